@@ -1,0 +1,18 @@
+"""Run by CI with the Python of an environment that holds only the wheel, from a folder outside the checkout."""
+
+import importlib.metadata
+import importlib.util
+import pathlib
+import sys
+
+files = importlib.metadata.files("bayessim-mjx") or []
+tops = {pathlib.PurePath(f).parts[0] for f in files} - {".."}
+assert all(t == "bayessim_mjx" or t.startswith("bayessim_mjx-") for t in tops), f"the wheel installs {sorted(tops)}"
+for name in ("tasks", "cfg"):
+    assert importlib.util.find_spec(name) is None, f"a package named plainly {name!r} is importable"
+
+import bayessim_mjx.tasks.pendulum  # noqa: E402
+
+assert "site-packages" in bayessim_mjx.tasks.pendulum.__file__, bayessim_mjx.tasks.pendulum.__file__
+assert "tasks" not in sys.modules
+print("wheel: only bayessim_mjx is installed, tasks inside it")
