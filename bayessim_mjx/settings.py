@@ -1,0 +1,299 @@
+"""All settings with their defaults, meaning and limits, as frozen dataclasses. `config.py` loads them from files.
+
+The names in `bayessim:`, `env:` and `task:` are BayesSimIG's. Nothing here imports jax.
+"""
+
+import dataclasses
+import math
+import types
+import typing
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from bayessim_mjx.errors import UserError
+
+COLLECT_POLICIES = ("policy_random", "policy_ones", "policy_rl", "policy_rl_randomized", "policy_replay")
+SUMMARIZERS = ("summary_start", "summary_waypts", "summary_corr", "summary_corrdiff", "summary_signatory")
+ACTIVATIONS = ("elu", "relu", "selu", "tanh", "swish", "gelu")
+
+
+class Frozen(dict):
+    """A mapping that cannot be changed: sections of free form stay plain dicts to read, and the config immutable."""
+
+    def _refuse(self, *_: Any, **__: Any) -> typing.NoReturn:
+        raise TypeError("the configuration is immutable; make another with config.replace or config.load")
+
+    __setitem__ = __delitem__ = update = pop = popitem = clear = setdefault = __ior__ = _refuse  # type: ignore[assignment]
+
+    def __hash__(self) -> int:  # type: ignore[override]
+        return hash(tuple(self.items()))
+
+    def __reduce__(self) -> tuple:
+        return Frozen, (dict(self),)
+
+
+def freeze(value: Any) -> Any:
+    """Deep copy of plain YAML data with mappings frozen and lists as tuples."""
+    if isinstance(value, Mapping):
+        return Frozen({str(k): freeze(v) for k, v in value.items()})
+    return tuple(freeze(v) for v in value) if isinstance(value, list | tuple) else value
+
+
+def thaw(value: Any) -> Any:
+    """The inverse of `freeze`: plain dicts and lists, ready for YAML."""
+    if isinstance(value, Mapping):
+        return {k: thaw(v) for k, v in value.items()}
+    return [thaw(v) for v in value] if isinstance(value, list | tuple) else value
+
+
+def setting(default: Any, doc: str, **limits: Any) -> Any:
+    """A field with its meaning and limits (`low`, `high`: inclusive; `above`: exclusive; `choices`)."""
+    return field(default=default, metadata={"doc": doc, **limits})
+
+
+class Section:
+    """A group of settings; checks its own types and limits however it is made."""
+
+    SECTION: typing.ClassVar[str] = ""
+
+    def __post_init__(self) -> None:
+        hints = typing.get_type_hints(type(self))
+        for f in dataclasses.fields(self):  # type: ignore[arg-type]
+            path = f"{self.SECTION}.{f.name}".lstrip(".")
+            value = coerce(getattr(self, f.name), hints[f.name], path)
+            check_limits(value, f.metadata, path)
+            object.__setattr__(self, f.name, value)
+        self.check()
+
+    def check(self) -> None:
+        """Conditions over several settings."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain dicts and lists, as written to YAML."""
+        return {f.name: thaw(getattr(self, f.name)) for f in dataclasses.fields(self)}  # type: ignore[arg-type]
+
+
+def coerce(value: Any, annotation: Any, path: str, source: str = "") -> Any:
+    """`value` as the annotated type, or a UserError naming key, value, expected type and `source`."""
+    where = f" ({source})" if source else ""
+    if isinstance(annotation, types.UnionType) or typing.get_origin(annotation) is typing.Union:
+        options = typing.get_args(annotation)
+        if value is None and type(None) in options:
+            return None
+        return coerce(value, next(o for o in options if o is not type(None)), path, source)
+    if typing.get_origin(annotation) is tuple:
+        item = typing.get_args(annotation)[0]
+        value = [value] if isinstance(value, str) and item is str else value
+        if not isinstance(value, list | tuple):
+            raise UserError(f"{path} = {value!r}{where}: expected a list of {item.__name__}")
+        return tuple(coerce(v, item, f"{path}[{i}]", source) for i, v in enumerate(value))
+    if annotation in (Frozen, dict):
+        if isinstance(value, Mapping):
+            return freeze(value)
+        raise UserError(f"{path} = {value!r}{where}: expected a section of `key: value` lines")
+    if annotation is Any:
+        return freeze(value)
+    if annotation is float and isinstance(value, int | float) and not isinstance(value, bool) and not math.isnan(value):
+        return float(value)
+    if annotation is int and isinstance(value, float) and value.is_integer():
+        return int(value)
+    if annotation in (bool, str) and isinstance(value, annotation):
+        return value
+    if annotation is int and isinstance(value, int) and not isinstance(value, bool):
+        return value
+    if dataclasses.is_dataclass(annotation) and isinstance(value, annotation):  # type: ignore[arg-type]
+        return value
+    name = {"int": "a whole number", "float": "a number", "bool": "True or False", "str": "text"}
+    raise UserError(f"{path} = {value!r}{where}: expected {name.get(annotation.__name__, annotation.__name__)}")
+
+
+def check_limits(value: Any, limits: Mapping[str, Any], path: str, source: str = "") -> None:
+    """Raise a UserError where a value (or an item of a tuple) breaks the field's limits."""
+    where = f" ({source})" if source else ""
+    for item in value if isinstance(value, tuple) else (value,):
+        if item is None or isinstance(item, Mapping):
+            continue
+        if "choices" in limits and item not in limits["choices"]:
+            raise UserError(f"{path} = {item!r}{where}: allowed are {', '.join(map(str, limits['choices']))}")
+        if "low" in limits and item < limits["low"]:
+            raise UserError(f"{path} = {item!r}{where}: must be at least {limits['low']}")
+        if "high" in limits and item > limits["high"]:
+            raise UserError(f"{path} = {item!r}{where}: must be at most {limits['high']}")
+        if "above" in limits and item <= limits["above"]:
+            raise UserError(f"{path} = {item!r}{where}: must be greater than {limits['above']}")
+
+
+@dataclass(frozen=True)
+class EnvConfig(Section):
+    """`env:`. Keys of one task only (`options`) are those its cfg/<task>.yaml lists; read like a mapping too."""
+
+    SECTION: typing.ClassVar[str] = "env"
+    numEnvs: int = setting(256, "worlds simulated in parallel; the same number as ppo.num_envs", low=1)
+    episodeLength: int | None = setting(None, "control steps per episode; null: the task's own", low=1)
+    realParams: Frozen | None = setting(None, "surrogate real: {weights, means, stds} or {parameter name: value}")
+    options: Frozen = field(default_factory=Frozen, metadata={"doc": "settings of this task alone"})
+
+    def to_dict(self) -> dict[str, Any]:
+        plain = super().to_dict()
+        options = plain.pop("options")
+        return {**plain, **options}
+
+    def __getitem__(self, key: str) -> Any:
+        return self.options[key] if key in self.options else getattr(self, key)
+
+    def get(self, key: str, default: Any = None) -> Any:
+        """The value of `key`, or `default` where it is absent or null."""
+        value = self.options.get(key, getattr(self, key, None))
+        return default if value is None else value
+
+    def keys(self) -> list[str]:
+        return ["numEnvs", "episodeLength", "realParams", *self.options]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.keys())
+
+    def __contains__(self, key: object) -> bool:
+        return key in self.keys()
+
+
+@dataclass(frozen=True)
+class BayesSimConfig(Section):
+    """`bayessim:`, the keys of BayesSimIG with their meaning there."""
+
+    SECTION: typing.ClassVar[str] = "bayessim"
+    trainTrajs: int = setting(10000, "simulated trajectories collected per round", low=1)
+    collectPolicy: str = setting(
+        "policy_random", "actions while collecting (symmetric random)", choices=COLLECT_POLICIES
+    )
+    summarizerFxn: str = setting("summary_start", "trajectory summary", choices=SUMMARIZERS)
+    trainTrajLen: int = setting(20, "control steps per training trajectory (arrays have one more row)", low=1)
+    ftune: bool = setting(True, "keep one network over all rounds; False: a new one each round")
+    modelClass: str | None = setting("MDNN", "MDNN, MDRFF[_<kernel>[_<sigma>]]; None: plain uniform randomisation")
+    components: int = setting(10, "mixture components", low=1)
+    fullCovariance: bool = setting(False, "full covariance per component")
+    hiddenLayers: tuple[int, ...] = setting((128, 128), "widths of the network", low=1)
+    lr: float = setting(1e-4, "Adam learning rate of the network", above=0)
+    realEvals: int = setting(100, "surrogate-real episodes that score the policy each round", low=1)
+    realTrajs: int = setting(1, "real trajectories used for inference each round (they accumulate)", low=1)
+    realIters: int = setting(100, "rounds of the outer loop", low=1)
+    ftuneRL: bool = setting(False, "keep training one policy over all rounds; False: a new one each round")
+    policyCheckpt: str | None = setting(None, "checkpoint of a policy to start from")
+
+    def check(self) -> None:
+        if self.modelClass is not None and self.modelClass.split("_")[0] not in ("MDNN", "MDRFF"):
+            raise UserError(
+                f"bayessim.modelClass = {self.modelClass!r}: allowed are MDNN, "
+                "MDRFF[_<RBF|Laplace|Matern12|Matern32|Matern52>[_<sigma>]] and None (plain uniform randomisation)"
+            )
+
+
+@dataclass(frozen=True)
+class PPOConfig(Section):
+    """`ppo:`, also the content of a --cfg_train file."""
+
+    SECTION: typing.ClassVar[str] = "ppo"
+    num_envs: int = setting(256, "worlds in parallel; the same number as env.numEnvs", low=1)
+    num_steps: int = setting(16, "control steps per world and iteration", low=1)
+    num_epochs: int = setting(5, "passes over each batch", low=1)
+    num_minibatches: int = setting(4, "minibatches per pass", low=1)
+    gamma: float = setting(0.99, "discount", low=0, high=1)
+    gae_lambda: float = setting(0.95, "lambda of the advantage estimate", low=0, high=1)
+    clip_param: float = setting(0.2, "clip range of the probability ratio", above=0)
+    use_clipped_value_loss: bool = setting(True, "clip the value loss with the same range")
+    value_loss_coef: float = setting(1.0, "weight of the value loss", low=0)
+    entropy_coef: float = setting(0.0, "weight of the entropy bonus", low=0)
+    learning_rate: float = setting(3e-4, "Adam learning rate (at the start, if adaptive)", above=0)
+    schedule: str = setting("adaptive", "learning rate by KL, or fixed", choices=("adaptive", "fixed"))
+    desired_kl: float = setting(0.01, "KL per update that the adaptive schedule aims at", above=0)
+    max_grad_norm: float = setting(1.0, "gradient clipping", above=0)
+    normalize_observations: bool = setting(True, "running mean and variance of observations")
+    normalize_advantage_per_minibatch: bool = setting(False, "else once per batch")
+    reward_scale: float = setting(1.0, "factor on rewards seen by the learner", above=0)
+    hidden_actor: tuple[int, ...] = setting((64, 64), "widths of the actor", low=1)
+    hidden_critic: tuple[int, ...] = setting((64, 64), "widths of the critic", low=1)
+    activation: str = setting("elu", "activation of both networks", choices=ACTIVATIONS)
+    init_std: float = setting(1.0, "initial standard deviation of actions", above=0)
+    action_clip: float = setting(1.0, "actions are clipped to +- this before the environment", above=0)
+    max_iterations: int = setting(100, "iterations (per round of the outer loop)", low=0)
+    log_interval: int = setting(10, "iterations between log lines", low=1)
+    save_interval: int = setting(50, "iterations between checkpoints", low=1)
+    eval_episodes: int = setting(100, "episodes per evaluation", low=1)
+
+    def check(self) -> None:
+        batch = self.num_envs * self.num_steps
+        if batch % self.num_minibatches:
+            raise UserError(
+                f"ppo.num_minibatches = {self.num_minibatches} does not divide the batch of num_envs * num_steps = "
+                f"{self.num_envs} * {self.num_steps} = {batch} samples"
+            )
+
+
+@dataclass(frozen=True)
+class RealConfig(Section):
+    """`real:`, logs of the real system in place of the surrogate."""
+
+    SECTION: typing.ClassVar[str] = "real"
+    logs: tuple[str, ...] = setting((), "log files or folders; none: the surrogate at env.realParams")
+    map: str | None = setting(None, "YAML file from log columns to joints and actuators")
+    segment_length: int | None = setting(None, "control steps per segment; null: bayessim.trainTrajLen", low=1)
+    segment_stride: int | None = setting(None, "control steps between segment starts; null: no overlap", low=1)
+    noise: float = setting(0.0, "standard deviation of the noise on the surrogate's observations", low=0)
+
+
+@dataclass(frozen=True)
+class MonitorConfig(Section):
+    """`monitor:`, what is shown and recorded."""
+
+    SECTION: typing.ClassVar[str] = "monitor"
+    console: bool = setting(True, "progress on the terminal")
+    tensorboard: bool = setting(True, "TensorBoard event files")
+    posterior_plots: bool = setting(True, "picture of the posterior each round")
+    video: bool = setting(False, "record videos")
+    video_length: int = setting(200, "control steps per video", low=1)
+    video_interval: int = setting(2000, "control steps of each world between videos", low=1)
+
+
+@dataclass(frozen=True)
+class Config(Section):
+    """All settings of a run. In YAML `task` is called `task_name`, and `randomization` is BayesSimIG's `task:`."""
+
+    task: str = setting("", "name of the task")
+    seed: int = setting(0, "seed of everything random", low=0)
+    name: str = setting("", "last part of the run folder's name")
+    logdir: str = setting("logs", "root of the run folders")
+    device: str = setting("auto", "auto, cpu, gpu, gpu:1, cuda:0")
+    cache_dir: str | None = setting(None, "compilation cache; null: $BAYESSIM_MJX_CACHE or ~/.cache/bayessim_mjx/jax")
+    env: EnvConfig = field(default_factory=EnvConfig)
+    randomization: Frozen = field(default_factory=Frozen)
+    effects: tuple[Frozen, ...] = setting((), "unmodelled effects in the simulator: list of {effect, where, ...}")
+    bayessim: BayesSimConfig = field(default_factory=BayesSimConfig)
+    ppo: PPOConfig = field(default_factory=PPOConfig)
+    real: RealConfig = field(default_factory=RealConfig)
+    monitor: MonitorConfig = field(default_factory=MonitorConfig)
+
+    def check(self) -> None:
+        if self.env.numEnvs != self.ppo.num_envs:
+            raise UserError(
+                f"env.numEnvs = {self.env.numEnvs} and ppo.num_envs = {self.ppo.num_envs} are one setting: "
+                "give the same number, or only one of them"
+            )
+
+    @property
+    def task_name(self) -> str:
+        """The YAML name of `task`."""
+        return self.task
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain nested dicts with the YAML names, fully resolved; `config.from_dict` is the inverse."""
+        plain: dict[str, Any] = {}
+        for f in dataclasses.fields(self):
+            value = getattr(self, f.name)
+            plain[YAML_NAMES.get(f.name, f.name)] = value.to_dict() if isinstance(value, Section) else thaw(value)
+        return plain
+
+
+YAML_NAMES = {"task": "task_name", "randomization": "task"}
+SECTIONS: dict[str, type[Section]] = {
+    "env": EnvConfig, "bayessim": BayesSimConfig, "ppo": PPOConfig, "real": RealConfig, "monitor": MonitorConfig,
+}  # fmt: skip
