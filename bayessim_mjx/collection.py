@@ -1,0 +1,251 @@
+"""Trajectories for inference: who acts while they are collected, and where the real ones come from.
+
+A *source* gives real trajectories one at a time: a surrogate real (the simulator at hidden parameters) or recorded logs.
+Both are turned into summaries by the same function as the simulated trajectories, so the features always mean the same.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from bayessim_mjx.config import Config
+from bayessim_mjx.distributions import Distribution
+from bayessim_mjx.env import Env
+from bayessim_mjx.errors import UserError
+from bayessim_mjx.inference import summarizers
+from bayessim_mjx.logs import Log, noise, read_logs, segments
+from bayessim_mjx.parameters import ParameterSpace
+from bayessim_mjx.rl.ppo import Policy
+from bayessim_mjx.rollout import Trajectory, replay, rollout
+
+RANDOM_SHARE = 0.1  # policy_rl_randomized: share of the steps with a uniformly random action (BayesSimIG)
+POLICY_DEPENDENT = ("policy_rl", "policy_rl_randomized")
+
+
+def policy_function(name: str, policy: Policy, action_size: int) -> Callable[[Array, dict], Array]:
+    """The collection policy `name` as a function (key, obs of one world) -> action [action_size].
+
+    random is symmetric, U[-1, 1]; rl_randomized flips its coin for every world and step by itself.
+    """
+
+    def uniform(key: Array) -> Array:
+        return jax.random.uniform(key, (action_size,), minval=-1.0, maxval=1.0)
+
+    def randomized(key: Array, obs: dict) -> Array:
+        k_coin, k_random, k_policy = jax.random.split(key, 3)
+        return jnp.where(jax.random.bernoulli(k_coin, RANDOM_SHARE), uniform(k_random), policy.act(k_policy, obs))
+
+    functions: dict[str, Callable[[Array, dict], Array]] = {
+        "policy_random": lambda key, obs: uniform(key),
+        "policy_ones": lambda key, obs: jnp.ones(action_size),
+        "policy_rl": lambda key, obs: policy.act(key, obs),
+        "policy_rl_randomized": randomized,
+    }
+    return functions[name]
+
+
+def summarise(summarizer: Callable, trajectory: Trajectory) -> Array:
+    """Features [worlds, D] of trajectories, from observations and actions."""
+    return jax.vmap(summarizer)(trajectory.observation, trajectory.action)
+
+
+@dataclasses.dataclass(frozen=True)
+class Surrogate:
+    """The simulator at hidden parameters, standing in for hardware (`env.realParams`)."""
+
+    env: Env
+    space: ParameterSpace
+    weights: np.ndarray  # [K]
+    means: np.ndarray  # [K, d]
+    sds: np.ndarray  # [K, d]
+    policy_name: str
+    length: int
+    noise: float  # standard deviation of the noise on observations, in simulation and in reality
+    summarizer: Callable[[Array, Array], Array]
+
+    @property
+    def truth(self) -> np.ndarray:
+        """Mean of the heaviest component [d]: the line in the plots and the point that is scored."""
+        return self.means[int(np.argmax(self.weights))]
+
+    @property
+    def supply(self) -> int | None:
+        """How many real trajectories there are; None: as many as asked for."""
+        return None
+
+    def sample(self, key: Array, count: int) -> Array:
+        """theta [count, d] of the surrogate, inside the box."""
+        k_component, k_noise = jax.random.split(key)
+        component = jax.random.choice(k_component, len(self.weights), (count,), p=jnp.asarray(self.weights))
+        noise_ = jax.random.normal(k_noise, (count, len(self.space)))
+        theta = jnp.asarray(self.means)[component] + jnp.asarray(self.sds)[component] * noise_
+        return jnp.clip(theta, self.space.low, self.space.high).astype(jnp.float32)
+
+    def simulate(self, key: Array, thetas: Array, policy: Policy) -> Array:
+        """Features [N, D] of simulated trajectories at `thetas`."""
+        return summarise(self.summarizer, self._observe(key, thetas, policy))
+
+    def _observe(self, key: Array, thetas: Array, policy: Policy) -> Trajectory:
+        k_roll, k_noise = jax.random.split(key)
+        act = policy_function(self.policy_name, policy, self.env.action_size)
+        trajectory = rollout(self.env, act, k_roll, thetas, self.length)
+        seen = trajectory.observation
+        return trajectory.replace(observation=seen + self.noise * jax.random.normal(k_noise, seen.shape))
+
+    def real(self, key: Array, first: int, count: int, policy: Policy) -> tuple[Array, Trajectory]:
+        """`count` real trajectories and their features [count, D]; `first` of them were asked for before."""
+        del first
+        k_theta, k_roll = jax.random.split(key)
+        trajectory = self._observe(k_roll, self.sample(k_theta, count), policy)
+        return summarise(self.summarizer, trajectory), trajectory
+
+
+@dataclasses.dataclass(frozen=True)
+class Recorded:
+    """Segments of recorded logs. In simulation the logged commands are replayed from the logged state."""
+
+    env: Any
+    space: ParameterSpace
+    data: dict[str, np.ndarray]  # qpos0 [M, nq], qvel0 [M, nv], command [M, T, nu], qpos [M, T+1, nq], qvel [M, T+1, nv]
+    order: np.ndarray  # [M] the order in which segments are used
+    noise: dict[str, np.ndarray]  # standard deviation of the measurement noise: qpos [nq], qvel [nv]
+    summarizer: Callable[[Array, Array], Array]
+    truth: None = None
+
+    @property
+    def supply(self) -> int:
+        return len(self.order)
+
+    def features(self, qpos: Array, qvel: Array, command: Array) -> Array:
+        states = jnp.concatenate([qpos, qvel], axis=-1)
+        return jax.vmap(self.summarizer)(states, command)
+
+    def simulate(self, key: Array, thetas: Array, policy: Policy) -> Array:
+        """Replay randomly drawn segments at `thetas` [N, d], with measurement noise; features [N, D]."""
+        del policy  # the logged commands act
+        k_segment, k_qpos, k_qvel = jax.random.split(key, 3)
+        index = jnp.asarray(self.order)[jax.random.randint(k_segment, (thetas.shape[0],), 0, len(self.order))]
+        start = {name: jnp.asarray(self.data[name])[index] for name in ("qpos0", "qvel0", "command")}
+        motion = replay(self.env.physics, start["qpos0"], start["qvel0"], start["command"], thetas)
+        qpos = motion["qpos"] + self.noise["qpos"] * jax.random.normal(k_qpos, motion["qpos"].shape)
+        qvel = motion["qvel"] + self.noise["qvel"] * jax.random.normal(k_qvel, motion["qvel"].shape)
+        return self.features(qpos, qvel, start["command"])
+
+    def real(self, key: Array, first: int, count: int, policy: Policy) -> tuple[Array, Trajectory]:
+        """The next `count` segments of the logs and their features."""
+        del key, policy
+        index = self.order[(first + np.arange(count)) % len(self.order)]
+        d = {name: jnp.asarray(value[index]) for name, value in self.data.items()}
+        steps = d["command"].shape[1]
+        zeros = jnp.zeros((count, steps))
+        observation = jnp.concatenate([d["qpos"], d["qvel"]], axis=-1)
+        trajectory = Trajectory(
+            observation=observation,
+            action=d["command"],
+            reward=zeros,
+            terminated=zeros,
+            truncated=zeros,
+            valid=zeros + 1.0,
+            theta=jnp.zeros((count, len(self.space))),
+            qpos=d["qpos"],
+            qvel=d["qvel"],
+            command=d["command"],
+        )
+        return self.features(d["qpos"], d["qvel"], d["command"]), trajectory
+
+
+Source = Surrogate | Recorded
+
+
+def make_source(config: Config, env: Env) -> Source:
+    """The real side that `config` asks for: logs if `real.logs` is set, else the surrogate of `env.realParams`."""
+    summarizer = summarizers.get(config.bayessim.summarizerFxn)
+    if config.real.logs:
+        return _recorded(config, env, summarizer)
+    if config.bayessim.collectPolicy == "policy_replay":
+        raise UserError("bayessim.collectPolicy=policy_replay replays logged commands and needs real.logs=DIR")
+    weights, means, sds = real_parameters(config.env.realParams, env.space)
+    b = config.bayessim
+    return Surrogate(
+        env, env.space, weights, means, sds, b.collectPolicy, b.trainTrajLen, config.real.noise, summarizer
+    )
+
+
+def _recorded(config: Config, env: Any, summarizer: Callable) -> Recorded:
+    if not hasattr(env, "physics"):
+        raise UserError(f"real.logs needs a task with its own MuJoCo model; {env.name!r} is not one")
+    logs: list[Log] = read_logs(config.real.logs, env.mj_model, config.real.map)
+    length = config.real.segment_length or config.bayessim.trainTrajLen
+    data = segments(logs, length, dt=env.dt, stride=config.real.segment_stride or length)
+    count = len(data["qpos0"])
+    needed = config.bayessim.realTrajs
+    if count < needed:
+        raise UserError(
+            f"real.logs: the logs hold {count} segments of {length} steps ({length * env.dt:.3g} s), "
+            f"bayessim.realTrajs={needed} are asked for; shorten bayessim.trainTrajLen or record more"
+        )
+    order = np.random.default_rng(config.seed).permutation(count)
+    return Recorded(env, env.space, data, order, noise(logs), summarizer)
+
+
+def real_parameters(settings: Any, space: ParameterSpace) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """weights [K], means [K, d], sds [K, d] of `env.realParams`; a one-number list stands for every parameter.
+
+    Unlike BayesSimIG, `stds` are standard deviations (there they were used as variances).
+    """
+    if not settings:
+        raise UserError("env.realParams is missing: give the surrogate's parameters, or real.logs=DIR for recorded motion")
+    means = [_row("means", row, space) for row in _rows(settings["means"])]
+    stds = [_row("stds", row, space) for row in _rows(settings.get("stds", [[0.0]] * len(means)))]
+    weights = np.asarray(settings.get("weights") or [1.0] * len(means), dtype=np.float64)
+    if not len(means) == len(stds) == len(weights):
+        raise UserError(
+            f"env.realParams: {len(weights)} weights, {len(means)} means, {len(stds)} stds; one of each per component"
+        )
+    if np.any(weights < 0) or weights.sum() <= 0:
+        raise UserError(f"env.realParams.weights={list(weights)}: must be >= 0 and not all 0")
+    for row in means:
+        for name, value, low, high in zip(space.names, row, space.low, space.high, strict=True):
+            if not low <= value <= high:
+                raise UserError(f"env.realParams.means: {name}={value:g} lies outside its range [{low:g}, {high:g}]")
+    if any(np.any(row < 0) for row in stds):
+        raise UserError("env.realParams.stds must be >= 0")
+    return (
+        (weights / weights.sum()).astype(np.float32),
+        np.asarray(means, dtype=np.float32),
+        np.asarray(stds, dtype=np.float32),
+    )
+
+
+def _rows(value: Any) -> list:
+    """A single mapping or flat list is one component."""
+    if isinstance(value, dict) or not isinstance(value[0], list | tuple | dict):
+        return [value]
+    return list(value)
+
+
+def _row(key: str, row: Any, space: ParameterSpace) -> np.ndarray:
+    if isinstance(row, dict):
+        for name in row:
+            space.index(name)
+        missing = [name for name in space.names if name not in row]
+        if missing:
+            raise UserError(f"env.realParams.{key}: no value for {', '.join(missing)}")
+        return np.asarray([float(row[name]) for name in space.names])
+    if len(row) == 1:
+        return np.full(len(space), float(row[0]))
+    if len(row) != len(space):
+        raise UserError(f"env.realParams.{key} has {len(row)} numbers, the task has {len(space)} parameters: {', '.join(space.names)}")
+    return np.asarray([float(value) for value in row])
+
+
+def domain_or_prior(space: ParameterSpace, components: int) -> Distribution | None:
+    """The prior as a distribution with room for `components` Gaussians; None for a task without parameters."""
+    return Distribution.prior(space, components) if len(space) else None

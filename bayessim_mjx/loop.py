@@ -1,0 +1,360 @@
+"""The outer loop: train on physics drawn from the domain, try the policy on the real side, infer a sharper domain.
+
+One round (BayesSimIG's order): PPO under the current domain; evaluation on the surrogate real; simulated trajectories
+over the *prior* and a fit of q(theta | summary); the real trajectories so far, multiplied, give the next domain.
+Simulating from the prior needs no proposal correction. All of a round runs on the device.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import time
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from bayessim_mjx import rl
+from bayessim_mjx.collection import POLICY_DEPENDENT, Recorded, Source, domain_or_prior, make_source
+from bayessim_mjx.config import BayesSimConfig, Config
+from bayessim_mjx.distributions import Distribution
+from bayessim_mjx.env import Env
+from bayessim_mjx.errors import UserError
+from bayessim_mjx.inference import fit, posterior
+from bayessim_mjx.rl.ppo import Policy, TrainState
+from bayessim_mjx.rollout import Trajectory, replay
+
+CHUNK = 2500  # trajectories simulated at once while collecting
+KEPT_ROUNDS = 4  # rounds of simulated trajectories kept for the fit where the collection policy does not change
+PREDICTIVE_DRAWS = 64
+
+
+@flax.struct.dataclass
+class LoopState:
+    """All that the next round needs, as arrays: it is the checkpoint."""
+
+    round: Array  # int32, rounds finished
+    train: TrainState
+    domain: Distribution | None  # what physics is drawn from
+    fit: Any  # FitState of the inference network; None for the uniform ablation
+    thetas: Array  # [capacity, d] simulated parameters
+    features: Array  # [capacity, D] and their summaries
+    real_features: Array  # [realIters * realTrajs, D], the first round * realTrajs rows are filled
+    real_posteriors: Distribution | None  # q(theta | x) of each real trajectory at the time it was seen
+
+
+@dataclasses.dataclass
+class RoundInfo:
+    """What a person wants to see of a round; numbers on the host."""
+
+    round: int
+    rounds: int
+    domain: Distribution | None  # what this round trained on
+    posterior: Distribution | None  # what it inferred
+    truth: np.ndarray | None
+    returns: np.ndarray  # [n] on the real side (surrogate) or under the domain (logs)
+    lengths: np.ndarray
+    real: Trajectory | None  # this round's real trajectories
+    predictive: dict[str, np.ndarray] | None  # qpos [n, T+1, nq], qvel: the first of them, re-simulated from the posterior
+    fit: dict[str, Any]
+    scores: dict[str, float]  # log p(truth), gain over the prior, credible level, contraction per parameter
+    seconds: dict[str, float]
+    warnings: list[str]
+
+
+class Monitor(Protocol):
+    """What the loop tells while it runs; every method may do nothing."""
+
+    def training(self, round_: int, metrics: dict[str, float], state: LoopState) -> None: ...
+    def round(self, info: RoundInfo, policy: Policy) -> None: ...
+
+
+class Checkpoints(Protocol):
+    def save(self, step: int, tree: Any, *, evaluation: float | None = None, meta: dict | None = None) -> Any: ...
+
+
+@dataclasses.dataclass(frozen=True)
+class Loop:
+    """The parts that do not move."""
+
+    env: Env
+    config: Config
+    source: Source | None
+    feature_size: int
+
+    @property
+    def settings(self) -> BayesSimConfig:
+        return self.config.bayessim
+
+    @property
+    def infers(self) -> bool:
+        return self.source is not None
+
+    @property
+    def capacity(self) -> int:
+        """Rows of simulated trajectories kept."""
+        b = self.settings
+        keeps = b.ftune and b.collectPolicy not in POLICY_DEPENDENT
+        return b.trainTrajs * (min(b.realIters, KEPT_ROUNDS) if keeps else 1)
+
+    def key(self, round_: int, purpose: str) -> Array:
+        """Every random draw has its own key, a function of the seed alone: a resumed run draws the same."""
+        purposes = ("init", "train", "evaluate", "simulate", "fit", "real", "predict")
+        return jax.random.fold_in(jax.random.PRNGKey(self.config.seed), round_ * len(purposes) + purposes.index(purpose))
+
+
+def make(config: Config, env: Env) -> Loop:
+    """Build the loop's static parts; refuses configurations that cannot work."""
+    b = config.bayessim
+    if b.modelClass is None:
+        # The ablation infers nothing, but is scored on the same surrogate.
+        source = make_source(config, env) if len(env.space) else None
+        return Loop(env, config, source, 0)
+    if not len(env.space):
+        raise UserError(
+            f"task {env.name!r} has no parameters to infer: name some under task.randomization_params, "
+            "or set bayessim.modelClass=None to train without inference"
+        )
+    source = make_source(config, env)
+    if isinstance(source, Recorded) and source.supply is not None and source.supply < b.realTrajs * b.realIters:
+        rounds = source.supply // b.realTrajs
+        raise UserError(
+            f"real.logs hold {source.supply} segments, enough for {rounds} rounds of bayessim.realTrajs={b.realTrajs}; "
+            f"set bayessim.realIters={rounds} or fewer, or a shorter bayessim.trainTrajLen"
+        )
+    shape = jax.eval_shape(lambda key: source.real(key, 0, 1, _untrained(env, config))[0], jax.random.PRNGKey(0))
+    return Loop(env, config, source, int(shape.shape[-1]))
+
+
+def _untrained(env: Env, config: Config) -> Policy:
+    return rl.ppo.policy_of(rl.init(env, config.ppo, jax.random.PRNGKey(0), domain_or_prior(env.space, 1)))
+
+
+def init(loop: Loop) -> LoopState:
+    """The state before round 0: an untrained policy, the prior as domain, no data."""
+    b, space, d = loop.settings, loop.env.space, len(loop.env.space)
+    domain = domain_or_prior(space, b.components)
+    infers = b.modelClass is not None
+    real_rows = b.realIters * b.realTrajs
+    return LoopState(
+        round=jnp.int32(0),
+        train=_new_policy(loop, 0, domain),
+        domain=domain,
+        fit=_new_network(loop, 0) if infers else None,
+        thetas=jnp.zeros((loop.capacity if infers else 0, d)),
+        features=jnp.zeros((loop.capacity if infers else 0, loop.feature_size)),
+        real_features=jnp.zeros((real_rows if infers else 0, loop.feature_size)),
+        real_posteriors=jax.tree.map(lambda leaf: jnp.zeros((real_rows, *leaf.shape)), domain) if infers else None,
+    )
+
+
+def _new_policy(loop: Loop, round_: int, domain: Distribution | None) -> TrainState:
+    return rl.init(loop.env, loop.config.ppo, loop.key(round_, "init"), domain)
+
+
+def _new_network(loop: Loop, round_: int) -> Any:
+    settings = fit.settings_from(loop.settings)
+    return fit.init(jax.random.fold_in(loop.key(round_, "fit"), 1), settings, loop.env.space, loop.feature_size)
+
+
+def training_target(loop: Loop, round_: int) -> int:
+    """PPO iterations after which the training of `round_` is over (BayesSimIG: max_iterations *per round*)."""
+    n = loop.config.ppo.max_iterations
+    return n * (round_ + 1) if loop.settings.ftuneRL else n
+
+
+def train(loop: Loop, state: LoopState, progress: Callable[[dict, TrainState], None] | None = None) -> LoopState:
+    """PPO under the current domain until this round's iterations are done (the rest of them, after a resume)."""
+    todo = training_target(loop, int(state.round)) - int(state.train.iteration)
+    if todo <= 0:
+        return state
+    trained, _ = rl.run(loop.env, loop.config.ppo, state.train, state.domain, iterations=todo, progress=progress)
+    return state.replace(train=trained)
+
+
+def step(loop: Loop, state: LoopState) -> tuple[LoopState, RoundInfo]:
+    """The rest of a round, after training: evaluate, collect, fit, condition on all real trajectories."""
+    started, seconds = time.perf_counter(), {}
+    round_, policy = int(state.round), rl.ppo.policy_of(state.train)
+    returns, lengths = _evaluate(loop, state, policy)
+    seconds["evaluate"] = time.perf_counter() - started
+    info = RoundInfo(
+        round=round_,
+        rounds=loop.settings.realIters,
+        domain=state.domain,
+        posterior=None,
+        truth=None if loop.source is None else loop.source.truth,
+        returns=returns,
+        lengths=lengths,
+        real=None,
+        predictive=None,
+        fit={},
+        scores={},
+        seconds=seconds,
+        warnings=[],
+    )
+    if loop.settings.modelClass is not None:
+        state = _infer(loop, state, policy, info)
+    state = state.replace(round=state.round + 1)
+    if not loop.settings.ftuneRL and round_ + 1 < loop.settings.realIters:
+        state = state.replace(train=_new_policy(loop, round_ + 1, state.domain))
+    return state, info
+
+
+def _evaluate(loop: Loop, state: LoopState, policy: Policy) -> tuple[np.ndarray, np.ndarray]:
+    """Deterministic episodes on the surrogate real; without one (logs), on physics drawn from the domain."""
+    key, n = loop.key(int(state.round), "evaluate"), loop.settings.realEvals
+    if isinstance(loop.source, Recorded) or loop.source is None:
+        thetas = jnp.zeros((n, 0)) if state.domain is None else state.domain.sample(key, n)
+    else:
+        thetas = loop.source.sample(key, n)
+    result = rl.evaluate(loop.env, policy, jax.random.fold_in(key, 1), thetas)
+    return np.asarray(result["return"]), np.asarray(result["length"])
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _simulate(source: Source, count: int, key: Array, policy: Policy, prior: Distribution) -> tuple[Array, Array]:
+    """`count` trajectories over the prior: theta [count, d], features [count, D], in chunks that fit the memory."""
+    chunks = -(-count // CHUNK)
+    size = -(-count // chunks)
+
+    def chunk(key: Array) -> tuple[Array, Array]:
+        k_theta, k_roll = jax.random.split(key)
+        thetas = prior.sample(k_theta, size)
+        return thetas, source.simulate(k_roll, thetas, policy)
+
+    thetas, features = jax.lax.map(chunk, jax.random.split(key, chunks))
+    return thetas.reshape(-1, thetas.shape[-1])[:count], features.reshape(-1, features.shape[-1])[:count]
+
+
+def _infer(loop: Loop, state: LoopState, policy: Policy, info: RoundInfo) -> LoopState:
+    b, source, round_ = loop.settings, loop.source, int(state.round)
+    assert source is not None and state.domain is not None
+    clock = time.perf_counter()
+    prior = domain_or_prior(loop.env.space, b.components)
+    thetas, features = _simulate(source, b.trainTrajs, loop.key(round_, "simulate"), policy, prior)
+    row = (round_ * b.trainTrajs) % loop.capacity
+    state = state.replace(
+        thetas=jax.lax.dynamic_update_slice(state.thetas, thetas, (row, 0)),
+        features=jax.lax.dynamic_update_slice(state.features, features, (row, 0)),
+    )
+    jax.block_until_ready(state.features)
+    info.seconds["simulate"] = time.perf_counter() - clock
+
+    clock = time.perf_counter()
+    network = state.fit if b.ftune or round_ == 0 else _new_network(loop, round_)
+    count = min((round_ + 1) * b.trainTrajs, loop.capacity)
+    network, fit_info = fit.fit(loop.key(round_, "fit"), network, state.thetas, state.features, jnp.int32(count))
+    info.fit = {name: np.asarray(value) for name, value in dataclasses.asdict(fit_info).items()}
+    info.seconds["fit"] = time.perf_counter() - clock
+
+    clock = time.perf_counter()
+    seen = round_ * b.realTrajs
+    real_features, real = source.real(loop.key(round_, "real"), seen, b.realTrajs, policy)
+    all_features = jax.lax.dynamic_update_slice(state.real_features, real_features, (seen, 0))
+    posteriors = fit.condition(network, all_features)
+    if b.collectPolicy in POLICY_DEPENDENT:
+        # An older trajectory was made by an older policy: its posterior stays that of the network of its time.
+        new = jnp.arange(all_features.shape[0]) >= seen
+        posteriors = jax.tree.map(
+            lambda old, now: jnp.where(new.reshape(-1, *[1] * (now.ndim - 1)), now, old), state.real_posteriors, posteriors
+        )
+    rows = [jax.tree.map(lambda leaf, i=i: leaf[i], posteriors) for i in range(seen + b.realTrajs)]
+    domain = posterior.combine(rows, b.components)
+    info.posterior, info.real = domain, jax.tree.map(np.asarray, real)
+    info.scores = score(domain, source.truth)
+    info.predictive = _predict(loop, domain, real, loop.key(round_, "predict"))
+    info.seconds["condition"] = time.perf_counter() - clock
+    return state.replace(fit=network, real_features=all_features, real_posteriors=posteriors, domain=domain)
+
+
+def score(domain: Distribution, truth: np.ndarray | None) -> dict[str, float]:
+    """Log density of the truth where it is known, and per-parameter contraction against the prior."""
+    contraction = np.asarray(domain.contraction())
+    scores = {f"contraction/{name}": float(c) for name, c in zip(domain.space.names, contraction, strict=True)}
+    if truth is not None:
+        scores["log_p_truth"] = float(domain.log_prob(jnp.asarray(truth)))
+        scores["gain_over_prior"] = float(domain.log_gain(jnp.asarray(truth)))
+        scores["credible_level"] = float(domain.credible_level(jnp.asarray(truth)))
+    return scores
+
+
+def _predict(loop: Loop, domain: Distribution, real: Trajectory, key: Array) -> dict[str, np.ndarray] | None:
+    """Posterior predictive: the first real trajectory's commands replayed from its first state at posterior draws."""
+    physics = getattr(loop.env, "physics", None)
+    if physics is None:
+        return None
+    thetas = domain.sample(key, PREDICTIVE_DRAWS)
+    first = [jnp.broadcast_to(x[0], (PREDICTIVE_DRAWS, *x.shape[1:])) for x in (real.qpos, real.qvel, real.command)]
+    motion = _replay(physics, first[0][:, 0], first[1][:, 0], first[2], thetas)
+    return {name: np.asarray(value) for name, value in motion.items()}
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _replay(physics: Any, qpos0: Array, qvel0: Array, command: Array, thetas: Array) -> dict[str, Array]:
+    return replay(physics, qpos0, qvel0, command, thetas)
+
+
+def run(
+    loop: Loop,
+    state: LoopState,
+    checkpoints: Checkpoints | None = None,
+    monitor: Monitor | None = None,
+) -> tuple[LoopState, list[RoundInfo]]:
+    """All rounds from `state` on. Checkpoints every ppo.save_interval iterations and after each round.
+
+    A round's checkpoint holds the *state after* it and the policy that was evaluated in it, so that "best" is the best evaluated policy.
+    """
+    infos = []
+    while int(state.round) < loop.settings.realIters:
+        round_ = int(state.round)
+        start = int(state.train.iteration)
+
+        def progress(metrics: dict, trained: TrainState, state: LoopState = state, round_: int = round_) -> None:
+            current = state.replace(train=trained)
+            if monitor is not None:
+                monitor.training(round_, metrics, current)
+            if checkpoints is not None and _due(loop, int(trained.iteration)):
+                checkpoints.save(checkpoint_step(loop, round_, trained), tree_of(loop, current), meta=_meta(current))
+
+        clock = time.perf_counter()
+        state = train(loop, state, progress)
+        seconds = time.perf_counter() - clock
+        policy = rl.ppo.policy_of(state.train)
+        number = checkpoint_step(loop, round_, state.train)
+        state, info = step(loop, state)
+        info.seconds["train"] = seconds
+        info.seconds["iterations"] = int(training_target(loop, round_)) - start
+        if checkpoints is not None:
+            checkpoints.save(
+                number + 1, {"policy": policy, "state": state}, evaluation=float(info.returns.mean()), meta=_meta(state)
+            )
+        if monitor is not None:
+            monitor.round(info, policy)
+        infos.append(info)
+    return state, infos
+
+
+def tree_of(loop: Loop, state: LoopState) -> dict[str, Any]:
+    """What a checkpoint holds; also the template to restore one."""
+    return {"policy": rl.ppo.policy_of(state.train), "state": state}
+
+
+def checkpoint_step(loop: Loop, round_: int, trained: TrainState) -> int:
+    """Checkpoints are numbered by PPO iterations and rounds together, so that they always grow."""
+    n = loop.config.ppo.max_iterations
+    done = int(trained.iteration) - (n * round_ if loop.settings.ftuneRL else 0)
+    return round_ * (n + 1) + done
+
+
+def _due(loop: Loop, iteration: int) -> bool:
+    return iteration % loop.config.ppo.save_interval == 0
+
+
+def _meta(state: LoopState) -> dict[str, int]:
+    return {"round": int(state.round), "iteration": int(state.train.iteration)}
