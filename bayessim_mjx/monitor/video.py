@@ -1,0 +1,290 @@
+"""Off-screen videos of MuJoCo motion: one world or a grid of worlds, with the physics parameters written over them.
+
+Nothing here may stop a training run: without a working OpenGL `record` warns once and returns None.
+"""
+
+import copy
+import io
+import os
+import platform
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bayessim_mjx.monitor.camera import view_of
+
+_OFF = ("disable", "disabled", "off", "false", "0")
+_warned: set[str] = set()
+
+
+def record(
+    mj_model: Any,
+    qpos: np.ndarray | Sequence[np.ndarray],
+    path: str | os.PathLike | None = None,
+    fps: float = 30.0,
+    width: int = 320,
+    height: int = 240,
+    camera: str | int | None = None,
+    overlay_text: str | Mapping | Sequence | None = None,
+    dt: float | None = None,
+) -> np.ndarray | None:
+    """Render qpos [T, nq] (or a list of them, one per world, shown as a grid) to frames [T', H, W, 3] uint8.
+
+    Args:
+        path: also save there (`.mp4` or `.gif`).
+        fps: frames per second of the video.
+        width, height: pixels of one world's picture.
+        camera: name or number of a camera of the model; None: the model's first, else one fitted to the motion.
+        overlay_text: lines or {name: value} written into the corner; with several worlds one entry per world.
+        dt: seconds between rows of qpos. When given, rows are picked so that the video runs in real time.
+    Returns:
+        None, with one warning, where no OpenGL works (or MUJOCO_GL=disable).
+    """
+    worlds = [np.asarray(q, np.float64) for q in (qpos if isinstance(qpos, list | tuple) else [qpos])]
+    for world in worlds:
+        if world.ndim != 2 or world.shape[1] != mj_model.nq or not len(world):
+            raise ValueError(f"qpos has shape {world.shape}; expected [T, {mj_model.nq}] for this model, T >= 1")
+    worlds = [world[_rows(len(world), dt, fps)] for world in worlds]
+    texts = [overlay_text] if len(worlds) == 1 else list(overlay_text or [None] * len(worlds))
+    try:
+        tiles = _render(mj_model, worlds, width, height, camera)
+    except Exception as error:  # drivers fail in many ways, and a picture is never worth a run
+        if isinstance(error, ValueError):
+            raise
+        return _warn(f"no video: rendering failed ({type(error).__name__}: {error})")
+    if tiles is None:
+        return None
+    frames = _grid([_write_over(tile, text) for tile, text in zip(tiles, texts, strict=True)])
+    if path is not None:
+        save(frames, path, fps)
+    return frames
+
+
+def _rows(length: int, dt: float | None, fps: float) -> np.ndarray:
+    if dt is None:
+        return np.arange(length)
+    count = max(1, round(length * dt * fps))
+    return np.minimum((np.arange(count) / (fps * dt)).astype(int), length - 1)
+
+
+def _warn(text: str) -> None:
+    if text not in _warned:
+        _warned.add(text)
+        warnings.warn(text, RuntimeWarning, stacklevel=3)
+
+
+def backends() -> list[str]:
+    """OpenGL backends to try, in order: what MUJOCO_GL says, else what suits the platform. Empty: rendering is off."""
+    chosen = os.environ.get("MUJOCO_GL", "").lower().strip()
+    if chosen in _OFF:
+        return []
+    if chosen in ("egl", "osmesa", "glfw", "cgl"):
+        return [chosen]
+    if platform.system() == "Linux":
+        return ["egl", "osmesa"] + (["glfw"] if os.environ.get("DISPLAY") else [])
+    return ["cgl", "glfw"] if platform.system() == "Darwin" else ["glfw"]
+
+
+@contextmanager
+def _context(width: int, height: int) -> Iterator[Any]:
+    """A current OpenGL context, or None.
+
+    MuJoCo fixes its backend when it is first imported, long before anybody asks for a video; so the context is made
+    here from the backend's own module and works whatever was imported before.
+    """
+    context, failures = None, []
+    for name in backends():
+        try:
+            context = _make_context(name, width, height)
+            break
+        except Exception as error:
+            failures.append(f"{name}: {error}")
+    if context is None:
+        _warn("no video: " + ("; ".join(failures) or "rendering is switched off by MUJOCO_GL"))
+    try:
+        yield context
+    finally:
+        if context is not None:
+            context.free()
+
+
+def _make_context(name: str, width: int, height: int) -> Any:
+    import importlib
+    import sys
+
+    before = os.environ.get("PYOPENGL_PLATFORM")
+    loaded = set(sys.modules)
+    try:
+        context = importlib.import_module(f"mujoco.{name}").GLContext(width, height)
+        context.make_current()
+        return context
+    except Exception:
+        # PyOpenGL keeps the platform it first saw: forget it, or the next backend cannot load.
+        for module in set(sys.modules) - loaded:
+            if module.split(".")[0] == "OpenGL" or module == f"mujoco.{name}":
+                del sys.modules[module]
+        if before is None:
+            os.environ.pop("PYOPENGL_PLATFORM", None)
+        raise
+
+
+def _render(model: Any, worlds: list[np.ndarray], width: int, height: int, camera: str | int | None) -> Any:
+    """Frames [T, H, W, 3] of each world, all T as long as the longest (the last pose is held)."""
+    import mujoco
+
+    model = copy.copy(model)  # the buffer and the lights are set for the video only
+    model.vis.global_.offwidth, model.vis.global_.offheight = 2 * width, 2 * height
+    model.vis.quality.offsamples = 0
+    if model.nlight == 0:
+        model.vis.headlight.ambient[:], model.vis.headlight.diffuse[:] = 0.45, 0.55
+    data = mujoco.MjData(model)
+    length = max(map(len, worlds))
+    with _context(width, height) as context:
+        if context is None:
+            return None
+        picture = _Picture(model, width, height)
+        try:
+            tiles = []
+            for world in worlds:
+                view = view_of(model, data, world, camera, width / height)
+                frames = [picture.take(data, pose, view) for pose in world]
+                tiles.append(np.stack(frames + [frames[-1]] * (length - len(frames))))
+        finally:
+            picture.free()
+    return tiles
+
+
+class _Picture:
+    """MuJoCo's renderer on the current context; a missing sky is painted light instead of black.
+
+    Drawn at twice the size and averaged: OpenGL's own smoothing would leave a black rim against the painted sky.
+    """
+
+    def __init__(self, model: Any, width: int, height: int):
+        import mujoco
+
+        self.mj, self.model = mujoco, model
+        self.context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self.context)
+        self.scene, self.option = mujoco.MjvScene(model, 10000), mujoco.MjvOption()
+        self.rect = mujoco.MjrRect(0, 0, 2 * width, 2 * height)
+        sky = np.linspace((205, 220, 235), (245, 248, 250), 2 * height).astype(np.uint8)  # top to bottom
+        self.sky = None if _has_sky(model) else np.broadcast_to(sky[:, None], (2 * height, 2 * width, 3))
+
+    def take(self, data: Any, qpos: np.ndarray, view: Any) -> np.ndarray:
+        mj, rect = self.mj, self.rect
+        data.qpos[:] = qpos
+        mj.mj_kinematics(self.model, data)
+        mj.mj_comPos(self.model, data)
+        mj.mj_camlight(self.model, data)
+        mj.mj_tendon(self.model, data)
+        everything = mj.mjtCatBit.mjCAT_ALL.value
+        mj.mjv_updateScene(self.model, data, self.option, None, view, everything, self.scene)
+        mj.mjr_render(rect, self.scene, self.context)
+        pixels = np.empty((rect.height, rect.width, 3), np.uint8)
+        depth = np.empty((rect.height, rect.width), np.float32)
+        mj.mjr_readPixels(pixels, depth, rect, self.context)
+        pixels, depth = pixels[::-1], depth[::-1]  # OpenGL counts rows from the bottom
+        if self.sky is not None:
+            pixels = np.where((depth >= 1.0)[..., None], self.sky, pixels)
+        fine = pixels.reshape(rect.height // 2, 2, rect.width // 2, 2, 3)
+        return fine.mean((1, 3), dtype=np.float32).astype(np.uint8)
+
+    def free(self) -> None:
+        self.context.free()
+
+
+def _has_sky(model: Any) -> bool:
+    import mujoco
+
+    return bool((np.asarray(model.tex_type) == mujoco.mjtTexture.mjTEXTURE_SKYBOX.value).any())
+
+
+def _grid(tiles: list[np.ndarray]) -> np.ndarray:
+    """Tile [T, H, W, 3] pictures, as near to a square as they come; empty places stay white."""
+    columns = int(np.ceil(np.sqrt(len(tiles))))
+    rows = -(-len(tiles) // columns)
+    length, height, width, _ = tiles[0].shape
+    out = np.full((length, rows * height, columns * width, 3), 255, np.uint8)
+    for i, tile in enumerate(tiles):
+        y, x = (i // columns) * height, (i % columns) * width
+        out[:, y : y + height, x : x + width] = tile
+    return out
+
+
+def _write_over(frames: np.ndarray, text: str | Mapping | Sequence | None) -> np.ndarray:
+    """Write `text` on a light ground into the upper left corner, as many lines as fit."""
+    if not text:
+        return frames
+    import matplotlib
+    from PIL import Image, ImageDraw, ImageFont
+
+    height, width = frames.shape[1:3]
+    size = max(10, height // 20)
+    font = ImageFont.truetype(os.path.join(matplotlib.get_data_path(), "fonts/ttf/DejaVuSans.ttf"), size)
+    lines = _lines(text)
+    fit = max(1, int(0.9 * height / (1.35 * size)))
+    lines = lines if len(lines) <= fit else [*lines[: fit - 1], f"… {len(lines) - fit + 1} more"]
+    box = ImageDraw.Draw(Image.new("RGB", (1, 1))).multiline_textbbox((6, 4), "\n".join(lines), font=font)
+    area = (slice(None), slice(0, min(height, int(box[3]) + 5)), slice(0, min(width, int(box[2]) + 7)))
+    frames = frames.copy()
+    frames[area] = (0.35 * frames[area] + 0.65 * 255).astype(np.uint8)
+    for frame in frames:
+        image = Image.fromarray(frame)
+        ImageDraw.Draw(image).multiline_text((6, 4), "\n".join(lines), font=font, fill=(20, 20, 20))
+        frame[...] = np.asarray(image)
+    return frames
+
+
+def _lines(text: str | Mapping | Sequence) -> list[str]:
+    if isinstance(text, Mapping):
+        return [f"{k} {v:.3g}" if isinstance(v, float | np.floating) else f"{k} {v}" for k, v in text.items()]
+    return text.splitlines() if isinstance(text, str) else [str(line) for line in text]
+
+
+def gif(frames: np.ndarray, fps: float) -> bytes:
+    """Frames [T, H, W, 3] uint8 as an endless GIF; one palette for all frames, so that colours do not flicker."""
+    from PIL import Image
+
+    sample = np.concatenate(frames[np.linspace(0, len(frames) - 1, 4).astype(int)])
+    palette = Image.fromarray(sample).quantize(255, dither=Image.Dither.NONE)
+    pictures = [Image.fromarray(f).quantize(palette=palette, dither=Image.Dither.NONE) for f in frames]
+    buffer = io.BytesIO()
+    duration = max(20, round(1000 / fps))  # viewers slow anything under 20 ms down to 100 ms
+    pictures[0].save(buffer, "GIF", save_all=True, append_images=pictures[1:], duration=duration, loop=0)
+    return buffer.getvalue()
+
+
+def save(frames: np.ndarray, path: str | os.PathLike, fps: float) -> bool:
+    """Save frames [T, H, W, 3] uint8 as `.gif` or `.mp4`. False, with a warning, where there is no ffmpeg."""
+    path = Path(path)
+    if path.suffix not in (".gif", ".mp4"):
+        raise ValueError(f"cannot save a video as {path.name!r}; allowed endings: .mp4, .gif")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if path.suffix == ".gif":
+        path.write_bytes(gif(frames, fps))
+        return True
+    try:
+        _mp4(frames, path, fps)
+    except Exception as error:
+        _warn(f"no mp4: {type(error).__name__}: {error}")
+        return False
+    return True
+
+
+def _mp4(frames: np.ndarray, path: Path, fps: float) -> None:
+    import imageio_ffmpeg
+
+    even = frames[:, : frames.shape[1] // 2 * 2, : frames.shape[2] // 2 * 2]  # yuv420p halves both sides
+    size = (even.shape[2], even.shape[1])
+    sink = imageio_ffmpeg.write_frames(
+        str(path), size, fps=fps, macro_block_size=2, output_params=["-loglevel", "error"]
+    )
+    sink.send(None)
+    for frame in even:
+        sink.send(np.ascontiguousarray(frame))
+    sink.close()

@@ -1,0 +1,154 @@
+"""TensorBoard event files: scalars, texts, figures and GIF videos, and pictures kept beside them in a `media` folder.
+
+Nothing here needs torch or moviepy. A resumed run takes the steps it is about to repeat out of the old event files.
+"""
+
+import io
+import math
+import os
+import struct
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+PurgeStep = int | Mapping[str, int] | None
+
+
+def records(path: Path) -> Iterator[tuple[bytes, Any]]:
+    """Yield (raw record with its checksums, `Event`) of one event file; one cut short by a kill ends it quietly."""
+    from tensorboardX.proto.event_pb2 import Event
+
+    data = path.read_bytes()
+    at = 0
+    while at + 12 <= len(data):
+        (length,) = struct.unpack_from("<Q", data, at)  # TFRecord: u64 length, u32 crc, data, u32 crc
+        end = at + 12 + length + 4
+        if end > len(data):
+            return
+        yield data[at:end], Event.FromString(data[at + 12 : end - 4])
+        at = end
+
+
+def event_files(folder: str | os.PathLike) -> list[Path]:
+    """Event files of one TensorBoard run, oldest first."""
+    return sorted(Path(folder).glob("events.out.tfevents.*"))
+
+
+def purge(folder: str | os.PathLike, step: int | Mapping[str, int]) -> int:
+    """Take events at or after `step` out of the event files in `folder`; returns how many went.
+
+    `step` is one number, or {tag prefix: number} where tags count different things (`{"BayesSim": 3, "Train": 600}`);
+    tags without a matching prefix stay. Files are replaced atomically.
+    """
+    dropped = 0
+    for path in event_files(folder):
+        old = list(records(path))
+        kept = [raw for raw, event in old if not _is_late(event, step)]
+        if len(kept) < len(old):
+            temporary = path.with_name(f".{path.name}.tmp")
+            temporary.write_bytes(b"".join(kept))
+            os.replace(temporary, path)
+            dropped += len(old) - len(kept)
+    return dropped
+
+
+def _is_late(event: Any, step: int | Mapping[str, int]) -> bool:
+    if not event.HasField("summary"):
+        return False
+    if isinstance(step, Mapping):
+        tags = [value.tag for value in event.summary.value]
+        return any(tag.startswith(prefix) and event.step >= first for prefix, first in step.items() for tag in tags)
+    return event.step >= step
+
+
+class Writer:
+    """Event files of one TensorBoard run.
+
+    Args:
+        path: folder of the run (made if it is not there).
+        purge_step: on resume, the first step that will be written again, see `purge`. None keeps everything.
+        media: folder for the pictures and videos that are shown, as plain files; None: `path/media`.
+    """
+
+    def __init__(self, path: str | os.PathLike, purge_step: PurgeStep = None, media: str | os.PathLike | None = None):
+        from tensorboardX import SummaryWriter
+
+        self.path = Path(path)
+        self.media = Path(media) if media is not None else self.path / "media"
+        if purge_step is not None:
+            purge(self.path, purge_step)
+        # A file's name holds whole seconds only: without a suffix a quick restart would overwrite the file before it.
+        suffix = f".{len(event_files(self.path)):04d}"
+        single = purge_step if isinstance(purge_step, int) else None
+        self._writer = SummaryWriter(str(self.path), purge_step=single, filename_suffix=suffix, flush_secs=10)
+
+    def scalars(self, step: int, values: Mapping[str, Any], prefix: str = "") -> None:
+        """Write {tag: number} (Python, NumPy or device scalars) at `step`. None and NaN are left out."""
+        for tag, value in values.items():
+            number = _number(prefix + tag, value)
+            if number is not None:
+                self._writer.add_scalar(prefix + tag, number, int(step))
+
+    def text(self, tag: str, text: str, step: int = 0, code: bool = False) -> None:
+        """Write Markdown; `code` shows it as it is, line for line (a YAML file, say)."""
+        if code:
+            text = "\n".join("    " + line for line in text.splitlines())
+        self._writer.add_text(tag, text, int(step))
+
+    def figure(self, tag: str, figure: Any, step: int) -> None:
+        """Write a matplotlib figure as PNG at its own dpi, keep the file, and close the figure."""
+        buffer = io.BytesIO()
+        figure.savefig(buffer, format="png")
+        self._image(tag, buffer.getvalue(), step)
+        self._keep(tag, step, ".png", lambda path: path.write_bytes(buffer.getvalue()))
+        figure.clear()
+        if "matplotlib.pyplot" in sys.modules:  # a figure from pyplot is also held by pyplot
+            sys.modules["matplotlib.pyplot"].close(figure)
+
+    def video(self, tag: str, frames: np.ndarray | None, fps: float, step: int) -> None:
+        """Write frames [T, H, W, 3] uint8 as a GIF in the image tab and keep an mp4. None (no OpenGL) is skipped."""
+        from bayessim_mjx.monitor import video
+
+        if frames is None:
+            return
+        self._image(tag, video.gif(frames, fps), step)
+        self._keep(tag, step, ".mp4", lambda path: video.save(frames, path, fps))
+
+    def flush(self) -> None:
+        self._writer.flush()
+
+    def close(self) -> None:
+        """Write what is still queued and close the event file; a second call does nothing."""
+        self._writer.close()
+
+    def __enter__(self) -> "Writer":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _image(self, tag: str, encoded: bytes, step: int) -> None:
+        from PIL import Image
+        from tensorboardX.proto.summary_pb2 import Summary
+
+        width, height = Image.open(io.BytesIO(encoded)).size
+        image = Summary.Image(height=height, width=width, colorspace=3, encoded_image_string=encoded)
+        self._writer.file_writer.add_summary(Summary(value=[Summary.Value(tag=tag, image=image)]), int(step))
+
+    def _keep(self, tag: str, step: int, suffix: str, write: Callable[[Path], Any]) -> None:
+        self.media.mkdir(parents=True, exist_ok=True)
+        name = "".join(c if c.isalnum() or c in "._-" else "_" for c in tag)
+        write(self.media / f"{name}_{int(step):06d}{suffix}")
+
+
+def _number(tag: str, value: Any) -> float | None:
+    if value is None:
+        return None
+    array = np.asarray(value)
+    if array.size != 1:
+        raise ValueError(f"scalar {tag!r} has shape {array.shape}; a scalar has one element")
+    number = float(array.reshape(()))
+    return None if math.isnan(number) else number
