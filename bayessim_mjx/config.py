@@ -1,6 +1,22 @@
-"""Typed configuration: re-exports the settings and loads them, strictly, from files, flags and overrides."""
+"""Typed configuration, loaded strictly from YAML files, flags and dotted overrides.
 
+Layers, later ones win: defaults < cfg/<task>.yaml < --cfg_env < --cfg_train < flags < `section.key=value`.
+A file's `task.randomization_params`, `env.realParams` and `effects` replace earlier ones whole; an override changes
+one entry. `task.randomization_params` alone may thus have fewer parameters than the task's own file.
+`env.numEnvs` and `ppo.num_envs` are one number: giving either sets both.
+"""
+
+import dataclasses
+import difflib
+import re
+import typing
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from bayessim_mjx.errors import UserError
 from bayessim_mjx.settings import (
+    YAML_NAMES,
     BayesSimConfig,
     Config,
     EnvConfig,
@@ -9,11 +25,274 @@ from bayessim_mjx.settings import (
     PPOConfig,
     RealConfig,
     Section,
+    checked,
+    coerce,
     freeze,
     thaw,
 )
 
 __all__ = [
-    "BayesSimConfig", "Config", "EnvConfig", "Frozen", "MonitorConfig", "PPOConfig", "RealConfig", "Section", "freeze",
-    "thaw",
+    "BayesSimConfig", "Config", "EnvConfig", "Frozen", "MonitorConfig", "PPOConfig", "RealConfig", "Section",
+    "cfg_folder", "freeze", "from_dict", "load", "read_yaml", "replace", "task_file", "thaw", "to_yaml", "unknown",
 ]  # fmt: skip
+
+Layer = tuple[str, Mapping[str, Any], bool]  # where it comes from, nested values, is it a file (else flag or override)
+SECTIONS: dict[str, type[Section]] = {
+    "env": EnvConfig, "bayessim": BayesSimConfig, "ppo": PPOConfig, "real": RealConfig, "monitor": MonitorConfig,
+}  # fmt: skip
+TOP_KEYS = [YAML_NAMES.get(f.name, f.name) for f in dataclasses.fields(Config)]
+TASK_KEYS = ("randomize", "randomization_params")
+RANDOMIZED_KEYS = ("range", "operation", "distribution", "schedule", "schedule_steps", "num_buckets")
+REAL_KEYS = ("weights", "means", "stds")
+OPERATIONS = ("scaling", "additive", "absolute")
+
+
+def cfg_folder() -> Path:
+    """The folder of task YAMLs: inside the package in a wheel, beside it in a checkout."""
+    package = Path(__file__).resolve().parent
+    return next((f for f in (package / "cfg", package.parent / "cfg") if f.is_dir()), package / "cfg")
+
+
+def task_file(task: str) -> Path:
+    """cfg/<task in snake case>.yaml (which need not exist)."""
+    return cfg_folder() / (re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", task).lower() + ".yaml")
+
+
+def load(
+    task: str | None = None,
+    *,
+    cfg_env: str | Path | None = None,
+    cfg_train: str | Path | None = None,
+    flags: Mapping[str, tuple[str, Any]] | None = None,
+    overrides: Iterable[str] = (),
+) -> Config:
+    """The configuration of `task` with all layers applied.
+
+    `flags` maps a flag's name to (dotted key, value), e.g. {"--num_envs": ("env.numEnvs", 64)}; `overrides` are
+    "section.key=value" texts. `task` may be left out where `cfg_env` holds `task_name`. Raises UserError.
+    """
+    files: list[Layer] = []
+    if cfg_env is not None:
+        files.append((str(cfg_env), read_yaml(cfg_env), True))
+    if cfg_train is not None:
+        files.append((str(cfg_train), _train_layer(cfg_train), True))
+    task = task or next((str(raw["task_name"]) for _, raw, _ in files if raw.get("task_name")), None)
+    if not task:
+        raise UserError("no task: give --task NAME (--list_tasks shows the names)")
+    more = [(flag, _nested(key, value), False) for flag, (key, value) in (flags or {}).items()]
+    return _build(task, [*files, *more, *map(_override, overrides)])
+
+
+def from_dict(raw: Mapping[str, Any], task: str | None = None, source: str = "dict") -> Config:
+    """A Config from plain nested dicts with the YAML names (the inverse of `Config.to_dict`). `raw` is not changed."""
+    task = task or raw.get("task_name")
+    if not task:
+        raise UserError(f"{source}: no task_name")
+    return _build(task, [(source, raw, True)])
+
+
+def replace(config: Config, **sections: Any) -> Config:
+    """A changed copy: `replace(config, ppo={"gamma": 0.9}, seed=3)`."""
+    changed = {
+        k: dataclasses.replace(getattr(config, k), **v) if isinstance(getattr(config, k), Section) else v
+        for k, v in sections.items()
+    }
+    return dataclasses.replace(config, **changed)
+
+
+def read_yaml(path: str | Path) -> dict[str, Any]:
+    """A YAML file as nested dicts; every way it can be broken is one UserError with file and line."""
+    import yaml
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+
+    try:
+        raw = OmegaConf.to_container(OmegaConf.load(path), resolve=True)
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        line = f", line {mark.line + 1}" if mark else ""
+        raise UserError(f"{path}{line}: not valid YAML: {getattr(error, 'problem', None) or error}") from None
+    except (OmegaConfBaseException, UnicodeDecodeError) as error:
+        raise UserError(f"{path}: not valid YAML: {str(error).splitlines()[0]}") from None
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read: {error.strerror or error}") from None
+    if not isinstance(raw, dict):
+        raise UserError(f"{path}: expected sections of `key: value` lines, found a {type(raw).__name__}")
+    return typing.cast(dict[str, Any], raw)
+
+
+def to_yaml(plain: Mapping[str, Any]) -> str:
+    """YAML text that `read_yaml` reads back exactly."""
+    from omegaconf import OmegaConf
+
+    return OmegaConf.to_yaml(OmegaConf.create(dict(plain)))
+
+
+def unknown(what: str, given: str, allowed: Iterable[str]) -> UserError:
+    """The error for a name that does not exist: with the close ones first, then all allowed."""
+    names = list(allowed)
+    last = {n.rpartition(".")[2].lower(): n for n in names}
+    close = [last[n] for n in difflib.get_close_matches(given.rpartition(".")[2].lower(), last, n=3, cutoff=0.6)]
+    hint = f" Did you mean {' or '.join(close)}?" if close else ""
+    return UserError(f"{what} {given!r} is unknown.{hint} Allowed: {', '.join(names)}")
+
+
+def _train_layer(path: str | Path) -> dict[str, Any]:
+    """A --cfg_train file: a `ppo:` section alone, or its keys bare."""
+    raw = read_yaml(path)
+    if "ppo" not in raw:
+        return {"ppo": raw}
+    if len(raw) > 1:
+        raise UserError(
+            f"{path}: {', '.join(k for k in raw if k != 'ppo')}: beside `ppo:`, sections belong in --cfg_env"
+        )
+    return raw
+
+
+def _nested(key: str, value: Any) -> dict[str, Any]:
+    for part in reversed(key.split(".")):
+        value = {part: value}
+    return value
+
+
+def _override(text: str) -> Layer:
+    """`a.b=[1, 2]` as a layer; the value is YAML."""
+    import yaml
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+
+    key, equals, _ = text.partition("=")
+    if not equals or not re.fullmatch(r"\w[\w.:-]*", key):
+        raise UserError(f"override {text!r}: expected section.key=value, e.g. bayessim.components=5")
+    try:
+        value = OmegaConf.to_container(OmegaConf.from_dotlist(["value=" + text[len(key) + 1 :]]))
+    except (yaml.YAMLError, OmegaConfBaseException) as error:
+        raise UserError(f"override {text!r}: the value is not valid YAML: {str(error).splitlines()[0]}") from None
+    return f"override {text!r}", _nested(key, typing.cast(dict, value)["value"]), False
+
+
+def _build(task: str, layers: Sequence[Layer]) -> Config:
+    own = task_file(task)
+    base: list[Layer] = [(str(own), read_yaml(own), True)] if own.is_file() else []
+    declared = dict(base[0][1].get("env") or {}) if base else {}
+    merged: dict[str, Any] = {}
+    for source, raw, is_file in [*base, *layers]:
+        _merge(merged, raw, source, is_file, declared)
+    merged.pop("task_name", None)
+    known = {f.name for f in dataclasses.fields(EnvConfig)}
+    env = merged.pop("env", {})
+    options = {k: v for k, v in env.items() if k not in known}
+    sections: dict[str, Any] = {k: cls(**merged.pop(k, {})) for k, cls in SECTIONS.items() if k != "env"}
+    sections["env"] = EnvConfig(**{k: v for k, v in env.items() if k in known}, options=Frozen(freeze(options)))
+    return Config(task=task, randomization=Frozen(freeze(merged.pop("task", {}))), **sections, **merged)
+
+
+def _merge(merged: dict[str, Any], raw: Mapping[str, Any], source: str, is_file: bool, declared: Mapping) -> None:
+    """Check one layer and write it over what is there; the layer itself is never changed."""
+    for key, value in raw.items():
+        if key not in TOP_KEYS:
+            raise unknown(f"{source}: key", str(key), TOP_KEYS + _dotted(str(key)))
+        if key == "task_name":
+            if value != merged.setdefault("task_name", value):
+                raise UserError(f"{source}: task_name = {value!r}, but the task is {merged['task_name']!r}")
+        elif key in SECTIONS or key == "task":
+            if not isinstance(value or {}, Mapping):
+                raise UserError(f"{key} = {value!r} ({source}): expected a section of `key: value` lines")
+            merge = _merge_task if key == "task" else _merge_section
+            merge(merged.setdefault(key, {}), value or {}, source, is_file, key, declared)  # type: ignore[operator]
+        else:
+            merged[key] = _field(Config, key, value, key, source)
+    sizes = [(raw.get("env") or {}).get("numEnvs"), (raw.get("ppo") or {}).get("num_envs")]
+    given = [n for n in sizes if n is not None]
+    if given and given[0] != given[-1]:
+        raise UserError(f"{source}: env.numEnvs = {given[0]} and ppo.num_envs = {given[1]} are one setting; give one")
+    if given:
+        merged.setdefault("env", {})["numEnvs"] = merged.setdefault("ppo", {})["num_envs"] = given[0]
+
+
+def _merge_section(
+    merged: dict, raw: Mapping, source: str, is_file: bool, section: str, declared: Mapping[str, Any]
+) -> None:
+    cls = SECTIONS[section]
+    fields = [f.name for f in dataclasses.fields(cls) if f.name != "options"]  # type: ignore[arg-type]
+    extra = [k for k in declared if k not in fields] if section == "env" else []
+    for key, value in raw.items():
+        path = f"{section}.{key}"
+        if key in ("numEnvs", "num_envs") and value is None:
+            continue  # null: the other of the two names decides
+        if key in fields:
+            if key == "realParams" and isinstance(value, Mapping):
+                value = _real_params(value, {} if is_file else merged.get(key) or {}, source)
+            merged[key] = _field(cls, key, value, path, source)
+        elif key in extra:
+            merged[key] = _like(value, declared[key], path, source)
+        else:
+            raise unknown(f"{source}: key", path, [f"{section}.{k}" for k in [*fields, *extra]])
+
+
+def _real_params(value: Mapping, base: Mapping, source: str) -> dict[str, Any]:
+    """{weights, means, stds}; rows are lists, or {parameter name: value} (checked against the task's parameters)."""
+    wrong = next((k for k in value if k not in REAL_KEYS), None)
+    if wrong is not None:
+        raise unknown(f"{source}: key", f"env.realParams.{wrong}", [f"env.realParams.{k}" for k in REAL_KEYS])
+    return {**base, **value}
+
+
+def _merge_task(merged: dict, raw: Mapping, source: str, is_file: bool, section: str, declared: Mapping) -> None:
+    """`task:`: a file gives the randomised parameters whole, an override changes what is there."""
+    for key, value in raw.items():
+        if key not in TASK_KEYS:
+            raise unknown(f"{source}: key", f"task.{key}", [f"task.{k}" for k in TASK_KEYS])
+        if key == "randomize":
+            merged[key] = coerce(value, bool, "task.randomize", source)
+        else:
+            value = coerce(value or {}, Frozen, f"task.{key}", source)
+            merged[key] = thaw(value) if is_file else _deep(merged.get(key, {}), value, f"task.{key}", source)
+            _check_ranges(merged[key], f"task.{key}", source)
+
+
+def _deep(base: Any, change: Any, path: str, source: str) -> Any:
+    if not isinstance(change, Mapping) or not isinstance(base, Mapping):
+        return thaw(change)
+    allowed = list(dict.fromkeys([*base, *(RANDOMIZED_KEYS if "range" in base else ())]))
+    for key in change:
+        if key not in allowed and path.count(".") > 0:
+            raise unknown(f"{source}: key", f"{path}.{key}", [f"{path}.{k}" for k in allowed])
+    return {**base, **{k: _deep(base.get(k), v, f"{path}.{k}", source) for k, v in change.items()}}
+
+
+def _check_ranges(node: Any, path: str, source: str) -> None:
+    """Every `range` below `node` is [low, high] with low < high; other nonsense is the parameter space's to refuse."""
+    if not isinstance(node, Mapping):
+        return
+    if "range" in node:
+        low_high = coerce(node["range"], tuple[float, ...], f"{path}.range", source)
+        gaussian = node.get("distribution") == "gaussian"  # then the two numbers are mean and variance
+        if len(low_high) != 2 or (low_high[0] >= low_high[1] and not gaussian):
+            raise UserError(f"{path}.range = {list(low_high)} ({source}): expected [low, high] with low < high")
+        if node.get("operation", "scaling") not in OPERATIONS:
+            raise unknown(f"{source}: {path}.operation", str(node["operation"]), OPERATIONS)
+    for key, value in node.items():
+        _check_ranges(value, f"{path}.{key}", source)
+
+
+def _field(cls: type[Section], key: str, value: Any, path: str, source: str) -> Any:
+    name = next((n for n, y in YAML_NAMES.items() if cls is Config and y == key), key)
+    hint = typing.get_type_hints(cls)[name]
+    metadata = next(f.metadata for f in dataclasses.fields(cls) if f.name == name)  # type: ignore[arg-type]
+    return checked(value, hint, metadata, path, source)
+
+
+def _like(value: Any, default: Any, path: str, source: str) -> Any:
+    """A task's own setting: of the type its cfg file has."""
+    if default is None or value is None:
+        return value
+    if isinstance(default, list):
+        return coerce(value, tuple[Any, ...], path, source)
+    return coerce(value, dict if isinstance(default, Mapping) else type(default), path, source)
+
+
+def _dotted(key: str) -> list[str]:
+    """Full names of the section keys that are called nearly `key`: the hint for a forgotten section."""
+    names = {f.name: f"{s}.{f.name}" for s, cls in SECTIONS.items() for f in dataclasses.fields(cls)}  # type: ignore[arg-type]
+    return [names[n] for n in difflib.get_close_matches(key, names, n=2, cutoff=0.7)]

@@ -7,7 +7,7 @@ import dataclasses
 import math
 import types
 import typing
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -60,10 +60,8 @@ class Section:
     def __post_init__(self) -> None:
         hints = typing.get_type_hints(type(self))
         for f in dataclasses.fields(self):  # type: ignore[arg-type]
-            path = f"{self.SECTION}.{f.name}".lstrip(".")
-            value = coerce(getattr(self, f.name), hints[f.name], path)
-            check_limits(value, f.metadata, path)
-            object.__setattr__(self, f.name, value)
+            path = f"{self.SECTION}.{YAML_NAMES.get(f.name, f.name) if not self.SECTION else f.name}".lstrip(".")
+            object.__setattr__(self, f.name, checked(getattr(self, f.name), hints[f.name], f.metadata, path))
         self.check()
 
     def check(self) -> None:
@@ -72,6 +70,25 @@ class Section:
     def to_dict(self) -> dict[str, Any]:
         """Plain dicts and lists, as written to YAML."""
         return {f.name: thaw(getattr(self, f.name)) for f in dataclasses.fields(self)}  # type: ignore[arg-type]
+
+
+def checked(value: Any, annotation: Any, metadata: Mapping[str, Any], path: str, source: str = "") -> Any:
+    """`value` with its short form spelt out, of the right type and within the limits; else a UserError."""
+    if "spell" in metadata:
+        value = metadata["spell"](value)
+    value = coerce(value, annotation, path, source)
+    check_limits(value, metadata, path, source)
+    return value
+
+
+def _prefixed(prefix: str) -> Callable[[Any], Any]:
+    """Short names: `random` for `policy_random`."""
+    return lambda value: prefix + value if isinstance(value, str) and not value.startswith(prefix) else value
+
+
+def _none(value: Any) -> Any:
+    """BayesSimIG writes `None` where YAML reads a string."""
+    return None if value == "None" else value
 
 
 def coerce(value: Any, annotation: Any, path: str, source: str = "") -> Any:
@@ -131,7 +148,7 @@ class EnvConfig(Section):
     SECTION: typing.ClassVar[str] = "env"
     numEnvs: int = setting(256, "worlds simulated in parallel; the same number as ppo.num_envs", low=1)
     episodeLength: int | None = setting(None, "control steps per episode; null: the task's own", low=1)
-    realParams: Frozen | None = setting(None, "surrogate real: {weights, means, stds} or {parameter name: value}")
+    realParams: Frozen | None = setting(None, "surrogate real: {weights, means, stds}, rows or {name: value}")
     options: Frozen = field(default_factory=Frozen, metadata={"doc": "settings of this task alone"})
 
     def to_dict(self) -> dict[str, Any]:
@@ -164,12 +181,16 @@ class BayesSimConfig(Section):
     SECTION: typing.ClassVar[str] = "bayessim"
     trainTrajs: int = setting(10000, "simulated trajectories collected per round", low=1)
     collectPolicy: str = setting(
-        "policy_random", "actions while collecting (symmetric random)", choices=COLLECT_POLICIES
+        "policy_random", "actions while collecting", choices=COLLECT_POLICIES, spell=_prefixed("policy_")
     )
-    summarizerFxn: str = setting("summary_start", "trajectory summary", choices=SUMMARIZERS)
+    summarizerFxn: str = setting(
+        "summary_start", "trajectory summary", choices=SUMMARIZERS, spell=_prefixed("summary_")
+    )
     trainTrajLen: int = setting(20, "control steps per training trajectory (arrays have one more row)", low=1)
     ftune: bool = setting(True, "keep one network over all rounds; False: a new one each round")
-    modelClass: str | None = setting("MDNN", "MDNN, MDRFF[_<kernel>[_<sigma>]]; None: plain uniform randomisation")
+    modelClass: str | None = setting(
+        "MDNN", "MDNN, MDRFF[_<kernel>[_<sigma>]]; None: plain uniform randomisation", spell=_none
+    )
     components: int = setting(10, "mixture components", low=1)
     fullCovariance: bool = setting(False, "full covariance per component")
     hiddenLayers: tuple[int, ...] = setting((128, 128), "widths of the network", low=1)
@@ -178,7 +199,7 @@ class BayesSimConfig(Section):
     realTrajs: int = setting(1, "real trajectories used for inference each round (they accumulate)", low=1)
     realIters: int = setting(100, "rounds of the outer loop", low=1)
     ftuneRL: bool = setting(False, "keep training one policy over all rounds; False: a new one each round")
-    policyCheckpt: str | None = setting(None, "checkpoint of a policy to start from")
+    policyCheckpt: str | None = setting(None, "checkpoint of a policy to start from", spell=_none)
 
     def check(self) -> None:
         if self.modelClass is not None and self.modelClass.split("_")[0] not in ("MDNN", "MDRFF"):
@@ -294,6 +315,3 @@ class Config(Section):
 
 
 YAML_NAMES = {"task": "task_name", "randomization": "task"}
-SECTIONS: dict[str, type[Section]] = {
-    "env": EnvConfig, "bayessim": BayesSimConfig, "ppo": PPOConfig, "real": RealConfig, "monitor": MonitorConfig,
-}  # fmt: skip
