@@ -1,0 +1,117 @@
+"""Mixture algebra on the host in float64: products of Gaussian mixtures with a flat part, and reduction.
+
+A `Mixture` is  exp(flat) + sum_k exp(log_weights_k) N(means_k, covs_k)  on the unit cube, up to a constant factor.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import log_ndtr
+
+NEGLIGIBLE = 1e-8  # relative mass below which a component is dropped
+CROWD = 96  # components kept before merging (bounds the pairwise work)
+
+
+class Mixture(NamedTuple):
+    """Unnormalised density on the unit cube; flat is -inf where there is no uniform part."""
+
+    flat: float
+    log_weights: np.ndarray  # [K]
+    means: np.ndarray  # [K, d]
+    covs: np.ndarray  # [K, d, d]
+
+
+def product(a: Mixture, b: Mixture) -> Mixture:
+    """All pairwise products, closed form: N(m1,S1) N(m2,S2) = N(m1; m2, S1+S2) N(m, S), S^-1 = S1^-1 + S2^-1."""
+    weights, means, covs = _pairs(a, b)
+    terms = [(weights, means, covs)]
+    if np.isfinite(b.flat):
+        terms.append((a.log_weights + b.flat, a.means, a.covs))
+    if np.isfinite(a.flat):
+        terms.append((b.log_weights + a.flat, b.means, b.covs))
+    joined = [np.concatenate(part) for part in zip(*terms, strict=True)]
+    return _rescaled(Mixture(a.flat + b.flat, *joined))
+
+
+def _pairs(a: Mixture, b: Mixture) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    d = a.means.shape[1]
+    total = a.covs[:, None] + b.covs[None, :]  # [Ka, Kb, d, d]
+    gain = np.swapaxes(np.linalg.solve(total, np.broadcast_to(a.covs[:, None], total.shape)), -1, -2)  # S1 (S1+S2)^-1
+    delta = b.means[None, :] - a.means[:, None]
+    means = a.means[:, None] + np.einsum("abij,abj->abi", gain, delta)
+    covs = np.einsum("abij,bjk->abik", gain, b.covs)
+    maha = np.einsum("abi,abi->ab", delta, np.linalg.solve(total, delta[..., None])[..., 0])
+    overlap = -0.5 * (maha + np.linalg.slogdet(total)[1] + d * np.log(2 * np.pi))
+    weights = a.log_weights[:, None] + b.log_weights[None, :] + overlap
+    return weights.reshape(-1), means.reshape(-1, d), _symmetric(covs.reshape(-1, d, d))
+
+
+def reduce(mixture: Mixture, components: int) -> Mixture:
+    """Drop negligible components, then merge the pair that costs least (Runnalls 2007, eq. 16) until K are left."""
+    mixture = prune(mixture)
+    weights, means, covs = np.exp(np.maximum(mixture.log_weights, -600.0)), mixture.means, mixture.covs
+    if len(weights) <= components:
+        return mixture
+    cost = _cost_table(weights, means, covs)
+    while len(weights) > components:
+        i, j = np.unravel_index(np.argmin(cost), cost.shape)
+        i, j = int(min(i, j)), int(max(i, j))
+        weights, means, covs = _merge(weights, means, covs, i, j)
+        cost = np.delete(np.delete(cost, j, 0), j, 1)
+        row = _costs_to(weights, means, covs, i)
+        cost[i, :], cost[:, i] = row, row
+    return Mixture(mixture.flat, np.log(weights), means, covs)
+
+
+def prune(mixture: Mixture) -> Mixture:
+    """Drop components whose mass inside the cube is negligible, and all but the CROWD heaviest."""
+    scores = mixture.log_weights + log_mass_bound(mixture.means, mixture.covs)
+    keep = scores > max(scores.max(), mixture.flat) + np.log(NEGLIGIBLE)
+    keep &= scores >= np.sort(scores)[-min(CROWD, len(scores))]
+    keep |= scores == scores.max()
+    return _rescaled(Mixture(mixture.flat, mixture.log_weights[keep], mixture.means[keep], mixture.covs[keep]))
+
+
+def log_mass_bound(means: np.ndarray, covs: np.ndarray) -> np.ndarray:
+    """Each Gaussian's log mass beyond the nearest wall of the cube (log 1/2 for a mean inside), [K]: a cheap bound."""
+    sd = np.sqrt(np.diagonal(covs, axis1=1, axis2=2))
+    return np.min(log_ndtr(np.minimum(np.minimum(means, 1 - means) / sd, 0)), axis=1)
+
+
+def _rescaled(mixture: Mixture) -> Mixture:
+    top = max(float(mixture.log_weights.max()), mixture.flat)
+    return mixture._replace(flat=mixture.flat - top, log_weights=mixture.log_weights - top)
+
+
+def _symmetric(covs: np.ndarray) -> np.ndarray:
+    return 0.5 * (covs + np.swapaxes(covs, -1, -2))
+
+
+def _join(w: np.ndarray, m: np.ndarray, c: np.ndarray, i: int, j: np.ndarray | int) -> tuple:
+    """Moments of component i joined with each of the components j."""
+    share = (w[i] / (w[i] + w[j]))[..., None]
+    gap = m[i] - m[j]
+    mean = share * m[i] + (1 - share) * m[j]
+    spread = (share * (1 - share))[..., None] * gap[..., :, None] * gap[..., None, :]
+    return mean, share[..., None] * c[i] + (1 - share[..., None]) * c[j] + spread
+
+
+def _costs_to(w: np.ndarray, m: np.ndarray, c: np.ndarray, i: int) -> np.ndarray:
+    """Runnalls' bound on the divergence of merging i with every other: 1/2 [(wi+wj) ln|Sij| - wi ln|Si| - wj ln|Sj|]."""
+    everyone = np.arange(len(w))
+    log_det = np.linalg.slogdet(c)[1]
+    joint = np.linalg.slogdet(_join(w, m, c, i, everyone)[1])[1]
+    cost = 0.5 * ((w[i] + w) * joint - w[i] * log_det[i] - w * log_det)
+    cost[i] = np.inf
+    return cost
+
+
+def _cost_table(w: np.ndarray, m: np.ndarray, c: np.ndarray) -> np.ndarray:
+    return np.stack([_costs_to(w, m, c, i) for i in range(len(w))])
+
+
+def _merge(w: np.ndarray, m: np.ndarray, c: np.ndarray, i: int, j: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    mean, cov = _join(w, m, c, i, j)
+    w, m, c = w.copy(), m.copy(), c.copy()
+    w[i], m[i], c[i] = w[i] + w[j], mean, _symmetric(cov)
+    return np.delete(w, j), np.delete(m, j, 0), np.delete(c, j, 0)

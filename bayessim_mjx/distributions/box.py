@@ -1,0 +1,135 @@
+"""Gaussians inside the unit cube: mass, quadrature and draws by the separation of variables of Genz (1992).
+
+Coordinate by coordinate a standard normal is drawn from the interval that keeps the point inside; the product of the
+interval masses is the importance weight. Exact for one dimension and for diagonal covariances.
+"""
+
+from functools import lru_cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.scipy.special import log_ndtr, ndtr, ndtri
+
+MASS_POINTS = 512  # quasi-Monte-Carlo points behind every log_inside
+
+
+@lru_cache(maxsize=64)
+def lattice(n: int, d: int) -> np.ndarray:
+    """Richtmyer points frac(i sqrt(prime_j) + shift) in the open unit cube, [n, d] float32, always the same."""
+    primes: list[int] = []
+    candidate = 2
+    while len(primes) < d:
+        if all(candidate % p for p in primes):
+            primes.append(candidate)
+        candidate += 1
+    steps = np.arange(1, n + 1)[:, None] * np.sqrt(np.asarray(primes, np.float64))[None, :]
+    points = (steps + np.random.default_rng(0).random(d)[None, :]) % 1.0
+    return np.clip(points, 1e-6, 1 - 1e-6).astype(np.float32)
+
+
+def _lower_side(a: Array, b: Array) -> tuple[Array, Array, Array]:
+    """Mirror intervals that lie on the positive side: there float32 cannot tell Phi from 1."""
+    flip = a + b > 0
+    return jnp.where(flip, -b, a), jnp.where(flip, -a, b), flip
+
+
+def log_interval(a: Array, b: Array) -> Array:
+    """log(Phi(b) - Phi(a)) for a < b, stable in both tails."""
+    a, b, _ = _lower_side(a, b)
+    upper = log_ndtr(b)
+    return upper + jnp.log(jnp.maximum(-jnp.expm1(log_ndtr(a) - upper), 1e-30))
+
+
+def truncated_normal(a: Array, b: Array, w: Array) -> Array:
+    """Standard normal restricted to [a, b] from uniforms w, by inversion; Marsaglia's tail formula beyond 5 sd."""
+    low, high, flip = _lower_side(a, b)
+    pa, pb = ndtr(low), ndtr(high)
+    centre = ndtri(jnp.clip(pa + w * (pb - pa), 1e-37, 1.0))
+    edge = jnp.minimum(high, -5.0)
+    # y^2 = b^2 - 2 log(1 - w (1 - exp((b^2 - a^2) / 2)))
+    drop = -jnp.expm1(jnp.minimum(edge * edge - low * low, 0.0) / 2)
+    tail = -jnp.sqrt(edge * edge - 2 * jnp.log(jnp.maximum(1 - w * drop, 1e-30)))
+    y = jnp.clip(jnp.where(high < -5.0, tail, centre), low, high)
+    return jnp.where(flip, -y, y)
+
+
+def separate(mean: Array, scale: Array, w: Array) -> tuple[Array, Array]:
+    """Points of N(mean, scale scale^T) forced into the cube. mean [d], scale [d, d] lower, w [n, d] uniforms.
+
+    Returns points [n, d] and log weights [n]; the mean of exp(log weights) is the Gaussian's mass in the cube.
+    """
+    n, d = w.shape
+
+    def coordinate(carry: tuple[Array, Array], i: Array) -> tuple[tuple[Array, Array], None]:
+        z, log_weight = carry
+        centre = mean[i] + z @ scale[i]  # the columns from i on are still zero
+        a, b = -centre / scale[i, i], (1 - centre) / scale[i, i]
+        z = z.at[:, i].set(truncated_normal(a, b, w[:, i]))
+        return (z, log_weight + log_interval(a, b)), None
+
+    start = jnp.zeros((n, d), jnp.float32), jnp.zeros((n,), jnp.float32)
+    (z, log_weight), _ = jax.lax.scan(coordinate, start, jnp.arange(d))
+    return jnp.clip(mean[None, :] + z @ scale.T, 0.0, 1.0), log_weight
+
+
+def log_masses(means: Array, scales: Array, points: int = MASS_POINTS) -> Array:
+    """Log mass of each Gaussian inside the cube: means [K, d], scales [K, d, d] -> [K]."""
+    w = jnp.asarray(lattice(points, means.shape[-1]))
+    weights = jax.vmap(lambda m, s: separate(m, s, w)[1])(means, scales)
+    return jnp.minimum(jax.nn.logsumexp(weights, axis=1) - np.log(points).astype(np.float32), 0.0)
+
+
+def log_density(u: Array, means: Array, scales: Array) -> Array:
+    """Untruncated log N(u_n; mean_k, scale_k scale_k^T): u [n, d], means [K, d], scales [K, d, d] -> [n, K]."""
+    d = means.shape[-1]
+    deviation = jnp.swapaxes(u[None, :, :] - means[:, None, :], 1, 2)  # [K, d, n]
+    z = jax.scipy.linalg.solve_triangular(scales, deviation, lower=True)
+    log_det = jnp.sum(jnp.log(jnp.diagonal(scales, axis1=-2, axis2=-1)), axis=-1)
+    constant = np.float32(0.5 * d * np.log(2 * np.pi))
+    return (-0.5 * jnp.sum(z * z, axis=1) - log_det[:, None] - constant).T
+
+
+def draw(
+    key: Array, logits: Array, means: Array, scales: Array, done: Array, u: Array, tries: int, spare: int
+) -> Array:
+    """Fill the rows of u [n, d] that are not `done` [n] with draws of the mixture truncated to the cube.
+
+    Exact rejection for `tries` rounds; rows still missing (little mass inside) are picked from `spare` points of
+    `separate` by their weights, so that every row is inside the cube whatever the mixture.
+    """
+    key_loop, key_spare = jax.random.split(key)
+    n, d = u.shape
+
+    def propose(key: Array) -> Array:
+        key_k, key_z = jax.random.split(key)
+        k = jax.random.categorical(key_k, logits, shape=(n,))
+        z = jax.random.normal(key_z, (n, d))
+        return means[k] + jnp.einsum("nij,nj->ni", scales[k], z)
+
+    def attempt(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        i, done, u = carry
+        new = propose(jax.random.fold_in(key_loop, i))
+        inside = jnp.all((new >= 0) & (new <= 1), axis=-1)
+        take = inside & ~done
+        return i + 1, done | inside, jnp.where(take[:, None], new, u)
+
+    _, done, u = jax.lax.while_loop(
+        lambda c: (c[0] < tries) & ~jnp.all(c[1]), attempt, (jnp.asarray(0, jnp.int32), done, u)
+    )
+
+    def rescue(u: Array) -> Array:
+        picked = jax.vmap(lambda k: _pick(k, logits, means, scales, spare))(jax.random.split(key_spare, n))
+        return jnp.where(done[:, None], u, picked)
+
+    return jax.lax.cond(jnp.all(done), lambda u: u, rescue, u)
+
+
+def _pick(key: Array, logits: Array, means: Array, scales: Array, spare: int) -> Array:
+    """One point of the truncated mixture by sampling-importance-resampling among `spare` separated points -> [d]."""
+    key_k, key_w, key_pick = jax.random.split(key, 3)
+    k = jax.random.categorical(key_k, logits, shape=(spare,))
+    w = jax.random.uniform(key_w, (spare, 1, means.shape[-1]), minval=1e-6, maxval=1 - 1e-6)
+    points, weights = jax.vmap(separate)(means[k], scales[k], w)
+    return points[jax.random.categorical(key_pick, weights[:, 0]), 0]

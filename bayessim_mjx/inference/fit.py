@@ -1,0 +1,237 @@
+"""Training of the inference network in one jitted program, and conditioning it on measured summaries.
+
+Arrays are padded to a capacity and the number of rows is traced: a growing data set does not recompile.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from flax import struct
+from jax import Array
+
+from bayessim_mjx.distributions import Distribution
+from bayessim_mjx.inference import mdn
+from bayessim_mjx.inference.settings import InferenceSettings
+
+GOLDEN = np.uint32(2654435769)  # 2^32 / golden ratio: spreads the validation rows evenly over any number of rows
+SCORED = 256  # validation rows for which the truncated density is reported
+CURVE = 40  # points of the loss curves, at least
+
+
+@struct.dataclass
+class FitState:
+    """What the next fit needs: weights and the standardisation of the inputs. Arrays only, but for the two settings."""
+
+    params: Any
+    x_mean: Array  # [D]
+    x_rate: Array  # [D] 1 / sd of the first fit's data; 0 drops a constant column
+    fits: Array  # [] int32, fits done so far
+    settings: InferenceSettings = struct.field(pytree_node=False)
+    space: Any = struct.field(pytree_node=False)
+
+
+@struct.dataclass
+class FitInfo:
+    """What a person wants to see. Scores are means over held-out rows, in nats."""
+
+    train_loss: Array  # [E] negative log density relative to the prior
+    val_loss: Array  # [E]
+    steps: Array  # [] gradient steps taken
+    best: Array  # [] index into the curves of the weights kept; -1: those before this fit
+    gain: Array  # [] log q(theta | x) - log p(theta), density not truncated
+    gain_truncated: Array  # [] the same for the truncated density, over the first 256 held-out rows
+    log_q: Array  # [] truncated log density in theta units: gain_truncated + log p(theta)
+    inside: Array  # [] mean mass of the untruncated mixture inside the box
+    clipped: Array  # [] share of input entries clipped
+    n_train: Array  # []
+    n_val: Array  # []
+    n_invalid: Array  # [] rows left out: not finite, or theta outside the box
+    skipped: Array  # [] steps left out because the gradient was not finite
+
+
+class _Data(NamedTuple):
+    x: Array  # [N, D] standardised
+    y: Array  # [N, d]
+    train: Array  # [N] bool
+    held: Array  # [V] indices of held-out rows, padded
+    mask: Array  # [V] float32
+
+
+def init(key: Array, settings: InferenceSettings, space: Any, dim_x: int) -> FitState:
+    """Fresh network for summaries of `dim_x` features and the parameters of `space`."""
+    if dim_x < 1:
+        raise ValueError(f"dim_x = {dim_x}: a summary needs at least one feature")
+    params = mdn.init(key, settings, dim_x, len(space))
+    return FitState(params, jnp.zeros(dim_x), jnp.ones(dim_x), jnp.asarray(0, jnp.int32), settings, space)
+
+
+def fit(
+    key: Array, state: FitState, thetas: Array, x: Array, count: int | Array | None = None
+) -> tuple[FitState, FitInfo]:
+    """Maximum likelihood on the first `count` rows of thetas [N, d] and x [N, D]; the rest is padding.
+
+    Goes on from the weights in `state` with a fresh schedule. The weights with the best held-out score are kept, the
+    starting ones included. Inputs keep the standardisation of the first fit. ValueError on wrong shapes or no usable row.
+    """
+    count = thetas.shape[0] if count is None else count
+    d, dim_x = len(state.space), state.x_mean.shape[0]
+    if thetas.ndim != 2 or x.ndim != 2 or thetas.shape[1] != d or x.shape != (thetas.shape[0], dim_x):
+        raise ValueError(f"need thetas [N, {d}] and x [N, {dim_x}], not {thetas.shape} and {x.shape}")
+    if isinstance(count, int | np.integer) and not 1 <= count <= thetas.shape[0]:
+        raise ValueError(f"count = {count}: the arrays hold {thetas.shape[0]} rows")
+    thetas, x = jnp.asarray(thetas, jnp.float32), jnp.asarray(x, jnp.float32)
+    state, info = _fit(key, state, thetas, x, jnp.asarray(count, jnp.int32))
+    if not isinstance(info.n_train, jax.core.Tracer) and int(info.n_train) == 0:
+        raise ValueError(f"none of the {int(count)} rows is usable: summaries not finite, or thetas outside the box")
+    return state, info
+
+
+def condition(state: FitState, x: Array) -> Distribution:
+    """Posterior of each summary x [n, D]: a Distribution whose leaves have the leading axis n (see its `split`)."""
+    if x.ndim != 2 or x.shape[1] != state.x_mean.shape[0]:
+        raise ValueError(f"need summaries [n, {state.x_mean.shape[0]}], not {x.shape}")
+    return _condition(state, jnp.asarray(x, jnp.float32))
+
+
+@jax.jit
+def _condition(state: FitState, x: Array) -> Distribution:
+    d = len(state.space)
+    z, _ = _standardise(x, state.x_mean, state.x_rate, state.settings.clip)
+    logits, means, scales = mdn.mixture(state.params, z, d, state.settings)
+    return jax.vmap(partial(Distribution.from_unit, state.space))(logits, means, scales)
+
+
+def schedule_length(settings: InferenceSettings, capacity: int) -> tuple[int, int]:
+    """(points of the loss curve, gradient steps per point) for arrays of `capacity` rows."""
+    per_epoch = -(-capacity // settings.batch)
+    total = min(max(settings.epochs * per_epoch, settings.min_steps), settings.max_steps)
+    chunk = max(1, min(per_epoch, total // CURVE)) if per_epoch > 1 else max(1, total // (2 * CURVE))
+    return -(-total // chunk), chunk
+
+
+@jax.jit
+def _fit(key: Array, state: FitState, thetas: Array, x: Array, count: Array) -> tuple[FitState, FitInfo]:
+    settings = state.settings
+    state, data, clipped, n_invalid = _prepare(state, thetas, x, count)
+    points, chunk = schedule_length(settings, x.shape[0])
+    optimiser = optax.chain(
+        optax.clip_by_global_norm(settings.grad_clip),
+        optax.adamw(optax.cosine_decay_schedule(settings.lr, points * chunk), weight_decay=settings.weight_decay),
+    )
+    n_train = jnp.sum(data.train.astype(jnp.int32))
+    batch = min(settings.batch, x.shape[0])
+
+    def loss(params: Any, rows: Array) -> Array:
+        return -jnp.mean(mdn.log_prob(params, data.x[rows], data.y[rows], settings))
+
+    def step(carry: tuple, rows: Array) -> tuple[tuple, Array]:
+        params, opt_state, skipped = carry
+        value, gradient = jax.value_and_grad(loss)(params, rows)
+        usable = jnp.isfinite(optax.global_norm(gradient))
+        updates, new_opt = optimiser.update(gradient, opt_state, params)
+        new = optax.apply_updates(params, updates), new_opt
+        params, opt_state = jax.tree.map(lambda a, b: jnp.where(usable, a, b), new, (params, opt_state))
+        return (params, opt_state, skipped + 1 - usable.astype(jnp.int32)), value
+
+    def point(carry: tuple, inputs: tuple[Array, Array]) -> tuple[tuple, tuple[Array, Array]]:
+        inner, best = carry
+        i, key = inputs
+        # a fresh order of the training rows; batches walk through it and wrap around
+        order = jnp.argsort(jnp.where(data.train, jax.random.uniform(key, data.train.shape), jnp.inf))
+        place = jnp.arange(chunk * batch, dtype=jnp.int32).reshape(chunk, batch) % jnp.maximum(n_train, 1)
+        inner, losses = jax.lax.scan(step, inner, order[place])
+        value = _held_out_loss(inner[0], data, settings)
+        better = value < best[0]
+        candidate = (value, inner[0], i)
+        best = jax.tree.map(lambda a, b: jnp.where(better, a, b), candidate, best)
+        return (inner, best), (jnp.mean(losses), value)
+
+    start = (state.params, optimiser.init(state.params), jnp.asarray(0, jnp.int32))
+    # a network that has not seen data yet is no candidate
+    value = jnp.where(state.fits == 0, jnp.inf, _held_out_loss(state.params, data, settings))
+    best = (value, state.params, jnp.asarray(-1, jnp.int32))
+    inputs = jnp.arange(points, dtype=jnp.int32), jax.random.split(key, points)
+    (inner, best), (train_loss, val_loss) = jax.lax.scan(point, (start, best), inputs)
+
+    state = state.replace(params=best[1], fits=state.fits + 1)
+    constant = np.float32(thetas.shape[1] * np.log(mdn.SPREAD))  # density of y -> density of u
+    info = FitInfo(
+        train_loss=train_loss - constant,
+        val_loss=val_loss - constant,
+        steps=jnp.asarray(points * chunk, jnp.int32),
+        best=best[2],
+        gain=constant - _held_out_loss(state.params, data, settings),
+        **_truncated_scores(state, data, thetas),
+        clipped=clipped,
+        n_train=n_train,
+        n_val=jnp.sum(data.mask).astype(jnp.int32),
+        n_invalid=n_invalid,
+        skipped=inner[2],
+    )
+    return state, info
+
+
+def _prepare(state: FitState, thetas: Array, x: Array, count: Array) -> tuple[FitState, _Data, Array, Array]:
+    """Mask, standardise and split. The split depends on the row number only, so it survives from fit to fit."""
+    rows = jnp.arange(x.shape[0], dtype=jnp.int32)
+    given = rows < count
+    valid = given & jnp.all(jnp.isfinite(x), axis=1) & jax.vmap(state.space.contains)(thetas)
+    nominal = jnp.asarray(state.space.nominal)[None, :]
+    u = jnp.clip(jax.vmap(state.space.to_unit)(jnp.where(valid[:, None], thetas, nominal)), 0, 1)
+    x = jnp.where(valid[:, None], x, 0.0)
+    mean, rate = _column_scales(x, valid)
+    first = state.fits == 0
+    mean, rate = jnp.where(first, mean, state.x_mean), jnp.where(first, rate, state.x_rate)
+    z, clipped = _standardise(x, mean, rate, state.settings.clip)
+
+    share = np.uint32(round(state.settings.validation * 2**32))
+    held = valid & (rows.astype(jnp.uint32) * GOLDEN < share)
+    held = jnp.where(jnp.any(held), held, valid)  # a handful of rows: better to validate on them than not at all
+    room = min(x.shape[0], int(state.settings.validation * x.shape[0]) + 8, 4096)
+    order = jnp.argsort(~held)[:room]
+    train = jnp.where(jnp.any(valid & ~held), valid & ~held, valid)
+    data = _Data(z, mdn.to_y(u), train, order, held[order].astype(jnp.float32))
+    n_invalid = jnp.sum((given & ~valid).astype(jnp.int32))
+    share_clipped = jnp.sum(jnp.where(valid[:, None], clipped, 0.0)) / jnp.maximum(jnp.sum(valid) * x.shape[1], 1)
+    return state.replace(x_mean=mean, x_rate=rate), data, share_clipped, n_invalid
+
+
+def _column_scales(x: Array, valid: Array) -> tuple[Array, Array]:
+    """Mean and 1 / sd per column over the valid rows; 0 where a column does not vary beyond rounding."""
+    n = jnp.maximum(jnp.sum(valid.astype(jnp.float32)), 1.0)
+    mean = jnp.sum(x, axis=0) / n
+    deviation = jnp.where(valid[:, None], x - mean[None, :], 0.0)
+    sd = jnp.sqrt(jnp.sum(deviation**2, axis=0) / n)
+    varies = sd > 1e-5 * jnp.abs(mean) + 1e-12
+    return mean, jnp.where(varies, 1.0 / jnp.where(varies, sd, 1.0), 0.0)
+
+
+def _standardise(x: Array, mean: Array, rate: Array, clip: float) -> tuple[Array, Array]:
+    z = (x - mean[None, :]) * rate[None, :]
+    return jnp.clip(z, -clip, clip), (jnp.abs(z) > clip).astype(jnp.float32)
+
+
+def _held_out_loss(params: Any, data: _Data, settings: InferenceSettings) -> Array:
+    value = mdn.log_prob(params, data.x[data.held], data.y[data.held], settings)
+    return -jnp.sum(jnp.where(data.mask > 0, value, 0.0)) / jnp.sum(data.mask)
+
+
+def _truncated_scores(state: FitState, data: _Data, thetas: Array) -> dict[str, Array]:
+    rows, mask = data.held[:SCORED], data.mask[:SCORED]
+    logits, means, scales = mdn.mixture(state.params, data.x[rows], thetas.shape[1], state.settings)
+    posterior = jax.vmap(partial(Distribution.from_unit, state.space))(logits, means, scales)
+    truth = jnp.where(mask[:, None] > 0, thetas[rows], jnp.asarray(state.space.nominal)[None, :])
+    gain = jax.vmap(lambda q, theta: q.log_gain(theta))(posterior, truth)
+    prior = jax.vmap(state.space.log_prior)(truth)
+
+    def average(value: Array) -> Array:
+        return jnp.sum(jnp.where(mask > 0, value, 0.0)) / jnp.sum(mask)
+
+    scores = {"gain_truncated": average(gain), "log_q": average(gain + prior)}
+    return {**scores, "inside": average(jnp.exp(posterior.log_inside))}
