@@ -1,0 +1,289 @@
+"""Env: Brax's functional protocol plus `reset(key, theta)`; Task: the base of the MuJoCo tasks in tasks/.
+
+An environment never resets itself: `done` is the termination of this step, `info["truncated"]` the time limit.
+"""
+
+import abc
+import difflib
+import functools
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from flax import struct
+
+from bayessim_mjx.effects.effect import Effect
+from bayessim_mjx.errors import UserError
+from bayessim_mjx.parameters import ParameterSpace
+from bayessim_mjx.physics import Physics, World, control_step, mjx
+
+Observations = dict[str, jax.Array]
+SignedPermutation = tuple[np.ndarray, np.ndarray]
+VARIANTS = ("isaacgymenvs", "bayessim2021")
+
+
+@struct.dataclass
+class State:
+    """What `reset` and `step` return; Brax's field names.
+
+    Attributes:
+        pipeline_state: what the next step needs (`World` in our own tasks).
+        obs: groups of observations, "policy" always; "state" and "privileged_state" are the names Brax looks up.
+        reward: `[]` float32; done: `[]` float32, 1 where this step terminated the episode.
+        metrics: scalars to look at.
+        info: `terminated`, `truncated` (float32), `final_observation` (this step's obs, before any auto-reset), `steps`
+            (int32, since reset); wrappers may add keys, which are kept.
+    """
+
+    pipeline_state: Any
+    obs: Observations
+    reward: jax.Array
+    done: jax.Array
+    metrics: dict[str, jax.Array] = struct.field(default_factory=dict)
+    info: dict[str, Any] = struct.field(default_factory=dict)
+
+
+class Env(abc.ABC):
+    """An environment. Pure and stateless: `reset` and `step` may be jitted, vmapped and scanned."""
+
+    name: str = ""
+    backend: str = "mjx"
+    episode_length: int
+    mirror: dict[str, SignedPermutation] | None = None
+
+    @abc.abstractmethod
+    def reset(self, key: jax.Array, theta: jax.Array | None = None) -> State:
+        """Start an episode with parameters `theta` `[d]` (None: nominal)."""
+
+    @abc.abstractmethod
+    def step(self, state: State, action: jax.Array) -> State:
+        """One control step with `action` `[action_size]` in [-1, 1]."""
+
+    @property
+    @abc.abstractmethod
+    def action_size(self) -> int:
+        """Number of actions."""
+
+    @property
+    @abc.abstractmethod
+    def dt(self) -> float:
+        """Control step, s."""
+
+    @property
+    @abc.abstractmethod
+    def space(self) -> ParameterSpace:
+        """The randomised parameters."""
+
+    @property
+    @abc.abstractmethod
+    def mj_model(self) -> mujoco.MjModel:
+        """The nominal MuJoCo model."""
+
+    @functools.cached_property
+    def observation_size(self) -> dict[str, tuple[int, ...]]:
+        """Shape of each observation group."""
+        state = jax.eval_shape(self.reset, jax.random.PRNGKey(0))
+        return {group: value.shape for group, value in state.obs.items()}
+
+    @property
+    def unwrapped(self) -> "Env":
+        """The environment itself."""
+        return self
+
+
+class Task(Env):
+    """Base of the MuJoCo tasks. A subclass gives the model and `initial`, `command`, `observe`, `reward`.
+
+    Args:
+        config: settings of `env:` (a mapping, or `config.EnvConfig`): `episodeLength`, `variant` and the task's own keys,
+            which are listed with their defaults in `options`.
+        randomization: the BayesSimIG `task:` section (key `randomization_params`); None or empty: the task's default.
+        effects: unmodelled effects to simulate.
+
+    Raises:
+        UserError: on an unknown setting or variant; ValueError: on bad parameters or effects.
+    """
+
+    control_dt: ClassVar[float]
+    default_episode_length: ClassVar[int]
+    options: ClassVar[dict[str, Any]] = {}
+    randomization: ClassVar[dict[str, Any]]
+    real_parameters: ClassVar[Sequence[float]]
+    observation_names: ClassVar[tuple[str, ...]]
+    observation_clip: ClassVar[dict[str, float | None]] = {"isaacgymenvs": None, "bayessim2021": 100.0}
+    max_qvel: ClassVar[float | None] = None
+    diverged_reward: ClassVar[float] = 0.0
+
+    def __init__(
+        self,
+        config: Mapping[str, Any] | Any = None,
+        randomization: Mapping[str, Any] | None = None,
+        effects: Sequence[Effect] = (),
+    ) -> None:
+        self.name = type(self).__name__
+        self.settings = self._read(config if config is not None else {})
+        self.variant: str = self.settings["variant"]
+        self.episode_length = int(self.settings["episodeLength"])
+        mj_model = self.spec().compile()
+        section = (randomization or self.randomization).get("randomization_params", {})
+        space = ParameterSpace.from_config(section, mj_model)
+        self.physics = Physics(mj_model, self.control_dt, space, effects, self.max_qvel)
+        self.joint_names = _names(mj_model, mujoco.mjtObj.mjOBJ_JOINT, mj_model.njnt)
+        self.actuator_names = _names(mj_model, mujoco.mjtObj.mjOBJ_ACTUATOR, mj_model.nu)
+
+    def _read(self, config: Any) -> dict[str, Any]:
+        known = {"episodeLength": self.default_episode_length, "variant": VARIANTS[0], **self.options}
+        ignored = {"numEnvs", "realParams", "options"}
+        values = {key: config[key] for key in config if key not in ignored and config[key] is not None}
+        for key in values:
+            if key not in known:
+                close = difflib.get_close_matches(key, known)
+                hint = f"; did you mean {close[0]}?" if close else ""
+                raise UserError(f"env.{key}: {self.name} has no such setting{hint} (it has: {', '.join(known)})")
+        settings = {**known, **values}
+        if settings["variant"] not in VARIANTS:
+            raise UserError(f"env.variant = {settings['variant']!r}: allowed are {', '.join(VARIANTS)}")
+        return settings
+
+    # What a task gives.
+
+    @abc.abstractmethod
+    def spec(self) -> mujoco.MjSpec:
+        """A fresh specification of the nominal model."""
+
+    @abc.abstractmethod
+    def initial(self, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Random (qpos `[nq]`, qvel `[nv]`) at the start of an episode."""
+
+    @abc.abstractmethod
+    def command(self, action: jax.Array) -> jax.Array:
+        """Actuator commands `[nu]` in physical units for an action in [-1, 1]."""
+
+    @abc.abstractmethod
+    def observe(self, world: World, data: mjx.Data, action: jax.Array) -> Observations:
+        """Observation groups ("policy", optionally "critic", unclipped) from `world.measurement`.
+
+        After a step `data` is that of the last sub-step (its forces are those of the step, its poses one timestep old);
+        at reset it holds the kinematics and no forces, and `action` is zero.
+        """
+
+    @abc.abstractmethod
+    def reward(
+        self, before: World, after: World, data: mjx.Data, action: jax.Array
+    ) -> tuple[jax.Array, jax.Array, dict[str, jax.Array]]:
+        """(reward, terminated (bool), metrics) of one step, from the true states."""
+
+    def start(self, key: jax.Array, world: World) -> dict[str, Any]:
+        """Numbers the task carries along in `world.task` (commands, goals, a key), drawn at reset."""
+        return {}
+
+    def advance(self, before: World, world: World, data: mjx.Data, action: jax.Array) -> World:
+        """Update `world.task` after the physics and before observation and reward."""
+        return world
+
+    # The protocol.
+
+    def reset(self, key: jax.Array, theta: jax.Array | None = None) -> State:
+        key, key_start = jax.random.split(key)
+        qpos, qvel = self.initial(key)
+        return self._begin(key_start, qpos, qvel, theta)
+
+    def reset_to(self, qpos: jax.Array, qvel: jax.Array, theta: jax.Array | None = None) -> State:
+        """Start in a given state (replay from a log); what the task draws at random is drawn with a fixed key."""
+        return self._begin(jax.random.PRNGKey(0), qpos, qvel, theta)
+
+    def _begin(self, key: jax.Array, qpos: jax.Array, qvel: jax.Array, theta: jax.Array | None) -> State:
+        world = self.physics.world(self.space.nominal if theta is None else theta, qpos, qvel)
+        world = world.replace(task={"steps": jnp.zeros((), jnp.int32)} | self.start(key, world))
+        data, action = self.physics.kinematics(world), jnp.zeros(self.action_size)
+        metrics = jax.eval_shape(lambda: self.reward(world, world, data, action)[2])
+        obs, zero = self._observe(world, data, action), jnp.zeros(())
+        return State(
+            pipeline_state=world,
+            obs=obs,
+            reward=zero,
+            done=zero,
+            metrics={name: zero for name in metrics},
+            info={"terminated": zero, "truncated": zero, "final_observation": obs, "steps": world.task["steps"]},
+        )
+
+    def step(self, state: State, action: jax.Array) -> State:
+        before: World = state.pipeline_state
+        action = jnp.clip(jnp.asarray(action, jnp.float32), -1.0, 1.0)
+        after, data = control_step(self.physics, before, self.command(action))
+        after, sound = _hold_if_diverged(before, after)
+        steps = before.task["steps"] + 1
+        after = after.replace(task=after.task | {"steps": steps})
+        after = self.advance(before, after, data, action)
+        reward, terminated, metrics = self.reward(before, after, data, action)
+        obs = self._observe(after, data, action)
+        done = (terminated | ~sound).astype(jnp.float32)
+        info = state.info | {
+            "terminated": done,
+            "truncated": (steps >= self.episode_length).astype(jnp.float32),
+            "final_observation": obs,
+        }
+        if "truncation" not in info:  # Brax's EpisodeWrapper counts in info["steps"] itself
+            info["steps"] = steps
+        return State(
+            pipeline_state=after,
+            obs=obs,
+            reward=_finite(jnp.where(sound, reward, self.diverged_reward)),
+            done=done,
+            metrics={name: _finite(value) for name, value in metrics.items()},
+            info=info,
+        )
+
+    def _observe(self, world: World, data: mjx.Data, action: jax.Array) -> Observations:
+        limit = self.observation_clip[self.variant]
+        obs = {name: _finite(value) for name, value in self.observe(world, data, action).items()}
+        if limit is not None:
+            obs = {name: jnp.clip(value, -limit, limit) for name, value in obs.items()}
+        aliases = {"state": "policy", "privileged_state": "critic"}
+        return obs | {alias: obs[group] for alias, group in aliases.items() if group in obs}
+
+    # Facts.
+
+    @property
+    def space(self) -> ParameterSpace:
+        return self.physics.space
+
+    @property
+    def mj_model(self) -> mujoco.MjModel:
+        return self.physics.mj_model
+
+    @property
+    def dt(self) -> float:
+        return self.physics.dt
+
+    @property
+    def action_size(self) -> int:
+        return self.mj_model.nu
+
+    @property
+    def sys(self) -> mjx.Model:
+        """The nominal model, under Brax's name."""
+        return self.physics.model
+
+
+def _hold_if_diverged(before: World, after: World) -> tuple[World, jax.Array]:
+    """(world, sound): a world whose state is no longer finite stays in its last finite state."""
+    parts = (after.qpos, after.qvel, after.act)
+    sound = functools.reduce(jnp.logical_and, [jnp.all(jnp.isfinite(x)) for x in parts])
+    keep = ("qpos", "qvel", "act", "warmstart", "memory", "measurement")
+    held = {
+        name: jax.tree.map(lambda new, old: jnp.where(sound, new, old), getattr(after, name), getattr(before, name))
+        for name in keep
+    }
+    return after.replace(**held), sound
+
+
+def _finite(x: jax.Array) -> jax.Array:
+    return jnp.where(jnp.isfinite(x), x, 0.0)
+
+
+def _names(mj_model: mujoco.MjModel, kind: mujoco.mjtObj, count: int) -> tuple[str, ...]:
+    return tuple(mujoco.mj_id2name(mj_model, kind, i) or f"{i}" for i in range(count))

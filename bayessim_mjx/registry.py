@@ -1,0 +1,58 @@
+"""Environments by name: `make("Ant")`, `make("brax:ant")`, `names()`. The only dynamic import of tasks."""
+
+import difflib
+import importlib
+import pkgutil
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from bayessim_mjx import effects as effects_room
+from bayessim_mjx import tasks
+from bayessim_mjx.errors import UserError
+
+if TYPE_CHECKING:
+    from bayessim_mjx.effects.effect import Effect
+    from bayessim_mjx.env import Env
+    from bayessim_mjx.settings import Config
+
+EXTERNAL = ("brax", "playground")
+
+
+def names() -> list[str]:
+    """Names of our own tasks: one per file in tasks/, `ball_balance.py` holds BallBalance."""
+    modules = {m.name for m in pkgutil.iter_modules(tasks.__path__) if not m.name.startswith("_")}
+    return sorted("".join(part.capitalize() for part in module.split("_")) for module in modules)
+
+
+def make(name: str, *, config: "Config | None" = None, effects: "Sequence[Effect]" = (), **env_overrides: Any) -> "Env":
+    """The environment called `name`, at the task's defaults where neither `config` nor an override says otherwise.
+
+    Args:
+        name: a name from `names()` (case and underscores do not matter), "brax:<env>" or "playground:<env>".
+        config: its `env` (episodeLength, variant, the task's own keys), `randomization` and `effects` are used.
+        effects: further effects, after those of the config.
+        env_overrides: `env:` settings that win over the config's, e.g. `episodeLength=100`.
+
+    Raises:
+        UserError: on an unknown name or setting.
+    """
+    if name.split(":")[0] in EXTERNAL and ":" in name:
+        wrapper = importlib.import_module("bayessim_mjx.wrappers.brax")
+        return wrapper.make(name, config=config, **env_overrides)
+    kind = _task(name)
+    settings = {} if config is None else {key: config.env[key] for key in config.env}
+    randomization = None if config is None else config.randomization
+    listed = () if config is None else [effects_room.make(**spec) for spec in config.effects]
+    return kind(settings | env_overrides, randomization, (*listed, *effects))
+
+
+def _task(name: str) -> Any:
+    known = {title.lower(): title for title in names()}
+    title = known.get(name.lower().replace("_", ""))
+    if title is None:
+        close = difflib.get_close_matches(name.lower(), known)
+        hint = f"did you mean {known[close[0]]}? " if close else ""
+        external = ", ".join(f"{prefix}:<env>" for prefix in EXTERNAL)
+        raise UserError(f"task {name!r}: {hint}there are: {', '.join(names())}, {external}")
+    snake = "".join(f"_{c.lower()}" if c.isupper() else c for c in title).lstrip("_")
+    return getattr(importlib.import_module(f"bayessim_mjx.tasks.{snake}"), title)

@@ -1,0 +1,109 @@
+"""Cartpole: balance a pole hinged on the side of a cart (IsaacGymEnvs' Cartpole).
+
+Nothing can touch anything, so contacts are off; friction, restitution and the slider's mass have no effect on the motion
+and stay unidentifiable, as in BayesSimIG. Joint damping is integrated implicitly (Euler with eulerdamp).
+"""
+
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from bayessim_mjx.env import Observations, Task
+from bayessim_mjx.physics import World, mjx
+
+# The URDF gives no inertias: those of the boxes. The slide limit of +-4 m lies outside |x| > 3 and is left out.
+XML = """
+<mujoco model="cartpole">
+  <compiler autolimits="true"/>
+  <option timestep="0.008333333333333333" integrator="Euler" iterations="1" ls_iterations="4">
+    <flag contact="disable"/>
+  </option>
+  <default>
+    <geom type="box" contype="0" conaffinity="0"/>
+  </default>
+  <worldbody>
+    <light pos="3 0 4" dir="-1 0 -1"/>
+    <camera name="side" pos="6 0 2.4" xyaxes="0 1 0 0 0 1"/>
+    <body name="slider" pos="0 0 2">
+      <inertial mass="1" pos="0 0 0" diaginertia="5.3334 0.00015 5.3334"/>
+      <geom name="slider" size="0.015 4 0.015" rgba="0.6 0.6 0.6 1"/>
+      <body name="cart">
+        <inertial mass="1" pos="0 0 0" diaginertia="0.00854 0.00667 0.00854"/>
+        <joint name="slider_to_cart" type="slide" axis="0 1 0"/>
+        <geom name="cart" size="0.1 0.125 0.1" rgba="0.2 0.4 0.8 1"/>
+        <body name="pole" pos="0.12 0 0">
+          <inertial mass="1" pos="0 0 0.47" diaginertia="0.0836 0.0835 0.00043"/>
+          <joint name="cart_to_pole" type="hinge" axis="1 0 0"/>
+          <geom name="pole" pos="0 0 0.47" size="0.02 0.03 0.5" rgba="0.9 0.6 0.2 1"/>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <motor name="slider_to_cart" joint="slider_to_cart" ctrlrange="-400 400" forcerange="-1000 1000"/>
+  </actuator>
+</mujoco>
+"""
+MAX_FORCE = 400.0  # N
+
+
+def _range(low: float, high: float, operation: str) -> dict:
+    return {"range": [low, high], "operation": operation, "distribution": "uniform"}
+
+
+class Cartpole(Task):
+    """Observation: cart position and velocity, pole angle (0 upright) and velocity; action: force / 400 N."""
+
+    control_dt: ClassVar[float] = 1 / 60
+    default_episode_length: ClassVar[int] = 500
+    diverged_reward: ClassVar[float] = -2.0
+    options: ClassVar[dict] = {"resetDist": 3.0}
+    observation_names: ClassVar[tuple[str, ...]] = ("cart_position", "cart_velocity", "pole_angle", "pole_velocity")
+    real_parameters: ClassVar[tuple[float, ...]] = (1.0, 0.7, 8.0, 2.0, 0.9, 6.0, 0.8, 0.5, 0.7, 2.0, 0.4, 60.0, 20.0)
+    randomization: ClassVar[dict] = {
+        "randomization_params": {
+            "actor_params": {
+                "cartpole": {
+                    "rigid_body_properties": {"mass": _range(0.01, 20.0, "scaling")},
+                    "rigid_shape_properties": {
+                        "friction": _range(0.01, 10.0, "scaling"),
+                        "restitution": _range(0.01, 1.0, "additive"),
+                    },
+                    "dof_properties": {
+                        "stiffness": _range(0.01, 2.0, "additive"),
+                        "damping": _range(0.01, 100.0, "additive"),
+                    },
+                }
+            }
+        }
+    }
+    mirror = {
+        "observation": (np.arange(4), -np.ones(4, np.float32)),
+        "action": (np.arange(1), -np.ones(1, np.float32)),
+    }
+
+    def spec(self) -> mujoco.MjSpec:
+        return mujoco.MjSpec.from_string(XML)
+
+    def initial(self, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        sample = jax.random.uniform(key, (2, 2), minval=-1.0)
+        return 0.1 * sample[0], 0.25 * sample[1]
+
+    def command(self, action: jax.Array) -> jax.Array:
+        return MAX_FORCE * action
+
+    def observe(self, world: World, data: mjx.Data, action: jax.Array) -> Observations:
+        (x, angle), (speed, spin) = world.measurement["qpos"], world.measurement["qvel"]
+        return {"policy": jnp.stack([x, speed, angle, spin])}
+
+    def reward(
+        self, before: World, after: World, data: mjx.Data, action: jax.Array
+    ) -> tuple[jax.Array, jax.Array, dict[str, jax.Array]]:
+        (x, angle), (speed, spin) = after.qpos, after.qvel
+        fallen = (jnp.abs(x) > self.settings["resetDist"]) | (jnp.abs(angle) > jnp.pi / 2)
+        # 1 - theta^2 - 0.01 |x_dot| - 0.005 |theta_dot|, and -2 at the end
+        reward = 1.0 - angle**2 - 0.01 * jnp.abs(speed) - 0.005 * jnp.abs(spin)
+        return jnp.where(fallen, -2.0, reward), fallen, {"pole_angle": jnp.abs(angle)}
