@@ -1,0 +1,154 @@
+"""The gate: refuse a log that cannot be meant, naming file, column and row; warn where it is only odd."""
+
+from __future__ import annotations
+
+import difflib
+import warnings
+from collections.abc import Mapping
+
+import mujoco
+import numpy as np
+
+from bayessim_mjx.errors import UserError
+from bayessim_mjx.recordings.log import Array, Channels, suggest
+from bayessim_mjx.recordings.table import Table
+
+_STREAMS = ("ctrl", "qpos", "qvel", "effort", "enabled")
+
+
+def check_channels(table: Table, columns: Mapping[str, Array], channels: Channels) -> None:
+    """Every name is known, nothing needed is missing, and what is needed is finite.
+
+    Raises:
+        UserError: a name that is no joint or actuator, a missing column, NaN or infinity.
+    """
+    named = {
+        "ctrl": channels.actuators,
+        "qpos": channels.qpos,
+        "qvel": channels.qvel,
+        "effort": channels.actuators,
+        "enabled": channels.actuators,
+    }
+    for column in columns:
+        prefix, _, name = column.partition(":")
+        if prefix in named and name and name not in named[prefix]:
+            raise UserError(f"{table.path}: column {column!r}: {_kind(prefix)}; {suggest(name, named[prefix])}")
+        near = difflib.get_close_matches(prefix.strip().lower(), [*_STREAMS, "time"], n=1, cutoff=0.74)
+        if prefix not in named and column != "time" and near and (name or near[0] == "time") and near[0] not in columns:
+            right = f"{near[0]}:{name}" if name else near[0]
+            raise UserError(f"{table.path}: unknown column {column!r}; did you mean {right!r}?")
+    needed = ["time"] + [f"{s}:{n}" for s in ("ctrl", "qpos") for n in named[s]]
+    if any(f"qvel:{n}" in columns for n in channels.qvel):
+        needed += [f"qvel:{n}" for n in channels.qvel]
+    missing = [c for c in needed if c not in columns]
+    if missing:
+        names = ", ".join(table.columns)
+        constant = "a joint that was not recorded can be held constant in the map (qpos: {<joint>: {value: 0.0}})"
+        raise UserError(f"{table.path}: missing column(s) {', '.join(missing)}; it has {names}; {constant}")
+    for column in needed:
+        bad = np.flatnonzero(~np.isfinite(columns[column]))
+        if len(bad):
+            at = f"{table.path}: column {column!r}, {table.where(int(bad[0]))}: {columns[column][bad[0]]}"
+            raise UserError(f"{at} ({len(bad)} such row(s)); allowed: finite numbers")
+
+
+def _kind(prefix: str) -> str:
+    return "no such joint" if prefix in ("qpos", "qvel") else "no such actuator"
+
+
+def check_time(table: Table, time: Array, min_rows: int) -> None:
+    """Time increases, in seconds, over enough rows.
+
+    Raises:
+        UserError: too few rows, time that stands or runs back, a period above one second.
+    """
+    if len(time) < min_rows:
+        raise UserError(f"{table.path}: {len(time)} rows; allowed: at least {min_rows}")
+    steps = np.diff(time)
+    back = np.flatnonzero(steps <= 0)
+    if len(back):
+        row = int(back[0]) + 1
+        at = f"{table.path}: column 'time', {table.where(row)}: {time[row]:.9g} s after {time[row - 1]:.9g} s"
+        raise UserError(f"{at} ({len(back)} such row(s)); allowed: strictly increasing time")
+    period = float(np.median(steps))
+    if period > 1.0:
+        text = f"{table.path}: column 'time': median step {period:.4g} s"
+        mend = "milliseconds: `time: {column: time, scale: 0.001}` in the map"
+        raise UserError(f"{text}; allowed: seconds, up to 1 s per row ({mend})")
+    jitter = float(np.mean(np.abs(steps / period - 1.0) > 0.2))
+    if jitter > 0.05:
+        warnings.warn(
+            f"{table.path}: {jitter:.0%} of the steps in time are more than 20 % off the median {period:.4g} s",
+            stacklevel=3,
+        )
+
+
+def check_motion(table: Table, columns: dict[str, Array], channels: Channels, mj_model: mujoco.MjModel) -> None:
+    """Angles are continuous, quaternions have norm 1, commands fit the actuator. Unwraps hinges in place, warning.
+
+    Raises:
+        UserError: jumps no joint makes, registers read with the wrong sign or unit.
+    """
+    for i, (joint, kind) in enumerate(zip(channels.joints, channels.kinds, strict=True)):
+        if kind == "hinge":
+            columns[f"qpos:{joint}"] = _unwrapped(table, joint, columns[f"qpos:{joint}"])
+        if kind in ("ball", "free"):
+            quat = [f"qpos:{c}" for c in channels.of_joint(joint)[-4:]]
+            columns.update(zip(quat, _quaternion(table, joint, np.stack([columns[c] for c in quat], 1)).T, strict=True))
+        if kind in ("hinge", "slide") and mj_model.jnt_limited[i]:
+            _inside(table, f"qpos:{joint}", columns[f"qpos:{joint}"], mj_model.jnt_range[i], "range", 0.5)
+    for i, actuator in enumerate(channels.actuators):
+        column, x = f"ctrl:{actuator}", columns[f"ctrl:{actuator}"]
+        jump = np.flatnonzero(np.abs(np.abs(np.diff(x)) - 65536.0) < 2000.0)
+        if len(jump):
+            row = int(jump[0])
+            at = f"{table.path}: column {column!r}, {table.where(row + 1)}: jump from {x[row]:g} to {x[row + 1]:g}"
+            raise UserError(f"{at}: a signed 16-bit register read as unsigned; allowed: `signed: 16` in the map")
+        if mj_model.actuator_ctrllimited[i]:
+            _inside(table, column, x, mj_model.actuator_ctrlrange[i], "ctrlrange", 0.01)
+
+
+def _unwrapped(table: Table, joint: str, q: Array) -> Array:
+    steps = np.diff(q)
+    jumps = np.flatnonzero(np.abs(steps) > np.pi)
+    if not len(jumps):
+        return q
+    turns = np.abs(np.abs(steps[jumps]) - 2 * np.pi) < 1.0
+    if not turns.all():
+        row = int(jumps[np.argmin(turns)])
+        at = f"{table.path}: column 'qpos:{joint}', {table.where(row + 1)}"
+        text = f"{at}: jump from {q[row]:.6g} to {q[row + 1]:.6g} rad in one step; allowed: below pi"
+        raise UserError(f"{text} (degrees or counts: `scale`, a wrapped encoder: `wrap` in the map)")
+    where = table.where(int(jumps[0]) + 1)
+    warnings.warn(
+        f"{table.path}: column 'qpos:{joint}' wraps by 2 pi {len(jumps)} time(s), first at {where}; unwrapped",
+        stacklevel=4,
+    )
+    return np.unwrap(q)
+
+
+def _quaternion(table: Table, joint: str, q: Array) -> Array:
+    """Norm 1 and without sign flips (q and -q are the same attitude)."""
+    norm = np.linalg.norm(q, axis=1)
+    bad = np.flatnonzero(np.abs(norm - 1.0) > 0.01)
+    if len(bad):
+        at = f"{table.path}: quaternion of joint {joint!r}, {table.where(int(bad[0]))}: norm {norm[bad[0]]:.4g}"
+        raise UserError(f"{at}; allowed: norm 1 within 0.01, in the order w x y z")
+    flips = np.cumprod(np.where(np.sum(q[1:] * q[:-1], axis=1) < 0, -1.0, 1.0))
+    return q / norm[:, None] * np.concatenate([[1.0], flips])[:, None]
+
+
+def _inside(table: Table, column: str, x: Array, bounds: Array, what: str, tolerance: float) -> None:
+    """Warn where x leaves the model's range; refuse where it is a hundred times too large (a unit)."""
+    low, high = map(float, bounds)
+    outside = np.flatnonzero((x < low - tolerance * (high - low)) | (x > high + tolerance * (high - low)))
+    if not len(outside):
+        return
+    worst = int(outside[np.argmax(np.abs(x[outside]))])
+    at = f"{table.path}: column {column!r}, {table.where(worst)}"
+    text = f"{at}: {x[worst]:.6g} is outside the model's {what} [{low:g}, {high:g}]"
+    if abs(x[worst]) > 20.0 * max(abs(low), abs(high)):
+        raise UserError(f"{text} by far; allowed: the model's unit (mend it with `scale` in the map)")
+    warnings.warn(
+        f"{text} ({len(outside)} row(s)); the simulation will clamp it" if what == "ctrlrange" else text, stacklevel=4
+    )

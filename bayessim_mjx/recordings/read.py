@@ -1,0 +1,237 @@
+"""Read recorded motion: CSV or NPZ, one file per run, checked row by row before anything is simulated."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from bayessim_mjx.config import read_yaml
+from bayessim_mjx.errors import UserError
+from bayessim_mjx.recordings.check import check_channels, check_motion, check_time
+from bayessim_mjx.recordings.log import Array, Channels, Log, suggest
+from bayessim_mjx.recordings.mapping import LogMap
+from bayessim_mjx.recordings.signals import estimate_velocity, noise_level
+from bayessim_mjx.recordings.table import Table, read_csv, read_npz
+
+MIN_ROWS = 10
+MAX_GAP = 5.0  # sample periods without a sample after which a file is cut in two
+_SUFFIXES = (".csv", ".npz")
+_FORMAT = (
+    "CSV with the columns time, ctrl:<actuator>, qpos:<joint>[, qvel:<joint>], "
+    "or NPZ with time, ctrl, qpos[, qvel], joints, actuators"
+)
+
+Paths = str | Path | Sequence[str | Path]
+
+
+def read_logs(
+    paths: Paths, mj_model: mujoco.MjModel, map: str | Path | Mapping[str, Any] | LogMap | None = None
+) -> list[Log]:
+    """Read all runs of a folder (or the files named), in the model's order of joints and actuators.
+
+    A folder's own `map.yaml` is used where `map` is not given. Files are cut at gaps longer than MAX_GAP periods;
+    `<file stem>.yaml` beside a file becomes its metadata (and `sigma: {<joint>: value}` the noise, where known).
+
+    Raises:
+        UserError: whatever is wrong with a file, naming the file, its column and row, and what is allowed.
+    """
+    chosen = map if map is not None else _map_of_folder(paths)
+    log_map = chosen if chosen is None or isinstance(chosen, LogMap) else LogMap.read(chosen)
+    channels = Channels.of(mj_model)
+    if log_map is not None:
+        _check_map(log_map, channels)
+    return [log for path in _files(paths, log_map) for log in _read_one(path, mj_model, channels, log_map)]
+
+
+def _map_of_folder(paths: Paths) -> Path | None:
+    given = _listed(paths)
+    own = given[0] / "map.yaml" if len(given) == 1 else None
+    return own if own is not None and own.is_file() else None
+
+
+def _listed(paths: Paths) -> list[Path]:
+    return [Path(paths)] if isinstance(paths, str | Path) else [Path(p) for p in paths]
+
+
+def _files(paths: Paths, log_map: LogMap | None) -> list[Path]:
+    """Every log file meant by the path(s), sorted.
+
+    Raises:
+        UserError: a path that does not exist, a folder without logs, a file of another kind.
+    """
+    given = _listed(paths)
+    if not given:
+        raise UserError(f"real.logs is empty; allowed: a folder of logs, or files: {_FORMAT}")
+    found: list[Path] = []
+    for path in given:
+        if path.is_dir():
+            pattern = log_map.files if log_map is not None and log_map.files else "*"
+            inside = sorted(p for p in path.glob(pattern) if p.is_file() and (pattern != "*" or p.suffix in _SUFFIXES))
+            if not inside:
+                seen = ", ".join(sorted(p.name for p in path.iterdir())[:5]) or "nothing"
+                raise UserError(f"{path}: no log matches {pattern!r}; it holds {seen}; allowed: {_FORMAT}")
+            found += inside
+        elif not path.is_file():
+            raise UserError(f"{path}: no such file or folder; allowed: a folder of logs, or files: {_FORMAT}")
+        elif log_map is None and path.suffix not in _SUFFIXES:
+            raise UserError(f"{path}: unknown kind of file {path.suffix!r}; allowed: {', '.join(_SUFFIXES)}, or a map")
+        else:
+            found.append(path)
+    return found
+
+
+def _read_one(path: Path, mj_model: mujoco.MjModel, channels: Channels, log_map: LogMap | None) -> list[Log]:
+    if path.suffix == ".npz":
+        table = read_npz(path)
+    else:
+        table = read_csv(path, *((log_map.delimiter, log_map.header) if log_map else ()))
+    columns = log_map.apply(table) if log_map is not None else _columns(table, channels)
+    check_channels(table, columns, channels)
+    check_time(table, columns["time"], MIN_ROWS)
+    check_motion(table, columns, channels, mj_model)
+    metadata = {**(log_map.metadata if log_map else {}), **_side_yaml(path), "source": str(path)}
+    return _pieces(table, columns, channels, metadata)
+
+
+def _check_map(log_map: LogMap, channels: Channels) -> None:
+    for stream, allowed in (("ctrl", channels.actuators), ("qpos", channels.qpos), ("qvel", channels.qvel)):
+        for name in getattr(log_map, stream):
+            if name not in allowed:
+                raise UserError(f"{log_map.path}: {stream}.{name} is no channel of the model; {suggest(name, allowed)}")
+
+
+def _columns(table: Table, channels: Channels) -> dict[str, Array]:
+    """The file's own columns as channels; text columns nobody asked for are left out with a warning."""
+    names = {c: c for c in table.columns} if table.first_line is not None else _npz_names(table, channels)
+    out = {}
+    for column, name in names.items():
+        needed = name == "time" or name.split(":")[0] in ("ctrl", "qpos", "qvel")
+        try:
+            out[name] = table.numbers(column)
+        except UserError as error:
+            if needed:
+                raise
+            warnings.warn(f"{error}; the column is left out", stacklevel=2)
+    return out
+
+
+def _npz_names(table: Table, channels: Channels) -> dict[str, str]:
+    """Array columns `qpos[0]` ... to channel names, by the names the file gives in `joints` and `actuators`."""
+    out = {c: c for c in table.columns}
+    for stream, key in (
+        ("qpos", "joints"),
+        ("qvel", "joints"),
+        ("ctrl", "actuators"),
+        ("effort", "actuators"),
+        ("enabled", "actuators"),
+    ):
+        if stream not in table.widths or (stream in ("effort", "enabled") and key not in table.names):
+            continue
+        if key not in table.names:
+            raise UserError(
+                f"{table.path}: no array {key!r} with the names of the {stream} columns; allowed: {_FORMAT}"
+            )
+        names = _expand(table, key, stream, channels)
+        width = table.widths[stream]
+        if len(names) != width:
+            named = f"{key!r} names {len(names)} ({', '.join(names)})"
+            raise UserError(
+                f"{table.path}: array {stream!r} has {width} columns, {named}; allowed: one column per channel"
+            )
+        own = [stream] if stream in table.columns else [f"{stream}[{i}]" for i in range(width)]
+        out.update({c: f"{stream}:{n}" for c, n in zip(own, names, strict=True)})
+    return out
+
+
+def _expand(table: Table, key: str, stream: str, channels: Channels) -> list[str]:
+    if key == "actuators":
+        return list(table.names[key])
+    for joint in table.names[key]:
+        if joint not in channels.joints:
+            raise UserError(
+                f"{table.path}: {joint!r} in 'joints' is no joint of the model; {suggest(joint, channels.joints)}"
+            )
+    return [c for joint in table.names[key] for c in channels.of_joint(joint, stream)]
+
+
+def _side_yaml(path: Path) -> Mapping[str, Any]:
+    side = path.with_suffix(".yaml")
+    return read_yaml(side) if side.is_file() and side.name != "map.yaml" else {}
+
+
+def _pieces(table: Table, columns: Mapping[str, Array], channels: Channels, metadata: Mapping[str, Any]) -> list[Log]:
+    """The file as one log, or as several where samples are missing for long."""
+    time = columns["time"]
+    steps = np.diff(time)
+    gaps = np.flatnonzero(steps > MAX_GAP * np.median(steps))
+    edges = [0, *(gaps + 1), len(time)]
+    spans = [(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True) if b - a >= MIN_ROWS]
+    if len(gaps):
+        worst = gaps[np.argmax(steps[gaps])]
+        text = (
+            f"{table.path}: {len(gaps)} gap(s) in time, the largest {steps[worst]:.4g} s "
+            f"after {table.where(int(worst))} (median period {np.median(steps):.4g} s)"
+        )
+        if not spans:
+            raise UserError(f"{text}; no run of {MIN_ROWS} samples is left; allowed: gaps up to {MAX_GAP:g} periods")
+        warnings.warn(f"{text}; cut into {len(spans)} run(s)", stacklevel=2)
+    names = [table.path.name] if len(spans) == 1 else [f"{table.path.name}#{k}" for k in range(len(spans))]
+    return [
+        _log(name, {k: c[a:b] for k, c in columns.items()}, channels, metadata)
+        for name, (a, b) in zip(names, spans, strict=True)
+    ]
+
+
+def _log(name: str, columns: Mapping[str, Array], channels: Channels, metadata: Mapping[str, Any]) -> Log:
+    rows = len(columns["time"])
+
+    def stack(stream: str, names: Sequence[str]) -> Array:
+        return np.stack([columns[f"{stream}:{n}"] for n in names], 1) if names else np.zeros((rows, 0))
+
+    qpos = stack("qpos", channels.qpos)
+    sigma = np.array([noise_level(c) for c in qpos.T])
+    known = metadata.get("sigma", {})
+    if not isinstance(known, Mapping):
+        raise UserError(
+            f"{metadata['source']}: sigma = {known!r} in its side YAML; allowed: a mapping '<joint>: value'"
+        )
+    sigma = np.array([float(known.get(n, s)) for n, s in zip(channels.qpos, sigma, strict=True)])
+    velocity, spread = estimate_velocity(columns["time"], qpos, channels, sigma)
+    has_qvel = all(f"qvel:{n}" in columns for n in channels.qvel)
+    if has_qvel:
+        measured = stack("qvel", channels.qvel)
+        _compare(name, measured, velocity, spread, channels)
+        velocity, spread = measured, np.array([noise_level(c) for c in measured.T])
+    used = {"time"} | {
+        f"{s}:{n}" for s in ("ctrl", "qpos", "qvel") for n in getattr(channels, s if s != "ctrl" else "actuators")
+    }
+    return Log(
+        name=name,
+        time=columns["time"],
+        ctrl=stack("ctrl", channels.actuators),
+        qpos=qpos,
+        qvel=velocity,
+        has_qvel=has_qvel,
+        channels=channels,
+        sigma_qpos=sigma,
+        sigma_qvel=spread,
+        streams={k: c for k, c in columns.items() if k not in used},
+        metadata=metadata,
+    )
+
+
+def _compare(name: str, measured: Array, estimated: Array, spread: Array, channels: Channels) -> None:
+    """Warn where the logged velocity is not the derivative of the logged position (unit, sign)."""
+    for channel, v, w, s in zip(channels.qvel, measured.T, estimated.T, spread, strict=True):
+        energy = float(w @ w)
+        if energy <= 9.0 * len(w) * s**2 or energy == 0.0:
+            continue
+        slope = float(v @ w) / energy
+        if not 0.7 < slope < 1.4:
+            text = f"{name}: qvel:{channel} is about {slope:.3g} times the derivative of qpos:{channel}"
+            warnings.warn(f"{text}; allowed: the same unit and sign per second (mend it in the map)", stacklevel=2)

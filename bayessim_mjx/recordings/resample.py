@@ -1,0 +1,160 @@
+"""Logs at the control period, and windows of them ready for replay in simulation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+
+from bayessim_mjx.errors import UserError
+from bayessim_mjx.recordings.log import Array, Log
+
+
+def is_even(log: Log, dt: float) -> bool:
+    """Whether every sample lies within dt/1000 of an even grid of period dt."""
+    grid = log.time[0] + dt * np.arange(len(log))
+    return bool(np.max(np.abs(log.time - grid)) < 1e-3 * dt)
+
+
+def resample(log: Log, dt: float, kind: Literal["cubic", "linear"] = "cubic") -> Log:
+    """The log on the grid time[0] + k dt. Command k is held over [t_k, t_k + dt).
+
+    Positions and velocities are interpolated. A logged command is held until the next row; the command of a step is
+    the *mean* of that held signal over the step (its impulse is kept, no sample is skipped and no delay added).
+    `enabled:` streams are 1 only where the drive was on throughout the step. A log that is already even is returned as
+    it is.
+
+    Raises:
+        UserError: dt or kind out of range, a log shorter than two steps, a rate so low that steps would be invented.
+    """
+    if not (np.isfinite(dt) and dt > 0):
+        raise UserError(f"resample: dt = {dt!r}; allowed: seconds > 0")
+    if kind not in ("cubic", "linear"):
+        raise UserError(f"resample: kind = {kind!r}; allowed: cubic, linear")
+    if is_even(log, dt):
+        return replace(log, time=log.time[0] + dt * np.arange(len(log)))
+    if log.period > 20 * dt:
+        text = f"log {log.name!r}: one row per {log.period:.4g} s against a control period of {dt:.4g} s"
+        raise UserError(f"{text}; allowed: up to 20 control periods per row")
+    rows = int(np.floor(log.duration / dt + 1e-6)) + 1
+    if rows < 3:
+        raise UserError(
+            f"log {log.name!r}: {log.duration:.4g} s long; allowed: at least two control periods of {dt:.4g} s"
+        )
+    grid = log.time[0] + dt * np.arange(rows)
+    inside = np.minimum(grid, log.time[-1])
+    return replace(
+        log,
+        time=grid,
+        ctrl=_mean_held(log.time, log.ctrl, grid, dt),
+        qpos=_normalised(log, _interpolate(log.time, log.qpos, inside, kind)),
+        qvel=_interpolate(log.time, log.qvel, inside, kind),
+        streams={k: _stream(log.time, k, s, grid, dt) for k, s in log.streams.items()},
+    )
+
+
+def _interpolate(time: Array, x: Array, grid: Array, kind: str) -> Array:
+    if kind == "cubic" and len(time) > 3:
+        return np.asarray(CubicSpline(time, x)(grid)) if x.shape[1] else np.zeros((len(grid), 0))
+    return np.stack([np.interp(grid, time, c) for c in x.T], 1) if x.shape[1] else np.zeros((len(grid), 0))
+
+
+def _mean_held(time: Array, x: Array, grid: Array, dt: float) -> Array:
+    """(1/dt) integral over [t_k, t_k + dt) of x held from each row to the next; the last row is held for ever."""
+    ends = np.append(grid, grid[-1] + dt)
+    times = np.append(time, max(time[-1], ends[-1]) + dt)
+    area = np.concatenate([np.zeros((1, x.shape[1])), np.cumsum(x * np.diff(times)[:, None], axis=0)])
+    return (
+        np.stack([np.diff(np.interp(ends, times, a)) / dt for a in area.T], 1)
+        if x.shape[1]
+        else np.zeros((len(grid), 0))
+    )
+
+
+def _stream(time: Array, name: str, x: Array, grid: Array, dt: float) -> Array:
+    if name.startswith("enabled"):
+        on = np.nan_to_num(x, nan=1.0)[:, None] > 0.5
+        return (_mean_held(time, on.astype(float), grid, dt)[:, 0] > 1.0 - 1e-6).astype(float)
+    seen = np.isfinite(x)
+    return np.interp(grid, time[seen], x[seen]) if seen.any() else np.full(len(grid), np.nan)
+
+
+def _normalised(log: Log, qpos: Array) -> Array:
+    """Interpolated quaternions back to norm 1."""
+    out = np.array(qpos)
+    for joint, kind in zip(log.joints, log.channels.kinds, strict=True):
+        if kind in ("hinge", "slide"):
+            continue
+        quat = list(range(*log.channels.columns(joint).indices(out.shape[1])))[-4:]
+        out[:, quat] /= np.linalg.norm(out[:, quat], axis=1, keepdims=True)
+    return out
+
+
+def segments(
+    logs: Log | Sequence[Log], length: int, stride: int | None = None, dt: float | None = None
+) -> dict[str, NDArray[Any]]:
+    """M windows of `length` = T control steps, one every `stride` steps (default T), ready for `rollout.replay`.
+
+    Args:
+        logs: sampled evenly at one period, or at any rates if `dt` is given: they are resampled first.
+        dt: control period [s].
+
+    Returns:
+        qpos0 [M, nq], qvel0 [M, nv], command [M, T, nu], qpos [M, T+1, nq], qvel [M, T+1, nv] (float32): apply
+        command[k] from row k to row k + 1. And run [M], start [M]: index of the log and first row of the window in it.
+        Windows in which a drive was switched off (`enabled:` streams) are left out: no command is no command of zero.
+
+    Raises:
+        UserError: no logs, uneven or different periods, length or stride out of range, no window left.
+    """
+    runs = [logs] if isinstance(logs, Log) else list(logs)
+    step = length if stride is None else stride
+    if not runs:
+        raise UserError("segments: no logs; allowed: at least one")
+    for key, value in (("length", length), ("stride", step)):
+        if value < 1:
+            raise UserError(f"segments: {key} = {value}; allowed: at least 1 control step")
+    runs = runs if dt is None else [resample(log, dt) for log in runs]
+    period = runs[0].period
+    for log in runs:
+        if not is_even(log, period):
+            text = f"log {log.name!r} is not sampled evenly every {period:.6g} s"
+            raise UserError(f"{text}; allowed: logs that went through resample(log, dt), or segments(..., dt=...)")
+    windows = [(r, a) for r, log in enumerate(runs) for a in _starts(log, length, step)]
+    if not windows:
+        raise UserError(_no_window(runs, length, period))
+
+    def cut(key: str, rows: int) -> NDArray[np.float32]:
+        return np.stack([getattr(runs[r], key)[a : a + rows] for r, a in windows]).astype(np.float32)
+
+    qpos, qvel = cut("qpos", length + 1), cut("qvel", length + 1)
+    run, start = (np.array(c, dtype=np.int64) for c in zip(*windows, strict=True))
+    motion = {"qpos0": qpos[:, 0], "qvel0": qvel[:, 0], "command": cut("ctrl", length), "qpos": qpos, "qvel": qvel}
+    return motion | {"run": run, "start": start}
+
+
+def _no_window(runs: Sequence[Log], length: int, period: float) -> str:
+    longest = max(runs, key=len)
+    off = " (partly with the drive switched off)" if any(not log.enabled.all() for log in runs) else ""
+    text = f"no log holds {length} control steps ({length * period:.4g} s); the longest is {longest.name!r} with"
+    return f"{text} {len(longest) - 1}{off}; allowed: shorter segments (bayessim.trainTrajLen) or longer logs"
+
+
+def _starts(log: Log, length: int, stride: int) -> list[int]:
+    on = log.enabled
+    return [a for a in range(0, len(log) - length, stride) if on[a : a + length].all()]
+
+
+def noise(logs: Log | Sequence[Log]) -> dict[str, Array]:
+    """Measurement noise of every channel, pooled over logs (rms): {"qpos": [nq], "qvel": [nv]} standard deviations."""
+    runs = [logs] if isinstance(logs, Log) else list(logs)
+    if not runs:
+        raise UserError("noise: no logs; allowed: at least one")
+    return {
+        "qpos": np.sqrt(np.mean([log.sigma_qpos**2 for log in runs], axis=0)),
+        "qvel": np.sqrt(np.mean([log.sigma_qvel**2 for log in runs], axis=0)),
+    }
