@@ -1,0 +1,49 @@
+"""Whole episodes of a policy, scored in one jitted program."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+
+from bayessim_mjx.rl.networks import Policy
+
+if TYPE_CHECKING:
+    from bayessim_mjx.env import Env
+
+
+def evaluate(
+    env: Env, policy: Policy, key: jax.Array, thetas: jax.Array, deterministic: bool = True
+) -> dict[str, jax.Array]:
+    """One episode in each world of thetas [n, d]: {"return": [n], "length": [n]}; by default the mean action."""
+    thetas = jnp.asarray(thetas, jnp.float32)
+    if thetas.ndim != 2:
+        raise ValueError(f"thetas has shape {thetas.shape}: expected [episodes, parameters]")
+    return _evaluate(env)(policy.replace(deterministic=deterministic), key, thetas)
+
+
+@lru_cache(maxsize=32)
+def _evaluate(env: Env) -> Callable[..., dict[str, jax.Array]]:
+    def run(policy: Policy, key: jax.Array, thetas: jax.Array) -> dict[str, jax.Array]:
+        count = thetas.shape[0]
+        reset_key, key = jax.random.split(key)
+        state = jax.vmap(env.reset)(jax.random.split(reset_key, count), thetas)
+
+        def going(carry: tuple) -> jax.Array:
+            return (carry[0] < env.episode_length) & carry[2].any()
+
+        def step(carry: tuple) -> Any:
+            t, state, alive, total, length = carry
+            state = jax.vmap(env.step)(state, policy(jax.random.fold_in(key, t), state.obs))
+            total, length = total + jnp.where(alive, state.reward, 0.0), length + alive
+            ended = state.info["terminated"] + state.info["truncated"] > 0
+            return t + 1, state, alive & ~ended, total, length
+
+        carry = (jnp.int32(0), state, jnp.ones(count, bool), jnp.zeros(count), jnp.zeros(count, jnp.int32))
+        _, _, _, total, length = jax.lax.while_loop(going, step, carry)
+        return {"return": total, "length": length}
+
+    return jax.jit(run)

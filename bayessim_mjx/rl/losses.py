@@ -1,0 +1,134 @@
+"""Proximal policy optimisation (Schulman et al. 2017): the losses, and the epochs of minibatches over one batch."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+from jax.flatten_util import ravel_pytree
+
+from bayessim_mjx.config import PPOConfig
+from bayessim_mjx.rl import networks
+from bayessim_mjx.rl.networks import Params
+
+MIN_LEARNING_RATE, MAX_LEARNING_RATE = 1e-5, 1e-2  # bounds of the adaptive schedule
+RATE_FACTOR = 1.5
+
+
+@struct.dataclass
+class Batch:
+    """B transitions, as the policy that collected them saw them (normalised, old statistics)."""
+
+    observation: jax.Array  # [B, S]
+    critic_observation: jax.Array  # [B, S']
+    action: jax.Array  # [B, A] unclipped sample
+    mean: jax.Array  # [B, A] of the collecting policy
+    log_prob: jax.Array  # [B]
+    value: jax.Array  # [B]
+    advantage: jax.Array  # [B]
+    returns: jax.Array  # [B]
+
+
+def surrogate_loss(log_prob: jax.Array, old_log_prob: jax.Array, advantage: jax.Array, clip: float) -> jax.Array:
+    """Clipped surrogate: mean max(-A ratio, -A clip(ratio, 1 +- clip)), ratio = pi_new / pi_old; arrays [B]."""
+    ratio = jnp.exp(log_prob - old_log_prob)
+    return jnp.maximum(-advantage * ratio, -advantage * jnp.clip(ratio, 1 - clip, 1 + clip)).mean()
+
+
+def value_loss(value: jax.Array, old_value: jax.Array, returns: jax.Array, clip: float | None) -> jax.Array:
+    """Mean squared error of the critic, [B] each; the worse of it and that of the value within +- clip of the old."""
+    error = (value - returns) ** 2
+    if clip is None:
+        return error.mean()
+    clipped = old_value + jnp.clip(value - old_value, -clip, clip)
+    return jnp.maximum(error, (clipped - returns) ** 2).mean()
+
+
+def standardise(x: jax.Array) -> jax.Array:
+    """Zero mean, unit standard deviation."""
+    return (x - x.mean()) / (x.std() + 1e-8)
+
+
+def loss(params: Params, old_log_std: jax.Array, batch: Batch, config: PPOConfig) -> tuple[jax.Array, dict]:
+    """Surrogate + c_v value loss - c_e entropy, and the figures of this minibatch. KL is of old || new, analytic."""
+    act = networks.activation(config.activation)
+    mean, log_std = networks.mean_action(params, batch.observation, act), params["actor"]["log_std"]
+    log_prob = networks.log_prob(mean, log_std, batch.action)
+    advantage = standardise(batch.advantage) if config.normalize_advantage_per_minibatch else batch.advantage
+    surrogate = surrogate_loss(log_prob, batch.log_prob, advantage, config.clip_param)
+    value = value_loss(
+        networks.value(params, batch.critic_observation, act),
+        batch.value,
+        batch.returns,
+        config.clip_param if config.use_clipped_value_loss else None,
+    )
+    entropy = networks.entropy(log_std)
+    metrics = {
+        "Loss/surrogate": surrogate,
+        "Loss/value": value,
+        "Loss/entropy": entropy,
+        "Loss/kl": networks.kl(batch.mean, old_log_std, mean, log_std).mean(),
+        "Loss/clip_fraction": (jnp.abs(jnp.exp(log_prob - batch.log_prob) - 1) > config.clip_param).mean(),
+    }
+    return surrogate + config.value_loss_coef * value - config.entropy_coef * entropy, metrics
+
+
+def adapt(learning_rate: jax.Array, kl: jax.Array, desired_kl: float) -> jax.Array:
+    """Down by 1.5 where the policy moved too far (KL > 2 desired), up where it hardly moved (0 < KL < desired / 2)."""
+    down = jnp.maximum(MIN_LEARNING_RATE, learning_rate / RATE_FACTOR)
+    up = jnp.minimum(MAX_LEARNING_RATE, learning_rate * RATE_FACTOR)
+    rate = jnp.where((kl > 0) & (kl < desired_kl / 2), up, learning_rate)
+    return jnp.where(kl > 2 * desired_kl, down, rate)
+
+
+def clip_norm(gradient: jax.Array, limit: float) -> tuple[jax.Array, jax.Array]:
+    """The flat gradient scaled down to the norm `limit` where it is longer, and its norm before."""
+    norm = jnp.linalg.norm(gradient)
+    return gradient * jnp.minimum(1.0, limit / (norm + 1e-6)), norm
+
+
+def minibatches(key: jax.Array, epochs: int, size: int, count: int) -> jax.Array:
+    """Indices [epochs * count, size // count]: a fresh permutation of all `size` transitions in each epoch.
+
+    A remainder is left out at the end of each permutation, so a different one in each epoch.
+    """
+    order = jax.vmap(lambda k: jax.random.permutation(k, size))(jax.random.split(key, epochs))
+    return order[:, : size - size % count].reshape(epochs * count, size // count)
+
+
+def optimiser_init(params: Params) -> optax.OptState:
+    """State of Adam over the flattened parameters (one vector: a few kernels per step instead of one set per layer)."""
+    return optax.scale_by_adam().init(ravel_pytree(params)[0])
+
+
+def optimise(
+    key: jax.Array,
+    params: Params,
+    opt_state: optax.OptState,
+    learning_rate: jax.Array,
+    batch: Batch,
+    config: PPOConfig,
+) -> tuple[Params, optax.OptState, jax.Array, dict[str, jax.Array]]:
+    """All epochs of minibatches: new parameters, Adam state, learning rate, and figures [epochs * minibatches] each."""
+    flat, unravel = ravel_pytree(params)
+    old_log_std = params["actor"]["log_std"]
+    if not config.normalize_advantage_per_minibatch:
+        batch = batch.replace(advantage=standardise(batch.advantage))
+    order = minibatches(key, config.num_epochs, batch.advantage.shape[0], config.num_minibatches)
+
+    def step(carry: tuple[Any, Any, Any], now: tuple[jax.Array, jax.Array]) -> tuple[Any, dict]:
+        flat, opt_state, rate = carry
+        number, index = now
+        part = jax.tree.map(lambda x: x[index], batch)
+        gradient, metrics = jax.grad(lambda p: loss(unravel(p), old_log_std, part, config), has_aux=True)(flat)
+        if config.schedule == "adaptive":  # nothing has moved before the first minibatch: its KL is rounding noise
+            rate = jnp.where(number > 0, adapt(rate, metrics["Loss/kl"], config.desired_kl), rate)
+        gradient, norm = clip_norm(gradient, config.max_grad_norm)
+        direction, opt_state = optax.scale_by_adam().update(gradient, opt_state)
+        metrics |= {"Policy/grad_norm": norm, "Loss/learning_rate": rate}
+        return (flat - rate * direction, opt_state, rate), metrics
+
+    start = (flat, opt_state, learning_rate)
+    (flat, opt_state, rate), metrics = jax.lax.scan(step, start, (jnp.arange(order.shape[0]), order))
+    return unravel(flat), opt_state, rate, metrics

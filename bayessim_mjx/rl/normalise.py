@@ -1,0 +1,42 @@
+"""Running mean and variance of observations: exact pooled moments, no forgetting."""
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+EPSILON = 1e-4  # added to the standard deviation, in units of the observation
+LIMIT = 10.0  # normalised observations are clipped to +- LIMIT, so that a feature seen constant so far cannot explode
+
+
+@struct.dataclass
+class Moments:
+    """Moments of all samples seen so far; mean 0 and variance 1 while there are none."""
+
+    mean: jax.Array  # [S]
+    var: jax.Array  # [S] population variance
+    count: jax.Array  # [] float32, number of samples
+
+
+def init(size: int) -> Moments:
+    """Moments of no samples of dimension `size`: normalising with them leaves observations as they are."""
+    return Moments(mean=jnp.zeros(size), var=jnp.ones(size), count=jnp.zeros(()))
+
+
+def update(moments: Moments, samples: jax.Array) -> Moments:
+    """Fold in samples [..., S] (Chan, Golub & LeVeque 1979): the result equals the moments of all samples together."""
+    samples = samples.reshape(-1, samples.shape[-1])
+    mean, var, n = samples.mean(0), samples.var(0), samples.shape[0]
+    count = moments.count + n
+    new, old = n / count, moments.count / count  # weights of the two sets, sum 1
+    delta = mean - moments.mean
+    # var = w_old var_old + w_new var_new + w_old w_new (mean_new - mean_old)^2
+    return Moments(
+        mean=moments.mean + new * delta,
+        var=old * moments.var + new * var + old * new * delta**2,
+        count=count,
+    )
+
+
+def normalise(moments: Moments, x: jax.Array) -> jax.Array:
+    """(x - mean) / (std + EPSILON), clipped to +- LIMIT; x [..., S]."""
+    return jnp.clip((x - moments.mean) / (jnp.sqrt(moments.var) + EPSILON), -LIMIT, LIMIT)

@@ -1,0 +1,183 @@
+"""PPO as `init` and one jitted `update`: new worlds, collection, advantages once, epochs of minibatches, statistics."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from bayessim_mjx.config import PPOConfig
+from bayessim_mjx.rl import episodes, losses, networks, normalise
+from bayessim_mjx.rl.gae import gae
+from bayessim_mjx.rl.networks import Policy
+from bayessim_mjx.rollout import collect
+
+if TYPE_CHECKING:
+    from bayessim_mjx.distributions import Distribution
+    from bayessim_mjx.env import Env, State
+
+Update = Callable[..., Any]
+
+
+@struct.dataclass
+class TrainState:
+    """All that the next update needs, as plain arrays: saving and restoring it resumes training bit for bit (CPU)."""
+
+    params: networks.Params
+    opt_state: Any  # Adam over the flattened parameters
+    normalizer: dict[str, normalise.Moments]  # by observation group
+    learning_rate: jax.Array  # []
+    env_states: Any  # State with leading axis num_envs
+    episodes: episodes.Episodes
+    key: jax.Array  # [2] uint32
+    iteration: jax.Array  # [] int32
+    env_steps: jax.Array  # [] uint32
+    config: PPOConfig = struct.field(pytree_node=False)  # that the networks were made with
+
+
+def critic_group(env: Env) -> str:
+    """The observation group that the critic sees: "critic" where the environment has one, else "policy"."""
+    return "critic" if "critic" in env.observation_size else "policy"
+
+
+def policy_of(state: TrainState) -> Policy:
+    """The policy of a training state, with its normaliser."""
+    config = state.config
+    return Policy(
+        actor=state.params["actor"],
+        normalizer=state.normalizer["policy"],
+        activation=config.activation,
+        normalize=config.normalize_observations,
+        action_clip=config.action_clip,
+    )
+
+
+def _reset(env: Env, key: jax.Array, domain: Distribution | None, worlds: int) -> State:
+    """Fresh episodes in `worlds` worlds with theta from the domain (None: nominal)."""
+    theta_key, reset_key = jax.random.split(key)
+    if domain is None:
+        thetas = jnp.tile(jnp.asarray(env.space.nominal, jnp.float32), (worlds, 1))
+    else:
+        thetas = domain.sample(theta_key, worlds)
+    return jax.vmap(env.reset)(jax.random.split(reset_key, worlds), thetas)
+
+
+def _stagger(key: jax.Array, state: State, episode_length: int) -> tuple[State, jax.Array]:
+    """First episodes' clocks spread out, so that time limits do not come all at once; and which are late, [N]."""
+    steps = jax.random.randint(key, state.reward.shape, 0, episode_length).astype(state.info["steps"].dtype)
+    return state.replace(info={**state.info, "steps": steps}), (steps > 0).astype(jnp.float32)
+
+
+def init(env: Env, config: PPOConfig, key: jax.Array, domain: Distribution | None = None) -> TrainState:
+    """The state before the first update; domain None trains at the nominal theta."""
+    if "policy" not in env.observation_size:
+        raise ValueError(f"observation groups {sorted(env.observation_size)}: a policy needs the group 'policy'")
+    return _init(env, config)(key, domain)
+
+
+@lru_cache(maxsize=32)
+def _init(env: Env, config: PPOConfig) -> Callable[..., TrainState]:
+    sizes = {group: env.observation_size[group][0] for group in {"policy", critic_group(env)}}
+
+    def run(key: jax.Array, domain: Distribution | None) -> TrainState:
+        key, network_key, reset_key, clock_key = jax.random.split(key, 4)
+        hidden = (config.hidden_actor, config.hidden_critic, config.init_std)
+        params = networks.init(network_key, sizes["policy"], sizes[critic_group(env)], env.action_size, *hidden)
+        env_states, partial = _stagger(clock_key, _reset(env, reset_key, domain, config.num_envs), env.episode_length)
+        return TrainState(
+            params=params,
+            opt_state=losses.optimiser_init(params),
+            normalizer={group: normalise.init(size) for group, size in sizes.items()},
+            learning_rate=jnp.float32(config.learning_rate),
+            env_states=env_states,
+            episodes=episodes.init(partial),
+            key=key,
+            iteration=jnp.int32(0),
+            env_steps=jnp.uint32(0),
+            config=config,
+        )
+
+    return jax.jit(run)
+
+
+def _collect(
+    env: Env, config: PPOConfig, state: TrainState, domain: Distribution | None, key: jax.Array
+) -> tuple[State, dict]:
+    """num_steps in every world with the current policy; resets come from a pool drawn once per update."""
+    pool_key, collect_key = jax.random.split(key)
+    policy = policy_of(state)
+
+    def act(key: jax.Array, obs: dict[str, jax.Array]) -> tuple[jax.Array, dict]:
+        mean, log_std = policy.distribution(obs)
+        action = mean + jnp.exp(log_std) * jax.random.normal(key, mean.shape)
+        return jnp.clip(action, -config.action_clip, config.action_clip), {"action": action, "mean": mean}
+
+    pool = _reset(env, pool_key, domain, config.num_envs)
+    groups = tuple(sorted(state.normalizer))
+    return collect(env, act, collect_key, state.env_states, pool, config.num_steps, groups)
+
+
+def _batch(env: Env, config: PPOConfig, state: TrainState, data: dict) -> losses.Batch:
+    """The collected [T, N] arrays as B = T N transitions with values, advantages and returns, computed once."""
+    act, group = networks.activation(config.activation), critic_group(env)
+
+    def seen(which: str, group: str) -> jax.Array:
+        x = data[which][group]
+        return normalise.normalise(state.normalizer[group], x) if config.normalize_observations else x
+
+    observation, critic_observation = seen("observation", "policy"), seen("observation", group)
+    value = networks.value(state.params, critic_observation, act)
+    next_value = networks.value(state.params, seen("final_observation", group), act)
+    reward = config.reward_scale * data["reward"]
+    ends = (data["terminated"], data["truncated"])
+    advantage, returns = gae(reward, value, next_value, *ends, config.gamma, config.gae_lambda)
+    mean, action = data["extras"]["mean"], data["extras"]["action"]
+    batch = losses.Batch(
+        observation=observation,
+        critic_observation=critic_observation,
+        action=action,
+        mean=mean,
+        log_prob=networks.log_prob(mean, state.params["actor"]["log_std"], action),
+        value=value,
+        advantage=advantage,
+        returns=returns,
+    )
+    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), batch)
+
+
+def update(
+    env: Env, config: PPOConfig, state: TrainState, domain: Distribution | None
+) -> tuple[TrainState, dict[str, jax.Array]]:
+    """One iteration, to be jitted: the new state and its metrics, scalars under their TensorBoard tags."""
+    key, collect_key, epochs_key = jax.random.split(state.key, 3)
+    env_states, data = _collect(env, config, state, domain, collect_key)
+    batch = _batch(env, config, state, data)
+    params, opt_state, rate, figures = losses.optimise(
+        epochs_key, state.params, state.opt_state, state.learning_rate, batch, config
+    )
+    normalizer = state.normalizer
+    if config.normalize_observations:  # only now: collection and update of one iteration see the same statistics
+        normalizer = {g: normalise.update(m, data["observation"][g]) for g, m in normalizer.items()}
+    finished = episodes.update(state.episodes, data["reward"], data["terminated"], data["truncated"])
+    env_steps = state.env_steps + jnp.uint32(config.num_envs * config.num_steps)
+    metrics = {name: x.mean() for name, x in figures.items()} | {
+        "Loss/learning_rate": rate,
+        # explained variance = 1 - var(R - V) / var(R)
+        "Loss/explained_variance": 1 - (batch.returns - batch.value).var() / (batch.returns.var() + 1e-8),
+        "Policy/mean_std": jnp.exp(params["actor"]["log_std"]).mean(),
+        "env_steps": env_steps,
+        **episodes.metrics(finished),
+    }
+    return TrainState(
+        params, opt_state, normalizer, rate, env_states, finished, key, state.iteration + 1, env_steps, state.config
+    ), metrics
+
+
+@lru_cache(maxsize=32)
+def make_update(env: Env, config: PPOConfig) -> Update:
+    """update(state, domain) -> (state, metrics of scalars), one jitted program; the same one for the same arguments."""
+    return jax.jit(lambda state, domain=None: update(env, config, state, domain))

@@ -1,0 +1,97 @@
+"""The host's loop around the jitted update: chunks of iterations, metrics once per log interval."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from bayessim_mjx.config import PPOConfig
+from bayessim_mjx.rl import ppo
+from bayessim_mjx.rl.networks import Policy
+from bayessim_mjx.rl.ppo import TrainState
+
+if TYPE_CHECKING:
+    from bayessim_mjx.distributions import Distribution
+    from bayessim_mjx.env import Env
+
+Metrics = dict[str, Any]
+# what an update reports, by TensorBoard tag: averaged over the log interval, or as it is at its end
+MEANS = (
+    "Loss/value", "Loss/surrogate", "Loss/entropy", "Loss/kl", "Loss/clip_fraction", "Loss/explained_variance",
+    "Policy/grad_norm",
+)  # fmt: skip
+LATEST = ("Train/mean_reward", "Train/mean_episode_length", "Loss/learning_rate", "Policy/mean_std", "env_steps")
+
+
+@lru_cache(maxsize=32)
+def _make_chunk(env: Env, config: PPOConfig) -> Callable[..., Any]:
+    """chunk(state, domain, count): `count` updates in one dispatch, one program for any count. Takes over the state."""
+
+    def chunk(state: TrainState, domain: Distribution | None, count: jax.Array) -> tuple[TrainState, Metrics]:
+        def body(_: jax.Array, carry: tuple[TrainState, Metrics]) -> tuple[TrainState, Metrics]:
+            state, metrics = ppo.update(env, config, carry[0], domain)
+            return state, {k: v if k in LATEST else carry[1][k] + v / count for k, v in metrics.items()}
+
+        zeros = {tag: jnp.float32(0) for tag in MEANS + LATEST} | {"env_steps": jnp.uint32(0)}
+        return jax.lax.fori_loop(0, count, body, (state, zeros))
+
+    return jax.jit(chunk, donate_argnums=0)
+
+
+def run(
+    env: Env,
+    config: PPOConfig,
+    state: TrainState,
+    domain: Distribution | None = None,
+    iterations: int | None = None,
+    progress: Callable[[Metrics, TrainState], None] | None = None,
+) -> tuple[TrainState, Metrics]:
+    """`iterations` more updates (config.max_iterations by default): the new state, and metrics of the last interval.
+
+    The host sees metrics every config.log_interval updates, Loss/* averaged over them, and then calls
+    progress(metrics, state). That state's buffers are reused by the next interval: copy what is to be kept.
+    FloatingPointError where the loss is no longer finite.
+    """
+    total = config.max_iterations if iterations is None else iterations
+    state = jax.tree.map(jnp.copy, state)  # the caller's state stays valid
+    done, metrics = 0, {}
+    while done < total:
+        count = min(config.log_interval, total - done)
+        start = time.perf_counter()
+        state, on_device = _make_chunk(env, config)(state, domain, jnp.int32(count))
+        metrics = {k: v.item() for k, v in jax.device_get(on_device).items()}
+        seconds = time.perf_counter() - start
+        done += count
+        if not np.isfinite(metrics["Loss/value"] + metrics["Loss/surrogate"]):
+            raise FloatingPointError(
+                f"the loss is not finite after iteration {int(state.iteration)} ({metrics}): check that the task's "
+                "observations and rewards stay finite over the whole domain, and lower ppo.learning_rate"
+            )
+        metrics["Perf/total_fps"] = count * config.num_envs * config.num_steps / seconds
+        metrics["Perf/iteration_time"] = seconds / count
+        if progress is not None:
+            progress(metrics, state)
+    return state, metrics
+
+
+def train(
+    env: Env,
+    config: PPOConfig,
+    key: jax.Array,
+    domain: Distribution | None = None,
+    *,
+    state: TrainState | None = None,
+    iterations: int | None = None,
+    progress: Callable[[Metrics, TrainState], None] | None = None,
+) -> tuple[Policy, Metrics]:
+    """Train from scratch, or go on from `state` (`key` is then not used); see `run`."""
+    if state is None:
+        state = ppo.init(env, config, key, domain)
+    state, metrics = run(env, config, state, domain, iterations, progress)
+    return ppo.policy_of(state), metrics

@@ -1,0 +1,197 @@
+"""Rollouts: scan over time, vmap over worlds. One whole episode per world, or endless collection with resets."""
+
+from __future__ import annotations
+
+import inspect
+import math
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+if TYPE_CHECKING:
+    from bayessim_mjx.env import Env, State
+    from bayessim_mjx.physics import Physics
+
+PolicyFn = Callable[..., Any]
+
+
+@struct.dataclass
+class Trajectory:
+    """One world, time-major; a batch has a leading axis of worlds. After the end the last observation is repeated."""
+
+    observation: jax.Array  # [T+1, S] group "policy"; row 0 is the reset
+    action: jax.Array  # [T, A] as the policy gave it
+    reward: jax.Array  # [T] 0 after the end
+    terminated: jax.Array  # [T] 1 at the step that ended the episode for good
+    truncated: jax.Array  # [T] 1 at the step where the time limit ended it
+    valid: jax.Array  # [T] 1 while the episode ran
+    theta: jax.Array  # [d]
+    qpos: jax.Array  # [T+1, nq] as measured; [T+1, 0] where the environment has no physics of ours
+    qvel: jax.Array  # [T+1, nv]
+    command: jax.Array  # [T, nu] what the action commanded of the actuators; [T, 0] likewise
+
+
+def select(mask: jax.Array, yes: Any, no: Any) -> Any:
+    """Leaf-wise where(mask, yes, no) for pytrees with a leading axis like mask [N]; keeps the dtypes of `yes`."""
+
+    def leaf(a: jax.Array, b: jax.Array) -> jax.Array:
+        return jnp.where(mask.reshape(mask.shape + (1,) * (jnp.ndim(a) - mask.ndim)), a, b).astype(jnp.result_type(a))
+
+    return jax.tree.map(leaf, yes, no)
+
+
+def as_pytree(policy_fn: PolicyFn) -> PolicyFn:
+    """The same function as a pytree, its arrays as leaves: new parameters are then new arguments, not a new program."""
+    if inspect.ismethod(policy_fn) and not jax.tree_util.all_leaves([policy_fn.__self__]):
+        return jax.tree_util.Partial(policy_fn.__func__, policy_fn.__self__)
+    return jax.tree_util.Partial(policy_fn) if jax.tree_util.all_leaves([policy_fn]) else policy_fn
+
+
+def rollout(env: Env, policy_fn: PolicyFn, key: jax.Array, thetas: jax.Array, length: int) -> Trajectory:
+    """One episode of at most `length` steps in each of N worlds; all fields with a leading N.
+
+    policy_fn(key, obs: {group: [S]}) -> action [A] acts in one world; a `Policy`, its method `act`, or any function.
+    thetas [N, d]. Compiled once per (env, function, length, N): another key, theta or policy of its kind reuses it.
+    """
+    if length < 1:
+        raise ValueError(f"length = {length}: a rollout has at least 1 step")
+    thetas = jnp.asarray(thetas, jnp.float32)
+    if thetas.ndim != 2:
+        raise ValueError(f"thetas has shape {thetas.shape}: expected [worlds, parameters]")
+    return _rollout(env, length)(as_pytree(policy_fn), key, thetas)
+
+
+@lru_cache(maxsize=32)
+def _rollout(env: Env, length: int) -> Callable[..., Trajectory]:
+    def run(policy_fn: PolicyFn, key: jax.Array, thetas: jax.Array) -> Trajectory:
+        worlds = thetas.shape[0]
+        reset_key, key = jax.random.split(key)
+        state = jax.vmap(env.reset)(jax.random.split(reset_key, worlds), thetas)
+
+        def step(carry: tuple, keys: jax.Array) -> tuple[tuple, tuple]:
+            state, alive, action = carry
+            action = select(alive, jax.vmap(policy_fn)(keys, state.obs), action)
+            after = select(alive, jax.vmap(env.step)(state, action), state)
+            terminated = after.info["terminated"] * alive
+            truncated = after.info["truncated"] * alive
+            row = (
+                action,
+                after.reward * alive,
+                terminated,
+                truncated,
+                alive.astype(jnp.float32),
+                _command(env, action),
+            )
+            return (after, alive & (terminated + truncated == 0), action), (row, _seen(after))
+
+        keys = jax.vmap(lambda k: jax.random.split(k, worlds))(jax.random.split(key, length))
+        carry = (state, jnp.ones(worlds, bool), jnp.zeros((worlds, env.action_size)))
+        _, (rows, seen) = jax.lax.scan(step, carry, keys)
+        seen = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), _seen(state), seen)
+        (action, reward, terminated, truncated, valid, command), (observation, qpos, qvel) = jax.tree.map(
+            lambda x: jnp.moveaxis(x, 0, 1), (rows, seen)
+        )
+        return Trajectory(observation, action, reward, terminated, truncated, valid, thetas, qpos, qvel, command)
+
+    return jax.jit(run)
+
+
+def _seen(state: State) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Policy observation [N, S] and measured qpos [N, nq], qvel [N, nv] (empty without physics of ours)."""
+    observation = state.obs["policy"]
+    measurement = getattr(state.pipeline_state, "measurement", None)
+    if measurement is None:
+        empty = jnp.zeros((observation.shape[0], 0))
+        return observation, empty, empty
+    return observation, measurement["qpos"], measurement["qvel"]
+
+
+def _command(env: Env, action: jax.Array) -> jax.Array:
+    """Actuator commands [N, nu] of the actions [N, A] (empty without physics of ours)."""
+    command = getattr(env, "command", None)
+    return jnp.zeros((action.shape[0], 0)) if command is None else jax.vmap(command)(action)
+
+
+def replay(
+    physics: Physics, qpos0: jax.Array, qvel0: jax.Array, command: jax.Array, thetas: jax.Array
+) -> dict[str, jax.Array]:
+    """Open loop: the commands [N, T, nu] from given states [N, nq], [N, nv] in the worlds thetas [N, d].
+
+    Returns the measurements {"qpos": [N, T+1, nq], "qvel": [N, T+1, nv]}, row 0 at the start.
+    """
+    arrays = [jnp.asarray(x, jnp.float32) for x in (qpos0, qvel0, command, thetas)]
+    shapes = [x.shape for x in arrays]
+    if [len(s) for s in shapes] != [2, 2, 3, 2] or len({s[0] for s in shapes}) != 1:
+        raise ValueError(
+            f"qpos0 {shapes[0]}, qvel0 {shapes[1]}, command {shapes[2]}, thetas {shapes[3]}: "
+            "expected [N, nq], [N, nv], [N, T, nu], [N, d] with the same N"
+        )
+    return _replay(physics)(*arrays)
+
+
+@lru_cache(maxsize=32)
+def _replay(physics: Physics) -> Callable[..., dict[str, jax.Array]]:
+    from bayessim_mjx.physics import control_step
+
+    def one(qpos: jax.Array, qvel: jax.Array, command: jax.Array, theta: jax.Array) -> dict[str, jax.Array]:
+        world = physics.world(theta, qpos, qvel)
+
+        def step(world: Any, command: jax.Array) -> tuple[Any, dict]:
+            world, _ = control_step(physics, world, command)
+            return world, world.measurement
+
+        _, after = jax.lax.scan(step, world, command)
+        return jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), world.measurement, after)
+
+    return jax.jit(jax.vmap(one))
+
+
+def collect(
+    env: Env,
+    policy_fn: PolicyFn,
+    key: jax.Array,
+    env_states: State,
+    pool: State,
+    length: int,
+    groups: Sequence[str] = ("policy",),
+) -> tuple[State, dict[str, Any]]:
+    """`length` steps in N worlds, each starting a new episode wherever one ends; to be called inside a jitted function.
+
+    policy_fn(key, obs: {group: [N, S]}) -> (action [N, A], extras) acts in all worlds at once; extras is kept.
+    pool: N freshly reset states. World i takes pool[(i + k stride) % N] for its k-th new episode in this call, so that
+    all worlds draw different ones, and theta is drawn anew with each episode.
+    Returns the last states and time-major arrays [T, N, ...]: observation and final_observation (the next one,
+    before any reset) by group, reward, terminated, truncated, extras.
+    """
+    worlds = env_states.reward.shape[0]
+    stride = _stride(worlds)
+
+    def step(carry: tuple[State, jax.Array], key: jax.Array) -> tuple[tuple, dict]:
+        state, index = carry
+        action, extras = policy_fn(key, state.obs)
+        after = jax.vmap(env.step)(state, action)
+        terminated = after.info["terminated"]
+        truncated = after.info["truncated"] * (1 - terminated)
+        ended = terminated + truncated > 0
+        row = {
+            "observation": {g: state.obs[g] for g in groups},
+            "final_observation": {g: after.info["final_observation"][g] for g in groups},
+            "reward": after.reward,
+            "terminated": terminated,
+            "truncated": truncated,
+            "extras": extras,
+        }
+        fresh = jax.tree.map(lambda x: x[index], pool)
+        return (select(ended, fresh, after), jnp.where(ended, (index + stride) % worlds, index)), row
+
+    (state, _), batch = jax.lax.scan(step, (env_states, jnp.arange(worlds)), jax.random.split(key, length))
+    return state, batch
+
+
+def _stride(worlds: int) -> int:
+    """A step near the golden section of the pool and coprime with its size: visits every entry before repeating one."""
+    return next(s for s in range(max(1, round(0.618 * worlds)), 0, -1) if math.gcd(s, worlds) == 1)
