@@ -243,9 +243,9 @@ class PPOConfig(Section):
 
     def check(self) -> None:
         batch = self.num_envs * self.num_steps
-        if batch % self.num_minibatches:
+        if self.num_minibatches > batch:
             raise UserError(
-                f"ppo.num_minibatches = {self.num_minibatches} does not divide the batch of num_envs * num_steps = "
+                f"ppo.num_minibatches = {self.num_minibatches} is more than the batch of num_envs * num_steps = "
                 f"{self.num_envs} * {self.num_steps} = {batch} samples"
             )
 

@@ -1,0 +1,131 @@
+"""One checkpoint: a pytree of arrays and a JSON index, written by Orbax into a folder that appears whole or not at all.
+
+The index holds every leaf's name, shape, dtype and SHA-256: a damaged or foreign checkpoint is told from a good one.
+"""
+
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bayessim_mjx.errors import UserError
+
+INDEX = "index.json"
+FORMAT = 1
+
+
+class CorruptedError(UserError):
+    """The checkpoint's files are damaged or incomplete."""
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Replace `path` by `content` atomically: a reader sees the old file or the new one, also after a kill."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    with open(temporary, "w", encoding="utf-8") as file:
+        json.dump(content, file, indent=1)
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(temporary, path)
+
+
+def save(path: Path, tree: Any, step: int, meta: Mapping[str, Any]) -> None:
+    """Write `tree` as the folder `path`, which must not exist. A dict's entries can be restored one by one."""
+    import jax
+
+    temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")
+    shutil.rmtree(temporary, ignore_errors=True)
+    temporary.mkdir(parents=True)
+    parts = jax.device_get(tree if type(tree) is dict else {"tree": tree})
+    index = {name: _save_part(temporary / name, part) for name, part in parts.items()}
+    write_json(temporary / INDEX, {"format": FORMAT, "step": int(step), "meta": dict(meta), "parts": index})
+    os.rename(temporary, path)
+
+
+def _save_part(folder: Path, part: Any) -> list[dict[str, Any]]:
+    import orbax.checkpoint as ocp
+
+    arrays = {name: np.asarray(leaf) for name, leaf in _leaves(part)}
+    # Orbax refuses arrays without elements; their shape in the index says it all.
+    stored = {f"{i:06d}": array for i, array in enumerate(arrays.values()) if array.size}
+    if stored:
+        with ocp.PyTreeCheckpointer() as checkpointer:
+            checkpointer.save(folder.absolute(), stored)
+    return [_describe(name, array) for name, array in arrays.items()]
+
+
+def _leaves(tree: Any) -> list[tuple[str, Any]]:
+    import jax
+
+    flat = jax.tree_util.tree_flatten_with_path(tree)[0]
+    return [(jax.tree_util.keystr(path, simple=True, separator="."), leaf) for path, leaf in flat]
+
+
+def _describe(name: str, array: np.ndarray) -> dict[str, Any]:
+    digest = hashlib.sha256(np.ascontiguousarray(array).tobytes()).hexdigest()
+    return {"name": name, "shape": list(array.shape), "dtype": str(array.dtype), "sha256": digest}
+
+
+def read_index(path: Path) -> dict[str, Any]:
+    """The index of the checkpoint `path`; CorruptedError where there is none."""
+    try:
+        index = json.loads((path / INDEX).read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise CorruptedError(f"{path}: not a checkpoint, or damaged: {INDEX}: {error}") from None
+    if not isinstance(index, dict) or index.get("format") != FORMAT or "parts" not in index:
+        raise CorruptedError(f"{path / INDEX}: not a checkpoint index of format {FORMAT}")
+    return index
+
+
+def restore(path: Path, template: Any) -> tuple[Any, dict[str, Any]]:
+    """(tree like `template`, meta). A dict template may name only some of the saved entries.
+
+    `template` holds arrays or ShapeDtypeStructs. CorruptedError for damaged files; UserError, naming the leaf, where
+    the checkpoint is that of another task or of other settings.
+    """
+    index = read_index(path)
+    parts = template if type(template) is dict else {"tree": template}
+    missing = [name for name in parts if name not in index["parts"]]
+    if missing:
+        raise UserError(f"{path}: the checkpoint has no {missing[0]!r}; it has {', '.join(index['parts'])}")
+    for name, part in parts.items():
+        _compare(f"{path}: {name}", index["parts"][name], part)
+    tree = {name: _restore_part(path / name, index["parts"][name], part) for name, part in parts.items()}
+    return (tree if type(template) is dict else tree["tree"]), index["meta"]
+
+
+def _compare(where: str, saved: list[dict], template: Any) -> None:
+    """Refuse a template whose leaves have other names, shapes or types than the saved ones."""
+    have = {leaf["name"]: f"{leaf['dtype']}{leaf['shape']}" for leaf in saved}
+    need = {name: f"{leaf.dtype}{list(leaf.shape)}" for name, leaf in _leaves(template)}
+    for name in dict.fromkeys([*need, *have]):
+        if need.get(name) != have.get(name):
+            raise UserError(
+                f"{where}.{name} is {have.get(name, 'absent')} in the checkpoint, but {need.get(name, 'absent')} under "
+                "the present settings: use the task and settings that it was made with"
+            )
+
+
+def _restore_part(folder: Path, saved: list[dict], template: Any) -> Any:
+    import jax
+    import jax.numpy as jnp
+    import orbax.checkpoint as ocp
+
+    stored: dict[str, Any] = {}
+    if any(0 not in leaf["shape"] for leaf in saved):
+        try:
+            with ocp.PyTreeCheckpointer() as checkpointer:
+                stored = checkpointer.restore(folder.absolute())
+        except Exception as error:  # a damaged file fails in many ways inside Orbax
+            raise CorruptedError(f"{folder}: damaged checkpoint: {str(error).splitlines()[0][:200]}") from None
+    leaves = []
+    for i, leaf in enumerate(saved):
+        array = np.asarray(stored.get(f"{i:06d}", np.zeros(leaf["shape"], leaf["dtype"])))
+        if _describe(leaf["name"], array) != leaf:
+            raise CorruptedError(f"{folder}: damaged checkpoint: {leaf['name']} differs from its checksum")
+        leaves.append(jnp.asarray(array))
+    return jax.tree.unflatten(jax.tree.structure(template), leaves)
