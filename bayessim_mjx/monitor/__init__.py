@@ -1,1 +1,1 @@
-"""What a person sees: TensorBoard files, plots, videos and the console. Takes results and computes nothing about them."""
+"""What a person sees: TensorBoard files, plots, videos and the console. Shows results, computes none."""

@@ -1,0 +1,190 @@
+"""The panels that plots of a posterior are made of: marginals, joint densities, intervals, correlations."""
+
+from typing import Any
+
+import numpy as np
+
+from bayessim_mjx.monitor.draws import Draws, correlations, density, density2, levels, shorten
+from bayessim_mjx.monitor.style import BLUE, DASHED, GREEN, GREY, NAVY, RED, YELLOW, blues, size_of
+
+Limits = tuple[float, float]
+
+
+def triangle(figure: Any, draws: Draws, true: np.ndarray | None, top: float = 0.75) -> None:
+    """Fill a (sub)figure with marginals on the diagonal and joint densities below; `top` inches stay free above."""
+    d = draws.d
+    width, height = size_of(figure)
+    left, right, bottom = 0.95 if d > 1 else 0.4, 0.25, 0.85 if d > 1 else 0.6
+    box = dict(left=left / width, right=1 - right / width, bottom=bottom / height, top=1 - top / height)
+    grid = figure.subplots(d, d, squeeze=False, gridspec_kw=box | dict(hspace=0.16, wspace=0.12))
+    cell = ((width - left - right) / d, (height - bottom - top) / d)
+    size = 9.0 if d == 1 else 7.5 if cell[0] > 1.5 else 6.5 if cell[0] > 1.0 else 5.5
+    limits = [limits_of(draws, k, true) for k in range(d)]
+    for row in range(d):
+        for column in range(d):
+            axes = grid[row, column]
+            if column > row:
+                axes.remove()
+                continue
+            if column == row:
+                marginal(axes, draws, row, true, limits[row])
+                axes.set_title(estimate(draws, row), fontsize=size, pad=3)
+            else:
+                joint(axes, draws, (column, row), true, (*limits[column], *limits[row]))
+            axes.tick_params(labelsize=size - 0.5, length=2, pad=1.5)
+            axes.tick_params(labelbottom=row == d - 1, labelleft=column == 0 and row > 0)
+            _few_ticks(axes, draws, column, row, min(cell))
+    _name_edges(grid, draws, cell, size)
+
+
+def _name_edges(grid: Any, draws: Draws, cell: tuple[float, float], size: float) -> None:
+    """Parameter names along the left and the bottom, in as many characters as a cell has room for."""
+    d = draws.d
+    per_inch = 72 / (size * 0.64)
+    room = [max(8, int(side * 0.97 * per_inch)) for side in cell]
+    for k in range(d):
+        below = grid[d - 1, k]
+        below.set_xlabel(label(draws, k, room[0] if d > 1 else 60, 3), fontsize=size)
+        below.xaxis.set_label_coords(0.5, -(0.22 if d > 1 else 0.28) / cell[1])
+        if k > 0:
+            grid[k, 0].set_ylabel(label(draws, k, room[1], 3), fontsize=size)
+            grid[k, 0].yaxis.set_label_coords(-0.34 / cell[0], 0.5)
+
+
+def marginal(axes: Any, draws: Draws, k: int, true: np.ndarray | None, limits: Limits) -> None:
+    """Density of parameter k over its prior, with the truth."""
+    x, y = density(draws.values[:, k], *limits)
+    axes.fill_between(x, y, color=BLUE, alpha=0.25, lw=0)
+    axes.plot(x, y, color=BLUE, lw=1.4)
+    if draws.prior is None:
+        flat = 1.0 / (draws.high[k] - draws.low[k])
+        axes.plot(np.clip([draws.low[k], draws.high[k]], *limits), [flat, flat], color=GREEN, lw=1.3, ls=DASHED)
+    else:
+        axes.plot(*density(draws.prior[:, k], draws.low[k], draws.high[k]), color=GREEN, lw=1.3, ls=DASHED)
+    if true is not None:
+        axes.axvline(true[k], color=RED, lw=1.6)
+    axes.set_xlim(*limits)
+    axes.set_ylim(0, 1.12 * y.max())
+    axes.set_yticks([])
+    _numbers(axes.xaxis, draws.log[k])
+
+
+def joint(axes: Any, draws: Draws, ij: tuple[int, int], true: np.ndarray | None, box: Any, star: bool = False) -> None:
+    """Density of parameters i (across) and j (up) in box (low i, high i, low j, high j), with 50 and 90 % regions.
+
+    `star` is BayesSimIG's look: smooth, a yellow star at the truth, a + at each component's mean.
+    """
+    i, j = ij
+    x, y, height = density2(draws.values[:, i], draws.values[:, j], box, 120 if star else 64)
+    flat = 1.0 / height.size
+    shading = "gouraud" if star else "nearest"
+    axes.pcolormesh(x, y, height, cmap=blues(), vmin=0, vmax=max(height.max(), 2.5 * flat), shading=shading)
+    if height.max() > 1.8 * flat:  # contours of a flat density would only draw its noise
+        lines = levels(height, (0.9, 0.5))
+        axes.contour(x, y, height, levels=lines, colors=BLUE, linewidths=[0.8, 1.3][-len(lines) :])
+    if star and draws.means is not None:
+        axes.plot(draws.means[:, i], draws.means[:, j], "+", color=NAVY, ms=9, mew=1.6)
+    if true is not None and star:
+        axes.plot(true[i], true[j], "*", color=YELLOW, mec="black", mew=0.8, ms=15, zorder=5)
+    elif true is not None:
+        axes.axvline(true[i], color=RED, lw=0.8, alpha=0.8)
+        axes.axhline(true[j], color=RED, lw=0.8, alpha=0.8)
+        axes.plot(true[i], true[j], "o", color=RED, ms=3.5)
+    axes.set_xlim(box[0], box[1])
+    axes.set_ylim(box[2], box[3])
+    _numbers(axes.xaxis, draws.log[i])
+    _numbers(axes.yaxis, draws.log[j])
+
+
+def intervals(axes: Any, draws: Draws, true: np.ndarray | None, room: int = 46) -> None:
+    """50 and 95 % intervals as fractions of the prior range; the best identified on top, contraction at the right."""
+    gain, order = draws.contraction(), best_first(draws)
+    unit = (np.percentile(draws.values, [2.5, 25, 50, 75, 97.5], axis=0) - draws.low) / (draws.high - draws.low)
+    for place, k in enumerate(order):
+        axes.plot(unit[[0, 4], k], [place, place], color=BLUE, lw=1.4, alpha=0.55, solid_capstyle="butt")
+        axes.plot(unit[[1, 3], k], [place, place], color=BLUE, lw=5.0, solid_capstyle="butt")
+        axes.plot(unit[2, k], place, "|", color="white", ms=6, mew=1.4)
+        axes.text(1.03, place, f"{gain[k] + 0.0:.2f}".replace("-0.00", "0.00"), va="center", fontsize=7, color=GREY)
+    if true is not None:
+        at = (true - draws.low) / (draws.high - draws.low)
+        axes.plot(np.clip(at[order], 0, 1), np.arange(draws.d), "d", color=RED, ms=4.5, clip_on=False, zorder=5)
+    axes.set_yticks(range(draws.d), [label(draws, k, room, 1, ranges=True) for k in order], fontsize=7)
+    axes.set_ylim(draws.d - 0.4, -0.6)
+    axes.set_xlim(0, 1)
+    axes.set_xticks([0, 0.25, 0.5, 0.75, 1], ["low", "25 %", "50 %", "75 %", "high"], fontsize=7.5)
+    axes.set_xlabel("place in the prior range", fontsize=8)
+    axes.text(1.03, -0.75, "contraction", fontsize=7, color=GREY, va="bottom", ha="left")
+    axes.set_title("50 % and 95 % intervals, best identified first", fontsize=9, loc="left")
+    axes.grid(axis="x", color="#E5E5E5", lw=0.7)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right", "left"]].set_visible(False)
+    axes.tick_params(axis="y", length=0)
+
+
+def correlation(figure: Any, draws: Draws) -> None:
+    """Heat map of the correlations, the best identified parameters first."""
+    ranked = draws.pick(best_first(draws))
+    width, height = size_of(figure)
+    side = min(height - 1.05, width - 3.5)
+    axes = figure.add_axes((2.3 / width, 0.7 / height, side / width, side / height))
+    picture = axes.imshow(correlations(ranked.values), vmin=-1, vmax=1, cmap="RdBu_r", interpolation="nearest")
+    step = max(1, int(np.ceil(ranked.d * 6.5 / (side * 72))))
+    ticks, short = range(0, ranked.d, step), shorten(ranked.names, 30)
+    size = float(np.clip(side * 72 / ranked.d * 0.85 * step, 4.5, 7))
+    axes.set_yticks(ticks, [f"{short[k]}  {k + 1}" for k in ticks], fontsize=size)
+    axes.set_xticks(ticks, [str(k + 1) for k in ticks], fontsize=size, rotation=90 if ranked.d > 25 else 0)
+    axes.tick_params(length=1.5, pad=1.5)
+    axes.set_title("correlation under the posterior, best identified first", fontsize=9)
+    bar = figure.add_axes(((2.45 + side) / width, 0.7 / height, 0.02, side / height))
+    figure.colorbar(picture, cax=bar).ax.tick_params(labelsize=7)
+
+
+def best_first(draws: Draws) -> np.ndarray:
+    return np.argsort(-draws.contraction(), kind="stable")
+
+
+def limits_of(draws: Draws, k: int, true: np.ndarray | None) -> Limits:
+    """The prior range, so that what was learned is seen; zoomed in once the posterior is under 12 % of it."""
+    low, high = float(draws.low[k]), float(draws.high[k])
+    inner = [float(v) for v in np.percentile(draws.values[:, k], [0.2, 99.8])]
+    inner += [] if true is None else [float(true[k])]
+    wide = max(max(inner) - min(inner), 1e-4 * (high - low))
+    if wide < 0.12 * (high - low):
+        return max(min(low, *inner), min(inner) - 0.6 * wide), min(max(high, *inner), max(inner) + 0.6 * wide)
+    return min(low, *inner), max(high, *inner)
+
+
+def label(draws: Draws, k: int, width: int, lines: int, ranges: bool = False) -> str:
+    """Name and unit of parameter k (and its range) in `lines` lines of `width` characters."""
+    tail = f" [{draws.units[k]}]" if draws.units[k] else ""
+    if ranges:
+        tail += f"   {natural(draws, k, draws.low[k]):.3g}–{natural(draws, k, draws.high[k]):.3g}"
+    return shorten(draws.names, max(width - (len(tail) if lines == 1 else 0), 8), lines)[k] + tail
+
+
+def estimate(draws: Draws, k: int) -> str:
+    values = natural(draws, k, draws.values[:, k])
+    return f"{values.mean():.3g} ± {values.std():.2g}"
+
+
+def natural(draws: Draws, k: int, value: Any) -> Any:
+    """Plotting coordinate -> the parameter's own unit."""
+    return 10.0**value if draws.log[k] else value
+
+
+def _numbers(axis: Any, log: bool) -> None:
+    from matplotlib.ticker import FuncFormatter
+
+    if log:
+        axis.set_major_formatter(FuncFormatter(lambda v, _: f"{10.0**v:.2g}"))
+
+
+def _few_ticks(axes: Any, draws: Draws, column: int, row: int, cell: float) -> None:
+    from matplotlib.ticker import MaxNLocator
+
+    most = 6 if cell > 3 else 3 if cell > 1.0 else 2
+    axes.xaxis.set_major_locator(MaxNLocator(most, prune="both" if draws.d > 1 else None))
+    _numbers(axes.xaxis, draws.log[column])
+    if column != row:
+        axes.yaxis.set_major_locator(MaxNLocator(most, prune="both"))
+        _numbers(axes.yaxis, draws.log[row])

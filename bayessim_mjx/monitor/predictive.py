@@ -1,0 +1,110 @@
+"""Posterior predictive picture: real motion over what the simulator does under the posterior, channel by channel."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from bayessim_mjx.monitor.draws import shorten
+from bayessim_mjx.monitor.style import BLUE, GREEN, handles, heading, new_figure
+
+
+def predictive(
+    time: Any,
+    real: Mapping[str, Any],
+    simulated: Mapping[str, Any],
+    *,
+    units: Mapping[str, str] | None = None,
+    before: Mapping[str, Any] | None = None,
+    title: str = "real against simulated under the posterior",
+    round: int | None = None,
+    most: int = 8,
+    lines: int = 4,
+) -> Any:
+    """Real motion against the 50 and 90 % bands of simulated motion and a few single simulations.
+
+    Args:
+        time: [T] seconds. real: {channel: [T] or [m, T]}. simulated: {channel: [n, T]}; NaN where an episode was over.
+        units: {channel: unit}. before: {channel: [n, T]} the same under the prior, drawn as a pale band.
+        most: at most so many channels; those that simulation explains worst come first. lines: single simulations.
+    Raises:
+        ValueError: no channel in common, or a length that is not T.
+    """
+    time = np.asarray(time, float)
+    data = {k: (_rows(real[k], time, k), _rows(simulated[k], time, k)) for k in real if k in simulated}
+    if not data:
+        raise ValueError(f"no channel in common: real has {sorted(real)}, simulated has {sorted(simulated)}")
+    ranked = sorted(data, key=lambda k: -_mismatch(*data[k]))
+    shown = ranked[:most]
+    columns = 1 if len(shown) <= 3 else 2
+    rows = -(-len(shown) // columns)
+    figure = new_figure(9.0 if columns == 1 else 12.0, 1.1 + 2.0 * rows, layout="constrained")
+    grid = figure.subplots(rows, columns, sharex=True, squeeze=False).ravel()
+    for axes in grid[len(shown) :]:
+        axes.remove()
+    for k, (axes, name) in enumerate(zip(grid, shown, strict=False)):
+        pale = None if before is None or name not in before else _rows(before[name], time, name)
+        _channel(axes, time, *data[name], pale, lines)
+        axes.set_title(_title(name, *data[name]), fontsize=9, loc="left")
+        unit = (units or {}).get(name, "")
+        axes.set_ylabel(f"[{unit}]" if unit else "", fontsize=8)
+        if k >= len(shown) - columns:
+            axes.set_xlabel("time [s]", fontsize=8)
+            axes.tick_params(labelbottom=True)
+    items = ["real", "draw", "band90", "band50"] + ["before"] * (before is not None)
+    marks, texts = handles(items)
+    figure.legend(marks, texts, loc="outside lower center", ncols=len(items), frameon=False, fontsize=8)
+    few = f", {len(shown)} of {len(ranked)} channels, worst explained first" if len(ranked) > most else ""
+    figure.suptitle(heading(title, round) + few, fontsize=11)
+    return figure
+
+
+def _rows(values: Any, time: np.ndarray, name: str) -> np.ndarray:
+    rows = np.atleast_2d(np.asarray(values, float))
+    if rows.shape[-1] != len(time):
+        raise ValueError(f"channel {name!r} has {rows.shape[-1]} steps, but time has {len(time)}")
+    return rows
+
+
+def _mismatch(real: np.ndarray, simulated: np.ndarray) -> float:
+    """Root mean square of real - median simulation, in units of how much the channel moves at all."""
+    off = real - _percentiles(simulated, [50])[0]
+    both = np.concatenate([real.ravel(), simulated.ravel()])
+    moves = both[np.isfinite(both)].std() if np.isfinite(both).any() else 0.0
+    known = off[np.isfinite(off)]
+    return float(np.sqrt((known**2).mean()) / moves) if len(known) and moves > 1e-9 else -1.0
+
+
+def _percentiles(rows: np.ndarray, percent: Sequence[float]) -> np.ndarray:
+    """Percentiles over the rows [n, T] -> [q, T]; NaN where no row is left."""
+    out = np.full((len(percent), rows.shape[1]), np.nan)
+    alive = np.isfinite(rows).any(0)
+    if alive.any():
+        out[:, alive] = np.nanpercentile(rows[:, alive], percent, axis=0)
+    return out
+
+
+def _channel(axes: Any, time: np.ndarray, real: np.ndarray, simulated: np.ndarray, pale: Any, lines: int) -> None:
+    if pale is not None:
+        axes.fill_between(time, *_percentiles(pale, [5, 95]), color=GREEN, alpha=0.13, lw=0)
+    band = _percentiles(simulated, [5, 25, 75, 95])
+    axes.fill_between(time, band[0], band[3], color=BLUE, alpha=0.18, lw=0)
+    axes.fill_between(time, band[1], band[2], color=BLUE, alpha=0.32, lw=0)
+    for row in simulated[:: max(1, len(simulated) // max(lines, 1))][:lines]:
+        axes.plot(time, row, color=BLUE, lw=0.6, alpha=0.8)
+    for row in real:
+        axes.plot(time, row, color="black", lw=1.5)
+    axes.grid(color="#EAEAEA", lw=0.6)
+    axes.set_axisbelow(True)
+    axes.margins(x=0)
+    axes.tick_params(labelsize=7.5)
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def _title(name: str, real: np.ndarray, simulated: np.ndarray) -> str:
+    low, high = _percentiles(simulated, [5, 95])
+    known = np.isfinite(real) & np.isfinite(low)
+    if not known.any():
+        return shorten([name], 40)[0]
+    inside = ((real >= low) & (real <= high))[known].mean()
+    return f"{shorten([name], 40)[0]}   ({100 * inside:.0f} % inside the 90 % band)"
