@@ -1,0 +1,231 @@
+"""What MuJoCo derives at compile time, recomputed in JAX: inverse weights, inertias at qpos0, lengths, statistics.
+
+The equations are those of `mj_setConst` (MuJoCo, engine_setconst.c), at qpos0.
+"""
+
+import contextlib
+import io
+from collections.abc import Collection
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jax.scipy.linalg import solve_triangular
+
+with contextlib.redirect_stdout(io.StringIO()):  # MJX announces on import that the optional warp is absent
+    from mujoco import mjx
+
+from bayessim_mjx.parameters import geometry
+
+_MASS = {"body_mass"}
+_SHAPE = {"geom_size", "geom_rbound"}
+_POSE = {"qpos0", "body_pos", "body_quat", "body_ipos", "jnt_pos", "jnt_axis", "geom_pos", "geom_quat", "site_pos"}
+_POSE |= {"site_quat", "eq_data"}
+_INERTIA = _MASS | {"body_inertia", "body_iquat", "dof_armature", "tendon_armature", "actuator_gear"}
+_PLANE, _HFIELD = int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_HFIELD)
+
+
+def set_const(
+    model: mjx.Model, changed: Collection[str] | None = None, reference: mjx.Model | None = None
+) -> mjx.Model:
+    """Recompute the derived constants of `model` from its primary fields. Pure JAX, for use under `vmap`.
+
+    Args:
+        model: a model (JAX implementation) whose primary fields were changed.
+        changed: names of the changed leaves; only what depends on them is recomputed. None: everything.
+        reference: the model as compiled. A statistic that its MJCF overrides (`<statistic extent=...>`) is then left
+            alone: recognised because the reference's own fields do not give it.
+
+    Returns:
+        The model with body_subtreemass, body_invweight0, dof_invweight0, dof_M0, tendon_length0, tendon_invweight0,
+        actuator_acc0, the anchor of connect constraints in the second body, cam_pos0, cam_poscom0 and stat.* brought
+        up to date. Not covered, because `mjx.Model` does not hold what is needed: the lights' rest poses (rendering),
+        numbers that the compiler froze from ratios (`dampratio`, automatic `springlength`, automatic weld poses).
+    """
+    every = changed is None
+    names = set(changed or ())
+    pose, inertia = every or bool(names & _POSE), every or bool(names & (_INERTIA | _POSE))
+    if not (pose or inertia or names & _SHAPE):
+        return model
+    with jax.default_matmul_precision("highest"):
+        data = _at_rest(model)
+        new: dict[str, jax.Array] = {}
+        if every or names & _MASS:
+            new["body_subtreemass"] = jnp.asarray(_descendants(model)) @ model.body_mass
+        if model.ncam and (every or names & (_MASS | _POSE)):
+            new.update(_cameras(model, data))
+        if inertia and model.nv:
+            new.update(_inertias(model, data))
+        if pose:
+            new.update(_lengths(model, data))
+        new.update(_statistics(model, data, reference, new, names if not every else None))
+    return model.tree_replace(new)
+
+
+def _at_rest(model: mjx.Model) -> mjx.Data:
+    data = mjx.make_data(model).replace(qpos=model.qpos0)
+    return mjx.tendon(model, mjx.com_pos(model, mjx.kinematics(model, data)))
+
+
+def _descendants(model: mjx.Model) -> np.ndarray:
+    """[i, j] = 1 if body j is body i or hangs below it."""
+    below = np.eye(model.nbody, dtype=np.float32)
+    for j in range(model.nbody - 1, 0, -1):
+        below[model.body_parentid[j]] += below[j]
+    return below
+
+
+def _inertias(model: mjx.Model, data: mjx.Data) -> dict[str, jax.Array]:
+    """Everything that comes from the mass matrix M(qpos0) = L L'."""
+    data = mjx.crb(model, data)
+    crb_diagonal = jnp.diagonal(mjx.full_m(model, data))
+    data = mjx.transmission(model, mjx.tendon_armature(model, data))
+    mass_matrix = mjx.full_m(model, data)
+    factor = jnp.linalg.cholesky(mass_matrix)
+    moving = np.flatnonzero(model.body_dofnum[model.body_weldid] > 0)
+    tendons, moments = _impl(data, "ten_J"), _impl(data, "actuator_moment")
+    jacobians = _body_jacobians(model, data, moving).reshape(-1, model.nv)
+    right = [jnp.eye(model.nv), jacobians, *([tendons] if model.ntendon else []), *([moments] if model.nu else [])]
+    # J inv(M) J' = |inv(L) J'|^2, one triangular solve for all of them
+    solved = jnp.split(
+        solve_triangular(factor, jnp.concatenate(right).T, lower=True), np.cumsum([len(r) for r in right])[:-1], axis=1
+    )
+    squares = [jnp.sum(s**2, axis=0) for s in solved]
+    new = {
+        "dof_M0": crb_diagonal,
+        "stat.meaninertia": jnp.mean(jnp.diagonal(mass_matrix)),
+        "dof_invweight0": _dof_weights(model, squares[0]),
+        "body_invweight0": _body_weights(model, moving, squares[1]),
+    }
+    if model.ntendon:
+        new["tendon_invweight0"] = squares[2]
+    if model.nu:  # acc0 = |inv(M) moment'|
+        new["actuator_acc0"] = jnp.linalg.norm(solve_triangular(factor, solved[-1], lower=True, trans=1), axis=0)
+    return new
+
+
+def _body_jacobians(model: mjx.Model, data: mjx.Data, bodies: np.ndarray) -> jax.Array:
+    """Jacobians of the bodies' centres of mass, translation above rotation, `[n, 6, nv]`."""
+    moves = _descendants(model)[model.dof_bodyid][:, bodies].T  # [n, nv]: does the dof move the body?
+    angular, linear = _cdof(data)[:, :3], _cdof(data)[:, 3:]
+    arm = data.xipos[bodies] - _impl(data, "subtree_com")[model.body_rootid[bodies]]
+    translation = linear[None] + jnp.cross(angular[None], arm[:, None])
+    both = jnp.concatenate([translation, jnp.broadcast_to(angular[None], translation.shape)], axis=-1)
+    return jnp.swapaxes(both * moves[..., None], 1, 2)
+
+
+def _dof_weights(model: mjx.Model, squares: jax.Array) -> jax.Array:
+    """Diagonal of inv(M), averaged over the translations and the rotations of free and ball joints."""
+    average = np.eye(model.nv, dtype=np.float32)
+    for kind, start in zip(model.jnt_type, model.jnt_dofadr, strict=True):
+        for block in {0: (0, 3), 1: (0,)}.get(int(kind), ()):
+            average[start + block : start + block + 3, start + block : start + block + 3] = 1 / 3
+    weights = jnp.asarray(average) @ squares
+    sliders = np.flatnonzero(model.body_simple[model.dof_bodyid] == 2)
+    return weights.at[sliders].set(1 / model.body_mass[model.dof_bodyid[sliders]])
+
+
+def _body_weights(model: mjx.Model, moving: np.ndarray, squares: jax.Array) -> jax.Array:
+    """Mean translational and rotational inverse weight of each body, `[nbody, 2]`; 0 for static bodies."""
+    weights = jnp.zeros((model.nbody, 2)).at[moving].set(squares.reshape(-1, 2, 3).mean(-1))
+    sliders = np.flatnonzero(model.body_simple == 2)
+    sliders = sliders[np.isin(sliders, moving)]
+    exact = jnp.stack([1 / model.body_mass[sliders], jnp.zeros(len(sliders))], axis=-1)
+    return weights.at[sliders].set(exact)
+
+
+def _lengths(model: mjx.Model, data: mjx.Data) -> dict[str, jax.Array]:
+    new = {"tendon_length0": data.ten_length} if model.ntendon else {}
+    connect = (model.eq_type == int(mujoco.mjtEq.mjEQ_CONNECT)) & (model.eq_objtype == int(mujoco.mjtObj.mjOBJ_BODY))
+    (ids,) = np.nonzero(connect)
+    if len(ids):
+        one, two = model.eq_obj1id[ids], model.eq_obj2id[ids]
+        anchor = data.xpos[one] + jnp.einsum("nij,nj->ni", data.xmat[one], model.eq_data[ids, :3])
+        local = jnp.einsum("nji,nj->ni", data.xmat[two], anchor - data.xpos[two])
+        new["eq_data"] = model.eq_data.at[ids, 3:6].set(local)
+    return new
+
+
+def _cameras(model: mjx.Model, data: mjx.Data) -> dict[str, jax.Array]:
+    body, target = model.cam_bodyid, model.cam_targetbodyid
+    offset = jnp.einsum("nij,nj->ni", data.xmat[body], model.cam_pos)
+    centre = _impl(data, "subtree_com")[np.where(target >= 0, target, body)]
+    return {"cam_pos0": offset, "cam_poscom0": offset + data.xpos[body] - centre}
+
+
+def _statistics(
+    model: mjx.Model,
+    data: mjx.Data,
+    reference: mjx.Model | None,
+    new: dict[str, jax.Array],
+    names: set[str] | None,
+) -> dict[str, jax.Array]:
+    """stat.*: what changed, unless the MJCF overrides it."""
+    found: dict[str, jax.Array] = {}
+    if model.nbody > 1 and (names is None or names & _MASS):
+        found["stat.meanmass"] = jnp.mean(model.body_mass[1:])
+    if names is None or names & (_POSE | _SHAPE):
+        found.update(_sizes(model, data))
+    if "stat.meaninertia" in new:
+        found["stat.meaninertia"] = new["stat.meaninertia"]
+    if reference is None:
+        return found
+    own = {"stat.meanmass": jnp.mean(reference.body_mass[1:])} if "stat.meanmass" in found else {}
+    if "stat.extent" in found:
+        own.update(_sizes(reference, _at_rest(reference)))
+    if "stat.meaninertia" in found:  # armature of tendons is in M, but not in dof_M0
+        own["stat.meaninertia"] = found["stat.meaninertia"] + jnp.mean(reference.dof_M0 - new["dof_M0"])
+    return {k: _unless_overridden(getattr(reference.stat, k[5:]), own[k], v) for k, v in found.items()}
+
+
+def _unless_overridden(compiled: jax.Array, own: jax.Array, new: jax.Array) -> jax.Array:
+    derived = jnp.all(jnp.abs(compiled - own) <= 1e-4 * jnp.maximum(jnp.abs(own), jnp.max(jnp.abs(own)) * 1e-2) + 1e-7)
+    return jnp.where(derived, new, compiled)
+
+
+def _sizes(model: mjx.Model, data: mjx.Data) -> dict[str, jax.Array]:
+    """Bounding box at qpos0 and mean body size (mj_setConst, setStat)."""
+    radius = model.geom_rbound
+    plane = model.geom_type == _PLANE
+    wide = jnp.max(model.geom_size[:, :2], axis=1)
+    radius = jnp.where(plane & (radius <= 0), jnp.where(wide > 0, 0.1 * wide, 0.01), radius)
+    for g in np.flatnonzero(model.geom_type == _HFIELD):
+        radius = radius.at[g].set(
+            jnp.where(radius[g] > 0, radius[g], 0.1 * np.max(model.hfield_size[model.geom_dataid[g]]))
+        )
+    points = [data.xpos[1:], data.xipos[1:], data.xanchor, data.site_xpos]
+    low = jnp.min(jnp.concatenate([*points, data.geom_xpos - radius[:, None]]), axis=0)
+    high = jnp.max(jnp.concatenate([*points, data.geom_xpos + radius[:, None]]), axis=0)
+    found = {"stat.center": (low + high) / 2}
+    size = jnp.zeros(model.nbody)
+    for j, body in enumerate(model.jnt_bodyid):
+        for b in (int(body), int(model.body_parentid[body])):
+            size = size.at[b].max(jnp.linalg.norm(data.xipos[b] - data.xanchor[j]))
+    size = size.at[0].set(0.0)
+    reach = model.geom_rbound + jnp.linalg.norm(data.xipos[model.geom_bodyid] - data.geom_xpos, axis=1)
+    size = size.at[model.geom_bodyid].max(jnp.where(model.geom_rbound > 0, reach, 0.0))
+    mean = jnp.mean(jnp.maximum(size[1:], 1e-5)) if model.nbody > 1 else model.stat.meansize
+    extent = jnp.maximum(1e-5, jnp.max(high - low))
+    return found | {"stat.meansize": mean, "stat.extent": jnp.maximum(extent, 2 * mean)}
+
+
+def bounds(model: mjx.Model, size: jax.Array, geoms: Collection[int]) -> dict[str, jax.Array]:
+    """geom_rbound and geom_aabb with those of the given primitives recomputed from `size` `[ngeom, 3]`."""
+    radius, box = model.geom_rbound, model.geom_aabb
+    for kind in geometry.PRIMITIVE:
+        ids = np.asarray([g for g in sorted(geoms) if model.geom_type[g] == kind], int)
+        if len(ids):
+            radius = radius.at[ids].set(geometry.rbound(kind, size[ids]))
+            box = box.at[ids, 3:].set(geometry.half_extents(kind, size[ids]))
+    return {"geom_rbound": radius, "geom_aabb": box}
+
+
+def _impl(data: mjx.Data, name: str) -> jax.Array:
+    """A field of Data that newer MJX keeps in the implementation's part."""
+    inner = getattr(data, "_impl", None)
+    return getattr(inner, name) if inner is not None and hasattr(inner, name) else getattr(data, name)
+
+
+def _cdof(data: mjx.Data) -> jax.Array:
+    return _impl(data, "cdof")

@@ -1,0 +1,71 @@
+"""One named physical number: range, prior, and which attribute of which MuJoCo element it stands for."""
+
+import dataclasses
+import math
+
+from bayessim_mjx.errors import UserError
+
+PRIORS = ("uniform", "loguniform", "gaussian")
+OPERATIONS = ("scaling", "additive", "absolute")
+
+
+@dataclasses.dataclass(frozen=True)
+class Parameter:
+    """A physical number that may be randomised or inferred.
+
+    Attributes:
+        name: unique in its space, e.g. `pole_mass_mult`, `cart_to_pole_damping`.
+        nominal: the value at which the model is as its MJCF says (or closest to it inside the range).
+        low, high: the range; every prior lives on it.
+        unit: of theta, for people; "" for multipliers.
+        prior: "uniform" | "loguniform" | "gaussian" (mean and sd in theta units, truncated to the range).
+        operation: on the model's own number x: "scaling" x theta, "additive" x + theta, "absolute" theta.
+        attribute: "mass", "friction", ... (see `attributes.py` for what each writes).
+        target: name of the MuJoCo element; "#<id>" for an unnamed one.
+        kind: "body" | "geom" | "joint" | "actuator" | "tendon" | "option" | "actor" | "effect".
+        factor: MuJoCo units per unit of theta, for additive and absolute parameters.
+        axis: unit vector in the body frame along which "length" stretches; None: the long axis of the (concrete) model.
+
+    Raises:
+        UserError: empty range, nominal outside it, a prior that does not fit the range, unknown words.
+    """
+
+    name: str
+    nominal: float
+    low: float
+    high: float
+    unit: str = ""
+    prior: str = "uniform"
+    mean: float | None = None
+    sd: float | None = None
+    operation: str = "scaling"
+    attribute: str = ""
+    target: str = ""
+    kind: str = "effect"
+    factor: float = 1.0
+    axis: tuple[float, float, float] | None = None
+
+    def __post_init__(self) -> None:
+        where = f"parameter {self.name!r}"
+        if not (math.isfinite(self.low) and math.isfinite(self.high) and self.low < self.high):
+            raise UserError(f"{where}: range [{self.low}, {self.high}] must be finite with low < high")
+        if not self.low <= self.nominal <= self.high:
+            raise UserError(f"{where}: nominal {self.nominal} is outside its range [{self.low}, {self.high}]")
+        if self.prior not in PRIORS:
+            raise UserError(f"{where}: prior {self.prior!r} is none of {', '.join(PRIORS)}")
+        if self.operation not in OPERATIONS:
+            raise UserError(f"{where}: operation {self.operation!r} is none of {', '.join(OPERATIONS)}")
+        if self.prior == "loguniform" and self.low <= 0:
+            raise UserError(f"{where}: a loguniform prior needs low > 0, not {self.low}")
+        if self.prior == "gaussian" and (self.mean is None or self.sd is None or not self.sd > 0):
+            raise UserError(f"{where}: a gaussian prior needs mean and sd > 0, not mean={self.mean}, sd={self.sd}")
+        if self.factor == 0 or not math.isfinite(self.factor):
+            raise UserError(f"{where}: factor {self.factor} must be finite and not 0")
+        _check_operation(self)
+
+
+def _check_operation(p: Parameter) -> None:
+    if p.operation != "scaling" and p.attribute in ("inertia", "length", "scale"):
+        raise UserError(f"parameter {p.name!r}: {p.attribute} knows only the operation 'scaling', not {p.operation!r}")
+    if p.operation == "scaling" and p.attribute in ("length", "scale", "mass", "inertia") and p.low <= 0:
+        raise UserError(f"parameter {p.name!r}: {p.attribute} is scaled by theta > 0, so low must be > 0, not {p.low}")

@@ -1,0 +1,134 @@
+"""ParameterSpace: an ordered set of parameters. Vector <-> names, unit coordinates, priors, writing into models."""
+
+import difflib
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from bayessim_mjx.errors import UserError
+from bayessim_mjx.parameters import priors
+from bayessim_mjx.parameters.parameter import Parameter
+
+if TYPE_CHECKING:
+    import mujoco
+    from mujoco import mjx
+
+
+class ParameterSpace:
+    """An ordered set of named parameters; theta is a float32 vector `[d]` in this order.
+
+    Immutable, equal and hashable by content: a static argument under `jit`, never a pytree.
+
+    Raises:
+        UserError: two parameters of one name.
+    """
+
+    def __init__(self, parameters: Iterable[Parameter] = ()) -> None:
+        self.parameters = tuple(parameters)
+        self.names = tuple(p.name for p in self.parameters)
+        self.units = tuple(p.unit for p in self.parameters)
+        twice = sorted({name for name in self.names if self.names.count(name) > 1})
+        if twice:
+            raise UserError(f"parameters named twice: {', '.join(twice)}")
+        self.low, self.high, self.nominal = (_frozen(getattr(p, k) for p in self.parameters) for k in _VECTORS)
+        self._index = {name: i for i, name in enumerate(self.names)}
+
+    @classmethod
+    def from_config(cls, randomization_params: Mapping[str, Any], mj_model: "mujoco.MjModel") -> "ParameterSpace":
+        """The space of a `randomization_params` section in BayesSimIG's YAML format (see `reading.py`).
+
+        Raises:
+            UserError: unknown actor, group, attribute or element; empty range; scaling of a number that is 0.
+        """
+        from bayessim_mjx.parameters import reading
+
+        return cls(reading.read(randomization_params, mj_model))
+
+    def __len__(self) -> int:
+        return len(self.parameters)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, ParameterSpace) and self.parameters == other.parameters
+
+    def __hash__(self) -> int:
+        return hash(self.parameters)
+
+    def __repr__(self) -> str:
+        return f"ParameterSpace({', '.join(self.names)})"
+
+    def __add__(self, other: "ParameterSpace") -> "ParameterSpace":
+        return ParameterSpace(self.parameters + other.parameters)
+
+    def index(self, name: str) -> int:
+        """Position of a parameter in theta; UserError with close matches if there is none of that name."""
+        if name in self._index:
+            return self._index[name]
+        close = difflib.get_close_matches(name, self.names, 3)
+        hint = f"did you mean {', '.join(close)}?" if close else f"there are: {', '.join(self.names) or 'none'}"
+        raise UserError(f"no parameter {name!r}; {hint}")
+
+    def subset(self, names: Sequence[str]) -> "ParameterSpace":
+        """The named parameters, in the order given."""
+        return ParameterSpace(self.parameters[self.index(name)] for name in names)
+
+    def vector(self, values: Mapping[str, float] | Sequence[float] | np.ndarray) -> np.ndarray:
+        """Values -> theta `[d]`, float32. A mapping may leave parameters out: these are nominal."""
+        if isinstance(values, Mapping):
+            theta = self.nominal.copy()
+            for name, value in values.items():
+                theta[self.index(name)] = value
+            return theta
+        theta = np.asarray(values, np.float32)
+        if theta.shape != (len(self),):
+            raise UserError(f"{len(self)} parameters ({', '.join(self.names)}) but values of shape {theta.shape}")
+        return theta
+
+    def as_dict(self, theta: Any) -> dict[str, float]:
+        """theta `[d]` -> {name: value}."""
+        return {name: float(value) for name, value in zip(self.names, self.vector(theta), strict=True)}
+
+    def contains(self, theta: Any) -> jax.Array:
+        """theta `[..., d]` -> bool `[...]`: inside the box, ends included."""
+        theta = jnp.asarray(theta)
+        return jnp.all((theta >= self.low) & (theta <= self.high), axis=-1)
+
+    def to_unit(self, theta: Any) -> jax.Array:
+        """Elementwise prior CDF, `[..., d]` -> [0, 1]: every prior is uniform on the unit cube in these coordinates."""
+        return priors.to_unit(self, jnp.asarray(theta, jnp.float32))
+
+    def from_unit(self, u: Any) -> jax.Array:
+        """Inverse of `to_unit`, `[..., d]`; never outside [low, high]."""
+        return priors.from_unit(self, jnp.asarray(u, jnp.float32))
+
+    def log_prior(self, theta: Any) -> jax.Array:
+        """Joint log density of the priors in theta units, `[..., d]` -> `[...]`; -inf outside the box."""
+        theta = jnp.asarray(theta, jnp.float32)
+        return jnp.where(self.contains(theta), jnp.sum(priors.log_density(self, theta), axis=-1), -jnp.inf)
+
+    def write(self, model: "mjx.Model", theta: Any) -> "mjx.Model":
+        """The nominal `model` with theta `[d]` written into it, derived constants recomputed. Pure; use under `vmap`.
+
+        Changes are relative to `model`, so always pass the nominal one. Leaves that no parameter concerns stay the
+        identical objects. Parameters of kind "effect" are ignored.
+        """
+        from bayessim_mjx.parameters import writing
+
+        return writing.write(self, model, theta)
+
+    def edit(self, spec: "mujoco.MjSpec", theta: Any) -> "mujoco.MjSpec":
+        """A copy of the nominal `spec` with the same change made in the MJCF; it compiles to what `write` makes."""
+        from bayessim_mjx.parameters import editing
+
+        return editing.edit(self, spec, theta)
+
+
+_VECTORS = ("low", "high", "nominal")
+
+
+def _frozen(values: Iterable[float]) -> np.ndarray:
+    array = np.asarray(list(values), np.float32)
+    array.setflags(write=False)
+    return array

@@ -1,0 +1,311 @@
+"""theta -> `mjx.Model`: a pure JAX function; changes only the fields concerned, relative to the model it is given."""
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from bayessim_mjx.errors import UserError
+from bayessim_mjx.parameters import attributes, constants, geometry
+from bayessim_mjx.parameters.attributes import FIELDS, Field
+from bayessim_mjx.parameters.parameter import Parameter
+
+if TYPE_CHECKING:
+    from mujoco import mjx
+
+    from bayessim_mjx.parameters.space import ParameterSpace
+
+MIN_RATIO = 0.05  # damping ratio of contacts at restitution 1: undamped contacts never settle
+
+
+class Draft:
+    """Leaves of a model that have been changed so far, by dotted name."""
+
+    def __init__(self, model: "mjx.Model") -> None:
+        self.model = model
+        self.leaves: dict[str, jax.Array] = {}
+        self.resized: set[int] = set()  # geoms whose size changed
+
+    def __getitem__(self, name: str) -> jax.Array:
+        if name in self.leaves:
+            return self.leaves[name]
+        value: Any = self.model
+        for part in name.split("."):
+            value = getattr(value, part)
+        return value
+
+    def __setitem__(self, name: str, value: jax.Array) -> None:
+        self.leaves[name] = value
+
+
+def write(space: "ParameterSpace", model: "mjx.Model", theta: Any) -> "mjx.Model":
+    """See `ParameterSpace.write`."""
+    theta = jnp.asarray(theta, jnp.float32)
+    if theta.shape != (len(space),):
+        raise UserError(f"theta has shape {theta.shape}, the space {len(space)} parameters; write many under vmap")
+    draft = Draft(model)
+    for (kind, attribute), members in _groups(space).items():
+        parameters = [space.parameters[i] for i in members]
+        values = theta[np.asarray(members)]
+        field = FIELDS.get((kind, attribute))
+        if field is not None:
+            _write_field(draft, field, parameters, values)
+        else:
+            _COMPOSITE[kind, attribute](draft, parameters, values)
+    if not draft.leaves:
+        return model
+    _follow_geoms(draft)
+    if draft.resized:
+        draft.leaves.update(constants.bounds(model, draft["geom_size"], draft.resized))
+    return constants.set_const(model.tree_replace(draft.leaves), set(draft.leaves), reference=model)
+
+
+def _groups(space: "ParameterSpace") -> dict[tuple[str, str], list[int]]:
+    """Positions in theta by (kind, attribute), in the order in which they are applied."""
+    groups: dict[tuple[str, str], list[int]] = {}
+    for i in sorted(range(len(space)), key=lambda i: (attributes.order(space.parameters[i].attribute), i)):
+        p = space.parameters[i]
+        if p.kind == "effect":
+            continue
+        if (p.kind, p.attribute) not in FIELDS and (p.kind, p.attribute) not in _COMPOSITE:
+            known = sorted(f"{k} {a}" for k, a in [*FIELDS, *_COMPOSITE])
+            raise UserError(
+                f"parameter {p.name!r}: no attribute {p.attribute!r} of {p.kind}; there are: {', '.join(known)}"
+            )
+        groups.setdefault((p.kind, p.attribute), []).append(i)
+    return groups
+
+
+def _applied(parameter: Parameter, old: jax.Array, value: jax.Array, sign: float = 1.0) -> jax.Array:
+    """The number in the model under an operation: scaling, additive, absolute."""
+    if parameter.operation == "scaling":
+        return old * value
+    step = sign * parameter.factor * value
+    return old + step if parameter.operation == "additive" else jnp.broadcast_to(step, jnp.shape(old))
+
+
+def _write_field(draft: Draft, field: Field, parameters: Sequence[Parameter], values: jax.Array) -> None:
+    """One scatter per operation for all parameters of a field."""
+    for operation in ("scaling", "additive", "absolute"):
+        rows, picks, steps = [], [], []
+        for j, p in enumerate(parameters):
+            if p.operation != operation:
+                continue
+            for row in attributes.rows(draft.model, field, attributes.element(draft.model, p.kind, p.target)):
+                rows.append(row)
+                picks.append(j)
+                steps.append(1.0 if operation == "scaling" else field.sign * p.factor)
+        if not rows:
+            continue
+        column = () if field.column is None else (field.column,)
+        at = draft[field.name].at[(np.asarray(rows), *column)]
+        number = values[np.asarray(picks)] * np.asarray(steps, np.float32)
+        draft[field.name] = {"scaling": at.multiply, "additive": at.add, "absolute": at.set}[operation](number)
+
+
+def _ratios(
+    draft: Draft, field: str, ids: Sequence[int], parameters: Sequence[Parameter], values: jax.Array
+) -> jax.Array:
+    """new / old of a field for each parameter, `[n]`."""
+    ratios = []
+    for j, (i, p) in enumerate(zip(ids, parameters, strict=True)):
+        old = draft[field][i]
+        old = old[0] if old.ndim else old
+        ratios.append(values[j] if p.operation == "scaling" else _applied(p, old, values[j]) / old)
+    return jnp.stack(ratios)
+
+
+def _elements(draft: Draft, parameters: Sequence[Parameter]) -> np.ndarray:
+    return np.asarray([attributes.element(draft.model, p.kind, p.target) for p in parameters])
+
+
+def _mass(draft: Draft, parameters: Sequence[Parameter], values: jax.Array) -> None:
+    """Mass, and the inertia in proportion."""
+    ids = _elements(draft, parameters)
+    ratios = _ratios(draft, "body_mass", ids, parameters, values)
+    draft["body_mass"] = draft["body_mass"].at[ids].multiply(ratios)
+    draft["body_inertia"] = draft["body_inertia"].at[ids].multiply(ratios[:, None])
+
+
+def _inertia(draft: Draft, parameters: Sequence[Parameter], values: jax.Array) -> None:
+    draft["body_inertia"] = draft["body_inertia"].at[_elements(draft, parameters)].multiply(values[:, None])
+
+
+def _gain(draft: Draft, parameters: Sequence[Parameter], values: jax.Array, columns: tuple[int, ...] = (1, 2)) -> None:
+    """Gain, and for servos the feedback terms alike (position kp and kv; `kp` leaves kv alone)."""
+    ids = _elements(draft, parameters)
+    ratios = _ratios(draft, "actuator_gainprm", ids, parameters, values)
+    draft["actuator_gainprm"] = draft["actuator_gainprm"].at[ids, 0].multiply(ratios)
+    servo = np.asarray([attributes.has_affine_bias(draft.model, i) for i in ids])
+    for column in columns if servo.any() else ():
+        draft["actuator_biasprm"] = draft["actuator_biasprm"].at[ids[servo], column].multiply(ratios[servo])
+
+
+def _kp(draft: Draft, parameters: Sequence[Parameter], values: jax.Array) -> None:
+    _gain(draft, parameters, values, columns=(1,))
+
+
+def _gravity(draft: Draft, parameters: Sequence[Parameter], values: jax.Array) -> None:
+    """Scaling multiplies the vector; additive adds to, absolute sets its z component."""
+    for p, value in zip(parameters, values, strict=True):
+        g = draft["opt.gravity"]
+        draft["opt.gravity"] = g * value if p.operation == "scaling" else g.at[2].set(_applied(p, g[2], value))
+
+
+def _restitution(draft: Draft, parameters: Sequence[Parameter], values: jax.Array) -> None:
+    """Damping ratio of the geom's contacts from the restitution e; e = 0 keeps the nominal contact.
+
+    zeta = -ln e / sqrt(pi^2 + ln^2 e), the free oscillation that keeps the fraction e of its speed per half period.
+    """
+    ids = _elements(draft, parameters)
+    solref = draft["geom_solref"][ids]
+    e = values * np.asarray([p.factor for p in parameters], np.float32)
+    log = jnp.log(jnp.clip(e, 1e-6, 1.0))
+    zeta = jnp.maximum(-log / jnp.sqrt(np.pi**2 + log**2), MIN_RATIO)
+    # direct format: solref = (-k, -b) with b = 2 zeta sqrt(k)
+    direct = -2 * zeta * jnp.sqrt(jnp.maximum(-solref[:, 0], 0.0))
+    new = jnp.where(e > 0, jnp.where(solref[:, 0] < 0, direct, zeta), solref[:, 1])
+    draft["geom_solref"] = draft["geom_solref"].at[ids, 1].set(new)
+
+
+def _length(draft: Draft, parameters: Sequence[Parameter], values: jax.Array) -> None:
+    for p, s in zip(parameters, values, strict=True):
+        body = attributes.element(draft.model, "body", p.target)
+        _stretch(draft, body, np.asarray(p.axis or geometry.long_axis(draft.model, body, p.name), np.float32), s)
+
+
+def _stretch(draft: Draft, body: int, axis: np.ndarray, s: jax.Array) -> None:
+    """Stretch a body by s along a unit vector of its frame: its parts move, aligned geoms lengthen, mass stays."""
+    model = draft.model
+    geoms = np.flatnonzero(model.geom_bodyid == body)
+    children = np.asarray([c for c in np.flatnonzero(model.body_parentid == body) if c != 0], int)
+    moved = {
+        "body_ipos": np.asarray([body]),
+        "body_pos": children,
+        "geom_pos": geoms,
+        "jnt_pos": np.flatnonzero(model.jnt_bodyid == body),
+        "site_pos": np.flatnonzero(model.site_bodyid == body),
+    }
+    for name, ids in moved.items():
+        if len(ids):  # x + (s - 1) a (a . x)
+            x = draft[name][ids]
+            along = jnp.sum(x * axis, axis=-1, keepdims=True)
+            draft[name] = draft[name].at[ids].set(x + (s - 1) * along * axis)
+    _stretch_anchors(draft, [body], lambda x: x + (s - 1) * jnp.sum(x * axis, axis=-1, keepdims=True) * axis)
+    for g in geoms:
+        _lengthen(draft, int(g), axis, s)
+    _stretch_inertia(draft, body, axis, s)
+
+
+def _lengthen(draft: Draft, geom: int, axis: np.ndarray, s: jax.Array) -> None:
+    """The half extents of a geom whose axis lies along the stretch; a radius stays."""
+    kind = int(draft.model.geom_type[geom])
+    columns = {geometry.CAPSULE: {2: 1}, geometry.CYLINDER: {2: 1}}.get(kind, {0: 0, 1: 1, 2: 2})
+    if kind in (geometry.SPHERE, int(mujoco.mjtGeom.mjGEOM_MESH)):
+        return
+    size = draft["geom_size"]
+    frame = geometry.rotation(draft["geom_quat"][geom])
+    for local, column in columns.items():
+        aligned = jnp.abs(jnp.sum(frame[:, local] * axis)) > 0.999
+        size = size.at[geom, column].multiply(jnp.where(aligned, s, 1.0))
+    draft["geom_size"] = size
+    draft.resized.add(geom)
+
+
+def _stretch_inertia(draft: Draft, body: int, axis: np.ndarray, s: jax.Array) -> None:
+    """Second moments P = tr(I)/2 1 - I grow by s^2 along the axis, which is a principal one (checked when read)."""
+    inertia = draft["body_inertia"][body]
+    along = jnp.abs(jnp.sum(geometry.rotation(draft["body_iquat"][body]) * axis[:, None], axis=0))
+    hot = jax.nn.one_hot(jnp.argmax(along), 3)
+    moment = jnp.sum(hot * (jnp.sum(inertia) / 2 - inertia))
+    draft["body_inertia"] = draft["body_inertia"].at[body].add((s**2 - 1) * moment * (1 - hot))
+
+
+def _scale(draft: Draft, parameters: Sequence[Parameter], values: jax.Array) -> None:
+    """Lengths x s, masses x s^3, inertias x s^5 (constant density) of a whole actor; its own place in the world stays.
+
+    Joint ranges, stiffness, damping, armature, gains and site sizes stay.
+    """
+    model = draft.model
+    for p, s in zip(parameters, values, strict=True):
+        root = attributes.actor_root(model, p.target)
+        bodies = np.asarray(attributes.subtree(model, root))
+        tops = {root} if root else {int(b) for b in bodies if model.body_parentid[b] == 0}
+        geoms = np.flatnonzero(np.isin(model.geom_bodyid, bodies))
+        scaled = {
+            "body_pos": np.asarray([b for b in bodies if int(b) not in tops], int),
+            "body_ipos": bodies,
+            "geom_pos": geoms,
+            "geom_size": geoms,
+            "jnt_pos": np.flatnonzero(np.isin(model.jnt_bodyid, bodies)),
+            "site_pos": np.flatnonzero(np.isin(model.site_bodyid, bodies)),
+        }
+        for name, ids in scaled.items():
+            if len(ids):
+                draft[name] = draft[name].at[ids].multiply(s)
+        draft["body_mass"] = draft["body_mass"].at[bodies].multiply(s**3)
+        draft["body_inertia"] = draft["body_inertia"].at[bodies].multiply(s**5)
+        draft.resized.update(int(g) for g in geoms)
+        _stretch_anchors(draft, bodies.tolist(), lambda x, s=s: x * s)
+
+
+def _stretch_anchors(draft: Draft, bodies: Sequence[int], move: Callable[[jax.Array], jax.Array]) -> None:
+    """Anchors of connect constraints move with their first body; the compiler derives the second one."""
+    model = draft.model
+    connect = (model.eq_type == int(mujoco.mjtEq.mjEQ_CONNECT)) & (model.eq_objtype == int(mujoco.mjtObj.mjOBJ_BODY))
+    (ids,) = np.nonzero(connect & np.isin(model.eq_obj1id, bodies))
+    if len(ids):
+        draft["eq_data"] = draft["eq_data"].at[ids, :3].set(move(draft["eq_data"][ids, :3]))
+
+
+def _follow_geoms(draft: Draft) -> None:
+    """Explicit contact pairs whose numbers are what their geoms combine to follow their geoms; others stay."""
+    model = draft.model
+    if not model.npair:
+        return
+    one, two = np.asarray(model.pair_geom1), np.asarray(model.pair_geom2)
+    rank = model.geom_priority[one] - model.geom_priority[two]
+    mix = _mix(model.geom_solmix[one], model.geom_solmix[two])[:, None]
+
+    def friction(values: jax.Array) -> jax.Array:
+        a, b = values[one, 0], values[two, 0]
+        return jnp.where(rank > 0, a, jnp.where(rank < 0, b, jnp.maximum(a, b)))
+
+    def solref(values: jax.Array) -> jax.Array:
+        a, b = values[one], values[two]
+        same = jnp.where(((a[:, 0] > 0) & (b[:, 0] > 0))[:, None], mix * a + (1 - mix) * b, jnp.minimum(a, b))
+        return jnp.where((rank > 0)[:, None], a, jnp.where((rank < 0)[:, None], b, same))
+
+    if "geom_friction" in draft.leaves:
+        nominal, new, pair = friction(model.geom_friction), friction(draft["geom_friction"]), model.pair_friction
+        follows = (jnp.abs(pair[:, :2] - nominal[:, None]) <= 1e-6 * nominal[:, None]).all(-1, keepdims=True)
+        draft["pair_friction"] = pair.at[:, :2].set(jnp.where(follows, new[:, None], pair[:, :2]))
+    if "geom_solref" in draft.leaves:
+        nominal, new = solref(model.geom_solref), solref(draft["geom_solref"])
+        follows = (jnp.abs(model.pair_solref - nominal) <= 1e-6 * jnp.abs(nominal)).all(-1, keepdims=True)
+        draft["pair_solref"] = jnp.where(follows, new, model.pair_solref)
+
+
+def _mix(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Weight of the first geom's contact parameters."""
+    small = float(mujoco.mjMINVAL)
+    return jnp.where(
+        (a >= small) & (b >= small),
+        a / jnp.maximum(a + b, small),
+        jnp.where((a < small) & (b < small), 0.5, jnp.where(a < small, 0.0, 1.0)),
+    )
+
+
+_COMPOSITE: dict[tuple[str, str], Callable[[Draft, Sequence[Parameter], jax.Array], None]] = {
+    ("geom", "restitution"): _restitution,
+    ("actuator", "gain"): _gain,
+    ("actuator", "kp"): _kp,
+    ("body", "mass"): _mass,
+    ("body", "inertia"): _inertia,
+    ("body", "length"): _length,
+    ("option", "gravity"): _gravity,
+    ("actor", "scale"): _scale,
+}
