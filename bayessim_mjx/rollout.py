@@ -74,8 +74,8 @@ def _rollout(env: Env, length: int) -> Callable[..., Trajectory]:
 
         def step(carry: tuple, keys: jax.Array) -> tuple[tuple, tuple]:
             state, alive, action = carry
-            action = select(alive, jax.vmap(policy_fn)(keys, state.obs), action)
-            after = select(alive, jax.vmap(env.step)(state, action), state)
+            action = select(~alive, action, jax.vmap(policy_fn)(keys, state.obs))
+            after = select(~alive, state, jax.vmap(env.step)(state, action))
             terminated = after.info["terminated"] * alive
             truncated = after.info["truncated"] * alive
             row = (

@@ -69,7 +69,16 @@ def _reset(env: Env, key: jax.Array, domain: Distribution | None, worlds: int) -
 def _stagger(key: jax.Array, state: State, episode_length: int) -> tuple[State, jax.Array]:
     """First episodes' clocks spread out, so that time limits do not come all at once; and which are late, [N]."""
     steps = jax.random.randint(key, state.reward.shape, 0, episode_length).astype(state.info["steps"].dtype)
-    return state.replace(info={**state.info, "steps": steps}), (steps > 0).astype(jnp.float32)
+    world = state.pipeline_state
+    if "steps" in getattr(world, "task", {}):  # our tasks count in the world, the others in info
+        world = world.replace(task={**world.task, "steps": steps})
+    state = state.replace(pipeline_state=world, info={**state.info, "steps": steps})
+    return state, (steps > 0).astype(jnp.float32)
+
+
+def _strong(tree: Any) -> Any:
+    """The same arrays without weak types: what goes into the first update is then typed like what comes out of it."""
+    return jax.tree.map(lambda x: jax.lax.convert_element_type(x, jnp.result_type(x)), tree)
 
 
 def init(env: Env, config: PPOConfig, key: jax.Array, domain: Distribution | None = None) -> TrainState:
@@ -88,7 +97,7 @@ def _init(env: Env, config: PPOConfig) -> Callable[..., TrainState]:
         hidden = (config.hidden_actor, config.hidden_critic, config.init_std)
         params = networks.init(network_key, sizes["policy"], sizes[critic_group(env)], env.action_size, *hidden)
         env_states, partial = _stagger(clock_key, _reset(env, reset_key, domain, config.num_envs), env.episode_length)
-        return TrainState(
+        state = TrainState(
             params=params,
             opt_state=losses.optimiser_init(params),
             normalizer={group: normalise.init(size) for group, size in sizes.items()},
@@ -100,6 +109,7 @@ def _init(env: Env, config: PPOConfig) -> Callable[..., TrainState]:
             env_steps=jnp.uint32(0),
             config=config,
         )
+        return _strong(state)
 
     return jax.jit(run)
 

@@ -1,0 +1,115 @@
+"""Environments of Brax and of MuJoCo Playground behind our protocol, for our trainer: `brax:ant`, `playground:<name>`.
+
+They have no parameters of ours: their space is empty and theta is ignored. (The other way needs no wrapper: our tasks
+follow Brax's protocol as they are.)
+"""
+
+import difflib
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+
+from bayessim_mjx.env import Env, Observations, State
+from bayessim_mjx.errors import UserError
+from bayessim_mjx.parameters import ParameterSpace
+
+if TYPE_CHECKING:
+    from bayessim_mjx.config import Config
+
+
+class BraxEnv(Env):
+    """A Brax-like environment with an episode length of its own; its state is carried in `pipeline_state`."""
+
+    def __init__(self, env: Any, name: str, episode_length: int) -> None:
+        self.env = env
+        self.name = name
+        self.episode_length = int(episode_length)
+        self._space = ParameterSpace(())
+
+    def reset(self, key: jax.Array, theta: jax.Array | None = None) -> State:
+        return self._state(self.env.reset(key), jnp.zeros((), jnp.int32))
+
+    def step(self, state: State, action: jax.Array) -> State:
+        inner = self.env.step(state.pipeline_state, jnp.clip(action, -1.0, 1.0))
+        after = self._state(_like(inner, state.pipeline_state), state.info["steps"] + 1)
+        return after.replace(info={**state.info, **after.info})
+
+    def _state(self, inner: Any, steps: jax.Array) -> State:
+        obs, done = _groups(inner.obs), jnp.asarray(inner.done, jnp.float32)
+        info = {
+            "terminated": done,
+            "truncated": (steps >= self.episode_length).astype(jnp.float32),
+            "final_observation": obs,
+            "steps": steps,
+        }
+        reward = jnp.asarray(inner.reward, jnp.float32)
+        return State(inner, obs, reward, done, dict(inner.metrics), info)
+
+    @property
+    def action_size(self) -> int:
+        return self.env.action_size
+
+    @property
+    def dt(self) -> float:
+        return float(self.env.dt)
+
+    @property
+    def space(self) -> ParameterSpace:
+        return self._space
+
+    @property
+    def mj_model(self) -> mujoco.MjModel:
+        return self.env.sys.mj_model if hasattr(self.env, "sys") else self.env.mj_model
+
+
+def _like(tree: Any, reference: Any) -> Any:
+    """`tree` with the dtypes of `reference`: some environments give whole numbers at reset and reals in step."""
+    return jax.tree.map(lambda x, ref: jnp.asarray(x, jnp.result_type(ref)), tree, reference)
+
+
+def _groups(obs: Any) -> Observations:
+    """Brax's and Playground's names of observation groups under ours."""
+    if not isinstance(obs, Mapping):
+        return {"policy": obs, "state": obs}
+    groups = {**obs, "policy": obs["state"]}
+    return {**groups, "critic": obs["privileged_state"]} if "privileged_state" in obs else groups
+
+
+def make(name: str, *, config: "Config | None" = None, **overrides: Any) -> BraxEnv:
+    """`brax:<name>` or `playground:<name>`; env.episodeLength (or the override) sets the episode's length."""
+    library, _, rest = name.partition(":")
+    length = overrides.pop("episodeLength", None if config is None else config.env.episodeLength)
+    if overrides:
+        raise UserError(f"env.{next(iter(overrides))}: {name} has no such setting (it has: episodeLength)")
+    return {"brax": make_brax, "playground": make_playground}[library](rest, length)
+
+
+def make_brax(name: str, episode_length: int | None = None) -> BraxEnv:
+    """The Brax environment `name` on MJX, episodes of 1000 steps by default."""
+    from brax import envs
+
+    _known(name, list(envs._envs), "brax")
+    return BraxEnv(envs.get_environment(name, backend="mjx"), f"brax:{name}", episode_length or 1000)
+
+
+def make_playground(name: str, episode_length: int | None = None) -> BraxEnv:
+    """The Playground environment `name` with its default settings, on MJX's JAX implementation."""
+    try:
+        from mujoco_playground import registry
+    except ImportError as error:
+        raise UserError(
+            f"playground:{name} needs MuJoCo Playground: pip install 'bayessim-mjx[playground]' ({error})"
+        ) from error
+    _known(name, list(registry.ALL_ENVS), "playground")
+    length = episode_length or registry.get_default_config(name).episode_length
+    return BraxEnv(registry.load(name, config_overrides={"impl": "jax"}), f"playground:{name}", length)
+
+
+def _known(name: str, names: list[str], library: str) -> None:
+    if name not in names:
+        close = difflib.get_close_matches(name, names)
+        hint = f"did you mean {close[0]}? " if close else ""
+        raise UserError(f"task {library}:{name}: {hint}there are: {', '.join(sorted(names))}")
