@@ -33,7 +33,7 @@ def triangle(figure: Any, draws: Draws, true: np.ndarray | None, top: float = 0.
                 joint(axes, draws, (column, row), true, (*limits[column], *limits[row]))
             axes.tick_params(labelsize=size - 0.5, length=2, pad=1.5)
             axes.tick_params(labelbottom=row == d - 1, labelleft=column == 0 and row > 0)
-            _few_ticks(axes, draws, column, row, min(cell))
+            _few_ticks(axes, draws, (column, row), cell)
     _name_edges(grid, draws, cell, size)
 
 
@@ -179,12 +179,11 @@ def _numbers(axis: Any, log: bool) -> None:
         axis.set_major_formatter(FuncFormatter(lambda v, _: f"{10.0**v:.2g}"))
 
 
-def _few_ticks(axes: Any, draws: Draws, column: int, row: int, cell: float) -> None:
+def _few_ticks(axes: Any, draws: Draws, place: tuple[int, int], cell: tuple[float, float]) -> None:
     from matplotlib.ticker import MaxNLocator
 
-    most = 6 if cell > 3 else 3 if cell > 1.0 else 2
-    axes.xaxis.set_major_locator(MaxNLocator(most, prune="both" if draws.d > 1 else None))
-    _numbers(axes.xaxis, draws.log[column])
-    if column != row:
-        axes.yaxis.set_major_locator(MaxNLocator(most, prune="both"))
-        _numbers(axes.yaxis, draws.log[row])
+    most = [6 if side > 3 else 3 if side > 1.0 else 2 for side in cell]
+    sides = [(axes.xaxis, place[0], most[0])] + [(axes.yaxis, place[1], most[1])] * (place[0] != place[1])
+    for axis, k, count in sides:
+        axis.set_major_locator(MaxNLocator(count, prune="both" if draws.d > 1 else None))
+        _numbers(axis, draws.log[k])

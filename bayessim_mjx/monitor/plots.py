@@ -65,7 +65,7 @@ def corner(
 
 def _overview(draws: Draws, true: np.ndarray | None, best: int) -> Any:
     """All parameters as intervals on the left, the corner of the best and all correlations on the right."""
-    figure = new_figure(16.5, max(10.5, 1.8 + 0.26 * draws.d))
+    figure = new_figure(16.5, max(12.0, 1.8 + 0.26 * draws.d))
     left, right = figure.subfigures(1, 2, width_ratios=(1.0, 1.05))
     above, below = right.subfigures(2, 1, height_ratios=(1.25, 1.0))
     height = size_of(left)[1]
