@@ -21,9 +21,10 @@ def quantum(x: Array) -> float:
         return float(np.ptp(x)) if len(levels) == 2 else 0.0
     steps = np.diff(levels)
     step = float(steps.min())
-    multiples = steps[steps < 8 * step] / step
+    step = float(np.median(steps[steps < 1.5 * step]))
+    multiples = steps[steps < 40 * step] / step
     regular = np.mean(np.abs(multiples - np.round(multiples)) < 0.1) > 0.95
-    return float(np.median(steps[steps < 1.5 * step])) if regular and len(multiples) > 0.5 * len(steps) else 0.0
+    return step if regular and len(multiples) > 0.5 * len(steps) else 0.0
 
 
 def noise_level(x: Array) -> float:
@@ -39,17 +40,22 @@ def noise_level(x: Array) -> float:
 def smoothing_window(x: Array, period: float, sigma: float) -> int:
     """Longest odd Savitzky-Golay window (samples) whose residual the noise still explains (discrepancy principle).
 
-    The residual is judged where it is worst (95th percentile of its local rms), so rest phases do not hide motion.
+    Both are judged where they are worst (95th percentile of their local rms): rest phases do not hide motion, and the
+    noise may grow with speed (jitter of the time stamps).
     """
     longest = max(5, min(int(MAX_WINDOW / period), len(x) // 4))
+    floor = max(sigma, _worst(np.diff(x, 4) / np.sqrt(70.0)) if len(x) > 4 else 0.0)
     chosen = 5
     for half in range(3, longest // 2 + 1):
-        residual = x - savgol_filter(x, 2 * half + 1, _POLYNOMIAL)
-        local = np.sqrt(np.maximum(uniform_filter1d(residual**2, 25, mode="nearest"), 0.0))
-        if np.percentile(local, 95) > 1.5 * sigma:
+        if _worst(x - savgol_filter(x, 2 * half + 1, _POLYNOMIAL)) > 1.25 * floor:
             break
         chosen = 2 * half + 1
     return chosen
+
+
+def _worst(residual: Array) -> float:
+    local = np.sqrt(np.maximum(uniform_filter1d(residual**2, 25, mode="nearest"), 0.0))
+    return float(np.percentile(local, 95))
 
 
 def derivative(time: Array, x: Array, sigma: float) -> tuple[Array, float]:
