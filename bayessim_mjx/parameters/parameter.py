@@ -65,6 +65,8 @@ class Parameter:
 
 
 def _check_operation(p: Parameter) -> None:
+    if p.kind == "effect":
+        return
     if p.operation != "scaling" and p.attribute in ("inertia", "length", "scale"):
         raise UserError(f"parameter {p.name!r}: {p.attribute} knows only the operation 'scaling', not {p.operation!r}")
     if p.operation == "scaling" and p.attribute in ("length", "scale", "mass", "inertia") and p.low <= 0:

@@ -1,5 +1,6 @@
 """theta -> `mjx.Model`: a pure JAX function; changes only the fields concerned, relative to the model it is given."""
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -101,14 +102,14 @@ def _write_field(draft: Draft, field: Field, parameters: Sequence[Parameter], va
         if not rows:
             continue
         column = () if field.column is None else (field.column,)
-        at = draft[field.name].at[(np.asarray(rows), *column)]
+        at: Any = draft[field.name].at[(np.asarray(rows), *column)]
         number = values[np.asarray(picks)] * np.asarray(steps, np.float32)
-        draft[field.name] = {"scaling": at.multiply, "additive": at.add, "absolute": at.set}[operation](number)
+        draft[field.name] = getattr(at, {"scaling": "multiply", "additive": "add", "absolute": "set"}[operation])(
+            number
+        )
 
 
-def _ratios(
-    draft: Draft, field: str, ids: Sequence[int], parameters: Sequence[Parameter], values: jax.Array
-) -> jax.Array:
+def _ratios(draft: Draft, field: str, ids: np.ndarray, parameters: Sequence[Parameter], values: jax.Array) -> jax.Array:
     """new / old of a field for each parameter, `[n]`."""
     ratios = []
     for j, (i, p) in enumerate(zip(ids, parameters, strict=True)):
@@ -249,7 +250,7 @@ def _scale(draft: Draft, parameters: Sequence[Parameter], values: jax.Array) -> 
         draft["body_mass"] = draft["body_mass"].at[bodies].multiply(s**3)
         draft["body_inertia"] = draft["body_inertia"].at[bodies].multiply(s**5)
         draft.resized.update(int(g) for g in geoms)
-        _stretch_anchors(draft, bodies.tolist(), lambda x, s=s: x * s)
+        _stretch_anchors(draft, bodies.tolist(), functools.partial(jnp.multiply, s))
 
 
 def _stretch_anchors(draft: Draft, bodies: Sequence[int], move: Callable[[jax.Array], jax.Array]) -> None:

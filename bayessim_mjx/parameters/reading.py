@@ -1,0 +1,402 @@
+"""Parameters from a `randomization_params` section in BayesSimIG's YAML format, mapped onto MuJoCo elements.
+
+Order of the vector: actors in the file's order, then groups. In list groups (bodies, shapes, tendons, actuators) the
+outer loop runs over elements, the inner over attributes; for dofs the other way round; `scale` is one number.
+Names: `<element>_<attribute>`, plus `_mult` for scaling.
+"""
+
+import difflib
+import fnmatch
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+
+from bayessim_mjx.errors import UserError
+from bayessim_mjx.parameters import attributes, geometry
+from bayessim_mjx.parameters.attributes import COMPOSITE, FIELDS, suggest
+from bayessim_mjx.parameters.parameter import OPERATIONS, Parameter
+
+SECTION_KEYS = ("frequency", "observations", "actions", "sim_params", "actor_params", "option", "effects")
+GROUPS: dict[str, tuple[str, tuple[str, ...]]] = {
+    "rigid_body_properties": ("body", ("mass", "inertia", "length", "com_x", "com_y", "com_z")),
+    "rigid_shape_properties": ("geom", ("friction", "restitution", "length")),
+    "dof_properties": ("joint", ("stiffness", "damping", "armature", "friction")),
+    "tendon_properties": ("tendon", ("stiffness", "damping", "friction")),
+    "actuator_properties": ("actuator", ("gain", "kp", "kv", "bias")),
+    "option": ("option", ("gravity",)),
+}
+OTHER_GROUPS = ("scale", "color", "effects")
+ACCEPTED = ("schedule", "schedule_steps", "num_buckets", "setup_only")  # BayesSimIG's; a posterior is not scheduled
+SETTINGS = ("range", "operation", "distribution", "mean", "sd", "include", "exclude", "factor", "unit", "nominal")
+DISTRIBUTIONS = {"uniform": "uniform", "loguniform": "loguniform", "log_uniform": "loguniform", "gaussian": "gaussian"}
+
+
+class Element(NamedTuple):
+    """One element of a group: its name in the parameter, and the MuJoCo element it stands for."""
+
+    label: str
+    kind: str
+    target: str
+
+
+def read(section: Mapping[str, Any], model: mujoco.MjModel) -> list[Parameter]:
+    """The parameters of a section, in order.
+
+    Args:
+        section: `randomization_params`, or the `task` section that holds it.
+        model: the nominal model.
+
+    Raises:
+        UserError: naming the key's path, its value and what is allowed.
+    """
+    section = section or {}
+    if "randomization_params" in section:
+        section = section["randomization_params"] or {}
+    path = "randomization_params"
+    _known(section, SECTION_KEYS, path)
+    found: list[Parameter] = []
+    actors = {k: v or {} for k, v in (section.get("actor_params") or {}).items()}
+    for actor, groups in actors.items():
+        where = f"{path}.actor_params.{actor}"
+        if actor == "effects":
+            found += _effects(groups, where)
+        elif actor == "option":
+            found += _group(model, [], "option", groups, where)
+        else:
+            found += _actor(model, actor, groups, [a for a in actors if a not in ("effects", "option")], where)
+    found += _group(model, [], "option", section.get("option") or {}, f"{path}.option")
+    found += _effects(section.get("effects") or {}, f"{path}.effects")
+    return found
+
+
+def _actor(
+    model: mujoco.MjModel, actor: str, groups: Mapping[str, Any], actors: Sequence[str], where: str
+) -> Iterator[Parameter]:
+    _known(groups, (*GROUPS, *OTHER_GROUPS), where)
+    bodies = _bodies(model, actor, actors, where)
+    for group, content in groups.items():
+        path = f"{where}.{group}"
+        if group == "color":  # looks, not physics
+            continue
+        if group == "effects":
+            yield from _effects(content or {}, path)
+        elif group == "scale":
+            yield _scale(model, actor, actors, content or {}, path)
+        else:
+            yield from _group(model, bodies, group, content or {}, path)
+
+
+def _bodies(model: mujoco.MjModel, actor: str, actors: Sequence[str], where: str) -> list[int]:
+    """Bodies of an actor: the subtree of the body of that name; else the whole model but the other actors' subtrees."""
+    have = attributes.names(model, "body")
+    if actor in have:
+        return attributes.subtree(model, have.index(actor))
+    model_name = model.names[: model.names.index(b"\0")].decode()
+    if len(actors) > 1 and actor != model_name:
+        raise UserError(f"{where}: no actor {actor!r}; {suggest(actor, [model_name, *have[1:]])}")
+    taken = {b for other in actors if other in have for b in attributes.subtree(model, have.index(other))}
+    return [b for b in attributes.subtree(model, 0) if b not in taken]
+
+
+def _group(
+    model: mujoco.MjModel, bodies: Sequence[int], group: str, content: Mapping[str, Any], where: str
+) -> Iterator[Parameter]:
+    """Parameters of one group, elements outside attributes, but for dofs attributes outside elements."""
+    kind, allowed = GROUPS[group]
+    _known(content, allowed, where)
+    elements = _elements(model, bodies, kind)
+    members = {a: _selected(model, elements, kind, a, s or {}, f"{where}.{a}") for a, s in content.items()}
+    if kind == "joint":
+        pairs = [(e, a) for a in content for e in members[a]]
+    else:
+        seen = list(dict.fromkeys(e for a in content for e in members[a]))
+        pairs = [(e, a) for e in sorted(seen, key=elements.index) for a in content if e in members[a]]
+    for e, a in pairs:
+        yield _parameter(model, e, kind, a, content[a], f"{where}.{a}")
+
+
+def _elements(model: mujoco.MjModel, bodies: Sequence[int], kind: str) -> list[Element]:
+    """Elements of a kind that belong to the bodies, in MuJoCo's order."""
+    if kind == "option":
+        return [Element("", "option", "option")]
+    have = attributes.names(model, kind)
+    if kind == "body":
+        return [Element(_plain(have[b], "body"), kind, have[b]) for b in bodies]
+    if kind == "geom":
+        return _shapes(model, bodies, have)
+    ids = [i for i in range(len(have)) if _owners(model, kind, i) & set(bodies)]
+    if kind == "joint":  # free joints are no dofs of an actor
+        ids = [i for i in ids if model.jnt_type[i] != int(mujoco.mjtJoint.mjJNT_FREE)]
+    return [Element(_plain(have[i], kind), kind, have[i]) for i in ids]
+
+
+def _plain(name: str, kind: str) -> str:
+    return f"{kind}{name[1:]}" if name.startswith("#") else name
+
+
+def _shapes(model: mujoco.MjModel, bodies: Sequence[int], have: Sequence[str]) -> list[Element]:
+    """Geoms, unnamed ones called like their body (further ones `_1`, `_2`); bodies without geoms as themselves."""
+    body_names, shapes = attributes.names(model, "body"), []
+    used: set[str] = set()
+    for body in bodies:
+        geoms = np.flatnonzero(model.geom_bodyid == body)
+        base = _plain(body_names[body], "body")
+        for g in geoms.tolist():
+            label = _plain(have[g], "geom") if not have[g].startswith("#") else _free(base, used)
+            used.add(label)
+            shapes.append(Element(label, "geom", have[g]))
+        if not len(geoms):
+            shapes.append(Element(base, "body", body_names[body]))
+    return shapes
+
+
+def _free(base: str, used: set[str]) -> str:
+    label, i = base, 0
+    while label in used:
+        i += 1
+        label = f"{base}_{i}"
+    return label
+
+
+def _owners(model: mujoco.MjModel, kind: str, i: int) -> set[int]:
+    """Bodies that an element belongs to."""
+    if kind == "joint":
+        return {int(model.jnt_bodyid[i])}
+    if kind == "tendon":
+        return _wrapped(model, i)
+    obj = int(model.actuator_trnid[i, 0])
+    transmission = mujoco.mjtTrn(int(model.actuator_trntype[i])).name
+    if "TENDON" in transmission:
+        return _wrapped(model, obj)
+    owner = {"JOINT": model.jnt_bodyid, "SITE": model.site_bodyid, "SLIDER": model.site_bodyid}
+    table = next((table for key, table in owner.items() if key in transmission), None)
+    return {obj} if table is None else {int(table[obj])}
+
+
+def _wrapped(model: mujoco.MjModel, tendon: int) -> set[int]:
+    owner = {"JOINT": model.jnt_bodyid, "SITE": model.site_bodyid}
+    start = int(model.tendon_adr[tendon])
+    bodies = set()
+    for w in range(start, start + int(model.tendon_num[tendon])):
+        kind = mujoco.mjtWrap(int(model.wrap_type[w])).name[7:]
+        if kind != "PULLEY":
+            bodies.add(int(owner.get(kind, model.geom_bodyid)[int(model.wrap_objid[w])]))
+    return bodies
+
+
+def _selected(
+    model: mujoco.MjModel,
+    elements: Sequence[Element],
+    kind: str,
+    attribute: str,
+    setting: Mapping[str, Any],
+    where: str,
+) -> list[Element]:
+    """Elements that carry the attribute, restricted by `include` and `exclude` (names or patterns with *)."""
+    _known(setting, (*SETTINGS, *ACCEPTED), where)
+    usable = [e for e in elements if e.kind == kind or attribute == "length"]
+    if kind == "geom" and attribute == "length":  # one length per body, called like its first shape
+        usable = list({_body_of(model, e): e for e in reversed(usable)}.values())[::-1]
+    labels = [e.label for e in usable]
+    for key in ("include", "exclude"):
+        patterns = setting.get(key)
+        patterns = [patterns] if isinstance(patterns, str) else list(patterns or [])
+        for pattern in patterns:
+            if not fnmatch.filter(labels, pattern):
+                raise UserError(f"{where}.{key}: no element {pattern!r} here; {suggest(pattern, labels)}")
+        if patterns:
+            wanted = key == "include"
+            usable = [e for e in usable if any(fnmatch.fnmatchcase(e.label, p) for p in patterns) == wanted]
+    if not usable:
+        raise UserError(f"{where}: the actor has no {kind} that could take it")
+    return usable
+
+
+def _body_of(model: mujoco.MjModel, e: Element) -> str:
+    names = attributes.names(model, "body")
+    return e.target if e.kind == "body" else names[int(model.geom_bodyid[attributes.element(model, "geom", e.target)])]
+
+
+def _parameter(
+    model: mujoco.MjModel, e: Element, kind: str, attribute: str, setting: Mapping[str, Any], where: str
+) -> Parameter:
+    operation = _choice(setting, "operation", OPERATIONS, "scaling", where)
+    name = f"{e.label}_{attribute}".lstrip("_") + ("_mult" if operation == "scaling" else "")
+    axis = None
+    if attribute == "length":
+        kind, target = "body", _body_of(model, e)
+        axis = geometry.long_axis(model, attributes.element(model, "body", target), f"{where}, {e.label}")
+    else:
+        target = e.target
+    kind, attribute, target = _driven(model, kind, attribute, target, operation)
+    _check_default(model, kind, attribute, target, operation, f"{where}, {e.label or kind}")
+    factor = _number(setting.get("factor", 1.0), f"{where}.factor")
+    return _build(
+        setting,
+        where,
+        name,
+        _own(model, kind, attribute, target, operation, factor),
+        unit="" if operation == "scaling" else str(setting.get("unit", _unit(model, kind, attribute, target))),
+        operation=operation,
+        attribute=attribute,
+        target=target,
+        kind=kind,
+        factor=factor,
+        axis=axis,
+    )
+
+
+def _driven(model: mujoco.MjModel, kind: str, attribute: str, target: str, operation: str) -> tuple[str, str, str]:
+    """Scaling a dof's stiffness or damping where the joint has none means its drive's: the servo's kp or kv.
+
+    Isaac Gym keeps the gains of position drives in the dof's stiffness and damping.
+    """
+    if kind != "joint" or operation != "scaling" or attribute not in ("stiffness", "damping"):
+        return kind, attribute, target
+    if _default(model, kind, attribute, target) != 0:
+        return kind, attribute, target
+    joint = attributes.element(model, "joint", target)
+    on_joint = (model.actuator_trnid[:, 0] == joint) & (model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT))
+    servos = [int(i) for i in np.flatnonzero(on_joint) if attributes.has_affine_bias(model, int(i))]
+    drive = {"stiffness": "kp", "damping": "kv"}[attribute]
+    if len(servos) != 1 or model.actuator_biasprm[servos[0], {"kp": 1, "kv": 2}[drive]] == 0:
+        return kind, attribute, target
+    return "actuator", drive, attributes.names(model, "actuator")[servos[0]]
+
+
+def _build(setting: Mapping[str, Any], where: str, name: str, own: float, **rest: Any) -> Parameter:
+    """A Parameter from the keys range, distribution, mean, sd, nominal; nominal = the model's own value, clipped."""
+    low, high = _range(setting, where)
+    distribution = _choice(setting, "distribution", tuple(DISTRIBUTIONS), "uniform", where)
+    nominal = _number(setting.get("nominal", min(max(own, low), high)), f"{where}.nominal")
+    mean, sd = (None if setting.get(k) is None else _number(setting[k], f"{where}.{k}") for k in ("mean", "sd"))
+    try:
+        return Parameter(name, nominal, low, high, prior=DISTRIBUTIONS[distribution], mean=mean, sd=sd, **rest)
+    except UserError as error:
+        raise UserError(f"{where}: {error}") from None
+
+
+def _unit(model: mujoco.MjModel, kind: str, attribute: str, target: str) -> str:
+    unit = FIELDS[kind, attribute].unit if (kind, attribute) in FIELDS else COMPOSITE[kind, attribute]
+    slide = int(mujoco.mjtJoint.mjJNT_SLIDE)
+    if kind == "joint" and model.jnt_type[attributes.element(model, kind, target)] == slide:
+        return {"N m/rad": "N/m", "N m s/rad": "N s/m", "kg m^2": "kg", "N m": "N"}[unit]
+    return unit
+
+
+def _own(model: mujoco.MjModel, kind: str, attribute: str, target: str, operation: str, factor: float) -> float:
+    """theta at which the model stays as it is."""
+    if operation == "absolute":
+        return _default(model, kind, attribute, target) / factor
+    return 1.0 if operation == "scaling" else 0.0
+
+
+def _default(model: mujoco.MjModel, kind: str, attribute: str, target: str) -> float:
+    """The model's own number; restitution counts as 0, lengths and scales as 1."""
+    if kind == "option":
+        return float(model.opt.gravity[2])
+    if (kind, attribute) in FIELDS:
+        field = FIELDS[kind, attribute]
+        i = attributes.rows(model, field, attributes.element(model, kind, target))[0]
+        value = np.asarray(getattr(model, field.name)[i]).reshape(-1)
+        return field.sign * float(value[field.column or 0])
+    if (kind, attribute) == ("geom", "restitution"):
+        return 0.0
+    names = {"mass": "body_mass", "inertia": "body_inertia", "gain": "actuator_gainprm", "kp": "actuator_gainprm"}
+    if attribute not in names:
+        return 1.0
+    return float(np.asarray(getattr(model, names[attribute])[attributes.element(model, kind, target)]).reshape(-1)[0])
+
+
+def _check_default(model: mujoco.MjModel, kind: str, attribute: str, target: str, operation: str, where: str) -> None:
+    default = _default(model, kind, attribute, target)
+    if operation == "scaling" and default == 0:
+        raise UserError(f"{where}: scaling a number that is 0 in the model does nothing; use additive, or exclude it")
+    if (kind, attribute) in (("joint", "friction"), ("tendon", "friction")) and default <= 0:
+        raise UserError(f"{where}: MJX ignores friction that is 0 in the MJCF; give frictionloss a small value there")
+    if attribute in ("gain", "kp", "mass") and default == 0:
+        raise UserError(f"{where}: it is 0 in the model and only known as a ratio; exclude it")
+
+
+def _scale(
+    model: mujoco.MjModel, actor: str, actors: Sequence[str], setting: Mapping[str, Any], where: str
+) -> Parameter:
+    """One number for the whole actor: `scale: {range: ...}`, or BayesSimIG's `scale: {scale: {range: ...}}`."""
+    if set(setting) == {"scale"}:
+        setting = setting["scale"]
+    _known(setting, (*SETTINGS, *ACCEPTED), where)
+    operation = _choice(setting, "operation", OPERATIONS, "scaling", where)
+    have = attributes.names(model, "body")
+    if actor not in have and len(actors) > 1:
+        raise UserError(f"{where}: only a body can be scaled apart from other actors; {suggest(actor, have[1:])}")
+    bodies = attributes.subtree(model, attributes.actor_root(model, actor))
+    for g in np.flatnonzero(np.isin(model.geom_bodyid, bodies)):
+        if int(model.geom_type[g]) not in geometry.PRIMITIVE:
+            raise UserError(
+                f"{where}: geom {attributes.names(model, 'geom')[g]} is a mesh, MJX cannot scale it per world"
+            )
+    name = f"{actor}_scale" + ("_mult" if operation == "scaling" else "")
+    return _build(setting, where, name, 1.0, operation=operation, attribute="scale", target=actor, kind="actor")
+
+
+def _effects(content: Mapping[str, Any], where: str) -> Iterator[Parameter]:
+    """effect -> where -> parameter -> range; nominal (neutral) is 0 unless `nominal` says otherwise."""
+    for effect, places in content.items():
+        for place, parameters in (places or {}).items():
+            for label, setting in (parameters or {}).items():
+                path = f"{where}.{effect}.{place}.{label}"
+                _known(setting, (*SETTINGS, *ACCEPTED), path)
+                _choice(setting, "operation", OPERATIONS, "absolute", path)
+                yield _build(
+                    setting,
+                    path,
+                    f"{place}.{effect}.{label}",
+                    0.0,
+                    unit=str(setting.get("unit", "")),
+                    operation="absolute",
+                    attribute=str(label),
+                    target=str(place),
+                    kind="effect",
+                )
+
+
+def _known(mapping: Any, allowed: Sequence[str], where: str) -> None:
+    if not isinstance(mapping, Mapping):
+        raise UserError(f"{where}: expected keys, not {mapping!r}")
+    for key in mapping:
+        if key not in allowed:
+            close = difflib.get_close_matches(str(key), allowed, 2)
+            hint = f"did you mean {', '.join(close)}? " if close else ""
+            raise UserError(f"{where}.{key}: unknown key; {hint}allowed: {', '.join(allowed)}")
+
+
+def _choice(setting: Mapping[str, Any], key: str, allowed: Sequence[str], default: str, where: str) -> str:
+    value = setting.get(key, default)
+    if value not in allowed:
+        raise UserError(f"{where}.{key}: {value!r} is none of {', '.join(allowed)}")
+    return value
+
+
+def _range(setting: Mapping[str, Any], where: str) -> tuple[float, float]:
+    value = setting.get("range")
+    if value is None:
+        raise UserError(f"{where}.range: missing; give [low, high]")
+    if isinstance(value, str) or not hasattr(value, "__len__") or len(value) != 2:
+        raise UserError(f"{where}.range: {value!r} is not [low, high]")
+    low, high = (_number(v, f"{where}.range") for v in value)
+    if not low < high:
+        raise UserError(f"{where}.range: [{low:g}, {high:g}] is empty; low must be less than high")
+    return low, high
+
+
+def _number(value: Any, where: str) -> float:
+    try:  # YAML reads 1e-3 as text
+        number = float("" if isinstance(value, bool) else value)
+    except (TypeError, ValueError):
+        raise UserError(f"{where}: {value!r} is not a number") from None
+    if not math.isfinite(number):
+        raise UserError(f"{where}: {value!r} is not finite")
+    return number
