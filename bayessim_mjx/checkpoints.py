@@ -82,25 +82,40 @@ def read_index(path: Path) -> dict[str, Any]:
 
 
 def restore(path: Path, template: Any) -> tuple[Any, dict[str, Any]]:
-    """(tree like `template`, meta). A dict template may name only some of the saved entries.
+    """(tree like `template`, meta). A dict template may name a part of it, e.g. "state.domain".
 
     `template` holds arrays or ShapeDtypeStructs. CorruptedError for damaged files; UserError, naming the leaf, where
     the checkpoint is that of another task or of other settings.
     """
     index = read_index(path)
-    parts = template if type(template) is dict else {"tree": template}
-    missing = [name for name in parts if name not in index["parts"]]
-    if missing:
-        raise UserError(f"{path}: the checkpoint has no {missing[0]!r}; it has {', '.join(index['parts'])}")
-    for name, part in parts.items():
-        _compare(f"{path}: {name}", index["parts"][name], part)
-    tree = {name: _restore_part(path / name, index["parts"][name], part) for name, part in parts.items()}
+    wanted = template if type(template) is dict else {"tree": template}
+    for name, part in wanted.items():
+        if name.partition(".")[0] not in index["parts"]:
+            raise UserError(f"{path}: the checkpoint has no {name!r}; it has {', '.join(index['parts'])}")
+        _compare(f"{path}: {name}", _saved(index, name), part)
+    tree = {name: _restore_part(path, index, name, part) for name, part in wanted.items()}
     return (tree if type(template) is dict else tree["tree"]), index["meta"]
 
 
-def _compare(where: str, saved: list[dict], template: Any) -> None:
+def has(path: Path, name: str) -> bool:
+    """Whether the checkpoint holds leaves under the dotted `name`."""
+    index = read_index(path)
+    return name.partition(".")[0] in index["parts"] and bool(_saved(index, name))
+
+
+def _saved(index: dict[str, Any], name: str) -> dict[int, dict]:
+    """Leaves under a dotted name, by their number in the part; their names are relative to it."""
+    part, _, inner = name.partition(".")
+    prefix = f"{inner}." if inner else ""
+    leaves = enumerate(index["parts"][part])
+    return {
+        i: {**leaf, "name": leaf["name"].removeprefix(prefix)} for i, leaf in leaves if leaf["name"].startswith(prefix)
+    }
+
+
+def _compare(where: str, saved: dict[int, dict], template: Any) -> None:
     """Refuse a template whose leaves have other names, shapes or types than the saved ones."""
-    have = {leaf["name"]: f"{leaf['dtype']}{leaf['shape']}" for leaf in saved}
+    have = {leaf["name"]: f"{leaf['dtype']}{leaf['shape']}" for leaf in saved.values()}
     need = {name: f"{leaf.dtype}{list(leaf.shape)}" for name, leaf in _leaves(template)}
     for name in dict.fromkeys([*need, *have]):
         if need.get(name) != have.get(name):
@@ -110,20 +125,21 @@ def _compare(where: str, saved: list[dict], template: Any) -> None:
             )
 
 
-def _restore_part(folder: Path, saved: list[dict], template: Any) -> Any:
+def _restore_part(path: Path, index: dict[str, Any], name: str, template: Any) -> Any:
     import jax
     import jax.numpy as jnp
     import orbax.checkpoint as ocp
 
+    folder, saved = path / name.partition(".")[0], _saved(index, name)
     stored: dict[str, Any] = {}
-    if any(0 not in leaf["shape"] for leaf in saved):
+    if any(0 not in leaf["shape"] for leaf in saved.values()):
         try:
             with ocp.PyTreeCheckpointer() as checkpointer:
                 stored = checkpointer.restore(folder.absolute())
         except Exception as error:  # a damaged file fails in many ways inside Orbax
             raise CorruptedError(f"{folder}: damaged checkpoint: {str(error).splitlines()[0][:200]}") from None
     leaves = []
-    for i, leaf in enumerate(saved):
+    for i, leaf in saved.items():
         array = np.asarray(stored.get(f"{i:06d}", np.zeros(leaf["shape"], leaf["dtype"])))
         if _describe(leaf["name"], array) != leaf:
             raise CorruptedError(f"{folder}: damaged checkpoint: {leaf['name']} differs from its checksum")

@@ -8,6 +8,7 @@ import datetime
 import json
 import math
 import platform
+import shlex
 import shutil
 import subprocess
 import sys
@@ -51,7 +52,7 @@ class Run:
         (path / "params" / "env.yaml").write_text(config.to_yaml(plain), encoding="utf-8")
         (path / "params" / "train.yaml").write_text(config.to_yaml(train), encoding="utf-8")
         command = sys.argv if command is None else command
-        text = command if isinstance(command, str) else " ".join(command)
+        text = command if isinstance(command, str) else shlex.join(command)
         (path / "command.txt").write_text(text + "\n", encoding="utf-8")
         run = cls(path, {
             "schema": SCHEMA, "task": task, "name": name, "created": _now(), "status": "running", "command": text,

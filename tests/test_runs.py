@@ -69,6 +69,8 @@ def test_one_entry_can_be_restored_alone(run: Run) -> None:
     run.save(1, tree(1))
     part, _ = run.restore("latest", {"policy": tree(2)["policy"]})
     assert same_bits(part["policy"], tree(1)["policy"])
+    inner, _ = run.restore("latest", {"policy.w": tree(2)["policy"]["w"]})
+    assert same_bits(inner["policy.w"], tree(1)["policy"]["w"])
 
 
 def test_latest_and_best_come_from_the_manifest(run: Run) -> None:

@@ -1,0 +1,214 @@
+"""What the commands share: flags, configuration from them, checkpoints by name, clean ends. No jax before parsing."""
+
+import argparse
+import contextlib
+import dataclasses
+import os
+import random
+import signal
+import sys
+import threading
+import types
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn
+
+from bayessim_mjx.config import Config, load, unknown
+from bayessim_mjx.errors import UserError
+
+if TYPE_CHECKING:
+    from bayessim_mjx.runs import Run
+
+DEBUG_VARIABLE = "BAYESSIM_MJX_DEBUG"  # set: errors come with a traceback
+# flag -> (dotted key, type, help); None as type: a switch
+FLAGS: dict[str, tuple[str, Any, str]] = {
+    "--num_envs": ("env.numEnvs", int, "worlds in parallel"),
+    "--seed": ("seed", int, "seed of everything random; -1: a random one"),
+    "--max_iterations": ("ppo.max_iterations", int, "PPO iterations (per round of the outer loop)"),
+    "--video": ("monitor.video", None, "record videos"),
+    "--video_length": ("monitor.video_length", int, "control steps per video"),
+    "--video_interval": ("monitor.video_interval", int, "control steps of each world between videos"),
+    "--logdir": ("logdir", str, "root of the run folders (logs)"),
+    "--name": ("name", str, "last part of the run folder's name"),
+    "--device": ("device", str, "auto, cpu, gpu, gpu:1, cuda:0"),
+    "--cache_dir": ("cache_dir", str, "compilation cache; off: none ($BAYESSIM_MJX_CACHE)"),
+}
+RESUMABLE = ("--device", "--cache_dir", "--video", "--video_length", "--video_interval", "--headless", "--resume")
+
+
+class Parser(argparse.ArgumentParser):
+    """Flags of one command and `section.key=value` overrides; all that is wrong is a UserError."""
+
+    def __init__(self, prog: str, description: str, resume: bool = False):
+        super().__init__(prog=f"python -m bayessim_mjx.{prog}", description=description, allow_abbrev=False)
+        self.add_argument("--task", help="name of the task (--list_tasks)")
+        for flag, (_, kind, text) in FLAGS.items():
+            options: dict[str, Any] = {"action": "store_true"} if kind is None else {"type": kind}
+            self.add_argument(flag, default=None, help=text, **options)
+        self.add_argument("--cfg_env", metavar="FILE", help="YAML with any sections, over cfg/<task>.yaml")
+        self.add_argument("--cfg_train", metavar="FILE", help="YAML of PPO settings")
+        self.add_argument("--checkpoint", metavar="PATH|latest|best", help="policy to start from, or to play")
+        self.add_argument("--use_last_checkpoint", action="store_true", help="the same as --checkpoint latest")
+        self.add_argument("--headless", action="store_true", help="plain lines, no progress bars; never a window")
+        self.add_argument("--list_tasks", action="store_true", help="print the names of the tasks")
+        if resume:
+            self.add_argument("--resume", metavar="RUN", help="go on with an interrupted run")
+        self.epilog = "section.key=value sets any setting, e.g. bayessim.components=5 ppo.gamma=0.99 (see cfg/*.yaml)"
+
+    def parse(self, argv: Sequence[str] | None) -> argparse.Namespace:
+        """Namespace with the flags, `overrides`, and `given` (flags that were used)."""
+        argv = list(sys.argv[1:] if argv is None else argv)
+        args, rest = self.parse_known_args(argv)
+        for text in rest:
+            if text.startswith("-"):
+                raise unknown("flag", text.split("=")[0], sorted(self._option_string_actions))
+            if "=" not in text:
+                raise UserError(f"{text!r} is neither a flag nor an override section.key=value")
+        args.overrides = rest
+        args.given = [a.split("=")[0] for a in argv if a.startswith("--")]
+        if args.use_last_checkpoint:
+            if args.checkpoint not in (None, "latest"):
+                raise UserError(f"--use_last_checkpoint and --checkpoint {args.checkpoint}: give one of them")
+            args.checkpoint = "latest"
+        return args
+
+    def error(self, message: str) -> NoReturn:
+        raise UserError(message.removeprefix("argument "))
+
+
+def config_of(args: argparse.Namespace, more: Mapping[str, tuple[str, Any]] | None = None) -> Config:
+    """The configuration that flags (and `more` like them), files and overrides ask for; the task has to exist."""
+    flags = dict(more or {})
+    for flag, (key, _, _) in FLAGS.items():
+        value = getattr(args, flag[2:])
+        if value is not None:
+            drawn = flag == "--seed" and value == -1
+            flags[flag] = (key, random.SystemRandom().randrange(10_000) if drawn else value)
+    task = args.task and task_name(args.task)
+    settings = load(task, cfg_env=args.cfg_env, cfg_train=args.cfg_train, flags=flags, overrides=args.overrides)
+    task_name(settings.task)
+    return settings
+
+
+def resumed_config(args: argparse.Namespace, config: Config) -> Config:
+    """The settings of the run to resume, with what may change: device, cache and videos. Anything else is refused."""
+    fixed = [flag for flag in args.given if flag not in RESUMABLE] + list(args.overrides)
+    if fixed:
+        raise UserError(f"--resume goes on with the run's own settings, which {fixed[0]} would change; start a new run")
+    video = {k: getattr(args, k) for k in ("video_length", "video_interval", "video") if getattr(args, k) is not None}
+    top = {k: getattr(args, k) for k in ("device", "cache_dir") if getattr(args, k) is not None}
+    monitor = dataclasses.replace(config.monitor, **video)
+    return dataclasses.replace(config, monitor=monitor, **top)
+
+
+def task_name(name: str) -> str:
+    """The task's proper name; UserError with the close ones where there is none."""
+    from bayessim_mjx import registry
+
+    if ":" in name:
+        return name
+    known = {title.lower(): title for title in registry.names()}
+    if name.lower().replace("_", "") not in known:
+        raise unknown("--task", name, [*known.values(), *(f"{prefix}:<env>" for prefix in registry.EXTERNAL)])
+    return known[name.lower().replace("_", "")]
+
+
+def list_tasks() -> int:
+    """Print the names of our own tasks."""
+    from bayessim_mjx import registry
+
+    print("\n".join(registry.names()))
+    return 0
+
+
+def find_checkpoint(which: str, task: str | None, logdir: str) -> tuple[Path, "Run | None"]:
+    """(checkpoint folder, its run) for "latest", "best" (of the task's newest run) or a run's or checkpoint's path."""
+    from bayessim_mjx import checkpoints
+    from bayessim_mjx.runs import MANIFEST, Run, latest_run
+
+    if which in ("latest", "best"):
+        if not task:
+            raise UserError(f"--checkpoint {which}: give --task NAME, or the path of a run")
+        run = latest_run(logdir, task)
+        return run.checkpoint(which), run
+    path = Path(which)
+    if (path / MANIFEST).is_file():
+        run = Run.open(path)
+        return run.checkpoint("latest" if run.manifest["best"] is None else "best"), run
+    if not path.is_dir():
+        raise UserError(f"--checkpoint {which}: no such folder; give a run, one of its checkpoints, latest or best")
+    checkpoints.read_index(path)
+    parents = path.absolute().parents
+    return path, Run.open(parents[1]) if (parents[1] / MANIFEST).is_file() else None
+
+
+def load_policy(path: Path, env: Any, config: Config) -> Any:
+    """The policy in a checkpoint folder; its networks have to be those of `config`."""
+    import jax
+
+    from bayessim_mjx import checkpoints, rl
+
+    make = lambda key: rl.policy_of(rl.init(env, config.ppo, key))  # noqa: E731
+    return checkpoints.restore(path, {"policy": jax.eval_shape(make, jax.random.PRNGKey(0))})[0]["policy"]
+
+
+def warm_start(train: Any, config: Config, env: Any) -> Any:
+    """The training state with actor and normaliser of `bayessim.policyCheckpt`, if that is set; the critic is new."""
+    if config.bayessim.policyCheckpt is None:
+        return train
+    path, _ = find_checkpoint(config.bayessim.policyCheckpt, config.task, config.logdir)
+    policy = load_policy(path, env, config)
+    normalizer = {**train.normalizer, "policy": policy.normalizer}
+    return train.replace(params={**train.params, "actor": policy.actor}, normalizer=normalizer)
+
+
+class Stop:
+    """Ctrl-C (or SIGTERM) asked for: `requested` is looked at where the state is whole."""
+
+    requested = False
+
+    def save(self, save: Callable[[], Any]) -> None:
+        """If a stop was asked for: save a checkpoint, then end."""
+        if self.requested:
+            save()
+            raise KeyboardInterrupt
+
+
+@contextlib.contextmanager
+def graceful() -> Iterator[Stop]:
+    """While inside, the first Ctrl-C asks for a stop at the next whole state, and the second one stops at once."""
+    stop, before = Stop(), {}
+
+    def ask(number: int, frame: types.FrameType | None) -> None:
+        if stop.requested:
+            raise KeyboardInterrupt
+        stop.requested = True
+        print("\nstopping after this step, with a checkpoint (again: at once)", file=sys.stderr)
+
+    if threading.current_thread() is threading.main_thread():
+        before = {n: signal.signal(n, ask) for n in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def command(run: Callable[[Sequence[str] | None], int]) -> Callable[..., int]:
+    """A `main(argv=None)` that returns an exit code: 2 and one line on stderr for a user's error, 130 after Ctrl-C."""
+
+    def main(argv: Sequence[str] | None = None) -> int:
+        try:
+            return run(argv)
+        except (ValueError, FloatingPointError) as error:
+            if os.environ.get(DEBUG_VARIABLE):
+                raise
+            print(f"error: {error}", file=sys.stderr)
+            return 2
+        except KeyboardInterrupt:
+            return 130
+        except SystemExit as end:  # --help
+            return int(end.code or 0)
+
+    main.__doc__ = run.__doc__
+    return main

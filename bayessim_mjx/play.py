@@ -1,0 +1,113 @@
+"""`python -m bayessim_mjx.play --task Pendulum --checkpoint best --video`: returns of a saved policy, and a video."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from bayessim_mjx import cli
+from bayessim_mjx.config import Config
+from bayessim_mjx.device import setup_jax
+from bayessim_mjx.errors import UserError
+
+DESCRIPTION = "Play a saved policy: on nominal physics, on the prior, on the surrogate real and on the posterior."
+PHYSICS = ("nominal", "prior", "real", "posterior")
+
+
+def _parser() -> cli.Parser:
+    parser = cli.Parser("play", DESCRIPTION)
+    parser.add_argument(
+        "--episodes", type=int, help="per kind of physics (default: --num_envs, else bayessim.realEvals)"
+    )
+    parser.add_argument("--physics", choices=PHYSICS, help="one kind only")
+    return parser
+
+
+def _settings(args: argparse.Namespace) -> tuple[Config, Path, Any]:
+    """(settings of the run that the checkpoint belongs to with flags on top, checkpoint folder, run or None)."""
+    if args.task:
+        args.task = cli.task_name(args.task)
+    path, run = cli.find_checkpoint(args.checkpoint or "best", args.task, args.logdir or "logs")
+    if run is None:
+        return cli.config_of(args), path, None
+    args.task = args.task or run.manifest["task"]
+    args.cfg_env = args.cfg_env or run.path / "params" / "env.yaml"
+    args.cfg_train = args.cfg_train or run.path / "params" / "train.yaml"
+    return cli.config_of(args), path, run
+
+
+def _physics(config: Config, env: Any, checkpoint: Path, key: Any, count: int) -> dict[str, Any]:
+    """theta [count, d] of every kind of physics that there is."""
+    import jax.numpy as jnp
+
+    from bayessim_mjx import checkpoints
+    from bayessim_mjx.collection import make_source
+    from bayessim_mjx.distributions import Distribution
+
+    kinds = {"nominal": jnp.tile(jnp.asarray(env.space.nominal, jnp.float32), (count, 1))}
+    if not len(env.space):
+        return kinds
+    prior = Distribution.prior(env.space, config.bayessim.components)
+    kinds["prior"] = prior.sample(key, count)
+    if config.env.realParams is not None and not config.real.logs:
+        kinds["real"] = make_source(config, env).sample(key, count)  # type: ignore[union-attr]
+    if checkpoints.has(checkpoint, "state.domain"):
+        domain = checkpoints.restore(checkpoint, {"state.domain": prior})[0]["state.domain"]
+        kinds["posterior"] = domain.sample(key, count)
+    return kinds
+
+
+def _video(config: Config, env: Any, policy: Any, thetas: Any, key: Any, path: Path) -> None:
+    import numpy as np
+
+    from bayessim_mjx.monitor import video
+    from bayessim_mjx.rollout import rollout
+
+    if not hasattr(env, "physics"):
+        raise UserError(f"--video: {env.name} has no MuJoCo model of ours to draw; leave it out")
+    qpos = rollout(env, policy.replace(deterministic=True), key, thetas[:1], config.monitor.video_length).qpos[0]
+    words = {name: f"{value:.3g}" for name, value in env.space.as_dict(np.asarray(thetas[0])).items()}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    frames = video.record(env.mj_model, np.asarray(qpos), path, fps=25, dt=env.dt, overlay_text=words)
+    print(f"video: {path}" if frames is not None else "no video could be made here")
+
+
+def _play(argv: Sequence[str] | None) -> int:
+    args = _parser().parse(argv)
+    if args.list_tasks:
+        return cli.list_tasks()
+    config, path, run = _settings(args)
+    count = args.episodes if args.episodes is not None else args.num_envs or config.bayessim.realEvals
+    if count < 1:
+        raise UserError(f"--episodes {count}: must be at least 1")
+    setup_jax(config)
+    import jax
+
+    from bayessim_mjx import registry, rl
+
+    env = registry.make(config.task, config=config)
+    policy, key = cli.load_policy(path, env, config), jax.random.PRNGKey(config.seed)
+    kinds = _physics(config, env, path, key, count)
+    if args.physics and args.physics not in kinds:
+        raise UserError(f"--physics {args.physics}: this checkpoint and task have {', '.join(kinds)}")
+    print(f"{config.task}, checkpoint {path}, {count} episodes each")
+    print(f"{'physics':<10}{'return':>10}{'sd':>10}{'min':>10}{'max':>10}{'length':>10}")
+    chosen = {args.physics: kinds[args.physics]} if args.physics else kinds
+    for name, thetas in chosen.items():
+        result = rl.evaluate(env, policy, jax.random.fold_in(key, 1), thetas)
+        r, length = result["return"], result["length"]
+        print(f"{name:<10}{r.mean():>10.4g}{r.std():>10.4g}{r.min():>10.4g}{r.max():>10.4g}{length.mean():>10.4g}")
+    if config.monitor.video:
+        name = next(n for n in ("real", "posterior", "prior", "nominal") if n in chosen)
+        folder = (run.path if run is not None else path.parent) / "videos" / "play"
+        _video(config, env, policy, chosen[name], key, folder / f"{path.name}_{name}.mp4")
+    return 0
+
+
+main = cli.command(_play)
+
+if __name__ == "__main__":
+    sys.exit(main())
