@@ -20,7 +20,7 @@ TORQUE_CONSTANT, RESISTANCE = 0.354, 3.40
 GAIN = TORQUE_CONSTANT / RESISTANCE  # N m/V
 DAMPING = TORQUE_CONSTANT**2 / RESISTANCE + 0.005  # N m s/rad, back-EMF and viscous friction
 ARMATURE = 0.002  # kg m^2, rotor inertia seen at the output
-COULOMB = 0.02  # N m
+COULOMB = 0.05  # N m
 
 # The weight is nearly a point (its own inertia is 1 % of m l^2); the arm weighs nothing.
 XML = f"""
@@ -51,8 +51,8 @@ XML = f"""
 """
 
 
-def _scaled(low: float, high: float) -> dict[str, Any]:
-    return {"range": [low, high], "operation": "scaling", "distribution": "uniform"}
+def _absolute(low: float, high: float, distribution: str = "uniform") -> dict[str, Any]:
+    return {"range": [low, high], "operation": "absolute", "distribution": distribution}
 
 
 class ServoPendulum(Task):
@@ -68,19 +68,19 @@ class ServoPendulum(Task):
     options: ClassVar[dict[str, Any]] = {"target": 1.2}
     diverged_reward: ClassVar[float] = 0.0
     observation_names: ClassVar[tuple[str, ...]] = ("cos_q", "sin_q", "speed", "cos_error", "sin_error")
-    # the surrogate, as factors on the nominal model: BAM's own fit of this servo (their model M1, revision HEAD)
-    real_parameters: ClassVar[tuple[float, ...]] = (1.0, 0.98, 0.64, 0.91, 0.92)
+    # the surrogate: BAM's own fit of this servo (their model M1, file params/xl330_HEAD_m1.json): kt 0.387, R 4.02
+    real_parameters: ClassVar[tuple[float, ...]] = (0.49, 0.0409, 0.0128, 0.00181, 0.0963)
     randomization: ClassVar[dict] = {
         "randomization_params": {
             "actor_params": {
-                "servo": {
-                    "rigid_body_properties": {"mass": _scaled(0.7, 1.3)},
+                "load": {
+                    "rigid_body_properties": {"mass": _absolute(0.4, 0.6)},
                     "dof_properties": {
-                        "damping": _scaled(0.3, 2.5),
-                        "friction": _scaled(0.1, 5.0),
-                        "armature": _scaled(0.2, 4.0),
+                        "damping": _absolute(0.003, 0.12, "loguniform"),
+                        "friction": _absolute(0.003, 0.25, "loguniform"),
+                        "armature": _absolute(0.0004, 0.01, "loguniform"),
                     },
-                    "actuator_properties": {"gain": _scaled(0.5, 1.6)},
+                    "actuator_properties": {"gain": _absolute(0.04, 0.16)},
                 }
             }
         }
