@@ -7,6 +7,7 @@ Both are turned into summaries by the same function as the simulated trajectorie
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -22,7 +23,7 @@ from bayessim_mjx.errors import UserError
 from bayessim_mjx.inference import summarizers
 from bayessim_mjx.logs import Log, noise, read_logs, segments
 from bayessim_mjx.parameters import ParameterSpace
-from bayessim_mjx.rl.ppo import Policy
+from bayessim_mjx.rl import Policy
 from bayessim_mjx.rollout import Trajectory, replay, rollout
 
 RANDOM_SHARE = 0.1  # policy_rl_randomized: share of the steps with a uniformly random action (BayesSimIG)
@@ -32,23 +33,35 @@ POLICY_DEPENDENT = ("policy_rl", "policy_rl_randomized")
 def policy_function(name: str, policy: Policy, action_size: int) -> Callable[[Array, dict], Array]:
     """The collection policy `name` as a function (key, obs of one world) -> action [action_size].
 
-    random is symmetric, U[-1, 1]; rl_randomized flips its coin for every world and step by itself.
+    random is symmetric, U[-1, 1]; rl_randomized flips its coin for every world and step by itself. The policy's arrays
+    are leaves of the function, so a new policy does not recompile.
     """
+    if name == "policy_rl":
+        return jax.tree_util.Partial(_act, policy)
+    if name == "policy_rl_randomized":
+        return jax.tree_util.Partial(_act_randomized, policy)
+    return {"policy_random": _random, "policy_ones": _ones}[name](action_size)
 
-    def uniform(key: Array) -> Array:
-        return jax.random.uniform(key, (action_size,), minval=-1.0, maxval=1.0)
 
-    def randomized(key: Array, obs: dict) -> Array:
-        k_coin, k_random, k_policy = jax.random.split(key, 3)
-        return jnp.where(jax.random.bernoulli(k_coin, RANDOM_SHARE), uniform(k_random), policy.act(k_policy, obs))
+def _act(policy: Policy, key: Array, obs: dict) -> Array:
+    return policy.replace(deterministic=False).act(key, obs)
 
-    functions: dict[str, Callable[[Array, dict], Array]] = {
-        "policy_random": lambda key, obs: uniform(key),
-        "policy_ones": lambda key, obs: jnp.ones(action_size),
-        "policy_rl": lambda key, obs: policy.act(key, obs),
-        "policy_rl_randomized": randomized,
-    }
-    return functions[name]
+
+def _act_randomized(policy: Policy, key: Array, obs: dict) -> Array:
+    k_coin, k_random, k_policy = jax.random.split(key, 3)
+    action = _act(policy, k_policy, obs)
+    other = jax.random.uniform(k_random, action.shape, minval=-1.0, maxval=1.0)
+    return jnp.where(jax.random.bernoulli(k_coin, RANDOM_SHARE), other, action)
+
+
+@functools.lru_cache
+def _random(action_size: int) -> Callable[[Array, dict], Array]:
+    return lambda key, obs: jax.random.uniform(key, (action_size,), minval=-1.0, maxval=1.0)
+
+
+@functools.lru_cache
+def _ones(action_size: int) -> Callable[[Array, dict], Array]:
+    return lambda key, obs: jnp.ones(action_size)
 
 
 def summarise(summarizer: Callable, trajectory: Trajectory) -> Array:
@@ -56,7 +69,7 @@ def summarise(summarizer: Callable, trajectory: Trajectory) -> Array:
     return jax.vmap(summarizer)(trajectory.observation, trajectory.action)
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)  # compared by identity: static under jit
 class Surrogate:
     """The simulator at hidden parameters, standing in for hardware (`env.realParams`)."""
 
@@ -107,7 +120,7 @@ class Surrogate:
         return summarise(self.summarizer, trajectory), trajectory
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)  # compared by identity: static under jit
 class Recorded:
     """Segments of recorded logs. In simulation the logged commands are replayed from the logged state."""
 

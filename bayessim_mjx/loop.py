@@ -19,14 +19,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from bayessim_mjx import rl
+from bayessim_mjx import inference, rl
 from bayessim_mjx.collection import POLICY_DEPENDENT, Recorded, Source, domain_or_prior, make_source
 from bayessim_mjx.config import BayesSimConfig, Config
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.env import Env
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.inference import fit, posterior
-from bayessim_mjx.rl.ppo import Policy, TrainState
+from bayessim_mjx.rl import Policy, TrainState
 from bayessim_mjx.rollout import Trajectory, replay
 
 CHUNK = 2500  # trajectories simulated at once while collecting
@@ -78,7 +77,7 @@ class Checkpoints(Protocol):
     def save(self, step: int, tree: Any, *, evaluation: float | None = None, meta: dict | None = None) -> Any: ...
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Loop:
     """The parts that do not move."""
 
@@ -132,7 +131,7 @@ def make(config: Config, env: Env) -> Loop:
 
 
 def _untrained(env: Env, config: Config) -> Policy:
-    return rl.ppo.policy_of(rl.init(env, config.ppo, jax.random.PRNGKey(0), domain_or_prior(env.space, 1)))
+    return rl.policy_of(rl.init(env, config.ppo, jax.random.PRNGKey(0), domain_or_prior(env.space, 1)))
 
 
 def init(loop: Loop) -> LoopState:
@@ -158,8 +157,8 @@ def _new_policy(loop: Loop, round_: int, domain: Distribution | None) -> TrainSt
 
 
 def _new_network(loop: Loop, round_: int) -> Any:
-    settings = fit.settings_from(loop.settings)
-    return fit.init(jax.random.fold_in(loop.key(round_, "fit"), 1), settings, loop.env.space, loop.feature_size)
+    settings = inference.InferenceSettings.of(loop.settings)
+    return inference.init(jax.random.fold_in(loop.key(round_, "fit"), 1), settings, loop.env.space, loop.feature_size)
 
 
 def training_target(loop: Loop, round_: int) -> int:
@@ -180,7 +179,7 @@ def train(loop: Loop, state: LoopState, progress: Callable[[dict, TrainState], N
 def step(loop: Loop, state: LoopState) -> tuple[LoopState, RoundInfo]:
     """The rest of a round, after training: evaluate, collect, fit, condition on all real trajectories."""
     started, seconds = time.perf_counter(), {}
-    round_, policy = int(state.round), rl.ppo.policy_of(state.train)
+    round_, policy = int(state.round), rl.policy_of(state.train)
     returns, lengths = _evaluate(loop, state, policy)
     seconds["evaluate"] = time.perf_counter() - started
     info = RoundInfo(
@@ -249,7 +248,7 @@ def _infer(loop: Loop, state: LoopState, policy: Policy, info: RoundInfo) -> Loo
     clock = time.perf_counter()
     network = state.fit if b.ftune or round_ == 0 else _new_network(loop, round_)
     count = min((round_ + 1) * b.trainTrajs, loop.capacity)
-    network, fit_info = fit.fit(loop.key(round_, "fit"), network, state.thetas, state.features, jnp.int32(count))
+    network, fit_info = inference.fit(loop.key(round_, "fit"), network, state.thetas, state.features, jnp.int32(count))
     info.fit = {name: np.asarray(value) for name, value in dataclasses.asdict(fit_info).items()}
     info.seconds["fit"] = time.perf_counter() - clock
 
@@ -257,15 +256,14 @@ def _infer(loop: Loop, state: LoopState, policy: Policy, info: RoundInfo) -> Loo
     seen = round_ * b.realTrajs
     real_features, real = source.real(loop.key(round_, "real"), seen, b.realTrajs, policy)
     all_features = jax.lax.dynamic_update_slice(state.real_features, real_features, (seen, 0))
-    posteriors = fit.condition(network, all_features)
+    posteriors = inference.condition(network, all_features)
     if b.collectPolicy in POLICY_DEPENDENT:
         # An older trajectory was made by an older policy: its posterior stays that of the network of its time.
         new = jnp.arange(all_features.shape[0]) >= seen
         posteriors = jax.tree.map(
             lambda old, now: jnp.where(new.reshape(-1, *[1] * (now.ndim - 1)), now, old), state.real_posteriors, posteriors
         )
-    rows = [jax.tree.map(lambda leaf, i=i: leaf[i], posteriors) for i in range(seen + b.realTrajs)]
-    domain = posterior.combine(rows, b.components)
+    domain = inference.combine(posteriors.split()[: seen + b.realTrajs], b.components)
     info.posterior, info.real = domain, jax.tree.map(np.asarray, real)
     info.scores = score(domain, source.truth)
     info.predictive = _predict(loop, domain, real, loop.key(round_, "predict"))
@@ -325,7 +323,7 @@ def run(
         clock = time.perf_counter()
         state = train(loop, state, progress)
         seconds = time.perf_counter() - clock
-        policy = rl.ppo.policy_of(state.train)
+        policy = rl.policy_of(state.train)
         number = checkpoint_step(loop, round_, state.train)
         state, info = step(loop, state)
         info.seconds["train"] = seconds
@@ -342,7 +340,7 @@ def run(
 
 def tree_of(loop: Loop, state: LoopState) -> dict[str, Any]:
     """What a checkpoint holds; also the template to restore one."""
-    return {"policy": rl.ppo.policy_of(state.train), "state": state}
+    return {"policy": rl.policy_of(state.train), "state": state}
 
 
 def checkpoint_step(loop: Loop, round_: int, trained: TrainState) -> int:

@@ -1,0 +1,198 @@
+"""What a person sees of a run of the loop: console lines, TensorBoard pages, videos, and one JSON line per round."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bayessim_mjx.config import Config
+from bayessim_mjx.loop import LoopState, RoundInfo
+from bayessim_mjx.monitor import plots, video
+from bayessim_mjx.monitor.console import Console
+from bayessim_mjx.monitor.writer import Writer
+from bayessim_mjx.rl import Policy
+
+MOST_PAIRS = 10  # BayesSimIG draws one figure per pair; beyond this the corner plot shows them all
+ROUNDS = "rounds.jsonl"
+
+Film = Callable[[Policy, int], np.ndarray]  # (policy, control steps) -> qpos [T+1, nq]
+
+
+class Session:
+    """The monitor of a run. `film` gives the motion of a policy on the real side, for videos; None: no videos."""
+
+    def __init__(
+        self,
+        path: Path,
+        config: Config,
+        env: Any,
+        console: Console,
+        film: Film | None = None,
+        start: LoopState | None = None,
+    ):
+        self.path, self.config, self.env, self.console, self.film = path, config, env, console, film
+        first_round = 0 if start is None else int(start.round)
+        first_iteration = None if start is None else int(start.train.iteration) + 1
+        self.inference = Writer(
+            path / "bsim", purge_step=first_round if start is not None else None, media=path / "pictures"
+        )
+        self.training_writer = Writer(path / "rl", purge_step=first_iteration, media=path / "videos" / "train")
+        self.started = time.perf_counter()
+        self.filmed = 0
+        self._drop_rounds(first_round)
+
+    def describe(self, text: str) -> None:
+        """The resolved settings as text, once."""
+        self.inference.text("BayesSim/cfg", text, code=True)
+
+    def training(self, round_: int, metrics: dict[str, float], state: LoopState) -> None:
+        iteration = self._overall(round_, int(state.train.iteration))
+        self.training_writer.scalars(iteration, metrics)
+        seconds = int(time.perf_counter() - self.started)
+        timed = {
+            f"{tag}/time": metrics[tag] for tag in ("Train/mean_reward", "Train/mean_episode_length") if tag in metrics
+        }
+        self.training_writer.scalars(seconds, timed)
+        self.console.iteration({**metrics, "iteration": iteration, "round": round_})
+        every = max(1, self.config.monitor.video_interval // self.config.ppo.num_steps)
+        if self.film is not None and iteration // every > self.filmed:
+            self.filmed = iteration // every
+            from bayessim_mjx.rl import policy_of
+
+            self._video(self.training_writer, "Train/video", policy_of(state.train), iteration)
+
+    def _overall(self, round_: int, iteration: int) -> int:
+        """One axis over all rounds, also where every round trains a new policy."""
+        return iteration if self.config.bayessim.ftuneRL else round_ * self.config.ppo.max_iterations + iteration
+
+    def round(self, info: RoundInfo, policy: Policy) -> None:
+        step = info.round
+        side = "Domain/rewards" if info.truth is None else "SurrogateReal/real_rewards"
+        scalars = {f"{side}_{name}": getattr(np, name)(info.returns) for name in ("mean", "min", "max", "std")}
+        scalars |= {f"BayesSim/{name}": value for name, value in info.scores.items()}
+        scalars |= {f"Perf/{name}_seconds": value for name, value in info.seconds.items() if name != "iterations"}
+        scalars |= fit_scalars(info.fit)
+        self.inference.scalars(step, scalars)
+        if self.config.monitor.posterior_plots:
+            self._plots(info)
+        if self.film is not None:
+            self._video(self.inference, "SurrogateReal/video", policy, step)
+        self._note(info)
+        self.console.round_line(**round_line(info))
+        for text in info.warnings:
+            self.console.warning(text)
+        self.inference.flush()
+        self.training_writer.flush()
+
+    def _plots(self, info: RoundInfo) -> None:
+        posterior = info.posterior
+        if posterior is None:
+            return
+        step, names = info.round, posterior.space.names
+        self.inference.figure("BayesSim/posterior", plots.corner(posterior, truth=info.truth, round=step), step)
+        pairs = list(itertools.combinations(range(len(names)), 2))
+        for i, j in pairs if len(pairs) <= MOST_PAIRS else []:
+            figure = plots.pair(
+                posterior, i, j, truth=info.truth, log_gain=info.scores.get("gain_over_prior"), round=step
+            )
+            self.inference.figure(f"BayesSim/posterior_{names[i]}_vs_{names[j]}", figure, step)
+        if info.predictive is not None and info.real is not None:
+            real, simulated = channels(self.env.mj_model, info)
+            clock = np.arange(info.real.qpos.shape[1]) * self.env.dt
+            self.inference.figure(
+                "BayesSim/posterior_predictive", plots.predictive(clock, real, simulated, round=step), step
+            )
+
+    def _video(self, writer: Writer, tag: str, policy: Policy, step: int) -> None:
+        assert self.film is not None
+        qpos = self.film(policy, self.config.monitor.video_length)
+        frames = video.record(self.env.mj_model, qpos, dt=self.env.dt, fps=25)
+        writer.video(tag, frames, 25, step)
+
+    def _note(self, info: RoundInfo) -> None:
+        """rounds.jsonl: the numbers of every round, for scripts."""
+        row = {
+            "round": info.round,
+            "returns": {"mean": float(info.returns.mean()), "sd": float(info.returns.std()), "n": len(info.returns)},
+            "scores": info.scores,
+            "seconds": {name: float(value) for name, value in info.seconds.items()},
+            "warnings": info.warnings,
+        }
+        if info.posterior is not None:
+            row["posterior"] = info.posterior.describe()
+        with open(self.path / ROUNDS, "a", encoding="utf-8") as file:
+            file.write(json.dumps(row) + "\n")
+
+    def _drop_rounds(self, first: int) -> None:
+        """On resume: rounds from `first` on will be written again."""
+        file = self.path / ROUNDS
+        if file.exists():
+            rows = [line for line in file.read_text(encoding="utf-8").splitlines() if _round_of(line) < first]
+            file.write_text("".join(row + "\n" for row in rows), encoding="utf-8")
+
+    def close(self) -> None:
+        self.inference.close()
+        self.training_writer.close()
+
+
+def _round_of(line: str) -> float:
+    try:
+        return json.loads(line)["round"]
+    except (ValueError, KeyError):
+        return float("inf")  # a line cut short by a kill
+
+
+def fit_scalars(fit: dict[str, Any]) -> dict[str, float]:
+    """BayesSimIG's tags for the losses of the inference network (last point of each curve) and its held-out scores."""
+    if not fit:
+        return {}
+    last = {"BayesSim/train_loss": fit["train_loss"][-1], "BayesSim/test_loss": np.min(fit["val_loss"])}
+    return last | {
+        f"BayesSim/held_out_{name}": fit[name] for name in ("log_q", "gain_truncated", "inside") if name in fit
+    }
+
+
+def channels(mj_model: Any, info: RoundInfo) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Measured positions and velocities by name: real [T+1], simulated [n, T+1]; NaN after the end of an episode."""
+    assert info.real is not None and info.predictive is not None
+    valid = np.concatenate([[True], np.asarray(info.real.valid[0]) > 0])
+    real, simulated = {}, {}
+    for kind, size in (("qpos", mj_model.nq), ("qvel", mj_model.nv)):
+        names = coordinate_names(mj_model, kind)
+        for k in range(size):
+            name = f"{kind}:{names[k]}"
+            real[name] = np.where(valid, np.asarray(getattr(info.real, kind))[0, :, k], np.nan)
+            simulated[name] = np.where(valid, info.predictive[kind][:, :, k], np.nan)
+    return real, simulated
+
+
+def coordinate_names(mj_model: Any, kind: str) -> list[str]:
+    """A name per entry of qpos or qvel: the joint's, with an index where it has several."""
+    widths = {"qpos": (7, 4, 1, 1), "qvel": (6, 3, 1, 1)}[kind]
+    names = []
+    for j in range(mj_model.njnt):
+        name, width = mj_model.joint(j).name or f"joint{j}", widths[int(mj_model.jnt_type[j])]
+        names += [name] if width == 1 else [f"{name}[{i}]" for i in range(width)]
+    return names
+
+
+def round_line(info: RoundInfo) -> dict[str, Any]:
+    """The numbers of the console's line for a round."""
+    posterior = info.posterior
+    widths = (
+        {} if posterior is None else dict(zip(posterior.space.names, np.asarray(posterior.sd()).tolist(), strict=True))
+    )
+    return {
+        "round": info.round,
+        "rounds": info.rounds,
+        "reward": (float(info.returns.mean()), float(info.returns.std())),
+        "gain": info.scores.get("gain_over_prior"),
+        "widths": widths,
+        "seconds": sum(value for name, value in info.seconds.items() if name != "iterations"),
+    }

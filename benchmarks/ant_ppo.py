@@ -1,0 +1,95 @@
+"""PPO on our Ant, nominal physics: steps/s and return, next to Brax PPO on the same task and device in the same run.
+
+    python benchmarks/ant_ppo.py --iterations 500 --num_envs 4096 --brax_steps 10000000
+
+Compilation is counted apart. Brax trains the same environment object through Brax's own protocol, with its published Ant hyperparameters;
+its returns are of its own evaluation episodes. One removed JAX function is put back for brax 0.14.2.
+"""
+
+import argparse
+import time
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from bayessim_mjx import config, registry, rl
+
+
+def ours(env, settings, iterations: int, seed: int) -> None:
+    ppo = replace(settings.ppo, log_interval=10)
+    started = time.perf_counter()
+    state = rl.init(env, ppo, jax.random.PRNGKey(seed), None)
+    state, _ = rl.run(env, ppo, state, None, iterations=1)
+    jax.block_until_ready(state.params)
+    compile_s = time.perf_counter() - started
+    started = time.perf_counter()
+
+    def progress(metrics, state):
+        if int(state.iteration) % 50 == 1 or int(state.iteration) >= iterations:
+            print(
+                f"ours  it {int(state.iteration):5d} steps {int(metrics['env_steps']):10d} t {time.perf_counter() - started:7.1f} s "
+                f"return {metrics['Train/mean_reward']:8.1f} length {metrics['Train/mean_episode_length']:6.1f} "
+                f"fps {metrics['Perf/total_fps']:10.0f} lr {metrics['Loss/learning_rate']:.1e} std {metrics['Policy/mean_std']:.2f}",
+                flush=True,
+            )
+
+    state, _ = rl.run(env, ppo, state, None, iterations=iterations - 1, progress=progress)
+    seconds = time.perf_counter() - started
+    steps = (iterations - 1) * ppo.num_envs * ppo.num_steps
+    thetas = jnp.tile(jnp.asarray(env.space.nominal), (256, 1))
+    result = rl.evaluate(env, rl.policy_of(state), jax.random.PRNGKey(1), thetas)
+    returns = np.asarray(result["return"])
+    print(
+        f"ours: {steps / seconds / 1e6:.3f} M env-steps/s training, {steps / 1e6:.1f} M steps in {seconds:.1f} s, first iteration with "
+        f"compilation {compile_s:.1f} s, evaluation {returns.mean():.0f} +- {returns.std():.0f}",
+        flush=True,
+    )
+
+
+def brax(env, steps: int, num_envs: int, seed: int) -> None:
+    from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+    if not hasattr(jax, "device_put_replicated"):
+
+        def replicated(tree, devices):
+            sharding = NamedSharding(Mesh(np.array(devices), ("i",)), PartitionSpec("i"))
+            return jax.tree.map(lambda x: jax.device_put(jnp.broadcast_to(x, (len(devices), *jnp.shape(x))), sharding), tree)
+
+        jax.device_put_replicated = replicated
+    from brax.training.agents.ppo import train as ppo_train
+
+    marks = []
+
+    def progress(step, metrics):
+        marks.append((step, time.perf_counter(), float(metrics["eval/episode_reward"]), float(metrics.get("training/sps", 0))))
+        print(f"brax  steps {step:10d} return {marks[-1][2]:8.1f} sps {marks[-1][3]:10.0f}", flush=True)
+
+    ppo_train.train(
+        environment=env, num_timesteps=steps, num_evals=4, episode_length=env.episode_length, num_envs=num_envs, seed=seed,
+        batch_size=2048, num_minibatches=32, num_updates_per_batch=4, unroll_length=5, discounting=0.97, learning_rate=3e-4,
+        entropy_cost=1e-2, reward_scaling=10, normalize_observations=True, progress_fn=progress, num_eval_envs=128,
+    )  # fmt: skip
+    print(f"brax: {marks[-1][3] / 1e6:.3f} M env-steps/s training (its own training/sps of the last epoch)", flush=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--task", default="Ant")
+    parser.add_argument("--iterations", type=int, default=500)
+    parser.add_argument("--num_envs", type=int, default=4096)
+    parser.add_argument("--brax_steps", type=int, default=0, help="0: leave Brax out")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("overrides", nargs="*")
+    args = parser.parse_args()
+    settings = config.load(args.task, overrides=[f"env.numEnvs={args.num_envs}", *args.overrides])
+    env = registry.make(args.task, config=settings)
+    print(jax.devices(), settings.ppo, flush=True)
+    ours(env, settings, args.iterations, args.seed)
+    if args.brax_steps:
+        brax(env, args.brax_steps, args.num_envs, args.seed)
+
+
+if __name__ == "__main__":
+    main()
