@@ -283,13 +283,11 @@ def _named(names: Sequence[str], values: Mapping[str, float]) -> list[str]:
 def _duration(seconds: float | None) -> str:
     if seconds is None or not math.isfinite(seconds):
         return "?"
-    if seconds < 60:
-        return f"{seconds:.0f} s" if seconds >= 10 else f"{seconds:.1f} s"
-    minutes = round(seconds / 60)
+    whole = int(seconds)
+    if whole < 60:
+        return f"{whole} s" if whole >= 10 else f"{seconds:.1f} s"
     return (
-        f"{int(seconds // 60)} min {int(seconds % 60):02d} s"
-        if minutes < 60
-        else f"{minutes // 60} h {minutes % 60:02d} min"
+        f"{whole // 60} min {whole % 60:02d} s" if whole < 3600 else f"{whole // 3600} h {whole % 3600 // 60:02d} min"
     )
 
 

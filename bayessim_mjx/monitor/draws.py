@@ -38,8 +38,12 @@ class Draws:
 
     def contraction(self) -> np.ndarray:
         """1 - var(posterior) / var(prior) of each parameter [d]: 0 nothing learned, 1 known exactly."""
-        spread = (self.high - self.low) ** 2 / 12 if self.prior is None else self.prior.var(0)
-        return 1.0 - self.values.var(0) / spread
+        prior = np.linspace(self.low, self.high, 2001) if self.prior is None else self.prior
+        return 1.0 - self.natural(self.values).var(0) / self.natural(prior).var(0)
+
+    def natural(self, values: np.ndarray) -> np.ndarray:
+        """Plotting coordinates [..., d] -> the parameters' own units."""
+        return np.where(self.log, 10.0 ** np.where(self.log, values, 0.0), values)
 
 
 def draws_of(

@@ -159,7 +159,11 @@ def label(draws: Draws, k: int, width: int, lines: int, ranges: bool = False) ->
     tail = f" [{draws.units[k]}]" if draws.units[k] else ""
     if ranges:
         tail += f"   {natural(draws, k, draws.low[k]):.3g}–{natural(draws, k, draws.high[k]):.3g}"
-    return shorten(draws.names, max(width - (len(tail) if lines == 1 else 0), 8), lines)[k] + tail
+    if lines == 1:
+        return shorten(draws.names, max(width - len(tail), 8))[k] + tail
+    name = shorten(draws.names, width, lines - bool(tail))[k]
+    apart = len(name.rsplit("\n", 1)[-1] + tail) > width
+    return name + ("\n" + tail.strip() if apart else tail)
 
 
 def estimate(draws: Draws, k: int) -> str:

@@ -55,7 +55,8 @@ def record(
     except Exception as error:  # drivers fail in many ways, and a picture is never worth a run
         if isinstance(error, ValueError):
             raise
-        return _warn(f"no video: rendering failed ({type(error).__name__}: {error})")
+        _warn(f"no video: rendering failed ({type(error).__name__}: {error})")
+        tiles = None
     if tiles is None:
         return None
     frames = _grid([_write_over(tile, text) for tile, text in zip(tiles, texts, strict=True)])
@@ -217,17 +218,17 @@ def _grid(tiles: list[np.ndarray]) -> np.ndarray:
 
 
 def _write_over(frames: np.ndarray, text: str | Mapping | Sequence | None) -> np.ndarray:
-    """Write `text` on a light ground into the upper left corner, as many lines as fit."""
+    """Write `text` on a light ground into the upper left corner, as many lines as leave the robot in sight."""
     if not text:
         return frames
     import matplotlib
     from PIL import Image, ImageDraw, ImageFont
 
     height, width = frames.shape[1:3]
-    size = max(10, height // 20)
+    size = max(10, height // 22)
     font = ImageFont.truetype(os.path.join(matplotlib.get_data_path(), "fonts/ttf/DejaVuSans.ttf"), size)
     lines = _lines(text)
-    fit = max(1, int(0.9 * height / (1.35 * size)))
+    fit = max(2, int(0.4 * height / (1.3 * size)))
     lines = lines if len(lines) <= fit else [*lines[: fit - 1], f"… {len(lines) - fit + 1} more"]
     box = ImageDraw.Draw(Image.new("RGB", (1, 1))).multiline_textbbox((6, 4), "\n".join(lines), font=font)
     area = (slice(None), slice(0, min(height, int(box[3]) + 5)), slice(0, min(width, int(box[2]) + 7)))
@@ -250,7 +251,7 @@ def gif(frames: np.ndarray, fps: float) -> bytes:
     """Frames [T, H, W, 3] uint8 as an endless GIF; one palette for all frames, so that colours do not flicker."""
     from PIL import Image
 
-    sample = np.concatenate(frames[np.linspace(0, len(frames) - 1, 4).astype(int)])
+    sample = np.concatenate(frames[np.linspace(0, len(frames) - 1, 8).astype(int)])
     palette = Image.fromarray(sample).quantize(255, dither=Image.Dither.NONE)
     pictures = [Image.fromarray(f).quantize(palette=palette, dither=Image.Dither.NONE) for f in frames]
     buffer = io.BytesIO()
@@ -277,14 +278,24 @@ def save(frames: np.ndarray, path: str | os.PathLike, fps: float) -> bool:
 
 
 def _mp4(frames: np.ndarray, path: Path, fps: float) -> None:
+    import subprocess
+
     import imageio_ffmpeg
 
     even = frames[:, : frames.shape[1] // 2 * 2, : frames.shape[2] // 2 * 2]  # yuv420p halves both sides
-    size = (even.shape[2], even.shape[1])
-    sink = imageio_ffmpeg.write_frames(
-        str(path), size, fps=fps, macro_block_size=2, output_params=["-loglevel", "error"]
-    )
-    sink.send(None)
-    for frame in even:
-        sink.send(np.ascontiguousarray(frame))
-    sink.close()
+    source = [
+        "-f",
+        "rawvideo",
+        "-pix_fmt",
+        "rgb24",
+        "-s",
+        f"{even.shape[2]}x{even.shape[1]}",
+        "-r",
+        f"{fps:g}",
+        "-i",
+        "-",
+    ]
+    target = ["-an", "-c:v", "libx264", "-pix_fmt", "yuv420p", "-movflags", "+faststart", str(path)]
+    # Not imageio_ffmpeg.write_frames: it forks (preexec_fn), which JAX's threads do not survive for sure.
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error", *source, *target]
+    subprocess.run(command, input=even.tobytes(), check=True, capture_output=True)

@@ -1,0 +1,104 @@
+"""What is written without a terminal is plain text with the numbers in it; with one, bars that go away."""
+
+import io
+
+from bayessim_mjx.monitor.console import Clock, Console, _duration, _fit, _number
+
+
+class Terminal(io.StringIO):
+    encoding = "utf-8"
+
+    def isatty(self):
+        return True
+
+
+def tell(file, **options):
+    with Console(file=file, **options) as console:
+        console.start({"task": "Pendulum", "parameters": ["mass [kg]", "length"], "run folder": "logs/x"})
+        console.begin(3)
+        console.phase("train", 20)
+        console.compile("PPO update", 7.34)
+        console.iteration({"Train/mean_reward": -455.25, "fps": 123456.0, "kl": float("nan"), "iteration": 10})
+        console.phase("fit")
+        console.round_line(
+            round=0, reward=(-455.2, 31.0), gain=2.31, widths={"mass": 0.12, "length": 0.4}, seconds=42.0
+        )
+        console.round_line(round=1, reward=-400.0, gain=None)
+        console.warning("no video [egl]")
+        rows = [
+            dict(name="length", low=0.01, high=2, mean=0.5, sd=0.25, truth=None, contraction=0.1),
+            dict(name="mass", unit="kg", low=0.01, high=2, mean=1.02, sd=0.1, truth=1.0, contraction=0.9),
+        ]
+        console.table(rows)
+    return file.getvalue()
+
+
+def test_plain_output_has_the_numbers_and_no_control_characters():
+    text = tell(io.StringIO())
+    assert not set(text) & {"\x1b", "\r", "\b"}
+    lines = [line.rstrip() for line in text.splitlines()]
+    assert lines[1] == "parameters  mass [kg], length"
+    assert "compiled PPO update in 7.3 s (cached next time)" in lines
+    assert any(line.startswith("train 10/20  mean_reward -455.2  fps 123.5k") for line in lines)
+    first = next(line for line in lines if line.startswith("round 1/3"))
+    assert first.startswith(
+        "round 1/3   real reward -455.2 ± 31   log p(truth) +2.31 nats   width mass 0.12, length 0.4   42 s"
+    )
+    assert next(line for line in lines if line.startswith("round 2/3")).startswith("round 2/3   real reward -400")
+    assert "warning: no video [egl]" in lines
+    mass, length = (next(i for i, x in enumerate(lines) if n in x and " .. " in x) for n in ("mass [kg]", "length"))
+    assert mass < length and "1.02 ± 0.1" in lines[mass] and "0.90" in lines[mass]
+
+
+def test_headless_is_plain_on_a_terminal_too():
+    assert "\x1b" not in tell(Terminal(), headless=True)
+
+
+def test_a_terminal_gets_bars_and_the_same_lines():
+    text = tell(Terminal())
+    assert "\x1b" in text and "real reward -455.2 ± 31" in text and "━" in text
+
+
+def test_ascii_streams_get_ascii():
+    file = io.TextIOWrapper(io.BytesIO(), encoding="ascii", write_through=True)
+    file.getvalue = lambda: file.buffer.getvalue().decode("ascii")
+    assert "-455.2 +/- 31" in tell(file)
+
+
+def test_many_widths_are_cut_to_the_line():
+    file = io.StringIO()
+    widths = {f"left_front_leg_{i}_mass_mult": 0.1 for i in range(40)}
+    Console(file=file).round_line(round=0, reward=(1.0, 2.0), widths=widths)
+    [line] = file.getvalue().splitlines()
+    assert "more" in line and len(line) <= 140
+
+
+def test_compiling_does_not_count_as_a_steps_time():
+    now = [0.0]
+    clock = Clock(10, now=lambda: now[0])
+    assert clock.eta() is None
+    now[0] = 22.0
+    clock.exclude(20.0)
+    clock.advance()
+    assert clock.eta() == 2.0 * 9
+    now[0] = 24.0
+    clock.advance(2)
+    assert clock.eta() == 2.0 * 8
+
+
+def test_a_resumed_run_counts_only_its_own_rounds():
+    now = [0.0]
+    clock = Clock(10, done=6, now=lambda: now[0])
+    now[0] = 5.0
+    clock.advance()
+    assert clock.eta() == 15.0
+
+
+def test_numbers_and_durations_are_short():
+    assert [_number(v) for v in (0.0123456, 12345.6, 2.5e6, 3, -1e9)] == ["0.01235", "12.35k", "2.5M", "3", "-1000M"]
+    assert [_duration(v) for v in (3.21, 42, 59.9, 125, 7300, None)] == [
+        "3.2 s", "42 s", "59 s", "2 min 05 s", "2 h 01 min", "?",
+    ]  # fmt: skip
+    assert _fit(["aa", "bb", "cc"], 100) == "aa, bb, cc"
+    assert _fit(["aaaa", "bbbb", "cccc"], 14) == "aaaa, +2 more"
+    assert _fit(["aaaa"], 2) == ""

@@ -1,0 +1,240 @@
+"""Figures of every size are drawn without a warning, say what they should, and no two texts lie over each other."""
+
+import itertools
+import warnings
+
+import numpy as np
+import pytest
+
+from bayessim_mjx.monitor import plots
+from bayessim_mjx.monitor.draws import correlations, density, density2, draws_of, levels, shorten
+
+LONG = ["hand_robot0_forearm_joint_stiffness_mult", "index_finger_proximal_damping", "slider_mass_mult"]
+
+
+@pytest.fixture(autouse=True)
+def no_warnings():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        yield
+
+
+def case(d, n=1500, width=0.1):
+    """Posterior of standard deviation `width` (in prior ranges) round the middle of [1, 3]^d, with long names."""
+    rng = np.random.default_rng(d)
+    samples = np.clip(2.0 + 2.0 * width * rng.normal(size=(n, d)), 1.0, 3.0)
+    names = [f"{LONG[i % 3]}" + (f"_{i}" if i > 2 else "") for i in range(d)]
+    return dict(samples=samples, names=names, low=np.full(d, 1.0), high=np.full(d, 3.0), truth=np.full(d, 2.1))
+
+
+def texts(figure):
+    """(text, box in pixels) of all that is written."""
+    figure.canvas.draw()
+    renderer, off = figure.canvas.get_renderer(), undrawn_ticks(figure)
+    written = figure.findobj(match=lambda artist: hasattr(artist, "get_text") and hasattr(artist, "get_fontsize"))
+    shown = [t for t in written if t.get_visible() and t.get_text().strip() and id(t) not in off]
+    return [(t.get_text(), t.get_window_extent(renderer)) for t in shown]
+
+
+def undrawn_ticks(figure):
+    """Labels of ticks outside the limits: matplotlib keeps them, but does not draw them."""
+    off = set()
+    for axes in figure.findobj(match=lambda artist: hasattr(artist, "get_xticklabels")):
+        for axis in (axes.xaxis, axes.yaxis):
+            low, high = sorted(axis.get_view_interval())
+            for tick in axis.get_major_ticks():
+                if not axes.axison or not low <= tick.get_loc() <= high:
+                    off |= {id(tick.label1), id(tick.label2)}
+    return off
+
+
+def overlaps(figure):
+    """Pairs of texts that share more than 2 x 2 pixels."""
+    found = []
+    for (a, x), (b, y) in itertools.combinations(texts(figure), 2):
+        wide = min(x.x1, y.x1) - max(x.x0, y.x0)
+        tall = min(x.y1, y.y1) - max(x.y0, y.y0)
+        if wide > 2 and tall > 2:
+            found.append((a, b))
+    return found
+
+
+def outside(figure):
+    box = figure.bbox
+    return [
+        t for t, b in texts(figure) if b.x0 < box.x0 - 1 or b.x1 > box.x1 + 1 or b.y0 < box.y0 - 1 or b.y1 > box.y1 + 1
+    ]
+
+
+@pytest.mark.parametrize("d", [1, 2, 5])
+def test_full_corner_has_one_panel_per_pair(d):
+    figure = plots.corner(**case(d), round=3)
+    assert len(figure.axes) == d * (d + 1) // 2
+    words = " ".join(t for t, _ in texts(figure)).replace("\n", "")
+    assert "Round 3: posterior over" in words and "truth" in words and "±" in words
+    assert overlaps(figure) == [] and outside(figure) == []
+
+
+@pytest.mark.parametrize("d", [17, 40])
+def test_many_parameters_are_all_listed(d):
+    c = case(d)
+    c["samples"][:, 7] = 2.0 + 0.1 * (c["samples"][:, 7] - 2.0)  # by far the best identified
+    figure = plots.corner(**c, units=["N m/rad"] * d, round=1, best=6)
+    forest = figure.axes[0]
+    labels = [label.get_text() for label in forest.get_yticklabels()]
+    assert len(set(labels)) == d and "index_finger" in labels[0] and all("1–3" in label for label in labels)
+    assert len(figure.axes) == 1 + 6 * 7 // 2 + 2  # intervals, corner, heat map and its colour bar
+    assert overlaps(figure) == [] and outside(figure) == []
+
+
+def test_a_twelve_parameter_corner_keeps_its_labels_apart():
+    figure = plots.corner(**case(12, n=400), units=["kg"] * 12)
+    assert len(figure.axes) == 78
+    assert overlaps(figure) == [] and outside(figure) == []
+
+
+def test_truth_and_prior_lines_stand_where_they_should():
+    figure = plots.corner(**case(1))
+    lines = figure.axes[0].lines
+    assert any(np.allclose(line.get_xdata(), 2.1) for line in lines)
+    assert any(np.allclose(line.get_ydata(), 0.5) for line in lines)  # uniform on [1, 3]
+    assert figure.axes[0].get_xlim() == (1.0, 3.0)
+
+
+def test_a_narrow_posterior_is_zoomed_and_a_truth_outside_the_range_is_seen():
+    assert np.ptp(plots.corner(**case(1, width=0.005)).axes[0].get_xlim()) < 0.5
+    low, high = plots.corner(**case(1) | {"truth": [3.4]}).axes[0].get_xlim()
+    assert low <= 1.0 and high >= 3.4
+
+
+def test_degenerate_samples_are_drawn():
+    c = case(2) | {"samples": np.full((50, 2), 2.0)}
+    c["samples"][0] = np.nan
+    plots.corner(**c)
+    plots.forest(c["samples"], c["names"], c["low"], c["high"])
+
+
+def test_logarithmic_axis():
+    samples = 10 ** np.random.default_rng(0).normal(0, 0.2, (1000, 1))
+    figure = plots.corner(samples, ["damping"], [0.01], [100.0], truth=[1.0], log=[True])
+    axes = figure.axes[0]
+    assert axes.get_xlim() == (-2.0, 2.0)
+    figure.canvas.draw()
+    assert "1" in [label.get_text() for label in axes.get_xticklabels()]
+
+
+def test_errors_name_what_is_wrong():
+    c = case(2)
+    with pytest.raises(ValueError, match="names has 1 entries"):
+        plots.corner(**c | {"names": ["a"]})
+    with pytest.raises(ValueError, match="none of the 4 samples is finite"):
+        plots.corner(**c | {"samples": np.full((4, 2), np.nan)})
+    with pytest.raises(ValueError, match="truth lacks"):
+        plots.corner(**c | {"truth": {"mass": 1.0}})
+    with pytest.raises(ValueError, match="no parameter 'mass'"):
+        plots.pair(c["samples"], "mass", 1, names=c["names"], low=c["low"], high=c["high"])
+
+
+def test_pair_is_bayessimigs_two_by_two():
+    c = case(3)
+    options = {k: c[k] for k in ("names", "low", "high", "truth")}
+    figure = plots.pair(c["samples"], 0, LONG[1], means=[[2.0, 2.0, 2.0]], log_gain=3.21, round=4, **options)
+    assert len(figure.axes) == 4
+    words = "\n".join(t for t, _ in texts(figure))
+    for part in ("Round 4", "contraction", "+3.21 nats", "mean ± sd", "component means"):
+        assert part in words
+    joint = figure.axes[2]
+    markers = {line.get_marker(): line.get_xydata().tolist() for line in joint.lines}
+    assert markers["*"] == [[2.1, 2.1]] and markers["+"] == [[2.0, 2.0]]
+    assert overlaps(figure) == [] and outside(figure) == []
+
+
+class Space:
+    """Stands for a ParameterSpace with one parameter of each kind of prior."""
+
+    names, units = ("mass", "damping", "length"), ("kg", "", "m")
+    low, high = np.array([1.0, 0.01, 0.0]), np.array([3.0, 100.0, 1.0])
+    parameters = tuple(type("P", (), {"prior": p}) for p in ("uniform", "loguniform", "gaussian"))
+
+    def __len__(self):
+        return 3
+
+    def from_unit(self, u):
+        u = np.asarray(u)
+        return np.stack([1 + 2 * u[:, 0], 10 ** (-2 + 4 * u[:, 1]), u[:, 2] ** 2], 1)
+
+
+class Posterior:
+    """Stands for a Distribution: the prior itself, with two components."""
+
+    space, prior_weight = Space(), 0.0
+    logits, means = np.array([0.0, -9.0]), np.array([[0.5, 0.5, 0.5], [0.1, 0.1, 0.1]])
+
+    def sample(self, key, n):
+        return self.space.from_unit(np.random.default_rng(1).random((n, 3)))
+
+
+def test_a_distribution_brings_names_ranges_prior_and_means():
+    draws = draws_of(Posterior())
+    assert draws.names == Space.names and draws.log.tolist() == [False, True, False]
+    np.testing.assert_allclose(draws.means, [[2.0, 0.0, 0.25]], atol=1e-6)  # the second has no weight; damping as log10
+    np.testing.assert_allclose(draws.contraction(), 0.0, atol=0.1)  # the posterior is the prior
+    assert len(plots.corner(Posterior(), truth={"mass": 2, "damping": 1, "length": 0.2}).axes) == 6
+
+
+def test_predictive_shows_the_worst_explained_channels_first():
+    rng, time = np.random.default_rng(0), np.linspace(0, 2, 50)
+    real = {f"joint_{k}": np.sin(time * (3 + k)) for k in range(10)} | {"still": np.zeros(50)}
+    simulated = {name: r + 0.05 * rng.normal(size=(30, 50)) for name, r in real.items()}
+    simulated["joint_4"] = simulated["joint_4"] + 1.0
+    simulated["joint_5"][:, 30:] = np.nan  # all episodes over
+    figure = plots.predictive(time, real, simulated, units={"joint_4": "rad"}, before=simulated, round=2)
+    titles = [axes.get_title(loc="left") for axes in figure.axes]
+    assert len(titles) == 8 and titles[0].startswith("joint_4   (0 % inside")
+    words = " ".join(t for t, _ in texts(figure))
+    assert "Round 2" in words and "8 of 11 channels" in words and "[rad]" in words and "time [s]" in words
+    assert overlaps(figure) == [] and outside(figure) == []
+
+
+def test_predictive_of_one_channel_and_its_errors():
+    time = np.arange(5.0)
+    figure = plots.predictive(time, {"a": np.zeros((2, 5))}, {"a": np.ones((1, 5))})
+    assert len(figure.axes) == 1
+    with pytest.raises(ValueError, match="'a' has 4 steps, but time has 5"):
+        plots.predictive(time, {"a": np.zeros(4)}, {"a": np.zeros((3, 5))})
+    with pytest.raises(ValueError, match="no channel in common"):
+        plots.predictive(time, {"a": np.zeros(5)}, {"b": np.zeros((3, 5))})
+
+
+def test_density_keeps_its_mass_at_the_border():
+    values = np.abs(np.random.default_rng(0).normal(0, 0.2, 20_000))  # half normal: densest at 0
+    x, y = density(values, 0.0, 2.0)
+    assert np.isclose((y * (x[1] - x[0])).sum(), 1.0)
+    assert abs(y[0] - 2 / (0.2 * np.sqrt(2 * np.pi))) < 0.3
+
+
+def test_levels_hold_the_mass_they_say():
+    rng = np.random.default_rng(0)
+    x, y = rng.normal(size=(2, 40_000))
+    *_, height = density2(x, y, (-4, 4, -4, 4), 100)
+    for level, mass in zip(levels(height, (0.9, 0.5)), (0.9, 0.5), strict=True):
+        assert abs(height[height >= level].sum() - mass) < 0.02
+    r = 1.18  # radius with half of a standard normal in the plane
+    inside = height >= levels(height, (0.5,))[0]
+    assert abs(inside.sum() * 0.08**2 - np.pi * r**2) < 0.4
+
+
+def test_correlations_of_known_vectors():
+    x = np.random.default_rng(0).normal(size=1000)
+    matrix = correlations(np.stack([x, -2 * x, np.ones(1000)], 1))
+    np.testing.assert_allclose(matrix, [[1, -1, 0], [-1, 1, 0], [0, 0, 1]], atol=1e-9)
+
+
+@pytest.mark.parametrize("width,lines", [(8, 1), (12, 2), (10, 3)])
+def test_short_names_fit_and_stay_different(width, lines):
+    names = LONG + [f"left_front_leg_{i}_friction_mult" for i in range(12)]
+    short = shorten(names, width, lines)
+    assert len(set(short)) == len(names)
+    for name in short:
+        assert len(name.split("\n")) <= lines and max(map(len, name.split("\n"))) <= width
+    assert shorten(["mass", "length"], 8) == ["mass", "length"]

@@ -1,0 +1,128 @@
+"""Videos show something, keep real time, and never stop a run where there is no OpenGL."""
+
+import warnings
+
+import mujoco
+import numpy as np
+import pytest
+
+from bayessim_mjx.monitor import video
+from bayessim_mjx.monitor.camera import view_of
+
+PENDULUM = """<mujoco><worldbody><body name="pole"><joint type="hinge" axis="0 1 0"/>
+<geom type="capsule" size=".05" fromto="0 0 0 0 0 1" rgba=".9 .1 .1 1"/></body></worldbody></mujoco>"""
+CAMERA = '<camera name="side" pos="0 -2 1" xyaxes="1 0 0 0 .4 1"/>'
+FLOATING = f"""<mujoco><worldbody><geom type="plane" size="5 5 .1"/>{CAMERA}
+<body name="torso" pos="0 0 1"><freejoint/><geom size=".2" rgba=".1 .9 .1 1"/></body></worldbody></mujoco>"""
+
+
+def model(xml):
+    return mujoco.MjModel.from_xml_string(xml)
+
+
+def rendered(*arguments, **options):
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        frames = video.record(*arguments, **options)
+    if frames is None:
+        assert any("no video" in str(w.message) for w in caught)
+        pytest.skip("no OpenGL here")
+    return frames
+
+
+def red(frame):
+    """Where the red pole is: mean (x, y) in pixels from the picture's middle, y upwards, and how many pixels."""
+    y, x = np.nonzero((frame[..., 0] > 90) & (frame[..., 0] > 2.0 * frame[..., 1]))
+    return x.mean() - frame.shape[1] / 2, frame.shape[0] / 2 - y.mean(), len(x)
+
+
+@pytest.fixture(autouse=True)
+def fresh(monkeypatch):
+    monkeypatch.setattr(video, "_warned", set())
+
+
+def test_the_pole_is_seen_where_it_points():
+    up, right = 0.0, np.pi / 2  # a turn about +y carries the pole from +z to +x
+    frames = rendered(model(PENDULUM), np.array([[up], [right], [np.pi], [-right]]), width=160, height=120)
+    assert frames.shape == (4, 120, 160, 3) and frames.dtype == np.uint8
+    (_, y0, n0), (x1, y1, _), (_, y2, _), (x3, *_) = map(red, frames)
+    assert n0 > 100 and y0 > 15 and x1 > 15 and abs(y1) < 12 and y2 < -15 and x3 < -15
+    assert frames[0].std() > 5 and frames[0, 0].mean() > 150  # a light sky, not black
+
+
+def test_grid_text_and_real_time(tmp_path):
+    worlds = [np.zeros((21, 1)), np.ones((11, 1)), np.zeros((21, 1))]
+    texts = ["real", {"mass": 1.234567}, None]
+    path = tmp_path / "videos" / "a.gif"
+    frames = rendered(
+        model(PENDULUM), worlds, path=path, fps=10, dt=0.05, width=96, height=80, overlay_text=texts, camera=None
+    )
+    assert frames.shape == (10, 160, 192, 3)  # 21 rows of 0.05 s: ten frames of 0.1 s, in a 2 x 2 grid
+    assert (frames[:, 80:, 96:] == 255).all()  # the fourth place is empty
+    assert frames[0, :20, :40].min() < 80  # letters
+    assert path.read_bytes()[:4] == b"GIF8"
+
+
+def test_cameras_by_name_number_and_default():
+    floating = model(FLOATING)
+    qpos, data = np.tile(floating.qpos0, (2, 1)), mujoco.MjData(floating)
+    for camera in ("side", 0, None):
+        assert view_of(floating, data, qpos, camera, 4 / 3).fixedcamid == 0
+    with pytest.raises(ValueError, match="no camera 'top'; it has \\['side'\\]"):
+        view_of(floating, data, qpos, "top", 4 / 3)
+    free = model(FLOATING.replace(CAMERA, ""))
+    view = view_of(free, mujoco.MjData(free), qpos, None, 4 / 3)
+    assert view.type == mujoco.mjtCamera.mjCAMERA_TRACKING and view.trackbodyid == free.body("torso").id
+    assert 0.4 < view.distance < 2.0  # near the robot, whatever the size of the floor
+    hinge = model(PENDULUM)
+    assert view_of(hinge, mujoco.MjData(hinge), np.zeros((1, 1)), None, 4 / 3).azimuth == 90  # face on
+
+
+def test_larger_than_the_models_buffer_and_the_model_is_left_alone():
+    pendulum = model(PENDULUM)
+    before = pendulum.vis.global_.offwidth, float(pendulum.vis.headlight.ambient[0])
+    assert rendered(pendulum, np.zeros((1, 1)), width=700, height=20).shape == (1, 20, 700, 3)
+    assert (pendulum.vis.global_.offwidth, float(pendulum.vis.headlight.ambient[0])) == before
+
+
+@pytest.mark.parametrize("off", ["disable", "off"])
+def test_switched_off_means_none_and_one_warning(monkeypatch, off):
+    monkeypatch.setenv("MUJOCO_GL", off)
+    with pytest.warns(RuntimeWarning, match="MUJOCO_GL"):
+        assert video.record(model(PENDULUM), np.zeros((2, 1))) is None
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert video.record(model(PENDULUM), np.zeros((2, 1))) is None  # said once
+
+
+def test_without_opengl_training_goes_on(monkeypatch):
+    def fail(*_):
+        raise ImportError("libEGL.so not found")
+
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    monkeypatch.setattr(video, "_make_context", fail)
+    with pytest.warns(RuntimeWarning, match="libEGL.so not found"):
+        assert video.record(model(PENDULUM), np.zeros((2, 1))) is None
+
+
+def test_the_users_choice_is_the_only_one_tried(monkeypatch):
+    monkeypatch.setenv("MUJOCO_GL", "osmesa")
+    assert video.backends() == ["osmesa"]
+    monkeypatch.delenv("MUJOCO_GL")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.setattr(video.platform, "system", lambda: "Linux")
+    assert video.backends() == ["egl", "osmesa"]
+
+
+def test_wrong_sizes_are_refused():
+    with pytest.raises(ValueError, match=r"qpos has shape \(2, 3\); expected \[T, 1\]"):
+        video.record(model(PENDULUM), np.zeros((2, 3)))
+    with pytest.raises(ValueError, match="allowed endings: .mp4, .gif"):
+        video.save(np.zeros((1, 4, 4, 3), np.uint8), "a.avi", 25)
+
+
+def test_odd_sizes_become_an_mp4(tmp_path):
+    imageio = pytest.importorskip("imageio.v3")
+    frames = np.random.default_rng(0).integers(0, 255, (6, 33, 47, 3)).astype(np.uint8)
+    assert video.save(frames, tmp_path / "a.mp4", 25)
+    assert imageio.imread(tmp_path / "a.mp4", plugin="FFMPEG").shape == (6, 32, 46, 3)
