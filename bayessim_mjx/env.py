@@ -98,8 +98,8 @@ class Task(Env):
     """Base of the MuJoCo tasks. A subclass gives the model and `initial`, `command`, `observe`, `reward`.
 
     Args:
-        config: settings of `env:` (a mapping, or `config.EnvConfig`): `episodeLength`, `variant` and the task's own keys,
-            which are listed with their defaults in `options`.
+        config: settings of `env:` (a mapping, or `config.EnvConfig`): `episodeLength`, `variant` and the task's own
+            keys, which are listed with their defaults in `options`.
         randomization: the BayesSimIG `task:` section (key `randomization_params`); None or empty: the task's default.
         effects: unmodelled effects to simulate.
 
@@ -273,7 +273,7 @@ def _hold_if_diverged(before: World, after: World) -> tuple[World, jax.Array]:
     """(world, sound): a world whose state is no longer finite stays in its last finite state."""
     parts = (after.qpos, after.qvel, after.act)
     sound = functools.reduce(jnp.logical_and, [jnp.all(jnp.isfinite(x)) for x in parts])
-    keep = ("qpos", "qvel", "act", "warmstart", "memory", "measurement")
+    keep = ("qpos", "qvel", "act", "warmstart", "memory", "forces", "measurement")
     held = {
         name: jax.tree.map(lambda new, old: jnp.where(sound, new, old), getattr(after, name), getattr(before, name))
         for name in keep

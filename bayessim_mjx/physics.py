@@ -1,7 +1,7 @@
-"""The one control step: command -> effects -> MJX sub-steps -> effects -> measurement. Environments and diagnosis call it.
+"""The one control step: command -> effects -> MJX sub-steps -> effects -> measurement. Tasks and diagnosis call it.
 
-The sub-step is composed of MJX's own stage functions in the order of `mjx.step`, so that an effect's force can depend on
-this sub-step's bias, passive and actuator forces. Without effects it equals `mjx.step`.
+The sub-step is composed of MJX's own stage functions in the order of `mjx.step`, so that an effect's force can depend
+on this sub-step's bias, passive and actuator forces. Without effects it equals `mjx.step`.
 """
 
 import contextlib
@@ -25,6 +25,8 @@ _EULER, _RK4, _IMPLICITFAST = (
     int(getattr(mujoco.mjtIntegrator, f"mjINT_{n}")) for n in ("EULER", "RK4", "IMPLICITFAST")
 )
 
+Memory = tuple[tuple, jax.Array]  # (memories of the effects, their last forces [effects, nv])
+
 
 @struct.dataclass
 class World:
@@ -37,6 +39,7 @@ class World:
         theta: `[d]`, the values of `physics.space` that hold in this episode.
         fields: model arrays that differ from the nominal ones, by dotted name (computed at reset, constant afterwards).
         memory: one pytree per effect.
+        forces: `[effects, nv]`, each effect's generalised force in the last sub-step.
         measurement: `{"qpos", "qvel"}` as the sensors show them; equal to qpos, qvel unless an effect says otherwise.
         task: numbers a task carries along (commands, counters); physics does not read them.
     """
@@ -49,6 +52,7 @@ class World:
     theta: jax.Array
     fields: dict[str, jax.Array]
     memory: tuple
+    forces: jax.Array
     measurement: dict[str, jax.Array]
     task: dict[str, Any] = struct.field(default_factory=dict)
 
@@ -136,6 +140,7 @@ class Physics:
             theta=theta,
             fields=_changed(self.model, model),
             memory=self._memory,
+            forces=jnp.zeros((len(self.effects), self.mj_model.nv)),
             measurement={"qpos": qpos, "qvel": qvel},
         )
 
@@ -180,35 +185,46 @@ def _overrides(effect: Effect, hook: str) -> bool:
     return getattr(type(effect), hook) is not getattr(Effect, hook)
 
 
-def forward(physics: Physics, model: mjx.Model, data: mjx.Data, memory: tuple, thetas: tuple) -> tuple:
-    """`mjx.forward` with the effects' forces added before the acceleration. Returns (data, memory)."""
+def forward(physics: Physics, model: mjx.Model, data: mjx.Data, carry: Memory, thetas: tuple) -> tuple:
+    """`mjx.forward` with the effects' forces added before the acceleration. Returns (data, (memory, forces))."""
     sensors = physics.mj_model.nsensor > 0
     data = mjx.fwd_position(model, data)
     data = mjx.sensor_pos(model, data) if sensors else data
     data = mjx.fwd_velocity(model, data)
     data = mjx.sensor_vel(model, data) if sensors else data
     data = mjx.fwd_actuation(model, data)
-    data = data.replace(qfrc_applied=physics.template.qfrc_applied)
-    remembered = list(memory)
-    for i, effect in enumerate(physics.effects):
-        if _overrides(effect, "on_force"):
-            remembered[i], force = effect.on_force(remembered[i], model, data, thetas[i])
-            data = data.replace(qfrc_applied=data.qfrc_applied + force)
+    data, carry = _effect_forces(physics, model, data, carry, thetas)
     data = mjx.fwd_acceleration(model, data)
     if data._impl.efc_J.size == 0:
-        return data.replace(qacc=data.qacc_smooth), tuple(remembered)
+        return data.replace(qacc=data.qacc_smooth), carry
     data = mjx.solve(model, data)
-    return (mjx.sensor_acc(model, data) if sensors else data), tuple(remembered)
+    return (mjx.sensor_acc(model, data) if sensors else data), carry
 
 
-def substep(physics: Physics, model: mjx.Model, data: mjx.Data, memory: tuple, thetas: tuple) -> tuple:
-    """One timestep from the state and ctrl in `data`. Returns (data, memory)."""
-    data, memory = forward(physics, model, data, memory, thetas)
+def _effect_forces(physics: Physics, model: mjx.Model, data: mjx.Data, carry: Memory, thetas: tuple) -> tuple:
+    """Sum of the effects' forces in qfrc_applied; each effect sees the newest forces of the others (Gauss-Seidel).
+
+    Forces start from those of the last sub-step, so that dry friction in several coupled joints settles to sticking.
+    """
+    memory, forces = list(carry[0]), carry[1]
+    for i, effect in enumerate(physics.effects):
+        if _overrides(effect, "on_force"):
+            others = data.replace(qfrc_applied=jnp.sum(forces.at[i].set(0.0), axis=0))
+            memory[i], force = effect.on_force(memory[i], model, others, thetas[i])
+            forces = forces.at[i].set(force)
+    if physics.effects:
+        data = data.replace(qfrc_applied=jnp.sum(forces, axis=0))
+    return data, (tuple(memory), forces)
+
+
+def substep(physics: Physics, model: mjx.Model, data: mjx.Data, carry: Memory, thetas: tuple) -> tuple:
+    """One timestep from the state and ctrl in `data`. Returns (data, (memory, forces))."""
+    data, carry = forward(physics, model, data, carry, thetas)
     integrate = {_EULER: mjx.euler, _RK4: mjx.rungekutta4, _IMPLICITFAST: mjx.implicit}
     data = integrate[int(physics.mj_model.opt.integrator)](model, data)
     if physics.max_qvel is not None:
         data = data.replace(qvel=jnp.clip(data.qvel, -physics.max_qvel, physics.max_qvel))
-    return data, memory
+    return data, carry
 
 
 def control_step(physics: Physics, world: World, command: jax.Array) -> tuple[World, mjx.Data]:
@@ -233,8 +249,9 @@ def control_step(physics: Physics, world: World, command: jax.Array) -> tuple[Wo
         data, remembered = carry
         return substep(physics, model, data.replace(ctrl=ctrl), remembered, thetas), None
 
-    start = (physics.data_of(world), tuple(memory))
-    (data, final), _ = body(start, commands[0]) if physics.substeps == 1 else jax.lax.scan(body, start, commands)
+    start = (physics.data_of(world), (tuple(memory), world.forces))
+    end, _ = body(start, commands[0]) if physics.substeps == 1 else jax.lax.scan(body, start, commands)
+    data, (final, forces) = end
     memory, measurement = list(final), {"qpos": data.qpos, "qvel": data.qvel}
     for i, effect in enumerate(physics.effects):
         memory[i], measurement = effect.on_measurement(memory[i], measurement, thetas[i])
@@ -245,6 +262,7 @@ def control_step(physics: Physics, world: World, command: jax.Array) -> tuple[Wo
         warmstart=data.qacc_warmstart,
         time=data.time,
         memory=tuple(memory),
+        forces=forces,
         measurement=measurement,
     )
     return world, data

@@ -1,7 +1,7 @@
 """Cartpole: balance a pole hinged on the side of a cart (IsaacGymEnvs' Cartpole).
 
-Nothing can touch anything, so contacts are off; friction, restitution and the slider's mass have no effect on the motion
-and stay unidentifiable, as in BayesSimIG. Joint damping is integrated implicitly (Euler with eulerdamp).
+Nothing can touch anything, so contacts are off; friction, restitution and the slider's mass have no effect on the
+motion and stay unidentifiable, as in BayesSimIG. Joint damping is integrated implicitly (Euler with eulerdamp).
 """
 
 from typing import ClassVar

@@ -27,7 +27,7 @@ XML = """
     <body name="pendulum">
       <inertial mass="1" pos="0 0 0.5" diaginertia="0.08333333333 0.08333333333 1e-6"/>
       <joint name="hinge" type="hinge" axis="0 1 0" armature="0" damping="0"/>
-      <geom name="pendulum" type="capsule" fromto="0 0 0 0 0 1" size="0.05" rgba="0.8 0.3 0.3 1" contype="0" conaffinity="0"/>
+      <geom name="pendulum" type="capsule" fromto="0 0 0 0 0 1" size="0.05" contype="0" conaffinity="0"/>
     </body>
   </worldbody>
   <actuator>

@@ -1,8 +1,9 @@
 """Actuator delay: commands arrive late by a fixed time.
 
-The command is a staircase in time (zero-order hold over each control step). Each sub-step applies the time average of the
-delayed staircase over that sub-step, so the impulse is exact for every delay, not only for whole sub-steps, and the
-motion depends continuously on the delay. Before the first command the first command is taken to have held for ever.
+The command is a staircase in time (zero-order hold over each control step). Each sub-step applies the time average of
+the delayed staircase over that sub-step (so: linear interpolation at sub-step resolution). The impulse is exact for
+every delay, not only for whole sub-steps, and the motion depends continuously on the delay. Before the first command
+the first command is taken to have held for ever.
 """
 
 import dataclasses

@@ -51,7 +51,7 @@ class CoulombFriction(Effect):
         model = physics.mj_model
         names = [model.joint(i).name for i in range(model.njnt)]
         joint = index_of("joint", self.where, names, self.name)
-        if model.jnt_type[joint] not in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE):
+        if int(model.jnt_type[joint]) not in (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)):
             raise ValueError(f"{self.name}: joint {self.where!r} is neither hinge nor slide")
         return (jnp.arange(model.nv) == model.jnt_dofadr[joint]).astype(jnp.float32)
 
@@ -73,7 +73,7 @@ def _inertia(model: "mjx.Model", data: "mjx.Data") -> jax.Array:
     inertia = mjx.full_m(model, data)
     implicit = int(model.opt.integrator) == int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
     euler = int(model.opt.integrator) == int(mujoco.mjtIntegrator.mjINT_EULER)
-    if euler and not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_EULERDAMP:
+    if euler and not int(model.opt.disableflags) & int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP):
         return inertia + model.opt.timestep * jnp.diag(model.dof_damping)
     derivative = mjx.deriv_smooth_vel(model, data) if implicit else None
     return inertia if derivative is None else inertia - model.opt.timestep * derivative

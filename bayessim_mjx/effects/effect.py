@@ -1,4 +1,4 @@
-"""The contract of an effect: something the nominal simulator leaves out, with parameters whose neutral values switch it off."""
+"""The contract of an effect: something the nominal simulator leaves out; its neutral parameters switch it off."""
 
 import abc
 import dataclasses
@@ -21,7 +21,7 @@ Measurement = dict[str, jax.Array]
 class Effect(abc.ABC):
     """One unmodelled effect at one place of the robot.
 
-    Subclasses are frozen dataclasses and override the hooks they need; the other hooks are the identity and cost nothing.
+    Subclasses are frozen dataclasses and override the hooks they need; the others are the identity and cost nothing.
     Rules: hooks are pure and traceable; every number that may be inferred is an entry of `theta` (this effect's own
     slice, in the order of `space()`); at the nominal (= neutral) theta each hook returns its input bit for bit.
 
@@ -45,14 +45,14 @@ class Effect(abc.ABC):
         return model
 
     def on_command(self, memory: Any, command: jax.Array, theta: jax.Array) -> tuple[Any, jax.Array]:
-        """Change the command of one control step, `[substeps, nu]`: one row per sub-step, equal rows if nothing changed it."""
+        """Change the command of one control step, `[substeps, nu]`: one row per sub-step, all equal without effects."""
         return memory, command
 
     def on_force(self, memory: Any, model: "mjx.Model", data: "mjx.Data", theta: jax.Array) -> tuple[Any, jax.Array]:
         """Generalised force `[nv]` to add in this sub-step.
 
         `data` holds this sub-step's mass matrix, qfrc_bias, qfrc_passive and qfrc_actuator, and in qfrc_applied the sum
-        of the forces of the effects before this one. Constraint forces are not known yet.
+        of the newest forces of all other effects (of this sub-step or the last). Constraint forces are not known yet.
         """
         return memory, jnp.zeros_like(data.qfrc_applied)
 

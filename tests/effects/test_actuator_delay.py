@@ -1,0 +1,90 @@
+"""A delayed staircase, by hand: a free mass integrates the force, so its speed is the impulse."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from bayessim_mjx.effects import make
+from bayessim_mjx.parameters import ParameterSpace
+from bayessim_mjx.physics import Physics, control_step
+
+XML = """
+<mujoco>
+  <option timestep="0.005" gravity="0 0 0"/>
+  <worldbody>
+    <body><joint name="a" type="slide"/><geom size=".1" mass="1" contype="0"/></body>
+    <body><joint name="b" type="slide"/><geom size=".1" mass="1" contype="0"/></body>
+  </worldbody>
+  <actuator><motor name="a" joint="a"/><motor name="b" joint="b"/></actuator>
+</mujoco>
+"""
+DT = 0.02
+
+
+def speeds(effects, theta, commands):
+    """Speeds `[T, 2]` of the two masses after each control step."""
+    p = Physics(mujoco.MjModel.from_xml_string(XML), DT, ParameterSpace(), effects)
+
+    def body(world, command):
+        world, _ = control_step(p, world, command)
+        return world, world.qvel
+
+    world = p.world(jnp.asarray(theta, jnp.float32))
+    return np.asarray(jax.jit(lambda w, c: jax.lax.scan(body, w, c)[1])(world, jnp.asarray(commands, jnp.float32)))
+
+
+def delayed_impulse(commands, delay):
+    """Integral of the delayed staircase, exactly; the first command held before t = 0."""
+    edges = np.arange(len(commands) + 1) * DT
+    total = np.concatenate([[0.0], np.cumsum(commands) * DT])
+    late = np.interp(edges[1:] - delay, edges, total)
+    return late + np.where(edges[1:] < delay, (edges[1:] - delay) * commands[0], 0) + delay * commands[0]
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.005, 0.0123, 0.02, 0.0311, 0.1])
+def test_impulse_is_exact_for_any_delay(delay):
+    commands = np.array([0.5, 1.0, -2.0, 3.0, 0.0, 0.0, 1.0, -1.0, 2.0, 0.3])
+    v = speeds([make("actuator_delay", where="all")], [delay], np.c_[commands, 2 * commands])
+    want = delayed_impulse(commands, delay)
+    np.testing.assert_allclose(v, np.c_[want, 2 * want], atol=1e-5)
+
+
+def test_one_actuator_alone():
+    commands = np.array([0.0, 1.0, 1.0, 1.0])
+    v = speeds([make("actuator_delay", where="b", high=0.05)], [0.04], np.c_[commands, commands])
+    np.testing.assert_allclose(v[:, 0], delayed_impulse(commands, 0.0), atol=1e-6)
+    np.testing.assert_allclose(v[:, 1], delayed_impulse(commands, 0.04), atol=1e-6)
+
+
+def test_delays_add():
+    commands = np.array([0.0, 1.0, -1.0, 2.0, 0.0, 1.0])
+    two = [make("actuator_delay", where="a"), make("actuator_delay", where="all")]
+    v = speeds(two, [0.015, 0.025], np.c_[commands, commands])
+    np.testing.assert_allclose(v[:, 0], delayed_impulse(commands, 0.04), atol=1e-5)
+    np.testing.assert_allclose(v[:, 1], delayed_impulse(commands, 0.025), atol=1e-5)
+
+
+def test_the_gradient_exists():
+    """d(speed)/d(delay) after a command step of 1 N is -1 N / 1 kg."""
+    p = Physics(mujoco.MjModel.from_xml_string(XML), DT, ParameterSpace(), [make("actuator_delay", where="all")])
+
+    def speed(delay):
+        world = p.world(delay[None])
+        for command in (0.0, 1.0, 1.0):
+            world, _ = control_step(p, world, jnp.full(2, command))
+        return world.qvel[0]
+
+    assert jax.jit(jax.grad(speed))(jnp.float32(0.013)) == pytest.approx(-1, abs=1e-4)
+
+
+def test_refusals():
+    with pytest.raises(ValueError, match="no actuator 'c'.*a, b"):
+        speeds([make("actuator_delay", where="c")], [0.0], np.zeros((1, 2)))
+    with pytest.raises(ValueError, match="high = 0"):
+        make("actuator_delay", where="a", high=0.0)
+    with pytest.raises(ValueError, match="did you mean actuator_delay"):
+        make("actuator_dely", where="a")
+    with pytest.raises(ValueError, match="no settings.*hihg"):
+        make("actuator_delay", where="a", hihg=1.0)

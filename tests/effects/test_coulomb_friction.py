@@ -1,0 +1,111 @@
+"""Dry friction by hand: it brakes with Fc / m, stops, stays, and lets go only above Fc."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from bayessim_mjx.effects import make
+from bayessim_mjx.parameters import ParameterSpace
+from bayessim_mjx.physics import Physics, control_step
+
+MASS, DT = 2.0, 0.01
+XML = """
+<mujoco>
+  <option timestep="0.002" gravity="0 0 -9.81" integrator="{integrator}"/>
+  <worldbody>
+    <body><joint name="x" type="slide" axis="1 0 0" damping="{damping}"/><geom size=".1" mass="2" contype="0"/></body>
+  </worldbody>
+  <actuator><motor name="x" joint="x"/></actuator>
+</mujoco>
+"""
+ARM = """
+<mujoco>
+  <option timestep="0.002"/>
+  <worldbody>
+    <body>
+      <joint name="shoulder" axis="0 1 0" damping="0.1"/>
+      <geom type="capsule" fromto="0 0 0 .5 0 0" size=".02" mass="1"/>
+      <body pos=".5 0 0">
+        <joint name="elbow" axis="0 1 0" damping="0.1"/><geom type="capsule" fromto="0 0 0 .5 0 0" size=".02" mass="1"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator><motor name="elbow" joint="elbow"/></actuator>
+</mujoco>
+"""
+
+
+def run(xml, effects, theta, commands, qvel):
+    """(qpos, qvel), `[T, n]`."""
+    p = Physics(mujoco.MjModel.from_xml_string(xml), DT, ParameterSpace(), effects)
+
+    def body(world, command):
+        world, _ = control_step(p, world, command)
+        return world, (world.qpos, world.qvel)
+
+    world = p.world(jnp.asarray(theta, jnp.float32), qvel=np.asarray(qvel))
+    commands = jnp.asarray(commands, jnp.float32)
+    return [np.asarray(x) for x in jax.jit(lambda w, c: jax.lax.scan(body, w, c)[1])(world, commands)]
+
+
+def slide(level, force, speed, steps=100, integrator="Euler", damping=0.0):
+    xml = XML.format(integrator=integrator, damping=damping)
+    q, v = run(xml, [make("coulomb_friction", where="x", high=10.0)], [level], np.full((steps, 1), force), [speed])
+    return q[:, 0], v[:, 0]
+
+
+def test_a_sliding_mass_brakes_stops_and_stays():
+    """From 1 m/s with Fc = 4 N, m = 2 kg: v = 1 - 2 t, at rest after 0.5 s and 0.25 m."""
+    q, v = slide(level=4.0, force=0.0, speed=1.0)
+    t = DT * np.arange(1, 101)
+    np.testing.assert_allclose(v, np.maximum(1 - 2 * t, 0), atol=1e-5)
+    assert q[-1] == pytest.approx(0.25, abs=0.002)  # semi-implicit Euler: within v dt_sub / 2
+    assert np.ptp(q[60:]) < 1e-8
+
+
+@pytest.mark.parametrize("integrator", ["Euler", "implicitfast"])
+def test_sticks_below_and_slips_above(integrator):
+    """With viscous damping the integrators solve implicitly; sticking stays exact."""
+    q, v = slide(level=4.0, force=3.9, speed=0.0, integrator=integrator, damping=3.0)
+    assert np.abs(v).max() < 1e-8 and np.abs(q).max() < 1e-8
+    q, v = slide(level=4.0, force=5.0, speed=0.0, steps=400, integrator=integrator, damping=3.0)
+    assert v[-1] == pytest.approx((5.0 - 4.0) / 3.0, rel=0.01)  # terminal speed (F - Fc) / c
+
+
+def test_never_reverses_the_motion():
+    for speed in (-0.3, 0.01, 2.0):
+        _, v = slide(level=7.0, force=1.0 * np.sign(speed), speed=speed, steps=200)
+        assert (v * np.sign(speed) >= -1e-7).all()
+        assert v[-1] == pytest.approx(0, abs=1e-7)
+
+
+def test_holds_an_arm_against_gravity_in_both_joints():
+    """Shoulder 9.81 N m and elbow 2.45 N m of weight: held by 12 and 4 N m, let go by less. Effects see each other."""
+    effects = [make("coulomb_friction", where=joint, high=20.0) for joint in ("shoulder", "elbow")]
+    q, _ = run(ARM, effects, [12.0, 4.0], np.zeros((50, 1)), [0, 0])
+    assert np.abs(q).max() < 2e-2
+    q, _ = run(ARM, effects, [5.0, 1.0], np.zeros((50, 1)), [0, 0])
+    assert np.abs(q).max() > 0.3
+
+
+def test_energy_only_leaves():
+    effects = [make("coulomb_friction", where="elbow", high=20.0)]
+    xml = ARM.replace('damping="0.1"', "").replace('timestep="0.002"', 'timestep="0.002" gravity="0 0 0"')
+    p = mujoco.MjModel.from_xml_string(xml)
+    data = mujoco.MjData(p)
+    q, v = run(xml, effects, [0.2], np.zeros((150, 1)), [2.0, -3.0])
+    energy = []
+    for x, w in zip(q, v, strict=True):
+        data.qpos[:], data.qvel[:] = x, w
+        mujoco.mj_forward(p, data)
+        mujoco.mj_energyVel(p, data)
+        energy.append(data.energy[1])
+    assert np.diff(energy).max() < 1e-3 * energy[0]
+    assert abs(v[-1, 1]) < 1e-2  # the elbow has locked; the whole turns on
+
+
+def test_refusals():
+    with pytest.raises(ValueError, match="no joint 'y'.*x"):
+        run(XML.format(integrator="Euler", damping=0), [make("coulomb_friction", where="y")], [0.0], [[0.0]], [0.0])

@@ -1,0 +1,114 @@
+"""What holds for every registered task."""
+
+import difflib
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from bayessim_mjx import registry
+
+NAMES = registry.names()
+
+
+@pytest.fixture(params=NAMES)
+def task(request, compiled):
+    return compiled(request.param)
+
+
+def draw(task, seed):
+    keys = jax.random.split(jax.random.PRNGKey(seed), task.worlds)
+    unit = jax.random.uniform(jax.random.PRNGKey(seed + 1), (task.worlds, len(task.env.space)))
+    return keys, task.env.space.from_unit(unit)
+
+
+def test_sizes_and_names_agree(task):
+    env = task.env
+    state = task.reset(*draw(task, 0))
+    assert {group: value.shape[1:] for group, value in state.obs.items()} == env.observation_size
+    assert env.observation_size["policy"] == env.observation_size["state"] == (len(env.observation_names),)
+    assert len(set(env.observation_names)) == len(env.observation_names)
+    assert len(env.actuator_names) == env.action_size
+    assert env.episode_length == env.default_episode_length
+
+
+def test_real_parameters_lie_in_the_prior(task):
+    space = task.env.space
+    assert len(space) == len(task.env.real_parameters)
+    assert bool(space.contains(space.vector(task.env.real_parameters)))
+
+
+def test_steps_stay_finite_over_the_whole_prior(task):
+    state = task.reset(*draw(task, 3))
+    rng = np.random.default_rng(0)
+    reference = jax.tree.structure(state)
+    types = [leaf.dtype for leaf in jax.tree.leaves(state)]
+    for _ in range(40):
+        action = rng.uniform(-1.5, 1.5, (task.worlds, task.env.action_size)).astype(np.float32)
+        state = task.step(state, action)
+        leaves = jax.tree.leaves((state.obs, state.reward, state.done, state.metrics, state.pipeline_state))
+        assert all(np.isfinite(leaf).all() for leaf in leaves)
+    assert jax.tree.structure(state) == reference  # scan and Brax's wrappers need a constant structure
+    assert [leaf.dtype for leaf in jax.tree.leaves(state)] == types
+    assert (np.asarray(state.info["steps"]) == 40).all()
+
+
+def test_actions_are_clipped_to_one(task):
+    state = task.reset(*draw(task, 4))
+    shape = (task.worlds, task.env.action_size)
+    within, beyond = task.step(state, np.ones(shape, np.float32)), task.step(state, np.full(shape, 7.0, np.float32))
+    assert np.array_equal(within.obs["policy"], beyond.obs["policy"])
+
+
+def test_theta_reaches_the_physics(task):
+    """Equal keys, different theta: different motion; and theta is recorded."""
+    keys, thetas = draw(task, 5)
+    keys = jnp.broadcast_to(keys[0], keys.shape)
+    state = task.reset(keys, thetas)
+    for _ in range(3):
+        state = task.step(state, np.full((task.worlds, task.env.action_size), 0.7, np.float32))
+    assert np.array_equal(state.pipeline_state.theta, thetas)
+    assert np.ptp(np.asarray(state.pipeline_state.qvel), axis=0).max() > 1e-3
+
+
+def test_a_diverged_world_terminates_with_finite_numbers(task):
+    state = task.reset(*draw(task, 6))
+    qvel = state.pipeline_state.qvel.at[0].set(jnp.nan)
+    broken = state.replace(pipeline_state=state.pipeline_state.replace(qvel=qvel))
+    action = np.zeros((task.worlds, task.env.action_size), np.float32)
+    after, reference = task.step(broken, action), task.step(state, action)
+    assert after.done[0] == after.info["terminated"][0] == 1
+    assert np.isfinite(after.obs["policy"]).all() and np.isfinite(after.reward).all()
+    assert after.reward[0] == np.float32(task.env.diverged_reward)
+    assert np.array_equal(after.obs["policy"][1:], reference.obs["policy"][1:])  # the others do not notice
+
+
+def test_mirror_is_an_involution_of_the_right_sizes(task):
+    if task.env.mirror is None:
+        pytest.skip("no mirror symmetry")
+    sizes = {"observation": len(task.env.observation_names), "action": task.env.action_size}
+    for key, (perm, sign) in task.env.mirror.items():
+        assert perm.shape == sign.shape == (sizes[key],)
+        assert np.array_equal(perm[perm], np.arange(sizes[key]))
+        assert np.array_equal(sign * sign[perm], np.ones(sizes[key]))
+
+
+def test_space_write_equals_recompiling(task):
+    """Motion-relevant arrays of the written model are those of the recompiled, edited MJCF."""
+    env = task.env
+    theta = np.asarray(draw(task, 7)[1][0])
+    written = jax.jit(lambda t: env.physics.model_of(env.physics.world(t)))(theta)
+    compiled = env.space.edit(env.spec(), theta).compile()
+    for name in ("body_mass", "body_inertia", "body_ipos", "geom_friction", "geom_solref", "jnt_stiffness"):
+        np.testing.assert_allclose(getattr(written, name), getattr(compiled, name), rtol=1e-5, atol=1e-7, err_msg=name)
+    for name in ("dof_damping", "body_subtreemass", "body_invweight0", "dof_invweight0", "actuator_gainprm"):
+        np.testing.assert_allclose(getattr(written, name), getattr(compiled, name), rtol=2e-5, atol=1e-7, err_msg=name)
+
+
+def test_the_spec_is_fresh_each_time(task):
+    spec = task.env.spec()
+    assert isinstance(spec, mujoco.MjSpec)
+    spec.bodies[1].name = "other"
+    assert difflib.SequenceMatcher(None, task.env.spec().bodies[1].name, "other").ratio() < 1
