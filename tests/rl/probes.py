@@ -172,3 +172,30 @@ class Domain:
 
     def sample(self, key: jax.Array, n: int) -> jax.Array:
         return jax.random.uniform(key, (n, *self.low.shape), minval=self.low, maxval=self.high)
+
+
+class Lifetime(Probe):
+    """theta is the number of steps until termination; reward 1 a step, so theta is also the return."""
+
+    class space:
+        nominal = np.ones(1, np.float32)
+
+    horizon = 0
+
+    def first(self, key: jax.Array) -> dict:
+        return {"policy": jax.random.uniform(key, (1,))}
+
+    def next(self, obs: dict, steps: jax.Array) -> dict:
+        return {"policy": obs["policy"] + 1}
+
+    def step(self, state: ProbeState, action: jax.Array) -> ProbeState:
+        after = super().step(state, action)
+        terminated = (after.info["steps"] >= state.pipeline_state[0]).astype(jnp.float32)
+        return after.replace(done=terminated, info={**after.info, "terminated": terminated})
+
+
+class Broken(Probe):
+    """A reward that is not a number."""
+
+    def reward(self, obs: dict, action: jax.Array, steps: jax.Array) -> jax.Array:
+        return jnp.float32(jnp.nan)

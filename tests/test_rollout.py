@@ -1,0 +1,114 @@
+"""Whole episodes, auto-resetting collection, and replay of commands."""
+
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent / "rl"))
+import probes  # noqa: E402
+
+from bayessim_mjx.rl import networks, normalise  # noqa: E402
+from bayessim_mjx.rollout import _stride, collect, rollout  # noqa: E402
+
+
+def key(seed):
+    return jax.random.PRNGKey(seed)
+
+
+def test_after_the_end_everything_stands_still():
+    """theta is the lifetime: worlds of 2, 5 and more than 6 steps."""
+    t = rollout(
+        probes.Lifetime(),
+        lambda key, obs: jax.random.normal(key, (1,)),
+        key(0),
+        jnp.array([[2.0], [5.0], [9.0]]),
+        6,
+    )
+    assert t.observation.shape == (3, 7, 1) and t.action.shape == (3, 6, 1) and t.reward.shape == (3, 6)
+    np.testing.assert_array_equal(t.valid.sum(1), [2, 5, 6])
+    np.testing.assert_array_equal(t.reward, t.valid)
+    np.testing.assert_array_equal(t.terminated.sum(1), [1, 1, 0])
+    assert t.terminated[0, 1] == 1 and t.terminated[1, 4] == 1
+    rise = np.diff(t.observation[:, :, 0], axis=1)
+    np.testing.assert_allclose(rise, t.valid, atol=1e-6)
+    for world, end in enumerate((2, 5)):
+        np.testing.assert_array_equal(t.action[world, end:], np.repeat(t.action[world, end - 1 : end], 6 - end, 0))
+    assert len(np.unique(t.action[2])) == 6
+    np.testing.assert_array_equal(t.theta, [[2], [5], [9]])
+    assert t.qpos.shape == (3, 7, 0) and t.command.shape == (3, 6, 0)
+
+
+def test_the_time_limit_is_a_truncation_with_the_true_last_observation():
+    t = rollout(probes.Clock(), lambda key, obs: jnp.zeros(1), key(0), jnp.zeros((1, 1)), 6)
+    np.testing.assert_array_equal(t.observation[0, :, 0], [0, 1, 2, 3, 4, 4, 4])
+    np.testing.assert_array_equal(t.truncated[0], [0, 0, 0, 1, 0, 0])
+    assert t.terminated.sum() == 0
+
+
+def test_another_key_theta_or_policy_of_the_same_kind_does_not_recompile():
+    env = probes.Lifetime()
+    policies = [
+        networks.Policy(networks.init(key(i), 1, 1, 1, (4,), (4,), 1.0)["actor"], normalise.init(1)) for i in (0, 1)
+    ]
+    a = rollout(env, policies[0], key(0), jnp.ones((2, 1)), 3)
+    traces = env.traces
+    b = rollout(env, policies[1], key(1), 2 * jnp.ones((2, 1)), 3)
+    assert env.traces == traces
+    assert (a.action != b.action).any()
+    c = rollout(env, policies[1].act, key(1), 2 * jnp.ones((2, 1)), 3)  # a method is another function, once
+    np.testing.assert_array_equal(b.action, c.action)
+    traces = env.traces
+    rollout(env, policies[0].act, key(1), 2 * jnp.ones((2, 1)), 3)
+    assert env.traces == traces
+
+
+def test_bad_sizes_are_refused():
+    with pytest.raises(ValueError, match="length = 0"):
+        rollout(probes.Clock(), lambda key, obs: jnp.zeros(1), key(0), jnp.zeros((1, 1)), 0)
+    with pytest.raises(ValueError, match=r"\(1,\).*\[worlds, parameters\]"):
+        rollout(probes.Clock(), lambda key, obs: jnp.zeros(1), key(0), jnp.zeros(1), 1)
+
+
+def collected(env, thetas, pool_thetas, length):
+    worlds = len(thetas)
+    keys = jax.random.split(key(0), worlds)
+    start, pool = (jax.vmap(env.reset)(keys, jnp.asarray(t, jnp.float32)[:, None]) for t in (thetas, pool_thetas))
+
+    def act(key, obs):
+        assert obs["policy"].shape == (worlds, 1)
+        return jnp.zeros((worlds, 1)), {"index": jnp.arange(worlds)}
+
+    return jax.jit(lambda: collect(env, act, key(1), start, pool, length, ("policy", "critic")))()
+
+
+def test_collection_starts_new_episodes_with_new_thetas_from_the_pool():
+    """Clock: 4 steps an episode. 3 worlds start with theta 0, 1, 2 and the pool holds 10, 11, 12."""
+    states, batch = collected(probes.Clock(), [0, 1, 2], [10, 11, 12], 10)
+    time, last = (np.asarray(batch[name]["policy"])[:, :, 0] for name in ("observation", "final_observation"))
+    np.testing.assert_array_equal(time[:, 0], [0, 1, 2, 3, 0, 1, 2, 3, 0, 1])
+    np.testing.assert_array_equal(last, time + 1)  # never the observation after the reset
+    np.testing.assert_array_equal(np.flatnonzero(batch["truncated"][:, 0]), [3, 7])
+    assert batch["terminated"].sum() == 0
+    theta = np.asarray(batch["observation"]["critic"])[:, :, 1]
+    np.testing.assert_array_equal(theta[[0, 4, 8]], [[0, 1, 2], [10, 11, 12], [12, 10, 11]])
+    np.testing.assert_array_equal(batch["final_observation"]["critic"][3, :, 1], [0, 1, 2])
+    np.testing.assert_array_equal(states.obs["policy"][:, 0], [2, 2, 2])
+    np.testing.assert_array_equal(batch["extras"]["index"][5], [0, 1, 2])
+
+
+def test_a_termination_on_the_last_step_is_no_truncation():
+    class Both(probes.Clock):
+        horizon = 4
+
+    _, batch = collected(Both(), [0], [0], 5)
+    assert batch["terminated"].sum() == 1 and batch["truncated"].sum() == 0
+
+
+@pytest.mark.parametrize("worlds", [1, 2, 3, 16, 100, 4096])
+def test_a_world_goes_through_the_whole_pool_before_repeating(worlds):
+    stride = _stride(worlds)
+    assert len({k * stride % worlds for k in range(worlds)}) == worlds
