@@ -54,8 +54,7 @@ def reduce(mixture: Mixture, components: int) -> Mixture:
         return mixture
     cost = _cost_table(weights, means, covs)
     while len(weights) > components:
-        i, j = np.unravel_index(np.argmin(cost), cost.shape)
-        i, j = int(min(i, j)), int(max(i, j))
+        i, j = sorted(divmod(int(np.argmin(cost)), len(weights)))
         weights, means, covs = _merge(weights, means, covs, i, j)
         cost = np.delete(np.delete(cost, j, 0), j, 1)
         row = _costs_to(weights, means, covs, i)
@@ -97,10 +96,11 @@ def _join(w: np.ndarray, m: np.ndarray, c: np.ndarray, i: int, j: np.ndarray | i
 
 
 def _costs_to(w: np.ndarray, m: np.ndarray, c: np.ndarray, i: int) -> np.ndarray:
-    """Runnalls' bound on the divergence of merging i with every other: 1/2 [(wi+wj) ln|Sij| - wi ln|Si| - wj ln|Sj|]."""
+    """Runnalls' bound on the divergence of merging i with every other component, [K]."""
     everyone = np.arange(len(w))
     log_det = np.linalg.slogdet(c)[1]
     joint = np.linalg.slogdet(_join(w, m, c, i, everyone)[1])[1]
+    # B(i, j) = 1/2 [(w_i + w_j) ln|S_ij| - w_i ln|S_i| - w_j ln|S_j|]
     cost = 0.5 * ((w[i] + w) * joint - w[i] * log_det[i] - w * log_det)
     cost[i] = np.inf
     return cost

@@ -61,6 +61,8 @@ def separate(mean: Array, scale: Array, w: Array) -> tuple[Array, Array]:
     Returns points [n, d] and log weights [n]; the mean of exp(log weights) is the Gaussian's mass in the cube.
     """
     n, d = w.shape
+    if d == 0:
+        return w, jnp.zeros(n)
 
     def coordinate(carry: tuple[Array, Array], i: Array) -> tuple[tuple[Array, Array], None]:
         z, log_weight = carry
@@ -84,6 +86,8 @@ def log_masses(means: Array, scales: Array, points: int = MASS_POINTS) -> Array:
 def log_density(u: Array, means: Array, scales: Array) -> Array:
     """Untruncated log N(u_n; mean_k, scale_k scale_k^T): u [n, d], means [K, d], scales [K, d, d] -> [n, K]."""
     d = means.shape[-1]
+    if d == 0:
+        return jnp.zeros((u.shape[0], means.shape[0]))
     deviation = jnp.swapaxes(u[None, :, :] - means[:, None, :], 1, 2)  # [K, d, n]
     z = jax.scipy.linalg.solve_triangular(scales, deviation, lower=True)
     log_det = jnp.sum(jnp.log(jnp.diagonal(scales, axis1=-2, axis2=-1)), axis=-1)

@@ -19,7 +19,7 @@ def write(path: str | Path, arrays: dict[str, np.ndarray], space: Any) -> Path:
     descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix=".tmp")
     try:
         with os.fdopen(descriptor, "wb") as file:
-            np.savez(file, header=np.asarray(json.dumps(header(space))), **arrays)
+            np.savez(file, **{"header": np.asarray(json.dumps(header(space))), **arrays})  # type: ignore[arg-type]
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)

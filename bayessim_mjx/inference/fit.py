@@ -5,6 +5,7 @@ Arrays are padded to a capacity and the number of rows is traced: a growing data
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -77,7 +78,8 @@ def fit(
     """Maximum likelihood on the first `count` rows of thetas [N, d] and x [N, D]; the rest is padding.
 
     Goes on from the weights in `state` with a fresh schedule. The weights with the best held-out score are kept, the
-    starting ones included. Inputs keep the standardisation of the first fit. ValueError on wrong shapes or no usable row.
+    starting ones included. Inputs keep the standardisation of the first fit. ValueError on wrong shapes or when no row
+    is usable.
     """
     count = thetas.shape[0] if count is None else count
     d, dim_x = len(state.space), state.x_mean.shape[0]
@@ -134,7 +136,8 @@ def _fit(key: Array, state: FitState, thetas: Array, x: Array, count: Array) -> 
         params, opt_state, skipped = carry
         value, gradient = jax.value_and_grad(loss)(params, rows)
         usable = jnp.isfinite(optax.global_norm(gradient))
-        updates, new_opt = optimiser.update(gradient, opt_state, params)
+        with jax.numpy_dtype_promotion("standard"):  # optax computes decay**count, a float to an int32
+            updates, new_opt = optimiser.update(gradient, opt_state, params)
         new = optax.apply_updates(params, updates), new_opt
         params, opt_state = jax.tree.map(lambda a, b: jnp.where(usable, a, b), new, (params, opt_state))
         return (params, opt_state, skipped + 1 - usable.astype(jnp.int32)), value
@@ -159,7 +162,7 @@ def _fit(key: Array, state: FitState, thetas: Array, x: Array, count: Array) -> 
     inputs = jnp.arange(points, dtype=jnp.int32), jax.random.split(key, points)
     (inner, best), (train_loss, val_loss) = jax.lax.scan(point, (start, best), inputs)
 
-    state = state.replace(params=best[1], fits=state.fits + 1)
+    state = replace(state, params=best[1], fits=state.fits + 1)
     constant = np.float32(thetas.shape[1] * np.log(mdn.SPREAD))  # density of y -> density of u
     info = FitInfo(
         train_loss=train_loss - constant,
@@ -198,8 +201,9 @@ def _prepare(state: FitState, thetas: Array, x: Array, count: Array) -> tuple[Fi
     train = jnp.where(jnp.any(valid & ~held), valid & ~held, valid)
     data = _Data(z, mdn.to_y(u), train, order, held[order].astype(jnp.float32))
     n_invalid = jnp.sum((given & ~valid).astype(jnp.int32))
-    share_clipped = jnp.sum(jnp.where(valid[:, None], clipped, 0.0)) / jnp.maximum(jnp.sum(valid) * x.shape[1], 1)
-    return state.replace(x_mean=mean, x_rate=rate), data, share_clipped, n_invalid
+    entries = jnp.maximum(jnp.sum(valid.astype(jnp.float32)), 1.0) * x.shape[1]
+    share_clipped = jnp.sum(jnp.where(valid[:, None], clipped, 0.0)) / entries
+    return replace(state, x_mean=mean, x_rate=rate), data, share_clipped, n_invalid
 
 
 def _column_scales(x: Array, valid: Array) -> tuple[Array, Array]:

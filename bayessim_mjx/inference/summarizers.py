@@ -46,21 +46,22 @@ def summary_corrdiff(states: Array, actions: Array, lags: int = 0) -> Array:
     (the paper has lag 0 only; lags show delays and slow modes).
     """
     _check(states, actions)
-    return _correlate(states[1:] - states[:-1], actions, lags)
+    tau = states[1:] - states[:-1]
+    return jnp.concatenate([_products(tau, actions, lags), jnp.mean(tau, axis=0), jnp.var(tau, axis=0)])
 
 
 def summary_corr(states: Array, actions: Array, lags: int = 0) -> Array:
-    """As summary_corrdiff with the states themselves (before each action) in place of their differences."""
+    """As summary_corrdiff with the states themselves: products with the state before each action, moments over all."""
     _check(states, actions)
-    return _correlate(states[:-1], actions, lags)
+    moments = jnp.mean(states, axis=0), jnp.var(states, axis=0)
+    return jnp.concatenate([_products(states[:-1], actions, lags), *moments])
 
 
-def _correlate(tau: Array, actions: Array, lags: int) -> Array:
+def _products(tau: Array, actions: Array, lags: int) -> Array:
     steps = tau.shape[0]
     if not 0 <= lags < steps:
         raise ValueError(f"lags = {lags}: a trajectory of {steps} steps allows 0 to {steps - 1}")
-    products = [(tau[lag:].T @ actions[: steps - lag]).reshape(-1) for lag in range(lags + 1)]
-    return jnp.concatenate([*products, jnp.mean(tau, axis=0), jnp.var(tau, axis=0)])
+    return jnp.concatenate([(tau[lag:].T @ actions[: steps - lag]).reshape(-1) for lag in range(lags + 1)])
 
 
 def _check(states: Array, actions: Array) -> None:

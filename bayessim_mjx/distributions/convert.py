@@ -1,0 +1,64 @@
+"""On the host: theta units -> unit coordinates, and Distribution <-> float64 mixtures."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from bayessim_mjx.distributions import algebra
+
+if TYPE_CHECKING:
+    from bayessim_mjx.distributions.distribution import Distribution
+
+OFF = np.float32(-1e9)  # logit of a component that is not in use
+
+
+def empty(components: int, d: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """logits, means, scales of `components` that are not in use."""
+    return np.full(components, OFF), np.full((components, d), 0.5), np.tile(np.eye(d), (components, 1, 1))
+
+
+def to_mixture(q: Distribution) -> algebra.Mixture:
+    """The density of q on the unit cube as flat part + weighted, untruncated Gaussians."""
+    logits, means, scales = (np.asarray(v, np.float64) for v in (q.logits, q.means, q.scales))
+    w0 = float(q.prior_weight)
+    with np.errstate(divide="ignore"):
+        flat, bulk = np.log(w0), np.log1p(-w0) - float(q.log_inside)
+    weights = np.maximum(logits - np.logaddexp.reduce(logits) + bulk, -1e12)
+    return algebra.Mixture(float(flat), weights, means, scales @ np.swapaxes(scales, -1, -2))
+
+
+def padded(mixture: algebra.Mixture, components: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """logits, means, scales of `components` Gaussians, and the log of their summed weights."""
+    k, d = mixture.means.shape
+    logits, means, scales = empty(components, d)
+    total = float(np.logaddexp.reduce(mixture.log_weights))
+    logits[:k], means[:k], scales[:k] = mixture.log_weights - total, mixture.means, np.linalg.cholesky(mixture.covs)
+    return logits, means, scales, total
+
+
+def unit_gaussian(space: Any, mean: Any, cov_or_sd: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Mean [d] and lower Cholesky factor [d, d] in unit coordinates; sd below 1e-6 of the box is raised to it."""
+    d = len(space)
+    theta, spread = np.asarray(mean, np.float64), np.asarray(cov_or_sd, np.float64)
+    if theta.shape != (d,) or spread.shape not in ((), (d,), (d, d)):
+        raise ValueError(f"{d} parameters {space.names}: mean of shape {theta.shape}, spread of shape {spread.shape}")
+    for name, value, low, high in zip(space.names, theta, space.low, space.high, strict=True):
+        if not np.float32(low) <= np.float32(value) <= np.float32(high):
+            raise ValueError(f"mean of {name} is {value:g}, outside [{low:g}, {high:g}]")
+    cov = spread if spread.ndim == 2 else np.diag(np.broadcast_to(spread, (d,)) ** 2)
+    point = jnp.asarray(theta, jnp.float32)
+    u, slope = jax.jvp(space.to_unit, (point,), (jnp.ones_like(point),))
+    slope = np.asarray(slope, np.float64)
+    if not np.all(np.isfinite(cov)) or np.any(np.diagonal(cov) < 0):
+        raise ValueError(f"spread of {space.names} must be finite and not negative, not {cov_or_sd}")
+    unit = slope[:, None] * cov * slope[None, :] + 1e-12 * np.eye(d)
+    return np.asarray(u, np.float64), np.linalg.cholesky(unit)
+
+
+def check_same_space(a: Any, b: Any) -> None:
+    if tuple(a.names) != tuple(b.names) or not (np.allclose(a.low, b.low) and np.allclose(a.high, b.high)):
+        raise ValueError(f"distributions over different parameters: {tuple(a.names)} and {tuple(b.names)}")
