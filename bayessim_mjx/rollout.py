@@ -12,9 +12,10 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from bayessim_mjx.physics import Physics, control_step
+
 if TYPE_CHECKING:
     from bayessim_mjx.env import Env, State
-    from bayessim_mjx.physics import Physics
 
 PolicyFn = Callable[..., Any]
 
@@ -135,8 +136,6 @@ def replay(
 
 @lru_cache(maxsize=32)
 def _replay(physics: Physics) -> Callable[..., dict[str, jax.Array]]:
-    from bayessim_mjx.physics import control_step
-
     def one(qpos: jax.Array, qvel: jax.Array, command: jax.Array, theta: jax.Array) -> dict[str, jax.Array]:
         world = physics.world(theta, qpos, qvel)
 
