@@ -125,6 +125,15 @@ def actor_root(model: Any, target: str) -> int:
     return have.index(target) if target in have else 0
 
 
+def refuse_simple(model: Any, body: int, label: str) -> None:
+    """UserError for a body whose mass matrix MuJoCo compiled as diagonal: its centre of mass must stay at its frame."""
+    if int(model.body_simple[body]):
+        raise UserError(
+            f"{label}: body {names(model, 'body')[body]} is compiled as 'simple' (diagonal inertia), so its centre of "
+            f"mass cannot move; exclude it, or give the body a child or an offset inertial"
+        )
+
+
 def has_affine_bias(model: Any, actuator: int) -> bool:
     """Whether the actuator is a servo (bias linear in length and velocity)."""
     return int(model.actuator_biastype[actuator]) == int(mujoco.mjtBias.mjBIAS_AFFINE)

@@ -26,16 +26,8 @@ _INERTIA = _MASS | {"body_inertia", "body_iquat", "dof_armature", "tendon_armatu
 _PLANE, _HFIELD = int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_HFIELD)
 
 
-def set_const(
-    model: mjx.Model, changed: Collection[str] | None = None, reference: mjx.Model | None = None
-) -> mjx.Model:
+def set_const(model: mjx.Model) -> mjx.Model:
     """Recompute the derived constants of `model` from its primary fields. Pure JAX, for use under `vmap`.
-
-    Args:
-        model: a model (JAX implementation) whose primary fields were changed.
-        changed: names of the changed leaves; only what depends on them is recomputed. None: everything.
-        reference: the model as compiled. A statistic that its MJCF overrides (`<statistic extent=...>`) is then left
-            alone: recognised because the reference's own fields do not give it.
 
     Returns:
         The model with body_subtreemass, body_invweight0, dof_invweight0, dof_M0, tendon_length0, tendon_invweight0,
@@ -43,24 +35,38 @@ def set_const(
         up to date. Not covered, because `mjx.Model` does not hold what is needed: the lights' rest poses (rendering),
         numbers that the compiler froze from ratios (`dampratio`, automatic `springlength`, automatic weld poses).
     """
-    every = changed is None
-    names = set(changed or ())
-    pose, inertia = every or bool(names & _POSE), every or bool(names & (_INERTIA | _POSE))
-    if not (pose or inertia or names & _SHAPE):
-        return model
+    return model.tree_replace(derived(model))
+
+
+def derived(
+    model: mjx.Model, changed: Collection[str] | None = None, reference: mjx.Model | None = None
+) -> dict[str, jax.Array]:
+    """Derived leaves by dotted name.
+
+    Args:
+        model: a model (JAX implementation) whose primary fields were changed.
+        changed: names of the changed leaves; only what depends on them is computed. None: everything.
+        reference: the model as compiled. A statistic that its MJCF overrides (`<statistic extent=...>`) keeps its
+            number: recognised because the reference's own fields do not give it.
+    """
+    names = None if changed is None else set(changed)
+    pose = names is None or bool(names & _POSE)
+    inertia = pose or bool((names or set()) & _INERTIA)
+    new: dict[str, jax.Array] = {}
+    if not (inertia or (names or set()) & _SHAPE):
+        return new
     with jax.default_matmul_precision("highest"):
         data = _at_rest(model)
-        new: dict[str, jax.Array] = {}
-        if every or names & _MASS:
+        if names is None or names & _MASS:
             new["body_subtreemass"] = jnp.asarray(_descendants(model)) @ model.body_mass
-        if model.ncam and (every or names & (_MASS | _POSE)):
+        if model.ncam and (names is None or names & (_MASS | _POSE)):
             new.update(_cameras(model, data))
         if inertia and model.nv:
             new.update(_inertias(model, data))
         if pose:
             new.update(_lengths(model, data))
-        new.update(_statistics(model, data, reference, new, names if not every else None))
-    return model.tree_replace(new)
+        new.update(_statistics(model, data, reference, new, names))
+    return new
 
 
 def _at_rest(model: mjx.Model) -> mjx.Data:

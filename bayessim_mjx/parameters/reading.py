@@ -313,6 +313,8 @@ def _default(model: mujoco.MjModel, kind: str, attribute: str, target: str) -> f
 
 def _check_default(model: mujoco.MjModel, kind: str, attribute: str, target: str, operation: str, where: str) -> None:
     default = _default(model, kind, attribute, target)
+    if attribute.startswith("com_"):
+        attributes.refuse_simple(model, attributes.element(model, kind, target), where)
     if operation == "scaling" and default == 0:
         raise UserError(f"{where}: scaling a number that is 0 in the model does nothing; use additive, or exclude it")
     if (kind, attribute) in (("joint", "friction"), ("tendon", "friction")) and default <= 0:

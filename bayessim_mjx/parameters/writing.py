@@ -1,5 +1,6 @@
 """theta -> `mjx.Model`: a pure JAX function; changes only the fields concerned, relative to the model it is given."""
 
+import dataclasses
 import functools
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
@@ -47,36 +48,46 @@ def write(space: "ParameterSpace", model: "mjx.Model", theta: Any) -> "mjx.Model
     theta = jnp.asarray(theta, jnp.float32)
     if theta.shape != (len(space),):
         raise UserError(f"theta has shape {theta.shape}, the space {len(space)} parameters; write many under vmap")
+    physical = tuple((i, _with_axis(p, model)) for i, p in enumerate(space.parameters) if p.kind != "effect")
+    return model.tree_replace(_changes(physical, model, theta)) if physical else model
+
+
+@functools.partial(jax.jit, static_argnums=0)  # compiled once also when called op by op
+def _changes(physical: tuple[tuple[int, Parameter], ...], model: "mjx.Model", theta: jax.Array) -> dict[str, jax.Array]:
+    """The leaves that differ from `model`'s, by dotted name."""
     draft = Draft(model)
-    for (kind, attribute), members in _groups(space).items():
-        parameters = [space.parameters[i] for i in members]
-        values = theta[np.asarray(members)]
+    for (kind, attribute), members in _groups(physical).items():
+        parameters = [p for _, p in members]
+        values = theta[np.asarray([i for i, _ in members])]
         field = FIELDS.get((kind, attribute))
         if field is not None:
             _write_field(draft, field, parameters, values)
         else:
             _COMPOSITE[kind, attribute](draft, parameters, values)
-    if not draft.leaves:
-        return model
     _follow_geoms(draft)
     if draft.resized:
         draft.leaves.update(constants.bounds(model, draft["geom_size"], draft.resized))
-    return constants.set_const(model.tree_replace(draft.leaves), set(draft.leaves), reference=model)
+    changed = model.tree_replace(draft.leaves)
+    return draft.leaves | constants.derived(changed, set(draft.leaves), reference=model)
 
 
-def _groups(space: "ParameterSpace") -> dict[tuple[str, str], list[int]]:
-    """Positions in theta by (kind, attribute), in the order in which they are applied."""
-    groups: dict[tuple[str, str], list[int]] = {}
-    for i in sorted(range(len(space)), key=lambda i: (attributes.order(space.parameters[i].attribute), i)):
-        p = space.parameters[i]
-        if p.kind == "effect":
-            continue
+def _with_axis(p: Parameter, model: "mjx.Model") -> Parameter:
+    if (p.kind, p.attribute) != ("body", "length") or p.axis is not None:
+        return p
+    body = attributes.element(model, "body", p.target)
+    return dataclasses.replace(p, axis=geometry.long_axis(model, body, p.name))
+
+
+def _groups(physical: Sequence[tuple[int, Parameter]]) -> dict[tuple[str, str], list[tuple[int, Parameter]]]:
+    """Parameters with their positions in theta by (kind, attribute), in the order in which they are applied."""
+    groups: dict[tuple[str, str], list[tuple[int, Parameter]]] = {}
+    for i, p in sorted(physical, key=lambda ip: (attributes.order(ip[1].attribute), ip[0])):
         if (p.kind, p.attribute) not in FIELDS and (p.kind, p.attribute) not in _COMPOSITE:
             known = sorted(f"{k} {a}" for k, a in [*FIELDS, *_COMPOSITE])
             raise UserError(
-                f"parameter {p.name!r}: no attribute {p.attribute!r} of {p.kind}; there are: {', '.join(known)}"
+                f"parameter {p.name!r}: no {p.kind} {p.attribute!r} to write; there are: {', '.join(known)}"
             )
-        groups.setdefault((p.kind, p.attribute), []).append(i)
+        groups.setdefault((p.kind, p.attribute), []).append((i, p))
     return groups
 
 
@@ -95,7 +106,10 @@ def _write_field(draft: Draft, field: Field, parameters: Sequence[Parameter], va
         for j, p in enumerate(parameters):
             if p.operation != operation:
                 continue
-            for row in attributes.rows(draft.model, field, attributes.element(draft.model, p.kind, p.target)):
+            element = attributes.element(draft.model, p.kind, p.target)
+            if field.name == "body_ipos":
+                attributes.refuse_simple(draft.model, element, p.name)
+            for row in attributes.rows(draft.model, field, element):
                 rows.append(row)
                 picks.append(j)
                 steps.append(1.0 if operation == "scaling" else field.sign * p.factor)
@@ -175,7 +189,7 @@ def _restitution(draft: Draft, parameters: Sequence[Parameter], values: jax.Arra
 def _length(draft: Draft, parameters: Sequence[Parameter], values: jax.Array) -> None:
     for p, s in zip(parameters, values, strict=True):
         body = attributes.element(draft.model, "body", p.target)
-        _stretch(draft, body, np.asarray(p.axis or geometry.long_axis(draft.model, body, p.name), np.float32), s)
+        _stretch(draft, body, np.asarray(p.axis, np.float32), s)
 
 
 def _stretch(draft: Draft, body: int, axis: np.ndarray, s: jax.Array) -> None:
@@ -219,10 +233,13 @@ def _lengthen(draft: Draft, geom: int, axis: np.ndarray, s: jax.Array) -> None:
 def _stretch_inertia(draft: Draft, body: int, axis: np.ndarray, s: jax.Array) -> None:
     """Second moments P = tr(I)/2 1 - I grow by s^2 along the axis, which is a principal one (checked when read)."""
     inertia = draft["body_inertia"][body]
-    along = jnp.abs(jnp.sum(geometry.rotation(draft["body_iquat"][body]) * axis[:, None], axis=0))
-    hot = jax.nn.one_hot(jnp.argmax(along), 3)
-    moment = jnp.sum(hot * (jnp.sum(inertia) / 2 - inertia))
-    draft["body_inertia"] = draft["body_inertia"].at[body].add((s**2 - 1) * moment * (1 - hot))
+    along = jnp.argmax(jnp.abs(jnp.sum(geometry.rotation(draft["body_iquat"][body]) * axis[:, None], axis=0)))
+    across = (along + np.array([1, 2])) % 3
+    a, b, c = inertia[along], inertia[across[0]], inertia[across[1]]
+    # I_b = P_c + P_a, P_a = (b + c - a) / 2, P_c = (a + (b - c)) / 2: no small differences of large numbers
+    moment = s**2 * (b + c - a) / 2
+    new = inertia.at[across].set(jnp.stack([(a + (b - c)) / 2 + moment, (a + (c - b)) / 2 + moment]))
+    draft["body_inertia"] = draft["body_inertia"].at[body].set(jnp.where(s == 1, inertia, new))
 
 
 def _scale(draft: Draft, parameters: Sequence[Parameter], values: jax.Array) -> None:
