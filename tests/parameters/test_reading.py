@@ -39,8 +39,6 @@ def test_actors_are_subtrees_and_further_shapes_are_numbered():
     names = read(WALKER, actor("torso", rigid_shape_properties={"friction": scaling(0.1, 2)})).names
     assert names[:2] == ("torso_friction_mult", "torso_1_friction_mult")
     assert len(names) == 7
-        "torso"
-    )
     two = {
         "actor_params": {
             "block": {"scale": scaling(0.5, 2)},

@@ -12,7 +12,6 @@ from bayessim_mjx.errors import UserError
 from bayessim_mjx.parameters import Parameter, ParameterSpace, set_const
 from bayessim_mjx.parameters.constants import mjx
 
-
 NUMBERS = {
     "rigid_body_properties": {
         "mass": scaling(0.2, 3),
