@@ -126,7 +126,9 @@ class Recorded:
 
     env: Any
     space: ParameterSpace
-    data: dict[str, np.ndarray]  # qpos0 [M, nq], qvel0 [M, nv], command [M, T, nu], qpos [M, T+1, nq], qvel [M, T+1, nv]
+    data: dict[
+        str, np.ndarray
+    ]  # qpos0 [M, nq], qvel0 [M, nv], command [M, T, nu], qpos [M, T+1, nq], qvel [M, T+1, nv]
     order: np.ndarray  # [M] the order in which segments are used
     noise: dict[str, np.ndarray]  # standard deviation of the measurement noise: qpos [nq], qvel [nv]
     summarizer: Callable[[Array, Array], Array]
@@ -214,7 +216,9 @@ def real_parameters(settings: Any, space: ParameterSpace) -> tuple[np.ndarray, n
     Unlike BayesSimIG, `stds` are standard deviations (there they were used as variances).
     """
     if not settings:
-        raise UserError("env.realParams is missing: give the surrogate's parameters, or real.logs=DIR for recorded motion")
+        raise UserError(
+            "env.realParams is missing: give the surrogate's parameters, or real.logs=DIR for recorded motion"
+        )
     means = [_row("means", row, space) for row in _rows(settings["means"])]
     stds = [_row("stds", row, space) for row in _rows(settings.get("stds", [[0.0]] * len(means)))]
     weights = np.asarray(settings.get("weights") or [1.0] * len(means), dtype=np.float64)
@@ -255,7 +259,9 @@ def _row(key: str, row: Any, space: ParameterSpace) -> np.ndarray:
     if len(row) == 1:
         return np.full(len(space), float(row[0]))
     if len(row) != len(space):
-        raise UserError(f"env.realParams.{key} has {len(row)} numbers, the task has {len(space)} parameters: {', '.join(space.names)}")
+        raise UserError(
+            f"env.realParams.{key} has {len(row)} numbers, the task has {len(space)} parameters: {', '.join(space.names)}"
+        )
     return np.asarray([float(value) for value in row])
 
 

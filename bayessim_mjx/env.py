@@ -116,6 +116,7 @@ class Task(Env):
     observation_clip: ClassVar[dict[str, float | None]] = {"isaacgymenvs": None, "bayessim2021": 100.0}
     max_qvel: ClassVar[float | None] = None
     diverged_reward: ClassVar[float] = 0.0
+    speed_limit: ClassVar[float] = 1e5  # |qvel| beyond which a world counts as diverged
 
     def __init__(
         self,
@@ -214,7 +215,7 @@ class Task(Env):
         before: World = state.pipeline_state
         action = jnp.clip(jnp.asarray(action, jnp.float32), -1.0, 1.0)
         after, data = control_step(self.physics, before, self.command(action))
-        after, sound = _hold_if_diverged(before, after)
+        after, sound = _hold_if_diverged(before, after, self.speed_limit)
         steps = before.task["steps"] + 1
         after = after.replace(task=after.task | {"steps": steps})
         after = self.advance(before, after, data, action)
@@ -233,7 +234,7 @@ class Task(Env):
             obs=obs,
             reward=_finite(jnp.where(sound, reward, self.diverged_reward)),
             done=done,
-            metrics={name: _finite(value) for name, value in metrics.items()},
+            metrics=state.metrics | {name: _finite(value) for name, value in metrics.items()},  # Brax adds its own
             info=info,
         )
 
@@ -269,10 +270,11 @@ class Task(Env):
         return self.physics.model
 
 
-def _hold_if_diverged(before: World, after: World) -> tuple[World, jax.Array]:
-    """(world, sound): a world whose state is no longer finite stays in its last finite state."""
+def _hold_if_diverged(before: World, after: World, speed_limit: float) -> tuple[World, jax.Array]:
+    """(world, sound): a world whose state is no longer finite, or faster than the limit, stays in its last sound state."""
     parts = (after.qpos, after.qvel, after.act)
     sound = functools.reduce(jnp.logical_and, [jnp.all(jnp.isfinite(x)) for x in parts])
+    sound &= jnp.all(jnp.abs(after.qvel) < speed_limit)
     keep = ("qpos", "qvel", "act", "warmstart", "memory", "forces", "measurement")
     held = {
         name: jax.tree.map(lambda new, old: jnp.where(sound, new, old), getattr(after, name), getattr(before, name))

@@ -59,7 +59,9 @@ class RoundInfo:
     returns: np.ndarray  # [n] on the real side (surrogate) or under the domain (logs)
     lengths: np.ndarray
     real: Trajectory | None  # this round's real trajectories
-    predictive: dict[str, np.ndarray] | None  # qpos [n, T+1, nq], qvel: the first of them, re-simulated from the posterior
+    predictive: (
+        dict[str, np.ndarray] | None
+    )  # qpos [n, T+1, nq], qvel: the first of them, re-simulated from the posterior
     fit: dict[str, Any]
     scores: dict[str, float]  # log p(truth), gain over the prior, credible level, contraction per parameter
     seconds: dict[str, float]
@@ -104,7 +106,9 @@ class Loop:
     def key(self, round_: int, purpose: str) -> Array:
         """Every random draw has its own key, a function of the seed alone: a resumed run draws the same."""
         purposes = ("init", "train", "evaluate", "simulate", "fit", "real", "predict")
-        return jax.random.fold_in(jax.random.PRNGKey(self.config.seed), round_ * len(purposes) + purposes.index(purpose))
+        return jax.random.fold_in(
+            jax.random.PRNGKey(self.config.seed), round_ * len(purposes) + purposes.index(purpose)
+        )
 
 
 def make(config: Config, env: Env) -> Loop:
@@ -261,7 +265,9 @@ def _infer(loop: Loop, state: LoopState, policy: Policy, info: RoundInfo) -> Loo
         # An older trajectory was made by an older policy: its posterior stays that of the network of its time.
         new = jnp.arange(all_features.shape[0]) >= seen
         posteriors = jax.tree.map(
-            lambda old, now: jnp.where(new.reshape(-1, *[1] * (now.ndim - 1)), now, old), state.real_posteriors, posteriors
+            lambda old, now: jnp.where(new.reshape(-1, *[1] * (now.ndim - 1)), now, old),
+            state.real_posteriors,
+            posteriors,
         )
     domain = inference.combine(posteriors.split()[: seen + b.realTrajs], b.components)
     info.posterior, info.real = domain, jax.tree.map(np.asarray, real)
@@ -311,7 +317,6 @@ def run(
     infos = []
     while int(state.round) < loop.settings.realIters:
         round_ = int(state.round)
-        start = int(state.train.iteration)
 
         def progress(metrics: dict, trained: TrainState, state: LoopState = state, round_: int = round_) -> None:
             current = state.replace(train=trained)
@@ -327,7 +332,6 @@ def run(
         number = checkpoint_step(loop, round_, state.train)
         state, info = step(loop, state)
         info.seconds["train"] = seconds
-        info.seconds["iterations"] = int(training_target(loop, round_)) - start
         if checkpoints is not None:
             checkpoints.save(
                 number + 1, {"policy": policy, "state": state}, evaluation=float(info.returns.mean()), meta=_meta(state)

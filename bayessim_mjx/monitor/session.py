@@ -14,12 +14,18 @@ import numpy as np
 from bayessim_mjx.config import Config
 from bayessim_mjx.loop import LoopState, RoundInfo
 from bayessim_mjx.monitor import plots, video
+from bayessim_mjx.monitor.compile_clock import CompileClock
 from bayessim_mjx.monitor.console import Console
 from bayessim_mjx.monitor.writer import Writer
-from bayessim_mjx.rl import Policy
+from bayessim_mjx.rl import Policy, policy_of
 
 MOST_PAIRS = 10  # BayesSimIG draws one figure per pair; beyond this the corner plot shows them all
 ROUNDS = "rounds.jsonl"
+WORTH_SAYING = 0.5  # seconds of compilation
+SHOWN = (
+    "Train/mean_reward", "Train/mean_episode_length", "Perf/total_fps", "Loss/kl", "Loss/learning_rate", "Loss/value",
+    "Loss/explained_variance", "Policy/mean_std", "env_steps",
+)  # fmt: skip
 
 Film = Callable[[Policy, int], np.ndarray]  # (policy, control steps) -> qpos [T+1, nq]
 
@@ -37,46 +43,57 @@ class Session:
         start: LoopState | None = None,
     ):
         self.path, self.config, self.env, self.console, self.film = path, config, env, console, film
+        self.compiling = CompileClock()
         first_round = 0 if start is None else int(start.round)
-        first_iteration = None if start is None else int(start.train.iteration) + 1
-        self.inference = Writer(
-            path / "bsim", purge_step=first_round if start is not None else None, media=path / "pictures"
-        )
-        self.training_writer = Writer(path / "rl", purge_step=first_iteration, media=path / "videos" / "train")
-        self.started = time.perf_counter()
-        self.filmed = 0
+        done = 0 if start is None else self._overall(first_round, int(start.train.iteration))
+        resumed = start is not None
+        self.inference = Writer(path / "bsim", purge_step=first_round if resumed else None, media=path / "pictures")
+        self.learning = Writer(path / "rl", purge_step=done + 1 if resumed else None, media=path / "videos")
+        self.wall = Writer(path / "rl_time")  # the same rewards over wall-clock seconds
+        self.started, self.filmed, self.phase_of = time.perf_counter(), 0, -1
         self._drop_rounds(first_round)
+        console.begin(config.bayessim.realIters, first_round)
+        self._phase(first_round, done)
+
+    def _phase(self, round_: int, done: int = 0) -> None:
+        """Training of `round_` begins, with `done` iterations of it behind (resume)."""
+        n = self.config.ppo.max_iterations
+        if round_ < self.config.bayessim.realIters and n:
+            self.console.phase("train", n, max(0, done - round_ * n))
 
     def describe(self, text: str) -> None:
         """The resolved settings as text, once."""
         self.inference.text("BayesSim/cfg", text, code=True)
 
+    def _compiled(self, what: str) -> None:
+        seconds, cached = self.compiling.take()
+        if seconds > WORTH_SAYING:
+            self.console.compile(what, seconds, cached)
+
     def training(self, round_: int, metrics: dict[str, float], state: LoopState) -> None:
+        self._compiled("training")
         iteration = self._overall(round_, int(state.train.iteration))
-        self.training_writer.scalars(iteration, metrics)
-        seconds = int(time.perf_counter() - self.started)
-        timed = {
-            f"{tag}/time": metrics[tag] for tag in ("Train/mean_reward", "Train/mean_episode_length") if tag in metrics
-        }
-        self.training_writer.scalars(seconds, timed)
-        self.console.iteration({**metrics, "iteration": iteration, "round": round_})
+        self.learning.scalars(iteration, metrics)
+        over_time = {tag: metrics[tag] for tag in ("Train/mean_reward", "Train/mean_episode_length") if tag in metrics}
+        self.wall.scalars(int(time.perf_counter() - self.started), over_time)
+        shown = {tag: metrics[tag] for tag in SHOWN if tag in metrics}
+        self.console.iteration(shown, iteration - round_ * self.config.ppo.max_iterations)
         every = max(1, self.config.monitor.video_interval // self.config.ppo.num_steps)
         if self.film is not None and iteration // every > self.filmed:
             self.filmed = iteration // every
-            from bayessim_mjx.rl import policy_of
-
-            self._video(self.training_writer, "Train/video", policy_of(state.train), iteration)
+            self._video(self.learning, "Train/video", policy_of(state.train), iteration)
 
     def _overall(self, round_: int, iteration: int) -> int:
         """One axis over all rounds, also where every round trains a new policy."""
         return iteration if self.config.bayessim.ftuneRL else round_ * self.config.ppo.max_iterations + iteration
 
     def round(self, info: RoundInfo, policy: Policy) -> None:
+        self._compiled("evaluation, simulation and inference")
         step = info.round
         side = "Domain/rewards" if info.truth is None else "SurrogateReal/real_rewards"
         scalars = {f"{side}_{name}": getattr(np, name)(info.returns) for name in ("mean", "min", "max", "std")}
         scalars |= {f"BayesSim/{name}": value for name, value in info.scores.items()}
-        scalars |= {f"Perf/{name}_seconds": value for name, value in info.seconds.items() if name != "iterations"}
+        scalars |= {f"Perf/{name}_seconds": value for name, value in info.seconds.items()}
         scalars |= fit_scalars(info.fit)
         self.inference.scalars(step, scalars)
         if self.config.monitor.posterior_plots:
@@ -87,8 +104,10 @@ class Session:
         self.console.round_line(**round_line(info))
         for text in info.warnings:
             self.console.warning(text)
-        self.inference.flush()
-        self.training_writer.flush()
+        for writer in (self.inference, self.learning, self.wall):
+            writer.flush()
+        self.compiling.take()  # the plots' small programs are not worth a line
+        self._phase(info.round + 1)
 
     def _plots(self, info: RoundInfo) -> None:
         posterior = info.posterior
@@ -137,8 +156,8 @@ class Session:
             file.write_text("".join(row + "\n" for row in rows), encoding="utf-8")
 
     def close(self) -> None:
-        self.inference.close()
-        self.training_writer.close()
+        for writer in (self.inference, self.learning, self.wall):
+            writer.close()
 
 
 def _round_of(line: str) -> float:
@@ -183,16 +202,16 @@ def coordinate_names(mj_model: Any, kind: str) -> list[str]:
 
 
 def round_line(info: RoundInfo) -> dict[str, Any]:
-    """The numbers of the console's line for a round."""
-    posterior = info.posterior
-    widths = (
-        {} if posterior is None else dict(zip(posterior.space.names, np.asarray(posterior.sd()).tolist(), strict=True))
-    )
+    """The numbers of the console's line for a round; a width is the posterior's sd over the prior's, narrowest first."""
+    widths = {}
+    if info.posterior is not None:
+        relative = np.sqrt(np.maximum(0.0, 1.0 - np.asarray(info.posterior.contraction())))
+        widths = dict(sorted(zip(info.posterior.space.names, relative.tolist(), strict=True), key=lambda item: item[1]))
     return {
         "round": info.round,
         "rounds": info.rounds,
         "reward": (float(info.returns.mean()), float(info.returns.std())),
         "gain": info.scores.get("gain_over_prior"),
         "widths": widths,
-        "seconds": sum(value for name, value in info.seconds.items() if name != "iterations"),
+        "seconds": sum(info.seconds.values()),
     }
