@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from bayessim_mjx.config import Config, load, unknown
+from bayessim_mjx.config import Config, load, replace, unknown
 from bayessim_mjx.errors import UserError
 
 if TYPE_CHECKING:
@@ -142,6 +142,14 @@ def find_checkpoint(which: str, task: str | None, logdir: str) -> tuple[Path, "R
     return path, Run.open(parents[1]) if (parents[1] / MANIFEST).is_file() else None
 
 
+def pin_policy(config: Config) -> Config:
+    """`bayessim.policyCheckpt` as the path of one checkpoint folder, which has to be there."""
+    if config.bayessim.policyCheckpt is None:
+        return config
+    path, _ = find_checkpoint(config.bayessim.policyCheckpt, config.task, config.logdir)
+    return replace(config, bayessim={"policyCheckpt": str(path.absolute())})
+
+
 def load_policy(path: Path, env: Any, config: Config) -> Any:
     """The policy in a checkpoint folder; its networks have to be those of `config`."""
     import jax
@@ -156,8 +164,7 @@ def warm_start(train: Any, config: Config, env: Any) -> Any:
     """The training state with actor and normaliser of `bayessim.policyCheckpt`, if that is set; the critic is new."""
     if config.bayessim.policyCheckpt is None:
         return train
-    path, _ = find_checkpoint(config.bayessim.policyCheckpt, config.task, config.logdir)
-    policy = load_policy(path, env, config)
+    policy = load_policy(Path(config.bayessim.policyCheckpt), env, config)
     normalizer = {**train.normalizer, "policy": policy.normalizer}
     return train.replace(params={**train.params, "actor": policy.actor}, normalizer=normalizer)
 

@@ -143,9 +143,8 @@ def _train_layer(path: str | Path) -> dict[str, Any]:
     if "ppo" not in raw:
         return {"ppo": raw}
     if len(raw) > 1:
-        raise UserError(
-            f"{path}: {', '.join(k for k in raw if k != 'ppo')}: beside `ppo:`, sections belong in --cfg_env"
-        )
+        others = ", ".join(k for k in raw if k != "ppo")
+        raise UserError(f"{path}: {others} beside `ppo:`: other sections belong in a --cfg_env file")
     return raw
 
 
@@ -175,7 +174,7 @@ def _build(task: str, layers: Sequence[Layer]) -> Config:
     own = task_file(task)
     base: list[Layer] = [(str(own), read_yaml(own), True)] if own.is_file() else []
     declared = dict(base[0][1].get("env") or {}) if base else {}
-    merged: dict[str, Any] = {}
+    merged: dict[str, Any] = {"task_name": task}
     for source, raw, is_file in [*base, *layers]:
         _merge(merged, raw, source, is_file, declared)
     merged.pop("task_name", None)
@@ -193,7 +192,7 @@ def _merge(merged: dict[str, Any], raw: Mapping[str, Any], source: str, is_file:
         if key not in TOP_KEYS:
             raise unknown(f"{source}: key", str(key), TOP_KEYS + _dotted(str(key)))
         if key == "task_name":
-            if value != merged.setdefault("task_name", value):
+            if value != merged["task_name"]:
                 raise UserError(f"{source}: task_name = {value!r}, but the task is {merged['task_name']!r}")
         elif key in SECTIONS or key == "task":
             if not isinstance(value or {}, Mapping):

@@ -38,7 +38,7 @@ def _prepare(args: argparse.Namespace) -> tuple[Config, Any]:
         run = Run.open(args.resume)
         return cli.resumed_config(args, run.config), run
     more = {"--checkpoint": ("bayessim.policyCheckpt", args.checkpoint)} if args.checkpoint else {}
-    return cli.config_of(args, more), None
+    return cli.pin_policy(cli.config_of(args, more)), None
 
 
 def film(env: Any, config: Config, thetas: Any) -> Callable[[Any, int], Any] | None:

@@ -43,8 +43,6 @@ class Run:
         command: Sequence[str] | str | None = None,
     ) -> "Run":
         """Make a new folder (never an existing one) with the resolved settings, the command and a manifest."""
-        if name and not name.replace("-", "").replace("_", "").replace(".", "").isalnum():
-            raise UserError(f"name = {name!r}: use letters, digits, - _ and . only")
         path = _new_folder(Path(logdir) / _folder_name(task), name)
         plain = settings.to_dict()
         train = {"ppo": plain.pop("ppo")}

@@ -5,6 +5,7 @@ The names in `bayessim:`, `env:` and `task:` are BayesSimIG's. Nothing here impo
 
 import dataclasses
 import math
+import re
 import types
 import typing
 from collections.abc import Callable, Iterator, Mapping
@@ -294,6 +295,8 @@ class Config(Section):
     monitor: MonitorConfig = field(default_factory=MonitorConfig)
 
     def check(self) -> None:
+        if not re.fullmatch(r"[\w.-]*", self.name):
+            raise UserError(f"name = {self.name!r}: use letters, digits, - _ and . only")
         if self.env.numEnvs != self.ppo.num_envs:
             raise UserError(
                 f"env.numEnvs = {self.env.numEnvs} and ppo.num_envs = {self.ppo.num_envs} are one setting: "

@@ -131,7 +131,7 @@ def _train(argv: Sequence[str] | None) -> int:
     more: dict[str, tuple[str, Any]] = {"--randomize": ("task.randomize", args.randomize)}
     if args.checkpoint:
         more["--checkpoint"] = ("bayessim.policyCheckpt", args.checkpoint)
-    return _run(cli.config_of(args, more), None, command, args.headless)
+    return _run(cli.pin_policy(cli.config_of(args, more)), None, command, args.headless)
 
 
 main = cli.command(_train)

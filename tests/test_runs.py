@@ -182,6 +182,6 @@ def test_damaged_manifest_and_foreign_folder(run: Run, tmp_path: Path) -> None:
         runs.latest_run(run.path.parents[1], "Pendulum")
 
 
-def test_names_cannot_leave_the_folder(tmp_path: Path) -> None:
+def test_names_cannot_leave_the_folder() -> None:
     with pytest.raises(UserError, match="name = '../x'"):
-        Run.create(tmp_path, "Ant", "../x", config.load("Ant"), "")
+        config.load("Ant", overrides=["name=../x"])

@@ -1,0 +1,263 @@
+"""The commands, called in this process: bad input is one line and exit code 2, a killed run goes on bit for bit."""
+
+import json
+import os
+import signal
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import pytest
+
+from bayessim_mjx import cli, main, play, registry, train
+from bayessim_mjx.env import Env, State
+from bayessim_mjx.parameters import Parameter, ParameterSpace
+from bayessim_mjx.runs import Run, latest_run
+
+SMALL = ["ppo.num_envs=4", "ppo.num_steps=4", "ppo.num_epochs=1", "ppo.num_minibatches=1", "ppo.hidden_actor=[4]"]
+SMALL += [
+    "ppo.hidden_critic=[4]",
+    "ppo.log_interval=1",
+    "ppo.save_interval=2",
+    "ppo.eval_episodes=4",
+    "--max_iterations=4",
+]
+SMALL += ["env.realParams.means=[[1.5]]", "env.realParams.stds=[[0.0]]", "--headless"]
+LOOP = ["bayessim.realIters=2", "bayessim.trainTrajs=32", "bayessim.realEvals=4", "bayessim.components=2"]
+LOOP += ["bayessim.hiddenLayers=[4]", "bayessim.trainTrajLen=4", "monitor.posterior_plots=False"]
+
+
+class Toy(Env):
+    """A mass on a line, pushed: quick to compile."""
+
+    name, backend, episode_length, dt, action_size = "Pendulum", "toy", 8, 0.1, 1
+    space = ParameterSpace([Parameter("mass", 1.0, 0.5, 2.0)])
+    mj_model = mujoco.MjModel.from_xml_string("<mujoco/>")
+
+    def reset(self, key: jax.Array, theta: jax.Array | None = None) -> State:
+        mass = (jnp.asarray(self.space.nominal) if theta is None else theta)[0]
+        return self._state(jax.random.normal(key, (2,)), mass, jnp.int32(0), jnp.float32(0))
+
+    def step(self, state: State, action: jax.Array) -> State:
+        x, mass = state.pipeline_state["x"], state.pipeline_state["mass"]
+        x = x + self.dt * jnp.stack([x[1], jnp.clip(action[0], -1, 1) / mass])
+        return self._state(x, mass, state.info["steps"] + 1, -jnp.sum(x**2))
+
+    def _state(self, x: jax.Array, mass: jax.Array, steps: jax.Array, reward: jax.Array) -> State:
+        zero, late = jnp.float32(0), (steps >= self.episode_length).astype(jnp.float32)
+        info = {"terminated": zero, "truncated": late, "final_observation": {"policy": x}, "steps": steps}
+        return State({"x": x, "mass": mass}, {"policy": x}, reward, zero, {}, info)
+
+
+TOY = Toy()
+
+
+@pytest.fixture(autouse=True)
+def quiet(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("BAYESSIM_MJX_CACHE", "off")
+    monkeypatch.delenv("BAYESSIM_MJX_DEBUG", raising=False)
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture
+def toy(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every task is the toy."""
+    monkeypatch.setattr(registry, "make", lambda name, **_: TOY)
+
+
+def error_of(capsys: pytest.CaptureFixture, run: Any, *argv: str) -> str:
+    """The one line on stderr of a command that has to refuse."""
+    assert run(list(argv)) == 2
+    err = capsys.readouterr().err
+    assert err.startswith("error: ") and err.count("\n") == 1 and "Traceback" not in err
+    return err
+
+
+@pytest.mark.parametrize(
+    ("argv", "words"),
+    [
+        (["--task", "Pendulm"], ["'Pendulm'", "Did you mean Pendulum", "Ant, Cartpole"]),
+        (["--tsk", "Pendulum"], ["'--tsk'", "Did you mean --task"]),
+        (["--task", "Pendulum", "--num_envs", "many"], ["--num_envs", "'many'"]),
+        (["--task", "Pendulum", "--num_envs", "0"], ["env.numEnvs = 0", "--num_envs", "at least 1"]),
+        (["--task", "Pendulum", "--task"], ["--task", "expected one argument"]),
+        (["--task", "Pendulum", "word"], ["'word'", "section.key=value"]),
+        (["--task", "Pendulum", "bayessim.component=5"], ["bayessim.component", "Did you mean bayessim.components"]),
+        (["--task", "Pendulum", "--device", "tpu:7"], ["device = 'tpu:7'", "available: cpu:0"]),
+        (["--task", "Pendulum", "--device", "abacus"], ["device = 'abacus'", "cuda:0"]),
+        (["--task", "Pendulum", "--cfg_env", "nowhere.yaml"], ["nowhere.yaml", "cannot be read"]),
+        (["--task", "Pendulum", "--name", "../up"], ["name = '../up'"]),
+        (["--resume", "nowhere"], ["nowhere: not a run folder"]),
+        (["--task", "Pendulum", "--checkpoint", "nowhere"], ["--checkpoint nowhere: no such folder"]),
+        (["--task", "Pendulum", "--use_last_checkpoint"], ["no run of 'Pendulum' with a checkpoint"]),
+        (["--task", "Pendulum", "--use_last_checkpoint", "--checkpoint", "best"], ["give one of them"]),
+        ([], ["no task", "--list_tasks"]),
+    ],
+)
+@pytest.mark.parametrize("command", [main.main, train.main])
+def test_bad_input_is_one_line(command: Any, argv: list[str], words: list[str], capsys: Any, toy: None) -> None:
+    line = error_of(capsys, command, *argv)
+    assert all(word in line for word in words), line
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("env.realParams.means=[[1.0, 5.0]]", ["env.realParams.means", "length", "5", "[0.01, 2]"]),
+        ("env.realParams.means=[[1.0, 0.5, 3.0]]", ["env.realParams.means", "3"]),
+        ("env.realParams.means=[{mass: 1.0}]", ["mass"]),
+        ("real.logs=[empty]", ["empty"]),
+    ],
+)
+def test_bad_real_side_is_one_line(override: str, words: list[str], capsys: Any, tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    line = error_of(capsys, main.main, "--task", "Pendulum", override)
+    assert all(word in line for word in words), line
+
+
+def test_help_and_task_list_need_no_task(capsys: pytest.CaptureFixture) -> None:
+    for command in (main.main, train.main, play.main):
+        assert command(["--help"]) == 0
+        assert "section.key=value" in capsys.readouterr().out
+    assert main.main(["--list_tasks"]) == 0
+    assert {"Pendulum", "Cartpole", "Ant"} <= set(capsys.readouterr().out.split())
+
+
+def test_every_ancestor_flag_is_known() -> None:
+    flags = "--task --num_envs --seed --max_iterations --headless --video --video_length --video_interval --checkpoint"
+    flags += " --use_last_checkpoint --logdir --cfg_env --cfg_train --device"
+    for prog in ("main", "train", "play"):
+        assert set(flags.split()) <= set(cli.Parser(prog, "")._option_string_actions)
+
+
+def test_seed_minus_one_is_drawn_and_recorded() -> None:
+    args = cli.Parser("main", "").parse(["--task", "pendulum", "--seed", "-1", "ppo.gamma=0.5"])
+    config = cli.config_of(args)
+    assert 0 <= config.seed < 10_000 and config.task == "Pendulum" and config.ppo.gamma == 0.5
+
+
+def checkpoint_of(run: Run, step: int) -> list:
+    """Names, shapes and checksums of everything in a checkpoint."""
+    return json.loads((run.checkpoint(step) / "index.json").read_text())["parts"]
+
+
+class Killed(BaseException):
+    """Nothing catches it: what is on the disk now is what a SIGKILL leaves."""
+
+
+def killed_after(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
+    """Run.save: complete `count` times, then die in the middle of the next one (half a folder, old manifest)."""
+    whole, done = Run.save, []
+
+    def save(self: Run, step: int, tree: Any, **options: Any) -> Path:
+        if len(done) == count:
+            (self.path / "checkpoints" / f"{step:09d}.1.tmp" / "state").mkdir(parents=True)
+            raise Killed
+        done.append(step)
+        return whole(self, step, tree, **options)
+
+    monkeypatch.setattr(Run, "save", save)
+
+
+def test_train_killed_and_resumed_equals_unkilled(toy: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    argv = ["--task", "Pendulum", "--randomize", *SMALL]
+    assert train.main([*argv, "--logdir", "whole"]) == 0
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        killed_after(patch, 1)
+        train.main([*argv, "--logdir", "killed"])
+    killed = latest_run("killed", "Pendulum")
+    assert killed.manifest["status"] == "running" and killed.manifest["latest"] == 2
+    assert train.main(["--resume", str(killed.path), "--headless"]) == 0
+    whole, resumed = latest_run("whole", "Pendulum"), Run.open(killed.path)
+    assert checkpoint_of(whole, 4) == checkpoint_of(resumed, 4)
+    assert whole.manifest["checkpoints"] == resumed.manifest["checkpoints"]
+    assert resumed.manifest["status"] == "finished"
+    assert not list(resumed.path.glob("checkpoints/*.tmp"))
+
+
+def test_ctrl_c_ends_with_a_checkpoint_and_130(toy: None, monkeypatch: Any, capsys: pytest.CaptureFixture) -> None:
+    argv = ["--task", "Pendulum", *SMALL]
+    assert train.main([*argv, "--logdir", "whole"]) == 0
+    with monkeypatch.context() as patch:
+        progress = train.Training.progress
+
+        def interrupted(self: train.Training, metrics: dict, state: Any) -> None:
+            if int(state.iteration) == 3:
+                os.kill(os.getpid(), signal.SIGINT)
+            progress(self, metrics, state)
+
+        patch.setattr(train.Training, "progress", interrupted)
+        assert train.main([*argv, "--logdir", "stopped"]) == 130
+    run = latest_run("stopped", "Pendulum")
+    assert run.manifest["status"] == "interrupted" and run.manifest["latest"] == 3
+    assert f"--resume {run.path}" in capsys.readouterr().out
+    assert train.main(["--resume", str(run.path)]) == 0
+    assert checkpoint_of(Run.open(run.path), 4) == checkpoint_of(latest_run("whole", "Pendulum"), 4)
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_resume_keeps_the_runs_settings(toy: None, capsys: pytest.CaptureFixture) -> None:
+    assert train.main(["--task", "Pendulum", *SMALL]) == 0
+    run = str(latest_run("logs", "Pendulum").path)
+    for argv in (["--seed", "3"], ["ppo.gamma=0.5"], ["--task", "Ant"], ["--randomize"]):
+        assert f"{argv[0]} would change" in error_of(capsys, train.main, "--resume", run, *argv)
+    assert train.main(["--resume", run, "--device", "cpu"]) == 0  # nothing left to do
+
+
+def test_corrupted_checkpoints_of_a_run_to_resume(toy: None, capsys: pytest.CaptureFixture) -> None:
+    assert train.main(["--task", "Pendulum", *SMALL]) == 0
+    run = latest_run("logs", "Pendulum")
+    (run.checkpoint(4) / "index.json").write_text("{")
+    assert train.main(["--resume", str(run.path)]) == 0
+    assert "going on from the checkpoint of step 2" in capsys.readouterr().err
+    (run.path / "params" / "train.yaml").write_text("ppo: {gamma: [")
+    assert "train.yaml" in error_of(capsys, train.main, "--resume", str(run.path))
+    (run.path / "run.json").write_text("{")
+    assert "damaged manifest" in error_of(capsys, train.main, "--resume", str(run.path))
+
+
+def test_play_prints_returns_of_latest_best_run_and_path(toy: None, capsys: pytest.CaptureFixture) -> None:
+    assert train.main(["--task", "Pendulum", *SMALL]) == 0
+    run = latest_run("logs", "Pendulum")
+    for which in ("latest", "best", str(run.path), str(run.checkpoint(2))):
+        capsys.readouterr()
+        assert play.main(["--task", "Pendulum", "--checkpoint", which, "--episodes", "3"]) == 0
+        rows = {line.split()[0]: line.split()[1:] for line in capsys.readouterr().out.splitlines()}
+        assert {"nominal", "prior", "real"} <= set(rows) and float(rows["nominal"][0]) < 0
+    assert "have nominal, prior, real" in error_of(
+        capsys, play.main, "--checkpoint", str(run.path), "--physics=posterior"
+    )
+    line = error_of(capsys, play.main, "--checkpoint", str(run.path), "ppo.hidden_actor=[5]")
+    assert "policy.actor" in line and "settings that it was made with" in line
+    assert "give --task NAME" in error_of(capsys, play.main, "--checkpoint", "latest")
+
+
+def test_training_goes_on_from_a_policy(toy: None) -> None:
+    assert train.main(["--task", "Pendulum", *SMALL]) == 0
+    run = latest_run("logs", "Pendulum")
+    assert train.main(["--task", "Pendulum", *SMALL, "--checkpoint", "best", "--max_iterations", "0"]) == 0
+    again = latest_run("logs", "Pendulum", with_checkpoint=False)
+    assert again.path != run.path and again.config.bayessim.policyCheckpt == str(run.checkpoint("best").absolute())
+
+
+@pytest.mark.slow
+@pytest.mark.ci
+def test_main_killed_and_resumed_equals_unkilled(toy: None, monkeypatch: Any, capsys: pytest.CaptureFixture) -> None:
+    argv = ["--task", "Pendulum", *SMALL, *LOOP]
+    assert main.main([*argv, "--logdir", "whole"]) == 0
+    whole = latest_run("whole", "Pendulum")
+    last = whole.manifest["latest"]
+    for saves in range(1, 5):  # within and between rounds
+        with monkeypatch.context() as patch, pytest.raises(Killed):
+            killed_after(patch, saves)
+            main.main([*argv, "--logdir", "killed"])
+        run = latest_run("killed", "Pendulum")
+        assert main.main(["--resume", str(run.path), "--headless"]) == 0
+        resumed = Run.open(run.path)
+        assert checkpoint_of(resumed, last) == checkpoint_of(whole, last), saves
+        assert [c["evaluation"] for c in resumed.checkpoints] == [c["evaluation"] for c in whole.checkpoints]
+    capsys.readouterr()
+    assert play.main(["--checkpoint", str(whole.path), "--episodes", "3"]) == 0
+    assert "posterior" in capsys.readouterr().out

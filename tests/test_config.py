@@ -1,0 +1,221 @@
+"""Layers of settings, strictness, and the task files: every mistake is one error that names its place."""
+
+import copy
+import dataclasses
+import pickle
+from pathlib import Path
+
+import pytest
+
+from bayessim_mjx import config
+from bayessim_mjx.config import Config, EnvConfig, PPOConfig, from_dict, load, read_yaml, task_file, to_yaml
+from bayessim_mjx.errors import UserError
+
+CFG = sorted(p.stem for p in config.cfg_folder().glob("*.yaml"))
+MASS = "task.randomization_params.actor_params.pendulum.rigid_body_properties.mass"
+
+
+def task_of(stem: str) -> str:
+    return "".join(part.capitalize() for part in stem.split("_"))
+
+
+@pytest.mark.parametrize("stem", CFG)
+def test_every_task_file_loads_and_survives_a_round_trip(stem: str, tmp_path: Path) -> None:
+    task = task_of(stem)
+    assert task_file(task).stem == stem
+    loaded = load(task)
+    file = tmp_path / "all.yaml"
+    file.write_text(to_yaml(loaded.to_dict()))
+    assert load(cfg_env=file) == loaded == from_dict(loaded.to_dict())
+
+
+@pytest.mark.parametrize("stem", CFG)
+def test_loading_changes_neither_input_nor_file(stem: str) -> None:
+    raw = read_yaml(task_file(task_of(stem)))
+    before, text = copy.deepcopy(raw), task_file(task_of(stem)).read_bytes()
+    first, second = from_dict(raw, task_of(stem)), from_dict(raw, task_of(stem))
+    assert raw == before and task_file(task_of(stem)).read_bytes() == text
+    assert first == second
+
+
+def test_bayessimig_keys_keep_their_names_and_values() -> None:
+    b, ant = load("Pendulum").bayessim, load("Ant").bayessim
+    assert (b.trainTrajs, b.trainTrajLen, b.summarizerFxn, b.collectPolicy) == (
+        10000,
+        20,
+        "summary_start",
+        "policy_random",
+    )
+    assert (b.components, b.fullCovariance, b.hiddenLayers, b.realTrajs, b.realEvals) == (10, True, (128, 128), 1, 100)
+    assert (ant.trainTrajLen, ant.summarizerFxn, ant.collectPolicy) == (50, "summary_corrdiff", "policy_rl_randomized")
+    assert len(load("Cartpole").env.realParams["means"][0]) == 13 and len(load("Ant").env.realParams["means"][0]) == 17
+
+
+def test_layers_in_order(tmp_path: Path) -> None:
+    (tmp_path / "e.yaml").write_text("bayessim: {components: 3, trainTrajs: 5, lr: 1e-3}\nseed: 4\n")
+    (tmp_path / "t.yaml").write_text("gamma: 0.5\nlearning_rate: 1e-3\nmax_iterations: 7\n")
+    c = load(
+        "Pendulum",
+        cfg_env=tmp_path / "e.yaml",
+        cfg_train=tmp_path / "t.yaml",
+        flags={"--max_iterations": ("ppo.max_iterations", 9)},
+        overrides=["bayessim.trainTrajs=6", "ppo.gamma=0.25"],
+    )
+    assert (c.bayessim.components, c.bayessim.trainTrajs, c.bayessim.lr, c.seed) == (3, 6, 1e-3, 4)
+    assert (c.ppo.gamma, c.ppo.learning_rate, c.ppo.max_iterations) == (0.25, 1e-3, 9)
+    assert c.bayessim.hiddenLayers == (128, 128)  # from cfg/pendulum.yaml
+
+
+def test_cfg_train_may_have_a_ppo_section_but_no_other(tmp_path: Path) -> None:
+    (tmp_path / "t.yaml").write_text("ppo: {gamma: 0.5}\n")
+    assert load("Ant", cfg_train=tmp_path / "t.yaml").ppo.gamma == 0.5
+    (tmp_path / "t.yaml").write_text("ppo: {gamma: 0.5}\nbayessim: {lr: 1.0}\n")
+    with pytest.raises(UserError, match=r"t\.yaml: bayessim beside `ppo:`"):
+        load("Ant", cfg_train=tmp_path / "t.yaml")
+
+
+def test_number_of_worlds_is_one_setting() -> None:
+    for override in ("env.numEnvs=48", "ppo.num_envs=48"):
+        c = load("Cartpole", overrides=[override])
+        assert c.env.numEnvs == c.ppo.num_envs == 48
+    assert load("Cartpole", overrides=["ppo.num_envs=null"]).ppo.num_envs == 512
+    with pytest.raises(UserError, match=r"env\.numEnvs = 1 and ppo\.num_envs = 2 are one setting"):
+        from_dict({"env": {"numEnvs": 1}, "ppo": {"num_envs": 2}}, "Ant")
+    with pytest.raises(UserError, match="one setting"):
+        Config(env=EnvConfig(numEnvs=3))
+
+
+def test_short_names_and_none() -> None:
+    c = load(
+        "Pendulum", overrides=["bayessim.collectPolicy=ones", "bayessim.modelClass=None", "bayessim.summarizerFxn=corr"]
+    )
+    assert (c.bayessim.collectPolicy, c.bayessim.modelClass, c.bayessim.summarizerFxn) == (
+        "policy_ones",
+        None,
+        "summary_corr",
+    )
+
+
+def test_a_file_gives_the_parameters_whole_and_an_override_changes_one(tmp_path: Path) -> None:
+    (tmp_path / "e.yaml").write_text(
+        "task:\n  randomization_params:\n    actor_params:\n      pendulum:\n        rigid_body_properties:\n"
+        "          mass: {range: [0.5, 1.5], operation: scaling}\n"
+    )
+    groups = load("Pendulum", cfg_env=tmp_path / "e.yaml").randomization["randomization_params"]["actor_params"][
+        "pendulum"
+    ]
+    assert list(groups) == ["rigid_body_properties"]
+    c = load("Pendulum", overrides=[f"{MASS}.range=[0.1,1.2]", f"{MASS}.distribution=loguniform"])
+    groups = c.randomization["randomization_params"]["actor_params"]["pendulum"]
+    assert groups["rigid_body_properties"]["mass"]["range"] == (0.1, 1.2)
+    assert groups["rigid_shape_properties"]["length"]["range"] == (0.01, 2.0)
+
+
+def test_real_params_by_name() -> None:
+    c = load("Pendulum", overrides=["env.realParams.means=[{pendulum_mass_mult: 1.0, pendulum_length_mult: 0.7}]"])
+    assert c.env.realParams["means"][0] == {"pendulum_mass_mult": 1.0, "pendulum_length_mult": 0.7}
+    assert c.env.realParams["weights"] == (1.0,)
+
+
+def test_a_config_is_immutable_hashable_and_picklable() -> None:
+    c = load("Pendulum")
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        c.seed = 3  # type: ignore[misc]
+    with pytest.raises(TypeError, match="immutable"):
+        c.randomization["randomize"] = False
+    with pytest.raises(TypeError, match="immutable"):
+        c.env.realParams.update(means=1)
+    assert hash(c) == hash(load("Pendulum")) and pickle.loads(pickle.dumps(c)) == c == copy.deepcopy(c)
+    changed = config.replace(c, ppo={"gamma": 0.9}, seed=3)
+    assert (changed.ppo.gamma, changed.seed, c.seed) == (0.9, 3, 0)
+    c.to_dict()["env"]["realParams"]["means"][0][0] = 99.0
+    assert c == load("Pendulum")
+
+
+def test_settings_of_one_task_are_typed_by_its_file() -> None:
+    c = load("Cartpole", overrides=["env.resetDist=2"])
+    assert c.env["resetDist"] == 2.0 and "resetDist" in c.env and c.env.get("nothing", 5) == 5
+    with pytest.raises(UserError, match=r"env\.resetDist = 'far'.*expected a number"):
+        load("Cartpole", overrides=["env.resetDist=far"])
+    with pytest.raises(UserError, match=r"'env\.resetDist' is unknown"):
+        load("Pendulum", overrides=["env.resetDist=2"])
+
+
+BAD = {
+    "bayessim.componets=5": r"override 'bayessim.componets=5'.*mean bayessim\.components\?.*Allowed: .*trainTrajs",
+    "componets=5": r"Did you mean bayessim\.components\?",
+    "pp.gamma=1": r"key 'pp' is unknown.*ppo",
+    "env.numEnv=5": r"Did you mean env\.numEnvs\?",
+    "ppo.gamma=abc": r"ppo\.gamma = 'abc' \(override.*expected a number",
+    "ppo.gamma=1.5": r"ppo\.gamma = 1\.5 \(override.*at most 1",
+    "ppo.gamma=.nan": r"ppo\.gamma = nan.*expected a number",
+    "ppo.learning_rate=0": r"must be greater than 0",
+    "ppo.clip_param=True": r"ppo\.clip_param = True.*expected a number",
+    "ppo.num_minibatches=100000": r"ppo\.num_minibatches = 100000 is more than the batch",
+    "ppo.activation=sigmod": r"ppo\.activation = 'sigmod'.*allowed are elu",
+    "ppo=5": r"ppo = 5 .*expected a section",
+    "bayessim.hiddenLayers=5": r"expected a list of int",
+    "bayessim.hiddenLayers=[8,x]": r"bayessim\.hiddenLayers\[1\] = 'x'.*whole number",
+    "bayessim.collectPolicy=rnd": r"allowed are policy_random, policy_ones",
+    "bayessim.modelClass=MDN": r"bayessim\.modelClass = 'MDN': allowed are MDNN",
+    "bayessim.ftune=maybe": r"expected True or False",
+    "seed=1.5": r"seed = 1\.5 .*whole number",
+    "seed=-2": r"seed = -2 .*at least 0",
+    "seed=": r"seed = None .*whole number",
+    "ppo.gamma": r"expected section\.key=value",
+    "ppo.gamma=[1,": r"the value is not valid YAML",
+    "task.randomise=True": r"Did you mean task\.randomize",
+    "env.realParams.mean=[[1]]": r"Did you mean env\.realParams\.means",
+    f"{MASS}.range=[3,2]": r"mass\.range = \[3\.0, 2\.0\] \(override .*low < high",
+    f"{MASS}.range=[1]": r"expected \[low, high\]",
+    f"{MASS}.operation=scalling": r"Did you mean scaling\?",
+    MASS.replace("mass", "mas") + ".range=[0,1]": r"Did you mean task.*rigid_body_properties\.mass\?",
+}
+
+
+@pytest.mark.parametrize("override", BAD)
+def test_a_bad_override_is_one_line_with_the_remedy(override: str) -> None:
+    with pytest.raises(UserError, match=BAD[override]) as caught:
+        load("Pendulum", overrides=[override])
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("bayessim:\n  lr: [1\n", r"f\.yaml, line \d: not valid YAML"),
+        ("bayessim: {lr: 1}\nbayessim: {lr: 2}\n", r"f\.yaml, line 2: not valid YAML.*duplicate"),
+        ("\tseed: 1\n", r"f\.yaml, line 1: not valid YAML"),
+        ("- 1\n- 2\n", r"f\.yaml: expected sections"),
+        ("just text\n", r"f\.yaml: key 'just text' is unknown"),
+        ("seed: ${nothing}\n", r"f\.yaml: not valid YAML.*nothing"),
+        (
+            "bayessim: {tranTrajs: 3}\n",
+            r"f\.yaml: key 'bayessim\.tranTrajs' is unknown. Did you mean bayessim\.trainTrajs",
+        ),
+    ],
+)
+def test_a_bad_file_is_named_with_its_line(text: str, message: str, tmp_path: Path) -> None:
+    (tmp_path / "f.yaml").write_text(text)
+    with pytest.raises(UserError, match=message):
+        load("Pendulum", cfg_env=tmp_path / "f.yaml")
+
+
+def test_missing_binary_and_folder_files(tmp_path: Path) -> None:
+    (tmp_path / "b.yaml").write_bytes(b"\xff\xfe\x00\x81")
+    for path in (tmp_path / "none.yaml", tmp_path / "b.yaml", tmp_path):
+        with pytest.raises(UserError, match=path.name):
+            load("Pendulum", cfg_env=path)
+
+
+def test_a_file_of_another_task_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "f.yaml").write_text(to_yaml(load("Ant").to_dict()))
+    with pytest.raises(UserError, match="task_name = 'Ant', but the task is 'Pendulum'"):
+        load("Pendulum", cfg_env=tmp_path / "f.yaml")
+
+
+def test_limits_hold_without_files_too() -> None:
+    with pytest.raises(UserError, match=r"ppo\.gamma = 2\.0: must be at most 1"):
+        PPOConfig(gamma=2.0)
+    with pytest.raises(UserError, match=r"ppo\.hidden_actor\[0\] = 'a'"):
+        PPOConfig(hidden_actor=("a",))  # type: ignore[arg-type]
