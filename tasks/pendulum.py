@@ -25,7 +25,7 @@ XML = """
     <light pos="0 -2 3" dir="0 1 -1"/>
     <camera name="side" pos="0 -5 0" xyaxes="1 0 0 0 0 1"/>
     <body name="pendulum">
-      <inertial mass="1" pos="0 0 0.5" diaginertia="0.08333333333 0.08333333333 1e-6"/>
+      <inertial mass="1" pos="0 0 0.5" diaginertia="0.08333333333 0.08333333333 1e-8"/>
       <joint name="hinge" type="hinge" axis="0 1 0" armature="0" damping="0"/>
       <geom name="pendulum" type="capsule" fromto="0 0 0 0 0 1" size="0.05" contype="0" conaffinity="0"/>
     </body>

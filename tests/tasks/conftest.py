@@ -20,12 +20,21 @@ def _compiled(name):
     env = registry.make(name)
     step = jax.jit(jax.vmap(env.step))
     reset = jax.jit(jax.vmap(env.reset))
-    return SimpleNamespace(env=env, reset=reset, step=step, worlds=WORLDS)
+
+    @jax.jit
+    def reset_to(qpos, qvel, thetas):
+        return jax.vmap(env.reset_to)(qpos, qvel, thetas)
+
+    def begin(qpos, qvel, theta=None):
+        theta = env.space.nominal if theta is None else theta
+        return reset_to(qpos, qvel, np.broadcast_to(theta, (len(qpos), len(env.space))))
+
+    return SimpleNamespace(env=env, reset=reset, reset_to=begin, step=step, worlds=WORLDS)
 
 
 @pytest.fixture
 def compiled():
-    """name -> env with its vmapped, jitted reset(keys, thetas) and step(states, actions) for 8 worlds."""
+    """name -> env with jitted reset(keys, thetas), reset_to(qpos, qvel, theta), step(states, actions) of 8 worlds."""
     return _compiled
 
 

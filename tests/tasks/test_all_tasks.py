@@ -1,7 +1,5 @@
 """What holds for every registered task."""
 
-import difflib
-
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -36,6 +34,8 @@ def test_sizes_and_names_agree(task):
 
 def test_real_parameters_lie_in_the_prior(task):
     space = task.env.space
+    if not hasattr(task.env, "real_parameters"):
+        pytest.skip("its reality is a robot")
     assert len(space) == len(task.env.real_parameters)
     assert bool(space.contains(space.vector(task.env.real_parameters)))
 
@@ -111,4 +111,4 @@ def test_the_spec_is_fresh_each_time(task):
     spec = task.env.spec()
     assert isinstance(spec, mujoco.MjSpec)
     spec.bodies[1].name = "other"
-    assert difflib.SequenceMatcher(None, task.env.spec().bodies[1].name, "other").ratio() < 1
+    assert task.env.spec().bodies[1].name != "other"

@@ -51,12 +51,11 @@ def test_rests_on_its_feet(compiled):
     """Without torque it stands at z = 0.379, and the feet carry its weight of 8.94 N."""
     task = compiled("Ant")
     zero = np.zeros((8, 8), np.float32)
-    theta = np.tile(task.env.space.nominal, (8, 1))
-    state = jax.vmap(task.env.reset_to)(np.tile(Q0, (8, 1)), np.zeros((8, 14), np.float32), theta)
+    state = task.reset_to(np.tile(Q0, (8, 1)), np.zeros((8, 14), np.float32))
     state = state.replace(pipeline_state=state.pipeline_state.replace(fields=nominal(task, 8)))
     for _ in range(200):
         state = task.step(state, zero)
-    assert state.pipeline_state.qpos[0, 2] == pytest.approx(0.379, abs=2e-3)
+    assert state.pipeline_state.qpos[0, 2] == pytest.approx(0.379, abs=3e-3)
     forces = np.asarray(state.obs["policy"][0, 28:52]).reshape(4, 2, 3)[:, 0] / 0.1
     turns = foot_frames(task.env.mj_model, state.pipeline_state.qpos[0])
     total = np.einsum("fij,fj->i", turns, forces)
@@ -91,7 +90,7 @@ def test_observations_by_hand(compiled):
     qpos[:, 3:7] = [np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)]
     qpos[1, 3:7] = [np.cos(0.2), np.sin(0.2), 0, 0]  # roll 0.4
     qvel[:, :3], qvel[:, 3:6], qvel[:, 6:] = [1, 0, 0], [0.1, 0.2, 0.3], 5.0
-    obs = np.asarray(jax.vmap(task.env.reset_to)(qpos, qvel).obs["policy"])
+    obs = np.asarray(task.reset_to(qpos, qvel).obs["policy"])
     want = [0.44, np.cos(yaw), -np.sin(yaw), 0, 0.1, 0.2, 0.3, yaw, 0, -yaw, 1, np.cos(yaw)]
     np.testing.assert_allclose(obs[0, :12], want, atol=1e-5)
     np.testing.assert_allclose(obs[1, [7, 8, 9, 10, 11]], [0, 0.4, 0, np.cos(0.4), 1], atol=1e-5)
@@ -103,14 +102,13 @@ def test_observations_by_hand(compiled):
 def test_reward_by_hand(compiled):
     task = compiled("Ant")
     qpos, qvel = states(5)
-    qpos[0, 2] = 0.30
+    qpos[0, 2:7] = [0.30, 0, 1, 0, 0]  # on its back, feet in the air
     qpos[1, 3:7] = [np.cos(0.8), 0, 0, np.sin(0.8)]  # looks away by 1.6 rad
-    before = jax.vmap(task.env.reset_to)(qpos, qvel)
+    before = task.reset_to(qpos, qvel)
     action = np.float32(np.random.default_rng(6).uniform(-1, 1, (8, 8)))
     after = task.step(before, action)
     q, v = (np.asarray(x, np.float64) for x in (after.pipeline_state.qpos, after.pipeline_state.qvel))
     obs = np.asarray(after.obs["policy"])
-    # float32 leaves 1e-4 m of 1000 m: 60 times that in the speed
     progress = 60 * (np.hypot(1000 - qpos[:, 0], qpos[:, 1]) - np.hypot(1000 - q[:, 0], q[:, 1]))
     heading = obs[:, 11]
     want = progress + 0.5 + 0.1 * (obs[:, 10] > 0.93) + np.where(heading > 0.8, 0.5, 0.5 * heading / 0.8)
@@ -119,7 +117,7 @@ def test_reward_by_hand(compiled):
     fallen = q[:, 2] < 0.31
     assert fallen[0] and not fallen.all()
     assert np.array_equal(after.done, fallen)
-    np.testing.assert_allclose(after.reward, np.where(fallen, -2, want), atol=1e-3)
+    np.testing.assert_allclose(after.reward, np.where(fallen, -2, want), atol=1e-4)
     np.testing.assert_allclose(obs[:, 52:], action)
 
 
@@ -127,7 +125,7 @@ def test_foot_wrenches_agree_with_mujoco(compiled):
     """The same contact forces as MuJoCo's rne_postconstraint, in the foot's frame about its origin."""
     task = compiled("Ant")
     qpos, qvel = states(7, height=(0.33, 0.38))
-    state = jax.vmap(task.env.reset_to)(qpos, qvel)
+    state = task.reset_to(qpos, qvel)
     state = state.replace(pipeline_state=state.pipeline_state.replace(fields=nominal(task, 8)))
     got = np.asarray(task.step(state, np.zeros((8, 8), np.float32)).obs["policy"][:, 28:52]).reshape(8, 4, 2, 3) / 0.1
     model = task.env.mj_model
@@ -148,16 +146,16 @@ def test_mirror_equivariance_in_contact(compiled):
     task = compiled("Ant")
     qpos, qvel = states(8)
     action = np.float32(np.random.default_rng(9).uniform(-1, 1, (8, 8)))
-    one = task.step(jax.vmap(task.env.reset_to)(qpos, qvel), action)
+    one = task.step(task.reset_to(qpos, qvel), action)
     perm, sign = task.env.mirror["action"]
-    two = task.step(jax.vmap(task.env.reset_to)(*mirrored(qpos, qvel)), sign * action[:, perm])
+    two = task.step(task.reset_to(*mirrored(qpos, qvel)), sign * action[:, perm])
     perm, sign = task.env.mirror["observation"]
     left, right = np.asarray(two.obs["policy"]), sign * np.asarray(one.obs["policy"])[:, perm]
     assert np.abs(right[:, 28:52]).max() > 0.5  # some feet press on the ground
     smooth = [*range(28), *range(52, 60)]
     np.testing.assert_allclose(left[:, smooth], right[:, smooth], atol=1e-5, rtol=1e-5)
     np.testing.assert_allclose(left, right, atol=1e-4, rtol=1e-4)  # contact forces reach hundreds of N
-    np.testing.assert_allclose(two.reward, one.reward, atol=1e-2)  # progress: see the reward test
+    np.testing.assert_allclose(two.reward, one.reward, atol=1e-5, rtol=1e-5)
 
 
 def test_resets(compiled):
@@ -184,9 +182,9 @@ def test_mjx_agrees_with_mujoco_in_the_air(compiled, both_engines):
 
 
 def test_mjx_agrees_with_mujoco_in_contact(compiled, both_engines):
-    """20 control steps from standing: one solver iteration, and contacts that switch, part the engines later."""
+    """8 control steps from standing: one solver iteration and contacts that switch part the engines later."""
     env, rng = compiled("Ant").env, np.random.default_rng(4)
     qpos = Q0.copy()
     qpos[2] = 0.38
-    fast, exact = both_engines(env, qpos, np.zeros(14), rng.uniform(-0.5, 0.5, (20, 8)))
+    fast, exact = both_engines(env, qpos, np.zeros(14), rng.uniform(-0.5, 0.5, (8, 8)))
     np.testing.assert_allclose(fast[0], exact[0], atol=2e-3)
