@@ -489,8 +489,9 @@ DFKI = Path(__file__).resolve().parents[2] / "shared" / "data" / "dfki_simple_pe
 
 @pytest.mark.skipif(not DFKI.is_dir(), reason="the DFKI pendulum's logs are not in ../shared/data")
 def test_foreign_logs_of_the_dfki_pendulum_by_map() -> None:
-    xml = """<mujoco><worldbody><body><joint name="hinge" axis="0 1 0"/>
-    <geom size=".05" mass=".5" pos="0 0 -.5"/></body></worldbody><actuator><motor name="motor" joint="hinge"/></actuator></mujoco>"""
+    xml = """<mujoco>
+    <worldbody><body><joint name="hinge" axis="0 1 0"/><geom size=".05" mass=".5" pos="0 0 -.5"/></body></worldbody>
+    <actuator><motor name="motor" joint="hinge"/></actuator></mujoco>"""
     log_map = {
         "files": "*ddp_data_measured.csv",
         "ctrl": {"motor": "torque"},

@@ -1,0 +1,85 @@
+"""Adapt the servo pendulum to real logs: 16 runs of a Dynamixel XL330 (Rhoban's BAM), against published values.
+
+    python examples/adapt_servo.py [--out DIR] [--seed N] [section.key=value ...]
+
+The same as `python -m bayessim_mjx.main --task ServoPendulum real.logs=DIR` with a small budget, and with the gap (how
+far replayed motion is from the logs) before and after. The published fits are BAM's files params/xl330_HEAD_m*.json.
+"""
+
+import argparse
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from convert_xl330 import RAW, convert
+
+from bayessim_mjx import loop, registry
+from bayessim_mjx.config import load
+from bayessim_mjx.distributions import Distribution
+from bayessim_mjx.env import Task
+from bayessim_mjx.logs import Log, read_logs, segments
+from bayessim_mjx.rollout import replay
+
+# load mass, damping = kt^2/R + viscous, Coulomb friction, armature, gain = kt/R
+PUBLISHED = {
+    "data sheet (nominal)": (0.49, 0.0419, 0.05, 0.002, 0.1041),
+    "BAM M1 (Coulomb, viscous)": (0.49, 0.0409, 0.0128, 0.00181, 0.0963),
+    "BAM M5 less load friction": (0.49, 0.362**2 / 2.75 + 0.0063, 0.009, 0.00185, 0.362 / 2.75),
+}
+SMALL = ["ppo.max_iterations=10", "bayessim.realEvals=20", "monitor.video=False"]
+WINDOWS = (0.1, 0.25, 0.5)  # s
+
+
+def gap(env: Task, logs: list[Log], theta: Any, seconds: float) -> float:
+    """Root mean square of simulated minus logged angle [rad] over all windows of that length, replayed at theta [d]."""
+    data = segments(logs, round(seconds / env.dt), dt=env.dt)
+    thetas = np.tile(np.float32(theta), (len(data["qpos0"]), 1))
+    motion = replay(env.physics, data["qpos0"], data["qvel0"], data["command"], thetas)
+    return float(np.sqrt(np.mean((np.asarray(motion["qpos"]) - data["qpos"]) ** 2)))
+
+
+def adapt(folder: Path, overrides: list[str], seed: int = 0) -> tuple[Task, Distribution]:
+    """Run the outer loop on the logs in `folder`; (task, posterior of the last round)."""
+    logs = f"real.logs={folder}"
+    config = load("ServoPendulum", flags={"--seed": ("seed", seed)}, overrides=[*SMALL, logs, *overrides])
+    env = registry.make(config.task, config=config)
+    parts = loop.make(config, env)
+    _, rounds = loop.run(parts, loop.init(parts))
+    return env, rounds[-1].posterior
+
+
+def show(env: Task, logs: list[Log], posterior: Distribution) -> None:
+    """Two tables: parameters (posterior against published values) and gaps."""
+    mean, sd = np.asarray(posterior.mean()), np.asarray(posterior.sd())
+    rows = {**PUBLISHED, "posterior mean": mean}
+    print(f"\n{'':30}" + "".join(f"{name:>16}" for name in env.space.names))
+    for label, values in {**rows, "posterior sd": sd}.items():
+        print(f"{label:30}" + "".join(f"{v:16.4f}" for v in values))
+    print(f"\n{'gap, RMS in mrad':30}" + "".join(f"{s:14.2f} s" for s in WINDOWS))
+    for label, values in rows.items():
+        print(f"{label:30}" + "".join(f"{1e3 * gap(env, logs, values, s):16.1f}" for s in WINDOWS))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument(
+        "--out", type=Path, help="where the CSV files and posterior.png go (default: a temporary folder)"
+    )
+    parser.add_argument("--seed", type=int, default=0)
+    args, overrides = parser.parse_known_args()
+    if not RAW.is_dir():
+        raise SystemExit(f"skipped: the logs are not there ({RAW})")
+    out = args.out or Path(tempfile.mkdtemp(prefix="xl330_"))
+    print(f"{len(convert(out / 'logs'))} logs in {out / 'logs'}")
+    env, posterior = adapt(out / "logs", overrides, args.seed)
+    show(env, read_logs(out / "logs", env.mj_model), posterior)
+    from bayessim_mjx.monitor import plots
+
+    truth = dict(zip(env.space.names, PUBLISHED["BAM M1 (Coulomb, viscous)"], strict=True))
+    plots.corner(posterior, truth=truth, title="XL330 servo; lines: BAM M1").savefig(out / "posterior.png")
+    print(f"\npicture: {out / 'posterior.png'}")
+
+
+if __name__ == "__main__":
+    main()
