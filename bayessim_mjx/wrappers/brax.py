@@ -30,7 +30,9 @@ class BraxEnv(Env):
         self._space = ParameterSpace(())
 
     def reset(self, key: jax.Array, theta: jax.Array | None = None) -> State:
-        return self._state(self.env.reset(key), jnp.zeros((), jnp.int32))
+        inner = self.env.reset(key)
+        reward, done, metrics = jax.tree.map(_real, (inner.reward, inner.done, dict(inner.metrics)))
+        return self._state(inner.replace(reward=reward, done=done, metrics=metrics), jnp.zeros((), jnp.int32))
 
     def step(self, state: State, action: jax.Array) -> State:
         inner = self.env.step(state.pipeline_state, jnp.clip(action, -1.0, 1.0))
@@ -38,15 +40,14 @@ class BraxEnv(Env):
         return after.replace(info={**state.info, **after.info})
 
     def _state(self, inner: Any, steps: jax.Array) -> State:
-        obs, done = _groups(inner.obs), jnp.asarray(inner.done, jnp.float32)
+        obs, done = _groups(inner.obs), inner.done
         info = {
             "terminated": done,
             "truncated": (steps >= self.episode_length).astype(jnp.float32),
             "final_observation": obs,
             "steps": steps,
         }
-        reward = jnp.asarray(inner.reward, jnp.float32)
-        return State(inner, obs, reward, done, dict(inner.metrics), info)
+        return State(inner, obs, inner.reward, done, dict(inner.metrics), info)
 
     @property
     def action_size(self) -> int:
@@ -65,8 +66,12 @@ class BraxEnv(Env):
         return self.env.sys.mj_model if hasattr(self.env, "sys") else self.env.mj_model
 
 
+def _real(x: Any) -> jax.Array:
+    return jnp.asarray(x, jnp.float32)
+
+
 def _like(tree: Any, reference: Any) -> Any:
-    """`tree` with the dtypes of `reference`: some environments give whole numbers at reset and reals in step."""
+    """`tree` with the dtypes of `reference`: a state must not change its type from one step to the next."""
     return jax.tree.map(lambda x, ref: jnp.asarray(x, jnp.result_type(ref)), tree, reference)
 
 

@@ -39,7 +39,7 @@ class GymnasiumEnv(gymnasium.Env):
             self._theta = jnp.asarray(options["theta"], jnp.float32)
         key = jax.random.PRNGKey(int(self.np_random.integers(2**31)))
         self._state = self._reset(key, self._theta)
-        return np.asarray(self._state.obs["policy"]), {"theta": np.asarray(self._theta)}
+        return np.array(self._state.obs["policy"]), {"theta": np.array(self._theta)}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
         if self._state is None:
@@ -47,7 +47,7 @@ class GymnasiumEnv(gymnasium.Env):
         self._state = self._step(self._state, jnp.asarray(action, jnp.float32))
         info = self._state.info
         metrics = {name: float(value) for name, value in self._state.metrics.items()}
-        observation = np.asarray(self._state.obs["policy"])
+        observation = np.array(self._state.obs["policy"])
         terminated, truncated = bool(info["terminated"]), bool(info["truncated"])
         return observation, float(self._state.reward), terminated, truncated, metrics
 
@@ -84,7 +84,7 @@ class GymnasiumVectorEnv(VectorEnv):
             self._key = jax.random.PRNGKey(seed)
         self._key, key = jax.random.split(self._key)
         self._state = self._reset(key, self._domain)
-        return np.asarray(self._state.obs["policy"]), {}  # type: ignore[attr-defined]
+        return np.array(self._state.obs["policy"]), {}  # type: ignore[attr-defined]
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict]:
         if self._state is None:
@@ -96,6 +96,6 @@ class GymnasiumVectorEnv(VectorEnv):
         if ended.any():
             final = np.empty(self.num_envs, object)
             for i in np.flatnonzero(ended):
-                final[i] = np.asarray(after.info["final_observation"]["policy"][i])
+                final[i] = np.array(after.info["final_observation"]["policy"][i])
             info = {"final_obs": final, "_final_obs": ended}
-        return np.asarray(self._state.obs["policy"]), np.asarray(after.reward), terminated, truncated, info
+        return np.array(self._state.obs["policy"]), np.asarray(after.reward), terminated, truncated, info

@@ -1,0 +1,124 @@
+"""Brax's trainer on our tasks and our trainer on Brax's and Playground's environments."""
+
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from bayessim_mjx import rl
+from bayessim_mjx.config import PPOConfig
+from bayessim_mjx.registry import make
+from bayessim_mjx.rollout import rollout
+from bayessim_mjx.wrappers.brax import BraxEnv
+
+sys.path.insert(0, str(Path(__file__).parent))
+import brax_shim  # noqa: E402
+
+CONFIG = PPOConfig(num_envs=8, num_steps=4, num_epochs=1, num_minibatches=2, hidden_actor=(8,), hidden_critic=(8,))
+
+
+class Toy:
+    """Brax's protocol in ten lines: whole-number rewards at reset, real ones in step, plain array observations."""
+
+    action_size, dt = 1, 0.1
+
+    def reset(self, rng):
+        from brax.envs.base import State
+
+        return State(None, jnp.zeros(2), jnp.zeros((), int), jnp.zeros(()), {"m": jnp.zeros((), int)}, {})
+
+    def step(self, state, action):
+        obs = state.obs + 1
+        done = (obs[0] >= 3).astype(float)
+        return state.replace(obs=obs, reward=1.5 * action[0], done=done, metrics={"m": obs[0]})
+
+
+def test_protocol_of_a_wrapped_environment():
+    env = BraxEnv(Toy(), "toy", 2)
+    assert env.observation_size == {"policy": (2,), "state": (2,)}
+    assert len(env.space) == 0
+    t = rollout(env, lambda key, obs: jnp.full(1, 7.0), jax.random.PRNGKey(0), jnp.zeros((2, 0)), 4)
+    np.testing.assert_array_equal(t.truncated[0], [0, 1, 0, 0])
+    np.testing.assert_array_equal(t.terminated[0], [0, 0, 0, 0])
+    np.testing.assert_array_equal(t.reward[0], [1.5, 1.5, 0, 0])  # actions are clipped to +-1
+    longer = rollout(
+        BraxEnv(Toy(), "toy", 9), lambda key, obs: jnp.zeros(1), jax.random.PRNGKey(0), jnp.zeros((1, 0)), 4
+    )
+    np.testing.assert_array_equal(longer.terminated[0], [0, 0, 1, 0])
+
+
+def test_our_trainer_on_a_wrapped_environment():
+    env = BraxEnv(Toy(), "toy", 5)
+    _, metrics = rl.train(env, CONFIG, jax.random.PRNGKey(0), iterations=2)
+    assert metrics["Train/mean_episode_length"] <= 3
+    assert np.isfinite(metrics["Loss/value"])
+
+
+@pytest.mark.parametrize("name", ["brax:foo", "brax:annt"])
+def test_unknown_names_are_refused(name):
+    with pytest.raises(ValueError, match=f"{name}.*inverted_pendulum"):
+        make(name)
+
+
+def test_settings_of_our_tasks_are_refused():
+    with pytest.raises(ValueError, match="env.resetDist"):
+        make("brax:ant", resetDist=2.0)
+
+
+def test_playground_that_is_not_installed_says_how_to_get_it():
+    try:
+        import mujoco_playground  # noqa: F401
+    except ImportError:
+        with pytest.raises(ValueError, match=r"pip install 'bayessim-mjx\[playground\]'"):
+            make("playground:CartpoleBalance")
+    else:
+        assert make("playground:CartpoleBalance").episode_length == 1000
+
+
+@pytest.mark.slow
+@pytest.mark.ci
+@pytest.mark.parametrize("name", ["brax:inverted_pendulum", "brax:ant"])
+def test_our_trainer_trains_brax_environments(name):
+    env = make(name, episodeLength=100)
+    assert env.episode_length == 100 and env.mj_model.nu == env.action_size
+    policy, metrics = rl.train(env, CONFIG, jax.random.PRNGKey(0), iterations=2)
+    assert np.isfinite(metrics["Loss/value"])
+    assert policy.act(None, jnp.zeros(env.observation_size["policy"])).shape == (env.action_size,)
+
+
+@pytest.mark.slow
+def test_our_trainer_trains_a_playground_environment():
+    pytest.importorskip("mujoco_playground")
+    env = make("playground:CartpoleBalance")
+    _, metrics = rl.train(env, CONFIG, jax.random.PRNGKey(0), iterations=2)
+    assert np.isfinite(metrics["Loss/value"])
+
+
+@pytest.mark.slow
+@pytest.mark.ci
+def test_braxs_trainer_trains_our_task():
+    """Its wrappers count the steps and end the episodes: 200 of Pendulum's steps, rewards of at most 0."""
+    from brax.training.agents.ppo import train as ppo
+
+    seen = []
+    with brax_shim.device_put_replicated():
+        _, params, _ = ppo.train(
+            environment=make("Pendulum"),
+            num_timesteps=256,
+            episode_length=200,
+            num_envs=8,
+            num_eval_envs=4,
+            unroll_length=4,
+            batch_size=4,
+            num_minibatches=2,
+            num_updates_per_batch=1,
+            num_evals=2,
+            progress_fn=lambda steps, metrics: seen.append(metrics),
+        )
+    assert len(seen) == 2
+    assert all(metrics["eval/avg_episode_length"] == 200 for metrics in seen)
+    assert all(-16.3 * 200 <= metrics["eval/episode_reward"] < 0 for metrics in seen)
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves(params))
