@@ -42,7 +42,20 @@ SECTIONS: dict[str, type[Section]] = {
 }  # fmt: skip
 TOP_KEYS = [YAML_NAMES.get(f.name, f.name) for f in dataclasses.fields(Config)]
 TASK_KEYS = ("randomize", "randomization_params")
-RANDOMIZED_KEYS = ("range", "operation", "distribution", "schedule", "schedule_steps", "num_buckets")
+RANDOMIZED_KEYS = (
+    "range",
+    "operation",
+    "distribution",
+    "mean",
+    "sd",
+    "nominal",
+    "include",
+    "exclude",
+    "factor",
+    "unit",
+)
+RANDOMIZED_KEYS += ("schedule", "schedule_steps", "num_buckets")
+NUISANCE_KEYS = ("observations", "actions", "sim_params")  # noise: two numbers of their own meaning, nothing inferred
 REAL_KEYS = ("weights", "means", "stds")
 OPERATIONS = ("scaling", "additive", "absolute")
 
@@ -266,13 +279,13 @@ def _check_ranges(node: Any, path: str, source: str) -> None:
         return
     if "range" in node:
         low_high = coerce(node["range"], tuple[float, ...], f"{path}.range", source)
-        gaussian = node.get("distribution") == "gaussian"  # then the two numbers are mean and variance
-        if len(low_high) != 2 or (low_high[0] >= low_high[1] and not gaussian):
+        if len(low_high) != 2 or low_high[0] >= low_high[1]:
             raise UserError(f"{path}.range = {list(low_high)} ({source}): expected [low, high] with low < high")
         if node.get("operation", "scaling") not in OPERATIONS:
             raise unknown(f"{source}: {path}.operation", str(node["operation"]), OPERATIONS)
     for key, value in node.items():
-        _check_ranges(value, f"{path}.{key}", source)
+        if key not in NUISANCE_KEYS:
+            _check_ranges(value, f"{path}.{key}", source)
 
 
 def _field(cls: type[Section], key: str, value: Any, path: str, source: str) -> Any:

@@ -70,7 +70,8 @@ def _run(config: Config, run: Any, command: Sequence[str], headless: bool) -> in
     device = setup_jax(config)
     env = registry.make(config.task, config=config)
     parts = loop.make(config, env)
-    state, resumed = loop.init(parts), run is not None and bool(run.checkpoints)
+    state: Any = loop.init(parts)
+    resumed = run is not None and bool(run.checkpoints)
     state = state.replace(train=cli.warm_start(state.train, config, env)) if not resumed else state
     if run is None:
         run = runs.Run.create(config.logdir, config.task, config.name, config, command)

@@ -15,7 +15,7 @@ from typing import Any
 from bayessim_mjx.errors import UserError
 
 COLLECT_POLICIES = ("policy_random", "policy_ones", "policy_rl", "policy_rl_randomized", "policy_replay")
-SUMMARIZERS = ("summary_start", "summary_waypts", "summary_corr", "summary_corrdiff", "summary_signatory")
+SUMMARIZERS = ("summary_start", "summary_waypts", "summary_corr", "summary_corrdiff")
 ACTIVATIONS = ("elu", "relu", "selu", "tanh", "swish", "gelu")
 
 
