@@ -9,14 +9,15 @@ import difflib
 import fnmatch
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import mujoco
 import numpy as np
 
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.parameters import attributes, geometry
+from bayessim_mjx.parameters import attributes, elements, geometry
 from bayessim_mjx.parameters.attributes import COMPOSITE, FIELDS, suggest
+from bayessim_mjx.parameters.elements import Element
 from bayessim_mjx.parameters.parameter import OPERATIONS, Parameter
 
 SECTION_KEYS = ("frequency", "observations", "actions", "sim_params", "actor_params", "option", "effects")
@@ -32,14 +33,6 @@ OTHER_GROUPS = ("scale", "color", "effects")
 ACCEPTED = ("schedule", "schedule_steps", "num_buckets", "setup_only")  # BayesSimIG's; a posterior is not scheduled
 SETTINGS = ("range", "operation", "distribution", "mean", "sd", "include", "exclude", "factor", "unit", "nominal")
 DISTRIBUTIONS = {"uniform": "uniform", "loguniform": "loguniform", "log_uniform": "loguniform", "gaussian": "gaussian"}
-
-
-class Element(NamedTuple):
-    """One element of a group: its name in the parameter, and the MuJoCo element it stands for."""
-
-    label: str
-    kind: str
-    target: str
 
 
 def read(section: Mapping[str, Any], model: mujoco.MjModel) -> list[Parameter]:
@@ -76,7 +69,7 @@ def _actor(
     model: mujoco.MjModel, actor: str, groups: Mapping[str, Any], actors: Sequence[str], where: str
 ) -> Iterator[Parameter]:
     _known(groups, (*GROUPS, *OTHER_GROUPS), where)
-    bodies = _bodies(model, actor, actors, where)
+    bodies = elements.of_actor(model, actor, actors, where)
     for group, content in groups.items():
         path = f"{where}.{group}"
         if group == "color":  # looks, not physics
@@ -89,107 +82,26 @@ def _actor(
             yield from _group(model, bodies, group, content or {}, path)
 
 
-def _bodies(model: mujoco.MjModel, actor: str, actors: Sequence[str], where: str) -> list[int]:
-    """Bodies of an actor: the subtree of the body of that name; else the whole model but the other actors' subtrees."""
-    have = attributes.names(model, "body")
-    if actor in have:
-        return attributes.subtree(model, have.index(actor))
-    model_name = model.names[: model.names.index(b"\0")].decode()
-    if len(actors) > 1 and actor != model_name:
-        raise UserError(f"{where}: no actor {actor!r}; {suggest(actor, [model_name, *have[1:]])}")
-    taken = {b for other in actors if other in have for b in attributes.subtree(model, have.index(other))}
-    return [b for b in attributes.subtree(model, 0) if b not in taken]
-
-
 def _group(
     model: mujoco.MjModel, bodies: Sequence[int], group: str, content: Mapping[str, Any], where: str
 ) -> Iterator[Parameter]:
     """Parameters of one group, elements outside attributes, but for dofs attributes outside elements."""
     kind, allowed = GROUPS[group]
     _known(content, allowed, where)
-    elements = _elements(model, bodies, kind)
-    members = {a: _selected(model, elements, kind, a, s or {}, f"{where}.{a}") for a, s in content.items()}
+    available = elements.of_bodies(model, bodies, kind)
+    members = {a: _selected(model, available, kind, a, s or {}, f"{where}.{a}") for a, s in content.items()}
     if kind == "joint":
         pairs = [(e, a) for a in content for e in members[a]]
     else:
         seen = list(dict.fromkeys(e for a in content for e in members[a]))
-        pairs = [(e, a) for e in sorted(seen, key=elements.index) for a in content if e in members[a]]
+        pairs = [(e, a) for e in sorted(seen, key=available.index) for a in content if e in members[a]]
     for e, a in pairs:
         yield _parameter(model, e, kind, a, content[a], f"{where}.{a}")
 
 
-def _elements(model: mujoco.MjModel, bodies: Sequence[int], kind: str) -> list[Element]:
-    """Elements of a kind that belong to the bodies, in MuJoCo's order."""
-    if kind == "option":
-        return [Element("", "option", "option")]
-    have = attributes.names(model, kind)
-    if kind == "body":
-        return [Element(_plain(have[b], "body"), kind, have[b]) for b in bodies]
-    if kind == "geom":
-        return _shapes(model, bodies, have)
-    ids = [i for i in range(len(have)) if _owners(model, kind, i) & set(bodies)]
-    if kind == "joint":  # free joints are no dofs of an actor
-        ids = [i for i in ids if model.jnt_type[i] != int(mujoco.mjtJoint.mjJNT_FREE)]
-    return [Element(_plain(have[i], kind), kind, have[i]) for i in ids]
-
-
-def _plain(name: str, kind: str) -> str:
-    return f"{kind}{name[1:]}" if name.startswith("#") else name
-
-
-def _shapes(model: mujoco.MjModel, bodies: Sequence[int], have: Sequence[str]) -> list[Element]:
-    """Geoms, unnamed ones called like their body (further ones `_1`, `_2`); bodies without geoms as themselves."""
-    body_names, shapes = attributes.names(model, "body"), []
-    used: set[str] = set()
-    for body in bodies:
-        geoms = np.flatnonzero(model.geom_bodyid == body)
-        base = _plain(body_names[body], "body")
-        for g in geoms.tolist():
-            label = _plain(have[g], "geom") if not have[g].startswith("#") else _free(base, used)
-            used.add(label)
-            shapes.append(Element(label, "geom", have[g]))
-        if not len(geoms):
-            shapes.append(Element(base, "body", body_names[body]))
-    return shapes
-
-
-def _free(base: str, used: set[str]) -> str:
-    label, i = base, 0
-    while label in used:
-        i += 1
-        label = f"{base}_{i}"
-    return label
-
-
-def _owners(model: mujoco.MjModel, kind: str, i: int) -> set[int]:
-    """Bodies that an element belongs to."""
-    if kind == "joint":
-        return {int(model.jnt_bodyid[i])}
-    if kind == "tendon":
-        return _wrapped(model, i)
-    obj = int(model.actuator_trnid[i, 0])
-    transmission = mujoco.mjtTrn(int(model.actuator_trntype[i])).name
-    if "TENDON" in transmission:
-        return _wrapped(model, obj)
-    owner = {"JOINT": model.jnt_bodyid, "SITE": model.site_bodyid, "SLIDER": model.site_bodyid}
-    table = next((table for key, table in owner.items() if key in transmission), None)
-    return {obj} if table is None else {int(table[obj])}
-
-
-def _wrapped(model: mujoco.MjModel, tendon: int) -> set[int]:
-    owner = {"JOINT": model.jnt_bodyid, "SITE": model.site_bodyid}
-    start = int(model.tendon_adr[tendon])
-    bodies = set()
-    for w in range(start, start + int(model.tendon_num[tendon])):
-        kind = mujoco.mjtWrap(int(model.wrap_type[w])).name[7:]
-        if kind != "PULLEY":
-            bodies.add(int(owner.get(kind, model.geom_bodyid)[int(model.wrap_objid[w])]))
-    return bodies
-
-
 def _selected(
     model: mujoco.MjModel,
-    elements: Sequence[Element],
+    members: Sequence[Element],
     kind: str,
     attribute: str,
     setting: Mapping[str, Any],
@@ -197,9 +109,9 @@ def _selected(
 ) -> list[Element]:
     """Elements that carry the attribute, restricted by `include` and `exclude` (names or patterns with *)."""
     _known(setting, (*SETTINGS, *ACCEPTED), where)
-    usable = [e for e in elements if e.kind == kind or attribute == "length"]
+    usable = [e for e in members if e.kind == kind or attribute == "length"]
     if kind == "geom" and attribute == "length":  # one length per body, called like its first shape
-        usable = list({_body_of(model, e): e for e in reversed(usable)}.values())[::-1]
+        usable = list({elements.body_of(model, e): e for e in reversed(usable)}.values())[::-1]
     labels = [e.label for e in usable]
     for key in ("include", "exclude"):
         patterns = setting.get(key)
@@ -215,11 +127,6 @@ def _selected(
     return usable
 
 
-def _body_of(model: mujoco.MjModel, e: Element) -> str:
-    names = attributes.names(model, "body")
-    return e.target if e.kind == "body" else names[int(model.geom_bodyid[attributes.element(model, "geom", e.target)])]
-
-
 def _parameter(
     model: mujoco.MjModel, e: Element, kind: str, attribute: str, setting: Mapping[str, Any], where: str
 ) -> Parameter:
@@ -227,7 +134,7 @@ def _parameter(
     name = f"{e.label}_{attribute}".lstrip("_") + ("_mult" if operation == "scaling" else "")
     axis = None
     if attribute == "length":
-        kind, target = "body", _body_of(model, e)
+        kind, target = "body", elements.body_of(model, e)
         axis = geometry.long_axis(model, attributes.element(model, "body", target), f"{where}, {e.label}")
     else:
         target = e.target

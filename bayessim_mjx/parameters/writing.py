@@ -13,6 +13,7 @@ import numpy as np
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.parameters import attributes, constants, geometry
 from bayessim_mjx.parameters.attributes import FIELDS, Field
+from bayessim_mjx.parameters.draft import Draft, follow_geoms
 from bayessim_mjx.parameters.parameter import Parameter
 
 if TYPE_CHECKING:
@@ -21,26 +22,6 @@ if TYPE_CHECKING:
     from bayessim_mjx.parameters.space import ParameterSpace
 
 MIN_RATIO = 0.05  # damping ratio of contacts at restitution 1: undamped contacts never settle
-
-
-class Draft:
-    """Leaves of a model that have been changed so far, by dotted name."""
-
-    def __init__(self, model: "mjx.Model") -> None:
-        self.model = model
-        self.leaves: dict[str, jax.Array] = {}
-        self.resized: set[int] = set()  # geoms whose size changed
-
-    def __getitem__(self, name: str) -> jax.Array:
-        if name in self.leaves:
-            return self.leaves[name]
-        value: Any = self.model
-        for part in name.split("."):
-            value = getattr(value, part)
-        return value
-
-    def __setitem__(self, name: str, value: jax.Array) -> None:
-        self.leaves[name] = value
 
 
 def write(space: "ParameterSpace", model: "mjx.Model", theta: Any) -> "mjx.Model":
@@ -64,7 +45,7 @@ def _changes(physical: tuple[tuple[int, Parameter], ...], model: "mjx.Model", th
             _write_field(draft, field, parameters, values)
         else:
             _COMPOSITE[kind, attribute](draft, parameters, values)
-    _follow_geoms(draft)
+    follow_geoms(draft)
     if draft.resized:
         draft.leaves.update(constants.bounds(model, draft["geom_size"], draft.resized))
     changed = model.tree_replace(draft.leaves)
@@ -277,44 +258,6 @@ def _stretch_anchors(draft: Draft, bodies: Sequence[int], move: Callable[[jax.Ar
     (ids,) = np.nonzero(connect & np.isin(model.eq_obj1id, bodies))
     if len(ids):
         draft["eq_data"] = draft["eq_data"].at[ids, :3].set(move(draft["eq_data"][ids, :3]))
-
-
-def _follow_geoms(draft: Draft) -> None:
-    """Explicit contact pairs whose numbers are what their geoms combine to follow their geoms; others stay."""
-    model = draft.model
-    if not model.npair:
-        return
-    one, two = np.asarray(model.pair_geom1), np.asarray(model.pair_geom2)
-    rank = model.geom_priority[one] - model.geom_priority[two]
-    mix = _mix(model.geom_solmix[one], model.geom_solmix[two])[:, None]
-
-    def friction(values: jax.Array) -> jax.Array:
-        a, b = values[one, 0], values[two, 0]
-        return jnp.where(rank > 0, a, jnp.where(rank < 0, b, jnp.maximum(a, b)))
-
-    def solref(values: jax.Array) -> jax.Array:
-        a, b = values[one], values[two]
-        same = jnp.where(((a[:, 0] > 0) & (b[:, 0] > 0))[:, None], mix * a + (1 - mix) * b, jnp.minimum(a, b))
-        return jnp.where((rank > 0)[:, None], a, jnp.where((rank < 0)[:, None], b, same))
-
-    if "geom_friction" in draft.leaves:
-        nominal, new, pair = friction(model.geom_friction), friction(draft["geom_friction"]), model.pair_friction
-        follows = (jnp.abs(pair[:, :2] - nominal[:, None]) <= 1e-6 * nominal[:, None]).all(-1, keepdims=True)
-        draft["pair_friction"] = pair.at[:, :2].set(jnp.where(follows, new[:, None], pair[:, :2]))
-    if "geom_solref" in draft.leaves:
-        nominal, new = solref(model.geom_solref), solref(draft["geom_solref"])
-        follows = (jnp.abs(model.pair_solref - nominal) <= 1e-6 * jnp.abs(nominal)).all(-1, keepdims=True)
-        draft["pair_solref"] = jnp.where(follows, new, model.pair_solref)
-
-
-def _mix(a: jax.Array, b: jax.Array) -> jax.Array:
-    """Weight of the first geom's contact parameters."""
-    small = float(mujoco.mjMINVAL)
-    return jnp.where(
-        (a >= small) & (b >= small),
-        a / jnp.maximum(a + b, small),
-        jnp.where((a < small) & (b < small), 0.5, jnp.where(a < small, 0.0, 1.0)),
-    )
 
 
 _COMPOSITE: dict[tuple[str, str], Callable[[Draft, Sequence[Parameter], jax.Array], None]] = {
