@@ -43,18 +43,9 @@ SECTIONS: dict[str, type[Section]] = {
 TOP_KEYS = [YAML_NAMES.get(f.name, f.name) for f in dataclasses.fields(Config)]
 TASK_KEYS = ("randomize", "randomization_params")
 RANDOMIZED_KEYS = (
-    "range",
-    "operation",
-    "distribution",
-    "mean",
-    "sd",
-    "nominal",
-    "include",
-    "exclude",
-    "factor",
-    "unit",
-)
-RANDOMIZED_KEYS += ("schedule", "schedule_steps", "num_buckets")
+    "range", "operation", "distribution", "mean", "sd", "nominal", "include", "exclude", "factor", "unit", "schedule",
+    "schedule_steps", "num_buckets", "setup_only",
+)  # fmt: skip
 NUISANCE_KEYS = ("observations", "actions", "sim_params")  # noise: two numbers of their own meaning, nothing inferred
 REAL_KEYS = ("weights", "means", "stds")
 OPERATIONS = ("scaling", "additive", "absolute")
