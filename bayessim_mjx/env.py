@@ -271,7 +271,7 @@ class Task(Env):
 
 
 def _hold_if_diverged(before: World, after: World, speed_limit: float) -> tuple[World, jax.Array]:
-    """(world, sound): a world whose state is no longer finite, or faster than the limit, stays in its last sound state."""
+    """(world, sound): a world that is no longer finite, or faster than the limit, stays in its last sound state."""
     parts = (after.qpos, after.qvel, after.act)
     sound = functools.reduce(jnp.logical_and, [jnp.all(jnp.isfinite(x)) for x in parts])
     sound &= jnp.all(jnp.abs(after.qvel) < speed_limit)

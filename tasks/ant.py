@@ -59,8 +59,8 @@ class Ant(Task):
     control_dt: ClassVar[float] = 1 / 60
     default_episode_length: ClassVar[int] = 1000
     diverged_reward: ClassVar[float] = -2.0
-    # A joint swung through its whole range by the full torque reaches 65 rad/s; one world in a few million steps explodes
-    # (one solver iteration), and a single reward of 1e11 ruins the critic.
+    # A joint swung through its whole range by the full torque reaches 65 rad/s; one world in a few million steps
+    # explodes (one solver iteration), and a single reward of 1e11 ruins the critic.
     speed_limit: ClassVar[float] = 200.0
     observation_names: ClassVar[tuple[str, ...]] = NAMES
     real_parameters: ClassVar[tuple[float, ...]] = (0.9, 1.0, 5.0, 3.4, 0.5, 3.7, 4.8, 4.2, 2.3, *(0.1, 15.0) * 4)
