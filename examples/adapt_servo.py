@@ -11,6 +11,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 from convert_xl330 import RAW, convert
 
@@ -34,8 +35,8 @@ WINDOWS = (0.1, 0.25, 0.5)  # s
 def gap(env: Task, logs: list[Log], theta: Any, seconds: float) -> float:
     """Root mean square of simulated minus logged angle [rad] over all windows of that length, replayed at theta [d]."""
     data = segments(logs, round(seconds / env.dt), dt=env.dt)
-    thetas = np.tile(np.float32(theta), (len(data["qpos0"]), 1))
-    motion = replay(env.physics, data["qpos0"], data["qvel0"], data["command"], thetas)
+    start, speed, command = (jnp.asarray(data[k]) for k in ("qpos0", "qvel0", "command"))
+    motion = replay(env.physics, start, speed, command, jnp.tile(jnp.asarray(theta), (len(start), 1)))
     return float(np.sqrt(np.mean((np.asarray(motion["qpos"]) - data["qpos"]) ** 2)))
 
 
@@ -46,13 +47,15 @@ def adapt(folder: Path, overrides: list[str], seed: int = 0) -> tuple[Task, Dist
     env = registry.make(config.task, config=config)
     parts = loop.make(config, env)
     _, rounds = loop.run(parts, loop.init(parts))
-    return env, rounds[-1].posterior
+    posterior = rounds[-1].posterior
+    assert isinstance(env, Task) and posterior is not None
+    return env, posterior
 
 
 def show(env: Task, logs: list[Log], posterior: Distribution) -> None:
     """Two tables: parameters (posterior against published values) and gaps."""
     mean, sd = np.asarray(posterior.mean()), np.asarray(posterior.sd())
-    rows = {**PUBLISHED, "posterior mean": mean}
+    rows: dict[str, Any] = {**PUBLISHED, "posterior mean": mean}
     print(f"\n{'':30}" + "".join(f"{name:>16}" for name in env.space.names))
     for label, values in {**rows, "posterior sd": sd}.items():
         print(f"{label:30}" + "".join(f"{v:16.4f}" for v in values))
