@@ -137,8 +137,9 @@ class Distribution:
         The mass of each component is exact; its shape is the Gaussian's marginal, truncated (exact where the
         parameters left out are not correlated with those kept, or not cut off by the box).
         """
-        leaves = evaluate.marginal(self, tuple(self.space.index(name) for name in names))
-        return Distribution.from_unit(self.space.subset(names), *leaves, prior_weight=self.prior_weight)
+        index = tuple(self.space.index(name) for name in names)
+        logits, means, scales = evaluate.marginal(self, index)
+        return Distribution.from_unit(self.space.subset(names), logits, means, scales, self.prior_weight)
 
     # ---- mixture algebra (on the host) --------------------------------------------------------------------------
     def product(self, *others: Distribution, components: int | None = None) -> Distribution:

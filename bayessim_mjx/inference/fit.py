@@ -103,10 +103,14 @@ def condition(state: FitState, x: Array) -> Distribution:
 
 @jax.jit
 def _condition(state: FitState, x: Array) -> Distribution:
-    d = len(state.space)
-    z, _ = _standardise(x, state.x_mean, state.x_rate, state.settings.clip)
-    logits, means, scales = mdn.mixture(state.params, z, d, state.settings)
-    return jax.vmap(partial(Distribution.from_unit, state.space))(logits, means, scales)
+    return _posteriors(state, _standardise(x, state.x_mean, state.x_rate, state.settings.clip)[0])
+
+
+def _posteriors(state: FitState, z: Array) -> Distribution:
+    """Standardised summaries [n, D] -> batched Distribution, a trace of the prior mixed in."""
+    leaves = mdn.mixture(state.params, z, len(state.space), state.settings)
+    build = partial(Distribution.from_unit, state.space, prior_weight=state.settings.defensive)
+    return jax.vmap(build)(*leaves)
 
 
 def schedule_length(settings: InferenceSettings, capacity: int) -> tuple[int, int]:
@@ -155,10 +159,10 @@ def _fit(key: Array, state: FitState, thetas: Array, x: Array, count: Array) -> 
         best = jax.tree.map(lambda a, b: jnp.where(better, a, b), candidate, best)
         return (inner, best), (jnp.mean(losses), value)
 
-    start = (state.params, optimiser.init(state.params), jnp.asarray(0, jnp.int32))
-    # a network that has not seen data yet is no candidate
-    value = jnp.where(state.fits == 0, jnp.inf, _held_out_loss(state.params, data, settings))
-    best = (value, state.params, jnp.asarray(-1, jnp.int32))
+    linear = mdn.linear_start(state.params, data.x, data.y, data.train.astype(jnp.float32), settings)
+    params = jax.tree.map(lambda a, b: jnp.where(state.fits == 0, a, b), linear, state.params)
+    start = (params, optimiser.init(params), jnp.asarray(0, jnp.int32))
+    best = (_held_out_loss(params, data, settings), params, jnp.asarray(-1, jnp.int32))
     inputs = jnp.arange(points, dtype=jnp.int32), jax.random.split(key, points)
     (inner, best), (train_loss, val_loss) = jax.lax.scan(point, (start, best), inputs)
 
@@ -228,8 +232,7 @@ def _held_out_loss(params: Any, data: _Data, settings: InferenceSettings) -> Arr
 
 def _truncated_scores(state: FitState, data: _Data, thetas: Array) -> dict[str, Array]:
     rows, mask = data.held[:SCORED], data.mask[:SCORED]
-    logits, means, scales = mdn.mixture(state.params, data.x[rows], thetas.shape[1], state.settings)
-    posterior = jax.vmap(partial(Distribution.from_unit, state.space))(logits, means, scales)
+    posterior = _posteriors(state, data.x[rows])
     truth = jnp.where(mask[:, None] > 0, thetas[rows], jnp.asarray(state.space.nominal)[None, :])
     gain = jax.vmap(lambda q, theta: q.log_gain(theta))(posterior, truth)
     prior = jax.vmap(state.space.log_prior)(truth)

@@ -16,6 +16,7 @@ from jax import Array
 from bayessim_mjx.inference.settings import InferenceSettings
 
 Params = dict[str, Any]
+RIDGE_LIMIT = 1024  # features up to which linear_start is worth its cost
 SPREAD = np.float32(np.sqrt(12.0))  # 1 / sd of Uniform[0, 1]
 
 
@@ -43,6 +44,36 @@ def init(key: Array, settings: InferenceSettings, dim_x: int, d: int) -> Params:
     biases = layers[-1]["b"].at[k : k + k * d].set(0.7 * jax.random.normal(keys[-1], (k * d,)))
     layers[-1] = {**layers[-1], "b": biases}
     return {"layers": layers, "skip": jnp.zeros((dim_x, sizes[-1]))}
+
+
+def linear_start(params: Params, x: Array, y: Array, weights: Array, settings: InferenceSettings) -> Params:
+    """Set the linear path to the ridge regression of y [n, d] on x [n, D] and every component to its residuals.
+
+    Training then starts at the best linear-Gaussian posterior instead of the prior; components keep their spread, in
+    units of the residual sd. `weights` [n] are 1 for rows to use and 0 for the rest. No change beyond RIDGE_LIMIT
+    features, where the normal equations would cost more than they save.
+    """
+    (dim_x, d), k = (x.shape[1], y.shape[1]), settings.components
+    if dim_x > RIDGE_LIMIT or d == 0:
+        return params
+    n = jnp.maximum(jnp.sum(weights), 1.0)
+    gram = (x * weights[:, None]).T @ x / n + 1e-3 * jnp.eye(dim_x)
+    mean = weights @ y / n
+    slope = jnp.linalg.solve(gram, (x * weights[:, None]).T @ (y - mean[None, :]) / n)  # [D, d]
+    residual = (y - mean[None, :] - x @ slope) * weights[:, None]
+    chol = jnp.linalg.cholesky(residual.T @ residual / n + 1e-4 * jnp.eye(d))
+    sd = jnp.sqrt(jnp.sum(chol * chol, axis=1))
+    factor = jax.scipy.linalg.solve_triangular(chol, jnp.eye(d), lower=True)
+    if not settings.fullCovariance:
+        factor = jnp.diag(1.0 / sd)
+    last = params["layers"][-1]
+    spread = last["b"][k : k + k * d].reshape(k, d)
+    log_diagonal = 8 * jnp.arctanh(jnp.log(jnp.diagonal(factor)) / 8)
+    parts = [jnp.zeros(k), (mean[None, :] + spread * sd[None, :]).reshape(-1), jnp.tile(log_diagonal, k)]
+    if settings.fullCovariance:
+        parts.append(jnp.tile(factor[np.tril_indices(d, -1)], k))
+    skip = params["skip"].at[:, k : k + k * d].set(jnp.tile(slope, (1, k)))
+    return {"layers": [*params["layers"][:-1], {**last, "b": jnp.concatenate(parts)}], "skip": skip}
 
 
 def forward(params: Params, x: Array, d: int, settings: InferenceSettings) -> tuple[Array, Array, Array]:

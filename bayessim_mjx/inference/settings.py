@@ -25,6 +25,7 @@ class InferenceSettings:
     grad_clip: float = 5.0  # global norm
     validation: float = 0.1  # share of rows held out
     clip: float = 10.0  # standardised inputs are clipped to +-clip
+    defensive: float = 1e-4  # prior mass in every posterior: one that is wildly wrong cannot veto the others
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "hiddenLayers", tuple(int(width) for width in self.hiddenLayers))
@@ -35,6 +36,8 @@ class InferenceSettings:
                 raise ValueError(f"{name} = {getattr(self, name)!r} must be positive")
         if not 0 < self.validation < 1:
             raise ValueError(f"validation = {self.validation!r} must lie between 0 and 1")
+        if not 0 <= self.defensive < 1:
+            raise ValueError(f"defensive = {self.defensive!r} must lie in [0, 1)")
         if any(width < 1 for width in self.hiddenLayers):
             raise ValueError(f"hiddenLayers = {self.hiddenLayers!r}: widths must be positive")
 
