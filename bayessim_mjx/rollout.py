@@ -112,9 +112,9 @@ def _seen(state: State) -> tuple[jax.Array, jax.Array, jax.Array]:
 
 
 def _command(env: Env, action: jax.Array) -> jax.Array:
-    """Actuator commands [N, nu] of the actions [N, A] (empty without physics of ours)."""
+    """Actuator commands [N, nu] of the actions [N, A], clipped as by the task (empty without physics of ours)."""
     command = getattr(env, "command", None)
-    return jnp.zeros((action.shape[0], 0)) if command is None else jax.vmap(command)(action)
+    return jnp.zeros((action.shape[0], 0)) if command is None else jax.vmap(command)(jnp.clip(action, -1.0, 1.0))
 
 
 def replay(

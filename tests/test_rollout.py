@@ -11,8 +11,9 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parent / "rl"))
 import probes  # noqa: E402
 
+from bayessim_mjx.registry import make  # noqa: E402
 from bayessim_mjx.rl import networks, normalise  # noqa: E402
-from bayessim_mjx.rollout import _stride, collect, rollout  # noqa: E402
+from bayessim_mjx.rollout import _stride, collect, replay, rollout  # noqa: E402
 
 
 def key(seed):
@@ -112,3 +113,20 @@ def test_a_termination_on_the_last_step_is_no_truncation():
 def test_a_world_goes_through_the_whole_pool_before_repeating(worlds):
     stride = _stride(worlds)
     assert len({k * stride % worlds for k in range(worlds)}) == worlds
+
+
+def test_replaying_the_commands_gives_the_motion_back():
+    """A rollout of a task records what its motors were told: the same commands in the same worlds move it alike."""
+    env = make("Pendulum")
+    thetas = jnp.array([[1.0, 1.0], [0.5, 1.5]])
+    t = rollout(env, lambda key, obs: jax.random.uniform(key, (1,), minval=-2.0, maxval=2.0), key(0), thetas, 5)
+    assert t.qpos.shape == (2, 6, 1) and t.command.shape == (2, 5, 1)
+    np.testing.assert_allclose(t.command[..., 0], 2 * np.clip(t.action[..., 0], -1, 1), rtol=1e-6)
+    np.testing.assert_allclose(t.observation[..., 2], t.qvel[..., 0], rtol=1e-6)
+    again = replay(env.physics, t.qpos[:, 0], t.qvel[:, 0], t.command, thetas)
+    np.testing.assert_allclose(again["qpos"], t.qpos, atol=1e-5)
+    np.testing.assert_allclose(again["qvel"], t.qvel, atol=1e-5)
+    other = replay(env.physics, t.qpos[:, 0], t.qvel[:, 0], t.command, thetas[::-1])
+    assert np.abs(other["qpos"] - t.qpos).max() > 0.01
+    with pytest.raises(ValueError, match=r"qpos0 \(1, 1\).*same N"):
+        replay(env.physics, t.qpos[:1, 0], t.qvel[:, 0], t.command, thetas)

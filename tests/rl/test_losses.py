@@ -191,3 +191,12 @@ def test_the_remainder_is_left_out_at_random():
     left = [set(range(10)) - set(row.tolist()) for row in index]
     assert all(len(s) == 1 for s in left)
     assert len(set.union(*left)) > 1
+
+
+def test_every_transition_is_used_once_per_epoch():
+    """At rate 0 nothing moves: the minibatches' mean losses average to that of the whole batch, in each epoch."""
+    params, batch = example()
+    *_, metrics = optimise(params, batch, config(num_epochs=2, num_minibatches=8), rate=0.0)
+    whole = float((batch.advantage**2).mean())
+    np.testing.assert_allclose(metrics["Loss/value"].reshape(2, 8).mean(1), whole, rtol=1e-5)
+    assert metrics["Loss/value"].std() > 0

@@ -48,6 +48,7 @@ def test_training_in_two_halves_is_training_at_once():
     resumed, _ = rl.run(WALK, CONFIG, saved, iterations=3)
     assert_bitwise(whole, resumed)
     assert (int(whole.iteration), int(whole.env_steps)) == (6, 6 * 16 * 8)
+    assert (half.key != start.key).any() and (whole.key != half.key).any()
     policy, _ = rl.train(WALK, CONFIG, key(9), state=half, iterations=3)
     assert_bitwise(policy, rl.policy_of(whole))
 
