@@ -25,8 +25,7 @@ SignedPermutation = tuple[np.ndarray, np.ndarray]
 VARIANTS = ("isaacgymenvs", "bayessim2021")
 
 
-@struct.dataclass
-class State:
+class State(struct.PyTreeNode):
     """What `reset` and `step` return; Brax's field names.
 
     Attributes:
@@ -197,7 +196,8 @@ class Task(Env):
         return self._begin(jax.random.PRNGKey(0), qpos, qvel, theta)
 
     def _begin(self, key: jax.Array, qpos: jax.Array, qvel: jax.Array, theta: jax.Array | None) -> State:
-        world = self.physics.world(self.space.nominal if theta is None else theta, qpos, qvel)
+        theta = jnp.asarray(self.space.nominal) if theta is None else theta
+        world = self.physics.world(theta, qpos, qvel)
         world = world.replace(task={"steps": jnp.zeros((), jnp.int32)} | self.start(key, world))
         data, action = self.physics.kinematics(world), jnp.zeros(self.action_size)
         metrics = jax.eval_shape(lambda: self.reward(world, world, data, action)[2])

@@ -28,8 +28,7 @@ _EULER, _RK4, _IMPLICITFAST = (
 Memory = tuple[tuple, jax.Array]  # (memories of the effects, their last forces [effects, nv])
 
 
-@struct.dataclass
-class World:
+class World(struct.PyTreeNode):
     """Everything the next control step of one world needs. Lean: no `mjx.Data`; `vmap` adds leading axes.
 
     Attributes:
@@ -91,7 +90,7 @@ class Physics:
         self.dt = float(self.substeps * mj_model.opt.timestep)
         if int(mj_model.opt.integrator) not in (_EULER, _RK4, _IMPLICITFAST):
             raise ValueError(f"integrator {mj_model.opt.integrator}: MJX has Euler, RK4 and implicitfast")
-        self.max_qvel = None if max_qvel is None else np.broadcast_to(np.float32(max_qvel), (mj_model.nv,))
+        self.max_qvel = None if max_qvel is None else np.broadcast_to(np.asarray(max_qvel, np.float32), (mj_model.nv,))
         self.model = mjx.put_model(mj_model, impl="jax")
         self.template = mjx.make_data(mj_model, impl="jax")
         self._memory = tuple(effect.init(self) for effect in self.effects)
@@ -169,9 +168,9 @@ def _substeps(control_dt: float, timestep: float) -> int:
 
 def _changed(nominal: mjx.Model, model: mjx.Model) -> dict[str, jax.Array]:
     """Leaves of `model` that are not the nominal objects, by dotted name."""
-    before, structure = jax.tree_util.tree_flatten_with_path(nominal)
-    after, new_structure = jax.tree_util.tree_flatten(model)
-    if structure != new_structure:
+    before, _ = jax.tree_util.tree_flatten_with_path(nominal)
+    after = jax.tree.leaves(model)
+    if jax.tree.structure(nominal) != jax.tree.structure(model):
         raise ValueError("an effect or parameter changed the structure of the model; only array values may change")
     pairs = zip(before, after, strict=True)
     return {_dotted(path): new for (path, old), new in pairs if new is not old}

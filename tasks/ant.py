@@ -5,7 +5,7 @@ Joint stiffness, when randomised, is a passive spring about q = 0 (springref 0),
 """
 
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -44,7 +44,7 @@ def _mirror() -> dict[str, tuple[np.ndarray, np.ndarray]]:
     wrench = np.concatenate([POLAR, AXIAL])
     feet = (28 + 6 * np.array([3, 2, 1, 0])[:, None] + np.arange(6)).ravel()
     perm = [np.arange(12), 12 + LEG_PERM, 20 + LEG_PERM, feet, 52 + LEG_PERM]
-    sign = [[1], POLAR, AXIAL, [-1, -1, -1, 1, 1], LEG_SIGN, LEG_SIGN, np.tile(wrench, 4), LEG_SIGN]
+    sign: list[Any] = [[1], POLAR, AXIAL, [-1, -1, -1, 1, 1], LEG_SIGN, LEG_SIGN, np.tile(wrench, 4), LEG_SIGN]
     observation = (np.concatenate(perm), np.concatenate(sign).astype(np.float32))
     return {"observation": observation, "action": (LEG_PERM, LEG_SIGN.astype(np.float32))}
 

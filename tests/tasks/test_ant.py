@@ -109,7 +109,8 @@ def test_reward_by_hand(compiled):
     after = task.step(before, action)
     q, v = (np.asarray(x, np.float64) for x in (after.pipeline_state.qpos, after.pipeline_state.qvel))
     obs = np.asarray(after.obs["policy"])
-    progress = 60 * (np.hypot(1000 - qpos[:, 0], qpos[:, 1]) - np.hypot(1000 - q[:, 0], q[:, 1]))
+    q_before = qpos.astype(np.float64)
+    progress = 60 * (np.hypot(1000 - q_before[:, 0], q_before[:, 1]) - np.hypot(1000 - q[:, 0], q[:, 1]))
     heading = obs[:, 11]
     want = progress + 0.5 + 0.1 * (obs[:, 10] > 0.93) + np.where(heading > 0.8, 0.5, 0.5 * heading / 0.8)
     want -= 0.005 * (action**2).sum(1) + 0.05 * np.abs(action * 0.2 * v[:, 6:]).sum(1)
