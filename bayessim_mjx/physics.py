@@ -170,8 +170,7 @@ def _changed(nominal: mjx.Model, model: mjx.Model) -> dict[str, jax.Array]:
     """Leaves of `model` that are not the nominal objects, by dotted name."""
     before, _ = jax.tree_util.tree_flatten_with_path(nominal)
     after = jax.tree.leaves(model)
-    same = jax.tree.structure(nominal) == jax.tree.structure(model)
-    if not same:
+    if jax.tree.structure(nominal) != jax.tree.structure(model):  # type: ignore[operator]  # jaxlib's stubs
         raise ValueError("an effect or parameter changed the structure of the model; only array values may change")
     pairs = zip(before, after, strict=True)
     return {_dotted(path): new for (path, old), new in pairs if new is not old}
