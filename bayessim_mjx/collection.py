@@ -1,7 +1,7 @@
 """Trajectories for inference: who acts while they are collected, and where the real ones come from.
 
-A *source* gives real trajectories one at a time: a surrogate real (the simulator at hidden parameters) or recorded logs.
-Both are turned into summaries by the same function as the simulated trajectories, so the features always mean the same.
+A *source* gives real trajectories: a surrogate real (the simulator at hidden parameters) or recorded logs. Both are
+turned into summaries by the same function as the simulated trajectories, so the features always mean the same.
 """
 
 from __future__ import annotations
@@ -260,7 +260,8 @@ def _row(key: str, row: Any, space: ParameterSpace) -> np.ndarray:
         return np.full(len(space), float(row[0]))
     if len(row) != len(space):
         raise UserError(
-            f"env.realParams.{key} has {len(row)} numbers, the task has {len(space)} parameters: {', '.join(space.names)}"
+            f"env.realParams.{key} has {len(row)} numbers, the task has {len(space)} parameters: "
+            f"{', '.join(space.names)}"
         )
     return np.asarray([float(value) for value in row])
 

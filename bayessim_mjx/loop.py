@@ -26,7 +26,7 @@ from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.env import Env
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.rl import Policy, TrainState
-from bayessim_mjx.rollout import Trajectory, replay
+from bayessim_mjx.rollout import Trajectory, replay, select
 
 CHUNK = 2500  # trajectories simulated at once while collecting
 KEPT_ROUNDS = 4  # rounds of simulated trajectories kept for the fit where the collection policy does not change
@@ -61,7 +61,7 @@ class RoundInfo:
     real: Trajectory | None  # this round's real trajectories
     predictive: (
         dict[str, np.ndarray] | None
-    )  # qpos [n, T+1, nq], qvel: the first of them, re-simulated from the posterior
+    )  # qpos [n, T+1, nq], qvel: the first one, re-simulated
     fit: dict[str, Any]
     scores: dict[str, float]  # log p(truth), gain over the prior, credible level, contraction per parameter
     seconds: dict[str, float]
@@ -261,14 +261,11 @@ def _infer(loop: Loop, state: LoopState, policy: Policy, info: RoundInfo) -> Loo
     real_features, real = source.real(loop.key(round_, "real"), seen, b.realTrajs, policy)
     all_features = jax.lax.dynamic_update_slice(state.real_features, real_features, (seen, 0))
     posteriors = inference.condition(network, all_features)
+    posteriors = posteriors.replace(prior_weight=jnp.full_like(posteriors.prior_weight, b.priorShare))
     if b.collectPolicy in POLICY_DEPENDENT:
         # An older trajectory was made by an older policy: its posterior stays that of the network of its time.
         new = jnp.arange(all_features.shape[0]) >= seen
-        posteriors = jax.tree.map(
-            lambda old, now: jnp.where(new.reshape(-1, *[1] * (now.ndim - 1)), now, old),
-            state.real_posteriors,
-            posteriors,
-        )
+        posteriors = select(new, posteriors, state.real_posteriors)
     domain = inference.combine(posteriors.split()[: seen + b.realTrajs], b.components)
     info.posterior, info.real = domain, jax.tree.map(np.asarray, real)
     info.scores = score(domain, source.truth)
@@ -312,7 +309,8 @@ def run(
 ) -> tuple[LoopState, list[RoundInfo]]:
     """All rounds from `state` on. Checkpoints every ppo.save_interval iterations and after each round.
 
-    A round's checkpoint holds the *state after* it and the policy that was evaluated in it, so that "best" is the best evaluated policy.
+    A round's checkpoint holds the state *after* it and the policy that was evaluated in it, so that "best" is the best
+    evaluated policy.
     """
     infos = []
     while int(state.round) < loop.settings.realIters:

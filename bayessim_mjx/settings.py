@@ -195,7 +195,10 @@ class BayesSimConfig(Section):
     components: int = setting(10, "mixture components", low=1)
     fullCovariance: bool = setting(False, "full covariance per component")
     hiddenLayers: tuple[int, ...] = setting((128, 128), "widths of the network", low=1)
-    lr: float = setting(1e-4, "Adam learning rate of the network", above=0)
+    lr: float = setting(2e-3, "peak learning rate of the network (cosine; BayesSimIG: 1e-4, constant)", above=0)
+    priorShare: float = setting(
+        0.05, "prior mixed into each trajectory's posterior: a misjudged one cannot rule out the truth", low=0, high=1
+    )
     realEvals: int = setting(100, "surrogate-real episodes that score the policy each round", low=1)
     realTrajs: int = setting(1, "real trajectories used for inference each round (they accumulate)", low=1)
     realIters: int = setting(100, "rounds of the outer loop", low=1)

@@ -202,7 +202,7 @@ def coordinate_names(mj_model: Any, kind: str) -> list[str]:
 
 
 def round_line(info: RoundInfo) -> dict[str, Any]:
-    """The numbers of the console's line for a round; a width is the posterior's sd over the prior's, narrowest first."""
+    """The numbers of the console's line for a round; a width is posterior sd / prior sd, narrowest first."""
     widths = {}
     if info.posterior is not None:
         relative = np.sqrt(np.maximum(0.0, 1.0 - np.asarray(info.posterior.contraction())))

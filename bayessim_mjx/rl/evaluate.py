@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
@@ -22,7 +23,7 @@ def evaluate(
     thetas = jnp.asarray(thetas, jnp.float32)
     if thetas.ndim != 2:
         raise ValueError(f"thetas has shape {thetas.shape}: expected [episodes, parameters]")
-    return _evaluate(env)(policy.replace(deterministic=deterministic), key, thetas)
+    return _evaluate(env)(dataclasses.replace(policy, deterministic=deterministic), key, thetas)
 
 
 @lru_cache(maxsize=32)

@@ -1,5 +1,6 @@
 """Proximal policy optimisation (Schulman et al. 2017): the losses, and the epochs of minibatches over one batch."""
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -114,7 +115,7 @@ def optimise(
     flat, unravel = ravel_pytree(params)
     old_log_std = params["actor"]["log_std"]
     if not config.normalize_advantage_per_minibatch:
-        batch = batch.replace(advantage=standardise(batch.advantage))
+        batch = dataclasses.replace(batch, advantage=standardise(batch.advantage))
     order = minibatches(key, config.num_epochs, batch.advantage.shape[0], config.num_minibatches)
 
     def step(carry: tuple[Any, Any, Any], now: tuple[jax.Array, jax.Array]) -> tuple[Any, dict]:

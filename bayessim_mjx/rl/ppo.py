@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
@@ -72,7 +73,7 @@ def _stagger(key: jax.Array, state: State, episode_length: int) -> tuple[State, 
     world = state.pipeline_state
     if "steps" in getattr(world, "task", {}):  # our tasks count in the world, the others in info
         world = world.replace(task={**world.task, "steps": steps})
-    state = state.replace(pipeline_state=world, info={**state.info, "steps": steps})
+    state = dataclasses.replace(state, pipeline_state=world, info={**state.info, "steps": steps})
     return state, (steps > 0).astype(jnp.float32)
 
 

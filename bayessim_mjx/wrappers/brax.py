@@ -4,6 +4,7 @@ They have no parameters of ours: their space is empty and theta is ignored. (The
 follow Brax's protocol as they are.)
 """
 
+import dataclasses
 import difflib
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
@@ -37,7 +38,7 @@ class BraxEnv(Env):
     def step(self, state: State, action: jax.Array) -> State:
         inner = self.env.step(state.pipeline_state, jnp.clip(action, -1.0, 1.0))
         after = self._state(_like(inner, state.pipeline_state), state.info["steps"] + 1)
-        return after.replace(info={**state.info, **after.info})
+        return dataclasses.replace(after, info={**state.info, **after.info})
 
     def _state(self, inner: Any, steps: jax.Array) -> State:
         obs, done = _groups(inner.obs), inner.done

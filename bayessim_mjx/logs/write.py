@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.recordings.log import Array, Log
+from bayessim_mjx.logs.log import Array, Log
 
 
 def write_log(path: str | Path, log: Log, velocity: bool | None = None) -> Path:

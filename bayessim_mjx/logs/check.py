@@ -11,8 +11,8 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.recordings.log import Array, Channels, suggest
-from bayessim_mjx.recordings.table import Table
+from bayessim_mjx.logs.log import Array, Channels, suggest
+from bayessim_mjx.logs.table import Table
 
 _STREAMS = ("ctrl", "qpos", "qvel", "effort", "enabled")
 

@@ -7,7 +7,7 @@ from scipy.interpolate import CubicSpline
 from scipy.ndimage import uniform_filter1d
 from scipy.signal import savgol_coeffs, savgol_filter
 
-from bayessim_mjx.recordings.log import Array, Channels
+from bayessim_mjx.logs.log import Array, Channels
 
 MAX_WINDOW = 0.25  # s, the longest smoothing window
 _POLYNOMIAL = 3

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.recordings.log import Array
+from bayessim_mjx.logs.log import Array
 
 _WORDS = {"true": 1.0, "false": 0.0, "": float("nan")}
 

@@ -12,11 +12,11 @@ import numpy as np
 
 from bayessim_mjx.config import read_yaml
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.recordings.check import check_channels, check_motion, check_time
-from bayessim_mjx.recordings.log import Array, Channels, Log, suggest
-from bayessim_mjx.recordings.mapping import LogMap
-from bayessim_mjx.recordings.signals import estimate_velocity, noise_level
-from bayessim_mjx.recordings.table import Table, read_csv, read_npz
+from bayessim_mjx.logs.check import check_channels, check_motion, check_time
+from bayessim_mjx.logs.log import Array, Channels, Log, suggest
+from bayessim_mjx.logs.mapping import LogMap
+from bayessim_mjx.logs.signals import estimate_velocity, noise_level
+from bayessim_mjx.logs.table import Table, read_csv, read_npz
 
 MIN_ROWS = 10
 MAX_GAP = 5.0  # sample periods without a sample after which a file is cut in two

@@ -11,8 +11,8 @@ import numpy as np
 
 from bayessim_mjx.config import read_yaml
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.recordings.log import Array, suggest
-from bayessim_mjx.recordings.table import Table
+from bayessim_mjx.logs.log import Array, suggest
+from bayessim_mjx.logs.table import Table
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.recordings.log import Array, Log
+from bayessim_mjx.logs.log import Array, Log
 
 
 def is_even(log: Log, dt: float) -> bool:
