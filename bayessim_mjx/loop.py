@@ -59,9 +59,7 @@ class RoundInfo:
     returns: np.ndarray  # [n] on the real side (surrogate) or under the domain (logs)
     lengths: np.ndarray
     real: Trajectory | None  # this round's real trajectories
-    predictive: (
-        dict[str, np.ndarray] | None
-    )  # qpos [n, T+1, nq], qvel: the first one, re-simulated
+    predictive: dict[str, np.ndarray] | None  # qpos [n, T+1, nq], qvel: the first one, re-simulated
     fit: dict[str, Any]
     scores: dict[str, float]  # log p(truth), gain over the prior, credible level, contraction per parameter
     seconds: dict[str, float]

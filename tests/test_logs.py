@@ -9,7 +9,7 @@ import pytest
 
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs import Channels, Log, estimate_velocity, noise, read_logs, resample, segments, write_log
-from bayessim_mjx.recordings.signals import noise_level, quantum
+from bayessim_mjx.logs.signals import noise_level, quantum
 
 ARM = """
 <mujoco>

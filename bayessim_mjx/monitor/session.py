@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from bayessim_mjx.config import Config
+from bayessim_mjx.logs import Channels
 from bayessim_mjx.loop import LoopState, RoundInfo
 from bayessim_mjx.monitor import plots, video
 from bayessim_mjx.monitor.compile_clock import CompileClock
@@ -181,24 +182,13 @@ def channels(mj_model: Any, info: RoundInfo) -> tuple[dict[str, np.ndarray], dic
     """Measured positions and velocities by name: real [T+1], simulated [n, T+1]; NaN after the end of an episode."""
     assert info.real is not None and info.predictive is not None
     valid = np.concatenate([[True], np.asarray(info.real.valid[0]) > 0])
-    real, simulated = {}, {}
-    for kind, size in (("qpos", mj_model.nq), ("qvel", mj_model.nv)):
-        names = coordinate_names(mj_model, kind)
-        for k in range(size):
-            name = f"{kind}:{names[k]}"
+    real, simulated, named = {}, {}, Channels.of(mj_model)
+    for kind in ("qpos", "qvel"):
+        for k, channel in enumerate(getattr(named, kind)):
+            name = f"{kind}:{channel}"
             real[name] = np.where(valid, np.asarray(getattr(info.real, kind))[0, :, k], np.nan)
             simulated[name] = np.where(valid, info.predictive[kind][:, :, k], np.nan)
     return real, simulated
-
-
-def coordinate_names(mj_model: Any, kind: str) -> list[str]:
-    """A name per entry of qpos or qvel: the joint's, with an index where it has several."""
-    widths = {"qpos": (7, 4, 1, 1), "qvel": (6, 3, 1, 1)}[kind]
-    names = []
-    for j in range(mj_model.njnt):
-        name, width = mj_model.joint(j).name or f"joint{j}", widths[int(mj_model.jnt_type[j])]
-        names += [name] if width == 1 else [f"{name}[{i}]" for i in range(width)]
-    return names
 
 
 def round_line(info: RoundInfo) -> dict[str, Any]:
