@@ -265,6 +265,10 @@ def _infer(loop: Loop, state: LoopState, policy: Policy, info: RoundInfo) -> Loo
         new = jnp.arange(all_features.shape[0]) >= seen
         posteriors = select(new, posteriors, state.real_posteriors)
     domain = inference.combine(posteriors.split()[: seen + b.realTrajs], b.components)
+    domain = inference.restore_prior(domain, network.identified)
+    unknown = [n for n, known in zip(domain.names, np.asarray(network.identified), strict=True) if not known]
+    if unknown:
+        info.warnings.append(f"not identified by these trajectories, kept at the prior: {', '.join(unknown)}")
     info.posterior, info.real = domain, jax.tree.map(np.asarray, real)
     info.scores = score(domain, source.truth)
     info.predictive = _predict(loop, domain, real, loop.key(round_, "predict"))

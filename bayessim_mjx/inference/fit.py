@@ -17,7 +17,7 @@ from flax import struct
 from jax import Array
 
 from bayessim_mjx.distributions import Distribution
-from bayessim_mjx.inference import mdn
+from bayessim_mjx.inference import identify, mdn
 from bayessim_mjx.inference.settings import InferenceSettings
 
 GOLDEN = np.uint32(2654435769)  # 2^32 / golden ratio: spreads the validation rows evenly over any number of rows
@@ -33,6 +33,7 @@ class FitState:
     x_mean: Array  # [D]
     x_rate: Array  # [D] 1 / sd of the first fit's data; 0 drops a constant column
     fits: Array  # [] int32, fits done so far
+    identified: Array  # [d] bool, parameters whose marginal beats the prior on the last fit's held-out rows
     settings: InferenceSettings = struct.field(pytree_node=False)
     space: Any = struct.field(pytree_node=False)
 
@@ -49,6 +50,8 @@ class FitInfo:
     gain_truncated: Array  # [] the same for the truncated density, over the first 256 held-out rows
     log_q: Array  # [] truncated log density in theta units: gain_truncated + log p(theta)
     inside: Array  # [] mean mass of the untruncated mixture inside the box
+    parameter_gain: Array  # [d] the same for each parameter's marginal by itself
+    identified: Array  # [d] bool: that gain is significant and relevant
     clipped: Array  # [] share of input entries clipped
     n_train: Array  # []
     n_val: Array  # []
@@ -69,7 +72,8 @@ def init(key: Array, settings: InferenceSettings, space: Any, dim_x: int) -> Fit
     if dim_x < 1:
         raise ValueError(f"dim_x = {dim_x}: a summary needs at least one feature")
     params = mdn.init(key, settings, dim_x, len(space))
-    return FitState(params, jnp.zeros(dim_x), jnp.ones(dim_x), jnp.asarray(0, jnp.int32), settings, space)
+    known, fits = jnp.ones(len(space), bool), jnp.asarray(0, jnp.int32)
+    return FitState(params, jnp.zeros(dim_x), jnp.ones(dim_x), fits, known, settings, space)
 
 
 def fit(
@@ -167,6 +171,10 @@ def _fit(key: Array, state: FitState, thetas: Array, x: Array, count: Array) -> 
     (inner, best), (train_loss, val_loss) = jax.lax.scan(point, (start, best), inputs)
 
     state = replace(state, params=best[1], fits=state.fits + 1)
+    held = mdn.mixture(state.params, data.x[data.held], thetas.shape[1], settings)
+    marginals = identify.marginal_gain(*held, mdn.from_y(data.y[data.held]))
+    parameter_gain, identified = identify.identified(marginals, data.mask)
+    state = replace(state, identified=identified)
     constant = np.float32(thetas.shape[1] * np.log(mdn.SPREAD))  # density of y -> density of u
     info = FitInfo(
         train_loss=train_loss - constant,
@@ -175,6 +183,8 @@ def _fit(key: Array, state: FitState, thetas: Array, x: Array, count: Array) -> 
         best=best[2],
         gain=constant - _held_out_loss(state.params, data, settings),
         **_truncated_scores(state, data, thetas),
+        parameter_gain=parameter_gain,
+        identified=identified,
         clipped=clipped,
         n_train=n_train,
         n_val=jnp.sum(data.mask).astype(jnp.int32),

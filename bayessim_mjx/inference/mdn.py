@@ -25,6 +25,11 @@ def to_y(u: Array) -> Array:
     return (u - 0.5) * SPREAD
 
 
+def from_y(y: Array) -> Array:
+    """Coordinates of the network -> unit coordinates."""
+    return y / SPREAD + 0.5
+
+
 def head_size(d: int, settings: InferenceSettings) -> int:
     """Outputs of the network: logits, means, log diagonals, strictly lower entries."""
     lower = d * (d - 1) // 2 if settings.fullCovariance else 0

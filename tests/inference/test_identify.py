@@ -1,0 +1,61 @@
+"""Parameters that the data say nothing about stay at the prior, however many trajectories multiply."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.special import ndtr
+
+from bayessim_mjx import inference
+from bayessim_mjx.distributions import Distribution
+from bayessim_mjx.inference import identify
+from bayessim_mjx.parameters import Parameter, ParameterSpace
+
+SPACE = ParameterSpace([Parameter("seen", 0.0, -1.0, 1.0), Parameter("unseen", 5.0, 0.0, 10.0)])
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    """x = seen + N(0, 0.2); unseen does not enter."""
+    thetas = jax.vmap(SPACE.from_unit)(jax.random.uniform(jax.random.PRNGKey(0), (4000, 2)))
+    x = thetas[:, :1] + 0.2 * jax.random.normal(jax.random.PRNGKey(1), (4000, 1))
+    settings = inference.InferenceSettings(components=4, hiddenLayers=(32,))
+    return inference.fit(jax.random.PRNGKey(2), inference.init(jax.random.PRNGKey(3), settings, SPACE, 1), thetas, x)
+
+
+def test_the_held_out_gain_tells_them_apart(fitted):
+    state, info = fitted
+    np.testing.assert_array_equal(np.asarray(state.identified), [True, False])
+    # the expected gain is the mutual information h(x) - h(noise), x being uniform plus Gaussian
+    x = np.linspace(-2.5, 2.5, 20001)
+    density = (ndtr((x + 1) / 0.2) - ndtr((x - 1) / 0.2)) / 2
+    entropy = -np.trapezoid(density * np.log(np.maximum(density, 1e-300)), x)
+    information = entropy - 0.5 * np.log(2 * np.pi * np.e * 0.2**2)
+    assert float(info.parameter_gain[0]) == pytest.approx(information, abs=0.08)
+    assert float(info.parameter_gain[1]) < 0.005
+
+
+def test_the_product_of_many_leaves_the_unseen_one_flat(fitted):
+    state, _ = fitted
+    x = 0.3 + 0.2 * jax.random.normal(jax.random.PRNGKey(4), (20, 1))
+    product = inference.combine(inference.condition(state, x), 4)
+    posterior = inference.restore_prior(product, state.identified)
+    assert float(posterior.contraction()[1]) == pytest.approx(0.0, abs=0.01)
+    assert float(posterior.mean()[1]) == pytest.approx(5.0, abs=0.05)
+    assert float(posterior.sd()[0]) == pytest.approx(float(product.sd()[0]), rel=0.02)
+    samples = np.asarray(posterior.sample(jax.random.PRNGKey(5), 4000))
+    assert np.histogram(samples[:, 1], bins=5, range=(0, 10))[0] == pytest.approx([800] * 5, abs=120)
+
+
+def test_marginal_gain_by_hand():
+    """One Gaussian of sd 0.1 in the middle: 1 / (0.1 sqrt(2 pi)) = 3.989 at its mean; flat where sd is large."""
+    scales = jnp.asarray([[[[0.1, 0.0], [0.0, 50.0]]]])
+    gain = identify.marginal_gain(jnp.zeros((1, 1)), jnp.full((1, 1, 2), 0.5), scales, jnp.full((1, 2), 0.5))
+    np.testing.assert_allclose(np.asarray(gain), [[np.log(3.98942), 0.0]], atol=1e-4)
+
+
+def test_all_kept_changes_nothing():
+    q = Distribution.gaussian(SPACE, [0.2, 4.0], [0.1, 1.0], components=2)
+    kept = inference.restore_prior(q, jnp.ones(2, bool))
+    theta = jnp.asarray([[0.2, 4.0], [0.0, 5.0], [0.9, 9.0]])
+    np.testing.assert_allclose(np.asarray(kept.log_prob(theta)), np.asarray(q.log_prob(theta)), atol=1e-3)
