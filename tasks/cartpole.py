@@ -21,18 +21,25 @@ XML = """
   <option timestep="0.008333333333333333" integrator="Euler" iterations="1" ls_iterations="4">
     <flag contact="disable"/>
   </option>
+  <visual>
+    <headlight ambient="0.4 0.4 0.4" diffuse="0.25 0.25 0.25" specular="0 0 0"/>
+  </visual>
   <default>
     <geom type="box" contype="0" conaffinity="0"/>
   </default>
   <worldbody>
-    <light pos="3 0 4" dir="-1 0 -1"/>
-    <camera name="side" pos="6 0 2.4" xyaxes="0 1 0 0 0 1"/>
+    <light type="directional" pos="3 0 4" dir="-1 0.3 -1" diffuse="0.45 0.45 0.45" castshadow="false"/>
     <body name="slider" pos="0 0 2">
       <inertial mass="1" pos="0 0 0" diaginertia="5.3334 0.00015 5.3334"/>
       <geom name="slider" size="0.015 4 0.015" rgba="0.6 0.6 0.6 1"/>
+      <replicate count="17" offset="0 0.5 0">
+        <site name="mark" type="box" pos="0 -4 0" size="0.016 0.012 0.05" rgba="0.3 0.3 0.3 1"/>
+      </replicate>
+      <site name="middle" type="box" size="0.017 0.016 0.08" rgba="0.75 0.2 0.15 1"/>
       <body name="cart">
         <inertial mass="1" pos="0 0 0" diaginertia="0.00854 0.00667 0.00854"/>
         <joint name="slider_to_cart" type="slide" axis="0 1 0"/>
+        <camera name="side" mode="track" pos="3.2 0 0.35" xyaxes="0 1 0 0 0 1"/>
         <geom name="cart" size="0.1 0.125 0.1" rgba="0.2 0.4 0.8 1"/>
         <body name="pole" pos="0.12 0 0">
           <inertial mass="1" pos="0 0 0.47" diaginertia="0.0836 0.0835 0.00043"/>

@@ -21,13 +21,17 @@ XML = """
   <option timestep="0.05" gravity="0 0 -10" integrator="Euler" iterations="1" ls_iterations="4">
     <flag contact="disable" constraint="disable"/>
   </option>
+  <visual>
+    <headlight ambient="0.4 0.4 0.4" diffuse="0.25 0.25 0.25" specular="0 0 0"/>
+  </visual>
   <worldbody>
-    <light pos="0 -2 3" dir="0 1 -1"/>
-    <camera name="side" pos="0 -5 0" xyaxes="1 0 0 0 0 1"/>
+    <light type="directional" pos="0 -2 3" dir="0.3 1 -1" diffuse="0.5 0.5 0.5" castshadow="false"/>
+    <site name="axle" type="cylinder" fromto="0 -0.07 0 0 0.07 0" size="0.03" rgba="0.2 0.2 0.2 1"/>
     <body name="pendulum">
       <inertial mass="1" pos="0 0 0.5" diaginertia="0.08333333333 0.08333333333 1e-8"/>
       <joint name="hinge" type="hinge" axis="0 1 0" armature="0" damping="0"/>
-      <geom name="pendulum" type="capsule" fromto="0 0 0 0 0 1" size="0.05" contype="0" conaffinity="0"/>
+      <geom name="pendulum" type="capsule" fromto="0 0 0 0 0 1" size="0.05" rgba="0.8 0.3 0.25 1" contype="0"
+            conaffinity="0"/>
     </body>
   </worldbody>
   <actuator>

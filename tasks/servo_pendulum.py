@@ -30,9 +30,12 @@ XML = f"""
   <option timestep="0.0025" integrator="Euler" iterations="6" ls_iterations="20">
     <flag contact="disable"/>
   </option>
+  <visual>
+    <headlight ambient="0.4 0.4 0.4" diffuse="0.25 0.25 0.25" specular="0 0 0"/>
+  </visual>
   <worldbody>
-    <light pos="0 -1 1" dir="0 1 -1"/>
-    <camera name="side" pos="0 -0.6 0" xyaxes="1 0 0 0 0 1"/>
+    <light type="directional" pos="0 -1 1" dir="0.3 1 -1" diffuse="0.45 0.45 0.45" castshadow="false"/>
+    <camera name="side" pos="0 -0.42 0" xyaxes="1 0 0 0 0 1"/>
     <geom name="housing" type="box" size="0.012 0.013 0.017" pos="0 0.02 0" rgba="0.2 0.2 0.2 1" contype="0"
           conaffinity="0"/>
     <body name="load">
@@ -41,7 +44,7 @@ XML = f"""
              frictionloss="{COULOMB:g}" solreffriction="0.006 1"/>
       <geom name="arm" type="capsule" fromto="0 0 0 0 0 -0.1" size="0.004" rgba="0.7 0.7 0.7 1" contype="0"
             conaffinity="0" mass="0"/>
-      <geom name="weight" type="cylinder" fromto="0 -0.01 -0.1 0 0.01 -0.1" size="0.03" rgba="0.8 0.3 0.3 1" contype="0"
+      <geom name="weight" type="cylinder" fromto="0 -0.01 -0.1 0 0.01 -0.1" size="0.03" rgba="0.75 0.3 0.25 1" contype="0"
             conaffinity="0" mass="0"/>
     </body>
   </worldbody>
