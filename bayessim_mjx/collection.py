@@ -44,7 +44,7 @@ def policy_function(name: str, policy: Policy, action_size: int) -> Callable[[Ar
 
 
 def _act(policy: Policy, key: Array, obs: dict) -> Array:
-    return policy.replace(deterministic=False).act(key, obs)
+    return dataclasses.replace(policy, deterministic=False).act(key, obs)
 
 
 def _act_randomized(policy: Policy, key: Array, obs: dict) -> Array:
@@ -110,7 +110,7 @@ class Surrogate:
         act = policy_function(self.policy_name, policy, self.env.action_size)
         trajectory = rollout(self.env, act, k_roll, thetas, self.length)
         seen = trajectory.observation
-        return trajectory.replace(observation=seen + self.noise * jax.random.normal(k_noise, seen.shape))
+        return dataclasses.replace(trajectory, observation=seen + self.noise * jax.random.normal(k_noise, seen.shape))
 
     def real(self, key: Array, first: int, count: int, policy: Policy) -> tuple[Array, Trajectory]:
         """`count` real trajectories and their features [count, D]; `first` of them were asked for before."""

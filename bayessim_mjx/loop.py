@@ -175,7 +175,7 @@ def train(loop: Loop, state: LoopState, progress: Callable[[dict, TrainState], N
     if todo <= 0:
         return state
     trained, _ = rl.run(loop.env, loop.config.ppo, state.train, state.domain, iterations=todo, progress=progress)
-    return state.replace(train=trained)
+    return dataclasses.replace(state, train=trained)
 
 
 def step(loop: Loop, state: LoopState) -> tuple[LoopState, RoundInfo]:
@@ -201,9 +201,9 @@ def step(loop: Loop, state: LoopState) -> tuple[LoopState, RoundInfo]:
     )
     if loop.settings.modelClass is not None:
         state = _infer(loop, state, policy, info)
-    state = state.replace(round=state.round + 1)
+    state = dataclasses.replace(state, round=state.round + 1)
     if not loop.settings.ftuneRL and round_ + 1 < loop.settings.realIters:
-        state = state.replace(train=_new_policy(loop, round_ + 1, state.domain))
+        state = dataclasses.replace(state, train=_new_policy(loop, round_ + 1, state.domain))
     return state, info
 
 
@@ -240,7 +240,8 @@ def _infer(loop: Loop, state: LoopState, policy: Policy, info: RoundInfo) -> Loo
     prior = domain_or_prior(loop.env.space, b.components)
     thetas, features = _simulate(source, b.trainTrajs, loop.key(round_, "simulate"), policy, prior)
     row = (round_ * b.trainTrajs) % loop.capacity
-    state = state.replace(
+    state = dataclasses.replace(
+        state,
         thetas=jax.lax.dynamic_update_slice(state.thetas, thetas, (row, 0)),
         features=jax.lax.dynamic_update_slice(state.features, features, (row, 0)),
     )
@@ -259,21 +260,24 @@ def _infer(loop: Loop, state: LoopState, policy: Policy, info: RoundInfo) -> Loo
     real_features, real = source.real(loop.key(round_, "real"), seen, b.realTrajs, policy)
     all_features = jax.lax.dynamic_update_slice(state.real_features, real_features, (seen, 0))
     posteriors = inference.condition(network, all_features)
-    posteriors = posteriors.replace(prior_weight=jnp.full_like(posteriors.prior_weight, b.priorShare))
+    posteriors = dataclasses.replace(posteriors, prior_weight=jnp.full_like(posteriors.prior_weight, b.priorShare))
     if b.collectPolicy in POLICY_DEPENDENT:
         # An older trajectory was made by an older policy: its posterior stays that of the network of its time.
         new = jnp.arange(all_features.shape[0]) >= seen
         posteriors = select(new, posteriors, state.real_posteriors)
     domain = inference.combine(posteriors.split()[: seen + b.realTrajs], b.components)
     domain = inference.restore_prior(domain, network.identified)
-    unknown = [n for n, known in zip(domain.names, np.asarray(network.identified), strict=True) if not known]
-    if unknown:
+    known, before = np.asarray(network.identified), np.asarray(state.fit.identified)
+    unknown = [name for name, k in zip(domain.names, known, strict=True) if not k]
+    if unknown and not np.array_equal(known, before):
         info.warnings.append(f"not identified by these trajectories, kept at the prior: {', '.join(unknown)}")
     info.posterior, info.real = domain, jax.tree.map(np.asarray, real)
     info.scores = score(domain, source.truth)
     info.predictive = _predict(loop, domain, real, loop.key(round_, "predict"))
     info.seconds["condition"] = time.perf_counter() - clock
-    return state.replace(fit=network, real_features=all_features, real_posteriors=posteriors, domain=domain)
+    return dataclasses.replace(
+        state, fit=network, real_features=all_features, real_posteriors=posteriors, domain=domain
+    )
 
 
 def score(domain: Distribution, truth: np.ndarray | None) -> dict[str, float]:
@@ -319,7 +323,7 @@ def run(
         round_ = int(state.round)
 
         def progress(metrics: dict, trained: TrainState, state: LoopState = state, round_: int = round_) -> None:
-            current = state.replace(train=trained)
+            current = dataclasses.replace(state, train=trained)
             if monitor is not None:
                 monitor.training(round_, metrics, current)
             if checkpoints is not None and _due(loop, int(trained.iteration)):

@@ -1,9 +1,9 @@
-"""The whole loop with a task's default settings, several seeds: wall time, return on the surrogate real, the truth's density.
+"""The whole loop with a task's default settings, several seeds: wall time, return, density of the truth.
 
     python benchmarks/loop.py --task Pendulum --seeds 5
 
-Each seed is a fresh process, as a user would start it; the compilation cache is shared (the first seed may fill it). Prints one row
-per seed and the medians.
+Each seed is a fresh process, as a user would start it; the compilation cache is shared (the first seed fills it).
+Prints one row per seed.
 """
 
 import argparse
@@ -19,12 +19,11 @@ from pathlib import Path
 
 def one(task: str, seed: int, logdir: str, overrides: list[str], cache: str) -> dict:
     """Run a seed; the last round's numbers, wall seconds and peak memory."""
-    command = [sys.executable, "-m", "bayessim_mjx.main", "--task", task, "--seed", str(seed), "--headless", "--logdir", logdir]
+    command = [sys.executable, "-m", "bayessim_mjx.main", "--task", task, "--seed", str(seed), "--headless"]
+    command += ["--logdir", logdir, "--name", f"seed{seed}", *overrides]
     started = time.perf_counter()
     before = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
-    subprocess.run(
-        [*command, f"name=seed{seed}", *overrides], check=True, env=os.environ | {"BAYESSIM_MJX_CACHE": cache}, stdout=sys.stderr
-    )
+    subprocess.run(command, check=True, env=os.environ | {"BAYESSIM_MJX_CACHE": cache}, stdout=sys.stderr)
     seconds = time.perf_counter() - started
     peak = max(before, resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)
     folder = next(Path(logdir).glob(f"{task}/*_seed{seed}"))

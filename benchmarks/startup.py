@@ -1,6 +1,6 @@
-"""First and second start: a tiny run of the loop in fresh processes, with an empty compilation cache and then with a filled one.
+"""First and second start: a tiny run of the loop in fresh processes, with an empty compilation cache, then a full one.
 
-    python benchmarks/startup.py --task Pendulum
+python benchmarks/startup.py --task Pendulum
 """
 
 import argparse
@@ -15,8 +15,9 @@ TINY = ["bayessim.realIters=1", "bayessim.trainTrajs=1000", "bayessim.realEvals=
 
 def start(task: str, scratch: str) -> float:
     began = time.perf_counter()
-    command = [sys.executable, "-m", "bayessim_mjx.main", "--task", task, "--headless", "--logdir", f"{scratch}/logs", *TINY]
-    subprocess.run(command, check=True, env=os.environ | {"BAYESSIM_MJX_CACHE": f"{scratch}/cache"}, stdout=subprocess.DEVNULL)
+    command = [sys.executable, "-m", "bayessim_mjx.main", "--task", task, "--headless", "--logdir", f"{scratch}/logs"]
+    cached = os.environ | {"BAYESSIM_MJX_CACHE": f"{scratch}/cache"}
+    subprocess.run([*command, *TINY], check=True, env=cached, stdout=subprocess.DEVNULL)
     return time.perf_counter() - began
 
 
@@ -28,7 +29,7 @@ def main() -> None:
         first = start(args.task, scratch)
         second = [start(args.task, scratch) for _ in range(3)]
     median = sorted(second)[1]
-    print(f"{args.task}: first start {first:.1f} s, second start {median:.1f} s (median of 3), ratio {first / median:.2f}")
+    print(f"{args.task}: first start {first:.1f} s, second {median:.1f} s (median of 3), ratio {first / median:.2f}")
 
 
 if __name__ == "__main__":
