@@ -58,17 +58,19 @@ def film(env: Any, config: Config, thetas: Any) -> Callable[[Any, int], Any] | N
     return motion
 
 
-def _run(config: Config, run: Any, command: Sequence[str], headless: bool) -> int:
+def _run(config: Config, run: Any, command: Sequence[str], console: Any) -> int:
     import numpy as np
 
     from bayessim_mjx import loop, registry, runs
-    from bayessim_mjx.monitor.console import Console
+    from bayessim_mjx.monitor import video
+    from bayessim_mjx.monitor.opening import opening
     from bayessim_mjx.monitor.session import Session
 
     if config.randomization.get("randomize") is False and config.bayessim.modelClass is not None:
         raise UserError("task.randomize = False: there is nothing to infer; use bayessim_mjx.train for PPO alone")
     device = setup_jax(config)
     env = registry.make(config.task, config=config)
+    console.start(opening(config, env, device))
     parts = loop.make(config, env)
     state: Any = loop.init(parts)
     resumed = run is not None and bool(run.checkpoints)
@@ -85,9 +87,11 @@ def _run(config: Config, run: Any, command: Sequence[str], headless: bool) -> in
 
     truth = None if parts.source is None else parts.source.truth
     thetas = np.asarray(env.space.nominal if truth is None else truth)[None]
-    with Console(headless=headless) as console, cli.graceful() as stop:
-        console.start({"task": config.task, "run": str(run.path), "device": str(device), "seed": config.seed})
-        session = Session(run.path, config, env, console, film(env, config, thetas), state if resumed else None)
+    motion = film(env, config, thetas)
+    model = None if motion is None else video.model_at(env, thetas[0])
+    console.say(f"run folder {run.path}")
+    with cli.graceful() as stop:
+        session = Session(run.path, config, env, console, motion, state if resumed else None, model)
         session.describe(to_yaml(config.to_dict()))
         try:
             _, rounds = loop.run(parts, state, run, Watched(session, stop, save))
@@ -99,7 +103,8 @@ def _run(config: Config, run: Any, command: Sequence[str], headless: bool) -> in
             session.close()
         run.set_status("finished")
         _report(console, env, rounds, truth)
-        console.say(f"results: {run.path}  (tensorboard --logdir {run.path} --samples_per_plugin images=1000)")
+        console.say(f"best policy: python -m bayessim_mjx.play --checkpoint {run.path} --video")
+        console.say(f"pictures:    tensorboard --logdir {run.path} --samples_per_plugin images=1000")
     return 0
 
 
@@ -130,7 +135,10 @@ def _adapt(argv: Sequence[str] | None) -> int:
     if args.list_tasks:
         return cli.list_tasks()
     config, run = _prepare(args)
-    return _run(config, run, ["python", "-m", "bayessim_mjx.main", *argv], args.headless)
+    from bayessim_mjx.monitor.console import Console
+
+    with Console(headless=args.headless) as console:
+        return _run(config, run, ["python", "-m", "bayessim_mjx.main", *argv], console)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -60,19 +60,23 @@ def _physics(config: Config, env: Any, checkpoint: Path, key: Any, count: int) -
     return kinds
 
 
-def _video(config: Config, env: Any, policy: Any, thetas: Any, key: Any, path: Path) -> None:
+def _video(config: Config, env: Any, policy: Any, thetas: Any, key: Any, path: Path) -> str:
+    """Film one episode at the first of `thetas` [n, d]; what to say of it."""
     import numpy as np
 
     from bayessim_mjx.monitor import video
+    from bayessim_mjx.monitor.words import without_prefix
     from bayessim_mjx.rollout import rollout
 
     if not hasattr(env, "physics"):
         raise UserError(f"--video: {env.name} has no MuJoCo model of ours to draw; leave it out")
     qpos = rollout(env, policy.replace(deterministic=True), key, thetas[:1], config.monitor.video_length).qpos[0]
-    words = {name: f"{value:.3g}" for name, value in env.space.as_dict(np.asarray(thetas[0])).items()}
+    values = [f"{value:.3g}" for value in np.asarray(thetas[0])]
+    words = dict(zip(without_prefix(env.space.names), values, strict=True))
     path.parent.mkdir(parents=True, exist_ok=True)
-    frames = video.record(env.mj_model, np.asarray(qpos), path, fps=25, dt=env.dt, overlay_text=words)
-    print(f"video: {path}" if frames is not None else "no video could be made here")
+    model = video.model_at(env, thetas[0])
+    frames = video.record(model, np.asarray(qpos), path, fps=25, width=480, height=360, dt=env.dt, overlay_text=words)
+    return f"video: {path}" if frames is not None else "no video could be made here"
 
 
 def _play(argv: Sequence[str] | None) -> int:
@@ -83,6 +87,14 @@ def _play(argv: Sequence[str] | None) -> int:
     count = args.episodes if args.episodes is not None else args.num_envs or config.bayessim.realEvals
     if count < 1:
         raise UserError(f"--episodes {count}: must be at least 1")
+    from bayessim_mjx.monitor.console import Console
+
+    with Console(headless=True) as console:
+        return _show(args, config, path, run, count, console)
+
+
+def _show(args: argparse.Namespace, config: Config, path: Path, run: Any, count: int, console: Any) -> int:
+    """The table of returns, row by row, and the video."""
     setup_jax(config)
     import jax
 
@@ -93,17 +105,19 @@ def _play(argv: Sequence[str] | None) -> int:
     kinds = _physics(config, env, path, key, count)
     if args.physics and args.physics not in kinds:
         raise UserError(f"--physics {args.physics}: this checkpoint and task have {', '.join(kinds)}")
-    print(f"{config.task}, checkpoint {path}, {count} episodes each")
-    print(f"{'physics':<10}{'return':>10}{'sd':>10}{'min':>10}{'max':>10}{'length':>10}")
+    console.say(f"{config.task}, {count} episodes each, checkpoint {path}")
+    console.say(f"{'physics':<10}{'return':>10}{'sd':>10}{'min':>10}{'max':>10}{'length':>10}")
     chosen = {args.physics: kinds[args.physics]} if args.physics else kinds
     for name, thetas in chosen.items():
         result = rl.evaluate(env, policy, jax.random.fold_in(key, 1), thetas)
         r, length = result["return"], result["length"]
-        print(f"{name:<10}{r.mean():>10.4g}{r.std():>10.4g}{r.min():>10.4g}{r.max():>10.4g}{length.mean():>10.4g}")
+        console.say(
+            f"{name:<10}{r.mean():>10.4g}{r.std():>10.4g}{r.min():>10.4g}{r.max():>10.4g}{length.mean():>10.4g}"
+        )
     if config.monitor.video:
         name = next(n for n in ("real", "posterior", "prior", "nominal") if n in chosen)
         folder = (run.path if run is not None else path.parent) / "videos" / "play"
-        _video(config, env, policy, chosen[name], key, folder / f"{path.name}_{name}.mp4")
+        console.say(_video(config, env, policy, chosen[name], key, folder / f"{path.name}_{name}.mp4"))
     return 0
 
 

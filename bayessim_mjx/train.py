@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-import time
 from collections.abc import Sequence
 from typing import Any
 
@@ -13,7 +12,9 @@ from bayessim_mjx.device import setup_jax
 
 DESCRIPTION = "PPO alone: on nominal physics, or on physics drawn from the prior with --randomize."
 
-SHOWN = ("Train/mean_reward", "Train/mean_episode_length", "Perf/total_fps", "Loss/value", "Loss/learning_rate")
+SPEED, WORTH_SAYING = "Perf/total_fps", 0.5  # seconds of compilation
+PLAY = "python -m bayessim_mjx.play"
+SHOWN = ("Train/mean_reward", "Train/mean_episode_length", SPEED, "Loss/value", "Loss/kl", "Loss/learning_rate")
 
 
 def _parser() -> cli.Parser:
@@ -29,12 +30,13 @@ class Training:
         import jax
 
         from bayessim_mjx.distributions import Distribution
+        from bayessim_mjx.monitor.compile_clock import CompileClock
 
         self.config, self.env, self.run, self.writer, self.console, self.stop = config, env, run, writer, console, stop
         randomized = bool(config.randomization.get("randomize")) and len(env.space) > 0
         self.domain = Distribution.prior(env.space, 1) if randomized else None
         self.key, self.evaluation_key = jax.random.split(jax.random.PRNGKey(config.seed))
-        self.began = time.perf_counter()
+        self.compiling = CompileClock()
 
     def state(self) -> Any:
         """A new training state."""
@@ -50,8 +52,12 @@ class Training:
 
     def progress(self, metrics: dict[str, Any], state: Any) -> None:
         iteration = int(state.iteration)
-        self.writer.scalars(iteration, metrics)
-        self.console.iteration({tag: metrics[tag] for tag in SHOWN if tag in metrics}, iteration)
+        self.writer.scalars(iteration, {tag if "/" in tag else f"Perf/{tag}": v for tag, v in metrics.items()})
+        seconds, cached = self.compiling.take()
+        if slowed := seconds > WORTH_SAYING:
+            self.console.compile("training", seconds, cached)
+        shown = {tag: metrics[tag] for tag in SHOWN if tag in metrics and not (slowed and tag == SPEED)}
+        self.console.iteration(shown, iteration)
         self.stop.save(lambda: self.run.save(iteration, self.tree(state)))
 
     def evaluate(self, state: Any) -> float:
@@ -68,7 +74,11 @@ class Training:
         score = float(result["return"].mean())
         figures = {"Eval/mean_reward": score, "Eval/mean_episode_length": float(result["length"].mean())}
         self.writer.scalars(int(state.iteration), figures)
-        self.console.say(f"iteration {int(state.iteration)}: return {score:.4g} over {count} episodes")
+        seconds, cached = self.compiling.take()
+        if seconds > WORTH_SAYING:
+            self.console.compile("evaluation", seconds, cached)
+        sd = float(result["return"].std())
+        self.console.say(f"evaluation at {int(state.iteration)}: return {score:.4g} ± {sd:.4g} over {count} episodes")
         return score
 
     def train(self, state: Any) -> Any:
@@ -87,23 +97,25 @@ class Training:
 def _run(config: Config, run: Any, command: Sequence[str], headless: bool) -> int:
     from bayessim_mjx import registry, runs
     from bayessim_mjx.monitor.console import Console
+    from bayessim_mjx.monitor.opening import opening
     from bayessim_mjx.monitor.writer import Writer
 
     device = setup_jax(config)
-    env = registry.make(config.task, config=config)
-    resumed = run is not None and bool(run.checkpoints)
-    if run is None:
-        run = runs.Run.create(config.logdir, config.task, config.name, config, command)
-    run.set_status("running")
     with Console(headless=headless) as console, cli.graceful() as stop:
+        env = registry.make(config.task, config=config)
+        console.start(opening(config, env, device, infers=False))
+        resumed = run is not None and bool(run.checkpoints)
+        if run is None:
+            run = runs.Run.create(config.logdir, config.task, config.name, config, command)
+        run.set_status("running")
+        console.say(f"run folder {run.path}")
         training = Training(config, env, run, None, console, stop)
         state = training.state()
         if resumed:
             state = run.restore("latest", training.tree(state), fall_back=True)[0]["state"]
         training.writer = Writer(run.path, purge_step=int(state.iteration) + 1 if resumed else None)
         training.writer.text("cfg", to_yaml(config.to_dict()), code=True)
-        console.start({"task": config.task, "run": str(run.path), "device": str(device), "seed": config.seed})
-        console.phase("train", config.ppo.max_iterations, int(state.iteration))
+        console.phase("training", config.ppo.max_iterations, int(state.iteration))
         try:
             training.train(state)
         except KeyboardInterrupt:
@@ -113,7 +125,8 @@ def _run(config: Config, run: Any, command: Sequence[str], headless: bool) -> in
         finally:
             training.writer.close()
         run.set_status("finished")
-        console.say(f"results: {run.path}  (best checkpoint: {run.manifest['best']})")
+        console.say(f"best policy (step {run.manifest['best']}): {PLAY} --checkpoint {run.path} --video")
+        console.say(f"curves: tensorboard --logdir {run.path}")
     return 0
 
 

@@ -80,7 +80,8 @@ def main() -> None:
     from bayessim_mjx.monitor import plots
 
     truth = dict(zip(env.space.names, PUBLISHED["BAM M1 (Coulomb, viscous)"], strict=True))
-    plots.corner(posterior, truth=truth, title="XL330 servo; lines: BAM M1").savefig(out / "posterior.png")
+    figure = plots.corner(posterior, truth=truth, truth_label="published: BAM M1", title="XL330 servo")
+    figure.savefig(out / "posterior.png")
     print(f"\npicture: {out / 'posterior.png'}")
 
 

@@ -3,13 +3,14 @@
 Takes plain numbers and dicts. Without a terminal (or with `headless`) no control character is ever written.
 """
 
-import math
 import sys
 import time
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TextIO
 
 from bayessim_mjx.monitor.draws import shorten
+from bayessim_mjx.monitor.words import ascii_of, duration, escape, fit, is_number, named, number, spoken, without_prefix
 
 FILE_WIDTH = 140  # columns assumed where there is no terminal
 
@@ -67,11 +68,23 @@ class Console:
         self._steps: Clock | None = None
         self._phase = ""
         self._bars: dict[str, Any] = {}
+        self._showwarning = warnings.showwarning
 
     def __enter__(self) -> "Console":
+        """While inside, warnings meant for the user (UserWarning) become lines here, not Python's own noise."""
+        before = self._showwarning = warnings.showwarning
+
+        def show(message: Any, category: Any, *where: Any, **more: Any) -> None:
+            if issubclass(category, UserWarning):
+                self.warning(str(message))
+            else:
+                before(message, category, *where, **more)
+
+        warnings.showwarning = show
         return self
 
     def __exit__(self, *_: object) -> None:
+        warnings.showwarning = self._showwarning
         self.close()
 
     @property
@@ -85,7 +98,7 @@ class Console:
         wide = max(map(len, summary), default=0)
         for key, value in summary.items():
             many = isinstance(value, Sequence) and not isinstance(value, str)
-            text = _fit([str(v) for v in value], self.width - wide - 2) if many else str(value)
+            text = fit([str(v) for v in value], 3 * (self.width - wide - 2)) if many else str(value)
             self._say(f"{key:<{wide}}  {text}", f"[bold]{key:<{wide}}[/]  ", text)
 
     def begin(self, rounds: int, done: int = 0) -> None:
@@ -99,15 +112,18 @@ class Console:
         self._steps = Clock(total, done, self._now) if total else None
         self._bar("phase", name, total, done)
         if not self.live:
-            self._say(f"{name} ..." if not total else f"{name}: {total} iterations")
+            clock = self._rounds
+            where = "" if clock is None else f"round {min(clock.done + 1, clock.total)}/{clock.total}: "
+            self._say(f"{where}{name} ..." if not total else f"{where}{name}, {total - done} iterations ...")
 
     def compile(self, message: str, seconds: float, cached: bool = False) -> None:
         """A program was compiled; its time is kept out of the ETA. `cached`: it came from the compilation cache."""
         for clock in (self._rounds, self._steps):
             if clock is not None:
                 clock.exclude(seconds)
-        how = "from the cache" if cached else "cached next time"
-        self._say(f"compiled {message} in {seconds:.1f} s ({how})", "[dim]", None)
+        how = "loaded" if cached else "compiled"
+        tail = "from the cache" if cached else "cached for the next start"
+        self._say(f"{how} {message} in {duration(seconds)} ({tail})", "[dim]", None)
 
     def iteration(self, metrics: Mapping[str, Any], iteration: int | None = None) -> None:
         """One log interval of training: numbers in the order given, as many as fit.
@@ -115,8 +131,8 @@ class Console:
         The bar moves to `iteration` of this phase (else to metrics["iteration"], else one on); `iteration`, `round` are
         not repeated among the numbers.
         """
-        shown = {k: v for k, v in metrics.items() if k not in ("iteration", "round") and _is_number(v)}
-        numbers = [f"{_short(k)} {_number(v)}" for k, v in shown.items()]
+        shown = {k: v for k, v in metrics.items() if k not in ("iteration", "round") and is_number(v)}
+        numbers = [f"{spoken(k)} {number(v)}" for k, v in shown.items()]
         at = metrics.get("iteration") if iteration is None else iteration
         where, eta, done = self._phase or "iteration", None, None
         if self._steps is not None:
@@ -126,10 +142,10 @@ class Console:
         elif at is not None:
             where += f" {int(at)}"
         if self._progress is not None and "phase" in self._bars:
-            self._move("phase", done, _fit(numbers, max(self.width - 64, 20), "  "), eta)
+            self._move("phase", done, fit(numbers, max(self.width - 70, 20), "  ", count=False), eta)
             return
-        ahead = f"  ETA {_duration(eta)}" if eta else ""
-        self._say(f"{where}  " + _fit(numbers, self.width - len(where) - len(ahead) - 2, "  ") + ahead)
+        ahead = f"  ETA {duration(eta)}" if eta else ""
+        self._say(f"{where}  " + fit(numbers, self.width - len(where) - len(ahead) - 2, "  ", count=False) + ahead)
 
     def round_line(
         self,
@@ -147,7 +163,7 @@ class Console:
             round: counted from 0. rounds: how many there are (default: what `begin` said).
             reward: mean (and standard deviation) of the return on the real system.
             gain: log posterior - log prior at the truth [nats].
-            widths: {parameter: width of its posterior}, in the order of interest: as many as fit are shown.
+            widths: {parameter: posterior sd / prior sd}, in the order of interest: as many as fit are shown.
         """
         if self._rounds is not None:
             self._rounds.advance(int(round) + 1)
@@ -155,16 +171,18 @@ class Console:
         parts = [f"round {int(round) + 1}" + (f"/{rounds}" if rounds else "")]
         if reward is not None:
             values = reward if isinstance(reward, Sequence) else (reward,)
-            parts.append("real reward " + " ± ".join(_number(v) for v in values))
-        parts += [f"log p(truth) {float(gain):+.2f} nats"] if gain is not None and _is_number(gain) else []
+            parts.append("real reward " + " ± ".join(number(v) for v in values))
+        if gain is not None and is_number(gain):
+            parts.append(f"log p(truth) {float(gain):+.2f} nats vs prior")
         eta = self._rounds.eta() if self._rounds is not None else None
-        tail = [] if seconds is None else [_duration(float(seconds))]
-        tail += [f"ETA {_duration(eta)}"] if eta else []
-        room = self.width - len("   ".join(parts + tail)) - len("   width ")
+        tail = [] if seconds is None else [duration(float(seconds))]
+        tail += [f"ETA {duration(eta)}"] if eta else []
+        room = self.width - len("   ".join(parts + tail)) - len("   sd/prior ")
         if widths:
-            full, short = (_fit(_named(names, widths), room) for names in (list(widths), shorten(list(widths), 18)))
+            brief = without_prefix(list(widths))
+            full, short = (fit(named(names, widths), room) for names in (brief, shorten(brief, 18)))
             fitting = short if "more" in full or not full else full
-            parts += [f"width {fitting}"] if fitting else []
+            parts += [f"sd/prior {fitting}"] if fitting else []
         self._say("   ".join(parts + tail), "[bold]", None)
         if self._rounds is not None:
             done, total = self._rounds.done, self._rounds.total
@@ -176,17 +194,17 @@ class Console:
         from rich.table import Table
 
         rows = sorted(parameters, key=lambda row: -float(row.get("contraction") or 0.0))
-        known = any(_is_number(row.get("truth")) for row in rows)
+        known = any(is_number(row.get("truth")) for row in rows)
         table = Table(title=title, box=box.SIMPLE_HEAD if self._unicode else box.ASCII, title_justify="left")
         for name in ["parameter", "prior range", "posterior", *(["truth"] if known else []), "contraction"]:
             table.add_column(name, justify="left" if name == "parameter" else "right", overflow="fold")
         for row in rows:
             unit = f" [{row['unit']}]" if row.get("unit") else ""
-            cells = [f"{row['name']}{unit}", f"{_number(row['low'])} .. {_number(row['high'])}"]
-            cells.append(f"{_number(row['mean'])} ± {_number(row['sd'])}")
-            cells += [_number(row["truth"]) if _is_number(row.get("truth")) else "-"] if known else []
-            cells.append(f"{float(row['contraction']):.2f}" if _is_number(row.get("contraction")) else "-")
-            table.add_row(*[_escape(self._plain(c)) for c in cells])
+            cells = [f"{row['name']}{unit}", f"{number(row['low'])} .. {number(row['high'])}"]
+            cells.append(f"{number(row['mean'])} ± {number(row['sd'])}")
+            cells += [number(row["truth"]) if is_number(row.get("truth")) else "-"] if known else []
+            cells.append(f"{float(row['contraction']):.2f}" if is_number(row.get("contraction")) else "-")
+            table.add_row(*[escape(self._plain(c)) for c in cells])
         self._rich.print(table, soft_wrap=False)
 
     def say(self, text: str) -> None:
@@ -205,20 +223,16 @@ class Console:
     # ---- how it is written
 
     def _plain(self, text: str) -> str:
-        if self._unicode:
-            return text
-        for sign, words in (("±", "+/-"), ("…", "..."), ("–", "-"), ("·", "*"), ("²", "^2")):
-            text = text.replace(sign, words)
-        return text.encode("ascii", "replace").decode()
+        return text if self._unicode else ascii_of(text)
 
     def _say(self, text: str, style: str = "", rest: str | None = "") -> None:
         """Print one line; on a terminal `style` is markup in front (all of the line if `rest` is None)."""
         if not self.live or not style:
-            self._rich.print(_escape(self._plain(text)))
+            self._rich.print(escape(self._plain(text)))
         elif rest is None:
-            self._rich.print(f"{style}{_escape(self._plain(text))}[/]")
+            self._rich.print(f"{style}{escape(self._plain(text))}[/]")
         else:
-            self._rich.print(style + _escape(self._plain(rest)))
+            self._rich.print(style + escape(self._plain(rest)))
 
     def _bar(self, kind: str, text: str, total: int | None, done: int) -> None:
         if not self.live:
@@ -243,59 +257,6 @@ class Console:
     def _move(self, kind: str, done: int | None, note: str, eta: float | None, text: str | None = None) -> None:
         if self._progress is None or kind not in self._bars:
             return
-        said = "" if eta is None else f"ETA {_duration(eta)}"
+        said = "" if eta is None else f"ETA {duration(eta)}"
         more: dict[str, Any] = {} if text is None else {"description": text}
-        self._progress.update(self._bars[kind], completed=done, note=_escape(note), eta=said, **more)
-
-
-def _escape(text: str) -> str:
-    from rich.markup import escape
-
-    return escape(text)
-
-
-def _is_number(value: Any) -> bool:
-    try:
-        return value is not None and not isinstance(value, str) and not math.isnan(float(value))
-    except (TypeError, ValueError):
-        return False
-
-
-def _number(value: Any) -> str:
-    """Four significant digits, whole numbers as such, large ones with k and M."""
-    number = float(value)
-    if abs(number) >= 1e6 and math.isfinite(number):
-        return f"{number / 1e6:.4g}M"
-    if abs(number) >= 1e4 and math.isfinite(number):
-        return f"{number / 1e3:.4g}k"
-    return f"{number:.4g}"
-
-
-def _short(tag: str) -> str:
-    """`Train/mean_reward` -> `mean_reward`."""
-    return tag.rsplit("/", 1)[-1]
-
-
-def _named(names: Sequence[str], values: Mapping[str, float]) -> list[str]:
-    return [f"{name} {float(value):.2g}" for name, value in zip(names, values.values(), strict=True)]
-
-
-def _duration(seconds: float | None) -> str:
-    if seconds is None or not math.isfinite(seconds):
-        return "?"
-    whole = int(seconds)
-    if whole < 60:
-        return f"{whole} s" if whole >= 10 else f"{seconds:.1f} s"
-    return (
-        f"{whole // 60} min {whole % 60:02d} s" if whole < 3600 else f"{whole // 3600} h {whole % 3600 // 60:02d} min"
-    )
-
-
-def _fit(parts: Sequence[str], room: int, joint: str = ", ") -> str:
-    """The first parts that fit into `room` characters, then how many more there are; nothing if not even one fits."""
-    for count in range(len(parts), 0, -1):
-        more = [f"+{len(parts) - count} more"] if count < len(parts) else []
-        text = joint.join([*parts[:count], *more])
-        if len(text) <= room:
-            return text
-    return ""
+        self._progress.update(self._bars[kind], completed=done, note=escape(note), eta=said, **more)

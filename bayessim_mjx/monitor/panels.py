@@ -186,7 +186,7 @@ def _numbers(axis: Any, log: bool) -> None:
 def _few_ticks(axes: Any, draws: Draws, place: tuple[int, int], cell: tuple[float, float]) -> None:
     from matplotlib.ticker import MaxNLocator
 
-    most = [6 if side > 3 else 3 if side > 1.0 else 2 for side in cell]
+    most = [6 if side > 3 else 5 if side > 1.5 else 3 if side > 1.0 else 2 for side in cell]
     sides = [(axes.xaxis, place[0], most[0])] + [(axes.yaxis, place[1], most[1])] * (place[0] != place[1])
     for axis, k, count in sides:
         axis.set_major_locator(MaxNLocator(count, prune="both" if draws.d > 1 else None))

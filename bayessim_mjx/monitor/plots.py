@@ -39,6 +39,7 @@ def corner(
     title: str | None = None,
     round: int | None = None,
     best: int = 6,
+    truth_label: str = "truth",
 ) -> Any:
     """The posterior over all parameters: every pair up to 12 parameters, an overview of all and the `best` above that.
 
@@ -48,6 +49,7 @@ def corner(
         prior: Distribution or samples [m, d]; None: the space's own prior.
         log: [d] bool, parameters to show on a log axis; None: those with a log-uniform prior.
         title, round: what the title says; `round` is put in front.
+        truth_label: what the red line is, where it is not a truth (a published value, say).
     """
     draws = draws_of(samples, names, low, high, prior, units, log)
     true = draws.coordinate(_truth(truth, draws.names))
@@ -59,7 +61,7 @@ def corner(
         cell = max(1.25, min(2.3, 8.5 / draws.d))
         figure = new_figure(*((6.2, 4.2) if draws.d == 1 else (cell * draws.d + 1.2, cell * draws.d + 1.6)))
         triangle(figure, draws, true)
-    head(figure, text, items)
+    head(figure, text, items, truth_label)
     return figure
 
 
@@ -86,6 +88,7 @@ def forest(
     *,
     title: str = "posterior",
     round: int | None = None,
+    truth_label: str = "truth",
     **more: Any,
 ) -> Any:
     """All parameters as 50 and 95 % intervals over their prior ranges, the best identified on top; see `corner`."""
@@ -95,7 +98,7 @@ def forest(
     axes = figure.add_axes((0.36, 0.6 / height, 0.52, 1 - 1.5 / height))
     true = draws.coordinate(_truth(truth, draws.names))
     intervals(axes, draws, true)
-    head(figure, heading(title, round), ["posterior"] + ["truth"] * (true is not None))
+    head(figure, heading(title, round), ["posterior"] + ["truth"] * (true is not None), truth_label)
     return figure
 
 

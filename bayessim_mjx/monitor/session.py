@@ -23,16 +23,21 @@ from bayessim_mjx.rl import Policy, policy_of
 MOST_PAIRS = 10  # BayesSimIG draws one figure per pair; beyond this the corner plot shows them all
 ROUNDS = "rounds.jsonl"
 WORTH_SAYING = 0.5  # seconds of compilation
+REST = "evaluation, simulation, inference"  # of a round, after training
+SPEED = "Perf/total_fps"
 SHOWN = (
-    "Train/mean_reward", "Train/mean_episode_length", "Perf/total_fps", "Loss/kl", "Loss/learning_rate", "Loss/value",
-    "Loss/explained_variance", "Policy/mean_std", "env_steps",
+    "Train/mean_reward", "Train/mean_episode_length", SPEED, "Loss/kl", "Loss/learning_rate", "Loss/value",
+    "Loss/explained_variance", "Policy/mean_std",
 )  # fmt: skip
 
 Film = Callable[[Policy, int], np.ndarray]  # (policy, control steps) -> qpos [T+1, nq]
 
 
 class Session:
-    """The monitor of a run. `film` gives the motion of a policy on the real side, for videos; None: no videos."""
+    """The monitor of a run. Steps in TensorBoard: rounds done (`bsim`), PPO iterations (`rl`), seconds (`rl_time`).
+
+    `film` gives the motion of a policy on the real side, for videos of `model` (default: the nominal one); None: none.
+    """
 
     def __init__(
         self,
@@ -42,13 +47,15 @@ class Session:
         console: Console,
         film: Film | None = None,
         start: LoopState | None = None,
+        model: Any = None,
     ):
         self.path, self.config, self.env, self.console, self.film = path, config, env, console, film
+        self.model = getattr(env, "mj_model", None) if model is None else model
         self.compiling = CompileClock()
         first_round = 0 if start is None else int(start.round)
         done = 0 if start is None else self._overall(first_round, int(start.train.iteration))
         resumed = start is not None
-        self.inference = Writer(path / "bsim", purge_step=first_round if resumed else None, media=path / "pictures")
+        self.inference = Writer(path / "bsim", purge_step=first_round + 1 if resumed else None, media=path / "pictures")
         self.learning = Writer(path / "rl", purge_step=done + 1 if resumed else None, media=path / "videos")
         self.wall = Writer(path / "rl_time")  # the same rewards over wall-clock seconds
         self.started, self.filmed, self.phase_of = time.perf_counter(), 0, -1
@@ -60,29 +67,34 @@ class Session:
         """Training of `round_` begins, with `done` iterations of it behind (resume)."""
         n = self.config.ppo.max_iterations
         if round_ < self.config.bayessim.realIters and n:
-            self.console.phase("train", n, max(0, done - round_ * n))
+            self.console.phase("training", n, max(0, done - round_ * n))
 
     def describe(self, text: str) -> None:
         """The resolved settings as text, once."""
         self.inference.text("BayesSim/cfg", text, code=True)
 
-    def _compiled(self, what: str) -> None:
+    def _compiled(self, what: str) -> bool:
+        """Whether there was compiling worth a line; says so."""
         seconds, cached = self.compiling.take()
         if seconds > WORTH_SAYING:
             self.console.compile(what, seconds, cached)
+        return seconds > WORTH_SAYING
 
     def training(self, round_: int, metrics: dict[str, float], state: LoopState) -> None:
-        self._compiled("training")
+        slowed = self._compiled("training")
         iteration = self._overall(round_, int(state.train.iteration))
-        self.learning.scalars(iteration, metrics)
+        self.learning.scalars(iteration, {tag if "/" in tag else f"Perf/{tag}": v for tag, v in metrics.items()})
         over_time = {tag: metrics[tag] for tag in ("Train/mean_reward", "Train/mean_episode_length") if tag in metrics}
         self.wall.scalars(int(time.perf_counter() - self.started), over_time)
-        shown = {tag: metrics[tag] for tag in SHOWN if tag in metrics}
-        self.console.iteration(shown, iteration - round_ * self.config.ppo.max_iterations)
+        shown = {tag: metrics[tag] for tag in SHOWN if tag in metrics and not (slowed and tag == SPEED)}
+        done, n = iteration - round_ * self.config.ppo.max_iterations, self.config.ppo.max_iterations
+        self.console.iteration(shown, done)
         every = max(1, self.config.monitor.video_interval // self.config.ppo.num_steps)
         if self.film is not None and iteration // every > self.filmed:
             self.filmed = iteration // every
             self._video(self.learning, "Train/video", policy_of(state.train), iteration)
+        if done >= n:
+            self.console.phase(REST)
 
     def _overall(self, round_: int, iteration: int) -> int:
         """One axis over all rounds, also where every round trains a new policy."""
@@ -90,7 +102,7 @@ class Session:
 
     def round(self, info: RoundInfo, policy: Policy) -> None:
         self._compiled("evaluation, simulation and inference")
-        step = info.round
+        step = info.round + 1
         side = "Domain/rewards" if info.truth is None else "SurrogateReal/real_rewards"
         scalars = {f"{side}_{name}": getattr(np, name)(info.returns) for name in ("mean", "min", "max", "std")}
         scalars |= {f"BayesSim/{name}": value for name, value in info.scores.items()}
@@ -114,7 +126,7 @@ class Session:
         posterior = info.posterior
         if posterior is None:
             return
-        step, names = info.round, posterior.space.names
+        step, names = info.round + 1, posterior.space.names
         self.inference.figure("BayesSim/posterior", plots.corner(posterior, truth=info.truth, round=step), step)
         pairs = list(itertools.combinations(range(len(names)), 2))
         for i, j in pairs if len(pairs) <= MOST_PAIRS else []:
@@ -126,13 +138,15 @@ class Session:
             real, simulated = channels(self.env.mj_model, info)
             clock = np.arange(info.real.qpos.shape[1]) * self.env.dt
             self.inference.figure(
-                "BayesSim/posterior_predictive", plots.predictive(clock, real, simulated, round=step), step
+                "BayesSim/posterior_predictive",
+                plots.predictive(clock, real, simulated, units=units(self.env.mj_model), round=step),
+                step,
             )
 
     def _video(self, writer: Writer, tag: str, policy: Policy, step: int) -> None:
         assert self.film is not None
         qpos = self.film(policy, self.config.monitor.video_length)
-        frames = video.record(self.env.mj_model, qpos, dt=self.env.dt, fps=25)
+        frames = video.record(self.model, qpos, dt=self.env.dt, fps=25)
         writer.video(tag, frames, 25, step)
 
     def _note(self, info: RoundInfo) -> None:
@@ -189,6 +203,15 @@ def channels(mj_model: Any, info: RoundInfo) -> tuple[dict[str, np.ndarray], dic
             real[name] = np.where(valid, np.asarray(getattr(info.real, kind))[0, :, k], np.nan)
             simulated[name] = np.where(valid, info.predictive[kind][:, :, k], np.nan)
     return real, simulated
+
+
+def units(mj_model: Any) -> dict[str, str]:
+    """{channel: unit} of hinges and slides, named as in `channels`."""
+    named, found = Channels.of(mj_model), {}
+    for joint, kind in zip(named.joints, named.kinds, strict=True):
+        if unit := {"hinge": "rad", "slide": "m"}.get(kind):
+            found |= {f"qpos:{joint}": unit, f"qvel:{joint}": f"{unit}/s"}
+    return found
 
 
 def round_line(info: RoundInfo) -> dict[str, Any]:

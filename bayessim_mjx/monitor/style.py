@@ -34,7 +34,7 @@ def blues() -> Any:
     return LinearSegmentedColormap.from_list("posterior", ["#FFFFFF", SKY, BLUE])
 
 
-def handles(items: Sequence[str]) -> tuple[list[Any], list[str]]:
+def handles(items: Sequence[str], truth_label: str = "truth") -> tuple[list[Any], list[str]]:
     """Legend handles and texts of the things named."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
@@ -42,7 +42,7 @@ def handles(items: Sequence[str]) -> tuple[list[Any], list[str]]:
     known = {
         "posterior": (Line2D([], [], color=BLUE, lw=2), "posterior"),
         "prior": (Line2D([], [], color=GREEN, lw=1.5, ls=DASHED), "prior"),
-        "truth": (Line2D([], [], color=RED, lw=2), "truth"),
+        "truth": (Line2D([], [], color=RED, lw=2), truth_label),
         "regions": (Patch(fc=SKY, ec=BLUE), "50 and 90 % regions"),
         "star": (Line2D([], [], color=YELLOW, marker="*", mec="black", ls="", ms=11), "truth of both"),
         "means": (Line2D([], [], color=NAVY, marker="+", ls="", ms=8, mew=1.6), "component means"),
@@ -55,9 +55,9 @@ def handles(items: Sequence[str]) -> tuple[list[Any], list[str]]:
     return [known[i][0] for i in items], [known[i][1] for i in items]
 
 
-def head(figure: Any, heading: str, items: Sequence[str]) -> None:
+def head(figure: Any, heading: str, items: Sequence[str], truth_label: str = "truth") -> None:
     """Title and one-row legend in the top 0.5 inches of the figure."""
-    marks, texts = handles(items)
+    marks, texts = handles(items, truth_label)
     width, height = size_of(figure)
     title = shorten([heading], int(width * 9), 1)[0]
     figure.text(0.5, 1 - 0.12 / height, title, fontsize=11, ha="center", va="top")

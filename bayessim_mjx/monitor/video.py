@@ -65,6 +65,11 @@ def record(
     return frames
 
 
+def model_at(env: Any, theta: Any) -> Any:
+    """The MuJoCo model of one of our tasks with theta [d] in it, so that a longer rod is drawn longer."""
+    return env.space.edit(env.spec(), np.asarray(theta)).compile() if len(env.space) else env.mj_model
+
+
 def _rows(length: int, dt: float | None, fps: float) -> np.ndarray:
     if dt is None:
         return np.arange(length)
@@ -75,7 +80,7 @@ def _rows(length: int, dt: float | None, fps: float) -> np.ndarray:
 def _warn(text: str) -> None:
     if text not in _warned:
         _warned.add(text)
-        warnings.warn(text, RuntimeWarning, stacklevel=3)
+        warnings.warn(text, stacklevel=3)
 
 
 def backends() -> list[str]:

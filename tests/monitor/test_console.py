@@ -1,8 +1,10 @@
 """What is written without a terminal is plain text with the numbers in it; with one, bars that go away."""
 
 import io
+import warnings
 
-from bayessim_mjx.monitor.console import Clock, Console, _duration, _fit, _number
+from bayessim_mjx.monitor.console import Clock, Console
+from bayessim_mjx.monitor.words import duration, fit, number, without_prefix
 
 
 class Terminal(io.StringIO):
@@ -38,13 +40,13 @@ def test_plain_output_has_the_numbers_and_no_control_characters():
     assert not set(text) & {"\x1b", "\r", "\b"}
     lines = [line.rstrip() for line in text.splitlines()]
     assert lines[1] == "parameters  mass [kg], length"
-    assert "compiled PPO update in 7.3 s (cached next time)" in lines
-    assert any(line.startswith("train 10/20  mean_reward -455.2  fps 123.5k") for line in lines)
-    first = next(line for line in lines if line.startswith("round 1/3"))
+    assert "compiled PPO update in 7.3 s (cached for the next start)" in lines
+    assert any(line.startswith("train 10/20  reward -455.2  fps 123.5k") for line in lines)
+    first = next(line for line in lines if line.startswith("round 1/3 "))
     assert first.startswith(
-        "round 1/3   real reward -455.2 ± 31   log p(truth) +2.31 nats   width mass 0.12, length 0.4   42 s"
+        "round 1/3   real reward -455.2 ± 31   log p(truth) +2.31 nats vs prior   sd/prior mass 0.12, length 0.4   42 s"
     )
-    assert next(line for line in lines if line.startswith("round 2/3")).startswith("round 2/3   real reward -400")
+    assert next(line for line in lines if line.startswith("round 2/3 ")).startswith("round 2/3   real reward -400")
     assert "warning: no video [egl]" in lines
     mass, length = (next(i for i, x in enumerate(lines) if n in x and " .. " in x) for n in ("mass [kg]", "length"))
     assert mass < length and "1.02 ± 0.1" in lines[mass] and "0.90" in lines[mass]
@@ -95,10 +97,39 @@ def test_a_resumed_run_counts_only_its_own_rounds():
 
 
 def test_numbers_and_durations_are_short():
-    assert [_number(v) for v in (0.0123456, 12345.6, 2.5e6, 3, -1e9)] == ["0.01235", "12.35k", "2.5M", "3", "-1000M"]
-    assert [_duration(v) for v in (3.21, 42, 59.9, 125, 7300, None)] == [
+    assert [number(v) for v in (0.0123456, 12345.6, 2.5e6, 3, -1e9)] == ["0.01235", "12.35k", "2.5M", "3", "-1000M"]
+    assert [duration(v) for v in (3.21, 42, 59.9, 125, 7300, None)] == [
         "3.2 s", "42 s", "59 s", "2 min 05 s", "2 h 01 min", "?",
     ]  # fmt: skip
-    assert _fit(["aa", "bb", "cc"], 100) == "aa, bb, cc"
-    assert _fit(["aaaa", "bbbb", "cccc"], 14) == "aaaa, +2 more"
-    assert _fit(["aaaa"], 2) == ""
+    assert fit(["aa", "bb", "cc"], 100) == "aa, bb, cc"
+    assert fit(["aaaa", "bbbb", "cccc"], 14) == "aaaa, +2 more"
+    assert fit(["aaaa"], 2) == ""
+    assert fit(["aaaa", "bbbb"], 5, count=False) == "aaaa"
+    assert without_prefix(["rod_mass", "rod_length"]) == ["mass", "length"]
+    assert without_prefix(["rod_mass"]) == ["rod_mass"]
+
+
+def test_warnings_for_the_user_are_lines_and_others_keep_their_way():
+    file, before, elsewhere = io.StringIO(), warnings.showwarning, []
+    with warnings.catch_warnings():
+        warnings.simplefilter("always")
+        warnings.showwarning = lambda message, *_, **__: elsewhere.append(str(message))
+        with Console(file=file):
+            warnings.warn("a.csv: time repeats", stacklevel=1)
+            warnings.warn("old", DeprecationWarning, stacklevel=1)
+    assert file.getvalue() == "warning: a.csv: time repeats\n" and elsewhere == ["old"]
+    assert warnings.showwarning is before
+
+
+def test_compile_time_of_a_program_inside_another_counts_once():
+    from bayessim_mjx.monitor.compile_clock import BACKEND, COMPILE, RETRIEVED, CompileClock
+
+    now = [0.0]
+    clock = CompileClock(lambda: now[0])
+    for at, event, seconds in ((2.0, "trace", 1.0), (5.0, "trace", 4.5), (9.0, "backend_compile_duration", 3.0)):
+        now[0] = at
+        clock._duration(COMPILE + event, seconds)
+    assert clock.take() == (7.5, False)
+    clock._duration(RETRIEVED, 0.2)
+    clock._duration(BACKEND, 0.3)
+    assert clock.take()[1] and clock.take() == (0, False)

@@ -88,7 +88,7 @@ def test_larger_than_the_models_buffer_and_the_model_is_left_alone():
 @pytest.mark.parametrize("off", ["disable", "off"])
 def test_switched_off_means_none_and_one_warning(monkeypatch, off):
     monkeypatch.setenv("MUJOCO_GL", off)
-    with pytest.warns(RuntimeWarning, match="MUJOCO_GL"):
+    with pytest.warns(UserWarning, match="MUJOCO_GL"):
         assert video.record(model(PENDULUM), np.zeros((2, 1))) is None
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -101,7 +101,7 @@ def test_without_opengl_training_goes_on(monkeypatch):
 
     monkeypatch.delenv("MUJOCO_GL", raising=False)
     monkeypatch.setattr(video, "_make_context", fail)
-    with pytest.warns(RuntimeWarning, match="libEGL.so not found"):
+    with pytest.warns(UserWarning, match="libEGL.so not found"):
         assert video.record(model(PENDULUM), np.zeros((2, 1))) is None
 
 

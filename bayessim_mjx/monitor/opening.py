@@ -1,0 +1,40 @@
+"""What a command says first: task, parameters, budget, device, and what will take time."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from bayessim_mjx.config import Config
+from bayessim_mjx.monitor.words import number
+
+COMPILES = "the first start compiles its programs (about a minute on a CPU), later starts load them from the cache"
+
+
+def opening(config: Config, env: Any, device: Any, infers: bool = True) -> dict[str, Any]:
+    """{what: value} for `Console.start`; `infers`: the outer loop, else PPO alone."""
+    lines: dict[str, Any] = {"task": f"{config.task}, {'adaptive domain randomisation' if infers else 'PPO alone'}"}
+    if infers or config.randomization.get("randomize"):
+        lines["parameters"] = [_range(p) for p in env.space.parameters] or "none"
+    if infers:
+        logs = config.real.logs
+        lines["real side"] = f"recorded motion in {logs}" if logs else "surrogate: the simulator at hidden parameters"
+    lines["budget"] = _budget(config, infers)
+    lines |= {"device": str(device), "seed": config.seed, "note": COMPILES}
+    return lines
+
+
+def _range(p: Any) -> str:
+    unit = f" {p.unit}" if p.unit else ""
+    return f"{p.name} {number(p.low)}..{number(p.high)}{unit}"
+
+
+def _budget(config: Config, infers: bool) -> str:
+    ppo, b = config.ppo, config.bayessim
+    steps = ppo.max_iterations * ppo.num_steps * ppo.num_envs
+    training = f"{ppo.max_iterations} PPO iterations × {ppo.num_envs} worlds × {ppo.num_steps} steps"
+    if not infers:
+        return f"{training} = {number(steps)} steps"
+    whole = f"{b.realIters} rounds × ({training}) = {number(b.realIters * steps)} steps"
+    if b.modelClass is None:
+        return f"{whole}; no inference (bayessim.modelClass=None)"
+    return f"{whole}; {b.trainTrajs} simulated trajectories per round to infer from"
