@@ -22,13 +22,13 @@ class CompileClock:
         self.spans: list[tuple[float, float]] = []
         jax.monitoring.register_event_duration_secs_listener(self._duration)
 
-    def _duration(self, event: str, seconds: float, **_: Any) -> None:
+    def _duration(self, event: str, duration_secs: float, **_: Any) -> None:
         if event == RETRIEVED:
-            self.retrieved += seconds
+            self.retrieved += duration_secs
         if not event.startswith(COMPILE):
             return
-        self.backend += seconds if event == BACKEND else 0.0
-        begun, end = self.now() - seconds, self.now()
+        self.backend += duration_secs if event == BACKEND else 0.0
+        begun, end = self.now() - duration_secs, self.now()
         while self.spans and self.spans[-1][0] >= begun:  # what this one contains: a program traced inside another
             self.spans.pop()
         self.spans.append((begun, end))

@@ -238,13 +238,13 @@ class Console:
         if not self.live:
             return
         if self._progress is None:
-            from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn
+            from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn
 
             columns = (
                 SpinnerColumn(),
                 TextColumn("{task.description:<14}"),
                 BarColumn(24),
-                MofNCompleteColumn(),
+                TextColumn("{task.fields[count]}"),
                 TextColumn("{task.fields[eta]}"),
                 TextColumn("{task.fields[note]}"),
             )
@@ -252,11 +252,20 @@ class Console:
             self._progress.start()
         if kind in self._bars:
             self._progress.remove_task(self._bars[kind])
-        self._bars[kind] = self._progress.add_task(text, total=total, completed=done, eta="", note="")
+        self._bars[kind] = self._progress.add_task(
+            text, total=total, completed=done, eta="", note="", count=_count(done, total)
+        )
 
     def _move(self, kind: str, done: int | None, note: str, eta: float | None, text: str | None = None) -> None:
         if self._progress is None or kind not in self._bars:
             return
         said = "" if eta is None else f"ETA {duration(eta)}"
         more: dict[str, Any] = {} if text is None else {"description": text}
+        clock = self._rounds if kind == "round" else self._steps
+        if clock is not None and done is not None:
+            more["count"] = _count(done, clock.total)
         self._progress.update(self._bars[kind], completed=done, note=escape(note), eta=said, **more)
+
+
+def _count(done: int, total: int | None) -> str:
+    return f"{done}/{total}" if total else ""

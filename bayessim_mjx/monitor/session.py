@@ -84,7 +84,9 @@ class Session:
         slowed = self._compiled("training")
         iteration = self._overall(round_, int(state.train.iteration))
         self.learning.scalars(iteration, {tag if "/" in tag else f"Perf/{tag}": v for tag, v in metrics.items()})
-        over_time = {tag: metrics[tag] for tag in ("Train/mean_reward", "Train/mean_episode_length") if tag in metrics}
+        over_time: dict[str, float] = {
+            tag: metrics[tag] for tag in ("Train/mean_reward", "Train/mean_episode_length") if tag in metrics
+        }
         self.wall.scalars(int(time.perf_counter() - self.started), over_time)
         shown = {tag: metrics[tag] for tag in SHOWN if tag in metrics and not (slowed and tag == SPEED)}
         done, n = iteration - round_ * self.config.ppo.max_iterations, self.config.ppo.max_iterations
@@ -207,7 +209,8 @@ def channels(mj_model: Any, info: RoundInfo) -> tuple[dict[str, np.ndarray], dic
 
 def units(mj_model: Any) -> dict[str, str]:
     """{channel: unit} of hinges and slides, named as in `channels`."""
-    named, found = Channels.of(mj_model), {}
+    named = Channels.of(mj_model)
+    found: dict[str, str] = {}
     for joint, kind in zip(named.joints, named.kinds, strict=True):
         if unit := {"hinge": "rad", "slide": "m"}.get(kind):
             found |= {f"qpos:{joint}": unit, f"qvel:{joint}": f"{unit}/s"}
