@@ -68,10 +68,9 @@ def brax(env, steps: int, num_envs: int, seed: int) -> None:
     marks = []
 
     def progress(step, metrics):
-        marks.append(
-            (step, time.perf_counter(), float(metrics["eval/episode_reward"]), float(metrics.get("training/sps", 0)))
-        )
-        print(f"brax  steps {step:10d} return {marks[-1][2]:8.1f} sps {marks[-1][3]:10.0f}", flush=True)
+        marks.append(float(metrics.get("training/sps", 0)))
+        reward = float(metrics["eval/episode_reward"])
+        print(f"brax  steps {step:10d} return {reward:8.1f} sps {marks[-1]:10.0f}", flush=True)
 
     ppo_train.train(
         environment=env, num_timesteps=steps, num_evals=4, episode_length=env.episode_length, num_envs=num_envs,

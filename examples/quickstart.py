@@ -8,6 +8,7 @@ config = load("Pendulum", overrides=small)
 env = registry.make(config.task, config=config)
 parts = loop.make(config, env)
 state, rounds = loop.run(parts, loop.init(parts))
-for name, row in rounds[-1].posterior.describe().items():
+assert state.domain is not None
+for name, row in state.domain.describe().items():
     print(name, row)
 print("hidden truth:", rounds[-1].truth)
