@@ -71,6 +71,7 @@ def _run(config: Config, run: Any, command: Sequence[str], console: Any) -> int:
     device = setup_jax(config)
     env = registry.make(config.task, config=config)
     console.start(opening(config, env, device))
+    console.phase("setting up")
     parts = loop.make(config, env)
     state: Any = loop.init(parts)
     resumed = run is not None and bool(run.checkpoints)

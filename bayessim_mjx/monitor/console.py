@@ -177,7 +177,8 @@ class Console:
         eta = self._rounds.eta() if self._rounds is not None else None
         tail = [] if seconds is None else [duration(float(seconds))]
         tail += [f"ETA {duration(eta)}"] if eta else []
-        room = self.width - len("   ".join(parts + tail)) - len("   sd/prior ")
+        rows = 1 if self.width >= FILE_WIDTH else 2  # a narrow terminal breaks the line
+        room = rows * self.width - len("   ".join(parts + tail)) - len("   sd/prior ")
         if widths:
             brief = without_prefix(list(widths))
             full, short = (fit(named(names, widths), room) for names in (brief, shorten(brief, 18)))

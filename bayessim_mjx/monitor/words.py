@@ -12,6 +12,7 @@ SPOKEN = {
     "total_fps": "steps/s",
     "learning_rate": "lr",
     "explained_variance": "explained",
+    "value": "value loss",
     "mean_std": "action sd",
 }
 
