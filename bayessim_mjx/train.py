@@ -28,15 +28,19 @@ class Training:
 
     def __init__(self, config: Config, env: Any, run: Any, writer: Any, console: Any, stop: cli.Stop):
         import jax
+        import jax.numpy as jnp
 
         from bayessim_mjx.distributions import Distribution
+        from bayessim_mjx.main import film
         from bayessim_mjx.monitor.compile_clock import CompileClock
 
         self.config, self.env, self.run, self.writer, self.console, self.stop = config, env, run, writer, console, stop
         randomized = bool(config.randomization.get("randomize")) and len(env.space) > 0
         self.domain = Distribution.prior(env.space, 1) if randomized else None
         self.key, self.evaluation_key = jax.random.split(jax.random.PRNGKey(config.seed))
-        self.compiling = CompileClock()
+        self.compiling, self.filmed = CompileClock(), 0
+        nominal = jnp.asarray(env.space.nominal, jnp.float32)[None]
+        self.film = film(env, config, nominal)  # None: no videos
 
     def state(self) -> Any:
         """A new training state."""
@@ -58,7 +62,23 @@ class Training:
             self.console.compile("training", seconds, cached)
         shown = {tag: metrics[tag] for tag in SHOWN if tag in metrics and not (slowed and tag == SPEED)}
         self.console.iteration(shown, iteration)
+        self._video(iteration, state)
         self.stop.save(lambda: self.run.save(iteration, self.tree(state)))
+
+    def _video(self, iteration: int, state: Any) -> None:
+        """An episode at nominal physics every `monitor.video_interval` steps, and at the end."""
+        from bayessim_mjx.monitor import video
+        from bayessim_mjx.rl import policy_of
+
+        ppo, monitor = self.config.ppo, self.config.monitor
+        every = max(1, monitor.video_interval // ppo.num_steps)
+        if self.film is None or not (iteration // every > self.filmed or iteration >= ppo.max_iterations):
+            return
+        self.filmed = iteration // every
+        frames = video.record(
+            self.env.mj_model, self.film(policy_of(state), monitor.video_length), dt=self.env.dt, fps=25
+        )
+        self.writer.video("Train/video", frames, 25, iteration)
 
     def evaluate(self, state: Any) -> float:
         """Mean return of deterministic episodes, the same worlds at every evaluation; logged."""
@@ -113,7 +133,7 @@ def _run(config: Config, run: Any, command: Sequence[str], headless: bool) -> in
         state = training.state()
         if resumed:
             state = run.restore("latest", training.tree(state), fall_back=True)[0]["state"]
-        training.writer = Writer(run.path, purge_step=int(state.iteration) + 1 if resumed else None)
+        training.writer = Writer(run.path, int(state.iteration) + 1 if resumed else None, media=run.path / "videos")
         training.writer.text("cfg", to_yaml(config.to_dict()), code=True)
         console.phase("training", config.ppo.max_iterations, int(state.iteration))
         try:

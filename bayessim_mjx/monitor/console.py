@@ -153,6 +153,7 @@ class Console:
         round: int,
         rounds: int | None = None,
         reward: tuple[float, float] | float | None = None,
+        where: str = "real",
         gain: float | None = None,
         widths: Mapping[str, float] | None = None,
         seconds: float | None = None,
@@ -161,7 +162,7 @@ class Console:
 
         Args:
             round: counted from 0. rounds: how many there are (default: what `begin` said).
-            reward: mean (and standard deviation) of the return on the real system.
+            reward: mean (and standard deviation) of the return on the real system, or `where` it was measured.
             gain: log posterior - log prior at the truth [nats].
             widths: {parameter: posterior sd / prior sd}, in the order of interest: as many as fit are shown.
         """
@@ -171,7 +172,7 @@ class Console:
         parts = [f"round {int(round) + 1}" + (f"/{rounds}" if rounds else "")]
         if reward is not None:
             values = reward if isinstance(reward, Sequence) else (reward,)
-            parts.append("real reward " + " ± ".join(number(v) for v in values))
+            parts.append(f"{where} reward " + " ± ".join(number(v) for v in values))
         if gain is not None and is_number(gain):
             parts.append(f"log p(truth) {float(gain):+.2f} nats vs prior")
         eta = self._rounds.eta() if self._rounds is not None else None

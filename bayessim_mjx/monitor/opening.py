@@ -16,7 +16,7 @@ def opening(config: Config, env: Any, device: Any, infers: bool = True) -> dict[
     if infers or config.randomization.get("randomize"):
         lines["parameters"] = [_range(p) for p in env.space.parameters] or "none"
     if infers:
-        logs = config.real.logs
+        logs = ", ".join([config.real.logs] if isinstance(config.real.logs, str) else map(str, config.real.logs or ()))
         lines["real side"] = f"recorded motion in {logs}" if logs else "surrogate: the simulator at hidden parameters"
     lines["budget"] = _budget(config, infers)
     lines |= {"device": str(device), "seed": config.seed, "note": COMPILES}

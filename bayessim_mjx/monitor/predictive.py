@@ -97,6 +97,10 @@ def _channel(axes: Any, time: np.ndarray, real: np.ndarray, simulated: np.ndarra
     axes.grid(color="#EAEAEA", lw=0.6)
     axes.set_axisbelow(True)
     axes.margins(x=0)
+    seen = np.concatenate([real.ravel(), band.ravel()])
+    seen = seen[np.isfinite(seen)]
+    if len(seen) and (wide := float(np.ptp(seen))) > 0:  # one simulation that runs away must not flatten the rest
+        axes.set_ylim(seen.min() - 0.08 * wide, seen.max() + 0.08 * wide)
     axes.tick_params(labelsize=7.5)
     axes.spines[["top", "right"]].set_visible(False)
 

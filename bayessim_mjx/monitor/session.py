@@ -227,6 +227,7 @@ def round_line(info: RoundInfo) -> dict[str, Any]:
         "round": info.round,
         "rounds": info.rounds,
         "reward": (float(info.returns.mean()), float(info.returns.std())),
+        "where": "simulated" if info.truth is None else "real",
         "gain": info.scores.get("gain_over_prior"),
         "widths": widths,
         "seconds": sum(info.seconds.values()),
