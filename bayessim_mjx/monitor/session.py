@@ -114,7 +114,7 @@ class Session:
         if self.config.monitor.posterior_plots:
             self._plots(info)
         if self.film is not None:
-            self._video(self.inference, "SurrogateReal/video", policy, step)
+            self._video(self.inference, f"{side.split('/')[0]}/video", policy, step)
         self._note(info)
         self.console.round_line(**round_line(info))
         for text in info.warnings:
