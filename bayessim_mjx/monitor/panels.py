@@ -48,7 +48,7 @@ def _name_edges(grid: Any, draws: Draws, cell: tuple[float, float], size: float)
         below.xaxis.set_label_coords(0.5, -(0.22 if d > 1 else 0.28) / cell[1])
         if k > 0:
             grid[k, 0].set_ylabel(label(draws, k, room[1], 3), fontsize=size)
-            grid[k, 0].yaxis.set_label_coords(-0.34 / cell[0], 0.5)
+            grid[k, 0].yaxis.set_label_coords(-0.48 / cell[0], 0.5)
 
 
 def marginal(axes: Any, draws: Draws, k: int, true: np.ndarray | None, limits: Limits) -> None:
@@ -186,7 +186,7 @@ def _numbers(axis: Any, log: bool) -> None:
 def _few_ticks(axes: Any, draws: Draws, place: tuple[int, int], cell: tuple[float, float]) -> None:
     from matplotlib.ticker import MaxNLocator
 
-    most = [6 if side > 3 else 5 if side > 1.5 else 3 if side > 1.0 else 2 for side in cell]
+    most = [6 if side > 3 else 4 if side > 2 else 3 if side > 1.0 else 2 for side in cell]
     sides = [(axes.xaxis, place[0], most[0])] + [(axes.yaxis, place[1], most[1])] * (place[0] != place[1])
     for axis, k, count in sides:
         axis.set_major_locator(MaxNLocator(count, prune="both" if draws.d > 1 else None))
