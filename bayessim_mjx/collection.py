@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -26,6 +27,7 @@ from bayessim_mjx.parameters import ParameterSpace
 from bayessim_mjx.rl import Policy
 from bayessim_mjx.rollout import Trajectory, replay, rollout
 
+ESTIMATED_SPEED = 3.0  # error of a velocity estimated from positions, in its noise part: it lags at transients
 RANDOM_SHARE = 0.1  # policy_rl_randomized: share of the steps with a uniformly random action (BayesSimIG)
 POLICY_DEPENDENT = ("policy_rl", "policy_rl_randomized")
 
@@ -93,6 +95,11 @@ class Surrogate:
         """How many real trajectories there are; None: as many as asked for."""
         return None
 
+    @property
+    def policy_dependent(self) -> bool:
+        """Whether the trajectories, simulated and real, are made by the policy of their round."""
+        return self.policy_name in POLICY_DEPENDENT
+
     def sample(self, key: Array, count: int) -> Array:
         """theta [count, d] of the surrogate, inside the box."""
         k_component, k_noise = jax.random.split(key)
@@ -126,32 +133,40 @@ class Recorded:
 
     env: Any
     space: ParameterSpace
-    data: dict[
-        str, np.ndarray
-    ]  # qpos0 [M, nq], qvel0 [M, nv], command [M, T, nu], qpos [M, T+1, nq], qvel [M, T+1, nv]
+    data: dict[str, np.ndarray]  # qpos0, qvel0 [M, .], command [M, T, nu], qpos [M, T+1, nq], qvel [M, T+1, nv]
     order: np.ndarray  # [M] the order in which segments are used
     noise: dict[str, np.ndarray]  # standard deviation of the measurement noise: qpos [nq], qvel [nv]
+    with_qvel: (
+        bool  # velocities were measured; estimated ones are no features, simulation has nothing like their errors
+    )
     summarizer: Callable[[Array, Array], Array]
     truth: None = None
+    policy_dependent: bool = False  # the logged commands act, whatever bayessim.collectPolicy says
 
     @property
     def supply(self) -> int:
         return len(self.order)
 
     def features(self, qpos: Array, qvel: Array, command: Array) -> Array:
-        states = jnp.concatenate([qpos, qvel], axis=-1)
+        states = jnp.concatenate([qpos, qvel], axis=-1) if self.with_qvel else qpos
         return jax.vmap(self.summarizer)(states, command)
 
     def simulate(self, key: Array, thetas: Array, policy: Policy) -> Array:
-        """Replay randomly drawn segments at `thetas` [N, d], with measurement noise; features [N, D]."""
+        """Replay randomly drawn segments at `thetas` [N, d], with measurement noise; features [N, D].
+
+        The logged first state is a measurement too: the replay starts where the system may really have been.
+        """
         del policy  # the logged commands act
-        k_segment, k_qpos, k_qvel = jax.random.split(key, 3)
+        k_segment, *keys = jax.random.split(key, 5)
         index = jnp.asarray(self.order)[jax.random.randint(k_segment, (thetas.shape[0],), 0, len(self.order))]
-        start = {name: jnp.asarray(self.data[name])[index] for name in ("qpos0", "qvel0", "command")}
-        motion = replay(self.env.physics, start["qpos0"], start["qvel0"], start["command"], thetas)
-        qpos = motion["qpos"] + self.noise["qpos"] * jax.random.normal(k_qpos, motion["qpos"].shape)
-        qvel = motion["qvel"] + self.noise["qvel"] * jax.random.normal(k_qvel, motion["qvel"].shape)
-        return self.features(qpos, qvel, start["command"])
+        qpos0, qvel0, command = (jnp.asarray(self.data[name])[index] for name in ("qpos0", "qvel0", "command"))
+        speed_error = self.noise["qvel"] * (1.0 if self.with_qvel else ESTIMATED_SPEED)
+        start = qpos0 + self.noise["qpos"] * jax.random.normal(keys[0], qpos0.shape)
+        speed = qvel0 + speed_error * jax.random.normal(keys[1], qvel0.shape)
+        motion = replay(self.env.physics, start, speed, command, thetas)
+        qpos = motion["qpos"] + self.noise["qpos"] * jax.random.normal(keys[2], motion["qpos"].shape)
+        qvel = motion["qvel"] + self.noise["qvel"] * jax.random.normal(keys[3], motion["qvel"].shape)
+        return self.features(qpos.at[:, 0].set(qpos0), qvel.at[:, 0].set(qvel0), command)
 
     def real(self, key: Array, first: int, count: int, policy: Policy) -> tuple[Array, Trajectory]:
         """The next `count` segments of the logs and their features."""
@@ -206,8 +221,12 @@ def _recorded(config: Config, env: Any, summarizer: Callable) -> Recorded:
             f"real.logs: the logs hold {count} segments of {length} steps ({length * env.dt:.3g} s), "
             f"bayessim.realTrajs={needed} are asked for; shorten bayessim.trainTrajLen or record more"
         )
+    if config.bayessim.collectPolicy != "policy_replay":
+        policy = config.bayessim.collectPolicy
+        warnings.warn(f"real.logs: the logged commands act, bayessim.collectPolicy={policy} does not", stacklevel=2)
     order = np.random.default_rng(config.seed).permutation(count)
-    return Recorded(env, env.space, data, order, noise(logs), summarizer)
+    measured = all(log.has_qvel for log in logs)
+    return Recorded(env, env.space, data, order, noise(logs), measured, summarizer)
 
 
 def real_parameters(settings: Any, space: ParameterSpace) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -20,7 +20,7 @@ import numpy as np
 from jax import Array
 
 from bayessim_mjx import inference, rl
-from bayessim_mjx.collection import POLICY_DEPENDENT, Recorded, Source, domain_or_prior, make_source
+from bayessim_mjx.collection import Recorded, Source, domain_or_prior, make_source
 from bayessim_mjx.config import BayesSimConfig, Config
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.env import Env
@@ -31,6 +31,7 @@ from bayessim_mjx.rollout import Trajectory, replay, select
 CHUNK = 2500  # trajectories simulated at once while collecting
 KEPT_ROUNDS = 4  # rounds of simulated trajectories kept for the fit where the collection policy does not change
 PREDICTIVE_DRAWS = 64
+CLIPPED = 0.01  # share of clipped summary entries worth a warning
 
 
 @flax.struct.dataclass
@@ -41,7 +42,7 @@ class LoopState:
     train: TrainState
     domain: Distribution | None  # what physics is drawn from
     fit: Any  # FitState of the inference network; None for the uniform ablation
-    thetas: Array  # [capacity, d] simulated parameters
+    thetas: Array  # [kept rounds * trainTrajs, d] simulated parameters; none where every round uses its own alone
     features: Array  # [capacity, D] and their summaries
     real_features: Array  # [realIters * realTrajs, D], the first round * realTrajs rows are filled
     real_posteriors: Distribution | None  # q(theta | x) of each real trajectory at the time it was seen
@@ -74,7 +75,15 @@ class Monitor(Protocol):
 
 
 class Checkpoints(Protocol):
-    def save(self, step: int, tree: Any, *, evaluation: float | None = None, meta: dict | None = None) -> Any: ...
+    def save(
+        self,
+        step: int,
+        tree: Any,
+        *,
+        evaluation: float | None = None,
+        meta: dict | None = None,
+        supersede: bool = False,
+    ) -> Any: ...
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -96,10 +105,10 @@ class Loop:
 
     @property
     def capacity(self) -> int:
-        """Rows of simulated trajectories kept."""
+        """Rows of simulated trajectories kept from round to round; 0: a round's own are fitted and dropped."""
         b = self.settings
-        keeps = b.ftune and b.collectPolicy not in POLICY_DEPENDENT
-        return b.trainTrajs * (min(b.realIters, KEPT_ROUNDS) if keeps else 1)
+        keeps = b.ftune and self.source is not None and not self.source.policy_dependent
+        return b.trainTrajs * min(b.realIters, KEPT_ROUNDS) if keeps else 0
 
     def key(self, round_: int, purpose: str) -> Array:
         """Every random draw has its own key, a function of the seed alone: a resumed run draws the same."""
@@ -159,7 +168,8 @@ def _new_policy(loop: Loop, round_: int, domain: Distribution | None) -> TrainSt
 
 
 def _new_network(loop: Loop, round_: int) -> Any:
-    settings = inference.InferenceSettings.of(loop.settings)
+    changing = loop.source is not None and loop.source.policy_dependent
+    settings = inference.InferenceSettings.of(loop.settings, restandardise=changing)
     return inference.init(jax.random.fold_in(loop.key(round_, "fit"), 1), settings, loop.env.space, loop.feature_size)
 
 
@@ -202,8 +212,11 @@ def step(loop: Loop, state: LoopState) -> tuple[LoopState, RoundInfo]:
     if loop.settings.modelClass is not None:
         state = _infer(loop, state, policy, info)
     state = dataclasses.replace(state, round=state.round + 1)
-    if not loop.settings.ftuneRL and round_ + 1 < loop.settings.realIters:
-        state = dataclasses.replace(state, train=_new_policy(loop, round_ + 1, state.domain))
+    if round_ + 1 < loop.settings.realIters:
+        # new episodes under the new domain also where the policy goes on
+        new = _new_policy(loop, round_ + 1, state.domain)
+        kept = dataclasses.replace(state.train, env_states=new.env_states, episodes=new.episodes)
+        state = dataclasses.replace(state, train=kept if loop.settings.ftuneRL else new)
     return state, info
 
 
@@ -211,6 +224,7 @@ def _evaluate(loop: Loop, state: LoopState, policy: Policy) -> tuple[np.ndarray,
     """Deterministic episodes on the surrogate real; without one (logs), on physics drawn from the domain."""
     key, n = loop.key(int(state.round), "evaluate"), loop.settings.realEvals
     if isinstance(loop.source, Recorded) or loop.source is None:
+        # no truth to try it on: the physics it will be randomised over next, as far as that is known now
         thetas = jnp.zeros((n, 0)) if state.domain is None else state.domain.sample(key, n)
     else:
         thetas = loop.source.sample(key, n)
@@ -239,19 +253,18 @@ def _infer(loop: Loop, state: LoopState, policy: Policy, info: RoundInfo) -> Loo
     clock = time.perf_counter()
     prior = domain_or_prior(loop.env.space, b.components)
     thetas, features = _simulate(source, b.trainTrajs, loop.key(round_, "simulate"), policy, prior)
-    row = (round_ * b.trainTrajs) % loop.capacity
-    state = dataclasses.replace(
-        state,
-        thetas=jax.lax.dynamic_update_slice(state.thetas, thetas, (row, 0)),
-        features=jax.lax.dynamic_update_slice(state.features, features, (row, 0)),
-    )
-    jax.block_until_ready(state.features)
+    count = b.trainTrajs
+    if loop.capacity:
+        row, count = (round_ * b.trainTrajs) % loop.capacity, min((round_ + 1) * b.trainTrajs, loop.capacity)
+        thetas = jax.lax.dynamic_update_slice(state.thetas, thetas, (row, 0))
+        features = jax.lax.dynamic_update_slice(state.features, features, (row, 0))
+        state = dataclasses.replace(state, thetas=thetas, features=features)
+    jax.block_until_ready(features)
     info.seconds["simulate"] = time.perf_counter() - clock
 
     clock = time.perf_counter()
     network = state.fit if b.ftune or round_ == 0 else _new_network(loop, round_)
-    count = min((round_ + 1) * b.trainTrajs, loop.capacity)
-    network, fit_info = inference.fit(loop.key(round_, "fit"), network, state.thetas, state.features, jnp.int32(count))
+    network, fit_info = inference.fit(loop.key(round_, "fit"), network, thetas, features, jnp.int32(count))
     info.fit = {name: np.asarray(value) for name, value in dataclasses.asdict(fit_info).items()}
     info.seconds["fit"] = time.perf_counter() - clock
 
@@ -259,18 +272,14 @@ def _infer(loop: Loop, state: LoopState, policy: Policy, info: RoundInfo) -> Loo
     seen = round_ * b.realTrajs
     real_features, real = source.real(loop.key(round_, "real"), seen, b.realTrajs, policy)
     all_features = jax.lax.dynamic_update_slice(state.real_features, real_features, (seen, 0))
-    posteriors = inference.condition(network, all_features)
-    posteriors = dataclasses.replace(posteriors, prior_weight=jnp.full_like(posteriors.prior_weight, b.priorShare))
-    if b.collectPolicy in POLICY_DEPENDENT:
+    posteriors = _factors(network, all_features, b.priorShare)
+    if source.policy_dependent:
         # An older trajectory was made by an older policy: its posterior stays that of the network of its time.
         new = jnp.arange(all_features.shape[0]) >= seen
         posteriors = select(new, posteriors, state.real_posteriors)
-    domain = inference.combine(posteriors.split()[: seen + b.realTrajs], b.components)
-    domain = inference.restore_prior(domain, network.identified)
-    known, before = np.asarray(network.identified), np.asarray(state.fit.identified)
-    unknown = [name for name, k in zip(domain.names, known, strict=True) if not k]
-    if unknown and not np.array_equal(known, before):
-        info.warnings.append(f"not identified by these trajectories, kept at the prior: {', '.join(unknown)}")
+    rows = jax.tree.map(np.asarray, posteriors).split()  # on the host: an index on the device compiles each time
+    domain = inference.combine(rows[: seen + b.realTrajs], b.components)
+    info.warnings += _complaints(domain.names, info.fit, known_before=np.asarray(state.fit.identified))
     info.posterior, info.real = domain, jax.tree.map(np.asarray, real)
     info.scores = score(domain, source.truth)
     info.predictive = _predict(loop, domain, real, loop.key(round_, "predict"))
@@ -278,6 +287,29 @@ def _infer(loop: Loop, state: LoopState, policy: Policy, info: RoundInfo) -> Loo
     return dataclasses.replace(
         state, fit=network, real_features=all_features, real_posteriors=posteriors, domain=domain
     )
+
+
+@jax.jit
+def _factors(network: Any, features: Array, prior_share: float) -> Distribution:
+    """q(theta | x) of every real trajectory: the prior where nothing is identified, and a share of it everywhere."""
+    posteriors = inference.condition(network, features)
+    posteriors = jax.vmap(inference.restore_prior, in_axes=(0, None))(posteriors, network.identified)
+    return dataclasses.replace(posteriors, prior_weight=jnp.full_like(posteriors.prior_weight, prior_share))
+
+
+def _complaints(names: tuple[str, ...], fit: dict[str, Any], known_before: np.ndarray) -> list[str]:
+    """What a person should know about this round's fit."""
+    texts, known = [], fit["identified"]
+    unknown = [name for name, k in zip(names, known, strict=True) if not k]
+    if unknown and not np.array_equal(known, known_before):
+        texts.append(f"not identified by these trajectories, kept at the prior: {', '.join(unknown)}")
+    if fit["clipped"] > CLIPPED:
+        texts.append(f"{100 * float(fit['clipped']):.1f} % of the summaries' entries lie beyond 10 sd and were clipped")
+    if fit["n_invalid"] > 0:
+        texts.append(f"{int(fit['n_invalid'])} simulated trajectories left out: their summaries are not finite")
+    if fit["skipped"] > 0:
+        texts.append(f"{int(fit['skipped'])} steps of the fit skipped: gradient not finite")
+    return texts
 
 
 def score(domain: Distribution, truth: np.ndarray | None) -> dict[str, float]:
@@ -320,28 +352,30 @@ def run(
     """
     infos = []
     while int(state.round) < loop.settings.realIters:
-        round_ = int(state.round)
+        round_, last = int(state.round), [int(state.train.iteration)]
 
-        def progress(metrics: dict, trained: TrainState, state: LoopState = state, round_: int = round_) -> None:
-            current = dataclasses.replace(state, train=trained)
+        def progress(
+            metrics: dict, trained: TrainState, state: LoopState = state, round_: int = round_, last: list[int] = last
+        ) -> None:
+            current, every = dataclasses.replace(state, train=trained), loop.config.ppo.save_interval
             if monitor is not None:
                 monitor.training(round_, metrics, current)
-            if checkpoints is not None and _due(loop, int(trained.iteration)):
+            if checkpoints is not None and int(trained.iteration) // every > last[0] // every:
+                last[0] = int(trained.iteration)
                 checkpoints.save(checkpoint_step(loop, round_, trained), tree_of(loop, current), meta=_meta(current))
 
         clock = time.perf_counter()
         state = train(loop, state, progress)
         seconds = time.perf_counter() - clock
-        policy = rl.policy_of(state.train)
-        number = checkpoint_step(loop, round_, state.train)
+        policy, number = rl.policy_of(state.train), checkpoint_step(loop, round_, state.train) + 1
         state, info = step(loop, state)
         info.seconds["train"] = seconds
-        if checkpoints is not None:
-            checkpoints.save(
-                number + 1, {"policy": policy, "state": state}, evaluation=float(info.returns.mean()), meta=_meta(state)
-            )
         if monitor is not None:
-            monitor.round(info, policy)
+            monitor.round(info, policy)  # first: a round that was not reported is not finished
+        if checkpoints is not None:
+            evaluation, tree = float(info.returns.mean()), {"policy": policy, "state": state}
+            # under logs every round is evaluated on its own physics: only the newest evaluation counts
+            checkpoints.save(number, tree, evaluation=evaluation, meta=_meta(state), supersede=info.truth is None)
         infos.append(info)
     return state, infos
 
@@ -356,10 +390,6 @@ def checkpoint_step(loop: Loop, round_: int, trained: TrainState) -> int:
     n = loop.config.ppo.max_iterations
     done = int(trained.iteration) - (n * round_ if loop.settings.ftuneRL else 0)
     return round_ * (n + 1) + done
-
-
-def _due(loop: Loop, iteration: int) -> bool:
-    return iteration % loop.config.ppo.save_interval == 0
 
 
 def _meta(state: LoopState) -> dict[str, int]:

@@ -93,9 +93,18 @@ class Run:
         self._write()
 
     def save(
-        self, step: int, tree: Any, *, evaluation: float | None = None, meta: Mapping[str, Any] | None = None
+        self,
+        step: int,
+        tree: Any,
+        *,
+        evaluation: float | None = None,
+        meta: Mapping[str, Any] | None = None,
+        supersede: bool = False,
     ) -> Path:
-        """Checkpoint a pytree of arrays; with an `evaluation` (mean return, higher is better) it may become "best"."""
+        """Checkpoint a pytree of arrays; with an `evaluation` (mean return, higher is better) it may become "best".
+
+        `supersede`: earlier evaluations were of something else and no longer compete.
+        """
         score = None if evaluation is None or not math.isfinite(evaluation) else float(evaluation)
         folder = self.path / "checkpoints"
         folder.mkdir(exist_ok=True)
@@ -104,7 +113,8 @@ class Run:
         checkpoints.save(path, tree, step, meta or {})
         kind = "periodic" if score is None else "evaluated"
         entry = {"step": int(step), "path": str(path.relative_to(self.path)), "evaluation": score, "kind": kind}
-        listed = [c for c in self.checkpoints if c["step"] != int(step)] + [entry]
+        older = [c for c in self.checkpoints if c["step"] != int(step)]
+        listed = [{**c, "evaluation": None} if supersede else c for c in older] + [entry]
         best = _best(listed)
         kept = [c for i, c in enumerate(listed) if i >= len(listed) - self.keep or c["step"] == best]
         self.manifest.update(checkpoints=kept, latest=int(step), best=best)

@@ -82,8 +82,8 @@ def fit(
     """Maximum likelihood on the first `count` rows of thetas [N, d] and x [N, D]; the rest is padding.
 
     Goes on from the weights in `state` with a fresh schedule. The weights with the best held-out score are kept, the
-    starting ones included. Inputs keep the standardisation of the first fit. ValueError on wrong shapes or when no row
-    is usable.
+    starting ones included. Inputs keep the standardisation of the first fit, unless settings.restandardise. ValueError
+    on wrong shapes or when no row is usable.
     """
     count = thetas.shape[0] if count is None else count
     d, dim_x = len(state.space), state.x_mean.shape[0]
@@ -203,8 +203,8 @@ def _prepare(state: FitState, thetas: Array, x: Array, count: Array) -> tuple[Fi
     u = jnp.clip(jax.vmap(state.space.to_unit)(jnp.where(valid[:, None], thetas, nominal)), 0, 1)
     x = jnp.where(valid[:, None], x, 0.0)
     mean, rate = _column_scales(x, valid)
-    first = state.fits == 0
-    mean, rate = jnp.where(first, mean, state.x_mean), jnp.where(first, rate, state.x_rate)
+    fresh = (state.fits == 0) | state.settings.restandardise
+    mean, rate = jnp.where(fresh, mean, state.x_mean), jnp.where(fresh, rate, state.x_rate)
     z, clipped = _standardise(x, mean, rate, state.settings.clip)
 
     share = np.uint32(round(state.settings.validation * 2**32))

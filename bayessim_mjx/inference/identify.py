@@ -42,6 +42,7 @@ def identified(gain: Array, mask: Array) -> tuple[Array, Array]:
     return mean, mean > SIGNIFICANT * jnp.sqrt(var / n) + RELEVANT
 
 
+@jax.jit
 def restore_prior(posterior: Distribution, keep: Array) -> Distribution:
     """The posterior over the parameters to keep [d], the prior over the others, independent of them."""
     keep = jnp.asarray(keep)

@@ -24,6 +24,7 @@ class InferenceSettings:
     max_steps: int = 4000
     grad_clip: float = 5.0  # global norm
     validation: float = 0.1  # share of rows held out
+    restandardise: bool = False  # inputs anew at every fit: for data whose distribution changes from fit to fit
     clip: float = 10.0  # standardised inputs are clipped to +-clip
     defensive: float = 1e-4  # prior mass in every posterior: one that is wildly wrong cannot veto the others
 
