@@ -17,6 +17,7 @@ from bayessim_mjx.distributions import Distribution, box
 
 SIGNIFICANT = 3.0  # standard errors of the mean held-out gain
 RELEVANT = 0.01  # nats
+DEFENSIVE = 0.05  # share of the prior mixed in before scoring
 FLAT = 20.0  # sd in unit coordinates that is flat inside the cube: the density varies by 3e-4
 
 
@@ -36,6 +37,8 @@ def marginal_gain(logits: Array, means: Array, scales: Array, u: Array) -> Array
 def identified(gain: Array, mask: Array) -> tuple[Array, Array]:
     """(mean gain [d], identified [d]) from gains [n, d] of the rows with mask [n] = 1."""
     n = jnp.maximum(jnp.sum(mask), 1.0)
+    # a share of the prior bounds what a single misjudged row can cost
+    gain = jnp.logaddexp(np.float32(np.log(DEFENSIVE)), np.float32(np.log1p(-DEFENSIVE)) + gain)
     gain = jnp.where(mask[:, None] > 0, gain, 0.0)
     mean = jnp.sum(gain, axis=0) / n
     var = jnp.sum(jnp.where(mask[:, None] > 0, (gain - mean[None, :]) ** 2, 0.0), axis=0) / n
