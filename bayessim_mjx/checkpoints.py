@@ -24,10 +24,15 @@ class CorruptedError(UserError):
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Replace `path` by `content` atomically: a reader sees the old file or the new one, also after a kill."""
+    """Replace `path` by `content` atomically."""
+    write_text(path, json.dumps(content, indent=1))
+
+
+def write_text(path: Path, text: str) -> None:
+    """Replace `path` by `text` atomically: a reader sees the old file or the new one, also after a kill."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     with open(temporary, "w", encoding="utf-8") as file:
-        json.dump(content, file, indent=1)
+        file.write(text)
         file.flush()
         os.fsync(file.fileno())
     os.replace(temporary, path)
@@ -78,7 +83,23 @@ def read_index(path: Path) -> dict[str, Any]:
         raise CorruptedError(f"{path}: not a checkpoint, or damaged: {INDEX}: {error}") from None
     if not isinstance(index, dict) or index.get("format") != FORMAT or "parts" not in index:
         raise CorruptedError(f"{path / INDEX}: not a checkpoint index of format {FORMAT}")
+    parts = index["parts"]
+    if not (isinstance(parts, dict) and isinstance(index.get("meta"), dict)):
+        raise CorruptedError(f"{path / INDEX}: damaged checkpoint index: parts and meta have to be objects")
+    for name, leaves in parts.items():
+        if not (isinstance(leaves, list) and all(map(_is_leaf, leaves))):
+            raise CorruptedError(f"{path / INDEX}: damaged checkpoint index: part {name!r} is no list of leaves")
     return index
+
+
+def _is_leaf(leaf: Any) -> bool:
+    """Whether it is what `_describe` makes."""
+    return (
+        isinstance(leaf, dict)
+        and all(isinstance(leaf.get(key), str) for key in ("name", "dtype", "sha256"))
+        and isinstance(leaf.get("shape"), list)
+        and all(type(n) is int and n >= 0 for n in leaf["shape"])
+    )
 
 
 def restore(path: Path, template: Any) -> tuple[Any, dict[str, Any]]:

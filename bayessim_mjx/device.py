@@ -15,7 +15,7 @@ def setup_jax(config: Config) -> Any:
     """Make the device of `config` the default and switch the compilation cache on; returns the device."""
     import jax
 
-    match = re.fullmatch(r"(auto|cpu|gpu|cuda|rocm|tpu)(?::(\d+))?", config.device)
+    match = re.fullmatch(r"(auto(?!:)|cpu|gpu|cuda|rocm|tpu)(?::(\d+))?", config.device)
     if match is None:
         raise UserError(f"device = {config.device!r}: expected auto, cpu, gpu, gpu:1 or cuda:0")
     platform, number = match[1], int(match[2] or 0)

@@ -68,12 +68,13 @@ class Run:
             raise UserError(f"{path}: not a run folder (no {MANIFEST} in it)")
         try:
             manifest = json.loads(file.read_text(encoding="utf-8"))
-            schema = manifest["schema"]
-            [(int(c["step"]), str(c["path"]), c["evaluation"]) for c in manifest["checkpoints"]]
-        except (OSError, ValueError, KeyError, TypeError) as error:
+        except (OSError, ValueError) as error:
             raise UserError(f"{file}: damaged manifest: {type(error).__name__}: {error}") from None
-        if schema != SCHEMA:
+        schema = manifest.get("schema") if isinstance(manifest, dict) else None
+        if type(schema) is int and schema != SCHEMA:
             raise UserError(f"{file}: written by another version (schema {schema}, this one reads {SCHEMA})")
+        if fault := _fault(manifest):
+            raise UserError(f"{file}: damaged manifest: {fault}")
         return cls(path, manifest)
 
     @property
@@ -88,7 +89,7 @@ class Run:
         return self.manifest["checkpoints"]
 
     def set_status(self, status: str) -> None:
-        """running, finished or interrupted."""
+        """running, finished, interrupted (Ctrl-C) or failed (an error)."""
         self.manifest["status"] = status
         self._write()
 
@@ -163,6 +164,26 @@ class Run:
         for path in folder.iterdir():
             if path.name not in listed and DAMAGED not in path.name:
                 shutil.rmtree(path, ignore_errors=True)
+
+
+def _fault(manifest: Any) -> str | None:
+    """What is wrong with the contents of run.json; None: nothing."""
+    if not isinstance(manifest, dict):
+        return "not an object"
+    for key, kind in (("schema", int), ("task", str), ("created", str), ("status", str), ("checkpoints", list)):
+        if type(manifest.get(key)) is not kind:
+            return f"{key} = {manifest.get(key)!r}"
+    for entry in manifest["checkpoints"]:
+        ok = isinstance(entry, dict) and type(entry.get("step")) is int and isinstance(entry.get("path"), str)
+        score = entry.get("evaluation", "") if ok else ""
+        if not ok or isinstance(score, bool) or not isinstance(score, int | float | None):
+            return f"checkpoints: {entry!r}"
+    steps = [entry["step"] for entry in manifest["checkpoints"]]
+    for key in ("latest", "best"):
+        step = manifest.get(key, "absent")
+        if step is not None and (type(step) is not int or step not in steps):
+            return f"{key} = {step!r} is none of the checkpoints {steps}"
+    return None
 
 
 def _best(listed: Sequence[Mapping[str, Any]]) -> int | None:

@@ -182,6 +182,53 @@ def test_damaged_manifest_and_foreign_folder(run: Run, tmp_path: Path) -> None:
         runs.latest_run(run.path.parents[1], "Pendulum")
 
 
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("best", "gone"),
+        ("best", 7),
+        ("latest", "1"),
+        ("task", 3),
+        ("created", None),
+        ("checkpoints", {"step": 1}),
+        ("checkpoints", [3]),
+        ("checkpoints", [{"step": "1", "path": "x", "evaluation": None}]),
+        ("checkpoints", [{"step": 1, "path": "x"}]),
+        ("checkpoints", [{"step": 1, "path": "x", "evaluation": "high"}]),
+    ],
+)
+def test_a_manifest_of_wrong_types_is_named(run: Run, key: str, value: object) -> None:
+    run.save(1, tree(), evaluation=0.0)
+    manifest = json.loads((run.path / "run.json").read_text())
+    manifest[key] = value
+    if value == "gone":
+        del manifest[key]
+    (run.path / "run.json").write_text(json.dumps(manifest))
+    with pytest.raises(UserError, match=rf"run\.json: damaged manifest: {key}"):
+        Run.open(run.path)
+    (run.path / "run.json").write_text("3")
+    with pytest.raises(UserError, match="damaged manifest: not an object"):
+        Run.open(run.path)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"parts": {"policy": 3}},
+        {"parts": []},
+        {"parts": {"policy": [{"name": "w"}]}},
+        {"parts": {"policy": [{"name": "w", "shape": "3", "dtype": "float32", "sha256": ""}]}},
+        {"meta": None},
+    ],
+)
+def test_an_index_of_wrong_types_is_damage(run: Run, change: dict) -> None:
+    path = run.save(1, tree())
+    index = json.loads((path / "index.json").read_text())
+    (path / "index.json").write_text(json.dumps({**index, **change}))
+    with pytest.raises(UserError, match=r"index\.json: damaged checkpoint index"):
+        run.restore("latest", tree(), fall_back=True)
+
+
 def test_names_cannot_leave_the_folder() -> None:
     with pytest.raises(UserError, match="name = '../x'"):
         config.load("Ant", overrides=["name=../x"])
