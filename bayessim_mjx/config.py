@@ -42,6 +42,8 @@ SECTIONS: dict[str, type[Section]] = {
 }  # fmt: skip
 TOP_KEYS = [YAML_NAMES.get(f.name, f.name) for f in dataclasses.fields(Config)]
 TASK_KEYS = ("randomize", "randomization_params")
+PARAMS = "task.randomization_params"
+NEW_GROUPS = ("option", "effects")  # which an override may add; what is in `effects` is for the effects to check
 RANDOMIZED_KEYS = (
     "range", "operation", "distribution", "mean", "sd", "nominal", "include", "exclude", "factor", "unit", "schedule",
     "schedule_steps", "num_buckets", "setup_only",
@@ -257,9 +259,10 @@ def _merge_task(merged: dict, raw: Mapping, source: str, is_file: bool, section:
 def _deep(base: Any, change: Any, path: str, source: str) -> Any:
     if not isinstance(change, Mapping) or not isinstance(base, Mapping):
         return thaw(change)
-    allowed = list(dict.fromkeys([*base, *(RANDOMIZED_KEYS if "range" in base else ())]))
+    more = RANDOMIZED_KEYS if "range" in base else NEW_GROUPS if path == PARAMS else ()
+    allowed = list(dict.fromkeys([*base, *more]))
     for key in change:
-        if key not in allowed and path.count(".") > 0:
+        if key not in allowed and path.count(".") > 0 and not path.startswith(f"{PARAMS}.effects"):
             raise unknown(f"{source}: key", f"{path}.{key}", [f"{path}.{k}" for k in allowed])
     return {**base, **{k: _deep(base.get(k), v, f"{path}.{k}", source) for k, v in change.items()}}
 

@@ -16,6 +16,7 @@ import numpy as np
 from flax import struct
 
 from bayessim_mjx.effects.effect import Effect
+from bayessim_mjx.effects.reading import stack
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.parameters import ParameterSpace
 from bayessim_mjx.physics import Physics, World, control_step, mjx
@@ -100,7 +101,12 @@ class Task(Env):
         config: settings of `env:` (a mapping, or `config.EnvConfig`): `episodeLength`, `variant` and the task's own
             keys, which are listed with their defaults in `options`.
         randomization: the BayesSimIG `task:` section (key `randomization_params`); None or empty: the task's default.
-        effects: unmodelled effects to simulate.
+            `randomize: False` means the model's own physics: no parameters, and no effects from the section.
+        effects: unmodelled effects to simulate, whose ranges the section's `effects` may change; effects that only the
+            section names come after them. theta holds the model's parameters, then those of the effects.
+
+    A world that is no longer finite, or where a velocity reaches `speed_limit`, counts as diverged: it stays in its
+    last sound state, and the episode terminates with the reward `diverged_reward`. Observations are always finite.
 
     Raises:
         UserError: on an unknown setting or variant; ValueError: on bad parameters or effects.
@@ -114,8 +120,8 @@ class Task(Env):
     observation_names: ClassVar[tuple[str, ...]]
     observation_clip: ClassVar[dict[str, float | None]] = {"isaacgymenvs": None, "bayessim2021": 100.0}
     max_qvel: ClassVar[float | None] = None
-    diverged_reward: ClassVar[float] = 0.0
-    speed_limit: ClassVar[float] = 1e5  # |qvel| beyond which a world counts as diverged
+    diverged_reward: ClassVar[float] = 0.0  # of the step in which a world diverges
+    speed_limit: ClassVar[float] = 1e5  # |qvel|, m/s or rad/s, from which on a world counts as diverged
 
     def __init__(
         self,
@@ -128,9 +134,10 @@ class Task(Env):
         self.variant: str = self.settings["variant"]
         self.episode_length = int(self.settings["episodeLength"])
         mj_model = self.spec().compile()
-        section = (randomization or self.randomization).get("randomization_params", {})
+        randomization = randomization or self.randomization
+        section = {} if randomization.get("randomize") is False else randomization.get("randomization_params", {})
         space = ParameterSpace.from_config(section, mj_model)
-        self.physics = Physics(mj_model, self.control_dt, space, effects, self.max_qvel)
+        self.physics = Physics(mj_model, self.control_dt, space, stack(section, effects), self.max_qvel)
         self.joint_names = _names(mj_model, mujoco.mjtObj.mjOBJ_JOINT, mj_model.njnt)
         self.actuator_names = _names(mj_model, mujoco.mjtObj.mjOBJ_ACTUATOR, mj_model.nu)
 

@@ -3,11 +3,12 @@
 import difflib
 import importlib
 import pkgutil
+import warnings
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from bayessim_mjx import effects as effects_room
 from bayessim_mjx import tasks
+from bayessim_mjx.effects import reading
 from bayessim_mjx.errors import UserError
 
 if TYPE_CHECKING:
@@ -29,7 +30,8 @@ def make(name: str, *, config: "Config | None" = None, effects: "Sequence[Effect
 
     Args:
         name: a name from `names()` (case and underscores do not matter), "brax:<env>" or "playground:<env>".
-        config: its `env` (episodeLength, variant, the task's own keys), `randomization` and `effects` are used.
+        config: its `env` (episodeLength, variant, the task's own keys), `randomization` and `effects` are used;
+            `task.randomize = False` gives the nominal task, with an empty parameter space.
         effects: further effects, after those of the config.
         env_overrides: `env:` settings that win over the config's, e.g. `episodeLength=100`.
 
@@ -42,7 +44,10 @@ def make(name: str, *, config: "Config | None" = None, effects: "Sequence[Effect
     kind = _task(name)
     settings = {} if config is None else {key: config.env[key] for key in config.env}
     randomization = None if config is None else config.randomization
-    listed = () if config is None else [effects_room.make(**spec) for spec in config.effects]
+    listed = () if config is None else reading.listed(config.effects)
+    if listed and randomization is not None and randomization.get("randomize") is False:
+        warnings.warn("effects: they are off, because task.randomize = False means nominal physics", stacklevel=2)
+        listed = ()
     return kind(settings | env_overrides, randomization, (*listed, *effects))
 
 

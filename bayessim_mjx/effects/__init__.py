@@ -1,5 +1,6 @@
 """Unmodelled effects, one per file, looked up by name: `effects.make("coulomb_friction", where="hinge")`."""
 
+import dataclasses
 import difflib
 import importlib
 import pkgutil
@@ -13,7 +14,7 @@ __all__ = ["Effect", "make", "names"]
 
 def names() -> list[str]:
     """Names of all effects: the files of this folder."""
-    return sorted(m.name for m in pkgutil.iter_modules(__path__) if m.name != "effect")
+    return sorted(m.name for m in pkgutil.iter_modules(__path__) if m.name not in ("effect", "reading"))
 
 
 def make(effect: str, where: str, **settings: Any) -> Effect:
@@ -28,13 +29,17 @@ def make(effect: str, where: str, **settings: Any) -> Effect:
         UserError: on an unknown effect or setting.
     """
     if effect not in names():
-        close = difflib.get_close_matches(effect, names())
-        raise UserError(
-            f"effect {effect!r}: " + (f"did you mean {close[0]}? " if close else "") + f"there are: {names()}"
-        )
+        close = difflib.get_close_matches(str(effect), names())
+        hint = f"did you mean {close[0]}? " if close else ""
+        raise UserError(f"no effect {effect!r}; {hint}there are: {', '.join(names())}")
     module = importlib.import_module(f"{__name__}.{effect}")
     kind = getattr(module, "".join(part.capitalize() for part in effect.split("_")))
-    allowed = set(kind.__dataclass_fields__)
-    if unknown := set(settings) - allowed:
-        raise UserError(f"effect {effect}: no settings {sorted(unknown)}; allowed are {sorted(allowed)}")
+    if not isinstance(where, str):
+        raise UserError(f"effect {effect}: where = {where!r}: expected the MuJoCo name of a joint, actuator ...")
+    allowed = {f.name: f.type for f in dataclasses.fields(kind) if f.name not in ("where", "parameters")}
+    for name, value in settings.items():
+        if name not in allowed:
+            raise UserError(f"effect {effect}: no setting {name!r}; allowed are {', '.join(allowed)}")
+        if allowed[name] is float and (isinstance(value, bool) or not isinstance(value, int | float)):
+            raise UserError(f"effect {effect}: {name} = {value!r}: expected a number")
     return kind(where=where, **settings)

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from bayessim_mjx.effects.effect import Effect, index_of
+from bayessim_mjx.errors import UserError
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 
 if TYPE_CHECKING:
@@ -27,7 +28,7 @@ class ActuatorDelay(Effect):
     Parameters: `delay`, s, neutral 0.
 
     Attributes:
-        high: largest delay that can be represented, s.
+        high: largest delay, s, unless `parameters` has another range.
     """
 
     where: str = "all"
@@ -36,9 +37,11 @@ class ActuatorDelay(Effect):
 
     def __post_init__(self) -> None:
         if not 0 < self.high < math.inf:
-            raise ValueError(f"{self.name}: high = {self.high} s, must be positive and finite")
+            raise UserError(f"{self.name}: high = {self.high} s, must be positive and finite")
+        if (low := self.space().parameters[0].low) < 0:
+            raise UserError(f"{self.where}.{self.name}.delay: range begins at {low:g} s; a delay is never negative")
 
-    def space(self) -> ParameterSpace:
+    def defaults(self) -> ParameterSpace:
         label = f"{self.where}.{self.name}.delay"
         delay = Parameter(label, 0.0, 0.0, self.high, unit="s", attribute="delay", target=self.where, kind="effect")
         return ParameterSpace([delay])
@@ -49,9 +52,9 @@ class ActuatorDelay(Effect):
         mask = jnp.ones(nu, bool)
         if self.where != "all":
             names = [physics.mj_model.actuator(i).name for i in range(nu)]
-            mask = jnp.arange(nu) == index_of("actuator", self.where, names, self.name)
+            mask = jnp.arange(nu) == index_of("actuator", self.where, [*names, "all"], self.name)
         timestep = physics.mj_model.opt.timestep
-        lag = math.ceil(self.high / timestep - 1e-6) + 1
+        lag = math.ceil(self.space().parameters[0].high / timestep - 1e-6) + 1
         return {
             "history": jnp.zeros((lag, nu)),
             "mask": mask,

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import mujoco
 
 from bayessim_mjx.effects.effect import Effect, index_of
+from bayessim_mjx.errors import UserError
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 
 if TYPE_CHECKING:
@@ -31,7 +32,7 @@ class CoulombFriction(Effect):
     is loaded through a contact may creep within one sub-step by what the contact alone would do.
 
     Attributes:
-        high: upper limit of the level, N m or N.
+        high: upper limit of the level, N m or N, unless `parameters` has another range.
     """
 
     high: float = 1.0
@@ -39,9 +40,11 @@ class CoulombFriction(Effect):
 
     def __post_init__(self) -> None:
         if not 0 < self.high < math.inf:
-            raise ValueError(f"{self.name}: high = {self.high}, must be positive and finite")
+            raise UserError(f"{self.name}: high = {self.high}, must be positive and finite")
+        if (low := self.space().parameters[0].low) < 0:
+            raise UserError(f"{self.where}.{self.name}.level: range begins at {low:g}; friction is never negative")
 
-    def space(self) -> ParameterSpace:
+    def defaults(self) -> ParameterSpace:
         label = f"{self.where}.{self.name}.level"
         level = Parameter(label, 0.0, 0.0, self.high, unit="N m", attribute="level", target=self.where, kind="effect")
         return ParameterSpace([level])

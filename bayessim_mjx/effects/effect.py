@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import jax
 import jax.numpy as jnp
 
-from bayessim_mjx.parameters import ParameterSpace
+from bayessim_mjx.errors import UserError
+from bayessim_mjx.parameters import Parameter, ParameterSpace
+from bayessim_mjx.parameters.attributes import suggest
 
 if TYPE_CHECKING:
     from mujoco import mjx
@@ -27,14 +29,21 @@ class Effect(abc.ABC):
 
     Attributes:
         where: MuJoCo name of the joint, actuator, body ... concerned, or "all" where the effect allows it.
+        parameters: with other ranges and priors than the effect's own, in the place of those of the same name.
     """
 
     where: str
+    parameters: tuple[Parameter, ...] = dataclasses.field(default=(), kw_only=True)
     name: ClassVar[str]
 
     @abc.abstractmethod
+    def defaults(self) -> ParameterSpace:
+        """The effect's own parameters: kind "effect", nominal = neutral, named `<where>.<effect>.<parameter>`."""
+
     def space(self) -> ParameterSpace:
-        """The effect's parameters: kind "effect", nominal = neutral, named `<where>.<effect>.<parameter>`."""
+        """The effect's parameters in the order of `defaults`, with the ranges and priors that hold here."""
+        other = {p.name: p for p in self.parameters}
+        return ParameterSpace(other.get(p.name, p) for p in self.defaults().parameters)
 
     def init(self, physics: "Physics") -> Any:
         """Memory at the start of an episode, a pytree of arrays. Refuse an unknown `where` here (ValueError)."""
@@ -65,8 +74,8 @@ def index_of(kind: str, name: str, names: list[str], effect: str) -> int:
     """Index of `name` among `names`.
 
     Raises:
-        ValueError: naming the effect, the unknown name and the names there are.
+        UserError: naming the effect, the unknown name and what may be meant.
     """
     if name not in names:
-        raise ValueError(f"{effect}: no {kind} {name!r} in the model; there are: {', '.join(names)}")
+        raise UserError(f"{effect}: no {kind} {name!r} in the model; {suggest(name, names)}")
     return names.index(name)

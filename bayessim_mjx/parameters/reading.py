@@ -2,12 +2,15 @@
 
 Order of the vector: actors in the file's order, then groups. In list groups (bodies, shapes, tendons, actuators) the
 outer loop runs over elements, the inner over attributes; for dofs the other way round; `scale` is one number.
-Names: `<element>_<attribute>`, plus `_mult` for scaling.
+Names: `<element>_<attribute>`, plus `_mult` for scaling. `effects` groups are only found here: `effects/reading.py`
+makes effects of them, whose parameters follow the model's.
 """
 
+import dataclasses
 import difflib
 import fnmatch
 import math
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -29,14 +32,21 @@ GROUPS: dict[str, tuple[str, tuple[str, ...]]] = {
     "actuator_properties": ("actuator", ("gain", "kp", "kv", "bias")),
     "option": ("option", ("gravity",)),
 }
+PATH = "task.randomization_params"
 OTHER_GROUPS = ("scale", "color", "effects")
-ACCEPTED = ("schedule", "schedule_steps", "num_buckets", "setup_only")  # BayesSimIG's; a posterior is not scheduled
+ACCEPTED = ("schedule", "schedule_steps", "num_buckets", "setup_only")  # BayesSimIG's; see `_check_accepted`
 SETTINGS = ("range", "operation", "distribution", "mean", "sd", "include", "exclude", "factor", "unit", "nominal")
+EFFECT_SETTINGS = ("range", "operation", "distribution", "mean", "sd", "unit", "nominal")
+NOISE = {  # BayesSimIG's nuisance noise, which is not simulated here -> what there is instead
+    "observations": "real.noise is noise on the surrogate's observations",
+    "actions": "the effects of `effects:` disturb commands",
+    "sim_params": "option.gravity randomises gravity",
+}
 DISTRIBUTIONS = {"uniform": "uniform", "loguniform": "loguniform", "log_uniform": "loguniform", "gaussian": "gaussian"}
 
 
 def read(section: Mapping[str, Any], model: mujoco.MjModel) -> list[Parameter]:
-    """The parameters of a section, in order.
+    """The model's parameters of a section, in order; those of its effects are not among them.
 
     Args:
         section: `randomization_params`, or the `task` section that holds it.
@@ -45,24 +55,74 @@ def read(section: Mapping[str, Any], model: mujoco.MjModel) -> list[Parameter]:
     Raises:
         UserError: naming the key's path, its value and what is allowed.
     """
-    section = section or {}
-    if "randomization_params" in section:
-        section = section["randomization_params"] or {}
-    path = "randomization_params"
-    _known(section, SECTION_KEYS, path)
+    section, actors = _open(section)
     found: list[Parameter] = []
-    actors = {k: v or {} for k, v in (section.get("actor_params") or {}).items()}
     for actor, groups in actors.items():
-        where = f"{path}.actor_params.{actor}"
-        if actor == "effects":
-            found += _effects(groups, where)
-        elif actor == "option":
+        where = f"{PATH}.actor_params.{actor}"
+        if actor == "option":
             found += _group(model, [], "option", groups, where)
-        else:
+        elif actor != "effects":
             found += _actor(model, actor, groups, [a for a in actors if a not in ("effects", "option")], where)
-    found += _group(model, [], "option", section.get("option") or {}, f"{path}.option")
-    found += _effects(section.get("effects") or {}, f"{path}.effects")
+    found += _group(model, [], "option", section.get("option") or {}, f"{PATH}.option")
     return found
+
+
+def effect_groups(section: Mapping[str, Any]) -> Iterator[tuple[str, str, str, Mapping[str, Any]]]:
+    """(path, effect, where, {parameter: settings}) of a section's `effects`, at its top or below `actor_params`."""
+    section, actors = _open(section)
+    groups = [(f"{PATH}.actor_params.{a}.effects", g["effects"]) for a, g in actors.items() if "effects" in g]
+    groups += [(f"{PATH}.actor_params.effects", actors.get("effects")), (f"{PATH}.effects", section.get("effects"))]
+    for path, group in groups:
+        for effect, places in _mapping(group, path).items():
+            for place, parameters in _mapping(places, f"{path}.{effect}").items():
+                where = f"{path}.{effect}.{place}"
+                yield where, str(effect), str(place), _mapping(parameters, where)
+
+
+def effect_parameter(default: Parameter, setting: Any, where: str) -> Parameter:
+    """An effect's own parameter with range and prior of `setting`; nominal stays, or is the range's end next to it."""
+    setting = _mapping(setting, where)
+    _known(setting, (*EFFECT_SETTINGS, *ACCEPTED), where)
+    _check_accepted(setting, where)
+    _choice(setting, "operation", ("absolute",), "absolute", where)
+    ranged: dict[str, Any] = {"range": (default.low, default.high), **setting}
+    if "distribution" not in setting:
+        ranged |= {"distribution": default.prior, "mean": setting.get("mean", default.mean)}
+        ranged["sd"] = setting.get("sd", default.sd)
+    same = ("unit", "operation", "attribute", "target", "kind", "factor", "axis")
+    rest = {f.name: getattr(default, f.name) for f in dataclasses.fields(default) if f.name in same}
+    rest["unit"] = str(setting.get("unit", default.unit))
+    return _build(ranged, where, default.name, default.nominal, **rest)
+
+
+def _open(section: Any) -> tuple[Mapping[str, Any], dict[str, Mapping[str, Any]]]:
+    """(the `randomization_params`, its actors), after a look at the keys that are not about parameters."""
+    section = _mapping(section, PATH)
+    if "randomization_params" in section:
+        section = _mapping(section["randomization_params"], PATH)
+    _known(section, SECTION_KEYS, PATH)
+    for key, instead in NOISE.items():
+        if section.get(key):
+            raise UserError(f"{PATH}.{key}: this noise is not simulated ({instead}); remove the key")
+    if section.get("frequency") not in (None, 1):
+        raise UserError(
+            f"{PATH}.frequency = {section['frequency']!r}: every episode draws new parameters; give 1, or leave it out"
+        )
+    actors = _mapping(section.get("actor_params"), f"{PATH}.actor_params")
+    return section, {str(k): _mapping(v, f"{PATH}.actor_params.{k}") for k, v in actors.items()}
+
+
+def _check_accepted(setting: Mapping[str, Any], where: str) -> None:
+    """BayesSimIG's keys that would change the result are refused, harmless ones ignored with a warning."""
+    if setting.get("schedule") not in (None, "constant"):
+        raise UserError(
+            f"{where}.schedule = {setting['schedule']!r}: the range does not grow over time; allowed: constant"
+        )
+    if setting.get("schedule_steps") not in (None, 0):
+        raise UserError(f"{where}.schedule_steps = {setting['schedule_steps']!r}: nothing is scheduled; allowed: 0")
+    for key in ("num_buckets", "setup_only"):
+        if setting.get(key):
+            warnings.warn(f"{where}.{key} is ignored: values are continuous and new in every episode", stacklevel=2)
 
 
 def _actor(
@@ -72,12 +132,10 @@ def _actor(
     bodies = elements.of_actor(model, actor, actors, where)
     for group, content in groups.items():
         path = f"{where}.{group}"
-        if group == "color":  # looks, not physics
+        if group in ("color", "effects"):  # looks, not physics; not the model's
             continue
-        if group == "effects":
-            yield from _effects(content or {}, path)
-        elif group == "scale":
-            yield _scale(model, actor, actors, content or {}, path)
+        if group == "scale":
+            yield _scale(model, actor, actors, _mapping(content, path), path)
         else:
             yield from _group(model, bodies, group, content or {}, path)
 
@@ -109,13 +167,16 @@ def _selected(
 ) -> list[Element]:
     """Elements that carry the attribute, restricted by `include` and `exclude` (names or patterns with *)."""
     _known(setting, (*SETTINGS, *ACCEPTED), where)
+    _check_accepted(setting, where)
     usable = [e for e in members if e.kind == kind or attribute == "length"]
     if kind == "geom" and attribute == "length":  # one length per body, called like its first shape
         usable = list({elements.body_of(model, e): e for e in reversed(usable)}.values())[::-1]
     labels = [e.label for e in usable]
     for key in ("include", "exclude"):
         patterns = setting.get(key)
-        patterns = [patterns] if isinstance(patterns, str) else list(patterns or [])
+        patterns = [patterns] if isinstance(patterns, str) else patterns or []
+        if not (isinstance(patterns, Sequence) and all(isinstance(p, str) for p in patterns)):
+            raise UserError(f"{where}.{key} = {patterns!r}: expected names or patterns with *; there are: {labels}")
         for pattern in patterns:
             if not fnmatch.filter(labels, pattern):
                 raise UserError(f"{where}.{key}: no element {pattern!r} here; {suggest(pattern, labels)}")
@@ -237,6 +298,7 @@ def _scale(
     if set(setting) == {"scale"}:
         setting = setting["scale"]
     _known(setting, (*SETTINGS, *ACCEPTED), where)
+    _check_accepted(setting, where)
     operation = _choice(setting, "operation", OPERATIONS, "scaling", where)
     have = attributes.names(model, "body")
     if actor not in have and len(actors) > 1:
@@ -251,30 +313,16 @@ def _scale(
     return _build(setting, where, name, 1.0, operation=operation, attribute="scale", target=actor, kind="actor")
 
 
-def _effects(content: Mapping[str, Any], where: str) -> Iterator[Parameter]:
-    """effect -> where -> parameter -> range; nominal (neutral) is 0 unless `nominal` says otherwise."""
-    for effect, places in content.items():
-        for place, parameters in (places or {}).items():
-            for label, setting in (parameters or {}).items():
-                path = f"{where}.{effect}.{place}.{label}"
-                _known(setting, (*SETTINGS, *ACCEPTED), path)
-                _choice(setting, "operation", OPERATIONS, "absolute", path)
-                yield _build(
-                    setting,
-                    path,
-                    f"{place}.{effect}.{label}",
-                    0.0,
-                    unit=str(setting.get("unit", "")),
-                    operation="absolute",
-                    attribute=str(label),
-                    target=str(place),
-                    kind="effect",
-                )
+def _mapping(value: Any, where: str) -> Mapping[str, Any]:
+    """A section; nothing at all is an empty one."""
+    if value is None or isinstance(value, Mapping):
+        return value or {}
+    raise UserError(f"{where} = {value!r}: expected a section of `key: value` lines")
 
 
 def _known(mapping: Any, allowed: Sequence[str], where: str) -> None:
     if not isinstance(mapping, Mapping):
-        raise UserError(f"{where}: expected keys, not {mapping!r}")
+        raise UserError(f"{where} = {mapping!r}: expected a section with keys of {', '.join(allowed)}")
     for key in mapping:
         if key not in allowed:
             close = difflib.get_close_matches(str(key), allowed, 2)

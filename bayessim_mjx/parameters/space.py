@@ -40,6 +40,8 @@ class ParameterSpace:
     def from_config(cls, randomization_params: Mapping[str, Any], mj_model: "mujoco.MjModel") -> "ParameterSpace":
         """The space of a `randomization_params` section in BayesSimIG's YAML format (see `reading.py`).
 
+        Without the parameters of its `effects`, which `effects.reading.stack` makes.
+
         Raises:
             UserError: unknown actor, group, attribute or element; empty range; scaling of a number that is 0.
         """

@@ -86,5 +86,5 @@ def test_refusals():
         make("actuator_delay", where="a", high=0.0)
     with pytest.raises(ValueError, match="did you mean actuator_delay"):
         make("actuator_dely", where="a")
-    with pytest.raises(ValueError, match="no settings.*hihg"):
+    with pytest.raises(ValueError, match="no setting .*hihg"):
         make("actuator_delay", where="a", hihg=1.0)

@@ -81,7 +81,7 @@ def test_priors_units_factors_and_the_keys_of_bayessimig():
             "armature": {**additive(0, 1), "distribution": "gaussian", "mean": 0.1, "sd": 0.05, "exclude": "left_*"},
         },
         color=True,
-    ) | {"frequency": 1, "observations": {"range": [0, 0.1]}, "sim_params": {}}
+    ) | {"frequency": 1, "observations": None, "sim_params": {}}
     space = read(WALKER, {"randomize": True, "randomization_params": section})
     assert space.names[0] == "left_hip_damping" and space.parameters[0].prior == "loguniform"
     assert space.parameters[0].factor == 0.01 and space.units[0] == "%"
@@ -89,13 +89,19 @@ def test_priors_units_factors_and_the_keys_of_bayessimig():
     assert not any("left" in name for name in space.names[1:])
 
 
-def test_gravity_and_effects_beside_the_actors():
-    effects = {"delay": {"all": {"seconds": {"range": [0, 0.05], "unit": "s"}}}}
-    space = read(PENDULUM, {"option": {"gravity": additive(-1, 1)}, "effects": effects})
-    assert space.names == ("gravity", "all.delay.seconds")
-    effect = space.parameters[1]
-    assert (effect.kind, effect.target, effect.nominal, effect.unit) == ("effect", "all", 0.0, "s")
+def test_gravity_beside_the_actors():
+    effects = {"actuator_delay": {"all": {"delay": {"range": [0, 0.05]}}}}  # an effect's are not the model's
+    assert read(PENDULUM, {"option": {"gravity": additive(-1, 1)}, "effects": effects}).names == ("gravity",)
     assert len(read(PENDULUM, {})) == 0
+
+
+def test_harmless_keys_of_isaac_gym_are_ignored_with_a_warning():
+    for key in ("num_buckets", "setup_only"):
+        with pytest.warns(UserWarning, match=rf"mass\.{key} is ignored"):
+            assert (
+                len(read(WALKER, actor(rigid_body_properties={"mass": {**scaling(1, 2, include="torso"), key: 1}})))
+                == 1
+            )
 
 
 @pytest.mark.parametrize(
@@ -121,6 +127,25 @@ def test_gravity_and_effects_beside_the_actors():
         (actor(dof_properties={"stiffness": scaling(0.1, 1)}), "left_knee: scaling a number that is 0"),
         ({"actor_params": {"torsi": {}, "block": {}}}, "no actor 'torsi'; did you mean torso"),
         ({"actor_parms": {}}, "did you mean actor_params"),
+        ({"actor_params": 3}, r"task\.randomization_params\.actor_params = 3: expected a section"),
+        ({"actor_params": {"walker": 3}}, r"actor_params\.walker = 3: expected a section"),
+        (actor(rigid_body_properties=3), r"rigid_body_properties = 3: expected a section with keys of mass"),
+        (
+            actor(rigid_body_properties={"mass": 3}),
+            r"rigid_body_properties\.mass = 3: expected a section with keys of range",
+        ),
+        (actor(scale=3), r"walker\.scale = 3: expected a section"),
+        (actor(rigid_body_properties={"mass": scaling(1, 2, include=3)}), r"mass\.include = 3: expected names"),
+        ({"observations": {"range": [0, 0.1]}}, r"params\.observations: this noise is not simulated.*real\.noise"),
+        ({"actions": {"range": [0, 0.1]}}, r"params\.actions: this noise is not simulated"),
+        ({"sim_params": {"gravity": {"range": [0, 0.4]}}}, r"params\.sim_params: .*option\.gravity"),
+        ({"frequency": 600}, r"params\.frequency = 600: every episode draws new.*give 1"),
+        (
+            actor(rigid_body_properties={"mass": {**scaling(1, 2), "schedule": "linear"}}),
+            r"mass\.schedule = 'linear'.*allowed: constant",
+        ),
+        (actor(rigid_body_properties={"mass": {**scaling(1, 2), "schedule_steps": 9}}), r"mass\.schedule_steps = 9"),
+        (actor(scale={**scaling(1, 2), "schedule": "linear"}), r"scale\.schedule = 'linear'"),
     ],
 )
 def test_refusals_name_the_key_and_what_there_is(section, words):
