@@ -39,10 +39,13 @@ RESUMABLE = ("--device", "--cache_dir", "--video", "--video_length", "--video_in
 class Parser(argparse.ArgumentParser):
     """Flags of one command and `section.key=value` overrides; all that is wrong is a UserError."""
 
-    def __init__(self, prog: str, description: str, resume: bool = False):
+    def __init__(self, prog: str, description: str, resume: bool = False, without: Sequence[str] = ()):
         super().__init__(prog=f"python -m bayessim_mjx.{prog}", description=description, allow_abbrev=False)
+        self.command, self.without = prog, without
         self.add_argument("--task", help="name of the task (--list_tasks)")
         for flag, (_, kind, text) in FLAGS.items():
+            if flag in without:
+                continue
             options: dict[str, Any] = {"action": "store_true"} if kind is None else {"type": kind}
             self.add_argument(flag, default=None, help=text, **options)
         self.add_argument("--cfg_env", metavar="FILE", help="YAML with any sections, over cfg/<task>.yaml")
@@ -60,6 +63,8 @@ class Parser(argparse.ArgumentParser):
         argv = list(sys.argv[1:] if argv is None else argv)
         args, rest = self.parse_known_args(argv)
         for text in rest:
+            if text.split("=")[0] in self.without:
+                raise UserError(f"{text.split('=')[0]}: {self.command} has no use for it")
             if text.startswith("-"):
                 raise unknown("flag", text.split("=")[0], sorted(self._option_string_actions))
             if "=" not in text:
@@ -80,7 +85,7 @@ def config_of(args: argparse.Namespace, more: Mapping[str, tuple[str, Any]] | No
     """The configuration that flags (and `more` like them), files and overrides ask for; the task has to exist."""
     flags = dict(more or {})
     for flag, (key, _, _) in FLAGS.items():
-        value = getattr(args, flag[2:])
+        value = getattr(args, flag[2:], None)  # not every command has every flag
         if value is not None:
             drawn = flag == "--seed" and value == -1
             flags[flag] = (key, random.SystemRandom().randrange(10_000) if drawn else value)
@@ -161,7 +166,12 @@ def load_policy(path: Path, env: Any, config: Config) -> Any:
 
 
 def warm_start(train: Any, config: Config, env: Any) -> Any:
-    """The training state with actor and normaliser of `bayessim.policyCheckpt`, if that is set; the critic is new."""
+    """The training state with actor and normaliser of `bayessim.policyCheckpt`, if that is set; the critic is new.
+
+    `main` and `train` call it for the state that a run begins with, not when they resume one. `loop.init` does not read
+    files: a program of your own that is to start from a policy calls this on `loop.init(parts).train`. With
+    `bayessim.ftuneRL=False` only round 0 starts from the policy, as later rounds train new ones.
+    """
     if config.bayessim.policyCheckpt is None:
         return train
     policy = load_policy(Path(config.bayessim.policyCheckpt), env, config)
@@ -173,6 +183,11 @@ class Stop:
     """Ctrl-C (or SIGTERM) asked for: `requested` is looked at where the state is whole."""
 
     requested = False
+
+    def check(self) -> None:
+        """End here if a stop was asked for."""
+        if self.requested:
+            raise KeyboardInterrupt
 
     def save(self, save: Callable[[], Any]) -> None:
         """If a stop was asked for: save a checkpoint, then end."""
@@ -199,6 +214,23 @@ def graceful() -> Iterator[Stop]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def running(run: "Run", say: Callable[[str], Any]) -> Iterator[None]:
+    """The run's status: running while inside; then finished, interrupted (Ctrl-C) or failed (any error)."""
+    run.set_status("running")
+    try:
+        yield
+    except KeyboardInterrupt:
+        run.set_status("interrupted")
+        say(f"interrupted; go on with --resume {run.path}")
+        raise
+    except Exception:
+        with contextlib.suppress(OSError):  # a full disk must not hide the first error
+            run.set_status("failed")
+        raise
+    run.set_status("finished")
 
 
 def command(run: Callable[[Sequence[str] | None], int]) -> Callable[..., int]:

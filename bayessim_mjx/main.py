@@ -16,18 +16,30 @@ DESCRIPTION = "Adaptive domain randomisation: rounds of PPO, evaluation, simulat
 
 
 class Watched:
-    """The loop's monitor with stops at whole states: after a log interval of training, and after a round."""
+    """The loop's monitor and checkpoints with stops at whole states: after a log interval, and after a round is saved.
 
-    def __init__(self, session: Any, stop: cli.Stop, save: Callable[[int, Any], Any]):
-        self.session, self.stop, self.save = session, stop, save
+    What is reported lies on the disk before the checkpoint that follows it: a resumed run repeats nothing before that.
+    """
+
+    def __init__(self, session: Any, stop: cli.Stop, run: Any, parts: Any):
+        self.session, self.stop, self.run, self.parts = session, stop, run, parts
 
     def training(self, round_: int, metrics: dict[str, float], state: Any) -> None:
+        from bayessim_mjx import loop
+
         self.session.training(round_, metrics, state)
-        self.stop.save(lambda: self.save(round_, state))
+        if self.stop.requested:
+            meta = {"round": int(state.round), "iteration": int(state.train.iteration)}
+            self.save(loop.checkpoint_step(self.parts, round_, state.train), loop.tree_of(self.parts, state), meta=meta)
 
     def round(self, info: Any, policy: Any) -> None:
-        self.session.round(info, policy)
-        self.stop.save(lambda: None)  # the loop saved it just now
+        self.session.round(info, policy)  # no stop here: the round is not saved yet
+
+    def save(self, step: int, tree: Any, *, meta: dict[str, Any], **options: Any) -> None:
+        self.session.flush()
+        self.run.save(step, tree, meta={**meta, "seconds": self.session.wall.mark()}, **options)
+        if meta["round"] < self.parts.settings.realIters:  # else all is done, and there is nothing to go on with
+            self.stop.check()
 
 
 def _prepare(args: argparse.Namespace) -> tuple[Config, Any]:
@@ -41,9 +53,10 @@ def _prepare(args: argparse.Namespace) -> tuple[Config, Any]:
     return cli.pin_policy(cli.config_of(args, more)), None
 
 
-def film(env: Any, config: Config, thetas: Any) -> Callable[[Any, int], Any] | None:
-    """(policy, control steps) -> qpos [T+1, nq] of one episode at thetas [1, d]; None where no video is to be made."""
+def film(env: Any, config: Config) -> Callable[[Any, int, Any], Any] | None:
+    """(policy, control steps, theta [d]) -> qpos [T+1, nq] of one episode; None where no video is to be made."""
     import jax
+    import jax.numpy as jnp
     import numpy as np
 
     from bayessim_mjx.rollout import rollout
@@ -51,20 +64,16 @@ def film(env: Any, config: Config, thetas: Any) -> Callable[[Any, int], Any] | N
     if not config.monitor.video or not hasattr(env, "physics"):
         return None
 
-    def motion(policy: Any, length: int) -> np.ndarray:
-        actor = policy.replace(deterministic=True)
+    def motion(policy: Any, length: int, theta: Any) -> np.ndarray:
+        actor, thetas = policy.replace(deterministic=True), jnp.asarray(theta, jnp.float32)[None]
         return np.asarray(rollout(env, actor, jax.random.PRNGKey(config.seed), thetas, length).qpos[0])
 
     return motion
 
 
 def _run(config: Config, run: Any, command: Sequence[str], console: Any) -> int:
-    import numpy as np
-
     from bayessim_mjx import loop, registry, runs
-    from bayessim_mjx.monitor import video
     from bayessim_mjx.monitor.opening import opening
-    from bayessim_mjx.monitor.session import Session
 
     if config.randomization.get("randomize") is False and config.bayessim.modelClass is not None:
         raise UserError("task.randomize = False: there is nothing to infer; use bayessim_mjx.train for PPO alone")
@@ -73,51 +82,61 @@ def _run(config: Config, run: Any, command: Sequence[str], console: Any) -> int:
     console.start(opening(config, env, device))
     console.phase("setting up")
     parts = loop.make(config, env)
-    state: Any = loop.init(parts)
-    resumed = run is not None and bool(run.checkpoints)
-    state = state.replace(train=cli.warm_start(state.train, config, env)) if not resumed else state
+    state, resumed_at = _state(parts, run)
     if run is None:
         run = runs.Run.create(config.logdir, config.task, config.name, config, command)
-    elif resumed:
-        state = run.restore("latest", loop.tree_of(parts, state), fall_back=True)[0]["state"]
-    run.set_status("running")
-
-    def save(round_: int, now: Any) -> None:
-        step = loop.checkpoint_step(parts, round_, now.train)
-        run.save(step, loop.tree_of(parts, now), meta={"round": int(now.round), "iteration": int(now.train.iteration)})
-
-    truth = None if parts.source is None else parts.source.truth
-    thetas = np.asarray(env.space.nominal if truth is None else truth)[None]
-    motion = film(env, config, thetas)
-    model = None if motion is None else video.model_at(env, thetas[0])
     console.say(f"run folder {run.path}")
-    with cli.graceful() as stop:
-        session = Session(run.path, config, env, console, motion, state if resumed else None, model)
-        session.describe(to_yaml(config.to_dict()))
-        try:
-            _, rounds = loop.run(parts, state, run, Watched(session, stop, save))
-        except KeyboardInterrupt:
-            run.set_status("interrupted")
-            console.say(f"interrupted; go on with --resume {run.path}")
-            raise
-        finally:
-            session.close()
-        run.set_status("finished")
-        _report(console, env, rounds, truth)
-        console.say(f"best policy: python -m bayessim_mjx.play --checkpoint {run.path} --video")
-        console.say(f"pictures:    tensorboard --logdir {run.path} --samples_per_plugin images=1000")
+    with cli.running(run, console.say):
+        if int(state.round) >= config.bayessim.realIters:
+            console.say("this run had finished; there is nothing to go on with")
+        else:
+            state = _rounds(parts, state, run, console, resumed_at)
+        _report(console, parts, state)
+    which = "best" if run.manifest["best"] is not None else "latest"
+    console.say(f"{which} policy: python -m bayessim_mjx.play --checkpoint {run.path} --video")
+    console.say(f"pictures:    tensorboard --logdir {run.path} --samples_per_plugin images=1000")
     return 0
 
 
-def _report(console: Any, env: Any, rounds: Sequence[Any], truth: Any) -> None:
+def _state(parts: Any, run: Any) -> tuple[Any, int | None]:
+    """(state to begin with, second of the run's clock that its checkpoint lies at: -1 none yet, None a new run)."""
+    from bayessim_mjx import loop
+    from bayessim_mjx.monitor.wall import marked
+
+    state = loop.init(parts)
+    if run is not None and run.checkpoints:
+        tree, meta = run.restore("latest", loop.tree_of(parts, state), fall_back=True)
+        return tree["state"], marked(meta)
+    train = cli.warm_start(state.train, parts.config, parts.env)
+    return state.replace(train=train), None if run is None else -1
+
+
+def _rounds(parts: Any, state: Any, run: Any, console: Any, resumed_at: int | None) -> Any:
+    """The rounds that are left, watched; the last state."""
+    from bayessim_mjx import loop
+    from bayessim_mjx.monitor.session import Session
+
+    config, env = parts.config, parts.env
+    truth = None if parts.source is None else parts.source.truth
+    with cli.graceful() as stop:
+        session = Session(run.path, config, env, console, film(env, config), state, resumed_at, truth)
+        try:
+            session.describe(to_yaml(config.to_dict()))
+            watched = Watched(session, stop, run, parts)
+            return loop.run(parts, state, watched, watched)[0]
+        finally:
+            session.close()
+
+
+def _report(console: Any, parts: Any, state: Any) -> None:
     """The closing table of parameters."""
     import numpy as np
 
-    posterior = rounds[-1].posterior if rounds else None
-    if posterior is None:
+    if parts.settings.modelClass is None:
         return
-    mean, sd = np.asarray(posterior.mean()), np.sqrt(np.diagonal(np.asarray(posterior.cov())))
-    contraction, space = np.asarray(posterior.contraction()), env.space
+    posterior, space, truth = state.domain, parts.env.space, parts.source.truth
+    mean, sd = np.asarray(posterior.mean()), np.asarray(posterior.sd())
+    contraction = np.asarray(posterior.contraction())
     console.table(
         [
             {

@@ -18,7 +18,7 @@ PHYSICS = ("nominal", "prior", "real", "posterior")
 
 
 def _parser() -> cli.Parser:
-    parser = cli.Parser("play", DESCRIPTION)
+    parser = cli.Parser("play", DESCRIPTION, without=("--max_iterations", "--video_interval", "--name", "--resume"))
     parser.add_argument(
         "--episodes", type=int, help="per kind of physics (default: --num_envs, else bayessim.realEvals)"
     )

@@ -112,7 +112,7 @@ class Run:
         self._sweep(folder)
         path = _free(folder / f"{int(step):09d}")
         checkpoints.save(path, tree, step, meta or {})
-        kind = "periodic" if score is None else "evaluated"
+        kind = "periodic" if evaluation is None else "evaluated"
         entry = {"step": int(step), "path": str(path.relative_to(self.path)), "evaluation": score, "kind": kind}
         older = [c for c in self.checkpoints if c["step"] != int(step)]
         listed = [{**c, "evaluation": None} if supersede else c for c in older] + [entry]

@@ -26,27 +26,47 @@ def _parser() -> cli.Parser:
 class Training:
     """PPO with an evaluation and a checkpoint every `ppo.save_interval` iterations; "best" is by evaluation."""
 
-    def __init__(self, config: Config, env: Any, run: Any, writer: Any, console: Any, stop: cli.Stop):
+    writer: Any  # TensorBoard by PPO iterations
+    wall: Any  # and by seconds
+
+    def __init__(self, config: Config, env: Any, run: Any, console: Any, stop: cli.Stop):
         import jax
-        import jax.numpy as jnp
 
         from bayessim_mjx.distributions import Distribution
         from bayessim_mjx.main import film
         from bayessim_mjx.monitor.compile_clock import CompileClock
 
-        self.config, self.env, self.run, self.writer, self.console, self.stop = config, env, run, writer, console, stop
+        self.config, self.env, self.run, self.console, self.stop = config, env, run, console, stop
         randomized = bool(config.randomization.get("randomize")) and len(env.space) > 0
         self.domain = Distribution.prior(env.space, 1) if randomized else None
         self.key, self.evaluation_key = jax.random.split(jax.random.PRNGKey(config.seed))
         self.compiling, self.filmed = CompileClock(), 0
-        nominal = jnp.asarray(env.space.nominal, jnp.float32)[None]
-        self.film = film(env, config, nominal)  # None: no videos
+        self.film = film(env, config)  # None: no videos
 
-    def state(self) -> Any:
-        """A new training state."""
+    def state(self, resume: bool) -> tuple[Any, int | None]:
+        """(state to begin with, second of the run's clock that its checkpoint lies at: -1 none yet, None a new run)."""
         from bayessim_mjx import rl
+        from bayessim_mjx.monitor.wall import marked
 
-        return cli.warm_start(rl.init(self.env, self.config.ppo, self.key, self.domain), self.config, self.env)
+        state = rl.init(self.env, self.config.ppo, self.key, self.domain)
+        if resume and self.run.checkpoints:
+            tree, meta = self.run.restore("latest", self.tree(state), fall_back=True)
+            return tree["state"], marked(meta)
+        return cli.warm_start(state, self.config, self.env), -1 if resume else None
+
+    def open(self, iteration: int, resumed_at: int | None) -> None:
+        """Begin to write; on resume what lies after the checkpoint goes, as it is written again."""
+        from bayessim_mjx.monitor.wall import Wall
+        from bayessim_mjx.monitor.writer import Writer
+
+        path, late = self.run.path, None if resumed_at is None else {"cfg": 0, "": iteration + 1}
+        self.writer, self.wall = Writer(path, late, media=path / "videos"), Wall(path, resumed_at)
+        self.filmed = iteration // self._film_every()
+        self.writer.text("cfg", to_yaml(self.config.to_dict()), code=True)
+
+    def close(self) -> None:
+        self.writer.close()
+        self.wall.close()
 
     def tree(self, state: Any) -> dict[str, Any]:
         """What a checkpoint holds."""
@@ -61,23 +81,34 @@ class Training:
         if slowed := seconds > WORTH_SAYING:
             self.console.compile("training", seconds, cached)
         shown = {tag: metrics[tag] for tag in SHOWN if tag in metrics and not (slowed and tag == SPEED)}
+        self.wall.scalars(metrics)
         self.console.iteration(shown, iteration)
         self._video(iteration, state)
-        self.stop.save(lambda: self.run.save(iteration, self.tree(state)))
+        if iteration < self.config.ppo.max_iterations:  # else all is done but the evaluation
+            self.stop.save(lambda: self.save(state))
+
+    def save(self, state: Any, evaluation: float | None = None) -> None:
+        """A checkpoint, with all that was written before it on the disk."""
+        self.writer.flush()
+        self.wall.flush()
+        meta = {"iteration": int(state.iteration), "seconds": self.wall.mark()}
+        self.run.save(int(state.iteration), self.tree(state), evaluation=evaluation, meta=meta)
+
+    def _film_every(self) -> int:
+        """PPO iterations between videos."""
+        return max(1, self.config.monitor.video_interval // self.config.ppo.num_steps)
 
     def _video(self, iteration: int, state: Any) -> None:
         """An episode at nominal physics every `monitor.video_interval` steps, and at the end."""
         from bayessim_mjx.monitor import video
         from bayessim_mjx.rl import policy_of
 
-        ppo, monitor = self.config.ppo, self.config.monitor
-        every = max(1, monitor.video_interval // ppo.num_steps)
-        if self.film is None or not (iteration // every > self.filmed or iteration >= ppo.max_iterations):
+        every, last = self._film_every(), iteration >= self.config.ppo.max_iterations
+        if self.film is None or not (iteration // every > self.filmed or last):
             return
         self.filmed = iteration // every
-        frames = video.record(
-            self.env.mj_model, self.film(policy_of(state), monitor.video_length), dt=self.env.dt, fps=25
-        )
+        qpos = self.film(policy_of(state), self.config.monitor.video_length, self.env.space.nominal)
+        frames = video.record(self.env.mj_model, qpos, dt=self.env.dt, fps=25)
         self.writer.video("Train/video", frames, 25, iteration)
 
     def evaluate(self, state: Any) -> float:
@@ -101,16 +132,24 @@ class Training:
         self.console.say(f"evaluation at {int(state.iteration)}: return {score:.4g} ± {sd:.4g} over {count} episodes")
         return score
 
+    def owes_evaluation(self, iteration: int) -> bool:
+        """Whether the checkpoint here is to be evaluated and was not: Ctrl-C saves without."""
+        ppo = self.config.ppo
+        due = iteration >= ppo.max_iterations or (iteration > 0 and iteration % ppo.save_interval == 0)
+        return due and not any(c["step"] == iteration and c["kind"] == "evaluated" for c in self.run.checkpoints)
+
     def train(self, state: Any) -> Any:
-        """All iterations that are left."""
+        """All iterations that are left; the last policy is evaluated in any case, so that it can become the best."""
         from bayessim_mjx import rl
 
         ppo = self.config.ppo
+        if self.owes_evaluation(int(state.iteration)):
+            self.save(state, self.evaluate(state))
         while (done := int(state.iteration)) < ppo.max_iterations:
+            self.stop.check()
             chunk = min(ppo.save_interval - done % ppo.save_interval, ppo.max_iterations - done)
             state, _ = rl.run(self.env, ppo, state, self.domain, iterations=chunk, progress=self.progress)
-            self.run.save(int(state.iteration), self.tree(state), evaluation=self.evaluate(state))
-            self.stop.save(lambda: None)
+            self.save(state, self.evaluate(state))
         return state
 
 
@@ -118,34 +157,30 @@ def _run(config: Config, run: Any, command: Sequence[str], headless: bool) -> in
     from bayessim_mjx import registry, runs
     from bayessim_mjx.monitor.console import Console
     from bayessim_mjx.monitor.opening import opening
-    from bayessim_mjx.monitor.writer import Writer
 
     device = setup_jax(config)
     with Console(headless=headless) as console, cli.graceful() as stop:
         env = registry.make(config.task, config=config)
         console.start(opening(config, env, device, infers=False))
-        resumed = run is not None and bool(run.checkpoints)
+        resume = run is not None
         if run is None:
             run = runs.Run.create(config.logdir, config.task, config.name, config, command)
-        run.set_status("running")
         console.say(f"run folder {run.path}")
-        training = Training(config, env, run, None, console, stop)
-        state = training.state()
-        if resumed:
-            state = run.restore("latest", training.tree(state), fall_back=True)[0]["state"]
-        training.writer = Writer(run.path, int(state.iteration) + 1 if resumed else None, media=run.path / "videos")
-        training.writer.text("cfg", to_yaml(config.to_dict()), code=True)
-        console.phase("training", config.ppo.max_iterations, int(state.iteration))
-        try:
-            training.train(state)
-        except KeyboardInterrupt:
-            run.set_status("interrupted")
-            console.say(f"interrupted; go on with --resume {run.path}")
-            raise
-        finally:
-            training.writer.close()
-        run.set_status("finished")
-        console.say(f"best policy (step {run.manifest['best']}): {PLAY} --checkpoint {run.path} --video")
+        with cli.running(run, console.say):
+            training = Training(config, env, run, console, stop)
+            state, resumed_at = training.state(resume)
+            done = int(state.iteration)
+            if done >= config.ppo.max_iterations and not training.owes_evaluation(done):
+                console.say("this run had finished; there is nothing to go on with")
+            else:
+                training.open(done, resumed_at)
+                console.phase("training", config.ppo.max_iterations, done)
+                try:
+                    training.train(state)
+                finally:
+                    training.close()
+        which = "latest" if run.manifest["best"] is None else f"best (step {run.manifest['best']})"
+        console.say(f"{which} policy: {PLAY} --checkpoint {run.path} --video")
         console.say(f"curves: tensorboard --logdir {run.path}")
     return 0
 

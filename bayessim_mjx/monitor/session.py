@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import itertools
 import json
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from bayessim_mjx.checkpoints import write_text
 from bayessim_mjx.config import Config
 from bayessim_mjx.logs import Channels
 from bayessim_mjx.loop import LoopState, RoundInfo
 from bayessim_mjx.monitor import plots, video
 from bayessim_mjx.monitor.compile_clock import CompileClock
 from bayessim_mjx.monitor.console import Console
+from bayessim_mjx.monitor.wall import Wall
 from bayessim_mjx.monitor.writer import Writer
 from bayessim_mjx.rl import Policy, policy_of
 
@@ -30,13 +31,20 @@ SHOWN = (
     "Loss/explained_variance", "Policy/mean_std",
 )  # fmt: skip
 
-Film = Callable[[Policy, int], np.ndarray]  # (policy, control steps) -> qpos [T+1, nq]
+SETTINGS = "BayesSim/cfg"
+Film = Callable[[Policy, int, np.ndarray], np.ndarray]  # (policy, control steps, theta [d]) -> qpos [T+1, nq]
 
 
 class Session:
     """The monitor of a run. Steps in TensorBoard: rounds done (`bsim`), PPO iterations (`rl`), seconds (`rl_time`).
 
-    `film` gives the motion of a policy on the real side, for videos of `model` (default: the nominal one); None: none.
+    Args:
+        path: the run's folder.
+        film: the motion of a policy at theta, for videos; None: no videos.
+        start: the state that the run begins with; None: the very first.
+        resumed_at: on --resume the second of its checkpoint (`Wall.mark`; -1: it had none yet), so that nothing that
+            is about to be written again stays; None for a new run.
+        truth: theta [d] of the surrogate real, which the videos show. Without one they show the posterior's mean.
     """
 
     def __init__(
@@ -47,18 +55,21 @@ class Session:
         console: Console,
         film: Film | None = None,
         start: LoopState | None = None,
-        model: Any = None,
+        resumed_at: int | None = None,
+        truth: np.ndarray | None = None,
     ):
         self.path, self.config, self.env, self.console, self.film = path, config, env, console, film
-        self.model = getattr(env, "mj_model", None) if model is None else model
         self.compiling = CompileClock()
         first_round = 0 if start is None else int(start.round)
         done = 0 if start is None else self._overall(first_round, int(start.train.iteration))
-        resumed = start is not None
-        self.inference = Writer(path / "bsim", purge_step=first_round + 1 if resumed else None, media=path / "pictures")
-        self.learning = Writer(path / "rl", purge_step=done + 1 if resumed else None, media=path / "videos")
-        self.wall = Writer(path / "rl_time")  # the same rewards over wall-clock seconds
-        self.started, self.filmed, self.phase_of = time.perf_counter(), 0, -1
+        late = None if resumed_at is None else {SETTINGS: 0, "": first_round + 1}  # the settings are written again
+        self.inference = Writer(path / "bsim", purge_step=late, media=path / "pictures")
+        self.learning = Writer(path / "rl", purge_step=None if late is None else done + 1, media=path / "videos")
+        self.wall = Wall(path, resumed_at)
+        self.filmed = done // self._film_every()
+        self._show_physics(env.space.nominal if truth is None else truth)
+        if truth is None and start is not None and first_round:
+            self._show_posterior(start.domain)
         self._drop_rounds(first_round)
         console.begin(config.bayessim.realIters, first_round)
         self._phase(first_round, done)
@@ -69,9 +80,22 @@ class Session:
         if round_ < self.config.bayessim.realIters and n:
             self.console.phase("training", n, max(0, done - round_ * n))
 
+    def _film_every(self) -> int:
+        """PPO iterations between videos of the training."""
+        return max(1, self.config.monitor.video_interval // self.config.ppo.num_steps)
+
+    def _show_physics(self, theta: Any) -> None:
+        """Videos from now on are made at theta [d], and of a model that looks so."""
+        self.theta = np.asarray(theta, np.float32)
+        self.model = None if self.film is None else video.model_at(self.env, self.theta)
+
+    def _show_posterior(self, posterior: Any) -> None:
+        if posterior is not None and self.film is not None:
+            self._show_physics(posterior.mean())
+
     def describe(self, text: str) -> None:
         """The resolved settings as text, once."""
-        self.inference.text("BayesSim/cfg", text, code=True)
+        self.inference.text(SETTINGS, text, code=True)
 
     def _compiled(self, what: str) -> bool:
         """Whether there was compiling worth a line; says so."""
@@ -84,16 +108,12 @@ class Session:
         slowed = self._compiled("training")
         iteration = self._overall(round_, int(state.train.iteration))
         self.learning.scalars(iteration, {tag if "/" in tag else f"Perf/{tag}": v for tag, v in metrics.items()})
-        over_time: dict[str, float] = {
-            tag: metrics[tag] for tag in ("Train/mean_reward", "Train/mean_episode_length") if tag in metrics
-        }
-        self.wall.scalars(int(time.perf_counter() - self.started), over_time)
+        self.wall.scalars(metrics)
         shown = {tag: metrics[tag] for tag in SHOWN if tag in metrics and not (slowed and tag == SPEED)}
         done, n = iteration - round_ * self.config.ppo.max_iterations, self.config.ppo.max_iterations
         self.console.iteration(shown, done)
-        every = max(1, self.config.monitor.video_interval // self.config.ppo.num_steps)
-        if self.film is not None and iteration // every > self.filmed:
-            self.filmed = iteration // every
+        if self.film is not None and iteration // self._film_every() > self.filmed:
+            self.filmed = iteration // self._film_every()
             self._video(self.learning, "Train/video", policy_of(state.train), iteration)
         if done >= n:
             self.console.phase(REST)
@@ -113,14 +133,15 @@ class Session:
         self.inference.scalars(step, scalars)
         if self.config.monitor.posterior_plots:
             self._plots(info)
+        if info.truth is None:
+            self._show_posterior(info.posterior)
         if self.film is not None:
             self._video(self.inference, f"{side.split('/')[0]}/video", policy, step)
         self._note(info)
         self.console.round_line(**round_line(info))
         for text in info.warnings:
             self.console.warning(text)
-        for writer in (self.inference, self.learning, self.wall):
-            writer.flush()
+        self.flush()
         self.compiling.take()  # the plots' small programs are not worth a line
         self._phase(info.round + 1)
 
@@ -147,7 +168,7 @@ class Session:
 
     def _video(self, writer: Writer, tag: str, policy: Policy, step: int) -> None:
         assert self.film is not None
-        qpos = self.film(policy, self.config.monitor.video_length)
+        qpos = self.film(policy, self.config.monitor.video_length, self.theta)
         frames = video.record(self.model, qpos, dt=self.env.dt, fps=25)
         writer.video(tag, frames, 25, step)
 
@@ -170,7 +191,12 @@ class Session:
         file = self.path / ROUNDS
         if file.exists():
             rows = [line for line in file.read_text(encoding="utf-8").splitlines() if _round_of(line) < first]
-            file.write_text("".join(row + "\n" for row in rows), encoding="utf-8")
+            write_text(file, "".join(row + "\n" for row in rows))
+
+    def flush(self) -> None:
+        """Bring everything to the disk; before a checkpoint, as what lies before it is not written again."""
+        for writer in (self.inference, self.learning, self.wall):
+            writer.flush()
 
     def close(self) -> None:
         for writer in (self.inference, self.learning, self.wall):
@@ -179,8 +205,8 @@ class Session:
 
 def _round_of(line: str) -> float:
     try:
-        return json.loads(line)["round"]
-    except (ValueError, KeyError):
+        return float(json.loads(line)["round"])
+    except (ValueError, KeyError, TypeError):
         return float("inf")  # a line cut short by a kill
 
 

@@ -41,7 +41,7 @@ def purge(folder: str | os.PathLike, step: int | Mapping[str, int]) -> int:
     """Take events at or after `step` out of the event files in `folder`; returns how many went.
 
     `step` is one number, or {tag prefix: number} where tags count different things (`{"BayesSim": 3, "Train": 600}`);
-    tags without a matching prefix stay. Files are replaced atomically.
+    tags without a matching prefix stay, and "" is a prefix of every tag. Files are replaced atomically.
     """
     dropped = 0
     for path in event_files(folder):
@@ -82,7 +82,7 @@ class Writer:
             purge(self.path, purge_step)
         # A file's name holds whole seconds only: without a suffix a quick restart would overwrite the file before it.
         suffix = f".{len(event_files(self.path)):04d}"
-        single = purge_step if isinstance(purge_step, int) else None
+        single = purge_step if isinstance(purge_step, int | None) else purge_step.get("")
         self._writer = SummaryWriter(str(self.path), purge_step=single, filename_suffix=suffix, flush_secs=10)
 
     def scalars(self, step: int, values: Mapping[str, Any], prefix: str = "") -> None:
