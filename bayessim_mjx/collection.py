@@ -233,14 +233,24 @@ def real_parameters(settings: Any, space: ParameterSpace) -> tuple[np.ndarray, n
     """weights [K], means [K, d], sds [K, d] of `env.realParams`; a one-number list stands for every parameter.
 
     Unlike BayesSimIG, `stds` are standard deviations (there they were used as variances).
+
+    Raises:
+        UserError: naming the key, its value and what is allowed.
     """
     if not settings:
         raise UserError(
             "env.realParams is missing: give the surrogate's parameters, or real.logs=DIR for recorded motion"
         )
-    means = [_row("means", row, space) for row in _rows(settings["means"])]
-    stds = [_row("stds", row, space) for row in _rows(settings.get("stds", [[0.0]] * len(means)))]
-    weights = np.asarray(settings.get("weights") or [1.0] * len(means), dtype=np.float64)
+    if "means" not in settings:
+        raise UserError(
+            f"env.realParams.means is missing (there is only {', '.join(settings)}): expected {_rows_of(space)}"
+        )
+    means = _rows("means", settings["means"], space)
+    stds = _rows("stds", settings.get("stds", [[0.0]] * len(means)), space)
+    given = settings.get("weights", [1.0] * len(means))
+    if not isinstance(given, list | tuple) or not given:
+        raise UserError(f"env.realParams.weights = {given!r}: expected a list of one number >= 0 per row of means")
+    weights = np.asarray([_number(f"weights[{i}]", w) for i, w in enumerate(given)])
     if not len(means) == len(stds) == len(weights):
         raise UserError(
             f"env.realParams: {len(weights)} weights, {len(means)} means, {len(stds)} stds; one of each per component"
@@ -260,29 +270,47 @@ def real_parameters(settings: Any, space: ParameterSpace) -> tuple[np.ndarray, n
     )
 
 
-def _rows(value: Any) -> list:
-    """A single mapping or flat list is one component."""
-    if isinstance(value, dict) or not isinstance(value[0], list | tuple | dict):
-        return [value]
-    return list(value)
+def _rows(key: str, value: Any, space: ParameterSpace) -> list[np.ndarray]:
+    """Rows [d], one per component; a single mapping or flat list is one component."""
+    if not isinstance(value, dict | list | tuple) or not value:
+        raise UserError(f"env.realParams.{key} = {value!r}: expected {_rows_of(space)}")
+    many = not isinstance(value, dict) and any(isinstance(row, dict | list | tuple) for row in value)
+    return [_row(f"{key}[{i}]", row, space) for i, row in enumerate(value if many else [value])]
+
+
+def _rows_of(space: ParameterSpace) -> str:
+    return f"one row per component, a list of numbers for {', '.join(space.names)}, or {{name: number}}"
+
+
+def _number(key: str, value: Any) -> float:
+    try:  # YAML reads 1e-3 as text
+        number = float("" if isinstance(value, bool) else value)
+    except (TypeError, ValueError):
+        number = np.nan
+    if not np.isfinite(number):
+        raise UserError(f"env.realParams.{key} = {value!r}: expected a number")
+    return number
 
 
 def _row(key: str, row: Any, space: ParameterSpace) -> np.ndarray:
+    if not isinstance(row, dict | list | tuple) or not row:
+        raise UserError(f"env.realParams.{key} = {row!r}: expected {_rows_of(space)}")
     if isinstance(row, dict):
         for name in row:
             space.index(name)
         missing = [name for name in space.names if name not in row]
         if missing:
             raise UserError(f"env.realParams.{key}: no value for {', '.join(missing)}")
-        return np.asarray([float(row[name]) for name in space.names])
-    if len(row) == 1:
-        return np.full(len(space), float(row[0]))
+        return np.asarray([_number(f"{key}.{name}", row[name]) for name in space.names])
+    numbers = [_number(f"{key}[{i}]", value) for i, value in enumerate(row)]
+    if len(numbers) == 1:
+        return np.full(len(space), numbers[0])
     if len(row) != len(space):
         raise UserError(
             f"env.realParams.{key} has {len(row)} numbers, the task has {len(space)} parameters: "
             f"{', '.join(space.names)}"
         )
-    return np.asarray([float(value) for value in row])
+    return np.asarray(numbers)
 
 
 def domain_or_prior(space: ParameterSpace, components: int) -> Distribution | None:
