@@ -5,6 +5,7 @@ The names in `bayessim:`, `env:` and `task:` are BayesSimIG's. Nothing here impo
 
 import dataclasses
 import math
+import os
 import re
 import types
 import typing
@@ -16,6 +17,7 @@ from bayessim_mjx.errors import UserError
 
 COLLECT_POLICIES = ("policy_random", "policy_ones", "policy_rl", "policy_rl_randomized", "policy_replay")
 SUMMARIZERS = ("summary_start", "summary_waypts", "summary_corr", "summary_corrdiff")
+MODELS = ("MDNN",)  # classes of posterior networks that there are
 ACTIVATIONS = ("elu", "relu", "selu", "tanh", "swish", "gelu")
 
 
@@ -87,6 +89,13 @@ def _prefixed(prefix: str) -> Callable[[Any], Any]:
     return lambda value: prefix + value if isinstance(value, str) and not value.startswith(prefix) else value
 
 
+def _absolute(value: Any) -> Any:
+    """A path, or paths, that mean the same from any folder; what is no text is left for the type check to refuse."""
+    if isinstance(value, list | tuple):
+        return [_absolute(v) for v in value]
+    return os.path.abspath(os.path.expanduser(value)) if isinstance(value, str) and value else value
+
+
 def _none(value: Any) -> Any:
     """BayesSimIG writes `None` where YAML reads a string."""
     return None if value == "None" else value
@@ -104,7 +113,8 @@ def coerce(value: Any, annotation: Any, path: str, source: str = "") -> Any:
         item = typing.get_args(annotation)[0]
         value = [value] if isinstance(value, str) and item is str else value
         if not isinstance(value, list | tuple):
-            raise UserError(f"{path} = {value!r}{where}: expected a list of {item.__name__}")
+            what = {"Frozen": "sections", "int": "whole numbers", "float": "numbers", "str": "texts"}
+            raise UserError(f"{path} = {value!r}{where}: expected a list of {what.get(item.__name__, item.__name__)}")
         return tuple(coerce(v, item, f"{path}[{i}]", source) for i, v in enumerate(value))
     if annotation in (Frozen, dict):
         if isinstance(value, Mapping):
@@ -190,7 +200,7 @@ class BayesSimConfig(Section):
     trainTrajLen: int = setting(20, "control steps per training trajectory (arrays have one more row)", low=1)
     ftune: bool = setting(True, "keep one network over all rounds; False: a new one each round")
     modelClass: str | None = setting(
-        "MDNN", "MDNN, MDRFF[_<kernel>[_<sigma>]]; None: plain uniform randomisation", spell=_none
+        "MDNN", "posterior network, MDNN; None: no inference, plain uniform randomisation", spell=_none
     )
     components: int = setting(10, "mixture components", low=1)
     fullCovariance: bool = setting(False, "full covariance per component")
@@ -206,10 +216,11 @@ class BayesSimConfig(Section):
     policyCheckpt: str | None = setting(None, "checkpoint of a policy to start from", spell=_none)
 
     def check(self) -> None:
-        if self.modelClass is not None and self.modelClass.split("_")[0] not in ("MDNN", "MDRFF"):
+        if self.modelClass is not None and self.modelClass not in MODELS:
+            later = " (MDRFF is not in this version yet)" if self.modelClass.startswith("MDRFF") else ""
             raise UserError(
-                f"bayessim.modelClass = {self.modelClass!r}: allowed are MDNN, "
-                "MDRFF[_<RBF|Laplace|Matern12|Matern32|Matern52>[_<sigma>]] and None (plain uniform randomisation)"
+                f"bayessim.modelClass = {self.modelClass!r}: allowed are {', '.join(MODELS)} and None, "
+                f"plain uniform randomisation{later}"
             )
 
 
@@ -259,11 +270,15 @@ class RealConfig(Section):
     """`real:`, logs of the real system in place of the surrogate."""
 
     SECTION: typing.ClassVar[str] = "real"
-    logs: tuple[str, ...] = setting((), "log files or folders; none: the surrogate at env.realParams")
-    map: str | None = setting(None, "YAML file from log columns to joints and actuators")
+    logs: tuple[str, ...] = setting(
+        (), "log files or folders, kept as absolute paths; none: the surrogate at env.realParams", spell=_absolute
+    )
+    map: str | None = setting(None, "YAML file from log columns to joints and actuators", spell=_absolute)
     segment_length: int | None = setting(None, "control steps per segment; null: bayessim.trainTrajLen", low=1)
     segment_stride: int | None = setting(None, "control steps between segment starts; null: no overlap", low=1)
-    noise: float = setting(0.0, "standard deviation of the noise on the surrogate's observations", low=0)
+    noise: float = setting(
+        0.0, "sd of the noise on the surrogate's observations; without effect where real.logs is given", low=0
+    )
 
 
 @dataclass(frozen=True)
@@ -271,8 +286,6 @@ class MonitorConfig(Section):
     """`monitor:`, what is shown and recorded."""
 
     SECTION: typing.ClassVar[str] = "monitor"
-    console: bool = setting(True, "progress on the terminal")
-    tensorboard: bool = setting(True, "TensorBoard event files")
     posterior_plots: bool = setting(True, "picture of the posterior each round")
     video: bool = setting(False, "record videos")
     video_length: int = setting(200, "control steps per video", low=1)
@@ -291,7 +304,10 @@ class Config(Section):
     cache_dir: str | None = setting(None, "compilation cache; null: $BAYESSIM_MJX_CACHE or ~/.cache/bayessim_mjx/jax")
     env: EnvConfig = field(default_factory=EnvConfig)
     randomization: Frozen = field(default_factory=Frozen)
-    effects: tuple[Frozen, ...] = setting((), "unmodelled effects in the simulator: list of {effect, where, ...}")
+    effects: tuple[Frozen, ...] = setting(
+        (),
+        "unmodelled effects in the simulator: list of {effect, where, ...}; ranges: task.randomization_params.effects",
+    )
     bayessim: BayesSimConfig = field(default_factory=BayesSimConfig)
     ppo: PPOConfig = field(default_factory=PPOConfig)
     real: RealConfig = field(default_factory=RealConfig)

@@ -7,12 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from bayessim_mjx import config
+from bayessim_mjx import config, registry
 from bayessim_mjx.config import Config, EnvConfig, PPOConfig, from_dict, load, read_yaml, task_file, to_yaml
 from bayessim_mjx.errors import UserError
 
 CFG = sorted(p.stem for p in config.cfg_folder().glob("*.yaml"))
-MASS = "task.randomization_params.actor_params.pendulum.rigid_body_properties.mass"
+PARAMS = "task.randomization_params"
+MASS = f"{PARAMS}.actor_params.pendulum.rigid_body_properties.mass"
 
 
 def task_of(stem: str) -> str:
@@ -154,10 +155,19 @@ BAD = {
     "ppo.num_minibatches=100000": r"ppo\.num_minibatches = 100000 is more than the batch",
     "ppo.activation=sigmod": r"ppo\.activation = 'sigmod'.*allowed are elu",
     "ppo=5": r"ppo = 5 .*expected a section",
-    "bayessim.hiddenLayers=5": r"expected a list of int",
+    "bayessim.hiddenLayers=5": r"expected a list of whole numbers",
     "bayessim.hiddenLayers=[8,x]": r"bayessim\.hiddenLayers\[1\] = 'x'.*whole number",
     "bayessim.collectPolicy=rnd": r"allowed are policy_random, policy_ones",
-    "bayessim.modelClass=MDN": r"bayessim\.modelClass = 'MDN': allowed are MDNN",
+    "bayessim.modelClass=MDN": r"bayessim\.modelClass = 'MDN': allowed are MDNN and None, plain uniform randomisation$",
+    "bayessim.modelClass=MDNN_x": r"bayessim\.modelClass = 'MDNN_x': allowed are MDNN and None",
+    "bayessim.modelClass=MDRFF_RBF": r"bayessim\.modelClass = 'MDRFF_RBF': .*MDRFF is not in this version yet",
+    "monitor.console=False": r"'monitor\.console' is unknown",
+    "monitor.tensorboard=False": r"'monitor\.tensorboard' is unknown",
+    "real.logs=3": r"real\.logs = 3 .*expected a list of texts",
+    "real.map=3": r"real\.map = 3 .*expected text",
+    "effects=3": r"effects = 3 .*expected a list of sections",
+    "effects=[3]": r"effects\[0\] = 3 .*expected a section",
+    "task.randomization_params=3": r"task\.randomization_params = 3 .*expected a section",
     "bayessim.ftune=maybe": r"expected True or False",
     "seed=1.5": r"seed = 1\.5 .*whole number",
     "seed=-2": r"seed = -2 .*at least 0",
@@ -212,6 +222,47 @@ def test_a_file_of_another_task_is_refused(tmp_path: Path) -> None:
     (tmp_path / "f.yaml").write_text(to_yaml(load("Ant").to_dict()))
     with pytest.raises(UserError, match="task_name = 'Ant', but the task is 'Pendulum'"):
         load("Pendulum", cfg_env=tmp_path / "f.yaml")
+
+
+def test_paths_of_the_real_side_are_absolute(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    c = load("Pendulum", overrides=["real.logs=[runs, ../b.csv]", "real.map=map.yaml"])
+    assert c.real.logs == (str(tmp_path / "runs"), str(tmp_path.parent / "b.csv"))
+    assert c.real.map == str(tmp_path / "map.yaml")
+    assert load("Pendulum", overrides=["real.logs=runs"]).real.logs == (str(tmp_path / "runs"),)
+    monkeypatch.chdir(tmp_path.parent)
+    assert from_dict(c.to_dict()) == c
+
+
+def test_an_override_may_add_effects_and_gravity_but_no_unknown_group() -> None:
+    c = load(
+        "Pendulum",
+        overrides=[
+            f"{PARAMS}.effects.actuator_delay.all.delay.range=[0,0.1]",
+            f"{PARAMS}.effects.coulomb_friction.hinge={{}}",
+            f"{PARAMS}.option.gravity={{range: [-1, 1], operation: additive}}",
+        ],
+    )
+    section = c.randomization["randomization_params"]
+    assert section["effects"] == {
+        "actuator_delay": {"all": {"delay": {"range": (0, 0.1)}}},
+        "coulomb_friction": {"hinge": {}},
+    }
+    assert section["option"]["gravity"]["range"] == (-1, 1) and "pendulum" in section["actor_params"]
+    with pytest.raises(UserError, match=r"Did you mean task\.randomization_params\.effects"):
+        load("Pendulum", overrides=[f"{PARAMS}.efects.actuator_delay.all.delay.range=[0,0.1]"])
+
+
+@pytest.mark.parametrize("task", ["Pendulum", "Cartpole", "Ant"])
+def test_a_section_as_bayessimig_writes_it_loads(task: str, tmp_path: Path) -> None:
+    """It has `color` beside the groups, no frequency, and schedules that are constant."""
+    section = load(task).to_dict()["task"]
+    section["randomization_params"].pop("frequency")
+    (actor,) = section["randomization_params"]["actor_params"].values()
+    actor["color"] = True
+    (tmp_path / "f.yaml").write_text(to_yaml({"task": section}))
+    from_file = load(task, cfg_env=tmp_path / "f.yaml")
+    assert registry.make(task, config=from_file).space == registry.make(task).space
 
 
 def test_limits_hold_without_files_too() -> None:

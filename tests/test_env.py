@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from brax.envs import training
 
-from bayessim_mjx import registry
+from bayessim_mjx import collection, config, registry
 from bayessim_mjx.errors import UserError
 
 
@@ -43,6 +43,34 @@ def test_truncation_comes_at_the_episode_length_and_termination_at_the_fall(cart
         assert (state.done, state.info["truncated"]) == (0, float(i == 20))
     state = step(cartpole.reset_to(np.float32([0, 1.6]), upright), jnp.zeros(1))
     assert (state.done, state.info["terminated"], state.info["truncated"]) == (1, 1, 0)
+
+
+def test_a_world_that_runs_away_ends_its_episode_with_finite_observations(cartpole):
+    """Reaching the speed limit counts as diverged, as a number that is not finite does."""
+    step, still = jax.jit(cartpole.step), np.zeros(2, np.float32)
+    for speed in (2e5, np.inf, np.nan):
+        after = step(cartpole.reset_to(still, np.float32([speed, 0.0])), jnp.zeros(1))
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((after.obs, after.reward, after.metrics)))
+        assert (after.done, after.info["terminated"], after.info["truncated"]) == (1, 1, 0)
+        assert after.reward == cartpole.diverged_reward
+
+
+def test_a_world_is_held_in_its_last_sound_state():
+    class Slow(type(registry.make("Cartpole"))):
+        speed_limit, diverged_reward = 2.0, -7.0
+
+    env = Slow()
+    before = env.reset_to(np.zeros(2, np.float32), np.float32([1.5, 0.0]))
+    after = jax.jit(env.step)(before, jnp.ones(1))  # 400 N on the cart
+    assert (after.done, after.reward) == (1, -7)
+    np.testing.assert_array_equal(after.obs["policy"], before.obs["policy"])
+    assert jax.jit(env.step)(before, jnp.zeros(1)).done == 0
+
+
+def test_without_randomisation_the_space_is_empty_and_the_domain_none():
+    env = registry.make("Cartpole", config=config.load("Cartpole", overrides=["task.randomize=False"]))
+    assert len(env.space) == 0 and collection.domain_or_prior(env.space, 3) is None
+    assert jax.jit(env.step)(env.reset(jax.random.PRNGKey(0)), jnp.zeros(1)).pipeline_state.fields == {}
 
 
 def test_bayessim_variant_clips_observations():
