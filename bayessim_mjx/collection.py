@@ -129,7 +129,11 @@ class Surrogate:
 
 @dataclasses.dataclass(frozen=True, eq=False)  # compared by identity: static under jit
 class Recorded:
-    """Segments of recorded logs. In simulation the logged commands are replayed from the logged state."""
+    """Segments of recorded logs. In simulation the logged commands are replayed from the logged state.
+
+    Features are of the *difference* to the replay with nominal parameters, in which the effect of theta is not dwarfed
+    by the motion itself, and of the first state.
+    """
 
     env: Any
     space: ParameterSpace
@@ -148,8 +152,14 @@ class Recorded:
         return len(self.order)
 
     def features(self, qpos: Array, qvel: Array, command: Array) -> Array:
-        states = jnp.concatenate([qpos, qvel], axis=-1) if self.with_qvel else qpos
-        return jax.vmap(self.summarizer)(states, command)
+        """[N, D] of measured motion qpos [N, T+1, nq], qvel [N, T+1, nv] under command [N, T, nu]."""
+        nominal = jnp.broadcast_to(jnp.asarray(self.space.nominal), (qpos.shape[0], len(self.space)))
+        expected = replay(self.env.physics, qpos[:, 0], qvel[:, 0], command, nominal)
+        states = qpos - expected["qpos"]
+        if self.with_qvel:
+            states = jnp.concatenate([states, qvel - expected["qvel"]], axis=-1)
+        summaries = jax.vmap(self.summarizer)(states, command)
+        return jnp.concatenate([summaries, qpos[:, 0], qvel[:, 0]], axis=-1)
 
     def simulate(self, key: Array, thetas: Array, policy: Policy) -> Array:
         """Replay randomly drawn segments at `thetas` [N, d], with measurement noise; features [N, D].

@@ -278,7 +278,10 @@ def _infer(loop: Loop, state: LoopState, policy: Policy, info: RoundInfo) -> Loo
         new = jnp.arange(all_features.shape[0]) >= seen
         posteriors = select(new, posteriors, state.real_posteriors)
     rows = jax.tree.map(np.asarray, posteriors).split()  # on the host: an index on the device compiles each time
-    domain = inference.combine(rows[: seen + b.realTrajs], b.components)
+    usable = [row for row in rows[: seen + b.realTrajs] if _finite(row)]
+    domain = inference.combine(usable, b.components) if usable else prior
+    if len(usable) < seen + b.realTrajs:
+        info.warnings.append(f"{seen + b.realTrajs - len(usable)} real trajectories left out: no finite posterior")
     info.warnings += _complaints(domain.names, info.fit, known_before=np.asarray(state.fit.identified))
     info.posterior, info.real = domain, jax.tree.map(np.asarray, real)
     info.scores = score(domain, source.truth)
@@ -295,6 +298,10 @@ def _factors(network: Any, features: Array, prior_share: float) -> Distribution:
     posteriors = inference.condition(network, features)
     posteriors = jax.vmap(inference.restore_prior, in_axes=(0, None))(posteriors, network.identified)
     return dataclasses.replace(posteriors, prior_weight=jnp.full_like(posteriors.prior_weight, prior_share))
+
+
+def _finite(posterior: Distribution) -> bool:
+    return all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(posterior))
 
 
 def _complaints(names: tuple[str, ...], fit: dict[str, Any], known_before: np.ndarray) -> list[str]:

@@ -13,9 +13,9 @@ from bayessim_mjx.rollout import replay
 
 TINY = [
     "env.numEnvs=8", "ppo.num_steps=8", "ppo.num_minibatches=2", "ppo.num_epochs=1", "ppo.max_iterations=3",
-    "ppo.log_interval=1", "ppo.save_interval=1", "ppo.hidden_actor=[8]", "ppo.hidden_critic=[8]", "bayessim.trainTrajs=400",
-    "bayessim.realEvals=4", "bayessim.realIters=2", "bayessim.realTrajs=2", "bayessim.components=3",
-    "bayessim.hiddenLayers=[16]", "bayessim.trainTrajLen=8",
+    "ppo.log_interval=1", "ppo.save_interval=1", "ppo.hidden_actor=[8]", "ppo.hidden_critic=[8]",
+    "bayessim.trainTrajs=400", "bayessim.realEvals=4", "bayessim.realIters=2", "bayessim.realTrajs=2", "bayessim.components=3",
+    "bayessim.hiddenLayers=[16]", "bayessim.trainTrajLen=8", "bayessim.ftuneRL=True",
 ]  # fmt: skip
 
 
@@ -163,7 +163,8 @@ def recorded(env, tmp_path_factory):
     for i in range(6):
         ctrl = np.concatenate([command[i], command[i][-1:]])
         measured = {name: np.asarray(motion[name][i], np.float64) for name in ("qpos", "qvel")}
-        header = f"time,ctrl:{env.mj_model.actuator(0).name},qpos:{env.mj_model.joint(0).name},qvel:{env.mj_model.joint(0).name}"
+        joint, actuator = env.mj_model.joint(0).name, env.mj_model.actuator(0).name
+        header = f"time,ctrl:{actuator},qpos:{joint},qvel:{joint}"
         table = np.column_stack([time, ctrl, measured["qpos"], measured["qvel"]])
         np.savetxt(folder / f"run{i}.csv", table, delimiter=",", header=header, comments="")
     return folder, truth

@@ -49,10 +49,13 @@ def identified(gain: Array, mask: Array) -> tuple[Array, Array]:
 def restore_prior(posterior: Distribution, keep: Array) -> Distribution:
     """The posterior over the parameters to keep [d], the prior over the others, independent of them."""
     keep = jnp.asarray(keep)
-    covariance = posterior.scales @ jnp.swapaxes(posterior.scales, -1, -2)
-    both = keep[:, None] & keep[None, :]
-    covariance = jnp.where(both[None], covariance, 0.0) + jnp.diag(jnp.where(keep, 0.0, FLAT**2))[None]
-    means, scales = jnp.where(keep[None, :], posterior.means, 0.5), jnp.linalg.cholesky(covariance)
+    means = jnp.where(keep[None, :], posterior.means, 0.5)
+    # a factor of (S S^T on the kept rows) + FLAT^2 on the others, by QR: forming S S^T would lose thin components
+    kept = jnp.where(keep[None, :, None], posterior.scales, 0.0)
+    flat = jnp.broadcast_to(jnp.diag(jnp.where(keep, 0.0, FLAT)), kept.shape)
+    upper = jnp.linalg.qr(jnp.swapaxes(jnp.concatenate([kept, flat], axis=-1), -1, -2), mode="r")
+    sign = jnp.where(jnp.diagonal(upper, axis1=-2, axis2=-1) < 0, -1.0, 1.0)
+    scales = jnp.swapaxes(upper * sign[..., :, None], -1, -2)
     # each component keeps its mass inside the cube
     mass = box.log_masses(posterior.means, posterior.scales) - box.log_masses(means, scales)
     logits = jax.nn.log_softmax(posterior.logits) + mass

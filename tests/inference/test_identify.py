@@ -59,3 +59,13 @@ def test_all_kept_changes_nothing():
     kept = inference.restore_prior(q, jnp.ones(2, bool))
     theta = jnp.asarray([[0.2, 4.0], [0.0, 5.0], [0.9, 9.0]])
     np.testing.assert_allclose(np.asarray(kept.log_prob(theta)), np.asarray(q.log_prob(theta)), atol=1e-3)
+
+
+def test_thin_components_survive():
+    """Correlation 1 - 1e-9: the covariance is singular in float32, its factor is not."""
+    thin = jnp.asarray([[[0.2, 0.0], [0.2, 1e-5]]])
+    q = Distribution.from_unit(SPACE, jnp.zeros(1), jnp.full((1, 2), 0.5), thin)
+    kept = identify.restore_prior(q, jnp.ones(2, bool))
+    np.testing.assert_allclose(np.asarray(kept.scales), np.asarray(thin), rtol=1e-3, atol=1e-7)
+    half = identify.restore_prior(q, jnp.asarray([False, True]))
+    np.testing.assert_allclose(np.asarray(half.scales[0]), [[identify.FLAT, 0.0], [0.0, 0.2]], rtol=1e-4, atol=1e-5)
