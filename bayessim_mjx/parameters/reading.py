@@ -7,10 +7,7 @@ makes effects of them, whose parameters follow the model's.
 """
 
 import dataclasses
-import difflib
 import fnmatch
-import math
-import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -18,7 +15,7 @@ import mujoco
 import numpy as np
 
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.parameters import attributes, elements, geometry
+from bayessim_mjx.parameters import attributes, checks, elements, geometry
 from bayessim_mjx.parameters.attributes import COMPOSITE, FIELDS, suggest
 from bayessim_mjx.parameters.elements import Element
 from bayessim_mjx.parameters.parameter import OPERATIONS, Parameter
@@ -34,7 +31,7 @@ GROUPS: dict[str, tuple[str, tuple[str, ...]]] = {
 }
 PATH = "task.randomization_params"
 OTHER_GROUPS = ("scale", "color", "effects")
-ACCEPTED = ("schedule", "schedule_steps", "num_buckets", "setup_only")  # BayesSimIG's; see `_check_accepted`
+ACCEPTED = ("schedule", "schedule_steps", "num_buckets", "setup_only")  # BayesSimIG's; see `checks.accepted`
 SETTINGS = ("range", "operation", "distribution", "mean", "sd", "include", "exclude", "factor", "unit", "nominal")
 EFFECT_SETTINGS = ("range", "operation", "distribution", "mean", "sd", "unit", "nominal")
 NOISE = {  # BayesSimIG's nuisance noise, which is not simulated here -> what there is instead
@@ -73,18 +70,18 @@ def effect_groups(section: Mapping[str, Any]) -> Iterator[tuple[str, str, str, M
     groups = [(f"{PATH}.actor_params.{a}.effects", g["effects"]) for a, g in actors.items() if "effects" in g]
     groups += [(f"{PATH}.actor_params.effects", actors.get("effects")), (f"{PATH}.effects", section.get("effects"))]
     for path, group in groups:
-        for effect, places in _mapping(group, path).items():
-            for place, parameters in _mapping(places, f"{path}.{effect}").items():
+        for effect, places in checks.mapping(group, path).items():
+            for place, parameters in checks.mapping(places, f"{path}.{effect}").items():
                 where = f"{path}.{effect}.{place}"
-                yield where, str(effect), str(place), _mapping(parameters, where)
+                yield where, str(effect), str(place), checks.mapping(parameters, where)
 
 
 def effect_parameter(default: Parameter, setting: Any, where: str) -> Parameter:
     """An effect's own parameter with range and prior of `setting`; nominal stays, or is the range's end next to it."""
-    setting = _mapping(setting, where)
-    _known(setting, (*EFFECT_SETTINGS, *ACCEPTED), where)
-    _check_accepted(setting, where)
-    _choice(setting, "operation", ("absolute",), "absolute", where)
+    setting = checks.mapping(setting, where)
+    checks.known(setting, (*EFFECT_SETTINGS, *ACCEPTED), where)
+    checks.accepted(setting, where)
+    checks.choice(setting, "operation", ("absolute",), "absolute", where)
     ranged: dict[str, Any] = {"range": (default.low, default.high), **setting}
     if "distribution" not in setting:
         ranged |= {"distribution": default.prior, "mean": setting.get("mean", default.mean)}
@@ -97,10 +94,10 @@ def effect_parameter(default: Parameter, setting: Any, where: str) -> Parameter:
 
 def _open(section: Any) -> tuple[Mapping[str, Any], dict[str, Mapping[str, Any]]]:
     """(the `randomization_params`, its actors), after a look at the keys that are not about parameters."""
-    section = _mapping(section, PATH)
+    section = checks.mapping(section, PATH)
     if "randomization_params" in section:
-        section = _mapping(section["randomization_params"], PATH)
-    _known(section, SECTION_KEYS, PATH)
+        section = checks.mapping(section["randomization_params"], PATH)
+    checks.known(section, SECTION_KEYS, PATH)
     for key, instead in NOISE.items():
         if section.get(key):
             raise UserError(f"{PATH}.{key}: this noise is not simulated ({instead}); remove the key")
@@ -108,34 +105,21 @@ def _open(section: Any) -> tuple[Mapping[str, Any], dict[str, Mapping[str, Any]]
         raise UserError(
             f"{PATH}.frequency = {section['frequency']!r}: every episode draws new parameters; give 1, or leave it out"
         )
-    actors = _mapping(section.get("actor_params"), f"{PATH}.actor_params")
-    return section, {str(k): _mapping(v, f"{PATH}.actor_params.{k}") for k, v in actors.items()}
-
-
-def _check_accepted(setting: Mapping[str, Any], where: str) -> None:
-    """BayesSimIG's keys that would change the result are refused, harmless ones ignored with a warning."""
-    if setting.get("schedule") not in (None, "constant"):
-        raise UserError(
-            f"{where}.schedule = {setting['schedule']!r}: the range does not grow over time; allowed: constant"
-        )
-    if setting.get("schedule_steps") not in (None, 0):
-        raise UserError(f"{where}.schedule_steps = {setting['schedule_steps']!r}: nothing is scheduled; allowed: 0")
-    for key in ("num_buckets", "setup_only"):
-        if setting.get(key):
-            warnings.warn(f"{where}.{key} is ignored: values are continuous and new in every episode", stacklevel=2)
+    actors = checks.mapping(section.get("actor_params"), f"{PATH}.actor_params")
+    return section, {str(k): checks.mapping(v, f"{PATH}.actor_params.{k}") for k, v in actors.items()}
 
 
 def _actor(
     model: mujoco.MjModel, actor: str, groups: Mapping[str, Any], actors: Sequence[str], where: str
 ) -> Iterator[Parameter]:
-    _known(groups, (*GROUPS, *OTHER_GROUPS), where)
+    checks.known(groups, (*GROUPS, *OTHER_GROUPS), where)
     bodies = elements.of_actor(model, actor, actors, where)
     for group, content in groups.items():
         path = f"{where}.{group}"
         if group in ("color", "effects"):  # looks, not physics; not the model's
             continue
         if group == "scale":
-            yield _scale(model, actor, actors, _mapping(content, path), path)
+            yield _scale(model, actor, actors, checks.mapping(content, path), path)
         else:
             yield from _group(model, bodies, group, content or {}, path)
 
@@ -145,7 +129,7 @@ def _group(
 ) -> Iterator[Parameter]:
     """Parameters of one group, elements outside attributes, but for dofs attributes outside elements."""
     kind, allowed = GROUPS[group]
-    _known(content, allowed, where)
+    checks.known(content, allowed, where)
     available = elements.of_bodies(model, bodies, kind)
     members = {a: _selected(model, available, kind, a, s or {}, f"{where}.{a}") for a, s in content.items()}
     if kind == "joint":
@@ -166,8 +150,8 @@ def _selected(
     where: str,
 ) -> list[Element]:
     """Elements that carry the attribute, restricted by `include` and `exclude` (names or patterns with *)."""
-    _known(setting, (*SETTINGS, *ACCEPTED), where)
-    _check_accepted(setting, where)
+    checks.known(setting, (*SETTINGS, *ACCEPTED), where)
+    checks.accepted(setting, where)
     usable = [e for e in members if e.kind == kind or attribute == "length"]
     if kind == "geom" and attribute == "length":  # one length per body, called like its first shape
         usable = list({elements.body_of(model, e): e for e in reversed(usable)}.values())[::-1]
@@ -191,7 +175,7 @@ def _selected(
 def _parameter(
     model: mujoco.MjModel, e: Element, kind: str, attribute: str, setting: Mapping[str, Any], where: str
 ) -> Parameter:
-    operation = _choice(setting, "operation", OPERATIONS, "scaling", where)
+    operation = checks.choice(setting, "operation", OPERATIONS, "scaling", where)
     name = f"{e.label}_{attribute}".lstrip("_") + ("_mult" if operation == "scaling" else "")
     axis = None
     if attribute == "length":
@@ -201,7 +185,7 @@ def _parameter(
         target = e.target
     kind, attribute, target = _driven(model, kind, attribute, target, operation)
     _check_default(model, kind, attribute, target, operation, f"{where}, {e.label or kind}")
-    factor = _number(setting.get("factor", 1.0), f"{where}.factor")
+    factor = checks.number(setting.get("factor", 1.0), f"{where}.factor")
     return _build(
         setting,
         where,
@@ -237,10 +221,10 @@ def _driven(model: mujoco.MjModel, kind: str, attribute: str, target: str, opera
 
 def _build(setting: Mapping[str, Any], where: str, name: str, own: float, **rest: Any) -> Parameter:
     """A Parameter from the keys range, distribution, mean, sd, nominal; nominal = the model's own value, clipped."""
-    low, high = _range(setting, where)
-    distribution = _choice(setting, "distribution", tuple(DISTRIBUTIONS), "uniform", where)
-    nominal = _number(setting.get("nominal", min(max(own, low), high)), f"{where}.nominal")
-    mean, sd = (None if setting.get(k) is None else _number(setting[k], f"{where}.{k}") for k in ("mean", "sd"))
+    low, high = checks.low_high(setting, where)
+    distribution = checks.choice(setting, "distribution", tuple(DISTRIBUTIONS), "uniform", where)
+    nominal = checks.number(setting.get("nominal", min(max(own, low), high)), f"{where}.nominal")
+    mean, sd = (None if setting.get(k) is None else checks.number(setting[k], f"{where}.{k}") for k in ("mean", "sd"))
     try:
         return Parameter(name, nominal, low, high, prior=DISTRIBUTIONS[distribution], mean=mean, sd=sd, **rest)
     except UserError as error:
@@ -297,9 +281,9 @@ def _scale(
     """One number for the whole actor: `scale: {range: ...}`, or BayesSimIG's `scale: {scale: {range: ...}}`."""
     if set(setting) == {"scale"}:
         setting = setting["scale"]
-    _known(setting, (*SETTINGS, *ACCEPTED), where)
-    _check_accepted(setting, where)
-    operation = _choice(setting, "operation", OPERATIONS, "scaling", where)
+    checks.known(setting, (*SETTINGS, *ACCEPTED), where)
+    checks.accepted(setting, where)
+    operation = checks.choice(setting, "operation", OPERATIONS, "scaling", where)
     have = attributes.names(model, "body")
     if actor not in have and len(actors) > 1:
         raise UserError(f"{where}: only a body can be scaled apart from other actors; {suggest(actor, have[1:])}")
@@ -311,49 +295,3 @@ def _scale(
             )
     name = f"{actor}_scale" + ("_mult" if operation == "scaling" else "")
     return _build(setting, where, name, 1.0, operation=operation, attribute="scale", target=actor, kind="actor")
-
-
-def _mapping(value: Any, where: str) -> Mapping[str, Any]:
-    """A section; nothing at all is an empty one."""
-    if value is None or isinstance(value, Mapping):
-        return value or {}
-    raise UserError(f"{where} = {value!r}: expected a section of `key: value` lines")
-
-
-def _known(mapping: Any, allowed: Sequence[str], where: str) -> None:
-    if not isinstance(mapping, Mapping):
-        raise UserError(f"{where} = {mapping!r}: expected a section with keys of {', '.join(allowed)}")
-    for key in mapping:
-        if key not in allowed:
-            close = difflib.get_close_matches(str(key), allowed, 2)
-            hint = f"did you mean {', '.join(close)}? " if close else ""
-            raise UserError(f"{where}.{key}: unknown key; {hint}allowed: {', '.join(allowed)}")
-
-
-def _choice(setting: Mapping[str, Any], key: str, allowed: Sequence[str], default: str, where: str) -> str:
-    value = setting.get(key, default)
-    if value not in allowed:
-        raise UserError(f"{where}.{key}: {value!r} is none of {', '.join(allowed)}")
-    return value
-
-
-def _range(setting: Mapping[str, Any], where: str) -> tuple[float, float]:
-    value = setting.get("range")
-    if value is None:
-        raise UserError(f"{where}.range: missing; give [low, high]")
-    if isinstance(value, str) or not hasattr(value, "__len__") or len(value) != 2:
-        raise UserError(f"{where}.range: {value!r} is not [low, high]")
-    low, high = (_number(v, f"{where}.range") for v in value)
-    if not low < high:
-        raise UserError(f"{where}.range: [{low:g}, {high:g}] is empty; low must be less than high")
-    return low, high
-
-
-def _number(value: Any, where: str) -> float:
-    try:  # YAML reads 1e-3 as text
-        number = float("" if isinstance(value, bool) else value)
-    except (TypeError, ValueError):
-        raise UserError(f"{where}: {value!r} is not a number") from None
-    if not math.isfinite(number):
-        raise UserError(f"{where}: {value!r} is not finite")
-    return number

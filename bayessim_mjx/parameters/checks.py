@@ -1,0 +1,72 @@
+"""Checks of a `randomization_params` section: each error names the key's path, its value and what is allowed."""
+
+import difflib
+import math
+import warnings
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from bayessim_mjx.errors import UserError
+
+
+def mapping(value: Any, where: str) -> Mapping[str, Any]:
+    """A section; nothing at all is an empty one."""
+    if value is None or isinstance(value, Mapping):
+        return value or {}
+    raise UserError(f"{where} = {value!r}: expected a section of `key: value` lines")
+
+
+def known(section: Any, allowed: Sequence[str], where: str) -> None:
+    """A section without other keys than the allowed ones."""
+    if not isinstance(section, Mapping):
+        raise UserError(f"{where} = {section!r}: expected a section with keys of {', '.join(allowed)}")
+    for key in section:
+        if key not in allowed:
+            close = difflib.get_close_matches(str(key), allowed, 2)
+            hint = f"did you mean {', '.join(close)}? " if close else ""
+            raise UserError(f"{where}.{key}: unknown key; {hint}allowed: {', '.join(allowed)}")
+
+
+def choice(setting: Mapping[str, Any], key: str, allowed: Sequence[str], default: str, where: str) -> str:
+    """The value of `key`, one of the allowed."""
+    value = setting.get(key, default)
+    if value not in allowed:
+        raise UserError(f"{where}.{key}: {value!r} is none of {', '.join(allowed)}")
+    return value
+
+
+def low_high(setting: Mapping[str, Any], where: str) -> tuple[float, float]:
+    """The setting's `range`, low < high."""
+    value = setting.get("range")
+    if value is None:
+        raise UserError(f"{where}.range: missing; give [low, high]")
+    if isinstance(value, str) or not hasattr(value, "__len__") or len(value) != 2:
+        raise UserError(f"{where}.range: {value!r} is not [low, high]")
+    low, high = (number(v, f"{where}.range") for v in value)
+    if not low < high:
+        raise UserError(f"{where}.range: [{low:g}, {high:g}] is empty; low must be less than high")
+    return low, high
+
+
+def number(value: Any, where: str) -> float:
+    """A finite number."""
+    try:  # YAML reads 1e-3 as text
+        number = float("" if isinstance(value, bool) else value)
+    except (TypeError, ValueError):
+        raise UserError(f"{where}: {value!r} is not a number") from None
+    if not math.isfinite(number):
+        raise UserError(f"{where}: {value!r} is not finite")
+    return number
+
+
+def accepted(setting: Mapping[str, Any], where: str) -> None:
+    """BayesSimIG's keys that would change the result are refused, harmless ones ignored with a warning."""
+    if setting.get("schedule") not in (None, "constant"):
+        raise UserError(
+            f"{where}.schedule = {setting['schedule']!r}: the range does not grow over time; allowed: constant"
+        )
+    if setting.get("schedule_steps") not in (None, 0):
+        raise UserError(f"{where}.schedule_steps = {setting['schedule_steps']!r}: nothing is scheduled; allowed: 0")
+    for key in ("num_buckets", "setup_only"):
+        if setting.get(key):
+            warnings.warn(f"{where}.{key} is ignored: values are continuous and new in every episode", stacklevel=2)
