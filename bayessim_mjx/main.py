@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import sys
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -35,10 +36,19 @@ class Watched:
     def round(self, info: Any, policy: Any) -> None:
         self.session.round(info, policy)  # no stop here: the round is not saved yet
 
-    def save(self, step: int, tree: Any, *, meta: dict[str, Any], **options: Any) -> None:
+    def save(
+        self,
+        step: int,
+        tree: Any,
+        *,
+        evaluation: float | None = None,
+        meta: dict | None = None,
+        supersede: bool = False,
+    ) -> None:
         self.session.flush()
-        self.run.save(step, tree, meta={**meta, "seconds": self.session.wall.mark()}, **options)
-        if meta["round"] < self.parts.settings.realIters:  # else all is done, and there is nothing to go on with
+        clock = {**(meta or {}), "seconds": self.session.wall.mark()}
+        self.run.save(step, tree, evaluation=evaluation, meta=clock, supersede=supersede)
+        if int(tree["state"].round) < self.parts.settings.realIters:  # else all is done
             self.stop.check()
 
 
@@ -108,7 +118,7 @@ def _state(parts: Any, run: Any) -> tuple[Any, int | None]:
         tree, meta = run.restore("latest", loop.tree_of(parts, state), fall_back=True)
         return tree["state"], marked(meta)
     train = cli.warm_start(state.train, parts.config, parts.env)
-    return state.replace(train=train), None if run is None else -1
+    return dataclasses.replace(state, train=train), None if run is None else -1
 
 
 def _rounds(parts: Any, state: Any, run: Any, console: Any, resumed_at: int | None) -> Any:

@@ -1,18 +1,25 @@
 """The commands, called in this process: bad input is one line and exit code 2, a killed run goes on bit for bit."""
 
+import collections
 import json
 import os
 import signal
+import subprocess
+import sys
+import time
+import types
 from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 import pytest
 
 from bayessim_mjx import cli, main, play, registry, train
 from bayessim_mjx.env import Env, State
+from bayessim_mjx.monitor.writer import event_files, records
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 from bayessim_mjx.runs import Run, latest_run
 
@@ -87,6 +94,7 @@ def error_of(capsys: pytest.CaptureFixture, run: Any, *argv: str) -> str:
         (["--task", "Pendulum", "bayessim.component=5"], ["bayessim.component", "Did you mean bayessim.components"]),
         (["--task", "Pendulum", "--device", "tpu:7"], ["device = 'tpu:7'", "available: cpu:0"]),
         (["--task", "Pendulum", "--device", "abacus"], ["device = 'abacus'", "cuda:0"]),
+        (["--task", "Pendulum", "--device", "auto:1"], ["device = 'auto:1'", "expected auto, cpu, gpu"]),
         (["--task", "Pendulum", "--cfg_env", "nowhere.yaml"], ["nowhere.yaml", "cannot be read"]),
         (["--task", "Pendulum", "--name", "../up"], ["name = '../up'"]),
         (["--resume", "nowhere"], ["nowhere: not a run folder"]),
@@ -138,9 +146,30 @@ def test_seed_minus_one_is_drawn_and_recorded() -> None:
     assert 0 <= config.seed < 10_000 and config.task == "Pendulum" and config.ppo.gamma == 0.5
 
 
+@pytest.mark.parametrize("flag", ["--max_iterations=3", "--video_interval", "--name", "--resume"])
+def test_play_neither_shows_nor_takes_flags_of_training(flag: str, capsys: pytest.CaptureFixture) -> None:
+    assert f"{flag.split('=')[0]}: play has no use for it" in error_of(capsys, play.main, flag, "3")
+    assert play.main(["--help"]) == 0
+    assert flag.split("=")[0] not in capsys.readouterr().out
+
+
 def checkpoint_of(run: Run, step: int) -> list:
     """Names, shapes and checksums of everything in a checkpoint."""
     return json.loads((run.checkpoint(step) / "index.json").read_text())["parts"]
+
+
+def repeated_events(run: Run) -> list:
+    """(folder, tag, step) that the run's TensorBoard events hold more than once, in all folders."""
+    folders = [run.path, *(run.path / name for name in ("bsim", "rl", "rl_time"))]
+    count = collections.Counter(
+        (folder.name, value.tag, event.step)
+        for folder in folders
+        for file in event_files(folder)
+        for _, event in records(file)
+        for value in event.summary.value
+    )
+    assert count
+    return [key for key, n in count.items() if n > 1]
 
 
 class Killed(BaseException):
@@ -161,41 +190,95 @@ def killed_after(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
     monkeypatch.setattr(Run, "save", save)
 
 
-def test_train_killed_and_resumed_equals_unkilled(toy: None, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("saves", [0, 1])
+def test_train_killed_and_resumed_equals_unkilled(toy: None, monkeypatch: pytest.MonkeyPatch, saves: int) -> None:
     argv = ["--task", "Pendulum", "--randomize", *SMALL]
     assert train.main([*argv, "--logdir", "whole"]) == 0
     with monkeypatch.context() as patch, pytest.raises(Killed):
-        killed_after(patch, 1)
+        killed_after(patch, saves)
         train.main([*argv, "--logdir", "killed"])
-    killed = latest_run("killed", "Pendulum")
-    assert killed.manifest["status"] == "running" and killed.manifest["latest"] == 2
+    killed = latest_run("killed", "Pendulum", with_checkpoint=False)
+    assert killed.manifest["status"] == "running" and killed.manifest["latest"] == (2 if saves else None)
     assert train.main(["--resume", str(killed.path), "--headless"]) == 0
     whole, resumed = latest_run("whole", "Pendulum"), Run.open(killed.path)
     assert checkpoint_of(whole, 4) == checkpoint_of(resumed, 4)
     assert whole.manifest["checkpoints"] == resumed.manifest["checkpoints"]
     assert resumed.manifest["status"] == "finished"
+    assert not repeated_events(resumed)
     assert not list(resumed.path.glob("checkpoints/*.tmp"))
 
 
-def test_ctrl_c_ends_with_a_checkpoint_and_130(toy: None, monkeypatch: Any, capsys: pytest.CaptureFixture) -> None:
+@pytest.mark.parametrize("at", [2, 3])
+def test_ctrl_c_ends_with_a_checkpoint_and_130(
+    toy: None, monkeypatch: Any, capsys: pytest.CaptureFixture, at: int
+) -> None:
+    """Also where an evaluation is due: the resumed run makes up for it."""
     argv = ["--task", "Pendulum", *SMALL]
     assert train.main([*argv, "--logdir", "whole"]) == 0
     with monkeypatch.context() as patch:
         progress = train.Training.progress
 
         def interrupted(self: train.Training, metrics: dict, state: Any) -> None:
-            if int(state.iteration) == 3:
+            if int(state.iteration) == at:
                 os.kill(os.getpid(), signal.SIGINT)
             progress(self, metrics, state)
 
         patch.setattr(train.Training, "progress", interrupted)
         assert train.main([*argv, "--logdir", "stopped"]) == 130
     run = latest_run("stopped", "Pendulum")
-    assert run.manifest["status"] == "interrupted" and run.manifest["latest"] == 3
+    assert run.manifest["status"] == "interrupted" and run.manifest["latest"] == at
     assert f"--resume {run.path}" in capsys.readouterr().out
     assert train.main(["--resume", str(run.path)]) == 0
-    assert checkpoint_of(Run.open(run.path), 4) == checkpoint_of(latest_run("whole", "Pendulum"), 4)
+    resumed, whole = Run.open(run.path), latest_run("whole", "Pendulum")
+    assert checkpoint_of(resumed, 4) == checkpoint_of(whole, 4)
+    scores = ({c["step"]: c["evaluation"] for c in r.checkpoints if c["step"] != 3} for r in (resumed, whole))
+    assert next(scores) == next(scores)
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_ctrl_c_after_the_last_iteration_still_evaluates_it(toy: None, monkeypatch: Any) -> None:
+    progress = train.Training.progress
+
+    def interrupted(self: train.Training, metrics: dict, state: Any) -> None:
+        if int(state.iteration) == 4:
+            os.kill(os.getpid(), signal.SIGINT)
+        progress(self, metrics, state)
+
+    monkeypatch.setattr(train.Training, "progress", interrupted)
+    assert train.main(["--task", "Pendulum", *SMALL]) == 0
+    run = latest_run("logs", "Pendulum")
+    assert run.manifest["status"] == "finished" and run.checkpoints[-1]["evaluation"] is not None
+
+
+@pytest.mark.parametrize("error", [FloatingPointError("the loss is not finite"), RuntimeError("out of memory")])
+def test_a_run_that_fails_says_so(toy: None, monkeypatch: Any, error: Exception) -> None:
+    def fail(self: train.Training, state: Any) -> float:
+        raise error
+
+    monkeypatch.setattr(train.Training, "evaluate", fail)
+    if isinstance(error, RuntimeError):  # a fault of ours keeps its traceback
+        with pytest.raises(RuntimeError):
+            train.main(["--task", "Pendulum", *SMALL])
+    else:
+        assert train.main(["--task", "Pendulum", *SMALL]) == 2
+    assert latest_run("logs", "Pendulum", with_checkpoint=False).manifest["status"] == "failed"
+
+
+def test_main_stops_only_after_the_rounds_checkpoint() -> None:
+    """A stop that is asked for during inference comes while the round is reported, before it is saved."""
+    calls: list = []
+    wall = types.SimpleNamespace(mark=lambda: 7)
+    session = types.SimpleNamespace(round=lambda *_: calls.append("round"), flush=lambda: None, wall=wall)
+    run = types.SimpleNamespace(save=lambda step, tree, *, meta, **_: calls.append((step, meta["seconds"])))
+    stop = cli.Stop()
+    parts = types.SimpleNamespace(settings=types.SimpleNamespace(realIters=2))
+    watched = main.Watched(session, stop, run, parts)
+    stop.requested = True
+    watched.round(None, None)
+    with pytest.raises(KeyboardInterrupt):
+        watched.save(5, {"state": types.SimpleNamespace(round=1)}, meta={})
+    watched.save(10, {"state": types.SimpleNamespace(round=2)}, meta={})  # the last round: nothing is left to stop
+    assert calls == ["round", (5, 7), (10, 7)]
 
 
 def test_resume_keeps_the_runs_settings(toy: None, capsys: pytest.CaptureFixture) -> None:
@@ -203,7 +286,9 @@ def test_resume_keeps_the_runs_settings(toy: None, capsys: pytest.CaptureFixture
     run = str(latest_run("logs", "Pendulum").path)
     for argv in (["--seed", "3"], ["ppo.gamma=0.5"], ["--task", "Ant"], ["--randomize"]):
         assert f"{argv[0]} would change" in error_of(capsys, train.main, "--resume", run, *argv)
-    assert train.main(["--resume", run, "--device", "cpu"]) == 0  # nothing left to do
+    capsys.readouterr()
+    assert train.main(["--resume", run, "--device", "cpu"]) == 0
+    assert "this run had finished" in capsys.readouterr().out
 
 
 def test_corrupted_checkpoints_of_a_run_to_resume(toy: None, capsys: pytest.CaptureFixture) -> None:
@@ -249,15 +334,95 @@ def test_main_killed_and_resumed_equals_unkilled(toy: None, monkeypatch: Any, ca
     assert main.main([*argv, "--logdir", "whole"]) == 0
     whole = latest_run("whole", "Pendulum")
     last = whole.manifest["latest"]
-    for saves in range(1, 5):  # within and between rounds
+    for saves in range(5):  # before the first one, within and between rounds
         with monkeypatch.context() as patch, pytest.raises(Killed):
             killed_after(patch, saves)
             main.main([*argv, "--logdir", "killed"])
-        run = latest_run("killed", "Pendulum")
+        run = latest_run("killed", "Pendulum", with_checkpoint=False)
         assert main.main(["--resume", str(run.path), "--headless"]) == 0
         resumed = Run.open(run.path)
         assert checkpoint_of(resumed, last) == checkpoint_of(whole, last), saves
         assert [c["evaluation"] for c in resumed.checkpoints] == [c["evaluation"] for c in whole.checkpoints]
+        assert not repeated_events(resumed)
+        assert [json.loads(line)["round"] for line in (run.path / "rounds.jsonl").read_text().splitlines()] == [0, 1]
     capsys.readouterr()
+    assert main.main(["--resume", str(whole.path), "--headless"]) == 0
+    out = capsys.readouterr().out
+    assert "this run had finished" in out and "contraction" in out  # and the table of parameters
     assert play.main(["--checkpoint", str(whole.path), "--episodes", "3"]) == 0
     assert "posterior" in capsys.readouterr().out
+
+
+def interrupted_round(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ctrl-C while the first round is reported."""
+    from bayessim_mjx.monitor.session import Session
+
+    whole = Session.round
+
+    def round_(self: Session, info: Any, policy: Any) -> None:
+        whole(self, info, policy)
+        if info.round == 0:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr(Session, "round", round_)
+
+
+@pytest.mark.slow
+@pytest.mark.ci
+def test_main_interrupted_in_a_round_keeps_the_round(toy: None, monkeypatch: Any) -> None:
+    with monkeypatch.context() as patch:
+        interrupted_round(patch)
+        assert main.main(["--task", "Pendulum", *SMALL, *LOOP]) == 130
+    run = latest_run("logs", "Pendulum")
+    assert run.manifest["status"] == "interrupted" and run.checkpoints[-1]["evaluation"] is not None
+    assert run.manifest["best"] == run.manifest["latest"] == 5
+    assert main.main(["--resume", str(run.path), "--headless"]) == 0
+    assert not repeated_events(run) and Run.open(run.path).manifest["status"] == "finished"
+
+
+def write_pendulum_logs(folder: Path) -> None:
+    """Six runs of 3 s on the pendulum with mass 1.4 and length 0.7, as CSV."""
+    from bayessim_mjx import config
+    from bayessim_mjx.rollout import replay
+
+    env = registry.make("Pendulum", config=config.load("Pendulum"))
+    clock, starts = np.arange(61) * env.dt, np.linspace(-2.5, 2.5, 6)[:, None]
+    command = 2.0 * np.sin(np.outer(np.linspace(1.0, 4.0, 6), clock[:-1]))[..., None]
+    motion = replay(env.physics, starts, np.zeros_like(starts), command, np.tile([1.4, 0.7], (6, 1)))
+    actuator, joint = env.mj_model.actuator(0).name, env.mj_model.joint(0).name
+    header = f"time,ctrl:{actuator},qpos:{joint},qvel:{joint}"
+    folder.mkdir()
+    for i in range(6):
+        columns = [clock, np.append(command[i], command[i][-1]), motion["qpos"][i], motion["qvel"][i]]
+        np.savetxt(folder / f"run{i}.csv", np.column_stack(columns), delimiter=",", header=header, comments="")
+
+
+@pytest.mark.slow
+@pytest.mark.ci
+def test_a_real_process_on_logs_survives_sigkill(tmp_path: Path) -> None:
+    """kill -9 after the first checkpoint, --resume: the last checkpoint is that of an unkilled run, and it plays."""
+    write_pendulum_logs(tmp_path / "recorded")
+    argv = ["--task", "Pendulum", *SMALL, *LOOP, "real.logs=recorded", "bayessim.realTrajs=2", "--seed", "3"]
+    start = [sys.executable, "-m", "bayessim_mjx.main"]
+    environment = {**os.environ, "BAYESSIM_MJX_CACHE": str(tmp_path / "cache")}
+    subprocess.run([*start, *argv, "--logdir", "whole"], env=environment, check=True, capture_output=True)
+    whole = latest_run("whole", "Pendulum")
+
+    with subprocess.Popen([*start, *argv, "--logdir", "killed"], env=environment, stdout=subprocess.DEVNULL) as process:
+        manifest = lambda: list(Path("killed").glob("*/*/run.json"))  # noqa: E731
+        while not (manifest() and json.loads(manifest()[0].read_text())["checkpoints"]):
+            assert process.poll() is None
+            time.sleep(0.02)
+        process.kill()
+    killed = latest_run("killed", "Pendulum")
+    assert process.returncode == -signal.SIGKILL and killed.manifest["status"] == "running"
+    assert killed.manifest["latest"] < whole.manifest["latest"]
+
+    again = subprocess.run([*start, "--resume", str(killed.path)], env=environment, check=True, capture_output=True)
+    assert "warning: real.logs: the logged commands act" in again.stdout.decode() and b"Warning" not in again.stderr
+    resumed, last = Run.open(killed.path), whole.manifest["latest"]
+    assert checkpoint_of(resumed, last) == checkpoint_of(whole, last)
+    assert [c["evaluation"] for c in resumed.checkpoints] == [c["evaluation"] for c in whole.checkpoints]
+    assert not repeated_events(resumed)
+    assert resumed.manifest["best"] == last  # under logs only the newest evaluation counts
+    assert play.main(["--checkpoint", str(killed.path), "--episodes", "3", "--physics", "posterior"]) == 0
