@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from bayessim_mjx import cli
@@ -63,24 +63,6 @@ def _prepare(args: argparse.Namespace) -> tuple[Config, Any]:
     return cli.pin_policy(cli.config_of(args, more)), None
 
 
-def film(env: Any, config: Config) -> Callable[[Any, int, Any], Any] | None:
-    """(policy, control steps, theta [d]) -> qpos [T+1, nq] of one episode; None where no video is to be made."""
-    import jax
-    import jax.numpy as jnp
-    import numpy as np
-
-    from bayessim_mjx.rollout import rollout
-
-    if not config.monitor.video or not hasattr(env, "physics"):
-        return None
-
-    def motion(policy: Any, length: int, theta: Any) -> np.ndarray:
-        actor, thetas = policy.replace(deterministic=True), jnp.asarray(theta, jnp.float32)[None]
-        return np.asarray(rollout(env, actor, jax.random.PRNGKey(config.seed), thetas, length).qpos[0])
-
-    return motion
-
-
 def _run(config: Config, run: Any, command: Sequence[str], console: Any) -> int:
     from bayessim_mjx import loop, registry, runs
     from bayessim_mjx.monitor.opening import opening
@@ -124,6 +106,7 @@ def _state(parts: Any, run: Any) -> tuple[Any, int | None]:
 def _rounds(parts: Any, state: Any, run: Any, console: Any, resumed_at: int | None) -> Any:
     """The rounds that are left, watched; the last state."""
     from bayessim_mjx import loop
+    from bayessim_mjx.monitor.film import film
     from bayessim_mjx.monitor.session import Session
 
     config, env = parts.config, parts.env

@@ -33,8 +33,8 @@ class Training:
         import jax
 
         from bayessim_mjx.distributions import Distribution
-        from bayessim_mjx.main import film
         from bayessim_mjx.monitor.compile_clock import CompileClock
+        from bayessim_mjx.monitor.film import film
 
         self.config, self.env, self.run, self.console, self.stop = config, env, run, console, stop
         randomized = bool(config.randomization.get("randomize")) and len(env.space) > 0
