@@ -116,6 +116,10 @@ class Physics:
         Raises:
             ValueError: on a wrong shape.
         """
+        with jax.default_matmul_precision("highest"):
+            return self._world(theta, qpos, qvel)
+
+    def _world(self, theta: jax.Array, qpos: jax.Array | None, qvel: jax.Array | None) -> World:
         theta = jnp.asarray(theta, jnp.float32)
         qpos = jnp.asarray(self.mj_model.qpos0 if qpos is None else qpos, jnp.float32)
         qvel = jnp.zeros(self.mj_model.nv) if qvel is None else jnp.asarray(qvel, jnp.float32)
@@ -238,6 +242,11 @@ def control_step(physics: Physics, world: World, command: jax.Array) -> tuple[Wo
         (world after the step, `mjx.Data` of the last sub-step: its state is the new one; its poses, contacts and forces
         are those computed *before* the last integration, as after `mjx.step`).
     """
+    with jax.default_matmul_precision("highest"):  # a GPU would round the inputs of its products to TF32
+        return _control_step(physics, world, command)
+
+
+def _control_step(physics: Physics, world: World, command: jax.Array) -> tuple[World, mjx.Data]:
     model, thetas = physics.model_of(world), physics.split(world.theta)[1]
     memory = list(world.memory)
     commands = jnp.broadcast_to(command, (physics.substeps, physics.mj_model.nu))

@@ -12,6 +12,8 @@ import numpy as np
 from jax import Array
 from jax.scipy.special import log_ndtr, ndtr, ndtri
 
+from bayessim_mjx.triangular import product, solve_lower
+
 MASS_POINTS = 512  # quasi-Monte-Carlo points behind every log_inside
 
 
@@ -66,14 +68,14 @@ def separate(mean: Array, scale: Array, w: Array) -> tuple[Array, Array]:
 
     def coordinate(carry: tuple[Array, Array], i: Array) -> tuple[tuple[Array, Array], None]:
         z, log_weight = carry
-        centre = mean[i] + z @ scale[i]  # the columns from i on are still zero
+        centre = mean[i] + product(z, scale[i])  # the columns from i on are still zero
         a, b = -centre / scale[i, i], (1 - centre) / scale[i, i]
         z = z.at[:, i].set(truncated_normal(a, b, w[:, i]))
         return (z, log_weight + log_interval(a, b)), None
 
     start = jnp.zeros((n, d), jnp.float32), jnp.zeros((n,), jnp.float32)
     (z, log_weight), _ = jax.lax.scan(coordinate, start, jnp.arange(d))
-    return jnp.clip(mean[None, :] + z @ scale.T, 0.0, 1.0), log_weight
+    return jnp.clip(mean[None, :] + product(z, scale.T), 0.0, 1.0), log_weight
 
 
 def log_masses(means: Array, scales: Array, points: int = MASS_POINTS) -> Array:
@@ -89,7 +91,7 @@ def log_density(u: Array, means: Array, scales: Array) -> Array:
     if d == 0:
         return jnp.zeros((u.shape[0], means.shape[0]))
     deviation = jnp.swapaxes(u[None, :, :] - means[:, None, :], 1, 2)  # [K, d, n]
-    z = jax.scipy.linalg.solve_triangular(scales, deviation, lower=True)
+    z = solve_lower(scales, deviation)
     log_det = jnp.sum(jnp.log(jnp.diagonal(scales, axis1=-2, axis2=-1)), axis=-1)
     constant = np.float32(0.5 * d * np.log(2 * np.pi))
     return (-0.5 * jnp.sum(z * z, axis=1) - log_det[:, None] - constant).T
@@ -110,7 +112,7 @@ def draw(
         key_k, key_z = jax.random.split(key)
         k = jax.random.categorical(key_k, logits, shape=(n,))
         z = jax.random.normal(key_z, (n, d))
-        return means[k] + jnp.einsum("nij,nj->ni", scales[k], z)
+        return means[k] + jnp.einsum("nij,nj->ni", scales[k], z, precision=jax.lax.Precision.HIGHEST)
 
     def attempt(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         i, done, u = carry

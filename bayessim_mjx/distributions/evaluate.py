@@ -12,6 +12,7 @@ import numpy as np
 from jax import Array
 
 from bayessim_mjx.distributions import box
+from bayessim_mjx.triangular import lower_factor
 
 if TYPE_CHECKING:
     from bayessim_mjx.distributions.distribution import Distribution
@@ -106,6 +107,6 @@ def marginal(q: Distribution, index: tuple[int, ...]) -> tuple[Array, Array, Arr
     """logits, means and scales of the coordinates `index`; each component keeps its mass inside the cube."""
     ids = np.asarray(index)
     rows = q.scales[:, ids, :]
-    means, scales = q.means[:, ids], jnp.linalg.cholesky(rows @ jnp.swapaxes(rows, 1, 2))
+    means, scales = q.means[:, ids], lower_factor(rows)
     logits = jax.nn.log_softmax(q.logits) + box.log_masses(q.means, q.scales) - box.log_masses(means, scales)
     return logits, means, scales

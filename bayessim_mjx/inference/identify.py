@@ -14,6 +14,7 @@ from jax import Array
 from jax.scipy.special import logsumexp
 
 from bayessim_mjx.distributions import Distribution, box
+from bayessim_mjx.triangular import lower_factor
 
 SIGNIFICANT = 3.0  # standard errors of the mean held-out gain
 RELEVANT = 0.01  # nats
@@ -50,12 +51,10 @@ def restore_prior(posterior: Distribution, keep: Array) -> Distribution:
     """The posterior over the parameters to keep [d], the prior over the others, independent of them."""
     keep = jnp.asarray(keep)
     means = jnp.where(keep[None, :], posterior.means, 0.5)
-    # a factor of (S S^T on the kept rows) + FLAT^2 on the others, by QR: forming S S^T would lose thin components
+    # a factor of (S S^T on the kept rows) + FLAT^2 on the others; forming S S^T would lose thin components
     kept = jnp.where(keep[None, :, None], posterior.scales, 0.0)
     flat = jnp.broadcast_to(jnp.diag(jnp.where(keep, 0.0, FLAT)), kept.shape)
-    upper = jnp.linalg.qr(jnp.swapaxes(jnp.concatenate([kept, flat], axis=-1), -1, -2), mode="r")
-    sign = jnp.where(jnp.diagonal(upper, axis1=-2, axis2=-1) < 0, -1.0, 1.0)
-    scales = jnp.swapaxes(upper * sign[..., :, None], -1, -2)
+    scales = lower_factor(jnp.concatenate([kept, flat], axis=-1))
     # each component keeps its mass inside the cube
     mass = box.log_masses(posterior.means, posterior.scales) - box.log_masses(means, scales)
     logits = jax.nn.log_softmax(posterior.logits) + mass

@@ -14,6 +14,7 @@ import numpy as np
 from jax import Array
 
 from bayessim_mjx.inference.settings import InferenceSettings
+from bayessim_mjx.triangular import inverse_lower, product
 
 Params = dict[str, Any]
 RIDGE_LIMIT = 1024  # features up to which linear_start is worth its cost
@@ -62,13 +63,13 @@ def linear_start(params: Params, x: Array, y: Array, weights: Array, settings: I
     if dim_x > RIDGE_LIMIT or d == 0:
         return params
     n = jnp.maximum(jnp.sum(weights), 1.0)
-    gram = (x * weights[:, None]).T @ x / n + 1e-3 * jnp.eye(dim_x)
+    gram = product((x * weights[:, None]).T, x) / n + 1e-3 * jnp.eye(dim_x)
     mean = weights @ y / n
-    slope = jnp.linalg.solve(gram, (x * weights[:, None]).T @ (y - mean[None, :]) / n)  # [D, d]
+    slope = jnp.linalg.solve(gram, product((x * weights[:, None]).T, y - mean[None, :]) / n)  # [D, d]
     residual = (y - mean[None, :] - x @ slope) * weights[:, None]
     chol = jnp.linalg.cholesky(residual.T @ residual / n + 1e-4 * jnp.eye(d))
     sd = jnp.sqrt(jnp.sum(chol * chol, axis=1))
-    factor = jax.scipy.linalg.solve_triangular(chol, jnp.eye(d), lower=True)
+    factor = inverse_lower(chol)
     if not settings.fullCovariance:
         factor = jnp.diag(1.0 / sd)
     last = params["layers"][-1]
@@ -113,7 +114,5 @@ def log_prob(params: Params, x: Array, y: Array, settings: InferenceSettings) ->
 def mixture(params: Params, x: Array, d: int, settings: InferenceSettings) -> tuple[Array, Array, Array]:
     """Mixture in unit coordinates: logits [n, K], means [n, K, d], Cholesky factors of the covariances [n, K, d, d]."""
     logits, means, factors = forward(params, x, d, settings)
-    identity = jnp.broadcast_to(jnp.eye(d), factors.shape)
     # covariance (A^T A)^-1 = A^-1 A^-T, and A^-1 is lower triangular
-    scales = jax.scipy.linalg.solve_triangular(factors, identity, lower=True)
-    return logits, 0.5 + means / SPREAD, scales / SPREAD
+    return logits, 0.5 + means / SPREAD, inverse_lower(factors) / SPREAD

@@ -11,12 +11,12 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jax.scipy.linalg import solve_triangular
 
 with contextlib.redirect_stdout(io.StringIO()):  # MJX announces on import that the optional warp is absent
     from mujoco import mjx
 
 from bayessim_mjx.parameters import geometry
+from bayessim_mjx.triangular import inverse_lower
 
 _MASS = {"body_mass"}
 _SHAPE = {"geom_size", "geom_rbound"}
@@ -89,7 +89,7 @@ def _inertias(model: mjx.Model, data: mjx.Data) -> dict[str, jax.Array]:
     data = mjx.transmission(model, mjx.tendon_armature(model, data))
     mass_matrix = mjx.full_m(model, data)
     # inv(L) once and products with it: many times cheaper under vmap than a solve per Jacobian, and as accurate here
-    inverse = solve_triangular(jnp.linalg.cholesky(mass_matrix), jnp.eye(model.nv), lower=True)
+    inverse = inverse_lower(jnp.linalg.cholesky(mass_matrix))
     moving = np.flatnonzero(model.body_dofnum[model.body_weldid] > 0)
     jacobians = _body_jacobians(model, data, moving).reshape(-1, model.nv)
 
