@@ -251,7 +251,7 @@ def _infer(loop: Loop, state: LoopState, policy: Policy, info: RoundInfo) -> Loo
     b, source, round_ = loop.settings, loop.source, int(state.round)
     assert source is not None and state.domain is not None
     clock = time.perf_counter()
-    prior = domain_or_prior(loop.env.space, b.components)
+    prior = Distribution.prior(loop.env.space, b.components)
     thetas, features = _simulate(source, b.trainTrajs, loop.key(round_, "simulate"), policy, prior)
     count = b.trainTrajs
     if loop.capacity:

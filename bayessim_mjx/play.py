@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from bayessim_mjx import cli
-from bayessim_mjx.config import Config
+from bayessim_mjx.config import Config, freeze
 from bayessim_mjx.device import setup_jax
 from bayessim_mjx.errors import UserError
 
@@ -100,6 +101,8 @@ def _show(args: argparse.Namespace, config: Config, path: Path, run: Any, count:
 
     from bayessim_mjx import registry, rl
 
+    # also a policy trained on nominal physics can be tried on the prior and on the surrogate real
+    config = dataclasses.replace(config, randomization=freeze({**config.randomization, "randomize": True}))
     env = registry.make(config.task, config=config)
     policy, key = cli.load_policy(path, env, config), jax.random.PRNGKey(config.seed)
     kinds = _physics(config, env, path, key, count)

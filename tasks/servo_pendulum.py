@@ -44,8 +44,8 @@ XML = f"""
              frictionloss="{COULOMB:g}" solreffriction="0.006 1"/>
       <geom name="arm" type="capsule" fromto="0 0 0 0 0 -0.1" size="0.004" rgba="0.7 0.7 0.7 1" contype="0"
             conaffinity="0" mass="0"/>
-      <geom name="weight" type="cylinder" fromto="0 -0.01 -0.1 0 0.01 -0.1" size="0.03" rgba="0.75 0.3 0.25 1" contype="0"
-            conaffinity="0" mass="0"/>
+      <geom name="weight" type="cylinder" fromto="0 -0.01 -0.1 0 0.01 -0.1" size="0.03" rgba="0.75 0.3 0.25 1"
+            contype="0" conaffinity="0" mass="0"/>
     </body>
   </worldbody>
   <actuator>

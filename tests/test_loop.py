@@ -14,8 +14,8 @@ from bayessim_mjx.rollout import replay
 TINY = [
     "env.numEnvs=8", "ppo.num_steps=8", "ppo.num_minibatches=2", "ppo.num_epochs=1", "ppo.max_iterations=3",
     "ppo.log_interval=1", "ppo.save_interval=1", "ppo.hidden_actor=[8]", "ppo.hidden_critic=[8]",
-    "bayessim.trainTrajs=400", "bayessim.realEvals=4", "bayessim.realIters=2", "bayessim.realTrajs=2", "bayessim.components=3",
-    "bayessim.hiddenLayers=[16]", "bayessim.trainTrajLen=8", "bayessim.ftuneRL=True",
+    "bayessim.trainTrajs=400", "bayessim.realEvals=4", "bayessim.realIters=2", "bayessim.realTrajs=2",
+    "bayessim.components=3", "bayessim.hiddenLayers=[16]", "bayessim.trainTrajLen=8", "bayessim.ftuneRL=True",
 ]  # fmt: skip
 
 
