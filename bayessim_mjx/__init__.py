@@ -1,1 +1,42 @@
-"""bayessim_mjx: adaptive domain randomisation and sim-to-real gap diagnosis on MuJoCo MJX."""
+"""bayessim_mjx: adaptive domain randomisation and sim-to-real gap diagnosis on MuJoCo MJX.
+
+The public names, by room (imported when first used, so that the commands start fast):
+
+    config        load                                     settings of a run from cfg/<task>.yaml and overrides
+    registry      make, names                              tasks by name
+    parameters    Parameter, ParameterSpace                named physical numbers, written into an mjx.Model
+    distributions Distribution                             prior, randomisation and posterior over theta
+    physics       Physics, World, control_step             the one control step
+    effects       Effect                                   what the nominal simulator leaves out
+    env           Env, State, Task                         environments
+    logs          Log, read_logs                           recorded motion
+
+Rooms to import as modules: rollout (rollout, replay), rl (train, evaluate), inference (fit, condition, combine),
+loop (make, init, run).
+"""
+
+from importlib import import_module
+from typing import Any
+
+_ROOMS = {
+    "config": ("load",),
+    "registry": ("make", "names"),
+    "parameters": ("Parameter", "ParameterSpace"),
+    "distributions": ("Distribution",),
+    "physics": ("Physics", "World", "control_step"),
+    "effects": ("Effect",),
+    "env": ("Env", "State", "Task"),
+    "logs": ("Log", "read_logs"),
+}
+_WHERE = {name: room for room, names in _ROOMS.items() for name in names}
+
+__all__ = [
+    "Distribution", "Effect", "Env", "Log", "Parameter", "ParameterSpace", "Physics", "State", "Task", "World",
+    "control_step", "load", "make", "names", "read_logs",
+]  # fmt: skip
+
+
+def __getattr__(name: str) -> Any:
+    if name in _WHERE:
+        return getattr(import_module(f"bayessim_mjx.{_WHERE[name]}"), name)
+    raise AttributeError(f"module 'bayessim_mjx' has no attribute {name!r}; it has {', '.join(__all__)}")

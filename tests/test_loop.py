@@ -114,6 +114,21 @@ def test_checkpoint_steps_grow_and_rounds_are_evaluated(finished):
     assert [value for _, value in evaluated] == [pytest.approx(info.returns.mean()) for info in rounds]
 
 
+def test_later_rounds_compile_nothing(env):
+    """Prior or posterior, more data, more real trajectories: the same programs."""
+    parts = loop.make(settings("bayessim.realIters=4"), env)
+    state, compiled, counts = loop.init(parts), [], []
+    listener = lambda event, seconds, **_: compiled.append(event)  # noqa: E731
+    jax.monitoring.register_event_duration_secs_listener(listener)
+    try:
+        for _ in range(4):
+            state, _info = loop.step(parts, loop.train(parts, state))
+            counts.append(compiled.count("/jax/core/compile/backend_compile_duration"))
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listener)
+    assert counts[3] == counts[1], counts  # the second round still meets a product of several for the first time
+
+
 @pytest.mark.parametrize("stop", [1, 3, 4])
 def test_a_resumed_run_is_the_unkilled_run_bit_for_bit(finished, parts, stop):
     """From a checkpoint within round 0's training, after round 0, and within round 1."""
