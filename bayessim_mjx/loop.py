@@ -100,10 +100,6 @@ class Loop:
         return self.config.bayessim
 
     @property
-    def infers(self) -> bool:
-        return self.source is not None
-
-    @property
     def capacity(self) -> int:
         """Rows of simulated trajectories kept from round to round; 0: a round's own are fitted and dropped."""
         b = self.settings
@@ -337,13 +333,8 @@ def _predict(loop: Loop, domain: Distribution, real: Trajectory, key: Array) -> 
         return None
     thetas = domain.sample(key, PREDICTIVE_DRAWS)
     first = [jnp.broadcast_to(x[0], (PREDICTIVE_DRAWS, *x.shape[1:])) for x in (real.qpos, real.qvel, real.command)]
-    motion = _replay(physics, first[0][:, 0], first[1][:, 0], first[2], thetas)
+    motion = replay(physics, first[0][:, 0], first[1][:, 0], first[2], thetas)
     return {name: np.asarray(value) for name, value in motion.items()}
-
-
-@functools.partial(jax.jit, static_argnums=0)
-def _replay(physics: Any, qpos0: Array, qvel0: Array, command: Array, thetas: Array) -> dict[str, Array]:
-    return replay(physics, qpos0, qvel0, command, thetas)
 
 
 def run(
@@ -369,7 +360,7 @@ def run(
                 monitor.training(round_, metrics, current)
             if checkpoints is not None and int(trained.iteration) // every > last[0] // every:
                 last[0] = int(trained.iteration)
-                checkpoints.save(checkpoint_step(loop, round_, trained), tree_of(loop, current), meta=_meta(current))
+                checkpoints.save(checkpoint_step(loop, round_, trained), tree_of(loop, current), meta=meta_of(current))
 
         clock = time.perf_counter()
         state = train(loop, state, progress)
@@ -382,7 +373,7 @@ def run(
         if checkpoints is not None:
             evaluation, tree = float(info.returns.mean()), {"policy": policy, "state": state}
             # under logs every round is evaluated on its own physics: only the newest evaluation counts
-            checkpoints.save(number, tree, evaluation=evaluation, meta=_meta(state), supersede=info.truth is None)
+            checkpoints.save(number, tree, evaluation=evaluation, meta=meta_of(state), supersede=info.truth is None)
         infos.append(info)
     return state, infos
 
@@ -399,5 +390,6 @@ def checkpoint_step(loop: Loop, round_: int, trained: TrainState) -> int:
     return round_ * (n + 1) + done
 
 
-def _meta(state: LoopState) -> dict[str, int]:
+def meta_of(state: LoopState) -> dict[str, int]:
+    """What a checkpoint says of itself beside its arrays."""
     return {"round": int(state.round), "iteration": int(state.train.iteration)}

@@ -30,8 +30,8 @@ class Watched:
 
         self.session.training(round_, metrics, state)
         if self.stop.requested:
-            meta = {"round": int(state.round), "iteration": int(state.train.iteration)}
-            self.save(loop.checkpoint_step(self.parts, round_, state.train), loop.tree_of(self.parts, state), meta=meta)
+            step, tree = loop.checkpoint_step(self.parts, round_, state.train), loop.tree_of(self.parts, state)
+            self.save(step, tree, meta=loop.meta_of(state))
 
     def round(self, info: Any, policy: Any) -> None:
         self.session.round(info, policy)  # no stop here: the round is not saved yet
