@@ -19,6 +19,7 @@ with contextlib.redirect_stdout(io.StringIO()):  # MJX announces on import that 
     from mujoco import mjx
 
 from bayessim_mjx.effects.effect import Effect
+from bayessim_mjx.effects.site import Motion, SubStep
 from bayessim_mjx.parameters import ParameterSpace
 
 _EULER, _RK4, _IMPLICITFAST = (
@@ -26,6 +27,7 @@ _EULER, _RK4, _IMPLICITFAST = (
 )
 
 Memory = tuple[tuple, jax.Array]  # (memories of the effects, their last forces [effects, nv])
+Seen = dict[str, jax.Array]  # what the sensors showed after the last control step: qpos [nq], qvel [nv], error [nq]
 
 
 class World(struct.PyTreeNode):
@@ -93,7 +95,9 @@ class Physics:
         self.max_qvel = None if max_qvel is None else np.broadcast_to(np.asarray(max_qvel, np.float32), (mj_model.nv,))
         self.model = mjx.put_model(mj_model, impl="jax")
         self.template = mjx.make_data(mj_model, impl="jax")
-        self._memory = tuple(effect.init(self) for effect in self.effects)
+        timestep = float(mj_model.opt.timestep)
+        self.sites = tuple(effect.bind(mj_model, timestep, self.substeps) for effect in self.effects)
+        self._memory = tuple(effect.init(at) for effect, at in zip(self.effects, self.sites, strict=True))
 
     def split(self, theta: jax.Array) -> tuple[jax.Array, tuple[jax.Array, ...]]:
         """(values of the model's parameters, one slice per effect)."""
@@ -132,8 +136,8 @@ class Physics:
                 raise ValueError(f"{label} has shape {value.shape}, expected ({size},)")
         own, slices = self.split(theta)
         model = self.model_space.write(self.model, own)
-        for effect, part in zip(self.effects, slices, strict=True):
-            model = effect.on_model(model, part)
+        for effect, at, part in zip(self.effects, self.sites, slices, strict=True):
+            model = effect.on_model(at, model, part)
         return World(
             qpos=qpos,
             qvel=qvel,
@@ -188,15 +192,33 @@ def _overrides(effect: Effect, hook: str) -> bool:
     return getattr(type(effect), hook) is not getattr(Effect, hook)
 
 
-def forward(physics: Physics, model: mjx.Model, data: mjx.Data, carry: Memory, thetas: tuple) -> tuple:
+class Drive(struct.PyTreeNode):
+    """What acts on a world besides its command, all optional.
+
+    Attributes:
+        force: `[nv]`, a generalised force of unknown origin.
+        enabled: `[nu]`, 1 where the drive is on; 0: the actuator exerts no force at all (open leads).
+        law: a controller between the command and the actuators, `laws.Law`.
+    """
+
+    force: jax.Array | None = None
+    enabled: jax.Array | None = None
+    law: Any = None
+
+
+def forward(
+    physics: Physics, model: mjx.Model, data: mjx.Data, carry: Memory, thetas: tuple, seen: Seen, drive: Drive
+) -> tuple:
     """`mjx.forward` with the effects' forces added before the acceleration. Returns (data, (memory, forces))."""
     sensors = physics.mj_model.nsensor > 0
     data = mjx.fwd_position(model, data)
     data = mjx.sensor_pos(model, data) if sensors else data
     data = mjx.fwd_velocity(model, data)
     data = mjx.sensor_vel(model, data) if sensors else data
+    if drive.law is not None:
+        data = data.replace(ctrl=drive.law(data.ctrl, data.qpos, data.qvel, seen))
     data = mjx.fwd_actuation(model, data)
-    data, carry = _effect_forces(physics, model, data, carry, thetas)
+    data, carry = _effect_forces(physics, model, data, carry, thetas, seen, drive)
     data = mjx.fwd_acceleration(model, data)
     if data._impl.efc_J.size == 0:
         return data.replace(qacc=data.qacc_smooth), carry
@@ -204,25 +226,57 @@ def forward(physics: Physics, model: mjx.Model, data: mjx.Data, carry: Memory, t
     return (mjx.sensor_acc(model, data) if sensors else data), carry
 
 
-def _effect_forces(physics: Physics, model: mjx.Model, data: mjx.Data, carry: Memory, thetas: tuple) -> tuple:
-    """Sum of the effects' forces in qfrc_applied; each effect sees the newest forces of the others (Gauss-Seidel).
+def _effect_forces(
+    physics: Physics, model: mjx.Model, data: mjx.Data, carry: Memory, thetas: tuple, seen: Seen, drive: Drive
+) -> tuple:
+    """The actuators' forces as the effects change them, and the sum of the effects' own forces in qfrc_applied.
 
-    Forces start from those of the last sub-step, so that dry friction in several coupled joints settles to sticking.
+    Each effect sees the newest forces of the others (Gauss-Seidel). They start from those of the last sub-step, so that
+    dry friction in several coupled joints settles to sticking.
     """
+    if not physics.effects and drive.enabled is None and drive.force is None:
+        return data, carry
     memory, forces = list(carry[0]), carry[1]
-    for i, effect in enumerate(physics.effects):
+    step = SubStep(model, data, seen, float(physics.mj_model.opt.timestep))
+    each = list(zip(range(len(physics.effects)), physics.effects, physics.sites, strict=True))
+    acting = data.actuator_force
+    for i, effect, at in each:
+        if _overrides(effect, "on_actuator"):
+            memory[i], acting = effect.on_actuator(at, memory[i], step, acting, thetas[i])
+    if drive.enabled is not None:
+        acting = acting * drive.enabled
+    if acting is not data.actuator_force:
+        # what changed, through the transmission: neutral effects leave qfrc_actuator bit for bit
+        change = (acting - data.actuator_force) @ _moment(data)
+        data = data.replace(actuator_force=acting, qfrc_actuator=data.qfrc_actuator + change)
+    step = SubStep(model, data, seen, float(physics.mj_model.opt.timestep))
+    known = data.qfrc_passive - data.qfrc_bias + data.qfrc_actuator
+    outside = jnp.zeros_like(data.qfrc_applied) if drive.force is None else drive.force
+    for i, effect, at in each:
         if _overrides(effect, "on_force"):
-            others = data.replace(qfrc_applied=jnp.sum(forces.at[i].set(0.0), axis=0))
-            memory[i], force = effect.on_force(memory[i], model, others, thetas[i])
+            others = known + outside + jnp.sum(forces.at[i].set(0.0), axis=0)
+            memory[i], force = effect.on_force(at, memory[i], step.seen_by(others, forces[i]), thetas[i])
             forces = forces.at[i].set(force)
-    if physics.effects:
-        data = data.replace(qfrc_applied=jnp.sum(forces, axis=0))
+    if physics.effects or drive.force is not None:
+        data = data.replace(qfrc_applied=jnp.sum(forces, axis=0) + outside)
     return data, (tuple(memory), forces)
 
 
-def substep(physics: Physics, model: mjx.Model, data: mjx.Data, carry: Memory, thetas: tuple) -> tuple:
+def _moment(data: mjx.Data) -> jax.Array:
+    return data._impl.actuator_moment
+
+
+def substep(
+    physics: Physics,
+    model: mjx.Model,
+    data: mjx.Data,
+    carry: Memory,
+    thetas: tuple,
+    seen: Seen,
+    drive: Drive = Drive(),  # noqa: B008  # immutable
+) -> tuple:
     """One timestep from the state and ctrl in `data`. Returns (data, (memory, forces))."""
-    data, carry = forward(physics, model, data, carry, thetas)
+    data, carry = forward(physics, model, data, carry, thetas, seen, drive)
     integrate = {_EULER: mjx.euler, _RK4: mjx.rungekutta4, _IMPLICITFAST: mjx.implicit}
     data = integrate[int(physics.mj_model.opt.integrator)](model, data)
     if physics.max_qvel is not None:
@@ -230,39 +284,49 @@ def substep(physics: Physics, model: mjx.Model, data: mjx.Data, carry: Memory, t
     return data, carry
 
 
-def control_step(physics: Physics, world: World, command: jax.Array) -> tuple[World, mjx.Data]:
+def control_step(
+    physics: Physics,
+    world: World,
+    command: jax.Array,
+    drive: Drive = Drive(),  # noqa: B008  # immutable
+) -> tuple[World, mjx.Data]:
     """Advance one world by one control step.
 
     Args:
         physics: static.
         world: the state.
-        command: `[nu]`, in the units of the actuators' ctrl; MuJoCo clips it to ctrlrange where ctrllimited.
+        command: `[nu]`, in the units of the actuators' ctrl, or `[substeps, nu]`, one row per sub-step; MuJoCo clips it
+            to ctrlrange where ctrllimited.
+        drive: what else acts.
 
     Returns:
         (world after the step, `mjx.Data` of the last sub-step: its state is the new one; its poses, contacts and forces
         are those computed *before* the last integration, as after `mjx.step`).
     """
     with jax.default_matmul_precision("highest"):  # a GPU would round the inputs of its products to TF32
-        return _control_step(physics, world, command)
+        return _control_step(physics, world, command, drive)
 
 
-def _control_step(physics: Physics, world: World, command: jax.Array) -> tuple[World, mjx.Data]:
+def _control_step(physics: Physics, world: World, command: jax.Array, drive: Drive) -> tuple[World, mjx.Data]:
     model, thetas = physics.model_of(world), physics.split(world.theta)[1]
     memory = list(world.memory)
     commands = jnp.broadcast_to(command, (physics.substeps, physics.mj_model.nu))
-    for i, effect in enumerate(physics.effects):
-        memory[i], commands = effect.on_command(memory[i], commands, thetas[i])
+    each = list(zip(range(len(physics.effects)), physics.effects, physics.sites, strict=True))
+    for i, effect, at in each:
+        memory[i], commands = effect.on_command(at, memory[i], commands, thetas[i])
+
+    seen = world.measurement | {"error": world.measurement["qpos"] - world.qpos}
 
     def body(carry: tuple, ctrl: jax.Array) -> tuple[tuple, None]:
         data, remembered = carry
-        return substep(physics, model, data.replace(ctrl=ctrl), remembered, thetas), None
+        return substep(physics, model, data.replace(ctrl=ctrl), remembered, thetas, seen, drive), None
 
     start = (physics.data_of(world), (tuple(memory), world.forces))
     end, _ = body(start, commands[0]) if physics.substeps == 1 else jax.lax.scan(body, start, commands)
     data, (final, forces) = end
     memory, measurement = list(final), {"qpos": data.qpos, "qvel": data.qvel}
-    for i, effect in enumerate(physics.effects):
-        memory[i], measurement = effect.on_measurement(memory[i], measurement, thetas[i])
+    for i, effect, at in each:
+        memory[i], measurement = effect.on_measurement(at, memory[i], measurement, thetas[i])
     world = world.replace(
         qpos=data.qpos,
         qvel=data.qvel,
@@ -274,3 +338,24 @@ def _control_step(physics: Physics, world: World, command: jax.Array) -> tuple[W
         measurement=measurement,
     )
     return world, data
+
+
+def begin(physics: Physics, theta: jax.Array, motion: Motion) -> World:
+    """A world in the middle of a log: effects' memories filled by the recorded past, sensors' effects undone.
+
+    Args:
+        theta: `[d]`; motion: measured, around the start, with the commands before it.
+    """
+    world = physics.world(theta, motion.qpos[motion.start], motion.qvel[motion.start])
+    thetas, memory = physics.split(world.theta)[1], list(world.memory)
+    for i in reversed(range(len(physics.effects))):  # sensors come last in a step, so they are undone first
+        memory[i], motion = physics.effects[i].on_start(physics.sites[i], memory[i], motion, thetas[i])
+
+    def past(memory: tuple, commands: jax.Array) -> tuple[tuple, None]:
+        remembered = list(memory)
+        for i, (effect, at) in enumerate(zip(physics.effects, physics.sites, strict=True)):
+            remembered[i], commands = effect.on_command(at, remembered[i], commands, thetas[i])
+        return tuple(remembered), None
+
+    filled, _ = jax.lax.scan(past, tuple(memory), motion.command[: motion.start])
+    return world.replace(qpos=motion.qpos[motion.start], qvel=motion.qvel[motion.start], memory=filled)

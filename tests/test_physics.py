@@ -86,7 +86,7 @@ def test_only_changed_fields_travel():
 
 def test_nested_fields_are_found_and_put_back():
     class Moon(type(make("actuator_delay", where="all"))):
-        def on_model(self, model, theta):
+        def on_model(self, at, model, theta):
             return model.tree_replace({"opt.gravity": jnp.array([0.0, 0.0, -1.62])})
 
     p = physics(effects=[Moon(where="all")])

@@ -11,13 +11,15 @@ from bayessim_mjx.errors import UserError
 
 __all__ = ["Effect", "make", "names"]
 
+NOT_EFFECTS = ("effect", "reading", "site", "friction")  # modules of this folder that are no effect
+
 
 def names() -> list[str]:
     """Names of all effects: the files of this folder."""
-    return sorted(m.name for m in pkgutil.iter_modules(__path__) if m.name not in ("effect", "reading"))
+    return sorted(m.name for m in pkgutil.iter_modules(__path__) if m.name not in NOT_EFFECTS)
 
 
-def make(effect: str, where: str, **settings: Any) -> Effect:
+def make(effect: str, where: str | tuple[str, ...], **settings: Any) -> Effect:
     """The effect called `effect` at the place `where`.
 
     Args:
@@ -34,7 +36,9 @@ def make(effect: str, where: str, **settings: Any) -> Effect:
         raise UserError(f"no effect {effect!r}; {hint}there are: {', '.join(names())}")
     module = importlib.import_module(f"{__name__}.{effect}")
     kind = getattr(module, "".join(part.capitalize() for part in effect.split("_")))
-    if not isinstance(where, str):
+    if isinstance(where, list):
+        where = tuple(where)
+    if not isinstance(where, str) and not (isinstance(where, tuple) and all(isinstance(w, str) for w in where)):
         raise UserError(f"effect {effect}: where = {where!r}: expected the MuJoCo name of a joint, actuator ...")
     allowed = {f.name: f.type for f in dataclasses.fields(kind) if f.name not in ("where", "parameters")}
     for name, value in settings.items():

@@ -1,9 +1,9 @@
 """Actuator delay: commands arrive late by a fixed time.
 
-The command is a staircase in time (zero-order hold over each control step). Each sub-step applies the time average of
-the delayed staircase over that sub-step (so: linear interpolation at sub-step resolution). The impulse is exact for
-every delay, not only for whole sub-steps, and the motion depends continuously on the delay. Before the first command
-the first command is taken to have held for ever.
+The command is a staircase in time. Each sub-step applies the time average of the delayed staircase over that sub-step
+(so: linear interpolation at sub-step resolution). The impulse is exact for every delay, not only for whole sub-steps,
+and the motion depends continuously on the delay. Before the first command the first command is taken to have held for
+ever.
 """
 
 import dataclasses
@@ -13,17 +13,16 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import jax
 import jax.numpy as jnp
 
-from bayessim_mjx.effects.effect import Effect, index_of
-from bayessim_mjx.errors import UserError
-from bayessim_mjx.parameters import Parameter, ParameterSpace
+from bayessim_mjx.effects.effect import Effect, Quantity
+from bayessim_mjx.effects.site import Site
 
 if TYPE_CHECKING:
-    from bayessim_mjx.physics import Physics
+    import mujoco
 
 
 @dataclasses.dataclass(frozen=True)
 class ActuatorDelay(Effect):
-    """Delay of one actuator's command, or of all (`where="all"`).
+    """u(t - delay) at one actuator or several.
 
     Parameters: `delay`, s, neutral 0.
 
@@ -31,46 +30,31 @@ class ActuatorDelay(Effect):
         high: largest delay, s, unless `parameters` has another range.
     """
 
-    where: str = "all"
+    where: str | tuple[str, ...] = "all"
     high: float = 0.1
     name: ClassVar[str] = "actuator_delay"
+    kind: ClassVar[str] = "actuator"
+    quantities: ClassVar[tuple[Quantity, ...]] = (Quantity("delay", 0.0, 0.0, 0.1, unit="s", grid=(0.05, 0.2, 0.5)),)
 
-    def __post_init__(self) -> None:
-        if not 0 < self.high < math.inf:
-            raise UserError(f"{self.name}: high = {self.high} s, must be positive and finite")
-        if (low := self.space().parameters[0].low) < 0:
-            raise UserError(f"{self.where}.{self.name}.delay: range begins at {low:g} s; a delay is never negative")
+    def init(self, at: Site) -> Any:
+        """{"history": `[lag, nu]` commands of past sub-steps, newest last; "fresh"}."""
+        longest = max(p.high for p in self.space().parameters)
+        lag = math.ceil(longest / at.timestep - 1e-6) + 1
+        return {"history": jnp.zeros((lag, at.nu)), "fresh": jnp.ones((), bool)}
 
-    def defaults(self) -> ParameterSpace:
-        label = f"{self.where}.{self.name}.delay"
-        delay = Parameter(label, 0.0, 0.0, self.high, unit="s", attribute="delay", target=self.where, kind="effect")
-        return ParameterSpace([delay])
-
-    def init(self, physics: "Physics") -> Any:
-        """{"history": `[lag, nu]` commands of past sub-steps, newest last; "mask": `[nu]`; "fresh"; "timestep": []}."""
-        nu = physics.mj_model.nu
-        mask = jnp.ones(nu, bool)
-        if self.where != "all":
-            names = [physics.mj_model.actuator(i).name for i in range(nu)]
-            mask = jnp.arange(nu) == index_of("actuator", self.where, [*names, "all"], self.name)
-        timestep = physics.mj_model.opt.timestep
-        lag = math.ceil(self.space().parameters[0].high / timestep - 1e-6) + 1
-        return {
-            "history": jnp.zeros((lag, nu)),
-            "mask": mask,
-            "fresh": jnp.ones((), bool),
-            "timestep": jnp.float32(timestep),
-        }
-
-    def on_command(self, memory: Any, command: jax.Array, theta: jax.Array) -> tuple[Any, jax.Array]:
+    def on_command(self, at: Site, memory: Any, command: jax.Array, theta: jax.Array) -> tuple[Any, jax.Array]:
         lag, steps = memory["history"].shape[0], command.shape[0]
         past = jnp.where(memory["fresh"], command[0], memory["history"])
         signal = jnp.concatenate([past, command])  # row lag + k is sub-step k of this control step
-        delay = jnp.clip(theta[0] / memory["timestep"], 0.0, lag - 1.0)
+        own = signal[:, at.ids]
+        delay = jnp.clip(at.values(theta)[:, 0] / jnp.float32(at.timestep), 0.0, lag - 1.0)
         whole = jnp.floor(delay)
         part = delay - whole
-        row = lag + jnp.arange(steps) - whole.astype(jnp.int32)
+        row = lag + jnp.arange(steps)[:, None] - whole.astype(jnp.int32)
         # mean of the staircase over a sub-step that begins `delay` sub-steps earlier
-        late = (1.0 - part) * signal[row] + part * signal[row - 1]
-        shifted = jnp.where((delay > 0) & memory["mask"], late, command)
-        return memory | {"history": signal[-lag:], "fresh": jnp.zeros((), bool)}, shifted
+        late = (1.0 - part) * jnp.take_along_axis(own, row, 0) + part * jnp.take_along_axis(own, row - 1, 0)
+        shifted = command.at[:, at.ids].set(jnp.where(delay > 0, late, command[:, at.ids]))
+        return {"history": signal[-lag:], "fresh": jnp.zeros((), bool)}, shifted
+
+    def edit(self, spec: "mujoco.MjSpec", values: dict[str, dict[str, float]]) -> str | None:
+        return "MuJoCo's delay buffer holds whole timesteps and MJX has none; use effects.yaml"

@@ -2,80 +2,162 @@
 
 import abc
 import dataclasses
+import math
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 
+from bayessim_mjx.effects.site import Motion, Site, SubStep, find
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.parameters import Parameter, ParameterSpace
-from bayessim_mjx.parameters.attributes import suggest
 
 if TYPE_CHECKING:
+    import mujoco
     from mujoco import mjx
-
-    from bayessim_mjx.physics import Physics
 
 Measurement = dict[str, jax.Array]
 
 
 @dataclasses.dataclass(frozen=True)
-class Effect(abc.ABC):
-    """One unmodelled effect at one place of the robot.
-
-    Subclasses are frozen dataclasses and override the hooks they need; the others are the identity and cost nothing.
-    Rules: hooks are pure and traceable; every number that may be inferred is an entry of `theta` (this effect's own
-    slice, in the order of `space()`); at the nominal (= neutral) theta each hook returns its input bit for bit.
+class Quantity:
+    """One number of an effect at one place.
 
     Attributes:
-        where: MuJoCo name of the joint, actuator, body ... concerned, or "all" where the effect allows it.
+        name: of the parameter.
+        neutral: the value that switches it off (its part of the effect) exactly.
+        low, high: range where nothing is known of the robot.
+        unit: for a hinge; a slide's is derived from it.
+        per: what the range grows with, so that one library fits a toy servo and an industrial arm: "force" (largest effort
+            or load at the place), "command" (largest command), "speed", "travel", "inertia" (M_ii), "mass" (of the
+            body), or products such as "force/speed"; "" for absolute ranges.
+        reach: (low, high) in multiples of `per`, used by the diagnosis in the place of low, high.
+        grid: starting values for a fit, as fractions of the way from neutral to each end of the range.
+        prior: "uniform" or "loguniform".
+    """
+
+    name: str
+    neutral: float
+    low: float
+    high: float
+    unit: str = ""
+    per: str = ""
+    reach: tuple[float, float] | None = None
+    grid: tuple[float, ...] = (0.03, 0.15, 0.5)
+    prior: str = "uniform"
+
+
+@dataclasses.dataclass(frozen=True)
+class Effect(abc.ABC):
+    """One unmodelled effect, at one place of the robot or at several.
+
+    Subclasses are frozen dataclasses, state `name`, `kind` and `quantities`, and override the hooks they need; the others
+    are the identity and cost nothing. Rules: hooks are pure and traceable; every number that may be inferred is an entry
+    of `theta` (this effect's own slice, in the order of `space()`); at the neutral theta each hook returns its input bit
+    for bit. Hooks work on all places at once: `at.values(theta)` is `[places, quantities]`.
+
+    Attributes:
+        where: MuJoCo name of the actuator, joint, body ... concerned; a tuple of names: each with values of its own;
+            "all": every place of the kind, all with the same values.
         parameters: with other ranges and priors than the effect's own, in the place of those of the same name.
     """
 
-    where: str
+    where: str | tuple[str, ...]
     parameters: tuple[Parameter, ...] = dataclasses.field(default=(), kw_only=True)
     name: ClassVar[str]
+    kind: ClassVar[str]  # actuator | joint (hinge or slide) | body | geom | world
+    quantities: ClassVar[tuple[Quantity, ...]]
 
-    @abc.abstractmethod
+    def places(self) -> tuple[str, ...]:
+        """Names that own a set of parameters."""
+        return (self.where,) if isinstance(self.where, str) else tuple(self.where)
+
     def defaults(self) -> ParameterSpace:
         """The effect's own parameters: kind "effect", nominal = neutral, named `<where>.<effect>.<parameter>`."""
+        return ParameterSpace(self._parameter(place, q) for place in self.places() for q in self.quantities)
+
+    def _parameter(self, place: str, q: Quantity) -> Parameter:
+        label = f"{place}.{self.name}.{q.name}"
+        high = getattr(self, "high", q.high) if len(self.quantities) == 1 else q.high
+        return Parameter(
+            label, q.neutral, q.low, high, unit=q.unit, prior=q.prior, attribute=q.name, target=place, kind="effect"
+        )
 
     def space(self) -> ParameterSpace:
         """The effect's parameters in the order of `defaults`, with the ranges and priors that hold here."""
         other = {p.name: p for p in self.parameters}
         return ParameterSpace(other.get(p.name, p) for p in self.defaults().parameters)
 
-    def init(self, physics: "Physics") -> Any:
-        """Memory at the start of an episode, a pytree of arrays. Refuse an unknown `where` here (ValueError)."""
+    def check(self) -> None:
+        """Refuse ranges that reach where the physics has no meaning: beyond the end of a quantity that ends at neutral.
+
+        Raises:
+            UserError: naming the parameter, its range and the end.
+        """
+        for p, q in zip(self.space().parameters, self.quantities * len(self.places()), strict=True):
+            if q.neutral == q.low and p.low < q.low:
+                raise UserError(f"{p.name}: range begins at {p.low:g} {p.unit}; allowed: from {q.low:g} (off) upwards")
+            if q.neutral == q.high and p.high > q.high:
+                raise UserError(f"{p.name}: range ends at {p.high:g} {p.unit}; allowed: up to {q.high:g} (off)")
+
+    def __post_init__(self) -> None:
+        high = getattr(self, "high", None)
+        if high is not None and not 0 < high < math.inf:
+            raise UserError(f"{self.name}: high = {high} {self.quantities[0].unit}, must be positive and finite")
+        if not self.places():
+            raise UserError(f"{self.name}: where = (): give at least one {self.kind}")
+        self.check()
+
+    def bind(self, mj_model: "mujoco.MjModel", timestep: float, substeps: int) -> Site:
+        """Where the effect sits in this model; the hooks' argument `at`. Static: no traced values.
+
+        Raises:
+            UserError: naming the effect, the unknown place and what may be meant.
+        """
+        return find(self, mj_model, timestep, substeps)
+
+    def init(self, at: Site) -> Any:
+        """Memory at the start of an episode, a pytree of arrays of fixed shape; no constants (keep those in the site)."""
         return ()
 
-    def on_model(self, model: "mjx.Model", theta: jax.Array) -> "mjx.Model":
+    def on_model(self, at: Site, model: "mjx.Model", theta: jax.Array) -> "mjx.Model":
         """Change the model; called once per episode. Leave untouched leaves the identical objects."""
         return model
 
-    def on_command(self, memory: Any, command: jax.Array, theta: jax.Array) -> tuple[Any, jax.Array]:
-        """Change the command of one control step, `[substeps, nu]`: one row per sub-step, all equal without effects."""
+    def on_start(self, at: Site, memory: Any, motion: Motion, theta: jax.Array) -> tuple[Any, Motion]:
+        """The true motion around a start state behind the measured one (the inverse of `on_measurement`).
+
+        Only called where an episode starts in the middle of a log: also fill the memory from `motion` here.
+        """
+        return memory, motion
+
+    def on_command(self, at: Site, memory: Any, command: jax.Array, theta: jax.Array) -> tuple[Any, jax.Array]:
+        """Change the command of one control step, `[substeps, nu]`: one row per sub-step."""
         return memory, command
 
-    def on_force(self, memory: Any, model: "mjx.Model", data: "mjx.Data", theta: jax.Array) -> tuple[Any, jax.Array]:
-        """Generalised force `[nv]` to add in this sub-step.
+    def on_actuator(
+        self, at: Site, memory: Any, step: SubStep, force: jax.Array, theta: jax.Array
+    ) -> tuple[Any, jax.Array]:
+        """Change the actuators' forces `[nu]` of this sub-step (as MuJoCo computed and earlier effects changed them)."""
+        return memory, force
 
-        `data` holds this sub-step's mass matrix, qfrc_bias, qfrc_passive and qfrc_actuator, and in qfrc_applied the sum
-        of the newest forces of all other effects (of this sub-step or the last). Constraint forces are not known yet.
+    def on_force(self, at: Site, memory: Any, step: SubStep, theta: jax.Array) -> tuple[Any, jax.Array]:
+        """Generalised force `[nv]` to add in this sub-step; `step.force` is the sum of all other known forces.
+
+        It includes the newest forces of the other effects (of this sub-step or the last), and no constraint forces.
         """
-        return memory, jnp.zeros_like(data.qfrc_applied)
+        return memory, jnp.zeros_like(step.force)
 
-    def on_measurement(self, memory: Any, measurement: Measurement, theta: jax.Array) -> tuple[Any, Measurement]:
+    def on_measurement(
+        self, at: Site, memory: Any, measurement: Measurement, theta: jax.Array
+    ) -> tuple[Any, Measurement]:
         """Change what the sensors show after a control step: `{"qpos": [nq], "qvel": [nv]}`."""
         return memory, measurement
 
+    def edit(self, spec: "mujoco.MjSpec", values: dict[str, dict[str, float]]) -> str | None:
+        """Write the effect into `spec` where MuJoCo can express it natively: values[place][quantity].
 
-def index_of(kind: str, name: str, names: list[str], effect: str) -> int:
-    """Index of `name` among `names`.
-
-    Raises:
-        UserError: naming the effect, the unknown name and what may be meant.
-    """
-    if name not in names:
-        raise UserError(f"{effect}: no {kind} {name!r} in the model; {suggest(name, names)}")
-    return names.index(name)
+        Returns:
+            None where written, else why not (one sentence for people).
+        """
+        return "MuJoCo has no such element"

@@ -1,0 +1,241 @@
+"""Where an effect sits in a model (static), and what it sees of a sub-step (traced)."""
+
+import dataclasses
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from flax import struct
+
+from bayessim_mjx.errors import UserError
+from bayessim_mjx.parameters.attributes import suggest
+from bayessim_mjx.triangular import inverse_lower, product
+
+if TYPE_CHECKING:
+    from mujoco import mjx
+
+    from bayessim_mjx.effects.effect import Effect
+
+_HINGE, _SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
+_KINDS = ("actuator", "joint", "body", "geom")
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Site:
+    """An effect's places in a model.
+
+    Attributes:
+        names: of the elements, `[n]`; ids: their MuJoCo ids, `[n]`.
+        tied: all elements share one set of parameters ("all"); else each has its own.
+        quantities: number of parameters of one place.
+        qadr, dadr: `[n]`, columns in qpos and qvel of the joint (of the joint an actuator drives; -1: no such joint).
+        slide: `[n]` bool, the joint is a slide.
+        timestep: s, of a sub-step; substeps: per control step; nq, nv, nu: sizes.
+        mj_model: the nominal model.
+    """
+
+    names: tuple[str, ...]
+    ids: np.ndarray
+    tied: bool
+    quantities: int
+    qadr: np.ndarray
+    dadr: np.ndarray
+    slide: np.ndarray
+    timestep: float
+    substeps: int
+    mj_model: mujoco.MjModel
+
+    @property
+    def nq(self) -> int:
+        return int(self.mj_model.nq)
+
+    @property
+    def nv(self) -> int:
+        return int(self.mj_model.nv)
+
+    @property
+    def nu(self) -> int:
+        return int(self.mj_model.nu)
+
+    @property
+    def dt(self) -> float:
+        """Control step, s."""
+        return self.timestep * self.substeps
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def values(self, theta: jax.Array) -> jax.Array:
+        """The effect's slice of theta as `[n, quantities]`, one row per element (the same row for all where tied)."""
+        rows = theta.reshape(-1, self.quantities)
+        return jnp.broadcast_to(rows, (len(self), self.quantities))
+
+    def scatter(self, values: jax.Array) -> jax.Array:
+        """One number per element `[n]` -> generalised force `[nv]`, added up where elements share a joint."""
+        return jnp.zeros(self.nv, values.dtype).at[self.dadr].add(values)
+
+
+def find(effect: "Effect", model: mujoco.MjModel, timestep: float, substeps: int) -> Site:
+    """The site of `effect`; UserError where a place is not in the model or cannot carry it."""
+    kind = effect.kind
+    names = _names(model, kind)
+    usable = [i for i in range(len(names)) if _usable(model, kind, i)]
+    if effect.where == "all":
+        ids = np.asarray(usable, int)
+        if not len(ids):
+            raise UserError(f"{effect.name}: the model has no {kind} that could take it")
+    else:
+        ids = np.asarray([_id(effect, place, names, usable) for place in effect.places()], int)
+    joints = _joints(model, kind, ids)
+    clean = np.maximum(joints, 0)
+    adr = [np.where(joints >= 0, a[clean] if model.njnt else -1, -1) for a in (model.jnt_qposadr, model.jnt_dofadr)]
+    slide = (joints >= 0) & (model.jnt_type[clean] == _SLIDE) if model.njnt else np.zeros(len(ids), bool)
+    return Site(
+        names=tuple(names[i] for i in ids),
+        ids=ids,
+        tied=effect.where == "all",
+        quantities=len(effect.quantities),
+        qadr=np.asarray(adr[0], int),
+        dadr=np.asarray(adr[1], int),
+        slide=np.asarray(slide),
+        timestep=timestep,
+        substeps=substeps,
+        mj_model=model,
+    )
+
+
+def places(effect_kind: str, model: mujoco.MjModel) -> tuple[str, ...]:
+    """Names of all elements of the model that can carry an effect of this kind."""
+    names = _names(model, effect_kind)
+    return tuple(n for i, n in enumerate(names) if _usable(model, effect_kind, i))
+
+
+def _names(model: mujoco.MjModel, kind: str) -> list[str]:
+    if kind == "world":
+        return ["world"]
+    count = {"actuator": model.nu, "joint": model.njnt, "body": model.nbody, "geom": model.ngeom}[kind]
+    return [getattr(model, kind)(i).name or f"{kind}{i}" for i in range(count)]
+
+
+def _usable(model: mujoco.MjModel, kind: str, i: int) -> bool:
+    if kind == "joint":
+        return int(model.jnt_type[i]) in (_HINGE, _SLIDE)
+    return model.body_mass[i] > 0 and model.body_weldid[i] != 0 if kind == "body" else True
+
+
+def _id(effect: "Effect", place: str, names: list[str], usable: list[int]) -> int:
+    if place not in names:
+        kind = effect.kind
+        raise UserError(f"{effect.name}: no {kind} {place!r} in the model; {suggest(place, [*names, 'all'])}")
+    index = names.index(place)
+    if index not in usable:
+        why = "is neither hinge nor slide" if effect.kind == "joint" else "has no mass or cannot move"
+        allowed = ", ".join(names[i] for i in usable) or "none"
+        raise UserError(f"{effect.name}: {effect.kind} {place!r} {why}; allowed: {allowed}")
+    return index
+
+
+def _joints(model: mujoco.MjModel, kind: str, ids: np.ndarray) -> np.ndarray:
+    """The joint of each element, -1 where there is none (bodies, geoms, actuators on tendons ...)."""
+    if kind == "joint":
+        return ids
+    if kind != "actuator":
+        return np.full(len(ids), -1)
+    on_joint = np.isin(model.actuator_trntype[ids], (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)))
+    return np.where(on_joint, model.actuator_trnid[ids, 0], -1)
+
+
+class SubStep:
+    """What is known of one sub-step before its acceleration. Made while tracing; derived values are computed once.
+
+    Attributes:
+        model, data: data holds this sub-step's poses, mass matrix, qfrc_bias, qfrc_passive, actuator_force and moments.
+        force: `[nv]`, passive - bias + actuators + all other effects; no constraint forces (they are not known yet).
+        actuator_force: `[nu]`, after the effects on actuators.
+        ctrl: `[nu]`, the command as it reached the actuators.
+        dt: s, the sub-step.
+        last: `[nv]`, this effect's own force in the last sub-step.
+        measurement: what the sensors showed after the last control step.
+    """
+
+    def __init__(
+        self,
+        model: "mjx.Model",
+        data: "mjx.Data",
+        measurement: dict[str, jax.Array],
+        dt: float,
+        cache: dict[str, Any] | None = None,
+    ) -> None:
+        self.model, self.data, self.measurement, self.dt = model, data, measurement, dt
+        self.force = self.last = data.qfrc_applied
+        self.actuator_force = data.actuator_force
+        self._cache = {} if cache is None else cache
+
+    def seen_by(self, force: jax.Array, last: jax.Array) -> "SubStep":
+        """The same sub-step with the forces that one effect sees."""
+        other = SubStep(self.model, self.data, self.measurement, self.dt, self._cache)
+        other.force, other.last, other.actuator_force = force, last, self.actuator_force
+        return other
+
+    @property
+    def ctrl(self) -> jax.Array:
+        return self.data.ctrl
+
+    @property
+    def qpos(self) -> jax.Array:
+        return self.data.qpos
+
+    @property
+    def qvel(self) -> jax.Array:
+        return self.data.qvel
+
+    @property
+    def inverse(self) -> jax.Array:
+        """`[nv, nv]`, inverse of the matrix that the integrator solves: M plus the implicit damping."""
+        if "inverse" not in self._cache:
+            factor = inverse_lower(jnp.linalg.cholesky(self._inertia()))
+            self._cache["inverse"] = product(factor.T, factor)
+        return self._cache["inverse"]
+
+    def _inertia(self) -> jax.Array:
+        from mujoco import mjx
+
+        model = self.model
+        inertia = mjx.full_m(model, self.data)
+        integrator = int(model.opt.integrator)
+        euler = integrator == int(mujoco.mjtIntegrator.mjINT_EULER)
+        if euler and not int(model.opt.disableflags) & int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP):
+            return inertia + model.opt.timestep * jnp.diag(model.dof_damping)
+        implicit = integrator == int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
+        derivative = mjx.deriv_smooth_vel(model, self.data) if implicit else None
+        return inertia if derivative is None else inertia - model.opt.timestep * derivative
+
+    @property
+    def next_qvel(self) -> jax.Array:
+        """`[nv]`, the velocities at the end of the sub-step under the forces known so far."""
+        return self.qvel + self.dt * product(self.inverse, self.force[:, None])[:, 0]
+
+
+class Motion(struct.PyTreeNode):
+    """Recorded motion around a start, one row per control step; row `start` is the start itself.
+
+    Attributes:
+        qpos: `[rows, nq]`, qvel: `[rows, nv]`.
+        command: `[rows, substeps, nu]`; row k acts from row k to row k + 1.
+        start: static int.
+    """
+
+    qpos: jax.Array
+    qvel: jax.Array
+    command: jax.Array
+    start: int = struct.field(pytree_node=False)
+
+    def shifted(self, steps: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """(qpos, qvel) read `steps` control steps later (a fraction is interpolated, the ends are held), `[rows, ..]`."""
+        rows = self.qpos.shape[0]
+        at = jnp.clip(jnp.arange(rows) + steps, 0, rows - 1)
+        low = jnp.clip(jnp.floor(at).astype(jnp.int32), 0, rows - 2)
+        part = (at - low)[:, None]
+        return tuple((1 - part) * x[low] + part * x[low + 1] for x in (self.qpos, self.qvel))  # type: ignore[return-value]

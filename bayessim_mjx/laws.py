@@ -1,0 +1,110 @@
+"""Controllers between a logged command and the actuators: firmware loops that a log's metadata declares."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from flax import struct
+
+from bayessim_mjx.errors import UserError
+from bayessim_mjx.parameters.attributes import suggest
+
+ALIASES = {
+    "direct": "direct", "torque": "direct", "force": "direct", "effort": "direct", "voltage": "direct", "duty": "direct",
+    "position": "position", "pd": "position", "p": "position", "velocity": "velocity",
+}  # fmt: skip
+KEYS = ("law", "kp", "kd", "limit", "scale")
+
+
+class Law(struct.PyTreeNode):
+    """One controller per actuator, `[nu]` each; vmapped worlds may have different gains.
+
+    direct:   u = scale c
+    position: u = clip(scale (kp (c - q) - kd w), +-limit)
+    velocity: u = clip(scale kp (c - w), +-limit)
+    q, w are as the joint's own encoder shows them: with the static error that the sensors had at the last control step.
+    """
+
+    on_position: jax.Array
+    on_velocity: jax.Array
+    kp: jax.Array
+    kd: jax.Array
+    limit: jax.Array
+    scale: jax.Array
+    qadr: tuple[int, ...] = struct.field(pytree_node=False)
+    dadr: tuple[int, ...] = struct.field(pytree_node=False)
+
+    def __call__(self, command: jax.Array, qpos: jax.Array, qvel: jax.Array, seen: Mapping[str, jax.Array]) -> jax.Array:
+        """Command `[nu]` -> ctrl `[nu]`."""
+        q = qpos[jnp.asarray(self.qadr)] + (seen["error"][jnp.asarray(self.qadr)] if "error" in seen else 0.0)
+        w = qvel[jnp.asarray(self.dadr)]
+        position = self.kp * (command - q) - self.kd * w
+        velocity = self.kp * (command - w)
+        loop = jnp.where(self.on_position > 0, position, velocity) * self.scale
+        closed = (self.on_position + self.on_velocity) > 0
+        return jnp.where(closed, jnp.clip(loop, -self.limit, self.limit), command * self.scale)
+
+
+def declared(metadata: Mapping[str, Any]) -> bool:
+    """Whether a log's metadata declares a controller that is not simply direct."""
+    given = metadata.get("controller")
+    if not isinstance(given, Mapping):
+        return False
+    blocks = [b for b in given.values() if isinstance(b, Mapping)] or [given]
+    return any(ALIASES.get(str(b.get("law", "direct")).lower()) != "direct" or "scale" in b for b in blocks)
+
+
+def read(metadata: Mapping[str, Any], model: mujoco.MjModel, actuators: Sequence[str], source: str) -> Law:
+    """The law of one log: `controller: {law, kp, kd, limit, scale}`, numbers or one per actuator by name.
+
+    Raises:
+        UserError: unknown key, law or actuator; a position law without kp; an actuator that drives no joint.
+    """
+    given = metadata.get("controller") or {}
+    if not isinstance(given, Mapping):
+        raise UserError(f"{source}: controller = {given!r}; allowed: a mapping with {', '.join(KEYS)}")
+    rows = [_of_actuator(given, name, actuators, source) for name in actuators]
+    joint_of = np.where(model.actuator_trntype <= int(mujoco.mjtTrn.mjTRN_JOINTINPARENT), model.actuator_trnid[:, 0], -1)
+    for row, name, joint in zip(rows, actuators, joint_of, strict=True):
+        if row["law"] != "direct" and joint < 0:
+            raise UserError(f"{source}: controller.law = {row['law']} of actuator {name!r}, which drives no joint")
+    joint_of = np.maximum(joint_of, 0)
+
+    def column(key: str) -> jax.Array:
+        return jnp.asarray([float(row[key]) for row in rows], jnp.float32)
+
+    return Law(
+        on_position=jnp.asarray([float(r["law"] == "position") for r in rows], jnp.float32),
+        on_velocity=jnp.asarray([float(r["law"] == "velocity") for r in rows], jnp.float32),
+        kp=column("kp"),
+        kd=column("kd"),
+        limit=column("limit"),
+        scale=column("scale"),
+        qadr=tuple(int(i) for i in model.jnt_qposadr[joint_of]),
+        dadr=tuple(int(i) for i in model.jnt_dofadr[joint_of]),
+    )
+
+
+def _of_actuator(given: Mapping[str, Any], name: str, actuators: Sequence[str], source: str) -> dict[str, Any]:
+    blocks = {k: v for k, v in given.items() if isinstance(v, Mapping)}
+    for key in blocks:
+        if key not in actuators:
+            raise UserError(f"{source}: controller.{key}: no such actuator; {suggest(str(key), actuators)}")
+    own = {**{k: v for k, v in given.items() if k not in blocks}, **blocks.get(name, {})}
+    law = str(own.get("law", "direct")).lower()
+    if law not in ALIASES:
+        law = "direct"  # a note for people ("firmware P, inside the logged duty") is not a law to be simulated
+    row = {"law": ALIASES[law], "kp": 0.0, "kd": 0.0, "limit": np.inf, "scale": 1.0}
+    for key in ("kp", "kd", "limit", "scale"):
+        if own.get(key) is None or (ALIASES[law] == "direct" and key != "scale"):
+            continue
+        try:
+            row[key] = float(own[key])
+        except (TypeError, ValueError):
+            raise UserError(f"{source}: controller.{key} = {own[key]!r}; allowed: a number") from None
+    if row["law"] != "direct" and not row["kp"] > 0:
+        raise UserError(f"{source}: controller.law = {row['law']} of actuator {name!r} needs kp > 0, has {row['kp']:g}")
+    return row
