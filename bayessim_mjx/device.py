@@ -53,3 +53,14 @@ def _cache(jax: Any, folder: str | None) -> None:
     jax.config.update("jax_compilation_cache_dir", str(path))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
+
+
+def compiler_options() -> dict[str, Any]:
+    """Options for `jax.jit` of programs with kinematic chains.
+
+    XLA's newer fusion on CPU computes shared subexpressions anew in every consumer: for a chain of six joints MJX's
+    kinematics then cost 150 times what they should.
+    """
+    import jax
+
+    return {"xla_cpu_use_fusion_emitters": False} if jax.default_backend() == "cpu" else {}

@@ -34,6 +34,8 @@ class Quantity:
         reach: (low, high) in multiples of `per`, used by the diagnosis in the place of low, high.
         grid: starting values for a fit, as fractions of the way from neutral to each end of the range.
         prior: "uniform" or "loguniform".
+        shape: it only shapes the effect (a speed, an order, a lever arm): where the other quantities are neutral the effect
+            is off whatever this one is; `grid` is then in fractions of the range from low to high.
     """
 
     name: str
@@ -45,6 +47,7 @@ class Quantity:
     reach: tuple[float, float] | None = None
     grid: tuple[float, ...] = (0.03, 0.15, 0.5)
     prior: str = "uniform"
+    shape: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
