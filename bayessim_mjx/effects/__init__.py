@@ -1,41 +1,164 @@
-"""Unmodelled effects, one per file, looked up by name: `effects.make("coulomb_friction", where="hinge")`."""
+"""Unmodelled effects, one per file, looked up by name: `effects.make("coulomb_friction", where="hinge")`.
+
+A user's own effect is a frozen dataclass like those here: installed under the entry point group
+`bayessim_mjx.effects`, or in a file, called `path.py:MyEffect`.
+"""
 
 import dataclasses
 import difflib
+import functools
+import hashlib
 import importlib
+import importlib.metadata
+import importlib.util
+import inspect
+import keyword
 import pkgutil
+import sys
+import traceback
+from pathlib import Path
+from types import ModuleType
 from typing import Any
 
-from bayessim_mjx.effects.effect import Effect
+from bayessim_mjx.effects.effect import Effect, Quantity
 from bayessim_mjx.errors import UserError
 
-__all__ = ["Effect", "make", "names"]
+__all__ = ["Effect", "load", "make", "names", "spec_of"]
 
-NOT_EFFECTS = ("effect", "reading", "site", "friction")  # modules of this folder that are no effect
+ENTRY_POINTS = "bayessim_mjx.effects"
+KINDS = ("actuator", "joint", "body", "geom", "world")
 
 
 def names() -> list[str]:
-    """Names of all effects: the files of this folder."""
-    return sorted(m.name for m in pkgutil.iter_modules(__path__) if m.name not in NOT_EFFECTS)
+    """Names of all effects: the files of this folder that hold one, and the installed ones."""
+    return sorted([*_library(), *_installed()])
+
+
+@functools.cache
+def _library() -> tuple[str, ...]:
+    """The files of this folder that define an effect of their name; the others are helpers."""
+    return tuple(m.name for m in pkgutil.iter_modules(__path__) if _own(m.name) is not None)
+
+
+def _own(name: Any) -> type[Effect] | None:
+    """The class CamelCase of the file of that name, if it is an effect."""
+    if not isinstance(name, str) or not (Path(__file__).parent / f"{name}.py").is_file():
+        return None
+    module = importlib.import_module(f"{__name__}.{name}")
+    kind = getattr(module, "".join(part.capitalize() for part in name.split("_")), None)
+    return kind if _is_effect(kind) else None
+
+
+def _installed() -> dict[str, importlib.metadata.EntryPoint]:
+    return {point.name: point for point in importlib.metadata.entry_points(group=ENTRY_POINTS)}
+
+
+def _is_effect(kind: Any) -> bool:
+    return isinstance(kind, type) and issubclass(kind, Effect) and kind is not Effect
+
+
+def load(spec: str) -> type[Effect]:
+    """The class of an effect.
+
+    Args:
+        spec: a name from `names()`, or `path.py:MyEffect`, relative to the working directory.
+
+    Raises:
+        UserError: no such effect, file or class; a class that does not keep the contract (`effect.py`).
+    """
+    if isinstance(spec, str) and ".py:" in spec:
+        path, _, title = spec.rpartition(":")
+        return _checked(_from_file(Path(path), title), spec)
+    own = _own(spec)
+    if own is not None:
+        return own
+    if spec in _installed():
+        try:
+            kind = _installed()[spec].load()
+        except Exception as error:
+            raise UserError(f"effect {spec!r}: its package cannot be imported: {error}") from error
+        return _checked(kind, spec, spec)
+    close = difflib.get_close_matches(str(spec), names())
+    hint = f"did you mean {close[0]}? " if close else ""
+    raise UserError(f"no effect {spec!r}; {hint}there are: {', '.join(names())}; or a file: path.py:MyEffect")
+
+
+def _from_file(path: Path, title: str) -> Any:
+    if not path.is_file():
+        raise UserError(f"effect {path}:{title}: no file {path} (from {Path.cwd()})")
+    path = path.resolve()
+    found = _executed(path, path.stat().st_mtime_ns)
+    if not hasattr(found, title):
+        own = [n for n, kind in vars(found).items() if _is_effect(kind) and kind.__module__ == found.__name__]
+        raise UserError(
+            f"effect {path}:{title}: no class {title!r} in the file; its effects: {', '.join(own) or 'none'}"
+        )
+    return getattr(found, title)
+
+
+@functools.cache  # one class per file as it is now, so that equal effects are equal
+def _executed(path: Path, changed: int) -> ModuleType:
+    name = f"{__name__}.own_{path.stem}_{hashlib.sha1(f'{path}{changed}'.encode()).hexdigest()[:8]}"
+    spec = importlib.util.spec_from_file_location(name, path)
+    assert spec is not None and spec.loader is not None
+    module = sys.modules[name] = importlib.util.module_from_spec(spec)
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:
+        del sys.modules[name]
+        raise UserError(f"{path}{_line(error, path)}: {type(error).__name__}: {error}") from error
+    return module
+
+
+def _line(error: Exception, path: Path) -> str:
+    """Where in the user's file it went wrong."""
+    lines = [f.lineno for f in traceback.extract_tb(error.__traceback__) if f.filename == str(path)]
+    line = error.lineno if isinstance(error, SyntaxError) else lines[-1] if lines else None
+    return f", line {line}" if line else ""
+
+
+def _checked(kind: Any, spec: str, name: str | None = None) -> type[Effect]:
+    """The class, if it keeps the contract and its name is its own."""
+    if not _is_effect(kind):
+        raise UserError(f"effect {spec}: {kind!r} is no subclass of bayessim_mjx.effects.Effect")
+    for attribute, what in (("name", "its name"), ("kind", f"one of {', '.join(KINDS)}"), ("quantities", "parameters")):
+        if not getattr(kind, attribute, None):
+            raise UserError(f"effect {spec}: the class lacks `{attribute}: ClassVar` ({what})")
+    if not isinstance(kind.name, str) or not kind.name.isidentifier() or keyword.iskeyword(kind.name):
+        raise UserError(f"effect {spec}: name = {kind.name!r}: expected one word of letters, digits and _")
+    if kind.kind not in KINDS:
+        raise UserError(f"effect {spec}: kind = {kind.kind!r}: allowed are {', '.join(KINDS)}")
+    if not all(isinstance(q, Quantity) for q in kind.quantities):
+        raise UserError(f"effect {spec}: quantities = {kind.quantities!r}: expected a tuple of effects.effect.Quantity")
+    if "__dataclass_params__" not in vars(kind) or not kind.__dataclass_params__.frozen:  # type: ignore[attr-defined]
+        raise UserError(f"effect {spec}: the class lacks @dataclasses.dataclass(frozen=True)")
+    if name not in (None, kind.name):
+        raise UserError(f"effect {spec}: the class calls itself {kind.name!r}; name the entry point so")
+    if _own(kind.name) is not None or (name is None and kind.name in _installed()):
+        raise UserError(f"effect {spec}: there is an effect {kind.name!r} already; give the class another name")
+    return kind
+
+
+def spec_of(effect: Effect) -> str:
+    """What `load` finds the effect's class by: its name, or `path.py:MyEffect`."""
+    kind = type(effect)
+    if not kind.__module__.startswith(f"{__name__}.own_"):
+        return effect.name
+    return f"{inspect.getfile(kind)}:{kind.__qualname__}"
 
 
 def make(effect: str, where: str | tuple[str, ...], **settings: Any) -> Effect:
     """The effect called `effect` at the place `where`.
 
     Args:
-        effect: a name from `names()`.
-        where: MuJoCo name of the joint, actuator ... concerned.
+        effect: what `load` takes.
+        where: MuJoCo name of the joint, actuator ... concerned, several names, or "all".
         settings: further fields of the effect, for example the upper limits of its parameters.
 
     Raises:
         UserError: on an unknown effect or setting.
     """
-    if effect not in names():
-        close = difflib.get_close_matches(str(effect), names())
-        hint = f"did you mean {close[0]}? " if close else ""
-        raise UserError(f"no effect {effect!r}; {hint}there are: {', '.join(names())}")
-    module = importlib.import_module(f"{__name__}.{effect}")
-    kind = getattr(module, "".join(part.capitalize() for part in effect.split("_")))
+    kind = load(effect)
     if isinstance(where, list):
         where = tuple(where)
     if not isinstance(where, str) and not (isinstance(where, tuple) and all(isinstance(w, str) for w in where)):
@@ -44,6 +167,6 @@ def make(effect: str, where: str | tuple[str, ...], **settings: Any) -> Effect:
     for name, value in settings.items():
         if name not in allowed:
             raise UserError(f"effect {effect}: no setting {name!r}; allowed are {', '.join(allowed)}")
-        if allowed[name] is float and (isinstance(value, bool) or not isinstance(value, int | float)):
+        if allowed[name] in (float, "float") and (isinstance(value, bool) or not isinstance(value, int | float)):
             raise UserError(f"effect {effect}: {name} = {value!r}: expected a number")
     return kind(where=where, **settings)
