@@ -109,6 +109,38 @@ def test_streams_and_side_yaml_are_kept(tmp_path: Path, arm: mujoco.MjModel) -> 
     assert log.enabled.tolist() == [i % 2 == 0 for i in range(40)]
 
 
+def test_side_yaml_declares_condition_noise_and_quantum(tmp_path: Path, arm: mujoco.MjModel) -> None:
+    table = np.c_[rows(), rows()[:, 3:5], rows()[:, 1]]
+    write(tmp_path, table, HEADER + ",qvel:shoulder,qvel:elbow,effort:m_elbow")
+    side = tmp_path / "run.yaml"
+    side.write_text("""
+condition: warm
+repeat_of: other.csv
+payload: {mass: 0.3}
+controller: {law: position, kp: 12, kd: 0.1, limit: 1.5, scale: 2}
+sigma: {elbow: 0.25, "qvel:shoulder": 0.125, "effort:m_elbow": 0.5}
+quantum: {"qpos:shoulder": 0.12}
+""")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # these velocities are no derivatives
+        (log,) = read_logs(tmp_path, arm)
+    assert log.condition == "warm" == log.metadata["operating_condition"]
+    assert log.metadata["controller"] == {"law": "position", "kp": 12, "kd": 0.1, "limit": 1.5, "scale": 2}
+    assert log.metadata["repeat_of"] == "other.csv" and log.metadata["payload"] == {"mass": 0.3}
+    np.testing.assert_allclose(log.sigma_qpos, [0.12 / np.sqrt(12), 0.25])
+    assert log.sigma_qvel[0] == 0.125 and log.sigma_qvel[1] < 0.1
+    for text, words in (
+        ("sigma: {elbw: 1}", ("sigma.elbw", "'qpos:elbow'")),
+        ("quantum: {elbow: big}", ("quantum.elbow = 'big'", "a number >= 0")),
+        ("sigma: {elbow: -1}", ("sigma.elbow = -1", "a number >= 0")),
+        ("quantum: 3", ("quantum = 3", "mapping")),
+    ):
+        side.write_text(text)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            refused(tmp_path, arm, "run.csv", *words)
+
+
 def test_free_joint_by_index_and_quaternion_velocity(tmp_path: Path) -> None:
     model = mujoco.MjModel.from_xml_string(FREE)
     channels = Channels.of(model)

@@ -87,7 +87,7 @@ class Log:
         sigma_qpos, sigma_qvel: [nq], [nv] standard deviation of the measurement noise.
         streams: whatever else was recorded, [T] each: `effort:<actuator>`, `enabled:<actuator>` (0 = drive off, the
             command did not act), witnesses such as `voltage`; NaN where not sampled.
-        metadata: the file's side YAML (operating_condition, controller, payload ...) and `source`, its path.
+        metadata: the file's side YAML (condition, controller, payload, repeat_of ...) and `source`, its path.
     """
 
     name: str
@@ -137,6 +137,12 @@ class Log:
     def period(self) -> float:
         """Median sample period [s]."""
         return float(np.median(np.diff(self.time)))
+
+    @property
+    def condition(self) -> str | None:
+        """Label of the operating condition it was recorded under, where its metadata has one."""
+        label = self.metadata.get("operating_condition", self.metadata.get("condition"))
+        return None if label is None else str(label)
 
     @property
     def enabled(self) -> NDArray[np.bool_]:

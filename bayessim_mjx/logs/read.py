@@ -35,7 +35,8 @@ def read_logs(
     """Read all runs of a folder (or the files named), in the model's order of joints and actuators.
 
     A folder's own `map.yaml` is used where `map` is not given. Files are cut at gaps longer than MAX_GAP periods;
-    `<file stem>.yaml` beside a file becomes its metadata (and `sigma: {<joint>: value}` the noise, where known).
+    `<file stem>.yaml` beside a file becomes its metadata; `sigma` and `quantum` there, {<channel>: value}, replace the
+    estimates of a channel's noise and resolution.
 
     Raises:
         UserError: whatever is wrong with a file, naming the file, its column and row, and what is allowed.
@@ -95,6 +96,8 @@ def _read_one(path: Path, mj_model: mujoco.MjModel, channels: Channels, log_map:
     check_time(table, columns["time"], MIN_ROWS)
     check_motion(table, columns, channels, mj_model)
     metadata = {**(log_map.metadata if log_map else {}), **_side_yaml(path), "source": str(path)}
+    if "condition" in metadata:
+        metadata.setdefault("operating_condition", metadata["condition"])
     return _pieces(table, columns, channels, metadata)
 
 
@@ -193,20 +196,21 @@ def _log(name: str, columns: Mapping[str, Array], channels: Channels, metadata: 
     def stack(stream: str, names: Sequence[str]) -> Array:
         return np.stack([columns[f"{stream}:{n}"] for n in names], 1) if names else np.zeros((rows, 0))
 
+    sigma, grain = (_known(metadata, key, columns, channels) for key in ("sigma", "quantum"))
+
+    def spread_of(stream: str, names: Sequence[str], x: Array) -> Array:
+        keys = [f"{stream}:{n}" for n in names]
+        level = [sigma[k] if k in sigma else noise_level(c, grain.get(k)) for k, c in zip(keys, x.T, strict=True)]
+        return np.array(level)
+
     qpos = stack("qpos", channels.qpos)
-    sigma = np.array([noise_level(c) for c in qpos.T])
-    known = metadata.get("sigma", {})
-    if not isinstance(known, Mapping):
-        raise UserError(
-            f"{metadata['source']}: sigma = {known!r} in its side YAML; allowed: a mapping '<joint>: value'"
-        )
-    sigma = np.array([float(known.get(n, s)) for n, s in zip(channels.qpos, sigma, strict=True)])
-    velocity, spread = estimate_velocity(columns["time"], qpos, channels, sigma)
+    sigma_qpos = spread_of("qpos", channels.qpos, qpos)
+    velocity, spread = estimate_velocity(columns["time"], qpos, channels, sigma_qpos)
     has_qvel = all(f"qvel:{n}" in columns for n in channels.qvel)
     if has_qvel:
         measured = stack("qvel", channels.qvel)
         _compare(name, measured, velocity, spread, channels)
-        velocity, spread = measured, np.array([noise_level(c) for c in measured.T])
+        velocity, spread = measured, spread_of("qvel", channels.qvel, measured)
     used = {"time"} | {
         f"{s}:{n}" for s in ("ctrl", "qpos", "qvel") for n in getattr(channels, s if s != "ctrl" else "actuators")
     }
@@ -218,11 +222,29 @@ def _log(name: str, columns: Mapping[str, Array], channels: Channels, metadata: 
         qvel=velocity,
         has_qvel=has_qvel,
         channels=channels,
-        sigma_qpos=sigma,
+        sigma_qpos=sigma_qpos,
         sigma_qvel=spread,
         streams={k: c for k, c in columns.items() if k not in used},
         metadata=metadata,
     )
+
+
+def _known(metadata: Mapping[str, Any], key: str, columns: Mapping[str, Array], channels: Channels) -> dict[str, float]:
+    """Declared noise or quantum per column; `<joint>` is short for `qpos:<joint>`."""
+    given, source = metadata.get(key) or {}, metadata["source"]
+    if not isinstance(given, Mapping):
+        raise UserError(f"{source}: {key} = {given!r} in its side YAML; allowed: a mapping '<channel>: value'")
+    out = {}
+    for name, value in given.items():
+        column = f"qpos:{name}" if name in channels.qpos else str(name)
+        if column not in columns or column == "time":
+            allowed = [c for c in columns if c != "time"]
+            raise UserError(f"{source}: {key}.{name} in its side YAML: no such channel; {suggest(str(name), allowed)}")
+        number = isinstance(value, int | float) and not isinstance(value, bool) and np.isfinite(value)
+        if not number or value < 0:
+            raise UserError(f"{source}: {key}.{name} = {value!r} in its side YAML; allowed: a number >= 0")
+        out[column] = float(value)
+    return out
 
 
 def _compare(name: str, measured: Array, estimated: Array, spread: Array, channels: Channels) -> None:

@@ -27,14 +27,15 @@ def quantum(x: Array) -> float:
     return step if regular and len(multiples) > 0.5 * len(steps) else 0.0
 
 
-def noise_level(x: Array) -> float:
+def noise_level(x: Array, grain: float | None = None) -> float:
     """Standard deviation of the measurement noise in x [T]: max(quantum / sqrt 12, robust high-frequency residual).
 
-    The fourth difference of white noise has variance 70 sigma^2; its median is blind to rare jerks of the true motion.
+    `grain` is the quantum where it is known; otherwise it is estimated. The fourth difference of white noise has
+    variance 70 sigma^2; its median is blind to rare jerks of the true motion.
     """
     fourth = np.diff(x, 4)
     residual = 1.4826 * float(np.median(np.abs(fourth))) / np.sqrt(70.0) if len(fourth) else 0.0
-    return max(quantum(x) / np.sqrt(12.0), residual)
+    return max((quantum(x) if grain is None else grain) / np.sqrt(12.0), residual)
 
 
 def smoothing_window(x: Array, period: float, sigma: float) -> int:
