@@ -1,0 +1,76 @@
+"""Actuator dead band: too small a command does nothing (least duty that moves a motor, servo tolerance, valve lap)."""
+
+import dataclasses
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from bayessim_mjx.effects.effect import Effect, Quantity
+from bayessim_mjx.effects.site import Site, SubStep
+from bayessim_mjx.errors import UserError
+
+_FIXED = int(mujoco.mjtGain.mjGAIN_FIXED)
+_NONE, _AFFINE = int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE)
+
+
+@dataclasses.dataclass(frozen=True)
+class ActuatorDeadband(Effect):
+    """dz(e; h) = sgn(e) max(|e| - h, 0) in the place of what the actuator acts on, e.
+
+    e is the command of a force or velocity actuator, and the error c - q of a position servo. Computed before
+    MuJoCo's force limit; effects that change the force come after it in the stack.
+
+    Parameters: `half_width` h, in the unit of the actuator's ctrl (rad for a position servo of a hinge), neutral 0.
+
+    Attributes:
+        high: largest half-width, unless `parameters` has another range.
+    """
+
+    high: float = 0.2
+    name: ClassVar[str] = "actuator_deadband"
+    kind: ClassVar[str] = "actuator"
+    quantities: ClassVar[tuple[Quantity, ...]] = (
+        Quantity("half_width", 0.0, 0.0, 0.2, unit="ctrl", per="command", reach=(0.0, 0.3), grid=(0.01, 0.05, 0.2)),
+    )
+
+    def bind(self, mj_model: mujoco.MjModel, timestep: float, substeps: int) -> Site:
+        at = super().bind(mj_model, timestep, substeps)
+        gains, biases = mj_model.actuator_gaintype[at.ids], mj_model.actuator_biastype[at.ids]
+        for name, gain, bias in zip(at.names, gains, biases, strict=True):
+            if gain != _FIXED or bias not in (_NONE, _AFFINE):
+                allowed = "motor, position, velocity ..."
+                raise UserError(f"{self.name}: actuator {name!r} has no fixed gain; allowed: {allowed}")
+        return at
+
+    def on_actuator(
+        self, at: Site, memory: Any, step: SubStep, force: jax.Array, theta: jax.Array
+    ) -> tuple[Any, jax.Array]:
+        half = at.values(theta)[:, 0]
+        model, data = step.model, step.data
+        affine = at.mj_model.actuator_biastype[at.ids] == _AFFINE
+        gain, bias = model.actuator_gainprm[at.ids, 0], model.actuator_biasprm[at.ids] * affine[:, None]
+        error = gain * _signal(at, step) + bias[:, 1] * data.actuator_length[at.ids]  # gain e
+        full = error + bias[:, 0] + bias[:, 2] * data._impl.actuator_velocity[at.ids]
+        band = jnp.abs(gain) * half
+        low, high = _range(at, model.actuator_forcelimited, model.actuator_forcerange)
+        change = jnp.clip(full - jnp.clip(error, -band, band), low, high) - jnp.clip(full, low, high)
+        return memory, force.at[at.ids].add(jnp.where(half > 0, change, 0.0))
+
+
+def _signal(at: Site, step: SubStep) -> jax.Array:
+    """What the actuators act on, `[n]`: the command within its range, or the activation where there is one."""
+    model = at.mj_model
+    command = jnp.clip(step.ctrl[at.ids], *_range(at, step.model.actuator_ctrllimited, step.model.actuator_ctrlrange))
+    stateful = model.actuator_actadr[at.ids] >= 0
+    if not stateful.any():
+        return command
+    last = model.actuator_actadr[at.ids] + model.actuator_actnum[at.ids] - 1
+    return jnp.where(stateful, step.data.act[np.maximum(last, 0)], command)
+
+
+def _range(at: Site, limited: Any, bounds: jax.Array) -> tuple[jax.Array, jax.Array]:
+    low, high = jnp.where(limited[at.ids, None], bounds[at.ids], jnp.array([-jnp.inf, jnp.inf])).T
+    return low, high

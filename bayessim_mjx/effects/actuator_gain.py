@@ -1,0 +1,56 @@
+"""Actuator gain: the force is a constant multiple of the modelled one (torque constant, gear loss, supply voltage)."""
+
+import dataclasses
+from typing import Any, ClassVar
+
+import jax
+import mujoco
+
+from bayessim_mjx.effects.effect import Effect, Quantity
+from bayessim_mjx.effects.site import Site, SubStep
+
+GAINS = (mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtGain.mjGAIN_AFFINE)  # linear in their parameters
+BIASES = (mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtBias.mjBIAS_AFFINE)
+
+
+def addressed(spec: mujoco.MjSpec, values: dict[str, dict[str, float]]) -> list[tuple[Any, dict[str, float]]]:
+    """(actuator, its values) for the actuators that `values` names; "all": every one."""
+    named = [(a.name or f"actuator{i}", a) for i, a in enumerate(spec.actuators)]
+    return [(a, values[key]) for name, a in named for key in (name, "all") if key in values]
+
+
+def nonlinear(spec: mujoco.MjSpec, values: dict[str, dict[str, float]]) -> str | None:
+    """Why an actuator's force cannot be scaled or shifted by its parameters, if so."""
+    for actuator, _ in addressed(spec, values):
+        if actuator.gaintype not in GAINS or actuator.biastype not in BIASES:
+            return f"actuator {actuator.name} is a muscle or a motor model, whose force has no parameter for it"
+    return None
+
+
+@dataclasses.dataclass(frozen=True)
+class ActuatorGain(Effect):
+    """f' = gain f, for all that the actuator exerts: a position servo's stiffness and damping, and its force limit.
+
+    Parameters: `gain`, no unit, neutral 1.
+    """
+
+    name: ClassVar[str] = "actuator_gain"
+    kind: ClassVar[str] = "actuator"
+    quantities: ClassVar[tuple[Quantity, ...]] = (Quantity("gain", 1.0, 0.5, 1.5, grid=(0.1, 0.3, 0.6)),)
+
+    def on_actuator(
+        self, at: Site, memory: Any, step: SubStep, force: jax.Array, theta: jax.Array
+    ) -> tuple[Any, jax.Array]:
+        return memory, force.at[at.ids].multiply(at.values(theta)[:, 0])
+
+    def edit(self, spec: mujoco.MjSpec, values: dict[str, dict[str, float]]) -> str | None:
+        """Native: gainprm, biasprm and forcerange, times gain."""
+        if why := nonlinear(spec, values):
+            return why
+        compiled = spec.copy().compile()  # its biasprm has the damping that a dampratio stands for
+        order = list(spec.actuators)
+        for actuator, own in addressed(spec, values):
+            actuator.gainprm = own["gain"] * actuator.gainprm
+            actuator.biasprm = own["gain"] * compiled.actuator_biasprm[order.index(actuator)]
+            actuator.forcerange = own["gain"] * actuator.forcerange
+        return None

@@ -1,0 +1,58 @@
+"""Actuator saturation: the force has a limit (current limit of the drive, full supply voltage, a slipping clutch)."""
+
+import dataclasses
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from bayessim_mjx.effects.actuator_gain import addressed
+from bayessim_mjx.effects.effect import Effect, Quantity
+from bayessim_mjx.effects.site import Site, SubStep
+
+
+def limits(actuator: Any) -> np.ndarray | None:
+    """(lowest, highest) force of a spec's actuator, None where it has no limit."""
+    unlimited = actuator.forcelimited == mujoco.mjtLimited.mjLIMITED_FALSE or not np.any(actuator.forcerange)
+    return None if unlimited else np.array(actuator.forcerange)
+
+
+@dataclasses.dataclass(frozen=True)
+class ActuatorSaturation(Effect):
+    """|f| <= 1 / inverse_limit, in units of the actuator's force; the inverse, so that "no limit" is a number.
+
+    f' = f / max(1, inverse_limit |f|)
+
+    Parameters: `inverse_limit`, 1/(N m) (hinge) or 1/N (slide), neutral 0. Data below the limit do not see it: the
+    first starting value of a fit lies just below the largest effort.
+
+    Attributes:
+        high: largest inverse limit, unless `parameters` has another range.
+    """
+
+    high: float = 10.0
+    name: ClassVar[str] = "actuator_saturation"
+    kind: ClassVar[str] = "actuator"
+    quantities: ClassVar[tuple[Quantity, ...]] = (
+        Quantity(
+            "inverse_limit", 0.0, 0.0, 10.0, unit="1/(N m)", per="1/force", reach=(0.0, 5.0), grid=(0.22, 0.3, 0.5)
+        ),
+    )
+
+    def on_actuator(
+        self, at: Site, memory: Any, step: SubStep, force: jax.Array, theta: jax.Array
+    ) -> tuple[Any, jax.Array]:
+        own = force[at.ids]
+        return memory, force.at[at.ids].set(own / jnp.maximum(1.0, at.values(theta)[:, 0] * jnp.abs(own)))
+
+    def edit(self, spec: mujoco.MjSpec, values: dict[str, dict[str, float]]) -> str | None:
+        """Native: forcerange, inside the one that there is."""
+        for actuator, own in addressed(spec, values):
+            if own["inverse_limit"] > 0:
+                limit = 1.0 / own["inverse_limit"]
+                before = limits(actuator)
+                actuator.forcerange = np.clip([-limit, limit] if before is None else before, -limit, limit)
+                actuator.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
+        return None

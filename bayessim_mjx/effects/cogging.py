@@ -1,0 +1,41 @@
+"""Cogging and torque ripple: a force periodic in the angle (magnets against slots, gear teeth, wave generator)."""
+
+import dataclasses
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+
+from bayessim_mjx.effects.effect import Effect, Quantity
+from bayessim_mjx.effects.site import Site, SubStep
+from bayessim_mjx.triangular import product
+
+# a fit finds the order only from about +-pi / (range of motion) away: start at the usual ones
+_ORDERS = (2, 4, 6, 8, 12, 16, 24, 32, 48)
+
+
+@dataclasses.dataclass(frozen=True)
+class Cogging(Effect):
+    """f = sine sin(n x) + cosine cos(n x) through the actuator's transmission; x is its length (gear times angle).
+
+    Sine and cosine instead of amplitude and phase: linear, and no wrap. It also acts while the drive is off, and no
+    limit or gain of the actuator changes it.
+
+    Parameters:
+        sine, cosine: N m (hinge) or N (slide), neutral 0.
+        order: n, periods per revolution (per 2 pi of x), without effect where both amplitudes are 0.
+    """
+
+    name: ClassVar[str] = "cogging"
+    kind: ClassVar[str] = "actuator"
+    quantities: ClassVar[tuple[Quantity, ...]] = (
+        Quantity("sine", 0.0, -1.0, 1.0, unit="N m", per="force", reach=(-0.3, 0.3), grid=(0.1,)),
+        Quantity("cosine", 0.0, -1.0, 1.0, unit="N m", per="force", reach=(-0.3, 0.3), grid=(0.1,)),
+        Quantity("order", 1.0, 1.0, 60.0, unit="1/rev", grid=tuple((n - 1) / 59 for n in _ORDERS)),
+    )
+
+    def on_force(self, at: Site, memory: Any, step: SubStep, theta: jax.Array) -> tuple[Any, jax.Array]:
+        sine, cosine, order = at.values(theta).T
+        angle = order * step.data.actuator_length[at.ids]
+        force = sine * jnp.sin(angle) + cosine * jnp.cos(angle)
+        return memory, product(force[None], step.data._impl.actuator_moment[at.ids])[0]
