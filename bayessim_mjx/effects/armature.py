@@ -1,0 +1,53 @@
+"""Armature: inertia of the motor's rotor, seen through the gear (times the gear ratio squared), and of the gear."""
+
+import dataclasses
+from typing import TYPE_CHECKING, ClassVar
+
+import jax
+import jax.numpy as jnp
+
+from bayessim_mjx.effects.effect import Effect, Quantity
+from bayessim_mjx.effects.friction import add, native
+from bayessim_mjx.effects.site import Site
+from bayessim_mjx.parameters import constants
+
+if TYPE_CHECKING:
+    import mujoco
+    from mujoco import mjx
+
+
+@dataclasses.dataclass(frozen=True)
+class Armature(Effect):
+    """F = -J dw/dt: the joint's diagonal of the mass matrix grows by J, with what MuJoCo derives from it.
+
+    Parameters: `inertia` J, kg m^2 (hinge) or kg (slide), on top of the model's own armature, neutral 0.
+
+    Attributes:
+        high: upper limit of J, unless `parameters` has another range.
+    """
+
+    high: float = 1.0
+    name: ClassVar[str] = "armature"
+    kind: ClassVar[str] = "joint"
+    quantities: ClassVar[tuple[Quantity, ...]] = (
+        Quantity("inertia", 0.0, 0.0, 1.0, unit="kg m^2", per="inertia", reach=(0.0, 1.5)),
+    )
+
+    def on_model(self, at: Site, model: "mjx.Model", theta: jax.Array) -> "mjx.Model":
+        added = at.values(theta)[:, 0]
+        changed = model.replace(dof_armature=model.dof_armature.at[at.dadr].add(added))
+        derived = constants.derived(changed, {"dof_armature"}, reference=model)
+        # neutral: the compiler's own numbers, not their recomputation in float32
+        present = jnp.any(added > 0)
+        kept = {name: jnp.where(present, new, _leaf(model, name)) for name, new in derived.items()}
+        return changed.tree_replace(kept)
+
+    def edit(self, spec: "mujoco.MjSpec", values: dict[str, dict[str, float]]) -> str | None:
+        for joint, own in native(spec, values):
+            add(joint, "armature", own["inertia"])
+        return None
+
+
+def _leaf(model: "mjx.Model", name: str) -> jax.Array:
+    group, _, own = name.rpartition(".")
+    return getattr(getattr(model, group) if group else model, own)

@@ -1,0 +1,38 @@
+"""Friction of joints that differs by direction: worn or preloaded gears, lip seals, belts, ball screws, cables."""
+
+import dataclasses
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import jax
+
+from bayessim_mjx.effects.effect import Effect, Quantity
+from bayessim_mjx.effects.friction import resist
+from bayessim_mjx.effects.site import Site, SubStep
+
+if TYPE_CHECKING:
+    import mujoco
+
+
+@dataclasses.dataclass(frozen=True)
+class AsymmetricFriction(Effect):
+    """F = -(a+ + b+ w) where w > 0, a- - b- w where w < 0; at rest it holds against -a- .. a+ (see `friction.resist`).
+
+    Parameters: `level_forward` a+, `level_backward` a-, N m (hinge) or N (slide); `viscous_forward` b+,
+    `viscous_backward` b-, N m s/rad or N s/m; all neutral 0.
+    """
+
+    name: ClassVar[str] = "asymmetric_friction"
+    kind: ClassVar[str] = "joint"
+    quantities: ClassVar[tuple[Quantity, ...]] = (
+        Quantity("level_forward", 0.0, 0.0, 1.0, unit="N m", per="force", reach=(0.0, 1.0)),
+        Quantity("level_backward", 0.0, 0.0, 1.0, unit="N m", per="force", reach=(0.0, 1.0)),
+        Quantity("viscous_forward", 0.0, 0.0, 1.0, unit="N m s/rad", per="force/speed", reach=(0.0, 1.0)),
+        Quantity("viscous_backward", 0.0, 0.0, 1.0, unit="N m s/rad", per="force/speed", reach=(0.0, 1.0)),
+    )
+
+    def on_force(self, at: Site, memory: Any, step: SubStep, theta: jax.Array) -> tuple[Any, jax.Array]:
+        values = at.values(theta)
+        return memory, resist(at, step, level=values[:, :2], damping=values[:, 2:])
+
+    def edit(self, spec: "mujoco.MjSpec", values: dict[str, dict[str, float]]) -> str | None:
+        return "MuJoCo's joint friction and damping are the same in both directions; use effects.yaml"

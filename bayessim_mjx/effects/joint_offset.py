@@ -1,0 +1,63 @@
+"""Joint offset: an encoder whose zero is off, by mounting, homing or a tooth skipped by a belt."""
+
+import dataclasses
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import jax
+import mujoco
+import numpy as np
+
+from bayessim_mjx.effects.effect import Effect, Measurement, Quantity
+from bayessim_mjx.effects.site import Motion, Site
+
+if TYPE_CHECKING:
+    from mujoco import mjx
+
+_ON_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
+_AFFINE = int(mujoco.mjtBias.mjBIAS_AFFINE)
+
+
+@dataclasses.dataclass(frozen=True)
+class JointOffset(Effect):
+    """measured = q + o, also for the joint's own position servo, whose command c then acts as c - o.
+
+    The servo's share is written into its bias, gain c + b1 gear (q + o): unlike a shifted command it is right at the
+    ends of ctrlrange and in the start of filtered actuators too. Controllers that a log declares (`laws`) know the
+    sensors' static error themselves.
+
+    Parameters: `offset` o, rad (hinge) or m (slide), neutral 0.
+    """
+
+    name: ClassVar[str] = "joint_offset"
+    kind: ClassVar[str] = "joint"
+    quantities: ClassVar[tuple[Quantity, ...]] = (
+        Quantity("offset", 0.0, -0.1, 0.1, unit="rad", per="travel", reach=(-0.1, 0.1)),
+    )
+
+    def on_model(self, at: Site, model: "mjx.Model", theta: jax.Array) -> "mjx.Model":
+        servos, place = _servos(at)
+        if not len(servos):
+            return model
+        bias = model.actuator_biasprm
+        shift = bias[servos, 1] * model.actuator_gear[servos, 0] * at.values(theta)[place, 0]
+        return model.replace(actuator_biasprm=bias.at[servos, 0].add(shift))
+
+    def on_start(self, at: Site, memory: Any, motion: Motion, theta: jax.Array) -> tuple[Any, Motion]:
+        return memory, motion.replace(qpos=motion.qpos.at[:, at.qadr].add(-at.values(theta)[:, 0]))
+
+    def on_measurement(
+        self, at: Site, memory: Any, measurement: Measurement, theta: jax.Array
+    ) -> tuple[Any, Measurement]:
+        return memory, measurement | {"qpos": measurement["qpos"].at[at.qadr].add(at.values(theta)[:, 0])}
+
+    def edit(self, spec: mujoco.MjSpec, values: dict[str, dict[str, float]]) -> str | None:
+        return "MuJoCo's joint sensors have no zero of their own; use effects.yaml"
+
+
+def _servos(at: Site) -> tuple[np.ndarray, np.ndarray]:
+    """(ids of actuators that close a loop on the position of a joint of the site, index of that joint in the site)."""
+    model = at.mj_model
+    loop = (model.actuator_biastype == _AFFINE) & (model.actuator_biasprm[:, 1] != 0)
+    joint = np.where(np.isin(model.actuator_trntype, _ON_JOINT), model.actuator_trnid[:, 0], -1)
+    servos = np.flatnonzero(loop & np.isin(joint, at.ids))
+    return servos, np.asarray([list(at.ids).index(j) for j in joint[servos]], int)

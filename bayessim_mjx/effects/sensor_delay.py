@@ -1,0 +1,66 @@
+"""Sensor delay: measurements that arrive late, by bus cycles, conversion and transport."""
+
+import dataclasses
+import math
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+
+from bayessim_mjx.effects.effect import Effect, Measurement, Quantity
+from bayessim_mjx.effects.sensor_gain import columns, written
+from bayessim_mjx.effects.site import Motion, Site
+
+if TYPE_CHECKING:
+    import mujoco
+
+
+@dataclasses.dataclass(frozen=True)
+class SensorDelay(Effect):
+    """measured(t) = q(t - d), w(t - d), interpolated linearly between control steps.
+
+    Before the first measurement of an episode the first one is taken to have held for ever; an episode that starts in
+    the middle of a log takes its past from there.
+
+    Parameters: `delay` d, s, neutral 0.
+
+    Attributes:
+        high: largest delay, s, unless `parameters` has another range.
+    """
+
+    high: float = 0.05
+    name: ClassVar[str] = "sensor_delay"
+    kind: ClassVar[str] = "joint"
+    quantities: ClassVar[tuple[Quantity, ...]] = (Quantity("delay", 0.0, 0.0, 0.05, unit="s", grid=(0.1, 0.3, 0.6)),)
+
+    def init(self, at: Site) -> Any:
+        """{"history": `[lag, n, 2]` positions and velocities after past control steps, newest last; "fresh"}."""
+        longest = max(p.high for p in self.space().parameters)
+        lag = max(2, math.ceil(longest / at.dt - 1e-6))
+        return {"history": jnp.zeros((lag, len(at), 2)), "fresh": jnp.ones((), bool)}
+
+    def on_start(self, at: Site, memory: Any, motion: Motion, theta: jax.Array) -> tuple[Any, Motion]:
+        steps = at.values(theta)[:, 0] / jnp.float32(at.dt)
+        later = columns(at, *jax.vmap(motion.shifted)(steps))  # [n, rows, n, 2]: every delay, every joint
+        true = jnp.moveaxis(jnp.diagonal(later, axis1=0, axis2=2), -1, 1)  # [rows, n, 2]: each joint by its own
+        lag = memory["history"].shape[0]
+        past = jnp.clip(jnp.arange(motion.start - lag + 1, motion.start + 1), 0, None)
+        filled = {"history": true[past], "fresh": jnp.zeros((), bool)}
+        return filled, motion.replace(**written(at, motion.qpos, motion.qvel, true))
+
+    def on_measurement(
+        self, at: Site, memory: Any, measurement: Measurement, theta: jax.Array
+    ) -> tuple[Any, Measurement]:
+        now, lag = columns(at, **measurement), memory["history"].shape[0]
+        past = jnp.where(memory["fresh"], now, memory["history"])
+        signal = jnp.concatenate([past, now[None]])  # row `lag` is now
+        steps = jnp.clip(at.values(theta)[:, 0] / jnp.float32(at.dt), 0.0, lag)
+        whole = jnp.minimum(jnp.floor(steps), lag - 1.0)
+        row, joint = lag - whole.astype(jnp.int32), jnp.arange(len(at))
+        newer, older = signal[row, joint], signal[row - 1, joint]
+        shown = newer + (steps - whole)[:, None] * (older - newer)
+        memory = {"history": signal[1:], "fresh": jnp.zeros((), bool)}
+        return memory, written(at, **measurement, values=shown)
+
+    def edit(self, spec: "mujoco.MjSpec", values: dict[str, dict[str, float]]) -> str | None:
+        return "MuJoCo delays sensors, not qpos and qvel, and MJX does not know these delays; use effects.yaml"

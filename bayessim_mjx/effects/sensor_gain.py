@@ -1,0 +1,55 @@
+"""Sensor gain: an encoder or potentiometer of the wrong scale, or a gear ratio that is not what the driver believes."""
+
+import dataclasses
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+
+from bayessim_mjx.effects.effect import Effect, Measurement, Quantity
+from bayessim_mjx.effects.site import Motion, Site
+from bayessim_mjx.errors import UserError
+
+if TYPE_CHECKING:
+    import mujoco
+
+
+@dataclasses.dataclass(frozen=True)
+class SensorGain(Effect):
+    """measured = g q, g w. Only what is shown: a servo's own loop runs on the true angle.
+
+    Parameters: `gain` g, > 0, dimensionless, neutral 1.
+    """
+
+    name: ClassVar[str] = "sensor_gain"
+    kind: ClassVar[str] = "joint"
+    quantities: ClassVar[tuple[Quantity, ...]] = (Quantity("gain", 1.0, 0.8, 1.2),)
+
+    def check(self) -> None:
+        super().check()
+        for p in self.space().parameters:
+            if p.low <= 0:
+                raise UserError(f"{p.name}: range begins at {p.low:g}; allowed: above 0")
+
+    def on_start(self, at: Site, memory: Any, motion: Motion, theta: jax.Array) -> tuple[Any, Motion]:
+        true = columns(at, motion.qpos, motion.qvel) / at.values(theta)
+        return memory, motion.replace(**written(at, motion.qpos, motion.qvel, true))
+
+    def on_measurement(
+        self, at: Site, memory: Any, measurement: Measurement, theta: jax.Array
+    ) -> tuple[Any, Measurement]:
+        shown = columns(at, **measurement) * at.values(theta)
+        return memory, written(at, **measurement, values=shown)
+
+    def edit(self, spec: "mujoco.MjSpec", values: dict[str, dict[str, float]]) -> str | None:
+        return "MuJoCo's joint sensors have no scale; use effects.yaml"
+
+
+def columns(at: Site, qpos: jax.Array, qvel: jax.Array) -> jax.Array:
+    """Position and velocity of the site's joints, `[..., n, 2]`, of qpos `[..., nq]` and qvel `[..., nv]`."""
+    return jnp.stack([qpos[..., at.qadr], qvel[..., at.dadr]], axis=-1)
+
+
+def written(at: Site, qpos: jax.Array, qvel: jax.Array, values: jax.Array) -> Measurement:
+    """{"qpos", "qvel"} with the site's joints showing `values`; the inverse of `columns`."""
+    return {"qpos": qpos.at[..., at.qadr].set(values[..., 0]), "qvel": qvel.at[..., at.dadr].set(values[..., 1])}

@@ -1,0 +1,44 @@
+"""Stribeck friction of joints: dry friction that is larger near standstill, where the lubricant is squeezed out.
+
+Causes: boundary lubrication of gears, seals and plain bearings. Sign: stick-slip in slow motion.
+"""
+
+import dataclasses
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+
+from bayessim_mjx.effects.effect import Effect, Quantity
+from bayessim_mjx.effects.friction import dry
+from bayessim_mjx.effects.site import Site, SubStep
+
+if TYPE_CHECKING:
+    import mujoco
+
+_SLOWEST = 1e-6  # keeps w / ws finite
+
+
+@dataclasses.dataclass(frozen=True)
+class StribeckFriction(Effect):
+    """F = -(fc + fs exp(-(w / ws)^2)) sgn(w), up to fc + fs at rest; `friction.dry` tells how it is computed.
+
+    Parameters: `level` fc and `excess` fs, N m (hinge) or N (slide), neutral 0; `speed` ws, rad/s or m/s, without
+    effect where fs = 0.
+    """
+
+    name: ClassVar[str] = "stribeck_friction"
+    kind: ClassVar[str] = "joint"
+    quantities: ClassVar[tuple[Quantity, ...]] = (
+        Quantity("level", 0.0, 0.0, 1.0, unit="N m", per="force", reach=(0.0, 1.0)),
+        Quantity("excess", 0.0, 0.0, 1.0, unit="N m", per="force", reach=(0.0, 1.0)),
+        Quantity("speed", 0.1, 0.01, 1.0, unit="rad/s", per="speed", reach=(0.01, 0.5), prior="loguniform"),
+    )
+
+    def on_force(self, at: Site, memory: Any, step: SubStep, theta: jax.Array) -> tuple[Any, jax.Array]:
+        level, excess, speed = at.values(theta).T
+        share = jnp.exp(-((step.qvel[at.dadr] / jnp.maximum(speed, _SLOWEST)) ** 2))
+        return memory, dry(at, step, level + excess * share)
+
+    def edit(self, spec: "mujoco.MjSpec", values: dict[str, dict[str, float]]) -> str | None:
+        return "MuJoCo's joint friction does not depend on the speed; use effects.yaml"
