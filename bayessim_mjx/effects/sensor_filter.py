@@ -42,8 +42,8 @@ class SensorFilter(Effect):
 
     def on_start(self, at: Site, memory: Any, motion: Motion, theta: jax.Array) -> tuple[Any, Motion]:
         shown = columns(at, motion.qpos, motion.qvel)  # [rows, n, 2]
-        acceleration = jnp.gradient(shown[..., 1], jnp.float32(at.dt), axis=0)
-        rate = jnp.stack([shown[..., 1], acceleration], axis=-1)  # the filtered velocity is the filtered angle's rate
+        speed = shown[..., 1]  # a filtered velocity is the filtered angle's rate
+        rate = jnp.stack([speed, jnp.asarray(jnp.gradient(speed, axis=0)) / jnp.float32(at.dt)], axis=-1)
         true = shown + at.values(theta) * rate
         filled = {"input": true[motion.start], "output": shown[motion.start], "fresh": jnp.zeros((), bool)}
         return filled, motion.replace(**written(at, motion.qpos, motion.qvel, true))

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 class ViscousFriction(Effect):
     """F = -b w.
 
-    Where the integrator treats joint damping implicitly (Euler, implicitfast) it is MuJoCo's own damping; elsewhere (RK4)
-    a force with the speed at the end of the sub-step, `friction.viscous`. Either way stable for any b dt / M.
+    Where the integrator treats joint damping implicitly (Euler, implicitfast) it is MuJoCo's own damping; elsewhere
+    (RK4) a force with the speed at the end of the sub-step, `friction.viscous`. Either way stable for any b dt / M.
 
     Parameters: `damping` b, N m s/rad (hinge) or N s/m (slide), neutral 0.
 
@@ -56,7 +56,6 @@ def _implicit(model: mujoco.MjModel) -> bool:
     flags, integrator = int(model.opt.disableflags), int(model.opt.integrator)
     if flags & int(mujoco.mjtDisableBit.mjDSBL_DAMPER):
         return False
-    euler = integrator == int(mujoco.mjtIntegrator.mjINT_EULER) and not flags & int(
-        mujoco.mjtDisableBit.mjDSBL_EULERDAMP
-    )
-    return euler or integrator == int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
+    if integrator == int(mujoco.mjtIntegrator.mjINT_EULER):
+        return not flags & int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
+    return integrator == int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
