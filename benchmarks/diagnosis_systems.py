@@ -1,0 +1,201 @@
+"""Robots of the diagnosis benchmark, from primitives, and how each is excited: eight runs in five operating conditions."""
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+
+SECONDS = 4.0
+RISE = 0.25  # s, of a step, so that a step asks for an effort that drives have
+# (operating condition, profile, amplitude and pace as multiples of the system's)
+RUNS = (
+    ("slow_triangle", "triangle", 1.0, 0.35),
+    ("slow_triangle", "triangle", 0.35, 0.6),
+    ("multisine", "multisine", 1.0, 1.0),
+    ("multisine", "multisine", 0.4, 1.8),
+    ("chirp", "chirp", 0.7, 1.0),
+    ("steps", "steps", 0.6, 1.0),
+    ("steps", "steps", 1.0, 1.6),
+    ("open_loop", "multisine", 1.0, 1.0),
+)
+Reference = Callable[[float], np.ndarray]
+
+
+@dataclasses.dataclass(frozen=True)
+class System:
+    """A robot without effects and what an experimenter does with it.
+
+    Attributes:
+        xml: the nominal model. Bodies that move carry geoms with stated masses; `base` is fixed and massive.
+        period: s, of log and outer controller.
+        servo: actuators take position targets (in the model's own servo); else torques of an outer PD controller.
+        kp, kd: of the outer controller, N m/rad and N m s/rad (N/m, N s/m) per actuator.
+        centre, swing: rad or m per actuator, of the reference motion; push: share of the command range in open loop.
+        pace: Hz, of the reference motion.
+        sigma: rad or m per joint, noise of the encoders.
+    """
+
+    name: str
+    xml: str
+    period: float
+    servo: bool
+    kp: tuple[float, ...]
+    kd: tuple[float, ...]
+    centre: tuple[float, ...]
+    swing: tuple[float, ...]
+    pace: float
+    sigma: tuple[float, ...]
+    push: float = 0.25
+
+
+def reference(profile: str, amplitude: np.ndarray, pace: float, rng: np.random.Generator) -> Reference:
+    """Motion around zero, `[n]` at any time: joints at different paces and phases, so that they can be told apart."""
+    n = len(amplitude)
+    paces = pace * rng.uniform(0.75, 1.25, n)
+    phases = rng.uniform(0, 1, n)
+    if profile == "triangle":
+
+        def at(t: float) -> np.ndarray:
+            s = (paces * t + phases) % 1.0
+            wave = 4 * np.abs(s - 0.5) - 1
+            return amplitude * np.clip(1.25 * wave, -1, 1)  # rests at both ends
+    elif profile == "multisine":
+        harmonics = np.outer([0.5, 1.0, 1.7, 2.9], paces)
+        shares = np.array([0.45, 0.4, 0.25, 0.12])[:, None]
+        shift = rng.uniform(0, 2 * np.pi, harmonics.shape)
+
+        def at(t: float) -> np.ndarray:
+            return amplitude * (shares * np.sin(2 * np.pi * harmonics * t + shift)).sum(0)
+    elif profile == "chirp":
+
+        def at(t: float) -> np.ndarray:
+            rate = 0.3 * t + (3.0 - 0.3) * t * t / (2 * SECONDS)  # 0.3 to 3 times the pace
+            return amplitude / (1 + 0.35 * t) * np.sin(2 * np.pi * (paces * rate + phases))
+    else:
+        levels = rng.uniform(-1, 1, (64, n))
+
+        def at(t: float) -> np.ndarray:
+            count = np.maximum(t * paces * 1.5 + phases, 0.0)
+            whole = count.astype(int)
+            s = np.clip((count - whole) / (1.5 * paces * RISE), 0, 1)
+            old, new = levels[whole, np.arange(n)], levels[whole + 1, np.arange(n)]
+            return amplitude * (old + (new - old) * s * s * (3 - 2 * s))
+
+    return at
+
+
+def _model(name: str, timestep: float, worldbody: str, actuator: str) -> str:
+    return f"""<mujoco model="{name}">
+  <compiler angle="radian" autolimits="true"/>
+  <option timestep="{timestep}" integrator="implicitfast"/>
+  <default><geom type="capsule" contype="0" conaffinity="0"/></default>
+  <worldbody>
+    <body name="base"><geom name="base" type="box" size=".06 .06 .04" mass="3"/>
+{worldbody}
+    </body>
+  </worldbody>
+  <actuator>
+{actuator}
+  </actuator>
+</mujoco>
+"""
+
+
+def _chain(links: list[tuple]) -> str:
+    """Nested bodies: (body, joint, axis, position, end of the capsule, radius, mass, damping, armature)."""
+    text, close = "", ""
+    for depth, (body, joint, axis, pos, end, radius, mass, damping, armature) in enumerate(links):
+        pad = "  " * (depth + 3)
+        text += (
+            f'{pad}<body name="{body}" pos="{pos}">\n'
+            f'{pad}  <joint name="{joint}" axis="{axis}" damping="{damping}" armature="{armature}"/>\n'
+            f'{pad}  <geom name="{body}" fromto="0 0 0 {end}" size="{radius}" mass="{mass}"/>\n'
+        )
+        close = f"{pad}</body>\n" + close
+    return text + close
+
+
+def _motors(joints: list[str], limits: list[float]) -> str:
+    return "\n".join(
+        f'    <motor name="{j}_motor" joint="{j}" ctrlrange="-{u} {u}"/>' for j, u in zip(joints, limits, strict=True)
+    )
+
+
+def _pendulum() -> System:
+    links = [("link", "hinge", "0 1 0", "0 0 0", "0 0 -.4", ".02", 0.6, 0.02, 0.006)]
+    xml = _model("pendulum", 0.005, _chain(links), _motors(["hinge"], [4.0]))
+    return System("pendulum", xml, 0.02, False, (6.0,), (0.5,), (0.6,), (1.0,), 0.5, (4e-4,))
+
+
+def _cartpole() -> System:
+    body = """      <body name="cart">
+        <joint name="slider" type="slide" axis="1 0 0" damping=".6" armature=".15"/>
+        <geom name="cart" type="box" size=".08 .05 .04" mass=".8"/>
+        <body name="pole">
+          <joint name="pole" axis="0 1 0" damping=".004" armature=".001"/>
+          <geom name="pole" fromto="0 0 0 0 0 -.5" size=".015" mass=".3"/>
+        </body>
+      </body>"""
+    motor = '    <motor name="slider_motor" joint="slider" ctrlrange="-20 20"/>'
+    xml = _model("cartpole", 0.005, body, motor)
+    return System("cartpole", xml, 0.02, False, (60.0,), (10.0,), (0.0,), (0.25,), 0.45, (3e-4, 5e-4), push=0.1)
+
+
+def _two_link() -> System:
+    links = [
+        ("upper", "shoulder", "0 1 0", "0 0 0", "0 0 -.3", ".025", 1.0, 0.06, 0.02),
+        ("lower", "elbow", "0 1 0", "0 0 -.3", "0 0 -.25", ".02", 0.6, 0.03, 0.01),
+    ]
+    xml = _model("two_link", 0.005, _chain(links), _motors(["shoulder", "elbow"], [12.0, 5.0]))
+    return System("two_link", xml, 0.01, False, (40.0, 14.0), (3.0, 1.0), (0.7, 0.6), (0.8, 0.9), 0.5, (3e-4, 4e-4))
+
+
+_JOINTS6 = ["waist", "shoulder", "elbow", "roll", "pitch", "flange"]
+
+
+def _links6() -> str:
+    return _chain(
+        [
+            ("column", "waist", "0 0 1", "0 0 .1", "0 0 .2", ".06", 3.0, 0.5, 0.25),
+            ("upper_arm", "shoulder", "0 1 0", "0 0 .2", "0 0 .35", ".045", 2.5, 0.5, 0.25),
+            ("forearm", "elbow", "0 1 0", "0 0 .35", ".3 0 0", ".04", 1.5, 0.3, 0.12),
+            ("wrist1", "roll", "1 0 0", ".3 0 0", ".08 0 0", ".035", 0.6, 0.06, 0.03),
+            ("wrist2", "pitch", "0 1 0", ".08 0 0", ".08 0 0", ".03", 0.4, 0.06, 0.03),
+            ("tool", "flange", "1 0 0", ".08 0 0", ".06 0 .03", ".025", 0.3, 0.03, 0.015),
+        ]
+    )
+
+
+_REST6 = (0.0, 0.4, 0.4, 0.3, 0.5, 0.2)
+_SWING6 = (0.7, 0.5, 0.6, 0.8, 0.7, 0.9)
+_SIGMA6 = (3e-4,) * 3 + (4e-4,) * 3
+
+
+def _arm_servo() -> System:
+    gains = zip(_JOINTS6, (400, 400, 250, 60, 60, 25), (40, 40, 20, 4, 4, 1.5), strict=True)
+    servos = "\n".join(f'    <position name="{j}_servo" joint="{j}" kp="{kp}" kv="{kv}"/>' for j, kp, kv in gains)
+    xml = _model("arm_servo", 0.005, _links6(), servos)
+    return System("arm_servo", xml, 0.01, True, (), (), _REST6, _SWING6, 0.45, _SIGMA6)
+
+
+def _arm_torque() -> System:
+    limits = [40.0, 60.0, 30.0, 8.0, 8.0, 4.0]
+    xml = _model("arm_torque", 0.005, _links6(), _motors(_JOINTS6, limits))
+    kp = (150.0, 200.0, 110.0, 20.0, 20.0, 8.0)
+    kd = (20.0, 25.0, 12.0, 2.0, 2.0, 0.8)
+    return System("arm_torque", xml, 0.01, False, kp, kd, _REST6, _SWING6, 0.45, _SIGMA6, push=0.12)
+
+
+def _leg() -> System:
+    links = [
+        ("hip_link", "abduction", "1 0 0", "0 0 0", "0 .08 0", ".04", 0.7, 0.05, 0.02),
+        ("thigh", "hip", "0 1 0", "0 .08 0", "0 0 -.2", ".025", 1.0, 0.05, 0.02),
+        ("shank", "knee", "0 1 0", "0 0 -.2", "0 0 -.2", ".015", 0.25, 0.03, 0.015),
+    ]
+    joints = ["abduction", "hip", "knee"]
+    xml = _model("leg", 0.005, _chain(links), _motors(joints, [15.0, 15.0, 8.0]))
+    kp, kd = (30.0, 30.0, 12.0), (2.0, 2.0, 0.8)
+    return System("leg", xml, 0.01, False, kp, kd, (0.0, 0.5, -0.9), (0.5, 0.7, 0.8), 0.7, (4e-4,) * 3)
+
+
+SYSTEMS = {s.name: s for s in (_pendulum(), _cartpole(), _two_link(), _arm_servo(), _arm_torque(), _leg())}
