@@ -2,7 +2,8 @@
 
 Layers, later ones win: defaults < cfg/<task>.yaml < --cfg_env < --cfg_train < flags < `section.key=value`.
 A file's `task.randomization_params`, `env.realParams` and `effects` replace earlier ones whole; an override changes
-one entry. `task.randomization_params` alone may thus have fewer parameters than the task's own file.
+one entry. `task.randomization_params` alone may thus have fewer parameters than the task's own file. `effects` may be
+the path of an effects.yaml, whose contents then are the setting.
 `env.numEnvs` and `ppo.num_envs` are one number: giving either sets both.
 """
 
@@ -33,7 +34,8 @@ from bayessim_mjx.settings import (
 
 __all__ = [
     "BayesSimConfig", "Config", "EnvConfig", "Frozen", "MonitorConfig", "PPOConfig", "RealConfig", "Section",
-    "cfg_folder", "freeze", "from_dict", "load", "read_yaml", "replace", "task_file", "thaw", "to_yaml", "unknown",
+    "cfg_folder", "freeze", "from_dict", "load", "read_effects", "read_yaml", "replace", "task_file", "thaw", "to_yaml",
+    "unknown",
 ]  # fmt: skip
 
 Layer = tuple[str, Mapping[str, Any], bool]  # where it comes from, nested values, is it a file (else flag or override)
@@ -51,6 +53,8 @@ RANDOMIZED_KEYS = (
 NUISANCE_KEYS = ("observations", "actions", "sim_params")  # noise: two numbers of their own meaning, nothing inferred
 REAL_KEYS = ("weights", "means", "stds")
 OPERATIONS = ("scaling", "additive", "absolute")
+EFFECTS_SCHEMA = 1
+EFFECTS_KEYS = ("schema", "effects", "calibrated")
 
 
 def cfg_folder() -> Path:
@@ -127,6 +131,19 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
     return typing.cast(dict[str, Any], raw)
 
 
+def read_effects(path: str | Path) -> dict[str, Any]:
+    """`effects` and `calibrated` of an effects.yaml (see `effects/storage.py`), not looked into."""
+    raw = read_yaml(path)
+    for key in raw:
+        if key not in EFFECTS_KEYS:
+            raise unknown(f"{path}: key", str(key), EFFECTS_KEYS)
+    if raw.get("schema") != EFFECTS_SCHEMA:
+        raise UserError(
+            f"{path}: schema = {raw.get('schema')!r}: expected schema: {EFFECTS_SCHEMA}, as a diagnosis writes"
+        )
+    return {key: raw.get(key) or [] for key in EFFECTS_KEYS[1:]}
+
+
 def to_yaml(plain: Mapping[str, Any]) -> str:
     """YAML text that `read_yaml` reads back exactly."""
     from omegaconf import OmegaConf
@@ -194,7 +211,7 @@ def _build(task: str, layers: Sequence[Layer]) -> Config:
 
 def _merge(merged: dict[str, Any], raw: Mapping[str, Any], source: str, is_file: bool, declared: Mapping) -> None:
     """Check one layer and write it over what is there; the layer itself is never changed."""
-    for key, value in raw.items():
+    for key, value in _with_effects(raw, source).items():
         if key not in TOP_KEYS:
             raise unknown(f"{source}: key", str(key), TOP_KEYS + _dotted(str(key)))
         if key == "task_name":
@@ -213,6 +230,18 @@ def _merge(merged: dict[str, Any], raw: Mapping[str, Any], source: str, is_file:
         raise UserError(f"{source}: env.numEnvs = {given[0]} and ppo.num_envs = {given[1]} are one setting; give one")
     if given:
         merged.setdefault("env", {})["numEnvs"] = merged.setdefault("ppo", {})["num_envs"] = given[0]
+
+
+def _with_effects(raw: Mapping[str, Any], source: str) -> Mapping[str, Any]:
+    """The layer with the contents of its effects.yaml; effects without calibrated parameters replace those before."""
+    effects = raw.get("effects")
+    if not isinstance(effects, str):
+        return {"calibrated": [], **raw} if "effects" in raw else raw
+    if not Path(effects).is_file():
+        raise UserError(
+            f"effects = {effects!r} ({source}): no such file; expected an effects.yaml or a list of {{effect, where}}"
+        )
+    return {**raw, **read_effects(effects)}
 
 
 def _merge_section(

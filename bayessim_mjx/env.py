@@ -17,8 +17,9 @@ from flax import struct
 
 from bayessim_mjx.effects.effect import Effect
 from bayessim_mjx.effects.reading import stack
+from bayessim_mjx.effects.storage import corrected
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.parameters import ParameterSpace
+from bayessim_mjx.parameters import Parameter, ParameterSpace
 from bayessim_mjx.physics import Physics, World, control_step, mjx
 
 Observations = dict[str, jax.Array]
@@ -104,6 +105,7 @@ class Task(Env):
             `randomize: False` means the model's own physics: no parameters, and no effects from the section.
         effects: unmodelled effects to simulate, whose ranges the section's `effects` may change; effects that only the
             section names come after them. theta holds the model's parameters, then those of the effects.
+        calibrated: parameters of the model as identified by a diagnosis; see `effects.storage.corrected`.
 
     A world that is no longer finite, or where a velocity reaches `speed_limit`, counts as diverged: it stays in its
     last sound state, and the episode terminates with the reward `diverged_reward`. Observations are always finite.
@@ -128,15 +130,17 @@ class Task(Env):
         config: Mapping[str, Any] | Any = None,
         randomization: Mapping[str, Any] | None = None,
         effects: Sequence[Effect] = (),
+        calibrated: Sequence[Parameter] = (),
     ) -> None:
         self.name = type(self).__name__
         self.settings = self._read(config if config is not None else {})
         self.variant: str = self.settings["variant"]
         self.episode_length = int(self.settings["episodeLength"])
-        mj_model = self.spec().compile()
         randomization = randomization or self.randomization
         section = {} if randomization.get("randomize") is False else randomization.get("randomization_params", {})
-        space = ParameterSpace.from_config(section, mj_model)
+        spec, mj_model, space = corrected(self.spec(), section, calibrated)
+        if calibrated:
+            self.spec = spec.copy  # type: ignore[method-assign]  # of the corrected model
         self.physics = Physics(mj_model, self.control_dt, space, stack(section, effects), self.max_qvel)
         self.joint_names = _names(mj_model, mujoco.mjtObj.mjOBJ_JOINT, mj_model.njnt)
         self.actuator_names = _names(mj_model, mujoco.mjtObj.mjOBJ_ACTUATOR, mj_model.nu)

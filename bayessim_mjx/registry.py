@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from bayessim_mjx import tasks
-from bayessim_mjx.effects import reading
+from bayessim_mjx.effects import reading, storage
 from bayessim_mjx.errors import UserError
 
 if TYPE_CHECKING:
@@ -30,8 +30,9 @@ def make(name: str, *, config: "Config | None" = None, effects: "Sequence[Effect
 
     Args:
         name: a name from `names()` (case and underscores do not matter), "brax:<env>" or "playground:<env>".
-        config: its `env` (episodeLength, variant, the task's own keys), `randomization` and `effects` are used;
-            `task.randomize = False` gives the nominal task, with an empty parameter space.
+        config: its `env` (episodeLength, variant, the task's own keys), `randomization`, `effects` and `calibrated` are
+            used; `task.randomize = False` gives the nominal task, with an empty parameter space. What a diagnosis
+            identified (`effects=effects.yaml`) belongs to nominal physics.
         effects: further effects, after those of the config.
         env_overrides: `env:` settings that win over the config's, e.g. `episodeLength=100`.
 
@@ -39,16 +40,26 @@ def make(name: str, *, config: "Config | None" = None, effects: "Sequence[Effect
         UserError: on an unknown name or setting.
     """
     if name.split(":")[0] in EXTERNAL and ":" in name:
+        if config is not None and (config.effects or config.calibrated):
+            raise UserError(f"effects: {name} is not simulated here, so it cannot take any; leave them out")
         wrapper = importlib.import_module("bayessim_mjx.wrappers.brax")
         return wrapper.make(name, config=config, **env_overrides)
     kind = _task(name)
-    settings = {} if config is None else {key: config.env[key] for key in config.env}
-    randomization = None if config is None else config.randomization
-    listed = () if config is None else reading.listed(config.effects)
-    if listed and randomization is not None and randomization.get("randomize") is False:
-        warnings.warn("effects: they are off, because task.randomize = False means nominal physics", stacklevel=2)
-        listed = ()
-    return kind(settings | env_overrides, randomization, (*listed, *effects))
+    if config is None:
+        return kind(env_overrides, None, effects)
+    settings = {key: config.env[key] for key in config.env} | env_overrides
+    own = (*_listed(config), *effects)
+    return kind(settings, config.randomization, own, storage.calibrated(config.calibrated))
+
+
+def _listed(config: "Config") -> "tuple[Effect, ...]":
+    """The config's effects; on nominal physics those whose values are known, as the others are neutral there."""
+    specs = config.effects
+    if config.randomization.get("randomize") is False:
+        specs = tuple(spec for spec in specs if spec.get("parameters"))
+        if len(specs) < len(config.effects):
+            warnings.warn("effects: they are off, because task.randomize = False means nominal physics", stacklevel=3)
+    return reading.listed(specs)
 
 
 def _task(name: str) -> Any:

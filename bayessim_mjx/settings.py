@@ -96,6 +96,15 @@ def _absolute(value: Any) -> Any:
     return os.path.abspath(os.path.expanduser(value)) if isinstance(value, str) and value else value
 
 
+def _own_effects(value: Any) -> Any:
+    """Effects from files, path.py:MyEffect, by paths that mean the same from any folder."""
+    if isinstance(value, list | tuple):
+        return [_own_effects(v) for v in value]
+    if isinstance(value, Mapping) and ".py:" in str(value.get("effect")):
+        return {**value, "effect": _absolute(value["effect"])}
+    return value
+
+
 def _none(value: Any) -> Any:
     """BayesSimIG writes `None` where YAML reads a string."""
     return None if value == "None" else value
@@ -306,8 +315,11 @@ class Config(Section):
     randomization: Frozen = field(default_factory=Frozen)
     effects: tuple[Frozen, ...] = setting(
         (),
-        "unmodelled effects in the simulator: list of {effect, where, ...}; ranges: task.randomization_params.effects",
+        "unmodelled effects in the simulator: list of {effect, where, ...}, or an effects.yaml; ranges: "
+        "task.randomization_params.effects",
+        spell=_own_effects,
     )
+    calibrated: tuple[Frozen, ...] = setting((), "the model's parameters as identified, from an effects.yaml")
     bayessim: BayesSimConfig = field(default_factory=BayesSimConfig)
     ppo: PPOConfig = field(default_factory=PPOConfig)
     real: RealConfig = field(default_factory=RealConfig)

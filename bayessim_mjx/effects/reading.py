@@ -11,12 +11,15 @@ from typing import Any
 from bayessim_mjx import effects as room
 from bayessim_mjx.effects.effect import Effect
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.parameters import reading
+from bayessim_mjx.parameters import checks, reading
 from bayessim_mjx.parameters.attributes import suggest
 
 
 def listed(specs: Sequence[Mapping[str, Any]]) -> tuple[Effect, ...]:
-    """The effects of a list of {effect, where, further settings of the effect}.
+    """The effects of a list of {effect, where, further settings of the effect, parameters}.
+
+    `effect` is what `effects.load` takes. `parameters` gives ranges, priors and nominal values, as in an effects.yaml:
+    {parameter: {range, distribution, nominal, ...}}, below the name of each place where `where` is a list.
 
     Raises:
         UserError: naming the entry, and what is unknown or missing in it.
@@ -31,7 +34,16 @@ def _listed(spec: Any, path: str) -> Effect:
     for key, what in (("effect", f"one of {', '.join(room.names())}"), ("where", "a joint, actuator ... of the model")):
         if given.get(key) is None:
             raise UserError(f"{path}.{key} is missing in {given}: give {what}")
-    return _make(path, given.pop("effect"), given.pop("where"), given)
+    parameters = checks.mapping(given.pop("parameters", None), f"{path}.parameters")
+    effect = _make(path, given.pop("effect"), given.pop("where"), given)
+    if isinstance(effect.where, str):
+        return _ranged(effect, effect.where, parameters, f"{path}.parameters")
+    for place, settings in parameters.items():
+        if place not in effect.where:
+            raise UserError(f"{path}.parameters.{place}: {suggest(str(place), effect.where)}")
+        below = f"{path}.parameters.{place}"
+        effect = _ranged(effect, place, checks.mapping(settings, below), below)
+    return effect
 
 
 def _make(path: str, effect: Any, where: Any, settings: Mapping[str, Any]) -> Effect:
@@ -53,21 +65,26 @@ def stack(section: Mapping[str, Any], effects: Sequence[Effect] = ()) -> tuple[E
     """
     found = list(effects)
     for path, name, where, parameters in reading.effect_groups(section):
-        places = [i for i, e in enumerate(found) if (e.name, e.where) == (name, where)]
+        spec = next((room.spec_of(e) for e in found if e.name == name), name)  # users' own go by their name too
+        new = _make(path, spec, where, {})
+        places = [i for i, e in enumerate(found) if (e.name, e.where) == (new.name, where)]
         if not places:
             places = [len(found)]
-            found.append(_make(path, name, where, {}))
-        found[places[0]] = _ranged(found[places[0]], parameters, path)
+            found.append(new)
+        found[places[0]] = _ranged(found[places[0]], where, parameters, path)
     return tuple(found)
 
 
-def _ranged(effect: Effect, settings: Mapping[str, Any], path: str) -> Effect:
-    own = {p.attribute: p for p in effect.space().parameters}
-    for label in settings:
+def _ranged(effect: Effect, place: str, settings: Mapping[str, Any], path: str) -> Effect:
+    """The effect with other ranges and priors at one place."""
+    own = {p.attribute: p for p in effect.space().parameters if p.target == place}
+    changed = {}
+    for label, setting in settings.items():
         if label not in own:
             raise UserError(f"{path}.{label}: {effect.name} has no such parameter; {suggest(label, own)}")
-    changed = {label: reading.effect_parameter(own[label], s, f"{path}.{label}") for label, s in settings.items()}
+        changed[own[label].name] = reading.effect_parameter(own[label], setting, f"{path}.{label}")
+    parameters = tuple(changed.get(p.name, p) for p in effect.space().parameters)
     try:
-        return dataclasses.replace(effect, parameters=tuple((own | changed).values()))
+        return dataclasses.replace(effect, parameters=parameters)
     except UserError as error:
         raise UserError(f"{path}: {error}") from None
