@@ -1,0 +1,178 @@
+"""What may be wrong: every effect at every place, and tied over all places, as coordinates of one vector theta."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayessim_mjx import effects as library
+from bayessim_mjx.diagnosis.scales import Scales, ranges
+from bayessim_mjx.effects.effect import Effect, Quantity
+from bayessim_mjx.effects.site import places
+from bayessim_mjx.parameters import Parameter, ParameterSpace
+from bayessim_mjx.physics import Physics
+
+Array = NDArray[np.float64]
+STEP = 0.005  # of the range: finite differences
+
+
+@dataclass(frozen=True)
+class Coordinate:
+    """One number to be fitted: the same value at one or several entries of theta.
+
+    Attributes:
+        name: of the (first) parameter; index: its entries in theta.
+        neutral, low, high: unit as the parameter's.
+        precision: of a Gaussian prior around neutral, 1/unit^2 (0: flat between the bounds).
+        unit: for people.
+    """
+
+    name: str
+    index: tuple[int, ...]
+    neutral: float
+    low: float
+    high: float
+    precision: float = 0.0
+    unit: str = ""
+
+    @property
+    def step(self) -> float:
+        return STEP * (self.high - self.low)
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One effect at one place (or tied over all), with the coordinates that describe it.
+
+    Attributes:
+        effect, where: names; `where` = "all" if tied over several places.
+        kind: actuator, joint, body, geom or world.
+        coordinates: its parameters.
+        shapes: `[k]`, whether a coordinate only shapes the effect.
+        probes: starting points `[n, k]`, in the coordinates' units.
+    """
+
+    effect: str
+    where: str
+    kind: str
+    coordinates: tuple[Coordinate, ...]
+    shapes: tuple[bool, ...]
+    probes: Array = field(repr=False, compare=False, hash=False, default_factory=lambda: np.zeros((0, 0)))
+
+    @property
+    def label(self) -> str:
+        return f"{self.effect}@{self.where}"
+
+
+def base_coordinates(space: ParameterSpace) -> tuple[Coordinate, ...]:
+    """The parameters that the simulator already has: a weak Gaussian prior inside their ranges."""
+    return tuple(
+        Coordinate(p.name, (i,), p.nominal, p.low, p.high, _precision(p), p.unit) for i, p in enumerate(space.parameters)
+    )
+
+
+def _precision(p: Parameter) -> float:
+    if p.prior == "gaussian" and p.sd:
+        return 1.0 / p.sd**2
+    return 1.0 / (0.58 * (p.high - p.low)) ** 2  # sd of a uniform prior, doubled: between the bounds nearly flat
+
+
+def stack(
+    names: Sequence[str], model_space: ParameterSpace, scales: Scales, mj_model: object, own: Sequence[type[Effect]] = ()
+) -> tuple[tuple[Effect, ...], list[tuple[type[Effect], tuple[str, ...]]]]:
+    """One Effect per name over all of its places, each place with values and ranges of its own."""
+    made, table = [], []
+    kinds = [library.load(name) for name in names] + list(own)
+    for kind in kinds:
+        found = tuple(p for p in places(kind.kind, scales.model) if _alive(kind, p, scales))
+        if not found:
+            continue
+        try:
+            parameters = tuple(p for place in found for p in ranges(kind, place, scales))
+            effect = kind(where=found, parameters=parameters)
+            effect.bind(scales.model, float(scales.model.opt.timestep), 1)
+        except ValueError:  # not applicable to this model (a mount effect on a free-floating robot ...)
+            continue
+        made.append(effect)
+        table.append((kind, found))
+    return tuple(made), table
+
+
+def _alive(kind: type[Effect], place: str, scales: Scales) -> bool:
+    """Joints that never moved tell nothing of what happens in them; nor do contacts of a model without contacts."""
+    model = scales.model
+    if kind.kind == "joint":
+        joint = [model.joint(i).name or f"joint{i}" for i in range(model.njnt)].index(place)
+        return bool(scales.moves[model.jnt_dofadr[joint]])
+    if kind.kind == "geom":
+        geom = [model.geom(i).name or f"geom{i}" for i in range(model.ngeom)].index(place)
+        return bool(model.geom_contype[geom] | model.geom_conaffinity[geom]) and _collides(model)
+    return True
+
+
+def _collides(model: object) -> bool:
+    import mujoco
+
+    off = int(model.opt.disableflags) & int(mujoco.mjtDisableBit.mjDSBL_CONTACT)  # type: ignore[attr-defined]
+    return not off
+
+
+def enumerate_candidates(physics: Physics) -> list[Candidate]:
+    """All candidates of a stack: each effect at each of its places; tied where there are several places."""
+    out, start = [], len(physics.model_space)
+    for effect in physics.effects:
+        parameters, k = effect.space().parameters, len(effect.quantities)
+        count = len(effect.places())
+        rows = [range(start + i * k, start + (i + 1) * k) for i in range(count)]
+        for i, place in enumerate(effect.places()):
+            out.append(_candidate(effect, place, [parameters[i * k : (i + 1) * k]], [rows[i]]))
+        if count > 1 and effect.kind != "geom":
+            out.append(_candidate(effect, "all", [parameters[i * k : (i + 1) * k] for i in range(count)], rows))
+        start += count * k
+    return out
+
+
+def _candidate(effect: Effect, where: str, parameters: Sequence[Sequence[Parameter]], rows: Sequence[range]) -> Candidate:
+    coordinates = []
+    for j, q in enumerate(effect.quantities):
+        own = [p[j] for p in parameters]
+        low, high = min(p.low for p in own), max(p.high for p in own)
+        index = tuple(row[j] for row in rows)
+        name = own[0].name if len(own) == 1 else f"all.{effect.name}.{q.name}"
+        coordinates.append(Coordinate(name, index, own[0].nominal, low, high, unit=own[0].unit))
+    shown = tuple(replace(c, precision=_shrink(c)) for c in coordinates)
+    shapes = tuple(q.shape for q in effect.quantities)
+    return Candidate(effect.name, where, effect.kind, shown, shapes, _probes(effect.quantities, shown))
+
+
+def _shrink(c: Coordinate) -> float:
+    """A half-normal of the range's width: keeps what data cannot tell near neutral, and is nothing to what they can."""
+    return 1.0 / (c.high - c.low) ** 2
+
+
+def _probes(quantities: Sequence[Quantity], coordinates: Sequence[Coordinate]) -> Array:
+    """Starting points: each amplitude alone at each grid value (both signs), all together, shapes over their grids."""
+    amplitude = [j for j, q in enumerate(quantities) if not q.shape]
+    shapes = [j for j in range(len(quantities)) if j not in amplitude]
+    neutral = np.array([c.neutral for c in coordinates])
+    values = [_grid(q, c) for q, c in zip(quantities, coordinates, strict=True)]
+    points = []
+    for choice in itertools.product(*(values[j] for j in shapes)):
+        for j in amplitude:
+            for value in values[j]:
+                point = neutral.copy()
+                point[shapes] = choice
+                point[j] = value
+                points.append(point)
+    return np.array(points)
+
+
+def _grid(q: Quantity, c: Coordinate) -> list[float]:
+    if q.shape:
+        return [c.low + f * (c.high - c.low) for f in q.grid]
+    out = [c.neutral + f * (c.high - c.neutral) for f in q.grid if c.high > c.neutral]
+    return out + [c.neutral - f * (c.neutral - c.low) for f in q.grid if c.low < c.neutral]

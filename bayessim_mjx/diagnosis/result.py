@@ -1,0 +1,158 @@
+"""What a diagnosis says: plain dataclasses of numbers and words, to and from JSON. The report renders them."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+SCHEMA = 1
+VERDICTS = ("no_gap", "parameters", "effects", "ambiguous", "unexplained", "insufficient_data")
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """One identified number."""
+
+    mean: float
+    sd: float
+    unit: str = ""
+
+
+@dataclass(frozen=True)
+class FoundEffect:
+    """An effect that reality has and the simulator has not.
+
+    Attributes:
+        name, where: of the library, of the model.
+        parameters: {parameter: Estimate}.
+        probability: that this effect, and none of its rivals, is what is there.
+        gap_closed, gap_closed_ci: share of the reducible squared gap, held out, 90 % interval.
+        equivalent_to: [{"effects": ["payload@link", ...], "gap_closed": ..., "why": sentence}], rivals that these logs
+            cannot tell from it.
+        sentence: for people; predicted_gap_closed: before it was added.
+        share: of the gap closed by all effects together (Shapley).
+    """
+
+    name: str
+    where: str
+    parameters: dict[str, Estimate]
+    probability: float
+    gap_closed: float
+    gap_closed_ci: tuple[float, float]
+    equivalent_to: list[dict[str, Any]] = field(default_factory=list)
+    sentence: str = ""
+    predicted_gap_closed: float = math.nan
+    share: float = math.nan
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where the gap lies: a channel (joint, actuator, sensor, link of the chain), its share, and in which region."""
+
+    channel: str
+    share: float
+    ci: tuple[float, float]
+    region: str
+    kind: str = "joint"
+
+
+@dataclass(frozen=True)
+class Gap:
+    """Root mean square of measured minus simulated motion on held-out windows, in units of the measurement noise.
+
+    horizons: [{"name": "0.25 s", "seconds", "nominal", "calibrated", "with_effects", "reducible_floor", "noise_floor",
+    "ci": {stage: [lo, hi]}}]; by_channel: {joint: {stage: value}}; physical: {joint: {stage: value, "unit"}}, rad or m.
+    """
+
+    noise_floor: float
+    nominal: float
+    calibrated: float
+    with_effects: float
+    reducible_floor: float
+    unit: str = "noise standard deviations"
+    by_channel: dict[str, dict[str, float]] = field(default_factory=dict)
+    horizons: list[dict[str, Any]] = field(default_factory=list)
+    physical: dict[str, dict[str, Any]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """The whole result.
+
+    Attributes:
+        verdict: one of VERDICTS; sentences: the verdict in words, most important first.
+        parameters: {name: {"mean", "sd", "nominal", "low", "high", "unit", "structural": sentence or ""}}.
+        candidates: ranked [{"effects": [label ...], "label", "score", "se", "gap_closed", "parameters": {..}, "absorbed"}].
+        next_experiment: {"name", "why", "evidence", "file", "table": [...]} or {}.
+        details: numbers for pictures (see `report`); not part of diagnosis.json but saved beside it.
+    """
+
+    verdict: str
+    sentences: list[str]
+    effects: list[FoundEffect]
+    where: list[Place]
+    gap: Gap
+    parameters: dict[str, dict[str, Any]]
+    candidates: list[dict[str, Any]]
+    warnings: list[str]
+    next_experiment: dict[str, Any]
+    versions: dict[str, str]
+    details: dict[str, Any] = field(default_factory=dict)
+    schema: int = SCHEMA
+
+    def to_dict(self) -> dict[str, Any]:
+        """The contents of diagnosis.json; numbers that are not finite become null."""
+        out = {"schema": self.schema} | {
+            f.name: _plain(getattr(self, f.name)) for f in dataclasses.fields(self) if f.name not in ("details", "schema")
+        }
+        return out
+
+    def save(self, folder: str | Path) -> Path:
+        """Write diagnosis.json and details.json into `folder`; returns the former's path."""
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        path = folder / "diagnosis.json"
+        path.write_text(json.dumps(self.to_dict(), indent=1, allow_nan=False) + "\n")
+        (folder / "details.json").write_text(json.dumps(_plain(self.details), allow_nan=False))
+        return path
+
+
+def load(folder: str | Path) -> Diagnosis:
+    """A saved diagnosis; what was not finite is NaN again."""
+    folder = Path(folder)
+    raw = json.loads((folder / "diagnosis.json").read_text())
+    details = folder / "details.json"
+    raw["details"] = json.loads(details.read_text()) if details.is_file() else {}
+    raw["effects"] = [_effect(e) for e in raw["effects"]]
+    raw["where"] = [Place(**{**p, "ci": tuple(p["ci"])}) for p in raw["where"]]
+    raw["gap"] = Gap(**{k: math.nan if v is None else v for k, v in raw["gap"].items()})
+    return Diagnosis(**raw)
+
+
+def _effect(raw: dict[str, Any]) -> FoundEffect:
+    parameters = {k: Estimate(**{n: math.nan if x is None else x for n, x in v.items()}) for k, v in raw["parameters"].items()}
+    rest = {k: math.nan if v is None else v for k, v in raw.items() if k != "parameters"}
+    return FoundEffect(**{**rest, "parameters": parameters, "gap_closed_ci": tuple(raw["gap_closed_ci"])})
+
+
+def _plain(value: Any) -> Any:
+    """Dataclasses, arrays and numpy numbers as JSON values."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+    if isinstance(value, dict):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, np.generic):
+        return _plain(value.item())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

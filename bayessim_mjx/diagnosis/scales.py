@@ -1,0 +1,161 @@
+"""How large forces, speeds and travel are at each place of this robot in these logs: what ranges of effects grow with."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from bayessim_mjx.effects.effect import Effect, Quantity
+from bayessim_mjx.errors import UserError
+from bayessim_mjx.logs.log import Log
+from bayessim_mjx.parameters import Parameter
+
+Array = NDArray[np.float64]
+LARGE = 98.0  # percentile that counts as the largest
+
+
+@dataclass(frozen=True)
+class Scales:
+    """Per dof `[nv]`: force [N m or N], speed, travel [rad or m], inertia; per actuator `[nu]`: command, effort.
+
+    moves: `[nv]` bool, whether the joint moved by more than its noise at all.
+    """
+
+    model: mujoco.MjModel
+    force: Array
+    speed: Array
+    travel: Array
+    inertia: Array
+    command: Array
+    effort: Array
+    moves: NDArray[np.bool_]
+
+    def at(self, kind: str, place: str) -> dict[str, float]:
+        """{word of `Quantity.per`: scale} at one place."""
+        model = self.model
+        if kind == "joint":
+            return self._of_dof(int(model.jnt_dofadr[_index(model, "joint", place)]))
+        if kind == "actuator":
+            i = _index(model, "actuator", place)
+            joint = int(model.actuator_trnid[i, 0])
+            on_joint = int(model.actuator_trntype[i]) <= int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+            own = self._of_dof(int(model.jnt_dofadr[joint])) if on_joint else {}
+            return own | {"command": float(self.command[i]), "force": float(self.effort[i])}
+        if kind == "body":
+            i = _index(model, "body", place)
+            gravity = float(np.linalg.norm(model.opt.gravity)) or 9.81
+            below = float(model.body_subtreemass[i])
+            return {"mass": max(float(model.body_mass[i]), 0.1 * below), "weight": below * gravity}
+        return {}
+
+    def _of_dof(self, v: int) -> dict[str, float]:
+        words = ("force", "speed", "travel", "inertia")
+        return {word: float(getattr(self, word)[v]) for word in words}
+
+
+def _index(model: mujoco.MjModel, kind: str, place: str) -> int:
+    count = {"joint": model.njnt, "actuator": model.nu, "body": model.nbody}[kind]
+    names = [getattr(model, kind)(i).name or f"{kind}{i}" for i in range(count)]
+    return names.index(place)
+
+
+def measure(model: mujoco.MjModel, logs: Sequence[Log]) -> Scales:
+    """Scales from logs on an even grid; forces by inverse dynamics of the measured motion, and from the commands."""
+    speed = _large([log.qvel for log in logs])
+    ptp = np.max([_span(model, log) for log in logs], axis=0)
+    data = mujoco.MjData(model)
+    torque, inertia = [], []
+    for log in logs:
+        acceleration = np.gradient(log.qvel, log.time, axis=0)
+        for k in range(0, len(log), max(1, len(log) // 100)):
+            data.qpos[:], data.qvel[:], data.qacc[:] = log.qpos[k], log.qvel[k], acceleration[k]
+            mujoco.mj_inverse(model, data)
+            torque.append(np.abs(data.qfrc_inverse))
+            inertia.append(_diagonal(model, data))
+    command = _large([log.ctrl for log in logs])
+    force = np.percentile(torque, LARGE, axis=0)
+    effort = np.zeros(model.nu)
+    for i in range(model.nu):
+        gear = float(model.actuator_gear[i, 0]) or 1.0
+        joint = int(model.actuator_trnid[i, 0])
+        on_joint = int(model.actuator_trntype[i]) <= int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+        needed = float(force[model.jnt_dofadr[joint]]) / abs(gear) if on_joint else 0.0
+        direct = command[i] * abs(float(model.actuator_gainprm[i, 0])) if model.actuator_biasprm[i, 1] == 0 else 0.0
+        effort[i] = max(needed, direct, 1e-9)
+        if on_joint:
+            force[model.jnt_dofadr[joint]] = max(force[model.jnt_dofadr[joint]], direct * abs(gear))
+    noise = np.sqrt(np.mean([np.pad(log.sigma_qpos, (0, max(0, model.nv - model.nq)))[: model.nv] ** 2 for log in logs], axis=0))
+    return Scales(
+        model=model,
+        force=np.maximum(force, 1e-9),
+        speed=np.maximum(speed, 1e-6),
+        travel=np.maximum(ptp / 2, 1e-6),
+        inertia=np.maximum(np.mean(inertia, axis=0), 1e-12),
+        command=np.maximum(command, 1e-9),
+        effort=effort,
+        moves=ptp > 10 * noise + 1e-9,
+    )
+
+
+def _large(parts: Sequence[Array]) -> Array:
+    return np.percentile(np.abs(np.concatenate(parts)), LARGE, axis=0) if parts[0].shape[1] else np.zeros(0)
+
+
+def _span(model: mujoco.MjModel, log: Log) -> Array:
+    """Range of motion per dof `[nv]`; of free and ball joints that of their coordinates, roughly."""
+    out = np.zeros(model.nv)
+    for j in range(model.njnt):
+        q, v = int(model.jnt_qposadr[j]), int(model.jnt_dofadr[j])
+        wide = {0: 6, 1: 3}.get(int(model.jnt_type[j]), 1)
+        own = np.ptp(log.qpos[:, q : q + wide], axis=0)
+        out[v : v + wide] = own
+    return out
+
+
+def _diagonal(model: mujoco.MjModel, data: mujoco.MjData) -> Array:
+    """Diagonal of the mass matrix `[nv]`, by its product with each unit vector (the same call in every MuJoCo)."""
+    column, out = np.zeros(model.nv), np.zeros(model.nv)
+    for v in range(model.nv):
+        mujoco.mj_mulM(model, data, column, np.eye(model.nv)[v])
+        out[v] = column[v]
+    return out
+
+
+def ranges(effect: type[Effect], place: str, scales: Scales) -> tuple[Parameter, ...]:
+    """The effect's parameters at a place, with ranges that fit this robot.
+
+    Raises:
+        UserError: a quantity grows with something that its kind of place does not have.
+    """
+    here = scales.at(effect.kind, place)
+    own = effect(where=place).defaults().parameters
+    return tuple(_ranged(p, q, here, effect) for p, q in zip(own, effect.quantities, strict=True))
+
+
+def _ranged(p: Parameter, q: Quantity, here: dict[str, float], effect: type[Effect]) -> Parameter:
+    if not q.per or q.reach is None:
+        return p
+    unit = _product(q.per, here, effect)
+    low, high = (float(q.neutral + r * unit) if q.neutral == 0 else float(r * unit) for r in q.reach)
+    nominal = min(max(q.neutral, low), high)
+    low, high = (low, high) if low < high else (q.low, q.high)
+    return Parameter(
+        p.name, nominal, low, high, unit=p.unit, prior=q.prior if low > 0 else "uniform", attribute=p.attribute, target=p.target, kind="effect"
+    )  # fmt: skip
+
+
+def _product(expression: str, here: dict[str, float], effect: type[Effect]) -> float:
+    """'force/speed^2' -> number."""
+    value = 1.0
+    for i, factor in enumerate(expression.split("/")):
+        word, _, power = factor.strip().partition("^")
+        if word in ("1", ""):
+            continue
+        if word not in here:
+            raise UserError(f"{effect.name}: range per {word!r}; a {effect.kind} has {', '.join(here) or 'no scales'}")
+        value *= here[word] ** ((-1 if i else 1) * float(power or 1))
+    return value

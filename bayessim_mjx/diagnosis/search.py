@@ -1,0 +1,227 @@
+"""The race: known parameters first, then all single effects, pairs of the best, and greedy steps forward and back."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from bayessim_mjx.diagnosis.candidates import Candidate
+from bayessim_mjx.diagnosis.fit import Fitter, Job
+from bayessim_mjx.diagnosis.models import Comparison, Model, compare, scored
+from bayessim_mjx.diagnosis.screen import Screened, screen
+
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Thresholds and budgets of the race, fixed before any data are seen.
+
+    Attributes:
+        relevance: an effect must close this share of the gap above the noise; drop: and lower the cost by this share.
+        evidence: and gain this many nats plus the logarithm of the number of candidates (family-wise).
+        t: and improve windows of all conditions: mean over clustered standard error.
+        floor: a model within this factor of the noise (rms) is not improved further.
+        tie: rivals are models whose share of the gap closed is within this of the winner's.
+        singles, pairs: how many candidates are fitted, and of how many all pairs.
+        most: effects in one model; iterations: of a fit; fresh: base columns differenced anew at every step if there are
+            at most so many.
+    """
+
+    relevance: float = 0.05
+    drop: float = 0.03
+    evidence: float = 5.0
+    t: float = 2.0
+    floor: float = 1.05
+    tie: float = 0.04
+    singles: int = 48
+    pairs: int = 7
+    most: int = 5
+    iterations: int = 9
+    fresh: int = 6
+
+
+@dataclass(eq=False)
+class Race:
+    """What was tried. `models` maps the labels of a model's effects to it."""
+
+    fitter: Fitter
+    candidates: Sequence[Candidate]
+    settings: Settings
+    nominal: Job
+    base: Model
+    models: dict[frozenset[str], Model] = field(default_factory=dict)
+    screened: list[Screened] = field(default_factory=list)
+    winner: Model | None = None
+    steps: list[tuple[str, Comparison]] = field(default_factory=list)
+
+    @property
+    def noise(self) -> float:
+        """Expected cost of a window under a perfect model."""
+        return float(self.fitter.size)
+
+    def better(self, old: Model, new: Model) -> Comparison:
+        return compare(old, new, self.fitter.simulator.windows.group, self.noise)
+
+    def passes(self, old: Model, new: Model) -> bool:
+        """Whether `new`'s additional effects are both real and relevant."""
+        c, s = self.better(old, new), self.settings
+        if old.total < s.floor**2 * self.noise * len(old.cost):  # nothing left above the noise
+            return False
+        many = np.log(max(len(self.candidates), 2)) * max(1, len(new.effects) - len(old.effects))
+        return c.share > s.relevance and c.drop > s.drop and c.evidence > s.evidence + many and c.t > s.t
+
+    def closure(self, model: Model) -> float:
+        """Share of the base model's gap above the noise that `model` closes, held out."""
+        return 1.0 - max(model.total - self._floor(), 0.0) / max(self.base.total - self._floor(), 1e-12)
+
+    def _floor(self) -> float:
+        return min(self.noise * len(self.base.cost), min((m.total for m in self.models.values()), default=np.inf))
+
+
+def run(fitter: Fitter, candidates: Sequence[Candidate], settings: Settings, progress: Progress | None = None) -> Race:
+    """The whole race on the windows of `fitter`."""
+    say = progress or (lambda text, done, total: None)
+    nominal = fitter.begin(fitter.base)
+    job = fitter.begin(fitter.base)
+    say("known parameters", 0, 1)
+    fitter.iterate([job], 10, lambda j: range(len(j.coordinates)))
+    job = fitter.refresh(job)
+    race = Race(fitter, candidates, settings, nominal, scored(fitter, job, ()))
+    race.models[frozenset()] = race.base
+    say("screening", 0, 1)
+    race.screened = screen(fitter, job, candidates)
+    _singles(race, say)
+    best = _pairs(race, say)
+    race.winner = _greedy(race, best, say)
+    return race
+
+
+def _fresh(race: Race, job: Job) -> list[int]:
+    base = len(race.fitter.base)
+    own = list(range(base, len(job.coordinates)))
+    return list(range(len(job.coordinates))) if base <= race.settings.fresh else own
+
+
+def fit_models(race: Race, plans: Sequence[tuple[Model, Screened]], label: str, say: Progress) -> list[Model]:
+    """Models of the plans' effects plus one more each, fitted together; what was fitted before is looked up."""
+    fitter, todo = race.fitter, {}
+    for model, extra in plans:
+        key = frozenset([*(c.label for c in model.effects), extra.candidate.label])
+        if key not in race.models and key not in todo:
+            job = fitter.derive(model.job, extra.candidate.coordinates, extra.start, " + ".join(sorted(key)))
+            todo[key] = (job, (*model.effects, extra.candidate))
+    jobs = [job for job, _ in todo.values()]
+    total = len(jobs)
+    fitter.iterate(
+        jobs, race.settings.iterations, lambda j: _fresh(race, j), progress=lambda left: say(label, total - left, total)
+    )
+    for key, (job, effects) in todo.items():
+        race.models[key] = scored(fitter, job, effects)
+    keys = [frozenset([*(c.label for c in m.effects), e.candidate.label]) for m, e in plans]
+    return [race.models[k] for k in keys]
+
+
+def _singles(race: Race, say: Progress) -> None:
+    chosen = [s for s in race.screened if s.gain > 0][: race.settings.singles]
+    fit_models(race, [(race.base, s) for s in chosen], "single effects", say)
+
+
+def ranked(race: Race, size: int | None = None) -> list[Model]:
+    """Models tried, best first."""
+    chosen = [m for m in race.models.values() if size is None or len(m.effects) == size]
+    return sorted(chosen, key=lambda m: m.total)
+
+
+def compatible(a: Candidate, b: Candidate) -> bool:
+    """Not the same numbers twice (an effect at one joint and tied over all)."""
+    return not {i for c in a.coordinates for i in c.index} & {i for c in b.coordinates for i in c.index}
+
+
+def _start_of(race: Race, candidate: Candidate) -> Screened:
+    """The candidate with its values from its single fit as the start."""
+    single = race.models.get(frozenset([candidate.label]))
+    found = next(s for s in race.screened if s.candidate.label == candidate.label)
+    if single is None:
+        return found
+    return Screened(candidate, single.values_of(candidate), found.gain, found.absorbed, found.column)
+
+
+def _pairs(race: Race, say: Progress) -> Model:
+    """All pairs of the best singles; returns the smallest model that no other beats."""
+    top = [m.effects[0] for m in ranked(race, 1)[: race.settings.pairs]]
+    singles = ranked(race, 1)
+    if not singles:
+        return race.base
+    best = singles[0]
+    if race.base.total < race.settings.floor**2 * race.noise * len(race.base.cost):
+        return race.base
+    plans = []
+    for a, b in itertools.combinations(top, 2):
+        if compatible(a, b):
+            first = race.models[frozenset([a.label])]
+            plans.append((first, _start_of(race, b)))
+    pairs = fit_models(race, plans, "pairs", say)
+    best_pair = min(pairs, key=lambda m: m.total) if pairs else None
+    if best_pair is not None and race.passes(best, best_pair):
+        return best_pair
+    return best if race.passes(race.base, best) else race.base
+
+
+def _greedy(race: Race, model: Model, say: Progress) -> Model:
+    """Add what passes, drop what does not, until nothing changes."""
+    for _ in range(race.settings.most):
+        if not model.effects:
+            return model
+        model = _polish(race, model)
+        added = _forward(race, model, say)
+        model = _backward(race, added if added is not None else model, say)
+        if added is None or frozenset(c.label for c in model.effects) == frozenset(c.label for c in added.effects[:-1]):
+            return model
+        race.steps.append((model.label, race.better(race.base, model)))
+    return model
+
+
+def _polish(race: Race, model: Model) -> Model:
+    """All columns anew at the fit, and some more steps."""
+    job = race.fitter.refresh(model.job)
+    race.fitter.iterate([job], 4, lambda j: _fresh(race, j))
+    new = scored(race.fitter, race.fitter.refresh(job), model.effects)
+    race.models[frozenset(c.label for c in model.effects)] = new
+    return new
+
+
+def _forward(race: Race, model: Model, say: Progress) -> Model | None:
+    if len(model.effects) >= race.settings.most:
+        return None
+    others = [c for c in race.candidates if all(compatible(c, e) for e in model.effects)]
+    found = [s for s in screen(race.fitter, model.job, others) if s.gain > 0][: race.settings.pairs]
+    bigger = fit_models(race, [(model, s) for s in found], f"{len(model.effects) + 1} effects", say)
+    passing = [m for m in bigger if race.passes(model, m)]
+    return min(passing, key=lambda m: m.total) if passing else None
+
+
+def _backward(race: Race, model: Model, say: Progress) -> Model:
+    """Drop effects that the others make superfluous."""
+    while len(model.effects) > 1:
+        smaller = [without(race, model, e, say) for e in model.effects]
+        idle = [m for m in smaller if not race.passes(m, model)]
+        if not idle:
+            return model
+        model = min(idle, key=lambda m: m.total)
+    return model
+
+
+def without(race: Race, model: Model, effect: Candidate, say: Progress) -> Model:
+    """The model without one of its effects, refitted."""
+    rest = [e for e in model.effects if e is not effect]
+    key = frozenset(c.label for c in rest)
+    if key not in race.models:
+        small = race.base
+        for e in rest:
+            start = Screened(e, model.values_of(e), 0.0, 0.0, np.zeros(0))
+            (small,) = fit_models(race, [(small, start)], "dropping", say)
+    return race.models[key]

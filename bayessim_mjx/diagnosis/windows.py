@@ -1,0 +1,245 @@
+"""Logs cut into windows for multiple shooting: commands per sub-step, measured motion around each start, noise, groups."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from flax import struct
+from numpy.typing import NDArray
+
+from bayessim_mjx import laws
+from bayessim_mjx.effects.site import Motion
+from bayessim_mjx.errors import UserError
+from bayessim_mjx.logs.log import Log
+from bayessim_mjx.logs.resample import resample
+
+Array = NDArray[np.float64]
+AROUND = 0.1  # s of recorded motion before and after a start that effects with memory may look at
+MAX_AROUND = 24  # control steps
+
+
+class Batch(struct.PyTreeNode):
+    """What the simulator needs of every window, leading axis W.
+
+    Attributes:
+        command: `[W, H, S, nu]`, mean over each sub-step, centred on its force evaluation.
+        around: Motion, `[W, 2 L + 1, ...]`, row L is the start.
+        qpos: `[W, H, nq]`, qvel: `[W, H, nv]`: measured after each control step.
+        drive: enabled `[W, H, nu]` or None; law `[W, nu]` or None.
+    """
+
+    command: jax.Array
+    around: Motion
+    qpos: jax.Array
+    qvel: jax.Array
+    enabled: jax.Array | None
+    law: laws.Law | None
+
+
+@dataclass(frozen=True, eq=False)
+class Windows:
+    """Windows of one length, cut from logs on the control period.
+
+    Attributes:
+        batch: for the simulator.
+        log, start, group: `[W]`, index of the log, first row in it, index of the operating condition.
+        groups: names of the conditions.
+        sigma_q, sigma_v: `[nv]`, noise of positions (tangent) and of velocities (inf where they are not used).
+        spread: `[2 nv]`, standard deviation of the measured start state.
+        logs: the resampled logs.
+        dt: control period, s.
+    """
+
+    batch: Batch
+    log: NDArray[np.int64]
+    start: NDArray[np.int64]
+    group: NDArray[np.int64]
+    groups: tuple[str, ...]
+    sigma_q: Array
+    sigma_v: Array
+    spread: Array
+    logs: tuple[Log, ...]
+    dt: float
+
+    def __len__(self) -> int:
+        return len(self.log)
+
+    @property
+    def steps(self) -> int:
+        return int(self.batch.command.shape[1])
+
+
+def groups_of(logs: Sequence[Log], key: str | None = None) -> tuple[list[int], tuple[str, ...]]:
+    """Operating condition of each log: metadata `key`, else `condition` or `operating_condition`, else one per log.
+
+    Raises:
+        UserError: the key that was asked for is not in a log's metadata.
+    """
+    labels = []
+    for log in logs:
+        value = log.metadata.get(key) if key else log.metadata.get("condition", log.metadata.get("operating_condition"))
+        if key and value is None:
+            have = ", ".join(sorted(log.metadata)) or "nothing"
+            raise UserError(f"--group {key}: the metadata of {log.name!r} has no such key; it has {have}")
+        labels.append(str(value) if value is not None else "")
+    if len(set(labels)) == 1 and len(logs) > 1 or not all(labels):
+        labels = [label if label and len(set(labels)) > 1 else log.name for label, log in zip(labels, logs, strict=True)]
+    names = tuple(dict.fromkeys(labels))
+    return [names.index(label) for label in labels], names
+
+
+def cut(
+    logs: Sequence[Log],
+    model: mujoco.MjModel,
+    dt: float,
+    substeps: int,
+    length: int,
+    *,
+    limit: int,
+    group: str | None = None,
+    use_qvel: bool = True,
+    first_only: bool = False,
+) -> Windows:
+    """Windows of `length` control steps, at most `limit`, spread evenly over the logs.
+
+    Args:
+        use_qvel: compare measured velocities too (where all logs have them).
+        first_only: one window per log, at its beginning (whole episodes).
+
+    Raises:
+        UserError: no log is long enough.
+    """
+    even = [resample(log, dt) for log in logs]
+    fine = [_fine_commands(log, e, dt, substeps) for log, e in zip(logs, even, strict=True)]
+    group_of, names = groups_of(logs, group)
+    starts = _starts(even, length, limit, first_only)
+    if not starts:
+        longest = max(len(e) - 1 for e in even)
+        raise UserError(
+            f"no log holds {length} control steps of {dt:.4g} s; the longest has {longest}; allowed: longer logs"
+        )
+    if len(names) == 1:  # one condition only: blocks in time stand in for conditions
+        names, group_of_window = _blocks(starts, even)
+    else:
+        group_of_window = [group_of[r] for r, _ in starts]
+    around = min(MAX_AROUND, max(2, int(np.ceil(AROUND / dt))))
+    law = _laws(logs, model) if any(laws.declared(log.metadata) for log in logs) else None
+    pick = np.asarray([r for r, _ in starts])
+    enabled = _enabled(even, starts, length, model) if any(not e.enabled.all() for e in even) else None
+    batch = Batch(
+        command=_stack([fine[r][a : a + length] for r, a in starts]),
+        around=_around(even, fine, starts, around),
+        qpos=_stack([even[r].qpos[a + 1 : a + length + 1] for r, a in starts]),
+        qvel=_stack([even[r].qvel[a + 1 : a + length + 1] for r, a in starts]),
+        enabled=enabled,
+        law=None if law is None else jax.tree.map(lambda x: x[pick], law),
+    )
+    sigma_q, sigma_v, spread = _noise(even, model, use_qvel and all(log.has_qvel for log in logs))
+    return Windows(
+        batch=batch,
+        log=pick,
+        start=np.asarray([a for _, a in starts]),
+        group=np.asarray(group_of_window),
+        groups=names,
+        sigma_q=sigma_q,
+        sigma_v=sigma_v,
+        spread=spread,
+        logs=tuple(even),
+        dt=dt,
+    )
+
+
+def _starts(logs: Sequence[Log], length: int, limit: int, first_only: bool) -> list[tuple[int, int]]:
+    every = []
+    for r, log in enumerate(logs):
+        last = len(log) - 1 - length
+        if last < 0:
+            continue
+        every += [(r, 0)] if first_only else [(r, a) for a in range(0, last + 1, length)]
+    if len(every) <= limit:
+        return every
+    keep = np.unique(np.linspace(0, len(every) - 1, limit).round().astype(int))
+    return [every[i] for i in keep]
+
+
+def _blocks(starts: list[tuple[int, int]], logs: Sequence[Log]) -> tuple[tuple[str, ...], list[int]]:
+    """Up to five contiguous blocks in time, over all windows in order."""
+    count = min(5, len(starts))
+    of = [i * count // len(starts) for i in range(len(starts))]
+    return tuple(f"part {i + 1} of {count}" for i in range(count)), of
+
+
+def _fine_commands(raw: Log, even: Log, dt: float, substeps: int) -> NDArray[np.float32]:
+    """`[rows, S, nu]`: mean of the held command over each sub-step, half a sub-step early.
+
+    Semi-implicit Euler advances with the force at the beginning of a sub-step; read as a leapfrog (velocities half a
+    sub-step before positions) that force stands for the interval centred there. With the command averaged over this
+    interval the positions are second order accurate, and no delay of half a sub-step is found in anybody's data.
+    """
+    h = dt / substeps
+    rows, nu = len(even), raw.ctrl.shape[1]
+    edges = even.time[0] - h / 2 + h * np.arange(rows * substeps + 1)
+    times = np.concatenate([[min(edges[0], raw.time[0]) - dt], raw.time[1:], [max(edges[-1], raw.time[-1]) + dt]])
+    held = np.concatenate([raw.ctrl])  # row k holds from time[k] to time[k+1]; the first and last for ever
+    area = np.concatenate([np.zeros((1, nu)), np.cumsum(held * np.diff(times)[:, None], axis=0)])
+    means = np.stack([np.diff(np.interp(edges, times, a)) / h for a in area.T], 1) if nu else np.zeros((rows * substeps, 0))
+    return means.reshape(rows, substeps, nu).astype(np.float32)
+
+
+def _around(even: Sequence[Log], fine: list, starts: list[tuple[int, int]], around: int) -> Motion:
+    """Recorded rows `a - around .. a + around`; beyond the ends of a log the end is held."""
+    rows = [(r, np.clip(np.arange(a - around, a + around + 1), 0, len(even[r]) - 1)) for r, a in starts]
+    return Motion(
+        qpos=_stack([even[r].qpos[i] for r, i in rows]),
+        qvel=_stack([even[r].qvel[i] for r, i in rows]),
+        command=_stack([fine[r][i] for r, i in rows]),
+        start=around,
+    )
+
+
+def _laws(logs: Sequence[Log], model: mujoco.MjModel) -> laws.Law:
+    each = [laws.read(log.metadata, model, log.actuators, str(log.metadata.get("source", log.name))) for log in logs]
+    return jax.tree.map(lambda *x: jnp.stack(x), *each)
+
+
+def _enabled(even: Sequence[Log], starts: list[tuple[int, int]], length: int, model: mujoco.MjModel) -> jax.Array:
+    """`[W, H, nu]`, 0 where an actuator's drive was off."""
+    out = []
+    for r, a in starts:
+        rows = np.ones((length, model.nu))
+        for name, stream in even[r].streams.items():
+            if name.startswith("enabled:"):
+                on = np.nan_to_num(stream[a : a + length], nan=1.0) > 0.5
+                rows[:, even[r].actuators.index(name.split(":", 1)[1])] = on
+        out.append(rows)
+    return _stack(out)
+
+
+def _noise(logs: Sequence[Log], model: mujoco.MjModel, use_qvel: bool) -> tuple[Array, Array, Array]:
+    """(sigma_q [nv], sigma_v [nv], spread of the start [2 nv]), pooled over logs."""
+    sigma = np.sqrt(np.mean([log.sigma_qpos**2 for log in logs], axis=0))
+    dofs: list[float] = []
+    for j in range(model.njnt):
+        q, kind = int(model.jnt_qposadr[j]), int(model.jnt_type[j])
+        if kind == int(mujoco.mjtJoint.mjJNT_FREE):
+            dofs += [*sigma[q : q + 3], *([2 * float(sigma[q + 3 : q + 7].mean())] * 3)]
+        elif kind == int(mujoco.mjtJoint.mjJNT_BALL):
+            dofs += [2 * float(sigma[q : q + 4].mean())] * 3
+        else:
+            dofs.append(float(sigma[q]))
+    motion = np.sqrt(np.mean([np.mean(log.qvel**2, axis=0) for log in logs], axis=0))
+    travel = np.maximum(motion * 0.05, 1e-9)
+    sigma_q = np.maximum(np.asarray(dofs), 1e-5 * travel)  # data without noise: the simulator's own precision
+    rate = np.sqrt(np.mean([log.sigma_qvel**2 for log in logs], axis=0))
+    sigma_v = np.maximum(rate, 1e-3 * motion) if use_qvel else np.full(model.nv, np.inf)
+    start_v = np.maximum(3 * rate, 0.1 * motion + 10 * sigma_q)
+    return sigma_q, sigma_v, np.concatenate([3 * sigma_q, start_v])
+
+
+def _stack(parts: list) -> jax.Array:
+    return jnp.asarray(np.stack(parts), jnp.float32)
