@@ -1,0 +1,113 @@
+"""Payload: a mass that the model does not know (a tool, a gripper's load, a battery, cables) sits on a body."""
+
+import dataclasses
+from typing import TYPE_CHECKING, ClassVar
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from bayessim_mjx.effects.bodies import native
+from bayessim_mjx.effects.effect import Effect, Quantity
+from bayessim_mjx.effects.site import Site, find
+from bayessim_mjx.parameters import attributes, constants, geometry
+
+if TYPE_CHECKING:
+    from mujoco import mjx
+
+SWEEPS = 4  # of Jacobi's method: it converges quadratically, 3 are enough for float32
+PAIRS = ((0, 1, 2), (1, 2, 0), (2, 0, 1))  # plane of the rotation and its axis
+FIELDS = ("body_mass", "body_inertia", "body_ipos", "body_iquat")
+
+
+def principal(inertia: jax.Array, quat: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Principal moments `[3]` and frame `[4]` of a symmetric matrix `[3, 3]` given in the frame `quat`.
+
+    Jacobi's rotations instead of eigh: no LAPACK under vmap, and a diagonal matrix stays as it is, bit for bit.
+    """
+    for p, q, axis in PAIRS * SWEEPS:
+        scale = jnp.trace(inertia)
+        off, apart = inertia[p, q] / scale, (inertia[q, q] - inertia[p, p]) / scale
+        # tan(angle) = 2 a_pq sgn(d) / (|d| + sqrt(d^2 + 4 a_pq^2)), d = a_qq - a_pp; 0 where a_pq = d = 0
+        square = apart**2 + 4 * off**2
+        below = jnp.abs(apart) + jnp.sqrt(jnp.where(square > 0, square, 1.0))
+        angle = jnp.arctan(jnp.where(apart < 0, -2.0, 2.0) * off / below)
+        cos, sin = jnp.cos(angle), jnp.sin(angle)
+        turn = jnp.eye(3).at[p, p].set(cos).at[q, q].set(cos).at[p, q].set(sin).at[q, p].set(-sin)
+        inertia = turn.T @ inertia @ turn
+        quat = _turned(quat, axis, -angle)
+    return jnp.diagonal(inertia), quat
+
+
+def _turned(quat: jax.Array, axis: int, angle: jax.Array) -> jax.Array:
+    """quat * (rotation about an axis of its own frame)."""
+    w, v, unit = quat[0], quat[1:], jnp.eye(3)[axis]
+    c, s = jnp.cos(angle / 2), jnp.sin(angle / 2)
+    return jnp.concatenate([(c * w - s * v[axis])[None], c * v + s * (w * unit + jnp.cross(v, unit))])
+
+
+def _loaded(
+    mass: jax.Array, inertia: jax.Array, ipos: jax.Array, iquat: jax.Array, load: jax.Array, arm: jax.Array
+) -> tuple[jax.Array, ...]:
+    """One body's FIELDS with a point mass `load` at `arm` `[3]` from its centre of mass."""
+    total = mass + load
+    local = geometry.rotation(iquat).T @ arm
+    # about the new centre of mass: I + mu (|r|^2 1 - r r^T), mu = m load / (m + load)
+    reduced = mass * (load / total)
+    moment = jnp.diag(inertia) + reduced * (jnp.sum(local**2) * jnp.eye(3) - jnp.outer(local, local))
+    moments, frame = principal(moment, iquat)
+    return total, moments, ipos + (load / total) * arm, frame
+
+
+@dataclasses.dataclass(frozen=True)
+class Payload(Effect):
+    """A point mass fixed to a body: mass, centre of mass, inertia and all that MuJoCo derives from them.
+
+    Parameters: `mass`, kg, neutral 0; `com_x`, `com_y`, `com_z`, m, where it sits in the body's frame, from the body's
+    own centre of mass; without effect where mass = 0.
+    """
+
+    name: ClassVar[str] = "payload"
+    kind: ClassVar[str] = "body"
+    quantities: ClassVar[tuple[Quantity, ...]] = (
+        Quantity("mass", 0.0, 0.0, 1.0, unit="kg", per="mass", reach=(0.0, 1.0)),
+        *(Quantity(f"com_{axis}", 0.0, -0.1, 0.1, unit="m", grid=(0.5,), shape=True) for axis in "xyz"),
+    )
+
+    def bind(self, mj_model: mujoco.MjModel, timestep: float, substeps: int) -> Site:
+        """The site; refuses bodies whose mass matrix was compiled as diagonal, which an offset mass would fill."""
+        at = find(self, mj_model, timestep, substeps)
+        for name, body in zip(at.names, at.ids, strict=True):
+            if mj_model.body_dofnum[body] > 1 and int(mj_model.body_simple[body]) == 1:
+                attributes.refuse_simple(mj_model, int(body), f"{name}.payload")
+        return at
+
+    def on_model(self, at: Site, model: "mjx.Model", theta: jax.Array) -> "mjx.Model":
+        load, arm = at.values(theta)[:, 0], at.values(theta)[:, 1:]
+        old = [getattr(model, field)[at.ids] for field in FIELDS]
+        new = jax.vmap(_loaded)(*old, load, arm)
+        changed = model.replace(
+            **{f: getattr(model, f).at[at.ids].set(n) for f, n in zip(FIELDS, new, strict=True)},
+        )
+        derived = constants.derived(changed, set(FIELDS), reference=model)
+        # neutral: the compiler's own numbers, not their recomputation in float32
+        present = jnp.any(load > 0)
+        return changed.tree_replace({k: jnp.where(present, v, _leaf(model, k)) for k, v in derived.items()})
+
+    def edit(self, spec: mujoco.MjSpec, values: dict[str, dict[str, float]]) -> str | None:
+        """Native: a body without joints, with that mass and no extent."""
+        places = list(native(spec, values))
+        compiled = spec.copy().compile()
+        for body, i, own in places:
+            if own["mass"] == 0:
+                continue
+            arm = np.array([own["com_x"], own["com_y"], own["com_z"]])
+            load = body.add_body(name=f"{body.name or f'body{i}'}.payload", pos=compiled.body_ipos[i] + arm)
+            load.mass, load.inertia, load.explicitinertial = own["mass"], np.full(3, 1e-12), True
+        return None
+
+
+def _leaf(model: "mjx.Model", name: str) -> jax.Array:
+    group, _, own = name.rpartition(".")
+    return getattr(getattr(model, group) if group else model, own)
