@@ -1,0 +1,82 @@
+"""Parameters and effects written into an MJCF: what compiles, and what is said of the rest."""
+
+import dataclasses
+
+import mujoco
+import pytest
+
+from bayessim_mjx import effects
+from bayessim_mjx.effects.coulomb_friction import CoulombFriction
+from bayessim_mjx.effects.native import write_model
+from bayessim_mjx.errors import UserError
+from bayessim_mjx.parameters import Parameter, ParameterSpace
+
+ARM = """<mujoco><option integrator="implicitfast"/><worldbody><body name="a"><joint name="first" damping="0.1"/>
+  <geom size="0.1" mass="1"/><body><joint type="slide"/><geom size="0.1" mass="2"/></body></body></worldbody>
+  <actuator><motor joint="first"/></actuator></mujoco>"""
+SPACE = ParameterSpace([Parameter("damping", 1.0, 0.5, 2.0, attribute="damping", target="first", kind="joint")])
+
+
+@pytest.fixture
+def spec():
+    return mujoco.MjSpec.from_string(ARM)
+
+
+def test_parameters_and_effects_are_both_in_the_model(spec):
+    stack = [effects.make("coulomb_friction", where="first"), effects.make("armature", where="first")]
+    values = {"first.coulomb_friction.level": 0.3, "first.armature.inertia": 0.02}
+    written, missing = write_model(spec, SPACE, [1.5], stack, values)
+    model = mujoco.MjModel.from_xml_string(written.to_xml())
+    assert missing == []
+    assert (model.dof_frictionloss[0], model.dof_armature[0]) == pytest.approx((0.3, 0.02))
+    assert model.dof_damping[0] == pytest.approx(0.15) and spec.compile().dof_damping[0] == pytest.approx(0.1)
+
+
+def test_all_places_and_unnamed_joints(spec):
+    everywhere = effects.make("coulomb_friction", where="all")
+    model = write_model(spec, SPACE, {}, [everywhere], {"all.coulomb_friction.level": 0.3})[0].compile()
+    assert list(model.dof_frictionloss) == pytest.approx([0.3, 0.3]) and model.joint(1).name == "joint1"
+    each = effects.make("coulomb_friction", where=("first", "joint1"))
+    values = {"first.coulomb_friction.level": 0.1, "joint1.coulomb_friction.level": 0.2}
+    model = write_model(spec, SPACE, {}, [each], values)[0].compile()
+    assert list(model.dof_frictionloss) == pytest.approx([0.1, 0.2])
+
+
+def test_identified_values_are_nominal_where_none_are_given(spec):
+    (p,) = effects.make("coulomb_friction", where="first").space().parameters
+    known = CoulombFriction("first", parameters=(dataclasses.replace(p, nominal=0.25),))
+    assert write_model(spec, SPACE, {}, [known])[0].compile().dof_frictionloss[0] == 0.25
+
+
+@dataclasses.dataclass(frozen=True)
+class Broken(CoulombFriction):
+    """Its edit leaves an MJCF that does not compile."""
+
+    def edit(self, spec, values):
+        spec.joint("first").type = mujoco.mjtJoint.mjJNT_FREE
+        spec.joint("first").frictionloss = 3.0
+        spec.bodies[2].add_freejoint()
+        return None
+
+
+def test_what_cannot_be_written_is_said_with_the_reason_and_leaves_no_trace(spec):
+    stack = [effects.make("actuator_delay", where="all"), Broken("first"), effects.make("coulomb_friction", "first")]
+    written, missing = write_model(spec, SPACE, {}, stack, {"first.coulomb_friction.level": 0.3})
+    assert missing[0].startswith("actuator_delay at all: MuJoCo's delay buffer holds whole timesteps")
+    assert missing[1].startswith("coulomb_friction at first: MuJoCo refuses it: ") and len(missing) == 2
+    model = written.compile()
+    assert model.joint(0).type[0] == int(mujoco.mjtJoint.mjJNT_HINGE)
+    assert model.dof_frictionloss[0] == pytest.approx(0.3)
+
+
+def test_masses_that_mujoco_fixes_by_their_sum_are_said_too(spec):
+    spec.compiler.settotalmass = 3.0
+    space = ParameterSpace([Parameter("mass", 1.0, 0.5, 2.0, attribute="mass", target="a", kind="body")])
+    written, missing = write_model(spec, space, [1.1])
+    assert len(missing) == 1 and missing[0].startswith("calibrated parameters: compiler settotalmass=3")
+    assert written.compile().body_mass[1:] == pytest.approx([1.0, 2.0])
+
+
+def test_an_unknown_place_is_refused(spec):
+    with pytest.raises(UserError, match=r"no joint 'frist' in the model; did you mean first"):
+        write_model(spec, SPACE, {}, [effects.make("coulomb_friction", where="frist")])
