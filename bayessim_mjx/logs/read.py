@@ -20,6 +20,7 @@ from bayessim_mjx.logs.table import Table, read_csv, read_npz
 
 MIN_ROWS = 10
 MAX_GAP = 5.0  # sample periods without a sample after which a file is cut in two
+SHORT_GAP = 0.01  # s; shorter pauses are bridged however fast the file is
 _SUFFIXES = (".csv", ".npz")
 _FORMAT = (
     "CSV with the columns time, ctrl:<actuator>, qpos:<joint>[, qvel:<joint>], "
@@ -34,7 +35,7 @@ def read_logs(
 ) -> list[Log]:
     """Read all runs of a folder (or the files named), in the model's order of joints and actuators.
 
-    A folder's own `map.yaml` is used where `map` is not given. Files are cut at gaps longer than MAX_GAP periods;
+    A folder's own `map.yaml` is used where `map` is not given. Files are cut at gaps longer than MAX_GAP periods and 10 ms;
     `<file stem>.yaml` beside a file becomes its metadata; `sigma` and `quantum` there, {<channel>: value}, replace the
     estimates of a channel's noise and resolution.
 
@@ -171,7 +172,7 @@ def _pieces(table: Table, columns: Mapping[str, Array], channels: Channels, meta
     """The file as one log, or as several where samples are missing for long."""
     time = columns["time"]
     steps = np.diff(time)
-    gaps = np.flatnonzero(steps > MAX_GAP * np.median(steps))
+    gaps = np.flatnonzero(steps > max(MAX_GAP * float(np.median(steps)), SHORT_GAP))
     edges = [0, *(gaps + 1), len(time)]
     spans = [(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True) if b - a >= MIN_ROWS]
     if len(gaps):

@@ -1,0 +1,223 @@
+"""Is a log's effort related to its motion? The best bounded linear model of the inverse dynamics has to explain it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import mujoco
+import numpy as np
+
+from bayessim_mjx import laws
+from bayessim_mjx.diagnosis.inverse import Columns, Dynamics
+from bayessim_mjx.diagnosis.motion import Mask, bandwidth, filtered, motion
+from bayessim_mjx.logs.log import Array, Log
+
+REFUSED, DOUBTFUL = 0.3, 0.7  # share of the effort's variance explained
+CAUSAL = (-0.003, 0.15)  # s by which motion may follow the command for physical reasons: delay, lag, elasticity
+_FAR = 0.5  # s, the largest offset between clocks that is looked for
+_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
+_NO_MEMORY = tuple(int(getattr(mujoco.mjtDyn, f"mjDYN_{n}")) for n in ("NONE", "FILTER", "FILTEREXACT"))
+
+
+@dataclass(frozen=True, eq=False)
+class Effort:
+    """What drove one joint: signal [T of the log], in the model's unit (N m, N) where `scaled`."""
+
+    joint: str
+    dof: int
+    source: str  # ctrl or effort
+    signal: Array
+    scaled: bool
+
+
+@dataclass(frozen=True)
+class Relation:
+    """How far one joint's effort follows from its motion.
+
+    Attributes:
+        explained: share of the variance, at the best lag that physics allows; None: not tested, `text` says why.
+        friction: the share that friction and offset explain without any body.
+        lag: s by which the motion follows the effort.
+        mend: what would mend it, or nothing.
+    """
+
+    joint: str
+    source: str
+    explained: float | None
+    friction: float = 0.0
+    lag: float = 0.0
+    mend: str = ""
+    text: str = ""
+
+    @property
+    def refused(self) -> bool:
+        """Too little is explained; or what is explained is a sign of the velocity that owes nothing to the masses."""
+        e = self.explained
+        return e is not None and (e < REFUSED or (e < DOUBTFUL and e < self.friction + 0.05))
+
+
+def is_effort(mj_model: mujoco.MjModel, actuator: int) -> bool:
+    """Whether this actuator's ctrl is a force up to a gain (motor, voltage), not the target of a servo."""
+    bias = mj_model.actuator_biasprm[actuator, 1] if mj_model.actuator_biastype[actuator] else 0.0
+    fixed = mj_model.actuator_gaintype[actuator] == int(mujoco.mjtGain.mjGAIN_FIXED)
+    affine = mj_model.actuator_biastype[actuator] <= int(mujoco.mjtBias.mjBIAS_AFFINE)
+    return bool(fixed and affine and bias == 0.0 and mj_model.actuator_dyntype[actuator] in _NO_MEMORY)
+
+
+def dof_of(mj_model: mujoco.MjModel, actuator: int) -> int | None:
+    """The degree of freedom of the hinge or slide joint that an actuator drives; None for tendons, sites, balls."""
+    if mj_model.actuator_trntype[actuator] not in _JOINT:
+        return None
+    joint = mj_model.actuator_trnid[actuator, 0]
+    axial = mj_model.jnt_type[joint] >= int(mujoco.mjtJoint.mjJNT_SLIDE)
+    return int(mj_model.jnt_dofadr[joint]) if axial else None
+
+
+def efforts(log: Log, mj_model: mujoco.MjModel) -> Iterator[Effort]:
+    """The efforts of every joint whose drives are all known: from the `effort:` streams, and from ctrl."""
+    dofs = [dof_of(mj_model, i) for i in range(mj_model.nu)]
+    gear = mj_model.actuator_gear[:, 0]
+    for dof in sorted({d for d in dofs if d is not None}):
+        own = [i for i, d in enumerate(dofs) if d == dof]
+        joint = log.joints[int(mj_model.dof_jntid[dof])]
+        streams = [log.streams.get(f"effort:{log.actuators[i]}") for i in own]
+        if all(s is not None and np.isfinite(s).all() for s in streams):
+            yield Effort(joint, dof, "effort", sum(g * s for g, s in zip(gear[own], streams, strict=True)), False)
+        if all(is_effort(mj_model, i) for i in own) and not _closed(log):
+            yield Effort(joint, dof, "ctrl", sum(gear[i] * _force(mj_model, i, log.ctrl[:, i]) for i in own), True)
+
+
+def _closed(log: Log) -> bool:
+    """Whether a position or velocity loop stands between the logged command and the actuator."""
+    given = log.metadata.get("controller")
+    blocks = [given, *given.values()] if isinstance(given, dict) else []
+    named = [str(b.get("law", "direct")).lower() for b in blocks if isinstance(b, dict)]
+    return any(laws.ALIASES.get(n, "direct") != "direct" for n in named)
+
+
+def _force(mj_model: mujoco.MjModel, i: int, ctrl: Array) -> Array:
+    if mj_model.actuator_ctrllimited[i]:
+        ctrl = np.clip(ctrl, *mj_model.actuator_ctrlrange[i])
+    force = mj_model.actuator_gainprm[i, 0] * ctrl
+    return np.clip(force, *mj_model.actuator_forcerange[i]) if mj_model.actuator_forcelimited[i] else force
+
+
+def relations(log: Log, mj_model: mujoco.MjModel) -> list[Relation]:
+    """One relation per joint and source of effort."""
+    found = list(efforts(log, mj_model))
+    if not found:
+        return []
+    top = bandwidth(log)
+    pictures = []
+    for cutoff in sorted({max(3.0, top / 2), top}):  # the slower one is the quieter one
+        moved = motion(log, mj_model, cutoff)
+        pictures.append(Dynamics.of(mj_model, moved))
+    return [_relation(log, mj_model, effort, pictures) for effort in found]
+
+
+def _relation(log: Log, mj_model: mujoco.MjModel, effort: Effort, pictures: list[Dynamics]) -> Relation:
+    own = Relation(effort.joint, effort.source, None)
+    tests = [t for t in (_Test.of(log, effort, d) for d in pictures) if t.rows.sum() * t.step * t.cutoff >= 4.0]
+    if not tests:
+        return replace(own, text="too little motion, free of contacts and limits, to compare the effort with")
+    if any(t.small for t in tests):
+        return replace(own, text="the effort hardly changes against the inertial forces; free motion tests nothing")
+    lags = np.linspace(-_FAR, _FAR, 41)
+    curves = [t.over(lags) for t in tests]
+    test, curve = max(zip(tests, curves, strict=True), key=lambda p: float(np.max(p[1])))
+    physical = (lags >= CAUSAL[0]) & (lags <= CAUSAL[1])
+    explained = max(float(c[physical].max()) for c in curves)
+    relation = replace(
+        own, explained=explained, friction=test.friction(), lag=_nearest(lags, curve, test.at_zero(curve, lags))
+    )
+    return replace(relation, mend=_mend(log, mj_model, effort, relation, curve, test)) if relation.refused else relation
+
+
+def _nearest(lags: Array, curve: Array, now: float) -> float:
+    """The smallest lag that is as good as the best; 0 where the best is hardly better than none."""
+    best = float(curve.max())
+    if best - now < 0.02:
+        return 0.0
+    good = np.flatnonzero(curve >= best - 0.1 * (best - now))
+    return float(lags[good[np.argmin(np.abs(lags[good]))]])
+
+
+@dataclass(frozen=True, eq=False)
+class _Test:
+    """One effort against one picture of the motion."""
+
+    log: Log
+    effort: Effort
+    picture: Dynamics
+    columns: Columns
+    rows: Mask
+
+    @classmethod
+    def of(cls, log: Log, effort: Effort, picture: Dynamics) -> _Test:
+        return cls(log, effort, picture, picture.columns(effort.dof), picture.moved.moving(effort.dof))
+
+    @property
+    def step(self) -> float:
+        return self.picture.moved.step
+
+    @property
+    def cutoff(self) -> float:
+        return self.picture.moved.cutoff
+
+    @property
+    def small(self) -> bool:
+        y = filtered(self.effort.signal, self.log, self.picture.moved)[self.rows]
+        force = (self.picture.bodies.sum(0) - self.picture.weight)[self.rows, self.effort.dof]
+        idle = float(y.std()) <= 1e-6 * float(np.abs(y).max()) + 1e-12
+        return idle or (self.effort.scaled and float(y.std()) < 0.1 * float(np.sqrt(np.mean(force**2))))
+
+    def over(self, lags: Array) -> Array:
+        """[L] share explained where the effort is delayed by each lag."""
+        signals = filtered(self.effort.signal, self.log, self.picture.moved, lags)
+        return np.array([self.columns.explained(y, self.rows, self.effort.scaled) for y in signals])
+
+    def at_zero(self, curve: Array, lags: Array) -> float:
+        return float(np.interp(0.0, lags, curve))
+
+    def friction(self) -> float:
+        y = filtered(self.effort.signal, self.log, self.picture.moved)
+        return self.columns.friction().explained(y, self.rows)
+
+    def pieces(self) -> list[tuple[float, float]]:
+        """Spans [s since the start] that the model does explain, from windows of a tenth of the log, at least 2 s."""
+        moved = self.picture.moved
+        y = filtered(self.effort.signal, self.log, moved)
+        edges = np.arange(moved.time[0], moved.time[-1] + 1e-9, max(2.0, 0.1 * self.log.duration))
+        spans: list[tuple[float, float]] = []
+        for a, b in zip(edges[:-1], edges[1:], strict=True):
+            rows = self.rows & (moved.time >= a) & (moved.time < b)
+            enough = rows.sum() * moved.step * moved.cutoff >= 3.0
+            if enough and self.columns.explained(y, rows, self.effort.scaled) > 0.9:
+                start = (
+                    spans.pop()[0] if spans and abs(spans[-1][1] - (a - moved.time[0])) < 1e-6 else a - moved.time[0]
+                )
+                spans.append((float(start), float(b - moved.time[0])))
+        return spans
+
+
+def _mend(log: Log, mj_model: mujoco.MjModel, effort: Effort, now: Relation, curve: Array, test: _Test) -> str:
+    """One remedy that would explain the effort, in words, or nothing."""
+    assert now.explained is not None
+    y = filtered(effort.signal, log, test.picture.moved)
+    if now.lag and curve.max() > DOUBTFUL:
+        return f"shifting the command by {now.lag:+.3f} s would explain {curve.max():.0%}"
+    turned = test.columns.explained(-y, test.rows, effort.scaled)
+    if turned > DOUBTFUL:
+        return f"the opposite sign would explain {turned:.0%}"
+    if np.abs(log.qpos).max() > 6.0:
+        radians = replace(log, qpos=np.radians(log.qpos), qvel=np.radians(log.qvel))
+        other = _Test.of(radians, effort, Dynamics.of(mj_model, motion(radians, mj_model, test.cutoff)))
+        share = other.columns.explained(y, other.rows, effort.scaled)
+        if share > DOUBTFUL:
+            return f"positions in degrees would explain {share:.0%}"
+    free = test.columns.explained(y, test.rows, scaled=False)
+    if effort.scaled and free > DOUBTFUL:
+        return f"another scale of the command would explain {free:.0%}"
+    spans = ", ".join(f"{a:.1f} to {b:.1f} s" for a, b in test.pieces())
+    return f"the part from {spans} alone can be explained: cut the file there" if spans else ""

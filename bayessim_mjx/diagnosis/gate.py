@@ -1,0 +1,157 @@
+"""The data gate of the diagnosis: which logs can be used, which not and why, and what is odd about them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from bayessim_mjx.diagnosis import sanity
+from bayessim_mjx.diagnosis.effort import DOUBTFUL, Relation, relations
+from bayessim_mjx.diagnosis.sanity import Finding, Velocity, refuse, warn
+from bayessim_mjx.errors import UserError
+from bayessim_mjx.logs.log import Log
+
+LATE = 0.3  # s; a larger offset between commands and motion is a fault of the clocks, not of the robot
+
+
+@dataclass(frozen=True, eq=False)
+class Report:
+    """What the gate says about one log.
+
+    Attributes:
+        relations: effort against motion, per joint and source.
+        velocities: measured velocities against derivatives of positions.
+    """
+
+    log: Log
+    remarks: tuple[Finding, ...]
+    relations: tuple[Relation, ...] = ()
+    velocities: tuple[Velocity, ...] = ()
+
+    @property
+    def usable(self) -> bool:
+        return not self.of("refused")
+
+    def of(self, kind: str) -> tuple[str, ...]:
+        """The texts of one kind: refused, warning or finding."""
+        return tuple(r.text for r in self.remarks if r.kind == kind)
+
+
+@dataclass(frozen=True, eq=False)
+class Gate:
+    """The reports of all logs, in their order.
+
+    Attributes:
+        qvel: per measured velocity channel, whether it agrees with its position in every usable log.
+    """
+
+    reports: tuple[Report, ...]
+    qvel: dict[str, bool]
+
+    @property
+    def usable(self) -> tuple[Log, ...]:
+        return tuple(r.log for r in self.reports if r.usable)
+
+    @property
+    def refused(self) -> dict[str, str]:
+        """Reasons by the name of the log."""
+        return {r.log.name: "; ".join(r.of("refused")) for r in self.reports if not r.usable}
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """One sentence each, beginning with the name of the log."""
+        refused = tuple(f"{name}: refused: {reason}" for name, reason in self.refused.items())
+        return refused + self._all("warning")
+
+    @property
+    def findings(self) -> tuple[str, ...]:
+        """What is odd, but a property of the robot rather than of the log (delays)."""
+        return self._all("finding")
+
+    @property
+    def use_qvel(self) -> bool:
+        """Whether the measured velocities may be compared with the simulator's; otherwise the positions say it all."""
+        return bool(self.qvel) and all(self.qvel.values()) and all(log.has_qvel for log in self.usable)
+
+    def demand(self) -> tuple[Log, ...]:
+        """The usable logs.
+
+        Raises:
+            UserError: there is none; with every reason.
+        """
+        if not self.usable:
+            reasons = "; ".join(f"{name}: {reason}" for name, reason in self.refused.items()) or "no logs were given"
+            raise UserError(f"no usable log: {reasons}")
+        return self.usable
+
+    def _all(self, kind: str) -> tuple[str, ...]:
+        return tuple(f"{r.log.name}: {text}" for r in self.reports if r.usable for text in r.of(kind))
+
+
+def check(logs: Sequence[Log], mj_model: mujoco.MjModel, dt: float) -> Gate:
+    """Judge every log against the model and the control period dt [s]. Nothing is raised: read the verdict.
+
+    Raises:
+        UserError: dt is no time.
+    """
+    if not (np.isfinite(dt) and dt > 0):
+        raise UserError(f"gate: dt = {dt!r}; allowed: seconds > 0")
+    reports = tuple(_report(log, mj_model, dt) for log in logs)
+    seen = [v for r in reports if r.usable for v in r.velocities]
+    # by channel: every log in which it moves has to agree
+    qvel = {c: all(v.usable(dt) for v in seen if v.channel == c) for c in dict.fromkeys(v.channel for v in seen)}
+    return Gate(reports, qvel)
+
+
+def _report(log: Log, mj_model: mujoco.MjModel, dt: float) -> Report:
+    own = tuple(f for test in sanity.CHECKS for f in test(log, dt))
+    if any(f.kind == "refused" for f in own):
+        return Report(log, own)  # nothing further can be computed from it
+    related = tuple(relations(log, mj_model))
+    seen = tuple(sanity.velocities(log))
+    step = max(dt, log.period)
+    return Report(log, (*own, *_of_velocity(seen, step), *_of_effort(related)), related, seen)
+
+
+def _of_velocity(seen: Sequence[Velocity], step: float) -> list[Finding]:
+    return [
+        warn(
+            f"qvel:{v.channel} is {v.slope:.3g} times the derivative of its position, {v.lag * 1e3:+.0f} ms late "
+            f"(correlation {v.correlation:.3f}): positions are used instead"
+        )
+        for v in seen
+        if not v.usable(step)
+    ]
+
+
+def _of_effort(related: Sequence[Relation]) -> list[Finding]:
+    """A log is refused where at least half of its joints have no effort that fits their motion."""
+    best: dict[str, Relation] = {}
+    for r in related:
+        if r.explained is not None and (r.joint not in best or r.explained > (best[r.joint].explained or 0.0)):
+            best[r.joint] = r
+    bad = [r for r in best.values() if r.refused]
+    out = [warn(f"effort of {r.joint} ({r.source}) not compared with its motion: {r.text}") for r in related if r.text]
+    for r in best.values():
+        assert r.explained is not None
+        if r in bad:
+            out.append((refuse if 2 * len(bad) >= len(best) else warn)(_unrelated(r)))
+        elif r.explained < DOUBTFUL:
+            out.append(warn(f"{r.joint}: no model explains {1 - r.explained:.0%} of its effort ({r.source})"))
+        if r.lag and r not in bad:
+            text = f"{r.joint}: its motion follows the effort ({r.source}) {r.lag * 1e3:+.0f} ms late"
+            out.append(warn(f"{text}: do the clocks agree?") if abs(r.lag) > LATE else Finding("finding", text))
+    return out
+
+
+def _unrelated(r: Relation) -> str:
+    assert r.explained is not None
+    share = min(1.0, 1.0 - r.explained)
+    text = f"effort unrelated to motion: {share:.0%} of the effort of {r.joint} ({r.source}) unexplained by any model"
+    if r.explained >= 0.3:
+        text += f", and friction alone explains {r.friction:.0%}"
+    why = r.mend or "column not aligned in time, wrong scale, or forces that were not logged?"
+    return f"{text} ({why})"
