@@ -1,4 +1,4 @@
-"""Robots of the diagnosis benchmark, from primitives, and how each is excited: eight runs in five operating conditions."""
+"""Robots of the diagnosis benchmark, from primitives, and their motion: eight runs in five operating conditions."""
 
 import dataclasses
 from collections.abc import Callable

@@ -1,7 +1,7 @@
 """Reality for the diagnosis benchmark: MuJoCo C at a tenth of the nominal step, wrong base parameters, causes, sensors.
 
-Independent of the library's physics and effects. `Plant` is a robot with its causes; `run` moves it as an experimenter
-would; `replay` is what a perfect simulator without the causes makes of the same commands.
+Independent of the library's physics and effects. `Plant` is a robot with its causes, `run` moves it as an experimenter
+would.
 """
 
 import dataclasses
@@ -13,14 +13,12 @@ from diagnosis_causes import Cause, Scales
 from diagnosis_systems import RUNS, SECONDS, System, reference
 
 FINER = 10
-WINDOW = 0.5  # s, over which an effect is compared with the noise
 QUANTUM = 2 * np.pi / 16384
-PUSHED = (0, 2, 4, 6)  # the runs that set an effect's strength
 
 
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """time [T], ctrl [T, nu] in force from each row on, measured and true qpos, qvel [T, joints], peak effort by dof."""
+    """time [T], ctrl [T, nu] in force from each row on, qpos, qvel [T, joints] with and without noise, peak effort."""
 
     time: np.ndarray
     ctrl: np.ndarray
@@ -202,20 +200,3 @@ def scales_of(plant: Plant, runs: Sequence[Run]) -> Scales:
         timestep=plant.timestep,
         servo=plant.system.servo,
     )
-
-
-def equivalent_noise(plain: Plant, runs: Sequence[Run]) -> float:
-    """How far `plain` leaves the measured motion within windows, started on it and given its commands.
-
-    Root mean square over windows and time of position differences in units of the encoder noise, largest over joints.
-    """
-    rows = round(WINDOW / plain.system.period)
-    square, count = np.zeros(len(plain.joints)), 0
-    for r in runs:
-        for start in range(0, len(r.time) - rows, rows):
-            plain.reset(r.clean[start], r.clean_v[start], r.ctrl[start])
-            for k in range(start, start + rows):
-                plain.advance(r.ctrl[k])
-                square += (plain.measure()[0] - r.clean[k + 1]) ** 2
-            count += rows
-    return float(np.max(np.sqrt(square / count) / np.asarray(plain.system.sigma)))

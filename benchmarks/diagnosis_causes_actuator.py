@@ -1,4 +1,4 @@
-"""Causes at actuators and bodies."""
+"""Causes at actuators."""
 
 import math
 from collections import deque
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from diagnosis_truth import Plant
 
 
-class _Actuator(Cause):
+class ActuatorCause(Cause):
     kind = "actuator"
 
     @property
@@ -24,7 +24,7 @@ class _Actuator(Cause):
         self.value = float(command[self.id])
 
 
-class ActuatorDelay(_Actuator):
+class ActuatorDelay(ActuatorCause):
     """A buffer of commands; times in between are interpolated."""
 
     name = "actuator_delay"
@@ -45,7 +45,7 @@ class ActuatorDelay(_Actuator):
         return {"delay": self.size}
 
 
-class ActuatorLag(_Actuator):
+class ActuatorLag(ActuatorCause):
     """MuJoCo's filterexact."""
 
     name = "actuator_lag"
@@ -62,10 +62,10 @@ class ActuatorLag(_Actuator):
         plant.data.act[plant.model.actuator_actadr[self.id]] = self.value
 
     def parameters(self) -> dict[str, float]:
-        return {"time": self.size}
+        return {"time_constant": self.size}
 
 
-class ActuatorGain(_Actuator):
+class ActuatorGain(ActuatorCause):
     name = "actuator_gain"
     largest = 0.6
 
@@ -81,7 +81,7 @@ class ActuatorGain(_Actuator):
         return {"gain": 1 + self.sign * self.size}
 
 
-class ActuatorBias(_Actuator):
+class ActuatorBias(ActuatorCause):
     name = "actuator_bias"
 
     def draw(self, rng: np.random.Generator) -> None:
@@ -97,7 +97,7 @@ class ActuatorBias(_Actuator):
         return {"bias": self.sign * self.size}
 
 
-class ActuatorDeadband(_Actuator):
+class ActuatorDeadband(ActuatorCause):
     """Of the command; in a servo of its position error."""
 
     name = "actuator_deadband"
@@ -112,10 +112,10 @@ class ActuatorDeadband(_Actuator):
         u[self.id] = origin + math.copysign(max(abs(error) - self.size, 0.0), error)
 
     def parameters(self) -> dict[str, float]:
-        return {"width": self.size}
+        return {"half_width": self.size}
 
 
-class ActuatorSaturation(_Actuator):
+class ActuatorSaturation(ActuatorCause):
     """MuJoCo's forcerange; the size is the largest effort over the limit, less one."""
 
     name = "actuator_saturation"
@@ -134,7 +134,7 @@ class ActuatorSaturation(_Actuator):
         return {"limit": self.limit}
 
 
-class SpeedTorqueLimit(_Actuator):
+class SpeedTorqueLimit(ActuatorCause):
     """|tau| <= stall (1 - |w| / w0) when driving, stall when braking: forcerange moved in every sub-step."""
 
     name = "speed_torque_limit"
@@ -161,10 +161,10 @@ class SpeedTorqueLimit(_Actuator):
         )
 
     def parameters(self) -> dict[str, float]:
-        return {"stall": self.stall, "speed": self.free_speed}
+        return {"inverse_stall": 1 / self.stall, "inverse_speed": 1 / self.free_speed}
 
 
-class EffortLoss(_Actuator):
+class EffortLoss(ActuatorCause):
     """Sag behind a source resistance: u / (1 + c |u|); in a servo of its effort, by its gains."""
 
     name = "effort_loss"
@@ -187,7 +187,7 @@ class EffortLoss(_Actuator):
         return {"loss": self.size / self.scales.force[self.joint]}
 
 
-class Cogging(_Actuator):
+class Cogging(ActuatorCause):
     name = "cogging"
     stepped = True
 
@@ -200,10 +200,11 @@ class Cogging(_Actuator):
         plant.data.qfrc_applied[plant.dof(self.joint)] += self.size * math.sin(self.count * q + self.phase)
 
     def parameters(self) -> dict[str, float]:
-        return {"amplitude": self.size, "count": self.count, "phase": self.phase}
+        a, p = self.size, self.phase
+        return {"sine": a * math.cos(p), "cosine": a * math.sin(p), "order": self.count}
 
 
-class RateLimit(_Actuator):
+class RateLimit(ActuatorCause):
     """The size is the 99 % quantile of the command's rate over the limit."""
 
     name = "rate_limit"
@@ -221,77 +222,4 @@ class RateLimit(_Actuator):
         u[self.id] = self.value
 
     def parameters(self) -> dict[str, float]:
-        return {"limit": self.limit}
-
-
-class Payload(Cause):
-    """A lump welded to the body, somewhere along it."""
-
-    name = "payload"
-    kind = "body"
-
-    def draw(self, rng: np.random.Generator) -> None:
-        self.share, self.aside = rng.uniform(0.2, 1.0), rng.uniform(-0.03, 0.03, 3)
-        self.largest = 1.5 * self.scales.mass[self.where]
-
-    def edit(self, spec: mujoco.MjSpec) -> None:
-        body = spec.body(self.where)
-        end = np.array(body.geoms[0].fromto[3:])
-        self.position = self.share * np.nan_to_num(end) + self.aside
-        lump = body.add_body(name=f"{self.where}/payload", pos=self.position)
-        lump.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.01, 0, 0], mass=max(self.size, 1e-9), contype=0, conaffinity=0
-        )
-
-    def parameters(self) -> dict[str, float]:
-        x, y, z = self.position
-        return {"mass": self.size, "x": x, "y": y, "z": z}
-
-
-class GravityTilt(Cause):
-    """The base does not stand level: gravity leans in the direction that the joints can feel."""
-
-    name = "gravity_tilt"
-    kind = "world"
-    largest = 0.25
-
-    def draw(self, rng: np.random.Generator) -> None:
-        spread = 0.3 if len(self.scales.force) < 3 else np.pi
-        self.heading = float(rng.choice([0, np.pi])) + rng.uniform(-spread, spread)
-
-    def edit(self, spec: mujoco.MjSpec) -> None:
-        g, lean = 9.81, self.size
-        spec.option.gravity = [
-            g * math.sin(lean) * math.cos(self.heading), g * math.sin(lean) * math.sin(self.heading), -g * math.cos(lean)
-        ]  # fmt: skip
-
-    def parameters(self) -> dict[str, float]:
-        return {"lean": self.size, "heading": self.heading}
-
-
-class ExternalForce(Cause):
-    """A constant force on a body in world axes (a spring balancer, wind), with gusts in one case of three."""
-
-    name = "external_force"
-    kind = "body"
-    stepped = True
-
-    def draw(self, rng: np.random.Generator) -> None:
-        heading = rng.uniform(0, 2 * np.pi) if len(self.scales.force) >= 3 else float(rng.choice([0, np.pi]))
-        self.direction = np.array([math.cos(heading), math.sin(heading), rng.uniform(-0.3, 0.3)])
-        self.gusts = 0.4 if rng.uniform() < 1 / 3 else 0.0
-        self.seed = int(rng.integers(2**31))
-        self.largest = 3 * max(self.scales.force.values())
-
-    def reset(self, plant: "Plant", command: np.ndarray) -> None:
-        self.id, self.wind = plant.model.body(self.where).id, 0.0
-        self.rng = np.random.default_rng(self.seed)
-
-    def force(self, plant: "Plant") -> None:
-        if self.gusts:  # Ornstein-Uhlenbeck of 0.5 s
-            step = plant.timestep / 0.5
-            self.wind += -self.wind * step + math.sqrt(2 * step) * self.rng.normal()
-        plant.data.xfrc_applied[self.id, :3] += self.size * (1 + self.gusts * self.wind) * self.direction
-
-    def parameters(self) -> dict[str, float]:
-        return dict(zip("xyz", (self.size * self.direction).tolist(), strict=True))
+        return {"slowness": 1 / self.limit}

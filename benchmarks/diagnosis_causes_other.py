@@ -1,4 +1,4 @@
-"""Causes at the base and the sensors, and those that no library knows."""
+"""Causes at bodies, the base and the sensors."""
 
 import math
 from collections import deque
@@ -6,26 +6,82 @@ from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
-from diagnosis_causes import JOINT, Cause, Friction
-from diagnosis_causes_more import (
-    ActuatorBias,
-    ActuatorDeadband,
-    ActuatorDelay,
-    ActuatorGain,
-    ActuatorLag,
-    ActuatorSaturation,
-    Cogging,
-    EffortLoss,
-    ExternalForce,
-    GravityTilt,
-    Payload,
-    RateLimit,
-    SpeedTorqueLimit,
-    _Actuator,
-)
+from diagnosis_causes import Cause
 
 if TYPE_CHECKING:
     from diagnosis_truth import Plant
+
+
+class Payload(Cause):
+    """A lump welded to the body, somewhere along it."""
+
+    name = "payload"
+    kind = "body"
+
+    def draw(self, rng: np.random.Generator) -> None:
+        self.share, self.aside = rng.uniform(0.2, 1.0), rng.uniform(-0.03, 0.03, 3)
+        self.largest = 1.5 * self.scales.mass[self.where]
+
+    def edit(self, spec: mujoco.MjSpec) -> None:
+        body = spec.body(self.where)
+        end = np.array(body.geoms[0].fromto[3:])
+        self.position = self.share * np.nan_to_num(end) + self.aside
+        lump = body.add_body(name=f"{self.where}/payload", pos=self.position)
+        lump.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.01, 0, 0], mass=max(self.size, 1e-9), contype=0, conaffinity=0
+        )
+
+    def parameters(self) -> dict[str, float]:
+        x, y, z = self.position
+        return {"mass": self.size, "x": x, "y": y, "z": z}
+
+
+class GravityTilt(Cause):
+    """The base does not stand level: gravity leans in the direction that the joints can feel."""
+
+    name = "gravity_tilt"
+    kind = "world"
+    largest = 0.25
+
+    def draw(self, rng: np.random.Generator) -> None:
+        spread = 0.3 if len(self.scales.force) < 3 else np.pi
+        self.heading = float(rng.choice([0, np.pi])) + rng.uniform(-spread, spread)
+
+    def edit(self, spec: mujoco.MjSpec) -> None:
+        g, lean = 9.81, self.size
+        aside = g * math.sin(lean)
+        spec.option.gravity = [aside * math.cos(self.heading), aside * math.sin(self.heading), -g * math.cos(lean)]
+
+    def parameters(self) -> dict[str, float]:
+        return {"lean": self.size, "heading": self.heading}
+
+
+class ExternalForce(Cause):
+    """A constant force on a body in world axes (a spring balancer, wind), with gusts in one case of three."""
+
+    name = "external_force"
+    kind = "body"
+    stepped = True
+
+    def draw(self, rng: np.random.Generator) -> None:
+        heading = rng.uniform(0, 2 * np.pi) if len(self.scales.force) >= 3 else float(rng.choice([0, np.pi]))
+        self.direction = np.array([math.cos(heading), math.sin(heading), rng.uniform(-0.3, 0.3)])
+        self.gusts = 0.4 if rng.uniform() < 1 / 3 else 0.0
+        self.seed = int(rng.integers(2**31))
+        self.largest = 3 * max(self.scales.force.values())
+
+    def reset(self, plant: "Plant", command: np.ndarray) -> None:
+        self.id, self.wind = plant.model.body(self.where).id, 0.0
+        self.rng = np.random.default_rng(self.seed)
+
+    def force(self, plant: "Plant") -> None:
+        if self.gusts:  # Ornstein-Uhlenbeck of 0.5 s
+            step = plant.timestep / 0.5
+            self.wind += -self.wind * step + math.sqrt(2 * step) * self.rng.normal()
+        plant.data.xfrc_applied[self.id, :3] += self.size * (1 + self.gusts * self.wind) * self.direction
+
+    def parameters(self) -> dict[str, float]:
+        return dict(zip("xyz", (self.size * self.direction).tolist(), strict=True))
 
 
 class BaseFlexibility(Cause):
@@ -123,7 +179,7 @@ class SensorFilter(Cause):
         q[i], v[i] = self.state
 
     def parameters(self) -> dict[str, float]:
-        return {"time": self.size}
+        return {"time_constant": self.size}
 
 
 class SensorGain(Cause):
@@ -140,87 +196,3 @@ class SensorGain(Cause):
 
     def parameters(self) -> dict[str, float]:
         return {"gain": 1 + self.sign * self.size}
-
-
-class PositionHysteresis(Friction):
-    """Unknown to the library: bristles that grip only in some angles, so that the loop's width depends on position."""
-
-    name = "unknown_position_hysteresis"
-
-    def draw(self, rng: np.random.Generator) -> None:
-        super().draw(rng)
-        low, high = self.scales.travel[self.where]
-        self.wave, self.phase = rng.uniform(2.0, 3.5) * 2 * np.pi / (high - low), rng.uniform(0, 2 * np.pi)
-
-    def level(self, plant: "Plant", w: float) -> float:
-        q = float(plant.data.qpos[plant.address(self.where)])
-        return self.size * max(math.sin(self.wave * q + self.phase), 1e-3)
-
-
-class CrossCoupling(_Actuator):
-    """Unknown to the library: part of this actuator's effort arrives at another joint (a differential, a taut cable)."""
-
-    name = "unknown_cross_coupling"
-    stepped = True
-
-    def draw(self, rng: np.random.Generator) -> None:
-        self.other = str(rng.choice([j for j in self.scales.force if j != self.joint]))
-
-    def force(self, plant: "Plant") -> None:
-        effort = plant.data.qfrc_actuator[plant.dof(self.joint)]
-        plant.data.qfrc_applied[plant.dof(self.other)] += self.size * effort
-
-
-class VaryingGain(_Actuator):
-    """Unknown to the library: the gain wanders with time."""
-
-    name = "unknown_varying_gain"
-    largest = 0.9
-    stepped = True
-
-    def draw(self, rng: np.random.Generator) -> None:
-        self.rate, self.phase = rng.uniform(0.25, 0.6), rng.uniform(0, 2 * np.pi)
-
-    def reset(self, plant: "Plant", command: np.ndarray) -> None:
-        super().reset(plant, command)
-        self.gain = plant.model.actuator_gainprm[self.id].copy()
-        self.bias = plant.model.actuator_biasprm[self.id].copy()
-
-    def command(self, plant: "Plant", u: np.ndarray) -> None:
-        g = 1 + self.size * math.sin(2 * math.pi * self.rate * plant.data.time + self.phase)
-        plant.model.actuator_gainprm[self.id] = self.gain * g
-        plant.model.actuator_biasprm[self.id] = self.bias * g
-
-
-class Pushes(Cause):
-    """Unknown to the library: somebody pushes at times that no log tells."""
-
-    name = "unknown_pushes"
-    kind = "body"
-    stepped = True
-
-    def draw(self, rng: np.random.Generator) -> None:
-        self.seed = int(rng.integers(2**31))
-        self.runs = 0
-        self.largest = 10 * max(self.scales.force.values())
-
-    def reset(self, plant: "Plant", command: np.ndarray) -> None:
-        self.id = plant.model.body(self.where).id
-        rng = np.random.default_rng((self.seed, round(1e6 * float(np.sum(np.abs(command))))))
-        self.starts = np.sort(rng.uniform(0.2, 3.7, 4))
-        self.forces = rng.uniform(0.5, 1.0, (4, 1)) * rng.choice([-1, 1], (4, 1)) * [1.0, 0.6, 0.2]
-
-    def force(self, plant: "Plant") -> None:
-        for start, force in zip(self.starts, self.forces, strict=True):
-            s = (plant.data.time - start) / 0.25
-            if 0 < s < 1:
-                plant.data.xfrc_applied[self.id, :3] += self.size * math.sin(math.pi * s) * force
-
-
-_KNOWN = (
-    *JOINT, ActuatorDelay, ActuatorLag, ActuatorGain, ActuatorBias, ActuatorDeadband, ActuatorSaturation, SpeedTorqueLimit,
-    EffortLoss, Cogging, RateLimit, Payload, GravityTilt, ExternalForce, BaseFlexibility, JointOffset, SensorDelay,
-    SensorFilter, SensorGain,
-)  # fmt: skip
-KNOWN: dict[str, type[Cause]] = {c.name: c for c in _KNOWN}
-UNKNOWN: dict[str, type[Cause]] = {c.name: c for c in (PositionHysteresis, CrossCoupling, VaryingGain, Pushes)}
