@@ -35,7 +35,8 @@ def resist(at: Site, step: SubStep, level: jax.Array, damping: jax.Array) -> jax
         for i, dof in enumerate(at.dadr):
             gain = dt * inverse[dof, dof]  # dw/dF
             stop = force[i] - speed[dof] / gain  # the force that would bring the joint to rest
-            held = jnp.clip(stop, -level[i, 0], level[i, 1])
+            # no clip: at level 0 its derivative in the level would be lost
+            held = jnp.where(stop < -level[i, 0], -level[i, 0], jnp.where(stop > level[i, 1], level[i, 1], stop))
             left = gain * (held - stop)  # the speed that dry friction leaves; 0 where it holds
             slope = jnp.where(left > 0, damping[i, 0], damping[i, 1])
             new = held - slope * left / (1.0 + gain * slope)

@@ -4,6 +4,7 @@ import dataclasses
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 
@@ -21,9 +22,8 @@ _AFFINE = int(mujoco.mjtBias.mjBIAS_AFFINE)
 class JointOffset(Effect):
     """measured = q + o, also for the joint's own position servo, whose command c then acts as c - o.
 
-    The servo's share is written into its bias, gain c + b1 gear (q + o): unlike a shifted command it is right at the
-    ends of ctrlrange and in the start of filtered actuators too. Controllers that a log declares (`laws`) know the
-    sensors' static error themselves.
+    A servo's force is gain c + b1 gear (q + o): its command shifts by b1 gear o / gain (-o for a position servo), and
+    its ctrlrange with it. Controllers that a log declares (`laws`) know the sensors' static error themselves.
 
     Parameters: `offset` o, rad (hinge) or m (slide), neutral 0.
     """
@@ -35,12 +35,14 @@ class JointOffset(Effect):
     )
 
     def on_model(self, at: Site, model: "mjx.Model", theta: jax.Array) -> "mjx.Model":
-        servos, place = _servos(at)
+        servos, shift = _shift(at, theta)
         if not len(servos):
             return model
-        bias = model.actuator_biasprm
-        shift = bias[servos, 1] * model.actuator_gear[servos, 0] * at.values(theta)[place, 0]
-        return model.replace(actuator_biasprm=bias.at[servos, 0].add(shift))
+        return model.replace(actuator_ctrlrange=model.actuator_ctrlrange.at[servos].add(shift[:, None]))
+
+    def on_command(self, at: Site, memory: Any, command: jax.Array, theta: jax.Array) -> tuple[Any, jax.Array]:
+        servos, shift = _shift(at, theta)
+        return memory, command.at[:, servos].add(shift) if len(servos) else command
 
     def on_start(self, at: Site, memory: Any, motion: Motion, theta: jax.Array) -> tuple[Any, Motion]:
         return memory, motion.replace(qpos=motion.qpos.at[:, at.qadr].add(-at.values(theta)[:, 0]))
@@ -54,10 +56,12 @@ class JointOffset(Effect):
         return "MuJoCo's joint sensors have no zero of their own; use effects.yaml"
 
 
-def _servos(at: Site) -> tuple[np.ndarray, np.ndarray]:
-    """(ids of actuators that close a loop on the position of a joint of the site, index of that joint in the site)."""
+def _shift(at: Site, theta: jax.Array) -> tuple[np.ndarray, jax.Array]:
+    """(ids of actuators that close a loop on the position of a joint of the site, by how much their commands shift)."""
     model = at.mj_model
     loop = (model.actuator_biastype == _AFFINE) & (model.actuator_biasprm[:, 1] != 0)
     joint = np.where(np.isin(model.actuator_trntype, _ON_JOINT), model.actuator_trnid[:, 0], -1)
     servos = np.flatnonzero(loop & np.isin(joint, at.ids))
-    return servos, np.asarray([list(at.ids).index(j) for j in joint[servos]], int)
+    place = np.asarray([list(at.ids).index(j) for j in joint[servos]], int)
+    factor = model.actuator_biasprm[servos, 1] * model.actuator_gear[servos, 0] / model.actuator_gainprm[servos, 0]
+    return servos, jnp.asarray(factor, jnp.float32) * at.values(theta)[place, 0]

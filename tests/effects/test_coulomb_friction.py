@@ -90,6 +90,17 @@ def test_holds_an_arm_against_gravity_in_both_joints():
     assert np.abs(q).max() > 0.3
 
 
+def test_the_derivative_at_neutral_is_that_of_sliding():
+    """From 1 m/s, 2 kg and 0.01 s: dv / dFc = -0.01 / 2, also at Fc = 0."""
+    xml = XML.format(integrator="Euler", damping=0)
+    p = Physics(mujoco.MjModel.from_xml_string(xml), DT, ParameterSpace(), [make("coulomb_friction", where="x")])
+
+    def speed(theta):
+        return control_step(p, p.world(theta, qvel=jnp.ones(1)), jnp.zeros(1))[0].qvel[0]
+
+    assert jax.jit(jax.grad(speed))(jnp.zeros(1))[0] == pytest.approx(-0.005, rel=1e-4)
+
+
 def test_energy_only_leaves():
     effects = [make("coulomb_friction", where="elbow", high=20.0)]
     xml = ARM.replace('damping="0.1"', "").replace('timestep="0.002"', 'timestep="0.002" gravity="0 0 0"')

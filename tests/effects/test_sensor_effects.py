@@ -1,0 +1,196 @@
+"""What sensors show, by hand from the true motion; and starts in the middle of a recording."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+from scipy.signal import lsim
+
+from bayessim_mjx.effects import make
+from bayessim_mjx.effects.site import Motion
+from bayessim_mjx.errors import UserError
+from bayessim_mjx.parameters import ParameterSpace
+from bayessim_mjx.physics import Physics, begin, control_step
+from bayessim_mjx.rollout import replay
+
+DT, STEPS = 0.02, 60
+NAMES = ("joint_offset", "sensor_gain", "sensor_filter", "sensor_delay")  # the last sees what the others show
+XML = """
+<mujoco>
+  <option timestep="0.005" gravity="0 0 0"/>
+  <default><geom type="capsule" fromto="0 0 0 .4 0 0" size=".03" mass="1" contype="0"/></default>
+  <worldbody>
+    <body><joint name="a" axis="0 1 0" damping=".3"/><geom/></body>
+    <body><joint name="b" axis="0 1 0" damping=".3" stiffness="2"/><geom/></body>
+  </worldbody>
+  <actuator>
+    <position name="a" joint="a" kp="8" kv=".2" gear="2" ctrlrange="-2 2" ctrllimited="true"/>
+    <motor name="b" joint="b"/>
+  </actuator>
+</mujoco>
+"""
+T = DT * np.arange(STEPS)
+COMMAND = np.stack([0.8 * np.sin(4 * T) + 0.3 * np.sin(9 * T), np.sin(5 * T)], axis=1)
+START = np.array([[0.3, -0.2]]), np.array([[0.5, -1.0]])
+
+
+def physics_of(effects):
+    return Physics(mujoco.MjModel.from_xml_string(XML), DT, ParameterSpace(), effects)
+
+
+@pytest.fixture(scope="module")
+def full():
+    return physics_of([make(n, where=("a", "b")) for n in NAMES])
+
+
+def theta_of(physics, values):
+    theta = np.array(physics.space.nominal)
+    for name, value in values.items():
+        theta[physics.space.names.index(name)] = value
+    return theta
+
+
+def shown(physics, values, command=COMMAND):
+    """(qpos, qvel) `[T+1, 2]` as measured."""
+    out = replay(physics, *START, command[None], theta_of(physics, values)[None])
+    return np.asarray(out["qpos"][0]), np.asarray(out["qvel"][0])
+
+
+def test_neutral_changes_no_bit(full):
+    for names, values in (((), {}), (("sensor_gain",), {"a.sensor_gain.gain": 1.1})):
+        bare = physics_of([make(n, where=("a", "b")) for n in names])
+        for one, two in zip(shown(bare, values), shown(full, values), strict=True):
+            assert np.array_equal(one, two)
+
+
+def test_two_places_are_two_single_effects(full):
+    values = dict(joint_offset=("offset", 0.05), sensor_gain=("gain", 0.9))
+    values |= dict(sensor_filter=("time_constant", 0.03), sensor_delay=("delay", 0.035))
+    values = {f"{j}.{n}.{k}": v * s for n, (k, v) in values.items() for j, s in (("a", 1.0), ("b", 1.05))}
+    singles = physics_of([make(n, where=j) for n in NAMES for j in "ab"])
+    for one, two in zip(shown(full, values), shown(singles, values), strict=True):
+        np.testing.assert_allclose(one, two, atol=1e-6)
+
+
+def test_gain_scales_what_is_shown(full):
+    true, seen = shown(full, {}), shown(full, {"b.sensor_gain.gain": 1.15})
+    for x, y in zip(true, seen, strict=True):
+        np.testing.assert_allclose(y[1:], x[1:] * [1.0, 1.15], rtol=1e-6, atol=1e-7)
+
+
+@pytest.mark.parametrize("delay", [0.005, 0.02, 0.031, 0.05])
+def test_delay_shows_the_past(full, delay):
+    true, seen = shown(full, {}), shown(full, {"b.sensor_delay.delay": delay})
+    for x, y in zip(true, seen, strict=True):
+        want = np.interp(T - delay, T, x[1:, 1])  # the first value held before
+        np.testing.assert_allclose(y[1:, 1], want, atol=2e-6)
+        assert np.array_equal(x[:, 0], y[:, 0])
+
+
+@pytest.mark.parametrize("constant", [1e-6, 0.004, 0.05])
+def test_filter_is_the_exact_low_pass(full, constant):
+    """Against scipy's simulation of T y' = q - y, settled at the first value."""
+    true, seen = shown(full, {}), shown(full, {"b.sensor_filter.time_constant": constant})
+    for x, y in zip(true, seen, strict=True):
+        first, a = x[1, 1], 1 / constant
+        want = x[1:, 1] if constant < 1e-5 else first + lsim(([a], [1, a]), x[1:, 1] - first, T)[1]
+        np.testing.assert_allclose(y[1:, 1], want, atol=2e-4 if constant < 1e-5 else 1e-5)
+        assert np.array_equal(x[:, 0], y[:, 0])
+
+
+def test_a_servo_with_an_offset_turns_to_command_minus_offset(full):
+    """True motion = that of the command c - o without offset; a motor's command does not shift."""
+    seen = shown(full, {"a.joint_offset.offset": 0.07, "b.joint_offset.offset": -0.03})
+    # gear 2: the servo's length is twice the angle, so the command shifts by twice the offset
+    shifted = shown(full, {}, COMMAND - [2 * 0.07, 0.0])
+    np.testing.assert_allclose(seen[0][1:] - [0.07, -0.03], shifted[0][1:], atol=1e-6)
+    np.testing.assert_allclose(seen[1][1:], shifted[1][1:], atol=5e-6)
+
+
+def test_a_servo_with_an_offset_at_the_end_of_ctrlrange(full):
+    """Command 2 at gear 2 means 1 rad on the encoder, so 1.08 rad in truth; ctrlrange ends at 2."""
+    physics = physics_of([make("joint_offset", where="a")])
+    out = replay(physics, *START, np.tile([[[2.0, 0.0]]], (1, 250, 1)), np.array([[-0.08]]))
+    assert out["qpos"][0, -1, 0] == pytest.approx(1.0, abs=1e-3)
+
+
+CASES = {
+    "joint_offset": ({"offset": 0.06}, 1e-5),
+    "sensor_gain": ({"gain": 0.9}, 1e-5),
+    "sensor_filter": ({"time_constant": 0.04}, 2e-3),
+    "sensor_delay": ({"delay": 0.033}, 2e-3),
+    "whole step": ({"sensor_delay.delay": 0.04}, 1e-5),
+    "all": (
+        {
+            "joint_offset.offset": 0.06,
+            "sensor_gain.gain": 0.9,
+            "sensor_filter.time_constant": 0.03,
+            "sensor_delay.delay": 0.033,
+        },
+        3e-3,
+    ),
+}
+
+
+@pytest.fixture(scope="module")
+def continued(full):
+    """Measured (qpos, qvel) `[STEPS - start, 2]` after a start in the middle of a recording."""
+
+    def run(theta, motion, commands):
+        def body(world, command):
+            world, _ = control_step(full, world, command)
+            return world, (world.measurement["qpos"], world.measurement["qvel"])
+
+        return jax.lax.scan(body, begin(full, theta, motion), commands)[1]
+
+    return jax.jit(run)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_start_in_the_middle_goes_on_as_the_recording(full, continued, case):
+    """Exact for what can be undone exactly; a fractional delay and a filter up to dt^2 terms (see CASES, rad)."""
+    own, tolerance = CASES[case]
+    values = {f"{j}.{k if '.' in k else f'{case}.{k}'}": v for j in "ab" for k, v in own.items()}
+    logged = shown(full, values)
+    rows, start = slice(10, 40), 15
+    command = np.repeat(COMMAND[:, None], full.substeps, axis=1)
+    arrays = [jnp.asarray(x[rows], jnp.float32) for x in (*logged, command)]
+    qpos, qvel = continued(
+        jnp.asarray(theta_of(full, values)), Motion(*arrays, start=start), jnp.asarray(command[10 + start :])
+    )
+    np.testing.assert_allclose(qpos, logged[0][11 + start :], atol=tolerance)
+    np.testing.assert_allclose(qvel, logged[1][11 + start :], atol=20 * tolerance)
+
+
+@pytest.mark.parametrize("case", [c for c in CASES if c in NAMES])
+def test_recovers_a_hidden_value(full, case):
+    ((key, truth),) = CASES[case][0].items()
+    neutral = float(key == "gain")
+
+    def residual(x):
+        seen = shown(full, {f"a.{case}.{key}": x[0], f"b.{case}.{key}": x[1]}, COMMAND)
+        return np.concatenate([(s - m).ravel() for s, m in zip(seen, logged, strict=True)])
+
+    values = np.array([truth, neutral + 0.7 * (truth - neutral)])
+    logged = shown(full, {f"a.{case}.{key}": values[0], f"b.{case}.{key}": values[1]}, COMMAND)
+    fit = least_squares(residual, neutral + 0.4 * (values - neutral), diff_step=1e-2)
+    np.testing.assert_allclose(fit.x - neutral, values - neutral, rtol=0.02)
+
+
+def test_the_memory_of_a_delay_grows_with_its_range():
+    for high, rows in ((0.05, 3), (0.3, 15), (0.01, 2)):
+        assert physics_of([make("sensor_delay", where="all", high=high)]).world(np.zeros(1)).memory[0][
+            "history"
+        ].shape == (rows, 2, 2)
+
+
+def test_refusals_and_what_cannot_be_written():
+    effect = make("sensor_gain", where="a")
+    with pytest.raises(UserError, match="a.sensor_gain.gain: range begins at 0; allowed: above 0"):
+        dataclasses.replace(effect, parameters=(dataclasses.replace(effect.space().parameters[0], low=0.0),))
+    for name in NAMES:
+        assert "use effects.yaml" in make(name, where="a").edit(mujoco.MjSpec.from_string(XML), {"a": {}})
