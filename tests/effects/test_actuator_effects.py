@@ -16,7 +16,7 @@ from bayessim_mjx.physics import Physics
 from bayessim_mjx.rollout import replay
 
 DT, TIMESTEP, STEPS, WORLDS = 0.02, 0.005, 40, 10
-GEAR, KP, KV, LIMIT = 2.0, 6.0, 0.4, 2.5
+KP, KV, LIMIT = 6.0, 0.4, 2.5
 XML = """
 <mujoco>
   <option timestep="0.005"/>
@@ -231,7 +231,7 @@ def test_finite_over_the_whole_range():
 
 @EACH
 def test_recovers_its_values(name):
-    """From the best of coarse starts, values of both places at once to 2 %."""
+    """Values of both places at once to 2 %, from the best of three starts off by up to 60 % (20 % for an order)."""
     p, true = physics("together"), np.ravel(TRUE[name])
     neutral = np.array([q.neutral for q in make(name, where="x").quantities * 2])
     free = np.flatnonzero(true != neutral)
@@ -243,13 +243,9 @@ def test_recovers_its_values(name):
         values[:, free] += np.asarray(points) * (true - neutral)[free]
         return (motion(p, [theta(p, name, v) for v in values]) - target).reshape(len(points), -1)
 
-    def jacobian(point):
-        near = residual([point, *(point + 0.01 * np.eye(len(free)))])
-        return ((near[1:] - near[0]) / 0.01).T
-
     starts = np.array([0.4, 0.7, 1.6])[:, None] * np.ones(len(free))
     if name == "cogging":  # the order is found from nearby only
-        starts[:, 2] = [0.6, 0.9, 1.2]
+        starts[:, 2] = [0.8, 0.9, 1.2]
     start = starts[np.argmin((residual(starts) ** 2).sum(axis=1))]
-    fit = least_squares(lambda x: residual([x])[0], start, jac=jacobian, bounds=(0, np.inf))
+    fit = least_squares(lambda x: residual([x])[0], start, diff_step=0.01, bounds=(0, np.inf))
     np.testing.assert_allclose(fit.x, 1.0, atol=0.02)
