@@ -1,0 +1,48 @@
+"""report.html: one self-contained page, plotly.js inside, nothing loaded from anywhere."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from markupsafe import Markup
+
+from bayessim_mjx.diagnosis.result import Diagnosis
+from bayessim_mjx.report import sections
+from bayessim_mjx.report.look import STAGE, WIDTH
+from bayessim_mjx.report.words import STAGES
+
+TEMPLATE = "template.html.j2"
+
+
+def write(diagnosis: Diagnosis, folder: str | Path) -> Path:
+    """Write `folder/report.html`; returns its path."""
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / "report.html"
+    path.write_text(render(diagnosis), encoding="utf-8")
+    return path
+
+
+def render(d: Diagnosis) -> str:
+    """The page as text."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+    from plotly.offline import get_plotlyjs
+
+    environment = Environment(
+        loader=FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=StrictUndefined,
+        trim_blocks=True, lstrip_blocks=True,
+    )  # fmt: skip
+    environment.filters["embed"] = embed
+    return environment.get_template(TEMPLATE).render(
+        plotly=Markup(get_plotlyjs()), width=WIDTH, stage_names=STAGES, stage_colours=STAGE, verdict=d.verdict,
+        top=sections.top(d), gap=sections.how_far(d), effects=sections.effects(d), candidates=sections.candidates(d),
+        where=sections.where(d), overlays=sections.overlays(d), parameters=sections.parameters(d),
+        isolability=sections.isolability(d), flexible=sections.flexible(d), experiment=sections.experiment(d),
+        data=sections.data(d), warnings=d.warnings, versions=d.versions,
+    )  # fmt: skip
+
+
+def embed(value: Any) -> Markup:
+    """JSON that may stand inside a <script> element, whatever strings are in it."""
+    text = json.dumps(value, allow_nan=False, separators=(",", ":"), ensure_ascii=True)
+    return Markup(text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026"))

@@ -1,0 +1,216 @@
+"""A diagnosis in plain English: effects, places, units, numbers with sensible digits, verdicts and what to do next."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from bayessim_mjx.diagnosis.result import Diagnosis, Estimate, FoundEffect
+
+# effect: (what people call it, kind of place)
+EFFECTS = {
+    "actuator_delay": ("command delay", "actuator"),
+    "actuator_lag": ("actuator lag", "actuator"),
+    "actuator_gain": ("wrong actuator gain", "actuator"),
+    "actuator_bias": ("effort bias", "actuator"),
+    "actuator_deadband": ("command deadband", "actuator"),
+    "actuator_saturation": ("effort saturation", "actuator"),
+    "speed_torque_limit": ("speed-torque limit", "actuator"),
+    "effort_loss": ("effort loss at high load", "actuator"),
+    "cogging": ("cogging", "actuator"),
+    "rate_limit": ("command rate limit", "actuator"),
+    "coulomb_friction": ("Coulomb friction", "joint"),
+    "stribeck_friction": ("Stribeck friction", "joint"),
+    "viscous_friction": ("viscous friction", "joint"),
+    "load_friction": ("load-dependent friction", "joint"),
+    "asymmetric_friction": ("direction-dependent friction", "joint"),
+    "quadratic_drag": ("quadratic drag", "joint"),
+    "backlash": ("backlash", "joint"),
+    "joint_elasticity": ("elastic transmission", "joint"),
+    "joint_spring": ("spring", "joint"),
+    "armature": ("added rotor inertia", "joint"),
+    "joint_offset": ("angle offset", "joint"),
+    "payload": ("extra payload", "body"),
+    "gravity_tilt": ("tilted base", "world"),
+    "external_force": ("external force", "body"),
+    "base_flexibility": ("flexible mount", "body"),
+    "contact_friction": ("changed contact friction", "geom"),
+    "contact_compliance": ("contact compliance", "geom"),
+    "sensor_delay": ("measurement delay", "joint"),
+    "sensor_filter": ("measurement filter", "joint"),
+    "sensor_gain": ("wrong sensor gain", "joint"),
+}
+# quantities that are easier to read as their reciprocal
+RECIPROCALS = {
+    "inverse_limit": "limit",
+    "inverse_stall": "stall effort",
+    "inverse_speed": "no-load speed",
+    "slowness": "largest rate",
+}
+STAGES = {
+    "nominal": "as delivered",
+    "calibrated": "recalibrated",
+    "with_effects": "with effects",
+    "reducible_floor": "reducible floor",
+    "noise_floor": "noise floor",
+}
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Badge text, one sentence where the diagnosis brings none, and what to do next."""
+
+    badge: str
+    headline: str
+    advice: str
+
+
+VERDICTS = {
+    "no_gap": Verdict(
+        "No gap",
+        "The simulator reproduces the logs as well as their noise allows.",
+        "Train on the simulator as it is. Motions unlike the logged ones are not covered: log those too.",
+    ),
+    "parameters": Verdict(
+        "Parameters only",
+        "Recalibrating what the simulator already has closes the gap; nothing is missing.",
+        "Take over the recalibrated parameters below; no effect needs to be added.",
+    ),
+    "effects": Verdict(
+        "Missing effects found",
+        "The simulator leaves out effects that these logs identify.",
+        "Pass effects=effects.yaml to main, train or play, or load model_with_effects.xml in plain MuJoCo.",
+    ),
+    "ambiguous": Verdict(
+        "Ambiguous",
+        "Several explanations fit these logs equally well.",
+        "Run the next experiment below: it separates the rivals. Until then, randomise over all of them.",
+    ),
+    "unexplained": Verdict(
+        "Unexplained",
+        "Part of the gap is reproducible, but no effect in the library explains it.",
+        "Look at where the remaining force acts, below, and give the cause as an effect of your own "
+        "(--effects file.py:Name).",
+    ),
+    "insufficient_data": Verdict(
+        "Too little data",
+        "These logs cannot tell.",
+        "Repair or extend the logs as the warnings below say, and diagnose again.",
+    ),
+}
+_SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+def finite(value: Any) -> bool:
+    """A number that can be shown; None, NaN, infinities and text cannot."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _power(value: float) -> int:
+    return math.floor(math.log10(abs(value))) if value else 0
+
+
+def _fixed(value: float, decimals: int) -> str:
+    text = f"{value:.{max(decimals, 0)}f}"
+    return text.replace("-", "−") if float(text) else text.lstrip("-")
+
+
+def number(value: Any, digits: int = 3) -> str:
+    """`digits` significant digits without an exponent where people read none; "–" where there is no number."""
+    if not finite(value):
+        return "–"
+    if value and not -4 <= _power(value) < 6:
+        p = _power(value)
+        return f"{_fixed(value / 10**p, digits - 1)}·10{str(p).translate(_SUPERSCRIPT)}"
+    text = _fixed(value, digits - 1 - _power(float(f"{value:.{digits - 1}e}")))
+    return text.rstrip("0").rstrip(".") if "." in text and abs(value) >= 10**digits else text
+
+
+def percent(share: Any, sign: bool = False) -> str:
+    """A share as whole per cents, one decimal below 10 %."""
+    if not finite(share):
+        return "–"
+    text = _fixed(100 * share, 1 if 0 < abs(share) < 0.0995 else 0)
+    return ("+" if sign and share > 0 else "") + text + " %"
+
+
+def unit(text: str) -> str:
+    """`N m s^2/rad^2` -> `N m s²/rad²`."""
+    parts = text.split("^")
+    return parts[0] + "".join(p[:1].translate(_SUPERSCRIPT) + p[1:] for p in parts[1:])
+
+
+def estimate(mean: Any, sd: Any = math.nan, in_unit: str = "") -> str:
+    """`0.031 ± 0.002 N m`: one digit of the sd (two where it begins with 1), the mean to the same place; s below 0.5 as ms."""
+    if in_unit == "s" and finite(mean) and abs(mean) < 0.5:
+        mean, sd, in_unit = 1e3 * mean, 1e3 * sd if finite(sd) else sd, "ms"
+    tail = f" {unit(in_unit)}" if in_unit else ""
+    if not finite(mean) or not finite(sd) or sd <= 0 or sd > 1e3 * abs(mean) > 0:
+        return number(mean) + tail
+    big = max(_power(mean), _power(sd))
+    if not -4 <= big < 6:
+        return f"({estimate(mean / 10**big, sd / 10**big)})·10{str(big).translate(_SUPERSCRIPT)}{tail}"
+    places = (1 if f"{sd:e}"[0] == "1" else 0) - _power(sd)
+    return f"{_fixed(round(mean, places), places)} ± {_fixed(round(sd, places), places)}{tail}"
+
+
+def effect_noun(name: str) -> str:
+    return EFFECTS.get(name, (name.replace("_", " "), ""))[0]
+
+
+def effect_title(name: str, where: str) -> str:
+    """`Coulomb friction at joint 'elbow'`."""
+    noun, kind = effect_noun(name), EFFECTS.get(name, ("", ""))[1]
+    noun = noun[:1].upper() + noun[1:]
+    if kind == "world" or not where:
+        return noun
+    if where == "all":
+        return f"{noun} at all {kind or 'place'}s"
+    return f"{noun} at {kind} '{where}'" if kind else f"{noun} at '{where}'"
+
+
+def label_title(label: str, short: bool = False) -> str:
+    """`coulomb_friction@elbow` -> `Coulomb friction at joint 'elbow'`, or in short `Coulomb friction · elbow`."""
+    name, _, where = str(label).partition("@")
+    if short and where:
+        title = effect_noun(name)
+        return f"{title[:1].upper()}{title[1:]} · {where}"
+    return effect_title(name, where) if where or name in EFFECTS else str(label)
+
+
+def candidate_title(candidate: Mapping[str, Any]) -> str:
+    labels = candidate.get("effects") or []
+    return " + ".join(label_title(x, short=True) for x in labels) or str(candidate.get("label") or "no effect")
+
+
+def quantity(name: str, value: Estimate) -> tuple[str, str]:
+    """A parameter's name and value for people; reciprocals turned over (`inverse_limit` 0.5 1/(N m) -> limit 2 N m)."""
+    if name in RECIPROCALS and finite(value.mean) and value.mean > 0:
+        sd = value.sd / value.mean**2 if finite(value.sd) else value.sd  # d(1/x) = dx / x^2
+        return RECIPROCALS[name], estimate(1 / value.mean, sd, _turned(value.unit))
+    return name.replace("_", " "), estimate(value.mean, value.sd, value.unit)
+
+
+def _turned(text: str) -> str:
+    over, _, under = text.partition("/")
+    under = under.removeprefix("(").removesuffix(")")
+    return under if over in ("1", "") else f"{under}/{over}"
+
+
+def effect_line(effect: FoundEffect) -> str:
+    """`Coulomb friction at joint 'elbow': 0.031 ± 0.002 N m`; several parameters by name."""
+    found = [quantity(k, v) for k, v in effect.parameters.items()]
+    values = [v for _, v in found] if len(found) == 1 and len(effect.parameters) == 1 else [f"{k} {v}" for k, v in found]
+    return effect_title(effect.name, effect.where) + (": " + ", ".join(values) if values else "")
+
+
+def headline(diagnosis: Diagnosis) -> str:
+    return diagnosis.sentences[0] if diagnosis.sentences else VERDICTS[diagnosis.verdict].headline
+
+
+def gap_closed(stages: Mapping[str, Any]) -> float:
+    """Share of the reducible squared gap closed from the delivered simulator to the one with effects; NaN if unknown."""
+    before, after, floor = (stages.get(k) for k in ("nominal", "with_effects", "reducible_floor"))
+    if not (finite(before) and finite(after) and finite(floor)) or before <= floor:  # type: ignore[operator]
+        return math.nan
+    return (before**2 - after**2) / (before**2 - floor**2)  # type: ignore[operator]

@@ -1,0 +1,129 @@
+"""The page says everything that is in the diagnosis, shows hostile strings as text and loads nothing."""
+
+import json
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+import fake  # noqa: E402
+
+from bayessim_mjx import report  # noqa: E402
+from bayessim_mjx.diagnosis.result import VERDICTS, load  # noqa: E402
+from bayessim_mjx.report.words import VERDICTS as WORDS  # noqa: E402
+
+VOID = {"meta", "br", "hr", "img", "input", "link", "wbr", "line", "rect", "circle"}
+
+
+class Page(HTMLParser):
+    """Visible text, tags with attributes, JSON of the figures, and whether tags are balanced."""
+
+    def __init__(self, source: str):
+        super().__init__()
+        self.tags, self.open, self.words, self.figures, self.scripts = [], [], [], [], 0
+        self.feed(source)
+        self.text = " ".join("".join(self.words).split())
+
+    def handle_starttag(self, tag, attributes):
+        self.tags.append((tag, dict(attributes)))
+        if tag not in VOID:
+            self.open.append((tag, dict(attributes)))
+
+    def handle_endtag(self, tag):
+        assert self.open and self.open[-1][0] == tag, f"</{tag}> closes {self.open[-1:]}"
+        self.open.pop()
+
+    def handle_data(self, data):
+        tag, attributes = self.open[-1] if self.open else ("", {})
+        if tag == "script" and attributes.get("type") == "application/json":
+            self.figures.append(json.loads(data))
+        elif tag == "script":
+            self.scripts += 1
+        elif tag != "style":
+            self.words.append(data)
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    return report.write(fake.full(), tmp_path_factory.mktemp("page"))
+
+
+@pytest.fixture(scope="module")
+def page(written):
+    return Page(written.read_text(encoding="utf-8"))
+
+
+def test_page_is_balanced_and_small_enough(written, page):
+    assert not page.open
+    assert written.name == "report.html" and written.stat().st_size < 6_000_000
+
+
+def test_every_effect_its_numbers_and_all_warnings_are_there(page):
+    assert "Coulomb friction at joint 'elbow': 0.031 ± 0.002 N m" in page.text
+    assert "Command delay at actuator 'm_shoulder': 21.3 ± 1.1 ms" in page.text
+    for words in ("Missing effects found", "68 %", "61 % – 74 %", "91 %", "no log moves the elbow slower than 0.2 rad/s"):
+        assert words in page.text
+    for words in (*fake.full().warnings, *fake.full().sentences, "elbow, at reversals below 0.2 rad/s", "next_experiment.csv"):
+        assert words in page.text
+    for name, value in fake.full().versions.items():
+        assert name in page.text and value in page.text
+
+
+def test_hostile_names_stay_text(page):
+    assert page.scripts == 2  # plotly.js and the page's own; nothing from a log's name
+    assert "<script>alert('log')</script>" in page.text
+
+
+def test_nothing_is_loaded(written, page):
+    assert not [tag for tag, a in page.tags if tag in ("link", "img", "iframe", "object") or "src" in a]
+    assert all(a["href"].startswith("#") for _, a in page.tags if "href" in a)
+    style = written.read_text(encoding="utf-8").partition("<style>")[2].partition("</style>")[0]
+    assert "url(" not in style and "@import" not in style
+
+
+def test_figures_are_of_the_page_s_width_and_hold_the_data(page):
+    assert len(page.figures) >= 3 + 1 + 3 + 3 + 9 + 1  # waterfalls, horizons, maps, frequency, overlays, episodes
+    assert all(f["width"] <= 960 and f["data"] for f in page.figures)
+    overlay = next(f for f in page.figures if "columns" in f)
+    rows = fake.full().details["overlays"][0]
+    assert [v for v in overlay["columns"]["m"] if v is not None] == pytest.approx(rows["measured"])
+    assert overlay["columns"]["m"].count(None) == len(rows["starts"]) - 1  # windows are not joined
+
+
+@pytest.mark.parametrize("verdict", VERDICTS)
+def test_every_verdict_renders_without_details(verdict, tmp_path):
+    page = Page(report.write(fake.bare(verdict), tmp_path).read_text(encoding="utf-8"))
+    assert not page.open
+    for words in (WORDS[verdict].badge, WORDS[verdict].headline, WORDS[verdict].advice):
+        assert words in page.text
+    assert "nan" not in page.text.lower().split()
+
+
+def test_a_saved_diagnosis_gives_the_same_page(tmp_path, page):
+    fake.full().save(tmp_path)
+    assert Page(report.write(load(tmp_path), tmp_path).read_text(encoding="utf-8")).text == page.text
+
+
+@pytest.mark.parametrize("key", sorted(fake.details()))
+def test_any_one_of_the_details_may_be_missing_or_alone(key, tmp_path):
+    import dataclasses
+
+    whole = fake.full()
+    rest = {k: v for k, v in whole.details.items() if k != key}
+    for details in (rest, {key: whole.details[key]}):
+        source = report.write(dataclasses.replace(whole, details=details), tmp_path).read_text(encoding="utf-8")
+        assert not Page(source).open
+
+
+def test_many_logs_stay_within_the_size(tmp_path):
+    import dataclasses
+
+    whole = fake.full()
+    row = whole.details["overlays"][0]
+    long = row | {k: row[k] * 20 for k in ("time", "measured", "nominal", "calibrated", "with_effects")} | {"starts": []}
+    many = [long | {"log": f"log_{k}", "joint": f"j{j}"} for k in range(30) for j in range(6)]
+    path = report.write(dataclasses.replace(whole, details={"overlays": many}), tmp_path)
+    assert path.stat().st_size < 6_000_000
+    assert "more are in details.json" in path.read_text(encoding="utf-8")
