@@ -71,7 +71,8 @@ class Candidate:
 def base_coordinates(space: ParameterSpace) -> tuple[Coordinate, ...]:
     """The parameters that the simulator already has: a weak Gaussian prior inside their ranges."""
     return tuple(
-        Coordinate(p.name, (i,), p.nominal, p.low, p.high, _precision(p), p.unit) for i, p in enumerate(space.parameters)
+        Coordinate(p.name, (i,), p.nominal, p.low, p.high, _precision(p), p.unit)
+        for i, p in enumerate(space.parameters)
     )
 
 
@@ -82,24 +83,24 @@ def _precision(p: Parameter) -> float:
 
 
 def stack(
-    names: Sequence[str], model_space: ParameterSpace, scales: Scales, mj_model: object, own: Sequence[type[Effect]] = ()
-) -> tuple[tuple[Effect, ...], list[tuple[type[Effect], tuple[str, ...]]]]:
-    """One Effect per name over all of its places, each place with values and ranges of its own."""
-    made, table = [], []
-    kinds = [library.load(name) for name in names] + list(own)
+    kinds: Sequence[type[Effect]], model_space: ParameterSpace, scales: Scales
+) -> tuple[tuple[Effect, ...], list[str]]:
+    """One Effect per kind over all of its places, each place with values and ranges of its own; and what is left out."""
+    made, left_out = [], []
     for kind in kinds:
         found = tuple(p for p in places(kind.kind, scales.model) if _alive(kind, p, scales))
         if not found:
+            left_out.append(f"{kind.name}: no {kind.kind} here that could carry it and was excited")
             continue
         try:
             parameters = tuple(p for place in found for p in ranges(kind, place, scales))
             effect = kind(where=found, parameters=parameters)
             effect.bind(scales.model, float(scales.model.opt.timestep), 1)
-        except ValueError:  # not applicable to this model (a mount effect on a free-floating robot ...)
+        except ValueError as error:
+            left_out.append(f"{kind.name}: {error}")
             continue
         made.append(effect)
-        table.append((kind, found))
-    return tuple(made), table
+    return tuple(made), left_out
 
 
 def _alive(kind: type[Effect], place: str, scales: Scales) -> bool:
@@ -136,7 +137,9 @@ def enumerate_candidates(physics: Physics) -> list[Candidate]:
     return out
 
 
-def _candidate(effect: Effect, where: str, parameters: Sequence[Sequence[Parameter]], rows: Sequence[range]) -> Candidate:
+def _candidate(
+    effect: Effect, where: str, parameters: Sequence[Sequence[Parameter]], rows: Sequence[range]
+) -> Candidate:
     coordinates = []
     for j, q in enumerate(effect.quantities):
         own = [p[j] for p in parameters]
@@ -172,7 +175,8 @@ def _probes(quantities: Sequence[Quantity], coordinates: Sequence[Coordinate]) -
 
 
 def _grid(q: Quantity, c: Coordinate) -> list[float]:
+    """Shapes: over the whole range. Amplitudes: away from neutral, upwards where there is room (a secant has no sign)."""
     if q.shape:
         return [c.low + f * (c.high - c.low) for f in q.grid]
-    out = [c.neutral + f * (c.high - c.neutral) for f in q.grid if c.high > c.neutral]
-    return out + [c.neutral - f * (c.neutral - c.low) for f in q.grid if c.low < c.neutral]
+    end = c.high if c.high > c.neutral else c.low
+    return [c.neutral + f * (end - c.neutral) for f in q.grid]

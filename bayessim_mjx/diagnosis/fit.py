@@ -91,7 +91,9 @@ class Fitter:
             theta[list(c.index)] = v
         return theta
 
-    def _differences(self, coordinates: Sequence[Coordinate], values: Array, which: Sequence[int]) -> tuple[list[Array], list[float]]:
+    def _differences(
+        self, coordinates: Sequence[Coordinate], values: Array, which: Sequence[int]
+    ) -> tuple[list[Array], list[float]]:
         """Shifted thetas for the columns `which`, and the shifts."""
         thetas, steps = [], []
         for i in which:
@@ -111,7 +113,9 @@ class Fitter:
         shifted = self.whiten(self.simulator.run(np.repeat(theta[None], s, 0), moved))
         return np.moveaxis((r[None] - shifted) / h[:, None, None], 0, -1)
 
-    def begin(self, coordinates: Sequence[Coordinate], values: Array | None = None, offsets: Array | None = None) -> Job:
+    def begin(
+        self, coordinates: Sequence[Coordinate], values: Array | None = None, offsets: Array | None = None
+    ) -> Job:
         """A job with fresh columns for everything."""
         coordinates = tuple(coordinates)
         values = np.array([c.neutral for c in coordinates]) if values is None else np.asarray(values, float)
@@ -177,7 +181,9 @@ class Fitter:
             if progress is not None:
                 progress(len(active))
 
-    def _accept(self, job: Job, values: Array, x: Array, r: Array, which: Sequence[int], steps: Sequence[float]) -> None:
+    def _accept(
+        self, job: Job, values: Array, x: Array, r: Array, which: Sequence[int], steps: Sequence[float]
+    ) -> None:
         cost = self.cost(job, r[0], x, values)
         if cost < job.cost or not np.isfinite(job.cost):
             if np.isfinite(job.cost) and len(which) < len(job.coordinates):

@@ -66,7 +66,7 @@ def effective_samples(job: Job, fitter: Fitter) -> float:
         if rho < 0.05:
             break
         tau += rho
-    return max(r.size / (2 * tau), 2.0 * windows ** 0.5)
+    return max(r.size / (2 * tau), 2.0 * windows**0.5)
 
 
 @dataclass(frozen=True)

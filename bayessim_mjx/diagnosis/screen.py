@@ -6,7 +6,7 @@ Tangents at neutral mislead where laws have kinks (dry friction, play): the colu
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,7 @@ class Screened:
         candidate; start: `[k]`, values to start a fit from.
         gain: predicted drop of the cost; absorbed: share of the effect that refitting the model hides.
         column: `[W, n]`, the projected change of the residual per unit of the way to the start (for isolability).
+        others: further starting points `[m, k]`, in other places of its range.
     """
 
     candidate: Candidate
@@ -32,6 +33,7 @@ class Screened:
     gain: float
     absorbed: float
     column: Array
+    others: tuple[Array, ...] = ()
 
 
 def screen(fitter: Fitter, job: Job, candidates: Sequence[Candidate]) -> list[Screened]:
@@ -49,12 +51,25 @@ def screen(fitter: Fitter, job: Job, candidates: Sequence[Candidate]) -> list[Sc
     shifted = fitter.whiten(run(np.stack(thetas), np.repeat(job.offsets[None], len(thetas), 0)))
     columns = job.r[None] - shifted  # [m, W, n]
     project = _Projection(fitter, job)
-    best: dict[int, Screened] = {}
+    each: dict[int, list[tuple[Screened, Array]]] = {}
     for i, point, column in zip(owner, points, columns, strict=True):
-        found = _one(project, candidates[i], point, column)
-        if i not in best or found.gain > best[i].gain:
-            best[i] = found
-    return sorted(best.values(), key=lambda s: -s.gain)
+        each.setdefault(i, []).append((_one(project, candidates[i], point, column), point))
+    best = [_with_others(found) for found in each.values()]
+    return sorted(best, key=lambda s: -s.gain)
+
+
+def _with_others(found: list[tuple[Screened, Array]]) -> Screened:
+    """The best start, with the best one that differs in what it moves or in its shape."""
+    found = sorted(found, key=lambda f: -f[0].gain)
+    first, point = found[0]
+    neutral = np.array([c.neutral for c in first.candidate.coordinates])
+    shapes = np.array(first.candidate.shapes)
+
+    def sort_of(p: Array) -> tuple:
+        return tuple(np.sign(p - neutral)[~shapes]) + tuple(p[shapes])
+
+    other = next((s.start for s, p in found[1:] if s.gain > 0 and sort_of(p) != sort_of(point)), None)
+    return replace(first, others=(point,) if other is None else (point, other))
 
 
 class _Projection:
@@ -84,7 +99,11 @@ class _Projection:
         s_ab = np.einsum("w,wnk,wn->k", w, self.A, a) - np.einsum("w,wsk,ws->k", w, self.BA, MBa)
         along = self.inverse @ s_ab
         projected = a - np.einsum("wns,ws->wn", starts.B, MBa)
-        projected = projected - self.A @ along + np.einsum("wns,wst,wtk,k->wn", starts.B, starts.M, self.BA, along, optimize=True)
+        projected = (
+            projected
+            - self.A @ along
+            + np.einsum("wns,wst,wtk,k->wn", starts.B, starts.M, self.BA, along, optimize=True)
+        )
         return s_aa - float(s_ab @ along), g_a - float(s_ab @ (self.inverse @ self.slope)), s_aa, projected * self.root
 
 
@@ -94,10 +113,11 @@ def _one(project: _Projection, candidate: Candidate, point: Array, column: Array
     low, high = (np.array([getattr(c, e) for c in candidate.coordinates]) for e in ("low", "high"))
     if norm < 1e-9 or s <= 1e-9 * norm:
         return Screened(candidate, point, 0.0, 1.0, projected)
+    way = np.where(candidate.shapes, 0.0, point - neutral)
     with np.errstate(divide="ignore", invalid="ignore"):
-        room = np.where(point > neutral, (high - neutral) / (point - neutral), (neutral - low) / (neutral - point))
-    t = float(np.clip(g / s, 0.0, np.nanmin(np.where(point == neutral, np.inf, room))))
+        ahead = np.where(way > 0, (high - neutral) / way, np.where(way < 0, (low - neutral) / way, np.inf))
+        behind = np.where(way > 0, (neutral - low) / way, np.where(way < 0, (neutral - high) / way, np.inf))
+    t = float(np.clip(g / s, -np.min(behind), np.min(ahead)))
     gain = 2 * t * g - t * t * s
-    start = np.where(candidate.shapes, point, neutral + max(t, 0.02) * (point - neutral))
+    start = np.where(candidate.shapes, point, neutral + (t if abs(t) > 0.02 else 0.02) * (point - neutral))
     return Screened(candidate, np.clip(start, low, high), max(gain, 0.0), 1.0 - s / norm, projected)
-

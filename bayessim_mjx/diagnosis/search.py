@@ -12,6 +12,7 @@ from bayessim_mjx.diagnosis.candidates import Candidate
 from bayessim_mjx.diagnosis.fit import Fitter, Job
 from bayessim_mjx.diagnosis.models import Comparison, Model, compare, scored
 from bayessim_mjx.diagnosis.screen import Screened, screen
+from bayessim_mjx.effects import load, names
 
 Progress = Callable[[str, int, int], None]
 
@@ -42,6 +43,7 @@ class Settings:
     most: int = 5
     iterations: int = 9
     fresh: int = 6
+    starts: int = 20
 
 
 @dataclass(eq=False)
@@ -96,8 +98,35 @@ def run(fitter: Fitter, candidates: Sequence[Candidate], settings: Settings, pro
     race.screened = screen(fitter, job, candidates)
     _singles(race, say)
     best = _pairs(race, say)
-    race.winner = _greedy(race, best, say)
+    race.winner = simplest(race, _greedy(race, best, say), say)
     return race
+
+
+def simplest(race: Race, model: Model, say: Progress) -> Model:
+    """A law gives way to its own special case where that closes nearly as much."""
+    for effect in model.effects:
+        for name in special_cases(effect):
+            other = next((c for c in race.candidates if c.effect == name and c.where == effect.where), None)
+            if other is None or not all(e is effect or compatible(e, other) for e in model.effects):
+                continue
+            smaller = exchange(race, model, effect, other, say)
+            if race.closure(model) - race.closure(smaller) < race.settings.tie / 2:
+                return simplest(race, _polish(race, smaller), say)
+    return model
+
+
+def special_cases(effect: Candidate) -> tuple[str, ...]:
+    """Names of the effects that it contains, from its class."""
+    return tuple(getattr(load(effect.effect), "contains", ())) if effect.effect in names() else ()
+
+
+def exchange(race: Race, model: Model, old: Candidate, new: Candidate, say: Progress) -> Model:
+    """The model with one effect in the place of another, refitted."""
+    rest = without(race, model, old, say)
+    if rest.effects:
+        start = next(s for s in screen(race.fitter, rest.job, [new]))
+        return fit_models(race, [(rest, start)], "exchanges", say)[0]
+    return fit_models(race, [(race.base, _start_of(race, new))], "exchanges", say)[0]
 
 
 def _fresh(race: Race, job: Job) -> list[int]:
@@ -112,17 +141,29 @@ def fit_models(race: Race, plans: Sequence[tuple[Model, Screened]], label: str, 
     for model, extra in plans:
         key = frozenset([*(c.label for c in model.effects), extra.candidate.label])
         if key not in race.models and key not in todo:
-            job = fitter.derive(model.job, extra.candidate.coordinates, extra.start, " + ".join(sorted(key)))
-            todo[key] = (job, (*model.effects, extra.candidate))
-    jobs = [job for job, _ in todo.values()]
+            todo[key] = (_starts(race, model, extra, len(todo)), (*model.effects, extra.candidate))
+    jobs = [job for several, _ in todo.values() for job in several]
     total = len(jobs)
     fitter.iterate(
         jobs, race.settings.iterations, lambda j: _fresh(race, j), progress=lambda left: say(label, total - left, total)
     )
-    for key, (job, effects) in todo.items():
-        race.models[key] = scored(fitter, job, effects)
+    for key, (several, effects) in todo.items():
+        race.models[key] = scored(fitter, min(several, key=lambda job: job.cost), effects)
     keys = [frozenset([*(c.label for c in m.effects), e.candidate.label]) for m, e in plans]
     return [race.models[k] for k in keys]
+
+
+def _starts(race: Race, model: Model, extra: Screened, rank: int) -> list[Job]:
+    """Jobs from several starting points: costs have several minima (an inertia hides in another, a shape is wrong)."""
+    fitter, coordinates = race.fitter, extra.candidate.coordinates
+    jobs = [fitter.derive(model.job, coordinates, extra.start)]
+    if rank < race.settings.starts and extra.others:
+        fresh = fitter.derive(model.job, coordinates, extra.others[0])
+        base = len(fitter.base)
+        fresh.values[:base] = [c.neutral for c in fitter.base]  # not from where the base went without the effect
+        jobs.append(fresh)
+        jobs += [fitter.derive(model.job, coordinates, other) for other in extra.others[1:]]
+    return jobs
 
 
 def _singles(race: Race, say: Progress) -> None:

@@ -23,6 +23,7 @@ class AsymmetricFriction(Effect):
 
     name: ClassVar[str] = "asymmetric_friction"
     kind: ClassVar[str] = "joint"
+    contains: ClassVar[tuple[str, ...]] = ("coulomb_friction", "viscous_friction")
     quantities: ClassVar[tuple[Quantity, ...]] = (
         Quantity("level_forward", 0.0, 0.0, 1.0, unit="N m", per="force", reach=(0.0, 1.0)),
         Quantity("level_backward", 0.0, 0.0, 1.0, unit="N m", per="force", reach=(0.0, 1.0)),

@@ -31,7 +31,7 @@ class Cogging(Effect):
     quantities: ClassVar[tuple[Quantity, ...]] = (
         Quantity("sine", 0.0, -1.0, 1.0, unit="N m", per="force", reach=(-0.3, 0.3), grid=(0.1,)),
         Quantity("cosine", 0.0, -1.0, 1.0, unit="N m", per="force", reach=(-0.3, 0.3), grid=(0.1,)),
-        Quantity("order", 1.0, 1.0, 60.0, unit="1/rev", grid=tuple((n - 1) / 59 for n in _ORDERS)),
+        Quantity("order", 1.0, 1.0, 60.0, unit="1/rev", grid=tuple((n - 1) / 59 for n in _ORDERS), shape=True),
     )
 
     def on_force(self, at: Site, memory: Any, step: SubStep, theta: jax.Array) -> tuple[Any, jax.Array]:

@@ -70,6 +70,7 @@ class Effect(abc.ABC):
     name: ClassVar[str]
     kind: ClassVar[str]  # actuator | joint (hinge or slide) | body | geom | world
     quantities: ClassVar[tuple[Quantity, ...]]
+    contains: ClassVar[tuple[str, ...]] = ()  # effects that are special cases of this one
 
     def places(self) -> tuple[str, ...]:
         """Names that own a set of parameters."""

@@ -29,10 +29,22 @@ class StribeckFriction(Effect):
 
     name: ClassVar[str] = "stribeck_friction"
     kind: ClassVar[str] = "joint"
+    contains: ClassVar[tuple[str, ...]] = ("coulomb_friction",)
     quantities: ClassVar[tuple[Quantity, ...]] = (
         Quantity("level", 0.0, 0.0, 1.0, unit="N m", per="force", reach=(0.0, 1.0)),
         Quantity("excess", 0.0, 0.0, 1.0, unit="N m", per="force", reach=(0.0, 1.0)),
-        Quantity("speed", 0.1, 0.01, 1.0, unit="rad/s", per="speed", reach=(0.01, 0.5), prior="loguniform"),
+        Quantity(
+            "speed",
+            0.1,
+            0.01,
+            1.0,
+            unit="rad/s",
+            per="speed",
+            reach=(0.01, 0.5),
+            prior="loguniform",
+            grid=(0.03, 0.2, 0.6),
+            shape=True,
+        ),
     )
 
     def on_force(self, at: Site, memory: Any, step: SubStep, theta: jax.Array) -> tuple[Any, jax.Array]:

@@ -1,0 +1,94 @@
+"""How far: held-out distance of measured and simulated motion, in noise units, at several horizons and by joint."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayessim_mjx.diagnosis.fit import Fitter, Job
+from bayessim_mjx.diagnosis.models import Model
+from bayessim_mjx.diagnosis.quadratic import eliminate
+from bayessim_mjx.diagnosis.uncertainty import bootstrap_weights, interval
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """Whitened held-out errors of a model, `[W, H, channels]`, really simulated without each window's condition."""
+
+    error: Array
+
+    def cost(self, steps: int, channels: slice = slice(None)) -> Array:
+        """Mean square over the first steps, per window `[W]`."""
+        return np.asarray(np.mean(self.error[:, :steps, channels] ** 2, axis=(1, 2)))
+
+
+def predict(fitter: Fitter, model: Model) -> Prediction:
+    """Simulate each condition's windows with the parameters found without it; starts re-estimated on the window."""
+    windows = fitter.simulator.windows
+    names = np.unique(windows.group)
+    error = np.zeros((len(windows), windows.steps, int(fitter.used.sum())))
+    for name, values in zip(names, model.estimates, strict=True):
+        own = np.flatnonzero(windows.group == name)
+        error[own] = _settled(fitter, model.job, values, own)
+    return Prediction(error)
+
+
+def nominal(fitter: Fitter, job: Job) -> Prediction:
+    """The simulator as delivered, starts estimated."""
+    return Prediction(_settled(fitter, job, np.array([c.neutral for c in job.coordinates]), np.arange(len(job.r))))
+
+
+def _settled(fitter: Fitter, job: Job, values: Array, own: NDArray[np.int64]) -> Array:
+    """Errors `[w, H, channels]` of some windows after two Newton steps of their start states."""
+    theta = fitter.vector(job.coordinates, values)[None]
+    offsets = job.offsets[own]
+    B = job.B[own]
+    errors = fitter.simulator.run(theta, offsets[None], own)[0]
+    best = errors
+    for _ in range(2):
+        r = fitter.whiten(errors)
+        _, starts = eliminate(r, np.zeros((*r.shape, 0)), B, offsets, fitter.spread)
+        moved = offsets + starts.step(np.zeros((*r.shape, 0)), np.zeros(0))
+        errors = fitter.simulator.run(theta, moved[None], own)[0]
+        better = np.sum(fitter.whiten(errors) ** 2, 1) < np.sum(fitter.whiten(best) ** 2, 1)
+        best = np.where(better[:, None, None], errors, best)
+        offsets = np.where(better[:, None], moved, offsets)
+        errors = best
+    return np.asarray(best[..., fitter.used] / fitter.sigma)
+
+
+def stages(
+    predictions: dict[str, Prediction], floor: float | None, steps: int, group: NDArray[np.int64], seed: int
+) -> dict[str, Any]:
+    """Root mean squares of the stages over the first `steps`, each with a bootstrap interval."""
+    rng = np.random.default_rng(seed)
+    draws = bootstrap_weights(group, 400, rng)
+    out: dict[str, Any] = {"ci": {}, "noise_floor": 1.0}
+    for name, prediction in predictions.items():
+        cost = prediction.cost(steps)
+        out[name] = float(np.sqrt(cost.mean()))
+        out["ci"][name] = list(interval(np.sqrt(np.maximum((draws * cost).mean(1), 0.0))))
+    if floor is not None:
+        out["reducible_floor"] = floor
+    return out
+
+
+def closure(
+    before: Array, after: Array, reference: float, group: NDArray[np.int64], seed: int
+) -> tuple[float, tuple[float, float]]:
+    """(E0 - E1) / (E0 - Eref) on squared errors per window, with its interval.
+
+    Args:
+        before, after: `[W]` mean squares of windows; reference: mean square that nothing undercuts.
+    """
+    draws = bootstrap_weights(group, 400, np.random.default_rng(seed))
+    top, bottom = before - after, before - reference
+    samples = (draws @ top) / np.maximum(draws @ bottom, 1e-9)
+    value = float(top.sum() / max(bottom.sum(), 1e-9))
+    low, high = interval(np.clip(samples, -1.0, 1.0))
+    return min(value, 1.0), (min(low, value), max(high, min(value, 1.0)))

@@ -1,0 +1,162 @@
+"""From a race to a verdict: rivals, equivalences, what is structural, and the words."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from bayessim_mjx.diagnosis.candidates import Candidate
+from bayessim_mjx.diagnosis.models import Model
+from bayessim_mjx.diagnosis.search import Progress, Race, compatible, fit_models, ranked, special_cases, without
+from bayessim_mjx.diagnosis.screen import screen
+
+MILD = 10.0  # nats: below, held-out evidence between two models is called a tie
+
+
+@dataclass(frozen=True, eq=False)
+class Rival:
+    """Another explanation that these logs cannot tell from (a part of) the winner."""
+
+    effects: tuple[Candidate, ...]
+    model: Model
+    closure: float
+    why: str
+    contains: bool = False
+
+    def to_dict(self) -> dict[str, Any]:
+        return {"effects": [c.label for c in self.effects], "gap_closed": self.closure, "why": self.why}
+
+
+@dataclass(frozen=True, eq=False)
+class Ruling:
+    """The winner's effects with their rivals."""
+
+    model: Model
+    rivals: dict[str, list[Rival]] = field(default_factory=dict)
+
+    @property
+    def ambiguous(self) -> bool:
+        return any(not r.contains for rivals in self.rivals.values() for r in rivals)
+
+
+def rule(race: Race, say: Progress) -> Ruling:
+    """Look for rivals of every effect of the winner: replaced by another one, the model predicts as well."""
+    winner = race.winner
+    assert winner is not None
+    ruling = Ruling(winner)
+    for effect in winner.effects:
+        ruling.rivals[effect.label] = _rivals(race, winner, effect, say)
+    return ruling
+
+
+def _rivals(race: Race, winner: Model, effect: Candidate, say: Progress) -> list[Rival]:
+    rest = without(race, winner, effect, say)
+    others = [c for c in race.candidates if c is not effect and all(compatible(c, e) for e in rest.effects)]
+    if rest.effects:
+        found = [s for s in screen(race.fitter, rest.job, others) if s.gain > 0][: race.settings.pairs]
+        models = fit_models(race, [(rest, s) for s in found], "rivals", say)
+    else:
+        models = [m for m in ranked(race, 1) if m.effects[0] is not effect]
+    out = []
+    for model in models:
+        (other,) = [c for c in model.effects if c not in rest.effects]
+        out += _rival(race, winner, effect, (other,), model)
+    if not rest.effects:
+        for model in ranked(race, 2):
+            if effect not in model.effects:
+                out += [
+                    r
+                    for r in _rival(race, winner, effect, model.effects, model)
+                    if r.closure > race.closure(winner) + 0.01
+                ]
+    return sorted(out, key=lambda r: -r.closure)[:6]
+
+
+def _rival(race: Race, winner: Model, effect: Candidate, others: tuple[Candidate, ...], model: Model) -> list[Rival]:
+    c = race.better(model, winner)
+    behind = race.closure(winner) - race.closure(model)
+    misfit = winner.total > 1.3 * race.noise * len(winner.cost)
+    told_apart = c.evidence > MILD and (c.t > 2.0 or c.evidence > 3 * MILD)
+    if told_apart and not (misfit and behind < race.settings.tie / 2):
+        return []
+    if behind > 3 * race.settings.tie:
+        return []
+    contains = any(effect.effect in special_cases(o) and o.where == effect.where for o in others)
+    same = any(o.effect == effect.effect and compatible(o, effect) is False for o in others)
+    why = (
+        "contains it as a special case and explains no more"
+        if contains
+        else f"held-out evidence differs by {c.evidence:.1f} nats, {max(behind, 0.0):.1%} of the gap"
+    )
+    return [Rival(others, model, race.closure(model), why, contains or same)]
+
+
+def structural(race: Race, model: Model, sd: np.ndarray) -> dict[str, str]:
+    """Known parameters that sit at a bound or move between operating conditions (Wald test, Bonferroni)."""
+    from scipy import stats
+
+    out = {}
+    base = len(race.fitter.base)
+    groups = len(model.estimates)
+    for i, c in enumerate(model.job.coordinates[:base]):
+        value, width = model.job.values[i], c.high - c.low
+        if min(value - c.low, c.high - value) < 1e-3 * width:
+            out[c.name] = f"sits at its bound {value:.4g}: it stands in for something else, or its range is too narrow"
+    if groups < 3:
+        return out
+    each, deviation = per_condition(race, model)
+    for i, c in enumerate(model.job.coordinates[:base]):
+        z2 = float(
+            np.sum(((each[:, i] - np.average(each[:, i], weights=1 / deviation[:, i] ** 2)) / deviation[:, i]) ** 2)
+        )
+        p = float(stats.chi2.sf(z2, groups - 1)) * base
+        spread = float(np.std(each[:, i]))
+        if p < 1e-3 and spread > 0.05 * (c.high - c.low) and c.name not in out:
+            out[c.name] = f"moves between operating conditions (sd {spread:.3g} over {groups}): structure is missing"
+    return out
+
+
+def per_condition(race: Race, model: Model) -> tuple[np.ndarray, np.ndarray]:
+    """Each condition's own estimate and standard deviation, `[G, k]`, one Newton step from the common fit."""
+    q, _ = model.job.quadratic(race.fitter.spread)
+    precision, pull, low, high = model.job.prior()
+    group = race.fitter.simulator.windows.group
+    each, deviation = [], []
+    inflation = max(model.total / model.job.r.size, 0.5) * model.job.r.size / model.samples
+    for name in np.unique(group):
+        g, S = q.weighted(model.job.weight * (group == name))
+        H = S / inflation + np.diag(precision)
+        covariance = np.linalg.pinv(H)
+        each.append(model.job.values + np.clip(covariance @ (g / inflation + pull), low, high))
+        deviation.append(np.sqrt(np.diag(covariance)))
+    return np.array(each), np.array(deviation)
+
+
+def shapley(race: Race, model: Model, say: Progress) -> dict[str, float]:
+    """Each effect's share of the squared gap that they close together (Shapley, 1953), over all orders."""
+    effects, n = model.effects, len(model.effects)
+    if n > 4:
+        return {}
+    value = {frozenset(): 0.0}
+    for size in range(1, n + 1):
+        for some in itertools.combinations(effects, size):
+            m = model
+            for e in effects:
+                if e not in some:
+                    m = without(race, m, e, say)
+            value[frozenset(c.label for c in some)] = race.base.total - m.total
+    out = {}
+    for e in effects:
+        rest = [c.label for c in effects if c is not e]
+        shares = []
+        for order in itertools.permutations(rest):
+            for k in range(len(order) + 1):
+                before = frozenset(order[:k])
+                weight = 1 / (n * len(list(itertools.permutations(rest))))
+                shares.append(weight * (value[before | {e.label}] - value[before]))
+        out[e.label] = float(np.sum(shares))
+    total = sum(out.values())
+    return {k: v / total for k, v in out.items()} if total else out
