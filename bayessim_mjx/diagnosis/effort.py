@@ -128,19 +128,24 @@ def _relation(log: Log, mj_model: mujoco.MjModel, effort: Effort, pictures: list
     test, curve = max(zip(tests, curves, strict=True), key=lambda p: float(np.max(p[1])))
     physical = (lags >= CAUSAL[0]) & (lags <= CAUSAL[1])
     explained = max(float(c[physical].max()) for c in curves)
-    relation = replace(
-        own, explained=explained, friction=test.friction(), lag=_nearest(lags, curve, test.at_zero(curve, lags))
-    )
-    return replace(relation, mend=_mend(log, mj_model, effort, relation, curve, test)) if relation.refused else relation
+    relation = replace(own, explained=explained, friction=test.friction(), lag=_nearest(lags, curve))
+    doubtful = explained < DOUBTFUL
+    return replace(relation, mend=_mend(log, mj_model, effort, relation, curve, test)) if doubtful else relation
 
 
-def _nearest(lags: Array, curve: Array, now: float) -> float:
-    """The smallest lag that is as good as the best; 0 where the best is hardly better than none."""
-    best = float(curve.max())
+def _nearest(lags: Array, curve: Array) -> float:
+    """The smallest lag about as good as the best, between the grid's; 0 where the best is hardly better than none."""
+    best, now = float(curve.max()), float(np.interp(0.0, lags, curve))
     if best - now < 0.02:
         return 0.0
-    good = np.flatnonzero(curve >= best - 0.1 * (best - now))
-    return float(lags[good[np.argmin(np.abs(lags[good]))]])
+    good = np.flatnonzero(curve >= best - min(0.002, 0.1 * (best - now)))
+    k = int(good[np.argmin(np.abs(lags[good]))])
+    while 0 < k < len(lags) - 1 and max(curve[k - 1], curve[k + 1]) > curve[k]:
+        k += 1 if curve[k + 1] > curve[k - 1] else -1  # to the top of its hill
+    if k in (0, len(lags) - 1):
+        return float(lags[k])
+    left, top, right = curve[k - 1 : k + 2]  # the vertex of the parabola through them
+    return float(lags[k] + 0.5 * (lags[1] - lags[0]) * (left - right) / min(left - 2 * top + right, -1e-12))
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,6 +163,10 @@ class _Test:
         return cls(log, effort, picture, picture.columns(effort.dof), picture.moved.moving(effort.dof))
 
     @property
+    def signal(self) -> Array:
+        return filtered(self.effort.signal, self.log, self.picture.moved)
+
+    @property
     def step(self) -> float:
         return self.picture.moved.step
 
@@ -167,7 +176,7 @@ class _Test:
 
     @property
     def small(self) -> bool:
-        y = filtered(self.effort.signal, self.log, self.picture.moved)[self.rows]
+        y = self.signal[self.rows]
         force = (self.picture.bodies.sum(0) - self.picture.weight)[self.rows, self.effort.dof]
         idle = float(y.std()) <= 1e-6 * float(np.abs(y).max()) + 1e-12
         return idle or (self.effort.scaled and float(y.std()) < 0.1 * float(np.sqrt(np.mean(force**2))))
@@ -175,25 +184,25 @@ class _Test:
     def over(self, lags: Array) -> Array:
         """[L] share explained where the effort is delayed by each lag."""
         signals = filtered(self.effort.signal, self.log, self.picture.moved, lags)
-        return np.array([self.columns.explained(y, self.rows, self.effort.scaled) for y in signals])
-
-    def at_zero(self, curve: Array, lags: Array) -> float:
-        return float(np.interp(0.0, lags, curve))
+        return self.columns.explained(signals, self.rows, self.effort.scaled)
 
     def friction(self) -> float:
-        y = filtered(self.effort.signal, self.log, self.picture.moved)
-        return self.columns.friction().explained(y, self.rows)
+        return float(self.columns.friction().explained(self.signal[None], self.rows)[0])
+
+    def share(self, rows: Mask | None = None, sign: float = 1.0, scaled: bool | None = None) -> float:
+        """Explained without a lag, over other rows, with the other sign or at any scale."""
+        scaled = self.effort.scaled if scaled is None else scaled
+        return float(self.columns.explained(sign * self.signal[None], self.rows if rows is None else rows, scaled)[0])
 
     def pieces(self) -> list[tuple[float, float]]:
         """Spans [s since the start] that the model does explain, from windows of a tenth of the log, at least 2 s."""
         moved = self.picture.moved
-        y = filtered(self.effort.signal, self.log, moved)
         edges = np.arange(moved.time[0], moved.time[-1] + 1e-9, max(2.0, 0.1 * self.log.duration))
         spans: list[tuple[float, float]] = []
         for a, b in zip(edges[:-1], edges[1:], strict=True):
             rows = self.rows & (moved.time >= a) & (moved.time < b)
             enough = rows.sum() * moved.step * moved.cutoff >= 3.0
-            if enough and self.columns.explained(y, rows, self.effort.scaled) > 0.9:
+            if enough and self.share(rows) > 0.9:
                 start = (
                     spans.pop()[0] if spans and abs(spans[-1][1] - (a - moved.time[0])) < 1e-6 else a - moved.time[0]
                 )
@@ -204,19 +213,17 @@ class _Test:
 def _mend(log: Log, mj_model: mujoco.MjModel, effort: Effort, now: Relation, curve: Array, test: _Test) -> str:
     """One remedy that would explain the effort, in words, or nothing."""
     assert now.explained is not None
-    y = filtered(effort.signal, log, test.picture.moved)
     if now.lag and curve.max() > DOUBTFUL:
         return f"shifting the command by {now.lag:+.3f} s would explain {curve.max():.0%}"
-    turned = test.columns.explained(-y, test.rows, effort.scaled)
+    turned = test.share(sign=-1.0)
     if turned > DOUBTFUL:
         return f"the opposite sign would explain {turned:.0%}"
     if np.abs(log.qpos).max() > 6.0:
         radians = replace(log, qpos=np.radians(log.qpos), qvel=np.radians(log.qvel))
-        other = _Test.of(radians, effort, Dynamics.of(mj_model, motion(radians, mj_model, test.cutoff)))
-        share = other.columns.explained(y, other.rows, effort.scaled)
+        share = _Test.of(radians, effort, Dynamics.of(mj_model, motion(radians, mj_model, test.cutoff))).share()
         if share > DOUBTFUL:
             return f"positions in degrees would explain {share:.0%}"
-    free = test.columns.explained(y, test.rows, scaled=False)
+    free = test.share(scaled=False)
     if effort.scaled and free > DOUBTFUL:
         return f"another scale of the command would explain {free:.0%}"
     spans = ", ".join(f"{a:.1f} to {b:.1f} s" for a, b in test.pieces())

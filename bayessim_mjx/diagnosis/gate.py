@@ -140,7 +140,8 @@ def _of_effort(related: Sequence[Relation]) -> list[Finding]:
         if r in bad:
             out.append((refuse if 2 * len(bad) >= len(best) else warn)(_unrelated(r)))
         elif r.explained < DOUBTFUL:
-            out.append(warn(f"{r.joint}: no model explains {1 - r.explained:.0%} of its effort ({r.source})"))
+            text = f"{r.joint}: no model explains {1 - r.explained:.0%} of its effort ({r.source})"
+            out.append(warn(f"{text} ({r.mend})" if r.mend else text))
         if r.lag and r not in bad:
             text = f"{r.joint}: its motion follows the effort ({r.source}) {r.lag * 1e3:+.0f} ms late"
             out.append(warn(f"{text}: do the clocks agree?") if abs(r.lag) > LATE else Finding("finding", text))

@@ -139,22 +139,24 @@ class Columns:
         """Offset and friction alone, as if the joint carried nothing."""
         return Columns(self.x[:, :4], self.low[:4], self.high[:4], slice(0, 0))
 
-    def explained(self, effort: Array, rows: Mask, scaled: bool = True) -> float:
-        """Share of the variance of effort [T] over the rows [T] that the bounded model explains (may be negative).
+    def explained(self, efforts: Array, rows: Mask, scaled: bool = True) -> Array:
+        """[L] share of the variance of efforts [L, T] over the rows [T] that the bounded model explains, or below zero.
 
         scaled: the effort's unit is the model's; otherwise every scale of the effort is tried.
         """
-        y, x = effort[rows], self.x[rows]
+        y, x = efforts[:, rows], self.x[rows]
         size = np.linalg.norm(x, axis=0) + 1e-12
         # a bounded fit of R c = Q'y is that of X c = y
         q, r = np.linalg.qr(x / size)
-        target, total = q.T @ y, float(np.sum((y - y.mean()) ** 2))
-        outside = float(y @ y - target @ target)
+        bounds = (self.low * size, self.high * size)
+        body = float(np.linalg.norm(x[:, self.rigid].sum(1)))
 
-        def misfit(scale: float) -> float:
-            fit = lsq_linear(r, scale * target, bounds=(self.low * size, self.high * size), method="bvls")
-            return 2.0 * float(fit.cost) / scale**2
+        def one(signal: Array) -> float:
+            target = q.T @ signal
+            norm = max(float(np.linalg.norm(signal)), 1e-300)
+            tried = np.ones(1) if scaled or body == 0 else body / norm * np.geomspace(0.1, 10.0, 9)
+            fits = [2.0 * lsq_linear(r, s * target, bounds=bounds, method="bvls").cost / s**2 for s in tried]
+            left = norm**2 - float(target @ target) + float(min(fits))
+            return 1.0 - left / max(float(np.sum((signal - signal.mean()) ** 2)), 1e-300)
 
-        body = float(np.linalg.norm(x[:, self.rigid].sum(1))) / max(float(np.linalg.norm(y)), 1e-300)
-        scales = np.array([1.0]) if scaled or body == 0 else max(body, 1e-9) * np.geomspace(0.1, 10.0, 9)
-        return 1.0 - (outside + min(misfit(float(s)) for s in scales)) / max(total, 1e-300)
+        return np.array([one(signal) for signal in y])

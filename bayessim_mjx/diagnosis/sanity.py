@@ -84,7 +84,9 @@ def clipped(log: Log, dt: float) -> Iterator[Finding]:
         for end in (float(x.max()), float(x.min())):
             share = _flat(x, end)
             if share > CLIPPED:
-                yield warn(f"{name} is clipped at {end:.5g} ({share:.0%} of the rows; a sensor's end or a hard stop)")
+                text = f"{name} is clipped at {end:.5g} ({share:.0%} of the rows"
+                drive = name.startswith("effort:")
+                yield Finding("finding", f"{text}; the drive's limit?)") if drive else warn(f"{text}; a hard stop?)")
 
 
 def _measured(log: Log) -> Iterator[tuple[str, Array]]:
@@ -156,12 +158,15 @@ def velocities(log: Log) -> list[Velocity]:
     """One comparison per measured velocity whose joint moves well above the noise."""
     if not log.has_qvel:
         return []
-    rates, spread = estimate_velocity(log.time, log.qpos, log.channels, log.sigma_qpos)
     cutoff = bandwidth(log)
-    grid = np.linspace(log.time[0], log.time[-1], len(log))
+    rows = slice(None, None, max(1, int(1.0 / (20.0 * cutoff * log.period))))
+    time = log.time[rows]
+    rates, spread = estimate_velocity(time, log.qpos[rows], log.channels, log.sigma_qpos)
+    grid = np.linspace(time[0], time[-1], len(time))
+    step = float(grid[1] - grid[0])
     out = []
-    for name, v, w, noise in zip(log.channels.qvel, log.qvel.T, rates.T, spread, strict=True):
-        even = [lowpass(np.interp(grid, log.time, x), log.period, cutoff) for x in (v, w)]
+    for name, v, w, noise in zip(log.channels.qvel, log.qvel[rows].T, rates.T, spread, strict=True):
+        even = [lowpass(np.interp(grid, time, x), step, cutoff) for x in (v, w)]
         if float(np.std(even[1])) > 2.0 * float(noise) and np.ptp(v) > 0:
             out.append(_compare(name, grid, even[0], even[1]))
     return out
@@ -169,7 +174,7 @@ def velocities(log: Log) -> list[Velocity]:
 
 def _compare(name: str, grid: Array, v: Array, w: Array) -> Velocity:
     # odd count: a lag of exactly 0 is among them
-    lags = np.linspace(-0.1, 0.1, 401) if grid[-1] - grid[0] > 1.0 else np.zeros(1)
+    lags = np.linspace(-0.1, 0.1, 201) if grid[-1] - grid[0] > 1.0 else np.zeros(1)
     late = [np.interp(grid - lag, grid, w) for lag in lags]
     errors = [float(np.sum((v - (v @ x) / (x @ x) * x) ** 2)) for x in late]
     best = int(np.argmin(errors))
