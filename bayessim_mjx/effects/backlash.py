@@ -1,0 +1,74 @@
+"""Backlash: play between motor and link (gear teeth, splines, keys, worn couplings)."""
+
+import dataclasses
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+
+from bayessim_mjx.effects import transmission
+from bayessim_mjx.effects.effect import Effect, Quantity
+from bayessim_mjx.effects.site import Site, SubStep
+
+if TYPE_CHECKING:
+    import mujoco
+    from mujoco import mjx
+
+MARK = 2.0**-40
+ROUNDS = 2  # of finding out which teeth touch
+
+
+@dataclasses.dataclass(frozen=True)
+class Backlash(Effect):
+    """The motor turns freely within +-gap around the link; at its ends the teeth push, never pull, and do not bounce.
+
+    J w_m' = tau - s, link moved by s, |q_m - q| <= gap, s = 0 inside. The motor is that of `joint_elasticity`: its
+    inertia J is the joint's armature, or a fifth of what is felt at the joint. The sensors show the link; position
+    servos see the motor. At the start the load has pushed the motor to one end of the gap.
+
+    Parameters: `gap`, half of the play, rad (hinge) or m (slide), neutral 0.
+    """
+
+    name: ClassVar[str] = "backlash"
+    kind: ClassVar[str] = "joint"
+    quantities: ClassVar[tuple[Quantity, ...]] = (
+        Quantity("gap", 0.0, 0.0, 0.05, unit="rad", per="travel", reach=(0.0, 0.1), grid=(0.03, 0.1, 0.4)),
+    )
+
+    def init(self, at: Site) -> Any:
+        return transmission.start(at) | {"side": jnp.zeros(len(at))}
+
+    def on_model(self, at: Site, model: "mjx.Model", theta: jax.Array) -> "mjx.Model":
+        return transmission.split(at, model, self._on(at, theta), MARK)
+
+    def on_actuator(
+        self, at: Site, memory: Any, step: SubStep, force: jax.Array, theta: jax.Array
+    ) -> tuple[Any, jax.Array]:
+        return memory, transmission.feedback(at, memory, step, force, self._on(at, theta))
+
+    def on_force(self, at: Site, memory: Any, step: SubStep, theta: jax.Array) -> tuple[Any, jax.Array]:
+        on, gap, fresh = self._on(at, theta), at.values(theta)[:, 0], memory["fresh"]
+        both = transmission.sides(at, memory, step, on, MARK)
+        none, whole = jnp.zeros(len(at)), jnp.full(len(at), step.dt)
+
+        def solve(side: jax.Array) -> transmission.Passed:
+            rest = jnp.where(fresh, 0.0, gap * side)
+            return transmission.transmit(both, step.dt, none, none, whole, rest, on & (fresh | (side != 0)))
+
+        side = memory["side"]
+        for _ in range(ROUNDS):
+            passed = solve(side)
+            twist = both.twist + step.dt * passed.slip
+            hit = jnp.where(jnp.abs(twist) > gap, jnp.sign(twist), 0.0)
+            side = jnp.where(side == 0, hit, jnp.where(passed.torque * side > 0, side, 0.0))
+        passed = solve(side)
+        side = jnp.where(fresh, jnp.sign(passed.torque), side)
+        twist = jnp.where(fresh, gap * side, both.twist)
+        rest, force = transmission.finish(at, step, both, passed, twist)
+        return rest | {"side": jnp.where(on, side, 0.0)}, force
+
+    def _on(self, at: Site, theta: jax.Array) -> jax.Array:
+        return at.values(theta)[:, 0] > 0
+
+    def edit(self, spec: "mujoco.MjSpec", values: dict[str, dict[str, float]]) -> str | None:
+        return "MuJoCo needs a body and a joint more for the motor, which changes qpos and qvel; use effects.yaml"

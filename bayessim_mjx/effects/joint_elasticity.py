@@ -1,0 +1,72 @@
+"""Joint elasticity: a spring between motor and link (harmonic drives, belts, long shafts, series elastic actuators)."""
+
+import dataclasses
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+
+from bayessim_mjx.effects import transmission
+from bayessim_mjx.effects.effect import Effect, Quantity
+from bayessim_mjx.effects.site import Site, SubStep
+
+if TYPE_CHECKING:
+    import mujoco
+    from mujoco import mjx
+
+MARK = 2.0**-20
+
+
+@dataclasses.dataclass(frozen=True)
+class JointElasticity(Effect):
+    """J w_m' = tau - s, link moved by s = k (q_m - q) + d (w_m - w), d = 2 zeta sqrt(k J_s).
+
+    The actuators turn the motor, whose inertia J is the joint's armature (taken off the link), or a fifth of what is
+    felt at the joint where the model has none; J_s is the inertia of motor against link. The sensors show the link;
+    position servos see the motor. Joint damping and friction stay with the link. At the start the spring is wound up by
+    the torque that a rigid joint would pass on.
+
+    Parameters: `compliance` 1/k, rad/(N m) (hinge) or m/N (slide), neutral 0; `damping` zeta, without effect where the
+    compliance is 0.
+    """
+
+    name: ClassVar[str] = "joint_elasticity"
+    kind: ClassVar[str] = "joint"
+    quantities: ClassVar[tuple[Quantity, ...]] = (
+        Quantity(
+            "compliance", 0.0, 0.0, 0.05, unit="rad/(N m)", per="1/force", reach=(0.0, 0.1), grid=(0.03, 0.1, 0.4)
+        ),
+        Quantity("damping", 0.1, 0.02, 0.5, grid=(0.1,), shape=True),
+    )
+
+    def init(self, at: Site) -> Any:
+        return transmission.start(at)
+
+    def on_model(self, at: Site, model: "mjx.Model", theta: jax.Array) -> "mjx.Model":
+        return transmission.split(at, model, self._on(at, theta), MARK)
+
+    def on_actuator(
+        self, at: Site, memory: Any, step: SubStep, force: jax.Array, theta: jax.Array
+    ) -> tuple[Any, jax.Array]:
+        return memory, transmission.feedback(at, memory, step, force, self._on(at, theta))
+
+    def on_force(self, at: Site, memory: Any, step: SubStep, theta: jax.Array) -> tuple[Any, jax.Array]:
+        on = self._on(at, theta)
+        both = transmission.sides(at, memory, step, on, MARK)
+        compliance, ratio = at.values(theta).T
+        soft = jnp.where(on & ~memory["fresh"], compliance, 0.0)
+        period = jnp.where(on, soft * both.series, 0.0)  # J_s / k
+        root = jnp.sqrt(jnp.where(period > 0, period, 1.0))
+        loss = jnp.where(period > 0, 2 * ratio * root, 0.0)  # d / k = 2 zeta sqrt(J_s / k)
+        # a resolved spring is looked at where the sub-step begins, which costs no energy; a stiff one where it ends
+        squares = period / (step.dt**2 * (1 + period * both.kp / both.motor))
+        late = step.dt * jnp.maximum(1.0 - squares, 0.0)
+        passed = transmission.transmit(both, step.dt, soft, loss, late, jnp.zeros(len(at)), on)
+        twist = jnp.where(memory["fresh"], compliance * passed.torque, both.twist)
+        return transmission.finish(at, step, both, passed, twist)
+
+    def _on(self, at: Site, theta: jax.Array) -> jax.Array:
+        return at.values(theta)[:, 0] > 0
+
+    def edit(self, spec: "mujoco.MjSpec", values: dict[str, dict[str, float]]) -> str | None:
+        return "MuJoCo needs a body and a joint more for the motor, which changes qpos and qvel; use effects.yaml"

@@ -1,0 +1,216 @@
+"""Motor and link as two inertias with something soft or loose between them, shared by the transmission effects.
+
+The joint of the model is the link. The motors of the site's joints live in the effect's memory: `twist`, motor angle
+less link angle, and `speed`, the motors' velocity. Both sides are solved together at the end of the sub-step, so that a
+stiff transmission tends to the rigid joint of the model and no stiffness is unstable. Position servos close their loop
+on the motor's side, where their encoder is.
+"""
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from bayessim_mjx.effects.site import Site, SubStep
+from bayessim_mjx.triangular import inverse_lower, product
+
+if TYPE_CHECKING:
+    from mujoco import mjx
+
+SHARE = 0.2  # of the joint's inertia is the motor's where the model has no armature
+REAL = 2.0**-10  # armature below this part of the joint's inertia counts as none
+_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
+_IMPLICIT = int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
+
+
+def start(at: Site) -> dict[str, jax.Array]:
+    """Memory at the start; `fresh`: the first sub-step is rigid and shows where the load leaves the motor."""
+    return {"twist": jnp.zeros(len(at)), "speed": jnp.zeros(len(at)), "fresh": jnp.ones((), bool)}
+
+
+def split(at: Site, model: "mjx.Model", on: jax.Array, mark: float) -> "mjx.Model":
+    """Take the armature off the links where `on` `[n]`: it is the motors'.
+
+    The hooks of the sub-step must find it again, with parameters written into it, and have no other place for a number
+    of the episode than the model: it stays there times `mark`, a power of 2 that makes it weigh nothing.
+    """
+    armature = model.dof_armature[at.dadr]
+    taken = on & (armature > REAL * model.dof_M0[at.dadr])
+    return model.replace(dof_armature=model.dof_armature.at[at.dadr].set(jnp.where(taken, mark * armature, armature)))
+
+
+def follow(at: Site, memory: Any, step: SubStep) -> tuple[jax.Array, jax.Array]:
+    """(twist, slip), `[n]`: motor less link, now; the link moved as the whole simulation let it."""
+    slip = jnp.where(memory["fresh"], 0.0, memory["speed"] - step.qvel[at.dadr])
+    return memory["twist"] + step.dt * slip, slip
+
+
+def servos(at: Site) -> tuple[np.ndarray, np.ndarray]:
+    """(ids of the actuators with feedback from joints of the site, their places in it)."""
+    model = at.mj_model
+    dof = np.full(model.nu, -1)
+    on_joint = np.isin(model.actuator_trntype, _JOINT)
+    dof[on_joint] = model.jnt_dofadr[model.actuator_trnid[on_joint, 0]]
+    affine = model.actuator_biastype == int(mujoco.mjtBias.mjBIAS_AFFINE)
+    ids = np.flatnonzero(affine & np.isin(dof, at.dadr))
+    return ids, np.asarray([int(np.flatnonzero(at.dadr == dof[i])[0]) for i in ids], int)
+
+
+def feedback(at: Site, memory: Any, step: SubStep, force: jax.Array, on: jax.Array) -> jax.Array:
+    """Actuator forces `[nu]` with the servos' feedback taken from the motors instead of the links."""
+    ids, places = servos(at)
+    if not len(ids):
+        return force
+    model, data = step.model, step.data
+    twist, slip = (x[places] for x in follow(at, memory, step))
+    gear, bias = model.actuator_gear[ids, 0], model.actuator_biasprm[ids]
+    extra = gear * (bias[:, 1] * twist + bias[:, 2] * slip)
+    low, high = _limits(model, ids)
+    own = data.actuator_force[ids]
+    inside = jnp.where((own > low) & (own < high), own, _unlimited(model, data)[ids])
+    change = jnp.clip(inside + extra, low, high) - own
+    return force.at[ids].add(jnp.where(on[places], change, 0.0))
+
+
+def _limits(model: "mjx.Model", ids: np.ndarray) -> tuple[jax.Array, jax.Array]:
+    limited = model.actuator_forcelimited[ids].astype(bool)
+    low, high = model.actuator_forcerange[ids].T
+    return jnp.where(limited, low, -jnp.inf), jnp.where(limited, high, jnp.inf)
+
+
+def _unlimited(model: "mjx.Model", data: "mjx.Data") -> jax.Array:
+    """Servos' forces `[nu]` before their limit: k u + b0 + b1 l + b2 l'."""
+    limited = model.actuator_ctrllimited.astype(bool)
+    low, high = model.actuator_ctrlrange.T
+    signal = jnp.where(limited, jnp.clip(data.ctrl, low, high), data.ctrl)
+    if at_work := model.na:
+        last = np.minimum(model.actuator_actadr + model.actuator_actnum - 1, at_work - 1)
+        signal = jnp.where(model.actuator_actadr < 0, signal, data.act[last])
+    b0, b1, b2 = model.actuator_biasprm[:, :3].T
+    speed = product(data._impl.actuator_moment, data.qvel[:, None])[:, 0]
+    return model.actuator_gainprm[:, 0] * signal + b0 + b1 * data.actuator_length + b2 * speed
+
+
+class Sides(NamedTuple):
+    """Motors and links of a sub-step before anything passes between them, `[n]` each; on: the effect is active there.
+
+    twist, slip: motor less link, angle and velocity; torque: the actuators', on the motor; motor: its inertia; kp, kv:
+    the servos' feedback that follows the motor within the sub-step; inside: what of the matrix that the integrator
+    solves is not the link's (servo damping, the motor's share), kg m^2; servo: the first of these two; series: inertia
+    of motor against link; inertia `[n, n]`: of the links, as felt at the joints, with `inside`; push: impulse of all
+    other forces on the links.
+    """
+
+    on: jax.Array
+    twist: jax.Array
+    slip: jax.Array
+    torque: jax.Array
+    motor: jax.Array
+    kp: jax.Array
+    kv: jax.Array
+    inside: jax.Array
+    servo: jax.Array
+    series: jax.Array
+    inertia: jax.Array
+    push: jax.Array
+
+
+def sides(at: Site, memory: Any, step: SubStep, on: jax.Array, mark: float) -> Sides:
+    """Both sides of the site's joints in this sub-step; `mark` as in `split`."""
+    model, dof, dt = step.model, at.dadr, step.dt
+    torque = jnp.where(on, step.data.qfrc_actuator[dof], 0.0)
+    kp, kv, damping = _gains(at, step, on)
+    mobility = step.inverse[np.ix_(dof, dof)]
+    inertia = inverse(mobility)
+    servo = dt * damping if int(at.mj_model.opt.integrator) == _IMPLICIT else jnp.zeros(len(at))
+    alone = mobility if not _has_inner_damping(at) else inverse(inertia - jnp.diag(servo))
+    felt = 1.0 / jnp.diagonal(alone)
+    part = min(SHARE, 0.8 / len(at))  # trace bound: what the motors leave stays positive definite
+    armature = model.dof_armature[dof] / mark
+    whole = model.dof_M0[dof]
+    own = (armature > REAL * whole) & (armature < whole / REAL)
+    motor, link = jnp.where(own, armature, part * felt), jnp.where(own, felt, (1 - part) * felt)
+    free = step.dt * (step.inverse[dof] * (step.force - at.scatter(torque))).sum(-1)
+    twist, slip = follow(at, memory, step)
+    return Sides(
+        on=on,
+        twist=jnp.where(on, twist, 0.0),
+        slip=jnp.where(on, slip, 0.0),
+        torque=torque,
+        motor=motor,
+        kp=kp,
+        kv=kv,
+        inside=jnp.where(on, servo + jnp.where(own, 0.0, motor), 0.0),
+        servo=servo,
+        series=motor * link / (motor + link),
+        inertia=inertia,
+        push=(inertia * free).sum(-1),
+    )
+
+
+def _has_inner_damping(at: Site) -> bool:
+    return int(at.mj_model.opt.integrator) == _IMPLICIT and len(servos(at)[0]) > 0
+
+
+def _gains(at: Site, step: SubStep, on: jax.Array) -> tuple[jax.Array, ...]:
+    """(kp, kv where the servo is free to respond, kv that MuJoCo's matrix holds), at the joints `[n]`."""
+    ids, places = servos(at)
+    none = jnp.zeros(len(at))
+    if not len(ids):
+        return none, none, none
+    model, force = step.model, step.actuator_force[ids]
+    gear, bias = model.actuator_gear[ids, 0], model.actuator_biasprm[ids]
+    low, high = _limits(model, ids)
+    responds = (force > low) & (force < high) & (force != 0)  # 0: switched off
+    kp, kv = -(gear**2) * bias[:, 1], -(gear**2) * bias[:, 2]
+    gains = (jnp.where(responds, kp, 0.0), jnp.where(responds, kv, 0.0), kv)
+    return tuple(jnp.where(on, jnp.maximum(none.at[places].add(g), 0.0), 0.0) for g in gains)
+
+
+class Passed(NamedTuple):
+    """At the end of a sub-step, `[n]`: torque through the transmission, change of the links' speed, motor's slip."""
+
+    torque: jax.Array
+    change: jax.Array
+    slip: jax.Array
+
+
+def transmit(
+    both: Sides, dt: float, soft: jax.Array, loss: jax.Array, late: jax.Array, rest: jax.Array, held: jax.Array
+) -> Passed:
+    """Solve motors and links together where `held` `[n]`; elsewhere nothing passes between them.
+
+    soft s = (twist - rest) + (late + loss) slip', with compliance `soft` 1/k, `loss` d/k (s), `late` theta dt: where in
+    the sub-step the spring is looked at (0: its beginning, dt: its end), and slip' at the end of the sub-step.
+    """
+    # motor: J (w' - w) = dt (tau - s - kp late slip' - kv (slip' - slip) - servo (v' - v) / dt)
+    slow = both.motor + dt * late * both.kp + dt * both.kv
+    rigid = both.motor + both.servo
+    drive = dt * both.torque + (both.motor + dt * both.kv) * both.slip
+    over = late + loss
+    below = jnp.where(held, slow * soft + dt * over, 1.0)
+    gain = jnp.where(held, over / below, 0.0)
+    pull = jnp.where(held, (over * drive + slow * (both.twist - rest)) / below, 0.0)
+    # link: Y (v' - v) = push + dt s, with s = pull - gain rigid (v' - v)
+    matrix = both.inertia + jnp.diag(dt * gain * rigid - both.inside)
+    change = (inverse(matrix) * (both.push + dt * pull)).sum(-1)
+    torque = pull - gain * rigid * change
+    return Passed(torque, change, (drive - dt * torque - rigid * change) / slow)
+
+
+def finish(at: Site, step: SubStep, both: Sides, passed: Passed, twist: jax.Array) -> tuple[dict, jax.Array]:
+    """(memory, generalised force `[nv]`): the link gets what passed instead of what the actuators exert."""
+    own = passed.torque + both.inside * passed.change / step.dt - both.torque
+    speed = step.qvel[at.dadr] + passed.change + jnp.where(both.on, passed.slip, 0.0)
+    memory = {"twist": jnp.where(both.on, twist, 0.0), "speed": speed, "fresh": jnp.zeros((), bool)}
+    return memory, at.scatter(jnp.where(both.on, own, 0.0))
+
+
+def inverse(matrix: jax.Array) -> jax.Array:
+    """Inverse of a positive definite matrix `[n, n]`."""
+    if matrix.shape[0] == 1:
+        return 1.0 / matrix
+    factor = inverse_lower(jnp.linalg.cholesky(matrix))
+    return product(factor.T, factor)
