@@ -131,7 +131,7 @@ class ActuatorSaturation(ActuatorCause):
         return self.scales.force[self.joint] / (1 + self.size)
 
     def parameters(self) -> dict[str, float]:
-        return {"limit": self.limit}
+        return {"inverse_limit": 1 / self.limit}
 
 
 class SpeedTorqueLimit(ActuatorCause):

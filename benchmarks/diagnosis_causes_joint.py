@@ -30,7 +30,9 @@ class Bristle:
         decay = math.exp(-rate * self.timestep)
         before = self.z
         self.z = before * decay + (w * (1 - decay) / rate if rate > 1e-9 else w * self.timestep)
-        return -(self.s0 * self.z + self.s1 * (self.z - before) / self.timestep)
+        # the bristles' own damping must not brake a fast joint: no more than the level, so that LuGre stays passive
+        damping = min(self.s1, level / abs(w)) if w else self.s1
+        return -(self.s0 * self.z + damping * (self.z - before) / self.timestep)
 
 
 class Friction(Cause):
@@ -203,7 +205,7 @@ class Backlash(TwoBodies):
         joint.damping[0] = 0.02 * spec.joint(self.where).damping[0]
 
     def parameters(self) -> dict[str, float]:
-        return {"width": self.size}
+        return {"gap": self.size / 2}
 
 
 class JointElasticity(TwoBodies):
@@ -221,4 +223,4 @@ class JointElasticity(TwoBodies):
         joint.damping[0] = 2 * self.zeta * math.sqrt(k * self.scales.inertia[self.where])
 
     def parameters(self) -> dict[str, float]:
-        return {"stiffness": 1 / max(self.size, self.smallest), "compliance": max(self.size, self.smallest)}
+        return {"compliance": max(self.size, self.smallest)}

@@ -53,7 +53,9 @@ class GravityTilt(Cause):
         spec.option.gravity = [aside * math.cos(self.heading), aside * math.sin(self.heading), -g * math.cos(lean)]
 
     def parameters(self) -> dict[str, float]:
-        return {"lean": self.size, "heading": self.heading}
+        pitch = math.asin(math.sin(self.size) * math.cos(self.heading))
+        roll = -math.asin(math.sin(self.size) * math.sin(self.heading) / math.cos(pitch))
+        return {"roll": roll, "pitch": pitch}
 
 
 class ExternalForce(Cause):
@@ -81,7 +83,7 @@ class ExternalForce(Cause):
         plant.data.xfrc_applied[self.id, :3] += self.size * (1 + self.gusts * self.wind) * self.direction
 
     def parameters(self) -> dict[str, float]:
-        return dict(zip("xyz", (self.size * self.direction).tolist(), strict=True))
+        return {f"force_{a}": float(self.size * x) for a, x in zip("xyz", self.direction, strict=True)}
 
 
 class BaseFlexibility(Cause):

@@ -1,0 +1,174 @@
+"""The benchmark's reality against hand computation, plain MuJoCo and the log reader."""
+
+import json
+import sys
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from bayessim_mjx.logs import read_logs
+
+BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
+sys.path.insert(0, str(BENCHMARKS))
+cases = pytest.importorskip("diagnosis_cases")
+import diagnosis_score as score  # noqa: E402
+import diagnosis_strength as strength  # noqa: E402
+import diagnosis_truth as truth  # noqa: E402
+
+PENDULUM = cases.SYSTEMS["pendulum"]
+
+
+def cause(name: str, size: float, system: str = "pendulum", where: str | None = None):
+    robot = cases.SYSTEMS[system]
+    plain = truth.Plant(robot, {})
+    scales = truth.scales_of(plain, [truth.run(plain, 0, 0, noise=False)])
+    place = where or cases.places(robot, name, scales)[0]
+    return cases.CAUSES[name](place, scales, np.random.default_rng(0), size)
+
+
+def coast(plant: truth.Plant, q: float, v: float, seconds: float, u: float = 0.0) -> tuple[float, float]:
+    plant.reset(np.array([q]), np.array([v]), np.array([u]))
+    for _ in range(round(seconds / plant.system.period)):
+        plant.advance(np.array([u]))
+    return tuple(float(x[0]) for x in plant.link())
+
+
+def weightless(*causes, damping: float = 0.0) -> truth.Plant:
+    plant = truth.Plant(PENDULUM, {"hinge.damping": damping}, causes)
+    plant.model.opt.gravity[:] = 0
+    return plant
+
+
+def inertia(plant: truth.Plant) -> float:
+    return 1 / float(plant.model.dof_invweight0[0])
+
+
+def test_nothing_of_the_library_is_used():
+    for file in BENCHMARKS.glob("diagnosis_[cst]*.py"):
+        text = file.read_text()
+        assert not any(word in text for word in ("import bayessim_mjx", "from bayessim_mjx", "mjx.")), file.name
+
+
+def test_without_causes_and_noise_it_is_the_nominal_model_at_a_tenth_of_its_step(tmp_path):
+    case = cases.make_case("two_link", (), "medium", 3, tmp_path, velocity=True, spread=0.0, noise=False)
+    model = mujoco.MjModel.from_xml_path(str(case.out / "model.xml"))
+    model.opt.timestep /= truth.FINER
+    log = read_logs(case.out / "logs", model)[3]
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = log.qpos[0], log.qvel[0]
+    for row in range(1, len(log)):
+        data.ctrl[:] = log.ctrl[row - 1]
+        mujoco.mj_step(model, data, nstep=round(0.01 / model.opt.timestep))
+        np.testing.assert_allclose(log.qpos[row], data.qpos, atol=1e-6)
+
+
+def test_dry_friction_takes_its_level_times_the_way_out_of_the_energy():
+    level, v = 0.02, 4.0
+    plant = weightless(cause("coulomb_friction", level))
+    way, left = coast(plant, 0.0, v, 0.4)
+    # 1/2 J v0^2 - 1/2 J v^2 = level way, but for the bristles' own bend
+    assert 0.5 * inertia(plant) * (v**2 - left**2) == pytest.approx(level * way, rel=3e-3)
+
+
+def test_a_resting_joint_sticks_below_the_level_and_slips_above_it():
+    plant = weightless(cause("coulomb_friction", 0.1))
+    assert abs(coast(plant, 0.0, 0.0, 1.0, u=0.09)[0]) < 1e-3
+    # J w' = u - level
+    way = 0.5 * (0.2 - 0.1) / inertia(plant)
+    assert coast(plant, 0.0, 0.0, 1.0, u=0.2)[0] == pytest.approx(way, rel=5e-3)
+
+
+def test_a_late_command_moves_late():
+    plant = weightless(cause("actuator_delay", 0.05))
+    plant.reset(np.zeros(1), np.zeros(1), np.zeros(1))
+    for _ in range(10):
+        plant.advance(np.ones(1))
+    # J w' = 1 from 0.05 s on
+    assert plant.link()[0][0] == pytest.approx(0.5 * 0.15**2 / inertia(plant), rel=1e-2)
+
+
+def test_a_lag_loses_its_time_constant_of_impulse():
+    plant = weightless(cause("actuator_lag", 0.02))
+    plant.reset(np.zeros(1), np.zeros(1), np.zeros(1))
+    for _ in range(25):
+        plant.advance(np.ones(1))
+    # integral of 1 - exp(-t / T) is t - T after many T
+    assert plant.link()[1][0] == pytest.approx((0.5 - 0.02) / inertia(plant), rel=3e-3)
+
+
+def test_a_held_load_winds_up_an_elastic_joint_by_its_compliance():
+    plant = truth.Plant(PENDULUM, {}, [cause("joint_elasticity", 0.05)])
+    plant.model.dof_damping[:] = 1.0  # come to rest soon
+    load = 0.6 * 9.81 * 0.2
+    coast(plant, np.pi / 2, 0.0, 4.0, u=-load)
+    rotor, play = plant.data.qpos
+    torque = load * np.sin(rotor + play)  # about the hinge, on the link
+    assert abs(play) == pytest.approx(0.05 * abs(torque), rel=0.02)
+
+
+def test_the_link_moves_inside_the_play_and_no_farther():
+    plant = truth.Plant(PENDULUM, {}, [cause("backlash", 0.04)])
+    coast(plant, 0.5, 0.0, 3.0)
+    low = high = 0.0
+    for _ in range(100):
+        plant.advance(np.zeros(1))
+        low, high = min(low, plant.data.qpos[1]), max(high, plant.data.qpos[1])
+    assert high - low < 0.045 and abs(plant.data.qpos[1]) <= 0.0225
+
+
+@pytest.mark.parametrize("name", ["viscous_friction", "sensor_delay", "payload"])
+def test_a_cause_of_the_asked_strength_is_that_far_from_the_model(name):
+    base = truth.base_parameters(PENDULUM, 0.2, np.random.default_rng(0))
+    ruler = strength.Ruler(PENDULUM, base, 0.2, 0)
+    hidden = cause(name, 0.0)
+    raw, left = strength.resize(hidden, ruler, 10.0)
+    assert 8 < min(raw, strength.HIDDEN * left) < 12 and left <= raw
+    assert ruler.measure(ruler.runs)[0] < 1e-9  # and without it nothing is
+
+
+def test_two_writings_of_a_case_are_equal_and_other_seeds_differ(tmp_path):
+    effects = [("external_force", "lower"), "coulomb_friction"]
+    first, second = (cases.make_case("two_link", effects, "medium", 7, tmp_path / n) for n in "ab")
+    other = cases.make_case("two_link", (), "medium", 8, tmp_path / "c")
+    files = sorted(p.relative_to(first.out) for p in first.out.rglob("*") if p.is_file())
+    assert len(files) == 8 * 2 + 2
+    assert all((first.out / f).read_bytes() == (second.out / f).read_bytes() for f in files)
+    assert other.truth["base"] != first.truth["base"]
+
+
+def test_logs_are_read_with_the_right_noise_and_conditions(tmp_path):
+    case = cases.make_case("leg", (), "medium", 1, tmp_path, velocity=False)
+    logs = read_logs(case.out / "logs", mujoco.MjModel.from_xml_path(str(case.out / "model.xml")))
+    assert len({log.metadata["condition"] for log in logs}) >= 4 and len(logs) == 8
+    noise = np.median([log.sigma_qpos for log in logs], axis=0)
+    np.testing.assert_allclose(noise, cases.SYSTEMS["leg"].sigma, rtol=0.3)
+
+
+def verdict(folder: Path, name: str, where: str, rivals: list) -> score.Outcome:
+    told = {"name": name, "where": where, "parameters": {"level": {"mean": 0.1, "sd": 0.01}}, "gap_closed": 0.97}
+    out = folder / "diagnosis"
+    out.mkdir(exist_ok=True)
+    (out / "diagnosis.json").write_text(
+        json.dumps({"verdict": "effects", "effects": [told | {"equivalent_to": rivals}]})
+    )
+    return score.read(folder)
+
+
+def test_scores_of_a_right_a_rival_and_a_wrong_verdict(tmp_path):
+    folder = cases.make_case("two_link", (), "medium", 1, tmp_path).out
+    hidden = {"name": "coulomb_friction", "where": "elbow", "parameters": {"level": 0.11}, "raw": 20.0, "left": 9.0}
+    sealed = json.loads((folder / "truth.json").read_text()) | {"effects": [hidden]}
+    (folder / "truth.json").write_text(json.dumps(sealed))
+    right = verdict(folder, "coulomb_friction", "elbow", [])
+    assert right.right(hidden) and score.covered(right) == [True]
+    assert score.closure_errors([right]) == pytest.approx([0.03])
+    rival = verdict(folder, "stribeck_friction", "elbow", [{"effects": ["coulomb_friction@elbow"]}])
+    assert rival.inside(hidden) and not rival.right(hidden)
+    assert not verdict(folder, "coulomb_friction", "shoulder", []).inside(hidden)
+
+
+def test_wilson_interval_of_nine_in_ten():
+    # (p + z^2/2n -+ z sqrt(p q / n + z^2 / 4n^2)) / (1 + z^2/n) with z = 1.96: Wilson (1927), 0.596 to 0.982
+    assert score.wilson(9, 10, 1.96) == pytest.approx((0.596, 0.982), abs=1e-3)
