@@ -51,6 +51,12 @@ class Outcome:
     def right(self, effect: dict[str, Any]) -> bool:
         return any(self.same(f["name"], str(f["where"]), effect) for f in self.named())
 
+    def best(self, effects: Sequence[dict[str, Any]]) -> bool:
+        """Baseline (single-fold error, as BAM): the candidate that predicts best held out is the truth, no thresholds."""
+        ranked = [c for c in (self.said or {}).get("candidates", []) if c.get("score") is not None]
+        top = _labels(ranked[0]) if ranked else []
+        return len(top) == len(effects) and all(any(self.same(*t, e) for t in top) for e in effects)
+
     def inside(self, effect: dict[str, Any]) -> bool:
         """Named, or in the set of what cannot be told from what is named."""
         rivals = [label for f in self.named() for entry in f["equivalent_to"] for label in _labels(entry)]
@@ -133,6 +139,8 @@ def rates(outcomes: Sequence[Outcome], left_out: Sequence[Outcome]) -> list[Rate
         ("nothing wrong: false alarm", [label(o) not in ("no_gap", "parameters") for o in null], 0.02),
         ("unknown cause: unexplained", [_unexplained(o) for o in unknown], 0.9),
         ("family left out: unexplained", [_unexplained(o) for o in left_out], 0.9),
+        ("single, baseline: best candidate", [o.best([o.truth["effects"][0]]) for o in single], 0.95),
+        ("nothing wrong, baseline: false alarm", [not o.best([]) for o in null], 0.02),
         ("90 % intervals that cover", [c for o in (*single, *double) for c in covered(o)], 0.9),
         ("closure within 5 points", [e <= 0.05 for e in closure_errors(single)], 0.9),
     ]  # fmt: skip
