@@ -242,6 +242,8 @@ def _recorded(config: Config, env: Any, summarizer: Callable) -> Recorded:
 def real_parameters(settings: Any, space: ParameterSpace) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """weights [K], means [K, d], sds [K, d] of `env.realParams`; a one-number list stands for every parameter.
 
+    Rows may leave the effects' parameters out: these are nominal (as a diagnosis identified them, or neutral).
+
     Unlike BayesSimIG, `stds` are standard deviations (there they were used as variances).
 
     Raises:
@@ -255,8 +257,8 @@ def real_parameters(settings: Any, space: ParameterSpace) -> tuple[np.ndarray, n
         raise UserError(
             f"env.realParams.means is missing (there is only {', '.join(settings)}): expected {_rows_of(space)}"
         )
-    means = _rows("means", settings["means"], space)
-    stds = _rows("stds", settings.get("stds", [[0.0]] * len(means)), space)
+    means = _rows("means", settings["means"], space, space.nominal)
+    stds = _rows("stds", settings.get("stds", [[0.0]] * len(means)), space, np.zeros(len(space)))
     given = settings.get("weights", [1.0] * len(means))
     if not isinstance(given, list | tuple) or not given:
         raise UserError(f"env.realParams.weights = {given!r}: expected a list of one number >= 0 per row of means")
@@ -280,12 +282,12 @@ def real_parameters(settings: Any, space: ParameterSpace) -> tuple[np.ndarray, n
     )
 
 
-def _rows(key: str, value: Any, space: ParameterSpace) -> list[np.ndarray]:
-    """Rows [d], one per component; a single mapping or flat list is one component."""
+def _rows(key: str, value: Any, space: ParameterSpace, rest: np.ndarray) -> list[np.ndarray]:
+    """Rows [d], one per component; a single mapping or flat list is one component. `rest` [d]: effects left out."""
     if not isinstance(value, dict | list | tuple) or not value:
         raise UserError(f"env.realParams.{key} = {value!r}: expected {_rows_of(space)}")
     many = not isinstance(value, dict) and any(isinstance(row, dict | list | tuple) for row in value)
-    return [_row(f"{key}[{i}]", row, space) for i, row in enumerate(value if many else [value])]
+    return [_row(f"{key}[{i}]", row, space, rest) for i, row in enumerate(value if many else [value])]
 
 
 def _rows_of(space: ParameterSpace) -> str:
@@ -302,19 +304,23 @@ def _number(key: str, value: Any) -> float:
     return number
 
 
-def _row(key: str, row: Any, space: ParameterSpace) -> np.ndarray:
+def _row(key: str, row: Any, space: ParameterSpace, rest: np.ndarray) -> np.ndarray:
     if not isinstance(row, dict | list | tuple) or not row:
         raise UserError(f"env.realParams.{key} = {row!r}: expected {_rows_of(space)}")
     if isinstance(row, dict):
         for name in row:
             space.index(name)
-        missing = [name for name in space.names if name not in row]
+        missing = [p.name for p in space.parameters if p.name not in row and p.kind != "effect"]
         if missing:
             raise UserError(f"env.realParams.{key}: no value for {', '.join(missing)}")
-        return np.asarray([_number(f"{key}.{name}", row[name]) for name in space.names])
+        known = zip(space.names, rest, strict=True)
+        return np.asarray([_number(f"{key}.{name}", row.get(name, value)) for name, value in known])
     numbers = [_number(f"{key}[{i}]", value) for i, value in enumerate(row)]
     if len(numbers) == 1:
         return np.full(len(space), numbers[0])
+    model = [i for i, p in enumerate(space.parameters) if p.kind != "effect"]  # the first of theta
+    if len(row) == len(model):
+        return np.asarray([*numbers, *rest[len(model) :]])
     if len(row) != len(space):
         raise UserError(
             f"env.realParams.{key} has {len(row)} numbers, the task has {len(space)} parameters: "

@@ -109,7 +109,9 @@ class Diagnosis:
     def to_dict(self) -> dict[str, Any]:
         """The contents of diagnosis.json; numbers that are not finite become null."""
         out = {"schema": self.schema} | {
-            f.name: _plain(getattr(self, f.name)) for f in dataclasses.fields(self) if f.name not in ("details", "schema")
+            f.name: _plain(getattr(self, f.name))
+            for f in dataclasses.fields(self)
+            if f.name not in ("details", "schema")
         }
         return out
 
@@ -136,7 +138,9 @@ def load(folder: str | Path) -> Diagnosis:
 
 
 def _effect(raw: dict[str, Any]) -> FoundEffect:
-    parameters = {k: Estimate(**{n: math.nan if x is None else x for n, x in v.items()}) for k, v in raw["parameters"].items()}
+    parameters = {
+        k: Estimate(**{n: math.nan if x is None else x for n, x in v.items()}) for k, v in raw["parameters"].items()
+    }
     rest = {k: math.nan if v is None else v for k, v in raw.items() if k != "parameters"}
     return FoundEffect(**{**rest, "parameters": parameters, "gap_closed_ci": tuple(raw["gap_closed_ci"])})
 

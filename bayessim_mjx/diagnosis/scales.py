@@ -88,7 +88,9 @@ def measure(model: mujoco.MjModel, logs: Sequence[Log]) -> Scales:
         effort[i] = max(needed, direct, 1e-9)
         if on_joint:
             force[model.jnt_dofadr[joint]] = max(force[model.jnt_dofadr[joint]], direct * abs(gear))
-    noise = np.sqrt(np.mean([np.pad(log.sigma_qpos, (0, max(0, model.nv - model.nq)))[: model.nv] ** 2 for log in logs], axis=0))
+    noise = np.sqrt(
+        np.mean([np.pad(log.sigma_qpos, (0, max(0, model.nv - model.nq)))[: model.nv] ** 2 for log in logs], axis=0)
+    )
     return Scales(
         model=model,
         force=np.maximum(force, 1e-9),

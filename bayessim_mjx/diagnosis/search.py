@@ -12,6 +12,7 @@ from bayessim_mjx.diagnosis.candidates import Candidate
 from bayessim_mjx.diagnosis.fit import Fitter, Job
 from bayessim_mjx.diagnosis.models import Comparison, Model, compare, scored
 from bayessim_mjx.diagnosis.screen import Screened, screen
+from bayessim_mjx.diagnosis.uncertainty import deviations
 from bayessim_mjx.effects import load, names
 
 Progress = Callable[[str, int, int], None]
@@ -22,7 +23,8 @@ class Settings:
     """Thresholds and budgets of the race, fixed before any data are seen.
 
     Attributes:
-        relevance: an effect must close this share of the gap above the noise; drop: and lower the cost by this share.
+        relevance: an effect must close this share of the gap above the noise; more: a further effect, of what the others
+            leave; drop: and lower the cost by this share.
         evidence: and gain this many nats plus the logarithm of the number of candidates (family-wise).
         t: and improve windows of all conditions: mean over clustered standard error.
         floor: a model within this factor of the noise (rms) is not improved further.
@@ -33,6 +35,7 @@ class Settings:
     """
 
     relevance: float = 0.05
+    more: float = 0.15
     drop: float = 0.03
     evidence: float = 5.0
     t: float = 2.0
@@ -41,7 +44,7 @@ class Settings:
     singles: int = 48
     pairs: int = 7
     most: int = 5
-    iterations: int = 9
+    iterations: int = 12
     fresh: int = 6
     starts: int = 20
 
@@ -74,7 +77,17 @@ class Race:
         if old.total < s.floor**2 * self.noise * len(old.cost):  # nothing left above the noise
             return False
         many = np.log(max(len(self.candidates), 2)) * max(1, len(new.effects) - len(old.effects))
-        return c.share > s.relevance and c.drop > s.drop and c.evidence > s.evidence + many and c.t > s.t
+        if not all(self.distinct(new, e) for e in new.effects if e not in old.effects):
+            return False
+        relevance = s.more if old.effects else s.relevance
+        return c.share > relevance and c.drop > s.drop and c.evidence > s.evidence + many and c.t > s.t
+
+    def distinct(self, model: Model, effect: Candidate) -> bool:
+        """Whether at least one amplitude of the effect is two standard deviations away from neutral."""
+        sd = deviations(self.fitter, model)
+        own = [model.job.names.index(c.name) for c in effect.coordinates]
+        off = [abs(model.job.values[i] - c.neutral) / max(sd[i], 1e-300) for i, c in zip(own, effect.coordinates, strict=True)]
+        return any(z > 2.0 for z, shape in zip(off, effect.shapes, strict=True) if not shape)
 
     def closure(self, model: Model) -> float:
         """Share of the base model's gap above the noise that `model` closes, held out."""

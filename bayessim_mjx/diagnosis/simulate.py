@@ -92,9 +92,7 @@ class Simulator:
         model, h = self.physics.mj_model, float(self.physics.mj_model.opt.timestep)
         own = jax.tree.map(lambda x: x[index], batch)
         world = begin(self.physics, theta, own.around)
-        world = world.replace(
-            qpos=integrate(model, world.qpos, offset[: self.nv]), qvel=world.qvel + offset[self.nv :]
-        )
+        world = world.replace(qpos=integrate(model, world.qpos, offset[: self.nv]), qvel=world.qvel + offset[self.nv :])
 
         def step(world: Any, row: tuple) -> tuple[Any, tuple]:
             command, extra, enabled = row

@@ -88,7 +88,9 @@ def groups_of(logs: Sequence[Log], key: str | None = None) -> tuple[list[int], t
             raise UserError(f"--group {key}: the metadata of {log.name!r} has no such key; it has {have}")
         labels.append(str(value) if value is not None else "")
     if len(set(labels)) == 1 and len(logs) > 1 or not all(labels):
-        labels = [label if label and len(set(labels)) > 1 else log.name for label, log in zip(labels, logs, strict=True)]
+        labels = [
+            label if label and len(set(labels)) > 1 else log.name for label, log in zip(labels, logs, strict=True)
+        ]
     names = tuple(dict.fromkeys(labels))
     return [names.index(label) for label in labels], names
 
@@ -187,7 +189,9 @@ def _fine_commands(raw: Log, even: Log, dt: float, substeps: int) -> NDArray[np.
     times = np.concatenate([[min(edges[0], raw.time[0]) - dt], raw.time[1:], [max(edges[-1], raw.time[-1]) + dt]])
     held = np.concatenate([raw.ctrl])  # row k holds from time[k] to time[k+1]; the first and last for ever
     area = np.concatenate([np.zeros((1, nu)), np.cumsum(held * np.diff(times)[:, None], axis=0)])
-    means = np.stack([np.diff(np.interp(edges, times, a)) / h for a in area.T], 1) if nu else np.zeros((rows * substeps, 0))
+    means = (
+        np.stack([np.diff(np.interp(edges, times, a)) / h for a in area.T], 1) if nu else np.zeros((rows * substeps, 0))
+    )
     return means.reshape(rows, substeps, nu).astype(np.float32)
 
 
