@@ -5,12 +5,12 @@ lines also differ in dashes, areas in hatching.
 """
 
 import html
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
 
-from bayessim_mjx.monitor.style import BLUE, GREY, NAVY, SKY
+from bayessim_mjx.monitor.style import BLUE, SKY
 from bayessim_mjx.report.words import finite
 
 INK, FAINT, GRID = "#1f2429", "#6a737d", "#e6e9ec"
@@ -24,7 +24,7 @@ STAGE = {
 }
 DASH = {"nominal": "dot", "calibrated": "dash", "with_effects": "solid", "measured": "solid"}
 HATCH = {"nominal": "", "calibrated": "", "with_effects": "", "reducible_floor": "/", "noise_floor": "."}
-LINES = (BLUE, "#D55E00", "#009E73", "#CC79A7", "#E69F00", NAVY, GREY, "#000000")
+OVER = {"fillmode": "overlay", "fgcolor": "white", "size": 6}  # hatching over the colour
 FONT = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', Arial, sans-serif"
 WIDTH = 960  # of the page's column, px: fixed, so that screen and paper are laid out alike
 
@@ -47,24 +47,59 @@ def numbers(values: Any, digits: int = 5) -> list[float | None]:
 
 
 def axis(title: str = "", **more: Any) -> dict[str, Any]:
+    """An axis with faint grid lines; `more` are plotly's own settings."""
     base = {
-        "showgrid": True, "gridcolor": GRID, "zeroline": False, "linecolor": "#9aa3ab", "showline": True,
-        "ticks": "outside", "ticklen": 4, "tickcolor": "#9aa3ab", "automargin": True,
+        "showgrid": True,
+        "gridcolor": GRID,
+        "zeroline": False,
+        "linecolor": "#9aa3ab",
+        "showline": True,
+        "ticks": "outside",
+        "ticklen": 4,
+        "tickcolor": "#9aa3ab",
+        "automargin": True,
         "title": {"text": title, "font": {"size": 12.5, "color": INK}, "standoff": 8},
-    }  # fmt: skip
+    }
     return base | more
 
 
 def figure(data: list[dict], width: int, height: int, **layout: Any) -> dict[str, Any]:
     """{"data", "layout", "width", "height"} of one figure, without plotly's own colours, title or legend box."""
     base = {
-        "width": width, "height": height, "paper_bgcolor": "white", "plot_bgcolor": "white", "showlegend": False,
-        "font": {"family": FONT, "size": 12, "color": INK}, "margin": {"l": 60, "r": 16, "t": 30, "b": 46},
-        "hoverlabel": {"bgcolor": "white", "bordercolor": "#9aa3ab", "font": {"family": FONT, "size": 12, "color": INK}},
+        "width": width,
+        "height": height,
+        "paper_bgcolor": "white",
+        "plot_bgcolor": "white",
+        "showlegend": False,
+        "font": {"family": FONT, "size": 12, "color": INK},
+        "margin": {"l": 60, "r": 16, "t": 30, "b": 46},
+        "hoverlabel": {
+            "bgcolor": "white",
+            "bordercolor": "#9aa3ab",
+            "font": {"family": FONT, "size": 12, "color": INK},
+        },
         "legend": {"orientation": "h", "x": 0, "y": 1.02, "xanchor": "left", "yanchor": "bottom", "font": {"size": 12}},
-        "dragmode": "zoom", "hovermode": "closest",
-    }  # fmt: skip
+        "dragmode": "zoom",
+        "hovermode": "closest",
+    }
     return {"data": data, "layout": base | layout, "width": width, "height": height}
+
+
+def log_ticks(values: Sequence[Any]) -> list[float]:
+    """1, 2, 5, 10, 20 ... between the smallest and the largest positive value, thinned out to at most about eight."""
+    known = [v for v in values if finite(v) and v > 0]
+    if not known:
+        return [1.0]
+    low, high = np.floor(np.log10(min(known))), np.ceil(np.log10(max(known)))
+    digits = (1, 2, 5) if high - low <= 2 else (1, 3) if high - low <= 4 else (1,)
+    ticks = [float(f"{d}e{int(p)}") for p in np.arange(low, high + 1) for d in digits]
+    return [t for t in ticks if min(known) / 1.8 <= t <= max(known) * 1.8]
+
+
+def log_axis(title: str, values: Sequence[Any], **more: Any) -> dict[str, Any]:
+    """A logarithmic axis whose ticks are whole numbers that people read, without plotly's small 2s and 5s."""
+    ticks = log_ticks(values)
+    return axis(title, type="log", tickvals=ticks, ticktext=[f"{t:g}" for t in ticks], **more)
 
 
 def note(words: str, x: float, y: float, **more: Any) -> dict[str, Any]:
@@ -101,7 +136,7 @@ def cells(count: int, columns: int, gap_x: float, gap_y: float) -> list[tuple[li
     return out
 
 
-def broken(values: Sequence[Any], breaks: Sequence[int]) -> list[Any]:
+def broken(values: Iterable[Any], breaks: Sequence[int]) -> list[Any]:
     """`values` with None before each index of `breaks`, so that the line is interrupted there."""
     out: list[Any] = []
     stops = set(breaks)

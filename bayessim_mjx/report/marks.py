@@ -5,7 +5,7 @@ from typing import Any
 
 from markupsafe import Markup
 
-from bayessim_mjx.report.words import finite
+from bayessim_mjx.report.words import finite, known_span
 
 WIDTH, HEIGHT, PAD = 190, 18, 6
 
@@ -23,12 +23,12 @@ def interval(
     ci: Sequence[Any] | None,
     limits: tuple[float, float],
     colour: str,
-    ticks: Sequence[float] = (),
+    ticks: Sequence[Any] = (),
     hollow: Any = None,
     inner: Sequence[Any] | None = None,
     width: int = WIDTH,
 ) -> Markup:
-    """A dot at `value`, a line over `ci`, a thick one over `inner`, thin uprights at `ticks`, a hollow dot at `hollow`."""
+    """A dot at `value`, a line over `ci`, a thick one over `inner`, uprights at `ticks`, a hollow dot at `hollow`."""
 
     def at(x: Any) -> float:
         share = (float(x) - limits[0]) / (limits[1] - limits[0])
@@ -37,8 +37,8 @@ def interval(
     y = HEIGHT / 2
     parts = [f'<line class="track" x1="{PAD}" x2="{width - PAD}" y1="{y}" y2="{y}"/>']
     parts += [f'<line class="tick" x1="{at(t)}" x2="{at(t)}" y1="1" y2="{HEIGHT - 1}"/>' for t in ticks if finite(t)]
-    for span, thick in ((ci, 2), (inner, 4)):
-        if span is not None and all(map(finite, span)):
+    for span, thick in ((known_span(ci), 2), (known_span(inner), 4)):
+        if span:
             ends = f'x1="{at(span[0])}" x2="{at(span[1])}" y1="{y}" y2="{y}"'
             parts.append(f'<line {ends} stroke="{colour}" stroke-width="{thick}"/>')
     if finite(hollow):
@@ -58,10 +58,17 @@ def bar(share: Any, ci: Sequence[Any] | None, colour: str, width: int = WIDTH) -
     y = HEIGHT / 2
     parts = [f'<line class="track" x1="{PAD}" x2="{width - PAD}" y1="{y}" y2="{y}"/>']
     if finite(share):
-        parts.append(f'<rect x="{PAD}" y="3" width="{round(at(share) - PAD, 1)}" height="{HEIGHT - 6}" fill="{colour}"/>')
-    if ci is not None and all(map(finite, ci)):
-        parts.append(f'<line x1="{at(ci[0])}" x2="{at(ci[1])}" y1="{y}" y2="{y}" stroke="#222" stroke-width="1.5"/>')
-        parts += [f'<line x1="{at(c)}" x2="{at(c)}" y1="5" y2="{HEIGHT - 5}" stroke="#222" stroke-width="1.5"/>' for c in ci]
+        parts.append(
+            f'<rect x="{PAD}" y="3" width="{round(at(share) - PAD, 1)}" height="{HEIGHT - 6}" fill="{colour}"/>'
+        )
+    ends = known_span(ci)
+    if ends:
+        parts.append(
+            f'<line x1="{at(ends[0])}" x2="{at(ends[1])}" y1="{y}" y2="{y}" stroke="#222" stroke-width="1.5"/>'
+        )
+        parts += [
+            f'<line x1="{at(c)}" x2="{at(c)}" y1="5" y2="{HEIGHT - 5}" stroke="#222" stroke-width="1.5"/>' for c in ends
+        ]
     return _svg(parts, width)
 
 

@@ -7,7 +7,7 @@ from typing import Any
 from markupsafe import Markup
 
 from bayessim_mjx.diagnosis.result import Diagnosis
-from bayessim_mjx.report import sections
+from bayessim_mjx.report import evidence, sections
 from bayessim_mjx.report.look import STAGE, WIDTH
 from bayessim_mjx.report.words import STAGES
 
@@ -29,17 +29,33 @@ def render(d: Diagnosis) -> str:
     from plotly.offline import get_plotlyjs
 
     environment = Environment(
-        loader=FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=StrictUndefined,
-        trim_blocks=True, lstrip_blocks=True,
-    )  # fmt: skip
+        loader=FileSystemLoader(Path(__file__).parent),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
     environment.filters["embed"] = embed
     return environment.get_template(TEMPLATE).render(
-        plotly=Markup(get_plotlyjs()), width=WIDTH, stage_names=STAGES, stage_colours=STAGE, verdict=d.verdict,
-        top=sections.top(d), gap=sections.how_far(d), effects=sections.effects(d), candidates=sections.candidates(d),
-        where=sections.where(d), overlays=sections.overlays(d), parameters=sections.parameters(d),
-        isolability=sections.isolability(d), flexible=sections.flexible(d), experiment=sections.experiment(d),
-        data=sections.data(d), warnings=d.warnings, versions=d.versions,
-    )  # fmt: skip
+        plotly=Markup(get_plotlyjs()),
+        width=WIDTH,
+        stage_names=STAGES,
+        stage_colours=STAGE,
+        verdict=d.verdict,
+        top=sections.top(d),
+        gap=sections.how_far(d),
+        effects=sections.effects(d),
+        candidates=sections.candidates(d),
+        where=sections.where(d),
+        overlays=evidence.overlays(d),
+        parameters=evidence.parameters(d),
+        isolability=evidence.isolability(d),
+        flexible=evidence.flexible(d),
+        experiment=evidence.experiment(d),
+        data=evidence.data(d),
+        warnings=d.warnings,
+        versions=d.versions,
+    )
 
 
 def embed(value: Any) -> Markup:

@@ -5,8 +5,10 @@ from typing import Any
 
 from bayessim_mjx.diagnosis.result import Diagnosis, FoundEffect
 from bayessim_mjx.report import gap_figures, marks, place_figures
+from bayessim_mjx.report.choice import choice
 from bayessim_mjx.report.look import STAGE
 from bayessim_mjx.report.words import (
+    MISSING,
     STAGES,
     VERDICTS,
     candidate_title,
@@ -16,6 +18,7 @@ from bayessim_mjx.report.words import (
     finite,
     gap_closed,
     headline,
+    known_span,
     label_title,
     number,
     percent,
@@ -24,8 +27,12 @@ from bayessim_mjx.report.words import (
 )
 
 MOST_CANDIDATES = 20
-OVERLAY_NUMBERS = 120_000  # in all overlays together, so that the page stays a few MB
-FEWEST_POINTS = 200
+TILES = {
+    "nominal": "gap as delivered",
+    "calibrated": "after recalibrating",
+    "with_effects": "with the effects",
+    "reducible_floor": "reducible floor",
+}
 
 
 def top(d: Diagnosis) -> dict[str, Any]:
@@ -33,18 +40,24 @@ def top(d: Diagnosis) -> dict[str, Any]:
     verdict = VERDICTS[d.verdict]
     stages = stages_of(d)
     tiles = [
-        {"words": f"gap {STAGES[s]}", "value": number(stages[s]), "unit": "noise sd", "colour": STAGE[s]}
+        {"words": TILES[s], "value": number(stages[s]), "unit": "noise sd", "colour": STAGE[s]}
         for s in ("nominal", "calibrated", "with_effects", "reducible_floor")
-        if finite(stages[s])
+        if finite(stages[s]) and (s != "with_effects" or d.effects or stages[s] != stages["calibrated"])
     ]
     closed = gap_closed(stages)
     if finite(closed):
-        tiles.append({"words": "of the reducible gap closed", "value": percent(closed), "unit": "", "colour": "#1f2429"})
+        tiles.append({"words": "reducible gap closed", "value": percent(closed), "unit": "", "colour": "#1f2429"})
     found = [{"line": effect_line(e), "rivals": len(e.equivalent_to)} for e in d.effects]
     return {
-        "badge": verdict.badge, "verdict": d.verdict, "headline": headline(d), "sentences": d.sentences[1:],
-        "advice": verdict.advice, "tiles": tiles, "found": found, "warnings": len(d.warnings),
-    }  # fmt: skip
+        "badge": verdict.badge,
+        "verdict": d.verdict,
+        "headline": headline(d),
+        "sentences": d.sentences[1:],
+        "advice": verdict.advice,
+        "tiles": tiles,
+        "found": found,
+        "warnings": len(d.warnings),
+    }
 
 
 def stages_of(d: Diagnosis) -> dict[str, float]:
@@ -61,7 +74,7 @@ def shares_of(d: Diagnosis) -> list[dict[str, Any]]:
 def how_far(d: Diagnosis) -> dict[str, Any]:
     """Waterfalls per horizon, the horizons side by side, shares, predicted against realised, and tables."""
     stages, shares = stages_of(d), shares_of(d)
-    rows = [{"name": "overall", **stages}]
+    rows: list[dict[str, Any]] = [{"name": "overall", **stages}]
     same = [h for h in d.gap.horizons if all(h.get(s) == stages[s] for s in ("nominal", "with_effects"))]
     rows = list(d.gap.horizons) if same else rows + list(d.gap.horizons)
     falls = [(str(r["name"]), f) for r in rows if (f := gap_figures.waterfall(r, shares, r.get("ci")))]
@@ -69,48 +82,62 @@ def how_far(d: Diagnosis) -> dict[str, Any]:
     return {
         "choice": choice(["horizon"], [((name,), f) for name, f in falls], start),
         "horizons": gap_figures.horizons(d.gap.horizons),
-        "table": [_stages_row(r, r.get("ci") or {}) for r in rows if finite(r.get("nominal"))],
-        "channels": _channels(d),
+        "table": _table([_stages_row(str(r["name"]), r, r.get("ci") or {}) for r in rows if finite(r.get("nominal"))]),
+        "channels": _table(_channels(d)),
         "shapley": _shapley(d.details.get("shapley") or []),
         "closure": _closure(d.details.get("closure") or []),
         "unit": d.gap.unit,
-    }  # fmt: skip
+    }
 
 
-def _stages_row(row: Mapping[str, Any], ci: Mapping[str, Any], name: str = "") -> dict[str, Any]:
-    cells = []
+def _stages_row(name: str, row: Mapping[str, Any], ci: Mapping[str, Any]) -> dict[str, Any]:
+    cells = {}
     for stage in STAGES:
-        span = ci.get(stage)
-        between = f"{number(span[0])} – {number(span[1])}" if span and all(map(finite, span)) else ""
-        cells.append({"value": number(row.get(stage)), "between": between})
-    return {"name": name or str(row.get("name", "")), "cells": cells, "closed": percent(gap_closed(row))}
+        span = known_span(ci.get(stage))
+        between = f"{number(span[0])} – {number(span[1])}" if span else ""
+        cells[stage] = {"value": number(row.get(stage)), "between": between}
+    return {"name": name, "cells": cells, "closed": percent(gap_closed(row))}
+
+
+def _table(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Rows and those of the stages that some row knows."""
+    known = [s for s in STAGES if any(r["cells"][s]["value"] != MISSING for r in rows)]
+    return {"rows": rows, "stages": known, "closed": any(r["closed"] != MISSING for r in rows)}
 
 
 def _channels(d: Diagnosis) -> list[dict[str, Any]]:
-    rows = [_stages_row(v, {}, k) for k, v in d.gap.by_channel.items()]
+    rows = [_stages_row(k, v, {}) for k, v in d.gap.by_channel.items()]
     for row in rows:
         physical = d.gap.physical.get(row["name"], {})
-        for cell, stage in zip(row["cells"], STAGES, strict=True):
-            if finite(physical.get(stage)):
-                cell["between"] = f"{number(physical[stage])} {unit(physical.get('unit', ''))}"
+        for stage, cell in row["cells"].items():
+            if finite(physical.get(stage)) and physical.get("unit"):
+                cell["between"] = f"{number(physical[stage])} {unit(physical['unit'])}"
     return rows
 
 
 def _shapley(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     return [
-        {"name": label_title(r["effect"]), "share": percent(r.get("share")), "between": between(r.get("low"), r.get("high")),
-         "mark": marks.bar(r.get("share"), (r.get("low"), r.get("high")), STAGE["with_effects"])}
+        {
+            "name": label_title(r["effect"]),
+            "share": percent(r.get("share")),
+            "between": between(r.get("low"), r.get("high")),
+            "mark": marks.bar(r.get("share"), (r.get("low"), r.get("high")), STAGE["with_effects"]),
+        }
         for r in rows
-    ]  # fmt: skip
+    ]
 
 
 def _closure(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     limits = marks.scale_of([r.get(k) for r in rows for k in ("predicted", "realised")] + [1.0])
     return [
-        {"name": candidate_title(r), "predicted": percent(r.get("predicted")), "realised": percent(r.get("realised")),
-         "mark": marks.interval(r.get("realised"), None, limits, STAGE["with_effects"], hollow=r.get("predicted"))}
+        {
+            "name": candidate_title(r),
+            "predicted": percent(r.get("predicted")),
+            "realised": percent(r.get("realised")),
+            "mark": marks.interval(r.get("realised"), None, limits, STAGE["with_effects"], hollow=r.get("predicted")),
+        }
         for r in rows
-    ]  # fmt: skip
+    ]
 
 
 def between(low: Any, high: Any) -> str:
@@ -123,19 +150,26 @@ def effects(d: Diagnosis) -> list[dict[str, Any]]:
 
 def _effect(e: FoundEffect) -> dict[str, Any]:
     return {
-        "title": effect_title(e.name, e.where), "label": f"{e.name}@{e.where}", "sentence": e.sentence,
+        "title": effect_title(e.name, e.where),
+        "label": f"{e.name}@{e.where}",
+        "sentence": e.sentence,
         "parameters": [dict(zip(("name", "value"), quantity(k, v), strict=True)) for k, v in e.parameters.items()],
-        "probability": percent(e.probability), "closed": percent(e.gap_closed), "ci": between(*e.gap_closed_ci),
+        "probability": percent(e.probability),
+        "closed": percent(e.gap_closed),
+        "ci": between(*e.gap_closed_ci),
         "mark": marks.bar(e.gap_closed, e.gap_closed_ci, STAGE["with_effects"]),
         "chance": marks.bar(e.probability, None, "#9aa3ab"),
         "predicted": percent(e.predicted_gap_closed) if finite(e.predicted_gap_closed) else "",
         "share": percent(e.share) if finite(e.share) else "",
         "rivals": [
-            {"name": candidate_title(r), "closed": percent(r["gap_closed"]) if finite(r.get("gap_closed")) else "",
-             "why": r.get("why") or ""}
+            {
+                "name": candidate_title(r),
+                "closed": percent(r["gap_closed"]) if finite(r.get("gap_closed")) else "",
+                "why": r.get("why") or "",
+            }
             for r in e.equivalent_to
         ],
-    }  # fmt: skip
+    }
 
 
 def candidates(d: Diagnosis) -> dict[str, Any]:
@@ -150,13 +184,28 @@ def candidates(d: Diagnosis) -> dict[str, Any]:
         spans = [(score - m * se, score + m * se) for m in (2, 1)] if finite(score) and finite(se) else [None, None]
         chosen = set(c.get("effects") or []) == confirmed and bool(confirmed)
         colour = STAGE["with_effects"] if chosen else "#5b6670"
-        rows.append({
-            "rank": k, "name": candidate_title(c), "score": number(score), "se": number(se) if se else "", "chosen": chosen,
-            "closed": percent(c.get("gap_closed")), "absorbed": percent(c.get("absorbed")),
-            "values": "; ".join(_value(n, v) for n, v in (c.get("parameters") or {}).items()),
-            "mark": marks.interval(score, spans[0], limits, colour, (0.0,), inner=spans[1]),
-        })  # fmt: skip
+        rows.append(
+            {
+                "rank": k,
+                "name": candidate_title(c),
+                "score": number(score),
+                "se": number(se) if se else "",
+                "chosen": chosen,
+                "closed": percent(c.get("gap_closed")),
+                "absorbed": percent(c.get("absorbed")),
+                "values": "; ".join(_value(n, v) for n, v in _own(c).items()),
+                "mark": marks.interval(score, spans[0], limits, colour, (0.0,), inner=spans[1]),
+            }
+        )
     return {"rows": rows, "more": len(d.candidates) - len(shown), "values": any(r["values"] for r in rows)}
+
+
+def _own(candidate: Mapping[str, Any]) -> dict[str, Any]:
+    """The values of the candidate's own parameters: `<where>.<effect>.<parameter>`, or those without a place."""
+    labels = [str(x).partition("@") for x in candidate.get("effects") or []]
+    heads = tuple(f"{where}.{name}." for name, _, where in labels)
+    values = candidate.get("parameters") or {}
+    return {k: v for k, v in values.items() if k.startswith(heads) or "." not in k} if heads else {}
 
 
 def _value(name: str, value: Any) -> str:
@@ -177,131 +226,26 @@ def where(d: Diagnosis) -> dict[str, Any]:
     waves = sorted(d.details.get("frequency") or [], key=lambda r: order.get(r["joint"], len(order)))
     return {
         "places": [
-            {"channel": p.channel, "kind": p.kind, "share": percent(p.share), "ci": between(*p.ci), "region": p.region,
-             "mark": marks.bar(p.share, p.ci, STAGE["nominal"])}
+            {
+                "channel": p.channel,
+                "kind": p.kind,
+                "share": percent(p.share),
+                "ci": between(*p.ci),
+                "region": p.region,
+                "mark": marks.bar(p.share, p.ci, STAGE["nominal"]),
+            }
             for p in ranked
         ],
         "links": [
-            {"name": x["name"], "verdict": x.get("verdict") or "", "slope": number(x.get("slope")),
-             "correlation": number(x.get("correlation"), 4), "lag": estimate(x.get("lag"), in_unit="s")}
+            {
+                "name": x["name"],
+                "verdict": x.get("verdict") or "",
+                "slope": number(x.get("slope")),
+                "correlation": number(x.get("correlation"), 4),
+                "lag": estimate(x.get("lag"), in_unit="s"),
+            }
             for x in d.details.get("links") or []
         ],
         "maps": choice(["joint"], [((j,), place_figures.maps(by_joint[j])) for j in joints]),
         "frequency": choice(["joint"], [((str(r["joint"]),), place_figures.frequency(r)) for r in waves]),
-    }  # fmt: skip
-
-
-def overlays(d: Diagnosis) -> dict[str, Any]:
-    """Measured against simulated by log and joint, and every log's gap; beyond the page's budget the smallest gaps go."""
-    rows = list(d.details.get("overlays") or [])
-    most = max(OVERLAY_NUMBERS // (8 * FEWEST_POINTS), 1)
-    kept = rows if len(rows) <= most else sorted(rows, key=_worst, reverse=True)[:most]
-    points = max(FEWEST_POINTS, min(2000, OVERLAY_NUMBERS // (8 * max(len(kept), 1))))
-    panels = [((str(r.get("log", "")), str(r.get("joint", ""))), gap_figures.overlay(r, points)) for r in kept if len(r["time"])]
-    lines = d.details.get("episodes") or []
-    return {
-        "choice": choice(["log", "joint"], panels), "left": len(rows) - len(kept),
-        "episodes": gap_figures.episodes(lines[:60]) if lines else None,
-    }  # fmt: skip
-
-
-def _worst(row: Mapping[str, Any]) -> float:
-    return max((abs(a - b) for a, b in zip(row["measured"], row.get("nominal") or [], strict=False) if finite(a) and finite(b)), default=0.0)
-
-
-def choice(axes: Sequence[str], panels: Sequence[tuple[tuple[str, ...], dict]], start: int = 0) -> dict[str, Any]:
-    """Panels of which one is shown: {"axes": [{"name", "options"}], "panels": [{"keys": [option numbers], "title", "figure"}]}."""
-    options = [list(dict.fromkeys(keys[k] for keys, _ in panels)) for k in range(len(axes))]
-    return {
-        "axes": [{"name": n, "options": o, "at": o.index(panels[start][0][k])} for k, (n, o) in enumerate(zip(axes, options, strict=True)) if len(o) > 1],
-        "panels": [
-            {"keys": [options[k].index(key) for k, key in enumerate(keys) if len(options[k]) > 1],
-             "title": ", ".join(f"{n} {key}" for n, key in zip(axes, keys, strict=True) if key),
-             "figure": figure, "shown": k == start}
-            for k, (keys, figure) in enumerate(panels)
-        ],
-    }  # fmt: skip
-
-
-def parameters(d: Diagnosis) -> dict[str, Any]:
-    """Recalibrated parameters in their ranges, and their estimates per operating condition."""
-    rows = []
-    for name, p in d.parameters.items():
-        mean, sd, low, high = (p.get(k) for k in ("mean", "sd", "low", "high"))
-        ranged = finite(low) and finite(high) and high > low
-        limits = (low, high) if ranged else marks.scale_of([mean, p.get("nominal")], zero=False)
-        ci = (max(mean - 1.645 * sd, limits[0]), min(mean + 1.645 * sd, limits[1])) if finite(mean) and finite(sd) else None
-        colour = STAGE["nominal"] if p.get("structural") else STAGE["with_effects"]
-        rows.append({
-            "name": name, "nominal": number(p.get("nominal")), "value": estimate(mean, sd), "unit": unit(p.get("unit") or ""),
-            "structural": p.get("structural") or "", "low": number(low) if ranged else "", "high": number(high) if ranged else "",
-            "mark": marks.interval(mean, ci, limits, colour, (p.get("nominal"),), width=150),
-        })  # fmt: skip
-    found = d.details.get("groups") or {}
-    some = found.get("names") and found.get("parameters")
-    moves = {k: found["parameters"][k] for k in sorted(found["parameters"], key=lambda k: not d.parameters.get(k, {}).get("structural"))} if some else {}
-    return {"rows": rows, "groups": place_figures.groups(found["names"], moves, d.parameters) if moves else None,
-            "left": max(len(moves) - 12, 0)}  # fmt: skip
-
-
-def isolability(d: Diagnosis) -> dict[str, Any]:
-    found = d.details.get("isolability") or {}
-    labels = found.get("labels") or []
-    if not labels:
-        return {}
-    figure = place_figures.isolability(labels, found["cosine"], found.get("absorbed") or [])
-    return {"figure": figure, "left": max(len(labels) - place_figures.MOST_LABELS, 0)}
-
-
-def flexible(d: Diagnosis) -> dict[str, Any]:
-    """The flexible residual force: how much better than the named effects it is, on what it depends, where."""
-    found = d.details.get("flexible") or {}
-    if not found:
-        return {}
-    seeds = [s for s in found.get("seeds") or [] if finite(s)]
-    rows = [("recalibrated simulator", d.gap.calibrated), ("with the named effects", d.gap.with_effects),
-            ("flexible force on the recalibrated simulator", found.get("rms_on_base")),
-            ("flexible force on top of the named effects", found.get("rms_on_winner"))]  # fmt: skip
-    known = [(n, v) for n, v in rows if finite(v)]
-    depends = found.get("depends_on") or []
-    return {
-        "rows": [{"name": n, "value": number(v)} for n, v in known],
-        "seeds": f"{number(min(seeds))} – {number(max(seeds))} over {len(seeds)} seeds" if len(seeds) > 1 else "",
-        "where": found.get("where") or [], "figure": place_figures.importance(depends) if depends else None,
-    }  # fmt: skip
-
-
-def experiment(d: Diagnosis) -> dict[str, Any]:
-    """The next experiment, its command, and the menu with the expected evidence."""
-    plan, menu = d.next_experiment, d.details.get("experiments") or []
-    own = next((e for e in menu if e.get("name") == plan.get("name")), None) or {}
-    command = own.get("command") or {}
-    rows = plan.get("table") or [{"experiment": e.get("name"), "evidence": e.get("evidence")} for e in menu]
-    heads = list(dict.fromkeys(k for r in rows for k in r)) if all(isinstance(r, Mapping) for r in rows) else []
-    return {
-        "plan": plan, "evidence": number(plan.get("evidence")) if finite(plan.get("evidence")) else "",
-        "figure": gap_figures.commands(command) if command.get("ctrl") and plan else None,
-        "heads": heads, "rows": [[cell(r.get(h)) for h in heads] for r in rows] if heads else [],
-        "pairs": [{"a": label_title(p["a"]), "b": label_title(p["b"]), "evidence": number(p.get("evidence"))} for p in own.get("pairs") or []],
-    }  # fmt: skip
-
-
-def data(d: Diagnosis) -> dict[str, Any]:
-    """Noise per channel and what repeats say."""
-    noise = d.details.get("noise") or []
-    keys = [k for k in ("channel", "sigma", "quantum", "rest", "highfrequency", "source") if any(k in n for n in noise)]
-    again = d.details.get("reproducibility") or {}
-    return {
-        "heads": keys, "rows": [[cell(n.get(k)) for k in keys] for n in noise],
-        "again": [{"name": k.replace("_", " "), "value": cell(v)["text"]} for k, v in again.items()],
-    }  # fmt: skip
-
-
-def cell(value: Any) -> dict[str, Any]:
-    """A table's cell: text, and whether it is a number (set to the right)."""
-    if isinstance(value, Mapping):
-        return {"text": "; ".join(f"{k} {cell(v)['text']}" for k, v in value.items()), "number": False}
-    if isinstance(value, list | tuple):
-        return {"text": ", ".join(cell(v)["text"] for v in value), "number": False}
-    plain = value is None or isinstance(value, str | bool)
-    return {"text": ("–" if value is None else str(value)) if plain else number(value), "number": not plain}
+    }

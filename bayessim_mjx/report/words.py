@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeGuard
 
 from bayessim_mjx.diagnosis.result import Diagnosis, Estimate, FoundEffect
 
@@ -33,7 +33,7 @@ EFFECTS = {
     "payload": ("extra payload", "body"),
     "gravity_tilt": ("tilted base", "world"),
     "external_force": ("external force", "body"),
-    "base_flexibility": ("flexible mount", "body"),
+    "base_flexibility": ("flexible mount", "world"),
     "contact_friction": ("changed contact friction", "geom"),
     "contact_compliance": ("contact compliance", "geom"),
     "sensor_delay": ("measurement delay", "joint"),
@@ -98,12 +98,18 @@ VERDICTS = {
         "Repair or extend the logs as the warnings below say, and diagnose again.",
     ),
 }
+MISSING = "–"
 _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
-def finite(value: Any) -> bool:
+def finite(value: Any) -> TypeGuard[float]:
     """A number that can be shown; None, NaN, infinities and text cannot."""
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def known_span(span: Any) -> tuple[float, float] | None:
+    """Both ends of an interval, or None where one is not known."""
+    return (span[0], span[1]) if span is not None and all(map(finite, span)) else None
 
 
 def _power(value: float) -> int:
@@ -118,8 +124,10 @@ def _fixed(value: float, decimals: int) -> str:
 def number(value: Any, digits: int = 3) -> str:
     """`digits` significant digits without an exponent where people read none; "–" where there is no number."""
     if not finite(value):
-        return "–"
-    if value and not -4 <= _power(value) < 6:
+        return MISSING
+    if isinstance(value, int) or value == 0:
+        return f"{value:.0f}".replace("-", "−")
+    if not -4 <= _power(value) < 6:
         p = _power(value)
         return f"{_fixed(value / 10**p, digits - 1)}·10{str(p).translate(_SUPERSCRIPT)}"
     text = _fixed(value, digits - 1 - _power(float(f"{value:.{digits - 1}e}")))
@@ -127,10 +135,11 @@ def number(value: Any, digits: int = 3) -> str:
 
 
 def percent(share: Any, sign: bool = False) -> str:
-    """A share as whole per cents, one decimal below 10 %."""
+    """A share as whole per cents, with one decimal below 10 % and where 99.5 to 99.9 % would read as all."""
     if not finite(share):
-        return "–"
-    text = _fixed(100 * share, 1 if 0 < abs(share) < 0.0995 else 0)
+        return MISSING
+    fine = 0 < abs(share) < 0.0995 or 0.995 <= abs(share) < 0.9995
+    text = _fixed(100 * share, 1 if fine else 0)
     return ("+" if sign and share > 0 else "") + text + " %"
 
 
@@ -141,12 +150,13 @@ def unit(text: str) -> str:
 
 
 def estimate(mean: Any, sd: Any = math.nan, in_unit: str = "") -> str:
-    """`0.031 ± 0.002 N m`: one digit of the sd (two where it begins with 1), the mean to the same place; s below 0.5 as ms."""
+    """`0.031 ± 0.002 N m`: one digit of the sd (two if it begins with 1), the mean alike; s below 0.5 as ms."""
     if in_unit == "s" and finite(mean) and abs(mean) < 0.5:
         mean, sd, in_unit = 1e3 * mean, 1e3 * sd if finite(sd) else sd, "ms"
     tail = f" {unit(in_unit)}" if in_unit else ""
     if not finite(mean) or not finite(sd) or sd <= 0 or sd > 1e3 * abs(mean) > 0:
         return number(mean) + tail
+    sd = float(f"{sd:.1e}")
     big = max(_power(mean), _power(sd))
     if not -4 <= big < 6:
         return f"({estimate(mean / 10**big, sd / 10**big)})·10{str(big).translate(_SUPERSCRIPT)}{tail}"
@@ -162,11 +172,11 @@ def effect_title(name: str, where: str) -> str:
     """`Coulomb friction at joint 'elbow'`."""
     noun, kind = effect_noun(name), EFFECTS.get(name, ("", ""))[1]
     noun = noun[:1].upper() + noun[1:]
-    if kind == "world" or not where:
+    if where in ("", "world") or (kind == "world" and where == "all"):
         return noun
     if where == "all":
         return f"{noun} at all {kind or 'place'}s"
-    return f"{noun} at {kind} '{where}'" if kind else f"{noun} at '{where}'"
+    return f"{noun} at {kind} '{where}'" if kind and kind != "world" else f"{noun} at '{where}'"
 
 
 def label_title(label: str, short: bool = False) -> str:
@@ -200,7 +210,7 @@ def _turned(text: str) -> str:
 def effect_line(effect: FoundEffect) -> str:
     """`Coulomb friction at joint 'elbow': 0.031 ± 0.002 N m`; several parameters by name."""
     found = [quantity(k, v) for k, v in effect.parameters.items()]
-    values = [v for _, v in found] if len(found) == 1 and len(effect.parameters) == 1 else [f"{k} {v}" for k, v in found]
+    values = [v if len(found) == 1 else f"{k} {v}" for k, v in found]
     return effect_title(effect.name, effect.where) + (": " + ", ".join(values) if values else "")
 
 
@@ -209,8 +219,8 @@ def headline(diagnosis: Diagnosis) -> str:
 
 
 def gap_closed(stages: Mapping[str, Any]) -> float:
-    """Share of the reducible squared gap closed from the delivered simulator to the one with effects; NaN if unknown."""
+    """Share of the reducible squared gap closed between delivery and the effects; NaN where unknown."""
     before, after, floor = (stages.get(k) for k in ("nominal", "with_effects", "reducible_floor"))
-    if not (finite(before) and finite(after) and finite(floor)) or before <= floor:  # type: ignore[operator]
+    if not (finite(before) and finite(after) and finite(floor)) or before <= floor:
         return math.nan
-    return (before**2 - after**2) / (before**2 - floor**2)  # type: ignore[operator]
+    return (before**2 - after**2) / (before**2 - floor**2)

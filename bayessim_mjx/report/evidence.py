@@ -1,0 +1,133 @@
+"""Sections with evidence: overlays, parameters, isolability, the flexible force, the next experiment, noise."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from bayessim_mjx.diagnosis.result import Diagnosis
+from bayessim_mjx.report import marks, motion_figures, rival_figures
+from bayessim_mjx.report.choice import choice
+from bayessim_mjx.report.look import STAGE
+from bayessim_mjx.report.words import estimate, finite, known_span, label_title, number, unit
+
+OVERLAY_NUMBERS = 90_000  # in all overlays together, so that the page stays a few MB
+FEWEST_POINTS = 200
+
+
+def overlays(d: Diagnosis) -> dict[str, Any]:
+    """Measured against simulated by log and joint, and every log's gap; beyond the budget the smallest go."""
+    rows = list(d.details.get("overlays") or [])
+    most = max(OVERLAY_NUMBERS // (8 * FEWEST_POINTS), 1)
+    kept = rows if len(rows) <= most else sorted(rows, key=_worst, reverse=True)[:most]
+    points = max(FEWEST_POINTS, min(2000, OVERLAY_NUMBERS // (8 * max(len(kept), 1))))
+    keys = [(str(r.get("log", "")), str(r.get("joint", ""))) for r in kept]
+    panels = [(key, motion_figures.overlay(r, points)) for key, r in zip(keys, kept, strict=True) if len(r["time"])]
+    lines = d.details.get("episodes") or []
+    return {
+        "choice": choice(["log", "joint"], panels),
+        "left": len(rows) - len(kept),
+        "episodes": motion_figures.episodes(lines[:60]) if lines else None,
+    }
+
+
+def _worst(row: Mapping[str, Any]) -> float:
+    pairs = zip(row["measured"], row.get("nominal") or [], strict=False)
+    return max((abs(a - b) for a, b in pairs if finite(a) and finite(b)), default=0.0)
+
+
+def parameters(d: Diagnosis) -> dict[str, Any]:
+    """Recalibrated parameters in their ranges, and their estimates per operating condition."""
+    rows = []
+    for name, p in d.parameters.items():
+        mean, sd = p.get("mean"), p.get("sd")
+        ranged = known_span((p.get("low"), p.get("high")))
+        limits = ranged or marks.scale_of([mean, p.get("nominal")], zero=False)
+        ci = (mean - 1.645 * sd, mean + 1.645 * sd) if finite(mean) and finite(sd) else None
+        colour = STAGE["nominal"] if p.get("structural") else STAGE["with_effects"]
+        rows.append(
+            {
+                "name": name,
+                "nominal": number(p.get("nominal")),
+                "value": estimate(mean, sd),
+                "unit": unit(p.get("unit") or ""),
+                "structural": p.get("structural") or "",
+                "low": number(ranged[0]) if ranged else "",
+                "high": number(ranged[1]) if ranged else "",
+                "mark": marks.interval(mean, ci, limits, colour, (p.get("nominal"),), width=150),
+            }
+        )
+    found = d.details.get("groups") or {}
+    estimates = found.get("parameters") or {} if found.get("names") else {}
+    moves = sorted(estimates, key=lambda k: not d.parameters.get(k, {}).get("structural"))
+    figure = rival_figures.groups(found["names"], {k: estimates[k] for k in moves}, d.parameters) if moves else None
+    return {"rows": rows, "groups": figure, "left": max(len(moves) - 12, 0)}
+
+
+def isolability(d: Diagnosis) -> dict[str, Any]:
+    found = d.details.get("isolability") or {}
+    labels = found.get("labels") or []
+    if not labels:
+        return {}
+    figure = rival_figures.isolability(labels, found["cosine"], found.get("absorbed") or [])
+    return {"figure": figure, "left": max(len(labels) - rival_figures.MOST_LABELS, 0)}
+
+
+def flexible(d: Diagnosis) -> dict[str, Any]:
+    """The flexible residual force: how much better than the named effects it is, on what it depends, where."""
+    found = d.details.get("flexible") or {}
+    if not found:
+        return {}
+    seeds: list[float] = [s for s in found.get("seeds") or [] if finite(s)]
+    rows = [
+        ("recalibrated simulator", d.gap.calibrated),
+        ("with the named effects", d.gap.with_effects),
+        ("flexible force on the recalibrated simulator", found.get("rms_on_base")),
+        ("flexible force on top of the named effects", found.get("rms_on_winner")),
+    ]
+    known = [(n, v) for n, v in rows if finite(v)]
+    depends = found.get("depends_on") or []
+    return {
+        "rows": [{"name": n, "value": number(v)} for n, v in known],
+        "seeds": f"{number(min(seeds))} – {number(max(seeds))} over {len(seeds)} seeds" if len(seeds) > 1 else "",
+        "where": found.get("where") or [],
+        "figure": rival_figures.importance(depends) if depends else None,
+    }
+
+
+def experiment(d: Diagnosis) -> dict[str, Any]:
+    """The next experiment, its command, and the menu with the expected evidence."""
+    plan, menu = d.next_experiment, d.details.get("experiments") or []
+    own = next((e for e in menu if e.get("name") == plan.get("name")), None) or {}
+    command = own.get("command") or {}
+    rows = plan.get("table") or [{"experiment": e.get("name"), "evidence": e.get("evidence")} for e in menu]
+    heads = list(dict.fromkeys(k for r in rows for k in r)) if all(isinstance(r, Mapping) for r in rows) else []
+    pairs = [(label_title(p["a"]), label_title(p["b"]), number(p.get("evidence"))) for p in own.get("pairs") or []]
+    return {
+        "plan": plan,
+        "evidence": number(plan.get("evidence")) if finite(plan.get("evidence")) else "",
+        "figure": motion_figures.commands(command) if command.get("ctrl") and plan else None,
+        "heads": heads,
+        "rows": [[cell(r.get(h)) for h in heads] for r in rows] if heads else [],
+        "pairs": [dict(zip(("a", "b", "evidence"), p, strict=True)) for p in pairs],
+    }
+
+
+def data(d: Diagnosis) -> dict[str, Any]:
+    """Noise per channel and what repeats say."""
+    noise = d.details.get("noise") or []
+    keys = [k for k in ("channel", "sigma", "quantum", "rest", "highfrequency", "source") if any(k in n for n in noise)]
+    again = d.details.get("reproducibility") or {}
+    return {
+        "heads": keys,
+        "rows": [[cell(n.get(k)) for k in keys] for n in noise],
+        "again": [{"name": k.replace("_", " "), "value": cell(v)["text"]} for k, v in again.items()],
+    }
+
+
+def cell(value: Any) -> dict[str, Any]:
+    """A table's cell: text, and whether it is a number (set to the right)."""
+    if isinstance(value, Mapping):
+        return {"text": "; ".join(f"{k} {cell(v)['text']}" for k, v in value.items()), "number": False}
+    if isinstance(value, list | tuple):
+        return {"text": ", ".join(cell(v)["text"] for v in value), "number": False}
+    plain = value is None or isinstance(value, str | bool)
+    return {"text": ("–" if value is None else str(value)) if plain else number(value), "number": not plain}

@@ -1,0 +1,175 @@
+"""What these logs can tell: estimates per operating condition, isolability, and what the flexible force depends on."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from bayessim_mjx.monitor.style import SKY
+from bayessim_mjx.report.look import (
+    FAINT,
+    INK,
+    OVER,
+    STAGE,
+    WIDTH,
+    axis,
+    cells,
+    figure,
+    heading,
+    layout_key,
+    note,
+    numbers,
+    panel,
+    text,
+)
+from bayessim_mjx.report.words import finite, label_title, percent, unit
+
+MOST_LABELS = 36
+
+
+def groups(
+    names: Sequence[str], parameters: Mapping[str, Mapping[str, Any]], known: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Estimates of each parameter per operating condition (mean and 2 sd); dotted: the simulator's own value."""
+    shown = list(parameters.items())[:12]
+    columns = min(3, len(shown))
+    longest = max((len(str(n)) for n in names), default=1)
+    foot = 34 if longest * len(names) < 34 else min(7 * longest, 80) + 16
+    height = 40 + (140 + foot) * -(-len(shown) // columns)
+    data, layout, titles, levels = [], {}, [], []
+    places = cells(len(shown), columns, 0.07, (36 + foot) / height)
+    for k, ((name, row), (across, up)) in enumerate(zip(shown, places, strict=True)):
+        x, y = panel(k)
+        moves = bool(known.get(name, {}).get("structural"))
+        colour = STAGE["nominal"] if moves else STAGE["with_effects"]
+        spread = [2 * s if finite(s) else 0 for s in row.get("sd") or [0.0] * len(names)]
+        data.append(
+            {
+                "type": "scatter",
+                "mode": "markers",
+                "x": list(range(len(names))),
+                "y": numbers(row["mean"]),
+                "xaxis": x,
+                "yaxis": y,
+                "marker": {"color": colour, "size": 8, "symbol": "diamond" if moves else "circle"},
+                "error_y": {"type": "data", "array": spread, "color": colour, "thickness": 1.6, "width": 0},
+                "hovertemplate": "%{y:.4g}<extra></extra>",
+            }
+        )
+        ticks: dict[str, Any] = {
+            "tickvals": list(range(len(names))),
+            "ticktext": [text(n, 16) for n in names],
+            "showgrid": False,
+        }
+        layout[layout_key(x)] = axis(domain=across, anchor=y, range=[-0.6, len(names) - 0.4], **ticks)
+        layout[layout_key(y)] = axis(domain=up, anchor=x, nticks=5)
+        in_unit = unit(str(known.get(name, {}).get("unit") or ""))
+        titles.append(heading(text(name, 34) + (f" ({in_unit})" if in_unit else ""), x, y))
+        levels += _level(known.get(name, {}).get("nominal"), x, y)
+    return figure(
+        data,
+        WIDTH if columns == 3 else 320 * columns,
+        height,
+        annotations=titles,
+        shapes=levels,
+        margin={"l": 60, "r": 10, "t": 28, "b": 12 + foot},
+        **layout,
+    )
+
+
+def _level(value: Any, x: str, y: str) -> list[dict[str, Any]]:
+    line = {"color": FAINT, "width": 1.2, "dash": "dot"}
+    place = {"type": "line", "xref": f"{x} domain", "x0": 0, "x1": 1, "yref": y, "y0": value, "y1": value}
+    return [place | {"line": line}] if finite(value) else []
+
+
+def isolability(labels: Sequence[str], cosine: Sequence[Sequence[float]], absorbed: Sequence[float]) -> dict[str, Any]:
+    """|cos| between what effects do to these logs (lower triangle), and the share that known parameters would hide."""
+    n = min(len(labels), MOST_LABELS)
+    names = [text(label_title(label, short=True), 46) for label in labels[:n]]
+    table = [[numbers([cosine[i][j]])[0] if j <= i else None for j in range(n)] for i in range(n)]
+    hide = [absorbed[i] if i < len(absorbed) and finite(absorbed[i]) else None for i in range(n)]
+    cell = 30 if n <= 18 else 20
+    at = list(range(n))
+    heat = {
+        "type": "heatmap",
+        "z": table,
+        "x": at,
+        "y": at,
+        "zmin": 0,
+        "zmax": 1,
+        "xgap": 1,
+        "ygap": 1,
+        "hoverongaps": False,
+        "colorscale": [[0, "#f7fafc"], [0.5, SKY], [1, "#00507d"]],
+        "showscale": False,
+        "customdata": [[f"{names[i]}<br>and {names[j]}" for j in range(n)] for i in range(n)],
+        "hovertemplate": "%{customdata}<br>|cos| = %{z:.2f}<extra></extra>",
+    }
+    values = [
+        note(
+            f"{v:.2f}".replace("0.", ".") if v < 0.995 else "1",
+            j,
+            i,
+            xref="x",
+            yref="y",
+            font={"size": 11 if cell == 30 else 8.5, "color": "white" if v > 0.72 else INK},
+        )
+        for i, row in enumerate(table)
+        for j, v in enumerate(row)
+        if v is not None and j < i and v >= 0.3
+    ]
+    bars = {
+        "type": "bar",
+        "orientation": "h",
+        "x": hide,
+        "y": at,
+        "xaxis": "x2",
+        "yaxis": "y",
+        "width": 0.62,
+        "marker": {"color": "#E69F00", "line": {"color": INK, "width": 0.5}},
+        "text": [percent(h) for h in hide],
+        "textposition": "outside",
+        "cliponaxis": False,
+        "hoverinfo": "skip",
+        "textfont": {"size": 11},
+    }
+    left = 8 + 6.6 * max(map(len, names), default=10)
+    foot = 0.72 * left + 14
+    side = cell * n
+    width = WIDTH if left + side + 170 > 700 else round(left + side + 250)
+    split = (side / (width - left - 60), (side + 30) / (width - left - 60))
+    split = split if split[1] < 0.85 else (0.78, 0.82)
+    over = [heading("similarity |cos|", "x", "y"), heading("hidden by known parameters", "x2", "y")]
+    return figure(
+        [heat, bars],
+        width,
+        round(side + 34 + foot),
+        annotations=[*over, *values],
+        xaxis=axis(
+            domain=[0, split[0]], tickvals=at, ticktext=names, tickangle=-45, showgrid=False, ticks="", showline=False
+        ),
+        xaxis2=axis(domain=[split[1], 1], range=[0, 1], tickformat=".0%", tickvals=[0, 0.5, 1], anchor="y"),
+        yaxis=axis(tickvals=at, ticktext=names, range=[n - 0.5, -0.5], showgrid=False, ticks="", showline=False),
+        margin={"l": round(left), "r": 60, "t": 34, "b": round(foot)},
+    )
+
+
+def importance(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """What the flexible residual force depends on, the most important input on top."""
+    ranked = sorted((r for r in rows if finite(r.get("importance"))), key=lambda r: r["importance"])
+    bars = {
+        "type": "bar",
+        "orientation": "h",
+        "x": [r["importance"] for r in ranked],
+        "y": [text(r["input"], 32) for r in ranked],
+        "marker": {"color": SKY, "line": {"color": INK, "width": 0.5}, "pattern": {"shape": "/", **OVER}},
+        "hovertemplate": "%{y}: %{x:.3g}<extra></extra>",
+        "width": 0.62,
+    }
+    return figure(
+        [bars],
+        560,
+        62 + 24 * len(ranked),
+        margin={"l": 130, "r": 12, "t": 8, "b": 44},
+        xaxis=axis("importance", rangemode="tozero"),
+        yaxis=axis(showgrid=False, ticks=""),
+    )

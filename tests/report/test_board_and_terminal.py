@@ -1,0 +1,57 @@
+"""TensorBoard's files read back hold the numbers; the terminal's lines hold the words."""
+
+import io
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+import fake  # noqa: E402
+
+from bayessim_mjx import report  # noqa: E402
+from bayessim_mjx.diagnosis.result import VERDICTS  # noqa: E402
+from bayessim_mjx.monitor.writer import event_files, records  # noqa: E402
+from bayessim_mjx.report.words import VERDICTS as WORDS  # noqa: E402
+
+
+def _written(folder):
+    values = [v for path in event_files(folder) for _, e in records(path) for v in e.summary.value]
+    return {v.tag: v for v in values}
+
+
+def test_tensorboard_holds_stages_closures_and_pictures(tmp_path):
+    report.tensorboard(fake.full(), tmp_path)
+    tags = _written(tmp_path)
+    assert tags["Gap/nominal"].simple_value == pytest.approx(21.4)
+    assert tags["Gap_whole_log/with_effects"].simple_value == pytest.approx(12.3)
+    assert tags["Closed/coulomb_friction_elbow"].simple_value == pytest.approx(0.68)
+    for tag in ("waterfall", "candidates", "overlays"):
+        image = tags[f"Diagnosis/{tag}"].image
+        assert image.encoded_image_string.startswith(b"\x89PNG") and image.width > 500
+
+
+def test_tensorboard_without_numbers_has_the_verdict_only(tmp_path):
+    report.tensorboard(fake.bare("insufficient_data"), tmp_path)
+    assert set(_written(tmp_path)) == {"Gap/noise_floor", "Diagnosis/verdict/text_summary"}
+
+
+def test_console_says_what_was_found_in_plain_lines(tmp_path):
+    path = report.write(fake.full(), tmp_path)
+    file = io.StringIO()
+    report.console(fake.full(), tmp_path, file=file)
+    text = file.getvalue()
+    assert not set(text) & {"\x1b", "\r", "\b"}
+    for words in ("Missing effects found", "Coulomb friction at joint 'elbow'", "0.031 ± 0.002 N m", "68 %", str(path)):
+        assert words in text
+    assert all(f"warning: {w}" in text for w in fake.full().warnings)
+    assert "3 more in diagnosis.json" in text
+
+
+@pytest.mark.parametrize("verdict", VERDICTS)
+def test_console_of_every_verdict_also_in_ascii(verdict):
+    file = io.TextIOWrapper(io.BytesIO(), encoding="ascii", write_through=True)
+    report.console(fake.bare(verdict), file=file)
+    assert WORDS[verdict].badge in file.buffer.getvalue().decode("ascii")
+    report.console(fake.full(), file=file)
+    assert "0.031 +/- 0.002 N m" in file.buffer.getvalue().decode("ascii")

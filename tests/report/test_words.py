@@ -1,0 +1,88 @@
+"""Numbers, units and effects as people read them; the right answers are written down by hand."""
+
+import math
+
+import pytest
+
+from bayessim_mjx.diagnosis.result import VERDICTS, Estimate, FoundEffect
+from bayessim_mjx.report import words
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (0.031234, "0.0312"),
+        (12.449, "12.4"),
+        (9.999, "10.0"),
+        (123456.0, "123456"),
+        (0, "0"),
+        (7, "7"),
+        (-0.5, "−0.500"),
+        (2.5e-6, "2.50·10⁻⁶"),
+        (1.234e8, "1.23·10⁸"),
+        (math.nan, "–"),
+        (None, "–"),
+        ("x", "–"),
+    ],
+)
+def test_numbers(value, text):
+    assert words.number(value) == text
+
+
+@pytest.mark.parametrize(
+    ("mean", "sd", "unit", "text"),
+    [
+        (0.0312, 0.0021, "N m", "0.031 ± 0.002 N m"),
+        (0.0213, 0.0011, "s", "21.3 ± 1.1 ms"),
+        (-1.5, 0.24, "rad", "−1.5 ± 0.2 rad"),
+        (152.0, 31.0, "", "150 ± 30"),
+        (0.5, math.nan, "kg", "0.500 kg"),
+        (3.2e-6, 4e-7, "kg m^2", "(3.2 ± 0.4)·10⁻⁶ kg m²"),
+    ],
+)
+def test_estimates_show_the_digits_that_the_sd_allows(mean, sd, unit, text):
+    assert words.estimate(mean, sd, unit) == text
+
+
+@pytest.mark.parametrize(
+    ("share", "text"), [(0.68, "68 %"), (0.042, "4.2 %"), (0.9972, "99.7 %"), (1.0, "100 %"), (0.0, "0 %")]
+)
+def test_shares(share, text):
+    assert words.percent(share) == text
+
+
+def test_units_have_superscripts():
+    assert words.unit("N m s^2/rad^2") == "N m s²/rad²" and words.unit("N m/rad^3") == "N m/rad³"
+
+
+def test_effects_in_plain_english():
+    assert words.effect_title("payload", "hand") == "Extra payload at body 'hand'"
+    assert words.effect_title("coulomb_friction", "all") == "Coulomb friction at all joints"
+    assert words.effect_title("my_effect", "elbow") == "My effect at 'elbow'"
+    assert words.label_title("actuator_delay@m1", short=True) == "Command delay · m1"
+
+
+def test_a_reciprocal_is_turned_over_with_its_error():
+    # 1 / 0.5 = 2, sd 0.05 / 0.5^2 = 0.2
+    assert words.quantity("inverse_limit", Estimate(0.5, 0.05, "1/(N m)")) == ("limit", "2.0 ± 0.2 N m")
+    assert words.quantity("inverse_speed", Estimate(0.1, 0.01, "s/rad")) == ("no-load speed", "10.0 ± 1.0 rad/s")
+
+
+def test_an_effect_with_several_parameters_names_them():
+    two = {"level": Estimate(0.1, 0.03, "N m"), "excess": Estimate(0.2, 0.05, "N m")}
+    line = words.effect_line(FoundEffect("stribeck_friction", "j", two, 1.0, 0.5, (0.4, 0.6)))
+    assert line == "Stribeck friction at joint 'j': level 0.10 ± 0.03 N m, excess 0.20 ± 0.05 N m"
+
+
+def test_gap_closed_by_hand():
+    # (10^2 - 2^2) / (10^2 - 1^2) = 96 / 99
+    assert words.gap_closed({"nominal": 10, "with_effects": 2, "reducible_floor": 1}) == pytest.approx(96 / 99)
+    assert math.isnan(words.gap_closed({"nominal": 10, "with_effects": 2}))
+
+
+def test_every_verdict_and_effect_of_the_library_has_words():
+    from bayessim_mjx import effects
+
+    assert set(words.VERDICTS) == set(VERDICTS)
+    kinds = {name: effects.load(name).kind for name in effects.names()}
+    assert {n: k for n, k in kinds.items() if words.EFFECTS.get(n, ("", ""))[1] != k} == {}
