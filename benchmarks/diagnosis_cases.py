@@ -45,6 +45,8 @@ def places(system: System, effect: str, scales: Scales) -> list[str]:
         return [] if effect == "unknown_cross_coupling" and len(scales.force) < 2 else list(scales.drives)
     if cause.kind == "world":
         return [] if system.name == "cartpole" else ["world"]
+    if cause.kind == "geom":
+        return ["foot"] if 'name="foot"' in system.xml else []
     if cause.kind == "body":
         return list(scales.mass)[-2:]  # what is carried is carried at the end
     return driven if effect in _ROTOR else list(scales.force)

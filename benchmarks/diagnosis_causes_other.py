@@ -102,11 +102,48 @@ class BaseFlexibility(Cause):
         k = 1 / max(self.size, self.smallest)
         base = spec.body("base")
         for name, axis in (("base/x", [1, 0, 0]), ("base/y", [0, 1, 0])):
-            joint = base.add_joint(name=name, axis=axis, pos=[0, 0, -0.3], armature=0.1 * self.inertia)
+            joint = base.add_joint(name=name, axis=axis, pos=[0, 0, -0.1], armature=0.1 * self.inertia)
             joint.stiffness[0], joint.damping[0] = k, 2 * self.zeta * math.sqrt(k * self.inertia)
 
     def parameters(self) -> dict[str, float]:
-        return {"stiffness": 1 / max(self.size, self.smallest)}
+        return {"compliance": max(self.size, self.smallest)}
+
+
+class ContactFriction(Cause):
+    """MuJoCo's sliding friction of a geom, larger or smaller by a factor."""
+
+    name = "contact_friction"
+    kind = "geom"
+
+    def draw(self, rng: np.random.Generator) -> None:
+        self.sign = float(rng.choice([-1, 1]))
+        self.largest = 4.0 if self.sign < 0 else 2.0
+
+    def edit(self, spec: mujoco.MjSpec) -> None:
+        geom = spec.geom(self.where)
+        geom.friction = geom.friction * [self.factor, 1, 1]
+
+    @property
+    def factor(self) -> float:
+        return (1 + self.size) ** self.sign
+
+    def parameters(self) -> dict[str, float]:
+        return {"scale": self.factor}
+
+
+class ContactCompliance(Cause):
+    """MuJoCo's time constant of a geom's contacts, longer by a factor."""
+
+    name = "contact_compliance"
+    kind = "geom"
+    largest = 2.0
+
+    def edit(self, spec: mujoco.MjSpec) -> None:
+        geom = spec.geom(self.where)
+        geom.solref = geom.solref * [math.exp(self.size), 1]
+
+    def parameters(self) -> dict[str, float]:
+        return {"softness": self.size}
 
 
 class JointOffset(Cause):

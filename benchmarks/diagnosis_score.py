@@ -52,7 +52,7 @@ class Outcome:
         return any(self.same(f["name"], str(f["where"]), effect) for f in self.named())
 
     def best(self, effects: Sequence[dict[str, Any]]) -> bool:
-        """Baseline (single-fold error, as BAM): the candidate that predicts best held out is the truth, no thresholds."""
+        """Baseline (single-fold error, as BAM does): the candidate that predicts best is the truth, no thresholds."""
         ranked = [c for c in (self.said or {}).get("candidates", []) if c.get("score") is not None]
         top = _labels(ranked[0]) if ranked else []
         return len(top) == len(effects) and all(any(self.same(*t, e) for t in top) for e in effects)

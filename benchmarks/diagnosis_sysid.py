@@ -1,4 +1,4 @@
-"""The parameter fit that mujoco.sysid does, on the same cases: time and held-out error; then one candidate after another.
+"""The parameter fit that mujoco.sysid does, on the same cases: time, held-out error; then one candidate after another.
 
     pip install "mujoco[sysid]"
     python benchmarks/diagnosis_sysid.py CASE [CASE ...] --candidates

@@ -31,6 +31,7 @@ class System:
         servo: actuators take position targets (in the model's own servo); else torques of an outer PD controller.
         kp, kd: of the outer controller, N m/rad and N m s/rad (N/m, N s/m) per actuator.
         centre, swing: rad or m per actuator, of the reference motion; push: share of the command range in open loop.
+        lift: rad, how far off the reference the driven joints start, so that a foot starts above the floor.
         pace: Hz, of the reference motion.
         sigma: rad or m per joint, noise of the encoders.
     """
@@ -46,6 +47,7 @@ class System:
     pace: float
     sigma: tuple[float, ...]
     push: float = 0.25
+    lift: float = 0.0
 
 
 def reference(profile: str, amplitude: np.ndarray, pace: float, rng: np.random.Generator) -> Reference:
@@ -198,4 +200,22 @@ def _leg() -> System:
     return System("leg", xml, 0.01, False, kp, kd, (0.0, 0.5, -0.9), (0.5, 0.7, 0.8), 0.7, (4e-4,) * 3)
 
 
-SYSTEMS = {s.name: s for s in (_pendulum(), _cartpole(), _two_link(), _arm_servo(), _arm_torque(), _leg())}
+def _foot() -> System:
+    """A leg whose foot slides on the floor under load and, in large motions, leaves it."""
+    links = [
+        ("thigh", "hip", "0 1 0", "0 0 0", "0 0 -.2", ".025", 1.0, 0.1, 0.02),
+        ("shank", "knee", "0 1 0", "0 0 -.2", "0 0 -.2", ".015", 0.25, 0.1, 0.015),
+    ]
+    xml = _model("crouch", 0.002, _chain(links), _motors(["hip", "knee"], [15.0, 15.0]))
+    foot = 'type="sphere" size=".02" pos="0 0 -.2" mass=".03" friction=".8 .005 .0001"'
+    floor = '<geom name="floor" type="plane" size="2 2 .1" pos="0 0 -.35" friction=".3 .005 .0001"'
+    touch = ' contype="1" conaffinity="1"/>'
+    shank = xml.index('<geom name="shank"')
+    after = xml.index("/>", shank) + 2
+    xml = xml[:after] + f'\n          <geom name="foot" {foot}{touch}' + xml[after:]
+    xml = xml.replace('    <body name="base">', f'    {floor}{touch}\n    <body name="base">')
+    kp, kd = (40.0, 30.0), (2.0, 1.5)
+    return System("foot", xml, 0.01, False, kp, kd, (0.5, -1.0), (0.25, 0.3), 0.7, (4e-4,) * 2, push=0.1, lift=-0.2)
+
+
+SYSTEMS = {s.name: s for s in (_pendulum(), _cartpole(), _two_link(), _arm_servo(), _arm_torque(), _leg(), _foot())}

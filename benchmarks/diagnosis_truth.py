@@ -158,7 +158,7 @@ def run(plant: Plant, index: int, seed: int, noise: bool = True) -> Run:
         return np.clip(u + (system.push * limit * extra(t) if free else 0), -limit, limit)
 
     start, speed = np.zeros((2, len(plant.joints)))
-    start[driven] = centre + (0 if free else target(0.0))
+    start[driven] = centre + system.lift + (0 if free else target(0.0))
     speed[driven] = 0 if free else (target(5e-3) - target(-5e-3)) / 1e-2
     plant.reset(start, speed, control(0.0, start, speed))
     record: dict[str, list[np.ndarray]] = {k: [] for k in ("ctrl", "qpos", "qvel", "clean", "clean_v")}
