@@ -59,9 +59,10 @@ class JointOffset(Effect):
 def _shift(at: Site, theta: jax.Array) -> tuple[np.ndarray, jax.Array]:
     """(ids of actuators that close a loop on the position of a joint of the site, by how much their commands shift)."""
     model = at.mj_model
-    loop = (model.actuator_biastype == _AFFINE) & (model.actuator_biasprm[:, 1] != 0)
+    gain, slope = model.actuator_gainprm[:, 0], model.actuator_biasprm[:, 1]
+    loop = (model.actuator_biastype == _AFFINE) & (slope != 0) & (gain != 0)
     joint = np.where(np.isin(model.actuator_trntype, _ON_JOINT), model.actuator_trnid[:, 0], -1)
     servos = np.flatnonzero(loop & np.isin(joint, at.ids))
     place = np.asarray([list(at.ids).index(j) for j in joint[servos]], int)
-    factor = model.actuator_biasprm[servos, 1] * model.actuator_gear[servos, 0] / model.actuator_gainprm[servos, 0]
+    factor = slope[servos] * model.actuator_gear[servos, 0] / gain[servos]
     return servos, jnp.asarray(factor, jnp.float32) * at.values(theta)[place, 0]
