@@ -40,6 +40,7 @@ class Relation:
         friction: the share that friction and offset explain without any body.
         lag: s by which the motion follows the effort.
         mend: what would mend it, or nothing.
+        certain: the mend is a sign or a unit, which no robot has wrong.
     """
 
     joint: str
@@ -48,13 +49,15 @@ class Relation:
     friction: float = 0.0
     lag: float = 0.0
     mend: str = ""
+    certain: bool = False
     text: str = ""
 
     @property
     def refused(self) -> bool:
         """Too little is explained; or what is explained is a sign of the velocity that owes nothing to the masses."""
         e = self.explained
-        return e is not None and (e < REFUSED or (e < DOUBTFUL and e < self.friction + 0.05))
+        vain = self.certain or e is not None and e < self.friction + 0.05
+        return e is not None and (e < REFUSED or (e < DOUBTFUL and vain))
 
 
 def is_effort(mj_model: mujoco.MjModel, actuator: int) -> bool:
@@ -122,6 +125,9 @@ def _relation(log: Log, mj_model: mujoco.MjModel, effort: Effort, pictures: list
     if not tests:
         return replace(own, text="too little motion, free of contacts and limits, to compare the effort with")
     if any(t.small for t in tests):
+        share = _in_radians(log, mj_model, tests[0])
+        if share > DOUBTFUL:
+            return replace(own, explained=0.0, certain=True, mend=f"positions in degrees would explain {share:.0%}")
         return replace(own, text="the effort hardly changes against the inertial forces; free motion tests nothing")
     lags = np.linspace(-_FAR, _FAR, 41)
     curves = [t.over(lags) for t in tests]
@@ -129,8 +135,10 @@ def _relation(log: Log, mj_model: mujoco.MjModel, effort: Effort, pictures: list
     physical = (lags >= CAUSAL[0]) & (lags <= CAUSAL[1])
     explained = max(float(c[physical].max()) for c in curves)
     relation = replace(own, explained=explained, friction=test.friction(), lag=_nearest(lags, curve))
-    doubtful = explained < DOUBTFUL
-    return replace(relation, mend=_mend(log, mj_model, effort, relation, curve, test)) if doubtful else relation
+    if explained >= DOUBTFUL:
+        return relation
+    mend, certain = _mend(log, mj_model, relation, curve, test)
+    return replace(relation, mend=mend, certain=certain)
 
 
 def _nearest(lags: Array, curve: Array) -> float:
@@ -210,21 +218,27 @@ class _Test:
         return spans
 
 
-def _mend(log: Log, mj_model: mujoco.MjModel, effort: Effort, now: Relation, curve: Array, test: _Test) -> str:
-    """One remedy that would explain the effort, in words, or nothing."""
-    assert now.explained is not None
+def _mend(log: Log, mj_model: mujoco.MjModel, now: Relation, curve: Array, test: _Test) -> tuple[str, bool]:
+    """One remedy that would explain the effort, in words, or nothing; and whether it is a sign or a unit."""
     if now.lag and curve.max() > DOUBTFUL:
-        return f"shifting the command by {now.lag:+.3f} s would explain {curve.max():.0%}"
+        return f"shifting the command by {now.lag:+.3f} s would explain {curve.max():.0%}", False
     turned = test.share(sign=-1.0)
     if turned > DOUBTFUL:
-        return f"the opposite sign would explain {turned:.0%}"
-    if np.abs(log.qpos).max() > 6.0:
-        radians = replace(log, qpos=np.radians(log.qpos), qvel=np.radians(log.qvel))
-        share = _Test.of(radians, effort, Dynamics.of(mj_model, motion(radians, mj_model, test.cutoff))).share()
-        if share > DOUBTFUL:
-            return f"positions in degrees would explain {share:.0%}"
+        return f"the opposite sign would explain {turned:.0%}", True
+    radians = _in_radians(log, mj_model, test)
+    if radians > DOUBTFUL:
+        return f"positions in degrees would explain {radians:.0%}", True
     free = test.share(scaled=False)
-    if effort.scaled and free > DOUBTFUL:
-        return f"another scale of the command would explain {free:.0%}"
+    if test.effort.scaled and free > DOUBTFUL:
+        return f"another scale of the command would explain {free:.0%}", False
     spans = ", ".join(f"{a:.1f} to {b:.1f} s" for a, b in test.pieces())
-    return f"the part from {spans} alone can be explained: cut the file there" if spans else ""
+    return (f"the part from {spans} alone can be explained: cut the file there" if spans else ""), False
+
+
+def _in_radians(log: Log, mj_model: mujoco.MjModel, test: _Test) -> float:
+    """Share explained if the positions were degrees; 0 where they are too small for that."""
+    if np.abs(log.qpos).max() < 6.0:
+        return 0.0
+    radians = replace(log, qpos=np.radians(log.qpos), qvel=np.radians(log.qvel))
+    picture = Dynamics.of(mj_model, motion(radians, mj_model, test.cutoff))
+    return _Test.of(radians, test.effort, picture).share()

@@ -177,7 +177,9 @@ def _compare(name: str, grid: Array, v: Array, w: Array) -> Velocity:
     lags = np.linspace(-0.1, 0.1, 201) if grid[-1] - grid[0] > 1.0 else np.zeros(1)
     late = [np.interp(grid - lag, grid, w) for lag in lags]
     errors = [float(np.sum((v - (v @ x) / (x @ x) * x) ** 2)) for x in late]
-    best = int(np.argmin(errors))
+    best, now = int(np.argmin(errors)), len(lags) // 2
+    if errors[best] > 0.5 * errors[now] or best in (0, len(lags) - 1):
+        best = now  # a lag has to explain something
     x = late[best]
     correlation = float(v @ x) / float(np.linalg.norm(v) * np.linalg.norm(x))
     return Velocity(name, float(v @ x) / float(x @ x), float(lags[best]), correlation)

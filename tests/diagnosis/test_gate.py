@@ -120,7 +120,7 @@ def test_the_reason_names_what_would_mend_it(good: Log) -> None:
     late = dataclasses.replace(good, ctrl=np.roll(good.ctrl, 30, axis=0))
     refused(late, "shifting the command by -0.29", "s would explain")
     refused(dataclasses.replace(good, ctrl=-good.ctrl), "the opposite sign would explain")
-    warned(dataclasses.replace(good, ctrl=20 * good.ctrl), "no model explains", "another scale of the command would explain")
+    warned(dataclasses.replace(good, ctrl=20 * good.ctrl), "no model explains", "another scale")
     degrees = dataclasses.replace(good, qpos=np.degrees(good.qpos), qvel=np.degrees(good.qvel))
     refused(degrees, "positions in degrees would explain")
 

@@ -37,8 +37,8 @@ def test_effective_size_has_limits() -> None:
 def test_sensor_noise_is_recovered() -> None:
     log = record(PENDULUM, sines((1.0,)), sigma=3e-3)
     assert floors([log]).qpos[0] == pytest.approx(3e-3, rel=0.15)
-    two = [log, record(PENDULUM, sines((1.0,), seed=1), sigma=1e-3, seed=2)]
-    assert floors(two).qpos[0] == pytest.approx(np.sqrt(5) * 1e-3, rel=0.15)  # pooled: rms
+    quiet = [record(PENDULUM, sines((1.0,), seed=k), sigma=1e-3, seed=k) for k in (1, 2)]
+    assert floors([log, *quiet]).qpos[0] == pytest.approx(1e-3, rel=0.15)  # one run that shakes is not the sensor
 
 
 def test_noise_at_rest_counts_where_it_is_slow() -> None:
