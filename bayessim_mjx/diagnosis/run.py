@@ -2,33 +2,33 @@
 
 from __future__ import annotations
 
-import importlib.metadata
-import warnings as python_warnings
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any
 
-import jax
 import mujoco
 import numpy as np
 
 from bayessim_mjx import effects as library
-from bayessim_mjx.diagnosis import candidates, gap, scales, search, uncertainty, verdict, windows
+from bayessim_mjx.diagnosis import candidates, channels, gap, gate, noise, scales, search, verdict, windows
 from bayessim_mjx.diagnosis.fit import Fitter
-from bayessim_mjx.diagnosis.models import Model
-from bayessim_mjx.diagnosis.result import Diagnosis, Estimate, FoundEffect, Gap, Place
+from bayessim_mjx.diagnosis.flexible import Flexible, flexible
 from bayessim_mjx.diagnosis.robot import Robot
 from bayessim_mjx.diagnosis.simulate import Simulator
 from bayessim_mjx.effects.effect import Effect
-from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Log
+from bayessim_mjx.logs.resample import resample
 from bayessim_mjx.physics import Physics
 
 WINDOW = 0.5  # s
 SHORTEST = 0.004  # s, control period of the diagnosis; faster logs are resampled
 LIMITS = ((1, 160), (3, 96), (7, 64), (100, 48))  # (up to so many dofs, windows)
+LEAST = 6  # windows: with fewer nothing can be held out
 Progress = Callable[[str, int, int], None]
+
+
+class TooLittleData(Exception):
+    """There is something to look at, but not enough to hold anything out; the text says what is missing."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,13 +37,31 @@ class Setup:
 
     robot: Robot
     physics: Physics
-    logs: tuple[Log, ...]
+    gate: gate.Gate
+    floors: noise.Floors
     fitter: Fitter
     candidates: list[candidates.Candidate]
     scales: scales.Scales
     settings: search.Settings
     seed: int
     warnings: list[str] = field(default_factory=list)
+
+    @property
+    def logs(self) -> tuple[Log, ...]:
+        return self.gate.usable
+
+
+@dataclass(frozen=True, eq=False)
+class Findings:
+    """All that was computed; `report_of` (see `assemble`) turns it into a Diagnosis."""
+
+    setup: Setup
+    race: search.Race
+    ruling: verdict.Ruling
+    predictions: dict[str, gap.Prediction]
+    flexible_base: Flexible | None
+    flexible_winner: Flexible | None
+    links: list[channels.Link]
 
 
 def control_period(robot: Robot, logs: Sequence[Log]) -> float:
@@ -62,27 +80,48 @@ def prepare(
     group: str | None = None,
     seed: int = 0,
     settings: search.Settings | None = None,
-    use_qvel: bool = True,
 ) -> Setup:
-    """Compile-ready set-up from logs that passed the gate.
+    """Everything up to the first simulation.
 
     Raises:
-        UserError: unknown effects, logs too short.
+        UserError: unknown effects, no usable log.
+        TooLittleData: too few windows.
     """
     dt = control_period(robot, logs)
-    length = int(np.clip(round(WINDOW / dt), 8, 100))
-    names = library.names() if effects == "all" else list(effects)
-    kinds = [library.load(n) if isinstance(n, str) else n for n in names]
-    plain = robot.physics(dt)
-    even = [log for log in logs]
-    size = scales.measure(robot.mj_model, even)
-    stack, _ = candidates.stack(kinds, robot.space, size)
+    seen = gate.check(logs, robot.mj_model, dt)
+    usable = seen.demand()
+    notes = [*seen.warnings, *(f"{text} (found, not assumed)" for text in seen.findings)]
+    floors = noise.floors(usable)
+    kinds = [library.load(n) if isinstance(n, str) else n for n in (library.names() if effects == "all" else effects)]
+    size = scales.measure(robot.mj_model, [resample(log, dt) for log in usable])
+    stack, left_out = candidates.stack(kinds, robot.space, size)
     physics = robot.physics(dt, stack)
-    limit = next(n for dofs, n in LIMITS if robot.mj_model.nv <= dofs)
-    cut = windows.cut(logs, physics.mj_model, dt, plain.substeps, length, limit=limit, group=group, use_qvel=use_qvel)
+    cut = _windows(robot, physics, usable, dt, group, seen.use_qvel)
     fitter = Fitter(Simulator(physics, cut), candidates.base_coordinates(robot.space), physics.space.nominal)
     every = candidates.enumerate_candidates(physics)
-    return Setup(robot, physics, tuple(logs), fitter, every, size, settings or search.Settings(), seed)
+    notes += [*floors.warnings, *(f"not tried: {text}" for text in left_out), *_few_conditions(cut)]
+    return Setup(robot, physics, seen, floors, fitter, every, size, settings or search.Settings(), seed, notes)
+
+
+def _windows(
+    robot: Robot, physics: Physics, logs: Sequence[Log], dt: float, group: str | None, use_qvel: bool
+) -> windows.Windows:
+    limit = next(n for dofs, n in LIMITS if robot.mj_model.nv <= dofs)
+    longest = max(int(log.duration / dt) for log in logs)
+    length = int(np.clip(round(WINDOW / dt), 8, 100))
+    if longest < length:
+        raise TooLittleData(f"the longest log has {longest} control steps of {dt:.3g} s, one window needs {length}")
+    cut = windows.cut(logs, physics.mj_model, dt, physics.substeps, length, limit=limit, group=group, use_qvel=use_qvel)
+    if len(cut) < LEAST:
+        raise TooLittleData(f"{len(cut)} windows of {length * dt:.2g} s; holding conditions out needs {LEAST}")
+    return cut
+
+
+def _few_conditions(cut: windows.Windows) -> list[str]:
+    count = len(cut.groups)
+    if cut.groups[0].startswith("part 1 of"):
+        return ["one operating condition only: blocks in time are held out, which tells little about other conditions"]
+    return [f"{count} operating conditions: intervals are rough"] if count < 4 else []
 
 
 def diagnose(
@@ -94,104 +133,46 @@ def diagnose(
     seed: int = 0,
     settings: search.Settings | None = None,
     progress: Progress | None = None,
-) -> tuple[Diagnosis, Setup, search.Race]:
-    """The whole diagnosis."""
+) -> Findings:
+    """The whole computation.
+
+    Args:
+        robot: the model with the parameters that it may recalibrate.
+        logs: recorded motion.
+        effects: "all", or names (also of one's own, `path.py:Class`) or classes.
+        group: metadata key of the operating conditions that are held out in turn.
+        progress: called with (what is being done, done, total).
+
+    Raises:
+        UserError: nothing usable. TooLittleData: nothing could be held out.
+    """
     say = progress or (lambda text, done, total: None)
+    say("looking at the logs", 0, 1)
     setup = prepare(robot, logs, effects, group=group, seed=seed, settings=settings)
     race = search.run(setup.fitter, setup.candidates, setup.settings, say)
     ruling = verdict.rule(race, say)
-    return _assemble(setup, race, ruling, say), setup, race
-
-
-def _assemble(setup: Setup, race: search.Race, ruling: verdict.Ruling, say: Progress) -> Diagnosis:
     fitter, model = setup.fitter, ruling.model
-    cut = fitter.simulator.windows
+    say("how far", 0, 1)
     predictions = {"nominal": gap.nominal(fitter, race.nominal), "calibrated": gap.predict(fitter, race.base)}
     predictions["with_effects"] = gap.predict(fitter, model) if model.effects else predictions["calibrated"]
-    name = _verdict(race, ruling)
-    sd = uncertainty.deviations(fitter, model)
-    found = _effects(setup, race, ruling, predictions, sd, say) if model.effects else []
-    return Diagnosis(
-        verdict=name,
-        sentences=[],
-        effects=found,
-        where=[],
-        gap=_gap(setup, predictions),
-        parameters=_parameters(race, model, sd),
-        candidates=_ranking(race),
-        warnings=list(setup.warnings),
-        next_experiment={},
-        versions=versions(),
-    )
+    say("none of these?", 0, 1)
+    on_base = _flexible(setup, race.base, race)
+    on_winner = _flexible(setup, model, race) if model.effects else on_base
+    links = [link for log in setup.logs[:1] for link in channels.links(log, robot.mj_model)]
+    return Findings(setup, race, ruling, predictions, on_base, on_winner, links)
 
 
-def _verdict(race: search.Race, ruling: verdict.Ruling) -> str:
-    if ruling.model.effects:
-        return "ambiguous" if ruling.ambiguous else "effects"
-    floor = race.noise * len(race.base.cost) * race.settings.floor**2
-    q, _ = race.nominal.quadratic(race.fitter.spread)
-    moved = q.c.sum() > max(1.1 * race.base.total, floor)
-    return "parameters" if moved else "no_gap"
+def _flexible(setup: Setup, model: search.Model, race: search.Race) -> Flexible | None:
+    """The flexible force on a model whose gap is above the noise."""
+    if not race.above_noise(model):
+        return None
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return flexible(setup.fitter, model.job)
 
 
-def _effects(
-    setup: Setup, race: search.Race, ruling: verdict.Ruling, predictions: dict, sd: np.ndarray, say: Progress
-) -> list:
-    fitter, model = setup.fitter, ruling.model
-    group = fitter.simulator.windows.group
-    shares = verdict.shapley(race, model, say)
-    steps = fitter.simulator.windows.steps
-    reference = min(1.0, float(predictions["with_effects"].cost(steps).mean()))
-    out = []
-    for effect in model.effects:
-        own = [model.job.names.index(c.name) for c in effect.coordinates]
-        rivals = ruling.rivals.get(effect.label, [])
-        rest = verdict.without(race, model, effect, say)
-        before = gap.predict(fitter, rest) if rest.effects else predictions["calibrated"]
-        closed, ci = gap.closure(
-            before.cost(steps), predictions["with_effects"].cost(steps), reference, group, setup.seed
-        )
-        weights = uncertainty.win_share(
-            [model, *(r.model for r in rivals if not r.contains)], group, race.noise, np.random.default_rng(setup.seed)
-        )
-        out.append(FoundEffect(
-            name=effect.effect,
-            where=effect.where,
-            parameters={c.name.rsplit(".", 1)[1]: Estimate(float(model.job.values[i]), float(sd[i]), c.unit) for i, c in zip(own, effect.coordinates, strict=True)},
-            probability=float(weights[0]),
-            gap_closed=closed,
-            gap_closed_ci=ci,
-            equivalent_to=[r.to_dict() for r in rivals],
-            share=shares.get(effect.label, float("nan")),
-        ))  # fmt: skip
-    return sorted(out, key=lambda e: -e.share if e.share == e.share else -e.gap_closed)
-
-
-def _gap(setup: Setup, predictions: dict[str, gap.Prediction]) -> Gap:
-    cut = setup.fitter.simulator.windows
-    lengths = {
-        "10 control steps": min(10, cut.steps),
-        "0.25 s": max(1, round(0.25 / cut.dt)),
-        f"{cut.steps * cut.dt:.2g} s": cut.steps,
-    }
-    horizons = []
-    for name, steps in lengths.items():
-        horizons.append(
-            {"name": name, "seconds": steps * cut.dt, **gap.stages(predictions, None, steps, cut.group, setup.seed)}
-        )
-    whole = horizons[-1]
-    names = _dof_names(setup.physics.mj_model)
-    by_channel = {
-        joint: {stage: float(np.sqrt(p.cost(cut.steps, slice(i, i + 1)).mean())) for stage, p in predictions.items()}
-        for i, joint in enumerate(names)
-    }
-    physical = {
-        joint: {s: v * float(cut.sigma_q[i]) for s, v in by_channel[joint].items()} for i, joint in enumerate(names)
-    }
-    return Gap(1.0, whole["nominal"], whole["calibrated"], whole["with_effects"], min(1.0, whole["with_effects"]), by_channel=by_channel, horizons=horizons, physical=physical)  # fmt: skip
-
-
-def _dof_names(model: mujoco.MjModel) -> list[str]:
+def dof_names(model: mujoco.MjModel) -> list[str]:
+    """One name per dof `[nv]`."""
     out = [""] * model.nv
     for j in range(model.njnt):
         name = model.joint(j).name or f"joint{j}"
@@ -199,33 +180,3 @@ def _dof_names(model: mujoco.MjModel) -> list[str]:
         for k in range(width):
             out[int(model.jnt_dofadr[j]) + k] = name if width == 1 else f"{name}[{k}]"
     return out
-
-
-def _parameters(race: search.Race, model: Model, sd: np.ndarray) -> dict[str, dict[str, Any]]:
-    remarks = verdict.structural(race, model, sd)
-    return {
-        c.name: {"mean": float(model.job.values[i]), "sd": float(sd[i]), "nominal": c.neutral, "low": c.low, "high": c.high, "unit": c.unit, "structural": remarks.get(c.name, "")}
-        for i, c in enumerate(race.fitter.base)
-    }  # fmt: skip
-
-
-def _ranking(race: search.Race) -> list[dict[str, Any]]:
-    out = []
-    for model in search.ranked(race)[:40]:
-        c = race.better(race.base, model)
-        group = race.fitter.simulator.windows.group
-        gain = race.base.cost - model.cost
-        sums = np.array([gain[group == g].sum() for g in np.unique(group)])
-        se = float(np.std(sums, ddof=1) * np.sqrt(len(sums))) if len(sums) > 1 else float("nan")
-        above = max(race.base.total - race.noise * len(race.base.cost), 1e-9)
-        out.append({
-            "effects": [e.label for e in model.effects], "label": model.label, "score": c.evidence, "se": se / above,
-            "gap_closed": race.closure(model), "rms": float(np.sqrt(model.total / model.job.r.size)),
-            "parameters": dict(zip(model.job.names, map(float, model.job.values), strict=True)),
-        })  # fmt: skip
-    return out
-
-
-def versions() -> dict[str, str]:
-    """Versions of what the result depends on."""
-    return {p: importlib.metadata.version(p) for p in ("bayessim-mjx", "mujoco", "mujoco-mjx", "jax", "numpy")}

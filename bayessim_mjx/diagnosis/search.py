@@ -74,7 +74,7 @@ class Race:
     def passes(self, old: Model, new: Model) -> bool:
         """Whether `new`'s additional effects are both real and relevant."""
         c, s = self.better(old, new), self.settings
-        if old.total < s.floor**2 * self.noise * len(old.cost):  # nothing left above the noise
+        if not self.above_noise(old):
             return False
         many = np.log(max(len(self.candidates), 2)) * max(1, len(new.effects) - len(old.effects))
         if not all(self.distinct(new, e) for e in new.effects if e not in old.effects):
@@ -82,11 +82,18 @@ class Race:
         relevance = s.more if old.effects else s.relevance
         return c.share > relevance and c.drop > s.drop and c.evidence > s.evidence + many and c.t > s.t
 
+    def above_noise(self, model: Model) -> bool:
+        """Whether the model's held-out error is worth explaining."""
+        return model.total > self.settings.floor**2 * self.noise * len(model.cost)
+
     def distinct(self, model: Model, effect: Candidate) -> bool:
         """Whether at least one amplitude of the effect is two standard deviations away from neutral."""
         sd = deviations(self.fitter, model)
         own = [model.job.names.index(c.name) for c in effect.coordinates]
-        off = [abs(model.job.values[i] - c.neutral) / max(sd[i], 1e-300) for i, c in zip(own, effect.coordinates, strict=True)]
+        off = [
+            abs(model.job.values[i] - c.neutral) / max(sd[i], 1e-300)
+            for i, c in zip(own, effect.coordinates, strict=True)
+        ]
         return any(z > 2.0 for z, shape in zip(off, effect.shapes, strict=True) if not shape)
 
     def closure(self, model: Model) -> float:
@@ -211,7 +218,7 @@ def _pairs(race: Race, say: Progress) -> Model:
     if not singles:
         return race.base
     best = singles[0]
-    if race.base.total < race.settings.floor**2 * race.noise * len(race.base.cost):
+    if not race.above_noise(race.base):
         return race.base
     plans = []
     for a, b in itertools.combinations(top, 2):

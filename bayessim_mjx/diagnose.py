@@ -1,0 +1,161 @@
+"""Gap diagnosis of recorded motion: python -m bayessim_mjx.diagnose --model robot.xml --data LOGS."""
+
+import argparse
+import contextlib
+import sys
+import time
+import warnings
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn
+
+from bayessim_mjx import cli
+from bayessim_mjx.config import Config
+from bayessim_mjx.device import setup_jax
+from bayessim_mjx.errors import UserError
+
+if TYPE_CHECKING:
+    from bayessim_mjx.diagnosis.result import Diagnosis
+    from bayessim_mjx.diagnosis.robot import Robot
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        raise UserError(message.removeprefix("argument "))
+
+
+def _parser() -> _Parser:
+    parser = _Parser(
+        prog="python -m bayessim_mjx.diagnose",
+        description="Where the gap between logs and simulator lies, which effects cause it, how far it shrinks with them.",
+        allow_abbrev=False,
+    )
+    parser.add_argument("--task", help="one of our tasks (see main --list_tasks)")
+    parser.add_argument("--model", metavar="FILE", help="an MJCF with hinge or slide joints and actuators")
+    parser.add_argument("--data", metavar="PATH", nargs="+", help="logs: files or folders (docs/logs.md)")
+    parser.add_argument("--map", metavar="FILE", help="map of foreign columns (docs/logs.md)")
+    parser.add_argument("--parameters", metavar="FILE", help="params.yaml: what the simulator may recalibrate")
+    parser.add_argument("--effects", default="all", help="all, or names and path.py:Class, with commas")
+    parser.add_argument("--out", metavar="DIR", default="diagnosis", help="folder of the results (diagnosis)")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--group", metavar="KEY", help="metadata key of the operating conditions held out in turn")
+    parser.add_argument("--device", default="auto", help="auto, cpu, gpu")
+    parser.add_argument("--cache_dir", help="compilation cache; off: none")
+    parser.add_argument("--headless", action="store_true", help="plain lines, no progress bars")
+    return parser
+
+
+def _checked(args: argparse.Namespace) -> None:
+    if (args.task is None) == (args.model is None):
+        raise UserError("give one of --task NAME and --model FILE")
+    if not args.data:
+        raise UserError("--data is missing: give files or folders of logs")
+    out = Path(args.out)
+    if out.exists() and not out.is_dir():
+        raise UserError(f"--out {out}: there is a file of that name; give a folder")
+
+
+@contextlib.contextmanager
+def _progress(headless: bool) -> Iterator[Any]:
+    """A function (what, done, total) that shows it: a bar with the time left, or lines."""
+    began = time.monotonic()
+    if headless or not sys.stderr.isatty():
+        last: list[str] = []
+
+        def line(text: str, done: int, total: int) -> None:
+            if [text] != last:
+                last[:] = [text]
+                print(f"{time.monotonic() - began:6.1f} s  {text}", file=sys.stderr, flush=True)
+
+        yield line
+        return
+    from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    columns = (
+        SpinnerColumn(),
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, transient=True) as bars:
+        tasks: dict[str, Any] = {}
+
+        def bar(text: str, done: int, total: int) -> None:
+            if text not in tasks:
+                for other in tasks.values():
+                    bars.update(other, completed=bars.tasks[other].total)
+                tasks[text] = bars.add_task(text, total=max(total, 1))
+            bars.update(tasks[text], completed=done, total=max(total, 1))
+
+        yield bar
+
+
+def _robot(args: argparse.Namespace) -> "Robot":
+    from bayessim_mjx.diagnosis import robot
+
+    if args.model is not None:
+        return robot.of_file(args.model, args.parameters)
+    from bayessim_mjx import registry
+    from bayessim_mjx.config import load
+
+    task = cli.task_name(args.task)
+    env: Any = registry.make(task, config=load(task))
+    return robot.of_task(env, args.parameters)
+
+
+def _diagnosis(args: argparse.Namespace, robot: "Robot", notes: list[str], say: Any) -> "Diagnosis":
+    """The result; too little data is a verdict, not an error."""
+    from bayessim_mjx.diagnosis import assemble, run
+    from bayessim_mjx.logs import read_logs
+
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", UserWarning)
+        logs = read_logs(args.data if len(args.data) > 1 else args.data[0], robot.mj_model, args.map)
+    notes += list(dict.fromkeys(str(w.message) for w in caught))
+    names = "all" if args.effects == "all" else [n.strip() for n in args.effects.split(",") if n.strip()]
+    try:
+        found = run.diagnose(robot, logs, names, group=args.group, seed=args.seed, progress=say)
+    except run.TooLittleData as reason:
+        return assemble.insufficient(str(reason), notes)
+    found.setup.warnings[:0] = notes
+    result = assemble.diagnosis_of(found, say)
+    return assemble.with_more(result, found, Path(args.out), say)
+
+
+def _diagnose(argv: Sequence[str] | None) -> int:
+    args = _parser().parse_args(argv)
+    _checked(args)
+    setup_jax(Config(task="", device=args.device, cache_dir=args.cache_dir))
+    from bayessim_mjx import report
+
+    began = time.monotonic()
+    notes: list[str] = []
+    with warnings.catch_warnings(record=True) as caught, _progress(args.headless) as say:
+        warnings.simplefilter("always", UserWarning)
+        robot = _robot(args)
+        notes += list(dict.fromkeys(str(w.message) for w in caught))
+        result = _diagnosis(args, robot, notes, say)
+        say("writing the report", 0, 1)
+        result = _write(result, robot, Path(args.out), report)
+    report.console(result)
+    print(f"{time.monotonic() - began:.0f} s; open {Path(args.out) / 'report.html'}")
+    return 0
+
+
+def _write(result: "Diagnosis", robot: "Robot", folder: Path, report: Any) -> "Diagnosis":
+    from bayessim_mjx.diagnosis import apply
+
+    folder.mkdir(parents=True, exist_ok=True)
+    result.save(folder)  # before anything that could fail: nothing computed is lost
+    if result.verdict != "insufficient_data":
+        apply.write_outputs(result, robot, folder)
+    report.write(result, folder)
+    report.tensorboard(result, folder)
+    return result
+
+
+main = cli.command(_diagnose)
+
+if __name__ == "__main__":
+    sys.exit(main())
