@@ -59,7 +59,9 @@ def parameters(d: Diagnosis) -> dict[str, Any]:
     estimates = found.get("parameters") or {} if found.get("names") else {}
     moves = sorted(estimates, key=lambda k: not d.parameters.get(k, {}).get("structural"))
     figure = rival_figures.groups(found["names"], {k: estimates[k] for k in moves}, d.parameters) if moves else None
-    return {"rows": rows, "groups": figure, "left": max(len(moves) - 12, 0)}
+    names = found.get("names") or []
+    numbered = [] if rival_figures.fits(names) else names
+    return {"rows": rows, "groups": figure, "numbered": numbered, "left": max(len(moves) - 12, 0)}
 
 
 def isolability(d: Diagnosis) -> dict[str, Any]:

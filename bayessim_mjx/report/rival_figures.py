@@ -25,17 +25,21 @@ from bayessim_mjx.report.words import finite, label_title, percent, unit
 MOST_LABELS = 36
 
 
+def fits(names: Sequence[str]) -> bool:
+    """Whether the conditions' names fit under a panel; else they are numbered."""
+    return len(names) * max((len(str(n)) for n in names), default=0) <= 34
+
+
 def groups(
     names: Sequence[str], parameters: Mapping[str, Mapping[str, Any]], known: Mapping[str, Any]
 ) -> dict[str, Any]:
     """Estimates of each parameter per operating condition (mean and 2 sd); dotted: the simulator's own value."""
     shown = list(parameters.items())[:12]
     columns = min(3, len(shown))
-    longest = max((len(str(n)) for n in names), default=1)
-    foot = 34 if longest * len(names) < 34 else min(7 * longest, 80) + 16
-    height = 40 + (140 + foot) * -(-len(shown) // columns)
+    height = 40 + 176 * -(-len(shown) // columns)
+    labels = [text(n, 16) for n in names] if fits(names) else [str(k + 1) for k in range(len(names))]
     data, layout, titles, levels = [], {}, [], []
-    places = cells(len(shown), columns, 0.07, (36 + foot) / height)
+    places = cells(len(shown), columns, 0.07, 70 / height)
     for k, ((name, row), (across, up)) in enumerate(zip(shown, places, strict=True)):
         x, y = panel(k)
         moves = bool(known.get(name, {}).get("structural"))
@@ -56,7 +60,7 @@ def groups(
         )
         ticks: dict[str, Any] = {
             "tickvals": list(range(len(names))),
-            "ticktext": [text(n, 16) for n in names],
+            "ticktext": labels,
             "showgrid": False,
         }
         layout[layout_key(x)] = axis(domain=across, anchor=y, range=[-0.6, len(names) - 0.4], **ticks)
@@ -70,7 +74,7 @@ def groups(
         height,
         annotations=titles,
         shapes=levels,
-        margin={"l": 60, "r": 10, "t": 28, "b": 12 + foot},
+        margin={"l": 60, "r": 10, "t": 28, "b": 46},
         **layout,
     )
 
@@ -115,7 +119,7 @@ def isolability(labels: Sequence[str], cosine: Sequence[Sequence[float]], absorb
         )
         for i, row in enumerate(table)
         for j, v in enumerate(row)
-        if v is not None and j < i and v >= 0.3
+        if v is not None and j < i and v >= (0.3 if cell == 30 else 0.8)
     ]
     bars = {
         "type": "bar",
@@ -133,22 +137,31 @@ def isolability(labels: Sequence[str], cosine: Sequence[Sequence[float]], absorb
         "textfont": {"size": 11},
     }
     left = 8 + 6.6 * max(map(len, names), default=10)
-    foot = 0.72 * left + 14
+    rows = names if cell == 30 else [f"{name}  <b>{k + 1}</b>" for k, name in enumerate(names)]
+    below = names if cell == 30 else [str(k + 1) for k in at]  # long names would overlap there
+    foot = 0.72 * left + 14 if cell == 30 else 40
     side = cell * n
     width = WIDTH if left + side + 170 > 700 else round(left + side + 250)
     split = (side / (width - left - 60), (side + 30) / (width - left - 60))
     split = split if split[1] < 0.85 else (0.78, 0.82)
-    over = [heading("similarity |cos|", "x", "y"), heading("hidden by known parameters", "x2", "y")]
+    over = [heading("similarity |cos|", "x", "y"), heading("hidden share", "x2", "y")]
     return figure(
         [heat, bars],
         width,
         round(side + 34 + foot),
         annotations=[*over, *values],
         xaxis=axis(
-            domain=[0, split[0]], tickvals=at, ticktext=names, tickangle=-45, showgrid=False, ticks="", showline=False
+            domain=[0, split[0]],
+            tickvals=at,
+            ticktext=below,
+            tickfont={"size": 12 if cell == 30 else 8.5},
+            tickangle=-45 if cell == 30 else 0,
+            showgrid=False,
+            ticks="",
+            showline=False,
         ),
         xaxis2=axis(domain=[split[1], 1], range=[0, 1], tickformat=".0%", tickvals=[0, 0.5, 1], anchor="y"),
-        yaxis=axis(tickvals=at, ticktext=names, range=[n - 0.5, -0.5], showgrid=False, ticks="", showline=False),
+        yaxis=axis(tickvals=at, ticktext=rows, range=[n - 0.5, -0.5], showgrid=False, ticks="", showline=False),
         margin={"l": round(left), "r": 60, "t": 34, "b": round(foot)},
     )
 

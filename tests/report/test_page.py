@@ -1,5 +1,6 @@
 """The page says everything that is in the diagnosis, shows hostile strings as text and loads nothing."""
 
+import dataclasses
 import json
 import sys
 from html.parser import HTMLParser
@@ -132,8 +133,6 @@ def test_a_saved_diagnosis_gives_the_same_page(tmp_path, page):
 
 @pytest.mark.parametrize("key", sorted(fake.details()))
 def test_any_one_of_the_details_may_be_missing_or_alone(key, tmp_path):
-    import dataclasses
-
     whole = fake.full()
     rest = {k: v for k, v in whole.details.items() if k != key}
     for details in (rest, {key: whole.details[key]}):
@@ -142,8 +141,6 @@ def test_any_one_of_the_details_may_be_missing_or_alone(key, tmp_path):
 
 
 def test_many_logs_stay_within_the_size(tmp_path):
-    import dataclasses
-
     whole = fake.full()
     row = whole.details["overlays"][0]
     long = (
@@ -153,3 +150,13 @@ def test_many_logs_stay_within_the_size(tmp_path):
     path = report.write(dataclasses.replace(whole, details={"overlays": many}), tmp_path)
     assert path.stat().st_size < 6_000_000
     assert "more are in details.json" in path.read_text(encoding="utf-8")
+
+
+def test_many_links_of_the_chain_become_a_table(tmp_path):
+    whole = fake.full()
+    links = [link | {"name": f"{link['name']} {j}"} for j in fake.JOINTS for link in whole.details["links"]]
+    page = Page(
+        report.write(dataclasses.replace(whole, details={"links": links}), tmp_path).read_text(encoding="utf-8")
+    )
+    assert not page.open and "effort → motion wrist" in page.text
+    assert not [a for _, a in page.tags if a.get("class") == "chain"]
