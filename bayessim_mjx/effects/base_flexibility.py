@@ -1,7 +1,7 @@
 """Base flexibility: the robot's base rocks on its mount (a table, a tripod, a cabinet, rubber feet, a soft flange)."""
 
 import dataclasses
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -14,9 +14,6 @@ from bayessim_mjx.effects.gravity_tilt import tilted
 from bayessim_mjx.effects.site import Site, SubStep, find
 from bayessim_mjx.errors import UserError
 
-if TYPE_CHECKING:
-    from mujoco import mjx
-
 STOP = 0.3  # rad: a base that topples leans against something
 SETTLING = 3  # rounds of finding how the robot's weight tilts the base at the start
 
@@ -26,9 +23,9 @@ class BaseFlexibility(Effect):
     """I p'' = (moment of the robot on its base) - k p - d p', I = k / (2 pi f)^2, d = 2 zeta sqrt(k I).
 
     p: tilt of the base about the world's x and y axes through the origin of the robot's first body, small. Robot and
-    base are solved together: gravity tilts in the robot's frame and p'' moves all bodies. Left out: Coriolis forces of
-    p', and constraint forces (contacts, joint limits) on the base. At the start the base has settled under the robot's
-    weight. Robots with a fixed base only.
+    base are solved together: gravity tilts in the robot's frame, p' and p'' act on all bodies. Left out: what
+    constraints (contacts, joint limits) do to the base. At the start the base has settled under the robot's weight.
+    Robots with a fixed base only.
 
     Parameters: `compliance` 1/k, rad/(N m), neutral 0; `frequency` f, Hz, of the base without the robot; `damping`
     zeta, likewise; the latter two without effect where the compliance is 0.
@@ -57,19 +54,20 @@ class BaseFlexibility(Effect):
     def on_force(self, at: Site, memory: Any, step: SubStep, theta: jax.Array) -> tuple[Any, jax.Array]:
         compliance, frequency, ratio = at.values(theta)[0]
         slow, dt = 1.0 / (2 * jnp.pi * frequency), step.dt
-        robot = _robot(at, step)
-        tilt = jnp.where(memory["fresh"], _settled(robot, compliance), memory["tilt"])
         rate, lag = memory["rate"], 2 * ratio * slow
+        robot = _robot(at, step, rate)
+        tilt = jnp.where(memory["fresh"], _settled(robot, compliance), memory["tilt"])
         gravity = tilted(robot.gravity, *tilt) - robot.gravity
-        free = robot.shed @ (step.force + robot.momentum[:, 3:] @ gravity)
-        moment = robot.moment(tilt) - robot.bias - free
-        # Schur complement of the robot; k p and d p' at the end of the sub-step; all times 1/k
-        matrix = compliance * (robot.inertia - robot.shed @ robot.coupling.T) + (slow**2 + dt * (lag + dt)) * jnp.eye(2)
-        acceleration = _solve(matrix, compliance * moment - tilt - (dt + lag) * rate)
+        carried = robot.momentum[:, 3:] @ gravity + robot.coriolis
+        moment = robot.moment(tilt) - robot.bias - robot.shed @ (step.force + carried)
+        # a resolved spring is looked at where the sub-step begins, which costs no energy; a stiff one where it ends
+        late = lag + dt * jnp.maximum(1.0 - (slow / dt) ** 2, 0.0)
+        # Schur complement of the robot; all times 1/k
+        matrix = compliance * (robot.inertia - robot.shed @ robot.coupling.T) + (slow**2 + dt * late) * jnp.eye(2)
+        acceleration = _solve(matrix, compliance * moment - tilt - late * rate)
         new = jnp.clip(tilt + dt * (rate + dt * acceleration), -STOP, STOP)
         left = {"tilt": new, "rate": (new - tilt) / dt, "fresh": jnp.zeros((), bool)}
-        force = robot.momentum[:, 3:] @ gravity - robot.coupling.T @ acceleration
-        return left, jnp.where(compliance > 0, force, 0.0)
+        return left, jnp.where(compliance > 0, carried - robot.coupling.T @ acceleration, 0.0)
 
     def edit(self, spec: mujoco.MjSpec, values: dict[str, dict[str, float]]) -> str | None:
         return "MuJoCo needs two joints more under the robot, which changes qpos and qvel; use effects.yaml"
@@ -80,8 +78,9 @@ class _Robot:
     """What the base feels of the robot, moments about the base's origin.
 
     momentum: `[nv, 6]` (angular, linear) per unit of each joint's speed, world axes; coupling: `[2, nv]`, its moments
-    about x and y; inertia `[2, 2]`; shed `[2, nv]`, coupling times the inverse of the mass matrix; bias `[2]`, moment of
-    the inertial forces at no acceleration; lever `[3]`, mass times centre of mass from the base; gravity `[3]`.
+    about x and y; inertia `[2, 2]`; shed `[2, nv]`, coupling times the inverse of the mass matrix; bias `[2]`, moment
+    of the inertial forces at no acceleration; coriolis `[nv]`, what the base's rate does to the joints; lever `[3]`,
+    mass times centre of mass from the base; gravity `[3]`.
     """
 
     momentum: jax.Array
@@ -89,6 +88,7 @@ class _Robot:
     inertia: jax.Array
     shed: jax.Array
     bias: jax.Array
+    coriolis: jax.Array
     lever: jax.Array
     gravity: jax.Array
 
@@ -97,44 +97,61 @@ class _Robot:
         return jnp.cross(self.lever, tilted(self.gravity, *tilt))[:2]
 
 
-def _robot(at: Site, step: SubStep) -> _Robot:
-    from mujoco.mjx._src.math import inert_mul, motion_cross_force
-
+def _robot(at: Site, step: SubStep, rate: jax.Array) -> _Robot:
     model, data = at.mj_model, step.data
-    root = model.body_rootid[model.dof_bodyid]
-    roots = np.unique(root)
-    times = jax.vmap(inert_mul)
-    momentum = times(data._impl.crb[model.dof_bodyid], data.cdof)
+    bodies = np.flatnonzero(np.isin(model.body_rootid, model.body_rootid[model.dof_bodyid]))
+    roots = np.unique(model.body_rootid[bodies])
     base = jnp.asarray(model.body_pos[roots[0]], jnp.float32)
-    arm = data.subtree_com[root] - base  # from the base to where MuJoCo's spatial vectors refer to
-    coupling = (momentum[:, :3] + jnp.cross(arm, momentum[:, 3:]))[:, :2].T
-    motion = _rocking(data.subtree_com[roots] - base)  # [trees, 2, 6]
-    inertia = sum(
-        motion[i] @ jax.vmap(inert_mul, (None, 0))(data._impl.crb[r], motion[i]).T for i, r in enumerate(roots)
-    )
-    # forces on the bodies at no acceleration of the joints: I a + v x I v
-    below = np.flatnonzero(np.isin(model.body_rootid, roots))
-    acceleration = moved(model)[below] @ (data.cdof_dot * data.qvel[:, None])
-    inert = data._impl.cinert[below]
-    force = times(inert, acceleration) + jax.vmap(motion_cross_force)(data.cvel[below], times(inert, data.cvel[below]))
-    away = data.subtree_com[model.body_rootid[below]] - base
-    weighed = step.model.body_mass[below][:, None] * (data.xipos[below] - base)
+    # MuJoCo's spatial vectors (angular, linear) refer to the centre of mass of their tree
+    momentum = _times(data._impl.crb[model.dof_bodyid], data.cdof)
+    arm = data.subtree_com[model.body_rootid] - base
+    axes = jnp.broadcast_to(jnp.eye(3)[:2], (len(roots), 2, 3))
+    rocking = jnp.concatenate([axes, jnp.cross(axes, arm[roots, None])], axis=-1)  # [trees, 2, 6]
+    # forces on the bodies at no acceleration of joints and base: I a + v x I v, and what the base's velocity u adds
+    inertia, speed = data._impl.cinert[bodies], data.cvel[bodies]
+    below = moved(model)[bodies]
+    still = _times(inertia, below @ (data.cdof_dot * data.qvel[:, None])) + _across(speed, _times(inertia, speed))
+    sway = (rate @ rocking)[np.searchsorted(roots, model.body_rootid[bodies])]
+    extra = _times(inertia, _turned(sway, speed)) + _across(sway, _times(inertia, speed))
+    extra = extra + _across(speed + sway, _times(inertia, sway))
+    coupling = _moments(momentum, arm[model.dof_bodyid]).T
     disabled = int(model.opt.disableflags) & int(mujoco.mjtDisableBit.mjDSBL_GRAVITY)
     return _Robot(
         momentum=momentum,
         coupling=coupling,
-        inertia=inertia,
+        inertia=jnp.einsum("rai,rbi->ab", rocking, _times(data._impl.crb[roots, None], rocking)),
         shed=coupling @ step.inverse,
-        bias=jnp.sum(force[:, :3] + jnp.cross(away, force[:, 3:]), axis=0)[:2],
-        lever=jnp.sum(weighed, axis=0),
+        bias=jnp.sum(_moments(still + extra, arm[bodies]), axis=0),
+        coriolis=-jnp.sum(data.cdof * (below.T @ extra), axis=1),
+        lever=step.model.body_mass[bodies] @ (data.xipos[bodies] - base),
         gravity=jnp.zeros(3) if disabled else step.model.opt.gravity,
     )
 
 
-def _rocking(arm: jax.Array) -> jax.Array:
-    """Motions `[trees, 2, 6]` of points at `arm` `[trees, 3]` from the base that rocks about x and about y."""
-    axes = jnp.broadcast_to(jnp.eye(3)[:2], (len(arm), 2, 3))
-    return jnp.concatenate([axes, jnp.cross(axes, arm[:, None])], axis=-1)
+def _times(inertia: jax.Array, motion: jax.Array) -> jax.Array:
+    """Spatial inertia `[..., 10]` (matrix, mass times position, mass) times motion `[..., 6]` -> force."""
+    matrix, place, mass = inertia[..., np.array([[0, 3, 4], [3, 1, 5], [4, 5, 2]])], inertia[..., 6:9], inertia[..., 9:]
+    angular, linear = motion[..., :3], motion[..., 3:]
+    turning = jnp.sum(matrix * angular[..., None, :], axis=-1) + jnp.cross(place, linear)
+    return jnp.concatenate([turning, mass * linear - jnp.cross(place, angular)], axis=-1)
+
+
+def _across(motion: jax.Array, force: jax.Array) -> jax.Array:
+    """motion x force, `[n, 6]` each."""
+    (angular, linear), (turning, pushing) = jnp.split(motion, 2, axis=-1), jnp.split(force, 2, axis=-1)
+    moment = jnp.cross(angular, turning) + jnp.cross(linear, pushing)
+    return jnp.concatenate([moment, jnp.cross(angular, pushing)], axis=-1)
+
+
+def _turned(motion: jax.Array, other: jax.Array) -> jax.Array:
+    """motion x other motion, `[n, 6]` each."""
+    (angular, linear), (turning, moving) = jnp.split(motion, 2, axis=-1), jnp.split(other, 2, axis=-1)
+    return jnp.concatenate([jnp.cross(angular, turning), jnp.cross(angular, moving) + jnp.cross(linear, turning)], -1)
+
+
+def _moments(force: jax.Array, arm: jax.Array) -> jax.Array:
+    """Moments `[n, 2]` about x and y at the base of spatial forces `[n, 6]` that refer to `arm` `[n, 3]` from it."""
+    return (force[:, :3] + jnp.cross(arm, force[:, 3:]))[:, :2]
 
 
 def _settled(robot: _Robot, compliance: jax.Array) -> jax.Array:

@@ -104,7 +104,8 @@ class Payload(Effect):
                 continue
             arm = np.array([own["com_x"], own["com_y"], own["com_z"]])
             load = body.add_body(name=f"{body.name or f'body{i}'}.payload", pos=compiled.body_ipos[i] + arm)
-            load.mass, load.inertia, load.explicitinertial = own["mass"], np.full(3, 1e-12), True
+            load.mass, load.ipos, load.inertia = own["mass"], np.zeros(3), np.full(3, 1e-12)
+            load.explicitinertial = True
         return None
 
 
