@@ -155,7 +155,7 @@ class Velocity:
 
 
 def velocities(log: Log) -> list[Velocity]:
-    """One comparison per measured velocity whose joint moves well above the noise."""
+    """One comparison per measured velocity whose joint moves well above the noise, in logs long enough."""
     if not log.has_qvel:
         return []
     cutoff = bandwidth(log)
@@ -164,18 +164,24 @@ def velocities(log: Log) -> list[Velocity]:
     rates, spread = estimate_velocity(time, log.qpos[rows], log.channels, log.sigma_qpos)
     grid = np.linspace(time[0], time[-1], len(time))
     step = float(grid[1] - grid[0])
+    if grid[-1] - grid[0] < 2.0 / cutoff:
+        return []  # all of it is edge
     out = []
     for name, v, w, noise in zip(log.channels.qvel, log.qvel[rows].T, rates.T, spread, strict=True):
         even = [lowpass(np.interp(grid, time, x), step, cutoff) for x in (v, w)]
         if float(np.std(even[1])) > 2.0 * float(noise) and np.ptp(v) > 0:
-            out.append(_compare(name, grid, even[0], even[1]))
+            out.append(_compare(name, grid, even[0], even[1], 0.5 / cutoff))
     return out
 
 
-def _compare(name: str, grid: Array, v: Array, w: Array) -> Velocity:
+def _compare(name: str, grid: Array, v: Array, w: Array, edge: float) -> Velocity:
+    jerk = np.abs(np.gradient(w))
+    # samples on either side of an impact say nothing about the velocity between them
+    rows = (grid > grid[0] + edge) & (grid < grid[-1] - edge) & (jerk <= np.percentile(jerk, 90))
     # odd count: a lag of exactly 0 is among them
     lags = np.linspace(-0.1, 0.1, 201) if grid[-1] - grid[0] > 1.0 else np.zeros(1)
-    late = [np.interp(grid - lag, grid, w) for lag in lags]
+    late = [np.interp(grid - lag, grid, w)[rows] for lag in lags]
+    v = v[rows]
     errors = [float(np.sum((v - (v @ x) / (x @ x) * x) ** 2)) for x in late]
     best, now = int(np.argmin(errors)), len(lags) // 2
     if errors[best] > 0.5 * errors[now] or best in (0, len(lags) - 1):
