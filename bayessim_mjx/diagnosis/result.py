@@ -7,9 +7,14 @@ import json
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from bayessim_mjx.distributions import Distribution
+    from bayessim_mjx.parameters import ParameterSpace
+    from bayessim_mjx.physics import Physics
 
 SCHEMA = 1
 VERDICTS = ("no_gap", "parameters", "effects", "ambiguous", "unexplained", "insufficient_data")
@@ -88,7 +93,8 @@ class Diagnosis:
     Attributes:
         verdict: one of VERDICTS; sentences: the verdict in words, most important first.
         parameters: {name: {"mean", "sd", "nominal", "low", "high", "unit", "structural": sentence or ""}}.
-        candidates: ranked [{"effects": [label ...], "label", "score", "se", "gap_closed", "parameters": {..}, "absorbed"}].
+        candidates: ranked [{"effects": [label ...], "label", "score", "se", "gap_closed", "parameters": {..},
+            "absorbed"}].
         next_experiment: {"name", "why", "evidence", "file", "table": [...]} or {}.
         details: numbers for pictures (see `report`); not part of diagnosis.json but saved beside it.
     """
@@ -114,6 +120,18 @@ class Diagnosis:
             if f.name not in ("details", "schema")
         }
         return out
+
+    def apply(self, physics: Physics) -> Physics:
+        """The corrected simulator, see `apply.apply`."""
+        from bayessim_mjx.diagnosis import apply
+
+        return apply.apply(self, physics)
+
+    def prior(self, physics: Physics | ParameterSpace | None = None) -> Distribution:
+        """What is known of the corrected simulator's theta, for the loop; see `apply.prior`."""
+        from bayessim_mjx.diagnosis import apply
+
+        return apply.prior(self, physics)
 
     def save(self, folder: str | Path) -> Path:
         """Write diagnosis.json and details.json into `folder`; returns the former's path."""
