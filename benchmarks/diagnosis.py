@@ -47,15 +47,15 @@ def jobs(out: Path, seeds: range, kinds: Iterable[str], systems: Iterable[str], 
         scales = scales_of(plain, [run(plain, 0, 0, noise=False)])
         known, unknown = ([e for e in names if places(robot, e, scales)] for names in (KNOWN, UNKNOWN))
         shift = zlib.crc32(system.encode())
-        known = [known[i] for i in np.random.default_rng(shift).permutation(len(known))]
+        known, unknown = (list(np.random.default_rng(shift).permutation(names)) for names in (known, unknown))
         for seed in seeds:
             rng = np.random.default_rng((seed, shift))
             strength = str(rng.choice(strengths))
             drawn = {
-                "single": (known[seed % len(known)],),
+                "single": (str(known[seed % len(known)]),),
                 "double": tuple(str(e) for e in rng.choice(known, 2, replace=False)),
                 "null": (),
-                "unknown": (unknown[seed % len(unknown)],),
+                "unknown": (str(unknown[seed % len(unknown)]),),
             }
             found += [(k, system, drawn[k], strength, seed, out / f"{system}_{k}_s{seed}") for k in kinds]
     return found

@@ -127,7 +127,8 @@ Rate = tuple[str, list[bool], float]
 def rates(outcomes: Sequence[Outcome], left_out: Sequence[Outcome]) -> list[Rate]:
     """(what is asked, answers, goal)."""
     of: Callable[[str], list[Outcome]] = lambda kind: [o for o in outcomes if o.kind == kind and o.strong_enough]  # noqa: E731
-    single, double, null = of("single"), of("double"), of("null")
+    single, double = of("single"), of("double")
+    null = [o for o in of("null") if o.said]  # a failure is no alarm; the footer counts them
     unknown = of("unknown")
     return [
         ("single: effect and place named", [o.right(o.truth["effects"][0]) for o in single], 0.95),
