@@ -1,7 +1,7 @@
-"""The generalised force that is missing in each window: finite-difference columns and a smooth estimate with its spread.
+"""The generalised force that is missing in each window: finite-difference columns, a smooth estimate, its spread.
 
-Around a fit a window's residual is  r = D d + B x + A p + noise:  d the force at nodes in time, x the start state, p the
-parameters. The force has a Gaussian-process prior whose strength and smoothness are chosen by the marginal likelihood.
+Around a fit a window's residual is  r = D d + B x + A p + noise:  d the force at nodes in time, x the start state,
+p the parameters. The force has a Gaussian-process prior; the marginal likelihood chooses its strength and smoothness.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class Linear:
     """A fit's residuals as a linear function of a force over each window.
 
     Attributes:
-        D: `[W, n, nv m]`, minus the derivative of the whitened residual by the force of dof v at node k, column v m + k.
+        D: `[W, n, nv m]`, minus the derivative of the whitened residual; column v m + k: force of dof v, node k.
         basis: `[H, m]`, force in each control step from the forces at the nodes.
         scale: `[nv]`, size of the forces of this robot, N m or N.
         r: `[W, n]`, residuals extrapolated to no force, no parameter step and the fit's start states.
@@ -177,11 +177,11 @@ class _Posterior:
 
     def solved(self) -> _Posterior:
         """p by generalised least squares, then d given p; all windows at once."""
-        q, k, m = self.linear.quadratic, self.job.A.shape[2], self.linear.nodes
+        q, k = self.linear.quadratic, self.job.A.shape[2]
         inner = np.linalg.inv(self.correlation)
         P = np.kron(np.diag(1 / self.amplitude**2), inner)
         S = q.S / self.noise
-        cov = np.linalg.inv(S[:, k:, k:] + P)
+        cov = np.asarray(np.linalg.inv(S[:, k:, k:] + P), np.float64)
         gain = cov @ S[:, k:, :k]  # [W, nv m, k]
         precision, pull, low, high = self.job.prior()
         p = np.zeros(k)
@@ -270,7 +270,7 @@ def _finish(fitter: Fitter, job: Job, found: _Posterior) -> Disturbance:
         values=job.values + found.p,
         evidence=found.evidence,
         without=_refined_noise(nothing).evidence,
-        time=(np.arange(linear.nodes) + 0.5) * spacing,
+        time=np.asarray((np.arange(linear.nodes) + 0.5) * spacing, np.float64),
         linear=linear,
     )
 

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 from bayessim_mjx.diagnosis import motion_inputs
 from bayessim_mjx.diagnosis.disturbance import Disturbance, estimate
 from bayessim_mjx.diagnosis.fit import Fitter, Job
+from bayessim_mjx.diagnosis.models import clustered_t
 from bayessim_mjx.diagnosis.motion_inputs import QUANTITIES, WORDS, Inputs
-from bayessim_mjx.diagnosis.quadratic import Quadratic, solve
+from bayessim_mjx.diagnosis.quadratic import TRUST, Quadratic, solve
 
 Array = NDArray[np.float64]
 RIDGES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0)  # of the mean curvature of each joint's features
@@ -39,6 +40,8 @@ class Held:
         cost: `[W]`, of the median seed with the best ridge, unweighted; base: `[W]`, of the model without the force.
         totals: `[seeds, ridges]`; ridge, seed: the one in `cost`.
         gain, se: how much cheaper all windows together are, and its standard error over folds.
+        t: mean over standard error of the windows' log gain above the noise, clustered by fold; unlike the gain itself
+            it is not ruled by the conditions with the largest errors.
     """
 
     cost: Array
@@ -49,10 +52,11 @@ class Held:
     plain: float
     gain: float
     se: float
+    t: float
 
     @property
     def significant(self) -> bool:
-        return self.gain > 2 * self.se
+        return self.gain > 0 and self.t > 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +65,8 @@ class Flexible:
 
     Attributes:
         condition, interpolation: held out by operating condition, by blocks within conditions.
-        depends_on: [{"input": "elbow speed", "joint", "quantity", "importance": share of the gain lost when it is shuffled}].
+        depends_on: [{"input": "elbow speed", "joint", "quantity", "importance"}], largest first; importance: share of
+            the gain that is lost when it is shuffled.
         where: {joint: share of the gain lost without the force on it}.
         text: one sentence each.
         force: `[W, m, nv]`, of the median seed on all windows, N m or N.
@@ -185,9 +190,10 @@ class _Seeded:
         S[np.diag_indices(len(S))] += ridge * np.repeat(curvature, self.each) + 1e-9 * curvature.max() + 1e-300
         both = np.linalg.solve(S, np.concatenate([g[:, None], C.T], 1))
         gp, Spp = problem.q.subset(np.arange(k)).weighted(w)
-        step = solve(
-            Spp - C @ both[:, 1:] + np.diag(problem.precision), gp + problem.pull - C @ both[:, 0], problem.low, problem.high
-        ) if k else np.zeros(0)  # fmt: skip
+        step = np.zeros(0)
+        if k:
+            Spp = Spp - C @ both[:, 1:] + np.diag(problem.precision + TRUST * np.diag(Spp))
+            step = solve(Spp, gp + problem.pull - C @ both[:, 0], problem.low, problem.high)
         beta = both[:, 0] - both[:, 1:] @ step
         return step, beta * np.repeat(problem.scale, self.each)
 
@@ -261,9 +267,12 @@ def own_features(inputs: Inputs) -> Array:
     turn = np.where(inputs.hinge, 1.0, 0.0)
     recent = s * np.exp(-inputs.since_reversal / 0.1)
     columns = [
-        q, np.sin(q) * turn, np.cos(q) * turn, w, sign, fast, w * np.abs(w), s, recent, inputs.stop[..., 0], inputs.stop[..., 1],
+        q, np.sin(q) * turn, np.cos(q) * turn, w, sign, fast, w * np.abs(w),
+        s, recent, inputs.stop[..., 0], inputs.stop[..., 1],
         effort, np.abs(effort), effort * np.abs(effort), np.abs(effort) * sign, load, np.abs(load) * sign,
-        inputs.pull, inputs.past[..., 0], inputs.past[..., 1], inputs.time, inputs.time * sign, inputs.time * effort, q * sign, np.sin(q) * turn * sign, np.cos(q) * turn * sign,
+        inputs.pull, inputs.past[..., 0], inputs.past[..., 1],
+        inputs.time, inputs.time * sign, inputs.time * effort,
+        q * sign, np.sin(q) * turn * sign, np.cos(q) * turn * sign,
     ]  # fmt: skip
     return np.stack(columns, 3)
 
@@ -291,11 +300,13 @@ def _held(problem: _Problem, runs: dict[int, _Seeded], fold: NDArray[np.int64], 
     plain = float(ridges[_widest(median, base.sum())])
     by_fold = np.array([np.sum((base - cost)[fold == name]) for name in np.unique(fold)])
     se = float(np.sqrt(len(by_fold)) * np.std(by_fold, ddof=1)) if len(by_fold) > 1 else np.inf
-    return Held(cost, base, totals, float(ridges[at]), list(runs)[seed], plain, float(by_fold.sum()), se)
+    size = problem.fitter.size
+    t = clustered_t(np.log(np.maximum(base, 0) + size) - np.log(np.maximum(cost, 0) + size), fold)
+    return Held(cost, base, totals, float(ridges[at]), list(runs)[seed], plain, float(by_fold.sum()), se, t)
 
 
 def _widest(totals: Array, base: float) -> int:
-    """The largest ridge that loses at most a few per cent of the best one's gain: fewer features that cancel each other."""
+    """The largest ridge that loses little of the best one's gain: fewer features that cancel each other."""
     allowed = totals.min() + SLACK * max(base - totals.min(), 0.0)
     return int(np.flatnonzero(totals <= allowed).max())
 
@@ -303,7 +314,7 @@ def _widest(totals: Array, base: float) -> int:
 def _shuffled(inputs: Inputs, joint: int, quantity: str, order: NDArray[np.int64]) -> Inputs:
     values = np.array(inputs.of(quantity))
     values[:, :, joint] = values[order][:, :, joint]
-    return replace(inputs, **{quantity: values})
+    return replace(inputs, **{quantity: values})  # type: ignore[arg-type]
 
 
 def _importance(problem: _Problem, run: _Seeded, fold: NDArray[np.int64], fits: list, best: Held) -> list[dict]:

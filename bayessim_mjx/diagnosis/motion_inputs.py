@@ -16,11 +16,12 @@ from bayessim_mjx.logs.log import Log
 Array = NDArray[np.float64]
 _AXIAL = (int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE))
 MOVING = 0.03  # of the speed scale: below this a joint has no direction of its own
-# no measured acceleration: with effort and pose it *is* the residual of inverse dynamics, noise included, so that a force
-# that depends on it explains everything, held out or not
+# no measured acceleration: with effort and pose it *is* the residual of inverse dynamics, noise included, so that a
+# force that depends on it explains everything, held out or not
 QUANTITIES = ("position", "speed", "direction", "stop", "load", "effort", "past", "pull", "since_reversal", "time")
 WORDS = {
-    "position": "position", "speed": "speed", "direction": "direction of motion", "stop": "micro-motion after reversals",
+    "position": "position", "speed": "speed", "direction": "direction of motion",
+    "stop": "micro-motion after reversals",
     "load": "gravity load", "effort": "effort", "past": "past effort", "pull": "expected acceleration",
     "since_reversal": "time since reversal", "time": "time",
 }  # fmt: skip
