@@ -1,0 +1,290 @@
+"""What a robot may do (limits from model and logs) and a menu of motions inside these limits that excite one joint or all.
+
+Shapes are those of gap diagnosis practice: slow triangles for dry friction and play, staircases of speeds for what grows
+with speed, chirps and multisines for timing and inertia, steps for limits and deadbands, strokes for the speed-torque curve.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from bayessim_mjx.errors import UserError
+from bayessim_mjx.logs.log import Channels, Log
+from bayessim_mjx.parameters.attributes import suggest
+
+Array = NDArray[np.float64]
+BEYOND = 1.1  # of what the logs already did, where the model says nothing
+USED = 0.9  # of the allowed range, so that overshoot stays inside
+_AXIAL = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+_KEYS = {"joints": ("range", "speed"), "actuators": ("command", "effort")}
+
+
+@dataclass(frozen=True, eq=False)
+class Limits:
+    """What must not be left.
+
+    Attributes:
+        low, high, speed: `[nv]`, rad or m, and per s; infinite where nothing limits (joints that nothing drives, bases).
+        command_low, command_high: `[nu]`, units of ctrl; effort: `[nu]`, largest |force| of the actuator.
+        source: {joint or actuator: where the limits come from}.
+    """
+
+    low: Array
+    high: Array
+    speed: Array
+    command_low: Array
+    command_high: Array
+    effort: Array
+    source: dict[str, str]
+
+
+def limits_of(model: mujoco.MjModel, logs: Sequence[Log], given: Mapping[str, Any] | None = None) -> Limits:
+    """Ranges of the model where it has some, else 110 % of what the logs did; `given` has the last word.
+
+    Args:
+        given: {"joints": {name: {"range": [low, high], "speed": v}}, "actuators": {name: {"command": [low, high],
+            "effort": f}}}.
+
+    Raises:
+        UserError: unknown keys or names, a range upside down.
+    """
+    given = given or {}
+    channels = Channels.of(model)
+    _known(given, {"joints": channels.joints, "actuators": channels.actuators})
+    source: dict[str, str] = {}
+    low, high, speed = np.full(model.nv, -np.inf), np.full(model.nv, np.inf), np.full(model.nv, np.inf)
+    for j, name in enumerate(channels.joints):
+        if int(model.jnt_type[j]) in _AXIAL:
+            v = int(model.jnt_dofadr[j])
+            own = given.get("joints", {}).get(name, {})
+            low[v], high[v], speed[v], source[name] = _of_joint(model, j, logs, own)
+    rows = [_of_actuator(model, i, n, logs, given.get("actuators", {}).get(n, {})) for i, n in enumerate(channels.actuators)]  # fmt: skip
+    source |= {n: row[3] for n, row in zip(channels.actuators, rows, strict=True)}
+    commands = np.array([row[:3] for row in rows], float).reshape(-1, 3)
+    return Limits(low, high, speed, commands[:, 0], commands[:, 1], commands[:, 2], source)
+
+
+def _known(given: Mapping[str, Any], names: Mapping[str, Sequence[str]]) -> None:
+    for section, entries in given.items():
+        if section not in _KEYS:
+            raise UserError(f"limits.{section}: {suggest(section, list(_KEYS))}")
+        for name, own in entries.items():
+            if name not in names[section]:
+                raise UserError(f"limits.{section}.{name}: not in the model; {suggest(name, names[section])}")
+            for key, value in own.items():
+                if key not in _KEYS[section]:
+                    raise UserError(f"limits.{section}.{name}.{key}: allowed: {', '.join(_KEYS[section])}")
+                if np.ndim(value) and not value[0] < value[1]:
+                    raise UserError(f"limits.{section}.{name}.{key} = {list(value)}: allowed: low < high")
+
+
+def _of_joint(model: mujoco.MjModel, j: int, logs: Sequence[Log], own: Mapping[str, Any]) -> tuple:
+    q, v = int(model.jnt_qposadr[j]), int(model.jnt_dofadr[j])
+    moved = np.concatenate([log.qpos[:, q] for log in logs])
+    fast = np.percentile(np.abs(np.concatenate([log.qvel[:, v] for log in logs])), 99.5)
+    driven = bool(np.any((model.actuator_trnid[:, 0] == j) & (model.actuator_trntype <= 1)))
+    speed = float(own.get("speed", BEYOND * fast if driven else np.inf))
+    if "range" in own:
+        return float(own["range"][0]), float(own["range"][1]), speed, "given"
+    if model.jnt_limited[j]:
+        return (
+            float(model.jnt_range[j, 0]),
+            float(model.jnt_range[j, 1]),
+            speed,
+            "range of the model, speed of the logs",
+        )
+    if not driven:
+        return -np.inf, np.inf, speed, "not driven: free"
+    middle, half = (moved.max() + moved.min()) / 2, BEYOND * np.ptp(moved) / 2
+    return middle - half, middle + half, speed, "110 % of the logs"
+
+
+def _of_actuator(model: mujoco.MjModel, i: int, name: str, logs: Sequence[Log], own: Mapping[str, Any]) -> tuple:
+    sent = np.concatenate([log.ctrl[:, i] for log in logs])
+    middle, half = (sent.max() + sent.min()) / 2, BEYOND * np.ptp(sent) / 2
+    low, high, source = middle - half, middle + half, "110 % of the logs"
+    if "command" in own:
+        (low, high), source = own["command"], "given"
+    elif model.actuator_ctrllimited[i]:
+        (low, high), source = model.actuator_ctrlrange[i], "range of the model"
+    if "effort" in own:
+        return low, high, float(own["effort"]), source
+    if model.actuator_forcelimited[i]:
+        return low, high, float(np.abs(model.actuator_forcerange[i]).max()), source
+    if model.actuator_biasprm[i, 1] == 0 and model.actuator_biasprm[i, 2] == 0:  # force proportional to the command
+        return low, high, float(max(abs(low), abs(high)) * abs(model.actuator_gainprm[i, 0])), source
+    return low, high, BEYOND * _pull(model, i, logs), source
+
+
+def _pull(model: mujoco.MjModel, i: int, logs: Sequence[Log]) -> float:
+    """Largest force of a servo on the logs: gain * command + bias of position and speed."""
+    j, gear = int(model.actuator_trnid[i, 0]), float(model.actuator_gear[i, 0])
+    q, v = int(model.jnt_qposadr[j]), int(model.jnt_dofadr[j])
+    b = model.actuator_biasprm[i]
+    forces = [
+        model.actuator_gainprm[i, 0] * x.ctrl[:, i] + b[0] + gear * (b[1] * x.qpos[:, q] + b[2] * x.qvel[:, v])
+        for x in logs
+    ]
+    return float(np.abs(np.concatenate(forces)).max())
+
+
+@dataclass(frozen=True, eq=False)
+class Excitation:
+    """One motion of the menu.
+
+    Attributes:
+        kind: its name in the menu; where: joint, or "all".
+        offset: `[T, nv]`, reference motion relative to the middle position, at full amplitude.
+        live: `[T, nv]`, 0 while the joint's drive is to be off.
+        sharp: jumps are meant, and not smoothed away.
+    """
+
+    kind: str
+    where: str
+    offset: Array
+    live: Array
+    sharp: bool = False
+
+    @property
+    def name(self) -> str:
+        return f"{self.kind} on {'all joints together' if self.where == 'all' else self.where}"
+
+
+def middle(limits: Limits, logs: Sequence[Log], model: mujoco.MjModel) -> tuple[Array, Array]:
+    """(qpos to start from `[nq]`, usable half range `[nv]`): the logs' middle, moved away from the ends."""
+    start = np.array(logs[0].qpos[0])
+    half = np.full(model.nv, np.inf)
+    for j in range(model.njnt):
+        if int(model.jnt_type[j]) not in _AXIAL:
+            continue
+        q, v = int(model.jnt_qposadr[j]), int(model.jnt_dofadr[j])
+        seen = float(np.median(np.concatenate([log.qpos[:, q] for log in logs])))
+        width = limits.high[v] - limits.low[v]
+        if np.isfinite(width):
+            start[q] = np.clip(seen, limits.low[v] + 0.3 * width, limits.high[v] - 0.3 * width)
+            half[v] = USED * min(limits.high[v] - start[q], start[q] - limits.low[v])
+    return start, half
+
+
+def menu(time: Array, joints: Mapping[str, int], half: Array, speed: Array, release: Sequence[str], seed: int) -> list[Excitation]:  # fmt: skip
+    """Every kind of motion on every joint, and on all together.
+
+    Args:
+        time: `[T]`, s; joints: {name: dof} that are driven; half, speed: `[nv]`, usable half range and largest speed.
+        release: names of the joints whose drive can be switched off.
+    """
+    places = [*joints, *(["all"] if len(joints) > 1 else [])]
+    out = []
+    for kind, shape in SHAPES.items():
+        for place in places:
+            if kind == RELEASE and place not in release:
+                continue
+            out.append(_of(kind, shape, place, time, joints, half, speed, seed))
+    return out
+
+
+def _of(
+    kind: str, shape: Any, place: str, time: Array, joints: Mapping[str, int], half: Array, speed: Array, seed: int
+) -> Excitation:
+    rng = np.random.default_rng(seed)
+    offset, live = np.zeros((len(time), len(half))), np.ones((len(time), len(half)))
+    own = joints if place == "all" else {place: joints[place]}
+    for k, v in enumerate(own.values()):
+        # together, each joint at a pace of its own, so that their motions are not alike
+        pace = 1.0 if len(own) == 1 else 0.55 + 0.45 * ((k * 0.618) % 1.0)
+        reach = half[v] if len(own) == 1 else 0.7 * half[v]
+        offset[:, v] = shape(time, reach, pace * speed[v], rng)
+        if kind == RELEASE:
+            live[:, v] = _held(time)
+    return Excitation(kind, place, offset, live, kind == "steps of three sizes")
+
+
+def _triangle(way: Array, a: float) -> Array:
+    """Position `a`-bounded after a way travelled back and forth, starting in the middle."""
+    return 2 * a / np.pi * np.arcsin(np.sin(np.pi / 2 * way / a))
+
+
+def _slow(t: Array, a: float, v: float, rng: Any) -> Array:
+    return _triangle(max(0.06 * v, 1.5 * a / t[-1]) * t, a)
+
+
+def _staircase(t: Array, a: float, v: float, rng: Any) -> Array:
+    level = np.array([0.06, 0.12, 0.25, 0.5, 0.85])[np.minimum((5 * t / t[-1]).astype(int), 4)]
+    return _triangle(np.cumsum(level * v) * (t[1] - t[0]), a)
+
+
+def _strokes(t: Array, a: float, v: float, rng: Any) -> Array:
+    """At top speed from end to end with a rest of 0.2 s at every turn."""
+    stroke, dt = 2 * a / (0.9 * v), t[1] - t[0]
+    moving = np.mod(t + stroke / 2, stroke + 0.2) < stroke
+    return _triangle(np.cumsum(0.9 * v * moving) * dt, a)
+
+
+def _fastest(t: Array) -> float:
+    """Hz, the highest frequency worth sending."""
+    return float(min(8.0, 0.1 / (t[1] - t[0])))
+
+
+def _chirp(t: Array, a: float, v: float, rng: Any) -> Array:
+    low, high = 0.15, _fastest(t)
+    f = low * (high / low) ** (t / t[-1])
+    phase = 2 * np.pi * np.concatenate([[0.0], np.cumsum((f[1:] + f[:-1]) / 2 * np.diff(t))])
+    return np.minimum(0.8 * a, 0.7 * v / (2 * np.pi * f)) * np.sin(phase)
+
+
+def _multisine(t: Array, a: float, v: float, rng: Any) -> Array:
+    f = np.round(np.geomspace(0.2, _fastest(t), 10) * t[-1]) / t[-1]
+    lines = np.sin(2 * np.pi * np.outer(t, f) + rng.uniform(0, 2 * np.pi, len(f))) / f**0.8
+    x = lines.sum(1) - lines[0].sum()
+    return x * min(0.8 * a / np.abs(x).max(), 0.8 * v / np.abs(np.gradient(x, t)).max())
+
+
+def _steps(t: Array, a: float, v: float, rng: Any) -> Array:
+    levels = a * np.array([0.0, 0.15, -0.15, 0.4, -0.4, 0.8, -0.8, 0.0])
+    wanted, out = levels[np.minimum((8 * t / t[-1]).astype(int), 7)], np.zeros(len(t))
+    reach = 0.9 * v * (t[1] - t[0])
+    for k in range(1, len(t)):
+        out[k] = out[k - 1] + np.clip(wanted[k] - out[k - 1], -reach, reach)
+    return out
+
+
+def _holds(t: Array, a: float, v: float, rng: Any) -> Array:
+    levels = a * np.array([0.0, 0.45, 0.9, 0.45, 0.0, -0.45, -0.9, -0.45])
+    knots = np.linspace(0, t[-1], 2 * len(levels))
+    return np.interp(t, knots, np.repeat(levels, 2))
+
+
+def _reversals(t: Array, a: float, v: float, rng: Any) -> Array:
+    """Small slow strokes that grow from 1 % to 12 % of the range: presliding, play and deadband."""
+    size = a * 0.01 * 12 ** (t / t[-1])
+    return size * _triangle(4 * t, 1.0)
+
+
+RELEASE = "hold and release"
+
+
+def _held(t: Array) -> Array:
+    return (np.mod(t, t[-1] / 3) < 0.6 * t[-1] / 3).astype(float)
+
+
+def _hold(t: Array, a: float, v: float, rng: Any) -> Array:
+    return np.interp(t, np.linspace(0, t[-1], 7), a * np.array([0.0, 0.35, 0.35, -0.6, -0.6, 0.85, 0.85]))
+
+
+SHAPES = {
+    "slow triangle": _slow,
+    "staircase of speeds": _staircase,
+    "chirp": _chirp,
+    "multisine": _multisine,
+    "steps of three sizes": _steps,
+    "ramps and holds": _holds,
+    "small reversals": _reversals,
+    RELEASE: _hold,
+    "fast driving and braking": _strokes,
+}
