@@ -145,9 +145,10 @@ def _diagnose(argv: Sequence[str] | None) -> int:
 
 def _write(result: "Diagnosis", robot: "Robot", folder: Path, report: Any) -> "Diagnosis":
     from bayessim_mjx.diagnosis import apply
+    from bayessim_mjx.diagnosis.result import load
 
-    folder.mkdir(parents=True, exist_ok=True)
     result.save(folder)  # before anything that could fail: nothing computed is lost
+    result = load(folder)
     if result.verdict != "insufficient_data":
         apply.write_outputs(result, robot, folder)
     report.write(result, folder)

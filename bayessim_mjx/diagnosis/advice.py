@@ -1,4 +1,4 @@
-"""Words about experiments: what separates an effect from its look-alikes, what to record besides, and why one is proposed."""
+"""Words about experiments: what separates an effect from its look-alikes, what else to record, why one is proposed."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ STANDING = (("turned on its side (90 degrees about the world's x axis)", (math.p
 
 @dataclass(frozen=True, eq=False)
 class Help:
-    """A change of the rig that a person makes: name, instruction, what it adds to theta `[P]`, and the mount's (roll, pitch)."""
+    """What a person changes: name, instruction, what it adds to theta `[P]`, and the mount's (roll, pitch)."""
 
     name: str
     needs: str
@@ -117,7 +117,8 @@ def title(model: Model) -> str:
     """'load friction at elbow and actuator delay at elbow_motor'."""
     if not model.effects:
         return "the known parameters alone"
-    return " and ".join(f"{c.effect.replace('_', ' ')} {'everywhere' if c.where == 'all' else 'at ' + c.where}" for c in model.effects)  # fmt: skip
+    places = ["everywhere" if c.where == "all" else f"at {c.where}" for c in model.effects]
+    return " and ".join(f"{c.effect.replace('_', ' ')} {p}" for c, p in zip(model.effects, places, strict=True))
 
 
 def witnesses(models: Sequence[Model], logs: Sequence[Log]) -> list[str]:
@@ -145,9 +146,10 @@ def reason(scorer: Any, chosen: Any, labels: Sequence[str], contested: bool, use
     if not useful:
         most = f"the best, {chosen.name}, is expected to give {chosen.evidence:.1g} nats"
         return f"no safe excitation separates {rivals} ({most}); what would: {instead(scorer.models)}"
-    verb = "separates" if contested else "confirms"
+    verb = "separates" if contested else "makes sure of"
     weak = 10.0 / max(chosen.evidence, 1e-9)
     again = f"; repeat it {math.ceil(weak)} times for a decision" if 1.3 < weak <= 10 else ""
+    rivals = rivals if contested else rivals.replace(" from ", " against ", 1)
     return f"{action}: {verb} {rivals}, expected evidence {chosen.evidence:.3g} nats{again}"
 
 

@@ -143,6 +143,12 @@ def _recorded(name: str, row: dict) -> Parameter:
     return Parameter(name, row["nominal"], row["low"], row["high"], unit=row.get("unit") or "")
 
 
+def correction(diagnosis: Diagnosis, space: ParameterSpace) -> storage.Correction:
+    """The effects found, and those parameters of `space` that were calibrated: the contents of effects.yaml."""
+    known = calibrated_of(diagnosis, space).parameters
+    return storage.Correction(effects_of(diagnosis), tuple(p for p in known if p not in space.parameters))
+
+
 def write_outputs(diagnosis: Diagnosis, robot: Robot, folder: str | Path) -> list[str]:
     """Write effects.yaml and model_with_effects.xml.
 
@@ -150,10 +156,10 @@ def write_outputs(diagnosis: Diagnosis, robot: Robot, folder: str | Path) -> lis
         One sentence for each thing that the XML leaves out because MuJoCo has no element for it.
     """
     folder = Path(folder)
-    effects, known = effects_of(diagnosis), calibrated_of(diagnosis, robot.space)
-    calibrated = ParameterSpace(p for p in known.parameters if p not in robot.space.parameters)
-    found = [*calibrated.parameters, *(p for e in effects for p in e.space().parameters)]
-    identified = {p.name: (p.mean, p.sd) for p in found if p.mean is not None and p.sd is not None}
+    found = correction(diagnosis, robot.space)
+    effects, calibrated = found.effects, ParameterSpace(found.calibrated)
+    every = [*calibrated.parameters, *(p for e in effects for p in e.space().parameters)]
+    identified = {p.name: (p.mean, p.sd) for p in every if p.mean is not None and p.sd is not None}
     storage.write(folder / "effects.yaml", effects, identified, calibrated)
     source = robot.spec()
     spec, missing = native.write_model(source, calibrated, calibrated.nominal, effects)

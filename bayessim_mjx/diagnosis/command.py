@@ -108,7 +108,8 @@ def _limits(e: Experiment) -> dict[str, Any]:
             joints[name] = {"range": _short(limits.low[v], limits.high[v]), "speed": _short(limits.speed[v])[0]}
     rows = zip(log.actuators, limits.command_low, limits.command_high, limits.effort, strict=True)
     actuators = {n: {"command": _short(low, high), "effort": _short(effort)[0]} for n, low, high, effort in rows}
-    return {"joints": joints, "actuators": actuators, "largest_share_used": round(e.chosen.played.worst, 3), "from": limits.source}  # fmt: skip
+    used = round(e.chosen.played.worst, 3)
+    return {"joints": joints, "actuators": actuators, "largest_share_used": used, "from": limits.source}
 
 
 def _short(*values: float) -> list[float]:

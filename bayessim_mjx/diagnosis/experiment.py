@@ -1,25 +1,19 @@
-"""The next experiment: which safe motion separates the models that survived, or sharpens the one that is left.
-
-T-optimality with refit (Atkinson and Fedorov, 1975): an experiment is worth what is left of the difference between two
-rivals' predictions after the losing one has adapted all it can, against what the logs have already taught it.
-"""
+"""The next experiment: which safe motion separates the models that survived, or sharpens the one that is left."""
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-import jax
 import numpy as np
 from numpy.typing import NDArray
 
-from bayessim_mjx.diagnosis import advice, windows
-from bayessim_mjx.diagnosis.excitation import Excitation, Limits, limits_of, menu
-from bayessim_mjx.diagnosis.fit import Fitter, Job
+from bayessim_mjx.diagnosis import advice
+from bayessim_mjx.diagnosis.design import Scored, Scorer
+from bayessim_mjx.diagnosis.excitation import Excitation, menu
+from bayessim_mjx.diagnosis.limits import Limits, limits_of
 from bayessim_mjx.diagnosis.models import Model
-from bayessim_mjx.diagnosis.quadratic import eliminate, solve
 from bayessim_mjx.diagnosis.rehearsal import Drives, Played, Rehearsal
 from bayessim_mjx.diagnosis.search import Race, ranked
 from bayessim_mjx.diagnosis.uncertainty import win_share
@@ -36,18 +30,6 @@ NOTHING = 1.0  # nats: less separates nobody
 BUDGET = 24_000  # windows simulated for a first look at the whole menu
 FINAL = 5  # experiments looked at in full
 WEIGHT = 0.1  # least share of a surviving model
-
-
-@dataclass(frozen=True, eq=False)
-class Scored:
-    """One experiment of the menu: mean evidence in nats, that of each pair `[M, M]` (truth, rival), and what it needs."""
-
-    name: str
-    played: Played
-    evidence: float
-    pairs: Array
-    needs: str = ""
-    sharpened: tuple[float, float] = (0.0, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,139 +62,14 @@ class Experiment:
         return own | {"file": file if self.chosen is not None else ""}
 
     def details(self) -> list[dict[str, Any]]:
-        """For the report's pictures: [{"name", "evidence", "pairs", "command": {"time", "ctrl": {actuator: values}}}]."""
+        """For the report: [{"name", "evidence", "pairs", "command": {"time", "ctrl": {actuator: values}}}]."""
         out = []
         for s in self.menu:
-            log = s.played.log
-            command = {"time": log.time.tolist(), "ctrl": {n: c.tolist() for n, c in zip(log.actuators, log.ctrl.T, strict=True)}}  # fmt: skip
-            out.append(
-                {"name": s.name, "evidence": s.evidence, "pairs": _named(s.pairs, self.labels), "command": command}
-            )
+            log, pairs = s.played.log, _named(s.pairs, self.labels)
+            ctrl = {n: c.tolist() for n, c in zip(log.actuators, log.ctrl.T, strict=True)}
+            command = {"time": log.time.tolist(), "ctrl": ctrl}
+            out.append({"name": s.name, "evidence": s.evidence, "pairs": pairs, "command": command})
         return out
-
-
-class Scorer:
-    """Evidence of experiments, simulated by the diagnosis' own compiled program.
-
-    Attributes:
-        models: rivals; posterior: `[M]` precisions `[k, k]` from the logs; ratio: effective share of samples; misfit: of
-            each model in noise variances.
-    """
-
-    def __init__(self, setup: Setup, models: Sequence[Model], weights: Array) -> None:
-        self.setup, self.fitter, self.models, self.weights = setup, setup.fitter, list(models), weights
-        count = models[0].job.r.size
-        self.ratio = np.array([min(m.samples / count, 1.0) for m in models])
-        self.misfit = np.array([max(m.total / count, 0.5) for m in models])
-        self.posterior = [self._posterior(m, k) for m, k in zip(models, self.ratio / self.misfit, strict=True)]
-
-    def _posterior(self, model: Model, discount: float) -> Array:
-        q, _ = model.job.quadratic(self.fitter.spread)
-        _, S = q.weighted(model.job.weight)
-        return discount * S + np.diag(model.job.prior()[0])
-
-    def score(self, played: Sequence[Played], shift: Array, each: int) -> list[Array]:
-        """Evidence `[M, M]` in nats of every experiment: row the truth, column the rival that adapts.
-
-        Args:
-            shift: `[P]`, added to every theta (a known payload, another mount); each: windows looked at per experiment.
-
-        The diagonal holds, for the truth itself, log(sd before / sd after) of its least certain parameter.
-        """
-        logs = [p.log for p in played]
-        original = self.fitter.simulator.windows
-        cut = windows.cut(
-            logs, self.setup.physics.mj_model, original.dt, self.setup.physics.substeps, original.steps, limit=each * len(logs)
-        )  # fmt: skip
-        found = [self._jobs(chunk, shift) for chunk in _chunks(cut, original)]
-        full = (len(logs[0]) - 1) // original.steps
-        out = []
-        for k in range(len(logs)):
-            own = np.flatnonzero(cut.log == k)
-            where = [(jobs, own[(own >= a) & (own < a + len(original))] - a) for a, jobs in zip(range(0, len(cut), len(original)), found, strict=True)]  # fmt: skip
-            out.append(self._evidence([w for w in where if len(w[1])], full / max(len(own), 1), full))
-        return out
-
-    def _jobs(self, chunk: windows.Windows, shift: Array) -> list[Job]:
-        simulator = copy.copy(self.fitter.simulator)  # shares the compiled program
-        simulator.windows = chunk
-        fitter = _Shifted(self.fitter, simulator, shift)
-        jobs = [fitter.begin(m.job.coordinates, m.job.values) for m in self.models]
-        self.fitter.simulator.rollouts = simulator.rollouts
-        return jobs
-
-    def _evidence(self, where: list[tuple[list[Job], NDArray[np.int64]]], scale: float, full: int) -> Array:
-        m = len(self.models)
-        out = np.zeros((m, m))
-        for i in range(m):
-            for j in range(m):
-                out[i, j] = self._adapted(where, i, j, scale, full) if i != j else self._sharper(where, i, scale)
-        return out
-
-    def _quadratic(self, where: list, i: int, j: int) -> tuple[float, Array, Array]:
-        """Sums over the windows of the squared difference between truth i and rival j, as a quadratic in j's parameters."""
-        c, g, S = 0.0, np.zeros(self.models[j].size), np.zeros((self.models[j].size,) * 2)
-        for jobs, some in where:
-            r = (jobs[j].r - jobs[i].r)[some]
-            q, _ = eliminate(
-                r, jobs[j].A[some], jobs[j].B[some], np.zeros_like(jobs[j].offsets[some]), self.fitter.spread
-            )
-            c, g, S = c + q.c.sum(), g + q.g.sum(0), S + q.S.sum(0)
-        return float(c), g, S
-
-    def _adapted(self, where: list, i: int, j: int, scale: float, full: int) -> float:
-        """min over dp of discount |y_i - y_j(p_j + dp)|^2 + dp' (posterior) dp; evidence N/2 log(1 + D/N), for small D D/2."""
-        c, g, S = self._quadratic(where, i, j)
-        discount = scale * self.ratio[i] / self.misfit[i]
-        _, _, low, high = self.models[j].job.prior()
-        H = discount * S + self.posterior[j]
-        p = solve(H, discount * g, low, high)
-        D = max(discount * c - 2 * discount * float(g @ p) + float(p @ H @ p), 0.0)
-        samples = full * self.fitter.size * self.ratio[i]
-        return float(0.5 * samples * np.log1p(D / samples))
-
-    def _sharper(self, where: list, i: int, scale: float) -> float:
-        _, _, S = self._quadratic(where, i, i)
-        worst, before = self.loosest(i)
-        after = np.linalg.pinv(self.posterior[i] + scale * self.ratio[i] / self.misfit[i] * S)[worst, worst]
-        return float(0.5 * np.log(before / max(after, 1e-300)))
-
-    def loosest(self, i: int) -> tuple[int, float]:
-        """(index, variance) of model i's least certain parameter, relative to its range; effects' before known ones."""
-        variance = np.diag(np.linalg.pinv(self.posterior[i]))
-        coordinates, base = self.models[i].job.coordinates, len(self.fitter.base)
-        relative = np.sqrt(variance) / np.array([c.high - c.low for c in coordinates])
-        first = base if len(coordinates) > base else 0
-        worst = first + int(np.argmax(relative[first:]))
-        return worst, float(variance[worst])
-
-    def mean(self, pairs: Array) -> float:
-        """Evidence over all pairs, weighted by how probable the two are."""
-        w = np.outer(self.weights, self.weights) * (1 - np.eye(len(self.weights)))
-        return float((w * pairs).sum() / w.sum()) if w.sum() else float(pairs[0, 0])
-
-
-class _Shifted(Fitter):
-    """The same fitter on other windows, with something known added to every theta."""
-
-    def __init__(self, fitter: Fitter, simulator: Any, shift: Array) -> None:
-        self.__dict__.update(fitter.__dict__)
-        self.simulator, self.shift = simulator, shift
-
-    def vector(self, coordinates: Any, values: Array) -> Array:
-        return super().vector(coordinates, values) + self.shift
-
-
-def _chunks(cut: windows.Windows, like: windows.Windows) -> list[windows.Windows]:
-    """Windows in pieces of the size that the program was compiled for, the last one filled up."""
-    batch, size, out = cut.batch, len(like), []
-    if like.batch.enabled is not None and batch.enabled is None:
-        batch = batch.replace(enabled=np.ones((len(cut), cut.steps, batch.command.shape[-1]), np.float32))
-    for a in range(0, len(cut), size):
-        index = np.minimum(np.arange(a, a + size), len(cut) - 1)
-        own = jax.tree.map(lambda x: jax.numpy.asarray(x)[index], batch)  # noqa: B023  # used at once
-        out.append(replace(cut, batch=own, log=cut.log[index], start=cut.start[index], group=cut.group[index]))
-    return out
 
 
 def propose(
@@ -261,7 +118,7 @@ def _contenders(race: Race, ruling: Ruling, given: Sequence[Model] | None) -> tu
 
 
 def _touched(joints: dict[str, int], models: Sequence[Model], model: Any) -> dict[str, int]:
-    """Driven joints that the models disagree about: named by an effect, at or above its body; all where it is the world."""
+    """Driven joints that the models disagree about: named by an effect, at or above its body; for the world all."""
     places = {(c.kind, c.where) for m in models for c in m.effects}
     names: set[str] = set()
     for kind, where in places:
@@ -341,12 +198,13 @@ def _decide(
     witnesses = advice.witnesses(scorer.models, scorer.fitter.simulator.windows.logs)
     kept = {s.name for s in final}
     table = [*final, *(s for s in [*scored, *attended] if s.name not in kept)]
+    everything = sorted(table, key=lambda s: -s.evidence)
     return Experiment(
         name=chosen.name if chosen is not None and useful else "none",
         why=why,
         evidence=chosen.evidence if chosen is not None else 0.0,
         pairs=_named(chosen.pairs, labels) if chosen is not None else [],
-        table=[{"experiment": s.name, "evidence": round(s.evidence, 2), "needs": s.needs} for s in sorted(table, key=lambda s: -s.evidence)],
+        table=[{"experiment": s.name, "evidence": round(s.evidence, 2), "needs": s.needs} for s in everything],
         needs=chosen.needs if chosen is not None and useful else advice.instead(scorer.models),
         witnesses=witnesses,
         chosen=chosen if useful else None,
@@ -354,7 +212,7 @@ def _decide(
         drives=stage.drives,
         limits=stage.limits,
         labels=labels,
-    )  # fmt: skip
+    )
 
 
 def _named(pairs: Array, labels: Sequence[str]) -> list[dict[str, Any]]:

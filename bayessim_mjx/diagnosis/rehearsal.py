@@ -1,9 +1,9 @@
-"""Experiments rehearsed in the simulators of all rivals, the loop closed around the reference, until all stay inside the limits."""
+"""Experiments rehearsed under all rivals, the loop closed around the reference, until all stay inside the limits."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -14,89 +14,24 @@ from flax import struct
 from numpy.typing import NDArray
 
 from bayessim_mjx.device import compiler_options
-from bayessim_mjx.diagnosis.excitation import Excitation, Limits, middle
-from bayessim_mjx.logs.log import Channels, Log
+from bayessim_mjx.diagnosis.drives import Drives, drives_of
+from bayessim_mjx.diagnosis.excitation import Excitation, middle
+from bayessim_mjx.diagnosis.limits import Limits
+from bayessim_mjx.logs.log import Log
 from bayessim_mjx.physics import Drive, Physics, control_step
 
 if TYPE_CHECKING:
     from bayessim_mjx.diagnosis.run import Setup
 
 Array = NDArray[np.float64]
-BANDWIDTH = 12.0  # rad/s, of the loop around a torque-driven joint
 LANES = 32  # worlds in one call
 ROUNDS = 5  # of making an experiment smaller until it is safe
 SHRINK = 0.7
 SLACK = 1.02  # of a limit: rounding and noise in what the logs did
-KINDS = ("torque", "position", "velocity", "none")
-
-
-@dataclass(frozen=True, eq=False)
-class Drives:
-    """How each actuator is commanded: u = unit * target, or for torque unit * (feed-forward + kp e + kd de/dt).
-
-    Attributes:
-        kind: `[nu]`, one of KINDS; joint: `[nu]` names ("" where it drives no hinge or slide).
-        q, v: `[nu]`, columns in qpos and qvel; unit: `[nu]`, ctrl per joint unit; kp, kd: `[nu]`, in ctrl units.
-    """
-
-    kind: tuple[str, ...]
-    joint: tuple[str, ...]
-    q: NDArray[np.int64]
-    v: NDArray[np.int64]
-    unit: Array
-    kp: Array
-    kd: Array
-
-    def joints(self) -> dict[str, int]:
-        """{joint: dof} that can be moved."""
-        return {n: int(v) for n, v, kind in zip(self.joint, self.v, self.kind, strict=True) if n and kind != "none"}
-
-
-def drives_of(model: mujoco.MjModel, law: Any, inertia: Array, dt: float) -> Drives:
-    """law: of the logs, leading axis windows, or None; inertia: `[nv]`; dt: s, control period."""
-    names = Channels.of(model).joints
-    rows = [_drive(model, i, None if law is None else jax.tree.map(lambda x: np.asarray(x[0]), law)) for i in range(model.nu)]  # fmt: skip
-    joints = [j for _, j, _ in rows]
-    v = np.array([model.jnt_dofadr[max(j, 0)] for j in joints], np.int64)
-    sharing = np.array([sum(j == other for other in joints) for j in joints], float)
-    unit = np.array([u for _, _, u in rows]) / np.where([k == "torque" for k, _, _ in rows], sharing, 1.0)
-    omega = min(BANDWIDTH, 0.25 / dt)
-    torque = np.array([k == "torque" for k, _, _ in rows])
-    speed = np.array([k == "velocity" for k, _, _ in rows])
-    return Drives(
-        kind=tuple(k for k, _, _ in rows),
-        joint=tuple(names[j] if j >= 0 else "" for j in joints),
-        q=np.array([model.jnt_qposadr[max(j, 0)] for j in joints], np.int64),
-        v=v,
-        unit=unit,
-        kp=unit * np.where(torque, inertia[v] * omega**2, np.where(speed, 2.0, 0.0)),
-        kd=unit * np.where(torque, 1.6 * omega * inertia[v], 0.0),
-    )
-
-
-def _drive(model: mujoco.MjModel, i: int, law: Any) -> tuple[str, int, float]:
-    """(kind, joint, ctrl per joint unit) of one actuator."""
-    j, gear, gain = int(model.actuator_trnid[i, 0]), float(model.actuator_gear[i, 0]), float(model.actuator_gainprm[i, 0])  # fmt: skip
-    axial = int(model.actuator_trntype[i]) <= 1 and int(model.jnt_type[j]) >= int(mujoco.mjtJoint.mjJNT_SLIDE)
-    if not axial:
-        return "none", -1, 0.0
-    if law is not None and law.on_position[i] > 0:
-        return "position", j, 1.0
-    if law is not None and law.on_velocity[i] > 0:
-        return "velocity", j, 1.0
-    scale = 1.0 if law is None else float(law.scale[i])
-    if int(model.actuator_gaintype[i]) != int(mujoco.mjtGain.mjGAIN_FIXED) or gain * gear * scale == 0:
-        return "none", j, 0.0
-    b = model.actuator_biasprm[i]
-    if b[1]:
-        return "position", j, float(-b[1] * gear / gain / scale)
-    if b[2]:
-        return "velocity", j, float(-b[2] * gear / gain / scale)
-    return "torque", j, 1.0 / (gain * gear * scale)
 
 
 class Plan(struct.PyTreeNode):
-    """What the loop is to follow: ref, speed, feed `[T, nu]` (feed-forward in ctrl units); live `[T, nu]`; start `[nq]`."""
+    """What the loop follows: ref, speed, feed `[T, nu]` (feed-forward, in ctrl units); live `[T, nu]`; start `[nq]`."""
 
     ref: jax.Array
     speed: jax.Array
@@ -110,8 +45,8 @@ class Played:
     """An experiment as the winner's simulator played it.
 
     Attributes:
-        excitation; scale: of its amplitude; log: motion `[T + 1, ..]` and commands; worst: largest share of a limit used.
-        safe: whether every rival stayed inside the limits.
+        excitation; scale: of its amplitude; log: motion `[T + 1, ..]` and commands.
+        worst: largest share of a limit that was used; safe: whether every rival stayed inside the limits.
     """
 
     excitation: Excitation
@@ -197,7 +132,8 @@ class Rehearsal:
             some = pairs[a : a + LANES]
             padded = some + [some[-1]] * (LANES - len(some))
             index = np.array([p for p, _ in padded])
-            rows, ends = self._run(small[[m for _, m in padded]], jax.tree.map(lambda x: x[index], stacked))
+            chosen = Plan(**{f.name: getattr(stacked, f.name)[index] for f in fields(Plan)})
+            rows, ends = self._run(small[[m for _, m in padded]], chosen)
             q, w, u, f = (np.asarray(x, np.float64) for x in rows)
             q_end, w_end = (np.asarray(x, np.float64)[:, None] for x in ends)
             q, w = np.concatenate([q, q_end], 1), np.concatenate([w, w_end], 1)
@@ -259,7 +195,16 @@ class Rehearsal:
             if self.can_switch and self.drives.kind[i] not in ("torque", "none") and off.any():
                 streams[f"enabled:{name}"] = 1.0 - np.append(off, off[-1])
         controller = {k: v for k, v in like.metadata.items() if k == "controller"}
-        return replace(like, name=e.name, time=time, ctrl=np.concatenate([command, command[-1:]]), qpos=qpos, qvel=qvel, streams=streams, metadata=controller)  # fmt: skip
+        return replace(
+            like,
+            name=e.name,
+            time=time,
+            ctrl=np.concatenate([command, command[-1:]]),
+            qpos=qpos,
+            qvel=qvel,
+            streams=streams,
+            metadata=controller,
+        )
 
 
 def _columns(physics: Physics, effects: set[str]) -> tuple[NDArray[np.int64], list]:

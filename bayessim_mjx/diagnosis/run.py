@@ -23,6 +23,7 @@ from bayessim_mjx.physics import Physics
 WINDOW = 0.5  # s
 SHORTEST = 0.004  # s, control period of the diagnosis; faster logs are resampled
 LIMITS = ((1, 160), (3, 96), (7, 64), (100, 48))  # (up to so many dofs, windows)
+BUDGET = 24000  # sub-steps of one simulation of all windows
 LEAST = 6  # windows: with fewer nothing can be held out
 Progress = Callable[[str, int, int], None]
 
@@ -111,6 +112,7 @@ def _windows(
     length = int(np.clip(round(WINDOW / dt), 8, 100))
     if longest < length:
         raise TooLittleData(f"the longest log has {longest} control steps of {dt:.3g} s, one window needs {length}")
+    limit = min(limit, max(24, BUDGET // (length * physics.substeps)))
     cut = windows.cut(logs, physics.mj_model, dt, physics.substeps, length, limit=limit, group=group, use_qvel=use_qvel)
     if len(cut) < LEAST:
         raise TooLittleData(f"{len(cut)} windows of {length * dt:.2g} s; holding conditions out needs {LEAST}")

@@ -150,9 +150,10 @@ def exchange(race: Race, model: Model, old: Candidate, new: Candidate, say: Prog
 
 
 def _fresh(race: Race, job: Job) -> list[int]:
+    """Columns to be differenced anew: the effects' at every step, the known parameters' at every third where affordable."""
     base = len(race.fitter.base)
-    own = list(range(base, len(job.coordinates)))
-    return list(range(len(job.coordinates))) if base <= race.settings.fresh else own
+    turn = base <= race.settings.fresh and len(job.history) % 3 == 0
+    return list(range(0 if turn else base, len(job.coordinates)))
 
 
 def fit_models(race: Race, plans: Sequence[tuple[Model, Screened]], label: str, say: Progress) -> list[Model]:
