@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from mujoco import mjx
 
 
-def tilted(gravity: jax.Array, roll: jax.Array, pitch: jax.Array) -> jax.Array:
+def tilted(gravity: jax.Array, roll: jax.Array | float, pitch: jax.Array | float) -> jax.Array:
     """Gravity `[3]` in the frame of a robot turned by roll about the world's x, then by pitch about its y (rad)."""
     x, y, z = gravity
     # g' = R^T g, R = Ry(pitch) Rx(roll)

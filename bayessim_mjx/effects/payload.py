@@ -85,8 +85,8 @@ class Payload(Effect):
 
     def on_model(self, at: Site, model: "mjx.Model", theta: jax.Array) -> "mjx.Model":
         load, arm = at.values(theta)[:, 0], at.values(theta)[:, 1:]
-        old = [getattr(model, field)[at.ids] for field in FIELDS]
-        new = jax.vmap(_loaded)(*old, load, arm)
+        mass, inertia, ipos, iquat = (getattr(model, field)[at.ids] for field in FIELDS)
+        new = jax.vmap(_loaded)(mass, inertia, ipos, iquat, load, arm)
         changed = model.replace(
             **{f: getattr(model, f).at[at.ids].set(n) for f, n in zip(FIELDS, new, strict=True)},
         )

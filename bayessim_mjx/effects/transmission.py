@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 
 from bayessim_mjx.effects.site import Site, SubStep
-from bayessim_mjx.triangular import inverse_lower, product
+from bayessim_mjx.triangular import product
 
 if TYPE_CHECKING:
     from mujoco import mjx
@@ -209,8 +209,14 @@ def finish(at: Site, step: SubStep, both: Sides, passed: Passed, twist: jax.Arra
 
 
 def inverse(matrix: jax.Array) -> jax.Array:
-    """Inverse of a positive definite matrix `[n, n]`."""
-    if matrix.shape[0] == 1:
-        return 1.0 / matrix
-    factor = inverse_lower(jnp.linalg.cholesky(matrix))
-    return product(factor.T, factor)
+    """Inverse of a positive definite matrix `[n, n]`, by Gauss-Jordan: small, and needs no pivots."""
+    size = matrix.shape[0]
+
+    def step(k: jax.Array, a: jax.Array) -> jax.Array:
+        here = jnp.arange(size) == k
+        row, column = jnp.sum(a * here[:, None], axis=0), jnp.sum(a * here, axis=1)
+        row = jnp.where(here, 1.0, row) / jnp.sum(row * here)
+        rest = jnp.where(here, 0.0, a) - column[:, None] * row
+        return jnp.where(here[:, None], row, rest)
+
+    return 1.0 / matrix if size == 1 else jax.lax.fori_loop(0, size, step, matrix)
