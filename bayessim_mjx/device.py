@@ -1,5 +1,6 @@
 """The device and the persistent compilation cache, chosen before jax does anything."""
 
+import functools
 import os
 import re
 from pathlib import Path
@@ -55,12 +56,20 @@ def _cache(jax: Any, folder: str | None) -> None:
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
 
 
+@functools.cache
 def compiler_options() -> dict[str, Any]:
-    """Options for `jax.jit` of programs with kinematic chains.
+    """Options for `jax.jit` of programs with kinematic chains; none where the compiler does not know them.
 
-    XLA's newer fusion on CPU computes shared subexpressions anew in every consumer: for a chain of six joints MJX's
-    kinematics then cost 150 times what they should.
+    XLA's fusion on CPU may compute shared subexpressions anew in every consumer: for a chain of six joints MJX's
+    kinematics then cost 150 times what they should (jaxlib 0.10).
     """
     import jax
 
-    return {"xla_cpu_use_fusion_emitters": False} if jax.default_backend() == "cpu" else {}
+    options = {"xla_cpu_use_fusion_emitters": False}
+    if jax.default_backend() != "cpu":
+        return {}
+    try:
+        jax.jit(lambda x: x + 1, compiler_options=options)(0.0)
+    except jax.errors.JaxRuntimeError:
+        return {}
+    return options

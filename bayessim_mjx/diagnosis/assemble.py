@@ -363,7 +363,13 @@ def _episodes(found: Findings) -> list[dict[str, Any]]:
 
 def versions() -> dict[str, str]:
     """Versions of what the result depends on."""
-    return {p: importlib.metadata.version(p) for p in ("bayessim-mjx", "mujoco", "mujoco-mjx", "jax", "numpy")}
+    out = {}
+    for package in ("bayessim-mjx", "mujoco", "mujoco-mjx", "jax", "numpy"):
+        try:
+            out[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:  # run from a checkout that was not installed
+            out[package] = "unknown"
+    return out
 
 
 def insufficient(reason: str, notes: list[str]) -> Diagnosis:
