@@ -15,7 +15,7 @@ from bayessim_mjx.logs.log import Log
 
 Array = NDArray[np.float64]
 _AXIAL = (int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE))
-MOVING = 0.03  # of the speed scale: below this a joint has no direction of its own
+MOVING = (0.003, 0.03)  # of the speed scale: limits of the speed below which a joint has no direction of its own
 # no measured acceleration: with effort and pose it *is* the residual of inverse dynamics, noise included, so that a
 # force that depends on it explains everything, held out or not
 QUANTITIES = ("position", "speed", "direction", "stop", "load", "effort", "past", "pull", "since_reversal", "time")
@@ -111,7 +111,8 @@ def _scale(values: Array) -> Array:
 
 def _of_log(log: Log, index: int, windows: Windows, model: mujoco.MjModel, speed_scale: Array) -> dict[str, Array]:
     position = _positions(log, model)
-    direction, since = _direction(log.qvel, MOVING * speed_scale, windows.dt)
+    slow = np.clip(3 * log.sigma_qvel, MOVING[0] * speed_scale, MOVING[1] * speed_scale)
+    direction, since = _direction(log.qvel, slow, windows.dt)
     travel = np.maximum(np.ptp(position, axis=0), 1e-9)
     widths = [np.maximum(f * travel, 4 * windows.sigma_q) for f in (0.01, 0.05)]
     load, effort, pull = _forces(log, model, windows, index)
@@ -139,16 +140,21 @@ def _positions(log: Log, model: mujoco.MjModel) -> Array:
 
 
 def _direction(speed: Array, threshold: Array, dt: float) -> tuple[Array, Array]:
-    """(sign of the last clear motion, seconds since it changed), `[T, nv]`."""
+    """(sign of the last clear motion, from where the speed crossed zero; seconds since it changed), `[T, nv]`."""
     direction, since = np.zeros_like(speed), np.zeros_like(speed)
-    clear = np.abs(speed) > threshold
-    first = np.take_along_axis(np.sign(speed), np.argmax(clear, axis=0)[None], 0)[0]
-    state, age = first * clear.any(axis=0), np.zeros(speed.shape[1])
-    for t in range(len(speed)):
-        new = np.where(clear[t], np.sign(speed[t]), state)
-        age = np.where(new != state, 0.0, age + dt)
-        state = new
-        direction[t], since[t] = state, age
+    for v in range(speed.shape[1]):
+        sign, clear = np.sign(speed[:, v]), np.abs(speed[:, v]) > threshold[v]
+        if not clear.any():
+            continue
+        state, start = sign[np.argmax(clear)], 0
+        for t in range(len(sign)):
+            if clear[t] and sign[t] != state:
+                state, start = sign[t], t
+                while start > 0 and sign[start - 1] == state:
+                    start -= 1
+                direction[start:t, v] = state
+                since[start:t, v] = dt * np.arange(t - start)
+            direction[t, v], since[t, v] = state, dt * (t - start)
     return direction, since
 
 
