@@ -144,13 +144,17 @@ def reason(scorer: Any, chosen: Any, labels: Sequence[str], contested: bool, use
     if len(labels) == 1:
         return _sharpening(scorer, chosen, action)
     if not useful:
-        most = f"the best, {chosen.name}, is expected to give {chosen.evidence:.1g} nats"
+        most = f"the best, {chosen.name}, is expected to give {nats(chosen.evidence)} nats"
         return f"no safe excitation separates {rivals} ({most}); what would: {instead(scorer.models)}"
     verb = "separates" if contested else "makes sure of"
     weak = 10.0 / max(chosen.evidence, 1e-9)
     again = f"; repeat it {math.ceil(weak)} times for a decision" if 1.3 < weak <= 10 else ""
     rivals = rivals if contested else rivals.replace(" from ", " against ", 1)
-    return f"{action}: {verb} {rivals}, expected evidence {chosen.evidence:.3g} nats{again}"
+    return f"{action}: {verb} {rivals}, expected evidence {nats(chosen.evidence)} nats{again}"
+
+
+def nats(evidence: float) -> str:
+    return f"{evidence:.0f}" if evidence >= 10 else f"{evidence:.1f}"
 
 
 def _article(name: str) -> str:

@@ -1,6 +1,7 @@
 """How much an experiment would tell: the evidence between rivals after the losing one has adapted all it can.
 
-T-optimality with refit (Atkinson and Fedorov, 1975), each rival held back by what the logs have already taught it.
+T-optimality with refit (Atkinson and Fedorov, 1975), each rival held back by what the logs have already taught it, on
+average over what they leave open about the truth.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from bayessim_mjx.diagnosis.run import Setup
 
 Array = NDArray[np.float64]
+DRAWS = 16  # from the posterior of the truth's parameters
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,23 +37,24 @@ class Scored:
     evidence: float
     pairs: Array
     needs: str = ""
-    sharpened: tuple[float, float] = (0.0, 0.0)
 
 
 class Scorer:
     """Evidence of experiments, simulated by the diagnosis' own compiled program.
 
     Attributes:
-        models: rivals; weights: `[M]`; posterior: `[M]` precisions `[k, k]` from the logs; ratio: effective share of
-            samples; misfit: of each model in noise variances.
+        models: rivals; weights: `[M]`; posterior: `[M]` precisions `[k, k]` from the logs; draws: `[M]` of parameters
+            from it; ratio: effective share of samples; misfit: of each model in noise variances.
     """
 
-    def __init__(self, setup: Setup, models: Sequence[Model], weights: Array) -> None:
+    def __init__(self, setup: Setup, models: Sequence[Model], weights: Array, seed: int = 0) -> None:
         self.setup, self.fitter, self.models, self.weights = setup, setup.fitter, list(models), weights
         count = models[0].job.r.size
         self.ratio = np.array([min(m.samples / count, 1.0) for m in models])
         self.misfit = np.array([max(m.total / count, 0.5) for m in models])
         self.posterior = [self._posterior(m, k) for m, k in zip(models, self.ratio / self.misfit, strict=True)]
+        rng = np.random.default_rng(seed)
+        self.draws = [self._draw(i, rng) for i in range(len(models))]
 
     def _posterior(self, model: Model, discount: float) -> Array:
         q, _ = model.job.quadratic(self.fitter.spread)
@@ -92,36 +95,59 @@ class Scorer:
         m = len(self.models)
         out = np.zeros((m, m))
         for i in range(m):
+            own = self._quadratic(where, i, i)
+            out[i, i] = self._sharper(own[2], i, scale)
             for j in range(m):
-                out[i, j] = self._adapted(where, i, j, scale, full) if i != j else self._sharper(where, i, scale)
+                if i != j:
+                    out[i, j] = self._adapted(own, self._quadratic(where, i, j), i, j, scale, full)
         return out
 
     def _quadratic(self, where: list, i: int, j: int) -> tuple[float, Array, Array]:
-        """Squared difference between truth i and rival j, summed over windows, as a quadratic in j's parameters."""
-        c, g, S = 0.0, np.zeros(self.models[j].size), np.zeros((self.models[j].size,) * 2)
+        """|y_i(p_i + dq) - y_j(p_j + dp)|^2, summed over windows, starts free, as a quadratic in z = (dp, dq)."""
+        size = self.models[j].size + self.models[i].size
+        c, g, S = 0.0, np.zeros(size), np.zeros((size, size))
         for jobs, some in where:
-            r = (jobs[j].r - jobs[i].r)[some]
-            q, _ = eliminate(
-                r, jobs[j].A[some], jobs[j].B[some], np.zeros_like(jobs[j].offsets[some]), self.fitter.spread
-            )
+            r, x = (jobs[j].r - jobs[i].r)[some], np.zeros_like(jobs[j].offsets[some])
+            A = np.concatenate([jobs[j].A[some], -jobs[i].A[some]], axis=2)
+            q, _ = eliminate(r, A, jobs[j].B[some], x, self.fitter.spread)
             c, g, S = c + q.c.sum(), g + q.g.sum(0), S + q.S.sum(0)
         return float(c), g, S
 
-    def _adapted(self, where: list, i: int, j: int, scale: float, full: int) -> float:
-        """D = min over dp of discount |y_i - y_j(p_j + dp)|^2 + dp' P dp; evidence N/2 log(1 + D/N), or D/2 if small."""
-        c, g, S = self._quadratic(where, i, j)
-        discount = scale * self.ratio[i] / self.misfit[i]
-        _, _, low, high = self.models[j].job.prior()
-        H = discount * S + self.posterior[j]
-        p = solve(H, discount * g, low, high)
-        D = max(discount * c - 2 * discount * float(g @ p) + float(p @ H @ p), 0.0)
-        samples = full * self.fitter.size * self.ratio[i]
-        return float(0.5 * samples * np.log1p(D / samples))
+    def _adapted(self, own: tuple, other: tuple, i: int, j: int, scale: float, full: int) -> float:
+        """Mean over i's posterior of N/2 log((N + D_ij) / (N + D_ii)), half the difference of the D if they are small.
 
-    def _sharper(self, where: list, i: int, scale: float) -> float:
-        _, _, S = self._quadratic(where, i, i)
+        D_ij = min over dp of discount |y_i(p_i + dq) - y_j(p_j + dp)|^2 + dp' P_j dp, dq drawn from the posterior that
+        the logs leave of i: how large an effect really is matters, and they may hardly know.
+        """
+        discount = scale * self.ratio[i] / self.misfit[i]
+        samples = full * self.fitter.size * self.ratio[i]
+        gains = []
+        for dq in self.draws[i]:
+            rival, truth = (self._distance(q, dq, k, discount) for q, k in ((other, j), (own, i)))
+            gains.append(0.5 * samples * np.log((samples + rival) / (samples + truth)))
+        return max(float(np.mean(gains)), 0.0)
+
+    def _distance(self, quadratic: tuple[float, Array, Array], dq: Array, j: int, discount: float) -> float:
+        c, g, S = quadratic
+        k = self.models[j].size
+        rest = c - 2 * float(g[k:] @ dq) + float(dq @ S[k:, k:] @ dq)
+        pull = discount * (g[:k] - S[:k, k:] @ dq)
+        _, _, low, high = self.models[j].job.prior()
+        H = discount * S[:k, :k] + self.posterior[j]
+        p = solve(H, pull, low, high)
+        return max(discount * rest - 2 * float(pull @ p) + float(p @ H @ p), 0.0)
+
+    def _draw(self, i: int, rng: np.random.Generator) -> Array:
+        """Deviations `[DRAWS, k]` of model i's parameters, in pairs of opposite sign, kept inside their bounds."""
+        covariance = np.linalg.pinv(self.posterior[i])
+        half = rng.multivariate_normal(np.zeros(len(covariance)), covariance, DRAWS // 2, method="eigh")
+        _, _, low, high = self.models[i].job.prior()
+        return np.clip(np.concatenate([half, -half]), low, high)
+
+    def _sharper(self, S: Array, i: int, scale: float) -> float:
+        k = self.models[i].size
         worst, before = self.loosest(i)
-        after = np.linalg.pinv(self.posterior[i] + scale * self.ratio[i] / self.misfit[i] * S)[worst, worst]
+        after = np.linalg.pinv(self.posterior[i] + scale * self.ratio[i] / self.misfit[i] * S[:k, :k])[worst, worst]
         return float(0.5 * np.log(before / max(after, 1e-300)))
 
     def loosest(self, i: int) -> tuple[int, float]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -40,7 +40,7 @@ class Experiment:
         name, why, evidence, needs: in words and nats; pairs: [{"a", "b", "evidence"}].
         table: every experiment with its evidence, best first; witnesses: streams worth logging as well.
         chosen: what is to be played, None where nothing helps; menu: best ones in full; drives, limits: of the robot.
-        labels: of the models.
+        labels: of the models; unsafe: motions that left the limits however small they were made.
     """
 
     name: str
@@ -55,10 +55,13 @@ class Experiment:
     drives: Drives
     limits: Limits
     labels: list[str] = field(default_factory=list)
+    unsafe: list[str] = field(default_factory=list)
 
     def to_dict(self, file: str = "") -> dict[str, Any]:
         """For diagnosis.json."""
-        own = {k: getattr(self, k) for k in ("name", "why", "evidence", "pairs", "table", "needs", "witnesses")}
+        own = {
+            k: getattr(self, k) for k in ("name", "why", "evidence", "pairs", "table", "needs", "witnesses", "unsafe")
+        }
         return own | {"file": file if self.chosen is not None else ""}
 
     def details(self) -> list[dict[str, Any]]:
@@ -89,7 +92,7 @@ def propose(
     cut, model = setup.fitter.simulator.windows, setup.physics.mj_model
     models, contested = _contenders(race, ruling, rivals_models)
     weights = np.maximum(win_share(models, cut.group, race.noise, np.random.default_rng(seed)), WEIGHT)
-    scorer = Scorer(setup, models, weights)
+    scorer = Scorer(setup, models, weights, seed)
     allowed = limits_of(model, cut.logs, limits)
     rows = max(cut.steps, int(round(SECONDS / cut.dt)) // cut.steps * cut.steps)
     time = cut.dt * np.arange(rows)
@@ -100,7 +103,9 @@ def propose(
     scored = _look(scorer, stage, every)
     attended = _with_help(scorer, stage, scored, model)
     final = _in_full(scorer, stage, scored, attended)
-    return _decide(scorer, stage, final, scored, attended, contested)
+    safe = {s.played.excitation.name for s in scored}
+    found = _decide(scorer, stage, final, scored, attended, contested)
+    return replace(found, unsafe=[e.name for e in every if e.name not in safe])
 
 
 def _contenders(race: Race, ruling: Ruling, given: Sequence[Model] | None) -> tuple[list[Model], bool]:

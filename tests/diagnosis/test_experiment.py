@@ -12,12 +12,12 @@ from bayessim_mjx.diagnosis.command import read_command, write_command
 from bayessim_mjx.diagnosis.experiment import propose
 from bayessim_mjx.diagnosis.limits import limits_of
 from bayessim_mjx.diagnosis.models import scored
-from bayessim_mjx.diagnosis.robot import default_space, Robot
+from bayessim_mjx.diagnosis.robot import Robot, default_space
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Channels, Log
 from bayessim_mjx.logs.signals import estimate_velocity
 
-DT, FINE, NOISE, DRAG = 0.02, 40, 4e-4, 0.012
+DT, FINE, NOISE, DRAG = 0.02, 40, 4e-4, 0.004
 SPEED, RANGE, TORQUE = 12.0, 2.6, 4.0
 LIMITS = {"joints": {"hinge": {"range": [-RANGE, RANGE], "speed": SPEED}}}
 XML = """<mujoco><option timestep="{step}"/><worldbody><body>
@@ -59,7 +59,7 @@ def slow_logs():
     out = []
     for k in range(4):
         time = DT * np.arange(201)
-        ref = 1.5 * np.sin(2 * np.pi * (0.22 + 0.01 * k) * time + k)
+        ref = 0.5 * np.sin(2 * np.pi * (0.22 + 0.01 * k) * time + k)
         q, u = real(lambda i, q, w, ref=ref: 6 * (ref[i] - q) - 0.6 * w, 200, start=ref[0])
         out.append(log_of(f"slow{k}", q, u, k))
     return out
@@ -86,11 +86,10 @@ def proposal():
     return propose(setup, race, ruling, [models["viscous_friction"]], LIMITS)
 
 
-def gain(setup, race):
-    """Evidence for drag against viscous friction, nats, after both are fitted to everything (T-optimality's currency)."""
+def evidence(race):
+    """What the race says for drag against viscous friction, nats, held out."""
     models = {m.effects[0].effect: m for m in search.ranked(race, 1)}
-    drag, viscous = models["quadratic_drag"], models["viscous_friction"]
-    return 0.5 * drag.samples * np.log(viscous.job.cost / drag.job.cost)
+    return race.better(models["viscous_friction"], models["quadratic_drag"]).evidence
 
 
 def test_fast_motion_is_proposed_where_only_fast_motion_separates():
@@ -101,7 +100,7 @@ def test_fast_motion_is_proposed_where_only_fast_motion_separates():
     assert np.abs(found.chosen.played.log.qvel).max() > 2 * slow
     assert found.evidence > 10 and found.evidence > 5 * by_name["slow triangle on hinge"]
     assert "quadratic drag at hinge from viscous friction at hinge" in found.why
-    assert found.name in found.why and f"{found.evidence:.3g} nats" in found.why
+    assert found.name in found.why and f"{found.evidence:.0f} nats" in found.why
 
 
 def test_the_program_of_the_diagnosis_is_used_as_it_is():
@@ -119,7 +118,7 @@ def test_limits_hold_in_everything_that_is_proposed():
 
 
 def test_the_promised_evidence_comes_true(tmp_path):
-    setup, race, _, _ = contest()
+    _, race, _, _ = contest()
     found = proposal()
     command = read_command(write_command(tmp_path / "next.csv", found))
     kp, kd = (command.notes["closed_loop"][k]["motor"] for k in ("kp", "kd"))
@@ -131,11 +130,9 @@ def test_the_promised_evidence_comes_true(tmp_path):
 
     q, u = real(law, len(ref) - 1, start=ref[0])
     assert np.abs(q).max() < RANGE
-    before = gain(setup, race)
-    again, after = diagnosed([*slow_logs(), log_of("next", q, u, 99)])
-    realised = gain(again, after) - before
-    print("expected", found.evidence, "realised", realised, "before", before, "held out",
-          after.better(*(next(m for m in search.ranked(after, 1) if m.effects[0].effect == e) for e in ("viscous_friction", "quadratic_drag"))))
+    _, after = diagnosed([*slow_logs(), log_of("next", q, u, 99)])
+    realised = evidence(after) - evidence(race)
+    assert evidence(race) < 5
     assert found.evidence / 3 < realised < 3 * found.evidence
     assert after.winner.effects[0].effect == "quadratic_drag"
 
@@ -179,12 +176,19 @@ def test_limits_come_from_the_model_and_else_from_the_logs():
     moved = np.concatenate([log.qpos[:, 0] for log in logs])
     assert own.high[0] - own.low[0] == pytest.approx(1.1 * np.ptp(moved))
     assert own.command_low[0] == -TORQUE and own.effort[0] == TORQUE
-    assert 1.0 < own.speed[0] < 1.1 * max(np.abs(log.qvel).max() for log in logs) + 1e-9
+    fastest = max(np.abs(log.qvel).max() for log in logs)
+    assert 0.9 * fastest < own.speed[0] <= 1.1 * fastest
 
 
 @pytest.mark.parametrize(
-    "given", [{"joint": {}}, {"joints": {"knee": {}}}, {"joints": {"hinge": {"rnge": 1}}}, {"joints": {"hinge": {"range": [1, -1]}}}]
-)  # fmt: skip
+    "given",
+    [
+        {"joint": {}},
+        {"joints": {"knee": {}}},
+        {"joints": {"hinge": {"rnge": 1}}},
+        {"joints": {"hinge": {"range": [1, -1]}}},
+    ],
+)
 def test_wrong_limits_are_refused(given):
     with pytest.raises(UserError, match="limits"):
         limits_of(robot().mj_model, slow_logs(), given)
