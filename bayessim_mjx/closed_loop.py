@@ -1,0 +1,188 @@
+"""Policies in closed loop on the simulator as it was, on the corrected one and on the surrogate real.
+
+Four kinds of policies, all trained alike: `nominal` on the simulator as it was, `corrected` on the corrected one with
+what the diagnosis knows as randomisation, `wide` on the simulator as it was with its known parameters randomised widely
+and `oracle` on the surrogate real itself. Evaluations use the same initial states and random numbers everywhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from bayessim_mjx import laws, rl
+from bayessim_mjx.config import PPOConfig
+from bayessim_mjx.diagnosis import windows
+from bayessim_mjx.diagnosis.simulate import Simulator
+from bayessim_mjx.distributions import Distribution
+from bayessim_mjx.errors import UserError
+from bayessim_mjx.gap_measures import standard_error
+from bayessim_mjx.logs.log import Channels, Log
+from bayessim_mjx.parameters import Parameter, ParameterSpace
+from bayessim_mjx.physics import Physics
+from bayessim_mjx.rl import Policy
+
+if TYPE_CHECKING:
+    from bayessim_mjx.env import Task
+
+Array = NDArray[np.float64]
+WIDE = 0.5  # of the nominal value, either way
+CHECKPOINTS = 8  # policies of one training that are kept and ranked, besides the untrained one
+REPLAYED = 4.0  # s of each log
+
+
+@dataclass(frozen=True, eq=False)
+class Simulators:
+    """The task on each physics.
+
+    Attributes:
+        nominal: as it was; its space holds the known parameters, uniform within +-50 %.
+        corrected: at the identified values; its space has the diagnosis's priors.
+        real: the surrogate, nominal at the hidden values; None where there are only logs.
+    """
+
+    nominal: Task
+    corrected: Task
+    real: Task | None
+
+    def training(self, role: str) -> tuple[Task, Distribution | None]:
+        """(environment, what its physics is drawn from) for the policies of a role."""
+        if role == "oracle":
+            assert self.real is not None
+            return self.real, None
+        env = self.corrected if role == "corrected" else self.nominal
+        return env, Distribution.prior(env.space) if role != "nominal" and len(env.space) else None
+
+    @property
+    def roles(self) -> tuple[str, ...]:
+        return ("nominal", "corrected", "wide", "oracle") if self.real is not None else ("nominal", "corrected")
+
+
+def wide(space: ParameterSpace) -> ParameterSpace:
+    """The known parameters, uniform within +-50 % of their nominal values (in their own ranges where those are 0)."""
+    return ParameterSpace(_wide(p) for p in space.parameters)
+
+
+def _wide(p: Parameter) -> Parameter:
+    ends = sorted((1 + side * WIDE) * p.nominal for side in (-1, 1))
+    low, high = ends if p.nominal else (p.low, p.high)
+    return replace(p, low=low, high=high, prior="uniform", mean=None, sd=None)
+
+
+def marks(iterations: int) -> list[int]:
+    """PPO iterations after which a policy is kept: 0, ..., `iterations`."""
+    return sorted({round(iterations * i / CHECKPOINTS) for i in range(CHECKPOINTS + 1)})
+
+
+def train(
+    env: Task,
+    ppo: PPOConfig,
+    key: jax.Array,
+    domain: Distribution | None,
+    at: Sequence[int],
+    keep: Callable[[int, Policy], Any],
+    progress: Callable[[dict, Any], None] | None = None,
+) -> None:
+    """PPO from scratch; `keep(iteration, policy)` at the iterations `at` (increasing)."""
+    state, done = rl.init(env, ppo, key, domain), 0
+    for mark in at:
+        if mark > done:
+            state, _ = rl.run(env, ppo, state, domain, iterations=mark - done, progress=progress)
+            done = mark
+        keep(mark, rl.policy_of(state))
+
+
+@dataclass(frozen=True, eq=False)
+class Judge:
+    """Evaluates policies: `episodes` whole ones each, the same initial states everywhere."""
+
+    simulators: Simulators
+    episodes: int
+    key: jax.Array
+
+    def nominal(self, env: Task, policy: Policy, theta: Any = None) -> Array:
+        """Returns `[episodes]` at one theta (default: nominal)."""
+        theta = env.space.nominal if theta is None else theta
+        thetas = jnp.tile(jnp.asarray(theta, jnp.float32), (self.episodes, 1))
+        return self._returns(env, policy, thetas)
+
+    def drawn(self, env: Task, policy: Policy) -> Array:
+        """Returns `[episodes]`, each with physics drawn from the environment's priors."""
+        prior = Distribution.prior(env.space)
+        return self._returns(env, policy, prior.sample(jax.random.fold_in(self.key, 1), self.episodes))
+
+    def _returns(self, env: Task, policy: Policy, thetas: jax.Array) -> Array:
+        return np.asarray(rl.evaluate(env, policy, self.key, thetas)["return"], np.float64)
+
+    def everywhere(self, policy: Policy) -> dict[str, Array]:
+        """Returns on each simulator; "posterior" is the corrected one over what the diagnosis leaves open."""
+        s = self.simulators
+        out = {"nominal": self.nominal(s.nominal, policy), "corrected": self.nominal(s.corrected, policy)}
+        if len(s.corrected.space):
+            out["posterior"] = self.drawn(s.corrected, policy)
+        return out if s.real is None else out | {"real": self.nominal(s.real, policy)}
+
+    def at_home(self, role: str, policy: Policy) -> float:
+        """Mean return where the policies of this role are trained, with other random numbers than the reported ones."""
+        env, domain = self.simulators.training(role)
+        other = replace(self, key=jax.random.fold_in(self.key, 2))
+        return float((other.nominal(env, policy) if domain is None else other.drawn(env, policy)).mean())
+
+    def without(self, policy: Policy) -> list[dict[str, Any]]:
+        """Per effect and place: return on the corrected simulator minus that without it, with its standard error."""
+        env = self.simulators.corrected
+        full = self.nominal(env, policy)
+        out = []
+        for label, theta in switched_off(env.physics).items():
+            name, where = label.split("@", 1)
+            change = full - self.nominal(env, policy, theta)
+            out.append({"effect": name, "where": where, "change": float(change.mean()), "se": standard_error(change)})
+        return out
+
+
+def switched_off(physics: Physics) -> dict[str, Array]:
+    """{"effect@where": the nominal theta with this effect neutral there}."""
+    out, start = {}, len(physics.model_space)
+    for effect in physics.effects:
+        neutral, k = effect.defaults().nominal, len(effect.quantities)
+        for i, place in enumerate(effect.places()):
+            own = np.arange(i * k, (i + 1) * k)
+            theta = physics.space.nominal.astype(np.float64)
+            theta[start + own] = neutral[own]
+            out[f"{effect.name}@{place}"] = theta
+        start += len(neutral)
+    return out
+
+
+def replay(logs: Sequence[Log], nominal: Physics, corrected: Physics) -> dict[str, Any] | None:
+    """Declared controllers replayed in closed loop from the logs' first states: error of position, root mean square.
+
+    Returns:
+        {"seconds", "logs", "error": {dof: {"nominal", "corrected"}}} in rad or m; None where no log declares a law.
+
+    Raises:
+        UserError: the logs are too short.
+    """
+    declared = [log for log in logs if laws.declared(log.metadata)]
+    if not declared:
+        return None
+    dt = nominal.dt
+    length = int(min(REPLAYED, *(log.time[-1] - log.time[0] for log in declared)) / dt) - 1
+    if length < 2:
+        raise UserError(f"--real: the shortest log with a controller holds {length + 1} control steps of {dt:.3g} s")
+    rms = {}
+    for name, physics in (("nominal", nominal), ("corrected", corrected)):
+        cut = windows.cut(
+            declared, physics.mj_model, dt, physics.substeps, length, limit=len(declared), first_only=True
+        )
+        error = Simulator(physics, cut, lanes=len(cut)).run(physics.space.nominal[None].astype(np.float64))
+        rms[name] = np.sqrt(np.mean(error[0, ..., : physics.mj_model.nv] ** 2, axis=(0, 1)))
+    names = Channels.of(nominal.mj_model).qvel
+    errors = {n: {s: float(rms[s][i]) for s in rms} for i, n in enumerate(names)}
+    return {"seconds": length * dt, "logs": [log.name for log in declared], "error": errors}

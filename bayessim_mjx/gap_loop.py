@@ -1,0 +1,96 @@
+"""`python -m bayessim_mjx.gap_loop --task T --diagnosis DIR (--real LOGS | --surrogate FILE)`: worth of a correction.
+
+Trains a policy on the simulator as it was and one on the corrected simulator, and says what return each is predicted to
+reach, what it reaches on the surrogate real, and what retraining recovers (see docs/diagnosis.md).
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from bayessim_mjx import cli
+from bayessim_mjx.config import Config
+from bayessim_mjx.device import setup_jax
+from bayessim_mjx.errors import UserError
+
+DESCRIPTION = "What a diagnosed gap costs in return, and what retraining on the corrected simulator recovers."
+WITHOUT = ("--max_iterations", "--video", "--video_length", "--video_interval", "--logdir", "--name")
+
+
+def _parser() -> cli.Parser:
+    parser = cli.Parser("gap_loop", DESCRIPTION, without=WITHOUT)
+    parser.add_argument("--diagnosis", metavar="DIR", help="what bayessim_mjx.diagnose wrote")
+    parser.add_argument(
+        "--surrogate", metavar="FILE", help="stand-in for the real system: its truth as an effects.yaml"
+    )
+    parser.add_argument("--real", metavar="LOGS", nargs="+", help="logs of the real system; no real return is known")
+    parser.add_argument("--parameters", metavar="FILE", help="params.yaml of the diagnosis, if it had one")
+    parser.add_argument("--iterations", type=int, help="PPO iterations of each policy (default: ppo.max_iterations)")
+    parser.add_argument("--seeds", type=int, default=1, help="policies of each kind")
+    parser.add_argument("--episodes", type=int, default=200, help="episodes of each evaluation")
+    parser.add_argument("--out", metavar="DIR", help="results and policies (default: <diagnosis>/gap_loop)")
+    return parser
+
+
+def _check(args: argparse.Namespace) -> None:
+    """What can be refused before anything is loaded."""
+    if not args.diagnosis:
+        raise UserError("--diagnosis is missing: give the folder that bayessim_mjx.diagnose wrote")
+    if not (Path(args.diagnosis) / "diagnosis.json").is_file():
+        raise UserError(
+            f"--diagnosis {args.diagnosis}: no diagnosis.json in it; give the --out of bayessim_mjx.diagnose"
+        )
+    if bool(args.real) == bool(args.surrogate):
+        raise UserError("give one of --surrogate FILE (a stand-in for the real system) and --real LOGS")
+    if args.surrogate and not Path(args.surrogate).is_file():
+        raise UserError(f"--surrogate {args.surrogate}: no such file; expected the hidden truth as an effects.yaml")
+    for flag, least in (("seeds", 1), ("episodes", 2), ("iterations", 1)):
+        value = getattr(args, flag)
+        if value is not None and value < least:
+            raise UserError(f"--{flag} {value}: must be at least {least}")
+
+
+def _config(args: argparse.Namespace) -> Config:
+    more = {} if args.iterations is None else {"--iterations": ("ppo.max_iterations", args.iterations)}
+    config = cli.config_of(args, more)
+    if config.effects or config.calibrated:
+        raise UserError("effects: the simulator as it was has none; those of the diagnosis come by --diagnosis")
+    return config
+
+
+def _gap_loop(argv: Sequence[str] | None) -> int:
+    args = _parser().parse(argv)
+    if args.list_tasks:
+        return cli.list_tasks()
+    _check(args)
+    config = _config(args)
+    from bayessim_mjx.monitor.console import Console
+
+    with Console(headless=args.headless) as console:
+        return _run(args, config, console)
+
+
+def _run(args: argparse.Namespace, config: Config, console: Any) -> int:
+    device = setup_jax(config)
+    from bayessim_mjx import gap_study, gap_words
+
+    begun = time.perf_counter()
+    study = gap_study.make(args, config)
+    console.start(study.opening() | {"device": str(device)})
+    result = study.run(console)
+    result["seconds"] = round(time.perf_counter() - begun, 1)
+    path = study.write(result)
+    gap_words.show(result, args.headless)
+    console.say(f"written: {path}; curves: tensorboard --logdir {study.out}")
+    return 0
+
+
+main = cli.command(_gap_loop)
+
+if __name__ == "__main__":
+    sys.exit(main())
