@@ -59,8 +59,7 @@ class Disturbance:
 
     Attributes:
         force, sd: `[W, m, nv]`, posterior mean and standard deviation, N m or N.
-        reliability: `[W, m, nv]`, 1 - (sd / prior sd)^2: how much of a true force the mean shows (the rest is the
-            prior's pull to zero).
+        gain: `[W, nv, m, m]`, expected mean = gain times a true force on this dof: what the prior's pull to zero leaves.
         amplitude: `[nv]`, prior standard deviation; memory: s, its correlation time.
         noise: factor on the standard deviation of the measurement noise.
         values: `[k]`, the job's parameters, estimated together with the force.
@@ -71,7 +70,7 @@ class Disturbance:
 
     force: Array
     sd: Array
-    reliability: Array
+    gain: Array
     amplitude: Array
     memory: float
     noise: float
@@ -80,6 +79,11 @@ class Disturbance:
     without: float
     time: Array
     linear: Linear
+
+    @property
+    def reliability(self) -> Array:
+        """`[W, m, nv]`, how much of a constant force the mean shows at each node."""
+        return np.moveaxis(self.gain.sum(3), 1, 2)
 
     @property
     def flat(self) -> Array:
@@ -257,13 +261,15 @@ def _finish(fitter: Fitter, job: Job, found: _Posterior) -> Disturbance:
     shape = (len(found.d), len(linear.scale), linear.nodes)
     variance = np.einsum("wii->wi", found.cov) + _from_parameters(job, found)
     sd = np.sqrt(np.swapaxes(variance.reshape(shape), 1, 2))
-    given = np.sqrt(np.swapaxes(np.einsum("wii->wi", found.cov).reshape(shape), 1, 2))
+    k = job.A.shape[2]
+    whole = found.cov @ linear.quadratic.S[:, k:, k:] / found.noise
+    gain = np.einsum("wvivj->wvij", whole.reshape(*shape, *shape[1:]))
     nothing = replace(found, amplitude=1e-7 * linear.scale)
     spacing = windows.steps * windows.dt / linear.nodes
     return Disturbance(
         force=np.swapaxes(found.d.reshape(shape), 1, 2),
         sd=sd,
-        reliability=np.clip(1 - (given / found.amplitude) ** 2, 0.0, 1.0),
+        gain=gain,
         amplitude=found.amplitude,
         memory=found.memory * spacing,
         noise=float(np.sqrt(found.noise)),

@@ -1,6 +1,6 @@
 """Signatures of known causes in the estimated force: the "why" shown to people before any effect is fitted.
 
-All regressions read  force = reliability * X beta,  with intervals by a bootstrap over operating conditions.
+All regressions read  estimate = gain X beta,  with intervals by a bootstrap over operating conditions.
 """
 
 from __future__ import annotations
@@ -50,15 +50,17 @@ class Fingerprint:
     weight: dict[str, float]
 
 
-def regress(y: Array, X: Array, reliability: Array, draws: Array) -> tuple[Array, list[tuple[float, float]], Array]:
-    """(beta `[k]`, intervals, rms of each term) for y `[W, m]`, X `[W, m, k]`; draws: `[n, W]` weights of windows."""
-    rows = X * reliability[..., None]
+def regress(y: Array, X: Array, gain: Array, draws: Array) -> tuple[Array, Array, Array]:
+    """(beta `[k]`, resampled `[n, k]`, rms of terms) for y `[W, m]`, X `[W, m, k]`, gain `[W, m, m]`; draws: `[n, W]`."""
+    rows = gain @ X
+    scale = np.sqrt(np.mean(rows**2, axis=(0, 1))) + 1e-300
+    rows = rows / scale
     S, g = np.einsum("wmi,wmj->wij", rows, rows), np.einsum("wmi,wm->wi", rows, y)
-    ridge = 1e-9 * np.eye(X.shape[2]) * max(float(np.trace(S.sum(0))), 1e-300)
-    beta = np.linalg.solve(S.sum(0) + ridge, g.sum(0))
-    sampled = np.linalg.solve(np.tensordot(draws, S, 1) + ridge, np.tensordot(draws, g, 1)[..., None])[..., 0]
+    ridge = 1e-6 * np.eye(X.shape[2]) * rows[..., 0].size
+    beta = np.linalg.solve(S.sum(0) + ridge, g.sum(0)) / scale
+    sampled = np.linalg.solve(np.tensordot(draws, S, 1) + ridge, np.tensordot(draws, g, 1)[..., None])[..., 0] / scale
     term = np.sqrt(np.mean((X * beta) ** 2, axis=(0, 1)))
-    return beta, [interval(s) for s in sampled.T], term
+    return beta, sampled, term
 
 
 def _fingerprint(
@@ -66,11 +68,11 @@ def _fingerprint(
 ) -> Fingerprint:
     """terms: {name: (column `[W, m]`, unit)}; say: {name: words} for those that matter."""
     X = np.stack([column for column, _ in terms.values()], 2)
-    used = np.where(node.used, node.reliability, 0.0)
-    beta, spread, rms = regress(np.where(node.used, y, 0.0), X, used, draws)
+    used = node.used
+    beta, sampled, rms = regress(np.where(used, y, 0.0), X, used[..., None] * node.gain, draws)
     numbers = {
-        key: Number(float(b), *ends, unit)
-        for (key, (_, unit)), b, ends in zip(terms.items(), beta, spread, strict=True)
+        key: Number(float(b), *interval(s), unit)
+        for (key, (_, unit)), b, s in zip(terms.items(), beta, sampled.T, strict=True)
     }
     size = max(float(np.sqrt(np.mean(y[node.used] ** 2))) if node.used.any() else 0.0, 1e-300)
     weight = {key: float(r) / size for key, r in zip(terms, rms, strict=True)}
@@ -140,7 +142,8 @@ def _lag(
     channels = r.reshape(len(r), windows.steps, -1)
     behind = -channels[..., dof] * windows.sigma_q[dof] if fitter.used[:nv].all() else np.zeros(r.shape[:1] + (1,))
     average = linear.basis / linear.basis.sum(0)
-    whole = Nodes(behind @ average, np.ones_like(node.force), node.axes, node.units, node.joint, node.force_unit)
+    one = np.broadcast_to(np.eye(average.shape[1]), node.gain.shape)
+    whole = Nodes(behind @ average, one, node.axes, node.units, node.joint, node.force_unit)
     angle = inputs.angle_unit[dof]
     s, w = np.sign(node.axes["direction"]), node.axes["speed"]
     return _fingerprint(

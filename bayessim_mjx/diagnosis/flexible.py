@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
 
 from bayessim_mjx.diagnosis import motion_inputs
 from bayessim_mjx.diagnosis.disturbance import Disturbance, estimate
@@ -188,7 +189,7 @@ class _Seeded:
         C = np.tensordot(w, self.C, 1)
         curvature = np.diag(S).reshape(problem.nv, -1).mean(1)
         S[np.diag_indices(len(S))] += ridge * np.repeat(curvature, self.each) + 1e-9 * curvature.max() + 1e-300
-        both = np.linalg.solve(S, np.concatenate([g[:, None], C.T], 1))
+        both = cho_solve(cho_factor(S), np.concatenate([g[:, None], C.T], 1))
         gp, Spp = problem.q.subset(np.arange(k)).weighted(w)
         step = np.zeros(0)
         if k:
@@ -355,6 +356,6 @@ def _words(held: dict[str, Held], importance: list[dict], where: dict[str, float
         share = h.gain / max(float(h.base.sum()), 1e-300)
         text.append(f"on {how} a flexible force removes {share:.0%} of the squared gap that is left")
     joints = [j for j, share in where.items() if share > 0.2 * max(where.values())]
-    inputs = [d["input"] for d in importance if d["importance"] > IMPORTANT * importance[0]["importance"]][:4]
-    text.append(f"what is missing acts at {', '.join(joints)} and depends on {', '.join(inputs)}")
-    return text
+    inputs = [d["input"] for d in importance if d["importance"] > IMPORTANT * max(importance[0]["importance"], 0.5)][:4]
+    depends = f"depends on {', '.join(inputs)}" if inputs else "depends on nothing that was measured: it is constant"
+    return [*text, f"what is missing acts at {', '.join(joints)} and {depends}"]

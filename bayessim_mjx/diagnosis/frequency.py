@@ -12,7 +12,7 @@ from scipy.signal.windows import dpss
 
 from bayessim_mjx.diagnosis import motion_inputs
 from bayessim_mjx.diagnosis.disturbance import Disturbance, estimate
-from bayessim_mjx.diagnosis.fingerprints import Number
+from bayessim_mjx.diagnosis.fingerprints import Number, regress
 from bayessim_mjx.diagnosis.fit import Fitter, Job
 from bayessim_mjx.diagnosis.motion_inputs import Inputs
 from bayessim_mjx.diagnosis.regions import discoveries
@@ -120,28 +120,25 @@ def orders(disturbance: Disturbance, inputs: Inputs, dof: int, draws: Array, mos
     tried = np.arange(max(first, 1), last + 1)
     if not len(tried):
         return []
-    y, rel = disturbance.force[..., dof], disturbance.reliability[..., dof]
+    y, gain = disturbance.force[..., dof], disturbance.gain[:, dof]
     w, s, load = (inputs.of(k)[..., dof] @ average for k in ("speed", "direction", "load"))
     flat = [np.ones_like(w), s, w, w * np.abs(w), load, q @ average]
-    found = [_order(int(n), y, rel, q, average, flat, draws) for n in tried]
+    found = [_order(int(n), y, gain, q, average, flat, draws) for n in tried]
     strong = discoveries(np.array([f["p"] for f in found]))
     size = np.array([f["amplitude"] for f in found])
-    large = (size > SMALL * np.sqrt(np.mean(y**2))) & (size > STANDS * np.median(size))
+    padded = np.pad(size, 1)
+    peak = (size >= padded[2:]) & (size >= padded[:-2])  # a short range of motion smears an order over its neighbours
+    large = peak & (size > SMALL * np.sqrt(np.mean(y**2))) & (size > STANDS * np.median(size))
     return [f for f, is_strong in zip(found, strong & large, strict=True) if is_strong]
 
 
-def _order(n: int, y: Array, rel: Array, q: Array, average: Array, flat: list[Array], draws: Array) -> dict:
-    X = np.stack([*flat, np.cos(n * q) @ average, np.sin(n * q) @ average], 2) * rel[..., None]
-    scale = np.sqrt(np.mean(X**2, axis=(0, 1))) + 1e-300
-    X = X / scale
-    S, g = np.einsum("wmi,wmj->wij", X, X), np.einsum("wmi,wm->wi", X, y)
-    ridge = 1e-6 * np.eye(X.shape[2]) * S.sum() / X.shape[2]
-    beta = np.linalg.solve(S.sum(0) + ridge, g.sum(0))[-2:] / scale[-2:]
-    sampled = np.linalg.solve(np.tensordot(draws, S, 1) + ridge, np.tensordot(draws, g, 1)[..., None])[..., 0]
-    spread = np.cov((sampled[:, -2:] / scale[-2:]).T) + 1e-300 * np.eye(2)
-    z2 = float(beta @ np.linalg.solve(spread, beta))
+def _order(n: int, y: Array, gain: Array, q: Array, average: Array, flat: list[Array], draws: Array) -> dict:
+    X = np.stack([*flat, np.cos(n * q) @ average, np.sin(n * q) @ average], 2)
+    beta, sampled, _ = regress(y, X, gain, draws)
+    pair, spread = beta[-2:], np.cov(sampled[:, -2:].T) + 1e-300 * np.eye(2)
+    z2 = float(pair @ np.linalg.solve(spread, pair))
     # two coefficients, few conditions: Hotelling's rather than chi^2
-    return {"order": int(n), "amplitude": float(np.hypot(*beta)), "p": float((1 + z2 / 14) ** -7)}
+    return {"order": n, "amplitude": float(np.hypot(*pair)), "p": float((1 + z2 / 14) ** -7)}
 
 
 def line(hz: Array, power: Array, lowest: float = 1.0) -> tuple[float, float]:

@@ -14,7 +14,7 @@ from bayessim_mjx.diagnosis.uncertainty import interval
 
 Array = NDArray[np.float64]
 BINS = 8
-LEAST = 0.3  # reliability below which a node tells nothing
+LEAST = 0.3  # of the best reliability: nodes below tell nothing
 RATE = 0.05  # false discoveries among the significant bins
 SHUFFLES = 300
 ALONG = "force along the motion"
@@ -32,21 +32,25 @@ class Nodes:
     """One joint's estimated force and the measured quantities, at the nodes of all windows.
 
     Attributes:
-        force: `[W, m]`, N m or N; reliability: `[W, m]`; window: `[W, m]` its index.
+        force: `[W, m]`, N m or N; gain: `[W, m, m]`, what the estimate shows of a true force.
         axes: {axis: `[W, m]`}; units: {axis: unit}.
         joint, force_unit: for people.
     """
 
     force: Array
-    reliability: Array
+    gain: Array
     axes: dict[str, Array]
     units: dict[str, str]
     joint: str
     force_unit: str
 
     @property
+    def reliability(self) -> Array:
+        return np.asarray(self.gain.sum(2))
+
+    @property
     def used(self) -> NDArray[np.bool_]:
-        return self.reliability > LEAST
+        return self.reliability > LEAST * self.reliability.max()
 
     def along(self) -> Array:
         """Force times direction of motion: negative is against it."""
@@ -67,7 +71,7 @@ def nodes(disturbance: Disturbance, inputs: Inputs, dof: int) -> Nodes:
         values = inputs.of(quantity)[..., dof]
         axes[axis] = (np.abs(values) if axis.endswith("size") else values) @ average
         units[axis] = of.get(quantity, "")
-    return Nodes(disturbance.force[..., dof], disturbance.reliability[..., dof], axes, units, inputs.joints[dof], force)
+    return Nodes(disturbance.force[..., dof], disturbance.gain[:, dof], axes, units, inputs.joints[dof], force)
 
 
 def bins(node: Nodes, axis: str) -> tuple[Array, NDArray[np.int64]]:
