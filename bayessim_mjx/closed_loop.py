@@ -134,30 +134,36 @@ class Judge:
         other = replace(self, key=jax.random.fold_in(self.key, 2))
         return float((other.nominal(env, policy) if domain is None else other.drawn(env, policy)).mean())
 
-    def without(self, policy: Policy) -> list[dict[str, Any]]:
-        """Per effect and place: return on the corrected simulator minus that without it, with its standard error."""
+    def one_by_one(self, policy: Policy) -> list[dict[str, Any]]:
+        """Per effect and place: what it changes of the return, beside the other effects ("last") and by itself ("alone").
+
+        Both, because an effect that ends every episode at once hides all others.
+        """
         env = self.simulators.corrected
-        full = self.nominal(env, policy)
+        full, neutral = env.space.nominal, neutral_theta(env.physics)
+        with_all, with_none = self.nominal(env, policy), self.nominal(env, policy, neutral)
         out = []
-        for label, theta in switched_off(env.physics).items():
-            name, where = label.split("@", 1)
-            change = full - self.nominal(env, policy, theta)
-            out.append({"effect": name, "where": where, "change": float(change.mean()), "se": standard_error(change)})
+        for (name, where), own in places(env.physics).items():
+            last = with_all - self.nominal(env, policy, np.where(own, neutral, full))
+            alone = self.nominal(env, policy, np.where(own, full, neutral)) - with_none
+            changes = {
+                k: {"mean": float(x.mean()), "se": standard_error(x)} for k, x in (("last", last), ("alone", alone))
+            }
+            out.append({"effect": name, "where": where, **changes})
         return out
 
 
-def switched_off(physics: Physics) -> dict[str, Array]:
-    """{"effect@where": the nominal theta with this effect neutral there}."""
-    out, start = {}, len(physics.model_space)
-    for effect in physics.effects:
-        neutral, k = effect.defaults().nominal, len(effect.quantities)
-        for i, place in enumerate(effect.places()):
-            own = np.arange(i * k, (i + 1) * k)
-            theta = physics.space.nominal.astype(np.float64)
-            theta[start + own] = neutral[own]
-            out[f"{effect.name}@{place}"] = theta
-        start += len(neutral)
-    return out
+def places(physics: Physics) -> dict[tuple[str, str], NDArray[np.bool_]]:
+    """{(effect, where): which entries of theta are its parameters}, `[d]` each."""
+    labels = [(p.name.rsplit(".", 2)[1], p.target) for e in physics.effects for p in e.space().parameters]
+    every = [None] * len(physics.model_space) + labels
+    return {label: np.array([own == label for own in every]) for label in dict.fromkeys(labels)}
+
+
+def neutral_theta(physics: Physics) -> Array:
+    """Nominal, with all effects switched off."""
+    off = [e.defaults().nominal for e in physics.effects]
+    return np.concatenate([physics.model_space.nominal, *off])
 
 
 def replay(logs: Sequence[Log], nominal: Physics, corrected: Physics) -> dict[str, Any] | None:

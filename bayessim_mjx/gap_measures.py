@@ -81,19 +81,16 @@ def _redrawn(x: Array, rng: np.random.Generator) -> float:
 
 
 def relevance(nominal: Sequence[dict], corrected: Sequence[dict], cost: float) -> list[dict[str, Any]]:
-    """Which effects matter for the task: change of return by each effect, for the policy before and after retraining.
+    """Which effects matter for the task: {"effect", "where", "change": {policy: {"last", "alone"}}, "irrelevant"}.
 
     Args:
-        nominal, corrected: what `Judge.without` says of pi_0 and pi_1.
+        nominal, corrected: what `closed_loop.Judge.one_by_one` says of pi_0 and pi_1.
         cost: return that pi_0 loses by the whole correction (predicted).
     """
-    return [
-        {
-            "effect": a["effect"],
-            "where": a["where"],
-            "change": {"nominal": a["change"], "corrected": b["change"]},
-            "se": {"nominal": a["se"], "corrected": b["se"]},
-            "irrelevant": all(abs(x["change"]) < max(IRRELEVANT * abs(cost), SURE * x["se"]) for x in (a, b)),
-        }
-        for a, b in zip(nominal, corrected, strict=True)
-    ]
+    out = []
+    for before, after in zip(nominal, corrected, strict=True):
+        change = {n: {k: x[k] for k in ("last", "alone")} for n, x in (("nominal", before), ("corrected", after))}
+        every = [x for each in change.values() for x in each.values()]
+        idle = all(abs(x["mean"]) < max(IRRELEVANT * abs(cost), SURE * x["se"]) for x in every)
+        out.append({"effect": before["effect"], "where": before["where"], "change": change, "irrelevant": idle})
+    return out

@@ -120,7 +120,7 @@ class Study:
     def run(self, console: Any) -> dict[str, Any]:
         """The contents of gap_loop.json."""
         policies = self.all_policies(console)
-        console.phase("evaluating")
+        console.say(f"evaluating, {self.judge.episodes} episodes of every policy on every simulator ...")
         best = {role: [self.chosen(role, p) for p in each] for role, each in policies.items()}
         rows = {
             role: [self.judge.everywhere(p[at]) for p, at in zip(each, best[role], strict=True)]
@@ -146,10 +146,10 @@ class Study:
         return out
 
     def _relevance(self, policies: dict, best: dict, rows: dict) -> list[dict[str, Any]]:
-        """Effects taken out one at a time, for the first policy before and after retraining."""
+        """What each effect changes, for the first policy before and after retraining."""
         first = {role: policies[role][0][best[role][0]] for role in ("nominal", "corrected")}
         cost = float(np.mean(rows["nominal"][0]["nominal"] - rows["nominal"][0]["corrected"]))
-        each = {role: self.judge.without(policy) for role, policy in first.items()}
+        each = {role: self.judge.one_by_one(policy) for role, policy in first.items()}
         return measures.relevance(each["nominal"], each["corrected"], cost)
 
     def write(self, found: dict[str, Any]) -> Path:

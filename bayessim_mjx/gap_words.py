@@ -116,9 +116,10 @@ def _plus_minus(each: Sequence[Mapping[str, Any]], simulator: str) -> str:
 def _effects(effects: Sequence[Mapping[str, Any]], unicode: bool) -> Any:
     rows = []
     for e in effects:
-        changes = [f"{number(e['change'][r])} ± {number(e['se'][r])}" for r in ("nominal", "corrected")]
+        every = [e["change"][role][how] for role in ("nominal", "corrected") for how in ("alone", "last")]
+        changes = [f"{number(x['mean'])} ± {number(x['se'])}" for x in every]
         rows.append([e["effect"], e["where"], *changes, "no" if e["irrelevant"] else "yes"])
-    columns = ["effect", "where", "before retraining", "after", "matters"]
+    columns = ["effect", "where", "before: alone", "with the others", "retrained: alone", "with the others", "matters"]
     return _table("change of return by", columns, rows, unicode)
 
 

@@ -100,10 +100,10 @@ def test_true_and_wrong_diagnoses_and_a_second_start(folder, tmp_path, trained, 
     assert found["gap"]["training"]["after"] == 0.0
     assert found["gap"]["training"]["before"] > 3 and found["gap"]["training"]["closure"] == 1.0
     assert found["ranking"]["tau"]["corrected"] == 1.0 and found["ranking"]["violation"]["corrected"] == 0.0
-    assert [(e["effect"], e["where"]) for e in found["effects"]] == [
-        ("actuator_gain", "torque"),
-        ("coulomb_friction", "hinge"),
-    ]
+    gain, friction = found["effects"]
+    assert (gain["effect"], gain["where"], friction["effect"]) == ("actuator_gain", "torque", "coulomb_friction")
+    alone, last = (friction["change"]["nominal"][k]["mean"] for k in ("alone", "last"))
+    assert alone != last and not friction["irrelevant"]
     tags = {v.tag for _, e in records(event_files(out)[0]) if e.HasField("summary") for v in e.summary.value}
     assert {"Gap/before", "Gap/after", "Return_real/nominal"} <= tags
     assert "trained on the corrected simulator" in capsys.readouterr().out
@@ -227,19 +227,28 @@ def test_return_recovered():
 
 
 def test_which_effects_matter():
-    idle = {"effect": "backlash", "where": "hinge", "change": 0.2, "se": 0.01}
-    strong = idle | {"effect": "coulomb_friction", "change": -3.0}
-    found = gap_measures.relevance([idle, strong], [idle, idle | {"effect": "coulomb_friction"}], cost=10.0)
+    little, much = {"mean": 0.2, "se": 0.01}, {"mean": -3.0, "se": 0.01}
+    backlash, friction = ({"effect": n, "where": "hinge", "last": little} for n in ("backlash", "coulomb_friction"))
+    found = gap_measures.relevance(
+        [backlash | {"alone": little}, friction | {"alone": much}],  # hidden behind the others, but not alone
+        [backlash | {"alone": little}, friction | {"alone": little}],
+        cost=10.0,
+    )
     assert [e["irrelevant"] for e in found] == [True, False]
+    assert found[1]["change"]["nominal"] == {"last": little, "alone": much}
 
 
 def test_wide_ranges_marks_and_effects_switched_off(robot):
     space = closed_loop.wide(robot.space + ParameterSpace([Parameter("extra", 0.0, 0.0, 0.3)]))
     assert [(p.low, p.high, p.prior) for p in space.parameters] == [(0.5, 1.5, "uniform"), (0.0, 0.3, "uniform")]
     assert closed_loop.marks(80) == [0, 10, 20, 30, 40, 50, 60, 70, 80] and closed_loop.marks(2) == [0, 1, 2]
-    off = closed_loop.switched_off(apply.apply(diagnosis(TRUTH, MASS), robot.physics(robot.control_dt)))
-    np.testing.assert_allclose(off["actuator_gain@torque"], [1.1, 1.0, 0.3], rtol=1e-6)
-    np.testing.assert_allclose(off["coulomb_friction@hinge"], [1.1, 0.6, 0.0], rtol=1e-6)
+    physics = apply.apply(diagnosis(TRUTH, MASS), robot.physics(robot.control_dt))
+    np.testing.assert_allclose(closed_loop.neutral_theta(physics), [1.1, 1.0, 0.0], rtol=1e-6)
+    own = closed_loop.places(physics)
+    assert {k: v.tolist() for k, v in own.items()} == {
+        ("actuator_gain", "torque"): [False, True, False],
+        ("coulomb_friction", "hinge"): [False, False, True],
+    }
 
 
 @pytest.mark.slow

@@ -10,6 +10,8 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import mujoco
+
 from bayessim_mjx import effects as library
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.effects import native, storage
@@ -19,8 +21,6 @@ from bayessim_mjx.parameters import Parameter, ParameterSpace
 from bayessim_mjx.physics import Physics
 
 if TYPE_CHECKING:
-    import mujoco
-
     from bayessim_mjx.diagnosis.result import Diagnosis, Estimate, FoundEffect
     from bayessim_mjx.diagnosis.robot import Robot
 
@@ -163,12 +163,24 @@ def write_outputs(diagnosis: Diagnosis, robot: Robot, folder: str | Path) -> lis
     storage.write(folder / "effects.yaml", effects, identified, calibrated)
     source = robot.spec()
     spec, missing = native.write_model(source, calibrated, calibrated.nominal, effects)
-    spec = _at_home(spec, source.modelfiledir)
+    spec = _friction_acting(_at_home(spec, source.modelfiledir))
     spec.compile()
     left_out = "".join(f"  {sentence}\n" for sentence in missing)
     note = f"<!-- Not in this model:\n{left_out.replace('--', '- -')}-->\n" if missing else ""
     (folder / "model_with_effects.xml").write_text(note + spec.to_xml(), encoding="utf-8")
     return [f"model_with_effects.xml leaves out {sentence}" for sentence in missing]
+
+
+def _friction_acting(spec: mujoco.MjSpec) -> mujoco.MjSpec:
+    """Native friction is a constraint: where constraints are off as a whole, all others are now off one by one."""
+    off = mujoco.mjtDisableBit
+    if any(joint.frictionloss > 0 for joint in spec.joints):
+        flags = int(spec.option.disableflags) & ~int(off.mjDSBL_FRICTIONLOSS)
+        if flags & int(off.mjDSBL_CONSTRAINT):
+            others = int(off.mjDSBL_CONTACT) | int(off.mjDSBL_LIMIT) | int(off.mjDSBL_EQUALITY)
+            flags = flags & ~int(off.mjDSBL_CONSTRAINT) | others
+        spec.option.disableflags = flags
+    return spec
 
 
 def _at_home(spec: mujoco.MjSpec, folder: str) -> mujoco.MjSpec:

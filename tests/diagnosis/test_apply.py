@@ -155,6 +155,12 @@ def test_the_mjcf_has_what_mujoco_can_express(robot, tmp_path):
     assert model.actuator_gainprm[0, 0] == pytest.approx(0.6)
     assert model.body_mass[1] == pytest.approx(1.1)
     assert text.startswith("<!-- Not in this model:") and "actuator_delay at torque" in text
+    data = mujoco.MjData(model)
+    data.qpos[0] = (
+        0.03  # 0.16 N m of gravity against 0.3 N m of friction: it stays, although the task has no constraints
+    )
+    mujoco.mj_step(model, data, 40)
+    assert abs(data.qpos[0] - 0.03) < 0.01
 
 
 def test_known_parameters_without_estimates_stay_out_of_the_file(arm, tmp_path):
