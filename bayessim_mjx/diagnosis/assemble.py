@@ -14,6 +14,7 @@ from bayessim_mjx.diagnosis.models import Model
 from bayessim_mjx.diagnosis.result import Diagnosis, Estimate, FoundEffect, Gap, Place
 from bayessim_mjx.diagnosis.run import Findings, Setup, dof_names
 
+UNEXPLAINED = 2.0  # noise standard deviations that remain and that nothing predicts
 MANY = 24  # candidates in the isolability matrix, overlays in the report
 REMAINS = 0.3  # share of the calibrated gap that a flexible force closes on top of named effects: not in the library
 
@@ -58,6 +59,8 @@ def _verdict(found: Findings, remains: float) -> str:
         return "unexplained"
     if model.effects:
         return "ambiguous" if found.ruling.ambiguous else "effects"
+    if np.sqrt(race.base.total / (race.noise * len(race.base.cost))) > UNEXPLAINED:
+        return "unexplained"
     q, _ = race.nominal.quadratic(race.fitter.spread)
     floor = race.noise * len(race.base.cost) * race.settings.floor**2
     return "parameters" if q.c.sum() > max(1.1 * race.base.total, floor) else "no_gap"
@@ -259,7 +262,7 @@ def _sentences(name: str, effects: list[FoundEffect], parameters: dict, found: F
         "parameters": f"The parameters are off, the structure is right: recalibrated, the gap falls from {cost['nominal']:.3g} to {cost['calibrated']:.3g} noise standard deviations.",
         "effects": f"The simulator lacks {named}.",
         "ambiguous": f"The simulator lacks something like {named}; these logs cannot tell it from its rivals.",
-        "unexplained": "Something reproducible is missing that no effect of the library explains.",
+        "unexplained": "Something is missing that no effect of the library explains.",
         "insufficient_data": "Too little data to hold anything out.",
     }[name]
     out = [head]
@@ -274,7 +277,7 @@ def _sentences(name: str, effects: list[FoundEffect], parameters: dict, found: F
     flex = found.flexible_winner
     if name == "unexplained" and flex is not None:
         out += flex.text
-    if name in ("no_gap", "parameters") and found.race.above_noise(found.race.base):
+    if not effects and remains == 0.0 and found.race.above_noise(found.race.base):
         out.append(
             f"What remains ({cost['calibrated']:.3g}) no candidate and no flexible force predicts on held-out conditions: process noise, an input that was not logged, or noise larger than estimated."
         )

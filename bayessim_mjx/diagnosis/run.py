@@ -23,7 +23,8 @@ from bayessim_mjx.physics import Physics
 WINDOW = 0.5  # s
 SHORTEST = 0.004  # s, control period of the diagnosis; faster logs are resampled
 LIMITS = ((1, 160), (3, 96), (7, 64), (100, 48))  # (up to so many dofs, windows)
-BUDGET = 24000  # sub-steps of one simulation of all windows
+BUDGET = 24000  # sub-steps of one simulation of all windows; half of it for robots of more than MANY dofs
+MANY = 3
 LEAST = 6  # windows: with fewer nothing can be held out
 Progress = Callable[[str, int, int], None]
 
@@ -101,7 +102,13 @@ def prepare(
     fitter = Fitter(Simulator(physics, cut), candidates.base_coordinates(robot.space), physics.space.nominal)
     every = candidates.enumerate_candidates(physics)
     notes += [*floors.warnings, *(f"not tried: {text}" for text in left_out), *_few_conditions(cut)]
-    return Setup(robot, physics, seen, floors, fitter, every, size, settings or search.Settings(), seed, notes)
+    return Setup(robot, physics, seen, floors, fitter, every, size, settings or _settings(robot), seed, notes)
+
+
+def _settings(robot: Robot) -> search.Settings:
+    """Budgets for the robot's size; thresholds are the same for all."""
+    big = robot.mj_model.nv > MANY
+    return search.Settings(singles=24, pairs=5, screened=24, starts=8) if big else search.Settings()
 
 
 def _windows(
@@ -112,7 +119,8 @@ def _windows(
     length = int(np.clip(round(WINDOW / dt), 8, 100))
     if longest < length:
         raise TooLittleData(f"the longest log has {longest} control steps of {dt:.3g} s, one window needs {length}")
-    limit = min(limit, max(24, BUDGET // (length * physics.substeps)))
+    budget = BUDGET if robot.mj_model.nv <= MANY else BUDGET // 2
+    limit = min(limit, max(24, budget // (length * physics.substeps)))
     cut = windows.cut(logs, physics.mj_model, dt, physics.substeps, length, limit=limit, group=group, use_qvel=use_qvel)
     if len(cut) < LEAST:
         raise TooLittleData(f"{len(cut)} windows of {length * dt:.2g} s; holding conditions out needs {LEAST}")

@@ -36,8 +36,11 @@ class Screened:
     others: tuple[Array, ...] = ()
 
 
-def screen(fitter: Fitter, job: Job, candidates: Sequence[Candidate]) -> list[Screened]:
-    """All candidates on top of `job`, best first."""
+def screen(fitter: Fitter, job: Job, candidates: Sequence[Candidate], limit: int = 96) -> list[Screened]:
+    """All candidates on top of `job`, best first, on at most `limit` windows."""
+    count = len(job.r)
+    own = np.unique(np.linspace(0, count - 1, min(count, limit)).round().astype(int))
+    job = _part(job, own)
     owner, thetas, points = [], [], []
     for i, candidate in enumerate(candidates):
         for point in candidate.probes:
@@ -48,13 +51,14 @@ def screen(fitter: Fitter, job: Job, candidates: Sequence[Candidate]) -> list[Sc
     if not thetas:
         return []
     run = fitter.simulator.run
-    shifted = fitter.whiten(run(np.stack(thetas), np.repeat(job.offsets[None], len(thetas), 0)))
+    shifted = fitter.whiten(run(np.stack(thetas), np.repeat(job.offsets[None], len(thetas), 0), own))
     columns = job.r[None] - shifted  # [m, W, n]
     project = _Projection(fitter, job)
     each: dict[int, list[tuple[Screened, Array]]] = {}
     for i, point, column in zip(owner, points, columns, strict=True):
         each.setdefault(i, []).append((_one(project, candidates[i], point, column), point))
     best = [_with_others(found) for found in each.values()]
+    best = [replace(s, gain=s.gain * count / len(own)) for s in best]
     return sorted(best, key=lambda s: -s.gain)
 
 
@@ -70,6 +74,13 @@ def _with_others(found: list[tuple[Screened, Array]]) -> Screened:
 
     other = next((s.start for s, p in found[1:] if s.gain > 0 and sort_of(p) != sort_of(point)), None)
     return replace(first, others=(point,) if other is None else (point, other))
+
+
+def _part(job: Job, own: NDArray[np.int64]) -> Job:
+    """The job on some of its windows."""
+    return replace(
+        job, offsets=job.offsets[own], r=job.r[own], A=job.A[own], B=job.B[own], weight=job.weight[own], history=[]
+    )
 
 
 class _Projection:

@@ -10,8 +10,8 @@ import numpy as np
 
 from bayessim_mjx.diagnosis.candidates import Candidate
 from bayessim_mjx.diagnosis.models import Model
-from bayessim_mjx.diagnosis.search import Progress, Race, compatible, fit_models, ranked, special_cases, without
 from bayessim_mjx.diagnosis.screen import screen
+from bayessim_mjx.diagnosis.search import Progress, Race, compatible, fit_models, ranked, special_cases, without
 
 MILD = 10.0  # nats: below, held-out evidence between two models is called a tie
 
@@ -56,7 +56,9 @@ def _rivals(race: Race, winner: Model, effect: Candidate, say: Progress) -> list
     rest = without(race, winner, effect, say)
     others = [c for c in race.candidates if c is not effect and all(compatible(c, e) for e in rest.effects)]
     if rest.effects:
-        found = [s for s in screen(race.fitter, rest.job, others) if s.gain > 0][: race.settings.pairs]
+        found = [s for s in screen(race.fitter, rest.job, others, race.settings.screened) if s.gain > 0][
+            : race.settings.pairs
+        ]
         models = fit_models(race, [(rest, s) for s in found], "rivals", say)
     else:
         models = [m for m in ranked(race, 1) if m.effects[0] is not effect]

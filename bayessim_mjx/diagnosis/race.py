@@ -1,0 +1,198 @@
+"""The state of the race: what was fitted, what counts as better, and fitting more models."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from bayessim_mjx.diagnosis.candidates import Candidate
+from bayessim_mjx.diagnosis.fit import Fitter, Job
+from bayessim_mjx.diagnosis.models import Comparison, Model, compare, scored
+from bayessim_mjx.diagnosis.screen import Screened, screen
+from bayessim_mjx.diagnosis.uncertainty import deviations
+from bayessim_mjx.effects import load, names
+
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Thresholds and budgets of the race, fixed before any data are seen.
+
+    Attributes:
+        relevance: an effect must close this share of the gap above the noise; more: a further effect, of what the others
+            leave; drop: and lower the cost by this share.
+        evidence: and gain this many nats plus the logarithm of the number of candidates (family-wise).
+        t: and improve windows of all conditions: mean over clustered standard error.
+        floor: a model within this factor of the noise (rms) is not improved further.
+        tie: rivals are models whose share of the gap closed is within this of the winner's.
+        singles, pairs: how many candidates are fitted, and of how many all pairs; screened: windows looked at in
+            screening.
+        most: effects in one model; iterations: of a fit; fresh: base columns differenced anew at every step if there are
+            at most so many.
+    """
+
+    relevance: float = 0.05
+    more: float = 0.15
+    drop: float = 0.03
+    evidence: float = 5.0
+    t: float = 2.0
+    floor: float = 1.05
+    tie: float = 0.04
+    singles: int = 48
+    pairs: int = 7
+    most: int = 5
+    screened: int = 96
+    iterations: int = 12
+    fresh: int = 6
+    starts: int = 20
+
+
+@dataclass(eq=False)
+class Race:
+    """What was tried. `models` maps the labels of a model's effects to it."""
+
+    fitter: Fitter
+    candidates: Sequence[Candidate]
+    settings: Settings
+    nominal: Job
+    base: Model
+    models: dict[frozenset[str], Model] = field(default_factory=dict)
+    screened: list[Screened] = field(default_factory=list)
+    winner: Model | None = None
+    steps: list[tuple[str, Comparison]] = field(default_factory=list)
+
+    @property
+    def noise(self) -> float:
+        """Expected cost of a window under a perfect model."""
+        return float(self.fitter.size)
+
+    def better(self, old: Model, new: Model) -> Comparison:
+        return compare(old, new, self.fitter.simulator.windows.group, self.noise)
+
+    def passes(self, old: Model, new: Model) -> bool:
+        """Whether `new`'s additional effects are both real and relevant."""
+        c, s = self.better(old, new), self.settings
+        if not self.above_noise(old):
+            return False
+        many = np.log(max(len(self.candidates), 2)) * max(1, len(new.effects) - len(old.effects))
+        if not all(self.distinct(new, e) for e in new.effects if e not in old.effects):
+            return False
+        relevance = s.more if old.effects else s.relevance
+        return c.share > relevance and c.drop > s.drop and c.evidence > s.evidence + many and c.t > s.t
+
+    def above_noise(self, model: Model) -> bool:
+        """Whether the model's held-out error is worth explaining."""
+        return model.total > self.settings.floor**2 * self.noise * len(model.cost)
+
+    def distinct(self, model: Model, effect: Candidate) -> bool:
+        """Whether at least one amplitude of the effect is two standard deviations away from neutral."""
+        sd = deviations(self.fitter, model)
+        own = [model.job.names.index(c.name) for c in effect.coordinates]
+        off = [
+            abs(model.job.values[i] - c.neutral) / max(sd[i], 1e-300)
+            for i, c in zip(own, effect.coordinates, strict=True)
+        ]
+        return any(z > 2.0 for z, shape in zip(off, effect.shapes, strict=True) if not shape)
+
+    def closure(self, model: Model) -> float:
+        """Share of the base model's gap above the noise that `model` closes, held out."""
+        return 1.0 - max(model.total - self._floor(), 0.0) / max(self.base.total - self._floor(), 1e-12)
+
+    def _floor(self) -> float:
+        return min(self.noise * len(self.base.cost), min((m.total for m in self.models.values()), default=np.inf))
+
+
+def _fresh(race: Race, job: Job) -> list[int]:
+    """Columns to be differenced anew: the effects' at every step, the known parameters' at every third where affordable."""
+    base = len(race.fitter.base)
+    turn = base <= race.settings.fresh and len(job.history) % 3 == 0
+    return list(range(0 if turn else base, len(job.coordinates)))
+
+
+def fit_models(race: Race, plans: Sequence[tuple[Model, Screened]], label: str, say: Progress) -> list[Model]:
+    """Models of the plans' effects plus one more each, fitted together; what was fitted before is looked up."""
+    fitter, todo = race.fitter, {}
+    for model, extra in plans:
+        key = frozenset([*(c.label for c in model.effects), extra.candidate.label])
+        if key not in race.models and key not in todo:
+            todo[key] = (_starts(race, model, extra, len(todo)), (*model.effects, extra.candidate))
+    jobs = [job for several, _ in todo.values() for job in several]
+    total = len(jobs)
+    fitter.iterate(
+        jobs, race.settings.iterations, lambda j: _fresh(race, j), progress=lambda left: say(label, total - left, total)
+    )
+    for key, (several, effects) in todo.items():
+        race.models[key] = scored(fitter, min(several, key=lambda job: job.cost), effects)
+    keys = [frozenset([*(c.label for c in m.effects), e.candidate.label]) for m, e in plans]
+    return [race.models[k] for k in keys]
+
+
+def _starts(race: Race, model: Model, extra: Screened, rank: int) -> list[Job]:
+    """Jobs from several starting points: costs have several minima (an inertia hides in another, a shape is wrong)."""
+    fitter, coordinates = race.fitter, extra.candidate.coordinates
+    jobs = [fitter.derive(model.job, coordinates, extra.start)]
+    if rank < race.settings.starts and extra.others:
+        fresh = fitter.derive(model.job, coordinates, extra.others[0])
+        base = len(fitter.base)
+        fresh.values[:base] = [c.neutral for c in fitter.base]  # not from where the base went without the effect
+        jobs.append(fresh)
+        jobs += [fitter.derive(model.job, coordinates, other) for other in extra.others[1:]]
+    return jobs
+
+
+def ranked(race: Race, size: int | None = None) -> list[Model]:
+    """Models tried, best first."""
+    chosen = [m for m in race.models.values() if size is None or len(m.effects) == size]
+    return sorted(chosen, key=lambda m: m.total)
+
+
+def compatible(a: Candidate, b: Candidate) -> bool:
+    """Not the same numbers twice (an effect at one joint and tied over all)."""
+    return not {i for c in a.coordinates for i in c.index} & {i for c in b.coordinates for i in c.index}
+
+
+def start_of(race: Race, candidate: Candidate) -> Screened:
+    """The candidate with its values from its single fit as the start."""
+    single = race.models.get(frozenset([candidate.label]))
+    found = next(s for s in race.screened if s.candidate.label == candidate.label)
+    if single is None:
+        return found
+    return Screened(candidate, single.values_of(candidate), found.gain, found.absorbed, found.column)
+
+
+def polish(race: Race, model: Model) -> Model:
+    """All columns anew at the fit, and some more steps."""
+    job = race.fitter.refresh(model.job)
+    race.fitter.iterate([job], 4, lambda j: _fresh(race, j))
+    new = scored(race.fitter, race.fitter.refresh(job), model.effects)
+    race.models[frozenset(c.label for c in model.effects)] = new
+    return new
+
+
+def without(race: Race, model: Model, effect: Candidate, say: Progress) -> Model:
+    """The model without one of its effects, refitted."""
+    rest = [e for e in model.effects if e is not effect]
+    key = frozenset(c.label for c in rest)
+    if key not in race.models:
+        small = race.base
+        for e in rest:
+            start = Screened(e, model.values_of(e), 0.0, 0.0, np.zeros(0))
+            (small,) = fit_models(race, [(small, start)], "dropping", say)
+    return race.models[key]
+
+
+def exchange(race: Race, model: Model, old: Candidate, new: Candidate, say: Progress) -> Model:
+    """The model with one effect in the place of another, refitted."""
+    rest = without(race, model, old, say)
+    if rest.effects:
+        start = next(s for s in screen(race.fitter, rest.job, [new], race.settings.screened))
+        return fit_models(race, [(rest, start)], "exchanges", say)[0]
+    return fit_models(race, [(race.base, start_of(race, new))], "exchanges", say)[0]
+
+
+def special_cases(effect: Candidate) -> tuple[str, ...]:
+    """Names of the effects that it contains, from its class."""
+    return tuple(getattr(load(effect.effect), "contains", ())) if effect.effect in names() else ()
