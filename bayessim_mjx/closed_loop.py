@@ -135,7 +135,7 @@ class Judge:
         return float((other.nominal(env, policy) if domain is None else other.drawn(env, policy)).mean())
 
     def one_by_one(self, policy: Policy) -> list[dict[str, Any]]:
-        """Per effect and place: what it changes of the return, beside the other effects ("last") and by itself ("alone").
+        """Per effect and place: what it changes of the return, beside the others ("last") and by itself ("alone").
 
         Both, because an effect that ends every episode at once hides all others.
         """

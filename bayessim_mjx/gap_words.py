@@ -36,7 +36,7 @@ def sentences(found: Mapping[str, Any]) -> list[str]:
         out.append("No log declares a controller (metadata `controller: {law, kp, kd}`), so none was replayed.")
     idle = [f"{e['effect']} at {e['where']}" for e in found["effects"] if e["irrelevant"]]
     if idle:
-        out.append(f"For this task these need not be modelled: {', '.join(idle)}.")
+        out.append(f"By itself each of these could be left out for this task: {', '.join(idle)}.")
     return [s for s in out if s]
 
 
