@@ -124,8 +124,8 @@ def title(model: Model) -> str:
 def witnesses(models: Sequence[Model], logs: Sequence[Log]) -> list[str]:
     """Streams that would decide between the models' effects and that the logs do not have."""
     have = {name.split(":", 1)[0] for log in logs for name in log.streams}
-    wanted = [WITNESS[c.effect] for m in models for c in m.effects if c.effect in WITNESS]
-    return list(dict.fromkeys(text for key, text in wanted if key not in have))
+    wanted = dict(WITNESS[c.effect] for m in models for c in m.effects if c.effect in WITNESS)
+    return [text for key, text in wanted.items() if key not in have]
 
 
 def instead(models: Sequence[Model]) -> str:

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from bayessim_mjx.diagnosis.run import Setup
 
 Array = NDArray[np.float64]
-DRAWS = 16  # from the posterior of the truth's parameters
+DRAWS = 8  # from the posterior of the truth's parameters
 
 
 @dataclass(frozen=True, eq=False)

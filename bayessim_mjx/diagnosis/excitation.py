@@ -62,18 +62,20 @@ def middle(limits: Limits, logs: Sequence[Log], model: mujoco.MjModel) -> tuple[
 def menu(
     time: Array,
     joints: Mapping[str, int],
+    alone: Sequence[str],
     half: Array,
     speed: Array,
     release: Sequence[str],
     seed: int,
 ) -> list[Excitation]:
-    """Every kind of motion on every joint, and on all together.
+    """Every kind of motion on single joints, and on all together.
 
     Args:
-        time: `[T]`, s; joints: {name: dof} that are driven; half, speed: `[nv]`, usable half range and largest speed.
+        time: `[T]`, s; joints: {name: dof} that are concerned; alone: names of those moved one at a time.
+        half, speed: `[nv]`, usable half range and largest speed.
         release: names of the joints whose drive can be switched off.
     """
-    places = [*joints, *(["all"] if len(joints) > 1 else [])]
+    places = [*alone, *(["all"] if len(joints) > 1 else [])]
     out = []
     for kind, shape in SHAPES.items():
         for place in places:

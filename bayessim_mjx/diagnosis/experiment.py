@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
+import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
@@ -27,9 +28,10 @@ Array = NDArray[np.float64]
 SECONDS = 10.0
 MOST = 4  # models compared
 NOTHING = 1.0  # nats: less separates nobody
-BUDGET = 24_000  # windows simulated for a first look at the whole menu
-FINAL = 5  # experiments looked at in full
+BUDGET = 6_000  # windows simulated for a first look at the whole menu
+FINAL = 3  # experiments looked at in full
 WEIGHT = 0.1  # least share of a surviving model
+ALONE = 2  # joints that are moved one at a time where more are concerned
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,11 +97,12 @@ def propose(
     scorer = Scorer(setup, models, weights, seed)
     allowed = limits_of(model, cut.logs, limits)
     rows = max(cut.steps, int(round(SECONDS / cut.dt)) // cut.steps * cut.steps)
-    time = cut.dt * np.arange(rows)
+    time = np.asarray(cut.dt * np.arange(rows), np.float64)
     effects = {c.effect for m in models for c in m.effects} | {"payload", "gravity_tilt"}
     stage = Rehearsal(setup, effects, time, allowed)
     joints = _touched(stage.drives.joints(), models, model)
-    every = menu(time, joints, stage.half, allowed.speed, stage.release, seed) if joints else []
+    loaded = sorted(joints, key=lambda n: -setup.scales.force[joints[n]])[:ALONE]
+    every = menu(time, joints, loaded, stage.half, allowed.speed, stage.release, seed) if joints else []
     scored = _look(scorer, stage, every)
     attended = _with_help(scorer, stage, scored, model)
     final = _in_full(scorer, stage, scored, attended)
@@ -165,11 +168,11 @@ def _scored(scorer: Scorer, played: Played, pairs: Array, help_: advice.Help | N
 
 
 def _with_help(scorer: Scorer, stage: Rehearsal, scored: list[Scored], model: Any) -> list[Scored]:
-    """The best three motions again, with a known payload and with the robot mounted on its side."""
+    """The best two motions again, with a known payload and with the robot mounted on its side."""
     out = []
-    top = [s.played.excitation for s in scored[:3]]
+    top = [s.played.excitation for s in scored[:2]]
     for own in advice.helps(scorer.setup) if top else []:
-        gravity = np.asarray(tilted(np.asarray(model.opt.gravity), *own.tilt))
+        gravity = np.asarray(tilted(jnp.asarray(model.opt.gravity), *(jnp.asarray(a) for a in own.tilt)))
         played = [p for p in stage.play(top, _thetas(scorer, own.shift), gravity) if p.safe]
         full = len(stage.time) // scorer.fitter.simulator.windows.steps
         if played:

@@ -88,7 +88,7 @@ class Rehearsal:
         torque = jnp.asarray([k == "torque" for k in d.kind])
         world = self.physics.world(theta, plan.start)
 
-        def step(world: Any, row: tuple) -> tuple:
+        def step(world: Any, row: tuple) -> tuple[Any, tuple]:
             ref, speed, feed, live = row
             q, w = world.measurement["qpos"], world.measurement["qvel"]
             u = feed + jnp.asarray(d.kp) * (ref - q[d.q]) + jnp.asarray(d.kd) * (speed - w[d.v])
@@ -98,6 +98,8 @@ class Rehearsal:
             new, data = control_step(self.physics, world, u, Drive(None, enabled, self.law))
             return new, (q, w, u, data.actuator_force)
 
+        end: Any
+        rows: Any
         end, rows = jax.lax.scan(step, world, (plan.ref, plan.speed, plan.feed, plan.live))
         return rows, (end.measurement["qpos"], end.measurement["qvel"])
 
@@ -162,7 +164,7 @@ class Rehearsal:
             ),
         )
         arrays = (ref, speed[:, d.v], feed, e.live[:, d.v], self.start)
-        return Plan(*(np.asarray(x, np.float32) for x in arrays))
+        return Plan(*(jnp.asarray(x, jnp.float32) for x in arrays))
 
     def _turn(self, offset: Array, i: int) -> float:
         """s, time in which actuator i can turn the motion round with half of its effort."""
