@@ -59,7 +59,7 @@ class Disturbance:
 
     Attributes:
         force, sd: `[W, m, nv]`, posterior mean and standard deviation, N m or N.
-        gain: `[W, nv, m, m]`, expected mean = gain times a true force on this dof: what the prior's pull to zero leaves.
+        gain: `[W, nv, m, m]`, expected mean = gain times a true force on this dof (the prior pulls to zero).
         amplitude: `[nv]`, prior standard deviation; memory: s, its correlation time.
         noise: factor on the standard deviation of the measurement noise.
         values: `[k]`, the job's parameters, estimated together with the force.

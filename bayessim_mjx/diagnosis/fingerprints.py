@@ -51,7 +51,7 @@ class Fingerprint:
 
 
 def regress(y: Array, X: Array, gain: Array, draws: Array) -> tuple[Array, Array, Array]:
-    """(beta `[k]`, resampled `[n, k]`, rms of terms) for y `[W, m]`, X `[W, m, k]`, gain `[W, m, m]`; draws: `[n, W]`."""
+    """(beta `[k]`, resampled `[n, k]`, rms of terms `[k]`): y `[W, m]`, X `[W, m, k]`, gain `[W, m, m]`."""
     rows = gain @ X
     scale = np.sqrt(np.mean(rows**2, axis=(0, 1))) + 1e-300
     rows = rows / scale
