@@ -13,8 +13,8 @@ from bayessim_mjx.errors import UserError
 from bayessim_mjx.parameters.attributes import suggest
 
 ALIASES = {
-    "direct": "direct", "torque": "direct", "force": "direct", "effort": "direct", "voltage": "direct", "duty": "direct",
-    "position": "position", "pd": "position", "p": "position", "velocity": "velocity",
+    "direct": "direct", "torque": "direct", "force": "direct", "effort": "direct", "voltage": "direct",
+    "duty": "direct", "position": "position", "pd": "position", "p": "position", "velocity": "velocity",
 }  # fmt: skip
 KEYS = ("law", "kp", "kd", "limit", "scale")
 
@@ -37,7 +37,9 @@ class Law(struct.PyTreeNode):
     qadr: tuple[int, ...] = struct.field(pytree_node=False)
     dadr: tuple[int, ...] = struct.field(pytree_node=False)
 
-    def __call__(self, command: jax.Array, qpos: jax.Array, qvel: jax.Array, seen: Mapping[str, jax.Array]) -> jax.Array:
+    def __call__(
+        self, command: jax.Array, qpos: jax.Array, qvel: jax.Array, seen: Mapping[str, jax.Array]
+    ) -> jax.Array:
         """Command `[nu]` -> ctrl `[nu]`."""
         q = qpos[jnp.asarray(self.qadr)] + (seen["error"][jnp.asarray(self.qadr)] if "error" in seen else 0.0)
         w = qvel[jnp.asarray(self.dadr)]
@@ -67,7 +69,8 @@ def read(metadata: Mapping[str, Any], model: mujoco.MjModel, actuators: Sequence
     if not isinstance(given, Mapping):
         raise UserError(f"{source}: controller = {given!r}; allowed: a mapping with {', '.join(KEYS)}")
     rows = [_of_actuator(given, name, actuators, source) for name in actuators]
-    joint_of = np.where(model.actuator_trntype <= int(mujoco.mjtTrn.mjTRN_JOINTINPARENT), model.actuator_trnid[:, 0], -1)
+    on_joint = model.actuator_trntype <= int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+    joint_of = np.where(on_joint, model.actuator_trnid[:, 0], -1)
     for row, name, joint in zip(rows, actuators, joint_of, strict=True):
         if row["law"] != "direct" and joint < 0:
             raise UserError(f"{source}: controller.law = {row['law']} of actuator {name!r}, which drives no joint")
@@ -97,7 +100,7 @@ def _of_actuator(given: Mapping[str, Any], name: str, actuators: Sequence[str], 
     law = str(own.get("law", "direct")).lower()
     if law not in ALIASES:
         law = "direct"  # a note for people ("firmware P, inside the logged duty") is not a law to be simulated
-    row = {"law": ALIASES[law], "kp": 0.0, "kd": 0.0, "limit": np.inf, "scale": 1.0}
+    row: dict[str, Any] = {"law": ALIASES[law], "kp": 0.0, "kd": 0.0, "limit": np.inf, "scale": 1.0}
     for key in ("kp", "kd", "limit", "scale"):
         if own.get(key) is None or (ALIASES[law] == "direct" and key != "scale"):
             continue

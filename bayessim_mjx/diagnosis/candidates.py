@@ -9,7 +9,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bayessim_mjx import effects as library
 from bayessim_mjx.diagnosis.scales import Scales, ranges
 from bayessim_mjx.effects.effect import Effect, Quantity
 from bayessim_mjx.effects.site import places
@@ -85,7 +84,7 @@ def _precision(p: Parameter) -> float:
 def stack(
     kinds: Sequence[type[Effect]], model_space: ParameterSpace, scales: Scales
 ) -> tuple[tuple[Effect, ...], list[str]]:
-    """One Effect per kind over all of its places, each place with values and ranges of its own; and what is left out."""
+    """One Effect per kind over all of its places, each with values and ranges of its own; and what is left out."""
     made, left_out = [], []
     for kind in kinds:
         found = tuple(p for p in places(kind.kind, scales.model) if _alive(kind, p, scales))
@@ -175,7 +174,7 @@ def _probes(quantities: Sequence[Quantity], coordinates: Sequence[Coordinate]) -
 
 
 def _grid(q: Quantity, c: Coordinate) -> list[float]:
-    """Shapes: over the whole range. Amplitudes: away from neutral, upwards where there is room (a secant has no sign)."""
+    """Shapes: over the whole range. Amplitudes: from neutral, upwards where there is room (a secant has no sign)."""
     if q.shape:
         return [c.low + f * (c.high - c.low) for f in q.grid]
     end = c.high if c.high > c.neutral else c.low

@@ -1,7 +1,7 @@
 """Multiple shooting: bounded Levenberg-Marquardt for many candidate models in lockstep, so that one call simulates all.
 
-Each job has its own free coordinates; parameters common to all and start states keep the columns of the base fit until a
-refresh. Residuals are whitened by the noise; windows in which the simulation is far off everywhere are weighted down.
+Each job has its own free coordinates; parameters common to all and start states keep the columns of the base fit until
+a refresh. Residuals are whitened by the noise; windows in which the simulation is far off everywhere are weighted down.
 """
 
 from __future__ import annotations
@@ -144,7 +144,8 @@ class Fitter:
         """A job with more coordinates, starting at `values` for these; its first columns come with the first step."""
         own = tuple(job.coordinates) + tuple(extra)
         blank = np.zeros((*job.r.shape, len(extra)))
-        new = Job(own, np.concatenate([job.values, values]), job.offsets, job.r, np.concatenate([job.A, blank], 2), job.B, job.weight, np.inf)  # fmt: skip
+        start, columns = np.concatenate([job.values, values]), np.concatenate([job.A, blank], 2)
+        new = Job(own, start, job.offsets, job.r, columns, job.B, job.weight, np.inf)
         new.label = label
         return new
 
@@ -156,7 +157,7 @@ class Fitter:
         tolerance: float = 1e-3,
         progress: Callable[[int], None] | None = None,
     ) -> None:
-        """Levenberg-Marquardt in lockstep, in place; `fresh(job)`: which columns are differenced anew at every point."""
+        """Levenberg-Marquardt in lockstep, in place; `fresh(job)`: columns that are differenced anew at every point."""
         state = {id(j): (j.values.copy(), j.offsets.copy()) for j in jobs}  # trial points
         active = list(jobs)
         for _ in range(iterations + 1):

@@ -2,7 +2,8 @@
 
 For a window with residual r, columns A (parameters) and B (start state, prior spread D, current offset x):
     |r - A p - B dx|^2 + |(x + dx) / D|^2, minimised over dx, is  c - 2 g'p + p'S p   (Schur complement).
-Everything after the rollouts (steps, held-out scores, bootstraps, screening of pairs) is algebra on (c, g, S) per window.
+Everything after the rollouts (steps, held-out scores, bootstraps, screening of pairs) is algebra on each window's
+(c, g, S).
 """
 
 from __future__ import annotations
@@ -101,7 +102,7 @@ def solve(S: Array, g: Array, low: Array, high: Array) -> Array:
     return p * scale
 
 
-def _cholesky_solve(H: Array, h: Array) -> Array:
+def _cholesky_solve(H: Array, h: Array) -> NDArray[np.floating]:
     try:
         return np.linalg.solve(H, h)
     except np.linalg.LinAlgError:
@@ -114,8 +115,8 @@ def held_out(
     """Leave-one-condition-out by one Newton step from the fit to all windows (the infinitesimal jackknife).
 
     Args:
-        q: at the fit; group, weight: `[W]`; precision, pull: `[K]` of the Gaussian prior, pull = precision * (mean - value);
-        low, high: `[K]`, how far each parameter may move.
+        q: at the fit; group, weight: `[W]`; precision, pull: `[K]` of the Gaussian prior, pull = precision * (mean -
+            value); low, high: `[K]`, how far each parameter may move.
 
     Returns:
         (costs of the held-out windows `[W]`, estimates relative to the fit `[G, K]`).

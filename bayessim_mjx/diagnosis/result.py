@@ -146,21 +146,23 @@ class Diagnosis:
 def load(folder: str | Path) -> Diagnosis:
     """A saved diagnosis; what was not finite is NaN again."""
     folder = Path(folder)
-    raw = json.loads((folder / "diagnosis.json").read_text())
+    raw: dict[str, Any] = json.loads((folder / "diagnosis.json").read_text())
     details = folder / "details.json"
     raw["details"] = json.loads(details.read_text()) if details.is_file() else {}
     raw["effects"] = [_effect(e) for e in raw["effects"]]
     raw["where"] = [Place(**{**p, "ci": tuple(p["ci"])}) for p in raw["where"]]
-    raw["gap"] = Gap(**{k: math.nan if v is None else v for k, v in raw["gap"].items()})
+    raw["gap"] = Gap(**_numbers(raw["gap"]))
     return Diagnosis(**raw)
 
 
 def _effect(raw: dict[str, Any]) -> FoundEffect:
-    parameters = {
-        k: Estimate(**{n: math.nan if x is None else x for n, x in v.items()}) for k, v in raw["parameters"].items()
-    }
-    rest = {k: math.nan if v is None else v for k, v in raw.items() if k != "parameters"}
+    parameters = {k: Estimate(**_numbers(v)) for k, v in raw["parameters"].items()}
+    rest = _numbers({k: v for k, v in raw.items() if k != "parameters"})
     return FoundEffect(**{**rest, "parameters": parameters, "gap_closed_ci": tuple(raw["gap_closed_ci"])})
+
+
+def _numbers(raw: dict[str, Any]) -> dict[str, Any]:
+    return {k: math.nan if v is None else v for k, v in raw.items()}
 
 
 def _plain(value: Any) -> Any:

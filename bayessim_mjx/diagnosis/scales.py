@@ -1,4 +1,4 @@
-"""How large forces, speeds and travel are at each place of this robot in these logs: what ranges of effects grow with."""
+"""How large forces, speeds and travel are at each place of this robot in these logs: what effects' ranges grow with."""
 
 from __future__ import annotations
 
@@ -145,9 +145,10 @@ def _ranged(p: Parameter, q: Quantity, here: dict[str, float], effect: type[Effe
     low, high = (float(q.neutral + r * unit) if q.neutral == 0 else float(r * unit) for r in q.reach)
     nominal = min(max(q.neutral, low), high)
     low, high = (low, high) if low < high else (q.low, q.high)
+    prior = q.prior if low > 0 else "uniform"
     return Parameter(
-        p.name, nominal, low, high, unit=p.unit, prior=q.prior if low > 0 else "uniform", attribute=p.attribute, target=p.target, kind="effect"
-    )  # fmt: skip
+        p.name, nominal, low, high, unit=p.unit, prior=prior, attribute=p.attribute, target=p.target, kind="effect"
+    )
 
 
 def _product(expression: str, here: dict[str, float], effect: type[Effect]) -> float:

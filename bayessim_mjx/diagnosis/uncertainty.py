@@ -15,8 +15,8 @@ LEVEL = 0.9
 def deviations(fitter: Fitter, model: Model) -> Array:
     """Standard deviations `[k]` of the model's parameters.
 
-    The larger of the formal one, inflated by the misfit and the residuals' correlation, and the jackknife over operating
-    conditions (Quenouille, 1956): model errors repeat within a condition, so windows are no independent samples.
+    The larger of the formal one, inflated by the misfit and the residuals' correlation, and the jackknife over
+    operating conditions (Quenouille, 1956): model errors repeat within a condition, so windows are not independent.
     """
     q, _ = model.job.quadratic(fitter.spread)
     precision, _, _, _ = model.job.prior()

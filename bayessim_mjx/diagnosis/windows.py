@@ -1,4 +1,4 @@
-"""Logs cut into windows for multiple shooting: commands per sub-step, measured motion around each start, noise, groups."""
+"""Logs cut into windows for multiple shooting: commands per sub-step, measured motion at each start, noise, groups."""
 
 from __future__ import annotations
 

@@ -28,14 +28,14 @@ class Quantity:
         neutral: the value that switches it off (its part of the effect) exactly.
         low, high: range where nothing is known of the robot.
         unit: for a hinge; a slide's is derived from it.
-        per: what the range grows with, so that one library fits a toy servo and an industrial arm: "force" (largest effort
-            or load at the place), "command" (largest command), "speed", "travel", "inertia" (M_ii), "mass" (of the
-            body), or products such as "force/speed"; "" for absolute ranges.
+        per: what the range grows with, so that one library fits a toy servo and an industrial arm: "force" (largest
+            effort or load at the place), "command" (largest command), "speed", "travel", "inertia" (M_ii), "mass" (of
+            the body), or products such as "force/speed"; "" for absolute ranges.
         reach: (low, high) in multiples of `per`, used by the diagnosis in the place of low, high.
         grid: starting values for a fit, as fractions of the way from neutral to each end of the range.
         prior: "uniform" or "loguniform".
-        shape: it only shapes the effect (a speed, an order, a lever arm): where the other quantities are neutral the effect
-            is off whatever this one is; `grid` is then in fractions of the range from low to high.
+        shape: it only shapes the effect (a speed, an order, a lever arm): where the other quantities are neutral the
+            effect is off whatever this one is; `grid` is then in fractions of the range from low to high.
     """
 
     name: str
@@ -54,10 +54,10 @@ class Quantity:
 class Effect(abc.ABC):
     """One unmodelled effect, at one place of the robot or at several.
 
-    Subclasses are frozen dataclasses, state `name`, `kind` and `quantities`, and override the hooks they need; the others
-    are the identity and cost nothing. Rules: hooks are pure and traceable; every number that may be inferred is an entry
-    of `theta` (this effect's own slice, in the order of `space()`); at the neutral theta each hook returns its input bit
-    for bit. Hooks work on all places at once: `at.values(theta)` is `[places, quantities]`.
+    Subclasses are frozen dataclasses, state `name`, `kind` and `quantities`, and override the hooks they need; the
+    others are the identity and cost nothing. Rules: hooks are pure and traceable; every number that may be inferred is
+    an entry of `theta` (this effect's own slice, in the order of `space()`); at the neutral theta each hook returns its
+    input bit for bit. Hooks work on all places at once: `at.values(theta)` is `[places, quantities]`.
 
     Attributes:
         where: MuJoCo name of the actuator, joint, body ... concerned; a tuple of names: each with values of its own;
@@ -121,7 +121,7 @@ class Effect(abc.ABC):
         return find(self, mj_model, timestep, substeps)
 
     def init(self, at: Site) -> Any:
-        """Memory at the start of an episode, a pytree of arrays of fixed shape; no constants (keep those in the site)."""
+        """Memory at the start of an episode: a pytree of arrays of fixed shape; constants belong in the site."""
         return ()
 
     def on_model(self, at: Site, model: "mjx.Model", theta: jax.Array) -> "mjx.Model":
@@ -142,7 +142,7 @@ class Effect(abc.ABC):
     def on_actuator(
         self, at: Site, memory: Any, step: SubStep, force: jax.Array, theta: jax.Array
     ) -> tuple[Any, jax.Array]:
-        """Change the actuators' forces `[nu]` of this sub-step (as MuJoCo computed and earlier effects changed them)."""
+        """Change the actuators' forces `[nu]` of this sub-step, as MuJoCo and earlier effects left them."""
         return memory, force
 
     def on_force(self, at: Site, memory: Any, step: SubStep, theta: jax.Array) -> tuple[Any, jax.Array]:

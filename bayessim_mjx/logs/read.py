@@ -35,9 +35,9 @@ def read_logs(
 ) -> list[Log]:
     """Read all runs of a folder (or the files named), in the model's order of joints and actuators.
 
-    A folder's own `map.yaml` is used where `map` is not given. Files are cut at gaps longer than MAX_GAP periods and 10 ms;
-    `<file stem>.yaml` beside a file becomes its metadata; `sigma` and `quantum` there, {<channel>: value}, replace the
-    estimates of a channel's noise and resolution.
+    A folder's own `map.yaml` is used where `map` is not given. Files are cut at gaps longer than MAX_GAP periods and
+    10 ms; `<file stem>.yaml` beside a file becomes its metadata; `sigma` and `quantum` there, {<channel>: value},
+    replace the estimates of a channel's noise and resolution.
 
     Raises:
         UserError: whatever is wrong with a file, naming the file, its column and row, and what is allowed.
