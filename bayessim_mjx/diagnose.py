@@ -27,7 +27,7 @@ class _Parser(argparse.ArgumentParser):
 def _parser() -> _Parser:
     parser = _Parser(
         prog="python -m bayessim_mjx.diagnose",
-        description="Where the gap between logs and simulator lies, which effects cause it, how far it shrinks with them.",
+        description="Where the gap between logs and simulator lies, which effects cause it, how far it shrinks.",
         allow_abbrev=False,
     )
     parser.add_argument("--task", help="one of our tasks (see main --list_tasks)")
@@ -138,7 +138,7 @@ def _diagnose(argv: Sequence[str] | None) -> int:
         result = _diagnosis(args, robot, notes, say)
         say("writing the report", 0, 1)
         result = _write(result, robot, Path(args.out), report)
-    report.console(result)
+    report.console(result, Path(args.out))
     print(f"{time.monotonic() - began:.0f} s; open {Path(args.out) / 'report.html'}")
     return 0
 
@@ -150,7 +150,8 @@ def _write(result: "Diagnosis", robot: "Robot", folder: Path, report: Any) -> "D
     result.save(folder)  # before anything that could fail: nothing computed is lost
     result = load(folder)
     if result.verdict != "insufficient_data":
-        apply.write_outputs(result, robot, folder)
+        result.warnings.extend(apply.write_outputs(result, robot, folder))
+        result.save(folder)
     report.write(result, folder)
     report.tensorboard(result, folder)
     return result

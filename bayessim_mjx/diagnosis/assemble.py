@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -55,7 +56,15 @@ def _remains(found: Findings) -> float:
 
 def _verdict(found: Findings, remains: float) -> str:
     race, model = found.race, found.ruling.model
-    if remains > REMAINS or (model.effects and found.flexible_winner is not None and _beaten(found)):
+    cost = {k: float(p.cost(found.setup.fitter.simulator.windows.steps).mean()) for k, p in found.predictions.items()}
+    left = cost["with_effects"] - 1.0
+    if model.effects and left > UNEXPLAINED**2 - 1.0 and left > 0.6 * (cost["calibrated"] - 1.0):
+        return "unexplained"  # what is named closes little of it
+    if (
+        race.above_noise(model)
+        and remains > REMAINS
+        or (model.effects and found.flexible_winner is not None and _beaten(found))
+    ):
         return "unexplained"
     if model.effects:
         return "ambiguous" if found.ruling.ambiguous else "effects"
@@ -366,7 +375,7 @@ def _episodes(found: Findings) -> list[dict[str, Any]]:
 
 def versions() -> dict[str, str]:
     """Versions of what the result depends on."""
-    out = {}
+    out: dict[str, str] = {}
     for package in ("bayessim-mjx", "mujoco", "mujoco-mjx", "jax", "numpy"):
         try:
             out[package] = importlib.metadata.version(package)
@@ -384,5 +393,39 @@ def insufficient(reason: str, notes: list[str]) -> Diagnosis:
 
 
 def with_more(result: Diagnosis, found: Findings, folder: Path, say: search.Progress) -> Diagnosis:
-    """The result with maps, spectra and the next experiment; what fails there is a warning, the verdict stands."""
+    """The result with maps, spectra and the next experiment; what fails there becomes a warning, the verdict stands."""
+    for part, text in ((_with_places, "where"), (_with_experiment, "next experiment")):
+        say(text, 0, 1)
+        try:
+            result = part(result, found, folder)
+        except Exception as error:  # the verdict is there: a picture or proposal less must not lose it
+            result.warnings.append(f"{text}: not available ({type(error).__name__}: {error})")
     return result
+
+
+def _with_places(result: Diagnosis, found: Findings, folder: Path) -> Diagnosis:
+    from bayessim_mjx.diagnosis import frequency, where
+
+    if found.disturbance is None:
+        return result
+    fitter, job = found.setup.fitter, found.race.base.job
+    places, maps, sentences = where.locate(fitter, job, found.disturbance, seed=found.setup.seed)
+    spectra, heard = frequency.analyse(fitter, job, found.disturbance, seed=found.setup.seed)
+    details = result.details | {"maps": maps, "frequency": spectra}
+    return replace(
+        result, where=places or result.where, sentences=[*result.sentences, *sentences, *heard], details=details
+    )
+
+
+def _with_experiment(result: Diagnosis, found: Findings, folder: Path) -> Diagnosis:
+    from bayessim_mjx.diagnosis import command, experiment
+
+    if not (found.ruling.model.effects or found.race.above_noise(found.race.base)):
+        return result
+    proposal = experiment.propose(found.setup, found.race, found.ruling, seed=found.setup.seed)
+    file = ""
+    if proposal.chosen is not None:
+        folder.mkdir(parents=True, exist_ok=True)
+        file = command.write_command(folder / "next_experiment.csv", proposal, str(folder / "diagnosis.json")).name
+    details = result.details | {"experiments": proposal.details()}
+    return replace(result, next_experiment=proposal.to_dict(file), details=details)

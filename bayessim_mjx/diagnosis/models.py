@@ -78,12 +78,14 @@ class Comparison:
         drop: as a share of the old cost itself.
         evidence: N_eff/2 log(cost ratio), nats.
         t: mean over windows of the robust log gain, over its standard error clustered by condition.
+        worst: the smallest drop among the conditions, as a share of the condition's old cost.
     """
 
     share: float
     drop: float
     evidence: float
     t: float
+    worst: float
 
 
 def compare(old: Model, new: Model, group: NDArray[np.int64], noise: float) -> Comparison:
@@ -96,7 +98,12 @@ def compare(old: Model, new: Model, group: NDArray[np.int64], noise: float) -> C
         drop=gain / old.total,
         evidence=0.5 * new.samples * float(np.log(old.total / new.total)),
         t=clustered_t(log_gain, group),
+        worst=min(_drop(old.cost[group == g], new.cost[group == g], noise) for g in np.unique(group)),
     )
+
+
+def _drop(old: Array, new: Array, noise: float) -> float:
+    return float((old.sum() - new.sum()) / (old.sum() + noise * len(old)))
 
 
 def clustered_t(x: Array, group: NDArray[np.int64]) -> float:

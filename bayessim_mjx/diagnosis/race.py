@@ -39,7 +39,7 @@ class Settings:
     drop: float = 0.03
     evidence: float = 5.0
     t: float = 2.0
-    floor: float = 1.05
+    floor: float = 1.3
     tie: float = 0.04
     singles: int = 48
     pairs: int = 7
@@ -59,10 +59,9 @@ class Race:
     settings: Settings
     nominal: Job
     base: Model
+    winner: Model
     models: dict[frozenset[str], Model] = field(default_factory=dict)
     screened: list[Screened] = field(default_factory=list)
-    winner: Model | None = None
-    steps: list[tuple[str, Comparison]] = field(default_factory=list)
 
     @property
     def noise(self) -> float:
@@ -81,7 +80,25 @@ class Race:
         if not all(self.distinct(new, e) for e in new.effects if e not in old.effects):
             return False
         relevance = s.more if old.effects else s.relevance
-        return c.share > relevance and c.drop > s.drop and c.evidence > s.evidence + many and c.t > s.t
+        if not (c.share > relevance and c.drop > s.drop and c.evidence > s.evidence + many):
+            return False
+        # what acts in few windows only (a limit, drag at speed) helps few of them, but then by much and harms no other
+        rare = c.evidence > 10 * s.evidence + many and c.share > 0.3 and c.worst > -0.1
+        return c.t > s.t or rare
+
+    def at_noise(self, model: Model) -> bool:
+        """Whether the model predicts as well as the noise allows."""
+        return model.total <= self.noise * len(model.cost)
+
+    def best_of(self, old: Model, models: Sequence[Model]) -> Model | None:
+        """The best model; of those that leave nearly as little of the gap of `old`, the one with the fewest numbers."""
+        if not models:
+            return None
+        best = min(models, key=lambda m: m.total)
+        room = 0.1 * max(old.total - self.noise * len(old.cost), 0.0)
+        near = [m for m in models if m.total <= best.total + room and self.at_noise(m) >= self.at_noise(best)]
+        told = [m for m in near if self.at_noise(m) or m.total < 2.0 * best.total]
+        return min(told, key=lambda m: (m.size, m.total))
 
     def above_noise(self, model: Model) -> bool:
         """Whether the model's held-out error is worth explaining."""

@@ -11,8 +11,10 @@ import numpy as np
 
 from bayessim_mjx import effects as library
 from bayessim_mjx.diagnosis import candidates, channels, gap, gate, noise, scales, search, verdict, windows
+from bayessim_mjx.diagnosis.disturbance import Disturbance, estimate
 from bayessim_mjx.diagnosis.fit import Fitter
 from bayessim_mjx.diagnosis.flexible import Flexible, flexible
+from bayessim_mjx.diagnosis.models import Model
 from bayessim_mjx.diagnosis.robot import Robot
 from bayessim_mjx.diagnosis.simulate import Simulator
 from bayessim_mjx.effects.effect import Effect
@@ -63,6 +65,7 @@ class Findings:
     predictions: dict[str, gap.Prediction]
     flexible_base: Flexible | None
     flexible_winner: Flexible | None
+    disturbance: Disturbance | None
     links: list[channels.Link]
 
 
@@ -160,25 +163,48 @@ def diagnose(
     say("looking at the logs", 0, 1)
     setup = prepare(robot, logs, effects, group=group, seed=seed, settings=settings)
     race = search.run(setup.fitter, setup.candidates, setup.settings, say)
+    race.winner = _verified(setup, race, say)
     ruling = verdict.rule(race, say)
     fitter, model = setup.fitter, ruling.model
     say("how far", 0, 1)
     predictions = {"nominal": gap.nominal(fitter, race.nominal), "calibrated": gap.predict(fitter, race.base)}
     predictions["with_effects"] = gap.predict(fitter, model) if model.effects else predictions["calibrated"]
     say("none of these?", 0, 1)
-    on_base = _flexible(setup, race.base, race)
+    missing = _disturbance(setup, race)
+    on_base = _flexible(setup, race.base, race, missing)
     on_winner = _flexible(setup, model, race) if model.effects else on_base
     links = [link for log in setup.logs[:1] for link in channels.links(log, robot.mj_model)]
-    return Findings(setup, race, ruling, predictions, on_base, on_winner, links)
+    return Findings(setup, race, ruling, predictions, on_base, on_winner, missing, links)
 
 
-def _flexible(setup: Setup, model: search.Model, race: search.Race) -> Flexible | None:
+def _verified(setup: Setup, race: search.Race, say: Progress) -> Model:
+    """The winner without effects that do not help when held-out windows are really simulated (not by linearisation)."""
+    model = race.winner
+    steps = setup.fitter.simulator.windows.steps
+    while model.effects:
+        full = gap.predict(setup.fitter, model).cost(steps).mean()
+        smaller = [search.without(race, model, e, say) for e in model.effects]
+        error = [gap.predict(setup.fitter, m).cost(steps).mean() for m in smaller]
+        helps = [(e - full) / max(e - 1.0, 1e-9) for e in error]
+        least = int(np.argmin(helps))
+        if helps[least] > race.settings.more / 2:
+            return model
+        model = smaller[least]
+    return model
+
+
+def _disturbance(setup: Setup, race: search.Race) -> Disturbance | None:
+    """The force that the recalibrated simulator lacks, where its gap is above the noise."""
+    return estimate(setup.fitter, race.base.job) if race.above_noise(race.base) else None
+
+
+def _flexible(setup: Setup, model: Model, race: search.Race, missing: Disturbance | None = None) -> Flexible | None:
     """The flexible force on a model whose gap is above the noise."""
     if not race.above_noise(model):
         return None
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        return flexible(setup.fitter, model.job)
+        return flexible(setup.fitter, model.job, missing)
 
 
 def dof_names(model: mujoco.MjModel) -> list[str]:

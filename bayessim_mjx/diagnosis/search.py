@@ -34,10 +34,15 @@ def run(fitter: Fitter, candidates: Sequence[Candidate], settings: Settings, pro
     say("known parameters", 0, 1)
     fitter.iterate([job], 10, lambda j: range(len(j.coordinates)))
     job = fitter.refresh(job)
-    race = Race(fitter, candidates, settings, nominal, scored(fitter, job, ()))
+    base = scored(fitter, job, ())
+    race = Race(fitter, candidates, settings, nominal, base, winner=base)
     race.models[frozenset()] = race.base
     say("screening", 0, 1)
     race.screened = screen(fitter, job, candidates, settings.screened)
+    if not race.above_noise(race.base):  # nothing to explain: a few fits for the table
+        fit_models(race, [(race.base, s) for s in race.screened[:4]], "single effects", say)
+        race.winner = race.base
+        return race
     _singles(race, say)
     best = _pairs(race, say)
     race.winner = simplest(race, _greedy(race, best, say), say)
@@ -78,16 +83,16 @@ def _pairs(race: Race, say: Progress) -> Model:
     singles = ranked(race, 1)
     if not singles:
         return race.base
-    best = singles[0]
     if not race.above_noise(race.base):
         return race.base
+    best = race.best_of(race.base, singles) or race.base
     plans = []
     for a, b in itertools.combinations(top, 2):
         if compatible(a, b):
             first = race.models[frozenset([a.label])]
             plans.append((first, start_of(race, b)))
     pairs = fit_models(race, plans, "pairs", say)
-    best_pair = min(pairs, key=lambda m: m.total) if pairs else None
+    best_pair = race.best_of(best, pairs)
     if best_pair is not None and race.passes(best, best_pair):
         return best_pair
     return best if race.passes(race.base, best) else race.base
@@ -118,7 +123,7 @@ def _forward(race: Race, model: Model, say: Progress, barred: Sequence[str]) -> 
     ]
     bigger = fit_models(race, [(model, s) for s in found], f"{len(model.effects) + 1} effects", say)
     passing = [m for m in bigger if race.passes(model, m)]
-    return min(passing, key=lambda m: m.total) if passing else None
+    return race.best_of(model, passing)
 
 
 def _backward(race: Race, model: Model, say: Progress) -> Model:

@@ -45,7 +45,6 @@ class Ruling:
 def rule(race: Race, say: Progress) -> Ruling:
     """Look for rivals of every effect of the winner: replaced by another one, the model predicts as well."""
     winner = race.winner
-    assert winner is not None
     ruling = Ruling(winner)
     for effect in winner.effects:
         ruling.rivals[effect.label] = _rivals(race, winner, effect, say)
@@ -82,6 +81,7 @@ def _rival(race: Race, winner: Model, effect: Candidate, others: tuple[Candidate
     behind = race.closure(winner) - race.closure(model)
     misfit = winner.total > 1.3 * race.noise * len(winner.cost)
     told_apart = c.evidence > MILD and (c.t > 2.0 or c.evidence > 3 * MILD)
+    told_apart = told_apart and not (race.at_noise(winner) and race.at_noise(model))
     if told_apart and not (misfit and behind < race.settings.tie / 2):
         return []
     if behind > 3 * race.settings.tie:

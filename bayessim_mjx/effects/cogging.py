@@ -11,7 +11,7 @@ from bayessim_mjx.effects.site import Site, SubStep
 from bayessim_mjx.triangular import product
 
 # a fit finds the order only from about +-pi / (range of motion) away: start at the usual ones
-_ORDERS = (2, 4, 6, 8, 12, 16, 24, 32, 48)
+_ORDERS = (1, 2, 3, 4, 5, 6, 7, 8, 10, 12, 14, 16, 18, 20, 22, 24, 27, 30, 33, 36, 40, 44, 48, 54, 60)
 
 
 @dataclasses.dataclass(frozen=True)
