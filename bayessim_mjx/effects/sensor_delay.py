@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from bayessim_mjx.effects.effect import Effect, Measurement, Quantity
 from bayessim_mjx.effects.sensor_gain import columns, written
-from bayessim_mjx.effects.site import Motion, Site
+from bayessim_mjx.effects.site import Motion, Site, between
 
 if TYPE_CHECKING:
     import mujoco
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True)
 class SensorDelay(Effect):
-    """measured(t) = q(t - d), w(t - d), interpolated linearly between control steps.
+    """measured(t) = q(t - d), w(t - d); between control steps the acceleration is taken as constant.
 
     Before the first measurement of an episode the first one is taken to have held for ever; an episode that starts in
     the middle of a log takes its past from there.
@@ -40,9 +40,7 @@ class SensorDelay(Effect):
         return {"history": jnp.zeros((lag, len(at), 2)), "fresh": jnp.ones((), bool)}
 
     def on_start(self, at: Site, memory: Any, motion: Motion, theta: jax.Array) -> tuple[Any, Motion]:
-        steps = at.values(theta)[:, 0] / jnp.float32(at.dt)
-        later = columns(at, *jax.vmap(motion.shifted)(steps))  # [n, rows, n, 2]: every delay, every joint
-        true = jnp.moveaxis(jnp.diagonal(later, axis1=0, axis2=2), -1, 1)  # [rows, n, 2]: each joint by its own
+        true = motion.shifted(at, at.values(theta)[:, 0] / jnp.float32(at.dt))
         lag = memory["history"].shape[0]
         past = jnp.clip(jnp.arange(motion.start - lag + 1, motion.start + 1), 0, None)
         filled = {"history": true[past], "fresh": jnp.zeros((), bool)}
@@ -58,7 +56,9 @@ class SensorDelay(Effect):
         whole = jnp.minimum(jnp.floor(steps), lag - 1.0)
         row, joint = lag - whole.astype(jnp.int32), jnp.arange(len(at))
         newer, older = signal[row, joint], signal[row - 1, joint]
-        shown = newer + (steps - whole)[:, None] * (older - newer)
+        part, gained = steps - whole, older[:, 1] - newer[:, 1]
+        position = between(newer[:, 0], older[:, 0], -gained, part, at.dt)
+        shown = jnp.stack([position, newer[:, 1] + part * gained], axis=-1)
         memory = {"history": signal[1:], "fresh": jnp.zeros((), bool)}
         return memory, written(at, **measurement, values=shown)
 

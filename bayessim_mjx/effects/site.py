@@ -143,7 +143,9 @@ def _joints(model: mujoco.MjModel, kind: str, ids: np.ndarray) -> np.ndarray:
         return ids
     if kind != "actuator":
         return np.full(len(ids), -1)
-    on_joint = np.isin(model.actuator_trntype[ids], (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)))
+    on_joint = np.isin(
+        model.actuator_trntype[ids], (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
+    )
     return np.where(on_joint, model.actuator_trnid[ids, 0], -1)
 
 
@@ -232,10 +234,31 @@ class Motion(struct.PyTreeNode):
     command: jax.Array
     start: int = struct.field(pytree_node=False)
 
-    def shifted(self, steps: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """(qpos, qvel) read `steps` control steps later (a fraction is interpolated, the ends are held), `[rows, ..]`."""
-        rows = self.qpos.shape[0]
-        at = jnp.clip(jnp.arange(rows) + steps, 0, rows - 1)
-        low = jnp.clip(jnp.floor(at).astype(jnp.int32), 0, rows - 2)
-        part = (at - low)[:, None]
-        return tuple((1 - part) * x[low] + part * x[low + 1] for x in (self.qpos, self.qvel))  # type: ignore[return-value]
+    def shifted(self, at: Site, steps: jax.Array) -> jax.Array:
+        """Position and velocity of each joint of `at` read its own number of control steps later, `[rows, n, 2]`.
+
+        Args: steps: `[n]`, in control steps, of any sign, with fractions; the recording's ends are held.
+        """
+        last = self.qpos.shape[0] - 1
+        when = jnp.clip(jnp.arange(last + 1)[:, None] + steps, 0, last)
+        low = jnp.clip(jnp.floor(when).astype(jnp.int32), 0, max(last - 1, 0))
+        part = when - low
+
+        def row(x: jax.Array, ahead: int) -> jax.Array:
+            return jnp.take_along_axis(x, jnp.clip(low + ahead, 0, last), axis=0)
+
+        qpos, qvel = self.qpos[:, at.qadr], self.qvel[:, at.dadr]
+        before, here, there, after = (row(qvel, k) for k in (-1, 0, 1, 2))
+        # cubic through four velocities: the derivative of a Hermite spline would divide the encoders' noise by dt
+        inner, outer = (1 + part) * (2 - part) / 2, -part * (1 - part) / 6
+        velocity = inner * ((1 - part) * here + part * there) + outer * ((2 - part) * before + (1 + part) * after)
+        return jnp.stack([between(row(qpos, 0), row(qpos, 1), there - here, part, at.dt), velocity], axis=-1)
+
+
+def between(one: jax.Array, two: jax.Array, gained: jax.Array, part: jax.Array, dt: float) -> jax.Array:
+    """Position a `part` of the way from `one` to `two`, dt apart, at constant acceleration gained / dt.
+
+    Only the *difference* of the velocities bends the path: where an end is held it is a line, and the half sub-step by
+    which semi-implicit Euler's velocities lag, the same at both ends, cancels (not so in a Hermite spline).
+    """
+    return (1 - part) * one + part * two - 0.5 * jnp.float32(dt) * part * (1 - part) * gained

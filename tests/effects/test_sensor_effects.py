@@ -82,24 +82,44 @@ def test_gain_scales_what_is_shown(full):
         np.testing.assert_allclose(y[1:], x[1:] * [1.0, 1.15], rtol=1e-6, atol=1e-7)
 
 
+def path(qpos, qvel, times):
+    """Position at `times` when the acceleration is constant in every control step; the first one held before."""
+    qpos, qvel, rows = (np.concatenate([x[:1]] * 5 + [x]) for x in (qpos, qvel, np.zeros_like(qpos)))
+    k = np.clip(np.floor(times / DT + 1e-9).astype(int) + 5, 0, len(qpos) - 2)
+    s = times - DT * (k - 5)
+    slope, bend = np.diff(qpos)[k] / DT, np.diff(qvel)[k] / DT
+    return qpos[k] + slope * s - bend / 2 * s * (DT - s)
+
+
 @pytest.mark.parametrize("delay", [0.005, 0.02, 0.031, 0.05])
 def test_delay_shows_the_past(full, delay):
     true, seen = shown(full, {}), shown(full, {"b.sensor_delay.delay": delay})
+    x, v = (y[1:, 1] for y in true)
+    np.testing.assert_allclose(seen[0][1:, 1], path(x, v, T - delay), atol=3e-6)
+    np.testing.assert_allclose(seen[1][1:, 1], np.interp(T - delay, T, v), atol=3e-6)
     for x, y in zip(true, seen, strict=True):
-        want = np.interp(T - delay, T, x[1:, 1])  # the first value held before
-        np.testing.assert_allclose(y[1:, 1], want, atol=2e-6)
         assert np.array_equal(x[:, 0], y[:, 0])
 
 
 @pytest.mark.parametrize("constant", [1e-6, 0.004, 0.05])
 def test_filter_is_the_exact_low_pass(full, constant):
-    """Against scipy's simulation of T y' = q - y, settled at the first value."""
+    """Against scipy's simulation of T y' = q - y on a fine grid, settled at the first value."""
     true, seen = shown(full, {}), shown(full, {"b.sensor_filter.time_constant": constant})
-    for x, y in zip(true, seen, strict=True):
-        first, a = x[1, 1], 1 / constant
-        want = x[1:, 1] if constant < 1e-5 else first + lsim(([a], [1, a]), x[1:, 1] - first, T)[1]
-        np.testing.assert_allclose(y[1:, 1], want, atol=2e-4 if constant < 1e-5 else 1e-5)
+    (q, v), a, fine = (x[1:, 1] for x in true), 1 / constant, DT / 50 * np.arange(50 * STEPS - 49)
+    for x, y, inner in zip(true, seen, (path(q, v, fine), np.interp(fine, T, v)), strict=True):
+        low = inner if constant < 1e-5 else inner[0] + lsim(([a], [1, a]), inner - inner[0], fine)[1]
+        np.testing.assert_allclose(y[1:, 1], low[::50], atol=2e-4 if constant < 1e-5 else 1e-5)
         assert np.array_equal(x[:, 0], y[:, 0])
+
+
+@pytest.mark.parametrize("name", ["sensor_delay", "sensor_filter"])
+def test_what_is_shown_goes_to_the_truth_with_the_parameter(full, name):
+    """The change is proportional to a small parameter: -p w for both, no jump at zero."""
+    key = "delay" if name == "sensor_delay" else "time_constant"
+    (q, v), small = shown(full, {}), 1e-4
+    change = shown(full, {f"b.{name}.{key}": small})[0][3:, 1] - q[3:, 1]
+    # semi-implicit Euler's velocity is half a sub-step behind its path: up to 15 rad/s^2 * 2.5 ms
+    np.testing.assert_allclose(change / small, -v[3:, 1], atol=0.1)
 
 
 def test_a_servo_with_an_offset_turns_to_command_minus_offset(full):
@@ -121,8 +141,8 @@ def test_a_servo_with_an_offset_at_the_end_of_ctrlrange(full):
 CASES = {
     "joint_offset": ({"offset": 0.06}, 1e-5),
     "sensor_gain": ({"gain": 0.9}, 1e-5),
-    "sensor_filter": ({"time_constant": 0.04}, 2e-3),
-    "sensor_delay": ({"delay": 0.033}, 2e-3),
+    "sensor_filter": ({"time_constant": 0.04}, 1e-3),
+    "sensor_delay": ({"delay": 0.033}, 1e-3),
     "whole step": ({"sensor_delay.delay": 0.04}, 1e-5),
     "all": (
         {
@@ -164,6 +184,76 @@ def test_a_start_in_the_middle_goes_on_as_the_recording(full, continued, case):
     )
     np.testing.assert_allclose(qpos, logged[0][11 + start :], atol=tolerance)
     np.testing.assert_allclose(qvel, logged[1][11 + start :], atol=20 * tolerance)
+
+
+SHARP = XML.replace('timestep="0.005"', 'timestep="0.002" integrator="RK4"')  # no errors but the sensors'
+
+
+def sharp_truth():
+    """(qpos, qvel at every fine step `[20 ms / 0.2 ms * STEPS + 1, 2]`, command of every sub-step) from MuJoCo C."""
+    model = mujoco.MjModel.from_xml_string(SHARP)
+    model.opt.timestep /= 10
+    data, t = mujoco.MjData(model), 0.002 * np.arange(10 * STEPS)
+    command = np.stack([0.8 * np.sin(15 * t) + 0.3 * np.sin(23 * t), 4.5 * np.sin(17 * t)], axis=1)
+    rows = []
+    for ctrl in command:
+        for _ in range(10):
+            rows.append((data.qpos.copy(), data.qvel.copy()))
+            data.ctrl = ctrl
+            mujoco.mj_step(model, data)
+    return *(np.stack(x) for x in zip(*rows, strict=True)), command.reshape(STEPS, 10, 2)
+
+
+@pytest.fixture(scope="module")
+def predicted():
+    """Measured qpos `[25, 2]` of 25 control steps (commands `[25, 10, 2]`) after a start in the middle of a log."""
+    effects = [make(n, where="all") for n in ("sensor_delay", "sensor_filter")]
+    physics = Physics(mujoco.MjModel.from_xml_string(SHARP), DT, ParameterSpace(), effects)
+
+    def body(world, command):
+        world, _ = control_step(physics, world, command)
+        return world, world.measurement["qpos"]
+
+    return jax.jit(lambda theta, motion, commands: jax.lax.scan(body, begin(physics, theta, motion), commands)[1])
+
+
+@pytest.mark.parametrize("delay, constant", [(2.5e-3, 0.0), (0.0, 6e-3)])
+def test_agrees_with_a_sensor_in_fine_time(predicted, delay, constant):
+    """The true parameter predicts what a true sensor shows to 0.3 mrad, at 100 to 200 rad/s^2 (an arm has 50)."""
+    qpos, qvel, command = sharp_truth()
+    assert np.abs(np.diff(qvel[::10], axis=0) / 0.002).max(axis=0).min() > 50
+    t = 2e-4 * np.arange(len(qpos))
+    true = np.concatenate([qpos, qvel], axis=1).T
+    if delay:
+        late = [np.interp(t - delay, t, x) for x in true]
+    else:
+        late = [lsim(([1 / constant], [1, 1 / constant]), x, t)[1] for x in true]
+    log = np.stack(late, axis=1)[::100]
+    arrays = [jnp.asarray(x[10:31], jnp.float32) for x in (log[:, :2], log[:, 2:], command)]
+    theta, ahead = (jnp.asarray(x, jnp.float32) for x in ([delay, constant], command[20:45]))
+    seen = predicted(theta, Motion(*arrays, start=10), ahead)
+    np.testing.assert_allclose(seen, log[21:46, :2], atol=3e-4)
+
+
+def test_a_motion_is_shifted_by_each_joints_own_time():
+    """q'' constant is exact, ends are held even at speed, and joints are found behind a free joint's quaternion."""
+    free = "<worldbody><body><freejoint/><geom/></body>"
+    physics = Physics(
+        mujoco.MjModel.from_xml_string(XML.replace("<worldbody>", free)),
+        DT,
+        ParameterSpace(),
+        [make("sensor_delay", where=("a", "b"))],
+    )
+    t = DT * np.arange(12)[:, None]
+    inside, steps = np.clip(t, 2 * DT, 9 * DT), np.array([0.0, 0.3])
+    curve = [lambda x: 1 + 3 * x - 25 * x**2, lambda x: 3 - 50 * x]
+    qpos, qvel = np.repeat(curve[0](inside), 9, 1), np.repeat(curve[1](inside), 8, 1)
+    arrays = [jnp.asarray(x, jnp.float32) for x in (qpos, qvel, np.zeros((12, 4, 2)))]
+    out = np.asarray(Motion(*arrays, start=6).shifted(physics.sites[0], jnp.asarray(steps, jnp.float32)))
+    assert np.array_equal(out[..., 0, 0], arrays[0][:, 7]) and np.array_equal(out[..., 0, 1], arrays[1][:, 6])
+    want = np.clip(t[:, 0] + 0.3 * DT, 2 * DT, 9 * DT)
+    np.testing.assert_allclose(out[[0, *range(2, 12)], 1, 0], curve[0](want)[[0, *range(2, 12)]], atol=1e-6)
+    np.testing.assert_allclose(out[3:8, 1, 1], curve[1](want)[3:8], atol=1e-5)
 
 
 @pytest.mark.parametrize("case", [c for c in CASES if c in NAMES])
