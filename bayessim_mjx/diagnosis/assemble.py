@@ -12,11 +12,12 @@ import numpy as np
 from bayessim_mjx.diagnosis import gap, search, uncertainty, verdict
 from bayessim_mjx.diagnosis.candidates import Candidate
 from bayessim_mjx.diagnosis.models import Model
+from bayessim_mjx.diagnosis.pictures import details
 from bayessim_mjx.diagnosis.result import Diagnosis, Estimate, FoundEffect, Gap, Place
-from bayessim_mjx.diagnosis.run import Findings, Setup, dof_names
+from bayessim_mjx.diagnosis.run import Findings, Setup, dof_names, length_unit
+from bayessim_mjx.diagnosis.sentences import horizon_warning, sentences
 
 UNEXPLAINED = 2.0  # noise standard deviations that remain and that nothing predicts
-MANY = 24  # candidates in the isolability matrix, overlays in the report
 REMAINS = 0.3  # share of the calibrated gap that a flexible force closes on top of named effects: not in the library
 
 
@@ -31,16 +32,16 @@ def diagnosis_of(found: Findings, say: search.Progress = lambda text, done, tota
     parameters = _parameters(race, model, sd)
     return Diagnosis(
         verdict=name,
-        sentences=_sentences(name, effects, parameters, found, remains),
+        sentences=sentences(name, effects, parameters, found, remains),
         effects=effects,
         where=_where(found),
         gap=_gap(found),
         parameters=parameters,
         candidates=ranking(race),
-        warnings=list(setup.warnings) + _horizon_warning(found),
+        warnings=list(setup.warnings) + horizon_warning(found),
         next_experiment={},
         versions=versions(),
-        details=_details(found, effects),
+        details=details(found, effects),
     )
 
 
@@ -158,7 +159,8 @@ def _gap(found: Findings) -> Gap:
         for i, joint in enumerate(names)
     }
     physical = {
-        joint: {s: v * float(cut.sigma_q[i]) for s, v in by_channel[joint].items()} | {"unit": _length(setup, i)}
+        joint: {s: v * float(cut.sigma_q[i]) for s, v in by_channel[joint].items()}
+        | {"unit": length_unit(setup.physics.mj_model, i)}
         for i, joint in enumerate(names)
     }
     return Gap(
@@ -181,15 +183,6 @@ def _floor(found: Findings) -> float:
     return max(1.0, float(np.sqrt(min(totals) / (race.noise * len(race.base.cost)))))
 
 
-def _length(setup: Setup, dof: int) -> str:
-    model = setup.physics.mj_model
-    joint = int(model.dof_jntid[dof])
-    slides = int(model.jnt_type[joint]) == 2 or (
-        int(model.jnt_type[joint]) == 0 and dof - int(model.jnt_dofadr[joint]) < 3
-    )
-    return "m" if slides else "rad"
-
-
 def _parameters(race: search.Race, model: Model, sd: np.ndarray) -> dict[str, dict[str, Any]]:
     remarks = verdict.structural(race, model, sd)
     return {
@@ -202,11 +195,11 @@ def _parameters(race: search.Race, model: Model, sd: np.ndarray) -> dict[str, di
 
 
 def ranking(race: search.Race) -> list[dict[str, Any]]:
-    """Models tried, best first, with the held-out score (nats over the known parameters alone) and its standard error."""
+    """Models tried, best first: held-out score, nats over the known parameters alone, and its standard error."""
     group = race.fitter.simulator.windows.group
     above = max(race.base.total - race.noise * len(race.base.cost), 1e-9)
     absorbed = {s.candidate.label: s.absorbed for s in race.screened}
-    out = []
+    out: list[dict[str, Any]] = []
     for model in search.ranked(race)[:60]:
         gain = race.base.cost - model.cost
         sums = np.array([gain[group == g].sum() for g in np.unique(group)])
@@ -241,136 +234,6 @@ def _where(found: Findings) -> list[Place]:
         Place(n, float(costs[:, i].sum() / total), uncertainty.interval(shares[:, i]), "") for i, n in enumerate(names)
     ]
     return sorted(out, key=lambda p: -p.share)
-
-
-def _horizon_warning(found: Findings) -> list[str]:
-    """A verdict that changes with the horizon is flagged."""
-    if not found.ruling.model.effects:
-        return []
-    cut = found.setup.fitter.simulator.windows
-    closed = []
-    for steps in (min(10, cut.steps), cut.steps):
-        before, after = (found.predictions[k].cost(steps).mean() for k in ("calibrated", "with_effects"))
-        closed.append((before - after) / max(before - 1.0, 1e-9) if before > 1.2 else np.nan)
-    if np.all(np.isfinite(closed)) and abs(closed[0] - closed[1]) > 0.3:
-        short, long = (steps * cut.dt for steps in (min(10, cut.steps), cut.steps))
-        return [
-            f"the gap closed depends on the horizon: {closed[0]:.0%} over {short:.2g} s, {closed[1]:.0%} over {long:.2g} s"
-        ]
-    return []
-
-
-def _sentences(name: str, effects: list[FoundEffect], parameters: dict, found: Findings, remains: float) -> list[str]:
-    cost = {
-        k: float(np.sqrt(p.cost(found.setup.fitter.simulator.windows.steps).mean()))
-        for k, p in found.predictions.items()
-    }
-    named = " and ".join(f"{e.name.replace('_', ' ')} at {e.where}" for e in effects)
-    head = {
-        "no_gap": f"No gap above the noise: the simulator is within {cost['nominal']:.2g} noise standard deviations of the logs.",
-        "parameters": f"The parameters are off, the structure is right: recalibrated, the gap falls from {cost['nominal']:.3g} to {cost['calibrated']:.3g} noise standard deviations.",
-        "effects": f"The simulator lacks {named}.",
-        "ambiguous": f"The simulator lacks something like {named}; these logs cannot tell it from its rivals.",
-        "unexplained": "Something is missing that no effect of the library explains.",
-        "insufficient_data": "Too little data to hold anything out.",
-    }[name]
-    out = [head]
-    if name == "unexplained" and effects:
-        out.append(
-            f"Of the library {named} comes nearest; a flexible force on top of it still closes {remains:.0%} of the gap."
-        )
-    if effects:
-        out.append(
-            f"With it the gap falls from {cost['calibrated']:.3g} (recalibrated) to {cost['with_effects']:.3g} noise standard deviations on held-out conditions."
-        )
-    flex = found.flexible_winner
-    if name == "unexplained" and flex is not None:
-        out += flex.text
-    if not effects and remains == 0.0 and found.race.above_noise(found.race.base):
-        out.append(
-            f"What remains ({cost['calibrated']:.3g}) no candidate and no flexible force predicts on held-out conditions: process noise, an input that was not logged, or noise larger than estimated."
-        )
-    out += [f"{k}: {v['structural']}." for k, v in parameters.items() if v["structural"]]
-    return out
-
-
-def _details(found: Findings, effects: list[FoundEffect]) -> dict[str, Any]:
-    race, ruling = found.race, found.ruling
-    flex = found.flexible_winner or found.flexible_base
-    rms = {
-        k: float(np.sqrt(p.cost(found.setup.fitter.simulator.windows.steps).mean()))
-        for k, p in found.predictions.items()
-    }
-    each, deviation = verdict.per_condition(race, ruling.model)
-    groups = found.setup.fitter.simulator.windows.groups
-    return {
-        "overlays": _overlays(found),
-        "isolability": _isolability(race),
-        "episodes": _episodes(found),
-        "closure": [{"effects": e.name, "predicted": e.predicted_gap_closed, "realised": e.gap_closed} for e in effects],
-        "shapley": [{"effect": f"{e.name}@{e.where}", "share": e.share} for e in effects if e.share == e.share],
-        "flexible": {} if flex is None else flex.details(rms["calibrated"], rms["with_effects"]),
-        "groups": {
-            "names": list(groups),
-            "parameters": {n: {"mean": each[:, i], "sd": deviation[:, i]} for i, n in enumerate(ruling.model.job.names)},
-        },
-        "links": [
-            {"name": f"{k.name} ({k.where})", "slope": k.slope, "correlation": k.correlation, "lag": k.lag, "verdict": k.text}
-            for k in found.links
-        ],
-        "noise": [
-            {"channel": n, "sigma": float(s)}
-            for n, s in zip(dof_names(found.setup.physics.mj_model), found.setup.fitter.simulator.windows.sigma_q, strict=True)
-        ],
-    }  # fmt: skip
-
-
-def _overlays(found: Findings) -> list[dict[str, Any]]:
-    setup = found.setup
-    cut, model = setup.fitter.simulator.windows, setup.physics.mj_model
-    out = []
-    for r, log in enumerate(cut.logs):
-        own = np.flatnonzero(cut.log == r)
-        for joint in range(model.njnt):
-            if int(model.jnt_type[joint]) not in (2, 3) or len(out) >= MANY or not len(own):
-                continue
-            q, v = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
-            rows = np.concatenate([np.arange(cut.start[w] + 1, cut.start[w] + 1 + cut.steps) for w in own])
-            entry: dict[str, Any] = {
-                "log": log.name, "joint": model.joint(joint).name or f"joint{joint}", "unit": _length(setup, v),
-                "time": log.time[rows] - log.time[0], "measured": log.qpos[rows, q],
-                "starts": log.time[cut.start[own]] - log.time[0],
-            }  # fmt: skip
-            for stage, prediction in found.predictions.items():
-                entry[stage] = log.qpos[rows, q] - (prediction.error[own, :, v] * cut.sigma_q[v]).reshape(-1)
-            out.append(entry)
-    return out
-
-
-def _isolability(race: search.Race) -> dict[str, Any]:
-    """|cos| between what the candidates change in the residual, known parameters and starts projected out."""
-    some = [s for s in race.screened if s.absorbed < 0.999][:MANY]
-    if len(some) < 2:
-        return {}
-    columns = np.stack([s.column.reshape(-1) for s in some])
-    columns = columns / np.maximum(np.linalg.norm(columns, axis=1, keepdims=True), 1e-300)
-    return {
-        "labels": [s.candidate.label for s in some],
-        "cosine": np.abs(columns @ columns.T),
-        "absorbed": [s.absorbed for s in some],
-    }
-
-
-def _episodes(found: Findings) -> list[dict[str, Any]]:
-    cut = found.setup.fitter.simulator.windows
-    out = []
-    for r, log in enumerate(cut.logs):
-        own = cut.log == r
-        if own.any():
-            row: dict[str, Any] = {"log": log.name, "condition": cut.groups[int(cut.group[own][0])]}
-            row |= {k: float(np.sqrt(p.cost(cut.steps)[own].mean())) for k, p in found.predictions.items()}
-            out.append(row)
-    return out
 
 
 def versions() -> dict[str, str]:
@@ -409,12 +272,10 @@ def _with_places(result: Diagnosis, found: Findings, folder: Path) -> Diagnosis:
     if found.disturbance is None:
         return result
     fitter, job = found.setup.fitter, found.race.base.job
-    places, maps, sentences = where.locate(fitter, job, found.disturbance, seed=found.setup.seed)
+    places, maps, told = where.locate(fitter, job, found.disturbance, seed=found.setup.seed)
     spectra, heard = frequency.analyse(fitter, job, found.disturbance, seed=found.setup.seed)
-    details = result.details | {"maps": maps, "frequency": spectra}
-    return replace(
-        result, where=places or result.where, sentences=[*result.sentences, *sentences, *heard], details=details
-    )
+    more = result.details | {"maps": maps, "frequency": spectra}
+    return replace(result, where=places or result.where, sentences=[*result.sentences, *told, *heard], details=more)
 
 
 def _with_experiment(result: Diagnosis, found: Findings, folder: Path) -> Diagnosis:
@@ -427,5 +288,5 @@ def _with_experiment(result: Diagnosis, found: Findings, folder: Path) -> Diagno
     if proposal.chosen is not None:
         folder.mkdir(parents=True, exist_ok=True)
         file = command.write_command(folder / "next_experiment.csv", proposal, str(folder / "diagnosis.json")).name
-    details = result.details | {"experiments": proposal.details()}
-    return replace(result, next_experiment=proposal.to_dict(file), details=details)
+    more = result.details | {"experiments": proposal.details()}
+    return replace(result, next_experiment=proposal.to_dict(file), details=more)

@@ -22,16 +22,16 @@ class Settings:
     """Thresholds and budgets of the race, fixed before any data are seen.
 
     Attributes:
-        relevance: an effect must close this share of the gap above the noise; more: a further effect, of what the others
-            leave; drop: and lower the cost by this share.
+        relevance: an effect must close this share of the gap above the noise; more: a further effect, of what the
+            others leave; drop: and lower the cost by this share.
         evidence: and gain this many nats plus the logarithm of the number of candidates (family-wise).
         t: and improve windows of all conditions: mean over clustered standard error.
         floor: a model within this factor of the noise (rms) is not improved further.
         tie: rivals are models whose share of the gap closed is within this of the winner's.
         singles, pairs: how many candidates are fitted, and of how many all pairs; screened: windows looked at in
             screening.
-        most: effects in one model; iterations: of a fit; fresh: base columns differenced anew at every step if there are
-            at most so many.
+        most: effects in one model; iterations: of a fit; fresh: base columns are differenced anew if there are at most so
+            many.
     """
 
     relevance: float = 0.05
@@ -77,7 +77,8 @@ class Race:
         if not self.above_noise(old):
             return False
         many = np.log(max(len(self.candidates), 2)) * max(1, len(new.effects) - len(old.effects))
-        if not all(self.distinct(new, e) for e in new.effects if e not in old.effects):
+        added = [e for e in new.effects if e not in old.effects]
+        if c.share < 0.3 and not all(self.distinct(new, e) for e in added):
             return False
         relevance = s.more if old.effects else s.relevance
         if not (c.share > relevance and c.drop > s.drop and c.evidence > s.evidence + many):
@@ -123,7 +124,7 @@ class Race:
 
 
 def _fresh(race: Race, job: Job) -> list[int]:
-    """Columns to be differenced anew: the effects' at every step, the known parameters' at every third where affordable."""
+    """Columns to be differenced anew: the effects' at every step, the known parameters' at every third if cheap."""
     base = len(race.fitter.base)
     turn = base <= race.settings.fresh and len(job.history) % 3 == 0
     return list(range(0 if turn else base, len(job.coordinates)))
@@ -131,7 +132,8 @@ def _fresh(race: Race, job: Job) -> list[int]:
 
 def fit_models(race: Race, plans: Sequence[tuple[Model, Screened]], label: str, say: Progress) -> list[Model]:
     """Models of the plans' effects plus one more each, fitted together; what was fitted before is looked up."""
-    fitter, todo = race.fitter, {}
+    fitter = race.fitter
+    todo: dict[frozenset[str], tuple[list[Job], tuple[Candidate, ...]]] = {}
     for model, extra in plans:
         key = frozenset([*(c.label for c in model.effects), extra.candidate.label])
         if key not in race.models and key not in todo:

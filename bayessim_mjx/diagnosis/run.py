@@ -216,3 +216,11 @@ def dof_names(model: mujoco.MjModel) -> list[str]:
         for k in range(width):
             out[int(model.jnt_dofadr[j]) + k] = name if width == 1 else f"{name}[{k}]"
     return out
+
+
+def length_unit(model: mujoco.MjModel, dof: int) -> str:
+    """rad or m."""
+    joint = int(model.dof_jntid[dof])
+    free = int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_FREE)
+    slides = int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_SLIDE)
+    return "m" if slides or (free and dof - int(model.jnt_dofadr[joint]) < 3) else "rad"

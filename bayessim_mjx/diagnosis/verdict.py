@@ -142,7 +142,7 @@ def shapley(race: Race, model: Model, say: Progress) -> dict[str, float]:
     effects, n = model.effects, len(model.effects)
     if n > 4:
         return {}
-    value = {frozenset(): 0.0}
+    value: dict[frozenset[str], float] = {frozenset(): 0.0}
     for size in range(1, n + 1):
         for some in itertools.combinations(effects, size):
             m = model

@@ -1,0 +1,94 @@
+"""Numbers for the pictures of a diagnosis: overlays, isolability, per-log and per-condition tables."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from bayessim_mjx.diagnosis import race, verdict
+from bayessim_mjx.diagnosis.result import FoundEffect
+from bayessim_mjx.diagnosis.run import Findings, dof_names, length_unit
+
+MANY = 24  # candidates in the isolability matrix, overlays in the report
+
+
+def details(found: Findings, effects: list[FoundEffect]) -> dict[str, Any]:
+    ruling, cut = found.ruling, found.setup.fitter.simulator.windows
+    flex = found.flexible_winner or found.flexible_base
+    rms = {k: float(np.sqrt(p.cost(cut.steps).mean())) for k, p in found.predictions.items()}
+    each, deviation = verdict.per_condition(found.race, ruling.model)
+    names = ruling.model.job.names
+    return {
+        "overlays": _overlays(found),
+        "isolability": _isolability(found.race),
+        "episodes": _episodes(found),
+        "closure": [
+            {"effects": e.name, "predicted": e.predicted_gap_closed, "realised": e.gap_closed} for e in effects
+        ],
+        "shapley": [{"effect": f"{e.name}@{e.where}", "share": e.share} for e in effects if e.share == e.share],
+        "flexible": {} if flex is None else flex.details(rms["calibrated"], rms["with_effects"]),
+        "groups": {
+            "names": list(cut.groups),
+            "parameters": {n: {"mean": each[:, i], "sd": deviation[:, i]} for i, n in enumerate(names)},
+        },
+        "links": [
+            {
+                "name": f"{k.name} ({k.where})", "slope": k.slope, "correlation": k.correlation, "lag": k.lag,
+                "verdict": k.text,
+            }
+            for k in found.links
+        ],
+        "noise": [
+            {"channel": n, "sigma": float(s)}
+            for n, s in zip(dof_names(found.setup.physics.mj_model), cut.sigma_q, strict=True)
+        ],
+    }  # fmt: skip
+
+
+def _overlays(found: Findings) -> list[dict[str, Any]]:
+    setup = found.setup
+    cut, model = setup.fitter.simulator.windows, setup.physics.mj_model
+    out: list[dict[str, Any]] = []
+    for r, log in enumerate(cut.logs):
+        own = np.flatnonzero(cut.log == r)
+        for joint in range(model.njnt):
+            if int(model.jnt_type[joint]) not in (2, 3) or len(out) >= MANY or not len(own):
+                continue
+            q, v = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
+            rows = np.concatenate([np.arange(cut.start[w] + 1, cut.start[w] + 1 + cut.steps) for w in own])
+            entry: dict[str, Any] = {
+                "log": log.name, "joint": model.joint(joint).name or f"joint{joint}", "unit": length_unit(model, v),
+                "time": log.time[rows] - log.time[0], "measured": log.qpos[rows, q],
+                "starts": log.time[cut.start[own]] - log.time[0],
+            }  # fmt: skip
+            for stage, prediction in found.predictions.items():
+                entry[stage] = log.qpos[rows, q] - (prediction.error[own, :, v] * cut.sigma_q[v]).reshape(-1)
+            out.append(entry)
+    return out
+
+
+def _isolability(of: race.Race) -> dict[str, Any]:
+    """|cos| between what the candidates change in the residual, known parameters and starts projected out."""
+    some = [s for s in of.screened if s.absorbed < 0.999][:MANY]
+    if len(some) < 2:
+        return {}
+    columns = np.stack([s.column.reshape(-1) for s in some])
+    columns = columns / np.maximum(np.linalg.norm(columns, axis=1, keepdims=True), 1e-300)
+    return {
+        "labels": [s.candidate.label for s in some],
+        "cosine": np.abs(columns @ columns.T),
+        "absorbed": [s.absorbed for s in some],
+    }
+
+
+def _episodes(found: Findings) -> list[dict[str, Any]]:
+    cut = found.setup.fitter.simulator.windows
+    out: list[dict[str, Any]] = []
+    for r, log in enumerate(cut.logs):
+        own = cut.log == r
+        if own.any():
+            row: dict[str, Any] = {"log": log.name, "condition": cut.groups[int(cut.group[own][0])]}
+            row |= {k: float(np.sqrt(p.cost(cut.steps)[own].mean())) for k, p in found.predictions.items()}
+            out.append(row)
+    return out
