@@ -37,7 +37,14 @@ class ActuatorSaturation(Effect):
     kind: ClassVar[str] = "actuator"
     quantities: ClassVar[tuple[Quantity, ...]] = (
         Quantity(
-            "inverse_limit", 0.0, 0.0, 10.0, unit="1/(N m)", per="1/force", reach=(0.0, 5.0), grid=(0.08, 0.12, 0.16, 0.22, 0.3, 0.5)
+            "inverse_limit",
+            0.0,
+            0.0,
+            10.0,
+            unit="1/(N m)",
+            per="1/force",
+            reach=(0.0, 5.0),
+            grid=(0.08, 0.12, 0.16, 0.22, 0.3, 0.5),
         ),
     )
 

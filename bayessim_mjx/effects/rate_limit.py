@@ -28,7 +28,16 @@ class RateLimit(Effect):
     kind: ClassVar[str] = "actuator"
     quantities: ClassVar[tuple[Quantity, ...]] = (
         # per the largest command: seconds from 0 to it
-        Quantity("slowness", 0.0, 0.0, 2.0, unit="s/ctrl", per="1/command", reach=(0.0, 2.0), grid=(0.005, 0.01, 0.02, 0.05, 0.12, 0.3)),
+        Quantity(
+            "slowness",
+            0.0,
+            0.0,
+            2.0,
+            unit="s/ctrl",
+            per="1/command",
+            reach=(0.0, 2.0),
+            grid=(0.005, 0.01, 0.02, 0.05, 0.12, 0.3),
+        ),
     )
 
     def init(self, at: Site) -> Any:

@@ -28,8 +28,12 @@ class SpeedTorqueLimit(Effect):
     name: ClassVar[str] = "speed_torque_limit"
     kind: ClassVar[str] = "actuator"
     quantities: ClassVar[tuple[Quantity, ...]] = (
-        Quantity("inverse_stall", 0.0, 0.0, 10.0, unit="1/(N m)", per="1/force", reach=(0.0, 3.0), grid=(0.1, 0.2, 0.35, 0.6)),
-        Quantity("inverse_speed", 0.0, 0.0, 5.0, unit="s/rad", per="1/speed", reach=(0.0, 1.5), grid=(0.2, 0.4, 0.6, 0.9)),
+        Quantity(
+            "inverse_stall", 0.0, 0.0, 10.0, unit="1/(N m)", per="1/force", reach=(0.0, 3.0), grid=(0.1, 0.2, 0.35, 0.6)
+        ),
+        Quantity(
+            "inverse_speed", 0.0, 0.0, 5.0, unit="s/rad", per="1/speed", reach=(0.0, 1.5), grid=(0.2, 0.4, 0.6, 0.9)
+        ),
     )
 
     def on_actuator(
