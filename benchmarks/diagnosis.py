@@ -147,7 +147,7 @@ def main() -> None:
     old.add_argument("--timeout", type=float, default=3600.0, help="s per case")
     old.add_argument("arguments", nargs="*", help="more arguments of the command, after --")
     old.set_defaults(does=diagnose)
-    told = commands.add_parser("score", help="rates with 90 % Wilson intervals, confusion matrix")
+    told = commands.add_parser("score", help="rates with 90 %% Wilson intervals, confusion matrix")
     told.add_argument("cases", type=Path)
     told.add_argument("--out", type=Path, help="folder for score.md, score.json, confusion.csv (default: the cases')")
     told.set_defaults(does=lambda args: print(score(cases(args.cases), args.out or args.cases)))

@@ -30,8 +30,8 @@ class Settings:
         tie: rivals are models whose share of the gap closed is within this of the winner's.
         singles, pairs: how many candidates are fitted, and of how many all pairs; screened: windows looked at in
             screening.
-        most: effects in one model; iterations: of a fit; fresh: base columns are differenced anew if there are at most so
-            many.
+        most: effects in one model; iterations: of a fit; fresh: base columns are differenced anew if
+            there are at most so many.
     """
 
     relevance: float = 0.05
