@@ -1,0 +1,107 @@
+"""Logs of a pendulum from MuJoCo C at a tenth of the diagnosed simulator's step, for the tests of the diagnosis.
+
+Integrated by Runge-Kutta: MuJoCo's Euler step would act half a sub-step early, which precise logs show as a gap.
+"""
+
+import copy
+import dataclasses
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from bayessim_mjx.diagnosis import robot, run, windows
+from bayessim_mjx.diagnosis.fit import Fitter, Job
+from bayessim_mjx.logs import Channels, Log, estimate_velocity, write_log
+
+MODEL = """<mujoco><option timestep="%g" integrator="%s"/><worldbody><body name="link">
+  <joint name="hinge" axis="0 1 0" damping="%g" armature="%g" frictionloss="%g"/>
+  <geom type="capsule" size=".02" fromto="0 0 0 0 0 -.5" mass="%g" contype="0" conaffinity="0"/></body></worldbody>
+<actuator><motor name="motor" joint="hinge"/></actuator></mujoco>"""
+STEP, PERIOD = 0.002, 0.02  # s, of the simulator and of the logs
+DAMPING, ARMATURE, MASS = 0.02, 0.005, 0.5  # nominal
+NAMES = ("hinge_damping_mult", "hinge_armature_mult", "link_mass_mult")
+FEW = ("coulomb_friction", "viscous_friction", "actuator_delay", "actuator_gain", "payload")
+
+
+def nominal(folder: Path) -> robot.Robot:
+    """The simulator under diagnosis."""
+    path = folder / "pendulum.xml"
+    path.write_text(MODEL % (STEP, "Euler", DAMPING, ARMATURE, 0.0, MASS))
+    return robot.of_file(path)
+
+
+def recorded(
+    *,
+    friction: float = 0.0,
+    delay: float = 0.0,
+    scale: tuple[float, float, float] = (1.0, 1.0, 1.0),
+    count: int = 8,
+    seconds: float = 4.0,
+    sigma: float = 4e-4,
+    seed: int = 0,
+    **metadata: object,
+) -> list[Log]:
+    """`count` logs under a PD law that follows sines, slow to fast.
+
+    Args:
+        friction: N m; delay: s; scale: of damping, armature and mass; sigma: rad.
+    """
+    each = 10 * round(PERIOD / STEP)
+    damping, armature, mass = np.multiply((DAMPING, ARMATURE, MASS), scale)
+    model = mujoco.MjModel.from_xml_string(MODEL % (PERIOD / each, "RK4", damping, armature, friction, mass))
+    rng = np.random.default_rng(seed)
+    return [_one(model, i, round(seconds / PERIOD), each, delay, sigma, rng, metadata) for i in range(count)]
+
+
+def _one(
+    model: mujoco.MjModel,
+    i: int,
+    rows: int,
+    each: int,
+    delay: float,
+    sigma: float,
+    rng: np.random.Generator,
+    metadata: dict[str, object],
+) -> Log:
+    data, late = mujoco.MjData(model), round(delay / model.opt.timestep)
+    data.qpos[0] = 0.3 * rng.normal()
+    rate, size = 0.4 + 0.2 * i, 0.3 + 0.1 * i
+    table, held = [], []
+    for k in range(rows + 1):
+        t = k * PERIOD
+        target = size * np.sin(2 * np.pi * rate * t + i) + 0.2 * np.sin(3.1 * rate * t)
+        command = 6.0 * (target - data.qpos[0]) - 0.6 * data.qvel[0]
+        table.append((t, command, data.qpos[0]))
+        for _ in range(each):
+            held.append(command)
+            data.ctrl[0] = held[max(0, len(held) - 1 - late)]
+            mujoco.mj_step(model, data)
+    time, ctrl, qpos = (np.array(c) for c in zip(*table, strict=True))
+    qpos = (qpos + sigma * rng.normal(size=len(qpos)))[:, None]
+    channels, noise = Channels.of(model), np.array([max(sigma, 1e-7)])
+    qvel, spread = estimate_velocity(time, qpos, channels, noise)
+    return Log(f"log{i}", time, ctrl[:, None], qpos, qvel, False, channels, noise, spread, metadata=metadata)
+
+
+def fitted(setup: run.Setup) -> tuple[Fitter, Job]:
+    """The fit of the known parameters alone."""
+    fitter = setup.fitter
+    job = fitter.begin(fitter.base)
+    fitter.iterate([job], 8, lambda j: range(len(j.coordinates)))
+    return fitter, fitter.refresh(job)
+
+
+def refit(setup: run.Setup, logs: list[Log]) -> tuple[Fitter, Job]:
+    """`fitted` on other logs of the same number and length, by the program that is already compiled."""
+    simulator = copy.copy(setup.fitter.simulator)
+    old, model, physics = simulator.windows, setup.physics.mj_model, setup.physics
+    simulator.windows = windows.cut(logs, model, PERIOD, physics.substeps, old.steps, limit=len(old))
+    return fitted(dataclasses.replace(setup, fitter=Fitter(simulator, setup.fitter.base, setup.fitter.theta)))
+
+
+def saved(folder: Path, logs: list[Log]) -> Path:
+    """The logs as CSV files."""
+    for log in logs:
+        write_log(folder / f"{log.name}.csv", log)
+    return folder

@@ -1,0 +1,59 @@
+"""Screening from one simulation per starting point: the true effect first, its gain foretold."""
+
+import numpy as np
+import pytest
+
+from bayessim_mjx.diagnosis import run
+from bayessim_mjx.diagnosis.screen import screen
+
+from .pendulums import FEW, fitted, nominal, recorded, refit
+
+SCALE = (1.1, 1.08, 0.95)
+TRUTHS = {"coulomb_friction": {"friction": 0.03}, "actuator_delay": {"delay": 0.008}}
+
+
+@pytest.fixture(scope="module")
+def setup(tmp_path_factory):
+    return run.prepare(nominal(tmp_path_factory.mktemp("screen")), recorded(scale=SCALE), FEW)
+
+
+@pytest.fixture(scope="module", params=TRUTHS)
+def screened(request, setup):
+    fitter, job = refit(setup, recorded(scale=SCALE, **TRUTHS[request.param]))
+    return request.param, setup, fitter, job, screen(fitter, job, setup.candidates)
+
+
+def test_the_true_effect_gains_most(screened):
+    truth, setup, _, _, found = screened
+    assert {s.candidate.label for s in found} == {c.label for c in setup.candidates}
+    assert found[0].candidate.effect == truth
+    assert [s.gain for s in found] == sorted((s.gain for s in found), reverse=True)
+
+
+def test_predicted_gains_are_realised(screened):
+    _, _, fitter, job, found = screened
+    best = found[0]
+    new = fitter.derive(job, best.candidate.coordinates, best.start)
+    fitter.iterate([new], 10, lambda j: range(len(j.coordinates)))
+    assert 0.5 < best.gain / (job.cost - new.cost) < 2.0
+
+
+def test_starts_lie_within_their_ranges_and_shares_are_shares(screened):
+    *_, found = screened
+    for s in found:
+        bounds = [(c.low, c.high) for c in s.candidate.coordinates]
+        assert all(low <= v <= high for v, (low, high) in zip(s.start, bounds, strict=True))
+        assert s.gain >= 0 and -1e-6 <= s.absorbed <= 1 + 1e-6 and np.isfinite(s.column).all()
+
+
+def test_what_the_known_parameters_already_do_is_absorbed(setup):
+    fitter, job = fitted(setup)
+    found = {s.candidate.effect: s for s in screen(fitter, job, setup.candidates)}
+    assert found["viscous_friction"].absorbed > 0.95  # the same column as damping
+    assert found["viscous_friction"].absorbed > found["coulomb_friction"].absorbed
+    assert fitter.simulator.traces == 1
+
+
+def test_no_candidates_no_answers(screened):
+    _, _, fitter, job, _ = screened
+    assert screen(fitter, job, []) == []
