@@ -1,5 +1,7 @@
 """Screening from one simulation per starting point: the true effect first, its gain foretold."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -9,7 +11,7 @@ from bayessim_mjx.diagnosis.screen import screen
 from .pendulums import FEW, fitted, nominal, recorded, refit
 
 SCALE = (1.1, 1.08, 0.95)
-TRUTHS = {"coulomb_friction": {"friction": 0.03}, "actuator_delay": {"delay": 0.008}}
+TRUTHS: dict[str, dict[str, Any]] = {"coulomb_friction": {"friction": 0.03}, "actuator_delay": {"delay": 0.008}}
 
 
 @pytest.fixture(scope="module")

@@ -89,7 +89,7 @@ def test_a_step_of_the_command_acts_half_a_substep_before_its_row():
 def test_impulses_of_commands_survive_fast_logs():
     fast = 5  # rows of the log per control step
     rng = np.random.default_rng(0)
-    time = PERIOD / fast * np.arange(60 * fast + 1)
+    time = PERIOD / fast * np.arange(60 * fast + 1, dtype=np.float64)
     ctrl = rng.normal(size=(len(time), 1))
     qpos = np.sin(time)[:, None]
     raw = dataclasses.replace(LOGS[0], time=time, ctrl=ctrl, qpos=qpos, qvel=np.cos(time)[:, None])
@@ -126,5 +126,5 @@ def test_drives_that_are_off_are_off_in_the_window():
     on = np.ones(len(LOGS[0]))
     on[:8] = 0
     found = cut([dataclasses.replace(LOGS[0], streams={"enabled:motor": on}), LOGS[1]])
-    np.testing.assert_array_equal(found.batch.enabled[0, :, 0], on[:LENGTH])
+    np.testing.assert_array_equal(np.asarray(found.batch.enabled)[0, :, 0], on[:LENGTH])
     assert np.all(np.asarray(found.batch.enabled)[found.log == 1] == 1)
