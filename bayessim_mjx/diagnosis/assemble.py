@@ -196,14 +196,12 @@ def _parameters(race: search.Race, model: Model, sd: np.ndarray) -> dict[str, di
 
 def ranking(race: search.Race) -> list[dict[str, Any]]:
     """Models tried, best first: held-out score, nats over the known parameters alone, and its standard error."""
-    group = race.fitter.simulator.windows.group
-    above = max(race.base.total - race.noise * len(race.base.cost), 1e-9)
+    draws = uncertainty.bootstrap_weights(race.fitter.simulator.windows.group, 200, np.random.default_rng(0))
     absorbed = {s.candidate.label: s.absorbed for s in race.screened}
     out: list[dict[str, Any]] = []
     for model in search.ranked(race)[:60]:
-        gain = race.base.cost - model.cost
-        sums = np.array([gain[group == g].sum() for g in np.unique(group)])
-        error = float(np.std(sums, ddof=1) * np.sqrt(len(sums)) / above) if len(sums) > 1 else float("nan")
+        ratio = np.log((draws @ race.base.cost) / (draws @ model.cost))
+        error = float(0.5 * model.samples * np.std(ratio))
         out.append({
             "effects": [e.label for e in model.effects],
             "label": model.label,

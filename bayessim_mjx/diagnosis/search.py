@@ -58,7 +58,7 @@ def simplest(race: Race, model: Model, say: Progress) -> Model:
         if len(parts) > 1:
             smaller.append(_together(race, model, effect, parts, say))
         near = [m for m in smaller if race.closure(model) - race.closure(m) < race.settings.tie / 2]
-        near = [m for m in near if m.size <= model.size]
+        near = [m for m in near if m.size <= model.size and m.total < 6.0 * max(model.total, race.noise * len(m.cost))]
         if near:
             return simplest(race, polish(race, min(near, key=lambda m: (m.size, m.total))), say)
     return model
