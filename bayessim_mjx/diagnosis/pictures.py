@@ -24,7 +24,8 @@ def details(found: Findings, effects: list[FoundEffect]) -> dict[str, Any]:
         "isolability": _isolability(found.race),
         "episodes": _episodes(found),
         "closure": [
-            {"effects": [f"{e.name}@{e.where}"], "predicted": e.predicted_gap_closed, "realised": e.gap_closed} for e in effects
+            {"effects": [f"{e.name}@{e.where}"], "predicted": e.predicted_gap_closed, "realised": e.gap_closed}
+            for e in effects
         ],
         "shapley": [{"effect": f"{e.name}@{e.where}", "share": e.share} for e in effects if e.share == e.share],
         "flexible": {} if flex is None else flex.details(rms["calibrated"], rms["with_effects"]),

@@ -157,7 +157,8 @@ def _starts(race: Race, model: Model, extra: Screened, rank: int) -> list[Job]:
         fresh = fitter.derive(model.job, coordinates, extra.others[0])
         base = len(fitter.base)
         fresh.values[:base] = [c.neutral for c in fitter.base]  # not from where the base went without the effect
-        jobs.append(fresh)
+        # a limit has no derivative below its threshold, so also from the probe itself, not scaled down to its step
+        jobs += [fresh, fitter.derive(model.job, coordinates, extra.others[0])]
         jobs += [fitter.derive(model.job, coordinates, other) for other in extra.others[1:]]
     return jobs
 
