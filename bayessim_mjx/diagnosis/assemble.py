@@ -199,13 +199,15 @@ def ranking(race: search.Race) -> list[dict[str, Any]]:
     draws = uncertainty.bootstrap_weights(race.fitter.simulator.windows.group, 200, np.random.default_rng(0))
     absorbed = {s.candidate.label: s.absorbed for s in race.screened}
     out: list[dict[str, Any]] = []
-    for model in search.ranked(race)[:60]:
+    tried = search.ranked(race)[:60]
+    samples = tried[0].samples  # one for all, so that scores are in the order of the errors
+    for model in tried:
         ratio = np.log((draws @ race.base.cost) / (draws @ model.cost))
-        error = float(0.5 * model.samples * np.std(ratio))
+        error = float(0.5 * samples * np.std(ratio))
         out.append({
             "effects": [e.label for e in model.effects],
             "label": model.label,
-            "score": race.better(race.base, model).evidence,
+            "score": 0.5 * samples * float(np.log(race.base.total / model.total)),
             "se": error,
             "gap_closed": race.closure(model),
             "rms": float(np.sqrt(model.total / model.job.r.size)),

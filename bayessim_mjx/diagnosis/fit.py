@@ -210,7 +210,10 @@ class Fitter:
         q, _ = job.quadratic(self.spread)
         precision, pull, low, high = job.prior()
         group = self.simulator.windows.group if group is None else group
-        return held_out(q, group, job.weight, precision, pull, low, high)
+        leash = np.full(len(job.coordinates), np.inf)
+        for i in range(len(self.base), len(job.coordinates)):
+            leash[i] = max(0.5 * abs(job.values[i] - job.coordinates[i].neutral), 4 * job.coordinates[i].step)
+        return held_out(q, group, job.weight, precision, pull, low, high, leash)
 
 
 def _columns(r: Array, shifted: Array, steps: Sequence[float]) -> Array:

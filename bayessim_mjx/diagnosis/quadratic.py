@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+PARTS = 8
 TRUST = 1e-3  # of the curvature: without a condition the fit stays put along directions that no data decide
 
 
@@ -69,7 +70,7 @@ def eliminate(r: Array, A: Array, B: Array, x: Array, spread: Array) -> tuple[Qu
 def solve(S: Array, g: Array, low: Array, high: Array) -> Array:
     """argmin p'Sp - 2 g'p with low <= p <= high (S positive semidefinite): an active set of bounds.
 
-    Primal active set from the clipped free solution; at most 4 K passes.
+    Bounds are held and released one at a time (primal active set), from the clipped free solution.
     """
     k = len(g)
     scale = 1 / np.sqrt(np.maximum(np.diag(S), 1e-300))
@@ -79,26 +80,26 @@ def solve(S: Array, g: Array, low: Array, high: Array) -> Array:
     if np.all((p >= lo) & (p <= hi)):
         return p * scale
     p = np.clip(p, lo, hi)
-    for _ in range(200):  # projected coordinate descent with a Newton step on the free set
-        free = ~(((p <= lo) & (H @ p - h > 0)) | ((p >= hi) & (H @ p - h < 0)))
-        if free.any():
-            target = p.copy()
-            rest = h[free] - H[np.ix_(free, ~free)] @ p[~free]
-            target[free] = _cholesky_solve(H[np.ix_(free, free)], rest)
-            move = target - p
-            with np.errstate(divide="ignore", invalid="ignore"):
-                room = np.where(move > 0, (hi - p) / move, np.where(move < 0, (lo - p) / move, np.inf))
-            alpha = min(1.0, float(np.min(room)))
-            p = np.clip(p + alpha * move, lo, hi)
-            at = np.argmin(room) if alpha < 1 else -1
-            if at >= 0:
-                p[at] = hi[at] if move[at] > 0 else lo[at]
-            if alpha >= 1:
-                slope = H @ p - h
-                if np.all((slope > -1e-9) | (p >= hi)) and np.all((slope < 1e-9) | (p <= lo)):
-                    break
-        else:
+    held = (p <= lo) | (p >= hi)
+    for _ in range(20 * k):
+        target = p.copy()
+        if (~held).any():
+            rest = h[~held] - H[np.ix_(~held, held)] @ p[held]
+            target[~held] = _cholesky_solve(H[np.ix_(~held, ~held)], rest)
+        move = target - p
+        with np.errstate(divide="ignore", invalid="ignore"):
+            room = np.where(move > 0, (hi - p) / move, np.where(move < 0, (lo - p) / move, np.inf))
+        at = int(np.argmin(room))
+        if room[at] < 1.0:  # up to the first bound, which is then held
+            p = np.clip(p + room[at] * move, lo, hi)
+            p[at], held[at] = (hi if move[at] > 0 else lo)[at], True
+            continue
+        p = np.clip(target, lo, hi)
+        slope = H @ p - h
+        inward = held * np.where(p <= lo, -slope, slope)
+        if np.max(inward) < 1e-9:
             break
+        held[int(np.argmax(inward))] = False  # the one that pulls hardest away from its bound
     return p * scale
 
 
@@ -110,22 +111,43 @@ def _cholesky_solve(H: Array, h: Array) -> NDArray[np.floating]:
 
 
 def held_out(
-    q: Quadratic, group: NDArray[np.int64], weight: Array, precision: Array, pull: Array, low: Array, high: Array
+    q: Quadratic,
+    group: NDArray[np.int64],
+    weight: Array,
+    precision: Array,
+    pull: Array,
+    low: Array,
+    high: Array,
+    leash: Array | None = None,
 ) -> tuple[Array, Array]:
     """Leave-one-condition-out by one Newton step from the fit to all windows (the infinitesimal jackknife).
 
     Args:
-        q: at the fit; group, weight: `[W]`; precision, pull: `[K]` of the Gaussian prior, pull = precision * (mean -
-            value); low, high: `[K]`, how far each parameter may move.
+        q: at the fit; group, weight: `[W]`; precision, pull: `[K]` of the Gaussian prior, pull = precision * (mean - value);
+        low, high: `[K]`, how far each parameter may move.
+        leash: `[K]`; a parameter that moves further without a condition is only seen in that condition. Its windows are
+            then held out in PARTS: what is left of them tells the parameter.
 
     Returns:
         (costs of the held-out windows `[W]`, estimates relative to the fit `[G, K]`).
     """
+
+    def step(out: NDArray[np.bool_]) -> Array:
+        g, S = q.weighted(weight * ~out)
+        return solve(S + np.diag(precision + TRUST * np.diag(S)), g + pull, low, high)
+
     costs, moves = np.zeros(len(group)), []
     for name in np.unique(group):
         out = group == name
-        g, S = q.weighted(weight * ~out)
-        p = solve(S + np.diag(precision + TRUST * np.diag(S)), g + pull, low, high)
-        costs[out] = q.at(p)[out]
+        p = step(out)
+        if leash is not None and np.any(np.abs(p) > leash):
+            own = np.flatnonzero(out)
+            parts = [np.isin(np.arange(len(group)), own[k::PARTS]) for k in range(min(PARTS, len(own)))]
+            steps = [step(part) for part in parts]
+            for part, each in zip(parts, steps, strict=True):
+                costs[part] = q.at(each)[part]
+            p = np.mean(steps, axis=0)
+        else:
+            costs[out] = q.at(p)[out]
         moves.append(p)
     return costs, np.array(moves)
