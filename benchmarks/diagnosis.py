@@ -1,11 +1,12 @@
 """Blind benchmark of the gap diagnosis: is a hidden effect named, at its place, and nothing where there is none?
 
-    python benchmarks/diagnosis.py generate --out CASES --seeds 1000:1010 --kinds single,double,null,unknown
+    python benchmarks/diagnosis.py generate --out CASES --seeds 2000:2010 --kinds single,double,null,unknown
     python benchmarks/diagnosis.py run CASES
     python benchmarks/diagnosis.py run CASES --leave-out-family
     python benchmarks/diagnosis.py score CASES
 
-Seeds below 1000 are for development; numbers to publish come from seeds of 1000 and more, which nothing was tuned on.
+Seeds below 2000 are for development (1000 to 1029 were looked at, on the pendulum). Numbers to publish come from seeds
+of 2000 and more, which nothing was tuned on.
 """
 
 import argparse
@@ -135,7 +136,7 @@ def main() -> None:
     commands = parser.add_subparsers(required=True)
     new = commands.add_parser("generate", help="write cases")
     new.add_argument("--out", type=Path, required=True)
-    new.add_argument("--seeds", default="1000:1010", help="first:last, last not included")
+    new.add_argument("--seeds", default="2000:2010", help="first:last, last not included")
     new.add_argument("--kinds", default=",".join(KINDS))
     new.add_argument("--systems", default=",".join(SYSTEMS))
     new.add_argument("--strengths", default="medium,strong", help=f"of {', '.join(STRENGTHS)}; they take turns")

@@ -70,7 +70,7 @@ def make_case(
         effects: names, or (name, where); () is a case in which nothing but base parameters is wrong.
         strength: weak, medium, strong, severe: 3, 10, 30, 100 noises within half a second, and a third of that still
             there after the base parameters have been refitted.
-        seed: of everything; below 1000 for development, from 1000 on for the benchmark.
+        seed: of everything; below 2000 for development, from 2000 on for the benchmark.
         out: folder, created.
         velocity: log velocities (default: drawn).
         spread: of the base parameters; noise: of the encoders.

@@ -9,6 +9,7 @@ import numpy as np
 from bayessim_mjx.diagnosis import race, verdict
 from bayessim_mjx.diagnosis.result import FoundEffect
 from bayessim_mjx.diagnosis.run import Findings, dof_names, length_unit
+from bayessim_mjx.effects import spec_of
 
 MANY = 24  # candidates in the isolability matrix, overlays in the report
 
@@ -20,6 +21,7 @@ def details(found: Findings, effects: list[FoundEffect]) -> dict[str, Any]:
     each, deviation = verdict.per_condition(found.race, ruling.model)
     names = ruling.model.job.names
     return {
+        "effect_specs": {e.name: spec_of(e) for e in found.setup.physics.effects},
         "overlays": _overlays(found),
         "isolability": _isolability(found.race),
         "episodes": _episodes(found),

@@ -123,7 +123,8 @@ def held_out(
     """Leave-one-condition-out by one Newton step from the fit to all windows (the infinitesimal jackknife).
 
     Args:
-        q: at the fit; group, weight: `[W]`; precision, pull: `[K]` of the Gaussian prior, pull = precision * (mean - value);
+        q: at the fit; group, weight: `[W]`.
+        precision, pull: `[K]` of the Gaussian prior, pull = precision (mean - value).
         low, high: `[K]`, how far each parameter may move.
         leash: `[K]`; a parameter that moves further without a condition is only seen in that condition. Its windows are
             then held out in PARTS: what is left of them tells the parameter.
