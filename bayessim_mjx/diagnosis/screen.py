@@ -63,7 +63,7 @@ def screen(fitter: Fitter, job: Job, candidates: Sequence[Candidate], limit: int
 
 
 def _with_others(found: list[tuple[Screened, Array]]) -> Screened:
-    """The best start, with the best one that differs in what it moves or in its shape."""
+    """The best start, with the best that differs in what it moves or in its shape, and the best at another level."""
     found = sorted(found, key=lambda f: -f[0].gain)
     first, point = found[0]
     neutral = np.array([c.neutral for c in first.candidate.coordinates])
@@ -72,8 +72,10 @@ def _with_others(found: list[tuple[Screened, Array]]) -> Screened:
     def sort_of(p: Array) -> tuple:
         return tuple(np.sign(p - neutral)[~shapes]) + tuple(p[shapes])
 
-    other = next((s.start for s, p in found[1:] if s.gain > 0 and sort_of(p) != sort_of(point)), None)
-    return replace(first, others=(point,) if other is None else (point, other))
+    useful = [(s, p) for s, p in found[1:] if s.gain > 0]
+    others = [s.start for s, p in useful if sort_of(p) != sort_of(point)][:1]
+    levels = [p for _, p in useful if sort_of(p) == sort_of(point)][:1]
+    return replace(first, others=(point, *others, *levels))
 
 
 def _part(job: Job, own: NDArray[np.int64]) -> Job:
