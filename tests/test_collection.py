@@ -11,7 +11,11 @@ from bayessim_mjx.parameters import Parameter, ParameterSpace
 from bayessim_mjx.rl import networks, normalise
 
 SPACE = ParameterSpace(
-    [Parameter("mass", 1.0, 0.1, 2.0), Parameter("length", 1.0, 0.1, 2.0), Parameter("damping", 0.5, 0.0, 1.0)]
+    [
+        Parameter("mass", 1.0, 0.1, 2.0, kind="body"),
+        Parameter("length", 1.0, 0.1, 2.0, kind="body"),
+        Parameter("damping", 0.5, 0.0, 1.0, kind="body"),
+    ]
 )
 
 
