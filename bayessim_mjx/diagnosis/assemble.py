@@ -14,8 +14,9 @@ from bayessim_mjx.diagnosis.candidates import Candidate
 from bayessim_mjx.diagnosis.models import Model
 from bayessim_mjx.diagnosis.pictures import details
 from bayessim_mjx.diagnosis.result import Diagnosis, Estimate, FoundEffect, Gap, Place
-from bayessim_mjx.diagnosis.run import Findings, Setup, dof_names, length_unit
+from bayessim_mjx.diagnosis.run import Findings, Setup, length_unit
 from bayessim_mjx.diagnosis.sentences import horizon_warning, sentences
+from bayessim_mjx.logs.log import Channels
 
 UNEXPLAINED = 2.0  # noise standard deviations that remain and that nothing predicts
 REMAINS = 0.3  # share of the calibrated gap that a flexible force closes on top of named effects: not in the library
@@ -153,7 +154,7 @@ def _gap(found: Findings) -> Gap:
         row["reducible_floor"] = min(floor, row["with_effects"])
         horizons.append({"name": f"{steps * cut.dt:.2g} s", "seconds": steps * cut.dt, **row})
     whole = horizons[-1]
-    names = dof_names(setup.physics.mj_model)
+    names = Channels.of(setup.physics.mj_model).qvel
     by_channel = {
         joint: {s: float(np.sqrt(p.cost(cut.steps, slice(i, i + 1)).mean())) for s, p in predictions.items()}
         for i, joint in enumerate(names)
@@ -223,7 +224,7 @@ def _where(found: Findings) -> list[Place]:
     cut = setup.fitter.simulator.windows
     draws = uncertainty.bootstrap_weights(cut.group, 400, np.random.default_rng(setup.seed))
     calibrated = found.predictions["calibrated"]
-    names = dof_names(setup.physics.mj_model)
+    names = Channels.of(setup.physics.mj_model).qvel
     costs = np.stack([np.maximum(calibrated.cost(cut.steps, slice(i, i + 1)) - 1.0, 0.0) for i in range(len(names))], 1)
     total = costs.sum()
     if total <= 0.1 * costs.size:

@@ -6,12 +6,13 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.scales import Scales, ranges
 from bayessim_mjx.effects.effect import Effect, Quantity
-from bayessim_mjx.effects.site import places
+from bayessim_mjx.effects.site import element_names, places
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 from bayessim_mjx.physics import Physics
 
@@ -81,9 +82,7 @@ def _precision(p: Parameter) -> float:
     return 1.0 / (0.58 * (p.high - p.low)) ** 2  # sd of a uniform prior, doubled: between the bounds nearly flat
 
 
-def stack(
-    kinds: Sequence[type[Effect]], model_space: ParameterSpace, scales: Scales
-) -> tuple[tuple[Effect, ...], list[str]]:
+def stack(kinds: Sequence[type[Effect]], scales: Scales) -> tuple[tuple[Effect, ...], list[str]]:
     """One Effect per kind over all of its places, each with values and ranges of its own; and what is left out."""
     made, left_out = [], []
     for kind in kinds:
@@ -106,19 +105,13 @@ def _alive(kind: type[Effect], place: str, scales: Scales) -> bool:
     """Joints that never moved tell nothing of what happens in them; nor do contacts of a model without contacts."""
     model = scales.model
     if kind.kind == "joint":
-        joint = [model.joint(i).name or f"joint{i}" for i in range(model.njnt)].index(place)
+        joint = element_names(model, "joint").index(place)
         return bool(scales.moves[model.jnt_dofadr[joint]])
     if kind.kind == "geom":
-        geom = [model.geom(i).name or f"geom{i}" for i in range(model.ngeom)].index(place)
-        return bool(model.geom_contype[geom] | model.geom_conaffinity[geom]) and _collides(model)
+        geom = element_names(model, "geom").index(place)
+        off = int(model.opt.disableflags) & int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+        return bool(model.geom_contype[geom] | model.geom_conaffinity[geom]) and not off
     return True
-
-
-def _collides(model: object) -> bool:
-    import mujoco
-
-    off = int(model.opt.disableflags) & int(mujoco.mjtDisableBit.mjDSBL_CONTACT)  # type: ignore[attr-defined]
-    return not off
 
 
 def enumerate_candidates(physics: Physics) -> list[Candidate]:

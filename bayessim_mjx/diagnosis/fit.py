@@ -39,7 +39,6 @@ class Job:
     weight: Array
     cost: float
     damping: float = 1e-3
-    label: str = ""
     history: list[float] = field(default_factory=list)
 
     @property
@@ -140,14 +139,12 @@ class Fitter:
         each = np.sum(r**2, 1) + np.sum((offsets / self.spread) ** 2, 1)
         return float(job.weight @ each) + job.penalty(values)
 
-    def derive(self, job: Job, extra: Sequence[Coordinate], values: Array, label: str = "") -> Job:
+    def derive(self, job: Job, extra: Sequence[Coordinate], values: Array) -> Job:
         """A job with more coordinates, starting at `values` for these; its first columns come with the first step."""
         own = tuple(job.coordinates) + tuple(extra)
         blank = np.zeros((*job.r.shape, len(extra)))
         start, columns = np.concatenate([job.values, values]), np.concatenate([job.A, blank], 2)
-        new = Job(own, start, job.offsets, job.r, columns, job.B, job.weight, np.inf)
-        new.label = label
-        return new
+        return Job(own, start, job.offsets, job.r, columns, job.B, job.weight, np.inf)
 
     def iterate(
         self,
@@ -210,10 +207,8 @@ class Fitter:
         q, _ = job.quadratic(self.spread)
         precision, pull, low, high = job.prior()
         group = self.simulator.windows.group if group is None else group
-        leash = np.full(len(job.coordinates), np.inf)
-        for i in range(len(self.base), len(job.coordinates)):
-            leash[i] = max(0.5 * abs(job.values[i] - job.coordinates[i].neutral), 4 * job.coordinates[i].step)
-        return held_out(q, group, job.weight, precision, pull, low, high, leash)
+        watched = np.arange(len(self.base), len(job.coordinates))
+        return held_out(q, group, job.weight, precision, pull, low, high, watched)
 
 
 def _columns(r: Array, shifted: Array, steps: Sequence[float]) -> Array:

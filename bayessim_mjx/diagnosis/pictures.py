@@ -8,8 +8,9 @@ import numpy as np
 
 from bayessim_mjx.diagnosis import race, verdict
 from bayessim_mjx.diagnosis.result import FoundEffect
-from bayessim_mjx.diagnosis.run import Findings, dof_names, length_unit
+from bayessim_mjx.diagnosis.run import Findings, length_unit
 from bayessim_mjx.effects import spec_of
+from bayessim_mjx.logs.log import Channels
 
 MANY = 24  # candidates in the isolability matrix, overlays in the report
 
@@ -44,7 +45,7 @@ def details(found: Findings, effects: list[FoundEffect]) -> dict[str, Any]:
         ],
         "noise": [
             {"channel": n, "sigma": float(s)}
-            for n, s in zip(dof_names(found.setup.physics.mj_model), cut.sigma_q, strict=True)
+            for n, s in zip(Channels.of(found.setup.physics.mj_model).qvel, cut.sigma_q, strict=True)
         ],
     }  # fmt: skip
 

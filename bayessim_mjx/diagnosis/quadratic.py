@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 PARTS = 8
+ONLY = 9.0  # a parameter whose variance grows by this without a condition is told by that condition alone
 TRUST = 1e-3  # of the curvature: without a condition the fit stays put along directions that no data decide
 
 
@@ -118,7 +119,7 @@ def held_out(
     pull: Array,
     low: Array,
     high: Array,
-    leash: Array | None = None,
+    watched: NDArray[np.int64] | None = None,
 ) -> tuple[Array, Array]:
     """Leave-one-condition-out by one Newton step from the fit to all windows (the infinitesimal jackknife).
 
@@ -126,22 +127,29 @@ def held_out(
         q: at the fit; group, weight: `[W]`.
         precision, pull: `[K]` of the Gaussian prior, pull = precision (mean - value).
         low, high: `[K]`, how far each parameter may move.
-        leash: `[K]`; a parameter that moves further without a condition is only seen in that condition. Its windows are
-            then held out in PARTS: what is left of them tells the parameter.
+        watched: parameters that may be told by one condition alone (a limit only reached there, drag only felt there).
+            That condition's windows are then held out in PARTS: extrapolating a parameter to where it first matters
+            would judge its uncertainty, not the model.
 
     Returns:
         (costs of the held-out windows `[W]`, estimates relative to the fit `[G, K]`).
     """
+    watched = np.arange(0) if watched is None else watched
+
+    def without(out: NDArray[np.bool_]) -> tuple[Array, Array]:
+        g, S = q.weighted(weight * ~out)
+        return g, S + np.diag(precision + TRUST * np.diag(S))
 
     def step(out: NDArray[np.bool_]) -> Array:
-        g, S = q.weighted(weight * ~out)
-        return solve(S + np.diag(precision + TRUST * np.diag(S)), g + pull, low, high)
+        g, S = without(out)
+        return solve(S, g + pull, low, high)
 
+    known = _variances(without(np.zeros(len(group), bool))[1])
     costs, moves = np.zeros(len(group)), []
     for name in np.unique(group):
         out = group == name
-        p = step(out)
-        if leash is not None and np.any(np.abs(p) > leash):
+        lost = _variances(without(out)[1]) > ONLY * known
+        if lost[watched].any():
             own = np.flatnonzero(out)
             parts = [np.isin(np.arange(len(group)), own[k::PARTS]) for k in range(min(PARTS, len(own)))]
             steps = [step(part) for part in parts]
@@ -149,6 +157,13 @@ def held_out(
                 costs[part] = q.at(each)[part]
             p = np.mean(steps, axis=0)
         else:
+            p = step(out)
             costs[out] = q.at(p)[out]
         moves.append(p)
     return costs, np.array(moves)
+
+
+def _variances(S: Array) -> Array:
+    """Diagonal of the inverse `[K]`."""
+    scale = 1 / np.sqrt(np.maximum(np.diag(S), 1e-300))
+    return np.diag(np.linalg.pinv(S * scale[:, None] * scale[None, :], hermitian=True)) * scale**2

@@ -99,7 +99,7 @@ def prepare(
     floors = noise.floors(usable)
     kinds = [library.load(n) if isinstance(n, str) else n for n in (library.names() if effects == "all" else effects)]
     size = scales.measure(robot.mj_model, [resample(log, dt) for log in usable])
-    stack, left_out = candidates.stack(kinds, robot.space, size)
+    stack, left_out = candidates.stack(kinds, size)
     physics = robot.physics(dt, stack)
     cut = _windows(robot, physics, usable, dt, group, seen.use_qvel)
     fitter = Fitter(Simulator(physics, cut), candidates.base_coordinates(robot.space), physics.space.nominal)
@@ -205,17 +205,6 @@ def _flexible(setup: Setup, model: Model, race: search.Race, missing: Disturbanc
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return flexible(setup.fitter, model.job, missing)
-
-
-def dof_names(model: mujoco.MjModel) -> list[str]:
-    """One name per dof `[nv]`."""
-    out = [""] * model.nv
-    for j in range(model.njnt):
-        name = model.joint(j).name or f"joint{j}"
-        width = {0: 6, 1: 3}.get(int(model.jnt_type[j]), 1)
-        for k in range(width):
-            out[int(model.jnt_dofadr[j]) + k] = name if width == 1 else f"{name}[{k}]"
-    return out
 
 
 def length_unit(model: mujoco.MjModel, dof: int) -> str:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayessim_mjx.effects.effect import Effect, Quantity
+from bayessim_mjx.effects.site import element_names
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Log
 from bayessim_mjx.parameters import Parameter
@@ -38,15 +39,15 @@ class Scales:
         """{word of `Quantity.per`: scale} at one place."""
         model = self.model
         if kind == "joint":
-            return self._of_dof(int(model.jnt_dofadr[_index(model, "joint", place)]))
+            return self._of_dof(int(model.jnt_dofadr[element_names(model, "joint").index(place)]))
         if kind == "actuator":
-            i = _index(model, "actuator", place)
+            i = element_names(model, "actuator").index(place)
             joint = int(model.actuator_trnid[i, 0])
             on_joint = int(model.actuator_trntype[i]) <= int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)
             own = self._of_dof(int(model.jnt_dofadr[joint])) if on_joint else {}
             return own | {"command": float(self.command[i]), "force": float(self.effort[i])}
         if kind == "body":
-            i = _index(model, "body", place)
+            i = element_names(model, "body").index(place)
             gravity = float(np.linalg.norm(model.opt.gravity)) or 9.81
             below = float(model.body_subtreemass[i])
             return {"mass": max(float(model.body_mass[i]), 0.1 * below), "weight": below * gravity}
@@ -55,12 +56,6 @@ class Scales:
     def _of_dof(self, v: int) -> dict[str, float]:
         words = ("force", "speed", "travel", "inertia")
         return {word: float(getattr(self, word)[v]) for word in words}
-
-
-def _index(model: mujoco.MjModel, kind: str, place: str) -> int:
-    count = {"joint": model.njnt, "actuator": model.nu, "body": model.nbody}[kind]
-    names = [getattr(model, kind)(i).name or f"{kind}{i}" for i in range(count)]
-    return names.index(place)
 
 
 def measure(model: mujoco.MjModel, logs: Sequence[Log]) -> Scales:

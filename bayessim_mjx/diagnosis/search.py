@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from dataclasses import replace
 
 from bayessim_mjx.diagnosis.candidates import Candidate
 from bayessim_mjx.diagnosis.fit import Fitter
@@ -30,7 +31,7 @@ def run(fitter: Fitter, candidates: Sequence[Candidate], settings: Settings, pro
     """The whole race on the windows of `fitter`."""
     say = progress or (lambda text, done, total: None)
     nominal = fitter.begin(fitter.base)
-    job = fitter.begin(fitter.base)
+    job = replace(nominal, A=nominal.A.copy(), history=[])  # the same point, simulated once
     say("known parameters", 0, 1)
     fitter.iterate([job], 10, lambda j: range(len(j.coordinates)))
     job = fitter.refresh(job)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import jax
 
 from bayessim_mjx.effects.effect import Effect, Quantity
-from bayessim_mjx.effects.friction import dry
+from bayessim_mjx.effects.friction import add, dry, native
 from bayessim_mjx.effects.site import Site, SubStep
 
 if TYPE_CHECKING:
@@ -37,7 +37,6 @@ class CoulombFriction(Effect):
         return memory, dry(at, step, at.values(theta)[:, 0])
 
     def edit(self, spec: "mujoco.MjSpec", values: dict[str, dict[str, float]]) -> str | None:
-        for place, own in values.items():
-            joint = spec.joint(place)
-            joint.frictionloss = joint.frictionloss + own["level"]
+        for joint, own in native(spec, values):
+            add(joint, "frictionloss", own["level"])
         return None

