@@ -133,8 +133,9 @@ def _windows(
 def _few_conditions(cut: windows.Windows) -> list[str]:
     count = len(cut.groups)
     if cut.groups[0].startswith("part 1 of"):
-        return ["one operating condition only: blocks in time are held out, which tells little about other conditions"]
-    return [f"{count} operating conditions: intervals are rough"] if count < 4 else []
+        blocks = "one operating condition only: blocks in time are held out, which tells little about other conditions"
+        return [*cut.notes, blocks]
+    return [*cut.notes, *([f"{count} operating conditions: intervals are rough"] if count < 4 else [])]
 
 
 def diagnose(

@@ -53,6 +53,7 @@ class Windows:
         spread: `[2 nv]`, standard deviation of the measured start state.
         logs: the resampled logs.
         dt: control period, s.
+        notes: what else is held out than was asked for.
     """
 
     batch: Batch
@@ -65,6 +66,7 @@ class Windows:
     spread: Array
     logs: tuple[Log, ...]
     dt: float
+    notes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.log)
@@ -78,21 +80,39 @@ def groups_of(logs: Sequence[Log], key: str | None = None) -> tuple[list[int], t
     """Operating condition of each log: metadata `key`, else `condition` or `operating_condition`, else one per log.
 
     Raises:
-        UserError: the key that was asked for is not in a log's metadata.
+        UserError: the key that was asked for is in no log's metadata.
     """
-    labels = []
-    for log in logs:
-        value = log.metadata.get(key) if key else log.metadata.get("condition", log.metadata.get("operating_condition"))
-        if key and value is None:
-            have = ", ".join(sorted(log.metadata)) or "nothing"
-            raise UserError(f"--group {key}: the metadata of {log.name!r} has no such key; it has {have}")
-        labels.append(str(value) if value is not None else "")
-    if len(set(labels)) == 1 and len(logs) > 1 or not all(labels):
-        labels = [
-            label if label and len(set(labels)) > 1 else log.name for label, log in zip(labels, logs, strict=True)
-        ]
+    labels = _labels(logs, key)
+    if key and not any(labels):
+        have = ", ".join(sorted({k for log in logs for k in log.metadata})) or "no keys"
+        raise UserError(f"--group {key}: no log's metadata has this key; there are: {have}")
+    told = len(set(labels)) > 1  # the same condition everywhere cannot be held out
+    labels = [label if label and told else log.name for label, log in zip(labels, logs, strict=True)]
     names = tuple(dict.fromkeys(labels))
     return [names.index(label) for label in labels], names
+
+
+def _labels(logs: Sequence[Log], key: str | None) -> list[str]:
+    """Each log's condition, "" where its metadata do not tell."""
+    found = [
+        log.metadata.get(key) if key else log.metadata.get("condition", log.metadata.get("operating_condition"))
+        for log in logs
+    ]
+    return ["" if value is None else str(value) for value in found]
+
+
+def group_notes(logs: Sequence[Log], key: str | None) -> tuple[str, ...]:
+    """What is held out in place of the conditions that were asked for, where these cannot be."""
+    labels = _labels(logs, key)
+    if not key or not any(labels):
+        return ()
+    without = [log.name for log, label in zip(logs, labels, strict=True) if not label]
+    if without:
+        return (f"--group {key}: {', '.join(without)} without this key: each is held out as a condition of its own",)
+    if len(set(labels)) > 1:
+        return ()
+    instead = "single logs" if len(logs) > 1 else "blocks of the only log in time"
+    return (f"--group {key}: {labels[0]!r} in all logs, so nothing can be held out by it; {instead} are held out",)
 
 
 def cut(
@@ -153,6 +173,7 @@ def cut(
         spread=spread,
         logs=tuple(even),
         dt=dt,
+        notes=group_notes(logs, group),
     )
 
 

@@ -64,10 +64,27 @@ def test_operating_conditions():
     assert windows.groups_of(both, "load") == ([0, 0, 1], ("1", "2"))
     found = cut(both, group="load")
     assert found.groups == ("1", "2") and all((found.log == 2) == (found.group == 1))
-    with pytest.raises(UserError, match="--group speed.*log0.*condition, load"):
+    assert not found.notes
+    with pytest.raises(UserError, match="--group speed: no log.*condition, load"):
         windows.groups_of(both, "speed")
-    with pytest.raises(UserError, match="--group speed.*nothing"):
+    with pytest.raises(UserError, match="--group speed.*no keys"):
         windows.groups_of(LOGS, "speed")
+
+
+def test_a_group_that_holds_nothing_out_is_told():
+    def loaded(*values):
+        return [
+            dataclasses.replace(log, metadata={} if v is None else {"load": v})
+            for log, v in zip(LOGS, values, strict=True)
+        ]
+
+    same = cut(loaded(1, 1, 1), group="load")
+    assert same.groups == ("log0", "log1", "log2")
+    assert same.notes == ("--group load: '1' in all logs, so nothing can be held out by it; single logs are held out",)
+    partly = cut(loaded(1, 2, None), group="load")
+    assert partly.groups == ("1", "2", "log2") and "log2 without this key" in partly.notes[0]
+    (alone,) = cut(loaded(1, 1, 1)[:1], group="load").notes
+    assert "blocks of the only log in time" in alone
 
 
 def test_one_log_is_held_out_in_blocks_of_time():
