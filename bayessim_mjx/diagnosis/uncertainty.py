@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 
 from bayessim_mjx.diagnosis.fit import Fitter
 from bayessim_mjx.diagnosis.models import Model
@@ -12,23 +15,57 @@ Array = NDArray[np.float64]
 LEVEL = 0.9
 
 
-def deviations(fitter: Fitter, model: Model) -> Array:
-    """Standard deviations `[k]` of the model's parameters.
+@dataclass(frozen=True, eq=False)
+class Spread:
+    """What limits a fit's parameters.
 
-    The larger of the formal one, inflated by the misfit and the residuals' correlation, and the jackknife over
-    operating conditions (Quenouille, 1956): model errors repeat within a condition, so windows are not independent.
+    Attributes:
+        formal: `[k, k]`, Laplace covariance, inflated by the misfit and by the residuals' correlation.
+        between: `[k, k]`, jackknife over operating conditions (Quenouille, 1956): model errors repeat within a
+            condition, so windows are not independent.
+        freedom: `[k]`, degrees of freedom of `between`: conditions that tell the parameter, less one.
     """
+
+    formal: Array
+    between: Array
+    freedom: Array
+
+
+def spread(fitter: Fitter, model: Model) -> Spread:
+    """The uncertainty of the model's parameters at its fit."""
     q, _ = model.job.quadratic(fitter.spread)
     precision, _, _, _ = model.job.prior()
     _, S = q.weighted(model.job.weight)
     covariance = np.linalg.pinv(S + np.diag(precision))
     count = model.job.r.size
     inflation = max(model.total / count, 0.5) * count / model.samples
-    formal = np.diag(covariance) * inflation
-    estimates = model.estimates
-    g = len(estimates)
-    jackknife = (g - 1) / g * np.sum((estimates - estimates.mean(0)) ** 2, axis=0) if g > 1 else 0.0
-    return np.sqrt(np.maximum(formal, jackknife))
+    moves = model.estimates - model.estimates.mean(0)
+    g = len(moves)
+    group = fitter.simulator.windows.group
+    told = [covariance @ q.weighted(model.job.weight * (group == name))[1] @ covariance for name in np.unique(group)]
+    share = np.diagonal(told, axis1=1, axis2=2)  # of the parameter's variance, by the condition it comes from
+    effective = share.sum(0) ** 2 / np.maximum((share**2).sum(0), 1e-300)  # Carter, Schnepel and Steigerwald (2017)
+    return Spread(np.asarray(covariance * inflation), (g - 1) / g * moves.T @ moves, np.maximum(effective - 1.0, 1.0))
+
+
+def deviations(fitter: Fitter, model: Model) -> Array:
+    """Standard deviations `[k]` of the model's parameters: the larger of the formal and the jackknife's."""
+    found = spread(fitter, model)
+    return np.sqrt(np.maximum(np.diag(found.formal), np.diag(found.between)))
+
+
+def covariance(fitter: Fitter, model: Model) -> Array:
+    """`[k, k]`, of a Gaussian with the 90 % intervals of the parameters and their correlations.
+
+    Few conditions: Student's quantile in the normal's place, where what differs between conditions decides.
+    """
+    found = spread(fitter, model)
+    formal, between = np.diag(found.formal), np.diag(found.between)
+    wide = stats.t.ppf((1 + LEVEL) / 2, found.freedom) / stats.norm.ppf((1 + LEVEL) / 2)
+    sd = np.sqrt(np.where(between > formal, between * wide**2, formal))
+    both = found.formal + found.between
+    scale = sd / np.sqrt(np.maximum(np.diag(both), 1e-300))
+    return np.asarray(both * scale[:, None] * scale[None, :])
 
 
 def bootstrap_weights(group: NDArray[np.int64], count: int, rng: np.random.Generator) -> Array:
