@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import mujoco
+import numpy as np
 
 from bayessim_mjx import effects as library
 from bayessim_mjx.distributions import Distribution
@@ -122,7 +123,10 @@ def apply(diagnosis: Diagnosis, physics: Physics) -> Physics:
 
 
 def prior(diagnosis: Diagnosis, physics: Physics | ParameterSpace | None = None) -> Distribution:
-    """What is known of the corrected simulator's theta: identified means and sds, truncated to the ranges.
+    """What is known of the corrected simulator's theta: jointly Gaussian, truncated to the ranges.
+
+    Where a diagnosis brings no covariance, the parameters are independent. Else the distribution's space has the names
+    and ranges of the corrected simulator's, but uniform priors: over those a Gaussian is exact.
 
     Args:
         physics: the simulator that was diagnosed, or the space of its known parameters; None: the diagnosis's own
@@ -135,7 +139,21 @@ def prior(diagnosis: Diagnosis, physics: Physics | ParameterSpace | None = None)
     space = calibrated_of(diagnosis, known)
     for effect in effects_of(diagnosis):
         space = space + effect.space()
-    return Distribution.prior(space)
+    return _jointly(diagnosis.covariance, space) if diagnosis.covariance else Distribution.prior(space)
+
+
+def _jointly(covariance: dict, space: ParameterSpace) -> Distribution:
+    """Gaussian at nominal theta; parameters without a covariance are as wide as their ranges."""
+    flat = ParameterSpace(dataclasses.replace(p, prior="uniform", mean=None, sd=None) for p in space.parameters)
+    width = np.asarray(space.high, float) - np.asarray(space.low, float)
+    matrix = np.diag(width**2 / 12)
+    found = [n for n in covariance["names"] if n in space.names]
+    at = [space.index(n) for n in found]
+    of = [covariance["names"].index(n) for n in found]
+    known = np.asarray(covariance["matrix"], float)[np.ix_(of, of)]
+    least = (LEAST_SD * width[at]) ** 2
+    matrix[np.ix_(at, at)] = known + np.diag(np.maximum(least - np.diag(known), 0.0))
+    return Distribution.gaussian(flat, np.asarray(space.nominal, float), matrix)
 
 
 def _recorded(name: str, row: dict) -> Parameter:

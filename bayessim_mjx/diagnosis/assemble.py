@@ -26,7 +26,8 @@ def diagnosis_of(found: Findings, say: search.Progress = lambda text, done, tota
     """The result of a diagnosis."""
     setup, race, ruling = found.setup, found.race, found.ruling
     model = ruling.model
-    sd = uncertainty.deviations(setup.fitter, model)
+    together = uncertainty.covariance(setup.fitter, model)
+    sd = np.sqrt(np.diag(together))
     effects = _effects(found, sd, say)
     remains = _remains(found)
     name = _verdict(found, remains)
@@ -43,6 +44,7 @@ def diagnosis_of(found: Findings, say: search.Progress = lambda text, done, tota
         next_experiment={},
         versions=versions(),
         details=details(found, effects),
+        covariance={"names": list(model.job.names), "matrix": together},
     )
 
 

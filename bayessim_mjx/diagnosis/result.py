@@ -95,6 +95,7 @@ class Diagnosis:
         parameters: {name: {"mean", "sd", "nominal", "low", "high", "unit", "structural": sentence or ""}}.
         candidates: ranked [{"effects": [label ...], "label", "score", "se", "gap_closed", "parameters": {..},
             "absorbed"}].
+        covariance: {"names": [...], "matrix": [[...]]} of parameters and effects' parameters together, or {}.
         next_experiment: {"name", "why", "evidence", "file", "table": [...]} or {}.
         details: numbers for pictures (see `report`); not part of diagnosis.json but saved beside it.
     """
@@ -110,6 +111,7 @@ class Diagnosis:
     next_experiment: dict[str, Any]
     versions: dict[str, str]
     details: dict[str, Any] = field(default_factory=dict)
+    covariance: dict[str, Any] = field(default_factory=dict)
     schema: int = SCHEMA
 
     def to_dict(self) -> dict[str, Any]:

@@ -122,6 +122,28 @@ def test_the_prior_is_that_of_the_corrected_simulator(robot, corrected):
     np.testing.assert_allclose(alone.mean(), q.mean(), rtol=1e-4)
 
 
+def test_the_prior_keeps_what_is_known_of_parameters_together(robot, corrected):
+    level, delay = "hinge.coulomb_friction.level", "torque.actuator_delay.delay"
+    names = [level, MASS, "all.actuator_gain.gain", delay]  # in the fit's order, not the simulator's
+    sd, correlation = np.array([0.02, 0.01, 0.03, 0.004]), np.eye(4)
+    correlation[0, 2] = correlation[2, 0] = 0.95
+    joint = dataclasses.replace(FOUND, covariance={"names": names, "matrix": correlation * np.outer(sd, sd)})
+    q = joint.prior(robot.physics(robot.control_dt))
+    assert q.names == corrected.space.names
+    np.testing.assert_allclose((q.space.low, q.space.high), (corrected.space.low, corrected.space.high))
+    draws = np.asarray(q.sample(jax.random.PRNGKey(0), 4000))
+    np.testing.assert_allclose(draws.mean(0), [1.1, 0.06, 0.6, 0.3], rtol=0.01)
+    np.testing.assert_allclose(draws.std(0), [0.01, 0.004, 0.03, 0.02], rtol=0.05)
+    drawn = np.corrcoef(draws.T)
+    assert drawn[2, 3] == pytest.approx(0.95, abs=0.01) and abs(drawn[0, 1]) < 0.05
+
+
+def test_draws_of_the_prior_stay_in_the_ranges(robot):
+    wide = dataclasses.replace(FOUND, covariance={"names": ["hinge.coulomb_friction.level"], "matrix": [[1.0]]})
+    draws = np.asarray(wide.prior(robot.space).sample(jax.random.PRNGKey(0), 500))
+    assert draws[:, -1].min() >= 0.0 and draws[:, -1].std() > 0.1  # friction never drives
+
+
 def test_a_parameter_that_the_simulator_has_not_is_refused(robot):
     other = dataclasses.replace(FOUND, parameters={"pole_mass_mult": FOUND.parameters[MASS]})
     with pytest.raises(UserError, match="no parameter 'pole_mass_mult'.*pendulum_mass_mult"):
