@@ -1,8 +1,9 @@
 """Blind benchmark of the gap diagnosis: is a hidden effect named, at its place, and nothing where there is none?
 
     python benchmarks/diagnosis.py generate --out CASES --seeds 2000:2010 --kinds single,double,null,unknown
-    python benchmarks/diagnosis.py run CASES
-    python benchmarks/diagnosis.py run CASES --leave-out-family
+    python benchmarks/diagnosis.py isolable CASES --workers 8
+    python benchmarks/diagnosis.py run CASES --baselines --workers 8
+    python benchmarks/diagnosis.py run CASES --leave-out-family --workers 8
     python benchmarks/diagnosis.py score CASES
 
 Seeds below 2000 are for development (1000 to 1029 were looked at, on the pendulum). Numbers to publish come from seeds
@@ -13,29 +14,24 @@ import argparse
 import json
 import multiprocessing
 import os
+import queue
 import subprocess
 import sys
 import time
 import zlib
 from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 from diagnosis_cases import KNOWN, STRENGTHS, SYSTEMS, UNKNOWN, make_case, places
-from diagnosis_score import score
+from diagnosis_families import without
+from diagnosis_isolable import hidden, rivals
+from diagnosis_tables import score
 from diagnosis_truth import Plant, run, scales_of
 
 KINDS = ("single", "double", "null", "unknown")
-FAMILIES = (
-    ("coulomb_friction", "stribeck_friction", "load_friction", "asymmetric_friction", "actuator_deadband"),
-    ("viscous_friction", "quadratic_drag", "asymmetric_friction"),
-    ("actuator_delay", "actuator_lag", "rate_limit", "sensor_delay", "sensor_filter"),
-    ("backlash", "joint_elasticity", "base_flexibility", "actuator_deadband", "sensor_delay", "actuator_delay",
-     "actuator_lag"),
-    ("payload", "gravity_tilt", "external_force", "joint_spring", "joint_offset", "actuator_bias"),
-    ("actuator_gain", "sensor_gain", "armature", "payload", "actuator_saturation", "effort_loss", "speed_torque_limit"),
-    ("cogging",),
-)  # fmt: skip
+WORKER = Path(__file__).with_name("diagnosis_worker.py")
 Job = tuple[str, str, tuple[str, ...], str, int, Path]
 
 
@@ -85,46 +81,76 @@ def generate(args: argparse.Namespace) -> None:
             print(line, flush=True)
 
 
-def without(effects: Iterable[str]) -> str:
-    """The library less the families of these effects, for --effects."""
-    left_out = {e for family in FAMILIES for e in family if set(effects) & set(family)}
-    return ",".join(e for e in KNOWN if e not in left_out)
-
-
 def diagnose(args: argparse.Namespace) -> None:
-    """The command on every case that has no result yet; what it wrote and how long it took."""
-    for folder in cases(args.cases):
-        truth = json.loads((folder / "truth.json").read_text())
-        if args.leave_out_family and truth.get("kind") != "single":
-            continue
-        out = folder / ("left_out" if args.leave_out_family else "diagnosis")
-        if (out / "exit.json").exists():
-            continue
-        command = [
-            sys.executable,
-            "-m",
-            "bayessim_mjx.diagnose",
-            "--model",
-            folder / "model.xml",
-            "--data",
-            folder / "logs",
-        ]
-        command += ["--out", out, "--seed", "0", *args.arguments]
-        if args.leave_out_family:
-            command += ["--effects", without(e["name"] for e in truth["effects"])]
-        out.mkdir(exist_ok=True)
-        started = time.perf_counter()
+    """Every case that is not finished, each in a process on a core of its own; finished cases stay."""
+    where = "left_out" if args.leave_out_family else "diagnosis"
+    todo = [folder for folder in cases(args.cases) if _wanted(folder, where, args)]
+    cores: queue.Queue[int] = queue.Queue()
+    usable = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else list(range(os.cpu_count() or 1))
+    for core in usable[: args.workers]:
+        cores.put(core)
+    with ThreadPoolExecutor(min(args.workers, len(usable))) as pool:
+        for done, line in enumerate(pool.map(lambda folder: _diagnose_one(folder, where, args, cores), todo), 1):
+            print(f"{done}/{len(todo)} {line}", flush=True)
+
+
+def _wanted(folder: Path, where: str, args: argparse.Namespace) -> bool:
+    """Not finished, or without the baselines that are now asked for."""
+    truth = json.loads((folder / "truth.json").read_text())
+    if args.leave_out_family and truth.get("kind") != "single":
+        return False
+    ended = (folder / where / "exit.json").exists()
+    return not ended or (args.baselines and not (folder / where / "baselines.json").exists())
+
+
+def _diagnose_one(folder: Path, where: str, args: argparse.Namespace, cores: "queue.Queue[int]") -> str:
+    out, core = folder / where, cores.get()
+    out.mkdir(exist_ok=True)
+    for old in ("exit.json", "baselines.json"):
+        (out / old).unlink(missing_ok=True)
+    command = [sys.executable, WORKER, folder, "--out", out, "--core", core]
+    command += ["--baselines"] if args.baselines and not args.leave_out_family else []
+    more = list(args.more)
+    if args.leave_out_family:
+        hidden = json.loads((folder / "truth.json").read_text())["effects"]
+        more += ["--effects", without((e["name"] for e in hidden), KNOWN)]
+    quiet = {name: "1" for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")}
+    started = time.perf_counter()
+    try:
         with (out / "output.txt").open("w") as text:
-            try:
-                done = subprocess.run(
-                    command, stdout=text, stderr=subprocess.STDOUT, timeout=args.timeout, env=os.environ
-                )
-                code = done.returncode
-            except subprocess.TimeoutExpired:
-                code = 124
-        seconds = time.perf_counter() - started
+            done = subprocess.run(
+                [str(c) for c in [*command, "--more", *more]],
+                stdout=text, stderr=subprocess.STDOUT, timeout=args.timeout, env=os.environ | quiet,
+            )  # fmt: skip
+        code = done.returncode
+    except subprocess.TimeoutExpired:
+        code = 124
+    finally:
+        cores.put(core)
+    seconds = time.perf_counter() - started
+    if not (out / "exit.json").exists():  # died or was stopped: counts as a case without a result
         (out / "exit.json").write_text(json.dumps({"code": code, "seconds": seconds}))
-        print(f"{folder.name}: exit {code}, {seconds:.0f} s", flush=True)
+    said = out / "diagnosis.json"
+    verdict = json.loads(said.read_text())["verdict"] if said.exists() else "no result"
+    return f"{folder.name}: exit {code}, {verdict}, {seconds:.0f} s"
+
+
+def _isolate(folder: Path) -> str:
+    started = time.perf_counter()
+    found = rivals(*hidden(json.loads((folder / "truth.json").read_text())))
+    (folder / "isolable.json").write_text(json.dumps(found, indent=1))
+    told = ", ".join(f"{r['name']}@{r['where']} {r['left']:.2f}" for r in found[:2])
+    return f"{folder.name}: closest {told} ({time.perf_counter() - started:.0f} s)"
+
+
+def isolate(args: argparse.Namespace) -> None:
+    """For every single that was not looked at: which other causes explain its motion nearly as well?"""
+    kinds = {f: json.loads((f / "truth.json").read_text())["kind"] for f in cases(args.cases)}
+    todo = [f for f, kind in kinds.items() if kind == "single" and not (f / "isolable.json").exists()]
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    with multiprocessing.get_context("spawn").Pool(args.workers) as pool:
+        for line in pool.imap_unordered(_isolate, todo):
+            print(line, flush=True)
 
 
 def cases(folder: Path) -> list[Path]:
@@ -144,13 +170,22 @@ def main() -> None:
     new.set_defaults(does=generate)
     old = commands.add_parser("run", help="diagnose every case that has no result yet")
     old.add_argument("cases", type=Path)
-    old.add_argument("--leave-out-family", action="store_true", help="singles, without the effect and its look-alikes")
+    old.add_argument(
+        "--leave-out-family", "--without-family", action="store_true",
+        help="singles, without the effect and its look-alikes: to be unexplained",
+    )  # fmt: skip
+    old.add_argument("--baselines", action="store_true", help="and the baselines on the same fits")
+    old.add_argument("--workers", type=int, default=os.cpu_count(), help="cases at a time, one core each")
     old.add_argument("--timeout", type=float, default=3600.0, help="s per case")
-    old.add_argument("arguments", nargs="*", help="more arguments of the command, after --")
+    old.add_argument("--more", nargs=argparse.REMAINDER, default=[], help="further arguments of the command; last")
     old.set_defaults(does=diagnose)
-    told = commands.add_parser("score", help="rates with 90 %% Wilson intervals, confusion matrix")
+    apart = commands.add_parser("isolable", help="which singles other causes explain as well, from the truth alone")
+    apart.add_argument("cases", type=Path)
+    apart.add_argument("--workers", type=int, default=os.cpu_count())
+    apart.set_defaults(does=isolate)
+    told = commands.add_parser("score", help="rates with 95 %% Wilson intervals beside the baselines, confusion matrix")
     told.add_argument("cases", type=Path)
-    told.add_argument("--out", type=Path, help="folder for score.md, score.json, confusion.csv (default: the cases')")
+    told.add_argument("--out", type=Path, help="folder of score.md, .json, .html and confusion.* (default: the cases')")
     told.set_defaults(does=lambda args: print(score(cases(args.cases), args.out or args.cases)))
     args = parser.parse_args()
     args.does(args)

@@ -87,10 +87,10 @@ def make_case(
     truths = []
     for effect in effects:
         assert ruler
-        cause = _draw(effect, robot, scales_of(ruler.plain, ruler.runs), causes, rng)
+        cause = draw_cause(effect, robot, scales_of(ruler.plain, ruler.runs), causes, rng)
         raw, left = resize(cause, ruler, STRENGTHS[strength])
         causes.append(cause)
-        told = {"name": cause.name, "where": cause.where, "parameters": cause.parameters()}
+        told = {"name": cause.name, "where": cause.where, "parameters": cause.parameters(), "size": cause.size}
         truths.append(told | {"raw": raw, "left": left})
     plant = Plant(robot, base, causes)
     runs = [run(plant, i, seed, noise) for i in range(len(RUNS))]
@@ -100,7 +100,7 @@ def make_case(
     return Case(out, truth)
 
 
-def _draw(
+def draw_cause(
     effect: str | tuple[str, str], robot: System, scales: Scales, taken: Sequence[Cause], rng: np.random.Generator
 ) -> Cause:
     name, where = (effect, None) if isinstance(effect, str) else effect

@@ -1,6 +1,5 @@
-"""Scores diagnosis.json files against sealed truths: rates with Wilson intervals, coverage, confusion matrix."""
+"""What diagnosis.json files are worth against sealed truths: rates with Wilson intervals, coverage, confusions."""
 
-import csv
 import json
 import math
 from collections import Counter
@@ -11,8 +10,12 @@ from typing import Any
 
 import mujoco
 import numpy as np
+from diagnosis_isolable import APART
 
-Z = 1.645  # 90 %
+Z90, Z95 = 1.645, 1.960
+# parameters that do not mean the same in generator and library (another pivot, gusts, signed loads)
+LOOSE = ("base_flexibility", "external_force", "load_friction")
+VERDICTS = ("no_gap", "parameters", "unexplained", "insufficient_data", "no result")
 GOALS = {"weak": 3.0, "medium": 10.0, "strong": 30.0, "severe": 100.0}
 REACHED = 0.8  # of the strength that was asked for, or the case does not count
 
@@ -26,6 +29,9 @@ class Outcome:
     said: dict[str, Any] | None
     joint_of: dict[str, str]
     seconds: float
+    compile_seconds: float = math.nan
+    true_closure: float | None = None  # what the true effects close, fitted by the same race
+    isolable: bool | None = None  # None: not looked at
 
     @property
     def kind(self) -> str:
@@ -51,12 +57,6 @@ class Outcome:
     def right(self, effect: dict[str, Any]) -> bool:
         return any(self.same(f["name"], str(f["where"]), effect) for f in self.named())
 
-    def best(self, effects: Sequence[dict[str, Any]]) -> bool:
-        """Baseline (single-fold error, as BAM does): the candidate that predicts best is the truth, no thresholds."""
-        ranked = [c for c in (self.said or {}).get("candidates", []) if c.get("score") is not None]
-        top = _labels(ranked[0]) if ranked else []
-        return len(top) == len(effects) and all(any(self.same(*t, e) for t in top) for e in effects)
-
     def inside(self, effect: dict[str, Any]) -> bool:
         """Named, or in the set of what cannot be told from what is named."""
         rivals = [label for f in self.named() for entry in f["equivalent_to"] for label in _labels(entry)]
@@ -73,16 +73,32 @@ def _labels(entry: Any) -> list[tuple[str, str]]:
     return [(entry["name"], str(entry.get("where", "")))]
 
 
-def read(folder: Path, results: str = "diagnosis") -> Outcome:
+def read(folder: Path, results: str = "diagnosis", baseline: str | None = None) -> Outcome:
+    """One case as the diagnosis, or one of the baselines on its fits, tells it."""
     model = mujoco.MjModel.from_xml_path(str(folder / "model.xml"))
     joints = {model.actuator(i).name: model.joint(model.actuator_trnid[i, 0]).name for i in range(model.nu)}
-    path, ended = folder / results / "diagnosis.json", folder / results / "exit.json"
-    said = json.loads(path.read_text()) if path.exists() else None
-    seconds = json.loads(ended.read_text())["seconds"] if ended.exists() else math.nan
-    return Outcome(folder, json.loads((folder / "truth.json").read_text()), said, joints, seconds)
+    where = folder / results
+    said = (
+        _json(where / "diagnosis.json") if baseline is None else (_json(where / "baselines.json") or {}).get(baseline)
+    )
+    ended, oracle, rivals = (
+        _json(where / "exit.json") or {},
+        _json(where / "oracle.json") or {},
+        _json(folder / "isolable.json"),
+    )
+    seconds = ended.get("seconds", math.nan) if baseline is None else (said or {}).get("seconds", math.nan)
+    return Outcome(
+        folder, json.loads((folder / "truth.json").read_text()), said, joints, seconds,
+        ended.get("compile_seconds", math.nan), oracle.get("closure"),
+        None if rivals is None else all(r["left"] >= APART for r in rivals),
+    )  # fmt: skip
 
 
-def wilson(hits: int, n: int, z: float = Z) -> tuple[float, float]:
+def _json(path: Path) -> Any:
+    return json.loads(path.read_text()) if path.exists() else None
+
+
+def wilson(hits: int, n: int, z: float = Z95) -> tuple[float, float]:
     """Interval of a rate."""
     if not n:
         return 0.0, 1.0
@@ -96,22 +112,19 @@ def covered(outcome: Outcome) -> list[bool]:
     found = []
     for effect in outcome.truth["effects"]:
         for f in outcome.named():
-            if not outcome.same(f["name"], str(f["where"]), effect):
+            if effect["name"] in LOOSE or not outcome.same(f["name"], str(f["where"]), effect):
                 continue
             for name, value in effect["parameters"].items():
                 given = f["parameters"].get(name)
                 if given and given["sd"]:
-                    found.append(abs(given["mean"] - value) <= Z * given["sd"])
+                    found.append(abs(given["mean"] - value) <= Z90 * given["sd"])
     return found
 
 
-def closure_errors(singles: Sequence[Outcome]) -> list[float]:
-    """|gap closed - 1|: less its effect, reality is the model at other base parameters: the true effect closes all."""
-    return [
-        abs(sum(f["gap_closed"] for f in o.named()) - 1.0)
-        for o in singles
-        if o.right(o.truth["effects"][0]) and all(f["gap_closed"] is not None for f in o.named())
-    ]
+def closure_errors(outcomes: Sequence[Outcome]) -> list[float]:
+    """|share of the gap that what is named closes - share the true effects close|; nothing named closes nothing."""
+    told = [o for o in outcomes if o.said and o.true_closure is not None]
+    return [abs(sum(f["gap_closed"] or 0.0 for f in o.named()) - o.true_closure) for o in told]
 
 
 def label(outcome: Outcome) -> str:
@@ -121,30 +134,49 @@ def label(outcome: Outcome) -> str:
     return outcome.named()[0]["name"] if outcome.named() else str(outcome.said["verdict"])
 
 
-Rate = tuple[str, list[bool], float]
+@dataclass(frozen=True)
+class Rate:
+    """What is asked, the answer of every case that counts, and the goal: at least, or (`most`) at most."""
+
+    what: str
+    answers: list[bool]
+    goal: float
+    most: bool = False
+
+    def to_dict(self) -> dict[str, Any]:
+        low, high = wilson(sum(self.answers), len(self.answers))
+        hits, n = sum(self.answers), len(self.answers)
+        return {"hits": hits, "n": n, "low": low, "high": high, "goal": self.goal, "at_most": self.most}
+
+    @property
+    def text(self) -> str:
+        """ "93 %", or nothing where nothing was asked."""
+        return f"{100 * sum(self.answers) / len(self.answers):.0f} %" if self.answers else "-"
 
 
-def rates(outcomes: Sequence[Outcome], left_out: Sequence[Outcome]) -> list[Rate]:
-    """(what is asked, answers, goal)."""
+def rates(outcomes: Sequence[Outcome], left_out: Sequence[Outcome] = ()) -> list[Rate]:
+    """The measures over all cases whose hidden effects are as strong as asked for."""
     of: Callable[[str], list[Outcome]] = lambda kind: [o for o in outcomes if o.kind == kind and o.strong_enough]  # noqa: E731
-    single, double = of("single"), of("double")
+    single, double, unknown = of("single"), of("double"), of("unknown")
     null = [o for o in of("null") if o.said]  # a failure is no alarm; the footer counts them
-    unknown = of("unknown")
+    right = lambda o: all(o.right(e) for e in o.truth["effects"])  # noqa: E731
+    inside = lambda o: all(o.inside(e) for e in o.truth["effects"])  # noqa: E731
+    left_out = [o for o in left_out if o.strong_enough]
+    errors = closure_errors(single)
     return [
-        ("single: effect and place named", [o.right(o.truth["effects"][0]) for o in single], 0.95),
-        ("single: effect named, any place", [_names(o) for o in single], 0.95),
-        ("single: truth in the equivalence set", [o.inside(o.truth["effects"][0]) for o in single], 0.98),
-        ("single: nothing else named", [o.right(o.truth["effects"][0]) and len(o.named()) == 1 for o in single], 0.9),
-        ("double: both named", [all(o.right(e) for e in o.truth["effects"]) for o in double], 0.85),
-        ("double: both in the set", [all(o.inside(e) for e in o.truth["effects"]) for o in double], 0.85),
-        ("nothing wrong: false alarm", [label(o) not in ("no_gap", "parameters") for o in null], 0.02),
-        ("unknown cause: unexplained", [_unexplained(o) for o in unknown], 0.9),
-        ("family left out: unexplained", [_unexplained(o) for o in left_out], 0.9),
-        ("single, baseline: best candidate", [o.best([o.truth["effects"][0]]) for o in single], 0.95),
-        ("nothing wrong, baseline: false alarm", [not o.best([]) for o in null], 0.02),
-        ("90 % intervals that cover", [c for o in (*single, *double) for c in covered(o)], 0.9),
-        ("closure within 5 points", [e <= 0.05 for e in closure_errors(single)], 0.9),
-    ]  # fmt: skip
+        Rate("single, isolable: effect and place named", [right(o) for o in single if o.isolable], 0.95),
+        Rate("single, all: effect and place named", [right(o) for o in single], 0.95),
+        Rate("single: effect named, any place", [_names(o) for o in single], 0.95),
+        Rate("single: truth in the equivalence set", [inside(o) for o in single], 0.98),
+        Rate("single: nothing else named", [right(o) and len(o.named()) == 1 for o in single], 0.9),
+        Rate("double: both named", [right(o) for o in double], 0.85),
+        Rate("double: both in the equivalence set", [inside(o) for o in double], 0.85),
+        Rate("nothing wrong: false alarm", [label(o) not in ("no_gap", "parameters") for o in null], 0.02, most=True),
+        Rate("unknown cause: unexplained", [_unexplained(o) for o in unknown], 0.9),
+        Rate("family left out: unexplained", [_unexplained(o) for o in left_out], 0.9),
+        Rate("closure within 5 points of the truth's", [e <= 0.05 for e in errors], 0.9),
+        Rate("90 % intervals that cover", [c for o in (*single, *double) for c in covered(o)], 0.9),
+    ]
 
 
 def _unexplained(outcome: Outcome) -> bool:
@@ -155,59 +187,15 @@ def _names(outcome: Outcome) -> bool:
     return outcome.truth["effects"][0]["name"] in {f["name"] for f in outcome.named()}
 
 
-def score(folders: Sequence[Path], out: Path) -> str:
-    """Write score.md, score.json and confusion.csv; the former's text."""
-    every = [read(f) for f in folders]
-    outcomes = [o for o in every if o.said or not math.isnan(o.seconds)]
-    left_out = [read(f, "left_out") for f in folders if (f / "left_out" / "exit.json").exists()]
-    table = ["| measure | rate | 90 % interval | n | goal |", "|---|---|---|---|---|"]
-    numbers: dict[str, Any] = {}
-    for what, answers, goal in rates(outcomes, left_out):
-        hits, n = sum(answers), len(answers)
-        low, high = wilson(hits, n)
-        rate = f"{100 * hits / n:.0f} %" if n else "-"
-        table.append(f"| {what} | {rate} | {100 * low:.0f} to {100 * high:.0f} % | {n} | {100 * goal:.0f} % |")
-        numbers[what] = {"hits": hits, "n": n, "low": low, "high": high, "goal": goal}
-    lines = [*table, "", *_breakdown(outcomes), "", *_footer(every, outcomes)]
-    out.mkdir(parents=True, exist_ok=True)
-    (out / "score.json").write_text(json.dumps(numbers, indent=1))
-    (out / "score.md").write_text("\n".join(lines) + "\n")
-    confusion(outcomes, out / "confusion.csv")
-    return "\n".join(lines)
-
-
-def _breakdown(outcomes: Sequence[Outcome]) -> list[str]:
-    """Singles by effect: right, in the set, and what was said instead."""
-    lines = ["| hidden effect | n | named | in the set | said instead |", "|---|---|---|---|---|"]
-    singles = [o for o in outcomes if o.kind == "single" and o.strong_enough]
-    for name in sorted({o.truth["effects"][0]["name"] for o in singles}):
-        own = [o for o in singles if o.truth["effects"][0]["name"] == name]
-        right, inside = (sum(getattr(o, k)(o.truth["effects"][0]) for o in own) for k in ("right", "inside"))
-        wrong = Counter(label(o) for o in own if not o.right(o.truth["effects"][0]))
-        said = ", ".join(f"{what} {n}" for what, n in wrong.most_common())
-        lines.append(f"| {name} | {len(own)} | {right} | {inside} | {said} |")
-    return lines
-
-
-def _footer(every: Sequence[Outcome], outcomes: Sequence[Outcome]) -> list[str]:
-    weak = sum(not o.strong_enough for o in outcomes)
-    failed = sum(o.said is None for o in outcomes)
-    seconds = [o.seconds for o in outcomes if math.isfinite(o.seconds)]
-    took = f"median {np.median(seconds):.0f} s, longest {max(seconds):.0f} s" if seconds else "no times"
-    return [
-        f"{len(outcomes)} of {len(every)} cases run; {failed} without a result; {weak} not counted because the effect "
-        f"cannot be as strong as asked on that robot; {took} per case."
-    ]
-
-
-def confusion(outcomes: Sequence[Outcome], path: Path) -> None:
-    """Rows: what was hidden (singles, nothing, unknown causes). Columns: what was named first, or the verdict."""
-    pairs = Counter()
+def confusion(outcomes: Sequence[Outcome]) -> tuple[list[str], list[str], np.ndarray]:
+    """(rows, columns, counts): hidden (singles, nothing, an unknown cause) against named first, or the verdict."""
+    pairs: Counter[tuple[str, str]] = Counter()
     for o in outcomes:
         if len(o.truth["effects"]) <= 1 and o.strong_enough:
             pairs[next((e["name"] for e in o.truth["effects"]), "nothing"), label(o)] += 1
-    rows, columns = (sorted({p[i] for p in pairs}) for i in (0, 1))
-    with path.open("w", newline="") as file:
-        table = csv.writer(file)
-        table.writerow(["hidden", *columns])
-        table.writerows([r, *(pairs[r, c] for c in columns)] for r in rows)
+    effects = sorted({h for h, _ in pairs} | {s for _, s in pairs} - set(VERDICTS))
+    rows = [e for e in effects if any(h == e for h, _ in pairs)]
+    columns = [e for e in effects if any(s == e for _, s in pairs)] + [
+        v for v in VERDICTS if any(s == v for _, s in pairs)
+    ]
+    return rows, columns, np.array([[pairs[r, c] for c in columns] for r in rows], int).reshape(len(rows), len(columns))

@@ -45,22 +45,22 @@ class Ruler:
         scale = np.array(list(base.values()))
         self.bounds = (np.minimum(1 - spread - scale, -1e-9), np.maximum(1 + spread - scale, 1e-9))
 
-    def windows(self, plant: Plant, runs: Sequence[Run], shift: np.ndarray | None = None) -> np.ndarray:
-        """Simulated positions less recorded ones, `[windows, rows, joints]`, in noises."""
+    def windows(self, plant: Plant, runs: Sequence[Run], shift: np.ndarray | None = None, every: int = 1) -> np.ndarray:
+        """Simulated positions less recorded ones, `[windows, rows, joints]`, in noises; of every so many windows."""
         dq, dv = np.zeros((2, len(plant.joints))) if shift is None else shift
         out = []
-        for r in runs:
-            for start in range(0, len(r.time) - self.rows, self.rows):
-                plant.reset(r.clean[start] + dq, r.clean_v[start] + dv, r.ctrl[start])
-                for k in range(start, start + self.rows):
-                    plant.advance(r.ctrl[k])
-                    out.append(plant.measure()[0] - r.clean[k + 1])
+        starts = [(r, start) for r in runs for start in range(0, len(r.time) - self.rows, self.rows)]
+        for r, start in starts[::every]:
+            plant.reset(r.clean[start] + dq, r.clean_v[start] + dv, r.ctrl[start])
+            for k in range(start, start + self.rows):
+                plant.advance(r.ctrl[k])
+                out.append(plant.measure()[0] - r.clean[k + 1])
         return np.array(out).reshape(-1, self.rows, len(plant.joints)) / np.asarray(self.system.sigma)
 
-    def outside(self, x: np.ndarray) -> np.ndarray:
+    def outside(self, x: np.ndarray, every: int = 1) -> np.ndarray:
         """Columns `[windows, rows, joints, ...]` without the part that initial states explain, flattened."""
-        flat = x.reshape(*x.shape[:1], self.rows * x.shape[2], -1)
-        return (flat - self.free @ (np.swapaxes(self.free, 1, 2) @ flat)).reshape(-1, flat.shape[-1])
+        flat, free = x.reshape(*x.shape[:1], self.rows * x.shape[2], -1), self.free[::every]
+        return (flat - free @ (np.swapaxes(free, 1, 2) @ flat)).reshape(-1, flat.shape[-1])
 
     def measure(self, runs: Sequence[Run]) -> tuple[float, float]:
         """(raw, left) of runs with causes."""

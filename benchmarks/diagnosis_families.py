@@ -1,0 +1,27 @@
+"""Look-alikes among the effects, and the library less the families of some effects."""
+
+from collections.abc import Iterable
+
+FAMILIES = (
+    ("coulomb_friction", "stribeck_friction", "load_friction", "asymmetric_friction", "actuator_deadband"),
+    ("viscous_friction", "quadratic_drag", "asymmetric_friction"),
+    ("actuator_delay", "actuator_lag", "rate_limit", "sensor_delay", "sensor_filter"),
+    ("backlash", "joint_elasticity", "base_flexibility", "actuator_deadband", "sensor_delay", "actuator_delay",
+     "actuator_lag"),
+    ("payload", "gravity_tilt", "external_force", "joint_spring", "joint_offset", "actuator_bias"),
+    ("actuator_gain", "sensor_gain", "armature", "payload", "actuator_saturation", "effort_loss", "speed_torque_limit"),
+    ("cogging",),
+    ("contact_friction", "contact_compliance"),
+)  # fmt: skip
+
+
+def relatives(effects: Iterable[str]) -> set[str]:
+    """The effects and everything that shares a family with one of them."""
+    given = set(effects)
+    return given.union(*(family for family in FAMILIES if given & set(family)))
+
+
+def without(effects: Iterable[str], library: Iterable[str]) -> str:
+    """The library less the families of these effects, for --effects."""
+    left_out = relatives(effects)
+    return ",".join(e for e in library if e not in left_out)

@@ -1,0 +1,101 @@
+"""One case of the blind benchmark in a process of its own: the command, the true effect's closure, the baselines.
+
+    python benchmarks/diagnosis_worker.py CASE --out FOLDER [--core N] [--baselines] [--more arguments of the command]
+
+Writes what the command writes, then oracle.json, exit.json (without it the case is not finished), baselines.json. The
+command gets nothing but model and logs; the truth is opened after its verdict is on disk.
+"""
+
+import argparse
+import json
+import os
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+COMPILING = "/jax/core/compile/"  # JAX's events: tracing, lowering, compiling (or reading the compilation cache)
+
+
+def diagnose(arguments: list[str]) -> tuple[int, dict[str, float], Any]:
+    """(exit code, seconds in all and of compilation, findings or None) of the diagnosis's own command."""
+    started = time.perf_counter()
+    import jax.monitoring
+
+    from bayessim_mjx import diagnose as command
+    from bayessim_mjx.diagnosis import run
+
+    spent, kept = [0.0], []
+    original = run.diagnose
+
+    def listen(event: str, seconds: float, **_: Any) -> None:
+        spent[0] += seconds * event.startswith(COMPILING)
+
+    def keep(*args: Any, **options: Any) -> run.Findings:
+        kept.append(original(*args, **options))
+        return kept[0]
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    run.diagnose = keep
+    code = command.main(arguments)
+    times = {"seconds": time.perf_counter() - started, "compile_seconds": spent[0]}
+    return code, times, kept[0] if kept else None
+
+
+def oracle(found: Any, effects: list[dict[str, Any]], joint_of: dict[str, str]) -> dict[str, Any]:
+    """What the true effects close, fitted like any other model of the race; None where the library lacks one."""
+    from diagnosis_baselines import candidate_of, closure, fitted
+
+    chosen = [candidate_of(found.race, e["name"], e["where"], joint_of) for e in effects]
+    if not effects or None in chosen:
+        return {"closure": None, "effects": [e["name"] for e in effects]}
+    model = fitted(found.race, chosen)
+    return {"closure": closure(found, model), "effects": [c.label for c in chosen]}
+
+
+def joints_of(folder: Path) -> dict[str, str]:
+    """{actuator: the joint that it drives}."""
+    import mujoco
+
+    model = mujoco.MjModel.from_xml_path(str(folder / "model.xml"))
+    return {model.actuator(i).name: model.joint(model.actuator_trnid[i, 0]).name for i in range(model.nu)}
+
+
+def _write(path: Path, content: Any) -> None:
+    part = path.with_suffix(".part")  # a killed run leaves no half file
+    part.write_text(json.dumps(content, indent=1, default=float))
+    part.replace(path)
+
+
+def work(case: Path, out: Path, baselines: bool, arguments: list[str]) -> int:
+    """Run one case; the exit code."""
+    given = ["--model", case / "model.xml", "--data", case / "logs", "--out", out, "--seed", "0", "--headless"]
+    code, ended, found = diagnose([str(a) for a in [*given, *arguments]])
+    if found is not None:
+        started = time.perf_counter()
+        truth = json.loads((case / "truth.json").read_text())
+        _write(out / "oracle.json", oracle(found, truth["effects"], joints_of(case)))
+        ended["oracle_seconds"] = time.perf_counter() - started
+    _write(out / "exit.json", {"code": code} | ended)
+    if found is not None and baselines:
+        from diagnosis_baselines import all_baselines
+
+        _write(out / "baselines.json", all_baselines(found))
+    return code
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("case", type=Path)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--core", type=int, help="the only CPU to use")
+    parser.add_argument("--baselines", action="store_true")
+    parser.add_argument("--more", nargs=argparse.REMAINDER, default=[], help="arguments of the command; last")
+    args = parser.parse_args()
+    if args.core is not None:
+        os.sched_setaffinity(0, {args.core})  # before JAX counts the cores
+    return work(args.case, args.out, args.baselines, args.more)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
