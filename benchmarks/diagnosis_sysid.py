@@ -1,165 +1,139 @@
-"""The parameter fit that mujoco.sysid does, on the same cases: time, held-out error; then one candidate after another.
+"""Against mujoco.sysid, in one process on the same core: the same parameter fit, then all candidates one after another.
 
     pip install "mujoco[sysid]"
-    python benchmarks/diagnosis_sysid.py CASE [CASE ...] --candidates
+    taskset -c 0 python benchmarks/diagnosis_sysid.py CASE [CASE ...] [--race]
 
-Mass, damping and armature within 20 %, windows of 0.5 s from the measured state (mujoco.sysid fits no initial states),
-one operating condition held out. Candidates are those that MuJoCo has as an attribute: friction, spring, gain, bias.
+Known parameters: mass, damping and armature within 20 %; one operating condition is held out. mujoco.sysid with its own
+defaults gets whole runs, as in its documentation, and also the windows that the library fits; it fits no start states,
+which come from smoothed encoders. Joint positions are compared as states: its joint sensors lag by one timestep.
+Candidates for mujoco.sysid are those that MuJoCo has as an attribute, with the library's bounds. Times are CPU seconds.
 """
 
 import argparse
+import contextlib
+import io
 import json
-import time
-from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
+from typing import Any
 
+import diagnosis_fitter as fitter
+import diagnosis_native as native
 import mujoco
 import numpy as np
 from mujoco import sysid
 from scipy.signal import savgol_filter
 
-SPREAD, WINDOW, HELD_OUT = 0.2, 0.5, "chirp"
-Windows = list[tuple[np.ndarray, np.ndarray, np.ndarray]]  # initial state, controls and positions by row
+WINDOW, HELD_OUT = 0.5, "chirp"
+Pieces = list[tuple[np.ndarray, np.ndarray, np.ndarray]]  # initial state, controls and positions by row
 
 
-def windows(folder: Path, model: mujoco.MjModel, held_out: bool) -> tuple[Windows, float]:
-    """Windows of the runs in (or not in) the held-out condition, and the log period in s."""
-    found: Windows = []
+def pieces(folder: Path, model: mujoco.MjModel, held_out: bool | None, seconds: float | None) -> tuple[Pieces, float]:
+    """Runs in (or not in, or None: all) the held-out condition, whole or cut, and the log period in s."""
+    found: Pieces = []
     for path in sorted((folder / "logs").glob("*.csv")):
-        if (HELD_OUT in path.stem) != held_out:
+        if held_out is not None and (HELD_OUT in path.stem) != held_out:
             continue
         table = np.genfromtxt(path, delimiter=",", names=True, deletechars="")
         u, q = (np.stack([table[n] for n in table.dtype.names if n.startswith(k)], 1) for k in ("ctrl:", "qpos:"))
         period = float(np.median(np.diff(table["time"])))
         v = savgol_filter(q, 7, 3, deriv=1, delta=period, axis=0)
         smooth = savgol_filter(q, 7, 3, axis=0)
-        rows = round(WINDOW / period)
+        rows = round(seconds / period) if seconds else len(q) - 1
         for a in range(0, len(q) - rows, rows):
             state = sysid.create_initial_state(model, smooth[a], v[a], act=np.zeros(model.na))
             found.append((state, u[a : a + rows], q[a : a + rows + 1]))
     return found, period
 
 
-def sequences(spec: mujoco.MjSpec, cut: Windows, period: float) -> sysid.ModelSequences:
+def sequences(spec: mujoco.MjSpec, cut: Pieces, period: float) -> sysid.ModelSequences:
+    """Controls held over every timestep, positions compared as states at the end of every period."""
     model = spec.compile()
     steps = round(period / model.opt.timestep)
-    controls, sensors = [], []
+    joints = [(model.joint(i).name, sysid.SignalType.MjStateQPos) for i in range(model.njnt)]
+    controls, measured = [], []
     for _, u, q in cut:
-        fine = np.repeat(u, steps, axis=0)  # held, not interpolated
+        fine = np.repeat(u, steps, axis=0)
         times = np.arange(len(fine) + 1) * model.opt.timestep
-        held = np.concatenate([fine, fine[-1:]])
-        controls.append(sysid.TimeSeries.from_control_names(times, held, model))
-        names = [model.sensor(i).name for i in range(model.nsensor)]
-        sensors.append(sysid.TimeSeries.from_names(np.arange(len(q)) * period, q, model, names=names))
-    labels = [f"w{i}" for i in range(len(cut))]
-    return sysid.ModelSequences("robot", spec, labels, [s for s, _, _ in cut], controls, sensors)
+        controls.append(sysid.TimeSeries.from_control_names(times, np.concatenate([fine, fine[-1:]]), model))
+        measured.append(sysid.TimeSeries.from_names(np.arange(len(q)) * period, q, model, names=joints))
+    labels = [f"piece {i}" for i in range(len(cut))]
+    return sysid.ModelSequences("robot", spec, labels, [s for s, _, _ in cut], controls, measured)
 
 
-def specification(folder: Path) -> mujoco.MjSpec:
-    spec = mujoco.MjSpec.from_file(str(folder / "model.xml"))
-    for joint in spec.joints:
-        spec.add_sensor(
-            name=f"{joint.name}_pos", type=mujoco.mjtSensor.mjSENS_JOINTPOS, objtype=mujoco.mjtObj.mjOBJ_JOINT,
-            objname=joint.name,
-        )  # fmt: skip
-    return spec
+def optimise(
+    data: sysid.ModelSequences, params: sysid.ParameterDict, threads: int | None = 1
+) -> tuple[float, sysid.ParameterDict]:
+    """(CPU s, estimates) with the defaults of mujoco.sysid; threads: None for its default, one per core."""
+    more = {} if threads is None else {"n_threads": threads}
+    residual_fn = sysid.build_residual_fn(models_sequences=[data], **more)
+    with contextlib.redirect_stdout(io.StringIO()):  # its optimiser reports every iteration
+        seconds, (found, _) = fitter.timed(lambda: sysid.optimize(params, residual_fn, verbose=False))
+    return seconds, found
 
 
-def _write(nominal: mujoco.MjModel, place: str, what: str, spec: mujoco.MjSpec, parameter: sysid.Parameter) -> None:
-    """Set an attribute of a spec; factors are of the nominal value, so nothing accumulates."""
-    x = float(parameter.value[0])
-    if what == "mass":
-        for geom in spec.body(place).geoms:
-            geom.mass = x * nominal.body(place).mass[0]
-    elif what == "damping":
-        spec.joint(place).damping[0] = x * np.ravel(nominal.joint(place).damping)[0]
-    elif what == "armature":
-        spec.joint(place).armature = x * nominal.joint(place).armature[0]
-    elif what == "friction":
-        spec.joint(place).frictionloss = x
-    elif what == "spring":
-        spec.joint(place).stiffness[0] = x
-    elif what == "gain":
-        spec.actuator(place).gainprm = nominal.actuator(place).gainprm * x
-        spec.actuator(place).biasprm = nominal.actuator(place).biasprm * x
-    else:
-        spec.actuator(place).biastype = mujoco.mjtBias.mjBIAS_AFFINE
-        spec.actuator(place).biasprm[0] = x
-
-
-def base(nominal: mujoco.MjModel) -> sysid.ParameterDict:
-    bodies = [nominal.body(i).name for i in range(nominal.nbody) if nominal.body_weldid[i] != 0]
-    joints = [nominal.joint(i).name for i in range(nominal.njnt)]
-    pairs = [(b, "mass") for b in bodies] + [(j, a) for a in ("damping", "armature") for j in joints]
-    params = sysid.ParameterDict()
-    for place, what in pairs:
-        write = partial(_write, nominal, place, what)
-        params.add(sysid.Parameter(f"{place}.{what}", 1.0, 1 - SPREAD, 1 + SPREAD, modifier=write))
-    return params
-
-
-def candidates(nominal: mujoco.MjModel) -> Iterator[sysid.Parameter]:
-    """One parameter per candidate, its bounds from a torque of the size of the robot's own."""
-    joints = [nominal.joint(i).name for i in range(nominal.njnt)]
-    actuators = [nominal.actuator(i).name for i in range(nominal.nu)]
-    force = float(9.81 * nominal.body_mass[2:].sum() * 0.3)
-    for places, what, start, low, high in (
-        (joints, "friction", 1e-3 * force, 0.0, force), (joints, "spring", 1e-3 * force, 0.0, force),
-        (actuators, "gain", 1.0, 0.5, 1.5), (actuators, "bias", 0.0, -force, force),
-    ):  # fmt: skip
-        for place in places:
-            write = partial(_write, nominal, place, what)
-            yield sysid.Parameter(f"{place}.{what}", start, low, high, modifier=write)
-
-
-def fit(
-    train: sysid.ModelSequences, test: sysid.ModelSequences, params: sysid.ParameterDict
-) -> tuple[float, float, np.ndarray]:
-    """(seconds, held-out root mean square in rad or m over all joints, estimates)."""
-    started = time.perf_counter()
-    found, _ = sysid.optimize(params, sysid.build_residual_fn(models_sequences=[train]), verbose=False, max_iters=30)
-    return time.perf_counter() - started, error(test, found), found.as_vector()
-
-
-def error(test: sysid.ModelSequences, params: sysid.ParameterDict) -> float:
-    residual_fn = sysid.build_residual_fn(models_sequences=[test])
+def error(data: sysid.ModelSequences, params: sysid.ParameterDict) -> float:
+    """Root mean square in rad or m over all joints."""
+    residual_fn = sysid.build_residual_fn(models_sequences=[data])
     _, simulated, measured = residual_fn(params.as_vector(), params)
     gap = [s.data - m.data for s, m in zip(np.ravel(simulated), np.ravel(measured), strict=True)]
     return float(np.sqrt(np.mean(np.square(gap))))
 
 
-def compare(folder: Path, race: bool) -> dict:
-    nominal = specification(folder).compile()
-    (cut, period), (kept, _) = windows(folder, nominal, False), windows(folder, nominal, True)
-    train, test = sequences(specification(folder), cut, period), sequences(specification(folder), kept, period)
-    params = base(nominal)
-    before = error(test, params)
-    seconds, after, x = fit(train, test, params)
+def compare_fit(folder: Path) -> dict:
+    """The parameter fit: seconds, held-out windows in MuJoCo C, error of the factors (root mean square)."""
+    xml = str(folder / "model.xml")
+    nominal = native.specification(xml).compile()
     truth = json.loads((folder / "truth.json").read_text())["base"]
-    names = params.keys()  # not itself iterable
-    off = float(np.sqrt(np.mean((x - np.array([truth[n] for n in names])) ** 2)))
-    out = {"case": folder.name, "nominal": before, "fitted": after, "seconds": round(seconds, 1), "parameters off": off}
-    if race:
-        results = {}
-        for extra in candidates(nominal):
-            more = base(nominal)
-            more.add(extra)
-            took, reached, _ = fit(train, test, more)
-            results[extra.name] = {"held out": reached, "seconds": round(took, 1)}
-        out["candidates"] = results
-        out["race seconds"] = round(sum(r["seconds"] for r in results.values()), 1)
-        out["best"] = min(results, key=lambda n: results[n]["held out"])
+    test = sequences(native.specification(xml), *pieces(folder, nominal, True, WINDOW))
+    out: dict[str, Any] = {}
+
+    def note(name: str, seconds: float, x: dict[str, float]) -> None:
+        params = native.base(nominal)
+        names = params.keys()  # not itself iterable
+        params.update_from_vector(np.array([x[n] for n in names]))
+        off = float(np.sqrt(np.mean([(x[n] - truth[n]) ** 2 for n in truth])))
+        out[name] = {"seconds": seconds, "off": off, "held out": error(test, params)}
+
+    note("nominal", 0.0, dict.fromkeys(truth, 1.0))
+    note("truth", 0.0, truth)
+    for name, length, threads in (
+        ("sysid, runs", None, 1), ("sysid, runs, threads", None, None), ("sysid, windows", WINDOW, 1),
+    ):  # fmt: skip
+        train = sequences(native.specification(xml), *pieces(folder, nominal, False, length))
+        params = native.base(nominal)
+        seconds, found = optimise(train, params, threads)
+        note(name, seconds, dict(zip(params.keys(), found.as_vector().tolist(), strict=True)))
+    ours = fitter.fit(folder, HELD_OUT)
+    note("library", ours["fit"], ours["x"])
+    out["library"] |= {k: ours[k] for k in ("prepare", "compile")}
     return out
+
+
+def compare_race(folder: Path) -> dict:
+    """All candidates by the library; by mujoco.sysid those that MuJoCo has, on whole runs, from off the bounds."""
+    ours, candidates = fitter.race_all(folder)
+    nominal = native.specification(str(folder / "model.xml"), loads=True).compile()
+    data = pieces(folder, nominal, None, None)
+    each, fits = {}, {}
+    for extra in native.effects(nominal, candidates):
+        payload = extra.name.startswith("payload")
+        train = sequences(native.specification(str(folder / "model.xml"), loads=payload), *data)
+        params = native.base(nominal)
+        params.add(extra)
+        params.move_off_bounds()
+        each[extra.name], found = optimise(train, params)
+        fits[extra.name] = error(train, found)
+    return {"library": ours, "sysid": each, "sysid best": min(fits, key=lambda n: fits[n])}
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("cases", type=Path, nargs="+")
-    parser.add_argument("--candidates", action="store_true", help="also fit each candidate effect in turn")
+    parser.add_argument("--race", action="store_true", help="all candidates instead of the parameter fit")
     args = parser.parse_args()
     for folder in args.cases:
-        print(json.dumps(compare(folder, args.candidates)), flush=True)
+        told = compare_race(folder) if args.race else compare_fit(folder)
+        print(json.dumps({"case": folder.name} | told, default=float), flush=True)
 
 
 if __name__ == "__main__":

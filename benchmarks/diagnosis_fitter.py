@@ -1,0 +1,71 @@
+"""The library's side of the comparison with mujoco.sysid: its own parameter fit and its race, timed in parts."""
+
+import dataclasses
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from bayessim_mjx.diagnosis import race, run, search
+from bayessim_mjx.diagnosis.candidates import Candidate
+from bayessim_mjx.diagnosis.fit import Fitter
+from bayessim_mjx.diagnosis.models import scored
+from bayessim_mjx.diagnosis.robot import of_file
+from bayessim_mjx.diagnosis.screen import screen
+from bayessim_mjx.logs import read_logs
+
+
+def timed(work: Callable[[], Any]) -> tuple[float, Any]:
+    """(CPU seconds of all threads, result): other jobs on the same cores do not count."""
+    started = time.process_time()
+    result = work()
+    return time.process_time() - started, result
+
+
+def prepare(folder: Path, effects: Any, without: str | None) -> tuple[float, float, run.Setup]:
+    """(s to read and cut the logs, s to compile, setup); `without`: an operating condition left out."""
+
+    def read() -> run.Setup:
+        robot = of_file(folder / "model.xml")
+        logs = read_logs(folder / "logs", robot.mj_model)
+        return run.prepare(robot, [log for log in logs if log.metadata["condition"] != without], effects)
+
+    reading, setup = timed(read)
+    first, _ = timed(lambda: setup.fitter.simulator.run(setup.fitter.theta[None]))
+    again, _ = timed(lambda: setup.fitter.simulator.run(setup.fitter.theta[None]))
+    return reading, first - again, setup
+
+
+def fit_base(fitter: Fitter) -> Any:
+    """The known parameters, as the race begins."""
+    job = fitter.begin(fitter.base)
+    fitter.iterate([job], 10, lambda j: range(len(j.coordinates)))
+    return fitter.refresh(job)
+
+
+def fit(folder: Path, without: str) -> dict:
+    """The parameter fit alone. `x`: {name as in truth.json: factor}."""
+    reading, compiling, setup = prepare(folder, (), without)
+    fitting, job = timed(lambda: fit_base(setup.fitter))
+    names = [f"{p.target}.{p.attribute}" for p in setup.robot.space.parameters]
+    return {"prepare": reading, "compile": compiling, "fit": fitting, "x": dict(zip(names, job.values, strict=True))}
+
+
+def race_all(folder: Path) -> tuple[dict, list[Candidate]]:
+    """Screening of all candidates and the fits of all singles that could gain, each in its share of the whole."""
+    reading, compiling, setup = prepare(folder, "all", None)
+    fitter, settings = setup.fitter, dataclasses.replace(setup.settings, singles=len(setup.candidates))
+    known, job = timed(lambda: fit_base(fitter))
+    model = scored(fitter, job, ())
+    tried = race.Race(fitter, setup.candidates, settings, job, model, winner=model)
+    screening, tried.screened = timed(lambda: screen(fitter, job, setup.candidates, settings.screened))
+    singles, models = timed(lambda: _singles(tried))
+    assert fitter.simulator.traces == 1
+    out = {"candidates": len(setup.candidates), "fitted": len(models), "prepare": reading, "compile": compiling}
+    out |= {"known": known, "screening": screening, "singles": singles}
+    return out | {"seconds": known + screening + singles, "best": search.ranked(tried, 1)[0].label}, setup.candidates
+
+
+def _singles(tried: race.Race) -> list:
+    plans = [(tried.base, s) for s in tried.screened if s.gain > 0]
+    return race.fit_models(tried, plans, "single effects", lambda text, done, total: None)
