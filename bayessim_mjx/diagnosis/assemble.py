@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from bayessim_mjx.diagnosis import gap, search, uncertainty, verdict
+from bayessim_mjx.diagnosis import gap, search, uncertainty, verdict, whole
 from bayessim_mjx.diagnosis.candidates import Candidate
 from bayessim_mjx.diagnosis.models import Model
 from bayessim_mjx.diagnosis.pictures import details
@@ -19,6 +19,7 @@ from bayessim_mjx.diagnosis.sentences import horizon_warning, sentences
 from bayessim_mjx.logs.log import Channels
 
 UNEXPLAINED = 2.0  # noise standard deviations that remain and that nothing predicts
+SHORT = 0.1  # s, the first horizon
 REMAINS = 0.3  # share of the calibrated gap that a flexible force closes on top of named effects: not in the library
 
 
@@ -32,15 +33,18 @@ def diagnosis_of(found: Findings, say: search.Progress = lambda text, done, tota
     remains = _remains(found)
     name = _verdict(found, remains)
     parameters = _parameters(race, model, sd)
+    say("whole logs", 0, 1)
+    over = whole.simulate(found)
+    far = _gap(found, over)
     return Diagnosis(
         verdict=name,
         sentences=sentences(name, effects, parameters, found, remains),
         effects=effects,
         where=_where(found),
-        gap=_gap(found),
+        gap=far,
         parameters=parameters,
         candidates=ranking(race),
-        warnings=list(setup.warnings) + horizon_warning(found),
+        warnings=[*setup.warnings, *over.notes, *(horizon_warning(far) if effects else [])],
         next_experiment={},
         versions=versions(),
         details=details(found, effects),
@@ -146,16 +150,20 @@ def _unit(setup: Setup, effect: Candidate, unit: str) -> str:
     return swap.get(unit, unit.replace("N m", "N").replace("rad", "m"))
 
 
-def _gap(found: Findings) -> Gap:
+def _gap(found: Findings, over: whole.Whole) -> Gap:
     setup, predictions = found.setup, found.predictions
     cut = setup.fitter.simulator.windows
     floor = _floor(found)
-    horizons = []
-    for steps in sorted({min(10, cut.steps), max(1, min(cut.steps, round(0.25 / cut.dt))), cut.steps}):
-        row = gap.stages(predictions, None, steps, cut.group, setup.seed)
-        row["reducible_floor"] = min(floor, row["with_effects"])
-        horizons.append({"name": f"{steps * cut.dt:.2g} s", "seconds": steps * cut.dt, **row})
-    whole = horizons[-1]
+    short = max(1, min(round(SHORT / cut.dt), cut.steps // 2))
+    rows = []
+    for steps in (short, cut.steps):
+        costs = {k: p.cost(steps) for k, p in predictions.items()} | {"reducible_floor": floor}
+        seconds = steps * cut.dt
+        rows.append({"name": f"{seconds:.2g} s", "seconds": seconds, **_row(costs, cut.group, setup.seed)})
+    main = rows[-1]
+    if len(over.group):
+        costs = over.cost | {"reducible_floor": max(float(floor.mean()), 1.0) + over.chance}
+        rows.append({"name": over.name, "seconds": over.seconds, **_row(costs, over.group, setup.seed)})
     names = Channels.of(setup.physics.mj_model).qvel
     by_channel = {
         joint: {s: float(np.sqrt(p.cost(cut.steps, slice(i, i + 1)).mean())) for s, p in predictions.items()}
@@ -168,22 +176,31 @@ def _gap(found: Findings) -> Gap:
     }
     return Gap(
         noise_floor=1.0,
-        nominal=whole["nominal"],
-        calibrated=whole["calibrated"],
-        with_effects=whole["with_effects"],
-        reducible_floor=whole["reducible_floor"],
+        nominal=main["nominal"],
+        calibrated=main["calibrated"],
+        with_effects=main["with_effects"],
+        reducible_floor=main["reducible_floor"],
         by_channel=by_channel,
-        horizons=horizons,
+        horizons=rows,
         physical=physical,
     )
 
 
-def _floor(found: Findings) -> float:
-    """The smallest held-out error that anything reached, named or flexible, not below the noise (rms)."""
+def _row(costs: dict[str, np.ndarray], group: np.ndarray, seed: int) -> dict[str, Any]:
+    """One horizon; what is reducible ends at the noise, and where the effects are better than any other model."""
+    row = gap.stages(costs, group, seed)
+    low, high = (max(v, 1.0) for v in row["ci"]["reducible_floor"])
+    level = row["reducible_floor"] = min(max(row["reducible_floor"], 1.0), row["with_effects"])
+    row["ci"]["reducible_floor"] = [min(low, level), max(level, min(high, row["ci"]["with_effects"][1]))]
+    return row
+
+
+def _floor(found: Findings) -> np.ndarray:
+    """Mean squares `[W]` of the best held-out prediction that anything reached, named or flexible."""
     race = found.race
-    totals = [m.total for m in race.models.values()]
-    totals += [float(f.condition.cost.sum()) for f in (found.flexible_base, found.flexible_winner) if f is not None]
-    return max(1.0, float(np.sqrt(min(totals) / (race.noise * len(race.base.cost)))))
+    every = [m.cost for m in race.models.values()]
+    every += [f.condition.cost for f in (found.flexible_base, found.flexible_winner) if f is not None]
+    return min(every, key=np.sum) / race.noise
 
 
 def _parameters(race: search.Race, model: Model, sd: np.ndarray) -> dict[str, dict[str, Any]]:

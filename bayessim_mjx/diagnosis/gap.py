@@ -18,9 +18,14 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """Whitened held-out errors of a model, `[W, H, channels]`, really simulated without each window's condition."""
+    """A model really simulated, with the parameters found without each window's condition.
+
+    Attributes:
+        error: `[W, H, channels]`, whitened; offsets: `[W, s]`, of the start states.
+    """
 
     error: Array
+    offsets: Array
 
     def cost(self, steps: int, channels: slice = slice(None)) -> Array:
         """Mean square over the first steps, per window `[W]`."""
@@ -32,49 +37,48 @@ def predict(fitter: Fitter, model: Model) -> Prediction:
     windows = fitter.simulator.windows
     names = np.unique(windows.group)
     error = np.zeros((len(windows), windows.steps, int(fitter.used.sum())))
+    offsets = np.zeros_like(model.job.offsets)
     for name, values in zip(names, model.estimates, strict=True):
         own = np.flatnonzero(windows.group == name)
-        error[own] = _settled(fitter, model.job, values, own)
-    return Prediction(error)
+        error[own], offsets[own] = _settled(fitter, model.job, values, own)
+    return Prediction(error, offsets)
 
 
 def nominal(fitter: Fitter, job: Job) -> Prediction:
     """The simulator as delivered, starts estimated."""
-    return Prediction(_settled(fitter, job, np.array([c.neutral for c in job.coordinates]), np.arange(len(job.r))))
+    values = np.array([c.neutral for c in job.coordinates])
+    return Prediction(*_settled(fitter, job, values, np.arange(len(job.r))))
 
 
-def _settled(fitter: Fitter, job: Job, values: Array, own: NDArray[np.int64]) -> Array:
-    """Errors `[w, H, channels]` of some windows after two Newton steps of their start states."""
+def _settled(fitter: Fitter, job: Job, values: Array, own: NDArray[np.int64]) -> tuple[Array, Array]:
+    """(errors `[w, H, channels]`, starts `[w, s]`) of some windows after two Newton steps of their start states."""
     theta = fitter.vector(job.coordinates, values)[None]
-    offsets = job.offsets[own]
+    best_offsets = offsets = job.offsets[own]
     B = job.B[own]
-    errors = fitter.simulator.run(theta, offsets[None], own)[0]
-    best = errors
+    best = errors = fitter.simulator.run(theta, offsets[None], own)[0]
     for _ in range(2):
         r = fitter.whiten(errors)
         _, starts = eliminate(r, np.zeros((*r.shape, 0)), B, offsets, fitter.spread)
-        moved = offsets + starts.step(np.zeros((*r.shape, 0)), np.zeros(0))
-        errors = fitter.simulator.run(theta, moved[None], own)[0]
+        offsets = offsets + starts.step(np.zeros((*r.shape, 0)), np.zeros(0))
+        errors = fitter.simulator.run(theta, offsets[None], own)[0]
         better = np.sum(fitter.whiten(errors) ** 2, 1) < np.sum(fitter.whiten(best) ** 2, 1)
         best = np.where(better[:, None, None], errors, best)
-        offsets = np.where(better[:, None], moved, offsets)
-        errors = best
-    return np.asarray(best[..., fitter.used] / fitter.sigma)
+        best_offsets = np.where(better[:, None], offsets, best_offsets)
+        errors, offsets = best, best_offsets
+    return np.asarray(best[..., fitter.used] / fitter.sigma), best_offsets
 
 
-def stages(
-    predictions: dict[str, Prediction], floor: float | None, steps: int, group: NDArray[np.int64], seed: int
-) -> dict[str, Any]:
-    """Root mean squares of the stages over the first `steps`, each with a bootstrap interval."""
-    rng = np.random.default_rng(seed)
-    draws = bootstrap_weights(group, 400, rng)
+def stages(costs: dict[str, Array], group: NDArray[np.int64], seed: int) -> dict[str, Any]:
+    """Root mean squares of the stages, each with a bootstrap interval.
+
+    Args:
+        costs: {stage: `[W]` mean squares of windows}; group: `[W]`.
+    """
+    draws = bootstrap_weights(group, 400, np.random.default_rng(seed))
     out: dict[str, Any] = {"ci": {}, "noise_floor": 1.0}
-    for name, prediction in predictions.items():
-        cost = prediction.cost(steps)
+    for name, cost in costs.items():
         out[name] = float(np.sqrt(cost.mean()))
         out["ci"][name] = list(interval(np.sqrt(np.maximum((draws * cost).mean(1), 0.0))))
-    if floor is not None:
-        out["reducible_floor"] = floor
     return out
 
 

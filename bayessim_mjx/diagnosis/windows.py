@@ -126,12 +126,14 @@ def cut(
     group: str | None = None,
     use_qvel: bool = True,
     first_only: bool = False,
+    starts: list[tuple[int, int]] | None = None,
 ) -> Windows:
     """Windows of `length` control steps, at most `limit`, spread evenly over the logs.
 
     Args:
         use_qvel: compare measured velocities too (where all logs have them).
         first_only: one window per log, at its beginning (whole episodes).
+        starts: (log, row) of the windows wanted; beyond the end of a log its last row is held.
 
     Raises:
         UserError: no log is long enough.
@@ -139,7 +141,7 @@ def cut(
     even = [resample(log, dt) for log in logs]
     fine = [_fine_commands(log, e, dt, substeps) for log, e in zip(logs, even, strict=True)]
     group_of, names = groups_of(logs, group)
-    starts = _starts(even, length, limit, first_only)
+    starts = _starts(even, length, limit, first_only) if starts is None else starts
     if not starts:
         longest = max(len(e) - 1 for e in even)
         raise UserError(
@@ -154,10 +156,10 @@ def cut(
     pick = np.asarray([r for r, _ in starts])
     enabled = _enabled(even, starts, length, model) if any(not e.enabled.all() for e in even) else None
     batch = Batch(
-        command=_stack([fine[r][a : a + length] for r, a in starts]),
+        command=_stack([fine[r][_rows(even[r], a, length)] for r, a in starts]),
         around=_around(even, fine, starts, around),
-        qpos=_stack([even[r].qpos[a + 1 : a + length + 1] for r, a in starts]),
-        qvel=_stack([even[r].qvel[a + 1 : a + length + 1] for r, a in starts]),
+        qpos=_stack([even[r].qpos[_rows(even[r], a + 1, length)] for r, a in starts]),
+        qvel=_stack([even[r].qvel[_rows(even[r], a + 1, length)] for r, a in starts]),
         enabled=enabled,
         law=None if law is None else jax.tree.map(lambda x: x[pick], law),
     )
@@ -188,6 +190,10 @@ def _starts(logs: Sequence[Log], length: int, limit: int, first_only: bool) -> l
         return every
     keep = np.unique(np.linspace(0, len(every) - 1, limit).round().astype(int))
     return [every[i] for i in keep]
+
+
+def _rows(log: Log, first: int, count: int) -> NDArray[np.int64]:
+    return np.minimum(np.arange(first, first + count), len(log) - 1)
 
 
 def _blocks(starts: list[tuple[int, int]], logs: Sequence[Log]) -> tuple[tuple[str, ...], list[int]]:
@@ -239,7 +245,7 @@ def _enabled(even: Sequence[Log], starts: list[tuple[int, int]], length: int, mo
         rows = np.ones((length, model.nu))
         for name, stream in even[r].streams.items():
             if name.startswith("enabled:"):
-                on = np.nan_to_num(stream[a : a + length], nan=1.0) > 0.5
+                on = np.nan_to_num(stream[_rows(even[r], a, length)], nan=1.0) > 0.5
                 rows[:, even[r].actuators.index(name.split(":", 1)[1])] = on
         out.append(rows)
     return _stack(out)
