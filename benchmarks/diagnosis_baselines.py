@@ -21,7 +21,7 @@ TESTED = 0.3  # share of the operating conditions in the one test set of the sin
 # what the flexible force depends on most -> the effect that a reader would name; not here: nothing that can be named
 MEANS = {
     "position": "joint_spring", "speed": "viscous_friction", "direction": "coulomb_friction",
-    "stop": "coulomb_friction", "load": "load_friction", "effort": "actuator_gain", "past": "actuator_delay",
+    "stop": "coulomb_friction", "load": "payload", "effort": "actuator_gain", "past": "actuator_delay",
     "pull": "armature", "since_reversal": "backlash",
 }  # fmt: skip
 Said = dict[str, Any]
@@ -126,12 +126,13 @@ def importance(found: Findings) -> Said:
     if first["quantity"] not in MEANS:
         return {"verdict": "unexplained", "effects": []}
     name = MEANS[first["quantity"]]
-    joint = first["joint"]
     rivals = sorted({e for family in FAMILIES if name in family for e in family} - {name})
+    model = found.setup.physics.mj_model
+    where = f"{first['joint']}+{model.body(int(model.joint(first['joint']).bodyid[0])).name}"  # or the body behind it
     whole, left = flex.condition.base.sum(), flex.condition.cost.sum()
     floor = found.race.noise * len(flex.condition.base)
     closed = float(np.clip((whole - left) / max(whole - min(floor, left), 1e-9), 0.0, 1.0))
-    return {"verdict": "effects", "effects": [_named(name, joint, {}, closed, rivals)]}
+    return {"verdict": "effects", "effects": [_named(name, where, {}, closed, rivals)]}
 
 
 def classifier(found: Findings) -> Said:

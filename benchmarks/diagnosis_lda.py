@@ -14,12 +14,12 @@ from bayessim_mjx.diagnosis.candidates import Candidate
 SIMULATED = 1500  # in all, shared by the candidates
 FEW, MANY = 6, 32  # simulations of one candidate
 WINDOWS = 48  # windows at most
+QUIET = 1.1  # times the noise: a gap of that size is nothing
 WEAKEST = -1.5  # simulated amplitudes are 10 to this, up to 1, of their range
 DIRECTIONS = 60  # principal components at most
 SHRINK = 0.2
 Array = np.ndarray
-Label = tuple[int, int, bool]  # candidate, its largest amplitude, whether that is positive; (-1, 0, True): nothing
-NOTHING: Label = (-1, 0, True)
+Label = tuple[int, int, bool]  # candidate, its largest amplitude, whether that is positive
 
 
 class Discriminants:
@@ -50,10 +50,9 @@ def _principal(x: Array, count: int) -> Array:
     return (vector[:, kept] / np.sqrt(value[kept])).T @ x
 
 
-def features(r: Array) -> Array:
-    """Direction and (log) size of projected gaps `[..., n]`."""
-    size = np.linalg.norm(r, axis=-1, keepdims=True)
-    return np.concatenate([r / size, 0.1 * np.log(size / np.sqrt(r.shape[-1]))], -1)
+def directions(r: Array) -> Array:
+    """Projected gaps `[..., n]` of size 1: strength is not known beforehand."""
+    return r / np.linalg.norm(r, axis=-1, keepdims=True)
 
 
 def draw(candidate: Candidate, rng: np.random.Generator) -> tuple[Array, tuple[int, bool]]:
@@ -104,10 +103,12 @@ def classify(fitter: Any, job: Any, candidates: Sequence[Candidate], rng: np.ran
     # reality minus the recalibrated simulator, were the candidate reality
     column = job.r[own] - fitter.whiten(fitter.simulator.run(np.stack(thetas), offsets, own))
     outside = Outside(job, own)
-    clean = outside(column)
-    noise = outside(rng.normal(size=(len(clean) + MANY, *column.shape[1:])))
-    seen = np.linalg.norm(clean, axis=1) > np.linalg.norm(noise[: len(clean)], axis=1) / 3
-    rows = np.concatenate([(clean + noise[: len(clean)])[seen], noise[len(clean) :]])
-    labels = [d for d, s in zip(drawn, seen, strict=True) if s] + [NOTHING] * MANY
-    label = Discriminants(features(rows), labels)(features(outside(job.r[own])))
-    return None if label == NOTHING else candidates[label[0]]
+    clean, recorded = outside(column), outside(job.r[own])
+    noise = outside(rng.normal(size=column.shape))
+    loud = np.linalg.norm(noise, axis=1)
+    if np.linalg.norm(recorded) < QUIET * loud.max():
+        return None
+    seen = np.linalg.norm(clean, axis=1) > loud / 3
+    labels = [d for d, s in zip(drawn, seen, strict=True) if s]
+    label = Discriminants(directions((clean + noise)[seen]), labels)(directions(recorded))
+    return candidates[label[0]]

@@ -1,0 +1,142 @@
+"""Scores, tables and pictures of the blind benchmark on cases written by hand."""
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
+score = pytest.importorskip("diagnosis_score")
+import diagnosis_systems as systems  # noqa: E402
+import diagnosis_tables as tables  # noqa: E402
+
+ELBOW = {"name": "coulomb_friction", "where": "elbow", "parameters": {"level": 0.11}, "raw": 20.0, "left": 9.0}
+HIP = {"name": "actuator_gain", "where": "shoulder_motor", "parameters": {"gain": 1.2}, "raw": 20.0, "left": 9.0}
+RIGHT = ("coulomb_friction", "elbow")
+
+
+def said(*named: tuple[str, str], verdict: str | None = None, rivals: list | None = None, level: float = 0.1) -> Any:
+    numbers = {"level": {"mean": level, "sd": 0.01}, "gain": {"mean": 1.0, "sd": 0.01}}
+    told = {"parameters": numbers, "gap_closed": 0.9 / max(len(named), 1), "equivalent_to": rivals or []}
+    effects = [{"name": name, "where": where} | told for name, where in named]
+    return {"verdict": verdict or ("effects" if named else "no_gap"), "effects": effects}
+
+
+def case(
+    folder: Path,
+    effects: list,
+    verdict: Any,
+    *,
+    kind: str = "single",
+    oracle: float = 0.93,
+    rival: float = 5.0,
+    **more: Any,
+) -> Path:
+    """A folder as generate, isolable and run leave it."""
+    out = folder / "diagnosis"
+    out.mkdir(parents=True)
+    (folder / "model.xml").write_text(systems.SYSTEMS["two_link"].xml)
+    truth = {"system": "two_link", "strength": "medium", "effects": effects, "kind": kind, "seed": 1}
+    files = {folder / "truth.json": truth, out / "exit.json": {"code": 0, "seconds": 60.0, "compile_seconds": 20.0}}
+    files |= {out / "oracle.json": {"closure": oracle}, folder / "isolable.json": [{"name": "x", "left": rival}]}
+    files |= {out / "diagnosis.json": verdict} if verdict else {}
+    files |= {folder / name: content for name, content in more.items()}
+    for path, content in files.items():
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(json.dumps(content))
+    return folder
+
+
+def rates(*folders: Path) -> dict[str, score.Rate]:
+    return {r.what: r for r in score.rates([score.read(f) for f in folders])}
+
+
+def test_a_right_a_rival_and_a_wrong_verdict(tmp_path):
+    right = score.read(case(tmp_path / "a", [ELBOW], said(RIGHT)))
+    assert right.right(ELBOW) and score.covered(right) == [True]
+    assert score.closure_errors([right]) == pytest.approx([0.03])
+    rivals = [{"effects": ["coulomb_friction@elbow"]}]
+    rival = score.read(case(tmp_path / "b", [ELBOW], said(("stribeck_friction", "elbow"), rivals=rivals)))
+    assert rival.inside(ELBOW) and not rival.right(ELBOW)
+    wrong = score.read(case(tmp_path / "c", [ELBOW], said(("coulomb_friction", "shoulder"))))
+    assert not wrong.inside(ELBOW)
+
+
+def test_an_actuator_and_its_joint_are_one_place(tmp_path):
+    assert score.read(case(tmp_path / "a", [HIP], said(("actuator_gain", "shoulder")))).right(HIP)
+
+
+def test_what_a_rival_explains_from_the_truth_does_not_count_as_isolable(tmp_path):
+    near = case(tmp_path / "a", [ELBOW], said(), rival=0.2)
+    far = case(tmp_path / "b", [ELBOW], said(RIGHT), rival=4.0)
+    found = rates(near, far)
+    assert found["single, isolable: effect and place named"].answers == [True]
+    assert found["single, all: effect and place named"].answers == [False, True]
+
+
+def test_a_cause_weaker_than_asked_does_not_count(tmp_path):
+    weak = case(tmp_path / "a", [ELBOW | {"left": 1.0}], said())
+    assert not rates(weak)["single, all: effect and place named"].answers
+
+
+def test_doubles_nulls_and_unknown_causes(tmp_path):
+    both = case(tmp_path / "a", [ELBOW, HIP], said(RIGHT, ("actuator_gain", "shoulder_motor")), kind="double")
+    one = case(tmp_path / "b", [ELBOW, HIP], said(RIGHT), kind="double")
+    alarm = case(tmp_path / "c", [], said(RIGHT), kind="null", oracle=None)
+    quiet = case(tmp_path / "d", [], said(verdict="parameters"), kind="null", oracle=None)
+    other = ELBOW | {"name": "unknown_pushes"}
+    found = rates(both, one, alarm, quiet, case(tmp_path / "e", [other], said(verdict="unexplained"), kind="unknown"))
+    assert found["double: both named"].answers == [True, False]
+    assert found["nothing wrong: false alarm"].answers == [True, False]
+    assert found["unknown cause: unexplained"].answers == [True]
+
+
+def test_a_family_left_out_has_to_be_unexplained(tmp_path):
+    folder = case(tmp_path / "a", [ELBOW], said(RIGHT))
+    (folder / "left_out").mkdir()
+    (folder / "left_out" / "diagnosis.json").write_text(json.dumps(said(verdict="unexplained")))
+    found = {r.what: r for r in score.rates([], [score.read(folder, "left_out")])}
+    assert found["family left out: unexplained"].answers == [True]
+
+
+def test_naming_nothing_closes_nothing(tmp_path):
+    assert score.closure_errors([score.read(case(tmp_path / "a", [ELBOW], said()))]) == [0.93]
+
+
+def test_parameters_that_mean_something_else_are_not_asked_for(tmp_path):
+    loose = {"name": "load_friction", "where": "elbow", "parameters": {"level": 9.0}, "raw": 20.0, "left": 9.0}
+    assert score.covered(score.read(case(tmp_path / "a", [loose], said(("load_friction", "elbow"))))) == []
+
+
+def test_confusion_counts_hidden_against_named(tmp_path):
+    folders = [case(tmp_path / "a", [ELBOW], said(RIGHT)), case(tmp_path / "b", [ELBOW], said())]
+    folders += [case(tmp_path / "c", [], said(("backlash", "elbow")), kind="null")]
+    rows, columns, counts = score.confusion([score.read(f) for f in folders])
+    assert rows == ["coulomb_friction", "nothing"] and columns == ["backlash", "coulomb_friction", "no_gap"]
+    np.testing.assert_array_equal(counts, [[0, 1, 1], [1, 0, 0]])
+
+
+def test_everything_is_written_with_the_baselines_beside_it(tmp_path):
+    folders = [case(tmp_path / "a", [ELBOW], said(RIGHT)), case(tmp_path / "b", [HIP], None)]
+    fits = {"naive BIC": said(("backlash", "elbow")), "parameter refit": said(verdict="parameters")}
+    (folders[0] / "diagnosis" / "baselines.json").write_text(json.dumps(fits))
+    footer = tables.score(folders, tmp_path / "out")
+    assert footer.startswith("2 of 2 cases run; 1 without a result")
+    files = ("score.md", "score.json", "score.html", "confusion.csv", "confusion.txt", "confusion.png")
+    assert all((tmp_path / "out" / f).stat().st_size > 50 for f in files)
+    numbers = json.loads((tmp_path / "out" / "score.json").read_text())
+    named = "single, all: effect and place named"
+    assert (numbers["diagnosis"][named]["hits"], numbers["diagnosis"][named]["n"]) == (1, 2)
+    assert (numbers["naive BIC"][named]["hits"], numbers["naive BIC"][named]["n"]) == (0, 1)
+    assert numbers["diagnosis"]["seconds"]["median_compile_seconds"] == 20.0
+    page = (tmp_path / "out" / "score.html").read_text()
+    assert "naive BIC: hidden against named" in page and "Plotly.newPlot" in page
+    assert (tmp_path / "out" / "confusion.csv").read_text().splitlines()[0] == "hidden,coulomb_friction,no result"
+
+
+def test_wilson_interval_of_nine_in_ten():
+    # (p + z^2/2n -+ z sqrt(p q / n + z^2 / 4n^2)) / (1 + z^2/n) with z = 1.96: Wilson (1927), 0.596 to 0.982
+    assert score.wilson(9, 10) == pytest.approx((0.596, 0.982), abs=1e-3)
