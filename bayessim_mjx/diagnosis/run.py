@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -10,7 +11,18 @@ import mujoco
 import numpy as np
 
 from bayessim_mjx import effects as library
-from bayessim_mjx.diagnosis import candidates, channels, gap, gate, noise, scales, search, verdict, windows
+from bayessim_mjx.diagnosis import (
+    candidates,
+    channels,
+    discretisation,
+    gap,
+    gate,
+    noise,
+    scales,
+    search,
+    verdict,
+    windows,
+)
 from bayessim_mjx.diagnosis.disturbance import Disturbance, estimate
 from bayessim_mjx.diagnosis.fit import Fitter
 from bayessim_mjx.diagnosis.flexible import Flexible, flexible
@@ -27,6 +39,7 @@ SHORTEST = 0.004  # s, control period of the diagnosis; faster logs are resample
 LIMITS = ((1, 160), (3, 96), (7, 64), (100, 48))  # (up to so many dofs, windows)
 BUDGET = 24000  # sub-steps of one simulation of all windows; half of it for robots of more than MANY dofs
 MANY = 3
+FEWEST = 24  # windows that are simulated whatever the budget
 LEAST = 6  # windows: with fewer nothing can be held out
 Progress = Callable[[str, int, int], None]
 
@@ -49,6 +62,7 @@ class Setup:
     settings: search.Settings
     seed: int
     warnings: list[str] = field(default_factory=list)
+    discretisation: discretisation.Discretisation | None = None
 
     @property
     def logs(self) -> tuple[Log, ...]:
@@ -100,12 +114,16 @@ def prepare(
     kinds = [library.load(n) if isinstance(n, str) else n for n in (library.names() if effects == "all" else effects)]
     size = scales.measure(robot.mj_model, [resample(log, dt) for log in usable])
     stack, left_out = candidates.stack(kinds, size)
+    own = robot.physics(dt)
+    cuts = _windows(own, usable, group, seen.use_qvel)
+    step = discretisation.measure(own, cuts, usable, _finest(own, len(cuts(1)), cuts(1).steps))
+    robot = step.robot(robot)
     physics = robot.physics(dt, stack)
-    cut = _windows(robot, physics, usable, dt, group, seen.use_qvel)
+    cut = step.noisier(cuts(step.factor, _limit(physics, cuts(1).steps)))
     fitter = Fitter(Simulator(physics, cut), candidates.base_coordinates(robot.space), physics.space.nominal)
     every = candidates.enumerate_candidates(physics)
-    notes += [*floors.warnings, *(f"not tried: {text}" for text in left_out), *_few_conditions(cut)]
-    return Setup(robot, physics, seen, floors, fitter, every, size, settings or _settings(robot), seed, notes)
+    notes += [*floors.warnings, *step.warnings(), *(f"not tried: {text}" for text in left_out), *_few_conditions(cut)]
+    return Setup(robot, physics, seen, floors, fitter, every, size, settings or _settings(robot), seed, notes, step)
 
 
 def _settings(robot: Robot) -> search.Settings:
@@ -115,19 +133,38 @@ def _settings(robot: Robot) -> search.Settings:
 
 
 def _windows(
-    robot: Robot, physics: Physics, logs: Sequence[Log], dt: float, group: str | None, use_qvel: bool
-) -> windows.Windows:
-    limit = next(n for dofs, n in LIMITS if robot.mj_model.nv <= dofs)
+    physics: Physics, logs: Sequence[Log], group: str | None, use_qvel: bool
+) -> Callable[..., windows.Windows]:
+    """(factor, limit) -> the windows with that many times the sub-steps of `physics`, by default the same ones."""
+    dt = physics.dt
     longest = max(int(log.duration / dt) for log in logs)
     length = int(np.clip(round(WINDOW / dt), 8, 100))
     if longest < length:
         raise TooLittleData(f"the longest log has {longest} control steps of {dt:.3g} s, one window needs {length}")
-    budget = BUDGET if robot.mj_model.nv <= MANY else BUDGET // 2
-    limit = min(limit, max(24, budget // (length * physics.substeps)))
-    cut = windows.cut(logs, physics.mj_model, dt, physics.substeps, length, limit=limit, group=group, use_qvel=use_qvel)
-    if len(cut) < LEAST:
-        raise TooLittleData(f"{len(cut)} windows of {length * dt:.2g} s; holding conditions out needs {LEAST}")
-    return cut
+    own = _limit(physics, length)
+
+    @functools.cache
+    def cuts(factor: int, limit: int = own) -> windows.Windows:
+        count = physics.substeps * factor
+        return windows.cut(logs, physics.mj_model, dt, count, length, limit=limit, group=group, use_qvel=use_qvel)
+
+    if len(cuts(1)) < LEAST:
+        raise TooLittleData(f"{len(cuts(1))} windows of {length * dt:.2g} s; holding conditions out needs {LEAST}")
+    return cuts
+
+
+def _limit(physics: Physics, length: int) -> int:
+    """Most windows of so many control steps that are simulated at once."""
+    nv = physics.mj_model.nv
+    budget = BUDGET if nv <= MANY else BUDGET // 2
+    limit = next(n for dofs, n in LIMITS if nv <= dofs)
+    return min(limit, max(FEWEST, budget // (length * physics.substeps)))
+
+
+def _finest(physics: Physics, count: int, length: int) -> int:
+    """How many times the sub-steps the budget allows when at most half of `count` windows are given up for it."""
+    budget = BUDGET if physics.mj_model.nv <= MANY else BUDGET // 2
+    return max(1, budget // (length * physics.substeps * max(FEWEST, (count + 1) // 2)))
 
 
 def _few_conditions(cut: windows.Windows) -> list[str]:
