@@ -1,7 +1,7 @@
 """Against mujoco.sysid, in one process on the same core: the same parameter fit, then all candidates one after another.
 
     pip install "mujoco[sysid]"
-    taskset -c 0 python benchmarks/diagnosis_sysid.py CASE [CASE ...] [--race]
+    taskset -c 0 python benchmarks/diagnosis_sysid.py CASE [CASE ...] [--race [--one-place]]
 
 Known parameters: mass, damping and armature within 20 %; one operating condition is held out. mujoco.sysid with its own
 defaults gets whole runs, as in its documentation, and also the windows that the library fits; it fits no start states,
@@ -13,6 +13,8 @@ import argparse
 import contextlib
 import io
 import json
+import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +36,8 @@ def pieces(folder: Path, model: mujoco.MjModel, held_out: bool | None, seconds: 
         if held_out is not None and (HELD_OUT in path.stem) != held_out:
             continue
         table = np.genfromtxt(path, delimiter=",", names=True, deletechars="")
-        u, q = (np.stack([table[n] for n in table.dtype.names if n.startswith(k)], 1) for k in ("ctrl:", "qpos:"))
+        names = table.dtype.names or ()
+        u, q = (np.stack([table[n] for n in names if n.startswith(k)], 1) for k in ("ctrl:", "qpos:"))
         period = float(np.median(np.diff(table["time"])))
         v = savgol_filter(q, 7, 3, deriv=1, delta=period, axis=0)
         smooth = savgol_filter(q, 7, 3, axis=0)
@@ -79,7 +82,14 @@ def error(data: sysid.ModelSequences, params: sysid.ParameterDict) -> float:
     return float(np.sqrt(np.mean(np.square(gap))))
 
 
-def compare_fit(folder: Path) -> dict:
+VARIANTS = {  # of mujoco.sysid: length of the pieces in s (None: whole runs), threads
+    "runs": (None, 1),
+    "windows": (WINDOW, 1),
+    "threads": (None, None),
+}
+
+
+def compare_fit(folder: Path, variants: Sequence[str]) -> dict:
     """The parameter fit: seconds, held-out windows in MuJoCo C, error of the factors (root mean square)."""
     xml = str(folder / "model.xml")
     nominal = native.specification(xml).compile()
@@ -96,22 +106,24 @@ def compare_fit(folder: Path) -> dict:
 
     note("nominal", 0.0, dict.fromkeys(truth, 1.0))
     note("truth", 0.0, truth)
-    for name, length, threads in (
-        ("sysid, runs", None, 1), ("sysid, runs, threads", None, None), ("sysid, windows", WINDOW, 1),
-    ):  # fmt: skip
+    for name in variants:
+        length, threads = VARIANTS[name]
         train = sequences(native.specification(xml), *pieces(folder, nominal, False, length))
         params = native.base(nominal)
         seconds, found = optimise(train, params, threads)
-        note(name, seconds, dict(zip(params.keys(), found.as_vector().tolist(), strict=True)))
+        note(f"sysid, {name}", seconds, dict(zip(params.keys(), found.as_vector().tolist(), strict=True)))
     ours = fitter.fit(folder, HELD_OUT)
     note("library", ours["fit"], ours["x"])
     out["library"] |= {k: ours[k] for k in ("prepare", "compile")}
     return out
 
 
-def compare_race(folder: Path) -> dict:
+def compare_race(folder: Path, one_place: bool) -> dict:
     """All candidates by the library; by mujoco.sysid those that MuJoCo has, on whole runs, from off the bounds."""
     ours, candidates = fitter.race_all(folder)
+    print(json.dumps(ours), file=sys.stderr, flush=True)
+    if one_place:
+        candidates = list({c.effect: c for c in reversed(candidates) if c.where != "all"}.values())
     nominal = native.specification(str(folder / "model.xml"), loads=True).compile()
     data = pieces(folder, nominal, None, None)
     each, fits = {}, {}
@@ -123,6 +135,7 @@ def compare_race(folder: Path) -> dict:
         params.move_off_bounds()
         each[extra.name], found = optimise(train, params)
         fits[extra.name] = error(train, found)
+        print(f"{extra.name}: {each[extra.name]:.1f} s", file=sys.stderr, flush=True)
     return {"library": ours, "sysid": each, "sysid best": min(fits, key=lambda n: fits[n])}
 
 
@@ -130,9 +143,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("cases", type=Path, nargs="+")
     parser.add_argument("--race", action="store_true", help="all candidates instead of the parameter fit")
+    parser.add_argument("--variants", default="runs,windows,threads", help="of the parameter fit by mujoco.sysid")
+    parser.add_argument("--one-place", action="store_true", help="mujoco.sysid fits every effect at one place only")
     args = parser.parse_args()
     for folder in args.cases:
-        told = compare_race(folder) if args.race else compare_fit(folder)
+        told = compare_race(folder, args.one_place) if args.race else compare_fit(folder, args.variants.split(","))
         print(json.dumps({"case": folder.name} | told, default=float), flush=True)
 
 
