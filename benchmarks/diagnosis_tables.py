@@ -3,6 +3,7 @@
 import csv
 import json
 import math
+import sys
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,6 +14,7 @@ from diagnosis_score import Outcome, Rate, confusion, label, rates, read
 
 Table = tuple[str, list[str], list[list[str]]]  # title, header, rows
 OWN = "diagnosis"
+WIDTH = 160  # of tables in files
 STYLE = "body{font:14px sans-serif;margin:2em}table{border-collapse:collapse}td,th{border:1px solid;padding:3px 8px}"
 
 
@@ -125,7 +127,7 @@ def _print(tables: Sequence[Table]) -> None:
     from rich.console import Console
     from rich.table import Table as Shown
 
-    console = Console()
+    console = Console(width=None if sys.stdout.isatty() else WIDTH)
     for title, header, rows in tables:
         shown = Shown(title=title)
         for name in header:
