@@ -9,12 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from bayessim_mjx.diagnosis import gap, search, uncertainty, verdict, whole
-from bayessim_mjx.diagnosis.candidates import Candidate
+from bayessim_mjx.diagnosis import gap, named, search, uncertainty, verdict, whole
 from bayessim_mjx.diagnosis.models import Model
 from bayessim_mjx.diagnosis.pictures import details
-from bayessim_mjx.diagnosis.result import Diagnosis, Estimate, FoundEffect, Gap, Place
-from bayessim_mjx.diagnosis.run import Findings, Setup, length_unit
+from bayessim_mjx.diagnosis.result import Diagnosis, Gap, Place
+from bayessim_mjx.diagnosis.run import Findings, length_unit
 from bayessim_mjx.diagnosis.sentences import horizon_warning, sentences
 from bayessim_mjx.logs.log import Channels
 
@@ -29,13 +28,14 @@ def diagnosis_of(found: Findings, say: search.Progress = lambda text, done, tota
     model = ruling.model
     together = uncertainty.covariance(setup.fitter, model)
     sd = np.sqrt(np.diag(together))
-    effects = _effects(found, sd, say)
+    closed = named.closed_by(found)
+    effects = named.effects_of(found, sd, closed, say)
     remains = _remains(found)
     name = _verdict(found, remains)
     parameters = _parameters(race, model, sd)
     say("whole logs", 0, 1)
     over = whole.simulate(found)
-    far = _gap(found, over)
+    far = _gap(found, over, {k: v for k, v in closed.items() if k != "each"})
     return Diagnosis(
         verdict=name,
         sentences=sentences(name, effects, parameters, found, remains),
@@ -47,7 +47,7 @@ def diagnosis_of(found: Findings, say: search.Progress = lambda text, done, tota
         warnings=[*setup.warnings, *over.notes, *(horizon_warning(far) if effects else [])],
         next_experiment={},
         versions=versions(),
-        details=details(found, effects),
+        details=details(found, effects, closed),
         covariance={"names": list(model.job.names), "matrix": together},
     )
 
@@ -89,68 +89,7 @@ def _beaten(found: Findings) -> bool:
     return base is not None and base.condition.significant and float(base.condition.cost.sum()) < 0.6 * model.total
 
 
-def _effects(found: Findings, sd: np.ndarray, say: search.Progress) -> list[FoundEffect]:
-    model, race = found.ruling.model, found.race
-    if not model.effects:
-        return []
-    shares = verdict.shapley(race, model, say)
-    out = [_effect(found, e, sd, shares.get(e.label, float("nan")), say) for e in model.effects]
-    return sorted(out, key=lambda e: -e.share if e.share == e.share else -e.gap_closed)
-
-
-def _effect(found: Findings, effect: Candidate, sd: np.ndarray, share: float, say: search.Progress) -> FoundEffect:
-    setup, race, model, predictions = found.setup, found.race, found.ruling.model, found.predictions
-    fitter, cut = setup.fitter, setup.fitter.simulator.windows
-    rivals = found.ruling.rivals.get(effect.label, [])
-    rest = verdict.without(race, model, effect, say)
-    before = gap.predict(fitter, rest) if rest.effects else predictions["calibrated"]
-    after = predictions["with_effects"]
-    reference = min(1.0, float(after.cost(cut.steps).mean()))
-    calibrated = predictions["calibrated"].cost(cut.steps)
-    whole, _ = gap.closure(calibrated, after.cost(cut.steps), 1.0, cut.group, setup.seed)
-    alone = share if len(model.effects) > 1 and share == share else 1.0
-    closed, ci = gap.closure(before.cost(cut.steps), after.cost(cut.steps), reference, cut.group, setup.seed)
-    if len(model.effects) > 1:  # of the whole gap, by its share in what all close together
-        closed, ci = whole * alone, (ci[0] * whole * alone, min(1.0, ci[1] * whole * alone))
-    told = [model, *(r.model for r in rivals if not r.contains)]
-    weight = uncertainty.win_share(told, cut.group, race.noise, np.random.default_rng(setup.seed))
-    screened = next((s for s in race.screened if s.candidate.label == effect.label), None)
-    above = max(race.base.total - race.noise * len(race.base.cost), 1e-9)
-    own = [model.job.names.index(c.name) for c in effect.coordinates]
-    numbers = {
-        c.name.rsplit(".", 1)[1]: Estimate(float(model.job.values[i]), float(sd[i]), _unit(setup, effect, c.unit))
-        for i, c in zip(own, effect.coordinates, strict=True)
-    }
-    return FoundEffect(
-        name=effect.effect,
-        where=effect.where,
-        parameters=numbers,
-        probability=float(weight[0]),
-        gap_closed=closed,
-        gap_closed_ci=ci,
-        equivalent_to=[r.to_dict() for r in rivals],
-        sentence="",
-        predicted_gap_closed=float("nan") if screened is None else min(screened.gain / above, 1.0),
-        share=share,
-    )
-
-
-def _unit(setup: Setup, effect: Candidate, unit: str) -> str:
-    """A hinge's unit as a slide's, where the place is a slide."""
-    model = setup.physics.mj_model
-    if effect.kind not in ("joint", "actuator") or effect.where == "all":
-        return unit
-    try:
-        joint = model.joint(effect.where).id if effect.kind == "joint" else int(model.actuator(effect.where).trnid[0])
-    except KeyError:
-        return unit
-    if joint < 0 or int(model.jnt_type[joint]) != 2:
-        return unit
-    swap = {"N m/rad": "N/m", "N m s/rad": "N s/m", "N m s": "N s/m", "kg m^2": "kg", "N m": "N", "rad": "m"}
-    return swap.get(unit, unit.replace("N m", "N").replace("rad", "m"))
-
-
-def _gap(found: Findings, over: whole.Whole) -> Gap:
+def _gap(found: Findings, over: whole.Whole, closed: dict[str, Any]) -> Gap:
     setup, predictions = found.setup, found.predictions
     cut = setup.fitter.simulator.windows
     floor = _floor(found)
@@ -183,6 +122,7 @@ def _gap(found: Findings, over: whole.Whole) -> Gap:
         by_channel=by_channel,
         horizons=rows,
         physical=physical,
+        closed=closed,
     )
 
 

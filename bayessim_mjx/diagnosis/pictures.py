@@ -15,7 +15,7 @@ from bayessim_mjx.logs.log import Channels
 MANY = 24  # candidates in the isolability matrix, overlays in the report
 
 
-def details(found: Findings, effects: list[FoundEffect]) -> dict[str, Any]:
+def details(found: Findings, effects: list[FoundEffect], closed: dict[str, Any]) -> dict[str, Any]:
     ruling, cut = found.ruling, found.setup.fitter.simulator.windows
     flex = found.flexible_winner or found.flexible_base
     rms = {k: float(np.sqrt(p.cost(cut.steps).mean())) for k, p in found.predictions.items()}
@@ -26,10 +26,7 @@ def details(found: Findings, effects: list[FoundEffect]) -> dict[str, Any]:
         "overlays": _overlays(found),
         "isolability": _isolability(found.race),
         "episodes": _episodes(found),
-        "closure": [
-            {"effects": [f"{e.name}@{e.where}"], "predicted": e.predicted_gap_closed, "realised": e.gap_closed}
-            for e in effects
-        ],
+        "closure": _closure(effects, closed),
         "shapley": [{"effect": f"{e.name}@{e.where}", "share": e.share} for e in effects if e.share == e.share],
         "flexible": {} if flex is None else flex.details(rms["calibrated"], rms["with_effects"]),
         "groups": {
@@ -48,6 +45,17 @@ def details(found: Findings, effects: list[FoundEffect]) -> dict[str, Any]:
             for n, s in zip(Channels.of(found.setup.physics.mj_model).qvel, cut.sigma_q, strict=True)
         ],
     }  # fmt: skip
+
+
+def _closure(effects: list[FoundEffect], closed: dict[str, Any]) -> list[dict[str, Any]]:
+    """Promised and realised, of each effect and of all together."""
+    labels = [f"{e.name}@{e.where}" for e in effects]
+    rows: list[dict[str, Any]] = [
+        {"effects": [n], "predicted": e.predicted_gap_closed, "realised": e.gap_closed, "ci": e.gap_closed_ci}
+        for n, e in zip(labels, effects, strict=True)
+    ]
+    both = {k: closed[k] for k in ("predicted", "realised", "ci")} if len(rows) > 1 else {}
+    return [*rows, {"effects": labels} | both] if both else rows
 
 
 def _overlays(found: Findings) -> list[dict[str, Any]]:

@@ -37,10 +37,11 @@ class FoundEffect:
         name, where: of the library, of the model.
         parameters: {parameter: Estimate}.
         probability: that this effect, and none of its rivals, is what is there.
-        gap_closed, gap_closed_ci: share of the reducible squared gap, held out, 90 % interval.
+        gap_closed, gap_closed_ci: its part of what all effects close, as a share of the recalibrated simulator's
+            squared gap above the noise, on held-out windows, with a 90 % interval.
         equivalent_to: [{"effects": ["payload@link", ...], "gap_closed": ..., "why": sentence}], rivals that these logs
             cannot tell from it.
-        sentence: for people; predicted_gap_closed: before it was added.
+        sentence: for people; predicted_gap_closed: the same share as promised before any effect was fitted.
         share: of the gap closed by all effects together (Shapley).
     """
 
@@ -72,7 +73,9 @@ class Gap:
     """Root mean square of measured minus simulated motion on held-out windows, in units of the measurement noise.
 
     horizons: [{"name": "0.25 s", "seconds", "nominal", "calibrated", "with_effects", "reducible_floor", "noise_floor",
-    "ci": {stage: [lo, hi]}}]; by_channel: {joint: {stage: value}}; physical: {joint: {stage: value, "unit"}}, rad or m.
+    "ci": {stage: [lo, hi]}}]; by_channel: {joint: {stage: value}}; physical: {joint: {stage: value, "unit"}}, rad or m;
+    closed: {"predicted", "realised", "ci"}, share of the recalibrated simulator's squared gap above the noise that all
+    effects close together: as promised before any was fitted, and on held-out windows afterwards.
     """
 
     noise_floor: float
@@ -84,6 +87,7 @@ class Gap:
     by_channel: dict[str, dict[str, float]] = field(default_factory=dict)
     horizons: list[dict[str, Any]] = field(default_factory=list)
     physical: dict[str, dict[str, Any]] = field(default_factory=dict)
+    closed: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

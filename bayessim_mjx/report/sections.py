@@ -134,7 +134,9 @@ def _closure(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
             "name": candidate_title(r),
             "predicted": percent(r.get("predicted")),
             "realised": percent(r.get("realised")),
-            "mark": marks.interval(r.get("realised"), None, limits, STAGE["with_effects"], hollow=r.get("predicted")),
+            "mark": marks.interval(
+                r.get("realised"), r.get("ci"), limits, STAGE["with_effects"], hollow=r.get("predicted")
+            ),
         }
         for r in rows
     ]
