@@ -75,6 +75,7 @@ def _verdict(d: Diagnosis, text: Any, unicode: bool) -> Any:
     lines = [text(headline(d), "bold"), *map(text, d.sentences[1:])]
     if known:
         lines.append(text("gap in noise standard deviations: " + ", ".join(known)))
+    lines += [text(line) for line in _longest(d)]
     lines.append(text(VERDICTS[d.verdict].advice, "dim"))
     style = COLOURS[d.verdict]
     edge = box.ROUNDED if unicode else box.ASCII
@@ -85,6 +86,15 @@ def _verdict(d: Diagnosis, text: Any, unicode: bool) -> Any:
         border_style=style,
         box=edge,
     )
+
+
+def _longest(d: Diagnosis) -> list[str]:
+    """The gap over the longest horizon, where that is not the one of the line before."""
+    last = d.gap.horizons[-1] if d.gap.horizons else {}
+    if not last or last.get("nominal") == d.gap.nominal:
+        return []
+    known = [f"{STAGES[s]} {number(last[s])}" for s in STAGES if finite(last.get(s))]
+    return [f"over {last['name']} ({number(last.get('seconds'), 2)} s): " + ", ".join(known)]
 
 
 def _table(*columns: tuple[str, bool]) -> Any:
@@ -104,6 +114,7 @@ def _effects(d: Diagnosis, text: Any) -> Any:
         ("parameters", False),
         ("gap closed", True),
         ("90 %", True),
+        ("promised", True),
         ("probability", True),
         ("or", False),
     )
@@ -116,6 +127,7 @@ def _effects(d: Diagnosis, text: Any) -> Any:
             values,
             percent(e.gap_closed),
             between(*e.gap_closed_ci),
+            percent(e.predicted_gap_closed),
             percent(e.probability),
             rivals,
         )

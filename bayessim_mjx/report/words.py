@@ -5,41 +5,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, TypeGuard
 
+from bayessim_mjx.diagnosis.nouns import EFFECTS
 from bayessim_mjx.diagnosis.result import Diagnosis, Estimate, FoundEffect
 
-# effect: (what people call it, kind of place)
-EFFECTS = {
-    "actuator_delay": ("command delay", "actuator"),
-    "actuator_lag": ("actuator lag", "actuator"),
-    "actuator_gain": ("wrong actuator gain", "actuator"),
-    "actuator_bias": ("effort bias", "actuator"),
-    "actuator_deadband": ("command deadband", "actuator"),
-    "actuator_saturation": ("effort saturation", "actuator"),
-    "speed_torque_limit": ("speed-torque limit", "actuator"),
-    "effort_loss": ("effort loss at high load", "actuator"),
-    "cogging": ("cogging", "actuator"),
-    "rate_limit": ("command rate limit", "actuator"),
-    "coulomb_friction": ("Coulomb friction", "joint"),
-    "stribeck_friction": ("Stribeck friction", "joint"),
-    "viscous_friction": ("viscous friction", "joint"),
-    "load_friction": ("load-dependent friction", "joint"),
-    "asymmetric_friction": ("direction-dependent friction", "joint"),
-    "quadratic_drag": ("quadratic drag", "joint"),
-    "backlash": ("backlash", "joint"),
-    "joint_elasticity": ("elastic transmission", "joint"),
-    "joint_spring": ("spring", "joint"),
-    "armature": ("added rotor inertia", "joint"),
-    "joint_offset": ("angle offset", "joint"),
-    "payload": ("extra payload", "body"),
-    "gravity_tilt": ("tilted base", "world"),
-    "external_force": ("external force", "body"),
-    "base_flexibility": ("flexible mount", "world"),
-    "contact_friction": ("changed contact friction", "geom"),
-    "contact_compliance": ("contact compliance", "geom"),
-    "sensor_delay": ("measurement delay", "joint"),
-    "sensor_filter": ("measurement filter", "joint"),
-    "sensor_gain": ("wrong sensor gain", "joint"),
-}
 # quantities that are easier to read as their reciprocal
 RECIPROCALS = {
     "inverse_limit": "limit",

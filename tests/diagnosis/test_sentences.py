@@ -1,0 +1,68 @@
+"""The verdict in words: one effect or several, promised and realised, every verdict a plain sentence."""
+
+import pytest
+
+from bayessim_mjx.diagnosis import sentences
+from bayessim_mjx.diagnosis.nouns import LACKS, listed, missing
+from bayessim_mjx.diagnosis.result import VERDICTS, FoundEffect, Gap
+from bayessim_mjx.effects import names
+
+LEVEL = {"nominal": 21.44, "calibrated": 2.7, "with_effects": 0.866}
+
+
+def effect(name, where, closed, promised):
+    return FoundEffect(name, where, {}, 1.0, closed, (closed, closed), predicted_gap_closed=promised)
+
+
+FRICTION = effect("coulomb_friction", "hinge", 0.68, 0.66)
+GAIN = effect("actuator_gain", "torque", 0.32, 0.31)
+
+
+def test_one_effect():
+    head, falls = sentences.verdict_in_words("effects", [FRICTION], LEVEL, 0.0)
+    assert head == "The simulator lacks Coulomb friction at hinge."
+    assert falls.startswith("With it the gap falls from 2.70 (recalibrated) to 0.87 noise standard deviations")
+    assert falls.endswith("66% was promised to go before it was added, and 68% went.")
+
+
+def test_several_effects():
+    head, falls = sentences.verdict_in_words("effects", [FRICTION, GAIN], LEVEL, 0.0)
+    assert head == "The simulator lacks Coulomb friction at hinge and the true actuator gain at torque."
+    assert falls.startswith("With them the gap falls")
+    assert falls.endswith("97% was promised to go before they were added, and 100% went.")
+
+
+def test_what_comes_nearest_where_nothing_explains():
+    one = sentences.verdict_in_words("unexplained", [FRICTION], LEVEL, 0.4)[1]
+    assert one.startswith("Of the library, Coulomb friction at hinge comes nearest; a flexible force on top of it still ")
+    assert one.endswith("closes 40% of the gap.")
+    two = sentences.verdict_in_words("unexplained", [FRICTION, GAIN], LEVEL, 0.0)[1]
+    assert "come nearest; a flexible force alone predicts" in two
+
+
+@pytest.mark.parametrize("verdict", [v for v in VERDICTS if v != "insufficient_data"])
+def test_every_verdict_is_a_sentence(verdict):
+    for found in ([], [FRICTION], [FRICTION, GAIN]):
+        for text in sentences.verdict_in_words(verdict, found, LEVEL, 0.4):
+            assert text[0].isupper() and text.endswith(".") and "{" not in text and "  " not in text
+
+
+def test_names_of_effects_and_places():
+    assert missing("viscous_friction", "all") == "viscous friction at all joints"
+    assert missing("gravity_tilt", "world") == "the tilt of the base"
+    assert missing("my_effect", "elbow") == "my effect at elbow"
+    assert set(LACKS) <= set(names())
+    assert listed(["a"]) == "a" and listed(["a", "b", "c"], "or") == "a, b or c" and listed([]) == ""
+
+
+@pytest.mark.parametrize(("value", "text"), [(0.8661, "0.87"), (2.7, "2.70"), (21.44, "21.4"), (161.6, "162")])
+def test_numbers(value, text):
+    assert sentences.number(value) == text
+
+
+def test_a_closure_that_depends_on_the_horizon_is_flagged():
+    rows = [("0.1 s", 3.0, 1.0), ("0.5 s", 3.0, 1.1), ("whole log", 100.0, 70.0)]
+    horizons = [{"name": n, "calibrated": c, "with_effects": w} for n, c, w in rows]
+    (told,) = sentences.horizon_warning(Gap(1.0, 4.0, 3.0, 1.1, 1.0, horizons=horizons))
+    assert told == "the gap closed depends on the horizon: 100% over 0.1 s, 97% over 0.5 s, 51% over whole log"
+    assert not sentences.horizon_warning(Gap(1.0, 4.0, 3.0, 1.1, 1.0, horizons=horizons[:2]))
