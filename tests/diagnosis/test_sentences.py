@@ -34,8 +34,8 @@ def test_several_effects():
 
 def test_what_comes_nearest_where_nothing_explains():
     one = sentences.verdict_in_words("unexplained", [FRICTION], LEVEL, 0.4)[1]
-    assert one.startswith("Of the library, Coulomb friction at hinge comes nearest; a flexible force on top of it still ")
-    assert one.endswith("closes 40% of the gap.")
+    assert one.startswith("Of the library, Coulomb friction at hinge comes nearest; a flexible force on top of it")
+    assert one.endswith("still closes 40% of the gap.")
     two = sentences.verdict_in_words("unexplained", [FRICTION, GAIN], LEVEL, 0.0)[1]
     assert "come nearest; a flexible force alone predicts" in two
 
