@@ -15,12 +15,13 @@ import json
 import multiprocessing
 import os
 import queue
+import signal
 import subprocess
 import sys
 import time
 import zlib
 from collections.abc import Iterable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +33,7 @@ from diagnosis_truth import Plant, run, scales_of
 
 KINDS = ("single", "double", "null", "unknown")
 WORKER = Path(__file__).with_name("diagnosis_worker.py")
+STOPPED = (130, -signal.SIGINT, -signal.SIGTERM)  # by somebody: to be run again
 Job = tuple[str, str, tuple[str, ...], str, int, Path]
 
 
@@ -90,8 +92,12 @@ def diagnose(args: argparse.Namespace) -> None:
     for core in usable[: args.workers]:
         cores.put(core)
     with ThreadPoolExecutor(min(args.workers, len(usable))) as pool:
-        for done, line in enumerate(pool.map(lambda folder: _diagnose_one(folder, where, args, cores), todo), 1):
-            print(f"{done}/{len(todo)} {line}", flush=True)
+        running = [pool.submit(_diagnose_one, folder, where, args, cores) for folder in todo]
+        try:
+            for done, each in enumerate(as_completed(running), 1):
+                print(f"{done}/{len(todo)} {each.result()}", flush=True)
+        finally:  # Ctrl-C: what has not begun does not begin
+            pool.shutdown(cancel_futures=True)
 
 
 def _wanted(folder: Path, where: str, args: argparse.Namespace) -> bool:
@@ -128,7 +134,7 @@ def _diagnose_one(folder: Path, where: str, args: argparse.Namespace, cores: "qu
     finally:
         cores.put(core)
     seconds = time.perf_counter() - started
-    if not (out / "exit.json").exists():  # died or was stopped: counts as a case without a result
+    if not (out / "exit.json").exists() and code not in STOPPED:  # died: counts as a case without a result
         (out / "exit.json").write_text(json.dumps({"code": code, "seconds": seconds}))
     said = out / "diagnosis.json"
     verdict = json.loads(said.read_text())["verdict"] if said.exists() else "no result"

@@ -87,6 +87,8 @@ def work(case: Path, out: Path, baselines: bool, arguments: list[str]) -> int:
         truth = json.loads((case / "truth.json").read_text())
         _write(out / "oracle.json", oracle(found, truth["effects"], joints_of(case)))
         ended["oracle_seconds"] = time.perf_counter() - started
+    if code == 130:  # Ctrl-C: to be run again
+        return code
     _write(out / "exit.json", {"code": code} | ended)
     if found is not None and baselines:
         from diagnosis_baselines import all_baselines
@@ -103,7 +105,7 @@ def main() -> int:
     parser.add_argument("--baselines", action="store_true")
     parser.add_argument("--more", nargs=argparse.REMAINDER, default=[], help="arguments of the command; last")
     args = parser.parse_args()
-    if args.core is not None:
+    if args.core is not None and hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {args.core})  # before JAX counts the cores
     return work(args.case, args.out, args.baselines, args.more)
 

@@ -1,0 +1,80 @@
+"""The benchmark's run command with a worker that only pretends: cores, finished cases, interruptions."""
+
+import argparse
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
+pytest.importorskip("diagnosis_cases")
+import diagnosis as command  # noqa: E402
+
+WORKER = """import json, sys
+from pathlib import Path
+case, out = Path(sys.argv[1]), Path(sys.argv[3])
+(out / "arguments.json").write_text(json.dumps(sys.argv))
+if (case / "stopped").exists():
+    sys.exit(130)
+if (case / "broken").exists():
+    sys.exit(1)
+(out / "exit.json").write_text('{"code": 0, "seconds": 1.0}')
+if "--baselines" in sys.argv:
+    (out / "baselines.json").write_text("{}")
+"""
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    worker = tmp_path / "worker.py"
+    worker.write_text(WORKER)
+    monkeypatch.setattr(command, "WORKER", worker)
+    for name, kind in (("one", "single"), ("two", "null")):
+        effects = [{"name": "cogging"}] if kind == "single" else []
+        (tmp_path / "cases" / name).mkdir(parents=True)
+        (tmp_path / "cases" / name / "truth.json").write_text(json.dumps({"kind": kind, "effects": effects}))
+    return tmp_path / "cases"
+
+
+def run(folder: Path, **more) -> None:
+    given = {"leave_out_family": False, "baselines": False, "workers": 2, "timeout": 60.0, "more": []}
+    command.diagnose(argparse.Namespace(cases=folder, **(given | more)))
+
+
+def told(folder: Path, where: str = "diagnosis") -> list[str]:
+    return json.loads((folder / where / "arguments.json").read_text())
+
+
+def test_finished_cases_stay_and_unfinished_ones_are_run(folder, capsys):
+    run(folder)
+    (folder / "two" / "diagnosis" / "exit.json").unlink()
+    run(folder)
+    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == ["1/2", "2/2", "1/1"]
+
+
+def test_baselines_that_are_missing_are_asked_for_again(folder):
+    run(folder)
+    assert "--baselines" not in told(folder / "one")
+    run(folder, baselines=True)
+    assert "--baselines" in told(folder / "one") and (folder / "two" / "diagnosis" / "baselines.json").exists()
+
+
+def test_what_was_stopped_is_run_again_and_what_died_counts_as_run(folder, capsys):
+    (folder / "one" / "stopped").touch()
+    (folder / "two" / "broken").touch()
+    run(folder)
+    assert not (folder / "one" / "diagnosis" / "exit.json").exists()
+    assert json.loads((folder / "two" / "diagnosis" / "exit.json").read_text())["code"] == 1
+    capsys.readouterr()
+    run(folder)
+    assert capsys.readouterr().out.startswith("1/1 one: exit 130, no result")
+
+
+def test_the_family_of_singles_only_is_left_out_of_the_library(folder):
+    run(folder, leave_out_family=True, more=["--group", "payload"])
+    arguments = told(folder / "one", "left_out")
+    assert arguments[arguments.index("--more") + 1 : -2] == ["--group", "payload"]
+    library = arguments[-1].split(",")
+    assert arguments[-2] == "--effects" and "cogging" not in library and len(library) == 29
+    assert not (folder / "two" / "left_out").exists()
