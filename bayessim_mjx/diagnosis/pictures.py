@@ -17,8 +17,6 @@ MANY = 24  # candidates in the isolability matrix, overlays in the report
 
 def details(found: Findings, effects: list[FoundEffect], closed: dict[str, Any]) -> dict[str, Any]:
     ruling, cut = found.ruling, found.setup.fitter.simulator.windows
-    flex = found.flexible_winner or found.flexible_base
-    rms = {k: float(np.sqrt(p.cost(cut.steps).mean())) for k, p in found.predictions.items()}
     each, deviation = verdict.per_condition(found.race, ruling.model)
     names = ruling.model.job.names
     return {
@@ -28,7 +26,7 @@ def details(found: Findings, effects: list[FoundEffect], closed: dict[str, Any])
         "episodes": _episodes(found),
         "closure": _closure(effects, closed),
         "shapley": [{"effect": f"{e.name}@{e.where}", "share": e.share} for e in effects if e.share == e.share],
-        "flexible": {} if flex is None else flex.details(rms["calibrated"], rms["with_effects"]),
+        "flexible": _flexible(found),
         "groups": {
             "names": list(cut.groups),
             "parameters": {n: {"mean": each[:, i], "sd": deviation[:, i]} for i, n in enumerate(names)},
@@ -56,6 +54,19 @@ def _closure(effects: list[FoundEffect], closed: dict[str, Any]) -> list[dict[st
     ]
     both = {k: closed[k] for k in ("predicted", "realised", "ci")} if len(rows) > 1 else {}
     return [*rows, {"effects": labels} | both] if both else rows
+
+
+def _flexible(found: Findings) -> dict[str, Any]:
+    """The flexible force on the recalibrated simulator and on top of the effects, in noise standard deviations."""
+    base = found.flexible_base
+    winner = found.flexible_winner if found.ruling.model.effects else None
+    shown = winner or base
+    if shown is None:
+        return {}
+    size = found.setup.fitter.size
+    levels = [np.nan if f is None else float(np.sqrt(f.condition.cost.mean() / size)) for f in (base, winner)]
+    told = shown.details(*levels)
+    return told | {"seeds": [s / np.sqrt(size) for s in told["seeds"]]}
 
 
 def _overlays(found: Findings) -> list[dict[str, Any]]:

@@ -101,7 +101,7 @@ def experiment(d: Diagnosis) -> dict[str, Any]:
     own = next((e for e in menu if e.get("name") == plan.get("name")), None) or {}
     command = own.get("command") or {}
     rows = plan.get("table") or [{"experiment": e.get("name"), "evidence": e.get("evidence")} for e in menu]
-    heads = list(dict.fromkeys(k for r in rows for k in r)) if all(isinstance(r, Mapping) for r in rows) else []
+    heads = list(dict.fromkeys(k for r in rows for k, v in r.items() if v not in ("", None)))
     pairs = [(label_title(p["a"]), label_title(p["b"]), number(p.get("evidence"))) for p in own.get("pairs") or []]
     return {
         "plan": plan,

@@ -23,13 +23,17 @@ from bayessim_mjx.report.look import (
 from bayessim_mjx.report.words import STAGES, finite, unit
 
 
+def _condition(row: Mapping[str, Any]) -> str:
+    """The log's operating condition, where that is not the log itself."""
+    condition = row.get("condition")
+    known = condition and condition != row.get("log")
+    return f" <span style='color:{FAINT}'>{text(condition, 24)}</span>" if known else ""
+
+
 def episodes(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Gap of every log at each stage, logs from top to bottom, on a logarithmic axis."""
     names = [text(r.get("log", k), 42) for k, r in enumerate(rows)]
-    names = [
-        f"{n} <span style='color:{FAINT}'>{text(r['condition'], 24)}</span>" if r.get("condition") else n
-        for n, r in zip(names, rows, strict=True)
-    ]
+    names = [n + _condition(r) for n, r in zip(names, rows, strict=True)]
     at = list(range(len(rows)))
     stages = ("nominal", "calibrated", "with_effects")
     values = {s: numbers([r.get(s) for r in rows]) for s in stages}

@@ -195,7 +195,7 @@ def candidates(d: Diagnosis) -> dict[str, Any]:
                 "chosen": chosen,
                 "closed": percent(c.get("gap_closed")),
                 "absorbed": percent(c.get("absorbed")),
-                "values": "; ".join(_value(n, v) for n, v in _own(c).items()),
+                "values": "; ".join(_value(n, v) for n, v in _own(c).items() if n not in d.parameters),
                 "mark": marks.interval(score, spans[0], limits, colour, (0.0,), inner=spans[1]),
             }
         )
@@ -238,16 +238,22 @@ def where(d: Diagnosis) -> dict[str, Any]:
             }
             for p in ranked
         ],
-        "links": [
-            {
-                "name": x["name"],
-                "verdict": x.get("verdict") or "",
-                "slope": number(x.get("slope")),
-                "correlation": number(x.get("correlation"), 4),
-                "lag": estimate(x.get("lag"), in_unit="s"),
-            }
-            for x in d.details.get("links") or []
-        ],
+        "links": [_link(x) for x in d.details.get("links") or []],
         "maps": choice(["joint"], [((j,), place_figures.maps(by_joint[j])) for j in joints]),
         "frequency": choice(["joint"], [((str(r["joint"]),), place_figures.frequency(r)) for r in waves]),
+    }
+
+
+def _link(x: Mapping[str, Any]) -> dict[str, Any]:
+    """A link of the chain; its verdict without the name and the numbers that stand beside it."""
+    told = str(x.get("verdict") or "")
+    head, _, rest = told.partition(": ")
+    told = (rest if "->" in head and rest else told).rpartition(" (corr ")[0] or (rest if "->" in head else told)
+    return {
+        "name": str(x["name"]).replace("->", "→"),
+        "verdict": told,
+        "slope": number(x.get("slope")),
+        "correlation": number(x.get("correlation"), 4),
+        "lag": estimate(x.get("lag"), in_unit="s") if finite(x.get("lag")) else MISSING,
+        "tested": any(finite(x.get(k)) for k in ("slope", "correlation", "lag")),
     }
