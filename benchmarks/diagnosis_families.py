@@ -8,9 +8,9 @@ FAMILIES = (
     ("actuator_delay", "actuator_lag", "rate_limit", "sensor_delay", "sensor_filter"),
     ("backlash", "joint_elasticity", "base_flexibility", "actuator_deadband", "sensor_delay", "actuator_delay",
      "actuator_lag"),
-    ("payload", "gravity_tilt", "external_force", "joint_spring", "joint_offset", "actuator_bias"),
+    # a sine of the angle at order 1 is what gravity does to one joint
+    ("payload", "gravity_tilt", "external_force", "joint_spring", "joint_offset", "actuator_bias", "cogging"),
     ("actuator_gain", "sensor_gain", "armature", "payload", "actuator_saturation", "effort_loss", "speed_torque_limit"),
-    ("cogging",),
     ("contact_friction", "contact_compliance"),
 )  # fmt: skip
 

@@ -76,5 +76,5 @@ def test_the_family_of_singles_only_is_left_out_of_the_library(folder):
     arguments = told(folder / "one", "left_out")
     assert arguments[arguments.index("--more") + 1 : -2] == ["--group", "payload"]
     library = arguments[-1].split(",")
-    assert arguments[-2] == "--effects" and "cogging" not in library and len(library) == 29
+    assert arguments[-2] == "--effects" and "cogging" not in library and len(library) == 23
     assert not (folder / "two" / "left_out").exists()
