@@ -118,14 +118,15 @@ def compare_fit(folder: Path, variants: Sequence[str]) -> dict:
     return out
 
 
-def compare_race(folder: Path, one_place: bool) -> dict:
-    """All candidates by the library; by mujoco.sysid those that MuJoCo has, on whole runs, from off the bounds."""
+def compare_race(folder: Path, variant: str, one_place: bool) -> dict:
+    """All candidates by the library; by mujoco.sysid those that MuJoCo has, from off the bounds."""
     ours, candidates = fitter.race_all(folder)
     print(json.dumps(ours), file=sys.stderr, flush=True)
     if one_place:
         candidates = list({c.effect: c for c in reversed(candidates) if c.where != "all"}.values())
     nominal = native.specification(str(folder / "model.xml"), loads=True).compile()
-    data = pieces(folder, nominal, None, None)
+    length, threads = VARIANTS[variant]
+    data = pieces(folder, nominal, None, length)
     each, fits = {}, {}
     for extra in native.effects(nominal, candidates):
         payload = extra.name.startswith("payload")
@@ -133,7 +134,7 @@ def compare_race(folder: Path, one_place: bool) -> dict:
         params = native.base(nominal)
         params.add(extra)
         params.move_off_bounds()
-        each[extra.name], found = optimise(train, params)
+        each[extra.name], found = optimise(train, params, threads)
         fits[extra.name] = error(train, found)
         print(f"{extra.name}: {each[extra.name]:.1f} s", file=sys.stderr, flush=True)
     return {"library": ours, "sysid": each, "sysid best": min(fits, key=lambda n: fits[n])}
@@ -143,11 +144,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("cases", type=Path, nargs="+")
     parser.add_argument("--race", action="store_true", help="all candidates instead of the parameter fit")
-    parser.add_argument("--variants", default="runs,windows,threads", help="of the parameter fit by mujoco.sysid")
+    parser.add_argument("--variants", default="runs,windows,threads", help="of mujoco.sysid; --race takes the first")
     parser.add_argument("--one-place", action="store_true", help="mujoco.sysid fits every effect at one place only")
     args = parser.parse_args()
+    variants = args.variants.split(",")
     for folder in args.cases:
-        told = compare_race(folder, args.one_place) if args.race else compare_fit(folder, args.variants.split(","))
+        told = compare_race(folder, variants[0], args.one_place) if args.race else compare_fit(folder, variants)
         print(json.dumps({"case": folder.name} | told, default=float), flush=True)
 
 
