@@ -14,10 +14,17 @@ from diagnosis_truth import Plant, Run, base_parameters, run, scales_of
 from scipy.optimize import lsq_linear
 
 APART = 1.0  # encoder noises (rms over time, largest over joints): below, a rival explains the same motion
+SHARE = 0.2  # and of what the known parameters leave: less is lost in the simulator's own step and in linearising
 DRAWS = 2  # of a rival's sign and shape
 STEPS = 3  # secant steps to its size
 TOLD = 5  # rivals kept
 EVERY = 2  # windows are thinned by this: a rival costs several simulations
+# what the laws can be besides what the generator draws: to a single joint a sine of its angle, or a force straight up,
+# is what gravity does
+SHAPES: dict[str, tuple[dict[str, Any], ...]] = {
+    "cogging": ({"count": 1, "phase": 0.0}, {"count": 1, "phase": np.pi / 2}),
+    "external_force": ({"direction": np.eye(3)[0], "gusts": 0.0}, {"direction": np.eye(3)[2], "gusts": 0.0}),
+}
 _FIRST = 0.1  # of the largest size
 _SIGNED = ("sign", "heading", "direction", "phase")  # what has one of these may act either way round
 
@@ -44,6 +51,11 @@ def hidden(truth: dict[str, Any]) -> tuple[Cause, Ruler]:
     return cause, ruler
 
 
+def isolable(found: list[dict[str, Any]], left: float) -> bool:
+    """Whether every rival leaves enough; `left`: noises that base parameters alone leave (of the truth)."""
+    return all(r["left"] >= max(APART, SHARE * left) for r in found)
+
+
 def rivals(cause: Cause, ruler: Ruler) -> list[dict[str, Any]]:
     """[{"name", "where", "left"}], the closest first: left in encoder noises."""
     scales = cause.scales
@@ -53,7 +65,7 @@ def rivals(cause: Cause, ruler: Ruler) -> list[dict[str, Any]]:
     found = []
     for name, where in _others(cause, ruler, scales, near):
         rng = np.random.default_rng((ruler.seed, *name.encode()))
-        left = min(_closest(name, where, ruler, scales, runs, gap, rng) for _ in range(DRAWS))
+        left = min(_closest(rival, ruler, runs, gap) for rival in _drawn(name, where, scales, rng))
         found.append({"name": name, "where": where, "left": left})
     return sorted(found, key=lambda r: r["left"])[:TOLD]
 
@@ -78,13 +90,19 @@ def _others(cause: Cause, ruler: Ruler, scales: Scales, near: str) -> list[tuple
     return out
 
 
-def _closest(
-    name: str, where: str, ruler: Ruler, scales: Scales, runs: list[Run], gap: np.ndarray, rng: np.random.Generator
-) -> float:
-    """What the best size of one draw of a rival leaves, in noises."""
+def _drawn(name: str, where: str, scales: Scales, rng: np.random.Generator) -> list[Cause]:
+    """A cause with some signs and shapes."""
     from diagnosis_cases import CAUSES
 
-    rival = CAUSES[name](where, scales, rng)
+    out = [CAUSES[name](where, scales, rng) for _ in range(DRAWS)]
+    for shape in SHAPES.get(name, ()):
+        out.append(CAUSES[name](where, scales, rng))
+        vars(out[-1]).update(shape)
+    return out
+
+
+def _closest(rival: Cause, ruler: Ruler, runs: list[Run], gap: np.ndarray) -> float:
+    """What the best size of a rival leaves, in noises."""
     either = any(hasattr(rival, a) for a in _SIGNED)
     smallest = max(rival.smallest, 1e-4 * rival.largest)
     rival.size, best = max(_FIRST * rival.largest, smallest), np.inf

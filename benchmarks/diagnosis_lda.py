@@ -69,12 +69,14 @@ def draw(candidate: Candidate, rng: np.random.Generator) -> tuple[Array, tuple[i
 
 
 class Outside:
-    """Projects whitened gaps `[..., W, n]` onto what the base parameters and start states cannot do (linearised)."""
+    """Projects whitened gaps `[..., W, n]` onto what base parameters inside their bounds and start states cannot do."""
 
     def __init__(self, job: Any, own: Array) -> None:
         self.starts = np.linalg.qr(job.B[own])[0]
-        A = self._without_starts(np.moveaxis(job.A[own], 2, 0))
-        flat = A.reshape(len(A), -1).T
+        _, _, below, above = job.prior()
+        inside = np.minimum(-below, above) > 1e-6 * (above - below)
+        A = self._without_starts(np.moveaxis(job.A[own][:, :, inside], 2, 0))
+        flat = A.reshape(len(A), own.size * job.A.shape[1]).T
         left, size, _ = np.linalg.svd(flat, full_matrices=False)
         self.base = left[:, size > 1e-6 * max(size.max(initial=0.0), 1e-300)]
 

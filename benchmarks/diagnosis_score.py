@@ -10,7 +10,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from diagnosis_isolable import APART
+from diagnosis_isolable import isolable
 
 Z90, Z95 = 1.645, 1.960
 # parameters that do not mean the same in generator and library (another pivot, gusts, signed loads)
@@ -77,7 +77,7 @@ def read(folder: Path, results: str = "diagnosis", baseline: str | None = None) 
     """One case as the diagnosis, or one of the baselines on its fits, tells it."""
     model = mujoco.MjModel.from_xml_path(str(folder / "model.xml"))
     joints = {model.actuator(i).name: model.joint(model.actuator_trnid[i, 0]).name for i in range(model.nu)}
-    where = folder / results
+    truth, where = json.loads((folder / "truth.json").read_text()), folder / results
     said = (
         _json(where / "diagnosis.json") if baseline is None else (_json(where / "baselines.json") or {}).get(baseline)
     )
@@ -88,9 +88,9 @@ def read(folder: Path, results: str = "diagnosis", baseline: str | None = None) 
     )
     seconds = ended.get("seconds", math.nan) if baseline is None else (said or {}).get("seconds", math.nan)
     return Outcome(
-        folder, json.loads((folder / "truth.json").read_text()), said, joints, seconds,
+        folder, truth, said, joints, seconds,
         ended.get("compile_seconds", math.nan), oracle.get("closure"),
-        None if rivals is None else all(r["left"] >= APART for r in rivals),
+        None if rivals is None else isolable(rivals, truth["effects"][0]["left"]),
     )  # fmt: skip
 
 

@@ -41,7 +41,8 @@ def case(
     (folder / "model.xml").write_text(systems.SYSTEMS["two_link"].xml)
     truth = {"system": "two_link", "strength": "medium", "effects": effects, "kind": kind, "seed": 1}
     files = {folder / "truth.json": truth, out / "exit.json": {"code": 0, "seconds": 60.0, "compile_seconds": 20.0}}
-    files |= {out / "oracle.json": {"closure": oracle}, folder / "isolable.json": [{"name": "x", "left": rival}]}
+    files |= {out / "oracle.json": {"closure": oracle}}
+    files |= {folder / "isolable.json": [{"name": "x", "left": rival}]} if kind == "single" else {}
     files |= {out / "diagnosis.json": verdict} if verdict else {}
     files |= {folder / name: content for name, content in more.items()}
     for path, content in files.items():
@@ -71,10 +72,11 @@ def test_an_actuator_and_its_joint_are_one_place(tmp_path):
 
 def test_what_a_rival_explains_from_the_truth_does_not_count_as_isolable(tmp_path):
     near = case(tmp_path / "a", [ELBOW], said(), rival=0.2)
+    faint = case(tmp_path / "c", [ELBOW | {"left": 30.0}], said(), rival=4.0)
     far = case(tmp_path / "b", [ELBOW], said(RIGHT), rival=4.0)
-    found = rates(near, far)
+    found = rates(near, faint, far)
     assert found["single, isolable: effect and place named"].answers == [True]
-    assert found["single, all: effect and place named"].answers == [False, True]
+    assert found["single, all: effect and place named"].answers == [False, False, True]
 
 
 def test_a_cause_weaker_than_asked_does_not_count(tmp_path):

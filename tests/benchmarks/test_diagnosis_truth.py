@@ -167,7 +167,7 @@ def test_a_cause_in_its_own_place_leaves_nothing_and_others_leave_more():
     runs = [truth.run(truth.Plant(PENDULUM, ruler.base, [damper]), i, 0, noise=False) for i in strength.PUSHED]
     gap = ruler.windows(ruler.plain, runs, every=isolable.EVERY)
     left = {
-        name: isolable._closest(name, where, ruler, scales, runs, gap, np.random.default_rng(1))
+        name: isolable._closest(cases.CAUSES[name](where, scales, np.random.default_rng(1)), ruler, runs, gap)
         for name, where in (("viscous_friction", "hinge"), ("joint_spring", "hinge"), ("actuator_bias", "hinge_motor"))
     }
     whole = float(np.sqrt(np.mean(gap**2, axis=(0, 1))).max())
