@@ -12,18 +12,14 @@ from dataclasses import dataclass
 from math import comb
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from bayessim_mjx.device import compiler_options
-from bayessim_mjx.diagnosis.quadratic import eliminate
 from bayessim_mjx.diagnosis.robot import Robot
-from bayessim_mjx.diagnosis.simulate import difference, integrate
-from bayessim_mjx.diagnosis.windows import Batch, Windows
+from bayessim_mjx.diagnosis.substeps import Errors, held
+from bayessim_mjx.diagnosis.windows import Windows
 from bayessim_mjx.logs.log import Channels, Log
-from bayessim_mjx.physics import Drive, Physics, begin, substep
+from bayessim_mjx.physics import Physics
 
 Array = NDArray[np.float64]
 FACTORS = (1, 2, 4, 8)
@@ -32,7 +28,7 @@ ENOUGH = 0.5  # noises: an error of the time step that does not show
 WORTH = 1.0  # noises: from here on the user is told
 REALITY = 0.1  # of the simulator's error is noise: logs that were simulated at a tenth of its step have as much
 CONVERGING = 1.3  # errors that shrink by less from one sub-step to its half are not worth finer ones
-NUDGE = 1e-4  # rad or rad/s, at least, of the start states for their finite differences
+FAR = 4.0  # medians: windows with larger errors are no measure, as in the fit
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +89,8 @@ class Discretisation:
             text += f"; the diagnosis simulates at {1e3 * self.timestep / self.factor:.3g} ms"
         if simulated:
             return f"{text}; the logs show no noise, so what is smaller than this is taken for noise"
-        left = np.sqrt(np.maximum((self.floor / self.sigma)[np.isfinite(self.sigma)] ** 2 - 1, 0.0)).max()
+        known = np.isfinite(self.sigma)
+        left = np.sqrt(np.maximum((self.floor[known] / self.sigma[known]) ** 2 - 1, 0.0)).max()
         return f"{text}; what it cannot remove, {left:.2g} noises, is taken for noise" if left > ENOUGH else text
 
     def to_dict(self) -> dict[str, Any]:
@@ -133,15 +130,16 @@ def measure(physics: Physics, cuts: Callable[[int], Windows], logs: Sequence[Log
     """
     first = cuts(1)
     touching = contacts(physics)
+    sigma = np.concatenate([first.sigma_q, first.sigma_v])
     errors = Errors(physics, first, 4)
+    errors.start(sigma)
     coarse, mid, fine = (errors.run(cuts(f), f) for f in (1, 2, 4))
     plain = errors.run(held(first), 1, corrected=False)
-    sigma = np.concatenate([first.sigma_q, first.sigma_v])
     settle = errors.settler(sigma)
-    one, two = (_size(settle(a - b), touching) for a, b in ((coarse, mid), (mid, fine)))
+    one, two = settle(coarse - mid), settle(mid - fine)
     gain = _gain(one / sigma, two / sigma)
     limit = fine + (fine - mid) / max(gain - 1, 1.0)
-    at = {f: one * (gain / (gain - 1)) / gain ** np.log2(f) for f in FACTORS}
+    at = {f: _size(one, touching) * gain / (gain - 1) / gain ** np.log2(f) for f in FACTORS}
     settled = _size(settle(plain - limit), touching)
     clean = np.array([noise_free(logs, i) for i in physics.mj_model.jnt_qposadr[physics.mj_model.dof_jntid]])
     share = np.where(np.tile(clean, 2), 1.0, REALITY)
@@ -163,8 +161,9 @@ def measure(physics: Physics, cuts: Callable[[int], Windows], logs: Sequence[Log
 
 
 def _gain(one: Array, two: Array) -> float:
-    """What halving the sub-step gains, between hardly anything (chaos, rounding) and the second order's 4."""
-    ratio = np.sqrt(np.sum(one**2) / max(float(np.sum(two**2)), 1e-300))
+    """What halving the sub-step gains in the usual window: from hardly anything (chaos) to the second order's 4."""
+    size = [np.sqrt(np.sum(e**2, (1, 2))) for e in (one, two)]
+    ratio = np.median(size[0] / np.maximum(size[1], 1e-12))
     return float(np.clip(ratio, 1.1, 4.0))
 
 
@@ -175,9 +174,10 @@ def _choose(error: dict[int, float], gain: float) -> int:
 
 
 def _size(error: Array, touching: bool) -> Array:
-    """Root mean square `[channels]` of errors `[W, H, channels]`; with contacts the median over windows."""
+    """Root mean square `[channels]` of errors `[W, H, channels]`; windows far off count less, with contacts hardly."""
     each = np.mean(error**2, axis=1)
-    return np.asarray(np.sqrt(np.median(each, axis=0) if touching else np.mean(each, axis=0)))
+    usual = np.median(each, axis=0)
+    return np.asarray(np.sqrt(usual if touching else np.mean(np.minimum(each, FAR**2 * usual), axis=0)))
 
 
 def contacts(physics: Physics) -> bool:
@@ -194,72 +194,3 @@ def noise_free(logs: Sequence[Log], column: int) -> bool:
 def _level(x: Array, order: int) -> float:
     """Standard deviation of white noise in x [T] by differences of an order: Var = binomial(2 n, n) sigma^2."""
     return float(np.median(np.abs(np.diff(x, order))) / np.sqrt(comb(2 * order, order))) if len(x) > order else 0.0
-
-
-def held(cut: Windows) -> Windows:
-    """Windows whose commands are held over the whole control step, as in training."""
-    length, substeps = cut.batch.command.shape[1:3]
-    rows = np.stack([cut.logs[r].ctrl[a : a + length] for r, a in zip(cut.log, cut.start, strict=True)])
-    command = jnp.asarray(np.repeat(rows[:, :, None], substeps, 2), jnp.float32)
-    return dataclasses.replace(cut, batch=cut.batch.replace(command=command))
-
-
-class Errors:
-    """Windows without effects at any sub-step, by one compiled program: measured minus simulated, `[W, H, 2 nv]`."""
-
-    def __init__(self, physics: Physics, cut: Windows, most: int) -> None:
-        self.physics, self.cut, self.most = physics, cut, most * physics.substeps
-        self.theta = jnp.asarray(physics.space.nominal, jnp.float32)
-        self._run = jax.jit(jax.vmap(self._one, in_axes=(0, 0, None, None, None)), compiler_options=compiler_options())
-
-    def run(self, cut: Windows, factor: int, corrected: bool = True, offsets: Array | None = None) -> Array:
-        """With the commands of `cut` at the sub-step h / factor; corrected: velocities lie half of it early."""
-        count = cut.batch.command.shape[2]
-        missing = [(0, 0), (0, 0), (0, self.most - count), (0, 0)]
-        batch = self.cut.batch.replace(command=jnp.pad(cut.batch.command, missing))  # the past keeps its shape
-        shape = (len(cut), 2 * self.physics.mj_model.nv)
-        offsets = np.zeros(shape) if offsets is None else np.broadcast_to(offsets, shape)
-        h = np.float32(self.physics.mj_model.opt.timestep / factor)
-        error = self._run(batch, np.asarray(offsets, np.float32), count, h, np.float32(corrected))
-        return np.nan_to_num(np.asarray(error, np.float64), nan=1e3, posinf=1e3, neginf=-1e3)
-
-    def _one(self, own: Batch, offset: jax.Array, count: jax.Array, h: jax.Array, corrected: jax.Array) -> jax.Array:
-        with jax.default_matmul_precision("highest"):
-            return self._errors(own, offset, count, h, corrected)
-
-    def _errors(self, own: Batch, offset: jax.Array, count: jax.Array, h: jax.Array, corrected: jax.Array) -> jax.Array:
-        physics, nv = self.physics, self.physics.mj_model.nv
-        world = begin(physics, self.theta, own.around)
-        world = world.replace(qpos=integrate(physics.mj_model, world.qpos, offset[:nv]), qvel=world.qvel + offset[nv:])
-        model = physics.model_of(world).tree_replace({"opt.timestep": h})
-
-        def step(data: Any, row: tuple) -> tuple[Any, tuple]:
-            command, enabled = row
-            seen = {"qpos": data.qpos, "qvel": data.qvel, "error": jnp.zeros_like(data.qpos)}
-            drive = Drive(None, enabled, own.law)
-
-            def sub(k: jax.Array, data: Any) -> Any:
-                return substep(physics, model, data.replace(ctrl=command[k]), ((), world.forces), (), seen, drive)[0]
-
-            data = jax.lax.fori_loop(0, count, sub, data)
-            return data, (data.qpos, data.qvel + 0.5 * corrected * h * data.qacc)
-
-        _, (qpos, qvel) = jax.lax.scan(step, physics.data_of(world), (own.command, own.enabled))
-        error = jax.vmap(lambda a, b: difference(physics.mj_model, a, b))(own.qpos, qpos)
-        return jnp.concatenate([error, own.qvel - qvel], axis=1)
-
-    def settler(self, sigma: Array) -> Callable[[Array], Array]:
-        """Errors -> errors that no change of the start states takes away, by linearisation."""
-        cut, here = self.cut, self.run(self.cut, 1)
-        nudges = np.diag(np.maximum(0.2 * cut.spread, NUDGE))
-        moved = [(here - self.run(cut, 1, offsets=n)) / n.max() / sigma for n in nudges]
-        columns = np.stack([m.reshape(len(m), -1) for m in moved], -1)
-
-        def settle(error: Array) -> Array:
-            r = (error / sigma).reshape(len(error), -1)
-            nothing = np.zeros((*r.shape, 0))
-            _, starts = eliminate(r, nothing, columns, np.zeros((len(r), columns.shape[2])), cut.spread)
-            left = r - np.einsum("wns,ws->wn", columns, starts.step(nothing, np.zeros(0)))
-            return np.asarray(left.reshape(error.shape)) * np.where(np.isfinite(sigma), sigma, 0.0)
-
-        return settle
