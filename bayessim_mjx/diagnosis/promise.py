@@ -1,6 +1,6 @@
-"""What adding effects promises before any of them is fitted: linear, from one simulation of each, on held-out windows.
+"""What adding effects promises before any of them is fitted: linear, from one simulation of each.
 
-In the same unit as what they then close: mean squares of held-out windows, as a share of the gap above the noise.
+In the same unit as what they then close: mean squares of the windows, as a share of the gap above the noise.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.candidates import Candidate
-from bayessim_mjx.diagnosis.quadratic import Quadratic, eliminate, held_out
+from bayessim_mjx.diagnosis.quadratic import Quadratic, eliminate, solve
 from bayessim_mjx.diagnosis.race import Race
 
 Array = NDArray[np.float64]
@@ -30,21 +30,27 @@ def promised(race: Race, effects: Sequence[Candidate], reference: float) -> tupl
     q, precision, high = _linear(race, effects)
     base = len(race.fitter.base)
 
+    _, pull, low, top = race.base.job.prior()
+    even = np.ones(len(race.base.job.r))  # all windows count alike, as in what is realised
+
     def left(some: frozenset[int]) -> float:
-        """Held-out mean square with some of the effects, the known parameters refitted."""
+        """Mean square with some of the effects, the known parameters refitted."""
         columns = np.array([*range(base), *(base + i for i in sorted(some))], dtype=np.int64)
-        _, pull, low, top = race.base.job.prior()
         more = np.zeros(len(some))
+        own = q.subset(columns)
+        g, S = own.weighted(even)
         limits = np.concatenate([low, more]), np.concatenate([top, high[sorted(some)]])
-        group, weight = race.fitter.simulator.windows.group, race.base.job.weight
-        costs, _ = held_out(q.subset(columns), group, weight, precision[columns], np.concatenate([pull, more]), *limits)
-        return float(costs.mean()) / race.noise
+        p = solve(S + np.diag(precision[columns]), g + np.concatenate([pull, more]), *limits)
+        return float(own.at(p).mean()) / race.noise
 
     before = left(frozenset())
     above = max(before - reference, 1e-9)
     every = frozenset(range(len(effects)))
-    each = shapley(len(effects), lambda some: min((before - left(some)) / above, 1.0))
-    total = min((before - left(every)) / above, 1.0)
+
+    def share(some: frozenset[int]) -> float:
+        return float(np.clip((before - left(some)) / above, 0.0, 1.0))  # what promises harm is not added
+
+    each, total = shapley(len(effects), share), share(every)
     return total, {e.label: share for e, share in zip(effects, each, strict=True)}
 
 
