@@ -91,5 +91,5 @@ def horizon_warning(gap: Gap) -> list[str]:
     }
     if len(closed) < 2 or max(closed.values()) - min(closed.values()) < 0.3:
         return []
-    shares = ", ".join(f"{share:.0%} over {name}" for name, share in closed.items())
+    shares = ", ".join(f"{share:.0%} ({name})" for name, share in closed.items())
     return [f"the gap closed depends on the horizon: {shares}"]

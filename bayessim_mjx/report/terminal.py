@@ -94,7 +94,7 @@ def _longest(d: Diagnosis) -> list[str]:
     if not last or last.get("nominal") == d.gap.nominal:
         return []
     known = [f"{STAGES[s]} {number(last[s])}" for s in STAGES if finite(last.get(s))]
-    return [f"over {last['name']} ({number(last.get('seconds'), 2)} s): " + ", ".join(known)]
+    return [f"{last['name']} ({number(last.get('seconds'), 2)} s): " + ", ".join(known)]
 
 
 def _table(*columns: tuple[str, bool]) -> Any:

@@ -64,5 +64,5 @@ def test_a_closure_that_depends_on_the_horizon_is_flagged():
     rows = [("0.1 s", 3.0, 1.0), ("0.5 s", 3.0, 1.1), ("whole log", 100.0, 70.0)]
     horizons = [{"name": n, "calibrated": c, "with_effects": w} for n, c, w in rows]
     (told,) = sentences.horizon_warning(Gap(1.0, 4.0, 3.0, 1.1, 1.0, horizons=horizons))
-    assert told == "the gap closed depends on the horizon: 100% over 0.1 s, 97% over 0.5 s, 51% over whole log"
+    assert told == "the gap closed depends on the horizon: 100% (0.1 s), 97% (0.5 s), 51% (whole log)"
     assert not sentences.horizon_warning(Gap(1.0, 4.0, 3.0, 1.1, 1.0, horizons=horizons[:2]))
