@@ -153,11 +153,20 @@ class Fitter:
         fresh: Callable[[Job], Sequence[int]],
         tolerance: float = 1e-3,
         progress: Callable[[int], None] | None = None,
+        keep: Callable[[int, Sequence[Job]], Sequence[Job]] | None = None,
     ) -> None:
-        """Levenberg-Marquardt in lockstep, in place; `fresh(job)`: columns that are differenced anew at every point."""
+        """Levenberg-Marquardt in lockstep, in place.
+
+        Args:
+            jobs: to be fitted; iterations: steps at most.
+            fresh: columns of a job that are differenced anew at every point.
+            tolerance: a job rests when three steps gain less than this share of its cost.
+            progress: told how many jobs still run.
+            keep: (steps made, running jobs) -> those worth going on with.
+        """
         state = {id(j): (j.values.copy(), j.offsets.copy()) for j in jobs}  # trial points
         active = list(jobs)
-        for _ in range(iterations + 1):
+        for made in range(iterations + 1):
             if not active:
                 return
             plans, thetas, offsets = [], [], []
@@ -176,6 +185,7 @@ class Fitter:
                 self._accept(job, *state[id(job)], own, which, steps)
                 state[id(job)] = self._propose(job)
             active = [j for j in active if not _settled(j, tolerance)]
+            active = active if keep is None else list(keep(made, active))
             if progress is not None:
                 progress(len(active))
 

@@ -46,6 +46,7 @@ class Settings:
     most: int = 5
     screened: int = 96
     iterations: int = 12
+    tolerance: float = 5e-3
     fresh: int = 6
     starts: int = 20
 
@@ -141,12 +142,43 @@ def fit_models(race: Race, plans: Sequence[tuple[Model, Screened]], label: str, 
     jobs = [job for several, _ in todo.values() for job in several]
     total = len(jobs)
     fitter.iterate(
-        jobs, race.settings.iterations, lambda j: _fresh(race, j), progress=lambda left: say(label, total - left, total)
+        jobs,
+        race.settings.iterations,
+        lambda j: _fresh(race, j),
+        race.settings.tolerance,
+        progress=lambda left: say(label, total - left, total),
+        keep=_Heats([several for several, _ in todo.values()]),
     )
     for key, (several, effects) in todo.items():
         race.models[key] = scored(fitter, min(several, key=lambda job: job.cost), effects)
     keys = [frozenset([*(c.label for c in m.effects), e.candidate.label]) for m, e in plans]
     return [race.models[k] for k in keys]
+
+
+class _Heats:
+    """Successive halving: which fits go on. Starts far behind their candidate's best stop first, then candidates that
+    are far behind the best candidate (they keep the cost they reached, and their place far down the table). What still
+    falls fast goes on."""
+
+    STARTS = {1: 4.0, 2: 2.0, 3: 1.3, 5: 1.03}  # steps made -> cost over the best start's
+    CANDIDATES = {2: 8.0, 3: 5.0, 5: 3.0}  # and over the best candidate's
+    FAST = 0.7  # cost after over cost before a step
+
+    def __init__(self, entries: Sequence[Sequence[Job]]) -> None:
+        self.entries = entries
+        self.owner = {id(job): i for i, several in enumerate(entries) for job in several}
+
+    def __call__(self, made: int, running: Sequence[Job]) -> list[Job]:
+        best = [min(job.cost for job in several) for several in self.entries]
+        limits = np.full(len(best), np.inf)
+        if made in self.STARTS:
+            limits = self.STARTS[made] * np.array(best)
+        if made in self.CANDIDATES:
+            limits[np.array(best) > self.CANDIDATES[made] * min(best)] = 0.0
+        return [job for job in running if job.cost <= limits[self.owner[id(job)]] or self._falls(job)]
+
+    def _falls(self, job: Job) -> bool:
+        return len(job.history) > 1 and job.history[-1] < self.FAST * job.history[-2]
 
 
 def _starts(race: Race, model: Model, extra: Screened, rank: int) -> list[Job]:

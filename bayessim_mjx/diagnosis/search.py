@@ -105,7 +105,8 @@ def _greedy(race: Race, model: Model, say: Progress, barred: Sequence[str] = ())
         if not model.effects:
             return model
         model = polish(race, model)
-        added = _forward(race, model, say, barred)
+        # at the noise nothing passes any more
+        added = _forward(race, model, say, barred) if race.above_noise(model) else None
         if added is None:
             return _backward(race, model, say)
         smaller = _backward(race, added, say)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
@@ -10,12 +11,15 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from bayessim_mjx.device import compiler_options
+from bayessim_mjx.device import compiler_options, cores
 from bayessim_mjx.diagnosis.windows import Batch, Windows
 from bayessim_mjx.physics import Drive, Physics, begin, control_step
 
 Array = NDArray[np.float64]
-LANES = 1024  # worlds in one call; fewer are padded, more are cut
+# worlds in one call; fewer are padded, more are cut. A CPU wants them in its cache (a pendulum's: 2.2 times as fast as
+# 1024) and one call on each core, an accelerator as many as it can get
+CPU_LANES = 128
+LANES = 4096
 
 
 def difference(model: mujoco.MjModel, measured: jax.Array, simulated: jax.Array) -> jax.Array:
@@ -76,13 +80,17 @@ class Simulator:
         rollouts: windows simulated so far.
     """
 
-    def __init__(self, physics: Physics, windows: Windows, lanes: int = LANES) -> None:
-        self.physics, self.windows, self.lanes = physics, windows, lanes
+    def __init__(self, physics: Physics, windows: Windows, lanes: int | None = None) -> None:
+        self.physics, self.windows = physics, windows
+        on_cpu = jax.default_backend() == "cpu"
+        self.lanes = lanes or (CPU_LANES if on_cpu else LANES)
+        self.workers = cores() if on_cpu else 1
         self.nv = int(physics.mj_model.nv)
         self.channels = 2 * self.nv
         self.traces = self.rollouts = 0
         self._run = jax.jit(jax.vmap(self._one, in_axes=(None, 0, 0, 0, 0)), compiler_options=compiler_options())
-        self._no_force = jnp.zeros((lanes, windows.steps, self.nv))
+        self._no_offset = np.zeros((self.lanes, 2 * self.nv), np.float32)
+        self._no_force = jnp.zeros((self.lanes, windows.steps, self.nv))
 
     def _one(
         self, batch: Batch, index: jax.Array, theta: jax.Array, offset: jax.Array, force: jax.Array
@@ -125,23 +133,23 @@ class Simulator:
         """
         chosen = np.arange(len(self.windows)) if windows is None else np.asarray(windows)
         n, w = len(thetas), len(chosen)
-        pair_theta = np.repeat(np.arange(n), w)
-        pair_window = np.tile(chosen, n)
         flat_offsets = None if offsets is None else np.asarray(offsets, np.float32).reshape(n * w, -1)
         flat_force = None if force is None else np.asarray(force, np.float32).reshape(n * w, *force.shape[2:])
-        thetas = np.asarray(thetas, np.float32)
-        out = []
-        for a in range(0, n * w, self.lanes):
-            some = np.arange(a, min(a + self.lanes, n * w))
-            index = np.concatenate([some, np.full(self.lanes - len(some), some[-1])])
-            errors, _ = self._run(
-                self.windows.batch,
-                pair_window[index],
-                thetas[pair_theta[index]],
-                np.zeros((self.lanes, 2 * self.nv), np.float32) if flat_offsets is None else flat_offsets[index],
-                self._no_force if flat_force is None else flat_force[index],
-            )
-            out.append((errors, len(some)))  # asynchronous: the next call is prepared while this one runs
+        thetas, of_theta, of_window = np.asarray(thetas, np.float32), np.repeat(np.arange(n), w), np.tile(chosen, n)
+
+        def part(first: int) -> NDArray[np.float32]:
+            count = min(self.lanes, n * w - first)
+            own = first + np.minimum(np.arange(self.lanes), count - 1)
+            offset = self._no_offset if flat_offsets is None else flat_offsets[own]
+            extra = self._no_force if flat_force is None else flat_force[own]
+            errors, _ = self._run(self.windows.batch, of_window[own], thetas[of_theta[own]], offset, extra)
+            return np.asarray(errors)[:count]
+
+        firsts = list(range(0, n * w, self.lanes))
+        alone = firsts[:1] if self.traces == 0 else []  # traced once, not by every thread
+        done = [part(first) for first in alone]
+        with ThreadPoolExecutor(self.workers) as pool:
+            done += pool.map(part, firsts[len(alone) :])
         self.rollouts += n * w
-        result = np.concatenate([np.asarray(e)[:k] for e, k in out]).astype(np.float64)
+        result = np.concatenate(done).astype(np.float64)
         return np.nan_to_num(result, nan=1e3, posinf=1e3, neginf=-1e3).reshape(n, w, *result.shape[1:])
