@@ -26,7 +26,6 @@ FACTORS = (1, 2, 4, 8)
 CONTACTS = 4  # the finest with contacts: what is left there is chaos, which no step removes
 ENOUGH = 0.5  # noises: an error of the time step that does not show
 WORTH = 1.0  # noises: from here on the user is told
-REALITY = 0.1  # of the simulator's error is noise: logs that were simulated at a tenth of its step have as much
 CONVERGING = 1.3  # errors that shrink by less from one sub-step to its half are not worth finer ones
 FAR = 4.0  # medians: windows with larger errors are no measure, as in the fit
 
@@ -142,8 +141,7 @@ def measure(physics: Physics, cuts: Callable[[int], Windows], logs: Sequence[Log
     at = {f: _size(one, touching) * gain / (gain - 1) / gain ** np.log2(f) for f in FACTORS}
     settled = _size(settle(plain - limit), touching)
     clean = np.array([noise_free(logs, i) for i in physics.mj_model.jnt_qposadr[physics.mj_model.dof_jntid]])
-    share = np.where(np.tile(clean, 2), 1.0, REALITY)
-    base = np.hypot(sigma, share * settled)
+    base = np.hypot(sigma, np.tile(clean, 2) * settled)  # who simulated such logs may have used this step or another
     allowed = [f for f in FACTORS if f <= (min(most, CONTACTS) if touching else most)]
     factor = _choose({f: float(np.max(at[f] / base)) for f in allowed}, gain)
     return Discretisation(
