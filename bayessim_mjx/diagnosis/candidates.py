@@ -117,7 +117,7 @@ def _alive(kind: type[Effect], place: str, scales: Scales) -> bool:
 def enumerate_candidates(physics: Physics) -> list[Candidate]:
     """All candidates of a stack: each effect at each of its places; tied where there are several places."""
     out, start = [], len(physics.model_space)
-    for effect in physics.effects:
+    for effect in (e for e in physics.effects if e.quantities):
         parameters, k = effect.space().parameters, len(effect.quantities)
         count = len(effect.places())
         rows = [range(start + i * k, start + (i + 1) * k) for i in range(count)]

@@ -72,7 +72,7 @@ class Scorer:
         logs = [p.log for p in played]
         original = self.fitter.simulator.windows
         model, substeps, limit = self.setup.physics.mj_model, self.setup.physics.substeps, each * len(logs)
-        cut = windows.cut(logs, model, original.dt, substeps, original.steps, limit=limit)
+        cut = windows.cut(logs, model, original.dt, substeps, original.steps, limit=limit, centred=False)
         found = [self._jobs(chunk, shift) for chunk in _chunks(cut, original)]
         full = (len(logs[0]) - 1) // original.steps
         out = []

@@ -28,6 +28,7 @@ class Job:
         coordinates: free ones; values: `[k]`; offsets: `[W, s]` of the start states.
         r: whitened residuals `[W, n]`; A: `[W, n, k]`, minus their derivatives; B: `[W, n, s]` by the start states.
         weight: `[W]`; cost: weighted, priors included; damping: Levenberg's.
+        promise: by how much the step now tried would lower the cost if the model were linear.
     """
 
     coordinates: tuple[Coordinate, ...]
@@ -39,6 +40,7 @@ class Job:
     weight: Array
     cost: float
     damping: float = 1e-3
+    promise: float = np.inf
     history: list[float] = field(default_factory=list)
 
     @property
@@ -210,6 +212,7 @@ class Fitter:
         precision, pull, low, high = job.prior()
         S = S + np.diag(precision)
         p = solve(S + job.damping * np.diag(np.diag(S)), g + pull, low, high)
+        job.promise = float(2 * (g + pull) @ p - p @ S @ p)
         return job.values + p, job.offsets + starts.step(job.A, p)
 
     def scores(self, job: Job, group: NDArray[np.int64] | None = None) -> tuple[Array, Array]:
@@ -249,7 +252,8 @@ def weights(job: Job) -> Array:
 
 
 def _settled(job: Job, tolerance: float) -> bool:
-    if job.damping > 1e6:
+    """No step is promising, or those that were accepted gain little; refused ones are no sign of convergence."""
+    if job.promise < tolerance * abs(job.cost) / 3 or job.damping > 1e6:
         return True
-    recent = job.history[-4:]
-    return len(recent) == 4 and np.isfinite(recent[0]) and recent[0] - recent[-1] < tolerance * abs(recent[-1])
+    last = list(dict.fromkeys(job.history))[-4:]  # accepted costs
+    return len(last) == 4 and np.isfinite(last[0]) and last[0] - last[-1] < tolerance * abs(last[-1])

@@ -20,7 +20,7 @@ def details(found: Findings, effects: list[FoundEffect], closed: dict[str, Any])
     each, deviation = verdict.per_condition(found.race, ruling.model)
     names = ruling.model.job.names
     return {
-        "effect_specs": {e.name: spec_of(e) for e in found.setup.physics.effects},
+        "effect_specs": {e.name: spec_of(e) for e in found.setup.physics.effects if e.quantities},
         "overlays": _overlays(found),
         "isolability": _isolability(found.race),
         "episodes": _episodes(found),

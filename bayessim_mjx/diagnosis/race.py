@@ -158,7 +158,7 @@ def fit_models(race: Race, plans: Sequence[tuple[Model, Screened]], label: str, 
 class _Heats:
     """Successive halving: which fits go on. Starts far behind their candidate's best stop first, then candidates that
     are far behind the best candidate (they keep the cost they reached, and their place far down the table). What still
-    falls fast goes on."""
+    falls fast goes on, and what was refused a step that would have brought much."""
 
     STARTS = {1: 4.0, 2: 2.0, 3: 1.3, 5: 1.03}  # steps made -> cost over the best start's
     CANDIDATES = {2: 8.0, 3: 5.0, 5: 3.0}  # and over the best candidate's
@@ -178,7 +178,9 @@ class _Heats:
         return [job for job in running if job.cost <= limits[self.owner[id(job)]] or self._falls(job)]
 
     def _falls(self, job: Job) -> bool:
-        return len(job.history) > 1 and job.history[-1] < self.FAST * job.history[-2]
+        refused = len(job.history) > 1 and job.history[-1] == job.history[-2]
+        fell = len(job.history) > 1 and job.history[-1] < self.FAST * job.history[-2]
+        return fell or (refused and job.promise > (1 - self.FAST) * job.cost)
 
 
 def _starts(race: Race, model: Model, extra: Screened, rank: int) -> list[Job]:

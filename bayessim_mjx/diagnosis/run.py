@@ -23,6 +23,7 @@ from bayessim_mjx.diagnosis import (
     verdict,
     windows,
 )
+from bayessim_mjx.diagnosis.centred import physics_of
 from bayessim_mjx.diagnosis.disturbance import Disturbance, estimate
 from bayessim_mjx.diagnosis.fit import Fitter
 from bayessim_mjx.diagnosis.flexible import Flexible, flexible
@@ -118,8 +119,8 @@ def prepare(
     cuts = _windows(own, usable, group, seen.use_qvel)
     step = discretisation.measure(own, cuts, usable, _finest(own, len(cuts(1)), cuts(1).steps))
     robot = step.robot(robot)
-    physics = robot.physics(dt, stack)
-    cut = step.noisier(cuts(step.factor, _limit(physics, cuts(1).steps)))
+    physics = physics_of(robot, dt, stack)
+    cut = step.noisier(cuts(step.factor, _limit(physics, cuts(1).steps), centred=False))
     fitter = Fitter(Simulator(physics, cut), candidates.base_coordinates(robot.space), physics.space.nominal)
     every = candidates.enumerate_candidates(physics)
     notes += [*floors.warnings, *step.warnings(), *(f"not tried: {text}" for text in left_out), *_few_conditions(cut)]
@@ -144,9 +145,18 @@ def _windows(
     own = _limit(physics, length)
 
     @functools.cache
-    def cuts(factor: int, limit: int = own) -> windows.Windows:
-        count = physics.substeps * factor
-        return windows.cut(logs, physics.mj_model, dt, count, length, limit=limit, group=group, use_qvel=use_qvel)
+    def cuts(factor: int, limit: int = own, centred: bool = True) -> windows.Windows:
+        return windows.cut(
+            logs,
+            physics.mj_model,
+            dt,
+            physics.substeps * factor,
+            length,
+            limit=limit,
+            group=group,
+            use_qvel=use_qvel,
+            centred=centred,
+        )
 
     if len(cuts(1)) < LEAST:
         raise TooLittleData(f"{len(cuts(1))} windows of {length * dt:.2g} s; holding conditions out needs {LEAST}")

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis import windows
+from bayessim_mjx.diagnosis.centred import physics_of
 from bayessim_mjx.diagnosis.gap import Prediction
 from bayessim_mjx.diagnosis.models import Model
 from bayessim_mjx.diagnosis.run import Findings, Setup
@@ -76,10 +77,12 @@ def _simulator(found: Findings, logs: Array, starts: list[int], length: int, lan
     """Of the named effects only: a small program, compiled in seconds."""
     setup, named = found.setup, {e.effect for e in found.ruling.model.effects}
     cut = setup.fitter.simulator.windows
-    physics = setup.robot.physics(cut.dt, [e for e in setup.physics.effects if e.name in named])
+    physics = physics_of(setup.robot, cut.dt, [e for e in setup.physics.effects if e.name in named])
     some = [setup.logs[r] for r in logs]
     where = list(enumerate(starts))
-    own = windows.cut(some, physics.mj_model, cut.dt, physics.substeps, length, limit=len(some), starts=where)
+    own = windows.cut(
+        some, physics.mj_model, cut.dt, physics.substeps, length, limit=len(some), starts=where, centred=False
+    )
     return Simulator(physics, own, lanes)
 
 

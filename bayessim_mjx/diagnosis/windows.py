@@ -27,7 +27,7 @@ class Batch(struct.PyTreeNode):
     """What the simulator needs of every window, leading axis W.
 
     Attributes:
-        command: `[W, H, S, nu]`, mean over each sub-step, centred on its force evaluation.
+        command: `[W, H, S, nu]`, mean over each sub-step (or over the interval centred on its beginning).
         around: Motion, `[W, 2 L + 1, ...]`, row L is the start.
         qpos: `[W, H, nq]`, qvel: `[W, H, nv]`: measured after each control step.
         drive: enabled `[W, H, nu]` or None; law `[W, nu]` or None.
@@ -127,6 +127,7 @@ def cut(
     use_qvel: bool = True,
     first_only: bool = False,
     starts: list[tuple[int, int]] | None = None,
+    centred: bool = True,
 ) -> Windows:
     """Windows of `length` control steps, at most `limit`, spread evenly over the logs.
 
@@ -134,12 +135,13 @@ def cut(
         use_qvel: compare measured velocities too (where all logs have them).
         first_only: one window per log, at its beginning (whole episodes).
         starts: (log, row) of the windows wanted; beyond the end of a log its last row is held.
+        centred: commands are centred on the force evaluations; False: the physics does that (`centred.physics_of`).
 
     Raises:
         UserError: no log is long enough.
     """
     even = [resample(log, dt) for log in logs]
-    fine = [_fine_commands(log, e, dt, substeps) for log, e in zip(logs, even, strict=True)]
+    fine = [_fine_commands(log, e, dt, substeps, centred) for log, e in zip(logs, even, strict=True)]
     group_of, names = groups_of(logs, group)
     starts = _starts(even, length, limit, first_only) if starts is None else starts
     if not starts:
@@ -203,8 +205,8 @@ def _blocks(starts: list[tuple[int, int]], logs: Sequence[Log]) -> tuple[tuple[s
     return tuple(f"part {i + 1} of {count}" for i in range(count)), of
 
 
-def _fine_commands(raw: Log, even: Log, dt: float, substeps: int) -> NDArray[np.float32]:
-    """`[rows, S, nu]`: mean of the held command over each sub-step, half a sub-step early.
+def _fine_commands(raw: Log, even: Log, dt: float, substeps: int, centred: bool) -> NDArray[np.float32]:
+    """`[rows, S, nu]`: mean of the held command over each sub-step; centred: half a sub-step early.
 
     Semi-implicit Euler advances with the force at the beginning of a sub-step; read as a leapfrog (velocities half a
     sub-step before positions) that force stands for the interval centred there. With the command averaged over this
@@ -212,7 +214,7 @@ def _fine_commands(raw: Log, even: Log, dt: float, substeps: int) -> NDArray[np.
     """
     h = dt / substeps
     rows, nu = len(even), raw.ctrl.shape[1]
-    edges = even.time[0] - h / 2 + h * np.arange(rows * substeps + 1)
+    edges = even.time[0] - centred * h / 2 + h * np.arange(rows * substeps + 1)
     times = np.concatenate([[min(edges[0], raw.time[0]) - dt], raw.time[1:], [max(edges[-1], raw.time[-1]) + dt]])
     held = np.concatenate([raw.ctrl])  # row k holds from time[k] to time[k+1]; the first and last for ever
     area = np.concatenate([np.zeros((1, nu)), np.cumsum(held * np.diff(times)[:, None], axis=0)])

@@ -96,7 +96,7 @@ def refit(setup: run.Setup, logs: list[Log]) -> tuple[Fitter, Job]:
     """`fitted` on other logs of the same number and length, by the program that is already compiled."""
     simulator = copy.copy(setup.fitter.simulator)
     old, model, physics = simulator.windows, setup.physics.mj_model, setup.physics
-    simulator.windows = windows.cut(logs, model, PERIOD, physics.substeps, old.steps, limit=len(old))
+    simulator.windows = windows.cut(logs, model, PERIOD, physics.substeps, old.steps, limit=len(old), centred=False)
     return fitted(dataclasses.replace(setup, fitter=Fitter(simulator, setup.fitter.base, setup.fitter.theta)))
 
 
