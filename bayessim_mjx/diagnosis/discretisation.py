@@ -24,7 +24,7 @@ from bayessim_mjx.physics import Physics
 Array = NDArray[np.float64]
 FACTORS = (1, 2, 4, 8)
 CONTACTS = 4  # the finest with contacts: what is left there is chaos, which no step removes
-ENOUGH = 0.5  # noises: an error of the time step that does not show
+ENOUGH = 0.6  # noises: an error of the time step that does not show
 WORTH = 1.0  # noises: from here on the user is told
 CONVERGING = 1.3  # errors that shrink by less from one sub-step to its half are not worth finer ones
 FAR = 4.0  # medians: windows with larger errors are no measure, as in the fit
@@ -152,7 +152,7 @@ def measure(physics: Physics, cuts: Callable[[int], Windows], logs: Sequence[Log
         settled=settled,
         left=at[factor],
         sigma=sigma,
-        floor=np.hypot(base, at[factor]),
+        floor=np.sqrt(base**2 + _excess(at[factor], base)),
         simulated=clean,
         channels=Channels.of(physics.mj_model).qvel,
     )
@@ -169,6 +169,12 @@ def _choose(error: dict[int, float], gain: float) -> int:
     """The coarsest factor that is fine enough; where none is, the finest, if finer ones gain anything."""
     enough = [f for f, e in error.items() if e < ENOUGH]
     return min(enough) if enough else max(error) if gain > CONVERGING else 1
+
+
+def _excess(error: Array, noise: Array) -> Array:
+    """Squares of errors beyond what does not show."""
+    known = np.isfinite(noise)
+    return np.maximum(error**2 - np.square(ENOUGH * noise, where=known, out=np.zeros_like(noise)), 0.0)
 
 
 def _size(error: Array, touching: bool) -> Array:
