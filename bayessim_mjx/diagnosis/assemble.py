@@ -123,6 +123,7 @@ def _gap(found: Findings, over: whole.Whole, closed: dict[str, Any]) -> Gap:
         horizons=rows,
         physical=physical,
         closed=closed,
+        integrator=setup.discretisation.to_dict() if setup.discretisation else {},
     )
 
 

@@ -25,6 +25,7 @@ Array = NDArray[np.float64]
 FACTORS = (1, 2, 4, 8)
 CONTACTS = 4  # the finest with contacts: what is left there is chaos, which no step removes
 ENOUGH = 0.6  # noises: an error of the time step that does not show
+SHORTER = 5  # halvings of the time step that can be recommended
 WORTH = 1.0  # noises: from here on the user is told
 CONVERGING = 1.3  # errors that shrink by less from one sub-step to its half are not worth finer ones
 FAR = 4.0  # medians: windows with larger errors are no measure, as in the fit
@@ -81,9 +82,10 @@ class Discretisation:
         return [text + self._remedy(noises[at], bool(self.simulated[at]))]
 
     def _remedy(self, noises: float, simulated: bool) -> str:
-        better = self.timestep / 2 ** int(np.ceil(np.log2(noises / WORTH)))
-        other = "a shorter step or" if simulated else f"a step of {1e3 * better:.2g} ms, or"
-        text = f"{other} the integrator RK4 where nothing is in contact, mends it"
+        halvings = int(np.ceil(np.log2(noises / WORTH)))
+        told = not simulated and halvings <= SHORTER
+        other = f"a step of {1e3 * self.timestep / 2**halvings:.2g} ms" if told else "a shorter step"
+        text = f"{other}, or the integrator RK4 where nothing is in contact, makes it smaller"
         if self.factor > 1:
             text += f"; the diagnosis simulates at {1e3 * self.timestep / self.factor:.3g} ms"
         if simulated:

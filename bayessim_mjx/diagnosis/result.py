@@ -75,7 +75,8 @@ class Gap:
     horizons: [{"name": "0.25 s", "seconds", "nominal", "calibrated", "with_effects", "reducible_floor", "noise_floor",
     "ci": {stage: [lo, hi]}}]; by_channel: {joint: {stage: value}}; physical: {joint: {stage: value, "unit"}}, rad or m;
     closed: {"predicted", "realised", "ci"}, share of the recalibrated simulator's squared gap above the noise that all
-    effects close together: as promised before any was fitted, and on held-out windows afterwards.
+    effects close together: as promised before any was fitted, and on held-out windows afterwards; integrator: what the
+    simulator's own time step is worth (`discretisation.Discretisation.to_dict`).
     """
 
     noise_floor: float
@@ -88,6 +89,7 @@ class Gap:
     horizons: list[dict[str, Any]] = field(default_factory=list)
     physical: dict[str, dict[str, Any]] = field(default_factory=dict)
     closed: dict[str, Any] = field(default_factory=dict)
+    integrator: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,19 @@ from bayessim_mjx.diagnosis.race import (
 )
 from bayessim_mjx.diagnosis.screen import screen
 
-__all__ = ["Progress", "Race", "Settings", "compatible", "fit_models", "ranked", "run", "special_cases", "without"]
+__all__ = [
+    "Progress",
+    "Race",
+    "Settings",
+    "compatible",
+    "fit_models",
+    "parts_of",
+    "ranked",
+    "run",
+    "special_cases",
+    "together",
+    "without",
+]
 
 
 def run(fitter: Fitter, candidates: Sequence[Candidate], settings: Settings, progress: Progress | None = None) -> Race:
@@ -53,11 +65,10 @@ def run(fitter: Fitter, candidates: Sequence[Candidate], settings: Settings, pro
 def simplest(race: Race, model: Model, say: Progress) -> Model:
     """A law gives way to its own special case, or to several of them, where they close nearly as much."""
     for effect in model.effects:
-        parts = [c for c in race.candidates if c.effect in special_cases(effect) and c.where == effect.where]
-        parts = [p for p in parts if all(e is effect or compatible(e, p) for e in model.effects)]
+        parts = parts_of(race, model, effect)
         smaller = [exchange(race, model, effect, part, say) for part in parts]
         if len(parts) > 1:
-            smaller.append(_together(race, model, effect, parts, say))
+            smaller.append(together(race, model, effect, parts, say))
         near = [m for m in smaller if race.closure(model) - race.closure(m) < race.settings.tie / 2]
         near = [m for m in near if m.size <= model.size and m.total < 6.0 * max(model.total, race.noise * len(m.cost))]
         if near:
@@ -65,7 +76,13 @@ def simplest(race: Race, model: Model, say: Progress) -> Model:
     return model
 
 
-def _together(race: Race, model: Model, effect: Candidate, parts: Sequence[Candidate], say: Progress) -> Model:
+def parts_of(race: Race, model: Model, effect: Candidate) -> list[Candidate]:
+    """Special cases of one of a model's effects that fit beside its others."""
+    parts = [c for c in race.candidates if c.effect in special_cases(effect) and c.where == effect.where]
+    return [p for p in parts if all(e is effect or compatible(e, p) for e in model.effects)]
+
+
+def together(race: Race, model: Model, effect: Candidate, parts: Sequence[Candidate], say: Progress) -> Model:
     """All special cases of an effect in its place, and what else is then worth adding."""
     new = exchange(race, model, effect, parts[0], say)
     for part in parts[1:]:

@@ -11,7 +11,17 @@ import numpy as np
 from bayessim_mjx.diagnosis.candidates import Candidate
 from bayessim_mjx.diagnosis.models import Model
 from bayessim_mjx.diagnosis.screen import screen
-from bayessim_mjx.diagnosis.search import Progress, Race, compatible, fit_models, ranked, special_cases, without
+from bayessim_mjx.diagnosis.search import (
+    Progress,
+    Race,
+    compatible,
+    fit_models,
+    parts_of,
+    ranked,
+    special_cases,
+    together,
+    without,
+)
 
 MILD = 10.0  # nats: below, held-out evidence between two models is called a tie
 
@@ -47,8 +57,22 @@ def rule(race: Race, say: Progress) -> Ruling:
     winner = race.winner
     ruling = Ruling(winner)
     for effect in winner.effects:
-        ruling.rivals[effect.label] = _rivals(race, winner, effect, say)
+        ruling.rivals[effect.label] = [*_in_parts(race, winner, effect, say), *_rivals(race, winner, effect, say)]
     return ruling
+
+
+def _in_parts(race: Race, winner: Model, effect: Candidate, say: Progress) -> list[Rival]:
+    """The special cases of an effect together, where they close nearly as much as it does."""
+    parts = parts_of(race, winner, effect)
+    if len(parts) < 2:
+        return []
+    model = together(race, winner, effect, parts, say)
+    behind = race.closure(winner) - race.closure(model)
+    if effect in model.effects or behind > race.settings.tie:
+        return []
+    own = tuple(e for e in model.effects if e not in winner.effects)
+    why = f"simpler laws in its place close {race.closure(model):.1%} against {race.closure(winner):.1%}"
+    return [Rival(own, model, race.closure(model), why, contains=True)]
 
 
 def _rivals(race: Race, winner: Model, effect: Candidate, say: Progress) -> list[Rival]:

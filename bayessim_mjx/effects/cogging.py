@@ -10,8 +10,9 @@ from bayessim_mjx.effects.effect import Effect, Quantity
 from bayessim_mjx.effects.site import Site, SubStep
 from bayessim_mjx.triangular import product
 
-# a fit finds the order only from about +-pi / (range of motion) away: start at the usual ones
-_ORDERS = (1, 2, 3, 4, 5, 6, 7, 8, 10, 12, 14, 16, 18, 20, 22, 24, 27, 30, 33, 36, 40, 44, 48, 54, 60)
+# Once per turn is gravity's own period: what has it there is a payload, not a motor's poles.
+# A fit finds the order only from about +-pi / (range of motion) away: start at the usual ones
+_ORDERS = (2, 3, 4, 5, 6, 7, 8, 10, 12, 14, 16, 18, 20, 22, 24, 27, 30, 33, 36, 40, 44, 48, 54, 60)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,7 +32,7 @@ class Cogging(Effect):
     quantities: ClassVar[tuple[Quantity, ...]] = (
         Quantity("sine", 0.0, -1.0, 1.0, unit="N m", per="force", reach=(-0.3, 0.3), grid=(0.1,)),
         Quantity("cosine", 0.0, -1.0, 1.0, unit="N m", per="force", reach=(-0.3, 0.3), grid=(0.1,)),
-        Quantity("order", 1.0, 1.0, 60.0, unit="1/rev", grid=tuple((n - 1) / 59 for n in _ORDERS), shape=True),
+        Quantity("order", 2.0, 2.0, 60.0, unit="1/rev", grid=tuple((n - 2) / 58 for n in _ORDERS), shape=True),
     )
 
     def on_force(self, at: Site, memory: Any, step: SubStep, theta: jax.Array) -> tuple[Any, jax.Array]:

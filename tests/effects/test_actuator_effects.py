@@ -48,7 +48,7 @@ TRUE = {
     "effort_loss": [[0.4], [0.7]],
     "actuator_saturation": [[1.1], [0.8]],
     "speed_torque_limit": [[0.5, 0.12], [0.6, 0.1]],
-    "cogging": [[0.25, -0.2, 6.0], [0.0, 0.0, 1.0]],
+    "cogging": [[0.25, -0.2, 6.0], [0.0, 0.0, 2.0]],
 }
 NATIVE = ("actuator_gain", "actuator_bias", "actuator_saturation")
 EACH = pytest.mark.parametrize("name", sorted(TRUE))
