@@ -84,9 +84,16 @@ def _verdict(found: Findings, remains: float) -> str:
 
 
 def _beaten(found: Findings) -> bool:
-    """Whether a flexible force alone predicts held-out conditions much better than the named effects do."""
-    base, model = found.flexible_base, found.ruling.model
-    return base is not None and base.condition.significant and float(base.condition.cost.sum()) < 0.6 * model.total
+    """Whether a flexible force alone predicts held-out conditions much better than the named effects do.
+
+    By a relevant share of the gap too: of effects that close 99.9 % something is left that a force can learn.
+    """
+    race, base, model = found.race, found.flexible_base, found.ruling.model
+    if base is None or not base.condition.significant:
+        return False
+    better = model.total - float(base.condition.cost.sum())
+    above = race.base.total - race.noise * len(race.base.cost)
+    return better > 0.4 * model.total and better > race.settings.relevance * above
 
 
 def _gap(found: Findings, over: whole.Whole, closed: dict[str, Any]) -> Gap:

@@ -70,7 +70,7 @@ def simplest(race: Race, model: Model, say: Progress) -> Model:
         if len(parts) > 1:
             smaller.append(together(race, model, effect, parts, say))
         near = [m for m in smaller if race.closure(model) - race.closure(m) < race.settings.tie / 2]
-        near = [m for m in near if m.size <= model.size and m.total < 6.0 * max(model.total, race.noise * len(m.cost))]
+        near = [m for m in near if m.size <= model.size and m.total < 3.0 * max(model.total, race.noise * len(m.cost))]
         if near:
             return simplest(race, polish(race, min(near, key=lambda m: (m.size, m.total))), say)
     return model
@@ -83,11 +83,11 @@ def parts_of(race: Race, model: Model, effect: Candidate) -> list[Candidate]:
 
 
 def together(race: Race, model: Model, effect: Candidate, parts: Sequence[Candidate], say: Progress) -> Model:
-    """All special cases of an effect in its place, and what else is then worth adding."""
+    """All special cases of an effect in its place, and what else is then worth adding within as many numbers."""
     new = exchange(race, model, effect, parts[0], say)
     for part in parts[1:]:
         (new,) = fit_models(race, [(new, start_of(race, part))], "special cases", say)
-    return _greedy(race, new, say, barred=(effect.effect,))
+    return _greedy(race, new, say, barred=(effect.effect,), size=model.size)
 
 
 def _singles(race: Race, say: Progress) -> None:
@@ -116,14 +116,18 @@ def _pairs(race: Race, say: Progress) -> Model:
     return best if race.passes(race.base, best) else race.base
 
 
-def _greedy(race: Race, model: Model, say: Progress, barred: Sequence[str] = ()) -> Model:
-    """Add what passes, drop what does not, until nothing changes; effects that are barred are not added."""
+def _greedy(race: Race, model: Model, say: Progress, barred: Sequence[str] = (), size: float = float("inf")) -> Model:
+    """Add what passes, drop what does not, until nothing changes.
+
+    Args:
+        barred: effects that are not added; size: free numbers that the model may have at most.
+    """
     for _ in range(race.settings.most):
         if not model.effects:
             return model
         model = polish(race, model)
         # at the noise nothing passes any more
-        added = _forward(race, model, say, barred) if race.above_noise(model) else None
+        added = _forward(race, model, say, barred, size) if race.above_noise(model) else None
         if added is None:
             return _backward(race, model, say)
         smaller = _backward(race, added, say)
@@ -133,10 +137,11 @@ def _greedy(race: Race, model: Model, say: Progress, barred: Sequence[str] = ())
     return model
 
 
-def _forward(race: Race, model: Model, say: Progress, barred: Sequence[str]) -> Model | None:
+def _forward(race: Race, model: Model, say: Progress, barred: Sequence[str], size: float) -> Model | None:
     if len(model.effects) >= race.settings.most:
         return None
     others = [c for c in race.candidates if all(compatible(c, e) for e in model.effects) and c.effect not in barred]
+    others = [c for c in others if model.size + len(c.coordinates) <= size]
     found = [s for s in screen(race.fitter, model.job, others, race.settings.screened) if s.gain > 0][
         : race.settings.pairs
     ]
