@@ -97,6 +97,14 @@ def log_density(u: Array, means: Array, scales: Array) -> Array:
     return (-0.5 * jnp.sum(z * z, axis=1) - log_det[:, None] - constant).T
 
 
+def propose(key: Array, logits: Array, means: Array, scales: Array, n: int) -> Array:
+    """n draws of the mixture, not truncated -> [n, d]."""
+    key_k, key_z = jax.random.split(key)
+    k = jax.random.categorical(key_k, logits, shape=(n,))
+    z = jax.random.normal(key_z, (n, means.shape[-1]))
+    return means[k] + jnp.einsum("nij,nj->ni", scales[k], z, precision=jax.lax.Precision.HIGHEST)
+
+
 def draw(
     key: Array, logits: Array, means: Array, scales: Array, done: Array, u: Array, tries: int, spare: int
 ) -> Array:
@@ -106,17 +114,11 @@ def draw(
     `separate` by their weights, so that every row is inside the cube whatever the mixture.
     """
     key_loop, key_spare = jax.random.split(key)
-    n, d = u.shape
-
-    def propose(key: Array) -> Array:
-        key_k, key_z = jax.random.split(key)
-        k = jax.random.categorical(key_k, logits, shape=(n,))
-        z = jax.random.normal(key_z, (n, d))
-        return means[k] + jnp.einsum("nij,nj->ni", scales[k], z, precision=jax.lax.Precision.HIGHEST)
+    n = u.shape[0]
 
     def attempt(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         i, done, u = carry
-        new = propose(jax.random.fold_in(key_loop, i))
+        new = propose(jax.random.fold_in(key_loop, i), logits, means, scales, n)
         inside = jnp.all((new >= 0) & (new <= 1), axis=-1)
         take = inside & ~done
         return i + 1, done | inside, jnp.where(take[:, None], new, u)

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from bayessim_mjx.distributions import algebra
+from bayessim_mjx.distributions import algebra, box, charts, evaluate
 
 if TYPE_CHECKING:
     from bayessim_mjx.distributions.distribution import Distribution
@@ -16,19 +16,37 @@ if TYPE_CHECKING:
 OFF = np.float32(-1e9)  # logit of a component that is not in use
 
 
-def empty(components: int, d: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def empty(components: int, d: int, centre: float = 0.5) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """logits, means, scales of `components` that are not in use."""
-    return np.full(components, OFF), np.full((components, d), 0.5), np.tile(np.eye(d), (components, 1, 1))
+    return np.full(components, OFF), np.full((components, d), centre), np.tile(np.eye(d), (components, 1, 1))
 
 
 def to_mixture(q: Distribution) -> algebra.Mixture:
-    """The density of q on the unit cube as flat part + weighted, untruncated Gaussians."""
+    """The density of q (plain or probit) as a part of the prior + weighted, untruncated Gaussians."""
     logits, means, scales = (np.asarray(v, np.float64) for v in (q.logits, q.means, q.scales))
     w0 = float(q.prior_weight)
     with np.errstate(divide="ignore"):
         flat, bulk = np.log(w0), np.log1p(-w0) - float(q.log_inside)
     weights = np.maximum(logits - np.logaddexp.reduce(logits) + bulk, -1e12)
-    return algebra.Mixture(float(flat), weights, means, scales @ np.swapaxes(scales, -1, -2))
+    covs = scales @ np.swapaxes(scales, -1, -2)
+    return algebra.Mixture(float(flat), weights, means, covs, charts.PRIOR_PRECISION.get(q.chart, 1.0))
+
+
+def recharted(q: Distribution, chart: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Means, scales and logits in another chart: moments of each component (of its part inside the cube)."""
+    u, log_weights = evaluate.component_points(q, evaluate.POINTS)
+    z, log_weights = (np.asarray(v, np.float64) for v in (charts.to_chart(u, chart), log_weights))
+    weights = np.exp(log_weights - log_weights.max(axis=1, keepdims=True))
+    weights /= weights.sum(axis=1, keepdims=True)
+    means = np.einsum("kn,kni->ki", weights, z)
+    gap = z - means[:, None]
+    covs = np.einsum("kn,kni,knj->kij", weights, gap, gap) + 1e-12 * np.eye(z.shape[-1])
+    scales = np.linalg.cholesky(covs)
+    # every component keeps its mass inside the cube
+    mass = np.logaddexp.reduce(log_weights, axis=1) - np.log(log_weights.shape[1])
+    if chart == "plain":
+        mass = mass - np.asarray(box.log_masses(jnp.asarray(means, jnp.float32), jnp.asarray(scales, jnp.float32)))
+    return means, scales, np.asarray(q.logits, np.float64) + mass
 
 
 def padded(mixture: algebra.Mixture, components: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:

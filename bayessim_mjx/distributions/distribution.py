@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,7 +14,7 @@ from flax import struct
 from jax import Array
 from jax.typing import ArrayLike
 
-from bayessim_mjx.distributions import algebra, box, convert, evaluate, storage
+from bayessim_mjx.distributions import algebra, box, charts, convert, evaluate, storage
 
 if TYPE_CHECKING:
     from bayessim_mjx.parameters import ParameterSpace
@@ -22,19 +22,21 @@ if TYPE_CHECKING:
 
 @struct.dataclass
 class Distribution:
-    """w0 Uniform + (1 - w0) MoG truncated to the cube, in the unit coordinates u = space.to_unit(theta).
+    """w0 prior + (1 - w0) MoG in the coordinates z of a chart (charts.py) of the unit cube u = space.to_unit(theta).
 
-    There every prior is uniform, hence a product of posteriors needs no division by the prior. All leaves are float32
-    arrays whose shapes depend on K and d only, so a prior and a posterior of K components share compiled programs.
-    Leaves may carry leading axes (see `split`, or jax.vmap over the distribution).
+    In the plain chart z = u and the MoG is truncated to the cube; every prior is uniform there, hence a product of
+    posteriors needs no division by the prior. All leaves are float32 arrays whose shapes depend on K and d only, so a
+    prior and a posterior of K components share compiled programs. Leaves may carry leading axes (see `split`, or
+    jax.vmap over the distribution).
     """
 
     prior_weight: Array  # [] w0
     logits: Array  # [K]
-    means: Array  # [K, d] in unit coordinates
+    means: Array  # [K, d] in the chart's coordinates
     scales: Array  # [K, d, d] lower Cholesky factors of the covariances
     log_inside: Array  # [] log mass of the untruncated MoG inside the cube
     space: Any = struct.field(pytree_node=False)  # ParameterSpace
+    chart: str = struct.field(pytree_node=False, default="plain")
 
     # ---- constructors -------------------------------------------------------------------------------------------
     @classmethod
@@ -45,16 +47,19 @@ class Distribution:
         means: ArrayLike,
         scales: ArrayLike,
         prior_weight: ArrayLike = 0.0,
+        chart: str = "plain",
     ) -> Distribution:
-        """From unit coordinates: logits [K], means [K, d], lower Cholesky factors [K, d, d]. Traceable."""
+        """From coordinates of the chart: logits [K], means [K, d], lower Cholesky factors [K, d, d]. Traceable."""
         w0, logits, means, scales = (jnp.asarray(v, jnp.float32) for v in (prior_weight, logits, means, scales))
-        return cls(w0, logits, means, scales, evaluate.log_inside(logits, means, scales), space)
+        cut = charts.check(chart) == "plain"
+        inside = evaluate.log_inside(logits, means, scales) if cut else jnp.zeros((), jnp.float32)
+        return cls(w0, logits, means, scales, inside, space, chart)
 
     @classmethod
-    def prior(cls, space: ParameterSpace, components: int = 1) -> Distribution:
+    def prior(cls, space: ParameterSpace, components: int = 1, chart: str = "plain") -> Distribution:
         """The prior itself, with `components` unused Gaussians so that its structure is a posterior's."""
-        _, means, scales = convert.empty(components, len(space))
-        return cls.from_unit(space, np.zeros(components), means, scales, 1.0)
+        _, means, scales = convert.empty(components, len(space), charts.NEUTRAL[charts.check(chart)][0])
+        return cls.from_unit(space, np.zeros(components), means, scales, 1.0, chart)
 
     @classmethod
     def gaussian(cls, space: ParameterSpace, mean: Any, cov_or_sd: Any, components: int = 1) -> Distribution:
@@ -88,6 +93,11 @@ class Distribution:
     @property
     def names(self) -> tuple[str, ...]:
         return tuple(self.space.names)
+
+    @property
+    def centres(self) -> Array:
+        """Centres of the Gaussians in unit coordinates, kept in the cube [K, d]."""
+        return evaluate.centres_unit(self)
 
     def sample(self, key: Array, n: int) -> Array:
         """n draws -> theta [n, d], every one inside [space.low, space.high]."""
@@ -139,27 +149,76 @@ class Distribution:
         """
         index = tuple(self.space.index(name) for name in names)
         logits, means, scales = evaluate.marginal(self, index)
-        return Distribution.from_unit(self.space.subset(names), logits, means, scales, self.prior_weight)
+        return Distribution.from_unit(self.space.subset(names), logits, means, scales, self.prior_weight, self.chart)
+
+    def condition(self, values: Mapping[str, float]) -> Distribution:
+        """Distribution of the other parameters where those named have these values (theta units). Exact.
+
+        ValueError where a value lies outside its range.
+        """
+        given = tuple(self.space.index(name) for name in values)
+        free = tuple(i for i in range(len(self.space)) if i not in given)
+        for i, value in zip(given, values.values(), strict=True):
+            if not self.space.low[i] <= np.float32(value) <= self.space.high[i]:
+                low, high = self.space.low[i], self.space.high[i]
+                raise ValueError(f"condition: {self.names[i]} = {value:g} is outside [{low:g}, {high:g}]")
+        u = jnp.clip(self.space.subset(tuple(values)).to_unit(np.asarray([*values.values()], np.float32)), 0, 1)
+        logits, means, scales, weight = evaluate.conditional(self, given, free, u)
+        rest = self.space.subset([self.names[i] for i in free])
+        return Distribution.from_unit(rest, logits, means, scales, weight, self.chart)
 
     # ---- mixture algebra (on the host) --------------------------------------------------------------------------
     def product(self, *others: Distribution, components: int | None = None) -> Distribution:
-        """Posterior given independent data sets: p(theta)^(1-n) prod_i q_i(theta), reduced to `components` (this K)."""
+        """Posterior given independent data sets: p(theta)^(1-n) prod_i q_i(theta), reduced to `components` (this K).
+
+        Logit distributions, whose prior is no Gaussian, are carried over to the probit chart first (see `rechart`).
+        """
         k = components or self.components
-        result = convert.to_mixture(self)
+        chart = "probit" if self.chart == "logit" else self.chart
+        result = convert.to_mixture(self.rechart(chart))
         for other in others:
             convert.check_same_space(self.space, other.space)
-            result = algebra.reduce(algebra.product(result, convert.to_mixture(other)), max(4 * k, 32))
-        return self._of(self.space, algebra.reduce(result, k), k)
+            factor = convert.to_mixture(other.rechart(chart))
+            result = algebra.reduce(algebra.product(result, factor), max(4 * k, 32))
+        return self._of(self.space, algebra.reduce(result, k), k, chart)
+
+    def divide(self, proposal: Distribution) -> tuple[Distribution, float]:
+        """self * prior / proposal, the proposal being one Gaussian; and the share of weight that had to be left out.
+
+        Left out are components broader than the proposal allows: their quotient is no density. Where nothing is left
+        the result is self, with share 1. ValueError for a proposal of several components or in another chart.
+        """
+        convert.check_same_space(self.space, proposal.space)
+        if proposal.chart != self.chart or self.chart == "logit":
+            raise ValueError(f"divide: charts {self.chart} and {proposal.chart}; both must be plain, or both probit")
+        if proposal.components != 1:
+            raise ValueError(f"divide: a proposal of {proposal.components} Gaussians; reduce it to 1")
+        divisor = convert.to_mixture(proposal)
+        quotient, lost = algebra.divide(convert.to_mixture(self), divisor.means[0], divisor.covs[0])
+        if quotient is None:
+            return self, lost
+        return self._of(self.space, quotient, self.components, self.chart), lost
 
     def reduce(self, components: int) -> Distribution:
         """The same density with at most `components` Gaussians (negligible ones dropped, then Runnalls merging)."""
-        return self._of(self.space, algebra.reduce(convert.to_mixture(self), components), components)
+        mixture = algebra.reduce(convert.to_mixture(self), components)
+        return self._of(self.space, mixture, components, self.chart)
+
+    def rechart(self, chart: str) -> Distribution:
+        """The same distribution in another chart; each Gaussian keeps its mean and covariance in the new coordinates.
+
+        An approximation, good where components are narrow against the range or the charts alike (logit, probit).
+        """
+        if charts.check(chart) == self.chart:
+            return self
+        means, scales, logits = convert.recharted(self, chart)
+        return Distribution.from_unit(self.space, logits, means, scales, self.prior_weight, chart)
 
     @classmethod
-    def _of(cls, space: Any, mixture: algebra.Mixture, components: int) -> Distribution:
+    def _of(cls, space: Any, mixture: algebra.Mixture, components: int, chart: str) -> Distribution:
         """Pad to `components` and weigh the flat part against the mass of the Gaussians inside the cube."""
         logits, means, scales, total = convert.padded(mixture, components)
-        q = cls.from_unit(space, logits, means, scales)
+        q = cls.from_unit(space, logits, means, scales, chart=chart)
         bulk = total + float(q.log_inside)
         w0 = np.exp(mixture.flat - np.logaddexp(mixture.flat, bulk)) if np.isfinite(mixture.flat) else 0.0
         return replace(q, prior_weight=jnp.asarray(w0, jnp.float32))
@@ -172,12 +231,13 @@ class Distribution:
     def save(self, path: str | Path) -> Path:
         """Write arrays and a JSON header (names, box) into one .npz, atomically."""
         arrays = {f: np.asarray(getattr(self, f)) for f in storage.FIELDS}
-        return storage.write(path, arrays, self.space)
+        return storage.write(path, arrays, self.space, self.chart)
 
     @classmethod
     def load(cls, path: str | Path, space: ParameterSpace) -> Distribution:
         """Read what `save` wrote; ValueError if its parameters are not those of `space`."""
-        return cls(**{k: jnp.asarray(v) for k, v in storage.read(path, space).items()}, space=space)
+        arrays, chart = storage.read(path, space)
+        return cls(**{k: jnp.asarray(v) for k, v in arrays.items()}, space=space, chart=chart)
 
     def describe(self) -> dict[str, dict[str, float]]:
         """Per parameter name: mean, sd, contraction, and the box."""

@@ -10,9 +10,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.scipy.special import ndtri
 
-from bayessim_mjx.distributions import box
-from bayessim_mjx.triangular import lower_factor
+from bayessim_mjx.distributions import box, charts
+from bayessim_mjx.triangular import lower_factor, product, solve_lower
 
 if TYPE_CHECKING:
     from bayessim_mjx.distributions.distribution import Distribution
@@ -45,8 +46,10 @@ def log_inside(logits: Array, means: Array, scales: Array) -> Array:
 
 def log_unit(q: Distribution, u: Array) -> Array:
     """Unit-cube log density of u [n, d] (taken to be inside) -> [n]."""
-    mog = jax.nn.logsumexp(jax.nn.log_softmax(q.logits)[None, :] + box.log_density(u, q.means, q.scales), axis=1)
-    return jnp.logaddexp(jnp.log(q.prior_weight), jnp.log1p(-q.prior_weight) + mog - q.log_inside)
+    z = charts.to_chart(u, q.chart)
+    mog = jax.nn.logsumexp(jax.nn.log_softmax(q.logits)[None, :] + box.log_density(z, q.means, q.scales), axis=1)
+    mog = mog + charts.log_slope(z, q.chart) - q.log_inside
+    return jnp.logaddexp(jnp.log(q.prior_weight), jnp.log1p(-q.prior_weight) + mog)
 
 
 @jax.jit
@@ -64,18 +67,32 @@ def sample(q: Distribution, key: Array, n: int) -> Array:
     key_flat, key_u, key_mog = jax.random.split(key, 3)
     flat = jax.random.uniform(key_flat, (n,)) < q.prior_weight
     u = jax.random.uniform(key_u, (n, q.means.shape[-1]))
-    u = box.draw(key_mog, q.logits, q.means, q.scales, flat, u, TRIES, SPARE)
+    if q.chart == "plain":
+        u = box.draw(key_mog, q.logits, q.means, q.scales, flat, u, TRIES, SPARE)
+    else:
+        u = jnp.where(
+            flat[:, None], u, charts.from_chart(box.propose(key_mog, q.logits, q.means, q.scales, n), q.chart)
+        )
     return to_theta(q.space, u)
 
 
 @partial(jax.jit, static_argnames="points")
+def component_points(q: Distribution, points: int) -> tuple[Array, Array]:
+    """Unit coordinates [K, n, d] of each component inside the cube and log weights [K, n]; mean weight = its mass."""
+    w = jnp.asarray(box.lattice(points, q.means.shape[-1]))
+    if q.chart == "plain":
+        return jax.vmap(lambda m, s: box.separate(m, s, w))(q.means, q.scales)
+    z = q.means[:, None, :] + jnp.einsum("kij,nj->kni", q.scales, ndtri(w), precision=jax.lax.Precision.HIGHEST)
+    return charts.from_chart(z, q.chart), jnp.zeros((q.components, points), jnp.float32)
+
+
+@partial(jax.jit, static_argnames="points")
 def quadrature(q: Distribution, points: int) -> tuple[Array, Array]:
-    d = q.means.shape[-1]
-    w = jnp.asarray(box.lattice(points, d))
-    u, log_weight = jax.vmap(lambda m, s: box.separate(m, s, w))(q.means, q.scales)
+    u, log_weight = component_points(q, points)
     mass = jax.nn.softmax((jax.nn.log_softmax(q.logits)[:, None] + log_weight).reshape(-1))
     weights = jnp.concatenate([jnp.full((points,), 1 / points) * q.prior_weight, (1 - q.prior_weight) * mass])
-    return to_theta(q.space, jnp.concatenate([w, as_rows(u)])), weights
+    flat = jnp.asarray(box.lattice(points, q.means.shape[-1]))
+    return to_theta(q.space, jnp.concatenate([flat, as_rows(u)])), weights
 
 
 @jax.jit
@@ -86,10 +103,15 @@ def moments(q: Distribution) -> tuple[Array, Array]:
     return mean, (deviation * weights[:, None]).T @ deviation
 
 
+def centres_unit(q: Distribution) -> Array:
+    """Centres of the Gaussians in unit coordinates, kept in the cube [K, d]."""
+    return jnp.clip(charts.from_chart(q.means, q.chart), 0, 1)
+
+
 @jax.jit
 def mode(q: Distribution) -> Array:
     theta, _ = quadrature(q, POINTS)
-    centres = to_theta(q.space, jnp.clip(q.means, 0, 1))
+    centres = to_theta(q.space, centres_unit(q))
     candidates = jnp.concatenate([centres, moments(q)[0][None, :], theta])
     return candidates[jnp.argmax(log_gain(q, candidates))]
 
@@ -108,5 +130,26 @@ def marginal(q: Distribution, index: tuple[int, ...]) -> tuple[Array, Array, Arr
     ids = np.asarray(index)
     rows = q.scales[:, ids, :]
     means, scales = q.means[:, ids], lower_factor(rows)
-    logits = jax.nn.log_softmax(q.logits) + box.log_masses(q.means, q.scales) - box.log_masses(means, scales)
+    logits = jax.nn.log_softmax(q.logits)
+    if q.chart == "plain":
+        logits = logits + box.log_masses(q.means, q.scales) - box.log_masses(means, scales)
     return logits, means, scales
+
+
+@partial(jax.jit, static_argnums=(1, 2))
+def conditional(
+    q: Distribution, given: tuple[int, ...], free: tuple[int, ...], u: Array
+) -> tuple[Array, Array, Array, Array]:
+    """logits, means, scales and prior weight of the coordinates `free` where those `given` are u [g]. Exact."""
+    # the factor of the coordinates in this order: its blocks are those of the marginal and of the conditional
+    ids, g = np.asarray(given + free), len(given)
+    means, lower = q.means[:, ids], lower_factor(q.scales[:, ids, :])
+    z = charts.to_chart(u, q.chart)[None, :]
+    evidence = box.log_density(z, means[:, :g], lower[:, :g, :g])[0] + charts.log_slope(z, q.chart)
+    gap = solve_lower(lower[:, :g, :g], (z - means[:, :g])[:, :, None])
+    means, scales = means[:, g:] + product(lower[:, g:, :g], gap)[:, :, 0], lower[:, g:, g:]
+    logits = jax.nn.log_softmax(q.logits) + evidence
+    mass = logits + box.log_masses(means, scales) if q.chart == "plain" else logits
+    bulk = jnp.log1p(-q.prior_weight) - q.log_inside + jax.nn.logsumexp(mass)
+    weight = jax.nn.sigmoid(jnp.log(q.prior_weight) - bulk)
+    return logits, means, scales, weight

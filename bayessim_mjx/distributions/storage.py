@@ -12,14 +12,14 @@ FIELDS = ("prior_weight", "logits", "means", "scales", "log_inside")
 VERSION = 1
 
 
-def write(path: str | Path, arrays: dict[str, np.ndarray], space: Any) -> Path:
+def write(path: str | Path, arrays: dict[str, np.ndarray], space: Any, chart: str) -> Path:
     """Write arrays and the space's names and box to `path` (a reader sees the old file or the new one, never half)."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix=".tmp")
     try:
         with os.fdopen(descriptor, "wb") as file:
-            np.savez(file, **{"header": np.asarray(json.dumps(header(space))), **arrays})  # type: ignore[arg-type]
+            np.savez(file, **{"header": np.asarray(json.dumps({**header(space), "chart": chart})), **arrays})  # type: ignore[arg-type]
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)
@@ -35,8 +35,8 @@ def header(space: Any) -> dict[str, Any]:
     return {"format": "bayessim_mjx.Distribution", "version": VERSION, "names": list(space.names), "box": box}
 
 
-def read(path: str | Path, space: Any) -> dict[str, np.ndarray]:
-    """Arrays of a file written by `write`; ValueError naming the first disagreement with `space`."""
+def read(path: str | Path, space: Any) -> tuple[dict[str, np.ndarray], str]:
+    """Arrays and chart of a file written by `write`; ValueError naming the first disagreement with `space`."""
     with np.load(path, allow_pickle=False) as file:
         if "header" not in file or any(name not in file for name in FIELDS):
             raise ValueError(f"{path} holds no distribution: it has {sorted(file)}, needed are header and {FIELDS}")
@@ -50,4 +50,4 @@ def read(path: str | Path, space: Any) -> dict[str, np.ndarray]:
     for name, range_ in expected["box"].items():
         if not np.allclose(stored["box"][name], range_, rtol=1e-5):
             raise ValueError(f"{path} has {name} in {stored['box'][name]}, but its range here is {range_}")
-    return arrays
+    return arrays, stored.get("chart", "plain")

@@ -1,0 +1,52 @@
+"""Coordinates z of the unit cube in which a Distribution is a mixture of Gaussians: plain, probit or logit.
+
+plain: z = u, truncated to the cube; the prior is flat. probit: z = Phi^-1(u); the prior is N(0, I), nothing is cut off.
+logit: z = log(u / (1 - u)); the prior is logistic, nothing is cut off.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.scipy.special import ndtr, ndtri
+
+CHARTS = ("plain", "probit", "logit")
+EDGE = 1e-6  # unit coordinates are kept this far from 0 and 1 where a chart is infinite there
+PRIOR_PRECISION = {"plain": 0.0, "probit": 1.0}  # where the prior is Gaussian: products and quotients are closed
+# mean and sd of a Gaussian that is the prior (plain: flat to 3e-4 inside the cube; logit: to 0.02 in probability)
+NEUTRAL = {"plain": (0.5, 20.0), "probit": (0.0, 1.0), "logit": (0.0, 1.702)}
+# centre and sd of the prior: z-scores for networks
+SCORE = {"plain": (0.5, 12**-0.5), "probit": (0.0, 1.0), "logit": (0.0, np.pi / 3**0.5)}
+
+
+def check(chart: str) -> str:
+    """The chart's name; ValueError if there is none of that name."""
+    if chart not in CHARTS:
+        raise ValueError(f"chart = {chart!r}: allowed are {', '.join(CHARTS)}")
+    return chart
+
+
+def to_chart(u: Array, chart: str) -> Array:
+    """Unit coordinates -> z, elementwise."""
+    if chart == "plain":
+        return u
+    u = jnp.clip(u, EDGE, 1 - EDGE)
+    return ndtri(u) if chart == "probit" else jnp.log(u) - jnp.log1p(-u)
+
+
+def from_chart(z: Array, chart: str) -> Array:
+    """z -> unit coordinates, elementwise (plain: as they are, also outside the cube)."""
+    if chart == "plain":
+        return z
+    return ndtr(z) if chart == "probit" else jax.nn.sigmoid(z)
+
+
+def log_slope(z: Array, chart: str) -> Array:
+    """log |det dz/du| at z [..., d] -> [...]; a density of z times this is a density of u."""
+    if chart == "plain":
+        return jnp.zeros(z.shape[:-1], z.dtype)
+    if chart == "probit":
+        return jnp.sum(0.5 * z * z + np.float32(0.5 * np.log(2 * np.pi)), axis=-1)
+    return jnp.sum(jax.nn.softplus(z) + jax.nn.softplus(-z), axis=-1)
