@@ -1,0 +1,217 @@
+"""Whether a real summary lies outside what simulation can produce, with p-values that are exact by ranks.
+
+Three scores of a summary z, each ranked among those of fresh simulations (exchangeable with a real trajectory where
+nothing is wrong): the distance of z from E[z | theta-hat], whitened; the same in units that change with theta-hat; the
+distance to the nearest simulations in the network's last hidden layer. The first two are two-sided, as noise that is
+lower than assumed makes the residual too small (reference/sbi.md section 3.4). The smallest of the three p-values is
+ranked again, which makes it one p-value.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from bayessim_mjx.triangular import product
+
+FOURIER = 300  # random features of theta-hat behind E[z | theta-hat]
+WIDTH = 0.4  # their length scale, in units of the box
+RIDGE = 1e-4
+MOST = 256  # whitened coordinates; a longer summary's residual is projected at random
+NEIGHBOURS, NEAR = 5, 4000  # nearest simulations, among so many
+CLIP = 20.0  # standard deviations
+FLAGGED = 0.05  # p-value below which the posterior is distrusted
+SCORES = ("residual", "scaled residual", "distance to simulations")
+TWO_SIDED = (True, True, False)
+
+
+class Scores(NamedTuple):
+    """Scores of n summaries."""
+
+    joint: Array  # [n, 3] in the order of SCORES
+    features: Array  # [n, D] residual of each feature given theta-hat, in its standard deviations
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """How far real summaries are from what simulation produces; arrays over n real trajectories, on the host."""
+
+    p: np.ndarray  # [n] of each trajectory: uniform where nothing is wrong
+    parts: np.ndarray  # [n, 3] the p-value of each score by itself
+    sides: np.ndarray  # [n, 3] +1 the score is high, -1 low
+    features: np.ndarray  # [n, D] two-sided p-value of each feature by itself
+    reference: int  # simulations that they were ranked among
+
+    @property
+    def joint(self) -> float:
+        """One p-value for all trajectories (Cauchy combination: they share theta, hence are not independent)."""
+        return combined(self.p)
+
+    @property
+    def flagged(self) -> bool:
+        return self.joint < FLAGGED
+
+    def sentence(self) -> str:
+        """What a person should know; empty where nothing is wrong."""
+        if not self.flagged:
+            return ""
+        worst = int(np.argmin(self.p))
+        many = "" if len(self.p) == 1 else f", worst of {len(self.p)}: trajectory {worst + 1}"
+        count = f"p = {self.joint:.2g} among {self.reference} simulations{many}"
+        return f"the real trajectories are unlike anything simulated ({count}): {self._why(worst)}"
+
+    def _why(self, row: int) -> str:
+        score = int(np.argmin(self.parts[row]))
+        if TWO_SIDED[score] and self.sides[row, score] < 0:
+            return "they follow the simulator too closely, so the noise is assumed too large"
+        feature = int(np.argmin(self.features[row]))
+        return f"something moves them that no parameter explains, or the noise is larger (most in feature {feature})"
+
+
+def prior_share(p: float, most: float) -> float:
+    """Share of the prior in the randomisation: 0 where p >= 0.05, rising to `most` at p = 0."""
+    return most * max(0.0, 1.0 - p / FLAGGED)
+
+
+def combined(p: np.ndarray) -> float:
+    """Cauchy combination of p-values [n], valid under dependence (Liu and Xie 2020)."""
+    p = np.clip(p, 1e-6, 1 - 1e-6)
+    return float(0.5 - np.arctan(np.mean(np.tan((0.5 - p) * np.pi))) / np.pi)
+
+
+def detect(state: Any, thetas: Array, x: Array, count: int | Array, held: Array, real: Array) -> Misfit:
+    """Test real summaries [n, D] against fresh simulations `held` [m, D] that the network has not seen.
+
+    `thetas` [N, d] and `x` [N, D] are what the network of `state` was fitted on, `count` of their rows valid.
+    """
+    rows = jnp.concatenate([jnp.asarray(held), jnp.asarray(real)])
+    scores = jax.tree.map(np.asarray, score(state, thetas, x, jnp.asarray(count, jnp.int32), rows))
+    m = held.shape[0]
+    usable = np.all(np.isfinite(scores.joint[:m]), axis=1) & np.all(np.isfinite(scores.features[:m]), axis=1)
+    return ranked(Scores(*(s[:m][usable] for s in scores)), Scores(*(s[m:] for s in scores)))
+
+
+def ranked(held: Scores, real: Scores) -> Misfit:
+    """p-values of `real` scores by their ranks among `held` ones and themselves; not finite counts as the highest."""
+    joint = np.nan_to_num(np.asarray(real.joint, np.float64), nan=np.inf)
+    found = [_joint(np.asarray(held.joint, np.float64), row) for row in joint]
+    p, parts, sides = (np.asarray(v) for v in zip(*found, strict=True))
+    return Misfit(p, parts, sides, _two_sided(held.features, np.asarray(real.features)), len(held.joint))
+
+
+def _joint(held: np.ndarray, row: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+    """(p, p of each score, its side) of one row [3] pooled with held [m, 3]: exact where all are exchangeable."""
+    pool = np.concatenate([held, row[None]])
+    n = len(pool)
+    at_least = n - _count_below(pool)  # [n, 3] members of the pool that are as high or higher
+    at_most = _count_below(-pool)
+    at_most = n - at_most
+    tail = np.where(TWO_SIDED, 2.0 * np.minimum(at_least, at_most), at_least) / n
+    least = tail.min(axis=1)
+    p = float(np.mean(least <= least[-1]))
+    return p, np.minimum(tail[-1], 1.0), np.where(at_least[-1] <= at_most[-1], 1, -1)
+
+
+def _count_below(pool: np.ndarray) -> np.ndarray:
+    """How many of each column are smaller, [n, k]."""
+    return np.stack([np.searchsorted(np.sort(column), column, side="left") for column in pool.T], axis=1)
+
+
+def _two_sided(held: np.ndarray, real: np.ndarray) -> np.ndarray:
+    """Two-sided rank p-value of each column of real [n, D] among held [m, D] and itself."""
+    below = np.stack([np.mean(held <= row, axis=0) for row in real])
+    above = np.stack([np.mean(held >= row, axis=0) for row in real])
+    m = len(held)
+    return np.minimum(1.0, 2 * (m * np.minimum(below, above) + 1) / (m + 1))
+
+
+def latent(state: Any, x: Array) -> Array:
+    """What the network made of summaries x [n, D]: its last hidden layer [n, H]."""
+    h = jnp.clip((x - state.x_mean[None, :]) * state.x_rate[None, :], -state.settings.clip, state.settings.clip)
+    for layer in state.params["layers"][:-1]:
+        h = jax.nn.silu(h @ layer["w"] + layer["b"][None, :])
+    return h
+
+
+@jax.jit
+def score(state: Any, thetas: Array, x: Array, count: Array, rows: Array) -> Scores:
+    """Scores of summaries `rows` [n, D]; the first `count` of thetas [N, d], x [N, D] describe the simulations."""
+    finite = jnp.all(jnp.isfinite(x), axis=1)
+    used = ((jnp.arange(x.shape[0]) < count) & finite).astype(jnp.float32)
+    x = jnp.where(finite[:, None], x, 0.0)
+    z, z_new = _standardised(x, used, x, rows)
+    h, h_new = _standardised(latent(state, x), used, latent(state, x), latent(state, rows))
+    u = jax.vmap(state.space.to_unit)(thetas)
+    ones = jnp.ones((x.shape[0], 1)), jnp.ones((rows.shape[0], 1))
+    estimate = _ridge(jnp.concatenate([h, z, ones[0]], 1), u, used)
+    f, f_new = (
+        _fourier(jnp.clip(product(jnp.concatenate([a, b, c], 1), estimate), -0.3, 1.3))
+        for a, b, c in ((h, z, ones[0]), (h_new, z_new, ones[1]))
+    )
+    mean = _ridge(f, z, used)
+    r, r_new = z - product(f, mean), z_new - product(f_new, mean)
+    whitener = _whitener(r, used)
+    w, w_new = product(r, whitener), product(r_new, whitener)
+    # log w^2 given theta-hat: noise and the reach of the network differ over the box
+    spread = _ridge(f, jnp.log(w * w + 1e-3), used)
+    scaled = w_new / jnp.exp(0.5 * product(f_new, spread))
+    sd = jnp.sqrt(_mean(r * r, used)) + 1e-6
+    near = _nearest(h[:NEAR], used[:NEAR], h_new)
+    joint = jnp.stack([jnp.log(jnp.sum(w_new**2, 1)), jnp.log(jnp.sum(scaled**2, 1)), near], axis=1)
+    return Scores(joint, r_new / sd[None, :])
+
+
+def _mean(values: Array, used: Array) -> Array:
+    return used @ values / jnp.maximum(jnp.sum(used), 1.0)
+
+
+def _standardised(x: Array, used: Array, *arrays: Array) -> list[Array]:
+    """Each of `arrays` by mean and sd of the used rows of x; columns that do not vary become 0."""
+    mean = _mean(x, used)
+    sd = jnp.sqrt(_mean((x - mean[None, :]) ** 2, used))
+    varies = sd > 1e-5 * jnp.abs(mean) + 1e-12
+    rate = jnp.where(varies, 1.0 / jnp.where(varies, sd, 1.0), 0.0)
+    return [jnp.clip((a - mean[None, :]) * rate[None, :], -CLIP, CLIP) for a in arrays]
+
+
+def _ridge(f: Array, y: Array, used: Array) -> Array:
+    """Coefficients [F, Y] of y [N, Y] on f [N, F]."""
+    n = jnp.maximum(jnp.sum(used), 1.0)
+    gram = product((f * used[:, None]).T, f) / n + RIDGE * jnp.eye(f.shape[1])
+    return jnp.linalg.solve(gram, product((f * used[:, None]).T, y) / n)
+
+
+def _fourier(u: Array) -> Array:
+    """Smooth functions of theta-hat [n, d] -> [n, FOURIER + d + 1]."""
+    rng, d = np.random.default_rng(0), u.shape[1]
+    frequency = jnp.asarray(rng.normal(size=(d, FOURIER)) / (WIDTH * np.sqrt(max(1.0, d / 3))), jnp.float32)
+    phase = jnp.asarray(rng.uniform(0, 2 * np.pi, FOURIER), jnp.float32)
+    waves = np.float32(np.sqrt(2.0)) * jnp.cos(product(u, frequency) + phase[None, :])
+    return jnp.concatenate([waves, u, jnp.ones((u.shape[0], 1))], axis=1)
+
+
+def _whitener(r: Array, used: Array) -> Array:
+    """Matrix [D, m] after which the used residuals have covariance 1; m <= MOST."""
+    size = r.shape[1]
+    projection = jnp.eye(size)
+    if size > MOST:
+        projection = jnp.asarray(np.random.default_rng(1).normal(size=(size, MOST)) / np.sqrt(size), jnp.float32)
+    p = product(r, projection) * used[:, None]
+    cov = product(p.T, p) / jnp.maximum(jnp.sum(used), 1.0)
+    values, vectors = jnp.linalg.eigh(cov)
+    floor = 1e-5 * jnp.max(values)
+    kept = jnp.where(values > floor, 1.0 / jnp.sqrt(jnp.maximum(values, floor)), 0.0)  # constant columns
+    return product(projection, vectors * kept[None, :])
+
+
+def _nearest(h: Array, used: Array, new: Array) -> Array:
+    """log mean distance of new [n, H] to the nearest used rows of h [N, H]."""
+    square = jnp.sum(new**2, 1)[:, None] + jnp.sum(h**2, 1)[None, :] - 2 * product(new, h.T)
+    square = jnp.where(used[None, :] > 0, jnp.maximum(square, 1e-9), jnp.inf)
+    nearest = -jax.lax.top_k(-square, min(NEIGHBOURS, h.shape[0]))[0]
+    return jnp.log(jnp.mean(jnp.sqrt(nearest), axis=1))
