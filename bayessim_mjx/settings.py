@@ -4,6 +4,7 @@ The names in `bayessim:`, `env:` and `task:` are BayesSimIG's. Nothing here impo
 """
 
 import dataclasses
+import difflib
 import math
 import os
 import re
@@ -16,7 +17,15 @@ from typing import Any
 from bayessim_mjx.errors import UserError
 
 COLLECT_POLICIES = ("policy_random", "policy_ones", "policy_rl", "policy_rl_randomized", "policy_replay")
-SUMMARIZERS = ("summary_start", "summary_waypts", "summary_corr", "summary_corrdiff")
+SUMMARIZERS = {  # summaries of a trajectory, and what a number at the end of the name means
+    "summary_start": "steps",
+    "summary_waypts": "waypoints",
+    "summary_corr": "lags",
+    "summary_corrdiff": "lags",
+    "summary_signatory": "depth",
+    "summary_logsignature": "depth",
+    "summary_learned": None,
+}
 MODELS = ("MDNN",)  # classes of posterior networks that there are
 ACTIVATIONS = ("elu", "relu", "selu", "tanh", "swish", "gelu")
 
@@ -87,6 +96,26 @@ def checked(value: Any, annotation: Any, metadata: Mapping[str, Any], path: str,
 def _prefixed(prefix: str) -> Callable[[Any], Any]:
     """Short names: `random` for `policy_random`."""
     return lambda value: prefix + value if isinstance(value, str) and not value.startswith(prefix) else value
+
+
+def summary_of(name: str, key: str = "summarizer") -> tuple[str, dict[str, int]]:
+    """("summary_corrdiff", {"lags": 3}) of `corrdiff_3`, like BayesSimIG's MDRFF_<kernel>_<sigma>.
+
+    Raises:
+        UserError: naming the value, where it came from (`key`) and the summaries that there are.
+    """
+    stem, _, number = name.rpartition("_")
+    full = _prefixed("summary_")(stem if number.isdecimal() else name)
+    if full not in SUMMARIZERS:
+        close = difflib.get_close_matches(full, SUMMARIZERS, n=1)
+        hint = f" (did you mean {close[0]}?)" if close else ""
+        raise UserError(f"{key} = {name!r}{hint}: allowed are {', '.join(SUMMARIZERS)}")
+    if not number.isdecimal():
+        return full, {}
+    option = SUMMARIZERS[full]
+    if option is None:
+        raise UserError(f"{key} = {name!r}: {full} takes no number")
+    return full, {option: int(number)}
 
 
 def _absolute(value: Any) -> Any:
@@ -204,7 +233,10 @@ class BayesSimConfig(Section):
         "policy_random", "actions while collecting", choices=COLLECT_POLICIES, spell=_prefixed("policy_")
     )
     summarizerFxn: str = setting(
-        "summary_start", "trajectory summary", choices=SUMMARIZERS, spell=_prefixed("summary_")
+        "summary_start",
+        "trajectory summary: summary_start, _waypts, _corr, _corrdiff, _signatory, _logsignature or _learned; with its "
+        "number of steps, waypoints, lags or levels as in summary_corrdiff_3",
+        spell=_prefixed("summary_"),
     )
     trainTrajLen: int = setting(20, "control steps per training trajectory (arrays have one more row)", low=1)
     ftune: bool = setting(True, "keep one network over all rounds; False: a new one each round")
@@ -225,6 +257,7 @@ class BayesSimConfig(Section):
     policyCheckpt: str | None = setting(None, "checkpoint of a policy to start from", spell=_none)
 
     def check(self) -> None:
+        summary_of(self.summarizerFxn, "bayessim.summarizerFxn")
         if self.modelClass is not None and self.modelClass not in MODELS:
             later = " (MDRFF is not in this version yet)" if self.modelClass.startswith("MDRFF") else ""
             raise UserError(

@@ -6,7 +6,7 @@ the entry of word (i_1, ..., i_k) stands at sum_j i_j n^(k-j). Chen: S(path, the
 
 from __future__ import annotations
 
-from functools import lru_cache
+from functools import lru_cache, reduce
 
 import jax
 import jax.numpy as jnp
@@ -117,5 +117,5 @@ def _outer(a: Array, b: Array) -> Array:
 def _nilpotent(a: Levels, b: Levels) -> Levels:
     """(a - 1)(b - 1): level k is the sum of a_i b_{k-i}."""
     return (jnp.zeros_like(a[0]),) + tuple(
-        sum(_outer(a[i - 1], b[k - i - 1]) for i in range(1, k)) for k in range(2, len(a) + 1)
+        reduce(jnp.add, [_outer(a[i - 1], b[k - i - 1]) for i in range(1, k)]) for k in range(2, len(a) + 1)
     )
