@@ -3,8 +3,8 @@
 Three scores of a summary z, each ranked among those of fresh simulations (exchangeable with a real trajectory where
 nothing is wrong): the distance of z from E[z | theta-hat], whitened; the same in units that change with theta-hat; the
 distance to the nearest simulations in the network's last hidden layer. The first two are two-sided, as noise that is
-lower than assumed makes the residual too small (reference/sbi.md section 3.4). The smallest of the three p-values is
-ranked again, which makes it one p-value.
+lower than assumed makes the residual too small (reference/sbi.md section 3.4). The three p-values are combined and the
+combination is ranked again, which makes it one p-value.
 """
 
 from __future__ import annotations
@@ -109,12 +109,12 @@ def _joint(held: np.ndarray, row: np.ndarray) -> tuple[float, np.ndarray, np.nda
     pool = np.concatenate([held, row[None]])
     n = len(pool)
     at_least = n - _count_below(pool)  # [n, 3] members of the pool that are as high or higher
-    at_most = _count_below(-pool)
-    at_most = n - at_most
-    tail = np.where(TWO_SIDED, 2.0 * np.minimum(at_least, at_most), at_least) / n
-    least = tail.min(axis=1)
-    p = float(np.mean(least <= least[-1]))
-    return p, np.minimum(tail[-1], 1.0), np.where(at_least[-1] <= at_most[-1], 1, -1)
+    at_most = n - _count_below(-pool)
+    tail = np.minimum(np.where(TWO_SIDED, 2.0 * np.minimum(at_least, at_most), at_least) / n, 1.0)
+    # Cauchy combination; a score that fits well (p > 1/2) is no evidence against the others
+    evidence = np.sum(np.tan((0.5 - np.minimum(tail, 0.5)) * np.pi), axis=1)
+    p = float(np.mean(evidence >= evidence[-1]))
+    return p, tail[-1], np.where(at_least[-1] <= at_most[-1], 1, -1)
 
 
 def _count_below(pool: np.ndarray) -> np.ndarray:
