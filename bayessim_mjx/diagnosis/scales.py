@@ -45,6 +45,8 @@ class Scales:
             joint = int(model.actuator_trnid[i, 0])
             on_joint = int(model.actuator_trntype[i]) <= int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)
             own = self._of_dof(int(model.jnt_dofadr[joint])) if on_joint else {}
+            if own:
+                own["travel"] *= abs(float(model.actuator_gear[i, 0])) or 1.0  # of the actuator's own length
             return own | {"command": float(self.command[i]), "force": float(self.effort[i])}
         if kind == "body":
             i = element_names(model, "body").index(place)
@@ -138,6 +140,7 @@ def _ranged(p: Parameter, q: Quantity, here: dict[str, float], effect: type[Effe
         return p
     unit = _product(q.per, here, effect)
     low, high = (float(q.neutral + r * unit) if q.neutral == 0 else float(r * unit) for r in q.reach)
+    low, high = (max(low, q.low), max(high, q.high)) if q.at_least else (low, high)
     nominal = min(max(q.neutral, low), high)
     low, high = (low, high) if low < high else (q.low, q.high)
     prior = q.prior if low > 0 else "uniform"

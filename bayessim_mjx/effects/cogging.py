@@ -1,6 +1,7 @@
 """Cogging and torque ripple: a force periodic in the angle (magnets against slots, gear teeth, wave generator)."""
 
 import dataclasses
+import math
 from typing import Any, ClassVar
 
 import jax
@@ -10,8 +11,9 @@ from bayessim_mjx.effects.effect import Effect, Quantity
 from bayessim_mjx.effects.site import Site, SubStep
 from bayessim_mjx.triangular import product
 
-# Once per turn is gravity's own period: what has it there is a payload, not a motor's poles.
-# A fit finds the order only from about +-pi / (range of motion) away: start at the usual ones
+# With fewer periods in the range of motion (or per turn) it is any smooth force: of gravity, a spring, a rough place.
+# A fit finds the order only from nearby: start at the usual ones
+_LEAST, _MOST = 1.5 * math.pi, 30 * math.pi
 _ORDERS = (2, 3, 4, 5, 6, 7, 8, 10, 12, 14, 16, 18, 20, 22, 24, 27, 30, 33, 36, 40, 44, 48, 54, 60)
 
 
@@ -32,7 +34,18 @@ class Cogging(Effect):
     quantities: ClassVar[tuple[Quantity, ...]] = (
         Quantity("sine", 0.0, -1.0, 1.0, unit="N m", per="force", reach=(-0.3, 0.3), grid=(0.1,)),
         Quantity("cosine", 0.0, -1.0, 1.0, unit="N m", per="force", reach=(-0.3, 0.3), grid=(0.1,)),
-        Quantity("order", 2.0, 2.0, 60.0, unit="1/rev", grid=tuple((n - 2) / 58 for n in _ORDERS), shape=True),
+        Quantity(
+            "order",
+            2.0,
+            2.0,
+            60.0,
+            unit="1/rev",
+            per="1/travel",  # travel is half the range of motion
+            reach=(_LEAST, _MOST),
+            grid=tuple((n - 2) / 58 for n in _ORDERS),
+            shape=True,
+            at_least=True,
+        ),
     )
 
     def on_force(self, at: Site, memory: Any, step: SubStep, theta: jax.Array) -> tuple[Any, jax.Array]:

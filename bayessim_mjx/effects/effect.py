@@ -36,6 +36,7 @@ class Quantity:
         prior: "uniform" or "loguniform".
         shape: it only shapes the effect (a speed, an order, a lever arm): where the other quantities are neutral the
             effect is off whatever this one is; `grid` is then in fractions of the range from low to high.
+        at_least: ends of the range that `reach` gives are raised to `low` and `high` where they are below.
     """
 
     name: str
@@ -48,6 +49,7 @@ class Quantity:
     grid: tuple[float, ...] = (0.03, 0.15, 0.5)
     prior: str = "uniform"
     shape: bool = False
+    at_least: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
