@@ -153,11 +153,15 @@ def base_increment(state: Array, action_size: int) -> Array:
 
 
 def summary_learned(states: Array, actions: Array, valid: Array | None = None) -> Array:
-    """The trajectory itself for a network that learns its features -> [(T+1) S + T A + T]: states, actions, valid."""
+    """The trajectory itself for a network that learns its features (embedding.py) -> [(2 T + 1) S + T A + T].
+
+    states, their changes s_{t+1} - s_t, actions, valid. Changes have a scale of their own, small beside the states'.
+    """
     states, actions = held(states, actions, valid)
     mask = jnp.ones(actions.shape[0]) if valid is None else valid.astype(jnp.float32)
-    _affordable("summary_learned", states.size + actions.size + mask.size, "a shorter trajectory, corrdiff")
-    return jnp.concatenate([states.reshape(-1), actions.reshape(-1), mask])
+    parts = [states, states[1:] - states[:-1], actions, mask]
+    _affordable("summary_learned", sum(part.size for part in parts), "a shorter trajectory, corrdiff")
+    return jnp.concatenate([part.reshape(-1) for part in parts])
 
 
 def held(states: Array, actions: Array, valid: Array | None = None) -> tuple[Array, Array]:

@@ -142,7 +142,7 @@ def test_summaries_that_are_rows_of_the_trajectory_have_no_stream():
 SIZES = {  # T = 20, S = 4, A = 2, as documented
     "start": 20 * 6 + 4, "start_5": 5 * 6 + 4, "waypts": 10 * 6, "waypts_21": 21 * 6, "corr": 8 + 8,
     "corrdiff_3": 4 * 8 + 8, "signatory": 7 + 49 + 343, "signatory_2": 7 + 49, "logsignature": 7 + 21 + 112,
-    "learned": 21 * 4 + 20 * 2 + 20,
+    "learned": (21 + 20) * 4 + 20 * 2 + 20,
 }  # fmt: skip
 
 
