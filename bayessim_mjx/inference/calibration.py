@@ -1,0 +1,255 @@
+"""Is the posterior as sure as it may be? Ranks, coverage and TARP on held-out pairs, and a verdict in words.
+
+All of it rests on one fact: with theta drawn from the prior and x simulated at it, the rank of theta among draws of an
+exact q(theta | x) is uniform, for any function of theta that is ranked (Cook et al. 2006; Talts et al. 2018).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache, partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from scipy.special import ndtr
+
+from bayessim_mjx.distributions import Distribution, box, charts
+
+LEVELS = (0.5, 0.8, 0.95)
+DRAWS = 256  # proposals per pair; those outside the box are left out
+ALPHA = 0.01  # chance that a calibrated posterior is called anything else
+TEMPERATURES = np.geomspace(1.0, 4.0, 15).astype(np.float32)
+CALIBRATED, OVER, UNDER, BIASED, ODD = "calibrated", "over-confident", "under-confident", "biased", "miscalibrated"
+
+
+class Ranks(NamedTuple):
+    """Fractional ranks of n truths among posterior draws, uniform on [0, 1] where the posterior is exact."""
+
+    parameters: Array  # [n, d] each parameter: simulation-based calibration
+    level: Array  # [n] mass of draws denser than the truth: HPD levels
+    tarp: Array  # [n] share of draws nearer to a random point than the truth (Lemos et al. 2023)
+    gain: Array  # [n] log q(theta) - log p(theta)
+    variance: Array  # [n, d] of the draws, in theta units
+
+
+@partial(jax.jit, static_argnames="draws")
+def ranks(key: Array, posteriors: Distribution, thetas: Array, draws: int = DRAWS) -> Ranks:
+    """Ranks of thetas [n, d] among up to `draws` of each of n batched posteriors; all pairs in one program."""
+    space = posteriors.space
+    u = jax.vmap(space.to_unit)(thetas)
+
+    def one(key: Array, q: Distribution, theta: Array, u: Array, reference: Array) -> Ranks:
+        k_draw, *keys = jax.random.split(key, 4)
+        v, kept = _draws(k_draw, q, draws)
+        sample = jax.vmap(space.from_unit)(v)
+        gain = q.log_gain(jnp.concatenate([theta[None], sample]))
+        near, far = (jnp.sum((x - reference[None, :]) ** 2, axis=-1, keepdims=True) for x in (v, u[None]))
+        parameters = _rank(keys[0], v, u[None, :], kept)
+        level = _rank(keys[1], -gain[1:, None], -gain[:1, None], kept)
+        tarp = _rank(keys[2], near, far, kept)
+        mean = kept @ sample / jnp.maximum(jnp.sum(kept), 1.0)
+        variance = kept @ (sample - mean[None, :]) ** 2 / jnp.maximum(jnp.sum(kept) - 1, 1.0)
+        return Ranks(parameters, level[0], tarp[0], gain[0], variance)
+
+    # the point that distances are taken to: the truth of another pair, which x says nothing about
+    return jax.vmap(one)(jax.random.split(key, u.shape[0]), posteriors, thetas, u, jnp.roll(u, 1, axis=0))
+
+
+def _draws(key: Array, q: Distribution, n: int) -> tuple[Array, Array]:
+    """n proposals [n, d] in unit coordinates and which of them [n] are draws of q: those that fell into the box.
+
+    Ranks among a random number of draws are as uniform as among a fixed one, so nothing needs to be drawn again.
+    """
+    k_flat, k_thin, k_u, k_mog = jax.random.split(key, 4)
+    mog = charts.from_chart(box.propose(k_mog, q.logits, q.means, q.scales, n), q.chart)
+    inside = jnp.all((mog >= 0) & (mog <= 1), axis=-1)
+    # the prior's share has to lose as many draws as the mixture does
+    thinned = jax.random.uniform(k_thin, (n,)) < jnp.exp(q.log_inside)
+    flat = jax.random.uniform(k_flat, (n,)) < q.prior_weight
+    v = jnp.where(flat[:, None], jax.random.uniform(k_u, mog.shape), jnp.clip(mog, 0, 1))
+    return v, jnp.where(flat, thinned, inside).astype(jnp.float32)
+
+
+def _rank(key: Array, draws: Array, value: Array, kept: Array) -> Array:
+    """Fractional rank of value [1, k] in the kept rows of draws [S, k], ties and gaps broken at random -> [k]."""
+    below, equal = kept @ (draws < value).astype(jnp.float32), kept @ (draws == value).astype(jnp.float32)
+    return (below + (equal + 1) * jax.random.uniform(key, below.shape)) / (jnp.sum(kept) + 1)
+
+
+@dataclass(frozen=True)
+class Report:
+    """What the held-out pairs say of a posterior; arrays on the host."""
+
+    names: tuple[str, ...]
+    verdict: str  # calibrated, over-confident, under-confident, biased, miscalibrated
+    words: str  # the verdict as a sentence
+    coverage: dict[float, tuple[float, float]]  # nominal level -> (share of truths in that HPD region, standard error)
+    p: dict[str, float]  # Anderson-Darling p-values: of each parameter's ranks, of "HPD level" and "TARP"
+    bias: np.ndarray  # [d] standard errors by which the truths lie above the draws
+    spread: np.ndarray  # [d] the same for truths too far out: > 0 over-confident
+    gain: float  # mean log q(theta) - log p(theta)
+    contraction: np.ndarray  # [d] 1 - mean posterior variance / prior variance
+    ranks: Ranks
+    temperature: float | None = None  # factor on the standard deviations that was applied
+    before: str | None = None  # the verdict without it
+    predictive: float | None = None  # p-value of the posterior predictive check
+
+    @property
+    def pairs(self) -> int:
+        return len(self.ranks.level)
+
+    def table(self) -> str:
+        """Coverage in words: `50 %: 49 ± 2, 80 %: ...`."""
+        rows = [f"{100 * a:.0f} %: {100 * c:.0f} ± {100 * s:.0f}" for a, (c, s) in self.coverage.items()]
+        return ", ".join(rows)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain numbers, for JSON."""
+        return {
+            "verdict": self.verdict, "words": self.words, "pairs": self.pairs, "p": self.p, "gain": self.gain,
+            "coverage": {f"{a:g}": {"observed": c, "se": s} for a, (c, s) in self.coverage.items()},
+            "bias": dict(zip(self.names, self.bias.tolist(), strict=True)),
+            "spread": dict(zip(self.names, self.spread.tolist(), strict=True)),
+            "contraction": dict(zip(self.names, self.contraction.tolist(), strict=True)),
+            "temperature": self.temperature, "before": self.before, "predictive": self.predictive,
+        }  # fmt: skip
+
+
+def check(key: Array, posteriors: Distribution, thetas: Array, draws: int = DRAWS) -> Report:
+    """Judge n batched posteriors by the thetas [n, d] that their data were simulated at; theta ~ prior.
+
+    Pairs that are not finite are left out; ValueError where fewer than 20 remain.
+    """
+    found = jax.tree.map(np.asarray, ranks(key, posteriors, jnp.asarray(thetas), draws))
+    keep = np.isfinite(found.gain) & np.all(np.isfinite(found.variance), axis=1)
+    if keep.sum() < 20:
+        raise ValueError(f"calibration: {int(keep.sum())} usable pairs; at least 20 are needed")
+    return judge(Ranks(*(part[keep] for part in found)), posteriors.space)
+
+
+def judge(found: Ranks, space: Any) -> Report:
+    """The report on given ranks."""
+    n, names = len(found.level), tuple(space.names)
+    pit = np.asarray(found.parameters, np.float64)
+    coverage = {a: (float(np.mean(found.level <= a)), float(np.sqrt(a * (1 - a) / n))) for a in LEVELS}
+    p = {name: uniform_p(pit[:, i]) for i, name in enumerate(names)}
+    p |= {"HPD level": uniform_p(found.level), "TARP": uniform_p(found.tarp)}
+    # sd of U is 1/sqrt(12), that of (U - 1/2)^2 is 1/sqrt(180)
+    bias = (pit.mean(0) - 0.5) * np.sqrt(12 * n)
+    spread = (np.mean((pit - 0.5) ** 2, axis=0) - 1 / 12) * np.sqrt(180 * n)
+    level = (found.level.astype(np.float64).mean() - 0.5) * np.sqrt(12 * n)
+    verdict, words = _verdict(names, bias, spread, float(level), p)
+    prior = jax.vmap(space.from_unit)(jnp.asarray(box.lattice(1024, len(space))))
+    contraction = 1 - found.variance.mean(0) / np.var(np.asarray(prior), axis=0)
+    gain = float(found.gain.mean())
+    return Report(names, verdict, words, coverage, p, bias, spread, gain, contraction, found)
+
+
+def _verdict(
+    names: Sequence[str], bias: np.ndarray, spread: np.ndarray, level: float, p: dict[str, float]
+) -> tuple[str, str]:
+    """(verdict, sentence): each of four families of tests has a quarter of ALPHA, shared by its members."""
+    limit = ALPHA / 4
+    biased = [i for i in range(len(names)) if _two_sided(bias[i]) < limit / len(names)]
+    odd_width = [i for i in range(len(names)) if _two_sided(spread[i]) < limit / len(names)]
+    joint = _two_sided(level) < limit
+    if biased:
+        sides = [f"{names[i]} (the truth is {'above' if bias[i] > 0 else 'below'})" for i in biased]
+        return BIASED, f"biased in {', '.join(sides)}"
+    if joint or odd_width:
+        total = level if joint else float(spread[odd_width].sum())
+        where = f", most in {names[int(np.argmax(np.abs(spread)))]}" if odd_width and len(names) > 1 else ""
+        kind, how = (OVER, "narrow") if total > 0 else (UNDER, "wide")
+        return kind, f"{kind}: too {how}{where}"
+    worst = min(p, key=lambda name: p[name])
+    if p[worst] < limit / len(p):
+        return ODD, f"{ODD}: the ranks of {worst} are not uniform (p = {p[worst]:.1g}), the shape is wrong"
+    return CALIBRATED, CALIBRATED
+
+
+def _two_sided(z: float) -> float:
+    return float(2 * ndtr(-abs(z)))
+
+
+def uniform_p(values: np.ndarray) -> float:
+    """p-value of the Anderson-Darling statistic of [n] values against U[0, 1], by simulation of the statistic."""
+    null = _null(len(values))
+    return float((1 + np.sum(null >= anderson_darling(np.asarray(values, np.float64)[None])[0])) / (1 + len(null)))
+
+
+def anderson_darling(values: np.ndarray) -> np.ndarray:
+    """A^2 of each row of [m, n] against U[0, 1] -> [m]."""
+    n = values.shape[-1]
+    u = np.clip(np.sort(values, axis=-1), 1e-7, 1 - 1e-7)
+    # A^2 = -n - 1/n sum_i (2i - 1) (ln u_i + ln(1 - u_(n+1-i)))
+    return -n - np.mean((2 * np.arange(1, n + 1) - 1) * (np.log(u) + np.log1p(-u[:, ::-1])), axis=-1)
+
+
+@lru_cache(maxsize=8)
+def _null(n: int, draws: int = 4000) -> np.ndarray:
+    return anderson_darling(np.random.default_rng(0).random((draws, n)))
+
+
+def tempered(posterior: Distribution, factor: float | Array) -> Distribution:
+    """Standard deviations of every component times `factor`; also for batched posteriors under jax.vmap."""
+    q = posterior
+    return Distribution.from_unit(q.space, q.logits, q.means, q.scales * factor, q.prior_weight, q.chart)
+
+
+def temperature(posteriors: Distribution, thetas: Array) -> float:
+    """The factor on standard deviations that gives batched posteriors the highest mean log density at thetas [n, d]."""
+    scores = np.asarray(_scores(posteriors, jnp.asarray(thetas), jnp.asarray(TEMPERATURES)))
+    return float(TEMPERATURES[int(np.argmax(scores))])
+
+
+@jax.jit
+def _scores(posteriors: Distribution, thetas: Array, factors: Array) -> Array:
+    def one(q: Distribution, theta: Array, factor: Array) -> Array:
+        scales = q.scales * factor
+        # fewer points than Distribution.from_unit takes: there are many to weigh
+        masses = box.log_masses(q.means, scales, 64) if q.chart == "plain" else jnp.zeros_like(q.logits)
+        inside = jax.nn.logsumexp(jax.nn.log_softmax(q.logits) + masses)
+        return replace(q, scales=scales, log_inside=inside).log_gain(theta)
+
+    def at(factor: Array) -> Array:
+        gain = jax.vmap(one, in_axes=(0, 0, None))(posteriors, thetas, factor)
+        return jnp.mean(jnp.where(jnp.isfinite(gain), gain, 0.0))
+
+    return jax.lax.map(at, factors)
+
+
+def corrected(key: Array, posteriors: Distribution, thetas: Array) -> Report:
+    """`check`; where it finds over-confidence, a temperature is fitted on one half and judged on the other."""
+    report = check(key, posteriors, thetas)
+    if report.verdict != OVER:
+        return report
+    half = thetas.shape[0] // 2
+    first, second = (jax.tree.map(lambda leaf, part=part: leaf[part], posteriors) for part in _halves(half))
+    factor = temperature(first, thetas[:half])
+    if factor <= 1.0:
+        return report
+    wider = jax.vmap(tempered, in_axes=(0, None))(second, factor)
+    after = check(jax.random.fold_in(key, 1), wider, thetas[half:])
+    words = f"{report.words}; standard deviations times {factor:.2f}, then {after.words}"
+    return replace(after, words=words, temperature=factor, before=report.verdict)
+
+
+def _halves(half: int) -> tuple[slice, slice]:
+    return slice(None, half), slice(half, None)
+
+
+def predictive(x: np.ndarray, replicates: np.ndarray) -> tuple[float, np.ndarray]:
+    """Posterior predictive check of summaries x [n, D] by replicates [n, R, D] simulated at draws given each x.
+
+    The ranks of an x among its own replicates crowd in the middle (the posterior has seen x), so only a bias counts:
+    per feature the two-sided p-value of the mean rank [D], and their minimum times D.
+    """
+    below = np.mean(replicates < x[:, None, :], axis=1) + 0.5 * np.mean(replicates == x[:, None, :], axis=1)
+    n = len(x)
+    sd = np.maximum(below.std(axis=0), 1e-3)
+    p = 2 * ndtr(-np.abs(below.mean(0) - 0.5) / sd * np.sqrt(n))
+    return float(min(1.0, p.min() * len(p))), p
