@@ -15,6 +15,8 @@ from bayessim_mjx.diagnosis.candidates import Candidate
 from bayessim_mjx.diagnosis.fit import Fitter, Job
 
 Array = NDArray[np.float64]
+MANY = 400  # starting points, from which on they are screened in two stages
+CANDIDATES, POINTS, FEWEST = 64, 4, 8  # looked at again, starting points of each, windows of the first look
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,29 +39,46 @@ class Screened:
 
 
 def screen(fitter: Fitter, job: Job, candidates: Sequence[Candidate], limit: int = 96) -> list[Screened]:
-    """All candidates on top of `job`, best first, on at most `limit` windows."""
+    """All candidates on top of `job`, best first, on at most `limit` windows.
+
+    Where there are many starting points, a third of the windows tells which are worth a second look on all of them.
+    """
+    every = [(i, point) for i, candidate in enumerate(candidates) for point in candidate.probes]
+    if len(every) <= MANY:
+        return _ordered(_looked_at(fitter, job, candidates, every, limit))
+    coarse = _looked_at(fitter, job, candidates, every, max(limit // 3, FEWEST))
+    order = sorted(coarse, key=lambda i: -max(s.gain for s, _ in coarse[i]))[:CANDIDATES]
+    again = [(i, p) for i in order for _, p in sorted(coarse[i], key=lambda f: -f[0].gain)[:POINTS]]
+    fine = _looked_at(fitter, job, candidates, again, limit)
+    return _ordered(fine) + _ordered({i: found for i, found in coarse.items() if i not in fine})
+
+
+def _looked_at(
+    fitter: Fitter, job: Job, candidates: Sequence[Candidate], plans: Sequence[tuple[int, Array]], limit: int
+) -> dict[int, list[tuple[Screened, Array]]]:
+    """{candidate: [(what its starting point gains, the point)]} for plans of (candidate, point)."""
     count = len(job.r)
     own = np.unique(np.linspace(0, count - 1, min(count, limit)).round().astype(int))
-    job = _part(job, own)
-    owner, thetas, points = [], [], []
-    for i, candidate in enumerate(candidates):
-        for point in candidate.probes:
-            owner.append(i)
-            points.append(point)
-            coordinates = (*job.coordinates, *candidate.coordinates)
-            thetas.append(fitter.vector(coordinates, np.concatenate([job.values, point])))
-    if not thetas:
-        return []
+    part = _part(job, own)
+    if not plans:
+        return {}
+    thetas = [
+        fitter.vector((*job.coordinates, *candidates[i].coordinates), np.concatenate([job.values, point]))
+        for i, point in plans
+    ]
     run = fitter.simulator.run
-    shifted = fitter.whiten(run(np.stack(thetas), np.repeat(job.offsets[None], len(thetas), 0), own))
-    columns = job.r[None] - shifted  # [m, W, n]
-    project = _Projection(fitter, job)
+    shifted = fitter.whiten(run(np.stack(thetas), np.repeat(part.offsets[None], len(thetas), 0), own))
+    columns = part.r[None] - shifted  # [m, W, n]
+    project = _Projection(fitter, part)
     each: dict[int, list[tuple[Screened, Array]]] = {}
-    for i, point, column in zip(owner, points, columns, strict=True):
-        each.setdefault(i, []).append((_one(project, candidates[i], point, column), point))
-    best = [_with_others(found) for found in each.values()]
-    best = [replace(s, gain=s.gain * count / len(own)) for s in best]
-    return sorted(best, key=lambda s: -s.gain)
+    for (i, point), column in zip(plans, columns, strict=True):
+        one = _one(project, candidates[i], point, column)
+        each.setdefault(i, []).append((replace(one, gain=one.gain * count / len(own)), point))
+    return each
+
+
+def _ordered(each: dict[int, list[tuple[Screened, Array]]]) -> list[Screened]:
+    return sorted((_with_others(found) for found in each.values()), key=lambda s: -s.gain)
 
 
 def _with_others(found: list[tuple[Screened, Array]]) -> Screened:

@@ -1,5 +1,6 @@
 """Screening from one simulation per starting point: the true effect first, its gain foretold."""
 
+import importlib
 from typing import Any
 
 import numpy as np
@@ -59,3 +60,19 @@ def test_what_the_known_parameters_already_do_is_absorbed(setup):
 def test_no_candidates_no_answers(screened):
     _, _, fitter, job, _ = screened
     assert screen(fitter, job, []) == []
+
+
+def test_a_first_look_at_few_windows_keeps_what_matters(screened, monkeypatch):
+    truth, setup, fitter, job, _ = screened
+    whole = screen(fitter, job, setup.candidates, 24)
+    module = importlib.import_module("bayessim_mjx.diagnosis.screen")
+    monkeypatch.setattr(module, "MANY", 0)
+    monkeypatch.setattr(module, "CANDIDATES", 3)
+    before = fitter.simulator.rollouts
+    found = screen(fitter, job, setup.candidates, 24)
+    points = sum(len(c.probes) for c in setup.candidates)
+    assert fitter.simulator.rollouts - before <= 8 * points + 24 * 3 * module.POINTS
+    assert {s.candidate.label for s in found} == {c.label for c in setup.candidates}
+    assert found[0].candidate.effect == truth
+    np.testing.assert_allclose(found[0].gain, whole[0].gain)
+    np.testing.assert_allclose(found[0].start, whole[0].start)
