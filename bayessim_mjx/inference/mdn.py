@@ -1,7 +1,9 @@
-"""Mixture density network: standardised features -> mixture of Gaussians over z-scored unit coordinates.
+"""Mixture density network: standardised features -> mixture of Gaussians over z-scored coordinates of the parameters.
 
-y = (u - 1/2) sqrt(12) has mean 0 and variance 1 under every prior. A component is N(y; mu, (A^T A)^-1) with A lower
-triangular, so training needs no solve and its log-determinant is exact (reference/sbi.md section 2.2).
+y is the chart's coordinate with mean 0 and variance 1 under the prior. The network (MLP, or random Fourier features)
+gives centres mu and lower triangular A. A component is N(y; mu, (A^T A)^-1), so training needs no solve and its
+log-determinant is exact; in the probit chart it is N(y; 0, I) exp(-|A (y - mu)|^2 / 2) / Z: precision I + A^T A, never
+broader than the prior, for products and sequential rounds (reference/sbi.md section 2).
 """
 
 from __future__ import annotations
@@ -13,33 +15,52 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from bayessim_mjx.distributions import Distribution, box, charts
+from bayessim_mjx.inference import features
 from bayessim_mjx.inference.settings import InferenceSettings
-from bayessim_mjx.triangular import inverse_lower, product
+from bayessim_mjx.triangular import inverse_lower, lower_factor, product
 
 Params = dict[str, Any]
 RIDGE_LIMIT = 1024  # features up to which linear_start is worth its cost
-SPREAD = np.float32(np.sqrt(12.0))  # 1 / sd of Uniform[0, 1]
+RIDGE = 1e-3  # of the features' variance
+WEAK = 0.05  # smallest precision beyond the prior's that linear_start gives to a component of the probit chart
+MULTIPLES = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0)  # of the median distance: bandwidths tried by validation
+CUT_POINTS = 16  # quasi-Monte-Carlo points of a component's mass inside the box, in training
+FIXED = ("omega", "rate")  # of the parameters, those that are not trained
+LOG_2PI = float(np.log(2 * np.pi))
 
 
-def to_y(u: Array) -> Array:
+def to_y(u: Array, chart: str = "plain") -> Array:
     """Unit coordinates -> coordinates of the network."""
-    return (u - 0.5) * SPREAD
+    centre, sd = charts.SCORE[chart]
+    return (charts.to_chart(u, chart) - np.float32(centre)) * np.float32(1 / sd)
 
 
-def from_y(y: Array) -> Array:
-    """Coordinates of the network -> unit coordinates."""
-    return y / SPREAD + 0.5
+def log_volume(y: Array, chart: str) -> Array:
+    """log |det dy/du| at y [..., d] -> [...]: what a log density of y needs to be one of u."""
+    centre, sd = charts.SCORE[chart]
+    return charts.log_slope(y * np.float32(sd) + np.float32(centre), chart) - np.float32(y.shape[-1] * np.log(sd))
+
+
+def bounded(settings: InferenceSettings) -> bool:
+    """Whether components have the precision I + A^T A."""
+    return settings.coordinates == "probit"
 
 
 def head_size(d: int, settings: InferenceSettings) -> int:
-    """Outputs of the network: logits, means, log diagonals, strictly lower entries."""
+    """Outputs of the network: logits, centres, log diagonals, strictly lower entries."""
     lower = d * (d - 1) // 2 if settings.fullCovariance else 0
     return settings.components * (1 + 2 * d + lower)
 
 
 def init(key: Array, settings: InferenceSettings, dim_x: int, d: int) -> Params:
-    """Network weights: hidden layers, a small last layer, a linear path from input to output, spread mean biases."""
-    sizes = (dim_x, *settings.hiddenLayers, head_size(d, settings))
+    """Network weights: hidden layers, a small last layer, a linear path from input to output, spread centre biases."""
+    fixed: Params = {}
+    sizes: tuple[int, ...] = (dim_x, *settings.hiddenLayers, head_size(d, settings))
+    if settings.kernel is not None:
+        omega = features.frequencies(settings.kernel, dim_x, settings.fourierFeatures)
+        fixed = {"omega": jnp.asarray(omega), "rate": jnp.asarray(1 / (settings.fixed_bandwidth or 1.0), jnp.float32)}
+        sizes = (2 * settings.fourierFeatures, sizes[-1])
     keys = jax.random.split(key, len(sizes))
     gains = [1.0] * (len(sizes) - 2) + [0.1]
     layers = [
@@ -49,47 +70,97 @@ def init(key: Array, settings: InferenceSettings, dim_x: int, d: int) -> Params:
     k = settings.components
     biases = layers[-1]["b"].at[k : k + k * d].set(0.7 * jax.random.normal(keys[-1], (k * d,)))
     layers[-1] = {**layers[-1], "b": biases}
-    return {"layers": layers, "skip": jnp.zeros((dim_x, sizes[-1]))}
+    return {"layers": layers, "skip": jnp.zeros((dim_x, sizes[-1])), **fixed}
+
+
+def hidden(params: Params, x: Array) -> Array:
+    """What the last layer sees: hidden units or Fourier features, [n, D] -> [n, H]."""
+    if "omega" in params:
+        return features.fourier(x, params["omega"], params["rate"])
+    for layer in params["layers"][:-1]:
+        x = jax.nn.silu(x @ layer["w"] + layer["b"][None, :])
+    return x
+
+
+def choose_bandwidth(
+    params: Params, x: Array, y: Array, train: Array, held: Array, settings: InferenceSettings
+) -> Params:
+    """Set the features' bandwidth from the data (`train`, `held` [n] are bool); nothing to do for MDNN or a number."""
+    if settings.kernel is None or settings.fixed_bandwidth is not None:
+        return params
+    median = features.median_distance(x, train)
+    if settings.bandwidth == "median" or x.shape[1] + 2 * settings.fourierFeatures > RIDGE_LIMIT:
+        return {**params, "rate": 1 / median}
+
+    def held_out(rate: Array) -> Array:
+        """log det of the held-out residuals' covariance."""
+        design = jnp.concatenate([features.fourier(x, params["omega"], rate), x], axis=1)
+        mean, slope = ridge(design, y, train.astype(jnp.float32))
+        residual = jnp.where(held[:, None], y - mean[None, :] - product(design, slope), 0.0)
+        cov = product(residual.T, residual) / jnp.maximum(jnp.sum(held.astype(jnp.float32)), 1.0)
+        return jnp.linalg.slogdet(cov + 1e-6 * jnp.eye(y.shape[1]))[1]
+
+    rates = 1 / (median * jnp.asarray(MULTIPLES, jnp.float32))
+    return {**params, "rate": rates[jnp.argmin(jax.lax.map(held_out, rates))]}
+
+
+def ridge(design: Array, y: Array, weights: Array) -> tuple[Array, Array]:
+    """Ridge regression of y [n, d] on design [n, H] with weights [n] of 0 or 1 -> mean [d], slope [H, d]."""
+    n = jnp.maximum(jnp.sum(weights), 1.0)
+    mean = weights @ y / n
+    weighted = (design * weights[:, None]).T
+    gram = product(weighted, design) / n + RIDGE * jnp.eye(design.shape[1])
+    return mean, jnp.linalg.solve(gram, product(weighted, y - mean[None, :]) / n)
 
 
 def linear_start(params: Params, x: Array, y: Array, weights: Array, settings: InferenceSettings) -> Params:
     """Set the linear path to the ridge regression of y [n, d] on x [n, D] and every component to its residuals.
 
     Training then starts at the best linear-Gaussian posterior instead of the prior; components keep their spread, in
-    units of the residual sd. `weights` [n] are 1 for rows to use and 0 for the rest. No change beyond RIDGE_LIMIT
-    features, where the normal equations would cost more than they save.
+    units of the residual sd. With Fourier features these are regressed on too. `weights` [n] are 1 for rows to use and
+    0 for the rest. No change beyond RIDGE_LIMIT features, where the normal equations would cost more than they save.
     """
     (dim_x, d), k = (x.shape[1], y.shape[1]), settings.components
-    if dim_x > RIDGE_LIMIT or d == 0:
+    design = jnp.concatenate([hidden(params, x), x], axis=1) if "omega" in params else x
+    if design.shape[1] > RIDGE_LIMIT or d == 0:
         return params
-    n = jnp.maximum(jnp.sum(weights), 1.0)
-    gram = product((x * weights[:, None]).T, x) / n + 1e-3 * jnp.eye(dim_x)
-    mean = weights @ y / n
-    slope = jnp.linalg.solve(gram, product((x * weights[:, None]).T, y - mean[None, :]) / n)  # [D, d]
-    residual = (y - mean[None, :] - x @ slope) * weights[:, None]
-    chol = jnp.linalg.cholesky(residual.T @ residual / n + 1e-4 * jnp.eye(d))
-    sd = jnp.sqrt(jnp.sum(chol * chol, axis=1))
-    factor = inverse_lower(chol)
+    mean, slope = ridge(design, y, weights)
+    residual = (y - mean[None, :] - product(design, slope)) * weights[:, None]
+    cov = product(residual.T, residual) / jnp.maximum(jnp.sum(weights), 1.0) + 1e-4 * jnp.eye(d)
+    sd = jnp.sqrt(jnp.diagonal(cov))
+    if bounded(settings):
+        mean, slope, cov = _beyond_prior(mean, slope, cov)
+    factor = inverse_lower(jnp.linalg.cholesky(cov))  # A^T A = cov^-1
     if not settings.fullCovariance:
-        factor = jnp.diag(1.0 / sd)
+        factor = jnp.diag(1.0 / jnp.sqrt(jnp.diagonal(cov)))
     last = params["layers"][-1]
     spread = last["b"][k : k + k * d].reshape(k, d)
-    log_diagonal = 8 * jnp.arctanh(jnp.log(jnp.diagonal(factor)) / 8)
+    log_diagonal = 8 * jnp.arctanh(jnp.clip(jnp.log(jnp.diagonal(factor)) / 8, -0.99, 0.99))
     parts = [jnp.zeros(k), (mean[None, :] + spread * sd[None, :]).reshape(-1), jnp.tile(log_diagonal, k)]
     if settings.fullCovariance:
         parts.append(jnp.tile(factor[np.tril_indices(d, -1)], k))
-    skip = params["skip"].at[:, k : k + k * d].set(jnp.tile(slope, (1, k)))
-    return {"layers": [*params["layers"][:-1], {**last, "b": jnp.concatenate(parts)}], "skip": skip}
+    columns = jnp.tile(slope, (1, k))
+    weight = last["w"]
+    if "omega" in params:
+        weight = weight.at[:, k : k + k * d].add(columns[:-dim_x])
+    skip = params["skip"].at[:, k : k + k * d].set(columns[-dim_x:])
+    layers = [*params["layers"][:-1], {"w": weight, "b": jnp.concatenate(parts)}]
+    return {**params, "layers": layers, "skip": skip}
+
+
+def _beyond_prior(mean: Array, slope: Array, cov: Array) -> tuple[Array, Array, Array]:
+    """Centre mu, its slope and (A^T A)^-1 of the component of precision I + A^T A with that posterior mean and cov."""
+    values, vectors = jnp.linalg.eigh(cov)
+    extra = jnp.maximum(1 / values - 1, WEAK)  # eigenvalues of A^T A
+    stretch = product(vectors * ((1 + extra) / extra)[None, :], vectors.T)  # m = (I + A^T A)^-1 A^T A mu
+    return stretch @ mean, product(slope, stretch), product(vectors / extra[None, :], vectors.T)
 
 
 def forward(params: Params, x: Array, d: int, settings: InferenceSettings) -> tuple[Array, Array, Array]:
-    """Standardised x [n, D] -> logits [n, K], means [n, K, d], precision factors A [n, K, d, d] in y coordinates."""
+    """Standardised x [n, D] -> log weights [n, K], centres mu [n, K, d], factors A [n, K, d, d] in y coordinates."""
     n, k = x.shape[0], settings.components
-    h = x
-    for layer in params["layers"][:-1]:
-        h = jax.nn.silu(h @ layer["w"] + layer["b"][None, :])
     last = params["layers"][-1]
-    out = h @ last["w"] + last["b"][None, :] + x @ params["skip"]
+    out = hidden(params, x) @ last["w"] + last["b"][None, :] + x @ params["skip"]
     logits, means, diagonal, lower = jnp.split(out, np.cumsum([k, k * d, k * d]), axis=1)
     # A_ii = exp(8 tanh(r / 8)): between exp(-8) and exp(8), slope 1 at r = 0
     diagonal = jnp.exp(8 * jnp.tanh(diagonal.reshape(n, k, d) / 8))
@@ -97,22 +168,117 @@ def forward(params: Params, x: Array, d: int, settings: InferenceSettings) -> tu
     if settings.fullCovariance and d > 1:
         rows, columns = np.tril_indices(d, -1)
         factors = factors.at[:, :, rows, columns].set(lower.reshape(n, k, -1))
-    return logits, means.reshape(n, k, d), factors
+    return jax.nn.log_softmax(logits), means.reshape(n, k, d), factors
+
+
+def log_normaliser(means: Array, factors: Array, settings: InferenceSettings) -> Array:
+    """log of the integral of a component's exp(-|A (y - mu)|^2 / 2), in the probit chart against N(y; 0, I)."""
+    d = means.shape[-1]
+    if bounded(settings):
+        eye = jnp.broadcast_to(jnp.eye(d), factors.shape)
+        return overlap(means, factors, jnp.zeros_like(means), eye)
+    log_det = jnp.sum(jnp.log(jnp.diagonal(factors, axis1=-2, axis2=-1)), axis=-1)
+    return np.float32(0.5 * d * LOG_2PI) - log_det
+
+
+def overlap(means: Array, factors: Array, centres: Array, scales: Array) -> Array:
+    """log of the integral of N(y; centre, S S^T) exp(-|A (y - mu)|^2 / 2).
+
+    It is the evidence N(A mu; A centre, I + A S S^T A^T) less its constant: nothing is inverted, nothing cancels.
+    """
+    spread = product(factors, scales)
+    gap = product(factors, (means - centres)[..., None])
+    gram = product(spread, jnp.swapaxes(spread, -1, -2)) + jnp.eye(means.shape[-1])[(None,) * (spread.ndim - 2)]
+    return log_gaussian(gap[..., 0], gram)
+
+
+def log_gaussian(v: Array, cov: Array) -> Array:
+    """log N(v; 0, cov) + d/2 log 2 pi: v [..., d], cov [..., d, d] -> [...].
+
+    Elimination row by row with the batch as the last axis: in training many times faster than loops over batches of
+    small matrices, and no LAPACK (see triangular.py).
+    """
+    d = v.shape[-1]
+    rows = jnp.moveaxis(cov.reshape(-1, d, d), 0, -1)  # [d, d, n]
+
+    def eliminate(carry: tuple[Array, Array, Array], _: None) -> tuple[tuple[Array, Array, Array], None]:
+        rows, right, value = carry
+        pivot = jnp.maximum(rows[0, 0], 1e-20)
+        value = value - 0.5 * jnp.log(pivot) - 0.5 * right[0] * right[0] / pivot
+        column = rows[1:, 0] / pivot[None]
+        right = jnp.pad(right[1:] - column * right[:1], ((0, 1), (0, 0)))
+        rows = jnp.pad(rows[1:, 1:] - column[:, None] * rows[:1, 1:], ((0, 1), (0, 1), (0, 0)))
+        return (rows, right, value), None
+
+    start = rows, v.reshape(-1, d).T, jnp.zeros(rows.shape[-1], v.dtype)
+    return jax.lax.scan(eliminate, start, length=d)[0][2].reshape(v.shape[:-1])
 
 
 def log_prob(params: Params, x: Array, y: Array, settings: InferenceSettings) -> Array:
-    """Untruncated log density of y [n, d] given standardised x [n, D] -> [n]."""
-    d = y.shape[-1]
-    logits, means, factors = forward(params, x, d, settings)
+    """Log density of y [n, d] given standardised x [n, D] -> [n]; cut off at the box in truncated coordinates only."""
+    return density(forward(params, x, y.shape[-1], settings), y, settings)
+
+
+def density(heads: tuple[Array, Array, Array], y: Array, settings: InferenceSettings) -> Array:
+    """`log_prob` from what `forward` gives."""
+    weights, means, factors = heads
     z = jnp.sum(factors * (y[:, None, :] - means)[:, :, None, :], axis=-1)  # A (y - mu)
-    log_det = jnp.sum(jnp.log(jnp.diagonal(factors, axis1=-2, axis2=-1)), axis=-1)
-    constant = np.float32(0.5 * d * np.log(2 * np.pi))
-    component = log_det - 0.5 * jnp.sum(z * z, axis=-1) - constant
-    return jax.nn.logsumexp(jax.nn.log_softmax(logits) + component, axis=-1)
+    component = weights - 0.5 * jnp.sum(z * z, axis=-1) - log_normaliser(means, factors, settings)
+    value = jax.nn.logsumexp(component, axis=-1)
+    if bounded(settings):
+        value = value - 0.5 * jnp.sum(y * y, axis=-1) - np.float32(0.5 * y.shape[-1] * LOG_2PI)
+    if settings.coordinates == "truncated":
+        value = value - log_inside(heads)
+    return value
+
+
+def log_inside(heads: tuple[Array, Array, Array]) -> Array:
+    """log mass of each row's mixture inside the cube, plain chart -> [n]; differentiable."""
+    weights, means, factors = heads
+    n, k, d = means.shape
+    centre, sd = (np.float32(v) for v in charts.SCORE["plain"])
+    flat = lambda v: v.reshape(n * k, *v.shape[2:])  # noqa: E731
+    points = 1 if d == 1 else CUT_POINTS
+    mass = box.log_masses(flat(means * sd + centre), flat(inverse_lower(factors) * sd), points)
+    return jax.nn.logsumexp(weights + mass.reshape(n, k), axis=-1)
+
+
+def log_tilt(heads: tuple[Array, Array, Array], proposal: Distribution, settings: InferenceSettings) -> Array:
+    """log of the integral of q(theta | x) proposal(theta) / prior(theta), in closed form: one proposal per row -> [n].
+
+    Non-atomic SNPE-C (Greenberg et al. 2019): pairs simulated from the proposal follow q proposal / (prior Z), with
+    this Z. In the plain chart the box is not looked at: for proposals well inside it.
+    """
+    weights, means, factors = heads
+    d, (centre, sd) = means.shape[-1], (np.float32(v) for v in charts.SCORE[settings.chart])
+    centres, scales = (proposal.means - centre) / sd, proposal.scales / sd
+    shape = jnp.broadcast_shapes(means[:, :, None].shape, centres[:, None].shape)
+    pair = overlap(
+        jnp.broadcast_to(means[:, :, None], shape),
+        jnp.broadcast_to(factors[:, :, None], (*shape, d)),
+        jnp.broadcast_to(centres[:, None], shape),
+        jnp.broadcast_to(scales[:, None], (*shape, d)),
+    )
+    volume = np.float32(0.0 if bounded(settings) else -d * np.log(sd))  # 1 / prior density of y
+    ratio = weights - log_normaliser(means, factors, settings) + volume
+    ratio = ratio[:, :, None] + pair + jax.nn.log_softmax(proposal.logits)[:, None, :]
+    mixed = jax.nn.logsumexp(ratio, axis=(1, 2)) - proposal.log_inside
+    w0 = proposal.prior_weight
+    usual = w0 < 1  # the prior itself needs no correction, and its unused Gaussians no gradient
+    mixed = jnp.where(usual, mixed, 0.0)
+    return jnp.logaddexp(jnp.log(w0), jnp.log(jnp.where(usual, 1 - w0, 1e-30)) + mixed)
 
 
 def mixture(params: Params, x: Array, d: int, settings: InferenceSettings) -> tuple[Array, Array, Array]:
-    """Mixture in unit coordinates: logits [n, K], means [n, K, d], Cholesky factors of the covariances [n, K, d, d]."""
-    logits, means, factors = forward(params, x, d, settings)
-    # covariance (A^T A)^-1 = A^-1 A^-T, and A^-1 is lower triangular
-    return logits, 0.5 + means / SPREAD, inverse_lower(factors) / SPREAD
+    """Mixture in the chart: log weights [n, K], means [n, K, d], Cholesky factors of the covariances [n, K, d, d]."""
+    weights, means, factors = forward(params, x, d, settings)
+    centre, sd = (np.float32(v) for v in charts.SCORE[settings.chart])
+    if not bounded(settings):
+        # covariance (A^T A)^-1 = A^-1 A^-T, and A^-1 is lower triangular
+        return weights, centre + means * sd, inverse_lower(factors) * sd
+    # I + A^T A = L L^T, its inverse is (L^-T) (L^-T)^T; mean = mu - (I + A^T A)^-1 mu
+    eye = jnp.broadcast_to(jnp.eye(d), factors.shape)
+    lower = lower_factor(jnp.concatenate([jnp.swapaxes(factors, -1, -2), eye], axis=-1))
+    scales = lower_factor(jnp.swapaxes(inverse_lower(lower), -1, -2))
+    shrunk = product(scales, product(jnp.swapaxes(scales, -1, -2), means[..., None]))[..., 0]
+    return weights, means - shrunk, scales

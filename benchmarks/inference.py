@@ -1,0 +1,136 @@
+"""Posteriors against exact ones: C2ST, log score, coverage and wall time with the compilation apart.
+
+    python benchmarks/inference.py --problems gaussian_linear two_moons pendulum --simulations 10000 --seeds 5
+    python benchmarks/inference.py --problems two_moons coordinates=truncated ensemble=5    # any InferenceSettings
+    python benchmarks/inference.py --problems two_moons --peers mdn maf nsf                 # sbi, where it is installed
+
+One row per problem, model and seed, as JSON. C2ST is the mean over three observations (0.5 = exact).
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import importlib.util
+import json
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from inference_c2st import c2st
+from inference_problems import PROBLEMS, Problem
+
+from bayessim_mjx.inference import InferenceSettings, condition, fit, init
+
+OBSERVATIONS, HELD_OUT = 3, 300
+
+
+def ours(problem: Problem, seed: int, thetas: Any, x: Any, options: dict) -> tuple[dict, Callable, Callable | None]:
+    """Fit twice, the second time compiled; -> row, sampler of (x, n), and log score and credible levels of pairs."""
+    settings = InferenceSettings(**{**problem.settings, **options})
+    seconds, cpu = [], []
+    for _ in range(2):
+        wall, process = time.perf_counter(), time.process_time()
+        state = init(jax.random.PRNGKey(seed), settings, problem.space, x.shape[1])
+        state, info = fit(jax.random.PRNGKey(seed + 1), state, thetas, x)
+        jax.block_until_ready(state.params)
+        seconds.append(time.perf_counter() - wall)
+        cpu.append(time.process_time() - process)
+    row = {
+        "model": settings.modelClass,
+        "coordinates": settings.coordinates,
+        "wall s": round(seconds[1], 2),
+        "cpu s": round(cpu[1], 2),
+        "cpu s with compilation": round(cpu[0], 2),
+        "best": int(info.best),
+    }
+
+    def sample(x: np.ndarray, n: int) -> np.ndarray:
+        return np.asarray(condition(state, jnp.asarray(x)[None]).split()[0].sample(jax.random.PRNGKey(9), n))
+
+    def scores(thetas: Any, x: Any) -> tuple[np.ndarray, np.ndarray]:
+        def one(x: Any, theta: Any) -> tuple[Any, Any]:
+            q = jax.tree.map(lambda leaf: leaf[0], condition(state, x[None]))
+            return q.log_prob(theta), q.credible_level(theta)
+
+        density, level = jax.lax.map(lambda row: one(*row), (x, thetas))
+        return np.asarray(density), np.asarray(level)
+
+    return row, sample, scores
+
+
+def peer(problem: Problem, seed: int, thetas: Any, x: Any, estimator: str) -> tuple[dict, Callable, None]:
+    """sbi's NPE at its defaults on the same pairs."""
+    import torch
+    from sbi.inference import NPE
+    from sbi.utils import BoxUniform
+
+    torch.manual_seed(seed)
+    low, high = (torch.tensor(np.array(v)) for v in (problem.space.low, problem.space.high))
+    prior: Any = BoxUniform(low, high)
+    if problem.name == "gaussian_linear":
+        prior = torch.distributions.MultivariateNormal(torch.zeros(10), 0.1 * torch.eye(10))
+    wall, process = time.perf_counter(), time.process_time()
+    trainer = NPE(prior=prior, density_estimator=estimator)
+    trainer.append_simulations(torch.tensor(np.array(thetas)), torch.tensor(np.array(x))).train()
+    posterior = trainer.build_posterior()
+    row = {"model": f"sbi {estimator}", "wall s": time.perf_counter() - wall, "cpu s": time.process_time() - process}
+
+    def sample(x: np.ndarray, n: int) -> np.ndarray:
+        return posterior.sample((n,), x=torch.tensor(np.array(x)), show_progress_bars=False).numpy()
+
+    return row, sample, None
+
+
+def measure(problem: Problem, seed: int, simulations: int, samples: int, model: Callable) -> dict:
+    """One row: fit `model` and compare it with the exact posterior."""
+    thetas, x = problem.pairs(jax.random.PRNGKey(1000 + seed), simulations)
+    row, sample, scores = model(problem, seed, thetas, x)
+    _, observed = problem.pairs(jax.random.PRNGKey(7), OBSERVATIONS)
+    rng = np.random.default_rng(seed)
+    values = []
+    for x_o in np.asarray(observed):
+        exact = problem.exact(rng, x_o, samples)
+        values.append(c2st(exact, sample(x_o, samples), seed))
+    row = {"problem": problem.name, "seed": seed, "simulations": simulations, **row, "c2st": round(np.mean(values), 4)}
+    row["each"] = [round(v, 3) for v in values]
+    if scores is not None:
+        density, level = scores(*problem.pairs(jax.random.PRNGKey(8), HELD_OUT))
+        row["log q"] = round(float(density.mean()), 3)
+        row["coverage 50/80/95"] = [round(float(np.mean(level <= p)), 3) for p in (0.5, 0.8, 0.95)]
+    return row
+
+
+def option(text: str) -> tuple[str, Any]:
+    name, _, value = text.partition("=")
+    try:
+        return name, ast.literal_eval(value)
+    except (ValueError, SyntaxError):
+        return name, value
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--problems", nargs="+", default=list(PROBLEMS), choices=list(PROBLEMS))
+    parser.add_argument("--simulations", type=int, default=10_000)
+    parser.add_argument("--samples", type=int, default=5000, help="of each posterior, for C2ST")
+    parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--peers", nargs="*", default=[], choices=["mdn", "maf", "nsf"])
+    args, rest = parser.parse_known_args()
+    if args.peers and importlib.util.find_spec("sbi") is None:
+        parser.error("--peers needs sbi: pip install sbi")
+    options = dict(option(text) for text in rest)
+    for name in args.problems:
+        problem = PROBLEMS[name]()
+        models: list[Callable] = [lambda *a: ours(*a, options)]
+        models += [lambda *a, e=e: peer(*a, e) for e in args.peers]
+        for seed in range(args.seeds):
+            for model in models:
+                print(json.dumps(measure(problem, seed, args.simulations, args.samples, model)), flush=True)
+
+
+if __name__ == "__main__":
+    main()

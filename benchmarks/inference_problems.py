@@ -1,0 +1,122 @@
+"""Inference problems whose exact posterior is known (gaussian_linear and two_moons are sbibm's definitions)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from bayessim_mjx.distributions import Distribution
+from bayessim_mjx.parameters import Parameter, ParameterSpace
+
+DRAWS = 400_000  # of the prior, behind the pendulum's exact posterior
+
+
+@dataclass(frozen=True)
+class Problem:
+    name: str
+    space: ParameterSpace
+    simulate: Callable[[Array, Array], Array]  # key, theta [n, d] -> x [n, D]
+    exact: Callable[[np.random.Generator, np.ndarray, int], np.ndarray]  # rng, x [D], n -> theta [n, d]
+    settings: dict  # what suits the problem: Gaussian priors are exact in probit coordinates
+
+    def pairs(self, key: Array, n: int) -> tuple[Array, Array]:
+        """theta [n, d] from the prior, x [n, D]."""
+        key_theta, key_x = jax.random.split(key)
+        thetas = Distribution.prior(self.space).sample(key_theta, n)
+        return thetas, self.simulate(key_x, thetas)
+
+
+def gaussian_linear() -> Problem:
+    """theta in R^10 ~ N(0, 0.1 I), x = theta + N(0, 0.1 I): posterior N(x / 2, 0.05 I)."""
+    sd = 0.1**0.5
+    space = ParameterSpace([Parameter(f"t{i}", 0.0, -2.0, 2.0, prior="gaussian", mean=0.0, sd=sd) for i in range(10)])
+
+    def simulate(key: Array, theta: Array) -> Array:
+        return theta + sd * jax.random.normal(key, theta.shape)
+
+    def exact(rng: np.random.Generator, x: np.ndarray, n: int) -> np.ndarray:
+        return x / 2 + 0.05**0.5 * rng.normal(size=(n, 10))
+
+    return Problem("gaussian_linear", space, simulate, exact, {"coordinates": "probit", "components": 1})
+
+
+def two_moons() -> Problem:
+    """theta ~ U[-1, 1]^2, a crescent of radius N(0.1, 0.01^2) moved by (-|t1 + t2|, t2 - t1) / sqrt(2)."""
+    space = ParameterSpace([Parameter(f"t{i}", 0.0, -1.0, 1.0) for i in range(2)])
+
+    def simulate(key: Array, theta: Array) -> Array:
+        key_angle, key_radius = jax.random.split(key)
+        a = jax.random.uniform(key_angle, theta.shape[:1], minval=-jnp.pi / 2, maxval=jnp.pi / 2)
+        r = 0.1 + 0.01 * jax.random.normal(key_radius, theta.shape[:1])
+        moved = jnp.stack([-jnp.abs(theta[:, 0] + theta[:, 1]), theta[:, 1] - theta[:, 0]], axis=1) / jnp.sqrt(2.0)
+        return jnp.stack([r * jnp.cos(a) + 0.25, r * jnp.sin(a)], axis=1) + moved
+
+    def exact(rng: np.random.Generator, x: np.ndarray, n: int) -> np.ndarray:
+        a, r = rng.uniform(-np.pi / 2, np.pi / 2, 20 * n), rng.normal(0.1, 0.01, 20 * n)
+        rest = x[None] - np.stack([r * np.cos(a) + 0.25, r * np.sin(a)], 1)
+        total = np.sqrt(2) * rest[:, 0] * rng.choice([-1, 1], 20 * n)
+        difference = np.sqrt(2) * rest[:, 1]
+        theta = np.stack([total - difference, total + difference], 1) / 2
+        return theta[(rest[:, 0] <= 0) & np.all(np.abs(theta) <= 1, axis=1)][:n]
+
+    return Problem("two_moons", space, simulate, exact, {"coordinates": "plain", "components": 16})
+
+
+def pendulum() -> Problem:
+    """q'' = -(9.81 / L) sin q - (b q' - u) / (m L^2) from q = 1, u = 1.5 sin 2t, 40 noisy (angle, velocity) in 2 s."""
+    ranges = (("length", 0.3, 1.5), ("mass", 0.3, 2.0), ("damping", 0.02, 0.5))
+    space = ParameterSpace([Parameter(n, (lo + hi) / 2, lo, hi) for n, lo, hi in ranges])
+    noise = np.tile(np.float32([0.05, 0.2]), 40)
+
+    def motion(theta: Array) -> Array:
+        length, mass, damping = theta
+
+        def step(state: tuple[Array, Array], t: Array) -> tuple[tuple[Array, Array], Array]:
+            q, v = state
+            torque = damping * v - 1.5 * jnp.sin(2 * t)
+            v = v + 0.01 * (-9.81 / length * jnp.sin(q) - torque / (mass * length**2))
+            q = q + 0.01 * v
+            return (q, v), jnp.stack([q, v])
+
+        _, states = jax.lax.scan(step, (jnp.ones(()), jnp.zeros(())), 0.01 * jnp.arange(200))
+        return states[4::5].reshape(-1)
+
+    clean = jax.jit(jax.vmap(motion))
+
+    def simulate(key: Array, theta: Array) -> Array:
+        return clean(theta) + noise * jax.random.normal(key, (theta.shape[0], 80))
+
+    cache: list[tuple[np.ndarray, np.ndarray]] = []
+
+    def exact(rng: np.random.Generator, x: np.ndarray, n: int) -> np.ndarray:
+        """Importance resampling of prior draws, twice: the second time around the first result."""
+        if not cache:
+            theta = Distribution.prior(space).sample(jax.random.PRNGKey(77), DRAWS)
+            cache.append((np.asarray(theta), np.asarray(clean(theta))))
+        theta, y = cache[0]
+        first = theta[_resample(rng, _log_likelihood(y, x), 2000)]
+        centre, cov = first.mean(0), 4 * np.cov(first.T) + 1e-8 * np.eye(3)
+        draws = rng.multivariate_normal(centre, cov, DRAWS // 4)
+        draws = draws[np.all((draws >= space.low) & (draws <= space.high), axis=1)].astype(np.float32)
+        gap = draws - centre
+        log_q = -0.5 * np.einsum("ni,ij,nj->n", gap, np.linalg.inv(cov), gap)
+        likelihood = _log_likelihood(np.asarray(clean(jnp.asarray(draws))), x)
+        return draws[_resample(rng, likelihood - log_q, n)]
+
+    def _log_likelihood(y: np.ndarray, x: np.ndarray) -> np.ndarray:
+        return -0.5 * np.sum(((y - x) / noise) ** 2, axis=1, dtype=np.float64)
+
+    return Problem("pendulum", space, simulate, exact, {"coordinates": "plain", "components": 8, "ensemble": 5})
+
+
+def _resample(rng: np.random.Generator, log_weights: np.ndarray, n: int) -> np.ndarray:
+    weights = np.exp(log_weights - log_weights.max())
+    return rng.choice(len(weights), n, p=weights / weights.sum())
+
+
+PROBLEMS = {make.__name__: make for make in (gaussian_linear, two_moons, pendulum)}
