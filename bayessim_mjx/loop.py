@@ -25,12 +25,14 @@ from bayessim_mjx.config import BayesSimConfig, Config
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.env import Env
 from bayessim_mjx.errors import UserError
+from bayessim_mjx.inference import calibration, checks, misspecification
 from bayessim_mjx.rl import Policy, TrainState
 from bayessim_mjx.rollout import Trajectory, replay, select
 
 CHUNK = 2500  # trajectories simulated at once while collecting
 KEPT_ROUNDS = 4  # rounds of simulated trajectories kept for the fit where the collection policy does not change
 PREDICTIVE_DRAWS = 64
+REFERENCE = 10000  # simulations that `reexamine` compares real trajectories with, at most
 CLIPPED = 0.01  # share of clipped summary entries worth a warning
 
 
@@ -65,6 +67,7 @@ class RoundInfo:
     scores: dict[str, float]  # log p(truth), gain over the prior, credible level, contraction per parameter
     seconds: dict[str, float]
     warnings: list[str]
+    checks: checks.Checks | None = None  # calibration, misfit, walls; None: none asked for
 
 
 class Monitor(Protocol):
@@ -248,7 +251,9 @@ def _infer(loop: Loop, state: LoopState, policy: Policy, info: RoundInfo) -> Loo
     assert source is not None and state.domain is not None
     clock = time.perf_counter()
     prior = Distribution.prior(loop.env.space, b.components)
-    thetas, features = _simulate(source, b.trainTrajs, loop.key(round_, "simulate"), policy, prior)
+    # one program for what is fitted and what tests the fit
+    pairs = _simulate(source, b.trainTrajs + b.checkTrajs, loop.key(round_, "simulate"), policy, prior)
+    (thetas, features), held = (tuple(p[: b.trainTrajs] for p in pairs), tuple(p[b.trainTrajs :] for p in pairs))
     count = b.trainTrajs
     if loop.capacity:
         row, count = (round_ * b.trainTrajs) % loop.capacity, min((round_ + 1) * b.trainTrajs, loop.capacity)
@@ -268,30 +273,56 @@ def _infer(loop: Loop, state: LoopState, policy: Policy, info: RoundInfo) -> Loo
     seen = round_ * b.realTrajs
     real_features, real = source.real(loop.key(round_, "real"), seen, b.realTrajs, policy)
     all_features = jax.lax.dynamic_update_slice(state.real_features, real_features, (seen, 0))
-    posteriors = _factors(network, all_features, b.priorShare)
+    fitted, known = (thetas, features, count), slice(seen if source.policy_dependent else 0, seen + b.realTrajs)
+    verdict = _examine(loop, round_, network, fitted, held, all_features, known, info)
+    widening = 1.0 if verdict is None else verdict[0].temperature or 1.0
+    posteriors = _factors(network, all_features, b.priorShare, widening)
     if source.policy_dependent:
         # An older trajectory was made by an older policy: its posterior stays that of the network of its time.
         new = jnp.arange(all_features.shape[0]) >= seen
         posteriors = select(new, posteriors, state.real_posteriors)
     rows = jax.tree.map(np.asarray, posteriors).split()  # on the host: an index on the device compiles each time
     usable = [row for row in rows[: seen + b.realTrajs] if _finite(row)]
-    domain = inference.combine(usable, b.components) if usable else prior
+    posterior = inference.combine(usable, b.components) if usable else prior
     if len(usable) < seen + b.realTrajs:
         info.warnings.append(f"{seen + b.realTrajs - len(usable)} real trajectories left out: no finite posterior")
-    info.warnings += _complaints(domain.names, info.fit, known_before=np.asarray(state.fit.identified))
-    info.posterior, info.real = domain, jax.tree.map(np.asarray, real)
-    info.scores = score(domain, source.truth)
-    info.predictive = _predict(loop, domain, real, loop.key(round_, "predict"))
-    info.seconds["condition"] = time.perf_counter() - clock
+    info.warnings += _complaints(posterior.names, info.fit, known_before=np.asarray(state.fit.identified))
+    info.posterior, info.real = posterior, jax.tree.map(np.asarray, real)
+    info.scores = score(posterior, source.truth)
+    domain = posterior
+    if verdict is not None:
+        info.checks = checks.conclude(*verdict, posterior, b.distrust)
+        told = posterior.names if round_ else _unknown(posterior.names, info.fit)
+        info.warnings += info.checks.warnings(told)
+        domain = checks.guarded(posterior, info.checks.prior_share)
+    info.predictive = _predict(loop, posterior, real, loop.key(round_, "predict"))
+    info.seconds["condition"] = time.perf_counter() - clock - info.seconds.get("check", 0.0)
     return dataclasses.replace(
         state, fit=network, real_features=all_features, real_posteriors=posteriors, domain=domain
     )
 
 
+def _examine(
+    loop: Loop, round_: int, network: Any, fitted: tuple, held: tuple, real: Array, known: slice, info: RoundInfo
+) -> tuple[calibration.Report, misspecification.Misfit] | None:
+    """Calibration and misfit, or None where they are switched off or too few fresh simulations are usable."""
+    clock = time.perf_counter()
+    if not loop.settings.checkTrajs:
+        return None
+    key = jax.random.fold_in(loop.key(round_, "fit"), 2)
+    try:
+        return checks.examine(key, network, fitted, held, real, known)
+    except ValueError as error:
+        info.warnings.append(str(error))
+        return None
+    finally:
+        info.seconds["check"] = time.perf_counter() - clock
+
+
 @jax.jit
-def _factors(network: Any, features: Array, prior_share: float) -> Distribution:
+def _factors(network: Any, features: Array, prior_share: float, widening: float) -> Distribution:
     """q(theta | x) of every real trajectory: the prior where nothing is identified, and a share of it everywhere."""
-    posteriors = inference.condition(network, features)
+    posteriors = calibration.widened(inference.condition(network, features), widening)
     posteriors = jax.vmap(inference.restore_prior, in_axes=(0, None))(posteriors, network.identified)
     return dataclasses.replace(posteriors, prior_weight=jnp.full_like(posteriors.prior_weight, prior_share))
 
@@ -302,9 +333,8 @@ def _finite(posterior: Distribution) -> bool:
 
 def _complaints(names: tuple[str, ...], fit: dict[str, Any], known_before: np.ndarray) -> list[str]:
     """What a person should know about this round's fit."""
-    texts, known = [], fit["identified"]
-    unknown = [name for name, k in zip(names, known, strict=True) if not k]
-    if unknown and not np.array_equal(known, known_before):
+    texts, unknown = [], _unknown(names, fit)
+    if unknown and not np.array_equal(fit["identified"], known_before):
         texts.append(f"not identified by these trajectories, kept at the prior: {', '.join(unknown)}")
     if fit["clipped"] > CLIPPED:
         texts.append(f"{100 * float(fit['clipped']):.1f} % of the summaries' entries lie beyond 10 sd and were clipped")
@@ -313,6 +343,34 @@ def _complaints(names: tuple[str, ...], fit: dict[str, Any], known_before: np.nd
     if fit["skipped"] > 0:
         texts.append(f"{int(fit['skipped'])} steps of the fit skipped: gradient not finite")
     return texts
+
+
+def reexamine(loop: Loop, state: LoopState, policy: Policy, pairs: int, seed: int = 0) -> checks.Checks:
+    """The checks of a round done again, on `pairs` fresh simulations and with a posterior predictive check.
+
+    `state` is that after the round and `policy` the one that it was evaluated with, as in its checkpoint.
+    """
+    b, source, rows = loop.settings, loop.source, int(state.round) * loop.settings.realTrajs
+    assert source is not None and state.domain is not None
+    prior, key = Distribution.prior(loop.env.space, b.components), jax.random.PRNGKey(seed)
+    key = jax.random.fold_in(jax.random.fold_in(key, 0xCA11), int(state.round))  # seen by no fit
+    known = min(b.trainTrajs, REFERENCE)
+    thetas, x = _simulate(source, known + pairs, jax.random.fold_in(key, 1), policy, prior)
+    held = thetas[known:], x[known:]
+    first = rows - b.realTrajs if source.policy_dependent else 0
+    verdict = checks.examine(
+        key, state.fit, (thetas[:known], x[:known], known), held, state.real_features, slice(first, rows)
+    )
+    again = checks.replicated(
+        jax.random.fold_in(key, 2), state.fit, held[1], lambda k, t: source.simulate(k, t, policy)
+    )
+    report = dataclasses.replace(verdict[0], predictive=again)
+    return checks.conclude(report, verdict[1], state.domain, b.distrust)
+
+
+def _unknown(names: tuple[str, ...], fit: dict[str, Any]) -> tuple[str, ...]:
+    """Parameters that the fit gives back their prior."""
+    return tuple(name for name, known in zip(names, fit["identified"], strict=True) if not known)
 
 
 def score(domain: Distribution, truth: np.ndarray | None) -> dict[str, float]:

@@ -250,6 +250,13 @@ class BayesSimConfig(Section):
     priorShare: float = setting(
         0.05, "prior mixed into each trajectory's posterior: a misjudged one cannot rule out the truth", low=0, high=1
     )
+    checkTrajs: int = setting(
+        300, "fresh simulated trajectories a round that test calibration and misfit; 0: no tests (else 40 or more)", low=0
+    )
+    distrust: float = setting(
+        0.5, "most of the prior mixed into the randomisation where the real trajectories look unlike simulated ones",
+        low=0, high=1,
+    )  # fmt: skip
     realEvals: int = setting(100, "surrogate-real episodes that score the policy each round", low=1)
     realTrajs: int = setting(1, "real trajectories used for inference each round (they accumulate)", low=1)
     realIters: int = setting(100, "rounds of the outer loop", low=1)
@@ -257,6 +264,8 @@ class BayesSimConfig(Section):
     policyCheckpt: str | None = setting(None, "checkpoint of a policy to start from", spell=_none)
 
     def check(self) -> None:
+        if 0 < self.checkTrajs < 40:
+            raise UserError(f"bayessim.checkTrajs = {self.checkTrajs}: 0 (no tests), or at least 40")
         summary_of(self.summarizerFxn, "bayessim.summarizerFxn")
         if self.modelClass is not None and self.modelClass not in MODELS:
             later = " (MDRFF is not in this version yet)" if self.modelClass.startswith("MDRFF") else ""

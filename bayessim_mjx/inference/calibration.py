@@ -15,12 +15,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.typing import ArrayLike
 from scipy.special import ndtr
 
 from bayessim_mjx.distributions import Distribution, box, charts
 
 LEVELS = (0.5, 0.8, 0.95)
 DRAWS = 256  # proposals per pair; those outside the box are left out
+FEWEST = 15  # pairs that say anything
 ALPHA = 0.01  # chance that a calibrated posterior is called anything else
 TEMPERATURES = np.geomspace(1.0, 4.0, 15).astype(np.float32)
 CALIBRATED, OVER, UNDER, BIASED, ODD = "calibrated", "over-confident", "under-confident", "biased", "miscalibrated"
@@ -122,13 +124,17 @@ class Report:
 def check(key: Array, posteriors: Distribution, thetas: Array, draws: int = DRAWS) -> Report:
     """Judge n batched posteriors by the thetas [n, d] that their data were simulated at; theta ~ prior.
 
-    Pairs that are not finite are left out; ValueError where fewer than 20 remain.
+    Pairs that are not finite are left out; ValueError where hardly any remains.
     """
     found = jax.tree.map(np.asarray, ranks(key, posteriors, jnp.asarray(thetas), draws))
+    return judge(_usable(found), posteriors.space)
+
+
+def _usable(found: Ranks) -> Ranks:
     keep = np.isfinite(found.gain) & np.all(np.isfinite(found.variance), axis=1)
-    if keep.sum() < 20:
-        raise ValueError(f"calibration: {int(keep.sum())} usable pairs; at least 20 are needed")
-    return judge(Ranks(*(part[keep] for part in found)), posteriors.space)
+    if keep.sum() < FEWEST:
+        raise ValueError(f"calibration: {int(keep.sum())} usable pairs; at least {FEWEST} are needed")
+    return Ranks(*(part[keep] for part in found))
 
 
 def judge(found: Ranks, space: Any) -> Report:
@@ -137,7 +143,7 @@ def judge(found: Ranks, space: Any) -> Report:
     pit = np.asarray(found.parameters, np.float64)
     coverage = {a: (float(np.mean(found.level <= a)), float(np.sqrt(a * (1 - a) / n))) for a in LEVELS}
     p = {name: uniform_p(pit[:, i]) for i, name in enumerate(names)}
-    p |= {"HPD level": uniform_p(found.level), "TARP": uniform_p(found.tarp)}
+    p |= {"HPD level": uniform_p(np.asarray(found.level)), "TARP": uniform_p(np.asarray(found.tarp))}
     # sd of U is 1/sqrt(12), that of (U - 1/2)^2 is 1/sqrt(180)
     bias = (pit.mean(0) - 0.5) * np.sqrt(12 * n)
     spread = (np.mean((pit - 0.5) ** 2, axis=0) - 1 / 12) * np.sqrt(180 * n)
@@ -200,14 +206,18 @@ def tempered(posterior: Distribution, factor: float | Array) -> Distribution:
     return Distribution.from_unit(q.space, q.logits, q.means, q.scales * factor, q.prior_weight, q.chart)
 
 
-def temperature(posteriors: Distribution, thetas: Array) -> float:
-    """The factor on standard deviations that gives batched posteriors the highest mean log density at thetas [n, d]."""
-    scores = np.asarray(_scores(posteriors, jnp.asarray(thetas), jnp.asarray(TEMPERATURES)))
-    return float(TEMPERATURES[int(np.argmax(scores))])
+def temperature(posteriors: Distribution, thetas: Array, weights: ArrayLike | None = None) -> float:
+    """The factor >= 1 on standard deviations that gives batched posteriors the highest mean log density at thetas.
+
+    thetas [n, d]; weights [n], 0 for pairs to leave out.
+    """
+    thetas = jnp.asarray(thetas)
+    weights = jnp.ones(thetas.shape[0]) if weights is None else jnp.asarray(weights, jnp.float32)
+    return float(TEMPERATURES[int(np.argmax(np.asarray(_scores(posteriors, thetas, weights))))])
 
 
 @jax.jit
-def _scores(posteriors: Distribution, thetas: Array, factors: Array) -> Array:
+def _scores(posteriors: Distribution, thetas: Array, weights: Array) -> Array:
     def one(q: Distribution, theta: Array, factor: Array) -> Array:
         scales = q.scales * factor
         # fewer points than Distribution.from_unit takes: there are many to weigh
@@ -217,9 +227,9 @@ def _scores(posteriors: Distribution, thetas: Array, factors: Array) -> Array:
 
     def at(factor: Array) -> Array:
         gain = jax.vmap(one, in_axes=(0, 0, None))(posteriors, thetas, factor)
-        return jnp.mean(jnp.where(jnp.isfinite(gain), gain, 0.0))
+        return jnp.mean(jnp.where(jnp.isfinite(gain), gain, 0.0) * weights)
 
-    return jax.lax.map(at, factors)
+    return jax.lax.map(at, jnp.asarray(TEMPERATURES))
 
 
 def corrected(key: Array, posteriors: Distribution, thetas: Array) -> Report:
@@ -227,19 +237,22 @@ def corrected(key: Array, posteriors: Distribution, thetas: Array) -> Report:
     report = check(key, posteriors, thetas)
     if report.verdict != OVER:
         return report
-    half = thetas.shape[0] // 2
-    first, second = (jax.tree.map(lambda leaf, part=part: leaf[part], posteriors) for part in _halves(half))
-    factor = temperature(first, thetas[:half])
+    n = thetas.shape[0]
+    factor = temperature(posteriors, thetas, np.arange(n) < n // 2)
     if factor <= 1.0:
         return report
-    wider = jax.vmap(tempered, in_axes=(0, None))(second, factor)
-    after = check(jax.random.fold_in(key, 1), wider, thetas[half:])
+    wider = widened(posteriors, factor)
+    # all of them: a program that is compiled already
+    found = jax.tree.map(np.asarray, ranks(jax.random.fold_in(key, 1), wider, jnp.asarray(thetas)))
+    after = judge(_usable(Ranks(*(part[n // 2 :] for part in found))), posteriors.space)
     words = f"{report.words}; standard deviations times {factor:.2f}, then {after.words}"
     return replace(after, words=words, temperature=factor, before=report.verdict)
 
 
-def _halves(half: int) -> tuple[slice, slice]:
-    return slice(None, half), slice(half, None)
+@jax.jit
+def widened(posteriors: Distribution, factor: float | Array) -> Distribution:
+    """Batched posteriors, `tempered`."""
+    return jax.vmap(tempered, in_axes=(0, None))(posteriors, factor)
 
 
 def predictive(x: np.ndarray, replicates: np.ndarray) -> tuple[float, np.ndarray]:

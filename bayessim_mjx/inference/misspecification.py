@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from bayessim_mjx.inference import mdn
 from bayessim_mjx.triangular import product
 
 FOURIER = 300  # random features of theta-hat behind E[z | theta-hat]
@@ -55,6 +56,10 @@ class Misfit:
     @property
     def flagged(self) -> bool:
         return self.joint < FLAGGED
+
+    def part(self, rows: slice) -> Misfit:
+        """Some of the trajectories."""
+        return Misfit(self.p[rows], self.parts[rows], self.sides[rows], self.features[rows], self.reference)
 
     def sentence(self) -> str:
         """What a person should know; empty where nothing is wrong."""
@@ -101,7 +106,7 @@ def ranked(held: Scores, real: Scores) -> Misfit:
     joint = np.nan_to_num(np.asarray(real.joint, np.float64), nan=np.inf)
     found = [_joint(np.asarray(held.joint, np.float64), row) for row in joint]
     p, parts, sides = (np.asarray(v) for v in zip(*found, strict=True))
-    return Misfit(p, parts, sides, _two_sided(held.features, np.asarray(real.features)), len(held.joint))
+    return Misfit(p, parts, sides, _two_sided(np.asarray(held.features), np.asarray(real.features)), len(held.joint))
 
 
 def _joint(held: np.ndarray, row: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
@@ -112,7 +117,7 @@ def _joint(held: np.ndarray, row: np.ndarray) -> tuple[float, np.ndarray, np.nda
     at_most = n - _count_below(-pool)
     tail = np.minimum(np.where(TWO_SIDED, 2.0 * np.minimum(at_least, at_most), at_least) / n, 1.0)
     # Cauchy combination; a score that fits well (p > 1/2) is no evidence against the others
-    evidence = np.sum(np.tan((0.5 - np.minimum(tail, 0.5)) * np.pi), axis=1)
+    evidence = np.sum(np.tan((0.5 - np.minimum(tail, 0.5)) * np.pi) - 1e-3 * tail, axis=1)  # the last: no ties
     p = float(np.mean(evidence >= evidence[-1]))
     return p, tail[-1], np.where(at_least[-1] <= at_most[-1], 1, -1)
 
@@ -131,11 +136,15 @@ def _two_sided(held: np.ndarray, real: np.ndarray) -> np.ndarray:
 
 
 def latent(state: Any, x: Array) -> Array:
-    """What the network made of summaries x [n, D]: its last hidden layer [n, H]."""
-    h = jnp.clip((x - state.x_mean[None, :]) * state.x_rate[None, :], -state.settings.clip, state.settings.clip)
+    """What the network made of summaries x [n, D]: the last hidden layers of all members of the ensemble, [n, E H]."""
+    clip = state.settings.clip
+    z = jnp.clip((x - state.x_mean[None, :]) * state.x_rate[None, :], -clip, clip)
+    if hasattr(mdn, "hidden"):
+        layers = jax.vmap(mdn.hidden, in_axes=(0, None))(state.params, z)
+        return jnp.moveaxis(layers, 0, 1).reshape(x.shape[0], -1)
     for layer in state.params["layers"][:-1]:
-        h = jax.nn.silu(h @ layer["w"] + layer["b"][None, :])
-    return h
+        z = jax.nn.silu(z @ layer["w"] + layer["b"][None, :])
+    return z
 
 
 @jax.jit

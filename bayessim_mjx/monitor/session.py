@@ -14,7 +14,7 @@ from bayessim_mjx.checkpoints import write_text
 from bayessim_mjx.config import Config
 from bayessim_mjx.logs import Channels
 from bayessim_mjx.loop import LoopState, RoundInfo
-from bayessim_mjx.monitor import plots, video
+from bayessim_mjx.monitor import plots, trust, video
 from bayessim_mjx.monitor.compile_clock import CompileClock
 from bayessim_mjx.monitor.console import Console
 from bayessim_mjx.monitor.wall import Wall
@@ -130,6 +130,7 @@ class Session:
         scalars |= {f"BayesSim/{name}": value for name, value in info.scores.items()}
         scalars |= {f"Perf/{name}_seconds": value for name, value in info.seconds.items()}
         scalars |= fit_scalars(info.fit)
+        scalars |= {} if info.checks is None else {f"BayesSim/{n}": v for n, v in info.checks.scalars.items()}
         self.inference.scalars(step, scalars)
         if self.config.monitor.posterior_plots:
             self._plots(info)
@@ -139,6 +140,8 @@ class Session:
             self._video(self.inference, f"{side.split('/')[0]}/video", policy, step)
         self._note(info)
         self.console.round_line(**round_line(info))
+        if info.checks is not None:
+            self.console.say(info.checks.sentence())
         for text in info.warnings:
             self.console.warning(text)
         self.flush()
@@ -150,6 +153,8 @@ class Session:
         if posterior is None:
             return
         step, names = info.round + 1, posterior.space.names
+        if info.checks is not None:
+            self.inference.figure("BayesSim/calibration", trust.calibration(info.checks.calibration, round=step), step)
         self.inference.figure("BayesSim/posterior", plots.corner(posterior, truth=info.truth, round=step), step)
         pairs = list(itertools.combinations(range(len(names)), 2))
         for i, j in pairs if len(pairs) <= MOST_PAIRS else []:
@@ -183,6 +188,8 @@ class Session:
         }
         if info.posterior is not None:
             row["posterior"] = info.posterior.describe()
+        if info.checks is not None:
+            row["checks"] = info.checks.to_dict()
         with open(self.path / ROUNDS, "a", encoding="utf-8") as file:
             file.write(json.dumps(row) + "\n")
 

@@ -69,3 +69,11 @@ def test_thin_components_survive():
     np.testing.assert_allclose(np.asarray(kept.scales), np.asarray(thin), rtol=1e-3, atol=1e-7)
     half = identify.restore_prior(q, jnp.asarray([False, True]))
     np.testing.assert_allclose(np.asarray(half.scales[0]), [[identify.FLAT, 0.0], [0.0, 0.2]], rtol=1e-4, atol=1e-5)
+
+
+def test_flat_parameters_are_named():
+    texts = identify.flat_sentences(
+        ("arm mass", "slider mass", "friction"), np.array([0.9, 0.01, 0.6]), np.array([0.8, 0.0, 0.01])
+    )
+    assert texts[0] == "slider mass: not identified by these trajectories"
+    assert texts[1].startswith("friction: not identified by the real trajectories") and len(texts) == 2

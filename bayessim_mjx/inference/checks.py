@@ -1,0 +1,108 @@
+"""What is asked of every inference: is it calibrated, does reality look like simulation, what was identified."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from bayessim_mjx.distributions import Distribution
+from bayessim_mjx.inference import calibration, misspecification
+from bayessim_mjx.inference.calibration import Report
+from bayessim_mjx.inference.fit import condition
+from bayessim_mjx.inference.identify import flat_sentences
+from bayessim_mjx.inference.misspecification import Misfit
+from bayessim_mjx.inference.walls import Pile, piles
+
+
+@dataclass(frozen=True)
+class Checks:
+    """Everything that was found, on the host."""
+
+    calibration: Report
+    misfit: Misfit
+    piles: tuple[Pile, ...]  # walls at which the posterior piles up
+    flat: tuple[str, ...]  # sentences on parameters that were not identified
+    prior_share: float  # of the prior, mixed into the randomisation because of the misfit
+
+    @property
+    def scalars(self) -> dict[str, float]:
+        """{name: number} for curves."""
+        report, names = self.calibration, self.calibration.names
+        found = {f"coverage_{100 * level:.0f}": share for level, (share, _) in report.coverage.items()}
+        found |= {f"calibration_p/{name}": p for name, p in report.p.items()}
+        found |= {f"expected_contraction/{n}": float(c) for n, c in zip(names, report.contraction, strict=True)}
+        found |= {"temperature": report.temperature or 1.0, "misfit_p": self.misfit.joint}
+        return found | {"misfit_prior_share": self.prior_share}
+
+    def sentence(self) -> str:
+        """One line: the verdict on the network, and on reality."""
+        report = self.calibration
+        reality = "unlike simulated ones" if self.misfit.flagged else "like simulated ones"
+        return (
+            f"posterior {report.words} (HPD coverage {report.table()}); "
+            f"real trajectories {reality}, p = {self.misfit.joint:.2g}"
+        )
+
+    def warnings(self, told: Sequence[str] = ()) -> list[str]:
+        """What a person should act on; of the parameters `told` it is known already that they are not identified."""
+        texts = [text for text in self.flat if text.split(":")[0] not in told]
+        if self.calibration.verdict != calibration.CALIBRATED:
+            texts.append(f"posterior {self.calibration.words}: simulate more (bayessim.trainTrajs)")
+        if self.misfit.flagged:
+            share = f"; {100 * self.prior_share:.0f} % of the randomisation is drawn from the prior"
+            texts.append(self.misfit.sentence() + (share if self.prior_share else ""))
+        return texts + [pile.sentence() for pile in self.piles]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain numbers, for JSON."""
+        misfit = {"p": self.misfit.joint, "trajectories": self.misfit.p.tolist(), "sentence": self.misfit.sentence()}
+        walls = [pile._asdict() for pile in self.piles]
+        return {
+            "calibration": self.calibration.to_dict(), "misfit": misfit, "walls": walls, "flat": list(self.flat),
+            "prior_share": self.prior_share,
+        }  # fmt: skip
+
+
+def examine(
+    key: Array, network: Any, simulated: tuple[Array, Array, int], held: tuple[Array, Array], real: Array, rows: slice
+) -> tuple[Report, Misfit]:
+    """Calibration of the network and misfit of the real summaries.
+
+    simulated: (thetas [N, d], x [N, D], valid rows) that the network was fitted on. held: fresh pairs (thetas, x) from
+    the prior. real [n, D]: summaries, of which `rows` are judged; the rest is padding that spares a compilation.
+    """
+    report = calibration.corrected(key, condition(network, held[1]), held[0])
+    misfit = misspecification.detect(network, *simulated, held[1], real)
+    return report, misfit.part(rows)
+
+
+def conclude(report: Report, misfit: Misfit, posterior: Distribution, distrust: float) -> Checks:
+    """The checks' result for the posterior given all real trajectories."""
+    flat = flat_sentences(posterior.names, report.contraction, np.asarray(posterior.contraction()))
+    share = misspecification.prior_share(misfit.joint, distrust)
+    return Checks(report, misfit, tuple(piles(posterior)), tuple(flat), share)
+
+
+def guarded(posterior: Distribution, share: float) -> Distribution:
+    """The posterior with a further `share` of the prior mixed in."""
+    w = posterior.prior_weight
+    return replace(posterior, prior_weight=jnp.asarray(w + share * (1 - w), jnp.float32)) if share else posterior
+
+
+def replicated(
+    key: Array, network: Any, x: Array, simulate: Callable[[Array, Array], Array], pairs: int = 200, each: int = 10
+) -> float:
+    """p-value of the posterior predictive check; simulate(key, thetas [n, d]) -> summaries [n, D] is called once."""
+    x, keys = x[:pairs], jax.random.split(key, 2)
+    draws = jax.vmap(lambda k, q: q.sample(k, each))(jax.random.split(keys[0], x.shape[0]), condition(network, x))
+    again = simulate(keys[1], draws.reshape(-1, draws.shape[-1]))
+    return calibration.predictive(np.asarray(x), np.asarray(again).reshape(x.shape[0], each, -1))[0]
+
+
+__all__ = ["Checks", "conclude", "examine", "guarded", "replicated"]

@@ -1,0 +1,108 @@
+"""The verdict on posteriors that are exact, or deliberately too narrow, too wide and shifted; p-values are uniform."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.stats import kstest
+
+from bayessim_mjx.distributions import Distribution
+from bayessim_mjx.inference import calibration
+from bayessim_mjx.parameters import Parameter, ParameterSpace
+
+SPACE = ParameterSpace([Parameter("a", 0.0, -1.0, 1.0), Parameter("b", 5.0, 0.0, 10.0)])
+MIXING = np.array([[1.0, 0.4], [0.0, 1.0]])
+COV = 0.15**2 * np.linalg.inv(MIXING.T @ MIXING)  # of u given x = MIXING u + N(0, 0.15^2 I), in unit coordinates
+PAIRS = 300
+
+
+def posteriors(seed, scale=1.0, shift=(0.0, 0.0)):
+    """(exact posteriors of PAIRS draws from the prior, changed as said; the truths). Exact: Gaussian cut to the box."""
+    key_u, key_x = jax.random.split(jax.random.PRNGKey(seed))
+    u = jax.random.uniform(key_u, (PAIRS, 2))
+    x = u @ MIXING.T.astype(np.float32) + 0.15 * jax.random.normal(key_x, (PAIRS, 2))
+    means = x @ np.linalg.inv(MIXING).T.astype(np.float32) + jnp.asarray(shift, jnp.float32)[None, :]
+    factor = jnp.asarray(scale * np.linalg.cholesky(COV), jnp.float32)
+    build = jax.jit(jax.vmap(lambda m: Distribution.from_unit(SPACE, jnp.zeros(1), m[None], factor[None])))
+    return build(means), jax.vmap(SPACE.from_unit)(u)
+
+
+def report(seed, **change):
+    return calibration.check(jax.random.PRNGKey(100 + seed), *posteriors(seed, **change))
+
+
+@pytest.fixture(scope="module")
+def exact():
+    return [report(seed) for seed in range(20)]
+
+
+def test_exact_posteriors_are_called_calibrated(exact):
+    assert sum(r.verdict == calibration.CALIBRATED for r in exact) >= 19  # 1 % each
+    shares = np.mean([[r.coverage[level][0] for level in calibration.LEVELS] for r in exact], axis=0)
+    errors = [exact[0].coverage[level][1] / np.sqrt(len(exact)) for level in calibration.LEVELS]
+    assert np.all(np.abs(shares - calibration.LEVELS) < 3.5 * np.asarray(errors))
+
+
+@pytest.mark.parametrize(
+    ("change", "verdict"),
+    [
+        ({"scale": 0.7}, calibration.OVER),
+        ({"scale": 1.5}, calibration.UNDER),
+        ({"shift": (0.0, 0.09)}, calibration.BIASED),
+    ],
+)
+def test_wrong_posteriors_are_caught(change, verdict):
+    reports = [report(seed, **change) for seed in range(5)]
+    assert all(r.verdict == verdict for r in reports), [r.words for r in reports]
+    if verdict == calibration.BIASED:
+        assert all("b (the truth is below)" in r.words and "a (" not in r.words for r in reports)
+
+
+def test_p_values_are_uniform_where_nothing_is_wrong(exact):
+    p = np.array([list(r.p.values()) for r in exact])
+    assert kstest(p[:, :2].ravel(), "uniform").pvalue > 0.001 and kstest(p[:, 3], "uniform").pvalue > 0.001
+    draws = np.random.default_rng(0).random((250, 100))
+    assert kstest([calibration.uniform_p(row) for row in draws], "uniform").pvalue > 0.01
+    # its 5 % point is 2.492 for any n (Stephens 1974)
+    assert np.quantile(calibration._null(100), 0.95) == pytest.approx(2.492, abs=0.15)
+
+
+def test_ranks_are_uniform_also_where_the_prior_is_mixed_in():
+    q, theta = posteriors(3)
+    mixed = dataclasses.replace(q, prior_weight=jnp.full(PAIRS, 0.3))
+    fresh = jax.jit(jax.vmap(lambda key, q: q.sample(key, 1)[0]))(jax.random.split(jax.random.PRNGKey(9), PAIRS), mixed)
+    found = calibration.check(jax.random.PRNGKey(1), mixed, fresh)  # theta drawn from q itself: exact by construction
+    assert found.verdict == calibration.CALIBRATED and min(found.p.values()) > 0.001
+
+
+def test_a_temperature_undoes_what_was_too_narrow():
+    q, theta = posteriors(5, scale=0.6)
+    found = calibration.corrected(jax.random.PRNGKey(0), q, theta)
+    assert found.before == calibration.OVER and found.verdict == calibration.CALIBRATED
+    assert found.temperature == pytest.approx(1 / 0.6, rel=0.2)
+    assert "standard deviations times" in found.words and found.pairs == PAIRS // 2
+    assert calibration.corrected(jax.random.PRNGKey(0), *posteriors(5)).temperature is None
+
+
+def test_contraction_is_that_of_the_exact_posterior(exact):
+    # draws cut by the box are a little narrower than sqrt(COV); var of the prior is 1/12 in unit coordinates
+    expected = 1 - np.diag(COV) * 12
+    assert np.all(exact[0].contraction > expected - 0.02) and np.all(exact[0].contraction < expected + 0.15)
+
+
+def test_too_few_pairs_are_refused():
+    q, theta = posteriors(0)
+    nothing = jax.tree.map(lambda leaf: jnp.full_like(leaf, jnp.nan), q)
+    with pytest.raises(ValueError, match="0 usable pairs"):
+        calibration.check(jax.random.PRNGKey(0), nothing, theta)
+
+
+def test_the_predictive_check_notices_replicates_that_lie_elsewhere():
+    rng = np.random.default_rng(0)
+    x, again = rng.normal(size=(200, 5)), rng.normal(size=(200, 10, 5))
+    p, features = calibration.predictive(x, again)
+    assert p > 0.01
+    p, features = calibration.predictive(x, again + np.array([0, 0, 0.7, 0, 0]))
+    assert p < 1e-3 and np.argmin(features) == 2
