@@ -251,7 +251,7 @@ class BayesSimConfig(Section):
         0.05, "prior mixed into each trajectory's posterior: a misjudged one cannot rule out the truth", low=0, high=1
     )
     checkTrajs: int = setting(
-        300, "fresh simulated trajectories a round that test calibration and misfit; 0: no tests (else 40 or more)", low=0
+        300, "fresh simulations a round that test calibration and misfit; 0: no tests (else 40 or more)", low=0
     )
     distrust: float = setting(
         0.5, "most of the prior mixed into the randomisation where the real trajectories look unlike simulated ones",

@@ -139,12 +139,8 @@ def latent(state: Any, x: Array) -> Array:
     """What the network made of summaries x [n, D]: the last hidden layers of all members of the ensemble, [n, E H]."""
     clip = state.settings.clip
     z = jnp.clip((x - state.x_mean[None, :]) * state.x_rate[None, :], -clip, clip)
-    if hasattr(mdn, "hidden"):
-        layers = jax.vmap(mdn.hidden, in_axes=(0, None))(state.params, z)
-        return jnp.moveaxis(layers, 0, 1).reshape(x.shape[0], -1)
-    for layer in state.params["layers"][:-1]:
-        z = jax.nn.silu(z @ layer["w"] + layer["b"][None, :])
-    return z
+    layers = jax.vmap(mdn.hidden, in_axes=(0, None))(state.params, z)
+    return jnp.moveaxis(layers, 0, 1).reshape(x.shape[0], -1)
 
 
 @jax.jit
