@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -60,8 +61,8 @@ def draw_truncated(key: Array, posterior: Distribution, n: int, mass: float = MA
     """
     key, key_level = jax.random.split(key)
     level = jnp.quantile(posterior.log_gain(posterior.sample(key_level, POOL)), mass)
-    wide = posterior.replace(scales=2 * posterior.scales, prior_weight=jnp.full((), 0.5, jnp.float32))  # type: ignore
-    wide = Distribution.from_unit(wide.space, wide.logits, wide.means, wide.scales, 0.5, wide.chart)
+    q = posterior
+    wide = Distribution.from_unit(q.space, q.logits, q.means, 2 * q.scales, 0.5, q.chart)
     kept: list[np.ndarray] = []
     weights: list[np.ndarray] = []
     while sum(len(rows) for rows in kept) < n:
@@ -135,7 +136,7 @@ def _network(key: Array, settings: InferenceSettings, space: object, x: Array) -
 def _learn(key: Array, rounds: Rounds, x: Array, method: str) -> None:
     """Fit the rows that the method may use, and condition on the real trajectories."""
     first = len(rounds.proposals) == 1
-    use, correction = slice(None), {}
+    use, correction = slice(None), dict[str, Any]()
     if method == "division":  # only the last round: its network is that of one proposal
         use = slice(len(rounds.thetas) - int((rounds.origin == len(rounds.proposals) - 1).sum()), None)
     elif method == "apt" and not first:
