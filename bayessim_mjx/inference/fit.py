@@ -16,7 +16,7 @@ import optax
 from flax import struct
 from jax import Array
 
-from bayessim_mjx.distributions import Distribution
+from bayessim_mjx.distributions import Distribution, charts
 from bayessim_mjx.inference import identify, mdn
 from bayessim_mjx.inference.settings import InferenceSettings
 
@@ -29,7 +29,7 @@ CURVE = 40  # points of the loss curves, at least
 class FitState:
     """What the next fit needs: weights and the standardisation of the inputs. Arrays only, but for the two settings."""
 
-    params: Any
+    params: Any  # of all members of the ensemble: leaves [E, ...]
     x_mean: Array  # [D]
     x_rate: Array  # [D] 1 / sd of the first fit's data; 0 drops a constant column
     fits: Array  # [] int32, fits done so far
@@ -43,10 +43,10 @@ class FitInfo:
     """What a person wants to see. Scores are means over held-out rows, in nats."""
 
     train_loss: Array  # [E] negative log density relative to the prior
-    val_loss: Array  # [E]
+    val_loss: Array  # [E], both are means over the ensemble
     steps: Array  # [] gradient steps taken
-    best: Array  # [] index into the curves of the weights kept; -1: those before this fit
-    gain: Array  # [] log q(theta | x) - log p(theta), density not truncated
+    best: Array  # [] index into the curves of the weights kept (the latest of the ensemble); -1: those before this fit
+    gain: Array  # [] log q(theta | x) - log p(theta), density not truncated (but in truncated coordinates)
     gain_truncated: Array  # [] the same for the truncated density, over the first 256 held-out rows
     log_q: Array  # [] truncated log density in theta units: gain_truncated + log p(theta)
     inside: Array  # [] mean mass of the untruncated mixture inside the box
@@ -62,28 +62,42 @@ class FitInfo:
 class _Data(NamedTuple):
     x: Array  # [N, D] standardised
     y: Array  # [N, d]
+    slopes: Array  # [N] log density of u = log density of y + this
     train: Array  # [N] bool
     held: Array  # [V] indices of held-out rows, padded
     mask: Array  # [V] float32
+    origin: Array | None  # [N] the proposal each row was simulated from
+    proposals: Distribution | None  # leaves [R, ...]
 
 
 def init(key: Array, settings: InferenceSettings, space: Any, dim_x: int) -> FitState:
     """Fresh network for summaries of `dim_x` features and the parameters of `space`."""
     if dim_x < 1:
         raise ValueError(f"dim_x = {dim_x}: a summary needs at least one feature")
-    params = mdn.init(key, settings, dim_x, len(space))
+    member = partial(mdn.init, settings=settings, dim_x=dim_x, d=len(space))
+    params = jax.vmap(member)(jax.random.split(key, settings.ensemble))
     known, fits = jnp.ones(len(space), bool), jnp.asarray(0, jnp.int32)
     return FitState(params, jnp.zeros(dim_x), jnp.ones(dim_x), fits, known, settings, space)
 
 
 def fit(
-    key: Array, state: FitState, thetas: Array, x: Array, count: int | Array | None = None
+    key: Array,
+    state: FitState,
+    thetas: Array,
+    x: Array,
+    count: int | Array | None = None,
+    proposals: Distribution | None = None,
+    origin: Array | None = None,
 ) -> tuple[FitState, FitInfo]:
     """Maximum likelihood on the first `count` rows of thetas [N, d] and x [N, D]; the rest is padding.
 
     Goes on from the weights in `state` with a fresh schedule. The weights with the best held-out score are kept, the
     starting ones included. Inputs keep the standardisation of the first fit, unless settings.restandardise. ValueError
     on wrong shapes or when no row is usable.
+
+    Rows simulated from other proposals than the prior are corrected for (mdn.log_tilt): `proposals` are distributions
+    with a leading axis R (proposal.stack), `origin` [N] says from which of them each row comes. The scores in the
+    FitInfo are then means over held-out rows of all proposals.
     """
     count = thetas.shape[0] if count is None else count
     d, dim_x = len(state.space), state.x_mean.shape[0]
@@ -91,11 +105,24 @@ def fit(
         raise ValueError(f"need thetas [N, {d}] and x [N, {dim_x}], not {thetas.shape} and {x.shape}")
     if isinstance(count, int | np.integer) and not 1 <= count <= thetas.shape[0]:
         raise ValueError(f"count = {count}: the arrays hold {thetas.shape[0]} rows")
+    if proposals is not None:
+        _check_proposals(state, thetas, proposals, origin)
+        origin = jnp.asarray(origin, jnp.int32)
     thetas, x = jnp.asarray(thetas, jnp.float32), jnp.asarray(x, jnp.float32)
-    state, info = _fit(key, state, thetas, x, jnp.asarray(count, jnp.int32))
+    state, info = _fit(key, state, thetas, x, jnp.asarray(count, jnp.int32), proposals, origin)
     if not isinstance(info.n_train, jax.core.Tracer) and int(info.n_train) == 0:
         raise ValueError(f"none of the {int(count)} rows is usable: summaries not finite, or thetas outside the box")
     return state, info
+
+
+def _check_proposals(state: FitState, thetas: Array, proposals: Distribution, origin: Array | None) -> None:
+    if origin is None or np.shape(origin) != (thetas.shape[0],):
+        raise ValueError(
+            f"proposals need origin [{thetas.shape[0]}], not {None if origin is None else np.shape(origin)}"
+        )
+    chart = state.settings.chart
+    if chart == "logit" or proposals.chart != chart:
+        raise ValueError(f"proposals in the {proposals.chart} chart, network in {chart}: both must be probit, or plain")
 
 
 def condition(state: FitState, x: Array) -> Distribution:
@@ -112,9 +139,18 @@ def _condition(state: FitState, x: Array) -> Distribution:
 
 def _posteriors(state: FitState, z: Array) -> Distribution:
     """Standardised summaries [n, D] -> batched Distribution, a trace of the prior mixed in."""
-    leaves = mdn.mixture(state.params, z, len(state.space), state.settings)
-    build = partial(Distribution.from_unit, state.space, prior_weight=state.settings.defensive)
-    return jax.vmap(build)(*leaves)
+    build = partial(
+        Distribution.from_unit, state.space, prior_weight=state.settings.defensive, chart=state.settings.chart
+    )
+    return jax.vmap(build)(*_mixtures(state, z))
+
+
+def _mixtures(state: FitState, z: Array) -> tuple[Array, Array, Array]:
+    """Log weights [n, E K], means and factors of the ensemble's mixture, all members alike."""
+    d, settings = len(state.space), state.settings
+    leaves = jax.vmap(lambda params: mdn.mixture(params, z, d, settings))(state.params)
+    joined = [jnp.moveaxis(leaf, 0, 1).reshape(z.shape[0], -1, *leaf.shape[3:]) for leaf in leaves]
+    return joined[0] - np.float32(np.log(settings.ensemble)), joined[1], joined[2]
 
 
 def schedule_length(settings: InferenceSettings, capacity: int) -> tuple[int, int]:
@@ -126,19 +162,64 @@ def schedule_length(settings: InferenceSettings, capacity: int) -> tuple[int, in
 
 
 @jax.jit
-def _fit(key: Array, state: FitState, thetas: Array, x: Array, count: Array) -> tuple[FitState, FitInfo]:
+def _fit(
+    key: Array,
+    state: FitState,
+    thetas: Array,
+    x: Array,
+    count: Array,
+    proposals: Distribution | None,
+    origin: Array | None,
+) -> tuple[FitState, FitInfo]:
     settings = state.settings
     state, data, clipped, n_invalid = _prepare(state, thetas, x, count)
+    data = data._replace(proposals=proposals, origin=origin)
     points, chunk = schedule_length(settings, x.shape[0])
+    member = partial(_train, data=data, settings=settings, fresh=state.fits == 0)
+    params, best, skipped, train_loss, val_loss = jax.vmap(member)(
+        jax.random.split(key, settings.ensemble), state.params
+    )
+    state = replace(state, params=params, fits=state.fits + 1)
+    marginals = _marginal_gain(_mixtures(state, data.x[data.held]), data.y[data.held], settings)
+    parameter_gain, identified = identify.identified(marginals, data.mask)
+    state = replace(state, identified=identified)
+    # densities of y -> densities of u; the same for every weight
+    volume = jnp.sum(jnp.where(data.train, data.slopes, 0.0)) / jnp.maximum(jnp.sum(data.train.astype(jnp.float32)), 1)
+    held_volume = jnp.sum(data.slopes[data.held] * data.mask) / jnp.sum(data.mask)
+    info = FitInfo(
+        train_loss=jnp.mean(train_loss, axis=0) - volume,
+        val_loss=jnp.mean(val_loss, axis=0) - held_volume,
+        steps=jnp.asarray(points * chunk, jnp.int32),
+        best=jnp.max(best),
+        gain=held_volume + _held_out_gain(state, data),
+        **_truncated_scores(state, data, thetas),
+        parameter_gain=parameter_gain,
+        identified=identified,
+        clipped=clipped,
+        n_train=jnp.sum(data.train.astype(jnp.int32)),
+        n_val=jnp.sum(data.mask).astype(jnp.int32),
+        n_invalid=n_invalid,
+        skipped=jnp.sum(skipped),
+    )
+    return state, info
+
+
+def _train(
+    key: Array, params: Any, data: _Data, settings: InferenceSettings, fresh: Array
+) -> tuple[Any, Array, Array, Array, Array]:
+    """One member: its best weights, where they were on the curve, steps skipped, and the two loss curves."""
+    points, chunk = schedule_length(settings, data.x.shape[0])
     optimiser = optax.chain(
         optax.clip_by_global_norm(settings.grad_clip),
         optax.adamw(optax.cosine_decay_schedule(settings.lr, points * chunk), weight_decay=settings.weight_decay),
     )
     n_train = jnp.sum(data.train.astype(jnp.int32))
-    batch = min(settings.batch, x.shape[0])
+    batch = min(settings.batch, data.x.shape[0])
+    params = jax.tree.map(lambda a, b: jnp.where(fresh, a, b), _fresh(params, data, settings), params)
+    fixed = {name: params[name] for name in mdn.FIXED if name in params}
 
     def loss(params: Any, rows: Array) -> Array:
-        return -jnp.mean(mdn.log_prob(params, data.x[rows], data.y[rows], settings))
+        return -jnp.mean(_objective({**params, **fixed}, rows, data, settings))
 
     def step(carry: tuple, rows: Array) -> tuple[tuple, Array]:
         params, opt_state, skipped = carry
@@ -157,41 +238,39 @@ def _fit(key: Array, state: FitState, thetas: Array, x: Array, count: Array) -> 
         order = jnp.argsort(jnp.where(data.train, jax.random.uniform(key, data.train.shape), jnp.inf))
         place = jnp.arange(chunk * batch, dtype=jnp.int32).reshape(chunk, batch) % jnp.maximum(n_train, 1)
         inner, losses = jax.lax.scan(step, inner, order[place])
-        value = _held_out_loss(inner[0], data, settings)
+        value = held_out(inner[0])
         better = value < best[0]
         candidate = (value, inner[0], i)
         best = jax.tree.map(lambda a, b: jnp.where(better, a, b), candidate, best)
         return (inner, best), (jnp.mean(losses), value)
 
-    linear = mdn.linear_start(state.params, data.x, data.y, data.train.astype(jnp.float32), settings)
-    params = jax.tree.map(lambda a, b: jnp.where(state.fits == 0, a, b), linear, state.params)
-    start = (params, optimiser.init(params), jnp.asarray(0, jnp.int32))
-    best = (_held_out_loss(params, data, settings), params, jnp.asarray(-1, jnp.int32))
+    def held_out(params: Any) -> Array:
+        value = _objective({**params, **fixed}, data.held, data, settings)
+        return -jnp.sum(jnp.where(data.mask > 0, value, 0.0)) / jnp.sum(data.mask)
+
+    trained = {name: leaf for name, leaf in params.items() if name not in fixed}
+    start = (trained, optimiser.init(trained), jnp.asarray(0, jnp.int32))
+    best = (held_out(trained), trained, jnp.asarray(-1, jnp.int32))
     inputs = jnp.arange(points, dtype=jnp.int32), jax.random.split(key, points)
     (inner, best), (train_loss, val_loss) = jax.lax.scan(point, (start, best), inputs)
+    return {**best[1], **fixed}, best[2], inner[2], train_loss, val_loss
 
-    state = replace(state, params=best[1], fits=state.fits + 1)
-    held = mdn.mixture(state.params, data.x[data.held], thetas.shape[1], settings)
-    marginals = identify.marginal_gain(*held, mdn.from_y(data.y[data.held]))
-    parameter_gain, identified = identify.identified(marginals, data.mask)
-    state = replace(state, identified=identified)
-    constant = np.float32(thetas.shape[1] * np.log(mdn.SPREAD))  # density of y -> density of u
-    info = FitInfo(
-        train_loss=train_loss - constant,
-        val_loss=val_loss - constant,
-        steps=jnp.asarray(points * chunk, jnp.int32),
-        best=best[2],
-        gain=constant - _held_out_loss(state.params, data, settings),
-        **_truncated_scores(state, data, thetas),
-        parameter_gain=parameter_gain,
-        identified=identified,
-        clipped=clipped,
-        n_train=n_train,
-        n_val=jnp.sum(data.mask).astype(jnp.int32),
-        n_invalid=n_invalid,
-        skipped=inner[2],
-    )
-    return state, info
+
+def _fresh(params: Any, data: _Data, settings: InferenceSettings) -> Any:
+    """The weights a first fit starts from."""
+    held = jnp.zeros_like(data.train).at[data.held].set(data.mask > 0)
+    params = mdn.choose_bandwidth(params, data.x, data.y, data.train, held, settings)
+    return mdn.linear_start(params, data.x, data.y, data.train.astype(jnp.float32), settings)
+
+
+def _objective(params: Any, rows: Array, data: _Data, settings: InferenceSettings) -> Array:
+    """What training maximises, per row: log q(theta | x), less the log of what the proposal makes of it."""
+    x, y = data.x[rows], data.y[rows]
+    if data.proposals is None or data.origin is None:
+        return mdn.log_prob(params, x, y, settings)
+    heads = mdn.forward(params, x, y.shape[-1], settings)
+    proposal = jax.tree.map(lambda leaf: leaf[data.origin[rows]], data.proposals)
+    return mdn.density(heads, y, settings) - mdn.log_tilt(heads, proposal, settings)
 
 
 def _prepare(state: FitState, thetas: Array, x: Array, count: Array) -> tuple[FitState, _Data, Array, Array]:
@@ -213,7 +292,9 @@ def _prepare(state: FitState, thetas: Array, x: Array, count: Array) -> tuple[Fi
     room = min(x.shape[0], int(state.settings.validation * x.shape[0]) + 8, 4096)
     order = jnp.argsort(~held)[:room]
     train = jnp.where(jnp.any(valid & ~held), valid & ~held, valid)
-    data = _Data(z, mdn.to_y(u), train, order, held[order].astype(jnp.float32))
+    y = mdn.to_y(u, state.settings.chart)
+    slopes = mdn.log_volume(y, state.settings.chart)
+    data = _Data(z, y, slopes, train, order, held[order].astype(jnp.float32), None, None)
     n_invalid = jnp.sum((given & ~valid).astype(jnp.int32))
     entries = jnp.maximum(jnp.sum(valid.astype(jnp.float32)), 1.0) * x.shape[1]
     share_clipped = jnp.sum(jnp.where(valid[:, None], clipped, 0.0)) / entries
@@ -235,9 +316,24 @@ def _standardise(x: Array, mean: Array, rate: Array, clip: float) -> tuple[Array
     return jnp.clip(z, -clip, clip), (jnp.abs(z) > clip).astype(jnp.float32)
 
 
-def _held_out_loss(params: Any, data: _Data, settings: InferenceSettings) -> Array:
-    value = mdn.log_prob(params, data.x[data.held], data.y[data.held], settings)
-    return -jnp.sum(jnp.where(data.mask > 0, value, 0.0)) / jnp.sum(data.mask)
+def _held_out_gain(state: FitState, data: _Data) -> Array:
+    """Mean log density of y of the ensemble's mixture over the held-out rows."""
+    value = jax.vmap(lambda params: _objective(params, data.held, data, state.settings))(state.params)
+    value = jax.nn.logsumexp(value, axis=0) - np.float32(np.log(state.settings.ensemble))
+    return jnp.sum(jnp.where(data.mask > 0, value, 0.0)) / jnp.sum(data.mask)
+
+
+def _marginal_gain(mixtures: tuple[Array, Array, Array], y: Array, settings: InferenceSettings) -> Array:
+    """log marginal density of each parameter relative to its prior at y [n, d] -> [n, d]."""
+    centre, sd = (np.float32(v) for v in charts.SCORE[settings.chart])
+    z = y * sd + centre
+    if settings.chart == "plain":
+        return identify.marginal_gain(*mixtures, z)
+    logits, means, scales = mixtures
+    spread = jnp.sqrt(jnp.sum(scales**2, axis=-1))  # [n, K, d]
+    density = jax.scipy.stats.norm.logpdf((z[:, None, :] - means) / spread) - jnp.log(spread)
+    marginal = jax.nn.logsumexp(jax.nn.log_softmax(logits)[:, :, None] + density, axis=1)
+    return marginal + charts.log_slope(z[..., None], settings.chart)
 
 
 def _truncated_scores(state: FitState, data: _Data, thetas: Array) -> dict[str, Array]:

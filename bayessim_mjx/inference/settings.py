@@ -2,15 +2,26 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, fields
 from typing import Any
 
-MODELS = ("MDNN",)
+MODEL = re.compile(r"MDNN|MDRFF(?:_(RBF|Laplace|Matern12|Matern32|Matern52)(?:_(median|validation|[0-9][0-9.e+-]*))?)?")
+COORDINATES = ("plain", "truncated", "probit", "logit")
 
 
 @dataclass(frozen=True)
 class InferenceSettings:
-    """The first five keep BayesSimIG's names; the training recipe is that of reference/sbi.md section 3.2."""
+    """The first five keep BayesSimIG's names; the training recipe is that of reference/sbi.md section 3.2.
+
+    modelClass is MDNN, or MDRFF[_<kernel>[_<bandwidth>]] with the kernels RBF, Matern12 (Laplace), Matern32, Matern52
+    and as bandwidth a number (in standard deviations of the features), `median` (of the distances) or `validation`
+    (the multiple of the median that a ridge regression predicts held-out rows with best; the default).
+
+    coordinates are those in which the posterior is a Gaussian mixture: `plain` unit coordinates (cut off at the box
+    afterwards), `truncated` (the same, cut off in training too), `probit` (the prior is exactly N(0, I) and no
+    component is broader; exact for Gaussian priors) or `logit`.
+    """
 
     modelClass: str = "MDNN"
     components: int = 10
@@ -27,12 +38,15 @@ class InferenceSettings:
     restandardise: bool = False  # inputs anew at every fit: for data whose distribution changes from fit to fit
     clip: float = 10.0  # standardised inputs are clipped to +-clip
     defensive: float = 1e-4  # prior mass in every posterior: one that is wildly wrong cannot veto the others
+    coordinates: str = "plain"
+    ensemble: int = 1  # networks trained side by side; their posterior has ensemble * components Gaussians
+    fourierFeatures: int = 256  # frequencies of MDRFF: twice as many features
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "hiddenLayers", tuple(int(width) for width in self.hiddenLayers))
-        if self.modelClass not in MODELS:
-            raise ValueError(f"modelClass = {self.modelClass!r}: this version has {', '.join(MODELS)}")
-        for name in ("components", "batch", "epochs", "min_steps", "max_steps", "lr", "grad_clip", "clip"):
+        self._check_model()
+        positive = ("components", "batch", "epochs", "min_steps", "max_steps", "lr", "grad_clip", "clip")
+        for name in (*positive, "ensemble", "fourierFeatures"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} = {getattr(self, name)!r} must be positive")
         if not 0 < self.validation < 1:
@@ -41,6 +55,41 @@ class InferenceSettings:
             raise ValueError(f"defensive = {self.defensive!r} must lie in [0, 1)")
         if any(width < 1 for width in self.hiddenLayers):
             raise ValueError(f"hiddenLayers = {self.hiddenLayers!r}: widths must be positive")
+        if self.coordinates not in COORDINATES:
+            raise ValueError(f"coordinates = {self.coordinates!r}: allowed are {', '.join(COORDINATES)}")
+
+    def _check_model(self) -> None:
+        try:
+            known = bool(MODEL.fullmatch(str(self.modelClass))) and (self.kernel is None or self.fixed_bandwidth != 0)
+        except ValueError:  # a bandwidth such as 1.2.3
+            known = False
+        if not known:
+            raise ValueError(
+                f"modelClass = {self.modelClass!r}: there are MDNN, MDRFF, MDRFF_<kernel>, MDRFF_<kernel>_<bandwidth>, "
+                "kernel one of RBF, Laplace, Matern12, Matern32, Matern52, bandwidth a number, median or validation"
+            )
+
+    @property
+    def kernel(self) -> str | None:
+        """Kernel of the Fourier features; None for MDNN."""
+        match = MODEL.fullmatch(self.modelClass)
+        return None if match is None or self.modelClass == "MDNN" else match.group(1) or "RBF"
+
+    @property
+    def bandwidth(self) -> str:
+        """`median`, `validation` or a number, as text."""
+        match = MODEL.fullmatch(self.modelClass)
+        return (match.group(2) if match else None) or "validation"
+
+    @property
+    def fixed_bandwidth(self) -> float | None:
+        """The bandwidth where it is given as a number."""
+        return None if self.bandwidth in ("median", "validation") else float(self.bandwidth)
+
+    @property
+    def chart(self) -> str:
+        """Chart of the posterior distributions (distributions/charts.py)."""
+        return "plain" if self.coordinates == "truncated" else self.coordinates
 
     @classmethod
     def of(cls, section: Any, **overrides: Any) -> InferenceSettings:

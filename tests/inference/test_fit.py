@@ -170,7 +170,7 @@ def test_the_density_of_the_network_is_that_of_its_mixture():
     for w, m, s in zip(weights, means, scales, strict=True):
         cov, gap = s @ s.T, np.asarray(u[0]) - m
         density += w * np.exp(-0.5 * gap @ np.linalg.solve(cov, gap)) / np.sqrt(np.linalg.det(2 * np.pi * cov))
-    got = float(mdn.log_prob(params, x, mdn.to_y(u), settings)[0]) + 2 * np.log(mdn.SPREAD)
+    got = float(mdn.log_prob(params, x, mdn.to_y(u), settings)[0]) + np.log(12)  # y = (u - 1/2) sqrt(12)
     assert got == pytest.approx(np.log(density), abs=1e-3)
 
 
