@@ -1,7 +1,7 @@
 """Quasi-random Fourier features of stationary kernels: phi(x) . phi(y) / (2 M) -> k(|x - y| / bandwidth).
 
-Spectral densities: RBF is Gaussian; Matern nu is a multivariate Student t with 2 nu degrees of freedom. The entries of a
-vector share one chi-square, so the kernel is isotropic.
+Spectral densities: RBF is Gaussian; Matern nu is a multivariate Student t with 2 nu degrees of freedom. The entries of
+a vector share one chi-square, so the kernel is isotropic.
 """
 
 from __future__ import annotations
