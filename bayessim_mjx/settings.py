@@ -26,7 +26,8 @@ SUMMARIZERS = {  # summaries of a trajectory, and what a number at the end of th
     "summary_logsignature": "depth",
     "summary_learned": None,
 }
-MODELS = ("MDNN",)  # classes of posterior networks that there are
+# classes of posterior networks: MDNN, or random Fourier features as MDRFF[_<kernel>[_<bandwidth>]]
+MODEL = re.compile(r"MDNN|MDRFF(?:_(RBF|Laplace|Matern12|Matern32|Matern52)(?:_(median|validation|[0-9][0-9.e+-]*))?)?")
 ACTIVATIONS = ("elu", "relu", "selu", "tanh", "swish", "gelu")
 
 
@@ -241,7 +242,9 @@ class BayesSimConfig(Section):
     trainTrajLen: int = setting(20, "control steps per training trajectory (arrays have one more row)", low=1)
     ftune: bool = setting(True, "keep one network over all rounds; False: a new one each round")
     modelClass: str | None = setting(
-        "MDNN", "posterior network, MDNN; None: no inference, plain uniform randomisation", spell=_none
+        "MDNN",
+        "posterior network: MDNN, MDRFF or MDRFF_<kernel>_<bandwidth>; None: no inference, plain uniform randomisation",
+        spell=_none,
     )
     components: int = setting(10, "mixture components", low=1)
     fullCovariance: bool = setting(False, "full covariance per component")
@@ -267,11 +270,11 @@ class BayesSimConfig(Section):
         if 0 < self.checkTrajs < 40:
             raise UserError(f"bayessim.checkTrajs = {self.checkTrajs}: 0 (no tests), or at least 40")
         summary_of(self.summarizerFxn, "bayessim.summarizerFxn")
-        if self.modelClass is not None and self.modelClass not in MODELS:
-            later = " (MDRFF is not in this version yet)" if self.modelClass.startswith("MDRFF") else ""
+        if self.modelClass is not None and not MODEL.fullmatch(self.modelClass):
             raise UserError(
-                f"bayessim.modelClass = {self.modelClass!r}: allowed are {', '.join(MODELS)} and None, "
-                f"plain uniform randomisation{later}"
+                f"bayessim.modelClass = {self.modelClass!r}: allowed are MDNN, MDRFF, MDRFF_<kernel>, "
+                "MDRFF_<kernel>_<bandwidth> (kernel RBF, Laplace, Matern12, Matern32 or Matern52; bandwidth a number, "
+                "median or validation) and None, plain uniform randomisation"
             )
 
 

@@ -31,8 +31,8 @@ def product(a: Mixture, b: Mixture) -> Mixture:
         terms.append((a.log_weights + b.flat, a.means, a.covs))
     if np.isfinite(a.flat):
         terms.append((b.log_weights + a.flat, b.means, b.covs))
-    joined = [np.concatenate(part) for part in zip(*terms, strict=True)]
-    return _rescaled(Mixture(a.flat + b.flat, *joined, a.prior))
+    weights, means, covs = (np.concatenate(part) for part in zip(*terms, strict=True))
+    return _rescaled(Mixture(a.flat + b.flat, weights, means, covs, a.prior))
 
 
 def _pairs(a: Mixture, b: Mixture) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -69,7 +69,9 @@ def _natural(mixture: Mixture) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return precision, shift, 0.5 * (np.linalg.slogdet(precision)[1] - np.sum(shift * mixture.means, axis=1))
 
 
-def _moments(weights: np.ndarray, precision: np.ndarray, shift: np.ndarray) -> tuple[np.ndarray, ...]:
+def _moments(
+    weights: np.ndarray, precision: np.ndarray, shift: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Completes the square: exp(weights - z P z / 2 + h z) -> log masses (less d/2 log 2 pi), means, covariances."""
     covs = _symmetric(np.linalg.inv(precision))
     means = np.einsum("kij,kj->ki", covs, shift)
@@ -93,8 +95,8 @@ def divide(mixture: Mixture, mean: np.ndarray, cov: np.ndarray) -> tuple[Mixture
     lost = float(shares[~proper].sum())
     if not proper.any():
         return None, lost
-    terms = _moments((mixture.log_weights + ck)[proper], precision[proper], (hk - h0)[proper])
-    return _rescaled(Mixture(-np.inf, *terms, mixture.prior)), lost
+    weights, means, covs = _moments((mixture.log_weights + ck)[proper], precision[proper], (hk - h0)[proper])
+    return _rescaled(Mixture(-np.inf, weights, means, covs, mixture.prior)), lost
 
 
 def reduce(mixture: Mixture, components: int) -> Mixture:

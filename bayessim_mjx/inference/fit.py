@@ -269,7 +269,8 @@ def _objective(params: Any, rows: Array, data: _Data, settings: InferenceSetting
     if data.proposals is None or data.origin is None:
         return mdn.log_prob(params, x, y, settings)
     heads = mdn.forward(params, x, y.shape[-1], settings)
-    proposal = jax.tree.map(lambda leaf: leaf[data.origin[rows]], data.proposals)
+    own = data.origin[rows]
+    proposal = jax.tree.map(lambda leaf: leaf[own], data.proposals)
     return mdn.density(heads, y, settings) - mdn.log_tilt(heads, proposal, settings)
 
 
