@@ -160,7 +160,7 @@ BAD = {
     "bayessim.collectPolicy=rnd": r"allowed are policy_random, policy_ones",
     "bayessim.modelClass=MDN": r"bayessim\.modelClass = 'MDN': allowed are MDNN and None, plain uniform randomisation$",
     "bayessim.modelClass=MDNN_x": r"bayessim\.modelClass = 'MDNN_x': allowed are MDNN and None",
-    "bayessim.modelClass=MDRFF_RBF": r"bayessim\.modelClass = 'MDRFF_RBF': .*MDRFF is not in this version yet",
+    "bayessim.modelClass=MDRFF_Cosine": r"bayessim\.modelClass = .MDRFF_Cosine.: allowed are MDNN, MDRFF",
     "monitor.console=False": r"'monitor\.console' is unknown",
     "monitor.tensorboard=False": r"'monitor\.tensorboard' is unknown",
     "real.logs=3": r"real\.logs = 3 .*expected a list of texts",
