@@ -158,7 +158,7 @@ BAD = {
     "bayessim.hiddenLayers=5": r"expected a list of whole numbers",
     "bayessim.hiddenLayers=[8,x]": r"bayessim\.hiddenLayers\[1\] = 'x'.*whole number",
     "bayessim.collectPolicy=rnd": r"allowed are policy_random, policy_ones",
-    "bayessim.modelClass=MDN": r"bayessim\.modelClass = 'MDN': allowed are MDNN, MDRFF.*None, plain uniform randomisation$",
+    "bayessim.modelClass=MDN": r"bayessim\.modelClass = 'MDN': allowed are MDNN.*None, plain uniform randomisation$",
     "bayessim.modelClass=MDNN_x": r"bayessim\.modelClass = 'MDNN_x': allowed are MDNN, MDRFF",
     "bayessim.modelClass=MDRFF_Cosine": r"bayessim\.modelClass = .MDRFF_Cosine.: allowed are MDNN, MDRFF",
     "monitor.console=False": r"'monitor\.console' is unknown",

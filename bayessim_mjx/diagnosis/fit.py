@@ -212,7 +212,8 @@ class Fitter:
         precision, pull, low, high = job.prior()
         S = S + np.diag(precision)
         p = solve(S + job.damping * np.diag(np.diag(S)), g + pull, low, high)
-        job.promise = float(2 * (g + pull) @ p - p @ S @ p)
+        by_starts = job.cost - job.penalty(job.values) - float(job.weight @ q.c)
+        job.promise = by_starts + float(2 * (g + pull) @ p - p @ S @ p)
         return job.values + p, job.offsets + starts.step(job.A, p)
 
     def scores(self, job: Job, group: NDArray[np.int64] | None = None) -> tuple[Array, Array]:

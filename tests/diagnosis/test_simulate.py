@@ -73,7 +73,7 @@ def test_a_force_is_the_torque_of_a_motor(simulator):
     theta, cut = simulator.physics.space.nominal, simulator.windows
     force = np.full((1, len(cut), cut.steps, 1), 0.05)
     pushed = simulator.run(theta[None], force=force)
-    past = cut.batch.around._replace(command=cut.batch.around.command + 0.05)
+    past = cut.batch.around.replace(command=cut.batch.around.command + 0.05)
     batch = cut.batch.replace(command=cut.batch.command + 0.05, around=past)
     motor = simulate.Simulator(simulator.physics, dataclasses.replace(cut, batch=batch), lanes=32).run(theta[None])
     assert np.abs(pushed - motor).max() < 1e-5
