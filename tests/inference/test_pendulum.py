@@ -44,11 +44,13 @@ def test_length_and_damping_of_a_pendulum_are_found(name):
     assert float(info.gain_truncated) > 0.8  # nats over the prior
 
     truth = np.asarray([0.8, 0.2], np.float32)
-    real = observe(jax.random.split(jax.random.PRNGKey(3), 48), jnp.tile(truth, (48, 1)))
-    one, all_ = infer(state, real[:1]), infer(state, real[:8])
+    real = observe(jax.random.split(jax.random.PRNGKey(3), 8), jnp.tile(truth, (8, 1)))
+    one, all_ = infer(state, real[:1]), infer(state, real)
     assert float(all_.mean()[0]) == pytest.approx(0.8, abs=0.08)
     assert np.all(np.asarray(all_.sd()) < np.asarray(one.sd()))
     assert float(all_.contraction()[0]) > 0.95
-    # each product carries its network's bias eight times: a single one may well miss the truth
-    levels = [float(infer(state, real[8 * i : 8 * i + 8]).credible_level(truth)) for i in range(6)]
-    assert np.median(levels) < 0.99
+    # few simulations make over-confident posteriors (a round's calibration says so): most truths, not 95 %, inside
+    fresh = jnp.asarray(rng.uniform(SPACE.low, SPACE.high, (100, 2)), jnp.float32)
+    seen = observe(jax.random.split(jax.random.PRNGKey(4), 100), fresh)
+    levels = [float(infer(state, x[None]).credible_level(np.asarray(t))) for x, t in zip(seen, fresh, strict=True)]
+    assert np.mean(np.asarray(levels) < 0.95) > 0.6
