@@ -8,7 +8,7 @@ import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 from bayessim_mjx import cli
 from bayessim_mjx.config import Config
@@ -18,13 +18,8 @@ from bayessim_mjx.errors import UserError
 FOLDER = "calibration"
 
 
-class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> NoReturn:
-        raise UserError(message.removeprefix("argument "))
-
-
-def _parser() -> _Parser:
-    parser = _Parser(
+def _parser() -> cli.PlainParser:
+    parser = cli.PlainParser(
         prog="python -m bayessim_mjx.calibrate",
         description="Calibration of a run's posterior on fresh simulations, and whether reality looks like them.",
         allow_abbrev=False,

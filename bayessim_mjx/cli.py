@@ -36,7 +36,14 @@ FLAGS: dict[str, tuple[str, Any, str]] = {
 RESUMABLE = ("--device", "--cache_dir", "--video", "--video_length", "--video_interval", "--headless", "--resume")
 
 
-class Parser(argparse.ArgumentParser):
+class PlainParser(argparse.ArgumentParser):
+    """Flags; what is wrong with them is a UserError."""
+
+    def error(self, message: str) -> NoReturn:
+        raise UserError(message.removeprefix("argument "))
+
+
+class Parser(PlainParser):
     """Flags of one command and `section.key=value` overrides; all that is wrong is a UserError."""
 
     def __init__(self, prog: str, description: str, resume: bool = False, without: Sequence[str] = ()):
@@ -76,9 +83,6 @@ class Parser(argparse.ArgumentParser):
                 raise UserError(f"--use_last_checkpoint and --checkpoint {args.checkpoint}: give one of them")
             args.checkpoint = "latest"
         return args
-
-    def error(self, message: str) -> NoReturn:
-        raise UserError(message.removeprefix("argument "))
 
 
 def config_of(args: argparse.Namespace, more: Mapping[str, tuple[str, Any]] | None = None) -> Config:

@@ -7,7 +7,7 @@ import time
 import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any
 
 from bayessim_mjx import cli
 from bayessim_mjx.config import Config
@@ -19,13 +19,8 @@ if TYPE_CHECKING:
     from bayessim_mjx.diagnosis.robot import Robot
 
 
-class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> NoReturn:
-        raise UserError(message.removeprefix("argument "))
-
-
-def _parser() -> _Parser:
-    parser = _Parser(
+def _parser() -> cli.PlainParser:
+    parser = cli.PlainParser(
         prog="python -m bayessim_mjx.diagnose",
         description="Where the gap between logs and simulator lies, which effects cause it, how far it shrinks.",
         allow_abbrev=False,

@@ -35,14 +35,14 @@ def _parts(found: Findings, closed: dict[str, Any], say: Progress) -> dict[str, 
     """{label: part}; the shares are of the linear promise where too many effects are named to fit all subsets."""
     model, race = found.ruling.model, found.race
     labels = [e.label for e in model.effects]
-    if len(labels) < 2 or not verdict.shapley(race, model, say):
+    fitted = verdict.subsets(race, model, say) if len(labels) > 1 else {}
+    if not fitted:
         total = sum(closed["each"].values()) if labels else 0.0
         share = {n: closed["each"][n] / total if len(labels) > 1 and total else 1.0 for n in labels}
         return {n: _part(s, (s, s), n, closed) for n, s in share.items()}
 
-    def drop(some: frozenset[int]) -> np.ndarray:  # all subsets were fitted for the shares
-        smaller = model if len(some) == len(labels) else race.models[frozenset(labels[i] for i in some)]
-        return np.asarray(race.base.cost - smaller.cost)
+    def drop(some: frozenset[int]) -> np.ndarray:
+        return np.asarray(race.base.cost - fitted[frozenset(labels[i] for i in some)].cost)
 
     each = promise.shapley(len(labels), drop)
     group = race.fitter.simulator.windows.group

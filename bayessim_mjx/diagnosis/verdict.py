@@ -161,28 +161,17 @@ def per_condition(race: Race, model: Model) -> tuple[np.ndarray, np.ndarray]:
     return np.array(each), np.array(deviation)
 
 
-def shapley(race: Race, model: Model, say: Progress) -> dict[str, float]:
-    """Each effect's share of the squared gap that they close together (Shapley, 1953), over all orders."""
-    effects, n = model.effects, len(model.effects)
-    if n > 4:
+def subsets(race: Race, model: Model, say: Progress) -> dict[frozenset[str], Model]:
+    """{labels: the model with these of its effects}, every subset refitted; {} where they are too many."""
+    effects = model.effects
+    if len(effects) > 4:
         return {}
-    value: dict[frozenset[str], float] = {frozenset(): 0.0}
-    for size in range(1, n + 1):
+    out = {frozenset[str](): race.base}
+    for size in range(1, len(effects) + 1):
         for some in itertools.combinations(effects, size):
-            m = model
+            smaller = model
             for e in effects:
                 if e not in some:
-                    m = without(race, m, e, say)
-            value[frozenset(c.label for c in some)] = race.base.total - m.total
-    out = {}
-    for e in effects:
-        rest = [c.label for c in effects if c is not e]
-        shares = []
-        for order in itertools.permutations(rest):
-            for k in range(len(order) + 1):
-                before = frozenset(order[:k])
-                weight = 1 / (n * len(list(itertools.permutations(rest))))
-                shares.append(weight * (value[before | {e.label}] - value[before]))
-        out[e.label] = float(np.sum(shares))
-    total = sum(out.values())
-    return {k: v / total for k, v in out.items()} if total else out
+                    smaller = without(race, smaller, e, say)
+            out[frozenset(c.label for c in some)] = smaller
+    return out
