@@ -4,6 +4,8 @@ import os
 import subprocess
 import sys
 
+import pytest
+
 # The suite's time is XLA's: without fusion emitters it compiles a control step in two thirds of the time.
 QUICK = "--xla_cpu_use_fusion_emitters=false"
 
@@ -18,3 +20,12 @@ def known(flag: str) -> bool:
 # Set by hand, also to nothing, it stays: CI runs its slow tests with the compiler as users have it. Workers inherit it.
 if "XLA_FLAGS" not in os.environ:
     os.environ["XLA_FLAGS"] = QUICK if known(QUICK) else ""
+
+
+@pytest.fixture
+def strict():
+    """No silent promotion of types or broadcasting of ranks."""
+    import jax
+
+    with jax.numpy_dtype_promotion("strict"), jax.numpy_rank_promotion("raise"):
+        yield

@@ -17,10 +17,7 @@ SPACE = ParameterSpace([MASS, LENGTH])
 NORMAL = ParameterSpace([Parameter(n, 1.0, -2.0, 4.0, prior="gaussian", mean=1.0, sd=0.5) for n in ("a", "b")])
 
 
-@pytest.fixture(autouse=True)
-def strict():
-    with jax.numpy_dtype_promotion("strict"), jax.numpy_rank_promotion("raise"):
-        yield
+pytestmark = pytest.mark.usefixtures("strict")
 
 
 def key(seed: int = 0) -> jax.Array:

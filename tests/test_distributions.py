@@ -9,11 +9,7 @@ from scipy import stats
 from bayessim_mjx.distributions import Distribution, Gaussian, GaussianMixture, Uniform
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 
-
-@pytest.fixture(autouse=True)
-def strict():
-    with jax.numpy_dtype_promotion("strict"), jax.numpy_rank_promotion("raise"):
-        yield
+pytestmark = pytest.mark.usefixtures("strict")
 
 
 def key(seed: int = 0) -> jax.Array:

@@ -15,10 +15,7 @@ from bayessim_mjx.inference.summarizers import summary_learned
 EMBEDDING = Embedding(steps=12, state_size=2, action_size=1, features=4, width=8, window=3)
 
 
-@pytest.fixture(autouse=True)
-def strict():
-    with jax.numpy_dtype_promotion("strict"), jax.numpy_rank_promotion("raise"):
-        yield
+pytestmark = pytest.mark.usefixtures("strict")
 
 
 def trajectories(count: int, steps: int = 12, seed: int = 0) -> tuple[jax.Array, jax.Array]:

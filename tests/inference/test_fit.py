@@ -18,10 +18,7 @@ SMALL = InferenceSettings(components=2, hiddenLayers=(32,), batch=128, min_steps
 QUICK = dataclasses.replace(SMALL, min_steps=20, max_steps=20, batch=32)
 
 
-@pytest.fixture(autouse=True)
-def strict():
-    with jax.numpy_dtype_promotion("strict"), jax.numpy_rank_promotion("raise"):
-        yield
+pytestmark = pytest.mark.usefixtures("strict")
 
 
 def key(seed: int = 0) -> jax.Array:

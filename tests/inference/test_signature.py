@@ -11,11 +11,7 @@ import pytest
 
 from bayessim_mjx.inference import signature as sig
 
-
-@pytest.fixture(autouse=True)
-def strict():
-    with jax.numpy_dtype_promotion("strict"), jax.numpy_rank_promotion("raise"):
-        yield
+pytestmark = pytest.mark.usefixtures("strict")
 
 
 def path(seed: int, steps: int, channels: int) -> jax.Array:

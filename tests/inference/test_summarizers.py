@@ -14,10 +14,7 @@ STATES = jnp.asarray([[0.0, 1.0], [1.0, 1.0], [3.0, 0.0], [6.0, 0.0]])  # T = 3,
 ACTIONS = jnp.asarray([[1.0], [2.0], [-1.0]])
 
 
-@pytest.fixture(autouse=True)
-def strict():
-    with jax.numpy_dtype_promotion("strict"), jax.numpy_rank_promotion("raise"):
-        yield
+pytestmark = pytest.mark.usefixtures("strict")
 
 
 def test_start_is_the_whole_trajectory_time_major():
