@@ -42,6 +42,7 @@ def screen(fitter: Fitter, job: Job, candidates: Sequence[Candidate], limit: int
     """All candidates on top of `job`, best first, on at most `limit` windows.
 
     Where there are many starting points, a third of the windows tells which are worth a second look on all of them.
+    Gains are scaled to all windows as if those looked at were typical: good for ranking, too high as an estimate.
     """
     every = [(i, point) for i, candidate in enumerate(candidates) for point in candidate.probes]
     if len(every) <= MANY:
@@ -58,7 +59,7 @@ def _looked_at(
 ) -> dict[int, list[tuple[Screened, Array]]]:
     """{candidate: [(what its starting point gains, the point)]} for plans of (candidate, point)."""
     count = len(job.r)
-    own = np.unique(np.linspace(0, count - 1, min(count, limit)).round().astype(int))
+    own = _telling(job, limit)
     part = _part(job, own)
     if not plans:
         return {}
@@ -75,6 +76,17 @@ def _looked_at(
         one = _one(project, candidates[i], point, column)
         each.setdefault(i, []).append((replace(one, gain=one.gain * count / len(own)), point))
     return each
+
+
+def _telling(job: Job, limit: int) -> NDArray[np.int64]:
+    """At most `limit` windows: half of them where most is left to explain (a limit acts in few), the rest spread."""
+    count = len(job.r)
+    if count <= limit:
+        return np.arange(count)
+    worst = np.argsort(-np.sum(job.r**2, 1), kind="stable")[: limit // 2]
+    others = np.setdiff1d(np.arange(count), worst)
+    spread = others[np.linspace(0, len(others) - 1, limit - len(worst)).round().astype(int)]
+    return np.sort(np.concatenate([worst, spread]))
 
 
 def _ordered(each: dict[int, list[tuple[Screened, Array]]]) -> list[Screened]:
