@@ -259,8 +259,9 @@ def _train(
 def _fresh(params: Any, data: _Data, settings: InferenceSettings) -> Any:
     """The weights a first fit starts from."""
     held = jnp.zeros_like(data.train).at[data.held].set(data.mask > 0)
-    params = mdn.choose_bandwidth(params, data.x, data.y, data.train, held, settings)
-    return mdn.linear_start(params, data.x, data.y, data.train.astype(jnp.float32), settings)
+    x = mdn.embedded(params, data.x, settings)
+    params = mdn.choose_bandwidth(params, x, data.y, data.train, held, settings)
+    return mdn.linear_start(params, x, data.y, data.train.astype(jnp.float32), settings)
 
 
 def _objective(params: Any, rows: Array, data: _Data, settings: InferenceSettings) -> Array:
@@ -282,7 +283,8 @@ def _prepare(state: FitState, thetas: Array, x: Array, count: Array) -> tuple[Fi
     nominal = jnp.asarray(state.space.nominal)[None, :]
     u = jnp.clip(jax.vmap(state.space.to_unit)(jnp.where(valid[:, None], thetas, nominal)), 0, 1)
     x = jnp.where(valid[:, None], x, 0.0)
-    mean, rate = _column_scales(x, valid)
+    embedding = state.settings.embedding
+    mean, rate = _column_scales(x, valid) if embedding is None else embedding.scales(x, valid)
     fresh = (state.fits == 0) | state.settings.restandardise
     mean, rate = jnp.where(fresh, mean, state.x_mean), jnp.where(fresh, rate, state.x_rate)
     z, clipped = _standardise(x, mean, rate, state.settings.clip)

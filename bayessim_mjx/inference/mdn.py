@@ -8,6 +8,7 @@ broader than the prior, for products and sequential rounds (reference/sbi.md sec
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import jax
@@ -26,6 +27,7 @@ RIDGE = 1e-3  # of the features' variance
 WEAK = 0.05  # smallest precision beyond the prior's that linear_start gives to a component of the probit chart
 MULTIPLES = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0)  # of the median distance: bandwidths tried by validation
 CUT_POINTS = 16  # quasi-Monte-Carlo points of a component's mass inside the box, in training
+AT_ONCE = 1024  # trajectories embedded at once
 FIXED = ("omega", "rate")  # of the parameters, those that are not trained
 LOG_2PI = float(np.log(2 * np.pi))
 
@@ -55,11 +57,16 @@ def head_size(d: int, settings: InferenceSettings) -> int:
 
 def init(key: Array, settings: InferenceSettings, dim_x: int, d: int) -> Params:
     """Network weights: hidden layers, a small last layer, a linear path from input to output, spread centre biases."""
-    fixed: Params = {}
+    more: Params = {}
+    if settings.embedding is not None:
+        key, key_embedding = jax.random.split(key)
+        more = {"embedding": settings.embedding.init(key_embedding, jnp.zeros((1, dim_x)))}
+        dim_x = settings.embedding.size(dim_x)
     sizes: tuple[int, ...] = (dim_x, *settings.hiddenLayers, head_size(d, settings))
     if settings.kernel is not None:
         omega = features.frequencies(settings.kernel, dim_x, settings.fourierFeatures)
-        fixed = {"omega": jnp.asarray(omega), "rate": jnp.asarray(1 / (settings.fixed_bandwidth or 1.0), jnp.float32)}
+        rate = jnp.asarray(1 / (settings.fixed_bandwidth or 1.0), jnp.float32)
+        more = {**more, "omega": jnp.asarray(omega), "rate": rate}
         sizes = (2 * settings.fourierFeatures, sizes[-1])
     keys = jax.random.split(key, len(sizes))
     gains = [1.0] * (len(sizes) - 2) + [0.1]
@@ -70,7 +77,15 @@ def init(key: Array, settings: InferenceSettings, dim_x: int, d: int) -> Params:
     k = settings.components
     biases = layers[-1]["b"].at[k : k + k * d].set(0.7 * jax.random.normal(keys[-1], (k * d,)))
     layers[-1] = {**layers[-1], "b": biases}
-    return {"layers": layers, "skip": jnp.zeros((dim_x, sizes[-1])), **fixed}
+    return {"layers": layers, "skip": jnp.zeros((dim_x, sizes[-1])), **more}
+
+
+def embedded(params: Params, x: Array, settings: InferenceSettings) -> Array:
+    """Standardised summaries [n, D] as the network takes them in: as they are, or embedded (embedding.py) [n, F]."""
+    if settings.embedding is None:
+        return x
+    apply = partial(settings.embedding.apply, params["embedding"])
+    return apply(x) if x.shape[0] <= AT_ONCE else jax.lax.map(apply, x, batch_size=AT_ONCE)
 
 
 def hidden(params: Params, x: Array) -> Array:
@@ -159,7 +174,7 @@ def _beyond_prior(mean: Array, slope: Array, cov: Array) -> tuple[Array, Array, 
 def forward(params: Params, x: Array, d: int, settings: InferenceSettings) -> tuple[Array, Array, Array]:
     """Standardised x [n, D] -> log weights [n, K], centres mu [n, K, d], factors A [n, K, d, d] in y coordinates."""
     n, k = x.shape[0], settings.components
-    last = params["layers"][-1]
+    last, x = params["layers"][-1], embedded(params, x, settings)
     out = hidden(params, x) @ last["w"] + last["b"][None, :] + x @ params["skip"]
     logits, means, diagonal, lower = jnp.split(out, np.cumsum([k, k * d, k * d]), axis=1)
     # A_ii = exp(8 tanh(r / 8)): between exp(-8) and exp(8), slope 1 at r = 0

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from bayessim_mjx.settings import MODEL
+
+if TYPE_CHECKING:
+    from bayessim_mjx.inference.embedding import Embedding
 
 COORDINATES = ("plain", "truncated", "probit", "logit")
 
@@ -41,6 +44,7 @@ class InferenceSettings:
     coordinates: str = "plain"
     ensemble: int = 1  # networks trained side by side; their posterior has ensemble * components Gaussians
     fourierFeatures: int = 256  # frequencies of MDRFF: twice as many features
+    embedding: Embedding | None = None  # trained with the network, which then takes in rows of summary_learned
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "hiddenLayers", tuple(int(width) for width in self.hiddenLayers))
