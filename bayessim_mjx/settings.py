@@ -304,7 +304,10 @@ class PPOConfig(Section):
     hidden_critic: tuple[int, ...] = setting((64, 64), "widths of the critic", low=1)
     activation: str = setting("elu", "activation of both networks", choices=ACTIVATIONS)
     init_std: float = setting(1.0, "initial standard deviation of actions", above=0)
-    action_clip: float = setting(1.0, "actions are clipped to +- this before the environment", above=0)
+    state_dependent_std: bool = setting(False, "the actor gives the standard deviation too, else it is a parameter")
+    shared_trunk: bool = setting(False, "the critic is one layer on the actor's hidden ones (hidden_critic is unused)")
+    action_clip: float = setting(1.0, "actions are kept within +- this before the environment", above=0)
+    action_bound: str = setting("clip", "how: clipped, or squashed by action_clip * tanh", choices=("clip", "tanh"))
     max_iterations: int = setting(100, "iterations (per round of the outer loop)", low=0)
     log_interval: int = setting(10, "iterations between log lines", low=1)
     save_interval: int = setting(50, "iterations between checkpoints", low=1)
@@ -317,6 +320,10 @@ class PPOConfig(Section):
                 f"ppo.num_minibatches = {self.num_minibatches} is more than the batch of num_envs * num_steps = "
                 f"{self.num_envs} * {self.num_steps} = {batch} samples"
             )
+        if self.shared_trunk and not self.hidden_actor:
+            raise UserError("ppo.shared_trunk = True needs hidden layers to share: ppo.hidden_actor is []")
+        if self.state_dependent_std and not 0.007 <= self.init_std <= 148:  # exp(+-5), networks.LOG_STD_LIMIT
+            raise UserError(f"ppo.init_std = {self.init_std}: with ppo.state_dependent_std it is from 0.007 to 148")
 
 
 @dataclass(frozen=True)

@@ -116,6 +116,7 @@ def _diagnose_one(folder: Path, where: str, args: argparse.Namespace, cores: "qu
         (out / old).unlink(missing_ok=True)
     command = [sys.executable, WORKER, folder, "--out", out, "--core", core]
     command += ["--baselines"] if args.baselines and not args.leave_out_family else []
+    command += ["--verdict-only"] if args.verdict_only else []
     more = list(args.more)
     if args.leave_out_family:
         hidden = json.loads((folder / "truth.json").read_text())["effects"]
@@ -160,7 +161,9 @@ def isolate(args: argparse.Namespace) -> None:
 
 
 def cases(folder: Path) -> list[Path]:
-    return sorted(p.parent for p in folder.glob("*/truth.json"))
+    """By seed, then by name: whenever it is stopped, all systems and kinds have been tried equally often."""
+    found = (p.parent for p in folder.glob("*/truth.json"))
+    return sorted(found, key=lambda f: (int(f.name.rpartition("_s")[2]), f.name))
 
 
 def main() -> None:
@@ -181,6 +184,7 @@ def main() -> None:
         help="singles, without the effect and its look-alikes: to be unexplained",
     )  # fmt: skip
     old.add_argument("--baselines", action="store_true", help="and the baselines on the same fits")
+    old.add_argument("--verdict-only", action="store_true", help="no maps, next experiment and report: faster")
     old.add_argument("--workers", type=int, default=os.cpu_count(), help="cases at a time, one core each")
     old.add_argument("--timeout", type=float, default=3600.0, help="s per case")
     old.add_argument("--more", nargs=argparse.REMAINDER, default=[], help="further arguments of the command; last")

@@ -1,6 +1,6 @@
 """One case of the blind benchmark in a process of its own: the command, the true effect's closure, the baselines.
 
-    python benchmarks/diagnosis_worker.py CASE --out FOLDER [--core N] [--baselines] [--more arguments of the command]
+    python benchmarks/diagnosis_worker.py CASE --out FOLDER [--core N] [--baselines] [--verdict-only] [--more ARGUMENTS]
 
 Writes what the command writes, then oracle.json, exit.json (without it the case is not finished), baselines.json. The
 command gets nothing but model and logs; the truth is opened after its verdict is on disk.
@@ -42,6 +42,16 @@ def diagnose(arguments: list[str]) -> tuple[int, dict[str, float], Any]:
     code = command.main(arguments)
     times = {"seconds": time.perf_counter() - started, "compile_seconds": covered(compiling)}
     return code, times, kept[0] if kept else None
+
+
+def without_pictures() -> None:
+    """Only the verdict and its numbers: no maps, proposal, report and curves, which no score is made of."""
+    from bayessim_mjx import report
+    from bayessim_mjx.diagnosis import assemble
+
+    assemble.with_more = lambda result, found, folder, say: result
+    report.write = lambda result, folder: None
+    report.tensorboard = lambda result, folder: None
 
 
 def covered(spans: list[tuple[float, float]]) -> float:
@@ -103,10 +113,13 @@ def main() -> int:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--core", type=int, help="the only CPU to use")
     parser.add_argument("--baselines", action="store_true")
+    parser.add_argument("--verdict-only", action="store_true")
     parser.add_argument("--more", nargs=argparse.REMAINDER, default=[], help="arguments of the command; last")
     args = parser.parse_args()
     if args.core is not None and hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {args.core})  # before JAX counts the cores
+    if args.verdict_only:
+        without_pictures()
     return work(args.case, args.out, args.baselines, args.more)
 
 

@@ -29,6 +29,7 @@ class Batch:
     value: jax.Array  # [B]
     advantage: jax.Array  # [B]
     returns: jax.Array  # [B]
+    log_std: jax.Array | None = None  # [B, A] of the collecting policy, where it depends on the state
 
 
 def surrogate_loss(log_prob: jax.Array, old_log_prob: jax.Array, advantage: jax.Array, clip: float) -> jax.Array:
@@ -51,11 +52,12 @@ def standardise(x: jax.Array) -> jax.Array:
     return (x - x.mean()) / (x.std() + 1e-8)
 
 
-def loss(params: Params, old_log_std: jax.Array, batch: Batch, config: PPOConfig) -> tuple[jax.Array, dict]:
+def loss(params: Params, old_log_std: jax.Array | None, batch: Batch, config: PPOConfig) -> tuple[jax.Array, dict]:
     """Surrogate + c_v value loss - c_e entropy, and the figures of this minibatch. KL is of old || new, analytic."""
     act = networks.activation(config.activation)
-    mean, log_std = networks.mean_action(params, batch.observation, act), params["actor"]["log_std"]
-    log_prob = networks.log_prob(mean, log_std, batch.action)
+    mean, log_std = networks.gaussian(params["actor"], batch.observation, act)
+    log_prob = networks.log_prob(mean, log_std, batch.action)  # of raw actions: tanh's slope cancels in the ratio
+    old_log_std = old_log_std if batch.log_std is None else batch.log_std
     advantage = standardise(batch.advantage) if config.normalize_advantage_per_minibatch else batch.advantage
     surrogate = surrogate_loss(log_prob, batch.log_prob, advantage, config.clip_param)
     value = value_loss(
@@ -64,7 +66,9 @@ def loss(params: Params, old_log_std: jax.Array, batch: Batch, config: PPOConfig
         batch.returns,
         config.clip_param if config.use_clipped_value_loss else None,
     )
-    entropy = networks.entropy(log_std)
+    squash = config.action_bound == "tanh"
+    entropy = networks.squashed_entropy(mean, log_std, config.action_clip) if squash else networks.entropy(log_std)
+    entropy = entropy.mean()
     metrics = {
         "Loss/surrogate": surrogate,
         "Loss/value": value,
@@ -113,7 +117,7 @@ def optimise(
 ) -> tuple[Params, optax.OptState, jax.Array, dict[str, jax.Array]]:
     """All epochs of minibatches: new parameters, Adam state, learning rate, and figures [epochs * minibatches] each."""
     flat, unravel = ravel_pytree(params)
-    old_log_std = params["actor"]["log_std"]
+    old_log_std = params["actor"].get("log_std")
     if not config.normalize_advantage_per_minibatch:
         batch = dataclasses.replace(batch, advantage=standardise(batch.advantage))
     order = minibatches(key, config.num_epochs, batch.advantage.shape[0], config.num_minibatches)

@@ -1,10 +1,16 @@
-"""Actor and critic: two plain multilayer perceptrons, and a Gaussian whose spread does not depend on the state."""
+"""Actor and critic as multilayer perceptrons, apart or on one trunk; Gaussian actions, clipped or squashed by tanh.
+
+A Gaussian acts on *raw* actions u; the environment gets clip(u, +- limit), or limit tanh(u) where it is squashed. The
+parameters' structure says what they are: without "log_std" the actor's last layer gives the spread as well, and a
+critic of one "head" stands on the actor's hidden layers.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
 from bayessim_mjx.errors import UserError
@@ -21,6 +27,8 @@ ACTIVATIONS: dict[str, Callable[[jax.Array], jax.Array]] = {
     "gelu": jax.nn.gelu,
 }
 HALF_LOG_2PI = 0.9189385332046727
+LOG_STD_LIMIT = 5.0  # of a spread that depends on the state: |log std| stays below it
+NODES, WEIGHTS = np.polynomial.hermite_e.hermegauss(16)  # sum w f(x) = sqrt(2 pi) E f(x), x ~ N(0, 1)
 
 
 def activation(name: str) -> Callable[[jax.Array], jax.Array]:
@@ -55,26 +63,52 @@ def init(
     hidden_actor: Sequence[int],
     hidden_critic: Sequence[int],
     init_std: float,
+    state_dependent_std: bool = False,
+    shared_trunk: bool = False,
 ) -> Params:
     """Parameters of both networks. The actor's last layer is small: the first policy is nearly N(0, init_std^2)."""
     actor_key, critic_key = jax.random.split(key)
-    return {
-        "actor": {
-            "layers": mlp_init(actor_key, [observation_size, *hidden_actor, action_size], 0.01),
-            "log_std": jnp.full(action_size, jnp.log(init_std)),
-        },
-        "critic": {"layers": mlp_init(critic_key, [critic_size, *hidden_critic, 1], 1.0)},
-    }
+    layers = mlp_init(actor_key, [observation_size, *hidden_actor, action_size], 0.01)
+    actor: Params = {"layers": layers, "log_std": jnp.full(action_size, jnp.log(init_std))}
+    if state_dependent_std:  # outputs for the spread begin at init_std everywhere
+        bias = jnp.full(action_size, LOG_STD_LIMIT * np.arctanh(np.log(init_std) / LOG_STD_LIMIT))
+        spread = {"w": jnp.zeros_like(layers[-1]["w"]), "b": bias}
+        joined = jax.tree.map(lambda mean, log_std: jnp.concatenate([mean, log_std], -1), layers[-1], spread)
+        actor = {"layers": [*layers[:-1], joined]}
+    if shared_trunk:
+        return {"actor": actor, "critic": {"head": mlp_init(critic_key, [hidden_actor[-1], 1], 1.0)}}
+    return {"actor": actor, "critic": {"layers": mlp_init(critic_key, [critic_size, *hidden_critic, 1], 1.0)}}
+
+
+def gaussian(actor: Params, x: jax.Array, act: Callable[[jax.Array], jax.Array]) -> tuple[jax.Array, jax.Array]:
+    """Mean [..., A] and log standard deviation ([A], or [..., A] where it depends on the state) at normalised x."""
+    out = mlp(actor["layers"], x, act)
+    if "log_std" in actor:
+        return out, actor["log_std"]
+    mean, spread = jnp.split(out, 2, -1)
+    return mean, LOG_STD_LIMIT * jnp.tanh(spread / LOG_STD_LIMIT)
 
 
 def mean_action(params: Params, x: jax.Array, act: Callable[[jax.Array], jax.Array]) -> jax.Array:
     """Mean of the policy's Gaussian, [..., A], at normalised observations x [..., S]."""
-    return mlp(params["actor"]["layers"], x, act)
+    return gaussian(params["actor"], x, act)[0]
 
 
 def value(params: Params, x: jax.Array, act: Callable[[jax.Array], jax.Array]) -> jax.Array:
     """The critic's value [...] at normalised observations x [..., S]."""
+    if "head" in params["critic"]:
+        return mlp([*params["actor"]["layers"][:-1], *params["critic"]["head"]], x, act)[..., 0]
     return mlp(params["critic"]["layers"], x, act)[..., 0]
+
+
+def bounded(raw: jax.Array, limit: float, squash: bool) -> jax.Array:
+    """What the environment gets of raw actions: within +- limit."""
+    return limit * jnp.tanh(raw) if squash else jnp.clip(raw, -limit, limit)
+
+
+def log_slope(raw: jax.Array, limit: float) -> jax.Array:
+    """log |d a / d u| of a = limit tanh(u), summed over the last axis: log limit + 2 (log 2 - u - softplus(-2 u))."""
+    return (jnp.log(limit) + 2 * (jnp.log(2.0) - raw - jax.nn.softplus(-2 * raw))).sum(-1)
 
 
 def log_prob(mean: jax.Array, log_std: jax.Array, action: jax.Array) -> jax.Array:
@@ -88,8 +122,15 @@ def entropy(log_std: jax.Array) -> jax.Array:
     return (log_std + 0.5 + HALF_LOG_2PI).sum(-1)
 
 
+def squashed_entropy(mean: jax.Array, log_std: jax.Array, limit: float) -> jax.Array:
+    """Entropy of limit tanh(u), [...]: that of u plus E log |d a / d u|, by Gauss-Hermite quadrature."""
+    nodes, weights = jnp.asarray(NODES, jnp.float32), jnp.asarray(WEIGHTS / WEIGHTS.sum(), jnp.float32)
+    u = mean[..., None, :] + jnp.exp(log_std)[..., None, :] * nodes[:, None]  # [..., nodes, A]
+    return entropy(log_std) + log_slope(u, limit) @ weights
+
+
 def kl(mean: jax.Array, log_std: jax.Array, new_mean: jax.Array, new_log_std: jax.Array) -> jax.Array:
-    """KL(old || new) of diagonal Gaussians, [...]; exactly 0 where they agree.
+    """KL(old || new) of diagonal Gaussians, [...]; exactly 0 where they agree. Squashing both leaves it as it is.
 
     = sum 1/2 [ (r - 1 - log r) + ((mean - new_mean) / new_std)^2 ],  r = (std / new_std)^2
     """
@@ -108,19 +149,29 @@ class Policy:
     normalize: bool = struct.field(pytree_node=False, default=True)
     action_clip: float = struct.field(pytree_node=False, default=1.0)
     deterministic: bool = struct.field(pytree_node=False, default=False)
+    squash: bool = struct.field(pytree_node=False, default=False)
 
     def distribution(self, obs: Mapping[str, jax.Array] | jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Mean [..., A] and log standard deviation [A] of the unclipped action; obs: groups, or "policy" alone."""
+        """Mean [..., A] and log sd ([A] or [..., A]) of the raw action; obs: groups, or "policy" alone."""
         x = jnp.asarray(obs["policy"] if isinstance(obs, Mapping) else obs)
         x = normalise.normalise(self.normalizer, x) if self.normalize else x
-        return mlp(self.actor["layers"], x, activation(self.activation)), self.actor["log_std"]
+        return gaussian(self.actor, x, activation(self.activation))
+
+    def bounded(self, raw: jax.Array) -> jax.Array:
+        """The action within +- action_clip of a raw one."""
+        return bounded(raw, self.action_clip, self.squash)
+
+    def log_prob(self, obs: Mapping[str, jax.Array] | jax.Array, raw: jax.Array) -> jax.Array:
+        """Log density [...] of the raw action [..., A]; where it is squashed, that of what the environment gets."""
+        density = log_prob(*self.distribution(obs), raw)
+        return density - log_slope(raw, self.action_clip) if self.squash else density
 
     def act(self, key: jax.Array | None, obs: Mapping[str, jax.Array] | jax.Array) -> jax.Array:
-        """Action [..., A] within +- action_clip: the mean if `key` is None, else a sample."""
+        """Action [..., A] within +- action_clip: at the mean if `key` is None, else a sample."""
         mean, log_std = self.distribution(obs)
         if key is not None:
             mean = mean + jnp.exp(log_std) * jax.random.normal(key, mean.shape)
-        return jnp.clip(mean, -self.action_clip, self.action_clip)
+        return self.bounded(mean)
 
     def __call__(self, key: jax.Array | None, obs: Mapping[str, jax.Array] | jax.Array) -> jax.Array:
         return self.act(None if self.deterministic else key, obs)

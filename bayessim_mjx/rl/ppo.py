@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from bayessim_mjx.config import PPOConfig
+from bayessim_mjx.errors import UserError
 from bayessim_mjx.rl import episodes, losses, networks, normalise
 from bayessim_mjx.rl.gae import gae
 from bayessim_mjx.rl.networks import Policy
@@ -54,6 +55,7 @@ def policy_of(state: TrainState) -> Policy:
         activation=config.activation,
         normalize=config.normalize_observations,
         action_clip=config.action_clip,
+        squash=config.action_bound == "tanh",
     )
 
 
@@ -86,6 +88,11 @@ def init(env: Env, config: PPOConfig, key: jax.Array, domain: Distribution | Non
     """The state before the first update; domain None trains at the nominal theta."""
     if "policy" not in env.observation_size:
         raise ValueError(f"observation groups {sorted(env.observation_size)}: a policy needs the group 'policy'")
+    if config.shared_trunk and critic_group(env) != "policy":
+        raise UserError(
+            f"ppo.shared_trunk = True: {type(env).__name__} shows its critic other observations than its policy, so "
+            "they need a network each; set it to False"
+        )
     return _init(env, config)(key, domain)
 
 
@@ -96,7 +103,8 @@ def _init(env: Env, config: PPOConfig) -> Callable[..., TrainState]:
     def run(key: jax.Array, domain: Distribution | None) -> TrainState:
         key, network_key, reset_key, clock_key = jax.random.split(key, 4)
         hidden = (config.hidden_actor, config.hidden_critic, config.init_std)
-        params = networks.init(network_key, sizes["policy"], sizes[critic_group(env)], env.action_size, *hidden)
+        kind = (config.state_dependent_std, config.shared_trunk)
+        params = networks.init(network_key, sizes["policy"], sizes[critic_group(env)], env.action_size, *hidden, *kind)
         env_states, partial = _stagger(clock_key, _reset(env, reset_key, domain, config.num_envs), env.episode_length)
         state = TrainState(
             params=params,
@@ -125,7 +133,8 @@ def _collect(
     def act(key: jax.Array, obs: dict[str, jax.Array]) -> tuple[jax.Array, dict]:
         mean, log_std = policy.distribution(obs)
         action = mean + jnp.exp(log_std) * jax.random.normal(key, mean.shape)
-        return jnp.clip(action, -config.action_clip, config.action_clip), {"action": action, "mean": mean}
+        extras = {"action": action, "mean": mean}
+        return policy.bounded(action), extras if log_std.ndim == 1 else extras | {"log_std": log_std}
 
     pool = _reset(env, pool_key, domain, config.num_envs)
     groups = tuple(sorted(state.normalizer))
@@ -147,15 +156,17 @@ def _batch(env: Env, config: PPOConfig, state: TrainState, data: dict) -> losses
     ends = (data["terminated"], data["truncated"])
     advantage, returns = gae(reward, value, next_value, *ends, config.gamma, config.gae_lambda)
     mean, action = data["extras"]["mean"], data["extras"]["action"]
+    log_std = data["extras"].get("log_std")
     batch = losses.Batch(
         observation=observation,
         critic_observation=critic_observation,
         action=action,
         mean=mean,
-        log_prob=networks.log_prob(mean, state.params["actor"]["log_std"], action),
+        log_prob=networks.log_prob(mean, state.params["actor"]["log_std"] if log_std is None else log_std, action),
         value=value,
         advantage=advantage,
         returns=returns,
+        log_std=log_std,
     )
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), batch)
 
@@ -179,7 +190,7 @@ def update(
         "Loss/learning_rate": rate,
         # explained variance = 1 - var(R - V) / var(R)
         "Loss/explained_variance": 1 - (batch.returns - batch.value).var() / (batch.returns.var() + 1e-8),
-        "Policy/mean_std": jnp.exp(params["actor"]["log_std"]).mean(),
+        "Policy/mean_std": jnp.exp(params["actor"]["log_std"] if batch.log_std is None else batch.log_std).mean(),
         "env_steps": env_steps,
         **episodes.metrics(finished),
     }
