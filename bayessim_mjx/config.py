@@ -25,7 +25,10 @@ from bayessim_mjx.settings import (
     MonitorConfig,
     PPOConfig,
     RealConfig,
+    RNDConfig,
     Section,
+    SymmetryConfig,
+    WeightSchedule,
     checked,
     coerce,
     freeze,
@@ -33,9 +36,9 @@ from bayessim_mjx.settings import (
 )
 
 __all__ = [
-    "BayesSimConfig", "Config", "EnvConfig", "Frozen", "MonitorConfig", "PPOConfig", "RealConfig", "Section",
-    "cfg_folder", "freeze", "from_dict", "load", "read_effects", "read_yaml", "replace", "task_file", "thaw", "to_yaml",
-    "unknown",
+    "BayesSimConfig", "Config", "EnvConfig", "Frozen", "MonitorConfig", "PPOConfig", "RNDConfig", "RealConfig",
+    "Section", "SymmetryConfig", "WeightSchedule", "cfg_folder", "freeze", "from_dict", "load", "read_effects",
+    "read_yaml", "replace", "task_file", "thaw", "to_yaml", "unknown",
 ]  # fmt: skip
 
 Layer = tuple[str, Mapping[str, Any], bool]  # where it comes from, nested values, is it a file (else flag or override)
@@ -257,11 +260,33 @@ def _merge_section(
         if key in fields:
             if key == "realParams" and isinstance(value, Mapping):
                 value = _real_params(value, {} if is_file else merged.get(key) or {}, source)
-            merged[key] = _field(cls, key, value, path, source)
+            if (nested := subsection(cls, key)) and isinstance(value, Mapping):
+                merged[key] = _merge_nested(nested, merged.get(key) or {}, value, path, source)
+            else:
+                merged[key] = _field(cls, key, value, path, source)
         elif key in extra:
             merged[key] = _like(value, declared[key], path, source)
         else:
             raise unknown(f"{source}: key", path, [f"{section}.{k}" for k in [*fields, *extra]])
+
+
+def subsection(cls: type[Section], key: str) -> type[Section] | None:
+    """The class of a setting that is a section of its own, such as ppo.rnd."""
+    options = (o for o in typing.get_args(typing.get_type_hints(cls)[key]) if isinstance(o, type))
+    return next((o for o in options if issubclass(o, Section)), None)
+
+
+def _merge_nested(cls: type[Section], merged: Mapping, raw: Mapping, path: str, source: str) -> dict[str, Any]:
+    """Plain values of a section within a section: checked one by one here, and together when all layers are there."""
+    fields, merged = [f.name for f in dataclasses.fields(cls)], dict(merged)  # type: ignore[arg-type]
+    for key, value in raw.items():
+        if key not in fields:
+            raise unknown(f"{source}: key", f"{path}.{key}", [f"{path}.{k}" for k in fields])
+        if (nested := subsection(cls, key)) and isinstance(value, Mapping):
+            merged[key] = _merge_nested(nested, merged.get(key) or {}, value, f"{path}.{key}", source)
+        else:
+            merged[key] = _field(cls, key, value, f"{path}.{key}", source)
+    return merged
 
 
 def _real_params(value: Mapping, base: Mapping, source: str) -> dict[str, Any]:

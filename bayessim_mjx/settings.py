@@ -82,7 +82,8 @@ class Section:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain dicts and lists, as written to YAML."""
-        return {f.name: thaw(getattr(self, f.name)) for f in dataclasses.fields(self)}  # type: ignore[arg-type]
+        values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}  # type: ignore[arg-type]
+        return {name: v.to_dict() if isinstance(v, Section) else thaw(v) for name, v in values.items()}
 
 
 def checked(value: Any, annotation: Any, metadata: Mapping[str, Any], path: str, source: str = "") -> Any:
@@ -155,9 +156,11 @@ def coerce(value: Any, annotation: Any, path: str, source: str = "") -> Any:
             what = {"Frozen": "sections", "int": "whole numbers", "float": "numbers", "str": "texts"}
             raise UserError(f"{path} = {value!r}{where}: expected a list of {what.get(item.__name__, item.__name__)}")
         return tuple(coerce(v, item, f"{path}[{i}]", source) for i, v in enumerate(value))
-    if annotation in (Frozen, dict):
+    if annotation in (Frozen, dict) or (isinstance(annotation, type) and issubclass(annotation, Section)):
+        if isinstance(value, Section):
+            return value
         if isinstance(value, Mapping):
-            return freeze(value)
+            return annotation(**value) if issubclass(annotation, Section) else freeze(value)
         raise UserError(f"{path} = {value!r}{where}: expected a section of `key: value` lines")
     if annotation is Any:
         return freeze(value)
@@ -168,8 +171,6 @@ def coerce(value: Any, annotation: Any, path: str, source: str = "") -> Any:
     if annotation in (bool, str) and isinstance(value, annotation):
         return value
     if annotation is int and isinstance(value, int) and not isinstance(value, bool):
-        return value
-    if dataclasses.is_dataclass(annotation) and isinstance(value, annotation):  # type: ignore[arg-type]
         return value
     name = {"int": "a whole number", "float": "a number", "bool": "True or False", "str": "text"}
     raise UserError(f"{path} = {value!r}{where}: expected {name.get(annotation.__name__, annotation.__name__)}")
@@ -279,6 +280,59 @@ class BayesSimConfig(Section):
 
 
 @dataclass(frozen=True)
+class WeightSchedule(Section):
+    """`ppo.rnd.weight_schedule:`. Steps are control steps of all worlds together in time, not iterations."""
+
+    SECTION: typing.ClassVar[str] = "ppo.rnd.weight_schedule"
+    mode: str = setting("constant", "course of the weight", choices=("constant", "step", "linear"))
+    initial_step: int | None = setting(None, "linear: control step at which the weight begins to move", low=0)
+    final_step: int | None = setting(None, "step, linear: control step from which on it is final_value", low=0)
+    final_value: float | None = setting(None, "step, linear: last weight, in the units of ppo.rnd.weight", low=0)
+
+    def check(self) -> None:
+        needed = {"constant": (), "step": ("final_step", "final_value")}
+        for name in needed.get(self.mode, ("initial_step", "final_step", "final_value")):
+            if getattr(self, name) is None:
+                raise UserError(f"{self.SECTION}.{name} is missing: mode {self.mode} needs it")
+        if self.mode == "linear" and self.initial_step >= self.final_step:  # type: ignore[operator]
+            raise UserError(
+                f"{self.SECTION}.initial_step = {self.initial_step} must be less than final_step = {self.final_step}"
+            )
+
+
+@dataclass(frozen=True)
+class RNDConfig(Section):
+    """`ppo.rnd:`, random network distillation; the names and defaults of rsl_rl."""
+
+    SECTION: typing.ClassVar[str] = "ppo.rnd"
+    num_outputs: int = setting(1, "size of the embedding", low=1)
+    predictor_hidden_dims: tuple[int, ...] = setting((-1,), "widths of the predictor; -1: size of its input", low=-1)
+    target_hidden_dims: tuple[int, ...] = setting((-1,), "widths of the random target; -1: size of its input", low=-1)
+    activation: str = setting("elu", "activation of both networks", choices=ACTIVATIONS)
+    state_normalization: bool = setting(False, "running mean and variance of the observations they see")
+    reward_normalization: bool = setting(False, "novelty in units of the spread of its discounted sum")
+    weight: float = setting(0.0, "weight of the novelty as a reward per second (times the control step)", low=0)
+    weight_schedule: WeightSchedule | None = setting(None, "course of the weight; null: constant")
+    learning_rate: float = setting(1e-3, "Adam learning rate of the predictor", above=0)
+    obs_groups: tuple[str, ...] = setting((), "observation groups they see; none: rnd_state, else policy")
+
+    def check(self) -> None:
+        for name in ("predictor_hidden_dims", "target_hidden_dims"):
+            if 0 in getattr(self, name):
+                raise UserError(f"{self.SECTION}.{name} = {list(getattr(self, name))}: widths are 1 or more, or -1")
+
+
+@dataclass(frozen=True)
+class SymmetryConfig(Section):
+    """`ppo.symmetry:`, use of the robot's mirror maps; all off: its asymmetry is only logged."""
+
+    SECTION: typing.ClassVar[str] = "ppo.symmetry"
+    use_data_augmentation: bool = setting(False, "train on the mirrored samples too")
+    use_mirror_loss: bool = setting(False, "add the mirror loss, the squared difference of a(M o) and M a(o)")
+    mirror_loss_coeff: float = setting(0.0, "weight of the mirror loss", low=0)
+
+
+@dataclass(frozen=True)
 class PPOConfig(Section):
     """`ppo:`, also the content of a --cfg_train file."""
 
@@ -308,6 +362,8 @@ class PPOConfig(Section):
     shared_trunk: bool = setting(False, "the critic is one layer on the actor's hidden ones (hidden_critic is unused)")
     action_clip: float = setting(1.0, "actions are kept within +- this before the environment", above=0)
     action_bound: str = setting("clip", "how: clipped, or squashed by action_clip * tanh", choices=("clip", "tanh"))
+    rnd: RNDConfig | None = setting(None, "random network distillation: rewards for what is new; null: none")
+    symmetry: SymmetryConfig | None = setting(None, "use of the robot's mirror symmetry; null: none")
     max_iterations: int = setting(100, "iterations (per round of the outer loop)", low=0)
     log_interval: int = setting(10, "iterations between log lines", low=1)
     save_interval: int = setting(50, "iterations between checkpoints", low=1)

@@ -8,7 +8,19 @@ from pathlib import Path
 import pytest
 
 from bayessim_mjx import config, registry
-from bayessim_mjx.config import Config, EnvConfig, PPOConfig, from_dict, load, read_yaml, task_file, to_yaml
+from bayessim_mjx.config import (
+    Config,
+    EnvConfig,
+    PPOConfig,
+    RNDConfig,
+    SymmetryConfig,
+    WeightSchedule,
+    from_dict,
+    load,
+    read_yaml,
+    task_file,
+    to_yaml,
+)  # fmt: skip
 from bayessim_mjx.errors import UserError
 
 CFG = sorted(p.stem for p in config.cfg_folder().glob("*.yaml"))
@@ -155,6 +167,14 @@ BAD = {
     "ppo.num_minibatches=100000": r"ppo\.num_minibatches = 100000 is more than the batch",
     "ppo.activation=sigmod": r"ppo\.activation = 'sigmod'.*allowed are elu",
     "ppo=5": r"ppo = 5 .*expected a section",
+    "ppo.rnd=5": r"ppo\.rnd = 5 .*expected a section",
+    "ppo.rnd.wait=1": r"key 'ppo\.rnd\.wait' is unknown. Did you mean ppo\.rnd\.weight\?",
+    "ppo.rnd.weight=-1": r"ppo\.rnd\.weight = -1\.0 \(override.*at least 0",
+    "ppo.rnd.target_hidden_dims=[64, 0]": r"ppo\.rnd\.target_hidden_dims = \[64, 0\]: widths are 1 or more, or -1",
+    "ppo.rnd.weight_schedule.mode=cosine": r"mode = 'cosine'.*allowed are constant, step, linear",
+    "ppo.rnd.weight_schedule.mode=linear": r"weight_schedule\.initial_step is missing: mode linear needs it",
+    "ppo.rnd.weight_schedule={mode: linear, initial_step: 9, final_step: 9, final_value: 0}": r"step = 9 must be",
+    "ppo.symmetry.use_mirror_loss=3": r"ppo\.symmetry\.use_mirror_loss = 3.*expected True or False",
     "bayessim.hiddenLayers=5": r"expected a list of whole numbers",
     "bayessim.hiddenLayers=[8,x]": r"bayessim\.hiddenLayers\[1\] = 'x'.*whole number",
     "bayessim.collectPolicy=rnd": r"allowed are policy_random, policy_ones",
@@ -270,3 +290,14 @@ def test_limits_hold_without_files_too() -> None:
         PPOConfig(gamma=2.0)
     with pytest.raises(UserError, match=r"ppo\.hidden_actor\[0\] = 'a'"):
         PPOConfig(hidden_actor=("a",))  # type: ignore[arg-type]
+
+
+def test_sections_within_a_section_are_off_until_one_of_their_keys_is_given() -> None:
+    assert load("Pendulum").ppo.rnd is None and load("Pendulum").ppo.symmetry is None
+    schedule = ["ppo.rnd.weight_schedule.mode=step", "ppo.rnd.weight_schedule.final_step=7"]
+    keys = ["ppo.rnd.weight=2", *schedule, "ppo.rnd.weight_schedule.final_value=0.5", "ppo.symmetry={}"]
+    config = load("Pendulum", overrides=keys)
+    assert config.ppo.rnd == RNDConfig(weight=2.0, weight_schedule=WeightSchedule("step", None, 7, 0.5))
+    assert config.ppo.symmetry == SymmetryConfig()
+    assert from_dict(config.to_dict()) == config and hash(config.ppo) == hash(from_dict(config.to_dict()).ppo)
+    assert load("Pendulum", overrides=[*keys, "ppo.rnd=null"]).ppo.rnd is None
