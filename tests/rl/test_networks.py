@@ -63,3 +63,90 @@ def test_the_policy_normalises_with_its_own_statistics():
 def test_unknown_activation_is_refused_by_name():
     with pytest.raises(ValueError, match=r"ppo.activation = 'foo'.*elu"):
         networks.activation("foo")
+
+
+def squashed(**changes):
+    return policy(squash=True, action_clip=2.0, **changes)
+
+
+def test_squashed_actions_stay_within_their_bounds_and_the_mode_is_the_squashed_mean():
+    p, obs = squashed(), jnp.array([0.1, -0.2, 0.3])
+    np.testing.assert_allclose(p.act(None, obs), 2 * np.tanh(p.distribution(obs)[0]), rtol=1e-6)
+    actions = jax.vmap(lambda k: p.act(k, obs))(jax.random.split(jax.random.PRNGKey(1), 1000))
+    assert 1.9 < jnp.abs(actions).max() < 2.0
+
+
+def test_the_density_of_squashed_actions_integrates_to_one():
+    """Change of variables: p(a) da over a in (-2, 2)^2, midpoints; the Gaussian's own density would not do."""
+    p, obs = squashed(), jnp.array([0.1, -0.2, 0.3])
+    line = -2 + (np.arange(400) + 0.5) / 100
+    actions = np.stack(np.meshgrid(line, line), -1)
+    density = np.exp(p.log_prob(obs, jnp.arctanh(jnp.asarray(actions, jnp.float32) / 2)))
+    assert density.sum() * 0.01**2 == pytest.approx(1.0, abs=1e-3)
+
+
+def test_squashed_log_prob_by_hand():
+    """u = 1: N(1; 0, 1) / (2 (1 - tanh(1)^2)) = 0.2419707 / 0.8399487 in each of the two dimensions."""
+    p = squashed(normalize=False)
+    p = p.replace(actor=jax.tree.map(jnp.zeros_like, p.actor))
+    assert p.log_prob(jnp.zeros(3), jnp.ones(2)) == pytest.approx(2 * np.log(0.2419707 / 0.8399487), rel=1e-5)
+    far = networks.log_slope(jnp.array([[40.0], [-40.0]]), 1.0)  # 1 - tanh^2 is 0 in float32 there
+    np.testing.assert_allclose(far, 2 * np.log(2) - 80, rtol=1e-6)
+
+
+@pytest.mark.parametrize("mean, std", [(0.0, 1.0), (1.5, 0.5), (-0.7, 2.0)])
+def test_squashed_entropy_equals_the_integral(mean, std):
+    u = np.linspace(mean - 12 * std, mean + 12 * std, 200_001)
+    density = stats.norm(mean, std).pdf(u)
+    log_a = np.log(density + 1e-300) - (np.log(2) + 2 * (np.log(2) - u - np.logaddexp(0, -2 * u)))
+    expected = -np.trapezoid(density * log_a, u)
+    entropy = networks.squashed_entropy(jnp.array([mean]), jnp.log(jnp.array([std])), 2.0)
+    assert entropy == pytest.approx(expected, abs=5e-3)
+
+
+def test_divergence_of_squashed_policies_is_that_of_their_gaussians():
+    """KL = E log p / q, the slopes cancel: by quadrature over actions against the closed form 0.443147."""
+    u = np.linspace(-9, 9, 100_001)
+    p, q = stats.norm(0, 1), stats.norm(1, 2)
+    slope = 1 - np.tanh(u) ** 2 + 1e-300
+    a_density_p, a_density_q = p.pdf(u) / slope, q.pdf(u) / slope
+    divergence = np.trapezoid(a_density_p * np.log(a_density_p / a_density_q) * slope, u)
+    assert networks.kl(jnp.zeros(1), jnp.zeros(1), jnp.ones(1), jnp.log(2.0) * jnp.ones(1)) == pytest.approx(
+        divergence, abs=1e-5
+    )
+
+
+def test_a_spread_that_depends_on_the_state_begins_at_init_std_and_stays_bounded():
+    params = networks.init(jax.random.PRNGKey(0), 3, 3, 2, (8,), (8,), 0.3, state_dependent_std=True)
+    x = jax.random.normal(jax.random.PRNGKey(1), (50, 3))
+    mean, log_std = networks.gaussian(params["actor"], x, jnp.tanh)
+    assert mean.shape == log_std.shape == (50, 2)
+    np.testing.assert_allclose(jnp.exp(log_std), 0.3, rtol=1e-5)
+    layers = params["actor"]["layers"]
+    layers = [*layers[:-1], {"w": layers[-1]["w"] + 10.0, "b": layers[-1]["b"]}]
+    _, log_std = networks.gaussian({"layers": layers}, x, jnp.tanh)
+    assert log_std.std() > 1 and jnp.abs(log_std).max() <= 5
+
+
+def test_means_are_the_same_with_either_kind_of_spread():
+    plain, dependent = (
+        networks.init(jax.random.PRNGKey(0), 3, 3, 2, (8,), (8,), 0.3, state_dependent_std=flag)
+        for flag in (False, True)
+    )
+    x = jnp.ones((4, 3))
+    mean = networks.mean_action(plain, x, jnp.tanh)
+    np.testing.assert_allclose(networks.mean_action(dependent, x, jnp.tanh), mean, rtol=1e-5)
+
+
+def test_a_shared_trunk_is_trained_by_both():
+    """By hand: trunk tanh(x), critic head 3, actor head 2; values move the trunk's weights."""
+    one = lambda w: {"w": jnp.array([[w]]), "b": jnp.zeros(1)}  # noqa: E731
+    params = {"actor": {"layers": [one(1.0), one(2.0)], "log_std": jnp.zeros(1)}, "critic": {"head": [one(3.0)]}}
+    x = jnp.array([0.5])
+    assert networks.value(params, x, jnp.tanh) == pytest.approx(3 * np.tanh(0.5), rel=1e-5)
+    assert networks.mean_action(params, x, jnp.tanh)[0] == pytest.approx(2 * np.tanh(0.5), rel=1e-5)
+    slope = jax.grad(lambda p: networks.value(p, x, jnp.tanh))(params)["actor"]["layers"]
+    assert slope[0]["w"][0, 0] == pytest.approx(3 * 0.5 * (1 - np.tanh(0.5) ** 2), rel=1e-5)
+    assert slope[1]["w"][0, 0] == 0
+    made = networks.init(jax.random.PRNGKey(0), 5, 5, 2, (8, 6), (3,), 1.0, shared_trunk=True)
+    assert made["critic"]["head"][0]["w"].shape == (6, 1)
