@@ -360,6 +360,7 @@ class PPOConfig(Section):
     init_std: float = setting(1.0, "initial standard deviation of actions", above=0)
     state_dependent_std: bool = setting(False, "the actor gives the standard deviation too, else it is a parameter")
     shared_trunk: bool = setting(False, "the critic is one layer on the actor's hidden ones (hidden_critic is unused)")
+    critic_theta: bool = setting(False, "the critic also sees the physics, theta (not the actor)")
     action_clip: float = setting(1.0, "actions are kept within +- this before the environment", above=0)
     action_bound: str = setting("clip", "how: clipped, or squashed by action_clip * tanh", choices=("clip", "tanh"))
     rnd: RNDConfig | None = setting(None, "random network distillation: rewards for what is new; null: none")
@@ -375,6 +376,10 @@ class PPOConfig(Section):
             raise UserError(
                 f"ppo.num_minibatches = {self.num_minibatches} is more than the batch of num_envs * num_steps = "
                 f"{self.num_envs} * {self.num_steps} = {batch} samples"
+            )
+        if self.shared_trunk and self.critic_theta:
+            raise UserError(
+                "ppo.critic_theta = True: with ppo.shared_trunk the actor would see theta too; use one of them"
             )
         if self.shared_trunk and not self.hidden_actor:
             raise UserError("ppo.shared_trunk = True needs hidden layers to share: ppo.hidden_actor is []")

@@ -16,6 +16,7 @@ from bayessim_mjx.errors import UserError
 from bayessim_mjx.rl import episodes, losses, networks, normalise
 from bayessim_mjx.rl.gae import gae
 from bayessim_mjx.rl.networks import Policy
+from bayessim_mjx.rl.privileged import knowing_theta
 from bayessim_mjx.rollout import collect
 
 if TYPE_CHECKING:
@@ -44,6 +45,11 @@ class TrainState:
 def critic_group(env: Env) -> str:
     """The observation group that the critic sees: "critic" where the environment has one, else "policy"."""
     return "critic" if "critic" in env.observation_size else "policy"
+
+
+def _for_learner(env: Env, config: PPOConfig) -> Env:
+    """The environment as the learner sees it."""
+    return knowing_theta(env) if config.critic_theta else env
 
 
 def policy_of(state: TrainState) -> Policy:
@@ -88,6 +94,7 @@ def init(env: Env, config: PPOConfig, key: jax.Array, domain: Distribution | Non
     """The state before the first update; domain None trains at the nominal theta."""
     if "policy" not in env.observation_size:
         raise ValueError(f"observation groups {sorted(env.observation_size)}: a policy needs the group 'policy'")
+    env = _for_learner(env, config)
     if config.shared_trunk and critic_group(env) != "policy":
         raise UserError(
             f"ppo.shared_trunk = True: {type(env).__name__} shows its critic other observations than its policy, so "
@@ -175,6 +182,7 @@ def update(
     env: Env, config: PPOConfig, state: TrainState, domain: Distribution | None
 ) -> tuple[TrainState, dict[str, jax.Array]]:
     """One iteration, to be jitted: the new state and its metrics, scalars under their TensorBoard tags."""
+    env = _for_learner(env, config)
     key, collect_key, epochs_key = jax.random.split(state.key, 3)
     env_states, data = _collect(env, config, state, domain, collect_key)
     batch = _batch(env, config, state, data)
