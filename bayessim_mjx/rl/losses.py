@@ -52,12 +52,15 @@ def standardise(x: jax.Array) -> jax.Array:
     return (x - x.mean()) / (x.std() + 1e-8)
 
 
-def loss(params: Params, old_log_std: jax.Array | None, batch: Batch, config: PPOConfig) -> tuple[jax.Array, dict]:
-    """Surrogate + c_v value loss - c_e entropy, and the figures of this minibatch. KL is of old || new, analytic."""
+def loss(params: Params, old_log_std: Any, batch: Batch, config: PPOConfig) -> tuple[jax.Array, dict]:
+    """Surrogate + c_v value loss - c_e entropy, and the figures of this minibatch. KL is of old || new, analytic.
+
+    old_log_std [A] is that of the collecting policy; not used where the batch has its own.
+    """
     act = networks.activation(config.activation)
     mean, log_std = networks.gaussian(params["actor"], batch.observation, act)
     log_prob = networks.log_prob(mean, log_std, batch.action)  # of raw actions: tanh's slope cancels in the ratio
-    old_log_std = old_log_std if batch.log_std is None else batch.log_std
+    old = old_log_std if batch.log_std is None else batch.log_std
     advantage = standardise(batch.advantage) if config.normalize_advantage_per_minibatch else batch.advantage
     surrogate = surrogate_loss(log_prob, batch.log_prob, advantage, config.clip_param)
     value = value_loss(
@@ -73,7 +76,7 @@ def loss(params: Params, old_log_std: jax.Array | None, batch: Batch, config: PP
         "Loss/surrogate": surrogate,
         "Loss/value": value,
         "Loss/entropy": entropy,
-        "Loss/kl": networks.kl(batch.mean, old_log_std, mean, log_std).mean(),
+        "Loss/kl": networks.kl(batch.mean, old, mean, log_std).mean(),
         "Loss/clip_fraction": (jnp.abs(jnp.exp(log_prob - batch.log_prob) - 1) > config.clip_param).mean(),
     }
     return surrogate + config.value_loss_coef * value - config.entropy_coef * entropy, metrics
