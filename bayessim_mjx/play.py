@@ -1,4 +1,7 @@
-"""`python -m bayessim_mjx.play --task Pendulum --checkpoint best --video`: returns of a saved policy, and a video."""
+"""`python -m bayessim_mjx.play --task Pendulum --checkpoint best --video`: returns of a saved policy, and a video.
+
+`--export` writes the policy as an ONNX file instead.
+"""
 
 from __future__ import annotations
 
@@ -24,6 +27,9 @@ def _parser() -> cli.Parser:
         "--episodes", type=int, help="per kind of physics (default: --num_envs, else bayessim.realEvals)"
     )
     parser.add_argument("--physics", choices=PHYSICS, help="one kind only")
+    parser.add_argument(
+        "--export", metavar="FILE", nargs="?", const="", help="write the policy as ONNX (exported/ of the run) and end"
+    )
     return parser
 
 
@@ -80,6 +86,19 @@ def _video(config: Config, env: Any, policy: Any, thetas: Any, key: Any, path: P
     return f"video: {path}" if frames is not None else "no video could be made here"
 
 
+def _export(env: Any, policy: Any, checkpoint: Path, run: Any, target: str) -> str:
+    """Write the ONNX file; what to say of it."""
+    from bayessim_mjx.rl import export
+
+    if target and not target.endswith(".onnx"):
+        raise UserError(f"--export {target}: the file's name has to end with .onnx")
+    folder = (run.path if run is not None else checkpoint.parent) / "exported"
+    path = Path(target) if target else folder / f"{checkpoint.name}.onnx"
+    error = export.write(path, policy, env, {"checkpoint": checkpoint.name})
+    checked = "not compared (onnxruntime is not installed)" if error is None else f"differs by {error:.1e} at most"
+    return f"exported {path}: {checked}"
+
+
 def _play(argv: Sequence[str] | None) -> int:
     args = _parser().parse(argv)
     if args.list_tasks:
@@ -105,6 +124,9 @@ def _show(args: argparse.Namespace, config: Config, path: Path, run: Any, count:
     config = dataclasses.replace(config, randomization=freeze({**config.randomization, "randomize": True}))
     env = registry.make(config.task, config=config)
     policy, key = cli.load_policy(path, env, config), jax.random.PRNGKey(config.seed)
+    if args.export is not None:
+        console.say(_export(env, policy, path, run, args.export))
+        return 0
     kinds = _physics(config, env, path, key, count)
     if args.physics and args.physics not in kinds:
         raise UserError(f"--physics {args.physics}: this checkpoint and task have {', '.join(kinds)}")

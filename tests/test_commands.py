@@ -318,6 +318,15 @@ def test_play_prints_returns_of_latest_best_run_and_path(toy: None, capsys: pyte
     line = error_of(capsys, play.main, "--checkpoint", str(run.path), "ppo.hidden_actor=[5]")
     assert "policy.actor" in line and "settings that it was made with" in line
     assert "give --task NAME" in error_of(capsys, play.main, "--checkpoint", "latest")
+    assert "p.pt: the file's name has to end with .onnx" in error_of(
+        capsys, play.main, "--checkpoint", str(run.path), "--export", "p.pt"
+    )
+    pytest.importorskip("onnxruntime", reason="the extra [export] is not installed")
+    for flags in ([], ["deploy/p.onnx"]):
+        assert play.main(["--checkpoint", str(run.checkpoint(2)), "--export", *flags]) == 0
+        where, _, rest = capsys.readouterr().out.rpartition("exported ")[2].partition(": differs by ")
+        assert float(rest.split()[0]) < 1e-5 and Path(where).is_file()
+    assert where == "deploy/p.onnx"
 
 
 def test_training_goes_on_from_a_policy(toy: None) -> None:

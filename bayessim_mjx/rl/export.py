@@ -1,0 +1,196 @@
+"""A policy as an ONNX file for other machines: normaliser and limits inside, any batch size, and what its numbers mean.
+
+The graph: observation [batch, S] -> action [batch, A] in [-1, 1], the deterministic one, and command [batch, nu] in the
+actuators' units where the task scales each action by a number of its own. Metadata are texts, lists in JSON.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from bayessim_mjx.env import Env
+from bayessim_mjx.errors import UserError
+from bayessim_mjx.rl import normalise
+from bayessim_mjx.rl.networks import Policy
+
+OPSET, IR_VERSION = 17, 8  # of 2022: every runtime since reads it
+GOLDEN = 8  # observations with the policy's answers, for a check on the target machine
+PACKAGES = ("bayessim-mjx", "jax", "mujoco", "onnx")
+ONE_NODE = {"elu": "Elu", "relu": "Relu", "selu": "Selu", "tanh": "Tanh"}
+
+
+class Graph:
+    """A chain of ONNX nodes on one running value."""
+
+    def __init__(self, value: str) -> None:
+        self.value, self.nodes, self.constants = value, [], []  # type: ignore[var-annotated]
+
+    def then(self, operation: str, *others: Any, output: str = "", **attributes: Any) -> str:
+        """value = operation(value, *others); arrays become constants, texts are names of other values."""
+        from onnx import helper
+
+        names = [self.value, *(o if isinstance(o, str) else self.constant(o) for o in others)]
+        self.value = output or f"value_{len(self.nodes)}"
+        self.nodes.append(helper.make_node(operation, names, [self.value], **attributes))
+        return self.value
+
+    def constant(self, array: Any) -> str:
+        """Name of a float32 constant."""
+        from onnx import numpy_helper
+
+        name = f"constant_{len(self.constants)}"
+        self.constants.append(numpy_helper.from_array(np.asarray(array, np.float32), name))
+        return name
+
+    def activate(self, name: str) -> None:
+        """The activations of `networks.ACTIVATIONS`."""
+        x = self.value
+        if name in ONE_NODE:
+            self.then(ONE_NODE[name])
+        elif name == "swish":  # x sigmoid(x)
+            self.then("Sigmoid")
+            self.then("Mul", x)
+        else:  # gelu, as JAX's: x (1 + tanh(sqrt(2 / pi) (x + 0.044715 x^3))) / 2
+            for operation, other in (
+                ("Mul", x),
+                ("Mul", 0.044715),
+                ("Add", 1.0),
+                ("Mul", x),
+                ("Mul", (2 / np.pi) ** 0.5),
+            ):
+                self.then(operation, other)
+            self.then("Tanh")
+            for operation, other in (("Add", 1.0), ("Mul", x), ("Mul", 0.5)):
+                self.then(operation, other)
+
+
+def command_scale(env: Env) -> tuple[np.ndarray, np.ndarray] | None:
+    """(scale [A], offset [A]) of the commands offset + scale action; None where they are not of that form."""
+    command = getattr(env, "command", None)
+    if command is None:
+        return None
+    probes = np.random.default_rng(0).uniform(-1, 1, (16, env.action_size)).astype(np.float32)
+    offset = np.asarray(command(jnp.zeros(env.action_size)))
+    if offset.shape != (env.action_size,):
+        return None
+    scale = np.asarray(command(jnp.ones(env.action_size))) - offset
+    commands = np.stack([np.asarray(command(jnp.asarray(action))) for action in probes])
+    return (scale, offset) if np.allclose(commands, offset + scale * probes, rtol=1e-4, atol=1e-6) else None
+
+
+def _network(graph: Graph, policy: Policy, env: Env) -> None:
+    """Observation -> mean of the raw action."""
+    limit = getattr(env, "observation_clip", {}).get(getattr(env, "variant", ""))
+    if limit is not None:  # as the task does before the policy sees it
+        graph.then("Clip", -limit, limit)
+    if policy.normalize:
+        graph.then("Sub", policy.normalizer.mean)
+        graph.then("Div", jnp.sqrt(policy.normalizer.var) + normalise.EPSILON)
+        graph.then("Clip", -normalise.LIMIT, normalise.LIMIT)
+    *hidden, last = jax.device_get(policy.actor["layers"])
+    for layer in hidden:
+        graph.then("Gemm", layer["w"], layer["b"])
+        graph.activate(policy.activation)
+    size = env.action_size  # a spread that depends on the state comes after the means
+    graph.then("Gemm", last["w"][:, :size], last["b"][:size])
+
+
+def onnx_model(policy: Policy, env: Env, notes: Mapping[str, Any] | None = None) -> Any:
+    """The `onnx.ModelProto` of a policy of `env`; `notes`: more metadata. UserError where onnx is not installed."""
+    try:
+        import onnx
+        from onnx import helper
+    except ImportError:
+        raise UserError('--export needs the package onnx: pip install "bayessim-mjx[export]"') from None
+    graph, limit = Graph("observation"), policy.action_clip
+    _network(graph, policy, env)
+    if policy.squash:
+        graph.then("Tanh")
+        graph.then("Mul", limit)
+    bound = min(1.0, limit)  # environments clip to +- 1 in any case
+    graph.then("Clip", -bound, bound, output="action")
+    outputs, scaling = {"action": env.action_size}, command_scale(env)
+    if scaling is not None:
+        graph.then("Mul", scaling[0])
+        graph.then("Add", scaling[1], output="command")
+        outputs["command"] = env.action_size
+    value = lambda name, size: helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, ["batch", size])  # noqa: E731
+    size = env.observation_size["policy"][0]
+    ends = [value("observation", size)], [value(name, size) for name, size in outputs.items()]
+    model = helper.make_model(
+        helper.make_graph(graph.nodes, "policy", *ends, initializer=graph.constants),
+        opset_imports=[helper.make_opsetid("", OPSET)],
+        ir_version=IR_VERSION,
+        producer_name="bayessim_mjx",
+    )
+    described = metadata(policy, env) | dict(notes or {})
+    helper.set_model_props(model, {key: v if isinstance(v, str) else json.dumps(v) for key, v in described.items()})
+    onnx.checker.check_model(model, full_check=True)
+    return model
+
+
+def metadata(policy: Policy, env: Env) -> dict[str, Any]:
+    """What the inputs and outputs are, in their order, and golden pairs of observations and actions."""
+    scaling, golden = command_scale(env), golden_observations(policy)
+    action = jnp.clip(policy.act(None, golden), -1.0, 1.0)
+    facts = {
+        "task": env.name,
+        "observation_names": list(getattr(env, "observation_names", ())),
+        "action_names": _names(env.mj_model, mujoco.mjtObj.mjOBJ_ACTUATOR, env.mj_model.nu),
+        "joint_names": _names(env.mj_model, mujoco.mjtObj.mjOBJ_JOINT, env.mj_model.njnt),
+        "control_dt": env.dt,
+        "action_clip": policy.action_clip,
+        "versions": {name: _version(name) for name in PACKAGES},
+        "golden_observation": np.asarray(golden).tolist(),
+        "golden_action": np.asarray(action).tolist(),
+    }
+    if scaling is not None:
+        facts |= {"action_scale": scaling[0].tolist(), "action_offset": scaling[1].tolist()}
+    return facts
+
+
+def golden_observations(policy: Policy, count: int = GOLDEN) -> jax.Array:
+    """Observations [count, S] spread like those of the training, and some far outside."""
+    noise = jax.random.normal(jax.random.PRNGKey(0), (count, policy.normalizer.mean.shape[0]))
+    factor = jnp.where(jnp.arange(count) % 4 == 3, 20.0, 1.0)[:, None]
+    return policy.normalizer.mean + factor * noise * jnp.sqrt(policy.normalizer.var)
+
+
+def difference(path: Path, observation: Any, action: Any) -> float | None:
+    """Largest difference between the file's actions and `action` [N, A] at `observation`; None without onnxruntime."""
+    try:
+        import onnxruntime
+    except ImportError:
+        return None
+    session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
+    (answer,) = session.run(["action"], {"observation": np.asarray(observation, np.float32)})
+    return float(np.abs(answer - np.asarray(action)).max())
+
+
+def write(path: Path, policy: Policy, env: Env, notes: Mapping[str, Any] | None = None) -> float | None:
+    """Write the file; the largest difference to the policy at golden observations, None without onnxruntime."""
+    data = onnx_model(policy, env, notes).SerializeToString()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(data)
+    observation = golden_observations(policy)
+    return difference(path, observation, jnp.clip(policy.act(None, observation), -1.0, 1.0))
+
+
+def _names(model: mujoco.MjModel, kind: mujoco.mjtObj, count: int) -> Sequence[str]:
+    return [mujoco.mj_id2name(model, kind, i) or f"{i}" for i in range(count)]
+
+
+def _version(package: str) -> str:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return "unknown"
