@@ -99,10 +99,16 @@ def log_density(u: Array, means: Array, scales: Array) -> Array:
 
 def propose(key: Array, logits: Array, means: Array, scales: Array, n: int) -> Array:
     """n draws of the mixture, not truncated -> [n, d]."""
-    key_k, key_z = jax.random.split(key)
-    k = jax.random.categorical(key_k, logits, shape=(n,))
-    z = jax.random.normal(key_z, (n, means.shape[-1]))
-    return means[k] + jnp.einsum("nij,nj->ni", scales[k], z, precision=jax.lax.Precision.HIGHEST)
+    # one call for all random numbers: several of them, batched, take seconds to compile
+    w = jax.random.uniform(key, (n, 1 + means.shape[-1]), minval=1e-7)
+    k = choose(w[:, 0], logits)
+    return means[k] + jnp.einsum("nij,nj->ni", scales[k], ndtri(w[:, 1:]), precision=jax.lax.Precision.HIGHEST)
+
+
+def choose(w: Array, logits: Array) -> Array:
+    """Indices with the probabilities softmax(logits [K]) from uniforms w [n] in [0, 1), by inversion -> [n]."""
+    edges = jnp.cumsum(jax.nn.softmax(logits))
+    return jnp.sum(w[:, None] * edges[-1] >= edges[None, :-1], axis=1)
 
 
 def draw(
@@ -136,8 +142,7 @@ def draw(
 
 def _pick(key: Array, logits: Array, means: Array, scales: Array, spare: int) -> Array:
     """One point of the truncated mixture by sampling-importance-resampling among `spare` separated points -> [d]."""
-    key_k, key_w, key_pick = jax.random.split(key, 3)
-    k = jax.random.categorical(key_k, logits, shape=(spare,))
-    w = jax.random.uniform(key_w, (spare, 1, means.shape[-1]), minval=1e-6, maxval=1 - 1e-6)
-    points, weights = jax.vmap(separate)(means[k], scales[k], w)
-    return points[jax.random.categorical(key_pick, weights[:, 0]), 0]
+    w = jax.random.uniform(key, (1 + spare, 1 + means.shape[-1]), minval=1e-6, maxval=1 - 1e-6)
+    k = choose(w[1:, 0], logits)
+    points, weights = jax.vmap(separate)(means[k], scales[k], w[1:, None, 1:])
+    return points[choose(w[:1, 0], weights[:, 0])[0], 0]

@@ -66,13 +66,13 @@ def _draws(key: Array, q: Distribution, n: int) -> tuple[Array, Array]:
 
     Ranks among a random number of draws are as uniform as among a fixed one, so nothing needs to be drawn again.
     """
-    k_flat, k_thin, k_u, k_mog = jax.random.split(key, 4)
+    k_flat, k_mog = jax.random.split(key)
     mog = charts.from_chart(box.propose(k_mog, q.logits, q.means, q.scales, n), q.chart)
     inside = jnp.all((mog >= 0) & (mog <= 1), axis=-1)
     # the prior's share has to lose as many draws as the mixture does
-    thinned = jax.random.uniform(k_thin, (n,)) < jnp.exp(q.log_inside)
-    flat = jax.random.uniform(k_flat, (n,)) < q.prior_weight
-    v = jnp.where(flat[:, None], jax.random.uniform(k_u, mog.shape), jnp.clip(mog, 0, 1))
+    w = jax.random.uniform(k_flat, (n, 2 + mog.shape[1]))
+    thinned, flat = w[:, 0] < jnp.exp(q.log_inside), w[:, 1] < q.prior_weight
+    v = jnp.where(flat[:, None], w[:, 2:], jnp.clip(mog, 0, 1))
     return v, jnp.where(flat, thinned, inside).astype(jnp.float32)
 
 
@@ -243,7 +243,7 @@ def corrected(key: Array, posteriors: Distribution, thetas: Array) -> Report:
         return report
     wider = widened(posteriors, factor)
     # all of them: a program that is compiled already
-    found = jax.tree.map(np.asarray, ranks(jax.random.fold_in(key, 1), wider, jnp.asarray(thetas)))
+    found = jax.tree.map(np.asarray, ranks(jax.random.fold_in(key, 1), wider, jnp.asarray(thetas), DRAWS))
     after = judge(_usable(Ranks(*(part[n // 2 :] for part in found))), posteriors.space)
     words = f"{report.words}; standard deviations times {factor:.2f}, then {after.words}"
     return replace(after, words=words, temperature=factor, before=report.verdict)
