@@ -12,18 +12,17 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 import mujoco
-import numpy as np
 from flax import struct
 
 from bayessim_mjx.effects.effect import Effect
 from bayessim_mjx.effects.reading import stack
 from bayessim_mjx.effects.storage import corrected
 from bayessim_mjx.errors import UserError
+from bayessim_mjx.mirrors import Mirror, MirrorMap, resolve
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 from bayessim_mjx.physics import Physics, World, control_step, mjx
 
 Observations = dict[str, jax.Array]
-SignedPermutation = tuple[np.ndarray, np.ndarray]
 VARIANTS = ("isaacgymenvs", "bayessim2021")
 
 
@@ -53,7 +52,7 @@ class Env(abc.ABC):
     name: str = ""
     backend: str = "mjx"
     episode_length: int
-    mirror: dict[str, SignedPermutation] | None = None
+    mirrors: tuple[MirrorMap, ...] = ()
 
     @abc.abstractmethod
     def reset(self, key: jax.Array, theta: jax.Array | None = None) -> State:
@@ -120,6 +119,7 @@ class Task(Env):
     randomization: ClassVar[dict[str, Any]]
     real_parameters: ClassVar[Sequence[float]]
     observation_names: ClassVar[tuple[str, ...]]
+    mirror: ClassVar[tuple[Mirror, ...]] = ()  # symmetries of the robot by name; resolved in `mirrors`
     observation_clip: ClassVar[dict[str, float | None]] = {"isaacgymenvs": None, "bayessim2021": 100.0}
     max_qvel: ClassVar[float | None] = None
     diverged_reward: ClassVar[float] = 0.0  # of the step in which a world diverges
@@ -144,6 +144,8 @@ class Task(Env):
         self.physics = Physics(mj_model, self.control_dt, space, stack(section, effects), self.max_qvel)
         self.joint_names = _names(mj_model, mujoco.mjtObj.mjOBJ_JOINT, mj_model.njnt)
         self.actuator_names = _names(mj_model, mujoco.mjtObj.mjOBJ_ACTUATOR, mj_model.nu)
+        names = {"policy": self.observation_names}
+        self.mirrors = tuple(resolve(mirror, mj_model, names) for mirror in self.mirror)
 
     def _read(self, config: Any) -> dict[str, Any]:
         known = {"episodeLength": self.default_episode_length, "variant": VARIANTS[0], **self.options}

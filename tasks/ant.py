@@ -5,7 +5,7 @@ Joint stiffness, when randomised, is a passive spring about q = 0 (springref 0),
 """
 
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +13,7 @@ import mujoco
 import numpy as np
 
 from bayessim_mjx.env import Observations, Task
+from bayessim_mjx.mirrors import Mirror
 from bayessim_mjx.physics import World, mjx
 
 FEET = ("front_left_foot", "front_right_foot", "left_back_foot", "right_back_foot")
@@ -21,11 +22,6 @@ MAX_TORQUE = 15.0  # N m
 TARGET = np.array([1000.0, 0.0], np.float32)  # m
 FALLEN = 0.31  # m, height of the torso
 SPEED_SCALE, FORCE_SCALE = 0.2, 0.1
-
-# Left-right mirror (y -> -y): legs 1 <-> 4 and 2 <-> 3; the hips' axes keep, the ankles' axes turn.
-LEG_PERM = np.array([6, 7, 4, 5, 2, 3, 0, 1])
-LEG_SIGN = np.array([-1, 1] * 4)
-POLAR, AXIAL = np.array([1, -1, 1]), np.array([-1, 1, -1])
 
 _XYZ = ("x", "y", "z")
 NAMES = (
@@ -40,13 +36,19 @@ NAMES = (
 )
 
 
-def _mirror() -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    wrench = np.concatenate([POLAR, AXIAL])
-    feet = (28 + 6 * np.array([3, 2, 1, 0])[:, None] + np.arange(6)).ravel()
-    perm = [np.arange(12), 12 + LEG_PERM, 20 + LEG_PERM, feet, 52 + LEG_PERM]
-    sign: list[Any] = [[1], POLAR, AXIAL, [-1, -1, -1, 1, 1], LEG_SIGN, LEG_SIGN, np.tile(wrench, 4), LEG_SIGN]
-    observation = (np.concatenate(perm), np.concatenate(sign).astype(np.float32))
-    return {"observation": observation, "action": (LEG_PERM, LEG_SIGN.astype(np.float32))}
+def _mirror() -> Mirror:
+    """Left and right (y -> -y): legs 1 <-> 4 and 2 <-> 3; hips turn the other way, the ankles' axes take care of it."""
+    turned = [f"{foot}_{part}" for foot in FEET for part in ("force_y", "torque_x", "torque_z")]
+    partner = dict(zip(FEET, reversed(FEET), strict=True))
+    wrenches = [f"{foot}_{kind}_{i}" for foot in FEET for kind in ("force", "torque") for i in _XYZ]
+    images = {name: partner[foot] + name[len(foot) :] for name in wrenches for foot in FEET if name.startswith(foot)}
+    odd = ("velocity_y", "angular_velocity_x", "angular_velocity_z", "yaw", "roll", "angle_to_target")
+    return Mirror(
+        joints={"hip_1": "-hip_4", "hip_2": "-hip_3", "ankle_1": "ankle_4", "ankle_2": "ankle_3"},
+        observations={name: f"-{name}" for name in odd}
+        | {name: "-" * (name in turned) + other for name, other in images.items()},
+        normal="y",
+    )
 
 
 def _range(low: float, high: float, operation: str) -> dict:
@@ -74,7 +76,7 @@ class Ant(Task):
             }
         }
     }
-    mirror = _mirror()
+    mirror = (_mirror(),)
 
     def spec(self) -> mujoco.MjSpec:
         return mujoco.MjSpec.from_file(str(Path(__file__).with_name("ant.xml")))

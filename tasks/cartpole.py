@@ -9,9 +9,9 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 import mujoco
-import numpy as np
 
 from bayessim_mjx.env import Observations, Task
+from bayessim_mjx.mirrors import Mirror
 from bayessim_mjx.physics import World, mjx
 
 # The URDF gives no inertias: those of the boxes. The slide limit of +-4 m lies outside |x| > 3 and is left out.
@@ -87,10 +87,12 @@ class Cartpole(Task):
             }
         }
     }
-    mirror = {
-        "observation": (np.arange(4), -np.ones(4, np.float32)),
-        "action": (np.arange(1), -np.ones(1, np.float32)),
-    }
+    mirror = (
+        Mirror(
+            joints={"slider_to_cart": "-slider_to_cart", "cart_to_pole": "-cart_to_pole"},
+            observations={name: f"-{name}" for name in observation_names},
+        ),
+    )
 
     def spec(self) -> mujoco.MjSpec:
         return mujoco.MjSpec.from_string(XML)

@@ -9,9 +9,9 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 import mujoco
-import numpy as np
 
 from bayessim_mjx.env import Observations, Task
+from bayessim_mjx.mirrors import Mirror
 from bayessim_mjx.physics import World, mjx
 
 # Rod of mass 1 kg and length 1 m: com at l/2, inertia m l^2 / 12 about it (and a negligible one along the rod).
@@ -66,10 +66,7 @@ class Pendulum(Task):
             }
         }
     }
-    mirror = {
-        "observation": (np.array([0, 1, 2]), np.array([1.0, -1.0, -1.0], np.float32)),
-        "action": (np.array([0]), np.array([-1.0], np.float32)),
-    }
+    mirror = (Mirror(joints={"hinge": "-hinge"}, observations={"sin_theta": "-sin_theta", "theta_dot": "-theta_dot"}),)
 
     def spec(self) -> mujoco.MjSpec:
         return mujoco.MjSpec.from_string(XML)

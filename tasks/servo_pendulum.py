@@ -9,9 +9,9 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 import mujoco
-import numpy as np
 
 from bayessim_mjx.env import Observations, Task
+from bayessim_mjx.mirrors import Mirror
 from bayessim_mjx.physics import World, mjx
 
 VOLTAGE = 7.4  # V, supply of the rig; command = duty * VOLTAGE
@@ -92,10 +92,13 @@ class ServoPendulum(Task):
             }
         }
     }
-    mirror = {
-        "observation": (np.arange(5), np.array([1.0, -1.0, -1.0, 1.0, -1.0], np.float32)),
-        "action": (np.array([0]), np.array([-1.0], np.float32)),
-    }
+    mirror = (
+        Mirror(
+            joints={"servo": "-servo"},
+            observations={"sin_q": "-sin_q", "speed": "-speed", "sin_error": "-sin_error"},
+            task=("target",),
+        ),
+    )
 
     def spec(self) -> mujoco.MjSpec:
         return mujoco.MjSpec.from_string(XML)

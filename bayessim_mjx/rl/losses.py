@@ -1,6 +1,7 @@
 """Proximal policy optimisation (Schulman et al. 2017): the losses, and the epochs of minibatches over one batch."""
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -10,7 +11,8 @@ from flax import struct
 from jax.flatten_util import ravel_pytree
 
 from bayessim_mjx.config import PPOConfig
-from bayessim_mjx.rl import networks
+from bayessim_mjx.mirrors import MirrorMap
+from bayessim_mjx.rl import networks, symmetry
 from bayessim_mjx.rl.networks import Params
 
 MIN_LEARNING_RATE, MAX_LEARNING_RATE = 1e-5, 1e-2  # bounds of the adaptive schedule
@@ -30,6 +32,7 @@ class Batch:
     advantage: jax.Array  # [B]
     returns: jax.Array  # [B]
     log_std: jax.Array | None = None  # [B, A] of the collecting policy, where it depends on the state
+    copies: symmetry.Copies | None = None  # mirror images, where ppo.symmetry is on
 
 
 def surrogate_loss(log_prob: jax.Array, old_log_prob: jax.Array, advantage: jax.Array, clip: float) -> jax.Array:
@@ -52,23 +55,30 @@ def standardise(x: jax.Array) -> jax.Array:
     return (x - x.mean()) / (x.std() + 1e-8)
 
 
-def loss(params: Params, old_log_std: Any, batch: Batch, config: PPOConfig) -> tuple[jax.Array, dict]:
-    """Surrogate + c_v value loss - c_e entropy, and the figures of this minibatch. KL is of old || new, analytic.
+def loss(
+    params: Params, old_log_std: Any, batch: Batch, config: PPOConfig, mirrors: Sequence[MirrorMap] = ()
+) -> tuple[jax.Array, dict]:
+    """Surrogate + c_v value loss - c_e entropy [+ mirror loss], and the figures of this minibatch.
 
-    old_log_std [A] is that of the collecting policy; not used where the batch has its own.
+    old_log_std [A] is that of the collecting policy; not used where the batch has its own. KL is of old || new,
+    analytic; it, the entropy and the clip fraction are of the batch's own samples, not of their mirrored copies.
     """
-    act = networks.activation(config.activation)
-    mean, log_std = networks.gaussian(params["actor"], batch.observation, act)
-    log_prob = networks.log_prob(mean, log_std, batch.action)  # of raw actions: tanh's slope cancels in the ratio
-    old = old_log_std if batch.log_std is None else batch.log_std
-    advantage = standardise(batch.advantage) if config.normalize_advantage_per_minibatch else batch.advantage
-    surrogate = surrogate_loss(log_prob, batch.log_prob, advantage, config.clip_param)
+    act, size = networks.activation(config.activation), batch.advantage.shape[0]
+    if config.normalize_advantage_per_minibatch:
+        batch = dataclasses.replace(batch, advantage=standardise(batch.advantage))
+    augmented = config.symmetry is not None and config.symmetry.use_data_augmentation
+    samples = symmetry.augmented(batch) if augmented else batch
+    means, log_stds = networks.gaussian(params["actor"], samples.observation, act)
+    log_prob = networks.log_prob(means, log_stds, samples.action)  # of raw actions: tanh's slope cancels in the ratio
+    surrogate = surrogate_loss(log_prob, samples.log_prob, samples.advantage, config.clip_param)
     value = value_loss(
-        networks.value(params, batch.critic_observation, act),
-        batch.value,
-        batch.returns,
+        networks.value(params, samples.critic_observation, act),
+        samples.value,
+        samples.returns,
         config.clip_param if config.use_clipped_value_loss else None,
     )
+    mean, log_std = means[:size], log_stds if log_stds.ndim == 1 else log_stds[:size]
+    old = old_log_std if batch.log_std is None else batch.log_std
     squash = config.action_bound == "tanh"
     entropy = networks.squashed_entropy(mean, log_std, config.action_clip) if squash else networks.entropy(log_std)
     entropy = entropy.mean()
@@ -77,9 +87,32 @@ def loss(params: Params, old_log_std: Any, batch: Batch, config: PPOConfig) -> t
         "Loss/value": value,
         "Loss/entropy": entropy,
         "Loss/kl": networks.kl(batch.mean, old, mean, log_std).mean(),
-        "Loss/clip_fraction": (jnp.abs(jnp.exp(log_prob - batch.log_prob) - 1) > config.clip_param).mean(),
+        "Loss/clip_fraction": (jnp.abs(jnp.exp(log_prob[:size] - batch.log_prob) - 1) > config.clip_param).mean(),
     }
-    return surrogate + config.value_loss_coef * value - config.entropy_coef * entropy, metrics
+    total = surrogate + config.value_loss_coef * value - config.entropy_coef * entropy
+    if config.symmetry is not None:
+        asymmetry = _asymmetry(params, batch, mean, means[size:] if augmented else None, config, mirrors)
+        metrics["Loss/symmetry"] = asymmetry
+        if config.symmetry.use_mirror_loss:
+            total = total + config.symmetry.mirror_loss_coeff * asymmetry
+    return total, metrics
+
+
+def _asymmetry(
+    params: Params,
+    batch: Batch,
+    mean: jax.Array,
+    mirrored: jax.Array | None,
+    config: PPOConfig,
+    mirrors: Sequence[MirrorMap],
+) -> jax.Array:
+    """The mirror loss; mirrored [B K, A]: mean actions at the copies, where they are known already."""
+    assert batch.copies is not None
+    if mirrored is None:
+        act = networks.activation(config.activation)
+        mirrored = networks.mean_action(params, batch.copies.observation, act)
+    mirrored = mirrored.reshape(len(mean), -1, mean.shape[-1])
+    return symmetry.mirror_loss(mean, mirrored, [mirror.action for mirror in mirrors])
 
 
 def adapt(learning_rate: jax.Array, kl: jax.Array, desired_kl: float) -> jax.Array:
@@ -117,6 +150,7 @@ def optimise(
     learning_rate: jax.Array,
     batch: Batch,
     config: PPOConfig,
+    mirrors: Sequence[MirrorMap] = (),
 ) -> tuple[Params, optax.OptState, jax.Array, dict[str, jax.Array]]:
     """All epochs of minibatches: new parameters, Adam state, learning rate, and figures [epochs * minibatches] each."""
     flat, unravel = ravel_pytree(params)
@@ -129,7 +163,7 @@ def optimise(
         flat, opt_state, rate = carry
         number, index = now
         part = jax.tree.map(lambda x: x[index], batch)
-        gradient, metrics = jax.grad(lambda p: loss(unravel(p), old_log_std, part, config), has_aux=True)(flat)
+        gradient, metrics = jax.grad(lambda p: loss(unravel(p), old_log_std, part, config, mirrors), has_aux=True)(flat)
         if config.schedule == "adaptive":  # nothing has moved before the first minibatch: its KL is rounding noise
             rate = jnp.where(number > 0, adapt(rate, metrics["Loss/kl"], config.desired_kl), rate)
         gradient, norm = clip_norm(gradient, config.max_grad_norm)

@@ -22,21 +22,28 @@ def init(size: int) -> Moments:
     return Moments(mean=jnp.zeros(size), var=jnp.ones(size), count=jnp.zeros(()))
 
 
-def update(moments: Moments, samples: jax.Array) -> Moments:
-    """Fold in samples [..., S] (Chan, Golub & LeVeque 1979): the result equals the moments of all samples together."""
+def update(moments: Moments, samples: jax.Array, until: float | None = None) -> Moments:
+    """Fold in samples [..., S] (Chan, Golub & LeVeque 1979): the result equals the moments of all samples together.
+
+    Once `until` samples were seen, further ones change nothing.
+    """
     samples = samples.reshape(-1, samples.shape[-1])
     mean, var, n = samples.mean(0), samples.var(0), samples.shape[0]
     count = moments.count + n
     new, old = n / count, moments.count / count  # weights of the two sets, sum 1
     delta = mean - moments.mean
     # var = w_old var_old + w_new var_new + w_old w_new (mean_new - mean_old)^2
-    return Moments(
+    pooled = Moments(
         mean=moments.mean + new * delta,
         var=old * moments.var + new * var + old * new * delta**2,
         count=count,
     )
+    if until is None:
+        return pooled
+    return jax.tree.map(lambda a, b: jnp.where(moments.count < until, a, b), pooled, moments)
 
 
-def normalise(moments: Moments, x: jax.Array) -> jax.Array:
-    """(x - mean) / (std + EPSILON), clipped to +- LIMIT; x [..., S]."""
-    return jnp.clip((x - moments.mean) / (jnp.sqrt(moments.var) + EPSILON), -LIMIT, LIMIT)
+def normalise(moments: Moments, x: jax.Array, epsilon: float = EPSILON, limit: float | None = LIMIT) -> jax.Array:
+    """(x - mean) / (std + epsilon), clipped to +- limit; x [..., S]."""
+    scaled = (x - moments.mean) / (jnp.sqrt(moments.var) + epsilon)
+    return scaled if limit is None else jnp.clip(scaled, -limit, limit)

@@ -13,10 +13,12 @@ from flax import struct
 
 from bayessim_mjx.config import PPOConfig
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.rl import episodes, losses, networks, normalise
+from bayessim_mjx.mirrors import MirrorMap
+from bayessim_mjx.rl import episodes, losses, networks, normalise, rnd, symmetry
 from bayessim_mjx.rl.gae import gae
 from bayessim_mjx.rl.networks import Policy
 from bayessim_mjx.rl.privileged import knowing_theta
+from bayessim_mjx.rl.rnd import RND
 from bayessim_mjx.rollout import collect
 
 if TYPE_CHECKING:
@@ -40,6 +42,7 @@ class TrainState:
     iteration: jax.Array  # [] int32
     env_steps: jax.Array  # [] uint32
     config: PPOConfig = struct.field(pytree_node=False)  # that the networks were made with
+    rnd: RND | None = None  # None where config.rnd is
 
 
 def critic_group(env: Env) -> str:
@@ -50,6 +53,11 @@ def critic_group(env: Env) -> str:
 def _for_learner(env: Env, config: PPOConfig) -> Env:
     """The environment as the learner sees it."""
     return knowing_theta(env) if config.critic_theta else env
+
+
+def _mirrors(env: Env, config: PPOConfig) -> tuple[MirrorMap, ...]:
+    """The mirror maps in use, checked to know all that the networks see."""
+    return symmetry.mirrors(env, config, {"policy", critic_group(env)})
 
 
 def policy_of(state: TrainState) -> Policy:
@@ -100,6 +108,7 @@ def init(env: Env, config: PPOConfig, key: jax.Array, domain: Distribution | Non
             f"ppo.shared_trunk = True: {type(env).__name__} shows its critic other observations than its policy, so "
             "they need a network each; set it to False"
         )
+    _mirrors(env, config)
     return _init(env, config)(key, domain)
 
 
@@ -124,10 +133,19 @@ def _init(env: Env, config: PPOConfig) -> Callable[..., TrainState]:
             iteration=jnp.int32(0),
             env_steps=jnp.uint32(0),
             config=config,
+            rnd=_new_rnd(env, config, key, partial),
         )
         return _strong(state)
 
     return jax.jit(run)
+
+
+def _new_rnd(env: Env, config: PPOConfig, key: jax.Array, partial: jax.Array) -> RND | None:
+    """The networks of random network distillation, with a key of their own."""
+    if config.rnd is None:
+        return None
+    size = sum(env.observation_size[group][0] for group in rnd.groups(env.observation_size, config.rnd))
+    return rnd.init(jax.random.fold_in(key, 1), size, partial, config.rnd)
 
 
 def _collect(
@@ -144,7 +162,8 @@ def _collect(
         return policy.bounded(action), extras if log_std.ndim == 1 else extras | {"log_std": log_std}
 
     pool = _reset(env, pool_key, domain, config.num_envs)
-    groups = tuple(sorted(state.normalizer))
+    novel = () if config.rnd is None else rnd.groups(env.observation_size, config.rnd)
+    groups = tuple(sorted({*state.normalizer, *novel}))
     return collect(env, act, collect_key, state.env_states, pool, config.num_steps, groups)
 
 
@@ -174,8 +193,41 @@ def _batch(env: Env, config: PPOConfig, state: TrainState, data: dict) -> losses
         advantage=advantage,
         returns=returns,
         log_std=log_std,
+        copies=_copies(env, config, state, data),
     )
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), batch)
+
+
+def _copies(env: Env, config: PPOConfig, state: TrainState, data: dict) -> symmetry.Copies | None:
+    """Mirror images [T, N, K, ...] of the collected transitions; None where ppo.symmetry is off."""
+    maps = _mirrors(env, config)
+    if not maps:
+        return None
+    act, group = networks.activation(config.activation), critic_group(env)
+
+    def seen(group: str) -> jax.Array:
+        raw = symmetry.images(data["observation"][group], [m.observation[group] for m in maps])
+        return normalise.normalise(state.normalizer[group], raw) if config.normalize_observations else raw
+
+    observation, critic_observation = seen("policy"), seen(group)
+    action = symmetry.images(data["extras"]["action"], [m.action for m in maps])
+    log_prob = networks.log_prob(*networks.gaussian(state.params["actor"], observation, act), action)
+    value = networks.value(state.params, critic_observation, act)
+    return symmetry.Copies(observation, critic_observation, action, log_prob, value)
+
+
+def _novelty(
+    env: Env, config: PPOConfig, state: TrainState, data: dict, key: jax.Array
+) -> tuple[RND | None, jax.Array | None, dict[str, jax.Array]]:
+    """The predictor trained on what was collected, the reward [T, N] for its novelty before, and the losses."""
+    if config.rnd is None or state.rnd is None:
+        return None, None, {}
+    after = rnd.joined(data["final_observation"], rnd.groups(env.observation_size, config.rnd))
+    ends = (data["terminated"], data["truncated"])
+    novel, x, bonus = rnd.reward(state.rnd, after, *ends, config.rnd, env.dt, config.gamma)
+    x = x.reshape(-1, x.shape[-1])
+    novel, values = rnd.train(key, novel, x, config.rnd, config.num_epochs, config.num_minibatches)
+    return novel, bonus, {"Loss/rnd": values}
 
 
 def update(
@@ -185,10 +237,12 @@ def update(
     env = _for_learner(env, config)
     key, collect_key, epochs_key = jax.random.split(state.key, 3)
     env_states, data = _collect(env, config, state, domain, collect_key)
-    batch = _batch(env, config, state, data)
+    novel, bonus, novelty_loss = _novelty(env, config, state, data, epochs_key)
+    batch = _batch(env, config, state, data if bonus is None else data | {"reward": data["reward"] + bonus})
     params, opt_state, rate, figures = losses.optimise(
-        epochs_key, state.params, state.opt_state, state.learning_rate, batch, config
+        epochs_key, state.params, state.opt_state, state.learning_rate, batch, config, _mirrors(env, config)
     )
+    figures |= novelty_loss
     normalizer = state.normalizer
     if config.normalize_observations:  # only now: collection and update of one iteration see the same statistics
         normalizer = {g: normalise.update(m, data["observation"][g]) for g, m in normalizer.items()}
@@ -202,9 +256,22 @@ def update(
         "env_steps": env_steps,
         **episodes.metrics(finished),
     }
-    return TrainState(
-        params, opt_state, normalizer, rate, env_states, finished, key, state.iteration + 1, env_steps, state.config
-    ), metrics
+    if config.rnd is not None and novel is not None:
+        metrics |= rnd.metrics(novel, metrics["Train/mean_reward"], config.rnd)
+    after = dataclasses.replace(
+        state,
+        params=params,
+        opt_state=opt_state,
+        normalizer=normalizer,
+        learning_rate=rate,
+        env_states=env_states,
+        episodes=finished,
+        key=key,
+        iteration=state.iteration + 1,
+        env_steps=env_steps,
+        rnd=novel,
+    )
+    return after, metrics
 
 
 @lru_cache(maxsize=32)

@@ -26,7 +26,17 @@ MEANS = (
     "Loss/value", "Loss/surrogate", "Loss/entropy", "Loss/kl", "Loss/clip_fraction", "Loss/explained_variance",
     "Policy/grad_norm",
 )  # fmt: skip
-LATEST = ("Train/mean_reward", "Train/mean_episode_length", "Loss/learning_rate", "Policy/mean_std", "env_steps")
+LATEST = (
+    "Train/mean_reward", "Train/mean_episode_length", "Loss/learning_rate", "Policy/mean_std", "env_steps",
+    "Rnd/mean_extrinsic_reward", "Rnd/mean_intrinsic_reward", "Rnd/weight",
+)  # fmt: skip
+
+
+def tags(config: PPOConfig) -> tuple[str, ...]:
+    """What an update reports under these settings."""
+    always = MEANS + tuple(tag for tag in LATEST if not tag.startswith("Rnd/"))
+    novelty = () if config.rnd is None else ("Loss/rnd", *(tag for tag in LATEST if tag.startswith("Rnd/")))
+    return always + novelty + (() if config.symmetry is None else ("Loss/symmetry",))
 
 
 @lru_cache(maxsize=32)
@@ -38,7 +48,7 @@ def _make_chunk(env: Env, config: PPOConfig) -> Callable[..., Any]:
             state, metrics = ppo.update(env, config, carry[0], domain)
             return state, {k: v if k in LATEST else carry[1][k] + v / count for k, v in metrics.items()}
 
-        zeros = {tag: jnp.float32(0) for tag in MEANS + LATEST} | {"env_steps": jnp.uint32(0)}
+        zeros = {tag: jnp.float32(0) for tag in tags(config)} | {"env_steps": jnp.uint32(0)}
         return jax.lax.fori_loop(0, count, body, (state, zeros))
 
     return jax.jit(chunk, donate_argnums=0)

@@ -85,14 +85,33 @@ def test_a_diverged_world_terminates_with_finite_numbers(task):
     assert np.array_equal(after.obs["policy"][1:], reference.obs["policy"][1:])  # the others do not notice
 
 
-def test_mirror_is_an_involution_of_the_right_sizes(task):
-    if task.env.mirror is None:
+def image(x, part):
+    perm, sign = part
+    return sign * np.asarray(x)[..., perm]
+
+
+def test_mirrored_steps_are_the_mirror_image_of_steps(task):
+    """step(M s, M a) == M step(s, a), three steps on: the names' map against the physics."""
+    if not task.env.mirrors:
         pytest.skip("no mirror symmetry")
-    sizes = {"observation": len(task.env.observation_names), "action": task.env.action_size}
-    for key, (perm, sign) in task.env.mirror.items():
-        assert perm.shape == sign.shape == (sizes[key],)
-        assert np.array_equal(perm[perm], np.arange(sizes[key]))
-        assert np.array_equal(sign * sign[perm], np.ones(sizes[key]))
+    rng = np.random.default_rng(5)
+    keys = jax.random.split(jax.random.PRNGKey(6), task.worlds)
+    qpos, qvel = (np.asarray(x) for x in jax.vmap(task.env.initial)(keys))
+    qvel = qvel + np.float32(rng.uniform(-0.3, 0.3, qvel.shape))
+    for mirror in task.env.mirrors:
+        one, two = task.reset_to(qpos, qvel), task.reset_to(image(qpos, mirror.qpos), image(qvel, mirror.qvel))
+        turned = {name: -two.pipeline_state.task[name] for name in mirror.task}
+        two = two.replace(pipeline_state=two.pipeline_state.replace(task={**two.pipeline_state.task, **turned}))
+        for _ in range(3):
+            action = np.float32(rng.uniform(-0.5, 0.5, (task.worlds, task.env.action_size)))
+            one, two = task.step(one, action), task.step(two, image(action, mirror.action))
+        np.testing.assert_allclose(two.pipeline_state.qpos, image(one.pipeline_state.qpos, mirror.qpos), atol=2e-5)
+        np.testing.assert_allclose(two.pipeline_state.qvel, image(one.pipeline_state.qvel, mirror.qvel), atol=1e-3)
+        for group, part in mirror.observation.items():
+            assert np.abs(np.asarray(one.obs[group]) - image(one.obs[group], part)).max() > 0.1  # no symmetric state
+            np.testing.assert_allclose(two.obs[group], image(one.obs[group], part), atol=1e-3, rtol=1e-3)
+        np.testing.assert_allclose(two.reward, one.reward, atol=1e-3)
+        np.testing.assert_array_equal(two.done, one.done)
 
 
 def test_space_write_equals_recompiling(task):

@@ -12,7 +12,7 @@ JOINT_PERM, JOINT_SIGN = np.array([6, 7, 4, 5, 2, 3, 0, 1]), np.array([-1, 1] * 
 
 
 def mirrored(qpos, qvel):
-    """The state seen in a mirror along the x-z plane."""
+    """The state seen in a mirror along the x-z plane, by hand."""
     x, w = qpos.copy(), qvel.copy()
     x[:, [1, 4, 6]] *= -1  # y, and the x and z parts of the quaternion
     w[:, [1, 3, 5]] *= -1
@@ -148,9 +148,9 @@ def test_mirror_equivariance_in_contact(compiled):
     qpos, qvel = states(8)
     action = np.float32(np.random.default_rng(9).uniform(-1, 1, (8, 8)))
     one = task.step(task.reset_to(qpos, qvel), action)
-    perm, sign = task.env.mirror["action"]
+    perm, sign = task.env.mirrors[0].action
     two = task.step(task.reset_to(*mirrored(qpos, qvel)), sign * action[:, perm])
-    perm, sign = task.env.mirror["observation"]
+    perm, sign = task.env.mirrors[0].observation["policy"]
     left, right = np.asarray(two.obs["policy"]), sign * np.asarray(one.obs["policy"])[:, perm]
     assert np.abs(right[:, 28:52]).max() > 0.5  # some feet press on the ground
     smooth = [*range(28), *range(52, 60)]
