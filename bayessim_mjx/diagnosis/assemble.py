@@ -17,8 +17,9 @@ from bayessim_mjx.diagnosis.run import Findings, length_unit
 from bayessim_mjx.diagnosis.sentences import horizon_warning, sentences
 from bayessim_mjx.logs.log import Channels
 
-UNEXPLAINED = 2.0  # noise standard deviations that remain and that nothing predicts
+UNEXPLAINED = 1.5  # noise standard deviations that remain and that nothing predicts
 SHORT = 0.1  # s, the first horizon
+LITTLE = 0.3  # share of the calibrated gap that named effects may leave
 REMAINS = 0.3  # share of the calibrated gap that a flexible force closes on top of named effects: not in the library
 
 
@@ -66,7 +67,7 @@ def _verdict(found: Findings, remains: float) -> str:
     race, model = found.race, found.ruling.model
     cost = {k: float(p.cost(found.setup.fitter.simulator.windows.steps).mean()) for k, p in found.predictions.items()}
     left = cost["with_effects"] - 1.0
-    if model.effects and left > UNEXPLAINED**2 - 1.0 and left > 0.6 * (cost["calibrated"] - 1.0):
+    if model.effects and left > UNEXPLAINED**2 - 1.0 and left > LITTLE * (cost["calibrated"] - 1.0):
         return "unexplained"  # what is named closes little of it
     if (
         race.above_noise(model)

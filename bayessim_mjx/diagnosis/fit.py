@@ -6,6 +6,7 @@ a refresh. Residuals are whitened by the noise; windows in which the simulation 
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
@@ -13,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.candidates import Coordinate
-from bayessim_mjx.diagnosis.quadratic import Quadratic, Starts, eliminate, held_out, solve
+from bayessim_mjx.diagnosis.quadratic import Quadratic, Starts, blocks, eliminate, held_out, solve
 from bayessim_mjx.diagnosis.simulate import Simulator
 
 Array = NDArray[np.float64]
@@ -218,11 +219,12 @@ class Fitter:
 
     def scores(self, job: Job, group: NDArray[np.int64] | None = None) -> tuple[Array, Array]:
         """Held-out costs `[W]` (unweighted) and estimates without each condition, relative to the fit `[G, k]`."""
-        q, _ = job.quadratic(self.spread)
+        q, starts = job.quadratic(self.spread)
         precision, pull, low, high = job.prior()
         group = self.simulator.windows.group if group is None else group
         watched = np.arange(len(self.base), len(job.coordinates))
-        return held_out(q, group, job.weight, precision, pull, low, high, watched)
+        split = functools.partial(blocks, q, starts, job.r, job.A)
+        return held_out(q, group, job.weight, precision, pull, low, high, watched, split)
 
 
 def _columns(r: Array, shifted: Array, steps: Sequence[float]) -> Array:

@@ -8,6 +8,7 @@ Everything after the rollouts (steps, held-out scores, bootstraps, screening of 
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,6 +37,10 @@ class Quadratic:
         if p.ndim == 1:
             return self.c - 2 * self.g @ p + np.einsum("i,wij,j->w", p, self.S, p)
         return self.c - 2 * np.einsum("wi,wi->w", self.g, p) + np.einsum("wi,wij,wj->w", p, self.S, p)
+
+    def of(self, w: int) -> tuple[Array, Array]:
+        """g and S of one window."""
+        return self.g[w], self.S[w]
 
     def weighted(self, w: Array) -> tuple[Array, Array]:
         """(sum of g, sum of S) with window weights `[W]`."""
@@ -66,6 +71,22 @@ def eliminate(r: Array, A: Array, B: Array, x: Array, spread: Array) -> tuple[Qu
     g = np.einsum("wnk,wn->wk", A, r) - np.einsum("wsk,ws->wk", MBA, b)
     S = np.einsum("wnk,wnl->wkl", A, A, optimize=True) - np.einsum("wsk,wsl->wkl", BA, MBA, optimize=True)
     return Quadratic(c, g, S), Starts(B, M, b)
+
+
+def blocks(q: Quadratic, starts: Starts, r: Array, A: Array, w: int, count: int = PARTS) -> Quadratic:
+    """One window's cost as a sum over `count` blocks of its rows, which are in the order of time.
+
+    r `[W, n]`, A `[W, n, K]` as for `eliminate`. The start state stays eliminated by the whole window: rows of the
+    projected residual and columns are summed within blocks; what the start's prior adds is shared out evenly.
+    """
+    B, M = starts.B[w], starts.M[w]
+    own = r[w] - B @ (M @ starts.b[w])
+    columns = A[w] - B @ (M @ (B.T @ A[w]))
+    rows = np.array_split(np.arange(len(own)), count)
+    c = np.array([own[i] @ own[i] for i in rows])
+    g = np.array([columns[i].T @ own[i] for i in rows])
+    S = np.array([columns[i].T @ columns[i] for i in rows])
+    return Quadratic(c + (q.c[w] - c.sum()) / count, g + (q.g[w] - g.sum(0)) / count, S + (q.S[w] - S.sum(0)) / count)
 
 
 def solve(S: Array, g: Array, low: Array, high: Array) -> Array:
@@ -111,6 +132,9 @@ def _cholesky_solve(H: Array, h: Array) -> NDArray[np.floating]:
         return np.linalg.lstsq(H, h, rcond=None)[0]
 
 
+Split = Callable[[int], Quadratic]
+
+
 def held_out(
     q: Quadratic,
     group: NDArray[np.int64],
@@ -120,6 +144,7 @@ def held_out(
     low: Array,
     high: Array,
     watched: NDArray[np.int64] | None = None,
+    split: Split | None = None,
 ) -> tuple[Array, Array]:
     """Leave-one-condition-out by one Newton step from the fit to all windows (the infinitesimal jackknife).
 
@@ -130,31 +155,42 @@ def held_out(
         watched: parameters that may be told by one condition alone (a limit only reached there, drag only felt there).
             That condition's windows are then held out in PARTS: extrapolating a parameter to where it first matters
             would judge its uncertainty, not the model.
+        split: blocks in time of a window. One that alone tells a watched parameter is held out block by block.
 
     Returns:
         (costs of the held-out windows `[W]`, estimates relative to the fit `[G, K]`).
     """
     watched = np.arange(0) if watched is None else watched
 
-    def without(out: NDArray[np.bool_]) -> tuple[Array, Array]:
+    def without(out: NDArray[np.bool_], blocks: Sequence[tuple[float, Array, Array]] = ()) -> tuple[Array, Array]:
         g, S = q.weighted(weight * ~out)
+        for share, g_block, S_block in blocks:
+            g, S = g - share * g_block, S - share * S_block
         return g, S + np.diag(precision + TRUST * np.diag(S))
 
-    def step(out: NDArray[np.bool_]) -> Array:
-        g, S = without(out)
+    def step(out: NDArray[np.bool_], blocks: Sequence[tuple[float, Array, Array]] = ()) -> Array:
+        g, S = without(out, blocks)
         return solve(S, g + pull, low, high)
+
+    def tells(out: NDArray[np.bool_]) -> bool:
+        return bool((_variances(without(out)[1]) > ONLY * known)[watched].any())
 
     known = _variances(without(np.zeros(len(group), bool))[1])
     costs, moves = np.zeros(len(group)), []
     for name in np.unique(group):
         out = group == name
-        lost = _variances(without(out)[1]) > ONLY * known
-        if lost[watched].any():
+        if tells(out):
             own = np.flatnonzero(out)
-            parts = [np.isin(np.arange(len(group)), own[k::PARTS]) for k in range(min(PARTS, len(own)))]
-            steps = [step(part) for part in parts]
-            for part, each in zip(parts, steps, strict=True):
-                costs[part] = q.at(each)[part]
+            alone = [w for w in own if split and tells(np.arange(len(group)) == w)]
+            blocks = {w: split(int(w)) for w in alone} if split else {}
+            own, steps = np.setdiff1d(own, alone), []
+            for k in range(PARTS if alone else min(PARTS, len(own))):
+                part = np.isin(np.arange(len(group)), own[k::PARTS])
+                p = step(part, [(weight[w], *blocks[w].of(k)) for w in alone])
+                costs[part] = q.at(p)[part]
+                for w in alone:
+                    costs[w] += blocks[w].at(p)[k]
+                steps.append(p)
             p = np.mean(steps, axis=0)
         else:
             p = step(out)
@@ -164,6 +200,7 @@ def held_out(
 
 
 def _variances(S: Array) -> Array:
-    """Diagonal of the inverse `[K]`."""
+    """Diagonal of the inverse `[K]`; infinite where nothing is known (a limit that is never reached)."""
     scale = 1 / np.sqrt(np.maximum(np.diag(S), 1e-300))
-    return np.diag(np.linalg.pinv(S * scale[:, None] * scale[None, :], hermitian=True)) * scale**2
+    inverse = np.diag(np.linalg.pinv(S * scale[:, None] * scale[None, :], hermitian=True)) * scale**2
+    return np.where(np.diag(S) > 0, inverse, np.inf)

@@ -88,9 +88,9 @@ class Race:
         rare = c.evidence > 10 * s.evidence + many and c.share > 0.3 and c.worst > -0.1
         return c.t > s.t or rare
 
-    def at_noise(self, model: Model) -> bool:
-        """Whether the model predicts as well as the noise allows."""
-        return model.total <= self.noise * len(model.cost)
+    def at_noise(self, model: Model, factor: float = 1.0) -> bool:
+        """Whether the model predicts as well as the noise (of `factor` times the variance) allows."""
+        return model.total <= factor * self.noise * len(model.cost)
 
     def best_of(self, old: Model, models: Sequence[Model]) -> Model | None:
         """The best model; of those that leave nearly as little of the gap of `old`, the one with the fewest numbers."""

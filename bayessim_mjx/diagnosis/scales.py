@@ -52,8 +52,9 @@ class Scales:
             i = element_names(model, "body").index(place)
             gravity = float(np.linalg.norm(model.opt.gravity)) or 9.81
             below = float(model.body_subtreemass[i])
-            return {"mass": max(float(model.body_mass[i]), 0.1 * below), "weight": below * gravity}
-        return {}
+            mass = max(float(model.body_mass[i]), 0.1 * below)
+            return {"mass": mass, "weight": below * gravity, "size": _size(model, i)}
+        return {"moment": _moment(model)}
 
     def _of_dof(self, v: int) -> dict[str, float]:
         words = ("force", "speed", "travel", "inertia")
@@ -98,6 +99,26 @@ def measure(model: mujoco.MjModel, logs: Sequence[Log]) -> Scales:
         effort=effort,
         moves=ptp > 10 * noise + 1e-9,
     )
+
+
+def _size(model: mujoco.MjModel, body: int) -> float:
+    """m from the body's centre of mass to the farthest end of its geoms, or where a body joins."""
+    centre = model.body_ipos[body]
+    own = np.flatnonzero((model.geom_bodyid == body) & (model.geom_type != int(mujoco.mjtGeom.mjGEOM_PLANE)))
+    reach = [np.linalg.norm(model.geom_pos[g] - centre) + model.geom_rbound[g] for g in own]
+    joined = np.flatnonzero(model.body_parentid == body)
+    reach += [np.linalg.norm(model.body_pos[b] - centre) for b in joined if b != body]
+    return max([float(r) for r in reach], default=0.0) or 0.1
+
+
+def _moment(model: mujoco.MjModel) -> float:
+    """N m: what the robot weighs on its base when stretched out: masses times the lengths that carry them."""
+    length = np.zeros(model.nbody)
+    for b in range(1, model.nbody):
+        length[b] = length[model.body_parentid[b]] + np.linalg.norm(model.body_pos[b]) * (model.body_parentid[b] > 0)
+    arms = length[1:] + np.linalg.norm(model.body_ipos[1:], axis=1)
+    gravity = float(np.linalg.norm(model.opt.gravity)) or 9.81
+    return float(model.body_mass[1:] @ arms) * gravity or 1.0
 
 
 def _large(parts: Sequence[Array]) -> Array:

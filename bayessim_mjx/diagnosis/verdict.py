@@ -23,6 +23,7 @@ from bayessim_mjx.diagnosis.search import (
     without,
 )
 
+NEAR = 1.2  # noise variances: models that leave less than that explain the same
 MILD = 10.0  # nats: below, held-out evidence between two models is called a tie
 
 
@@ -105,7 +106,8 @@ def _rival(race: Race, winner: Model, effect: Candidate, others: tuple[Candidate
     behind = race.closure(winner) - race.closure(model)
     misfit = winner.total > 1.3 * race.noise * len(winner.cost)
     told_apart = c.evidence > MILD and (c.t > 2.0 or c.evidence > 3 * MILD)
-    told_apart = told_apart and not (race.at_noise(winner) and race.at_noise(model))
+    # what is left of both is worth less than the simulators' own differences: significant, not relevant
+    told_apart = told_apart and not (race.at_noise(winner, NEAR) and race.at_noise(model, NEAR))
     if told_apart and not (misfit and behind < race.settings.tie / 2):
         return []
     if behind > 3 * race.settings.tie:

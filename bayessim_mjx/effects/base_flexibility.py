@@ -35,9 +35,11 @@ class BaseFlexibility(Effect):
     name: ClassVar[str] = "base_flexibility"
     kind: ClassVar[str] = "world"
     quantities: ClassVar[tuple[Quantity, ...]] = (
-        Quantity("compliance", 0.0, 0.0, 0.01, unit="rad/(N m)", grid=(0.003, 0.03, 0.3)),
+        Quantity(
+            "compliance", 0.0, 0.0, 0.01, unit="rad/(N m)", per="1/moment", reach=(0.0, 0.6), grid=(0.003, 0.03, 0.3)
+        ),
         Quantity("frequency", 10.0, 2.0, 30.0, unit="Hz", grid=(0.1, 0.5), shape=True),
-        Quantity("damping", 0.1, 0.01, 0.5, grid=(0.1,), shape=True),
+        Quantity("damping", 0.1, 0.01, 1.0, grid=(0.1,), shape=True),
     )
 
     def bind(self, mj_model: mujoco.MjModel, timestep: float, substeps: int) -> Site:

@@ -36,7 +36,7 @@ class JointElasticity(Effect):
         Quantity(
             "compliance", 0.0, 0.0, 0.05, unit="rad/(N m)", per="1/force", reach=(0.0, 0.1), grid=(0.03, 0.1, 0.4)
         ),
-        Quantity("damping", 0.1, 0.02, 0.5, grid=(0.1,), shape=True),
+        Quantity("damping", 0.1, 0.02, 1.5, grid=(0.05,), shape=True),
     )
 
     def init(self, at: Site) -> Any:

@@ -72,7 +72,10 @@ class Payload(Effect):
     kind: ClassVar[str] = "body"
     quantities: ClassVar[tuple[Quantity, ...]] = (
         Quantity("mass", 0.0, 0.0, 1.0, unit="kg", per="mass", reach=(0.0, 1.0)),
-        *(Quantity(f"com_{axis}", 0.0, -0.1, 0.1, unit="m", grid=(0.5,), shape=True) for axis in "xyz"),
+        *(
+            Quantity(f"com_{axis}", 0.0, -0.1, 0.1, unit="m", per="size", reach=(-1.2, 1.2), grid=(0.5,), shape=True)
+            for axis in "xyz"
+        ),
     )
 
     def bind(self, mj_model: mujoco.MjModel, timestep: float, substeps: int) -> Site:

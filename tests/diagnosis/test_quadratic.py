@@ -113,3 +113,41 @@ def test_held_out_estimates_stay_within_their_bounds():
     _, moves = quadratic.held_out(q, np.arange(W) % 3, np.ones(W), np.zeros(K), np.zeros(K), low, high)
     assert np.all(moves >= low - 1e-12) and np.all(moves <= high + 1e-12)
     assert np.any(np.isclose(moves, low) | np.isclose(moves, high))
+
+
+def test_blocks_of_a_window_add_up_to_it_and_their_curvature_is_positive():
+    r, A, B, x, spread = problem(7)
+    q, starts = quadratic.eliminate(r, A, B, x, spread)
+    parts = quadratic.blocks(q, starts, r, A, 2, count=4)
+    np.testing.assert_allclose(parts.c.sum(), q.c[2])
+    np.testing.assert_allclose(parts.g.sum(0), q.g[2])
+    np.testing.assert_allclose(parts.S.sum(0), q.S[2], atol=1e-12)
+    assert np.all(np.linalg.eigvalsh(parts.S) > -1e-9)
+
+
+def one_window_tells(truth: float, seed: int) -> tuple[float, float]:
+    """Cost of the window that alone feels the only parameter: held out whole, and held out block by block."""
+    rng = np.random.default_rng(seed)
+    windows, rows = 12, 80
+    A, B = np.zeros((windows, rows, 1)), rng.normal(size=(windows, rows, S))
+    A[5, 20:, 0] = 1.0  # a limit, reached after a quarter of one window
+    r = A[..., 0] * truth + rng.normal(size=(windows, rows))
+    q, starts = quadratic.eliminate(r, A, B, np.zeros((windows, S)), np.full(S, 5.0))
+    ends = np.full(1, 100.0)
+    given = q, np.repeat([0, 1, 2, 3], 3), np.ones(windows), np.zeros(1), np.zeros(1), -ends, ends, np.arange(1)
+    whole, _ = quadratic.held_out(*given)
+    apart, _ = quadratic.held_out(*given, lambda w: quadratic.blocks(q, starts, r, A, w))
+    others = np.arange(windows) != 5
+    np.testing.assert_allclose(apart[others], whole[others], rtol=1e-6)
+    return float(whole[5]), float(apart[5])
+
+
+def test_an_effect_felt_in_one_window_alone_is_predicted_from_block_to_block():
+    whole, apart = one_window_tells(truth=10.0, seed=3)
+    assert whole > 0.9 * 60 * 10.0**2  # without the window nobody knows of the parameter
+    assert 50 < apart < 120  # 80 rows of unit noise
+
+
+def test_a_parameter_that_only_fits_noise_gains_nothing_from_block_to_block():
+    gains = [np.subtract(*one_window_tells(truth=0.0, seed=seed)) for seed in range(20)]
+    assert np.mean(gains) < 0.0  # whole: left where it was; block by block: one fitted number costs about 1
