@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,8 @@ from bayessim_mjx.diagnosis.quadratic import eliminate
 from bayessim_mjx.diagnosis.uncertainty import bootstrap_weights, interval
 
 Array = NDArray[np.float64]
+WORSE, WITHIN = 2.0, 1.02  # held-out squares over those promised; those of the other windows over the common fit's
+SHORTER = (1.0, 0.5, 0.25, 0.125, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +44,33 @@ def predict(fitter: Fitter, model: Model) -> Prediction:
         own = np.flatnonzero(windows.group == name)
         error[own], offsets[own] = _settled(fitter, model.job, values, own)
     return Prediction(error, offsets)
+
+
+def steadied(fitter: Fitter, model: Model) -> Model:
+    """The model with estimates without each condition that the other conditions bear out.
+
+    They come of one linear step from the common fit. Where parameters are hardly told (a wind's sideways force) that
+    step can lead where the model is no longer linear. A condition whose windows are predicted much worse than the step
+    promised gets a shorter one, by halves, until the *other* windows are no worse off than at the common fit.
+    """
+    windows, job = fitter.simulator.windows, model.job
+    names, estimates = np.unique(windows.group), model.estimates.copy()
+    for g, name in enumerate(names):
+        own, others = np.flatnonzero(windows.group == name), np.flatnonzero(windows.group != name)
+        if _squares(fitter, job, estimates[g], own).sum() <= WORSE * model.cost[own].sum():
+            continue
+        limit = WITHIN * float(job.weight[others] @ _squares(fitter, job, job.values, others))
+        for share in SHORTER:
+            at = job.values + share * (model.estimates[g] - job.values)
+            if job.weight[others] @ _squares(fitter, job, at, others) <= limit:
+                break
+        estimates[g] = at
+    return replace(model, estimates=estimates)
+
+
+def _squares(fitter: Fitter, job: Job, values: Array, own: NDArray[np.int64]) -> Array:
+    """Sums of squared errors of some windows, starts re-estimated, `[w]`."""
+    return np.asarray(np.sum(_settled(fitter, job, values, own)[0] ** 2, axis=(1, 2)))
 
 
 def nominal(fitter: Fitter, job: Job) -> Prediction:

@@ -228,10 +228,12 @@ def diagnose(
 def _verified(setup: Setup, race: search.Race, say: Progress) -> Model:
     """The winner without effects that do not help when held-out windows are really simulated (not by linearisation)."""
     model = race.winner
+    if model.effects:
+        model = gap.steadied(setup.fitter, model)
     steps = setup.fitter.simulator.windows.steps
     while model.effects:
         full = gap.predict(setup.fitter, model).cost(steps).mean()
-        smaller = [search.without(race, model, e, say) for e in model.effects]
+        smaller = [gap.steadied(setup.fitter, search.without(race, model, e, say)) for e in model.effects]
         error = [gap.predict(setup.fitter, m).cost(steps).mean() for m in smaller]
         helps = [(e - full) / max(e - 1.0, 1e-9) for e in error]
         least = int(np.argmin(helps))

@@ -24,6 +24,7 @@ from bayessim_mjx.diagnosis.search import (
 )
 
 NEAR = 1.2  # noise variances: models that leave less than that explain the same
+SAME = 0.005  # of the gap
 MILD = 10.0  # nats: below, held-out evidence between two models is called a tie
 
 
@@ -54,12 +55,21 @@ class Ruling:
 
 
 def rule(race: Race, say: Progress) -> Ruling:
-    """Look for rivals of every effect of the winner: replaced by another one, the model predicts as well."""
+    """Look for rivals of every effect of the winner: replaced by another one, the model predicts as well.
+
+    A rival that closes as much with fewer numbers takes the winner's place.
+    """
     winner = race.winner
     ruling = Ruling(winner)
     for effect in winner.effects:
         ruling.rivals[effect.label] = [*_in_parts(race, winner, effect, say), *_rivals(race, winner, effect, say)]
-    return ruling
+    least = race.closure(winner) - SAME
+    fewer = [r.model for rivals in ruling.rivals.values() for r in rivals if not r.contains and r.closure >= least]
+    fewer = [m for m in fewer if m.size < winner.size and race.at_noise(m, NEAR) >= race.at_noise(winner, NEAR)]
+    if not fewer:
+        return ruling
+    race.winner = min(fewer, key=lambda m: (m.size, m.total))
+    return rule(race, say)
 
 
 def _in_parts(race: Race, winner: Model, effect: Candidate, say: Progress) -> list[Rival]:

@@ -73,7 +73,9 @@ class Payload(Effect):
     quantities: ClassVar[tuple[Quantity, ...]] = (
         Quantity("mass", 0.0, 0.0, 1.0, unit="kg", per="mass", reach=(0.0, 1.0)),
         *(
-            Quantity(f"com_{axis}", 0.0, -0.1, 0.1, unit="m", per="size", reach=(-1.2, 1.2), grid=(0.5,), shape=True)
+            Quantity(
+                f"com_{axis}", 0.0, -0.1, 0.1, unit="m", per="size", reach=(-1.2, 1.2), grid=(0.3, 0.7), shape=True
+            )
             for axis in "xyz"
         ),
     )
