@@ -194,6 +194,32 @@ class Lifetime(Probe):
         return after.replace(done=terminated, info={**after.info, "terminated": terminated})
 
 
+class Valley(Probe):
+    """gym's MountainCarContinuous: 100 at the top, reached by swinging to and fro alone; each step costs 0.1 a^2.
+
+    Observation: position, and speed in units of its range.
+    """
+
+    dt = 1.0
+    power = 0.0015
+    horizon, episode_length = 0, 200
+    observation_size = {"policy": (2,)}
+
+    def first(self, key: jax.Array) -> dict:
+        return {"policy": jnp.stack([jax.random.uniform(key, minval=-0.6, maxval=-0.4), jnp.zeros(())])}
+
+    def step(self, state: ProbeState, action: jax.Array) -> ProbeState:
+        after = super().step(state, action)
+        x, speed = state.obs["policy"] * jnp.array([1.0, 0.07])
+        speed = jnp.clip(speed + self.power * jnp.clip(action[0], -1, 1) - 0.0025 * jnp.cos(3 * x), -0.07, 0.07)
+        x = jnp.clip(x + speed, -1.2, 0.6)
+        speed = jnp.where((x <= -1.2) & (speed < 0), 0.0, speed)
+        top = (x >= 0.45).astype(jnp.float32)
+        obs = {"policy": jnp.stack([x, speed / 0.07])}
+        info = {**after.info, "terminated": top, "final_observation": obs}
+        return after.replace(obs=obs, reward=100 * top - 0.1 * jnp.clip(action[0], -1, 1) ** 2, done=top, info=info)
+
+
 class Broken(Probe):
     """A reward that is not a number."""
 

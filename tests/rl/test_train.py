@@ -11,6 +11,7 @@ import pytest
 from bayessim_mjx import rl
 from bayessim_mjx.config import PPOConfig
 from bayessim_mjx.rl import networks, ppo
+from bayessim_mjx.rl.train import time as clock
 
 CONFIG = PPOConfig(
     num_envs=16, num_steps=8, num_epochs=2, num_minibatches=2, hidden_actor=(8,), hidden_critic=(8,), log_interval=2
@@ -91,6 +92,14 @@ def test_loss_figures_are_averaged_over_the_log_interval():
         values.append(metrics)
     assert averaged["Loss/value"] == pytest.approx(np.mean([m["Loss/value"] for m in values]), rel=1e-4)
     assert averaged["Loss/learning_rate"] == pytest.approx(float(values[-1]["Loss/learning_rate"]))
+
+
+def test_speed_is_environment_steps_per_second_of_the_interval(monkeypatch):
+    """A clock that goes on by 4 s at each look: two looks an interval."""
+    looks = iter(range(0, 100, 4))
+    monkeypatch.setattr(clock, "perf_counter", lambda: next(looks))
+    _, metrics = rl.run(WALK, CONFIG, rl.init(WALK, CONFIG, key(0)), iterations=2)
+    assert (metrics["Perf/total_fps"], metrics["Perf/iteration_time"]) == (2 * 16 * 8 / 4, 2.0)
 
 
 def test_the_callers_state_survives():
