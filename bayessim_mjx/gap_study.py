@@ -48,7 +48,7 @@ def correction(folder: Path, known: ParameterSpace) -> storage.Correction:
     return found
 
 
-def _nominal_task(config: Config) -> Any:
+def nominal_task(config: Config) -> Any:
     """The task at its model's own physics."""
     plain = dataclasses.replace(config, randomization=freeze({"randomize": False}))
     return registry.make(config.task, config=plain)
@@ -56,7 +56,7 @@ def _nominal_task(config: Config) -> Any:
 
 def _on(config: Config, physics: Physics) -> Any:
     """The task on other physics; a fresh one, since compiled programs are kept by environment."""
-    env = _nominal_task(config)
+    env = nominal_task(config)
     env.physics = physics
     return env
 
@@ -66,6 +66,20 @@ def _corrected(body: robot.Robot, dt: float, found: storage.Correction, source: 
         return body.physics(dt, found.effects, ParameterSpace(found.calibrated))
     except ValueError as error:
         raise UserError(f"{source} does not fit --task {body.name}: {error}") from None
+
+
+def surrogate(config: Config, file: str | Path) -> Any:
+    """The task on a stand-in for the real system.
+
+    Args:
+        file: its truth as an effects.yaml, hidden values as nominal ones.
+
+    Raises:
+        UserError: the file is wrong or does not fit the task.
+    """
+    body = robot.of_task(nominal_task(config))
+    physics = _corrected(body, float(body.control_dt or 0.0), storage.read(file), f"--surrogate {file}")
+    return _on(config, physics)
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,13 +204,13 @@ def make(args: argparse.Namespace, config: Config) -> Study:
         UserError: the diagnosis, the surrogate or the logs do not fit the task.
     """
     folder = Path(args.diagnosis)
-    body = robot.of_task(_nominal_task(config), args.parameters)
+    body = robot.of_task(nominal_task(config), args.parameters)
     dt = float(body.control_dt or 0.0)
     physics = _corrected(body, dt, correction(folder, body.space), f"--diagnosis {folder}")
     nominal = _on(config, body.physics(dt, (), closed_loop.wide(body.space)))
     real = logs = None
     if args.surrogate:
-        real = _on(config, _corrected(body, dt, storage.read(args.surrogate), f"--surrogate {args.surrogate}"))
+        real = surrogate(config, args.surrogate)
     else:
         logs = read_logs(args.real, body.mj_model)
     simulators = Simulators(nominal, _on(config, physics), real)
