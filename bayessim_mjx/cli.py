@@ -169,6 +169,21 @@ def load_policy(path: Path, env: Any, config: Config) -> Any:
     return checkpoints.restore(path, {"policy": jax.eval_shape(make, jax.random.PRNGKey(0))})[0]["policy"]
 
 
+def privileged(config: Config, env: Any) -> tuple[Any, Any]:
+    """(`env` as the policy of `config` is trained in it, the teacher of ppo.teacher or None)."""
+    from bayessim_mjx.rl import privileged as shown
+
+    if config.ppo.policy_theta:
+        env = shown.for_policy(env)
+    if config.ppo.teacher is None:
+        return env, None
+    path, run = find_checkpoint(config.ppo.teacher, None, "")
+    settings = config if run is None else run.config
+    seen = shown.for_policy(env) if settings.ppo.policy_theta else env
+    teacher = load_policy(path, seen, settings)
+    return (shown.for_teacher(env) if settings.ppo.policy_theta else env), teacher
+
+
 def warm_start(train: Any, config: Config, env: Any) -> Any:
     """The training state with actor and normaliser of `bayessim.policyCheckpt`, if that is set; the critic is new.
 

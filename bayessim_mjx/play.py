@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from bayessim_mjx import cli
-from bayessim_mjx.config import Config, freeze
+from bayessim_mjx.config import Config, freeze, replace
 from bayessim_mjx.device import setup_jax
 from bayessim_mjx.errors import UserError
 
@@ -123,6 +123,7 @@ def _show(args: argparse.Namespace, config: Config, path: Path, run: Any, count:
     # also a policy trained on nominal physics can be tried on the prior and on the surrogate real
     config = dataclasses.replace(config, randomization=freeze({**config.randomization, "randomize": True}))
     env = registry.make(config.task, config=config)
+    env, _ = cli.privileged(replace(config, ppo={"teacher": None}), env)
     policy, key = cli.load_policy(path, env, config), jax.random.PRNGKey(config.seed)
     if args.export is not None:
         console.say(_export(env, policy, path, run, args.export))

@@ -361,6 +361,9 @@ class PPOConfig(Section):
     state_dependent_std: bool = setting(False, "the actor gives the standard deviation too, else it is a parameter")
     shared_trunk: bool = setting(False, "the critic is one layer on the actor's hidden ones (hidden_critic is unused)")
     critic_theta: bool = setting(False, "the critic also sees the physics, theta (not the actor)")
+    policy_theta: bool = setting(False, "the policy sees theta too: a teacher, for simulation alone (train, play)")
+    teacher: str | None = setting(None, "checkpoint of a policy to imitate, in place of PPO (train)", spell=_absolute)
+    distil_loss: str = setting("mse", "error of the imitated actions", choices=("mse", "huber"))
     action_clip: float = setting(1.0, "actions are kept within +- this before the environment", above=0)
     action_bound: str = setting("clip", "how: clipped, or squashed by action_clip * tanh", choices=("clip", "tanh"))
     rnd: RNDConfig | None = setting(None, "random network distillation: rewards for what is new; null: none")
@@ -381,6 +384,11 @@ class PPOConfig(Section):
             raise UserError(
                 "ppo.critic_theta = True: with ppo.shared_trunk the actor would see theta too; use one of them"
             )
+        if self.teacher is not None and (self.rnd is not None or self.symmetry is not None):
+            raise UserError("ppo.teacher: a student has no use for ppo.rnd and ppo.symmetry; set them to null")
+        if (self.critic_theta or self.policy_theta) and self.symmetry is not None:
+            which = "ppo.critic_theta" if self.critic_theta else "ppo.policy_theta"
+            raise UserError(f"{which} = True: theta has no mirror image, so ppo.symmetry has to be null")
         if self.shared_trunk and not self.hidden_actor:
             raise UserError("ppo.shared_trunk = True needs hidden layers to share: ppo.hidden_actor is []")
         if self.state_dependent_std and not 0.007 <= self.init_std <= 148:  # exp(+-5), networks.LOG_STD_LIMIT

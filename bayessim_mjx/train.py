@@ -1,4 +1,7 @@
-"""`python -m bayessim_mjx.train --task Ant`: PPO alone, on nominal physics or (`--randomize`) on the prior."""
+"""`python -m bayessim_mjx.train --task Ant`: PPO alone, on nominal physics or (`--randomize`) on the prior.
+
+`--distil RUN` trains a student of that run's policy instead.
+"""
 
 from __future__ import annotations
 
@@ -14,12 +17,21 @@ DESCRIPTION = "PPO alone: on nominal physics, or on physics drawn from the prior
 
 SPEED, WORTH_SAYING = "Perf/total_fps", 0.5  # seconds of compilation
 PLAY = "python -m bayessim_mjx.play"
-SHOWN = ("Train/mean_reward", "Train/mean_episode_length", SPEED, "Loss/value", "Loss/kl", "Loss/learning_rate")
+SHOWN = (
+    "Train/mean_reward",
+    "Train/mean_episode_length",
+    SPEED,
+    "Loss/value",
+    "Loss/kl",
+    "Loss/behavior",
+    "Loss/learning_rate",
+)
 
 
 def _parser() -> cli.Parser:
     parser = cli.Parser("train", DESCRIPTION, resume=True)
     parser.add_argument("--randomize", action="store_true", help="draw the physics of every episode from the prior")
+    parser.add_argument("--distil", metavar="RUN", help="imitate this run's (or checkpoint's) policy, in place of PPO")
     return parser
 
 
@@ -36,12 +48,13 @@ class Training:
         from bayessim_mjx.monitor.compile_clock import CompileClock
         from bayessim_mjx.monitor.film import film
 
-        self.config, self.env, self.run, self.console, self.stop = config, env, run, console, stop
+        self.env, self.teacher = cli.privileged(config, env)
+        self.config, self.run, self.console, self.stop = config, run, console, stop
         randomized = bool(config.randomization.get("randomize")) and len(env.space) > 0
         self.domain = Distribution.prior(env.space, 1) if randomized else None
         self.key, self.evaluation_key = jax.random.split(jax.random.PRNGKey(config.seed))
         self.compiling, self.filmed = CompileClock(), 0
-        self.film = film(env, config)  # None: no videos
+        self.film = film(self.env, config)  # None: no videos
 
     def state(self, resume: bool) -> tuple[Any, int | None]:
         """(state to begin with, second of the run's clock that its checkpoint lies at: -1 none yet, None a new run)."""
@@ -148,7 +161,9 @@ class Training:
         while (done := int(state.iteration)) < ppo.max_iterations:
             self.stop.check()
             chunk = min(ppo.save_interval - done % ppo.save_interval, ppo.max_iterations - done)
-            state, _ = rl.run(self.env, ppo, state, self.domain, iterations=chunk, progress=self.progress)
+            state, _ = rl.run(
+                self.env, ppo, state, self.domain, iterations=chunk, progress=self.progress, teacher=self.teacher
+            )
             self.save(state, self.evaluate(state))
         return state
 
@@ -197,6 +212,8 @@ def _train(argv: Sequence[str] | None) -> int:
         run = Run.open(args.resume)
         return _run(cli.resumed_config(args, run.config), run, command, args.headless)
     more: dict[str, tuple[str, Any]] = {"--randomize": ("task.randomize", args.randomize)}
+    if args.distil:
+        more["--distil"] = ("ppo.teacher", str(cli.find_checkpoint(args.distil, None, "")[0]))
     if args.checkpoint:
         more["--checkpoint"] = ("bayessim.policyCheckpt", args.checkpoint)
     return _run(cli.pin_policy(cli.config_of(args, more)), None, command, args.headless)

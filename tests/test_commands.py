@@ -341,6 +341,23 @@ def test_training_goes_on_from_a_policy(toy: None) -> None:
 
 @pytest.mark.slow
 @pytest.mark.ci
+def test_a_teacher_that_sees_theta_is_imitated_by_a_student_that_does_not(toy: None, capsys: Any) -> None:
+    argv = ["--task", "Pendulum", "--randomize", *SMALL]
+    assert train.main([*argv, "ppo.policy_theta=True", "--logdir", "teachers"]) == 0
+    teacher = latest_run("teachers", "Pendulum")
+    assert play.main(["--checkpoint", str(teacher.path), "--episodes", "3"]) == 0
+    assert train.main([*argv, "--distil", str(teacher.path)]) == 0
+    student = latest_run("logs", "Pendulum")
+    assert Path(student.config.ppo.teacher or "") == teacher.checkpoint("best").absolute()
+    assert train.main(["--resume", str(student.path), "--headless"]) == 0
+    capsys.readouterr()
+    assert play.main(["--checkpoint", str(student.path), "--episodes", "3", "--physics", "nominal"]) == 0
+    assert "nominal" in capsys.readouterr().out
+    assert "no such folder" in error_of(capsys, train.main, *argv, "--distil", "nowhere")
+
+
+@pytest.mark.slow
+@pytest.mark.ci
 def test_main_killed_and_resumed_equals_unkilled(toy: None, monkeypatch: Any, capsys: pytest.CaptureFixture) -> None:
     argv = ["--task", "Pendulum", *SMALL, *LOOP]
     assert main.main([*argv, "--logdir", "whole"]) == 0

@@ -1,7 +1,7 @@
 """Proximal policy optimisation (Schulman et al. 2017): the losses, and the epochs of minibatches over one batch."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -153,18 +153,41 @@ def optimise(
     mirrors: Sequence[MirrorMap] = (),
 ) -> tuple[Params, optax.OptState, jax.Array, dict[str, jax.Array]]:
     """All epochs of minibatches: new parameters, Adam state, learning rate, and figures [epochs * minibatches] each."""
-    flat, unravel = ravel_pytree(params)
     old_log_std = params["actor"].get("log_std")
     if not config.normalize_advantage_per_minibatch:
         batch = dataclasses.replace(batch, advantage=standardise(batch.advantage))
-    order = minibatches(key, config.num_epochs, batch.advantage.shape[0], config.num_minibatches)
+
+    def objective(params: Params, part: Batch) -> tuple[jax.Array, dict]:
+        return loss(params, old_log_std, part, config, mirrors)
+
+    return descend(key, params, opt_state, learning_rate, batch, config, objective)
+
+
+def descend(
+    key: jax.Array,
+    params: Params,
+    opt_state: optax.OptState,
+    learning_rate: jax.Array,
+    batch: Any,
+    config: PPOConfig,
+    objective: Callable[[Params, Any], tuple[jax.Array, dict]],
+) -> tuple[Params, optax.OptState, jax.Array, dict[str, jax.Array]]:
+    """Adam on objective(params, minibatch) -> (loss, figures) over all epochs of minibatches; returns as `optimise`.
+
+    The rate adapts to the figure "Loss/kl" where there is one and ppo.schedule says so.
+    """
+    flat, unravel = ravel_pytree(params)
+    size = jax.tree.leaves(batch)[0].shape[0]
+    order = minibatches(key, config.num_epochs, size, config.num_minibatches)
 
     def step(carry: tuple[Any, Any, Any], now: tuple[jax.Array, jax.Array]) -> tuple[Any, dict]:
         flat, opt_state, rate = carry
         number, index = now
         part = jax.tree.map(lambda x: x[index], batch)
-        gradient, metrics = jax.grad(lambda p: loss(unravel(p), old_log_std, part, config, mirrors), has_aux=True)(flat)
-        if config.schedule == "adaptive":  # nothing has moved before the first minibatch: its KL is rounding noise
+        gradient, metrics = jax.grad(lambda p: objective(unravel(p), part), has_aux=True)(flat)
+        if (
+            config.schedule == "adaptive" and "Loss/kl" in metrics
+        ):  # nothing has moved before the first minibatch: its KL is rounding noise
             rate = jnp.where(number > 0, adapt(rate, metrics["Loss/kl"], config.desired_kl), rate)
         gradient, norm = clip_norm(gradient, config.max_grad_norm)
         direction, opt_state = optax.scale_by_adam().update(gradient, opt_state)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
@@ -14,10 +14,9 @@ from flax import struct
 from bayessim_mjx.config import PPOConfig
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.mirrors import MirrorMap
-from bayessim_mjx.rl import episodes, losses, networks, normalise, rnd, symmetry
+from bayessim_mjx.rl import episodes, losses, networks, normalise, privileged, rnd, symmetry
 from bayessim_mjx.rl.gae import gae
 from bayessim_mjx.rl.networks import Policy
-from bayessim_mjx.rl.privileged import knowing_theta
 from bayessim_mjx.rl.rnd import RND
 from bayessim_mjx.rollout import collect
 
@@ -52,7 +51,7 @@ def critic_group(env: Env) -> str:
 
 def _for_learner(env: Env, config: PPOConfig) -> Env:
     """The environment as the learner sees it."""
-    return knowing_theta(env) if config.critic_theta else env
+    return privileged.for_critic(env) if config.critic_theta else env
 
 
 def _mirrors(env: Env, config: PPOConfig) -> tuple[MirrorMap, ...]:
@@ -102,6 +101,8 @@ def init(env: Env, config: PPOConfig, key: jax.Array, domain: Distribution | Non
     """The state before the first update; domain None trains at the nominal theta."""
     if "policy" not in env.observation_size:
         raise ValueError(f"observation groups {sorted(env.observation_size)}: a policy needs the group 'policy'")
+    if config.policy_theta and getattr(env, "target", "") != "policy":
+        raise UserError("ppo.policy_theta = True trains a teacher; the commands that can are train and play")
     env = _for_learner(env, config)
     if config.shared_trunk and critic_group(env) != "policy":
         raise UserError(
@@ -149,9 +150,17 @@ def _new_rnd(env: Env, config: PPOConfig, key: jax.Array, partial: jax.Array) ->
 
 
 def _collect(
-    env: Env, config: PPOConfig, state: TrainState, domain: Distribution | None, key: jax.Array
+    env: Env,
+    config: PPOConfig,
+    state: TrainState,
+    domain: Distribution | None,
+    key: jax.Array,
+    more: Sequence[str] = (),
 ) -> tuple[State, dict]:
-    """num_steps in every world with the current policy; resets come from a pool drawn once per update."""
+    """num_steps in every world with the current policy; resets come from a pool drawn once per update.
+
+    The observation groups are those that the networks see, and `more`.
+    """
     pool_key, collect_key = jax.random.split(key)
     policy = policy_of(state)
 
@@ -163,7 +172,7 @@ def _collect(
 
     pool = _reset(env, pool_key, domain, config.num_envs)
     novel = () if config.rnd is None else rnd.groups(env.observation_size, config.rnd)
-    groups = tuple(sorted({*state.normalizer, *novel}))
+    groups = tuple(sorted({*state.normalizer, *novel, *more}))
     return collect(env, act, collect_key, state.env_states, pool, config.num_steps, groups)
 
 

@@ -1,4 +1,4 @@
-"""A critic that knows the physics: theta is known in simulation, and the actor does not see it."""
+"""Observations with the physics in them: theta is known in simulation, to a critic or to a policy that teaches."""
 
 from __future__ import annotations
 
@@ -16,44 +16,68 @@ if TYPE_CHECKING:
 
 
 @lru_cache(maxsize=32)
-def knowing_theta(env: Env) -> Any:
+def _knowing(env: Env, source: str, target: str, setting: str) -> Any:
+    return ThetaSeen(env, source, target, setting)
+
+
+def for_critic(env: Env) -> Any:
     """`env` whose group "critic" ends with theta; the same object for the same environment."""
-    return ThetaCritic(env)
+    return _knowing(env, "critic" if "critic" in env.observation_size else "policy", "critic", "ppo.critic_theta")
 
 
-class ThetaCritic:
-    """An environment whose observation group "critic" is its own (or "policy") and theta, in [-1, 1] over its range.
+def for_policy(env: Env) -> Any:
+    """`env` whose group "policy" ends with theta."""
+    return _knowing(env, "policy", "policy", "ppo.policy_theta")
 
-    theta is kept in info["theta"]. All else is the environment's. UserError where it has no parameters.
+
+def for_teacher(env: Env) -> Any:
+    """`env` with a group "teacher": its "policy" with theta at the end."""
+    return _knowing(env, "policy", "teacher", "ppo.teacher")
+
+
+class ThetaSeen:
+    """An environment whose observation group `target` is its group `source` and theta, in [-1, 1] over its range.
+
+    theta is kept in info["theta"]; all else is the environment's.
+
+    Raises:
+        UserError: naming `setting`, where there are no parameters.
     """
 
-    def __init__(self, env: Env) -> None:
+    def __init__(self, env: Env, source: str, target: str, setting: str) -> None:
         if not len(env.space):
             raise UserError(
-                "ppo.critic_theta = True: there are no parameters to show to the critic; randomise some "
-                "(task.randomization_params, --randomize), or set it to False"
+                f"{setting}: there are no parameters to show; randomise some (task.randomization_params, --randomize)"
             )
-        self.env = env
+        self.env, self.source, self.target = env, source, target
         low, high = (np.asarray(x, np.float32) for x in (env.space.low, env.space.high))
         self.middle = (low + high) / 2
         self.half = np.where(high > low, (high - low) / 2, 1).astype(np.float32)
-        self.source = "critic" if "critic" in env.observation_size else "policy"
-        size = env.observation_size[self.source][0] + len(env.space)
-        self.observation_size = {**env.observation_size, "critic": (size,)}
+        size = env.observation_size[source][0] + len(env.space)
+        self.observation_size = {**env.observation_size, target: (size,)}
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.env, name)
+
+    @property
+    def observation_names(self) -> tuple[str, ...]:
+        """Of the group "policy"."""
+        return (*getattr(self.env, "observation_names", ()), *(self.env.space.names if self.target == "policy" else ()))
 
     def reset(self, key: jax.Array, theta: jax.Array | None = None) -> State:
         theta = jnp.asarray(self.env.space.nominal, jnp.float32) if theta is None else theta
         return self._show(self.env.reset(key, theta), theta)
 
     def step(self, state: State, action: jax.Array) -> State:
-        return self._show(self.env.step(state, action), state.info["theta"])
+        own = state
+        if self.source == self.target:  # an environment may make its next observation of the last one
+            whole = state.obs[self.target]
+            own = state.replace(obs={**state.obs, self.target: whole[: whole.shape[0] - len(self.middle)]})
+        return self._show(self.env.step(own, action), state.info["theta"])
 
     def _show(self, state: State, theta: jax.Array) -> State:
         def see(obs: dict[str, jax.Array]) -> dict[str, jax.Array]:
-            return {**obs, "critic": jnp.concatenate([obs[self.source], (theta - self.middle) / self.half])}
+            return {**obs, self.target: jnp.concatenate([obs[self.source], (theta - self.middle) / self.half])}
 
         info = {**state.info, "theta": theta, "final_observation": see(state.info["final_observation"])}
         return state.replace(obs=see(state.obs), info=info)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from bayessim_mjx.config import PPOConfig
-from bayessim_mjx.rl import ppo
+from bayessim_mjx.rl import distil, ppo
 from bayessim_mjx.rl.networks import Policy
 from bayessim_mjx.rl.ppo import TrainState
 
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from bayessim_mjx.env import Env
 
 Metrics = dict[str, Any]
+LOSSES = ("Loss/value", "Loss/surrogate", "Loss/behavior")
 # what an update reports, by TensorBoard tag: averaged over the log interval, or as it is at its end
 MEANS = (
     "Loss/value", "Loss/surrogate", "Loss/entropy", "Loss/kl", "Loss/clip_fraction", "Loss/explained_variance",
@@ -40,15 +41,19 @@ def tags(config: PPOConfig) -> tuple[str, ...]:
 
 
 @lru_cache(maxsize=32)
-def _make_chunk(env: Env, config: PPOConfig) -> Callable[..., Any]:
-    """chunk(state, domain, count): `count` updates in one dispatch, one program for any count. Takes over the state."""
+def _make_chunk(env: Env, config: PPOConfig, distils: bool = False) -> Callable[..., Any]:
+    """chunk(state, given, count): `count` updates in one dispatch, one program for any count. Takes over the state.
 
-    def chunk(state: TrainState, domain: Distribution | None, count: jax.Array) -> tuple[TrainState, Metrics]:
+    given: what an update needs besides, the domain, and the teacher where one is imitated.
+    """
+    update, reported = (distil.update, distil.TAGS) if distils else (ppo.update, tags(config))
+
+    def chunk(state: TrainState, given: tuple, count: jax.Array) -> tuple[TrainState, Metrics]:
         def body(_: jax.Array, carry: tuple[TrainState, Metrics]) -> tuple[TrainState, Metrics]:
-            state, metrics = ppo.update(env, config, carry[0], domain)
+            state, metrics = update(env, config, carry[0], *given)
             return state, {k: v if k in LATEST else carry[1][k] + v / count for k, v in metrics.items()}
 
-        zeros = {tag: jnp.float32(0) for tag in tags(config)} | {"env_steps": jnp.uint32(0)}
+        zeros = {tag: jnp.float32(0) for tag in reported} | {"env_steps": jnp.uint32(0)}
         return jax.lax.fori_loop(0, count, body, (state, zeros))
 
     return jax.jit(chunk, donate_argnums=0)
@@ -61,24 +66,26 @@ def run(
     domain: Distribution | None = None,
     iterations: int | None = None,
     progress: Callable[[Metrics, TrainState], None] | None = None,
+    teacher: Policy | None = None,
 ) -> tuple[TrainState, Metrics]:
     """`iterations` more updates (config.max_iterations by default): the new state, and metrics of the last interval.
 
     The host sees metrics every config.log_interval updates, Loss/* averaged over them, and then calls
     progress(metrics, state). That state's buffers are reused by the next interval: copy what is to be kept.
-    FloatingPointError where the loss is no longer finite.
+    FloatingPointError where the loss is no longer finite. With a `teacher` its actions are imitated, see `distil`.
     """
     total = config.max_iterations if iterations is None else iterations
     state = jax.tree.map(jnp.copy, state)  # the caller's state stays valid
+    given = (domain,) if teacher is None else (domain, teacher)
     done, metrics = 0, {}
     while done < total:
         count = min(config.log_interval, total - done)
         start = time.perf_counter()
-        state, on_device = _make_chunk(env, config)(state, domain, jnp.int32(count))
+        state, on_device = _make_chunk(env, config, teacher is not None)(state, given, jnp.int32(count))
         metrics = {k: v.item() for k, v in jax.device_get(on_device).items()}
         seconds = time.perf_counter() - start
         done += count
-        if not np.isfinite(metrics["Loss/value"] + metrics["Loss/surrogate"]):
+        if not np.isfinite(sum(metrics[tag] for tag in LOSSES if tag in metrics)):
             raise FloatingPointError(
                 f"the loss is not finite after iteration {int(state.iteration)} ({metrics}): check that the task's "
                 "observations and rewards stay finite over the whole domain, and lower ppo.learning_rate"

@@ -11,8 +11,7 @@ import pytest
 from bayessim_mjx import rl
 from bayessim_mjx.config import PPOConfig
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.rl import networks, normalise
-from bayessim_mjx.rl.privileged import knowing_theta
+from bayessim_mjx.rl import networks, normalise, privileged
 
 CONFIG = PPOConfig(
     num_envs=64, num_steps=8, num_epochs=4, num_minibatches=4, learning_rate=3e-3, schedule="fixed", gamma=0.9,
@@ -40,7 +39,7 @@ DOMAIN = probes.Domain(jnp.array([2.0]), jnp.array([6.0]))
 
 
 def test_theta_follows_the_observation_within_minus_one_and_one():
-    env = knowing_theta(Luck())
+    env = privileged.for_critic(Luck())
     state = env.reset(jax.random.PRNGKey(0), jnp.array([5.0]))
     np.testing.assert_array_equal(state.obs["critic"], [0.0, 0.5])
     np.testing.assert_array_equal(state.obs["policy"], [0.0])
@@ -65,7 +64,7 @@ def test_the_value_follows_theta_and_the_policy_does_not_see_it():
 
 
 def test_what_cannot_work_is_refused():
-    with pytest.raises(UserError, match="ppo.critic_theta = True: there are no parameters"):
+    with pytest.raises(UserError, match="ppo.critic_theta: there are no parameters"):
         rl.init(probes.Walk(), CONFIG, jax.random.PRNGKey(0))
     with pytest.raises(UserError, match="ppo.critic_theta = True: with ppo.shared_trunk"):
         dataclasses.replace(CONFIG, shared_trunk=True)

@@ -1,0 +1,86 @@
+"""Teacher and student: a policy learns the actions of another, which may see more, on its own rollouts.
+
+As rsl_rl's distillation (after DAgger, Ross et al. 2011): the student acts, with noise; the teacher says what it would
+have done. The training state is PPO's, so a student can be trained further by PPO.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from bayessim_mjx.config import PPOConfig
+from bayessim_mjx.rl import episodes, losses, networks, normalise, ppo
+from bayessim_mjx.rl.networks import Params, Policy
+
+if TYPE_CHECKING:
+    from bayessim_mjx.distributions import Distribution
+    from bayessim_mjx.env import Env
+
+TAGS = (
+    "Loss/behavior", "Loss/learning_rate", "Policy/grad_norm", "Policy/mean_std", "Train/mean_reward",
+    "Train/mean_episode_length", "env_steps",
+)  # fmt: skip
+
+
+def teacher_group(env: Env) -> str:
+    """The observation group that the teacher sees: "teacher" where there is one, else the student's."""
+    return "teacher" if "teacher" in env.observation_size else "policy"
+
+
+def loss(params: Params, observation: jax.Array, target: jax.Array, config: PPOConfig) -> jax.Array:
+    """Mean error of the student's deterministic action at normalised observations [B, S]; target [B, A].
+
+    Squared, or Huber's with threshold 1. An action that will be clipped is compared before that: it must not be stuck.
+    """
+    mean = networks.mean_action(params, observation, networks.activation(config.activation))
+    action = networks.bounded(mean, config.action_clip, True) if config.action_bound == "tanh" else mean
+    error = action - target
+    return (optax.huber_loss(error) if config.distil_loss == "huber" else error**2).mean()
+
+
+def update(
+    env: Env, config: PPOConfig, state: ppo.TrainState, domain: Distribution | None, teacher: Policy
+) -> tuple[ppo.TrainState, dict[str, jax.Array]]:
+    """One iteration, to be jitted: the student's rollout, the teacher's actions there, epochs of minibatches."""
+    key, collect_key, epochs_key = jax.random.split(state.key, 3)
+    group = teacher_group(env)
+    env_states, data = ppo._collect(env, config, state, domain, collect_key, (group,))
+    seen = data["observation"]["policy"]
+    observation = normalise.normalise(state.normalizer["policy"], seen) if config.normalize_observations else seen
+    batch = (observation, teacher.act(None, data["observation"][group]))
+    batch = jax.tree.map(lambda x: x.reshape(-1, x.shape[-1]), batch)
+
+    def objective(params: Params, part: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, dict]:
+        error = loss(params, *part, config)
+        return error, {"Loss/behavior": error}
+
+    params, opt_state, rate, figures = losses.descend(
+        epochs_key, state.params, state.opt_state, state.learning_rate, batch, config, objective
+    )
+    normalizer = state.normalizer
+    if config.normalize_observations:
+        normalizer = {**normalizer, "policy": normalise.update(normalizer["policy"], seen)}
+    finished = episodes.update(state.episodes, data["reward"], data["terminated"], data["truncated"])
+    after = dataclasses.replace(
+        state,
+        params=params,
+        opt_state=opt_state,
+        normalizer=normalizer,
+        env_states=env_states,
+        episodes=finished,
+        key=key,
+        iteration=state.iteration + 1,
+        env_steps=state.env_steps + jnp.uint32(config.num_envs * config.num_steps),
+    )
+    metrics: dict[str, Any] = {name: x.mean() for name, x in figures.items()} | {
+        "Loss/learning_rate": rate,
+        "Policy/mean_std": jnp.exp(ppo.policy_of(after).distribution(seen)[1]).mean(),
+        "env_steps": after.env_steps,
+        **episodes.metrics(finished),
+    }
+    return after, metrics
