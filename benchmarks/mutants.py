@@ -56,12 +56,12 @@ MUTANTS = (
     ),
     Mutant(
         4, "mirror loss on the wrong half", LOSSES, "means[size:] if augmented", "means[:size] if augmented",
-        (f"{T}symmetry.py",), True,
+        (f"{T}symmetry.py", "-k", "weighted_and_added"), True,
     ),
     Mutant(
         5, "log-probabilities of mirrored samples zeroed", PPO,
         "symmetry.Copies(observation, critic_observation, action, log_prob, value)",
-        "symmetry.Copies(observation, critic_observation, action, 0 * log_prob, value)", (f"{T}symmetry.py",), True,
+        "symmetry.Copies(observation, critic_observation, action, 0 * log_prob, value)", (f"{T}symmetry.py", "-k", "seen_and_rated"), True,
     ),
     Mutant(
         6, "surrogate: max becomes min", LOSSES, "jnp.maximum(-advantage * ratio", "jnp.minimum(-advantage * ratio",
@@ -113,7 +113,7 @@ MUTANTS = (
     ),
     Mutant(
         18, "mirror loss never added", LOSSES, "total = total + config.symmetry.mirror_loss_coeff * asymmetry",
-        "pass", (f"{T}symmetry.py",),
+        "pass", (f"{T}symmetry.py", "-k", "weighted_and_added"),
     ),
     Mutant(
         19, "arguments of KL swapped", LOSSES, "networks.kl(batch.mean, old, mean, log_std)",
@@ -137,7 +137,7 @@ MUTANTS = (
     ),
     Mutant(
         24, "gradient through the mirrored target", SYMMETRY, "jax.lax.stop_gradient(images(mean, actions))",
-        "images(mean, actions)", (f"{T}symmetry.py",),
+        "images(mean, actions)", (f"{T}symmetry.py", "-k", "by_hand"),
     ),
     Mutant(
         25, "discounted novelty without gamma", RND, "total = gamma * carry[0] + now", "total = carry[0] + now",
