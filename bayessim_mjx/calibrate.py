@@ -16,6 +16,13 @@ from bayessim_mjx.device import setup_jax
 from bayessim_mjx.errors import UserError
 
 FOLDER = "calibration"
+ADVICE = {
+    "calibrated": "its regions hold the truth as often as they say",
+    "over-confident": "do not trust its width; more bayessim.trainTrajs, or a bayessim.ensemble",
+    "under-confident": "the truth lies inside, but more could be known; train longer or simulate more",
+    "biased": "do not trust its place; simulate more (bayessim.trainTrajs)",
+    "miscalibrated": "do not trust its shape; more bayessim.components, or other bayessim.coordinates",
+}
 
 
 def _parser() -> cli.PlainParser:
@@ -58,36 +65,54 @@ def _calibrate(argv: Sequence[str] | None) -> int:
     if int(tree["state"].round) < 1:
         raise UserError(f"--run {args.run}: no round of it is finished, there is no posterior yet")
     with Console(headless=True) as console:
-        console.say(f"{config.task}, {args.pairs} fresh pairs of parameters and trajectories, {run.path}")
+        done = int(tree["state"].round)
+        console.say(f"{config.task}, round {done}, {args.pairs} fresh pairs of parameters and trajectories, {run.path}")
         found = loop.reexamine(parts, tree["state"], tree["policy"], args.pairs, args.seed)
-        for line in report_lines(found):
-            console.say(line)
-        console.say(f"report and picture: {_write(run.path / FOLDER, found)}")
+        show(console, found)
+        folder = write(run.path / FOLDER, found, done)
+        console.say(f"report and picture: {folder}, and in TensorBoard under {FOLDER}")
     return 0
 
 
-def report_lines(found: Any) -> list[str]:
-    """What the command prints of inference.checks.Checks."""
+def show(console: Any, found: Any) -> None:
+    """Verdict, tables and advice of inference.checks.Checks on the terminal."""
     report = found.calibration
-    lines = [f"verdict     posterior {report.words}", f"coverage    {report.table()} (nominal: observed, percent)"]
+    for line in verdict_lines(found):
+        console.say(line)
+    rows = [[f"{100 * a:.0f} %", f"{100 * c:.1f} ± {100 * e:.1f} %"] for a, (c, e) in report.coverage.items()]
+    console.grid(["region of the posterior", "truths inside"], rows)
+    columns = zip(report.names, report.bias, report.spread, report.contraction, strict=True)
+    rows = [[n, f"{report.p[n]:.2g}", f"{bias:+.1f}", f"{wide:+.1f}", f"{c:.2f}"] for n, bias, wide, c in columns]
+    console.grid(["parameter", "p of ranks", "bias [se]", "too narrow [se]", "contraction"], rows)
+    for text in found.warnings():
+        console.warning(text)
+
+
+def verdict_lines(found: Any) -> list[str]:
+    """The verdicts in words: on the network, and on whether reality looks like simulation."""
+    report, misfit = found.calibration, found.misfit
+    lines = [f"verdict     posterior {report.words}: {ADVICE[report.verdict]}"]
+    if report.temperature is not None and report.before is None:
+        lines += [f"            (tested with its standard deviations times {report.temperature:.2f}, as in its round)"]
     lines += [f"gain        {report.gain:.2f} nats over the prior, on average"]
     if report.predictive is not None:
         lines += [f"predictive  p = {report.predictive:.2g} that simulation at the posterior reproduces the summaries"]
-    lines += ["", f"{'parameter':<36}{'p of ranks':>12}{'bias [se]':>12}{'width [se]':>12}{'contraction':>13}"]
-    rows = zip(report.names, report.bias, report.spread, report.contraction, strict=True)
-    lines += [f"{n:<36}{report.p[n]:>12.2g}{bias:>12.1f}{spread:>12.1f}{c:>13.2f}" for n, bias, spread, c in rows]
-    p = " ".join(f"{value:.2g}" for value in found.misfit.p)
-    lines += ["", f"real trajectories: p = {found.misfit.joint:.2g} that simulation produces the like (each: {p})"]
-    return lines + [f"warning: {text}" for text in found.warnings()]
+    each = "" if len(misfit.p) == 1 else f" (each: {' '.join(f'{value:.2g}' for value in misfit.p)})"
+    reality = "unlike anything simulated" if misfit.flagged else "like simulated ones"
+    return [*lines, f"reality     the real trajectories are {reality}, p = {misfit.joint:.2g}{each}"]
 
 
-def _write(folder: Path, found: Any) -> Path:
+def write(folder: Path, found: Any, round_: int) -> Path:
+    """report.json, and the picture as PNG and in TensorBoard at step `round_`, in place of an earlier one."""
     from bayessim_mjx.checkpoints import write_text
     from bayessim_mjx.monitor import trust
+    from bayessim_mjx.monitor.writer import Writer
 
     folder.mkdir(exist_ok=True)
-    write_text(folder / "report.json", json.dumps(found.to_dict(), indent=1) + "\n")
-    trust.calibration(found.calibration).savefig(folder / "calibration.png")
+    write_text(folder / "report.json", json.dumps({"round": round_, **found.to_dict()}, indent=1) + "\n")
+    with Writer(folder, purge_step={"Calibration": round_}, media=folder) as writer:
+        writer.figure("Calibration/regions_and_ranks", trust.calibration(found.calibration, round=round_), round_)
+        writer.scalars(round_, found.scalars, prefix="Calibration/")
     return folder
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -21,8 +21,9 @@ from bayessim_mjx.config import Config
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.env import Env
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.inference import summarizers
-from bayessim_mjx.logs import Log, noise, read_logs, segments
+from bayessim_mjx.inference import feature_names, summarizers
+from bayessim_mjx.inference.embedding import Embedding
+from bayessim_mjx.logs import Channels, Log, noise, read_logs, segments
 from bayessim_mjx.parameters import ParameterSpace
 from bayessim_mjx.rl import Policy
 from bayessim_mjx.rollout import Trajectory, replay, rollout
@@ -67,8 +68,31 @@ def _ones(action_size: int) -> Callable[[Array, dict], Array]:
 
 
 def summarise(summarizer: Callable, trajectory: Trajectory) -> Array:
-    """Features [worlds, D] of trajectories, from observations and actions."""
-    return jax.vmap(summarizer)(trajectory.observation, trajectory.action)
+    """Features [worlds, D] of trajectories, from observations and actions while the episodes ran."""
+    return jax.vmap(summarizer)(trajectory.observation, trajectory.action, trajectory.valid)
+
+
+@dataclasses.dataclass(frozen=True)
+class Seen:
+    """What a summarizer is given, by name."""
+
+    steps: int
+    states: tuple[str, ...]
+    actions: tuple[str, ...]
+    context: tuple[str, ...] = ()  # features after those of the summary
+
+    def features(self, summary: str) -> tuple[str, ...]:
+        """A name for every feature."""
+        return (*feature_names.names(summary, self.steps, self.states, self.actions), *self.context)
+
+    def embedding(self) -> Embedding:
+        """The network that learns its features from summary_learned."""
+        window = min(Embedding.window, self.steps)
+        return Embedding(self.steps, len(self.states), len(self.actions), window=window)
+
+
+def _named(names: Sequence[str], size: int, kind: str) -> tuple[str, ...]:
+    return tuple(names) if len(names) == size else tuple(f"{kind} {i + 1}" for i in range(size))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)  # compared by identity: static under jit
@@ -83,7 +107,7 @@ class Surrogate:
     policy_name: str
     length: int
     noise: float  # standard deviation of the noise on observations, in simulation and in reality
-    summarizer: Callable[[Array, Array], Array]
+    summarizer: summarizers.Summarizer
 
     @property
     def truth(self) -> np.ndarray:
@@ -99,6 +123,15 @@ class Surrogate:
     def policy_dependent(self) -> bool:
         """Whether the trajectories, simulated and real, are made by the policy of their round."""
         return self.policy_name in POLICY_DEPENDENT
+
+    @property
+    def channels(self) -> Seen:
+        """What the summarizer sees: observations and actions."""
+        (size,) = self.env.observation_size["policy"]
+        states = _named(getattr(self.env, "observation_names", ()), size, "observation")
+        model = getattr(self.env, "mj_model", None)
+        commands = () if model is None else Channels.of(model).actuators
+        return Seen(self.length, states, _named(commands, self.env.action_size, "action"))
 
     def sample(self, key: Array, count: int) -> Array:
         """theta [count, d] of the surrogate, inside the box."""
@@ -143,13 +176,22 @@ class Recorded:
     with_qvel: (
         bool  # velocities were measured; estimated ones are no features, simulation has nothing like their errors
     )
-    summarizer: Callable[[Array, Array], Array]
+    summarizer: summarizers.Summarizer
     truth: None = None
     policy_dependent: bool = False  # the logged commands act, whatever bayessim.collectPolicy says
 
     @property
     def supply(self) -> int:
         return len(self.order)
+
+    @property
+    def channels(self) -> Seen:
+        """What the summarizer sees: deviations from the nominal replay, and commands; then come the first states."""
+        named = Channels.of(self.env.mj_model)
+        speeds = [f"{name} speed" for name in named.qvel]
+        states = [f"deviation of {name}" for name in (*named.qpos, *(speeds if self.with_qvel else ()))]
+        first = tuple(f"first {name}" for name in (*named.qpos, *speeds))
+        return Seen(self.data["command"].shape[1], tuple(states), named.actuators, first)
 
     def features(self, qpos: Array, qvel: Array, command: Array) -> Array:
         """[N, D] of measured motion qpos [N, T+1, nq], qvel [N, T+1, nv] under command [N, T, nu]."""
@@ -329,6 +371,6 @@ def _row(key: str, row: Any, space: ParameterSpace, rest: np.ndarray) -> np.ndar
     return np.asarray(numbers)
 
 
-def domain_or_prior(space: ParameterSpace, components: int) -> Distribution | None:
+def domain_or_prior(space: ParameterSpace, components: int, chart: str = "plain") -> Distribution | None:
     """The prior as a distribution with room for `components` Gaussians; None for a task without parameters."""
-    return Distribution.prior(space, components) if len(space) else None
+    return Distribution.prior(space, components, chart) if len(space) else None

@@ -28,6 +28,9 @@ SUMMARIZERS = {  # summaries of a trajectory, and what a number at the end of th
 }
 # classes of posterior networks: MDNN, or random Fourier features as MDRFF[_<kernel>[_<bandwidth>]]
 MODEL = re.compile(r"MDNN|MDRFF(?:_(RBF|Laplace|Matern12|Matern32|Matern52)(?:_(median|validation|[0-9][0-9.e+-]*))?)?")
+COORDINATES = ("plain", "truncated", "probit", "logit")
+PROPOSALS = ("prior", "apt", "truncated", "division")
+UNCORRECTED = (("apt", "truncated"), ("apt", "logit"), ("division", "logit"))  # (proposal, coordinates)
 ACTIVATIONS = ("elu", "relu", "selu", "tanh", "swish", "gelu")
 
 
@@ -250,6 +253,25 @@ class BayesSimConfig(Section):
     components: int = setting(10, "mixture components", low=1)
     fullCovariance: bool = setting(False, "full covariance per component")
     hiddenLayers: tuple[int, ...] = setting((128, 128), "widths of the network", low=1)
+    ensemble: int = setting(1, "networks trained side by side; their posteriors are averaged", low=1, high=50)
+    coordinates: str = setting(
+        "plain",
+        "in which the posterior is a Gaussian mixture: plain (in the range, cut off at its ends), truncated (cut off "
+        "in training too), probit (the prior is a Gaussian) or logit",
+        choices=COORDINATES,
+    )
+    proposal: str = setting(
+        "prior",
+        "what rounds after the first are simulated from: the prior; or the last posterior, corrected for: apt (in the "
+        "loss), truncated (the prior within the posterior's region) or division (BayesSim's, by one Gaussian)",
+        choices=PROPOSALS,
+    )
+    temperature: float | None = setting(
+        None,
+        "factor on the posterior's standard deviations; null: fitted where a round's tests say over-confident; 1: none",
+        above=0,
+        high=100,
+    )
     lr: float = setting(2e-3, "peak learning rate of the network (cosine; BayesSimIG: 1e-4, constant)", above=0)
     priorShare: float = setting(
         0.05, "prior mixed into each trajectory's posterior: a misjudged one cannot rule out the truth", low=0, high=1
@@ -271,6 +293,11 @@ class BayesSimConfig(Section):
         if 0 < self.checkTrajs < 40:
             raise UserError(f"bayessim.checkTrajs = {self.checkTrajs}: 0 (no tests), or at least 40")
         summary_of(self.summarizerFxn, "bayessim.summarizerFxn")
+        if (self.proposal, self.coordinates) in UNCORRECTED:
+            raise UserError(
+                f"bayessim.proposal = {self.proposal!r}: no correction in bayessim.coordinates = {self.coordinates!r}; "
+                "take coordinates plain or probit, or proposal truncated or prior"
+            )
         if self.modelClass is not None and not MODEL.fullmatch(self.modelClass):
             raise UserError(
                 f"bayessim.modelClass = {self.modelClass!r}: allowed are MDNN, MDRFF, MDRFF_<kernel>, "
@@ -360,6 +387,7 @@ class PPOConfig(Section):
     init_std: float = setting(1.0, "initial standard deviation of actions", above=0)
     state_dependent_std: bool = setting(False, "the actor gives the standard deviation too, else it is a parameter")
     shared_trunk: bool = setting(False, "the critic is one layer on the actor's hidden ones (hidden_critic is unused)")
+    memory: int = setting(0, "units of a recurrent layer (GRU) before the actor's others; 0: none (train, play)", low=0)
     critic_theta: bool = setting(False, "the critic also sees the physics, theta (not the actor)")
     policy_theta: bool = setting(False, "the policy sees theta too: a teacher, for simulation alone (train, play)")
     teacher: str | None = setting(None, "checkpoint of a policy to imitate, in place of PPO (train)", spell=_absolute)
@@ -389,6 +417,13 @@ class PPOConfig(Section):
         if (self.critic_theta or self.policy_theta) and self.symmetry is not None:
             which = "ppo.critic_theta" if self.critic_theta else "ppo.policy_theta"
             raise UserError(f"{which} = True: theta has no mirror image, so ppo.symmetry has to be null")
+        if self.memory and (self.symmetry is not None or self.teacher is not None):
+            raise UserError(f"ppo.memory = {self.memory}: not with ppo.symmetry or ppo.teacher; set them to null")
+        if self.memory and self.num_minibatches > self.num_envs:
+            raise UserError(
+                f"ppo.num_minibatches = {self.num_minibatches}: with ppo.memory a minibatch is of whole sequences, and "
+                f"there are only num_envs = {self.num_envs}"
+            )
         if self.shared_trunk and not self.hidden_actor:
             raise UserError("ppo.shared_trunk = True needs hidden layers to share: ppo.hidden_actor is []")
         if self.state_dependent_std and not 0.007 <= self.init_std <= 148:  # exp(+-5), networks.LOG_STD_LIMIT

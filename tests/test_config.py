@@ -155,7 +155,7 @@ def test_settings_of_one_task_are_typed_by_its_file() -> None:
 
 
 BAD = {
-    "bayessim.componets=5": r"override 'bayessim.componets=5'.*mean bayessim\.components\?.*Allowed: .*trainTrajs",
+    "bayessim.componets=5": r"override 'bayessim.componets=5'.*mean bayessim\.components or .*Allowed: .*trainTrajs",
     "componets=5": r"Did you mean bayessim\.components\?",
     "pp.gamma=1": r"key 'pp' is unknown.*ppo",
     "env.numEnv=5": r"Did you mean env\.numEnvs\?",
@@ -181,6 +181,11 @@ BAD = {
     "bayessim.modelClass=MDN": r"bayessim\.modelClass = 'MDN': allowed are MDNN.*None, plain uniform randomisation$",
     "bayessim.modelClass=MDNN_x": r"bayessim\.modelClass = 'MDNN_x': allowed are MDNN, MDRFF",
     "bayessim.modelClass=MDRFF_Cosine": r"bayessim\.modelClass = .MDRFF_Cosine.: allowed are MDNN, MDRFF",
+    "bayessim.coordinates=cosine": r"coordinates = 'cosine' .*allowed are plain, truncated, probit, logit",
+    "bayessim.proposal=snpe": r"proposal = 'snpe' .*allowed are prior, apt, truncated, division",
+    "bayessim={proposal: apt, coordinates: logit}": r"'apt': no correction in bayessim\.coordinates = 'logit'; take",
+    "bayessim.ensemble=0": r"ensemble = 0 .*at least 1",
+    "bayessim.temperature=0": r"temperature = 0\.0 .*greater than 0",
     "monitor.console=False": r"'monitor\.console' is unknown",
     "monitor.tensorboard=False": r"'monitor\.tensorboard' is unknown",
     "real.logs=3": r"real\.logs = 3 .*expected a list of texts",

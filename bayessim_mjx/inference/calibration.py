@@ -19,6 +19,7 @@ from jax.typing import ArrayLike
 from scipy.special import ndtr
 
 from bayessim_mjx.distributions import Distribution, box, charts
+from bayessim_mjx.triangular import inverse_lower, lower_factor, product
 
 LEVELS = (0.5, 0.8, 0.95)
 DRAWS = 256  # proposals per pair; those outside the box are left out
@@ -39,16 +40,26 @@ class Ranks(NamedTuple):
 
 
 @partial(jax.jit, static_argnames="draws")
-def ranks(key: Array, posteriors: Distribution, thetas: Array, draws: int = DRAWS) -> Ranks:
-    """Ranks of thetas [n, d] among up to `draws` of each of n batched posteriors; all pairs in one program."""
+def ranks(
+    key: Array, posteriors: Distribution, thetas: Array, draws: int = DRAWS, tilt: Distribution | None = None
+) -> Ranks:
+    """Ranks of thetas [n, d] among up to `draws` of each of n batched posteriors; all pairs in one program.
+
+    `tilt`: the thetas come from it instead of the prior, so they are ranked among draws of q tilt / prior.
+    """
     space = posteriors.space
     u = jax.vmap(space.to_unit)(thetas)
 
     def one(key: Array, q: Distribution, theta: Array, u: Array, reference: Array) -> Ranks:
-        k_draw, *keys = jax.random.split(key, 4)
+        k_draw, k_tilt, *keys = jax.random.split(key, 5)
         v, kept = _draws(k_draw, q, draws)
         sample = jax.vmap(space.from_unit)(v)
-        gain = q.log_gain(jnp.concatenate([theta[None], sample]))
+        points = jnp.concatenate([theta[None], sample])
+        gain = q.log_gain(points)
+        if tilt is not None:
+            ratio = tilt.log_gain(points)
+            gain = gain + ratio
+            kept = kept * (jnp.log(jax.random.uniform(k_tilt, (draws,), minval=1e-7)) < ratio[1:] - jnp.max(ratio[1:]))
         near, far = (jnp.sum((x - reference[None, :]) ** 2, axis=-1, keepdims=True) for x in (v, u[None]))
         parameters = _rank(keys[0], v, u[None, :], kept)
         level = _rank(keys[1], -gain[1:, None], -gain[:1, None], kept)
@@ -121,12 +132,14 @@ class Report:
         }  # fmt: skip
 
 
-def check(key: Array, posteriors: Distribution, thetas: Array, draws: int = DRAWS) -> Report:
-    """Judge n batched posteriors by the thetas [n, d] that their data were simulated at; theta ~ prior.
+def check(
+    key: Array, posteriors: Distribution, thetas: Array, draws: int = DRAWS, tilt: Distribution | None = None
+) -> Report:
+    """Judge n batched posteriors by the thetas [n, d] that their data were simulated at; theta ~ prior, or `tilt`.
 
     Pairs that are not finite are left out; ValueError where hardly any remains.
     """
-    found = jax.tree.map(np.asarray, ranks(key, posteriors, jnp.asarray(thetas), draws))
+    found = jax.tree.map(np.asarray, ranks(key, posteriors, jnp.asarray(thetas), draws, tilt))
     return judge(_usable(found), posteriors.space)
 
 
@@ -201,9 +214,26 @@ def _null(n: int, draws: int = 4000) -> np.ndarray:
 
 
 def tempered(posterior: Distribution, factor: float | Array) -> Distribution:
-    """Standard deviations of every component times `factor`; also for batched posteriors under jax.vmap."""
+    """Standard deviations of every component times `factor`, but never beyond the prior's; for jax.vmap too."""
     q = posterior
-    return Distribution.from_unit(q.space, q.logits, q.means, q.scales * factor, q.prior_weight, q.chart)
+    return Distribution.from_unit(q.space, q.logits, *_spread(q, factor), q.prior_weight, q.chart)
+
+
+def _spread(q: Distribution, factor: float | Array) -> tuple[Array, Array]:
+    """Means and scales of the components of (q / p)^(1 / factor^2) p, p as Gaussian as the chart has it."""
+    if q.chart == "plain":  # p is flat
+        return q.means, q.scales * factor
+    centre, sd = charts.NEUTRAL[q.chart]
+    power = 1 / jnp.square(jnp.asarray(factor, jnp.float32))
+    inverse = inverse_lower(q.scales)
+    prior = jnp.broadcast_to(jnp.eye(q.scales.shape[-1]), q.scales.shape) * jnp.sqrt(1 - power) / np.float32(sd)
+    # precision P power + (1 - power) / sd^2 = C C^T, P = S^-T S^-1
+    c = lower_factor(jnp.concatenate([jnp.swapaxes(inverse, -1, -2) * jnp.sqrt(power), prior], axis=-1))
+    scales = lower_factor(jnp.swapaxes(inverse_lower(c), -1, -2))
+    shift = product(inverse, (q.means - np.float32(centre))[..., None])
+    shift = product(jnp.swapaxes(inverse, -1, -2), shift) * power
+    means = product(scales, product(jnp.swapaxes(scales, -1, -2), shift))[..., 0] + np.float32(centre)
+    return means, scales
 
 
 def temperature(posteriors: Distribution, thetas: Array, weights: ArrayLike | None = None) -> float:
@@ -219,11 +249,11 @@ def temperature(posteriors: Distribution, thetas: Array, weights: ArrayLike | No
 @jax.jit
 def _scores(posteriors: Distribution, thetas: Array, weights: Array) -> Array:
     def one(q: Distribution, theta: Array, factor: Array) -> Array:
-        scales = q.scales * factor
+        means, scales = _spread(q, factor)
         # fewer points than Distribution.from_unit takes: there are many to weigh
-        masses = box.log_masses(q.means, scales, 64) if q.chart == "plain" else jnp.zeros_like(q.logits)
+        masses = box.log_masses(means, scales, 64) if q.chart == "plain" else jnp.zeros_like(q.logits)
         inside = jax.nn.logsumexp(jax.nn.log_softmax(q.logits) + masses)
-        return replace(q, scales=scales, log_inside=inside).log_gain(theta)
+        return replace(q, means=means, scales=scales, log_inside=inside).log_gain(theta)
 
     def at(factor: Array) -> Array:
         gain = jax.vmap(one, in_axes=(0, 0, None))(posteriors, thetas, factor)
@@ -232,21 +262,36 @@ def _scores(posteriors: Distribution, thetas: Array, weights: Array) -> Array:
     return jax.lax.map(at, jnp.asarray(TEMPERATURES))
 
 
-def corrected(key: Array, posteriors: Distribution, thetas: Array) -> Report:
+def corrected(key: Array, posteriors: Distribution, thetas: Array, tilt: Distribution | None = None) -> Report:
     """`check`; where it finds over-confidence, a temperature is fitted on one half and judged on the other."""
-    report = check(key, posteriors, thetas)
+    report = check(key, posteriors, thetas, DRAWS, tilt)
     if report.verdict != OVER:
         return report
     n = thetas.shape[0]
-    factor = temperature(posteriors, thetas, np.arange(n) < n // 2)
+    first = np.arange(n) < n // 2
+    if tilt is None:
+        factor = temperature(posteriors, thetas, first)
+    else:
+        factor = _temperature_by_level(key, posteriors, thetas, first, tilt)
     if factor <= 1.0:
         return report
     wider = widened(posteriors, factor)
     # all of them: a program that is compiled already
-    found = jax.tree.map(np.asarray, ranks(jax.random.fold_in(key, 1), wider, jnp.asarray(thetas), DRAWS))
+    found = jax.tree.map(np.asarray, ranks(jax.random.fold_in(key, 1), wider, jnp.asarray(thetas), DRAWS, tilt))
     after = judge(_usable(Ranks(*(part[n // 2 :] for part in found))), posteriors.space)
     words = f"{report.words}; standard deviations times {factor:.2f}, then {after.words}"
     return replace(after, words=words, temperature=factor, before=report.verdict)
+
+
+def _temperature_by_level(
+    key: Array, posteriors: Distribution, thetas: Array, use: np.ndarray, tilt: Distribution
+) -> float:
+    """The smallest factor at which the truths lie at HPD levels of 1/2 on average: q tilt / prior has no known norm."""
+    for factor in TEMPERATURES:
+        level = np.asarray(ranks(key, widened(posteriors, factor), jnp.asarray(thetas), DRAWS, tilt).level)[use]
+        if np.nanmean(level) <= 0.5:
+            break
+    return float(factor)
 
 
 @jax.jit

@@ -15,7 +15,7 @@ from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.inference import calibration, misspecification
 from bayessim_mjx.inference.calibration import Report
 from bayessim_mjx.inference.fit import condition
-from bayessim_mjx.inference.identify import flat_sentences
+from bayessim_mjx.inference.identify import flat_sentences, restore_prior
 from bayessim_mjx.inference.misspecification import Misfit
 from bayessim_mjx.inference.walls import Pile, piles
 
@@ -70,16 +70,38 @@ class Checks:
 
 
 def examine(
-    key: Array, network: Any, simulated: tuple[Array, Array, int], held: tuple[Array, Array], real: Array, rows: slice
+    key: Array,
+    network: Any,
+    simulated: tuple[Array, Array, int],
+    held: tuple[Array, Array],
+    real: Array,
+    rows: slice,
+    *,
+    temperature: float | None = None,
+    tilt: Distribution | None = None,
+    names: Sequence[str] = (),
 ) -> tuple[Report, Misfit]:
     """Calibration of the network and misfit of the real summaries.
 
     simulated: (thetas [N, d], x [N, D], valid rows) that the network was fitted on. held: fresh pairs (thetas, x) from
-    the prior. real [n, D]: summaries, of which `rows` are judged; the rest is padding that spares a compilation.
+    the prior, or from `tilt`. real [n, D]: summaries, of which `rows` are judged; the rest is padding that spares a
+    compilation. temperature: that of the posteriors judged; None: fitted where they are over-confident. names [D] of
+    the features.
     """
-    report = calibration.corrected(key, condition(network, held[1]), held[0])
-    misfit = misspecification.detect(network, *simulated, held[1], real)
+    posteriors = conditioned(network, held[1])
+    if temperature is None:
+        report = calibration.corrected(key, posteriors, held[0], tilt)
+    else:
+        report = calibration.check(key, calibration.widened(posteriors, temperature), held[0], tilt=tilt)
+        report = replace(report, temperature=None if temperature == 1.0 else temperature)
+    misfit = misspecification.detect(network, *simulated, held[1], real, names)
     return report, misfit.part(rows)
+
+
+@jax.jit
+def conditioned(network: Any, x: Array) -> Distribution:
+    """Posterior of each summary x [n, D] as it is used: parameters that are not identified have their prior."""
+    return jax.vmap(restore_prior, in_axes=(0, None))(condition(network, x), network.identified)
 
 
 def conclude(report: Report, misfit: Misfit, posterior: Distribution, distrust: float) -> Checks:
@@ -96,11 +118,18 @@ def guarded(posterior: Distribution, share: float) -> Distribution:
 
 
 def replicated(
-    key: Array, network: Any, x: Array, simulate: Callable[[Array, Array], Array], pairs: int = 200, each: int = 10
+    key: Array,
+    network: Any,
+    x: Array,
+    simulate: Callable[[Array, Array], Array],
+    pairs: int = 200,
+    each: int = 10,
+    temperature: float = 1.0,
 ) -> float:
     """p-value of the posterior predictive check; simulate(key, thetas [n, d]) -> summaries [n, D] is called once."""
     x, keys = x[:pairs], jax.random.split(key, 2)
-    draws = jax.vmap(lambda k, q: q.sample(k, each))(jax.random.split(keys[0], x.shape[0]), condition(network, x))
+    posteriors = calibration.widened(conditioned(network, x), temperature)
+    draws = jax.vmap(lambda k, q: q.sample(k, each))(jax.random.split(keys[0], x.shape[0]), posteriors)
     again = simulate(keys[1], draws.reshape(-1, draws.shape[-1]))
     return calibration.predictive(np.asarray(x), np.asarray(again).reshape(x.shape[0], each, -1))[0]
 

@@ -22,7 +22,9 @@ SIGNIFICANT = 3.0  # standard errors of the mean held-out gain
 RELEVANT = 0.01  # nats
 DEFENSIVE = 0.05  # share of the prior mixed in before scoring
 CONTRACTED = 0.05  # share of the prior's variance that has to go before a parameter counts as narrowed
-FLAT = 20.0  # sd in unit coordinates that is flat inside the cube: the density varies by 3e-4
+# centre and sd of a Gaussian that is the prior. plain: its density varies by 3e-4 inside the cube. logit: to 0.02 in
+# probability, and exactly N(0, 1) in mean and variance where a product takes it over to the probit chart
+FLAT = {"plain": (0.5, 20.0), "probit": (0.0, 1.0), "logit": (0.0, 1.7758)}
 
 
 def marginal_gain(logits: Array, means: Array, scales: Array, u: Array) -> Array:
@@ -52,16 +54,15 @@ def identified(gain: Array, mask: Array) -> tuple[Array, Array]:
 @jax.jit
 def restore_prior(posterior: Distribution, keep: Array) -> Distribution:
     """The posterior over the parameters to keep [d], the prior over the others, independent of them."""
-    keep = jnp.asarray(keep)
-    means = jnp.where(keep[None, :], posterior.means, 0.5)
-    # a factor of (S S^T on the kept rows) + FLAT^2 on the others; forming S S^T would lose thin components
-    kept = jnp.where(keep[None, :, None], posterior.scales, 0.0)
-    flat = jnp.broadcast_to(jnp.diag(jnp.where(keep, 0.0, FLAT)), kept.shape)
-    scales = lower_factor(jnp.concatenate([kept, flat], axis=-1))
-    # each component keeps its mass inside the cube
-    mass = box.log_masses(posterior.means, posterior.scales) - box.log_masses(means, scales)
-    logits = jax.nn.log_softmax(posterior.logits) + mass
-    return Distribution.from_unit(posterior.space, logits, means, scales, posterior.prior_weight)
+    q, keep, (centre, sd) = posterior, jnp.asarray(keep), FLAT[posterior.chart]
+    means = jnp.where(keep[None, :], q.means, centre)
+    # a factor of (S S^T on the kept rows) + sd^2 on the others; forming S S^T would lose thin components
+    kept = jnp.where(keep[None, :, None], q.scales, 0.0)
+    flat = jnp.broadcast_to(jnp.diag(jnp.where(keep, 0.0, sd)), kept.shape)
+    scales, logits = lower_factor(jnp.concatenate([kept, flat], axis=-1)), jax.nn.log_softmax(q.logits)
+    if q.chart == "plain":  # each component keeps its mass inside the cube
+        logits = logits + box.log_masses(q.means, q.scales) - box.log_masses(means, scales)
+    return Distribution.from_unit(q.space, logits, means, scales, q.prior_weight, q.chart)
 
 
 def flat_sentences(names: Sequence[str], expected: np.ndarray, real: np.ndarray) -> list[str]:

@@ -28,6 +28,7 @@ WEAK = 0.05  # smallest precision beyond the prior's that linear_start gives to 
 MULTIPLES = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0)  # of the median distance: bandwidths tried by validation
 CUT_POINTS = 16  # quasi-Monte-Carlo points of a component's mass inside the box, in training
 AT_ONCE = 1024  # trajectories embedded at once
+LEAST_INSIDE = float(np.log(0.1))  # log mass inside the box that training reckons with at least
 FIXED = ("omega", "rate")  # of the parameters, those that are not trained
 LOG_2PI = float(np.log(2 * np.pi))
 
@@ -255,7 +256,8 @@ def log_inside(heads: tuple[Array, Array, Array]) -> Array:
     flat = lambda v: v.reshape(n * k, *v.shape[2:])  # noqa: E731
     points = 1 if d == 1 else CUT_POINTS
     mass = box.log_masses(flat(means * sd + centre), flat(inverse_lower(factors) * sd), points)
-    return jax.nn.logsumexp(weights + mass.reshape(n, k), axis=-1)
+    # a floor: mixtures that are all but outside must not gain by how coarsely so little is estimated
+    return jnp.maximum(jax.nn.logsumexp(weights + mass.reshape(n, k), axis=-1), LEAST_INSIDE)
 
 
 def log_tilt(heads: tuple[Array, Array, Array], proposal: Distribution, settings: InferenceSettings) -> Array:

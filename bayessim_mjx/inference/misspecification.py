@@ -9,7 +9,8 @@ combination is ranked again, which makes it one p-value.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import jax
@@ -23,6 +24,7 @@ from bayessim_mjx.triangular import product
 FOURIER = 300  # random features of theta-hat behind E[z | theta-hat]
 WIDTH = 0.4  # their length scale, in units of the box
 RIDGE = 1e-4
+MOST_ALONE = 1024  # features up to which each is predicted from all others
 MOST = 256  # whitened coordinates; a longer summary's residual is projected at random
 NEIGHBOURS, NEAR = 5, 4000  # nearest simulations, among so many
 CLIP = 20.0  # standard deviations
@@ -35,7 +37,7 @@ class Scores(NamedTuple):
     """Scores of n summaries."""
 
     joint: Array  # [n, 3] in the order of SCORES
-    features: Array  # [n, D] residual of each feature given theta-hat, in its standard deviations
+    features: Array  # [n, D] residual of each feature given the others, in its standard deviations
 
 
 @dataclass(frozen=True)
@@ -46,7 +48,9 @@ class Misfit:
     parts: np.ndarray  # [n, 3] the p-value of each score by itself
     sides: np.ndarray  # [n, 3] +1 the score is high, -1 low
     features: np.ndarray  # [n, D] two-sided p-value of each feature by itself
+    residuals: np.ndarray  # [n, D] of each feature given the others, in its standard deviations
     reference: int  # simulations that they were ranked among
+    names: tuple[str, ...] = ()  # [D] of the features
 
     @property
     def joint(self) -> float:
@@ -59,7 +63,8 @@ class Misfit:
 
     def part(self, rows: slice) -> Misfit:
         """Some of the trajectories."""
-        return Misfit(self.p[rows], self.parts[rows], self.sides[rows], self.features[rows], self.reference)
+        found = {name: getattr(self, name)[rows] for name in ("p", "parts", "sides", "features", "residuals")}
+        return replace(self, **found)
 
     def sentence(self) -> str:
         """What a person should know; empty where nothing is wrong."""
@@ -74,8 +79,13 @@ class Misfit:
         score = int(np.argmin(self.parts[row]))
         if TWO_SIDED[score] and self.sides[row, score] < 0:
             return "they follow the simulator too closely, so the noise is assumed too large"
-        feature = int(np.argmin(self.features[row]))
-        return f"something moves them that no parameter explains, or the noise is larger (most in feature {feature})"
+        return f"something moves them that no parameter explains, or the noise is larger (most in {self.worst(row)})"
+
+    def worst(self, row: int) -> str:
+        """The feature of one trajectory that is least like simulated ones, by its name."""
+        # several may lie beyond all simulations: then the farthest
+        feature = int(np.lexsort((-np.abs(self.residuals[row]), self.features[row]))[0])
+        return self.names[feature] if self.names else f"feature {feature}"
 
 
 def prior_share(p: float, most: float) -> float:
@@ -89,16 +99,20 @@ def combined(p: np.ndarray) -> float:
     return float(0.5 - np.arctan(np.mean(np.tan((0.5 - p) * np.pi))) / np.pi)
 
 
-def detect(state: Any, thetas: Array, x: Array, count: int | Array, held: Array, real: Array) -> Misfit:
+def detect(
+    state: Any, thetas: Array, x: Array, count: int | Array, held: Array, real: Array, names: Sequence[str] = ()
+) -> Misfit:
     """Test real summaries [n, D] against fresh simulations `held` [m, D] that the network has not seen.
 
-    `thetas` [N, d] and `x` [N, D] are what the network of `state` was fitted on, `count` of their rows valid.
+    `thetas` [N, d] and `x` [N, D] are what the network of `state` was fitted on, `count` of their rows valid. `names`
+    [D] say what the features are.
     """
     rows = jnp.concatenate([jnp.asarray(held), jnp.asarray(real)])
     scores = jax.tree.map(np.asarray, score(state, thetas, x, jnp.asarray(count, jnp.int32), rows))
     m = held.shape[0]
     usable = np.all(np.isfinite(scores.joint[:m]), axis=1) & np.all(np.isfinite(scores.features[:m]), axis=1)
-    return ranked(Scores(*(s[:m][usable] for s in scores)), Scores(*(s[m:] for s in scores)))
+    found = ranked(Scores(*(s[:m][usable] for s in scores)), Scores(*(s[m:] for s in scores)))
+    return replace(found, names=tuple(names))
 
 
 def ranked(held: Scores, real: Scores) -> Misfit:
@@ -106,7 +120,8 @@ def ranked(held: Scores, real: Scores) -> Misfit:
     joint = np.nan_to_num(np.asarray(real.joint, np.float64), nan=np.inf)
     found = [_joint(np.asarray(held.joint, np.float64), row) for row in joint]
     p, parts, sides = (np.asarray(v) for v in zip(*found, strict=True))
-    return Misfit(p, parts, sides, _two_sided(np.asarray(held.features), np.asarray(real.features)), len(held.joint))
+    residuals = np.asarray(real.features)
+    return Misfit(p, parts, sides, _two_sided(np.asarray(held.features), residuals), residuals, len(held.joint))
 
 
 def _joint(held: np.ndarray, row: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
@@ -139,7 +154,7 @@ def latent(state: Any, x: Array) -> Array:
     """What the network made of summaries x [n, D]: the last hidden layers of all members of the ensemble, [n, E H]."""
     clip = state.settings.clip
     z = jnp.clip((x - state.x_mean[None, :]) * state.x_rate[None, :], -clip, clip)
-    layers = jax.vmap(mdn.hidden, in_axes=(0, None))(state.params, z)
+    layers = jax.vmap(lambda params: mdn.hidden(params, mdn.embedded(params, z, state.settings)))(state.params)
     return jnp.moveaxis(layers, 0, 1).reshape(x.shape[0], -1)
 
 
@@ -165,10 +180,23 @@ def score(state: Any, thetas: Array, x: Array, count: Array, rows: Array) -> Sco
     # log w^2 given theta-hat: noise and the reach of the network differ over the box
     spread = _ridge(f, jnp.log(w * w + 1e-3), used)
     scaled = w_new / jnp.exp(0.5 * product(f_new, spread))
-    sd = jnp.sqrt(_mean(r * r, used)) + 1e-6
     near = _nearest(h[:NEAR], used[:NEAR], h_new)
     joint = jnp.stack([jnp.log(jnp.sum(w_new**2, 1)), jnp.log(jnp.sum(scaled**2, 1)), near], axis=1)
-    return Scores(joint, r_new / sd[None, :])
+    return Scores(joint, _alone(z, r, used, z_new, r_new))
+
+
+def _alone(z: Array, r: Array, used: Array, z_new: Array, r_new: Array) -> Array:
+    """How far each feature is from what all the others predict, in standard deviations -> [n, D].
+
+    One odd feature spoils theta-hat and with it the residuals r of features that are as they should be; so those are
+    taken only where there are too many features to invert their covariance.
+    """
+    if z.shape[1] > MOST_ALONE:
+        return r_new / (jnp.sqrt(_mean(r * r, used)) + 1e-6)[None, :]
+    cov = product((z * used[:, None]).T, z) / jnp.maximum(jnp.sum(used), 1.0) + RIDGE * jnp.eye(z.shape[1])
+    precision = jnp.linalg.inv(cov)
+    # z_j - E[z_j | the others] = (P z)_j / P_jj, of variance 1 / P_jj
+    return product(z_new, precision) / jnp.sqrt(jnp.diagonal(precision))[None, :]
 
 
 def _mean(values: Array, used: Array) -> Array:

@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
-from bayessim_mjx.settings import MODEL
+from bayessim_mjx.settings import COORDINATES, MODEL
 
 if TYPE_CHECKING:
     from bayessim_mjx.inference.embedding import Embedding
-
-COORDINATES = ("plain", "truncated", "probit", "logit")
 
 
 @dataclass(frozen=True)

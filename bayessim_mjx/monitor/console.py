@@ -192,21 +192,28 @@ class Console:
 
     def table(self, parameters: Sequence[Mapping[str, Any]], title: str = "parameters") -> None:
         """Closing table, best identified first, of {name, unit, low, high, mean, sd, truth or None, contraction}."""
-        from rich import box
-        from rich.table import Table
-
-        rows = sorted(parameters, key=lambda row: -float(row.get("contraction") or 0.0))
-        known = any(is_number(row.get("truth")) for row in rows)
-        table = Table(title=title, box=box.SIMPLE_HEAD if self._unicode else box.ASCII, title_justify="left")
-        for name in ["parameter", "prior range", "posterior", *(["truth"] if known else []), "contraction"]:
-            table.add_column(name, justify="left" if name == "parameter" else "right", overflow="fold")
-        for row in rows:
+        ordered = sorted(parameters, key=lambda row: -float(row.get("contraction") or 0.0))
+        known = any(is_number(row.get("truth")) for row in ordered)
+        rows = []
+        for row in ordered:
             unit = f" [{row['unit']}]" if row.get("unit") else ""
             cells = [f"{row['name']}{unit}", f"{number(row['low'])} .. {number(row['high'])}"]
             cells.append(f"{number(row['mean'])} ± {number(row['sd'])}")
             cells += [number(row["truth"]) if is_number(row.get("truth")) else "-"] if known else []
-            cells.append(f"{float(row['contraction']):.2f}" if is_number(row.get("contraction")) else "-")
-            table.add_row(*[escape(self._plain(c)) for c in cells])
+            rows.append([*cells, f"{float(row['contraction']):.2f}" if is_number(row.get("contraction")) else "-"])
+        self.grid(["parameter", "prior range", "posterior", *(["truth"] if known else []), "contraction"], rows, title)
+
+    def grid(self, header: Sequence[str], rows: Sequence[Sequence[str]], title: str | None = None) -> None:
+        """A table of texts, the first column to the left, numbers to the right."""
+        from rich import box
+        from rich.table import Table
+
+        style = box.SIMPLE_HEAD if self._unicode else box.ASCII
+        table = Table(title=title, box=style, title_justify="left")
+        for i, name in enumerate(header):
+            table.add_column(name, justify="right" if i else "left", overflow="fold")
+        for row in rows:
+            table.add_row(*[escape(self._plain(cell)) for cell in row])
         self._rich.print(table, soft_wrap=False)
 
     def say(self, text: str) -> None:

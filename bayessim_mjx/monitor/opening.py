@@ -19,6 +19,8 @@ def opening(config: Config, env: Any, device: Any, infers: bool = True) -> dict[
         logs = ", ".join([config.real.logs] if isinstance(config.real.logs, str) else map(str, config.real.logs or ()))
         lines["real side"] = f"recorded motion in {logs}" if logs else "surrogate: the simulator at hidden parameters"
     lines["budget"] = _budget(config, infers)
+    if infers and config.bayessim.modelClass is not None:
+        lines["inference"] = _inference(config.bayessim)
     lines |= {"device": str(device), "seed": config.seed, "note": COMPILES}
     return lines
 
@@ -38,3 +40,12 @@ def _budget(config: Config, infers: bool) -> str:
     if b.modelClass is None:
         return f"{whole}; no inference (bayessim.modelClass=None)"
     return f"{whole}; {b.trainTrajs} simulated trajectories per round to infer from"
+
+
+def _inference(b: Any) -> str:
+    """Network, summary and, where they are not the plain ones, coordinates, proposal and temperature."""
+    parts = [b.modelClass if b.ensemble == 1 else f"{b.ensemble} × {b.modelClass}", b.summarizerFxn]
+    parts += [f"{b.coordinates} coordinates"] if b.coordinates != "plain" else []
+    parts += [f"later rounds simulated from the posterior ({b.proposal})"] if b.proposal != "prior" else []
+    parts += [f"standard deviations times {b.temperature:g}"] if b.temperature not in (None, 1.0) else []
+    return ", ".join(parts)

@@ -106,3 +106,33 @@ def test_the_predictive_check_notices_replicates_that_lie_elsewhere():
     assert p > 0.01
     p, features = calibration.predictive(x, again + np.array([0, 0, 0.7, 0, 0]))
     assert p < 1e-3 and np.argmin(features) == 2
+
+
+@pytest.mark.parametrize("chart", ["plain", "probit"])
+def test_a_temperature_widens_up_to_the_prior(chart):
+    """probit: (q / p)^(1 / f^2) p has precision (P - 1) / f^2 + 1; plain: sd times f."""
+    q = Distribution.from_unit(SPACE, jnp.zeros(1), jnp.full((1, 2), 0.4), 0.05 * jnp.eye(2)[None], 0.0, chart)
+    wide = calibration.tempered(q, 2.0)
+    if chart == "plain":
+        np.testing.assert_allclose(wide.scales[0], 0.1 * np.eye(2), rtol=1e-5)
+        return
+    precision = (1 / 0.05**2 - 1) / 4 + 1
+    np.testing.assert_allclose(wide.scales[0], precision**-0.5 * np.eye(2), rtol=1e-4)
+    np.testing.assert_allclose(wide.means[0], 0.4 / 0.05**2 / 4 / precision, rtol=1e-4)
+    flat = calibration.tempered(q, 1e4)  # nothing is left but the prior
+    np.testing.assert_allclose(flat.contraction(), [0.0, 0.0], atol=0.01)
+
+
+def test_pairs_from_a_proposal_are_ranked_among_draws_of_the_posterior_that_belongs_to_it():
+    """Truths drawn from a proposal that says more than the data: the draws are as narrow as both together."""
+    tilt = Distribution.gaussian(SPACE, [0.4, 7.0], [0.15, 0.8])
+    truth = tilt.sample(jax.random.PRNGKey(0), PAIRS)
+    u = jax.vmap(SPACE.to_unit)(truth)
+    noise = jnp.asarray(np.linalg.cholesky(COV * 4), jnp.float32)
+    means = u + jax.random.normal(jax.random.PRNGKey(1), u.shape) @ noise.T
+    q = jax.jit(jax.vmap(lambda m: Distribution.from_unit(SPACE, jnp.zeros(1), m[None], noise[None])))(means)
+    found = calibration.check(jax.random.PRNGKey(2), q, truth, tilt=tilt)
+    both = np.linalg.inv(np.linalg.inv(COV * 4) + np.diag(np.array([0.075, 0.08]) ** -2.0))
+    assert found.verdict == calibration.CALIBRATED
+    np.testing.assert_allclose(found.contraction, 1 - 12 * np.diag(both), atol=0.02)
+    assert calibration.check(jax.random.PRNGKey(2), q, truth).contraction.max() < 0.8

@@ -68,7 +68,9 @@ def test_thin_components_survive():
     kept = identify.restore_prior(q, jnp.ones(2, bool))
     np.testing.assert_allclose(np.asarray(kept.scales), np.asarray(thin), rtol=1e-3, atol=1e-7)
     half = identify.restore_prior(q, jnp.asarray([False, True]))
-    np.testing.assert_allclose(np.asarray(half.scales[0]), [[identify.FLAT, 0.0], [0.0, 0.2]], rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(
+        np.asarray(half.scales[0]), [[identify.FLAT["plain"][1], 0.0], [0.0, 0.2]], rtol=1e-4, atol=1e-5
+    )
 
 
 def test_flat_parameters_are_named():
@@ -77,3 +79,20 @@ def test_flat_parameters_are_named():
     )
     assert texts[0] == "slider mass: not identified by these trajectories"
     assert texts[1].startswith("friction: not identified by the real trajectories") and len(texts) == 2
+
+
+@pytest.mark.parametrize("chart", ["plain", "probit", "logit"])
+def test_the_prior_is_restored_in_every_chart_and_a_product_of_many_keeps_it(chart):
+    """Also where components are correlated: the kept marginal stays, twelve factors know nothing of the other."""
+    centre, sd = identify.FLAT[chart] if chart != "plain" else (0.5, 0.2)
+    scales = 0.5 * sd * jnp.asarray([[[1.0, 0.0], [0.8, 0.3]], [[0.7, 0.0], [-0.5, 0.4]]])
+    means = centre + sd * jnp.asarray([[0.1, 0.2], [-0.2, 0.4]])
+    q = Distribution.from_unit(SPACE, jnp.asarray([0.3, 0.0]), means, scales, 0.02, chart)
+    kept = inference.restore_prior(q, jnp.asarray([True, False]))
+    assert kept.chart == chart and float(kept.prior_weight) == pytest.approx(0.02)
+    theta = jnp.asarray([[-0.5], [0.0], [0.4]])
+    seen = [d.marginal(["seen"]).log_prob(theta) for d in (q, kept)]
+    np.testing.assert_allclose(*map(np.asarray, seen), atol=0.02)
+    assert abs(float(kept.contraction()[1])) < (0.03 if chart == "logit" else 0.003)
+    many = inference.combine([kept] * 12, 2)
+    assert abs(float(many.contraction()[1])) < 0.03 < float(many.contraction()[0]) - float(kept.contraction()[0])
