@@ -172,7 +172,10 @@ def load_policy(path: Path, env: Any, config: Config) -> Any:
 def privileged(config: Config, env: Any) -> tuple[Any, Any]:
     """(`env` as the policy of `config` is trained in it, the teacher of ppo.teacher or None)."""
     from bayessim_mjx.rl import privileged as shown
+    from bayessim_mjx.rl import recurrent
 
+    if config.ppo.memory:
+        env = recurrent.remembering(env, config.ppo.memory)
     if config.ppo.policy_theta:
         env = shown.for_policy(env)
     if config.ppo.teacher is None:

@@ -61,7 +61,8 @@ MUTANTS = (
     Mutant(
         5, "log-probabilities of mirrored samples zeroed", PPO,
         "symmetry.Copies(observation, critic_observation, action, log_prob, value)",
-        "symmetry.Copies(observation, critic_observation, action, 0 * log_prob, value)", (f"{T}symmetry.py", "-k", "seen_and_rated"), True,
+        "symmetry.Copies(observation, critic_observation, action, 0 * log_prob, value)",
+        (f"{T}symmetry.py", "-k", "seen_and_rated"), True,
     ),
     Mutant(
         6, "surrogate: max becomes min", LOSSES, "jnp.maximum(-advantage * ratio", "jnp.minimum(-advantage * ratio",

@@ -106,6 +106,8 @@ def _network(graph: Graph, policy: Policy, env: Env) -> None:
 
 def onnx_model(policy: Policy, env: Env, notes: Mapping[str, Any] | None = None) -> Any:
     """The `onnx.ModelProto` of a policy of `env`; `notes`: more metadata. UserError where onnx is not installed."""
+    if "gru" in policy.actor:
+        raise UserError("--export: policies with a memory (ppo.memory) cannot be exported yet")
     try:
         import onnx
         from onnx import helper

@@ -14,7 +14,7 @@ import numpy as np
 from flax import struct
 
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.rl import normalise
+from bayessim_mjx.rl import normalise, recurrent
 from bayessim_mjx.rl.normalise import Moments
 
 Params = dict[str, Any]
@@ -65,39 +65,51 @@ def init(
     init_std: float,
     state_dependent_std: bool = False,
     shared_trunk: bool = False,
+    memory: int = 0,
 ) -> Params:
-    """Parameters of both networks. The actor's last layer is small: the first policy is nearly N(0, init_std^2)."""
+    """Parameters of both networks. The actor's last layer is small: the first policy is nearly N(0, init_std^2).
+
+    memory: units of a recurrent layer before the actor's others; 0: none.
+    """
     actor_key, critic_key = jax.random.split(key)
-    layers = mlp_init(actor_key, [observation_size, *hidden_actor, action_size], 0.01)
+    layers = mlp_init(actor_key, [memory or observation_size, *hidden_actor, action_size], 0.01)
     actor: Params = {"layers": layers, "log_std": jnp.full(action_size, jnp.log(init_std))}
     if state_dependent_std:  # outputs for the spread begin at init_std everywhere
         bias = jnp.full(action_size, LOG_STD_LIMIT * np.arctanh(np.log(init_std) / LOG_STD_LIMIT))
         spread = {"w": jnp.zeros_like(layers[-1]["w"]), "b": bias}
         joined = jax.tree.map(lambda mean, log_std: jnp.concatenate([mean, log_std], -1), layers[-1], spread)
         actor = {"layers": [*layers[:-1], joined]}
+    if memory:
+        actor["gru"] = recurrent.init(jax.random.fold_in(actor_key, 1), observation_size, memory)
     if shared_trunk:
         return {"actor": actor, "critic": {"head": mlp_init(critic_key, [hidden_actor[-1], 1], 1.0)}}
     return {"actor": actor, "critic": {"layers": mlp_init(critic_key, [critic_size, *hidden_critic, 1], 1.0)}}
 
 
-def gaussian(actor: Params, x: jax.Array, act: Callable[[jax.Array], jax.Array]) -> tuple[jax.Array, jax.Array]:
+def _trunk(actor: Params, x: Any) -> jax.Array:
+    """What the actor's layers see of normalised observations x, of `recurrent` where it has a memory."""
+    return recurrent.features(actor["gru"], x) if "gru" in actor else x
+
+
+def gaussian(actor: Params, x: Any, act: Callable[[jax.Array], jax.Array]) -> tuple[jax.Array, jax.Array]:
     """Mean [..., A] and log standard deviation ([A], or [..., A] where it depends on the state) at normalised x."""
-    out = mlp(actor["layers"], x, act)
+    out = mlp(actor["layers"], _trunk(actor, x), act)
     if "log_std" in actor:
         return out, actor["log_std"]
     mean, spread = jnp.split(out, 2, -1)
     return mean, LOG_STD_LIMIT * jnp.tanh(spread / LOG_STD_LIMIT)
 
 
-def mean_action(params: Params, x: jax.Array, act: Callable[[jax.Array], jax.Array]) -> jax.Array:
+def mean_action(params: Params, x: Any, act: Callable[[jax.Array], jax.Array]) -> jax.Array:
     """Mean of the policy's Gaussian, [..., A], at normalised observations x [..., S]."""
     return gaussian(params["actor"], x, act)[0]
 
 
-def value(params: Params, x: jax.Array, act: Callable[[jax.Array], jax.Array]) -> jax.Array:
+def value(params: Params, x: Any, act: Callable[[jax.Array], jax.Array]) -> jax.Array:
     """The critic's value [...] at normalised observations x [..., S]."""
     if "head" in params["critic"]:
-        return mlp([*params["actor"]["layers"][:-1], *params["critic"]["head"]], x, act)[..., 0]
+        actor = params["actor"]
+        return mlp([*actor["layers"][:-1], *params["critic"]["head"]], _trunk(actor, x), act)[..., 0]
     return mlp(params["critic"]["layers"], x, act)[..., 0]
 
 
@@ -151,11 +163,24 @@ class Policy:
     deterministic: bool = struct.field(pytree_node=False, default=False)
     squash: bool = struct.field(pytree_node=False, default=False)
 
-    def distribution(self, obs: Mapping[str, jax.Array] | jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Mean [..., A] and log sd ([A] or [..., A]) of the raw action; obs: groups, or "policy" alone."""
+    def _seen(self, obs: Mapping[str, jax.Array] | jax.Array) -> Any:
+        """What the actor sees: normalised, with the memory where it has one."""
         x = jnp.asarray(obs["policy"] if isinstance(obs, Mapping) else obs)
         x = normalise.normalise(self.normalizer, x) if self.normalize else x
-        return gaussian(self.actor, x, activation(self.activation))
+        if "gru" in self.actor:
+            assert isinstance(obs, Mapping), "a policy with a memory acts on groups of observations"
+            return recurrent.Remembered(x, obs["memory"])
+        return x
+
+    def distribution(self, obs: Mapping[str, jax.Array] | jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Mean [..., A] and log sd ([A] or [..., A]) of the raw action; obs: groups, or "policy" alone."""
+        return gaussian(self.actor, self._seen(obs), activation(self.activation))
+
+    def carried(self, obs: Mapping[str, jax.Array] | jax.Array, action: jax.Array) -> jax.Array:
+        """The action for the environment: with the memory after `obs` behind it, where there is one."""
+        if "gru" not in self.actor:
+            return action
+        return jnp.concatenate([action, _trunk(self.actor, self._seen(obs))], -1)
 
     def bounded(self, raw: jax.Array) -> jax.Array:
         """The action within +- action_clip of a raw one."""
@@ -167,11 +192,11 @@ class Policy:
         return density - log_slope(raw, self.action_clip) if self.squash else density
 
     def act(self, key: jax.Array | None, obs: Mapping[str, jax.Array] | jax.Array) -> jax.Array:
-        """Action [..., A] within +- action_clip: at the mean if `key` is None, else a sample."""
+        """Action [..., A] within +- action_clip: at the mean if `key` is None, else a sample; a memory behind it."""
         mean, log_std = self.distribution(obs)
         if key is not None:
             mean = mean + jnp.exp(log_std) * jax.random.normal(key, mean.shape)
-        return self.bounded(mean)
+        return self.carried(obs, self.bounded(mean))
 
     def __call__(self, key: jax.Array | None, obs: Mapping[str, jax.Array] | jax.Array) -> jax.Array:
         return self.act(None if self.deterministic else key, obs)

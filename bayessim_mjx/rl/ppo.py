@@ -14,7 +14,7 @@ from flax import struct
 from bayessim_mjx.config import PPOConfig
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.mirrors import MirrorMap
-from bayessim_mjx.rl import episodes, losses, networks, normalise, privileged, rnd, symmetry
+from bayessim_mjx.rl import episodes, losses, networks, normalise, privileged, recurrent, rnd, symmetry
 from bayessim_mjx.rl.gae import gae
 from bayessim_mjx.rl.networks import Policy
 from bayessim_mjx.rl.rnd import RND
@@ -103,6 +103,10 @@ def init(env: Env, config: PPOConfig, key: jax.Array, domain: Distribution | Non
         raise ValueError(f"observation groups {sorted(env.observation_size)}: a policy needs the group 'policy'")
     if config.policy_theta and getattr(env, "target", "") != "policy":
         raise UserError("ppo.policy_theta = True trains a teacher; the commands that can are train and play")
+    if config.memory != getattr(env, "memory_size", 0):
+        raise UserError(
+            f"ppo.memory = {config.memory}: the commands that train and play policies with a memory are train and play"
+        )
     env = _for_learner(env, config)
     if config.shared_trunk and critic_group(env) != "policy":
         raise UserError(
@@ -120,8 +124,9 @@ def _init(env: Env, config: PPOConfig) -> Callable[..., TrainState]:
     def run(key: jax.Array, domain: Distribution | None) -> TrainState:
         key, network_key, reset_key, clock_key = jax.random.split(key, 4)
         hidden = (config.hidden_actor, config.hidden_critic, config.init_std)
-        kind = (config.state_dependent_std, config.shared_trunk)
-        params = networks.init(network_key, sizes["policy"], sizes[critic_group(env)], env.action_size, *hidden, *kind)
+        kind = (config.state_dependent_std, config.shared_trunk, config.memory)
+        actions = env.action_size - config.memory
+        params = networks.init(network_key, sizes["policy"], sizes[critic_group(env)], actions, *hidden, *kind)
         env_states, partial = _stagger(clock_key, _reset(env, reset_key, domain, config.num_envs), env.episode_length)
         state = TrainState(
             params=params,
@@ -168,25 +173,38 @@ def _collect(
         mean, log_std = policy.distribution(obs)
         action = mean + jnp.exp(log_std) * jax.random.normal(key, mean.shape)
         extras = {"action": action, "mean": mean}
-        return policy.bounded(action), extras if log_std.ndim == 1 else extras | {"log_std": log_std}
+        done = policy.carried(obs, policy.bounded(action))
+        return done, extras if log_std.ndim == 1 else extras | {"log_std": log_std}
 
     pool = _reset(env, pool_key, domain, config.num_envs)
     novel = () if config.rnd is None else rnd.groups(env.observation_size, config.rnd)
-    groups = tuple(sorted({*state.normalizer, *novel, *more}))
+    memory = ("memory",) if config.memory else ()
+    groups = tuple(sorted({*state.normalizer, *novel, *memory, *more}))
     return collect(env, act, collect_key, state.env_states, pool, config.num_steps, groups)
 
 
 def _batch(env: Env, config: PPOConfig, state: TrainState, data: dict) -> losses.Batch:
-    """The collected [T, N] arrays as B = T N transitions with values, advantages and returns, computed once."""
+    """The collected [T, N] arrays as B = T N transitions with values, advantages and returns, computed once.
+
+    With a memory as N sequences of T steps instead.
+    """
     act, group = networks.activation(config.activation), critic_group(env)
 
-    def seen(which: str, group: str) -> jax.Array:
+    def seen(which: str, group: str) -> Any:
         x = data[which][group]
         return normalise.normalise(state.normalizer[group], x) if config.normalize_observations else x
 
-    observation, critic_observation = seen("observation", "policy"), seen("observation", group)
+    def valued(which: str) -> Any:
+        x = seen(which, group)
+        return recurrent.Remembered(x, data[which]["memory"]) if config.memory and config.shared_trunk else x
+
+    observation, critic_observation = seen("observation", "policy"), valued("observation")
     value = networks.value(state.params, critic_observation, act)
-    next_value = networks.value(state.params, seen("final_observation", group), act)
+    next_value = networks.value(state.params, valued("final_observation"), act)
+    if config.memory:
+        steps = recurrent.Remembered(observation, data["observation"]["memory"])
+        observation = recurrent.sequences(steps, jnp.maximum(data["terminated"], data["truncated"]))
+        critic_observation = observation if config.shared_trunk else critic_observation
     reward = config.reward_scale * data["reward"]
     ends = (data["terminated"], data["truncated"])
     advantage, returns = gae(reward, value, next_value, *ends, config.gamma, config.gae_lambda)
@@ -204,7 +222,7 @@ def _batch(env: Env, config: PPOConfig, state: TrainState, data: dict) -> losses
         log_std=log_std,
         copies=_copies(env, config, state, data),
     )
-    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), batch)
+    return jax.tree.map(lambda x: x.swapaxes(0, 1) if config.memory else x.reshape(-1, *x.shape[2:]), batch)
 
 
 def _copies(env: Env, config: PPOConfig, state: TrainState, data: dict) -> symmetry.Copies | None:
