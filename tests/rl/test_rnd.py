@@ -274,7 +274,11 @@ NOVELTY = RNDConfig(
 )  # fmt: skip
 
 
-@pytest.mark.parametrize("novelty, low, high", [(NOVELTY, 50, 100), (None, -5, 0)], ids=["novelty", "alone"])
+@pytest.mark.parametrize(
+    "novelty, low, high",
+    [(NOVELTY, 50, 100), pytest.param(None, -5, 0, marks=[pytest.mark.slow, pytest.mark.ci])],
+    ids=["novelty", "alone"],
+)
 def test_a_hidden_prize_is_found_by_novelty_and_not_without_it(novelty, low, high):
     """The mountain car: not to move costs nothing, and the top pays 100."""
     env, setting = probes.Valley(), PPOConfig(
