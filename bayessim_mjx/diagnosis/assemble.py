@@ -27,7 +27,8 @@ def diagnosis_of(found: Findings, say: search.Progress = lambda text, done, tota
     """The result of a diagnosis."""
     setup, race, ruling = found.setup, found.race, found.ruling
     model = ruling.model
-    together = uncertainty.covariance(setup.fitter, model)
+    timestep = float(setup.robot.mj_model.opt.timestep) * (setup.discretisation.factor if setup.discretisation else 1)
+    together = uncertainty.covariance(setup.fitter, model) + np.diag(uncertainty.systematic(model, timestep) ** 2)
     sd = np.sqrt(np.diag(together))
     closed = named.closed_by(found)
     effects = named.effects_of(found, sd, closed, say)

@@ -64,7 +64,7 @@ class Gate:
     def warnings(self) -> tuple[str, ...]:
         """One sentence each, beginning with the name of the log."""
         refused = tuple(f"{name}: refused: {reason}" for name, reason in self.refused.items())
-        return refused + self._all("warning")
+        return refused + self._all("warning") + self._not_compared()
 
     @property
     def findings(self) -> tuple[str, ...]:
@@ -87,8 +87,29 @@ class Gate:
             raise UserError(f"no usable log: {reasons}")
         return self.usable
 
+    def _not_compared(self) -> tuple[str, ...]:
+        """One sentence per reason: many logs of many joints would bury everything else."""
+        reasons: dict[tuple[str, str], tuple[list[str], list[str]]] = {}
+        for report in self.reports:
+            for r in report.relations:
+                if report.usable and r.text:
+                    logs, joints = reasons.setdefault((r.source, r.text), ([], []))
+                    logs.append(report.log.name)
+                    joints.append(r.joint)
+        return tuple(
+            f"{_listed(logs)}: effort of {_listed(joints)} ({source}) not compared with the motion: {text}"
+            for (source, text), (logs, joints) in reasons.items()
+        )
+
     def _all(self, kind: str) -> tuple[str, ...]:
         return tuple(f"{r.log.name}: {text}" for r in self.reports if r.usable for text in r.of(kind))
+
+
+def _listed(names: Sequence[str]) -> str:
+    """The first three different names, and how many more there are."""
+    names = list(dict.fromkeys(names))
+    more = f" and {len(names) - 3} more" if len(names) > 3 else ""
+    return ", ".join(names[:3]) + more
 
 
 def check(logs: Sequence[Log], mj_model: mujoco.MjModel, dt: float) -> Gate:
@@ -136,7 +157,7 @@ def _of_effort(related: Sequence[Relation]) -> list[Finding]:
         if r.explained is not None and (r.joint not in best or r.explained > (best[r.joint].explained or 0.0)):
             best[r.joint] = r
     bad = [r for r in best.values() if r.refused]
-    out = [warn(f"effort of {r.joint} ({r.source}) not compared with its motion: {r.text}") for r in related if r.text]
+    out: list[Finding] = []
     for r in best.values():
         assert r.explained is not None
         if r in bad:

@@ -36,6 +36,9 @@ from bayessim_mjx.logs.resample import resample
 from bayessim_mjx.physics import Physics
 
 WINDOW = 0.5  # s
+SHORTER = (1.0, 0.5, 0.25)  # of it, tried in turn while the time step with contacts is worth more than LOTTERY noises
+LOTTERY = 5.0
+SHORTEST_WINDOW = 8  # control steps
 SHORTEST = 0.004  # s, control period of the diagnosis; faster logs are resampled
 LIMITS = ((1, 160), (3, 96), (7, 64), (100, 48))  # (up to so many dofs, windows)
 BUDGET = 24000  # sub-steps of one simulation of all windows; half of it for robots of more than MANY dofs
@@ -116,8 +119,7 @@ def prepare(
     size = scales.measure(robot.mj_model, [resample(log, dt) for log in usable])
     stack, left_out = candidates.stack(kinds, size)
     own = robot.physics(dt)
-    cuts = _windows(own, usable, group, seen.use_qvel)
-    step = discretisation.measure(own, cuts, usable, _finest(own, len(cuts(1)), cuts(1).steps))
+    cuts, step = _measured(own, usable, group, seen.use_qvel)
     robot = step.robot(robot)
     physics = physics_of(robot, dt, stack)
     cut = step.noisier(cuts(step.factor, _limit(physics, cuts(1).steps), centred=False))
@@ -133,13 +135,27 @@ def _settings(robot: Robot) -> search.Settings:
     return search.Settings(singles=24, pairs=5, screened=24, starts=8) if big else search.Settings()
 
 
+def _measured(
+    own: Physics, usable: Sequence[Log], group: str | None, use_qvel: bool
+) -> tuple[Callable[..., windows.Windows], discretisation.Discretisation]:
+    """The windows, and what the time step is worth in them; shorter ones where contacts make longer ones a lottery."""
+    for share in SHORTER:
+        cuts = _windows(own, usable, group, use_qvel, share * WINDOW)
+        step = discretisation.measure(own, cuts, usable, _finest(own, len(cuts(1)), cuts(1).steps))
+        known = np.isfinite(step.sigma)
+        worth = float(np.median(step.floor[known] / step.sigma[known]))
+        if worth < LOTTERY or not discretisation.contacts(own) or cuts(1).steps <= SHORTEST_WINDOW:
+            break
+    return cuts, step
+
+
 def _windows(
-    physics: Physics, logs: Sequence[Log], group: str | None, use_qvel: bool
+    physics: Physics, logs: Sequence[Log], group: str | None, use_qvel: bool, seconds: float = WINDOW
 ) -> Callable[..., windows.Windows]:
     """(factor, limit) -> the windows with that many times the sub-steps of `physics`, by default the same ones."""
     dt = physics.dt
     longest = max(int(log.duration / dt) for log in logs)
-    length = int(np.clip(round(WINDOW / dt), 8, 100))
+    length = int(np.clip(round(seconds / dt), SHORTEST_WINDOW, 100))
     if longest < length:
         raise TooLittleData(f"the longest log has {longest} control steps of {dt:.3g} s, one window needs {length}")
     own = _limit(physics, length)

@@ -92,6 +92,14 @@ def test_a_servo_has_no_effort_to_compare() -> None:
     assert not judge(target).reports[0].relations
 
 
+def test_what_was_not_compared_is_said_once_for_all_logs(arm: Log) -> None:
+    still = [dataclasses.replace(arm.cut(0, 60), name=f"run{i}") for i in range(5)]
+    gate = check(still, model(ARM), DT)
+    told = [w for w in gate.warnings if "not compared" in w]
+    assert len(told) == 1, gate.warnings
+    assert "run0, run1, run2 and 2 more" in told[0] and all(joint in told[0] for joint in arm.joints)
+
+
 def test_a_pendulum_that_only_falls_is_not_refused() -> None:
     log = record(PENDULUM, lambda t, q, v: np.array([0.002 * np.sin(3 * t) + (2.0 if t < 0.3 else 0.0)]))
     rest = log.cut(60, len(log))

@@ -70,3 +70,13 @@ def test_what_acts_alike_is_known_together_better_than_each():
     together = np.array([1.0, 0.9])  # the direction that the residuals see
     assert together @ found @ together < 0.1 * (sd @ sd)
     assert np.linalg.eigvalsh(found).min() > 0
+
+
+def test_simulators_differ_by_a_part_of_a_step_and_a_percent():
+    """Known parameters keep their interval; times are uncertain by the step, other numbers by their size."""
+    known = Coordinate("arm_mass_mult", (0,), 1.0, 0.8, 1.2)
+    delay = Coordinate("motor.actuator_delay.delay", (1,), 0.0, 0.0, 0.1, unit="s")
+    gain = Coordinate("motor.actuator_gain.gain", (2,), 1.0, 0.2, 2.0)
+    job = SimpleNamespace(coordinates=(known, delay, gain), values=np.array([1.1, 0.02, 0.7]))
+    model = SimpleNamespace(effects=(SimpleNamespace(coordinates=(delay, gain)),), job=job)
+    np.testing.assert_allclose(uncertainty.systematic(model, 0.01), [0.0, 0.07 * 0.01, 0.01 * 0.3])
