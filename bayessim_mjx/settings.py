@@ -253,7 +253,9 @@ class BayesSimConfig(Section):
     components: int = setting(10, "mixture components", low=1)
     fullCovariance: bool = setting(False, "full covariance per component")
     hiddenLayers: tuple[int, ...] = setting((128, 128), "widths of the network", low=1)
-    ensemble: int = setting(1, "networks trained side by side; their posteriors are averaged", low=1, high=50)
+    ensemble: int = setting(
+        4, "networks trained side by side; their posteriors are averaged by held-out score", low=1, high=50
+    )
     coordinates: str = setting(
         "plain",
         "in which the posterior is a Gaussian mixture: plain (in the range, cut off at its ends), truncated (cut off "

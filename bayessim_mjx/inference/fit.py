@@ -23,6 +23,7 @@ from bayessim_mjx.inference.settings import InferenceSettings
 GOLDEN = np.uint32(2654435769)  # 2^32 / golden ratio: spreads the validation rows evenly over any number of rows
 SCORED = 256  # validation rows for which the truncated density is reported
 CURVE = 40  # points of the loss curves, at least
+SHARPNESS = np.geomspace(0.7, 1.6, 13).astype(np.float32)  # of the ensemble, tried on the held-out rows
 
 
 @struct.dataclass
@@ -146,11 +147,12 @@ def _posteriors(state: FitState, z: Array) -> Distribution:
 
 
 def _mixtures(state: FitState, z: Array) -> tuple[Array, Array, Array]:
-    """Log weights [n, E K], means and factors of the ensemble's mixture, all members alike."""
+    """Log weights [n, E K], means and factors of the ensemble's mixture."""
     d, settings = len(state.space), state.settings
-    leaves = jax.vmap(lambda params: mdn.mixture(params, z, d, settings))(state.params)
+    logits, *others = jax.vmap(lambda params: mdn.mixture(params, z, d, settings))(state.params)
+    leaves = logits + state.params["share"][:, None, None], *others
     joined = [jnp.moveaxis(leaf, 0, 1).reshape(z.shape[0], -1, *leaf.shape[3:]) for leaf in leaves]
-    return joined[0] - np.float32(np.log(settings.ensemble)), joined[1], joined[2]
+    return joined[0], joined[1], joined[2]
 
 
 def schedule_length(settings: InferenceSettings, capacity: int) -> tuple[int, int]:
@@ -176,10 +178,11 @@ def _fit(
     data = data._replace(proposals=proposals, origin=origin)
     points, chunk = schedule_length(settings, x.shape[0])
     member = partial(_train, data=data, settings=settings, fresh=state.fits == 0)
+    rates = jnp.linspace(0.0, settings.dropout, settings.ensemble) if settings.ensemble > 1 else jnp.zeros(1)
     params, best, skipped, train_loss, val_loss = jax.vmap(member)(
-        jax.random.split(key, settings.ensemble), state.params
+        jax.random.split(key, settings.ensemble), state.params, rates
     )
-    state = replace(state, params=params, fits=state.fits + 1)
+    state = replace(state, params=_weigh(params, data, settings), fits=state.fits + 1)
     marginals = _marginal_gain(_mixtures(state, data.x[data.held]), data.y[data.held], settings)
     parameter_gain, identified = identify.identified(marginals, data.mask)
     state = replace(state, identified=identified)
@@ -205,7 +208,7 @@ def _fit(
 
 
 def _train(
-    key: Array, params: Any, data: _Data, settings: InferenceSettings, fresh: Array
+    key: Array, params: Any, rate: Array, data: _Data, settings: InferenceSettings, fresh: Array
 ) -> tuple[Any, Array, Array, Array, Array]:
     """One member: its best weights, where they were on the curve, steps skipped, and the two loss curves."""
     points, chunk = schedule_length(settings, data.x.shape[0])
@@ -218,12 +221,13 @@ def _train(
     params = jax.tree.map(lambda a, b: jnp.where(fresh, a, b), _fresh(params, data, settings), params)
     fixed = {name: params[name] for name in mdn.FIXED if name in params}
 
-    def loss(params: Any, rows: Array) -> Array:
-        return -jnp.mean(_objective({**params, **fixed}, rows, data, settings))
+    def loss(params: Any, rows: Array, key: Array) -> Array:
+        drop = (key, rate) if settings.ensemble > 1 and settings.dropout > 0 else None
+        return -jnp.mean(_objective({**params, **fixed}, rows, data, settings, drop))
 
-    def step(carry: tuple, rows: Array) -> tuple[tuple, Array]:
+    def step(carry: tuple, inputs: tuple[Array, Array]) -> tuple[tuple, Array]:
         params, opt_state, skipped = carry
-        value, gradient = jax.value_and_grad(loss)(params, rows)
+        value, gradient = jax.value_and_grad(loss)(params, *inputs)
         usable = jnp.isfinite(optax.global_norm(gradient))
         with jax.numpy_dtype_promotion("standard"):  # optax computes decay**count, a float to an int32
             updates, new_opt = optimiser.update(gradient, opt_state, params)
@@ -237,7 +241,7 @@ def _train(
         # a fresh order of the training rows; batches walk through it and wrap around
         order = jnp.argsort(jnp.where(data.train, jax.random.uniform(key, data.train.shape), jnp.inf))
         place = jnp.arange(chunk * batch, dtype=jnp.int32).reshape(chunk, batch) % jnp.maximum(n_train, 1)
-        inner, losses = jax.lax.scan(step, inner, order[place])
+        inner, losses = jax.lax.scan(step, inner, (order[place], jax.random.split(jax.random.fold_in(key, 1), chunk)))
         value = held_out(inner[0])
         better = value < best[0]
         candidate = (value, inner[0], i)
@@ -264,12 +268,41 @@ def _fresh(params: Any, data: _Data, settings: InferenceSettings) -> Any:
     return mdn.linear_start(params, x, data.y, data.train.astype(jnp.float32), settings)
 
 
-def _objective(params: Any, rows: Array, data: _Data, settings: InferenceSettings) -> Array:
+def _weigh(params: Any, data: _Data, settings: InferenceSettings) -> Any:
+    """Weights of the members and one sharpness for all, by the held-out density of their mixture.
+
+    A mixture of networks that disagree is wider than it need be, a single one narrower than it may be.
+    """
+
+    def scores(sharpness: Array) -> Array:
+        score = partial(_objective, rows=data.held, data=data, settings=settings)
+        return jax.vmap(lambda p: score({**p, "sharpness": sharpness}))(params)
+
+    def mixed(sharpness: Array) -> tuple[Array, Array]:
+        density = jnp.where(data.mask[None, :] > 0, jnp.maximum(scores(sharpness), -1e6), 0.0)  # [E, V]
+
+        def climb(share: Array, _: None) -> tuple[Array, None]:
+            # expectation maximisation; one row's worth of every member for few rows
+            mine = jax.nn.softmax(density + share[:, None], axis=0) @ data.mask + 1.0
+            return jnp.log(mine) - jnp.log(jnp.sum(mine)), None
+
+        share, _ = jax.lax.scan(climb, params["share"] * 0 - np.float32(np.log(settings.ensemble)), length=50)
+        return share, data.mask @ jax.nn.logsumexp(density + share[:, None], axis=0)
+
+    shares, value = jax.lax.map(mixed, jnp.asarray(SHARPNESS))
+    best = jnp.nanargmax(value)
+    sharpness = jnp.broadcast_to(jnp.asarray(SHARPNESS)[best], params["sharpness"].shape)
+    return {**params, "sharpness": sharpness, "share": shares[best]}
+
+
+def _objective(
+    params: Any, rows: Array, data: _Data, settings: InferenceSettings, drop: mdn.Drop | None = None
+) -> Array:
     """What training maximises, per row: log q(theta | x), less the log of what the proposal makes of it."""
     x, y = data.x[rows], data.y[rows]
+    heads = mdn.forward(params, x, y.shape[-1], settings, drop)
     if data.proposals is None or data.origin is None:
-        return mdn.log_prob(params, x, y, settings)
-    heads = mdn.forward(params, x, y.shape[-1], settings)
+        return mdn.density(heads, y, settings)
     own = data.origin[rows]
     proposal = jax.tree.map(lambda leaf: leaf[own], data.proposals)
     return mdn.density(heads, y, settings) - mdn.log_tilt(heads, proposal, settings)
@@ -322,7 +355,7 @@ def _standardise(x: Array, mean: Array, rate: Array, clip: float) -> tuple[Array
 def _held_out_gain(state: FitState, data: _Data) -> Array:
     """Mean log density of y of the ensemble's mixture over the held-out rows."""
     value = jax.vmap(lambda params: _objective(params, data.held, data, state.settings))(state.params)
-    value = jax.nn.logsumexp(value, axis=0) - np.float32(np.log(state.settings.ensemble))
+    value = jax.nn.logsumexp(value + state.params["share"][:, None], axis=0)
     return jnp.sum(jnp.where(data.mask > 0, value, 0.0)) / jnp.sum(data.mask)
 
 

@@ -22,6 +22,7 @@ from bayessim_mjx.inference.settings import InferenceSettings
 from bayessim_mjx.triangular import inverse_lower, lower_factor, product
 
 Params = dict[str, Any]
+Drop = tuple[Array, Array]  # key, rate
 RIDGE_LIMIT = 1024  # features up to which linear_start is worth its cost
 RIDGE = 1e-3  # of the features' variance
 WEAK = 0.05  # smallest precision beyond the prior's that linear_start gives to a component of the probit chart
@@ -29,7 +30,7 @@ MULTIPLES = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0)  # of the median distance: bandwid
 CUT_POINTS = 16  # quasi-Monte-Carlo points of a component's mass inside the box, in training
 AT_ONCE = 1024  # trajectories embedded at once
 LEAST_INSIDE = float(np.log(0.1))  # log mass inside the box that training reckons with at least
-FIXED = ("omega", "rate")  # of the parameters, those that are not trained
+FIXED = ("omega", "rate", "sharpness", "share")  # of the parameters, those that are not trained by gradients
 LOG_2PI = float(np.log(2 * np.pi))
 
 
@@ -78,6 +79,9 @@ def init(key: Array, settings: InferenceSettings, dim_x: int, d: int) -> Params:
     k = settings.components
     biases = layers[-1]["b"].at[k : k + k * d].set(0.7 * jax.random.normal(keys[-1], (k * d,)))
     layers[-1] = {**layers[-1], "b": biases}
+    # set by held-out rows: factor on all precisions' square roots, log weight in the ensemble
+    share = jnp.asarray(-np.log(settings.ensemble), jnp.float32)
+    more = {**more, "sharpness": jnp.ones(()), "share": share}
     return {"layers": layers, "skip": jnp.zeros((dim_x, sizes[-1])), **more}
 
 
@@ -89,12 +93,17 @@ def embedded(params: Params, x: Array, settings: InferenceSettings) -> Array:
     return apply(x) if x.shape[0] <= AT_ONCE else jax.lax.map(apply, x, batch_size=AT_ONCE)
 
 
-def hidden(params: Params, x: Array) -> Array:
-    """What the last layer sees: hidden units or Fourier features, [n, D] -> [n, H]."""
+def hidden(params: Params, x: Array, drop: Drop | None = None) -> Array:
+    """What the last layer sees: hidden units (some dropped in training) or Fourier features, [n, D] -> [n, H]."""
     if "omega" in params:
         return features.fourier(x, params["omega"], params["rate"])
     for layer in params["layers"][:-1]:
         x = jax.nn.silu(x @ layer["w"] + layer["b"][None, :])
+        if drop is not None:
+            key, rate = drop
+            key, key_layer = jax.random.split(key)
+            kept = jax.random.bits(key_layer, x.shape, jnp.uint8) >= (256 * rate).astype(jnp.uint8)
+            x, drop = jnp.where(kept, x / (1 - rate), 0.0), (key, rate)
     return x
 
 
@@ -172,11 +181,13 @@ def _beyond_prior(mean: Array, slope: Array, cov: Array) -> tuple[Array, Array, 
     return stretch @ mean, product(slope, stretch), product(vectors / extra[None, :], vectors.T)
 
 
-def forward(params: Params, x: Array, d: int, settings: InferenceSettings) -> tuple[Array, Array, Array]:
+def forward(
+    params: Params, x: Array, d: int, settings: InferenceSettings, drop: Drop | None = None
+) -> tuple[Array, Array, Array]:
     """Standardised x [n, D] -> log weights [n, K], centres mu [n, K, d], factors A [n, K, d, d] in y coordinates."""
     n, k = x.shape[0], settings.components
     last, x = params["layers"][-1], embedded(params, x, settings)
-    out = hidden(params, x) @ last["w"] + last["b"][None, :] + x @ params["skip"]
+    out = hidden(params, x, drop) @ last["w"] + last["b"][None, :] + x @ params["skip"]
     logits, means, diagonal, lower = jnp.split(out, np.cumsum([k, k * d, k * d]), axis=1)
     # A_ii = exp(8 tanh(r / 8)): between exp(-8) and exp(8), slope 1 at r = 0
     diagonal = jnp.exp(8 * jnp.tanh(diagonal.reshape(n, k, d) / 8))
@@ -184,7 +195,7 @@ def forward(params: Params, x: Array, d: int, settings: InferenceSettings) -> tu
     if settings.fullCovariance and d > 1:
         rows, columns = np.tril_indices(d, -1)
         factors = factors.at[:, :, rows, columns].set(lower.reshape(n, k, -1))
-    return jax.nn.log_softmax(logits), means.reshape(n, k, d), factors
+    return jax.nn.log_softmax(logits), means.reshape(n, k, d), factors * params["sharpness"]
 
 
 def log_normaliser(means: Array, factors: Array, settings: InferenceSettings) -> Array:

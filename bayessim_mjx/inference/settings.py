@@ -30,8 +30,8 @@ class InferenceSettings:
     hiddenLayers: tuple[int, ...] = (128, 128)
     lr: float = 2e-3  # peak of the cosine schedule
     weight_decay: float = 1e-4
-    batch: int = 256
-    epochs: int = 100  # passes over the capacity, within [min_steps, max_steps]
+    batch: int = 64  # a quarter of the rows in four times the steps: more per second, measured on noise-free data
+    epochs: int = 40  # passes over the capacity, within [min_steps, max_steps]
     min_steps: int = 1000
     max_steps: int = 4000
     grad_clip: float = 5.0  # global norm
@@ -40,7 +40,10 @@ class InferenceSettings:
     clip: float = 10.0  # standardised inputs are clipped to +-clip
     defensive: float = 1e-4  # prior mass in every posterior: one that is wildly wrong cannot veto the others
     coordinates: str = "plain"
-    ensemble: int = 1  # networks trained side by side; their posterior has ensemble * components Gaussians
+    # networks side by side, weighted by held-out score; their posterior has ensemble * components Gaussians. A single
+    # one is over-confident at a few thousand simulations: its 50 / 80 / 95 % regions held .31 / .58 / .82 of truths
+    ensemble: int = 4
+    dropout: float = 0.1  # of the last member, the first has none: few rows need it, many noise-free ones suffer
     fourierFeatures: int = 256  # frequencies of MDRFF: twice as many features
     embedding: Embedding | None = None  # trained with the network, which then takes in rows of summary_learned
 
@@ -53,8 +56,9 @@ class InferenceSettings:
                 raise ValueError(f"{name} = {getattr(self, name)!r} must be positive")
         if not 0 < self.validation < 1:
             raise ValueError(f"validation = {self.validation!r} must lie between 0 and 1")
-        if not 0 <= self.defensive < 1:
-            raise ValueError(f"defensive = {self.defensive!r} must lie in [0, 1)")
+        for name in ("defensive", "dropout"):
+            if not 0 <= getattr(self, name) < 1:
+                raise ValueError(f"{name} = {getattr(self, name)!r} must lie in [0, 1)")
         if any(width < 1 for width in self.hiddenLayers):
             raise ValueError(f"hiddenLayers = {self.hiddenLayers!r}: widths must be positive")
         if self.coordinates not in COORDINATES:

@@ -13,7 +13,9 @@ from bayessim_mjx.parameters import Parameter, ParameterSpace
 
 FLAT = ParameterSpace([Parameter("a", 0.0, -1.0, 1.0), Parameter("b", 0.0, -1.0, 1.0)])
 NOISE = 0.3
-SMALL = InferenceSettings(components=2, hiddenLayers=(16,), min_steps=300, max_steps=300, fourierFeatures=32)
+SMALL = InferenceSettings(
+    components=2, hiddenLayers=(16,), min_steps=300, max_steps=300, fourierFeatures=32, ensemble=1
+)
 
 
 def key(seed: int = 0) -> jax.Array:

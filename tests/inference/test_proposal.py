@@ -15,7 +15,9 @@ from bayessim_mjx.parameters import Parameter, ParameterSpace
 NORMAL = ParameterSpace([Parameter(n, 0.0, -3.0, 3.0, prior="gaussian", mean=0.0, sd=0.5) for n in ("a", "b")])
 FLAT = ParameterSpace([Parameter("a", 0.0, -1.0, 1.0), Parameter("b", 0.0, -1.0, 1.0)])
 NOISE = 0.1
-SETTINGS = InferenceSettings(components=2, hiddenLayers=(16,), min_steps=300, max_steps=300, coordinates="probit")
+SETTINGS = InferenceSettings(
+    components=2, hiddenLayers=(16,), min_steps=300, max_steps=300, coordinates="probit", ensemble=1
+)
 
 
 def key(seed: int = 0) -> jax.Array:
