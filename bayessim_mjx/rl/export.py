@@ -1,7 +1,8 @@
 """A policy as an ONNX file for other machines: normaliser and limits inside, any batch size, and what its numbers mean.
 
 The graph: observation [batch, S] -> action [batch, A] in [-1, 1], the deterministic one, and command [batch, nu] in the
-actuators' units where the task scales each action by a number of its own. Metadata are texts, lists in JSON.
+actuators' units where the task scales each action by a number of its own. A policy with a memory takes it, [batch, H],
+zeros at the start, and gives memory_next. Metadata are texts, lists in JSON.
 """
 
 from __future__ import annotations
@@ -73,21 +74,26 @@ class Graph:
                 self.then(operation, other)
 
 
-def command_scale(env: Env) -> tuple[np.ndarray, np.ndarray] | None:
+def memory_size(policy: Policy) -> int:
+    """Units of its memory, 0 without."""
+    return len(policy.actor["gru"]["h"]["w"]) if "gru" in policy.actor else 0
+
+
+def command_scale(env: Env, actions: int) -> tuple[np.ndarray, np.ndarray] | None:
     """(scale [A], offset [A]) of the commands offset + scale action; None where they are not of that form."""
     command = getattr(env, "command", None)
     if command is None:
         return None
-    probes = np.random.default_rng(0).uniform(-1, 1, (16, env.action_size)).astype(np.float32)
-    offset = np.asarray(command(jnp.zeros(env.action_size)))
-    if offset.shape != (env.action_size,):
+    probes = np.random.default_rng(0).uniform(-1, 1, (16, actions)).astype(np.float32)
+    offset = np.asarray(command(jnp.zeros(actions)))
+    if offset.shape != (actions,):
         return None
-    scale = np.asarray(command(jnp.ones(env.action_size))) - offset
+    scale = np.asarray(command(jnp.ones(actions))) - offset
     commands = np.stack([np.asarray(command(jnp.asarray(action))) for action in probes])
     return (scale, offset) if np.allclose(commands, offset + scale * probes, rtol=1e-4, atol=1e-6) else None
 
 
-def _network(graph: Graph, policy: Policy, env: Env) -> None:
+def _network(graph: Graph, policy: Policy, env: Env, size: int) -> None:
     """Observation -> mean of the raw action."""
     limit = getattr(env, "observation_clip", {}).get(getattr(env, "variant", ""))
     if limit is not None:  # as the task does before the policy sees it
@@ -96,38 +102,66 @@ def _network(graph: Graph, policy: Policy, env: Env) -> None:
         graph.then("Sub", policy.normalizer.mean)
         graph.then("Div", jnp.sqrt(policy.normalizer.var) + normalise.EPSILON)
         graph.then("Clip", -normalise.LIMIT, normalise.LIMIT)
+    if "gru" in policy.actor:
+        _remember(graph, jax.device_get(policy.actor["gru"]))
     *hidden, last = jax.device_get(policy.actor["layers"])
     for layer in hidden:
         graph.then("Gemm", layer["w"], layer["b"])
         graph.activate(policy.activation)
-    size = env.action_size  # a spread that depends on the state comes after the means
-    graph.then("Gemm", last["w"][:, :size], last["b"][:size])
+    graph.then("Gemm", last["w"][:, :size], last["b"][:size])  # a spread by state comes after the means
+
+
+def _remember(graph: Graph, gru: Any) -> None:
+    """Observation -> memory_next, as `recurrent.cell` does."""
+    x, units = graph.value, len(gru["h"]["w"])
+
+    def gate(value: str, layer: Any, number: int) -> str:
+        part = slice(number * units, (number + 1) * units)
+        graph.value = value
+        return graph.then("Gemm", layer["w"][:, part], layer["b"][part])
+
+    reset, update = (_sigmoid_sum(graph, gate(x, gru["x"], i), gate("memory", gru["h"], i)) for i in (0, 1))
+    candidate = gate(x, gru["x"], 2)
+    gate("memory", gru["h"], 2)
+    graph.then("Mul", reset)
+    graph.then("Add", candidate)
+    new = graph.then("Tanh")
+    graph.value = "memory"  # new + z (memory - new)
+    graph.then("Sub", new)
+    graph.then("Mul", update)
+    graph.then("Add", new, output="memory_next")
+
+
+def _sigmoid_sum(graph: Graph, a: str, b: str) -> str:
+    graph.value = a
+    graph.then("Add", b)
+    return graph.then("Sigmoid")
 
 
 def onnx_model(policy: Policy, env: Env, notes: Mapping[str, Any] | None = None) -> Any:
     """The `onnx.ModelProto` of a policy of `env`; `notes`: more metadata. UserError where onnx is not installed."""
-    if "gru" in policy.actor:
-        raise UserError("--export: policies with a memory (ppo.memory) cannot be exported yet")
     try:
         import onnx
         from onnx import helper
     except ImportError:
         raise UserError('--export needs the package onnx: pip install "bayessim-mjx[export]"') from None
-    graph, limit = Graph("observation"), policy.action_clip
-    _network(graph, policy, env)
+    graph, limit, actions = Graph("observation"), policy.action_clip, env.action_size - memory_size(policy)
+    _network(graph, policy, env, actions)
     if policy.squash:
         graph.then("Tanh")
         graph.then("Mul", limit)
     bound = min(1.0, limit)  # environments clip to +- 1 in any case
     graph.then("Clip", -bound, bound, output="action")
-    outputs, scaling = {"action": env.action_size}, command_scale(env)
+    outputs, scaling = {"action": actions}, command_scale(env, actions)
     if scaling is not None:
         graph.then("Mul", scaling[0])
         graph.then("Add", scaling[1], output="command")
-        outputs["command"] = env.action_size
+        outputs["command"] = actions
     value = lambda name, size: helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, ["batch", size])  # noqa: E731
-    size = env.observation_size["policy"][0]
-    ends = [value("observation", size)], [value(name, size) for name, size in outputs.items()]
+    inputs = {"observation": env.observation_size["policy"][0]}
+    if memory_size(policy):
+        inputs["memory"] = outputs["memory_next"] = memory_size(policy)
+    ends = [[value(name, size) for name, size in side.items()] for side in (inputs, outputs)]
     model = helper.make_model(
         helper.make_graph(graph.nodes, "policy", *ends, initializer=graph.constants),
         opset_imports=[helper.make_opsetid("", OPSET)],
@@ -142,8 +176,7 @@ def onnx_model(policy: Policy, env: Env, notes: Mapping[str, Any] | None = None)
 
 def metadata(policy: Policy, env: Env) -> dict[str, Any]:
     """What the inputs and outputs are, in their order, and golden pairs of observations and actions."""
-    scaling, golden = command_scale(env), golden_observations(policy)
-    action = jnp.clip(policy.act(None, golden), -1.0, 1.0)
+    scaling, golden = command_scale(env, env.action_size - memory_size(policy)), golden_inputs(policy)
     facts = {
         "task": env.name,
         "observation_names": list(getattr(env, "observation_names", ())),
@@ -152,39 +185,48 @@ def metadata(policy: Policy, env: Env) -> dict[str, Any]:
         "control_dt": env.dt,
         "action_clip": policy.action_clip,
         "versions": {name: _version(name) for name in PACKAGES},
-        "golden_observation": np.asarray(golden).tolist(),
-        "golden_action": np.asarray(action).tolist(),
+        "golden_action": np.asarray(answer(policy, golden)).tolist(),
+        **{f"golden_{name}": np.asarray(x).tolist() for name, x in golden.items()},
     }
     if scaling is not None:
         facts |= {"action_scale": scaling[0].tolist(), "action_offset": scaling[1].tolist()}
     return facts
 
 
-def golden_observations(policy: Policy, count: int = GOLDEN) -> jax.Array:
-    """Observations [count, S] spread like those of the training, and some far outside."""
-    noise = jax.random.normal(jax.random.PRNGKey(0), (count, policy.normalizer.mean.shape[0]))
+def golden_inputs(policy: Policy, count: int = GOLDEN) -> dict[str, jax.Array]:
+    """Inputs [count, ...]: observations spread like those of the training, some far outside; and memories."""
+    key, memory_key = jax.random.split(jax.random.PRNGKey(0))
+    noise = jax.random.normal(key, (count, policy.normalizer.mean.shape[0]))
     factor = jnp.where(jnp.arange(count) % 4 == 3, 20.0, 1.0)[:, None]
-    return policy.normalizer.mean + factor * noise * jnp.sqrt(policy.normalizer.var)
+    inputs = {"observation": policy.normalizer.mean + factor * noise * jnp.sqrt(policy.normalizer.var)}
+    size = memory_size(policy)
+    return inputs | ({"memory": jax.random.uniform(memory_key, (count, size), minval=-1)} if size else {})
 
 
-def difference(path: Path, observation: Any, action: Any) -> float | None:
-    """Largest difference between the file's actions and `action` [N, A] at `observation`; None without onnxruntime."""
+def answer(policy: Policy, inputs: Mapping[str, Any]) -> jax.Array:
+    """The deterministic actions [N, A] in [-1, 1] at these inputs."""
+    acted = policy.act(None, {"policy": inputs["observation"]} | {k: inputs[k] for k in inputs if k == "memory"})
+    return jnp.clip(acted[:, : acted.shape[1] - memory_size(policy)], -1.0, 1.0)
+
+
+def difference(path: Path, inputs: Mapping[str, Any], action: Any) -> float | None:
+    """Largest difference between the file's actions and `action` [N, A] at these inputs; None without onnxruntime."""
     try:
         import onnxruntime
     except ImportError:
         return None
     session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
-    (answer,) = session.run(["action"], {"observation": np.asarray(observation, np.float32)})
-    return float(np.abs(answer - np.asarray(action)).max())
+    (answers,) = session.run(["action"], {name: np.asarray(x, np.float32) for name, x in inputs.items()})
+    return float(np.abs(answers - np.asarray(action)).max())
 
 
 def write(path: Path, policy: Policy, env: Env, notes: Mapping[str, Any] | None = None) -> float | None:
-    """Write the file; the largest difference to the policy at golden observations, None without onnxruntime."""
+    """Write the file; the largest difference to the policy at golden inputs, None without onnxruntime."""
     data = onnx_model(policy, env, notes).SerializeToString()
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(data)
-    observation = golden_observations(policy)
-    return difference(path, observation, jnp.clip(policy.act(None, observation), -1.0, 1.0))
+    inputs = golden_inputs(policy)
+    return difference(path, inputs, answer(policy, inputs))
 
 
 def _names(model: mujoco.MjModel, kind: mujoco.mjtObj, count: int) -> Sequence[str]:

@@ -9,7 +9,7 @@ import pytest
 
 from bayessim_mjx import registry
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.rl import export, networks, normalise
+from bayessim_mjx.rl import export, networks, normalise, recurrent
 from bayessim_mjx.rl.networks import Policy
 
 pytest.importorskip("onnx", reason="the extra [export] is not installed")
@@ -57,6 +57,26 @@ def test_every_kind_of_policy_answers_alike_in_any_batch(env, kind, tmp_path):
     assert np.std(action) > 0.05 and np.abs(action).max() <= min(1.0, p.action_clip) + 1e-6
 
 
+def test_a_memory_goes_in_and_comes_out(env, tmp_path):
+    """Three steps from zeros: the file's actions and memories are those of the policy."""
+    params = networks.init(jax.random.PRNGKey(0), 3, 3, 1, (8,), (8,), 1.0, memory=4)
+    actor = {**params["actor"], "layers": jax.tree.map(lambda x: 9 * x, params["actor"]["layers"])}
+    p, remembering = Policy(actor, normalise.init(3)), recurrent.remembering(env, 4)
+    assert export.write(tmp_path / "policy.onnx", p, remembering) < 2e-6
+    session = runtime.InferenceSession(tmp_path / "policy.onnx", providers=["CPUExecutionProvider"])
+    assert [(i.name, i.shape) for i in session.get_inputs()] == [
+        ("observation", ["batch", 3]),
+        ("memory", ["batch", 4]),
+    ]
+    memory = np.zeros((2, 4), np.float32)
+    for step in range(3):
+        obs = np.asarray(jax.random.normal(jax.random.PRNGKey(step), (2, 3)))
+        expected = p.act(None, {"policy": obs, "memory": memory})
+        action, memory = session.run(["action", "memory_next"], {"observation": obs, "memory": memory})
+        np.testing.assert_allclose(np.hstack([action, memory]), expected, atol=2e-6)
+    assert np.abs(memory).max() > 0.1
+
+
 def test_the_file_says_what_its_numbers_mean(env, tmp_path):
     p = policy()
     export.write(tmp_path / "policy.onnx", p, env, {"checkpoint": "000100"})
@@ -99,11 +119,11 @@ def test_a_command_of_another_form_is_left_out():
         def command(self, action):
             return jnp.stack([action[0] + action[1], action[1]])
 
-    assert export.command_scale(Mixing()) is None
+    assert export.command_scale(Mixing(), 2) is None
     Mixing.command = lambda self, action: action**3
-    assert export.command_scale(Mixing()) is None
+    assert export.command_scale(Mixing(), 2) is None
     Mixing.command = lambda self, action: 3 * action + jnp.array([1.0, 2.0])
-    np.testing.assert_allclose(export.command_scale(Mixing()), [[3, 3], [1, 2]])
+    np.testing.assert_allclose(export.command_scale(Mixing(), 2), [[3, 3], [1, 2]])
 
 
 def test_without_the_package_the_extra_is_named(env, monkeypatch):
