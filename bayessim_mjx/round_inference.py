@@ -291,7 +291,7 @@ def reexamine(loop: Loop, state: LoopState, policy: Policy, pairs: int, seed: in
     )  # fmt: skip
     again = checks.replicated(
         jax.random.fold_in(key, 2), state.fit, held[1], lambda k, t: source.simulate(k, t, policy),
-        temperature=temperature,
+        temperature=temperature, tilt=used if b.proposal == "apt" else None,
     )  # fmt: skip
     report = dataclasses.replace(verdict[0], predictive=again)
     return checks.conclude(report, verdict[1], domain, b.distrust)

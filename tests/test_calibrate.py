@@ -43,7 +43,7 @@ def test_the_verdict_is_told_in_words_with_a_table():
     assert "posterior calibrated: its regions hold the truth as often as they say" in text
     assert "the real trajectories are like simulated ones, p = 0.4" in text
     (row,) = [line for line in text.splitlines() if line.strip().startswith("mass")]
-    assert len(row.split()) == 5
+    assert len(row.split()) == 5 and "too narrow [se]" in text
     (half,) = [line for line in text.splitlines() if line.strip().startswith("50 %")]
     share = float(half.split()[2])
     assert share == pytest.approx(50, abs=6)

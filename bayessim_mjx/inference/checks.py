@@ -19,6 +19,8 @@ from bayessim_mjx.inference.identify import flat_sentences, restore_prior
 from bayessim_mjx.inference.misspecification import Misfit
 from bayessim_mjx.inference.walls import Pile, piles
 
+CANDIDATES = 16  # draws of q for each one of q tilt / prior
+
 
 @dataclass(frozen=True)
 class Checks:
@@ -125,11 +127,21 @@ def replicated(
     pairs: int = 200,
     each: int = 10,
     temperature: float = 1.0,
+    tilt: Distribution | None = None,
 ) -> float:
-    """p-value of the posterior predictive check; simulate(key, thetas [n, d]) -> summaries [n, D] is called once."""
-    x, keys = x[:pairs], jax.random.split(key, 2)
+    """p-value of the posterior predictive check; simulate(key, thetas [n, d]) -> summaries [n, D] is called once.
+
+    `tilt`: the x were simulated at thetas from it instead of the prior, so draws are those of q tilt / prior.
+    """
+    x, keys = x[:pairs], jax.random.split(key, 3)
     posteriors = calibration.widened(conditioned(network, x), temperature)
-    draws = jax.vmap(lambda k, q: q.sample(k, each))(jax.random.split(keys[0], x.shape[0]), posteriors)
+    many = each if tilt is None else CANDIDATES * each
+    draws = jax.vmap(lambda k, q: q.sample(k, many))(jax.random.split(keys[0], x.shape[0]), posteriors)
+    if tilt is not None:
+        # the highest of log weight + Gumbel noise, `each` times: drawn by weight, without repeats
+        noisy = tilt.log_gain(draws) + jax.random.gumbel(keys[2], draws.shape[:2])
+        best = jax.lax.top_k(noisy, each)[1]
+        draws = jnp.take_along_axis(draws, best[:, :, None], axis=1)
     again = simulate(keys[1], draws.reshape(-1, draws.shape[-1]))
     return calibration.predictive(np.asarray(x), np.asarray(again).reshape(x.shape[0], each, -1))[0]
 

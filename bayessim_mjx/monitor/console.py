@@ -211,7 +211,7 @@ class Console:
         style = box.SIMPLE_HEAD if self._unicode else box.ASCII
         table = Table(title=title, box=style, title_justify="left")
         for i, name in enumerate(header):
-            table.add_column(name, justify="right" if i else "left", overflow="fold")
+            table.add_column(escape(name), justify="right" if i else "left", overflow="fold")
         for row in rows:
             table.add_row(*[escape(self._plain(cell)) for cell in row])
         self._rich.print(table, soft_wrap=False)
