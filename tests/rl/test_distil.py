@@ -72,6 +72,8 @@ def test_teacher_and_critic_stay_and_ppo_goes_on_from_the_student():
     assert int(further.iteration) == 3 and np.isfinite(metrics["Loss/value"])
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_a_policy_that_sees_theta_is_a_teacher():
     """Reward -(a - theta / 8)^2 can only be had by who sees theta."""
 

@@ -68,7 +68,7 @@ def test_sequences_are_single_steps_that_begin_anew_where_an_episode_does():
     np.testing.assert_allclose(recurrent.features(gru, forged), expected, atol=1e-6)
 
 
-@pytest.mark.parametrize("shared", [True, False])
+@pytest.mark.parametrize("shared", [True, pytest.param(False, marks=[pytest.mark.slow, pytest.mark.ci])])
 def test_the_first_minibatch_sees_an_unchanged_policy(shared):
     """Whatever the memories were, over several iterations and with ends of episodes in the middle of a sequence."""
     config = dataclasses.replace(CONFIG, num_epochs=1, num_minibatches=1, shared_trunk=shared, num_envs=16)
