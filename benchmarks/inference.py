@@ -2,7 +2,7 @@
 
     python benchmarks/inference.py --problems gaussian_linear two_moons pendulum --simulations 10000 --seeds 5
     python benchmarks/inference.py --problems two_moons coordinates=truncated ensemble=5    # any InferenceSettings
-    python benchmarks/inference.py --problems two_moons --peers mdn maf nsf                 # sbi, where it is installed
+    python benchmarks/inference.py --problems two_moons --peers mdn maf nsf --sbi ENV/lib/python3.11/site-packages
 
 One row per problem, model and seed, as JSON. C2ST is the mean over three observations (0.5 = exact).
 """
@@ -13,8 +13,10 @@ import argparse
 import ast
 import importlib.util
 import json
+import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -23,9 +25,9 @@ import numpy as np
 from inference_c2st import c2st
 from inference_problems import PROBLEMS, Problem
 
-from bayessim_mjx.inference import InferenceSettings, condition, fit, init
+from bayessim_mjx.inference import InferenceSettings, calibration, condition, fit, init
 
-OBSERVATIONS, HELD_OUT = 3, 300
+OBSERVATIONS, HELD_OUT = 3, 1000
 
 
 def ours(problem: Problem, seed: int, thetas: Any, x: Any, options: dict) -> tuple[dict, Callable, Callable | None]:
@@ -52,12 +54,8 @@ def ours(problem: Problem, seed: int, thetas: Any, x: Any, options: dict) -> tup
         return np.asarray(condition(state, jnp.asarray(x)[None]).split()[0].sample(jax.random.PRNGKey(9), n))
 
     def scores(thetas: Any, x: Any) -> tuple[np.ndarray, np.ndarray]:
-        def one(x: Any, theta: Any) -> tuple[Any, Any]:
-            q = jax.tree.map(lambda leaf: leaf[0], condition(state, x[None]))
-            return q.log_prob(theta), q.credible_level(theta)
-
-        density, level = jax.lax.map(lambda row: one(*row), (x, thetas))
-        return np.asarray(density), np.asarray(level)
+        found = calibration.ranks(jax.random.PRNGKey(3), condition(state, x), thetas)
+        return np.asarray(found.gain + jax.vmap(problem.space.log_prior)(thetas)), np.asarray(found.level)
 
     return row, sample, scores
 
@@ -89,14 +87,12 @@ def measure(problem: Problem, seed: int, simulations: int, samples: int, model: 
     """One row: fit `model` and compare it with the exact posterior."""
     thetas, x = problem.pairs(jax.random.PRNGKey(1000 + seed), simulations)
     row, sample, scores = model(problem, seed, thetas, x)
-    _, observed = problem.pairs(jax.random.PRNGKey(7), OBSERVATIONS)
-    rng = np.random.default_rng(seed)
-    values = []
-    for x_o in np.asarray(observed):
-        exact = problem.exact(rng, x_o, samples)
-        values.append(c2st(exact, sample(x_o, samples), seed))
-    row = {"problem": problem.name, "seed": seed, "simulations": simulations, **row, "c2st": round(np.mean(values), 4)}
-    row["each"] = [round(v, 3) for v in values]
+    row = {"problem": problem.name, "seed": seed, "simulations": simulations, **row}
+    if samples:
+        _, observed = problem.pairs(jax.random.PRNGKey(7), OBSERVATIONS)
+        rng = np.random.default_rng(seed)
+        values = [c2st(problem.exact(rng, x_o, samples), sample(x_o, samples), seed) for x_o in np.asarray(observed)]
+        row |= {"c2st": round(float(np.mean(values)), 4), "each": [round(v, 3) for v in values]}
     if scores is not None:
         density, level = scores(*problem.pairs(jax.random.PRNGKey(8), HELD_OUT))
         row["log q"] = round(float(density.mean()), 3)
@@ -116,15 +112,21 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--problems", nargs="+", default=list(PROBLEMS), choices=list(PROBLEMS))
     parser.add_argument("--simulations", type=int, default=10_000)
-    parser.add_argument("--samples", type=int, default=5000, help="of each posterior, for C2ST")
+    parser.add_argument("--samples", type=int, default=5000, help="of each posterior, for C2ST; 0: no C2ST")
+    parser.add_argument("--defaults", action="store_true", help="not the settings that suit the problem")
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--peers", nargs="*", default=[], choices=["mdn", "maf", "nsf"])
+    parser.add_argument("--sbi", help="folder that sbi and torch are installed in, if not beside this library")
     args, rest = parser.parse_known_args()
+    if args.sbi:
+        sys.path.append(args.sbi)
     if args.peers and importlib.util.find_spec("sbi") is None:
         parser.error("--peers needs sbi: pip install sbi")
     options = dict(option(text) for text in rest)
     for name in args.problems:
         problem = PROBLEMS[name]()
+        if args.defaults:
+            problem = replace(problem, settings={})
         models: list[Callable] = [lambda *a: ours(*a, options)]
         models += [lambda *a, e=e: peer(*a, e) for e in args.peers]
         for seed in range(args.seeds):
