@@ -22,7 +22,7 @@ SIGNIFICANT = 3.0  # standard errors of the mean held-out gain
 RELEVANT = 0.01  # nats
 DEFENSIVE = 0.05  # share of the prior mixed in before scoring
 CONTRACTED = 0.05  # share of the prior's variance that has to go before a parameter counts as narrowed
-# centre and sd of a Gaussian that is the prior. plain: its density varies by 3e-4 inside the cube. logit: to 0.02 in
+# centre and sd of a Gaussian that is the prior. plain: its density varies by 3e-4 inside the cube. logit: nearly in
 # probability, and exactly N(0, 1) in mean and variance where a product takes it over to the probit chart
 FLAT = {"plain": (0.5, 20.0), "probit": (0.0, 1.0), "logit": (0.0, 1.7758)}
 
