@@ -161,9 +161,9 @@ def onnx_model(policy: Policy, env: Env, notes: Mapping[str, Any] | None = None)
     inputs = {"observation": env.observation_size["policy"][0]}
     if memory_size(policy):
         inputs["memory"] = outputs["memory_next"] = memory_size(policy)
-    ends = [[value(name, size) for name, size in side.items()] for side in (inputs, outputs)]
+    begins, ends = ([value(name, size) for name, size in side.items()] for side in (inputs, outputs))
     model = helper.make_model(
-        helper.make_graph(graph.nodes, "policy", *ends, initializer=graph.constants),
+        helper.make_graph(graph.nodes, "policy", begins, ends, initializer=graph.constants),
         opset_imports=[helper.make_opsetid("", OPSET)],
         ir_version=IR_VERSION,
         producer_name="bayessim_mjx",
