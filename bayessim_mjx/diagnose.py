@@ -115,6 +115,7 @@ def _diagnosis(args: argparse.Namespace, robot: "Robot", notes: list[str], say: 
         return assemble.insufficient(str(reason), notes)
     found.setup.warnings[:0] = notes
     result = assemble.diagnosis_of(found, say)
+    result.save(Path(args.out))  # maps and the next experiment take time; killed there, the verdict stays
     return assemble.with_more(result, found, Path(args.out), say)
 
 

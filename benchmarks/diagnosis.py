@@ -163,7 +163,7 @@ def isolate(args: argparse.Namespace) -> None:
 def cases(folder: Path) -> list[Path]:
     """By seed, then by name: whenever it is stopped, all systems and kinds have been tried equally often."""
     found = (p.parent for p in folder.glob("*/truth.json"))
-    return sorted(found, key=lambda f: (int(f.name.rpartition("_s")[2]), f.name))
+    return sorted(found, key=lambda f: (f.name.rpartition("_s")[2].zfill(9), f.name))
 
 
 def main() -> None:

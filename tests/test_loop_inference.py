@@ -62,7 +62,7 @@ def assert_same_structure(a, b):
 
 
 CASES = [
-    pytest.param("probit", "apt", "2", id="probit-apt-ensemble"),
+    pytest.param("probit", "apt", "2", id="probit-apt-ensemble", marks=[pytest.mark.slow, pytest.mark.ci]),
     pytest.param("plain", "truncated", "1", id="plain-truncated", marks=pytest.mark.slow),
     pytest.param("logit", "prior", "2", id="logit-ensemble", marks=pytest.mark.slow),
     pytest.param("truncated", "prior", "1", id="truncated", marks=pytest.mark.slow),

@@ -38,7 +38,8 @@ def folder(tmp_path, monkeypatch):
 
 
 def run(folder: Path, **more) -> None:
-    given = {"leave_out_family": False, "baselines": False, "workers": 2, "timeout": 60.0, "more": []}
+    given = {"leave_out_family": False, "baselines": False, "verdict_only": False, "workers": 2, "timeout": 60.0}
+    given["more"] = []
     command.diagnose(argparse.Namespace(cases=folder, **(given | more)))
 
 
@@ -78,3 +79,16 @@ def test_the_family_of_singles_only_is_left_out_of_the_library(folder):
     library = arguments[-1].split(",")
     assert arguments[-2] == "--effects" and "cogging" not in library and len(library) == 23
     assert not (folder / "two" / "left_out").exists()
+
+
+def test_pictures_can_be_left_out(folder):
+    run(folder, verdict_only=True)
+    assert "--verdict-only" in told(folder / "one")
+
+
+def test_systems_and_kinds_take_turns(tmp_path):
+    for name in ("arm_single_s10", "arm_single_s9", "cart_null_s9", "leg_null_s100"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "truth.json").write_text("{}")
+    names = [folder.name for folder in command.cases(tmp_path)]
+    assert names == ["arm_single_s9", "cart_null_s9", "arm_single_s10", "leg_null_s100"]
