@@ -23,7 +23,7 @@ class Settings:
 
     Attributes:
         relevance: an effect must close this share of the gap above the noise; more: a further effect, of what the
-            others leave; drop: and lower the cost by this share.
+            others leave; least: and of the whole gap; drop: and lower the cost by this share.
         evidence: and gain this many nats plus the logarithm of the number of candidates (family-wise).
         t: and improve windows of all conditions: mean over clustered standard error.
         floor: a model within this factor of the noise (rms) is not improved further.
@@ -36,6 +36,7 @@ class Settings:
 
     relevance: float = 0.05
     more: float = 0.15
+    least: float = 0.003
     drop: float = 0.03
     evidence: float = 5.0
     t: float = 2.0
@@ -80,6 +81,9 @@ class Race:
         many = np.log(max(len(self.candidates), 2)) * max(1, len(new.effects) - len(old.effects))
         added = [e for e in new.effects if e not in old.effects]
         if c.share < 0.3 and not all(self.distinct(new, e) for e in added):
+            return False
+        above = self.base.total - self.noise * len(self.base.cost)
+        if old.effects and old.total - new.total < s.least * above:
             return False
         relevance = s.more if old.effects else s.relevance
         if not (c.share > relevance and c.drop > s.drop and c.evidence > s.evidence + many):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -24,7 +25,7 @@ from bayessim_mjx.diagnosis.search import (
 )
 
 NEAR = 1.2  # noise variances: models that leave less than that explain the same
-SAME = 0.005  # of the gap
+SAME = 0.02  # of what an effect closes
 MILD = 10.0  # nats: below, held-out evidence between two models is called a tie
 
 
@@ -63,13 +64,20 @@ def rule(race: Race, say: Progress) -> Ruling:
     ruling = Ruling(winner)
     for effect in winner.effects:
         ruling.rivals[effect.label] = [*_in_parts(race, winner, effect, say), *_rivals(race, winner, effect, say)]
-    least = race.closure(winner) - SAME
-    fewer = [r.model for rivals in ruling.rivals.values() for r in rivals if not r.contains and r.closure >= least]
-    fewer = [m for m in fewer if m.size < winner.size and race.at_noise(m, NEAR) >= race.at_noise(winner, NEAR)]
+    fewer = [m for e in winner.effects for m in _fewer(race, winner, e, ruling.rivals[e.label], say)]
     if not fewer:
         return ruling
     race.winner = min(fewer, key=lambda m: (m.size, m.total))
     return rule(race, say)
+
+
+def _fewer(race: Race, winner: Model, effect: Candidate, rivals: Sequence[Rival], say: Progress) -> list[Model]:
+    """Rivals with fewer numbers that close as much of what the other effects leave."""
+    rest = without(race, winner, effect, say).total
+    least = (1.0 - SAME) * (rest - winner.total)
+    models = [r.model for r in rivals if not r.contains and r.model.size < winner.size]
+    models = [m for m in models if rest - m.total >= least]
+    return [m for m in models if race.at_noise(m, NEAR) >= race.at_noise(winner, NEAR)]
 
 
 def _in_parts(race: Race, winner: Model, effect: Candidate, say: Progress) -> list[Rival]:
