@@ -68,16 +68,17 @@ def _corrected(body: robot.Robot, dt: float, found: storage.Correction, source: 
         raise UserError(f"{source} does not fit --task {body.name}: {error}") from None
 
 
-def surrogate(config: Config, file: str | Path) -> Any:
+def surrogate(config: Config, file: str | Path, body: robot.Robot | None = None) -> Any:
     """The task on a stand-in for the real system.
 
     Args:
         file: its truth as an effects.yaml, hidden values as nominal ones.
+        body: the task's robot, where it is there already.
 
     Raises:
         UserError: the file is wrong or does not fit the task.
     """
-    body = robot.of_task(nominal_task(config))
+    body = body or robot.of_task(nominal_task(config))
     physics = _corrected(body, float(body.control_dt or 0.0), storage.read(file), f"--surrogate {file}")
     return _on(config, physics)
 
@@ -210,7 +211,7 @@ def make(args: argparse.Namespace, config: Config) -> Study:
     nominal = _on(config, body.physics(dt, (), closed_loop.wide(body.space)))
     real = logs = None
     if args.surrogate:
-        real = surrogate(config, args.surrogate)
+        real = surrogate(config, args.surrogate, body)
     else:
         logs = read_logs(args.real, body.mj_model)
     simulators = Simulators(nominal, _on(config, physics), real)

@@ -145,7 +145,7 @@ def _collect(
         b.proposal,
         b.trainTrajs + b.checkTrajs,
     )
-    held, thetas, x, count = (thetas[b.trainTrajs :], x[b.trainTrajs :]), thetas[: b.trainTrajs], x[: b.trainTrajs], 0
+    held, thetas, x = (thetas[b.trainTrajs :], x[b.trainTrajs :]), thetas[: b.trainTrajs], x[: b.trainTrajs]
     slot = round_ % max(1, loop.capacity // b.trainTrajs)
     if loop.sequential:
         assert state.proposals is not None and state.proposal is not None
@@ -285,14 +285,14 @@ def reexamine(loop: Loop, state: LoopState, policy: Policy, pairs: int, seed: in
     thetas, x = _simulate(source, jax.random.fold_in(key, 1), policy, _proposal(loop, state), b.proposal, known + pairs)
     held = thetas[known:], x[known:]
     rows = slice((done - 1) * b.realTrajs if source.policy_dependent else 0, done * b.realTrajs)
+    judged: dict[str, Any] = {"temperature": temperature, "tilt": used if b.proposal == "apt" else None}
     verdict = checks.examine(
         key, state.fit, (thetas[:known], x[:known], known), held, state.real_features, rows,
-        temperature=temperature, tilt=used if b.proposal == "apt" else None, names=loop.feature_names,
+        names=loop.feature_names, **judged,
     )  # fmt: skip
     again = checks.replicated(
-        jax.random.fold_in(key, 2), state.fit, held[1], lambda k, t: source.simulate(k, t, policy),
-        temperature=temperature, tilt=used if b.proposal == "apt" else None,
-    )  # fmt: skip
+        jax.random.fold_in(key, 2), state.fit, held[1], lambda k, t: source.simulate(k, t, policy), **judged
+    )
     report = dataclasses.replace(verdict[0], predictive=again)
     return checks.conclude(report, verdict[1], domain, b.distrust)
 

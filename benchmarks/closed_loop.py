@@ -19,8 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from bayessim_mjx import checkpoints, gap_study, rl
-from bayessim_mjx.config import load
+from bayessim_mjx import checkpoints, cli, gap_study, rl
 from bayessim_mjx.diagnosis.result import load as load_diagnosis
 from bayessim_mjx.logs.log import Channels
 
@@ -115,7 +114,7 @@ def main() -> None:
     parser.add_argument("--effects", default="all", help="on offer in the diagnosis")
     parser.add_argument("more", nargs="*", help="after --: further arguments of the task's configuration")
     args = parser.parse_args()
-    config = load(args.task, overrides=_settings(args.more))
+    config = cli.config_of(cli.Parser("closed_loop", "").parse(["--task", args.task, *args.more]))
     surrogate, logs, found = truth(args.out, args.task), args.out / "logs", args.out / "diagnosis"
     row: dict = {"task": args.task, "device": str(jax.devices()[0])}
     if not logs.is_dir():
@@ -127,15 +126,6 @@ def main() -> None:
     given = ["--task", args.task, "--diagnosis", found, "--surrogate", surrogate, "--seeds", args.seeds, "--headless"]
     row["gap_loop s"] = command("gap_loop", *given, "--iterations", args.iterations, *args.more)
     print(json.dumps(row | summary(found), default=float))
-
-
-def _settings(more: list[str]) -> list[str]:
-    """`--num_envs N` as the override that it is; everything else as given."""
-    out = list(more)
-    if "--num_envs" in out:
-        at = out.index("--num_envs")
-        out[at : at + 2] = [f"env.numEnvs={out[at + 1]}"]
-    return out
 
 
 def summary(folder: Path) -> dict:
