@@ -65,22 +65,13 @@ def update(
     normalizer = state.normalizer
     if config.normalize_observations:
         normalizer = {**normalizer, "policy": normalise.update(normalizer["policy"], seen)}
-    finished = episodes.update(state.episodes, data["reward"], data["terminated"], data["truncated"])
     after = dataclasses.replace(
-        state,
-        params=params,
-        opt_state=opt_state,
-        normalizer=normalizer,
-        env_states=env_states,
-        episodes=finished,
-        key=key,
-        iteration=state.iteration + 1,
-        env_steps=state.env_steps + jnp.uint32(config.num_envs * config.num_steps),
+        ppo.moved_on(config, state, env_states, data, key), params=params, opt_state=opt_state, normalizer=normalizer
     )
     metrics: dict[str, Any] = {name: x.mean() for name, x in figures.items()} | {
         "Loss/learning_rate": rate,
         "Policy/mean_std": jnp.exp(ppo.policy_of(after).distribution(seen)[1]).mean(),
         "env_steps": after.env_steps,
-        **episodes.metrics(finished),
+        **episodes.metrics(after.episodes),
     }
     return after, metrics

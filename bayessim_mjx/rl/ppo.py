@@ -257,6 +257,18 @@ def _novelty(
     return novel, bonus, {"Loss/rnd": values}
 
 
+def moved_on(config: PPOConfig, state: TrainState, env_states: State, data: dict, key: jax.Array) -> TrainState:
+    """The state after a collection: worlds, episodes and counters; what is learnt from it is as before."""
+    return dataclasses.replace(
+        state,
+        env_states=env_states,
+        episodes=episodes.update(state.episodes, data["reward"], data["terminated"], data["truncated"]),
+        key=key,
+        iteration=state.iteration + 1,
+        env_steps=state.env_steps + jnp.uint32(config.num_envs * config.num_steps),
+    )
+
+
 def update(
     env: Env, config: PPOConfig, state: TrainState, domain: Distribution | None
 ) -> tuple[TrainState, dict[str, jax.Array]]:
@@ -273,31 +285,24 @@ def update(
     normalizer = state.normalizer
     if config.normalize_observations:  # only now: collection and update of one iteration see the same statistics
         normalizer = {g: normalise.update(m, data["observation"][g]) for g, m in normalizer.items()}
-    finished = episodes.update(state.episodes, data["reward"], data["terminated"], data["truncated"])
-    env_steps = state.env_steps + jnp.uint32(config.num_envs * config.num_steps)
+    after = dataclasses.replace(
+        moved_on(config, state, env_states, data, key),
+        params=params,
+        opt_state=opt_state,
+        normalizer=normalizer,
+        learning_rate=rate,
+        rnd=novel,
+    )
     metrics = {name: x.mean() for name, x in figures.items()} | {
         "Loss/learning_rate": rate,
         # explained variance = 1 - var(R - V) / var(R)
         "Loss/explained_variance": 1 - (batch.returns - batch.value).var() / (batch.returns.var() + 1e-8),
         "Policy/mean_std": jnp.exp(params["actor"]["log_std"] if batch.log_std is None else batch.log_std).mean(),
-        "env_steps": env_steps,
-        **episodes.metrics(finished),
+        "env_steps": after.env_steps,
+        **episodes.metrics(after.episodes),
     }
     if config.rnd is not None and novel is not None:
         metrics |= rnd.metrics(novel, metrics["Train/mean_reward"], config.rnd)
-    after = dataclasses.replace(
-        state,
-        params=params,
-        opt_state=opt_state,
-        normalizer=normalizer,
-        learning_rate=rate,
-        env_states=env_states,
-        episodes=finished,
-        key=key,
-        iteration=state.iteration + 1,
-        env_steps=env_steps,
-        rnd=novel,
-    )
     return after, metrics
 
 
