@@ -45,20 +45,45 @@ def save(path: Path, tree: Any, step: int, meta: Mapping[str, Any]) -> None:
     temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")
     shutil.rmtree(temporary, ignore_errors=True)
     temporary.mkdir(parents=True)
-    parts = jax.device_get(tree if type(tree) is dict else {"tree": tree})
+    parts = jax.device_get(_whole(tree if type(tree) is dict else {"tree": tree}))
     index = {name: _save_part(temporary / name, part) for name, part in parts.items()}
     write_json(temporary / INDEX, {"format": FORMAT, "step": int(step), "meta": dict(meta), "parts": index})
     os.rename(temporary, path)
 
 
-def _save_part(folder: Path, part: Any) -> list[dict[str, Any]]:
+def _whole(tree: Any) -> Any:
+    """The arrays that lie on devices of several processes, as host arrays; all of these processes have to save."""
+    import jax
+    from jax.experimental.multihost_utils import process_allgather
+
+    def whole(x: Any) -> Any:
+        parted = isinstance(x, jax.Array) and not x.is_fully_addressable
+        return process_allgather(x, tiled=True) if parted else x
+
+    return jax.tree.map(whole, tree)
+
+
+def _checkpointer() -> Any:
+    """Orbax, of this process alone."""
+    import jax
     import orbax.checkpoint as ocp
 
+    if jax.process_count() == 1:
+        return ocp.PyTreeCheckpointer()
+    own = jax.process_index()
+    options = ocp.options.MultiprocessingOptions(
+        primary_host=own, active_processes={own}, barrier_sync_key_prefix=f"process_{own}"
+    )
+    handler = ocp.PyTreeCheckpointHandler(multiprocessing_options=options)
+    return ocp.Checkpointer(handler, multiprocessing_options=options)
+
+
+def _save_part(folder: Path, part: Any) -> list[dict[str, Any]]:
     arrays = {name: np.asarray(leaf) for name, leaf in _leaves(part)}
     # Orbax refuses arrays without elements; their shape in the index says it all.
     stored = {f"{i:06d}": array for i, array in enumerate(arrays.values()) if array.size}
     if stored:
-        with ocp.PyTreeCheckpointer() as checkpointer:
+        with _checkpointer() as checkpointer:
             checkpointer.save(folder.absolute(), stored)
     return [_describe(name, array) for name, array in arrays.items()]
 
@@ -149,13 +174,12 @@ def _compare(where: str, saved: dict[int, dict], template: Any) -> None:
 def _restore_part(path: Path, index: dict[str, Any], name: str, template: Any) -> Any:
     import jax
     import jax.numpy as jnp
-    import orbax.checkpoint as ocp
 
     folder, saved = path / name.partition(".")[0], _saved(index, name)
     stored: dict[str, Any] = {}
     if any(0 not in leaf["shape"] for leaf in saved.values()):
         try:
-            with ocp.PyTreeCheckpointer() as checkpointer:
+            with _checkpointer() as checkpointer:
                 stored = checkpointer.restore(folder.absolute())
         except Exception as error:  # a damaged file fails in many ways inside Orbax
             raise CorruptedError(f"{folder}: damaged checkpoint: {str(error).splitlines()[0][:200]}") from None

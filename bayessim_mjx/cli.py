@@ -5,8 +5,10 @@ import contextlib
 import dataclasses
 import os
 import random
+import shutil
 import signal
 import sys
+import tempfile
 import threading
 import types
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -31,9 +33,12 @@ FLAGS: dict[str, tuple[str, Any, str]] = {
     "--logdir": ("logdir", str, "root of the run folders (logs)"),
     "--name": ("name", str, "last part of the run folder's name"),
     "--device": ("device", str, "auto, cpu, gpu, gpu:1, cuda:0"),
+    "--devices": ("devices", str, "how many devices share the worlds: a number, or all"),
     "--cache_dir": ("cache_dir", str, "compilation cache; off: none ($BAYESSIM_MJX_CACHE)"),
 }
-RESUMABLE = ("--device", "--cache_dir", "--video", "--video_length", "--video_interval", "--headless", "--resume")
+RESUMABLE = (
+    "--device", "--devices", "--cache_dir", "--video", "--video_length", "--video_interval", "--headless", "--resume",
+)  # fmt: skip
 
 
 class PlainParser(argparse.ArgumentParser):
@@ -100,12 +105,12 @@ def config_of(args: argparse.Namespace, more: Mapping[str, tuple[str, Any]] | No
 
 
 def resumed_config(args: argparse.Namespace, config: Config) -> Config:
-    """The settings of the run to resume, with what may change: device, cache and videos. Anything else is refused."""
+    """The settings of the run to resume, with what may change: devices, cache and videos. Anything else is refused."""
     fixed = [flag for flag in args.given if flag not in RESUMABLE] + list(args.overrides)
     if fixed:
         raise UserError(f"--resume goes on with the run's own settings, which {fixed[0]} would change; start a new run")
     video = {k: getattr(args, k) for k in ("video_length", "video_interval", "video") if getattr(args, k) is not None}
-    top = {k: getattr(args, k) for k in ("device", "cache_dir") if getattr(args, k) is not None}
+    top = {k: getattr(args, k) for k in ("device", "devices", "cache_dir") if getattr(args, k) is not None}
     monitor = dataclasses.replace(config.monitor, **video)
     return dataclasses.replace(config, monitor=monitor, **top)
 
@@ -236,6 +241,29 @@ def graceful() -> Iterator[Stop]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def first_writes(config: Config, run: "Run | None") -> Iterator[tuple[Config, "Run | None"]]:
+    """Of several processes the first one alone writes: the others work silently in folders that are then removed."""
+    import jax
+
+    if jax.process_count() == 1:
+        yield config, run
+        return
+    from jax.experimental.multihost_utils import sync_global_devices
+
+    from bayessim_mjx.runs import Run
+
+    with contextlib.ExitStack() as stack:
+        if jax.process_index() > 0:
+            folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="bayessim_mjx_")))
+            config = dataclasses.replace(config, logdir=str(folder))
+            run = run and Run.open(shutil.copytree(run.path, folder / "run"))
+            stack.enter_context(contextlib.redirect_stdout(stack.enter_context(open(os.devnull, "w"))))
+        sync_global_devices("the run to go on with is read")
+        yield config, run
+        sync_global_devices("the run is finished")
 
 
 @contextlib.contextmanager

@@ -1,19 +1,25 @@
-"""The device and the persistent compilation cache, chosen before jax does anything."""
+"""The devices, the processes and the persistent compilation cache, chosen before jax does anything."""
 
 import functools
 import os
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.settings import Config
 
+WORLDS = "worlds"  # the only axis of a mesh of devices
 CACHE_VARIABLE = "BAYESSIM_MJX_CACHE"
+PROCESSES = ("JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID")  # host:port, how many, which of them
 
 
 def setup_jax(config: Config) -> Any:
-    """Make the device of `config` the default and switch the compilation cache on; returns the device."""
+    """Make the device of `config` the default and switch the compilation cache on; returns the device.
+
+    Where JAX_COORDINATOR_ADDRESS is set, this process joins the others first (see `jax.distributed`).
+    """
     import jax
 
     match = re.fullmatch(r"(auto(?!:)|cpu|gpu|cuda|rocm|tpu)(?::(\d+))?", config.device)
@@ -23,6 +29,7 @@ def setup_jax(config: Config) -> Any:
     if platform == "cpu":
         jax.config.update("jax_platforms", "cpu")
     _cache(jax, config.cache_dir)
+    _join(jax)
     devices = _devices(jax, None if platform == "auto" else platform)
     if number >= len(devices):
         there = ", ".join(f"{d.platform}:{d.id}" for d in _devices(jax, None))
@@ -34,9 +41,50 @@ def setup_jax(config: Config) -> Any:
 
 def _devices(jax: Any, platform: str | None) -> list[Any]:
     try:
-        return jax.devices(platform)
+        return jax.local_devices(backend=platform)
     except RuntimeError:  # no such backend
         return []
+
+
+def _join(jax: Any) -> None:
+    """Several processes train one policy; their number and place may also come from Slurm or MPI, as jax finds them."""
+    address, *numbers = (os.environ.get(name) for name in PROCESSES)
+    if not address or jax.distributed.is_initialized():
+        return
+    for name, number in zip(PROCESSES[1:], numbers, strict=True):
+        if number is not None and not number.isdecimal():
+            raise UserError(f"{name} = {number!r}: expected a whole number")
+    size, place = (None if number is None else int(number) for number in numbers)
+    try:
+        jax.distributed.initialize(address, size, place)
+    except (ValueError, RuntimeError) as error:
+        raise UserError(f"JAX_COORDINATOR_ADDRESS = {address!r}: cannot join the other processes: {error}") from None
+
+
+def mesh(config: Config) -> Any:
+    """The devices that share the worlds, by `config.devices`, as `rl.init` takes them; None: one. After `setup_jax`."""
+    import jax
+
+    platform, _, number = config.device.partition(":")
+    there = jax.devices(None if platform == "auto" else platform)
+    if config.devices != "all" and not config.devices.isdecimal():
+        raise UserError(f"devices = {config.devices!r}: expected all, or how many")
+    count = len(there) if config.devices == "all" else int(config.devices)
+    if not 1 <= count <= len(there):
+        raise UserError(f"devices = {count}: there are {len(there)} ({there[0].platform})")
+    if jax.process_count() > 1 and count < len(there):
+        raise UserError(f"devices = {count}: {jax.process_count()} processes share all {len(there)}; set devices=all")
+    if count > 1 and number:
+        raise UserError(f"devices = {count} and device = {config.device!r}: one device is chosen, or several are used")
+    return mesh_of(there[:count])
+
+
+def mesh_of(devices: Sequence[Any]) -> Any:
+    """The mesh of these devices; None for one."""
+    import numpy as np
+    from jax.sharding import Mesh
+
+    return Mesh(np.array(devices), (WORLDS,)) if len(devices) > 1 else None
 
 
 def _cache(jax: Any, folder: str | None) -> None:

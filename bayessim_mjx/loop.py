@@ -19,6 +19,7 @@ import numpy as np
 from bayessim_mjx import rl
 from bayessim_mjx.collection import Recorded, domain_or_prior, make_source
 from bayessim_mjx.config import Config
+from bayessim_mjx.device import mesh
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.env import Env
 from bayessim_mjx.errors import UserError
@@ -86,7 +87,7 @@ def init(loop: Loop) -> LoopState:
 
 
 def _new_policy(loop: Loop, round_: int, domain: Distribution | None) -> TrainState:
-    return rl.init(loop.env, loop.config.ppo, loop.key(round_, "init"), domain)
+    return rl.init(loop.env, loop.config.ppo, loop.key(round_, "init"), domain, mesh(loop.config))
 
 
 def training_target(loop: Loop, round_: int) -> int:

@@ -63,13 +63,10 @@ def _prepare(args: argparse.Namespace) -> tuple[Config, Any]:
     return cli.pin_policy(cli.config_of(args, more)), None
 
 
-def _run(config: Config, run: Any, command: Sequence[str], console: Any) -> int:
+def _run(config: Config, run: Any, device: Any, command: Sequence[str], console: Any) -> int:
     from bayessim_mjx import loop, registry, runs
     from bayessim_mjx.monitor.opening import opening
 
-    if config.randomization.get("randomize") is False and config.bayessim.modelClass is not None:
-        raise UserError("task.randomize = False: there is nothing to infer; use bayessim_mjx.train for PPO alone")
-    device = setup_jax(config)
     env = registry.make(config.task, config=config)
     console.start(opening(config, env, device))
     console.phase("setting up")
@@ -148,10 +145,13 @@ def _adapt(argv: Sequence[str] | None) -> int:
     if args.list_tasks:
         return cli.list_tasks()
     config, run = _prepare(args)
+    if config.randomization.get("randomize") is False and config.bayessim.modelClass is not None:
+        raise UserError("task.randomize = False: there is nothing to infer; use bayessim_mjx.train for PPO alone")
     from bayessim_mjx.monitor.console import Console
 
-    with Console(headless=args.headless) as console:
-        return _run(config, run, ["python", "-m", "bayessim_mjx.main", *argv], console)
+    device = setup_jax(config)
+    with cli.first_writes(config, run) as (config, run), Console(headless=args.headless) as console:
+        return _run(config, run, device, ["python", "-m", "bayessim_mjx.main", *argv], console)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -152,26 +152,27 @@ def _replay(physics: Physics) -> Callable[..., dict[str, jax.Array]]:
 def collect(
     env: Env,
     policy_fn: PolicyFn,
-    key: jax.Array,
+    draws: Any,
     env_states: State,
     pool: State,
-    length: int,
     groups: Sequence[str] = ("policy",),
 ) -> tuple[State, dict[str, Any]]:
-    """`length` steps in N worlds, each starting a new episode wherever one ends; to be called inside a jitted function.
+    """T steps in N worlds, each starting a new episode wherever one ends; to be called inside a jitted function.
 
-    policy_fn(key, obs: {group: [N, S]}) -> (action [N, A], extras) acts in all worlds at once; extras is kept.
-    pool: N freshly reset states. World i takes pool[(i + k stride) % N] for its k-th new episode in this call, so that
-    all worlds draw different ones, and theta is drawn anew with each episode.
+    policy_fn(draw, obs: {group: [N, S]}) -> (action [N, A], extras) acts in all worlds at once; extras is kept.
+    draws: keys or noise, leaves [T, ...], one for each step. pool: N freshly reset states, shared in rings of R =
+    `ring(N)` worlds: for its k-th new episode in this call a world takes the entry k `_stride(R)` further in its ring, so
+    that all draw different ones, and theta is drawn anew with each episode. Whole rings can be run apart.
     Returns the last states and time-major arrays [T, N, ...]: observation and final_observation (the next one,
     before any reset) by group, reward, terminated, truncated, extras.
     """
     worlds = env_states.reward.shape[0]
-    stride = _stride(worlds)
+    size = ring(worlds)
+    stride, first = _stride(size), jnp.arange(worlds) // size * size
 
-    def step(carry: tuple[State, jax.Array], key: jax.Array) -> tuple[tuple, dict]:
+    def step(carry: tuple[State, jax.Array], draw: Any) -> tuple[tuple, dict]:
         state, index = carry
-        action, extras = policy_fn(key, state.obs)
+        action, extras = policy_fn(draw, state.obs)
         after = jax.vmap(env.step)(state, action)
         terminated = after.info["terminated"]
         truncated = after.info["truncated"] * (1 - terminated)
@@ -185,10 +186,16 @@ def collect(
             "extras": extras,
         }
         fresh = jax.tree.map(lambda x: x[index], pool)
-        return (select(ended, fresh, after), jnp.where(ended, (index + stride) % worlds, index)), row
+        following = first + (index - first + stride) % size
+        return (select(ended, fresh, after), jnp.where(ended, following, index)), row
 
-    (state, _), batch = jax.lax.scan(step, (env_states, jnp.arange(worlds)), jax.random.split(key, length))
+    (state, _), batch = jax.lax.scan(step, (env_states, jnp.arange(worlds)), draws)
     return state, batch
+
+
+def ring(worlds: int) -> int:
+    """How many neighbouring worlds share their resets: the least divisor of `worlds` from 32 on, or all."""
+    return next((size for size in range(32, worlds) if worlds % size == 0), worlds)
 
 
 def _stride(worlds: int) -> int:

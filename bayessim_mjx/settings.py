@@ -123,6 +123,11 @@ def summary_of(name: str, key: str = "summarizer") -> tuple[str, dict[str, int]]
     return full, {option: int(number)}
 
 
+def _counted(value: Any) -> Any:
+    """A number where a text is meant."""
+    return str(value) if type(value) is int else value
+
+
 def _absolute(value: Any) -> Any:
     """A path, or paths, that mean the same from any folder; what is no text is left for the type check to refuse."""
     if isinstance(value, list | tuple):
@@ -468,6 +473,7 @@ class Config(Section):
     name: str = setting("", "last part of the run folder's name")
     logdir: str = setting("logs", "root of the run folders")
     device: str = setting("auto", "auto, cpu, gpu, gpu:1, cuda:0")
+    devices: str = setting("1", "how many share the worlds of PPO: a number, or all", spell=_counted)
     cache_dir: str | None = setting(None, "compilation cache; null: $BAYESSIM_MJX_CACHE or ~/.cache/bayessim_mjx/jax")
     env: EnvConfig = field(default_factory=EnvConfig)
     randomization: Frozen = field(default_factory=Frozen)

@@ -11,7 +11,7 @@ from typing import Any
 
 from bayessim_mjx import cli
 from bayessim_mjx.config import Config, to_yaml
-from bayessim_mjx.device import setup_jax
+from bayessim_mjx.device import mesh, setup_jax
 
 DESCRIPTION = "PPO alone: on nominal physics, or on physics drawn from the prior with --randomize."
 
@@ -61,7 +61,7 @@ class Training:
         from bayessim_mjx import rl
         from bayessim_mjx.monitor.wall import marked
 
-        state = rl.init(self.env, self.config.ppo, self.key, self.domain)
+        state = rl.init(self.env, self.config.ppo, self.key, self.domain, mesh(self.config))
         if resume and self.run.checkpoints:
             tree, meta = self.run.restore("latest", self.tree(state), fall_back=True)
             return tree["state"], marked(meta)
@@ -174,7 +174,7 @@ def _run(config: Config, run: Any, command: Sequence[str], headless: bool) -> in
     from bayessim_mjx.monitor.opening import opening
 
     device = setup_jax(config)
-    with Console(headless=headless) as console, cli.graceful() as stop:
+    with cli.first_writes(config, run) as (config, run), Console(headless=headless) as console, cli.graceful() as stop:
         env = registry.make(config.task, config=config)
         console.start(opening(config, env, device, infers=False))
         resume = run is not None

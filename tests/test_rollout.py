@@ -83,7 +83,7 @@ def collected(env, thetas, pool_thetas, length):
         assert obs["policy"].shape == (worlds, 1)
         return jnp.zeros((worlds, 1)), {"index": jnp.arange(worlds)}
 
-    return jax.jit(lambda: collect(env, act, key(1), start, pool, length, ("policy", "critic")))()
+    return jax.jit(lambda: collect(env, act, jax.random.split(key(1), length), start, pool, ("policy", "critic")))()
 
 
 def test_collection_starts_new_episodes_with_new_thetas_from_the_pool():

@@ -1,9 +1,20 @@
 """Proximal policy optimisation on batched worlds; every update is one jitted program."""
 
 from bayessim_mjx.rl import ppo
-from bayessim_mjx.rl.evaluate import evaluate
+from bayessim_mjx.rl.evaluate import evaluate, evaluate_together
 from bayessim_mjx.rl.networks import Policy
 from bayessim_mjx.rl.ppo import TrainState, init, make_update, policy_of
 from bayessim_mjx.rl.train import run, train
 
-__all__ = ["Policy", "TrainState", "evaluate", "init", "make_update", "policy_of", "ppo", "run", "train"]
+__all__ = [
+    "Policy",
+    "TrainState",
+    "evaluate",
+    "evaluate_together",
+    "init",
+    "make_update",
+    "policy_of",
+    "ppo",
+    "run",
+    "train",
+]

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import optax
 
 from bayessim_mjx.config import PPOConfig
-from bayessim_mjx.rl import episodes, losses, networks, normalise, ppo
+from bayessim_mjx.rl import episodes, losses, networks, normalise, ppo, sharding
 from bayessim_mjx.rl.networks import Params, Policy
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ def update(
     env_states, data = ppo._collect(env, config, state, domain, collect_key, (group,))
     seen = data["observation"]["policy"]
     observation = normalise.normalise(state.normalizer["policy"], seen) if config.normalize_observations else seen
-    batch = (observation, teacher.act(None, data["observation"][group]))
+    batch = sharding.pinned((observation, teacher.act(None, data["observation"][group])), state.mesh)
     batch = jax.tree.map(lambda x: x.reshape(-1, x.shape[-1]), batch)
 
     def objective(params: Params, part: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, dict]:
@@ -60,7 +60,7 @@ def update(
         return error, {"Loss/behavior": error}
 
     params, opt_state, rate, figures = losses.descend(
-        epochs_key, state.params, state.opt_state, state.learning_rate, batch, config, objective
+        epochs_key, state.params, state.opt_state, state.learning_rate, batch, config, objective, state.mesh
     )
     normalizer = state.normalizer
     if config.normalize_observations:
@@ -74,4 +74,4 @@ def update(
         "env_steps": after.env_steps,
         **episodes.metrics(after.episodes),
     }
-    return after, metrics
+    return sharding.pinned(after, state.mesh, ppo.layout(after)), metrics

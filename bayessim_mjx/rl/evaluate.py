@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
@@ -24,6 +24,28 @@ def evaluate(
     if thetas.ndim != 2:
         raise ValueError(f"thetas has shape {thetas.shape}: expected [episodes, parameters]")
     return _evaluate(env)(dataclasses.replace(policy, deterministic=deterministic), key, thetas)
+
+
+def evaluate_together(
+    env: Env, policies: Sequence[Policy], key: jax.Array, thetas: jax.Array, deterministic: bool = True
+) -> dict[str, jax.Array]:
+    """`evaluate` of several policies in one program: thetas [policies, n, d] -> {"return", "length": [policies, n]}.
+
+    On an accelerator this takes hardly longer than one of them alone. The random numbers are the same for all.
+
+    Raises:
+        ValueError: the policies' networks differ, or thetas' shape.
+    """
+    thetas = jnp.asarray(thetas, jnp.float32)
+    if thetas.ndim != 3 or len(thetas) != len(policies):
+        raise ValueError(f"thetas has shape {thetas.shape}: expected [{len(policies)} policies, episodes, parameters]")
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *policies)
+    return _evaluate_together(env)(dataclasses.replace(stacked, deterministic=deterministic), key, thetas)
+
+
+@lru_cache(maxsize=32)
+def _evaluate_together(env: Env) -> Callable[..., dict[str, jax.Array]]:
+    return jax.jit(jax.vmap(_evaluate(env), in_axes=(0, None, 0)))
 
 
 @lru_cache(maxsize=32)

@@ -9,10 +9,11 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 from jax.flatten_util import ravel_pytree
+from jax.sharding import Mesh
 
 from bayessim_mjx.config import PPOConfig
 from bayessim_mjx.mirrors import MirrorMap
-from bayessim_mjx.rl import networks, symmetry
+from bayessim_mjx.rl import networks, sharding, symmetry
 from bayessim_mjx.rl.networks import Params
 
 MIN_LEARNING_RATE, MAX_LEARNING_RATE = 1e-5, 1e-2  # bounds of the adaptive schedule
@@ -129,13 +130,15 @@ def clip_norm(gradient: jax.Array, limit: float) -> tuple[jax.Array, jax.Array]:
     return gradient * jnp.minimum(1.0, limit / (norm + 1e-6)), norm
 
 
-def minibatches(key: jax.Array, epochs: int, size: int, count: int) -> jax.Array:
+def minibatches(key: jax.Array, epochs: int, size: int, count: int, mesh: Mesh | None = None) -> jax.Array:
     """Indices [epochs * count, size // count]: a fresh permutation of all `size` transitions in each epoch.
 
-    A remainder is left out at the end of each permutation, so a different one in each epoch.
+    A remainder is left out at the end of each permutation, so a different one in each epoch. Devices of a mesh share
+    every minibatch; the minibatches are those of one device.
     """
     order = jax.vmap(lambda k: jax.random.permutation(k, size))(jax.random.split(key, epochs))
-    return order[:, : size - size % count].reshape(epochs * count, size // count)
+    order = order[:, : size - size % count].reshape(epochs * count, size // count)
+    return sharding.pinned(order, mesh, sharding.SECOND)
 
 
 def optimiser_init(params: Params) -> optax.OptState:
@@ -151,6 +154,7 @@ def optimise(
     batch: Batch,
     config: PPOConfig,
     mirrors: Sequence[MirrorMap] = (),
+    mesh: Mesh | None = None,
 ) -> tuple[Params, optax.OptState, jax.Array, dict[str, jax.Array]]:
     """All epochs of minibatches: new parameters, Adam state, learning rate, and figures [epochs * minibatches] each."""
     old_log_std = params["actor"].get("log_std")
@@ -160,7 +164,7 @@ def optimise(
     def objective(params: Params, part: Batch) -> tuple[jax.Array, dict]:
         return loss(params, old_log_std, part, config, mirrors)
 
-    return descend(key, params, opt_state, learning_rate, batch, config, objective)
+    return descend(key, params, opt_state, learning_rate, batch, config, objective, mesh)
 
 
 def descend(
@@ -171,6 +175,7 @@ def descend(
     batch: Any,
     config: PPOConfig,
     objective: Callable[[Params, Any], tuple[jax.Array, dict]],
+    mesh: Mesh | None = None,
 ) -> tuple[Params, optax.OptState, jax.Array, dict[str, jax.Array]]:
     """Adam on objective(params, minibatch) -> (loss, figures) over all epochs of minibatches; returns as `optimise`.
 
@@ -178,7 +183,7 @@ def descend(
     """
     flat, unravel = ravel_pytree(params)
     size = jax.tree.leaves(batch)[0].shape[0]
-    order = minibatches(key, config.num_epochs, size, config.num_minibatches)
+    order = minibatches(key, config.num_epochs, size, config.num_minibatches, mesh)
 
     def step(carry: tuple[Any, Any, Any], now: tuple[jax.Array, jax.Array]) -> tuple[Any, dict]:
         flat, opt_state, rate = carry

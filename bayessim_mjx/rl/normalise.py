@@ -27,8 +27,8 @@ def update(moments: Moments, samples: jax.Array, until: float | None = None) -> 
 
     Once `until` samples were seen, further ones change nothing.
     """
-    samples = samples.reshape(-1, samples.shape[-1])
-    mean, var, n = samples.mean(0), samples.var(0), samples.shape[0]
+    over = tuple(range(samples.ndim - 1))
+    mean, var, n = samples.mean(over), samples.var(over), samples.size // samples.shape[-1]
     count = moments.count + n
     new, old = n / count, moments.count / count  # weights of the two sets, sum 1
     delta = mean - moments.mean

@@ -10,15 +10,17 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 from flax import struct
+from jax.sharding import Mesh
 
 from bayessim_mjx.config import PPOConfig
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.mirrors import MirrorMap
-from bayessim_mjx.rl import episodes, losses, networks, normalise, privileged, recurrent, rnd, symmetry
+from bayessim_mjx.rl import episodes, losses, networks, normalise, privileged, recurrent, rnd, sharding, symmetry
 from bayessim_mjx.rl.gae import gae
 from bayessim_mjx.rl.networks import Policy
 from bayessim_mjx.rl.rnd import RND
-from bayessim_mjx.rollout import collect
+from bayessim_mjx.rl.sharding import EVERYWHERE, FIRST, SECOND
+from bayessim_mjx.rollout import collect, ring
 
 if TYPE_CHECKING:
     from bayessim_mjx.distributions import Distribution
@@ -42,6 +44,7 @@ class TrainState:
     env_steps: jax.Array  # [] uint32
     config: PPOConfig = struct.field(pytree_node=False)  # that the networks were made with
     rnd: RND | None = None  # None where config.rnd is
+    mesh: Mesh | None = struct.field(pytree_node=False, default=None)  # of the devices that share the worlds
 
 
 def critic_group(env: Env) -> str:
@@ -59,10 +62,25 @@ def _mirrors(env: Env, config: PPOConfig) -> tuple[MirrorMap, ...]:
     return symmetry.mirrors(env, config, {"policy", critic_group(env)})
 
 
+def layout(state: TrainState) -> TrainState:
+    """Where the state's arrays lie: what belongs to worlds with them, all else on every device."""
+    everywhere = jax.tree.map(lambda _: EVERYWHERE, state)
+
+    def counted(counters: episodes.Episodes) -> episodes.Episodes:
+        return dataclasses.replace(counters, running_return=FIRST, running_length=FIRST, partial=FIRST)
+
+    novel = everywhere.rnd
+    return everywhere.replace(
+        env_states=jax.tree.map(lambda _: FIRST, state.env_states),
+        episodes=counted(everywhere.episodes),
+        rnd=None if novel is None else novel.replace(discounted=FIRST, episodes=counted(novel.episodes)),
+    )
+
+
 def policy_of(state: TrainState) -> Policy:
-    """The policy of a training state, with its normaliser."""
+    """The policy of a training state, with its normaliser; of several devices, as host arrays."""
     config = state.config
-    return Policy(
+    policy = Policy(
         actor=state.params["actor"],
         normalizer=state.normalizer["policy"],
         activation=config.activation,
@@ -70,16 +88,18 @@ def policy_of(state: TrainState) -> Policy:
         action_clip=config.action_clip,
         squash=config.action_bound == "tanh",
     )
+    return sharding.at_home(policy)
 
 
-def _reset(env: Env, key: jax.Array, domain: Distribution | None, worlds: int) -> State:
+def _reset(env: Env, key: jax.Array, domain: Distribution | None, worlds: int, mesh: Mesh | None = None) -> State:
     """Fresh episodes in `worlds` worlds with theta from the domain (None: nominal)."""
     theta_key, reset_key = jax.random.split(key)
     if domain is None:
         thetas = jnp.tile(jnp.asarray(env.space.nominal, jnp.float32), (worlds, 1))
     else:
         thetas = domain.sample(theta_key, worlds)
-    return jax.vmap(env.reset)(jax.random.split(reset_key, worlds), thetas)
+    reset = sharding.local(jax.vmap(env.reset), mesh, (FIRST, FIRST), FIRST)
+    return reset(jax.random.split(reset_key, worlds), thetas)
 
 
 def _stagger(key: jax.Array, state: State, episode_length: int) -> tuple[State, jax.Array]:
@@ -97,8 +117,29 @@ def _strong(tree: Any) -> Any:
     return jax.tree.map(lambda x: jax.lax.convert_element_type(x, jnp.result_type(x)), tree)
 
 
-def init(env: Env, config: PPOConfig, key: jax.Array, domain: Distribution | None = None) -> TrainState:
-    """The state before the first update; domain None trains at the nominal theta."""
+def _check_shares(config: PPOConfig, mesh: Mesh | None) -> None:
+    """Refuse numbers of worlds and minibatches that the devices cannot share evenly."""
+    devices, worlds = sharding.count(mesh), config.num_envs
+    if worlds % (devices * ring(worlds)):
+        raise UserError(
+            f"ppo.num_envs = {worlds} cannot be shared evenly by {devices} devices; give a multiple of {32 * devices}"
+        )
+    part = (worlds if config.memory else worlds * config.num_steps) // config.num_minibatches
+    if part % devices:
+        what = "sequences" if config.memory else "transitions"
+        raise UserError(
+            f"ppo.num_minibatches = {config.num_minibatches} makes minibatches of {part} {what}, which {devices} "
+            "devices cannot share evenly"
+        )
+
+
+def init(
+    env: Env, config: PPOConfig, key: jax.Array, domain: Distribution | None = None, mesh: Mesh | None = None
+) -> TrainState:
+    """The state before the first update; domain None trains at the nominal theta.
+
+    mesh: the devices that share the worlds, see `device.mesh`; None: the default device. Numbers change by rounding alone.
+    """
     if "policy" not in env.observation_size:
         raise ValueError(f"observation groups {sorted(env.observation_size)}: a policy needs the group 'policy'")
     if config.policy_theta and getattr(env, "target", "") != "policy":
@@ -114,11 +155,12 @@ def init(env: Env, config: PPOConfig, key: jax.Array, domain: Distribution | Non
             "they need a network each; set it to False"
         )
     _mirrors(env, config)
-    return _init(env, config)(key, domain)
+    _check_shares(config, mesh)
+    return _init(env, config, mesh)(*((key, domain) if mesh is None else sharding.agreed((key, domain))))
 
 
 @lru_cache(maxsize=32)
-def _init(env: Env, config: PPOConfig) -> Callable[..., TrainState]:
+def _init(env: Env, config: PPOConfig, mesh: Mesh | None) -> Callable[..., TrainState]:
     sizes = {group: env.observation_size[group][0] for group in {"policy", critic_group(env)}}
 
     def run(key: jax.Array, domain: Distribution | None) -> TrainState:
@@ -127,7 +169,8 @@ def _init(env: Env, config: PPOConfig) -> Callable[..., TrainState]:
         kind = (config.state_dependent_std, config.shared_trunk, config.memory)
         actions = env.action_size - config.memory
         params = networks.init(network_key, sizes["policy"], sizes[critic_group(env)], actions, *hidden, *kind)
-        env_states, partial = _stagger(clock_key, _reset(env, reset_key, domain, config.num_envs), env.episode_length)
+        worlds = _reset(env, reset_key, domain, config.num_envs, mesh)
+        env_states, partial = _stagger(clock_key, worlds, env.episode_length)
         state = TrainState(
             params=params,
             opt_state=losses.optimiser_init(params),
@@ -140,8 +183,9 @@ def _init(env: Env, config: PPOConfig) -> Callable[..., TrainState]:
             env_steps=jnp.uint32(0),
             config=config,
             rnd=_new_rnd(env, config, key, partial),
+            mesh=mesh,
         )
-        return _strong(state)
+        return sharding.pinned(_strong(state), mesh, layout(state))
 
     return jax.jit(run)
 
@@ -166,21 +210,26 @@ def _collect(
 
     The observation groups are those that the networks see, and `more`.
     """
-    pool_key, collect_key = jax.random.split(key)
-    policy = policy_of(state)
-
-    def act(key: jax.Array, obs: dict[str, jax.Array]) -> tuple[jax.Array, dict]:
-        mean, log_std = policy.distribution(obs)
-        action = mean + jnp.exp(log_std) * jax.random.normal(key, mean.shape)
-        extras = {"action": action, "mean": mean}
-        done = policy.carried(obs, policy.bounded(action))
-        return done, extras if log_std.ndim == 1 else extras | {"log_std": log_std}
-
-    pool = _reset(env, pool_key, domain, config.num_envs)
-    novel = () if config.rnd is None else rnd.groups(env.observation_size, config.rnd)
+    pool_key, noise_key = jax.random.split(key)
+    mesh, novel = state.mesh, () if config.rnd is None else rnd.groups(env.observation_size, config.rnd)
     memory = ("memory",) if config.memory else ()
     groups = tuple(sorted({*state.normalizer, *novel, *memory, *more}))
-    return collect(env, act, collect_key, state.env_states, pool, config.num_steps, groups)
+
+    def run(policy: Policy, noise: jax.Array, env_states: State, pool: State) -> tuple[State, dict]:
+        def act(noise: jax.Array, obs: dict[str, jax.Array]) -> tuple[jax.Array, dict]:
+            mean, log_std = policy.distribution(obs)
+            action = mean + jnp.exp(log_std) * noise
+            extras = {"action": action, "mean": mean}
+            done = policy.carried(obs, policy.bounded(action))
+            return done, extras if log_std.ndim == 1 else extras | {"log_std": log_std}
+
+        return collect(env, act, noise, env_states, pool, groups)
+
+    shape = (config.num_steps, config.num_envs, env.action_size - config.memory)
+    noise = sharding.pinned(jax.random.normal(noise_key, shape), mesh, SECOND)
+    pool = _reset(env, pool_key, domain, config.num_envs, mesh)
+    run = sharding.local(run, mesh, (EVERYWHERE, SECOND, FIRST, FIRST), (FIRST, SECOND))
+    return run(policy_of(state), noise, state.env_states, pool)
 
 
 def _batch(env: Env, config: PPOConfig, state: TrainState, data: dict) -> losses.Batch:
@@ -222,6 +271,7 @@ def _batch(env: Env, config: PPOConfig, state: TrainState, data: dict) -> losses
         log_std=log_std,
         copies=_copies(env, config, state, data),
     )
+    batch = sharding.pinned(batch, state.mesh)  # whole on every device: minibatches are drawn from all worlds
     return jax.tree.map(lambda x: x.swapaxes(0, 1) if config.memory else x.reshape(-1, *x.shape[2:]), batch)
 
 
@@ -252,8 +302,8 @@ def _novelty(
     after = rnd.joined(data["final_observation"], rnd.groups(env.observation_size, config.rnd))
     ends = (data["terminated"], data["truncated"])
     novel, x, bonus = rnd.reward(state.rnd, after, *ends, config.rnd, env.dt, config.gamma)
-    x = x.reshape(-1, x.shape[-1])
-    novel, values = rnd.train(key, novel, x, config.rnd, config.num_epochs, config.num_minibatches)
+    x = sharding.pinned(x, state.mesh).reshape(-1, x.shape[-1])
+    novel, values = rnd.train(key, novel, x, config.rnd, config.num_epochs, config.num_minibatches, state.mesh)
     return novel, bonus, {"Loss/rnd": values}
 
 
@@ -279,7 +329,7 @@ def update(
     novel, bonus, novelty_loss = _novelty(env, config, state, data, epochs_key)
     batch = _batch(env, config, state, data if bonus is None else data | {"reward": data["reward"] + bonus})
     params, opt_state, rate, figures = losses.optimise(
-        epochs_key, state.params, state.opt_state, state.learning_rate, batch, config, _mirrors(env, config)
+        epochs_key, state.params, state.opt_state, state.learning_rate, batch, config, _mirrors(env, config), state.mesh
     )
     figures |= novelty_loss
     normalizer = state.normalizer
@@ -303,7 +353,7 @@ def update(
     }
     if config.rnd is not None and novel is not None:
         metrics |= rnd.metrics(novel, metrics["Train/mean_reward"], config.rnd)
-    return after, metrics
+    return sharding.pinned(after, state.mesh, layout(after)), metrics
 
 
 @lru_cache(maxsize=32)

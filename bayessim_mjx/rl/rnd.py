@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import optax
 from flax import struct
+from jax.sharding import Mesh
 
 from bayessim_mjx.config import RNDConfig
 from bayessim_mjx.errors import UserError
@@ -145,7 +146,13 @@ def loss(predictor: list[networks.Params], rnd: RND, x: jax.Array, config: RNDCo
 
 
 def train(
-    key: jax.Array, rnd: RND, x: jax.Array, config: RNDConfig, epochs: int, minibatches: int
+    key: jax.Array,
+    rnd: RND,
+    x: jax.Array,
+    config: RNDConfig,
+    epochs: int,
+    minibatches: int,
+    mesh: Mesh | None = None,
 ) -> tuple[RND, jax.Array]:
     """One Adam step of the predictor per minibatch of x [B, S]; and the losses before them [epochs minibatches]."""
     optimiser = optax.adam(config.learning_rate)
@@ -156,7 +163,7 @@ def train(
         change, opt_state = optimiser.update(gradient, opt_state)
         return (optax.apply_updates(predictor, change), opt_state), value
 
-    order = losses.minibatches(key, epochs, x.shape[0], minibatches)
+    order = losses.minibatches(key, epochs, x.shape[0], minibatches, mesh)
     (predictor, opt_state), values = jax.lax.scan(step, (rnd.predictor, rnd.opt_state), order)
     return replace(rnd, predictor=predictor, opt_state=opt_state), values
 

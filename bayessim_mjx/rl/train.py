@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 
 from bayessim_mjx.config import PPOConfig
-from bayessim_mjx.rl import distil, ppo
+from bayessim_mjx.rl import distil, ppo, sharding
 from bayessim_mjx.rl.networks import Policy
 from bayessim_mjx.rl.ppo import TrainState
 
@@ -75,13 +76,15 @@ def run(
     FloatingPointError where the loss is no longer finite. With a `teacher` its actions are imitated, see `distil`.
     """
     total = config.max_iterations if iterations is None else iterations
-    state = jax.tree.map(jnp.copy, state)  # the caller's state stays valid
+    state = sharding.put(state, state.mesh, ppo.layout(state))  # the caller's state stays valid
     given = (domain,) if teacher is None else (domain, teacher)
+    if state.mesh is not None:
+        given = sharding.agreed(given)
     done, metrics = 0, {}
     while done < total:
         count = min(config.log_interval, total - done)
         start = time.perf_counter()
-        state, on_device = _make_chunk(env, config, teacher is not None)(state, given, jnp.int32(count))
+        state, on_device = _make_chunk(env, config, teacher is not None)(state, given, np.int32(count))
         metrics = {k: v.item() for k, v in jax.device_get(on_device).items()}
         seconds = time.perf_counter() - start
         done += count
@@ -106,9 +109,10 @@ def train(
     state: TrainState | None = None,
     iterations: int | None = None,
     progress: Callable[[Metrics, TrainState], None] | None = None,
+    mesh: Mesh | None = None,
 ) -> tuple[Policy, Metrics]:
-    """Train from scratch, or go on from `state` (`key` is then not used); see `run`."""
+    """Train from scratch, or go on from `state` (`key` and `mesh` are then not used); see `run`."""
     if state is None:
-        state = ppo.init(env, config, key, domain)
+        state = ppo.init(env, config, key, domain, mesh)
     state, metrics = run(env, config, state, domain, iterations, progress)
     return ppo.policy_of(state), metrics
