@@ -161,8 +161,8 @@ def collect(
 
     policy_fn(draw, obs: {group: [N, S]}) -> (action [N, A], extras) acts in all worlds at once; extras is kept.
     draws: keys or noise, leaves [T, ...], one for each step. pool: N freshly reset states, shared in rings of R =
-    `ring(N)` worlds: for its k-th new episode in this call a world takes the entry k `_stride(R)` further in its ring, so
-    that all draw different ones, and theta is drawn anew with each episode. Whole rings can be run apart.
+    `ring(N)` worlds: for its k-th new episode in this call a world takes the entry k `_stride(R)` further in its ring,
+    so that all draw different ones, and theta is drawn anew with each episode. Whole rings can be run apart.
     Returns the last states and time-major arrays [T, N, ...]: observation and final_observation (the next one,
     before any reset) by group, reward, terminated, truncated, extras.
     """

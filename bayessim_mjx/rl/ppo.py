@@ -64,9 +64,9 @@ def _mirrors(env: Env, config: PPOConfig) -> tuple[MirrorMap, ...]:
 
 def layout(state: TrainState) -> TrainState:
     """Where the state's arrays lie: what belongs to worlds with them, all else on every device."""
-    everywhere = jax.tree.map(lambda _: EVERYWHERE, state)
+    everywhere: Any = jax.tree.map(lambda _: EVERYWHERE, state)
 
-    def counted(counters: episodes.Episodes) -> episodes.Episodes:
+    def counted(counters: Any) -> Any:
         return dataclasses.replace(counters, running_return=FIRST, running_length=FIRST, partial=FIRST)
 
     novel = everywhere.rnd
@@ -138,7 +138,7 @@ def init(
 ) -> TrainState:
     """The state before the first update; domain None trains at the nominal theta.
 
-    mesh: the devices that share the worlds, see `device.mesh`; None: the default device. Numbers change by rounding alone.
+    mesh: the devices that share the worlds, see `device.mesh`; None: the default device. Results differ by rounding.
     """
     if "policy" not in env.observation_size:
         raise ValueError(f"observation groups {sorted(env.observation_size)}: a policy needs the group 'policy'")
