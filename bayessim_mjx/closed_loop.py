@@ -35,6 +35,9 @@ Array = NDArray[np.float64]
 WIDE = 0.5  # of the nominal value, either way
 CHECKPOINTS = 8  # policies of one training that are kept and ranked, besides the untrained one
 REPLAYED = 4.0  # s of each log
+TOGETHER = CHECKPOINTS + 1  # policies evaluated in one program
+DRAWN = "drawn"
+Plan = tuple[Policy, Any]  # a policy and the theta it plays on (None: nominal, DRAWN: the environment's priors)
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,51 +109,72 @@ class Judge:
     episodes: int
     key: jax.Array
 
-    def nominal(self, env: Task, policy: Policy, theta: Any = None) -> Array:
-        """Returns `[episodes]` at one theta (default: nominal)."""
+    def returns(self, env: Task, plans: Sequence[Plan]) -> list[Array]:
+        """Returns `[episodes]` of each plan: TOGETHER in one program, which is compiled once for an environment."""
+        out: dict[int, Array] = {}
+        for alike in _alike(plans):
+            for some in (alike[k : k + TOGETHER] for k in range(0, len(alike), TOGETHER)):
+                full = [plans[i] for i in some] + [plans[some[-1]]] * (TOGETHER - len(some))
+                thetas = jnp.stack([self._thetas(env, theta) for _, theta in full])
+                found = rl.evaluate_together(env, [policy for policy, _ in full], self.key, thetas)["return"]
+                out |= dict(zip(some, np.asarray(found, np.float64), strict=False))
+        return [out[i] for i in range(len(plans))]
+
+    def _thetas(self, env: Task, theta: Any) -> jax.Array:
+        """`[episodes, d]`: nominal (None), drawn from the environment's priors ("drawn"), or one theta for all."""
+        if isinstance(theta, str):
+            return Distribution.prior(env.space).sample(jax.random.fold_in(self.key, 1), self.episodes)
         theta = env.space.nominal if theta is None else theta
-        thetas = jnp.tile(jnp.asarray(theta, jnp.float32), (self.episodes, 1))
-        return self._returns(env, policy, thetas)
+        return jnp.tile(jnp.asarray(theta, jnp.float32), (self.episodes, 1))
 
-    def drawn(self, env: Task, policy: Policy) -> Array:
-        """Returns `[episodes]`, each with physics drawn from the environment's priors."""
-        prior = Distribution.prior(env.space)
-        return self._returns(env, policy, prior.sample(jax.random.fold_in(self.key, 1), self.episodes))
-
-    def _returns(self, env: Task, policy: Policy, thetas: jax.Array) -> Array:
-        return np.asarray(rl.evaluate(env, policy, self.key, thetas)["return"], np.float64)
-
-    def everywhere(self, policy: Policy) -> dict[str, Array]:
-        """Returns on each simulator; "posterior" is the corrected one over what the diagnosis leaves open."""
+    def everywhere(self, policies: Sequence[Policy]) -> list[dict[str, Array]]:
+        """Per policy, returns on each simulator; "posterior": the corrected one over what the diagnosis leaves open."""
         s = self.simulators
-        out = {"nominal": self.nominal(s.nominal, policy), "corrected": self.nominal(s.corrected, policy)}
+        places: dict[str, tuple[Task, Any]] = {"nominal": (s.nominal, None), "corrected": (s.corrected, None)}
         if len(s.corrected.space):
-            out["posterior"] = self.drawn(s.corrected, policy)
-        return out if s.real is None else out | {"real": self.nominal(s.real, policy)}
+            places["posterior"] = (s.corrected, DRAWN)
+        if s.real is not None:
+            places["real"] = (s.real, None)
+        found = {name: self.returns(env, [(p, theta) for p in policies]) for name, (env, theta) in places.items()}
+        return [{name: each[i] for name, each in found.items()} for i in range(len(policies))]
 
-    def at_home(self, role: str, policy: Policy) -> float:
-        """Mean return where the policies of this role are trained, with other random numbers than the reported ones."""
+    def at_home(self, role: str, policies: Sequence[Policy]) -> list[float]:
+        """Mean returns where policies of this role are trained, with other random numbers than the reported ones."""
         env, domain = self.simulators.training(role)
         other = replace(self, key=jax.random.fold_in(self.key, 2))
-        return float((other.nominal(env, policy) if domain is None else other.drawn(env, policy)).mean())
+        plans: list[Plan] = [(p, None if domain is None else DRAWN) for p in policies]
+        return [float(x.mean()) for x in other.returns(env, plans)]
 
-    def one_by_one(self, policy: Policy) -> list[dict[str, Any]]:
-        """Per effect and place: what it changes of the return, beside the others ("last") and by itself ("alone").
+    def one_by_one(self, policies: Sequence[Policy]) -> list[list[dict[str, Any]]]:
+        """Per policy, effect and place: what it changes of the return, beside the others ("last") and "alone".
 
         Both, because an effect that ends every episode at once hides all others.
         """
         env = self.simulators.corrected
         full, neutral = env.space.nominal, neutral_theta(env.physics)
-        with_all, with_none = self.nominal(env, policy), self.nominal(env, policy, neutral)
+        labels = places(env.physics)
+        thetas = [full, neutral]
+        for own in labels.values():
+            thetas += [np.where(own, neutral, full), np.where(own, full, neutral)]
+        found = iter(self.returns(env, [(p, theta) for p in policies for theta in thetas]))
         out = []
-        for (name, where), own in places(env.physics).items():
-            last = with_all - self.nominal(env, policy, np.where(own, neutral, full))
-            alone = self.nominal(env, policy, np.where(own, full, neutral)) - with_none
-            changes = {
-                k: {"mean": float(x.mean()), "se": standard_error(x)} for k, x in (("last", last), ("alone", alone))
-            }
-            out.append({"effect": name, "where": where, **changes})
+        for _ in policies:
+            with_all, with_none, rows = next(found), next(found), []
+            for name, where in labels:
+                changed = {"last": with_all - next(found), "alone": next(found) - with_none}
+                changes = {k: {"mean": float(x.mean()), "se": standard_error(x)} for k, x in changed.items()}
+                rows.append({"effect": name, "where": where, **changes})
+            out.append(rows)
         return out
+
+
+def _alike(plans: Sequence[Plan]) -> list[list[int]]:
+    """Indices of the plans, by networks of the same form."""
+    groups: dict[Any, list[int]] = {}
+    for i, (policy, _) in enumerate(plans):
+        leaves, form = jax.tree.flatten(policy)
+        groups.setdefault((form, tuple(np.shape(x) for x in leaves)), []).append(i)
+    return list(groups.values())
 
 
 def places(physics: Physics) -> dict[tuple[str, str], NDArray[np.bool_]]:

@@ -127,7 +127,7 @@ class Study:
 
     def chosen(self, role: str, policies: Policies) -> int:
         """The iteration whose policy is best where it was trained: nothing of the real system decides."""
-        score = {mark: self.judge.at_home(role, policy) for mark, policy in policies.items()}
+        score = dict(zip(policies, self.judge.at_home(role, list(policies.values())), strict=True))
         return max(score, key=lambda mark: score[mark])
 
     # ---- results
@@ -137,16 +137,16 @@ class Study:
         policies = self.all_policies(console)
         console.say(f"evaluating, {self.judge.episodes} episodes of every policy on every simulator ...")
         best = {role: [self.chosen(role, p) for p in each] for role, each in policies.items()}
-        rows = {
-            role: [self.judge.everywhere(p[at]) for p, at in zip(each, best[role], strict=True)]
-            for role, each in policies.items()
-        }
+        judged = iter(
+            self.judge.everywhere([p[at] for r, each in policies.items() for p, at in zip(each, best[r], strict=True)])
+        )
+        rows = {role: [next(judged) for _ in each] for role, each in policies.items()}
         out: dict[str, Any] = {"schema": SCHEMA, "task": self.config.task, **self.sources}
         out["settings"] = {"seeds": self.seeds, "episodes": self.judge.episodes, "ppo": self.config.ppo.to_dict()}
         out["policies"] = {role: _table(best[role], each) for role, each in rows.items()}
         out["gap"] = out["ranking"] = out["recovery"] = out["replay"] = None
         if self.simulators.real is not None:
-            every = [self.judge.everywhere(p) for each in policies["nominal"] for p in each.values()]
+            every = self.judge.everywhere([p for each in policies["nominal"] for p in each.values()])
             out["gap"] = {"policy": measures.gap(rows["nominal"]), "training": measures.gap(every)}
             out["ranking"] = measures.ranking(every)
             real = {role: np.stack([r["real"] for r in each]) for role, each in rows.items()}
@@ -164,8 +164,8 @@ class Study:
         """What each effect changes, for the first policy before and after retraining."""
         first = {role: policies[role][0][best[role][0]] for role in ("nominal", "corrected")}
         cost = float(np.mean(rows["nominal"][0]["nominal"] - rows["nominal"][0]["corrected"]))
-        each = {role: self.judge.one_by_one(policy) for role, policy in first.items()}
-        return measures.relevance(each["nominal"], each["corrected"], cost)
+        before, after = self.judge.one_by_one([first["nominal"], first["corrected"]])
+        return measures.relevance(before, after, cost)
 
     def write(self, found: dict[str, Any]) -> Path:
         """gap_loop.json and the scalars; returns the former's path."""

@@ -141,7 +141,7 @@ def _candidate(
         coordinates.append(Coordinate(name, index, own[0].nominal, low, high, unit=own[0].unit))
     shown = tuple(replace(c, precision=_shrink(c)) for c in coordinates)
     shapes = tuple(q.shape for q in effect.quantities)
-    return Candidate(effect.name, where, effect.kind, shown, shapes, _probes(effect.quantities, shown))
+    return Candidate(effect.name, where, effect.kind, shown, shapes, _probes(effect, shown))
 
 
 def _shrink(c: Coordinate) -> float:
@@ -149,21 +149,19 @@ def _shrink(c: Coordinate) -> float:
     return 1.0 / (c.high - c.low) ** 2
 
 
-def _probes(quantities: Sequence[Quantity], coordinates: Sequence[Coordinate]) -> Array:
-    """Starting points: each amplitude alone at each grid value (both signs), all together, shapes over their grids."""
-    amplitude = [j for j, q in enumerate(quantities) if not q.shape]
-    shapes = [j for j in range(len(quantities)) if j not in amplitude]
-    neutral = np.array([c.neutral for c in coordinates])
+def _probes(effect: Effect, coordinates: Sequence[Coordinate]) -> Array:
+    """Starting points `[n, k]`: each amplitude alone at each grid value, shapes over their grids.
+
+    Amplitudes that act together alone (`Effect.joint`) also in all combinations.
+    """
+    quantities = effect.quantities
+    neutral = [c.neutral for c in coordinates]
     values = [_grid(q, c) for q, c in zip(quantities, coordinates, strict=True)]
+    shapes = [v if q.shape else [n] for q, v, n in zip(quantities, values, neutral, strict=True)]
     points = []
-    for choice in itertools.product(*(values[j] for j in shapes)):
-        for j in amplitude:
-            for value in values[j]:
-                point = neutral.copy()
-                point[shapes] = choice
-                point[j] = value
-                points.append(point)
-    return np.array(points)
+    for j in (j for j, q in enumerate(quantities) if not q.shape):
+        points += itertools.product(*(values[j] if i == j else own for i, own in enumerate(shapes)))
+    return np.array(points + (list(itertools.product(*values)) if effect.joint else []))
 
 
 def _grid(q: Quantity, c: Coordinate) -> list[float]:

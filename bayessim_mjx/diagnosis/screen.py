@@ -26,6 +26,7 @@ class Screened:
     Attributes:
         candidate; start: `[k]`, values to start a fit from.
         gain: predicted drop of the cost; absorbed: share of the effect that refitting the model hides.
+        whole: drop of the cost at the starting point itself, as it was simulated.
         column: `[W, n]`, the projected change of the residual per unit of the way to the start (for isolability).
         others: further starting points `[m, k]`, in other places of its range.
     """
@@ -36,6 +37,7 @@ class Screened:
     absorbed: float
     column: Array
     others: tuple[Array, ...] = ()
+    whole: float = 0.0
 
 
 def screen(fitter: Fitter, job: Job, candidates: Sequence[Candidate], limit: int = 96) -> list[Screened]:
@@ -94,7 +96,10 @@ def _ordered(each: dict[int, list[tuple[Screened, Array]]]) -> list[Screened]:
 
 
 def _with_others(found: list[tuple[Screened, Array]]) -> Screened:
-    """The best start, with the best that differs in what it moves or in its shape, and the best at another level."""
+    """The best start, with the best that differs in what it moves or in its shape, and the best at another level.
+
+    The point that leaves least as it was simulated comes too: a secant says little of laws that act beyond a threshold.
+    """
     found = sorted(found, key=lambda f: -f[0].gain)
     first, point = found[0]
     neutral = np.array([c.neutral for c in first.candidate.coordinates])
@@ -106,7 +111,9 @@ def _with_others(found: list[tuple[Screened, Array]]) -> Screened:
     useful = [(s, p) for s, p in found[1:] if s.gain > 0]
     others = [s.start for s, p in useful if sort_of(p) != sort_of(point)][:1]
     levels = [p for _, p in useful if sort_of(p) == sort_of(point)][:1]
-    return replace(first, others=(point, *others, *levels))
+    least, seen = max(found, key=lambda f: f[0].whole)
+    whole = [seen] if least.whole > 0 and not any(np.array_equal(seen, p) for p in (point, *levels)) else []
+    return replace(first, others=(point, *others, *levels, *whole))
 
 
 def _part(job: Job, own: NDArray[np.int64]) -> Job:
@@ -164,4 +171,4 @@ def _one(project: _Projection, candidate: Candidate, point: Array, column: Array
     t = float(np.clip(g / s, -np.min(behind), np.min(ahead)))
     gain = 2 * t * g - t * t * s
     start = np.where(candidate.shapes, point, neutral + (t if abs(t) > 0.02 else 0.02) * (point - neutral))
-    return Screened(candidate, np.clip(start, low, high), max(gain, 0.0), 1.0 - s / norm, projected)
+    return Screened(candidate, np.clip(start, low, high), max(gain, 0.0), 1.0 - s / norm, projected, whole=2 * g - s)

@@ -73,6 +73,7 @@ class Effect(abc.ABC):
     kind: ClassVar[str]  # actuator | joint (hinge or slide) | body | geom | world
     quantities: ClassVar[tuple[Quantity, ...]]
     contains: ClassVar[tuple[str, ...]] = ()  # effects that are special cases of this one
+    joint: ClassVar[bool] = False  # its amplitudes are searched together: one alone may not act at all
 
     def places(self) -> tuple[str, ...]:
         """Names that own a set of parameters."""

@@ -30,7 +30,7 @@ class EffortLoss(Effect):
     name: ClassVar[str] = "effort_loss"
     kind: ClassVar[str] = "actuator"
     quantities: ClassVar[tuple[Quantity, ...]] = (
-        Quantity("loss", 0.0, 0.0, 10.0, unit="1/(N m)", per="1/force", reach=(0.0, 1.5), grid=(0.05, 0.2, 0.5)),
+        Quantity("loss", 0.0, 0.0, 10.0, unit="1/(N m)", per="1/force", reach=(0.0, 1.5), grid=(0.05, 0.2, 0.4, 0.7)),
     )
 
     def on_actuator(

@@ -27,6 +27,7 @@ class SpeedTorqueLimit(Effect):
 
     name: ClassVar[str] = "speed_torque_limit"
     kind: ClassVar[str] = "actuator"
+    joint: ClassVar[bool] = True
     quantities: ClassVar[tuple[Quantity, ...]] = (
         Quantity(
             "inverse_stall", 0.0, 0.0, 10.0, unit="1/(N m)", per="1/force", reach=(0.0, 3.0), grid=(0.1, 0.2, 0.35, 0.6)

@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 
 from bayessim_mjx.diagnosis import run
+from bayessim_mjx.diagnosis.candidates import Coordinate, _probes
 from bayessim_mjx.diagnosis.screen import screen
+from bayessim_mjx.effects.speed_torque_limit import SpeedTorqueLimit
 
 from .pendulums import FEW, fitted, nominal, recorded, refit
 
@@ -55,6 +57,32 @@ def test_what_the_known_parameters_already_do_is_absorbed(setup):
     assert found["viscous_friction"].absorbed > 0.95  # the same column as damping
     assert found["viscous_friction"].absorbed > found["coulomb_friction"].absorbed
     assert fitter.simulator.traces == 1
+
+
+def test_the_point_that_explains_most_as_simulated_is_among_the_starts(screened):
+    """A secant, scaled down, ends below a limit's threshold: what was really simulated has to be tried as it is."""
+    _, _, fitter, job, found = screened
+
+    def reached(s, point):
+        start = fitter.derive(job, s.candidate.coordinates, point)
+        fitter.iterate([start], 4, lambda j: range(len(j.coordinates) - len(point)))  # the effect stays where it is
+        return start.cost
+
+    true = found[0]
+    best = min(reached(true, point) for point in true.candidate.probes)
+    assert min(reached(true, point) for point in true.others) < 1.05 * best
+
+
+def test_amplitudes_that_act_together_alone_are_tried_in_all_combinations():
+    scales = {"force": 2.0, "speed": 10.0}
+    first, second = (np.array(q.grid) * q.reach[1] for q in SpeedTorqueLimit.quantities)
+    coordinates = [
+        Coordinate(q.name, (i,), 0.0, 0.0, q.reach[1] / s)
+        for i, (q, s) in enumerate(zip(SpeedTorqueLimit.quantities, scales.values(), strict=True))
+    ]
+    points = _probes(SpeedTorqueLimit("motor"), coordinates)
+    pairs = {(round(a, 6), round(b, 6)) for a, b in points}
+    assert pairs >= {(round(a / 2.0, 6), round(b / 10.0, 6)) for a in (0, *first) for b in (0, *second)} - {(0, 0)}
 
 
 def test_no_candidates_no_answers(screened):

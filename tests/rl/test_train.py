@@ -226,6 +226,19 @@ def test_evaluation_uses_the_mean_action_unless_told_otherwise():
         rl.evaluate(env, policy, key(0), jnp.zeros(2))
 
 
+def test_policies_evaluated_together_return_what_each_returns_alone():
+    env = probes.Clock()
+    policies = [rl.policy_of(rl.init(env, CONFIG, key(seed))) for seed in (0, 1)]
+    thetas = jnp.array([[[0.0], [2.0], [5.0]], [[1.0], [1.0], [3.0]]])
+    both = rl.evaluate_together(env, policies, key(0), thetas)
+    for i, policy in enumerate(policies):
+        alone = rl.evaluate(env, policy, key(0), thetas[i])
+        np.testing.assert_allclose(both["return"][i], alone["return"], rtol=1e-5)
+        np.testing.assert_array_equal(both["length"][i], alone["length"])
+    with pytest.raises(ValueError, match="2 policies"):
+        rl.evaluate_together(env, policies, key(0), thetas[0])
+
+
 def test_speed_is_environment_steps_per_second(monkeypatch):
     """The clock stands half a second later whenever it is read: 2 iterations of 16 worlds of 8 steps in that time."""
     clock = iter(np.arange(0, 100, 0.5))
