@@ -24,6 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from inference_c2st import c2st
 from inference_problems import PROBLEMS, Problem
+from inference_sbi import peer
 
 from bayessim_mjx.inference import InferenceSettings, calibration, condition, fit, init
 
@@ -46,7 +47,7 @@ def ours(problem: Problem, seed: int, thetas: Any, x: Any, options: dict) -> tup
         "coordinates": settings.coordinates,
         "wall s": round(seconds[1], 2),
         "cpu s": round(cpu[1], 2),
-        "cpu s with compilation": round(cpu[0], 2),
+        "wall s with compilation": round(seconds[0], 2),
         "best": int(info.best),
     }
 
@@ -60,43 +61,21 @@ def ours(problem: Problem, seed: int, thetas: Any, x: Any, options: dict) -> tup
     return row, sample, scores
 
 
-def peer(problem: Problem, seed: int, thetas: Any, x: Any, estimator: str) -> tuple[dict, Callable, None]:
-    """sbi's NPE at its defaults on the same pairs."""
-    import torch
-    from sbi.inference import NPE
-    from sbi.utils import BoxUniform
-
-    torch.manual_seed(seed)
-    low, high = (torch.tensor(np.array(v)) for v in (problem.space.low, problem.space.high))
-    prior: Any = BoxUniform(low, high)
-    if problem.name == "gaussian_linear":
-        prior = torch.distributions.MultivariateNormal(torch.zeros(10), 0.1 * torch.eye(10))
-    wall, process = time.perf_counter(), time.process_time()
-    trainer = NPE(prior=prior, density_estimator=estimator)
-    trainer.append_simulations(torch.tensor(np.array(thetas)), torch.tensor(np.array(x))).train()
-    posterior = trainer.build_posterior()
-    row = {"model": f"sbi {estimator}", "wall s": time.perf_counter() - wall, "cpu s": time.process_time() - process}
-
-    def sample(x: np.ndarray, n: int) -> np.ndarray:
-        return posterior.sample((n,), x=torch.tensor(np.array(x)), show_progress_bars=False).numpy()
-
-    return row, sample, None
-
-
 def measure(problem: Problem, seed: int, simulations: int, samples: int, model: Callable) -> dict:
     """One row: fit `model` and compare it with the exact posterior."""
     thetas, x = problem.pairs(jax.random.PRNGKey(1000 + seed), simulations)
     row, sample, scores = model(problem, seed, thetas, x)
     row = {"problem": problem.name, "seed": seed, "simulations": simulations, **row}
+    if scores is not None:
+        density, level = scores(*problem.pairs(jax.random.PRNGKey(8), HELD_OUT))
+        row["log q"] = round(float(density.mean()), 3)
+        row["coverage 50/80/95"] = [round(float(np.mean(level <= p)), 3) for p in (0.5, 0.8, 0.95)]
+        row["pairs"] = len(level)
     if samples:
         _, observed = problem.pairs(jax.random.PRNGKey(7), OBSERVATIONS)
         rng = np.random.default_rng(seed)
         values = [c2st(problem.exact(rng, x_o, samples), sample(x_o, samples), seed) for x_o in np.asarray(observed)]
         row |= {"c2st": round(float(np.mean(values)), 4), "each": [round(v, 3) for v in values]}
-    if scores is not None:
-        density, level = scores(*problem.pairs(jax.random.PRNGKey(8), HELD_OUT))
-        row["log q"] = round(float(density.mean()), 3)
-        row["coverage 50/80/95"] = [round(float(np.mean(level <= p)), 3) for p in (0.5, 0.8, 0.95)]
     return row
 
 
@@ -115,7 +94,10 @@ def main() -> None:
     parser.add_argument("--samples", type=int, default=5000, help="of each posterior, for C2ST; 0: no C2ST")
     parser.add_argument("--defaults", action="store_true", help="not the settings that suit the problem")
     parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--first", type=int, default=0, help="the first seed")
+    parser.add_argument("--only-peers", action="store_true", help="not the library itself")
     parser.add_argument("--peers", nargs="*", default=[], choices=["mdn", "maf", "nsf"])
+    parser.add_argument("--epochs", type=int, default=2**31 - 1, help="of peers, at most")
     parser.add_argument("--sbi", help="folder that sbi and torch are installed in, if not beside this library")
     args, rest = parser.parse_known_args()
     if args.sbi:
@@ -127,9 +109,9 @@ def main() -> None:
         problem = PROBLEMS[name]()
         if args.defaults:
             problem = replace(problem, settings={})
-        models: list[Callable] = [lambda *a: ours(*a, options)]
-        models += [lambda *a, e=e: peer(*a, e) for e in args.peers]
-        for seed in range(args.seeds):
+        models: list[Callable] = [] if args.only_peers else [lambda *a: ours(*a, options)]
+        models += [lambda *a, e=e: peer(*a, e, args.epochs) for e in args.peers]
+        for seed in range(args.first, args.first + args.seeds):
             for model in models:
                 print(json.dumps(measure(problem, seed, args.simulations, args.samples, model)), flush=True)
 

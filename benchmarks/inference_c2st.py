@@ -29,12 +29,12 @@ def c2st(a: np.ndarray, b: np.ndarray, seed: int = 0) -> float:
     rest = np.stack([np.concatenate([order[j] for j in range(FOLDS) if j != i]) for i in range(FOLDS)])
     held = int(HELD * rest.shape[1])
     keys = jax.random.split(jax.random.PRNGKey(seed), FOLDS)
-    x, y = jnp.asarray(rows), jnp.asarray(labels)
-    score = jax.vmap(functools.partial(_fold, x, y))
-    return float(np.mean(jax.jit(score)(keys, rest[:, held:], rest[:, :held], test)))
+    return float(np.mean(_folds(jnp.asarray(rows), jnp.asarray(labels), keys, rest[:, held:], rest[:, :held], test)))
 
 
-def _fold(x: Array, y: Array, key: Array, train: Array, held: Array, test: Array) -> Array:
+@jax.jit
+@functools.partial(jax.vmap, in_axes=(None, None, 0, 0, 0, 0))
+def _folds(x: Array, y: Array, key: Array, train: Array, held: Array, test: Array) -> Array:
     width = 10 * x.shape[1]
     sizes = (x.shape[1], width, width, 1)
     keys = jax.random.split(key, 4)
