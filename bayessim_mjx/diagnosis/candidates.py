@@ -158,7 +158,7 @@ def _probes(effect: Effect, coordinates: Sequence[Coordinate]) -> Array:
     neutral = [c.neutral for c in coordinates]
     values = [_grid(q, c) for q, c in zip(quantities, coordinates, strict=True)]
     shapes = [v if q.shape else [n] for q, v, n in zip(quantities, values, neutral, strict=True)]
-    points = []
+    points: list[tuple[float, ...]] = []
     for j in (j for j, q in enumerate(quantities) if not q.shape):
         points += itertools.product(*(values[j] if i == j else own for i, own in enumerate(shapes)))
     return np.array(points + (list(itertools.product(*values)) if effect.joint else []))

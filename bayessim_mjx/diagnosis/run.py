@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import warnings
 from collections.abc import Callable, Sequence
@@ -18,6 +19,7 @@ from bayessim_mjx.diagnosis import (
     gap,
     gate,
     noise,
+    ridges,
     scales,
     search,
     verdict,
@@ -28,6 +30,7 @@ from bayessim_mjx.diagnosis.disturbance import Disturbance, estimate
 from bayessim_mjx.diagnosis.fit import Fitter
 from bayessim_mjx.diagnosis.flexible import Flexible, flexible
 from bayessim_mjx.diagnosis.models import Model
+from bayessim_mjx.diagnosis.ridges import Ridges
 from bayessim_mjx.diagnosis.robot import Robot
 from bayessim_mjx.diagnosis.simulate import Simulator
 from bayessim_mjx.effects.effect import Effect
@@ -85,6 +88,7 @@ class Findings:
     flexible_winner: Flexible | None
     disturbance: Disturbance | None
     links: list[channels.Link]
+    ridges: Ridges | None = None
 
 
 def control_period(robot: Robot, logs: Sequence[Log]) -> float:
@@ -132,7 +136,7 @@ def prepare(
 def _settings(robot: Robot) -> search.Settings:
     """Budgets for the robot's size; thresholds are the same for all."""
     big = robot.mj_model.nv > MANY
-    return search.Settings(singles=24, pairs=5, screened=24, starts=8) if big else search.Settings()
+    return search.Settings(singles=24, pairs=5, screened=24, starts=16) if big else search.Settings()
 
 
 def _measured(
@@ -229,6 +233,7 @@ def diagnose(
     race = search.run(setup.fitter, setup.candidates, setup.settings, say)
     race.winner = _verified(setup, race, say)
     ruling = verdict.rule(race, say)
+    ruling, along = _on_ridges(race, ruling)
     fitter, model = setup.fitter, ruling.model
     say("how far", 0, 1)
     predictions = {"nominal": gap.nominal(fitter, race.nominal), "calibrated": gap.predict(fitter, race.base)}
@@ -238,7 +243,16 @@ def diagnose(
     on_base = _flexible(setup, race.base, race, missing)
     on_winner = _flexible(setup, model, race) if model.effects else on_base
     links = [link for log in setup.logs[:1] for link in channels.links(log, robot.mj_model)]
-    return Findings(setup, race, ruling, predictions, on_base, on_winner, missing, links)
+    return Findings(setup, race, ruling, predictions, on_base, on_winner, missing, links, along)
+
+
+def _on_ridges(race: search.Race, ruling: verdict.Ruling) -> tuple[verdict.Ruling, Ridges | None]:
+    """The ruling with its model where data and beliefs together put it, and what was simulated along its ridges."""
+    if not ruling.model.effects:
+        return ruling, None
+    model, along = ridges.settled(race.fitter, ruling.model)
+    race.models[frozenset(c.label for c in model.effects)] = race.winner = model
+    return dataclasses.replace(ruling, model=model), along
 
 
 def _verified(setup: Setup, race: search.Race, say: Progress) -> Model:

@@ -96,7 +96,7 @@ def _ordered(each: dict[int, list[tuple[Screened, Array]]]) -> list[Screened]:
 
 
 def _with_others(found: list[tuple[Screened, Array]]) -> Screened:
-    """The best start, with the best that differs in what it moves or in its shape, and the best at another level.
+    """The best start, with the best that differs in what it moves or in its shape, and the best at other levels.
 
     The point that leaves least as it was simulated comes too: a secant says little of laws that act beyond a threshold.
     """
@@ -110,7 +110,7 @@ def _with_others(found: list[tuple[Screened, Array]]) -> Screened:
 
     useful = [(s, p) for s, p in found[1:] if s.gain > 0]
     others = [s.start for s, p in useful if sort_of(p) != sort_of(point)][:1]
-    levels = [p for _, p in useful if sort_of(p) == sort_of(point)][:1]
+    levels = [p for _, p in useful if sort_of(p) == sort_of(point)][:2]
     least, seen = max(found, key=lambda f: f[0].whole)
     whole = [seen] if least.whole > 0 and not any(np.array_equal(seen, p) for p in (point, *levels)) else []
     return replace(first, others=(point, *others, *levels, *whole))

@@ -8,8 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from bayessim_mjx.diagnosis import ridges
 from bayessim_mjx.diagnosis.fit import Fitter
 from bayessim_mjx.diagnosis.models import Model
+from bayessim_mjx.diagnosis.ridges import Ridges
 
 Array = NDArray[np.float64]
 LEVEL = 0.9
@@ -31,21 +33,21 @@ class Spread:
     freedom: Array
 
 
-def spread(fitter: Fitter, model: Model) -> Spread:
-    """The uncertainty of the model's parameters at its fit."""
+def spread(fitter: Fitter, model: Model, along: Ridges | None = None) -> Spread:
+    """The uncertainty of the model's parameters at its fit; `along`: what was simulated along its ridges."""
     q, _ = model.job.quadratic(fitter.spread)
-    precision, _, _, _ = model.job.prior()
+    precision = np.diag(ridges.beliefs(model.job, len(fitter.base)))
     _, S = q.weighted(model.job.weight)
-    covariance = np.linalg.pinv(S + np.diag(precision))
-    count = model.job.r.size
-    inflation = max(model.total / count, 0.5) * count / model.samples
+    S = S if along is None else along.corrected(S, ridges.scales(model.job))
+    inflation = ridges.inflation(model)
+    covariance = np.linalg.pinv(S / inflation + precision)
     moves = model.estimates - model.estimates.mean(0)
     g = len(moves)
     group = fitter.simulator.windows.group
-    told = [covariance @ q.weighted(model.job.weight * (group == name))[1] @ covariance for name in np.unique(group)]
+    told = [covariance @ q.weighted(model.job.weight * (group == n))[1] @ covariance for n in np.unique(group)]
     share = np.diagonal(told, axis1=1, axis2=2)  # of the parameter's variance, by the condition it comes from
     effective = share.sum(0) ** 2 / np.maximum((share**2).sum(0), 1e-300)  # Carter, Schnepel and Steigerwald (2017)
-    return Spread(np.asarray(covariance * inflation), (g - 1) / g * moves.T @ moves, np.maximum(effective - 1.0, 1.0))
+    return Spread(np.asarray(covariance), (g - 1) / g * moves.T @ moves, np.maximum(effective - 1.0, 1.0))
 
 
 TIMES = 0.07  # of a time step; measured on single effects in MuJoCo C at a tenth of the step
@@ -58,15 +60,17 @@ def deviations(fitter: Fitter, model: Model) -> Array:
     return np.sqrt(np.maximum(np.diag(found.formal), np.diag(found.between)))
 
 
-def covariance(fitter: Fitter, model: Model) -> Array:
+def covariance(fitter: Fitter, model: Model, along: Ridges | None = None) -> Array:
     """`[k, k]`, of a Gaussian with the 90 % intervals of the parameters and their correlations.
 
     Few conditions: Student's quantile in the normal's place, where what differs between conditions decides.
     """
-    found = spread(fitter, model)
+    found = spread(fitter, model, along)
     formal, between = np.diag(found.formal), np.diag(found.between)
     wide = stats.t.ppf((1 + LEVEL) / 2, found.freedom) / stats.norm.ppf((1 + LEVEL) / 2)
     sd = np.sqrt(np.where(between > formal, between * wide**2, formal))
+    base = len(fitter.base)
+    sd[:base] = np.minimum(sd[:base], 1.0 / np.sqrt(ridges.beliefs(model.job, base)[:base]))  # data take nothing away
     both = found.formal + found.between
     scale = sd / np.sqrt(np.maximum(np.diag(both), 1e-300))
     return np.asarray(both * scale[:, None] * scale[None, :])

@@ -32,8 +32,8 @@ class Cogging(Effect):
     name: ClassVar[str] = "cogging"
     kind: ClassVar[str] = "actuator"
     quantities: ClassVar[tuple[Quantity, ...]] = (
-        Quantity("sine", 0.0, -1.0, 1.0, unit="N m", per="force", reach=(-0.3, 0.3), grid=(0.1,)),
-        Quantity("cosine", 0.0, -1.0, 1.0, unit="N m", per="force", reach=(-0.3, 0.3), grid=(0.1,)),
+        Quantity("sine", 0.0, -1.0, 1.0, unit="N m", per="force", reach=(-1.0, 1.0), grid=(0.03,)),
+        Quantity("cosine", 0.0, -1.0, 1.0, unit="N m", per="force", reach=(-1.0, 1.0), grid=(0.03,)),
         Quantity(
             "order",
             2.0,

@@ -34,7 +34,7 @@ class JointElasticity(Effect):
     kind: ClassVar[str] = "joint"
     quantities: ClassVar[tuple[Quantity, ...]] = (
         Quantity(
-            "compliance", 0.0, 0.0, 0.05, unit="rad/(N m)", per="1/force", reach=(0.0, 0.1), grid=(0.03, 0.1, 0.4)
+            "compliance", 0.0, 0.0, 0.05, unit="rad/(N m)", per="1/force", reach=(0.0, 0.3), grid=(0.01, 0.03, 0.1, 0.3)
         ),
         Quantity("damping", 0.1, 0.02, 1.5, grid=(0.05,), shape=True),
     )

@@ -27,7 +27,7 @@ class JointSpring(Effect):
     quantities: ClassVar[tuple[Quantity, ...]] = (
         Quantity("stiffness", 0.0, 0.0, 10.0, unit="N m/rad", per="force/travel", reach=(0.0, 1.0)),
         Quantity("cubic", 0.0, 0.0, 10.0, unit="N m/rad^3", per="force/travel^3", reach=(0.0, 1.0)),
-        Quantity("rest", 0.0, -3.2, 3.2, unit="rad", per="travel", reach=(-1.0, 1.0), grid=(0.1, 0.5, 0.9), shape=True),
+        Quantity("rest", 0.0, -3.2, 3.2, unit="rad", per="travel", reach=(-2.0, 2.0), grid=(0.3, 0.5, 0.7), shape=True),
     )
 
     def on_force(self, at: Site, memory: Any, step: SubStep, theta: jax.Array) -> tuple[Any, jax.Array]:
