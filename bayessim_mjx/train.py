@@ -174,6 +174,7 @@ def _run(config: Config, run: Any, command: Sequence[str], headless: bool) -> in
     from bayessim_mjx.monitor.opening import opening
 
     device = setup_jax(config)
+    mesh(config)  # refuse before there is a run folder
     with cli.first_writes(config, run) as (config, run), Console(headless=headless) as console, cli.graceful() as stop:
         env = registry.make(config.task, config=config)
         console.start(opening(config, env, device, infers=False))
