@@ -28,6 +28,7 @@ def _parser() -> cli.Parser:
     parser.add_argument(
         "--surrogate", metavar="FILE", help="stand-in for the real system: its truth as an effects.yaml"
     )
+    parser.add_argument("--surrogate_timestep", type=float, metavar="S", help="of its simulation (default: the task's)")
     parser.add_argument("--real", metavar="LOGS", nargs="+", help="logs of the real system; no real return is known")
     parser.add_argument("--parameters", metavar="FILE", help="params.yaml of the diagnosis, if it had one")
     parser.add_argument("--iterations", type=int, help="PPO iterations of each policy (default: ppo.max_iterations)")

@@ -16,7 +16,7 @@ from bayessim_mjx import checkpoints, cli, closed_loop, gap_words, registry
 from bayessim_mjx import gap_measures as measures
 from bayessim_mjx.closed_loop import Judge, Simulators
 from bayessim_mjx.config import Config, freeze
-from bayessim_mjx.diagnosis import apply, result, robot
+from bayessim_mjx.diagnosis import apply, discretisation, result, robot
 from bayessim_mjx.effects import storage
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.gap_policies import Keeper, Policies
@@ -61,6 +61,13 @@ def _on(config: Config, physics: Physics) -> Any:
     return env
 
 
+def _refined(body: robot.Robot, timestep: float) -> robot.Robot:
+    most = float(body.mj_model.opt.timestep)
+    if not 0 < timestep <= most:
+        raise UserError(f"--surrogate_timestep {timestep:g}: must be positive and at most the task's own, {most:g} s")
+    return discretisation.refined(body, timestep)
+
+
 def _corrected(body: robot.Robot, dt: float, found: storage.Correction, source: str) -> Physics:
     try:
         return body.physics(dt, found.effects, ParameterSpace(found.calibrated))
@@ -68,17 +75,20 @@ def _corrected(body: robot.Robot, dt: float, found: storage.Correction, source: 
         raise UserError(f"{source} does not fit --task {body.name}: {error}") from None
 
 
-def surrogate(config: Config, file: str | Path, body: robot.Robot | None = None) -> Any:
+def surrogate(config: Config, file: str | Path, body: robot.Robot | None = None, timestep: float | None = None) -> Any:
     """The task on a stand-in for the real system.
 
     Args:
         file: its truth as an effects.yaml, hidden values as nominal ones.
         body: the task's robot, where it is there already.
+        timestep: s, of its simulation (default: the task's own).
 
     Raises:
         UserError: the file is wrong or does not fit the task.
     """
     body = body or robot.of_task(nominal_task(config))
+    if timestep is not None:
+        body = _refined(body, timestep)
     physics = _corrected(body, float(body.control_dt or 0.0), storage.read(file), f"--surrogate {file}")
     return _on(config, physics)
 
@@ -211,7 +221,7 @@ def make(args: argparse.Namespace, config: Config) -> Study:
     nominal = _on(config, body.physics(dt, (), closed_loop.wide(body.space)))
     real = logs = None
     if args.surrogate:
-        real = surrogate(config, args.surrogate, body)
+        real = surrogate(config, args.surrogate, body, args.surrogate_timestep)
     else:
         logs = read_logs(args.real, body.mj_model)
     simulators = Simulators(nominal, _on(config, physics), real)

@@ -124,6 +124,11 @@ class Race:
         """Share of the base model's gap above the noise that `model` closes, held out."""
         return 1.0 - max(model.total - self._floor(), 0.0) / max(self.base.total - self._floor(), 1e-12)
 
+    def left(self, model: Model) -> float:
+        """Share of the base model's squared gap above the noise that `model` leaves."""
+        floor = self.noise * len(model.cost)
+        return max(model.total - floor, 0.0) / max(self.base.total - floor, 1e-12)
+
     def _floor(self) -> float:
         return min(self.noise * len(self.base.cost), min((m.total for m in self.models.values()), default=np.inf))
 

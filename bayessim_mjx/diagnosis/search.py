@@ -39,6 +39,11 @@ __all__ = [
 ]
 
 
+FAR = 1.5  # noises that remain: beyond, the search also tries other ways
+ELSEWHERE, PAIRS = 3, 3  # times, and pairs to go on from
+BETTER = 0.8  # of the gap that remains, which another way has to undercut
+
+
 def run(fitter: Fitter, candidates: Sequence[Candidate], settings: Settings, progress: Progress | None = None) -> Race:
     """The whole race on the windows of `fitter`."""
     say = progress or (lambda text, done, total: None)
@@ -57,8 +62,8 @@ def run(fitter: Fitter, candidates: Sequence[Candidate], settings: Settings, pro
         race.winner = race.base
         return race
     _singles(race, say)
-    best = _pairs(race, say)
-    race.winner = simplest(race, _greedy(race, best, say), say)
+    best = _elsewhere(race, _greedy(race, _pairs(race, say), say), say)
+    race.winner = simplest(race, best, say)
     return race
 
 
@@ -137,11 +142,37 @@ def _greedy(race: Race, model: Model, say: Progress, barred: Sequence[str] = (),
     return model
 
 
-def _forward(race: Race, model: Model, say: Progress, barred: Sequence[str], size: float) -> Model | None:
+def _elsewhere(race: Race, model: Model, say: Progress) -> Model:
+    """Other ways than the greedy one, where that ends far above the noise: one effect may stand in for several.
+
+    Without each of its effects in turn, and from the best pairs that it does not hold, the search goes on as before.
+    """
+    for _ in range(ELSEWHERE):
+        if not model.effects or race.at_noise(model, FAR**2):
+            return model
+        own = {c.label for c in model.effects}
+        starts = [(without(race, model, e, say), e.label) for e in model.effects if len(model.effects) > 1]
+        pairs = [m for m in ranked(race, 2) if not {c.label for c in m.effects} <= own]
+        starts += [(m, "") for m in pairs[:PAIRS]]
+        found = [_forward(race, m, say, (), float("inf"), without=label) for m, label in starts]
+        others = [m for m in found if m is not None]
+        if not others:
+            return model
+        other = _greedy(race, min(others, key=lambda m: m.total), say)
+        floor = race.noise * len(model.cost)
+        if other.total - floor > BETTER * (model.total - floor):
+            return model
+        model = other
+    return model
+
+
+def _forward(
+    race: Race, model: Model, say: Progress, barred: Sequence[str], size: float, without: str = ""
+) -> Model | None:
     if len(model.effects) >= race.settings.most:
         return None
     others = [c for c in race.candidates if all(compatible(c, e) for e in model.effects) and c.effect not in barred]
-    others = [c for c in others if model.size + len(c.coordinates) <= size]
+    others = [c for c in others if model.size + len(c.coordinates) <= size and c.label != without]
     found = [s for s in screen(race.fitter, model.job, others, race.settings.screened) if s.gain > 0][
         : race.settings.pairs
     ]

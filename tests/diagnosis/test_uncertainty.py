@@ -80,3 +80,4 @@ def test_simulators_differ_by_a_part_of_a_step_and_a_percent():
     job = SimpleNamespace(coordinates=(known, delay, gain), values=np.array([1.1, 0.02, 0.7]))
     model = SimpleNamespace(effects=(SimpleNamespace(coordinates=(delay, gain)),), job=job)
     np.testing.assert_allclose(uncertainty.systematic(model, 0.01), [0.0, 0.07 * 0.01, 0.01 * 0.3])
+    np.testing.assert_allclose(uncertainty.systematic(model, 0.01, 0.04), [0.0, 0.07 * 0.01, (0.01 + 0.15 * 0.2) * 0.3])
