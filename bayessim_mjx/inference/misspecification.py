@@ -1,8 +1,9 @@
 """Whether a real summary lies outside what simulation can produce, with p-values that are exact by ranks.
 
 Three scores of a summary z, each ranked among those of fresh simulations (exchangeable with a real trajectory where
-nothing is wrong): the distance of z from E[z | theta-hat], whitened; the same in units that change with theta-hat; the
-distance to the nearest simulations in the network's last hidden layer. The first two are two-sided, as noise that is
+nothing is wrong): the distance of z from what emulator.py says is simulated at the theta that explains it best, in
+units of the noise; the same in units that change with theta; the distance to the nearest simulations in the network's
+last hidden layer. The first two are two-sided, as noise that is
 lower than assumed makes the residual too small (reference/sbi.md section 3.4). The three p-values are combined and the
 combination is ranked again, which makes it one p-value.
 """
@@ -18,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from bayessim_mjx.inference import mdn
+from bayessim_mjx.inference import emulator, mdn
 from bayessim_mjx.triangular import product
 
 FOURIER = 300  # random features of theta-hat behind E[z | theta-hat]
@@ -166,32 +167,38 @@ def score(state: Any, thetas: Array, x: Array, count: Array, rows: Array) -> Sco
     x = jnp.where(finite[:, None], x, 0.0)
     z, z_new = _standardised(x, used, x, rows)
     h, h_new = _standardised(latent(state, x), used, latent(state, x), latent(state, rows))
-    u = jax.vmap(state.space.to_unit)(thetas)
+    u = jnp.where(used[:, None] > 0, jax.vmap(state.space.to_unit)(thetas), 0.5)
     ones = jnp.ones((x.shape[0], 1)), jnp.ones((rows.shape[0], 1))
+    whitener = _whitener(z, used)
+    y, y_new = product(z, whitener), product(z_new, whitener)
+    params = emulator.trained(u, y, used)
+    # noise, and the emulator's error: what is left at the true theta
+    unit = _whitener(y - emulator.emulated(params, u), used)
     estimate = _ridge(jnp.concatenate([h, z, ones[0]], 1), u, used)
-    f, f_new = (
-        _fourier(jnp.clip(product(jnp.concatenate([a, b, c], 1), estimate), -0.3, 1.3))
-        for a, b, c in ((h, z, ones[0]), (h_new, z_new, ones[1]))
+    first = lambda v: v[:NEAR]  # noqa: E731
+    (best, w), (best_new, w_new) = (
+        emulator.explained(params, unit, first(u), jnp.clip(product(jnp.concatenate([*rows], 1), estimate), 0, 1), goal)
+        for rows, goal in (((first(h), first(z), first(ones[0])), first(y)), ((h_new, z_new, ones[1]), y_new))
     )
-    mean = _ridge(f, z, used)
-    r, r_new = z - product(f, mean), z_new - product(f_new, mean)
-    whitener = _whitener(r, used)
-    w, w_new = product(r, whitener), product(r_new, whitener)
-    # log w^2 given theta-hat: noise and the reach of the network differ over the box
-    spread = _ridge(f, jnp.log(w * w + 1e-3), used)
+    f, f_new = _fourier(best), _fourier(best_new)
+    # log w^2 given theta: noise and the reach of the emulator differ over the box
+    spread = _ridge(f, jnp.log(w * w + 1e-3), first(used))
     scaled = w_new / jnp.exp(0.5 * product(f_new, spread))
     near = _nearest(h[:NEAR], used[:NEAR], h_new)
     joint = jnp.stack([jnp.log(jnp.sum(w_new**2, 1)), jnp.log(jnp.sum(scaled**2, 1)), near], axis=1)
-    return Scores(joint, _alone(z, r, used, z_new, r_new))
+    return Scores(joint, _alone(z, f, used, z_new, f_new))
 
 
-def _alone(z: Array, r: Array, used: Array, z_new: Array, r_new: Array) -> Array:
+def _alone(z: Array, f: Array, used: Array, z_new: Array, f_new: Array) -> Array:
     """How far each feature is from what all the others predict, in standard deviations -> [n, D].
 
-    One odd feature spoils theta-hat and with it the residuals r of features that are as they should be; so those are
-    taken only where there are too many features to invert their covariance.
+    One odd feature spoils theta-hat and with it the residuals of features that are as they should be; so those are
+    taken only where there are too many features to invert their covariance. f [NEAR, F] are functions of theta-hat.
     """
     if z.shape[1] > MOST_ALONE:
+        z, used = z[: f.shape[0]], used[: f.shape[0]]
+        mean = _ridge(f, z, used)
+        r, r_new = z - product(f, mean), z_new - product(f_new, mean)
         return r_new / (jnp.sqrt(_mean(r * r, used)) + 1e-6)[None, :]
     cov = product((z * used[:, None]).T, z) / jnp.maximum(jnp.sum(used), 1.0) + RIDGE * jnp.eye(z.shape[1])
     precision = jnp.linalg.inv(cov)
