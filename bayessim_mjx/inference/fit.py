@@ -23,7 +23,9 @@ from bayessim_mjx.inference.settings import InferenceSettings
 GOLDEN = np.uint32(2654435769)  # 2^32 / golden ratio: spreads the validation rows evenly over any number of rows
 SCORED = 256  # validation rows for which the truncated density is reported
 CURVE = 40  # points of the loss curves, at least
-SHARPNESS = np.geomspace(0.7, 1.6, 13).astype(np.float32)  # of the ensemble, tried on the held-out rows
+SHARPNESS = np.geomspace(0.4, 2.0, 17).astype(np.float32)  # of the members, tried on the held-out rows
+LADDER = 1  # power of the members' places that their dropout rises with
+CLIMBS, SWEEPS = 50, 2  # steps towards the members' weights; rounds over their sharpness
 
 
 @struct.dataclass
@@ -178,7 +180,8 @@ def _fit(
     data = data._replace(proposals=proposals, origin=origin)
     points, chunk = schedule_length(settings, x.shape[0])
     member = partial(_train, data=data, settings=settings, fresh=state.fits == 0)
-    rates = jnp.linspace(0.0, settings.dropout, settings.ensemble) if settings.ensemble > 1 else jnp.zeros(1)
+    # most members have little dropout
+    rates = settings.dropout * jnp.linspace(0.0, 1.0, settings.ensemble) ** LADDER
     params, best, skipped, train_loss, val_loss = jax.vmap(member)(
         jax.random.split(key, settings.ensemble), state.params, rates
     )
@@ -269,30 +272,44 @@ def _fresh(params: Any, data: _Data, settings: InferenceSettings) -> Any:
 
 
 def _weigh(params: Any, data: _Data, settings: InferenceSettings) -> Any:
-    """Weights of the members and one sharpness for all, by the held-out density of their mixture.
+    """Weight and sharpness of each member, by the held-out density of their mixture.
 
-    A mixture of networks that disagree is wider than it need be, a single one narrower than it may be.
+    Networks that disagree make a mixture that is wider than it need be, a single one is narrower than it may be; and a
+    sharp member beside a wide one has the heavy tails of a posterior that is rarely far off.
     """
+    score = partial(_objective, rows=data.held, data=data, settings=settings)
+    members = jnp.arange(settings.ensemble, dtype=jnp.int32)
 
     def scores(sharpness: Array) -> Array:
-        score = partial(_objective, rows=data.held, data=data, settings=settings)
-        return jax.vmap(lambda p: score({**p, "sharpness": sharpness}))(params)
+        density = jax.vmap(lambda p: score({**p, "sharpness": sharpness}))(params)
+        return jnp.where(data.mask[None, :] > 0, jnp.maximum(density, -1e6), 0.0)  # [E, V]
 
-    def mixed(sharpness: Array) -> tuple[Array, Array]:
-        density = jnp.where(data.mask[None, :] > 0, jnp.maximum(scores(sharpness), -1e6), 0.0)  # [E, V]
+    table = jax.lax.map(scores, jnp.asarray(SHARPNESS))  # [S, E, V]
+
+    def mixed(choice: Array) -> tuple[Array, Array]:
+        """Log weights [E] and total log density of the members at their choices [E] of the sharpness."""
+        density = table[choice, members]
 
         def climb(share: Array, _: None) -> tuple[Array, None]:
             # expectation maximisation; one row's worth of every member for few rows
             mine = jax.nn.softmax(density + share[:, None], axis=0) @ data.mask + 1.0
             return jnp.log(mine) - jnp.log(jnp.sum(mine)), None
 
-        share, _ = jax.lax.scan(climb, params["share"] * 0 - np.float32(np.log(settings.ensemble)), length=50)
+        start = jnp.full(settings.ensemble, np.float32(-np.log(settings.ensemble)))
+        share, _ = jax.lax.scan(climb, start, length=CLIMBS)
         return share, data.mask @ jax.nn.logsumexp(density + share[:, None], axis=0)
 
-    shares, value = jax.lax.map(mixed, jnp.asarray(SHARPNESS))
-    best = jnp.nanargmax(value)
-    sharpness = jnp.broadcast_to(jnp.asarray(SHARPNESS)[best], params["sharpness"].shape)
-    return {**params, "sharpness": sharpness, "share": shares[best]}
+    def improve(choice: Array, changed: Array) -> tuple[Array, None]:
+        """The best sharpness of the members `changed` [E], the others' held."""
+        tries = jnp.where(changed[None, :], jnp.arange(len(SHARPNESS), dtype=jnp.int32)[:, None], choice[None, :])
+        return tries[jnp.nanargmax(jax.vmap(lambda t: mixed(t)[1])(tries))], None
+
+    # all together, then one by one
+    turns = jnp.concatenate(
+        [jnp.ones((1, settings.ensemble), bool), *[jnp.eye(settings.ensemble, dtype=bool)] * SWEEPS]
+    )
+    choice, _ = jax.lax.scan(improve, jnp.zeros(settings.ensemble, jnp.int32), turns)
+    return {**params, "sharpness": jnp.asarray(SHARPNESS)[choice], "share": mixed(choice)[0]}
 
 
 def _objective(

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from bayessim_mjx.inference import InferenceSettings, combine, condition, fit, infer, init, mdn
+from bayessim_mjx.inference.fit import _Data, _weigh
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 
 SPACE = ParameterSpace([Parameter("mass", 1.0, 0.5, 2.5), Parameter("length", 1.0, -2.0, 4.0)])
@@ -138,6 +139,22 @@ def test_fine_tuning_never_ends_worse_on_the_held_out_rows(trained):
     state, worse = fit(key(3), again, thetas, x)  # a learning rate that ruins everything
     assert float(worse.gain) == pytest.approx(float(info.gain), abs=1e-4) and int(worse.best) == -1
     assert info.best >= 0 and int(state.fits) == 2
+
+
+def test_each_member_has_the_sharpness_that_held_out_rows_ask_for():
+    """Truths are half the time 0.2, half the time 0.6 off; both members say 0.35."""
+    settings = dataclasses.replace(SMALL, components=1, hiddenLayers=(1,), ensemble=2)
+    one = jax.tree.map(jnp.zeros_like, mdn.init(key(), settings, 1, 1))
+    one["layers"][-1]["b"] = one["layers"][-1]["b"].at[2].set(8 * np.arctanh(np.log(1 / 0.35) / 8))
+    params = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), one)
+    n = 20_000
+    y = np.where(np.arange(n) % 2, 0.2, 0.6) * np.random.default_rng(0).normal(size=n)
+    y, rows = jnp.asarray(y[:, None], jnp.float32), jnp.arange(n)
+    data = _Data(jnp.zeros((n, 1)), y, jnp.zeros(n), rows < 0, rows, jnp.ones(n), None, None)
+    found = jax.jit(lambda p: _weigh(p, data, settings))(params)
+    order = np.argsort(found["sharpness"])
+    np.testing.assert_allclose(np.asarray(found["sharpness"])[order], [0.35 / 0.6, 0.35 / 0.2], rtol=0.15)
+    np.testing.assert_allclose(np.exp(found["share"]), 0.5, atol=0.12)
 
 
 def test_one_parameter_and_few_rows():
