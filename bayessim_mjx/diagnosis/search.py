@@ -40,7 +40,7 @@ __all__ = [
 
 
 FAR = 1.5  # noises that remain: beyond, the search also tries other ways
-ELSEWHERE, PAIRS = 3, 3  # times, and pairs to go on from
+ELSEWHERE = 3  # times
 BETTER = 0.8  # of the gap that remains, which another way has to undercut
 
 
@@ -145,34 +145,32 @@ def _greedy(race: Race, model: Model, say: Progress, barred: Sequence[str] = (),
 def _elsewhere(race: Race, model: Model, say: Progress) -> Model:
     """Other ways than the greedy one, where that ends far above the noise: one effect may stand in for several.
 
-    Without each of its effects in turn, and from the best pairs that it does not hold, the search goes on as before.
+    Each of its effects in turn is left out, and the search goes on from the rest without that law.
     """
     for _ in range(ELSEWHERE):
         if not model.effects or race.at_noise(model, FAR**2):
             return model
-        own = {c.label for c in model.effects}
-        starts = [(without(race, model, e, say), e.label) for e in model.effects if len(model.effects) > 1]
-        pairs = [m for m in ranked(race, 2) if not {c.label for c in m.effects} <= own]
-        starts += [(m, "") for m in pairs[:PAIRS]]
-        found = [_forward(race, m, say, (), float("inf"), without=label) for m, label in starts]
-        others = [m for m in found if m is not None]
-        if not others:
-            return model
-        other = _greedy(race, min(others, key=lambda m: m.total), say)
+        others = [_instead(race, model, e, say) for e in model.effects]
+        best = min((m for m in others if m is not None), key=lambda m: m.total, default=model)
         floor = race.noise * len(model.cost)
-        if other.total - floor > BETTER * (model.total - floor):
+        if best.total - floor > BETTER * (model.total - floor):
             return model
-        model = other
+        model = best
     return model
 
 
-def _forward(
-    race: Race, model: Model, say: Progress, barred: Sequence[str], size: float, without: str = ""
-) -> Model | None:
+def _instead(race: Race, model: Model, effect: Candidate, say: Progress) -> Model | None:
+    """Where the search leads that may not use this effect's law, from the model's other effects."""
+    rest = without(race, model, effect, say)
+    start = _forward(race, rest, say, (effect.effect,), float("inf"))
+    return None if start is None else _greedy(race, start, say, barred=(effect.effect,))
+
+
+def _forward(race: Race, model: Model, say: Progress, barred: Sequence[str], size: float) -> Model | None:
     if len(model.effects) >= race.settings.most:
         return None
     others = [c for c in race.candidates if all(compatible(c, e) for e in model.effects) and c.effect not in barred]
-    others = [c for c in others if model.size + len(c.coordinates) <= size and c.label != without]
+    others = [c for c in others if model.size + len(c.coordinates) <= size]
     found = [s for s in screen(race.fitter, model.job, others, race.settings.screened) if s.gain > 0][
         : race.settings.pairs
     ]

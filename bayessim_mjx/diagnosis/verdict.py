@@ -11,6 +11,7 @@ import numpy as np
 
 from bayessim_mjx.diagnosis.candidates import Candidate
 from bayessim_mjx.diagnosis.models import Model
+from bayessim_mjx.diagnosis.race import polish
 from bayessim_mjx.diagnosis.screen import screen
 from bayessim_mjx.diagnosis.search import (
     Progress,
@@ -104,6 +105,7 @@ def _rivals(race: Race, winner: Model, effect: Candidate, say: Progress) -> list
         models = fit_models(race, [(rest, s) for s in found], "rivals", say)
     else:
         models = [m for m in ranked(race, 1) if m.effects[0] is not effect]
+    models = [_finished(race, winner, m) for m in models]
     out = []
     for model in models:
         (other,) = [c for c in model.effects if c not in rest.effects]
@@ -117,6 +119,12 @@ def _rivals(race: Race, winner: Model, effect: Candidate, say: Progress) -> list
                     if r.closure > race.closure(winner) + 0.01
                 ]
     return sorted(out, key=lambda r: -r.closure)[:6]
+
+
+def _finished(race: Race, winner: Model, model: Model) -> Model:
+    """A simpler rival that may not have come to its end: a few steps more where the winner is at the noise already."""
+    simpler = model.size < winner.size and model.total < 100.0 * winner.total
+    return polish(race, model) if simpler and race.at_noise(winner, NEAR) and not race.at_noise(model, NEAR) else model
 
 
 def _rival(race: Race, winner: Model, effect: Candidate, others: tuple[Candidate, ...], model: Model) -> list[Rival]:
