@@ -88,7 +88,7 @@ class Loop:
     def chart(self) -> str:
         """Coordinates in which the domain is a mixture of Gaussians."""
         b = self.settings
-        return "plain" if b.modelClass is None else rounds.chart_of(InferenceSettings.of(b).chart)
+        return "plain" if b.modelClass is None else rounds.chart_of(InferenceSettings.of(b).at(self.env.space).chart)
 
     def key(self, round_: int, purpose: str) -> Array:
         """Every random draw has its own key, a function of the seed alone: a resumed run draws the same."""

@@ -51,7 +51,7 @@ def blank(loop: Loop) -> dict[str, Any]:
 
 
 def _no_factors(loop: Loop, rows: int) -> Distribution:
-    settings = InferenceSettings.of(loop.settings)
+    settings = InferenceSettings.of(loop.settings).at(loop.env.space)
     factor = Distribution.prior(loop.env.space, settings.components * settings.ensemble, settings.chart)
     return jax.tree.map(lambda leaf: jnp.zeros((rows, *leaf.shape)), factor)
 

@@ -28,7 +28,7 @@ SUMMARIZERS = {  # summaries of a trajectory, and what a number at the end of th
 }
 # classes of posterior networks: MDNN, or random Fourier features as MDRFF[_<kernel>[_<bandwidth>]]
 MODEL = re.compile(r"MDNN|MDRFF(?:_(RBF|Laplace|Matern12|Matern32|Matern52)(?:_(median|validation|[0-9][0-9.e+-]*))?)?")
-COORDINATES = ("plain", "truncated", "probit", "logit")
+COORDINATES = ("plain", "truncated", "probit", "logit", "auto")
 PROPOSALS = ("prior", "apt", "truncated", "division")
 UNCORRECTED = (("apt", "truncated"), ("apt", "logit"), ("division", "logit"))  # (proposal, coordinates)
 ACTIVATIONS = ("elu", "relu", "selu", "tanh", "swish", "gelu")
@@ -264,7 +264,8 @@ class BayesSimConfig(Section):
     coordinates: str = setting(
         "plain",
         "in which the posterior is a Gaussian mixture: plain (in the range, cut off at its ends), truncated (cut off "
-        "in training too), probit (the prior is a Gaussian) or logit",
+        "in training too), probit (the prior is a Gaussian), logit, or auto: probit where every prior is Gaussian, "
+        "otherwise plain",
         choices=COORDINATES,
     )
     proposal: str = setting(

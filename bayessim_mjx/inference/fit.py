@@ -77,6 +77,7 @@ def init(key: Array, settings: InferenceSettings, space: Any, dim_x: int) -> Fit
     """Fresh network for summaries of `dim_x` features and the parameters of `space`."""
     if dim_x < 1:
         raise ValueError(f"dim_x = {dim_x}: a summary needs at least one feature")
+    settings = settings.at(space)
     member = partial(mdn.init, settings=settings, dim_x=dim_x, d=len(space))
     params = jax.vmap(member)(jax.random.split(key, settings.ensemble))
     known, fits = jnp.ones(len(space), bool), jnp.asarray(0, jnp.int32)

@@ -216,6 +216,15 @@ def test_wrong_input_is_refused(trained):
         InferenceSettings(components=0)
 
 
+def test_coordinates_are_probit_where_every_prior_is_gaussian():
+    """There a linear simulator's posterior is one Gaussian; other priors, and what is asked for, stay as they are."""
+    gaussian = [Parameter(name, 0.0, -2.0, 2.0, prior="gaussian", mean=0.0, sd=0.3) for name in "ab"]
+    spaces = ParameterSpace(gaussian), ParameterSpace([*gaussian, *SPACE.parameters]), SPACE
+    settings = dataclasses.replace(SMALL, coordinates="auto")
+    assert [init(key(), settings, space, 4).settings.coordinates for space in spaces] == ["probit", "plain", "plain"]
+    assert dataclasses.replace(SMALL, coordinates="logit").at(spaces[0]).chart == "logit"
+
+
 def test_settings_are_taken_from_a_configuration_section():
     @dataclasses.dataclass
     class Section:
