@@ -25,10 +25,8 @@ INVOLVED = 0.1  # share of an effect's variance that comes from a direction
 MOST, ROUNDS, STEPS = 6, 2, 2  # directions, moves along them, Newton steps in all others
 SHARES = (1.0, 0.5, 0.25)  # of the step along the ridges, tried in turn
 REACH = 1.5  # in units of UNIFORM: how far along a direction is simulated
-NATS, ROUNDING = (
-    2.0,
-    0.005,
-)  # of log-likelihood, and of the cost: a rise of less is no knowledge (single precision alone brings as much)
+NATS = 2.0  # of log-likelihood, and
+ROUNDING = 0.005  # of the cost: a smaller rise is no knowledge (single precision alone brings as much)
 
 
 @dataclass(frozen=True, eq=False)
