@@ -76,6 +76,8 @@ def read(out):
     return json.loads((out / "gap_loop.json").read_text())
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_true_and_wrong_diagnoses_and_a_second_start(folder, tmp_path, trained, capsys):
     out = tmp_path / "out"
     assert command(folder, "truth", out) == 0
