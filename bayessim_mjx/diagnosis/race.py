@@ -36,7 +36,7 @@ class Settings:
 
     relevance: float = 0.05
     more: float = 0.15
-    least: float = 0.001
+    least: float = 0.003
     drop: float = 0.03
     evidence: float = 5.0
     t: float = 2.0
