@@ -41,7 +41,7 @@ __all__ = [
 
 FAR = 1.5  # noises that remain: beyond, the search also tries other ways
 ELSEWHERE = 3  # times
-BETTER = 0.8  # of the gap that remains, which another way has to undercut
+BETTER = 0.5  # of the gap that remains, which another way has to undercut
 
 
 def run(fitter: Fitter, candidates: Sequence[Candidate], settings: Settings, progress: Progress | None = None) -> Race:
