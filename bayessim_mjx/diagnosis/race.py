@@ -82,8 +82,7 @@ class Race:
         added = [e for e in new.effects if e not in old.effects]
         if c.share < 0.3 and not all(self.distinct(new, e) for e in added):
             return False
-        above = self.base.total - self.noise * len(self.base.cost)
-        if old.effects and old.total - new.total < s.least * above:
+        if old.effects and old.total - new.total < s.least * self._above(self.base):
             return False
         relevance = s.more if old.effects else s.relevance
         if not (c.share > relevance and c.drop > s.drop and c.evidence > s.evidence + many):
@@ -126,8 +125,10 @@ class Race:
 
     def left(self, model: Model) -> float:
         """Share of the base model's squared gap above the noise that `model` leaves."""
-        floor = self.noise * len(model.cost)
-        return max(model.total - floor, 0.0) / max(self.base.total - floor, 1e-12)
+        return max(self._above(model), 0.0) / max(self._above(self.base), 1e-12)
+
+    def _above(self, model: Model) -> float:
+        return model.total - self.noise * len(model.cost)
 
     def _floor(self) -> float:
         return min(self.noise * len(self.base.cost), min((m.total for m in self.models.values()), default=np.inf))

@@ -152,8 +152,7 @@ def _elsewhere(race: Race, model: Model, say: Progress) -> Model:
             return model
         others = [_instead(race, model, e, say) for e in model.effects]
         best = min((m for m in others if m is not None), key=lambda m: m.total, default=model)
-        floor = race.noise * len(model.cost)
-        if best.total - floor > BETTER * (model.total - floor):
+        if race.left(best) > BETTER * race.left(model):
             return model
         model = best
     return model
