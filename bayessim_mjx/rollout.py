@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import inspect
 import math
 from collections.abc import Callable, Sequence
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 from flax import struct
+from jax.interpreters import partial_eval
 
 from bayessim_mjx.physics import Physics, control_step
 
@@ -71,12 +73,12 @@ def _rollout(env: Env, length: int) -> Callable[..., Trajectory]:
     def run(policy_fn: PolicyFn, key: jax.Array, thetas: jax.Array) -> Trajectory:
         worlds = thetas.shape[0]
         reset_key, key = jax.random.split(key)
-        state = jax.vmap(env.reset)(jax.random.split(reset_key, worlds), thetas)
+        state = jax.vmap(traced(env.reset))(jax.random.split(reset_key, worlds), thetas)
 
         def step(carry: tuple, keys: jax.Array) -> tuple[tuple, tuple]:
             state, alive, action = carry
             action = select(~alive, action, jax.vmap(policy_fn)(keys, state.obs))
-            after = select(~alive, state, jax.vmap(env.step)(state, action))
+            after = select(~alive, state, jax.vmap(traced(env.step))(state, action))
             terminated = after.info["terminated"] * alive
             truncated = after.info["truncated"] * alive
             row = (
@@ -164,16 +166,17 @@ def collect(
     `ring(N)` worlds: for its k-th new episode in this call a world takes the entry k `_stride(R)` further in its ring,
     so that all draw different ones, and theta is drawn anew with each episode. Whole rings can be run apart.
     Returns the last states and time-major arrays [T, N, ...]: observation and final_observation (the next one,
-    before any reset) by group, reward, terminated, truncated, extras.
+    before any reset) by group, reward, terminated, truncated, extras. What later steps do not depend on is not carried
+    on: it stays in the states as it was.
     """
     worlds = env_states.reward.shape[0]
-    size = ring(worlds)
+    size, lasting = ring(worlds), _lasting(env, env_states, tuple(groups))
     stride, first = _stride(size), jnp.arange(worlds) // size * size
 
     def step(carry: tuple[State, jax.Array], draw: Any) -> tuple[tuple, dict]:
         state, index = carry
         action, extras = policy_fn(draw, state.obs)
-        after = jax.vmap(env.step)(state, action)
+        after = jax.vmap(traced(env.step))(state, action)
         terminated = after.info["terminated"]
         truncated = after.info["truncated"] * (1 - terminated)
         ended = terminated + truncated > 0
@@ -185,12 +188,46 @@ def collect(
             "truncated": truncated,
             "extras": extras,
         }
-        fresh = jax.tree.map(lambda x: x[index], pool)
         following = first + (index - first + stride) % size
-        return (select(ended, fresh, after), jnp.where(ended, following, index)), row
+
+        def next_one(lasts: bool, old: jax.Array, new: jax.Array, fresh: jax.Array) -> jax.Array:
+            return select(ended, fresh[index], new) if lasts else old
+
+        return (jax.tree.map(next_one, lasting, state, after, pool), jnp.where(ended, following, index)), row
 
     (state, _), batch = jax.lax.scan(step, (env_states, jnp.arange(worlds)), draws)
     return state, batch
+
+
+@lru_cache(maxsize=64)
+def traced(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The same function (an environment's `reset` or `step`), written out once for all programs that it is part of."""
+    return jax.jit(function)
+
+
+def _lasting(env: Env, states: State, groups: tuple[str, ...]) -> State:
+    """Which arrays of a batch of states later observations (of these groups), rewards and ends depend on; of bools.
+
+    The states of a simulator hold much that each step computes anew: carrying it on costs as many copies.
+    """
+    one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), states)
+
+    def step(state: State, action: jax.Array) -> tuple[State, Any]:
+        after = traced(env.step)(state, action)
+        final = {g: after.info["final_observation"][g] for g in groups}
+        return after, (final, after.reward, after.info["terminated"], after.info["truncated"])
+
+    closed, shapes = jax.make_jaxpr(step, return_shape=True)(one, jax.ShapeDtypeStruct((env.action_size,), jnp.float32))
+    seen = jax.tree.map(lambda _: False, one)
+    seen = dataclasses.replace(seen, obs={g: g in groups for g in seen.obs})
+    needed, structure = jax.tree.flatten(seen)
+    shown = [True] * len(jax.tree.leaves(shapes[1]))
+    while True:  # what is needed now, and what it is computed from
+        used = partial_eval.dce_jaxpr(closed.jaxpr, [*needed, *shown])[1]
+        more = [a or b for a, b in zip(needed, used, strict=False)]
+        if more == needed:
+            return jax.tree.unflatten(structure, needed)
+        needed = more
 
 
 def ring(worlds: int) -> int:

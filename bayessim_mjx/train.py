@@ -61,7 +61,7 @@ class Training:
         from bayessim_mjx import rl
         from bayessim_mjx.monitor.wall import marked
 
-        state = rl.init(self.env, self.config.ppo, self.key, self.domain, mesh(self.config))
+        state = rl.start(self.env, self.config.ppo, self.key, self.domain, mesh(self.config), self.teacher)
         if resume and self.run.checkpoints:
             tree, meta = self.run.restore("latest", self.tree(state), fall_back=True)
             return tree["state"], marked(meta)

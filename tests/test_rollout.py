@@ -13,7 +13,7 @@ import probes  # noqa: E402
 
 from bayessim_mjx.registry import make  # noqa: E402
 from bayessim_mjx.rl import networks, normalise  # noqa: E402
-from bayessim_mjx.rollout import _stride, collect, replay, rollout  # noqa: E402
+from bayessim_mjx.rollout import _rollout, _stride, collect, replay, rollout  # noqa: E402
 
 
 def key(seed):
@@ -56,15 +56,14 @@ def test_another_key_theta_or_policy_of_the_same_kind_does_not_recompile():
         networks.Policy(networks.init(key(i), 1, 1, 1, (4,), (4,), 1.0)["actor"], normalise.init(1)) for i in (0, 1)
     ]
     a = rollout(env, policies[0], key(0), jnp.ones((2, 1)), 3)
-    traces = env.traces
     b = rollout(env, policies[1], key(1), 2 * jnp.ones((2, 1)), 3)
-    assert env.traces == traces
+    assert _rollout(env, 3)._cache_size() == 1
     assert (a.action != b.action).any()
     c = rollout(env, policies[1].act, key(1), 2 * jnp.ones((2, 1)), 3)  # a method is another function, once
     np.testing.assert_array_equal(b.action, c.action)
-    traces = env.traces
     rollout(env, policies[0].act, key(1), 2 * jnp.ones((2, 1)), 3)
-    assert env.traces == traces
+    assert _rollout(env, 3)._cache_size() == 2
+    assert env.traces == 1
 
 
 def test_bad_sizes_are_refused():
@@ -99,6 +98,25 @@ def test_collection_starts_new_episodes_with_new_thetas_from_the_pool():
     np.testing.assert_array_equal(batch["final_observation"]["critic"][3, :, 1], [0, 1, 2])
     np.testing.assert_array_equal(states.obs["policy"][:, 0], [2, 2, 2])
     np.testing.assert_array_equal(batch["extras"]["index"][5], [0, 1, 2])
+
+
+def test_only_what_later_steps_depend_on_is_carried_on():
+    """Of a sum that is rewarded all goes on, through what only it depends on; what is only shown stays as it was."""
+
+    class Rewarded(probes.Clock):
+        def reset(self, key, theta=None):
+            state = super().reset(key, theta)
+            return state.replace(metrics={"shown": jnp.zeros(())}, info={**state.info, "sum": 0.0, "pace": 1.0})
+
+        def step(self, state, action):
+            total = state.info["sum"] + state.info["pace"]
+            after = super().step(state, action).replace(reward=total, metrics={"shown": total})
+            return after.replace(info={**after.info, "sum": total, "pace": 2 * state.info["pace"]})
+
+    states, batch = collected(Rewarded(), [0, 1], [10, 11], 6)
+    np.testing.assert_array_equal(batch["reward"][:, 0], [1, 3, 7, 15, 1, 3])
+    assert (float(states.info["sum"][0]), float(states.info["pace"][0])) == (3, 4)
+    np.testing.assert_array_equal(states.metrics["shown"], 0)
 
 
 def test_a_termination_on_the_last_step_is_no_truncation():

@@ -4,7 +4,7 @@ from bayessim_mjx.rl import ppo
 from bayessim_mjx.rl.evaluate import evaluate, evaluate_together
 from bayessim_mjx.rl.networks import Policy
 from bayessim_mjx.rl.ppo import TrainState, init, make_update, policy_of
-from bayessim_mjx.rl.train import run, train
+from bayessim_mjx.rl.train import run, start, train
 
 __all__ = [
     "Policy",
@@ -16,5 +16,6 @@ __all__ = [
     "policy_of",
     "ppo",
     "run",
+    "start",
     "train",
 ]

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from bayessim_mjx.rl.networks import Policy
+from bayessim_mjx.rollout import traced
 
 if TYPE_CHECKING:
     from bayessim_mjx.env import Env
@@ -53,14 +54,14 @@ def _evaluate(env: Env) -> Callable[..., dict[str, jax.Array]]:
     def run(policy: Policy, key: jax.Array, thetas: jax.Array) -> dict[str, jax.Array]:
         count = thetas.shape[0]
         reset_key, key = jax.random.split(key)
-        state = jax.vmap(env.reset)(jax.random.split(reset_key, count), thetas)
+        state = jax.vmap(traced(env.reset))(jax.random.split(reset_key, count), thetas)
 
         def going(carry: tuple) -> jax.Array:
             return (carry[0] < env.episode_length) & carry[2].any()
 
         def step(carry: tuple) -> Any:
             t, state, alive, total, length = carry
-            state = jax.vmap(env.step)(state, policy(jax.random.fold_in(key, t), state.obs))
+            state = jax.vmap(traced(env.step))(state, policy(jax.random.fold_in(key, t), state.obs))
             total, length = total + jnp.where(alive, state.reward, 0.0), length + alive
             ended = state.info["terminated"] + state.info["truncated"] > 0
             return t + 1, state, alive & ~ended, total, length

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jax.sharding import Mesh
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from bayessim_mjx.config import PPOConfig
 from bayessim_mjx.errors import UserError
@@ -20,7 +20,7 @@ from bayessim_mjx.rl.gae import gae
 from bayessim_mjx.rl.networks import Policy
 from bayessim_mjx.rl.rnd import RND
 from bayessim_mjx.rl.sharding import EVERYWHERE, FIRST, SECOND
-from bayessim_mjx.rollout import collect, ring
+from bayessim_mjx.rollout import collect, ring, traced
 
 if TYPE_CHECKING:
     from bayessim_mjx.distributions import Distribution
@@ -98,7 +98,7 @@ def _reset(env: Env, key: jax.Array, domain: Distribution | None, worlds: int, m
         thetas = jnp.tile(jnp.asarray(env.space.nominal, jnp.float32), (worlds, 1))
     else:
         thetas = domain.sample(theta_key, worlds)
-    reset = sharding.local(jax.vmap(env.reset), mesh, (FIRST, FIRST), FIRST)
+    reset = sharding.local(jax.vmap(traced(env.reset)), mesh, (FIRST, FIRST), FIRST)
     return reset(jax.random.split(reset_key, worlds), thetas)
 
 
@@ -140,6 +140,25 @@ def init(
 
     mesh: the devices that share the worlds, see `device.mesh`; None: the default device. Results differ by rounding.
     """
+    check(env, config, mesh)
+    program = _init(_for_learner(env, config), config, mesh)
+    return program(*((key, domain) if mesh is None else sharding.agreed((key, domain))))
+
+
+def outline(env: Env, config: PPOConfig, domain: Distribution | None = None, mesh: Mesh | None = None) -> TrainState:
+    """Shapes, types and layout of what `init` returns."""
+    shapes = jax.eval_shape(_init(_for_learner(env, config), config, mesh), jax.random.PRNGKey(0), domain)
+    if mesh is None:
+        return shapes
+
+    def laid_out(x: jax.ShapeDtypeStruct, spec: PartitionSpec) -> jax.ShapeDtypeStruct:
+        return jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=NamedSharding(mesh, spec))
+
+    return jax.tree.map(laid_out, shapes, layout(shapes))
+
+
+def check(env: Env, config: PPOConfig, mesh: Mesh | None = None) -> None:
+    """Refuse what does not go together."""
     if "policy" not in env.observation_size:
         raise ValueError(f"observation groups {sorted(env.observation_size)}: a policy needs the group 'policy'")
     if config.policy_theta and getattr(env, "target", "") != "policy":
@@ -156,7 +175,6 @@ def init(
         )
     _mirrors(env, config)
     _check_shares(config, mesh)
-    return _init(env, config, mesh)(*((key, domain) if mesh is None else sharding.agreed((key, domain))))
 
 
 @lru_cache(maxsize=32)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +14,7 @@ import numpy as np
 from jax.sharding import Mesh
 
 from bayessim_mjx.config import PPOConfig
+from bayessim_mjx.device import cores
 from bayessim_mjx.rl import distil, ppo, sharding
 from bayessim_mjx.rl.networks import Policy
 from bayessim_mjx.rl.ppo import TrainState
@@ -42,7 +44,7 @@ def tags(config: PPOConfig) -> tuple[str, ...]:
 
 
 @lru_cache(maxsize=32)
-def _make_chunk(env: Env, config: PPOConfig, distils: bool = False) -> Callable[..., Any]:
+def _make_chunk(env: Env, config: PPOConfig, distils: bool = False) -> Any:
     """chunk(state, given, count): `count` updates in one dispatch, one program for any count. Takes over the state.
 
     given: what an update needs besides, the domain, and the teacher where one is imitated.
@@ -58,6 +60,38 @@ def _make_chunk(env: Env, config: PPOConfig, distils: bool = False) -> Callable[
         return jax.lax.fori_loop(0, count, body, (state, zeros))
 
     return jax.jit(chunk, donate_argnums=0)
+
+
+def start(
+    env: Env,
+    config: PPOConfig,
+    key: jax.Array,
+    domain: Distribution | None = None,
+    mesh: Mesh | None = None,
+    teacher: Policy | None = None,
+) -> TrainState:
+    """`ppo.init`, with the program of `run` compiled beside its own where there are processor cores for both."""
+    ppo.check(env, config, mesh)
+    if cores() == 1 or jax.process_count() > 1:
+        return ppo.init(env, config, key, domain, mesh)
+    given = _given(domain, teacher, mesh)
+    program = _make_chunk(env, config, teacher is not None)
+
+    def compile_program() -> None:
+        state = ppo.outline(env, config, domain, mesh)
+        program.lower(state, given, np.int32(1)).compile()
+
+    with ThreadPoolExecutor(1) as beside:
+        compiling = beside.submit(compile_program)
+        state = ppo.init(env, config, key, domain, mesh)
+        compiling.result()
+    return state
+
+
+def _given(domain: Distribution | None, teacher: Policy | None, mesh: Mesh | None) -> tuple:
+    """What an update needs besides the state, the same on all devices."""
+    given = (domain,) if teacher is None else (domain, teacher)
+    return given if mesh is None else sharding.agreed(given)
 
 
 def run(
@@ -77,9 +111,7 @@ def run(
     """
     total = config.max_iterations if iterations is None else iterations
     state = sharding.put(state, state.mesh, ppo.layout(state))  # the caller's state stays valid
-    given = (domain,) if teacher is None else (domain, teacher)
-    if state.mesh is not None:
-        given = sharding.agreed(given)
+    given = _given(domain, teacher, state.mesh)
     done, metrics = 0, {}
     while done < total:
         count = min(config.log_interval, total - done)
@@ -113,6 +145,6 @@ def train(
 ) -> tuple[Policy, Metrics]:
     """Train from scratch, or go on from `state` (`key` and `mesh` are then not used); see `run`."""
     if state is None:
-        state = ppo.init(env, config, key, domain, mesh)
+        state = start(env, config, key, domain, mesh)
     state, metrics = run(env, config, state, domain, iterations, progress)
     return ppo.policy_of(state), metrics
