@@ -11,7 +11,7 @@ import numpy as np
 from bayessim_mjx.effects.bodies import moved
 from bayessim_mjx.effects.effect import Effect, Quantity
 from bayessim_mjx.effects.gravity_tilt import tilted
-from bayessim_mjx.effects.site import Site, SubStep, find
+from bayessim_mjx.effects.site import Motion, Site, SubStep, find
 from bayessim_mjx.errors import UserError
 
 STOP = 0.3  # rad: a base that topples leans against something
@@ -22,13 +22,13 @@ SETTLING = 3  # rounds of finding how the robot's weight tilts the base at the s
 class BaseFlexibility(Effect):
     """I p'' = (moment of the robot on its base) - k p - d p', I = k / (2 pi f)^2, d = 2 zeta sqrt(k I).
 
-    p: tilt of the base about the world's x and y axes through the origin of the robot's first body, small. Robot and
-    base are solved together: gravity tilts in the robot's frame, p' and p'' act on all bodies. Left out: what
-    constraints (contacts, joint limits) do to the base. At the start the base has settled under the robot's weight.
-    Robots with a fixed base only.
+    p: tilt of the base about the world's x and y axes, small. They run `depth` below the origin of the robot's first
+    body: a table rocks about its feet and carries the robot to and fro. Robot and base are solved together: gravity
+    tilts in the robot's frame, p' and p'' act on all bodies. Left out: what constraints (contacts, joint limits) do to
+    the base. At the start the base has settled under the robot's weight. Robots with a fixed base only.
 
     Parameters: `compliance` 1/k, rad/(N m), neutral 0; `frequency` f, Hz, of the base without the robot; `damping`
-    zeta, likewise; the latter two without effect where the compliance is 0.
+    zeta, likewise; `depth`, m; the latter three without effect where the compliance is 0.
     """
 
     where: str | tuple[str, ...] = "world"
@@ -40,6 +40,7 @@ class BaseFlexibility(Effect):
         ),
         Quantity("frequency", 10.0, 2.0, 30.0, unit="Hz", grid=(0.1, 0.5), shape=True),
         Quantity("damping", 0.1, 0.01, 1.0, grid=(0.1,), shape=True),
+        Quantity("depth", 0.0, 0.0, 1.0, unit="m", grid=(0.0, 0.2), shape=True),
     )
 
     def bind(self, mj_model: mujoco.MjModel, timestep: float, substeps: int) -> Site:
@@ -51,24 +52,28 @@ class BaseFlexibility(Effect):
         return find(self, mj_model, timestep, substeps)
 
     def init(self, at: Site) -> Any:
-        return {"tilt": jnp.zeros(2), "rate": jnp.zeros(2), "fresh": jnp.ones((), bool)}
+        rest = jnp.zeros(2), jnp.zeros(2), jnp.ones((), bool), jnp.zeros((), bool)
+        return dict(zip(("tilt", "rate", "fresh", "moving"), rest, strict=True))
+
+    def on_start(self, at: Site, memory: Any, motion: Motion, theta: jax.Array) -> tuple[Any, Motion]:
+        return memory | {"moving": jnp.ones((), bool)}, motion  # how it rocks is not known: as it is pushed just then
 
     def on_force(self, at: Site, memory: Any, step: SubStep, theta: jax.Array) -> tuple[Any, jax.Array]:
-        compliance, frequency, ratio = at.values(theta)[0]
+        compliance, frequency, ratio, depth = at.values(theta)[0]
         slow, dt = 1.0 / (2 * jnp.pi * frequency), step.dt
         rate, lag = memory["rate"], 2 * ratio * slow
-        robot = _robot(at, step, rate)
-        tilt = jnp.where(memory["fresh"], _settled(robot, compliance), memory["tilt"])
-        gravity = tilted(robot.gravity, *tilt) - robot.gravity
-        carried = robot.momentum[:, 3:] @ gravity + robot.coriolis
-        moment = robot.moment(tilt) - robot.bias - robot.shed @ (step.force + carried)
+        robot = _robot(at, step, rate, depth)
+        settled = _settled(robot, compliance, step.force, memory["moving"])
+        tilt = jnp.where(memory["fresh"], settled, memory["tilt"])
+        carried, moment = robot.pushed(tilt, step.force)
         # a resolved spring is looked at where the sub-step begins, which costs no energy; a stiff one where it ends
         late = lag + dt * jnp.maximum(1.0 - (slow / dt) ** 2, 0.0)
         # Schur complement of the robot; all times 1/k
         matrix = compliance * (robot.inertia - robot.shed @ robot.coupling.T) + (slow**2 + dt * late) * jnp.eye(2)
         acceleration = _solve(matrix, compliance * moment - tilt - late * rate)
         new = jnp.clip(tilt + dt * (rate + dt * acceleration), -STOP, STOP)
-        left = {"tilt": new, "rate": (new - tilt) / dt, "fresh": jnp.zeros((), bool)}
+        no = jnp.zeros((), bool)
+        left = {"tilt": new, "rate": (new - tilt) / dt, "fresh": no, "moving": no}
         return left, jnp.where(compliance > 0, carried - robot.coupling.T @ acceleration, 0.0)
 
     def edit(self, spec: mujoco.MjSpec, values: dict[str, dict[str, float]]) -> str | None:
@@ -98,12 +103,18 @@ class _Robot:
         """Of gravity, `[2]`."""
         return jnp.cross(self.lever, tilted(self.gravity, *tilt))[:2]
 
+    def pushed(self, tilt: jax.Array, force: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Force on the joints `[nv]` of a tilted base, and the moment `[2]` on it where it does not accelerate."""
+        gravity = tilted(self.gravity, *tilt) - self.gravity
+        carried = self.momentum[:, 3:] @ gravity + self.coriolis
+        return carried, self.moment(tilt) - self.bias - self.shed @ (force + carried)
 
-def _robot(at: Site, step: SubStep, rate: jax.Array) -> _Robot:
+
+def _robot(at: Site, step: SubStep, rate: jax.Array, depth: jax.Array) -> _Robot:
     model, data = at.mj_model, step.data
     bodies = np.flatnonzero(np.isin(model.body_rootid, model.body_rootid[model.dof_bodyid]))
     roots = np.unique(model.body_rootid[bodies])
-    base = jnp.asarray(model.body_pos[roots[0]], jnp.float32)
+    base = jnp.asarray(model.body_pos[roots[0]], jnp.float32) - depth * jnp.array([0.0, 0.0, 1.0])
     # MuJoCo's spatial vectors (angular, linear) refer to the centre of mass of their tree
     momentum = _times(data._impl.crb[model.dof_bodyid], data.cdof)
     arm = data.subtree_com[model.body_rootid] - base
@@ -156,11 +167,12 @@ def _moments(force: jax.Array, arm: jax.Array) -> jax.Array:
     return (force[:, :3] + jnp.cross(arm, force[:, 3:]))[:, :2]
 
 
-def _settled(robot: _Robot, compliance: jax.Array) -> jax.Array:
-    """Tilt `[2]` at which the mount carries the robot at rest: p = moment(p) / k."""
+def _settled(robot: _Robot, compliance: jax.Array, force: jax.Array, moving: jax.Array) -> jax.Array:
+    """Tilt `[2]` at which the mount carries the robot, at rest or `moving` under this force: p = moment(p) / k."""
     tilt = jnp.zeros(2)
     for _ in range(SETTLING):
-        tilt = jnp.clip(compliance * robot.moment(tilt), -STOP, STOP)
+        moment = jnp.where(moving, robot.pushed(tilt, force)[1], robot.moment(tilt))
+        tilt = jnp.clip(compliance * moment, -STOP, STOP)
     return tilt
 
 

@@ -41,7 +41,7 @@ NEUTRAL = {
     "payload": [0.0] * 8,
     "gravity_tilt": [0.0] * 2,
     "external_force": [0.0] * 8,
-    "base_flexibility": [0, 10, 0.1],
+    "base_flexibility": [0, 10, 0.1, 0],
 }
 ROWS = 10
 
@@ -125,12 +125,12 @@ def test_external_force_is_xfrc_applied(slowness):
     assert np.abs(real - plain()).max() > 0.1
 
 
-def rocking(compliance, frequency, ratio):
+def rocking(compliance, frequency, ratio, depth):
     """The arm by MuJoCo C, at a tenth of the timestep, on a base with two more hinges, which starts at rest."""
     inertia = 1 / (compliance * (2 * np.pi * frequency) ** 2)
     damping = 2 * ratio * np.sqrt(inertia / compliance)
-    hinge = '<joint name="rock{0}" axis="{0}" stiffness="{1}" damping="{2}" armature="{3}"/>'
-    joints = "".join(hinge.format(axis, 1 / compliance, damping, inertia) for axis in ("0 1 0", "1 0 0"))
+    hinge = '<joint name="rock{0}" axis="{0}" pos="0 0 -{4}" stiffness="{1}" damping="{2}" armature="{3}"/>'
+    joints = "".join(hinge.format(axis, 1 / compliance, damping, inertia, depth) for axis in ("0 1 0", "1 0 0"))
     light = '<inertial pos="0 0 0" mass="1e-6" diaginertia="1e-9 1e-9 1e-9"/>'
     model = mujoco.MjModel.from_xml_string(ARM.format(dt=0.0002, mount=joints + light))
     data = mujoco.MjData(model)
@@ -143,7 +143,7 @@ def rocking(compliance, frequency, ratio):
     return plain() + apart  # without the error that the arm's own timestep makes with and without the base
 
 
-@pytest.mark.parametrize("base", [(0.004, 8.0, 0.1), (0.002, 25.0, 0.05), (0.01, 4.0, 0.3)])
+@pytest.mark.parametrize("base", [(0.004, 8.0, 0.1, 0.0), (0.002, 25.0, 0.05, 0.0), (0.01, 4.0, 0.3, 0.0), (0.004, 8.0, 0.1, 0.3)])
 def test_base_flexibility_is_two_more_hinges(base):
     real = rocking(*base)
     (q,) = run(theta(base_flexibility=base))
@@ -156,10 +156,10 @@ def test_stays_finite_and_tends_to_neutral():
     edges = [
         theta(payload=[10.0, 0.1, 0.1, 0.1, 10.0, -0.1, 0.1, -0.1]),
         theta(external_force=[30.0, -30.0, 30.0, 0.5] * 2),
-        theta(base_flexibility=[0.01, 2.0, 0.01]),
-        theta(base_flexibility=[0.1, 30.0, 0.01]),
+        theta(base_flexibility=[0.01, 2.0, 0.01, 0.0]),
+        theta(base_flexibility=[0.1, 30.0, 0.01, 1.0]),
         theta(payload=[1e-6, 0.1, 0.1, 0.1] * 2, external_force=[1e-5, 0, 0, 0.5] * 2),
-        theta(gravity_tilt=[1e-7, -1e-7], base_flexibility=[1e-8, 30.0, 0.01]),
+        theta(gravity_tilt=[1e-7, -1e-7], base_flexibility=[1e-8, 30.0, 0.01, 0.5]),
     ]
     q = run(*edges, theta())
     assert np.isfinite(q).all()
@@ -184,7 +184,7 @@ def native(name, place, **values):
          lambda: native("payload", "fore", mass=0.3, com_x=0.05, com_y=0.0, com_z=0.06)),
         ("gravity_tilt", [0.03, -0.05], [0, 1], lambda: native("gravity_tilt", "world", roll=0.03, pitch=-0.05)),
         ("external_force", [0, 0, 0, 0, 2.0, -1.0, 1.5, 0.0], [4, 5, 6], lambda: pushed([2.0, -1.0, 1.5])),
-        ("base_flexibility", [0.004, 8.0, 0.1], [0], lambda: rocking(0.004, 8.0, 0.1)),
+        ("base_flexibility", [0.004, 8.0, 0.1, 0.2], [0], lambda: rocking(0.004, 8.0, 0.1, 0.2)),
     ],
 )  # fmt: skip
 def test_recovers_what_mujoco_was_given(name, values, columns, real):
