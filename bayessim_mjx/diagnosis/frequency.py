@@ -27,6 +27,7 @@ DRAWS = 300
 LINE = 6.0  # a line stands so many times above its surroundings
 SMALL = 0.1  # of the force's rms: smaller orders are not mentioned
 STANDS = 4.0  # an order stands so many times above the others
+LEAST = 16  # values in a row that a spectrum is made of
 TURNS = 2.0  # periods that an order must have within the range of motion
 
 
@@ -58,7 +59,7 @@ class Spectra:
 def spectra(x: Sequence[Array], y: Sequence[Array], dt: float, log: Sequence[int] | None = None) -> Spectra:
     """Of pairs of series of any lengths; each is cut into segments of one common length that overlap by half."""
     shortest = min(len(a) for a in x)
-    size = min(int(round(SEGMENT / dt)), max(shortest, 16))
+    size = min(int(round(SEGMENT / dt)), max(shortest, LEAST))
     tapers = np.asarray(dpss(size, BANDWIDTH, TAPERS))
     rows, owner = [], []
     for i, (a, b) in enumerate(zip(x, y, strict=True)):
@@ -161,7 +162,10 @@ def analyse(
     disturbance = estimate(fitter, job) if disturbance is None else disturbance
     windows, rng = fitter.simulator.windows, np.random.default_rng(seed)
     inputs = motion_inputs.measured(windows, fitter.simulator.physics.mj_model)
-    parts = runs(windows)
+    nodes = disturbance.linear.nodes
+    parts = [part for part in runs(windows) if len(part) * min(nodes, windows.steps) >= LEAST]
+    if not parts:  # windows of chaotic motion lie apart
+        return [], []
     theta = fitter.vector(job.coordinates, job.values)
     error = fitter.simulator.run(theta[None], job.offsets[None])[0]
     draws = bootstrap_weights(windows.group, DRAWS, rng)

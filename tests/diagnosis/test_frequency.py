@@ -80,3 +80,11 @@ def test_a_delay_of_the_effort_is_found():
     for key in ("coherence_real", "coherence_sim", "gain_real", "gain_sim", "phase_real_deg", "phase_sim_deg"):
         assert len(found[0][key]) == len(found[0]["hz"])
     assert found[0]["orders"] == []
+
+
+def test_windows_too_short_and_apart_have_no_spectrum(monkeypatch):
+    """Of unstable motion only some windows are kept, so that none follows another."""
+    fitter, job = fitted(record(logs=2, seconds=2.0), iterations=0)
+    monkeypatch.setattr(frequency, "runs", lambda windows: [np.array([i]) for i in range(len(windows.log))])
+    monkeypatch.setattr(frequency, "LEAST", 2 * fitter.simulator.windows.steps)
+    assert frequency.analyse(fitter, job, disturbance.estimate(fitter, job)) == ([], [])
