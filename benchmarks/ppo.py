@@ -7,12 +7,15 @@
 
 One line of JSON per row, as it comes. Every race runs in a process of its own without any cache: its seconds are those
 since its command was given, imports and compilation included. Brax is judged by its own evaluations (128 episodes, as
-many as published), ours by the last 100 episodes of training, which it gets for nothing. `steps_per_s` is of training
-alone: the median over epochs or log intervals after the first. "wide" is ours with four times the worlds and a quarter
-of the steps: the same samples per update. One removed JAX function is put back for Brax.
+many as published); `seconds_without_evals` is without all of their time. Ours is judged by the same evaluation of the
+policies that it had at its log intervals, after the race; `training` has the returns of the last 100 episodes of
+training, which lag by an episode. `steps_per_s` is of training alone: the median over epochs or log intervals after
+the first. "wide" is ours with four times the worlds and a quarter of the steps: the same samples per update. A function
+that JAX no longer has is put back for Brax.
 """
 
 import argparse
+import contextlib
 import json
 import os
 import statistics
@@ -75,14 +78,24 @@ def ppo_config(published: dict, widening: int):
 class Race:
     """What one of them showed: [steps, seconds, reward], and when it got there."""
 
-    def __init__(self, started: float, goal: float) -> None:
-        self.started, self.goal = started, goal
+    def __init__(self, started: float, goal: float, limit: float | None) -> None:
+        self.started, self.goal, self.limit = started, goal, limit
         self.curve: list[list[float]] = []
+        self.marks: dict[str, float] = {}
 
-    def seen(self, steps: float, reward: float) -> bool:
-        """Note a reward; whether the goal is reached."""
-        self.curve.append([int(steps), round(time.time() - self.started, 2), round(float(reward), 1)])
-        return reward >= self.goal
+    def seconds(self) -> float:
+        return round(time.time() - self.started, 2)
+
+    def mark(self, name: str) -> None:
+        """Note when something was done."""
+        self.marks[name] = self.seconds()
+
+    def over(self, reward: float) -> bool:
+        """Whether to stop here: the goal is reached, or the time is over."""
+        return reward >= self.goal or self.late()
+
+    def late(self) -> bool:
+        return self.limit is not None and self.seconds() > self.limit
 
     def row(self, speeds: list[float]) -> dict:
         reached = next((point for point in self.curve if point[2] >= self.goal), [None, None, None])
@@ -91,48 +104,64 @@ class Race:
             "steps_per_s": round(statistics.median(later)) if later else None,
             "seconds_to_reward": reached[1],
             "steps_to_reward": reached[0],
-            "first_s": self.curve[0][1] if self.curve else None,
+            "marks": self.marks,
             "curve": self.curve,
         }
 
 
-class Reached(Exception):
-    """The goal is."""
+class Over(Exception):
+    """The race is."""
 
 
 def run_ours(name: str, published: dict, widening: int, seed: int, race: Race, whole: bool) -> dict:
-    """Until the goal, or four times the steps; `whole`: just all steps, and an evaluation like Brax's after them."""
+    """Until the goal, or four times the steps; `whole`: all steps, however early the goal is reached."""
+    race.mark("python")
     import jax
-    import jax.numpy as jnp
 
     from bayessim_mjx import registry, rl
 
+    race.mark("imports")
     env = registry.make(name, episodeLength=published["episode_length"])
     config = ppo_config(published, widening)
     total = max(1, round(published["num_timesteps"] / (config.num_envs * config.num_steps)))
     config = replace(config, log_interval=max(1, total // 50))
-    row: dict = {"worlds": config.num_envs}
+    row: dict = {"worlds": config.num_envs, "training": []}
     speeds: list[float] = []
+    policies: list = []
 
-    def progress(metrics: dict, _: object) -> None:
+    def progress(metrics: dict, state) -> None:
         speeds.append(metrics["Perf/total_fps"])
-        row["steps"] = metrics["env_steps"]
-        if race.seen(metrics["env_steps"], metrics["Train/mean_reward"]) and not whole and len(speeds) > 3:
-            raise Reached
+        policies.append((int(metrics["env_steps"]), race.seconds(), jax.device_get(rl.policy_of(state))))
+        row["training"].append(round(metrics["Train/mean_reward"], 1))
+        if race.late() or (race.over(metrics["Train/mean_reward"]) and not whole and len(speeds) > 3):
+            raise Over
 
-    try:
-        state = rl.init(env, config, jax.random.PRNGKey(seed))
-        state, _ = rl.run(env, config, state, iterations=total if whole else 4 * total, progress=progress)
-    except Reached:
-        pass
-    if whole:
-        result = rl.evaluate(env, rl.policy_of(state), jax.random.PRNGKey(1), jnp.zeros((128, 0)), deterministic=False)
-        row["reward"] = round(float(result["return"].mean()), 1)
-    return race.row(speeds) | row
+    race.mark("environment")
+    state = rl.start(env, config, jax.random.PRNGKey(seed))
+    race.mark("compiled")
+    with contextlib.suppress(Over):
+        rl.run(env, config, state, iterations=total if whole else 4 * total, progress=progress)
+    say({"env": name, "unjudged": row | {"steps": [p[0] for p in policies], "seconds": [p[1] for p in policies]}})
+    for (steps, taken, _), reward in zip(policies, judged(env, policies), strict=True):
+        race.curve.append([steps, taken, reward])
+    return race.row(speeds) | row | {"reward": race.curve[-1][2], "steps": race.curve[-1][0]}
 
 
-def run_brax(name: str, published: dict, seed: int, race: Race) -> dict:
+def judged(env, policies: list) -> list[float]:
+    """Mean returns of 128 episodes of each policy, with its noise, as Brax evaluates."""
+    import jax
+    import jax.numpy as jnp
+
+    from bayessim_mjx import rl
+
+    thetas = jnp.zeros((len(policies), 128, 0))
+    found = rl.evaluate_together(env, [p[2] for p in policies], jax.random.PRNGKey(1), thetas, deterministic=False)
+    return [round(float(x), 1) for x in found["return"].mean(1)]
+
+
+def run_brax(name: str, published: dict, seed: int, race: Race, whole: bool) -> dict:
     """Brax's trainer as published, on its own environment."""
+    race.mark("python")
     import jax
     import numpy as np
     from jax.sharding import Mesh, NamedSharding, PartitionSpec
@@ -152,13 +181,25 @@ def run_brax(name: str, published: dict, seed: int, race: Race) -> dict:
 
         options["wrap_env_fn"] = wrapper.wrap_for_brax_training
 
+    evaluations = [0.0]
+
     def progress(steps: int, metrics: dict) -> None:
-        race.seen(steps, metrics["eval/episode_reward"])
+        reward = float(metrics["eval/episode_reward"])
+        race.curve.append([int(steps), race.seconds(), round(reward, 1)])
+        evaluations[0] = float(metrics["eval/walltime"])  # of all so far
         if "training/sps" in metrics:
             speeds.append(float(metrics["training/sps"]))
+        say({"env": name, "brax": race.curve[-1]})
+        if race.late() or (race.over(reward) and not whole):
+            raise Over
 
-    train.train(environment=registry.make(name).env, seed=seed, progress_fn=progress, **options)
-    return race.row(speeds) | {"reward": race.curve[-1][2], "steps": race.curve[-1][0], "worlds": options["num_envs"]}
+    race.mark("imports")
+    with contextlib.suppress(Over):
+        train.train(environment=registry.make(name).env, seed=seed, progress_fn=progress, **options)
+    row = race.row(speeds) | {"reward": race.curve[-1][2], "steps": race.curve[-1][0], "worlds": options["num_envs"]}
+    if row["seconds_to_reward"] is not None and not whole:
+        row["seconds_without_evals"] = round(row["seconds_to_reward"] - evaluations[0], 2)
+    return row
 
 
 def work(task: dict) -> None:
@@ -166,9 +207,9 @@ def work(task: dict) -> None:
     import jax
 
     name, published = task["env"], PUBLISHED[task["env"]] | task["changes"]
-    race = Race(task["started"], SOLVED[name])
+    race = Race(task["started"], SOLVED[name], task["limit"])
     if task["who"] == "brax":
-        row = run_brax(name, published, task["seed"], race)
+        row = run_brax(name, published, task["seed"], race, task["whole"])
     else:
         row = run_ours(name, published, WAYS[task["who"]], task["seed"], race, task["whole"])
     device = jax.devices()[0].device_kind
@@ -185,7 +226,14 @@ def race(args: argparse.Namespace) -> None:
         for seed in range(args.first, args.first + args.seeds):
             for who in args.who:
                 whole = bool(args.steps) or args.whole
-                task = {"who": who, "env": name, "seed": seed, "changes": changes, "whole": whole}
+                task = {
+                    "who": who,
+                    "env": name,
+                    "seed": seed,
+                    "changes": changes,
+                    "whole": whole,
+                    "limit": args.seconds,
+                }
                 words = json.dumps(task | {"started": time.time()})
                 try:
                     subprocess.run(
@@ -204,17 +252,19 @@ def main() -> None:
     parser.add_argument("--steps", type=float, default=0, help="environment steps of all; 0: as published")
     parser.add_argument("--whole", action="store_true", help="ours goes on after the goal, too")
     parser.add_argument("--changes", default="{}", help="of the published settings, JSON")
-    parser.add_argument("--timeout", type=float, default=None, help="seconds for a row")
+    parser.add_argument("--seconds", type=float, default=None, help="after which a race ends with what it has")
+    parser.add_argument("--timeout", type=float, default=None, help="seconds after which a race is given up")
     parser.add_argument("--limit", action="store_true")
+    parser.add_argument("--compilation", action="store_true", help="the compiler's options, measured")
     parser.add_argument("--scaling", nargs="*", choices=["worlds", "devices", "curve"], default=None)
-    parser.add_argument("--task", default="Ant", help="of --limit and --scaling")
-    parser.add_argument("--worlds", type=int, nargs="*", help="of --limit and --scaling")
-    parser.add_argument("--iterations", type=int, default=50, help="of --limit and --scaling")
+    parser.add_argument("--task", default="Ant", help="of the measures that are no race")
+    parser.add_argument("--worlds", type=int, nargs="*", help="of the measures that are no race")
+    parser.add_argument("--iterations", type=int, default=50, help="of the measures that are no race")
     parser.add_argument("--work", help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.work:
         work(json.loads(args.work))
-    elif args.limit or args.scaling is not None:
+    elif args.limit or args.compilation or args.scaling is not None:
         sys.path.insert(0, str(Path(__file__).parent))
         import ppo_limits
 
