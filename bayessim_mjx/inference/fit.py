@@ -25,6 +25,8 @@ SCORED = 256  # validation rows for which the truncated density is reported
 CURVE = 40  # points of the loss curves, at least
 SHARPNESS = np.geomspace(0.4, 2.0, 17).astype(np.float32)  # of the members, tried on the held-out rows
 LADDER = 1  # power of the members' places that their dropout rises with
+TRIED = 300  # gradient steps at least, before a training may end early
+MEMBERS = "members"  # axis of the ensemble
 CLIMBS, SWEEPS = 50, 2  # steps towards the members' weights; rounds over their sharpness
 
 
@@ -79,7 +81,9 @@ def init(key: Array, settings: InferenceSettings, space: Any, dim_x: int) -> Fit
         raise ValueError(f"dim_x = {dim_x}: a summary needs at least one feature")
     settings = settings.at(space)
     member = partial(mdn.init, settings=settings, dim_x=dim_x, d=len(space))
-    params = jax.vmap(member)(jax.random.split(key, settings.ensemble))
+    params = jax.vmap(lambda k, count: member(k, count=count))(
+        jax.random.split(key, settings.ensemble), jnp.asarray(mdn.counts(settings))
+    )
     known, fits = jnp.ones(len(space), bool), jnp.asarray(0, jnp.int32)
     return FitState(params, jnp.zeros(dim_x), jnp.ones(dim_x), fits, known, settings, space)
 
@@ -179,11 +183,10 @@ def _fit(
     settings = state.settings
     state, data, clipped, n_invalid = _prepare(state, thetas, x, count)
     data = data._replace(proposals=proposals, origin=origin)
-    points, chunk = schedule_length(settings, x.shape[0])
     member = partial(_train, data=data, settings=settings, fresh=state.fits == 0)
     # most members have little dropout
     rates = settings.dropout * jnp.linspace(0.0, 1.0, settings.ensemble) ** LADDER
-    params, best, skipped, train_loss, val_loss = jax.vmap(member)(
+    params, best, steps, skipped, curves = jax.vmap(member, axis_name=MEMBERS)(
         jax.random.split(key, settings.ensemble), state.params, rates
     )
     state = replace(state, params=_weigh(params, data, settings), fits=state.fits + 1)
@@ -194,9 +197,9 @@ def _fit(
     volume = jnp.sum(jnp.where(data.train, data.slopes, 0.0)) / jnp.maximum(jnp.sum(data.train.astype(jnp.float32)), 1)
     held_volume = jnp.sum(data.slopes[data.held] * data.mask) / jnp.sum(data.mask)
     info = FitInfo(
-        train_loss=jnp.mean(train_loss, axis=0) - volume,
-        val_loss=jnp.mean(val_loss, axis=0) - held_volume,
-        steps=jnp.asarray(points * chunk, jnp.int32),
+        train_loss=jnp.mean(curves[:, 0], axis=0) - volume,
+        val_loss=jnp.mean(curves[:, 1], axis=0) - held_volume,
+        steps=steps[0],
         best=jnp.max(best),
         gain=held_volume + _held_out_gain(state, data),
         **_truncated_scores(state, data, thetas),
@@ -214,7 +217,10 @@ def _fit(
 def _train(
     key: Array, params: Any, rate: Array, data: _Data, settings: InferenceSettings, fresh: Array
 ) -> tuple[Any, Array, Array, Array, Array]:
-    """One member: its best weights, where they were on the curve, steps skipped, and the two loss curves."""
+    """One member: its best weights, where they were on the curve, steps taken and skipped, and the loss curves [2, P].
+
+    A first training ends early if no member has beaten the best start, the linear-Gaussian posterior, in a tenth of it.
+    """
     points, chunk = schedule_length(settings, data.x.shape[0])
     optimiser = optax.chain(
         optax.clip_by_global_norm(settings.grad_clip),
@@ -239,9 +245,9 @@ def _train(
         params, opt_state = jax.tree.map(lambda a, b: jnp.where(usable, a, b), new, (params, opt_state))
         return (params, opt_state, skipped + 1 - usable.astype(jnp.int32)), value
 
-    def point(carry: tuple, inputs: tuple[Array, Array]) -> tuple[tuple, tuple[Array, Array]]:
-        inner, best = carry
-        i, key = inputs
+    def point(carry: tuple) -> tuple:
+        i, _, inner, best, curves = carry
+        key = keys[i]
         # a fresh order of the training rows; batches walk through it and wrap around
         order = jnp.argsort(jnp.where(data.train, jax.random.uniform(key, data.train.shape), jnp.inf))
         place = jnp.arange(chunk * batch, dtype=jnp.int32).reshape(chunk, batch) % jnp.maximum(n_train, 1)
@@ -250,7 +256,9 @@ def _train(
         better = value < best[0]
         candidate = (value, inner[0], i)
         best = jax.tree.map(lambda a, b: jnp.where(better, a, b), candidate, best)
-        return (inner, best), (jnp.mean(losses), value)
+        curves = curves.at[:, i].set(jnp.stack([jnp.mean(losses), value]))
+        beaten = jax.lax.pmin(best[0], MEMBERS) < lowest
+        return i + 1, ~fresh | beaten | (i + 1 < patience), inner, best, curves
 
     def held_out(params: Any) -> Array:
         value = _objective({**params, **fixed}, data.held, data, settings)
@@ -259,9 +267,12 @@ def _train(
     trained = {name: leaf for name, leaf in params.items() if name not in fixed}
     start = (trained, optimiser.init(trained), jnp.asarray(0, jnp.int32))
     best = (held_out(trained), trained, jnp.asarray(-1, jnp.int32))
-    inputs = jnp.arange(points, dtype=jnp.int32), jax.random.split(key, points)
-    (inner, best), (train_loss, val_loss) = jax.lax.scan(point, (start, best), inputs)
-    return {**best[1], **fixed}, best[2], inner[2], train_loss, val_loss
+    lowest = jax.lax.pmin(best[0], MEMBERS)
+    patience, keys = max(points // 10, -(-TRIED // chunk)), jax.random.split(key, points)
+    carry = (jnp.asarray(0, jnp.int32), jnp.asarray(True), start, best, jnp.zeros((2, points)))
+    done, _, inner, best, curves = jax.lax.while_loop(lambda c: c[1] & (c[0] < points), point, carry)
+    curves = curves[:, jnp.minimum(jnp.arange(points, dtype=jnp.int32), done - 1)]
+    return {**best[1], **fixed}, best[2], done * chunk, inner[2], curves
 
 
 def _fresh(params: Any, data: _Data, settings: InferenceSettings) -> Any:

@@ -27,10 +27,11 @@ RIDGE_LIMIT = 1024  # features up to which linear_start is worth its cost
 RIDGE = 1e-3  # of the features' variance
 WEAK = 0.05  # smallest precision beyond the prior's that linear_start gives to a component of the probit chart
 MULTIPLES = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0)  # of the median distance: bandwidths tried by validation
+UNUSED = -60.0  # log weight of components that a member does not use
 CUT_POINTS = 16  # quasi-Monte-Carlo points of a component's mass inside the box, in training
 AT_ONCE = 1024  # trajectories embedded at once
 LEAST_INSIDE = float(np.log(0.1))  # log mass inside the box that training reckons with at least
-FIXED = ("omega", "rate", "sharpness", "share")  # of the parameters, those that are not trained by gradients
+FIXED = ("omega", "rate", "used", "sharpness", "share")  # of the parameters, those that are not trained by gradients
 LOG_2PI = float(np.log(2 * np.pi))
 
 
@@ -57,8 +58,18 @@ def head_size(d: int, settings: InferenceSettings) -> int:
     return settings.components * (1 + 2 * d + lower)
 
 
-def init(key: Array, settings: InferenceSettings, dim_x: int, d: int) -> Params:
-    """Network weights: hidden layers, a small last layer, a linear path from input to output, spread centre biases."""
+def counts(settings: InferenceSettings) -> np.ndarray:
+    """Components that each member of the ensemble uses [E]: the last of several has one, the others all."""
+    alone = (np.arange(settings.ensemble) == settings.ensemble - 1) & (settings.ensemble > 1)
+    return np.where(alone, 1, settings.components).astype(np.int32)
+
+
+def init(key: Array, settings: InferenceSettings, dim_x: int, d: int, count: Array | None = None) -> Params:
+    """Network weights: hidden layers, a small last layer, a linear path from input to output, spread centre biases.
+
+    Of the components `count` are used. One alone has nothing but the linear path at first: `linear_start` then makes it
+    the linear-Gaussian posterior.
+    """
     more: Params = {}
     if settings.embedding is not None:
         key, key_embedding = jax.random.split(key)
@@ -77,8 +88,11 @@ def init(key: Array, settings: InferenceSettings, dim_x: int, d: int) -> Params:
         for k, n, m, gain in zip(keys, sizes, sizes[1:], gains, strict=False)
     ]
     k = settings.components
-    biases = layers[-1]["b"].at[k : k + k * d].set(0.7 * jax.random.normal(keys[-1], (k * d,)))
-    layers[-1] = {**layers[-1], "b": biases}
+    count = jnp.asarray(k if count is None else count)
+    several = (count > 1).astype(jnp.float32)
+    biases = layers[-1]["b"].at[k : k + k * d].set(0.7 * several * jax.random.normal(keys[-1], (k * d,)))
+    layers[-1] = {"w": layers[-1]["w"] * several, "b": biases}
+    more["used"] = jnp.where(jnp.arange(k, dtype=jnp.int32) < count, 0.0, UNUSED)
     # set by held-out rows: factor on all precisions' square roots, log weight in the ensemble
     share = jnp.asarray(-np.log(settings.ensemble), jnp.float32)
     more = {**more, "sharpness": jnp.ones(()), "share": share}
@@ -195,7 +209,7 @@ def forward(
     if settings.fullCovariance and d > 1:
         rows, columns = np.tril_indices(d, -1)
         factors = factors.at[:, :, rows, columns].set(lower.reshape(n, k, -1))
-    return jax.nn.log_softmax(logits), means.reshape(n, k, d), factors * params["sharpness"]
+    return jax.nn.log_softmax(logits + params["used"][None, :]), means.reshape(n, k, d), factors * params["sharpness"]
 
 
 def log_normaliser(means: Array, factors: Array, settings: InferenceSettings) -> Array:

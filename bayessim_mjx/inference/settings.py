@@ -34,7 +34,7 @@ class InferenceSettings:
     batch: int = 64  # a quarter of the rows in four times the steps: more per second, measured on noise-free data
     epochs: int = 40  # passes over the capacity, within [min_steps, max_steps]
     min_steps: int = 1000
-    max_steps: int = 4000
+    max_steps: int = 8000
     grad_clip: float = 5.0  # global norm
     validation: float = 0.1  # share of rows held out
     restandardise: bool = False  # inputs anew at every fit: for data whose distribution changes from fit to fit
