@@ -27,6 +27,7 @@ from bayessim_mjx.diagnosis.search import (
 
 NEAR = 1.2  # noise variances: models that leave less than that explain the same
 SAME = 0.02  # of what an effect closes
+MOST = 8  # rivals told of one effect, single ones first
 MILD = 10.0  # nats: below, held-out evidence between two models is called a tie
 
 
@@ -111,14 +112,15 @@ def _rivals(race: Race, winner: Model, effect: Candidate, say: Progress) -> list
         (other,) = [c for c in model.effects if c not in rest.effects]
         out += _rival(race, winner, effect, (other,), model)
     if not rest.effects:
+        alone = {r.effects[0] for r in out}
         for model in ranked(race, 2):
-            if effect not in model.effects:
+            if effect not in model.effects and alone.isdisjoint(model.effects):
                 out += [
                     r
                     for r in _rival(race, winner, effect, model.effects, model)
                     if r.closure > race.closure(winner) + 0.01
                 ]
-    return sorted(out, key=lambda r: -r.closure)[:6]
+    return sorted(out, key=lambda r: (len(r.effects), -r.closure))[:MOST]
 
 
 def _finished(race: Race, winner: Model, model: Model) -> Model:
