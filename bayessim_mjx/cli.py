@@ -180,7 +180,7 @@ def privileged(config: Config, env: Any) -> tuple[Any, Any]:
     from bayessim_mjx.rl import recurrent
 
     if config.ppo.memory:
-        env = recurrent.remembering(env, config.ppo.memory)
+        env = recurrent.remembering(env, config.ppo.memory_size)
     if config.ppo.policy_theta:
         env = shown.for_policy(env)
     if config.ppo.teacher is None:

@@ -31,6 +31,7 @@ MODEL = re.compile(r"MDNN|MDRFF(?:_(RBF|Laplace|Matern12|Matern32|Matern52)(?:_(
 COORDINATES = ("plain", "truncated", "probit", "logit", "auto")
 PROPOSALS = ("prior", "apt", "truncated", "division")
 UNCORRECTED = (("apt", "truncated"), ("apt", "logit"), ("division", "logit"))  # (proposal, coordinates)
+MEMORIES = {"gru": 1, "lstm": 2}  # recurrent layers, and how many numbers each unit remembers
 ACTIVATIONS = ("elu", "relu", "selu", "tanh", "swish", "gelu")
 
 
@@ -262,7 +263,7 @@ class BayesSimConfig(Section):
         4, "networks trained side by side; their posteriors are averaged by held-out score", low=1, high=50
     )
     coordinates: str = setting(
-        "plain",
+        "auto",
         "in which the posterior is a Gaussian mixture: plain (in the range, cut off at its ends), truncated (cut off "
         "in training too), probit (the prior is a Gaussian), logit, or auto: probit where every prior is Gaussian, "
         "otherwise plain",
@@ -395,7 +396,8 @@ class PPOConfig(Section):
     init_std: float = setting(1.0, "initial standard deviation of actions", above=0)
     state_dependent_std: bool = setting(False, "the actor gives the standard deviation too, else it is a parameter")
     shared_trunk: bool = setting(False, "the critic is one layer on the actor's hidden ones (hidden_critic is unused)")
-    memory: int = setting(0, "units of a recurrent layer (GRU) before the actor's others; 0: none (train, play)", low=0)
+    memory: int = setting(0, "units of a recurrent layer before the actor's others; 0: none (train, play)", low=0)
+    memory_cell: str = setting("gru", "kind of the recurrent layer: gru or lstm", choices=tuple(MEMORIES))
     critic_theta: bool = setting(False, "the critic also sees the physics, theta (not the actor)")
     policy_theta: bool = setting(False, "the policy sees theta too: a teacher, for simulation alone (train, play)")
     teacher: str | None = setting(None, "checkpoint of a policy to imitate, in place of PPO (train)", spell=_absolute)
@@ -408,6 +410,11 @@ class PPOConfig(Section):
     log_interval: int = setting(10, "iterations between log lines", low=1)
     save_interval: int = setting(50, "iterations between checkpoints", low=1)
     eval_episodes: int = setting(100, "episodes per evaluation", low=1)
+
+    @property
+    def memory_size(self) -> int:
+        """Numbers that the policy carries on from step to step."""
+        return MEMORIES[self.memory_cell] * self.memory
 
     def check(self) -> None:
         batch = self.num_envs * self.num_steps

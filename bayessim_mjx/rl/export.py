@@ -1,7 +1,7 @@
 """A policy as an ONNX file for other machines: normaliser and limits inside, any batch size, and what its numbers mean.
 
 The graph: observation [batch, S] -> action [batch, A] in [-1, 1], the deterministic one, and command [batch, nu] in the
-actuators' units where the task scales each action by a number of its own. A policy with a memory takes it, [batch, H],
+actuators' units where the task scales each action by a number of its own. A policy with a memory takes it, [batch, M],
 zeros at the start, and gives memory_next. Metadata are texts, lists in JSON.
 """
 
@@ -20,7 +20,7 @@ import numpy as np
 
 from bayessim_mjx.env import Env
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.rl import normalise
+from bayessim_mjx.rl import normalise, recurrent
 from bayessim_mjx.rl.networks import Policy
 
 OPSET, IR_VERSION = 17, 8  # of 2022: every runtime since reads it
@@ -43,6 +43,19 @@ class Graph:
         self.value = output or f"value_{len(self.nodes)}"
         self.nodes.append(helper.make_node(operation, names, [self.value], **attributes))
         return self.value
+
+    def at(self, value: str) -> Graph:
+        """The same graph, to be gone on with from another value."""
+        self.value = value
+        return self
+
+    def split(self, count: int) -> list[str]:
+        """Names of as many equal parts of the value's columns."""
+        from onnx import helper
+
+        names = [f"value_{len(self.nodes)}_{i}" for i in range(count)]
+        self.nodes.append(helper.make_node("Split", [self.value], names, axis=1))
+        return names
 
     def constant(self, array: Any) -> str:
         """Name of a float32 constant."""
@@ -74,11 +87,6 @@ class Graph:
                 self.then(operation, other)
 
 
-def memory_size(policy: Policy) -> int:
-    """Units of its memory, 0 without."""
-    return len(policy.actor["gru"]["h"]["w"]) if "gru" in policy.actor else 0
-
-
 def command_scale(env: Env, actions: int) -> tuple[np.ndarray, np.ndarray] | None:
     """(scale [A], offset [A]) of the commands offset + scale action; None where they are not of that form."""
     command = getattr(env, "command", None)
@@ -102,8 +110,9 @@ def _network(graph: Graph, policy: Policy, env: Env, size: int) -> None:
         graph.then("Sub", policy.normalizer.mean)
         graph.then("Div", jnp.sqrt(policy.normalizer.var) + normalise.EPSILON)
         graph.then("Clip", -normalise.LIMIT, normalise.LIMIT)
-    if "gru" in policy.actor:
-        _remember(graph, jax.device_get(policy.actor["gru"]))
+    kind = recurrent.kind(policy.actor)
+    if kind is not None:
+        {"gru": _gru, "lstm": _lstm}[kind](graph, jax.device_get(policy.actor[kind]))
     *hidden, last = jax.device_get(policy.actor["layers"])
     for layer in hidden:
         graph.then("Gemm", layer["w"], layer["b"])
@@ -111,31 +120,41 @@ def _network(graph: Graph, policy: Policy, env: Env, size: int) -> None:
     graph.then("Gemm", last["w"][:, :size], last["b"][:size])  # a spread by state comes after the means
 
 
-def _remember(graph: Graph, gru: Any) -> None:
-    """Observation -> memory_next, as `recurrent.cell` does."""
-    x, units = graph.value, len(gru["h"]["w"])
+def _gates(graph: Graph, value: str, side: Any, count: int) -> list[str]:
+    """The sums of each gate over the input, or over the hidden units."""
+    graph.at(value).then("Gemm", side["w"], side["b"])
+    return graph.split(count)
 
-    def gate(value: str, layer: Any, number: int) -> str:
-        part = slice(number * units, (number + 1) * units)
-        graph.value = value
-        return graph.then("Gemm", layer["w"][:, part], layer["b"][part])
 
-    reset, update = (_sigmoid_sum(graph, gate(x, gru["x"], i), gate("memory", gru["h"], i)) for i in (0, 1))
-    candidate = gate(x, gru["x"], 2)
-    gate("memory", gru["h"], 2)
-    graph.then("Mul", reset)
-    graph.then("Add", candidate)
+def _gru(graph: Graph, layer: Any) -> None:
+    """Observation -> memory_next, as `recurrent.gru` does."""
+    observed = _gates(graph, graph.value, layer["x"], 3)
+    remembered = _gates(graph, "memory", layer["h"], 3)
+    sums = [graph.at(x).then("Add", h) for x, h in zip(observed[:2], remembered[:2], strict=True)]
+    reset, update = [graph.at(x).then("Sigmoid") for x in sums]
+    graph.at(remembered[2]).then("Mul", reset)
+    graph.then("Add", observed[2])
     new = graph.then("Tanh")
-    graph.value = "memory"  # new + z (memory - new)
-    graph.then("Sub", new)
+    graph.at("memory").then("Sub", new)  # new + z (memory - new)
     graph.then("Mul", update)
     graph.then("Add", new, output="memory_next")
 
 
-def _sigmoid_sum(graph: Graph, a: str, b: str) -> str:
-    graph.value = a
-    graph.then("Add", b)
-    return graph.then("Sigmoid")
+def _lstm(graph: Graph, layer: Any) -> None:
+    """Observation -> hidden units, and memory_next, as `recurrent.lstm` does."""
+    observed = graph.then("Gemm", layer["x"]["w"], layer["x"]["b"])
+    hidden, cells = graph.at("memory").split(2)
+    graph.at(hidden).then("Gemm", layer["h"]["w"], layer["h"]["b"])
+    graph.then("Add", observed)
+    sums = graph.split(4)
+    take, keep, new, show = [graph.at(x).then("Tanh" if i == 2 else "Sigmoid") for i, x in enumerate(sums)]
+    kept = graph.at(keep).then("Mul", cells)
+    graph.at(take).then("Mul", new)
+    cells = graph.then("Add", kept)
+    graph.then("Tanh")
+    hidden = graph.then("Mul", show)
+    graph.then("Concat", cells, output="memory_next", axis=1)
+    graph.at(hidden)
 
 
 def onnx_model(policy: Policy, env: Env, notes: Mapping[str, Any] | None = None) -> Any:
@@ -145,7 +164,11 @@ def onnx_model(policy: Policy, env: Env, notes: Mapping[str, Any] | None = None)
         from onnx import helper
     except ImportError:
         raise UserError('--export needs the package onnx: pip install "bayessim-mjx[export]"') from None
-    graph, limit, actions = Graph("observation"), policy.action_clip, env.action_size - memory_size(policy)
+    graph, limit, actions = (
+        Graph("observation"),
+        policy.action_clip,
+        env.action_size - recurrent.memory_size(policy.actor),
+    )
     _network(graph, policy, env, actions)
     if policy.squash:
         graph.then("Tanh")
@@ -159,8 +182,8 @@ def onnx_model(policy: Policy, env: Env, notes: Mapping[str, Any] | None = None)
         outputs["command"] = actions
     value = lambda name, size: helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, ["batch", size])  # noqa: E731
     inputs = {"observation": env.observation_size["policy"][0]}
-    if memory_size(policy):
-        inputs["memory"] = outputs["memory_next"] = memory_size(policy)
+    if recurrent.memory_size(policy.actor):
+        inputs["memory"] = outputs["memory_next"] = recurrent.memory_size(policy.actor)
     begins, ends = ([value(name, size) for name, size in side.items()] for side in (inputs, outputs))
     model = helper.make_model(
         helper.make_graph(graph.nodes, "policy", begins, ends, initializer=graph.constants),
@@ -176,7 +199,7 @@ def onnx_model(policy: Policy, env: Env, notes: Mapping[str, Any] | None = None)
 
 def metadata(policy: Policy, env: Env) -> dict[str, Any]:
     """What the inputs and outputs are, in their order, and golden pairs of observations and actions."""
-    scaling, golden = command_scale(env, env.action_size - memory_size(policy)), golden_inputs(policy)
+    scaling, golden = command_scale(env, env.action_size - recurrent.memory_size(policy.actor)), golden_inputs(policy)
     facts = {
         "task": env.name,
         "observation_names": list(getattr(env, "observation_names", ())),
@@ -199,14 +222,14 @@ def golden_inputs(policy: Policy, count: int = GOLDEN) -> dict[str, jax.Array]:
     noise = jax.random.normal(key, (count, policy.normalizer.mean.shape[0]))
     factor = jnp.where(jnp.arange(count) % 4 == 3, 20.0, 1.0)[:, None]
     inputs = {"observation": policy.normalizer.mean + factor * noise * jnp.sqrt(policy.normalizer.var)}
-    size = memory_size(policy)
+    size = recurrent.memory_size(policy.actor)
     return inputs | ({"memory": jax.random.uniform(memory_key, (count, size), minval=-1)} if size else {})
 
 
 def answer(policy: Policy, inputs: Mapping[str, Any]) -> jax.Array:
     """The deterministic actions [N, A] in [-1, 1] at these inputs."""
     acted = policy.act(None, {"policy": inputs["observation"]} | {k: inputs[k] for k in inputs if k == "memory"})
-    return jnp.clip(acted[:, : acted.shape[1] - memory_size(policy)], -1.0, 1.0)
+    return jnp.clip(acted[:, : acted.shape[1] - recurrent.memory_size(policy.actor)], -1.0, 1.0)
 
 
 def difference(path: Path, inputs: Mapping[str, Any], action: Any) -> float | None:

@@ -66,10 +66,11 @@ def init(
     state_dependent_std: bool = False,
     shared_trunk: bool = False,
     memory: int = 0,
+    memory_cell: str = "gru",
 ) -> Params:
     """Parameters of both networks. The actor's last layer is small: the first policy is nearly N(0, init_std^2).
 
-    memory: units of a recurrent layer before the actor's others; 0: none.
+    memory: units of a recurrent layer (`memory_cell`: gru or lstm) before the actor's others; 0: none.
     """
     actor_key, critic_key = jax.random.split(key)
     layers = mlp_init(actor_key, [memory or observation_size, *hidden_actor, action_size], 0.01)
@@ -80,7 +81,7 @@ def init(
         joined = jax.tree.map(lambda mean, log_std: jnp.concatenate([mean, log_std], -1), layers[-1], spread)
         actor = {"layers": [*layers[:-1], joined]}
     if memory:
-        actor["gru"] = recurrent.init(jax.random.fold_in(actor_key, 1), observation_size, memory)
+        actor[memory_cell] = recurrent.init(jax.random.fold_in(actor_key, 1), observation_size, memory, memory_cell)
     if shared_trunk:
         return {"actor": actor, "critic": {"head": mlp_init(critic_key, [hidden_actor[-1], 1], 1.0)}}
     return {"actor": actor, "critic": {"layers": mlp_init(critic_key, [critic_size, *hidden_critic, 1], 1.0)}}
@@ -88,7 +89,7 @@ def init(
 
 def _trunk(actor: Params, x: Any) -> jax.Array:
     """What the actor's layers see of normalised observations x, of `recurrent` where it has a memory."""
-    return recurrent.features(actor["gru"], x) if "gru" in actor else x
+    return recurrent.features(actor, x) if recurrent.kind(actor) else x
 
 
 def gaussian(actor: Params, x: Any, act: Callable[[jax.Array], jax.Array]) -> tuple[jax.Array, jax.Array]:
@@ -167,7 +168,7 @@ class Policy:
         """What the actor sees: normalised, with the memory where it has one."""
         x = jnp.asarray(obs["policy"] if isinstance(obs, Mapping) else obs)
         x = normalise.normalise(self.normalizer, x) if self.normalize else x
-        if "gru" in self.actor:
+        if recurrent.kind(self.actor):
             assert isinstance(obs, Mapping), "a policy with a memory acts on groups of observations"
             return recurrent.Remembered(x, obs["memory"])
         return x
@@ -178,9 +179,9 @@ class Policy:
 
     def carried(self, obs: Mapping[str, jax.Array] | jax.Array, action: jax.Array) -> jax.Array:
         """The action for the environment: with the memory after `obs` behind it, where there is one."""
-        if "gru" not in self.actor:
+        if not recurrent.kind(self.actor):
             return action
-        return jnp.concatenate([action, _trunk(self.actor, self._seen(obs))], -1)
+        return jnp.concatenate([action, recurrent.memories(self.actor, self._seen(obs))], -1)
 
     def bounded(self, raw: jax.Array) -> jax.Array:
         """The action within +- action_clip of a raw one."""

@@ -163,7 +163,7 @@ def check(env: Env, config: PPOConfig, mesh: Mesh | None = None) -> None:
         raise ValueError(f"observation groups {sorted(env.observation_size)}: a policy needs the group 'policy'")
     if config.policy_theta and getattr(env, "target", "") != "policy":
         raise UserError("ppo.policy_theta = True trains a teacher; the commands that can are train and play")
-    if config.memory != getattr(env, "memory_size", 0):
+    if config.memory_size != getattr(env, "memory_size", 0):
         raise UserError(
             f"ppo.memory = {config.memory}: the commands that train and play policies with a memory are train and play"
         )
@@ -184,9 +184,10 @@ def _init(env: Env, config: PPOConfig, mesh: Mesh | None) -> Callable[..., Train
     def run(key: jax.Array, domain: Distribution | None) -> TrainState:
         key, network_key, reset_key, clock_key = jax.random.split(key, 4)
         hidden = (config.hidden_actor, config.hidden_critic, config.init_std)
-        kind = (config.state_dependent_std, config.shared_trunk, config.memory)
-        actions = env.action_size - config.memory
-        params = networks.init(network_key, sizes["policy"], sizes[critic_group(env)], actions, *hidden, *kind)
+        kind = (config.state_dependent_std, config.shared_trunk)
+        memory = (config.memory, config.memory_cell)
+        actions = env.action_size - config.memory_size
+        params = networks.init(network_key, sizes["policy"], sizes[critic_group(env)], actions, *hidden, *kind, *memory)
         worlds = _reset(env, reset_key, domain, config.num_envs, mesh)
         env_states, partial = _stagger(clock_key, worlds, env.episode_length)
         state = TrainState(
@@ -243,7 +244,7 @@ def _collect(
 
         return collect(env, act, noise, env_states, pool, groups)
 
-    shape = (config.num_steps, config.num_envs, env.action_size - config.memory)
+    shape = (config.num_steps, config.num_envs, env.action_size - config.memory_size)
     noise = sharding.pinned(jax.random.normal(noise_key, shape), mesh, SECOND)
     pool = _reset(env, pool_key, domain, config.num_envs, mesh)
     run = sharding.local(run, mesh, (EVERYWHERE, SECOND, FIRST, FIRST), (FIRST, SECOND))

@@ -1,17 +1,22 @@
-"""Policies with a memory: a gated recurrent unit (Cho et al. 2014) before the actor's layers.
+"""Policies with a memory: a GRU (Cho et al. 2014) or LSTM (Gers et al. 2000) layer before the actor's others.
 
 The memory travels through the environment, as an observation group that the action carries on: it is zero wherever an
-episode begins, and to all else a policy stays a function of its observations.
+episode begins, and to all else a policy stays a function of its observations. The first numbers of a memory are the
+units' outputs, which the next layer sees; an LSTM's cells follow them.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 from flax import struct
+
+from bayessim_mjx.settings import MEMORIES
 
 if TYPE_CHECKING:
     from bayessim_mjx.env import Env, State
@@ -21,7 +26,7 @@ Params = dict[str, Any]
 
 @struct.dataclass
 class Remembered:
-    """One step: normalised observation [..., S] and the memory before it [..., H]."""
+    """One step: normalised observation [..., S] and the memory before it [..., M]."""
 
     observation: jax.Array
     memory: jax.Array
@@ -32,42 +37,90 @@ class Sequences:
     """n sequences of T steps as they were collected; the memory counts only where `starts` is 1."""
 
     observation: jax.Array  # [n, T, S] normalised
-    memory: jax.Array  # [n, T, H] before each step, of the collecting policy
+    memory: jax.Array  # [n, T, M] before each step, of the collecting policy
     starts: jax.Array  # [n, T] 1 at the first step and wherever an episode begins
 
 
-def init(key: jax.Array, size: int, units: int) -> Params:
-    """Orthogonal weights of the three gates (reset, update, candidate), biases zero."""
-    keys = jax.random.split(key, 6)
+def init(key: jax.Array, size: int, units: int, cell: str = "gru") -> Params:
+    """Orthogonal weights of each gate, biases zero; an LSTM's forget gates begin at bias 1 (Jozefowicz et al. 2015)."""
+    gates = CELLS[cell].gates
+    keys = jax.random.split(key, 2 * gates)
     draw = jax.nn.initializers.orthogonal()
-    gates = lambda keys, n: jnp.concatenate([draw(k, (n, units)) for k in keys], -1)  # noqa: E731
+    side = lambda keys, n: jnp.concatenate([draw(k, (n, units)) for k in keys], -1)  # noqa: E731
+    bias = jnp.zeros(gates * units)
     return {
-        "x": {"w": gates(keys[:3], size), "b": jnp.zeros(3 * units)},
-        "h": {"w": gates(keys[3:], units), "b": jnp.zeros(3 * units)},
+        "x": {"w": side(keys[:gates], size), "b": bias.at[units : 2 * units].set(1.0) if cell == "lstm" else bias},
+        "h": {"w": side(keys[gates:], units), "b": bias},
     }
 
 
-def cell(gru: Params, memory: jax.Array, x: jax.Array) -> jax.Array:
-    """The memory [..., H] after observations x [..., S]."""
-    xr, xz, xn = jnp.split(x @ gru["x"]["w"] + gru["x"]["b"], 3, -1)
-    hr, hz, hn = jnp.split(memory @ gru["h"]["w"] + gru["h"]["b"], 3, -1)
+def gru(layer: Params, memory: jax.Array, x: jax.Array) -> jax.Array:
+    """The memory [..., H] after observations x [..., S]; gates in the order reset, update, candidate."""
+    xr, xz, xn = jnp.split(x @ layer["x"]["w"] + layer["x"]["b"], 3, -1)
+    hr, hz, hn = jnp.split(memory @ layer["h"]["w"] + layer["h"]["b"], 3, -1)
     reset, update = jax.nn.sigmoid(xr + hr), jax.nn.sigmoid(xz + hz)
     # h' = (1 - z) tanh(x_n + r h_n) + z h
     return (1 - update) * jnp.tanh(xn + reset * hn) + update * memory
 
 
-def features(gru: Params, x: Remembered | Sequences) -> jax.Array:
-    """Memories after each observation, [..., H]: what the actor's layers see."""
+def lstm(layer: Params, memory: jax.Array, x: jax.Array) -> jax.Array:
+    """The memory [..., 2 H] = (h, c) after observations x [..., S]; gates: input, forget, candidate, output."""
+    hidden, cells = jnp.split(memory, 2, -1)
+    sums = x @ layer["x"]["w"] + layer["x"]["b"] + hidden @ layer["h"]["w"] + layer["h"]["b"]
+    take, keep, new, show = jnp.split(sums, 4, -1)
+    # c' = sigma(f) c + sigma(i) tanh(g),  h' = sigma(o) tanh(c')
+    cells = jax.nn.sigmoid(keep) * cells + jax.nn.sigmoid(take) * jnp.tanh(new)
+    return jnp.concatenate([jax.nn.sigmoid(show) * jnp.tanh(cells), cells], -1)
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A kind of recurrent layer."""
+
+    gates: int
+    after: Callable[[Params, jax.Array, jax.Array], jax.Array]  # (layer, memory, x) -> memory
+
+
+CELLS = {"gru": Cell(3, gru), "lstm": Cell(4, lstm)}
+
+
+def kind(actor: Params) -> str | None:
+    """The name of its recurrent layer, which is the key of its parameters; None without one."""
+    return next((name for name in CELLS if name in actor), None)
+
+
+def units(actor: Params) -> int:
+    """Outputs of its recurrent layer, 0 without one."""
+    name = kind(actor)
+    return 0 if name is None else len(actor[name]["h"]["w"])
+
+
+def memory_size(actor: Params) -> int:
+    """Numbers of memory, 0 without one."""
+    name = kind(actor)
+    return 0 if name is None else MEMORIES[name] * units(actor)
+
+
+def memories(actor: Params, x: Remembered | Sequences) -> jax.Array:
+    """The memory after each observation, [..., M]."""
+    name = kind(actor)
+    assert name is not None
+    layer, after = actor[name], CELLS[name].after
     if isinstance(x, Remembered):
-        return cell(gru, x.memory, x.observation)
+        return after(layer, x.memory, x.observation)
 
     def step(memory: jax.Array, now: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         observation, stored, start = now
-        memory = cell(gru, jnp.where(start[:, None] > 0, stored, memory), observation)
+        memory = after(layer, jnp.where(start[:, None] > 0, stored, memory), observation)
         return memory, memory
 
     in_time = jax.tree.map(lambda leaf: leaf.swapaxes(0, 1), (x.observation, x.memory, x.starts))
     return jax.lax.scan(step, x.memory[:, 0], in_time)[1].swapaxes(0, 1)
+
+
+def features(actor: Params, x: Remembered | Sequences) -> jax.Array:
+    """The units' outputs after each observation, [..., H]: what the actor's layers see."""
+    return memories(actor, x)[..., : units(actor)]
 
 
 def sequences(x: Remembered, ended: jax.Array) -> Sequences:
@@ -76,18 +129,18 @@ def sequences(x: Remembered, ended: jax.Array) -> Sequences:
 
 
 @lru_cache(maxsize=32)
-def remembering(env: Env, units: int) -> Any:
-    """`env` for a policy with `units` of memory; the same object for the same arguments."""
-    return Remembering(env, units)
+def remembering(env: Env, numbers: int) -> Any:
+    """`env` for a policy with `numbers` of memory (`ppo.memory_size`); the same object for the same arguments."""
+    return Remembering(env, numbers)
 
 
 class Remembering:
     """An environment whose actions end with the policy's memory, shown to it at the next step as the group "memory"."""
 
-    def __init__(self, env: Env, units: int) -> None:
-        self.env, self.memory_size = env, units
-        self.action_size = env.action_size + units
-        self.observation_size = {**env.observation_size, "memory": (units,)}
+    def __init__(self, env: Env, numbers: int) -> None:
+        self.env, self.memory_size = env, numbers
+        self.action_size = env.action_size + numbers
+        self.observation_size = {**env.observation_size, "memory": (numbers,)}
 
     def __getattr__(self, name: str) -> Any:
         value = getattr(self.env, name)

@@ -57,18 +57,19 @@ def test_every_kind_of_policy_answers_alike_in_any_batch(env, kind, tmp_path):
     assert np.std(action) > 0.05 and np.abs(action).max() <= min(1.0, p.action_clip) + 1e-6
 
 
-def test_a_memory_goes_in_and_comes_out(env, tmp_path):
+@pytest.mark.parametrize(("cell", "numbers"), [("gru", 4), ("lstm", 8)])
+def test_a_memory_goes_in_and_comes_out(env, tmp_path, cell, numbers):
     """Three steps from zeros: the file's actions and memories are those of the policy."""
-    params = networks.init(jax.random.PRNGKey(0), 3, 3, 1, (8,), (8,), 1.0, memory=4)
+    params = networks.init(jax.random.PRNGKey(0), 3, 3, 1, (8,), (8,), 1.0, memory=4, memory_cell=cell)
     actor = {**params["actor"], "layers": jax.tree.map(lambda x: 9 * x, params["actor"]["layers"])}
-    p, remembering = Policy(actor, normalise.init(3)), recurrent.remembering(env, 4)
+    p, remembering = Policy(actor, normalise.init(3)), recurrent.remembering(env, numbers)
     assert export.write(tmp_path / "policy.onnx", p, remembering) < 2e-6
     session = runtime.InferenceSession(tmp_path / "policy.onnx", providers=["CPUExecutionProvider"])
     assert [(i.name, i.shape) for i in session.get_inputs()] == [
         ("observation", ["batch", 3]),
-        ("memory", ["batch", 4]),
+        ("memory", ["batch", numbers]),
     ]
-    memory = np.zeros((2, 4), np.float32)
+    memory = np.zeros((2, numbers), np.float32)
     for step in range(3):
         obs = np.asarray(jax.random.normal(jax.random.PRNGKey(step), (2, 3)))
         expected = p.act(None, {"policy": obs, "memory": memory})
