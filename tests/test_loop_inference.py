@@ -12,6 +12,9 @@ from bayessim_mjx import collection, config, loop, round_inference
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 
 SPACE = ParameterSpace([Parameter("mass", 0.0, -1.0, 1.0), Parameter("unseen", 0.0, -1.0, 1.0)])
+NORMAL = ParameterSpace(
+    [Parameter(name, 0.0, -2.0, 2.0, prior="gaussian", mean=0.0, sd=0.5) for name in ("mass", "unseen")]
+)
 NOISE, TRUTH, FITTED = 0.1, np.array([0.3, 0.0], np.float32), 2000
 SMALL = [
     f"bayessim.trainTrajs={FITTED}", "bayessim.realTrajs=2", "bayessim.realIters=3", "bayessim.components=2",
@@ -40,10 +43,10 @@ class Stub:
         return x + jnp.asarray([0.0, self.offset]), jnp.zeros(count)
 
 
-def made(*more: str, **source) -> tuple[loop.Loop, loop.LoopState]:
+def made(*more: str, space: ParameterSpace = SPACE, **source) -> tuple[loop.Loop, loop.LoopState]:
     settings = config.load("Pendulum", overrides=[*SMALL, *more])
     names = ("mean of height", "push at step 0")
-    parts = loop.Loop(types.SimpleNamespace(space=SPACE), settings, Stub(**source), 2, names)
+    parts = loop.Loop(types.SimpleNamespace(space=space), settings, Stub(**source), 2, names)
     return parts, loop.LoopState(round=jnp.int32(0), train=None, **round_inference.blank(parts))
 
 
@@ -68,6 +71,7 @@ CASES = [
     pytest.param("truncated", "prior", "1", id="truncated", marks=pytest.mark.slow),
     pytest.param("plain", "division", "1", id="plain-division", marks=pytest.mark.slow),
     pytest.param("logit", "truncated", "1", id="logit-truncated", marks=pytest.mark.slow),
+    pytest.param("auto", "apt", "2", id="auto-apt-ensemble", marks=pytest.mark.slow),
 ]
 
 
@@ -75,8 +79,9 @@ CASES = [
 def test_two_rounds_give_the_analytic_posterior_and_a_restorable_state(coordinates, proposal, ensemble):
     """Exact for the mass: the mean of the measured features, sd 0.1 / sqrt(n); the unseen parameter keeps its prior."""
     parts, start = made(
-        f"bayessim.coordinates={coordinates}", f"bayessim.proposal={proposal}", f"bayessim.ensemble={ensemble}"
-    )
+        f"bayessim.coordinates={coordinates}", f"bayessim.proposal={proposal}", f"bayessim.ensemble={ensemble}",
+        space=NORMAL if coordinates == "auto" else SPACE,
+    )  # fmt: skip
     state, first = infer(parts, start)
     assert_same_structure(state, start)  # what a checkpoint is restored into
     again, second = infer(parts, state)
@@ -92,6 +97,12 @@ def test_two_rounds_give_the_analytic_posterior_and_a_restorable_state(coordinat
         rows = np.asarray(again.thetas)[FITTED : 2 * FITTED] if parts.capacity else None
         assert rows is None or rows[:, 0].std() < 0.35
         assert float(again.proposal.contraction()[0]) > 0.5 > float(start.proposal.contraction()[0])
+
+
+def test_coordinates_of_the_loop_are_probit_where_every_prior_is_gaussian():
+    parts, state = made(space=NORMAL)
+    assert parts.settings.coordinates == "auto"
+    assert parts.chart == state.domain.chart == state.real_posteriors.chart == state.fit.settings.chart == "probit"
 
 
 TESTED = ["bayessim.checkTrajs=200", "bayessim.priorShare=0.0"]
