@@ -28,6 +28,7 @@ ENOUGH = 0.6  # noises: an error of the time step that does not show
 SHORTER = 5  # halvings of the time step that can be recommended
 WORTH = 1.0  # noises: from here on the user is told
 CONVERGING = 1.3  # errors that shrink by less from one sub-step to its half are not worth finer ones
+SURE = 0.4  # of what is taken for noise: below, the estimates themselves are too coarse
 FAR = 4.0  # medians: windows with larger errors are no measure, as in the fit
 
 
@@ -66,6 +67,12 @@ class Discretisation:
         more = self.floor[:nv] - self.sigma[:nv]
         spread = cut.spread + np.concatenate([3 * more, 10 * more])  # as of windows with this noise
         return dataclasses.replace(cut, sigma_q=self.floor[:nv], sigma_v=self.floor[nv:], spread=spread)
+
+    @property
+    def believed(self) -> float:
+        """Share of what is taken for noise that is the sensors' (median over channels), at least SURE."""
+        known = np.isfinite(self.sigma) & ~np.tile(self.simulated, 2)
+        return float(np.clip(np.median(self.sigma[known] / self.floor[known]), SURE, 1.0)) if known.any() else 1.0
 
     def warnings(self) -> list[str]:
         """In words, where the simulator's own time step is worth more than the noise."""

@@ -30,6 +30,7 @@ class Job:
         r: whitened residuals `[W, n]`; A: `[W, n, k]`, minus their derivatives; B: `[W, n, s]` by the start states.
         weight: `[W]`; cost: weighted, priors included; damping: Levenberg's.
         promise: by how much the step now tried would lower the cost if the model were linear.
+        reach: `[W]`, share of their own steps that the start states make: less after one that did a window harm.
     """
 
     coordinates: tuple[Coordinate, ...]
@@ -43,6 +44,7 @@ class Job:
     damping: float = 1e-3
     promise: float = np.inf
     history: list[float] = field(default_factory=list)
+    reach: Array = field(default_factory=lambda: np.ones(1))
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -139,8 +141,10 @@ class Fitter:
         return job
 
     def cost(self, job: Job, r: Array, offsets: Array, values: Array) -> float:
-        each = np.sum(r**2, 1) + np.sum((offsets / self.spread) ** 2, 1)
-        return float(job.weight @ each) + job.penalty(values)
+        return float(job.weight @ self._each(r, offsets)) + job.penalty(values)
+
+    def _each(self, r: Array, offsets: Array) -> Array:
+        return np.sum(r**2, 1) + np.sum((offsets / self.spread) ** 2, 1)
 
     def derive(self, job: Job, extra: Sequence[Coordinate], values: Array) -> Job:
         """A job with more coordinates, starting at `values` for these; its first columns come with the first step."""
@@ -203,8 +207,12 @@ class Fitter:
             job.A = job.A.copy()
             job.A[:, :, which] = _columns(r[0], r[1:], steps)
             job.damping = max(job.damping / 5, 1e-7)
+            job.reach = np.minimum(2 * job.reach, 1.0)
         else:
             job.damping *= 6
+            # near a contact a start state's full step may be far too long, and no damping of the parameters shortens it
+            harmed = self._each(r[0], x) > self._each(job.r, job.offsets)
+            job.reach = np.where(harmed, 0.25, 1.0) * job.reach
         job.history.append(job.cost)
 
     def _propose(self, job: Job) -> tuple[Array, Array]:
@@ -215,7 +223,7 @@ class Fitter:
         p = solve(S + job.damping * np.diag(np.diag(S)), g + pull, low, high)
         by_starts = job.cost - job.penalty(job.values) - float(job.weight @ q.c)
         job.promise = by_starts + float(2 * (g + pull) @ p - p @ S @ p)
-        return job.values + p, job.offsets + starts.step(job.A, p)
+        return job.values + p, job.offsets + np.reshape(job.reach, (-1, 1)) * starts.step(job.A, p)
 
     def scores(self, job: Job, group: NDArray[np.int64] | None = None) -> tuple[Array, Array]:
         """Held-out costs `[W]` (unweighted) and estimates without each condition, relative to the fit `[G, k]`."""

@@ -129,8 +129,9 @@ def prepare(
     cut = step.noisier(cuts(step.factor, _limit(physics, cuts(1).steps), centred=False))
     fitter = Fitter(Simulator(physics, cut), candidates.base_coordinates(robot.space), physics.space.nominal)
     every = candidates.enumerate_candidates(physics)
+    settings = dataclasses.replace(settings or _settings(robot), believed=step.believed)
     notes += [*floors.warnings, *step.warnings(), *(f"not tried: {text}" for text in left_out), *_few_conditions(cut)]
-    return Setup(robot, physics, seen, floors, fitter, every, size, settings or _settings(robot), seed, notes, step)
+    return Setup(robot, physics, seen, floors, fitter, every, size, settings, seed, notes, step)
 
 
 def _settings(robot: Robot) -> search.Settings:

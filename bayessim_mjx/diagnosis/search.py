@@ -54,6 +54,9 @@ def run(fitter: Fitter, candidates: Sequence[Candidate], settings: Settings, pro
     job = fitter.refresh(job)
     base = scored(fitter, job, ())
     race = Race(fitter, candidates, settings, nominal, base, winner=base)
+    if race.rough:
+        race.base = race.winner = polish(race, base)
+        job = race.base.job
     race.models[frozenset()] = race.base
     say("screening", 0, 1)
     race.screened = screen(fitter, job, candidates, settings.screened)
@@ -147,12 +150,14 @@ def _elsewhere(race: Race, model: Model, say: Progress) -> Model:
 
     Each of its effects in turn is left out, and the search goes on from the rest without that law.
     """
+    settings = race.settings
     for _ in range(ELSEWHERE):
-        if not model.effects or race.at_noise(model, FAR**2):
+        if not model.effects or race.at_noise(model, (settings.believed * FAR) ** 2):
             return model
         others = [_instead(race, model, e, say) for e in model.effects]
         best = min((m for m in others if m is not None), key=lambda m: m.total, default=model)
-        if race.left(best) > BETTER * race.left(model):
+        noise = settings.believed**2 * race.noise * len(model.cost)
+        if best.total - noise > BETTER * (model.total - noise):
             return model
         model = best
     return model
