@@ -40,6 +40,7 @@ class Rival:
     closure: float
     why: str
     contains: bool = False
+    behind: float = 0.0  # nats
 
     def to_dict(self) -> dict[str, Any]:
         return {"effects": [c.label for c in self.effects], "gap_closed": self.closure, "why": self.why}
@@ -60,7 +61,8 @@ class Ruling:
 def rule(race: Race, say: Progress) -> Ruling:
     """Look for rivals of every effect of the winner: replaced by another one, the model predicts as well.
 
-    A rival that closes as much with fewer numbers takes the winner's place.
+    A rival that closes as much with fewer numbers takes the winner's place, and so does the same law at one place alone
+    where that is as good as at all of them.
     """
     winner = race.winner
     ruling = Ruling(winner)
@@ -77,9 +79,15 @@ def _fewer(race: Race, winner: Model, effect: Candidate, rivals: Sequence[Rival]
     """Rivals with fewer numbers that close as much of what the other effects leave."""
     rest = without(race, winner, effect, say).total
     least = (1.0 - SAME) * (rest - winner.total)
-    models = [r.model for r in rivals if not r.contains and r.model.size < winner.size]
+    models = [r.model for r in rivals if not r.contains and r.model.size < winner.size or _narrower(effect, r)]
     models = [m for m in models if rest - m.total >= least]
     return [m for m in models if race.at_noise(m, NEAR) >= race.at_noise(winner, NEAR)]
+
+
+def _narrower(effect: Candidate, rival: Rival) -> bool:
+    """Whether the rival is the same law at one of the places only, and the logs cannot tell."""
+    (*others, own) = rival.effects
+    return not others and own.effect == effect.effect and effect.where == "all" != own.where and rival.behind < MILD
 
 
 def _in_parts(race: Race, winner: Model, effect: Candidate, say: Progress) -> list[Rival]:
@@ -147,7 +155,7 @@ def _rival(race: Race, winner: Model, effect: Candidate, others: tuple[Candidate
         if contains
         else f"held-out evidence differs by {c.evidence:.1f} nats, {max(behind, 0.0):.1%} of the gap"
     )
-    return [Rival(others, model, race.closure(model), why, contains or same)]
+    return [Rival(others, model, race.closure(model), why, contains or same, c.evidence)]
 
 
 def structural(race: Race, model: Model, sd: np.ndarray) -> dict[str, str]:
