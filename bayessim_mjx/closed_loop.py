@@ -93,7 +93,7 @@ def train(
     progress: Callable[[dict, Any], None] | None = None,
 ) -> None:
     """PPO from scratch; `keep(iteration, policy)` at the iterations `at` (increasing)."""
-    state, done = rl.init(env, ppo, key, domain), 0
+    state, done = rl.start(env, ppo, key, domain), 0
     for mark in at:
         if mark > done:
             state, _ = rl.run(env, ppo, state, domain, iterations=mark - done, progress=progress)

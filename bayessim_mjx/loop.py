@@ -80,14 +80,20 @@ def _untrained(env: Env, config: Config) -> Policy:
     return rl.policy_of(rl.init(env, config.ppo, jax.random.PRNGKey(0), domain_or_prior(env.space, 1)))
 
 
-def init(loop: Loop) -> LoopState:
-    """The state before round 0: an untrained policy, the prior as domain, no data."""
+def init(loop: Loop, trains: bool = True) -> LoopState:
+    """The state before round 0: an untrained policy, the prior as domain, no data.
+
+    trains: whether training comes next, its program then being compiled beside the first reset's.
+    """
     fields = blank(loop)
-    return LoopState(round=jnp.int32(0), train=_new_policy(loop, 0, fields["domain"]), **fields)
+    policy = _new_policy(loop, 0, fields["domain"], rl.start if trains else rl.init)
+    return LoopState(round=jnp.int32(0), train=policy, **fields)
 
 
-def _new_policy(loop: Loop, round_: int, domain: Distribution | None) -> TrainState:
-    return rl.init(loop.env, loop.config.ppo, loop.key(round_, "init"), domain, mesh(loop.config))
+def _new_policy(
+    loop: Loop, round_: int, domain: Distribution | None, begin: Callable[..., TrainState] = rl.init
+) -> TrainState:
+    return begin(loop.env, loop.config.ppo, loop.key(round_, "init"), domain, mesh(loop.config))
 
 
 def training_target(loop: Loop, round_: int) -> int:
