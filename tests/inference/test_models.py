@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bayessim_mjx.distributions import Distribution
-from bayessim_mjx.inference import InferenceSettings, fit, infer, init
+from bayessim_mjx.inference import InferenceSettings, fit, infer, init, mdn
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 
 FLAT = ParameterSpace([Parameter("a", 0.0, -1.0, 1.0), Parameter("b", 0.0, -1.0, 1.0)])
@@ -55,3 +55,16 @@ def test_every_model_learns_the_posterior_in_its_box(options):
     assert 0.5 * np.abs(got - exact).sum() < 0.2  # the prior: 0.8; near a wall and with so few rows the best are at 0.1
     assert q.components == state.settings.components * state.settings.ensemble
     assert float(info.parameter_gain.min()) > 0.3 and bool(info.identified.all())
+
+
+def test_the_slope_of_a_gaussian_is_the_closed_one():
+    """d/dv = -C^-1 v, d/dC = (a a^T - C^-1) / 2 with a = C^-1 v; precisions of 1 to 1e6."""
+    rng = np.random.default_rng(0)
+    v, root = rng.normal(size=(6, 4)), rng.normal(size=(6, 4, 4)) * np.asarray([1, 1, 10, 1000])[:, None]
+    cov = root @ np.swapaxes(root, 1, 2) + np.eye(4)
+    a, inverse = np.linalg.solve(cov, v[..., None])[..., 0], np.linalg.inv(cov)
+    found = jax.grad(lambda v, c: jnp.sum(mdn.log_gaussian(v, c)), (0, 1))(
+        jnp.asarray(v, jnp.float32), jnp.asarray(cov, jnp.float32)
+    )
+    np.testing.assert_allclose(found[0], -a, atol=1e-3)
+    np.testing.assert_allclose(found[1], 0.5 * (a[:, :, None] * a[:, None, :] - inverse), atol=1e-3)
