@@ -21,6 +21,7 @@ from bayessim_mjx.errors import UserError
 from bayessim_mjx.mirrors import Mirror, MirrorMap, resolve
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 from bayessim_mjx.physics import Physics, World, control_step, mjx
+from bayessim_mjx.settings import IMPLEMENTATIONS
 
 Observations = dict[str, jax.Array]
 VARIANTS = ("isaacgymenvs", "bayessim2021")
@@ -141,14 +142,20 @@ class Task(Env):
         spec, mj_model, space = corrected(self.spec(), section, calibrated)
         if calibrated:
             self.spec = spec.copy  # type: ignore[method-assign]  # of the corrected model
-        self.physics = Physics(mj_model, self.control_dt, space, stack(section, effects), self.max_qvel)
+        impl, worlds = self.settings["impl"], (config or {}).get("numEnvs")
+        self.physics = Physics(mj_model, self.control_dt, space, stack(section, effects), self.max_qvel, impl, worlds)
         self.joint_names = _names(mj_model, mujoco.mjtObj.mjOBJ_JOINT, mj_model.njnt)
         self.actuator_names = _names(mj_model, mujoco.mjtObj.mjOBJ_ACTUATOR, mj_model.nu)
         names = {"policy": self.observation_names}
         self.mirrors = tuple(resolve(mirror, mj_model, names) for mirror in self.mirror)
 
     def _read(self, config: Any) -> dict[str, Any]:
-        known = {"episodeLength": self.default_episode_length, "variant": VARIANTS[0], **self.options}
+        known = {
+            "episodeLength": self.default_episode_length,
+            "variant": VARIANTS[0],
+            "impl": IMPLEMENTATIONS[0],
+            **self.options,
+        }
         ignored = {"numEnvs", "realParams", "options"}
         values = {key: config[key] for key in config if key not in ignored and config[key] is not None}
         for key in values:
@@ -157,6 +164,8 @@ class Task(Env):
                 hint = f"; did you mean {close[0]}?" if close else ""
                 raise UserError(f"env.{key}: {self.name} has no such setting{hint} (it has: {', '.join(known)})")
         settings = {**known, **values}
+        if settings["impl"] not in IMPLEMENTATIONS:
+            raise UserError(f"env.impl = {settings['impl']!r}: allowed are {', '.join(IMPLEMENTATIONS)}")
         if settings["variant"] not in VARIANTS:
             raise UserError(f"env.variant = {settings['variant']!r}: allowed are {', '.join(VARIANTS)}")
         return settings

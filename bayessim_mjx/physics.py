@@ -21,6 +21,7 @@ with contextlib.redirect_stdout(io.StringIO()):  # MJX announces on import that 
 from bayessim_mjx.effects.effect import Effect
 from bayessim_mjx.effects.site import Motion, SubStep
 from bayessim_mjx.parameters import ParameterSpace
+from bayessim_mjx.warp import Warp
 
 _EULER, _RK4, _IMPLICITFAST = (
     int(getattr(mujoco.mjtIntegrator, f"mjINT_{n}")) for n in ("EULER", "RK4", "IMPLICITFAST")
@@ -68,6 +69,8 @@ class Physics:
         effects: effects in the order in which their hooks are called.
         max_qvel: `[nv]` or scalar; velocities are clipped to +-max_qvel after each sub-step (the position has moved
             with the unclipped one). None: no clipping.
+        impl: what computes a timestep: MJX's stages in "jax", or all of it in "warp"; see `warp.Warp`.
+        worlds: how many are simulated together, for "warp".
 
     Raises:
         ValueError: if control_dt is no multiple of the timestep, the integrator is unknown to MJX, or an effect's
@@ -81,6 +84,8 @@ class Physics:
         space: ParameterSpace,
         effects: Sequence[Effect] = (),
         max_qvel: float | Sequence[float] | None = None,
+        impl: str = "jax",
+        worlds: int | None = None,
     ) -> None:
         self.mj_model = mj_model
         self.effects = tuple(effects)
@@ -95,6 +100,7 @@ class Physics:
         self.max_qvel = None if max_qvel is None else np.broadcast_to(np.asarray(max_qvel, np.float32), (mj_model.nv,))
         self.model = mjx.put_model(mj_model, impl="jax")
         self.template = mjx.make_data(mj_model, impl="jax")
+        self.warp = Warp(mj_model, self.template, self.effects, worlds) if impl == "warp" else None
         timestep = float(mj_model.opt.timestep)
         self.sites = tuple(effect.bind(mj_model, timestep, self.substeps) for effect in self.effects)
         self._memory = tuple(effect.init(at) for effect, at in zip(self.effects, self.sites, strict=True))
@@ -155,9 +161,9 @@ class Physics:
         """The model with this world's parameters."""
         return self.model.tree_replace(world.fields) if world.fields else self.model
 
-    def data_of(self, world: World) -> mjx.Data:
+    def data_of(self, world: World, template: mjx.Data | None = None) -> mjx.Data:
         """`mjx.Data` in this world's state; everything derived from the state is the template's (not this state's)."""
-        return self.template.replace(
+        return (self.template if template is None else template).replace(
             qpos=world.qpos, qvel=world.qvel, act=world.act, qacc_warmstart=world.warmstart, time=world.time
         )
 
@@ -276,9 +282,12 @@ def substep(
     drive: Drive = Drive(),  # noqa: B008  # immutable
 ) -> tuple:
     """One timestep from the state and ctrl in `data`. Returns (data, (memory, forces))."""
-    data, carry = forward(physics, model, data, carry, thetas, seen, drive)
-    integrate = {_EULER: mjx.euler, _RK4: mjx.rungekutta4, _IMPLICITFAST: mjx.implicit}
-    data = integrate[int(physics.mj_model.opt.integrator)](model, data)
+    if physics.warp is not None:
+        data = physics.warp.step(model, data)
+    else:
+        data, carry = forward(physics, model, data, carry, thetas, seen, drive)
+        integrate = {_EULER: mjx.euler, _RK4: mjx.rungekutta4, _IMPLICITFAST: mjx.implicit}
+        data = integrate[int(physics.mj_model.opt.integrator)](model, data)
     if physics.max_qvel is not None:
         data = data.replace(qvel=jnp.clip(data.qvel, -physics.max_qvel, physics.max_qvel))
     return data, carry
@@ -308,7 +317,8 @@ def control_step(
 
 
 def _control_step(physics: Physics, world: World, command: jax.Array, drive: Drive) -> tuple[World, mjx.Data]:
-    model, thetas = physics.model_of(world), physics.split(world.theta)[1]
+    warp, thetas = physics.warp, physics.split(world.theta)[1]
+    model = physics.model_of(world) if warp is None else warp.model_of(world.fields)
     memory = list(world.memory)
     commands = jnp.broadcast_to(command, (physics.substeps, physics.mj_model.nu))
     each = list(zip(range(len(physics.effects)), physics.effects, physics.sites, strict=True))
@@ -321,7 +331,7 @@ def _control_step(physics: Physics, world: World, command: jax.Array, drive: Dri
         data, remembered = carry
         return substep(physics, model, data.replace(ctrl=ctrl), remembered, thetas, seen, drive), None
 
-    start = (physics.data_of(world), (tuple(memory), world.forces))
+    start = (physics.data_of(world, None if warp is None else warp.data), (tuple(memory), world.forces))
     end, _ = body(start, commands[0]) if physics.substeps == 1 else jax.lax.scan(body, start, commands)
     data, (final, forces) = end
     memory, measurement = list(final), {"qpos": data.qpos, "qvel": data.qvel}

@@ -32,6 +32,7 @@ COORDINATES = ("plain", "truncated", "probit", "logit", "auto")
 PROPOSALS = ("prior", "apt", "truncated", "division")
 UNCORRECTED = (("apt", "truncated"), ("apt", "logit"), ("division", "logit"))  # (proposal, coordinates)
 MEMORIES = {"gru": 1, "lstm": 2}  # recurrent layers, and how many numbers each unit remembers
+IMPLEMENTATIONS = ("jax", "warp")  # of MJX
 ACTIVATIONS = ("elu", "relu", "selu", "tanh", "swish", "gelu")
 
 
@@ -209,6 +210,7 @@ class EnvConfig(Section):
     numEnvs: int = setting(256, "worlds simulated in parallel; the same number as ppo.num_envs", low=1)
     episodeLength: int | None = setting(None, "control steps per episode; null: the task's own", low=1)
     realParams: Frozen | None = setting(None, "surrogate real: {weights, means, stds}, rows or {name: value}")
+    impl: str = setting("jax", "what computes the physics: jax, or warp (needs warp-lang)", choices=IMPLEMENTATIONS)
     options: Frozen = field(default_factory=Frozen, metadata={"doc": "settings of this task alone"})
 
     def to_dict(self) -> dict[str, Any]:
@@ -225,7 +227,7 @@ class EnvConfig(Section):
         return default if value is None else value
 
     def keys(self) -> list[str]:
-        return ["numEnvs", "episodeLength", "realParams", *self.options]
+        return ["numEnvs", "episodeLength", "realParams", "impl", *self.options]
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.keys())

@@ -15,6 +15,7 @@ import numpy as np
 from bayessim_mjx.env import Observations, Task
 from bayessim_mjx.mirrors import Mirror
 from bayessim_mjx.physics import World, mjx
+from bayessim_mjx.warp import wrenches
 
 FEET = ("front_left_foot", "front_right_foot", "left_back_foot", "right_back_foot")
 JOINTS = ("hip_1", "ankle_1", "hip_2", "ankle_2", "hip_3", "ankle_3", "hip_4", "ankle_4")
@@ -40,8 +41,8 @@ def _mirror() -> Mirror:
     """Left and right (y -> -y): legs 1 <-> 4 and 2 <-> 3; hips turn the other way, the ankles' axes take care of it."""
     turned = [f"{foot}_{part}" for foot in FEET for part in ("force_y", "torque_x", "torque_z")]
     partner = dict(zip(FEET, reversed(FEET), strict=True))
-    wrenches = [f"{foot}_{kind}_{i}" for foot in FEET for kind in ("force", "torque") for i in _XYZ]
-    images = {name: partner[foot] + name[len(foot) :] for name in wrenches for foot in FEET if name.startswith(foot)}
+    names = [f"{foot}_{kind}_{i}" for foot in FEET for kind in ("force", "torque") for i in _XYZ]
+    images = {name: partner[foot] + name[len(foot) :] for name in names for foot in FEET if name.startswith(foot)}
     odd = ("velocity_y", "angular_velocity_x", "angular_velocity_z", "yaw", "roll", "angle_to_target")
     return Mirror(
         joints={"hip_1": "-hip_4", "hip_2": "-hip_3", "ankle_1": "ankle_4", "ankle_2": "ankle_3"},
@@ -134,10 +135,10 @@ class Ant(Task):
 
     def _foot_wrenches(self, data: mjx.Data) -> jax.Array:
         """`[24]`: contact force (N) and torque about the foot's origin (N m) of each foot, in the foot's frame."""
-        data = mjx.rne_postconstraint(self.sys, data)
+        by_body = wrenches(self.sys, data)
         feet = np.array([self.mj_model.body(name).id for name in FEET])
         # cfrc_ext: torque about the robot's centre of mass, then force; world axes
-        torque, force = data._impl.cfrc_ext[feet, :3], data._impl.cfrc_ext[feet, 3:]
+        torque, force = by_body[feet, :3], by_body[feet, 3:]
         arm = data.subtree_com[1] - data.xpos[feet]
         torque = torque + jnp.cross(arm, force)
         wrench = jnp.stack([force, torque], axis=1)
