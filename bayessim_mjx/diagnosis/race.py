@@ -89,7 +89,8 @@ class Race:
             return False
         many = np.log(max(len(self.candidates), 2)) * max(1, len(new.effects) - len(old.effects))
         added = [e for e in new.effects if e not in old.effects]
-        if c.share < 0.3 and not all(self.distinct(new, e) for e in added):
+        # by an effect that is hardly there a fit may only have come further
+        if not all(self.distinct(new, e, 2.0 if c.share < 0.3 else 1.0) for e in added):
             return False
         if old.effects and old.total - new.total < s.least * self._above(self.base):
             return False
@@ -122,15 +123,15 @@ class Race:
         share = self.settings.believed if model.effects else 1.0
         return model.total > (share * self.settings.floor) ** 2 * self.noise * len(model.cost)
 
-    def distinct(self, model: Model, effect: Candidate) -> bool:
-        """Whether at least one amplitude of the effect is two standard deviations away from neutral."""
+    def distinct(self, model: Model, effect: Candidate, far: float = 2.0) -> bool:
+        """Whether at least one amplitude of the effect is `far` standard deviations away from neutral."""
         sd = deviations(self.fitter, model)
         own = [model.job.names.index(c.name) for c in effect.coordinates]
         off = [
             abs(model.job.values[i] - c.neutral) / max(sd[i], 1e-300)
             for i, c in zip(own, effect.coordinates, strict=True)
         ]
-        return any(z > 2.0 for z, shape in zip(off, effect.shapes, strict=True) if not shape)
+        return any(z > far for z, shape in zip(off, effect.shapes, strict=True) if not shape)
 
     def closure(self, model: Model) -> float:
         """Share of the base model's gap above the noise that `model` closes, held out."""

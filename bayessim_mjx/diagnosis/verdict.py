@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -68,6 +68,9 @@ def rule(race: Race, say: Progress) -> Ruling:
     ruling = Ruling(winner)
     for effect in winner.effects:
         ruling.rivals[effect.label] = [*_in_parts(race, winner, effect, say), *_rivals(race, winner, effect, say)]
+    for rival in _instead_of_all(race, winner):
+        for rivals in ruling.rivals.values():
+            rivals.append(rival)
     fewer = [m for e in winner.effects for m in _fewer(race, winner, e, ruling.rivals[e.label], say)]
     if not fewer:
         return ruling
@@ -129,6 +132,18 @@ def _rivals(race: Race, winner: Model, effect: Candidate, say: Progress) -> list
                     if r.closure > race.closure(winner) + 0.01
                 ]
     return sorted(out, key=lambda r: (len(r.effects), -r.closure))[:MOST]
+
+
+def _instead_of_all(race: Race, winner: Model) -> list[Rival]:
+    """Single effects that explain as much as several of the winner's together."""
+    if len(winner.effects) < 2:
+        return []
+    out = []
+    for model in ranked(race, 1):
+        found = [r for e in winner.effects for r in _rival(race, winner, e, model.effects, model)]
+        if found:
+            out.append(replace(found[0], contains=any(r.contains for r in found)))
+    return out
 
 
 def _finished(race: Race, winner: Model, model: Model) -> Model:
