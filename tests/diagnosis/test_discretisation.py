@@ -156,3 +156,15 @@ def test_windows_get_shorter_where_contacts_make_the_step_worth_many_noises(monk
     pushed = logs(MASS, lambda i, t, q, v: np.sin(3 * t + i))
     cuts, step = run._measured(the(MASS).physics(PERIOD), pushed, None, False)
     assert cuts(1).steps == steps and step.floor[0] == steps / 6
+
+
+@pytest.mark.parametrize(
+    ("floor", "simulated", "share"), [(1e-3, False, 1.0), (2e-3, False, 0.5), (2e-2, False, 0.4), (2e-2, True, 1.0)]
+)
+def test_how_much_of_the_noise_is_the_sensors(floor, simulated, share):
+    """At least .4; logs of a simulation have no noise of their own to compare with."""
+    sigma, none = np.full(4, 1e-3), np.zeros(4)
+    found = discretisation.Discretisation(
+        0.01, 1, 1.0, none, none, none, sigma, np.full(4, floor), np.full(2, simulated), ("a", "b")
+    )
+    assert found.believed == pytest.approx(share)

@@ -1,0 +1,65 @@
+"""Which of several explanations is named, and which are told beside it, on races made by hand."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from bayessim_mjx.diagnosis import race as races
+from bayessim_mjx.diagnosis import verdict
+from bayessim_mjx.diagnosis.verdict import Rival
+
+
+def candidate(effect, where):
+    return SimpleNamespace(effect=effect, where=where, label=f"{effect}@{where}")
+
+
+@pytest.mark.parametrize(
+    ("effect", "rival", "behind", "narrower"),
+    [
+        (("armature", "all"), ("armature", "pole"), 3.0, True),
+        (("armature", "all"), ("armature", "pole"), 30.0, False),  # nats: the logs tell
+        (("armature", "pole"), ("armature", "all"), -3.0, False),
+        (("armature", "all"), ("payload", "pole"), 0.0, False),
+        (("armature", "slider"), ("armature", "pole"), 0.0, False),
+    ],
+)
+def test_one_place_is_named_before_all_where_the_logs_cannot_tell(effect, rival, behind, narrower):
+    other = Rival((candidate(*rival),), None, 1.0, "", behind=behind)
+    assert verdict._narrower(candidate(*effect), other) is narrower
+
+
+def test_one_law_in_the_place_of_two_is_told_of_both(monkeypatch):
+    """Friction that differs by direction is dry friction and a bias: 17 +- 16 mN m are 33 and 1 mN m."""
+    dry, bias, both = (candidate(n, "hinge") for n in ("coulomb_friction", "actuator_bias", "asymmetric_friction"))
+    winner, single, worse = (SimpleNamespace(effects=e) for e in ((dry, bias), (both,), (dry,)))
+    monkeypatch.setattr(verdict, "ranked", lambda race, size: [single, worse] if size == 1 else [])
+
+    def rival(race, winner, effect, others, model):
+        return [] if model is worse else [Rival(others, model, 0.99, "", contains=effect is dry)]
+
+    monkeypatch.setattr(verdict, "_rival", rival)
+    (found,) = verdict._instead_of_all(None, winner)
+    assert found.effects == (both,) and found.contains
+    assert verdict._instead_of_all(None, worse) == []
+
+
+@pytest.mark.parametrize(("value", "far", "there"), [(1.1, 2.0, True), (1.015, 2.0, False), (1.015, 1.0, True)])
+def test_an_effect_is_there_when_an_amplitude_is_off_neutral(monkeypatch, value, far, there):
+    monkeypatch.setattr(races, "deviations", lambda fitter, model: np.array([0.3, 0.01, 1e-9]))
+    gain, speed = SimpleNamespace(name="gain", neutral=1.0), SimpleNamespace(name="speed", neutral=0.0)
+    effect = SimpleNamespace(coordinates=[gain, speed], shapes=[False, True])  # a shape says nothing
+    job = SimpleNamespace(names=["mass", "gain", "speed"], values=np.array([1.0, value, 5.0]))
+    race = SimpleNamespace(fitter=None)
+    assert races.Race.distinct(race, SimpleNamespace(job=job), effect, far) is there
+
+
+@pytest.mark.parametrize(("rms", "believed", "goes_on"), [(1.2, 1.0, False), (1.4, 1.0, True), (1.2, 0.4, True)])
+def test_effects_are_added_until_the_sensors_noise_is_reached(rms, believed, goes_on):
+    """Where most of what counts as noise is what the time step may be worth, a model with effects can do better."""
+    race = SimpleNamespace(settings=races.Settings(believed=believed), noise=50.0)
+    cost = np.full(8, 50.0 * rms**2)
+    model = SimpleNamespace(effects=(candidate("payload", "link"),), cost=cost, total=cost.sum())
+    assert bool(races.Race.above_noise(race, model)) is goes_on
+    bare = SimpleNamespace(effects=(), cost=cost, total=cost.sum())
+    assert bool(races.Race.above_noise(race, bare)) is (rms > 1.3)
