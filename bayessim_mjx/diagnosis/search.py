@@ -40,6 +40,7 @@ __all__ = [
 
 
 FAR = 1.5  # noises that remain: beyond, the search also tries other ways
+MUCH = 0.03  # and of the whole gap
 ELSEWHERE = 3  # times
 BETTER = 0.5  # of the gap that remains, which another way has to undercut
 
@@ -154,9 +155,11 @@ def _elsewhere(race: Race, model: Model, say: Progress) -> Model:
     for _ in range(ELSEWHERE):
         if not model.effects or race.at_noise(model, (settings.believed * FAR) ** 2):
             return model
+        noise = settings.believed**2 * race.noise * len(model.cost)
+        if model.total - noise < MUCH * (race.base.total - noise):
+            return model
         others = [_instead(race, model, e, say) for e in model.effects]
         best = min((m for m in others if m is not None), key=lambda m: m.total, default=model)
-        noise = settings.believed**2 * race.noise * len(model.cost)
         if best.total - noise > BETTER * (model.total - noise):
             return model
         model = best
