@@ -1,8 +1,10 @@
 """What all tests share: a compiler that is quick about it, chosen before jax starts one."""
 
+import gc
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -20,6 +22,21 @@ def known(flag: str) -> bool:
 # Set by hand, also to nothing, it stays: CI runs its slow tests with the compiler as users have it. Workers inherit it.
 if "XLA_FLAGS" not in os.environ:
     os.environ["XLA_FLAGS"] = QUICK if known(QUICK) else ""
+
+
+MAPS = 20_000  # regions of memory; Linux gives a process 65530, and a compiler that gets no more of them crashes
+
+
+@pytest.fixture(autouse=True, scope="module")
+def room_for_programs():
+    """What was compiled is forgotten after a file of tests, where there is much of it."""
+    yield
+    maps = Path("/proc/self/maps")
+    if maps.is_file() and len(maps.read_bytes().splitlines()) > MAPS:
+        import jax
+
+        jax.clear_caches()
+        gc.collect()
 
 
 @pytest.fixture
