@@ -143,7 +143,9 @@ def rocking(compliance, frequency, ratio, depth):
     return plain() + apart  # without the error that the arm's own timestep makes with and without the base
 
 
-@pytest.mark.parametrize("base", [(0.004, 8.0, 0.1, 0.0), (0.002, 25.0, 0.05, 0.0), (0.01, 4.0, 0.3, 0.0), (0.004, 8.0, 0.1, 0.3)])
+@pytest.mark.parametrize(
+    "base", [(0.004, 8.0, 0.1, 0.0), (0.002, 25.0, 0.05, 0.0), (0.01, 4.0, 0.3, 0.0), (0.004, 8.0, 0.1, 0.3)]
+)
 def test_base_flexibility_is_two_more_hinges(base):
     real = rocking(*base)
     (q,) = run(theta(base_flexibility=base))
