@@ -252,7 +252,8 @@ def polish(race: Race, model: Model) -> Model:
                 break
     else:
         fitter.iterate([job], 4, lambda j: _fresh(race, j))
-    new = scored(race.fitter, race.fitter.refresh(job), model.effects)
+        fitter.refresh(job)
+    new = scored(fitter, job, model.effects)
     race.models[frozenset(c.label for c in model.effects)] = new
     return new
 

@@ -68,9 +68,9 @@ def rule(race: Race, say: Progress) -> Ruling:
     ruling = Ruling(winner)
     for effect in winner.effects:
         ruling.rivals[effect.label] = [*_in_parts(race, winner, effect, say), *_rivals(race, winner, effect, say)]
-    for rival in _instead_of_all(race, winner):
-        for rivals in ruling.rivals.values():
-            rivals.append(rival)
+    alike = _instead_of_all(race, winner)
+    for rivals in ruling.rivals.values():
+        rivals += alike
     fewer = [m for e in winner.effects for m in _fewer(race, winner, e, ruling.rivals[e.label], say)]
     if not fewer:
         return ruling

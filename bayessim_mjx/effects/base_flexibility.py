@@ -52,8 +52,8 @@ class BaseFlexibility(Effect):
         return find(self, mj_model, timestep, substeps)
 
     def init(self, at: Site) -> Any:
-        rest = jnp.zeros(2), jnp.zeros(2), jnp.ones((), bool), jnp.zeros((), bool)
-        return dict(zip(("tilt", "rate", "fresh", "moving"), rest, strict=True))
+        yes, no = jnp.ones((), bool), jnp.zeros((), bool)
+        return {"tilt": jnp.zeros(2), "rate": jnp.zeros(2), "fresh": yes, "moving": no}
 
     def on_start(self, at: Site, memory: Any, motion: Motion, theta: jax.Array) -> tuple[Any, Motion]:
         return memory | {"moving": jnp.ones((), bool)}, motion  # how it rocks is not known: as it is pushed just then
