@@ -392,6 +392,8 @@ class PPOConfig(Section):
     normalize_observations: bool = setting(True, "running mean and variance of observations")
     normalize_advantage_per_minibatch: bool = setting(False, "else once per batch")
     reward_scale: float = setting(1.0, "factor on rewards seen by the learner", above=0)
+    segment: int = setting(0, "minibatches estimate advantages anew over segments of so many steps; 0: no", low=0)
+    weight_init: str = setting("orthogonal", "how weights begin", choices=("orthogonal", "lecun_uniform"))
     hidden_actor: tuple[int, ...] = setting((64, 64), "widths of the actor", low=1)
     hidden_critic: tuple[int, ...] = setting((64, 64), "widths of the critic", low=1)
     activation: str = setting("elu", "activation of both networks", choices=ACTIVATIONS)
@@ -425,6 +427,8 @@ class PPOConfig(Section):
                 f"ppo.num_minibatches = {self.num_minibatches} is more than the batch of num_envs * num_steps = "
                 f"{self.num_envs} * {self.num_steps} = {batch} samples"
             )
+        if self.segment:
+            self._check_segment()
         if self.shared_trunk and self.critic_theta:
             raise UserError(
                 "ppo.critic_theta = True: with ppo.shared_trunk the actor would see theta too; use one of them"
@@ -445,6 +449,17 @@ class PPOConfig(Section):
             raise UserError("ppo.shared_trunk = True needs hidden layers to share: ppo.hidden_actor is []")
         if self.state_dependent_std and not 0.007 <= self.init_std <= 148:  # exp(+-5), networks.LOG_STD_LIMIT
             raise UserError(f"ppo.init_std = {self.init_std}: with ppo.state_dependent_std it is from 0.007 to 148")
+
+    def _check_segment(self) -> None:
+        said = f"ppo.segment = {self.segment}"
+        if self.num_steps % self.segment:
+            raise UserError(f"{said} has to divide ppo.num_steps = {self.num_steps}")
+        if self.num_minibatches > self.num_envs * self.num_steps // self.segment:
+            raise UserError(f"{said}: there are fewer segments than ppo.num_minibatches = {self.num_minibatches}")
+        if not self.normalize_advantage_per_minibatch:
+            raise UserError(f"{said} needs ppo.normalize_advantage_per_minibatch=True: each has advantages of its own")
+        if self.memory:
+            raise UserError(f"{said}: not with ppo.memory, whose minibatches are of whole sequences; set one to 0")
 
 
 @dataclass(frozen=True)

@@ -11,11 +11,13 @@ def gae(
     truncated: jax.Array,
     gamma: float,
     lam: float,
+    unroll: int = 1,
 ) -> tuple[jax.Array, jax.Array]:
     """Advantages and returns, [T, ...] each, from time-major arrays [T, ...].
 
     `next_value` is the value of the *true* next observation, before any reset: a termination is worth nothing
     afterwards, a truncation (time limit) is worth what the critic says. Both end the sum of an episode.
+    unroll: steps per turn of the loop.
     """
     # delta_t = r_t + gamma (1 - terminated_t) V(s_{t+1}) - V(s_t)
     delta = reward + gamma * (1 - terminated) * next_value - value
@@ -26,5 +28,5 @@ def gae(
         advantage = now[0] + now[1] * advantage
         return advantage, advantage
 
-    _, advantage = jax.lax.scan(step, 0.0 * delta[0], (delta, decay), reverse=True)
+    _, advantage = jax.lax.scan(step, 0.0 * delta[0], (delta, decay), reverse=True, unroll=unroll)
     return advantage, advantage + value

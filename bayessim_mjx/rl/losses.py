@@ -13,7 +13,7 @@ from jax.sharding import Mesh
 
 from bayessim_mjx.config import PPOConfig
 from bayessim_mjx.mirrors import MirrorMap
-from bayessim_mjx.rl import networks, sharding, symmetry
+from bayessim_mjx.rl import networks, segments, sharding, symmetry
 from bayessim_mjx.rl.networks import Params
 
 MIN_LEARNING_RATE, MAX_LEARNING_RATE = 1e-5, 1e-2  # bounds of the adaptive schedule
@@ -34,6 +34,7 @@ class Batch:
     returns: jax.Array  # [B]
     log_std: jax.Array | None = None  # [B, A] of the collecting policy, where it depends on the state
     copies: symmetry.Copies | None = None  # mirror images, where ppo.symmetry is on
+    future: segments.Future | None = None  # where ppo.segment is: all arrays are then segments [B / L, L, ...]
 
 
 def surrogate_loss(log_prob: jax.Array, old_log_prob: jax.Array, advantage: jax.Array, clip: float) -> jax.Array:
@@ -64,6 +65,8 @@ def loss(
     old_log_std [A] is that of the collecting policy; not used where the batch has its own. KL is of old || new,
     analytic; it, the entropy and the clip fraction are of the batch's own samples, not of their mirrored copies.
     """
+    if config.segment:
+        batch = segments.renewed(params, batch, config)
     act, size = networks.activation(config.activation), batch.advantage.shape[0]
     if config.normalize_advantage_per_minibatch:
         batch = dataclasses.replace(batch, advantage=standardise(batch.advantage))

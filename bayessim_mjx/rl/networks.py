@@ -38,12 +38,19 @@ def activation(name: str) -> Callable[[jax.Array], jax.Array]:
     return ACTIVATIONS[name]
 
 
-def mlp_init(key: jax.Array, sizes: Sequence[int], last_gain: float) -> list[Params]:
-    """Weights [in, out] orthogonal with gain sqrt(2) (the last layer: `last_gain`), biases zero; sizes: all widths."""
+def mlp_init(key: jax.Array, sizes: Sequence[int], last_gain: float, kind: str = "orthogonal") -> list[Params]:
+    """Weights [in, out] and biases of zero; sizes: all widths.
+
+    kind: orthogonal, with gain sqrt(2) (the last layer: `last_gain`), or lecun_uniform: uniform with variance 1 / in.
+    """
     keys = jax.random.split(key, len(sizes) - 1)
     gains = [2.0**0.5] * (len(sizes) - 2) + [last_gain]
+    uniform = jax.nn.initializers.lecun_uniform()
     return [
-        {"w": jax.nn.initializers.orthogonal(gain)(k, (n, m)), "b": jnp.zeros(m)}
+        {
+            "w": (uniform if kind == "lecun_uniform" else jax.nn.initializers.orthogonal(gain))(k, (n, m)),
+            "b": jnp.zeros(m),
+        }
         for k, gain, n, m in zip(keys, gains, sizes[:-1], sizes[1:], strict=True)
     ]
 
@@ -67,24 +74,32 @@ def init(
     shared_trunk: bool = False,
     memory: int = 0,
     memory_cell: str = "gru",
+    weight_init: str = "orthogonal",
 ) -> Params:
-    """Parameters of both networks. The actor's last layer is small: the first policy is nearly N(0, init_std^2).
+    """Parameters of both networks; weight_init: see `mlp_init`.
 
+    Orthogonal weights make the actor's last layer small: the first policy is nearly N(0, init_std^2).
     memory: units of a recurrent layer (`memory_cell`: gru or lstm) before the actor's others; 0: none.
     """
     actor_key, critic_key = jax.random.split(key)
-    layers = mlp_init(actor_key, [memory or observation_size, *hidden_actor, action_size], 0.01)
+    layers = mlp_init(actor_key, [memory or observation_size, *hidden_actor, action_size], 0.01, weight_init)
     actor: Params = {"layers": layers, "log_std": jnp.full(action_size, jnp.log(init_std))}
-    if state_dependent_std:  # outputs for the spread begin at init_std everywhere
+    if state_dependent_std:  # outputs for the spread begin at init_std, orthogonal weights everywhere
         bias = jnp.full(action_size, LOG_STD_LIMIT * np.arctanh(np.log(init_std) / LOG_STD_LIMIT))
-        spread = {"w": jnp.zeros_like(layers[-1]["w"]), "b": bias}
+        weights = jnp.zeros_like(layers[-1]["w"])
+        if weight_init == "lecun_uniform":
+            weights = jax.nn.initializers.lecun_uniform()(jax.random.fold_in(actor_key, 2), weights.shape)
+        spread = {"w": weights, "b": bias}
         joined = jax.tree.map(lambda mean, log_std: jnp.concatenate([mean, log_std], -1), layers[-1], spread)
         actor = {"layers": [*layers[:-1], joined]}
     if memory:
         actor[memory_cell] = recurrent.init(jax.random.fold_in(actor_key, 1), observation_size, memory, memory_cell)
     if shared_trunk:
-        return {"actor": actor, "critic": {"head": mlp_init(critic_key, [hidden_actor[-1], 1], 1.0)}}
-    return {"actor": actor, "critic": {"layers": mlp_init(critic_key, [critic_size, *hidden_critic, 1], 1.0)}}
+        return {"actor": actor, "critic": {"head": mlp_init(critic_key, [hidden_actor[-1], 1], 1.0, weight_init)}}
+    return {
+        "actor": actor,
+        "critic": {"layers": mlp_init(critic_key, [critic_size, *hidden_critic, 1], 1.0, weight_init)},
+    }
 
 
 def _trunk(actor: Params, x: Any) -> jax.Array:

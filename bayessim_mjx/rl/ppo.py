@@ -15,7 +15,18 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from bayessim_mjx.config import PPOConfig
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.mirrors import MirrorMap
-from bayessim_mjx.rl import episodes, losses, networks, normalise, privileged, recurrent, rnd, sharding, symmetry
+from bayessim_mjx.rl import (
+    episodes,
+    losses,
+    networks,
+    normalise,
+    privileged,
+    recurrent,
+    rnd,
+    segments,
+    sharding,
+    symmetry,
+)
 from bayessim_mjx.rl.gae import gae
 from bayessim_mjx.rl.networks import Policy
 from bayessim_mjx.rl.rnd import RND
@@ -124,9 +135,9 @@ def _check_shares(config: PPOConfig, mesh: Mesh | None) -> None:
         raise UserError(
             f"ppo.num_envs = {worlds} cannot be shared evenly by {devices} devices; give a multiple of {32 * devices}"
         )
-    part = (worlds if config.memory else worlds * config.num_steps) // config.num_minibatches
+    part = (worlds if config.memory else worlds * config.num_steps // max(1, config.segment)) // config.num_minibatches
     if part % devices:
-        what = "sequences" if config.memory else "transitions"
+        what = "sequences" if config.memory else "segments" if config.segment else "transitions"
         raise UserError(
             f"ppo.num_minibatches = {config.num_minibatches} makes minibatches of {part} {what}, which {devices} "
             "devices cannot share evenly"
@@ -185,7 +196,7 @@ def _init(env: Env, config: PPOConfig, mesh: Mesh | None) -> Callable[..., Train
         key, network_key, reset_key, clock_key = jax.random.split(key, 4)
         hidden = (config.hidden_actor, config.hidden_critic, config.init_std)
         kind = (config.state_dependent_std, config.shared_trunk)
-        memory = (config.memory, config.memory_cell)
+        memory = (config.memory, config.memory_cell, config.weight_init)
         actions = env.action_size - config.memory_size
         params = networks.init(network_key, sizes["policy"], sizes[critic_group(env)], actions, *hidden, *kind, *memory)
         worlds = _reset(env, reset_key, domain, config.num_envs, mesh)
@@ -254,7 +265,7 @@ def _collect(
 def _batch(env: Env, config: PPOConfig, state: TrainState, data: dict) -> losses.Batch:
     """The collected [T, N] arrays as B = T N transitions with values, advantages and returns, computed once.
 
-    With a memory as N sequences of T steps instead.
+    With a memory as N sequences of T steps instead, with ppo.segment as B / L segments of L steps.
     """
     act, group = networks.activation(config.activation), critic_group(env)
 
@@ -290,7 +301,13 @@ def _batch(env: Env, config: PPOConfig, state: TrainState, data: dict) -> losses
         log_std=log_std,
         copies=_copies(env, config, state, data),
     )
+    if config.segment:
+        future = segments.Future(reward, *ends, next_value, seen("final_observation", group))
+        batch = dataclasses.replace(batch, future=future)
     batch = sharding.pinned(batch, state.mesh)  # whole on every device: minibatches are drawn from all worlds
+    if config.segment:
+        batch = jax.tree.map(lambda x: segments.cut(x, config.segment), batch)
+        return dataclasses.replace(batch, future=dataclasses.replace(batch.future, last=batch.future.last[:, -1]))
     return jax.tree.map(lambda x: x.swapaxes(0, 1) if config.memory else x.reshape(-1, *x.shape[2:]), batch)
 
 

@@ -128,6 +128,18 @@ def test_a_spread_that_depends_on_the_state_begins_at_init_std_and_stays_bounded
     assert log_std.std() > 1 and jnp.abs(log_std).max() <= 5
 
 
+def test_lecun_uniform_weights_have_the_variance_of_one_over_their_inputs():
+    made = networks.init(
+        jax.random.PRNGKey(0), 50, 80, 30, (400,), (300,), 0.5, state_dependent_std=True, weight_init="lecun_uniform"
+    )
+    for layer in [*made["actor"]["layers"], *made["critic"]["layers"]]:
+        inputs = layer["w"].shape[0]
+        assert float(jnp.abs(layer["w"]).max()) <= (3 / inputs) ** 0.5
+        assert float(layer["w"].var()) * inputs == pytest.approx(1, abs=0.15)
+    spread = networks.gaussian(made["actor"], jnp.zeros((1, 50)), jnp.tanh)[1]
+    np.testing.assert_allclose(jnp.exp(spread), 0.5, rtol=1e-5)
+
+
 def test_means_are_the_same_with_either_kind_of_spread():
     plain, dependent = (
         networks.init(jax.random.PRNGKey(0), 3, 3, 2, (8,), (8,), 0.3, state_dependent_std=flag)

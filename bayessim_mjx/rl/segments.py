@@ -1,0 +1,50 @@
+"""Advantages over segments of a few steps that every minibatch estimates anew, with the critic of that moment.
+
+As Brax does. The critic that collected is a whole update old at the last minibatch; and a short segment rests on the
+critic after a few steps, where rewards summed up further vary more. Measured on ant: benchmarks/README.md.
+"""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from bayessim_mjx.config import PPOConfig
+from bayessim_mjx.rl import networks
+from bayessim_mjx.rl.gae import gae
+
+
+@struct.dataclass
+class Future:
+    """What advantages are made of besides values, for S segments of L steps."""
+
+    reward: jax.Array  # [S, L] with its scale, and the bonus for novelty
+    terminated: jax.Array  # [S, L]
+    truncated: jax.Array  # [S, L]
+    next_value: jax.Array  # [S, L] of the true next observation, by the critic that collected
+    last: jax.Array  # [S, S'] true next observation of the critic after the last step
+
+
+def cut(x: jax.Array, length: int) -> jax.Array:
+    """[T, N, ...] -> segments [T / length * N, length, ...]."""
+    steps, worlds = x.shape[:2]
+    return x.reshape(steps // length, length, worlds, *x.shape[2:]).swapaxes(1, 2).reshape(-1, length, *x.shape[2:])
+
+
+def renewed(params: networks.Params, batch: Any, config: PPOConfig) -> Any:
+    """The segments [S, L, ...] as S L transitions, with advantages and returns by the critic `params`.
+
+    Inside a segment the next value is that of the next observation seen, but the one from the collection where an
+    episode is cut off: the true next observation is then not the next one seen. No gradient flows through them.
+    """
+    act, future = networks.activation(config.activation), batch.future
+    value, last = (networks.value(params, x, act) for x in (batch.critic_observation, future.last))
+    following = jnp.concatenate([value[:, 1:], last[:, None]], 1)
+    following = jnp.where(future.truncated > 0, future.next_value, following)
+    steps = (future.reward, value, following, future.terminated, future.truncated)
+    estimates = gae(*(x.T for x in steps), config.gamma, config.gae_lambda, unroll=config.segment)
+    advantage, returns = (jax.lax.stop_gradient(x.T) for x in estimates)
+    batch = dataclasses.replace(batch, advantage=advantage, returns=returns, future=None)
+    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), batch)
