@@ -81,10 +81,16 @@ def mesh(config: Config) -> Any:
 
 def mesh_of(devices: Sequence[Any]) -> Any:
     """The mesh of these devices; None for one."""
+    import jax
     import numpy as np
     from jax.sharding import Mesh
 
-    return Mesh(np.array(devices), (WORLDS,)) if len(devices) > 1 else None
+    if len(devices) == 1:
+        return None
+    if devices[0].platform == "gpu" and hasattr(jax.config, "jax_use_shardy_partitioner"):
+        # jax 0.11's compiler ends with a segmentation fault in its pass shardy-xla on collection by several GPUs
+        jax.config.update("jax_use_shardy_partitioner", False)
+    return Mesh(np.array(devices), (WORLDS,))
 
 
 def _cache(jax: Any, folder: str | None) -> None:
