@@ -33,38 +33,44 @@ RANDOM_SHARE = 0.1  # policy_rl_randomized: share of the steps with a uniformly 
 POLICY_DEPENDENT = ("policy_rl", "policy_rl_randomized")
 
 
-def policy_function(name: str, policy: Policy, action_size: int) -> Callable[[Array, dict], Array]:
+def policy_function(name: str, policy: Policy, action_size: int, memory: int = 0) -> Callable[[Array, dict], Array]:
     """The collection policy `name` as a function (key, obs of one world) -> action [action_size].
 
+    memory: numbers at the end of an action that are the policy's memory (`rl.recurrent`), 0 where it is not asked.
     random is symmetric, U[-1, 1]; rl_randomized flips its coin for every world and step by itself. The policy's arrays
     are leaves of the function, so a new policy does not recompile.
     """
     if name == "policy_rl":
         return jax.tree_util.Partial(_act, policy)
     if name == "policy_rl_randomized":
-        return jax.tree_util.Partial(_act_randomized, policy)
-    return {"policy_random": _random, "policy_ones": _ones}[name](action_size)
+        return jax.tree_util.Partial(_randomized(memory), policy)
+    return {"policy_random": _random, "policy_ones": _ones}[name](action_size - memory, memory)
 
 
 def _act(policy: Policy, key: Array, obs: dict) -> Array:
     return dataclasses.replace(policy, deterministic=False).act(key, obs)
 
 
-def _act_randomized(policy: Policy, key: Array, obs: dict) -> Array:
-    k_coin, k_random, k_policy = jax.random.split(key, 3)
-    action = _act(policy, k_policy, obs)
-    other = jax.random.uniform(k_random, action.shape, minval=-1.0, maxval=1.0)
-    return jnp.where(jax.random.bernoulli(k_coin, RANDOM_SHARE), other, action)
+@functools.lru_cache  # the same function again, which does not recompile
+def _randomized(memory: int) -> Callable[[Policy, Array, dict], Array]:
+    def act(policy: Policy, key: Array, obs: dict) -> Array:
+        k_coin, k_random, k_policy = jax.random.split(key, 3)
+        action = _act(policy, k_policy, obs)
+        acted, remembered = jnp.split(action, [action.shape[-1] - memory])
+        other = jax.random.uniform(k_random, acted.shape, minval=-1.0, maxval=1.0)
+        return jnp.concatenate([jnp.where(jax.random.bernoulli(k_coin, RANDOM_SHARE), other, acted), remembered])
+
+    return act
 
 
 @functools.lru_cache
-def _random(action_size: int) -> Callable[[Array, dict], Array]:
-    return lambda key, obs: jax.random.uniform(key, (action_size,), minval=-1.0, maxval=1.0)
+def _random(actions: int, memory: int) -> Callable[[Array, dict], Array]:
+    return lambda key, obs: jnp.pad(jax.random.uniform(key, (actions,), minval=-1.0, maxval=1.0), (0, memory))
 
 
 @functools.lru_cache
-def _ones(action_size: int) -> Callable[[Array, dict], Array]:
-    return lambda key, obs: jnp.ones(action_size)
+def _ones(actions: int, memory: int) -> Callable[[Array, dict], Array]:
+    return lambda key, obs: jnp.pad(jnp.ones(actions), (0, memory))
 
 
 def summarise(summarizer: Callable, trajectory: Trajectory) -> Array:
@@ -125,13 +131,18 @@ class Surrogate:
         return self.policy_name in POLICY_DEPENDENT
 
     @property
+    def memory(self) -> int:
+        """Numbers of memory at the end of the policy's actions (`rl.recurrent`)."""
+        return getattr(self.env, "memory_size", 0)
+
+    @property
     def channels(self) -> Seen:
         """What the summarizer sees: observations and actions."""
         (size,) = self.env.observation_size["policy"]
         states = _named(getattr(self.env, "observation_names", ()), size, "observation")
         model = getattr(self.env, "mj_model", None)
         commands = () if model is None else Channels.of(model).actuators
-        return Seen(self.length, states, _named(commands, self.env.action_size, "action"))
+        return Seen(self.length, states, _named(commands, self.env.action_size - self.memory, "action"))
 
     def sample(self, key: Array, count: int) -> Array:
         """theta [count, d] of the surrogate, inside the box."""
@@ -147,10 +158,12 @@ class Surrogate:
 
     def _observe(self, key: Array, thetas: Array, policy: Policy) -> Trajectory:
         k_roll, k_noise = jax.random.split(key)
-        act = policy_function(self.policy_name, policy, self.env.action_size)
+        actions = self.env.action_size
+        act = policy_function(self.policy_name, policy, actions, self.memory)
         trajectory = rollout(self.env, act, k_roll, thetas, self.length)
-        seen = trajectory.observation
-        return dataclasses.replace(trajectory, observation=seen + self.noise * jax.random.normal(k_noise, seen.shape))
+        seen, action = trajectory.observation, trajectory.action[..., : actions - self.memory]
+        noisy = seen + self.noise * jax.random.normal(k_noise, seen.shape)
+        return dataclasses.replace(trajectory, observation=noisy, action=action)
 
     def real(self, key: Array, first: int, count: int, policy: Policy) -> tuple[Array, Trajectory]:
         """`count` real trajectories and their features [count, D]; `first` of them were asked for before."""

@@ -25,6 +25,7 @@ from bayessim_mjx.env import Env
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.loop_state import Loop, LoopState, RoundInfo
 from bayessim_mjx.rl import Policy, TrainState
+from bayessim_mjx.rl.recurrent import remembering
 from bayessim_mjx.round_inference import PREDICTIVE_DRAWS, blank, infer, reexamine, score
 
 __all__ = [
@@ -54,7 +55,8 @@ class Checkpoints(Protocol):
 
 def make(config: Config, env: Env) -> Loop:
     """Build the loop's static parts; refuses configurations that cannot work."""
-    b = config.bayessim
+    b, memory = config.bayessim, config.ppo.memory_size
+    env = remembering(env, memory) if memory else env
     if b.modelClass is None:
         # The ablation infers nothing, but is scored on the same surrogate.
         source = make_source(config, env) if len(env.space) else None

@@ -400,7 +400,7 @@ class PPOConfig(Section):
     init_std: float = setting(1.0, "initial standard deviation of actions", above=0)
     state_dependent_std: bool = setting(False, "the actor gives the standard deviation too, else it is a parameter")
     shared_trunk: bool = setting(False, "the critic is one layer on the actor's hidden ones (hidden_critic is unused)")
-    memory: int = setting(0, "units of a recurrent layer before the actor's others; 0: none (train, play)", low=0)
+    memory: int = setting(0, "units of a recurrent layer before the actor's others; 0: none", low=0)
     memory_cell: str = setting("gru", "kind of the recurrent layer: gru or lstm", choices=tuple(MEMORIES))
     critic_theta: bool = setting(False, "the critic also sees the physics, theta (not the actor)")
     policy_theta: bool = setting(False, "the policy sees theta too: a teacher, for simulation alone (train, play)")

@@ -145,6 +145,19 @@ def test_another_seed_draws_other_trajectories(env, finished):
     assert not np.array_equal(np.asarray(draws), np.asarray(finished[0].real_features[:2]))
 
 
+@pytest.mark.slow
+def test_a_policy_with_a_memory_acts_in_all_rounds_and_its_memory_is_no_action(env, parts):
+    """The features are those of a policy without one; random actions leave the memory alone."""
+    more = ("ppo.memory=4", "bayessim.collectPolicy=policy_rl_randomized", "ppo.num_minibatches=2")
+    remembering = loop.make(settings(*more), env)
+    assert remembering.feature_size == parts.feature_size
+    assert remembering.source.channels == parts.source.channels
+    state, (_, info) = loop.run(remembering, loop.init(remembering))
+    assert int(state.round) == 2 and np.isfinite(info.returns).all()
+    assert info.real.action.shape[-1] == env.action_size
+    assert "gru" in state.train.params["actor"]
+
+
 def test_without_a_model_the_domain_stays_the_prior(env):
     ablation = loop.make(settings("bayessim.modelClass=None", "bayessim.realIters=1"), env)
     state, rounds = loop.run(ablation, loop.init(ablation))

@@ -176,7 +176,7 @@ def check(env: Env, config: PPOConfig, mesh: Mesh | None = None) -> None:
         raise UserError("ppo.policy_theta = True trains a teacher; the commands that can are train and play")
     if config.memory_size != getattr(env, "memory_size", 0):
         raise UserError(
-            f"ppo.memory = {config.memory}: the commands that train and play policies with a memory are train and play"
+            f"ppo.memory = {config.memory}: the environment has to carry the memory on, see rl.recurrent.remembering"
         )
     env = _for_learner(env, config)
     if config.shared_trunk and critic_group(env) != "policy":
