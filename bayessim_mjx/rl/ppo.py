@@ -303,11 +303,13 @@ def _batch(env: Env, config: PPOConfig, state: TrainState, data: dict) -> losses
     )
     if config.segment:
         future = segments.Future(reward, *ends, next_value, seen("final_observation", group))
-        batch = dataclasses.replace(batch, future=future)
+        batch = dataclasses.replace(batch, future=segments.ended(future, config.segment))
+    alike = group == "policy" and not config.memory  # actor and critic see the same: it is sent to the devices once
+    batch = dataclasses.replace(batch, critic_observation=None) if alike else batch
     batch = sharding.pinned(batch, state.mesh)  # whole on every device: minibatches are drawn from all worlds
+    batch = dataclasses.replace(batch, critic_observation=batch.observation) if alike else batch
     if config.segment:
-        batch = jax.tree.map(lambda x: segments.cut(x, config.segment), batch)
-        return dataclasses.replace(batch, future=dataclasses.replace(batch.future, last=batch.future.last[:, -1]))
+        return segments.cut(batch, config.segment)
     return jax.tree.map(lambda x: x.swapaxes(0, 1) if config.memory else x.reshape(-1, *x.shape[2:]), batch)
 
 

@@ -27,10 +27,22 @@ class Future:
     last: jax.Array  # [S, S'] true next observation of the critic after the last step
 
 
-def cut(x: jax.Array, length: int) -> jax.Array:
-    """[T, N, ...] -> segments [T / length * N, length, ...]."""
-    steps, worlds = x.shape[:2]
-    return x.reshape(steps // length, length, worlds, *x.shape[2:]).swapaxes(1, 2).reshape(-1, length, *x.shape[2:])
+def ended(future: Future, length: int) -> Future:
+    """Time-major arrays [T, N, ...] with the observations `last` of segments' ends alone, [T / length, N, S']."""
+    return dataclasses.replace(future, last=future.last[length - 1 :: length])
+
+
+def cut(batch: Any, length: int) -> Any:
+    """Time-major arrays [T, N, ...] of a batch, its future `ended` -> segments [T / length * N, length, ...]."""
+
+    def segmented(x: jax.Array) -> jax.Array:
+        steps, worlds = x.shape[:2]
+        return x.reshape(steps // length, length, worlds, *x.shape[2:]).swapaxes(1, 2).reshape(-1, length, *x.shape[2:])
+
+    last = batch.future.last
+    batch = jax.tree.map(segmented, dataclasses.replace(batch, future=dataclasses.replace(batch.future, last=None)))
+    last = last.reshape(-1, last.shape[-1])
+    return dataclasses.replace(batch, future=dataclasses.replace(batch.future, last=last))
 
 
 def renewed(params: networks.Params, batch: Any, config: PPOConfig) -> Any:

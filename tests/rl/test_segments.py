@@ -42,7 +42,11 @@ def estimates(seen, ahead, scale=1.0):
 def test_segments_are_steps_in_a_row_of_one_world():
     x = jnp.arange(6)[:, None] * 10 + jnp.arange(2)  # step t of world n is 10 t + n
     expected = [[0, 10, 20], [1, 11, 21], [30, 40, 50], [31, 41, 51]]
-    np.testing.assert_array_equal(segments.cut(x, 3), expected)
+    ahead = segments.ended(segments.Future(x, x, x, x, x[..., None]), 3)
+    found = segments.cut(losses.Batch(*[x] * 8, future=ahead), 3)
+    np.testing.assert_array_equal(found.future.reward, expected)
+    np.testing.assert_array_equal(found.value, expected)
+    np.testing.assert_array_equal(found.future.last[:, 0], [20, 21, 50, 51])
 
 
 def test_sums_by_hand():
