@@ -382,6 +382,18 @@ def test_main_killed_and_resumed_equals_unkilled(toy: None, monkeypatch: Any, ca
     assert "posterior" in capsys.readouterr().out
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("summary", "model"), [("learned", "MDNN"), ("signatory_2", "MDRFF")])
+def test_main_learns_from_every_kind_of_summary(toy: None, summary: str, model: str) -> None:
+    """The toy's mass is 1.5 of 0.5 to 2: a thousand short trajectories are enough to favour it over the prior."""
+    more = [f"bayessim.summarizerFxn={summary}", f"bayessim.modelClass={model}", "bayessim.trainTrajs=1000"]
+    more += ["bayessim.hiddenLayers=[32]", "bayessim.trainTrajLen=8", "bayessim.ensemble=2", "bayessim.realIters=1"]
+    assert main.main(["--task", "Pendulum", *SMALL, *LOOP, *more]) == 0
+    run = latest_run("logs", "Pendulum")
+    (row,) = [json.loads(line) for line in (run.path / "rounds.jsonl").read_text().splitlines()]
+    assert row["scores"]["gain_over_prior"] > 0.2 and row["checks"]["misfit"]["p"] > 0.01
+
+
 def interrupted_round(monkeypatch: pytest.MonkeyPatch) -> None:
     """Ctrl-C while the first round is reported."""
     from bayessim_mjx.monitor.session import Session
