@@ -25,7 +25,7 @@ class Batch:
     """B transitions, as the policy that collected them saw them (normalised, old statistics)."""
 
     observation: jax.Array  # [B, S]
-    critic_observation: jax.Array  # [B, S']
+    critic_observation: Any  # [B, S'] array
     action: jax.Array  # [B, A] unclipped sample
     mean: jax.Array  # [B, A] of the collecting policy
     log_prob: jax.Array  # [B]

@@ -196,9 +196,9 @@ def _init(env: Env, config: PPOConfig, mesh: Mesh | None) -> Callable[..., Train
         key, network_key, reset_key, clock_key = jax.random.split(key, 4)
         hidden = (config.hidden_actor, config.hidden_critic, config.init_std)
         kind = (config.state_dependent_std, config.shared_trunk)
-        memory = (config.memory, config.memory_cell, config.weight_init)
-        actions = env.action_size - config.memory_size
-        params = networks.init(network_key, sizes["policy"], sizes[critic_group(env)], actions, *hidden, *kind, *memory)
+        memory = (config.memory, config.memory_cell)
+        widths = (sizes["policy"], sizes[critic_group(env)], env.action_size - config.memory_size)
+        params = networks.init(network_key, *widths, *hidden, *kind, *memory, weight_init=config.weight_init)
         worlds = _reset(env, reset_key, domain, config.num_envs, mesh)
         env_states, partial = _stagger(clock_key, worlds, env.episode_length)
         state = TrainState(
