@@ -15,17 +15,19 @@ import numpy as np
 import optax
 from flax import struct
 from jax import Array
+from jax.flatten_util import ravel_pytree
 
 from bayessim_mjx.distributions import Distribution, charts
-from bayessim_mjx.inference import identify, mdn
+from bayessim_mjx.inference import bases, identify, mdn
 from bayessim_mjx.inference.settings import InferenceSettings
+from bayessim_mjx.triangular import product
 
 GOLDEN = np.uint32(2654435769)  # 2^32 / golden ratio: spreads the validation rows evenly over any number of rows
 SCORED = 256  # validation rows for which the truncated density is reported
 CURVE = 40  # points of the loss curves, at least
 SHARPNESS = np.geomspace(0.4, 2.0, 17).astype(np.float32)  # of the members, tried on the held-out rows
 LADDER = 1  # power of the members' places that their dropout rises with
-TRIED = 300  # gradient steps at least, before a training may end early
+TRIED = 150  # gradient steps at least (and a fortieth) that bases are tried for, and before a training may end early
 MEMBERS = "members"  # axis of the ensemble
 CLIMBS, SWEEPS = 50, 2  # steps towards the members' weights; rounds over their sharpness
 
@@ -37,10 +39,16 @@ class FitState:
     params: Any  # of all members of the ensemble: leaves [E, ...]
     x_mean: Array  # [D]
     x_rate: Array  # [D] 1 / sd of the first fit's data; 0 drops a constant column
+    basis: Array | None  # [D, D] what standardised inputs are multiplied by; None: nothing
     fits: Array  # [] int32, fits done so far
     identified: Array  # [d] bool, parameters whose marginal beats the prior on the last fit's held-out rows
     settings: InferenceSettings = struct.field(pytree_node=False)
     space: Any = struct.field(pytree_node=False)
+
+    def inputs(self, x: Array) -> Array:
+        """Summaries x [n, D] as the network takes them in [n, D]."""
+        z = _standardise(x, self.x_mean, self.x_rate, self.settings.clip)[0]
+        return z if self.basis is None else _rotated(z, self.basis, self.settings.clip)
 
 
 @struct.dataclass
@@ -65,7 +73,7 @@ class FitInfo:
 
 
 class _Data(NamedTuple):
-    x: Array  # [N, D] standardised
+    x: Array  # [N, D] as the network takes them in; in training [M, N, D] in each of the bases
     y: Array  # [N, d]
     slopes: Array  # [N] log density of u = log density of y + this
     train: Array  # [N] bool
@@ -85,7 +93,8 @@ def init(key: Array, settings: InferenceSettings, space: Any, dim_x: int) -> Fit
         jax.random.split(key, settings.ensemble), jnp.asarray(mdn.counts(settings))
     )
     known, fits = jnp.ones(len(space), bool), jnp.asarray(0, jnp.int32)
-    return FitState(params, jnp.zeros(dim_x), jnp.ones(dim_x), fits, known, settings, space)
+    basis = jnp.eye(dim_x) if bases.count(settings, dim_x) > 1 else None
+    return FitState(params, jnp.zeros(dim_x), jnp.ones(dim_x), basis, fits, known, settings, space)
 
 
 def fit(
@@ -142,11 +151,11 @@ def condition(state: FitState, x: Array) -> Distribution:
 
 @jax.jit
 def _condition(state: FitState, x: Array) -> Distribution:
-    return _posteriors(state, _standardise(x, state.x_mean, state.x_rate, state.settings.clip)[0])
+    return _posteriors(state, state.inputs(x))
 
 
 def _posteriors(state: FitState, z: Array) -> Distribution:
-    """Standardised summaries [n, D] -> batched Distribution, a trace of the prior mixed in."""
+    """The network's inputs [n, D] -> batched Distribution, a trace of the prior mixed in."""
     build = partial(
         Distribution.from_unit, state.space, prior_weight=state.settings.defensive, chart=state.settings.chart
     )
@@ -182,13 +191,18 @@ def _fit(
 ) -> tuple[FitState, FitInfo]:
     settings = state.settings
     state, data, clipped, n_invalid = _prepare(state, thetas, x, count)
-    data = data._replace(proposals=proposals, origin=origin)
+    matrices = _bases(state, data)
+    data = data._replace(
+        proposals=proposals, origin=origin, x=jax.vmap(lambda m: _rotated(data.x, m, settings.clip))(matrices)
+    )
     member = partial(_train, data=data, settings=settings, fresh=state.fits == 0)
     # most members have little dropout
     rates = settings.dropout * jnp.linspace(0.0, 1.0, settings.ensemble) ** LADDER
-    params, best, steps, skipped, curves = jax.vmap(member, axis_name=MEMBERS)(
+    params, basis, best, steps, skipped, curves = jax.vmap(member, axis_name=MEMBERS)(
         jax.random.split(key, settings.ensemble), state.params, rates
     )
+    data = data._replace(x=data.x[basis[0]])
+    state = replace(state, basis=None if state.basis is None else matrices[basis[0]])
     state = replace(state, params=_weigh(params, data, settings), fits=state.fits + 1)
     marginals = _marginal_gain(_mixtures(state, data.x[data.held]), data.y[data.held], settings)
     parameter_gain, identified = identify.identified(marginals, data.mask)
@@ -214,73 +228,98 @@ def _fit(
     return state, info
 
 
+def _bases(state: FitState, data: _Data) -> Array:
+    """The matrices [M, D, D] that a first fit chooses from; later ones keep its choice."""
+    found = bases.candidates(data.x, data.train, bases.count(state.settings, data.x.shape[1]))
+    return found if state.basis is None else jnp.where(state.fits == 0, found, state.basis[None])
+
+
 def _train(
     key: Array, params: Any, rate: Array, data: _Data, settings: InferenceSettings, fresh: Array
-) -> tuple[Any, Array, Array, Array, Array]:
-    """One member: its best weights, where they were on the curve, steps taken and skipped, and the loss curves [2, P].
+) -> tuple[Any, Array, Array, Array, Array, Array]:
+    """One member: its best weights, their basis, where they were on the curve, steps taken and skipped, curves [2, P].
 
-    A first training ends early if no member has beaten the best start, the linear-Gaussian posterior, in a tenth of it.
+    In a first training each member tries another basis for a while, then all start anew in the best of them. It ends
+    early if no member has beaten the best start, the linear-Gaussian posterior, in a fortieth of it.
     """
-    points, chunk = schedule_length(settings, data.x.shape[0])
+    (points, chunk), tried = schedule_length(settings, data.x.shape[1]), data.x.shape[0]
     optimiser = optax.chain(
         optax.clip_by_global_norm(settings.grad_clip),
         optax.adamw(optax.cosine_decay_schedule(settings.lr, points * chunk), weight_decay=settings.weight_decay),
     )
     n_train = jnp.sum(data.train.astype(jnp.int32))
-    batch = min(settings.batch, data.x.shape[0])
-    params = jax.tree.map(lambda a, b: jnp.where(fresh, a, b), _fresh(params, data, settings), params)
-    fixed = {name: params[name] for name in mdn.FIXED if name in params}
+    batch = min(settings.batch, data.x.shape[1])
+    params = jax.vmap(lambda x: _fresh(params, data._replace(x=x), settings, fresh))(data.x)
+    fixed = {name: params[name][0] for name in mdn.FIXED if name in params}
+    trained = {name: leaf for name, leaf in params.items() if name not in fixed}
+    unravel = ravel_pytree(jax.tree.map(lambda leaf: leaf[0], trained))[1]
+    # one vector of weights: a few kernels per step instead of some for every layer
+    starts = jax.vmap(lambda tree: ravel_pytree(tree)[0])(trained)
 
-    def loss(params: Any, rows: Array, key: Array) -> Array:
+    def objective(flat: Array, basis: Array, rows: Array, drop: mdn.Drop | None = None) -> Array:
+        return _objective({**unravel(flat), **fixed}, rows, data, settings, drop, data.x[basis, rows])
+
+    def loss(flat: Array, basis: Array, rows: Array, key: Array) -> Array:
         drop = (key, rate) if settings.ensemble > 1 and settings.dropout > 0 else None
-        return -jnp.mean(_objective({**params, **fixed}, rows, data, settings, drop))
+        return -jnp.mean(objective(flat, basis, rows, drop))
 
-    def step(carry: tuple, inputs: tuple[Array, Array]) -> tuple[tuple, Array]:
-        params, opt_state, skipped = carry
-        value, gradient = jax.value_and_grad(loss)(params, *inputs)
+    def held_out(flat: Array, basis: Array) -> Array:
+        value = objective(flat, basis, data.held)
+        return -jnp.sum(jnp.where(data.mask > 0, value, 0.0)) / jnp.sum(data.mask)
+
+    def step(basis: Array, carry: tuple, inputs: tuple[Array, Array]) -> tuple[tuple, Array]:
+        flat, opt_state, skipped = carry
+        value, gradient = jax.value_and_grad(loss)(flat, basis, *inputs)
         usable = jnp.isfinite(optax.global_norm(gradient))
         with jax.numpy_dtype_promotion("standard"):  # optax computes decay**count, a float to an int32
-            updates, new_opt = optimiser.update(gradient, opt_state, params)
-        new = optax.apply_updates(params, updates), new_opt
-        params, opt_state = jax.tree.map(lambda a, b: jnp.where(usable, a, b), new, (params, opt_state))
-        return (params, opt_state, skipped + 1 - usable.astype(jnp.int32)), value
+            updates, new_opt = optimiser.update(gradient, opt_state, flat)
+        new = optax.apply_updates(flat, updates), new_opt
+        flat, opt_state = jax.tree.map(lambda a, b: jnp.where(usable, a, b), new, (flat, opt_state))
+        return (flat, opt_state, skipped + 1 - usable.astype(jnp.int32)), value
+
+    def begin(basis: Array) -> tuple[tuple, tuple]:
+        """What is trained, and the best so far: held-out loss, weights, place on the curve."""
+        flat = starts[basis]
+        zero = jnp.asarray(0, jnp.int32)
+        return (flat, optimiser.init(flat), zero), (values[basis], flat, zero - 1)
 
     def point(carry: tuple) -> tuple:
-        i, _, inner, best, curves = carry
-        key = keys[i]
+        i, _, basis, inner, best, curves = carry
+        # the members' trials are over
+        basis = jnp.where(i == 0, jnp.argmin(jax.lax.all_gather(best[0], MEMBERS)[:tried]), basis)
+        inner, best = jax.tree.map(lambda a, b: jnp.where(i == 0, a, b), begin(basis), (inner, best))
+        key = keys[i + trial]
         # a fresh order of the training rows; batches walk through it and wrap around
         order = jnp.argsort(jnp.where(data.train, jax.random.uniform(key, data.train.shape), jnp.inf))
         place = jnp.arange(chunk * batch, dtype=jnp.int32).reshape(chunk, batch) % jnp.maximum(n_train, 1)
-        inner, losses = jax.lax.scan(step, inner, (order[place], jax.random.split(jax.random.fold_in(key, 1), chunk)))
-        value = held_out(inner[0])
+        rows = order[place], jax.random.split(jax.random.fold_in(key, 1), chunk)
+        inner, losses = jax.lax.scan(partial(step, basis), inner, rows)
+        value = held_out(inner[0], basis)
         better = value < best[0]
-        candidate = (value, inner[0], i)
-        best = jax.tree.map(lambda a, b: jnp.where(better, a, b), candidate, best)
-        curves = curves.at[:, i].set(jnp.stack([jnp.mean(losses), value]))
-        beaten = jax.lax.pmin(best[0], MEMBERS) < lowest
-        return i + 1, ~fresh | beaten | (i + 1 < patience), inner, best, curves
+        best = jax.tree.map(lambda a, b: jnp.where(better, a, b), (value, inner[0], i), best)
+        curves = curves.at[:, jnp.maximum(i, 0)].set(jnp.stack([jnp.mean(losses), value]))
+        beaten = jax.lax.pmin(best[0], MEMBERS) < jax.lax.pmin(values[basis], MEMBERS)
+        return i + 1, ~fresh | beaten | (i + 1 < patience), basis, inner, best, curves
 
-    def held_out(params: Any) -> Array:
-        value = _objective({**params, **fixed}, data.held, data, settings)
-        return -jnp.sum(jnp.where(data.mask > 0, value, 0.0)) / jnp.sum(data.mask)
-
-    trained = {name: leaf for name, leaf in params.items() if name not in fixed}
-    start = (trained, optimiser.init(trained), jnp.asarray(0, jnp.int32))
-    best = (held_out(trained), trained, jnp.asarray(-1, jnp.int32))
-    lowest = jax.lax.pmin(best[0], MEMBERS)
-    patience, keys = max(points // 10, -(-TRIED // chunk)), jax.random.split(key, points)
-    carry = (jnp.asarray(0, jnp.int32), jnp.asarray(True), start, best, jnp.zeros((2, points)))
-    done, _, inner, best, curves = jax.lax.while_loop(lambda c: c[1] & (c[0] < points), point, carry)
+    patience = max(points // 40, -(-TRIED // chunk))
+    trial = patience if tried > 1 else 0
+    keys = jax.random.split(key, trial + points)
+    values = jax.vmap(held_out)(starts, jnp.arange(tried, dtype=jnp.int32))
+    basis = jax.lax.axis_index(MEMBERS) % tried
+    first = jnp.where(fresh, -trial, 0)
+    carry = (first, jnp.asarray(True), basis, *begin(basis), jnp.zeros((2, points)))
+    done, _, basis, inner, best, curves = jax.lax.while_loop(lambda c: c[1] & (c[0] < points), point, carry)
     curves = curves[:, jnp.minimum(jnp.arange(points, dtype=jnp.int32), done - 1)]
-    return {**best[1], **fixed}, best[2], done * chunk, inner[2], curves
+    return {**unravel(best[1]), **fixed}, basis, best[2], done * chunk, inner[2], curves
 
 
-def _fresh(params: Any, data: _Data, settings: InferenceSettings) -> Any:
-    """The weights a first fit starts from."""
+def _fresh(params: Any, data: _Data, settings: InferenceSettings, fresh: Array) -> Any:
+    """The weights that training starts from: of a first fit, the linear-Gaussian posterior."""
     held = jnp.zeros_like(data.train).at[data.held].set(data.mask > 0)
     x = mdn.embedded(params, data.x, settings)
-    params = mdn.choose_bandwidth(params, x, data.y, data.train, held, settings)
-    return mdn.linear_start(params, x, data.y, data.train.astype(jnp.float32), settings)
+    new = mdn.choose_bandwidth(params, x, data.y, data.train, held, settings)
+    new = mdn.linear_start(new, x, data.y, data.train.astype(jnp.float32), settings)
+    return jax.tree.map(lambda a, b: jnp.where(fresh, a, b), new, params)
 
 
 def _weigh(params: Any, data: _Data, settings: InferenceSettings) -> Any:
@@ -325,10 +364,15 @@ def _weigh(params: Any, data: _Data, settings: InferenceSettings) -> Any:
 
 
 def _objective(
-    params: Any, rows: Array, data: _Data, settings: InferenceSettings, drop: mdn.Drop | None = None
+    params: Any,
+    rows: Array,
+    data: _Data,
+    settings: InferenceSettings,
+    drop: mdn.Drop | None = None,
+    x: Array | None = None,
 ) -> Array:
     """What training maximises, per row: log q(theta | x), less the log of what the proposal makes of it."""
-    x, y = data.x[rows], data.y[rows]
+    x, y = data.x[rows] if x is None else x, data.y[rows]
     heads = mdn.forward(params, x, y.shape[-1], settings, drop)
     if data.proposals is None or data.origin is None:
         return mdn.density(heads, y, settings)
@@ -379,6 +423,10 @@ def _column_scales(x: Array, valid: Array) -> tuple[Array, Array]:
 def _standardise(x: Array, mean: Array, rate: Array, clip: float) -> tuple[Array, Array]:
     z = (x - mean[None, :]) * rate[None, :]
     return jnp.clip(z, -clip, clip), (jnp.abs(z) > clip).astype(jnp.float32)
+
+
+def _rotated(z: Array, basis: Array, clip: float) -> Array:
+    return jnp.clip(product(z, basis), -clip, clip)
 
 
 def _held_out_gain(state: FitState, data: _Data) -> Array:

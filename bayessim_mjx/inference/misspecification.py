@@ -153,8 +153,7 @@ def _two_sided(held: np.ndarray, real: np.ndarray) -> np.ndarray:
 
 def latent(state: Any, x: Array) -> Array:
     """What the network made of summaries x [n, D]: the last hidden layers of all members of the ensemble, [n, E H]."""
-    clip = state.settings.clip
-    z = jnp.clip((x - state.x_mean[None, :]) * state.x_rate[None, :], -clip, clip)
+    z = state.inputs(x)
     layers = jax.vmap(lambda params: mdn.hidden(params, mdn.embedded(params, z, state.settings)))(state.params)
     return jnp.moveaxis(layers, 0, 1).reshape(x.shape[0], -1)
 
