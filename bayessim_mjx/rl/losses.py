@@ -18,6 +18,7 @@ from bayessim_mjx.rl.networks import Params
 
 MIN_LEARNING_RATE, MAX_LEARNING_RATE = 1e-5, 1e-2  # bounds of the adaptive schedule
 RATE_FACTOR = 1.5
+FARTHEST = 3.0  # log of the ratio of probabilities up to which a sample counts
 
 
 @struct.dataclass
@@ -38,8 +39,12 @@ class Batch:
 
 
 def surrogate_loss(log_prob: jax.Array, old_log_prob: jax.Array, advantage: jax.Array, clip: float) -> jax.Array:
-    """Clipped surrogate: mean max(-A ratio, -A clip(ratio, 1 +- clip)), ratio = pi_new / pi_old; arrays [B]."""
-    ratio = jnp.exp(log_prob - old_log_prob)
+    """Clipped surrogate: mean max(-A ratio, -A clip(ratio, 1 +- clip)), ratio = pi_new / pi_old; arrays [B].
+
+    Beyond e^+-FARTHEST a ratio is held, without a gradient: mirrored copies may be that unlikely at first, and a single
+    one that is worse than expected would make the loss infinite.
+    """
+    ratio = jnp.exp(jnp.clip(log_prob - old_log_prob, -FARTHEST, FARTHEST))
     return jnp.maximum(-advantage * ratio, -advantage * jnp.clip(ratio, 1 - clip, 1 + clip)).mean()
 
 

@@ -53,6 +53,15 @@ def test_surrogate_is_clipped_only_where_that_is_pessimistic(ratio, advantage, e
     assert losses.surrogate_loss(new, old, jnp.array([float(advantage)]), 0.2) == pytest.approx(expected, rel=1e-5)
 
 
+def test_samples_that_were_all_but_impossible_leave_the_loss_finite_and_have_no_gradient():
+    """Mirrored copies of an asymmetric policy: exp(200) is infinite in float32, and so is the loss of a bad sample."""
+    old, advantage = jnp.array([-200.0, -3.0]), jnp.array([-1.0, -1.0])
+    new = jnp.array([0.0, -2.9])
+    value, slope = jax.value_and_grad(lambda new: losses.surrogate_loss(new, old, advantage, 0.2))(new)
+    assert value == pytest.approx((math.exp(3) + math.exp(0.1)) / 2, rel=1e-5)
+    np.testing.assert_allclose(slope, [0.0, math.exp(0.1) / 2], rtol=1e-5)
+
+
 @pytest.mark.parametrize(
     "value, clip, expected",
     [(2.0, 0.2, 1.0), (1.0, 0.2, 0.64), (1.0, None, 0.0), (0.1, 0.2, 0.81), (-1.0, 0.2, 4.0)],
