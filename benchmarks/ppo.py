@@ -11,8 +11,9 @@ many as published); `seconds_without_evals` is without all of their time. Ours i
 policies that it had at its log intervals, after the race; `training` has the returns of the last 100 episodes of
 training, which lag by an episode. `steps_per_s` is of training alone: the median over epochs or log intervals after
 the first. "wide" is ours with four times the worlds and a quarter of the steps: the same samples per update; "wider"
-with eight times. Ours has Brax's segments and first weights (`ppo.segment`, `ppo.weight_init`), too. A function that
-JAX no longer has is put back for Brax.
+with eight times. Ours has Brax's segments and first weights (`ppo.segment`, `ppo.weight_init`), too. Where Brax restarts
+all worlds before every update (CartpoleBalance), ours has training episodes of an update's length; goals are those of
+whole episodes. A function that JAX no longer has is put back for Brax.
 """
 
 import argparse
@@ -123,8 +124,10 @@ def run_ours(name: str, published: dict, widening: int, seed: int, race: Race, w
     from bayessim_mjx import registry, rl
 
     race.mark("imports")
-    env = registry.make(name, episodeLength=published["episode_length"])
     config = ppo_config(published, widening)
+    whole_env = registry.make(name, episodeLength=published["episode_length"])
+    length = config.num_steps if "num_resets_per_eval" in published else published["episode_length"]
+    env, share = registry.make(name, episodeLength=length), length / published["episode_length"]
     total = max(1, round(published["num_timesteps"] / (config.num_envs * config.num_steps)))
     config = replace(config, log_interval=max(1, total // 50))
     row: dict = {"worlds": config.num_envs, "training": []}
@@ -135,7 +138,7 @@ def run_ours(name: str, published: dict, widening: int, seed: int, race: Race, w
         speeds.append(metrics["Perf/total_fps"])
         policies.append((int(metrics["env_steps"]), race.seconds(), jax.device_get(rl.policy_of(state))))
         row["training"].append(round(metrics["Train/mean_reward"], 1))
-        if race.late() or (race.over(metrics["Train/mean_reward"]) and not whole and len(speeds) > 3):
+        if race.late() or (race.over(metrics["Train/mean_reward"] / share) and not whole and len(speeds) > 3):
             raise Over
 
     race.mark("environment")
@@ -144,7 +147,7 @@ def run_ours(name: str, published: dict, widening: int, seed: int, race: Race, w
     with contextlib.suppress(Over):
         rl.run(env, config, state, iterations=total if whole else 4 * total, progress=progress)
     say({"env": name, "unjudged": row | {"steps": [p[0] for p in policies], "seconds": [p[1] for p in policies]}})
-    for (steps, taken, _), reward in zip(policies, judged(env, policies), strict=True):
+    for (steps, taken, _), reward in zip(policies, judged(whole_env, policies), strict=True):
         race.curve.append([steps, taken, reward])
     return race.row(speeds) | row | {"reward": race.curve[-1][2], "steps": race.curve[-1][0]}
 

@@ -51,7 +51,10 @@ def update(
     group = teacher_group(env)
     env_states, data = ppo._collect(env, config, state, domain, collect_key, (group,))
     seen = data["observation"]["policy"]
-    observation = normalise.normalise(state.normalizer["policy"], seen) if config.normalize_observations else seen
+    normalizer, observation = state.normalizer, seen
+    if config.normalize_observations:  # learnt with the statistics that the student will act with
+        normalizer = {**normalizer, "policy": normalise.update(normalizer["policy"], seen)}
+        observation = normalise.normalise(normalizer["policy"], seen)
     batch = sharding.pinned((observation, teacher.act(None, data["observation"][group])), state.mesh)
     batch = jax.tree.map(lambda x: x.reshape(-1, x.shape[-1]), batch)
 
@@ -62,9 +65,6 @@ def update(
     params, opt_state, rate, figures = losses.descend(
         epochs_key, state.params, state.opt_state, state.learning_rate, batch, config, objective, state.mesh
     )
-    normalizer = state.normalizer
-    if config.normalize_observations:
-        normalizer = {**normalizer, "policy": normalise.update(normalizer["policy"], seen)}
     after = dataclasses.replace(
         ppo.moved_on(config, state, env_states, data, key), params=params, opt_state=opt_state, normalizer=normalizer
     )

@@ -23,7 +23,7 @@ FARTHEST = 3.0  # log of the ratio of probabilities up to which a sample counts
 
 @struct.dataclass
 class Batch:
-    """B transitions, as the policy that collected them saw them (normalised, old statistics)."""
+    """B transitions; observations normalised by statistics that include them."""
 
     observation: jax.Array  # [B, S]
     critic_observation: Any  # [B, S'] array

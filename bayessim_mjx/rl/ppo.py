@@ -1,4 +1,4 @@
-"""PPO as `init` and one jitted `update`: new worlds, collection, advantages once, epochs of minibatches, statistics."""
+"""PPO as `init` and one jitted `update`: new worlds, collection, statistics, advantages once, epochs of minibatches."""
 
 from __future__ import annotations
 
@@ -262,16 +262,30 @@ def _collect(
     return run(policy_of(state), noise, state.env_states, pool)
 
 
-def _batch(env: Env, config: PPOConfig, state: TrainState, data: dict) -> losses.Batch:
+def _statistics(config: PPOConfig, state: TrainState, data: dict) -> dict[str, normalise.Moments]:
+    """Those of the observations up to these: learnt with at once, as the policy will act with them.
+
+    A policy that learns with the statistics that it was collected with acts with others than it learnt with, which
+    costs most where they are still young (CartpoleBalance of Playground: twice the samples; benchmarks/README.md).
+    """
+    if not config.normalize_observations:
+        return state.normalizer
+    return {group: normalise.update(m, data["observation"][group]) for group, m in state.normalizer.items()}
+
+
+def _batch(
+    env: Env, config: PPOConfig, state: TrainState, data: dict, normalizer: dict[str, normalise.Moments]
+) -> losses.Batch:
     """The collected [T, N] arrays as B = T N transitions with values, advantages and returns, computed once.
 
-    With a memory as N sequences of T steps instead, with ppo.segment as B / L segments of L steps.
+    With a memory as N sequences of T steps instead, with ppo.segment as B / L segments of L steps. Observations are
+    normalised by `normalizer`; mean and probability of the actions are those of the policy that acted, by the state's.
     """
     act, group = networks.activation(config.activation), critic_group(env)
 
     def seen(which: str, group: str) -> Any:
         x = data[which][group]
-        return normalise.normalise(state.normalizer[group], x) if config.normalize_observations else x
+        return normalise.normalise(normalizer[group], x) if config.normalize_observations else x
 
     def valued(which: str) -> Any:
         x = seen(which, group)
@@ -299,7 +313,7 @@ def _batch(env: Env, config: PPOConfig, state: TrainState, data: dict) -> losses
         advantage=advantage,
         returns=returns,
         log_std=log_std,
-        copies=_copies(env, config, state, data),
+        copies=_copies(env, config, state, data, normalizer),
     )
     if config.segment:
         future = segments.Future(reward, *ends, next_value, seen("final_observation", group))
@@ -313,20 +327,23 @@ def _batch(env: Env, config: PPOConfig, state: TrainState, data: dict) -> losses
     return jax.tree.map(lambda x: x.swapaxes(0, 1) if config.memory else x.reshape(-1, *x.shape[2:]), batch)
 
 
-def _copies(env: Env, config: PPOConfig, state: TrainState, data: dict) -> symmetry.Copies | None:
+def _copies(
+    env: Env, config: PPOConfig, state: TrainState, data: dict, normalizer: dict[str, normalise.Moments]
+) -> symmetry.Copies | None:
     """Mirror images [T, N, K, ...] of the collected transitions; None where ppo.symmetry is off."""
     maps = _mirrors(env, config)
     if not maps:
         return None
     act, group = networks.activation(config.activation), critic_group(env)
 
-    def seen(group: str) -> jax.Array:
+    def seen(group: str, moments: dict[str, normalise.Moments]) -> jax.Array:
         raw = symmetry.images(data["observation"][group], [m.observation[group] for m in maps])
-        return normalise.normalise(state.normalizer[group], raw) if config.normalize_observations else raw
+        return normalise.normalise(moments[group], raw) if config.normalize_observations else raw
 
-    observation, critic_observation = seen("policy"), seen(group)
+    observation, critic_observation = seen("policy", normalizer), seen(group, normalizer)
     action = symmetry.images(data["extras"]["action"], [m.action for m in maps])
-    log_prob = networks.log_prob(*networks.gaussian(state.params["actor"], observation, act), action)
+    collector = networks.gaussian(state.params["actor"], seen("policy", state.normalizer), act)
+    log_prob = networks.log_prob(*collector, action)
     value = networks.value(state.params, critic_observation, act)
     return symmetry.Copies(observation, critic_observation, action, log_prob, value)
 
@@ -365,14 +382,13 @@ def update(
     key, collect_key, epochs_key = jax.random.split(state.key, 3)
     env_states, data = _collect(env, config, state, domain, collect_key)
     novel, bonus, novelty_loss = _novelty(env, config, state, data, epochs_key)
-    batch = _batch(env, config, state, data if bonus is None else data | {"reward": data["reward"] + bonus})
+    normalizer = _statistics(config, state, data)
+    data = data if bonus is None else data | {"reward": data["reward"] + bonus}
+    batch = _batch(env, config, state, data, normalizer)
     params, opt_state, rate, figures = losses.optimise(
         epochs_key, state.params, state.opt_state, state.learning_rate, batch, config, _mirrors(env, config), state.mesh
     )
     figures |= novelty_loss
-    normalizer = state.normalizer
-    if config.normalize_observations:  # only now: collection and update of one iteration see the same statistics
-        normalizer = {g: normalise.update(m, data["observation"][g]) for g, m in normalizer.items()}
     after = dataclasses.replace(
         moved_on(config, state, env_states, data, key),
         params=params,

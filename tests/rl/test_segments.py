@@ -87,8 +87,8 @@ def test_one_segment_of_all_steps_is_the_estimate_of_the_whole_batch():
     env.dt = 1.0
     state = rl.init(env, config, jax.random.PRNGKey(0))
     _, data = ppo._collect(env, config, state, None, jax.random.PRNGKey(1))
-    cut = ppo._batch(env, config, state, data)
-    whole = ppo._batch(env, dataclasses.replace(config, segment=0), state, data)
+    cut = ppo._batch(env, config, state, data, state.normalizer)
+    whole = ppo._batch(env, dataclasses.replace(config, segment=0), state, data, state.normalizer)
     assert cut.advantage.shape == (4, 6) and cut.future.last.shape[0] == 4
     renewed = segments.renewed(state.params, cut, config)
     for name in ("advantage", "returns"):  # step-major there, world-major here

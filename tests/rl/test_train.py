@@ -11,7 +11,7 @@ import pytest
 
 from bayessim_mjx import rl
 from bayessim_mjx.config import PPOConfig
-from bayessim_mjx.rl import networks, ppo
+from bayessim_mjx.rl import networks, normalise, ppo
 from bayessim_mjx.rl.train import time as clock
 
 # the package has functions of these names
@@ -145,6 +145,34 @@ def test_the_critic_has_its_own_observations_and_statistics():
     np.testing.assert_array_equal(policy.act(None, obs), policy.act(None, {**obs, "critic": jnp.ones(2)}))
 
 
+def test_a_policy_learns_with_the_statistics_that_it_will_act_with(monkeypatch):
+    """Of the first update, too: and the probabilities of the actions stay those of the policy that acted."""
+    env, batches = probes.Clock(), []
+    config = dataclasses.replace(CONFIG, normalize_observations=True)
+    state = rl.init(env, config, key(0))
+    for _ in range(2):
+        optimise = ppo.losses.optimise
+
+        def spy(*args):
+            batches.append(args[4])
+            return optimise(*args)  # noqa: B023
+
+        with monkeypatch.context() as patched:
+            patched.setattr(ppo.losses, "optimise", spy)
+            after, _ = ppo.update(env, config, state, None)
+        _, data = ppo._collect(env, config, state, None, jax.random.split(state.key, 3)[1])
+        raw, batch = data["observation"], batches[-1]
+        for group, seen in (("policy", batch.observation), ("critic", batch.critic_observation)):
+            expected = normalise.normalise(after.normalizer[group], raw[group]).reshape(seen.shape)
+            np.testing.assert_allclose(seen, expected, atol=1e-6)
+        mean, log_std = rl.policy_of(state).distribution(raw)
+        np.testing.assert_allclose(batch.mean, mean.reshape(batch.mean.shape), atol=1e-6)
+        log_prob = networks.log_prob(batch.mean, log_std, batch.action)
+        np.testing.assert_allclose(batch.log_prob, log_prob, atol=1e-5)
+        state = after
+    assert float(jnp.abs(after.normalizer["critic"].mean).max()) > 0.1  # or they could not have told
+
+
 def test_advantages_bootstrap_from_the_true_last_observation():
     """Rows cut by the time limit: advantage = reward + gamma V(last observation, 4) - V(observation)."""
     env = probes.Clock()
@@ -152,7 +180,7 @@ def test_advantages_bootstrap_from_the_true_last_observation():
     state = rl.init(env, config, key(0))
     state = state.replace(env_states=jax.vmap(env.reset)(jax.random.split(key(1), 16), jnp.zeros((16, 1))))
     _, data = jax.jit(lambda s: ppo._collect(env, config, s, None, s.key))(state)
-    batch = ppo._batch(env, config, state, data)
+    batch = ppo._batch(env, config, state, data, state.normalizer)
     cut = np.asarray(data["truncated"]).reshape(-1) > 0
     assert cut.sum() == 32
     first = np.asarray(data["observation"]["critic"][:, :, 0]).reshape(-1)
