@@ -60,8 +60,8 @@ MUTANTS = (
     ),
     Mutant(
         5, "log-probabilities of mirrored samples zeroed", PPO,
-        "symmetry.Copies(observation, critic_observation, action, log_prob, value)",
-        "symmetry.Copies(observation, critic_observation, action, 0 * log_prob, value)",
+        "symmetry.Copies(observation, critic_observation, action, log_prob, value, weight)",
+        "symmetry.Copies(observation, critic_observation, action, 0 * log_prob, value, weight)",
         (f"{T}symmetry.py", "-k", "seen_and_rated"), True,
     ),
     Mutant(

@@ -10,11 +10,11 @@ since its command was given, imports and compilation included. Brax is judged by
 many as published); `seconds_without_evals` is without all of their time. Ours is judged by the same evaluation of the
 policies that it had at its log intervals, after the race; `training` has the returns of the last 100 episodes of
 training, which lag by an episode. `steps_per_s` is of training alone: the median over epochs or log intervals after
-the first. Ours ends once five intervals were over the goal in training: single ones are, by chance, before the policy is.
-"wide" is ours with four times the worlds and a quarter of the steps: the same samples per update; "wider" with eight
-times. Ours has Brax's segments and first weights (`ppo.segment`, `ppo.weight_init`), too. Where Brax restarts all worlds
-before every update (CartpoleBalance), ours has training episodes of an update's length; goals are those of whole
-episodes. A function that JAX no longer has is put back for Brax.
+the first. Ours ends once five intervals were over the goal in training: single ones are, by chance, before the policy
+is. "wide" is ours with four times the worlds and a quarter of the steps: the same samples per update; "wider" with
+eight times. Ours has Brax's segments and first weights (`ppo.segment`, `ppo.weight_init`), too. Where Brax restarts all
+worlds before every update (CartpoleBalance), ours has training episodes of an update's length; goals are those of
+whole episodes. A function that JAX no longer has is put back for Brax.
 """
 
 import argparse

@@ -35,17 +35,23 @@ class Batch:
     returns: jax.Array  # [B]
     log_std: jax.Array | None = None  # [B, A] of the collecting policy, where it depends on the state
     copies: symmetry.Copies | None = None  # mirror images, where ppo.symmetry is on
+    weight: jax.Array | None = None  # [B] of samples and copies, where these were joined
     future: segments.Future | None = None  # where ppo.segment is: all arrays are then segments [B / L, L, ...]
 
 
-def surrogate_loss(log_prob: jax.Array, old_log_prob: jax.Array, advantage: jax.Array, clip: float) -> jax.Array:
+def surrogate_loss(
+    log_prob: jax.Array, old_log_prob: jax.Array, advantage: jax.Array, clip: float, weight: jax.Array | None = None
+) -> jax.Array:
     """Clipped surrogate: mean max(-A ratio, -A clip(ratio, 1 +- clip)), ratio = pi_new / pi_old; arrays [B].
+
+    weight: of the samples in the mean.
 
     Beyond e^+-FARTHEST a ratio is held, without a gradient: mirrored copies may be that unlikely at first, and a single
     one that is worse than expected would make the loss infinite.
     """
     ratio = jnp.exp(jnp.clip(log_prob - old_log_prob, -FARTHEST, FARTHEST))
-    return jnp.maximum(-advantage * ratio, -advantage * jnp.clip(ratio, 1 - clip, 1 + clip)).mean()
+    losses = jnp.maximum(-advantage * ratio, -advantage * jnp.clip(ratio, 1 - clip, 1 + clip))
+    return losses.mean() if weight is None else (weight * losses).sum() / weight.sum()
 
 
 def value_loss(value: jax.Array, old_value: jax.Array, returns: jax.Array, clip: float | None) -> jax.Array:
@@ -79,7 +85,7 @@ def loss(
     samples = symmetry.augmented(batch) if augmented else batch
     means, log_stds = networks.gaussian(params["actor"], samples.observation, act)
     log_prob = networks.log_prob(means, log_stds, samples.action)  # of raw actions: tanh's slope cancels in the ratio
-    surrogate = surrogate_loss(log_prob, samples.log_prob, samples.advantage, config.clip_param)
+    surrogate = surrogate_loss(log_prob, samples.log_prob, samples.advantage, config.clip_param, samples.weight)
     value = value_loss(
         networks.value(params, samples.critic_observation, act),
         samples.value,

@@ -302,18 +302,19 @@ def _batch(
     ends = (data["terminated"], data["truncated"])
     advantage, returns = gae(reward, value, next_value, *ends, config.gamma, config.gae_lambda)
     mean, action = data["extras"]["mean"], data["extras"]["action"]
-    log_std = data["extras"].get("log_std")
+    log_std = data["extras"]["log_std"] if "log_std" in data["extras"] else state.params["actor"]["log_std"]
+    log_prob = networks.log_prob(mean, log_std, action)
     batch = losses.Batch(
         observation=observation,
         critic_observation=critic_observation,
         action=action,
         mean=mean,
-        log_prob=networks.log_prob(mean, state.params["actor"]["log_std"] if log_std is None else log_std, action),
+        log_prob=log_prob,
         value=value,
         advantage=advantage,
         returns=returns,
-        log_std=log_std,
-        copies=_copies(env, config, state, data, normalizer),
+        log_std=data["extras"].get("log_std"),
+        copies=_copies(env, config, state, data, normalizer, log_prob),
     )
     if config.segment:
         future = segments.Future(reward, *ends, next_value, seen("final_observation", group))
@@ -328,9 +329,17 @@ def _batch(
 
 
 def _copies(
-    env: Env, config: PPOConfig, state: TrainState, data: dict, normalizer: dict[str, normalise.Moments]
+    env: Env,
+    config: PPOConfig,
+    state: TrainState,
+    data: dict,
+    normalizer: dict[str, normalise.Moments],
+    own: jax.Array,
 ) -> symmetry.Copies | None:
-    """Mirror images [T, N, K, ...] of the collected transitions; None where ppo.symmetry is off."""
+    """Mirror images [T, N, K, ...] of the collected transitions, whose log-probabilities are `own` [T, N].
+
+    None where ppo.symmetry is off.
+    """
     maps = _mirrors(env, config)
     if not maps:
         return None
@@ -345,7 +354,8 @@ def _copies(
     collector = networks.gaussian(state.params["actor"], seen("policy", state.normalizer), act)
     log_prob = networks.log_prob(*collector, action)
     value = networks.value(state.params, critic_observation, act)
-    return symmetry.Copies(observation, critic_observation, action, log_prob, value)
+    weight = jnp.exp(jnp.minimum(0.0, log_prob - own[..., None]))
+    return symmetry.Copies(observation, critic_observation, action, log_prob, value, weight)
 
 
 def _novelty(

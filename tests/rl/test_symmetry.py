@@ -69,7 +69,9 @@ def _example(size, mirrors, activation):
     advantage = jax.random.normal(keys[3], (size,))
     seen = symmetry.images(obs, [m.observation["policy"] for m in mirrors])
     done = symmetry.images(action, [m.action for m in mirrors])
-    copies = symmetry.Copies(seen, seen, done, *rate(seen, done)[1:])
+    _, mirrored, values = rate(seen, done)
+    weight = jnp.minimum(1, jnp.exp(mirrored - log_prob[:, None]))
+    copies = symmetry.Copies(seen, seen, done, mirrored, values, weight)
     batch = losses.Batch(obs, obs, action, mean, log_prob, value, advantage, value + advantage, copies=copies)
     return params, batch
 
@@ -115,6 +117,22 @@ def test_augmentation_is_training_on_the_copies_as_samples_of_their_own():
         assert with_copies[name] != pytest.approx(without[name], rel=1e-3)
 
 
+def test_copies_that_the_policy_would_never_make_do_not_move_it():
+    """A policy that turns left where its mirror image would turn right learns from what it did itself alone."""
+    params, batch = example()
+    copies = batch.copies.replace(log_prob=batch.copies.log_prob - 40, weight=jnp.exp(batch.copies.log_prob - 40))
+    old = params["actor"]["log_std"]
+
+    def gradient(batch, cfg, mirrors):
+        return jax.jit(jax.grad(lambda p: losses.loss(p, old, batch, cfg, mirrors)[0]))(params)["actor"]
+
+    one = gradient(dataclasses.replace(batch, copies=copies), config(augment=True), MIRRORS)
+    two = gradient(batch, CONFIG, ())
+    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(two), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-5)
+    assert max(float(jnp.abs(x).max()) for x in jax.tree.leaves(two)) > 1e-2
+
+
 def test_copies_keep_the_standardised_advantages_of_their_samples():
     params, batch = example()
     cfg = config(augment=True, normalize_advantage_per_minibatch=True)
@@ -123,10 +141,11 @@ def test_copies_keep_the_standardised_advantages_of_their_samples():
 
 
 def test_nothing_has_moved_before_the_first_minibatch_though_the_policy_is_not_symmetric():
-    """All ratios are 1: the surrogate is minus the mean advantage. With the samples' own densities it would not be."""
+    """All ratios are 1: the surrogate is minus the mean weighted advantage. With their own densities it is not."""
     params, batch = example()
     surrogate = loss(params, batch, config(augment=True))[1]["Loss/surrogate"]
-    assert surrogate == pytest.approx(-float(batch.advantage.mean()), abs=1e-5)
+    weight = 1 + np.minimum(1, np.exp(batch.copies.log_prob - batch.log_prob[:, None])).sum(1)
+    assert surrogate == pytest.approx(-float((weight * batch.advantage).sum() / weight.sum()), abs=1e-5)
     assert np.abs(batch.copies.log_prob - batch.log_prob[:, None]).max() > 1
 
 
@@ -170,7 +189,10 @@ def test_a_symmetric_policy_has_no_mirror_loss():
 
 
 def test_copies_are_seen_and_rated_as_the_collecting_policy_would():
-    """Mirrored before they are normalised, with statistics that are not symmetric; densities by the policy itself."""
+    """Mirrored before they are normalised, with statistics that are not symmetric; densities by the policy itself.
+
+    They are learnt with later statistics.
+    """
     cfg = config(augment=True)
     state = rl.init(ONE_SIDED, cfg, key(0))
     moments = normalise.Moments(jnp.array([0.4]), jnp.array([2.0]), jnp.float32(10))
@@ -180,14 +202,19 @@ def test_copies_are_seen_and_rated_as_the_collecting_policy_would():
     raw = {"policy": jnp.array([[[1.0], [-2.0]]])}
     action = jnp.array([[[0.3], [1.7]]])
     data = {"observation": raw, "extras": {"action": action}}
-    copies = ppo._copies(ONE_SIDED, cfg, state, data)
+    later = {"policy": normalise.Moments(jnp.array([0.6]), jnp.array([3.0]), jnp.float32(20))}
     policy = rl.policy_of(state)
-    np.testing.assert_allclose(copies.observation[0, :, 0], normalise.normalise(moments, -raw["policy"][0]), rtol=1e-6)
+    own = policy.log_prob(raw, action)
+    copies = ppo._copies(ONE_SIDED, cfg, state, data, later, own)
+    seen = normalise.normalise(later["policy"], -raw["policy"][0])
+    np.testing.assert_allclose(copies.observation[0, :, 0], seen, rtol=1e-6)
+    np.testing.assert_allclose(copies.weight[..., 0], np.minimum(1, np.exp(copies.log_prob[..., 0] - own)), rtol=1e-5)
+    assert copies.weight.min() < 0.9
     np.testing.assert_array_equal(copies.action[0, :, 0], -action[0])
     np.testing.assert_allclose(copies.log_prob[0, :, 0], policy.log_prob(-raw["policy"][0], -action[0]), rtol=1e-5)
     value = networks.value(state.params, copies.observation, networks.activation(cfg.activation))
     np.testing.assert_allclose(copies.value, value, rtol=1e-6)
-    assert ppo._copies(ONE_SIDED, CONFIG, state, data) is None
+    assert ppo._copies(ONE_SIDED, CONFIG, state, data, later, own) is None
 
 
 @pytest.mark.parametrize(
