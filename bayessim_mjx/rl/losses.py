@@ -28,12 +28,12 @@ class Batch:
     observation: jax.Array  # [B, S]
     critic_observation: Any  # [B, S'] array
     action: jax.Array  # [B, A] unclipped sample
-    mean: jax.Array  # [B, A] of the collecting policy
-    log_prob: jax.Array  # [B]
+    mean: jax.Array  # [B, A] of the policy before learning
+    log_prob: jax.Array  # [B] by the policy that collected: with older statistics
     value: jax.Array  # [B]
     advantage: jax.Array  # [B]
     returns: jax.Array  # [B]
-    log_std: jax.Array | None = None  # [B, A] of the collecting policy, where it depends on the state
+    log_std: jax.Array | None = None  # [B, A] like the mean, where it depends on the state
     copies: symmetry.Copies | None = None  # mirror images, where ppo.symmetry is on
     weight: jax.Array | None = None  # [B] of samples and copies, where these were joined
     future: segments.Future | None = None  # where ppo.segment is: all arrays are then segments [B / L, L, ...]

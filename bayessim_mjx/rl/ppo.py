@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -279,7 +279,8 @@ def _batch(
     """The collected [T, N] arrays as B = T N transitions with values, advantages and returns, computed once.
 
     With a memory as N sequences of T steps instead, with ppo.segment as B / L segments of L steps. Observations are
-    normalised by `normalizer`; mean and probability of the actions are those of the policy that acted, by the state's.
+    normalised by `normalizer`; the actions' probabilities are those of the policy that acted, by the state's. KL counts
+    from the policy that learning starts from: new statistics alone would slow an adaptive rate down.
     """
     act, group = networks.activation(config.activation), critic_group(env)
 
@@ -301,9 +302,13 @@ def _batch(
     reward = config.reward_scale * data["reward"]
     ends = (data["terminated"], data["truncated"])
     advantage, returns = gae(reward, value, next_value, *ends, config.gamma, config.gae_lambda)
-    mean, action = data["extras"]["mean"], data["extras"]["action"]
-    log_std = data["extras"]["log_std"] if "log_std" in data["extras"] else state.params["actor"]["log_std"]
-    log_prob = networks.log_prob(mean, log_std, action)
+    action, mean, log_std = data["extras"]["action"], data["extras"]["mean"], data["extras"].get("log_std")
+    fixed = state.params["actor"].get("log_std")
+    log_prob = networks.log_prob(mean, fixed if log_std is None else log_std, action)
+    if config.normalize_observations:
+        turned = partial(jax.tree.map, lambda x: x.swapaxes(0, 1) if config.memory else x)
+        mean, spread = networks.gaussian(state.params["actor"], turned(observation), act)
+        mean, log_std = turned((mean, None if log_std is None else spread))
     batch = losses.Batch(
         observation=observation,
         critic_observation=critic_observation,
@@ -313,7 +318,7 @@ def _batch(
         value=value,
         advantage=advantage,
         returns=returns,
-        log_std=data["extras"].get("log_std"),
+        log_std=log_std,
         copies=_copies(env, config, state, data, normalizer, log_prob),
     )
     if config.segment:
@@ -393,8 +398,8 @@ def update(
     env_states, data = _collect(env, config, state, domain, collect_key)
     novel, bonus, novelty_loss = _novelty(env, config, state, data, epochs_key)
     normalizer = _statistics(config, state, data)
-    data = data if bonus is None else data | {"reward": data["reward"] + bonus}
-    batch = _batch(env, config, state, data, normalizer)
+    rewarded = data if bonus is None else data | {"reward": data["reward"] + bonus}
+    batch = _batch(env, config, state, rewarded, normalizer)
     params, opt_state, rate, figures = losses.optimise(
         epochs_key, state.params, state.opt_state, state.learning_rate, batch, config, _mirrors(env, config), state.mesh
     )

@@ -112,7 +112,7 @@ def test_the_callers_state_survives():
 
 
 def test_statistics_are_pooled_before_learning():
-    """One minibatch per iteration: its KL is that of the policy that acted and the same with new statistics."""
+    """One minibatch per iteration: nothing is learnt before it, and its KL is of learning alone."""
     config = dataclasses.replace(CONFIG, num_epochs=1, num_minibatches=1)
     state, update = rl.init(WALK, config, key(0)), rl.make_update(WALK, config)
     seen = []
@@ -120,10 +120,8 @@ def test_statistics_are_pooled_before_learning():
         assert state.normalizer["policy"].count == i * 16 * 8
         _, data = jax.jit(lambda s: ppo._collect(WALK, config, s, None, jax.random.split(s.key, 3)[1]))(state)
         seen.append(np.asarray(data["observation"]["policy"]).reshape(-1))
-        actor, old = state.params["actor"], rl.policy_of(state).distribution(data["observation"])
         state, metrics = update(state, None)
-        renormalised = dataclasses.replace(rl.policy_of(state), actor=actor).distribution(data["observation"])
-        assert metrics["Loss/kl"] == pytest.approx(float(networks.kl(*old, *renormalised).mean()), rel=1e-2, abs=1e-9)
+        assert metrics["Loss/kl"] < 1e-9
         np.testing.assert_allclose(state.normalizer["policy"].mean[0], np.concatenate(seen).mean(), atol=1e-4)
         np.testing.assert_allclose(state.normalizer["policy"].var[0], np.concatenate(seen).var(), rtol=1e-3)
     assert_bitwise(rl.policy_of(state).normalizer, state.normalizer["policy"])
@@ -167,8 +165,7 @@ def test_a_policy_learns_with_the_statistics_that_it_will_act_with(monkeypatch):
             expected = normalise.normalise(after.normalizer[group], raw[group]).reshape(seen.shape)
             np.testing.assert_allclose(seen, expected, atol=1e-6)
         mean, log_std = rl.policy_of(state).distribution(raw)
-        np.testing.assert_allclose(batch.mean, mean.reshape(batch.mean.shape), atol=1e-6)
-        log_prob = networks.log_prob(batch.mean, log_std, batch.action)
+        log_prob = networks.log_prob(mean.reshape(batch.mean.shape), log_std, batch.action)
         np.testing.assert_allclose(batch.log_prob, log_prob, atol=1e-5)
         state = after
     assert float(jnp.abs(after.normalizer["critic"].mean).max()) > 0.1  # or they could not have told
