@@ -25,11 +25,13 @@ from bayessim_mjx.triangular import product
 GOLDEN = np.uint32(2654435769)  # 2^32 / golden ratio: spreads the validation rows evenly over any number of rows
 SCORED = 256  # validation rows for which the truncated density is reported
 CURVE = 40  # points of the loss curves, at least
-SHARPNESS = np.geomspace(0.4, 2.0, 17).astype(np.float32)  # of the members, tried on the held-out rows
+SHARPNESS = np.geomspace(0.35, 4.0, 21).astype(np.float32)  # of the parts, tried on the held-out rows
 LADDER = 1  # power of the members' places that their dropout rises with
+PACE = 0.5  # of steps in these trials: at the full rate a basis was once judged by how it shook (damped pendulum)
+FEW = 3000  # rows up to which dropout is as set; with more it falls in proportion: many need none
 TRIED = 150  # gradient steps at least (and a fortieth) that bases are tried for, and before a training may end early
 MEMBERS = "members"  # axis of the ensemble
-CLIMBS, SWEEPS = 50, 2  # steps towards the members' weights; rounds over their sharpness
+CLIMBS, SWEEPS = 50, 2  # steps towards the parts' weights; rounds of choosing them
 
 
 @struct.dataclass
@@ -94,6 +96,7 @@ def init(key: Array, settings: InferenceSettings, space: Any, dim_x: int) -> Fit
     )
     known, fits = jnp.ones(len(space), bool), jnp.asarray(0, jnp.int32)
     basis = jnp.eye(dim_x) if bases.count(settings, dim_x) > 1 else None
+    params["member"] = jnp.arange(settings.ensemble, dtype=jnp.int32)
     return FitState(params, jnp.zeros(dim_x), jnp.ones(dim_x), basis, fits, known, settings, space)
 
 
@@ -165,10 +168,16 @@ def _posteriors(state: FitState, z: Array) -> Distribution:
 def _mixtures(state: FitState, z: Array) -> tuple[Array, Array, Array]:
     """Log weights [n, E K], means and factors of the ensemble's mixture."""
     d, settings = len(state.space), state.settings
-    logits, *others = jax.vmap(lambda params: mdn.mixture(params, z, d, settings))(state.params)
+    logits, *others = jax.vmap(lambda params: mdn.mixture(params, z, d, settings))(_parts(state.params))
     leaves = logits + state.params["share"][:, None, None], *others
     joined = [jnp.moveaxis(leaf, 0, 1).reshape(z.shape[0], -1, *leaf.shape[3:]) for leaf in leaves]
     return joined[0], joined[1], joined[2]
+
+
+def _parts(params: Any) -> Any:
+    """The networks of the mixture's parts [E, ...]: a member may be several of them, more or less sharp, or none."""
+    own = {name: params[name] for name in ("sharpness", "share", "member")}
+    return {**jax.tree.map(lambda leaf: leaf[params["member"]], params), **own}
 
 
 def schedule_length(settings: InferenceSettings, capacity: int) -> tuple[int, int]:
@@ -197,9 +206,10 @@ def _fit(
     )
     member = partial(_train, data=data, settings=settings, fresh=state.fits == 0)
     # most members have little dropout
-    rates = settings.dropout * jnp.linspace(0.0, 1.0, settings.ensemble) ** LADDER
+    few = jnp.minimum(1.0, FEW / jnp.maximum(jnp.sum(data.train.astype(jnp.float32)), 1.0))
+    rates = few * settings.dropout * jnp.linspace(0.0, 1.0, settings.ensemble) ** LADDER
     params, basis, best, steps, skipped, curves = jax.vmap(member, axis_name=MEMBERS)(
-        jax.random.split(key, settings.ensemble), state.params, rates
+        jax.random.split(key, settings.ensemble), {**state.params, "sharpness": jnp.ones(settings.ensemble)}, rates
     )
     data = data._replace(x=data.x[basis[0]])
     state = replace(state, basis=None if state.basis is None else matrices[basis[0]])
@@ -267,13 +277,13 @@ def _train(
         value = objective(flat, basis, data.held)
         return -jnp.sum(jnp.where(data.mask > 0, value, 0.0)) / jnp.sum(data.mask)
 
-    def step(basis: Array, carry: tuple, inputs: tuple[Array, Array]) -> tuple[tuple, Array]:
+    def step(basis: Array, pace: Array, carry: tuple, inputs: tuple[Array, Array]) -> tuple[tuple, Array]:
         flat, opt_state, skipped = carry
         value, gradient = jax.value_and_grad(loss)(flat, basis, *inputs)
         usable = jnp.isfinite(optax.global_norm(gradient))
         with jax.numpy_dtype_promotion("standard"):  # optax computes decay**count, a float to an int32
             updates, new_opt = optimiser.update(gradient, opt_state, flat)
-        new = optax.apply_updates(flat, updates), new_opt
+        new = flat + pace * updates, new_opt
         flat, opt_state = jax.tree.map(lambda a, b: jnp.where(usable, a, b), new, (flat, opt_state))
         return (flat, opt_state, skipped + 1 - usable.astype(jnp.int32)), value
 
@@ -293,7 +303,7 @@ def _train(
         order = jnp.argsort(jnp.where(data.train, jax.random.uniform(key, data.train.shape), jnp.inf))
         place = jnp.arange(chunk * batch, dtype=jnp.int32).reshape(chunk, batch) % jnp.maximum(n_train, 1)
         rows = order[place], jax.random.split(jax.random.fold_in(key, 1), chunk)
-        inner, losses = jax.lax.scan(partial(step, basis), inner, rows)
+        inner, losses = jax.lax.scan(partial(step, basis, jnp.where(i < 0, PACE, 1.0)), inner, rows)
         value = held_out(inner[0], basis)
         better = value < best[0]
         best = jax.tree.map(lambda a, b: jnp.where(better, a, b), (value, inner[0], i), best)
@@ -323,44 +333,48 @@ def _fresh(params: Any, data: _Data, settings: InferenceSettings, fresh: Array) 
 
 
 def _weigh(params: Any, data: _Data, settings: InferenceSettings) -> Any:
-    """Weight and sharpness of each member, by the held-out density of their mixture.
+    """The mixture's parts, as many as members: whose network each is, how sharp, its weight; by the held-out density.
 
-    Networks that disagree make a mixture that is wider than it need be, a single one is narrower than it may be; and a
-    sharp member beside a wide one has the heavy tails of a posterior that is rarely far off.
+    Networks that disagree make a mixture that is wider than it need be, a single one is narrower than it may be; and
+    where a network is far better in some places than in others, itself sharper and itself wider make the peak and the
+    tails of a posterior that holds as often as it says.
     """
     score = partial(_objective, rows=data.held, data=data, settings=settings)
-    members = jnp.arange(settings.ensemble, dtype=jnp.int32)
 
     def scores(sharpness: Array) -> Array:
         density = jax.vmap(lambda p: score({**p, "sharpness": sharpness}))(params)
         return jnp.where(data.mask[None, :] > 0, jnp.maximum(density, -1e6), 0.0)  # [E, V]
 
     table = jax.lax.map(scores, jnp.asarray(SHARPNESS))  # [S, E, V]
+    table = table.reshape(-1, table.shape[-1])
+    everyone = jnp.arange(len(table), dtype=jnp.int32)
 
-    def mixed(choice: Array) -> tuple[Array, Array]:
-        """Log weights [E] and total log density of the members at their choices [E] of the sharpness."""
-        density = table[choice, members]
+    def mixed(choice: Array, climbs: int) -> tuple[Array, Array]:
+        """Log weights [E] and total log density of the parts `choice` [E], rows of the table."""
+        density = table[choice]
 
         def climb(share: Array, _: None) -> tuple[Array, None]:
-            # expectation maximisation; one row's worth of every member for few rows
+            # expectation maximisation; one row's worth of every part for few rows
             mine = jax.nn.softmax(density + share[:, None], axis=0) @ data.mask + 1.0
             return jnp.log(mine) - jnp.log(jnp.sum(mine)), None
 
         start = jnp.full(settings.ensemble, np.float32(-np.log(settings.ensemble)))
-        share, _ = jax.lax.scan(climb, start, length=CLIMBS)
+        share, _ = jax.lax.scan(climb, start, length=climbs)
         return share, data.mask @ jax.nn.logsumexp(density + share[:, None], axis=0)
 
-    def improve(choice: Array, changed: Array) -> tuple[Array, None]:
-        """The best sharpness of the members `changed` [E], the others' held."""
-        tries = jnp.where(changed[None, :], jnp.arange(len(SHARPNESS), dtype=jnp.int32)[:, None], choice[None, :])
-        return tries[jnp.nanargmax(jax.vmap(lambda t: mixed(t)[1])(tries))], None
+    def improve(choice: Array, part: Array) -> tuple[Array, None]:
+        """The best for one part, the others held."""
+        tries = jnp.where(jnp.arange(settings.ensemble) == part, everyone[:, None], choice[None, :])
+        return tries[jnp.nanargmax(jax.vmap(lambda t: mixed(t, CLIMBS // 4)[1])(tries))], None
 
-    # all together, then one by one
-    turns = jnp.concatenate(
-        [jnp.ones((1, settings.ensemble), bool), *[jnp.eye(settings.ensemble, dtype=bool)] * SWEEPS]
-    )
-    choice, _ = jax.lax.scan(improve, jnp.zeros(settings.ensemble, jnp.int32), turns)
-    return {**params, "sharpness": jnp.asarray(SHARPNESS)[choice], "share": mixed(choice)[0]}
+    # each member at its best at first
+    alone = (table @ data.mask).reshape(len(SHARPNESS), settings.ensemble)
+    members = jnp.arange(settings.ensemble, dtype=jnp.int32)
+    first = jnp.nanargmax(alone, axis=0).astype(jnp.int32) * settings.ensemble + members
+    turns = jnp.tile(members, SWEEPS)
+    choice, _ = jax.lax.scan(improve, first, turns)
+    sharpness, member = jnp.asarray(SHARPNESS)[choice // settings.ensemble], choice % settings.ensemble
+    return {**params, "sharpness": sharpness, "member": member, "share": mixed(choice, CLIMBS)[0]}
 
 
 def _objective(
@@ -431,7 +445,7 @@ def _rotated(z: Array, basis: Array, clip: float) -> Array:
 
 def _held_out_gain(state: FitState, data: _Data) -> Array:
     """Mean log density of y of the ensemble's mixture over the held-out rows."""
-    value = jax.vmap(lambda params: _objective(params, data.held, data, state.settings))(state.params)
+    value = jax.vmap(lambda params: _objective(params, data.held, data, state.settings))(_parts(state.params))
     value = jax.nn.logsumexp(value + state.params["share"][:, None], axis=0)
     return jnp.sum(jnp.where(data.mask > 0, value, 0.0)) / jnp.sum(data.mask)
 

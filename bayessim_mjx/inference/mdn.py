@@ -32,7 +32,8 @@ CUT_POINTS = 16  # quasi-Monte-Carlo points of a component's mass inside the box
 GOLDEN = np.uint32(2654435769)  # 2^32 / golden ratio
 AT_ONCE = 1024  # trajectories embedded at once
 LEAST_INSIDE = float(np.log(0.1))  # log mass inside the box that training reckons with at least
-FIXED = ("omega", "rate", "used", "sharpness", "share")  # of the parameters, those that are not trained by gradients
+# of the parameters, those that are not trained by gradients; the last three belong to the parts of the mixture
+FIXED = ("omega", "rate", "used", "sharpness", "share", "member")
 LOG_2PI = float(np.log(2 * np.pi))
 
 
@@ -94,9 +95,9 @@ def init(key: Array, settings: InferenceSettings, dim_x: int, d: int, count: Arr
     biases = layers[-1]["b"].at[k : k + k * d].set(0.7 * several * jax.random.normal(keys[-1], (k * d,)))
     layers[-1] = {"w": layers[-1]["w"] * several, "b": biases}
     more["used"] = jnp.where(jnp.arange(k, dtype=jnp.int32) < count, 0.0, UNUSED)
-    # set by held-out rows: factor on all precisions' square roots, log weight in the ensemble
+    # set by held-out rows: factor on all precisions' square roots, log weight in the ensemble, whose network it is
     share = jnp.asarray(-np.log(settings.ensemble), jnp.float32)
-    more = {**more, "sharpness": jnp.ones(()), "share": share}
+    more = {**more, "sharpness": jnp.ones(()), "share": share, "member": jnp.asarray(0, jnp.int32)}
     return {"layers": layers, "skip": jnp.zeros((dim_x, sizes[-1])), **more}
 
 

@@ -29,7 +29,7 @@ class InferenceSettings:
     components: int = 10
     fullCovariance: bool = True
     hiddenLayers: tuple[int, ...] = (128, 128)
-    lr: float = 2e-3  # peak of the cosine schedule
+    lr: float = 4e-3  # peak of the cosine schedule
     weight_decay: float = 1e-4
     batch: int = 64  # a quarter of the rows in four times the steps: more per second, measured on noise-free data
     epochs: int = 40  # passes over the capacity, within [min_steps, max_steps]
@@ -44,7 +44,8 @@ class InferenceSettings:
     # networks side by side, weighted by held-out score; their posterior has ensemble * components Gaussians. A single
     # one is over-confident at a few thousand simulations: its 50 / 80 / 95 % regions held .31 / .58 / .82 of truths
     ensemble: int = 4
-    dropout: float = 0.1  # of the last member, the first has none: few rows need it, many noise-free ones suffer
+    # of the last member, the first has none; less with more than 3000 rows, which need none and suffer
+    dropout: float = 0.1
     fourierFeatures: int = 256  # frequencies of MDRFF: twice as many features
     embedding: Embedding | None = None  # trained with the network, which then takes in rows of summary_learned
 
