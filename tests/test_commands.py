@@ -193,7 +193,7 @@ def killed_after(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
 @pytest.mark.parametrize("saves", [0, 1])
 def test_train_killed_and_resumed_equals_unkilled(toy: None, monkeypatch: pytest.MonkeyPatch, saves: int) -> None:
     """Also with a learning rate that falls at every second step, and with networks for novelty."""
-    learner = ["ppo.num_epochs=2", "ppo.desired_kl=1e-6", "ppo.rnd.weight=1"]
+    learner = ["ppo.num_epochs=2", "ppo.desired_kl=1e-9", "ppo.rnd.weight=1"]
     argv = ["--task", "Pendulum", "--randomize", *SMALL, *learner]
     assert train.main([*argv, "--logdir", "whole"]) == 0
     with monkeypatch.context() as patch, pytest.raises(Killed):
