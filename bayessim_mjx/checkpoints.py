@@ -167,7 +167,7 @@ def _compare(where: str, saved: dict[int, dict], template: Any) -> None:
         if need.get(name) != have.get(name):
             raise UserError(
                 f"{where}.{name} is {have.get(name, 'absent')} in the checkpoint, but {need.get(name, 'absent')} under "
-                "the present settings: use the task, the settings and the version that it was made with"
+                "the present settings: use the task, version and settings that it was made with"
             )
 
 

@@ -31,6 +31,7 @@ PACE = 0.5  # of steps in these trials: at the full rate a basis was once judged
 FEW = 3000  # rows up to which dropout is as set; with more it falls in proportion: many need none
 TRIED = 150  # gradient steps at least (and a fortieth) that bases are tried for, and before a training may end early
 MEMBERS = "members"  # axis of the ensemble
+WORTH = 2.0  # nats, over all held-out rows, that another choice of a part has to gain: with few rows the best is luck
 CLIMBS, SWEEPS = 50, 2  # steps towards the parts' weights; rounds of choosing them
 
 
@@ -349,8 +350,8 @@ def _weigh(params: Any, data: _Data, settings: InferenceSettings) -> Any:
     table = table.reshape(-1, table.shape[-1])
     everyone = jnp.arange(len(table), dtype=jnp.int32)
 
-    def mixed(choice: Array, climbs: int) -> tuple[Array, Array]:
-        """Log weights [E] and total log density of the parts `choice` [E], rows of the table."""
+    def mixed(choice: Array, share: Array, climbs: int) -> tuple[Array, Array]:
+        """Log weights [E], climbing from `share`, and total log density of the parts `choice` [E]."""
         density = table[choice]
 
         def climb(share: Array, _: None) -> tuple[Array, None]:
@@ -358,23 +359,26 @@ def _weigh(params: Any, data: _Data, settings: InferenceSettings) -> Any:
             mine = jax.nn.softmax(density + share[:, None], axis=0) @ data.mask + 1.0
             return jnp.log(mine) - jnp.log(jnp.sum(mine)), None
 
-        start = jnp.full(settings.ensemble, np.float32(-np.log(settings.ensemble)))
-        share, _ = jax.lax.scan(climb, start, length=climbs)
+        share, _ = jax.lax.scan(climb, share, length=climbs)
         return share, data.mask @ jax.nn.logsumexp(density + share[:, None], axis=0)
 
-    def improve(choice: Array, part: Array) -> tuple[Array, None]:
+    def improve(carry: tuple[Array, Array], part: Array) -> tuple[tuple[Array, Array], None]:
         """The best for one part, the others held."""
+        choice, share = carry
         tries = jnp.where(jnp.arange(settings.ensemble) == part, everyone[:, None], choice[None, :])
-        return tries[jnp.nanargmax(jax.vmap(lambda t: mixed(t, CLIMBS // 4)[1])(tries))], None
+        shares, values = jax.vmap(lambda t: mixed(t, share, CLIMBS // 4))(tries)
+        best = jnp.nanargmax(jnp.where(everyone == choice[part], values + WORTH, values))
+        return (tries[best], shares[best]), None
 
     # each member at its best at first
     alone = (table @ data.mask).reshape(len(SHARPNESS), settings.ensemble)
     members = jnp.arange(settings.ensemble, dtype=jnp.int32)
     first = jnp.nanargmax(alone, axis=0).astype(jnp.int32) * settings.ensemble + members
     turns = jnp.tile(members, SWEEPS)
-    choice, _ = jax.lax.scan(improve, first, turns)
+    alike = jnp.full(settings.ensemble, np.float32(-np.log(settings.ensemble)))
+    (choice, share), _ = jax.lax.scan(improve, (first, mixed(first, alike, CLIMBS)[0]), turns)
     sharpness, member = jnp.asarray(SHARPNESS)[choice // settings.ensemble], choice % settings.ensemble
-    return {**params, "sharpness": sharpness, "member": member, "share": mixed(choice, CLIMBS)[0]}
+    return {**params, "sharpness": sharpness, "member": member, "share": mixed(choice, share, CLIMBS)[0]}
 
 
 def _objective(

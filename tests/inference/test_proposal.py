@@ -72,6 +72,7 @@ def test_the_tilt_is_the_integral_over_the_cube():
 def test_the_prior_as_proposal_needs_no_correction():
     state = init(key(), SETTINGS, NORMAL, 2)
     params = jax.tree.map(lambda v: v[0], state.params)
+    params.pop("member")  # a number of a network, no weight
     prior = stack([Distribution.prior(NORMAL, 3, "probit")])
 
     def tilt(params):
