@@ -84,6 +84,27 @@ def bare(env: Any, worlds: int, steps: int, lean: bool) -> Callable[[], Any]:
     return lambda: run(given)
 
 
+def bare_own(env: Task, state: Any, steps: int) -> Callable[[], Any]:
+    """The same with what MuJoCo's state is, each world with a model of its own: parameters differ from world to world."""
+    names = ("qpos", "qvel", "act", "qacc_warmstart")
+    start = mjx.make_data(env.mj_model, impl="jax")
+
+    @jax.jit
+    def run(worlds: Any) -> Any:
+        def one(world: Any, part: Any) -> Any:
+            data = mjx.step(env.physics.model_of(world), start.replace(**part))
+            return {name: getattr(data, name) for name in names}
+
+        def step(part: Any, _: None) -> tuple[Any, None]:
+            return jax.vmap(one)(worlds, part), None
+
+        part = {"qpos": worlds.qpos, "qvel": worlds.qvel, "act": worlds.act, "qacc_warmstart": worlds.warmstart}
+        with jax.default_matmul_precision("highest"):
+            return jax.lax.scan(step, part, None, length=steps)[0]
+
+    return lambda: run(state.env_states.pipeline_state)
+
+
 def built(function: Callable[..., Any], *given: Any) -> tuple[Any, dict[str, float]]:
     """(compiled function, seconds of tracing, lowering and compiling)."""
     times = [time.perf_counter()]
@@ -112,6 +133,8 @@ def limit(task: str, worlds: int, say: Say) -> None:
     resets, rollout = seconds(lambda: reset(state)), seconds(lambda: collect(state))
     physics = {n: seconds(bare(env, worlds, settings.num_steps * substeps, n == "lean")) for n in ("lean", "whole")}
     best, sgd = min(physics.values()), whole - rollout
+    if isinstance(env, Task):
+        physics["own"] = seconds(bare_own(env, state, settings.num_steps * substeps))
     weights = sum(x.size for x in jax.tree.leaves(state.params) if x.ndim == 2)
     passes = count * settings.num_epochs
     flops = 6 * weights * passes + 4 * weights * count  # forward and backward; values before and after
@@ -123,6 +146,8 @@ def limit(task: str, worlds: int, say: Say) -> None:
         "rollout_steps_per_s": round(count / rollout), "train_steps_per_s": round(count / whole),
         "sgd_s": round(sgd, 5), "sgd_flops": flops, "sgd_bytes": moved,
     }  # fmt: skip
+    if "own" in physics:
+        row["rollout_share_own"] = round(physics["own"] / rollout, 3)
     kind = jax.devices()[0].device_kind
     if kind in PEAK:
         tensor, _, memory = PEAK[kind]
