@@ -85,7 +85,7 @@ def bare(env: Any, worlds: int, steps: int, lean: bool) -> Callable[[], Any]:
 
 
 def bare_own(env: Task, state: Any, steps: int) -> Callable[[], Any]:
-    """The same with what MuJoCo's state is, each world with a model of its own: parameters differ from world to world."""
+    """The same, lean, each world with a model of its own: parameters differ from world to world."""
     names = ("qpos", "qvel", "act", "qacc_warmstart")
     start = mjx.make_data(env.mj_model, impl="jax")
 
