@@ -76,8 +76,9 @@ def loss(
     old_log_std [A] is that of the collecting policy; not used where the batch has its own. KL is of old || new,
     analytic; it, the entropy and the clip fraction are of the batch's own samples, not of their mirrored copies.
     """
+    known = None
     if config.segment:
-        batch = segments.renewed(params, batch, config)
+        batch, known = segments.renewed(params, batch, config)
     act, size = networks.activation(config.activation), batch.advantage.shape[0]
     if config.normalize_advantage_per_minibatch:
         batch = dataclasses.replace(batch, advantage=standardise(batch.advantage))
@@ -87,7 +88,7 @@ def loss(
     log_prob = networks.log_prob(means, log_stds, samples.action)  # of raw actions: tanh's slope cancels in the ratio
     surrogate = surrogate_loss(log_prob, samples.log_prob, samples.advantage, config.clip_param, samples.weight)
     value = value_loss(
-        networks.value(params, samples.critic_observation, act),
+        networks.value(params, samples.critic_observation, act) if known is None or augmented else known,
         samples.value,
         samples.returns,
         config.clip_param if config.use_clipped_value_loss else None,

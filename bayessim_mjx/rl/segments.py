@@ -45,18 +45,20 @@ def cut(batch: Any, length: int) -> Any:
     return dataclasses.replace(batch, future=dataclasses.replace(batch.future, last=last))
 
 
-def renewed(params: networks.Params, batch: Any, config: PPOConfig) -> Any:
-    """The segments [S, L, ...] as S L transitions, with advantages and returns by the critic `params`.
+def renewed(params: networks.Params, batch: Any, config: PPOConfig) -> tuple[Any, jax.Array]:
+    """The segments [S, L, ...] as S L transitions, with advantages and returns by the critic `params`; and its values.
 
     Inside a segment the next value is that of the next observation seen, but the one from the collection where an
-    episode is cut off: the true next observation is then not the next one seen. No gradient flows through them.
+    episode is cut off: the true next observation is then not the next one seen. No gradient flows through advantages
+    and returns; the values [S L] are those to learn from, so that the critic is asked once.
     """
     act, future = networks.activation(config.activation), batch.future
-    value, last = (networks.value(params, x, act) for x in (batch.critic_observation, future.last))
+    flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), dataclasses.replace(batch, future=None))
+    values, last = (networks.value(params, x, act) for x in (flat.critic_observation, future.last))
+    value = jax.lax.stop_gradient(values).reshape(future.reward.shape)
     following = jnp.concatenate([value[:, 1:], last[:, None]], 1)
     following = jnp.where(future.truncated > 0, future.next_value, following)
     ends = (future.terminated.T, future.truncated.T)
     estimates = gae(future.reward.T, value.T, following.T, *ends, config.gamma, config.gae_lambda, config.segment)
-    advantage, returns = (jax.lax.stop_gradient(x.T) for x in estimates)
-    batch = dataclasses.replace(batch, advantage=advantage, returns=returns, future=None)
-    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), batch)
+    advantage, returns = (jax.lax.stop_gradient(x.T).reshape(-1) for x in estimates)
+    return dataclasses.replace(flat, advantage=advantage, returns=returns), values

@@ -34,7 +34,7 @@ def future(reward, terminated, truncated, next_value, last):
 def estimates(seen, ahead, scale=1.0):
     """Advantages and returns by a critic that says `scale` times what it sees."""
     params = {"critic": {"layers": [{"w": scale * IDENTITY[0]["w"], "b": IDENTITY[0]["b"]}]}}
-    found = segments.renewed(params, batch(seen, ahead), CONFIG)
+    found = segments.renewed(params, batch(seen, ahead), CONFIG)[0]
     assert found.future is None and found.observation.shape == (np.size(seen), 1)
     return np.asarray(found.advantage), np.asarray(found.returns)
 
@@ -72,11 +72,21 @@ def test_what_targets_are_made_of_gets_no_gradient():
     ahead = future([[1, 1, 1]], [[0, 0, 0]], [[0, 0, 0]], [[9, 9, 9]], [4])
 
     def total(params):
-        found = segments.renewed(params, batch([[1, 2, 3]], ahead), CONFIG)
+        found = segments.renewed(params, batch([[1, 2, 3]], ahead), CONFIG)[0]
         return found.advantage.sum() + found.returns.sum()
 
     gradient = jax.grad(total)({"critic": {"layers": IDENTITY}})
     assert all(not np.any(leaf) for leaf in jax.tree.leaves(gradient))
+
+
+def test_the_values_to_learn_from_are_the_critics_and_keep_their_gradient():
+    ahead = future([[1, 1, 1]], [[0, 0, 0]], [[0, 0, 0]], [[9, 9, 9]], [4])
+    shared = {"critic": {"layers": IDENTITY}}
+    values, gradient = jax.value_and_grad(lambda p: segments.renewed(p, batch([[1, 2, 3]], ahead), CONFIG)[1].sum())(
+        shared
+    )
+    assert float(values) == 6.0
+    assert float(gradient["critic"]["layers"][0]["w"].sum()) == 6.0  # d/dw of sum w x
 
 
 def test_one_segment_of_all_steps_is_the_estimate_of_the_whole_batch():
@@ -90,7 +100,7 @@ def test_one_segment_of_all_steps_is_the_estimate_of_the_whole_batch():
     cut = ppo._batch(env, config, state, data, state.normalizer)
     whole = ppo._batch(env, dataclasses.replace(config, segment=0), state, data, state.normalizer)
     assert cut.advantage.shape == (4, 6) and cut.future.last.shape[0] == 4
-    renewed = segments.renewed(state.params, cut, config)
+    renewed = segments.renewed(state.params, cut, config)[0]
     for name in ("advantage", "returns"):  # step-major there, world-major here
         of_whole = getattr(whole, name).reshape(6, 4).T.reshape(-1)
         np.testing.assert_allclose(getattr(renewed, name), of_whole, rtol=1e-4, atol=1e-5)
