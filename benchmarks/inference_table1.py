@@ -150,10 +150,10 @@ ROWS = {
 }  # fmt: skip
 
 
-@partial(jax.jit, static_argnums=(0, 1))
-def statistics(name: str, summary: str, key: Array, thetas: Array) -> Array:
+@partial(jax.jit, static_argnums=(0, 1, 2))
+def statistics(name: str, summary: str, lags: int, key: Array, thetas: Array) -> Array:
     """Summary averaged over 10 rollouts at each of thetas [n, d] -> [n, D]."""
-    summarize = summarizers.get(summary)
+    summarize = summarizers.get(summary, **({"lags": lags} if lags else {}))
 
     def one(inputs: tuple[Array, Array]) -> Array:
         key, theta = inputs
@@ -174,14 +174,14 @@ def cells(posteriors: Distribution, thetas: Array, names: tuple[str, ...]) -> Ar
 
 
 def measure(
-    name: str, seed: int, simulations: int, summary: str, settings: InferenceSettings
+    name: str, seed: int, simulations: int, summary: str, lags: int, settings: InferenceSettings
 ) -> Iterator[dict[str, Any]]:
     """One line per parameter."""
     row, prior = ROWS[name], Distribution.prior(ROWS[name].space)
     keys = jax.random.split(jax.random.PRNGKey(1000 + seed), 6)
     thetas, truths = prior.sample(keys[0], simulations), prior.sample(keys[1], TRUTHS)
     truths = jnp.concatenate([truths, jnp.asarray([row.truth], jnp.float32)])
-    x, seen = statistics(name, summary, keys[2], thetas), statistics(name, summary, keys[3], truths)
+    x, seen = (statistics(name, summary, lags, k, t) for k, t in ((keys[2], thetas), (keys[3], truths)))
     wall = time.perf_counter()
     state, _ = fit(keys[4], init(keys[5], settings, row.space, x.shape[1]), thetas, x)
     jax.block_until_ready(state.params)
@@ -192,7 +192,7 @@ def measure(
     for i, (parameter, (low, high)) in enumerate(row.ranges.items()):
         best, method = row.published[parameter]
         yield {
-            "problem": name, "parameter": parameter, "seed": seed, "simulations": simulations, "summary": summary,
+            "problem": name, "parameter": parameter, "seed": seed, "simulations": simulations, "summary": summary, "lags": lags,
             "log q at the one truth": round(float(score[-1, i]), 3), "prior": round(-float(np.log(high - low)), 3),
             "mean log q": round(float(score[:-1, i].mean()), 3), "truths": TRUTHS,
             "published": best, "by": method, "identified": bool(state.identified[i]),
@@ -208,10 +208,11 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0, help="the first seed")
     parser.add_argument("--simulations", type=int, default=1000)
     parser.add_argument("--summary", default="corrdiff", help="of the trajectory; the paper's is corrdiff")
+    parser.add_argument("--lags", type=int, default=0, help="of corr and corrdiff; the paper has none")
     args = parser.parse_args()
     for name in args.problems:
         for seed in range(args.first, args.first + args.seeds):
-            for row in measure(name, seed, args.simulations, args.summary, InferenceSettings()):
+            for row in measure(name, seed, args.simulations, args.summary, args.lags, InferenceSettings()):
                 print(json.dumps(row), flush=True)
 
 
