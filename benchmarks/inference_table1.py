@@ -192,7 +192,8 @@ def measure(
     for i, (parameter, (low, high)) in enumerate(row.ranges.items()):
         best, method = row.published[parameter]
         yield {
-            "problem": name, "parameter": parameter, "seed": seed, "simulations": simulations, "summary": summary, "lags": lags,
+            "problem": name, "parameter": parameter, "seed": seed, "simulations": simulations, "summary": summary,
+            "lags": lags,
             "log q at the one truth": round(float(score[-1, i]), 3), "prior": round(-float(np.log(high - low)), 3),
             "mean log q": round(float(score[:-1, i].mean()), 3), "truths": TRUTHS,
             "published": best, "by": method, "identified": bool(state.identified[i]),
