@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import jax
@@ -18,6 +19,9 @@ from bayessim_mjx.rl.networks import Params
 
 MIN_LEARNING_RATE, MAX_LEARNING_RATE = 1e-5, 1e-2  # bounds of the adaptive schedule
 RATE_FACTOR = 1.5
+# transitions from which epochs are shuffled one after the other: a GPU sorts many numbers at once slower than each by
+# itself (H200, five epochs of a million: 4.4 ms against 1.3; of 65 536: .36 against .86)
+MANY = 200_000
 FARTHEST = 3.0  # log of the ratio of probabilities up to which a sample counts
 
 
@@ -151,7 +155,8 @@ def minibatches(key: jax.Array, epochs: int, size: int, count: int, mesh: Mesh |
     A remainder is left out at the end of each permutation, so a different one in each epoch. Devices of a mesh share
     every minibatch; the minibatches are those of one device.
     """
-    order = jax.vmap(lambda k: jax.random.permutation(k, size))(jax.random.split(key, epochs))
+    shuffle, keys = partial(jax.random.permutation, x=size), jax.random.split(key, epochs)
+    order = jax.vmap(shuffle)(keys) if size < MANY else jax.lax.map(shuffle, keys)
     order = order[:, : size - size % count].reshape(epochs * count, size // count)
     return sharding.pinned(order, mesh, sharding.SECOND)
 

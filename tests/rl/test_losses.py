@@ -202,6 +202,12 @@ def test_the_remainder_is_left_out_at_random():
     assert len(set.union(*left)) > 1
 
 
+def test_how_epochs_are_shuffled_does_not_change_their_order(monkeypatch):
+    together = losses.minibatches(jax.random.PRNGKey(1), 3, 50, 2)
+    monkeypatch.setattr(losses, "MANY", 50)
+    np.testing.assert_array_equal(losses.minibatches(jax.random.PRNGKey(1), 3, 50, 2), together)
+
+
 def test_every_transition_is_used_once_per_epoch():
     """At rate 0 nothing moves: the minibatches' mean losses average to that of the whole batch, in each epoch."""
     params, batch = example()
