@@ -18,7 +18,7 @@ from jax import Array
 from jax.flatten_util import ravel_pytree
 
 from bayessim_mjx.distributions import Distribution, charts
-from bayessim_mjx.inference import bases, identify, mdn
+from bayessim_mjx.inference import bases, depth, identify, mdn
 from bayessim_mjx.inference.settings import InferenceSettings
 from bayessim_mjx.triangular import product
 
@@ -215,6 +215,8 @@ def _fit(
     data = data._replace(x=data.x[basis[0]])
     state = replace(state, basis=None if state.basis is None else matrices[basis[0]])
     state = replace(state, params=_weigh(params, data, settings), fits=state.fits + 1)
+    if proposals is None:  # else held-out truths are not from the prior, and lie elsewhere in their posteriors
+        state = _as_deep(jax.random.fold_in(key, 1), state, data)
     marginals = _marginal_gain(_mixtures(state, data.x[data.held]), data.y[data.held], settings)
     parameter_gain, identified = identify.identified(marginals, data.mask)
     state = replace(state, identified=identified)
@@ -379,6 +381,24 @@ def _weigh(params: Any, data: _Data, settings: InferenceSettings) -> Any:
     (choice, share), _ = jax.lax.scan(improve, (first, mixed(first, alike, CLIMBS)[0]), turns)
     sharpness, member = jnp.asarray(SHARPNESS)[choice // settings.ensemble], choice % settings.ensemble
     return {**params, "sharpness": sharpness, "member": member, "share": mixed(choice, share, CLIMBS)[0]}
+
+
+def _as_deep(key: Array, state: FitState, data: _Data) -> FitState:
+    """All parts sharper or wider by one factor, so that held-out truths lie as deep in their posteriors as they should.
+
+    The weights and sharpnesses of the best density leave them too wide where errors have long tails, as most are then
+    smaller than it says: 62 % of truths in the 50 % regions of BayesSimIG's data.
+    """
+    rows = data.held[: depth.MOST]
+    centre, sd = (np.float32(v) for v in charts.SCORE[state.settings.chart])
+
+    def at(factor: Array) -> tuple[Array, Array, Array]:
+        params = {**state.params, "sharpness": state.params["sharpness"] * factor}
+        return _mixtures(replace(state, params=params), data.x[rows])
+
+    mask = data.mask[: depth.MOST]
+    factor = depth.factor(key, at, data.y[rows] * sd + centre, mask, state.settings.chart)
+    return replace(state, params={**state.params, "sharpness": state.params["sharpness"] * factor})
 
 
 def _objective(

@@ -1,0 +1,67 @@
+"""How deep held-out truths lie in their posteriors, and how much sharper or wider these would have to be."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from bayessim_mjx.distributions import charts
+from bayessim_mjx.triangular import inverse_lower
+
+Mixtures = tuple[Array, Array, Array]  # log weights [n, K], means [n, K, d], Cholesky factors of covariances
+
+DRAWS = 64  # of each posterior
+MOST = 512  # rows looked at
+FACTORS = np.geomspace(0.75, 1 / 0.75, 15).astype(np.float32)
+REGIONS = np.float32([0.5, 0.8, 0.95])  # that should hold as many truths as they say
+DOUBT = 0.15  # standard deviation of the factor's log before anything is seen: a few rows are off by chance
+
+
+def levels(key: Array, mixtures: Mixtures, z: Array, chart: str) -> Array:
+    """Share of a posterior's draws that are denser than the truth z [n, d], [n]: uniform where it is exact.
+
+    The mixtures are those in the chart; draws outside the box of the plain chart are none of the posterior's.
+    """
+
+    def one(inputs: tuple[Array, Array, Array, Array, Array]) -> Array:
+        key, logits, means, scales, z = inputs
+        key_part, key_noise = jax.random.split(key)
+        part = jax.random.categorical(key_part, logits, shape=(DRAWS,))
+        noise = jax.random.normal(key_noise, (DRAWS, z.shape[0]))
+        draws = means[part] + jnp.sum(scales[part] * noise[:, None, :], axis=-1)
+        points = jnp.concatenate([z[None], draws])
+        gap = points[:, None, None, :] - means[None, :, None, :]
+        away = jnp.sum(inverse_lower(scales)[None] * gap, axis=-1)  # [1 + DRAWS, K, d]
+        size = jnp.sum(jnp.log(jnp.diagonal(scales, axis1=-2, axis2=-1)), axis=-1)
+        density = jax.nn.logsumexp(logits - size - 0.5 * jnp.sum(away * away, axis=-1), axis=-1)
+        density = density + charts.log_slope(points, chart)
+        inside = jnp.all((draws >= 0) & (draws <= 1), axis=-1) | (chart != "plain")
+        denser = jnp.sum((inside & (density[1:] > density[0])).astype(jnp.float32))
+        return (denser + 0.5) / (jnp.sum(inside.astype(jnp.float32)) + 1.0)
+
+    return jax.lax.map(one, (jax.random.split(key, z.shape[0]), *mixtures, z), batch_size=64)
+
+
+def factor(key: Array, at: Callable[[Array], Mixtures], z: Array, mask: Array, chart: str) -> Array:
+    """The factor on sharpness, of FACTORS, at which REGIONS hold truths z [n, d] (with mask [n] 1) as they should.
+
+    at(factor) gives the mixtures. A region of p holds p of n truths to within sqrt(p (1 - p) / n), and the log of the
+    factor is held to be within DOUBT of 0 beforehand.
+    """
+    count = jnp.maximum(jnp.sum(mask), 1.0)
+
+    def against(factor: Array) -> Array:
+        # the same draws for every factor
+        level = levels(key, at(factor), z, chart)
+        held = mask @ (level[:, None] <= REGIONS[None, :]).astype(jnp.float32) / count
+        off = jnp.where(jnp.sum(mask) > 0, count * (held - REGIONS) ** 2 / (REGIONS * (1 - REGIONS)), 0.0)
+        return jnp.mean(off) + (jnp.log(factor) / DOUBT) ** 2
+
+    factors, one = jnp.asarray(FACTORS), jnp.ones(())
+    # what is right within its error is left alone, which also saves the time
+    right = against(one) < 1.0
+    return jax.lax.cond(right, lambda: one, lambda: factors[jnp.nanargmin(jax.lax.map(against, factors))])
