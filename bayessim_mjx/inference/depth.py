@@ -61,7 +61,13 @@ def factor(key: Array, at: Callable[[Array], Mixtures], z: Array, mask: Array, c
         off = jnp.where(jnp.sum(mask) > 0, count * (held - REGIONS) ** 2 / (REGIONS * (1 - REGIONS)), 0.0)
         return jnp.mean(off) + (jnp.log(factor) / DOUBT) ** 2
 
-    factors, one = jnp.asarray(FACTORS), jnp.ones(())
-    # what is right within its error is left alone, which also saves the time
-    right = against(one) < 1.0
-    return jax.lax.cond(right, lambda: one, lambda: factors[jnp.nanargmin(jax.lax.map(against, factors))])
+    # as it is first: what is right within its error is left alone, which also saves the time
+    factors = jnp.asarray(np.concatenate([np.ones(1, np.float32), FACTORS]))
+
+    def better(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        i, least, best = carry
+        value = against(factors[i])
+        return i + 1, jnp.fmin(value, least), jnp.where(value < least, factors[i], best)
+
+    start = jnp.asarray(0, jnp.int32), jnp.asarray(jnp.inf, jnp.float32), factors[0]
+    return jax.lax.while_loop(lambda c: (c[0] < len(factors)) & ((c[0] != 1) | (c[1] >= 1.0)), better, start)[2]

@@ -18,6 +18,11 @@ def posteriors(factor, spread=0.05):
     return jnp.full((N, 2), np.log(0.5), jnp.float32), jnp.tile(means, (1, 2, 1)), scales
 
 
+@jax.jit
+def found_factor(z, mask):
+    return depth.factor(jax.random.PRNGKey(0), posteriors, z, mask, "plain")
+
+
 def truths(spread):
     noise = np.random.default_rng(1).normal(size=(N, D)) * spread
     return posteriors(1.0)[1][:, 0] + jnp.asarray(noise, jnp.float32)
@@ -50,14 +55,13 @@ def test_draws_outside_the_box_are_not_the_posteriors():
 @pytest.mark.parametrize("wide", [0.8, 1.0, 1.25])
 def test_the_factor_undoes_what_is_too_wide_or_too_narrow(wide):
     z = truths(0.05 / wide)  # posteriors `wide` times as wide as they should be
-    found = float(depth.factor(jax.random.PRNGKey(0), posteriors, z, MASK, "plain"))
-    assert found == pytest.approx(wide, rel=0.1)
+    assert float(found_factor(z, MASK)) == pytest.approx(wide, rel=0.1)
 
 
 def test_a_few_rows_are_hardly_believed():
     def of(first):
         few = jnp.where(jnp.arange(N) // 10 == first, 1.0, 0.0)
-        return float(depth.factor(jax.random.PRNGKey(0), posteriors, truths(0.05), few, "plain"))
+        return float(found_factor(truths(0.05), few))
 
     # ten truths alone would have the factor off by 20 %
     assert np.sqrt(np.mean(np.log([of(first) for first in range(8)]) ** 2)) < 0.1
