@@ -37,7 +37,7 @@ def levels(key: Array, mixtures: Mixtures, z: Array, chart: str) -> Array:
         gap = points[:, None, None, :] - means[None, :, None, :]
         away = jnp.sum(inverse_lower(scales)[None] * gap, axis=-1)  # [1 + DRAWS, K, d]
         size = jnp.sum(jnp.log(jnp.diagonal(scales, axis1=-2, axis2=-1)), axis=-1)
-        density = jax.nn.logsumexp(logits - size - 0.5 * jnp.sum(away * away, axis=-1), axis=-1)
+        density = jax.nn.logsumexp((logits - size)[None] - 0.5 * jnp.sum(away * away, axis=-1), axis=-1)
         density = density + charts.log_slope(points, chart)
         inside = jnp.all((draws >= 0) & (draws <= 1), axis=-1) | (chart != "plain")
         denser = jnp.sum((inside & (density[1:] > density[0])).astype(jnp.float32))

@@ -216,7 +216,7 @@ def _fit(
     state = replace(state, basis=None if state.basis is None else matrices[basis[0]])
     state = replace(state, params=_weigh(params, data, settings), fits=state.fits + 1)
     if proposals is None:  # else held-out truths are not from the prior, and lie elsewhere in their posteriors
-        state = _as_deep(jax.random.fold_in(key, 1), state, data)
+        state = _as_deep(state, data)
     marginals = _marginal_gain(_mixtures(state, data.x[data.held]), data.y[data.held], settings)
     parameter_gain, identified = identify.identified(marginals, data.mask)
     state = replace(state, identified=identified)
@@ -383,7 +383,7 @@ def _weigh(params: Any, data: _Data, settings: InferenceSettings) -> Any:
     return {**params, "sharpness": sharpness, "member": member, "share": mixed(choice, share, CLIMBS)[0]}
 
 
-def _as_deep(key: Array, state: FitState, data: _Data) -> FitState:
+def _as_deep(state: FitState, data: _Data) -> FitState:
     """All parts sharper or wider by one factor, so that held-out truths lie as deep in their posteriors as they should.
 
     The weights and sharpnesses of the best density leave them too wide where errors have long tails, as most are then
@@ -397,7 +397,8 @@ def _as_deep(key: Array, state: FitState, data: _Data) -> FitState:
         return _mixtures(replace(state, params=params), data.x[rows])
 
     mask = data.mask[: depth.MOST]
-    factor = depth.factor(key, at, data.y[rows] * sd + centre, mask, state.settings.chart)
+    # the same draws in every fit: weights that are kept keep their factor
+    factor = depth.factor(jax.random.PRNGKey(0), at, data.y[rows] * sd + centre, mask, state.settings.chart)
     return replace(state, params={**state.params, "sharpness": state.params["sharpness"] * factor})
 
 
