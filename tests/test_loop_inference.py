@@ -142,10 +142,13 @@ def test_an_over_confident_network_gets_a_temperature_which_is_told_kept_and_use
     parts, start = made(*TESTED, quiet=0.5)
     state, info = infer(parts, start)
     factor = float(state.temperature)
-    assert factor == pytest.approx(2.0, rel=0.2) and "standard deviations times" in info.checks.sentence()
+    assert "standard deviations times" in info.checks.sentence()
     assert info.checks.calibration.before == "over-confident"
     assert float(info.posterior.sd()[0]) == pytest.approx(NOISE / np.sqrt(2), rel=0.3)
     # given, it is applied as it is, and what is tested is the posterior that is used
     fixed, given = infer(*made(*TESTED, "bayessim.temperature=1", quiet=0.5))
     assert float(fixed.temperature) == 1.0 and given.checks.calibration.verdict == "over-confident"
+    # a network that knew half the noise; what its own held-out rows had it widened by is not needed again
+    network = float(given.posterior.sd()[0]) * np.sqrt(2)
+    assert network == pytest.approx(0.5 * NOISE, rel=0.25) and factor == pytest.approx(NOISE / network, rel=0.2)
     assert float(info.posterior.sd()[0] / given.posterior.sd()[0]) == pytest.approx(factor, rel=0.1)
