@@ -10,6 +10,7 @@ import numpy as np
 from jax import Array
 
 from bayessim_mjx.distributions import charts
+from bayessim_mjx.inference.calibration import LEVELS
 from bayessim_mjx.triangular import inverse_lower
 
 Mixtures = tuple[Array, Array, Array]  # log weights [n, K], means [n, K, d], Cholesky factors of covariances
@@ -17,7 +18,7 @@ Mixtures = tuple[Array, Array, Array]  # log weights [n, K], means [n, K, d], Ch
 DRAWS = 64  # of each posterior
 MOST = 512  # rows looked at
 FACTORS = np.geomspace(0.75, 1 / 0.75, 15).astype(np.float32)
-REGIONS = np.asarray([0.5, 0.8, 0.95], np.float32)  # that should hold as many truths as they say
+REGIONS = np.asarray(LEVELS, np.float32)  # that should hold as many truths as they say
 DOUBT = 0.15  # standard deviation of the factor's log before anything is seen: a few rows are off by chance
 
 
