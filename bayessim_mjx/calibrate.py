@@ -14,6 +14,7 @@ from bayessim_mjx import cli
 from bayessim_mjx.config import Config
 from bayessim_mjx.device import setup_jax
 from bayessim_mjx.errors import UserError
+from bayessim_mjx.quantities import estimate
 
 FOLDER = "calibration"
 ADVICE = {
@@ -78,8 +79,8 @@ def show(console: Any, found: Any) -> None:
     """Verdict, tables and advice of inference.checks.Checks on the terminal."""
     report = found.calibration
     for line in verdict_lines(found):
-        console.say(line)
-    rows = [[f"{100 * a:.0f} %", f"{100 * c:.1f} ± {100 * e:.1f} %"] for a, (c, e) in report.coverage.items()]
+        console.say(line, indent=12)
+    rows = [[f"{100 * a:.0f} %", f"{estimate(100 * c, 100 * e)} %"] for a, (c, e) in report.coverage.items()]
     console.grid(["region of the posterior", "truths inside"], rows)
     columns = zip(report.names, report.bias, report.spread, report.contraction, strict=True)
     rows = [[n, f"{report.p[n]:.2g}", f"{bias:+.1f}", f"{wide:+.1f}", f"{c:.2f}"] for n, bias, wide, c in columns]

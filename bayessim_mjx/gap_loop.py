@@ -86,8 +86,9 @@ def _run(args: argparse.Namespace, config: Config, console: Any) -> int:
     result = study.run(console)
     result["seconds"] = round(time.perf_counter() - begun, 1)
     path = study.write(result)
-    gap_words.show(result, args.headless)
-    console.say(f"written: {path}; curves: tensorboard --logdir {study.out}")
+    gap_words.show(result, console)
+    console.say(f"results in {path}")
+    console.command("curves", f"tensorboard --logdir {study.out}")
     return 0
 
 

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping, Sequence
-from typing import Any, TextIO
+from typing import Any
 
 import numpy as np
 
-from bayessim_mjx.monitor.console import FILE_WIDTH
-from bayessim_mjx.monitor.words import ascii_of, number
+from bayessim_mjx.monitor.console import Console
+from bayessim_mjx.monitor.words import number
+from bayessim_mjx.quantities import estimate
 
 ROLES = {
     "nominal": "trained on the simulator as it was",
@@ -84,52 +84,33 @@ def _percent(share: float) -> str:
     return f"{100 * share:.0f} %"
 
 
-def show(found: Mapping[str, Any], headless: bool = False, file: TextIO | None = None) -> None:
-    """Print the tables and the sentences; without a terminal (or `headless`) no control characters."""
-    from rich.console import Console
-
-    file = file or sys.stdout
-    live = not headless and bool(getattr(file, "isatty", lambda: False)())
-    options: dict[str, Any] = {} if live else dict(force_terminal=False, no_color=True, width=FILE_WIDTH)
-    unicode = "utf" in (getattr(file, "encoding", None) or "utf-8").lower()
-    rich = Console(file=file, highlight=False, markup=False, **options)
-    rich.print(_returns(found, unicode))
+def show(found: Mapping[str, Any], console: Console) -> None:
+    """Print the tables and the sentences."""
+    _returns(found, console)
     if found["effects"]:
-        rich.print(_effects(found["effects"], unicode))
+        _effects(found["effects"], console)
     for sentence in found["sentences"]:
-        rich.print(sentence if unicode else ascii_of(sentence), soft_wrap=True)
+        console.say(sentence)
 
 
-def _returns(found: Mapping[str, Any], unicode: bool) -> Any:
+def _returns(found: Mapping[str, Any], console: Console) -> None:
     simulators = list(found["policies"]["nominal"][0]["returns"])
-    rows = [[ROLES[role], *(f"{_plus_minus(each, s)}" for s in simulators)] for role, each in found["policies"].items()]
-    return _table("return on", ["policy", *(SIMULATORS[s] for s in simulators)], rows, unicode)
+    rows = [[ROLES[role], *(_plus_minus(each, s) for s in simulators)] for role, each in found["policies"].items()]
+    console.grid(["policy", *(SIMULATORS[s] for s in simulators)], rows, "return on")
 
 
 def _plus_minus(each: Sequence[Mapping[str, Any]], simulator: str) -> str:
     """Mean over seeds, and its standard error (over episodes where there is one seed)."""
     means = [p["returns"][simulator]["mean"] for p in each]
     error = np.std(means, ddof=1) / np.sqrt(len(means)) if len(means) > 1 else each[0]["returns"][simulator]["se"]
-    return f"{number(float(np.mean(means)))} ± {number(float(error))}"
+    return estimate(np.mean(means), error)
 
 
-def _effects(effects: Sequence[Mapping[str, Any]], unicode: bool) -> Any:
+def _effects(effects: Sequence[Mapping[str, Any]], console: Console) -> None:
     rows = []
     for e in effects:
         every = [e["change"][role][how] for role in ("nominal", "corrected") for how in ("alone", "last")]
-        changes = [f"{number(x['mean'])} ± {number(x['se'])}" for x in every]
+        changes = [estimate(x["mean"], x["se"]) for x in every]
         rows.append([e["effect"], e["where"], *changes, "no" if e["irrelevant"] else "yes"])
     columns = ["effect", "where", "before: alone", "with the others", "retrained: alone", "with the others", "matters"]
-    return _table("change of return by", columns, rows, unicode)
-
-
-def _table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], unicode: bool) -> Any:
-    from rich import box
-    from rich.table import Table
-
-    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD if unicode else box.ASCII)
-    for i, name in enumerate(columns):
-        table.add_column(name, justify="left" if i == 0 else "right")
-    for row in rows:
-        table.add_row(*(cell if unicode else ascii_of(cell) for cell in row))
-    return table
+    console.grid(columns, rows, "change of return by", left=(0, 1))

@@ -82,8 +82,8 @@ def _run(config: Config, run: Any, device: Any, command: Sequence[str], console:
             state = _rounds(parts, state, run, console, resumed_at)
         _report(console, parts, state)
     which = "best" if run.manifest["best"] is not None else "latest"
-    console.say(f"{which} policy: python -m bayessim_mjx.play --checkpoint {run.path} --video")
-    console.say(f"pictures:    tensorboard --logdir {run.path} --samples_per_plugin images=1000")
+    console.command(f"{which} policy", f"python -m bayessim_mjx.play --checkpoint {run.path} --video")
+    console.command("pictures", f"tensorboard --logdir {run.path} --samples_per_plugin images=1000")
     return 0
 
 

@@ -16,6 +16,7 @@ from bayessim_mjx import cli
 from bayessim_mjx.config import Config, freeze, replace
 from bayessim_mjx.device import setup_jax
 from bayessim_mjx.errors import UserError
+from bayessim_mjx.quantities import estimate
 
 DESCRIPTION = "Play a saved policy: on nominal physics, on the prior, on the surrogate real and on the posterior."
 PHYSICS = ("nominal", "prior", "real", "posterior")
@@ -114,7 +115,7 @@ def _play(argv: Sequence[str] | None) -> int:
 
 
 def _show(args: argparse.Namespace, config: Config, path: Path, run: Any, count: int, console: Any) -> int:
-    """The table of returns, row by row, and the video."""
+    """The table of returns, and the video."""
     setup_jax(config)
     import jax
 
@@ -132,14 +133,12 @@ def _show(args: argparse.Namespace, config: Config, path: Path, run: Any, count:
     if args.physics and args.physics not in kinds:
         raise UserError(f"--physics {args.physics}: this checkpoint and task have {', '.join(kinds)}")
     console.say(f"{config.task}, {count} episodes each, checkpoint {path}")
-    console.say(f"{'physics':<10}{'return':>10}{'sd':>10}{'min':>10}{'max':>10}{'length':>10}")
-    chosen = {args.physics: kinds[args.physics]} if args.physics else kinds
+    chosen, rows = {args.physics: kinds[args.physics]} if args.physics else kinds, []
     for name, thetas in chosen.items():
         result = rl.evaluate(env, policy, jax.random.fold_in(key, 1), thetas)
         r, length = result["return"], result["length"]
-        console.say(
-            f"{name:<10}{r.mean():>10.4g}{r.std():>10.4g}{r.min():>10.4g}{r.max():>10.4g}{length.mean():>10.4g}"
-        )
+        rows.append([name, estimate(r.mean(), r.std()), *(f"{v:.4g}" for v in (r.min(), r.max(), length.mean()))])
+    console.grid(["physics", "return", "lowest", "highest", "episode length"], rows)
     if config.monitor.video:
         name = next(n for n in ("real", "posterior", "prior", "nominal") if n in chosen)
         folder = (run.path if run is not None else path.parent) / "videos" / "play"

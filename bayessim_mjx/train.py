@@ -12,6 +12,7 @@ from typing import Any
 from bayessim_mjx import cli
 from bayessim_mjx.config import Config, to_yaml
 from bayessim_mjx.device import mesh, setup_jax
+from bayessim_mjx.quantities import estimate
 
 DESCRIPTION = "PPO alone: on nominal physics, or on physics drawn from the prior with --randomize."
 
@@ -141,8 +142,8 @@ class Training:
         seconds, cached = self.compiling.take()
         if seconds > WORTH_SAYING:
             self.console.compile("evaluation", seconds, cached)
-        sd = float(result["return"].std())
-        self.console.say(f"evaluation at {int(state.iteration)}: return {score:.4g} ± {sd:.4g} over {count} episodes")
+        found = estimate(score, result["return"].std())
+        self.console.say(f"evaluation at {int(state.iteration)}: return {found} over {count} episodes")
         return score
 
     def owes_evaluation(self, iteration: int) -> bool:
@@ -196,8 +197,8 @@ def _run(config: Config, run: Any, command: Sequence[str], headless: bool) -> in
                 finally:
                     training.close()
         which = "latest" if run.manifest["best"] is None else f"best (step {run.manifest['best']})"
-        console.say(f"{which} policy: {PLAY} --checkpoint {run.path} --video")
-        console.say(f"curves: tensorboard --logdir {run.path}")
+        console.command(f"{which} policy", f"{PLAY} --checkpoint {run.path} --video")
+        console.command("curves", f"tensorboard --logdir {run.path}")
     return 0
 
 

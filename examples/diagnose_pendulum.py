@@ -19,6 +19,7 @@ from bayessim_mjx import diagnose, registry, rl
 from bayessim_mjx.config import load
 from bayessim_mjx.diagnosis.result import load as load_diagnosis
 from bayessim_mjx.env import Task
+from bayessim_mjx.quantities import estimate
 
 FRICTION, GAIN = 0.15, 0.7  # N m; of the torque commanded
 SECONDS, RUNS, NOISE = 6.0, 8, 2e-3  # s, logs, rad
@@ -73,7 +74,7 @@ def main() -> None:
     found = load_diagnosis(out / "found")
     print(f"\nverdict: {found.verdict}; truth: coulomb_friction {FRICTION} N m, actuator_gain {GAIN}")
     for effect in found.effects:
-        values = ", ".join(f"{name} {e.mean:.3g} ± {e.sd:.2g} {e.unit}" for name, e in effect.parameters.items())
+        values = ", ".join(f"{name} {estimate(e.mean, e.sd)} {e.unit}" for name, e in effect.parameters.items())
         print(f"  {effect.name} at {effect.where}: {values}")
 
     settings = load("Pendulum", overrides=[f"effects={out / 'found' / 'effects.yaml'}", "task.randomize=False"])

@@ -19,6 +19,7 @@ from jax.typing import ArrayLike
 from scipy.special import ndtr
 
 from bayessim_mjx.distributions import Distribution, box, charts
+from bayessim_mjx.quantities import estimate
 from bayessim_mjx.triangular import inverse_lower, lower_factor, product
 
 LEVELS = (0.5, 0.8, 0.95)
@@ -117,7 +118,7 @@ class Report:
 
     def table(self) -> str:
         """Coverage in words: `50 %: 49 ± 2, 80 %: ...`."""
-        rows = [f"{100 * a:.0f} %: {100 * c:.0f} ± {100 * s:.0f}" for a, (c, s) in self.coverage.items()]
+        rows = [f"{100 * a:.0f} %: {estimate(100 * c, 100 * s, 1)}" for a, (c, s) in self.coverage.items()]
         return ", ".join(rows)
 
     def to_dict(self) -> dict[str, Any]:

@@ -1,18 +1,25 @@
 """What a run says on the terminal: progress bars with ETA where there is a terminal, plain lines everywhere else.
 
-Takes plain numbers and dicts. Without a terminal (or with `headless`) no control character is ever written.
+Takes plain numbers and dicts. Without a terminal (or with `headless`) no control character is ever written. Lines are
+broken at spaces, at the terminal's width or $COLUMNS; without either, what is said is one line, so that logs can be
+searched.
 """
 
+import os
 import sys
 import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any, TextIO
 
 from bayessim_mjx.monitor.draws import shorten
+from bayessim_mjx.monitor.tables import TIE, shell, table, wrapped
 from bayessim_mjx.monitor.words import ascii_of, duration, escape, fit, is_number, named, number, spoken, without_prefix
+from bayessim_mjx.quantities import estimate
 
-FILE_WIDTH = 140  # columns assumed where there is no terminal
+FILE_WIDTH = 140  # columns that tables and lists may take where there is no terminal
+WIDTHS = "posterior/prior sd"
+LEAST_WIDTH = 40  # narrower terminals break words
 
 
 class Clock:
@@ -58,11 +65,12 @@ class Console:
         file = file or sys.stdout
         self.live = not headless and bool(getattr(file, "isatty", lambda: False)())
         options: dict[str, Any] = dict(file=file, highlight=False, soft_wrap=True)
+        self._columns = int(c) if (c := os.environ.get("COLUMNS", "")).isdigit() else None  # as rich reads it
         if not self.live:
-            options |= dict(force_terminal=False, no_color=True, width=FILE_WIDTH)
+            options |= dict(force_terminal=False, no_color=True, width=self._columns or FILE_WIDTH)
         self._rich = RichConsole(**options)
         self._unicode = "utf" in (getattr(file, "encoding", None) or "utf-8").lower()
-        self._now = now
+        self._now, self._blank = now, False
         self._progress: Any = None
         self._rounds: Clock | None = None
         self._steps: Clock | None = None
@@ -89,7 +97,12 @@ class Console:
 
     @property
     def width(self) -> int:
-        return self._rich.width if self.live else FILE_WIDTH
+        return max(self._rich.width, LEAST_WIDTH)
+
+    @property
+    def _limit(self) -> int | None:
+        """Columns at which lines are broken; None: they are not."""
+        return self.width if self.live or self._columns else None
 
     # ---- what happens
 
@@ -98,8 +111,13 @@ class Console:
         wide = max(map(len, summary), default=0)
         for key, value in summary.items():
             many = isinstance(value, Sequence) and not isinstance(value, str)
-            text = fit([str(v) for v in value], 3 * (self.width - wide - 2)) if many else str(value)
-            self._say(f"{key:<{wide}}  {text}", f"[bold]{key:<{wide}}[/]  ", text)
+            # an entry of a list is not torn apart
+            items = [str(v).replace(" ", TIE) for v in value] if many else []
+            text = fit(items, 3 * (self.width - wide - 2)) if many else str(value)
+            first, *more = self._broken(f"{key:<{wide}}  {text}", wide + 2)
+            self._line(first, "bold", len(key))
+            for line in more:
+                self._line(line)
 
     def begin(self, rounds: int, done: int = 0) -> None:
         """Rounds to come, `done` of them finished before (resume)."""
@@ -123,7 +141,7 @@ class Console:
                 clock.exclude(seconds)
         how = "loaded" if cached else "compiled"
         tail = "from the cache" if cached else "cached for the next start"
-        self._say(f"{how} {message} in {duration(seconds)} ({tail})", "[dim]", None)
+        self._say(f"{how} {message} in {duration(seconds)} ({tail})", "dim")
 
     def iteration(self, metrics: Mapping[str, Any], iteration: int | None = None) -> None:
         """One log interval of training: numbers in the order given, as many as fit.
@@ -142,7 +160,7 @@ class Console:
         elif at is not None:
             where += f" {int(at)}"
         if self._progress is not None and "phase" in self._bars:
-            self._move("phase", done, fit(numbers, max(self.width - 70, 20), "  ", count=False), eta)
+            self._move("phase", done, fit(numbers, self._note_room(), "  ", count=False), eta)
             return
         ahead = f"  ETA {duration(eta)}" if eta else ""
         self._say(f"{where}  " + fit(numbers, self.width - len(where) - len(ahead) - 2, "  ", count=False) + ahead)
@@ -171,21 +189,18 @@ class Console:
             rounds = rounds or self._rounds.total
         parts = [f"round {int(round) + 1}" + (f"/{rounds}" if rounds else "")]
         if reward is not None:
-            values = reward if isinstance(reward, Sequence) else (reward,)
-            parts.append(f"{where} reward " + " ± ".join(number(v) for v in values))
+            parts.append(f"{where} return {estimate(*reward) if isinstance(reward, Sequence) else number(reward)}")
         if gain is not None and is_number(gain):
-            parts.append(f"log p(truth) {float(gain):+.2f} nats vs prior")
+            parts.append(f"log density at the truth {float(gain):+.2f} nats over the prior")
         eta = self._rounds.eta() if self._rounds is not None else None
         tail = [] if seconds is None else [duration(float(seconds))]
         tail += [f"ETA {duration(eta)}"] if eta else []
-        rows = 1 if self.width >= FILE_WIDTH else 2  # a narrow terminal breaks the line
-        room = rows * self.width - len("   ".join(parts + tail)) - len("   sd/prior ")
         if widths:
+            room = self.width - len(f"    {WIDTHS} ")
             brief = without_prefix(list(widths))
-            full, short = (fit(named(names, widths), room) for names in (brief, shorten(brief, 18)))
-            fitting = short if "more" in full or not full else full
-            parts += [f"sd/prior {fitting}"] if fitting else []
-        self._say("   ".join(parts + tail), "[bold]", None)
+            fitting = fit(named(brief, widths), room) or fit(named(shorten(brief, 18), widths), room)
+            parts += [f"{WIDTHS} {fitting}"] if fitting else []
+        self._facts(parts + tail, "bold")
         if self._rounds is not None:
             done, total = self._rounds.done, self._rounds.total
             self._move("round", done, "", eta, f"round {min(done + 1, total)}/{total}")
@@ -197,31 +212,57 @@ class Console:
         rows = []
         for row in ordered:
             unit = f" [{row['unit']}]" if row.get("unit") else ""
-            cells = [f"{row['name']}{unit}", f"{number(row['low'])} .. {number(row['high'])}"]
-            cells.append(f"{number(row['mean'])} ± {number(row['sd'])}")
+            cells = [f"{row['name']}{unit}", f"{number(row['low'])} to {number(row['high'])}"]
+            cells.append(estimate(row["mean"], row["sd"]))
             cells += [number(row["truth"]) if is_number(row.get("truth")) else "-"] if known else []
             rows.append([*cells, f"{float(row['contraction']):.2f}" if is_number(row.get("contraction")) else "-"])
         self.grid(["parameter", "prior range", "posterior", *(["truth"] if known else []), "contraction"], rows, title)
 
-    def grid(self, header: Sequence[str], rows: Sequence[Sequence[str]], title: str | None = None) -> None:
-        """A table of texts, the first column to the left, numbers to the right."""
+    def grid(
+        self,
+        header: Sequence[str],
+        rows: Sequence[Sequence[str]],
+        title: str | None = None,
+        left: Collection[int] = (0,),
+    ) -> None:
+        """A table of texts: the columns `left` hold words, the others numbers. See `tables.table`."""
+        plain = [[self._plain(cell) for cell in row] for row in (header, *rows)]
+        laid = table(plain[0], plain[1:], self.width, left)
+        if not self._blank:
+            self._line("")
+        for line in wrapped(self._plain(title), self._limit) if title else []:
+            self._line(line, "italic")
+        for line in laid.header:
+            self._line(line, "bold")
+        self._line(("─" if self._unicode else "-") * max(map(len, [*laid.header, *laid.rows])))
+        for line in laid.rows:
+            self._line(line)
+        self._line("")
+
+    def panel(self, title: str, lines: Sequence[tuple[str, str]], colour: str) -> None:
+        """A frame of `colour` round lines of (text, style), with a title."""
         from rich import box
-        from rich.table import Table
+        from rich.panel import Panel
+        from rich.text import Text
 
-        style = box.SIMPLE_HEAD if self._unicode else box.ASCII
-        table = Table(title=title, box=style, title_justify="left")
-        for i, name in enumerate(header):
-            table.add_column(escape(name), justify="right" if i else "left", overflow="fold")
-        for row in rows:
-            table.add_row(*[escape(self._plain(cell)) for cell in row])
-        self._rich.print(table, soft_wrap=False)
+        parts = [(part, style) for text, style in lines for part in wrapped(self._plain(text), self.width - 4)]
+        body = Text("\n").join(Text(part, style) for part, style in parts)
+        edge = box.ROUNDED if self._unicode else box.ASCII
+        name = Text(self._plain(title), f"bold {colour}")
+        self._rich.print(Panel(body, title=name, title_align="left", border_style=colour, box=edge), soft_wrap=False)
 
-    def say(self, text: str) -> None:
-        """One plain line."""
-        self._say(text)
+    def say(self, text: str, indent: int = 4) -> None:
+        """One plain line, or a paragraph whose later lines are indented."""
+        self._say(text, indent=indent)
+
+    def command(self, what: str, command: str) -> None:
+        """A command that the user may want to paste, on lines of its own: it stays whole, whatever the width."""
+        self._say(f"{what}:")
+        for line in shell(command, self._limit, 2):
+            self._line(line)
 
     def warning(self, text: str) -> None:
-        self._say(f"warning: {text}", "[yellow]", None)
+        self._say(f"warning: {text}", "yellow")
 
     def close(self) -> None:
         """Take the progress bars away; a second call does nothing."""
@@ -234,14 +275,32 @@ class Console:
     def _plain(self, text: str) -> str:
         return text if self._unicode else ascii_of(text)
 
-    def _say(self, text: str, style: str = "", rest: str | None = "") -> None:
-        """Print one line; on a terminal `style` is markup in front (all of the line if `rest` is None)."""
-        if not self.live or not style:
-            self._rich.print(escape(self._plain(text)))
-        elif rest is None:
-            self._rich.print(f"{style}{escape(self._plain(text))}[/]")
-        else:
-            self._rich.print(style + escape(self._plain(rest)))
+    def _broken(self, text: str, indent: int) -> list[str]:
+        return wrapped(self._plain(text), self._limit, indent)
+
+    def _say(self, text: str, style: str = "", indent: int = 4) -> None:
+        for line in self._broken(text, indent):
+            self._line(line, style)
+
+    def _facts(self, facts: Sequence[str], style: str) -> None:
+        """Short texts in a row, on as many lines as it takes; one that fits on a line is not broken."""
+        lines = [facts[0]]
+        for fact in facts[1:]:
+            if self._limit is None or len(lines[-1]) + 3 + len(fact) <= self._limit:
+                lines[-1] += f"   {fact}"
+            else:
+                lines.append(f"    {fact}")
+        for line in lines:
+            self._say(line, style, 6)
+
+    def _line(self, text: str, style: str = "", styled: int | None = None) -> None:
+        """Print one line as it is; on a terminal the first `styled` characters (default: all) in `style`."""
+        from rich.text import Text
+
+        line, self._blank = Text(self._plain(text)), not text
+        if self.live and style:
+            line.stylize(style, 0, styled)
+        self._rich.print(line)
 
     def _bar(self, kind: str, text: str, total: int | None, done: int) -> None:
         if not self.live:
@@ -252,7 +311,7 @@ class Console:
             columns = (
                 SpinnerColumn(),
                 TextColumn("{task.description:<14}"),
-                BarColumn(24),
+                BarColumn(self._bar_width),
                 TextColumn("{task.fields[count]}"),
                 TextColumn("{task.fields[eta]}"),
                 TextColumn("{task.fields[note]}"),
@@ -265,10 +324,21 @@ class Console:
             text, total=total, completed=done, eta="", note="", count=_count(done, total)
         )
 
+    @property
+    def _bar_width(self) -> int:
+        return 24 if self.width >= 120 else 10
+
+    def _note_room(self) -> int:
+        """Columns beside spinner, description, bar, count and time to go, each as wide as its widest."""
+        said = max(14, *(len(task.description) for task in self._progress.tasks))
+        clocks = [clock for clock in (self._rounds, self._steps) if clock is not None]
+        count = max((len(_count(clock.total, clock.total)) for clock in clocks), default=0)
+        return self.width - (1 + said + self._bar_width + count + len("ETA 59 min 59 s") + 6)
+
     def _move(self, kind: str, done: int | None, note: str, eta: float | None, text: str | None = None) -> None:
         if self._progress is None or kind not in self._bars:
             return
-        said = "" if eta is None else f"ETA {duration(eta)}"
+        said = "" if not eta else f"ETA {duration(eta)}"
         more: dict[str, Any] = {} if text is None else {"description": text}
         clock = self._rounds if kind == "round" else self._steps
         if clock is not None and done is not None:

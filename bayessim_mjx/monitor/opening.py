@@ -27,7 +27,7 @@ def opening(config: Config, env: Any, device: Any, infers: bool = True) -> dict[
 
 def _range(p: Any) -> str:
     unit = f" {p.unit}" if p.unit else ""
-    return f"{p.name} {number(p.low)}..{number(p.high)}{unit}"
+    return f"{p.name} {number(p.low)} to {number(p.high)}{unit}"
 
 
 def _budget(config: Config, infers: bool) -> str:

@@ -2,6 +2,7 @@
 
 import math
 import os
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -15,6 +16,8 @@ SPOKEN = {
     "value": "value loss",
     "mean_std": "action sd",
 }
+
+_PLAIN = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789")
 
 
 def spoken(tag: str) -> str:
@@ -80,6 +83,8 @@ def escape(text: str) -> str:
 
 
 def ascii_of(text: str) -> str:
-    for sign, words in (("±", "+/-"), ("…", "..."), ("–", "-"), ("·", "*"), ("²", "^2"), ("×", "x")):
+    """The nearest text of ASCII characters: `(1.2 ± 0.3)·10⁻⁶` -> `(1.2 +/- 0.3)*10^-6`."""
+    for sign, words in (("±", "+/-"), ("…", "..."), ("–", "-"), ("−", "-"), ("·", "*"), ("×", "x"), ("─", "-")):
         text = text.replace(sign, words)
+    text = re.sub("[⁻⁰¹²³⁴⁵⁶⁷⁸⁹]+", lambda found: "^" + found[0].translate(_PLAIN), text)
     return text.encode("ascii", "replace").decode()

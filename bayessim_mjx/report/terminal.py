@@ -1,12 +1,10 @@
 """A diagnosis on the terminal: the verdict, the effects, the best candidates, the warnings and where the files are."""
 
-import sys
 from pathlib import Path
-from typing import Any, TextIO
+from typing import TextIO
 
 from bayessim_mjx.diagnosis.result import Diagnosis
-from bayessim_mjx.monitor.console import FILE_WIDTH
-from bayessim_mjx.monitor.words import ascii_of
+from bayessim_mjx.monitor.console import Console
 from bayessim_mjx.report.sections import between, stages_of
 from bayessim_mjx.report.words import (
     MISSING,
@@ -14,6 +12,7 @@ from bayessim_mjx.report.words import (
     VERDICTS,
     candidate_title,
     effect_title,
+    estimate,
     finite,
     headline,
     number,
@@ -22,6 +21,7 @@ from bayessim_mjx.report.words import (
 )
 
 BEST = 8
+Table = tuple[list[str], list[list[str]], tuple[int, ...]]  # header, rows, columns of words
 COLOURS = {
     "no_gap": "green",
     "parameters": "blue",
@@ -43,49 +43,31 @@ def console(
         file: where to; None: standard output.
         headless: no control characters, as where there is no terminal.
     """
-    from rich.console import Console
-    from rich.text import Text
-
-    file = file or sys.stdout
-    live = not headless and bool(getattr(file, "isatty", lambda: False)())
-    options: dict[str, Any] = {} if live else dict(force_terminal=False, no_color=True, width=FILE_WIDTH)
-    unicode = "utf" in (getattr(file, "encoding", None) or "utf-8").lower()
-    rich = Console(file=file, highlight=False, **options)
-
-    def text(words: Any, style: str = "") -> Text:
-        return Text(str(words) if unicode else ascii_of(str(words)), style)
-
-    rich.print(_verdict(diagnosis, text, unicode))
-    for table in (_effects(diagnosis, text), _candidates(diagnosis, text)):
-        if table is not None:
-            rich.print(table)
-    for warning in diagnosis.warnings:
-        rich.print(text(f"warning: {warning}", "yellow"), soft_wrap=True)
-    for path in (Path(folder) / name for name in FILES) if folder is not None else ():
-        if path.exists():
-            rich.print(text(path), soft_wrap=True)
+    with Console(file=file, headless=headless) as out:
+        out.panel(VERDICTS[diagnosis.verdict].badge, _verdict(diagnosis), COLOURS[diagnosis.verdict])
+        for table in (_effects, _parameters, _places, _candidates):
+            header, rows, words = table(diagnosis)
+            if rows:
+                out.grid(header, rows, left=words)
+        if len(diagnosis.candidates) > BEST:
+            out.say(f"{len(diagnosis.candidates) - BEST} more candidates in diagnosis.json")
+        if plan := diagnosis.next_experiment:
+            out.say(f"next experiment: {plan.get('name', MISSING)} ({plan.get('why', '')}), {plan.get('file', '')}")
+        for warning in diagnosis.warnings:
+            out.warning(warning)
+        for path in (Path(folder) / name for name in FILES) if folder is not None else ():
+            if path.exists():
+                out.say(str(path))
 
 
-def _verdict(d: Diagnosis, text: Any, unicode: bool) -> Any:
-    from rich import box
-    from rich.console import Group
-    from rich.panel import Panel
-
+def _verdict(d: Diagnosis) -> list[tuple[str, str]]:
+    """Lines of (text, style)."""
     known = [f"{STAGES[s]} {number(v)}" for s, v in stages_of(d).items() if finite(v)]
-    lines = [text(headline(d), "bold"), *map(text, d.sentences[1:])]
+    lines = [(headline(d), "bold"), *((sentence, "") for sentence in d.sentences[1:])]
     if known:
-        lines.append(text("gap in noise standard deviations: " + ", ".join(known)))
-    lines += [text(line) for line in _longest(d)]
-    lines.append(text(VERDICTS[d.verdict].advice, "dim"))
-    style = COLOURS[d.verdict]
-    edge = box.ROUNDED if unicode else box.ASCII
-    return Panel(
-        Group(*lines),
-        title=text(VERDICTS[d.verdict].badge, f"bold {style}"),
-        title_align="left",
-        border_style=style,
-        box=edge,
-    )
+        lines.append(("gap in noise standard deviations: " + ", ".join(known), ""))
+    lines += [(line, "") for line in _longest(d)]
+    return [*lines, (VERDICTS[d.verdict].advice, "dim")]
 
 
 def _longest(d: Diagnosis) -> list[str]:
@@ -97,59 +79,46 @@ def _longest(d: Diagnosis) -> list[str]:
     return [f"{last['name']} ({number(last.get('seconds'), 2)} s): " + ", ".join(known)]
 
 
-def _table(*columns: tuple[str, bool]) -> Any:
-    from rich.table import Table
-
-    table = Table(box=None, pad_edge=False, header_style="bold", padding=(0, 2, 0, 0))
-    for words, right in columns:
-        table.add_column(words, justify="right" if right else "left")
-    return table
-
-
-def _effects(d: Diagnosis, text: Any) -> Any:
-    if not d.effects:
-        return None
-    table = _table(
-        ("effect", False),
-        ("parameters", False),
-        ("gap closed", True),
-        ("90 %", True),
-        ("promised", True),
-        ("probability", True),
-        ("or", False),
-    )
+def _effects(d: Diagnosis) -> Table:
+    header = ["effect", "parameters", "gap closed", "90 %", "promised", "probability", "or"]
+    rows = []
     for e in d.effects:
         found = [quantity(k, v) for k, v in e.parameters.items()]
-        rivals = "; ".join(candidate_title(r) for r in e.equivalent_to)
-        values = ", ".join(f"{k} {v}" for k, v in found)
-        cells = (
-            effect_title(e.name, e.where),
-            values,
-            percent(e.gap_closed),
-            between(*e.gap_closed_ci),
-            percent(e.predicted_gap_closed),
-            percent(e.probability),
-            rivals,
+        rows.append(
+            [
+                effect_title(e.name, e.where),
+                ", ".join(f"{k} {v}" for k, v in found),
+                percent(e.gap_closed),
+                between(*e.gap_closed_ci),
+                percent(e.predicted_gap_closed),
+                percent(e.probability),
+                "; ".join(candidate_title(r) for r in e.equivalent_to),
+            ]
         )
-        table.add_row(*map(text, cells))
-    return table
+    if not any(row[-1] for row in rows):
+        header, rows = header[:-1], [row[:-1] for row in rows]
+    return header, rows, (0, 1, 6)
 
 
-def _candidates(d: Diagnosis, text: Any) -> Any:
-    if not d.candidates:
-        return None
-    table = _table(
-        ("", True),
-        ("candidate", False),
-        ("held-out score", True),
-        ("± se" if str(text("±")) == "±" else "se", True),
-        ("gap closed", True),
-    )
+def _parameters(d: Diagnosis) -> Table:
+    """What the simulator's own parameters become, where that is the whole answer."""
+    rows = [
+        [name, number(p.get("nominal")), estimate(p.get("mean"), p.get("sd"), p.get("unit") or "")]
+        for name, p in d.parameters.items()
+        if d.verdict == "parameters"
+    ]
+    return ["parameter", "as delivered", "recalibrated"], rows, (0,)
+
+
+def _places(d: Diagnosis) -> Table:
+    """Where the gap lies, where no effect says so."""
+    rows = [[p.channel, percent(p.share), between(*p.ci), p.region] for p in d.where if d.verdict == "unexplained"]
+    return ["where the gap lies", "share", "90 %", "region"], rows, (0, 3)
+
+
+def _candidates(d: Diagnosis) -> Table:
+    rows = []
     for k, c in enumerate(d.candidates[:BEST], 1):
         se = number(c.get("se")) if finite(c.get("se")) else MISSING
-        cells = (k, candidate_title(c), number(c.get("score")), se, percent(c.get("gap_closed")))
-        table.add_row(*map(text, cells))
-    if len(d.candidates) > BEST:
-        table.caption = text(f"{len(d.candidates) - BEST} more in diagnosis.json")
-        table.caption_justify = "left"
-    return table
+        rows.append([f"{k} {candidate_title(c)}", number(c.get("score")), se, percent(c.get("gap_closed"))])
+    return ["candidate", "held-out score", "standard error", "gap closed"], rows, (0,)

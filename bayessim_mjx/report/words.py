@@ -3,10 +3,12 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, TypeGuard
+from typing import Any
 
+from bayessim_mjx import quantities
 from bayessim_mjx.diagnosis.nouns import EFFECTS
 from bayessim_mjx.diagnosis.result import Diagnosis, Estimate, FoundEffect
+from bayessim_mjx.quantities import MISSING, SUPERSCRIPT, finite
 
 # quantities that are easier to read as their reciprocal
 RECIPROCALS = {
@@ -66,13 +68,6 @@ VERDICTS = {
         "Repair or extend the logs as the warnings below say, and diagnose again.",
     ),
 }
-MISSING = "–"
-_SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
-
-
-def finite(value: Any) -> TypeGuard[float]:
-    """A number that can be shown; None, NaN, infinities and text cannot."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def known_span(span: Any) -> tuple[float, float] | None:
@@ -80,26 +75,9 @@ def known_span(span: Any) -> tuple[float, float] | None:
     return (span[0], span[1]) if span is not None and all(map(finite, span)) else None
 
 
-def _power(value: float) -> int:
-    return math.floor(math.log10(abs(value))) if value else 0
-
-
-def _fixed(value: float, decimals: int) -> str:
-    text = f"{value:.{max(decimals, 0)}f}"
-    return text.replace("-", "−") if float(text) else text.lstrip("-")
-
-
 def number(value: Any, digits: int = 3) -> str:
-    """`digits` significant digits without an exponent where people read none; "–" where there is no number."""
-    if not finite(value):
-        return MISSING
-    if isinstance(value, int) or value == 0:
-        return f"{value:.0f}".replace("-", "−")
-    if not -4 <= _power(value) < 6:
-        p = _power(value)
-        return f"{_fixed(value / 10**p, digits - 1)}·10{str(p).translate(_SUPERSCRIPT)}"
-    text = _fixed(value, digits - 1 - _power(float(f"{value:.{digits - 1}e}")))
-    return text.rstrip("0").rstrip(".") if "." in text and abs(value) >= 10**digits else text
+    """`quantities.number` with a minus sign in place of a hyphen."""
+    return quantities.number(value, digits).replace("-", "−")
 
 
 def percent(share: Any, sign: bool = False) -> str:
@@ -107,29 +85,22 @@ def percent(share: Any, sign: bool = False) -> str:
     if not finite(share):
         return MISSING
     fine = 0 < abs(share) < 0.0995 or 0.995 <= abs(share) < 0.9995
-    text = _fixed(100 * share, 1 if fine else 0)
+    text = quantities.fixed(100 * share, 1 if fine else 0).replace("-", "−")
     return ("+" if sign and share > 0 else "") + text + " %"
 
 
 def unit(text: str) -> str:
     """`N m s^2/rad^2` -> `N m s²/rad²`."""
     parts = text.split("^")
-    return parts[0] + "".join(p[:1].translate(_SUPERSCRIPT) + p[1:] for p in parts[1:])
+    return parts[0] + "".join(p[:1].translate(SUPERSCRIPT) + p[1:] for p in parts[1:])
 
 
 def estimate(mean: Any, sd: Any = math.nan, in_unit: str = "") -> str:
-    """`0.031 ± 0.002 N m`: one digit of the sd (two if it begins with 1), the mean alike; s below 0.5 as ms."""
+    """`0.0312 ± 0.0021 N m`, see `quantities.estimate`; seconds below 0.5 as ms."""
     if in_unit == "s" and finite(mean) and abs(mean) < 0.5:
         mean, sd, in_unit = 1e3 * mean, 1e3 * sd if finite(sd) else sd, "ms"
     tail = f" {unit(in_unit)}" if in_unit else ""
-    if not finite(mean) or not finite(sd) or sd <= 0 or sd > 1e3 * abs(mean) > 0:
-        return number(mean) + tail
-    sd = float(f"{sd:.1e}")
-    big = max(_power(mean), _power(sd))
-    if not -4 <= big < 6:
-        return f"({estimate(mean / 10**big, sd / 10**big)})·10{str(big).translate(_SUPERSCRIPT)}{tail}"
-    places = (1 if f"{sd:e}"[0] == "1" else 0) - _power(sd)
-    return f"{_fixed(round(mean, places), places)} ± {_fixed(round(sd, places), places)}{tail}"
+    return quantities.estimate(mean, sd).replace("-", "−") + tail
 
 
 def effect_noun(name: str) -> str:

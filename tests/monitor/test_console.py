@@ -1,7 +1,10 @@
 """What is written without a terminal is plain text with the numbers in it; with one, bars that go away."""
 
 import io
+import re
 import warnings
+
+import pytest
 
 from bayessim_mjx.monitor.console import Clock, Console
 from bayessim_mjx.monitor.words import duration, fit, number, without_prefix
@@ -44,12 +47,13 @@ def test_plain_output_has_the_numbers_and_no_control_characters():
     assert any(line.startswith("train 10/20  reward -455.2  fps 123.5k") for line in lines)
     first = next(line for line in lines if line.startswith("round 1/3 "))
     assert first.startswith(
-        "round 1/3   real reward -455.2 ± 31   log p(truth) +2.31 nats vs prior   sd/prior mass 0.12, length 0.4   42 s"
+        "round 1/3   real return -455 ± 31   log density at the truth +2.31 nats over the prior   "
+        "posterior/prior sd mass 0.12, length 0.4   42 s"
     )
-    assert next(line for line in lines if line.startswith("round 2/3 ")).startswith("round 2/3   real reward -400")
+    assert next(line for line in lines if line.startswith("round 2/3 ")).startswith("round 2/3   real return -400")
     assert "warning: no video [egl]" in lines
-    mass, length = (next(i for i, x in enumerate(lines) if n in x and " .. " in x) for n in ("mass [kg]", "length"))
-    assert mass < length and "1.02 ± 0.1" in lines[mass] and "0.90" in lines[mass]
+    mass, length = (next(i for i, x in enumerate(lines) if n in x and " to " in x) for n in ("mass [kg]", "length"))
+    assert mass < length and "1.02 ± 0.10" in lines[mass] and "0.90" in lines[mass]
 
 
 def test_headless_is_plain_on_a_terminal_too():
@@ -58,21 +62,67 @@ def test_headless_is_plain_on_a_terminal_too():
 
 def test_a_terminal_gets_bars_and_the_same_lines():
     text = tell(Terminal())
-    assert "\x1b" in text and "real reward -455.2 ± 31" in text and "━" in text
+    assert "\x1b" in text and "real return -455 ± 31" in text and "━" in text
 
 
 def test_ascii_streams_get_ascii():
     file = io.TextIOWrapper(io.BytesIO(), encoding="ascii", write_through=True)
     file.getvalue = lambda: file.buffer.getvalue().decode("ascii")
-    assert "-455.2 +/- 31" in tell(file)
+    assert "-455 +/- 31" in tell(file)
 
 
-def test_many_widths_are_cut_to_the_line():
+def test_many_widths_are_cut_to_a_line():
     file = io.StringIO()
     widths = {f"left_front_leg_{i}_mass_mult": 0.1 for i in range(40)}
     Console(file=file).round_line(round=0, reward=(1.0, 2.0), widths=widths)
     [line] = file.getvalue().splitlines()
-    assert "more" in line and len(line) <= 140
+    assert "more" in line and len(line) <= 200
+
+
+WORDS = (
+    "warning: not identified by these trajectories, kept at the prior: left_front_leg_stiffness_mult, "
+    "right_back_foot_mass_mult and the others of a long list of names"
+)
+
+
+@pytest.mark.parametrize("width", [80, 140])
+def test_no_word_is_broken_at_the_terminals_width(monkeypatch, width):
+    """Every line fits, and every word of what was said stands whole in some line."""
+    monkeypatch.setenv("COLUMNS", str(width))
+    names = ["left_front_leg_stiffness_mult", "index_finger_proximal_abduction_joint_friction_loss", "torso_mass_mult"]
+    for file in (io.StringIO(), Terminal()):
+        console = Console(file=file)
+        console.start({"parameters": [f"{name} 0.5 to 1.5" for name in names * 9], "note": WORDS})
+        console.say(WORDS)
+        console.round_line(round=3, rounds=10, reward=(-1.0, 2.0), gain=1.0, widths=dict.fromkeys(names, 0.5))
+        rows = [dict(name=n, unit="N m", low=0, high=2, mean=1.04, sd=0.064, truth=1.0, contraction=0.9) for n in names]
+        console.table(rows)
+        console.grid(["effect", "where", "gap closed"], [[WORDS, "left hind knee", "12.3 ± 1.2"]], left=(0, 1))
+        console.panel("Unexplained", [(WORDS, "bold")], "red")
+        lines = re.sub(r"\x1b\[[0-9;]*m", "", file.getvalue()).splitlines()
+        assert max(map(len, lines)) <= width
+        said = {word.strip(",│") for line in lines for word in line.split()}
+        assert {word.strip(",") for word in WORDS.split()} <= said and {*names} <= said
+        assert all(any(whole in line for line in lines) for whole in ("1.040 ± 0.064", "12.3 ± 1.2"))
+
+
+def test_a_command_can_be_pasted_at_every_width(monkeypatch):
+    command = "python -m bayessim_mjx.play --checkpoint logs/Pendulum/2026-11-22_18-59-13_a_long_name --video"
+    for width in (60, 140):
+        monkeypatch.setenv("COLUMNS", str(width))
+        file = io.StringIO()
+        Console(file=file).command("best policy", command)
+        head, *lines = file.getvalue().splitlines()
+        assert head == "best policy:" and max(map(len, lines)) <= width
+        joined = "\n".join(lines).replace("\\\n", "")  # as a shell reads it
+        assert joined.split() == command.split()
+
+
+def test_without_a_terminal_what_is_said_is_one_line(monkeypatch):
+    monkeypatch.delenv("COLUMNS", raising=False)
+    file = io.StringIO()
+    Console(file=file).say(3 * WORDS)
+    assert file.getvalue().splitlines() == [3 * WORDS]
 
 
 def test_compiling_does_not_count_as_a_steps_time():

@@ -42,10 +42,11 @@ def test_console_says_what_was_found_in_plain_lines(tmp_path):
     report.console(fake.full(), tmp_path, file=file)
     text = file.getvalue()
     assert not set(text) & {"\x1b", "\r", "\b"}
-    for words in ("Missing effects found", "Coulomb friction at joint 'elbow'", "0.031 ± 0.002 N m", "68 %", str(path)):
+    level = "0.0312 ± 0.0021 N m"
+    for words in ("Missing effects found", "Coulomb friction at joint 'elbow'", level, "68 %", str(path)):
         assert words in text
     assert all(f"warning: {w}" in text for w in fake.full().warnings)
-    assert "3 more in diagnosis.json" in text
+    assert "3 more candidates in diagnosis.json" in text
 
 
 @pytest.mark.parametrize("verdict", VERDICTS)
@@ -54,4 +55,4 @@ def test_console_of_every_verdict_also_in_ascii(verdict):
     report.console(fake.bare(verdict), file=file)
     assert WORDS[verdict].badge in file.buffer.getvalue().decode("ascii")
     report.console(fake.full(), file=file)
-    assert "0.031 +/- 0.002 N m" in file.buffer.getvalue().decode("ascii")
+    assert "0.0312 +/- 0.0021 N m" in file.buffer.getvalue().decode("ascii")

@@ -75,7 +75,7 @@ def test_page_is_balanced_and_small_enough(written, page):
 
 
 def test_every_effect_its_numbers_and_all_warnings_are_there(page):
-    assert "Coulomb friction at joint 'elbow': 0.031 ± 0.002 N m" in page.text
+    assert "Coulomb friction at joint 'elbow': 0.0312 ± 0.0021 N m" in page.text
     assert "Command delay at actuator 'm_shoulder': 21.3 ± 1.1 ms" in page.text
     for words in (
         "Missing effects found",

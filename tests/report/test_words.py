@@ -32,12 +32,12 @@ def test_numbers(value, text):
 @pytest.mark.parametrize(
     ("mean", "sd", "unit", "text"),
     [
-        (0.0312, 0.0021, "N m", "0.031 ± 0.002 N m"),
+        (0.0312, 0.0021, "N m", "0.0312 ± 0.0021 N m"),
         (0.0213, 0.0011, "s", "21.3 ± 1.1 ms"),
-        (-1.5, 0.24, "rad", "−1.5 ± 0.2 rad"),
-        (152.0, 31.0, "", "150 ± 30"),
+        (-1.5, 0.24, "rad", "−1.50 ± 0.24 rad"),
+        (152.0, 31.0, "", "152 ± 31"),
         (0.5, math.nan, "kg", "0.500 kg"),
-        (3.2e-6, 4e-7, "kg m^2", "(3.2 ± 0.4)·10⁻⁶ kg m²"),
+        (3.2e-6, 4e-7, "kg m^2", "(3.20 ± 0.40)·10⁻⁶ kg m²"),
     ],
 )
 def test_estimates_show_the_digits_that_the_sd_allows(mean, sd, unit, text):
@@ -64,14 +64,14 @@ def test_effects_in_plain_english():
 
 def test_a_reciprocal_is_turned_over_with_its_error():
     # 1 / 0.5 = 2, sd 0.05 / 0.5^2 = 0.2
-    assert words.quantity("inverse_limit", Estimate(0.5, 0.05, "1/(N m)")) == ("limit", "2.0 ± 0.2 N m")
+    assert words.quantity("inverse_limit", Estimate(0.5, 0.05, "1/(N m)")) == ("limit", "2.00 ± 0.20 N m")
     assert words.quantity("inverse_speed", Estimate(0.1, 0.01, "s/rad")) == ("no-load speed", "10.0 ± 1.0 rad/s")
 
 
 def test_an_effect_with_several_parameters_names_them():
     two = {"level": Estimate(0.1, 0.03, "N m"), "excess": Estimate(0.2, 0.05, "N m")}
     line = words.effect_line(FoundEffect("stribeck_friction", "j", two, 1.0, 0.5, (0.4, 0.6)))
-    assert line == "Stribeck friction at joint 'j': level 0.10 ± 0.03 N m, excess 0.20 ± 0.05 N m"
+    assert line == "Stribeck friction at joint 'j': level 0.100 ± 0.030 N m, excess 0.200 ± 0.050 N m"
 
 
 def test_gap_closed_by_hand():
