@@ -4,9 +4,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy import stats
+from scipy import special, stats
 
-from bayessim_mjx.distributions import Distribution
+from bayessim_mjx.distributions import Distribution, charts
+from bayessim_mjx.inference.calibration import _spread
+from bayessim_mjx.inference.identify import restore_prior
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 
 MASS = Parameter("mass", 1.0, 0.5, 2.5)
@@ -66,6 +68,19 @@ def test_the_standard_normal_is_the_prior_in_the_probit_chart():
     np.testing.assert_allclose(prior.log_gain(theta), 0.0, atol=1e-6)
     twice = some(SPACE, "probit").product(q, prior, components=4)  # knowing nothing changes nothing
     np.testing.assert_allclose(twice.log_gain(theta), some(SPACE, "probit").log_gain(theta), atol=1e-3)
+
+
+def test_the_gaussian_that_stands_for_the_prior_is_the_same_wherever_it_is_used():
+    """Logit: moments 0 and 1 in the probit chart, by quadrature; and a temperature leaves knowing nothing alone."""
+    x, w = np.polynomial.hermite_e.hermegauss(101)
+    z = charts.NEUTRAL["logit"][1] * x
+    probit = -np.sign(z) * special.ndtri_exp(-np.logaddexp(0.0, np.abs(z)))
+    assert w @ probit**2 / w.sum() == pytest.approx(1.0, abs=1e-5)
+    for chart in ("probit", "logit"):
+        q = restore_prior(some(SPACE, chart), jnp.asarray([True, False]))
+        means, scales = _spread(q, 2.0)
+        np.testing.assert_allclose(means[:, 1], charts.NEUTRAL[chart][0], atol=1e-6)
+        np.testing.assert_allclose(scales[:, 1, 1], charts.NEUTRAL[chart][1], rtol=1e-5)
 
 
 @pytest.mark.parametrize("chart", ["plain", "probit"])

@@ -134,8 +134,11 @@ class Race:
         return any(z > far for z, shape in zip(off, effect.shapes, strict=True) if not shape)
 
     def closure(self, model: Model) -> float:
-        """Share of the base model's gap above the noise that `model` closes, held out."""
-        return 1.0 - max(model.total - self._floor(), 0.0) / max(self.base.total - self._floor(), 1e-12)
+        """Share of the base model's squared gap above the noise that `model` closes, held out; at most 1.
+
+        The noise alone is the floor: the best of many models tried is below its own expected error by selection.
+        """
+        return 1.0 - self.left(model)
 
     def left(self, model: Model) -> float:
         """Share of the base model's squared gap above the noise that `model` leaves."""
@@ -143,9 +146,6 @@ class Race:
 
     def _above(self, model: Model) -> float:
         return model.total - self.noise * len(model.cost)
-
-    def _floor(self) -> float:
-        return min(self.noise * len(self.base.cost), min((m.total for m in self.models.values()), default=np.inf))
 
 
 def _fresh(race: Race, job: Job) -> list[int]:

@@ -155,7 +155,7 @@ def _finished(race: Race, winner: Model, model: Model) -> Model:
 def _rival(race: Race, winner: Model, effect: Candidate, others: tuple[Candidate, ...], model: Model) -> list[Rival]:
     c = race.better(model, winner)
     behind = race.closure(winner) - race.closure(model)
-    misfit = winner.total > 1.3 * race.noise * len(winner.cost)
+    misfit = race.above_noise(winner)
     told_apart = c.evidence > MILD and (c.t > 2.0 or c.evidence > 3 * MILD)
     # what is left of both is worth less than the simulators' own differences: significant, not relevant
     told_apart = told_apart and not (race.at_noise(winner, NEAR) and race.at_noise(model, NEAR))

@@ -15,8 +15,9 @@ from jax.scipy.special import ndtr, ndtri
 CHARTS = ("plain", "probit", "logit")
 EDGE = 1e-6  # unit coordinates are kept this far from 0 and 1 where a chart is infinite there
 PRIOR_PRECISION = {"plain": 0.0, "probit": 1.0}  # where the prior is Gaussian: products and quotients are closed
-# mean and sd of a Gaussian that is the prior (plain: flat to 3e-4 inside the cube; logit: to 0.02 in probability)
-NEUTRAL = {"plain": (0.5, 20.0), "probit": (0.0, 1.0), "logit": (0.0, 1.702)}
+# mean and sd of a Gaussian that is the prior. plain: its density varies by 3e-4 inside the cube. logit: to 0.02 in
+# probability, and exactly N(0, 1) in mean and variance in the probit chart, where products are taken
+NEUTRAL = {"plain": (0.5, 20.0), "probit": (0.0, 1.0), "logit": (0.0, 1.77579)}
 # centre and sd of the prior: z-scores for networks
 SCORE = {"plain": (0.5, 12**-0.5), "probit": (0.0, 1.0), "logit": (0.0, np.pi / 3**0.5)}
 

@@ -23,14 +23,16 @@ DOUBT = 0.15  # standard deviation of the factor's log before anything is seen: 
 
 
 def levels(key: Array, mixtures: Mixtures, z: Array, chart: str) -> Array:
-    """Share of a posterior's draws that are denser than the truth z [n, d], [n]: uniform where it is exact.
+    """Mass of a posterior that is denser than the truth z [n, d], by its rank among draws, [n].
 
-    The mixtures are those in the chart; draws outside the box of the plain chart are none of the posterior's.
+    Ranks are spread at random between their neighbours and ties broken at random, so that of exact posteriors a share
+    of exactly p has levels up to p. The mixtures are those in the chart; draws outside the box of the plain chart are
+    none of the posterior's.
     """
 
     def one(inputs: tuple[Array, Array, Array, Array, Array]) -> Array:
         key, logits, means, scales, z = inputs
-        key_part, key_noise = jax.random.split(key)
+        key_part, key_noise, key_rank = jax.random.split(key, 3)
         part = jax.random.categorical(key_part, logits, shape=(DRAWS,))
         noise = jax.random.normal(key_noise, (DRAWS, z.shape[0]))
         draws = means[part] + jnp.sum(scales[part] * noise[:, None, :], axis=-1)
@@ -41,8 +43,8 @@ def levels(key: Array, mixtures: Mixtures, z: Array, chart: str) -> Array:
         density = jax.nn.logsumexp((logits - size)[None] - 0.5 * jnp.sum(away * away, axis=-1), axis=-1)
         density = density + charts.log_slope(points, chart)
         inside = jnp.all((draws >= 0) & (draws <= 1), axis=-1) | (chart != "plain")
-        denser = jnp.sum((inside & (density[1:] > density[0])).astype(jnp.float32))
-        return (denser + 0.5) / (jnp.sum(inside.astype(jnp.float32)) + 1.0)
+        denser, equal = jnp.sum(inside & (density[1:] > density[0])), jnp.sum(inside & (density[1:] == density[0]))
+        return (denser + (equal + 1.0) * jax.random.uniform(key_rank)) / (jnp.sum(inside) + 1.0)
 
     return jax.lax.map(one, (jax.random.split(key, z.shape[0]), *mixtures, z), batch_size=64)
 

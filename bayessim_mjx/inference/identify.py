@@ -15,16 +15,13 @@ import numpy as np
 from jax import Array
 from jax.scipy.special import logsumexp
 
-from bayessim_mjx.distributions import Distribution, box
+from bayessim_mjx.distributions import Distribution, box, charts
 from bayessim_mjx.triangular import lower_factor
 
 SIGNIFICANT = 3.0  # standard errors of the mean held-out gain
 RELEVANT = 0.01  # nats
 DEFENSIVE = 0.05  # share of the prior mixed in before scoring
 CONTRACTED = 0.05  # share of the prior's variance that has to go before a parameter counts as narrowed
-# centre and sd of a Gaussian that is the prior. plain: its density varies by 3e-4 inside the cube. logit: nearly in
-# probability, and exactly N(0, 1) in mean and variance where a product takes it over to the probit chart
-FLAT = {"plain": (0.5, 20.0), "probit": (0.0, 1.0), "logit": (0.0, 1.7758)}
 
 
 def marginal_gain(logits: Array, means: Array, scales: Array, u: Array) -> Array:
@@ -54,7 +51,7 @@ def identified(gain: Array, mask: Array) -> tuple[Array, Array]:
 @jax.jit
 def restore_prior(posterior: Distribution, keep: Array) -> Distribution:
     """The posterior over the parameters to keep [d], the prior over the others, independent of them."""
-    q, keep, (centre, sd) = posterior, jnp.asarray(keep), FLAT[posterior.chart]
+    q, keep, (centre, sd) = posterior, jnp.asarray(keep), charts.NEUTRAL[posterior.chart]
     means = jnp.where(keep[None, :], q.means, centre)
     # a factor of (S S^T on the kept rows) + sd^2 on the others; forming S S^T would lose thin components
     kept = jnp.where(keep[None, :, None], q.scales, 0.0)

@@ -7,11 +7,12 @@ import pytest
 
 from bayessim_mjx.diagnosis import race as races
 from bayessim_mjx.diagnosis import verdict
+from bayessim_mjx.diagnosis.models import Model
 from bayessim_mjx.diagnosis.verdict import Rival
 
 
 def candidate(effect, where):
-    return SimpleNamespace(effect=effect, where=where, label=f"{effect}@{where}")
+    return SimpleNamespace(effect=effect, where=where, label=f"{effect}@{where}", coordinates=())
 
 
 @pytest.mark.parametrize(
@@ -63,3 +64,33 @@ def test_effects_are_added_until_the_sensors_noise_is_reached(rms, believed, goe
     assert bool(races.Race.above_noise(race, model)) is goes_on
     bare = SimpleNamespace(effects=(), cost=cost, total=cost.sum())
     assert bool(races.Race.above_noise(race, bare)) is (rms > 1.3)
+
+
+def raced(*totals, noise=50.0, settings=None):
+    """A race whose first model is the base and whose second the winner; `totals` are costs per window / noise."""
+    windows = SimpleNamespace(group=np.arange(8))
+    fitter = SimpleNamespace(size=noise, simulator=SimpleNamespace(windows=windows))
+    effects = [(), *((candidate("payload", f"link{i}"),) for i in range(1, len(totals)))]
+    models = [
+        Model(e, SimpleNamespace(coordinates=()), np.full(8, noise * t), np.zeros((8, 0)), 1e4)
+        for e, t in zip(effects, totals, strict=True)
+    ]
+    race = races.Race(fitter, [], settings or races.Settings(), None, models[0], models[1])
+    race.models = {frozenset(e.label for e in m.effects): m for m in models}
+    return race, models
+
+
+def test_what_is_closed_is_counted_from_the_noise_not_from_the_best_model_tried():
+    race, (base, winner, lucky, half) = raced(5.0, 1.0, 0.8, 3.0)
+    assert race.closure(winner) == race.closure(lucky) == 1.0 and race.closure(base) == 0.0
+    assert race.closure(half) == pytest.approx(0.5)
+    assert race.left(half) == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize(("rms", "misfit"), [(1.2, False), (1.4, True)])
+def test_a_model_misfits_beyond_the_same_noise_floor_at_which_the_race_goes_on(rms, misfit):
+    """Clearly worse held out, yet close behind: still a rival where neither law fits well, and only there."""
+    race, (_, winner, other) = raced(50.0, rms**2, rms**2 + 0.5)
+    assert bool(race.above_noise(winner)) is misfit
+    effect, effects = winner.effects[0], other.effects
+    assert bool(verdict._rival(race, winner, effect, effects, other)) is misfit

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.special import ndtri
 
 from bayessim_mjx.inference import depth
 
@@ -39,6 +40,16 @@ def test_the_level_of_a_gaussian_is_the_chi_square_probability():
     distance = np.sum(np.asarray(truths(0.05) - posteriors(1.0)[1][:, 0]) ** 2, axis=1) / 0.05**2
     expected = 1 - np.exp(-distance / 2)  # chi-square with two degrees of freedom
     assert np.mean(np.abs(found - expected)) < 0.05  # 64 draws: .04 on average
+
+
+def test_a_region_of_half_the_mass_holds_half_the_truths():
+    """Truths at 10 000 even quantiles; ranks (k + 1/2) / 65 of 64 draws would put 33/65 = .508 into it."""
+    n = 10_000
+    z = 0.5 + 0.05 * jnp.asarray(ndtri((np.arange(n) + 0.5) / n), jnp.float32)
+    mixtures = jnp.zeros((n, 1)), jnp.full((n, 1, 1), 0.5), jnp.full((n, 1, 1, 1), 0.05)
+    found = np.asarray(jax.jit(lambda k: depth.levels(k, mixtures, z[:, None], "plain"))(jax.random.PRNGKey(3)))
+    for region in (0.2, 0.5, 0.8):  # standard error below .002, the truths being even
+        assert np.mean(found <= region) == pytest.approx(region, abs=0.005)
 
 
 def test_draws_outside_the_box_are_not_the_posteriors():

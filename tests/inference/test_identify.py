@@ -7,7 +7,7 @@ import pytest
 from scipy.special import ndtr
 
 from bayessim_mjx import inference
-from bayessim_mjx.distributions import Distribution
+from bayessim_mjx.distributions import Distribution, charts
 from bayessim_mjx.inference import identify
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 
@@ -69,7 +69,7 @@ def test_thin_components_survive():
     np.testing.assert_allclose(np.asarray(kept.scales), np.asarray(thin), rtol=1e-3, atol=1e-7)
     half = identify.restore_prior(q, jnp.asarray([False, True]))
     np.testing.assert_allclose(
-        np.asarray(half.scales[0]), [[identify.FLAT["plain"][1], 0.0], [0.0, 0.2]], rtol=1e-4, atol=1e-5
+        np.asarray(half.scales[0]), [[charts.NEUTRAL["plain"][1], 0.0], [0.0, 0.2]], rtol=1e-4, atol=1e-5
     )
 
 
@@ -84,7 +84,7 @@ def test_flat_parameters_are_named():
 @pytest.mark.parametrize("chart", ["plain", "probit", "logit"])
 def test_the_prior_is_restored_in_every_chart_and_a_product_of_many_keeps_it(chart):
     """Also where components are correlated: the kept marginal stays, twelve factors know nothing of the other."""
-    centre, sd = identify.FLAT[chart] if chart != "plain" else (0.5, 0.2)
+    centre, sd = charts.NEUTRAL[chart] if chart != "plain" else (0.5, 0.2)
     scales = 0.5 * sd * jnp.asarray([[[1.0, 0.0], [0.8, 0.3]], [[0.7, 0.0], [-0.5, 0.4]]])
     means = centre + sd * jnp.asarray([[0.1, 0.2], [-0.2, 0.4]])
     q = Distribution.from_unit(SPACE, jnp.asarray([0.3, 0.0]), means, scales, 0.02, chart)
