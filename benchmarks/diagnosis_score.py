@@ -59,17 +59,17 @@ class Outcome:
 
     def inside(self, effect: dict[str, Any]) -> bool:
         """Named, or in the set of what cannot be told from what is named."""
-        rivals = [label for f in self.named() for entry in f["equivalent_to"] for label in _labels(entry)]
+        rivals = [label for f in self.named() for entry in f["equivalent_to"] for label in labels_of(entry)]
         return self.right(effect) or any(self.same(*label, effect) for label in rivals)
 
 
-def _labels(entry: Any) -> list[tuple[str, str]]:
+def labels_of(entry: Any) -> list[tuple[str, str]]:
     """ "effect@place" labels of an entry of equivalent_to, however it is written."""
     if isinstance(entry, str):
         name, _, where = entry.partition("@")
         return [(name, where)]
     if "effects" in entry:
-        return [label for e in entry["effects"] for label in _labels(e)]
+        return [label for e in entry["effects"] for label in labels_of(e)]
     return [(entry["name"], str(entry.get("where", "")))]
 
 

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import diagnosis_weights
 import numpy as np
 from diagnosis_score import Outcome, Rate, confusion, label, rates, read
 
@@ -24,11 +25,15 @@ def score(folders: Sequence[Path], out: Path) -> str:
     run = [o for o in every[OWN] if o.said or not math.isnan(o.seconds)]
     left_out = [read(f, "left_out") for f in folders if (f / "left_out" / "exit.json").exists()]
     told = {name: rates(run if name == OWN else o, left_out if name == OWN else ()) for name, o in every.items()}
-    tables = [_measures(told), _systems(run), _effects(run)]
+    tables = [_measures(told), _systems(run), _effects(run), diagnosis_weights.table(run)]
     text = "\n\n".join([*(markdown(t) for t in tables), _footer(every[OWN], run)])
     out.mkdir(parents=True, exist_ok=True)
     numbers = {name: {r.what: r.to_dict() for r in found} for name, found in told.items()}
     numbers[OWN]["seconds"] = _seconds(run)
+    weights = diagnosis_weights.forecasts(run)
+    numbers[OWN]["weights"] = (
+        dict(zip(("brier", "brier of the base rate"), diagnosis_weights.brier(weights), strict=True)) if weights else {}
+    )
     (out / "score.json").write_text(json.dumps(numbers, indent=1))
     (out / "score.md").write_text(text + "\n")
     matrices = {name: confusion(run if name == OWN else o) for name, o in every.items()}

@@ -1,4 +1,4 @@
-"""Numbers of the named effects: estimates, probability, what each closes, as promised and as realised."""
+"""Numbers of the named effects: estimates, weight among rivals, what each closes, as promised and as realised."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 
 from bayessim_mjx.diagnosis import gap, promise, uncertainty, verdict
 from bayessim_mjx.diagnosis.candidates import Candidate
+from bayessim_mjx.diagnosis.models import Model
 from bayessim_mjx.diagnosis.race import Progress
 from bayessim_mjx.diagnosis.result import Estimate, FoundEffect
 from bayessim_mjx.diagnosis.run import Findings, Setup
@@ -71,11 +72,11 @@ def closed_by(found: Findings) -> dict[str, Any]:
 
 
 def _effect(found: Findings, effect: Candidate, sd: np.ndarray, part: _Part) -> FoundEffect:
-    setup, race, model = found.setup, found.race, found.ruling.model
+    setup, model = found.setup, found.ruling.model
     rivals = found.ruling.rivals.get(effect.label, [])
-    told = [model, *(r.model for r in rivals if not r.contains)]
-    rng = np.random.default_rng(setup.seed)
-    weight = uncertainty.win_share(told, setup.fitter.simulator.windows.group, race.noise, rng)
+    weighed = [r for r in rivals if not r.contains]
+    own_weight, *others = _weights(found, [model, *(r.model for r in weighed)])
+    weight_of = dict(zip(map(id, weighed), others, strict=True))
     own = [model.job.names.index(c.name) for c in effect.coordinates]
     numbers = {
         c.name.rsplit(".", 1)[1]: Estimate(float(model.job.values[i]), float(sd[i]), _unit(setup, effect, c.unit))
@@ -85,14 +86,22 @@ def _effect(found: Findings, effect: Candidate, sd: np.ndarray, part: _Part) -> 
         name=effect.effect,
         where=effect.where,
         parameters=numbers,
-        probability=float(weight[0]),
+        weight_among_rivals=own_weight,
         gap_closed=part.closed,
         gap_closed_ci=part.ci,
-        equivalent_to=[r.to_dict() for r in rivals],
+        equivalent_to=[r.to_dict() | ({"weight": weight_of[id(r)]} if id(r) in weight_of else {}) for r in rivals],
         sentence="",
         predicted_gap_closed=part.promised,
         share=part.share if len(model.effects) > 1 else float("nan"),
     )
+
+
+def _weights(found: Findings, models: list[Model]) -> list[float]:
+    """Weights of a model and its rivals; NaN of one that has none."""
+    if len(models) < 2:
+        return [float("nan")]
+    group, rng = found.setup.fitter.simulator.windows.group, np.random.default_rng(found.setup.seed)
+    return uncertainty.win_share(models, group, found.race.noise, rng).tolist()
 
 
 def _unit(setup: Setup, effect: Candidate, unit: str) -> str:

@@ -36,11 +36,13 @@ class FoundEffect:
     Attributes:
         name, where: of the library, of the model.
         parameters: {parameter: Estimate}.
-        probability: that this effect, and none of its rivals, is what is there.
+        weight_among_rivals: of this effect against `equivalent_to`, 1 together: how often and how clearly its model
+            predicts held-out conditions better (pseudo-BMA+). It is no probability that the effect is there: what is
+            there may be none of them. NaN where there is no rival to be weighed against.
         gap_closed, gap_closed_ci: its part of what all effects close, as a share of the recalibrated simulator's
             squared gap above the noise, on held-out windows, with a 90 % interval.
-        equivalent_to: [{"effects": ["payload@link", ...], "gap_closed": ..., "why": sentence}], rivals that these logs
-            cannot tell from it.
+        equivalent_to: [{"effects": ["payload@link", ...], "gap_closed": ..., "why": sentence, "weight": among the
+            rivals}], which these logs cannot tell from it; of an effect that contains it as a special case, no weight.
         sentence: for people; predicted_gap_closed: the same share as promised before any effect was fitted.
         share: of the gap closed by all effects together (Shapley).
     """
@@ -48,7 +50,7 @@ class FoundEffect:
     name: str
     where: str
     parameters: dict[str, Estimate]
-    probability: float
+    weight_among_rivals: float
     gap_closed: float
     gap_closed_ci: tuple[float, float]
     equivalent_to: list[dict[str, Any]] = field(default_factory=list)
@@ -166,6 +168,9 @@ def load(folder: str | Path) -> Diagnosis:
 def _effect(raw: dict[str, Any]) -> FoundEffect:
     parameters = {k: Estimate(**_numbers(v)) for k, v in raw["parameters"].items()}
     rest = _numbers({k: v for k, v in raw.items() if k != "parameters"})
+    if "probability" in rest:  # its name in files of before
+        weight = rest.pop("probability")
+        rest["weight_among_rivals"] = weight if rest["equivalent_to"] else math.nan
     return FoundEffect(**{**rest, "parameters": parameters, "gap_closed_ci": tuple(raw["gap_closed_ci"])})
 
 

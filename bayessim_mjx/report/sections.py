@@ -156,17 +156,18 @@ def _effect(e: FoundEffect) -> dict[str, Any]:
         "label": f"{e.name}@{e.where}",
         "sentence": e.sentence,
         "parameters": [dict(zip(("name", "value"), quantity(k, v), strict=True)) for k, v in e.parameters.items()],
-        "probability": percent(e.probability),
+        "weight": percent(e.weight_among_rivals) if finite(e.weight_among_rivals) else "",
         "closed": percent(e.gap_closed),
         "ci": between(*e.gap_closed_ci),
         "mark": marks.bar(e.gap_closed, e.gap_closed_ci, STAGE["with_effects"]),
-        "chance": marks.bar(e.probability, None, "#9aa3ab"),
+        "weight_mark": marks.bar(e.weight_among_rivals, None, "#9aa3ab") if finite(e.weight_among_rivals) else "",
         "predicted": percent(e.predicted_gap_closed) if finite(e.predicted_gap_closed) else "",
         "share": percent(e.share) if finite(e.share) else "",
         "rivals": [
             {
                 "name": candidate_title(r),
                 "closed": percent(r["gap_closed"]) if finite(r.get("gap_closed")) else "",
+                "weight": percent(r["weight"]) if finite(r.get("weight")) else "",
                 "why": r.get("why") or "",
             }
             for r in e.equivalent_to

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import TextIO
 
-from bayessim_mjx.diagnosis.result import Diagnosis
+from bayessim_mjx.diagnosis.result import Diagnosis, FoundEffect
 from bayessim_mjx.monitor.console import Console
 from bayessim_mjx.report.sections import between, stages_of
 from bayessim_mjx.report.words import (
@@ -80,7 +80,7 @@ def _longest(d: Diagnosis) -> list[str]:
 
 
 def _effects(d: Diagnosis) -> Table:
-    header = ["effect", "parameters", "gap closed", "90 %", "promised", "probability", "or"]
+    header = ["effect", "parameters", "gap closed", "90 %", "promised", "weight among rivals"]
     rows = []
     for e in d.effects:
         found = [quantity(k, v) for k, v in e.parameters.items()]
@@ -91,13 +91,19 @@ def _effects(d: Diagnosis) -> Table:
                 percent(e.gap_closed),
                 between(*e.gap_closed_ci),
                 percent(e.predicted_gap_closed),
-                percent(e.probability),
-                "; ".join(candidate_title(r) for r in e.equivalent_to),
+                _rivals(e),
             ]
         )
     if not any(row[-1] for row in rows):
         header, rows = header[:-1], [row[:-1] for row in rows]
-    return header, rows, (0, 1, 6)
+    return header, rows, (0, 1, 5)
+
+
+def _rivals(e: FoundEffect) -> str:
+    """The effect's weight and then its rivals with theirs, where they have one; nothing where there is no rival."""
+    told = [percent(e.weight_among_rivals)] if finite(e.weight_among_rivals) else []
+    rivals = [(candidate_title(r), r.get("weight")) for r in e.equivalent_to]
+    return "; ".join([*told, *(f"{name} {percent(weight)}" if finite(weight) else name for name, weight in rivals)])
 
 
 def _parameters(d: Diagnosis) -> Table:

@@ -12,6 +12,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
 score = pytest.importorskip("diagnosis_score")
 import diagnosis_systems as systems  # noqa: E402
 import diagnosis_tables as tables  # noqa: E402
+import diagnosis_weights as weights  # noqa: E402
 
 ELBOW = {"name": "coulomb_friction", "where": "elbow", "parameters": {"level": 0.11}, "raw": 20.0, "left": 9.0}
 HIP = {"name": "actuator_gain", "where": "shoulder_motor", "parameters": {"gain": 1.2}, "raw": 20.0, "left": 9.0}
@@ -137,6 +138,28 @@ def test_everything_is_written_with_the_baselines_beside_it(tmp_path):
     page = (tmp_path / "out" / "score.html").read_text()
     assert "naive BIC: hidden against named" in page and "Plotly.newPlot" in page
     assert (tmp_path / "out" / "confusion.csv").read_text().splitlines()[0] == "hidden,coulomb_friction,no result"
+
+
+def test_weights_among_rivals_are_scored_as_probabilities(tmp_path):
+    """Said .8 and true, .2 and false, .8 and false, .2 and true: Brier (.04 + .04 + .64 + .64) / 4; half is true."""
+    rivals = [{"effects": ["stribeck_friction@elbow"], "weight": 0.2}, {"effects": ["load_friction@elbow"]}]
+    told = [
+        said(RIGHT, rivals=rivals),
+        said(("backlash", "elbow"), rivals=[rivals[0] | {"effects": ["@".join(RIGHT)]}]),
+    ]
+    for file in told:
+        file["effects"][0]["weight_among_rivals"] = 0.8
+    folders = [case(tmp_path / str(i), [ELBOW], file) for i, file in enumerate(told)]
+    folders.append(case(tmp_path / "alone", [ELBOW], said(RIGHT)))  # nothing to be weighed against
+    outcomes = [score.read(f) for f in folders]
+    found = weights.forecasts(outcomes)
+    assert sorted(found) == [(0.2, False), (0.2, True), (0.8, False), (0.8, True)]
+    assert weights.brier(found) == pytest.approx((0.34, 0.25))
+    _, _, rows = weights.table(outcomes)
+    assert [row[:3] for row in rows[:2]] == [["0.2 to 0.4", "2", "0.20"], ["0.8 to 1", "2", "0.80"]]
+    assert all(row[3].startswith("50 %") for row in rows[:2])
+    tables.score(folders, tmp_path / "out")
+    assert "Brier score 0.340; of the base rate 0.250" in (tmp_path / "out" / "score.md").read_text()
 
 
 def test_wilson_interval_of_nine_in_ten():

@@ -12,7 +12,7 @@ from .pendulums import FEW, nominal, recorded
 WRONG = (1.15, 0.88, 1.1)
 KEYS = {"schema", "verdict", "effects", "where", "gap", "parameters", "candidates", "warnings"}
 KEYS |= {"next_experiment", "versions"}
-EFFECT = {"name", "where", "parameters", "probability", "gap_closed", "gap_closed_ci", "equivalent_to"}
+EFFECT = {"name", "where", "parameters", "weight_among_rivals", "gap_closed", "gap_closed_ci", "equivalent_to"}
 GAP = {"noise_floor", "nominal", "calibrated", "with_effects", "reducible_floor", "unit", "by_channel"}
 
 
@@ -33,9 +33,12 @@ def test_dry_friction_is_named_with_its_level(rubbing):
     assert (effect.name, effect.where) == ("coulomb_friction", "hinge")
     level = effect.parameters["level"]
     assert level.mean == pytest.approx(0.04, rel=0.05) and level.unit == "N m" and 0 < level.sd < 0.01
-    assert effect.probability > 0.9 and effect.gap_closed > 0.8
+    assert effect.gap_closed > 0.8
     assert effect.gap_closed_ci[0] <= effect.gap_closed <= effect.gap_closed_ci[1] <= 1.0
     assert 0.5 < effect.predicted_gap_closed <= 1.0
+    weighed = [r["weight"] for r in effect.equivalent_to if "weight" in r]
+    expected = 1.0 - sum(weighed) if weighed else np.nan  # nothing to be weighed against is no certainty
+    np.testing.assert_allclose(effect.weight_among_rivals, expected, atol=1e-9)
     assert found.setup.fitter.simulator.traces == 1
 
 
@@ -89,11 +92,22 @@ def test_what_was_saved_is_what_is_loaded(rubbing, tmp_path):
     _, diagnosis = rubbing
     diagnosis.save(tmp_path / "a")
     again = result.load(tmp_path / "a")
-    assert again.to_dict() == diagnosis.to_dict()
+    assert again.to_dict() == diagnosis.to_dict() and "probability" not in again.to_dict()["effects"][0]
     assert again.effects[0].parameters["level"] == diagnosis.effects[0].parameters["level"]
     again.save(tmp_path / "b")
     for name in ("diagnosis.json", "details.json"):
         assert (tmp_path / "a" / name).read_text() == (tmp_path / "b" / name).read_text()
+
+
+def test_a_file_of_before_is_read_and_its_probability_told_as_a_weight(rubbing, tmp_path):
+    path = rubbing[1].save(tmp_path)
+    raw = json.loads(path.read_text())
+    rival = {"effects": ["stribeck_friction@hinge"], "gap_closed": 0.9, "why": ""}
+    for rivals, expected in (([rival], 0.7), ([], np.nan)):
+        (effect,) = raw["effects"]
+        effect = {k: v for k, v in effect.items() if k != "weight_among_rivals"} | {"equivalent_to": rivals}
+        path.write_text(json.dumps(raw | {"effects": [effect | {"probability": 0.7}]}))
+        np.testing.assert_equal(result.load(tmp_path).effects[0].weight_among_rivals, expected)
 
 
 def test_wrong_known_parameters_are_no_effect(tmp_path):

@@ -212,7 +212,7 @@ def full():
         LABELS[4].split("@")[0],
         "m_shoulder",
         {"delay": Estimate(0.0213, 0.0011, "s")},
-        0.99,
+        float("nan"),
         0.27,
         (0.21, 0.33),
         sentence="Commands reach the shoulder motor about one control step late.",
@@ -222,6 +222,7 @@ def full():
     rival = {
         "effects": ["stribeck_friction@elbow"],
         "gap_closed": 0.66,
+        "weight": 0.09,
         "why": "no log moves the elbow slower than 0.2 rad/s",
     }
     friction = FoundEffect(

@@ -45,6 +45,7 @@ def test_console_says_what_was_found_in_plain_lines(tmp_path):
     level = "0.0312 ± 0.0021 N m"
     for words in ("Missing effects found", "Coulomb friction at joint 'elbow'", level, "68 %", str(path)):
         assert words in text
+    assert "91 %; Stribeck friction · elbow 9.0 %" in text and "probability" not in text
     assert all(f"warning: {w}" in text for w in fake.full().warnings)
     assert "3 more candidates in diagnosis.json" in text
 

@@ -82,6 +82,7 @@ def test_every_effect_its_numbers_and_all_warnings_are_there(page):
         "68 %",
         "61 % – 74 %",
         "91 %",
+        "(closes 66 %, weight 9.0 %)",
         "no log moves the elbow slower than 0.2 rad/s",
     ):
         assert words in page.text
@@ -94,6 +95,10 @@ def test_every_effect_its_numbers_and_all_warnings_are_there(page):
         assert words in page.text
     for name, value in fake.full().versions.items():
         assert name in page.text and value in page.text
+
+
+def test_a_weight_among_rivals_is_told_only_where_there_are_rivals(page):
+    assert page.text.count("weight among rivals") == 1 and "probability" not in page.text.lower()
 
 
 def test_hostile_names_stay_text(page):
