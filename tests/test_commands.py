@@ -312,7 +312,7 @@ def test_play_prints_returns_of_latest_best_run_and_path(toy: None, capsys: pyte
     for which in ("latest", "best", str(run.path), str(run.checkpoint(2))):
         capsys.readouterr()
         assert play.main(["--task", "Pendulum", "--checkpoint", which, "--episodes", "3"]) == 0
-        rows = {line.split()[0]: line.split()[1:] for line in capsys.readouterr().out.splitlines()}
+        rows = {line.split()[0]: line.split()[1:] for line in capsys.readouterr().out.splitlines() if line}
         assert {"nominal", "prior", "real"} <= set(rows) and float(rows["nominal"][0]) < 0
     assert "have nominal, prior, real" in error_of(
         capsys, play.main, "--checkpoint", str(run.path), "--physics=posterior"

@@ -157,10 +157,10 @@ def levels(density: np.ndarray, masses: Sequence[float]) -> list[float]:
 
 
 def _bandwidth(values: np.ndarray, d: int) -> float:
-    """Scott's rule, n^(-1/(d+4)), with a spread that ignores far modes."""
+    """Scott's rule, n^(-1/(d+4)), with a spread that ignores far modes; contours of a plane want a quarter more."""
     quartiles = np.percentile(values, [25, 75])
     spread = min(float(values.std()), float(quartiles[1] - quartiles[0]) / 1.34 or float(values.std()))
-    return spread * len(values) ** (-1.0 / (d + 4))
+    return (1.25 if d > 1 else 1.0) * spread * len(values) ** (-1.0 / (d + 4))
 
 
 def _correlation(x: np.ndarray, y: np.ndarray) -> float:
@@ -194,20 +194,27 @@ def shorten(names: Sequence[str], width: int, lines: int = 1) -> list[str]:
 
 
 def _fold(name: str, width: int, lines: int, number: str = "") -> str:
-    for keep in range(min(len(name), width * lines - len(number)), 1, -1):  # breaking wastes room at the line ends
+    """The longest form that fits; one that breaks no word, where it keeps half as much at least."""
+    most = min(len(name), width * lines - len(number))
+    whole, broken = "", ""
+    for keep in range(most, 1, -1):  # breaking wastes room at the line ends
         text = name if keep >= len(name) else name[: keep // 2] + "…" + name[len(name) - (keep - keep // 2 - 1) :]
-        rows = _rows(number + text, width)
+        rows, clean = _rows(number + text, width)
         if len(rows) <= lines:
-            return "\n".join(rows)
-    return (number + name)[:width]
+            broken = broken or "\n".join(rows)
+            if clean:
+                whole = "\n".join(rows)
+                break
+    return whole if 2 * len(whole) >= len(broken) > 0 else broken or (number + name)[:width]
 
 
-def _rows(text: str, width: int) -> list[str]:
-    """Greedy lines of at most `width` characters; breaks behind a separator where there is one."""
-    rows = []
+def _rows(text: str, width: int) -> tuple[list[str], bool]:
+    """Greedy lines of at most `width` characters, broken behind a separator where there is one; whether all were."""
+    rows, clean = [], True
     while len(text) > width:
-        cut = max((text.rfind(c, 0, width) for c in "_. "), default=-1) + 1
-        cut = cut if cut > width // 3 else width
+        cut = max((text.rfind(c, 0, width) for c in "_. …"), default=-1) + 1
+        clean &= cut > 0
+        cut = cut if cut > 0 else width
         rows.append(text[:cut])
         text = text[cut:]
-    return [*rows, text] if text else rows
+    return [*rows, text] if text else rows, clean

@@ -6,8 +6,11 @@ import numpy as np
 
 from bayessim_mjx.monitor.draws import Draws, correlations, density, density2, levels, shorten
 from bayessim_mjx.monitor.style import BLUE, DASHED, GREEN, GREY, NAVY, RED, YELLOW, blues, size_of
+from bayessim_mjx.quantities import estimate, fixed
 
 Limits = tuple[float, float]
+NARROWEST = 1e-4  # of the prior range: no axis is narrower, as its ticks would have too many digits
+NEAR = 0.05  # of the prior range: an axis that ends so close to it goes on to it
 
 
 def triangle(figure: Any, draws: Draws, true: np.ndarray | None, top: float = 0.75) -> None:
@@ -28,23 +31,27 @@ def triangle(figure: Any, draws: Draws, true: np.ndarray | None, top: float = 0.
                 continue
             if column == row:
                 marginal(axes, draws, row, true, limits[row])
-                axes.set_title(estimate(draws, row), fontsize=size, pad=3)
+                axes.set_title(mean_and_sd(draws, row), fontsize=size, pad=3)
             else:
                 joint(axes, draws, (column, row), true, (*limits[column], *limits[row]))
             axes.tick_params(labelsize=size - 0.5, length=2, pad=1.5)
             axes.tick_params(labelbottom=row == d - 1, labelleft=column == 0 and row > 0)
-            _few_ticks(axes, draws, (column, row), cell)
-    _name_edges(grid, draws, cell, size)
+            few_ticks(axes, draws, (column, row), cell)
+    _name_edges(grid, draws, cell, size, [zoomed(draws, k, limits[k]) for k in range(d)])
 
 
-def _name_edges(grid: Any, draws: Draws, cell: tuple[float, float], size: float) -> None:
-    """Parameter names along the left and the bottom, in as many characters as a cell has room for."""
+def _name_edges(grid: Any, draws: Draws, cell: tuple[float, float], size: float, part: list[bool]) -> None:
+    """Names along the left and the bottom, in as many characters as a cell has room for.
+
+    Below an axis that shows a `part` of the prior range only, the range stands in full.
+    """
     d = draws.d
     per_inch = 72 / (size * 0.64)
     room = [max(8, int(side * 0.97 * per_inch)) for side in cell]
     for k in range(d):
         below = grid[d - 1, k]
-        below.set_xlabel(label(draws, k, room[0] if d > 1 else 60, 3), fontsize=size)
+        name = label(draws, k, room[0] if d > 1 else 60, 3)
+        below.set_xlabel(name + (f"\nprior {prior_range(draws, k)}" if part[k] else ""), fontsize=size)
         below.xaxis.set_label_coords(0.5, -(0.22 if d > 1 else 0.28) / cell[1])
         if k > 0:
             grid[k, 0].set_ylabel(label(draws, k, room[1], 3), fontsize=size)
@@ -75,10 +82,12 @@ def joint(axes: Any, draws: Draws, ij: tuple[int, int], true: np.ndarray | None,
     `star` is BayesSimIG's look: smooth, a yellow star at the truth, a + at each component's mean.
     """
     i, j = ij
-    x, y, height = density2(draws.values[:, i], draws.values[:, j], box, 120 if star else 64)
+    x, y, height = density2(draws.values[:, i], draws.values[:, j], box, 100)
     flat = 1.0 / height.size
-    shading = "gouraud" if star else "nearest"
-    axes.pcolormesh(x, y, height, cmap=blues(), vmin=0, vmax=max(height.max(), 2.5 * flat), shading=shading)
+    top = max(height.max(), 2.5 * flat)
+    axes.imshow(
+        height, extent=box, origin="lower", aspect="auto", interpolation="bicubic", cmap=blues(), vmin=0, vmax=top
+    )
     if height.max() > 1.8 * flat:  # contours of a flat density would only draw its noise
         lines = levels(height, (0.9, 0.5))
         axes.contour(x, y, height, levels=lines, colors=BLUE, linewidths=[0.8, 1.3][-len(lines) :])
@@ -104,7 +113,7 @@ def intervals(axes: Any, draws: Draws, true: np.ndarray | None, room: int = 46) 
         axes.plot(unit[[0, 4], k], [place, place], color=BLUE, lw=1.4, alpha=0.55, solid_capstyle="butt")
         axes.plot(unit[[1, 3], k], [place, place], color=BLUE, lw=5.0, solid_capstyle="butt")
         axes.plot(unit[2, k], place, "|", color="white", ms=6, mew=1.4)
-        axes.text(1.03, place, f"{gain[k] + 0.0:.2f}".replace("-0.00", "0.00"), va="center", fontsize=7, color=GREY)
+        axes.text(1.03, place, fixed(gain[k], 2), va="center", fontsize=7, color=GREY)
     if true is not None:
         at = (true - draws.low) / (draws.high - draws.low)
         axes.plot(np.clip(at[order], 0, 1), np.arange(draws.d), "d", color=RED, ms=4.5, clip_on=False, zorder=5)
@@ -144,21 +153,33 @@ def best_first(draws: Draws) -> np.ndarray:
 
 
 def limits_of(draws: Draws, k: int, true: np.ndarray | None) -> Limits:
-    """The prior range, so that what was learned is seen; zoomed in once the posterior is under 12 % of it."""
+    """Where parameter k is drawn: the central 98 % of the posterior and half as much on either side, and the truth.
+
+    Never beyond the prior range, but for a truth outside of it. A posterior as wide as the prior is drawn over all of
+    it; every narrower one fills the same part of its axis, so that no parameter is squeezed.
+    """
     low, high = float(draws.low[k]), float(draws.high[k])
-    inner = [float(v) for v in np.percentile(draws.values[:, k], [0.2, 99.8])]
-    inner += [] if true is None else [float(true[k])]
-    wide = max(max(inner) - min(inner), 1e-4 * (high - low))
-    if wide < 0.12 * (high - low):
-        return max(min(low, *inner), min(inner) - 0.6 * wide), min(max(high, *inner), max(inner) + 0.6 * wide)
-    return min(low, *inner), max(high, *inner)
+    inner = [float(v) for v in np.percentile(draws.values[:, k], [1.0, 99.0])]
+    margin = 0.5 * max(inner[1] - inner[0], NARROWEST * (high - low))
+    left, right = max(inner[0] - margin, min(low, inner[0])), min(inner[1] + margin, max(high, inner[1]))
+    if true is not None:
+        gap = 0.05 * (right - left)  # the line is not to lie on the frame
+        left = min(left, max(true[k] - gap, min(low, true[k])))
+        right = max(right, min(true[k] + gap, max(high, true[k])))
+    whole = high - low
+    return (low if 0 < left - low < NEAR * whole else left), (high if 0 < high - right < NEAR * whole else right)
+
+
+def zoomed(draws: Draws, k: int, limits: Limits) -> bool:
+    """Whether a part of the prior range lies outside."""
+    return limits[0] > draws.low[k] or limits[1] < draws.high[k]
 
 
 def label(draws: Draws, k: int, width: int, lines: int, ranges: bool = False) -> str:
     """Name and unit of parameter k (and its range) in `lines` lines of `width` characters."""
     tail = f" [{draws.units[k]}]" if draws.units[k] else ""
     if ranges:
-        tail += f"   {natural(draws, k, draws.low[k]):.3g}–{natural(draws, k, draws.high[k]):.3g}"
+        tail += f"   {prior_range(draws, k)}"
     if lines == 1:
         return shorten(draws.names, max(width - len(tail), 8))[k] + tail
     name = shorten(draws.names, width, lines - bool(tail))[k]
@@ -166,9 +187,13 @@ def label(draws: Draws, k: int, width: int, lines: int, ranges: bool = False) ->
     return name + ("\n" + tail.strip() if apart else tail)
 
 
-def estimate(draws: Draws, k: int) -> str:
+def prior_range(draws: Draws, k: int) -> str:
+    return f"{natural(draws, k, draws.low[k]):.3g} to {natural(draws, k, draws.high[k]):.3g}"
+
+
+def mean_and_sd(draws: Draws, k: int) -> str:
     values = natural(draws, k, draws.values[:, k])
-    return f"{values.mean():.3g} ± {values.std():.2g}"
+    return estimate(values.mean(), values.std())
 
 
 def natural(draws: Draws, k: int, value: Any) -> Any:
@@ -183,7 +208,8 @@ def _numbers(axis: Any, log: bool) -> None:
         axis.set_major_formatter(FuncFormatter(lambda v, _: f"{10.0**v:.2g}"))
 
 
-def _few_ticks(axes: Any, draws: Draws, place: tuple[int, int], cell: tuple[float, float]) -> None:
+def few_ticks(axes: Any, draws: Draws, place: tuple[int, int], cell: tuple[float, float]) -> None:
+    """As many ticks as a cell of these inches has room for; `place`: the parameters across and up."""
     from matplotlib.ticker import MaxNLocator
 
     most = [6 if side > 3 else 4 if side > 2 else 3 if side > 1.0 else 2 for side in cell]

@@ -9,17 +9,21 @@ from bayessim_mjx.monitor.draws import Draws, correlations, draws_of, shorten
 from bayessim_mjx.monitor.panels import (
     best_first,
     correlation,
-    estimate,
+    few_ticks,
     intervals,
     joint,
     label,
     limits_of,
     marginal,
+    mean_and_sd,
     natural,
+    prior_range,
     triangle,
+    zoomed,
 )
 from bayessim_mjx.monitor.predictive import predictive
 from bayessim_mjx.monitor.style import handles, head, heading, new_figure, size_of
+from bayessim_mjx.quantities import fixed
 
 __all__ = ["corner", "forest", "pair", "predictive"]
 
@@ -132,12 +136,15 @@ def pair(
     figure = new_figure(8.0, 7.2, layout="constrained")
     grid = figure.subplots(2, 2)
     limits = [limits_of(draws, k, true) for k in range(2)]
+    part = [f"   (prior {prior_range(draws, k)})" if zoomed(draws, k, limits[k]) else "" for k in range(2)]
     labels = [label(draws, k, 40, 2) for k in range(2)]
     for axes, k in ((grid[0, 0], 0), (grid[1, 1], 1)):
         marginal(axes, draws, k, true, limits[k])
-        axes.set(xlabel=labels[k], ylabel="density")
+        axes.set(xlabel=labels[k] + part[k], ylabel="density")
     joint(grid[1, 0], draws, (0, 1), true, (*limits[0], *limits[1]), star=True)
     grid[1, 0].set(xlabel=labels[0], ylabel=labels[1])
+    for axes, place in ((grid[0, 0], (0, 0)), (grid[1, 1], (1, 1)), (grid[1, 0], (0, 1))):
+        few_ticks(axes, draws, place, (3.2, 2.8))
     grid[0, 1].axis("off")
     grid[0, 1].text(0.0, 1.0, _facts(draws, true, log_gain), va="top", fontsize=9, linespacing=1.4)
     known = ["truth", "star"] if true is not None else []
@@ -152,10 +159,10 @@ def _facts(draws: Draws, true: np.ndarray | None, log_gain: float | None) -> str
     lines = []
     for k, gain in enumerate(draws.contraction()):
         unit = f" {draws.units[k]}" if draws.units[k] else ""
-        lines += [shorten(draws.names, 44)[k], f"    mean ± sd   {estimate(draws, k)}{unit}"]
+        lines += [shorten(draws.names, 44)[k], f"    mean ± sd   {mean_and_sd(draws, k)}{unit}"]
         lines += [f"    truth   {natural(draws, k, true[k]):.4g}{unit}"] if true is not None else []
-        lines += [f"    contraction   {gain:.2f}", ""]
-    lines += [f"correlation   {correlations(draws.values)[0, 1]:+.2f}"]
+        lines += [f"    contraction   {fixed(gain, 2)}", ""]
+    lines += [f"correlation   {fixed(correlations(draws.values)[0, 1], 2)}"]
     lines += [f"log gain at the truth   {log_gain:+.2f} nats"] if log_gain is not None else []
     return "\n".join(lines)
 

@@ -25,7 +25,8 @@ def predictive(
 
     Args:
         time: [T] seconds. real: {channel: [T] or [m, T]}. simulated: {channel: [n, T]}; NaN where an episode was over.
-        units: {channel: unit}. before: {channel: [n, T]} the same under the prior, drawn as a pale band.
+        units: {channel: unit}; a channel `qpos:elbow` or `qvel:elbow` is called by its quantity and joint.
+        before: {channel: [n, T]} the same under the prior, drawn as a pale band.
         most: at most so many channels; those that simulation explains worst come first. lines: single simulations.
     Raises:
         ValueError: no channel in common, or a length that is not T.
@@ -45,9 +46,9 @@ def predictive(
     for k, (axes, name) in enumerate(zip(grid, shown, strict=False)):
         pale = None if before is None or name not in before else _rows(before[name], time, name)
         _channel(axes, time, *data[name], pale, lines)
-        axes.set_title(_title(name, *data[name]), fontsize=9, loc="left")
         unit = (units or {}).get(name, "")
-        axes.set_ylabel(f"[{unit}]" if unit else "", fontsize=8)
+        axes.set_title(_title(name, unit, *data[name]), fontsize=9, loc="left")
+        axes.set_ylabel(_axis(name, unit), fontsize=8)
         if k >= len(shown) - columns:
             axes.set_xlabel("time [s]", fontsize=8)
             axes.tick_params(labelbottom=True)
@@ -105,10 +106,27 @@ def _channel(axes: Any, time: np.ndarray, real: np.ndarray, simulated: np.ndarra
     axes.spines[["top", "right"]].set_visible(False)
 
 
-def _title(name: str, real: np.ndarray, simulated: np.ndarray) -> str:
+def quantity(channel: str, unit: str) -> tuple[str, str]:
+    """(what is measured, at which joint): `qvel:elbow` in rad/s -> ("angular velocity", "elbow"); "" if not known."""
+    stream, _, joint = channel.partition(":")
+    known = {"qpos": {"rad": "angle", "m": "position", "": "orientation"}, "qvel": {"rad/s": "angular velocity"}}
+    if not joint or stream not in known:
+        return "", channel
+    return known[stream].get(unit, "velocity" if stream == "qvel" else "position"), joint
+
+
+def _axis(channel: str, unit: str) -> str:
+    what, joint = quantity(channel, unit)
+    short = shorten([joint], 22)[0]
+    return f"{what} of\n{short}" * bool(what) + f" [{unit}]" * bool(unit)
+
+
+def _title(channel: str, unit: str, real: np.ndarray, simulated: np.ndarray) -> str:
+    what, joint = quantity(channel, unit)
+    name = f"{shorten([joint], 40)[0]}, {what}" if what else shorten([channel], 40)[0]
     low, high = _percentiles(simulated, [5, 95])
     known = np.isfinite(real) & np.isfinite(low)
     if not known.any():
-        return shorten([name], 40)[0]
+        return name
     inside = ((real >= low) & (real <= high))[known].mean()
-    return f"{shorten([name], 40)[0]}   ({100 * inside:.0f} % inside the 90 % band)"
+    return f"{name}   ({100 * inside:.0f} % inside the 90 % band)"

@@ -241,13 +241,18 @@ def channels(mj_model: Any, info: RoundInfo) -> tuple[dict[str, np.ndarray], dic
 
 
 def units(mj_model: Any) -> dict[str, str]:
-    """{channel: unit} of hinges and slides, named as in `channels`."""
+    """{channel: unit}, named as in `channels`; quaternions have none."""
     named = Channels.of(mj_model)
+    by_kind = {
+        "hinge": ("rad",), "slide": ("m",), "ball": ("", "", "", "", "rad/s", "rad/s", "rad/s"),
+        "free": ("m",) * 3 + ("",) * 4 + ("m/s",) * 3 + ("rad/s",) * 3,
+    }  # fmt: skip
     found: dict[str, str] = {}
     for joint, kind in zip(named.joints, named.kinds, strict=True):
-        if unit := {"hinge": "rad", "slide": "m"}.get(kind):
-            found |= {f"qpos:{joint}": unit, f"qvel:{joint}": f"{unit}/s"}
-    return found
+        own = [f"{stream}:{channel}" for stream in ("qpos", "qvel") for channel in named.of_joint(joint, stream)]
+        unit = by_kind[kind]
+        found |= dict(zip(own, unit if len(unit) > 1 else (unit[0], f"{unit[0]}/s"), strict=True))
+    return {channel: unit for channel, unit in found.items() if unit}
 
 
 def round_line(info: RoundInfo) -> dict[str, Any]:

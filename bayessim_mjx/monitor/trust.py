@@ -7,6 +7,7 @@ import numpy as np
 
 from bayessim_mjx.monitor.draws import shorten
 from bayessim_mjx.monitor.style import BLUE, GREEN, GREY, RED, heading, new_figure
+from bayessim_mjx.quantities import estimate
 
 MOST = 8  # parameters by name, those whose ranks are least uniform
 BAND = 1.36  # of sqrt(n) sup |F_n - F|: 95 % (Kolmogorov)
@@ -33,33 +34,41 @@ def _ecdf(values: np.ndarray, at: np.ndarray) -> np.ndarray:
 def _coverage(axes: Any, report: Any) -> None:
     at = np.linspace(0, 1, 101)
     band = 2 * np.sqrt(at * (1 - at) / report.pairs)
-    axes.fill_between(at, at - band, at + band, color=GREY, alpha=0.2, lw=0, label="calibrated, 2 standard errors")
+    axes.fill_between(at, at - band, at + band, color=GREY, alpha=0.2, lw=0, label="calibrated, ± 2 standard errors")
     axes.plot(at, _ecdf(report.ranks.level, at), color=BLUE, lw=2, label="densest regions (HPD)")
     axes.plot(at, _ecdf(report.ranks.tarp, at), color=GREEN, lw=1.5, ls="--", label="regions around a point (TARP)")
     for level, (share, error) in report.coverage.items():
-        axes.errorbar([level], [share], yerr=[2 * error], color="black", marker="o", ms=4, capsize=3)
-        near = {"textcoords": "offset points", "xytext": (8, -12), "fontsize": 8}
-        axes.annotate(f"{100 * share:.0f} of {100 * level:.0f} %", (level, share), **near)
-    axes.set(xlim=(0, 1), ylim=(0, 1), xlabel="mass of the region", ylabel="share of truths inside")
-    axes.set_title("coverage: below the band is over-confident, above is too wide", fontsize=9, loc="left")
+        axes.errorbar([level], [share], yerr=[2 * error], color="black", marker="o", ms=4, capsize=3, clip_on=False)
+    axes.set(xlim=(0, 1), ylim=(0, 1), xlabel="probability of the region", ylabel="share of true parameters inside")
+    axes.set_title("coverage: below the band the posterior is too narrow, above too wide", fontsize=9, loc="left")
     axes.legend(loc="upper left", frameon=False, fontsize=8)
+    rows = [f"{100 * a:.0f} %:  {estimate(100 * c, 100 * e, 1)} %" for a, (c, e) in report.coverage.items()]
+    told = "\n".join(["observed coverage", *rows])
+    axes.text(0.97, 0.03, told, ha="right", va="bottom", fontsize=8, linespacing=1.4, transform=axes.transAxes)
 
 
 def _ranks(axes: Any, report: Any) -> None:
     at, n = np.linspace(0, 1, 201), report.pairs
-    axes.axhspan(-BAND / np.sqrt(n), BAND / np.sqrt(n), color=GREY, alpha=0.2, lw=0, label="95 % of calibrated ones")
+    half, stays = BAND / np.sqrt(n), "95 % of calibrated posteriors stay inside"
+    axes.axhspan(-half, half, color=GREY, alpha=0.2, lw=0, label=stays)
     worst = np.argsort([report.p[name] for name in report.names])
     from matplotlib import colormaps
 
     colours = [RED, *colormaps["viridis"](np.linspace(0.1, 0.9, MOST - 1))]
     for k, i in enumerate(worst):
-        named = {"color": colours[k], "label": f"{shorten(report.names, 34)[i]} (p = {report.p[report.names[i]]:.2g})"}
-        style: dict[str, Any] = named if k < MOST else {"color": GREY, "alpha": 0.4}
+        style: dict[str, Any] = {"color": GREY, "alpha": 0.4}
+        if k < MOST:
+            name = f"{shorten(report.names, 34)[i]} (p = {report.p[report.names[i]]:.2g})"
+            style = {"color": colours[k], "label": name}
         axes.plot(at, _ecdf(report.ranks.parameters[:, i], at) - at, lw=1.4, **style)
     axes.axhline(0, color="black", lw=0.6)
-    axes.set(xlim=(0, 1), xlabel="rank of the truth among the draws", ylabel="excess share of truths below that rank")
-    axes.set_title("ranks: above 0 draws lie too high, S-shape too narrow (up first) or wide", fontsize=9, loc="left")
-    axes.legend(loc="best", frameon=False, fontsize=8)
+    axes.set(xlim=(0, 1), xlabel="rank of the true value among draws", ylabel="share below that rank, minus the rank")
+    shapes = (
+        "ranks: a hump is a posterior too high, a dip one too low;\nup then down is too narrow, down then up too wide"
+    )
+    axes.set_title(shapes, fontsize=9, loc="left")
     low, high = axes.get_ylim()
-    wide = max(-low, high, 2 * BAND / np.sqrt(n))
-    axes.set_ylim(-wide, wide)
+    wide = max(-low, high, 2 * half)
+    lines = min(len(worst), MOST) + 1
+    axes.set_ylim(-wide, wide * (1 + 0.11 * lines))  # room for the legend above the curves
+    axes.legend(loc="upper right", frameon=False, fontsize=8)
