@@ -140,8 +140,8 @@ def step(loop: Loop, state: LoopState) -> tuple[LoopState, RoundInfo]:
     if round_ + 1 < loop.settings.realIters:
         # new episodes under the new domain also where the policy goes on
         new = _new_policy(loop, round_ + 1, state.domain)
-        kept = dataclasses.replace(state.train, env_states=new.env_states, episodes=new.episodes)
-        state = dataclasses.replace(state, train=kept if loop.settings.ftuneRL else new)
+        kept = rl.ppo.in_worlds_of(state.train, new) if loop.settings.ftuneRL else new
+        state = dataclasses.replace(state, train=kept)
     return state, info
 
 

@@ -12,6 +12,9 @@ from bayessim_mjx.errors import UserError
 
 SignedPermutation = tuple[np.ndarray, np.ndarray]  # (perm, sign): the image of x is sign * x[..., perm]
 AXES = "xyz"
+POSES = 3  # random ones in which transmissions are compared
+PARALLEL = 0.99  # cosine between the mirror image of an actuator's moment and that of its partner
+UNEVEN = 0.1  # of the width of ctrlrange, by which partners may differ
 
 
 @dataclass(frozen=True)
@@ -19,7 +22,7 @@ class Mirror:
     """What a task says: {"hip_1": "-hip_4"} for a left hip that moves like the right one with the sign turned.
 
     A pair is named once, or both ways; what is not named is its own image. An observation that begins with the name of
-    a joint ("hip_1_velocity") follows its joint. Actions follow the joints that they drive.
+    a joint ("hip_1_velocity") follows its joint. Actions follow what their actuators do to the mirrored robot.
     """
 
     joints: Mapping[str, str] = field(default_factory=dict)
@@ -140,17 +143,115 @@ def _of_state(model: mujoco.MjModel, mirror: Mirror) -> tuple[SignedPermutation,
     return of(1), of(2)
 
 
+def _of_actuators(model: mujoco.MjModel, qpos: SignedPermutation, qvel: SignedPermutation) -> SignedPermutation:
+    """Each actuator's partner, which does to the mirrored robot what it does to the robot, and the sign between them.
+
+    Told by the moments in a few poses and their mirror images, so that gears, tendons and sites need no rules of their
+    own; of several that do, by the numbers of the actuators (a servo and a damper on one joint).
+
+    Raises:
+        UserError: naming an actuator without a partner.
+    """
+    cosine, names = _alikeness(model, qpos, qvel), [_actuator_name(model, i) for i in range(model.nu)]
+    perm, signs = np.full(model.nu, -1), np.ones(model.nu, np.float32)
+    for i in range(model.nu):
+        if perm[i] >= 0:
+            continue
+        able = [k for k in range(i, model.nu) if perm[k] < 0 and _of_one_kind(model, i, k, cosine[i, k])]
+        if not able:
+            raise UserError(
+                f"mirror: no actuator does to the mirrored robot what {names[i]!r} does to the robot (there are "
+                f"{', '.join(names)}); allowed: partners of one kind, with gears, gains and ctrlrange that are mirror "
+                "images"
+            )
+        k = min(able, key=lambda k, i=i: _difference(model, i, k, cosine[i, k]))
+        perm[i], perm[k] = k, i
+        signs[i] = signs[k] = _command_sign(model, i, k, cosine[i, k])
+    return perm, signs
+
+
+def _alikeness(model: mujoco.MjModel, qpos: SignedPermutation, qvel: SignedPermutation) -> np.ndarray:
+    """[nu, nu], cosine between the mirror image of what actuator i does and what k does to the mirrored robot."""
+    data, rng = mujoco.MjData(model), np.random.default_rng(0)
+    here, there = [], []
+    for _ in range(POSES):
+        pose = np.array(model.qpos0)
+        mujoco.mj_integratePos(model, pose, rng.uniform(-0.7, 0.7, model.nv), 1.0)
+        here.append(_moments(model, data, pose)[:, qvel[0]] * qvel[1])
+        there.append(_moments(model, data, qpos[1] * pose[qpos[0]]))
+    one, two = np.concatenate(here, axis=1), np.concatenate(there, axis=1)
+    size = np.linalg.norm(one, axis=1)[:, None] * np.linalg.norm(two, axis=1)
+    return np.divide(one @ two.T, size, out=np.ones_like(size), where=size > 0)
+
+
+def _moments(model: mujoco.MjModel, data: mujoco.MjData, pose: np.ndarray) -> np.ndarray:
+    """[nu, nv], the generalised force of one unit of each actuator's force."""
+    data.qpos[:] = pose
+    for stage in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_tendon, mujoco.mj_transmission):
+        stage(model, data)
+    moments = np.zeros((model.nu, model.nv))
+    if model.nu:
+        rows = data.moment_rownnz, data.moment_rowadr, data.moment_colind
+        mujoco.mju_sparse2dense(moments, data.actuator_moment, *rows)
+    return moments
+
+
+def _actuator_name(model: mujoco.MjModel, index: int) -> str:
+    return mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, index) or f"actuator{index}"
+
+
+def _of_one_kind(model: mujoco.MjModel, i: int, k: int, cosine: float) -> bool:
+    """Whether actuator k can be the partner of i: it pushes along the mirror image, by the same law and limits."""
+    kinds = (model.actuator_trntype, model.actuator_gaintype, model.actuator_biastype, model.actuator_dyntype)
+    linear = model.actuator_gaintype[i] <= int(mujoco.mjtGain.mjGAIN_AFFINE)
+    linear &= model.actuator_biastype[i] <= int(mujoco.mjtBias.mjBIAS_AFFINE)
+    return (
+        abs(cosine) > PARALLEL
+        and all(kind[i] == kind[k] for kind in kinds)
+        and (cosine > 0 or bool(linear))  # a muscle only pulls
+        and model.actuator_ctrllimited[i] == model.actuator_ctrllimited[k]
+        and _range_is_image(model, i, k, _command_sign(model, i, k, cosine))
+    )
+
+
+def _command_sign(model: mujoco.MjModel, i: int, k: int, cosine: float) -> float:
+    """-1 where the partner has to be commanded the other way: it pushes the other way, or its gain is the other way."""
+    gain = model.actuator_gainprm[i, 0] * model.actuator_gainprm[k, 0]
+    return -1.0 if (cosine < 0) != (gain < 0) else 1.0
+
+
+def _range_is_image(model: mujoco.MjModel, i: int, k: int, sign: float) -> bool:
+    """Whether k's ctrlrange is about the image of i's."""
+    own, other = np.sort(sign * model.actuator_ctrlrange[i]), model.actuator_ctrlrange[k]
+    return not model.actuator_ctrllimited[i] or bool(np.all(np.abs(other - own) <= UNEVEN * np.ptp(own)))
+
+
+def _difference(model: mujoco.MjModel, i: int, k: int, cosine: float) -> float:
+    """How far the numbers of actuator k are from those of i's image, relative ones added up."""
+    command, length = _command_sign(model, i, k, cosine), -1.0 if cosine < 0 else 1.0
+    # force = (g0 + g1 l + g2 l') u + b0 + b1 l + b2 l'; force and l change by `length`, u by `command`
+    gain, bias = np.ones(model.actuator_gainprm.shape[1]), np.ones(model.actuator_biasprm.shape[1])
+    gain[:3], bias[0] = (command * length, command, command), length
+    gear = np.linalg.norm(model.actuator_gear, axis=1)
+    pairs = (
+        (gain * model.actuator_gainprm[i], model.actuator_gainprm[k]),
+        (bias * model.actuator_biasprm[i], model.actuator_biasprm[k]),
+        (model.actuator_dynprm[i], model.actuator_dynprm[k]),
+        (gear[i : i + 1], gear[k : k + 1]),
+    )
+    return sum(float(np.linalg.norm(a - b) / (np.linalg.norm(a) + np.linalg.norm(b) + 1e-12)) for a, b in pairs)
+
+
 def resolve(mirror: Mirror, model: mujoco.MjModel, groups: Mapping[str, Sequence[str]]) -> MirrorMap:
     """The maps that `mirror` means for this model and the observations called `groups[group]`; UserError."""
     known = {name for names in groups.values() for name in names}
     for name, text in mirror.observations.items():
         if unknown := {name, image(text)[0]} - known:
             raise UserError(f"mirror of observations: there is no {unknown.pop()!r}; there are {', '.join(known)}")
-    driven = [_joint_name(model, joint) for joint in model.actuator_trnid[:, 0]]
     qpos, qvel = _of_state(model, mirror)
     return MirrorMap(
         observation={g: signed_permutation(names, _following(names, mirror), g) for g, names in groups.items()},
-        action=signed_permutation(driven, {k: v for k, v in mirror.joints.items() if k in driven}, "actuated joints"),
+        action=_of_actuators(model, qpos, qvel),
         qpos=qpos,
         qvel=qvel,
         task=tuple(mirror.task),

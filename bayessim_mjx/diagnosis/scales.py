@@ -86,9 +86,7 @@ def measure(model: mujoco.MjModel, logs: Sequence[Log]) -> Scales:
         effort[i] = max(needed, direct, 1e-9)
         if on_joint:
             force[model.jnt_dofadr[joint]] = max(force[model.jnt_dofadr[joint]], direct * abs(gear))
-    noise = np.sqrt(
-        np.mean([np.pad(log.sigma_qpos, (0, max(0, model.nv - model.nq)))[: model.nv] ** 2 for log in logs], axis=0)
-    )
+    noise = np.sqrt(np.mean([log.sigma_dofs**2 for log in logs], axis=0))
     return Scales(
         model=model,
         force=np.maximum(force, 1e-9),
@@ -126,14 +124,11 @@ def _large(parts: Sequence[Array]) -> Array:
 
 
 def _span(model: mujoco.MjModel, log: Log) -> Array:
-    """Range of motion per dof `[nv]`; of free and ball joints that of their coordinates, roughly."""
-    out = np.zeros(model.nv)
-    for j in range(model.njnt):
-        q, v = int(model.jnt_qposadr[j]), int(model.jnt_dofadr[j])
-        wide = {0: 6, 1: 3}.get(int(model.jnt_type[j]), 1)
-        own = np.ptp(log.qpos[:, q : q + wide], axis=0)
-        out[v : v + wide] = own
-    return out
+    """Range of motion per dof `[nv]`; orientations as rotation vectors from the first one."""
+    away = np.zeros((len(log), model.nv))
+    for row, qpos in zip(away, log.qpos, strict=True):
+        mujoco.mj_differentiatePos(model, row, 1.0, log.qpos[0], qpos)
+    return np.ptp(away, axis=0) if len(log) else np.zeros(model.nv)
 
 
 def _diagonal(model: mujoco.MjModel, data: mujoco.MjData) -> Array:

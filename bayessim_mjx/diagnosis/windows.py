@@ -255,19 +255,10 @@ def _enabled(even: Sequence[Log], starts: list[tuple[int, int]], length: int, mo
 
 def _noise(logs: Sequence[Log], model: mujoco.MjModel, use_qvel: bool) -> tuple[Array, Array, Array]:
     """(sigma_q [nv], sigma_v [nv], spread of the start [2 nv]), pooled over logs."""
-    sigma = np.sqrt(np.mean([log.sigma_qpos**2 for log in logs], axis=0))
-    dofs: list[float] = []
-    for j in range(model.njnt):
-        q, kind = int(model.jnt_qposadr[j]), int(model.jnt_type[j])
-        if kind == int(mujoco.mjtJoint.mjJNT_FREE):
-            dofs += [*sigma[q : q + 3], *([2 * float(sigma[q + 3 : q + 7].mean())] * 3)]
-        elif kind == int(mujoco.mjtJoint.mjJNT_BALL):
-            dofs += [2 * float(sigma[q : q + 4].mean())] * 3
-        else:
-            dofs.append(float(sigma[q]))
+    dofs = np.sqrt(np.mean([log.sigma_dofs**2 for log in logs], axis=0))
     motion = np.sqrt(np.mean([np.mean(log.qvel**2, axis=0) for log in logs], axis=0))
     travel = np.maximum(motion * 0.05, 1e-9)
-    sigma_q = np.maximum(np.asarray(dofs), 1e-5 * travel)  # data without noise: the simulator's own precision
+    sigma_q = np.maximum(dofs, 1e-5 * travel)  # data without noise: the simulator's own precision
     rate = np.sqrt(np.mean([log.sigma_qvel**2 for log in logs], axis=0))
     sigma_v = np.maximum(rate, 1e-3 * motion) if use_qvel else np.full(model.nv, np.inf)
     start_v = np.maximum(3 * rate, 0.1 * motion + 10 * sigma_q)

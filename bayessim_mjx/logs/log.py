@@ -139,6 +139,17 @@ class Log:
         return float(np.median(np.diff(self.time)))
 
     @property
+    def sigma_dofs(self) -> Array:
+        """[nv]: noise of the positions per degree of freedom; of an orientation, twice that of its quaternion, rad."""
+        out: list[float] = []
+        for joint, kind in zip(self.joints, self.channels.kinds, strict=True):
+            own = self.sigma_qpos[self.channels.columns(joint)]
+            moved = own[: {"free": 3, "ball": 0}.get(kind, 1)]
+            turned = [2.0 * float(np.sqrt(np.mean(own[-4:] ** 2)))] * 3 if kind in ("free", "ball") else []
+            out += [*map(float, moved), *turned]
+        return np.array(out)
+
+    @property
     def condition(self) -> str | None:
         """Label of the operating condition it was recorded under, where its metadata has one."""
         label = self.metadata.get("operating_condition", self.metadata.get("condition"))

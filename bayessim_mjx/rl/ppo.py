@@ -102,6 +102,15 @@ def policy_of(state: TrainState) -> Policy:
     return sharding.at_home(policy)
 
 
+def in_worlds_of(state: TrainState, other: TrainState) -> TrainState:
+    """The learner of `state` in the worlds of `other`, with the sums that run over these worlds."""
+    novel = state.rnd
+    if novel is not None:
+        assert other.rnd is not None
+        novel = novel.replace(discounted=other.rnd.discounted, episodes=other.rnd.episodes)
+    return dataclasses.replace(state, env_states=other.env_states, episodes=other.episodes, rnd=novel)
+
+
 def _reset(env: Env, key: jax.Array, domain: Distribution | None, worlds: int, mesh: Mesh | None = None) -> State:
     """Fresh episodes in `worlds` worlds with theta from the domain (None: nominal)."""
     theta_key, reset_key = jax.random.split(key)

@@ -53,13 +53,22 @@ def test_surrogate_is_clipped_only_where_that_is_pessimistic(ratio, advantage, e
     assert losses.surrogate_loss(new, old, jnp.array([float(advantage)]), 0.2) == pytest.approx(expected, rel=1e-5)
 
 
-def test_samples_that_were_all_but_impossible_leave_the_loss_finite_and_have_no_gradient():
-    """Mirrored copies of an asymmetric policy: exp(200) is infinite in float32, and so is the loss of a bad sample."""
-    old, advantage = jnp.array([-200.0, -3.0]), jnp.array([-1.0, -1.0])
-    new = jnp.array([0.0, -2.9])
-    value, slope = jax.value_and_grad(lambda new: losses.surrogate_loss(new, old, advantage, 0.2))(new)
-    assert value == pytest.approx((math.exp(3) + math.exp(0.1)) / 2, rel=1e-5)
-    np.testing.assert_allclose(slope, [0.0, math.exp(0.1) / 2], rtol=1e-5)
+def test_what_is_worse_than_expected_keeps_its_gradient_however_likely_it_became():
+    """min(A r, A clip(r)) with A < 0 is A r: slope -A r up to e^3, -A e^3 from there on; with A > 0 it is clipped."""
+    old = jnp.array([-3.0, -3.0, -5.9, -6.1, -200.0, -200.0, -0.0])
+    new, advantage = jnp.array([-2.9, -2.9, -3.0, -3.0, 0.0, 0.0, -200.0]), jnp.array([-1.0, 1, -1, -1, -1, 1, 1])
+
+    def each(new, old, advantage):
+        return jax.value_and_grad(losses.surrogate_loss)(new, old, advantage, 0.2)
+
+    value, slope = jax.vmap(each)(new[:, None], old[:, None], advantage[:, None])
+    edge = math.exp(3)
+    np.testing.assert_allclose(
+        value, [math.exp(0.1), -math.exp(0.1), math.exp(2.9), edge * 1.1, edge * 198, -1.2, 0], rtol=1e-5, atol=1e-30
+    )
+    np.testing.assert_allclose(
+        slope[:, 0], [math.exp(0.1), -math.exp(0.1), math.exp(2.9), edge, edge, 0, 0], rtol=1e-5, atol=1e-30
+    )
 
 
 @pytest.mark.parametrize(
