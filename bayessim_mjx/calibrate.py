@@ -15,6 +15,7 @@ from bayessim_mjx.config import Config
 from bayessim_mjx.device import setup_jax
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.quantities import estimate
+from bayessim_mjx.settings import COUNT, SEEDS
 
 FOLDER = "calibration"
 ADVICE = {
@@ -34,10 +35,13 @@ def _parser() -> cli.PlainParser:
     )
     parser.add_argument("--run", metavar="RUN", required=True, help="folder of the run")
     parser.add_argument("--checkpoint", default="latest", help="latest, best or a step")
-    parser.add_argument("--pairs", type=int, default=1000, help="fresh simulated trajectories (1000)")
-    parser.add_argument("--seed", type=int, default=0, help="of the fresh simulations")
+    parser.add_argument(
+        "--pairs", type=cli.whole(-COUNT, COUNT), default=1000, help="fresh simulated trajectories (1000)"
+    )
+    parser.add_argument("--seed", type=cli.whole(0, SEEDS), default=0, help="of the fresh simulations")
     parser.add_argument("--device", help="auto, cpu, gpu")
     parser.add_argument("--cache_dir", help="compilation cache; off: none")
+    parser.trusting()
     return parser
 
 

@@ -5,6 +5,7 @@ import contextlib
 import dataclasses
 import os
 import random
+import re
 import shutil
 import signal
 import sys
@@ -15,6 +16,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
+from bayessim_mjx import trust
 from bayessim_mjx.config import Config, load, replace, unknown
 from bayessim_mjx.errors import UserError
 
@@ -22,14 +24,31 @@ if TYPE_CHECKING:
     from bayessim_mjx.runs import Run
 
 DEBUG_VARIABLE = "BAYESSIM_MJX_DEBUG"  # set: errors come with a traceback
+
+
+def whole(low: int, high: int) -> Callable[[str], int]:
+    """The type of a flag that takes a whole number from `low` to `high`, in the digits 0 to 9."""
+
+    def number(text: str) -> int:
+        if not re.fullmatch("[+-]?[0-9]{1,25}", text):
+            raise argparse.ArgumentTypeError(f"invalid int value: {text[:60]!r}")
+        if not low <= int(text) <= high:
+            raise argparse.ArgumentTypeError(f"{text}: must be from {low} to {high}")
+        return int(text)
+
+    return number
+
+
+integer = whole(-(10**25), 10**25)  # where the settings know the limits
+
 # flag -> (dotted key, type, help); None as type: a switch
 FLAGS: dict[str, tuple[str, Any, str]] = {
-    "--num_envs": ("env.numEnvs", int, "worlds in parallel"),
-    "--seed": ("seed", int, "seed of everything random; -1: a random one"),
-    "--max_iterations": ("ppo.max_iterations", int, "PPO iterations (per round of the outer loop)"),
+    "--num_envs": ("env.numEnvs", integer, "worlds in parallel"),
+    "--seed": ("seed", integer, "seed of everything random; -1: a random one"),
+    "--max_iterations": ("ppo.max_iterations", integer, "PPO iterations (per round of the outer loop)"),
     "--video": ("monitor.video", None, "record videos"),
-    "--video_length": ("monitor.video_length", int, "control steps per video"),
-    "--video_interval": ("monitor.video_interval", int, "control steps of each world between videos"),
+    "--video_length": ("monitor.video_length", integer, "control steps per video"),
+    "--video_interval": ("monitor.video_interval", integer, "control steps of each world between videos"),
     "--logdir": ("logdir", str, "root of the run folders (logs)"),
     "--name": ("name", str, "last part of the run folder's name"),
     "--device": ("device", str, "auto, cpu, gpu, gpu:1, cuda:0"),
@@ -38,28 +57,54 @@ FLAGS: dict[str, tuple[str, Any, str]] = {
 }
 RESUMABLE = (
     "--device", "--devices", "--cache_dir", "--video", "--video_length", "--video_interval", "--headless", "--resume",
+    trust.FLAG,
 )  # fmt: skip
 
 
 class PlainParser(argparse.ArgumentParser):
     """Flags; what is wrong with them is a UserError."""
 
+    def trusting(self) -> None:
+        """Add the flag that lets code run which settings name."""
+        text = "Python file whose effects settings may name (path.py:Class), again for each; see docs/trust.md"
+        self.add_argument(trust.FLAG, metavar="FILE", action=Allow, default=[], help=text)
+
     def error(self, message: str) -> NoReturn:
         raise UserError(message.removeprefix("argument "))
+
+
+class Allow(argparse.Action):
+    """Takes a file of code and allows it."""
+
+    def __call__(self, parser: Any, namespace: Any, value: Any, option: str | None = None) -> None:
+        if not Path(value).is_file():
+            raise UserError(f"{option} {value}: no such file; give the Python file that is to run")
+        trust.allow([value])
+        setattr(namespace, self.dest, [*getattr(namespace, self.dest), value])
 
 
 class Parser(PlainParser):
     """Flags of one command and `section.key=value` overrides; all that is wrong is a UserError."""
 
-    def __init__(self, prog: str, description: str, resume: bool = False, without: Sequence[str] = ()):
+    def __init__(
+        self,
+        prog: str,
+        description: str,
+        resume: bool = False,
+        without: Sequence[str] = (),
+        unused: Sequence[str] = (),
+        but: Sequence[str] = (),
+    ):
+        """`without`: flags, and `unused`: sections of settings (`but` these keys), that the command does not take."""
         super().__init__(prog=f"python -m bayessim_mjx.{prog}", description=description, allow_abbrev=False)
-        self.command, self.without = prog, without
+        self.command, self.without, self.unused, self.but = prog, without, unused, but
         self.add_argument("--task", help="name of the task (--list_tasks)")
         for flag, (_, kind, text) in FLAGS.items():
             if flag in without:
                 continue
             options: dict[str, Any] = {"action": "store_true"} if kind is None else {"type": kind}
             self.add_argument(flag, default=None, help=text, **options)
+        self.trusting()
         self.add_argument("--cfg_env", metavar="FILE", help="YAML with any sections, over cfg/<task>.yaml")
         self.add_argument("--cfg_train", metavar="FILE", help="YAML of PPO settings")
         self.add_argument("--checkpoint", metavar="PATH|latest|best", help="policy to start from, or to play")
@@ -82,12 +127,17 @@ class Parser(PlainParser):
             if "=" not in text:
                 raise UserError(f"{text!r} is neither a flag nor an override section.key=value")
         args.overrides = rest
+        args.idle = [key for key in (text.split("=")[0] for text in rest) if self._has_no_use_for(key)]
+        args.command = self.command
         args.given = [a.split("=")[0] for a in argv if a.startswith("--")]
         if args.use_last_checkpoint:
             if args.checkpoint not in (None, "latest"):
                 raise UserError(f"--use_last_checkpoint and --checkpoint {args.checkpoint}: give one of them")
             args.checkpoint = "latest"
         return args
+
+    def _has_no_use_for(self, key: str) -> bool:
+        return key.split(".")[0] in self.unused and key not in self.but
 
 
 def config_of(args: argparse.Namespace, more: Mapping[str, tuple[str, Any]] | None = None) -> Config:
@@ -101,6 +151,8 @@ def config_of(args: argparse.Namespace, more: Mapping[str, tuple[str, Any]] | No
     task = args.task and task_name(args.task)
     settings = load(task, cfg_env=args.cfg_env, cfg_train=args.cfg_train, flags=flags, overrides=args.overrides)
     task_name(settings.task)
+    if args.idle:
+        raise UserError(f"{args.idle[0]}: {args.command} has no use for it")
     return settings
 
 

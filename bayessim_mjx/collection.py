@@ -27,6 +27,7 @@ from bayessim_mjx.logs import Channels, Log, noise, read_logs, segments
 from bayessim_mjx.parameters import ParameterSpace
 from bayessim_mjx.rl import Policy
 from bayessim_mjx.rollout import Trajectory, replay, rollout
+from bayessim_mjx.settings import number as finite
 
 ESTIMATED_SPEED = 3.0  # error of a velocity estimated from positions, in its noise part: it lags at transients
 RANDOM_SHARE = 0.1  # policy_rl_randomized: share of the steps with a uniformly random action (BayesSimIG)
@@ -350,13 +351,10 @@ def _rows_of(space: ParameterSpace) -> str:
 
 
 def _number(key: str, value: Any) -> float:
-    try:  # YAML reads 1e-3 as text
-        number = float("" if isinstance(value, bool) else value)
-    except (TypeError, ValueError):
-        number = np.nan
-    if not np.isfinite(number):
+    found = finite(value)
+    if found is None:
         raise UserError(f"env.realParams.{key} = {value!r}: expected a number")
-    return number
+    return found
 
 
 def _row(key: str, row: Any, space: ParameterSpace, rest: np.ndarray) -> np.ndarray:

@@ -15,6 +15,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from bayessim_mjx import trust
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.settings import (
     YAML_NAMES,
@@ -34,6 +35,7 @@ from bayessim_mjx.settings import (
     freeze,
     thaw,
 )
+from bayessim_mjx.yaml_text import DEPTH, read_value, read_yaml, to_yaml
 
 __all__ = [
     "BayesSimConfig", "Config", "EnvConfig", "Frozen", "MonitorConfig", "PPOConfig", "RNDConfig", "RealConfig",
@@ -113,27 +115,6 @@ def replace(config: Config, **sections: Any) -> Config:
     return dataclasses.replace(config, **changed)
 
 
-def read_yaml(path: str | Path) -> dict[str, Any]:
-    """A YAML file as nested dicts; every way it can be broken is one UserError with file and line."""
-    import yaml
-    from omegaconf import OmegaConf
-    from omegaconf.errors import OmegaConfBaseException
-
-    try:
-        raw = OmegaConf.to_container(OmegaConf.load(path), resolve=True)
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        line = f", line {mark.line + 1}" if mark else ""
-        raise UserError(f"{path}{line}: not valid YAML: {getattr(error, 'problem', None) or error}") from None
-    except (OmegaConfBaseException, UnicodeDecodeError) as error:
-        raise UserError(f"{path}: not valid YAML: {str(error).splitlines()[0]}") from None
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read: {error.strerror or error}") from None
-    if not isinstance(raw, dict):
-        raise UserError(f"{path}: expected sections of `key: value` lines, found a {type(raw).__name__}")
-    return typing.cast(dict[str, Any], raw)
-
-
 def read_effects(path: str | Path) -> dict[str, Any]:
     """`effects` and `calibrated` of an effects.yaml (see `effects/storage.py`), not looked into."""
     raw = read_yaml(path)
@@ -145,13 +126,6 @@ def read_effects(path: str | Path) -> dict[str, Any]:
             f"{path}: schema = {raw.get('schema')!r}: expected schema: {EFFECTS_SCHEMA}, as a diagnosis writes"
         )
     return {key: raw.get(key) or [] for key in EFFECTS_KEYS[1:]}
-
-
-def to_yaml(plain: Mapping[str, Any]) -> str:
-    """YAML text that `read_yaml` reads back exactly."""
-    from omegaconf import OmegaConf
-
-    return OmegaConf.to_yaml(OmegaConf.create(dict(plain)))
 
 
 def unknown(what: str, given: str, allowed: Iterable[str]) -> UserError:
@@ -182,24 +156,18 @@ def _nested(key: str, value: Any) -> dict[str, Any]:
 
 def _override(text: str) -> Layer:
     """`a.b=[1, 2]` as a layer; the value is YAML."""
-    import yaml
-    from omegaconf import OmegaConf
-    from omegaconf.errors import OmegaConfBaseException
-
-    key, equals, _ = text.partition("=")
-    if not equals or not re.fullmatch(r"\w[\w.:-]*", key):
-        raise UserError(f"override {text!r}: expected section.key=value, e.g. bayessim.components=5")
-    try:
-        value = OmegaConf.to_container(OmegaConf.from_dotlist(["value=" + text[len(key) + 1 :]]))
-    except (yaml.YAMLError, OmegaConfBaseException) as error:
-        raise UserError(f"override {text!r}: the value is not valid YAML: {str(error).splitlines()[0]}") from None
-    return f"override {text!r}", _nested(key, typing.cast(dict, value)["value"]), False
+    key, equals, value = text.partition("=")
+    if not equals or not re.fullmatch(r"\w[\w.:-]*", key) or key.count(".") > DEPTH:
+        raise UserError(f"override {text[:80]!r}: expected section.key=value, e.g. bayessim.components=5")
+    source = f"override {text[:200]!r}"
+    return source, _nested(key, read_value(value, source)), False
 
 
 def _build(task: str, layers: Sequence[Layer]) -> Config:
     own = task_file(task)
     base: list[Layer] = [(str(own), read_yaml(own), True)] if own.is_file() else []
     declared = dict(base[0][1].get("env") or {}) if base else {}
+    _one_number_of_worlds(layers)
     merged: dict[str, Any] = {"task_name": task}
     for source, raw, is_file in [*base, *layers]:
         _merge(merged, raw, source, is_file, declared)
@@ -214,7 +182,7 @@ def _build(task: str, layers: Sequence[Layer]) -> Config:
 
 def _merge(merged: dict[str, Any], raw: Mapping[str, Any], source: str, is_file: bool, declared: Mapping) -> None:
     """Check one layer and write it over what is there; the layer itself is never changed."""
-    for key, value in _with_effects(raw, source).items():
+    for key, value in _with_effects(raw, source, is_file).items():
         if key not in TOP_KEYS:
             raise unknown(f"{source}: key", str(key), TOP_KEYS + _dotted(str(key)))
         if key == "task_name":
@@ -235,9 +203,25 @@ def _merge(merged: dict[str, Any], raw: Mapping[str, Any], source: str, is_file:
         merged.setdefault("env", {})["numEnvs"] = merged.setdefault("ppo", {})["num_envs"] = given[0]
 
 
-def _with_effects(raw: Mapping[str, Any], source: str) -> Mapping[str, Any]:
+def _one_number_of_worlds(layers: Sequence[Layer]) -> None:
+    """env.numEnvs and ppo.num_envs are one setting: the command line may not give two numbers for it."""
+    given: dict[str, tuple[str, Any]] = {}
+    for source, raw, is_file in layers:
+        for section, key in (("env", "numEnvs"), ("ppo", "num_envs")):
+            value = raw[section].get(key) if isinstance(raw.get(section), Mapping) else None
+            if value is not None and not is_file:
+                given[f"{section}.{key}"] = (source, value)
+    if len(given) == 2 and len({str(value) for _, value in given.values()}) == 2:
+        (a, (one, _)), (b, (two, _)) = given.items()
+        raise UserError(f"{a} and {b} are one setting, but {one} and {two} give two numbers; give one of them")
+
+
+def _with_effects(raw: Mapping[str, Any], source: str, is_file: bool) -> Mapping[str, Any]:
     """The layer with the contents of its effects.yaml; effects without calibrated parameters replace those before."""
     effects = raw.get("effects")
+    if not is_file and isinstance(effects, list | tuple):  # named on the command line itself
+        specs = [str(e.get("effect")) for e in effects if isinstance(e, Mapping)]
+        trust.allow(spec.rpartition(":")[0] for spec in specs if ".py:" in spec)
     if not isinstance(effects, str):
         return {"calibrated": [], **raw} if "effects" in raw else raw
     if not Path(effects).is_file():

@@ -22,7 +22,7 @@ def setup_jax(config: Config) -> Any:
     """
     import jax
 
-    match = re.fullmatch(r"(auto(?!:)|cpu|gpu|cuda|rocm|tpu)(?::(\d+))?", config.device)
+    match = re.fullmatch(r"(auto(?!:)|cpu|gpu|cuda|rocm|tpu)(?::([0-9]{1,6}))?", config.device)
     if match is None:
         raise UserError(f"device = {config.device!r}: expected auto, cpu, gpu, gpu:1 or cuda:0")
     platform, number = match[1], int(match[2] or 0)
@@ -52,7 +52,7 @@ def _join(jax: Any) -> None:
     if not address or jax.distributed.is_initialized():
         return
     for name, number in zip(PROCESSES[1:], numbers, strict=True):
-        if number is not None and not number.isdecimal():
+        if number is not None and not re.fullmatch("[0-9]{1,9}", number):
             raise UserError(f"{name} = {number!r}: expected a whole number")
     size, place = (None if number is None else int(number) for number in numbers)
     try:
@@ -67,7 +67,7 @@ def mesh(config: Config) -> Any:
 
     platform, _, number = config.device.partition(":")
     there = jax.devices(None if platform == "auto" else platform)
-    if config.devices != "all" and not config.devices.isdecimal():
+    if config.devices != "all" and not re.fullmatch("[0-9]{1,6}", config.devices):
         raise UserError(f"devices = {config.devices!r}: expected all, or how many")
     count = len(there) if config.devices == "all" else int(config.devices)
     if not 1 <= count <= len(there):

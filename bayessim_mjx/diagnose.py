@@ -13,6 +13,7 @@ from bayessim_mjx import cli
 from bayessim_mjx.config import Config
 from bayessim_mjx.device import setup_jax
 from bayessim_mjx.errors import UserError
+from bayessim_mjx.settings import SEEDS
 
 if TYPE_CHECKING:
     from bayessim_mjx.diagnosis.result import Diagnosis
@@ -32,7 +33,7 @@ def _parser() -> cli.PlainParser:
     parser.add_argument("--parameters", metavar="FILE", help="params.yaml: what the simulator may recalibrate")
     parser.add_argument("--effects", default="all", help="all, or names and path.py:Class, with commas")
     parser.add_argument("--out", metavar="DIR", default="diagnosis", help="folder of the results (diagnosis)")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seed", type=cli.whole(0, SEEDS), default=0)
     parser.add_argument("--group", metavar="KEY", help="metadata key of the operating conditions held out in turn")
     parser.add_argument("--device", default="auto", help="auto, cpu, gpu")
     parser.add_argument("--cache_dir", help="compilation cache; off: none")

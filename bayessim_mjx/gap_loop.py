@@ -23,7 +23,7 @@ WITHOUT = ("--max_iterations", "--video", "--video_length", "--video_interval", 
 
 
 def _parser() -> cli.Parser:
-    parser = cli.Parser("gap_loop", DESCRIPTION, without=WITHOUT)
+    parser = cli.Parser("gap_loop", DESCRIPTION, without=WITHOUT, unused=("bayessim", "real", "monitor"))
     parser.add_argument("--diagnosis", metavar="DIR", help="what bayessim_mjx.diagnose wrote")
     parser.add_argument(
         "--surrogate", metavar="FILE", help="stand-in for the real system: its truth as an effects.yaml"
@@ -31,9 +31,11 @@ def _parser() -> cli.Parser:
     parser.add_argument("--surrogate_timestep", type=float, metavar="S", help="of its simulation (default: the task's)")
     parser.add_argument("--real", metavar="LOGS", nargs="+", help="logs of the real system; no real return is known")
     parser.add_argument("--parameters", metavar="FILE", help="params.yaml of the diagnosis, if it had one")
-    parser.add_argument("--iterations", type=int, help="PPO iterations of each policy (default: ppo.max_iterations)")
-    parser.add_argument("--seeds", type=int, default=1, help="policies of each kind")
-    parser.add_argument("--episodes", type=int, default=200, help="episodes of each evaluation")
+    parser.add_argument(
+        "--iterations", type=cli.integer, help="PPO iterations of each policy (default: ppo.max_iterations)"
+    )
+    parser.add_argument("--seeds", type=cli.integer, default=1, help="policies of each kind")
+    parser.add_argument("--episodes", type=cli.integer, default=200, help="episodes of each evaluation")
     parser.add_argument("--out", metavar="DIR", help="results and policies (default: <diagnosis>/gap_loop)")
     return parser
 

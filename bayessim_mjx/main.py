@@ -60,7 +60,12 @@ def _prepare(args: argparse.Namespace) -> tuple[Config, Any]:
         run = Run.open(args.resume)
         return cli.resumed_config(args, run.config), run
     more = {"--checkpoint": ("bayessim.policyCheckpt", args.checkpoint)} if args.checkpoint else {}
-    return cli.pin_policy(cli.config_of(args, more)), None
+    config = cli.pin_policy(cli.config_of(args, more))
+    if config.ppo.teacher is not None:
+        raise UserError(
+            f"ppo.teacher = {config.ppo.teacher!r}: main has no use for it; bayessim_mjx.train --distil has"
+        )
+    return config, None
 
 
 def _run(config: Config, run: Any, device: Any, command: Sequence[str], console: Any) -> int:

@@ -17,6 +17,7 @@ from bayessim_mjx.config import Config, freeze, replace
 from bayessim_mjx.device import setup_jax
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.quantities import estimate
+from bayessim_mjx.settings import COUNT
 
 DESCRIPTION = "Play a saved policy: on nominal physics, on the prior, on the surrogate real and on the posterior."
 PHYSICS = ("nominal", "prior", "real", "posterior")
@@ -25,7 +26,9 @@ PHYSICS = ("nominal", "prior", "real", "posterior")
 def _parser() -> cli.Parser:
     parser = cli.Parser("play", DESCRIPTION, without=("--max_iterations", "--video_interval", "--name", "--resume"))
     parser.add_argument(
-        "--episodes", type=int, help="per kind of physics (default: --num_envs, else bayessim.realEvals)"
+        "--episodes",
+        type=cli.whole(-COUNT, COUNT),
+        help="per kind of physics (default: --num_envs, else bayessim.realEvals)",
     )
     parser.add_argument("--physics", choices=PHYSICS, help="one kind only")
     parser.add_argument(

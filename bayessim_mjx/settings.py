@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from bayessim_mjx import memory
 from bayessim_mjx.errors import UserError
 
 COLLECT_POLICIES = ("policy_random", "policy_ones", "policy_rl", "policy_rl_randomized", "policy_replay")
@@ -34,6 +35,9 @@ UNCORRECTED = (("apt", "truncated"), ("apt", "logit"), ("division", "logit"))  #
 MEMORIES = {"gru": 1, "lstm": 2}  # recurrent layers, and how many numbers each unit remembers
 IMPLEMENTATIONS = ("jax", "warp")  # of MJX
 ACTIVATIONS = ("elu", "relu", "selu", "tanh", "swish", "gelu")
+SEEDS = 2**32 - 1  # the largest seed: jax keeps 32 bits of it
+COUNT = 10**9  # beyond it a number of steps, episodes or trajectories is a slip of the finger
+WIDTH = 10**5  # and of a network's units
 
 
 class Frozen(dict):
@@ -66,7 +70,10 @@ def thaw(value: Any) -> Any:
 
 
 def setting(default: Any, doc: str, **limits: Any) -> Any:
-    """A field with its meaning and limits (`low`, `high`: inclusive; `above`: exclusive; `choices`)."""
+    """A field with its meaning and limits (`low`, `high`: inclusive; `above`: exclusive; `choices`).
+
+    Numbers are finite in any case.
+    """
     return field(default=default, metadata={"doc": doc, **limits})
 
 
@@ -112,17 +119,54 @@ def summary_of(name: str, key: str = "summarizer") -> tuple[str, dict[str, int]]
         UserError: naming the value, where it came from (`key`) and the summaries that there are.
     """
     stem, _, number = name.rpartition("_")
-    full = _prefixed("summary_")(stem if number.isdecimal() else name)
+    numbered = re.fullmatch("[0-9]{1,6}", number) is not None
+    full = _prefixed("summary_")(stem if numbered else name)
     if full not in SUMMARIZERS:
         close = difflib.get_close_matches(full, SUMMARIZERS, n=1)
         hint = f" (did you mean {close[0]}?)" if close else ""
         raise UserError(f"{key} = {name!r}{hint}: allowed are {', '.join(SUMMARIZERS)}")
-    if not number.isdecimal():
+    if not numbered:
         return full, {}
     option = SUMMARIZERS[full]
     if option is None:
         raise UserError(f"{key} = {name!r}: {full} takes no number")
     return full, {option: int(number)}
+
+
+def model_of(name: str, key: str = "modelClass") -> tuple[str, str | None, str | float]:
+    """("MDRFF", "RBF", 4.0) of `MDRFF_RBF_4.0`: class, kernel, bandwidth (a number, "median" or "validation").
+
+    Raises:
+        UserError: naming the value, where it came from (`key`) and what there is.
+    """
+    match = MODEL.fullmatch(name)
+    if match is None:
+        raise UserError(
+            f"{key} = {name!r}: allowed are MDNN, MDRFF, MDRFF_<kernel>, MDRFF_<kernel>_<bandwidth> (kernel RBF, "
+            "Laplace, Matern12, Matern32 or Matern52; bandwidth a number, median or validation); and in a run "
+            "None, plain uniform randomisation"
+        )
+    kernel, bandwidth = match.groups()
+    if bandwidth in (None, "median", "validation"):
+        return name.partition("_")[0], kernel or (None if name == "MDNN" else "RBF"), bandwidth or "validation"
+    try:
+        width = float(bandwidth)
+    except ValueError:
+        width = math.nan
+    if not 0 < width < math.inf:
+        raise UserError(f"{key} = {name!r}: the bandwidth {bandwidth} is no positive finite number")
+    return "MDRFF", kernel, width
+
+
+def number(value: Any) -> float | None:
+    """A finite number, also one that YAML reads as text (1e-3); None: it is none. Only in the digits 0 to 9."""
+    if isinstance(value, bool) or not isinstance(value, int | float | str) or not str(value).isascii():
+        return None
+    try:
+        found = float(value)
+    except (ValueError, OverflowError):
+        return None
+    return found if math.isfinite(found) else None
 
 
 def _counted(value: Any) -> Any:
@@ -135,6 +179,11 @@ def _absolute(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_absolute(v) for v in value]
     return os.path.abspath(os.path.expanduser(value)) if isinstance(value, str) and value else value
+
+
+def _weights(widths: tuple[int, ...]) -> float:
+    """Bytes of the weights between layers, with Adam's two moments."""
+    return 3 * 4.0 * sum(a * b for a, b in zip(widths, widths[1:], strict=False))
 
 
 def _own_effects(value: Any) -> Any:
@@ -174,16 +223,19 @@ def coerce(value: Any, annotation: Any, path: str, source: str = "") -> Any:
         raise UserError(f"{path} = {value!r}{where}: expected a section of `key: value` lines")
     if annotation is Any:
         return freeze(value)
-    if annotation is float and isinstance(value, int | float) and not isinstance(value, bool) and not math.isnan(value):
-        return float(value)
+    if annotation is float and isinstance(value, int | float) and (found := number(value)) is not None:
+        return found
     if annotation is int and isinstance(value, float) and value.is_integer():
         return int(value)
+    if annotation is str and isinstance(value, str) and "${" in value:
+        raise UserError(f"{path} = {value!r}{where}: ${{...}} is not expanded here; write the text itself")
     if annotation in (bool, str) and isinstance(value, annotation):
         return value
     if annotation is int and isinstance(value, int) and not isinstance(value, bool):
         return value
     name = {"int": "a whole number", "float": "a number", "bool": "True or False", "str": "text"}
-    raise UserError(f"{path} = {value!r}{where}: expected {name.get(annotation.__name__, annotation.__name__)}")
+    finite = ", and a finite one" if annotation is float and isinstance(value, float) else ""
+    raise UserError(f"{path} = {value!r}{where}: expected {name.get(annotation.__name__, annotation.__name__)}{finite}")
 
 
 def check_limits(value: Any, limits: Mapping[str, Any], path: str, source: str = "") -> None:
@@ -207,8 +259,8 @@ class EnvConfig(Section):
     """`env:`. Keys of one task only (`options`) are those its cfg/<task>.yaml lists; read like a mapping too."""
 
     SECTION: typing.ClassVar[str] = "env"
-    numEnvs: int = setting(256, "worlds simulated in parallel; the same number as ppo.num_envs", low=1)
-    episodeLength: int | None = setting(None, "control steps per episode; null: the task's own", low=1)
+    numEnvs: int = setting(256, "worlds simulated in parallel; the same number as ppo.num_envs", low=1, high=COUNT)
+    episodeLength: int | None = setting(None, "control steps per episode; null: the task's own", low=1, high=COUNT)
     realParams: Frozen | None = setting(None, "surrogate real: {weights, means, stds}, rows or {name: value}")
     impl: str = setting("jax", "what computes the physics: jax, or warp (needs warp-lang)", choices=IMPLEMENTATIONS)
     options: Frozen = field(default_factory=Frozen, metadata={"doc": "settings of this task alone"})
@@ -241,7 +293,7 @@ class BayesSimConfig(Section):
     """`bayessim:`, the keys of BayesSimIG with their meaning there."""
 
     SECTION: typing.ClassVar[str] = "bayessim"
-    trainTrajs: int = setting(10000, "simulated trajectories collected per round", low=1)
+    trainTrajs: int = setting(10000, "simulated trajectories collected per round", low=10, high=COUNT)
     collectPolicy: str = setting(
         "policy_random", "actions while collecting", choices=COLLECT_POLICIES, spell=_prefixed("policy_")
     )
@@ -251,16 +303,18 @@ class BayesSimConfig(Section):
         "number of steps, waypoints, lags or levels as in summary_corrdiff_3",
         spell=_prefixed("summary_"),
     )
-    trainTrajLen: int = setting(20, "control steps per training trajectory (arrays have one more row)", low=1)
+    trainTrajLen: int = setting(
+        20, "control steps per training trajectory (arrays have one more row)", low=1, high=COUNT
+    )
     ftune: bool = setting(True, "keep one network over all rounds; False: a new one each round")
     modelClass: str | None = setting(
         "MDNN",
         "posterior network: MDNN, MDRFF or MDRFF_<kernel>_<bandwidth>; None: no inference, plain uniform randomisation",
         spell=_none,
     )
-    components: int = setting(10, "mixture components", low=1)
-    fullCovariance: bool = setting(False, "full covariance per component")
-    hiddenLayers: tuple[int, ...] = setting((128, 128), "widths of the network", low=1)
+    components: int = setting(10, "mixture components", low=1, high=WIDTH)
+    fullCovariance: bool = setting(True, "full covariance per component; False: diagonal (BayesSimIG)")
+    hiddenLayers: tuple[int, ...] = setting((128, 128), "widths of the network", low=1, high=WIDTH)
     ensemble: int = setting(
         4, "networks trained side by side; their posteriors are averaged by held-out score", low=1, high=50
     )
@@ -283,20 +337,23 @@ class BayesSimConfig(Section):
         above=0,
         high=100,
     )
-    lr: float = setting(2e-3, "peak learning rate of the network (cosine; BayesSimIG: 1e-4, constant)", above=0)
+    lr: float = setting(4e-3, "peak learning rate of the network (cosine; BayesSimIG: 1e-4, constant)", above=0)
     priorShare: float = setting(
         0.05, "prior mixed into each trajectory's posterior: a misjudged one cannot rule out the truth", low=0, high=1
     )
     checkTrajs: int = setting(
-        300, "fresh simulations a round that test calibration and misfit; 0: no tests (else 40 or more)", low=0
+        300,
+        "fresh simulations a round that test calibration and misfit; 0: no tests (else 40 or more)",
+        low=0,
+        high=COUNT,
     )
     distrust: float = setting(
         0.5, "most of the prior mixed into the randomisation where the real trajectories look unlike simulated ones",
         low=0, high=1,
     )  # fmt: skip
-    realEvals: int = setting(100, "surrogate-real episodes that score the policy each round", low=1)
-    realTrajs: int = setting(1, "real trajectories used for inference each round (they accumulate)", low=1)
-    realIters: int = setting(100, "rounds of the outer loop", low=1)
+    realEvals: int = setting(100, "surrogate-real episodes that score the policy each round", low=1, high=COUNT)
+    realTrajs: int = setting(1, "real trajectories used for inference each round (they accumulate)", low=1, high=COUNT)
+    realIters: int = setting(100, "rounds of the outer loop", low=1, high=COUNT)
     ftuneRL: bool = setting(False, "keep training one policy over all rounds; False: a new one each round")
     policyCheckpt: str | None = setting(None, "checkpoint of a policy to start from", spell=_none)
 
@@ -309,12 +366,8 @@ class BayesSimConfig(Section):
                 f"bayessim.proposal = {self.proposal!r}: no correction in bayessim.coordinates = {self.coordinates!r}; "
                 "take coordinates plain or probit, or proposal truncated or prior"
             )
-        if self.modelClass is not None and not MODEL.fullmatch(self.modelClass):
-            raise UserError(
-                f"bayessim.modelClass = {self.modelClass!r}: allowed are MDNN, MDRFF, MDRFF_<kernel>, "
-                "MDRFF_<kernel>_<bandwidth> (kernel RBF, Laplace, Matern12, Matern32 or Matern52; bandwidth a number, "
-                "median or validation) and None, plain uniform randomisation"
-            )
+        if self.modelClass is not None:
+            model_of(self.modelClass, "bayessim.modelClass")
 
 
 @dataclass(frozen=True)
@@ -343,9 +396,13 @@ class RNDConfig(Section):
     """`ppo.rnd:`, random network distillation; the names and defaults of rsl_rl."""
 
     SECTION: typing.ClassVar[str] = "ppo.rnd"
-    num_outputs: int = setting(1, "size of the embedding", low=1)
-    predictor_hidden_dims: tuple[int, ...] = setting((-1,), "widths of the predictor; -1: size of its input", low=-1)
-    target_hidden_dims: tuple[int, ...] = setting((-1,), "widths of the random target; -1: size of its input", low=-1)
+    num_outputs: int = setting(1, "size of the embedding", low=1, high=WIDTH)
+    predictor_hidden_dims: tuple[int, ...] = setting(
+        (-1,), "widths of the predictor; -1: size of its input", low=-1, high=WIDTH
+    )
+    target_hidden_dims: tuple[int, ...] = setting(
+        (-1,), "widths of the random target; -1: size of its input", low=-1, high=WIDTH
+    )
     activation: str = setting("elu", "activation of both networks", choices=ACTIVATIONS)
     state_normalization: bool = setting(False, "running mean and variance of the observations they see")
     reward_normalization: bool = setting(False, "novelty in units of the spread of its discounted sum")
@@ -375,10 +432,10 @@ class PPOConfig(Section):
     """`ppo:`, also the content of a --cfg_train file."""
 
     SECTION: typing.ClassVar[str] = "ppo"
-    num_envs: int = setting(256, "worlds in parallel; the same number as env.numEnvs", low=1)
-    num_steps: int = setting(16, "control steps per world and iteration", low=1)
-    num_epochs: int = setting(5, "passes over each batch", low=1)
-    num_minibatches: int = setting(4, "minibatches per pass", low=1)
+    num_envs: int = setting(256, "worlds in parallel; the same number as env.numEnvs", low=1, high=COUNT)
+    num_steps: int = setting(16, "control steps per world and iteration", low=1, high=COUNT)
+    num_epochs: int = setting(5, "passes over each batch", low=1, high=COUNT)
+    num_minibatches: int = setting(4, "minibatches per pass", low=1, high=COUNT)
     gamma: float = setting(0.99, "discount", low=0, high=1)
     gae_lambda: float = setting(0.95, "lambda of the advantage estimate", low=0, high=1)
     clip_param: float = setting(0.2, "clip range of the probability ratio", above=0)
@@ -392,15 +449,17 @@ class PPOConfig(Section):
     normalize_observations: bool = setting(True, "running mean and variance of observations")
     normalize_advantage_per_minibatch: bool = setting(False, "else once per batch")
     reward_scale: float = setting(1.0, "factor on rewards seen by the learner", above=0)
-    segment: int = setting(0, "minibatches estimate advantages anew over segments of so many steps; 0: no", low=0)
+    segment: int = setting(
+        0, "minibatches estimate advantages anew over segments of so many steps; 0: no", low=0, high=COUNT
+    )
     weight_init: str = setting("orthogonal", "how weights begin", choices=("orthogonal", "lecun_uniform"))
-    hidden_actor: tuple[int, ...] = setting((64, 64), "widths of the actor", low=1)
-    hidden_critic: tuple[int, ...] = setting((64, 64), "widths of the critic", low=1)
+    hidden_actor: tuple[int, ...] = setting((64, 64), "widths of the actor", low=1, high=WIDTH)
+    hidden_critic: tuple[int, ...] = setting((64, 64), "widths of the critic", low=1, high=WIDTH)
     activation: str = setting("elu", "activation of both networks", choices=ACTIVATIONS)
     init_std: float = setting(1.0, "initial standard deviation of actions", above=0)
     state_dependent_std: bool = setting(False, "the actor gives the standard deviation too, else it is a parameter")
     shared_trunk: bool = setting(False, "the critic is one layer on the actor's hidden ones (hidden_critic is unused)")
-    memory: int = setting(0, "units of a recurrent layer before the actor's others; 0: none", low=0)
+    memory: int = setting(0, "units of a recurrent layer before the actor's others; 0: none", low=0, high=WIDTH)
     memory_cell: str = setting("gru", "kind of the recurrent layer: gru or lstm", choices=tuple(MEMORIES))
     critic_theta: bool = setting(False, "the critic also sees the physics, theta (not the actor)")
     policy_theta: bool = setting(False, "the policy sees theta too: a teacher, for simulation alone (train, play)")
@@ -410,10 +469,10 @@ class PPOConfig(Section):
     action_bound: str = setting("clip", "how: clipped, or squashed by action_clip * tanh", choices=("clip", "tanh"))
     rnd: RNDConfig | None = setting(None, "random network distillation: rewards for what is new; null: none")
     symmetry: SymmetryConfig | None = setting(None, "use of the robot's mirror symmetry; null: none")
-    max_iterations: int = setting(100, "iterations (per round of the outer loop)", low=0)
-    log_interval: int = setting(10, "iterations between log lines", low=1)
-    save_interval: int = setting(50, "iterations between checkpoints", low=1)
-    eval_episodes: int = setting(100, "episodes per evaluation", low=1)
+    max_iterations: int = setting(100, "iterations (per round of the outer loop)", low=0, high=COUNT)
+    log_interval: int = setting(10, "iterations between log lines", low=1, high=COUNT)
+    save_interval: int = setting(50, "iterations between checkpoints", low=1, high=COUNT)
+    eval_episodes: int = setting(100, "episodes per evaluation", low=1, high=COUNT)
 
     @property
     def memory_size(self) -> int:
@@ -471,11 +530,19 @@ class RealConfig(Section):
         (), "log files or folders, kept as absolute paths; none: the surrogate at env.realParams", spell=_absolute
     )
     map: str | None = setting(None, "YAML file from log columns to joints and actuators", spell=_absolute)
-    segment_length: int | None = setting(None, "control steps per segment; null: bayessim.trainTrajLen", low=1)
-    segment_stride: int | None = setting(None, "control steps between segment starts; null: no overlap", low=1)
+    segment_length: int | None = setting(
+        None, "control steps per segment; null: bayessim.trainTrajLen", low=1, high=COUNT
+    )
+    segment_stride: int | None = setting(
+        None, "control steps between segment starts; null: no overlap", low=1, high=COUNT
+    )
     noise: float = setting(
         0.0, "sd of the noise on the surrogate's observations; without effect where real.logs is given", low=0
     )
+
+    def check(self) -> None:
+        if self.map is not None and not self.logs:
+            raise UserError(f"real.map = {self.map!r}: there are no logs to map; give real.logs too, or leave it out")
 
 
 @dataclass(frozen=True)
@@ -485,8 +552,8 @@ class MonitorConfig(Section):
     SECTION: typing.ClassVar[str] = "monitor"
     posterior_plots: bool = setting(True, "picture of the posterior each round")
     video: bool = setting(False, "record videos")
-    video_length: int = setting(200, "control steps per video", low=1)
-    video_interval: int = setting(2000, "control steps of each world between videos", low=1)
+    video_length: int = setting(200, "control steps per video", low=1, high=COUNT)
+    video_interval: int = setting(2000, "control steps of each world between videos", low=1, high=COUNT)
 
 
 @dataclass(frozen=True)
@@ -494,7 +561,7 @@ class Config(Section):
     """All settings of a run. In YAML `task` is called `task_name`, and `randomization` is BayesSimIG's `task:`."""
 
     task: str = setting("", "name of the task")
-    seed: int = setting(0, "seed of everything random", low=0)
+    seed: int = setting(0, "seed of everything random", low=0, high=SEEDS)
     name: str = setting("", "last part of the run folder's name")
     logdir: str = setting("logs", "root of the run folders")
     device: str = setting("auto", "auto, cpu, gpu, gpu:1, cuda:0")
@@ -522,6 +589,30 @@ class Config(Section):
                 f"env.numEnvs = {self.env.numEnvs} and ppo.num_envs = {self.ppo.num_envs} are one setting: "
                 "give the same number, or only one of them"
             )
+        memory.refuse(self._needs())
+
+    def _needs(self) -> Iterator[tuple[str, float]]:
+        """Lower bounds of the memory that the settings ask for, bytes: what any task would take."""
+        ppo, b = self.ppo, self.bayessim
+        yield f"ppo.memory = {ppo.memory}", _weights((ppo.memory, 3 * ppo.memory))
+        if self.devices == "1":
+            steps = f"ppo.num_envs = {ppo.num_envs} (env.numEnvs) worlds, ppo.num_steps = {ppo.num_steps}"
+            remembered = f", ppo.memory = {ppo.memory}" if ppo.memory else ""
+            yield steps + remembered, 4.0 * ppo.num_envs * (60 + ppo.num_steps * (12 + ppo.memory))
+        yield f"ppo.hidden_actor = {list(ppo.hidden_actor)}", _weights(ppo.hidden_actor)
+        yield f"ppo.hidden_critic = {list(ppo.hidden_critic)}", _weights(ppo.hidden_critic)
+        if b.modelClass is None:
+            return
+        yield f"bayessim.trainTrajs = {b.trainTrajs}", 4.0 * 10 * b.trainTrajs
+        yield f"bayessim.trainTrajLen = {b.trainTrajLen}", 4.0 * 8 * min(b.trainTrajs, 2500) * b.trainTrajLen
+        yield f"bayessim.hiddenLayers = {list(b.hiddenLayers)}", b.ensemble * _weights(b.hiddenLayers)
+        heads = _weights((*b.hiddenLayers[-1:], 3 * b.components))
+        kept = 4.0 * 3 * b.components * b.realIters * b.realTrajs
+        yield (
+            f"bayessim.components = {b.components} of each of bayessim.realIters * realTrajs = "
+            f"{b.realIters} * {b.realTrajs} posteriors",
+            b.ensemble * (heads + kept),
+        )
 
     @property
     def task_name(self) -> str:

@@ -30,7 +30,7 @@ SHOWN = (
 
 
 def _parser() -> cli.Parser:
-    parser = cli.Parser("train", DESCRIPTION, resume=True)
+    parser = cli.Parser("train", DESCRIPTION, resume=True, unused=("bayessim", "real"), but=("bayessim.policyCheckpt",))
     parser.add_argument("--randomize", action="store_true", help="draw the physics of every episode from the prior")
     parser.add_argument("--distil", metavar="RUN", help="imitate this run's (or checkpoint's) policy, in place of PPO")
     return parser

@@ -101,6 +101,10 @@ def error_of(capsys: pytest.CaptureFixture, run: Any, *argv: str) -> str:
         (["--task", "Pendulum", "--checkpoint", "nowhere"], ["--checkpoint nowhere: no such folder"]),
         (["--task", "Pendulum", "--use_last_checkpoint"], ["no run of 'Pendulum' with a checkpoint"]),
         (["--task", "Pendulum", "--use_last_checkpoint", "--checkpoint", "best"], ["give one of them"]),
+        (["--task", "Pendulum", "--num_envs", "\u0663"], ["--num_envs", "'\u0663'"]),
+        (["--task", "Pendulum", "--seed", "9" * 20], ["seed = 99999999999999999999", "at most 4294967295"]),
+        (["--task", "Pendulum", "--num_envs", str(10**13)], ["env.numEnvs = 10000000000000", "--num_envs", "at most"]),
+        (["--task", "Pendulum", "--num_envs", "4", "ppo.num_envs=8"], ["--num_envs", "num_envs=8", "one setting"]),
         ([], ["no task", "--list_tasks"]),
     ],
 )
@@ -122,6 +126,19 @@ def test_bad_input_is_one_line(command: Any, argv: list[str], words: list[str], 
 def test_bad_real_side_is_one_line(override: str, words: list[str], capsys: Any, tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     line = error_of(capsys, main.main, "--task", "Pendulum", override)
+    assert all(word in line for word in words), line
+
+
+@pytest.mark.parametrize(
+    ("command", "override", "words"),
+    [
+        (main.main, "ppo.teacher=/nope", ["ppo.teacher = '/nope'", "train --distil"]),
+        (train.main, "bayessim.components=5", ["bayessim.components: train has no use for it"]),
+        (train.main, "real.logs=[a]", ["real.logs: train has no use for it"]),
+    ],
+)
+def test_settings_of_another_command_are_refused(command: Any, override: str, words: list[str], capsys: Any) -> None:
+    line = error_of(capsys, command, "--task", "Pendulum", override)
     assert all(word in line for word in words), line
 
 

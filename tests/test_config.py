@@ -2,13 +2,15 @@
 
 import copy
 import dataclasses
+import os
 import pickle
 from pathlib import Path
 
 import pytest
 
-from bayessim_mjx import config, registry
+from bayessim_mjx import config, memory, registry
 from bayessim_mjx.config import (
+    BayesSimConfig,
     Config,
     EnvConfig,
     PPOConfig,
@@ -22,6 +24,7 @@ from bayessim_mjx.config import (
     to_yaml,
 )  # fmt: skip
 from bayessim_mjx.errors import UserError
+from bayessim_mjx.inference import InferenceSettings
 
 CFG = sorted(p.stem for p in config.cfg_folder().glob("*.yaml"))
 PARAMS = "task.randomization_params"
@@ -65,16 +68,16 @@ def test_bayessimig_keys_keep_their_names_and_values() -> None:
 
 
 def test_layers_in_order(tmp_path: Path) -> None:
-    (tmp_path / "e.yaml").write_text("bayessim: {components: 3, trainTrajs: 5, lr: 1e-3}\nseed: 4\n")
+    (tmp_path / "e.yaml").write_text("bayessim: {components: 3, trainTrajs: 50, lr: 1e-3}\nseed: 4\n")
     (tmp_path / "t.yaml").write_text("gamma: 0.5\nlearning_rate: 1e-3\nmax_iterations: 7\n")
     c = load(
         "Pendulum",
         cfg_env=tmp_path / "e.yaml",
         cfg_train=tmp_path / "t.yaml",
         flags={"--max_iterations": ("ppo.max_iterations", 9)},
-        overrides=["bayessim.trainTrajs=6", "ppo.gamma=0.25"],
+        overrides=["bayessim.trainTrajs=60", "ppo.gamma=0.25"],
     )
-    assert (c.bayessim.components, c.bayessim.trainTrajs, c.bayessim.lr, c.seed) == (3, 6, 1e-3, 4)
+    assert (c.bayessim.components, c.bayessim.trainTrajs, c.bayessim.lr, c.seed) == (3, 60, 1e-3, 4)
     assert (c.ppo.gamma, c.ppo.learning_rate, c.ppo.max_iterations) == (0.25, 1e-3, 9)
     assert c.bayessim.hiddenLayers == (128, 128)  # from cfg/pendulum.yaml
 
@@ -96,6 +99,61 @@ def test_number_of_worlds_is_one_setting() -> None:
         from_dict({"env": {"numEnvs": 1}, "ppo": {"num_envs": 2}}, "Ant")
     with pytest.raises(UserError, match="one setting"):
         Config(env=EnvConfig(numEnvs=3))
+    both = r"env\.numEnvs and ppo\.num_envs are one setting, but .*numEnvs=4' and .*num_envs=8' give two numbers"
+    with pytest.raises(UserError, match=both):
+        load("Cartpole", overrides=["env.numEnvs=4", "ppo.num_envs=8"])
+    assert load("Cartpole", overrides=["env.numEnvs=4", "ppo.num_envs=4"]).env.numEnvs == 4
+
+
+TOO_MUCH = {
+    "ppo.num_envs=1000000": r"num_envs = 1000000 \(env\.numEnvs\) worlds, ppo\.num_steps = 64: needs at least 3\.31 GB",
+    "ppo.memory=100000": r"ppo\.memory = 100000: needs at least 360 GB",
+    "ppo.hidden_actor=[9000, 100000]": r"ppo\.hidden_actor = \[9000, 100000\]: needs at least 10\.8 GB",
+    "bayessim.trainTrajs=50000000": r"bayessim\.trainTrajs = 50000000: needs at least 2 GB",
+    "bayessim.hiddenLayers=[20000, 20000]": r"hiddenLayers = \[20000, 20000\]: needs at least 19\.2 GB",
+    "bayessim.components=100000": r"components = 100000 of each of .* 5 \* 1 posteriors: needs at least 1\.87 GB",
+}
+
+
+@pytest.mark.parametrize("override", TOO_MUCH)
+def test_what_cannot_fit_into_memory_is_refused_with_the_least_that_it_needs(override: str, monkeypatch) -> None:
+    """4 * N (60 + T 12) bytes for worlds, 12 bytes a weight (Adam), 40 a summary."""
+    monkeypatch.setattr(memory, "installed", lambda: 1.5e9)
+    with pytest.raises(UserError, match=TOO_MUCH[override] + r" of memory, and there are 1\.5 GB"):
+        load("Pendulum", overrides=[override, "ppo.num_minibatches=1"])
+    monkeypatch.setattr(memory, "installed", lambda: 1e12)
+    load("Pendulum", overrides=[override, "ppo.num_minibatches=1"])
+
+
+def test_memory_is_what_the_system_and_its_container_have(monkeypatch, tmp_path: Path) -> None:
+    physical = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    for content, expected in (("max\n", physical), ("1000\n", 1000.0)):
+        (tmp_path / "memory.max").write_text(content)
+        monkeypatch.setattr(memory, "GROUP", tmp_path / "memory.max")
+        assert memory.installed() == expected
+
+
+def test_inference_has_one_set_of_defaults() -> None:
+    """What `bayessim:` leaves out is what the inference room takes by itself."""
+    own, section = InferenceSettings(), BayesSimConfig()
+    shared = [f.name for f in dataclasses.fields(InferenceSettings) if hasattr(section, f.name)]
+    assert {"lr", "fullCovariance", "components", "ensemble"} <= set(shared)
+    assert {name: getattr(own, name) for name in shared} == {name: getattr(section, name) for name in shared}
+
+
+@pytest.mark.parametrize("stem", CFG)
+def test_a_task_and_its_file_say_the_same(stem: str) -> None:
+    """The defaults of the task's class and of cfg/<task>.yaml: parameters, surrogate, episode and the task's own."""
+    task = task_of(stem)
+    bare, filed = registry.make(task), registry.make(task, config=load(task))
+    assert bare.space == filed.space and len(bare.space) > 0
+    (means,) = load(task).env.realParams["means"]
+    assert tuple(means) == tuple(bare.real_parameters)
+    assert bare.settings == filed.settings and bare.episode_length == filed.episode_length
+
+
+def test_every_task_has_a_file() -> None:
+    assert {task_of(stem) for stem in CFG} == set(registry.names())
 
 
 def test_short_names_and_none() -> None:
@@ -194,6 +252,16 @@ BAD = {
     "effects=[3]": r"effects\[0\] = 3 .*expected a section",
     "task.randomization_params=3": r"task\.randomization_params = 3 .*expected a section",
     "bayessim.ftune=maybe": r"expected True or False",
+    "seed=99999999999999999999": r"seed = 9{20} \(override.*at most 4294967295",
+    "bayessim.components=1e12": r"bayessim\.components = 1000000000000 \(override.*at most 100000",
+    "bayessim.trainTrajs=1e12": r"bayessim\.trainTrajs = 1000000000000 \(override.*at most 1000000000",
+    "bayessim.trainTrajs=1": r"bayessim\.trainTrajs = 1 \(override.*at least 10",
+    "bayessim.modelClass=MDRFF_RBF_1e999": r"MDRFF_RBF_1e999': the bandwidth 1e999 is no positive finite number",
+    "bayessim.summarizerFxn=corrdiff_\u0663": r"allowed are summary_start",
+    "ppo.memory=1e12": r"ppo\.memory = 1000000000000 \(override.*at most 100000",
+    "ppo.num_envs=1e13": r"ppo\.num_envs = 10000000000000 \(override.*at most 1000000000",
+    "ppo.init_std=.inf": r"ppo\.init_std = inf \(override.*expected a number, and a finite one",
+    "real.map=/nope": r"real\.map = '/nope': there are no logs to map",
     "seed=1.5": r"seed = 1\.5 .*whole number",
     "seed=-2": r"seed = -2 .*at least 0",
     "seed=": r"seed = None .*whole number",
@@ -223,7 +291,7 @@ def test_a_bad_override_is_one_line_with_the_remedy(override: str) -> None:
         ("\tseed: 1\n", r"f\.yaml, line 1: not valid YAML"),
         ("- 1\n- 2\n", r"f\.yaml: expected sections"),
         ("just text\n", r"f\.yaml: key 'just text' is unknown"),
-        ("seed: ${nothing}\n", r"f\.yaml: not valid YAML.*nothing"),
+        ("seed: ${nothing}\n", r"f\.yaml: \$\{nothing\}: there is no nothing in the file"),
         (
             "bayessim: {tranTrajs: 3}\n",
             r"f\.yaml: key 'bayessim\.tranTrajs' is unknown. Did you mean bayessim\.trainTrajs",

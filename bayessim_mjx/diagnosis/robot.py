@@ -14,7 +14,7 @@ import numpy as np
 from bayessim_mjx import config
 from bayessim_mjx.effects.effect import Effect
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.parameters import ParameterSpace
+from bayessim_mjx.parameters import ParameterSpace, elements
 from bayessim_mjx.physics import Physics, mjx
 
 if TYPE_CHECKING:
@@ -200,7 +200,7 @@ def _literal(name: str) -> str:
 
 def _whole(model: mujoco.MjModel) -> str:
     """A name of the whole model as an actor: none of its bodies is called so."""
-    name = "robot"
+    name = elements.WHOLE
     while name in {model.body(b).name for b in range(model.nbody)}:
         name += "_"
     return name

@@ -20,10 +20,11 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from bayessim_mjx import trust
 from bayessim_mjx.effects.effect import Effect, Quantity
 from bayessim_mjx.errors import UserError
 
-__all__ = ["Effect", "load", "make", "names", "spec_of"]
+__all__ = ["Effect", "load", "make", "names", "recorded", "spec_of"]
 
 ENTRY_POINTS = "bayessim_mjx.effects"
 KINDS = ("actuator", "joint", "body", "geom", "world")
@@ -58,13 +59,24 @@ def _is_effect(kind: Any) -> bool:
 
 
 def load(spec: str) -> type[Effect]:
-    """The class of an effect.
+    """The class of an effect that the user names: the file of `path.py:MyEffect` may run from now on.
 
     Args:
         spec: a name from `names()`, or `path.py:MyEffect`, relative to the working directory.
 
     Raises:
         UserError: no such effect, file or class; a class that does not keep the contract (`effect.py`).
+    """
+    if isinstance(spec, str) and ".py:" in spec:
+        trust.allow([spec.rpartition(":")[0]])
+    return recorded(spec)
+
+
+def recorded(spec: str) -> type[Effect]:
+    """The class of an effect that a file names (settings, effects.yaml, diagnosis.json): `load` without its permission.
+
+    Raises:
+        UserError: as `load`; the user has not named the file of code.
     """
     if isinstance(spec, str) and ".py:" in spec:
         path, _, title = spec.rpartition(":")
@@ -86,6 +98,7 @@ def load(spec: str) -> type[Effect]:
 def _from_file(path: Path, title: str) -> Any:
     if not path.is_file():
         raise UserError(f"effect {path}:{title}: no file {path} (from {Path.cwd()})")
+    trust.check(path, f"{path}:{title}")
     path = path.resolve()
     found = _executed(path, path.stat().st_mtime_ns)
     if not hasattr(found, title):
@@ -147,26 +160,27 @@ def spec_of(effect: Effect) -> str:
     return f"{inspect.getfile(kind)}:{kind.__qualname__}"
 
 
-def make(effect: str, where: str | tuple[str, ...], **settings: Any) -> Effect:
+def make(effect: str | type[Effect], where: str | tuple[str, ...], **settings: Any) -> Effect:
     """The effect called `effect` at the place `where`.
 
     Args:
-        effect: what `load` takes.
+        effect: what `load` takes, or a class.
         where: MuJoCo name of the joint, actuator ... concerned, several names, or "all".
         settings: further fields of the effect, for example the upper limits of its parameters.
 
     Raises:
         UserError: on an unknown effect or setting.
     """
-    kind = load(effect)
+    kind = load(effect) if isinstance(effect, str) else effect
+    label = effect if isinstance(effect, str) else kind.name
     if isinstance(where, list):
         where = tuple(where)
     if not isinstance(where, str) and not (isinstance(where, tuple) and all(isinstance(w, str) for w in where)):
-        raise UserError(f"effect {effect}: where = {where!r}: expected the MuJoCo name of a joint, actuator ...")
+        raise UserError(f"effect {label}: where = {where!r}: expected the MuJoCo name of a joint, actuator ...")
     allowed = {f.name: f.type for f in dataclasses.fields(kind) if f.name not in ("where", "parameters")}
     for name, value in settings.items():
         if name not in allowed:
-            raise UserError(f"effect {effect}: no setting {name!r}; allowed are {', '.join(allowed)}")
+            raise UserError(f"effect {label}: no setting {name!r}; allowed are {', '.join(allowed)}")
         if allowed[name] in (float, "float") and (isinstance(value, bool) or not isinstance(value, int | float)):
-            raise UserError(f"effect {effect}: {name} = {value!r}: expected a number")
+            raise UserError(f"effect {label}: {name} = {value!r}: expected a number")
     return kind(where=where, **settings)

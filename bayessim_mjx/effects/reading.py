@@ -48,7 +48,7 @@ def _listed(spec: Any, path: str) -> Effect:
 
 def _make(path: str, effect: Any, where: Any, settings: Mapping[str, Any]) -> Effect:
     try:
-        return room.make(effect, where=where, **settings)
+        return room.make(room.recorded(effect), where=where, **settings)
     except UserError as error:
         raise UserError(f"{path}: {error}") from None
 

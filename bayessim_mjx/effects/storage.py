@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bayessim_mjx import config
+from bayessim_mjx import config, trust
 from bayessim_mjx import effects as room
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.effects import reading
@@ -27,7 +27,7 @@ from bayessim_mjx.parameters.reading import _default
 if TYPE_CHECKING:
     import mujoco
 
-HEADER = "# What a diagnosis found. Use: python -m bayessim_mjx.main --task T effects={name}\n"
+HEADER = "# What a diagnosis found. Use: python -m bayessim_mjx.main --task T effects={name}{code}\n"
 LEAST_SD = 1e-6  # of the range
 SURE = 3.0  # sd that a task's range is widened to hold
 _FIELDS = [f.name for f in dataclasses.fields(Parameter)]
@@ -72,7 +72,9 @@ def write(
         "calibrated": [_calibrated_entry(_identified(p, found)) for p in calibrated.parameters],
     }
     path = Path(path)
-    path.write_text(HEADER.format(name=path.name) + config.to_yaml(plain), encoding="utf-8")
+    files = dict.fromkeys(spec.rpartition(":")[0] for e in effects if ".py:" in (spec := room.spec_of(e)))
+    code = "".join(f" {trust.FLAG} {file}" for file in files)
+    path.write_text(HEADER.format(name=path.name, code=code) + config.to_yaml(plain), encoding="utf-8")
     return path
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any
 
-from bayessim_mjx.settings import COORDINATES, MODEL
+from bayessim_mjx.settings import COORDINATES, BayesSimConfig, model_of
 
 if TYPE_CHECKING:
     from bayessim_mjx.inference.embedding import Embedding
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class InferenceSettings:
-    """The first five keep BayesSimIG's names; the training recipe is that of reference/sbi.md section 3.2.
+    """The first five keep BayesSimIG's names and, like `ensemble` and `coordinates`, have the defaults of `bayessim:`.
 
     modelClass is MDNN, or MDRFF[_<kernel>[_<bandwidth>]] with the kernels RBF, Matern12 (Laplace), Matern32, Matern52
     and as bandwidth a number (in standard deviations of the features), `median` (of the distances) or `validation`
@@ -25,11 +25,11 @@ class InferenceSettings:
     otherwise `plain`: in plain coordinates the Gaussian posterior of a Gaussian prior is bent (0.09 nats a parameter).
     """
 
-    modelClass: str = "MDNN"
-    components: int = 10
-    fullCovariance: bool = True
-    hiddenLayers: tuple[int, ...] = (128, 128)
-    lr: float = 4e-3  # peak of the cosine schedule
+    modelClass: str = BayesSimConfig.modelClass or "MDNN"
+    components: int = BayesSimConfig.components
+    fullCovariance: bool = BayesSimConfig.fullCovariance
+    hiddenLayers: tuple[int, ...] = BayesSimConfig.hiddenLayers
+    lr: float = BayesSimConfig.lr  # peak of the cosine schedule
     weight_decay: float = 1e-4
     batch: int = 64  # a quarter of the rows in four times the steps: more per second, measured on noise-free data
     epochs: int = 40  # passes over the capacity, within [min_steps, max_steps]
@@ -40,10 +40,10 @@ class InferenceSettings:
     restandardise: bool = False  # inputs anew at every fit: for data whose distribution changes from fit to fit
     clip: float = 10.0  # standardised inputs are clipped to +-clip
     defensive: float = 1e-4  # prior mass in every posterior: one that is wildly wrong cannot veto the others
-    coordinates: str = "auto"
+    coordinates: str = BayesSimConfig.coordinates
     # networks side by side, weighted by held-out score; their posterior has ensemble * components Gaussians. A single
     # one is over-confident at a few thousand simulations: its 50 / 80 / 95 % regions held .31 / .58 / .82 of truths
-    ensemble: int = 4
+    ensemble: int = BayesSimConfig.ensemble
     # of the last member, the first has none; less with more than 3000 rows, which need none and suffer
     dropout: float = 0.1
     fourierFeatures: int = 256  # frequencies of MDRFF: twice as many features
@@ -51,7 +51,7 @@ class InferenceSettings:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "hiddenLayers", tuple(int(width) for width in self.hiddenLayers))
-        self._check_model()
+        model_of(str(self.modelClass))
         positive = ("components", "batch", "epochs", "min_steps", "max_steps", "lr", "grad_clip", "clip")
         for name in (*positive, "ensemble", "fourierFeatures"):
             if not getattr(self, name) > 0:
@@ -66,33 +66,21 @@ class InferenceSettings:
         if self.coordinates not in COORDINATES:
             raise ValueError(f"coordinates = {self.coordinates!r}: allowed are {', '.join(COORDINATES)}")
 
-    def _check_model(self) -> None:
-        try:
-            known = bool(MODEL.fullmatch(str(self.modelClass))) and (self.kernel is None or self.fixed_bandwidth != 0)
-        except ValueError:  # a bandwidth such as 1.2.3
-            known = False
-        if not known:
-            raise ValueError(
-                f"modelClass = {self.modelClass!r}: there are MDNN, MDRFF, MDRFF_<kernel>, MDRFF_<kernel>_<bandwidth>, "
-                "kernel one of RBF, Laplace, Matern12, Matern32, Matern52, bandwidth a number, median or validation"
-            )
-
     @property
     def kernel(self) -> str | None:
         """Kernel of the Fourier features; None for MDNN."""
-        match = MODEL.fullmatch(self.modelClass)
-        return None if match is None or self.modelClass == "MDNN" else match.group(1) or "RBF"
+        return model_of(self.modelClass)[1]
 
     @property
     def bandwidth(self) -> str:
         """`median`, `validation` or a number, as text."""
-        match = MODEL.fullmatch(self.modelClass)
-        return (match.group(2) if match else None) or "validation"
+        return str(model_of(self.modelClass)[2])
 
     @property
     def fixed_bandwidth(self) -> float | None:
         """The bandwidth where it is given as a number."""
-        return None if self.bandwidth in ("median", "validation") else float(self.bandwidth)
+        width = model_of(self.modelClass)[2]
+        return width if isinstance(width, float) else None
 
     @property
     def chart(self) -> str:

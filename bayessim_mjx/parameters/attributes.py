@@ -90,7 +90,7 @@ def element(model: Any, kind: str, target: str) -> int:
     have = names(model, kind)
     if target in have:
         return have.index(target)
-    if target.startswith("#") and target[1:].isdigit() and int(target[1:]) < len(have):
+    if target.startswith("#") and target[1:].isdecimal() and int(target[1:]) < len(have):
         return int(target[1:])
     raise UserError(f"no {kind} {target!r} in the model; {suggest(target, have)}")
 

@@ -1,12 +1,12 @@
 """Checks of a `randomization_params` section: each error names the key's path, its value and what is allowed."""
 
 import difflib
-import math
 import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from bayessim_mjx.errors import UserError
+from bayessim_mjx.settings import number as finite
 
 
 def mapping(value: Any, where: str) -> Mapping[str, Any]:
@@ -50,13 +50,11 @@ def low_high(setting: Mapping[str, Any], where: str) -> tuple[float, float]:
 
 def number(value: Any, where: str) -> float:
     """A finite number."""
-    try:  # YAML reads 1e-3 as text
-        number = float("" if isinstance(value, bool) else value)
-    except (TypeError, ValueError):
-        raise UserError(f"{where}: {value!r} is not a number") from None
-    if not math.isfinite(number):
-        raise UserError(f"{where}: {value!r} is not finite")
-    return number
+    found = finite(value)
+    if found is None:
+        infinite = isinstance(value, float)
+        raise UserError(f"{where}: {value!r} is not {'finite' if infinite else 'a number'}")
+    return found
 
 
 def accepted(setting: Mapping[str, Any], where: str) -> None:

@@ -10,6 +10,8 @@ from bayessim_mjx.errors import UserError
 from bayessim_mjx.parameters import attributes
 from bayessim_mjx.parameters.attributes import suggest
 
+WHOLE = "robot"  # the whole model as an actor; with _ at its end where one of the bodies is called so
+
 
 class Element(NamedTuple):
     """One element of a group: its name in the parameter, and the MuJoCo element it stands for."""
@@ -20,13 +22,16 @@ class Element(NamedTuple):
 
 
 def of_actor(model: mujoco.MjModel, actor: str, actors: Sequence[str], where: str) -> list[int]:
-    """Bodies of an actor: the subtree of the body of that name, else the model without the other actors' subtrees."""
+    """Bodies of an actor: the subtree of the body of that name, else the model without the other actors' subtrees.
+
+    The model goes by its name in the MJCF, or as `robot`.
+    """
     have = attributes.names(model, "body")
     if actor in have:
         return attributes.subtree(model, have.index(actor))
-    model_name = model.names[: model.names.index(b"\0")].decode()
-    if len(actors) > 1 and actor != model_name:
-        raise UserError(f"{where}: no actor {actor!r}; {suggest(actor, [model_name, *have[1:]])}")
+    whole = [model.names[: model.names.index(b"\0")].decode(), WHOLE]
+    if actor.rstrip("_") not in whole:
+        raise UserError(f"{where}: no actor {actor!r}; {suggest(actor, [*whole, *have[1:]])}")
     taken = {b for other in actors if other in have for b in attributes.subtree(model, have.index(other))}
     return [b for b in attributes.subtree(model, 0) if b not in taken]
 

@@ -127,7 +127,7 @@ def test_calibrated_numbers_are_converted_between_operations(ours, theirs):
         kind="joint", factor=1.0 if theirs == "scaling" else 2.0,
     )  # fmt: skip
     ranges = {"scaling": [0.9, 1.1], "additive": [-0.05, 0.05], "absolute": [0.45, 0.55]}
-    section = {"actor_params": {"r": {"dof_properties": {"damping": {"range": ranges[ours], "operation": ours}}}}}
+    section = {"actor_params": {"robot": {"dof_properties": {"damping": {"range": ranges[ours], "operation": ours}}}}}
     spec, model, space = storage.corrected(mujoco.MjSpec.from_string(PART), section, [found])
     (own,) = space.parameters
     slope = 0.5 if ours == "scaling" else 1.0

@@ -126,6 +126,7 @@ def test_harmless_keys_of_isaac_gym_are_ignored_with_a_warning():
         (actor(dof_properties={"friction": additive(0, 1)}), "MJX ignores friction that is 0"),
         (actor(dof_properties={"stiffness": scaling(0.1, 1)}), "left_knee: scaling a number that is 0"),
         ({"actor_params": {"torsi": {}, "block": {}}}, "no actor 'torsi'; did you mean torso"),
+        ({"actor_params": {"wolker": {}}}, "no actor 'wolker'; did you mean walker"),
         ({"actor_parms": {}}, "did you mean actor_params"),
         ({"actor_params": 3}, r"task\.randomization_params\.actor_params = 3: expected a section"),
         ({"actor_params": {"walker": 3}}, r"actor_params\.walker = 3: expected a section"),
