@@ -1,6 +1,7 @@
 """One checkpoint: a pytree of arrays and a JSON index, written by Orbax into a folder that appears whole or not at all.
 
-The index holds every leaf's name, shape, dtype and SHA-256: a damaged or foreign checkpoint is told from a good one.
+The index holds every leaf's name, shape, dtype and SHA-256, and what the numbers of distributions and networks mean
+(their `coordinates`): a damaged or foreign checkpoint is told from a good one.
 """
 
 import hashlib
@@ -17,6 +18,7 @@ from bayessim_mjx.errors import UserError
 
 INDEX = "index.json"
 FORMAT = 1
+MADE_WITH = "use the task, version and settings that it was made with"
 
 
 class CorruptedError(UserError):
@@ -46,8 +48,9 @@ def save(path: Path, tree: Any, step: int, meta: Mapping[str, Any]) -> None:
     shutil.rmtree(temporary, ignore_errors=True)
     temporary.mkdir(parents=True)
     parts = jax.device_get(_whole(tree if type(tree) is dict else {"tree": tree}))
-    index = {name: _save_part(temporary / name, part) for name, part in parts.items()}
-    write_json(temporary / INDEX, {"format": FORMAT, "step": int(step), "meta": dict(meta), "parts": index})
+    leaves = {name: _save_part(temporary / name, part) for name, part in parts.items()}
+    index = {"format": FORMAT, "step": int(step), "meta": dict(meta), "coordinates": _coordinates(parts)}
+    write_json(temporary / INDEX, {**index, "parts": leaves})
     os.rename(temporary, path)
 
 
@@ -95,6 +98,18 @@ def _leaves(tree: Any) -> list[tuple[str, Any]]:
     return [(jax.tree_util.keystr(path, simple=True, separator="."), leaf) for path, leaf in flat]
 
 
+def _coordinates(tree: Any) -> dict[str, dict[str, Any]]:
+    """The `coordinates` of everything in the tree that has some, by dotted name: what its arrays do not tell."""
+    import jax
+
+    def placed(node: Any) -> bool:
+        return isinstance(getattr(node, "coordinates", None), dict)
+
+    flat = jax.tree_util.tree_flatten_with_path(tree, is_leaf=placed)[0]
+    names = [(jax.tree_util.keystr(path, simple=True, separator="."), node) for path, node in flat]
+    return {name: node.coordinates for name, node in names if placed(node)}
+
+
 def _describe(name: str, array: np.ndarray) -> dict[str, Any]:
     digest = hashlib.sha256(np.ascontiguousarray(array).tobytes()).hexdigest()
     return {"name": name, "shape": list(array.shape), "dtype": str(array.dtype), "sha256": digest}
@@ -114,7 +129,18 @@ def read_index(path: Path) -> dict[str, Any]:
     for name, leaves in parts.items():
         if not (isinstance(leaves, list) and all(map(_is_leaf, leaves))):
             raise CorruptedError(f"{path / INDEX}: damaged checkpoint index: part {name!r} is no list of leaves")
+    places = index.setdefault("coordinates", {})  # older ones have none
+    if not (isinstance(places, dict) and all(map(_is_place, places.values()))):
+        raise CorruptedError(f"{path / INDEX}: damaged checkpoint index: coordinates have to be objects")
     return index
+
+
+def _is_place(place: Any) -> bool:
+    """Whether it is what `Distribution.coordinates` makes, as far as it is read."""
+    return isinstance(place, dict) and all(
+        isinstance(place.get(key), kind)
+        for key, kind in (("names", list), ("box", dict), ("priors", dict), ("chart", str))
+    )
 
 
 def _is_leaf(leaf: Any) -> bool:
@@ -131,14 +157,19 @@ def restore(path: Path, template: Any) -> tuple[Any, dict[str, Any]]:
     """(tree like `template`, meta). A dict template may name a part of it, e.g. "state.domain".
 
     `template` holds arrays or ShapeDtypeStructs. CorruptedError for damaged files; UserError, naming the leaf, where
-    the checkpoint is that of another task or of other settings.
+    the checkpoint is that of another task or of other settings, or in other coordinates.
     """
+    from bayessim_mjx.distributions.storage import disagreement
+
     index = read_index(path)
     wanted = template if type(template) is dict else {"tree": template}
     for name, part in wanted.items():
         if name.partition(".")[0] not in index["parts"]:
             raise UserError(f"{path}: the checkpoint has no {name!r}; it has {', '.join(index['parts'])}")
         _compare(f"{path}: {name}", _saved(index, name), part)
+    for name, own in _coordinates(wanted).items():
+        if words := disagreement(index["coordinates"].get(name, own), own):
+            raise UserError(f"{path}: {name} {words}: {MADE_WITH}")
     tree = {name: _restore_part(path, index, name, part) for name, part in wanted.items()}
     return (tree if type(template) is dict else tree["tree"]), index["meta"]
 
@@ -147,6 +178,11 @@ def has(path: Path, name: str) -> bool:
     """Whether the checkpoint holds leaves under the dotted `name`."""
     index = read_index(path)
     return name.partition(".")[0] in index["parts"] and bool(_saved(index, name))
+
+
+def chart(path: Path, name: str) -> str | None:
+    """The chart of the distribution under the dotted `name`; None where the checkpoint does not tell (older ones)."""
+    return read_index(path)["coordinates"].get(name, {}).get("chart")
 
 
 def _saved(index: dict[str, Any], name: str) -> dict[int, dict]:
@@ -167,7 +203,7 @@ def _compare(where: str, saved: dict[int, dict], template: Any) -> None:
         if need.get(name) != have.get(name):
             raise UserError(
                 f"{where}.{name} is {have.get(name, 'absent')} in the checkpoint, but {need.get(name, 'absent')} under "
-                "the present settings: use the task, version and settings that it was made with"
+                f"the present settings: {MADE_WITH}"
             )
 
 

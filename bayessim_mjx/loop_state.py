@@ -15,6 +15,7 @@ from bayessim_mjx.config import BayesSimConfig, Config
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.env import Env
 from bayessim_mjx.inference import InferenceSettings, checks, rounds
+from bayessim_mjx.parameters import ParameterSpace
 from bayessim_mjx.rl import TrainState
 from bayessim_mjx.rollout import Trajectory
 
@@ -58,6 +59,13 @@ class RoundInfo:
     checks: checks.Checks | None = None  # calibration, misfit, walls; None: none asked for
 
 
+def chart_of(settings: BayesSimConfig, space: ParameterSpace) -> str:
+    """Coordinates in which the loop's domain over `space` is a mixture of Gaussians."""
+    if settings.modelClass is None:
+        return "plain"
+    return rounds.chart_of(InferenceSettings.of(settings).at(space).chart)
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Loop:
     """The parts that do not move."""
@@ -87,8 +95,7 @@ class Loop:
     @property
     def chart(self) -> str:
         """Coordinates in which the domain is a mixture of Gaussians."""
-        b = self.settings
-        return "plain" if b.modelClass is None else rounds.chart_of(InferenceSettings.of(b).at(self.env.space).chart)
+        return chart_of(self.settings, self.env.space)
 
     def key(self, round_: int, purpose: str) -> Array:
         """Every random draw has its own key, a function of the seed alone: a resumed run draws the same."""

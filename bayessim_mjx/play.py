@@ -57,6 +57,7 @@ def _physics(config: Config, env: Any, checkpoint: Path, key: Any, count: int) -
     from bayessim_mjx import checkpoints
     from bayessim_mjx.collection import make_source
     from bayessim_mjx.distributions import Distribution
+    from bayessim_mjx.loop_state import chart_of
 
     kinds = {"nominal": jnp.tile(jnp.asarray(env.space.nominal, jnp.float32), (count, 1))}
     if not len(env.space):
@@ -66,7 +67,9 @@ def _physics(config: Config, env: Any, checkpoint: Path, key: Any, count: int) -
     if config.env.realParams is not None and not config.real.logs:
         kinds["real"] = make_source(config, env).sample(key, count)  # type: ignore[union-attr]
     if checkpoints.has(checkpoint, "state.domain"):
-        domain = checkpoints.restore(checkpoint, {"state.domain": prior})[0]["state.domain"]
+        own = checkpoints.chart(checkpoint, "state.domain") or chart_of(config.bayessim, env.space)
+        like = Distribution.prior(env.space, config.bayessim.components, own)
+        domain = checkpoints.restore(checkpoint, {"state.domain": like})[0]["state.domain"]
         kinds["posterior"] = domain.sample(key, count)
     return kinds
 

@@ -17,7 +17,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from bayessim_mjx import cli, main, play, registry, train
+from bayessim_mjx import cli, config, main, play, registry, train
 from bayessim_mjx.env import Env, State
 from bayessim_mjx.monitor.writer import event_files, records
 from bayessim_mjx.parameters import Parameter, ParameterSpace
@@ -323,6 +323,22 @@ def test_corrupted_checkpoints_of_a_run_to_resume(toy: None, capsys: pytest.Capt
     assert "damaged manifest" in error_of(capsys, train.main, "--resume", str(run.path))
 
 
+def test_play_draws_from_the_posterior_in_the_coordinates_that_it_was_saved_in(tmp_path: Path) -> None:
+    """A probit posterior's mean is that of its own draws; read as a plain one it was (1.35, 1.99) for (1.50, 1.90)."""
+    from bayessim_mjx import checkpoints
+    from bayessim_mjx.distributions import Distribution
+    from bayessim_mjx.distributions.charts import to_chart
+
+    settings = config.load("Pendulum", overrides=["bayessim.components=1"])
+    env, key = registry.make("Pendulum", config=settings), jax.random.PRNGKey(0)
+    centre = np.asarray(to_chart(env.space.to_unit(np.float32([1.5, 1.9])), "probit"))
+    posterior = Distribution.from_unit(env.space, [0.0], [centre], 0.05 * np.eye(2)[None], chart="probit")
+    checkpoints.save(tmp_path / "1", {"state": {"domain": posterior}}, 1, {})
+    drawn = np.asarray(play._physics(settings, env, tmp_path / "1", key, 400)["posterior"])
+    np.testing.assert_array_equal(drawn, posterior.sample(key, 400))
+    np.testing.assert_allclose(drawn.mean(0), [1.5, 1.9], atol=0.01)
+
+
 def test_play_prints_returns_of_latest_best_run_and_path(toy: None, capsys: pytest.CaptureFixture) -> None:
     assert train.main(["--task", "Pendulum", *SMALL]) == 0
     run = latest_run("logs", "Pendulum")
@@ -440,7 +456,6 @@ def test_main_interrupted_in_a_round_keeps_the_round(toy: None, monkeypatch: Any
 
 def write_pendulum_logs(folder: Path) -> None:
     """Six runs of 3 s on the pendulum with mass 1.4 and length 0.7, as CSV."""
-    from bayessim_mjx import config
     from bayessim_mjx.rollout import replay
 
     env = registry.make("Pendulum", config=config.load("Pendulum"))

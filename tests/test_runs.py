@@ -1,7 +1,9 @@
 """Run folders: atomic checkpoints, latest and best by the manifest, damage told from difference."""
 
+import dataclasses
 import json
 from pathlib import Path
+from typing import Any
 
 import flax.struct
 import jax
@@ -9,8 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from bayessim_mjx import config, runs
+from bayessim_mjx import checkpoints, config, runs
+from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.errors import UserError
+from bayessim_mjx.parameters import Parameter, ParameterSpace
 from bayessim_mjx.runs import Run
 
 
@@ -170,6 +174,39 @@ def test_another_structure_names_the_leaf(run: Run) -> None:
         run.restore("latest", {"critic": jnp.zeros(1)})
     with pytest.raises(UserError, match=r"policy\.b is absent in the checkpoint"):
         run.restore("latest", {"policy": {**tree()["policy"], "b": jnp.zeros(2)}})
+
+
+SPACE = ParameterSpace(
+    [Parameter("mass", 1.0, 0.5, 2.0), Parameter("gain", 1.0, 0.5, 2.0, prior="gaussian", mean=1.2, sd=0.1)]
+)
+
+
+def test_a_posterior_keeps_its_coordinates(run: Run) -> None:
+    """Numbers in unit coordinates mean nothing without chart, box and priors: other ones are refused, none assumed."""
+    probit = Distribution.from_unit(SPACE, [0.0], [[1.5, 1.9]], [np.eye(2) * 0.1], chart="probit")
+    path = run.save(1, {"state": {"domain": probit}})
+    assert checkpoints.chart(path, "state.domain") == "probit"
+    like = Distribution.prior(SPACE, 1, "probit")
+    again = run.restore(1, {"state.domain": jax.eval_shape(lambda: like)})[0]["state.domain"]
+    assert again.chart == "probit"
+    np.testing.assert_array_equal(again.mean(), probit.mean())
+    for own, message in (
+        (Distribution.prior(SPACE, 1), "state.domain is in probit coordinates, but they are plain here: use the task"),
+        (_over(high=3.0), r"has mass in \[0.5, 2.0\], but its range here is \[0.5, 3.0\]"),
+        (_over(prior="loguniform"), "has the prior uniform of mass, but its prior here is loguniform"),
+    ):
+        with pytest.raises(UserError, match=message):
+            run.restore(1, {"state.domain": own})
+    index = json.loads((path / "index.json").read_text())
+    index.pop("coordinates")  # as before there were any
+    (path / "index.json").write_text(json.dumps(index))
+    assert checkpoints.chart(path, "state.domain") is None
+    run.restore(1, {"state.domain": like})
+
+
+def _over(**changes: Any) -> Distribution:
+    mass = dataclasses.replace(SPACE.parameters[0], **changes)
+    return Distribution.prior(ParameterSpace([mass, SPACE.parameters[1]]), 1, "probit")
 
 
 def test_damaged_manifest_and_foreign_folder(run: Run, tmp_path: Path) -> None:

@@ -95,6 +95,11 @@ class Distribution:
         return tuple(self.space.names)
 
     @property
+    def coordinates(self) -> dict[str, Any]:
+        """What the arrays mean: names, box, priors and chart, as a checkpoint keeps them beside the arrays."""
+        return storage.coordinates(self.space, self.chart)
+
+    @property
     def centres(self) -> Array:
         """Centres of the Gaussians in unit coordinates, kept in the cube [K, d]."""
         return evaluate.centres_unit(self)
@@ -229,7 +234,7 @@ class Distribution:
 
     # ---- storage ------------------------------------------------------------------------------------------------
     def save(self, path: str | Path) -> Path:
-        """Write arrays and a JSON header (names, box) into one .npz, atomically."""
+        """Write arrays and a JSON header (names, box, priors, chart) into one .npz, atomically."""
         arrays = {f: np.asarray(getattr(self, f)) for f in storage.FIELDS}
         return storage.write(path, arrays, self.space, self.chart)
 

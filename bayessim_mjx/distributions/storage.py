@@ -9,17 +9,18 @@ from typing import Any
 import numpy as np
 
 FIELDS = ("prior_weight", "logits", "means", "scales", "log_inside")
-VERSION = 1
+FORMAT, VERSION = "bayessim_mjx.Distribution", 1
 
 
 def write(path: str | Path, arrays: dict[str, np.ndarray], space: Any, chart: str) -> Path:
-    """Write arrays and the space's names and box to `path` (a reader sees the old file or the new one, never half)."""
+    """Write arrays and what they mean to `path` (a reader sees the old file or the new one, never half)."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix=".tmp")
     try:
         with os.fdopen(descriptor, "wb") as file:
-            np.savez(file, **{"header": np.asarray(json.dumps({**header(space), "chart": chart})), **arrays})  # type: ignore[arg-type]
+            header = {"format": FORMAT, "version": VERSION, **coordinates(space, chart)}
+            np.savez(file, **{"header": np.asarray(json.dumps(header)), **arrays})  # type: ignore[arg-type]
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)
@@ -29,10 +30,36 @@ def write(path: str | Path, arrays: dict[str, np.ndarray], space: Any, chart: st
     return path
 
 
-def header(space: Any) -> dict[str, Any]:
-    """What must agree between the file and the space it is read into."""
+def coordinates(space: Any, chart: str) -> dict[str, Any]:
+    """What arrays in unit coordinates mean: names, box and priors of the space, and the chart; plain, for JSON."""
     box = {name: [float(low), float(high)] for name, low, high in zip(space.names, space.low, space.high, strict=True)}
-    return {"format": "bayessim_mjx.Distribution", "version": VERSION, "names": list(space.names), "box": box}
+    priors = {p.name: [p.prior, *(None if v is None else float(v) for v in (p.mean, p.sd))] for p in space.parameters}
+    return {"names": list(space.names), "box": box, "priors": priors, "chart": chart}
+
+
+def disagreement(stored: dict[str, Any], own: dict[str, Any]) -> str:
+    """The first way in which two `coordinates` differ, in words; "" where they do not. Older files lack some."""
+    if stored["names"] != own["names"]:
+        return f"is over {', '.join(stored['names'])}, but the parameters here are {', '.join(own['names'])}"
+    for name, range_ in own["box"].items():
+        if not np.allclose(stored["box"].get(name, np.nan), range_, rtol=1e-5):
+            return f"has {name} in {stored['box'].get(name)}, but its range here is {range_}"
+    for name, prior in own["priors"].items():
+        if not _same(given := stored.get("priors", {}).get(name, prior), prior):
+            return f"has the prior {_words(given)} of {name}, but its prior here is {_words(prior)}"
+    chart = stored.get("chart", "plain")
+    return "" if chart == own["chart"] else f"is in {chart} coordinates, but they are {own['chart']} here"
+
+
+def _same(a: list, b: list) -> bool:
+    """Whether two [prior, mean, sd] agree."""
+    numbers = [[np.nan if v is None else float(v) for v in prior[1:]] for prior in (a, b)]
+    return a[0] == b[0] and bool(np.allclose(*numbers, rtol=1e-5, equal_nan=True))
+
+
+def _words(prior: list) -> str:
+    kind, mean, sd = prior
+    return kind if mean is None else f"{kind} ({mean:g} +- {sd:g})"
 
 
 def read(path: str | Path, space: Any) -> tuple[dict[str, np.ndarray], str]:
@@ -42,12 +69,9 @@ def read(path: str | Path, space: Any) -> tuple[dict[str, np.ndarray], str]:
             raise ValueError(f"{path} holds no distribution: it has {sorted(file)}, needed are header and {FIELDS}")
         stored = json.loads(str(file["header"]))
         arrays = {name: file[name] for name in FIELDS}
-    expected = header(space)
     if stored.get("version") != VERSION:
         raise ValueError(f"{path} has version {stored.get('version')}, this program reads {VERSION}")
-    if stored["names"] != expected["names"]:
-        raise ValueError(f"{path} is over {stored['names']}, but the parameters here are {expected['names']}")
-    for name, range_ in expected["box"].items():
-        if not np.allclose(stored["box"][name], range_, rtol=1e-5):
-            raise ValueError(f"{path} has {name} in {stored['box'][name]}, but its range here is {range_}")
-    return arrays, stored.get("chart", "plain")
+    chart = stored.get("chart", "plain")
+    if words := disagreement(stored, coordinates(space, chart)):
+        raise ValueError(f"{path} {words}")
+    return arrays, chart

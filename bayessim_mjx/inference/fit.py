@@ -18,6 +18,7 @@ from jax import Array
 from jax.flatten_util import ravel_pytree
 
 from bayessim_mjx.distributions import Distribution, charts
+from bayessim_mjx.distributions.storage import coordinates
 from bayessim_mjx.inference import bases, depth, identify, mdn
 from bayessim_mjx.inference.settings import InferenceSettings
 from bayessim_mjx.triangular import product
@@ -47,6 +48,11 @@ class FitState:
     identified: Array  # [d] bool, parameters whose marginal beats the prior on the last fit's held-out rows
     settings: InferenceSettings = struct.field(pytree_node=False)
     space: Any = struct.field(pytree_node=False)
+
+    @property
+    def coordinates(self) -> dict[str, Any]:
+        """What the network's outputs mean, as of a `Distribution`."""
+        return coordinates(self.space, self.settings.chart)
 
     def inputs(self, x: Array) -> Array:
         """Summaries x [n, D] as the network takes them in [n, D]."""
