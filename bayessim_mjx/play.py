@@ -20,7 +20,12 @@ from bayessim_mjx.quantities import estimate
 from bayessim_mjx.settings import COUNT
 
 DESCRIPTION = "Play a saved policy: on nominal physics, on the prior, on the surrogate real and on the posterior."
-PHYSICS = ("nominal", "prior", "real", "posterior")
+KINDS = {
+    "nominal": "nominal physics",
+    "prior": "physics drawn from the prior",
+    "real": "surrogate real",
+    "posterior": "physics drawn from the posterior",
+}
 
 
 def _parser() -> cli.Parser:
@@ -30,7 +35,7 @@ def _parser() -> cli.Parser:
         type=cli.whole(-COUNT, COUNT),
         help="per kind of physics (default: --num_envs, else bayessim.realEvals)",
     )
-    parser.add_argument("--physics", choices=PHYSICS, help="one kind only")
+    parser.add_argument("--physics", choices=KINDS, help="one kind only")
     parser.add_argument(
         "--export", metavar="FILE", nargs="?", const="", help="write the policy as ONNX (exported/ of the run) and end"
     )
@@ -74,23 +79,23 @@ def _physics(config: Config, env: Any, checkpoint: Path, key: Any, count: int) -
     return kinds
 
 
-def _video(config: Config, env: Any, policy: Any, thetas: Any, key: Any, path: Path) -> str:
-    """Film one episode at the first of `thetas` [n, d]; what to say of it."""
+def _video(config: Config, env: Any, policy: Any, physics: tuple[str, Any], key: Any, path: Path) -> str:
+    """Film one episode at theta [d] of `physics` (its kind, theta); what to say of it."""
     import numpy as np
 
-    from bayessim_mjx.monitor import video
+    from bayessim_mjx.monitor import film, video
     from bayessim_mjx.monitor.words import without_prefix
-    from bayessim_mjx.rollout import rollout
 
     if not hasattr(env, "physics"):
         raise UserError(f"--video: {env.name} has no MuJoCo model of ours to draw; leave it out")
-    qpos = rollout(env, policy.replace(deterministic=True), key, thetas[:1], config.monitor.video_length).qpos[0]
-    values = [f"{value:.3g}" for value in np.asarray(thetas[0])]
-    words = dict(zip(without_prefix(env.space.names), values, strict=True))
+    kind, theta = physics
+    shown = film.motion(env, policy, key, theta, config.monitor.video_length)
+    values = [f"{value:.3g}" for value in np.asarray(theta)]
+    about = dict(zip(without_prefix(env.space.names), values, strict=True))
     path.parent.mkdir(parents=True, exist_ok=True)
-    model = video.model_at(env, thetas[0])
-    frames = video.record(model, np.asarray(qpos), path, fps=25, width=480, height=360, dt=env.dt, overlay_text=words)
-    return f"video: {path}" if frames is not None else "no video could be made here"
+    title = f"{config.task}, {KINDS[kind]}"
+    made = film.frames(video.model_at(env, theta), shown, config.monitor, title, about, path)
+    return f"video: {path}" if made is not None else "no video could be made here"
 
 
 def _export(env: Any, policy: Any, checkpoint: Path, run: Any, target: str) -> str:
@@ -148,7 +153,7 @@ def _show(args: argparse.Namespace, config: Config, path: Path, run: Any, count:
     if config.monitor.video:
         name = next(n for n in ("real", "posterior", "prior", "nominal") if n in chosen)
         folder = (run.path if run is not None else path.parent) / "videos" / "play"
-        console.say(_video(config, env, policy, chosen[name], key, folder / f"{path.name}_{name}.mp4"))
+        console.say(_video(config, env, policy, (name, chosen[name][0]), key, folder / f"{path.name}_{name}.mp4"))
     return 0
 
 

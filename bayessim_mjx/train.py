@@ -114,16 +114,17 @@ class Training:
 
     def _video(self, iteration: int, state: Any) -> None:
         """An episode at nominal physics every `monitor.video_interval` steps, and at the end."""
-        from bayessim_mjx.monitor import video
+        from bayessim_mjx.monitor.film import FPS, frames
         from bayessim_mjx.rl import policy_of
 
         every, last = self._film_every(), iteration >= self.config.ppo.max_iterations
         if self.film is None or not (iteration // every > self.filmed or last):
             return
         self.filmed = iteration // every
-        qpos = self.film(policy_of(state), self.config.monitor.video_length, self.env.space.nominal)
-        frames = video.record(self.env.mj_model, qpos, dt=self.env.dt, fps=25)
-        self.writer.video("Train/video", frames, 25, iteration)
+        monitor, title = self.config.monitor, f"{self.config.task}, training iteration {iteration}"
+        shown = self.film(policy_of(state), monitor.video_length, self.env.space.nominal)
+        pictures = frames(self.env.mj_model, shown, monitor, title, half=not last)
+        self.writer.video("Train/video", pictures, FPS, iteration)
 
     def evaluate(self, state: Any) -> float:
         """Mean return of deterministic episodes, the same worlds at every evaluation; logged."""

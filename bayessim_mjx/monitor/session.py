@@ -17,6 +17,7 @@ from bayessim_mjx.loop import LoopState, RoundInfo
 from bayessim_mjx.monitor import plots, trust, video
 from bayessim_mjx.monitor.compile_clock import CompileClock
 from bayessim_mjx.monitor.console import Console
+from bayessim_mjx.monitor.film import FPS, Motion, frames
 from bayessim_mjx.monitor.wall import Wall
 from bayessim_mjx.monitor.writer import Writer
 from bayessim_mjx.rl import Policy, policy_of
@@ -32,7 +33,7 @@ SHOWN = (
 )  # fmt: skip
 
 SETTINGS = "BayesSim/cfg"
-Film = Callable[[Policy, int, np.ndarray], np.ndarray]  # (policy, control steps, theta [d]) -> qpos [T+1, nq]
+Film = Callable[[Policy, int, np.ndarray], Motion]  # (policy, control steps, theta [d]) -> one episode
 
 
 class Session:
@@ -40,7 +41,7 @@ class Session:
 
     Args:
         path: the run's folder.
-        film: the motion of a policy at theta, for videos; None: no videos.
+        film: the episode of a policy at theta, for videos; None: no videos.
         start: the state that the run begins with; None: the very first.
         resumed_at: on --resume the second of its checkpoint (`Wall.mark`; -1: it had none yet), so that nothing that
             is about to be written again stays; None for a new run.
@@ -114,7 +115,8 @@ class Session:
         self.console.iteration(shown, done)
         if self.film is not None and iteration // self._film_every() > self.filmed:
             self.filmed = iteration // self._film_every()
-            self._video(self.learning, "Train/video", policy_of(state.train), iteration)
+            title = f"{self.config.task}, training iteration {iteration}"
+            self._video(self.learning, "Train/video", policy_of(state.train), iteration, title, half=True)
         if done >= n:
             self.console.phase(REST)
 
@@ -137,7 +139,9 @@ class Session:
         if info.truth is None:
             self._show_posterior(info.posterior)
         if self.film is not None:
-            self._video(self.inference, f"{side.split('/')[0]}/video", policy, step)
+            physics = "posterior mean" if info.truth is None else "surrogate real"
+            title = f"{self.config.task}, {physics}, round {step}"
+            self._video(self.inference, f"{side.split('/')[0]}/video", policy, step, title)
         self._note(info)
         self.console.round_line(**round_line(info))
         if info.checks is not None:
@@ -171,11 +175,10 @@ class Session:
                 step,
             )
 
-    def _video(self, writer: Writer, tag: str, policy: Policy, step: int) -> None:
+    def _video(self, writer: Writer, tag: str, policy: Policy, step: int, title: str, half: bool = False) -> None:
         assert self.film is not None
-        qpos = self.film(policy, self.config.monitor.video_length, self.theta)
-        frames = video.record(self.model, qpos, dt=self.env.dt, fps=25)
-        writer.video(tag, frames, 25, step)
+        shown = self.film(policy, self.config.monitor.video_length, self.theta)
+        writer.video(tag, frames(self.model, shown, self.config.monitor, title, half=half), FPS, step)
 
     def _note(self, info: RoundInfo) -> None:
         """rounds.jsonl: the numbers of every round, for scripts."""

@@ -31,6 +31,7 @@ def record(
     camera: str | int | None = None,
     overlay_text: str | Mapping | Sequence | None = None,
     dt: float | None = None,
+    captions: Sequence[str] | None = None,
 ) -> np.ndarray | None:
     """Render qpos [T, nq] (or a list of them, one per world, shown as a grid) to frames [T', H, W, 3] uint8.
 
@@ -41,6 +42,7 @@ def record(
         camera: name or number of a camera of the model; None: the model's first, else one fitted to the motion.
         overlay_text: lines or {name: value} written into the corner; with several worlds one entry per world.
         dt: seconds between rows of qpos. When given, rows are picked so that the video runs in real time.
+        captions: a line for each row of qpos [T], written below the first line of `overlay_text`; of one world only.
     Returns:
         None, with one warning, where no OpenGL works (or MUJOCO_GL=disable).
     """
@@ -48,8 +50,12 @@ def record(
     for world in worlds:
         if world.ndim != 2 or world.shape[1] != mj_model.nq or not len(world):
             raise ValueError(f"qpos has shape {world.shape}; expected [T, {mj_model.nq}] for this model, T >= 1")
-    worlds = [world[_rows(len(world), dt, fps)] for world in worlds]
+    if captions is not None and (len(worlds) != 1 or len(captions) != len(worlds[0])):
+        raise ValueError(f"{len(captions)} captions for {len(worlds)} world(s) of {len(worlds[0])} rows: one per row")
+    picked = [_rows(len(world), dt, fps) for world in worlds]
+    worlds = [world[rows] for world, rows in zip(worlds, picked, strict=True)]
     texts = [overlay_text] if len(worlds) == 1 else list(overlay_text or [None] * len(worlds))
+    each = None if captions is None else [captions[row] for row in picked[0]]
     try:
         tiles = _render(mj_model, worlds, width, height, camera)
     except Exception as error:  # drivers fail in many ways, and a picture is never worth a run
@@ -59,7 +65,7 @@ def record(
         tiles = None
     if tiles is None:
         return None
-    frames = _grid([_write_over(tile, text) for tile, text in zip(tiles, texts, strict=True)])
+    frames = _grid([_write_over(tile, text, each) for tile, text in zip(tiles, texts, strict=True)])
     if path is not None:
         save(frames, path, fps)
     return frames
@@ -157,11 +163,20 @@ def _render(model: Any, worlds: list[np.ndarray], width: int, height: int, camer
             tiles = []
             for world in worlds:
                 view = view_of(model, data, world, camera, width / height)
-                frames = [picture.take(data, pose, view) for pose in world]
+                frames = _frames(picture, data, world, view)
                 tiles.append(np.stack(frames + [frames[-1]] * (length - len(frames))))
         finally:
             picture.free()
     return tiles
+
+
+def _frames(picture: "_Picture", data: Any, world: np.ndarray, view: Any) -> list[np.ndarray]:
+    """A picture of every row; rows that repeat the one before are not drawn again."""
+    out: list[np.ndarray] = []
+    for k, pose in enumerate(world):
+        same = k > 0 and np.array_equal(pose, world[k - 1])
+        out.append(out[-1] if same else picture.take(data, pose, view))
+    return out
 
 
 class _Picture:
@@ -178,8 +193,8 @@ class _Picture:
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self.context)
         self.scene, self.option = mujoco.MjvScene(model, 10000), mujoco.MjvOption()
         self.rect = mujoco.MjrRect(0, 0, 2 * width, 2 * height)
-        sky = np.linspace((205, 220, 235), (245, 248, 250), 2 * height).astype(np.uint8)  # top to bottom
-        self.sky = None if _has_sky(model) else np.broadcast_to(sky[:, None], (2 * height, 2 * width, 3))
+        sky = np.linspace((205, 220, 235), (245, 248, 250), height).astype(np.uint16)  # top to bottom
+        self.sky = None if _has_sky(model) else sky[:, None]
 
     def take(self, data: Any, qpos: np.ndarray, view: Any) -> np.ndarray:
         mj, rect = self.mj, self.rect
@@ -194,14 +209,19 @@ class _Picture:
         pixels = np.empty((rect.height, rect.width, 3), np.uint8)
         depth = np.empty((rect.height, rect.width), np.float32)
         mj.mjr_readPixels(pixels, depth, rect, self.context)
-        pixels, depth = pixels[::-1], depth[::-1]  # OpenGL counts rows from the bottom
-        if self.sky is not None:
-            pixels = np.where((depth >= 1.0)[..., None], self.sky, pixels)
-        fine = pixels.reshape(rect.height // 2, 2, rect.width // 2, 2, 3)
-        return fine.mean((1, 3), dtype=np.float32).astype(np.uint8)
+        fine = _sum_of_fours(pixels[::-1])  # OpenGL counts rows from the bottom
+        if self.sky is not None:  # what nothing covers is black
+            fine += _sum_of_fours(depth[::-1] >= 1.0)[..., None] * self.sky
+        return (fine // 4).astype(np.uint8)
 
     def free(self) -> None:
         self.context.free()
+
+
+def _sum_of_fours(x: np.ndarray) -> np.ndarray:
+    """Sums over 2 x 2 pixels of x [2 H, 2 W, ...]."""
+    x = x.astype(np.uint16)
+    return x[::2, ::2] + x[1::2, ::2] + x[::2, 1::2] + x[1::2, 1::2]
 
 
 def _has_sky(model: Any) -> bool:
@@ -222,33 +242,43 @@ def _grid(tiles: list[np.ndarray]) -> np.ndarray:
     return out
 
 
-def _write_over(frames: np.ndarray, text: str | Mapping | Sequence | None) -> np.ndarray:
-    """Write `text` on a light ground into the upper left corner, as many lines as leave the robot in sight."""
-    if not text:
+def _write_over(
+    frames: np.ndarray, text: str | Mapping | Sequence | None, captions: Sequence[str] | None = None
+) -> np.ndarray:
+    """Write `text` on a light ground into the upper left corner, as many lines as leave the robot in sight.
+
+    `captions` [T] is each frame's own second line.
+    """
+    if not text and not captions:
         return frames
     import matplotlib
     from PIL import Image, ImageDraw, ImageFont
 
     height, width = frames.shape[1:3]
-    size = max(10, height // 22)
+    size = max(10, height // 26)
     font = ImageFont.truetype(os.path.join(matplotlib.get_data_path(), "fonts/ttf/DejaVuSans.ttf"), size)
-    lines = _lines(text)
-    fit = max(2, int(0.4 * height / (1.3 * size)))
+    lines = _lines(text or "")
+    fit = max(2, int(0.4 * height / (1.3 * size)) - bool(captions))
     lines = lines if len(lines) <= fit else [*lines[: fit - 1], f"… {len(lines) - fit + 1} more"]
-    box = ImageDraw.Draw(Image.new("RGB", (1, 1))).multiline_textbbox((6, 4), "\n".join(lines), font=font)
-    area = (slice(None), slice(0, min(height, int(box[3]) + 5)), slice(0, min(width, int(box[2]) + 7)))
-    frames = frames.copy()
-    frames[area] = (0.35 * frames[area] + 0.65 * 255).astype(np.uint8)
-    for frame in frames:
-        image = Image.fromarray(frame)
-        ImageDraw.Draw(image).multiline_text((6, 4), "\n".join(lines), font=font, fill=(20, 20, 20))
-        frame[...] = np.asarray(image)
-    return frames
+    each = ["\n".join(lines)] if captions is None else ["\n".join([*lines[:1], c, *lines[1:]]) for c in captions]
+    ruler, place = ImageDraw.Draw(Image.new("RGB", (1, 1))), (size // 2, size // 3)
+    boxes = [ruler.multiline_textbbox(place, words, font=font) for words in {len(w): w for w in each}.values()]
+    right, low = (int(max(box[k] for box in boxes)) + size // 2 for k in (2, 3))
+    area = (slice(0, min(height, low)), slice(0, min(width, right)))
+    out = np.empty_like(frames)
+    for k, frame in enumerate(frames):
+        out[k] = frame
+        ground = Image.fromarray((0.25 * frame[area] + 0.75 * 255).astype(np.uint8))
+        ImageDraw.Draw(ground).multiline_text(place, each[k % len(each)], font=font, fill=(20, 20, 20))
+        out[k][area] = np.asarray(ground)
+    return out
 
 
 def _lines(text: str | Mapping | Sequence) -> list[str]:
+    """Lines of a text; of a mapping `name value`, the value alone where the name is `title`."""
     if isinstance(text, Mapping):
-        return [f"{k} {v:.3g}" if isinstance(v, float | np.floating) else f"{k} {v}" for k, v in text.items()]
+        values = {k: f"{v:.3g}" if isinstance(v, float | np.floating) else str(v) for k, v in text.items()}
+        return [v if k == "title" else f"{k} {v}" for k, v in values.items()]
     return text.splitlines() if isinstance(text, str) else [str(line) for line in text]
 
 

@@ -9,6 +9,7 @@ import pytest
 from bayessim_mjx import config, loop
 from bayessim_mjx.monitor import session, video
 from bayessim_mjx.monitor.console import Console
+from bayessim_mjx.monitor.film import Motion
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 
 SPACE = ParameterSpace([Parameter("mass", 1.0, 0.5, 2.0)])
@@ -37,7 +38,11 @@ def info(round_, truth=None, mean=None):
 def filmed(monkeypatch):
     """The theta of every video that is made; the model it is drawn with has to be that of theta."""
     monkeypatch.setattr(video, "model_at", lambda env, theta: float(theta[0]))
-    monkeypatch.setattr(video, "record", lambda model, qpos, **_: None if model == qpos else pytest.fail("other model"))
+
+    def record(model, qpos, *_, **__):
+        assert (model == qpos).all(), "another model"
+
+    monkeypatch.setattr(video, "record", record)
     monkeypatch.setattr(session, "policy_of", lambda train: None)
     return []
 
@@ -45,7 +50,7 @@ def filmed(monkeypatch):
 def watch(path, filmed, start=None, resumed_at=None, truth=None):
     def film(policy, length, theta):
         filmed.append(float(theta[0]))
-        return filmed[-1]
+        return Motion(np.full((1, 1), filmed[-1]), np.zeros(1), 0.1)
 
     settings = config.load("Pendulum", overrides=SETTINGS)
     return session.Session(path, settings, ENV, Console(file=io.StringIO()), film, start, resumed_at, truth)

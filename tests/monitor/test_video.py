@@ -126,3 +126,75 @@ def test_odd_sizes_become_an_mp4(tmp_path):
     frames = np.random.default_rng(0).integers(0, 255, (6, 33, 47, 3)).astype(np.uint8)
     assert video.save(frames, tmp_path / "a.mp4", 25)
     assert imageio.imread(tmp_path / "a.mp4", plugin="FFMPEG").shape == (6, 32, 46, 3)
+
+
+def letters(frame, rows):
+    """How many dark pixels there are in the upper left corner's `rows`."""
+    return int((frame[rows, : frame.shape[1] // 2].max(-1) < 90).sum())
+
+
+def test_every_frame_carries_its_own_caption_below_the_title():
+    blank = np.full((3, 240, 320, 3), 200, np.uint8)
+    frames = video._write_over(blank, {"title": "Pendulum", "mass": 1.5}, ["0.00 s", "0.10 s", ""])
+    first, second, third = (slice(3 + 13 * k, 3 + 13 * (k + 1)) for k in range(3))
+    assert all(letters(frame, first) > 20 and letters(frame, third) > 20 for frame in frames)
+    assert letters(frames[0], second) > 20 and letters(frames[2], second) == 0
+    assert (frames[0] != frames[1]).any() and (frames[:, 120:] == 200).all()
+
+
+def test_captions_follow_the_rows_that_are_picked(monkeypatch):
+    drawn = {}
+    monkeypatch.setattr(video, "_render", lambda m, worlds, w, h, c: [np.zeros((len(worlds[0]), h, w, 3), np.uint8)])
+    monkeypatch.setattr(video, "_write_over", lambda frames, text, captions: drawn.setdefault("c", captions) and frames)
+    video.record(model(PENDULUM), np.zeros((5, 1)), fps=5, dt=0.1, captions=list("abcde"))
+    assert drawn["c"] == ["a", "c"]  # half a second at 5 frames a second: seconds 0 and 0.2
+    with pytest.raises(ValueError, match="2 captions for 1 world"):
+        video.record(model(PENDULUM), np.zeros((5, 1)), captions=["a", "b"])
+
+
+class Env:
+    """Stands for an environment of our own; its episode is the trajectory below."""
+
+    dt, physics = 0.1, None
+
+
+def episode(monkeypatch, terminated):
+    from types import SimpleNamespace
+
+    from bayessim_mjx.monitor import film
+
+    rows = SimpleNamespace(
+        qpos=np.arange(6.0)[None, :, None],
+        reward=np.array([[1.0, 2.0, 0.5, 0.0, 0.0]]),
+        valid=np.array([[1.0, 1.0, 1.0, 0.0, 0.0]]),
+        terminated=np.array([[0.0, 0.0, float(terminated), 0.0, 0.0]]),
+        truncated=np.zeros((1, 5)),
+    )
+    monkeypatch.setattr(film, "rollout", lambda *_: rows)
+    monkeypatch.setattr(film.jax.tree, "map", lambda f, t: SimpleNamespace(**{k: f(v) for k, v in vars(t).items()}))
+    policy = SimpleNamespace(replace=lambda **_: None)
+    return film.motion(Env(), policy, None, np.zeros(1), 5)
+
+
+def test_a_film_counts_time_and_return_until_the_episode_ends(monkeypatch):
+    shown = episode(monkeypatch, terminated=True)
+    assert shown.qpos[:, 0].tolist() == [0, 1, 2, 3] and shown.total.tolist() == [0.0, 1.0, 3.0, 3.5]
+    assert shown.captions() == [
+        "0.00 s    return 0.00", "0.10 s    return 1.00", "0.20 s    return 3.00",
+        "0.30 s    return 3.50    terminated",
+    ]  # fmt: skip
+
+
+def test_films_have_the_size_that_is_set_and_trainings_half_of_it(monkeypatch):
+    from bayessim_mjx.monitor import film
+    from bayessim_mjx.settings import MonitorConfig
+
+    asked = []
+    monkeypatch.setattr(video, "record", lambda m, qpos, path, **more: asked.append((len(qpos), more)))
+    shown = episode(monkeypatch, terminated=True)
+    for half in (False, True):
+        film.frames(None, shown, MonitorConfig(), "Pendulum, surrogate real", {"mass": 2}, half=half)
+    assert [(more["width"], more["height"]) for _, more in asked] == [(960, 720), (480, 360)]
+    length, more = asked[0]
+    assert length == 4 + 10 == len(more["captions"])  # the last pose stays for a second
+    assert more["overlay_text"] == {"title": "Pendulum, surrogate real", "mass": 2}
