@@ -554,8 +554,8 @@ class MonitorConfig(Section):
     video: bool = setting(False, "record videos")
     video_length: int = setting(200, "control steps per video", low=1, high=COUNT)
     video_interval: int = setting(2000, "control steps of each world between videos", low=1, high=COUNT)
-    video_width: int = setting(960, "pixels across of a video; half as many in those of the training", low=64, high=7680)
-    video_height: int = setting(720, "pixels up of a video; half as many in those of the training", low=64, high=7680)
+    video_width: int = setting(960, "width of a video in pixels; half of it while training", low=64, high=7680)
+    video_height: int = setting(720, "height of a video in pixels; half of it while training", low=64, high=7680)
 
 
 @dataclass(frozen=True)
