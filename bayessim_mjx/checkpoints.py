@@ -4,6 +4,7 @@ The index holds every leaf's name, shape, dtype and SHA-256, and what the number
 (their `coordinates`): a damaged or foreign checkpoint is told from a good one.
 """
 
+import errno
 import hashlib
 import json
 import os
@@ -19,6 +20,7 @@ from bayessim_mjx.errors import UserError
 INDEX = "index.json"
 FORMAT = 1
 MADE_WITH = "use the task, version and settings that it was made with"
+MARGIN = 1 << 19  # bytes on the disk beside the arrays of a checkpoint
 
 
 class CorruptedError(UserError):
@@ -33,11 +35,15 @@ def write_json(path: Path, content: Any) -> None:
 def write_text(path: Path, text: str) -> None:
     """Replace `path` by `text` atomically: a reader sees the old file or the new one, also after a kill."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    with open(temporary, "w", encoding="utf-8") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(temporary, path)
+    try:
+        with open(temporary, "w", encoding="utf-8") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except OSError:
+        temporary.unlink(missing_ok=True)
+        raise
 
 
 def save(path: Path, tree: Any, step: int, meta: Mapping[str, Any]) -> None:
@@ -48,10 +54,23 @@ def save(path: Path, tree: Any, step: int, meta: Mapping[str, Any]) -> None:
     shutil.rmtree(temporary, ignore_errors=True)
     temporary.mkdir(parents=True)
     parts = jax.device_get(_whole(tree if type(tree) is dict else {"tree": tree}))
+    _need(temporary, sum(np.asarray(leaf).nbytes for leaf in jax.tree.leaves(parts)))
     leaves = {name: _save_part(temporary / name, part) for name, part in parts.items()}
     index = {"format": FORMAT, "step": int(step), "meta": dict(meta), "coordinates": _coordinates(parts)}
-    write_json(temporary / INDEX, {**index, "parts": leaves})
+    index["parts"] = leaves
+    write_json(temporary / INDEX, {**index, "sha256": _digest(index)})
     os.rename(temporary, path)
+
+
+def _need(folder: Path, size: int) -> None:
+    """Refuse to begin what the disk has no room for: Orbax would fail in all of its threads at once."""
+    if shutil.disk_usage(folder).free < size + MARGIN:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder))
+
+
+def _digest(content: Any) -> str:
+    """Of an index without its own: a changed name or shape is damage, not another task's checkpoint."""
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 def _whole(tree: Any) -> Any:
@@ -119,10 +138,13 @@ def read_index(path: Path) -> dict[str, Any]:
     """The index of the checkpoint `path`; CorruptedError where there is none."""
     try:
         index = json.loads((path / INDEX).read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise CorruptedError(f"{path}: not a checkpoint, or damaged: {INDEX}: {error}") from None
     if not isinstance(index, dict) or index.get("format") != FORMAT or "parts" not in index:
         raise CorruptedError(f"{path / INDEX}: not a checkpoint index of format {FORMAT}")
+    digest = index.pop("sha256", None)  # checkpoints of earlier versions have none
+    if digest is not None and digest != _digest(index):
+        raise CorruptedError(f"{path / INDEX}: damaged checkpoint index: it differs from its checksum")
     parts = index["parts"]
     if not (isinstance(parts, dict) and isinstance(index.get("meta"), dict)):
         raise CorruptedError(f"{path / INDEX}: damaged checkpoint index: parts and meta have to be objects")

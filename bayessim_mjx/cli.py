@@ -11,6 +11,7 @@ import signal
 import sys
 import tempfile
 import threading
+import traceback
 import types
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -18,12 +19,13 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 from bayessim_mjx import trust
 from bayessim_mjx.config import Config, load, replace, unknown
-from bayessim_mjx.errors import UserError
+from bayessim_mjx.errors import UserError, disk_is_full, refused
 
 if TYPE_CHECKING:
     from bayessim_mjx.runs import Run
 
 DEBUG_VARIABLE = "BAYESSIM_MJX_DEBUG"  # set: errors come with a traceback
+BUGS = "to the issue tracker of bayessim_mjx"
 
 
 def whole(low: int, high: int) -> Callable[[str], int]:
@@ -165,6 +167,12 @@ def resumed_config(args: argparse.Namespace, config: Config) -> Config:
     top = {k: getattr(args, k) for k in ("device", "devices", "cache_dir") if getattr(args, k) is not None}
     monitor = dataclasses.replace(config.monitor, **video)
     return dataclasses.replace(config, monitor=monitor, **top)
+
+
+def say_changes(run: "Run", console: Any) -> None:
+    """Warn of all that is not as it was when the run to go on with was started; its manifest keeps it."""
+    for text in run.resumed():
+        console.warning(f"changed since the run was started: {text}")
 
 
 def task_name(name: str) -> str:
@@ -320,36 +328,62 @@ def first_writes(config: Config, run: "Run | None") -> Iterator[tuple[Config, "R
 
 @contextlib.contextmanager
 def running(run: "Run", say: Callable[[str], Any]) -> Iterator[None]:
-    """The run's status: running while inside; then finished, interrupted (Ctrl-C) or failed (any error)."""
-    run.set_status("running")
+    """The run's status: running while inside; then finished, interrupted (Ctrl-C) or failed (any error; `error`)."""
     try:
+        run.set_status("running")
         yield
+        run.set_status("finished")
     except KeyboardInterrupt:
         run.set_status("interrupted")
         say(f"interrupted; go on with --resume {run.path}")
         raise
-    except Exception:
-        with contextlib.suppress(OSError):  # a full disk must not hide the first error
-            run.set_status("failed")
+    except Exception as error:
+        full = disk_is_full(error)
+        with contextlib.suppress(OSError):  # what cannot be written must not hide the first error
+            run.set_status("failed", "the disk is full" if full else f"{type(error).__name__}: {error}")
+        if full:
+            why = _one_line(error)
+            advice = f"make room and go on with --resume {run.path}"
+            raise UserError(f"{run.path}: the disk is full ({why}); {advice}") from error
         raise
-    run.set_status("finished")
 
 
 def command(run: Callable[[Sequence[str] | None], int]) -> Callable[..., int]:
-    """A `main(argv=None)` that returns an exit code: 2 and one line on stderr for a user's error, 130 after Ctrl-C."""
+    """A `main(argv=None)` that returns an exit code.
+
+    0; 2 and one line on stderr for what the user can mend; 1 and a traceback for a bug; 130 after Ctrl-C.
+    """
 
     def main(argv: Sequence[str] | None = None) -> int:
         try:
             return run(argv)
-        except (ValueError, FloatingPointError) as error:
-            if os.environ.get(DEBUG_VARIABLE):
-                raise
-            print(f"error: {error}", file=sys.stderr)
-            return 2
         except KeyboardInterrupt:
             return 130
+        except BrokenPipeError:  # `... | head`: nobody reads on
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return 1
         except SystemExit as end:  # --help
-            return int(end.code or 0)
+            if end.code in (None, 0):
+                return 0
+            return _bug()
+        except Exception as error:
+            if os.environ.get(DEBUG_VARIABLE):
+                raise
+            if not isinstance(error, UserError) and not refused(error):
+                return _bug()
+            print(f"error: {_one_line(error)}", file=sys.stderr)
+            return 2
 
     main.__doc__ = run.__doc__
     return main
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split("\n"))
+
+
+def _bug() -> int:
+    """The traceback of the present error, and what to do with it."""
+    traceback.print_exc()
+    print(f"\nThis is a bug: please report it with the lines above and your command, {BUGS}", file=sys.stderr)
+    return 1

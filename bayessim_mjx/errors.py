@@ -1,5 +1,34 @@
 """Errors that are the user's to mend: the commands print them in one line, without a traceback."""
 
+import errno
+
+# What the system refuses for reasons outside of this program: the disk is full, a folder may not be written, a name is
+# too long. (An OSError of another kind, such as a file that ought to be there, is a bug.)
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_REFUSED = (*_FULL, errno.EROFS, errno.EACCES, errno.EPERM, errno.ENAMETOOLONG, errno.EMFILE, errno.ENFILE, errno.EIO)
+_WORDS = ("no space left", "disk quota", "file too large")  # of libraries that report it as an error of their own
+
 
 class UserError(ValueError):
     """Bad input. The message names the value, where it came from (file, flag, key) and what is allowed."""
+
+
+class DivergedError(UserError, FloatingPointError):
+    """Numbers are no longer finite, under settings that the user can change."""
+
+
+def disk_is_full(error: BaseException) -> bool:
+    """Whether the error, or one that caused it, says that nothing more can be written."""
+    seen: BaseException | None = error
+    while seen is not None:
+        text = str(seen).lower()
+        if (isinstance(seen, OSError) and seen.errno in _FULL) or any(word in text for word in _WORDS):
+            return True
+        seen = seen.__cause__ or seen.__context__
+    return False
+
+
+def refused(error: BaseException) -> bool:
+    """Whether the system refused to read or write a file, or has not the memory that was asked for."""
+    memory = isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error)
+    return memory or (isinstance(error, OSError) and error.errno in _REFUSED) or disk_is_full(error)

@@ -79,6 +79,8 @@ def _run(config: Config, run: Any, device: Any, command: Sequence[str], console:
     state, resumed_at = _state(parts, run)
     if run is None:
         run = runs.Run.create(config.logdir, config.task, config.name, config, command)
+    else:
+        cli.say_changes(run, console)
     console.say(f"run folder {run.path}")
     with cli.running(run, console.say):
         if int(state.round) >= config.bayessim.realIters:

@@ -1,13 +1,16 @@
 """Run folders: `<logdir>/<Task>/<timestamp>[_<name>]/` with params/, command.txt, checkpoints/ and run.json.
 
 The manifest is the only source of "latest" and "best". It is replaced atomically after a checkpoint is complete, so a
-kill at any moment leaves a run that can be opened; folders that it does not list are leftovers and are ignored.
+kill at any moment leaves a run that can be opened; folders that it does not list are leftovers and are ignored. Its
+paths lie in `checkpoints/`: a manifest from elsewhere cannot reach beyond its run.
 """
 
 import datetime
 import json
 import math
+import os
 import platform
+import re
 import shlex
 import shutil
 import subprocess
@@ -22,7 +25,10 @@ from bayessim_mjx.errors import UserError
 
 MANIFEST = "run.json"
 SCHEMA = 1
+FOLDER = "checkpoints"
 DAMAGED = ".damaged"
+OURS = re.compile(r"\d+(-\d+)?(\.\d+\.tmp)?")  # folders that `save` makes
+RESERVE, RESERVED = ".reserve", 1 << 16  # bytes given up on a full disk, so that the manifest can say so
 KEEP = 3  # newest checkpoints kept beside the best
 PACKAGES = ("bayessim-mjx", "jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy", "optax", "flax", "orbax-checkpoint")
 
@@ -44,19 +50,28 @@ class Run:
     ) -> "Run":
         """Make a new folder (never an existing one) with the resolved settings, the command and a manifest."""
         path = _new_folder(Path(logdir) / _folder_name(task), name)
+        try:
+            return cls._filled(path, task, name, settings, sys.argv if command is None else command)
+        except OSError as error:
+            shutil.rmtree(path, ignore_errors=True)
+            raise UserError(f"logdir: cannot write {path}: {error.strerror}") from None
+
+    @classmethod
+    def _filled(cls, path: Path, task: str, name: str, settings: config.Config, command: Sequence[str] | str) -> "Run":
         plain = settings.to_dict()
         train = {"ppo": plain.pop("ppo")}
         (path / "params").mkdir()
         (path / "params" / "env.yaml").write_text(config.to_yaml(plain), encoding="utf-8")
         (path / "params" / "train.yaml").write_text(config.to_yaml(train), encoding="utf-8")
-        command = sys.argv if command is None else command
         text = command if isinstance(command, str) else shlex.join(command)
         (path / "command.txt").write_text(text + "\n", encoding="utf-8")
         run = cls(path, {
             "schema": SCHEMA, "task": task, "name": name, "created": _now(), "status": "running", "command": text,
-            "versions": versions(), "git": git_state(), "checkpoints": [], "best": None, "latest": None,
+            "versions": versions(), "git": git_state(), "settings": settings.to_dict(),
+            "checkpoints": [], "best": None, "latest": None,
         })  # fmt: skip
         run._write()
+        run._reserve()
         return run
 
     @classmethod
@@ -68,7 +83,7 @@ class Run:
             raise UserError(f"{path}: not a run folder (no {MANIFEST} in it)")
         try:
             manifest = json.loads(file.read_text(encoding="utf-8"))
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, RecursionError) as error:
             raise UserError(f"{file}: damaged manifest: {type(error).__name__}: {error}") from None
         schema = manifest.get("schema") if isinstance(manifest, dict) else None
         if type(schema) is int and schema != SCHEMA:
@@ -88,10 +103,33 @@ class Run:
         """Entries {step, path, evaluation, kind}, oldest first."""
         return self.manifest["checkpoints"]
 
-    def set_status(self, status: str) -> None:
-        """running, finished, interrupted (Ctrl-C) or failed (an error)."""
-        self.manifest["status"] = status
+    def set_status(self, status: str, error: str | None = None) -> None:
+        """running, finished, interrupted (Ctrl-C) or failed (an `error`), also where the disk is full."""
+        self.manifest.pop("error", None)
+        self.manifest.update({"status": status} if error is None else {"status": status, "error": error})
+        if status == "failed":
+            (self.path / RESERVE).unlink(missing_ok=True)
+            self._sweep()  # half a checkpoint may be what filled the disk
         self._write()
+        if status == "running":
+            self._reserve()
+
+    def changes(self) -> list[str]:
+        """What is not as it was when the run was started: settings that were edited, versions, the code's commit."""
+        now, found = {"settings": self.config.to_dict(), "versions": versions(), "git": git_state()}, []
+        for key, title in (("settings", ""), ("versions", "version of "), ("git", "git ")):
+            then = self.manifest.get(key)
+            if isinstance(then, Mapping):  # earlier versions did not write them
+                found += [title + text for text in _differences(then, json.loads(json.dumps(now[key] or {})))]
+        return found
+
+    def resumed(self) -> list[str]:
+        """Note in the manifest that the run goes on, and on what; returns `changes`."""
+        found = self.changes()
+        entry = {"at": _now(), "from": self.manifest["latest"], "versions": versions(), "changed": found}
+        self.manifest["resumed"] = [*self.manifest.get("resumed", ()), entry]
+        self._write()
+        return found
 
     def save(
         self,
@@ -107,9 +145,9 @@ class Run:
         `supersede`: earlier evaluations were of something else and no longer compete.
         """
         score = None if evaluation is None or not math.isfinite(evaluation) else float(evaluation)
-        folder = self.path / "checkpoints"
+        folder = self.path / FOLDER
         folder.mkdir(exist_ok=True)
-        self._sweep(folder)
+        self._sweep()
         path = _free(folder / f"{int(step):09d}")
         checkpoints.save(path, tree, step, meta or {})
         kind = "periodic" if evaluation is None else "evaluated"
@@ -120,7 +158,7 @@ class Run:
         kept = [c for i, c in enumerate(listed) if i >= len(listed) - self.keep or c["step"] == best]
         self.manifest.update(checkpoints=kept, latest=int(step), best=best)
         self._write()
-        self._sweep(folder)
+        self._sweep()
         return path
 
     def checkpoint(self, which: str | int) -> Path:
@@ -151,18 +189,28 @@ class Run:
             print(f"note: {error}; going on from the checkpoint of step {older[-1]['step']}", file=sys.stderr)
             self.manifest.update(checkpoints=older, latest=older[-1]["step"], best=_best(older))
             self._write()
-            if path.exists():
+            if path.exists() and not (path.is_symlink() or path.parent.is_symlink()):
                 path.rename(_free(path.with_name(path.name + DAMAGED)))
             return self.restore("latest", template, fall_back=True)
 
     def _write(self) -> None:
         checkpoints.write_json(self.path / MANIFEST, self.manifest)
 
-    def _sweep(self, folder: Path) -> None:
-        """Remove what the manifest does not list: dropped checkpoints and halves left by a kill. Damaged ones stay."""
-        listed = {Path(c["path"]).name for c in self.checkpoints}
+    def _reserve(self) -> None:
+        path = self.path / RESERVE
+        if not path.exists():
+            path.write_bytes(os.urandom(RESERVED))  # not zeros: a file system may keep them as nothing
+
+    def _sweep(self) -> None:
+        """Remove what the manifest does not list: dropped checkpoints and halves left by a kill. Damaged ones stay.
+
+        Only folders that `save` made, and nothing behind a link: what lies there belongs to somebody else.
+        """
+        folder, listed = self.path / FOLDER, {Path(c["path"]).name for c in self.checkpoints}
+        if folder.is_symlink() or not folder.is_dir():
+            return
         for path in folder.iterdir():
-            if path.name not in listed and DAMAGED not in path.name:
+            if OURS.fullmatch(path.name) and path.name not in listed and not path.is_symlink():
                 shutil.rmtree(path, ignore_errors=True)
 
 
@@ -178,12 +226,29 @@ def _fault(manifest: Any) -> str | None:
         score = entry.get("evaluation", "") if ok else ""
         if not ok or isinstance(score, bool) or not isinstance(score, int | float | None):
             return f"checkpoints: {entry!r}"
+        if not _inside(entry["path"]):
+            return f"checkpoints: path = {entry['path']!r}; allowed: {FOLDER}/<name>"
     steps = [entry["step"] for entry in manifest["checkpoints"]]
     for key in ("latest", "best"):
         step = manifest.get(key, "absent")
         if step is not None and (type(step) is not int or step not in steps):
             return f"{key} = {step!r} is none of the checkpoints {steps}"
     return None
+
+
+def _inside(path: str) -> bool:
+    """Whether a manifest's path names a folder of the run's own checkpoints."""
+    parts = path.split("/")
+    return len(parts) == 2 and parts[0] == FOLDER and parts[1] not in ("", ".", "..") and "\\" not in path
+
+
+def _differences(then: Any, now: Any, path: str = "") -> list[str]:
+    """`ppo.gamma: 0.9, was 0.99` for every leaf of nested mappings that differs."""
+    if isinstance(then, Mapping) and isinstance(now, Mapping):
+        keys = dict.fromkeys([*then, *now])
+        inner = [(f"{path}.{key}".lstrip("."), then.get(key), now.get(key)) for key in keys]
+        return [text for at, a, b in inner for text in _differences(a, b, at)]
+    return [] if then == now else [f"{path}: {now}, was {then}"]
 
 
 def _best(listed: Sequence[Mapping[str, Any]]) -> int | None:

@@ -183,6 +183,8 @@ def _run(config: Config, run: Any, command: Sequence[str], headless: bool) -> in
         resume = run is not None
         if run is None:
             run = runs.Run.create(config.logdir, config.task, config.name, config, command)
+        else:
+            cli.say_changes(run, console)
         console.say(f"run folder {run.path}")
         with cli.running(run, console.say):
             training = Training(config, env, run, console, stop)

@@ -1,8 +1,10 @@
 """The commands, called in this process: bad input is one line and exit code 2, a killed run goes on bit for bit."""
 
 import collections
+import errno
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -17,8 +19,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from bayessim_mjx import cli, config, main, play, registry, train
+from bayessim_mjx import checkpoints, cli, config, main, play, registry, train
 from bayessim_mjx.env import Env, State
+from bayessim_mjx.errors import DivergedError, UserError
 from bayessim_mjx.monitor.writer import event_files, records
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 from bayessim_mjx.runs import Run, latest_run
@@ -270,18 +273,37 @@ def test_ctrl_c_after_the_last_iteration_still_evaluates_it(toy: None, monkeypat
     assert run.manifest["status"] == "finished" and run.checkpoints[-1]["evaluation"] is not None
 
 
-@pytest.mark.parametrize("error", [FloatingPointError("the loss is not finite"), RuntimeError("out of memory")])
-def test_a_run_that_fails_says_so(toy: None, monkeypatch: Any, error: Exception) -> None:
+@pytest.mark.parametrize("error", [DivergedError("the loss is not finite"), ValueError("math domain error")])
+def test_a_run_that_fails_says_so(toy: None, monkeypatch: Any, capsys: Any, error: Exception) -> None:
     def fail(self: train.Training, state: Any) -> float:
         raise error
 
     monkeypatch.setattr(train.Training, "evaluate", fail)
-    if isinstance(error, RuntimeError):  # a fault of ours keeps its traceback
-        with pytest.raises(RuntimeError):
-            train.main(["--task", "Pendulum", *SMALL])
-    else:
-        assert train.main(["--task", "Pendulum", *SMALL]) == 2
-    assert latest_run("logs", "Pendulum", with_checkpoint=False).manifest["status"] == "failed"
+    users = isinstance(error, UserError)
+    assert train.main(["--task", "Pendulum", *SMALL]) == (2 if users else 1)
+    err = capsys.readouterr().err
+    assert ("Traceback" in err and "please report it" in err) != users  # a fault of ours keeps its traceback
+    manifest = latest_run("logs", "Pendulum", with_checkpoint=False).manifest
+    assert manifest["status"] == "failed" and manifest["error"] == f"{type(error).__name__}: {error}"
+
+
+def test_only_what_the_user_can_mend_is_one_line(capsys: pytest.CaptureFixture) -> None:
+    """Exit codes: 2 for a user's error and for what the system refuses, 1 with the traceback for a bug."""
+
+    def ends(error: BaseException) -> tuple[int, str]:
+        def run(argv: Any) -> int:
+            raise error
+
+        return cli.command(run)([]), capsys.readouterr().err
+
+    assert ends(UserError("x = 3:\nallowed: 4")) == (2, "error: x = 3: allowed: 4\n")
+    assert ends(PermissionError(errno.EACCES, "Permission denied", "out")) == (
+        2, f"error: [Errno {errno.EACCES}] Permission denied: 'out'\n",
+    )  # fmt: skip
+    assert ends(KeyboardInterrupt())[0] == 130 and ends(SystemExit(0)) == (0, "")
+    for bug in (ValueError("math domain error"), FloatingPointError("x"), KeyError("k"), SystemExit("bye")):
+        code, err = ends(bug)
+        assert code == 1 and "Traceback" in err and "please report it" in err.splitlines()[-1]
 
 
 def test_main_stops_only_after_the_rounds_checkpoint() -> None:
@@ -299,6 +321,43 @@ def test_main_stops_only_after_the_rounds_checkpoint() -> None:
         watched.save(5, {"state": types.SimpleNamespace(round=1)}, meta={})
     watched.save(10, {"state": types.SimpleNamespace(round=2)}, meta={})  # the last round: nothing is left to stop
     assert calls == ["round", (5, 7), (10, 7)]
+
+
+def test_a_full_disk_ends_the_run_cleanly_and_it_goes_on(toy: None, monkeypatch: Any, capsys: Any) -> None:
+    """The disk fills up before the second checkpoint; with room again the run ends as one that never stopped."""
+    argv = ["--task", "Pendulum", *SMALL]
+    assert train.main([*argv, "--logdir", "whole"]) == 0
+    free, saves = shutil.disk_usage("."), iter([0])
+    with monkeypatch.context() as patch:
+        usage = lambda path: free if next(saves, None) == 0 else free._replace(free=4096)  # noqa: E731
+        patch.setattr(checkpoints.shutil, "disk_usage", usage)
+        assert "the disk is full" in error_of(capsys, train.main, *argv, "--logdir", "full")
+    run = latest_run("full", "Pendulum")
+    assert (run.manifest["status"], run.manifest["error"], run.manifest["latest"]) == ("failed", "the disk is full", 2)
+    assert len(list((run.path / "checkpoints").iterdir())) == 1 and not (run.path / ".reserve").exists()
+    assert train.main(["--resume", str(run.path)]) == 0
+    resumed = Run.open(run.path)
+    assert resumed.manifest["status"] == "finished" and "error" not in resumed.manifest
+    assert checkpoint_of(resumed, 4) == checkpoint_of(latest_run("whole", "Pendulum"), 4)
+    assert not repeated_events(resumed)
+
+
+def test_resume_says_what_changed_since(toy: None, capsys: pytest.CaptureFixture) -> None:
+    assert train.main(["--task", "Pendulum", *SMALL]) == 0
+    run = latest_run("logs", "Pendulum")
+    assert train.main(["--resume", str(run.path)]) == 0
+    assert "changed since" not in capsys.readouterr().out
+    file = run.path / "params" / "train.yaml"
+    gamma = run.config.ppo.gamma
+    file.write_text(file.read_text().replace(f"gamma: {gamma}\n", "gamma: 0.5\n"))
+    manifest = json.loads((run.path / "run.json").read_text())
+    manifest["versions"]["jax"] = "0.0.1"
+    (run.path / "run.json").write_text(json.dumps(manifest))
+    assert train.main(["--resume", str(run.path)]) == 0
+    out = " ".join(capsys.readouterr().out.split())
+    told = [f"ppo.gamma: 0.5, was {gamma}", f"version of jax: {jax.__version__}, was 0.0.1"]
+    assert all(f"warning: changed since the run was started: {text}" in out for text in told), out
+    assert Run.open(run.path).manifest["resumed"][-1]["changed"] == told
 
 
 def test_resume_keeps_the_runs_settings(toy: None, capsys: pytest.CaptureFixture) -> None:

@@ -122,6 +122,52 @@ def test_leftovers_of_a_kill_are_ignored_and_swept(run: Run) -> None:
     assert sorted(p.name for p in folder.iterdir()) == sorted(Path(c["path"]).name for c in opened.checkpoints)
 
 
+@pytest.mark.parametrize(
+    "path",
+    ["/elsewhere", "../elsewhere", "checkpoints/../../elsewhere", "checkpoints/..", "checkpoints", "x/000000001"],
+)
+def test_a_manifest_cannot_name_what_lies_outside_of_its_run(run: Run, tmp_path: Path, path: str) -> None:
+    """A foreign run.json once had any folder that it named renamed, as a damaged checkpoint."""
+    outside = run.path / ".." / "elsewhere"
+    outside.mkdir()
+    run.save(1, tree())
+    manifest = json.loads((run.path / "run.json").read_text())
+    manifest["checkpoints"][0]["path"] = str(outside.resolve()) if path == "/elsewhere" else path
+    (run.path / "run.json").write_text(json.dumps(manifest))
+    with pytest.raises(UserError, match=r"run\.json: damaged manifest: checkpoints: path = .*checkpoints/<name>"):
+        Run.open(run.path)
+    assert outside.is_dir()
+
+
+def test_what_lies_behind_a_link_is_not_swept(run: Run, tmp_path: Path) -> None:
+    """Nor what `save` did not make."""
+    foreign = tmp_path / "foreign" / "000000009"
+    foreign.mkdir(parents=True)
+    (foreign / "thesis.tex").write_text("x")
+    (run.path / "checkpoints").symlink_to(foreign.parent)
+    run.save(1, tree(1))
+    run.save(2, tree(2))
+    assert (foreign / "thesis.tex").is_file() and run.manifest["latest"] == 2
+    (run.path / "checkpoints").unlink()
+    (run.path / "checkpoints" / "notes").mkdir(parents=True)
+    (run.path / "checkpoints" / "000000007").symlink_to(foreign)
+    (run.path / "checkpoints" / "000000008").mkdir()
+    run.save(3, tree(3))
+    left = {p.name for p in (run.path / "checkpoints").iterdir()}
+    assert left == {"notes", "000000003", "000000007"} and (foreign / "thesis.tex").is_file()
+
+
+@pytest.mark.parametrize(("key", "value"), [("shape", [2, 2]), ("dtype", "int8"), ("name", "v.0"), ("step", 7)])
+def test_an_index_that_was_changed_is_damage_not_another_task(run: Run, key: str, value: object, capsys: Any) -> None:
+    run.save(1, tree(1))
+    path = run.save(2, tree(2))
+    index = json.loads((path / "index.json").read_text())
+    (index if key == "step" else index["parts"]["policy"][0])[key] = value
+    (path / "index.json").write_text(json.dumps(index))
+    assert same_bits(run.restore("latest", tree(0), fall_back=True)[0], tree(1))
+    assert "damaged checkpoint index: it differs from its checksum" in capsys.readouterr().err
+
+
 def test_same_step_again_replaces_the_old_one(run: Run) -> None:
     run.save(5, tree(1), evaluation=1.0)
     run.save(5, tree(2), evaluation=0.5)

@@ -8,17 +8,20 @@ import math
 import os
 import struct
 import sys
+import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+FLUSH = 10.0  # s
 PurgeStep = int | Mapping[str, int] | None
 
 
 def records(path: Path) -> Iterator[tuple[bytes, Any]]:
-    """Yield (raw record with its checksums, `Event`) of one event file; one cut short by a kill ends it quietly."""
+    """Yield (raw record with its checksums, `Event`) of one event file; one cut short or damaged ends it quietly."""
+    from google.protobuf.message import DecodeError
     from tensorboardX.proto.event_pb2 import Event
 
     data = path.read_bytes()
@@ -28,7 +31,11 @@ def records(path: Path) -> Iterator[tuple[bytes, Any]]:
         end = at + 12 + length + 4
         if end > len(data):
             return
-        yield data[at:end], Event.FromString(data[at + 12 : end - 4])
+        try:
+            event = Event.FromString(data[at + 12 : end - 4])
+        except DecodeError:
+            return
+        yield data[at:end], event
         at = end
 
 
@@ -41,9 +48,12 @@ def purge(folder: str | os.PathLike, step: int | Mapping[str, int]) -> int:
     """Take events at or after `step` out of the event files in `folder`; returns how many went.
 
     `step` is one number, or {tag prefix: number} where tags count different things (`{"BayesSim": 3, "Train": 600}`);
-    tags without a matching prefix stay, and "" is a prefix of every tag. Files are replaced atomically.
+    tags without a matching prefix stay, and "" is a prefix of every tag. Files are replaced atomically; a folder
+    that is a link stays as it is.
     """
     dropped = 0
+    if Path(folder).is_symlink():
+        return 0
     for path in event_files(folder):
         old = list(records(path))
         kept = [raw for raw, event in old if not _is_late(event, step)]
@@ -73,9 +83,9 @@ class Writer:
         media: folder for the pictures and videos that are shown, as plain files; None: `path/media`.
     """
 
-    def __init__(self, path: str | os.PathLike, purge_step: PurgeStep = None, media: str | os.PathLike | None = None):
-        from tensorboardX import SummaryWriter
+    _closed = False
 
+    def __init__(self, path: str | os.PathLike, purge_step: PurgeStep = None, media: str | os.PathLike | None = None):
         self.path = Path(path)
         self.media = Path(media) if media is not None else self.path / "media"
         if purge_step is not None:
@@ -83,20 +93,27 @@ class Writer:
         # A file's name holds whole seconds only: without a suffix a quick restart would overwrite the file before it.
         suffix = f".{len(event_files(self.path)):04d}"
         single = purge_step if isinstance(purge_step, int | None) else purge_step.get("")
-        self._writer = SummaryWriter(str(self.path), purge_step=single, filename_suffix=suffix, flush_secs=10)
+        self._file = _file(self.path, suffix)
+        self._flushed = time.monotonic()
+        if single is not None:
+            self._event(int(single), session_log={"status": 1})  # START: readers drop later events of earlier files
 
     def scalars(self, step: int, values: Mapping[str, Any], prefix: str = "") -> None:
         """Write {tag: number} (Python, NumPy or device scalars) at `step`. None and NaN are left out."""
         for tag, value in values.items():
             number = _number(prefix + tag, value)
             if number is not None:
-                self._writer.add_scalar(prefix + tag, number, int(step))
+                from tensorboardX.summary import scalar
+
+                self._event(int(step), summary=scalar(prefix + tag, number))
 
     def text(self, tag: str, text: str, step: int = 0, code: bool = False) -> None:
         """Write Markdown; `code` shows it as it is, line for line (a YAML file, say)."""
         if code:
             text = "\n".join("    " + line for line in text.splitlines())
-        self._writer.add_text(tag, text, int(step))
+        from tensorboardX.summary import text as text_of
+
+        self._event(int(step), summary=text_of(tag, text))
 
     def figure(self, tag: str, figure: Any, step: int) -> None:
         """Write a matplotlib figure as PNG at its own dpi, keep the file, and close the figure."""
@@ -118,11 +135,13 @@ class Writer:
         self._keep(tag, step, ".mp4", lambda path: video.save(frames, path, fps))
 
     def flush(self) -> None:
-        self._writer.flush()
+        self._file.flush()
 
     def close(self) -> None:
-        """Write what is still queued and close the event file; a second call does nothing."""
-        self._writer.close()
+        """Write what is not yet on the disk and close the event file; a second call does nothing."""
+        if not self._closed:
+            self._closed = True  # also where that fails: it is not tried twice
+            self._file.close()
 
     def __enter__(self) -> "Writer":
         return self
@@ -136,12 +155,29 @@ class Writer:
 
         width, height = Image.open(io.BytesIO(encoded)).size
         image = Summary.Image(height=height, width=width, colorspace=3, encoded_image_string=encoded)
-        self._writer.file_writer.add_summary(Summary(value=[Summary.Value(tag=tag, image=image)]), int(step))
+        self._event(int(step), summary=Summary(value=[Summary.Value(tag=tag, image=image)]))
+
+    def _event(self, step: int, **content: Any) -> None:
+        """Write one event, here and now: a full disk is this call's error, where a thread's would be lost."""
+        from tensorboardX.proto.event_pb2 import Event
+
+        self._file.write_event(Event(wall_time=time.time(), step=step, **content))
+        if time.monotonic() - self._flushed > FLUSH:
+            self._flushed = time.monotonic()
+            self._file.flush()
 
     def _keep(self, tag: str, step: int, suffix: str, write: Callable[[Path], Any]) -> None:
         self.media.mkdir(parents=True, exist_ok=True)
         name = "".join(c if c.isalnum() or c in "._-" else "_" for c in tag)
         write(self.media / f"{name}_{int(step):06d}{suffix}")
+
+
+def _file(folder: Path, suffix: str) -> Any:
+    """A new event file; to be written, flushed and closed."""
+    from tensorboardX.event_file_writer import EventsWriter
+
+    folder.mkdir(parents=True, exist_ok=True)
+    return EventsWriter(str(folder / "events"), suffix)
 
 
 def _number(tag: str, value: Any) -> float | None:

@@ -15,6 +15,7 @@ from jax.sharding import Mesh
 
 from bayessim_mjx.config import PPOConfig
 from bayessim_mjx.device import cores
+from bayessim_mjx.errors import DivergedError
 from bayessim_mjx.rl import distil, ppo, sharding
 from bayessim_mjx.rl.networks import Policy
 from bayessim_mjx.rl.ppo import TrainState
@@ -107,7 +108,7 @@ def run(
 
     The host sees metrics every config.log_interval updates, Loss/* averaged over them, and then calls
     progress(metrics, state). That state's buffers are reused by the next interval: copy what is to be kept.
-    FloatingPointError where the loss is no longer finite. With a `teacher` its actions are imitated, see `distil`.
+    DivergedError where the loss is no longer finite. With a `teacher` its actions are imitated, see `distil`.
     """
     total = config.max_iterations if iterations is None else iterations
     state = sharding.put(state, state.mesh, ppo.layout(state))  # the caller's state stays valid
@@ -121,7 +122,7 @@ def run(
         seconds = time.perf_counter() - start
         done += count
         if not np.isfinite(sum(metrics[tag] for tag in LOSSES if tag in metrics)):
-            raise FloatingPointError(
+            raise DivergedError(
                 f"the loss is not finite after iteration {int(state.iteration)} ({metrics}): check that the task's "
                 "observations and rewards stay finite over the whole domain, and lower ppo.learning_rate"
             )
