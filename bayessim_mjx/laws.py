@@ -16,7 +16,7 @@ ALIASES = {
     "direct": "direct", "torque": "direct", "force": "direct", "effort": "direct", "voltage": "direct",
     "duty": "direct", "position": "position", "pd": "position", "p": "position", "velocity": "velocity",
 }  # fmt: skip
-KEYS = ("law", "kp", "kd", "limit", "scale")
+KEYS = ("law", "kp", "kd", "limit", "scale", "note")  # note: for people
 
 
 class Law(struct.PyTreeNode):
@@ -97,17 +97,27 @@ def _of_actuator(given: Mapping[str, Any], name: str, actuators: Sequence[str], 
         if key not in actuators:
             raise UserError(f"{source}: controller.{key}: no such actuator; {suggest(str(key), actuators)}")
     own = {**{k: v for k, v in given.items() if k not in blocks}, **blocks.get(name, {})}
+    for key in own:
+        if key not in KEYS:
+            raise UserError(f"{source}: controller.{key}: {suggest(str(key), [*KEYS, *actuators])}")
     law = str(own.get("law", "direct")).lower()
     if law not in ALIASES:
-        law = "direct"  # a note for people ("firmware P, inside the logged duty") is not a law to be simulated
+        hint = f"{suggest(law, ALIASES)} (words for people belong in controller.note)"
+        raise UserError(f"{source}: controller.law = {own['law']!r}: {hint}")
     row: dict[str, Any] = {"law": ALIASES[law], "kp": 0.0, "kd": 0.0, "limit": np.inf, "scale": 1.0}
     for key in ("kp", "kd", "limit", "scale"):
-        if own.get(key) is None or (ALIASES[law] == "direct" and key != "scale"):
+        if own.get(key) is None:
             continue
+        if ALIASES[law] == "direct" and key != "scale":
+            raise UserError(
+                f"{source}: controller.{key} = {own[key]!r} without a loop; allowed: law: position or velocity"
+            )
         try:
             row[key] = float(own[key])
         except (TypeError, ValueError):
             raise UserError(f"{source}: controller.{key} = {own[key]!r}; allowed: a number") from None
+        if isinstance(own[key], bool) or not (np.isfinite(row[key]) or (key == "limit" and row[key] > 0)):
+            raise UserError(f"{source}: controller.{key} = {own[key]!r}; allowed: a finite number")
     if row["law"] != "direct" and not row["kp"] > 0:
         raise UserError(f"{source}: controller.law = {row['law']} of actuator {name!r} needs kp > 0, has {row['kp']:g}")
     return row

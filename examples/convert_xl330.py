@@ -39,7 +39,7 @@ def _convert(path: Path, out: Path) -> Path:
     np.savetxt(target, np.stack(list(columns.values()), 1), "%.9g", ",", header=",".join(columns), comments="")
     side = {
         "operating_condition": f"kp{run['kp']}",
-        "controller": {"law": "firmware P on the goal, inside the logged duty", "kp": run["kp"]},
+        "controller": {"law": "voltage", "note": f"firmware P on the goal, gain {run['kp']}, inside the logged duty"},
         "payload": {"mass": run["mass"], "length": run["length"]},
         "source_file": path.name,
     }

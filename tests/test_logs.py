@@ -132,13 +132,91 @@ quantum: {"qpos:shoulder": 0.12}
     for text, words in (
         ("sigma: {elbw: 1}", ("sigma.elbw", "'qpos:elbow'")),
         ("quantum: {elbow: big}", ("quantum.elbow = 'big'", "a number >= 0")),
-        ("sigma: {elbow: -1}", ("sigma.elbow = -1", "a number >= 0")),
+        ("sigma: {elbow: -1}", ("sigma.elbow = -1", "a number > 0")),
+        ("sigma: {elbow: 0}", ("sigma.elbow = 0", "a number > 0")),  # every gap would be infinitely significant
+        ("controller: {law: positon, kp: 3}", ("controller.law = 'positon'", "did you mean position?", "note")),
+        ("controller: {law: position, kp: 3, kv: 1}", ("controller.kv: there are: law, kp",)),
+        ("controller: {kp: 3}", ("controller.kp = 3 without a loop", "law: position")),
+        ("controller: {law: position, kp: .inf}", ("controller.kp = inf", "finite")),
         ("quantum: 3", ("quantum = 3", "mapping")),
     ):
         side.write_text(text)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             refused(tmp_path, arm, "run.csv", *words)
+
+
+def test_columns_without_numbers_or_names_are_left_out(tmp_path: Path, arm: mujoco.MjModel) -> None:
+    """A comma at the end of each line, the index column of pandas, an effort that was never sampled."""
+    lines = [",".join(["7", *map(repr, map(float, r)), "", ""]) for r in rows()]
+    (tmp_path / "run.csv").write_text("\n".join(["," + HEADER + ",effort:m_elbow,", *lines]))
+    with pytest.warns(UserWarning, match="'effort:m_elbow' holds no finite number; it is left out"):
+        (log,) = read_logs(tmp_path, arm)
+    assert set(log.streams) == {"unnamed 0"}
+    np.testing.assert_allclose(log.qpos, rows()[:, 3:5])
+
+
+def test_enabled_says_yes_and_no(tmp_path: Path, arm: mujoco.MjModel) -> None:
+    """Rows with the drive off must not count as rows of command 0 because of how "off" is spelt."""
+    words = ["yes", "no", "On", "OFF"]
+    lines = [",".join([*map(repr, map(float, r)), words[i % 4]]) for i, r in enumerate(rows())]
+    (tmp_path / "run.csv").write_text("\n".join([HEADER + ",enabled:m_elbow", *lines]))
+    (log,) = read_logs(tmp_path, arm)
+    assert log.enabled.tolist() == [i % 2 == 0 for i in range(40)]
+    (tmp_path / "run.csv").write_text("\n".join([HEADER + ",enabled:m_elbow", *lines]).replace("OFF", "idle"))
+    refused(tmp_path, arm, "line 5", "'enabled:m_elbow'", "'idle' is not a number", "yes, no, on, off")
+
+
+def test_npz_with_a_channel_twice_or_complex_numbers(tmp_path: Path, arm: mujoco.MjModel) -> None:
+    r = rows()
+    plain = {"time": r[:, 0], "ctrl": r[:, 1:3], "qpos": r[:, 3:5], "actuators": ["m_shoulder", "m_elbow"]}
+    np.savez(tmp_path / "run.npz", **plain, joints=["elbow", "elbow"])
+    refused(tmp_path, arm, "run.npz", "'joints' names 'elbow' more than once")
+    np.savez(tmp_path / "run.npz", **plain, joints=["shoulder", "elbow"], **{"qpos:elbow": r[:, 4]})
+    refused(tmp_path, arm, "run.npz", "two columns are 'qpos:elbow'")
+    np.savez(tmp_path / "run.npz", **{**plain, "qpos": r[:, 3:5] * (1 + 1j)}, joints=["shoulder", "elbow"])
+    refused(tmp_path, arm, "run.npz", "'qpos[0]' holds complex128", "real numbers")
+
+
+def test_the_same_recording_counts_once(tmp_path: Path, arm: mujoco.MjModel) -> None:
+    first = write(tmp_path, rows())
+    copy = write(tmp_path, rows(), name="tmp_copy.csv")
+    for given in ([first, first], [tmp_path], [first, copy, tmp_path / ".." / tmp_path.name / "run.csv"]):
+        with pytest.warns(UserWarning, match=r"\.csv: the same recording as .*run\.csv; it counts once"):
+            logs = read_logs(given if len(given) > 1 else given[0], arm)
+        assert [log.name for log in logs] == ["run.csv"]
+
+
+def test_repeat_of_a_log_that_is_not_there(tmp_path: Path, arm: mujoco.MjModel) -> None:
+    write(tmp_path, rows())
+    (tmp_path / "run.yaml").write_text("repeat_of: nowhere.csv\n")
+    with pytest.warns(UserWarning, match=r"run\.csv: repeat_of = 'nowhere\.csv'.*none of the logs.*allowed: run\.csv"):
+        read_logs(tmp_path, arm)
+    write(tmp_path, rows(41), name="nowhere.csv")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert len(read_logs(tmp_path, arm)) == 2
+
+
+@pytest.mark.parametrize(("mark", "word"), [(";", "semicolons"), ("\t", "tabs"), (" ", "blanks")])
+def test_another_delimiter_is_told(tmp_path: Path, arm: mujoco.MjModel, mark: str, word: str) -> None:
+    path = write(tmp_path, rows())
+    path.write_text(path.read_text().replace(",", mark))
+    refused(tmp_path, arm, "run.csv", f"parted by {word}", "delimiter")
+
+
+@pytest.mark.parametrize(
+    ("entry", "words"),
+    [
+        ({"qpos": {"elbow": {"column": "q", "signed": 5000}}}, ("qpos.elbow.signed = 5000", "2 to 64")),
+        ({"files": "/etc/*"}, ("files = '/etc/*'", "inside the folder")),
+        ({"files": "../*"}, ("files = '../*'", "inside the folder")),
+        ({"files": ""}, ("files = ''", "inside the folder")),
+    ],
+)
+def test_maps_that_once_ended_in_a_traceback(tmp_path: Path, arm: mujoco.MjModel, entry: dict, words: tuple) -> None:
+    write(tmp_path, rows())
+    refused(tmp_path, arm, *words, map=entry)
 
 
 def test_free_joint_by_index_and_quaternion_velocity(tmp_path: Path) -> None:

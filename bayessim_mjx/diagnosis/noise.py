@@ -6,7 +6,6 @@ import itertools
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
@@ -124,7 +123,7 @@ def repeats(logs: Sequence[Log]) -> list[list[Log]]:
             i = parent[i]
         return i
 
-    names = {alias: i for i, log in enumerate(logs) for alias in _aliases(log)}
+    names = {alias: i for i, log in enumerate(logs) for alias in log.aliases}
     for i, log in enumerate(logs):
         target = log.metadata.get("repeat_of")
         if target is None:
@@ -141,10 +140,6 @@ def repeats(logs: Sequence[Log]) -> list[list[Log]]:
     for i, log in enumerate(logs):
         groups.setdefault(root(i), []).append(log)
     return [g for g in groups.values() if len(g) > 1]
-
-
-def _aliases(log: Log) -> set[str]:
-    return {log.name, Path(log.name).stem, str(log.metadata.get("source", log.name))}
 
 
 def _same(a: Log, b: Log) -> bool:

@@ -109,6 +109,14 @@ def _check(model: mujoco.MjModel, source: str) -> None:
         raise UserError(f"{source}: the model has no hinge or slide joint, so there is no motion to compare")
     if not model.nu:
         raise UserError(f"{source}: the model has no actuator, so the logged commands cannot act on it")
+    step = float(model.opt.timestep)
+    if not (math.isfinite(step) and step > 0):
+        raise UserError(f"{source}: <option timestep> = {step:g}; allowed: seconds > 0")
+    idle = [_label(model, "actuator", i) for i in range(model.nu) if not np.any(model.actuator_gear[i])]
+    if len(idle) == model.nu:
+        raise UserError(f"{source}: gear = 0 of every actuator ({', '.join(idle)}): the logged commands cannot act")
+    if idle:
+        warnings.warn(f"{source}: gear = 0 of {', '.join(idle)}: these commands do nothing", stacklevel=3)
     if model.nplugin:
         raise UserError(f"{source}: MJX cannot simulate this model: it has plugins")
     ignored = [what for field, what in _IGNORED.items() if np.any(getattr(model, field, 0.0))]

@@ -14,7 +14,7 @@ from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Array, Channels, suggest
 from bayessim_mjx.logs.table import Table
 
-_STREAMS = ("ctrl", "qpos", "qvel", "effort", "enabled")
+STREAMS = ("ctrl", "qpos", "qvel", "effort", "enabled")
 
 
 def check_channels(table: Table, columns: Mapping[str, Array], channels: Channels) -> None:
@@ -34,7 +34,7 @@ def check_channels(table: Table, columns: Mapping[str, Array], channels: Channel
         prefix, _, name = column.partition(":")
         if prefix in named and name and name not in named[prefix]:
             raise UserError(f"{table.path}: column {column!r}: {_kind(prefix)}; {suggest(name, named[prefix])}")
-        near = difflib.get_close_matches(prefix.strip().lower(), [*_STREAMS, "time"], n=1, cutoff=0.74)
+        near = difflib.get_close_matches(prefix.strip().lower(), [*STREAMS, "time"], n=1, cutoff=0.74)
         if prefix not in named and column != "time" and near and (name or near[0] == "time") and near[0] not in columns:
             right = f"{near[0]}:{name}" if name else near[0]
             raise UserError(f"{table.path}: unknown column {column!r}; did you mean {right!r}?")

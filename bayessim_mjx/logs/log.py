@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -148,6 +149,11 @@ class Log:
             turned = [2.0 * float(np.sqrt(np.mean(own[-4:] ** 2)))] * 3 if kind in ("free", "ball") else []
             out += [*map(float, moved), *turned]
         return np.array(out)
+
+    @property
+    def aliases(self) -> set[str]:
+        """Names that another log's `repeat_of` may call it by."""
+        return {self.name, Path(self.name).stem, str(self.metadata.get("source", self.name))}
 
     @property
     def condition(self) -> str | None:

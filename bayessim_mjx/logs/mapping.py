@@ -116,11 +116,11 @@ def _mapping(path: str, key: str, value: Any) -> Mapping[str, Any]:
 
 
 _KINDS: dict[str, tuple[type | tuple[type, ...], str]] = {
-    "files": (str, "a file pattern such as '*.csv'"),
+    "files": (str, "a file pattern inside the folder such as '*.csv'"),
     "delimiter": (str, "one character"),
     "header": (bool, "true or false"),
     "column": ((str, int), "a header name or an index from 0"),
-    "signed": (int, "a number of bits such as 16"),
+    "signed": (int, "a number of bits from 2 to 64, such as 16"),
     "sign": (int, "1 or -1"),
 }
 
@@ -134,8 +134,12 @@ def _plain(path: str, key: str, value: Any) -> Any:
         good = good and len(value) == 1
     if last == "sign":
         good = good and value in (1, -1)
-    if last in ("signed", "wrap", "scale"):
-        good = good and np.isfinite(value) and (value > 0 if last != "scale" else value != 0)
+    if last == "signed":
+        good = good and 2 <= value <= 64
+    if last == "files":
+        good = good and bool(value.strip()) and not Path(value).is_absolute() and ".." not in Path(value).parts
+    if last in ("value", "offset", "wrap", "scale"):
+        good = good and abs(value) < 1e300 and (last != "wrap" or value > 0) and (last != "scale" or value != 0)
     if not good:
         raise UserError(f"{path}: {key} = {value!r}; allowed: {allowed}")
     return value

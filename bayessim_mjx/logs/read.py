@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -10,9 +11,10 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from bayessim_mjx import laws
 from bayessim_mjx.config import read_yaml
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.logs.check import check_channels, check_motion, check_time
+from bayessim_mjx.logs.check import STREAMS, check_channels, check_motion, check_time
 from bayessim_mjx.logs.log import Array, Channels, Log, suggest
 from bayessim_mjx.logs.mapping import LogMap
 from bayessim_mjx.logs.signals import estimate_velocity, noise_level
@@ -47,7 +49,32 @@ def read_logs(
     channels = Channels.of(mj_model)
     if log_map is not None:
         _check_map(log_map, channels)
-    return [log for path in _files(paths, log_map) for log in _read_one(path, mj_model, channels, log_map)]
+    files = _distinct(_files(paths, log_map))
+    logs = [log for path in files for log in _read_one(path, mj_model, channels, log_map)]
+    _check_repeats(logs)
+    return logs
+
+
+def _distinct(files: Sequence[Path]) -> list[Path]:
+    """Every recording once: one file named twice, or a copy of it, is no second run and no second condition."""
+    first: dict[bytes, Path] = {}
+    for path in files:
+        same = first.setdefault(hashlib.sha256(path.read_bytes()).digest(), path)
+        if same is not path:
+            warnings.warn(f"{path}: the same recording as {same}; it counts once", stacklevel=3)
+    return list(first.values())
+
+
+def _check_repeats(logs: Sequence[Log]) -> None:
+    """Warn of a `repeat_of` that names none of the logs."""
+    known = {alias for log in logs for alias in log.aliases}
+    for log in logs:
+        target = log.metadata.get("repeat_of")
+        if target is not None and str(target) not in known:
+            source = log.metadata["source"]
+            names = ", ".join(sorted({Path(str(other.metadata["source"])).name for other in logs}))
+            text = f"{source}: repeat_of = {target!r} in its side YAML is none of the logs; it is left alone"
+            warnings.warn(f"{text}; allowed: {names}", stacklevel=3)
 
 
 def _map_of_folder(paths: Paths) -> Path | None:
@@ -96,10 +123,20 @@ def _read_one(path: Path, mj_model: mujoco.MjModel, channels: Channels, log_map:
     check_channels(table, columns, channels)
     check_time(table, columns["time"], MIN_ROWS)
     check_motion(table, columns, channels, mj_model)
+    columns = _with_numbers(table, columns)
     metadata = {**(log_map.metadata if log_map else {}), **_side_yaml(path), "source": str(path)}
+    laws.read(metadata, mj_model, channels.actuators, str(path))  # refused here, before anything is simulated
     if "condition" in metadata:
         metadata.setdefault("operating_condition", metadata["condition"])
     return _pieces(table, columns, channels, metadata)
+
+
+def _with_numbers(table: Table, columns: dict[str, Array]) -> dict[str, Array]:
+    """Without the streams that hold no number at all, which say nothing."""
+    empty = [name for name, column in columns.items() if not np.isfinite(column).any()]
+    for name in empty:
+        warnings.warn(f"{table.path}: column {name!r} holds no finite number; it is left out", stacklevel=4)
+    return {name: column for name, column in columns.items() if name not in empty}
 
 
 def _check_map(log_map: LogMap, channels: Channels) -> None:
@@ -114,7 +151,9 @@ def _columns(table: Table, channels: Channels) -> dict[str, Array]:
     names = {c: c for c in table.columns} if table.first_line is not None else _npz_names(table, channels)
     out = {}
     for column, name in names.items():
-        needed = name == "time" or name.split(":")[0] in ("ctrl", "qpos", "qvel")
+        needed = name == "time" or name.split(":")[0] in STREAMS
+        if name in out:
+            raise UserError(f"{table.path}: two columns are {name!r}; allowed: one column per channel")
         try:
             out[name] = table.numbers(column)
         except UserError as error:
@@ -242,8 +281,9 @@ def _known(metadata: Mapping[str, Any], key: str, columns: Mapping[str, Array], 
             allowed = [c for c in columns if c != "time"]
             raise UserError(f"{source}: {key}.{name} in its side YAML: no such channel; {suggest(str(name), allowed)}")
         number = isinstance(value, int | float) and not isinstance(value, bool) and np.isfinite(value)
-        if not number or value < 0:
-            raise UserError(f"{source}: {key}.{name} = {value!r} in its side YAML; allowed: a number >= 0")
+        if not number or value < 0 or (key == "sigma" and value == 0):  # 0 would make every gap an infinite one
+            allowed = "a number > 0" if key == "sigma" else "a number >= 0"
+            raise UserError(f"{source}: {key}.{name} = {value!r} in its side YAML; allowed: {allowed}")
         out[column] = float(value)
     return out
 

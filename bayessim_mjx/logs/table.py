@@ -14,7 +14,9 @@ from numpy.typing import NDArray
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Array
 
-_WORDS = {"true": 1.0, "false": 0.0, "": float("nan")}
+_WORDS = {"true": 1.0, "yes": 1.0, "on": 1.0, "false": 0.0, "no": 0.0, "off": 0.0, "": float("nan")}
+_NUMBERS = "biufUS"  # NumPy's kinds of arrays that hold numbers, or texts of numbers
+_DELIMITERS = {";": "semicolons", "\t": "tabs", "|": "bars", " ": "blanks"}
 
 
 @dataclass(frozen=True)
@@ -35,12 +37,14 @@ class Table:
         return f"row {row}" if self.first_line is None else f"line {row + self.first_line}"
 
     def numbers(self, column: str) -> Array:
-        """The column as float64 [T]; blank fields are NaN, true/false are 1/0.
+        """The column as float64 [T]; blank fields are NaN; true, yes, on are 1 and false, no, off are 0.
 
         Raises:
             UserError: a field that is no number, naming its line.
         """
         values = self.columns[column]
+        if isinstance(values, np.ndarray) and values.dtype.kind not in _NUMBERS:
+            raise UserError(f"{self.path}: column {column!r} holds {values.dtype}; allowed: real numbers")
         try:
             return np.asarray(values).astype(np.float64)
         except (TypeError, ValueError):
@@ -52,14 +56,19 @@ class Table:
             return _WORDS[word] if word in _WORDS else float(word)
         except ValueError:
             at = f"{self.path}: {self.where(row)}, column {column!r}"
-            raise UserError(f"{at}: {text!r} is not a number; allowed: numbers, true, false") from None
+            raise UserError(
+                f"{at}: {text!r} is not a number; allowed: numbers, true, false, yes, no, on, off"
+            ) from None
 
 
 def read_csv(path: Path, delimiter: str = ",", header: bool = True) -> Table:
     """Read a CSV file; columns of a file without a header line are called 0, 1, 2 ...
 
+    A column without a name is called `unnamed <its number>`, or left out where it is blank throughout, as after a comma
+    at the end of each line.
+
     Raises:
-        UserError: no rows, a repeated column, a row of the wrong length.
+        UserError: no rows, a repeated column, a row of the wrong length, another delimiter.
     """
     try:
         lines = list(csv.reader(path.read_text(encoding="utf-8-sig").splitlines(), delimiter=delimiter))
@@ -71,6 +80,14 @@ def read_csv(path: Path, delimiter: str = ",", header: bool = True) -> Table:
     if not body:
         raise UserError(f"{path}: no data rows; allowed: a header line and one row per sample")
     names = [f.strip().lstrip("#").strip() for f in lines[0]] if header else [str(i) for i in range(len(body[0]))]
+    other = next((d for d in _DELIMITERS if d in names[0]), None) if len(names) == 1 else None
+    if other is not None:
+        mend = f"`delimiter: {other!r}` in a map (docs/logs.md)"
+        raise UserError(
+            f"{path}: one column {names[0]!r}: its fields are parted by {_DELIMITERS[other]}; mend it with {mend}"
+        )
+    unnamed = [i for i, name in enumerate(names) if not name]
+    names = [name or f"unnamed {i}" for i, name in enumerate(names)]
     repeated = sorted({n for n in names if names.count(n) > 1})
     if repeated:
         raise UserError(f"{path}: column {repeated[0]!r} appears more than once in the header")
@@ -79,7 +96,9 @@ def read_csv(path: Path, delimiter: str = ",", header: bool = True) -> Table:
         if len(fields) != len(names):
             allowed = f"allowed: {len(names)} ({', '.join(names)})"
             raise UserError(f"{path}: line {row + first} has {len(fields)} fields; {allowed}")
-    return Table(path, {name: [r[i] for r in body] for i, name in enumerate(names)}, first)
+    columns = {name: [r[i] for r in body] for i, name in enumerate(names)}
+    blank = {names[i] for i in unnamed if not any(r[i].strip() for r in body)}
+    return Table(path, {name: column for name, column in columns.items() if name not in blank}, first)
 
 
 def read_npz(path: Path) -> Table:
@@ -93,7 +112,10 @@ def read_npz(path: Path) -> Table:
             arrays = {k: file[k] for k in file.files}
     except Exception as error:  # zipfile, numpy and zlib each raise their own kinds for a broken archive
         raise UserError(f"{path}: not a readable NPZ file ({error}); allowed: numpy.savez of plain arrays") from None
-    names = {k: tuple(map(str, np.atleast_1d(arrays.pop(k)))) for k in ("joints", "actuators") if k in arrays}
+    names = {k: tuple(map(str, np.ravel(arrays.pop(k)))) for k in ("joints", "actuators") if k in arrays}
+    for key, given in names.items():
+        if twice := sorted({n for n in given if given.count(n) > 1}):
+            raise UserError(f"{path}: array {key!r} names {twice[0]!r} more than once; allowed: one column per channel")
     rows = len(arrays["time"]) if "time" in arrays and arrays["time"].ndim == 1 else None
     columns: dict[str, NDArray[Any]] = {}
     widths: dict[str, int] = {}

@@ -10,7 +10,8 @@ from bayessim_mjx.errors import UserError
 
 ARM = """
 <mujoco model="arm">
-  <option timestep="0.002" {option}/>
+  <option timestep="0.002"/>
+  <option {option}/>
   <worldbody>
     {world}
     <body name="upper">
@@ -85,6 +86,12 @@ def test_what_mjx_leaves_out_is_said(tmp_path):
         robot.of_file(write(tmp_path / "a.xml", rest=delayed))
 
 
+def test_an_actuator_without_a_gear_is_said(tmp_path):
+    idle = MOTOR.replace("</actuator>", '<motor name="idle" joint="shoulder" gear="0"/></actuator>')
+    with pytest.warns(UserWarning, match=r"a\.xml: gear = 0 of idle: these commands do nothing"):
+        robot.of_file(write(tmp_path / "a.xml", rest=idle))
+
+
 def test_a_free_base_is_fine(tmp_path):
     world = '<body name="b"><freejoint/><geom size="0.1" contype="0" conaffinity="0"/></body>'
     assert "b_mass_mult" in robot.of_file(write(tmp_path / "arm.xml", world=world)).space.names
@@ -97,7 +104,10 @@ BAD = {
     "collision": ({"world": SOLID}, r"MJX cannot simulate this model: .*ELLIPSOID.*BOX.* \(switch the contacts"),
     "actuator": ({"rest": DCMOTOR}, r"MJX cannot simulate this model: .*DCMOTOR.*not supported \(MJX has motor"),
     "solver": ({"option": 'solver="PGS"'}, r"a\.xml: MJX cannot simulate this model: mjtSolver.mjSOL_PGS .use CG"),
-    "line": ({"world": "<geom typ='box'/>"}, r"a\.xml: MuJoCo cannot load it: .*typ.*line 5"),
+    "timestep": ({"option": 'timestep="0"'}, r"a\.xml: <option timestep> = 0; allowed: seconds > 0"),
+    "nan": ({"option": 'timestep="nan"'}, r"a\.xml: <option timestep> = nan; allowed: seconds > 0"),
+    "gear": ({"rest": MOTOR.replace("/>", ' gear="0"/>')}, r"a\.xml: gear = 0 of every actuator \(m\)"),
+    "line": ({"world": "<geom typ='box'/>"}, r"a\.xml: MuJoCo cannot load it: .*typ.*line 6"),
     "size": ({"world": '<geom type="box"/>'}, r"a\.xml: MuJoCo cannot compile it: .*size"),
 }
 
