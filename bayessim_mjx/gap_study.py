@@ -39,7 +39,7 @@ def correction(folder: Path, known: ParameterSpace) -> storage.Correction:
     """
     try:
         diagnosis = result.load(folder)
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise UserError(f"--diagnosis {folder}: damaged diagnosis.json: {type(error).__name__}: {error}") from None
     file = folder / EFFECTS
     found = storage.read(file) if file.is_file() else apply.correction(diagnosis, known)
@@ -71,7 +71,7 @@ def _refined(body: robot.Robot, timestep: float) -> robot.Robot:
 def _corrected(body: robot.Robot, dt: float, found: storage.Correction, source: str) -> Physics:
     try:
         return body.physics(dt, found.effects, ParameterSpace(found.calibrated))
-    except ValueError as error:
+    except UserError as error:
         raise UserError(f"{source} does not fit --task {body.name}: {error}") from None
 
 

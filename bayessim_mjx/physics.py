@@ -18,8 +18,10 @@ from flax import struct
 with contextlib.redirect_stdout(io.StringIO()):  # MJX announces on import that the optional warp is absent
     from mujoco import mjx
 
+from bayessim_mjx.effects import contract
 from bayessim_mjx.effects.effect import Effect
 from bayessim_mjx.effects.site import Motion, SubStep
+from bayessim_mjx.errors import UserError
 from bayessim_mjx.parameters import ParameterSpace
 from bayessim_mjx.warp import Warp
 
@@ -96,12 +98,14 @@ class Physics:
         self.substeps = _substeps(control_dt, mj_model.opt.timestep)
         self.dt = float(self.substeps * mj_model.opt.timestep)
         if int(mj_model.opt.integrator) not in (_EULER, _RK4, _IMPLICITFAST):
-            raise ValueError(f"integrator {mj_model.opt.integrator}: MJX has Euler, RK4 and implicitfast")
+            raise UserError(f"integrator {mj_model.opt.integrator}: MJX has Euler, RK4 and implicitfast")
         self.max_qvel = None if max_qvel is None else np.broadcast_to(np.asarray(max_qvel, np.float32), (mj_model.nv,))
         self.model = mjx.put_model(mj_model, impl="jax")
         self.template = mjx.make_data(mj_model, impl="jax")
         self.warp = Warp(mj_model, self.template, self.effects, worlds) if impl == "warp" else None
         timestep = float(mj_model.opt.timestep)
+        for effect in filter(contract.brought, self.effects):
+            contract.check(effect, mj_model, self.model, self.substeps)
         self.sites = tuple(effect.bind(mj_model, timestep, self.substeps) for effect in self.effects)
         self._memory = tuple(effect.init(at) for effect, at in zip(self.effects, self.sites, strict=True))
 
@@ -176,7 +180,7 @@ class Physics:
 def _substeps(control_dt: float, timestep: float) -> int:
     count = round(control_dt / timestep)
     if count < 1 or abs(count * timestep - control_dt) > 1e-6 * control_dt:
-        raise ValueError(f"control step {control_dt} s is no whole multiple of the model's timestep {timestep} s")
+        raise UserError(f"control step {control_dt} s is no whole multiple of the model's timestep {timestep} s")
     return count
 
 
@@ -185,7 +189,7 @@ def _changed(nominal: mjx.Model, model: mjx.Model) -> dict[str, jax.Array]:
     before, _ = jax.tree_util.tree_flatten_with_path(nominal)
     after = jax.tree.leaves(model)
     if jax.tree.structure(nominal) != jax.tree.structure(model):  # type: ignore[operator]  # jaxlib's stubs
-        raise ValueError("an effect or parameter changed the structure of the model; only array values may change")
+        raise UserError("an effect or parameter changed the structure of the model; only array values may change")
     pairs = zip(before, after, strict=True)
     return {_dotted(path): new for (path, old), new in pairs if new is not old}
 

@@ -46,7 +46,10 @@ def _settings(args: argparse.Namespace) -> tuple[Config, Path, Any]:
     """(settings of the run that the checkpoint belongs to with flags on top, checkpoint folder, run or None)."""
     if args.task:
         args.task = cli.task_name(args.task)
-    path, run = cli.find_checkpoint(args.checkpoint or "best", args.task, args.logdir or "logs")
+    which = args.checkpoint or "best"
+    # of a task's newest run, which lies where flags, files and overrides say
+    logdir = cli.config_of(args).logdir if args.task and which in ("best", "latest") else ""
+    path, run = cli.find_checkpoint(which, args.task, logdir)
     if run is None:
         return cli.config_of(args), path, None
     args.task = args.task or run.manifest["task"]

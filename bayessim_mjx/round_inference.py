@@ -19,6 +19,7 @@ from jax import Array
 from bayessim_mjx import inference
 from bayessim_mjx.collection import Source, domain_or_prior
 from bayessim_mjx.distributions import Distribution
+from bayessim_mjx.errors import UserError
 from bayessim_mjx.inference import InferenceSettings, calibration, checks, misspecification, rounds
 from bayessim_mjx.loop_state import Loop, LoopState, RoundInfo
 from bayessim_mjx.rl import Policy
@@ -195,7 +196,7 @@ def _examine(
             key, state.fit, fitted, held, state.real_features, known,
             temperature=b.temperature, tilt=tilt, names=loop.feature_names,
         )  # fmt: skip
-    except ValueError as error:
+    except UserError as error:
         info.warnings.append(str(error))
         return None
     finally:

@@ -5,6 +5,7 @@ The command is the motor voltage: the PWM duty (of 885, a signed 16-bit register
 would brake. The stream `enabled:motor` says so, and windows that touch such rows are not used.
 """
 
+import argparse
 import json
 import sys
 from pathlib import Path
@@ -48,9 +49,10 @@ def _convert(path: Path, out: Path) -> Path:
 
 
 if __name__ == "__main__":
-    if len(sys.argv) != 2:
-        sys.exit(__doc__)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("out", metavar="OUT", type=Path, help="folder of the CSV files")
+    out = parser.parse_args().out
     if not RAW.is_dir():
         sys.exit(f"{RAW} is not there: nothing to convert")
-    for written in convert(Path(sys.argv[1])):
+    for written in convert(out):
         print(written)

@@ -1,5 +1,6 @@
 """A pendulum paid only while it stands: PPO alone learns to hang still; with a reward for novelty it swings up."""
 
+import argparse
 from dataclasses import replace
 
 import jax
@@ -34,6 +35,7 @@ NOVELTY = RNDConfig(
 alone = PPOConfig(
     num_envs=128, num_steps=50, num_minibatches=8, learning_rate=1e-3, gamma=0.98, max_iterations=200, log_interval=25
 )
+argparse.ArgumentParser(description=__doc__).parse_args()  # --help says what this is
 env = Standing({}, randomization={"randomize": False})
 for name, config in {"PPO alone": alone, "with novelty": replace(alone, rnd=NOVELTY)}.items():
 

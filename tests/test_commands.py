@@ -1,9 +1,11 @@
 """The commands, called in this process: bad input is one line and exit code 2, a killed run goes on bit for bit."""
 
+import ast
 import collections
 import errno
 import json
 import os
+import runpy
 import shutil
 import signal
 import subprocess
@@ -421,6 +423,26 @@ def test_play_prints_returns_of_latest_best_run_and_path(toy: None, capsys: pyte
         where, _, rest = capsys.readouterr().out.rpartition("exported ")[2].partition(": differs by ")
         assert float(rest.split()[0]) < 1e-5 and Path(where).is_file()
     assert where == "deploy/p.onnx"
+
+
+@pytest.mark.parametrize("where", ["--logdir=elsewhere", "logdir=elsewhere"])
+def test_play_looks_where_logdir_says(toy: None, capsys: pytest.CaptureFixture, where: str) -> None:
+    assert train.main(["--task", "Pendulum", *SMALL, where, "--max_iterations=0"]) == 0
+    assert play.main(["--task", "Pendulum", "--checkpoint", "latest", "--episodes", "2", where]) == 0
+    assert "checkpoint elsewhere" in capsys.readouterr().out
+    assert "no run of 'Pendulum'" in error_of(capsys, play.main, "--task", "Pendulum", "--checkpoint", "latest")
+
+
+@pytest.mark.parametrize("name", [p.name for p in sorted((Path(__file__).parents[1] / "examples").glob("*.py"))])
+def test_examples_say_what_they_are(name: str, monkeypatch: Any, capsys: pytest.CaptureFixture) -> None:
+    file = Path(__file__).parents[1] / "examples" / name
+    monkeypatch.syspath_prepend(file.parent)
+    monkeypatch.setattr(sys, "argv", [name, "--help"])
+    with pytest.raises(SystemExit) as end:
+        runpy.run_path(str(file), run_name="__main__")
+    first = ast.get_docstring(ast.parse(file.read_text()))
+    assert end.value.code in (None, 0) and first is not None
+    assert first.split()[:6] == capsys.readouterr().out.partition("\n\n")[2].split()[:6]
 
 
 def test_training_goes_on_from_a_policy(toy: None) -> None:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from bayessim_mjx.diagnosis.scales import Scales, ranges
 from bayessim_mjx.effects.effect import Effect, Quantity
 from bayessim_mjx.effects.site import element_names, places
+from bayessim_mjx.errors import UserError
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 from bayessim_mjx.physics import Physics
 
@@ -94,7 +95,7 @@ def stack(kinds: Sequence[type[Effect]], scales: Scales) -> tuple[tuple[Effect, 
             parameters = tuple(p for place in found for p in ranges(kind, place, scales))
             effect = kind(where=found, parameters=parameters)
             effect.bind(scales.model, float(scales.model.opt.timestep), 1)
-        except ValueError as error:
+        except UserError as error:
             left_out.append(f"{kind.name}: {error}")
             continue
         made.append(effect)

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from bayessim_mjx.distributions import algebra, box, charts, evaluate
+from bayessim_mjx.errors import UserError
 
 if TYPE_CHECKING:
     from bayessim_mjx.distributions.distribution import Distribution
@@ -66,13 +67,13 @@ def unit_gaussian(space: Any, mean: Any, cov_or_sd: Any) -> tuple[np.ndarray, np
         raise ValueError(f"{d} parameters {space.names}: mean of shape {theta.shape}, spread of shape {spread.shape}")
     for name, value, low, high in zip(space.names, theta, space.low, space.high, strict=True):
         if not np.float32(low) <= np.float32(value) <= np.float32(high):
-            raise ValueError(f"mean of {name} is {value:g}, outside [{low:g}, {high:g}]")
+            raise UserError(f"mean of {name} is {value:g}, outside [{low:g}, {high:g}]")
     cov = spread if spread.ndim == 2 else np.diag(np.broadcast_to(spread, (d,)) ** 2)
     point = jnp.asarray(theta, jnp.float32)
     u, slope = jax.jvp(space.to_unit, (point,), (jnp.ones_like(point),))
     slope = np.asarray(slope, np.float64)
     if not np.all(np.isfinite(cov)) or np.any(np.diagonal(cov) < 0):
-        raise ValueError(f"spread of {space.names} must be finite and not negative, not {cov_or_sd}")
+        raise UserError(f"spread of {space.names} must be finite and not negative, not {cov_or_sd}")
     unit = slope[:, None] * cov * slope[None, :] + 1e-12 * np.eye(d)
     return np.asarray(u, np.float64), np.linalg.cholesky(unit)
 

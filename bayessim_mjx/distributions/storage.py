@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from bayessim_mjx.errors import UserError
+
 FIELDS = ("prior_weight", "logits", "means", "scales", "log_inside")
 FORMAT, VERSION = "bayessim_mjx.Distribution", 1
 
@@ -66,12 +68,12 @@ def read(path: str | Path, space: Any) -> tuple[dict[str, np.ndarray], str]:
     """Arrays and chart of a file written by `write`; ValueError naming the first disagreement with `space`."""
     with np.load(path, allow_pickle=False) as file:
         if "header" not in file or any(name not in file for name in FIELDS):
-            raise ValueError(f"{path} holds no distribution: it has {sorted(file)}, needed are header and {FIELDS}")
+            raise UserError(f"{path} holds no distribution: it has {sorted(file)}, needed are header and {FIELDS}")
         stored = json.loads(str(file["header"]))
         arrays = {name: file[name] for name in FIELDS}
     if stored.get("version") != VERSION:
-        raise ValueError(f"{path} has version {stored.get('version')}, this program reads {VERSION}")
+        raise UserError(f"{path} has version {stored.get('version')}, this program reads {VERSION}")
     chart = stored.get("chart", "plain")
     if words := disagreement(stored, coordinates(space, chart)):
-        raise ValueError(f"{path} {words}")
+        raise UserError(f"{path} {words}")
     return arrays, chart

@@ -87,7 +87,7 @@ def recorded(spec: str) -> type[Effect]:
     if spec in _installed():
         try:
             kind = _installed()[spec].load()
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             raise UserError(f"effect {spec!r}: its package cannot be imported: {error}") from error
         return _checked(kind, spec, spec)
     close = difflib.get_close_matches(str(spec), names())
@@ -117,13 +117,13 @@ def _executed(path: Path, changed: int) -> ModuleType:
     module = sys.modules[name] = importlib.util.module_from_spec(spec)
     try:
         spec.loader.exec_module(module)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         del sys.modules[name]
         raise UserError(f"{path}{_line(error, path)}: {type(error).__name__}: {error}") from error
     return module
 
 
-def _line(error: Exception, path: Path) -> str:
+def _line(error: BaseException, path: Path) -> str:
     """Where in the user's file it went wrong."""
     lines = [f.lineno for f in traceback.extract_tb(error.__traceback__) if f.filename == str(path)]
     line = error.lineno if isinstance(error, SyntaxError) else lines[-1] if lines else None

@@ -63,8 +63,9 @@ def _add(spec: mujoco.MjSpec, effect: Effect, values: Values) -> tuple[mujoco.Mj
     try:
         why = effect.edit(new, values)
         new.compile()
-    except ValueError as error:  # MuJoCo's, on compiling
-        why = f"MuJoCo refuses it: {' '.join(str(error).split())}"
+    except Exception as error:  # MuJoCo's, on compiling, or of the method `edit` of a user's effect
+        who = "MuJoCo refuses it" if isinstance(error, ValueError) else f"its edit() fails: {type(error).__name__}"
+        why = f"{who}: {' '.join(str(error).split())}"
     return (spec, why) if why else (new, None)
 
 

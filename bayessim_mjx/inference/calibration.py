@@ -19,6 +19,7 @@ from jax.typing import ArrayLike
 from scipy.special import ndtr
 
 from bayessim_mjx.distributions import Distribution, box, charts
+from bayessim_mjx.errors import UserError
 from bayessim_mjx.quantities import estimate
 from bayessim_mjx.triangular import inverse_lower, lower_factor, product
 
@@ -147,7 +148,7 @@ def check(
 def _usable(found: Ranks) -> Ranks:
     keep = np.isfinite(found.gain) & np.all(np.isfinite(found.variance), axis=1)
     if keep.sum() < FEWEST:
-        raise ValueError(f"calibration: {int(keep.sum())} usable pairs; at least {FEWEST} are needed")
+        raise UserError(f"calibration: {int(keep.sum())} usable pairs; at least {FEWEST} are needed")
     return Ranks(*(part[keep] for part in found))
 
 

@@ -19,6 +19,7 @@ from jax.flatten_util import ravel_pytree
 
 from bayessim_mjx.distributions import Distribution, charts
 from bayessim_mjx.distributions.storage import coordinates
+from bayessim_mjx.errors import UserError
 from bayessim_mjx.inference import bases, depth, identify, mdn
 from bayessim_mjx.inference.settings import InferenceSettings
 from bayessim_mjx.triangular import product
@@ -95,7 +96,7 @@ class _Data(NamedTuple):
 def init(key: Array, settings: InferenceSettings, space: Any, dim_x: int) -> FitState:
     """Fresh network for summaries of `dim_x` features and the parameters of `space`."""
     if dim_x < 1:
-        raise ValueError(f"dim_x = {dim_x}: a summary needs at least one feature")
+        raise UserError(f"dim_x = {dim_x}: a summary needs at least one feature")
     settings = settings.at(space)
     member = partial(mdn.init, settings=settings, dim_x=dim_x, d=len(space))
     params = jax.vmap(lambda k, count: member(k, count=count))(
@@ -138,7 +139,7 @@ def fit(
     thetas, x = jnp.asarray(thetas, jnp.float32), jnp.asarray(x, jnp.float32)
     state, info = _fit(key, state, thetas, x, jnp.asarray(count, jnp.int32), proposals, origin)
     if not isinstance(info.n_train, jax.core.Tracer) and int(info.n_train) == 0:
-        raise ValueError(f"none of the {int(count)} rows is usable: summaries not finite, or thetas outside the box")
+        raise UserError(f"none of the {int(count)} rows is usable: summaries not finite, or thetas outside the box")
     return state, info
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from jax import Array
 
 from bayessim_mjx.distributions import Distribution
+from bayessim_mjx.errors import UserError
 from bayessim_mjx.inference.fit import FitState, condition
 
 
@@ -30,5 +31,5 @@ def infer(state: FitState, x: Array, components: int | None = None) -> Distribut
     """One posterior from the summaries x [n, D] of n real trajectories; ValueError on values that are not finite."""
     bad = np.flatnonzero(~np.all(np.isfinite(np.asarray(x)), axis=-1))
     if bad.size:
-        raise ValueError(f"the summary of real trajectory {bad[0]} holds values that are not finite")
+        raise UserError(f"the summary of real trajectory {bad[0]} holds values that are not finite")
     return combine(condition(state, jnp.asarray(x)), components)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any
 
+from bayessim_mjx.errors import UserError
 from bayessim_mjx.settings import COORDINATES, BayesSimConfig, model_of
 
 if TYPE_CHECKING:
@@ -55,16 +56,16 @@ class InferenceSettings:
         positive = ("components", "batch", "epochs", "min_steps", "max_steps", "lr", "grad_clip", "clip")
         for name in (*positive, "ensemble", "fourierFeatures"):
             if not getattr(self, name) > 0:
-                raise ValueError(f"{name} = {getattr(self, name)!r} must be positive")
+                raise UserError(f"{name} = {getattr(self, name)!r} must be positive")
         if not 0 < self.validation < 1:
-            raise ValueError(f"validation = {self.validation!r} must lie between 0 and 1")
+            raise UserError(f"validation = {self.validation!r} must lie between 0 and 1")
         for name in ("defensive", "dropout"):
             if not 0 <= getattr(self, name) < 1:
-                raise ValueError(f"{name} = {getattr(self, name)!r} must lie in [0, 1)")
+                raise UserError(f"{name} = {getattr(self, name)!r} must lie in [0, 1)")
         if any(width < 1 for width in self.hiddenLayers):
-            raise ValueError(f"hiddenLayers = {self.hiddenLayers!r}: widths must be positive")
+            raise UserError(f"hiddenLayers = {self.hiddenLayers!r}: widths must be positive")
         if self.coordinates not in COORDINATES:
-            raise ValueError(f"coordinates = {self.coordinates!r}: allowed are {', '.join(COORDINATES)}")
+            raise UserError(f"coordinates = {self.coordinates!r}: allowed are {', '.join(COORDINATES)}")
 
     @property
     def kernel(self) -> str | None:

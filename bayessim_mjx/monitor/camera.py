@@ -4,6 +4,8 @@ from typing import Any
 
 import numpy as np
 
+from bayessim_mjx.errors import UserError
+
 
 def view_of(model: Any, data: Any, qpos: np.ndarray, camera: str | int | None, aspect: float) -> Any:
     """`mujoco.MjvCamera` for motion qpos [T, nq]: `camera` by name or number, else the first, else a fitted one.
@@ -26,7 +28,7 @@ def _number(model: Any, camera: str | int) -> int:
         return names.index(camera)
     if not isinstance(camera, str) and 0 <= int(camera) < model.ncam:
         return int(camera)
-    raise ValueError(f"the model has no camera {camera!r}; it has {names or 'none'}")
+    raise UserError(f"the model has no camera {camera!r}; it has {names or 'none'}")
 
 
 def _fitted(view: Any, model: Any, data: Any, qpos: np.ndarray, aspect: float) -> Any:

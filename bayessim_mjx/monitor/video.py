@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from bayessim_mjx.errors import UserError
 from bayessim_mjx.monitor.camera import view_of
 
 _OFF = ("disable", "disabled", "off", "false", "0")
@@ -299,7 +300,7 @@ def save(frames: np.ndarray, path: str | os.PathLike, fps: float) -> bool:
     """Save frames [T, H, W, 3] uint8 as `.gif` or `.mp4`. False, with a warning, where there is no ffmpeg."""
     path = Path(path)
     if path.suffix not in (".gif", ".mp4"):
-        raise ValueError(f"cannot save a video as {path.name!r}; allowed endings: .mp4, .gif")
+        raise UserError(f"cannot save a video as {path.name!r}; allowed endings: .mp4, .gif")
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix == ".gif":
         path.write_bytes(gif(frames, fps))

@@ -180,7 +180,7 @@ def outline(env: Env, config: PPOConfig, domain: Distribution | None = None, mes
 def check(env: Env, config: PPOConfig, mesh: Mesh | None = None) -> None:
     """Refuse what does not go together."""
     if "policy" not in env.observation_size:
-        raise ValueError(f"observation groups {sorted(env.observation_size)}: a policy needs the group 'policy'")
+        raise UserError(f"observation groups {sorted(env.observation_size)}: a policy needs the group 'policy'")
     if config.policy_theta and getattr(env, "target", "") != "policy":
         raise UserError("ppo.policy_theta = True trains a teacher; the commands that can are train and play")
     if config.memory_size != getattr(env, "memory_size", 0):

@@ -80,6 +80,7 @@ BAD = {
     "empty": ({"(\n        Quantity": "() or (\n        "}, r"magnets\.py, line \d+: "),
     "clash": ({'"magnets"': '"armature"'}, r"there is an effect 'armature' already; give the class another name"),
     "spaces": ({'"magnets"': '"my magnets"'}, r"name = 'my magnets': expected one word"),
+    "exit": ({"import jax.numpy": "import sys; sys.exit()\nimport jax.numpy"}, r"magnets\.py, line 6: SystemExit: "),
     "frozen": ({"@dataclasses.dataclass(frozen=True)": ""}, r"the class lacks @dataclasses\.dataclass\(frozen=True\)"),
 }
 
@@ -121,3 +122,28 @@ def test_installed_effects_are_found_by_entry_point(monkeypatch, file):
         effects.load("other")
     with pytest.raises(UserError, match="there is an effect 'magnets' already"):
         effects.load(f"{file}:Magnets")
+
+
+HOOK = "        return memory, at.scatter(-pull * jnp.sin(self.poles * step.qpos[at.qadr]))\n"
+BAD_HOOKS = {
+    "raises": ("        return memory, undefined\n", r"on_force fails \(.*magnets\.py, line 24\): NameError: "),
+    "exits": ("        raise SystemExit(0)\n", r"on_force fails \(.*magnets\.py, line 24\): SystemExit"),
+    "returns nothing": ("", r"on_force returns nothing \(a missing return\?\); expected \(memory, an array \[1\]\)"),
+    "forgets the memory": (HOOK.replace("memory, ", ""), r"on_force returns an array \[1\]; expected \(memory"),
+    "another shape": (
+        "        return memory, pull[:, None]\n",
+        r"its result is an array \[1, 1\]; expected an array \[1\]",
+    ),
+    "is not neutral": (HOOK.replace("-pull", "0.5 - pull"), r"at the neutral values on_force changes its input"),
+    "is not finite": (HOOK.replace("-pull", "pull / (1 - pull)"), r"not finite at the highest values of its ranges"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_HOOKS)
+def test_a_hook_that_does_not_keep_the_contract_is_refused(case, file, source):
+    new, words = BAD_HOOKS[case]
+    assert HOOK.strip() in source
+    file.write_text(source.replace(HOOK.rstrip("\n"), new.rstrip("\n")))
+    with pytest.raises(UserError, match=words) as caught:
+        registry.make("Pendulum", effects=[effects.make(f"{file}:Magnets", where="hinge")])
+    assert "\n" not in str(caught.value) and "effect magnets" in str(caught.value)
