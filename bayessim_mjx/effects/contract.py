@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from bayessim_mjx.effects.effect import Effect
 
-ROOM = __name__.rpartition(".")[0]
+LIBRARY = __name__.split(".")[0]
 HOOKS = ("on_model", "on_start", "on_command", "on_actuator", "on_force", "on_measurement")
 ROWS = 3  # of the recording that `on_start` is tried on
 _tried: set[tuple] = set()
@@ -31,7 +31,7 @@ _tried: set[tuple] = set()
 def brought(effect: "Effect") -> bool:
     """Whether its class is not of this library."""
     module = type(effect).__module__
-    return not module.startswith(f"{ROOM}.") or module.startswith(f"{ROOM}.own_")
+    return not module.startswith(f"{LIBRARY}.") or ".own_" in module  # as `effects.load` calls a file
 
 
 def check(effect: "Effect", mj_model: mujoco.MjModel, model: "mjx.Model", substeps: int) -> None:
