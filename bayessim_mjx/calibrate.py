@@ -30,17 +30,23 @@ ADVICE = {
 def _parser() -> cli.PlainParser:
     parser = cli.PlainParser(
         prog="python -m bayessim_mjx.calibrate",
-        description="Calibration of a run's posterior on fresh simulations, and whether reality looks like them.",
-        allow_abbrev=False,
+        description="Test a finished run's posterior on fresh simulations, and whether real motion looks like them.",
+        usage="%(prog)s --run RUN [options]",
     )
     parser.add_argument("--run", metavar="RUN", required=True, help="folder of the run")
-    parser.add_argument("--checkpoint", default="latest", help="latest, best or a step")
     parser.add_argument(
-        "--pairs", type=cli.whole(-COUNT, COUNT), default=1000, help="fresh simulated trajectories (1000)"
+        "--checkpoint", metavar="WHICH", default="latest", help="latest, best or a step number (default: latest)"
     )
-    parser.add_argument("--seed", type=cli.whole(0, SEEDS), default=0, help="of the fresh simulations")
-    parser.add_argument("--device", help="auto, cpu, gpu")
-    parser.add_argument("--cache_dir", help="compilation cache; off: none")
+    parser.add_argument(
+        "--pairs",
+        metavar="N",
+        type=cli.whole(-COUNT, COUNT),
+        default=1000,
+        help="number of fresh simulated trajectories (default: 1000)",
+    )
+    parser.add_argument("--seed", metavar="N", type=cli.whole(0, SEEDS), default=0, help="random seed (default: 0)")
+    parser.add_argument("--device", metavar="NAME", help="auto, cpu or gpu (default: that of the run)")
+    parser.add_argument("--cache_dir", metavar="DIR", help="folder of compiled programs, or off")
     parser.trusting()
     return parser
 

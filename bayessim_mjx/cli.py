@@ -45,17 +45,28 @@ integer = whole(-(10**25), 10**25)  # where the settings know the limits
 
 # flag -> (dotted key, type, help); None as type: a switch
 FLAGS: dict[str, tuple[str, Any, str]] = {
-    "--num_envs": ("env.numEnvs", integer, "worlds in parallel"),
-    "--seed": ("seed", integer, "seed of everything random; -1: a random one"),
-    "--max_iterations": ("ppo.max_iterations", integer, "PPO iterations (per round of the outer loop)"),
+    "--num_envs": ("env.numEnvs", integer, "number of simulated worlds in parallel"),
+    "--seed": ("seed", integer, "random seed; -1 draws one"),
+    "--max_iterations": ("ppo.max_iterations", integer, "PPO iterations; in main the number per round"),
     "--video": ("monitor.video", None, "record videos"),
-    "--video_length": ("monitor.video_length", integer, "control steps per video"),
-    "--video_interval": ("monitor.video_interval", integer, "control steps of each world between videos"),
-    "--logdir": ("logdir", str, "root of the run folders (logs)"),
-    "--name": ("name", str, "last part of the run folder's name"),
-    "--device": ("device", str, "auto, cpu, gpu, gpu:1, cuda:0"),
-    "--devices": ("devices", str, "how many devices share the worlds: a number, or all"),
-    "--cache_dir": ("cache_dir", str, "compilation cache; off: none ($BAYESSIM_MJX_CACHE)"),
+    "--video_length": ("monitor.video_length", integer, "length of a video in control steps"),
+    "--video_interval": ("monitor.video_interval", integer, "control steps of each world from one video to the next"),
+    "--logdir": ("logdir", str, "folder of all runs (default: logs)"),
+    "--name": ("name", str, "word added to the name of the run folder"),
+    "--device": ("device", str, "auto, cpu, gpu, gpu:1 or cuda:0 (default: auto)"),
+    "--devices": ("devices", str, "number of devices that share the worlds, or all"),
+    "--cache_dir": ("cache_dir", str, "folder of compiled programs, or off (default: $BAYESSIM_MJX_CACHE)"),
+}
+CHECKPOINTS = {
+    "play": "policy to play (default: best)",
+    "gap_loop": "policies to evaluate in place of training new ones on the simulator as it was",
+}
+METAVARS = {str: "TEXT", integer: "N"} | {
+    "--devices": "N|all",
+    "--logdir": "DIR",
+    "--name": "NAME",
+    "--device": "NAME",
+    "--cache_dir": "DIR",
 }
 RESUMABLE = (
     "--device", "--devices", "--cache_dir", "--video", "--video_length", "--video_interval", "--headless", "--resume",
@@ -64,11 +75,14 @@ RESUMABLE = (
 
 
 class PlainParser(argparse.ArgumentParser):
-    """Flags; what is wrong with them is a UserError."""
+    """Flags; what is wrong with them is a UserError. The usage line does not repeat the list of options."""
+
+    def __init__(self, **options: Any):
+        super().__init__(**({"usage": "%(prog)s [options]", "allow_abbrev": False} | options))
 
     def trusting(self) -> None:
         """Add the flag that lets code run which settings name."""
-        text = "Python file whose effects settings may name (path.py:Class), again for each; see docs/trust.md"
+        text = "allow settings to use effects from this Python file; repeat for more files (docs/trust.md)"
         self.add_argument(trust.FLAG, metavar="FILE", action=Allow, default=[], help=text)
 
     def error(self, message: str) -> NoReturn:
@@ -98,24 +112,28 @@ class Parser(PlainParser):
         but: Sequence[str] = (),
     ):
         """`without`: flags, and `unused`: sections of settings (`but` these keys), that the command does not take."""
-        super().__init__(prog=f"python -m bayessim_mjx.{prog}", description=description, allow_abbrev=False)
+        usage = "%(prog)s [options] [section.key=value ...]"
+        super().__init__(prog=f"python -m bayessim_mjx.{prog}", description=description, usage=usage)
         self.command, self.without, self.unused, self.but = prog, without, unused, but
-        self.add_argument("--task", help="name of the task (--list_tasks)")
+        self.add_argument("--task", metavar="NAME", help="name of the task; --list_tasks prints them")
         for flag, (_, kind, text) in FLAGS.items():
             if flag in without:
                 continue
-            options: dict[str, Any] = {"action": "store_true"} if kind is None else {"type": kind}
+            shown = METAVARS.get(flag, METAVARS.get(kind))
+            options: dict[str, Any] = {"action": "store_true"} if kind is None else {"type": kind, "metavar": shown}
             self.add_argument(flag, default=None, help=text, **options)
         self.trusting()
-        self.add_argument("--cfg_env", metavar="FILE", help="YAML with any sections, over cfg/<task>.yaml")
-        self.add_argument("--cfg_train", metavar="FILE", help="YAML of PPO settings")
-        self.add_argument("--checkpoint", metavar="PATH|latest|best", help="policy to start from, or to play")
-        self.add_argument("--use_last_checkpoint", action="store_true", help="the same as --checkpoint latest")
-        self.add_argument("--headless", action="store_true", help="plain lines, no progress bars; never a window")
-        self.add_argument("--list_tasks", action="store_true", help="print the names of the tasks")
+        self.add_argument("--cfg_env", metavar="FILE", help="YAML file with settings, read after cfg/<task>.yaml")
+        self.add_argument("--cfg_train", metavar="FILE", help="YAML file with PPO settings")
+        self.add_argument(
+            "--checkpoint", metavar="PATH|latest|best", help=CHECKPOINTS.get(prog, "policy to start from")
+        )
+        self.add_argument("--use_last_checkpoint", action="store_true", help="same as --checkpoint latest")
+        self.add_argument("--headless", action="store_true", help="plain lines instead of progress bars")
+        self.add_argument("--list_tasks", action="store_true", help="print the names of the tasks and stop")
         if resume:
-            self.add_argument("--resume", metavar="RUN", help="go on with an interrupted run")
-        self.epilog = "section.key=value sets any setting, e.g. bayessim.components=5 ppo.gamma=0.99 (see cfg/*.yaml)"
+            self.add_argument("--resume", metavar="RUN", help="continue an interrupted run")
+        self.epilog = "section.key=value changes any setting, for example bayessim.components=5 (see cfg/*.yaml)"
 
     def parse(self, argv: Sequence[str] | None) -> argparse.Namespace:
         """Namespace with the flags, `overrides`, and `given` (flags that were used)."""

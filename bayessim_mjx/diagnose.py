@@ -23,21 +23,32 @@ if TYPE_CHECKING:
 def _parser() -> cli.PlainParser:
     parser = cli.PlainParser(
         prog="python -m bayessim_mjx.diagnose",
-        description="Where the gap between logs and simulator lies, which effects cause it, how far it shrinks.",
-        allow_abbrev=False,
+        description="Find where logs and simulator differ, which missing effects cause it, and how much they explain.",
+        usage="%(prog)s [options]\n       (--task NAME | --model FILE) --data PATH [PATH ...]",
     )
-    parser.add_argument("--task", help="one of our tasks (see main --list_tasks)")
-    parser.add_argument("--model", metavar="FILE", help="an MJCF with hinge or slide joints and actuators")
-    parser.add_argument("--data", metavar="PATH", nargs="+", help="logs: files or folders (docs/logs.md)")
-    parser.add_argument("--map", metavar="FILE", help="map of foreign columns (docs/logs.md)")
-    parser.add_argument("--parameters", metavar="FILE", help="params.yaml: what the simulator may recalibrate")
-    parser.add_argument("--effects", default="all", help="all, or names and path.py:Class, with commas")
-    parser.add_argument("--out", metavar="DIR", default="diagnosis", help="folder of the results (diagnosis)")
-    parser.add_argument("--seed", type=cli.whole(0, SEEDS), default=0)
-    parser.add_argument("--group", metavar="KEY", help="metadata key of the operating conditions held out in turn")
-    parser.add_argument("--device", default="auto", help="auto, cpu, gpu")
-    parser.add_argument("--cache_dir", help="compilation cache; off: none")
-    parser.add_argument("--headless", action="store_true", help="plain lines, no progress bars")
+    parser.add_argument("--task", metavar="NAME", help="a task of this library (main --list_tasks prints them)")
+    parser.add_argument("--model", metavar="FILE", help="an MJCF model with actuated hinge or slide joints")
+    parser.add_argument("--data", metavar="PATH", nargs="+", help="log files, or folders of them (docs/logs.md)")
+    parser.add_argument(
+        "--map", metavar="FILE", help="YAML file that maps the columns of the logs to the model (docs/logs.md)"
+    )
+    parser.add_argument("--parameters", metavar="FILE", help="YAML file with the parameters that may be recalibrated")
+    parser.add_argument(
+        "--effects",
+        metavar="LIST",
+        default="all",
+        help="effects to try, separated by commas: names or path.py:Class (default: all)",
+    )
+    parser.add_argument("--out", metavar="DIR", default="diagnosis", help="folder for the results (default: diagnosis)")
+    parser.add_argument("--seed", metavar="N", type=cli.whole(0, SEEDS), default=0, help="random seed (default: 0)")
+    parser.add_argument(
+        "--group",
+        metavar="KEY",
+        help="metadata key that names the operating condition of a log; each condition is held out in turn",
+    )
+    parser.add_argument("--device", metavar="NAME", default="auto", help="auto, cpu or gpu (default: auto)")
+    parser.add_argument("--cache_dir", metavar="DIR", help="folder of compiled programs, or off")
+    parser.add_argument("--headless", action="store_true", help="plain lines instead of progress bars")
     return parser
 
 

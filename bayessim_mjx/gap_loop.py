@@ -18,25 +18,43 @@ from bayessim_mjx.config import Config
 from bayessim_mjx.device import setup_jax
 from bayessim_mjx.errors import UserError
 
-DESCRIPTION = "What a diagnosed gap costs in return, and what retraining on the corrected simulator recovers."
+DESCRIPTION = (
+    "Measure how much return a diagnosed gap costs, and how much retraining on the corrected simulator recovers."
+)
 WITHOUT = ("--max_iterations", "--video", "--video_length", "--video_interval", "--logdir", "--name")
 
 
 def _parser() -> cli.Parser:
     parser = cli.Parser("gap_loop", DESCRIPTION, without=WITHOUT, unused=("bayessim", "real", "monitor"))
-    parser.add_argument("--diagnosis", metavar="DIR", help="what bayessim_mjx.diagnose wrote")
+    parser.add_argument("--diagnosis", metavar="DIR", help="folder that bayessim_mjx.diagnose wrote")
     parser.add_argument(
-        "--surrogate", metavar="FILE", help="stand-in for the real system: its truth as an effects.yaml"
+        "--surrogate",
+        metavar="FILE",
+        help="effects.yaml with the hidden truth of a simulated stand-in for the real system",
     )
-    parser.add_argument("--surrogate_timestep", type=float, metavar="S", help="of its simulation (default: the task's)")
-    parser.add_argument("--real", metavar="LOGS", nargs="+", help="logs of the real system; no real return is known")
-    parser.add_argument("--parameters", metavar="FILE", help="params.yaml of the diagnosis, if it had one")
     parser.add_argument(
-        "--iterations", type=cli.integer, help="PPO iterations of each policy (default: ppo.max_iterations)"
+        "--surrogate_timestep",
+        type=float,
+        metavar="S",
+        help="time step of that stand-in in seconds (default: that of the task)",
     )
-    parser.add_argument("--seeds", type=cli.integer, default=1, help="policies of each kind")
-    parser.add_argument("--episodes", type=cli.integer, default=200, help="episodes of each evaluation")
-    parser.add_argument("--out", metavar="DIR", help="results and policies (default: <diagnosis>/gap_loop)")
+    parser.add_argument(
+        "--real", metavar="LOGS", nargs="+", help="logs of the real system; returns are then predicted, not measured"
+    )
+    parser.add_argument("--parameters", metavar="FILE", help="the --parameters file that the diagnosis was given")
+    parser.add_argument(
+        "--iterations",
+        metavar="N",
+        type=cli.integer,
+        help="PPO iterations of each policy (default: ppo.max_iterations)",
+    )
+    parser.add_argument(
+        "--seeds", metavar="N", type=cli.integer, default=1, help="number of policies of each kind (default: 1)"
+    )
+    parser.add_argument(
+        "--episodes", metavar="N", type=cli.integer, default=200, help="episodes in each evaluation (default: 200)"
+    )
+    parser.add_argument("--out", metavar="DIR", help="folder for results and policies (default: <diagnosis>/gap_loop)")
     return parser
 
 

@@ -13,7 +13,9 @@ from bayessim_mjx.config import Config, to_yaml
 from bayessim_mjx.device import setup_jax
 from bayessim_mjx.errors import UserError
 
-DESCRIPTION = "Adaptive domain randomisation: rounds of PPO, evaluation, simulation and inference."
+DESCRIPTION = (
+    "Adaptive domain randomisation: rounds of PPO training, evaluation, simulation and inference of the physics."
+)
 
 
 class Watched:

@@ -19,7 +19,7 @@ from bayessim_mjx.errors import UserError
 from bayessim_mjx.quantities import estimate
 from bayessim_mjx.settings import COUNT
 
-DESCRIPTION = "Play a saved policy: on nominal physics, on the prior, on the surrogate real and on the posterior."
+DESCRIPTION = "Evaluate, film or export a saved policy."
 KINDS = {
     "nominal": "nominal physics",
     "prior": "physics drawn from the prior",
@@ -32,12 +32,17 @@ def _parser() -> cli.Parser:
     parser = cli.Parser("play", DESCRIPTION, without=("--max_iterations", "--video_interval", "--name", "--resume"))
     parser.add_argument(
         "--episodes",
+        metavar="N",
         type=cli.whole(-COUNT, COUNT),
-        help="per kind of physics (default: --num_envs, else bayessim.realEvals)",
+        help="episodes for each kind of physics (default: --num_envs, else bayessim.realEvals)",
     )
-    parser.add_argument("--physics", choices=KINDS, help="one kind only")
+    parser.add_argument("--physics", choices=KINDS, help="evaluate on this kind of physics only")
     parser.add_argument(
-        "--export", metavar="FILE", nargs="?", const="", help="write the policy as ONNX (exported/ of the run) and end"
+        "--export",
+        metavar="FILE",
+        nargs="?",
+        const="",
+        help="write the policy as an ONNX file and stop (default: in exported/ of the run)",
     )
     return parser
 

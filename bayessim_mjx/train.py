@@ -14,7 +14,7 @@ from bayessim_mjx.config import Config, to_yaml
 from bayessim_mjx.device import mesh, setup_jax
 from bayessim_mjx.quantities import estimate
 
-DESCRIPTION = "PPO alone: on nominal physics, or on physics drawn from the prior with --randomize."
+DESCRIPTION = "Train a policy with PPO alone, on nominal physics or on physics drawn from the prior."
 
 SPEED, WORTH_SAYING = "Perf/total_fps", 0.5  # seconds of compilation
 PLAY = "python -m bayessim_mjx.play"
@@ -31,8 +31,12 @@ SHOWN = (
 
 def _parser() -> cli.Parser:
     parser = cli.Parser("train", DESCRIPTION, resume=True, unused=("bayessim", "real"), but=("bayessim.policyCheckpt",))
-    parser.add_argument("--randomize", action="store_true", help="draw the physics of every episode from the prior")
-    parser.add_argument("--distil", metavar="RUN", help="imitate this run's (or checkpoint's) policy, in place of PPO")
+    parser.add_argument("--randomize", action="store_true", help="draw the physics of each episode from the prior")
+    parser.add_argument(
+        "--distil",
+        metavar="RUN",
+        help="train a student that imitates the policy of this run or checkpoint, instead of PPO",
+    )
     return parser
 
 

@@ -155,6 +155,18 @@ def test_help_and_task_list_need_no_task(capsys: pytest.CaptureFixture) -> None:
     assert {"Pendulum", "Cartpole", "Ant"} <= set(capsys.readouterr().out.split())
 
 
+def test_help_fits_into_80_columns(monkeypatch: Any, capsys: pytest.CaptureFixture) -> None:
+    from bayessim_mjx import calibrate, diagnose, gap_loop
+
+    monkeypatch.setenv("COLUMNS", "80")
+    for command in (main, train, play, calibrate, diagnose, gap_loop):
+        assert command.main(["--help"]) == 0
+        usage, *lines = capsys.readouterr().out.splitlines()
+        assert usage.startswith(f"usage: python -m {command.__name__} ") and max(map(len, [usage, *lines])) <= 80
+        flags = [line for line in lines if line.startswith("  -")]
+        assert all(len(line.split()) > 2 or lines[lines.index(line) + 1].startswith(" " * 8) for line in flags), flags
+
+
 def test_every_ancestor_flag_is_known() -> None:
     flags = "--task --num_envs --seed --max_iterations --headless --video --video_length --video_interval --checkpoint"
     flags += " --use_last_checkpoint --logdir --cfg_env --cfg_train --device"
