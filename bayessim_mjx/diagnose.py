@@ -39,6 +39,14 @@ def _parser() -> cli.PlainParser:
         default="all",
         help="effects to try, separated by commas: names or path.py:Class (default: all)",
     )
+    parser.add_argument(
+        "--tolerance",
+        metavar="LIMIT",
+        nargs="+",
+        default=[],
+        help="what may stay unexplained at a joint: 0.5deg, 2mm, 3%% of the motion, or elbow=0.5deg for one joint "
+        "(default: the larger of 3 noise standard deviations and 2%% of the motion)",
+    )
     parser.add_argument("--out", metavar="DIR", default="diagnosis", help="folder for the results (default: diagnosis)")
     parser.add_argument("--seed", metavar="N", type=cli.whole(0, SEEDS), default=0, help="random seed (default: 0)")
     parser.add_argument(
@@ -122,7 +130,8 @@ def _diagnosis(args: argparse.Namespace, robot: "Robot", notes: list[str], say: 
     notes += list(dict.fromkeys(str(w.message) for w in caught))
     names = "all" if args.effects == "all" else [n.strip() for n in args.effects.split(",") if n.strip()]
     try:
-        found = run.diagnose(robot, logs, names, group=args.group, seed=args.seed, progress=say)
+        asked = {"group": args.group, "seed": args.seed, "tolerated": args.tolerance}
+        found = run.diagnose(robot, logs, names, **asked, progress=say)
     except run.TooLittleData as reason:
         return assemble.insufficient(str(reason), notes)
     found.setup.warnings[:0] = notes

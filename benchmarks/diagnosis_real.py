@@ -129,7 +129,10 @@ def told(found: Diagnosis) -> dict[str, Any]:
     values = {e.name: {k: round(v.mean, 4) for k, v in e.parameters.items()} for e in found.effects}
     rivals = {e.name: [" + ".join(r["effects"]) for r in e.equivalent_to] for e in found.effects}
     known = {k: round(v["mean"], 4) for k, v in found.parameters.items()}
-    gap = {k: {s: v for s, v in row.items() if s != "unit"} for k, row in found.gap.physical.items()}
+    gap = {
+        k: {s: v for s, v in row.items() if s in ("nominal", "calibrated", "with_effects")}
+        for k, row in found.gap.physical.items()
+    }
     return {"verdict": found.verdict, "effects": values, "equivalent": rivals, "parameters": known, "gap": gap}
 
 

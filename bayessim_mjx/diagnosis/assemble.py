@@ -9,16 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from bayessim_mjx.diagnosis import gap, named, search, uncertainty, verdict, whole
+from bayessim_mjx.diagnosis import how_far, named, search, uncertainty, verdict, whole
 from bayessim_mjx.diagnosis.models import Model
 from bayessim_mjx.diagnosis.pictures import details
 from bayessim_mjx.diagnosis.result import Diagnosis, Gap, Place
-from bayessim_mjx.diagnosis.run import Findings, length_unit
+from bayessim_mjx.diagnosis.run import Findings
 from bayessim_mjx.diagnosis.sentences import horizon_warning, sentences
 from bayessim_mjx.logs.log import Channels
 
 UNEXPLAINED = 1.5  # noise standard deviations that remain and that nothing predicts
-SHORT = 0.1  # s, the first horizon
 LITTLE = 0.3  # share of the calibrated gap that named effects may leave
 REMAINS = 0.3  # share of the calibrated gap that a flexible force closes on top of named effects: not in the library
 
@@ -34,14 +33,15 @@ def diagnosis_of(found: Findings, say: search.Progress = lambda text, done, tota
     closed = named.closed_by(found)
     effects = named.effects_of(found, sd, closed, say)
     remains = _remains(found)
-    name = _verdict(found, remains)
+    far = how_far.measured(found, {k: v for k, v in closed.items() if k != "each"})
+    name = _verdict(found, remains, far)
     parameters = _parameters(race, model, sd)
     say("whole logs", 0, 1)
     over = whole.simulate(found)
-    far = _gap(found, over, {k: v for k, v in closed.items() if k != "each"})
+    far = how_far.with_whole(far, over, setup.tolerance, setup.seed)
     return Diagnosis(
         verdict=name,
-        sentences=sentences(name, effects, parameters, found, remains),
+        sentences=sentences(name, effects, parameters, found, far, remains, _beaten(found)),
         effects=effects,
         where=_where(found),
         gap=far,
@@ -65,8 +65,10 @@ def _remains(found: Findings) -> float:
     return float(top / max(race.base.total - floor, 1e-9))
 
 
-def _verdict(found: Findings, remains: float) -> str:
+def _verdict(found: Findings, remains: float, far: Gap) -> str:
     race, model = found.race, found.ruling.model
+    if model.effects and far.beyond:
+        return "unexplained"  # partly explained: what is left still matters
     cost = {k: float(p.cost(found.setup.fitter.simulator.windows.steps).mean()) for k, p in found.predictions.items()}
     left = cost["with_effects"] - 1.0
     if model.effects and left > UNEXPLAINED**2 - 1.0 and left > LITTLE * (cost["calibrated"] - 1.0):
@@ -97,61 +99,6 @@ def _beaten(found: Findings) -> bool:
     better = model.total - float(base.condition.cost.sum())
     above = race.base.total - race.noise * len(race.base.cost)
     return better > 0.4 * model.total and better > race.settings.relevance * above
-
-
-def _gap(found: Findings, over: whole.Whole, closed: dict[str, Any]) -> Gap:
-    setup, predictions = found.setup, found.predictions
-    cut = setup.fitter.simulator.windows
-    floor = _floor(found)
-    short = max(1, min(round(SHORT / cut.dt), cut.steps // 2))
-    rows = []
-    for steps in (short, cut.steps):
-        costs = {k: p.cost(steps) for k, p in predictions.items()} | {"reducible_floor": floor}
-        seconds = steps * cut.dt
-        rows.append({"name": f"{seconds:.2g} s", "seconds": seconds, **_row(costs, cut.group, setup.seed)})
-    main = rows[-1]
-    if len(over.group):
-        costs = over.cost | {"reducible_floor": max(float(floor.mean()), 1.0) + over.chance}
-        rows.append({"name": over.name, "seconds": over.seconds, **_row(costs, over.group, setup.seed)})
-    names = Channels.of(setup.physics.mj_model).qvel
-    by_channel = {
-        joint: {s: float(np.sqrt(p.cost(cut.steps, slice(i, i + 1)).mean())) for s, p in predictions.items()}
-        for i, joint in enumerate(names)
-    }
-    physical = {
-        joint: {s: v * float(cut.sigma_q[i]) for s, v in by_channel[joint].items()}
-        | {"unit": length_unit(setup.physics.mj_model, i)}
-        for i, joint in enumerate(names)
-    }
-    return Gap(
-        noise_floor=1.0,
-        nominal=main["nominal"],
-        calibrated=main["calibrated"],
-        with_effects=main["with_effects"],
-        reducible_floor=main["reducible_floor"],
-        by_channel=by_channel,
-        horizons=rows,
-        physical=physical,
-        closed=closed,
-        integrator=setup.discretisation.to_dict() if setup.discretisation else {},
-    )
-
-
-def _row(costs: dict[str, np.ndarray], group: np.ndarray, seed: int) -> dict[str, Any]:
-    """One horizon; what is reducible ends at the noise, and where the effects are better than any other model."""
-    row = gap.stages(costs, group, seed)
-    low, high = (max(v, 1.0) for v in row["ci"]["reducible_floor"])
-    level = row["reducible_floor"] = min(max(row["reducible_floor"], 1.0), row["with_effects"])
-    row["ci"]["reducible_floor"] = [min(low, level), max(level, min(high, row["ci"]["with_effects"][1]))]
-    return row
-
-
-def _floor(found: Findings) -> np.ndarray:
-    """Mean squares `[W]` of the best held-out prediction that anything reached, named or flexible."""
-    race = found.race
-    every = [m.cost for m in race.models.values()]
-    every += [f.condition.cost for f in (found.flexible_base, found.flexible_winner) if f is not None]
-    return min(every, key=np.sum) / race.noise
 
 
 def _parameters(race: search.Race, model: Model, sd: np.ndarray) -> dict[str, dict[str, Any]]:

@@ -8,7 +8,8 @@ import numpy as np
 
 from bayessim_mjx.diagnosis import race, verdict
 from bayessim_mjx.diagnosis.result import FoundEffect
-from bayessim_mjx.diagnosis.run import Findings, length_unit
+from bayessim_mjx.diagnosis.run import Findings
+from bayessim_mjx.diagnosis.tolerance import length_unit
 from bayessim_mjx.effects import spec_of
 from bayessim_mjx.logs.log import Channels
 

@@ -74,8 +74,13 @@ class Place:
 class Gap:
     """Root mean square of measured minus simulated motion on held-out windows, in units of the measurement noise.
 
+    reducible_floor: what no model undercuts: what runs of the same commands differ by, or the noise.
     horizons: [{"name": "0.25 s", "seconds", "nominal", "calibrated", "with_effects", "reducible_floor", "noise_floor",
-    "ci": {stage: [lo, hi]}}]; by_channel: {joint: {stage: value}}; physical: {joint: {stage: value, "unit"}}, rad or m;
+    "floor": "noise", "repeats" or "start" (of a long simulation), "ci": {stage: [lo, hi]}, "physical", "shares"}];
+    by_channel: {joint: {stage: value}}; physical: {joint: {stage: value, "unit"}}, rad or m, and "noise", "motion" (the
+    range of the logged motion), "tolerance", "largest" (error that the last stage leaves), "beyond" (whether it leaves
+    more than tolerated); shares: {stage: value}, of the range of motion, root mean square over the joints; beyond: the
+    joints where more than tolerated remains;
     closed: {"predicted", "realised", "ci"}, share of the recalibrated simulator's squared gap above the noise that all
     effects close together: as promised before any was fitted, and on held-out windows afterwards; integrator: what the
     simulator's own time step is worth (`discretisation.Discretisation.to_dict`).
@@ -90,6 +95,8 @@ class Gap:
     by_channel: dict[str, dict[str, float]] = field(default_factory=dict)
     horizons: list[dict[str, Any]] = field(default_factory=list)
     physical: dict[str, dict[str, Any]] = field(default_factory=dict)
+    shares: dict[str, float] = field(default_factory=dict)
+    beyond: list[str] = field(default_factory=list)
     closed: dict[str, Any] = field(default_factory=dict)
     integrator: dict[str, Any] = field(default_factory=dict)
 

@@ -8,7 +8,6 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
-import mujoco
 import numpy as np
 
 from bayessim_mjx import effects as library
@@ -22,6 +21,7 @@ from bayessim_mjx.diagnosis import (
     ridges,
     scales,
     search,
+    tolerance,
     verdict,
     windows,
 )
@@ -68,6 +68,7 @@ class Setup:
     scales: scales.Scales
     settings: search.Settings
     seed: int
+    tolerance: tolerance.Tolerance
     warnings: list[str] = field(default_factory=list)
     discretisation: discretisation.Discretisation | None = None
 
@@ -107,13 +108,15 @@ def prepare(
     group: str | None = None,
     seed: int = 0,
     settings: search.Settings | None = None,
+    tolerated: Sequence[str] = (),
 ) -> Setup:
     """Everything up to the first simulation.
 
     Raises:
-        UserError: unknown effects, no usable log.
+        UserError: unknown effects, no usable log, a tolerance that cannot be read.
         TooLittleData: too few windows.
     """
+    asked = tolerance.read(tolerated, robot.mj_model)
     dt = control_period(robot, logs)
     seen = gate.check(logs, robot.mj_model, dt)
     usable = seen.demand()
@@ -130,8 +133,10 @@ def prepare(
     fitter = Fitter(Simulator(physics, cut), candidates.base_coordinates(robot.space), physics.space.nominal)
     every = candidates.enumerate_candidates(physics)
     settings = dataclasses.replace(settings or _settings(robot), believed=step.believed)
+    allowed = tolerance.judge(robot.mj_model, 2 * size.travel, cut.sigma_q, asked)
     notes += [*floors.warnings, *step.warnings(), *(f"not tried: {text}" for text in left_out), *_few_conditions(cut)]
-    return Setup(robot, physics, seen, floors, fitter, every, size, settings, seed, notes, step)
+    notes += allowed.warnings()
+    return Setup(robot, physics, seen, floors, fitter, every, size, settings, seed, allowed, notes, step)
 
 
 def _settings(robot: Robot) -> search.Settings:
@@ -214,6 +219,7 @@ def diagnose(
     group: str | None = None,
     seed: int = 0,
     settings: search.Settings | None = None,
+    tolerated: Sequence[str] = (),
     progress: Progress | None = None,
 ) -> Findings:
     """The whole computation.
@@ -223,6 +229,7 @@ def diagnose(
         logs: recorded motion.
         effects: "all", or names (also of one's own, `path.py:Class`) or classes.
         group: metadata key of the operating conditions that are held out in turn.
+        tolerated: what may stay unexplained, as `--tolerance` (`tolerance.read`).
         progress: called with (what is being done, done, total).
 
     Raises:
@@ -230,7 +237,7 @@ def diagnose(
     """
     say = progress or (lambda text, done, total: None)
     say("looking at the logs", 0, 1)
-    setup = prepare(robot, logs, effects, group=group, seed=seed, settings=settings)
+    setup = prepare(robot, logs, effects, group=group, seed=seed, settings=settings, tolerated=tolerated)
     race = search.run(setup.fitter, setup.candidates, setup.settings, say)
     race.winner = _verified(setup, race, say)
     ruling = verdict.rule(race, say)
@@ -286,11 +293,3 @@ def _flexible(setup: Setup, model: Model, race: search.Race, missing: Disturbanc
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return flexible(setup.fitter, model.job, missing)
-
-
-def length_unit(model: mujoco.MjModel, dof: int) -> str:
-    """rad or m."""
-    joint = int(model.dof_jntid[dof])
-    free = int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_FREE)
-    slides = int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_SLIDE)
-    return "m" if slides or (free and dof - int(model.jnt_dofadr[joint]) < 3) else "rad"

@@ -5,70 +5,142 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
-
 from bayessim_mjx.diagnosis.nouns import listed, missing
 from bayessim_mjx.diagnosis.result import FoundEffect, Gap
 from bayessim_mjx.diagnosis.run import Findings
+from bayessim_mjx.diagnosis.tolerance import extent, share
 from bayessim_mjx.diagnosis.verdict import Rival
 
 CLEAR = 1.2  # noise variances above which a horizon's gap is worth a share
+TOLD = 6  # joints told one by one
 HEADS = {
-    "no_gap": "No gap above the noise: the simulator is within {nominal} noise standard deviations of the logs.",
+    "no_gap": "No gap above the noise: the logs differ from the simulator by {nominal}.",
     "parameters": "The parameters are off, the structure is right: recalibrated, the gap falls from {nominal} to "
-    "{calibrated} noise standard deviations.",
+    "{calibrated}.",
     "effects": "The simulator lacks {named}.",
     "ambiguous": "The simulator lacks something like {named}, but these logs fit other explanations as well.",
     "unexplained": "Something is missing that no effect of the library explains.",
 }
-NEAREST = "Of the library, {named} {come} nearest; "
-BEATEN = "a flexible force alone predicts held-out conditions far better."
-ON_TOP = "a flexible force on top of {them} still closes {remains} of the gap."
-FALLS = (
-    "With {them} the gap falls from {calibrated} (recalibrated) to {with_effects} noise standard deviations on "
-    "held-out conditions. Of the squared gap above the noise {predicted} was promised to go before {they} added, and "
-    "{realised} went."
+PARTLY = (
+    "Partly explained: {named} {close} {realised} of the squared gap above the noise, but more than the tolerance "
+    "remains at {beyond}."
 )
+NEAREST = "Of the library, {named} {come} nearest"
+BEATEN = "; a flexible force alone predicts held-out conditions far better"
+ON_TOP = "; a flexible force on top of {them} still closes {remains} of the gap"
+FALLS = (
+    "With {them} the recalibrated simulator's gap falls from {calibrated} to {with_effects} on held-out conditions. Of "
+    "the squared gap above the noise {predicted} was promised to go before {they} added, and {realised} went."
+)
+WITHIN = "What remains is within the tolerance at every joint: {within}."
 CHANCE = (
-    "What remains ({calibrated} noise standard deviations) no candidate and no flexible force predicts on held-out "
-    "conditions: process noise, an input that was not logged, or noise larger than estimated."
+    "What remains, {calibrated}, no candidate and no flexible force predicts on held-out conditions: process noise, an "
+    "input that was not logged, or noise larger than estimated."
 )
 
 
 def sentences(
-    name: str, effects: list[FoundEffect], parameters: dict[str, dict[str, Any]], found: Findings, remains: float
+    name: str,
+    effects: list[FoundEffect],
+    parameters: dict[str, dict[str, Any]],
+    found: Findings,
+    far: Gap,
+    remains: float,
+    beaten: bool,
 ) -> list[str]:
-    """The verdict, most important first."""
-    steps = found.setup.fitter.simulator.windows.steps
-    level = {k: float(np.sqrt(p.cost(steps).mean())) for k, p in found.predictions.items()}
-    told = verdict_in_words(name, effects, level, remains)
-    if name == "ambiguous":
+    """The verdict, most important first; `remains`, `beaten`: see `verdict_in_words`."""
+    told = verdict_in_words(name, effects, far, remains, beaten)
+    if found.ruling.ambiguous:
         told += [_instead(e, found.ruling.rivals.get(f"{e.name}@{e.where}", [])) for e in effects]
     if not effects and remains == 0.0 and found.race.above_noise(found.race.base):
-        told.append(CHANCE.format(calibrated=number(level["calibrated"])))
+        told.append(CHANCE.format(calibrated=stage_in_words(far, "calibrated")))
     if name == "unexplained" and found.flexible_winner is not None:
         told += [f"{text[:1].upper()}{text[1:]}." for text in found.flexible_winner.text]
     told += [f"{k} {v['structural']}." for k, v in parameters.items() if v["structural"]]
     return [text for text in told if text]
 
 
-def verdict_in_words(name: str, effects: list[FoundEffect], level: dict[str, float], remains: float) -> list[str]:
-    """Verdict and how far; level: {stage: root mean square in noise standard deviations}."""
+def verdict_in_words(
+    name: str, effects: list[FoundEffect], far: Gap, remains: float = 0.0, beaten: bool = False
+) -> list[str]:
+    """Verdict, how far, and what remains against the tolerance.
+
+    Args:
+        remains: share of the gap that a flexible force closes on top of the effects; beaten: whether a flexible force
+            alone does better than they do.
+    """
     promised, went = (sum(getattr(e, k) for e in effects) for k in ("predicted_gap_closed", "gap_closed"))
-    fill = {k: number(v) for k, v in level.items()} | {
+    one = len(effects) == 1
+    fill = {s: stage_in_words(far, s) for s in ("nominal", "calibrated", "with_effects")} | {
         "named": listed([missing(e.name, e.where) for e in effects]),
-        "them": "it" if len(effects) == 1 else "them",
-        "they": "it was" if len(effects) == 1 else "they were",
-        "come": "comes" if len(effects) == 1 else "come",
-        "remains": f"{remains:.0%}",
+        "them": "it" if one else "them",
+        "they": "it was" if one else "they were",
+        "come": "comes" if one else "come",
+        "close": "closes" if one else "close",
+        "remains": share(remains),
         "predicted": f"{promised:.0%}",
         "realised": f"{went:.0%}",
+        "beyond": listed([_left(n, far.physical[n]) for n in _worst(far) if n in far.beyond][:3]),
+        "within": _within(far),
     }
-    out = [HEADS[name]]
+    partly = name == "unexplained" and effects and far.beyond
+    out = [PARTLY if partly else HEADS[name]]
     if effects:
-        out += [NEAREST + (ON_TOP if remains > 0.05 else BEATEN)] if name == "unexplained" else []
+        more = ON_TOP if remains > 0.05 else BEATEN if beaten else ""
+        out += [f"{NEAREST}{more}."] if name == "unexplained" and (more or not partly) else []
         out.append(FALLS)
+    joints = list(far.physical)
+    if len(joints) > 1 and name != "no_gap":
+        out.append(_by_joint(far, bool(effects)))
+    if effects and _within(far) and not far.beyond:
+        out.append(WITHIN)
     return [text.format(**fill) for text in out]
+
+
+def stage_in_words(far: Gap, stage: str) -> str:
+    """`1.2 deg (2.1% of the motion, 27.0 noise sd)`; of several joints the share alone."""
+    parts = [share(far.shares[stage]) + " of the motion"] if stage in far.shares else []
+    noises = f"{number(getattr(far, stage))} noise sd"
+    if len(far.physical) == 1:
+        (row,) = far.physical.values()
+        return f"{extent(row[stage], row['unit'])} ({', '.join([*parts, noises])})"
+    return f"{parts[0]} ({noises})" if parts else noises
+
+
+def _worst(far: Gap) -> list[str]:
+    """Joints, what remains against the tolerance largest first."""
+    return sorted(far.physical, key=lambda n: -_against(far.physical[n]))
+
+
+def _against(row: dict[str, Any]) -> float:
+    return float(row["with_effects"] / row["tolerance"]) if row.get("tolerance") else 0.0
+
+
+def _left(name: str, row: dict[str, Any]) -> str:
+    """`elbow: 1.2 deg rms, 3.4 deg at most (2.1% of its motion; tolerance 0.8 deg)`."""
+    unit = row["unit"]
+    most = f"{extent(row['with_effects'], unit)} rms, {extent(row['largest'], unit)} at most"
+    part = f"{share(row['with_effects'] / row['motion'])} of its motion; " if row["motion"] else ""
+    return f"{name}: {most} ({part}tolerance {extent(row['tolerance'], unit)})"
+
+
+def _within(far: Gap) -> str:
+    """The joint that comes nearest to its tolerance."""
+    name = next((n for n in _worst(far) if far.physical[n].get("tolerance")), "")
+    if not name:
+        return ""
+    row = far.physical[name]
+    return f"{extent(row['with_effects'], row['unit'])} of {extent(row['tolerance'], row['unit'])} at {name}"
+
+
+def _by_joint(far: Gap, effects: bool) -> str:
+    """`By joint, recalibrated and with the effects: elbow 1.2 deg, 0.05 deg; ...`, the worst first."""
+    stages = ("calibrated", "with_effects") if effects else ("nominal", "calibrated")
+    words = "recalibrated and with the effects" if effects else "as delivered and recalibrated"
+    names = _worst(far)
+    rows = [(n, [extent(far.physical[n][s], far.physical[n]["unit"]) for s in stages]) for n in names[:TOLD]]
+    more = f"; {len(names) - TOLD} more in the table" if len(names) > TOLD else ""
+    return f"By joint, {words}: {'; '.join(f'{n} {a}, {b}' for n, (a, b) in rows)}{more}."
 
 
 def number(value: float) -> str:

@@ -27,12 +27,14 @@ class Whole:
     """Held-out errors over whole logs.
 
     Attributes:
-        cost: {stage: `[L]`}, mean squares in noise variances, of the logs that can be predicted.
+        cost: {stage: `[L]`}, mean squares in noise variances, of the logs that can be predicted; by_channel: {stage:
+            `[L, nv]`}, of positions alone.
         chance: `[L]`, mean squares that come of the uncertain start alone.
         group: `[L]`, operating conditions; name, seconds: of the horizon; notes: for the warnings.
     """
 
     cost: dict[str, Array]
+    by_channel: dict[str, Array]
     chance: Array
     group: NDArray[np.int64]
     name: str
@@ -128,13 +130,17 @@ def _judged(
     broken = [n for n, k, e in zip(names, last, errors, strict=True) if not np.isfinite(e[:, :k]).all()]
     kept = [i for i, n in enumerate(names) if n not in broken and last[i] >= LEAST * cut.steps]
     cost = {s: np.array([np.mean(errors[i][k, : last[i]] ** 2) for i in kept]) for k, s in enumerate(stages)}
-    cost.setdefault("with_effects", cost["calibrated"])
+    nv = setup.physics.mj_model.nv
+    each = {s: np.array([np.mean(errors[i][k, : last[i], :nv] ** 2, 0) for i in kept]) for k, s in enumerate(stages)}
+    for table in (cost, each):
+        table.setdefault("with_effects", table["calibrated"])
     longest = max((last[i] for i in kept), default=0) * cut.dt
     notes = _notes(names, kept, chaotic, broken, longest)
     notes += _away(stages, [[errors[i][k, : last[i]] / size[i] for i in kept] for k in range(len(stages))])
     whole = not chaotic and longest < SECONDS - cut.dt
     return Whole(
         cost=cost,
+        by_channel=each,
         chance=np.array([np.mean(spread[i][:, : last[i]] ** 2) for i in kept]),
         group=group[kept],
         name="whole log" if whole else f"up to {longest:.2g} s",

@@ -7,7 +7,9 @@ from bayessim_mjx.diagnosis.nouns import LACKS, listed, missing
 from bayessim_mjx.diagnosis.result import VERDICTS, FoundEffect, Gap
 from bayessim_mjx.effects import names
 
-LEVEL = {"nominal": 21.44, "calibrated": 2.7, "with_effects": 0.866}
+ROW = {"nominal": 0.02144, "calibrated": 0.0027, "with_effects": 0.000866, "unit": "rad", "tolerance": 0.02}
+SHARES = {"nominal": 0.02144, "calibrated": 0.0027, "with_effects": 0.000866}
+LEVEL = Gap(1.0, 21.44, 2.7, 0.866, 0.866, physical={"hinge": ROW}, shares=SHARES)
 
 
 def effect(name, where, closed, promised):
@@ -19,16 +21,21 @@ GAIN = effect("actuator_gain", "torque", 0.32, 0.31)
 
 
 def test_one_effect():
-    head, falls = sentences.verdict_in_words("effects", [FRICTION], LEVEL, 0.0)
+    head, falls, within = sentences.verdict_in_words("effects", [FRICTION], LEVEL)
     assert head == "The simulator lacks Coulomb friction at hinge."
-    assert falls.startswith("With it the gap falls from 2.70 (recalibrated) to 0.87 noise standard deviations")
+    # 2.7 mrad of 1 rad are 0.155 deg, 0.27 %
+    assert falls.startswith(
+        "With it the recalibrated simulator's gap falls from 0.15 deg (0.27% of the motion, 2.70 noise sd) to "
+        "0.050 deg (0.087% of the motion, 0.87 noise sd) on held-out conditions."
+    )
+    assert within == "What remains is within the tolerance at every joint: 0.050 deg of 1.1 deg at hinge."
     assert falls.endswith("66% was promised to go before it was added, and 68% went.")
 
 
 def test_several_effects():
-    head, falls = sentences.verdict_in_words("effects", [FRICTION, GAIN], LEVEL, 0.0)
+    head, falls, _ = sentences.verdict_in_words("effects", [FRICTION, GAIN], LEVEL)
     assert head == "The simulator lacks Coulomb friction at hinge and the true actuator gain at torque."
-    assert falls.startswith("With them the gap falls")
+    assert falls.startswith("With them the recalibrated")
     assert falls.endswith("97% was promised to go before they were added, and 100% went.")
 
 
@@ -36,8 +43,10 @@ def test_what_comes_nearest_where_nothing_explains():
     one = sentences.verdict_in_words("unexplained", [FRICTION], LEVEL, 0.4)[1]
     assert one.startswith("Of the library, Coulomb friction at hinge comes nearest; a flexible force on top of it")
     assert one.endswith("still closes 40% of the gap.")
-    two = sentences.verdict_in_words("unexplained", [FRICTION, GAIN], LEVEL, 0.0)[1]
+    two = sentences.verdict_in_words("unexplained", [FRICTION, GAIN], LEVEL, 0.0, beaten=True)[1]
     assert "come nearest; a flexible force alone predicts" in two
+    alone = sentences.verdict_in_words("unexplained", [FRICTION], LEVEL)[1]
+    assert alone == "Of the library, Coulomb friction at hinge comes nearest."
 
 
 @pytest.mark.parametrize("verdict", [v for v in VERDICTS if v != "insufficient_data"])

@@ -1,0 +1,185 @@
+"""What may remain unexplained: how it is typed, what it is by default, and what verdict and words make of it."""
+
+import math
+from types import SimpleNamespace
+
+import mujoco
+import numpy as np
+import pytest
+
+from bayessim_mjx.diagnosis import assemble, how_far, repeated, sentences, tolerance
+from bayessim_mjx.diagnosis.gap import Prediction
+from bayessim_mjx.diagnosis.result import FoundEffect, Gap
+from bayessim_mjx.errors import UserError
+from bayessim_mjx.logs import Channels, Log
+
+MODEL = mujoco.MjModel.from_xml_string("""<mujoco><worldbody>
+<body><joint name="hinge" axis="0 1 0"/><geom size=".1"/>
+<body><joint name="rail" type="slide"/><geom size=".1"/></body></body></worldbody></mujoco>""")
+DEG = math.pi / 180
+
+
+@pytest.mark.parametrize(
+    ("texts", "hinge", "rail"),
+    [
+        ([], 0.02 * 2.0, 3 * 0.01),  # 2 % of 2 rad is more than 3 mrad; 3 noises of 10 mm are more than 2 % of 0.5 m
+        (["hinge=0.5deg"], 0.5 * DEG, 0.03),
+        (["5%"], 0.1, 0.025),
+        (["0.02"], 0.02, 0.02),
+        (["hinge=10mrad,rail=4mm"], 0.01, 0.004),
+        (["rail=1cm", "1%"], 0.02, 0.01),  # the joint's own goes before that of all
+    ],
+)
+def test_what_is_typed_and_what_is_taken_without(texts, hinge, rail):
+    own = tolerance.judge(MODEL, np.array([2.0, 0.5]), np.array([0.001, 0.01]), tolerance.read(texts, MODEL))
+    assert own.limit == pytest.approx([hinge, rail]) and own.units == ("rad", "m")
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("elbow=1deg", "elbow"),
+        ("hinge=1mm", "deg"),
+        ("2deg", "rail"),  # of all joints, one of which slides
+        ("hinge=-1deg", "-1deg"),
+        ("hinge=", "''"),
+        ("hinge=0", "not positive"),
+        ("1.2.3", "1.2.3"),
+        ("hinge=lots", "lots"),
+        ("hinge=1e999", "not positive"),
+    ],
+)
+def test_what_cannot_be_read_is_refused_by_name(text, words):
+    with pytest.raises(UserError, match=r"--tolerance") as told:
+        tolerance.read([text], MODEL)
+    assert words in str(told.value) and ("allowed" in str(told.value) or "there are: hinge, rail" in str(told.value))
+
+
+def test_noise_is_taken_out_before_the_rest_is_judged():
+    own = tolerance.judge(MODEL, np.array([1.0, 1.0]), np.array([0.01, 0.01]), {0: tolerance.Limit(0.02, False)})
+    # sqrt(0.022^2 - 0.01^2) = 0.0196; sqrt(0.0325^2 - 0.01^2) = 0.0309 > 3 noises
+    assert own.exceeded(np.array([0.022, 0.0325])).tolist() == [False, True]
+    assert own.exceeded(np.array([0.023, 0.0310])).tolist() == [True, False]
+
+
+def test_a_tolerance_below_the_noise_is_told():
+    own = tolerance.judge(MODEL, np.ones(2), np.array([0.01, 0.01]), {0: tolerance.Limit(0.001, False)})
+    (text,) = own.warnings()
+    assert "hinge" in text and "noise" in text
+    assert not own.exceeded(np.array([0.0141, 0.0])).any()  # what is left above the noise is the noise itself
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "text"),
+    [(0.5 * DEG, "rad", "0.50 deg"), (12.34 * DEG, "rad", "12.3 deg"), (0.0012, "m", "1.2 mm"), (2.5, "m", "2.5 m"),
+     (0.0087 * DEG, "rad", "0.0087 deg"), (0.0, "m", "0.0 mm"), (180 * DEG, "rad", "180 deg")],
+)  # fmt: skip
+def test_physical_units(value, unit, text):
+    assert tolerance.extent(value, unit) == text
+
+
+# The verdict
+
+
+FRICTION = FoundEffect("coulomb_friction", "elbow", {}, 1.0, 0.8, (0.7, 0.9), predicted_gap_closed=0.8)
+
+
+def gap(left, limit=0.02):
+    """A gap of two joints; `left`: rad that remain at the elbow."""
+    rows = {
+        n: {"nominal": 0.2, "calibrated": 0.1, "with_effects": v, "unit": "rad", "noise": 1e-4, "motion": 1.0,
+            "tolerance": limit, "largest": 3 * v, "beyond": v > limit}
+        for n, v in (("shoulder", 0.001), ("elbow", left))
+    }  # fmt: skip
+    shares = {"nominal": 0.2, "calibrated": 0.1, "with_effects": left}
+    beyond = [n for n, r in rows.items() if r["beyond"]]
+    return Gap(1.0, 2000.0, 1000.0, 1e4 * left, 1.0, physical=rows, shares=shares, beyond=beyond)
+
+
+def findings(rms, noise=50.0, windows=8):
+    """A race whose winner names friction and leaves `rms` noises of a gap of 1000."""
+
+    def prediction(level):
+        return Prediction(np.full((windows, 5, 2), float(level)), np.zeros((windows, 4)))
+
+    winner = SimpleNamespace(effects=(FRICTION,), total=windows * noise * rms**2)
+    race = SimpleNamespace(
+        noise=noise,
+        above_noise=lambda m: True,
+        base=SimpleNamespace(total=windows * noise * 1e6, cost=np.ones(windows)),
+    )
+    cut = SimpleNamespace(windows=SimpleNamespace(steps=5))
+    return SimpleNamespace(
+        race=race, ruling=SimpleNamespace(model=winner, ambiguous=False, rivals={}), flexible_winner=None,
+        flexible_base=None, setup=SimpleNamespace(fitter=SimpleNamespace(simulator=cut)),
+        predictions={"nominal": prediction(2000), "calibrated": prediction(1000), "with_effects": prediction(rms)},
+    )  # fmt: skip
+
+
+def test_effects_that_leave_more_than_tolerated_explain_a_part():
+    """132 noises that remain are 2 % of the squared gap: all of it is closed, and yet 13 mrad may matter or not."""
+    assert assemble._verdict(findings(132.0), 0.0, gap(0.0132, limit=0.01)) == "unexplained"
+    assert assemble._verdict(findings(132.0), 0.0, gap(0.0132, limit=0.02)) == "effects"
+
+
+def test_the_headline_says_partly_explained_and_what_remains_where():
+    head, *rest = sentences.verdict_in_words("unexplained", [FRICTION], gap(0.0349))
+    assert head.startswith("Partly explained: Coulomb friction at elbow closes 80% of the squared gap above the noise")
+    assert "elbow: 2.0 deg rms, 6.0 deg at most (3.5% of its motion; tolerance 1.1 deg)" in head
+    assert "shoulder" not in head and any(text.startswith("By joint") for text in rest)
+    head, *rest = sentences.verdict_in_words("effects", [FRICTION], gap(0.0132))
+    assert head == "The simulator lacks Coulomb friction at elbow."
+    assert rest[-1] == "What remains is within the tolerance at every joint: 0.76 deg of 1.1 deg at elbow."
+
+
+def test_physical_units_and_shares_come_before_the_noise():
+    falls = sentences.verdict_in_words("effects", [FRICTION], gap(0.0132))[1]
+    assert "from 10% of the motion (1000 noise sd) to 1.3% of the motion (132 noise sd)" in falls
+    one = gap(0.0132)
+    del one.physical["shoulder"]
+    assert "5.7 deg (10% of the motion, 1000 noise sd)" in sentences.verdict_in_words("effects", [FRICTION], one)[1]
+
+
+# The floor
+
+
+def log_of(model, name, x, u):
+    one, none = np.full(1, 0.01), np.zeros((len(x), 1))
+    return Log(name, np.arange(len(x)) * 0.01, u[:, None], x[:, None], none, False, Channels.of(model), one, one)
+
+
+def test_the_floor_is_what_repeats_differ_by(monkeypatch):
+    """Two runs with noise of 1 and a disturbance of sd 2 of their own: no model is nearer than sqrt(1 + 4)."""
+    rng = np.random.default_rng(0)
+    sigma, steps, count = 0.01, 10, 40
+    time = np.arange(steps * count + 1)
+    model = mujoco.MjModel.from_xml_string(
+        "<mujoco><worldbody><body><joint/><geom size='.1'/></body></worldbody></mujoco>"
+    )
+    own = np.sin(time / 7.0)
+    runs = [own + sigma * np.sqrt(5.0) * rng.normal(size=len(time)) for _ in range(2)]
+    commands = (np.cos(time), np.cos(time), np.sin(time))
+    logs = [log_of(model, f"log{i}", x, u) for i, (x, u) in enumerate(zip([*runs, own], commands, strict=True))]
+    # the start state shifts a whole window and tilts it
+    B = np.tile(np.stack([np.ones(steps), np.arange(steps) / steps], 1) / sigma, (count, 1, 1))
+    cut = SimpleNamespace(
+        logs=logs, log=np.zeros(count, int), start=np.arange(count) * steps, steps=steps, group=np.zeros(count, int)
+    )
+    simulator = SimpleNamespace(windows=cut, physics=SimpleNamespace(mj_model=model))
+    fitter = SimpleNamespace(
+        simulator=simulator, used=np.array([True, False]), sigma=np.array([sigma]), spread=np.array([10.0, 10.0])
+    )
+    job = SimpleNamespace(B=B, offsets=np.zeros((count, 2)))
+    monkeypatch.setattr(repeated.noise, "repeats", lambda logs: [logs[:2]])
+    prediction, group = repeated.floor(fitter, job, logs)
+    assert len(group) == count
+    # two of ten numbers of a window go into its start state
+    assert np.sqrt(prediction.cost(steps).mean() / 0.8) == pytest.approx(np.sqrt(5.0), rel=0.05)
+    monkeypatch.setattr(repeated.noise, "repeats", lambda logs: [])
+    assert repeated.floor(fitter, job, logs) is None
+
+
+def test_without_repeats_the_floor_is_the_noise_whatever_was_tried():
+    row = {"with_effects": 132.0, "ci": {"with_effects": [120.0, 140.0]}}
+    assert how_far._floor(None, 5, row, 0) == {"reducible_floor": 1.0, "floor": "noise"}
+    assert row["ci"]["reducible_floor"] == [1.0, 1.0]
