@@ -6,8 +6,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
-from bayessim_mjx.diagnosis.candidates import Candidate
+from bayessim_mjx.diagnosis.candidates import Candidate, Coordinate
 from bayessim_mjx.diagnosis.discretisation import contacts
 from bayessim_mjx.diagnosis.fit import Fitter, Job
 from bayessim_mjx.diagnosis.models import Comparison, Model, compare, scored
@@ -17,6 +18,7 @@ from bayessim_mjx.effects import load, names
 
 Progress = Callable[[str, int, int], None]
 ROUNDS = 5  # of polishing, where it has to be done again and again
+ASTRAY = 10.0  # noises that a fit leaves: from there on nothing is as it was a step before
 
 
 @dataclass(frozen=True)
@@ -149,9 +151,12 @@ class Race:
 
 
 def _fresh(race: Race, job: Job) -> list[int]:
-    """Columns to be differenced anew: the effects' at every step, the known parameters' at every third if cheap."""
+    """Columns to be differenced anew: the effects' at every step, the known parameters' at every third if cheap.
+
+    Far from the logs, where they change from step to step, at every one.
+    """
     base = len(race.fitter.base)
-    turn = base <= race.settings.fresh and len(job.history) % 3 == 0
+    turn = base <= race.settings.fresh and (_astray(race, job) or len(job.history) % 3 == 0)
     return list(range(0 if turn else base, len(job.coordinates)))
 
 
@@ -212,13 +217,30 @@ def _starts(race: Race, model: Model, extra: Screened, rank: int) -> list[Job]:
     fitter, coordinates = race.fitter, extra.candidate.coordinates
     jobs = [fitter.derive(model.job, coordinates, extra.start)]
     if rank < race.settings.starts and extra.others:
-        fresh = fitter.derive(model.job, coordinates, extra.others[0])
-        base = len(fitter.base)
-        fresh.values[:base] = [c.neutral for c in fitter.base]  # not from where the base went without the effect
+        fresh = _delivered(race, model, coordinates, extra)
         # a limit has no derivative below its threshold, so also from the probe itself, not scaled down to its step
         jobs += [fresh, fitter.derive(model.job, coordinates, extra.others[0])]
         jobs += [fitter.derive(model.job, coordinates, other) for other in extra.others[1:]]
     return jobs
+
+
+def _delivered(race: Race, model: Model, coordinates: Sequence[Coordinate], extra: Screened) -> Job:
+    """A job from the known parameters as they were delivered, not from where they went without the effect.
+
+    Far from the logs the start states went astray as well, and what they do depends on the effect.
+    """
+    fitter, base = race.fitter, len(race.fitter.base)
+    known = np.concatenate([[c.neutral for c in fitter.base], model.job.values[base:]])
+    if _astray(race, model.job):
+        return fitter.begin((*model.job.coordinates, *coordinates), np.concatenate([known, extra.start]))
+    fresh = fitter.derive(model.job, coordinates, extra.others[0])
+    fresh.values[: len(known)] = known
+    return fresh
+
+
+def _astray(race: Race, job: Job) -> bool:
+    """Whether a fit is so far from the logs that its derivatives hold nowhere else."""
+    return job.cost > ASTRAY**2 * race.noise * len(job.r)
 
 
 def ranked(race: Race, size: int | None = None) -> list[Model]:

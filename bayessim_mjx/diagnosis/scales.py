@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from bayessim_mjx.diagnosis import loads
 from bayessim_mjx.effects.effect import Effect, Quantity
 from bayessim_mjx.effects.site import element_names
 from bayessim_mjx.errors import UserError
@@ -17,13 +18,15 @@ from bayessim_mjx.parameters import Parameter
 
 Array = NDArray[np.float64]
 LARGE = 98.0  # percentile that counts as the largest
+LOAD = 3.0  # times its own mass that a body may carry at least
 
 
 @dataclass(frozen=True)
 class Scales:
     """Per dof `[nv]`: force [N m or N], speed, travel [rad or m], inertia; per actuator `[nu]`: command, effort.
 
-    moves: `[nv]` bool, whether the joint moved by more than its noise at all.
+    moves: `[nv]` bool, whether the joint moved by more than its noise at all; carried: `[nbody]`, kg that the robot can
+    hold at each body; period: s between the logs' rows.
     """
 
     model: mujoco.MjModel
@@ -34,6 +37,8 @@ class Scales:
     command: Array
     effort: Array
     moves: NDArray[np.bool_]
+    carried: Array
+    period: float
 
     def at(self, kind: str, place: str) -> dict[str, float]:
         """{word of `Quantity.per`: scale} at one place."""
@@ -47,18 +52,20 @@ class Scales:
             own = self._of_dof(int(model.jnt_dofadr[joint])) if on_joint else {}
             if own:
                 own["travel"] *= abs(float(model.actuator_gear[i, 0])) or 1.0  # of the actuator's own length
-            return own | {"command": float(self.command[i]), "force": float(self.effort[i])}
+            return own | {"command": float(self.command[i]), "force": float(self.effort[i]), "period": self.period}
         if kind == "body":
             i = element_names(model, "body").index(place)
             gravity = float(np.linalg.norm(model.opt.gravity)) or 9.81
             below = float(model.body_subtreemass[i])
             mass = max(float(model.body_mass[i]), 0.1 * below)
-            return {"mass": mass, "weight": below * gravity, "size": _size(model, i)}
+            load = max(LOAD * mass, float(self.carried[i]))
+            own = {"mass": mass, "weight": below * gravity, "size": loads.size(model, i)}
+            return own | {"carried": load, "tool": loads.reach(model, i)}
         return {"moment": _moment(model)}
 
     def _of_dof(self, v: int) -> dict[str, float]:
         words = ("force", "speed", "travel", "inertia")
-        return {word: float(getattr(self, word)[v]) for word in words}
+        return {word: float(getattr(self, word)[v]) for word in words} | {"period": self.period}
 
 
 def measure(model: mujoco.MjModel, logs: Sequence[Log]) -> Scales:
@@ -66,10 +73,11 @@ def measure(model: mujoco.MjModel, logs: Sequence[Log]) -> Scales:
     speed = _large([log.qvel for log in logs])
     ptp = np.max([_span(model, log) for log in logs], axis=0)
     data = mujoco.MjData(model)
-    torque, inertia = [], []
+    torque, inertia, places = [], [], []
     for log in logs:
         acceleration = np.gradient(log.qvel, log.time, axis=0)
         for k in range(0, len(log), max(1, len(log) // 100)):
+            places.append(log.qpos[k])
             data.qpos[:], data.qvel[:], data.qacc[:] = log.qpos[k], log.qvel[k], acceleration[k]
             mujoco.mj_inverse(model, data)
             torque.append(np.abs(data.qfrc_inverse))
@@ -96,17 +104,9 @@ def measure(model: mujoco.MjModel, logs: Sequence[Log]) -> Scales:
         command=np.maximum(command, 1e-9),
         effort=effort,
         moves=ptp > 10 * noise + 1e-9,
+        carried=loads.carried(model, np.array(places)),
+        period=float(np.median([log.period for log in logs])),
     )
-
-
-def _size(model: mujoco.MjModel, body: int) -> float:
-    """m from the body's centre of mass to the farthest end of its geoms, or where a body joins."""
-    centre = model.body_ipos[body]
-    own = np.flatnonzero((model.geom_bodyid == body) & (model.geom_type != int(mujoco.mjtGeom.mjGEOM_PLANE)))
-    reach = [np.linalg.norm(model.geom_pos[g] - centre) + model.geom_rbound[g] for g in own]
-    joined = np.flatnonzero(model.body_parentid == body)
-    reach += [np.linalg.norm(model.body_pos[b] - centre) for b in joined if b != body]
-    return max([float(r) for r in reach], default=0.0) or 0.1
 
 
 def _moment(model: mujoco.MjModel) -> float:

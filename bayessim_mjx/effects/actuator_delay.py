@@ -34,7 +34,20 @@ class ActuatorDelay(Effect):
     high: float = 0.1
     name: ClassVar[str] = "actuator_delay"
     kind: ClassVar[str] = "actuator"
-    quantities: ClassVar[tuple[Quantity, ...]] = (Quantity("delay", 0.0, 0.0, 0.1, unit="s", grid=(0.05, 0.2, 0.5)),)
+    quantities: ClassVar[tuple[Quantity, ...]] = (
+        Quantity(
+            "delay",
+            0.0,
+            0.0,
+            0.1,
+            unit="s",
+            per="period",
+            reach=(0.0, 3.0),
+            grid=(0.05, 0.2, 0.5),
+            at_least=True,
+            remembered=True,
+        ),
+    )
 
     def init(self, at: Site) -> Any:
         """{"history": `[lag, nu]` commands of past sub-steps, newest last; "fresh"}."""

@@ -32,8 +32,8 @@ class LoadFriction(Effect):
     name: ClassVar[str] = "load_friction"
     kind: ClassVar[str] = "joint"
     quantities: ClassVar[tuple[Quantity, ...]] = (
-        Quantity("motor", 0.0, 0.0, 0.6),
-        Quantity("external", 0.0, 0.0, 0.6),
+        Quantity("motor", 0.0, 0.0, 0.6, most=1.0),
+        Quantity("external", 0.0, 0.0, 0.6, most=1.0),
     )
 
     def on_force(self, at: Site, memory: Any, step: SubStep, theta: jax.Array) -> tuple[Any, jax.Array]:

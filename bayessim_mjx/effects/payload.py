@@ -71,10 +71,10 @@ class Payload(Effect):
     name: ClassVar[str] = "payload"
     kind: ClassVar[str] = "body"
     quantities: ClassVar[tuple[Quantity, ...]] = (
-        Quantity("mass", 0.0, 0.0, 1.0, unit="kg", per="mass", reach=(0.0, 3.0), grid=(0.01, 0.05, 0.2, 0.5)),
+        Quantity("mass", 0.0, 0.0, 1.0, unit="kg", per="carried", reach=(0.0, 1.0), grid=(0.01, 0.05, 0.2, 0.5)),
         *(
             Quantity(
-                f"com_{axis}", 0.0, -0.1, 0.1, unit="m", per="size", reach=(-1.2, 1.2), grid=(0.3, 0.7), shape=True
+                f"com_{axis}", 0.0, -0.1, 0.1, unit="m", per="tool", reach=(-1.0, 1.0), grid=(0.3, 0.7), shape=True
             )
             for axis in "xyz"
         ),

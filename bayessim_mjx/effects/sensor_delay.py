@@ -31,7 +31,20 @@ class SensorDelay(Effect):
     high: float = 0.05
     name: ClassVar[str] = "sensor_delay"
     kind: ClassVar[str] = "joint"
-    quantities: ClassVar[tuple[Quantity, ...]] = (Quantity("delay", 0.0, 0.0, 0.05, unit="s", grid=(0.1, 0.3, 0.6)),)
+    quantities: ClassVar[tuple[Quantity, ...]] = (
+        Quantity(
+            "delay",
+            0.0,
+            0.0,
+            0.05,
+            unit="s",
+            per="period",
+            reach=(0.0, 3.0),
+            grid=(0.1, 0.3, 0.6),
+            at_least=True,
+            remembered=True,
+        ),
+    )
 
     def init(self, at: Site) -> Any:
         """{"history": `[lag, n, 2]` positions and velocities after past control steps, newest last; "fresh"}."""
