@@ -14,7 +14,7 @@ LEVER = 1e-6  # m: a shorter one carries nothing
 
 
 def carried(model: mujoco.MjModel, places: Array) -> Array:
-    """kg that the drives hold at each body `[nbody]`, at rest in every one of some places, at most the robot's own mass.
+    """kg that the drives hold at each body `[nbody]`, at rest in all of some places, at most what the robot weighs.
 
     At every joint m g lever <= force limit + own gravity torque, which the load may balance. Joints without a drive
     hold nothing and rule nothing out; nor do drives without a limit.

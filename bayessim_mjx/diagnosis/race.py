@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.candidates import Candidate, Coordinate
 from bayessim_mjx.diagnosis.discretisation import contacts
