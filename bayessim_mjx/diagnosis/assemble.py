@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from bayessim_mjx.diagnosis import how_far, named, search, uncertainty, verdict, whole
+from bayessim_mjx.diagnosis import bounds, how_far, named, search, uncertainty, verdict, whole
 from bayessim_mjx.diagnosis.models import Model
 from bayessim_mjx.diagnosis.pictures import details
 from bayessim_mjx.diagnosis.result import Diagnosis, Gap, Place
@@ -29,6 +29,7 @@ def diagnosis_of(found: Findings, say: search.Progress = lambda text, done, tota
     timestep = float(setup.robot.mj_model.opt.timestep) * (setup.discretisation.factor if setup.discretisation else 1)
     together = uncertainty.covariance(setup.fitter, model, found.ridges)
     together = together + np.diag(uncertainty.systematic(model, timestep, race.left(model)) ** 2)
+    together = _told(found, together)
     sd = np.sqrt(np.diag(together))
     closed = named.closed_by(found)
     effects = named.effects_of(found, sd, closed, say)
@@ -53,6 +54,18 @@ def diagnosis_of(found: Findings, say: search.Progress = lambda text, done, tota
         details=details(found, effects, closed),
         covariance={"names": list(model.job.names), "matrix": together},
     )
+
+
+def _told(found: Findings, covariance: np.ndarray) -> np.ndarray:
+    """The covariance without what it says of parameters that end at a bound."""
+    model, physics = found.ruling.model, found.setup.physics
+    at = []
+    for effect in model.effects:
+        for c, value in zip(effect.coordinates, model.values_of(effect), strict=True):
+            bound = bounds.of(physics, effect, c, float(value))
+            at += [model.job.names.index(c.name)] if bound is not None and bound.kind != "off" else []
+    neutral = np.array([c.neutral for c in model.job.coordinates])
+    return bounds.spread_out(covariance, model.job.values, neutral, at)
 
 
 def _remains(found: Findings) -> float:

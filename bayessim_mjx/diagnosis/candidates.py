@@ -47,7 +47,7 @@ class Coordinate:
 
 @dataclass(frozen=True)
 class Candidate:
-    """One effect at one place (or tied over all), with the coordinates that describe it.
+    """One effect at one place (or tied over all), with the coordinates that describe it. Equal whatever its ranges are.
 
     Attributes:
         effect, where: names; `where` = "all" if tied over several places.
@@ -60,8 +60,8 @@ class Candidate:
     effect: str
     where: str
     kind: str
-    coordinates: tuple[Coordinate, ...]
-    shapes: tuple[bool, ...]
+    coordinates: tuple[Coordinate, ...] = field(compare=False)
+    shapes: tuple[bool, ...] = field(compare=False)
     probes: Array = field(repr=False, compare=False, hash=False, default_factory=lambda: np.zeros((0, 0)))
 
     @property
@@ -140,12 +140,12 @@ def _candidate(
         index = tuple(row[j] for row in rows)
         name = own[0].name if len(own) == 1 else f"all.{effect.name}.{q.name}"
         coordinates.append(Coordinate(name, index, own[0].nominal, low, high, unit=own[0].unit))
-    shown = tuple(replace(c, precision=_shrink(c)) for c in coordinates)
+    shown = tuple(replace(c, precision=shrink(c)) for c in coordinates)
     shapes = tuple(q.shape for q in effect.quantities)
     return Candidate(effect.name, where, effect.kind, shown, shapes, _probes(effect, shown))
 
 
-def _shrink(c: Coordinate) -> float:
+def shrink(c: Coordinate) -> float:
     """A half-normal of the range's width: keeps what data cannot tell near neutral, and is nothing to what they can."""
     return 1.0 / (c.high - c.low) ** 2
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from bayessim_mjx.diagnosis import gap, promise, uncertainty, verdict
+from bayessim_mjx.diagnosis import bounds, gap, promise, uncertainty, verdict
 from bayessim_mjx.diagnosis.candidates import Candidate
 from bayessim_mjx.diagnosis.models import Model
 from bayessim_mjx.diagnosis.race import Progress
@@ -78,10 +78,13 @@ def _effect(found: Findings, effect: Candidate, sd: np.ndarray, part: _Part) -> 
     own_weight, *others = _weights(found, [model, *(r.model for r in weighed)])
     weight_of = dict(zip(map(id, weighed), others, strict=True))
     own = [model.job.names.index(c.name) for c in effect.coordinates]
-    numbers = {
-        c.name.rsplit(".", 1)[1]: Estimate(float(model.job.values[i]), float(sd[i]), _unit(setup, effect, c.unit))
-        for i, c in zip(own, effect.coordinates, strict=True)
-    }
+    numbers, ends = {}, []
+    for i, c in zip(own, effect.coordinates, strict=True):
+        value, word = float(model.job.values[i]), c.name.rsplit(".", 1)[1]
+        bound = bounds.of(setup.physics, effect, c, value)
+        deviation = float(sd[i]) if bound is None or bound.kind == "off" else float("nan")
+        numbers[word] = Estimate(value, deviation, _unit(setup, effect, c.unit), bound.kind if bound else "")
+        ends += [f"{word.replace('_', ' ')} {bound.why}"] if bound else []
     return FoundEffect(
         name=effect.effect,
         where=effect.where,
@@ -90,10 +93,15 @@ def _effect(found: Findings, effect: Candidate, sd: np.ndarray, part: _Part) -> 
         gap_closed=part.closed,
         gap_closed_ci=part.ci,
         equivalent_to=[r.to_dict() | ({"weight": weight_of[id(r)]} if id(r) in weight_of else {}) for r in rivals],
-        sentence="",
+        sentence=_sentence(ends),
         predicted_gap_closed=part.promised,
         share=part.share if len(model.effects) > 1 else float("nan"),
     )
+
+
+def _sentence(clauses: list[str]) -> str:
+    text = "; ".join(clauses)
+    return f"{text[:1].upper()}{text[1:]}." if text else ""
 
 
 def _weights(found: Findings, models: list[Model]) -> list[float]:

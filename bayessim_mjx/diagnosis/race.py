@@ -149,7 +149,7 @@ class Race:
         return model.total - self.noise * len(model.cost)
 
 
-def _fresh(race: Race, job: Job) -> list[int]:
+def fresh(race: Race, job: Job) -> list[int]:
     """Columns to be differenced anew: the effects' at every step, the known parameters' at every third if cheap.
 
     Far from the logs, where they change from step to step, at every one.
@@ -172,7 +172,7 @@ def fit_models(race: Race, plans: Sequence[tuple[Model, Screened]], label: str, 
     fitter.iterate(
         jobs,
         race.settings.iterations,
-        lambda j: _fresh(race, j),
+        lambda j: fresh(race, j),
         race.settings.tolerance,
         progress=lambda left: say(label, total - left, total),
         keep=_Heats([several for several, _ in todo.values()]),
@@ -216,9 +216,9 @@ def _starts(race: Race, model: Model, extra: Screened, rank: int) -> list[Job]:
     fitter, coordinates = race.fitter, extra.candidate.coordinates
     jobs = [fitter.derive(model.job, coordinates, extra.start)]
     if rank < race.settings.starts and extra.others:
-        fresh = _delivered(race, model, coordinates, extra)
+        anew = _delivered(race, model, coordinates, extra)
         # a limit has no derivative below its threshold, so also from the probe itself, not scaled down to its step
-        jobs += [fresh, fitter.derive(model.job, coordinates, extra.others[0])]
+        jobs += [anew, fitter.derive(model.job, coordinates, extra.others[0])]
         jobs += [fitter.derive(model.job, coordinates, other) for other in extra.others[1:]]
     return jobs
 
@@ -232,9 +232,9 @@ def _delivered(race: Race, model: Model, coordinates: Sequence[Coordinate], extr
     known = np.concatenate([[c.neutral for c in fitter.base], model.job.values[base:]])
     if _astray(race, model.job):
         return fitter.begin((*model.job.coordinates, *coordinates), np.concatenate([known, extra.start]))
-    fresh = fitter.derive(model.job, coordinates, extra.others[0])
-    fresh.values[: len(known)] = known
-    return fresh
+    anew = fitter.derive(model.job, coordinates, extra.others[0])
+    anew.values[: len(known)] = known
+    return anew
 
 
 def _astray(race: Race, job: Job) -> bool:
@@ -272,7 +272,7 @@ def polish(race: Race, model: Model) -> Model:
             if fitter.refresh(job).cost > 0.9 * before:
                 break
     else:
-        fitter.iterate([job], 4, lambda j: _fresh(race, j))
+        fitter.iterate([job], 4, lambda j: fresh(race, j))
         fitter.refresh(job)
     new = scored(fitter, job, model.effects)
     race.models[frozenset(c.label for c in model.effects)] = new
@@ -281,7 +281,7 @@ def polish(race: Race, model: Model) -> Model:
 
 def without(race: Race, model: Model, effect: Candidate, say: Progress) -> Model:
     """The model without one of its effects, refitted."""
-    rest = [e for e in model.effects if e is not effect]
+    rest = [e for e in model.effects if e != effect]
     key = frozenset(c.label for c in rest)
     if key not in race.models:
         small = race.base

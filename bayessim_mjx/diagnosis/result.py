@@ -22,11 +22,17 @@ VERDICTS = ("no_gap", "parameters", "effects", "ambiguous", "unexplained", "insu
 
 @dataclass(frozen=True)
 class Estimate:
-    """One identified number."""
+    """One identified number.
+
+    bound: "" where it lies inside its range; "at least" or "at most" (nothing larger or smaller was tried), "end" (of
+    what physics allows, or of what the logs tell), "off" (it has no part in the effect). At a bound, but for "off", sd
+    is NaN: an interval around the end of a range says nothing.
+    """
 
     mean: float
     sd: float
     unit: str = ""
+    bound: str = ""
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ import numpy as np
 
 from bayessim_mjx import effects as library
 from bayessim_mjx.diagnosis import (
+    bounds,
     candidates,
     channels,
     discretisation,
@@ -239,8 +240,9 @@ def diagnose(
     say("looking at the logs", 0, 1)
     setup = prepare(robot, logs, effects, group=group, seed=seed, settings=settings, tolerated=tolerated)
     race = search.run(setup.fitter, setup.candidates, setup.settings, say)
-    race.winner = _verified(setup, race, say)
+    race.winner = bounds.widened(race, _verified(setup, race, say), say)
     ruling = verdict.rule(race, say)
+    ruling = dataclasses.replace(ruling, model=bounds.widened(race, ruling.model, say))
     ruling, along = _on_ridges(race, ruling)
     fitter, model = setup.fitter, ruling.model
     say("how far", 0, 1)

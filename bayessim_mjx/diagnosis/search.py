@@ -6,6 +6,7 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 
+from bayessim_mjx.diagnosis.bounds import widen_leading
 from bayessim_mjx.diagnosis.candidates import Candidate
 from bayessim_mjx.diagnosis.fit import Fitter
 from bayessim_mjx.diagnosis.models import Model, scored
@@ -66,6 +67,7 @@ def run(fitter: Fitter, candidates: Sequence[Candidate], settings: Settings, pro
         race.winner = race.base
         return race
     _singles(race, say)
+    widen_leading(race, say)
     best = _elsewhere(race, _greedy(race, _pairs(race, say), say), say)
     race.winner = simplest(race, best, say)
     return race

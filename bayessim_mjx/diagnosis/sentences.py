@@ -56,6 +56,7 @@ def sentences(
         told.append(CHANCE.format(calibrated=stage_in_words(far, "calibrated")))
     if name == "unexplained" and found.flexible_winner is not None:
         told += [f"{text[:1].upper()}{text[1:]}." for text in found.flexible_winner.text]
+    told += [f"At its bound: {missing(e.name, e.where)}. {e.sentence}" for e in effects if _at_bound(e)]
     told += [f"{k} {v['structural']}." for k, v in parameters.items() if v["structural"]]
     return [text for text in told if text]
 
@@ -95,6 +96,10 @@ def verdict_in_words(
     if effects and _within(far) and not far.beyond:
         out.append(WITHIN)
     return [text.format(**fill) for text in out]
+
+
+def _at_bound(effect: FoundEffect) -> bool:
+    return any(v.bound not in ("", "off") for v in effect.parameters.values())
 
 
 def stage_in_words(far: Gap, stage: str) -> str:

@@ -109,14 +109,14 @@ def _in_parts(race: Race, winner: Model, effect: Candidate, say: Progress) -> li
 
 def _rivals(race: Race, winner: Model, effect: Candidate, say: Progress) -> list[Rival]:
     rest = without(race, winner, effect, say)
-    others = [c for c in race.candidates if c is not effect and all(compatible(c, e) for e in rest.effects)]
+    others = [c for c in race.candidates if c != effect and all(compatible(c, e) for e in rest.effects)]
     if rest.effects:
         found = [s for s in screen(race.fitter, rest.job, others, race.settings.screened) if s.gain > 0][
             : race.settings.pairs
         ]
         models = fit_models(race, [(rest, s) for s in found], "rivals", say)
     else:
-        models = [m for m in ranked(race, 1) if m.effects[0] is not effect]
+        models = [m for m in ranked(race, 1) if m.effects[0] != effect]
     models = [_finished(race, winner, m) for m in models]
     out = []
     for model in models:

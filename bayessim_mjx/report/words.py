@@ -136,8 +136,16 @@ def quantity(name: str, value: Estimate) -> tuple[str, str]:
     """A parameter's name and value for people; reciprocals turned over (`inverse_limit` 0.5 1/(N m) -> limit 2 N m)."""
     if name in RECIPROCALS and finite(value.mean) and value.mean > 0:
         sd = value.sd / value.mean**2 if finite(value.sd) else value.sd  # d(1/x) = dx / x^2
-        return RECIPROCALS[name], estimate(1 / value.mean, sd, _turned(value.unit))
-    return name.replace("_", " "), estimate(value.mean, value.sd, value.unit)
+        turned = {"at least": "at most", "at most": "at least"}.get(value.bound, value.bound)
+        return RECIPROCALS[name], _bounded(estimate(1 / value.mean, sd, _turned(value.unit)), turned)
+    return name.replace("_", " "), _bounded(estimate(value.mean, value.sd, value.unit), value.bound)
+
+
+def _bounded(text: str, bound: str) -> str:
+    """A value that ends at a bound (`Estimate.bound`)."""
+    if bound in ("at least", "at most"):
+        return f"{bound} {text}"
+    return text + {"off": " (off)", "end": " (end of its range)"}.get(bound, "")
 
 
 def _turned(text: str) -> str:
