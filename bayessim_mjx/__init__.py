@@ -18,6 +18,8 @@ loop (make, init, run).
 from importlib import import_module
 from typing import Any
 
+from bayessim_mjx.wrappers import announce
+
 _ROOMS = {
     "config": ("load",),
     "registry": ("make", "names"),
@@ -34,6 +36,9 @@ __all__ = [
     "Distribution", "Effect", "Env", "Log", "Parameter", "ParameterSpace", "Physics", "State", "Task", "World",
     "control_step", "load", "make", "names", "read_logs",
 ]  # fmt: skip
+
+
+announce()  # bayessim_mjx/<Task>-v0 in Gymnasium
 
 
 def __getattr__(name: str) -> Any:

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import mujoco
 from flax import struct
 
+from bayessim_mjx import compat
 from bayessim_mjx.effects.effect import Effect
 from bayessim_mjx.effects.reading import stack
 from bayessim_mjx.effects.storage import corrected
@@ -22,6 +23,8 @@ from bayessim_mjx.mirrors import Mirror, MirrorMap, resolve
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 from bayessim_mjx.physics import Physics, World, control_step, mjx
 from bayessim_mjx.settings import IMPLEMENTATIONS
+
+compat.supply()  # our environments are Brax's too: so that Brax's own trainers can run
 
 Observations = dict[str, jax.Array]
 VARIANTS = ("isaacgymenvs", "bayessim2021")

@@ -2,27 +2,22 @@
 
 import difflib
 import importlib
-import pkgutil
 import warnings
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from bayessim_mjx import tasks
 from bayessim_mjx.effects import reading, storage
 from bayessim_mjx.errors import UserError
+from bayessim_mjx.task_names import names
 
 if TYPE_CHECKING:
     from bayessim_mjx.effects.effect import Effect
     from bayessim_mjx.env import Env
     from bayessim_mjx.settings import Config
 
+__all__ = ["EXTERNAL", "make", "names"]
+
 EXTERNAL = ("brax", "playground")
-
-
-def names() -> list[str]:
-    """Names of our own tasks: one per file in tasks/, `ball_balance.py` holds BallBalance."""
-    modules = {m.name for m in pkgutil.iter_modules(tasks.__path__) if not m.name.startswith("_")}
-    return sorted("".join(part.capitalize() for part in module.split("_")) for module in modules)
 
 
 def make(name: str, *, config: "Config | None" = None, effects: "Sequence[Effect]" = (), **env_overrides: Any) -> "Env":

@@ -52,17 +52,6 @@ def ours(env, settings, iterations: int, seed: int) -> None:
 
 
 def brax(env, steps: int, num_envs: int, seed: int) -> None:
-    from jax.sharding import Mesh, NamedSharding, PartitionSpec
-
-    if not hasattr(jax, "device_put_replicated"):
-
-        def replicated(tree, devices):
-            sharding = NamedSharding(Mesh(np.array(devices), ("i",)), PartitionSpec("i"))
-            return jax.tree.map(
-                lambda x: jax.device_put(jnp.broadcast_to(x, (len(devices), *jnp.shape(x))), sharding), tree
-            )
-
-        jax.device_put_replicated = replicated
     from brax.training.agents.ppo import train as ppo_train
 
     marks = []

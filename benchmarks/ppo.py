@@ -169,15 +169,6 @@ def judged(env, policies: list) -> list[float]:
 def run_brax(name: str, published: dict, seed: int, race: Race, whole: bool) -> dict:
     """Brax's trainer as published, on its own environment."""
     race.mark("python")
-    import jax
-    import numpy as np
-    from jax.sharding import Mesh, NamedSharding, PartitionSpec
-
-    def replicated(tree, devices):  # the axis is called i as in Brax: under another name its programs compile twice
-        sharding = NamedSharding(Mesh(np.array(devices), ("i",)), PartitionSpec("i"))
-        return jax.tree.map(lambda x: jax.device_put(np.stack([np.asarray(x)] * len(devices)), sharding), tree)
-
-    jax.device_put_replicated = replicated
     from brax.training.agents.ppo import train
 
     from bayessim_mjx import registry

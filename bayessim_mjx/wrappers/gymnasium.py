@@ -1,5 +1,10 @@
-"""Our environments as `gymnasium.Env` (one world) and `gymnasium.vector.VectorEnv` (many worlds, resets themselves)."""
+"""Our environments as `gymnasium.Env` (one world) and `gymnasium.vector.VectorEnv` (many worlds in one batch).
 
+`gymnasium.make("bayessim_mjx/Pendulum-v0")` and `gymnasium.make_vec("bayessim_mjx/Pendulum-v0", num_envs=64)` make them
+too; keyword arguments beside those here are the task's `env:` settings (`episodeLength=100`).
+"""
+
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium
@@ -9,8 +14,32 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
+from bayessim_mjx import registry
 from bayessim_mjx.env import Env
+from bayessim_mjx.errors import UserError
+from bayessim_mjx.monitor import video
 from bayessim_mjx.rollout import select
+
+RENDER_MODES = ("rgb_array",)
+WIDTH, HEIGHT = 480, 360  # pixels of a picture
+SAME, NEXT, DISABLED = AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED
+
+
+def make(task: str, theta: Any = None, render_mode: str | None = None, **env_settings: Any) -> "GymnasiumEnv":
+    """One world of the task; what `gymnasium.make` calls."""
+    return GymnasiumEnv(registry.make(task, **env_settings), theta, render_mode)
+
+
+def make_vec(
+    task: str,
+    num_envs: int = 1,
+    domain: Any = None,
+    autoreset_mode: AutoresetMode | str = NEXT,
+    render_mode: str | None = None,
+    **env_settings: Any,
+) -> "GymnasiumVectorEnv":
+    """Many worlds of the task; what `gymnasium.make_vec` calls."""
+    return GymnasiumVectorEnv(registry.make(task, **env_settings), num_envs, domain, autoreset_mode, render_mode)
 
 
 def _spaces(env: Env) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
@@ -21,29 +50,79 @@ def _spaces(env: Env) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
     )
 
 
+def _metadata(env: Env, render_mode: str | None) -> dict[str, Any]:
+    """What Gymnasium reads of an environment; UserError for a way of rendering that there is not."""
+    modes = list(RENDER_MODES) if hasattr(env, "physics") else []
+    if render_mode is not None and render_mode not in modes:
+        raise UserError(f"render_mode = {render_mode!r}: allowed: None{''.join(f', {m!r}' for m in modes)}")
+    dt = getattr(env, "dt", None)
+    return {"render_modes": modes, "render_fps": 25 if dt is None else max(1, round(1.0 / dt))}
+
+
+def _theta(env: Env, theta: Any, rows: tuple[int, ...] = ()) -> np.ndarray:
+    """theta `[*rows, d]` from the same or from one `[d]`; UserError for another shape or beyond the parameters' box."""
+    space, value = env.space, np.asarray(theta, np.float32)
+    d = len(env.space.nominal)
+    if value.shape not in ((d,), (*rows, d)):
+        raise UserError(f"theta has shape {list(value.shape)}; expected {[d]}{f' or {[*rows, d]}' if rows else ''}")
+    value = np.broadcast_to(value, (*rows, d))
+    if hasattr(space, "contains") and not np.all(inside := np.asarray(space.contains(value))):
+        row = value if not rows else value[int(np.argmin(inside))]
+        i = int(np.argmin((row >= space.low) & (row <= space.high)))
+        raise UserError(f"theta: {space.names[i]} = {row[i]:g}; allowed: [{space.low[i]:g}, {space.high[i]:g}]")
+    return value
+
+
+def _options(options: Mapping[str, Any] | None, allowed: tuple[str, ...]) -> dict[str, Any]:
+    given = dict(options or {})
+    for key in given:
+        if key not in allowed:
+            raise UserError(f"options[{key!r}]: unknown; allowed: {', '.join(allowed)}")
+    return given
+
+
+class _Camera:
+    """Pictures of worlds, each with its own parameters; compiled models are kept while theta stays."""
+
+    def __init__(self, env: Env) -> None:
+        self.env, self._models = env, {}  # type: ignore[var-annotated]
+
+    def __call__(self, qpos: np.ndarray, theta: np.ndarray) -> np.ndarray | None:
+        """`[HEIGHT, WIDTH, 3]` uint8; None, with a warning, where no OpenGL works."""
+        key = theta.tobytes()
+        if key not in self._models:
+            self._models = {**dict(list(self._models.items())[-63:]), key: video.model_at(self.env, theta)}
+        frames = video.record(self._models[key], qpos[None], width=WIDTH, height=HEIGHT)
+        return None if frames is None else frames[0]
+
+
 class GymnasiumEnv(gymnasium.Env):
-    """One world; observations are the group "policy". `reset(options={"theta": [d]})` sets theta from then on."""
+    """One world; observations are the group "policy". `reset(options={"theta": [d]})` sets theta from then on.
 
-    metadata: dict[str, Any] = {"render_modes": []}
+    Raises:
+        UserError: theta of another shape or outside its box, an unknown option or render mode, a step before a reset.
+    """
 
-    def __init__(self, env: Env, theta: Any = None) -> None:
-        self.env = env
+    def __init__(self, env: Env, theta: Any = None, render_mode: str | None = None) -> None:
+        self.env, self.render_mode = env, render_mode
+        self.metadata = _metadata(env, render_mode)
         self.observation_space, self.action_space = _spaces(env)
-        self._theta = jnp.asarray(env.space.nominal if theta is None else theta, jnp.float32)
-        self._reset, self._step = jax.jit(env.reset), jax.jit(env.step)
+        self._theta = _theta(env, env.space.nominal if theta is None else theta)
+        self._reset, self._step, self._camera = jax.jit(env.reset), jax.jit(env.step), _Camera(env)
         self._state: Any = None
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
         super().reset(seed=seed)
-        if options and "theta" in options:
-            self._theta = jnp.asarray(options["theta"], jnp.float32)
+        given = _options(options, ("theta",))
+        if "theta" in given:
+            self._theta = _theta(self.env, given["theta"])
         key = jax.random.PRNGKey(int(self.np_random.integers(2**31)))
         self._state = self._reset(key, self._theta)
         return np.array(self._state.obs["policy"]), {"theta": np.array(self._theta)}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
         if self._state is None:
-            raise ValueError("step before reset: call reset() first")
+            raise UserError("step before reset: call reset() first")
         self._state = self._step(self._state, jnp.asarray(action, jnp.float32))
         info = self._state.info
         metrics = {name: float(value) for name, value in self._state.metrics.items()}
@@ -51,51 +130,135 @@ class GymnasiumEnv(gymnasium.Env):
         terminated, truncated = bool(info["terminated"]), bool(info["truncated"])
         return observation, float(self._state.reward), terminated, truncated, metrics
 
+    def render(self) -> np.ndarray | None:  # type: ignore[override]
+        """The present state as `[HEIGHT, WIDTH, 3]` uint8 where `render_mode` is "rgb_array"."""
+        if self.render_mode is None or self._state is None:
+            return None
+        return self._camera(np.asarray(self._state.pipeline_state.qpos), self._theta)
+
 
 class GymnasiumVectorEnv(VectorEnv):
     """`num_envs` worlds in one batch; theta comes from `domain` anew in each episode (None: nominal).
 
-    An ended world restarts in the same step: its last observation is info["final_obs"][i] where info["_final_obs"][i].
+    Args:
+        autoreset_mode: when an ended world restarts. "NextStep" (Gymnasium's default): in the next step, whose action
+            is not used and whose reward is 0. "SameStep": in the same step; the last observation of the episode is
+            info["final_obs"][i] where info["_final_obs"][i]. "Disabled": not before `reset` is asked to.
+
+    `reset(options=...)` takes `reset_mask` (bool `[num_envs]`: only these worlds) and `theta` (`[d]` or
+    `[num_envs, d]`: parameters of the worlds that are reset, from then on).
+
+    Raises:
+        UserError: as `GymnasiumEnv`; also a `reset_mask` of another kind, and a step with ended worlds if "Disabled".
     """
 
-    metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
-
-    def __init__(self, env: Env, num_envs: int, domain: Any = None) -> None:
-        self.env, self.num_envs, self._domain = env, num_envs, domain
+    def __init__(
+        self,
+        env: Env,
+        num_envs: int,
+        domain: Any = None,
+        autoreset_mode: AutoresetMode | str = NEXT,
+        render_mode: str | None = None,
+    ) -> None:
+        if not isinstance(num_envs, int | np.integer) or num_envs < 1:
+            raise UserError(f"num_envs = {num_envs!r}: must be a whole number of at least 1")
+        try:
+            self.mode = AutoresetMode(autoreset_mode)
+        except ValueError:
+            allowed = ", ".join(mode.value for mode in AutoresetMode)
+            raise UserError(f"autoreset_mode = {autoreset_mode!r}; allowed: {allowed}") from None
+        self.env, self.num_envs, self._domain, self.render_mode = env, int(num_envs), domain, render_mode
+        self.metadata = _metadata(env, render_mode) | {"autoreset_mode": self.mode}
         self.single_observation_space, self.single_action_space = _spaces(env)
-        self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self.action_space = batch_space(self.single_action_space, num_envs)
-        self._reset, self._step = jax.jit(self._fresh), jax.jit(self._advance)
-        self._key, self._state = jax.random.PRNGKey(0), None  # type: ignore[var-annotated]
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self._reset, self._step = jax.jit(self._restarted), jax.jit(self._advanced)
+        self._camera, self._key, self._state = _Camera(env), None, None  # type: ignore[var-annotated]
+        self._ended = np.zeros(self.num_envs, bool)
+        # parameters that `options` gave, and in which worlds they hold
+        self._given = np.zeros((self.num_envs, len(env.space.nominal)), np.float32), np.zeros(self.num_envs, bool)
+        self._thetas = self._given[0]
 
-    def _fresh(self, key: jax.Array, domain: Any) -> Any:
+    def _fresh(self, key: jax.Array, domain: Any, given: tuple) -> tuple[Any, jax.Array]:
         theta_key, reset_key = jax.random.split(key)
         nominal = jnp.asarray(self.env.space.nominal, jnp.float32)
         thetas = jnp.tile(nominal, (self.num_envs, 1)) if domain is None else domain.sample(theta_key, self.num_envs)
-        return jax.vmap(self.env.reset)(jax.random.split(reset_key, self.num_envs), thetas)
+        thetas = jnp.where(given[1][:, None], given[0], thetas)
+        return jax.vmap(self.env.reset)(jax.random.split(reset_key, self.num_envs), thetas), thetas
 
-    def _advance(self, key: jax.Array, state: Any, action: jax.Array, domain: Any) -> tuple[Any, Any]:
+    def _restarted(
+        self, key: jax.Array, old: tuple | None, mask: jax.Array, domain: Any, given: tuple
+    ) -> tuple[Any, jax.Array]:
+        """(state, thetas) with the worlds in `mask` begun anew."""
+        fresh = self._fresh(key, domain, given)
+        return fresh if old is None else select(mask, fresh, old)
+
+    def _advanced(
+        self, key: jax.Array, old: tuple, ended: jax.Array, action: jax.Array, domain: Any, given: tuple
+    ) -> tuple[Any, tuple[Any, jax.Array]]:
+        """(what the step led to, (state, thetas) to go on from)."""
+        state, thetas = old
         after = jax.vmap(self.env.step)(state, action)
-        ended = after.info["terminated"] + after.info["truncated"] > 0
-        return after, select(ended, self._fresh(key, domain), after)
+        if self.mode is DISABLED:
+            return after, (after, thetas)
+        again = ended if self.mode is NEXT else after.info["terminated"] + after.info["truncated"] > 0
+        begun = select(again, self._fresh(key, domain, given), (after, thetas))
+        return (begun[0] if self.mode is NEXT else after), begun
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
-        if seed is not None:
-            self._key = jax.random.PRNGKey(seed)
+        super().reset(seed=seed)
+        option = _options(options, ("theta", "reset_mask"))
+        mask = self._mask(option["reset_mask"]) if "reset_mask" in option else np.ones(self.num_envs, bool)
+        if "theta" in option:
+            value = _theta(self.env, option["theta"], (self.num_envs,))
+            old, held = self._given
+            self._given = np.where(mask[:, None], value, old), held | mask
+        if seed is not None or self._key is None:
+            self._key = jax.random.PRNGKey(int(self.np_random.integers(2**31)))
         self._key, key = jax.random.split(self._key)
-        self._state = self._reset(key, self._domain)
-        return np.array(self._state.obs["policy"]), {}  # type: ignore[attr-defined]
+        before = None if mask.all() else (self._state, self._thetas)
+        self._state, self._thetas = self._reset(key, before, mask, self._domain, self._given)
+        self._ended = self._ended & ~mask
+        return np.array(self._state.obs["policy"]), {"theta": np.array(self._thetas), "_theta": mask}
+
+    def _mask(self, mask: Any) -> np.ndarray:
+        if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_ or mask.shape != (self.num_envs,):
+            got = f"{mask.dtype} {list(mask.shape)}" if isinstance(mask, np.ndarray) else repr(mask)
+            raise UserError(f"options['reset_mask'] is {got}; expected a numpy array, bool {[self.num_envs]}")
+        if not mask.any():
+            raise UserError("options['reset_mask'] names no world")
+        if self._state is None and not mask.all():
+            raise UserError("options['reset_mask'] before the first reset: all worlds have to begin")
+        return mask
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict]:
         if self._state is None:
-            raise ValueError("step before reset: call reset() first")
+            raise UserError("step before reset: call reset() first")
+        if self.mode is DISABLED and self._ended.any():
+            raise UserError(f"worlds {np.flatnonzero(self._ended).tolist()} have ended: reset them with a reset_mask")
         self._key, key = jax.random.split(self._key)
-        after, self._state = self._step(key, self._state, jnp.asarray(actions, jnp.float32), self._domain)
+        actions = jnp.asarray(actions, jnp.float32)
+        old = self._state, self._thetas
+        after, (self._state, self._thetas) = self._step(key, old, self._ended, actions, self._domain, self._given)
         terminated, truncated = (np.asarray(after.info[name]) > 0 for name in ("terminated", "truncated"))
-        ended, info = terminated | truncated, {}
-        if ended.any():
-            final = np.empty(self.num_envs, object)
-            for i in np.flatnonzero(ended):
-                final[i] = np.array(after.info["final_observation"]["policy"][i])
-            info = {"final_obs": final, "_final_obs": ended}
-        return np.array(self._state.obs["policy"]), np.asarray(after.reward), terminated, truncated, info
+        reward = np.array(after.reward)
+        if self.mode is NEXT:
+            reward[self._ended] = 0.0
+        self._ended = ended = terminated | truncated
+        info = self._final(after, ended) if self.mode is SAME and ended.any() else {}
+        return np.array(self._state.obs["policy"]), reward, terminated, truncated, info
+
+    def _final(self, after: Any, ended: np.ndarray) -> dict[str, Any]:
+        """The last observations of the episodes that ended."""
+        final, last = np.empty(self.num_envs, object), np.array(after.info["final_observation"]["policy"])
+        for i in np.flatnonzero(ended):
+            final[i] = last[i]
+        return {"final_obs": final, "_final_obs": ended, "final_info": {}, "_final_info": ended}
+
+    def render(self) -> tuple[np.ndarray, ...] | None:  # type: ignore[override]
+        """A picture of each world, as `GymnasiumEnv.render`."""
+        if self.render_mode is None or self._state is None:
+            return None
+        qpos, thetas = np.asarray(self._state.pipeline_state.qpos), np.asarray(self._thetas)
+        frames = [self._camera(q, theta) for q, theta in zip(qpos, thetas, strict=True)]
+        return None if any(frame is None for frame in frames) else tuple(frames)  # type: ignore[arg-type]

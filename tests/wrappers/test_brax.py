@@ -1,8 +1,5 @@
 """Brax's trainer on our tasks and our trainer on Brax's and Playground's environments."""
 
-import sys
-from pathlib import Path
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,9 +10,6 @@ from bayessim_mjx.config import PPOConfig
 from bayessim_mjx.registry import make
 from bayessim_mjx.rollout import rollout
 from bayessim_mjx.wrappers.brax import BraxEnv
-
-sys.path.insert(0, str(Path(__file__).parent))
-import brax_shim  # noqa: E402
 
 CONFIG = PPOConfig(num_envs=8, num_steps=4, num_epochs=1, num_minibatches=2, hidden_actor=(8,), hidden_critic=(8,))
 
@@ -97,6 +91,16 @@ def test_our_trainer_trains_a_playground_environment():
     assert np.isfinite(metrics["Loss/value"])
 
 
+def test_what_braxs_trainers_ask_of_jax_is_there():
+    """Brax 0.14.2 calls jax.device_put_replicated, which jax 0.10 removed; an environment of ours brings it back."""
+    devices, tree = jax.local_devices(), {"w": jnp.arange(3.0), "key": jax.random.PRNGKey(0), "n": 2}
+    there = jax.device_put_replicated(tree, devices)
+    for x, y in zip(jax.tree.leaves(tree), jax.tree.leaves(there), strict=True):
+        np.testing.assert_array_equal(y, np.stack([np.asarray(x)] * len(devices)))
+    doubled = jax.pmap(lambda t: 2 * t["w"], axis_name="i")(there)
+    np.testing.assert_array_equal(doubled, [[0, 2, 4]] * len(devices))
+
+
 @pytest.mark.slow
 @pytest.mark.ci
 def test_braxs_trainer_trains_our_task():
@@ -104,20 +108,19 @@ def test_braxs_trainer_trains_our_task():
     from brax.training.agents.ppo import train as ppo
 
     seen = []
-    with brax_shim.device_put_replicated():
-        _, params, _ = ppo.train(
-            environment=make("Pendulum"),
-            num_timesteps=256,
-            episode_length=200,
-            num_envs=8,
-            num_eval_envs=4,
-            unroll_length=4,
-            batch_size=4,
-            num_minibatches=2,
-            num_updates_per_batch=1,
-            num_evals=2,
-            progress_fn=lambda steps, metrics: seen.append(metrics),
-        )
+    _, params, _ = ppo.train(
+        environment=make("Pendulum"),
+        num_timesteps=256,
+        episode_length=200,
+        num_envs=8,
+        num_eval_envs=4,
+        unroll_length=4,
+        batch_size=4,
+        num_minibatches=2,
+        num_updates_per_batch=1,
+        num_evals=2,
+        progress_fn=lambda steps, metrics: seen.append(metrics),
+    )
     assert len(seen) == 2
     assert all(metrics["eval/avg_episode_length"] == 200 for metrics in seen)
     assert all(-16.3 * 200 <= metrics["eval/episode_reward"] < 0 for metrics in seen)
