@@ -55,9 +55,7 @@ def _prediction(found: Mapping[str, Any]) -> str:
 
 def _recovery(r: Mapping[str, Any]) -> str:
     if r["corrected"]["recovered"] is None:
-        return (
-            "The gap costs no return worth the name: the policy trained on the real system itself is not surely better."
-        )
+        return "The gap costs no measurable return: a policy trained on the real system itself is not clearly better."
     (low, high), wide = r["corrected"]["ci"], r["wide"]["recovered"]
     return (
         f"Retraining on the corrected simulator recovers {_percent(r['corrected']['recovered'])} of the lost return "
@@ -75,8 +73,8 @@ def _ranking(r: Mapping[str, Any]) -> str:
 def _replay(r: Mapping[str, Any]) -> str:
     rms = {s: float(np.sqrt(np.mean([e[s] ** 2 for e in r["error"].values()]))) for s in ("nominal", "corrected")}
     return (
-        f"The logs' own controller in closed loop over {r['seconds']:.3g} s: position error "
-        f"{number(rms['nominal'])} as it was, {number(rms['corrected'])} corrected."
+        f"With each log's controller in closed loop over {r['seconds']:.3g} s, the position error is "
+        f"{number(rms['nominal'])} on the simulator as it was and {number(rms['corrected'])} on the corrected one."
     )
 
 

@@ -81,10 +81,10 @@ class Discretisation:
         if noises.max() < WORTH:
             return []
         at = int(np.argmax(noises))
-        size = "" if self.simulated[at] else f"{noises[at]:.1f} noises, "
+        size = "" if self.simulated[at] else f"{noises[at]:.1f} noise standard deviations, "
         text = (
-            f"the simulator's own time step of {1e3 * self.timestep:.3g} ms is worth {size}{self.own[at]:.2g} rad or m "
-            f"within a window at {self.channels[at]}: a gap for whatever is trained at it; "
+            f"the simulator's time step of {1e3 * self.timestep:.3g} ms costs {size}{self.own[at]:.2g} rad "
+            f"or m within a window at {self.channels[at]}: a gap for every policy that is trained with it; "
         )
         return [text + self._remedy(noises[at], bool(self.simulated[at]))]
 
@@ -92,14 +92,14 @@ class Discretisation:
         halvings = int(np.ceil(np.log2(noises / WORTH)))
         told = not simulated and halvings <= SHORTER
         other = f"a step of {1e3 * self.timestep / 2**halvings:.2g} ms" if told else "a shorter step"
-        text = f"{other}, or the integrator RK4 where nothing is in contact, makes it smaller"
+        text = f"{other}, or the integrator RK4 where nothing is in contact, reduces it"
         if self.factor > 1:
             text += f"; the diagnosis simulates at {1e3 * self.timestep / self.factor:.3g} ms"
         if simulated:
-            return f"{text}; the logs show no noise, so what is smaller than this is taken for noise"
+            return f"{text}; the logs show no noise, so everything smaller than this counts as noise"
         known = np.isfinite(self.sigma)
         left = np.sqrt(np.maximum((self.floor[known] / self.sigma[known]) ** 2 - 1, 0.0)).max()
-        return f"{text}; what it cannot remove, {left:.2g} noises, is taken for noise" if left > ENOUGH else text
+        return f"{text}; the rest, {left:.2g} noise standard deviations, counts as noise" if left > ENOUGH else text
 
     def to_dict(self) -> dict[str, Any]:
         """For diagnosis.json: numbers by channel, in noise units and physical ones."""

@@ -102,7 +102,11 @@ def test_fast_motion_is_simulated_more_finely_until_the_step_does_not_show():
     told = found.left * found.factor
     assert told[:2].max() == pytest.approx(true.max(), rel=0.35)
     (text,) = found.warnings()
-    assert "time step of 5 ms" in text and "noises" in text and any(n in text for n in ("shoulder", "elbow"))
+    assert (
+        "time step of 5 ms" in text
+        and "noise standard deviations" in text
+        and any(n in text for n in ("shoulder", "elbow"))
+    )
     fine = found.robot(the(ARM)).physics(PERIOD)
     assert fine.substeps == 2 * found.factor and fine.dt == pytest.approx(PERIOD)
     assert found.to_dict()["substep"] == pytest.approx(STEP / found.factor)
