@@ -97,9 +97,10 @@ def _blocks(rows: Sequence[Sequence[str]], width: int | None, left: Collection[i
     wide = _widths(rows, width, left)
     out = []
     for n, row in enumerate(rows):
-        cells = [
-            wrapped(cell, w if k in left or n == 0 else None) for k, (cell, w) in enumerate(zip(row, wide, strict=True))
-        ]
+        cells = []
+        for k, (cell, w) in enumerate(zip(row, wide, strict=True)):
+            after = 2 * (n > 0 and k == 0 and _longest_word(cell) + 2 <= w)
+            cells.append(wrapped(cell, w if k in left or n == 0 else None, after))
         tall = max(map(len, cells))
         for k, cell in enumerate(cells):  # words begin at the top, a header stands on its column
             empty = [""] * (tall - len(cell))

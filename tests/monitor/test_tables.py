@@ -34,9 +34,9 @@ def test_then_words_and_never_a_value_from_its_uncertainty():
         "                             gap",
         "effect       parameters   closed",
         "Coulomb      level          68 %",
-        "friction     0.03 ± 0.01",
+        "  friction   0.03 ± 0.01",
         "Command                      7 %",
-        "delay",
+        "  delay",
     ]
 
 
