@@ -56,7 +56,7 @@ def table(
         return _columns(header, rows, width, left)
     others = {k - 1 for k in left if k}
     if len(header) > 2 and INDENT + sum(least[1:]) + len(GAP) * (len(header) - 2) <= width:
-        rest = _blocks([header[1:], *(row[1:] for row in rows)], width - INDENT, others)
+        rest = _blocks([header[1:], *(row[1:] for row in rows)], width - INDENT, others, names=False)
         blocks = [
             [*wrapped(row[0], width, INDENT), *(" " * INDENT + line for line in block)]
             for row, block in zip([header, *rows], rest, strict=True)
@@ -92,14 +92,16 @@ def _least(header: Sequence[str], rows: Sequence[Sequence[str]], left: Collectio
     ]
 
 
-def _blocks(rows: Sequence[Sequence[str]], width: int | None, left: Collection[int]) -> list[list[str]]:
-    """Each row as lines; the first row is the header."""
+def _blocks(
+    rows: Sequence[Sequence[str]], width: int | None, left: Collection[int], names: bool = True
+) -> list[list[str]]:
+    """Each row as lines; the first row is the header. `names`: the first column names the row, broken ones indented."""
     wide = _widths(rows, width, left)
     out = []
     for n, row in enumerate(rows):
         cells = []
         for k, (cell, w) in enumerate(zip(row, wide, strict=True)):
-            after = 2 * (n > 0 and k == 0 and _longest_word(cell) + 2 <= w)
+            after = 2 * (names and n > 0 and k == 0 and _longest_word(cell) + 2 <= w)
             cells.append(wrapped(cell, w if k in left or n == 0 else None, after))
         tall = max(map(len, cells))
         for k, cell in enumerate(cells):  # words begin at the top, a header stands on its column
