@@ -1,6 +1,7 @@
 """The devices, the processes and the persistent compilation cache, chosen before jax does anything."""
 
 import functools
+import gc
 import os
 import re
 from collections.abc import Sequence
@@ -29,6 +30,7 @@ def setup_jax(config: Config) -> Any:
     if platform == "cpu":
         jax.config.update("jax_platforms", "cpu")
     _cache(jax, config.cache_dir)
+    _collect_rarely()
     _join(jax)
     devices = _devices(jax, None if platform == "auto" else platform)
     if number >= len(devices):
@@ -106,8 +108,14 @@ def _cache(jax: Any, folder: str | None) -> None:
             raise UserError(f"cache_dir = {chosen!r}: cannot be made: {error.strerror}") from None
         return
     jax.config.update("jax_compilation_cache_dir", str(path))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
-    jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)  # the small ones are many
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+def _collect_rarely() -> None:
+    """Tracing makes objects by the million that live on: looking for garbage among them took a quarter of its time."""
+    gc.freeze()
+    gc.set_threshold(100_000, 50, 100)
 
 
 @functools.cache

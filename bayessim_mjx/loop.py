@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from bayessim_mjx import rl
-from bayessim_mjx.collection import Recorded, domain_or_prior, make_source
+from bayessim_mjx.collection import Recorded, make_source
 from bayessim_mjx.config import Config
 from bayessim_mjx.device import mesh
 from bayessim_mjx.distributions import Distribution
@@ -73,13 +73,8 @@ def make(config: Config, env: Env) -> Loop:
             f"real.logs hold {source.supply} segments, enough for {most} rounds of bayessim.realTrajs={b.realTrajs}; "
             f"set bayessim.realIters={most} or fewer, or a shorter bayessim.trainTrajLen"
         )
-    shape = jax.eval_shape(lambda key: source.real(key, 0, 1, _untrained(env, config))[0], jax.random.PRNGKey(0))
     names = source.channels.features(b.summarizerFxn)
-    return Loop(env, config, source, int(shape.shape[-1]), names)
-
-
-def _untrained(env: Env, config: Config) -> Policy:
-    return rl.policy_of(rl.init(env, config.ppo, jax.random.PRNGKey(0), domain_or_prior(env.space, 1)))
+    return Loop(env, config, source, len(names), names)
 
 
 def init(loop: Loop, trains: bool = True) -> LoopState:

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from bayessim_mjx import config, loop, registry
+from bayessim_mjx import config, loop, registry, rl
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.rollout import replay
 
@@ -141,7 +141,7 @@ def test_a_resumed_run_is_the_unkilled_run_bit_for_bit(finished, parts, stop):
 
 def test_another_seed_draws_other_trajectories(env, finished):
     other = loop.make(settings("seed=1"), env)
-    draws = other.source.real(other.key(0, "real"), 0, 2, loop._untrained(env, other.config))[0]
+    draws = other.source.real(other.key(0, "real"), 0, 2, rl.policy_of(finished[0].train))[0]
     assert not np.array_equal(np.asarray(draws), np.asarray(finished[0].real_features[:2]))
 
 
