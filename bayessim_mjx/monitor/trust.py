@@ -38,7 +38,8 @@ def _coverage(axes: Any, report: Any) -> None:
     axes.plot(at, _ecdf(report.ranks.level, at), color=BLUE, lw=2, label="densest regions (HPD)")
     axes.plot(at, _ecdf(report.ranks.tarp, at), color=GREEN, lw=1.5, ls="--", label="regions around a point (TARP)")
     for level, (share, error) in report.coverage.items():
-        axes.errorbar([level], [share], yerr=[2 * error], color="black", marker="o", ms=4, capsize=3, clip_on=False)
+        reach = [[min(2 * error, share)], [min(2 * error, 1 - share)]]
+        axes.errorbar([level], [share], yerr=reach, color="black", marker="o", ms=4, capsize=3, clip_on=False)
     axes.set(xlim=(0, 1), ylim=(0, 1), xlabel="probability of the region", ylabel="share of true parameters inside")
     axes.set_title("coverage: below the band the posterior is too narrow, above too wide", fontsize=9, loc="left")
     axes.legend(loc="upper left", frameon=False, fontsize=8)
