@@ -9,7 +9,8 @@ import mujoco
 import numpy as np
 
 from bayessim_mjx import laws
-from bayessim_mjx.diagnosis.effort import dof_of, efforts
+from bayessim_mjx.diagnosis.drives import dof_of
+from bayessim_mjx.diagnosis.effort import efforts
 from bayessim_mjx.diagnosis.inverse import Dynamics
 from bayessim_mjx.diagnosis.motion import Mask, filtered, motion
 from bayessim_mjx.diagnosis.sanity import velocities

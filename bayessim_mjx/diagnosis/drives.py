@@ -15,6 +15,8 @@ from bayessim_mjx.logs.log import Channels
 Array = NDArray[np.float64]
 BANDWIDTH = 12.0  # rad/s, of the loop around a torque-driven joint
 KINDS = ("torque", "position", "velocity", "none")
+_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
+_NO_MEMORY = tuple(int(getattr(mujoco.mjtDyn, f"mjDYN_{n}")) for n in ("NONE", "FILTER", "FILTEREXACT"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,3 +84,20 @@ def _drive(model: mujoco.MjModel, i: int, law: Any) -> tuple[str, int, float]:
     if b[2]:
         return "velocity", j, float(-b[2] * gear / gain / scale)
     return "torque", j, 1.0 / (gain * gear * scale)
+
+
+def is_effort(mj_model: mujoco.MjModel, actuator: int) -> bool:
+    """Whether this actuator's ctrl is a force up to a gain (motor, voltage), not the target of a servo."""
+    bias = mj_model.actuator_biasprm[actuator, 1] if mj_model.actuator_biastype[actuator] else 0.0
+    fixed = mj_model.actuator_gaintype[actuator] == int(mujoco.mjtGain.mjGAIN_FIXED)
+    affine = mj_model.actuator_biastype[actuator] <= int(mujoco.mjtBias.mjBIAS_AFFINE)
+    return bool(fixed and affine and bias == 0.0 and mj_model.actuator_dyntype[actuator] in _NO_MEMORY)
+
+
+def dof_of(mj_model: mujoco.MjModel, actuator: int) -> int | None:
+    """The degree of freedom of the hinge or slide joint that an actuator drives; None for tendons, sites, balls."""
+    if mj_model.actuator_trntype[actuator] not in _JOINT:
+        return None
+    joint = mj_model.actuator_trnid[actuator, 0]
+    axial = mj_model.jnt_type[joint] >= int(mujoco.mjtJoint.mjJNT_SLIDE)
+    return int(mj_model.jnt_dofadr[joint]) if axial else None

@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import functools
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
 
 from bayessim_mjx import laws
+from bayessim_mjx.diagnosis.drives import dof_of, is_effort
 from bayessim_mjx.diagnosis.inverse import Columns, Dynamics
 from bayessim_mjx.diagnosis.motion import Mask, bandwidth, filtered, motion
 from bayessim_mjx.logs.log import Array, Log
 
 REFUSED, DOUBTFUL = 0.3, 0.7  # share of the effort's variance explained
 CAUSAL = (-0.003, 0.15)  # s by which motion may follow the command for physical reasons: delay, lag, elasticity
+LOADED = 0.5  # of what another remedy leaves unexplained, which a load has to undercut
+FAR_BETTER = 1 / 3  # of what the lags of a robot leave unexplained, which those of a clock have to undercut
 _FAR = 0.5  # s, the largest offset between clocks that is looked for
-_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
-_NO_MEMORY = tuple(int(getattr(mujoco.mjtDyn, f"mjDYN_{n}")) for n in ("NONE", "FILTER", "FILTEREXACT"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,23 +62,6 @@ class Relation:
         return e is not None and (e < REFUSED or (e < DOUBTFUL and vain))
 
 
-def is_effort(mj_model: mujoco.MjModel, actuator: int) -> bool:
-    """Whether this actuator's ctrl is a force up to a gain (motor, voltage), not the target of a servo."""
-    bias = mj_model.actuator_biasprm[actuator, 1] if mj_model.actuator_biastype[actuator] else 0.0
-    fixed = mj_model.actuator_gaintype[actuator] == int(mujoco.mjtGain.mjGAIN_FIXED)
-    affine = mj_model.actuator_biastype[actuator] <= int(mujoco.mjtBias.mjBIAS_AFFINE)
-    return bool(fixed and affine and bias == 0.0 and mj_model.actuator_dyntype[actuator] in _NO_MEMORY)
-
-
-def dof_of(mj_model: mujoco.MjModel, actuator: int) -> int | None:
-    """The degree of freedom of the hinge or slide joint that an actuator drives; None for tendons, sites, balls."""
-    if mj_model.actuator_trntype[actuator] not in _JOINT:
-        return None
-    joint = mj_model.actuator_trnid[actuator, 0]
-    axial = mj_model.jnt_type[joint] >= int(mujoco.mjtJoint.mjJNT_SLIDE)
-    return int(mj_model.jnt_dofadr[joint]) if axial else None
-
-
 def efforts(log: Log, mj_model: mujoco.MjModel) -> Iterator[Effort]:
     """The efforts of every joint whose drives are all known: from the `effort:` streams, and from ctrl."""
     dofs = [dof_of(mj_model, i) for i in range(mj_model.nu)]
@@ -87,11 +72,11 @@ def efforts(log: Log, mj_model: mujoco.MjModel) -> Iterator[Effort]:
         streams = [log.streams.get(f"effort:{log.actuators[i]}") for i in own]
         if all(s is not None and np.isfinite(s).all() for s in streams):
             yield Effort(joint, dof, "effort", sum(g * s for g, s in zip(gear[own], streams, strict=True)), False)
-        if all(is_effort(mj_model, i) for i in own) and not _closed(log):
+        if all(is_effort(mj_model, i) for i in own) and not closed(log):
             yield Effort(joint, dof, "ctrl", sum(gear[i] * _force(mj_model, i, log.ctrl[:, i]) for i in own), True)
 
 
-def _closed(log: Log) -> bool:
+def closed(log: Log) -> bool:
     """Whether a position or velocity loop stands between the logged command and the actuator."""
     given = log.metadata.get("controller")
     blocks = [given, *given.values()] if isinstance(given, dict) else []
@@ -116,10 +101,18 @@ def relations(log: Log, mj_model: mujoco.MjModel) -> list[Relation]:
     for cutoff in sorted({max(3.0, top / 2), top}):  # the slower one is the quieter one
         moved = motion(log, mj_model, cutoff)
         pictures.append(Dynamics.of(mj_model, moved))
-    return [_relation(log, mj_model, effort, pictures) for effort in found]
+    laden = functools.cache(lambda: [p.loaded(mj_model) for p in pictures])
+    return [_relation(log, mj_model, effort, pictures, laden) for effort in found]
 
 
-def _relation(log: Log, mj_model: mujoco.MjModel, effort: Effort, pictures: list[Dynamics]) -> Relation:
+def _relation(
+    log: Log,
+    mj_model: mujoco.MjModel,
+    effort: Effort,
+    pictures: list[Dynamics],
+    laden: Callable[[], list[Dynamics]] | None = None,
+) -> Relation:
+    """laden: the pictures with an unknown load, which is no fault of a log."""
     own = Relation(effort.joint, effort.source, None)
     tests = [t for t in (_Test.of(log, effort, d) for d in pictures) if t.rows.sum() * t.step * t.cutoff >= 4.0]
     if not tests:
@@ -134,10 +127,19 @@ def _relation(log: Log, mj_model: mujoco.MjModel, effort: Effort, pictures: list
     test, curve = max(zip(tests, curves, strict=True), key=lambda p: float(np.max(p[1])))
     physical = (lags >= CAUSAL[0]) & (lags <= CAUSAL[1])
     explained = max(float(c[physical].max()) for c in curves)
+    best = float(curve.max())
     relation = replace(own, explained=explained, friction=test.friction(), lag=_nearest(lags, curve))
-    if explained >= DOUBTFUL:
+    if explained >= DOUBTFUL and 1.0 - best > FAR_BETTER * (1.0 - explained):
+        # a periodic motion fits one period later too
+        relation = replace(relation, lag=_nearest(lags[physical], curve[physical]))
+    if explained >= DOUBTFUL and not relation.lag:
         return relation
-    mend, certain = _mend(log, mj_model, relation, curve, test)
+    share, mend, certain = (best, "", False) if explained >= DOUBTFUL else _mend(log, mj_model, relation, curve, test)
+    if laden is not None:
+        other = _relation(log, mj_model, effort, laden())
+        told = other.explained or 0.0
+        if told >= DOUBTFUL and not other.refused and 1.0 - told < LOADED * (1.0 - share):
+            return other
     return replace(relation, mend=mend, certain=certain)
 
 
@@ -218,21 +220,22 @@ class _Test:
         return spans
 
 
-def _mend(log: Log, mj_model: mujoco.MjModel, now: Relation, curve: Array, test: _Test) -> tuple[str, bool]:
-    """One remedy that would explain the effort, in words, or nothing; and whether it is a sign or a unit."""
-    if now.lag and curve.max() > DOUBTFUL:
-        return f"shifting the command by {now.lag:+.3f} s would explain {curve.max():.0%}", False
+def _mend(log: Log, mj_model: mujoco.MjModel, now: Relation, curve: Array, test: _Test) -> tuple[float, str, bool]:
+    """One remedy that would explain the effort, (how much of it, in words or nothing, whether a sign or a unit)."""
+    best = float(curve.max())
+    if now.lag and best > DOUBTFUL:
+        return best, f"shifting the command by {now.lag:+.3f} s would explain {best:.0%}", False
     turned = test.share(sign=-1.0)
     if turned > DOUBTFUL:
-        return f"the opposite sign would explain {turned:.0%}", True
+        return turned, f"the opposite sign would explain {turned:.0%}", True
     radians = _in_radians(log, mj_model, test)
     if radians > DOUBTFUL:
-        return f"positions in degrees would explain {radians:.0%}", True
+        return radians, f"positions in degrees would explain {radians:.0%}", True
     free = test.share(scaled=False)
     if test.effort.scaled and free > DOUBTFUL:
-        return f"another scale of the command would explain {free:.0%}", False
+        return free, f"another scale of the command would explain {free:.0%}", False
     spans = ", ".join(f"{a:.1f} to {b:.1f} s" for a, b in test.pieces())
-    return (f"the part from {spans} alone can be explained: cut the file there" if spans else ""), False
+    return 0.0, (f"the part from {spans} alone can be explained: cut the file there" if spans else ""), False
 
 
 def _in_radians(log: Log, mj_model: mujoco.MjModel, test: _Test) -> float:

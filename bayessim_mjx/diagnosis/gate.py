@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 
 from bayessim_mjx.diagnosis import sanity
-from bayessim_mjx.diagnosis.effort import DOUBTFUL, Relation, relations
+from bayessim_mjx.diagnosis.drives import dof_of, is_effort
+from bayessim_mjx.diagnosis.effort import DOUBTFUL, Relation, closed, relations
 from bayessim_mjx.diagnosis.sanity import Finding, Velocity, refuse, warn
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.logs.log import Log
+from bayessim_mjx.logs.log import Array, Log
 
+ALIKE = 5.0  # at most so many times a target's range is the range of what follows it
 LATE = 0.3  # s; a larger offset between commands and motion is a fault of the clocks, not of the robot
 
 
@@ -136,7 +138,34 @@ def _report(log: Log, mj_model: mujoco.MjModel, dt: float) -> Report:
     related = tuple(relations(log, mj_model))
     seen = tuple(sanity.velocities(log))
     step = max(dt, log.period)
+    targets = _targets(log, mj_model)
+    own += (*sanity.clipped(log, targets), *sanity.units(log, _vouched(log, mj_model, related, targets)))
     return Report(log, (*own, *_of_velocity(seen, step), *_of_effort(related)), related, seen)
+
+
+def _targets(log: Log, mj_model: mujoco.MjModel) -> dict[str, Array]:
+    """{joint: `[T]`} targets of the joints whose only drive follows one."""
+    out: dict[str, Array] = {}
+    dofs = [dof_of(mj_model, i) for i in range(mj_model.nu)]
+    for i, dof in enumerate(dofs):
+        if dof is not None and dofs.count(dof) == 1 and (closed(log) or not is_effort(mj_model, i)):
+            out[log.joints[int(mj_model.dof_jntid[dof])]] = log.ctrl[:, i]
+    return out
+
+
+def _vouched(log: Log, mj_model: mujoco.MjModel, related: Sequence[Relation], targets: Mapping[str, Array]) -> set[str]:
+    """Joints whose positions have the model's unit: its dynamics, its range or its drives' targets say so."""
+    found = {r.joint for r in related if r.source == "ctrl" and (r.explained or 0.0) >= DOUBTFUL}
+    for j, joint in enumerate(log.joints):
+        q = log.qpos[:, log.channels.columns(joint).start]
+        low, high = mj_model.jnt_range[j]
+        room = 0.1 * (high - low)
+        if mj_model.jnt_limited[j] and low - room <= q.min() and q.max() <= high + room:
+            found.add(joint)
+        moved = np.ptp(targets[joint]) if joint in targets else 0.0
+        if moved > 0 and 1 / ALIKE < np.ptp(q) / moved < ALIKE:
+            found.add(joint)
+    return found
 
 
 def _of_velocity(seen: Sequence[Velocity], step: float) -> list[Finding]:

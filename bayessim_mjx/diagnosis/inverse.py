@@ -7,12 +7,13 @@ filtered alike, least squares. Here with bounds, so that friction cannot stand i
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
 from scipy.optimize import lsq_linear
 
+from bayessim_mjx.diagnosis import loads
 from bayessim_mjx.diagnosis.motion import Mask, Motion, lowpass
 from bayessim_mjx.logs.log import Array
 
@@ -47,6 +48,15 @@ def _alone(mj_model: mujoco.MjModel, body: int) -> mujoco.MjModel:
     return model
 
 
+def _point(mj_model: mujoco.MjModel, body: int, place: Array) -> mujoco.MjModel:
+    """The model with nothing but 1 kg at a place [3] of one body, m from its centre of mass."""
+    model = _alone(mj_model, body)
+    model.body_mass[body] = 1.0
+    model.body_inertia[body] = 0.0
+    model.body_ipos[body] += place
+    return model
+
+
 def springs(mj_model: mujoco.MjModel, moved: Motion) -> Array:
     """[T, nv] effort that holds the model's own springs."""
     data = mujoco.MjData(mj_model)
@@ -68,6 +78,8 @@ class Dynamics:
         weight: [T, nv], the part of their sum that is gravity.
         tilt: [2, T, nv], gravity of g along world x and y.
         spring: [T, nv].
+        load: [P, T, nv], of 1 kg at some places of the last links; most: [P], kg that may be there. Empty where no
+            load is thought of.
     """
 
     moved: Motion
@@ -75,6 +87,8 @@ class Dynamics:
     weight: Array
     tilt: Array
     spring: Array
+    load: Array
+    most: Array
 
     @classmethod
     def of(cls, mj_model: mujoco.MjModel, moved: Motion) -> Dynamics:
@@ -83,13 +97,17 @@ class Dynamics:
         down = float(np.linalg.norm(mj_model.opt.gravity))
         tilt = [recursive(mj_model, moved, g * down) for g in np.eye(3)[:2]] if down > 0 else []
         still = [recursive(mj_model, moved, mj_model.opt.gravity), springs(mj_model, moved)]
-        empty = np.zeros((0, *moved.qvel.shape))
+        weight, spring = _smooth(moved, still)
+        return cls(moved, _smooth(moved, bodies), weight, _smooth(moved, tilt), spring, _smooth(moved, []), np.zeros(0))
 
-        def smooth(parts: list[Array]) -> Array:
-            return np.stack([lowpass(p, moved.step, moved.cutoff) for p in parts]) if parts else empty
-
-        weight, spring = smooth(still)
-        return cls(moved, smooth(bodies), weight, smooth(tilt), spring)
+    def loaded(self, mj_model: mujoco.MjModel) -> Dynamics:
+        """With loads that the model does not know: positive masses at and around the last links' centres of mass."""
+        parts, most = [], []
+        for body in last_links(mj_model):
+            for place in loads.reach(mj_model, body) * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)]):
+                parts.append(recursive(_point(mj_model, body, place), self.moved))
+                most.append(loads.weight(mj_model, body))
+        return replace(self, load=_smooth(self.moved, parts), most=np.array(most))
 
     def nominal(self, mj_model: mujoco.MjModel) -> Array:
         """[T, nv] effort that the nominal model needs for this motion, its friction and damping included."""
@@ -111,12 +129,14 @@ class Dynamics:
         losses = lowpass(losses, moved.step, moved.cutoff).T
         parts = [p for p in (*self.bodies[:, :, dof], self.spring[:, dof]) if np.abs(p).max() > 1e-9]
         tilt = [p for p in self.tilt[:, :, dof] if np.abs(p).max() > 1e-9]
+        felt = [i for i, p in enumerate(self.load[:, :, dof]) if np.abs(p).max() > 1e-9]
         blocks = (
             ([np.ones(len(v))], -np.inf, np.inf),
             (losses, 0.0, np.inf),
             ([travel - travel.mean()], 0.0, np.inf),
             (parts, 1.0 / FACTOR, FACTOR),
             (tilt, -0.3, 0.3),
+            *(([self.load[i, :, dof]], 0.0, self.most[i]) for i in felt),
         )
         return Columns(
             np.stack([c for block, _, _ in blocks for c in block], 1),
@@ -124,6 +144,18 @@ class Dynamics:
             np.array([high for block, _, high in blocks for _ in block]),
             slice(5 + 1, 5 + 1 + len(parts)),
         )
+
+
+def _smooth(moved: Motion, parts: list[Array]) -> Array:
+    """[P, T, nv], filtered as the motion is."""
+    return np.array([lowpass(p, moved.step, moved.cutoff) for p in parts]).reshape(-1, *moved.qvel.shape)
+
+
+def last_links(mj_model: mujoco.MjModel) -> list[int]:
+    """Bodies with joints that carry no further joints."""
+    jointed = np.flatnonzero(mj_model.body_jntnum)
+    above = {int(mj_model.body_weldid[mj_model.body_parentid[b]]) for b in jointed}
+    return [int(b) for b in jointed if int(b) not in above]
 
 
 @dataclass(frozen=True, eq=False)

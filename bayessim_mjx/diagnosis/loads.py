@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from bayessim_mjx.diagnosis.effort import dof_of, is_effort
+from bayessim_mjx.diagnosis.drives import dof_of, is_effort
 
 Array = NDArray[np.float64]
 BESIDE, OUT = 1.2, 0.3  # reach of a load: of the body's own size, of the robot's length
@@ -23,7 +23,7 @@ def carried(model: mujoco.MjModel, places: Array) -> Array:
         places: `[T, nq]`, positions that were logged.
     """
     limit = force_limits(model)
-    out = np.array([_moving(model, b) for b in range(model.nbody)])
+    out = np.array([weight(model, b) for b in range(model.nbody)])
     if not np.isfinite(limit).any():
         return out
     data, jacobian = mujoco.MjData(model), np.zeros((3, model.nv))
@@ -65,7 +65,7 @@ def _largest(model: mujoco.MjModel, actuator: int) -> float:
     return min(ends, default=np.inf)
 
 
-def _moving(model: mujoco.MjModel, body: int) -> float:
+def weight(model: mujoco.MjModel, body: int) -> float:
     """kg of all that moves in the body's tree."""
     own = (model.body_rootid == model.body_rootid[body]) & (model.body_weldid != 0)
     return float(model.body_mass[own].sum())

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.motion import bandwidth, lowpass
 from bayessim_mjx.logs.log import Array, Log
@@ -14,6 +15,8 @@ from bayessim_mjx.logs.signals import estimate_velocity, quantum
 
 MIN_ROWS, MIN_STEPS = 20, 10  # fewer rows or control steps than this hold no window
 CLIPPED = 0.05  # share of the rows on one flat top
+HELD = 0.01  # of a target's range: it does not change
+MOMENT = 0.05  # s
 _REGISTERS = (2.0**16, 2.0**32)
 _FASTEST = {"hinge": 150.0, "slide": 50.0}  # rad/s, m/s; faster: probably another unit
 
@@ -78,12 +81,18 @@ def constant(log: Log, dt: float) -> Iterator[Finding]:
             yield warn(f"{name} never changes ({stream[0]:.4g}): it is not used")
 
 
-def clipped(log: Log, dt: float) -> Iterator[Finding]:
-    """Flat tops: a sensor that runs into its end at speed and stays on one value."""
+def clipped(log: Log, targets: Mapping[str, Array]) -> Iterator[Finding]:
+    """Flat tops: a sensor that runs into its end at speed and stays on one value.
+
+    Args:
+        targets: {joint: `[T]`}, of joints whose drives follow a target: while it does not change they hold still.
+    """
     for name, x in _measured(log):
+        target = targets.get(name.partition(":")[2])
         for end in (float(x.max()), float(x.min())):
-            share = _flat(x, end)
-            if share > CLIPPED:
+            flat = _flat(x, end)
+            share = float(np.mean(flat))
+            if share > CLIPPED and not (target is not None and _steady(target, flat)):
                 text = f"{name} is clipped at {end:.5g} ({share:.0%} of the rows"
                 drive = name.startswith("effort:")
                 yield Finding("finding", f"{text}; the drive's limit?)") if drive else warn(f"{text}; a hard stop?)")
@@ -97,14 +106,22 @@ def _measured(log: Log) -> Iterator[tuple[str, Array]]:
     yield from ((n, s) for n, s in log.streams.items() if n.startswith("effort:") and np.isfinite(s).all())
 
 
-def _flat(x: Array, end: float) -> float:
-    """Share of rows in runs of four or more on the value `end` that are entered faster than a fifth of the top rate."""
+def _steady(target: Array, rows: NDArray[np.bool_]) -> bool:
+    """Whether a target has one value in most of these rows (a coarse encoder is there early), but not everywhere."""
+    low, high = np.quantile(target[rows], (0.1, 0.9))
+    return bool(high - low < HELD * np.ptp(target))
+
+
+def _flat(x: Array, end: float) -> NDArray[np.bool_]:
+    """Rows `[T]` in runs of four or more on the value `end` that are entered faster than a fifth of the top rate."""
     on = np.concatenate([[False], x == end, [False]])
     edges = np.flatnonzero(np.diff(on.astype(int))).reshape(-1, 2)
     rate = np.abs(np.diff(x))
     top = float(np.percentile(rate[rate > 0], 95)) if (rate > 0).any() else 0.0
-    rows = [b - a for a, b in edges if b - a >= 4 and a >= 2 and rate[a - 2] > 0.2 * top > 0]
-    return float(sum(rows)) / len(x)
+    rows = np.zeros(len(x), bool)
+    for a, b in edges:
+        rows[a:b] = b - a >= 4 and a >= 2 and rate[a - 2] > 0.2 * top > 0
+    return rows
 
 
 def wrapped(log: Log, dt: float) -> Iterator[Finding]:
@@ -125,19 +142,31 @@ def wrapped(log: Log, dt: float) -> Iterator[Finding]:
             break
 
 
-def units(log: Log, dt: float) -> Iterator[Finding]:
-    """Speeds and ranges that robots do not reach: degrees, counts, millimetres."""
+def units(log: Log, known: Collection[str] = ()) -> Iterator[Finding]:
+    """Speeds that robots do not reach: degrees, counts, millimetres.
+
+    Args:
+        known: joints whose unit something else vouches for.
+    """
     for joint, kind in zip(log.joints, log.channels.kinds, strict=True):
-        if kind not in _FASTEST:
+        if kind not in _FASTEST or joint in known:
             continue
         q, v = log.channels.columns(joint).start, log.channels.columns(joint, "qvel").start
-        fastest = float(np.percentile(np.abs(np.diff(log.qpos[:, q]) / np.diff(log.time)), 99))
+        fastest = float(np.percentile(_speed(log, q), 99))
         unit = "rad/s (degrees or counts?)" if kind == "hinge" else "m/s (millimetres or counts?)"
         if fastest > _FASTEST[kind]:
             yield warn(f"qpos:{joint} moves at {fastest:.4g} {unit}: mend the unit with `scale` in the map")
         measured = float(np.percentile(np.abs(log.qvel[:, v]), 99))
         if log.has_qvel and measured > _FASTEST[kind] and measured > 5.0 * fastest:
             yield warn(f"qvel:{joint} reads {measured:.4g} {unit}, its position moves at {fastest:.4g}")
+
+
+def _speed(log: Log, column: int) -> Array:
+    """Speeds over MOMENT s: between two rows noise and jitter of the stamps are fast as well."""
+    each = max(1, round(MOMENT / log.period))
+    return np.asarray(
+        np.abs((log.qpos[each:, column] - log.qpos[:-each, column]) / (log.time[each:] - log.time[:-each]))
+    )
 
 
 @dataclass(frozen=True)
@@ -191,4 +220,4 @@ def _compare(name: str, grid: Array, v: Array, w: Array, edge: float) -> Velocit
     return Velocity(name, float(v @ x) / float(x @ x), float(lags[best]), correlation)
 
 
-CHECKS = (size, jitter, constant, clipped, wrapped, units)
+CHECKS = (size, jitter, constant, wrapped)

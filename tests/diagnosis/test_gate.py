@@ -295,3 +295,66 @@ def test_xl330_passes(tmp_path: Path) -> None:
     gate = check(read_logs(tmp_path, servo), servo, 0.005)
     assert len(gate.usable) == 16 and not gate.refused
     assert all((r.relations[0].explained or 0) > 0.9 for r in gate.reports)
+
+
+# What is said of sound logs
+
+ON_A_RAIL = """
+<mujoco><option timestep="0.001"/><worldbody><body><joint name="rail" type="slide" axis="1 0 0" damping="1"/>
+  <geom size=".1" mass="1" contype="0" conaffinity="0"/></body></worldbody>
+<actuator>%s</actuator></mujoco>"""
+PUSHED, FOLLOWING = (
+    ON_A_RAIL % '<motor name="m" joint="rail"/>',
+    ON_A_RAIL % '<position name="m" joint="rail" kp="400" kv="40"/>',
+)
+
+
+def told(log: Log, xml: str) -> str:
+    gate = judge(log, xml)
+    assert gate.usable
+    return " ".join([*gate.warnings, *gate.findings])
+
+
+def test_a_servo_that_holds_its_target_is_not_clipped() -> None:
+    """Ramps between two targets, read by a coarse encoder; a stop is where other targets end on the same value."""
+    stiff = FOLLOWING.replace('kp="400" kv="40"', 'kp="40000" kv="400"')
+
+    def follows(target):
+        log = record(stiff, lambda t, q, v: np.array([target(t)]), sigma=0.0)
+        return dataclasses.replace(log, qpos=np.round(log.qpos, 2))
+
+    assert "clipped" not in told(follows(lambda t: np.clip(0.6 * np.sin(2 * t), -0.3, 0.3)), stiff)
+    free = follows(lambda t: 0.6 * np.sin(2 * t))
+    assert "a hard stop" in told(dataclasses.replace(free, qpos=np.clip(free.qpos, -0.3, 0.3)), stiff)
+
+
+def test_what_moves_fast_is_not_told_to_be_in_millimetres() -> None:
+    """120 N on 1 kg for a second, back and forth: some 60 m/s."""
+    fast = record(PUSHED, lambda t, q, v: np.array([120.0 * np.sign(np.sin(3 * t))]), sigma=1e-3)
+    assert np.percentile(np.abs(fast.qvel), 99) > 50 and "millimetres" not in told(fast, PUSHED)
+    follows = record(FOLLOWING.replace("400", "4000"), lambda t, q, v: np.array([9.0 * np.sin(9 * t)]))
+    assert "millimetres" not in told(follows, FOLLOWING)
+    slow = record(FOLLOWING, lambda t, q, v: np.array([0.3 * np.sin(3 * t)]))
+    noisy = dataclasses.replace(slow, time=slow.time + np.where(np.arange(len(slow)) % 9, 0.0, 0.0099))
+    assert "millimetres" not in told(noisy, FOLLOWING)  # jitter of the stamps is no speed
+    millimetres = dataclasses.replace(slow, qpos=1e3 * slow.qpos, qvel=1e3 * slow.qvel)
+    assert "millimetres" in told(millimetres, FOLLOWING)
+
+
+def laden(mass: float) -> str:
+    """The arm with a load beyond its end."""
+    load = f'<geom type="sphere" size=".03" mass="{mass}" pos="0 0 -.45" contype="0" conaffinity="0"/></body></body>'
+    return ARM.replace("</body></body>", load, 1)
+
+
+def test_a_load_is_no_fault_of_the_log() -> None:
+    """1.2 kg, half as much again as the link."""
+    gate = judge(record(laden(1.2), sines((6.0, 4.0)), seconds=12.0), ARM)
+    assert gate.usable and not gate.warnings, gate.warnings
+
+
+@pytest.mark.parametrize(("pace", "mass"), [(5.0, 0.9), (2.0, 0.6)])
+def test_clocks_that_agree_are_not_doubted_for_a_load(pace: float, mass: float) -> None:
+    """A periodic motion fits a quarter of a period later as well, and better where the model is wrong."""
+    log = record(laden(mass), lambda t, q, v: np.array([6.0 * np.sin(pace * t), 2.0 * np.sin(pace * t + 1.0)]))
+    assert not told(log, ARM)
