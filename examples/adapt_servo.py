@@ -20,6 +20,8 @@ from bayessim_mjx.config import load
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.env import Task
 from bayessim_mjx.logs import Log, read_logs, segments
+from bayessim_mjx.monitor.console import Console
+from bayessim_mjx.quantities import estimate, number
 from bayessim_mjx.rollout import replay
 
 # load mass, damping = kt^2/R + viscous, Coulomb friction, armature, gain = kt/R
@@ -55,13 +57,16 @@ def adapt(folder: Path, overrides: list[str], seed: int = 0) -> tuple[Task, Dist
 def show(env: Task, logs: list[Log], posterior: Distribution) -> None:
     """Two tables: parameters (posterior against published values) and gaps."""
     mean, sd = np.asarray(posterior.mean()), np.asarray(posterior.sd())
-    rows: dict[str, Any] = {**PUBLISHED, "posterior mean": mean}
-    print(f"\n{'':30}" + "".join(f"{name:>16}" for name in env.space.names))
-    for label, values in {**rows, "posterior sd": sd}.items():
-        print(f"{label:30}" + "".join(f"{v:16.4f}" for v in values))
-    print(f"\n{'gap, RMS in mrad':30}" + "".join(f"{s:14.2f} s" for s in WINDOWS))
-    for label, values in rows.items():
-        print(f"{label:30}" + "".join(f"{1e3 * gap(env, logs, values, s):16.1f}" for s in WINDOWS))
+    with Console() as console:
+        found = [estimate(m, s) for m, s in zip(mean, sd, strict=True)]
+        published = [[number(row[k]) for row in PUBLISHED.values()] for k in range(len(found))]
+        rows = [[name, *known, own] for name, known, own in zip(env.space.names, published, found, strict=True)]
+        console.grid(["parameter", *PUBLISHED, "posterior"], rows)
+        gaps = [
+            [label, *(number(1e3 * gap(env, logs, values, s)) for s in WINDOWS)]
+            for label, values in {**PUBLISHED, "posterior mean": mean}.items()
+        ]
+        console.grid(["gap, RMS in mrad", *(f"after {s:g} s" for s in WINDOWS)], gaps)
 
 
 def main() -> None:
