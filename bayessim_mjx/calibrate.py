@@ -14,16 +14,16 @@ from bayessim_mjx import cli
 from bayessim_mjx.config import Config
 from bayessim_mjx.device import setup_jax
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.quantities import estimate
+from bayessim_mjx.quantities import estimate, fixed
 from bayessim_mjx.settings import COUNT, SEEDS
 
 FOLDER = "calibration"
 ADVICE = {
-    "calibrated": "its regions hold the truth as often as they say",
-    "over-confident": "do not trust its width; more bayessim.trainTrajs, or a bayessim.ensemble",
-    "under-confident": "the truth lies inside, but more could be known; train longer or simulate more",
-    "biased": "do not trust its place; simulate more (bayessim.trainTrajs)",
-    "miscalibrated": "do not trust its shape; more bayessim.components, or other bayessim.coordinates",
+    "calibrated": "its regions contain the truth as often as they should",
+    "over-confident": "do not trust its width; raise bayessim.trainTrajs or bayessim.ensemble",
+    "under-confident": "the truth lies inside, but the data say more; train longer or raise bayessim.trainTrajs",
+    "biased": "do not trust its location; raise bayessim.trainTrajs",
+    "miscalibrated": "do not trust its shape; raise bayessim.components or change bayessim.coordinates",
 }
 
 
@@ -93,7 +93,7 @@ def show(console: Any, found: Any) -> None:
     rows = [[f"{100 * a:.0f} %", f"{estimate(100 * c, 100 * e)} %"] for a, (c, e) in report.coverage.items()]
     console.grid(["region of the posterior", "truths inside"], rows)
     columns = zip(report.names, report.bias, report.spread, report.contraction, strict=True)
-    rows = [[n, f"{report.p[n]:.2g}", f"{bias:+.1f}", f"{wide:+.1f}", f"{c:.2f}"] for n, bias, wide, c in columns]
+    rows = [[n, f"{report.p[n]:.2g}", fixed(bias, 1), fixed(wide, 1), fixed(c, 2)] for n, bias, wide, c in columns]
     console.grid(["parameter", "p of ranks", "bias [se]", "too narrow [se]", "contraction"], rows)
     for text in found.warnings():
         console.warning(text)
@@ -107,7 +107,7 @@ def verdict_lines(found: Any) -> list[str]:
         lines += [f"            (tested with its standard deviations times {report.temperature:.2f}, as in its round)"]
     lines += [f"gain        {report.gain:.2f} nats over the prior, on average"]
     if report.predictive is not None:
-        lines += [f"predictive  p = {report.predictive:.2g} that simulation at the posterior reproduces the summaries"]
+        lines += [f"predictive  p = {report.predictive:.2g} that simulations at the posterior reproduce the summaries"]
     each = "" if len(misfit.p) == 1 else f" (each: {' '.join(f'{value:.2g}' for value in misfit.p)})"
     reality = "unlike anything simulated" if misfit.flagged else "like simulated ones"
     return [*lines, f"reality     the real trajectories are {reality}, p = {misfit.joint:.2g}{each}"]

@@ -78,7 +78,8 @@ class PlainParser(argparse.ArgumentParser):
     """Flags; what is wrong with them is a UserError. The usage line does not repeat the list of options."""
 
     def __init__(self, **options: Any):
-        super().__init__(**({"usage": "%(prog)s [options]", "allow_abbrev": False} | options))
+        plain: dict[str, Any] = {"usage": "%(prog)s [options]", "allow_abbrev": False}
+        super().__init__(**(plain | options))
 
     def trusting(self) -> None:
         """Add the flag that lets code run which settings name."""

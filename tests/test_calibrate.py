@@ -40,7 +40,7 @@ def said(checks: Checks) -> str:
 
 def test_the_verdict_is_told_in_words_with_a_table():
     text = said(found())
-    assert "posterior calibrated: its regions hold the truth as often as they say" in text
+    assert "posterior calibrated: its regions contain the truth as often as they should" in text
     assert "the real trajectories are like simulated ones, p = 0.4" in text
     (row,) = [line for line in text.splitlines() if line.strip().startswith("mass")]
     assert len(row.split()) == 5 and "too narrow [se]" in text

@@ -72,5 +72,6 @@ def flat_sentences(names: Sequence[str], expected: np.ndarray, real: np.ndarray)
     kind = [name for name, a, b in zip(names, expected, real, strict=True) if b < CONTRACTED <= a]
     texts = [f"{name}: not identified by these trajectories" for name in flat]
     return texts + [
-        f"{name}: not identified by the real trajectories, though most simulated ones would" for name in kind
+        f"{name}: not identified by the real trajectories, although most simulated ones would identify it"
+        for name in kind
     ]

@@ -104,9 +104,9 @@ def _blocks(
             after = 2 * (names and n > 0 and k == 0 and _longest_word(cell) + 2 <= w)
             cells.append(wrapped(cell, w if k in left or n == 0 else None, after))
         tall = max(map(len, cells))
-        for k, cell in enumerate(cells):  # words begin at the top, a header stands on its column
-            empty = [""] * (tall - len(cell))
-            cells[k] = [*empty, *cell] if n == 0 else [*cell, *empty]
+        for k, broken in enumerate(cells):  # words begin at the top, a header stands on its column
+            empty = [""] * (tall - len(broken))
+            cells[k] = [*empty, *broken] if n == 0 else [*broken, *empty]
         lines = [
             GAP.join(c.ljust(w) if k in left else c.rjust(w) for k, (c, w) in enumerate(zip(line, wide, strict=True)))
             for line in zip(*cells, strict=True)
