@@ -43,8 +43,9 @@ def levels(key: Array, mixtures: Mixtures, z: Array, chart: str) -> Array:
         density = jax.nn.logsumexp((logits - size)[None] - 0.5 * jnp.sum(away * away, axis=-1), axis=-1)
         density = density + charts.log_slope(points, chart)
         inside = jnp.all((draws >= 0) & (draws <= 1), axis=-1) | (chart != "plain")
-        denser, equal = jnp.sum(inside & (density[1:] > density[0])), jnp.sum(inside & (density[1:] == density[0]))
-        return (denser + (equal + 1.0) * jax.random.uniform(key_rank)) / (jnp.sum(inside) + 1.0)
+        which = jnp.stack([density[1:] > density[0], density[1:] == density[0], jnp.ones(DRAWS, bool)])
+        denser, equal, whole = jnp.sum(inside[None] & which, axis=-1, dtype=jnp.float32)
+        return (denser + (equal + 1.0) * jax.random.uniform(key_rank)) / (whole + 1.0)
 
     return jax.lax.map(one, (jax.random.split(key, z.shape[0]), *mixtures, z), batch_size=64)
 
