@@ -13,6 +13,7 @@ import tempfile
 import threading
 import traceback
 import types
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -170,7 +171,11 @@ def config_of(args: argparse.Namespace, more: Mapping[str, tuple[str, Any]] | No
             drawn = flag == "--seed" and value == -1
             flags[flag] = (key, random.SystemRandom().randrange(10_000) if drawn else value)
     task = args.task and task_name(args.task)
-    settings = load(task, cfg_env=args.cfg_env, cfg_train=args.cfg_train, flags=flags, overrides=args.overrides)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", UserWarning)
+        settings = load(task, cfg_env=args.cfg_env, cfg_train=args.cfg_train, flags=flags, overrides=args.overrides)
+    for warning in caught:
+        print(f"note: {warning.message}", file=sys.stderr)
     task_name(settings.task)
     if args.idle:
         raise UserError(f"{args.idle[0]}: {args.command} has no use for it")

@@ -15,7 +15,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from bayessim_mjx import trust
+from bayessim_mjx import foreign, trust
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.settings import (
     YAML_NAMES,
@@ -59,6 +59,7 @@ NUISANCE_KEYS = ("observations", "actions", "sim_params")  # noise: two numbers 
 REAL_KEYS = ("weights", "means", "stds")
 OPERATIONS = ("scaling", "additive", "absolute")
 EFFECTS_SCHEMA = 1
+DICT = "dict"  # the source of settings that are no file
 EFFECTS_KEYS = ("schema", "effects", "calibrated")
 
 
@@ -98,7 +99,7 @@ def load(
     return _build(task, [*files, *more, *map(_override, overrides)])
 
 
-def from_dict(raw: Mapping[str, Any], task: str | None = None, source: str = "dict") -> Config:
+def from_dict(raw: Mapping[str, Any], task: str | None = None, source: str = DICT) -> Config:
     """A Config from plain nested dicts with the YAML names (the inverse of `Config.to_dict`). `raw` is not changed."""
     task = task or raw.get("task_name")
     if not task:
@@ -170,7 +171,9 @@ def _build(task: str, layers: Sequence[Layer]) -> Config:
     _one_number_of_worlds(layers)
     merged: dict[str, Any] = {"task_name": task}
     for source, raw, is_file in [*base, *layers]:
-        _merge(merged, raw, source, is_file, declared)
+        if is_file and source != DICT:
+            foreign.note(raw, source, declared)
+        _merge(merged, foreign.without(raw, declared) if is_file else raw, source, is_file, declared)
     merged.pop("task_name", None)
     known = {f.name for f in dataclasses.fields(EnvConfig)}
     env = merged.pop("env", {})
@@ -192,6 +195,7 @@ def _merge(merged: dict[str, Any], raw: Mapping[str, Any], source: str, is_file:
             if not isinstance(value or {}, Mapping):
                 raise UserError(f"{key} = {value!r} ({source}): expected a section of `key: value` lines")
             merge = _merge_task if key == "task" else _merge_section
+            value = _one_length(value or {}, source) if key == "env" else value
             merge(merged.setdefault(key, {}), value or {}, source, is_file, key, declared)  # type: ignore[operator]
         else:
             merged[key] = _field(Config, key, value, key, source)
@@ -201,6 +205,17 @@ def _merge(merged: dict[str, Any], raw: Mapping[str, Any], source: str, is_file:
         raise UserError(f"{source}: env.numEnvs = {given[0]} and ppo.num_envs = {given[1]} are one setting; give one")
     if given:
         merged.setdefault("env", {})["numEnvs"] = merged.setdefault("ppo", {})["num_envs"] = given[0]
+
+
+def _one_length(env: Mapping[str, Any], source: str) -> Mapping[str, Any]:
+    """`env:` with maxEpisodeLength under the name episodeLength; some of BayesSimIG's files call it so."""
+    if "maxEpisodeLength" not in env:
+        return env
+    longest, rest = env["maxEpisodeLength"], {k: v for k, v in env.items() if k != "maxEpisodeLength"}
+    if rest.get("episodeLength", longest) != longest:
+        given = rest["episodeLength"]
+        raise UserError(f"{source}: env.episodeLength = {given} and env.maxEpisodeLength = {longest} are one setting")
+    return {**rest, "episodeLength": longest}
 
 
 def _one_number_of_worlds(layers: Sequence[Layer]) -> None:

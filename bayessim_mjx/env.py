@@ -20,6 +20,8 @@ from bayessim_mjx.effects.reading import stack
 from bayessim_mjx.effects.storage import corrected
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.mirrors import Mirror, MirrorMap, resolve
+from bayessim_mjx.nuisance import Course, Drawn, Nuisance
+from bayessim_mjx.nuisance import read as read_nuisance
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 from bayessim_mjx.physics import Physics, World, control_step, mjx
 from bayessim_mjx.settings import IMPLEMENTATIONS
@@ -28,6 +30,7 @@ compat.supply()  # our environments are Brax's too: so that Brax's own trainers 
 
 Observations = dict[str, jax.Array]
 VARIANTS = ("isaacgymenvs", "bayessim2021")
+GRAVITY = "opt.gravity"  # leaf of the model
 
 
 class State(struct.PyTreeNode):
@@ -57,6 +60,7 @@ class Env(abc.ABC):
     backend: str = "mjx"
     episode_length: int
     mirrors: tuple[MirrorMap, ...] = ()
+    nuisance: Nuisance | None = None  # with it, reset takes a `Course` too, and info["nuisance"] is a `Drawn`
 
     @abc.abstractmethod
     def reset(self, key: jax.Array, theta: jax.Array | None = None) -> State:
@@ -149,6 +153,7 @@ class Task(Env):
         self.physics = Physics(mj_model, self.control_dt, space, stack(section, effects), self.max_qvel, impl, worlds)
         self.joint_names = _names(mj_model, mujoco.mjtObj.mjOBJ_JOINT, mj_model.njnt)
         self.actuator_names = _names(mj_model, mujoco.mjtObj.mjOBJ_ACTUATOR, mj_model.nu)
+        self.nuisance = read_nuisance(section, self.physics.space)
         names = {"policy": self.observation_names}
         self.mirrors = tuple(resolve(mirror, mj_model, names) for mirror in self.mirror)
 
@@ -211,47 +216,75 @@ class Task(Env):
 
     # The protocol.
 
-    def reset(self, key: jax.Array, theta: jax.Array | None = None) -> State:
+    def reset(self, key: jax.Array, theta: jax.Array | None = None, course: Course | None = None) -> State:
+        """`course`: what the world carries on; None: everything is drawn anew, and schedules are over."""
+        drawn = None
+        if self.nuisance is not None:
+            key, key_drawn = jax.random.split(key)
+            drawn = self.nuisance.begin(key_drawn, course, self.action_size)
         key, key_start = jax.random.split(key)
         qpos, qvel = self.initial(key)
-        return self._begin(key_start, qpos, qvel, theta)
+        return self._begin(key_start, qpos, qvel, theta, drawn)
 
     def reset_to(self, qpos: jax.Array, qvel: jax.Array, theta: jax.Array | None = None) -> State:
         """Start in a given state (replay from a log); what the task draws at random is drawn with a fixed key."""
-        return self._begin(jax.random.PRNGKey(0), qpos, qvel, theta)
+        drawn = None
+        if self.nuisance is not None:
+            drawn = self.nuisance.begin(jax.random.PRNGKey(0), None, self.action_size)
+        return self._begin(jax.random.PRNGKey(0), qpos, qvel, theta, drawn)
 
-    def _begin(self, key: jax.Array, qpos: jax.Array, qvel: jax.Array, theta: jax.Array | None) -> State:
+    def _begin(
+        self,
+        key: jax.Array,
+        qpos: jax.Array,
+        qvel: jax.Array,
+        theta: jax.Array | None,
+        drawn: Drawn | None,
+    ) -> State:
         theta = jnp.asarray(self.space.nominal) if theta is None else theta
-        world = self.physics.world(theta, qpos, qvel)
+        world = self._under_gravity(self.physics.world(theta, qpos, qvel), drawn)
         world = world.replace(task={"steps": jnp.zeros((), jnp.int32)} | self.start(key, world))
         data, action = self.physics.kinematics(world), jnp.zeros(self.action_size)
         metrics = jax.eval_shape(lambda: self.reward(world, world, data, action)[2])
-        obs, zero = self._observe(world, data, action), jnp.zeros(())
+        (drawn, obs), zero = self._observe(world, data, action, drawn), jnp.zeros(())
         return State(
             pipeline_state=world,
             obs=obs,
             reward=zero,
             done=zero,
             metrics={name: zero for name in metrics},
-            info={"terminated": zero, "truncated": zero, "final_observation": obs, "steps": world.task["steps"]},
+            info={"terminated": zero, "truncated": zero, "final_observation": obs, "steps": world.task["steps"]}
+            | ({} if drawn is None else {"nuisance": drawn}),
         )
+
+    def _under_gravity(self, world: World, drawn: Drawn | None) -> World:
+        if self.nuisance is None or self.nuisance.gravity is None or drawn is None:
+            return world
+        own = world.fields.get(GRAVITY, self.physics.model.opt.gravity)
+        return world.replace(fields={**world.fields, GRAVITY: self.nuisance.gravity_of(drawn, own)})
 
     def step(self, state: State, action: jax.Array) -> State:
         before: World = state.pipeline_state
-        action = jnp.clip(jnp.asarray(action, jnp.float32), -1.0, 1.0)
+        action, drawn = jnp.asarray(action, jnp.float32), None
+        if self.nuisance is not None:
+            drawn, action = self.nuisance.act(state.info["nuisance"], action)
+            drawn = self.nuisance.after_step(drawn)
+        action = jnp.clip(action, -1.0, 1.0)
         after, data = control_step(self.physics, before, self.command(action))
         after, sound = _hold_if_diverged(before, after, self.speed_limit)
         steps = before.task["steps"] + 1
         after = after.replace(task=after.task | {"steps": steps})
         after = self.advance(before, after, data, action)
         reward, terminated, metrics = self.reward(before, after, data, action)
-        obs = self._observe(after, data, action)
+        drawn, obs = self._observe(after, data, action, drawn)
         done = (terminated | ~sound).astype(jnp.float32)
         info = state.info | {
             "terminated": done,
             "truncated": (steps >= self.episode_length).astype(jnp.float32),
             "final_observation": obs,
         }
+        if drawn is not None:
+            info["nuisance"] = drawn
         if "truncation" not in info:  # Brax's EpisodeWrapper counts in info["steps"] itself
             info["steps"] = steps
         return State(
@@ -263,13 +296,19 @@ class Task(Env):
             info=info,
         )
 
-    def _observe(self, world: World, data: mjx.Data, action: jax.Array) -> Observations:
+    def _observe(
+        self, world: World, data: mjx.Data, action: jax.Array, drawn: Drawn | None
+    ) -> tuple[Drawn | None, Observations]:
         limit = self.observation_clip[self.variant]
         obs = {name: _finite(value) for name, value in self.observe(world, data, action).items()}
+        if self.nuisance is not None and drawn is not None:  # a critic of its own sees the truth
+            if not drawn.observation.size:
+                drawn = self.nuisance.seen(drawn, obs["policy"].shape[0])
+            drawn, obs["policy"] = self.nuisance.observe(drawn, obs["policy"])
         if limit is not None:
             obs = {name: jnp.clip(value, -limit, limit) for name, value in obs.items()}
         aliases = {"state": "policy", "privileged_state": "critic"}
-        return obs | {alias: obs[group] for alias, group in aliases.items() if group in obs}
+        return drawn, obs | {alias: obs[group] for alias, group in aliases.items() if group in obs}
 
     # Facts.
 

@@ -90,7 +90,9 @@ def init(loop: Loop, trains: bool = True) -> LoopState:
 def _new_policy(
     loop: Loop, round_: int, domain: Distribution | None, begin: Callable[..., TrainState] = rl.init
 ) -> TrainState:
-    return begin(loop.env, loop.config.ppo, loop.key(round_, "init"), domain, mesh(loop.config))
+    ppo = loop.config.ppo
+    clock = round_ * ppo.max_iterations * ppo.num_steps  # schedules of randomisation go on from round to round
+    return begin(loop.env, ppo, loop.key(round_, "init"), domain, mesh(loop.config), clock=clock)
 
 
 def training_target(loop: Loop, round_: int) -> int:

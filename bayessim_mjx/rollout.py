@@ -189,14 +189,41 @@ def collect(
             "extras": extras,
         }
         following = first + (index - first + stride) % size
+        fresh = jax.tree.map(lambda lasts, new: new[index] if lasts else new, lasting, pool)
+        fresh = next_episodes(env, ended, after, fresh)
 
         def next_one(lasts: bool, old: jax.Array, new: jax.Array, fresh: jax.Array) -> jax.Array:
-            return select(ended, fresh[index], new) if lasts else old
+            return select(ended, fresh, new) if lasts else old
 
-        return (jax.tree.map(next_one, lasting, state, after, pool), jnp.where(ended, following, index)), row
+        return (jax.tree.map(next_one, lasting, state, after, fresh), jnp.where(ended, following, index)), row
 
     (state, _), batch = jax.lax.scan(step, (env_states, jnp.arange(worlds)), draws)
     return state, batch
+
+
+def strong(tree: Any) -> Any:
+    """The same arrays without weak types: what goes into the first update is then typed like what comes out of it."""
+    return jax.tree.map(lambda x: jax.lax.convert_element_type(x, jnp.result_type(x)), tree)
+
+
+def next_episodes(env: Env, ended: jax.Array, after: State, fresh: State) -> State:
+    """`fresh` resets [N] of worlds that went on to `after`, with what these carry on from episode to episode.
+
+    Training's clock goes on; where `frequency` asks for it, an ended world keeps its parameters, gravity and lasting
+    noise, and is reset anew with them.
+    """
+    random = getattr(env, "nuisance", None)
+    if random is None:
+        return fresh
+    course = after.info["nuisance"].course
+    if random.frequency > 1:
+        keeps, fresh = ended & (course.age < random.frequency), strong(fresh)
+        keys, theta = fresh.info["nuisance"].key, after.pipeline_state.theta
+        again = lambda: strong(select(keeps, jax.vmap(traced(env.reset))(keys, theta, course), fresh))  # noqa: E731
+        fresh = jax.lax.cond(keeps.any(), again, lambda: fresh)
+    drawn = fresh.info["nuisance"]
+    drawn = drawn.replace(course=drawn.course.replace(clock=course.clock))
+    return fresh.replace(info={**fresh.info, "nuisance": drawn})
 
 
 @lru_cache(maxsize=64)
@@ -215,7 +242,8 @@ def _lasting(env: Env, states: State, groups: tuple[str, ...]) -> State:
     def step(state: State, action: jax.Array) -> tuple[State, Any]:
         after = traced(env.step)(state, action)
         final = {g: after.info["final_observation"][g] for g in groups}
-        return after, (final, after.reward, after.info["terminated"], after.info["truncated"])
+        carried = () if getattr(env, "nuisance", None) is None else (after.info["nuisance"], after.pipeline_state.theta)
+        return after, (final, after.reward, after.info["terminated"], after.info["truncated"], carried)
 
     closed, shapes = jax.make_jaxpr(step, return_shape=True)(one, jax.ShapeDtypeStruct((env.action_size,), jnp.float32))
     seen = jax.tree.map(lambda _: False, one)

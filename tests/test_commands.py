@@ -147,6 +147,13 @@ def test_settings_of_another_command_are_refused(command: Any, override: str, wo
     assert all(word in line for word in words), line
 
 
+def test_what_means_nothing_here_is_one_note(capsys: Any, tmp_path: Path, toy: None) -> None:
+    (tmp_path / "f.yaml").write_text("sim: {substeps: 2}\nenv: {envSpacing: 2}\n")
+    assert train.main(["--task", "Pendulum", *SMALL, "--cfg_env", "f.yaml", "--max_iterations", "0"]) == 0
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if "mean nothing" in line]
+    assert line == "note: f.yaml: left out, as they mean nothing here: sim, env.envSpacing"
+
+
 def test_help_and_task_list_need_no_task(capsys: pytest.CaptureFixture) -> None:
     for command in (main.main, train.main, play.main):
         assert command(["--help"]) == 0

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import mujoco
 import numpy as np
 
-from bayessim_mjx import config
+from bayessim_mjx import config, foreign
 from bayessim_mjx.effects.effect import Effect
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.parameters import ParameterSpace, elements
@@ -20,6 +20,7 @@ from bayessim_mjx.physics import Physics, mjx
 if TYPE_CHECKING:
     from bayessim_mjx.env import Task
 
+TRAINING = ("frequency", "observations", "actions", "sim_params")
 WITHIN = (0.8, 1.2)  # the default range of a scale
 _IMPLICIT = int(mujoco.mjtIntegrator.mjINT_IMPLICIT)
 _FREE = int(mujoco.mjtJoint.mjJNT_FREE)
@@ -214,6 +215,13 @@ def _whole(model: mujoco.MjModel) -> str:
     return name
 
 
+def _of_training(raw: Any) -> list[str]:
+    """Keys of the section that are about training: a diagnosis takes its noise from the logs."""
+    section = raw.get("task") if isinstance(raw.get("task"), dict) else raw
+    section = section.get("randomization_params", section)
+    return [key for key in TRAINING if isinstance(section, dict) and section.get(key) not in (None, 1)]
+
+
 def read_params(path: str | Path, model: mujoco.MjModel) -> ParameterSpace:
     """The space of a params.yaml in the loop's format.
 
@@ -224,6 +232,7 @@ def read_params(path: str | Path, model: mujoco.MjModel) -> ParameterSpace:
         UserError: naming the file and the key.
     """
     raw = config.read_yaml(path)
+    foreign.note(raw, str(path), more=_of_training(raw))
     section = (raw.get("task") or {}) if "task" in raw else raw
     section = section.get("randomization_params", section) if isinstance(section, dict) else section
     if not isinstance(section, dict) or not {"actor_params", "option"} & set(section):

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 HEADER = "# What a diagnosis found. Use: python -m bayessim_mjx.main --task T effects={name}{code}\n"
 LEAST_SD = 1e-6  # of the range
 SURE = 3.0  # sd that a task's range is widened to hold
-_FIELDS = [f.name for f in dataclasses.fields(Parameter)]
+_FIELDS = [f.name for f in dataclasses.fields(Parameter) if f.name != "schedule"]
 
 Identified = Distribution | Mapping[str, tuple[float, float]]
 
@@ -118,7 +118,7 @@ def _setting(p: Parameter) -> dict[str, Any]:
 
 
 def _calibrated_entry(p: Parameter) -> dict[str, Any]:
-    plain = dataclasses.asdict(p)
+    plain = {name: getattr(p, name) for name in _FIELDS}
     return plain | {"axis": None if p.axis is None else [float(a) for a in p.axis]}
 
 

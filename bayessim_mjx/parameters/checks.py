@@ -1,7 +1,6 @@
 """Checks of a `randomization_params` section: each error names the key's path, its value and what is allowed."""
 
 import difflib
-import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -55,16 +54,3 @@ def number(value: Any, where: str) -> float:
         infinite = isinstance(value, float)
         raise UserError(f"{where}: {value!r} is not {'finite' if infinite else 'a number'}")
     return found
-
-
-def accepted(setting: Mapping[str, Any], where: str) -> None:
-    """BayesSimIG's keys that would change the result are refused, harmless ones ignored with a warning."""
-    if setting.get("schedule") not in (None, "constant"):
-        raise UserError(
-            f"{where}.schedule = {setting['schedule']!r}: the range does not grow over time; allowed: constant"
-        )
-    if setting.get("schedule_steps") not in (None, 0):
-        raise UserError(f"{where}.schedule_steps = {setting['schedule_steps']!r}: nothing is scheduled; allowed: 0")
-    for key in ("num_buckets", "setup_only"):
-        if setting.get(key):
-            warnings.warn(f"{where}.{key} is ignored: values are continuous and new in every episode", stacklevel=2)

@@ -4,6 +4,7 @@ import dataclasses
 import math
 
 from bayessim_mjx.errors import UserError
+from bayessim_mjx.parameters.schedule import Schedule
 
 PRIORS = ("uniform", "loguniform", "gaussian")
 OPERATIONS = ("scaling", "additive", "absolute")
@@ -25,6 +26,7 @@ class Parameter:
         kind: "body" | "geom" | "joint" | "actuator" | "tendon" | "option" | "actor" | "effect".
         factor: MuJoCo units per unit of theta, for additive and absolute parameters.
         axis: unit vector in the body frame along which "length" stretches; None: the long axis of the (concrete) model.
+        schedule: how far from nominal training draws it as it goes on; inference and evaluation see the whole prior.
 
     Raises:
         UserError: empty range, nominal outside it, a prior that does not fit the range, unknown words.
@@ -44,6 +46,7 @@ class Parameter:
     kind: str = "effect"
     factor: float = 1.0
     axis: tuple[float, float, float] | None = None
+    schedule: Schedule = Schedule()
 
     def __post_init__(self) -> None:
         where = f"parameter {self.name!r}"

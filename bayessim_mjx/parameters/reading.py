@@ -19,6 +19,7 @@ from bayessim_mjx.parameters import attributes, checks, elements, geometry
 from bayessim_mjx.parameters.attributes import COMPOSITE, FIELDS, suggest
 from bayessim_mjx.parameters.elements import Element
 from bayessim_mjx.parameters.parameter import OPERATIONS, Parameter
+from bayessim_mjx.parameters.schedule import Schedule
 
 SECTION_KEYS = ("frequency", "observations", "actions", "sim_params", "actor_params", "option", "effects")
 GROUPS: dict[str, tuple[str, tuple[str, ...]]] = {
@@ -31,14 +32,9 @@ GROUPS: dict[str, tuple[str, tuple[str, ...]]] = {
 }
 PATH = "task.randomization_params"
 OTHER_GROUPS = ("scale", "color", "effects")
-ACCEPTED = ("schedule", "schedule_steps", "num_buckets", "setup_only")  # BayesSimIG's; see `checks.accepted`
+ACCEPTED = ("schedule", "schedule_steps", "num_buckets", "setup_only")  # the last two mean nothing here: see foreign.py
 SETTINGS = ("range", "operation", "distribution", "mean", "sd", "include", "exclude", "factor", "unit", "nominal")
 EFFECT_SETTINGS = ("range", "operation", "distribution", "mean", "sd", "unit", "nominal")
-NOISE = {  # BayesSimIG's nuisance noise, which is not simulated here -> what there is instead
-    "observations": "real.noise is noise on the surrogate's observations",
-    "actions": "the effects of `effects:` disturb commands",
-    "sim_params": "option.gravity randomises gravity",
-}
 DISTRIBUTIONS = {"uniform": "uniform", "loguniform": "loguniform", "log_uniform": "loguniform", "gaussian": "gaussian"}
 
 
@@ -80,7 +76,6 @@ def effect_parameter(default: Parameter, setting: Any, where: str) -> Parameter:
     """An effect's own parameter with range and prior of `setting`; nominal stays, or is the range's end next to it."""
     setting = checks.mapping(setting, where)
     checks.known(setting, (*EFFECT_SETTINGS, *ACCEPTED), where)
-    checks.accepted(setting, where)
     checks.choice(setting, "operation", ("absolute",), "absolute", where)
     ranged: dict[str, Any] = {"range": (default.low, default.high), **setting}
     if "distribution" not in setting:
@@ -98,13 +93,6 @@ def _open(section: Any) -> tuple[Mapping[str, Any], dict[str, Mapping[str, Any]]
     if "randomization_params" in section:
         section = checks.mapping(section["randomization_params"], PATH)
     checks.known(section, SECTION_KEYS, PATH)
-    for key, instead in NOISE.items():
-        if section.get(key):
-            raise UserError(f"{PATH}.{key}: this noise is not simulated ({instead}); remove the key")
-    if section.get("frequency") not in (None, 1):
-        raise UserError(
-            f"{PATH}.frequency = {section['frequency']!r}: every episode draws new parameters; give 1, or leave it out"
-        )
     actors = checks.mapping(section.get("actor_params"), f"{PATH}.actor_params")
     return section, {str(k): checks.mapping(v, f"{PATH}.actor_params.{k}") for k, v in actors.items()}
 
@@ -151,7 +139,6 @@ def _selected(
 ) -> list[Element]:
     """Elements that carry the attribute, restricted by `include` and `exclude` (names or patterns with *)."""
     checks.known(setting, (*SETTINGS, *ACCEPTED), where)
-    checks.accepted(setting, where)
     usable = [e for e in members if e.kind == kind or attribute == "length"]
     if kind == "geom" and attribute == "length":  # one length per body, called like its first shape
         usable = list({elements.body_of(model, e): e for e in reversed(usable)}.values())[::-1]
@@ -224,6 +211,7 @@ def _build(setting: Mapping[str, Any], where: str, name: str, own: float, **rest
     low, high = checks.low_high(setting, where)
     distribution = checks.choice(setting, "distribution", tuple(DISTRIBUTIONS), "uniform", where)
     nominal = checks.number(setting.get("nominal", min(max(own, low), high)), f"{where}.nominal")
+    rest["schedule"] = Schedule.read(setting, where)
     mean, sd = (None if setting.get(k) is None else checks.number(setting[k], f"{where}.{k}") for k in ("mean", "sd"))
     try:
         return Parameter(name, nominal, low, high, prior=DISTRIBUTIONS[distribution], mean=mean, sd=sd, **rest)
@@ -282,7 +270,6 @@ def _scale(
     if set(setting) == {"scale"}:
         setting = setting["scale"]
     checks.known(setting, (*SETTINGS, *ACCEPTED), where)
-    checks.accepted(setting, where)
     operation = checks.choice(setting, "operation", OPERATIONS, "scaling", where)
     have = attributes.names(model, "body")
     if actor not in have and len(actors) > 1:

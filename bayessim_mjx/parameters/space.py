@@ -105,6 +105,13 @@ class ParameterSpace:
         """Inverse of `to_unit`, `[..., d]`; never outside [low, high]."""
         return priors.from_unit(self, jnp.asarray(u, jnp.float32))
 
+    def scheduled(self, theta: Any, clock: jax.Array) -> jax.Array:
+        """theta `[..., d]` as training draws it after `clock` control steps: nominal + strength * (theta - nominal)."""
+        if not any(p.schedule.steps for p in self.parameters):
+            return theta
+        strength = jnp.stack([p.schedule.strength(clock) for p in self.parameters])
+        return jnp.where(strength == 1.0, theta, self.nominal + strength * (theta - self.nominal))
+
     def log_prior(self, theta: Any) -> jax.Array:
         """Joint log density of the priors in theta units, `[..., d]` -> `[...]`; -inf outside the box."""
         theta = jnp.asarray(theta, jnp.float32)

@@ -9,12 +9,14 @@ from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from bayessim_mjx.config import PPOConfig
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.mirrors import MirrorMap
+from bayessim_mjx.nuisance import starting
 from bayessim_mjx.rl import (
     episodes,
     losses,
@@ -31,7 +33,7 @@ from bayessim_mjx.rl.gae import gae
 from bayessim_mjx.rl.networks import Policy
 from bayessim_mjx.rl.rnd import RND
 from bayessim_mjx.rl.sharding import EVERYWHERE, FIRST, SECOND
-from bayessim_mjx.rollout import collect, ring, traced
+from bayessim_mjx.rollout import collect, ring, strong, traced
 
 if TYPE_CHECKING:
     from bayessim_mjx.distributions import Distribution
@@ -111,15 +113,27 @@ def in_worlds_of(state: TrainState, other: TrainState) -> TrainState:
     return dataclasses.replace(state, env_states=other.env_states, episodes=other.episodes, rnd=novel)
 
 
-def _reset(env: Env, key: jax.Array, domain: Distribution | None, worlds: int, mesh: Mesh | None = None) -> State:
-    """Fresh episodes in `worlds` worlds with theta from the domain (None: nominal)."""
+def _reset(
+    env: Env, key: jax.Array, domain: Distribution | None, worlds: int, mesh: Mesh | None = None, clock: Any = 0
+) -> State:
+    """Fresh episodes in `worlds` worlds with theta from the domain (None: nominal), `clock` steps into training."""
     theta_key, reset_key = jax.random.split(key)
     if domain is None:
         thetas = jnp.tile(jnp.asarray(env.space.nominal, jnp.float32), (worlds, 1))
     else:
         thetas = domain.sample(theta_key, worlds)
-    reset = sharding.local(jax.vmap(traced(env.reset)), mesh, (FIRST, FIRST), FIRST)
-    return reset(jax.random.split(reset_key, worlds), thetas)
+    given = (jax.random.split(reset_key, worlds), thetas)
+    if getattr(env, "nuisance", None) is not None:
+        given = (given[0], env.space.scheduled(thetas, clock), starting(clock, worlds))
+    reset = sharding.local(jax.vmap(traced(env.reset)), mesh, (FIRST,) * len(given), FIRST)
+    return reset(*given)
+
+
+def _clock(env: Env, env_states: State) -> jax.Array:
+    """Control steps of each world since training began; 0 where nothing goes by them."""
+    if getattr(env, "nuisance", None) is None:
+        return jnp.int32(0)
+    return env_states.info["nuisance"].course.clock.max()
 
 
 def _stagger(key: jax.Array, state: State, episode_length: int) -> tuple[State, jax.Array]:
@@ -130,11 +144,6 @@ def _stagger(key: jax.Array, state: State, episode_length: int) -> tuple[State, 
         world = world.replace(task={**world.task, "steps": steps})
     state = dataclasses.replace(state, pipeline_state=world, info={**state.info, "steps": steps})
     return state, (steps > 0).astype(jnp.float32)
-
-
-def _strong(tree: Any) -> Any:
-    """The same arrays without weak types: what goes into the first update is then typed like what comes out of it."""
-    return jax.tree.map(lambda x: jax.lax.convert_element_type(x, jnp.result_type(x)), tree)
 
 
 def _check_shares(config: PPOConfig, mesh: Mesh | None) -> None:
@@ -154,20 +163,27 @@ def _check_shares(config: PPOConfig, mesh: Mesh | None) -> None:
 
 
 def init(
-    env: Env, config: PPOConfig, key: jax.Array, domain: Distribution | None = None, mesh: Mesh | None = None
+    env: Env,
+    config: PPOConfig,
+    key: jax.Array,
+    domain: Distribution | None = None,
+    mesh: Mesh | None = None,
+    clock: int = 0,
 ) -> TrainState:
     """The state before the first update; domain None trains at the nominal theta.
 
+    clock: control steps that each world has trained before, which schedules of randomisation go by.
     mesh: the devices that share the worlds, see `device.mesh`; None: the default device. Results differ by rounding.
     """
     check(env, config, mesh)
     program = _init(_for_learner(env, config), config, mesh)
-    return program(*((key, domain) if mesh is None else sharding.agreed((key, domain))))
+    given = (key, domain, np.int32(clock))
+    return program(*(given if mesh is None else sharding.agreed(given)))
 
 
 def outline(env: Env, config: PPOConfig, domain: Distribution | None = None, mesh: Mesh | None = None) -> TrainState:
     """Shapes, types and layout of what `init` returns."""
-    shapes = jax.eval_shape(_init(_for_learner(env, config), config, mesh), jax.random.PRNGKey(0), domain)
+    shapes = jax.eval_shape(_init(_for_learner(env, config), config, mesh), jax.random.PRNGKey(0), domain, np.int32(0))
     if mesh is None:
         return shapes
 
@@ -201,14 +217,14 @@ def check(env: Env, config: PPOConfig, mesh: Mesh | None = None) -> None:
 def _init(env: Env, config: PPOConfig, mesh: Mesh | None) -> Callable[..., TrainState]:
     sizes = {group: env.observation_size[group][0] for group in {"policy", critic_group(env)}}
 
-    def run(key: jax.Array, domain: Distribution | None) -> TrainState:
+    def run(key: jax.Array, domain: Distribution | None, clock: jax.Array) -> TrainState:
         key, network_key, reset_key, clock_key = jax.random.split(key, 4)
         hidden = (config.hidden_actor, config.hidden_critic, config.init_std)
         kind = (config.state_dependent_std, config.shared_trunk)
         memory = (config.memory, config.memory_cell)
         widths = (sizes["policy"], sizes[critic_group(env)], env.action_size - config.memory_size)
         params = networks.init(network_key, *widths, *hidden, *kind, *memory, weight_init=config.weight_init)
-        worlds = _reset(env, reset_key, domain, config.num_envs, mesh)
+        worlds = _reset(env, reset_key, domain, config.num_envs, mesh, clock)
         env_states, partial = _stagger(clock_key, worlds, env.episode_length)
         state = TrainState(
             params=params,
@@ -224,7 +240,7 @@ def _init(env: Env, config: PPOConfig, mesh: Mesh | None) -> Callable[..., Train
             rnd=_new_rnd(env, config, key, partial),
             mesh=mesh,
         )
-        return sharding.pinned(_strong(state), mesh, layout(state))
+        return sharding.pinned(strong(state), mesh, layout(state))
 
     return jax.jit(run)
 
@@ -266,7 +282,7 @@ def _collect(
 
     shape = (config.num_steps, config.num_envs, env.action_size - config.memory_size)
     noise = sharding.pinned(jax.random.normal(noise_key, shape), mesh, SECOND)
-    pool = _reset(env, pool_key, domain, config.num_envs, mesh)
+    pool = _reset(env, pool_key, domain, config.num_envs, mesh, _clock(env, state.env_states))
     run = sharding.local(run, mesh, (EVERYWHERE, SECOND, FIRST, FIRST), (FIRST, SECOND))
     return run(policy_of(state), noise, state.env_states, pool)
 

@@ -64,9 +64,9 @@ class ThetaSeen:
         """Of the group "policy"."""
         return (*getattr(self.env, "observation_names", ()), *(self.env.space.names if self.target == "policy" else ()))
 
-    def reset(self, key: jax.Array, theta: jax.Array | None = None) -> State:
+    def reset(self, key: jax.Array, theta: jax.Array | None = None, *course: Any) -> State:
         theta = jnp.asarray(self.env.space.nominal, jnp.float32) if theta is None else theta
-        return self._show(self.env.reset(key, theta), theta)
+        return self._show(self.env.reset(key, theta, *course), theta)
 
     def step(self, state: State, action: jax.Array) -> State:
         own = state

@@ -147,8 +147,8 @@ class Remembering:
         # of an action with or without a memory behind it
         return (lambda action: value(action[: self.env.action_size])) if name == "command" else value
 
-    def reset(self, key: jax.Array, theta: jax.Array | None = None) -> State:
-        return self._show(self.env.reset(key, theta), jnp.zeros(self.memory_size))
+    def reset(self, key: jax.Array, theta: jax.Array | None = None, *course: Any) -> State:
+        return self._show(self.env.reset(key, theta, *course), jnp.zeros(self.memory_size))
 
     def step(self, state: State, action: jax.Array) -> State:
         action, memory = jnp.split(action, [self.env.action_size])

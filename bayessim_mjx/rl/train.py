@@ -70,11 +70,12 @@ def start(
     domain: Distribution | None = None,
     mesh: Mesh | None = None,
     teacher: Policy | None = None,
+    clock: int = 0,
 ) -> TrainState:
     """`ppo.init`, with the program of `run` compiled beside its own where there are processor cores for both."""
     ppo.check(env, config, mesh)
     if cores() == 1 or jax.process_count() > 1:
-        return ppo.init(env, config, key, domain, mesh)
+        return ppo.init(env, config, key, domain, mesh, clock)
     given = _given(domain, teacher, mesh)
     program = _make_chunk(env, config, teacher is not None)
 
@@ -84,7 +85,7 @@ def start(
 
     with ThreadPoolExecutor(1) as beside:
         compiling = beside.submit(compile_program)
-        state = ppo.init(env, config, key, domain, mesh)
+        state = ppo.init(env, config, key, domain, mesh, clock)
         compiling.result()
     return state
 

@@ -18,7 +18,7 @@ from bayessim_mjx import registry
 from bayessim_mjx.env import Env
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.monitor import video
-from bayessim_mjx.rollout import select
+from bayessim_mjx.rollout import next_episodes, select
 
 RENDER_MODES = ("rgb_array",)
 WIDTH, HEIGHT = 480, 360  # pixels of a picture
@@ -202,7 +202,11 @@ class GymnasiumVectorEnv(VectorEnv):
         if self.mode is DISABLED:
             return after, (after, thetas)
         again = ended if self.mode is NEXT else after.info["terminated"] + after.info["truncated"] > 0
-        begun = select(again, self._fresh(key, domain, given), (after, thetas))
+        fresh, drawn = self._fresh(key, domain, given)
+        fresh = next_episodes(self.env, again, after, fresh)
+        if getattr(self.env, "nuisance", None) is not None:  # where parameters last, these are the old ones
+            drawn = fresh.pipeline_state.theta
+        begun = select(again, (fresh, drawn), (after, thetas))
         return (begun[0] if self.mode is NEXT else after), begun
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
