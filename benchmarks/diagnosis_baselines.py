@@ -58,7 +58,7 @@ def closure(found: Findings, model: Model) -> float:
     cut = fitter.simulator.windows
     after = gap.predict(fitter, model).cost(cut.steps)
     before = found.predictions["calibrated"].cost(cut.steps)
-    return gap.closure(before, after, min(1.0, float(after.mean())), cut.group, found.setup.seed)[0]
+    return gap.Closed(before, after, cut.group).value
 
 
 def told(found: Findings, model: Model) -> Said:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from bayessim_mjx.diagnosis import bounds, how_far, named, search, uncertainty, verdict, whole
+from bayessim_mjx.diagnosis import bounds, clusters, how_far, named, search, uncertainty, verdict, whole
 from bayessim_mjx.diagnosis.models import Model
 from bayessim_mjx.diagnosis.pictures import details
 from bayessim_mjx.diagnosis.result import Diagnosis, Gap, Place
@@ -39,7 +39,7 @@ def diagnosis_of(found: Findings, say: search.Progress = lambda text, done, tota
     parameters = _parameters(race, model, sd)
     say("whole logs", 0, 1)
     over = whole.simulate(found)
-    far = how_far.with_whole(far, over, setup.tolerance, setup.seed)
+    far = how_far.with_whole(far, over, setup.tolerance)
     return Diagnosis(
         verdict=name,
         sentences=sentences(name, effects, parameters, found, far, remains, _beaten(found)),
@@ -127,14 +127,14 @@ def _parameters(race: search.Race, model: Model, sd: np.ndarray) -> dict[str, di
 
 def ranking(race: search.Race) -> list[dict[str, Any]]:
     """Models tried, best first: held-out score, nats over the known parameters alone, and its standard error."""
-    draws = uncertainty.bootstrap_weights(race.fitter.simulator.windows.group, 200, np.random.default_rng(0))
+    rows = clusters.leave_one_out(race.fitter.simulator.windows.group)
     absorbed = {s.candidate.label: s.absorbed for s in race.screened}
     out: list[dict[str, Any]] = []
     tried = search.ranked(race)[:60]
     samples = tried[0].samples  # one for all, so that scores are in the order of the errors
     for model in tried:
-        ratio = np.log((draws @ race.base.cost) / (draws @ model.cost))
-        error = float(0.5 * samples * np.std(ratio))
+        ratio = np.log((rows @ race.base.cost) / (rows @ model.cost))
+        error = float(0.5 * samples * clusters.error(ratio)) if len(rows) else float("nan")
         out.append({
             "effects": [e.label for e in model.effects],
             "label": model.label,
@@ -152,18 +152,14 @@ def _where(found: Findings) -> list[Place]:
     """Shares of the calibrated gap by joint, above the noise."""
     setup = found.setup
     cut = setup.fitter.simulator.windows
-    draws = uncertainty.bootstrap_weights(cut.group, 400, np.random.default_rng(setup.seed))
     calibrated = found.predictions["calibrated"]
     names = Channels.of(setup.physics.mj_model).qvel
     costs = np.stack([np.maximum(calibrated.cost(cut.steps, slice(i, i + 1)) - 1.0, 0.0) for i in range(len(names))], 1)
     total = costs.sum()
     if total <= 0.1 * costs.size:
         return []
-    sampled = draws @ costs
-    shares = sampled / np.maximum(sampled.sum(1, keepdims=True), 1e-12)
-    out = [
-        Place(n, float(costs[:, i].sum() / total), uncertainty.interval(shares[:, i]), "") for i, n in enumerate(names)
-    ]
+    ends = clusters.interval_of_shares(costs, cut.group)
+    out = [Place(n, float(costs[:, i].sum() / total), ends[i], "") for i, n in enumerate(names)]
     return sorted(out, key=lambda p: -p.share)
 
 
@@ -204,7 +200,7 @@ def _with_places(result: Diagnosis, found: Findings, folder: Path) -> Diagnosis:
         return result
     fitter, job = found.setup.fitter, found.race.base.job
     places, maps, told = where.locate(fitter, job, found.disturbance, seed=found.setup.seed)
-    spectra, heard = frequency.analyse(fitter, job, found.disturbance, seed=found.setup.seed)
+    spectra, heard = frequency.analyse(fitter, job, found.disturbance)
     more = result.details | {"maps": maps, "frequency": spectra}
     return replace(result, where=places or result.where, sentences=[*result.sentences, *told, *heard], details=more)
 

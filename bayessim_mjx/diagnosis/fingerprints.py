@@ -1,6 +1,6 @@
 """Signatures of known causes in the estimated force: the "why" shown to people before any effect is fitted.
 
-All regressions read  estimate = gain X beta,  with intervals by a bootstrap over operating conditions.
+All regressions read  estimate = gain X beta,  with intervals by a jackknife over operating conditions.
 """
 
 from __future__ import annotations
@@ -10,11 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bayessim_mjx.diagnosis.clusters import interval
 from bayessim_mjx.diagnosis.disturbance import Disturbance, step_of_starts
 from bayessim_mjx.diagnosis.fit import Fitter, Job
 from bayessim_mjx.diagnosis.motion_inputs import Inputs
 from bayessim_mjx.diagnosis.regions import Nodes
-from bayessim_mjx.diagnosis.uncertainty import interval
 
 Array = NDArray[np.float64]
 RECENT = 0.1  # s after a reversal
@@ -50,29 +50,40 @@ class Fingerprint:
     weight: dict[str, float]
 
 
-def regress(y: Array, X: Array, gain: Array, draws: Array) -> tuple[Array, Array, Array]:
-    """(beta `[k]`, resampled `[n, k]`, rms of terms `[k]`): y `[W, m]`, X `[W, m, k]`, gain `[W, m, m]`."""
+def regress(y: Array, X: Array, gain: Array, without: Array) -> tuple[Array, Array, Array]:
+    """(beta `[k]`, replicates `[G, k]`, rms of terms `[k]`): y `[W, m]`, X `[W, m, k]`, gain `[W, m, m]`.
+
+    `without`: `[G, W]`, windows without each condition (`clusters.leave_one_out`).
+    """
     rows = gain @ X
     scale = np.sqrt(np.mean(rows**2, axis=(0, 1))) + 1e-300
     rows = rows / scale
     S, g = np.einsum("wmi,wmj->wij", rows, rows), np.einsum("wmi,wm->wi", rows, y)
     ridge = 1e-6 * np.eye(X.shape[2]) * rows[..., 0].size
     beta = np.linalg.solve(S.sum(0) + ridge, g.sum(0)) / scale
-    sampled = np.linalg.solve(np.tensordot(draws, S, 1) + ridge, np.tensordot(draws, g, 1)[..., None])[..., 0] / scale
+    replicates = (
+        np.linalg.solve(np.tensordot(without, S, 1) + ridge, np.tensordot(without, g, 1)[..., None])[..., 0] / scale
+    )
     term = np.sqrt(np.mean((X * beta) ** 2, axis=(0, 1)))
-    return beta, sampled, term
+    return beta, replicates, term
 
 
 def _fingerprint(
-    name: str, node: Nodes, y: Array, terms: dict[str, tuple[Array, str]], draws: Array, say: dict[str, str], head: str
+    name: str,
+    node: Nodes,
+    y: Array,
+    terms: dict[str, tuple[Array, str]],
+    without: Array,
+    say: dict[str, str],
+    head: str,
 ) -> Fingerprint:
     """terms: {name: (column `[W, m]`, unit)}; say: {name: words} for those that matter."""
     X = np.stack([column for column, _ in terms.values()], 2)
     used = node.used
-    beta, sampled, rms = regress(np.where(used, y, 0.0), X, used[..., None] * node.gain, draws)
+    beta, replicates, rms = regress(np.where(used, y, 0.0), X, used[..., None] * node.gain, without)
     numbers = {
-        key: Number(float(b), *interval(s), unit)
-        for (key, (_, unit)), b, s in zip(terms.items(), beta, sampled.T, strict=True)
+        key: Number(float(b), *interval(float(b), s), unit)
+        for (key, (_, unit)), b, s in zip(terms.items(), beta, replicates.T, strict=True)
     }
     size = max(float(np.sqrt(np.mean(y[node.used] ** 2))) if node.used.any() else 0.0, 1e-300)
     weight = {key: float(r) / size for key, r in zip(terms, rms, strict=True)}
@@ -91,7 +102,7 @@ def _told(number: Number, words: str) -> str:
 
 
 def fingerprints(
-    fitter: Fitter, job: Job, disturbance: Disturbance, inputs: Inputs, dof: int, node: Nodes, draws: Array
+    fitter: Fitter, job: Job, disturbance: Disturbance, inputs: Inputs, dof: int, node: Nodes, without: Array
 ) -> list[Fingerprint]:
     """F1 odd and even in speed, F2 load, F3 lag and speed, F8 time, F10 time since reversal."""
     w, unit = node.axes["speed"], node.force_unit
@@ -107,31 +118,31 @@ def fingerprints(
     heavy = {"constant": (-s, unit), "linear": (-w, slope)}
     out = [
         _fingerprint(
-            "odd and even in speed", node, y, odd | {"even": (-np.abs(w), slope)}, draws,
+            "odd and even in speed", node, y, odd | {"even": (-np.abs(w), slope)}, without,
             {"constant": "against/with the motion at any speed", "linear": "against/with the motion, linear in speed",
              "quadratic": "against/with the motion, quadratic in speed", "offset": "always the same way",
              "even": "with speed but always the same way"},
             "of the missing force",
         ),
         _fingerprint(
-            "load", node, y, heavy | {"load": (-s * (load - load.mean()), f"{unit} per {unit}")}, draws,
+            "load", node, y, heavy | {"load": (-s * (load - load.mean()), f"{unit} per {unit}")}, without,
             {"load": "of gravity load"}, "the force against the motion changes by",
         ),
         _fingerprint(
-            "time", node, y, drift | {"drift": (late, f"{unit}/s")}, draws,
+            "time", node, y, drift | {"drift": (late, f"{unit}/s")}, without,
             {"friction": "against the motion", "drift": "always the same way"},
             "in the course of a log the force changes by",
         ),
         _fingerprint(
-            "time since reversal", node, y, {"constant": (-s, unit), "recent": (-s * recent, unit)}, draws,
+            "time since reversal", node, y, {"constant": (-s, unit), "recent": (-s * recent, unit)}, without,
             {"recent": "more/less"}, f"within {RECENT:g} s after reversals the force against the motion is",
         ),
     ]  # fmt: skip
-    return [*out, _lag(fitter, job, disturbance, inputs, dof, node, draws)]
+    return [*out, _lag(fitter, job, disturbance, inputs, dof, node, without)]
 
 
 def _lag(
-    fitter: Fitter, job: Job, disturbance: Disturbance, inputs: Inputs, dof: int, node: Nodes, draws: Array
+    fitter: Fitter, job: Job, disturbance: Disturbance, inputs: Inputs, dof: int, node: Nodes, without: Array
 ) -> Fingerprint:
     """|error| = c + T |speed|: how far the measured motion lags behind the simulated one (F3)."""
     linear, nv = disturbance.linear, fitter.simulator.nv
@@ -147,6 +158,6 @@ def _lag(
     angle = inputs.angle_unit[dof]
     s, w = np.sign(node.axes["direction"]), node.axes["speed"]
     return _fingerprint(
-        "lag", whole, whole.force, {"constant": (s, angle), "lag": (w, "s")}, draws,
+        "lag", whole, whole.force, {"constant": (s, angle), "lag": (w, "s")}, without,
         {"constant": "at any speed", "lag": "times the speed"}, "the measured motion lags behind the simulated one by",
     )  # fmt: skip

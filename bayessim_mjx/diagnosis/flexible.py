@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis import motion_inputs
+from bayessim_mjx.diagnosis.clusters import normal_deviate
 from bayessim_mjx.diagnosis.disturbance import Disturbance, estimate
 from bayessim_mjx.diagnosis.fit import Fitter, Job
-from bayessim_mjx.diagnosis.models import clustered_t
 from bayessim_mjx.diagnosis.motion_inputs import WORDS, Inputs
 from bayessim_mjx.diagnosis.regression import Regression, Seeded
 
@@ -37,7 +37,7 @@ class Held:
         cost: `[W]`, of the median seed with the best ridge, unweighted; base: `[W]`, of the model without the force.
         totals: `[seeds, ridges]`; ridge, seed: the one in `cost`.
         gain, se: how much cheaper all windows together are, and its standard error over folds.
-        t: mean over standard error of the windows' log gain above the noise, clustered by fold; unlike the gain itself
+        t: of the windows' log gain above the noise by folds, as a normal deviate; unlike the gain itself
             it is not ruled by the conditions with the largest errors.
     """
 
@@ -139,7 +139,7 @@ def _held(problem: Regression, runs: dict[int, Seeded], fold: NDArray[np.int64],
     by_fold = np.array([np.sum((base - cost)[fold == name]) for name in np.unique(fold)])
     se = float(np.sqrt(len(by_fold)) * np.std(by_fold, ddof=1)) if len(by_fold) > 1 else np.inf
     size = problem.fitter.size
-    t = clustered_t(np.log(np.maximum(base, 0) + size) - np.log(np.maximum(cost, 0) + size), fold)
+    t = normal_deviate(np.log(np.maximum(base, 0) + size) - np.log(np.maximum(cost, 0) + size), fold)
     return Held(cost, base, totals, float(ridges[at]), list(runs)[seed], plain, float(by_fold.sum()), se, t)
 
 

@@ -10,20 +10,18 @@ from numpy.typing import NDArray
 from scipy.signal import detrend
 from scipy.signal.windows import dpss
 
-from bayessim_mjx.diagnosis import motion_inputs
+from bayessim_mjx.diagnosis import clusters, motion_inputs
 from bayessim_mjx.diagnosis.disturbance import Disturbance, estimate
 from bayessim_mjx.diagnosis.fingerprints import Number, regress
 from bayessim_mjx.diagnosis.fit import Fitter, Job
 from bayessim_mjx.diagnosis.motion_inputs import Inputs
 from bayessim_mjx.diagnosis.regions import discoveries
-from bayessim_mjx.diagnosis.uncertainty import bootstrap_weights, interval
 from bayessim_mjx.diagnosis.windows import Windows
 
 Array = NDArray[np.float64]
 SEGMENT = 4.0  # s
 TAPERS, BANDWIDTH = 4, 2.5  # of the multitaper estimate (Thomson, 1982)
 COHERENT = 0.5  # below this a frequency says nothing about phase
-DRAWS = 300
 LINE = 6.0  # a line stands so many times above its surroundings
 SMALL = 0.1  # of the force's rms: smaller orders are not mentioned
 STANDS = 4.0  # an order stands so many times above the others
@@ -72,7 +70,7 @@ def spectra(x: Sequence[Array], y: Sequence[Array], dt: float, log: Sequence[int
     return Spectra(hz, xx[:, 1:].real, yy[:, 1:].real, xy[:, 1:], np.array(owner))
 
 
-def delay(found: Spectra, rng: np.random.Generator, top: float = np.inf) -> Number:
+def delay(found: Spectra, top: float = np.inf) -> Number:
     """Equivalent delay of y behind x [s] from the slope of the phase through zero, weighted by coherence.
 
     phase = -2 pi f T, weights C / (1 - C): frequencies without coherence C or above `top` Hz count nothing.
@@ -85,13 +83,12 @@ def delay(found: Spectra, rng: np.random.Generator, top: float = np.inf) -> Numb
     omega = 2 * np.pi * found.hz
 
     def slope(total: NDArray[np.complex128]) -> float:
-        turned = np.angle(total * np.exp(-1j * phase)) + phase  # near the pooled phase: no jumps between draws
+        turned = np.angle(total * np.exp(-1j * phase)) + phase  # near the pooled phase: no jumps between logs
         return float(-np.sum(weight * omega * turned) / max(float(np.sum(weight * omega**2)), 1e-300))
 
     whole = slope(found.pooled()[2])
-    draws = bootstrap_weights(found.log, DRAWS, rng)
-    low, high = interval(np.array([slope(found.pooled(w)[2]) for w in draws]))
-    return Number(whole, low, high, "s")
+    replicates = np.array([slope(found.pooled(w)[2]) for w in clusters.leave_one_out(found.log)])
+    return Number(whole, *clusters.interval(whole, replicates), "s")
 
 
 def runs(windows: Windows) -> list[NDArray[np.int64]]:
@@ -106,7 +103,7 @@ def runs(windows: Windows) -> list[NDArray[np.int64]]:
     return [np.asarray(part) for part in np.split(order, cuts)]
 
 
-def orders(disturbance: Disturbance, inputs: Inputs, dof: int, draws: Array, most: int = 64) -> list[dict]:
+def orders(disturbance: Disturbance, inputs: Inputs, dof: int, without: Array, most: int = 64) -> list[dict]:
     """[{"order", "amplitude", "p"}]: forces periodic in the angle of a hinge, significant ones.
 
     Amplitudes by least squares beside friction, load and offset, with the averaging between nodes taken into account.
@@ -124,7 +121,7 @@ def orders(disturbance: Disturbance, inputs: Inputs, dof: int, draws: Array, mos
     y, gain = disturbance.force[..., dof], disturbance.gain[:, dof]
     w, s, load = (inputs.of(k)[..., dof] @ average for k in ("speed", "direction", "load"))
     flat = [np.ones_like(w), s, w, w * np.abs(w), load, q @ average]
-    found = [_order(int(n), y, gain, q, average, flat, draws) for n in tried]
+    found = [_order(int(n), y, gain, q, average, flat, without) for n in tried]
     strong = discoveries(np.array([f["p"] for f in found]))
     size = np.array([f["amplitude"] for f in found])
     padded = np.pad(size, 1)
@@ -133,13 +130,15 @@ def orders(disturbance: Disturbance, inputs: Inputs, dof: int, draws: Array, mos
     return [f for f, is_strong in zip(found, strong & large, strict=True) if is_strong]
 
 
-def _order(n: int, y: Array, gain: Array, q: Array, average: Array, flat: list[Array], draws: Array) -> dict:
+def _order(n: int, y: Array, gain: Array, q: Array, average: Array, flat: list[Array], without: Array) -> dict:
     X = np.stack([*flat, np.cos(n * q) @ average, np.sin(n * q) @ average], 2)
-    beta, sampled, _ = regress(y, X, gain, draws[:100])
-    pair, spread = beta[-2:], np.cov(sampled[:, -2:].T) + 1e-300 * np.eye(2)
-    z2 = float(pair @ np.linalg.solve(spread, pair))
-    # two coefficients, few conditions: Hotelling's rather than chi^2
-    return {"order": n, "amplitude": float(np.hypot(*pair)), "p": float((1 + z2 / 14) ** -7)}
+    beta, replicates, _ = regress(y, X, gain, without)
+    pair, own = beta[-2:], len(replicates) - 1
+    p = 1.0  # two coefficients are told from 0 by three conditions at least
+    if own > 1:
+        z2 = float(pair @ np.linalg.solve(clusters.covariance(replicates[:, -2:]) + 1e-300 * np.eye(2), pair))
+        p = float((1 + z2 / own) ** (-(own - 1) / 2))  # Hotelling's T^2: (own - 1) / (2 own) T^2 ~ F(2, own - 1)
+    return {"order": n, "amplitude": float(np.hypot(*pair)), "p": p}
 
 
 def line(hz: Array, power: Array, lowest: float = 1.0) -> tuple[float, float]:
@@ -150,9 +149,7 @@ def line(hz: Array, power: Array, lowest: float = 1.0) -> tuple[float, float]:
     return (float(hz[best]), float(height[best])) if height[best] > LINE else (float("nan"), 0.0)
 
 
-def analyse(
-    fitter: Fitter, job: Job, disturbance: Disturbance | None = None, *, seed: int = 0
-) -> tuple[list[dict], list[str]]:
+def analyse(fitter: Fitter, job: Job, disturbance: Disturbance | None = None) -> tuple[list[dict], list[str]]:
     """(one entry per joint for pictures, sentences).
 
     Simulated motion is that of the windows, put together: it starts at the measured state in each of them, so that what
@@ -160,7 +157,7 @@ def analyse(
     plus missing force against effort.
     """
     disturbance = estimate(fitter, job) if disturbance is None else disturbance
-    windows, rng = fitter.simulator.windows, np.random.default_rng(seed)
+    windows = fitter.simulator.windows
     inputs = motion_inputs.measured(windows, fitter.simulator.physics.mj_model)
     nodes = disturbance.linear.nodes
     parts = [part for part in runs(windows) if len(part) * min(nodes, windows.steps) >= LEAST]
@@ -168,12 +165,12 @@ def analyse(
         return [], []
     theta = fitter.vector(job.coordinates, job.values)
     error = fitter.simulator.run(theta[None], job.offsets[None])[0]
-    draws = bootstrap_weights(windows.group, DRAWS, rng)
+    without = clusters.leave_one_out(windows.group)
     found, text = [], []
     for dof, joint in enumerate(inputs.joints):
         if not np.any(np.ptp(inputs.effort[..., dof], axis=1) > 0):
             continue
-        entry, says = _joint(windows, inputs, disturbance, error, parts, dof, draws, rng)
+        entry, says = _joint(windows, inputs, disturbance, error, parts, dof, without)
         found.append({"joint": joint, **entry})
         text += [f"{joint}: {s}" for s in says]
     return found, text + _shared([(e["joint"], e["line_hz"]) for e in found])
@@ -186,8 +183,7 @@ def _joint(
     error: Array,
     parts: list[NDArray[np.int64]],
     dof: int,
-    draws: Array,
-    rng: np.random.Generator,
+    without: Array,
 ) -> tuple[dict, list[str]]:
     logs = [int(windows.log[part[0]]) for part in parts]
     effort = [inputs.effort[part][..., dof].ravel() for part in parts]
@@ -201,8 +197,8 @@ def _joint(
     shown = max(float(disturbance.reliability[..., dof].mean()), 0.1)
     missing = [disturbance.force[part][..., dof].ravel() / shown for part in parts]
     through = spectra(drive, [a + b for a, b in zip(drive, missing, strict=True)], spacing, logs)
-    late = delay(through, rng, top=_busy(through))
-    turning = orders(disturbance, inputs, dof, draws)
+    late = delay(through, top=_busy(through))
+    turning = orders(disturbance, inputs, dof, without)
     peak, height = _resonance(spectra(drive, missing, spacing, logs))
     entry = _picture(measured, simulated) | {
         "orders": [{k: t[k] for k in ("order", "amplitude")} for t in turning],

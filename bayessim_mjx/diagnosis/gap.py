@@ -8,14 +8,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bayessim_mjx.diagnosis import clusters
 from bayessim_mjx.diagnosis.fit import Fitter, Job
 from bayessim_mjx.diagnosis.models import Model
 from bayessim_mjx.diagnosis.quadratic import eliminate
-from bayessim_mjx.diagnosis.uncertainty import bootstrap_weights, interval
 
 Array = NDArray[np.float64]
 WORSE, WITHIN = 2.0, 1.02  # held-out squares over those promised; those of the other windows over the common fit's
 SHORTER = (1.0, 0.5, 0.25, 0.125, 0.0)
+GRID = 400  # shares looked at
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,31 +98,67 @@ def _settled(fitter: Fitter, job: Job, values: Array, own: NDArray[np.int64]) ->
     return np.asarray(best[..., fitter.used] / fitter.sigma), best_offsets
 
 
-def stages(costs: dict[str, Array], group: NDArray[np.int64], seed: int) -> dict[str, Any]:
-    """Root mean squares of the stages, each with a bootstrap interval.
+def stages(costs: dict[str, Array], group: NDArray[np.int64]) -> dict[str, Any]:
+    """Root mean squares of the stages, each with a 90 % interval by operating conditions.
 
     Args:
         costs: {stage: `[W]` mean squares of windows}; group: `[W]`.
     """
-    draws = bootstrap_weights(group, 400, np.random.default_rng(seed))
     out: dict[str, Any] = {"ci": {}, "noise_floor": 1.0}
     for name, cost in costs.items():
         out[name] = float(np.sqrt(cost.mean()))
-        out["ci"][name] = list(interval(np.sqrt(np.maximum((draws * cost).mean(1), 0.0))))
+        out["ci"][name] = list(clusters.interval_of_rms(cost, group))
     return out
 
 
-def closure(
-    before: Array, after: Array, reference: float, group: NDArray[np.int64], seed: int
-) -> tuple[float, tuple[float, float]]:
-    """(E0 - E1) / (E0 - Eref) on squared errors per window, with its interval.
+@dataclass(frozen=True, eq=False)
+class Closed:
+    """Share of the squared gap above the noise that goes from one simulator to a better one: (E0 - E1) / (E0 - 1).
 
-    Args:
-        before, after: `[W]` mean squares of windows; reference: mean square that nothing undercuts.
+    Attributes:
+        before, after: `[W]` mean squares of windows in units of the noise; group: `[W]`, their conditions.
+        own, every: `[W]`, what one of several effects closes of what all do, where the share is of that one alone.
     """
-    draws = bootstrap_weights(group, 400, np.random.default_rng(seed))
-    top, bottom = before - after, before - reference
-    samples = (draws @ top) / np.maximum(draws @ bottom, 1e-9)
-    value = float(top.sum() / max(bottom.sum(), 1e-9))
-    low, high = interval(np.clip(samples, -1.0, 1.0))
-    return min(value, 1.0), (min(low, value), max(high, min(value, 1.0)))
+
+    before: Array
+    after: Array
+    group: NDArray[np.int64]
+    own: Array | float = 1.0
+    every: Array | float = 1.0
+
+    def _sums(self, rows: Array) -> tuple[Array, Array, Array]:
+        """Sums of what there was, what is left and of the noise, over windows with weights `[..., W]`."""
+        before, after, noise = rows @ self.before, rows @ self.after, rows.sum(-1)
+        own, every = (rows @ (x * np.ones_like(self.before)) for x in (self.own, self.every))
+        part = np.where(np.abs(every) > 1e-12 * np.abs(rows).sum(-1), own / np.where(every == 0, 1.0, every), 0.0)
+        return before, before - part * (before - after), noise
+
+    @property
+    def value(self) -> float:
+        """At most 1: nothing undercuts the noise."""
+        before, left, noise = self._sums(np.ones_like(self.before))
+        return min(float((before - left) / max(before - noise, 1e-9)), 1.0)
+
+    def interval(self) -> tuple[float, float]:
+        """90 % interval between -1 and 1, NaN of one condition.
+
+        A share s is kept where what is left, E1, could be what it says, (1 - s) E0 + s: where the logarithm of their
+        ratio is no more standard errors off 0 than Student's t allows. That holds near the noise, where E1 - 1 has no
+        logarithm, and near 0 alike; large windows rule neither, as they would the ratio's own standard error.
+        """
+        rows = clusters.leave_one_out(self.group)
+        if len(rows) < 2:
+            return clusters.NOTHING
+        shares = np.concatenate([1.0 - np.geomspace(2.0, 1e-4, GRID), [1.0]])[:, None]
+
+        def off(rows: Array) -> tuple[Array, Array]:
+            before, left, noise = self._sums(rows)
+            said = np.maximum((1 - shares) * before + shares * noise, 1e-9)
+            return np.log(np.maximum(left, 1e-9) / said), said
+
+        far, said = off(np.ones((1, len(self.before))))
+        without, rest = off(rows)
+        allowed = clusters.quantile(clusters.freedom((said - rest).T)) * clusters.error(without.T)
+        kept = shares[:, 0][np.abs(far[:, 0]) <= allowed]
+        value = self.value
+        return float(min([*kept[:1], value])), float(max([*kept[-1:], value]))

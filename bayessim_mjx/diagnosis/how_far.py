@@ -25,8 +25,8 @@ def measured(found: Findings, closed: dict[str, Any]) -> Gap:
     short = max(1, min(round(SHORT / cut.dt), cut.steps // 2))
     rows = []
     for steps in (short, cut.steps):
-        row = gap.stages({k: p.cost(steps) for k, p in predictions.items()}, cut.group, setup.seed)
-        row |= _floor(again, steps, row, setup.seed)
+        row = gap.stages({k: p.cost(steps) for k, p in predictions.items()}, cut.group)
+        row |= _floor(again, steps, row)
         each = {s: by_joint(p, steps, allowed) for s, p in predictions.items()}
         seconds = steps * cut.dt
         rows.append({"name": f"{seconds:.2g} s", "seconds": seconds, **row, **_physical(each, allowed)})
@@ -50,11 +50,11 @@ def measured(found: Findings, closed: dict[str, Any]) -> Gap:
     )
 
 
-def with_whole(far: Gap, over: whole.Whole, allowed: Tolerance, seed: int) -> Gap:
+def with_whole(far: Gap, over: whole.Whole, allowed: Tolerance) -> Gap:
     """The gap with one more horizon: whole logs, where some can be predicted."""
     if not len(over.group):
         return far
-    row = gap.stages(over.cost, over.group, seed)
+    row = gap.stages(over.cost, over.group)
     floor = far.reducible_floor if far.horizons[-1]["floor"] == "repeats" else 1.0
     level = np.sqrt(max(floor, 1.0) ** 2 + float(over.chance.mean()))
     row |= _level(level, (level, level), row, "start")
@@ -92,12 +92,12 @@ def _remains(last: Prediction, allowed: Tolerance) -> dict[str, dict[str, Any]]:
     }  # fmt: skip
 
 
-def _floor(again: Any, steps: int, row: dict[str, Any], seed: int) -> dict[str, Any]:
+def _floor(again: Any, steps: int, row: dict[str, Any]) -> dict[str, Any]:
     """What no model can undercut: what repeats of the same commands differ by; the noise where there are none."""
     if again is None:
         return _level(1.0, (1.0, 1.0), row, "noise")
     prediction, group = again
-    own = gap.stages({"own": prediction.cost(steps)}, group, seed)
+    own = gap.stages({"own": prediction.cost(steps)}, group)
     return _level(own["own"], tuple(own["ci"]["own"]), row, "repeats")
 
 

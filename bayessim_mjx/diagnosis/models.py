@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bayessim_mjx.diagnosis import clusters
 from bayessim_mjx.diagnosis.candidates import Candidate
 from bayessim_mjx.diagnosis.fit import Fitter, Job
 
@@ -77,7 +78,7 @@ class Comparison:
         share: drop of the held-out cost, as a share of the old one above the noise.
         drop: as a share of the old cost itself.
         evidence: N_eff/2 log(cost ratio), nats.
-        t: mean over windows of the robust log gain, over its standard error clustered by condition.
+        t: mean over windows of the robust log gain, over its standard error by conditions, as a normal deviate.
         worst: the smallest drop among the conditions, as a share of the condition's old cost.
     """
 
@@ -97,18 +98,10 @@ def compare(old: Model, new: Model, group: NDArray[np.int64], noise: float) -> C
         share=gain / above,
         drop=gain / old.total,
         evidence=0.5 * new.samples * float(np.log(old.total / new.total)),
-        t=clustered_t(log_gain, group),
+        t=clusters.normal_deviate(log_gain, group),
         worst=min(_drop(old.cost[group == g], new.cost[group == g], noise) for g in np.unique(group)),
     )
 
 
 def _drop(old: Array, new: Array, noise: float) -> float:
     return float((old.sum() - new.sum()) / (old.sum() + noise * len(old)))
-
-
-def clustered_t(x: Array, group: NDArray[np.int64]) -> float:
-    """Mean over standard error, clusters being conditions (single windows where there are fewer than four)."""
-    names = np.unique(group)
-    sums = np.array([np.sum(x[group == g] - x.mean()) for g in names]) if len(names) >= 4 else x - x.mean()
-    error = np.sqrt(np.sum(sums**2)) / len(x) + 1e-12
-    return float(x.mean() / error)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -36,39 +36,38 @@ def _parts(found: Findings, closed: dict[str, Any], say: Progress) -> dict[str, 
     """{label: part}; the shares are of the linear promise where too many effects are named to fit all subsets."""
     model, race = found.ruling.model, found.race
     labels = [e.label for e in model.effects]
+    if not labels:
+        return {}
     fitted = verdict.subsets(race, model, say) if len(labels) > 1 else {}
-    if not fitted:
-        total = sum(closed["each"].values()) if labels else 0.0
-        share = {n: closed["each"][n] / total if len(labels) > 1 and total else 1.0 for n in labels}
-        return {n: _part(s, (s, s), n, closed) for n, s in share.items()}
-
-    def drop(some: frozenset[int]) -> np.ndarray:
-        return np.asarray(race.base.cost - fitted[frozenset(labels[i] for i in some)].cost)
-
-    each = promise.shapley(len(labels), drop)
-    group = race.fitter.simulator.windows.group
-    draws = uncertainty.bootstrap_weights(group, 400, np.random.default_rng(found.setup.seed))
-    sampled = (draws @ each.T) / np.maximum((draws @ each.sum(0))[:, None], 1e-9)
-    shares = each.sum(1) / each.sum()
-    return {n: _part(shares[i], uncertainty.interval(sampled[:, i]), n, closed) for i, n in enumerate(labels)}
-
-
-def _part(share: float, spread: tuple[float, float], label: str, closed: dict[str, Any]) -> _Part:
-    whole, (low, high) = closed["realised"], closed["ci"]
-    ends = min(share * whole, spread[0] * low), min(max(share * whole, spread[1] * high), 1.0)
-    return _Part(float(share), float(share * whole), (float(ends[0]), float(ends[1])), closed["each"][label])
+    if fitted:
+        each = promise.shapley(
+            len(labels), lambda some: race.base.cost - fitted[frozenset(labels[i] for i in some)].cost
+        )
+    else:
+        each = np.array([[closed["each"][n] if len(labels) > 1 else 1.0] for n in labels])
+        each = each if each.sum() else np.ones_like(each)
+    out = {}
+    for label, own in zip(labels, each, strict=True):
+        part = replace(_closed(found), own=own, every=each.sum(0))
+        share = float(own.sum() / each.sum())
+        out[label] = _Part(share, part.value, part.interval(), closed["each"][label])
+    return out
 
 
 def closed_by(found: Findings) -> dict[str, Any]:
     """Share of the recalibrated simulator's squared gap that all effects close: promised, and then really."""
-    model, cut = found.ruling.model, found.setup.fitter.simulator.windows
+    model = found.ruling.model
     if not model.effects:
         return {}
+    closed = _closed(found)
+    total, each = promise.promised(found.race, model.effects)
+    return {"predicted": total, "realised": closed.value, "ci": closed.interval(), "each": each}
+
+
+def _closed(found: Findings) -> gap.Closed:
+    cut = found.setup.fitter.simulator.windows
     before, after = (found.predictions[k].cost(cut.steps) for k in ("calibrated", "with_effects"))
-    reference = min(1.0, float(after.mean()))
-    realised, ci = gap.closure(before, after, reference, cut.group, found.setup.seed)
-    total, each = promise.promised(found.race, model.effects, reference)
-    return {"predicted": total, "realised": realised, "ci": ci, "each": each}
+    return gap.Closed(before, after, cut.group)
 
 
 def _effect(found: Findings, effect: Candidate, sd: np.ndarray, part: _Part) -> FoundEffect:

@@ -21,12 +21,8 @@ Array = NDArray[np.float64]
 FURTHEST = 2.0  # times the screened start: further a secant is not trusted
 
 
-def promised(race: Race, effects: Sequence[Candidate], reference: float) -> tuple[float, dict[str, float]]:
-    """Shares of the recalibrated simulator's squared gap: of all effects together, and of each (Shapley, 1953).
-
-    Args:
-        reference: mean square that nothing undercuts.
-    """
+def promised(race: Race, effects: Sequence[Candidate]) -> tuple[float, dict[str, float]]:
+    """Shares of the recalibrated simulator's squared gap above the noise: of all, and of each (Shapley, 1953)."""
     q, precision, high = _linear(race, effects)
     base = len(race.fitter.base)
 
@@ -44,7 +40,7 @@ def promised(race: Race, effects: Sequence[Candidate], reference: float) -> tupl
         return float(own.at(p).mean()) / race.noise
 
     before = left(frozenset())
-    above = max(before - reference, 1e-9)
+    above = max(before - 1.0, 1e-9)
     every = frozenset(range(len(effects)))
 
     def share(some: frozenset[int]) -> float:

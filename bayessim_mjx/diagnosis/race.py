@@ -28,7 +28,7 @@ class Settings:
         relevance: an effect must close this share of the gap above the noise; more: a further effect, of what the
             others leave; least: and of the whole gap; drop: and lower the cost by this share.
         evidence: and gain this many nats plus the logarithm of the number of candidates (family-wise).
-        t: and improve windows of all conditions: mean over clustered standard error.
+        t: and improve windows of all conditions: mean over standard error by conditions, as a normal deviate.
         floor: a model within this factor of the noise (rms) is not improved further.
         believed: share of the noise (rms) that is the sensors'; the rest is what the time step may be worth at most.
         tie: rivals are models whose share of the gap closed is within this of the winner's.

@@ -8,9 +8,9 @@ from math import erfc
 import numpy as np
 from numpy.typing import NDArray
 
+from bayessim_mjx.diagnosis.clusters import interval
 from bayessim_mjx.diagnosis.disturbance import Disturbance
 from bayessim_mjx.diagnosis.motion_inputs import Inputs
-from bayessim_mjx.diagnosis.uncertainty import interval
 
 Array = NDArray[np.float64]
 BINS = 8
@@ -89,11 +89,11 @@ def bins(node: Nodes, axis: str) -> tuple[Array, NDArray[np.int64]]:
     return edges, np.where(node.used, index, -1)
 
 
-def force_map(node: Nodes, axis: str, draws: Array, rng: np.random.Generator) -> tuple[dict, Array]:
+def force_map(node: Nodes, axis: str, without: Array, rng: np.random.Generator) -> tuple[dict, Array]:
     """(numbers for a picture without `significant`, p-values per bin).
 
     Args:
-        draws: `[n, W]` bootstrap weights of windows.
+        without: `[G, W]`, windows without each condition (`clusters.leave_one_out`).
         rng: for the permutation of windows: a bin is significant if its mean differs from that of all nodes more than
             with the axis taken from other windows.
     """
@@ -105,9 +105,9 @@ def force_map(node: Nodes, axis: str, draws: Array, rng: np.random.Generator) ->
     each = np.stack([np.where(index == b, x, 0.0).sum(1) for b in range(count) for x in (force, reliability)], 1)
     each = each.reshape(len(force), count, 2)
     total = each.sum(0)
-    sampled = np.einsum("nw,wbx->nbx", draws, each)
+    replicates = np.einsum("gw,wbx->bgx", without, each)
     means = total[:, 0] / np.maximum(total[:, 1], 1e-9)
-    spread = [interval(s[:, 0] / np.maximum(s[:, 1], 1e-9)) for s in np.moveaxis(sampled, 1, 0)]
+    spread = [interval(m, w[:, 0] / np.maximum(w[:, 1], 1e-9)) for m, w in zip(means, replicates, strict=True)]
     low, high = (np.array(x) for x in zip(*spread, strict=True))
     found = {
         "joint": node.joint, "axis": axis, "quantity": AXES[axis][1], "unit": node.units[axis],

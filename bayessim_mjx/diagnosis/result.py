@@ -46,7 +46,7 @@ class FoundEffect:
             predicts held-out conditions better (pseudo-BMA+). It is no probability that the effect is there: what is
             there may be none of them. NaN where there is no rival to be weighed against.
         gap_closed, gap_closed_ci: its part of what all effects close, as a share of the recalibrated simulator's
-            squared gap above the noise, on held-out windows, with a 90 % interval.
+            squared gap above the noise, on held-out windows, with a 90 % interval (NaN of one condition).
         equivalent_to: [{"effects": ["payload@link", ...], "gap_closed": ..., "why": sentence, "weight": among the
             rivals}], which these logs cannot tell from it; of an effect that contains it as a special case, no weight.
         sentence: for people; predicted_gap_closed: the same share as promised before any effect was fitted.
@@ -173,7 +173,7 @@ def load(folder: str | Path) -> Diagnosis:
     details = folder / "details.json"
     raw["details"] = json.loads(details.read_text()) if details.is_file() else {}
     raw["effects"] = [_effect(e) for e in raw["effects"]]
-    raw["where"] = [Place(**{**p, "ci": tuple(p["ci"])}) for p in raw["where"]]
+    raw["where"] = [Place(**{**p, "ci": _ends(p["ci"])}) for p in raw["where"]]
     raw["gap"] = Gap(**_numbers(raw["gap"]))
     return Diagnosis(**raw)
 
@@ -184,7 +184,12 @@ def _effect(raw: dict[str, Any]) -> FoundEffect:
     if "probability" in rest:  # its name in files of before
         weight = rest.pop("probability")
         rest["weight_among_rivals"] = weight if rest["equivalent_to"] else math.nan
-    return FoundEffect(**{**rest, "parameters": parameters, "gap_closed_ci": tuple(raw["gap_closed_ci"])})
+    return FoundEffect(**{**rest, "parameters": parameters, "gap_closed_ci": _ends(raw["gap_closed_ci"])})
+
+
+def _ends(raw: list[float | None]) -> tuple[float, float]:
+    low, high = (math.nan if v is None else v for v in raw)
+    return low, high
 
 
 def _numbers(raw: dict[str, Any]) -> dict[str, Any]:

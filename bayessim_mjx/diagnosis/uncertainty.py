@@ -1,4 +1,4 @@
-"""Standard deviations of identified numbers and intervals of shares: clustered by operating condition."""
+"""Standard deviations of identified numbers, by operating conditions, and weights among rivals."""
 
 from __future__ import annotations
 
@@ -6,15 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
-from bayessim_mjx.diagnosis import ridges
+from bayessim_mjx.diagnosis import clusters, ridges
 from bayessim_mjx.diagnosis.fit import Fitter
 from bayessim_mjx.diagnosis.models import Model
 from bayessim_mjx.diagnosis.ridges import Ridges
 
 Array = NDArray[np.float64]
-LEVEL = 0.9
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,8 +21,7 @@ class Spread:
 
     Attributes:
         formal: `[k, k]`, Laplace covariance, inflated by the misfit and by the residuals' correlation.
-        between: `[k, k]`, jackknife over operating conditions (Quenouille, 1956): model errors repeat within a
-            condition, so windows are not independent.
+        between: `[k, k]`, jackknife over operating conditions.
         freedom: `[k]`, degrees of freedom of `between`: conditions that tell the parameter, less one.
     """
 
@@ -41,13 +38,10 @@ def spread(fitter: Fitter, model: Model, along: Ridges | None = None) -> Spread:
     S = S if along is None else along.corrected(S, ridges.scales(model.job))
     inflation = ridges.inflation(model)
     covariance = np.linalg.pinv(S / inflation + precision)
-    moves = model.estimates - model.estimates.mean(0)
-    g = len(moves)
     group = fitter.simulator.windows.group
     told = [covariance @ q.weighted(model.job.weight * (group == n))[1] @ covariance for n in np.unique(group)]
     share = np.diagonal(told, axis1=1, axis2=2)  # of the parameter's variance, by the condition it comes from
-    effective = share.sum(0) ** 2 / np.maximum((share**2).sum(0), 1e-300)  # Carter, Schnepel and Steigerwald (2017)
-    return Spread(np.asarray(covariance), (g - 1) / g * moves.T @ moves, np.maximum(effective - 1.0, 1.0))
+    return Spread(np.asarray(covariance), clusters.covariance(model.estimates), clusters.freedom(share))
 
 
 TIMES = 0.07  # of a time step; measured on single effects in MuJoCo C at a tenth of the step
@@ -68,7 +62,7 @@ def covariance(fitter: Fitter, model: Model, along: Ridges | None = None) -> Arr
     """
     found = spread(fitter, model, along)
     formal, between = np.diag(found.formal), np.diag(found.between)
-    wide = stats.t.ppf((1 + LEVEL) / 2, found.freedom) / stats.norm.ppf((1 + LEVEL) / 2)
+    wide = clusters.quantile(found.freedom) / clusters.quantile(np.inf)
     sd = np.sqrt(np.where(between > formal, between * wide**2, formal))
     base = len(fitter.base)
     sd[:base] = np.minimum(sd[:base], 1.0 / np.sqrt(ridges.beliefs(model.job, base)[:base]))  # data take nothing away
@@ -91,24 +85,14 @@ def systematic(model: Model, timestep: float, left: float = 0.0) -> Array:
     ])  # fmt: skip
 
 
-def bootstrap_weights(group: NDArray[np.int64], count: int, rng: np.random.Generator) -> Array:
-    """Bayesian bootstrap `[count, W]` over conditions; over windows where there are fewer than five conditions."""
-    names, index = np.unique(group, return_inverse=True)
-    if len(names) < 5:
-        index = np.arange(len(group))
-    draws = rng.dirichlet(np.ones(index.max() + 1), size=count) * (index.max() + 1)
-    return np.asarray(draws[:, index])
-
-
-def interval(samples: Array) -> tuple[float, float]:
-    """Central 90 % interval."""
-    low, high = np.quantile(samples, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
-    return float(low), float(high)
-
-
 def win_share(models: list[Model], group: NDArray[np.int64], noise: float, rng: np.random.Generator) -> Array:
-    """Pseudo-BMA+ weights (Yao et al., 2018, arXiv:1704.02030): held-out log scores under a Bayesian bootstrap."""
-    draws = bootstrap_weights(group, 500, rng)
+    """Pseudo-BMA+ weights (Yao et al., 2018, arXiv:1704.02030): held-out log scores under a Bayesian bootstrap.
+
+    Of conditions; of the windows where there is one condition only.
+    """
+    names, index = np.unique(group, return_inverse=True)
+    index = index if len(names) > 1 else np.arange(len(group))
+    draws = (rng.dirichlet(np.ones(index.max() + 1), size=500) * (index.max() + 1))[:, index]
     totals = np.stack([draws @ m.cost for m in models], 1) + 1e-9  # [draws, models]
     samples = min(m.samples for m in models)
     score = -0.5 * samples * np.log(totals)

@@ -5,16 +5,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from bayessim_mjx.diagnosis import motion_inputs, regions
+from bayessim_mjx.diagnosis import clusters, motion_inputs, regions
 from bayessim_mjx.diagnosis.disturbance import Disturbance, estimate
 from bayessim_mjx.diagnosis.fingerprints import fingerprints
 from bayessim_mjx.diagnosis.fit import Fitter, Job
 from bayessim_mjx.diagnosis.regions import ALONG, Leaf, Nodes, Tree
 from bayessim_mjx.diagnosis.result import Place
-from bayessim_mjx.diagnosis.uncertainty import bootstrap_weights, interval
 
 Array = NDArray[np.float64]
-DRAWS = 400
 QUIET = 1.1  # squared residual per sample that counts as noise alone
 WORTH = 0.1  # share of the gap that makes a joint worth a sentence
 TOLD = 0.15  # share of a joint's missing power that a region must explain to be told
@@ -37,15 +35,16 @@ def locate(
     windows, model = fitter.simulator.windows, fitter.simulator.physics.mj_model
     inputs = motion_inputs.measured(windows, model)
     rng = np.random.default_rng(seed)
-    draws = bootstrap_weights(windows.group, DRAWS, rng)
+    without = clusters.leave_one_out(windows.group)
     each = explained(job, disturbance)
-    share, spread = _shares(each, draws)
+    kept = np.maximum(each.sum(0), 0.0)
+    share, spread = kept / max(kept.sum(), 1e-300), clusters.interval_of_shares(each, windows.group)
     node = [regions.nodes(disturbance, inputs, v) for v in range(len(share))]
     worth = [v for v in np.argsort(-share) if share[v] > WORTH]
-    maps = _maps([node[v] for v in worth], draws, rng)
+    maps = _maps([node[v] for v in worth], without, rng)
     trees = {v: regions.tree(node[v], windows.group) for v in worth}
     sentences = [s for v in worth for s in _sentences(node[v], trees[v])]
-    prints = [f for v in worth for f in fingerprints(fitter, job, disturbance, inputs, v, node[v], draws)]
+    prints = [f for v in worth for f in fingerprints(fitter, job, disturbance, inputs, v, node[v], without)]
     sentences += [f.text for f in prints if f.text]
     places = [
         Place(node[v].joint, float(share[v]), spread[v], _region(node[v], trees.get(v))) for v in np.argsort(-share)
@@ -65,17 +64,9 @@ def explained(job: Job, disturbance: Disturbance) -> Array:
     return drop.reshape(len(d), disturbance.force.shape[2], -1).sum(2) * job.weight[:, None]
 
 
-def _shares(each: Array, draws: Array) -> tuple[Array, list[tuple[float, float]]]:
-    def share(total: Array) -> Array:
-        kept = np.maximum(total, 0.0)
-        return kept / np.maximum(kept.sum(-1, keepdims=True), 1e-300)
-
-    return share(each.sum(0)), [interval(s) for s in share(draws @ each).T]
-
-
-def _maps(nodes: list[Nodes], draws: Array, rng: np.random.Generator) -> list[dict]:
+def _maps(nodes: list[Nodes], without: Array, rng: np.random.Generator) -> list[dict]:
     """All maps of all joints; which bins are significant is decided over all of them together."""
-    made = [regions.force_map(node, axis, draws, rng) for node in nodes for axis in regions.AXES]
+    made = [regions.force_map(node, axis, without, rng) for node in nodes for axis in regions.AXES]
     made = [(m, p) for m, p in made if m]
     if not made:
         return []

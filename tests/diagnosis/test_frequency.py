@@ -24,7 +24,7 @@ def test_a_fractional_delay_is_measured_with_its_interval():
     x = [coloured(rng, 400, dt, 5.0) for _ in range(6)]
     y = [2.0 * delayed(a, dt, 0.0065) + 0.05 * rng.standard_normal(400) for a in x]
     found = frequency.spectra(x, y, dt)
-    late = frequency.delay(found, rng, top=5.0)
+    late = frequency.delay(found, top=5.0)
     assert late.value == pytest.approx(0.0065, rel=0.05)
     assert late.low < 0.0065 < late.high and late.high - late.low < 0.002
     busy = found.hz < 4.5

@@ -51,7 +51,7 @@ def race() -> SimpleNamespace:
 def test_on_a_linear_problem_the_promise_is_kept():
     found = race()
     before, after = (float(np.mean(x**2)) for x in (found.base.job.r, found.left))
-    total, each = promise.promised(found, found.effects, 1.0)
+    total, each = promise.promised(found, found.effects)
     assert total == pytest.approx((before - after) / (before - 1.0), abs=0.02)
     assert sum(each.values()) == pytest.approx(total, abs=1e-9)
     # columns of the same size, nearly orthogonal: shares as the squared amounts, 25 : 9

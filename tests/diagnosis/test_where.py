@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from bayessim_mjx.diagnosis import disturbance, motion_inputs, regions, where
+from bayessim_mjx.diagnosis import clusters, disturbance, motion_inputs, regions, where
 from bayessim_mjx.diagnosis.fingerprints import fingerprints
-from bayessim_mjx.diagnosis.uncertainty import bootstrap_weights
 
 from .missing_forces import fitted, record
 
@@ -32,9 +31,10 @@ def prints(case, dof):
     fitter, job, found = case
     windows = fitter.simulator.windows
     inputs = motion_inputs.measured(windows, fitter.simulator.physics.mj_model)
-    draws = bootstrap_weights(windows.group, 200, np.random.default_rng(0))
     node = regions.nodes(found, inputs, dof)
-    return {f.name: f for f in fingerprints(fitter, job, found, inputs, dof, node, draws)}
+    return {
+        f.name: f for f in fingerprints(fitter, job, found, inputs, dof, node, clusters.leave_one_out(windows.group))
+    }
 
 
 def test_the_joint_is_found(elbow):
@@ -121,6 +121,7 @@ def test_bins_without_a_pattern_are_rarely_significant():
         axes = {a: rng.standard_normal((40, 1)) + 0.3 * rng.standard_normal(shape) for a in regions.AXES}
         one = np.broadcast_to(np.eye(10), (40, 10, 10))
         node = regions.Nodes(values, one, axes, dict.fromkeys(axes, ""), "joint", "N m")
-        draws = bootstrap_weights(np.arange(40), 50, rng)
-        hits += regions.discoveries(regions.force_map(node, "position", draws, rng)[1]).any()
+        hits += regions.discoveries(
+            regions.force_map(node, "position", clusters.leave_one_out(np.arange(40)), rng)[1]
+        ).any()
     assert hits <= 4

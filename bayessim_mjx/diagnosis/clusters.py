@@ -1,0 +1,102 @@
+"""Uncertainty from few operating conditions: a jackknife over conditions, with Student's t.
+
+Windows of one condition err alike, as the model errs there alike. So conditions are what is independent, however few
+they are; of one condition alone nothing can be said. Coverage of the intervals: benchmarks/diagnosis_intervals.py.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+Array = NDArray[np.float64]
+LEVEL = 0.9
+NOTHING = (float("nan"), float("nan"))  # the interval of one condition
+
+
+def leave_one_out(group: NDArray[np.int64]) -> Array:
+    """`[G, W]`, 1 for the windows of all conditions but one; `[0, W]` of a single condition."""
+    names = np.unique(group)
+    return (group != names[:, None]).astype(np.float64)[: len(names) if len(names) > 1 else 0]
+
+
+def freedom(weight: Array) -> Array:
+    """Degrees of freedom of weights `[G, ...]` of conditions -> `[...]`, at least 1.
+
+    One less than the conditions that count: as many equal ones as have the same spread of weights (Carter, Schnepel and
+    Steigerwald, 2017).
+    """
+    count = weight.sum(0) ** 2 / np.maximum((weight**2).sum(0), 1e-300)
+    return np.asarray(np.maximum(count - 1.0, 1.0))
+
+
+def covariance(replicates: Array) -> Array:
+    """`[k, k]` of estimates from replicates `[G, k]`, each without one condition (Tukey, 1958)."""
+    g = len(replicates)
+    moves = replicates - replicates.mean(0)
+    return np.asarray((g - 1) / g * moves.T @ moves)
+
+
+def error(replicates: Array) -> Array:
+    """Standard errors `[...]` from replicates `[G, ...]`, each without one condition."""
+    g = len(replicates)
+    return np.asarray(np.sqrt((g - 1) / g * np.sum((replicates - replicates.mean(0)) ** 2, axis=0)))
+
+
+def quantile(freedom: Array | float) -> Array:
+    """Student's t that 90 % intervals reach to on either side."""
+    return np.asarray(stats.t.ppf((1 + LEVEL) / 2, freedom))
+
+
+def interval(value: float, replicates: Array) -> tuple[float, float]:
+    """90 % interval of an estimate from replicates `[G]`, each without one condition."""
+    if len(replicates) < 2:
+        return NOTHING
+    half = float(quantile(len(replicates) - 1.0) * error(replicates))
+    return value - half, value + half
+
+
+def interval_of_rms(cost: Array, group: NDArray[np.int64]) -> tuple[float, float]:
+    """90 % interval of the root mean of positive costs `[W]`; on a log scale, since few large errors rule a mean."""
+    rows = leave_one_out(group)
+    if len(rows) < 2:
+        return NOTHING
+    own = np.sum(cost) - rows @ cost
+    replicates = np.log(np.maximum(rows @ cost, 1e-300) / rows.sum(1))
+    half = float(quantile(freedom(own)) * error(replicates))
+    centre = np.log(max(float(np.mean(cost)), 1e-300))
+    # squares of numbers beyond 1e100 are of no use to anybody
+    low, high = np.exp(np.clip([0.5 * (centre - half), 0.5 * (centre + half)], -230.0, 230.0))
+    return float(low), float(high)
+
+
+def interval_of_shares(each: Array, group: NDArray[np.int64]) -> list[tuple[float, float]]:
+    """90 % intervals of the shares of k parts `[W, k]` in their sum; parts that are negative in sum count as 0."""
+
+    def shares(total: Array) -> Array:
+        kept = np.maximum(total, 0.0)
+        return np.asarray(kept / np.maximum(kept.sum(-1, keepdims=True), 1e-300))
+
+    ends = [interval(v, r) for v, r in zip(shares(each.sum(0)), shares(leave_one_out(group) @ each).T, strict=True)]
+    return [(float(np.clip(low, 0.0, 1.0)), float(np.clip(high, 0.0, 1.0))) for low, high in ends]
+
+
+def normal_deviate(x: Array, group: NDArray[np.int64]) -> float:
+    """How far the mean of x `[W]` lies from 0: the normal deviate of as small a probability as that of its t.
+
+    So a threshold has one error rate for any number of conditions. 0 where there is one condition only.
+    """
+    rows = leave_one_out(group)
+    if len(rows) < 2:
+        return 0.0
+    t = float(np.mean(x)) / (float(error(rows @ x / rows.sum(1))) + 1e-12)
+    beyond = float(stats.t.logsf(abs(t), freedom(len(x) - rows.sum(1))))
+    return float(np.copysign(_normal_quantile(beyond), t))
+
+
+def _normal_quantile(log_beyond: float) -> float:
+    """The normal deviate that is exceeded with a probability given by its logarithm, up to 1/2."""
+    from scipy.special import ndtri_exp
+
+    return float(-ndtri_exp(min(log_beyond, np.log(0.5))))
