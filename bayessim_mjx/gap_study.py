@@ -160,7 +160,7 @@ class Study:
             out["gap"] = {"policy": measures.gap(rows["nominal"]), "training": measures.gap(every)}
             out["ranking"] = measures.ranking(every)
             real = {role: np.stack([r["real"] for r in each]) for role, each in rows.items()}
-            out["recovery"] = measures.recovery(real, self.config.seed)
+            out["recovery"] = measures.recovery(real)
         else:
             out["replay"] = closed_loop.replay(
                 self.logs, self.simulators.nominal.physics, self.simulators.corrected.physics

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from bayessim_mjx.gap_measures import FEWEST
 from bayessim_mjx.monitor.console import Console
 from bayessim_mjx.monitor.words import number
 from bayessim_mjx.quantities import estimate
@@ -56,11 +57,20 @@ def _prediction(found: Mapping[str, Any]) -> str:
 def _recovery(r: Mapping[str, Any]) -> str:
     if r["corrected"]["recovered"] is None:
         return "The gap costs no measurable return: a policy trained on the real system itself is not clearly better."
-    (low, high), wide = r["corrected"]["ci"], r["wide"]["recovered"]
+    wide = r["wide"]["recovered"]
     return (
         f"Retraining on the corrected simulator recovers {_percent(r['corrected']['recovered'])} of the lost return "
-        f"(90 % interval {_percent(low)} to {_percent(high)}); wide randomisation without a diagnosis {_percent(wide)}."
+        f"({_interval(r)}); wide randomisation without a diagnosis {_percent(wide)}."
     )
+
+
+def _interval(r: Mapping[str, Any]) -> str:
+    if r["corrected"]["ci"]:
+        return "90 % interval {} to {}".format(*map(_percent, r["corrected"]["ci"]))
+    if r["seeds"] >= FEWEST:
+        return "no interval: what was lost is not known well enough"
+    seeds = "1 seed" if r["seeds"] == 1 else f"{r['seeds']} seeds"
+    return f"{seeds}: no interval; trainings differ, --seeds {FEWEST} gives one"
 
 
 def _ranking(r: Mapping[str, Any]) -> str:

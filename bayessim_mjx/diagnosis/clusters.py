@@ -1,7 +1,7 @@
 """Uncertainty from few operating conditions: a jackknife over conditions, with Student's t.
 
 Windows of one condition err alike, as the model errs there alike. So conditions are what is independent, however few
-they are; of one condition alone nothing can be said. Coverage of the intervals: benchmarks/diagnosis_intervals.py.
+they are; of one condition alone nothing can be said. Coverage of the intervals: benchmarks/intervals.py.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from scipy import stats
 
 Array = NDArray[np.float64]
 LEVEL = 0.9
+RULED = 0.5  # degrees of freedom where one condition rules a mean of squares: measured, see above
 NOTHING = (float("nan"), float("nan"))  # the interval of one condition
 
 
@@ -21,14 +22,14 @@ def leave_one_out(group: NDArray[np.int64]) -> Array:
     return (group != names[:, None]).astype(np.float64)[: len(names) if len(names) > 1 else 0]
 
 
-def freedom(weight: Array) -> Array:
-    """Degrees of freedom of weights `[G, ...]` of conditions -> `[...]`, at least 1.
+def freedom(weight: Array, least: float = 1.0) -> Array:
+    """Degrees of freedom of weights `[G, ...]` of conditions -> `[...]`, at least `least`.
 
     One less than the conditions that count: as many equal ones as have the same spread of weights (Carter, Schnepel and
     Steigerwald, 2017).
     """
     count = weight.sum(0) ** 2 / np.maximum((weight**2).sum(0), 1e-300)
-    return np.asarray(np.maximum(count - 1.0, 1.0))
+    return np.asarray(np.maximum(count - 1.0, least))
 
 
 def covariance(replicates: Array) -> Array:
@@ -64,7 +65,7 @@ def interval_of_rms(cost: Array, group: NDArray[np.int64]) -> tuple[float, float
         return NOTHING
     own = np.sum(cost) - rows @ cost
     replicates = np.log(np.maximum(rows @ cost, 1e-300) / rows.sum(1))
-    half = float(quantile(freedom(own)) * error(replicates))
+    half = float(quantile(freedom(own, RULED)) * error(replicates))
     centre = np.log(max(float(np.mean(cost)), 1e-300))
     # squares of numbers beyond 1e100 are of no use to anybody
     low, high = np.exp(np.clip([0.5 * (centre - half), 0.5 * (centre + half)], -230.0, 230.0))

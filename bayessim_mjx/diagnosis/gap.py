@@ -137,28 +137,29 @@ class Closed:
     def value(self) -> float:
         """At most 1: nothing undercuts the noise."""
         before, left, noise = self._sums(np.ones_like(self.before))
-        return min(float((before - left) / max(before - noise, 1e-9)), 1.0)
+        return min(float(before - left) / max(float(before - noise), 1e-9), 1.0)
 
     def interval(self) -> tuple[float, float]:
         """90 % interval between -1 and 1, NaN of one condition.
 
         A share s is kept where what is left, E1, could be what it says, (1 - s) E0 + s: where the logarithm of their
         ratio is no more standard errors off 0 than Student's t allows. That holds near the noise, where E1 - 1 has no
-        logarithm, and near 0 alike; large windows rule neither, as they would the ratio's own standard error.
+        logarithm, and near 0 alike. As many conditions count as rule the one or the other, whichever are fewer.
         """
         rows = clusters.leave_one_out(self.group)
         if len(rows) < 2:
             return clusters.NOTHING
         shares = np.concatenate([1.0 - np.geomspace(2.0, 1e-4, GRID), [1.0]])[:, None]
 
-        def off(rows: Array) -> tuple[Array, Array]:
+        def both(rows: Array) -> tuple[Array, Array]:
             before, left, noise = self._sums(rows)
-            said = np.maximum((1 - shares) * before + shares * noise, 1e-9)
-            return np.log(np.maximum(left, 1e-9) / said), said
+            return np.maximum(left, 1e-9), np.maximum((1 - shares) * before + shares * noise, 1e-9)
 
-        far, said = off(np.ones((1, len(self.before))))
-        without, rest = off(rows)
-        allowed = clusters.quantile(clusters.freedom((said - rest).T)) * clusters.error(without.T)
+        (left, said), (left_without, said_without) = both(np.ones((1, len(self.before)))), both(rows)
+        counting = [np.maximum(left - left_without, 0.0)[:, None], np.maximum(said - said_without, 0.0).T]
+        freedom = np.minimum(*(clusters.freedom(own, clusters.RULED) for own in counting))
+        allowed = clusters.quantile(freedom) * clusters.error(np.log(left_without / said_without).T)
+        far = np.log(left / said)
         kept = shares[:, 0][np.abs(far[:, 0]) <= allowed]
         value = self.value
         return float(min([*kept[:1], value])), float(max([*kept[-1:], value]))

@@ -34,7 +34,11 @@ def test_dry_friction_is_named_with_its_level(rubbing):
     level = effect.parameters["level"]
     assert level.mean == pytest.approx(0.04, rel=0.05) and level.unit == "N m" and 0 < level.sd < 0.01
     assert effect.gap_closed > 0.8
-    assert effect.gap_closed_ci[0] <= effect.gap_closed <= effect.gap_closed_ci[1] <= 1.0
+    before, after = (found.predictions[k].cost(10**6).sum() for k in ("calibrated", "with_effects"))
+    noise = len(found.setup.fitter.simulator.windows)
+    assert effect.gap_closed == pytest.approx(min((before - after) / (before - noise), 1.0))
+    low, high = effect.gap_closed_ci
+    assert 0.8 < low < effect.gap_closed <= high <= 1.0
     assert 0.5 < effect.predicted_gap_closed <= 1.0
     weighed = [r["weight"] for r in effect.equivalent_to if "weight" in r]
     expected = 1.0 - sum(weighed) if weighed else np.nan  # nothing to be weighed against is no certainty
