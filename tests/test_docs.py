@@ -15,7 +15,7 @@ ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 COMMANDS = ("main", "train", "play", "calibrate", "diagnose", "gap_loop")
 OTHERS = {"--logdir", "--samples_per_plugin"}  # tensorboard's
-PYTHON = {"env.py", "env.reset", "env.dt", "env.mj_model"}  # an environment in Python, not a setting
+PYTHON = {"env.py", "env.reset", "env.step", "env.dt", "env.mj_model", "ppo.train"}  # in Python, not settings
 
 
 @pytest.fixture(scope="module")

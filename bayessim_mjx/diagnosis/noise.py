@@ -61,9 +61,7 @@ def floors(logs: Sequence[Log], horizons: Sequence[float] = (0.1, 0.25, 0.5, 1.0
     qvel = _pooled([_sensor(log, "qvel") for log in logs])
     groups = repeats(logs)
     if not groups:
-        text = (
-            "no repeated runs: what is chance and what the model gets wrong can only be told by the growth of the error"
-        )
+        text = "no repeated runs: only the growth of the error separates chance from an error of the model"
         return Floors(qpos, qvel, warnings=(text,))
     rest = [_reproduced(group, marks) for group in groups]
     count = sum(r[2] for r in rest)

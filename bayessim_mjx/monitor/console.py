@@ -273,7 +273,7 @@ class Console:
     # ---- how it is written
 
     def _plain(self, text: str) -> str:
-        return text if self._unicode else ascii_of(text)
+        return text if self._unicode else TIE.join(map(ascii_of, text.split(TIE)))
 
     def _broken(self, text: str, indent: int) -> list[str]:
         return wrapped(self._plain(text), self._limit, indent)

@@ -5,6 +5,7 @@ from typing import TextIO
 
 from bayessim_mjx.diagnosis.result import Diagnosis, FoundEffect
 from bayessim_mjx.monitor.console import Console
+from bayessim_mjx.monitor.tables import TIE
 from bayessim_mjx.report.sections import between, stages_of
 from bayessim_mjx.report.words import (
     MISSING,
@@ -52,7 +53,8 @@ def console(
         if len(diagnosis.candidates) > BEST:
             out.say(f"{len(diagnosis.candidates) - BEST} more candidates in diagnosis.json")
         if plan := diagnosis.next_experiment:
-            out.say(f"next experiment: {plan.get('name', MISSING)} ({plan.get('why', '')}), {plan.get('file', '')}")
+            name, why = plan.get("name", MISSING), plan.get("why", "")
+            out.say(f"next experiment: {why if name in why else f'{name}: {why}'} ({plan.get('file', '')})")
         for warning in diagnosis.warnings:
             out.warning(warning)
         for path in (Path(folder) / name for name in FILES) if folder is not None else ():
@@ -87,7 +89,7 @@ def _effects(d: Diagnosis) -> Table:
         rows.append(
             [
                 effect_title(e.name, e.where),
-                ", ".join(f"{k} {v}" for k, v in found),
+                ", ".join(f"{k} {v.replace(' ', TIE)}" for k, v in found),  # a number keeps its unit
                 percent(e.gap_closed),
                 between(*e.gap_closed_ci),
                 percent(e.predicted_gap_closed),

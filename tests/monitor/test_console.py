@@ -68,7 +68,8 @@ def test_a_terminal_gets_bars_and_the_same_lines():
 def test_ascii_streams_get_ascii():
     file = io.TextIOWrapper(io.BytesIO(), encoding="ascii", write_through=True)
     file.getvalue = lambda: file.buffer.getvalue().decode("ascii")
-    assert "-455 +/- 31" in tell(file)
+    text = tell(file)
+    assert "-455 +/- 31" in text and "parameters  mass [kg], length" in text
 
 
 def test_many_widths_are_cut_to_a_line():
