@@ -1,5 +1,6 @@
 """TensorBoard's files read back hold the numbers; the terminal's lines hold the words."""
 
+import dataclasses
 import io
 import sys
 from pathlib import Path
@@ -57,3 +58,31 @@ def test_console_of_every_verdict_also_in_ascii(verdict):
     assert WORDS[verdict].badge in file.buffer.getvalue().decode("ascii")
     report.console(fake.full(), file=file)
     assert "0.0312 +/- 0.0021 N m" in file.buffer.getvalue().decode("ascii")
+
+
+@pytest.mark.parametrize(
+    ("verdict", "words"),
+    [
+        ("parameters", ["shoulder.damping", "0.1070 ± 0.0020 N m s/rad"]),
+        ("unexplained", ["elbow, at reversals below 0.2 rad/s", "55 % – 69 %"]),
+        ("ambiguous", ["next experiment: slow triangle: separates Coulomb from Stribeck", "(next_experiment.csv)"]),
+    ],
+)
+def test_what_the_advice_calls_below_is_below(verdict, words):
+    file = io.StringIO()
+    report.console(dataclasses.replace(fake.full(), verdict=verdict), file=file)
+    advice, below = file.getvalue().split(WORDS[verdict].advice[:40])
+    assert "below" in WORDS[verdict].advice and all(w in below for w in words) and not any(w in advice for w in words)
+
+
+@pytest.mark.parametrize("width", [80, 140])
+def test_no_line_is_wider_than_the_terminal_and_no_number_parts_from_its_unit(monkeypatch, width):
+    monkeypatch.setenv("COLUMNS", str(width))
+    for verdict in VERDICTS:
+        file = io.StringIO()
+        report.console(dataclasses.replace(fake.full(), verdict=verdict), file=file)
+        lines = file.getvalue().splitlines()
+        assert max(map(len, lines)) <= width
+        assert any("0.0312 ± 0.0021 N m" in line for line in lines)
+        said = set(" ".join(lines).replace("│", " ").split())
+        assert {word for text in (*fake.full().sentences, *fake.full().warnings) for word in text.split()} <= said
