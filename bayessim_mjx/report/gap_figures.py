@@ -25,6 +25,7 @@ PARTS = {
     "noise_floor": "not explained",
 }
 FLOORS = {"repeats": "differs between repeats", "start": "uncertain start"}  # what lies between floor and noise
+TICKS = [0.0, 0.2, 0.4, 0.6, 0.8, 1.0]
 STEPS = ("nominal", "calibrated", "with_effects")
 
 
@@ -123,6 +124,7 @@ def waterfall(
         [bars, spans],
         WIDTH,
         350,
+        least=100 * len(columns) + 80,
         shapes=links,
         annotations=marks,
         xaxis=axis(
@@ -133,7 +135,9 @@ def waterfall(
             tickangle=0,
             range=[-0.5, len(xs) - 0.5],
         ),
-        yaxis=axis("squared gap, share of the largest", tickformat=".0%", range=[0, max(1.12, 1.1 * max(tops))]),
+        yaxis=axis(
+            "squared gap, share of the largest", tickvals=TICKS, tickformat=".0%", range=[0, max(1.12, 1.1 * max(tops))]
+        ),
         margin={"l": 70, "r": 10, "t": 12, "b": 64},
     )
 

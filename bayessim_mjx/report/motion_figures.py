@@ -126,6 +126,7 @@ def overlay(row: Mapping[str, Any], points: int = 2000) -> dict[str, Any]:
         data,
         WIDTH,
         430,
+        least=640,
         showlegend=True,
         hovermode="x unified",
         shapes=ticks if len(ticks) <= 60 else [],

@@ -24,6 +24,7 @@ from bayessim_mjx.report.words import (
     number,
     percent,
     quantity,
+    small,
     stages_told,
     verdict_of,
 )
@@ -45,8 +46,8 @@ def top(d: Diagnosis) -> dict[str, Any]:
     tiles = [{"words": TILES[s], "colour": STAGE[s], **_tile(d, s)} for s in told]
     closed = gap_closed(stages)
     if finite(closed):
-        words = "of the gap above the noise closed" if not repeated(d) else "of the reproducible gap closed"
-        tiles.append({"words": words, "value": percent(closed), "unit": "", "below": "squared", "colour": "#1f2429"})
+        words = f"of the squared gap {'that repeats' if repeated(d) else 'above the noise'} closed"
+        tiles.append({"words": words, "value": percent(closed), "unit": "", "below": "", "colour": "#1f2429"})
     found = [{"line": effect_line(e), "rivals": len(e.equivalent_to)} for e in d.effects]
     return {
         "badge": verdict.badge,
@@ -67,10 +68,10 @@ def _tile(d: Diagnosis, stage: str) -> dict[str, str]:
     part = d.gap.shares.get(stage)
     if len(rows) == len(d.gap.physical) == 1:
         value, _, unit_ = length(rows[0][stage], rows[0]["unit"]).partition(" ")
-        parts = [f"{percent(part)} of the motion", noises] if finite(part) else [noises]
+        parts = [f"{small(part)} of the motion", noises] if finite(part) else [noises]
         return {"value": value, "unit": unit_, "below": ", ".join(parts)}
     if finite(part):
-        return {"value": percent(part), "unit": "of the motion", "below": noises}
+        return {"value": small(part), "unit": "", "below": f"of the motion, {noises}"}
     return {"value": number(getattr(d.gap, stage)), "unit": "noise sd", "below": ""}
 
 
@@ -131,7 +132,7 @@ def _stages_row(row: Mapping[str, Any], joints: int) -> dict[str, Any]:
     for stage in STAGES:
         span = known_span((row.get("ci") or {}).get(stage))
         noises = number(row.get(stage)) + (f" ({number(span[0])} – {number(span[1])})" if span else "")
-        value = length(own.get(stage), own.get("unit", "")) if own else percent(shares.get(stage))
+        value = length(own.get(stage), own.get("unit", "")) if own else small(shares.get(stage))
         known = value != MISSING
         cells[stage] = {"value": value, "between": f"{noises} sd"} if known else {"value": noises, "between": ""}
     return {"name": str(row["name"]), "cells": cells, "closed": percent(gap_closed(row)), "more": [], "beyond": False}

@@ -96,6 +96,11 @@ def length(value: Any, in_unit: str) -> str:
     return extent(value, in_unit).replace("-", "−") if finite(value) else MISSING
 
 
+def small(share: Any) -> str:
+    """A share with two digits, `0.16 %`: of a motion, of which little is left."""
+    return quantities.fixed(100 * share, 2) + " %" if finite(share) and 0 < share < 0.00995 else percent(share)
+
+
 def closure(share: Any) -> str:
     """A share of the gap closed; a model that widens it closes none."""
     return "none, it is worse" if finite(share) and share < -0.0005 else percent(share)
