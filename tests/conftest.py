@@ -36,8 +36,6 @@ if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("BAYESSIM_MJX_CACHE", os.environ["JAX_COMPILATION_CACHE_DIR"])
 
-os.environ.pop("COLUMNS", None)  # commands would break their lines there, and tests look for what they say
-
 # Tracing makes objects by the million that live on; looking for garbage among them took a quarter of its time.
 gc.set_threshold(100_000, 50, 100)
 
