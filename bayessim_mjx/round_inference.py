@@ -244,16 +244,12 @@ def _posterior(loop: Loop, state: LoopState, info: RoundInfo) -> Distribution:
     rows = jax.tree.map(
         np.asarray, state.real_posteriors
     ).split()  # on the host: an index on the device compiles each time
-    usable = [row for row in rows[:known] if _finite(row)]
+    usable = [row for row in rows[:known] if row.sound]
     if len(usable) < known:
-        info.warnings.append(f"{known - len(usable)} real trajectories left out: no finite posterior")
+        info.warnings.append(f"{known - len(usable)} real trajectories left out: their posteriors are no densities")
     if not usable:
         return Distribution.prior(loop.env.space, b.components, loop.chart)
     return inference.combine(usable, b.components).rechart(loop.chart)
-
-
-def _finite(posterior: Distribution) -> bool:
-    return all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(posterior))
 
 
 def _complaints(names: tuple[str, ...], fit: dict[str, Any], known_before: np.ndarray) -> list[str]:
