@@ -76,6 +76,8 @@ def shown(physics, values, command=COMMAND):
     return tuple(np.concatenate([first[None], rest]) for first, rest in zip(start, after, strict=True))
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_neutral_changes_no_bit(full):
     for names, values in (((), {}), (("sensor_gain",), {"a.sensor_gain.gain": 1.1})):
         bare = physics_of([make(n, where=("a", "b")) for n in names])
