@@ -192,7 +192,7 @@ def _merge(merged: dict[str, Any], raw: Mapping[str, Any], source: str, is_file:
             if value != merged["task_name"]:
                 raise UserError(f"{source}: task_name = {value!r}, but the task is {merged['task_name']!r}")
         elif key in SECTIONS or key == "task":
-            if not isinstance(value or {}, Mapping):
+            if value is not None and not isinstance(value, Mapping):
                 raise UserError(f"{key} = {value!r} ({source}): expected a section of `key: value` lines")
             merge = _merge_task if key == "task" else _merge_section
             value = _one_length(value or {}, source) if key == "env" else value

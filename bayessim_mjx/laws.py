@@ -16,6 +16,12 @@ ALIASES = {
     "direct": "direct", "torque": "direct", "force": "direct", "effort": "direct", "voltage": "direct",
     "duty": "direct", "position": "position", "pd": "position", "p": "position", "velocity": "velocity",
 }  # fmt: skip
+_ALLOWED = {
+    "kp": "a finite number > 0",
+    "kd": "a finite number >= 0",
+    "limit": "a number > 0",
+    "scale": "a finite number, not 0",
+}
 KEYS = ("law", "kp", "kd", "limit", "scale", "note")  # note: for people
 
 
@@ -36,11 +42,6 @@ class Law(struct.PyTreeNode):
     scale: jax.Array
     qadr: tuple[int, ...] = struct.field(pytree_node=False)
     dadr: tuple[int, ...] = struct.field(pytree_node=False)
-
-    @property
-    def through(self) -> jax.Array:
-        """`[nu]` bool, the command is the actuator's own ctrl."""
-        return (self.on_position + self.on_velocity == 0) & (self.scale == 1)
 
     def __call__(
         self, command: jax.Array, qpos: jax.Array, qvel: jax.Array, seen: Mapping[str, jax.Array]
@@ -96,18 +97,6 @@ def read(metadata: Mapping[str, Any], model: mujoco.MjModel, actuators: Sequence
     )
 
 
-def of_logs(logs: Sequence[Any], model: mujoco.MjModel) -> Law | None:
-    """The laws of several logs, leaves `[logs, nu]`; None where all commands go to the actuators as they are.
-
-    Raises:
-        UserError: as `read`.
-    """
-    if not any(declared(log.metadata) for log in logs):
-        return None
-    each = [read(log.metadata, model, log.actuators, str(log.metadata.get("source", log.name))) for log in logs]
-    return jax.tree.map(lambda *x: jnp.stack(x), *each)
-
-
 def _of_actuator(given: Mapping[str, Any], name: str, actuators: Sequence[str], source: str) -> dict[str, Any]:
     blocks = {k: v for k, v in given.items() if isinstance(v, Mapping)}
     for key in blocks:
@@ -133,8 +122,9 @@ def _of_actuator(given: Mapping[str, Any], name: str, actuators: Sequence[str], 
             row[key] = float(own[key])
         except (TypeError, ValueError):
             raise UserError(f"{source}: controller.{key} = {own[key]!r}; allowed: a number") from None
-        if isinstance(own[key], bool) or not (np.isfinite(row[key]) or (key == "limit" and row[key] > 0)):
-            raise UserError(f"{source}: controller.{key} = {own[key]!r}; allowed: a finite number")
+        good = {"kp": row["kp"] > 0, "kd": row["kd"] >= 0, "limit": row["limit"] > 0, "scale": row["scale"] != 0}[key]
+        if isinstance(own[key], bool) or not good or (key != "limit" and not np.isfinite(row[key])):
+            raise UserError(f"{source}: controller.{key} = {own[key]!r}; allowed: {_ALLOWED[key]}")
     if row["law"] != "direct" and not row["kp"] > 0:
         raise UserError(f"{source}: controller.law = {row['law']} of actuator {name!r} needs kp > 0, has {row['kp']:g}")
     return row

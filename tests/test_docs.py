@@ -33,7 +33,7 @@ def keys():
     for thing in vars(settings).values():
         if dataclasses.is_dataclass(thing) and getattr(thing, "SECTION", ""):
             found |= {f"{thing.SECTION}.{field.name}" for field in dataclasses.fields(thing)}
-    return found
+    return found | {"env.maxEpisodeLength"}  # BayesSimIG's other name of env.episodeLength
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)

@@ -138,6 +138,7 @@ quantum: {"qpos:shoulder": 0.12}
         ("controller: {law: position, kp: 3, kv: 1}", ("controller.kv: there are: law, kp",)),
         ("controller: {kp: 3}", ("controller.kp = 3 without a loop", "law: position")),
         ("controller: {law: position, kp: .inf}", ("controller.kp = inf", "finite")),
+        ("controller: {law: position, kp: 3, limit: 0}", ("controller.limit = 0", "a number > 0")),
         ("quantum: 3", ("quantum = 3", "mapping")),
     ):
         side.write_text(text)
@@ -164,7 +165,24 @@ def test_enabled_says_yes_and_no(tmp_path: Path, arm: mujoco.MjModel) -> None:
     (log,) = read_logs(tmp_path, arm)
     assert log.enabled.tolist() == [i % 2 == 0 for i in range(40)]
     (tmp_path / "run.csv").write_text("\n".join([HEADER + ",enabled:m_elbow", *lines]).replace("OFF", "idle"))
-    refused(tmp_path, arm, "line 5", "'enabled:m_elbow'", "'idle' is not a number", "yes, no, on, off")
+    refused(tmp_path, arm, "line 2", "'enabled:m_elbow'", "'yes' is not a number", "a column of true, false, yes, no")
+
+
+@pytest.mark.parametrize("text", ["no", "true", "\u0661"])
+def test_a_word_among_numbers_is_no_number(tmp_path: Path, arm: mujoco.MjModel, text: str) -> None:
+    """Nor is a digit of another script, which Python would read."""
+    path = write(tmp_path, rows())
+    lines = path.read_text().splitlines()
+    lines[3] = ",".join([*lines[3].split(",")[:-1], text])
+    path.write_text("\n".join(lines), encoding="utf-8")
+    refused(tmp_path, arm, "line 4", "'qpos:elbow'", f"{text!r} is not a number")
+
+
+def test_a_misspelt_key_of_the_side_yaml_is_told(tmp_path: Path, arm: mujoco.MjModel) -> None:
+    write(tmp_path, rows())
+    (tmp_path / "run.yaml").write_text("controler: {law: position, kp: 3}\nroom: 7\n")
+    with pytest.warns(UserWarning, match=r"run\.yaml: key 'controler' has no meaning here; did you mean 'controller'"):
+        read_logs(tmp_path, arm)
 
 
 def test_npz_with_a_channel_twice_or_complex_numbers(tmp_path: Path, arm: mujoco.MjModel) -> None:

@@ -86,7 +86,8 @@ def _overlays(found: Findings) -> list[dict[str, Any]]:
                 "time": log.time[rows] - log.time[0], "measured": log.qpos[rows, q],
                 "starts": log.time[cut.start[own]] - log.time[0],
             }  # fmt: skip
-            for stage, prediction in found.predictions.items():
+            told = {k: p for k, p in found.predictions.items() if k != "with_effects" or found.ruling.model.effects}
+            for stage, prediction in told.items():
                 entry[stage] = log.qpos[rows, q] - (prediction.error[own, :, v] * cut.sigma_q[v]).reshape(-1)
             out.append(entry)
     return out

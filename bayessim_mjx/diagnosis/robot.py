@@ -113,6 +113,8 @@ def _check(model: mujoco.MjModel, source: str) -> None:
     step = float(model.opt.timestep)
     if not (math.isfinite(step) and step > 0):
         raise UserError(f"{source}: <option timestep> = {step:g}; allowed: seconds > 0")
+    if broken := _not_finite(model):
+        raise UserError(f"{source}: numbers that are not finite in {', '.join(broken)}; allowed: finite numbers")
     idle = [_label(model, "actuator", i) for i in range(model.nu) if not np.any(model.actuator_gear[i])]
     if len(idle) == model.nu:
         raise UserError(f"{source}: gear = 0 of every actuator ({', '.join(idle)}): the logged commands cannot act")
@@ -129,6 +131,13 @@ def _check(model: mujoco.MjModel, source: str) -> None:
         mjx.make_data(mjx.put_model(model, impl="jax"))
     except (NotImplementedError, ValueError, TypeError) as error:
         raise UserError(f"{source}: MJX cannot simulate this model: {_one_line(error)}{_remedy(str(error))}") from None
+
+
+def _not_finite(model: mujoco.MjModel) -> list[str]:
+    """MuJoCo's arrays with a NaN or an infinity in them, by name: a gain, a mass, and what follows from them."""
+    fields = ((name, getattr(model, name, None)) for name in dir(model) if not name.startswith("_"))
+    floats = ((name, x) for name, x in fields if isinstance(x, np.ndarray) and x.dtype.kind == "f")
+    return [name for name, x in floats if not np.isfinite(x).all()]
 
 
 _IGNORED = {  # in the model but not in MJX's equations

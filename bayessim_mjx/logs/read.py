@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import hashlib
 import warnings
 from collections.abc import Mapping, Sequence
@@ -23,6 +24,7 @@ from bayessim_mjx.logs.table import Table, read_csv, read_npz
 MIN_ROWS = 10
 MAX_GAP = 5.0  # sample periods without a sample after which a file is cut in two
 SHORT_GAP = 0.01  # s; shorter pauses are bridged however fast the file is
+METADATA = ("condition", "operating_condition", "controller", "payload", "repeat_of", "sigma", "quantum")
 _SUFFIXES = (".csv", ".npz")
 _FORMAT = (
     "CSV with the columns time, ctrl:<actuator>, qpos:<joint>[, qvel:<joint>], "
@@ -122,10 +124,10 @@ def _read_one(path: Path, mj_model: mujoco.MjModel, channels: Channels, log_map:
     columns = log_map.apply(table) if log_map is not None else _columns(table, channels)
     check_channels(table, columns, channels)
     check_time(table, columns["time"], MIN_ROWS)
-    metadata = {**(log_map.metadata if log_map else {}), **_side_yaml(path), "source": str(path)}
-    law = laws.read(metadata, mj_model, channels.actuators, str(path))  # refused here, before anything is simulated
-    check_motion(table, columns, channels, mj_model, np.asarray(law.through))
+    check_motion(table, columns, channels, mj_model)
     columns = _with_numbers(table, columns)
+    metadata = {**(log_map.metadata if log_map else {}), **_side_yaml(path), "source": str(path)}
+    laws.read(metadata, mj_model, channels.actuators, str(path))  # refused here, before anything is simulated
     if "condition" in metadata:
         metadata.setdefault("operating_condition", metadata["condition"])
     return _pieces(table, columns, channels, metadata)
@@ -204,7 +206,12 @@ def _expand(table: Table, key: str, stream: str, channels: Channels) -> list[str
 
 def _side_yaml(path: Path) -> Mapping[str, Any]:
     side = path.with_suffix(".yaml")
-    return read_yaml(side) if side.is_file() and side.name != "map.yaml" else {}
+    content = read_yaml(side) if side.is_file() and side.name != "map.yaml" else {}
+    for key in content:
+        near = difflib.get_close_matches(str(key), METADATA, n=1, cutoff=0.75)
+        if key not in METADATA and near and near[0] not in content:
+            warnings.warn(f"{side}: key {key!r} has no meaning here; did you mean {near[0]!r}?", stacklevel=5)
+    return content
 
 
 def _pieces(table: Table, columns: Mapping[str, Array], channels: Channels, metadata: Mapping[str, Any]) -> list[Log]:

@@ -37,7 +37,7 @@ class Table:
         return f"row {row}" if self.first_line is None else f"line {row + self.first_line}"
 
     def numbers(self, column: str) -> Array:
-        """The column as float64 [T]; blank fields are NaN; true, yes, on are 1 and false, no, off are 0.
+        """The column as float64 [T]; blank fields are NaN. A column of words alone: true, yes, on are 1, the others 0.
 
         Raises:
             UserError: a field that is no number, naming its line.
@@ -46,18 +46,23 @@ class Table:
         if isinstance(values, np.ndarray) and values.dtype.kind not in _NUMBERS:
             raise UserError(f"{self.path}: column {column!r} holds {values.dtype}; allowed: real numbers")
         try:
+            if not isinstance(values, np.ndarray) and not all(map(str.isascii, values)):
+                raise ValueError("digits of other scripts")
             return np.asarray(values).astype(np.float64)
         except (TypeError, ValueError):
-            return np.array([self._number(column, row, str(v)) for row, v in enumerate(values)])
+            words = [str(v).strip().lower() for v in values]
+            switch = all(word in _WORDS for word in words)
+            return np.array([self._number(column, row, word, switch) for row, word in enumerate(words)])
 
-    def _number(self, column: str, row: int, text: str) -> float:
-        word = text.strip().lower()
+    def _number(self, column: str, row: int, text: str, switch: bool) -> float:
         try:
-            return _WORDS[word] if word in _WORDS else float(word)
+            if not text.isascii():
+                raise ValueError("digits of other scripts")
+            return _WORDS[text] if switch or not text else float(text)
         except ValueError:
             at = f"{self.path}: {self.where(row)}, column {column!r}"
             raise UserError(
-                f"{at}: {text!r} is not a number; allowed: numbers, true, false, yes, no, on, off"
+                f"{at}: {text!r} is not a number; allowed: numbers, or a column of true, false, yes, no, on, off"
             ) from None
 
 

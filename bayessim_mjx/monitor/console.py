@@ -12,9 +12,10 @@ import warnings
 from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any, TextIO
 
+from bayessim_mjx.monitor.bars import Bars
 from bayessim_mjx.monitor.draws import shorten
 from bayessim_mjx.monitor.tables import TIE, shell, table, wrapped
-from bayessim_mjx.monitor.words import ascii_of, duration, escape, fit, is_number, named, number, spoken, without_prefix
+from bayessim_mjx.monitor.words import ascii_of, duration, fit, is_number, named, number, spoken, without_prefix
 from bayessim_mjx.quantities import estimate
 
 FILE_WIDTH = 140  # columns that tables and lists may take where there is no terminal
@@ -71,11 +72,10 @@ class Console:
         self._rich = RichConsole(**options)
         self._unicode = "utf" in (getattr(file, "encoding", None) or "utf-8").lower()
         self._now, self._blank = now, False
-        self._progress: Any = None
+        self._bars: Bars | None = None
         self._rounds: Clock | None = None
         self._steps: Clock | None = None
         self._phase = ""
-        self._bars: dict[str, Any] = {}
         self._showwarning = warnings.showwarning
 
     def __enter__(self) -> "Console":
@@ -159,8 +159,8 @@ class Console:
             where += f" {done}/{self._steps.total}"
         elif at is not None:
             where += f" {int(at)}"
-        if self._progress is not None and "phase" in self._bars:
-            self._move("phase", done, fit(numbers, self._note_room(), "  ", count=False), eta)
+        if self._bars is not None and "phase" in self._bars:
+            self._bars.move("phase", done, fit(numbers, self._bars.note_room(), "  ", count=False), eta)
             return
         ahead = f"  ETA {duration(eta)}" if eta else ""
         self._say(f"{where}  " + fit(numbers, self.width - len(where) - len(ahead) - 2, "  ", count=False) + ahead)
@@ -201,9 +201,9 @@ class Console:
             fitting = fit(named(brief, widths), room) or fit(named(shorten(brief, 18), widths), room)
             parts += [f"{WIDTHS} {fitting}"] if fitting else []
         self._facts(parts + tail, "bold")
-        if self._rounds is not None:
+        if self._rounds is not None and self._bars is not None:
             done, total = self._rounds.done, self._rounds.total
-            self._move("round", done, "", eta, f"round {min(done + 1, total)}/{total}")
+            self._bars.move("round", done, "", eta, f"round {min(done + 1, total)}/{total}")
 
     def table(self, parameters: Sequence[Mapping[str, Any]], title: str = "parameters") -> None:
         """Closing table, best identified first, of {name, unit, low, high, mean, sd, truth or None, contraction}."""
@@ -266,9 +266,9 @@ class Console:
 
     def close(self) -> None:
         """Take the progress bars away; a second call does nothing."""
-        if self._progress is not None:
-            self._progress.stop()
-        self._progress, self._bars = None, {}
+        if self._bars is not None:
+            self._bars.close()
+        self._bars = None
 
     # ---- how it is written
 
@@ -303,48 +303,6 @@ class Console:
         self._rich.print(line)
 
     def _bar(self, kind: str, text: str, total: int | None, done: int) -> None:
-        if not self.live:
-            return
-        if self._progress is None:
-            from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn
-
-            columns = (
-                SpinnerColumn(),
-                TextColumn("{task.description:<14}"),
-                BarColumn(self._bar_width),
-                TextColumn("{task.fields[count]}"),
-                TextColumn("{task.fields[eta]}"),
-                TextColumn("{task.fields[note]}"),
-            )
-            self._progress = Progress(*columns, console=self._rich, transient=True)
-            self._progress.start()
-        if kind in self._bars:
-            self._progress.remove_task(self._bars[kind])
-        self._bars[kind] = self._progress.add_task(
-            text, total=total, completed=done, eta="", note="", count=_count(done, total)
-        )
-
-    @property
-    def _bar_width(self) -> int:
-        return 24 if self.width >= 120 else 10
-
-    def _note_room(self) -> int:
-        """Columns beside spinner, description, bar, count and time to go, each as wide as its widest."""
-        said = max(14, *(len(task.description) for task in self._progress.tasks))
-        clocks = [clock for clock in (self._rounds, self._steps) if clock is not None]
-        count = max((len(_count(clock.total, clock.total)) for clock in clocks), default=0)
-        return self.width - (1 + said + self._bar_width + count + len("ETA 59 min 59 s") + 6)
-
-    def _move(self, kind: str, done: int | None, note: str, eta: float | None, text: str | None = None) -> None:
-        if self._progress is None or kind not in self._bars:
-            return
-        said = "" if not eta else f"ETA {duration(eta)}"
-        more: dict[str, Any] = {} if text is None else {"description": text}
-        clock = self._rounds if kind == "round" else self._steps
-        if clock is not None and done is not None:
-            more["count"] = _count(done, clock.total)
-        self._progress.update(self._bars[kind], completed=done, note=escape(note), eta=said, **more)
-
-
-def _count(done: int, total: int | None) -> str:
-    return f"{done}/{total}" if total else ""
+        if self.live:
+            self._bars = self._bars or Bars(self._rich, self.width)
+            self._bars.show(kind, text, total, done)

@@ -65,7 +65,7 @@ def frames(
     """Pictures [T', H, W, 3] of a motion in real time; None where they cannot be made, see `video.record`.
 
     Args:
-        title: first line written over the picture; time and return follow, then `about` {name: value}.
+        title: below the picture, with the time and the return so far; `about` {name: value} is written over its corner.
         half: half as wide and high as set, for the many videos of a training.
     """
     hold = round(HOLD / shown.dt) if shown.end == "terminated" else 0
@@ -79,6 +79,7 @@ def frames(
         width=settings.video_width // (1 + half),
         height=settings.video_height // (1 + half),
         dt=shown.dt,
-        overlay_text={"title": title, **(about or {})},
+        overlay_text=about,
+        title=title,
         captions=[captions[k] for k in rows],
     )

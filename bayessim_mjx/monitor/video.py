@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from bayessim_mjx.errors import UserError
+from bayessim_mjx.monitor import lettering
 from bayessim_mjx.monitor.camera import view_of
 
 _OFF = ("disable", "disabled", "off", "false", "0")
@@ -32,6 +33,7 @@ def record(
     camera: str | int | None = None,
     overlay_text: str | Mapping | Sequence | None = None,
     dt: float | None = None,
+    title: str = "",
     captions: Sequence[str] | None = None,
 ) -> np.ndarray | None:
     """Render qpos [T, nq] (or a list of them, one per world, shown as a grid) to frames [T', H, W, 3] uint8.
@@ -43,7 +45,8 @@ def record(
         camera: name or number of a camera of the model; None: the model's first, else one fitted to the motion.
         overlay_text: lines or {name: value} written into the corner; with several worlds one entry per world.
         dt: seconds between rows of qpos. When given, rows are picked so that the video runs in real time.
-        captions: a line for each row of qpos [T], written below the first line of `overlay_text`; of one world only.
+        title, captions: one world only; a text, and one for each row of qpos [T]. They stand on a strip at the bottom,
+            so that they never hide the robot.
     Returns:
         None, with one warning, where no OpenGL works (or MUJOCO_GL=disable).
     """
@@ -56,9 +59,9 @@ def record(
     picked = [_rows(len(world), dt, fps) for world in worlds]
     worlds = [world[rows] for world, rows in zip(worlds, picked, strict=True)]
     texts = [overlay_text] if len(worlds) == 1 else list(overlay_text or [None] * len(worlds))
-    each = None if captions is None else [captions[row] for row in picked[0]]
+    strip = 0 if captions is None else lettering.strip_of(height)
     try:
-        tiles = _render(mj_model, worlds, width, height, camera)
+        tiles = _render(mj_model, worlds, width, height - strip, camera)
     except Exception as error:  # drivers fail in many ways, and a picture is never worth a run
         if isinstance(error, ValueError):
             raise
@@ -66,7 +69,9 @@ def record(
         tiles = None
     if tiles is None:
         return None
-    frames = _grid([_write_over(tile, text, each) for tile, text in zip(tiles, texts, strict=True)])
+    frames = _grid([lettering.corner(tile, text) for tile, text in zip(tiles, texts, strict=True)])
+    if captions is not None:
+        frames = lettering.underline(frames, strip, title, [captions[row] for row in picked[0]])
     if path is not None:
         save(frames, path, fps)
     return frames
@@ -241,46 +246,6 @@ def _grid(tiles: list[np.ndarray]) -> np.ndarray:
         y, x = (i // columns) * height, (i % columns) * width
         out[:, y : y + height, x : x + width] = tile
     return out
-
-
-def _write_over(
-    frames: np.ndarray, text: str | Mapping | Sequence | None, captions: Sequence[str] | None = None
-) -> np.ndarray:
-    """Write `text` on a light ground into the upper left corner, as many lines as leave the robot in sight.
-
-    `captions` [T] is each frame's own second line.
-    """
-    if not text and not captions:
-        return frames
-    import matplotlib
-    from PIL import Image, ImageDraw, ImageFont
-
-    height, width = frames.shape[1:3]
-    size = max(10, height // 26)
-    font = ImageFont.truetype(os.path.join(matplotlib.get_data_path(), "fonts/ttf/DejaVuSans.ttf"), size)
-    lines = _lines(text or "")
-    fit = max(2, int(0.4 * height / (1.3 * size)) - bool(captions))
-    lines = lines if len(lines) <= fit else [*lines[: fit - 1], f"… {len(lines) - fit + 1} more"]
-    each = ["\n".join(lines)] if captions is None else ["\n".join([*lines[:1], c, *lines[1:]]) for c in captions]
-    ruler, place = ImageDraw.Draw(Image.new("RGB", (1, 1))), (size // 2, size // 3)
-    boxes = [ruler.multiline_textbbox(place, words, font=font) for words in {len(w): w for w in each}.values()]
-    right, low = (int(max(box[k] for box in boxes)) + size // 2 for k in (2, 3))
-    area = (slice(0, min(height, low)), slice(0, min(width, right)))
-    out = np.empty_like(frames)
-    for k, frame in enumerate(frames):
-        out[k] = frame
-        ground = Image.fromarray((0.25 * frame[area] + 0.75 * 255).astype(np.uint8))
-        ImageDraw.Draw(ground).multiline_text(place, each[k % len(each)], font=font, fill=(20, 20, 20))
-        out[k][area] = np.asarray(ground)
-    return out
-
-
-def _lines(text: str | Mapping | Sequence) -> list[str]:
-    """Lines of a text; of a mapping `name value`, the value alone where the name is `title`."""
-    if isinstance(text, Mapping):
-        values = {k: f"{v:.3g}" if isinstance(v, float | np.floating) else str(v) for k, v in text.items()}
-        return [v if k == "title" else f"{k} {v}" for k, v in values.items()]
-    return text.splitlines() if isinstance(text, str) else [str(line) for line in text]
 
 
 def gif(frames: np.ndarray, fps: float) -> bytes:

@@ -118,8 +118,9 @@ def _group(
     """Parameters of one group, elements outside attributes, but for dofs attributes outside elements."""
     kind, allowed = GROUPS[group]
     checks.known(content, allowed, where)
+    content = {attribute: setting or {} for attribute, setting in content.items()}
     available = elements.of_bodies(model, bodies, kind)
-    members = {a: _selected(model, available, kind, a, s or {}, f"{where}.{a}") for a, s in content.items()}
+    members = {a: _selected(model, available, kind, a, s, f"{where}.{a}") for a, s in content.items()}
     if kind == "joint":
         pairs = [(e, a) for a in content for e in members[a]]
     else:

@@ -11,10 +11,9 @@ from bayessim_mjx.monitor.style import new_figure
 from bayessim_mjx.monitor.writer import Writer
 from bayessim_mjx.report.gap_figures import PARTS, part_words, squares
 from bayessim_mjx.report.look import DASH, FAINT, STAGE
-from bayessim_mjx.report.sections import stages_of
+from bayessim_mjx.report.sections import repeated, stages_of
 from bayessim_mjx.report.words import (
     STAGES,
-    VERDICTS,
     candidate_title,
     effect_line,
     finite,
@@ -23,6 +22,7 @@ from bayessim_mjx.report.words import (
     number,
     percent,
     unit,
+    verdict_of,
 )
 
 SHOWN = 4  # overlays in one picture
@@ -53,38 +53,46 @@ def scalars(d: Diagnosis) -> dict[str, float]:
 
 
 def _markdown(d: Diagnosis) -> str:
-    lines = [f"**{VERDICTS[d.verdict].badge}.** {headline(d)}", *d.sentences[1:], *map(effect_line, d.effects)]
+    lines = [f"**{verdict_of(d).badge}.** {headline(d)}", *d.sentences[1:], *map(effect_line, d.effects)]
     return "\n\n".join(lines + [f"Warning: {w}" for w in d.warnings])
 
 
 def pictures(d: Diagnosis) -> dict[str, Any]:
     """{tag: matplotlib Figure} of what there is to draw."""
-    level = squares(stages_of(d))
+    level = squares(_main(d), bool(d.effects))
     scored = [c for c in d.candidates if finite(c.get("score"))][:12]
     overlays = [o for o in d.details.get("overlays") or [] if len(o["time"])][:SHOWN]
-    out = {"waterfall": waterfall(level, stages_of(d))} if level else {}
+    overlays = overlays if d.effects else [{**o, "with_effects": None} for o in overlays]
+    out = {"waterfall": waterfall(level, _main(d))} if level else {}
     out |= {"candidates": candidates(scored)} if scored else {}
     return out | ({"overlays": overlay(overlays)} if overlays else {})
 
 
-def waterfall(level: Mapping[str, float], stages: Mapping[str, float]) -> Any:
+def _main(d: Diagnosis) -> dict[str, Any]:
+    """The stages of the windows' horizon, with what their floor comes from."""
+    return stages_of(d) | {"floor": "repeats" if repeated(d) else "noise"}
+
+
+def waterfall(level: Mapping[str, float], stages: Mapping[str, Any]) -> Any:
     """The squared gap from the delivered simulator down to the noise; roots over the stages."""
     figure = new_figure(8.0, 3.6, layout="constrained")
     axes = figure.subplots()
     bars = [("as delivered", 0.0, level["nominal"], "nominal", number(stages["nominal"]))]
-    before = level["nominal"]
+    before, last = level["nominal"], "with_effects" if "with_effects" in level else "calibrated"
     for stage in (s for s in PARTS if s in level):
         change = level[stage] - before
         low = min(before, level[stage])
-        bars.append((part_words(stage, level), low, abs(change), stage, percent(change, sign=True)))
-        if stage == "with_effects":
-            bars.append(("with effects", 0.0, level[stage], stage, number(stages[stage])))
+        bars.append(
+            (part_words(stage, level, stages.get("floor", "")), low, abs(change), stage, percent(change, sign=True))
+        )
+        if stage == last:
+            bars.append((STAGES[stage], 0.0, level[stage], stage, number(stages[stage])))
         before = level[stage]
     for k, (_, base, height, stage, words) in enumerate(bars):
         axes.bar(k, height, 0.62, base, color=STAGE[stage], edgecolor="black", linewidth=0.5)
         axes.text(k, base + height + 0.02, words, ha="center", va="bottom", fontsize=9)
     axes.set_xticks(range(len(bars)), [b[0].replace(" ", "\n", 1) for b in bars], fontsize=9)
-    axes.set(ylabel="squared gap / delivered", ylim=(0, 1.14))
+    axes.set(ylabel="squared gap / largest", ylim=(0, 1.14))
     return _plain(figure, axes)
 
 

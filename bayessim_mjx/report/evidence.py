@@ -15,18 +15,23 @@ FEWEST_POINTS = 200
 
 def overlays(d: Diagnosis) -> dict[str, Any]:
     """Measured against simulated by log and joint, and every log's gap; beyond the budget the smallest go."""
-    rows = list(d.details.get("overlays") or [])
+    rows = [_told(d, row) for row in d.details.get("overlays") or []]
     most = max(OVERLAY_NUMBERS // (8 * FEWEST_POINTS), 1)
     kept = rows if len(rows) <= most else sorted(rows, key=_worst, reverse=True)[:most]
     points = max(FEWEST_POINTS, min(2000, OVERLAY_NUMBERS // (8 * max(len(kept), 1))))
     keys = [(str(r.get("log", "")), str(r.get("joint", ""))) for r in kept]
     panels = [(key, motion_figures.overlay(r, points)) for key, r in zip(keys, kept, strict=True) if len(r["time"])]
-    lines = d.details.get("episodes") or []
+    lines = [_told(d, row) for row in d.details.get("episodes") or []]
     return {
         "choice": choice(["log", "joint"], panels),
         "left": len(rows) - len(kept),
         "episodes": motion_figures.episodes(lines[:60]) if lines else None,
     }
+
+
+def _told(d: Diagnosis, row: Mapping[str, Any]) -> dict[str, Any]:
+    """A row of motion or gaps without what is not there: no effects, nothing simulated with them."""
+    return {k: v for k, v in row.items() if k != "with_effects" or d.effects}
 
 
 def _worst(row: Mapping[str, Any]) -> float:
@@ -81,9 +86,9 @@ def flexible(d: Diagnosis) -> dict[str, Any]:
     seeds: list[float] = [s for s in found.get("seeds") or [] if finite(s)]
     rows = [
         ("recalibrated simulator", d.gap.calibrated),
-        ("with the named effects", d.gap.with_effects),
+        ("with the named effects", d.gap.with_effects if d.effects else None),
         ("flexible force on the recalibrated simulator", found.get("rms_on_base")),
-        ("flexible force on top of the named effects", found.get("rms_on_winner")),
+        ("flexible force on top of the named effects", found.get("rms_on_winner") if d.effects else None),
     ]
     known = [(n, v) for n, v in rows if finite(v)]
     depends = found.get("depends_on") or []

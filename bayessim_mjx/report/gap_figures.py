@@ -21,38 +21,54 @@ from bayessim_mjx.report.words import STAGES, finite, known_span, label_title, n
 PARTS = {
     "calibrated": "recalibrated parameters",
     "with_effects": "named effects",
-    "reducible_floor": "reducible, unexplained",
-    "noise_floor": "not reproducible",
+    "reducible_floor": "not explained",
+    "noise_floor": "not explained",
 }
-UNKNOWN_FLOOR = "not explained"  # the last part where the reducible floor was not measured
+FLOORS = {"repeats": "differs between repeats", "start": "uncertain start"}  # what lies between floor and noise
+TICKS = [0.0, 0.2, 0.4, 0.6, 0.8, 1.0]
+STEPS = ("nominal", "calibrated", "with_effects")
 
 
-def squares(stages: Mapping[str, Any]) -> dict[str, float]:
-    """Squared gap of each known stage as a share of the delivered simulator's; empty where a needed one is unknown."""
-    if not all(finite(stages.get(s)) for s in ("nominal", "calibrated", "with_effects")) or not stages["nominal"]:
+def squares(stages: Mapping[str, Any], effects: bool = True) -> dict[str, float]:
+    """Squared gap of each known stage as a share of the largest; empty where a needed one is unknown.
+
+    The floor is a stage of its own only where something says what lies between it and the noise.
+    """
+    if not all(finite(stages.get(s)) for s in STEPS) or not stages["nominal"]:
         return {}
-    return {s: (stages[s] / stages["nominal"]) ** 2 for s in STAGES if finite(stages.get(s))}
+    told = [s for s in STAGES if s != "with_effects" or effects]
+    told = [s for s in told if s != "reducible_floor" or stages.get("floor") in FLOORS]
+    return {s: (stages[s] / _largest(stages)) ** 2 for s in told if finite(stages.get(s))}
 
 
-def part_words(stage: str, level: Mapping[str, float]) -> str:
-    return UNKNOWN_FLOOR if stage == "noise_floor" and "reducible_floor" not in level else PARTS[stage]
+def _largest(stages: Mapping[str, Any]) -> float:
+    return float(max(stages[s] for s in STEPS))
+
+
+def part_words(stage: str, level: Mapping[str, float], floor: str = "") -> str:
+    """What is between a stage and the one before."""
+    return FLOORS[floor] if stage == "noise_floor" and "reducible_floor" in level else PARTS[stage]
 
 
 def waterfall(
-    stages: Mapping[str, Any], shares: Sequence[Mapping[str, Any]], ci: Mapping[str, Any] | None = None
+    stages: Mapping[str, Any], shares: Sequence[Mapping[str, Any]], effects: bool = True
 ) -> dict[str, Any] | None:
     """Bars from the delivered simulator's squared gap down to the noise; `shares` (Shapley) split the effects' part.
+
+    Args:
+        stages: one horizon; effects: whether there are any.
 
     Returns:
         None where a stage is unknown.
     """
-    level = squares(stages)
+    level, ci = squares(stages, effects), stages.get("ci")
     if not level:
         return None
+    last, words = ("with_effects", "with the effects") if effects else ("calibrated", "recalibrated")
     columns = [_total("as delivered", "nominal", stages, level, ci), _drop("calibrated", level)]
-    columns += _effects(shares, level)
-    columns += [_total("with the effects" if shares else "left", "with_effects", stages, level, ci)]
-    columns += [_drop(s, level) for s in ("reducible_floor", "noise_floor") if s in level]
+    columns += _effects(shares, level) if effects else []
+    columns += [_total(words, last, stages, level, ci)]
+    columns += [_drop(s, level, stages.get("floor", "")) for s in ("reducible_floor", "noise_floor") if s in level]
     columns += [_total("measurement noise", "noise_floor", stages, level, ci)] if "noise_floor" in level else []
     xs = list(range(len(columns)))
     sure = [k for k, c in enumerate(columns) if any(c["error"])]
@@ -108,6 +124,7 @@ def waterfall(
         [bars, spans],
         WIDTH,
         350,
+        least=100 * len(columns) + 80,
         shapes=links,
         annotations=marks,
         xaxis=axis(
@@ -118,14 +135,16 @@ def waterfall(
             tickangle=0,
             range=[-0.5, len(xs) - 0.5],
         ),
-        yaxis=axis("squared gap, share of the delivered", tickformat=".0%", range=[0, max(1.12, 1.1 * max(tops))]),
+        yaxis=axis(
+            "squared gap, share of the largest", tickvals=TICKS, tickformat=".0%", range=[0, max(1.12, 1.1 * max(tops))]
+        ),
         margin={"l": 70, "r": 10, "t": 12, "b": 64},
     )
 
 
 def _total(words: str, stage: str, stages: Mapping[str, Any], level: Mapping[str, float], ci: Any) -> dict[str, Any]:
     span = known_span((ci or {}).get(stage))
-    ends = [(s / stages["nominal"]) ** 2 for s in span] if span else [level[stage]] * 2
+    ends = [(s / _largest(stages)) ** 2 for s in span] if span else [level[stage]] * 2
     between = f" ({number(span[0])} to {number(span[1])})" if span else ""
     return {
         "x": _wrap(words, 13),
@@ -147,8 +166,8 @@ def _above(stage: str, level: Mapping[str, float]) -> float:
     return level[order[order.index(stage) - 1]]
 
 
-def _drop(stage: str, level: Mapping[str, float]) -> dict[str, Any]:
-    return _step(part_words(stage, level), stage, _above(stage, level), level[stage])
+def _drop(stage: str, level: Mapping[str, float], floor: str = "") -> dict[str, Any]:
+    return _step(part_words(stage, level, floor), stage, _above(stage, level), level[stage])
 
 
 def _step(words: str, stage: str, top: float, end: float) -> dict[str, Any]:
@@ -163,7 +182,7 @@ def _step(words: str, stage: str, top: float, end: float) -> dict[str, Any]:
         "hatch": HATCH[stage],
         "label": label,
         "error": (0.0, 0.0),
-        "hover": f"{words}: {label} of the delivered simulator's squared gap",
+        "hover": f"{words}: {label} of the largest squared gap",
     }
 
 
@@ -191,20 +210,18 @@ def _wrap(words: str, width: int) -> str:
     return "<br>".join(lines)
 
 
-def horizons(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
+def horizons(rows: Sequence[Mapping[str, Any]], effects: bool = True) -> dict[str, Any] | None:
     """Each horizon's squared gap as one bar of 100 %, cut into what closes which part."""
-    known = [(str(r.get("name", "")), squares(r)) for r in rows]
-    known = [(name, level) for name, level in known if level][::-1]
+    known = [(str(r.get("name", "")), r.get("floor", ""), squares(r, effects)) for r in rows]
+    known = [row for row in known if row[2]][::-1]
     if len(known) < 2:
         return None
-    names = [text(name) for name, _ in known]
-    first = known[0][1]
-    parts = [(part_words(s, first), s, HATCH[s]) for s in PARTS if all(s in level for _, level in known)]
-    parts += [("measurement noise", "", "")] if "noise_floor" in first else []
+    names = [text(name) for name, _, _ in known]
+    cuts = [_cuts(level, floor) for _, floor, level in known]
+    parts = list(dict.fromkeys(key for key in ORDER if any(key in c for c in cuts)))
     data = []
-    for words, part, hatch in parts:
-        sizes = [max(_above(part, level) - level[part], 0.0) if part else level["noise_floor"] for _, level in known]
-        stage = part or "noise_floor"
+    for words, stage in parts:
+        sizes, hatch = [c.get((words, stage), 0.0) for c in cuts], HATCH[stage] if words != LAST[0] else ""
         data.append(
             {
                 "type": "bar",
@@ -230,7 +247,7 @@ def horizons(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
     return figure(
         data,
         WIDTH,
-        84 + 34 * len(known),
+        98 + 34 * len(known),
         barmode="stack",
         showlegend=True,
         margin={"l": 90, "r": 20, "t": 34, "b": 30},
@@ -245,3 +262,23 @@ def horizons(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
             "font": {"size": 12},
         },
     )
+
+
+LAST = ("measurement noise", "noise_floor")
+ORDER = (
+    (PARTS["calibrated"], "calibrated"),
+    (PARTS["with_effects"], "with_effects"),
+    (PARTS["noise_floor"], "reducible_floor"),
+    *((words, "noise_floor") for words in FLOORS.values()),
+    LAST,
+)
+
+
+def _cuts(level: Mapping[str, float], floor: str) -> dict[tuple[str, str], float]:
+    """{(words, stage of the colour): part of one bar}; a stage that makes the gap larger takes no part of it."""
+    out = {}
+    for stage in (s for s in PARTS if s in level):
+        words = part_words(stage, level, floor)
+        key = (words, "reducible_floor" if words == PARTS["noise_floor"] else stage)
+        out[key] = max(_above(stage, level) - level[stage], 0.0)
+    return out | ({LAST: level["noise_floor"]} if "noise_floor" in level else {})

@@ -26,7 +26,8 @@ DASH = {"nominal": "dot", "calibrated": "dash", "with_effects": "solid", "measur
 HATCH = {"nominal": "", "calibrated": "", "with_effects": "", "reducible_floor": "/", "noise_floor": "."}
 OVER = {"fillmode": "overlay", "fgcolor": "white", "size": 6}  # hatching over the colour
 FONT = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', Arial, sans-serif"
-WIDTH = 960  # of the page's column, px: fixed, so that screen and paper are laid out alike
+WIDTH = 960  # of the page's column on a wide screen and on paper, px
+LEAST = 560  # px, of most figures on a narrow one
 
 
 def text(value: Any, length: int = 60) -> str:
@@ -63,8 +64,11 @@ def axis(title: str = "", **more: Any) -> dict[str, Any]:
     return base | more
 
 
-def figure(data: list[dict], width: int, height: int, **layout: Any) -> dict[str, Any]:
-    """{"data", "layout", "width", "height"} of one figure, without plotly's own colours, title or legend box."""
+def figure(data: list[dict], width: int, height: int, *, least: int = LEAST, **layout: Any) -> dict[str, Any]:
+    """{"data", "layout", "width", "height", "least"} of one figure, without plotly's own colours, title or legend box.
+
+    least: px, the width below which it cannot be read; narrower screens scroll.
+    """
     base = {
         "width": width,
         "height": height,
@@ -82,7 +86,7 @@ def figure(data: list[dict], width: int, height: int, **layout: Any) -> dict[str
         "dragmode": "zoom",
         "hovermode": "closest",
     }
-    return {"data": data, "layout": base | layout, "width": width, "height": height}
+    return {"data": data, "layout": base | layout, "width": width, "height": height, "least": min(least, width)}
 
 
 def log_ticks(values: Sequence[Any]) -> list[float]:

@@ -35,7 +35,7 @@ def episodes(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     names = [text(r.get("log", k), 42) for k, r in enumerate(rows)]
     names = [n + _condition(r) for n, r in zip(names, rows, strict=True)]
     at = list(range(len(rows)))
-    stages = ("nominal", "calibrated", "with_effects")
+    stages = [s for s in ("nominal", "calibrated", "with_effects") if any(finite(r.get(s)) for r in rows)]
     values = {s: numbers([r.get(s) for r in rows]) for s in stages}
     spans = [[v for s in stages if (v := values[s][k]) is not None] for k in at]
     lines = {
@@ -47,7 +47,7 @@ def episodes(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         "x": [x for s in spans for x in ((min(s), max(s), None) if s else (None,))],
         "y": [y for k, s in enumerate(spans) for y in ((k, k, None) if s else (None,))],
     }
-    symbols = dict(zip(stages, ("circle-open", "diamond", "circle"), strict=True))
+    symbols = {"nominal": "circle-open", "calibrated": "diamond", "with_effects": "circle"}
     dots = [
         {
             "type": "scatter",
@@ -126,6 +126,7 @@ def overlay(row: Mapping[str, Any], points: int = 2000) -> dict[str, Any]:
         data,
         WIDTH,
         430,
+        least=640,
         showlegend=True,
         hovermode="x unified",
         shapes=ticks if len(ticks) <= 60 else [],

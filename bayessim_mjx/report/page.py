@@ -43,6 +43,7 @@ def render(d: Diagnosis) -> str:
         stage_colours=STAGE,
         verdict=d.verdict,
         top=sections.top(d),
+        about=sections.about(d),
         gap=sections.how_far(d),
         effects=sections.effects(d),
         candidates=sections.candidates(d),

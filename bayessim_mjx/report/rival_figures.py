@@ -72,6 +72,7 @@ def groups(
         data,
         WIDTH if columns == 3 else 320 * columns,
         height,
+        least=240 * columns,
         annotations=titles,
         shapes=levels,
         margin={"l": 60, "r": 10, "t": 28, "b": 46},
@@ -149,6 +150,7 @@ def isolability(labels: Sequence[str], cosine: Sequence[Sequence[float]], absorb
         [heat, bars],
         width,
         round(side + 34 + foot),
+        least=width,
         annotations=[*over, *values],
         xaxis=axis(
             domain=[0, split[0]],

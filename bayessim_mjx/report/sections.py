@@ -10,8 +10,8 @@ from bayessim_mjx.report.look import STAGE
 from bayessim_mjx.report.words import (
     MISSING,
     STAGES,
-    VERDICTS,
     candidate_title,
+    closure,
     effect_line,
     effect_title,
     estimate,
@@ -20,10 +20,13 @@ from bayessim_mjx.report.words import (
     headline,
     known_span,
     label_title,
+    length,
     number,
     percent,
     quantity,
-    unit,
+    small,
+    stages_told,
+    verdict_of,
 )
 
 MOST_CANDIDATES = 20
@@ -31,22 +34,20 @@ TILES = {
     "nominal": "gap as delivered",
     "calibrated": "after recalibrating",
     "with_effects": "with the effects",
-    "reducible_floor": "reducible floor",
+    "reducible_floor": "what repeats differ by",
 }
 
 
 def top(d: Diagnosis) -> dict[str, Any]:
     """Verdict, sentences, what to do next and the key numbers."""
-    verdict = VERDICTS[d.verdict]
+    verdict = verdict_of(d)
     stages = stages_of(d)
-    tiles = [
-        {"words": TILES[s], "value": number(stages[s]), "unit": "noise sd", "colour": STAGE[s]}
-        for s in ("nominal", "calibrated", "with_effects", "reducible_floor")
-        if finite(stages[s]) and (s != "with_effects" or d.effects or stages[s] != stages["calibrated"])
-    ]
+    told = [s for s in TILES if s in stages_told(d) and finite(stages[s]) and (s != "reducible_floor" or repeated(d))]
+    tiles = [{"words": TILES[s], "colour": STAGE[s], **_tile(d, s)} for s in told]
     closed = gap_closed(stages)
     if finite(closed):
-        tiles.append({"words": "reducible gap closed", "value": percent(closed), "unit": "", "colour": "#1f2429"})
+        words = f"of the squared gap {'that repeats' if repeated(d) else 'above the noise'} closed"
+        tiles.append({"words": words, "value": percent(closed), "unit": "", "below": "", "colour": "#1f2429"})
     found = [{"line": effect_line(e), "rivals": len(e.equivalent_to)} for e in d.effects]
     return {
         "badge": verdict.badge,
@@ -58,6 +59,38 @@ def top(d: Diagnosis) -> dict[str, Any]:
         "found": found,
         "warnings": len(d.warnings),
     }
+
+
+def _tile(d: Diagnosis, stage: str) -> dict[str, str]:
+    """A stage's gap: of one joint in its unit, of several as a share of the motion; noise sd below."""
+    noises = f"{number(getattr(d.gap, stage))} noise sd"
+    rows = [r for r in d.gap.physical.values() if finite(r.get(stage))]
+    part = d.gap.shares.get(stage)
+    if len(rows) == len(d.gap.physical) == 1:
+        value, _, unit_ = length(rows[0][stage], rows[0]["unit"]).partition(" ")
+        parts = [f"{small(part)} of the motion", noises] if finite(part) else [noises]
+        return {"value": value, "unit": unit_, "below": ", ".join(parts)}
+    if finite(part):
+        return {"value": small(part), "unit": "", "below": f"of the motion, {noises}"}
+    return {"value": number(getattr(d.gap, stage)), "unit": "noise sd", "below": ""}
+
+
+def repeated(d: Diagnosis) -> bool:
+    """Whether the reducible floor is known from runs that were repeated."""
+    return any(h.get("floor") == "repeats" for h in d.gap.horizons)
+
+
+def about(d: Diagnosis) -> list[str]:
+    """What was diagnosed, from what, and when: short phrases."""
+    a = d.about
+    data = [str(p) for p in a.get("data") or []]
+    where_ = f" in {', '.join(data[:3])}" + (f" and {len(data) - 3} more" if len(data) > 3 else "") if data else ""
+    logs = f"{a['logs']} log{'s' if a['logs'] != 1 else ''}" if a.get("logs") else "logs"
+    size = [f"{number(a['seconds'])} s"] if finite(a.get("seconds")) else []
+    size += [f"{a['conditions']} operating conditions"] if (a.get("conditions") or 0) > 1 else []
+    return [
+        text for text in (a.get("robot"), f"{logs}{where_}" if data else "", ", ".join(size), a.get("date")) if text
+    ]
 
 
 def stages_of(d: Diagnosis) -> dict[str, float]:
@@ -77,41 +110,54 @@ def how_far(d: Diagnosis) -> dict[str, Any]:
     rows: list[dict[str, Any]] = [{"name": "overall", **stages}]
     same = [h for h in d.gap.horizons if all(h.get(s) == stages[s] for s in ("nominal", "with_effects"))]
     rows = list(d.gap.horizons) if same else rows + list(d.gap.horizons)
-    falls = [(str(r["name"]), f) for r in rows if (f := gap_figures.waterfall(r, shares, r.get("ci")))]
+    falls = [(str(r["name"]), f) for r in rows if (f := gap_figures.waterfall(r, shares, bool(d.effects)))]
     start = next((k for k, (name, _) in enumerate(falls) if same and name == str(same[0]["name"])), 0)
     return {
         "choice": choice(["horizon"], [((name,), f) for name, f in falls], start),
-        "horizons": gap_figures.horizons(d.gap.horizons),
-        "table": _table([_stages_row(str(r["name"]), r, r.get("ci") or {}) for r in rows if finite(r.get("nominal"))]),
-        "channels": _table(_channels(d)),
+        "horizons": gap_figures.horizons(d.gap.horizons, bool(d.effects)),
+        "table": _table(d, [_stages_row(r, len(d.gap.physical)) for r in rows if finite(r.get("nominal"))]),
+        "channels": _table(d, _channels(d)),
+        "repeated": repeated(d),
+        "beyond": bool(d.gap.beyond),
         "shapley": _shapley(d.details.get("shapley") or []),
         "closure": _closure(d.details.get("closure") or []),
         "unit": d.gap.unit,
     }
 
 
-def _stages_row(name: str, row: Mapping[str, Any], ci: Mapping[str, Any]) -> dict[str, Any]:
-    cells = {}
+def _stages_row(row: Mapping[str, Any], joints: int) -> dict[str, Any]:
+    """One horizon: the joint's error or the share of the motion, and noise sd with their interval below."""
+    own = next(iter((row.get("physical") or {}).values()), {}) if joints == 1 else {}
+    shares, cells = row.get("shares") or {}, {}
     for stage in STAGES:
-        span = known_span(ci.get(stage))
-        between = f"{number(span[0])} – {number(span[1])}" if span else ""
-        cells[stage] = {"value": number(row.get(stage)), "between": between}
-    return {"name": name, "cells": cells, "closed": percent(gap_closed(row))}
+        span = known_span((row.get("ci") or {}).get(stage))
+        noises = number(row.get(stage)) + (f" ({number(span[0])} – {number(span[1])})" if span else "")
+        value = length(own.get(stage), own.get("unit", "")) if own else small(shares.get(stage))
+        known = value != MISSING
+        cells[stage] = {"value": value, "between": f"{noises} sd"} if known else {"value": noises, "between": ""}
+    return {"name": str(row["name"]), "cells": cells, "closed": percent(gap_closed(row)), "more": [], "beyond": False}
 
 
-def _table(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Rows and those of the stages that some row knows."""
-    known = [s for s in STAGES if any(r["cells"][s]["value"] != MISSING for r in rows)]
-    return {"rows": rows, "stages": known, "closed": any(r["closed"] != MISSING for r in rows)}
+def _table(d: Diagnosis, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Rows and those of the stages that some row knows; the floor where runs were repeated, the noise is 1 sd."""
+    told = {s for s in stages_told(d) if s != "noise_floor" and (s != "reducible_floor" or repeated(d))}
+    known = [s for s in STAGES if s in told and any(r["cells"][s]["value"] != MISSING for r in rows)]
+    return {"rows": rows, "stages": known, "closed": any(r["closed"] != MISSING for r in rows), "heads": MORE}
+
+
+MORE = ("largest that is left", "tolerance", "range of motion", "noise")
 
 
 def _channels(d: Diagnosis) -> list[dict[str, Any]]:
-    rows = [_stages_row(k, v, {}) for k, v in d.gap.by_channel.items()]
-    for row in rows:
-        physical = d.gap.physical.get(row["name"], {})
-        for stage, cell in row["cells"].items():
-            if finite(physical.get(stage)) and physical.get("unit"):
-                cell["between"] = f"{number(physical[stage])} {unit(physical['unit'])}"
+    rows = []
+    for name, noises in d.gap.by_channel.items():
+        physical = d.gap.physical.get(name, {})
+        row = _stages_row({"name": name, **noises, "physical": {name: physical}}, 1 if physical else 0)
+        keys = ("largest", "tolerance", "motion", "noise")
+        known = any(finite(physical.get(k)) for k in keys)
+        row["more"] = [length(physical.get(k), physical.get("unit", "")) for k in keys] if known else []
+        row["beyond"] = bool(physical.get("beyond"))
+        rows.append(row)
     return rows
 
 
@@ -194,7 +240,7 @@ def candidates(d: Diagnosis) -> dict[str, Any]:
                 "score": number(score),
                 "se": number(se) if se else "",
                 "chosen": chosen,
-                "closed": percent(c.get("gap_closed")),
+                "closed": closure(c.get("gap_closed")),
                 "absorbed": percent(c.get("absorbed")),
                 "values": "; ".join(_value(n, v) for n, v in _own(c).items() if n not in d.parameters),
                 "mark": marks.interval(score, spans[0], limits, colour, (0.0,), inner=spans[1]),

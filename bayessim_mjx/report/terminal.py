@@ -9,9 +9,8 @@ from bayessim_mjx.monitor.tables import TIE
 from bayessim_mjx.report.sections import between, stages_of
 from bayessim_mjx.report.words import (
     MISSING,
-    STAGES,
-    VERDICTS,
     candidate_title,
+    closure,
     effect_title,
     estimate,
     finite,
@@ -19,6 +18,8 @@ from bayessim_mjx.report.words import (
     number,
     percent,
     quantity,
+    stages_told,
+    verdict_of,
 )
 
 BEST = 8
@@ -45,7 +46,7 @@ def console(
         headless: no control characters, as where there is no terminal.
     """
     with Console(file=file, headless=headless) as out:
-        out.panel(VERDICTS[diagnosis.verdict].badge, _verdict(diagnosis), COLOURS[diagnosis.verdict])
+        out.panel(verdict_of(diagnosis).badge, _verdict(diagnosis), COLOURS[diagnosis.verdict])
         for table in (_effects, _parameters, _places, _candidates):
             header, rows, words = table(diagnosis)
             if rows:
@@ -64,12 +65,12 @@ def console(
 
 def _verdict(d: Diagnosis) -> list[tuple[str, str]]:
     """Lines of (text, style)."""
-    known = [f"{STAGES[s]} {number(v)}" for s, v in stages_of(d).items() if finite(v)]
+    known = [f"{stages_told(d)[s]} {number(v)}" for s, v in stages_of(d).items() if finite(v) and s in stages_told(d)]
     lines = [(headline(d), "bold"), *((sentence, "") for sentence in d.sentences[1:])]
     if known:
         lines.append(("gap in noise standard deviations: " + ", ".join(known), ""))
     lines += [(line, "") for line in _longest(d)]
-    return [*lines, (VERDICTS[d.verdict].advice, "dim")]
+    return [*lines, (verdict_of(d).advice, "dim")]
 
 
 def _longest(d: Diagnosis) -> list[str]:
@@ -77,7 +78,7 @@ def _longest(d: Diagnosis) -> list[str]:
     last = d.gap.horizons[-1] if d.gap.horizons else {}
     if not last or last.get("nominal") == d.gap.nominal:
         return []
-    known = [f"{STAGES[s]} {number(last[s])}" for s in STAGES if finite(last.get(s))]
+    known = [f"{words} {number(last[s])}" for s, words in stages_told(d).items() if finite(last.get(s))]
     return [f"{last['name']} ({number(last.get('seconds'), 2)} s): " + ", ".join(known)]
 
 
@@ -128,5 +129,5 @@ def _candidates(d: Diagnosis) -> Table:
     rows = []
     for k, c in enumerate(d.candidates[:BEST], 1):
         se = number(c.get("se")) if finite(c.get("se")) else MISSING
-        rows.append([f"{k} {candidate_title(c)}", number(c.get("score")), se, percent(c.get("gap_closed"))])
+        rows.append([f"{k} {candidate_title(c)}", number(c.get("score")), se, closure(c.get("gap_closed"))])
     return ["candidate", "held-out score", "standard error", "gap closed"], rows, (0,)

@@ -8,6 +8,7 @@ from typing import Any
 from bayessim_mjx import quantities
 from bayessim_mjx.diagnosis.nouns import EFFECTS
 from bayessim_mjx.diagnosis.result import Diagnosis, Estimate, FoundEffect
+from bayessim_mjx.diagnosis.tolerance import extent
 from bayessim_mjx.quantities import MISSING, SUPERSCRIPT, finite
 
 # quantities that are easier to read as their reciprocal
@@ -44,7 +45,8 @@ VERDICTS = {
     "parameters": Verdict(
         "Parameters only",
         "Recalibrating what the simulator already has closes the gap; nothing is missing.",
-        "Take over the recalibrated parameters below; no effect needs to be added.",
+        "Take over the recalibrated parameters listed below: pass effects=effects.yaml, which holds them, to main, "
+        "train or play. No effect needs to be added.",
     ),
     "effects": Verdict(
         "Missing effects found",
@@ -68,6 +70,40 @@ VERDICTS = {
         "Repair or extend the logs as the warnings below say, and diagnose again.",
     ),
 }
+
+
+PARTLY = Verdict(
+    "Partly explained",
+    "The named effects leave more of the gap than is tolerated.",
+    "Pass effects=effects.yaml to main, train or play for what was found. For the rest, look at where the remaining "
+    "force acts, below, and give the cause as an effect of your own (--effects file.py:Name); or allow more with "
+    "--tolerance.",
+)
+
+
+def verdict_of(d: Diagnosis) -> Verdict:
+    """The verdict's words; an unexplained rest beside named effects has its own."""
+    return PARTLY if d.verdict == "unexplained" and d.effects else VERDICTS[d.verdict]
+
+
+def stages_told(d: Diagnosis) -> dict[str, str]:
+    """The stages that are there to be told: without effects nothing is simulated with them."""
+    return {s: words for s, words in STAGES.items() if s != "with_effects" or d.effects}
+
+
+def length(value: Any, in_unit: str) -> str:
+    """An error in degrees, millimetres or metres, see `tolerance.extent`."""
+    return extent(value, in_unit).replace("-", "−") if finite(value) else MISSING
+
+
+def small(share: Any) -> str:
+    """A share with two digits, `0.16 %`: of a motion, of which little is left."""
+    return quantities.fixed(100 * share, 2) + " %" if finite(share) and 0 < share < 0.00995 else percent(share)
+
+
+def closure(share: Any) -> str:
+    """A share of the gap closed; a model that widens it closes none."""
+    return "none, it is worse" if finite(share) and share < -0.0005 else percent(share)
 
 
 def known_span(span: Any) -> tuple[float, float] | None:
@@ -162,7 +198,7 @@ def effect_line(effect: FoundEffect) -> str:
 
 
 def headline(diagnosis: Diagnosis) -> str:
-    return diagnosis.sentences[0] if diagnosis.sentences else VERDICTS[diagnosis.verdict].headline
+    return diagnosis.sentences[0] if diagnosis.sentences else verdict_of(diagnosis).headline
 
 
 def gap_closed(stages: Mapping[str, Any]) -> float:

@@ -114,8 +114,6 @@ def test_a_file_of_before_is_read_and_its_probability_told_as_a_weight(rubbing, 
         np.testing.assert_equal(result.load(tmp_path).effects[0].weight_among_rivals, expected)
 
 
-@pytest.mark.slow
-@pytest.mark.ci
 def test_wrong_known_parameters_are_no_effect(tmp_path):
     _, diagnosis = diagnosed(tmp_path, recorded(scale=WRONG, seed=1))
     assert diagnosis.verdict == "parameters" and diagnosis.effects == []
@@ -126,8 +124,6 @@ def test_wrong_known_parameters_are_no_effect(tmp_path):
         assert not found["structural"], name
 
 
-@pytest.mark.slow
-@pytest.mark.ci
 def test_nothing_wrong_is_no_gap(tmp_path):
     _, diagnosis = diagnosed(tmp_path, recorded(seed=2))
     assert diagnosis.verdict == "no_gap" and diagnosis.effects == []

@@ -106,6 +106,10 @@ BAD = {
     "solver": ({"option": 'solver="PGS"'}, r"a\.xml: MJX cannot simulate this model: mjtSolver.mjSOL_PGS .use CG"),
     "timestep": ({"option": 'timestep="0"'}, r"a\.xml: <option timestep> = 0; allowed: seconds > 0"),
     "nan": ({"option": 'timestep="nan"'}, r"a\.xml: <option timestep> = nan; allowed: seconds > 0"),
+    "gain": (
+        {"rest": MOTOR.replace("/>", ' gear="nan"/>')},
+        r"a\.xml: numbers that are not finite in .*actuator_gear.*; allowed: finite",
+    ),
     "gear": ({"rest": MOTOR.replace("/>", ' gear="0"/>')}, r"a\.xml: gear = 0 of every actuator \(m\)"),
     "line": ({"world": "<geom typ='box'/>"}, r"a\.xml: MuJoCo cannot load it: .*typ.*line 6"),
     "size": ({"world": '<geom type="box"/>'}, r"a\.xml: MuJoCo cannot compile it: .*size"),

@@ -37,9 +37,7 @@ def trained(space: ParameterSpace, **options):
     "options",
     [
         {"modelClass": "MDRFF"},
-        pytest.param(
-            {"modelClass": "MDRFF_Matern32_median", "fullCovariance": False}, marks=[pytest.mark.slow, pytest.mark.ci]
-        ),
+        {"modelClass": "MDRFF_Matern32_median", "fullCovariance": False},
     ],
     ids=lambda o: " ".join(map(str, o.values())),
 )

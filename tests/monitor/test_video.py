@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from bayessim_mjx.monitor import video
+from bayessim_mjx.monitor import lettering, video
 from bayessim_mjx.monitor.camera import view_of
 
 PENDULUM = """<mujoco><worldbody><body name="pole"><joint type="hinge" axis="0 1 0"/>
@@ -128,26 +128,28 @@ def test_odd_sizes_become_an_mp4(tmp_path):
     assert imageio.imread(tmp_path / "a.mp4", plugin="FFMPEG").shape == (6, 32, 46, 3)
 
 
-def letters(frame, rows):
-    """How many dark pixels there are in the upper left corner's `rows`."""
-    return int((frame[rows, : frame.shape[1] // 2].max(-1) < 90).sum())
+def letters(part):
+    """How many dark pixels there are."""
+    return int((part.max(-1) < 90).sum())
 
 
-def test_every_frame_carries_its_own_caption_below_the_title():
+def test_title_and_captions_stand_on_a_strip_below_the_picture():
     blank = np.full((3, 240, 320, 3), 200, np.uint8)
-    frames = video._write_over(blank, {"title": "Pendulum", "mass": 1.5}, ["0.00 s", "0.10 s", ""])
-    first, second, third = (slice(3 + 13 * k, 3 + 13 * (k + 1)) for k in range(3))
-    assert all(letters(frame, first) > 20 and letters(frame, third) > 20 for frame in frames)
-    assert letters(frames[0], second) > 20 and letters(frames[2], second) == 0
-    assert (frames[0] != frames[1]).any() and (frames[:, 120:] == 200).all()
+    frames = lettering.underline(blank, 16, "Pendulum, round 2", ["0.00 s    return 0", "0.10 s    return -3", ""])
+    assert frames.shape == (3, 256, 320, 3) and (frames[:, :240] == 200).all()  # nothing of the picture is hidden
+    title, caption = frames[:, 240:, :160], frames[:, 240:, 160:]
+    assert all(letters(t) > 40 for t in title) and (title[0] == title[1]).all()
+    assert letters(caption[0]) > 40 and (caption[0] != caption[1]).any() and letters(caption[2]) == 0
+    long = lettering.underline(blank, 16, 20 * "long ", ["9.99 s    return -1234.5    terminated"] * 3)
+    assert letters(long[0, 240:, :4]) == 0 == letters(long[0, 240:, -4:])  # smaller letters, both ends free
 
 
 def test_captions_follow_the_rows_that_are_picked(monkeypatch):
     drawn = {}
     monkeypatch.setattr(video, "_render", lambda m, worlds, w, h, c: [np.zeros((len(worlds[0]), h, w, 3), np.uint8)])
-    monkeypatch.setattr(video, "_write_over", lambda frames, text, captions: drawn.setdefault("c", captions) and frames)
-    video.record(model(PENDULUM), np.zeros((5, 1)), fps=5, dt=0.1, captions=list("abcde"))
-    assert drawn["c"] == ["a", "c"]  # half a second at 5 frames a second: seconds 0 and 0.2
+    monkeypatch.setattr(video.lettering, "underline", lambda frames, *rest: drawn.setdefault("rest", rest) and frames)
+    video.record(model(PENDULUM), np.zeros((5, 1)), fps=5, dt=0.1, title="P", captions=list("abcde"))
+    assert drawn["rest"] == (15, "P", ["a", "c"])  # half a second at 5 frames a second: seconds 0 and 0.2
     with pytest.raises(ValueError, match="2 captions for 1 world"):
         video.record(model(PENDULUM), np.zeros((5, 1)), captions=["a", "b"])
 
@@ -197,4 +199,4 @@ def test_films_have_the_size_that_is_set_and_trainings_half_of_it(monkeypatch):
     assert [(more["width"], more["height"]) for _, more in asked] == [(960, 720), (480, 360)]
     length, more = asked[0]
     assert length == 4 + 10 == len(more["captions"])  # the last pose stays for a second
-    assert more["overlay_text"] == {"title": "Pendulum, surrogate real", "mass": 2}
+    assert more["overlay_text"] == {"mass": 2} and more["title"] == "Pendulum, surrogate real"

@@ -249,6 +249,8 @@ def full():
             "seconds": s,
             **dict(zip(stages, v, strict=True)),
             "ci": {k: [0.9 * x, 1.12 * x] for k, x in zip(stages, v, strict=True)},
+            "floor": "start" if n == "whole log" else "repeats",
+            "shares": {k: x / 1200 for k, x in zip(stages, v, strict=True)},
         }
         for (n, v), s in zip(rows.items(), (0.1, 0.25, 4.0), strict=True)
     ]
@@ -265,8 +267,11 @@ def full():
         },
         horizons=horizons,
         physical={
-            j: dict(zip(stages, (0.041, 0.029, 0.0051, 0.0043, 0.003), strict=True)) | {"unit": "rad"} for j in JOINTS
+            j: dict(zip(stages, (0.041, 0.029, 0.0051, 0.0043, 0.003), strict=True))
+            | {"unit": "rad", "noise": 0.003, "motion": 1.9, "tolerance": 0.038, "largest": 0.021, "beyond": False}
+            for j in JOINTS
         },
+        shares={"nominal": 0.0178, "calibrated": 0.0109, "with_effects": 0.0016},
     )
     parameters = {
         f"{j}.{p}": {
@@ -351,6 +356,14 @@ def full():
             "command": "python -m bayessim_mjx.diagnose --model arm.xml --data logs/ --seed 0",
         },
         details(),
+        about={
+            "robot": "arm",
+            "data": ["logs/2026-11"],
+            "logs": 6,
+            "seconds": 48.0,
+            "conditions": 3,
+            "date": "2026-11-22 18:30",
+        },
     )
 
 

@@ -165,3 +165,69 @@ def test_many_links_of_the_chain_become_a_table(tmp_path):
     )
     assert not page.open and "effort → motion wrist" in page.text
     assert not [a for _, a in page.tags if a.get("class") == "chain"]
+
+
+def rendered(diagnosis, tmp_path):
+    return Page(report.write(diagnosis, tmp_path).read_text(encoding="utf-8"))
+
+
+def test_the_header_says_what_was_diagnosed_and_when(page):
+    for words in ("arm", "6 logs in logs/2026-11", "48.0 s, 3 operating conditions", "2026-11-22 18:30"):
+        assert words in page.text[:600]
+
+
+def test_the_page_is_as_wide_as_the_screen(page):
+    (viewport,) = [a["content"] for tag, a in page.tags if tag == "meta" and a.get("name") == "viewport"]
+    assert viewport.startswith("width=device-width")
+    assert all(f["least"] <= f["width"] for f in page.figures)
+    tables = sum(tag == "table" for tag, _ in page.tags)
+    assert tables == sum(a.get("class") == "scroll" for _, a in page.tags) > 5
+
+
+def test_without_effects_nothing_is_drawn_with_them(tmp_path):
+    told = dataclasses.replace(fake.full(), verdict="parameters", effects=[], sentences=[])
+    page = rendered(told, tmp_path)
+    assert "with effects" not in page.text and "with the named effects" not in page.text
+    names = [t.get("name") for f in page.figures for t in f["data"]]
+    assert "recalibrated" in names and not {"with effects", "named effects"} & set(names)
+    assert "pass effects=effects.yaml" in page.text
+
+
+def test_no_bar_is_longer_than_its_scale(tmp_path):
+    """Recalibration may make held-out motion worse; a candidate may too."""
+    whole = fake.full()
+    worse = [h | {"calibrated": 1.7 * h["nominal"], "ci": {}} for h in whole.gap.horizons]
+    gap = dataclasses.replace(whole.gap, calibrated=1.7 * whole.gap.nominal, horizons=worse)
+    candidates = [*whole.candidates, whole.candidates[1] | {"gap_closed": -2.49}]
+    page = rendered(dataclasses.replace(whole, gap=gap, candidates=candidates), tmp_path)
+    stacked = [f for f in page.figures if f["layout"].get("barmode") == "stack"]
+    assert len(stacked) == 1
+    for k in range(len(worse)):
+        assert sum(t["x"][k] for t in stacked[0]["data"]) <= 1.0 + 1e-9
+    falls = [t for f in page.figures for t in f["data"] if t["type"] == "bar" and "base" in t]
+    assert falls and max(b + y for t in falls for b, y in zip(t["base"], t["y"], strict=True)) <= 1.0 + 1e-9
+    assert "249" not in page.text and "none, it is worse" in page.text
+
+
+def test_nothing_is_called_not_reproducible_where_nothing_was_repeated(tmp_path):
+    whole = fake.full()
+    alone = [h | {"floor": "noise", "reducible_floor": 1.0} for h in whole.gap.horizons]
+    gap = dataclasses.replace(whole.gap, reducible_floor=1.0, horizons=alone)
+    page = rendered(dataclasses.replace(whole, gap=gap), tmp_path)
+    names = {t.get("name") for f in page.figures for t in f["data"]}
+    assert "differs between repeats" not in names and "not explained" in names
+    assert "No commands were repeated" in page.text and "not reproducible" not in page.text
+
+
+def test_what_is_left_beside_effects_is_partly_explained(tmp_path):
+    whole = fake.full()
+    rows = {n: r | {"beyond": n == "elbow"} for n, r in whole.gap.physical.items()}
+    gap = dataclasses.replace(whole.gap, physical=rows, beyond=["elbow"])
+    page = rendered(dataclasses.replace(whole, verdict="unexplained", gap=gap), tmp_path)
+    assert "Partly explained" in page.text and "more than the tolerance remains" in page.text
+    assert [a for tag, a in page.tags if tag == "tr" and a.get("class") == "beyond"]
+
+
+def test_physical_units_come_first(page):
+    # 0.041 rad are 2.3 deg; 14.2 noise sd stand below
+    assert "2.3 deg14.2 sd" in page.text.replace(" 14.2", "14.2") and "range of motion" in page.text

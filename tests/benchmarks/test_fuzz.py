@@ -1,0 +1,52 @@
+"""A few of the inputs of benchmarks/fuzz.py, and of the kills of benchmarks/kills.py; both are run whole by hand."""
+
+import sys
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
+import fuzz  # noqa: E402
+import fuzz_cases  # noqa: E402
+import kills  # noqa: E402
+
+
+@pytest.mark.parametrize("kind", fuzz_cases.KINDS)
+def test_malformed_inputs_are_refused_or_harmless(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    function, found = fuzz_cases.KINDS[kind][0], []
+    for number in range(4):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        monkeypatch.chdir(folder)
+        what, call = function(np.random.default_rng([7, number]), folder)
+        found.append((what, *fuzz.outcome(call)))
+    assert [case for case in found if case[1] not in fuzz.GOOD] == []
+
+
+def test_what_the_inputs_are_made_from_is_sound(tmp_path: Path) -> None:
+    """Else all of them would be refused for the same reason."""
+    from bayessim_mjx.diagnosis import robot
+
+    rows = [",".join(f"{x:.6g}" for x in row) for row in fuzz_cases.table()]
+    (tmp_path / "run.csv").write_text("\n".join([fuzz_cases.HEADER, *rows]))
+    (tmp_path / "arm.xml").write_text(fuzz_cases.ARM)
+    (tmp_path / "params").write_text(fuzz_cases.PARAMS)
+    (tmp_path / "effects").write_text(fuzz_cases.EFFECTS)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for name, text in ((None, None), ("run.yaml", fuzz_cases.SIDE), ("map.yaml", fuzz_cases.MAP)):
+            if name is not None and text is not None:
+                (tmp_path / name).write_text(text)
+            fuzz_cases._read(tmp_path, None)
+        body = robot.of_file(tmp_path / "arm.xml", tmp_path / "params")
+        fuzz_cases._effects(tmp_path / "effects")
+    assert len(body.space) == 3
+
+
+@pytest.mark.slow
+@pytest.mark.ci
+def test_a_run_that_is_killed_goes_on_bit_for_bit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", ["kills.py", "--kills", "2", "--commands", "train", "--out", str(tmp_path)])
+    assert kills.main() == 0
