@@ -16,14 +16,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from bayessim_mjx import rl
+from bayessim_mjx import memory, rl
 from bayessim_mjx.collection import Recorded, make_source
 from bayessim_mjx.config import Config
 from bayessim_mjx.device import mesh
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.env import Env
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.loop_state import Loop, LoopState, RoundInfo
+from bayessim_mjx.loop_state import KEPT_ROUNDS, Loop, LoopState, RoundInfo
 from bayessim_mjx.rl import Policy, TrainState
 from bayessim_mjx.rl.recurrent import remembering
 from bayessim_mjx.round_inference import PREDICTIVE_DRAWS, blank, infer, reexamine, score
@@ -55,8 +55,8 @@ class Checkpoints(Protocol):
 
 def make(config: Config, env: Env) -> Loop:
     """Build the loop's static parts; refuses configurations that cannot work."""
-    b, memory = config.bayessim, config.ppo.memory_size
-    env = remembering(env, memory) if memory else env
+    b, units = config.bayessim, config.ppo.memory_size
+    env = remembering(env, units) if units else env
     if b.modelClass is None:
         # The ablation infers nothing, but is scored on the same surrogate.
         source = make_source(config, env) if len(env.space) else None
@@ -74,6 +74,9 @@ def make(config: Config, env: Env) -> Loop:
             f"set bayessim.realIters={most} or fewer, or a shorter bayessim.trainTrajLen"
         )
     names = source.channels.features(b.summarizerFxn)
+    rows = b.trainTrajs * (min(b.realIters, KEPT_ROUNDS) if b.ftune else 1)
+    what = f"bayessim.trainTrajs = {b.trainTrajs} summaries of {len(names)} features"
+    memory.refuse([(what, 4.0 * rows * (len(names) + len(env.space)))])
     return Loop(env, config, source, len(names), names)
 
 

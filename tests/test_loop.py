@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from bayessim_mjx import config, loop, registry, rl
+from bayessim_mjx import config, loop, memory, registry, rl
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.rollout import replay
 
@@ -234,3 +234,13 @@ def test_too_few_segments_are_refused_with_the_numbers(env, recorded):
         loop.make(settings(f"real.logs={recorded[0]}", "bayessim.trainTrajLen=20", "bayessim.realTrajs=10"), env)
     with pytest.raises(UserError, match="needs real.logs"):
         loop.make(settings("bayessim.collectPolicy=policy_replay"), env)
+
+
+def test_summaries_that_do_not_fit_are_refused(env, monkeypatch):
+    """Two rounds of a million rows: 9 observations of 3, 8 actions, two parameters, 4 bytes each."""
+    million = settings("bayessim.trainTrajs=1000000")
+    monkeypatch.setattr(memory, "installed", lambda: 2e6 * 37 * 4 - 1)
+    with pytest.raises(UserError, match=r"trainTrajs = 1000000 summaries of 35 features: needs at least 296 MB"):
+        loop.make(million, env)
+    monkeypatch.setattr(memory, "installed", lambda: 2e6 * 37 * 4)
+    loop.make(million, env)

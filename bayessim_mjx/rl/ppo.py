@@ -13,6 +13,7 @@ import numpy as np
 from flax import struct
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from bayessim_mjx import memory
 from bayessim_mjx.config import PPOConfig
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.mirrors import MirrorMap
@@ -162,6 +163,18 @@ def _check_shares(config: PPOConfig, mesh: Mesh | None) -> None:
         )
 
 
+def _check_memory(env: Env, config: PPOConfig, mesh: Mesh | None) -> None:
+    """Refuse worlds whose states (and as many resets) and one collection do not fit into a device's memory."""
+    key, theta = jax.random.PRNGKey(0), np.asarray(env.space.nominal, np.float32)
+    world = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(jax.eval_shape(traced(env.reset), key, theta)))
+    seen = sum(env.observation_size[group][0] for group in {"policy", critic_group(env)})
+    step = 4 * (2 * seen + 3 * env.action_size + 8)  # observations before and after; actions, rewards, values ...
+    share = config.num_envs / sharding.count(mesh)
+    what = f"ppo.num_envs = {config.num_envs} (env.numEnvs) worlds, ppo.num_steps = {config.num_steps}"
+    room = (jax.local_devices()[0].memory_stats() or {}).get("bytes_limit")
+    memory.refuse([(what, share * (2 * world + config.num_steps * step))], room)
+
+
 def init(
     env: Env,
     config: PPOConfig,
@@ -211,6 +224,7 @@ def check(env: Env, config: PPOConfig, mesh: Mesh | None = None) -> None:
         )
     _mirrors(env, config)
     _check_shares(config, mesh)
+    _check_memory(env, config, mesh)
 
 
 @lru_cache(maxsize=32)

@@ -9,8 +9,9 @@ import numpy as np
 import probes
 import pytest
 
-from bayessim_mjx import rl
+from bayessim_mjx import memory, rl
 from bayessim_mjx.config import PPOConfig
+from bayessim_mjx.errors import UserError
 from bayessim_mjx.rl import networks, normalise, ppo
 from bayessim_mjx.rl.train import time as clock
 
@@ -71,6 +72,18 @@ def test_one_program_for_every_seed_domain_and_number_of_iterations():
         state, _ = update(state, domain)
     assert update._cache_size() == 1
     assert env.traces == 1  # all these programs have the physics written out once
+
+
+def test_worlds_that_do_not_fit_are_refused_before_they_are_made(monkeypatch):
+    """The state of a world (and of its reset) and 16 steps of it, counted by hand."""
+    world = sum(x.nbytes for x in jax.tree.leaves(jax.jit(WALK.reset)(key(0), jnp.asarray(WALK.space.nominal))))
+    (size,) = WALK.observation_size["policy"]
+    needed = CONFIG.num_envs * (2 * world + CONFIG.num_steps * 4 * (2 * size + 3 * WALK.action_size + 8))
+    monkeypatch.setattr(memory, "installed", lambda: needed - 1)
+    with pytest.raises(UserError, match=rf"ppo\.num_envs = {CONFIG.num_envs} .*needs at least"):
+        rl.init(WALK, CONFIG, key(0))
+    monkeypatch.setattr(memory, "installed", lambda: needed)
+    ppo.check(WALK, CONFIG)
 
 
 def test_metrics_carry_exactly_the_known_tags():
