@@ -43,6 +43,15 @@ def number(value: Any, digits: int = 3) -> str:
     return text.rstrip("0").rstrip(".") if "." in text and abs(value) >= 10**digits else text
 
 
+def percent(share: Any, sign: bool = False) -> str:
+    """A share in per cent: whole from 10 % on, two digits below; 99.5 to 99.9 % with a decimal, as they are not all."""
+    if not finite(share := float(share) if _is_float(share) else share):
+        return MISSING
+    size = abs(share)
+    places = 1 - power(float(f"{100 * size:.1e}")) if 0 < size < 0.0995 else 1 if 0.995 <= size < 0.9995 else 0
+    return ("+" if sign and share > 0 else "") + f"{fixed(100 * share, min(places, 4))} %"
+
+
 def estimate(value: Any, uncertainty: Any = math.nan, digits: int = DIGITS) -> str:
     """`0.0312 ± 0.0021`: `digits` significant digits of the uncertainty, the value to the same decimal place.
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bayessim_mjx.monitor.words import ascii_of
-from bayessim_mjx.quantities import estimate, number
+from bayessim_mjx.quantities import estimate, number, percent
 
 
 @pytest.mark.parametrize(
@@ -47,3 +47,18 @@ def test_numbers():
 
 def test_in_ascii():
     assert ascii_of(estimate(-3.2e-6, 4e-7)) == "(-3.20 +/- 0.40)*10^-6"
+
+
+@pytest.mark.parametrize(
+    ("share", "text"),
+    [
+        (0.68, "68 %"), (0.0421, "4.2 %"), (0.00413, "0.41 %"), (0.09, "9.0 %"), (0.0996, "10 %"), (0.9972, "99.7 %"),
+        (1.0, "100 %"), (0.0, "0 %"), (-0.2, "-20 %"), (None, "–"),
+    ],
+)  # fmt: skip
+def test_shares(share, text):
+    assert percent(share) == text
+
+
+def test_a_change_has_a_sign():
+    assert percent(0.25, sign=True) == "+25 %" and percent(-0.25, sign=True) == "-25 %"

@@ -15,6 +15,7 @@ from bayessim_mjx.diagnosis.inverse import Dynamics
 from bayessim_mjx.diagnosis.motion import Mask, filtered, motion
 from bayessim_mjx.diagnosis.sanity import velocities
 from bayessim_mjx.logs.log import Array, Log
+from bayessim_mjx.quantities import percent
 
 _LAGS = np.linspace(-0.2, 0.2, 161)  # s
 
@@ -55,7 +56,7 @@ def _link(name: str, where: str, slope: float, correlation: float, lag: float, s
     if correlation < 0.99:
         faults.append(f"the shape differs (correlation {correlation:.3f})")
     if scaled and abs(slope - 1.0) > 0.05:
-        faults.append(f"the scale is off by {slope - 1.0:+.0%}")
+        faults.append(f"the scale is off by {percent(slope - 1.0, sign=True)}")
     if abs(lag) > step:
         faults.append(f"it is {abs(lag) * 1e3:.0f} ms {'late' if lag > 0 else 'early'}")
     numbers = f"corr {correlation:.3f}, slope {slope:.3g}, lag {lag * 1e3:+.1f} ms"

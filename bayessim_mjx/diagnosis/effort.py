@@ -14,6 +14,7 @@ from bayessim_mjx.diagnosis.drives import dof_of, is_effort
 from bayessim_mjx.diagnosis.inverse import Columns, Dynamics
 from bayessim_mjx.diagnosis.motion import Mask, bandwidth, filtered, motion
 from bayessim_mjx.logs.log import Array, Log
+from bayessim_mjx.quantities import percent
 
 REFUSED, DOUBTFUL = 0.3, 0.7  # share of the effort's variance explained
 CAUSAL = (-0.003, 0.15)  # s by which motion may follow the command for physical reasons: delay, lag, elasticity
@@ -120,7 +121,9 @@ def _relation(
     if any(t.small for t in tests):
         share = _in_radians(log, mj_model, tests[0])
         if share > DOUBTFUL:
-            return replace(own, explained=0.0, certain=True, mend=f"positions in degrees would explain {share:.0%}")
+            return replace(
+                own, explained=0.0, certain=True, mend=f"positions in degrees would explain {percent(share)}"
+            )
         return replace(own, text="the effort hardly changes against the inertial forces; free motion tests nothing")
     lags = np.linspace(-_FAR, _FAR, 41)
     curves = [t.over(lags) for t in tests]
@@ -224,16 +227,16 @@ def _mend(log: Log, mj_model: mujoco.MjModel, now: Relation, curve: Array, test:
     """One remedy that would explain the effort, (how much of it, in words or nothing, whether a sign or a unit)."""
     best = float(curve.max())
     if now.lag and best > DOUBTFUL:
-        return best, f"shifting the command by {now.lag:+.3f} s would explain {best:.0%}", False
+        return best, f"shifting the command by {now.lag:+.3f} s would explain {percent(best)}", False
     turned = test.share(sign=-1.0)
     if turned > DOUBTFUL:
-        return turned, f"the opposite sign would explain {turned:.0%}", True
+        return turned, f"the opposite sign would explain {percent(turned)}", True
     radians = _in_radians(log, mj_model, test)
     if radians > DOUBTFUL:
-        return radians, f"positions in degrees would explain {radians:.0%}", True
+        return radians, f"positions in degrees would explain {percent(radians)}", True
     free = test.share(scaled=False)
     if test.effort.scaled and free > DOUBTFUL:
-        return free, f"another scale of the command would explain {free:.0%}", False
+        return free, f"another scale of the command would explain {percent(free)}", False
     spans = ", ".join(f"{a:.1f} to {b:.1f} s" for a, b in test.pieces())
     return 0.0, (f"the part from {spans} alone can be explained: cut the file there" if spans else ""), False
 

@@ -19,6 +19,7 @@ from bayessim_mjx.diagnosis.disturbance import Disturbance, estimate
 from bayessim_mjx.diagnosis.fit import Fitter, Job
 from bayessim_mjx.diagnosis.motion_inputs import WORDS, Inputs
 from bayessim_mjx.diagnosis.regression import Regression, Seeded
+from bayessim_mjx.quantities import percent
 
 Array = NDArray[np.float64]
 RIDGES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)  # of the mean curvature of each joint's features
@@ -191,7 +192,7 @@ def _words(held: dict[str, Held], importance: list[dict], where: dict[str, float
     for name, h in held.items():
         how = "other operating conditions" if name == "condition" else "the same conditions at other times"
         share = h.gain / max(float(h.base.sum()), 1e-300)
-        text.append(f"on {how} a flexible force removes {share:.0%} of the squared gap that is left")
+        text.append(f"on {how} a flexible force removes {percent(share)} of the squared gap that is left")
     joints = [j for j, share in where.items() if share > 0.2 * max(where.values())]
     inputs = [d["input"] for d in importance if d["importance"] > IMPORTANT * max(importance[0]["importance"], 0.5)][:4]
     depends = f"depends on {', '.join(inputs)}" if inputs else "depends on nothing that was measured: it is constant"

@@ -14,6 +14,7 @@ from bayessim_mjx.diagnosis.effort import DOUBTFUL, Relation, closed, relations
 from bayessim_mjx.diagnosis.sanity import Finding, Velocity, refuse, warn
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Array, Log
+from bayessim_mjx.quantities import percent
 
 ALIKE = 5.0  # at most so many times a target's range is the range of what follows it
 LATE = 0.3  # s; a larger offset between commands and motion is a fault of the clocks, not of the robot
@@ -192,7 +193,7 @@ def _of_effort(related: Sequence[Relation]) -> list[Finding]:
         if r in bad:
             out.append((refuse if 2 * len(bad) >= len(best) else warn)(_unrelated(r)))
         elif r.explained < DOUBTFUL:
-            text = f"{r.joint}: no model explains {1 - r.explained:.0%} of its effort ({r.source})"
+            text = f"{r.joint}: no model explains {percent(1 - r.explained)} of its effort ({r.source})"
             out.append(warn(f"{text} ({r.mend})" if r.mend else text))
         if r.lag and r not in bad:
             text = f"{r.joint}: its motion follows the effort ({r.source}) {r.lag * 1e3:+.0f} ms late"
@@ -203,8 +204,10 @@ def _of_effort(related: Sequence[Relation]) -> list[Finding]:
 def _unrelated(r: Relation) -> str:
     assert r.explained is not None
     share = min(1.0, 1.0 - r.explained)
-    text = f"effort unrelated to motion: {share:.0%} of the effort of {r.joint} ({r.source}) unexplained by any model"
+    text = (
+        f"effort unrelated to motion: {percent(share)} of the effort of {r.joint} ({r.source}) unexplained by any model"
+    )
     if r.explained >= 0.3:
-        text += f", and friction alone explains {r.friction:.0%}"
+        text += f", and friction alone explains {percent(r.friction)}"
     why = r.mend or "column not aligned in time, wrong scale, or forces that were not logged?"
     return f"{text} ({why})"

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from bayessim_mjx.diagnosis.motion import bandwidth, lowpass
 from bayessim_mjx.logs.log import Array, Log
 from bayessim_mjx.logs.signals import estimate_velocity, quantum
+from bayessim_mjx.quantities import percent
 
 MIN_ROWS, MIN_STEPS = 20, 10  # fewer rows or control steps than this hold no window
 CLIPPED = 0.05  # share of the rows on one flat top
@@ -60,7 +61,9 @@ def jitter(log: Log, dt: float) -> Iterator[Finding]:
     off = float(np.mean(np.abs(steps / log.period - 1.0) > 0.2))
     if off > 0.1:
         worst = float(np.max(np.abs(steps / log.period - 1.0)))
-        yield warn(f"time: {off:.0%} of the steps are more than 20 % off their median (the worst by {worst:.0%})")
+        yield warn(
+            f"time: {percent(off)} of the steps are more than 20 % off their median (the worst by {percent(worst)})"
+        )
 
 
 def constant(log: Log, dt: float) -> Iterator[Finding]:
@@ -93,7 +96,7 @@ def clipped(log: Log, targets: Mapping[str, Array]) -> Iterator[Finding]:
             flat = _flat(x, end)
             share = float(np.mean(flat))
             if share > CLIPPED and not (target is not None and _steady(target, flat)):
-                text = f"{name} is clipped at {end:.5g} ({share:.0%} of the rows"
+                text = f"{name} is clipped at {end:.5g} ({percent(share)} of the rows"
                 drive = name.startswith("effort:")
                 yield Finding("finding", f"{text}; the drive's limit?)") if drive else warn(f"{text}; a hard stop?)")
 

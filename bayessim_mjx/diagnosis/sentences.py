@@ -8,8 +8,9 @@ from typing import Any
 from bayessim_mjx.diagnosis.nouns import listed, missing
 from bayessim_mjx.diagnosis.result import FoundEffect, Gap
 from bayessim_mjx.diagnosis.run import Findings
-from bayessim_mjx.diagnosis.tolerance import extent, share
+from bayessim_mjx.diagnosis.tolerance import extent
 from bayessim_mjx.diagnosis.verdict import Rival
+from bayessim_mjx.quantities import percent
 
 CLEAR = 1.2  # noise variances above which a horizon's gap is worth a share
 TOLD = 6  # joints told one by one
@@ -29,8 +30,8 @@ NEAREST = "Of the library, {named} {come} nearest"
 BEATEN = "; a flexible force alone predicts held-out conditions far better"
 ON_TOP = "; a flexible force on top of {them} still closes {remains} of the gap"
 FALLS = (
-    "With {them} the recalibrated simulator's gap falls from {calibrated} to {with_effects} on held-out conditions. Of "
-    "the squared gap above the noise {predicted} was promised to go before {they} added, and {realised} went."
+    "With {them} the recalibrated simulator's gap falls from {calibrated} to {with_effects} on held-out conditions. "
+    "Before {they} fitted, {predicted} of the squared gap above the noise was predicted to close; {realised} did."
 )
 WITHIN = "What remains is within the tolerance at every joint: {within}."
 CHANCE = (
@@ -78,9 +79,9 @@ def verdict_in_words(
         "they": "it was" if one else "they were",
         "come": "comes" if one else "come",
         "close": "closes" if one else "close",
-        "remains": share(remains),
-        "predicted": f"{promised:.0%}",
-        "realised": f"{went:.0%}",
+        "remains": percent(remains),
+        "predicted": percent(promised),
+        "realised": percent(went),
         "beyond": listed([_left(n, far.physical[n]) for n in _worst(far) if n in far.beyond][:3]),
         "within": _within(far),
     }
@@ -103,8 +104,8 @@ def _at_bound(effect: FoundEffect) -> bool:
 
 
 def stage_in_words(far: Gap, stage: str) -> str:
-    """`1.2 deg (2.1% of the motion, 27.0 noise sd)`; of several joints the share alone."""
-    parts = [share(far.shares[stage]) + " of the motion"] if stage in far.shares else []
+    """`1.2 deg (2.1 % of the motion, 27.0 noise sd)`; of several joints the share alone."""
+    parts = [percent(far.shares[stage]) + " of the motion"] if stage in far.shares else []
     noises = f"{number(getattr(far, stage))} noise sd"
     if len(far.physical) == 1:
         (row,) = far.physical.values()
@@ -122,10 +123,10 @@ def _against(row: dict[str, Any]) -> float:
 
 
 def _left(name: str, row: dict[str, Any]) -> str:
-    """`elbow: 1.2 deg rms, 3.4 deg at most (2.1% of its motion; tolerance 0.8 deg)`."""
+    """`elbow: 1.2 deg rms, 3.4 deg at most (2.1 % of its motion; tolerance 0.8 deg)`."""
     unit = row["unit"]
     most = f"{extent(row['with_effects'], unit)} rms, {extent(row['largest'], unit)} at most"
-    part = f"{share(row['with_effects'] / row['motion'])} of its motion; " if row["motion"] else ""
+    part = f"{percent(row['with_effects'] / row['motion'])} of its motion; " if row["motion"] else ""
     return f"{name}: {most} ({part}tolerance {extent(row['tolerance'], unit)})"
 
 
@@ -168,5 +169,5 @@ def horizon_warning(gap: Gap) -> list[str]:
     }
     if len(closed) < 2 or max(closed.values()) - min(closed.values()) < 0.3:
         return []
-    shares = ", ".join(f"{share:.0%} ({name})" for name, share in closed.items())
+    shares = ", ".join(f"{percent(share)} ({name})" for name, share in closed.items())
     return [f"the gap closed depends on the horizon: {shares}"]

@@ -130,10 +130,3 @@ def extent(value: float, unit: str) -> str:
         value, unit = 1e3 * value, "mm"
     digits = 1 - math.floor(math.log10(abs(value))) if value else 0
     return f"{value:.{min(max(digits, 1 if abs(value) < 99.5 else 0), 6)}f} {unit}"
-
-
-def share(value: float) -> str:
-    """`0.0213` -> `2.1%`, `0.34` -> `34%`, and 99.5 to 99.9 % not as all."""
-    if abs(value) < 0.0995:
-        return f"{100 * value:.2g}%"
-    return f"{100 * value:.{1 if 0.995 <= abs(value) < 0.9995 else 0}f}%"

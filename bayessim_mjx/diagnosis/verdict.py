@@ -24,6 +24,7 @@ from bayessim_mjx.diagnosis.search import (
     together,
     without,
 )
+from bayessim_mjx.quantities import percent
 
 NEAR = 1.2  # noise variances: models that leave less than that explain the same
 SAME = 0.02  # of what an effect closes
@@ -103,7 +104,7 @@ def _in_parts(race: Race, winner: Model, effect: Candidate, say: Progress) -> li
     if effect in model.effects or behind > race.settings.tie:
         return []
     own = tuple(e for e in model.effects if e not in winner.effects)
-    why = f"simpler laws in its place close {race.closure(model):.1%} against {race.closure(winner):.1%}"
+    why = f"simpler laws in its place close {percent(race.closure(model))} against {percent(race.closure(winner))}"
     return [Rival(own, model, race.closure(model), why, contains=True)]
 
 
@@ -168,7 +169,7 @@ def _rival(race: Race, winner: Model, effect: Candidate, others: tuple[Candidate
     why = (
         "contains it as a special case and explains no more"
         if contains
-        else f"held-out evidence differs by {c.evidence:.1f} nats, {max(behind, 0.0):.1%} of the gap"
+        else f"held-out evidence differs by {c.evidence:.1f} nats, {percent(max(behind, 0.0))} of the gap"
     )
     return [Rival(others, model, race.closure(model), why, contains or same, c.evidence)]
 

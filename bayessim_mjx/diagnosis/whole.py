@@ -13,6 +13,7 @@ from bayessim_mjx.diagnosis.gap import Prediction
 from bayessim_mjx.diagnosis.models import Model
 from bayessim_mjx.diagnosis.run import Findings, Setup
 from bayessim_mjx.diagnosis.simulate import Simulator
+from bayessim_mjx.quantities import percent
 
 Array = NDArray[np.float64]
 LOGS, SECONDS = 8, 10.0  # at most
@@ -175,8 +176,8 @@ def _notes(names: list[str], kept: list[int], chaotic: list[str], broken: list[s
         used = f"they count up to there (at most {longest:.2g} s)" if kept else "no horizon beyond the windows is given"
         which = f"{len(chaotic)} of {len(names)} logs ({', '.join(chaotic[:4])})"
         out.append(
-            f"unstable or chaotic motion: in {which} the start's uncertainty alone grows to {PART:.0%} of the motion, "
-            f"so no simulator can predict them whole; {used}"
+            f"unstable or chaotic motion: in {which} the uncertainty of the start alone grows to {percent(PART)} "
+            f"of the motion, so no simulator can predict them whole; {used}"
         )
     if broken:
         which = f"{len(broken)} of {len(names)} logs ({', '.join(broken[:4])})"

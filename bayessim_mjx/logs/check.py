@@ -13,6 +13,7 @@ from scipy.ndimage import median_filter
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Array, Channels, suggest
 from bayessim_mjx.logs.table import Table
+from bayessim_mjx.quantities import percent
 
 STREAMS = ("ctrl", "qpos", "qvel", "effort", "enabled")
 
@@ -79,7 +80,9 @@ def check_time(table: Table, time: Array, min_rows: int) -> None:
     local = median_filter(steps, 101, mode="nearest")  # a file may change its rate
     jitter = float(np.mean(np.abs(steps / local - 1.0) > 0.2))
     if jitter > 0.1:
-        text = f"{table.path}: column 'time': {jitter:.0%} of the steps are more than 20 % off the median around them"
+        text = (
+            f"{table.path}: column 'time': {percent(jitter)} of the steps are more than 20 % off the median around them"
+        )
         warnings.warn(text, stacklevel=3)
 
 

@@ -77,7 +77,7 @@ def _columns(header: Sequence[str], rows: Sequence[Sequence[str]], width: int | 
 
 
 def _tied(text: str) -> str:
-    return text.replace(" ± ", f"{TIE}±{TIE}")
+    return text.replace(" ± ", f"{TIE}±{TIE}").replace(" %", f"{TIE}%")
 
 
 def _longest_word(text: str) -> int:

@@ -117,12 +117,8 @@ def number(value: Any, digits: int = 3) -> str:
 
 
 def percent(share: Any, sign: bool = False) -> str:
-    """A share as whole per cents, with one decimal below 10 % and where 99.5 to 99.9 % would read as all."""
-    if not finite(share):
-        return MISSING
-    fine = 0 < abs(share) < 0.0995 or 0.995 <= abs(share) < 0.9995
-    text = quantities.fixed(100 * share, 1 if fine else 0).replace("-", "−")
-    return ("+" if sign and share > 0 else "") + text + " %"
+    """`quantities.percent` with a minus sign in place of a hyphen."""
+    return quantities.percent(share, sign).replace("-", "−")
 
 
 def unit(text: str) -> str:

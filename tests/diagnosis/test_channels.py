@@ -58,7 +58,7 @@ def test_a_declared_law_explains_the_effort(servo: Log) -> None:
     assert link.sound and link.slope == pytest.approx(1.0, abs=1e-3)
     weaker = dataclasses.replace(declared, streams={"effort:motor": 0.8 * effort})
     link = split(weaker)["command -> effort", "motor"]
-    assert not link.sound and link.slope == pytest.approx(0.8, abs=1e-3) and "off by -20%" in link.text
+    assert not link.sound and link.slope == pytest.approx(0.8, abs=1e-3) and "off by -20 %" in link.text
     late = dataclasses.replace(declared, streams={"effort:motor": np.roll(effort, 5)})
     link = split(late)["command -> effort", "motor"]
     assert not link.sound and link.lag == pytest.approx(0.05, abs=0.003) and "50 ms late" in link.text

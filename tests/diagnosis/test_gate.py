@@ -179,7 +179,7 @@ def test_still_channels(good: Log, arm: Log) -> None:
 
 def test_jitter_and_clipping(good: Log) -> None:
     time = good.time + np.where(np.arange(len(good)) % 4 == 0, 0.004, 0.0)
-    warned(dataclasses.replace(good, time=time), "50% of the steps are more than 20 % off")
+    warned(dataclasses.replace(good, time=time), "50 % of the steps are more than 20 % off")
     top = 0.5 * float(good.qpos.max())
     gate = judge(dataclasses.replace(good, qpos=np.minimum(good.qpos, top)))
     assert any("qpos:hinge is clipped at" in f.text for f in gate.reports[0].remarks), gate.reports

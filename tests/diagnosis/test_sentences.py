@@ -25,24 +25,28 @@ def test_one_effect():
     assert head == "The simulator lacks Coulomb friction at hinge."
     # 2.7 mrad of 1 rad are 0.155 deg, 0.27 %
     assert falls.startswith(
-        "With it the recalibrated simulator's gap falls from 0.15 deg (0.27% of the motion, 2.70 noise sd) to "
-        "0.050 deg (0.087% of the motion, 0.87 noise sd) on held-out conditions."
+        "With it the recalibrated simulator's gap falls from 0.15 deg (0.27 % of the motion, 2.70 noise sd) to "
+        "0.050 deg (0.087 % of the motion, 0.87 noise sd) on held-out conditions."
     )
     assert within == "What remains is within the tolerance at every joint: 0.050 deg of 1.1 deg at hinge."
-    assert falls.endswith("66% was promised to go before it was added, and 68% went.")
+    assert falls.endswith(
+        "Before it was fitted, 66 % of the squared gap above the noise was predicted to close; 68 % did."
+    )
 
 
 def test_several_effects():
     head, falls, _ = sentences.verdict_in_words("effects", [FRICTION, GAIN], LEVEL)
     assert head == "The simulator lacks Coulomb friction at hinge and the true actuator gain at torque."
     assert falls.startswith("With them the recalibrated")
-    assert falls.endswith("97% was promised to go before they were added, and 100% went.")
+    assert falls.endswith(
+        "Before they were fitted, 97 % of the squared gap above the noise was predicted to close; 100 % did."
+    )
 
 
 def test_what_comes_nearest_where_nothing_explains():
     one = sentences.verdict_in_words("unexplained", [FRICTION], LEVEL, 0.4)[1]
     assert one.startswith("Of the library, Coulomb friction at hinge comes nearest; a flexible force on top of it")
-    assert one.endswith("still closes 40% of the gap.")
+    assert one.endswith("still closes 40 % of the gap.")
     two = sentences.verdict_in_words("unexplained", [FRICTION, GAIN], LEVEL, 0.0, beaten=True)[1]
     assert "come nearest; a flexible force alone predicts" in two
     alone = sentences.verdict_in_words("unexplained", [FRICTION], LEVEL)[1]
@@ -73,5 +77,5 @@ def test_a_closure_that_depends_on_the_horizon_is_flagged():
     rows = [("0.1 s", 3.0, 1.0), ("0.5 s", 3.0, 1.1), ("whole log", 100.0, 70.0)]
     horizons = [{"name": n, "calibrated": c, "with_effects": w} for n, c, w in rows]
     (told,) = sentences.horizon_warning(Gap(1.0, 4.0, 3.0, 1.1, 1.0, horizons=horizons))
-    assert told == "the gap closed depends on the horizon: 100% (0.1 s), 97% (0.5 s), 51% (whole log)"
+    assert told == "the gap closed depends on the horizon: 100 % (0.1 s), 97 % (0.5 s), 51 % (whole log)"
     assert not sentences.horizon_warning(Gap(1.0, 4.0, 3.0, 1.1, 1.0, horizons=horizons[:2]))

@@ -124,8 +124,8 @@ def test_effects_that_leave_more_than_tolerated_explain_a_part():
 
 def test_the_headline_says_partly_explained_and_what_remains_where():
     head, *rest = sentences.verdict_in_words("unexplained", [FRICTION], gap(0.0349))
-    assert head.startswith("Partly explained: Coulomb friction at elbow closes 80% of the squared gap above the noise")
-    assert "elbow: 2.0 deg rms, 6.0 deg at most (3.5% of its motion; tolerance 1.1 deg)" in head
+    assert head.startswith("Partly explained: Coulomb friction at elbow closes 80 % of the squared gap above the noise")
+    assert "elbow: 2.0 deg rms, 6.0 deg at most (3.5 % of its motion; tolerance 1.1 deg)" in head
     assert "shoulder" not in head and any(text.startswith("By joint") for text in rest)
     head, *rest = sentences.verdict_in_words("effects", [FRICTION], gap(0.0132))
     assert head == "The simulator lacks Coulomb friction at elbow."
@@ -134,10 +134,10 @@ def test_the_headline_says_partly_explained_and_what_remains_where():
 
 def test_physical_units_and_shares_come_before_the_noise():
     falls = sentences.verdict_in_words("effects", [FRICTION], gap(0.0132))[1]
-    assert "from 10% of the motion (1000 noise sd) to 1.3% of the motion (132 noise sd)" in falls
+    assert "from 10 % of the motion (1000 noise sd) to 1.3 % of the motion (132 noise sd)" in falls
     one = gap(0.0132)
     del one.physical["shoulder"]
-    assert "5.7 deg (10% of the motion, 1000 noise sd)" in sentences.verdict_in_words("effects", [FRICTION], one)[1]
+    assert "5.7 deg (10 % of the motion, 1000 noise sd)" in sentences.verdict_in_words("effects", [FRICTION], one)[1]
 
 
 # The floor
