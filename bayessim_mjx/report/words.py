@@ -9,7 +9,9 @@ from bayessim_mjx import quantities
 from bayessim_mjx.diagnosis.nouns import EFFECTS
 from bayessim_mjx.diagnosis.result import Diagnosis, Estimate, FoundEffect
 from bayessim_mjx.diagnosis.tolerance import extent
-from bayessim_mjx.quantities import MISSING, SUPERSCRIPT, finite
+from bayessim_mjx.quantities import SUPERSCRIPT, finite
+
+MISSING = quantities.MISSING  # where there is no number
 
 # quantities that are easier to read as their reciprocal
 RECIPROCALS = {
