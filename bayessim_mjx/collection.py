@@ -17,19 +17,22 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from bayessim_mjx import laws
 from bayessim_mjx.config import Config
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.env import Env
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.inference import feature_names, summarizers
 from bayessim_mjx.inference.embedding import Embedding
+from bayessim_mjx.laws import Law
 from bayessim_mjx.logs import Channels, Log, noise, read_logs, segments
 from bayessim_mjx.parameters import ParameterSpace
 from bayessim_mjx.rl import Policy
-from bayessim_mjx.rollout import Trajectory, replay, rollout
+from bayessim_mjx.rollout import Trajectory, recording, remembered, replay, rollout
 from bayessim_mjx.settings import number as finite
 
 ESTIMATED_SPEED = 3.0  # error of a velocity estimated from positions, in its noise part: it lags at transients
+REPLAYED = 512  # segments replayed at once at nominal parameters
 RANDOM_SHARE = 0.1  # policy_rl_randomized: share of the steps with a uniformly random action (BayesSimIG)
 POLICY_DEPENDENT = ("policy_rl", "policy_rl_randomized")
 
@@ -173,10 +176,16 @@ class Surrogate:
         trajectory = self._observe(k_roll, self.sample(k_theta, count), policy)
         return summarise(self.summarizer, trajectory), trajectory
 
+    def repeated(self, first: int, real: Trajectory, thetas: Array) -> dict[str, Array]:
+        """The first of the trajectories `real` replayed at thetas [n, d]: its motion, see `rollout.replay`."""
+        del first
+        own = [_tiled(x[0], len(thetas)) for x in (real.qpos[:, 0], real.qvel[:, 0], real.command)]
+        return replay(self.env.physics, *own, thetas)  # type: ignore[attr-defined]
+
 
 @dataclasses.dataclass(frozen=True, eq=False)  # compared by identity: static under jit
 class Recorded:
-    """Segments of recorded logs. In simulation the logged commands are replayed from the logged state.
+    """Segments of recorded logs. In simulation the logged commands are replayed from the logged state, as recorded.
 
     Features are of the *difference* to the replay with nominal parameters, in which the effect of theta is not dwarfed
     by the motion itself, and of the first state.
@@ -184,7 +193,8 @@ class Recorded:
 
     env: Any
     space: ParameterSpace
-    data: dict[str, np.ndarray]  # qpos0, qvel0 [M, .], command [M, T, nu], qpos [M, T+1, nq], qvel [M, T+1, nv]
+    data: dict[str, np.ndarray]  # of `logs.segments`, M of them; expected_qpos, expected_qvel: of the nominal replay
+    law: Law | None  # the controllers that the logs declare, leaves [M, nu]; None: commands go to the actuators
     order: np.ndarray  # [M] the order in which segments are used
     noise: dict[str, np.ndarray]  # standard deviation of the measurement noise: qpos [nq], qvel [nv]
     with_qvel: (
@@ -207,13 +217,15 @@ class Recorded:
         first = tuple(f"first {name}" for name in (*named.qpos, *speeds))
         return Seen(self.data["command"].shape[1], tuple(states), named.actuators, first)
 
-    def features(self, qpos: Array, qvel: Array, command: Array) -> Array:
-        """[N, D] of measured motion qpos [N, T+1, nq], qvel [N, T+1, nv] under command [N, T, nu]."""
-        nominal = jnp.broadcast_to(jnp.asarray(self.space.nominal), (qpos.shape[0], len(self.space)))
-        expected = replay(self.env.physics, qpos[:, 0], qvel[:, 0], command, nominal)
-        states = qpos - expected["qpos"]
+    def features(self, index: Array, qpos: Array, qvel: Array) -> Array:
+        """[N, D] of measured motion qpos [N, T+1, nq], qvel [N, T+1, nv] under the commands of the segments index [N].
+
+        Both are deviations from the nominal replay of the segment, from its logged start.
+        """
+        expected_qpos, expected_qvel, command = self._of("expected_qpos", "expected_qvel", "command", index=index)
+        states = qpos - expected_qpos
         if self.with_qvel:
-            states = jnp.concatenate([states, qvel - expected["qvel"]], axis=-1)
+            states = jnp.concatenate([states, qvel - expected_qvel], axis=-1)
         summaries = jax.vmap(self.summarizer)(states, command)
         return jnp.concatenate([summaries, qpos[:, 0], qvel[:, 0]], axis=-1)
 
@@ -225,36 +237,50 @@ class Recorded:
         del policy  # the logged commands act
         k_segment, *keys = jax.random.split(key, 5)
         index = jnp.asarray(self.order)[jax.random.randint(k_segment, (thetas.shape[0],), 0, len(self.order))]
-        qpos0, qvel0, command = (jnp.asarray(self.data[name])[index] for name in ("qpos0", "qvel0", "command"))
+        qpos0, qvel0 = self._of("qpos0", "qvel0", index=index)
         speed_error = self.noise["qvel"] * (1.0 if self.with_qvel else ESTIMATED_SPEED)
         start = qpos0 + self.noise["qpos"] * jax.random.normal(keys[0], qpos0.shape)
         speed = qvel0 + speed_error * jax.random.normal(keys[1], qvel0.shape)
-        motion = replay(self.env.physics, start, speed, command, thetas)
+        motion = self._replayed(index, start, speed, thetas)
         qpos = motion["qpos"] + self.noise["qpos"] * jax.random.normal(keys[2], motion["qpos"].shape)
         qvel = motion["qvel"] + self.noise["qvel"] * jax.random.normal(keys[3], motion["qvel"].shape)
-        return self.features(qpos.at[:, 0].set(qpos0), qvel.at[:, 0].set(qvel0), command)
+        return self.features(index, qpos.at[:, 0].set(qpos0), qvel.at[:, 0].set(qvel0))
 
     def real(self, key: Array, first: int, count: int, policy: Policy) -> tuple[Array, Trajectory]:
         """The next `count` segments of the logs and their features."""
         del key, policy
         index = self.order[(first + np.arange(count)) % len(self.order)]
-        d = {name: jnp.asarray(value[index]) for name, value in self.data.items()}
-        steps = d["command"].shape[1]
-        zeros = jnp.zeros((count, steps))
-        observation = jnp.concatenate([d["qpos"], d["qvel"]], axis=-1)
+        qpos, qvel, command = self._of("qpos", "qvel", "command", index=index)
+        zeros = jnp.zeros(command.shape[:2])
         trajectory = Trajectory(
-            observation=observation,
-            action=d["command"],
+            observation=jnp.concatenate([qpos, qvel], axis=-1),
+            action=command,
             reward=zeros,
             terminated=zeros,
             truncated=zeros,
             valid=zeros + 1.0,
             theta=jnp.zeros((count, len(self.space))),
-            qpos=d["qpos"],
-            qvel=d["qvel"],
-            command=d["command"],
+            qpos=qpos,
+            qvel=qvel,
+            command=command,
         )
-        return self.features(d["qpos"], d["qvel"], d["command"]), trajectory
+        return self.features(index, qpos, qvel), trajectory
+
+    def repeated(self, first: int, real: Trajectory, thetas: Array) -> dict[str, Array]:
+        """The segment asked for as number `first` replayed at thetas [n, d]: its motion, see `rollout.replay`."""
+        del real
+        index = jnp.full(len(thetas), self.order[first % len(self.order)])
+        return self._replayed(index, *self._of("qpos0", "qvel0", index=index), thetas)
+
+    def _of(self, *names: str, index: Array | np.ndarray) -> list[Array]:
+        return [jnp.asarray(self.data[name])[index] for name in names]
+
+    def _replayed(self, index: Array, qpos0: Array, qvel0: Array, thetas: Array) -> dict[str, Array]:
+        """The segments index [N] from measured states, as they were recorded: past commands, controllers."""
+        physics = self.env.physics
+        near = recording(physics, *self._of("around_qpos", "around_qvel", "around_command", index=index))
+        law = None if self.law is None else jax.tree.map(lambda x: x[index], self.law)
+        return replay(physics, qpos0, qvel0, *self._of("command", index=index), thetas, near, law)
 
 
 Source = Surrogate | Recorded
@@ -279,7 +305,8 @@ def _recorded(config: Config, env: Any, summarizer: Callable) -> Recorded:
         raise UserError(f"real.logs needs a task with its own MuJoCo model; {env.name!r} is not one")
     logs: list[Log] = read_logs(config.real.logs, env.mj_model, config.real.map)
     length = config.real.segment_length or config.bayessim.trainTrajLen
-    data = segments(logs, length, dt=env.dt, stride=config.real.segment_stride or length)
+    stride = config.real.segment_stride or length
+    data = segments(logs, length, dt=env.dt, stride=stride, rows=remembered(env.physics))
     count = len(data["qpos0"])
     needed = config.bayessim.realTrajs
     if count < needed:
@@ -292,7 +319,26 @@ def _recorded(config: Config, env: Any, summarizer: Callable) -> Recorded:
         warnings.warn(f"real.logs: the logged commands act, bayessim.collectPolicy={policy} does not", stacklevel=2)
     order = np.random.default_rng(config.seed).permutation(count)
     measured = all(log.has_qvel for log in logs)
-    return Recorded(env, env.space, data, order, noise(logs), measured, summarizer)
+    law = laws.of_logs(logs, env.mj_model)
+    law = None if law is None else jax.tree.map(lambda x: x[data["run"]], law)
+    source = Recorded(env, env.space, data, law, order, noise(logs), measured, summarizer)
+    return dataclasses.replace(source, data=data | _expected(source))
+
+
+def _expected(source: Recorded) -> dict[str, np.ndarray]:
+    """What the logs would show at nominal parameters: expected_qpos [M, T+1, nq], expected_qvel [M, T+1, nv]."""
+    count = len(source.order)
+    size = min(count, REPLAYED)
+    thetas, found = _tiled(jnp.asarray(source.space.nominal, jnp.float32), size), []
+    for first in range(0, count, size):
+        index = jnp.minimum(first + jnp.arange(size), count - 1)
+        qpos0, qvel0 = source._of("qpos0", "qvel0", index=index)
+        found.append(jax.tree.map(np.asarray, source._replayed(index, qpos0, qvel0, thetas)))
+    return {f"expected_{name}": np.concatenate([part[name] for part in found])[:count] for name in found[0]}
+
+
+def _tiled(x: Array, count: int) -> Array:
+    return jnp.broadcast_to(x, (count, *x.shape))
 
 
 def real_parameters(settings: Any, space: ParameterSpace) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -1,11 +1,11 @@
 """Gap diagnosis of recorded motion: python -m bayessim_mjx.diagnose --model robot.xml --data LOGS."""
 
 import argparse
-import contextlib
 import sys
 import time
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +18,9 @@ from bayessim_mjx.settings import SEEDS
 if TYPE_CHECKING:
     from bayessim_mjx.diagnosis.result import Diagnosis
     from bayessim_mjx.diagnosis.robot import Robot
+
+
+PRELIMINARY = "preliminary.json"  # what is known while the race goes on
 
 
 def _parser() -> cli.PlainParser:
@@ -70,42 +73,6 @@ def _checked(args: argparse.Namespace) -> None:
         raise UserError(f"--out {out}: there is a file of that name; give a folder")
 
 
-@contextlib.contextmanager
-def _progress(headless: bool) -> Iterator[Any]:
-    """A function (what, done, total) that shows it: a bar with the time left, or lines."""
-    began = time.monotonic()
-    if headless or not sys.stderr.isatty():
-        last: list[str] = []
-
-        def line(text: str, done: int, total: int) -> None:
-            if [text] != last:
-                last[:] = [text]
-                print(f"{time.monotonic() - began:6.1f} s  {text}", file=sys.stderr, flush=True)
-
-        yield line
-        return
-    from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-
-    columns = (
-        SpinnerColumn(),
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, transient=True) as bars:
-        tasks: dict[str, Any] = {}
-
-        def bar(text: str, done: int, total: int) -> None:
-            if text not in tasks:
-                for other in tasks.values():
-                    bars.update(other, completed=bars.tasks[other].total)
-                tasks[text] = bars.add_task(text, total=max(total, 1))
-            bars.update(tasks[text], completed=done, total=max(total, 1))
-
-        yield bar
-
-
 def _robot(args: argparse.Namespace) -> "Robot":
     from bayessim_mjx.diagnosis import robot
 
@@ -121,23 +88,45 @@ def _robot(args: argparse.Namespace) -> "Robot":
 
 def _diagnosis(args: argparse.Namespace, robot: "Robot", notes: list[str], say: Any) -> "Diagnosis":
     """The result; too little data is a verdict, not an error."""
-    from bayessim_mjx.diagnosis import assemble, run
+    from bayessim_mjx.diagnosis import assemble, preliminary, run
     from bayessim_mjx.logs import read_logs
 
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
         logs = read_logs(args.data if len(args.data) > 1 else args.data[0], robot.mj_model, args.map)
     notes += list(dict.fromkeys(str(w.message) for w in caught))
+    about = _about(args, robot, [log.duration for log in logs])
     names = "all" if args.effects == "all" else [n.strip() for n in args.effects.split(",") if n.strip()]
+    so_far = Path(args.out) / PRELIMINARY
+
+    def keep(setup: Any, race: Any) -> None:
+        """What is known before there is a verdict: killed there, this stays."""
+        preliminary.write(so_far, about, [*notes, *setup.warnings], setup, race)
+
     try:
         asked = {"group": args.group, "seed": args.seed, "tolerated": args.tolerance}
-        found = run.diagnose(robot, logs, names, **asked, progress=say)
+        found = run.diagnose(robot, logs, names, **asked, progress=say, keep=keep)
     except run.TooLittleData as reason:
-        return assemble.insufficient(str(reason), notes)
+        return replace(assemble.insufficient(str(reason), notes), about=about)
     found.setup.warnings[:0] = notes
-    result = assemble.diagnosis_of(found, say)
+    conditions = len(found.setup.fitter.simulator.windows.groups)
+    result = replace(assemble.diagnosis_of(found, say), about=about | {"conditions": conditions})
     result.save(Path(args.out))  # maps and the next experiment take time; killed there, the verdict stays
+    so_far.unlink(missing_ok=True)
     return assemble.with_more(result, found, Path(args.out), say)
+
+
+def _about(args: argparse.Namespace, robot: "Robot", seconds: Sequence[float]) -> dict[str, Any]:
+    """What is diagnosed, for the report's header."""
+    return {
+        "robot": robot.name,
+        "model": str(args.model or args.task),
+        "data": [str(p) for p in args.data],
+        "logs": len(seconds),
+        "seconds": float(sum(seconds)),
+        "date": time.strftime("%Y-%m-%d %H:%M"),
+        "seed": args.seed,
+    }
 
 
 def _diagnose(argv: Sequence[str] | None) -> int:
@@ -145,10 +134,11 @@ def _diagnose(argv: Sequence[str] | None) -> int:
     _checked(args)
     setup_jax(Config(task="", device=args.device, cache_dir=args.cache_dir))
     from bayessim_mjx import report
+    from bayessim_mjx.monitor.stages import stages
 
     began = time.monotonic()
     notes: list[str] = []
-    with warnings.catch_warnings(record=True) as caught, _progress(args.headless) as say:
+    with warnings.catch_warnings(record=True) as caught, stages(args.headless) as say:
         warnings.simplefilter("always", UserWarning)
         robot = _robot(args)
         notes += list(dict.fromkeys(str(w.message) for w in caught))

@@ -43,6 +43,11 @@ class Law(struct.PyTreeNode):
     qadr: tuple[int, ...] = struct.field(pytree_node=False)
     dadr: tuple[int, ...] = struct.field(pytree_node=False)
 
+    @property
+    def through(self) -> jax.Array:
+        """`[nu]` bool, the command is the actuator's own ctrl."""
+        return (self.on_position + self.on_velocity == 0) & (self.scale == 1)
+
     def __call__(
         self, command: jax.Array, qpos: jax.Array, qvel: jax.Array, seen: Mapping[str, jax.Array]
     ) -> jax.Array:
@@ -95,6 +100,18 @@ def read(metadata: Mapping[str, Any], model: mujoco.MjModel, actuators: Sequence
         qadr=tuple(int(i) for i in model.jnt_qposadr[joint_of]),
         dadr=tuple(int(i) for i in model.jnt_dofadr[joint_of]),
     )
+
+
+def of_logs(logs: Sequence[Any], model: mujoco.MjModel) -> Law | None:
+    """The laws of several logs, leaves `[logs, nu]`; None where all commands go to the actuators as they are.
+
+    Raises:
+        UserError: as `read`.
+    """
+    if not any(declared(log.metadata) for log in logs):
+        return None
+    each = [read(log.metadata, model, log.actuators, str(log.metadata.get("source", log.name))) for log in logs]
+    return jax.tree.map(lambda *x: jnp.stack(x), *each)
 
 
 def _of_actuator(given: Mapping[str, Any], name: str, actuators: Sequence[str], source: str) -> dict[str, Any]:

@@ -23,7 +23,7 @@ from bayessim_mjx.errors import UserError
 from bayessim_mjx.inference import InferenceSettings, calibration, checks, misspecification, rounds
 from bayessim_mjx.loop_state import Loop, LoopState, RoundInfo
 from bayessim_mjx.rl import Policy
-from bayessim_mjx.rollout import Trajectory, replay, select
+from bayessim_mjx.rollout import Trajectory, select
 from bayessim_mjx.settings import summary_of
 
 CHUNK = 2500  # trajectories simulated at once while collecting
@@ -126,7 +126,7 @@ def infer(loop: Loop, state: LoopState, policy: Policy, info: RoundInfo) -> Loop
         told = posterior.names if round_ else _unknown(posterior.names, info.fit)
         info.warnings += info.checks.warnings(told)
         domain = checks.guarded(posterior, info.checks.prior_share)
-    info.predictive = _predict(loop, posterior, real, loop.key(round_, "predict"))
+    info.predictive = _predict(loop, posterior, seen, real, loop.key(round_, "predict"))
     info.seconds["condition"] = time.perf_counter() - clock - info.seconds.get("check", 0.0)
     following = rounds.following(posterior, b.proposal) if loop.sequential else None
     return dataclasses.replace(state, domain=domain, proposal=following)
@@ -244,16 +244,12 @@ def _posterior(loop: Loop, state: LoopState, info: RoundInfo) -> Distribution:
     rows = jax.tree.map(
         np.asarray, state.real_posteriors
     ).split()  # on the host: an index on the device compiles each time
-    usable = [row for row in rows[:known] if _finite(row)]
+    usable = [row for row in rows[:known] if row.sound]
     if len(usable) < known:
-        info.warnings.append(f"{known - len(usable)} real trajectories left out: no finite posterior")
+        info.warnings.append(f"{known - len(usable)} real trajectories left out: their posteriors are no densities")
     if not usable:
         return Distribution.prior(loop.env.space, b.components, loop.chart)
     return inference.combine(usable, b.components).rechart(loop.chart)
-
-
-def _finite(posterior: Distribution) -> bool:
-    return all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(posterior))
 
 
 def _complaints(names: tuple[str, ...], fit: dict[str, Any], known_before: np.ndarray) -> list[str]:
@@ -314,12 +310,12 @@ def score(domain: Distribution, truth: np.ndarray | None) -> dict[str, float]:
     return scores
 
 
-def _predict(loop: Loop, domain: Distribution, real: Trajectory, key: Array) -> dict[str, np.ndarray] | None:
+def _predict(
+    loop: Loop, domain: Distribution, first: int, real: Trajectory, key: Array
+) -> dict[str, np.ndarray] | None:
     """Posterior predictive: the first real trajectory's commands replayed from its first state at posterior draws."""
-    physics = getattr(loop.env, "physics", None)
-    if physics is None:
+    if getattr(loop.env, "physics", None) is None:
         return None
-    thetas = domain.sample(key, PREDICTIVE_DRAWS)
-    first = [jnp.broadcast_to(x[0], (PREDICTIVE_DRAWS, *x.shape[1:])) for x in (real.qpos, real.qvel, real.command)]
-    motion = replay(physics, first[0][:, 0], first[1][:, 0], first[2], thetas)
+    assert loop.source is not None
+    motion = loop.source.repeated(first, real, domain.sample(key, PREDICTIVE_DRAWS))
     return {name: np.asarray(value) for name, value in motion.items()}

@@ -167,7 +167,7 @@ MUTANTS = (
     ),
     Mutant(
         31, "one device's new episodes taken for those of all", PPO, "(EVERYWHERE, SECOND, FIRST, FIRST)",
-        "(EVERYWHERE, SECOND, FIRST, EVERYWHERE)", (f"{T}devices.py", "-k", "curves"),
+        "(EVERYWHERE, SECOND, FIRST, EVERYWHERE)", (f"{T}devices.py", "-m", "ci", "-k", "curves"),
     ),
 )  # fmt: skip
 

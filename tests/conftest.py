@@ -23,7 +23,9 @@ def known(flag: str) -> bool:
 # Set by hand, also to nothing, it stays: CI runs its slow tests with the compiler as users have it. Workers inherit it.
 if "XLA_FLAGS" not in os.environ:
     os.environ["XLA_FLAGS"] = QUICK if known(QUICK) else ""
-AS_USERS_HAVE_IT = os.environ["XLA_FLAGS"] != QUICK
+# Most programs run for milliseconds and compile for seconds, so none is optimised: half the time, also of long fits.
+if os.environ["XLA_FLAGS"] == QUICK:
+    os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
 
 # Programs are compiled once for all workers, subprocesses and later runs, also those that take milliseconds.
 KEPT = Path(__file__).resolve().parents[1] / ".pytest_cache" / "xla"
@@ -44,16 +46,6 @@ gc.set_threshold(100_000, 50, 100)
 
 def pytest_collection_finish() -> None:
     gc.freeze()
-
-
-@pytest.fixture(autouse=True, scope="module")
-def compiler(request):
-    """Most programs here run for milliseconds and compile for seconds: unless a file computes much, without LLVM's
-    optimisation. CI's slow tests have the compiler as users have it."""
-    import jax
-
-    optimised = AS_USERS_HAVE_IT or request.node.get_closest_marker("long") is not None
-    jax.config.update("jax_disable_most_optimizations", not optimised)
 
 
 MAPS = 20_000  # regions of memory; Linux gives a process 65530, and a compiler that gets no more of them crashes

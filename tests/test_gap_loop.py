@@ -126,6 +126,8 @@ def test_true_and_wrong_diagnoses_and_a_second_start(folder, tmp_path, trained, 
     assert wrong["after"] > wrong["before"] / 2  # the gain goes the wrong way
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_logs_only(folder, tmp_path, trained, robot, capsys):
     """Without a surrogate: predictions, and the logs' own controller replayed."""
     law = {"controller": {"law": "position", "kp": 8.0, "kd": 1.0}}

@@ -16,6 +16,7 @@ TINY = [
     "ppo.log_interval=1", "ppo.save_interval=1", "ppo.hidden_actor=[8]", "ppo.hidden_critic=[8]",
     "bayessim.trainTrajs=400", "bayessim.realEvals=4", "bayessim.realIters=2", "bayessim.realTrajs=2",
     "bayessim.components=3", "bayessim.hiddenLayers=[16]", "bayessim.trainTrajLen=8", "bayessim.ftuneRL=True",
+    "bayessim.checkTrajs=0",
 ]  # fmt: skip
 
 
@@ -114,6 +115,8 @@ def test_checkpoint_steps_grow_and_rounds_are_evaluated(finished):
     assert [value for _, value in evaluated] == [pytest.approx(info.returns.mean()) for info in rounds]
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_later_rounds_compile_nothing(env):
     """Prior or posterior, more data, more real trajectories: the same programs."""
     parts = loop.make(settings("bayessim.realIters=4"), env)
@@ -129,7 +132,10 @@ def test_later_rounds_compile_nothing(env):
     assert counts[3] == counts[1], counts  # the second round still meets a product of several for the first time
 
 
-@pytest.mark.parametrize("stop", [1, 3, 4])
+LONG = [pytest.mark.slow, pytest.mark.ci]
+
+
+@pytest.mark.parametrize("stop", [pytest.param(1, marks=LONG), 3, pytest.param(4, marks=LONG)])
 def test_a_resumed_run_is_the_unkilled_run_bit_for_bit(finished, parts, stop):
     """From a checkpoint within round 0's training, after round 0, and within round 1."""
     state, rounds, recorder = finished
@@ -165,6 +171,8 @@ def test_without_a_model_the_domain_stays_the_prior(env):
     assert rounds[0].returns.shape == (4,)
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_a_new_policy_each_round_where_asked_for(env):
     fresh = loop.make(settings("bayessim.ftuneRL=False"), env)
     state, _ = loop.run(fresh, loop.init(fresh))
@@ -187,6 +195,8 @@ def test_a_policy_that_goes_on_starts_its_sums_anew_in_new_worlds(env):
     assert_equal(after.rnd.predictor, rnd.predictor)
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_policy_dependent_posteriors_are_kept_from_their_time(env):
     dependent = loop.make(settings("bayessim.collectPolicy=policy_rl_randomized"), env)
     assert dependent.capacity == 0  # only a round's own simulations belong to its policy
@@ -214,6 +224,8 @@ def recorded(env, tmp_path_factory):
     return folder, truth
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_logs_give_back_the_parameters_they_were_made_with(env, recorded):
     folder, truth = recorded
     from_logs = settings(

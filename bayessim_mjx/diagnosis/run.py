@@ -31,6 +31,7 @@ from bayessim_mjx.diagnosis.disturbance import Disturbance, estimate
 from bayessim_mjx.diagnosis.fit import Fitter
 from bayessim_mjx.diagnosis.flexible import Flexible, flexible
 from bayessim_mjx.diagnosis.models import Model
+from bayessim_mjx.diagnosis.race import Race
 from bayessim_mjx.diagnosis.ridges import Ridges
 from bayessim_mjx.diagnosis.robot import Robot
 from bayessim_mjx.diagnosis.simulate import Simulator
@@ -222,6 +223,7 @@ def diagnose(
     settings: search.Settings | None = None,
     tolerated: Sequence[str] = (),
     progress: Progress | None = None,
+    keep: Callable[[Setup, Race | None], None] | None = None,
 ) -> Findings:
     """The whole computation.
 
@@ -232,6 +234,7 @@ def diagnose(
         group: metadata key of the operating conditions that are held out in turn.
         tolerated: what may stay unexplained, as `--tolerance` (`tolerance.read`).
         progress: called with (what is being done, done, total).
+        keep: called with what is known so far: the setup, and after each stage the race.
 
     Raises:
         UserError: nothing usable. TooLittleData: nothing could be held out.
@@ -239,7 +242,9 @@ def diagnose(
     say = progress or (lambda text, done, total: None)
     say("looking at the logs", 0, 1)
     setup = prepare(robot, logs, effects, group=group, seed=seed, settings=settings, tolerated=tolerated)
-    race = search.run(setup.fitter, setup.candidates, setup.settings, say)
+    known = keep or (lambda setup, race: None)
+    known(setup, None)
+    race = search.run(setup.fitter, setup.candidates, setup.settings, say, lambda race: known(setup, race))
     race.winner = bounds.widened(race, _verified(setup, race, say), say)
     ruling = verdict.rule(race, say)
     ruling = dataclasses.replace(ruling, model=bounds.widened(race, ruling.model, say))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from bayessim_mjx.diagnosis.bounds import widen_leading
@@ -46,8 +46,14 @@ ELSEWHERE = 3  # times
 BETTER = 0.5  # of the gap that remains, which another way has to undercut
 
 
-def run(fitter: Fitter, candidates: Sequence[Candidate], settings: Settings, progress: Progress | None = None) -> Race:
-    """The whole race on the windows of `fitter`."""
+def run(
+    fitter: Fitter,
+    candidates: Sequence[Candidate],
+    settings: Settings,
+    progress: Progress | None = None,
+    keep: Callable[[Race], None] = lambda race: None,
+) -> Race:
+    """The whole race on the windows of `fitter`; `keep` is called with it after each stage."""
     say = progress or (lambda text, done, total: None)
     nominal = fitter.begin(fitter.base)
     job = replace(nominal, A=nominal.A.copy(), history=[])  # the same point, simulated once
@@ -60,6 +66,7 @@ def run(fitter: Fitter, candidates: Sequence[Candidate], settings: Settings, pro
         race.base = race.winner = polish(race, base)
         job = race.base.job
     race.models[frozenset()] = race.base
+    keep(race)
     say("screening", 0, 1)
     race.screened = screen(fitter, job, candidates, settings.screened)
     if not race.above_noise(race.base):  # nothing to explain: a few fits for the table
@@ -68,7 +75,10 @@ def run(fitter: Fitter, candidates: Sequence[Candidate], settings: Settings, pro
         return race
     _singles(race, say)
     widen_leading(race, say)
-    best = _elsewhere(race, _greedy(race, _pairs(race, say), say), say)
+    keep(race)
+    best = _pairs(race, say)
+    keep(race)
+    best = _elsewhere(race, _greedy(race, best, say), say)
     race.winner = simplest(race, best, say)
     return race
 

@@ -13,13 +13,13 @@ from flax import struct
 from numpy.typing import NDArray
 
 from bayessim_mjx import laws
-from bayessim_mjx.effects.site import Motion
+from bayessim_mjx.effects.site import AROUND, Motion
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Log
+from bayessim_mjx.logs.resample import around as rows_around
 from bayessim_mjx.logs.resample import resample
 
 Array = NDArray[np.float64]
-AROUND = 0.1  # s of recorded motion before and after a start that effects with memory may look at
 MAX_AROUND = 24  # control steps
 
 
@@ -154,7 +154,7 @@ def cut(
     else:
         group_of_window = [group_of[r] for r, _ in starts]
     around = min(MAX_AROUND, max(2, int(np.ceil(AROUND / dt))))
-    law = _laws(logs, model) if any(laws.declared(log.metadata) for log in logs) else None
+    law = laws.of_logs(logs, model)
     pick = np.asarray([r for r, _ in starts])
     enabled = _enabled(even, starts, length, model) if any(not e.enabled.all() for e in even) else None
     batch = Batch(
@@ -226,18 +226,13 @@ def _fine_commands(raw: Log, even: Log, dt: float, substeps: int, centred: bool)
 
 def _around(even: Sequence[Log], fine: list, starts: list[tuple[int, int]], around: int) -> Motion:
     """Recorded rows `a - around .. a + around`; beyond the ends of a log the end is held."""
-    rows = [(r, np.clip(np.arange(a - around, a + around + 1), 0, len(even[r]) - 1)) for r, a in starts]
+    rows = [(r, rows_around(even[r], a, around)) for r, a in starts]
     return Motion(
         qpos=_stack([even[r].qpos[i] for r, i in rows]),
         qvel=_stack([even[r].qvel[i] for r, i in rows]),
         command=_stack([fine[r][i] for r, i in rows]),
         start=around,
     )
-
-
-def _laws(logs: Sequence[Log], model: mujoco.MjModel) -> laws.Law:
-    each = [laws.read(log.metadata, model, log.actuators, str(log.metadata.get("source", log.name))) for log in logs]
-    return jax.tree.map(lambda *x: jnp.stack(x), *each)
 
 
 def _enabled(even: Sequence[Log], starts: list[tuple[int, int]], length: int, model: mujoco.MjModel) -> jax.Array:

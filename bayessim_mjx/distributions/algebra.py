@@ -1,7 +1,11 @@
 """Mixture algebra on the host in float64: products and quotients of Gaussian mixtures with a flat part, reduction.
 
-A `Mixture` is  exp(flat) p + sum_k exp(log_weights_k) N(means_k, covs_k)  up to a constant factor. The prior p is 1 on
-the unit cube (precision 0) or N(0, I) (precision 1).
+A `Mixture` is  exp(flat) p + sum_k exp(log_weights_k) N(means_k, scales_k scales_k^T)  up to a constant factor. The
+prior p is 1 on the unit cube (precision 0) or N(0, I) (precision 1).
+
+Covariances and precisions are never formed where they are added: S is the Cholesky factor of a covariance, T = S^-1,
+and a triangular factor of T1^T T1 + T2^T T2 comes of T1 and T2 stacked, by orthogonal transformations (Bierman, 1977).
+So everything stays positive definite, and twice as many digits are kept.
 """
 
 from typing import NamedTuple
@@ -10,7 +14,11 @@ import numpy as np
 from scipy.special import log_ndtr
 
 NEGLIGIBLE = 1e-8  # relative mass below which a component is dropped
+FAINT = 1e-12  # the same of a factor: where all others contradict, a faint component may decide
 CROWD = 96  # components kept before merging (bounds the pairwise work)
+# standard deviations in coordinates of the chart: what is broader is flat over the unit cube to 1e-8, what is thinner
+# a point in float32; a network may put out both in one component
+WIDEST, THINNEST = 1e4, 1e-10
 
 
 class Mixture(NamedTuple):
@@ -19,118 +27,135 @@ class Mixture(NamedTuple):
     flat: float
     log_weights: np.ndarray  # [K]
     means: np.ndarray  # [K, d]
-    covs: np.ndarray  # [K, d, d]
+    scales: np.ndarray  # [K, d, d] lower Cholesky factors of the covariances
     prior: float = 0.0  # precision of the prior
 
 
 def product(a: Mixture, b: Mixture) -> Mixture:
     """a b / p, closed form: all pairs N(m1, S1) N(m2, S2) / p, and each part of the prior leaves the other factor."""
-    weights, means, covs = _pairs(a, b) if a.prior == 0 else _pairs_over_normal(a, b)
-    terms = [(weights, means, covs)]
+    a, b = (_conditioned(prune(x, FAINT)) for x in (a, b))
+    terms = [_pairs(a, b)]
     if np.isfinite(b.flat):
-        terms.append((a.log_weights + b.flat, a.means, a.covs))
+        terms.append((a.log_weights + b.flat, a.means, a.scales))
     if np.isfinite(a.flat):
-        terms.append((b.log_weights + a.flat, b.means, b.covs))
-    weights, means, covs = (np.concatenate(part) for part in zip(*terms, strict=True))
-    return _rescaled(Mixture(a.flat + b.flat, weights, means, covs, a.prior))
+        terms.append((b.log_weights + a.flat, b.means, b.scales))
+    weights, means, scales = (np.concatenate(part) for part in zip(*terms, strict=True))
+    return _rescaled(Mixture(a.flat + b.flat, weights, means, scales, a.prior))
+
+
+def _conditioned(mixture: Mixture) -> Mixture:
+    """The same density in the cube by components whose widths float64 can add.
+
+    In the probit chart a component that is broader than the prior is cut to it: a single data set cannot take knowledge
+    away, and the product of many would have no finite mass.
+    """
+    k, d = mixture.means.shape
+    eye = np.broadcast_to(np.eye(d), (k, d, d))
+    scales = root(np.concatenate([np.swapaxes(mixture.scales, -1, -2), THINNEST * eye], axis=-2))
+    mixture = mixture._replace(scales=scales)
+    if mixture.prior:
+        _, widths, axes = np.linalg.svd(_inverse(scales))
+        whiten = _coroot(np.maximum(widths, np.sqrt(mixture.prior))[..., None] * axes)
+        return mixture._replace(scales=_inverse(whiten))
+    flat = Mixture(-np.inf, np.zeros(1), np.full((1, d), 0.5), WIDEST * eye[:1])
+    weights, means, scales = _pairs(mixture, flat)
+    # up to the height of the flat Gaussian
+    weights = weights + d * (np.log(WIDEST) + 0.5 * np.log(2 * np.pi))
+    return mixture._replace(log_weights=weights, means=means, scales=scales)
 
 
 def _pairs(a: Mixture, b: Mixture) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """N(m1, S1) N(m2, S2) = N(m1; m2, S1 + S2) N(m, S), S^-1 = S1^-1 + S2^-1."""
-    d = a.means.shape[1]
-    total = a.covs[:, None] + b.covs[None, :]  # [Ka, Kb, d, d]
-    gain = np.swapaxes(np.linalg.solve(total, np.broadcast_to(a.covs[:, None], total.shape)), -1, -2)  # S1 (S1+S2)^-1
+    """N(m1, S1) N(m2, S2) / p of all pairs: log masses [n], means [n, d] and scales [n, d, d].
+
+    |T1 (x - m1)|^2 + |E2 (x - m2)|^2 = |T (x - m)|^2 + rest^2, E2^T E2 = T2^T T2 - prior, is one least-squares problem;
+    of a Gaussian prior a linear term m2 x - |m2|^2 / 2 is left.
+    """
+    (ka, d), kb = a.means.shape, len(b.means)
+    Ta, Tb = _inverse(a.scales), _inverse(b.scales)
+    Eb = Tb
+    if a.prior:
+        _, widths, axes = np.linalg.svd(Tb)
+        Eb = np.sqrt(np.maximum(widths**2 - a.prior, 0.0))[..., None] * axes
     delta = b.means[None, :] - a.means[:, None]
-    means = a.means[:, None] + np.einsum("abij,abj->abi", gain, delta)
-    covs = np.einsum("abij,bjk->abik", gain, b.covs)
-    maha = np.einsum("abi,abi->ab", delta, np.linalg.solve(total, delta[..., None])[..., 0])
-    overlap = -0.5 * (maha + np.linalg.slogdet(total)[1] + d * np.log(2 * np.pi))
-    weights = a.log_weights[:, None] + b.log_weights[None, :] + overlap
-    return weights.reshape(-1), means.reshape(-1, d), _symmetric(covs.reshape(-1, d, d))
+    stack = np.zeros((ka, kb, 2 * d, 1 + d))
+    stack[..., :d, 1:], stack[..., d:, 1:] = Ta[:, None], Eb[None]
+    stack[..., d:, 0] = np.einsum("bij,abj->abi", Eb, delta)
+    both = _coroot(stack)  # [[rest, 0], [T m, T]]
+    scales = _inverse(both[..., 1:, 1:])
+    means = a.means[:, None] + np.einsum("abij,abj->abi", scales, both[..., 1:, 0])
+    weights = _log_det(Ta)[:, None] + _log_det(Tb)[None] + _log_det(scales) - 0.5 * both[..., 0, 0] ** 2
+    if a.prior:
+        pull = np.einsum("abji,bj->abi", scales, b.means)
+        weights = weights + np.einsum("abi,bi->ab", means, b.means) - 0.5 * np.sum(b.means**2, axis=1)[None]
+        weights = weights + 0.5 * np.sum(pull**2, axis=-1)
+        means = means + np.einsum("abij,abj->abi", scales, pull)
+    else:
+        weights = weights - 0.5 * d * np.log(2 * np.pi)
+    weights = weights + a.log_weights[:, None] + b.log_weights[None, :]
+    return weights.reshape(-1), means.reshape(-1, d), scales.reshape(-1, d, d)
 
 
-def _pairs_over_normal(a: Mixture, b: Mixture) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """N(m1, S1) N(m2, S2) / N(0, I): precision P1 + P2 - I, shift P1 m1 + P2 m2."""
-    d = a.means.shape[1]
-    (pa, ha, ca), (pb, hb, cb) = _natural(a), _natural(b)
-    precision = (pa[:, None] + pb[None] - np.eye(d)).reshape(-1, d, d)
-    weights = (a.log_weights + ca)[:, None] + (b.log_weights + cb)[None]
-    return _moments(weights.reshape(-1), precision, (ha[:, None] + hb[None]).reshape(-1, d))
-
-
-def _natural(mixture: Mixture) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Precisions, shifts P m and 1/2 (log|P| - m P m). A component that is broader than the prior is cut to it:
-    a single data set cannot take knowledge away, and the product of many would have no finite mass."""
-    precision = _symmetric(np.linalg.inv(mixture.covs))
-    if mixture.prior:
-        values, vectors = np.linalg.eigh(precision)
-        precision = np.einsum("kij,kj,klj->kil", vectors, np.maximum(values, mixture.prior), vectors)
-    shift = np.einsum("kij,kj->ki", precision, mixture.means)
-    return precision, shift, 0.5 * (np.linalg.slogdet(precision)[1] - np.sum(shift * mixture.means, axis=1))
-
-
-def _moments(
-    weights: np.ndarray, precision: np.ndarray, shift: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Completes the square: exp(weights - z P z / 2 + h z) -> log masses (less d/2 log 2 pi), means, covariances."""
-    covs = _symmetric(np.linalg.inv(precision))
-    means = np.einsum("kij,kj->ki", covs, shift)
-    gain = 0.5 * (np.sum(shift * means, axis=1) - np.linalg.slogdet(precision)[1])
-    return weights + gain, means, covs
-
-
-def divide(mixture: Mixture, mean: np.ndarray, cov: np.ndarray) -> tuple[Mixture | None, float]:
-    """mixture p / N(mean, cov) (BayesSim, eq. 19 with Sigma'), and the share of weight of components left out.
+def divide(mixture: Mixture, mean: np.ndarray, scale: np.ndarray) -> tuple[Mixture | None, float]:
+    """mixture p / N(mean, scale scale^T) (BayesSim, eq. 19 with Sigma'), and the share of weight of what is left out.
 
     Left out are components whose quotient has no positive definite precision P_k + P_p - P_0. None where none is left.
     The mixture's part of the prior is taken to be negligible.
     """
-    d = len(mean)
-    # not `_natural(mixture)`: here a component may be broader than the prior
-    pk, hk, ck = _natural(mixture._replace(prior=0.0))
-    p0, h0, _ = _natural(Mixture(-np.inf, np.zeros(1), mean[None], cov[None]))
-    precision = pk + mixture.prior * np.eye(d) - p0
-    proper = np.linalg.eigvalsh(precision)[:, 0] > 1e-9 * np.linalg.eigvalsh(pk)[:, 0]
+    k, d = mixture.means.shape
+    eye = np.broadcast_to(np.eye(d), (k, d, d))
+    Tk, T0 = _inverse(mixture.scales), _inverse(scale[None])[0]
+    whiten = _coroot(np.concatenate([Tk, np.sqrt(mixture.prior) * eye], axis=-2))  # of P_k + P_p
+    _, widths, axes = np.linalg.svd(T0 @ _inverse(whiten))
+    proper = widths[:, 0] ** 2 < 1 - 1e-9
     shares = np.exp(mixture.log_weights - np.logaddexp.reduce(mixture.log_weights))
     lost = float(shares[~proper].sum())
     if not proper.any():
         return None, lost
-    weights, means, covs = _moments((mixture.log_weights + ck)[proper], precision[proper], (hk - h0)[proper])
-    return _rescaled(Mixture(-np.inf, weights, means, covs, mixture.prior)), lost
+    means, off = mixture.means[proper], mixture.means[proper] - mean
+    rows = np.sqrt(1 - widths[proper] ** 2)[..., None] * axes[proper]
+    scales = _inverse(_coroot(rows @ whiten[proper]))
+    # log density and its slope at the component's mean, where the component itself has none
+    height = 0.5 * np.sum((off @ T0.T) ** 2, axis=1) - 0.5 * mixture.prior * np.sum(means**2, axis=1)
+    pull = np.einsum("kji,kj->ki", scales, off @ T0.T @ T0 - mixture.prior * means)
+    weights = mixture.log_weights[proper] + _log_det(Tk[proper]) + _log_det(scales)
+    weights = weights + height + 0.5 * np.sum(pull**2, axis=1)
+    means = means + np.einsum("kij,kj->ki", scales, pull)
+    return _rescaled(Mixture(-np.inf, weights, means, scales, mixture.prior)), lost
 
 
 def reduce(mixture: Mixture, components: int) -> Mixture:
     """Drop negligible components, then merge the pair that costs least (Runnalls 2007, eq. 16) until K are left."""
     mixture = prune(mixture)
-    weights, means, covs = np.exp(np.maximum(mixture.log_weights, -600.0)), mixture.means, mixture.covs
+    weights, means, scales = np.exp(np.maximum(mixture.log_weights, -600.0)), mixture.means, mixture.scales
     if len(weights) <= components:
         return mixture
-    cost = _cost_table(weights, means, covs)
+    cost = np.stack([_costs_to(weights, means, scales, i) for i in range(len(weights))])
     while len(weights) > components:
         i, j = sorted(divmod(int(np.argmin(cost)), len(weights)))
-        weights, means, covs = _merge(weights, means, covs, i, j)
+        weights, means, scales = _merge(weights, means, scales, i, j)
         cost = np.delete(np.delete(cost, j, 0), j, 1)
-        row = _costs_to(weights, means, covs, i)
+        row = _costs_to(weights, means, scales, i)
         cost[i, :], cost[:, i] = row, row
-    return Mixture(mixture.flat, np.log(weights), means, covs, mixture.prior)
+    return Mixture(mixture.flat, np.log(weights), means, scales, mixture.prior)
 
 
-def prune(mixture: Mixture) -> Mixture:
-    """Drop components whose mass inside the cube is negligible, and all but the CROWD heaviest."""
+def prune(mixture: Mixture, negligible: float = NEGLIGIBLE) -> Mixture:
+    """Drop components whose mass inside the cube is negligible, and all but the CROWD heaviest; the heaviest stays."""
     scores = mixture.log_weights
     if mixture.prior == 0:  # the others are not cut off
-        scores = scores + log_mass_bound(mixture.means, mixture.covs)
-    keep = scores > max(scores.max(), mixture.flat) + np.log(NEGLIGIBLE)
+        scores = scores + log_mass_bound(mixture.means, mixture.scales)
+    scores = np.where(np.isnan(scores), -np.inf, scores)
+    keep = scores > max(scores.max(), mixture.flat) + np.log(negligible)
     keep &= scores >= np.sort(scores)[-min(CROWD, len(scores))]
-    keep |= scores == scores.max()
-    kept = mixture.log_weights[keep], mixture.means[keep], mixture.covs[keep]
+    keep[np.argmax(scores)] = True
+    kept = mixture.log_weights[keep], mixture.means[keep], mixture.scales[keep]
     return _rescaled(Mixture(mixture.flat, *kept, mixture.prior))
 
 
-def log_mass_bound(means: np.ndarray, covs: np.ndarray) -> np.ndarray:
+def log_mass_bound(means: np.ndarray, scales: np.ndarray) -> np.ndarray:
     """Each Gaussian's log mass beyond the nearest wall of the cube (log 1/2 for a mean inside), [K]: a cheap bound."""
-    sd = np.sqrt(np.diagonal(covs, axis1=1, axis2=2))
-    return np.min(log_ndtr(np.minimum(np.minimum(means, 1 - means) / sd, 0)), axis=1)
+    sd = np.maximum(np.sqrt(np.sum(scales**2, axis=-1)), THINNEST)
+    return np.min(log_ndtr(np.minimum(np.minimum(means, 1 - means) / sd, 0)), axis=1, initial=0.0)
 
 
 def _rescaled(mixture: Mixture) -> Mixture:
@@ -138,36 +163,57 @@ def _rescaled(mixture: Mixture) -> Mixture:
     return mixture._replace(flat=mixture.flat - top, log_weights=mixture.log_weights - top)
 
 
-def _symmetric(covs: np.ndarray) -> np.ndarray:
-    return 0.5 * (covs + np.swapaxes(covs, -1, -2))
+def root(rows: np.ndarray) -> np.ndarray:
+    """Lower S with positive diagonal, S S^T = rows^T rows: rows [..., m, d] -> [..., d, d]."""
+    return np.swapaxes(_positive(_triangle(rows)), -1, -2)
 
 
-def _join(w: np.ndarray, m: np.ndarray, c: np.ndarray, i: int, j: np.ndarray | int) -> tuple:
-    """Moments of component i joined with each of the components j."""
-    share = (w[i] / (w[i] + w[j]))[..., None]
-    gap = m[i] - m[j]
-    mean = share * m[i] + (1 - share) * m[j]
-    spread = (share * (1 - share))[..., None] * gap[..., :, None] * gap[..., None, :]
-    return mean, share[..., None] * c[i] + (1 - share[..., None]) * c[j] + spread
+def _coroot(rows: np.ndarray) -> np.ndarray:
+    """Lower T with positive diagonal, T^T T = rows^T rows: rows [..., m, d] -> [..., d, d]."""
+    return _positive(_triangle(rows[..., ::-1])[..., ::-1, ::-1])
 
 
-def _costs_to(w: np.ndarray, m: np.ndarray, c: np.ndarray, i: int) -> np.ndarray:
+def _triangle(rows: np.ndarray) -> np.ndarray:
+    return np.asarray(np.linalg.qr(rows, mode="r"))
+
+
+def _positive(triangular: np.ndarray) -> np.ndarray:
+    signs = np.where(np.diagonal(triangular, axis1=-2, axis2=-1) < 0, -1.0, 1.0)
+    return triangular * signs[..., None]
+
+
+def _inverse(lower: np.ndarray) -> np.ndarray:
+    """Of lower triangular matrices [..., d, d], by forward substitution: exact to rounding row by row."""
+    out, eye = np.zeros_like(lower), np.eye(lower.shape[-1])
+    for i in range(lower.shape[-1]):
+        before = (lower[..., i, None, :i] @ out[..., :i, :])[..., 0, :]
+        out[..., i, :] = (eye[i] - before) / lower[..., i, i, None]
+    return out
+
+
+def _log_det(triangular: np.ndarray) -> np.ndarray:
+    return np.sum(np.log(np.diagonal(triangular, axis1=-2, axis2=-1)), axis=-1)
+
+
+def _costs_to(w: np.ndarray, m: np.ndarray, s: np.ndarray, i: int) -> np.ndarray:
     """Runnalls' bound on the divergence of merging i with every other component, [K]."""
-    everyone = np.arange(len(w))
-    log_det = np.linalg.slogdet(c)[1]
-    joint = np.linalg.slogdet(_join(w, m, c, i, everyone)[1])[1]
-    # B(i, j) = 1/2 [(w_i + w_j) ln|S_ij| - w_i ln|S_i| - w_j ln|S_j|]
-    cost = 0.5 * ((w[i] + w) * joint - w[i] * log_det[i] - w * log_det)
+    share = w[i] / (w[i] + w)
+    log_det, joint = _log_det(s), _log_det(_joined(share, m[i] - m, s[i], s))
+    # B(i, j) = 1/2 [(w_i + w_j) ln|S_ij| - w_i ln|S_i| - w_j ln|S_j|], determinants of covariances
+    cost = (w[i] + w) * joint - w[i] * log_det[i] - w * log_det
     cost[i] = np.inf
     return cost
 
 
-def _cost_table(w: np.ndarray, m: np.ndarray, c: np.ndarray) -> np.ndarray:
-    return np.stack([_costs_to(w, m, c, i) for i in range(len(w))])
+def _joined(share: np.ndarray, gap: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Scales [K, d, d] of pairs of components as one; share [K] of the first, gap [K, d] between their means."""
+    a, b = np.sqrt(share)[:, None, None], np.sqrt(1 - share)[:, None, None]
+    first, second = (np.broadcast_to(np.swapaxes(s, -1, -2), second.shape) for s in (first, second))
+    return root(np.concatenate([a * first, b * second, a * b * gap[:, None, :]], axis=-2))
 
 
-def _merge(w: np.ndarray, m: np.ndarray, c: np.ndarray, i: int, j: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    mean, cov = _join(w, m, c, i, j)
-    w, m, c = w.copy(), m.copy(), c.copy()
-    w[i], m[i], c[i] = w[i] + w[j], mean, _symmetric(cov)
-    return np.delete(w, j), np.delete(m, j, 0), np.delete(c, j, 0)
+def _merge(w: np.ndarray, m: np.ndarray, s: np.ndarray, i: int, j: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    share, w, m, s = w[i] / (w[i] + w[j]), w.copy(), m.copy(), s.copy()
+    s[i] = _joined(np.array([share]), (m[i] - m[j])[None], s[i], s[j][None])[0]
+    w[i], m[i] = w[i] + w[j], share * m[i] + (1 - share) * m[j]
+    return np.delete(w, j), np.delete(m, j, 0), np.delete(s, j, 0)

@@ -23,14 +23,23 @@ def empty(components: int, d: int, centre: float = 0.5) -> tuple[np.ndarray, np.
 
 
 def to_mixture(q: Distribution) -> algebra.Mixture:
-    """The density of q (plain or probit) as a part of the prior + weighted, untruncated Gaussians."""
+    """The density of q (plain or probit) as a part of the prior + weighted, untruncated Gaussians.
+
+    Components of no weight are left out where they are no Gaussians. ValueError where q is no density.
+    """
     logits, means, scales = (np.asarray(v, np.float64) for v in (q.logits, q.means, q.scales))
-    w0 = float(q.prior_weight)
+    w0, inside = float(q.prior_weight), float(q.log_inside)
+    if not (0 <= w0 <= 1 and np.isfinite(inside) and not np.isnan(logits).any() and np.isfinite(logits).any()):
+        raise ValueError(f"no density: weight of the prior {w0:g}, log mass {inside:g}, log weights {logits}")
+    shares = logits - np.logaddexp.reduce(logits)
+    widths = np.diagonal(scales, axis1=1, axis2=2)
+    good = np.isfinite(means).all(axis=1) & np.isfinite(scales).all(axis=(1, 2)) & (widths > 0).all(axis=1)
+    if np.any(~good & (shares > np.log(algebra.FAINT))):
+        raise ValueError(f"no density: means {means[~good]}, scales {scales[~good]}")
     with np.errstate(divide="ignore"):
-        flat, bulk = np.log(w0), np.log1p(-w0) - float(q.log_inside)
-    weights = np.maximum(logits - np.logaddexp.reduce(logits) + bulk, -1e12)
-    covs = scales @ np.swapaxes(scales, -1, -2)
-    return algebra.Mixture(float(flat), weights, means, covs, charts.PRIOR_PRECISION.get(q.chart, 1.0))
+        flat, bulk = np.log(w0), np.log1p(-w0) - inside
+    weights, means, scales = np.maximum(shares + bulk, -1e12)[good], means[good], scales[good]
+    return algebra.Mixture(float(flat), weights, means, scales, charts.PRIOR_PRECISION.get(q.chart, 1.0))
 
 
 def recharted(q: Distribution, chart: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -41,8 +50,8 @@ def recharted(q: Distribution, chart: str) -> tuple[np.ndarray, np.ndarray, np.n
     weights /= weights.sum(axis=1, keepdims=True)
     means = np.einsum("kn,kni->ki", weights, z)
     gap = z - means[:, None]
-    covs = np.einsum("kn,kni,knj->kij", weights, gap, gap) + 1e-12 * np.eye(z.shape[-1])
-    scales = np.linalg.cholesky(covs)
+    least = np.broadcast_to(1e-6 * np.eye(z.shape[-1]), (len(means), z.shape[-1], z.shape[-1]))
+    scales = algebra.root(np.concatenate([np.sqrt(weights)[..., None] * gap, least], axis=1))
     # every component keeps its mass inside the cube
     mass = np.logaddexp.reduce(log_weights, axis=1) - np.log(log_weights.shape[1])
     if chart == "plain":
@@ -55,7 +64,7 @@ def padded(mixture: algebra.Mixture, components: int) -> tuple[np.ndarray, np.nd
     k, d = mixture.means.shape
     logits, means, scales = empty(components, d)
     total = float(np.logaddexp.reduce(mixture.log_weights))
-    logits[:k], means[:k], scales[:k] = mixture.log_weights - total, mixture.means, np.linalg.cholesky(mixture.covs)
+    logits[:k], means[:k], scales[:k] = mixture.log_weights - total, mixture.means, mixture.scales
     return logits, means, scales, total
 
 

@@ -172,11 +172,21 @@ class Distribution:
         rest = self.space.subset([self.names[i] for i in free])
         return Distribution.from_unit(rest, logits, means, scales, weight, self.chart)
 
+    @property
+    def sound(self) -> bool:
+        """Whether it is a density: finite, with weights and widths that a mixture can have (on the host)."""
+        try:
+            convert.to_mixture(self)
+        except ValueError:
+            return False
+        return True
+
     # ---- mixture algebra (on the host) --------------------------------------------------------------------------
     def product(self, *others: Distribution, components: int | None = None) -> Distribution:
         """Posterior given independent data sets: p(theta)^(1-n) prod_i q_i(theta), reduced to `components` (this K).
 
         Logit distributions, whose prior is no Gaussian, are carried over to the probit chart first (see `rechart`).
+        ValueError where one of them is no density (see `sound`).
         """
         k = components or self.components
         chart = "probit" if self.chart == "logit" else self.chart
@@ -199,7 +209,7 @@ class Distribution:
         if proposal.components != 1:
             raise ValueError(f"divide: a proposal of {proposal.components} Gaussians; reduce it to 1")
         divisor = convert.to_mixture(proposal)
-        quotient, lost = algebra.divide(convert.to_mixture(self), divisor.means[0], divisor.covs[0])
+        quotient, lost = algebra.divide(convert.to_mixture(self), divisor.means[0], divisor.scales[0])
         if quotient is None:
             return self, lost
         return self._of(self.space, quotient, self.components, self.chart), lost

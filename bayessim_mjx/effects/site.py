@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
     from bayessim_mjx.effects.effect import Effect
 
+AROUND = 0.1  # s of recorded motion before and after a start that effects with memory may look at, at least
 _HINGE, _SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
 _KINDS = ("actuator", "joint", "body", "geom")
 

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
 from bayessim_mjx.errors import UserError
@@ -86,8 +87,17 @@ def check_time(table: Table, time: Array, min_rows: int) -> None:
         warnings.warn(text, stacklevel=3)
 
 
-def check_motion(table: Table, columns: dict[str, Array], channels: Channels, mj_model: mujoco.MjModel) -> None:
+def check_motion(
+    table: Table,
+    columns: dict[str, Array],
+    channels: Channels,
+    mj_model: mujoco.MjModel,
+    through: NDArray[np.bool_],
+) -> None:
     """Angles are continuous, quaternions have norm 1, commands fit the actuator. Unwraps hinges in place, warning.
+
+    Args:
+        through: [nu], the logged command is the actuator's own and no controller's.
 
     Raises:
         UserError: jumps no joint makes, registers read with the wrong sign or unit.
@@ -107,7 +117,7 @@ def check_motion(table: Table, columns: dict[str, Array], channels: Channels, mj
             row = int(jump[0])
             at = f"{table.path}: column {column!r}, {table.where(row + 1)}: jump from {x[row]:g} to {x[row + 1]:g}"
             raise UserError(f"{at}: a signed 16-bit register read as unsigned; allowed: `signed: 16` in the map")
-        if mj_model.actuator_ctrllimited[i]:
+        if mj_model.actuator_ctrllimited[i] and through[i]:
             _inside(table, column, x, mj_model.actuator_ctrlrange[i], "ctrlrange", 0.01)
 
 

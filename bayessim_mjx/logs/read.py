@@ -124,10 +124,10 @@ def _read_one(path: Path, mj_model: mujoco.MjModel, channels: Channels, log_map:
     columns = log_map.apply(table) if log_map is not None else _columns(table, channels)
     check_channels(table, columns, channels)
     check_time(table, columns["time"], MIN_ROWS)
-    check_motion(table, columns, channels, mj_model)
-    columns = _with_numbers(table, columns)
     metadata = {**(log_map.metadata if log_map else {}), **_side_yaml(path), "source": str(path)}
-    laws.read(metadata, mj_model, channels.actuators, str(path))  # refused here, before anything is simulated
+    law = laws.read(metadata, mj_model, channels.actuators, str(path))  # refused here, before anything is simulated
+    check_motion(table, columns, channels, mj_model, np.asarray(law.through))
+    columns = _with_numbers(table, columns)
     if "condition" in metadata:
         metadata.setdefault("operating_condition", metadata["condition"])
     return _pieces(table, columns, channels, metadata)

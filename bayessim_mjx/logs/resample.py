@@ -94,18 +94,25 @@ def _normalised(log: Log, qpos: Array) -> Array:
     return out
 
 
+def around(log: Log, start: int, rows: int) -> NDArray[np.int64]:
+    """Indices of the log's rows `start - rows .. start + rows`; beyond its ends the end is held."""
+    return np.clip(np.arange(start - rows, start + rows + 1), 0, len(log) - 1)
+
+
 def segments(
-    logs: Log | Sequence[Log], length: int, stride: int | None = None, dt: float | None = None
+    logs: Log | Sequence[Log], length: int, stride: int | None = None, dt: float | None = None, rows: int = 0
 ) -> dict[str, NDArray[Any]]:
     """M windows of `length` = T control steps, one every `stride` steps (default T), ready for `rollout.replay`.
 
     Args:
         logs: sampled evenly at one period, or at any rates if `dt` is given: they are resampled first.
         dt: control period [s].
+        rows: L, control steps of the recording before and after each start that are given too.
 
     Returns:
         qpos0 [M, nq], qvel0 [M, nv], command [M, T, nu], qpos [M, T+1, nq], qvel [M, T+1, nv] (float32): apply
-        command[k] from row k to row k + 1. And run [M], start [M]: index of the log and first row of the window in it.
+        command[k] from row k to row k + 1. And run [M], start [M]: index of the log and first row of the window in it;
+        around_qpos [M, 2 L + 1, nq], around_qvel, around_command: the recording around the start, which is row L.
         Windows in which a drive was switched off (`enabled:` streams) are left out: no command is no command of zero.
 
     Raises:
@@ -128,12 +135,18 @@ def segments(
     if not windows:
         raise UserError(_no_window(runs, length, period))
 
-    def cut(key: str, rows: int) -> NDArray[np.float32]:
-        return np.stack([getattr(runs[r], key)[a : a + rows] for r, a in windows]).astype(np.float32)
+    def cut(key: str, count: int) -> NDArray[np.float32]:
+        return np.stack([getattr(runs[r], key)[a : a + count] for r, a in windows]).astype(np.float32)
 
+    near = [around(runs[r], a, rows) for r, a in windows]
+    motion = {
+        f"around_{name}": np.stack([getattr(runs[r], key)[i] for (r, _), i in zip(windows, near, strict=True)])
+        for name, key in (("qpos", "qpos"), ("qvel", "qvel"), ("command", "ctrl"))
+    }
+    motion = {name: x.astype(np.float32) for name, x in motion.items()}
     qpos, qvel = cut("qpos", length + 1), cut("qvel", length + 1)
     run, start = (np.array(c, dtype=np.int64) for c in zip(*windows, strict=True))
-    motion = {"qpos0": qpos[:, 0], "qvel0": qvel[:, 0], "command": cut("ctrl", length), "qpos": qpos, "qvel": qvel}
+    motion |= {"qpos0": qpos[:, 0], "qvel0": qvel[:, 0], "command": cut("ctrl", length), "qpos": qpos, "qvel": qvel}
     return motion | {"run": run, "start": start}
 
 

@@ -133,6 +133,8 @@ def test_a_cause_of_the_asked_strength_is_that_far_from_the_model(name):
     assert ruler.measure(ruler.runs)[0] < 1e-9  # and without it nothing is
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_two_writings_of_a_case_are_equal_and_other_seeds_differ(tmp_path):
     effects = [("external_force", "link"), "coulomb_friction"]
     first, second = (cases.make_case("pendulum", effects, "medium", 7, tmp_path / n) for n in "ab")

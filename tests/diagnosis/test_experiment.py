@@ -92,6 +92,8 @@ def evidence(race):
     return race.better(models["viscous_friction"], models["quadratic_drag"]).evidence
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_fast_motion_is_proposed_where_only_fast_motion_separates():
     setup, _, _, _ = contest()
     found = proposal()

@@ -1,11 +1,12 @@
 """The whole diagnosis of a pendulum with few effects on offer: verdicts, names, numbers, the result's schema."""
 
+import itertools
 import json
 
 import numpy as np
 import pytest
 
-from bayessim_mjx.diagnosis import assemble, result, run
+from bayessim_mjx.diagnosis import assemble, preliminary, result, run
 
 from .pendulums import FEW, nominal, recorded
 
@@ -17,13 +18,23 @@ GAP = {"noise_floor", "nominal", "calibrated", "with_effects", "reducible_floor"
 
 
 def diagnosed(folder, logs, effects=FEW) -> tuple[run.Findings, result.Diagnosis]:
-    found = run.diagnose(nominal(folder), logs, effects)
+    seen = itertools.count()
+
+    def keep(setup, race):
+        preliminary.write(folder / "so_far" / f"{next(seen)}.json", {"robot": "pendulum"}, ["a note"], setup, race)
+
+    found = run.diagnose(nominal(folder), logs, effects, keep=keep)
     return found, assemble.diagnosis_of(found)
 
 
 @pytest.fixture(scope="module")
-def rubbing(tmp_path_factory):
-    return diagnosed(tmp_path_factory.mktemp("rubbing"), recorded(friction=0.04, scale=(0.9, 1.1, 0.95)))
+def place(tmp_path_factory):
+    return tmp_path_factory.mktemp("rubbing")
+
+
+@pytest.fixture(scope="module")
+def rubbing(place):
+    return diagnosed(place, recorded(friction=0.04, scale=(0.9, 1.1, 0.95)))
 
 
 def test_dry_friction_is_named_with_its_level(rubbing):
@@ -44,6 +55,14 @@ def test_dry_friction_is_named_with_its_level(rubbing):
     expected = 1.0 - sum(weighed) if weighed else np.nan  # nothing to be weighed against is no certainty
     np.testing.assert_allclose(effect.weight_among_rivals, expected, atol=1e-9)
     assert found.setup.fitter.simulator.traces == 1
+
+
+def test_what_is_known_is_on_disk_before_the_race_ends(rubbing, place):
+    first, base, singles, pairs = (json.loads((place / "so_far" / f"{k}.json").read_text()) for k in range(4))
+    assert first["warnings"] == ["a note"] and first["windows"] > 6 and "gap" not in first
+    assert base["gap"]["nominal"] > base["gap"]["calibrated"] > 2 and len(base["parameters"]) == 3
+    best = singles["candidates"][0]
+    assert best["label"] == "coulomb_friction@hinge" and best["gap_closed"] > 0.8 and pairs["verdict"] is None
 
 
 def test_the_gap_shrinks_from_stage_to_stage(rubbing):
@@ -114,6 +133,8 @@ def test_a_file_of_before_is_read_and_its_probability_told_as_a_weight(rubbing, 
         np.testing.assert_equal(result.load(tmp_path).effects[0].weight_among_rivals, expected)
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_wrong_known_parameters_are_no_effect(tmp_path):
     _, diagnosis = diagnosed(tmp_path, recorded(scale=WRONG, seed=1))
     assert diagnosis.verdict == "parameters" and diagnosis.effects == []
@@ -124,6 +145,8 @@ def test_wrong_known_parameters_are_no_effect(tmp_path):
         assert not found["structural"], name
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_nothing_wrong_is_no_gap(tmp_path):
     _, diagnosis = diagnosed(tmp_path, recorded(seed=2))
     assert diagnosis.verdict == "no_gap" and diagnosis.effects == []

@@ -189,6 +189,8 @@ def test_lag_is_filterexact_of_fine_steps():
     np.testing.assert_allclose(got[:, :2], change[:, :2], atol=0.05 * np.abs(change[:, :2]).max())
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_neutral_changes_no_bit():
     """Also while dry friction acts."""
     with_effects = motion(physics("together"), [theta(physics("together"), friction=f) for f in (0.0, 0.2)])

@@ -68,6 +68,8 @@ def plain():
     return truth(mujoco.MjModel.from_xml_string(XML), COMMAND)
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_neutral_changes_no_bit_also_beside_another_effect():
     friction = make("coulomb_friction", where="elbow")
     alone = moved(physics(XML, [friction]), [[0.3]], COMMAND)

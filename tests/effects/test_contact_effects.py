@@ -54,6 +54,8 @@ def plain(qpos=None, qvel=None, values=None, name=None):
     return truth(model, NOTHING, qpos, qvel)
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_neutral_changes_no_bit_also_beside_another_effect():
     drag = make("viscous_friction", where="ax")
     alone = moved(physics(XML, [drag]), [[0.5]], NOTHING, FALLING, SLIDING)

@@ -90,6 +90,8 @@ def test_holds_an_arm_against_gravity_in_both_joints():
     assert np.abs(q).max() > 0.3
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_the_derivative_at_neutral_is_that_of_sliding():
     """From 1 m/s, 2 kg and 0.01 s: dv / dFc = -0.01 / 2, also at Fc = 0."""
     xml = XML.format(integrator="Euler", damping=0)

@@ -91,6 +91,8 @@ def waves(joints, steps=40):
     return np.concatenate([3 * np.sin(9 * t + i) + 2 * np.sin(23 * t) for i in range(joints)], axis=1)
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_neutral_changes_no_bit(arm):
     """The whole stack at neutral against no effect at all, and against Coulomb friction alone."""
     command = waves(2)

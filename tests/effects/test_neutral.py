@@ -35,6 +35,8 @@ def observations(env, theta):
 DEAR = pytest.param("Ant", marks=[pytest.mark.slow, pytest.mark.ci])
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 @pytest.mark.parametrize("task", [*sorted(set(WHERE) - {"Ant"}), DEAR])
 def test_neutral_effects_change_no_bit(task):
     bare = registry.make(task)

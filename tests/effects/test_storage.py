@@ -78,6 +78,8 @@ def test_the_loops_simulator_is_the_corrected_one(file):
     np.testing.assert_allclose(draws.std(0)[[0, 2, 3]], [0.02, 0.002, 0.05], rtol=0.1)
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_nominal_physics_is_corrected_also_without_randomisation(file):
     env = pendulum(f"effects={file}", "task.randomize=False")
     assert env.space.names == ("all.actuator_delay.delay", "hinge.coulomb_friction.level")

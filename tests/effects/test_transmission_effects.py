@@ -107,6 +107,8 @@ def rigid(actuator, integrator, dt, command):
     return truth(mujoco.MjModel.from_xml_string(model(actuator, integrator, dt=dt)), command)[:, 0]
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_neutral_leaves_every_number_of_the_model_and_the_motion():
     """Also beside another effect. The armature is a parameter in both programs: XLA folds constants as it likes."""
     armature = Parameter(

@@ -37,7 +37,9 @@ def trained(space: ParameterSpace, **options):
     "options",
     [
         {"modelClass": "MDRFF"},
-        {"modelClass": "MDRFF_Matern32_median", "fullCovariance": False},
+        pytest.param(
+            {"modelClass": "MDRFF_Matern32_median", "fullCovariance": False}, marks=[pytest.mark.slow, pytest.mark.ci]
+        ),
     ],
     ids=lambda o: " ".join(map(str, o.values())),
 )

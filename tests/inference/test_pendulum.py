@@ -31,6 +31,8 @@ def simulate(key: jax.Array, theta: jax.Array) -> tuple[jax.Array, jax.Array]:
     return states + 0.02 * jax.random.normal(key_noise, states.shape), torque
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 @pytest.mark.parametrize("name", ["summary_start", "summary_corrdiff"])
 def test_length_and_damping_of_a_pendulum_are_found(name):
     summarize = summarizers.get(name)

@@ -50,15 +50,21 @@ def assert_same_curve(a, b):
             np.testing.assert_allclose(other[tag], one[tag], rtol=1e-3, atol=1e-5, err_msg=tag)
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_curves_do_not_depend_on_the_number_of_devices(runs):
     """Losses, novelty, statistics and returns of six iterations, to float32's rounding."""
     assert_same_curve(runs["curves"]["1"], runs["curves"]["2"])
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_worlds_lie_on_all_devices_and_parameters_on_each(runs):
     assert runs["where"] == {"worlds": [2, False], "parameters": [2, True]}
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_a_run_saved_on_two_devices_goes_on_on_one(runs):
     first, after = runs["curves"]["2"], runs["resumed"]["1"]
     assert_same_curve(runs["resumed"]["2"], after)

@@ -173,6 +173,8 @@ def test_resets(compiled):
     assert qvel[:, 6:].std() == pytest.approx(0.1 / 3**0.5, rel=0.02)
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_mjx_agrees_with_mujoco_in_the_air(compiled, both_engines):
     """100 control steps of random torques with limits but no ground: the tumbling amplifies float32's rounding."""
     env, rng = compiled("Ant").env, np.random.default_rng(3)
@@ -182,6 +184,8 @@ def test_mjx_agrees_with_mujoco_in_the_air(compiled, both_engines):
     np.testing.assert_allclose(fast[0], exact[0], atol=2e-3)
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_mjx_agrees_with_mujoco_in_contact(compiled, both_engines):
     """8 control steps from standing: one solver iteration and contacts that switch part the engines later."""
     env, rng = compiled("Ant").env, np.random.default_rng(4)
