@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -136,7 +137,9 @@ def _within(far: Gap) -> str:
     if not name:
         return ""
     row = far.physical[name]
-    return f"{extent(row['with_effects'], row['unit'])} of {extent(row['tolerance'], row['unit'])} at {name}"
+    noise, unit = row.get("noise", 0.0), row["unit"]
+    above = math.sqrt(max(row["with_effects"] ** 2 - noise**2, 0.0))
+    return f"{extent(above, unit)} above the noise, of {extent(max(row['tolerance'], noise), unit)}, at {name}"
 
 
 def _by_joint(far: Gap, effects: bool) -> str:

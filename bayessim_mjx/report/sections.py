@@ -24,6 +24,7 @@ from bayessim_mjx.report.words import (
     number,
     percent,
     quantity,
+    repeated,
     small,
     stages_told,
     verdict_of,
@@ -42,7 +43,7 @@ def top(d: Diagnosis) -> dict[str, Any]:
     """Verdict, sentences, what to do next and the key numbers."""
     verdict = verdict_of(d)
     stages = stages_of(d)
-    told = [s for s in TILES if s in stages_told(d) and finite(stages[s]) and (s != "reducible_floor" or repeated(d))]
+    told = [s for s in TILES if s in stages_told(d) and finite(stages[s])]
     tiles = [{"words": TILES[s], "colour": STAGE[s], **_tile(d, s)} for s in told]
     closed = gap_closed(stages)
     if finite(closed):
@@ -73,11 +74,6 @@ def _tile(d: Diagnosis, stage: str) -> dict[str, str]:
     if finite(part):
         return {"value": small(part), "unit": "", "below": f"of the motion, {noises}"}
     return {"value": number(getattr(d.gap, stage)), "unit": "noise sd", "below": ""}
-
-
-def repeated(d: Diagnosis) -> bool:
-    """Whether the reducible floor is known from runs that were repeated."""
-    return any(h.get("floor") == "repeats" for h in d.gap.horizons)
 
 
 def about(d: Diagnosis) -> list[str]:
@@ -118,9 +114,10 @@ def how_far(d: Diagnosis) -> dict[str, Any]:
         "table": _table(d, [_stages_row(r, len(d.gap.physical)) for r in rows if finite(r.get("nominal"))]),
         "channels": _table(d, _channels(d)),
         "repeated": repeated(d),
+        "several": len(d.gap.physical) != 1 and bool(d.gap.shares),
         "beyond": bool(d.gap.beyond),
-        "shapley": _shapley(d.details.get("shapley") or []),
-        "closure": _closure(d.details.get("closure") or []),
+        "shapley": _shapley(d.details.get("shapley") or [] if d.effects else []),
+        "closure": _closure(d.details.get("closure") or [] if d.effects else []),
         "unit": d.gap.unit,
     }
 
@@ -140,7 +137,7 @@ def _stages_row(row: Mapping[str, Any], joints: int) -> dict[str, Any]:
 
 def _table(d: Diagnosis, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Rows and those of the stages that some row knows; the floor where runs were repeated, the noise is 1 sd."""
-    told = {s for s in stages_told(d) if s != "noise_floor" and (s != "reducible_floor" or repeated(d))}
+    told = {s for s in stages_told(d) if s != "noise_floor"}
     known = [s for s in STAGES if s in told and any(r["cells"][s]["value"] != MISSING for r in rows)]
     return {"rows": rows, "stages": known, "closed": any(r["closed"] != MISSING for r in rows), "heads": MORE}
 

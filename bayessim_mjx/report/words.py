@@ -89,8 +89,14 @@ def verdict_of(d: Diagnosis) -> Verdict:
 
 
 def stages_told(d: Diagnosis) -> dict[str, str]:
-    """The stages that are there to be told: without effects nothing is simulated with them."""
-    return {s: words for s, words in STAGES.items() if s != "with_effects" or d.effects}
+    """The stages that are there to be told: none with effects where there are none, no floor where nothing repeats."""
+    left_out = {"with_effects": not d.effects, "reducible_floor": not repeated(d)}
+    return {s: words for s, words in STAGES.items() if not left_out.get(s)}
+
+
+def repeated(d: Diagnosis) -> bool:
+    """Whether the reducible floor is known from runs that were repeated."""
+    return any(h.get("floor") == "repeats" for h in d.gap.horizons)
 
 
 def length(value: Any, in_unit: str) -> str:

@@ -129,7 +129,10 @@ def test_the_headline_says_partly_explained_and_what_remains_where():
     assert "shoulder" not in head and any(text.startswith("By joint") for text in rest)
     head, *rest = sentences.verdict_in_words("effects", [FRICTION], gap(0.0132))
     assert head == "The simulator lacks Coulomb friction at elbow."
-    assert rest[-1] == "What remains is within the tolerance at every joint: 0.76 deg of 1.1 deg at elbow."
+    assert (
+        rest[-1]
+        == "What remains is within the tolerance at every joint: 0.76 deg above the noise, of 1.1 deg, at elbow."
+    )
 
 
 def test_physical_units_and_shares_come_before_the_noise():
@@ -181,5 +184,5 @@ def test_the_floor_is_what_repeats_differ_by(monkeypatch):
 
 def test_without_repeats_the_floor_is_the_noise_whatever_was_tried():
     row = {"with_effects": 132.0, "ci": {"with_effects": [120.0, 140.0]}}
-    assert how_far._floor(None, 5, row, 0) == {"reducible_floor": 1.0, "floor": "noise"}
+    assert how_far._floor(None, 5, row) == {"reducible_floor": 1.0, "floor": "noise"}
     assert row["ci"]["reducible_floor"] == [1.0, 1.0]
