@@ -31,7 +31,7 @@ class Law(struct.PyTreeNode):
     direct:   u = scale c
     position: u = clip(scale (kp (c - q) - kd w), +-limit)
     velocity: u = clip(scale kp (c - w), +-limit)
-    q, w are as the joint's own encoder shows them: with the static error that the sensors had at the last control step.
+    q, w are as the joint's own encoder shows them, `Physics.encoders`.
     """
 
     on_position: jax.Array
@@ -48,12 +48,9 @@ class Law(struct.PyTreeNode):
         """`[nu]` bool, the command is the actuator's own ctrl."""
         return (self.on_position + self.on_velocity == 0) & (self.scale == 1)
 
-    def __call__(
-        self, command: jax.Array, qpos: jax.Array, qvel: jax.Array, seen: Mapping[str, jax.Array]
-    ) -> jax.Array:
-        """Command `[nu]` -> ctrl `[nu]`."""
-        q = qpos[jnp.asarray(self.qadr)] + (seen["error"][jnp.asarray(self.qadr)] if "error" in seen else 0.0)
-        w = qvel[jnp.asarray(self.dadr)]
+    def __call__(self, command: jax.Array, qpos: jax.Array, qvel: jax.Array) -> jax.Array:
+        """Command `[nu]` -> ctrl `[nu]`; qpos `[nq]`, qvel `[nv]` as shown."""
+        q, w = qpos[jnp.asarray(self.qadr)], qvel[jnp.asarray(self.dadr)]
         position = self.kp * (command - q) - self.kd * w
         velocity = self.kp * (command - w)
         loop = jnp.where(self.on_position > 0, position, velocity) * self.scale

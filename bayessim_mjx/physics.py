@@ -1,11 +1,8 @@
 """The one control step: command -> effects -> MJX sub-steps -> effects -> measurement. Tasks and diagnosis call it.
 
-The sub-step is composed of MJX's own stage functions in the order of `mjx.step`, so that an effect's force can depend
-on this sub-step's bias, passive and actuator forces. Without effects it equals `mjx.step`.
+Its sub-steps are those of `timestep`: MJX's, where no effect, drive or limit says otherwise.
 """
 
-import contextlib
-import io
 from collections.abc import Sequence
 from typing import Any
 
@@ -15,22 +12,15 @@ import mujoco
 import numpy as np
 from flax import struct
 
-with contextlib.redirect_stdout(io.StringIO()):  # MJX announces on import that the optional warp is absent
-    from mujoco import mjx
-
 from bayessim_mjx.effects import contract
-from bayessim_mjx.effects.effect import Effect
-from bayessim_mjx.effects.site import Motion, SubStep
+from bayessim_mjx.effects.effect import Effect, Measurement, overrides
+from bayessim_mjx.effects.site import Motion, under_tendon_limit
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.parameters import ParameterSpace
+from bayessim_mjx.timestep import EULER, IMPLICITFAST, RK4, Drive, mjx, staggered, substep
 from bayessim_mjx.warp import Warp
 
-_EULER, _RK4, _IMPLICITFAST = (
-    int(getattr(mujoco.mjtIntegrator, f"mjINT_{n}")) for n in ("EULER", "RK4", "IMPLICITFAST")
-)
-
-Memory = tuple[tuple, jax.Array]  # (memories of the effects, their last forces [effects, nv])
-Seen = dict[str, jax.Array]  # what the sensors showed after the last control step: qpos [nq], qvel [nv], error [nq]
+__all__ = ["Drive", "Physics", "World", "begin", "control_step", "mjx", "staggered", "substep"]
 
 
 class World(struct.PyTreeNode):
@@ -97,7 +87,7 @@ class Physics:
             self.space = self.space + effect.space()
         self.substeps = _substeps(control_dt, mj_model.opt.timestep)
         self.dt = float(self.substeps * mj_model.opt.timestep)
-        if int(mj_model.opt.integrator) not in (_EULER, _RK4, _IMPLICITFAST):
+        if int(mj_model.opt.integrator) not in (EULER, RK4, IMPLICITFAST):
             raise UserError(f"integrator {mj_model.opt.integrator}: MJX has Euler, RK4 and implicitfast")
         self.max_qvel = None if max_qvel is None else np.broadcast_to(np.asarray(max_qvel, np.float32), (mj_model.nv,))
         self.model = mjx.put_model(mj_model, impl="jax")
@@ -120,7 +110,7 @@ class Physics:
         return own, tuple(slices)
 
     def world(self, theta: jax.Array, qpos: jax.Array | None = None, qvel: jax.Array | None = None) -> World:
-        """A world at the start of an episode; writes `theta` into the model once.
+        """A world at the start of an episode, as the sensors show it at rest; writes `theta` into the model once.
 
         Args:
             theta: `[d]`, values of `self.space`.
@@ -131,9 +121,12 @@ class Physics:
             ValueError: on a wrong shape.
         """
         with jax.default_matmul_precision("highest"):
-            return self._world(theta, qpos, qvel)
+            world = self.unseen(theta, qpos, qvel)
+            memory, shown = self.sense(self.split(world.theta)[1], world.memory, world.measurement)
+            return world.replace(memory=memory, measurement=shown)
 
-    def _world(self, theta: jax.Array, qpos: jax.Array | None, qvel: jax.Array | None) -> World:
+    def unseen(self, theta: jax.Array, qpos: jax.Array | None, qvel: jax.Array | None) -> World:
+        """`world` without sensors: they have not measured yet."""
         theta = jnp.asarray(theta, jnp.float32)
         qpos = jnp.asarray(self.mj_model.qpos0 if qpos is None else qpos, jnp.float32)
         qvel = jnp.zeros(self.mj_model.nv) if qvel is None else jnp.asarray(qvel, jnp.float32)
@@ -160,6 +153,22 @@ class Physics:
             forces=jnp.zeros((len(self.effects), self.mj_model.nv)),
             measurement={"qpos": qpos, "qvel": qvel},
         )
+
+    def sense(self, thetas: tuple, memory: Sequence[Any], true: Measurement) -> tuple[tuple, Measurement]:
+        """(effects' memories, what the sensors show) of the true {"qpos", "qvel"}; thetas: one slice per effect."""
+        remembered, shown = list(memory), true
+        for i, (effect, at, theta) in enumerate(zip(self.effects, self.sites, thetas, strict=True)):
+            if overrides(effect, "on_measurement"):
+                remembered[i], shown = effect.on_measurement(at, remembered[i], shown, theta)
+        return tuple(remembered), shown
+
+    def encoders(self, thetas: tuple, qpos: jax.Array, qvel: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """(qpos, qvel) as the joints' own encoders show them to their drives: with the sensors' static errors.
+
+        Delays and filters lie between the drive and whoever records; without a past they show what is.
+        """
+        shown = self.sense(thetas, self._memory, {"qpos": qpos, "qvel": qvel})[1]
+        return shown["qpos"], shown["qvel"]
 
     def model_of(self, world: World) -> mjx.Model:
         """The model with this world's parameters."""
@@ -198,105 +207,6 @@ def _dotted(path: Sequence[Any]) -> str:
     return jax.tree_util.keystr(tuple(path), simple=True, separator=".")
 
 
-def _overrides(effect: Effect, hook: str) -> bool:
-    return getattr(type(effect), hook) is not getattr(Effect, hook)
-
-
-class Drive(struct.PyTreeNode):
-    """What acts on a world besides its command, all optional.
-
-    Attributes:
-        force: `[nv]`, a generalised force of unknown origin.
-        enabled: `[nu]`, 1 where the drive is on; 0: the actuator exerts no force at all (open leads).
-        law: a controller between the command and the actuators, `laws.Law`.
-    """
-
-    force: jax.Array | None = None
-    enabled: jax.Array | None = None
-    law: Any = None
-
-
-def forward(
-    physics: Physics, model: mjx.Model, data: mjx.Data, carry: Memory, thetas: tuple, seen: Seen, drive: Drive
-) -> tuple:
-    """`mjx.forward` with the effects' forces added before the acceleration. Returns (data, (memory, forces))."""
-    sensors = physics.mj_model.nsensor > 0
-    data = mjx.fwd_position(model, data)
-    data = mjx.sensor_pos(model, data) if sensors else data
-    data = mjx.fwd_velocity(model, data)
-    data = mjx.sensor_vel(model, data) if sensors else data
-    if drive.law is not None:
-        data = data.replace(ctrl=drive.law(data.ctrl, data.qpos, data.qvel, seen))
-    data = mjx.fwd_actuation(model, data)
-    data, carry = _effect_forces(physics, model, data, carry, thetas, seen, drive)
-    data = mjx.fwd_acceleration(model, data)
-    if data._impl.efc_J.size == 0:
-        return data.replace(qacc=data.qacc_smooth), carry
-    data = mjx.solve(model, data)
-    return (mjx.sensor_acc(model, data) if sensors else data), carry
-
-
-def _effect_forces(
-    physics: Physics, model: mjx.Model, data: mjx.Data, carry: Memory, thetas: tuple, seen: Seen, drive: Drive
-) -> tuple:
-    """The actuators' forces as the effects change them, and the sum of the effects' own forces in qfrc_applied.
-
-    Each effect sees the newest forces of the others (Gauss-Seidel). They start from those of the last sub-step, so that
-    dry friction in several coupled joints settles to sticking.
-    """
-    if not physics.effects and drive.enabled is None and drive.force is None:
-        return data, carry
-    memory, forces = list(carry[0]), carry[1]
-    step = SubStep(model, data, seen, float(physics.mj_model.opt.timestep))
-    each = list(zip(range(len(physics.effects)), physics.effects, physics.sites, strict=True))
-    acting = data.actuator_force
-    for i, effect, at in each:
-        if _overrides(effect, "on_actuator"):
-            memory[i], acting = effect.on_actuator(at, memory[i], step, acting, thetas[i])
-    if drive.enabled is not None:
-        acting = acting * drive.enabled
-    if acting is not data.actuator_force:
-        # what changed, through the transmission: neutral effects leave qfrc_actuator bit for bit
-        change = (acting - data.actuator_force) @ _moment(data)
-        data = data.replace(actuator_force=acting, qfrc_actuator=data.qfrc_actuator + change)
-    step = SubStep(model, data, seen, float(physics.mj_model.opt.timestep))
-    known = data.qfrc_passive - data.qfrc_bias + data.qfrc_actuator
-    outside = jnp.zeros_like(data.qfrc_applied) if drive.force is None else drive.force
-    for i, effect, at in each:
-        if _overrides(effect, "on_force"):
-            others = known + outside + jnp.sum(forces.at[i].set(0.0), axis=0)
-            memory[i], force = effect.on_force(at, memory[i], step.seen_by(others, forces[i]), thetas[i])
-            forces = forces.at[i].set(force)
-    if physics.effects or drive.force is not None:
-        data = data.replace(qfrc_applied=jnp.sum(forces, axis=0) + outside)
-    return data, (tuple(memory), forces)
-
-
-def _moment(data: mjx.Data) -> jax.Array:
-    return data._impl.actuator_moment
-
-
-def substep(
-    physics: Physics,
-    model: mjx.Model,
-    data: mjx.Data,
-    carry: Memory,
-    thetas: tuple,
-    seen: Seen,
-    drive: Drive = Drive(),  # noqa: B008  # immutable
-) -> tuple:
-    """One timestep from the state and ctrl in `data`. Returns (data, (memory, forces))."""
-    if physics.warp is not None:
-        data = physics.warp.step(model, data)
-    else:
-        data, carry = forward(physics, model, data, carry, thetas, seen, drive)
-        integrate = {_EULER: mjx.euler, _RK4: mjx.rungekutta4, _IMPLICITFAST: mjx.implicit}
-        data = integrate[int(physics.mj_model.opt.integrator)](model, data)
-    if physics.max_qvel is not None:
-        data = data.replace(qvel=jnp.clip(data.qvel, -physics.max_qvel, physics.max_qvel))
-    return data, carry
-
-
 def control_step(
     physics: Physics,
     world: World,
@@ -321,37 +231,48 @@ def control_step(
 
 
 def _control_step(physics: Physics, world: World, command: jax.Array, drive: Drive) -> tuple[World, mjx.Data]:
+    _refuse(physics, drive)
     warp, thetas = physics.warp, physics.split(world.theta)[1]
     model = physics.model_of(world) if warp is None else warp.model_of(world.fields)
     memory = list(world.memory)
     commands = jnp.broadcast_to(command, (physics.substeps, physics.mj_model.nu))
-    each = list(zip(range(len(physics.effects)), physics.effects, physics.sites, strict=True))
-    for i, effect, at in each:
+    for i, (effect, at) in enumerate(zip(physics.effects, physics.sites, strict=True)):
         memory[i], commands = effect.on_command(at, memory[i], commands, thetas[i])
-
-    seen = world.measurement | {"error": world.measurement["qpos"] - world.qpos}
 
     def body(carry: tuple, ctrl: jax.Array) -> tuple[tuple, None]:
         data, remembered = carry
-        return substep(physics, model, data.replace(ctrl=ctrl), remembered, thetas, seen, drive), None
+        return substep(physics, model, data.replace(ctrl=ctrl), remembered, thetas, world.measurement, drive), None
 
     start = (physics.data_of(world, None if warp is None else warp.data), (tuple(memory), world.forces))
     end, _ = body(start, commands[0]) if physics.substeps == 1 else jax.lax.scan(body, start, commands)
     data, (final, forces) = end
-    memory, measurement = list(final), {"qpos": data.qpos, "qvel": data.qvel}
-    for i, effect, at in each:
-        memory[i], measurement = effect.on_measurement(at, memory[i], measurement, thetas[i])
+    remembered, measurement = physics.sense(thetas, final, {"qpos": data.qpos, "qvel": data.qvel})
     world = world.replace(
         qpos=data.qpos,
         qvel=data.qvel,
         act=data.act,
         warmstart=data.qacc_warmstart,
         time=data.time,
-        memory=tuple(memory),
+        memory=remembered,
         forces=forces,
         measurement=measurement,
     )
     return world, data
+
+
+def _refuse(physics: Physics, drive: Drive) -> None:
+    """UserError where what acts cannot be simulated."""
+    given = [name for name, value in vars(drive).items() if value is not None]
+    if physics.warp is not None and given:
+        raise UserError(
+            f"env.impl = 'warp': Drive({', '.join(given)}) acts inside the timestep, which Warp computes as a whole; "
+            "allowed: env.impl = 'jax'"
+        )
+    if drive.enabled is not None and under_tendon_limit(physics.mj_model).any():
+        raise UserError(
+            "a drive cannot be switched off where a tendon has an actuatorfrcrange, which MJX takes before that; "
+            "allowed: forcerange at the actuators in its place"
+        )
 
 
 def begin(physics: Physics, theta: jax.Array, motion: Motion) -> World:
@@ -360,7 +281,7 @@ def begin(physics: Physics, theta: jax.Array, motion: Motion) -> World:
     Args:
         theta: `[d]`; motion: measured, around the start, with the commands before it.
     """
-    world = physics.world(theta, motion.qpos[motion.start], motion.qvel[motion.start])
+    world = physics.unseen(theta, motion.qpos[motion.start], motion.qvel[motion.start])  # shown is what was measured
     thetas, memory = physics.split(world.theta)[1], list(world.memory)
     for i in reversed(range(len(physics.effects))):  # sensors come last in a step, so they are undone first
         memory[i], motion = physics.effects[i].on_start(physics.sites[i], memory[i], motion, thetas[i])

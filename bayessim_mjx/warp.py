@@ -16,7 +16,7 @@ import mujoco
 with contextlib.redirect_stdout(io.StringIO()):  # MJX announces on import that the optional warp is absent
     from mujoco import mjx
 
-from bayessim_mjx.effects.effect import Effect
+from bayessim_mjx.effects.effect import Effect, overrides
 from bayessim_mjx.errors import UserError
 
 INSIDE = ("on_actuator", "on_force")  # hooks within a timestep
@@ -41,7 +41,7 @@ class Warp:
         self, mj_model: mujoco.MjModel, template: mjx.Data, effects: Sequence[Effect], worlds: int | None
     ) -> None:
         for effect in effects:
-            if any(getattr(type(effect), hook) is not getattr(Effect, hook) for hook in INSIDE):
+            if any(overrides(effect, hook) for hook in INSIDE):
                 raise UserError(
                     f"env.impl = 'warp': {effect.name} acts inside the timestep, which Warp computes as a whole; leave "
                     "the effect out or set env.impl to jax"

@@ -85,14 +85,12 @@ def test_only_changed_fields_travel():
 
 
 def test_nested_fields_are_found_and_put_back():
-    class Moon(type(make("actuator_delay", where="all"))):
-        def on_model(self, at, model, theta):
-            return model.tree_replace({"opt.gravity": jnp.array([0.0, 0.0, -1.62])})
-
-    p = physics(effects=[Moon(where="all")])
-    world = p.world(p.space.nominal)
+    p = physics(effects=[make("gravity_tilt", where="world")])
+    world = p.world(jnp.array([0.0, 0.1]))
     assert set(world.fields) == {"opt.gravity"}
-    assert p.model_of(world).opt.gravity[2] == pytest.approx(-1.62)
+    np.testing.assert_allclose(
+        p.model_of(world).opt.gravity, 9.81 * np.array([np.sin(0.1), 0, -np.cos(0.1)]), atol=1e-5
+    )
 
 
 def test_velocities_are_clipped_after_the_position_moved():

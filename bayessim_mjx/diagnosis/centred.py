@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from bayessim_mjx.diagnosis.robot import Robot
 from bayessim_mjx.effects.effect import Effect, Quantity
 from bayessim_mjx.effects.site import Site
-from bayessim_mjx.physics import Physics
+from bayessim_mjx.physics import Physics, staggered
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,6 +31,8 @@ class Centred(Effect):
         return {"last": jnp.zeros(at.nu), "fresh": jnp.ones((), bool)}
 
     def on_command(self, at: Site, memory: Any, command: jax.Array, theta: jax.Array) -> tuple[Any, jax.Array]:
+        if not staggered(at.mj_model):
+            return memory, command
         last = jnp.where(memory["fresh"], command[0], memory["last"])
         early = jnp.concatenate([last[None], command[:-1]])
         return {"last": command[-1], "fresh": jnp.zeros((), bool)}, 0.5 * (early + command)

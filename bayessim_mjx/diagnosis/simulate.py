@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from bayessim_mjx.device import compiler_options, cores
 from bayessim_mjx.diagnosis.windows import Batch, Windows
-from bayessim_mjx.physics import Drive, Physics, begin, control_step
+from bayessim_mjx.physics import Drive, Physics, begin, control_step, staggered
 
 Array = NDArray[np.float64]
 # worlds in one call; fewer are padded, more are cut. A CPU wants them in its cache (a pendulum's: 2.2 times as fast as
@@ -97,7 +97,9 @@ class Simulator:
     ) -> tuple[jax.Array, Any]:
         """Errors `[H, 2 nv]` of one window (positions, velocities) and the actuators' forces `[H, nu]`."""
         self.traces += 1
-        model, h = self.physics.mj_model, float(self.physics.mj_model.opt.timestep)
+        model = self.physics.mj_model
+        # s, by which the integrator's velocities lie before its positions
+        early = 0.5 * float(model.opt.timestep) if staggered(model) else 0.0
         own = jax.tree.map(lambda x: x[index], batch)
         world = begin(self.physics, theta, own.around)
         world = world.replace(qpos=integrate(model, world.qpos, offset[: self.nv]), qvel=world.qvel + offset[self.nv :])
@@ -105,8 +107,7 @@ class Simulator:
         def step(world: Any, row: tuple) -> tuple[Any, tuple]:
             command, extra, enabled = row
             world, data = control_step(self.physics, world, command, Drive(extra, enabled, own.law))
-            # the integrator's velocities lie half a sub-step before its positions
-            late = world.measurement["qvel"] + 0.5 * h * data.qacc
+            late = world.measurement["qvel"] + early * data.qacc
             return world, (world.measurement["qpos"], late, data.actuator_force)
 
         _, (qpos, qvel, effort) = jax.lax.scan(step, world, (own.command, force, own.enabled))

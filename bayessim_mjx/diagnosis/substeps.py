@@ -15,7 +15,7 @@ from bayessim_mjx.device import compiler_options
 from bayessim_mjx.diagnosis.quadratic import eliminate
 from bayessim_mjx.diagnosis.simulate import difference, integrate
 from bayessim_mjx.diagnosis.windows import Batch, Windows
-from bayessim_mjx.physics import Drive, Physics, begin, substep
+from bayessim_mjx.physics import Drive, Physics, begin, staggered, substep
 
 Array = NDArray[np.float64]
 STARTS = 5  # Newton steps of the start states
@@ -58,17 +58,18 @@ class Errors:
         world = begin(physics, self.theta, own.around)
         world = world.replace(qpos=integrate(physics.mj_model, world.qpos, offset[:nv]), qvel=world.qvel + offset[nv:])
         model = physics.model_of(world).tree_replace({"opt.timestep": h})
+        early = 0.5 * corrected * h if staggered(physics.mj_model) else 0.0
 
         def step(data: Any, row: tuple) -> tuple[Any, tuple]:
             command, enabled = row
-            seen = {"qpos": data.qpos, "qvel": data.qvel, "error": jnp.zeros_like(data.qpos)}
+            seen = {"qpos": data.qpos, "qvel": data.qvel}
             drive = Drive(None, enabled, own.law)
 
             def sub(k: jax.Array, data: Any) -> Any:
                 return substep(physics, model, data.replace(ctrl=command[k]), ((), world.forces), (), seen, drive)[0]
 
             data = jax.lax.fori_loop(0, count, sub, data)
-            return data, (data.qpos, data.qvel + 0.5 * corrected * h * data.qacc)
+            return data, (data.qpos, data.qvel + early * data.qacc)
 
         _, (qpos, qvel) = jax.lax.scan(step, physics.data_of(world), (own.command, own.enabled))
         error = jax.vmap(lambda a, b: difference(physics.mj_model, a, b))(own.qpos, qpos)

@@ -18,6 +18,7 @@ from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Log
 from bayessim_mjx.logs.resample import around as rows_around
 from bayessim_mjx.logs.resample import resample
+from bayessim_mjx.physics import staggered
 
 Array = NDArray[np.float64]
 MAX_AROUND = 24  # control steps
@@ -135,12 +136,13 @@ def cut(
         use_qvel: compare measured velocities too (where all logs have them).
         first_only: one window per log, at its beginning (whole episodes).
         starts: (log, row) of the windows wanted; beyond the end of a log its last row is held.
-        centred: commands are centred on the force evaluations; False: the physics does that (`centred.physics_of`).
+        centred: commands are centred on the force evaluations, where the integrator is `staggered`; False: the physics
+            does that (`centred.physics_of`).
 
     Raises:
         UserError: no log is long enough.
     """
-    even = [resample(log, dt) for log in logs]
+    even, centred = [resample(log, dt) for log in logs], centred and staggered(model)
     fine = [_fine_commands(log, e, dt, substeps, centred) for log, e in zip(logs, even, strict=True)]
     group_of, names = groups_of(logs, group)
     starts = _starts(even, length, limit, first_only) if starts is None else starts

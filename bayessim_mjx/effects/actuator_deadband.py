@@ -6,10 +6,9 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 import mujoco
-import numpy as np
 
 from bayessim_mjx.effects.effect import Effect, Quantity
-from bayessim_mjx.effects.site import Site, SubStep
+from bayessim_mjx.effects.site import Site, SubStep, ranges
 from bayessim_mjx.errors import UserError
 
 _FIXED = int(mujoco.mjtGain.mjGAIN_FIXED)
@@ -49,28 +48,10 @@ class ActuatorDeadband(Effect):
         self, at: Site, memory: Any, step: SubStep, force: jax.Array, theta: jax.Array
     ) -> tuple[Any, jax.Array]:
         half = at.values(theta)[:, 0]
-        model, data = step.model, step.data
-        affine = at.mj_model.actuator_biastype[at.ids] == _AFFINE
-        gain, bias = model.actuator_gainprm[at.ids, 0], model.actuator_biasprm[at.ids] * affine[:, None]
-        error = gain * _signal(at, step) + bias[:, 1] * data.actuator_length[at.ids]  # gain e
-        full = error + bias[:, 0] + bias[:, 2] * data._impl.actuator_velocity[at.ids]
-        band = jnp.abs(gain) * half
-        low, high = _range(at, model.actuator_forcelimited, model.actuator_forcerange)
+        model, length = step.model, step.data.actuator_length[at.ids]
+        stiffness = jnp.where(at.mj_model.actuator_biastype[at.ids] == _AFFINE, model.actuator_biasprm[at.ids, 1], 0.0)
+        gain, full = model.actuator_gainprm[at.ids, 0], step.asked[at.ids]
+        error, band = gain * step.signal[at.ids] + stiffness * length, jnp.abs(gain) * half  # gain e
+        low, high = ranges(model.actuator_forcelimited[at.ids], model.actuator_forcerange[at.ids])
         change = jnp.clip(full - jnp.clip(error, -band, band), low, high) - jnp.clip(full, low, high)
         return memory, force.at[at.ids].add(jnp.where(half > 0, change, 0.0))
-
-
-def _signal(at: Site, step: SubStep) -> jax.Array:
-    """What the actuators act on, `[n]`: the command within its range, or the activation where there is one."""
-    model = at.mj_model
-    command = jnp.clip(step.ctrl[at.ids], *_range(at, step.model.actuator_ctrllimited, step.model.actuator_ctrlrange))
-    stateful = model.actuator_actadr[at.ids] >= 0
-    if not stateful.any():
-        return command
-    last = model.actuator_actadr[at.ids] + model.actuator_actnum[at.ids] - 1
-    return jnp.where(stateful, step.data.act[np.maximum(last, 0)], command)
-
-
-def _range(at: Site, limited: Any, bounds: jax.Array) -> tuple[jax.Array, jax.Array]:
-    low, high = jnp.where(limited[at.ids, None], bounds[at.ids], jnp.array([-jnp.inf, jnp.inf])).T
-    return low, high

@@ -41,7 +41,7 @@ class ActuatorGain(Effect):
     def on_actuator(
         self, at: Site, memory: Any, step: SubStep, force: jax.Array, theta: jax.Array
     ) -> tuple[Any, jax.Array]:
-        return memory, force.at[at.ids].multiply(at.values(theta)[:, 0])
+        return memory, force.at[at.ids].set(force[at.ids] * at.values(theta)[:, 0])
 
     def edit(self, spec: mujoco.MjSpec, values: dict[str, dict[str, float]]) -> str | None:
         """Native: gainprm, biasprm and forcerange, times gain."""

@@ -67,6 +67,9 @@ class Backlash(Effect):
         rest, force = transmission.finish(at, step, both, passed, twist)
         return rest | {"side": jnp.where(on, side, 0.0)}, force
 
+    def transmits(self, at: Site, theta: jax.Array) -> jax.Array:
+        return at.scatter(jnp.where(self._on(at, theta), 1.0, 0.0)) > 0
+
     def _on(self, at: Site, theta: jax.Array) -> jax.Array:
         return at.values(theta)[:, 0] > 0
 

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from bayessim_mjx.effects.effect import overrides
 from bayessim_mjx.effects.site import Motion, Site, SubStep
 from bayessim_mjx.errors import UserError
 
@@ -48,18 +49,12 @@ def check(effect: "Effect", mj_model: mujoco.MjModel, model: "mjx.Model", subste
     space = effect.space()
     neutral = [q.neutral for q in effect.quantities] * len(effect.places())
     given = _inputs(at, mj_model)
-    for hook in (h for h in HOOKS if _overrides(effect, h)):
+    for hook in (h for h in HOOKS if overrides(effect, h)):
         call = jax.jit(partial(_called, effect, at, model, hook))
         for what, theta in (("neutral", neutral), ("lowest", space.low), ("highest", space.high)):
             before, after = _ours(effect, hook, partial(call, jnp.asarray(theta, jnp.float32), given))
             _compare(effect, hook, what, before, after)
     _tried.add(key)
-
-
-def _overrides(effect: "Effect", hook: str) -> bool:
-    from bayessim_mjx.effects.effect import Effect
-
-    return getattr(type(effect), hook) is not getattr(Effect, hook)
 
 
 def _ours(effect: "Effect", hook: str, call: Any) -> Any:
@@ -106,13 +101,19 @@ def _inputs(at: Site, mj_model: mujoco.MjModel) -> dict[str, Any]:
 def _called(effect: "Effect", at: Site, model: "mjx.Model", hook: str, theta: jax.Array, given: dict) -> tuple:
     """(what the hook leaves as it is when it is off, what it gives for it)."""
     data, memory = given["data"], effect.init(at)
-    seen = given["measurement"] | {"error": jnp.zeros(at.nq)}
-    step = SubStep(model, data, seen, at.timestep)
+    step = SubStep(model, data, given["measurement"], at.timestep)
+
+    def actuator() -> Any:  # with its derivative, which implicit integrators take
+        def own(force: jax.Array) -> Any:
+            return effect.on_actuator(at, memory, step, force, theta)
+
+        return jax.jvp(own, (given["force"],), (jnp.ones(at.nu),))[0]
+
     before, call = {
         "on_model": (model, lambda: (memory, effect.on_model(at, model, theta))),
         "on_start": (given["motion"], lambda: effect.on_start(at, memory, given["motion"], theta)),
         "on_command": (given["command"], lambda: effect.on_command(at, memory, given["command"], theta)),
-        "on_actuator": (given["force"], lambda: effect.on_actuator(at, memory, step, given["force"], theta)),
+        "on_actuator": (given["force"], actuator),
         "on_force": (jnp.zeros(at.nv), lambda: effect.on_force(at, memory, step, theta)),
         "on_measurement": (
             given["measurement"], lambda: effect.on_measurement(at, memory, given["measurement"], theta),

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from bayessim_mjx.effects.site import Motion, Site, SubStep, find
+from bayessim_mjx.effects.site import Motion, Site, SubStep, find, under_tendon_limit
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 
@@ -131,7 +132,15 @@ class Effect(abc.ABC):
         Raises:
             UserError: naming the effect, the unknown place and what may be meant.
         """
-        return find(self, mj_model, timestep, substeps)
+        at = find(self, mj_model, timestep, substeps)
+        limited = under_tendon_limit(mj_model)[at.ids] if self.kind == "actuator" else np.zeros(0, bool)
+        if limited.any() and overrides(self, "on_actuator"):
+            name = at.names[int(np.argmax(limited))]
+            raise UserError(
+                f"{self.name}: actuator {name!r} drives a tendon with an actuatorfrcrange, which MJX takes before "
+                "effects act; allowed: other actuators, or forcerange at the actuator in its place"
+            )
+        return at
 
     def init(self, at: Site) -> Any:
         """Memory at the start of an episode: a pytree of arrays of fixed shape; constants belong in the site."""
@@ -155,7 +164,12 @@ class Effect(abc.ABC):
     def on_actuator(
         self, at: Site, memory: Any, step: SubStep, force: jax.Array, theta: jax.Array
     ) -> tuple[Any, jax.Array]:
-        """Change the actuators' forces `[nu]` of this sub-step, as MuJoCo and earlier effects left them."""
+        """Change the actuators' forces `[nu]` of this sub-step, as MuJoCo and earlier effects left them.
+
+        Called once in every stage of the integrator, always with the memory of before the sub-step; kept is what the
+        first stage returns. An implicit integrator takes its derivative in `force` too (how much of a servo's damping
+        arrives), by `jax.jvp`. The joint's limit (`actuatorfrcrange`) comes later.
+        """
         return memory, force
 
     def on_force(self, at: Site, memory: Any, step: SubStep, theta: jax.Array) -> tuple[Any, jax.Array]:
@@ -165,10 +179,20 @@ class Effect(abc.ABC):
         """
         return memory, jnp.zeros_like(step.force)
 
+    def transmits(self, at: Site, theta: jax.Array) -> jax.Array:
+        """`[nv]` bool: at which degrees of freedom `on_force` replaces the actuators' torque by what it passes on.
+
+        That is of the whole sub-step, so this torque does not change between the stages of an integrator either.
+        """
+        return jnp.zeros(at.nv, bool)
+
     def on_measurement(
         self, at: Site, memory: Any, measurement: Measurement, theta: jax.Array
     ) -> tuple[Any, Measurement]:
-        """Change what the sensors show after a control step: `{"qpos": [nq], "qvel": [nv]}`."""
+        """Change what the sensors show after a reset or a control step: `{"qpos": [nq], "qvel": [nv]}`.
+
+        From the memory that `init` gives it shows what a robot at rest there would have shown for ever.
+        """
         return memory, measurement
 
     def edit(self, spec: "mujoco.MjSpec", values: dict[str, dict[str, float]]) -> str | None:
@@ -178,3 +202,8 @@ class Effect(abc.ABC):
             None where written, else why not (one sentence for people).
         """
         return "MuJoCo has no such element"
+
+
+def overrides(effect: Effect, hook: str) -> bool:
+    """Whether the effect has this hook; those it does not have are not called."""
+    return getattr(type(effect), hook) is not getattr(Effect, hook)

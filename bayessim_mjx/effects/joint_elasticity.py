@@ -65,6 +65,9 @@ class JointElasticity(Effect):
         twist = jnp.where(memory["fresh"], compliance * passed.torque, both.twist)
         return transmission.finish(at, step, both, passed, twist)
 
+    def transmits(self, at: Site, theta: jax.Array) -> jax.Array:
+        return at.scatter(jnp.where(self._on(at, theta), 1.0, 0.0)) > 0
+
     def _on(self, at: Site, theta: jax.Array) -> jax.Array:
         return at.values(theta)[:, 0] > 0
 

@@ -1,5 +1,6 @@
 """Where an effect sits in a model (static), and what it sees of a sub-step (traced)."""
 
+import copy
 import dataclasses
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +15,8 @@ from bayessim_mjx.parameters.attributes import suggest
 from bayessim_mjx.triangular import inverse_lower, product
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from mujoco import mjx
 
     from bayessim_mjx.effects.effect import Effect
@@ -21,6 +24,9 @@ if TYPE_CHECKING:
 AROUND = 0.1  # s of recorded motion before and after a start that effects with memory may look at, at least
 _HINGE, _SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
 _KINDS = ("actuator", "joint", "body", "geom")
+_ON_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
+_CONSTANT = (int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtGain.mjGAIN_FIXED))
+_AFFINE = (int(mujoco.mjtBias.mjBIAS_AFFINE), int(mujoco.mjtGain.mjGAIN_AFFINE))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -145,10 +151,26 @@ def _joints(model: mujoco.MjModel, kind: str, ids: np.ndarray) -> np.ndarray:
         return ids
     if kind != "actuator":
         return np.full(len(ids), -1)
-    on_joint = np.isin(
-        model.actuator_trntype[ids], (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
-    )
-    return np.where(on_joint, model.actuator_trnid[ids, 0], -1)
+    return np.where(np.isin(model.actuator_trntype[ids], _ON_JOINT), model.actuator_trnid[ids, 0], -1)
+
+
+def joint_dofs(model: mujoco.MjModel) -> np.ndarray:
+    """`[nu]`, the (first) column in qvel of the joint that each actuator drives; -1: tendons, sites ..."""
+    joints = _joints(model, "actuator", np.arange(model.nu))
+    return np.where(joints >= 0, model.jnt_dofadr[joints], -1)
+
+
+def under_tendon_limit(model: mujoco.MjModel) -> np.ndarray:
+    """`[nu]` bool: actuators of tendons whose total actuator force is limited."""
+    tendon = (model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_TENDON)) & (model.ntendon > 0)
+    limited = np.append(np.asarray(model.tendon_actfrclimited, bool), False)
+    return tendon & limited[np.where(tendon, model.actuator_trnid[:, 0], -1)]
+
+
+def ranges(limited: Any, bounds: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """(low, high) `[n]` of bounds `[n, 2]`, infinite where not limited."""
+    low, high = jnp.where(jnp.asarray(limited, bool)[:, None], bounds, jnp.array([-jnp.inf, jnp.inf])).T
+    return low, high
 
 
 class SubStep:
@@ -170,18 +192,25 @@ class SubStep:
         data: "mjx.Data",
         measurement: dict[str, jax.Array],
         dt: float,
-        cache: dict[str, Any] | None = None,
+        asked: jax.Array | None = None,
+        response: "Callable[[], jax.Array | None] | None" = None,
     ) -> None:
         self.model, self.data, self.measurement, self.dt = model, data, measurement, dt
         self.force = self.last = data.qfrc_applied
         self.actuator_force = data.actuator_force
-        self._cache = {} if cache is None else cache
+        self._responding = response
+        self._cache: dict[str, Any] = {} if asked is None else {"asked": asked}
 
     def seen_by(self, force: jax.Array, last: jax.Array) -> "SubStep":
         """The same sub-step with the forces that one effect sees."""
-        other = SubStep(self.model, self.data, self.measurement, self.dt, self._cache)
-        other.force, other.last, other.actuator_force = force, last, self.actuator_force
+        other = copy.copy(self)
+        other.force, other.last = force, last
         return other
+
+    def _once(self, name: str, compute: "Callable[[], Any]") -> Any:
+        if name not in self._cache:
+            self._cache[name] = compute()
+        return self._cache[name]
 
     @property
     def ctrl(self) -> jax.Array:
@@ -196,12 +225,60 @@ class SubStep:
         return self.data.qvel
 
     @property
+    def signal(self) -> jax.Array:
+        """`[nu]`, what the actuators act on: the command within its range, or the activation where there is one."""
+        model, data = self.model, self.data
+        signal = jnp.clip(data.ctrl, *ranges(model.actuator_ctrllimited, model.actuator_ctrlrange))
+        if not model.na:
+            return signal
+        last = np.clip(model.actuator_actadr + model.actuator_actnum - 1, 0, model.na - 1)
+        return jnp.where(model.actuator_actadr < 0, signal, data.act[last])
+
+    @property
+    def asked(self) -> jax.Array:
+        """`[nu]`, force before any limit: (k0 + k1 l + k2 l') u + b0 + b1 l + b2 l'; of muscles, as it is."""
+        return self._once("asked", self._asked)
+
+    def _asked(self) -> jax.Array:
+        model, data = self.model, self.data
+        terms = jnp.stack([jnp.ones(model.nu), data.actuator_length, data._impl.actuator_velocity])
+        gain, bias = (jnp.sum(prm[:, :3].T * terms, 0) for prm in (model.actuator_gainprm, model.actuator_biasprm))
+        fixed, none = model.actuator_gaintype == _CONSTANT[1], model.actuator_biastype == _CONSTANT[0]
+        linear = (fixed | (model.actuator_gaintype == _AFFINE[1])) & (none | (model.actuator_biastype == _AFFINE[0]))
+        gain, bias = jnp.where(fixed, model.actuator_gainprm[:, 0], gain), jnp.where(none, 0.0, bias)
+        return jnp.where(linear, gain * self.signal + bias, data.actuator_force)
+
+    @property
+    def response(self) -> jax.Array:
+        """`[nu]`, how much of a change of its damping force an actuator passes on: 1; 0 at a limit or switched off."""
+        found = self._response
+        return jnp.ones(self.model.nu) if found is None else found
+
+    @property
+    def _response(self) -> jax.Array | None:
+        return self._once("response", self._responding or (lambda: None))
+
+    @property
+    def solved(self) -> "mjx.Model":
+        """The model that an implicit integrator differentiates: actuators damp as far as they respond."""
+        model = self.model
+        shifted, affine = model.actuator_biastype == _AFFINE[0], model.actuator_gaintype == _AFFINE[1]
+        if not np.any(shifted | affine) or self._response is None:
+            return model
+        gain, bias = (
+            p.at[:, 2].set(p[:, 2] * self._response) for p in (model.actuator_gainprm, model.actuator_biasprm)
+        )
+        return model.replace(actuator_gainprm=gain, actuator_biasprm=bias)
+
+    @property
     def inverse(self) -> jax.Array:
         """`[nv, nv]`, inverse of the matrix that the integrator solves: M plus the implicit damping."""
-        if "inverse" not in self._cache:
+
+        def compute() -> jax.Array:
             factor = inverse_lower(jnp.linalg.cholesky(self._inertia()))
-            self._cache["inverse"] = product(factor.T, factor)
-        return self._cache["inverse"]
+            return product(factor.T, factor)
+
+        return self._once("inverse", compute)
 
     def _inertia(self) -> jax.Array:
         from mujoco import mjx
@@ -213,7 +290,7 @@ class SubStep:
         if euler and not int(model.opt.disableflags) & int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP):
             return inertia + model.opt.timestep * jnp.diag(model.dof_damping)
         implicit = integrator == int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
-        derivative = mjx.deriv_smooth_vel(model, self.data) if implicit else None
+        derivative = mjx.deriv_smooth_vel(self.solved, self.data) if implicit else None
         return inertia if derivative is None else inertia - model.opt.timestep * derivative
 
     @property

@@ -13,16 +13,14 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from bayessim_mjx.effects.site import Site, SubStep
-from bayessim_mjx.triangular import product
+from bayessim_mjx.effects.site import Site, SubStep, joint_dofs, ranges
 
 if TYPE_CHECKING:
     from mujoco import mjx
 
 SHARE = 0.2  # of the joint's inertia is the motor's where the model has no armature
 REAL = 2.0**-10  # armature below this part of the joint's inertia counts as none
-_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
-_IMPLICIT = int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
+_IMPLICIT, _RK4 = int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST), int(mujoco.mjtIntegrator.mjINT_RK4)
 
 
 def start(at: Site) -> dict[str, jax.Array]:
@@ -49,10 +47,7 @@ def follow(at: Site, memory: Any, step: SubStep) -> tuple[jax.Array, jax.Array]:
 
 def servos(at: Site) -> tuple[np.ndarray, np.ndarray]:
     """(ids of the actuators with feedback from joints of the site, their places in it)."""
-    model = at.mj_model
-    dof = np.full(model.nu, -1)
-    on_joint = np.isin(model.actuator_trntype, _JOINT)
-    dof[on_joint] = model.jnt_dofadr[model.actuator_trnid[on_joint, 0]]
+    model, dof = at.mj_model, joint_dofs(at.mj_model)
     affine = model.actuator_biastype == int(mujoco.mjtBias.mjBIAS_AFFINE)
     ids = np.flatnonzero(affine & np.isin(dof, at.dadr))
     return ids, np.asarray([int(np.flatnonzero(at.dadr == dof[i])[0]) for i in ids], int)
@@ -63,34 +58,17 @@ def feedback(at: Site, memory: Any, step: SubStep, force: jax.Array, on: jax.Arr
     ids, places = servos(at)
     if not len(ids):
         return force
-    model, data = step.model, step.data
+    model = step.model
     twist, slip = (x[places] for x in follow(at, memory, step))
+    if int(at.mj_model.opt.integrator) == _RK4:  # its link stands where the sub-step begins, the motor at its middle
+        twist = twist + 0.5 * step.dt * step.qvel[at.dadr[places]]
     gear, bias = model.actuator_gear[ids, 0], model.actuator_biasprm[ids]
     extra = gear * (bias[:, 1] * twist + bias[:, 2] * slip)
-    low, high = _limits(model, ids)
-    own = data.actuator_force[ids]
-    inside = jnp.where((own > low) & (own < high), own, _unlimited(model, data)[ids])
+    low, high = ranges(model.actuator_forcelimited[ids], model.actuator_forcerange[ids])
+    own = step.data.actuator_force[ids]
+    inside = jnp.where((own > low) & (own < high), own, step.asked[ids])
     change = jnp.clip(inside + extra, low, high) - own
     return force.at[ids].add(jnp.where(on[places], change, 0.0))
-
-
-def _limits(model: "mjx.Model", ids: np.ndarray) -> tuple[jax.Array, jax.Array]:
-    limited = model.actuator_forcelimited[ids].astype(bool)
-    low, high = model.actuator_forcerange[ids].T
-    return jnp.where(limited, low, -jnp.inf), jnp.where(limited, high, jnp.inf)
-
-
-def _unlimited(model: "mjx.Model", data: "mjx.Data") -> jax.Array:
-    """Servos' forces `[nu]` before their limit: k u + b0 + b1 l + b2 l'."""
-    limited = model.actuator_ctrllimited.astype(bool)
-    low, high = model.actuator_ctrlrange.T
-    signal = jnp.where(limited, jnp.clip(data.ctrl, low, high), data.ctrl)
-    if at_work := model.na:
-        last = np.minimum(model.actuator_actadr + model.actuator_actnum - 1, at_work - 1)
-        signal = jnp.where(model.actuator_actadr < 0, signal, data.act[last])
-    b0, b1, b2 = model.actuator_biasprm[:, :3].T
-    speed = product(data._impl.actuator_moment, data.qvel[:, None])[:, 0]
-    return model.actuator_gainprm[:, 0] * signal + b0 + b1 * data.actuator_length + b2 * speed
 
 
 class Sides(NamedTuple):
@@ -121,10 +99,10 @@ def sides(at: Site, memory: Any, step: SubStep, on: jax.Array, mark: float) -> S
     """Both sides of the site's joints in this sub-step; `mark` as in `split`."""
     model, dof, dt = step.model, at.dadr, step.dt
     torque = jnp.where(on, step.data.qfrc_actuator[dof], 0.0)
-    kp, kv, damping = _gains(at, step, on)
+    kp, kv = _gains(at, step, on)
     mobility = step.inverse[np.ix_(dof, dof)]
     inertia = inverse(mobility)
-    servo = dt * damping if int(at.mj_model.opt.integrator) == _IMPLICIT else jnp.zeros(len(at))
+    servo = dt * kv if int(at.mj_model.opt.integrator) == _IMPLICIT else jnp.zeros(len(at))
     alone = mobility if not _has_inner_damping(at) else inverse(inertia - jnp.diag(servo))
     felt = 1.0 / jnp.diagonal(alone)
     part = min(SHARE, 0.8 / len(at))  # trace bound: what the motors leave stays positive definite
@@ -154,19 +132,16 @@ def _has_inner_damping(at: Site) -> bool:
     return int(at.mj_model.opt.integrator) == _IMPLICIT and len(servos(at)[0]) > 0
 
 
-def _gains(at: Site, step: SubStep, on: jax.Array) -> tuple[jax.Array, ...]:
-    """(kp, kv where the servo is free to respond, kv that MuJoCo's matrix holds), at the joints `[n]`."""
+def _gains(at: Site, step: SubStep, on: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """(kp, kv) of the servos as far as they respond, at the joints `[n]`; MuJoCo's matrix holds this kv too."""
     ids, places = servos(at)
     none = jnp.zeros(len(at))
     if not len(ids):
-        return none, none, none
-    model, force = step.model, step.actuator_force[ids]
-    gear, bias = model.actuator_gear[ids, 0], model.actuator_biasprm[ids]
-    low, high = _limits(model, ids)
-    responds = (force > low) & (force < high) & (force != 0)  # 0: switched off
-    kp, kv = -(gear**2) * bias[:, 1], -(gear**2) * bias[:, 2]
-    gains = (jnp.where(responds, kp, 0.0), jnp.where(responds, kv, 0.0), kv)
-    return tuple(jnp.where(on, jnp.maximum(none.at[places].add(g), 0.0), 0.0) for g in gains)
+        return none, none
+    own = step.response[ids] * step.model.actuator_gear[ids, 0] ** 2
+    gains = (-own * step.model.actuator_biasprm[ids, k] for k in (1, 2))
+    kp, kv = (jnp.where(on, jnp.maximum(none.at[places].add(g), 0.0), 0.0) for g in gains)
+    return kp, kv
 
 
 class Passed(NamedTuple):

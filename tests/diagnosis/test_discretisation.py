@@ -112,6 +112,13 @@ def test_fast_motion_is_simulated_more_finely_until_the_step_does_not_show():
     assert found.to_dict()["substep"] == pytest.approx(STEP / found.factor)
 
 
+def test_the_integrator_that_is_recommended_leaves_nothing():
+    """RK4 at the same step: commands act when they are sent, and velocities are those of the positions' time."""
+    found, left = measured(ARM.replace("implicitfast", "RK4"), logs(ARM, swing))
+    assert found.factor == 1 and (found.own[:2] / NOISE).max() < 0.1 and not found.warnings()
+    assert (left[1] / NOISE).max() < 1.05  # nothing but the sensors' noise
+
+
 @pytest.mark.parametrize("finer", [1, 10])
 def test_without_noise_the_step_itself_is_the_floor(finer):
     found, left = measured(ARM, logs(ARM, swing, finer, noise=0.0))

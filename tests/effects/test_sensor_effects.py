@@ -11,12 +11,13 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.signal import lsim
 
+from bayessim_mjx import registry
 from bayessim_mjx.effects import make
 from bayessim_mjx.effects.site import Motion
 from bayessim_mjx.errors import UserError
+from bayessim_mjx.laws import Law
 from bayessim_mjx.parameters import ParameterSpace
-from bayessim_mjx.physics import Physics, begin, control_step
-from bayessim_mjx.rollout import replay
+from bayessim_mjx.physics import Drive, Physics, begin, control_step
 
 DT, STEPS = 0.02, 60
 NAMES = ("joint_offset", "sensor_gain", "sensor_filter", "sensor_delay")  # the last sees what the others show
@@ -35,8 +36,9 @@ XML = """
 </mujoco>
 """
 T = DT * np.arange(STEPS)
+ROWS = DT * np.arange(STEPS + 1)  # of what is measured: with the start
 COMMAND = np.stack([0.8 * np.sin(4 * T) + 0.3 * np.sin(9 * T), np.sin(5 * T)], axis=1)
-START = np.array([[0.3, -0.2]]), np.array([[0.5, -1.0]])
+START = np.array([0.3, -0.2]), np.array([0.5, -1.0])
 
 
 def physics_of(effects):
@@ -57,23 +59,25 @@ def theta_of(physics, values):
 
 @functools.lru_cache
 def episode(physics):
-    """(theta, true qpos, true qvel, commands) -> what is measured after every control step."""
+    """(theta, true qpos, true qvel, commands) -> what is measured at the start and after every control step."""
 
     def run(theta, qpos, qvel, commands):
         def body(world, command):
             world, _ = control_step(physics, world, command)
             return world, (world.measurement["qpos"], world.measurement["qvel"])
 
-        return jax.lax.scan(body, physics.world(theta, qpos, qvel), commands)[1]
+        world = physics.world(theta, qpos, qvel)
+        start = world.measurement["qpos"], world.measurement["qvel"]
+        after = jax.lax.scan(body, world, commands)[1]
+        return tuple(jnp.concatenate([one[None], rest]) for one, rest in zip(start, after, strict=True))
 
     return jax.jit(run)
 
 
 def shown(physics, values, command=COMMAND):
-    """(qpos, qvel) `[T+1, 2]` as measured, of an episode that truly begins at START, which is row 0."""
-    start = [x[0] for x in START]
-    after = episode(physics)(theta_of(physics, values).astype(np.float32), *start, command)
-    return tuple(np.concatenate([first[None], rest]) for first, rest in zip(start, after, strict=True))
+    """(qpos, qvel) `[T+1, 2]` as measured of an episode that truly begins at START."""
+    out = episode(physics)(theta_of(physics, values).astype(np.float32), *START, command)
+    return tuple(np.asarray(x) for x in out)
 
 
 @pytest.mark.slow
@@ -97,7 +101,56 @@ def test_two_places_are_two_single_effects(full):
 def test_gain_scales_what_is_shown(full):
     true, seen = shown(full, {}), shown(full, {"b.sensor_gain.gain": 1.15})
     for x, y in zip(true, seen, strict=True):
-        np.testing.assert_allclose(y[1:], x[1:] * [1.0, 1.15], rtol=1e-6, atol=1e-7)
+        np.testing.assert_allclose(y, x * [1.0, 1.15], rtol=1e-6, atol=1e-7)
+
+
+def test_a_reset_is_measured_too(full):
+    """What is shown of the start is what a robot at rest there would show: delays and filters know nothing else."""
+    own = {"joint_offset.offset": 0.1, "sensor_gain.gain": 1.1}
+    slow = {"sensor_filter.time_constant": 0.04, "sensor_delay.delay": 0.03}
+    for values in (own, own | slow):
+        qpos, qvel = shown(full, {f"a.{k}": v for k, v in values.items()})
+        np.testing.assert_allclose(qpos[0], [1.1 * (START[0][0] + 0.1), START[0][1]], rtol=1e-6)
+        np.testing.assert_allclose(qvel[0], [1.1 * START[1][0], START[1][1]], rtol=1e-6)
+
+
+def test_a_policy_sees_its_first_observation_through_the_sensors():
+    bare, off = (registry.make("Pendulum", effects=e) for e in ([], [make("joint_offset", where="hinge")]))
+    nominal, (q, w, o) = jnp.asarray(bare.space.nominal), np.float32([[0.7], [0.2], [0.06]])
+
+    @jax.jit
+    def observed():
+        return off.reset_to(q, w, jnp.append(nominal, o)).obs["policy"], bare.reset_to(q + o, w, nominal).obs["policy"]
+
+    np.testing.assert_allclose(*observed(), atol=1e-6)
+
+
+def test_a_declared_controller_knows_static_errors_and_no_delay(full):
+    """A drive has its own encoder: with its offset and scale, without the bus and filters between it and the log.
+
+    kp (c - g q) - kd g w is the law with g kp, g kd and c / g on the true angle.
+    """
+
+    def run(theta, gain, command):
+        gains = jnp.array([0.0, 25.0]) * gain, jnp.array([0.0, 1.5]) * gain
+        rest = dict(limit=jnp.full(2, jnp.inf), scale=jnp.ones(2), qadr=(0, 1), dadr=(0, 1))
+        law = Law(jnp.array([0.0, 1.0]), jnp.zeros(2), *gains, **rest)
+
+        def body(world, row):
+            world, _ = control_step(full, world, row, Drive(law=law))
+            return world, world.qpos
+
+        return jax.lax.scan(body, full.world(theta, *START), command)[1]
+
+    slow = {"b.sensor_filter.time_constant": 0.04, "b.sensor_delay.delay": 0.03}
+    cases = [({}, 1, COMMAND), (slow, 1, COMMAND), ({"b.sensor_gain.gain": 1.2}, 1, COMMAND)]
+    cases += [({}, 1.2, COMMAND / [1, 1.2]), ({"b.joint_offset.offset": 0.1}, 1, COMMAND), ({}, 1, COMMAND - [0, 0.1])]
+    thetas, gains, commands = zip(*cases, strict=True)
+    thetas = np.float32([theta_of(full, values) for values in thetas])
+    plain, late, scaled, strong, shifted, less = jax.jit(jax.vmap(run))(thetas, np.float32(gains), np.float32(commands))
+    for one, two in ((plain, late), (scaled, strong), (shifted, less)):
+        np.testing.assert_allclose(one, two, atol=1e-5)
+    assert np.abs(plain - scaled).max() > 0.02 and np.abs(plain - shifted).max() > 0.02
 
 
 def path(qpos, qvel, times):
@@ -112,9 +165,9 @@ def path(qpos, qvel, times):
 @pytest.mark.parametrize("delay", [0.005, 0.02, 0.031, 0.05])
 def test_delay_shows_the_past(full, delay):
     true, seen = shown(full, {}), shown(full, {"b.sensor_delay.delay": delay})
-    x, v = (y[1:, 1] for y in true)
-    np.testing.assert_allclose(seen[0][1:, 1], path(x, v, T - delay), atol=3e-6)
-    np.testing.assert_allclose(seen[1][1:, 1], np.interp(T - delay, T, v), atol=3e-6)
+    x, v = (y[:, 1] for y in true)
+    np.testing.assert_allclose(seen[0][:, 1], path(x, v, ROWS - delay), atol=3e-6)
+    np.testing.assert_allclose(seen[1][:, 1], np.interp(ROWS - delay, ROWS, v), atol=3e-6)
     for x, y in zip(true, seen, strict=True):
         assert np.array_equal(x[:, 0], y[:, 0])
 
@@ -123,10 +176,10 @@ def test_delay_shows_the_past(full, delay):
 def test_filter_is_the_exact_low_pass(full, constant):
     """Against scipy's simulation of T y' = q - y on a fine grid, settled at the first value."""
     true, seen = shown(full, {}), shown(full, {"b.sensor_filter.time_constant": constant})
-    (q, v), a, fine = (x[1:, 1] for x in true), 1 / constant, DT / 50 * np.arange(50 * STEPS - 49)
-    for x, y, inner in zip(true, seen, (path(q, v, fine), np.interp(fine, T, v)), strict=True):
+    (q, v), a, fine = (x[:, 1] for x in true), 1 / constant, DT / 50 * np.arange(50 * STEPS + 1)
+    for x, y, inner in zip(true, seen, (path(q, v, fine), np.interp(fine, ROWS, v)), strict=True):
         low = inner if constant < 1e-5 else inner[0] + lsim(([a], [1, a]), inner - inner[0], fine)[1]
-        np.testing.assert_allclose(y[1:, 1], low[::50], atol=2e-4 if constant < 1e-5 else 1e-5)
+        np.testing.assert_allclose(y[:, 1], low[::50], atol=2e-4 if constant < 1e-5 else 1e-5)
         assert np.array_equal(x[:, 0], y[:, 0])
 
 
@@ -145,15 +198,15 @@ def test_a_servo_with_an_offset_turns_to_command_minus_offset(full):
     seen = shown(full, {"a.joint_offset.offset": 0.07, "b.joint_offset.offset": -0.03})
     # gear 2: the servo's length is twice the angle, so the command shifts by twice the offset
     shifted = shown(full, {}, COMMAND - [2 * 0.07, 0.0])
-    np.testing.assert_allclose(seen[0][1:] - [0.07, -0.03], shifted[0][1:], atol=1e-6)
-    np.testing.assert_allclose(seen[1][1:], shifted[1][1:], atol=5e-6)
+    np.testing.assert_allclose(seen[0] - [0.07, -0.03], shifted[0], atol=1e-6)
+    np.testing.assert_allclose(seen[1], shifted[1], atol=5e-6)
 
 
 def test_a_servo_with_an_offset_at_the_end_of_ctrlrange(full):
     """Command 2 at gear 2 means 1 rad on the encoder, so 1.08 rad in truth; ctrlrange ends at 2."""
     physics = physics_of([make("joint_offset", where="a")])
-    out = replay(physics, *START, np.tile([[[2.0, 0.0]]], (1, 250, 1)), np.array([[-0.08]]))
-    assert out["qpos"][0, -1, 0] == pytest.approx(1.0, abs=1e-3)
+    qpos, _ = shown(physics, {"a.joint_offset.offset": -0.08}, np.tile([[2.0, 0.0]], (250, 1)))
+    assert qpos[-1, 0] == pytest.approx(1.0, abs=1e-3)
 
 
 CASES = {
