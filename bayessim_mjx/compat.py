@@ -29,4 +29,4 @@ def supply() -> None:
     Without it `brax.training.agents.ppo.train` ends with an AttributeError (google/brax#671). Nothing is replaced.
     """
     if not hasattr(jax, "device_put_replicated"):
-        jax.device_put_replicated = put_replicated
+        jax.device_put_replicated = put_replicated  # type: ignore[assignment]

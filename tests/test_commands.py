@@ -21,7 +21,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from bayessim_mjx import checkpoints, cli, config, main, play, registry, train
+from bayessim_mjx import checkpoints, cli, config, diagnose, main, play, registry, train
 from bayessim_mjx.env import Env, State
 from bayessim_mjx.errors import DivergedError, UserError
 from bayessim_mjx.monitor.writer import event_files, records
@@ -342,6 +342,13 @@ def test_main_stops_only_after_the_rounds_checkpoint() -> None:
         watched.save(5, {"state": types.SimpleNamespace(round=1)}, meta={})
     watched.save(10, {"state": types.SimpleNamespace(round=2)}, meta={})  # the last round: nothing is left to stop
     assert calls == ["round", (5, 7), (10, 7)]
+
+
+def test_a_path_that_no_system_takes_is_one_line(capsys: pytest.CaptureFixture) -> None:
+    xml = "<mujoco><worldbody><body><joint name='j'/><geom size='.1'/></body></worldbody>"
+    Path("arm.xml").write_text(xml + "<actuator><motor name='m' joint='j'/></actuator></mujoco>")
+    line = error_of(capsys, diagnose.main, "--model", "arm.xml", "--data", "a" * 300)
+    assert "a" * 300 in line and "too long" in line
 
 
 def test_a_full_disk_ends_the_run_cleanly_and_it_goes_on(toy: None, monkeypatch: Any, capsys: Any) -> None:

@@ -87,14 +87,14 @@ def _inputs(at: Site, mj_model: mujoco.MjModel) -> dict[str, Any]:
     mujoco.mj_integratePos(mj_model, data.qpos, rng.normal(size=at.nv), 0.1)
     data.ctrl[:] = rng.uniform(-1.0, 1.0, at.nu)
     mujoco.mj_forward(mj_model, data)
-    qpos, qvel = np.float32(data.qpos), np.float32(data.qvel)
-    command = np.float32(rng.uniform(-1.0, 1.0, (ROWS, at.substeps, at.nu)))
+    qpos, qvel = jnp.asarray(data.qpos, jnp.float32), jnp.asarray(data.qvel, jnp.float32)
+    command = jnp.asarray(rng.uniform(-1.0, 1.0, (ROWS, at.substeps, at.nu)), jnp.float32)
     return {
         "data": mjx.put_data(mj_model, data, impl="jax"),
         "command": command[0],
-        "force": np.float32(data.actuator_force),
+        "force": jnp.asarray(data.actuator_force, jnp.float32),
         "measurement": {"qpos": qpos, "qvel": qvel},
-        "motion": Motion(np.tile(qpos, (ROWS, 1)), np.tile(qvel, (ROWS, 1)), command, 1),
+        "motion": Motion(jnp.tile(qpos, (ROWS, 1)), jnp.tile(qvel, (ROWS, 1)), command, 1),
     }
 
 

@@ -173,7 +173,9 @@ class GymnasiumVectorEnv(VectorEnv):
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._reset, self._step = jax.jit(self._restarted), jax.jit(self._advanced)
-        self._camera, self._key, self._state = _Camera(env), None, None  # type: ignore[var-annotated]
+        self._camera = _Camera(env)
+        self._key: Any = None
+        self._state: Any = None
         self._ended = np.zeros(self.num_envs, bool)
         # parameters that `options` gave, and in which worlds they hold
         self._given = np.zeros((self.num_envs, len(env.space.nominal)), np.float32), np.zeros(self.num_envs, bool)
