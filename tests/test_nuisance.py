@@ -200,17 +200,21 @@ def test_updates_carry_the_clock_on(wrapped: bool) -> None:
     Also with parameters that last, a memory and a critic that sees theta.
     """
     env = remembering(ramped(frequency=4), 3) if wrapped else ramped()
+    saved: Any = None
     config = dataclasses.replace(SMALL, memory=3, critic_theta=True) if wrapped else SMALL
     domain, key = Distribution.prior(env.space, 1), jax.random.PRNGKey(0)
     state, seen = rl.init(env, config, key, domain, clock=5), []
     assert np.ptp(state.env_states.pipeline_state.theta[:, 0]) < 0.5
     step = ppo.make_update(env, config)
-    for _ in range(4):
+    for i in range(4):
         state, metrics = step(state, domain)
         seen.append(np.asarray(state.env_states.info["nuisance"].course.clock))
+        saved = jax.tree.map(np.array, jax.device_get(state)) if i == 1 else saved
     assert np.array_equal(seen, np.repeat(np.arange(10, 26, 5)[:, None], 32, 1))
     assert step._cache_size() == 1 and np.isfinite(metrics["Loss/value"])
     assert np.ptp(state.env_states.pipeline_state.theta[:, 0]) > 1.5
+    resumed = step(step(saved, domain)[0], domain)[0]  # as from a checkpoint
+    assert jax.tree.all(jax.tree.map(lambda a, b: np.array_equal(a, b), state, resumed))
 
 
 @pytest.mark.parametrize(("frequency", "draws"), [(1, [0, 4, 8, 12, 16, 20]), (8, [0, 8, 16]), (9, [0, 12])])
