@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 from bayessim_mjx import trust
 from bayessim_mjx.config import Config, load, replace, unknown
-from bayessim_mjx.errors import UserError, disk_is_full, refused
+from bayessim_mjx.errors import UserError, disk_is_full, out_of_memory, refused
 
 if TYPE_CHECKING:
     from bayessim_mjx.runs import Run
@@ -403,7 +403,10 @@ def command(run: Callable[[Sequence[str] | None], int]) -> Callable[..., int]:
 
 
 def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split("\n"))
+    text = " ".join(str(error).split("\n"))
+    if not out_of_memory(error):
+        return text
+    return f"{text.rstrip('. ') or 'out of memory'}; lower env.numEnvs, ppo.num_steps or bayessim.trainTrajs"
 
 
 def _bug() -> int:

@@ -28,7 +28,11 @@ def disk_is_full(error: BaseException) -> bool:
     return False
 
 
+def out_of_memory(error: BaseException) -> bool:
+    """Whether arrays did not fit, on this machine or on a device."""
+    return isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error)
+
+
 def refused(error: BaseException) -> bool:
     """Whether the system refused to read or write a file, or has not the memory that was asked for."""
-    memory = isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error)
-    return memory or (isinstance(error, OSError) and error.errno in _REFUSED) or disk_is_full(error)
+    return out_of_memory(error) or (isinstance(error, OSError) and error.errno in _REFUSED) or disk_is_full(error)

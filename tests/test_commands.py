@@ -147,6 +147,15 @@ def test_settings_of_another_command_are_refused(command: Any, override: str, wo
     assert all(word in line for word in words), line
 
 
+def test_what_the_allocator_refuses_names_the_numbers_to_lower(toy: None, monkeypatch: Any, capsys: Any) -> None:
+    def full(*_: Any) -> float:
+        raise RuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 104593043368 bytes.")
+
+    monkeypatch.setattr(train.Training, "evaluate", full)
+    line = error_of(capsys, train.main, "--task", "Pendulum", *SMALL)
+    assert "allocating 104593043368 bytes; lower env.numEnvs, ppo.num_steps or bayessim.trainTrajs" in line
+
+
 def test_what_means_nothing_here_is_one_note(capsys: Any, tmp_path: Path, toy: None) -> None:
     (tmp_path / "f.yaml").write_text("sim: {substeps: 2}\nenv: {envSpacing: 2}\n")
     assert train.main(["--task", "Pendulum", *SMALL, "--cfg_env", "f.yaml", "--max_iterations", "0"]) == 0

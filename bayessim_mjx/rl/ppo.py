@@ -168,7 +168,8 @@ def _check_memory(env: Env, config: PPOConfig, mesh: Mesh | None) -> None:
     key, theta = jax.random.PRNGKey(0), np.asarray(env.space.nominal, np.float32)
     world = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(jax.eval_shape(traced(env.reset), key, theta)))
     seen = sum(env.observation_size[group][0] for group in {"policy", critic_group(env)})
-    step = 4 * (2 * seen + 3 * env.action_size + 8)  # observations before and after; actions, rewards, values ...
+    # observations before and after; actions, rewards, values ...; the critic judges all steps at once
+    step = 4 * (2 * seen + 3 * env.action_size + 8 + max(config.hidden_critic, default=0))
     share = config.num_envs / sharding.count(mesh)
     what = f"ppo.num_envs = {config.num_envs} (env.numEnvs) worlds, ppo.num_steps = {config.num_steps}"
     room = (jax.local_devices()[0].memory_stats() or {}).get("bytes_limit")

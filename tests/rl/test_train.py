@@ -78,7 +78,8 @@ def test_worlds_that_do_not_fit_are_refused_before_they_are_made(monkeypatch):
     """The state of a world (and of its reset) and 16 steps of it, counted by hand."""
     world = sum(x.nbytes for x in jax.tree.leaves(jax.jit(WALK.reset)(key(0), jnp.asarray(WALK.space.nominal))))
     (size,) = WALK.observation_size["policy"]
-    needed = CONFIG.num_envs * (2 * world + CONFIG.num_steps * 4 * (2 * size + 3 * WALK.action_size + 8))
+    step = 2 * size + 3 * WALK.action_size + 8 + max(CONFIG.hidden_critic)
+    needed = CONFIG.num_envs * (2 * world + CONFIG.num_steps * 4 * step)
     monkeypatch.setattr(memory, "installed", lambda: needed - 1)
     with pytest.raises(UserError, match=rf"ppo\.num_envs = {CONFIG.num_envs} .*needs at least"):
         rl.init(WALK, CONFIG, key(0))
