@@ -92,6 +92,9 @@ def verdict_in_words(
         more = ON_TOP if remains > 0.05 else BEATEN if beaten else ""
         out += [f"{NEAREST}{more}."] if name == "unexplained" and (more or not partly) else []
         out.append(FALLS)
+    if name == "unexplained" and not effects:
+        rest = [_left(n, far.physical[n]) for n in _worst(far) if "largest" in far.physical[n]]
+        out += [f"What remains after recalibration: {listed(rest[:3])}."] if rest else []
     joints = list(far.physical)
     if len(joints) > 1 and name != "no_gap":
         out.append(_by_joint(far, bool(effects)))

@@ -84,6 +84,8 @@ def test_effects_that_are_not_there(place, capsys, tmp_path):
     assert "coulomb_fricton" in line and "coulomb_friction" in line
     assert "mine.py" in refused(capsys, *base, "--effects", "mine.py:Mine")
     assert "speed" in refused(capsys, *base, "--effects", "coulomb_friction", "--group", "speed")
+    assert "elbow" in (line := refused(capsys, *base, "--tolerance", "elbow=1deg")) and "hinge" in line
+    assert "not in mm" in refused(capsys, *base, "--tolerance", "hinge=2mm")
 
 
 def test_too_little_data_is_a_verdict(place, capsys, tmp_path):

@@ -135,6 +135,12 @@ def test_the_headline_says_partly_explained_and_what_remains_where():
     )
 
 
+def test_what_no_effect_explains_is_told_against_the_tolerance_too():
+    told = sentences.verdict_in_words("unexplained", [], gap(0.0349))[1]
+    assert told.startswith("What remains after recalibration: elbow: 2.0 deg rms, 6.0 deg at most")
+    assert told.endswith("and shoulder: 0.057 deg rms, 0.17 deg at most (0.10 % of its motion; tolerance 1.1 deg).")
+
+
 def test_physical_units_and_shares_come_before_the_noise():
     falls = sentences.verdict_in_words("effects", [FRICTION], gap(0.0132))[1]
     assert "from 10 % of the motion (1000 noise sd) to 1.3 % of the motion (132 noise sd)" in falls
