@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from brax.envs import training
 
-from bayessim_mjx import collection, config, registry
+from bayessim_mjx import collection, config, effects, registry
 from bayessim_mjx.errors import UserError
 
 
@@ -59,12 +59,14 @@ def test_a_world_is_held_in_its_last_sound_state():
     class Slow(type(registry.make("Cartpole"))):
         speed_limit, diverged_reward = 2.0, -7.0
 
-    env = Slow()
-    before = env.reset_to(np.zeros(2, np.float32), np.float32([1.5, 0.0]))
-    after = jax.jit(env.step)(before, jnp.ones(1))  # 400 N on the cart
-    assert (after.done, after.reward) == (1, -7)
+    env = Slow(effects=[effects.make("actuator_delay", where="all")])  # it remembers commands
+    step, before = jax.jit(env.step), env.reset_to(np.zeros(2, np.float32), np.float32([1.5, 0.0]))
+    after, sound = step(before, jnp.ones(1)), step(before, 0.01 * jnp.ones(1))  # 400 N and 4 N on the cart
+    assert (after.done, after.reward, sound.done) == (1, -7, 0)
     np.testing.assert_array_equal(after.obs["policy"], before.obs["policy"])
-    assert jax.jit(env.step)(before, jnp.zeros(1)).done == 0
+    held, old, new = (jax.tree.leaves(s.pipeline_state.memory) for s in (after, before, sound))
+    assert all(np.array_equal(a, b) for a, b in zip(held, old, strict=True))
+    assert not all(np.array_equal(a, b) for a, b in zip(new, old, strict=True))
 
 
 def test_without_randomisation_the_space_is_empty_and_the_domain_none():

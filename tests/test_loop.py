@@ -1,6 +1,7 @@
 """The outer loop on the pendulum with tiny budgets: order of a round, resume, ablation, recorded motion."""
 
 import dataclasses
+import types
 
 import jax
 import jax.numpy as jnp
@@ -162,6 +163,26 @@ def test_a_policy_with_a_memory_acts_in_all_rounds_and_its_memory_is_no_action(e
     assert int(state.round) == 2 and np.isfinite(info.returns).all()
     assert info.real.action.shape[-1] == env.action_size
     assert "gru" in state.train.params["actor"]
+
+
+@pytest.mark.parametrize("truth", [None, np.zeros(1)])
+def test_under_logs_only_the_newest_evaluation_counts(monkeypatch, truth):
+    """There is no truth then, and every round was evaluated on physics of its own."""
+    told, returns = [], np.array([1.0, 3.0])
+    saves = types.SimpleNamespace(save=lambda step, tree, **kwargs: told.append(kwargs))
+    monkeypatch.setattr(loop, "train", lambda parts, state, progress: state)
+    info = types.SimpleNamespace(truth=truth, returns=returns, seconds={})
+    monkeypatch.setattr(loop, "step", lambda parts, state: (dataclasses.replace(state, round=state.round + 1), info))
+    monkeypatch.setattr(rl, "policy_of", lambda state: None)
+    blank = dict.fromkeys((f.name for f in dataclasses.fields(loop.LoopState)), jnp.zeros(0))
+    train = types.SimpleNamespace(iteration=jnp.int32(3), env_steps=jnp.uint32(24))
+    state = loop.LoopState(**{**blank, "round": jnp.int32(0), "train": train})
+    ppo = types.SimpleNamespace(max_iterations=3, save_interval=1)
+    parts = types.SimpleNamespace(
+        settings=types.SimpleNamespace(realIters=2, ftuneRL=True), config=types.SimpleNamespace(ppo=ppo)
+    )
+    loop.run(parts, state, saves)
+    assert [(t["supersede"], t["evaluation"]) for t in told] == [(truth is None, 2.0)] * 2
 
 
 def test_without_a_model_the_domain_stays_the_prior(env):

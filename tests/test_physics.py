@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from bayessim_mjx.effects import make
+from bayessim_mjx.effects.site import Motion
 from bayessim_mjx.parameters import Parameter, ParameterSpace
-from bayessim_mjx.physics import Physics, control_step, mjx
+from bayessim_mjx.physics import Physics, begin, control_step, mjx
 
 BALL = '<body pos="1 0 .12"><freejoint/><geom type="sphere" size=".1" mass="1"/></body>'
 XML = """
@@ -129,3 +130,26 @@ def test_refusals():
         physics().world(jnp.zeros(2))
     with pytest.raises(ValueError, match=r"qvel has shape \(3,\), expected \(1,\)"):
         physics().world(jnp.zeros(0), qvel=np.zeros(3))
+
+
+def test_a_start_in_a_log_remembers_the_commands_before_it():
+    """The motor answers a control step late: begun in the middle, the arm moves as the one never stopped."""
+    p = physics(effects=[make("actuator_delay", where="motor")])
+    commands = jnp.float32([[0.4], [-0.6], [0.9], [0.0]])
+
+    @jax.jit
+    def moved():
+        def body(world, command):
+            return control_step(p, world, command)[0], (world.qpos, world.qvel)
+
+        theta = jnp.float32([0.02])
+        end, (qpos, qvel) = jax.lax.scan(body, p.world(theta), commands)
+        each = jnp.repeat(commands[:, None], p.substeps, axis=1)
+        again, forgetful = (
+            body(begin(p, theta, Motion(qpos, qvel, past, 3)), commands[3])[0].qvel for past in (each, 0 * each)
+        )
+        return end.qvel, again, forgetful
+
+    whole, again, forgetful = (float(x[0]) for x in moved())
+    assert again == pytest.approx(whole, abs=1e-5)
+    assert abs(forgetful - whole) > 0.05

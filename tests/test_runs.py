@@ -89,6 +89,14 @@ def test_latest_and_best_come_from_the_manifest(run: Run) -> None:
     assert len(list((run.path / "checkpoints").iterdir())) == 4
 
 
+def test_evaluations_of_something_else_no_longer_compete_for_best(run: Run) -> None:
+    """Under logs each round is evaluated on physics of its own: of 9, 5 and 7 the last is best."""
+    rows = ((1, 9.0, False, 1), (2, 5.0, True, 2), (3, 7.0, True, 3), (4, 6.0, False, 3))
+    for step, evaluation, supersede, best in rows:
+        run.save(step, tree(), evaluation=evaluation, supersede=supersede)
+        assert Run.open(run.path).manifest["best"] == best
+
+
 def test_newest_run_is_by_creation_not_by_name(tmp_path: Path) -> None:
     first, second = (Run.create(tmp_path, "Ant", name, config.load("Ant"), "") for name in ("z", "a"))
     for r in (first, second):

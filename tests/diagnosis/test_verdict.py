@@ -8,7 +8,8 @@ import pytest
 from bayessim_mjx.diagnosis import race as races
 from bayessim_mjx.diagnosis import verdict
 from bayessim_mjx.diagnosis.models import Model
-from bayessim_mjx.diagnosis.verdict import Rival
+
+from .tables import Table, law
 
 
 def candidate(effect, where):
@@ -16,33 +17,34 @@ def candidate(effect, where):
 
 
 @pytest.mark.parametrize(
-    ("effect", "rival", "behind", "narrower"),
+    ("alone", "effect", "named"),
     [
-        (("armature", "all"), ("armature", "pole"), 3.0, True),
-        (("armature", "all"), ("armature", "pole"), 30.0, False),  # nats: the logs tell
-        (("armature", "pole"), ("armature", "all"), -3.0, False),
-        (("armature", "all"), ("payload", "pole"), 0.0, False),
-        (("armature", "slider"), ("armature", "pole"), 0.0, False),
+        (1.2, "armature", "pole"),
+        (1.3, "armature", "all"),  # 400 nats: the logs tell
+        (1.2, "payload", "all"),  # another law
     ],
 )
-def test_one_place_is_named_before_all_where_the_logs_cannot_tell(effect, rival, behind, narrower):
-    other = Rival((candidate(*rival),), None, 1.0, "", behind=behind)
-    assert verdict._narrower(candidate(*effect), other) is narrower
+def test_one_place_is_named_before_all_where_the_logs_cannot_tell(monkeypatch, alone, effect, named):
+    tied, one = law("armature", "all", places=("pole", "cart")), law(effect, "pole")
+    table = Table(monkeypatch, {(): 100, (tied,): 1.2, (one,): alone})
+    race = table.tried()
+    race.winner = table.model((tied,))
+    verdict.rule(race, lambda *_: None)
+    assert [e.where for e in race.winner.effects] == [named]
 
 
 def test_one_law_in_the_place_of_two_is_told_of_both(monkeypatch):
     """Friction that differs by direction is dry friction and a bias: 17 +- 16 mN m are 33 and 1 mN m."""
-    dry, bias, both = (candidate(n, "hinge") for n in ("coulomb_friction", "actuator_bias", "asymmetric_friction"))
-    winner, single, worse = (SimpleNamespace(effects=e) for e in ((dry, bias), (both,), (dry,)))
-    monkeypatch.setattr(verdict, "ranked", lambda race, size: [single, worse] if size == 1 else [])
-
-    def rival(race, winner, effect, others, model):
-        return [] if model is worse else [Rival(others, model, 0.99, "", contains=effect is dry)]
-
-    monkeypatch.setattr(verdict, "_rival", rival)
-    (found,) = verdict._instead_of_all(None, winner)
-    assert found.effects == (both,) and found.contains
-    assert verdict._instead_of_all(None, worse) == []
+    dry, bias, both = law("coulomb_friction"), law("actuator_bias"), law("asymmetric_friction", numbers=2)
+    table = Table(monkeypatch, {(): 100, (dry,): 40, (bias,): 60, (both,): 1.0, (dry, bias): 1.0})
+    race = table.tried()
+    race.winner = table.model((dry, bias))
+    ruling = verdict.rule(race, lambda *_: None)
+    assert set(race.winner.effects) == {dry, bias}
+    for effect in (dry, bias):
+        (found,) = [r for r in ruling.rivals[effect.label] if r.model.effects == (both,)]
+        assert found.contains and found.closure == pytest.approx(1.0)
+    assert not any(r.effects == (bias,) for r in ruling.rivals[dry.label])
 
 
 @pytest.mark.parametrize(("value", "far", "there"), [(1.1, 2.0, True), (1.015, 2.0, False), (1.015, 1.0, True)])
