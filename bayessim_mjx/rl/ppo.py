@@ -110,7 +110,7 @@ def in_worlds_of(state: TrainState, other: TrainState) -> TrainState:
     novel = state.rnd
     if novel is not None:
         assert other.rnd is not None
-        novel = novel.replace(discounted=other.rnd.discounted, episodes=other.rnd.episodes)
+        novel = dataclasses.replace(novel, discounted=other.rnd.discounted, episodes=other.rnd.episodes)
     return dataclasses.replace(state, env_states=other.env_states, episodes=other.episodes, rnd=novel)
 
 
@@ -123,7 +123,7 @@ def _reset(
         thetas = jnp.tile(jnp.asarray(env.space.nominal, jnp.float32), (worlds, 1))
     else:
         thetas = domain.sample(theta_key, worlds)
-    given = (jax.random.split(reset_key, worlds), thetas)
+    given: tuple[Any, ...] = (jax.random.split(reset_key, worlds), thetas)
     if getattr(env, "nuisance", None) is not None:
         given = (given[0], env.space.scheduled(thetas, clock), starting(clock, worlds))
     reset = sharding.local(jax.vmap(traced(env.reset)), mesh, (FIRST,) * len(given), FIRST)

@@ -243,9 +243,8 @@ class GymnasiumVectorEnv(VectorEnv):
         if self.mode is DISABLED and self._ended.any():
             raise UserError(f"worlds {np.flatnonzero(self._ended).tolist()} have ended: reset them with a reset_mask")
         self._key, key = jax.random.split(self._key)
-        actions = jnp.asarray(actions, jnp.float32)
-        old = self._state, self._thetas
-        after, (self._state, self._thetas) = self._step(key, old, self._ended, actions, self._domain, self._given)
+        old, acted = (self._state, self._thetas), jnp.asarray(actions, jnp.float32)
+        after, (self._state, self._thetas) = self._step(key, old, self._ended, acted, self._domain, self._given)
         terminated, truncated = (np.asarray(after.info[name]) > 0 for name in ("terminated", "truncated"))
         reward = np.array(after.reward)
         if self.mode is NEXT:
