@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass, replace
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -130,14 +131,14 @@ class Dynamics:
         parts = [p for p in (*self.bodies[:, :, dof], self.spring[:, dof]) if np.abs(p).max() > 1e-9]
         tilt = [p for p in self.tilt[:, :, dof] if np.abs(p).max() > 1e-9]
         felt = [i for i, p in enumerate(self.load[:, :, dof]) if np.abs(p).max() > 1e-9]
-        blocks = (
+        blocks: list[tuple[Any, float, float]] = [
             ([np.ones(len(v))], -np.inf, np.inf),
             (losses, 0.0, np.inf),
             ([travel - travel.mean()], 0.0, np.inf),
             (parts, 1.0 / FACTOR, FACTOR),
             (tilt, -0.3, 0.3),
-            *(([self.load[i, :, dof]], 0.0, self.most[i]) for i in felt),
-        )
+            *(([self.load[i, :, dof]], 0.0, float(self.most[i])) for i in felt),
+        ]
         return Columns(
             np.stack([c for block, _, _ in blocks for c in block], 1),
             np.array([low for block, low, _ in blocks for _ in block]),

@@ -4,7 +4,7 @@ import contextlib
 import sys
 import time
 from collections.abc import Callable, Iterator
-from typing import TextIO
+from typing import Any, TextIO
 
 from bayessim_mjx.monitor.words import duration
 
@@ -59,7 +59,7 @@ def stages(headless: bool) -> Iterator[Say]:
     text, bar = TextColumn("{task.description}"), BarColumn()
     columns = (SpinnerColumn(), text, bar, MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
     with Progress(*columns, transient=True) as bars:
-        tasks = {}
+        tasks: dict[str, Any] = {}
 
         def show(stage: str, done: int, total: int) -> None:
             if stage not in tasks:

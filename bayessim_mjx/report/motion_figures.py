@@ -147,7 +147,8 @@ def _series(values: Sequence[Any]) -> np.ndarray:
 def commands(command: Mapping[str, Any]) -> dict[str, Any]:
     """The command of an experiment: one row per actuator, up to eight."""
     rows = list(command["ctrl"].items())[:8]
-    data, layout, titles = [], {}, []
+    data, titles = [], []
+    layout: dict[str, Any] = {}
     high = 1 / len(rows)
     time = numbers(command["time"], 6)
     for k, (name, values) in enumerate(rows):

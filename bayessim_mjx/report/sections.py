@@ -124,7 +124,7 @@ def how_far(d: Diagnosis) -> dict[str, Any]:
 
 def _stages_row(row: Mapping[str, Any], joints: int) -> dict[str, Any]:
     """One horizon: the joint's error or the share of the motion, and noise sd with their interval below."""
-    own = next(iter((row.get("physical") or {}).values()), {}) if joints == 1 else {}
+    own: Mapping[str, Any] = next(iter((row.get("physical") or {}).values()), {}) if joints == 1 else {}
     shares, cells = row.get("shares") or {}, {}
     for stage in STAGES:
         span = known_span((row.get("ci") or {}).get(stage))
