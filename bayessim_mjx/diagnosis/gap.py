@@ -117,21 +117,24 @@ class Closed:
 
     Attributes:
         before, after: `[W]` mean squares of windows in units of the noise; group: `[W]`, their conditions.
-        own, every: `[W]`, what one of several effects closes of what all do, where the share is of that one alone.
+        own, every: `[W]`, what one of several effects closes of what all do, where the share is of that one alone. Then
+            what undercuts the noise is nobody's, so that parts add up to the whole.
     """
 
     before: Array
     after: Array
     group: NDArray[np.int64]
-    own: Array | float = 1.0
-    every: Array | float = 1.0
+    own: Array | None = None
+    every: Array | None = None
 
     def _sums(self, rows: Array) -> tuple[Array, Array, Array]:
         """Sums of what there was, what is left and of the noise, over windows with weights `[..., W]`."""
         before, after, noise = rows @ self.before, rows @ self.after, rows.sum(-1)
+        if self.own is None or self.every is None:
+            return before, after, noise
         own, every = (rows @ (x * np.ones_like(self.before)) for x in (self.own, self.every))
-        part = np.where(np.abs(every) > 1e-12 * np.abs(rows).sum(-1), own / np.where(every == 0, 1.0, every), 0.0)
-        return before, before - part * (before - after), noise
+        part = np.where(np.abs(every) > 1e-12 * rows.sum(-1), own / np.where(every == 0, 1.0, every), 0.0)
+        return before, before - part * (before - np.maximum(after, noise)), noise
 
     @property
     def value(self) -> float:

@@ -145,6 +145,8 @@ def test_parts_of_what_is_closed_add_up_and_stay_below_one():
     for part in (whole, *parts):
         low, high = part.interval()
         assert low < part.value < high <= 1.0
+    lucky = np.full_like(before, 0.9)  # below the noise: all is closed, and no more
+    assert sum(gap.Closed(before, lucky, group, o, own.sum(0)).value for o in own) == pytest.approx(1.0)
     at_noise = gap.Closed(before, np.full_like(before, 0.9), group)
     assert at_noise.value == 1.0 and at_noise.interval()[1] == 1.0
 
