@@ -526,6 +526,12 @@ def test_segments(tmp_path: Path, arm: mujoco.MjModel) -> None:
     np.testing.assert_allclose(data["command"][1], logs[0].ctrl[5:15], rtol=1e-6)
     np.testing.assert_allclose(data["qpos"][9], logs[1].qpos[5:16], rtol=1e-6)
     assert all(v.dtype == np.float32 for k, v in data.items() if k not in ("run", "start"))
+    # the recording around each start; beyond the ends of a log the end is held
+    near = segments(logs, 10, stride=5, rows=3)
+    for name, log, first in (("around_qpos", logs[0].qpos, 0), ("around_command", logs[1].ctrl, 8)):
+        assert near[name].shape == (12, 7, 2)
+        np.testing.assert_allclose(near[name][first], log[[0, 0, 0, 0, 1, 2, 3]], rtol=1e-6)
+        np.testing.assert_allclose(near[name][first + 1], log[2:9], rtol=1e-6)
     assert len(segments(logs[0], 10)["qpos0"]) == 4
     assert segments(logs, 10, dt=0.005)["qpos"].shape == (9 + 5, 11, 2)
     with pytest.raises(UserError, match="no log holds 60 control steps.*'0.csv' with 49.*trainTrajLen"):
