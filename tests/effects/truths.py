@@ -1,12 +1,15 @@
 """Motion by the effects and by MuJoCo C, and fits of one to the other."""
 
+import functools
+
+import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 from scipy.optimize import least_squares
 
 from bayessim_mjx.parameters import ParameterSpace
-from bayessim_mjx.physics import Physics
-from bayessim_mjx.rollout import replay
+from bayessim_mjx.physics import Physics, control_step
 
 CONTROL = 0.02  # s
 
@@ -16,11 +19,23 @@ def physics(xml, effects):
 
 
 def moved(world, thetas, command, qpos=None, qvel=None):
-    """Positions `[N, T+1, nq]` in the worlds `thetas` `[N, d]` under the same commands `[T, nu]`."""
-    n, model = len(thetas), world.mj_model
+    """Positions `[N, T+1, nq]` in the worlds `thetas` `[N, d]` under the same commands `[T, nu]`, from a reset."""
+    model = world.mj_model
     start = [np.zeros(size) if x is None else x for x, size in ((qpos, model.nq), (qvel, model.nv))]
-    rows = [np.broadcast_to(x, (n, *np.shape(x))) for x in (*start, command)]
-    return np.asarray(replay(world, *rows, np.asarray(thetas, np.float32))["qpos"])
+    return np.asarray(_episodes(world)(np.float32(thetas), *map(np.float32, start), np.float32(command)))
+
+
+@functools.lru_cache
+def _episodes(physics):
+    def one(theta, qpos, qvel, command):
+        def step(world, row):
+            world, _ = control_step(physics, world, row)
+            return world, world.measurement["qpos"]
+
+        world = physics.world(theta, qpos, qvel)
+        return jnp.concatenate([world.measurement["qpos"][None], jax.lax.scan(step, world, command)[1]])
+
+    return jax.jit(jax.vmap(one, in_axes=(0, None, None, None)))
 
 
 def truth(model, command, qpos=None, qvel=None, push=None):
