@@ -223,10 +223,18 @@ def test_another_delimiter_is_told(tmp_path: Path, arm: mujoco.MjModel, mark: st
     refused(tmp_path, arm, "run.csv", f"parted by {word}", "delimiter")
 
 
+WHOLE = {"ctrl": {"m_shoulder": 1, "m_elbow": 2}, "qpos": {"shoulder": 3, "elbow": 4}}
+
+
 @pytest.mark.parametrize(
     ("entry", "words"),
     [
         ({"qpos": {"elbow": {"column": "q", "signed": 5000}}}, ("qpos.elbow.signed = 5000", "2 to 64")),
+        ({**WHOLE, "time": {"column": "time", "scale": 1e-320}}, ("median step", "at least 1e-06 s per row")),
+        (
+            {**WHOLE, "qpos": {"shoulder": 3, "elbow": {"column": 4, "scale": 1e299}}},
+            ("'qpos:elbow'", "finite numbers below 1e+15"),
+        ),
         ({"files": "/etc/*"}, ("files = '/etc/*'", "inside the folder")),
         ({"files": "../*"}, ("files = '../*'", "inside the folder")),
         ({"files": ""}, ("files = ''", "inside the folder")),

@@ -16,6 +16,8 @@ from bayessim_mjx.logs.log import Array, Channels, suggest
 from bayessim_mjx.logs.table import Table
 from bayessim_mjx.quantities import percent
 
+LARGEST = 1e15  # of a logged number: squares of larger ones are no longer numbers
+SHORTEST = 1e-6  # s between rows
 STREAMS = ("ctrl", "qpos", "qvel", "effort", "enabled")
 
 
@@ -49,10 +51,10 @@ def check_channels(table: Table, columns: Mapping[str, Array], channels: Channel
         constant = "a joint that was not recorded can be held constant in the map (qpos: {<joint>: {value: 0.0}})"
         raise UserError(f"{table.path}: missing column(s) {', '.join(missing)}; it has {names}; {constant}")
     for column in needed:
-        bad = np.flatnonzero(~np.isfinite(columns[column]))
+        bad = np.flatnonzero(~(np.abs(columns[column]) < LARGEST))
         if len(bad):
             at = f"{table.path}: column {column!r}, {table.where(int(bad[0]))}: {columns[column][bad[0]]}"
-            raise UserError(f"{at} ({len(bad)} such row(s)); allowed: finite numbers")
+            raise UserError(f"{at} ({len(bad)} such row(s)); allowed: finite numbers below {LARGEST:g}")
 
 
 def _kind(prefix: str) -> str:
@@ -74,6 +76,9 @@ def check_time(table: Table, time: Array, min_rows: int) -> None:
         at = f"{table.path}: column 'time', {table.where(row)}: {time[row]:.9g} s after {time[row - 1]:.9g} s"
         raise UserError(f"{at} ({len(back)} such row(s)); allowed: strictly increasing time")
     period = float(np.median(steps))
+    if period < SHORTEST:
+        text = f"{table.path}: column 'time': median step {period:.4g} s"
+        raise UserError(f"{text}; allowed: seconds, at least {SHORTEST:g} s per row")
     if period > 1.0:
         text = f"{table.path}: column 'time': median step {period:.4g} s"
         mend = "milliseconds: `time: {column: time, scale: 0.001}` in the map"
