@@ -289,8 +289,8 @@ def _known(metadata: Mapping[str, Any], key: str, columns: Mapping[str, Array], 
             raise UserError(f"{source}: {key}.{name} in its side YAML: no such channel; {suggest(str(name), allowed)}")
         number = isinstance(value, int | float) and not isinstance(value, bool) and np.isfinite(value)
         if not number or value < 0 or (key == "sigma" and value == 0):  # 0 would make every gap an infinite one
-            allowed = "a number > 0" if key == "sigma" else "a number >= 0"
-            raise UserError(f"{source}: {key}.{name} = {value!r} in its side YAML; allowed: {allowed}")
+            least = "a number > 0" if key == "sigma" else "a number >= 0"
+            raise UserError(f"{source}: {key}.{name} = {value!r} in its side YAML; allowed: {least}")
         out[column] = float(value)
     return out
 
