@@ -179,8 +179,9 @@ class Surrogate:
     def repeated(self, first: int, real: Trajectory, thetas: Array) -> dict[str, Array]:
         """The first of the trajectories `real` replayed at thetas [n, d]: its motion, see `rollout.replay`."""
         del first
-        own = [_tiled(x[0], len(thetas)) for x in (real.qpos[:, 0], real.qvel[:, 0], real.command)]
-        return replay(self.env.physics, *own, thetas)  # type: ignore[attr-defined]
+        first_rows = (real.qpos[:, 0], real.qvel[:, 0], real.command)
+        qpos0, qvel0, command = (_tiled(x[0], len(thetas)) for x in first_rows)
+        return replay(self.env.physics, qpos0, qvel0, command, thetas)  # type: ignore[attr-defined]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)  # compared by identity: static under jit
@@ -217,7 +218,7 @@ class Recorded:
         first = tuple(f"first {name}" for name in (*named.qpos, *speeds))
         return Seen(self.data["command"].shape[1], tuple(states), named.actuators, first)
 
-    def features(self, index: Array, qpos: Array, qvel: Array) -> Array:
+    def features(self, index: Array | np.ndarray, qpos: Array, qvel: Array) -> Array:
         """[N, D] of measured motion qpos [N, T+1, nq], qvel [N, T+1, nv] under the commands of the segments index [N].
 
         Both are deviations from the nominal replay of the segment, from its logged start.
@@ -270,7 +271,8 @@ class Recorded:
         """The segment asked for as number `first` replayed at thetas [n, d]: its motion, see `rollout.replay`."""
         del real
         index = jnp.full(len(thetas), self.order[first % len(self.order)])
-        return self._replayed(index, *self._of("qpos0", "qvel0", index=index), thetas)
+        qpos0, qvel0 = self._of("qpos0", "qvel0", index=index)
+        return self._replayed(index, qpos0, qvel0, thetas)
 
     def _of(self, *names: str, index: Array | np.ndarray) -> list[Array]:
         return [jnp.asarray(self.data[name])[index] for name in names]
@@ -280,7 +282,8 @@ class Recorded:
         physics = self.env.physics
         near = recording(physics, *self._of("around_qpos", "around_qvel", "around_command", index=index))
         law = None if self.law is None else jax.tree.map(lambda x: x[index], self.law)
-        return replay(physics, qpos0, qvel0, *self._of("command", index=index), thetas, near, law)
+        (command,) = self._of("command", index=index)
+        return replay(physics, qpos0, qvel0, command, thetas, near, law)
 
 
 Source = Surrogate | Recorded
