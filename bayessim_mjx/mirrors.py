@@ -164,7 +164,7 @@ def _of_actuators(model: mujoco.MjModel, qpos: SignedPermutation, qvel: SignedPe
                 f"{', '.join(names)}); allowed: partners of one kind, with gears, gains and ctrlrange that are mirror "
                 "images"
             )
-        k = min(able, key=lambda k, i=i: _difference(model, i, k, cosine[i, k]))
+        k = able[int(np.argmin([_difference(model, i, k, float(cosine[i, k])) for k in able]))]
         perm[i], perm[k] = k, i
         signs[i] = signs[k] = _command_sign(model, i, k, cosine[i, k])
     return perm, signs

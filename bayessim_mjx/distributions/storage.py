@@ -55,8 +55,8 @@ def disagreement(stored: dict[str, Any], own: dict[str, Any]) -> str:
 
 def _same(a: list, b: list) -> bool:
     """Whether two [prior, mean, sd] agree."""
-    numbers = [[np.nan if v is None else float(v) for v in prior[1:]] for prior in (a, b)]
-    return a[0] == b[0] and bool(np.allclose(*numbers, rtol=1e-5, equal_nan=True))
+    one, two = ([np.nan if v is None else float(v) for v in prior[1:]] for prior in (a, b))
+    return a[0] == b[0] and bool(np.allclose(one, two, rtol=1e-5, equal_nan=True))
 
 
 def _words(prior: list) -> str:
