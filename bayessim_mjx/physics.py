@@ -182,8 +182,12 @@ class Physics:
 
     def kinematics(self, world: World) -> mjx.Data:
         """`mjx.Data` with the poses and velocities of all bodies in this world's state; no contacts, no forces."""
-        model, data = self.model_of(world), self.data_of(world)
-        return mjx.com_vel(model, mjx.com_pos(model, mjx.kinematics(model, data)))
+        return _poses(self.model_of(world), self.data_of(world))
+
+
+@jax.jit  # a reset outside of any program would compile hundreds
+def _poses(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    return mjx.com_vel(model, mjx.com_pos(model, mjx.kinematics(model, data)))
 
 
 def _substeps(control_dt: float, timestep: float) -> int:

@@ -1,5 +1,7 @@
 """First and second start: a tiny run of the loop in fresh processes, with an empty compilation cache, then a full one.
 
+Seconds until the first iteration of training is reported, and to the end of the run.
+
 python benchmarks/startup.py --task Pendulum
 """
 
@@ -13,12 +15,18 @@ import time
 TINY = ["bayessim.realIters=1", "bayessim.trainTrajs=1000", "bayessim.realEvals=10", "ppo.max_iterations=1"]
 
 
-def start(task: str, scratch: str) -> float:
-    began = time.perf_counter()
+def start(task: str, scratch: str) -> tuple[float, float]:
+    """Seconds until training, seconds in all."""
+    began, training = time.perf_counter(), float("nan")
     command = [sys.executable, "-m", "bayessim_mjx.main", "--task", task, "--headless", "--logdir", f"{scratch}/logs"]
     cached = os.environ | {"BAYESSIM_MJX_CACHE": f"{scratch}/cache"}
-    subprocess.run([*command, *TINY], check=True, env=cached, stdout=subprocess.DEVNULL)
-    return time.perf_counter() - began
+    with subprocess.Popen([*command, *TINY], env=cached, stdout=subprocess.PIPE, text=True) as process:
+        for line in process.stdout:
+            if line.startswith("training 1/"):
+                training = time.perf_counter() - began
+    if process.returncode:
+        raise SystemExit(f"{' '.join(command)} ended with {process.returncode}")
+    return training, time.perf_counter() - began
 
 
 def main() -> None:
@@ -28,8 +36,9 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as scratch:
         first = start(args.task, scratch)
         second = [start(args.task, scratch) for _ in range(3)]
-    median = sorted(second)[1]
-    print(f"{args.task}: first start {first:.1f} s, second {median:.1f} s (median of 3), ratio {first / median:.2f}")
+    for what, one, later in zip(("training", "end"), first, zip(*second, strict=True), strict=True):
+        median = sorted(later)[1]
+        print(f"{args.task}, to {what}: first {one:.1f} s, second {median:.1f} s (of 3), ratio {one / median:.2f}")
 
 
 if __name__ == "__main__":

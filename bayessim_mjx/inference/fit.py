@@ -93,15 +93,21 @@ class _Data(NamedTuple):
     proposals: Distribution | None  # leaves [R, ...]
 
 
+@partial(jax.jit, static_argnums=(1, 2, 3))
+def _weights(key: Array, settings: InferenceSettings, dim_x: int, d: int) -> Any:
+    """Of the whole ensemble, `[M, ...]`."""
+    counts = jnp.asarray(mdn.counts(settings))
+    return jax.vmap(lambda k, count: mdn.init(k, settings, dim_x, d, count))(
+        jax.random.split(key, settings.ensemble), counts
+    )
+
+
 def init(key: Array, settings: InferenceSettings, space: Any, dim_x: int) -> FitState:
     """Fresh network for summaries of `dim_x` features and the parameters of `space`."""
     if dim_x < 1:
         raise UserError(f"dim_x = {dim_x}: a summary needs at least one feature")
     settings = settings.at(space)
-    member = partial(mdn.init, settings=settings, dim_x=dim_x, d=len(space))
-    params = jax.vmap(lambda k, count: member(k, count=count))(
-        jax.random.split(key, settings.ensemble), jnp.asarray(mdn.counts(settings))
-    )
+    params = _weights(key, settings, dim_x, len(space))
     known, fits = jnp.ones(len(space), bool), jnp.asarray(0, jnp.int32)
     basis = jnp.eye(dim_x) if bases.count(settings, dim_x) > 1 else None
     params["member"] = jnp.arange(settings.ensemble, dtype=jnp.int32)

@@ -60,8 +60,14 @@ def test_the_tilt_is_the_integral_over_the_cube():
         proposal = Distribution.from_unit(
             FLAT, [0.2, -0.1], means, scale * np.eye(2) * np.ones((2, 1, 1)), 0.1, coordinates
         )
-        got = mdn.log_tilt(mdn.forward(params, x, 2, settings), stack([proposal]), settings)
-        logits, m, s = (v[0] for v in mdn.mixture(params, x, 2, settings))
+
+        @jax.jit
+        def both(params, x, proposals, settings=settings):
+            tilt = mdn.log_tilt(mdn.forward(params, x, 2, settings), proposals, settings)
+            return tilt, mdn.mixture(params, x, 2, settings)
+
+        got, mixture = both(params, x, stack([proposal]))
+        logits, m, s = (v[0] for v in mixture)
         q = Distribution.from_unit(FLAT, logits, m, s, 0.0, coordinates)
         axis = -1 + 2 * (np.arange(400) + 0.5) / 400
         points = np.stack(np.meshgrid(axis, axis, indexing="ij"), -1).reshape(-1, 2).astype(np.float32)
@@ -78,7 +84,7 @@ def test_the_prior_as_proposal_needs_no_correction():
     def tilt(params):
         return mdn.log_tilt(mdn.forward(params, jnp.ones((1, 2)), 2, SETTINGS), prior, SETTINGS)[0]
 
-    value, gradient = jax.value_and_grad(tilt)(params)
+    value, gradient = jax.jit(jax.value_and_grad(tilt))(params)
     assert float(value) == pytest.approx(0.0, abs=1e-6)
     assert all(float(jnp.abs(leaf).max()) == 0.0 for leaf in jax.tree.leaves(gradient))
 
