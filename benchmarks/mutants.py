@@ -1,10 +1,11 @@
-"""31 one-line faults of a PPO library, put into ours one at a time: do the fast tests notice?
+"""One-line faults, put into the code one at a time: do the fast tests notice?
 
     python benchmarks/mutants.py [--only 6 7 ...] [--json FILE]
 
-The faults are those with which rsl_rl 5.4.2's own suite was tried (it notices 5), at the places where our code does the
-same. Each is an edit of one copy of the checkout; then the tests that can see it run until the first one fails. An edit
-that does not apply exactly once is an error, and so are tests that cannot run, or fail without any fault.
+The first 31 are those of a PPO with which rsl_rl 5.4.2's own suite was tried (it notices 5), at the places where our
+code does the same; the others (`mutant_faults.py`) are spread over all that is not PPO. Each is an edit of one copy of
+the checkout; then the tests that can see it run until the first one fails. An edit that does not apply exactly once is
+an error, and so are tests that cannot run, or fail without any fault.
 """
 
 import argparse
@@ -18,6 +19,8 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+
+from mutant_faults import FAULTS
 
 ROOT = Path(__file__).resolve().parents[1]
 COPIED = ("bayessim_mjx", "tasks", "cfg", "tests", "pyproject.toml")
@@ -44,7 +47,7 @@ class Mutant:
     peer: bool = False  # rsl_rl's suite notices its own
 
 
-MUTANTS = (
+PPO_MUTANTS = (
     Mutant(1, "lambda dropped from GAE", GAE, "decay = gamma * lam * (1", "decay = gamma * (1", (f"{T}gae.py",), True),
     Mutant(
         2, "value after a time limit not discounted", GAE, "reward + gamma * (1 - terminated)",
@@ -170,6 +173,7 @@ MUTANTS = (
         "(EVERYWHERE, SECOND, FIRST, EVERYWHERE)", (f"{T}devices.py", "-m", "ci", "-k", "curves"),
     ),
 )  # fmt: skip
+MUTANTS = (*PPO_MUTANTS, *(Mutant(n, *row) for n, row in enumerate(FAULTS, len(PPO_MUTANTS) + 1)))
 
 
 def mutated(text: str, mutant: Mutant) -> str:

@@ -10,8 +10,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
 mutants = pytest.importorskip("mutants")
 
 
-def test_there_are_the_thirty_one():
-    assert [m.number for m in mutants.MUTANTS] == list(range(1, 32))
+def test_there_are_the_thirty_one_of_ppo_and_as_many_others():
+    assert [m.number for m in mutants.MUTANTS] == list(range(1, len(mutants.MUTANTS) + 1))
+    assert len(mutants.PPO_MUTANTS) == 31 and len(mutants.FAULTS) >= 30
     assert sum(m.peer for m in mutants.MUTANTS) == 5
 
 

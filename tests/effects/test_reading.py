@@ -94,7 +94,7 @@ def test_an_effect_below_an_actor_counts_too():
         (delay(range=[1, 0]), r"delay\.range: \[1, 0\] is empty"),
         (delay(range=[-1, 1]), r"range begins at -1 s; allowed: from 0"),
         (delay(operation="scaling"), r"delay\.operation: 'scaling' is none of absolute"),
-        (delay(range=[0, 1], schedule="linear"), r"delay\.schedule = 'linear'"),
+        (delay(range=[0, 1], schedule="linear"), r"delay\.schedule_steps: a linear schedule needs"),
     ],
 )
 def test_refusals_of_the_group_name_the_key(section, words):
