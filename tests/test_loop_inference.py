@@ -11,6 +11,8 @@ import pytest
 from bayessim_mjx import collection, config, loop, round_inference
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 
+pytestmark = [pytest.mark.slow, pytest.mark.ci]  # whole diagnoses and fits
+
 SPACE = ParameterSpace([Parameter("mass", 0.0, -1.0, 1.0), Parameter("unseen", 0.0, -1.0, 1.0)])
 NORMAL = ParameterSpace(
     [Parameter(name, 0.0, -2.0, 2.0, prior="gaussian", mean=0.0, sd=0.5) for name in ("mass", "unseen")]

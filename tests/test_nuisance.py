@@ -111,6 +111,8 @@ def truth(qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
     return np.concatenate([np.cos(qpos), np.sin(qpos), qvel], -1)
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_observations_are_the_truth_with_white_and_lasting_noise_from_the_reset_on() -> None:
     trajectory, start = run()
     error = trajectory.observation - truth(trajectory.qpos, trajectory.qvel)  # [worlds, 7, 3]
@@ -174,6 +176,8 @@ def ramped(**more: Any) -> Any:
     return pendulum(3, actor_params=keys, **more)
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_training_draws_parameters_wider_and_wider() -> None:
     """theta = 1 + min(clock / 20, 1) (draw - 1)."""
     env = ramped()
@@ -217,6 +221,8 @@ def test_updates_carry_the_clock_on(wrapped: bool) -> None:
     assert jax.tree.all(jax.tree.map(lambda a, b: np.array_equal(a, b), state, resumed))
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 @pytest.mark.parametrize(("frequency", "draws"), [(1, [0, 4, 8, 12, 16, 20]), (8, [0, 8, 16]), (9, [0, 12])])
 def test_new_parameters_come_at_the_first_reset_after_so_many_steps(frequency: int, draws: list[int]) -> None:
     """Episodes of 4 steps; parameters, gravity and lasting noise change together, at these steps only."""

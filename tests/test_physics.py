@@ -44,6 +44,8 @@ def physics(integrator="Euler", space=None, contact=False, **kwargs):
     return Physics(model, 0.02, ParameterSpace() if space is None else space, **kwargs)
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 @pytest.mark.parametrize("integrator", ["Euler", "implicitfast"])
 def test_without_effects_it_is_mjx_step_repeated(integrator):
     """Ten control steps of four sub-steps, the ball in contact: to rounding (the two programs fuse differently)."""

@@ -133,6 +133,8 @@ def test_a_world_goes_through_the_whole_pool_before_repeating(worlds):
     assert len({k * stride % worlds for k in range(worlds)}) == worlds
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_replaying_the_commands_gives_the_motion_back():
     """A rollout of a task records what its motors were told: the same commands in the same worlds move it alike."""
     env = make("Pendulum")

@@ -102,6 +102,8 @@ def test_an_estimate_that_is_missing_is_refused():
         apply.effects_of(diagnosis([("coulom", "hinge", {"level": (1.0, 0.1)})]))
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_the_corrected_simulator_is_nominal_at_what_was_identified(robot, corrected):
     names = (MASS, "torque.actuator_delay.delay", "all.actuator_gain.gain", "hinge.coulomb_friction.level")
     assert corrected.space.names == names
@@ -156,6 +158,8 @@ def test_a_place_that_the_model_has_not_is_refused(robot):
         wrong.apply(robot.physics(robot.control_dt))
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_effects_yaml_simulates_like_apply(robot, corrected, tmp_path):
     FOUND.save(tmp_path)
     loaded = result.load(tmp_path)  # what a later command has

@@ -25,6 +25,8 @@ def errors(physics, logs, theta=None, **more):
     return Simulator(physics, cut, lanes=LIMIT).run(theta[None])[0, ..., :1]
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_without_effects_both_ways_agree(robot):
     logs = recorded(count=2, seconds=2.0)
     by_windows = errors(robot.physics(PERIOD, ()), logs)

@@ -7,6 +7,8 @@ from bayessim_mjx.diagnosis import disturbance as d
 
 from .missing_forces import fitted, record
 
+pytestmark = [pytest.mark.slow, pytest.mark.ci]  # whole diagnoses and fits
+
 
 @pytest.fixture(scope="module")
 def pushed():

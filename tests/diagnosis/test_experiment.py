@@ -17,6 +17,8 @@ from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Channels, Log
 from bayessim_mjx.logs.signals import estimate_velocity
 
+pytestmark = [pytest.mark.slow, pytest.mark.ci]  # whole diagnoses and fits
+
 DT, FINE, NOISE, DRAG = 0.02, 40, 4e-4, 0.004
 SPEED, RANGE, TORQUE = 12.0, 2.6, 4.0
 LIMITS = {"joints": {"hinge": {"range": [-RANGE, RANGE], "speed": SPEED}}}

@@ -7,6 +7,8 @@ from bayessim_mjx.diagnosis import flexible as f
 
 from .missing_forces import fitted, record
 
+pytestmark = [pytest.mark.slow, pytest.mark.ci]  # whole diagnoses and fits
+
 
 def hysteresis(t, data):
     """Friction that grows with the angle; not in the library."""

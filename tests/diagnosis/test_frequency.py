@@ -7,6 +7,8 @@ from bayessim_mjx.diagnosis import disturbance, frequency
 
 from .missing_forces import fitted, record
 
+pytestmark = [pytest.mark.slow, pytest.mark.ci]  # whole diagnoses and fits
+
 
 def coloured(rng, size, dt, top):
     """Noise with power up to `top` Hz."""

@@ -10,6 +10,8 @@ from bayessim_mjx.diagnosis import assemble, preliminary, result, run
 
 from .pendulums import FEW, nominal, recorded
 
+pytestmark = [pytest.mark.slow, pytest.mark.ci]  # whole diagnoses and fits
+
 WRONG = (1.15, 0.88, 1.1)
 KEYS = {"schema", "verdict", "effects", "where", "gap", "parameters", "candidates", "warnings"}
 KEYS |= {"next_experiment", "versions"}

@@ -8,6 +8,8 @@ from bayessim_mjx.diagnosis.models import scored
 
 from .pendulums import FEW, fitted, nominal, recorded
 
+pytestmark = [pytest.mark.slow, pytest.mark.ci]  # whole diagnoses and fits
+
 SCALE = (1.1, 1.05, 0.95)
 FRICTION = 0.03
 

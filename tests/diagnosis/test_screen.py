@@ -13,6 +13,8 @@ from bayessim_mjx.effects.speed_torque_limit import SpeedTorqueLimit
 
 from .pendulums import FEW, fitted, nominal, recorded, refit
 
+pytestmark = [pytest.mark.slow, pytest.mark.ci]  # whole diagnoses and fits
+
 SCALE = (1.1, 1.08, 0.95)
 TRUTHS: dict[str, dict[str, Any]] = {"coulomb_friction": {"friction": 0.03}, "actuator_delay": {"delay": 0.008}}
 

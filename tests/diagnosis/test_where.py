@@ -8,6 +8,8 @@ from bayessim_mjx.diagnosis.fingerprints import fingerprints
 
 from .missing_forces import fitted, record
 
+pytestmark = [pytest.mark.slow, pytest.mark.ci]  # whole diagnoses and fits
+
 
 def located(**case):
     fitter, job = fitted(record(**case))

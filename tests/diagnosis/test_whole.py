@@ -8,6 +8,8 @@ from bayessim_mjx.diagnosis import assemble, run, whole
 from . import pendulums
 from .pendulums import PERIOD, nominal, recorded
 
+pytestmark = [pytest.mark.slow, pytest.mark.ci]  # whole diagnoses and fits
+
 EFFECTS = ("coulomb_friction", "viscous_friction")
 
 

@@ -202,6 +202,8 @@ def test_recovers_what_mujoco_was_given(name, values, columns, real):
     np.testing.assert_allclose(found, wanted, atol=0.04 * np.abs(wanted).max())
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_two_places_are_two_single_effects():
     singles = [make(name, where=body) for name in ("payload", "external_force") for body in BODIES]
     load, push = [0.4, 0.05, -0.1, 0.02, 0.7, -0.03, 0.08, 0.1], [3.0, 0, 1.0, 0.2, 0, -2.0, 1.0, 0.1]

@@ -89,6 +89,8 @@ def test_compliance_is_that_of_the_edited_model():
     assert np.abs(real - plain(FALLING)).max() > 5e-3
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 @pytest.mark.parametrize(("columns", "wanted", "start"), [([0, 1], [1.7, 0.6], SLIDING), ([2, 3], [0.8, 0.5], None)])
 def test_recovers_what_mujoco_was_given(columns, wanted, start):
     name, quantity = (("contact_friction", "scale"), ("contact_compliance", "softness"))[columns[0] == 2]
@@ -105,6 +107,8 @@ def test_recovers_what_mujoco_was_given(columns, wanted, start):
     np.testing.assert_allclose(found, wanted, rtol=0.04)
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_two_places_are_two_single_effects_and_all_is_tied():
     singles = [make(name, where=g) for name in ("contact_friction", "contact_compliance") for g in GEOMS]
     (q,) = run([[1.5, 0.5, 0.4, -0.4]], FALLING, SLIDING)

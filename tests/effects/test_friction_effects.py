@@ -102,6 +102,8 @@ def test_neutral_changes_no_bit(arm):
         assert all(np.array_equal(one, two) for one, two in zip(bare, full, strict=True))
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_two_places_are_two_single_effects(arm):
     values = {f"{j}.{k}": v for j in "ab" for k, v in ACTIVE.items()} | {"b.viscous_friction.damping": 0.3}
     singles = bench(ARM, ("coulomb_friction", *NAMES), ["a", "b"])

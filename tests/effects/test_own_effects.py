@@ -29,6 +29,8 @@ def file(tmp_path, source):
     return tmp_path / "magnets.py"
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_a_file_is_loaded_simulated_and_named_by_its_name(file):
     spec = f"{file}:Magnets"
     kind = effects.load(spec)

@@ -34,6 +34,8 @@ def motion(env, theta):
     return jax.tree.map(np.asarray, replay(env.physics, *start, command, np.float32([theta])))
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_a_group_builds_its_effect(delayed):
     assert delayed.space.names == (*MODEL, DELAY)
     assert [type(e).__name__ for e in delayed.physics.effects] == ["ActuatorDelay"]

@@ -123,6 +123,8 @@ def test_neutral_leaves_every_number_of_the_model_and_the_motion():
     np.testing.assert_array_equal(moved(both, [[*theta, *NEUTRAL]], COMMAND), moved(alone, [theta], COMMAND))
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 @pytest.mark.parametrize(("frequency", "ratio"), [(5, 0.05), (12, 0.1), (30, 0.05)])
 def test_elasticity_is_a_spring_between_two_bodies(frequency, ratio):
     compliance, real = sprung(frequency, ratio, TORQUE, "Euler", COMMAND)
@@ -132,6 +134,8 @@ def test_elasticity_is_a_spring_between_two_bodies(frequency, ratio):
     assert np.abs(q - real).max() < 0.05 * effect + 1e-4
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_a_joints_limit_is_the_motors():
     """`actuatorfrcrange` of a joint cuts what the motor gets, as the actuator's own limit does at gear 1."""
     cut = model(SERVO).replace('<joint name="link"', '<joint name="link" actuatorfrcrange="-2 2"')

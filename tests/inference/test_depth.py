@@ -29,6 +29,8 @@ def truths(spread):
     return posteriors(1.0)[1][:, 0] + jnp.asarray(noise, jnp.float32)
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_levels_of_exact_posteriors_are_uniform():
     found = np.asarray(depth.levels(jax.random.PRNGKey(0), posteriors(1.0), truths(0.05), "plain"))
     # Kolmogorov-Smirnov: 1.63 / sqrt(n) is exceeded by chance in 1 %

@@ -18,7 +18,7 @@ from bayessim_mjx.parameters import Parameter, ParameterSpace
 EMBEDDING = Embedding(steps=12, state_size=2, action_size=1, features=4, width=8, window=3)
 
 
-pytestmark = pytest.mark.usefixtures("strict")
+pytestmark = [pytest.mark.usefixtures("strict"), pytest.mark.slow, pytest.mark.ci]
 
 
 def trajectories(count: int, steps: int = 12, seed: int = 0) -> tuple[jax.Array, jax.Array]:

@@ -7,6 +7,8 @@ from scipy.stats import chi2, kstest
 
 from bayessim_mjx.inference import emulator
 
+pytestmark = [pytest.mark.slow, pytest.mark.ci]  # whole diagnoses and fits
+
 NOISE, FEATURES = 0.1, 8
 SLOPE = np.random.default_rng(0).normal(size=(2, FEATURES))
 

@@ -95,6 +95,8 @@ def test_a_constant_column_is_dropped_and_cannot_speak_later(trained):
     np.testing.assert_array_equal(condition(state, x).means, condition(state, moved).means)
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_a_growing_data_set_does_not_retrace(monkeypatch):
     traces, density = [], mdn.density
     monkeypatch.setattr(mdn, "density", lambda *a: traces.append(1) or density(*a))
@@ -132,6 +134,8 @@ def test_diverged_simulations_are_left_out_and_counted():
         fit(key(1), state, thetas, np.full_like(x, np.nan))
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_fine_tuning_never_ends_worse_on_the_held_out_rows(trained):
     state, info = trained
     thetas, x = linear_gaussian(4000)
@@ -157,6 +161,8 @@ def test_each_member_has_the_sharpness_that_held_out_rows_ask_for():
     np.testing.assert_allclose(np.exp(found["share"]), 0.5, atol=0.12)
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_one_parameter_and_few_rows():
     space = ParameterSpace([Parameter("friction", 0.1, 0.01, 1.0, prior="loguniform")])
     rng = np.random.default_rng(0)

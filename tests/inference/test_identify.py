@@ -23,6 +23,8 @@ def fitted():
     return inference.fit(jax.random.PRNGKey(2), inference.init(jax.random.PRNGKey(3), settings, SPACE, 1), thetas, x)
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_the_held_out_gain_tells_them_apart(fitted):
     state, info = fitted
     np.testing.assert_array_equal(np.asarray(state.identified), [True, False])
@@ -35,6 +37,8 @@ def test_the_held_out_gain_tells_them_apart(fitted):
     assert float(info.parameter_gain[1]) < 0.005
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_the_product_of_many_leaves_the_unseen_one_flat(fitted):
     state, _ = fitted
     x = 0.3 + 0.2 * jax.random.normal(jax.random.PRNGKey(4), (20, 1))

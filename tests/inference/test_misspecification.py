@@ -13,6 +13,8 @@ from bayessim_mjx.inference.misspecification import Scores, ranked
 from bayessim_mjx.inference.walls import piles
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 
+pytestmark = [pytest.mark.slow, pytest.mark.ci]  # whole diagnoses and fits
+
 SPACE = ParameterSpace([Parameter("rate", 1.0, 0.5, 2.0), Parameter("size", 1.0, 0.2, 2.0)])
 TIME = jnp.linspace(0.0, 3.0, 30)
 

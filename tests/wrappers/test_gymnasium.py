@@ -31,6 +31,8 @@ def test_gymnasium_knows_our_tasks_by_name(order):
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_gymnasiums_maker_and_checker_accept_a_task():
     env = gymnasium.make(NAME, episodeLength=3)
     assert env.spec.id == NAME and env.unwrapped.env.episode_length == 3
@@ -39,6 +41,8 @@ def test_gymnasiums_maker_and_checker_accept_a_task():
         check_env(env.unwrapped)
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_a_picture_of_the_present_state():
     env = gymnasium.make(NAME, render_mode="rgb_array", theta=[1.2, 1.2])
     assert env.metadata["render_modes"] == ["rgb_array"] and env.metadata["render_fps"] == 20  # dt 0.05 s
@@ -53,6 +57,8 @@ def test_a_picture_of_the_present_state():
     assert [p.shape for p in many.render()] == [(360, 480, 3)] * 2
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_many_worlds_by_gymnasiums_maker_under_gymnasiums_wrappers():
     env = gymnasium.make_vec(NAME, num_envs=3, episodeLength=4)
     assert env.spec.id == NAME and env.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
