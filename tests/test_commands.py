@@ -435,6 +435,8 @@ def test_play_draws_from_the_posterior_in_the_coordinates_that_it_was_saved_in(t
     np.testing.assert_allclose(drawn.mean(0), [1.5, 1.9], atol=0.01)
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_play_prints_returns_of_latest_best_run_and_path(toy: None, capsys: pytest.CaptureFixture) -> None:
     assert train.main(["--task", "Pendulum", *SMALL]) == 0
     run = latest_run("logs", "Pendulum")

@@ -14,6 +14,8 @@ from bayessim_mjx.diagnosis.quadratic import eliminate
 from bayessim_mjx.diagnosis.substeps import Errors
 from bayessim_mjx.logs import Channels, Log, estimate_velocity
 
+pytestmark = [pytest.mark.slow, pytest.mark.ci]  # whole diagnoses and fits
+
 STEP, PERIOD, NOISE = 0.005, 0.01, 3e-4  # s, s, rad
 MASS = """<mujoco><option timestep=".005" gravity="0 0 0"/><worldbody><body><joint name="rail" type="slide"/>
 <geom size=".1" mass="2" contype="0" conaffinity="0"/></body></worldbody>

@@ -10,6 +10,8 @@ from bayessim_mjx.diagnosis.uncertainty import deviations
 
 from .pendulums import NAMES, fitted, nominal, recorded
 
+pytestmark = [pytest.mark.slow, pytest.mark.ci]  # whole diagnoses and fits
+
 SCALE = (1.12, 0.9, 1.07)
 FRICTION = 0.04
 

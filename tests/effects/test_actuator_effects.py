@@ -211,6 +211,8 @@ def test_neutral_changes_no_bit_beside_one_other(name):
     assert np.array_equal(*seen)
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_two_places_are_two_effects():
     p = physics("one by one")
     apart = motion(p, [theta(p, name, v) for name, v in TRUE.items()])

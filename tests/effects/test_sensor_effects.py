@@ -89,6 +89,8 @@ def test_neutral_changes_no_bit(full):
             assert np.array_equal(one, two)
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_two_places_are_two_single_effects(full):
     values = dict(joint_offset=("offset", 0.05), sensor_gain=("gain", 0.9))
     values |= dict(sensor_filter=("time_constant", 0.03), sensor_delay=("delay", 0.035))

@@ -145,6 +145,8 @@ def test_a_joints_limit_is_the_motors():
     assert np.abs(own[:2] - own[2]).max(axis=1).min() > 0.02
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 @pytest.mark.parametrize(("actuator", "integrator"), [(SERVO, "implicitfast"), (LIMITED, "Euler"), (SERVO, "RK4")])
 def test_position_servos_feel_the_motor(actuator, integrator):
     """Stiffness, damping and limit of the force act where the encoder is; with RK4 to first order in the step too."""
@@ -198,6 +200,8 @@ def chain(dt, springs=None):
     return CHAIN.format(dt=dt, a=0, b=0, motors=motors, springs=between, at="motor")
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_two_places_against_mujoco_and_against_two_single_effects():
     """Both joints are solved together in the one case, one after the other in the other: not bit for bit."""
     command = np.concatenate([2 * COMMAND, -COMMAND], axis=1)

@@ -12,6 +12,8 @@ from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.inference import calibration
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 
+pytestmark = [pytest.mark.slow, pytest.mark.ci]  # whole diagnoses and fits
+
 SPACE = ParameterSpace([Parameter("a", 0.0, -1.0, 1.0), Parameter("b", 5.0, 0.0, 10.0)])
 MIXING = np.array([[1.0, 0.4], [0.0, 1.0]])
 COV = 0.15**2 * np.linalg.inv(MIXING.T @ MIXING)  # of u given x = MIXING u + N(0, 0.15^2 I), in unit coordinates
