@@ -11,8 +11,6 @@ import pytest
 from bayessim_mjx import collection, config, loop, round_inference
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 
-pytestmark = [pytest.mark.slow, pytest.mark.ci]  # whole diagnoses and fits
-
 SPACE = ParameterSpace([Parameter("mass", 0.0, -1.0, 1.0), Parameter("unseen", 0.0, -1.0, 1.0)])
 NORMAL = ParameterSpace(
     [Parameter(name, 0.0, -2.0, 2.0, prior="gaussian", mean=0.0, sd=0.5) for name in ("mass", "unseen")]
@@ -101,6 +99,8 @@ def test_two_rounds_give_the_analytic_posterior_and_a_restorable_state(coordinat
         assert float(again.proposal.contraction()[0]) > 0.5 > float(start.proposal.contraction()[0])
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_coordinates_of_the_loop_are_probit_where_every_prior_is_gaussian():
     parts, state = made(space=NORMAL)
     assert parts.settings.coordinates == "auto"
@@ -115,6 +115,8 @@ def usual():
     return infer(*made(*TESTED))
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_nothing_is_said_where_nothing_is_wrong_but_what_is_not_identified(usual):
     state, info = usual
     assert info.checks.prior_share == 0.0 and float(state.temperature) == 1.0
@@ -123,6 +125,8 @@ def test_nothing_is_said_where_nothing_is_wrong_but_what_is_not_identified(usual
     np.testing.assert_array_equal(state.domain.prior_weight, info.posterior.prior_weight)
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_reality_unlike_simulation_is_told_by_name_and_part_of_the_randomisation_is_the_prior():
     state, info = infer(*made(*TESTED, "bayessim.distrust=0.4", offset=8.0))
     (told,) = [text for text in info.warnings if "unlike anything simulated" in text]
@@ -134,12 +138,16 @@ def test_reality_unlike_simulation_is_told_by_name_and_part_of_the_randomisation
     np.testing.assert_allclose(np.exp(np.asarray(state.domain.log_gain(at))), mixed, rtol=1e-3)
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_a_truth_beyond_the_range_is_told_with_parameter_and_side():
     _, info = infer(*made(*TESTED, mass=1.15))
     (told,) = [text for text in info.warnings if "end of its range" in text]
     assert told.startswith("mass:") and "upper end" in told and "raise its limit 1" in told
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_an_over_confident_network_gets_a_temperature_which_is_told_kept_and_used(usual):
     parts, start = made(*TESTED, quiet=0.5)
     state, info = infer(parts, start)
