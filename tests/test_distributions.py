@@ -132,7 +132,7 @@ def test_a_batch_of_distributions_maps_and_splits():
 
 def test_the_prior_contracts_nothing_and_a_spike_everything():
     space = ParameterSpace([MASS, FRICTION])
-    np.testing.assert_allclose(Uniform(space, 4).contraction(), 0.0, atol=1e-4)
+    np.testing.assert_allclose(Uniform(space, 4).contraction(), 0.0, atol=4e-5)  # 1.8e-5 on a GPU
     np.testing.assert_allclose(Gaussian(space, [1.0, 0.1], 1e-4).contraction(), 1.0, atol=1e-4)
     table = Gaussian(space, {"mass": 1.25, "friction": 0.2}, [0.05, 0.01]).describe()
     assert table["mass"]["mean"] == pytest.approx(1.25, abs=1e-3) and table["mass"]["sd"] == pytest.approx(

@@ -72,8 +72,8 @@ def test_chen_identity_and_the_reverse_path_is_the_inverse():
     parts = sig.product(scan(increments[:7]), tree(increments[7:]))
     back = sig.product(whole, scan(-increments[::-1]))
     for a, b, nothing in zip(whole, parts, back, strict=True):
-        np.testing.assert_allclose(a, b, atol=1e-5)  # float32, in whatever order the compiler adds
-        np.testing.assert_allclose(nothing, 0 * nothing, atol=1e-5)
+        np.testing.assert_allclose(a, b, atol=4e-6)  # float32, in whatever order the compiler adds
+        np.testing.assert_allclose(nothing, 0 * nothing, atol=4e-6)
 
 
 def test_resampling_and_pauses_change_nothing():
