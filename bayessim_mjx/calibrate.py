@@ -12,10 +12,10 @@ from typing import Any
 
 from bayessim_mjx import cli
 from bayessim_mjx.config import Config
+from bayessim_mjx.config.settings import COUNT, SEEDS
 from bayessim_mjx.device import setup_jax
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.quantities import estimate, fixed
-from bayessim_mjx.settings import COUNT, SEEDS
 
 FOLDER = "calibration"
 ADVICE = {
@@ -115,9 +115,9 @@ def verdict_lines(found: Any) -> list[str]:
 
 def write(folder: Path, found: Any, round_: int) -> Path:
     """report.json, and the picture as PNG and in TensorBoard at step `round_`, in place of an earlier one."""
-    from bayessim_mjx.checkpoints import write_text
     from bayessim_mjx.monitor import trust
     from bayessim_mjx.monitor.writer import Writer
+    from bayessim_mjx.runs.checkpoints import write_text
 
     folder.mkdir(exist_ok=True)
     write_text(folder / "report.json", json.dumps({"round": round_, **found.to_dict()}, indent=1) + "\n")

@@ -221,8 +221,7 @@ def list_tasks() -> int:
 
 def find_checkpoint(which: str, task: str | None, logdir: str) -> tuple[Path, "Run | None"]:
     """(checkpoint folder, its run) for "latest", "best" (of the task's newest run) or a run's or checkpoint's path."""
-    from bayessim_mjx import checkpoints
-    from bayessim_mjx.runs import MANIFEST, Run, latest_run
+    from bayessim_mjx.runs import MANIFEST, Run, checkpoints, latest_run
 
     if which in ("latest", "best"):
         if not task:
@@ -252,7 +251,8 @@ def load_policy(path: Path, env: Any, config: Config) -> Any:
     """The policy in a checkpoint folder; its networks have to be those of `config`."""
     import jax
 
-    from bayessim_mjx import checkpoints, rl
+    from bayessim_mjx import rl
+    from bayessim_mjx.runs import checkpoints
 
     make = lambda key: rl.policy_of(rl.init(env, config.ppo, key))  # noqa: E731
     return checkpoints.restore(path, {"policy": jax.eval_shape(make, jax.random.PRNGKey(0))})[0]["policy"]

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from bayessim_mjx.config.settings import Config
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.settings import Config
 
 WORLDS = "worlds"  # the only axis of a mesh of devices
 CACHE_VARIABLE = "BAYESSIM_MJX_CACHE"

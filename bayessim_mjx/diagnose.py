@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Any
 
 from bayessim_mjx import cli
 from bayessim_mjx.config import Config
+from bayessim_mjx.config.settings import SEEDS
 from bayessim_mjx.device import setup_jax
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.settings import SEEDS
 
 if TYPE_CHECKING:
+    from bayessim_mjx.diagnosis.fitting.robot import Robot
     from bayessim_mjx.diagnosis.result import Diagnosis
-    from bayessim_mjx.diagnosis.robot import Robot
 
 
 PRELIMINARY = "preliminary.json"  # what is known while the race goes on
@@ -74,7 +74,7 @@ def _checked(args: argparse.Namespace) -> None:
 
 
 def _robot(args: argparse.Namespace) -> "Robot":
-    from bayessim_mjx.diagnosis import robot
+    from bayessim_mjx.diagnosis.fitting import robot
 
     if args.model is not None:
         return robot.of_file(args.model, args.parameters)
@@ -88,7 +88,9 @@ def _robot(args: argparse.Namespace) -> "Robot":
 
 def _diagnosis(args: argparse.Namespace, robot: "Robot", notes: list[str], say: Any) -> "Diagnosis":
     """The result; too little data is a verdict, not an error."""
-    from bayessim_mjx.diagnosis import assemble, preliminary, run
+    from bayessim_mjx.diagnosis import run
+    from bayessim_mjx.diagnosis.setup import TooLittleData
+    from bayessim_mjx.diagnosis.summary import assemble, preliminary
     from bayessim_mjx.logs import read_logs
 
     with warnings.catch_warnings(record=True) as caught:
@@ -106,7 +108,7 @@ def _diagnosis(args: argparse.Namespace, robot: "Robot", notes: list[str], say: 
     try:
         asked = {"group": args.group, "seed": args.seed, "tolerated": args.tolerance}
         found = run.diagnose(robot, logs, names, **asked, progress=say, keep=keep)
-    except run.TooLittleData as reason:
+    except TooLittleData as reason:
         return replace(assemble.insufficient(str(reason), notes), about=about)
     found.setup.warnings[:0] = notes
     conditions = len(found.setup.fitter.simulator.windows.groups)
@@ -151,13 +153,13 @@ def _diagnose(argv: Sequence[str] | None) -> int:
 
 
 def _write(result: "Diagnosis", robot: "Robot", folder: Path, report: Any) -> "Diagnosis":
-    from bayessim_mjx.diagnosis import apply
+    from bayessim_mjx.diagnosis import correction
     from bayessim_mjx.diagnosis.result import load
 
     result.save(folder)  # before anything that could fail: nothing computed is lost
     result = load(folder)
     if result.verdict != "insufficient_data":
-        result.warnings.extend(apply.write_outputs(result, robot, folder))
+        result.warnings.extend(correction.write_outputs(result, robot, folder))
         result.save(folder)
     report.write(result, folder)
     report.tensorboard(result, folder)

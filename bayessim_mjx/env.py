@@ -15,16 +15,16 @@ import mujoco
 from flax import struct
 
 from bayessim_mjx import compat
+from bayessim_mjx.config.settings import IMPLEMENTATIONS
 from bayessim_mjx.effects.effect import Effect
-from bayessim_mjx.effects.reading import stack
-from bayessim_mjx.effects.storage import corrected
+from bayessim_mjx.effects.support.reading import stack
+from bayessim_mjx.effects.support.storage import corrected
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.mirrors import Mirror, MirrorMap, resolve
-from bayessim_mjx.nuisance import Course, Drawn, Nuisance
-from bayessim_mjx.nuisance import read as read_nuisance
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 from bayessim_mjx.physics import Physics, World, control_step, mjx
-from bayessim_mjx.settings import IMPLEMENTATIONS
+from bayessim_mjx.physics.nuisance import Course, Drawn, Nuisance
+from bayessim_mjx.physics.nuisance import read as read_nuisance
 
 compat.supply()  # our environments are Brax's too: so that Brax's own trainers can run
 

@@ -98,15 +98,16 @@ def _gap_loop(argv: Sequence[str] | None) -> int:
 
 def _run(args: argparse.Namespace, config: Config, console: Any) -> int:
     device = setup_jax(config)
-    from bayessim_mjx import gap_study, gap_words
+    from bayessim_mjx.closed_loop import words
+    from bayessim_mjx.closed_loop.study import make
 
     begun = time.perf_counter()
-    study = gap_study.make(args, config)
+    study = make(args, config)
     console.start(study.opening() | {"device": str(device)})
     result = study.run(console)
     result["seconds"] = round(time.perf_counter() - begun, 1)
     path = study.write(result)
-    gap_words.show(result, console)
+    words.show(result, console)
     console.say(f"results in {path}")
     console.command("curves", f"tensorboard --logdir {study.out}")
     return 0

@@ -14,10 +14,10 @@ from typing import Any
 
 from bayessim_mjx import cli
 from bayessim_mjx.config import Config, freeze, replace
+from bayessim_mjx.config.settings import COUNT
 from bayessim_mjx.device import setup_jax
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.quantities import estimate
-from bayessim_mjx.settings import COUNT
 
 DESCRIPTION = "Evaluate, film or export a saved policy."
 KINDS = {
@@ -67,10 +67,10 @@ def _physics(config: Config, env: Any, checkpoint: Path, key: Any, count: int) -
     """theta [count, d] of every kind of physics that there is."""
     import jax.numpy as jnp
 
-    from bayessim_mjx import checkpoints
-    from bayessim_mjx.collection import make_source
     from bayessim_mjx.distributions import Distribution
-    from bayessim_mjx.loop_state import chart_of
+    from bayessim_mjx.loop.sources import make_source
+    from bayessim_mjx.loop.state import chart_of
+    from bayessim_mjx.runs import checkpoints
 
     kinds = {"nominal": jnp.tile(jnp.asarray(env.space.nominal, jnp.float32), (count, 1))}
     if not len(env.space):

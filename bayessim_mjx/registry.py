@@ -6,14 +6,14 @@ import warnings
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from bayessim_mjx.effects import reading, storage
+from bayessim_mjx.effects.support import reading, storage
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.task_names import names
 
 if TYPE_CHECKING:
+    from bayessim_mjx.config.settings import Config
     from bayessim_mjx.effects.effect import Effect
     from bayessim_mjx.env import Env
-    from bayessim_mjx.settings import Config
 
 __all__ = ["EXTERNAL", "make", "names"]
 

@@ -14,9 +14,9 @@ import jax.numpy as jnp
 from flax import struct
 from jax.interpreters import partial_eval
 
-from bayessim_mjx.effects.site import AROUND, Motion
-from bayessim_mjx.laws import Law
+from bayessim_mjx.effects.support.site import AROUND, Motion
 from bayessim_mjx.physics import Drive, Physics, begin, control_step
+from bayessim_mjx.physics.controllers import Law
 
 if TYPE_CHECKING:
     from bayessim_mjx.env import Env, State

@@ -20,9 +20,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from bayessim_mjx import checkpoints, cli, gap_study, rl
+from bayessim_mjx import cli, rl
+from bayessim_mjx.closed_loop import study
 from bayessim_mjx.diagnosis.result import load as load_diagnosis
 from bayessim_mjx.logs.log import Channels
+from bayessim_mjx.runs import checkpoints
 
 MASS = {"kind": "body", "attribute": "mass", "mean": 1.1, "sd": 0.01, "low": 0.5, "high": 1.5}
 HIDDEN = {
@@ -62,10 +64,10 @@ def truth(folder: Path, task: str) -> Path:
 
 def record(config, surrogate: Path, folder: Path, iterations: int) -> int:
     """Logs of the plain simulator's policy on the surrogate, as random as in training; how many."""
-    plain = gap_study.nominal_task(config)
+    plain = study.nominal_task(config)
     state = rl.init(plain, config.ppo, jax.random.PRNGKey(config.seed))
     state, _ = rl.run(plain, config.ppo, state, None, iterations=iterations)
-    policy, real = rl.policy_of(state), gap_study.surrogate(config, surrogate, timestep=STEP[config.task])
+    policy, real = rl.policy_of(state), study.surrogate(config, surrogate, timestep=STEP[config.task])
     thetas = jnp.tile(jnp.asarray(real.space.nominal, jnp.float32), (RUNS, 1))
 
     def play(key: jax.Array, theta: jax.Array) -> tuple:

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 from diagnosis_families import FAMILIES
 
-from bayessim_mjx.diagnosis import gap, uncertainty
-from bayessim_mjx.diagnosis.candidates import Candidate
-from bayessim_mjx.diagnosis.models import Model
-from bayessim_mjx.diagnosis.quadratic import TRUST, solve
-from bayessim_mjx.diagnosis.race import Race, fit_models, start_of
-from bayessim_mjx.diagnosis.run import Findings
+from bayessim_mjx.diagnosis.findings import Findings
+from bayessim_mjx.diagnosis.fitting.candidates import Candidate
+from bayessim_mjx.diagnosis.fitting.quadratic import TRUST, solve
+from bayessim_mjx.diagnosis.selection import heldout, uncertainty
+from bayessim_mjx.diagnosis.selection.models import Model
+from bayessim_mjx.diagnosis.selection.race import Race, fit_models, start_of
 
 TESTED = 0.3  # share of the operating conditions in the one test set of the single fold
 # what the flexible force depends on most -> the effect that a reader would name; not here: nothing that can be named
@@ -56,9 +56,9 @@ def closure(found: Findings, model: Model) -> float:
     """Share of the calibrated gap that a model closes on held-out conditions, as in diagnosis.json."""
     fitter = found.setup.fitter
     cut = fitter.simulator.windows
-    after = gap.predict(fitter, model).cost(cut.steps)
+    after = heldout.predict(fitter, model).cost(cut.steps)
     before = found.predictions["calibrated"].cost(cut.steps)
-    return gap.Closed(before, after, cut.group).value
+    return heldout.Closed(before, after, cut.group).value
 
 
 def told(found: Findings, model: Model) -> Said:

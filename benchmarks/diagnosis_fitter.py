@@ -6,12 +6,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from bayessim_mjx.diagnosis import race, run, search
-from bayessim_mjx.diagnosis.candidates import Candidate
-from bayessim_mjx.diagnosis.fit import Fitter
-from bayessim_mjx.diagnosis.models import scored
-from bayessim_mjx.diagnosis.robot import of_file
-from bayessim_mjx.diagnosis.screen import screen
+from bayessim_mjx.diagnosis.fitting.candidates import Candidate
+from bayessim_mjx.diagnosis.fitting.fitter import Fitter
+from bayessim_mjx.diagnosis.fitting.robot import of_file
+from bayessim_mjx.diagnosis.selection import race, search
+from bayessim_mjx.diagnosis.selection.models import scored
+from bayessim_mjx.diagnosis.selection.screen import screen
+from bayessim_mjx.diagnosis.setup import Setup
+from bayessim_mjx.diagnosis.setup import prepare as prepared
 from bayessim_mjx.logs import read_logs
 
 
@@ -22,13 +24,13 @@ def timed(work: Callable[[], Any]) -> tuple[float, Any]:
     return time.process_time() - started, result
 
 
-def prepare(folder: Path, effects: Any, without: str | None) -> tuple[float, float, run.Setup]:
+def prepare(folder: Path, effects: Any, without: str | None) -> tuple[float, float, Setup]:
     """(s to read and cut the logs, s to compile, setup); `without`: an operating condition left out."""
 
-    def read() -> run.Setup:
+    def read() -> Setup:
         robot = of_file(folder / "model.xml")
         logs = read_logs(folder / "logs", robot.mj_model)
-        return run.prepare(robot, [log for log in logs if log.metadata["condition"] != without], effects)
+        return prepared(robot, [log for log in logs if log.metadata["condition"] != without], effects)
 
     reading, setup = timed(read)
     first, _ = timed(lambda: setup.fitter.simulator.run(setup.fitter.theta[None]))

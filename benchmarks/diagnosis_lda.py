@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from bayessim_mjx.diagnosis.candidates import Candidate
+from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 
 SIMULATED = 1500  # in all, shared by the candidates
 FEW, MANY = 6, 32  # simulations of one candidate

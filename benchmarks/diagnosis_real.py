@@ -21,11 +21,13 @@ from scipy.optimize import least_squares
 from scipy.signal import butter, filtfilt
 
 from bayessim_mjx import diagnose
-from bayessim_mjx.diagnosis import gate, result, windows
+from bayessim_mjx.diagnosis import result
+from bayessim_mjx.diagnosis.fitting import windows
+from bayessim_mjx.diagnosis.fitting.robot import of_file
+from bayessim_mjx.diagnosis.fitting.simulator import Simulator
+from bayessim_mjx.diagnosis.logcheck import gate
 from bayessim_mjx.diagnosis.result import Diagnosis
-from bayessim_mjx.diagnosis.robot import of_file
-from bayessim_mjx.diagnosis.run import control_period
-from bayessim_mjx.diagnosis.simulate import Simulator
+from bayessim_mjx.diagnosis.setup import control_period
 from bayessim_mjx.effects import load
 from bayessim_mjx.logs import read_logs
 from bayessim_mjx.logs.log import Log

@@ -24,6 +24,7 @@ def diagnose(arguments: list[str]) -> tuple[int, dict[str, float], Any]:
 
     from bayessim_mjx import diagnose as command
     from bayessim_mjx.diagnosis import run
+    from bayessim_mjx.diagnosis.findings import Findings
 
     compiling: list[tuple[float, float]] = []
     kept = []
@@ -33,7 +34,7 @@ def diagnose(arguments: list[str]) -> tuple[int, dict[str, float], Any]:
         if event.startswith(COMPILING):
             compiling.append((time.perf_counter() - seconds, time.perf_counter()))
 
-    def keep(*args: Any, **options: Any) -> run.Findings:
+    def keep(*args: Any, **options: Any) -> Findings:
         kept.append(original(*args, **options))
         return kept[0]
 
@@ -47,7 +48,7 @@ def diagnose(arguments: list[str]) -> tuple[int, dict[str, float], Any]:
 def without_pictures() -> None:
     """Only the verdict and its numbers: no maps, proposal, report and curves, which no score is made of."""
     from bayessim_mjx import report
-    from bayessim_mjx.diagnosis import assemble
+    from bayessim_mjx.diagnosis.summary import assemble
 
     assemble.with_more = lambda result, found, folder, say: result
     report.write = lambda result, folder: None

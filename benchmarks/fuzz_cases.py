@@ -211,7 +211,7 @@ def _npz(rng: np.random.Generator, folder: Path) -> str:
 
 
 def _read(folder: Path, log_map: Any) -> None:
-    from bayessim_mjx.diagnosis import gate
+    from bayessim_mjx.diagnosis.logcheck import gate
     from bayessim_mjx.logs import noise, read_logs, segments
 
     found = read_logs(folder, arm(), log_map)
@@ -250,7 +250,7 @@ def yamls(rng: np.random.Generator, folder: Path) -> Case:
         return what, lambda: _settings(config.load("Pendulum", cfg_train=folder / "x.yaml"))
     what = file_changed(rng, folder / "x.yaml", PARAMS if kind == "params" else EFFECTS)
     if kind == "params":
-        from bayessim_mjx.diagnosis import robot
+        from bayessim_mjx.diagnosis.fitting import robot
 
         return f"params: {what}", lambda: _box(robot.read_params(folder / "x.yaml", arm()))
     return f"effects: {what}", lambda: _effects(folder / "x.yaml")
@@ -274,7 +274,7 @@ def _box(space: Any) -> None:
 
 def _effects(path: Path) -> None:
     from bayessim_mjx import registry
-    from bayessim_mjx.effects import storage
+    from bayessim_mjx.effects.support import storage
 
     found = storage.read(path)
     _box(registry.make("Pendulum", effects=found.effects).space)
@@ -368,7 +368,7 @@ def models(rng: np.random.Generator, folder: Path) -> Case:
     def call() -> None:
         import mujoco
 
-        from bayessim_mjx.diagnosis import robot
+        from bayessim_mjx.diagnosis.fitting import robot
 
         body = robot.of_file(folder / "arm.xml")
         fitted = robot.with_timestep(body.mj_model, 0.01)

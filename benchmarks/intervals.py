@@ -14,8 +14,9 @@ import argparse
 import mujoco
 import numpy as np
 
-from bayessim_mjx import gap_measures
-from bayessim_mjx.diagnosis import clusters, gap
+from bayessim_mjx.closed_loop import measures
+from bayessim_mjx.diagnosis import statistics
+from bayessim_mjx.diagnosis.selection import heldout
 
 COUNTS = (2, 3, 4, 5, 8)
 SIGMA, PERIOD, STEPS, WINDOWS = 4e-4, 0.02, 25, 6  # rad, s, control steps of a window, windows of a condition
@@ -136,7 +137,7 @@ def shares(repeats: int, seed: int) -> None:
                 few = np.arange(WINDOWS) < rng.integers(3, WINDOWS + 1, size=(g, 1))  # logs of different lengths
                 group = np.repeat(np.arange(g), few.sum(1))
                 b, a = before[own][few], after[own][few]
-                ends = gap.Closed(b, a, group).interval(), old(b, a, group, rng)
+                ends = heldout.Closed(b, a, group).interval(), old(b, a, group, rng)
                 hits.append([low <= truth <= high for low, high in ends])
             new, was = np.mean(hits, axis=0)
             row.append(f"{new:>6.2f} ({was:.2f})")
@@ -161,7 +162,7 @@ def recovered(repeats: int, seed: int) -> None:
             for _ in range(repeats):
                 episodes = rng.normal(size=16)
                 real = {r: m + kind(rng, (k, 1)) + episodes + 0.5 * rng.normal(size=(k, 16)) for r, m in means.items()}
-                ends = gap_measures.recovery(real)["corrected"]["ci"]
+                ends = measures.recovery(real)["corrected"]["ci"]
                 hits += [] if ends is None else [ends[0] <= 0.8 <= ends[1]]
             row.append(f"{np.mean(hits):>6.2f}")
         print(f"{name:14}", *row)
@@ -175,7 +176,7 @@ def false_alarms(repeats: int, seed: int) -> None:
         for g in COUNTS:
             group = np.repeat(np.arange(g), WINDOWS)
             x = [kind(rng, g)[group] + kind(rng, len(group)) for _ in range(repeats)]
-            row.append(f"{100 * np.mean([clusters.normal_deviate(v, group) > 2.0 for v in x]):>5.1f} %")
+            row.append(f"{100 * np.mean([statistics.normal_deviate(v, group) > 2.0 for v in x]):>5.1f} %")
         print(f"{name:14}", *row)
 
 

@@ -6,16 +6,16 @@ file exactly once; `tests` are arguments of pytest for tests of the default suit
 
 P = "bayessim_mjx"
 TIMESTEP, PHYSICS, ROLLOUT, RUNS, LOOP = (
-    f"{P}/{name}.py" for name in ("timestep", "physics", "rollout", "runs", "loop")
+    f"{P}/{name}.py" for name in ("physics/timestep", "physics/step", "rollout", "runs/folder", "loop/outer_loop")
 )
 EFFECTS, DISTRIBUTIONS, LOGS = f"{P}/effects", f"{P}/distributions", f"{P}/logs"
 FORCES = "tests/effects/test_actuator_forces.py"
 SENSORS = "tests/effects/test_sensor_effects.py"
-RECORDED = "tests/test_recorded.py"
+RECORDED = "tests/loop/test_recorded.py"
 ALGEBRA = "tests/test_algebra.py"
-MANIFEST = "tests/test_runs.py"
+MANIFEST = "tests/runs/test_runs.py"
 LOG = "tests/test_logs.py"
-SEARCH = "tests/diagnosis/test_search.py"
+SEARCH = "tests/diagnosis/selection/test_search.py"
 
 FAULTS: tuple[tuple[str, str, str, str, tuple[str, ...]], ...] = (
     # physics
@@ -35,11 +35,12 @@ FAULTS: tuple[tuple[str, str, str, str, tuple[str, ...]], ...] = (
     (
         "velocities are clipped to half the limit", TIMESTEP,
         "jnp.clip(data.qvel, -physics.max_qvel, physics.max_qvel)",
-        "jnp.clip(data.qvel, -physics.max_qvel / 2, physics.max_qvel)", ("tests/test_physics.py", "-k", "clipped"),
+        "jnp.clip(data.qvel, -physics.max_qvel / 2, physics.max_qvel)",
+        ("tests/physics/test_physics.py", "-k", "clipped"),
     ),
     # effects
     (
-        "dry friction pushes on: level of the other direction", f"{EFFECTS}/friction.py",
+        "dry friction pushes on: level of the other direction", f"{EFFECTS}/support/friction.py",
         "jnp.where(stop > level[i, 1], level[i, 1], stop))", "jnp.where(stop > level[i, 1], level[i, 0], stop))",
         ("tests/effects/test_friction_effects.py", "-k", "by_direction"),
     ),
@@ -91,11 +92,11 @@ FAULTS: tuple[tuple[str, str, str, str, tuple[str, ...]], ...] = (
     # loop
     (
         "checkpoints of two rounds share a number", LOOP,
-        "return round_ * (n + 1) + done", "return round_ * n + done", ("tests/test_loop.py", "-k", "steps_grow"),
+        "return round_ * (n + 1) + done", "return round_ * n + done", ("tests/loop/test_loop.py", "-k", "steps_grow"),
     ),
     (
         "evaluations of former rounds compete under logs", LOOP, "supersede=info.truth is None)", "supersede=False)",
-        ("tests/test_loop.py", "-k", "newest_evaluation"),
+        ("tests/loop/test_loop.py", "-k", "newest_evaluation"),
     ),
     # rollout
     (
@@ -104,7 +105,7 @@ FAULTS: tuple[tuple[str, str, str, str, tuple[str, ...]], ...] = (
     ),
     (
         "a replay forgets the commands before it", PHYSICS, "memory=filled)", "memory=tuple(memory))",
-        ("tests/test_physics.py", RECORDED, "-k", "before_it or past_commands"),
+        ("tests/physics/test_physics.py", RECORDED, "-k", "before_it or past_commands"),
     ),
     (
         "a termination on the last step counts as a truncation too", ROLLOUT,
@@ -140,9 +141,9 @@ FAULTS: tuple[tuple[str, str, str, str, tuple[str, ...]], ...] = (
     ),
     # inference
     (
-        "regions hold the share of draws that are less dense", f"{P}/inference/depth.py",
+        "regions hold the share of draws that are less dense", f"{P}/inference/coverage_factor.py",
         "density[1:] > density[0], density", "density[1:] < density[0], density",
-        ("tests/inference/test_depth.py", "-k", "chi_square"),
+        ("tests/inference/test_coverage_factor.py", "-k", "chi_square"),
     ),
     (
         "a marginal gain without the mass inside the box", f"{P}/inference/identify.py",
@@ -155,7 +156,7 @@ FAULTS: tuple[tuple[str, str, str, str, tuple[str, ...]], ...] = (
     ),
     # diagnosis
     (
-        "superfluous effects stay in the answer", f"{P}/diagnosis/search.py",
+        "superfluous effects stay in the answer", f"{P}/diagnosis/selection/search.py",
         "idle = [m for m in smaller if not race.passes(m, model)]", "idle = []", (SEARCH, "-k", "superfluous"),
     ),
     (
@@ -164,7 +165,7 @@ FAULTS: tuple[tuple[str, str, str, str, tuple[str, ...]], ...] = (
         ("tests/diagnosis/test_tolerance.py", "-k", "taken_out"),
     ),
     (
-        "a law gives way to a special case that closes far less", f"{P}/diagnosis/search.py",
+        "a law gives way to a special case that closes far less", f"{P}/diagnosis/selection/search.py",
         "race.closure(model) - race.closure(m) < race.settings.tie / 2]", "race.closure(model) - race.closure(m) < 2]",
         (SEARCH, "-k", "gives_way"),
     ),

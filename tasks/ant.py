@@ -15,7 +15,7 @@ import numpy as np
 from bayessim_mjx.env import Observations, Task
 from bayessim_mjx.mirrors import Mirror
 from bayessim_mjx.physics import World, mjx
-from bayessim_mjx.warp import wrenches
+from bayessim_mjx.physics.warp import wrenches
 
 FEET = ("front_left_foot", "front_right_foot", "left_back_foot", "right_back_foot")
 JOINTS = ("hip_1", "ankle_1", "hip_2", "ankle_2", "hip_3", "ankle_3", "hip_4", "ankle_4")

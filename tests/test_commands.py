@@ -21,12 +21,12 @@ import mujoco
 import numpy as np
 import pytest
 
-from bayessim_mjx import checkpoints, cli, config, diagnose, main, play, registry, train
+from bayessim_mjx import cli, config, diagnose, main, play, registry, train
 from bayessim_mjx.env import Env, State
 from bayessim_mjx.errors import DivergedError, UserError
 from bayessim_mjx.monitor.writer import event_files, records
 from bayessim_mjx.parameters import Parameter, ParameterSpace
-from bayessim_mjx.runs import Run, latest_run
+from bayessim_mjx.runs import Run, checkpoints, latest_run
 
 SMALL = ["ppo.num_envs=4", "ppo.num_steps=4", "ppo.num_epochs=1", "ppo.num_minibatches=1", "ppo.hidden_actor=[4]"]
 SMALL += [
@@ -421,9 +421,9 @@ def test_corrupted_checkpoints_of_a_run_to_resume(toy: None, capsys: pytest.Capt
 
 def test_play_draws_from_the_posterior_in_the_coordinates_that_it_was_saved_in(tmp_path: Path) -> None:
     """A probit posterior's mean is that of its own draws; read as a plain one it was (1.35, 1.99) for (1.50, 1.90)."""
-    from bayessim_mjx import checkpoints
     from bayessim_mjx.distributions import Distribution
     from bayessim_mjx.distributions.charts import to_chart
+    from bayessim_mjx.runs import checkpoints
 
     settings = config.load("Pendulum", overrides=["bayessim.components=1"])
     env, key = registry.make("Pendulum", config=settings), jax.random.PRNGKey(0)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from bayessim_mjx import settings
+from bayessim_mjx.config import settings
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]

@@ -7,9 +7,9 @@ import pytest
 
 from bayessim_mjx import cli, config, effects, registry, trust
 from bayessim_mjx.config import load
-from bayessim_mjx.effects import storage
+from bayessim_mjx.config.yaml_text import read_value, read_yaml, to_yaml
+from bayessim_mjx.effects.support import storage
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.yaml_text import read_value, read_yaml, to_yaml
 
 EFFECT = """
 import dataclasses, pathlib

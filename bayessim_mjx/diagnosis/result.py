@@ -148,15 +148,15 @@ class Diagnosis:
 
     def apply(self, physics: Physics) -> Physics:
         """The corrected simulator, see `apply.apply`."""
-        from bayessim_mjx.diagnosis import apply
+        from bayessim_mjx.diagnosis import correction
 
-        return apply.apply(self, physics)
+        return correction.apply(self, physics)
 
     def prior(self, physics: Physics | ParameterSpace | None = None) -> Distribution:
         """What is known of the corrected simulator's theta, for the loop; see `apply.prior`."""
-        from bayessim_mjx.diagnosis import apply
+        from bayessim_mjx.diagnosis import correction
 
-        return apply.prior(self, physics)
+        return correction.prior(self, physics)
 
     def save(self, folder: str | Path) -> Path:
         """Write diagnosis.json and details.json into `folder`; returns the former's path."""

@@ -12,7 +12,7 @@ import numpy as np
 from jax import Array
 from jax.scipy.special import log_ndtr, ndtr, ndtri
 
-from bayessim_mjx.triangular import product, solve_lower
+from bayessim_mjx.linalg import product, solve_lower
 
 MASS_POINTS = 512  # quasi-Monte-Carlo points behind every log_inside
 

@@ -13,7 +13,7 @@ from jax import Array
 from jax.scipy.special import ndtri
 
 from bayessim_mjx.distributions import box, charts
-from bayessim_mjx.triangular import lower_factor, product, solve_lower
+from bayessim_mjx.linalg import lower_factor, product, solve_lower
 
 if TYPE_CHECKING:
     from bayessim_mjx.distributions.distribution import Distribution

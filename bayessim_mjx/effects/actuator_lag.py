@@ -10,7 +10,7 @@ import mujoco
 
 from bayessim_mjx.effects.actuator_gain import addressed
 from bayessim_mjx.effects.effect import Effect, Quantity
-from bayessim_mjx.effects.site import Site
+from bayessim_mjx.effects.support.site import Site
 
 if TYPE_CHECKING:
     from mujoco import MjSpec

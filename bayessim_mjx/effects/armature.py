@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 
 from bayessim_mjx.effects.effect import Effect, Quantity
-from bayessim_mjx.effects.friction import add, native
-from bayessim_mjx.effects.site import Site
+from bayessim_mjx.effects.support.friction import add, native
+from bayessim_mjx.effects.support.site import Site
 from bayessim_mjx.parameters import constants
 
 if TYPE_CHECKING:

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import jax
 
 from bayessim_mjx.effects.effect import Effect, Quantity
-from bayessim_mjx.effects.friction import resist
-from bayessim_mjx.effects.site import Site, SubStep
+from bayessim_mjx.effects.support.friction import resist
+from bayessim_mjx.effects.support.site import Site, SubStep
 
 if TYPE_CHECKING:
     import mujoco

@@ -9,8 +9,8 @@ import mujoco
 import numpy as np
 
 from bayessim_mjx.effects.effect import Effect, Quantity
-from bayessim_mjx.effects.geoms import native, of_pairs, touching
-from bayessim_mjx.effects.site import Site
+from bayessim_mjx.effects.support.geoms import native, of_pairs, touching
+from bayessim_mjx.effects.support.site import Site
 from bayessim_mjx.errors import UserError
 
 if TYPE_CHECKING:

@@ -7,8 +7,8 @@ import jax
 import mujoco
 
 from bayessim_mjx.effects.effect import Effect, Quantity
-from bayessim_mjx.effects.geoms import native, of_pairs, touching
-from bayessim_mjx.effects.site import Site
+from bayessim_mjx.effects.support.geoms import native, of_pairs, touching
+from bayessim_mjx.effects.support.site import Site
 
 if TYPE_CHECKING:
     from mujoco import mjx

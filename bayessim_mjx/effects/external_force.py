@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import jax
 import jax.numpy as jnp
 
-from bayessim_mjx.effects.bodies import project, velocity
 from bayessim_mjx.effects.effect import Effect, Quantity
-from bayessim_mjx.effects.site import Site, SubStep
+from bayessim_mjx.effects.support.bodies import project, velocity
+from bayessim_mjx.effects.support.site import Site, SubStep
 
 if TYPE_CHECKING:
     import mujoco

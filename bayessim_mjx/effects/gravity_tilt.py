@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from bayessim_mjx.effects.effect import Effect, Quantity
-from bayessim_mjx.effects.site import Site
+from bayessim_mjx.effects.support.site import Site
 
 if TYPE_CHECKING:
     import mujoco

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from bayessim_mjx.effects.effect import Effect, Measurement, Quantity
-from bayessim_mjx.effects.site import Motion, Site
+from bayessim_mjx.effects.support.site import Motion, Site
 
 if TYPE_CHECKING:
     from mujoco import mjx

@@ -8,8 +8,8 @@ import mujoco
 import numpy as np
 
 from bayessim_mjx.effects.effect import Effect, Quantity
-from bayessim_mjx.effects.friction import add, native
-from bayessim_mjx.effects.site import Site, SubStep
+from bayessim_mjx.effects.support.friction import add, native
+from bayessim_mjx.effects.support.site import Site, SubStep
 
 _RK4, _HINGE = int(mujoco.mjtIntegrator.mjINT_RK4), int(mujoco.mjtJoint.mjJNT_HINGE)
 

@@ -11,8 +11,8 @@ import jax
 import jax.numpy as jnp
 
 from bayessim_mjx.effects.effect import Effect, Quantity
-from bayessim_mjx.effects.friction import dry
-from bayessim_mjx.effects.site import Site, SubStep
+from bayessim_mjx.effects.support.friction import dry
+from bayessim_mjx.effects.support.site import Site, SubStep
 
 if TYPE_CHECKING:
     import mujoco

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from bayessim_mjx.effects.bodies import native
 from bayessim_mjx.effects.effect import Effect, Quantity
-from bayessim_mjx.effects.site import Site, find
+from bayessim_mjx.effects.support.bodies import native
+from bayessim_mjx.effects.support.site import Site, find
 from bayessim_mjx.parameters import attributes, constants, geometry
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from bayessim_mjx.effects.actuator_lag import at_rest, follow
 from bayessim_mjx.effects.effect import Effect, Quantity
-from bayessim_mjx.effects.site import Site
+from bayessim_mjx.effects.support.site import Site
 
 
 @dataclasses.dataclass(frozen=True)

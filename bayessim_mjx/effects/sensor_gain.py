@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from bayessim_mjx.effects.effect import Effect, Measurement, Quantity
-from bayessim_mjx.effects.site import Motion, Site
+from bayessim_mjx.effects.support.site import Motion, Site
 from bayessim_mjx.errors import UserError
 
 if TYPE_CHECKING:

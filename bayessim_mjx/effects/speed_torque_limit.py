@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from bayessim_mjx.effects.effect import Effect, Quantity
-from bayessim_mjx.effects.site import Site, SubStep
+from bayessim_mjx.effects.support.site import Site, SubStep
 
 _TINY = 1e-20
 

@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 import mujoco
 
-from bayessim_mjx.effects import friction
 from bayessim_mjx.effects.effect import Effect, Quantity
-from bayessim_mjx.effects.site import Site, SubStep
+from bayessim_mjx.effects.support import friction
+from bayessim_mjx.effects.support.site import Site, SubStep
 
 if TYPE_CHECKING:
     from mujoco import mjx

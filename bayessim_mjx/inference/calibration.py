@@ -20,8 +20,8 @@ from scipy.special import ndtr
 
 from bayessim_mjx.distributions import Distribution, box, charts
 from bayessim_mjx.errors import UserError
+from bayessim_mjx.linalg import inverse_lower, lower_factor, product
 from bayessim_mjx.quantities import estimate
-from bayessim_mjx.triangular import inverse_lower, lower_factor, product
 
 LEVELS = (0.5, 0.8, 0.95)
 DRAWS = 256  # proposals per pair; those outside the box are left out

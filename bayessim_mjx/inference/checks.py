@@ -17,7 +17,7 @@ from bayessim_mjx.inference.calibration import Report
 from bayessim_mjx.inference.fit import condition
 from bayessim_mjx.inference.identify import flat_sentences, restore_prior
 from bayessim_mjx.inference.misspecification import Misfit
-from bayessim_mjx.inference.walls import Pile, piles
+from bayessim_mjx.inference.range_ends import Pile, piles
 
 CANDIDATES = 16  # draws of q for each one of q tilt / prior
 

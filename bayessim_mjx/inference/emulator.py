@@ -8,7 +8,7 @@ import numpy as np
 import optax
 from jax import Array
 
-from bayessim_mjx.triangular import inverse_lower, lower_factor, product
+from bayessim_mjx.linalg import inverse_lower, lower_factor, product
 
 Layers = list[tuple[Array, Array]]
 WIDTH, STEPS, BATCH, RATE = 128, 1500, 256, 3e-3

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from itertools import product
 
+from bayessim_mjx.config.settings import summary_of
 from bayessim_mjx.inference import signature as sig
 from bayessim_mjx.inference.summarizers import signature_depth, waypoint_times
-from bayessim_mjx.settings import summary_of
 
 
 def names(summary: str, steps: int, states: Sequence[str], actions: Sequence[str]) -> tuple[str, ...]:

@@ -13,7 +13,7 @@ from scipy import stats
 from scipy.special import ndtri
 from scipy.stats import qmc
 
-from bayessim_mjx.triangular import product
+from bayessim_mjx.linalg import product
 
 NU = {"RBF": np.inf, "Laplace": 0.5, "Matern12": 0.5, "Matern32": 1.5, "Matern52": 2.5}
 PAIRED = 512  # rows behind the median heuristic

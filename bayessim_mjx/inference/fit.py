@@ -20,9 +20,9 @@ from jax.flatten_util import ravel_pytree
 from bayessim_mjx.distributions import Distribution, charts
 from bayessim_mjx.distributions.storage import coordinates
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.inference import bases, depth, identify, mdn
+from bayessim_mjx.inference import coverage_factor, identify, mdn, whitening
 from bayessim_mjx.inference.settings import InferenceSettings
-from bayessim_mjx.triangular import product
+from bayessim_mjx.linalg import product
 
 GOLDEN = np.uint32(2654435769)  # 2^32 / golden ratio: spreads the validation rows evenly over any number of rows
 SCORED = 256  # validation rows for which the truncated density is reported
@@ -109,7 +109,7 @@ def init(key: Array, settings: InferenceSettings, space: Any, dim_x: int) -> Fit
     settings = settings.at(space)
     params = _weights(key, settings, dim_x, len(space))
     known, fits = jnp.ones(len(space), bool), jnp.asarray(0, jnp.int32)
-    basis = jnp.eye(dim_x) if bases.count(settings, dim_x) > 1 else None
+    basis = jnp.eye(dim_x) if whitening.count(settings, dim_x) > 1 else None
     params["member"] = jnp.arange(settings.ensemble, dtype=jnp.int32)
     return FitState(params, jnp.zeros(dim_x), jnp.ones(dim_x), basis, fits, known, settings, space)
 
@@ -256,7 +256,7 @@ def _fit(
 
 def _bases(state: FitState, data: _Data) -> Array:
     """The matrices [M, D, D] that a first fit chooses from; later ones keep its choice."""
-    found = bases.candidates(data.x, data.train, bases.count(state.settings, data.x.shape[1]))
+    found = whitening.candidates(data.x, data.train, whitening.count(state.settings, data.x.shape[1]))
     return found if state.basis is None else jnp.where(state.fits == 0, found, state.basis[None])
 
 
@@ -402,16 +402,16 @@ def _as_deep(state: FitState, data: _Data) -> FitState:
     The weights and sharpnesses of the best density leave them too wide where errors have long tails, as most are then
     smaller than it says: 62 % of truths in the 50 % regions of BayesSimIG's data.
     """
-    rows = data.held[: depth.MOST]
+    rows = data.held[: coverage_factor.MOST]
     centre, sd = (np.float32(v) for v in charts.SCORE[state.settings.chart])
 
     def at(factor: Array) -> tuple[Array, Array, Array]:
         params = {**state.params, "sharpness": state.params["sharpness"] * factor}
         return _mixtures(replace(state, params=params), data.x[rows])
 
-    mask = data.mask[: depth.MOST]
+    mask = data.mask[: coverage_factor.MOST]
     # the same draws in every fit: weights that are kept keep their factor
-    factor = depth.factor(jax.random.PRNGKey(0), at, data.y[rows] * sd + centre, mask, state.settings.chart)
+    factor = coverage_factor.factor(jax.random.PRNGKey(0), at, data.y[rows] * sd + centre, mask, state.settings.chart)
     return replace(state, params={**state.params, "sharpness": state.params["sharpness"] * factor})
 
 

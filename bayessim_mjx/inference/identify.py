@@ -16,7 +16,7 @@ from jax import Array
 from jax.scipy.special import logsumexp
 
 from bayessim_mjx.distributions import Distribution, box, charts
-from bayessim_mjx.triangular import lower_factor
+from bayessim_mjx.linalg import lower_factor
 
 SIGNIFICANT = 3.0  # standard errors of the mean held-out gain
 RELEVANT = 0.01  # nats

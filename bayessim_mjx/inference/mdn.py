@@ -19,7 +19,7 @@ from jax import Array
 from bayessim_mjx.distributions import Distribution, box, charts
 from bayessim_mjx.inference import features
 from bayessim_mjx.inference.settings import InferenceSettings
-from bayessim_mjx.triangular import inverse_lower, lower_factor, product
+from bayessim_mjx.linalg import inverse_lower, lower_factor, product
 
 Params = dict[str, Any]
 Drop = tuple[Array, Array]  # key, rate

@@ -20,7 +20,7 @@ import numpy as np
 from jax import Array
 
 from bayessim_mjx.inference import emulator, mdn
-from bayessim_mjx.triangular import product
+from bayessim_mjx.linalg import product
 
 FOURIER = 300  # random features of theta-hat behind E[z | theta-hat]
 WIDTH = 0.4  # their length scale, in units of the box

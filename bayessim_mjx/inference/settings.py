@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any
 
+from bayessim_mjx.config.settings import COORDINATES, BayesSimConfig, model_of
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.settings import COORDINATES, BayesSimConfig, model_of
 
 if TYPE_CHECKING:
     from bayessim_mjx.inference.embedding import Embedding

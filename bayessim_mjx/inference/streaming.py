@@ -12,10 +12,10 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
+from bayessim_mjx.config.settings import summary_of
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.inference import signature as sig
 from bayessim_mjx.inference.summarizers import base_increment, signature_depth
-from bayessim_mjx.settings import summary_of
 
 
 class Stream(NamedTuple):

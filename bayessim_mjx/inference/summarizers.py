@@ -17,9 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from bayessim_mjx.config.settings import summary_of
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.inference import signature as sig
-from bayessim_mjx.settings import summary_of
 
 Summarizer = Callable[..., Array]  # (states [T+1, S], actions [T, A], valid [T] or nothing) -> [D]
 MAX_FEATURES = 16384  # 10 000 trajectories of as many features are 0.6 GiB, and a network sees each of them

@@ -12,7 +12,6 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from bayessim_mjx import laws
 from bayessim_mjx.config import read_yaml
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.check import STREAMS, check_channels, check_motion, check_time
@@ -20,6 +19,7 @@ from bayessim_mjx.logs.log import Array, Channels, Log, suggest
 from bayessim_mjx.logs.mapping import LogMap
 from bayessim_mjx.logs.signals import estimate_velocity, noise_level
 from bayessim_mjx.logs.table import Table, read_csv, read_npz
+from bayessim_mjx.physics import controllers
 
 MIN_ROWS = 10
 MAX_GAP = 5.0  # sample periods without a sample after which a file is cut in two
@@ -125,7 +125,9 @@ def _read_one(path: Path, mj_model: mujoco.MjModel, channels: Channels, log_map:
     check_channels(table, columns, channels)
     check_time(table, columns["time"], MIN_ROWS)
     metadata = {**(log_map.metadata if log_map else {}), **_side_yaml(path), "source": str(path)}
-    law = laws.read(metadata, mj_model, channels.actuators, str(path))  # refused here, before anything is simulated
+    law = controllers.read(
+        metadata, mj_model, channels.actuators, str(path)
+    )  # refused here, before anything is simulated
     check_motion(table, columns, channels, mj_model, np.asarray(law.through))
     columns = _with_numbers(table, columns)
     if "condition" in metadata:

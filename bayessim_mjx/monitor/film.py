@@ -12,10 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from bayessim_mjx.config import Config
+from bayessim_mjx.config.settings import MonitorConfig
 from bayessim_mjx.monitor import video
 from bayessim_mjx.quantities import fixed
 from bayessim_mjx.rollout import rollout
-from bayessim_mjx.settings import MonitorConfig
 
 FPS = 25
 HOLD = 1.0  # seconds for which the last pose of an episode that ended early is shown

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from bayessim_mjx.checkpoints import write_text
 from bayessim_mjx.config import Config
 from bayessim_mjx.logs import Channels
 from bayessim_mjx.loop import LoopState, RoundInfo
@@ -21,6 +20,7 @@ from bayessim_mjx.monitor.film import FPS, Motion, frames
 from bayessim_mjx.monitor.wall import Wall
 from bayessim_mjx.monitor.writer import Writer
 from bayessim_mjx.rl import Policy, policy_of
+from bayessim_mjx.runs.checkpoints import write_text
 
 MOST_PAIRS = 10  # BayesSimIG draws one figure per pair; beyond this the corner plot shows them all
 ROUNDS = "rounds.jsonl"

@@ -4,8 +4,8 @@ import difflib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from bayessim_mjx.config.settings import number as finite
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.settings import number as finite
 
 
 def mapping(value: Any, where: str) -> Mapping[str, Any]:

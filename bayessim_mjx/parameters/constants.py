@@ -15,8 +15,8 @@ import numpy as np
 with contextlib.redirect_stdout(io.StringIO()):  # MJX announces on import that the optional warp is absent
     from mujoco import mjx
 
+from bayessim_mjx.linalg import inverse_lower
 from bayessim_mjx.parameters import geometry
-from bayessim_mjx.triangular import inverse_lower
 
 _MASS = {"body_mass"}
 _SHAPE = {"geom_size", "geom_rbound"}

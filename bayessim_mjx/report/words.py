@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from bayessim_mjx import quantities
-from bayessim_mjx.diagnosis.nouns import EFFECTS
 from bayessim_mjx.diagnosis.result import Diagnosis, Estimate, FoundEffect
 from bayessim_mjx.diagnosis.tolerance import extent
+from bayessim_mjx.diagnosis.vocabulary import EFFECTS
 from bayessim_mjx.quantities import SUPERSCRIPT, finite
 
 MISSING = quantities.MISSING  # where there is no number

@@ -17,7 +17,7 @@ from bayessim_mjx import memory
 from bayessim_mjx.config import PPOConfig
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.mirrors import MirrorMap
-from bayessim_mjx.nuisance import starting
+from bayessim_mjx.physics.nuisance import starting
 from bayessim_mjx.rl import (
     episodes,
     losses,

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from bayessim_mjx.settings import MEMORIES
+from bayessim_mjx.config.settings import MEMORIES
 
 if TYPE_CHECKING:
     from bayessim_mjx.env import Env, State

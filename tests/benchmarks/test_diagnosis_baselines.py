@@ -8,9 +8,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from bayessim_mjx.diagnosis.candidates import Candidate, Coordinate
-from bayessim_mjx.diagnosis.fit import Job
-from bayessim_mjx.diagnosis.models import Model
+from bayessim_mjx.diagnosis.fitting.candidates import Candidate, Coordinate
+from bayessim_mjx.diagnosis.fitting.fitter import Job
+from bayessim_mjx.diagnosis.selection.models import Model
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
 baselines = pytest.importorskip("diagnosis_baselines")

@@ -27,7 +27,7 @@ def test_malformed_inputs_are_refused_or_harmless(kind: str, tmp_path: Path, mon
 
 def test_what_the_inputs_are_made_from_is_sound(tmp_path: Path) -> None:
     """Else all of them would be refused for the same reason."""
-    from bayessim_mjx.diagnosis import robot
+    from bayessim_mjx.diagnosis.fitting import robot
 
     rows = [",".join(f"{x:.6g}" for x in row) for row in fuzz_cases.table()]
     (tmp_path / "run.csv").write_text("\n".join([fuzz_cases.HEADER, *rows]))

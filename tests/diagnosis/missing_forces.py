@@ -5,9 +5,9 @@ from collections.abc import Callable
 import mujoco
 import numpy as np
 
-from bayessim_mjx.diagnosis import candidates, robot, windows
-from bayessim_mjx.diagnosis.fit import Fitter, Job
-from bayessim_mjx.diagnosis.simulate import Simulator
+from bayessim_mjx.diagnosis.fitting import candidates, robot, windows
+from bayessim_mjx.diagnosis.fitting.fitter import Fitter, Job
+from bayessim_mjx.diagnosis.fitting.simulator import Simulator
 from bayessim_mjx.logs import Channels, Log, estimate_velocity
 from bayessim_mjx.physics import Physics
 

@@ -10,8 +10,9 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from bayessim_mjx.diagnosis import robot, run, windows
-from bayessim_mjx.diagnosis.fit import Fitter, Job
+from bayessim_mjx.diagnosis.fitting import robot, windows
+from bayessim_mjx.diagnosis.fitting.fitter import Fitter, Job
+from bayessim_mjx.diagnosis.setup import Setup
 from bayessim_mjx.logs import Channels, Log, estimate_velocity, write_log
 
 MODEL = """<mujoco><option timestep="%g" integrator="%s"/><worldbody><body name="link">
@@ -84,7 +85,7 @@ def _one(
     return Log(f"log{i}", time, ctrl[:, None], qpos, qvel, False, channels, noise, spread, metadata=metadata)
 
 
-def fitted(setup: run.Setup) -> tuple[Fitter, Job]:
+def fitted(setup: Setup) -> tuple[Fitter, Job]:
     """The fit of the known parameters alone."""
     fitter = setup.fitter
     job = fitter.begin(fitter.base)
@@ -92,7 +93,7 @@ def fitted(setup: run.Setup) -> tuple[Fitter, Job]:
     return fitter, fitter.refresh(job)
 
 
-def refit(setup: run.Setup, logs: list[Log]) -> tuple[Fitter, Job]:
+def refit(setup: Setup, logs: list[Log]) -> tuple[Fitter, Job]:
     """`fitted` on other logs of the same number and length, by the program that is already compiled."""
     simulator = copy.copy(setup.fitter.simulator)
     old, model, physics = simulator.windows, setup.physics.mj_model, setup.physics

@@ -4,9 +4,9 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from bayessim_mjx.diagnosis import race, search, verdict
-from bayessim_mjx.diagnosis.candidates import Candidate
-from bayessim_mjx.diagnosis.models import Model
+from bayessim_mjx.diagnosis.fitting.candidates import Candidate
+from bayessim_mjx.diagnosis.selection import race, search, verdict
+from bayessim_mjx.diagnosis.selection.models import Model
 
 NOISE, WINDOWS = 50.0, 8
 

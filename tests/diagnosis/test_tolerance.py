@@ -7,9 +7,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from bayessim_mjx.diagnosis import assemble, how_far, repeated, sentences, tolerance
-from bayessim_mjx.diagnosis.gap import Prediction
+from bayessim_mjx.diagnosis import tolerance
 from bayessim_mjx.diagnosis.result import FoundEffect, Gap
+from bayessim_mjx.diagnosis.selection.heldout import Prediction
+from bayessim_mjx.diagnosis.summary import assemble, how_far, repeated, sentences
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs import Channels, Log
 

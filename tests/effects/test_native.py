@@ -7,7 +7,7 @@ import pytest
 
 from bayessim_mjx import effects
 from bayessim_mjx.effects.coulomb_friction import CoulombFriction
-from bayessim_mjx.effects.native import write_model
+from bayessim_mjx.effects.support.native import write_model
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bayessim_mjx import config, effects, registry
-from bayessim_mjx.effects import storage
+from bayessim_mjx.effects.support import storage
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.physics import control_step
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from bayessim_mjx import config, effects, registry
-from bayessim_mjx.effects.reading import listed, stack
+from bayessim_mjx.effects.support.reading import listed, stack
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.rollout import replay
 

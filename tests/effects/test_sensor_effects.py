@@ -13,11 +13,11 @@ from scipy.signal import lsim
 
 from bayessim_mjx import registry
 from bayessim_mjx.effects import make
-from bayessim_mjx.effects.site import Motion
+from bayessim_mjx.effects.support.site import Motion
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.laws import Law
 from bayessim_mjx.parameters import ParameterSpace
 from bayessim_mjx.physics import Drive, Physics, begin, control_step
+from bayessim_mjx.physics.controllers import Law
 
 DT, STEPS = 0.02, 60
 NAMES = ("joint_offset", "sensor_gain", "sensor_filter", "sensor_delay")  # the last sees what the others show

@@ -6,7 +6,7 @@ import pytest
 
 from bayessim_mjx import config, effects, registry
 from bayessim_mjx.distributions import Distribution
-from bayessim_mjx.effects import storage
+from bayessim_mjx.effects.support import storage
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 from bayessim_mjx.physics import control_step

@@ -10,7 +10,7 @@ from bayessim_mjx import inference
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.inference import checks, misspecification
 from bayessim_mjx.inference.misspecification import Scores, ranked
-from bayessim_mjx.inference.walls import piles
+from bayessim_mjx.inference.range_ends import piles
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 
 pytestmark = [pytest.mark.slow, pytest.mark.ci]  # whole diagnoses and fits

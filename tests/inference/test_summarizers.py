@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from bayessim_mjx.config.settings import SUMMARIZERS, BayesSimConfig
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.inference import summarizers
 from bayessim_mjx.inference.streaming import stream
-from bayessim_mjx.settings import SUMMARIZERS, BayesSimConfig
 
 STATES = jnp.asarray([[0.0, 1.0], [1.0, 1.0], [3.0, 0.0], [6.0, 0.0]])  # T = 3, S = 2
 ACTIONS = jnp.asarray([[1.0], [2.0], [-1.0]])

@@ -188,8 +188,8 @@ def test_a_film_counts_time_and_return_until_the_episode_ends(monkeypatch):
 
 
 def test_films_have_the_size_that_is_set_and_trainings_half_of_it(monkeypatch):
+    from bayessim_mjx.config.settings import MonitorConfig
     from bayessim_mjx.monitor import film
-    from bayessim_mjx.settings import MonitorConfig
 
     asked = []
     monkeypatch.setattr(video, "record", lambda m, qpos, path, **more: asked.append((len(qpos), more)))

@@ -23,8 +23,9 @@ def training(devices, state=None, folder=None):
     """(metrics of three log intervals, state) with `devices` of them; from a saved state, where there is one."""
     import jax
 
-    from bayessim_mjx import checkpoints, device, rl
+    from bayessim_mjx import device, rl
     from bayessim_mjx.config import PPOConfig, RNDConfig
+    from bayessim_mjx.runs import checkpoints
 
     env = walk()
     config = PPOConfig(
@@ -48,7 +49,7 @@ def where(state):
 
 def curves(folder):
     """Of 1 and 2 devices; and on each what follows a checkpoint of 2."""
-    from bayessim_mjx import checkpoints
+    from bayessim_mjx.runs import checkpoints
 
     runs = {n: training(n) for n in (1, 2)}
     checkpoints.save(Path(folder) / "saved", runs[2][1], 6, {})
@@ -63,8 +64,9 @@ def process(folder, address, number, count):
     os.environ |= {
         "JAX_COORDINATOR_ADDRESS": address, "JAX_PROCESS_ID": number, "JAX_NUM_PROCESSES": count
     }  # fmt: skip
-    from bayessim_mjx import checkpoints, device
+    from bayessim_mjx import device
     from bayessim_mjx.config import Config
+    from bayessim_mjx.runs import checkpoints
 
     device.setup_jax(Config(device="cpu", devices="all", cache_dir="off"))
     curve, state = training(len(jax.devices()))

@@ -1,0 +1,31 @@
+"""Settings: their defaults and limits (settings.py), and how files, flags and overrides are read (loading.py)."""
+
+from bayessim_mjx.config.loading import (
+    EFFECTS_SCHEMA,
+    cfg_folder,
+    from_dict,
+    load,
+    read_effects,
+    replace,
+    task_file,
+    unknown,
+)
+from bayessim_mjx.config.settings import (
+    BayesSimConfig,
+    Config,
+    EnvConfig,
+    MonitorConfig,
+    PPOConfig,
+    RealConfig,
+    RNDConfig,
+    SymmetryConfig,
+    WeightSchedule,
+    freeze,
+)
+from bayessim_mjx.config.yaml_text import read_yaml, to_yaml
+
+__all__ = [
+    "EFFECTS_SCHEMA", "BayesSimConfig", "Config", "EnvConfig", "MonitorConfig", "PPOConfig", "RNDConfig", "RealConfig",
+    "SymmetryConfig", "WeightSchedule", "cfg_folder", "freeze", "from_dict", "load", "read_effects", "read_yaml",
+    "replace", "task_file", "to_yaml", "unknown",
+]  # fmt: skip

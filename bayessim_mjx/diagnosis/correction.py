@@ -1,0 +1,209 @@
+"""A diagnosis as a simulator: effects and parameters at their identified values, their uncertainty as a prior.
+
+Only names, places and estimates are read, so a diagnosis loaded from its folder serves as well as a fresh one.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import mujoco
+import numpy as np
+
+from bayessim_mjx import effects as library
+from bayessim_mjx.distributions import Distribution
+from bayessim_mjx.effects.effect import Effect, Quantity
+from bayessim_mjx.effects.support import native, storage
+from bayessim_mjx.errors import UserError
+from bayessim_mjx.parameters import Parameter, ParameterSpace
+from bayessim_mjx.physics import Physics
+
+if TYPE_CHECKING:
+    from bayessim_mjx.diagnosis.fitting.robot import Robot
+    from bayessim_mjx.diagnosis.result import Diagnosis, Estimate, FoundEffect
+
+REACH = 4.0  # sd that a range holds on both sides, where physics allows
+LEAST_SD = 1e-6  # of the range: a prior needs a width
+UNKNOWN_SD = 0.5  # of the way from neutral, where the diagnosis could not tell
+OWN_EFFECTS = "effect_specs"  # in `Diagnosis.details`: {name: path.py:MyEffect} of effects that are not the library's
+
+
+def effects_of(diagnosis: Diagnosis) -> tuple[Effect, ...]:
+    """The effects found, with nominal = identified mean and prior Gaussian(mean, sd) truncated to a sensible range.
+
+    One effect at several places is one `Effect` with values of its own at each; "all" is tied. Their order is the
+    library's, as in the diagnosis.
+
+    Raises:
+        UserError: an unknown effect, or an estimate that is missing or no number.
+    """
+    places: dict[tuple[str, bool], list[FoundEffect]] = {}
+    for found in diagnosis.effects:
+        places.setdefault((found.name, found.where == "all"), []).append(found)
+    order = library.names()
+    keys = sorted(places, key=lambda key: order.index(key[0]) if key[0] in order else len(order))
+    own = diagnosis.details.get(OWN_EFFECTS, {})
+    return tuple(_effect(library.recorded(own.get(key[0], key[0])), places[key]) for key in keys)
+
+
+def _effect(kind: type[Effect], found: list[FoundEffect]) -> Effect:
+    where = found[0].where if len(found) == 1 else tuple(f.where for f in found)
+    plain = kind(where=where)
+    estimates = [e for f in found for e in _in_order(kind, f)]
+    rows = zip(plain.defaults().parameters, kind.quantities * len(found), estimates, strict=True)
+    return dataclasses.replace(plain, parameters=tuple(_identified(p, q, e) for p, q, e in rows))
+
+
+def _in_order(kind: type[Effect], found: FoundEffect) -> list[Estimate]:
+    """The estimates of one place in the order of the effect's quantities."""
+    names = [q.name for q in kind.quantities]
+    for name in names:
+        if name not in found.parameters or not math.isfinite(found.parameters[name].mean):
+            have = ", ".join(found.parameters) or "none"
+            raise UserError(f"diagnosis: {found.name} at {found.where}: no value of {name}; it has {have}")
+    return [found.parameters[name] for name in names]
+
+
+def _identified(p: Parameter, q: Quantity, e: Estimate) -> Parameter:
+    """The effect's parameter as identified; the library's range is widened where it must be."""
+    sd = e.sd if math.isfinite(e.sd) else UNKNOWN_SD * abs(e.mean - q.neutral)
+    low, high = min(p.low, e.mean - REACH * sd), max(p.high, e.mean + REACH * sd)
+    if q.low == q.neutral:  # beyond it the physics has no meaning
+        low = p.low
+    elif p.low > 0:  # a gain, a frequency: it stays positive
+        low = max(low, min(p.low, 0.5 * e.mean)) if e.mean > 0 else p.low
+    if q.high == q.neutral:
+        high = p.high
+    return _gaussian(dataclasses.replace(p, low=low, high=high, unit=e.unit or p.unit), e.mean, sd)
+
+
+def _gaussian(p: Parameter, mean: float, sd: float) -> Parameter:
+    mean = min(max(mean, p.low), p.high)
+    return dataclasses.replace(p, nominal=mean, prior="gaussian", mean=mean, sd=max(sd, LEAST_SD * (p.high - p.low)))
+
+
+def calibrated_of(diagnosis: Diagnosis, space: ParameterSpace) -> ParameterSpace:
+    """`space` with nominal = identified mean and Gaussian priors; parameters that were not calibrated stay as they are.
+
+    Raises:
+        UserError: the diagnosis calibrated a parameter that `space` has not.
+    """
+    for name in diagnosis.parameters:
+        space.index(name)
+    return ParameterSpace(_calibrated(p, diagnosis.parameters.get(p.name)) for p in space.parameters)
+
+
+def _calibrated(p: Parameter, found: dict | None) -> Parameter:
+    mean, sd = (_number((found or {}).get(key)) for key in ("mean", "sd"))
+    if math.isnan(mean):
+        return p
+    wide = dataclasses.replace(p, low=min(p.low, mean), high=max(p.high, mean))
+    return _gaussian(wide, mean, (p.high - p.low) / math.sqrt(12) if math.isnan(sd) else sd)
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None or not math.isfinite(value) else float(value)
+
+
+def apply(diagnosis: Diagnosis, physics: Physics) -> Physics:
+    """The corrected simulator: the same model and control step; nominal values are the identified ones.
+
+    Args:
+        physics: with the known parameters as its `model_space`; its effects are replaced by those found.
+
+    Raises:
+        UserError: an effect's place, or a calibrated parameter, is not in this model.
+    """
+    limit = None if physics.max_qvel is None else physics.max_qvel.tolist()
+    space = calibrated_of(diagnosis, physics.model_space)
+    return Physics(physics.mj_model, physics.dt, space, effects_of(diagnosis), limit)
+
+
+def prior(diagnosis: Diagnosis, physics: Physics | ParameterSpace | None = None) -> Distribution:
+    """What is known of the corrected simulator's theta: jointly Gaussian, truncated to the ranges.
+
+    Where a diagnosis brings no covariance, the parameters are independent. Else the distribution's space has the names
+    and ranges of the corrected simulator's, but uniform priors: over those a Gaussian is exact.
+
+    Args:
+        physics: the simulator that was diagnosed, or the space of its known parameters; None: the diagnosis's own
+            record of them, enough to draw theta for `apply(diagnosis, physics)`.
+    """
+    if physics is None:
+        known = ParameterSpace(_recorded(name, row) for name, row in diagnosis.parameters.items())
+    else:
+        known = physics.model_space if isinstance(physics, Physics) else physics
+    space = calibrated_of(diagnosis, known)
+    for effect in effects_of(diagnosis):
+        space = space + effect.space()
+    return _jointly(diagnosis.covariance, space) if diagnosis.covariance else Distribution.prior(space)
+
+
+def _jointly(covariance: dict, space: ParameterSpace) -> Distribution:
+    """Gaussian at nominal theta; parameters without a covariance are as wide as their ranges."""
+    flat = ParameterSpace(dataclasses.replace(p, prior="uniform", mean=None, sd=None) for p in space.parameters)
+    width = np.asarray(space.high, float) - np.asarray(space.low, float)
+    matrix = np.diag(width**2 / 12)
+    found = [n for n in covariance["names"] if n in space.names]
+    at = [space.index(n) for n in found]
+    of = [covariance["names"].index(n) for n in found]
+    known = np.asarray(covariance["matrix"], float)[np.ix_(of, of)]
+    least = (LEAST_SD * width[at]) ** 2
+    matrix[np.ix_(at, at)] = known + np.diag(np.maximum(least - np.diag(known), 0.0))
+    return Distribution.gaussian(flat, np.asarray(space.nominal, float), matrix)
+
+
+def _recorded(name: str, row: dict) -> Parameter:
+    """A known parameter by what diagnosis.json tells of it; it cannot be written into a model."""
+    return Parameter(name, row["nominal"], row["low"], row["high"], unit=row.get("unit") or "")
+
+
+def correction(diagnosis: Diagnosis, space: ParameterSpace) -> storage.Correction:
+    """The effects found, and those parameters of `space` that were calibrated: the contents of effects.yaml."""
+    known = calibrated_of(diagnosis, space).parameters
+    return storage.Correction(effects_of(diagnosis), tuple(p for p in known if p not in space.parameters))
+
+
+def write_outputs(diagnosis: Diagnosis, robot: Robot, folder: str | Path) -> list[str]:
+    """Write effects.yaml and model_with_effects.xml.
+
+    Returns:
+        One sentence for each thing that the XML leaves out because MuJoCo has no element for it.
+    """
+    folder = Path(folder)
+    found = correction(diagnosis, robot.space)
+    effects, calibrated = found.effects, ParameterSpace(found.calibrated)
+    every = [*calibrated.parameters, *(p for e in effects for p in e.space().parameters)]
+    identified = {p.name: (p.mean, p.sd) for p in every if p.mean is not None and p.sd is not None}
+    storage.write(folder / "effects.yaml", effects, identified, calibrated)
+    source = robot.spec()
+    spec, missing = native.write_model(source, calibrated, calibrated.nominal, effects)
+    spec = _friction_acting(_at_home(spec, source.modelfiledir))
+    spec.compile()
+    left_out = "".join(f"  {sentence}\n" for sentence in missing)
+    note = f"<!-- Not in this model:\n{left_out.replace('--', '- -')}-->\n" if missing else ""
+    (folder / "model_with_effects.xml").write_text(note + spec.to_xml(), encoding="utf-8")
+    return [f"model_with_effects.xml leaves out {sentence}" for sentence in missing]
+
+
+def _friction_acting(spec: mujoco.MjSpec) -> mujoco.MjSpec:
+    """Native friction is a constraint: where constraints are off as a whole, all others are now off one by one."""
+    off = mujoco.mjtDisableBit
+    if any(joint.frictionloss > 0 for joint in spec.joints):
+        flags = int(spec.option.disableflags) & ~int(off.mjDSBL_FRICTIONLOSS)
+        if flags & int(off.mjDSBL_CONSTRAINT):
+            others = int(off.mjDSBL_CONTACT) | int(off.mjDSBL_LIMIT) | int(off.mjDSBL_EQUALITY)
+            flags = flags & ~int(off.mjDSBL_CONSTRAINT) | others
+        spec.option.disableflags = flags
+    return spec
+
+
+def _at_home(spec: mujoco.MjSpec, folder: str) -> mujoco.MjSpec:
+    """The specification with its meshes and textures where they are, wherever its XML will lie."""
+    if folder:
+        spec.meshdir = str((Path(folder) / spec.meshdir).resolve())
+        spec.texturedir = str((Path(folder) / spec.texturedir).resolve())
+    return spec

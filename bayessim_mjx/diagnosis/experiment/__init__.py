@@ -1,0 +1,1 @@
+"""The next experiment: a safe motion that separates what these logs cannot tell apart."""

@@ -1,0 +1,186 @@
+"""A menu of motions inside the limits that excite one joint, or all together.
+
+Slow triangles show dry friction and play, staircases of speeds what grows with speed, chirps and multisines timing and
+inertia, steps the limits of drives and deadbands, fast strokes the speed-torque curve.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from bayessim_mjx.diagnosis.experiment.limits import AXIAL, Limits
+from bayessim_mjx.logs.log import Log
+
+Array = NDArray[np.float64]
+USED = 0.9  # of the allowed range, so that overshoot stays inside
+
+
+@dataclass(frozen=True, eq=False)
+class Excitation:
+    """One motion of the menu.
+
+    Attributes:
+        kind: its name in the menu; where: joint, or "all".
+        offset: `[T, nv]`, reference motion relative to the middle position, at full amplitude.
+        live: `[T, nv]`, 0 while the joint's drive is to be off.
+        sharp: jumps are meant, and not smoothed away.
+    """
+
+    kind: str
+    where: str
+    offset: Array
+    live: Array
+    sharp: bool = False
+
+    @property
+    def name(self) -> str:
+        return f"{self.kind} on {'all joints together' if self.where == 'all' else self.where}"
+
+
+def middle(limits: Limits, logs: Sequence[Log], model: mujoco.MjModel) -> tuple[Array, Array]:
+    """(qpos to start from `[nq]`, usable half range `[nv]`): the logs' middle, moved away from the ends."""
+    start = np.array(logs[0].qpos[0])
+    half = np.full(model.nv, np.inf)
+    for j in range(model.njnt):
+        if int(model.jnt_type[j]) not in AXIAL:
+            continue
+        q, v = int(model.jnt_qposadr[j]), int(model.jnt_dofadr[j])
+        seen = float(np.median(np.concatenate([log.qpos[:, q] for log in logs])))
+        width = limits.high[v] - limits.low[v]
+        if np.isfinite(width):
+            start[q] = np.clip(seen, limits.low[v] + 0.3 * width, limits.high[v] - 0.3 * width)
+            half[v] = USED * min(limits.high[v] - start[q], start[q] - limits.low[v])
+    return start, half
+
+
+def menu(
+    time: Array,
+    joints: Mapping[str, int],
+    alone: Sequence[str],
+    half: Array,
+    speed: Array,
+    release: Sequence[str],
+    seed: int,
+) -> list[Excitation]:
+    """Every kind of motion on single joints, and on all together.
+
+    Args:
+        time: `[T]`, s; joints: {name: dof} that are concerned; alone: names of those moved one at a time.
+        half, speed: `[nv]`, usable half range and largest speed.
+        release: names of the joints whose drive can be switched off.
+    """
+    places = [*alone, *(["all"] if len(joints) > 1 else [])]
+    out = []
+    for kind, shape in SHAPES.items():
+        for place in places:
+            if kind == RELEASE and place not in release:
+                continue
+            out.append(_of(kind, shape, place, time, joints, half, speed, seed))
+    return out
+
+
+def _of(
+    kind: str, shape: Any, place: str, time: Array, joints: Mapping[str, int], half: Array, speed: Array, seed: int
+) -> Excitation:
+    rng = np.random.default_rng(seed)
+    offset, live = np.zeros((len(time), len(half))), np.ones((len(time), len(half)))
+    own = joints if place == "all" else {place: joints[place]}
+    for k, v in enumerate(own.values()):
+        # together, each joint at a pace of its own, so that their motions are not alike
+        pace = 1.0 if len(own) == 1 else 0.55 + 0.45 * ((k * 0.618) % 1.0)
+        reach = half[v] if len(own) == 1 else 0.7 * half[v]
+        offset[:, v] = shape(time, reach, pace * speed[v], rng)
+        if kind == RELEASE:
+            live[:, v] = _held(time)
+    return Excitation(kind, place, offset, live, kind == "steps of three sizes")
+
+
+def _triangle(way: Array, a: float) -> Array:
+    """Position `a`-bounded after a way travelled back and forth, starting in the middle."""
+    return 2 * a / np.pi * np.arcsin(np.sin(np.pi / 2 * way / a))
+
+
+def _slow(t: Array, a: float, v: float, rng: Any) -> Array:
+    return _triangle(max(0.06 * v, 1.5 * a / t[-1]) * t, a)
+
+
+def _staircase(t: Array, a: float, v: float, rng: Any) -> Array:
+    level = np.array([0.06, 0.12, 0.25, 0.5, 0.85])[np.minimum((5 * t / t[-1]).astype(int), 4)]
+    return _triangle(np.cumsum(level * v) * (t[1] - t[0]), a)
+
+
+def _strokes(t: Array, a: float, v: float, rng: Any) -> Array:
+    """At top speed from end to end with a rest of 0.2 s at every turn."""
+    stroke, dt = 2 * a / (0.9 * v), t[1] - t[0]
+    moving = np.mod(t + stroke / 2, stroke + 0.2) < stroke
+    return _triangle(np.cumsum(0.9 * v * moving) * dt, a)
+
+
+def _fastest(t: Array) -> float:
+    """Hz, the highest frequency worth sending."""
+    return float(min(8.0, 0.1 / (t[1] - t[0])))
+
+
+def _chirp(t: Array, a: float, v: float, rng: Any) -> Array:
+    low, high = 0.15, _fastest(t)
+    f = low * (high / low) ** (t / t[-1])
+    phase = 2 * np.pi * np.concatenate([[0.0], np.cumsum((f[1:] + f[:-1]) / 2 * np.diff(t))])
+    return np.minimum(0.8 * a, 0.7 * v / (2 * np.pi * f)) * np.sin(phase)
+
+
+def _multisine(t: Array, a: float, v: float, rng: Any) -> Array:
+    f = np.round(np.geomspace(0.2, _fastest(t), 10) * t[-1]) / t[-1]
+    lines = np.sin(2 * np.pi * np.outer(t, f) + rng.uniform(0, 2 * np.pi, len(f))) / f**0.8
+    x = lines.sum(1) - lines[0].sum()
+    return x * min(0.8 * a / np.abs(x).max(), 0.8 * v / np.abs(np.gradient(x, t)).max())
+
+
+def _steps(t: Array, a: float, v: float, rng: Any) -> Array:
+    levels = a * np.array([0.0, 0.15, -0.15, 0.4, -0.4, 0.8, -0.8, 0.0])
+    wanted, out = levels[np.minimum((8 * t / t[-1]).astype(int), 7)], np.zeros(len(t))
+    reach = 0.9 * v * (t[1] - t[0])
+    for k in range(1, len(t)):
+        out[k] = out[k - 1] + np.clip(wanted[k] - out[k - 1], -reach, reach)
+    return out
+
+
+def _holds(t: Array, a: float, v: float, rng: Any) -> Array:
+    levels = a * np.array([0.0, 0.45, 0.9, 0.45, 0.0, -0.45, -0.9, -0.45])
+    knots = np.linspace(0, t[-1], 2 * len(levels))
+    return np.interp(t, knots, np.repeat(levels, 2))
+
+
+def _reversals(t: Array, a: float, v: float, rng: Any) -> Array:
+    """Small slow strokes that grow from 1 % to 12 % of the range: presliding, play and deadband."""
+    size = a * 0.01 * 12 ** (t / t[-1])
+    return size * _triangle(4 * t, 1.0)
+
+
+RELEASE = "hold and release"
+
+
+def _held(t: Array) -> Array:
+    return (np.mod(t, t[-1] / 3) < 0.6 * t[-1] / 3).astype(float)
+
+
+def _hold(t: Array, a: float, v: float, rng: Any) -> Array:
+    return np.interp(t, np.linspace(0, t[-1], 7), a * np.array([0.0, 0.35, 0.35, -0.6, -0.6, 0.85, 0.85]))
+
+
+SHAPES = {
+    "slow triangle": _slow,
+    "staircase of speeds": _staircase,
+    "chirp": _chirp,
+    "multisine": _multisine,
+    "steps of three sizes": _steps,
+    "ramps and holds": _holds,
+    "small reversals": _reversals,
+    RELEASE: _hold,
+    "fast driving and braking": _strokes,
+}

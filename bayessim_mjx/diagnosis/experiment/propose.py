@@ -1,0 +1,233 @@
+"""The next experiment: which safe motion separates the models that survived, or sharpens the one that is left."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from bayessim_mjx.diagnosis.experiment import advice
+from bayessim_mjx.diagnosis.experiment.design import Scored, Scorer
+from bayessim_mjx.diagnosis.experiment.excitation import Excitation, menu
+from bayessim_mjx.diagnosis.experiment.limits import Limits, limits_of
+from bayessim_mjx.diagnosis.experiment.rehearsal import Drives, Played, Rehearsal
+from bayessim_mjx.diagnosis.selection.models import Model
+from bayessim_mjx.diagnosis.selection.search import Race, ranked
+from bayessim_mjx.diagnosis.selection.uncertainty import win_share
+from bayessim_mjx.diagnosis.selection.verdict import MILD, Ruling
+from bayessim_mjx.effects.gravity_tilt import tilted
+
+if TYPE_CHECKING:
+    from bayessim_mjx.diagnosis.setup import Setup
+
+Array = NDArray[np.float64]
+SECONDS = 10.0
+MOST = 4  # models compared
+NOTHING = 1.0  # nats: less separates nobody
+BUDGET = 6_000  # windows simulated for a first look at the whole menu
+FINAL = 3  # experiments looked at in full
+WEIGHT = 0.1  # least share of a surviving model
+ALONE = 2  # joints that are moved one at a time where more are concerned
+
+
+@dataclass(frozen=True, eq=False)
+class Experiment:
+    """The proposal.
+
+    Attributes:
+        name, why, evidence, needs: in words and nats; pairs: [{"a", "b", "evidence"}].
+        table: every experiment with its evidence, best first; witnesses: streams worth logging as well.
+        chosen: what is to be played, None where nothing helps; menu: best ones in full; drives, limits: of the robot.
+        labels: of the models; unsafe: motions that left the limits however small they were made.
+    """
+
+    name: str
+    why: str
+    evidence: float
+    pairs: list[dict[str, Any]]
+    table: list[dict[str, Any]]
+    needs: str
+    witnesses: list[str]
+    chosen: Scored | None
+    menu: list[Scored]
+    drives: Drives
+    limits: Limits
+    labels: list[str] = field(default_factory=list)
+    unsafe: list[str] = field(default_factory=list)
+
+    def to_dict(self, file: str = "") -> dict[str, Any]:
+        """For diagnosis.json."""
+        own = {
+            k: getattr(self, k) for k in ("name", "why", "evidence", "pairs", "table", "needs", "witnesses", "unsafe")
+        }
+        return own | {"file": file if self.chosen is not None else ""}
+
+    def details(self) -> list[dict[str, Any]]:
+        """For the report: [{"name", "evidence", "pairs", "command": {"time", "ctrl": {actuator: values}}}]."""
+        out = []
+        for s in self.menu:
+            log, pairs = s.played.log, _named(s.pairs, self.labels)
+            ctrl = {n: c.tolist() for n, c in zip(log.actuators, log.ctrl.T, strict=True)}
+            command = {"time": log.time.tolist(), "ctrl": ctrl}
+            out.append({"name": s.name, "evidence": s.evidence, "pairs": pairs, "command": command})
+        return out
+
+
+def propose(
+    setup: Setup,
+    race: Race,
+    ruling: Ruling,
+    rivals_models: Sequence[Model] | None = None,
+    limits: Mapping[str, Any] | None = None,
+    seed: int = 0,
+) -> Experiment:
+    """The experiment that separates the surviving models best, within the limits.
+
+    Args:
+        rivals_models: models to be told from the winner; None: the ruling's rivals, and without any the closest losers.
+        limits: see `excitation.limits_of`.
+    """
+    cut, model = setup.fitter.simulator.windows, setup.physics.mj_model
+    models, contested = _contenders(race, ruling, rivals_models)
+    weights = np.maximum(win_share(models, cut.group, race.noise, np.random.default_rng(seed)), WEIGHT)
+    scorer = Scorer(setup, models, weights, seed)
+    allowed = limits_of(model, cut.logs, limits)
+    rows = max(cut.steps, int(round(SECONDS / cut.dt)) // cut.steps * cut.steps)
+    time = np.asarray(cut.dt * np.arange(rows), np.float64)
+    effects = {c.effect for m in models for c in m.effects} | {"payload", "gravity_tilt"}
+    stage = Rehearsal(setup, effects, time, allowed)
+    joints = _touched(stage.drives.joints(), models, model)
+    loaded = sorted(joints, key=lambda n: -setup.scales.force[joints[n]])[:ALONE]
+    every = menu(time, joints, loaded, stage.half, allowed.speed, stage.release, seed) if joints else []
+    scored = _look(scorer, stage, every)
+    attended = _with_help(scorer, stage, scored, model)
+    final = _in_full(scorer, stage, scored, attended)
+    safe = {s.played.excitation.name for s in scored}
+    found = _decide(scorer, stage, final, scored, attended, contested)
+    return replace(found, unsafe=[e.name for e in every if e.name not in safe])
+
+
+def _contenders(race: Race, ruling: Ruling, given: Sequence[Model] | None) -> tuple[list[Model], bool]:
+    """(winner and rivals, whether the logs left it open between them)."""
+    found = [r.model for rivals in ruling.rivals.values() for r in rivals if not r.contains] if given is None else given
+    found = list({id(m): m for m in found if m is not ruling.model}.values())
+    if found:
+        return [ruling.model, *found[: MOST - 1]], True
+    own = {c.effect for c in ruling.model.effects}
+    losers = [m for m in ranked(race) if m is not ruling.model and not {c.effect for c in m.effects} & own]
+    close = [m for m in losers if abs(race.better(m, ruling.model).evidence) < 3 * MILD and (m.effects or own)]
+    if not ruling.model.effects:  # nothing is wrong as far as these logs can tell: what could still hide?
+        close = close[:2]
+    return [ruling.model, *close[: MOST - 2]], False
+
+
+def _touched(joints: dict[str, int], models: Sequence[Model], model: Any) -> dict[str, int]:
+    """Driven joints that the models disagree about: named by an effect, at or above its body; for the world all."""
+    places = {(c.kind, c.where) for m in models for c in m.effects}
+    names: set[str] = set()
+    for kind, where in places:
+        if where == "all" or kind in ("world", "geom"):
+            return joints
+        if kind == "joint":
+            names.add(where)
+        if kind == "actuator":
+            names |= {n for n in joints if model.joint(n).id == model.actuator(where).trnid[0]}
+        body = model.body(where).id if kind == "body" else 0
+        while body:
+            names |= {n for n in joints if model.jnt_bodyid[model.joint(n).id] == body}
+            body = int(model.body_parentid[body])
+    own = {n: v for n, v in joints.items() if n in names}
+    return own or joints
+
+
+def _thetas(scorer: Scorer, shift: Array) -> Array:
+    vector = scorer.fitter.vector
+    return np.stack([vector(m.job.coordinates, m.job.values) + shift for m in scorer.models])
+
+
+def _look(scorer: Scorer, stage: Rehearsal, every: Sequence[Excitation]) -> list[Scored]:
+    """A first look at the whole menu, on as many windows as the budget allows, best first."""
+    shift = np.zeros(len(scorer.fitter.theta))
+    played = [p for p in stage.play(every, _thetas(scorer, shift)) if p.safe] if every else []
+    if not played:
+        return []
+    columns = sum(1 + m.size + 2 * scorer.fitter.simulator.nv for m in scorer.models)
+    full = (len(stage.time)) // scorer.fitter.simulator.windows.steps
+    each = int(np.clip(BUDGET / (columns * len(played)), 2, full))
+    pairs = scorer.score(played, shift, each)
+    return sorted((_scored(scorer, p, e) for p, e in zip(played, pairs, strict=True)), key=lambda s: -s.evidence)
+
+
+def _scored(scorer: Scorer, played: Played, pairs: Array, help_: advice.Help | None = None) -> Scored:
+    name = played.excitation.name + (f", {help_.name}" if help_ else "")
+    return Scored(name, played, scorer.mean(pairs), pairs, help_.needs if help_ else "")
+
+
+def _with_help(scorer: Scorer, stage: Rehearsal, scored: list[Scored], model: Any) -> list[Scored]:
+    """The best two motions again, with a known payload and with the robot mounted on its side."""
+    out = []
+    top = [s.played.excitation for s in scored[:2]]
+    for own in advice.helps(scorer.setup) if top else []:
+        gravity = np.asarray(tilted(jnp.asarray(model.opt.gravity), *(jnp.asarray(a) for a in own.tilt)))
+        played = [p for p in stage.play(top, _thetas(scorer, own.shift), gravity) if p.safe]
+        full = len(stage.time) // scorer.fitter.simulator.windows.steps
+        if played:
+            pairs = scorer.score(played, own.shift, max(2, full // 3))
+            out += [_scored(scorer, p, e, own) for p, e in zip(played, pairs, strict=True)]
+    return sorted(out, key=lambda s: -s.evidence)
+
+
+def _in_full(scorer: Scorer, stage: Rehearsal, scored: list[Scored], attended: list[Scored]) -> list[Scored]:
+    """The best ones on all of their windows."""
+    if not scored:
+        return []
+    full = len(stage.time) // scorer.fitter.simulator.windows.steps
+    best = [s.played for s in scored[:FINAL]]
+    pairs = scorer.score(best, np.zeros(len(scorer.fitter.theta)), full)
+    exact = [_scored(scorer, p, e) for p, e in zip(best, pairs, strict=True)]
+    return sorted([*exact, *attended[:2]], key=lambda s: -s.evidence)
+
+
+def _decide(
+    scorer: Scorer, stage: Rehearsal, final: list[Scored], scored: list[Scored], attended: list[Scored], contested: bool
+) -> Experiment:
+    labels = [advice.title(m) for m in scorer.models]
+    alone = [s for s in final if not s.needs]
+    chosen = alone[0] if alone else None
+    helped = next((s for s in final if s.needs), None)
+    if helped and (chosen is None or (chosen.evidence < MILD and helped.evidence > 1.5 * chosen.evidence + NOTHING)):
+        chosen = helped
+    useful = chosen is not None and (chosen.evidence > NOTHING or (len(labels) == 1 and chosen.evidence > 0.1))
+    why = advice.reason(scorer, chosen, labels, contested, useful, stage.limits)
+    witnesses = advice.witnesses(scorer.models, scorer.fitter.simulator.windows.logs)
+    kept = {s.name for s in final}
+    table = [*final, *(s for s in [*scored, *attended] if s.name not in kept)]
+    everything = sorted(table, key=lambda s: -s.evidence)
+    return Experiment(
+        name=chosen.name if chosen is not None and useful else "none",
+        why=why,
+        evidence=chosen.evidence if chosen is not None else 0.0,
+        pairs=_named(chosen.pairs, labels) if chosen is not None else [],
+        table=[{"experiment": s.name, "evidence": round(s.evidence, 2), "needs": s.needs} for s in everything],
+        needs=chosen.needs if chosen is not None and useful else advice.instead(scorer.models),
+        witnesses=witnesses,
+        chosen=chosen if useful else None,
+        menu=final,
+        drives=stage.drives,
+        limits=stage.limits,
+        labels=labels,
+    )
+
+
+def _named(pairs: Array, labels: Sequence[str]) -> list[dict[str, Any]]:
+    """The mean of both directions of every pair."""
+    n = len(labels)
+    return [
+        {"a": labels[i], "b": labels[j], "evidence": float(pairs[i, j] + pairs[j, i]) / 2}
+        for i in range(n)
+        for j in range(i + 1, n)
+    ]

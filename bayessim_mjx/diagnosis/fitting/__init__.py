@@ -1,0 +1,1 @@
+"""Models fitted to windows of the logs by multiple shooting. Knows no verdict."""

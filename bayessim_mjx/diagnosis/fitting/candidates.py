@@ -1,0 +1,173 @@
+"""What may be wrong: every effect at every place, and tied over all places, as coordinates of one vector theta."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from bayessim_mjx.diagnosis.fitting.scales import Scales, ranges
+from bayessim_mjx.effects.effect import Effect, Quantity
+from bayessim_mjx.effects.support.site import element_names, places
+from bayessim_mjx.errors import UserError
+from bayessim_mjx.parameters import Parameter, ParameterSpace
+from bayessim_mjx.physics import Physics
+
+Array = NDArray[np.float64]
+STEP = 0.005  # of the range: finite differences
+
+
+@dataclass(frozen=True)
+class Coordinate:
+    """One number to be fitted: the same value at one or several entries of theta.
+
+    Attributes:
+        name: of the (first) parameter; index: its entries in theta.
+        neutral, low, high: unit as the parameter's.
+        precision: of a Gaussian prior around neutral, 1/unit^2 (0: flat between the bounds).
+        unit: for people.
+    """
+
+    name: str
+    index: tuple[int, ...]
+    neutral: float
+    low: float
+    high: float
+    precision: float = 0.0
+    unit: str = ""
+
+    @property
+    def step(self) -> float:
+        return STEP * (self.high - self.low)
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One effect at one place (or tied over all), with the coordinates that describe it. Equal whatever its ranges are.
+
+    Attributes:
+        effect, where: names; `where` = "all" if tied over several places.
+        kind: actuator, joint, body, geom or world.
+        coordinates: its parameters.
+        shapes: `[k]`, whether a coordinate only shapes the effect.
+        probes: starting points `[n, k]`, in the coordinates' units.
+    """
+
+    effect: str
+    where: str
+    kind: str
+    coordinates: tuple[Coordinate, ...] = field(compare=False)
+    shapes: tuple[bool, ...] = field(compare=False)
+    probes: Array = field(repr=False, compare=False, hash=False, default_factory=lambda: np.zeros((0, 0)))
+
+    @property
+    def label(self) -> str:
+        return f"{self.effect}@{self.where}"
+
+
+def base_coordinates(space: ParameterSpace) -> tuple[Coordinate, ...]:
+    """The parameters that the simulator already has: a weak Gaussian prior inside their ranges."""
+    return tuple(
+        Coordinate(p.name, (i,), p.nominal, p.low, p.high, _precision(p), p.unit)
+        for i, p in enumerate(space.parameters)
+    )
+
+
+def _precision(p: Parameter) -> float:
+    if p.prior == "gaussian" and p.sd:
+        return 1.0 / p.sd**2
+    return 1.0 / (0.58 * (p.high - p.low)) ** 2  # sd of a uniform prior, doubled: between the bounds nearly flat
+
+
+def stack(kinds: Sequence[type[Effect]], scales: Scales) -> tuple[tuple[Effect, ...], list[str]]:
+    """One Effect per kind over all of its places, each with values and ranges of its own; and what is left out."""
+    made, left_out = [], []
+    for kind in kinds:
+        found = tuple(p for p in places(kind.kind, scales.model) if _alive(kind, p, scales))
+        if not found:
+            left_out.append(f"{kind.name}: no {kind.kind} here that could carry it and was excited")
+            continue
+        try:
+            parameters = tuple(p for place in found for p in ranges(kind, place, scales))
+            effect = kind(where=found, parameters=parameters)
+            effect.bind(scales.model, float(scales.model.opt.timestep), 1)
+        except UserError as error:
+            left_out.append(f"{kind.name}: {error}")
+            continue
+        made.append(effect)
+    return tuple(made), left_out
+
+
+def _alive(kind: type[Effect], place: str, scales: Scales) -> bool:
+    """Joints that never moved tell nothing of what happens in them; nor do contacts of a model without contacts."""
+    model = scales.model
+    if kind.kind == "joint":
+        joint = element_names(model, "joint").index(place)
+        return bool(scales.moves[model.jnt_dofadr[joint]])
+    if kind.kind == "geom":
+        geom = element_names(model, "geom").index(place)
+        off = int(model.opt.disableflags) & int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+        return bool(model.geom_contype[geom] | model.geom_conaffinity[geom]) and not off
+    return True
+
+
+def enumerate_candidates(physics: Physics) -> list[Candidate]:
+    """All candidates of a stack: each effect at each of its places; tied where there are several places."""
+    out, start = [], len(physics.model_space)
+    for effect in (e for e in physics.effects if e.quantities):
+        parameters, k = effect.space().parameters, len(effect.quantities)
+        count = len(effect.places())
+        rows = [range(start + i * k, start + (i + 1) * k) for i in range(count)]
+        for i, place in enumerate(effect.places()):
+            out.append(_candidate(effect, place, [parameters[i * k : (i + 1) * k]], [rows[i]]))
+        if count > 1 and effect.kind != "geom":
+            out.append(_candidate(effect, "all", [parameters[i * k : (i + 1) * k] for i in range(count)], rows))
+        start += count * k
+    return out
+
+
+def _candidate(
+    effect: Effect, where: str, parameters: Sequence[Sequence[Parameter]], rows: Sequence[range]
+) -> Candidate:
+    coordinates = []
+    for j, q in enumerate(effect.quantities):
+        own = [p[j] for p in parameters]
+        low, high = min(p.low for p in own), max(p.high for p in own)
+        index = tuple(row[j] for row in rows)
+        name = own[0].name if len(own) == 1 else f"all.{effect.name}.{q.name}"
+        coordinates.append(Coordinate(name, index, own[0].nominal, low, high, unit=own[0].unit))
+    shown = tuple(replace(c, precision=shrink(c)) for c in coordinates)
+    shapes = tuple(q.shape for q in effect.quantities)
+    return Candidate(effect.name, where, effect.kind, shown, shapes, _probes(effect, shown))
+
+
+def shrink(c: Coordinate) -> float:
+    """A half-normal of the range's width: keeps what data cannot tell near neutral, and is nothing to what they can."""
+    return 1.0 / (c.high - c.low) ** 2
+
+
+def _probes(effect: Effect, coordinates: Sequence[Coordinate]) -> Array:
+    """Starting points `[n, k]`: each amplitude alone at each grid value, shapes over their grids.
+
+    Amplitudes that act together alone (`Effect.joint`) also in all combinations.
+    """
+    quantities = effect.quantities
+    neutral = [c.neutral for c in coordinates]
+    values = [_grid(q, c) for q, c in zip(quantities, coordinates, strict=True)]
+    shapes = [v if q.shape else [n] for q, v, n in zip(quantities, values, neutral, strict=True)]
+    points: list[tuple[float, ...]] = []
+    for j in (j for j, q in enumerate(quantities) if not q.shape):
+        points += itertools.product(*(values[j] if i == j else own for i, own in enumerate(shapes)))
+    return np.array(points + (list(itertools.product(*values)) if effect.joint else []))
+
+
+def _grid(q: Quantity, c: Coordinate) -> list[float]:
+    """Shapes: over the whole range. Amplitudes: from neutral, upwards where there is room (a secant has no sign)."""
+    if q.shape:
+        return [c.low + f * (c.high - c.low) for f in q.grid]
+    end = c.high if c.high > c.neutral else c.low
+    return [c.neutral + f * (end - c.neutral) for f in q.grid]

@@ -1,0 +1,209 @@
+"""What the simulator's own time step is worth in the windows: mended by finer sub-steps, the rest counted as noise.
+
+Simulated without effects at sub-steps h, h/2 and h/4 from the same starts; errors against h -> 0 by Richardson.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from math import comb
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayessim_mjx.diagnosis.fitting.robot import Robot
+from bayessim_mjx.diagnosis.fitting.substeps import Errors, held
+from bayessim_mjx.diagnosis.fitting.windows import Windows
+from bayessim_mjx.logs.log import Channels, Log
+from bayessim_mjx.physics import Physics
+
+Array = NDArray[np.float64]
+FACTORS = (1, 2, 4, 8)
+CONTACTS = 4  # the finest with contacts: what is left there is chaos, which no step removes
+ENOUGH = 0.6  # noises: an error of the time step that does not show
+SHORTER = 5  # halvings of the time step that can be recommended
+WORTH = 1.0  # noises: from here on the user is told
+CONVERGING = 1.3  # errors that shrink by less from one sub-step to its half are not worth finer ones
+SURE = 0.4  # of what is taken for noise: below, the estimates themselves are too coarse
+FAR = 4.0  # medians: windows with larger errors are no measure, as in the fit
+
+
+@dataclass(frozen=True, eq=False)
+class Discretisation:
+    """Errors of the time step. Channels are positions, then velocities (`[2 nv]`, rad and rad/s or m and m/s).
+
+    Attributes:
+        timestep: s, the model's; factor: sub-steps of the diagnosis are `timestep / factor`.
+        order: of convergence, log2 of what halving the sub-step gains.
+        own: error of the simulator as it is (commands held, no correction) from the same starts.
+        settled: and after the start states have adapted; left: of the diagnosis' sub-steps, likewise adapted.
+        sigma: noise of the logs; floor: what the diagnosis takes for noise.
+        simulated: `[nv]`, channels that show no noise at all: logs of a simulation.
+        channels: names `[nv]`.
+    """
+
+    timestep: float
+    factor: int
+    order: float
+    own: Array
+    settled: Array
+    left: Array
+    sigma: Array
+    floor: Array
+    simulated: NDArray[np.bool_]
+    channels: tuple[str, ...]
+
+    def robot(self, robot: Robot) -> Robot:
+        """The robot at the sub-steps of the diagnosis."""
+        return robot if self.factor == 1 else refined(robot, self.timestep / self.factor)
+
+    def noisier(self, cut: Windows) -> Windows:
+        """Windows in which what cannot be removed is noise."""
+        nv = len(self.channels)
+        more = self.floor[:nv] - self.sigma[:nv]
+        spread = cut.spread + np.concatenate([3 * more, 10 * more])  # as of windows with this noise
+        return dataclasses.replace(cut, sigma_q=self.floor[:nv], sigma_v=self.floor[nv:], spread=spread)
+
+    @property
+    def believed(self) -> float:
+        """Share of what is taken for noise that is the sensors' (median over channels), at least SURE."""
+        known = np.isfinite(self.sigma) & ~np.tile(self.simulated, 2)
+        return float(np.clip(np.median(self.sigma[known] / self.floor[known]), SURE, 1.0)) if known.any() else 1.0
+
+    def warnings(self) -> list[str]:
+        """In words, where the simulator's own time step is worth more than the noise."""
+        nv = len(self.channels)
+        noises = self.own[:nv] / self.sigma[:nv]
+        if noises.max() < WORTH:
+            return []
+        at = int(np.argmax(noises))
+        size = "" if self.simulated[at] else f"{noises[at]:.1f} noise standard deviations, "
+        text = (
+            f"the simulator's time step of {1e3 * self.timestep:.3g} ms costs {size}{self.own[at]:.2g} rad "
+            f"or m within a window at {self.channels[at]}: a gap for every policy that is trained with it; "
+        )
+        return [text + self._remedy(noises[at], bool(self.simulated[at]))]
+
+    def _remedy(self, noises: float, simulated: bool) -> str:
+        halvings = int(np.ceil(np.log2(noises / WORTH)))
+        told = not simulated and halvings <= SHORTER
+        other = f"a step of {1e3 * self.timestep / 2**halvings:.2g} ms" if told else "a shorter step"
+        text = f"{other}, or the integrator RK4 where nothing is in contact, reduces it"
+        if self.factor > 1:
+            text += f"; the diagnosis simulates at {1e3 * self.timestep / self.factor:.3g} ms"
+        if simulated:
+            return f"{text}; the logs show no noise, so everything smaller than this counts as noise"
+        known = np.isfinite(self.sigma)
+        left = np.sqrt(np.maximum((self.floor[known] / self.sigma[known]) ** 2 - 1, 0.0)).max()
+        return f"{text}; the rest, {left:.2g} noise standard deviations, counts as noise" if left > ENOUGH else text
+
+    def to_dict(self) -> dict[str, Any]:
+        """For diagnosis.json: numbers by channel, in noise units and physical ones."""
+        nv = len(self.channels)
+
+        def by(values: Array) -> dict[str, float]:
+            return {n: float(v) for n, v in zip(self.channels, values, strict=True)}
+
+        return {
+            "timestep": self.timestep,
+            "substep": self.timestep / self.factor,
+            "order": self.order,
+            "noises": by(self.own[:nv] / self.sigma[:nv]),
+            "physical": by(self.own[:nv]),
+            "left": by(self.left[:nv] / self.sigma[:nv]),
+            "noise": by(self.sigma[:nv]),
+            "floor": by(self.floor[:nv]),
+            "simulated": {n: bool(s) for n, s in zip(self.channels, self.simulated, strict=True)},
+        }
+
+
+def refined(robot: Robot, timestep: float) -> Robot:
+    """The robot with another timestep in its model, s."""
+    model = copy.copy(robot.mj_model)
+    model.opt.timestep = timestep
+    return dataclasses.replace(robot, mj_model=model)
+
+
+def measure(physics: Physics, cuts: Callable[[int], Windows], logs: Sequence[Log], most: int) -> Discretisation:
+    """The errors of `physics` (without effects) in the windows, and the sub-steps that the diagnosis should take.
+
+    Args:
+        cuts: factor -> the same windows with commands for that many times the sub-steps.
+        logs: as recorded.
+        most: the finest factor that can be afforded.
+    """
+    first = cuts(1)
+    touching = contacts(physics)
+    sigma = np.concatenate([first.sigma_q, first.sigma_v])
+    errors = Errors(physics, first, 4)
+    errors.start(sigma)
+    coarse, mid, fine = (errors.run(cuts(f), f) for f in (1, 2, 4))
+    plain = errors.run(held(first), 1, corrected=False)
+    settle = errors.settler(sigma)
+    one, two = settle(coarse - mid), settle(mid - fine)
+    gain = _gain(one / sigma, two / sigma)
+    limit = fine + (fine - mid) / max(gain - 1, 1.0)
+    at = {f: _size(one, touching) * gain / (gain - 1) / gain ** np.log2(f) for f in FACTORS}
+    settled = _size(settle(plain - limit), touching)
+    clean = np.array([noise_free(logs, i) for i in physics.mj_model.jnt_qposadr[physics.mj_model.dof_jntid]])
+    base = np.hypot(sigma, np.tile(clean, 2) * settled)  # who simulated such logs may have used this step or another
+    allowed = [f for f in FACTORS if f <= (min(most, CONTACTS) if touching else most)]
+    factor = _choose({f: float(np.max(at[f] / base)) for f in allowed}, gain)
+    return Discretisation(
+        timestep=float(physics.mj_model.opt.timestep),
+        factor=factor,
+        order=float(np.log2(gain)),
+        own=_size(plain - limit, touching),
+        settled=settled,
+        left=at[factor],
+        sigma=sigma,
+        floor=np.sqrt(base**2 + _excess(at[factor], base)),
+        simulated=clean,
+        channels=Channels.of(physics.mj_model).qvel,
+    )
+
+
+def _gain(one: Array, two: Array) -> float:
+    """What halving the sub-step gains in the usual window: from hardly anything (chaos) to the second order's 4."""
+    size = [np.sqrt(np.sum(e**2, (1, 2))) for e in (one, two)]
+    ratio = np.median(size[0] / np.maximum(size[1], 1e-12))
+    return float(np.clip(ratio, 1.1, 4.0))
+
+
+def _choose(error: dict[int, float], gain: float) -> int:
+    """The coarsest factor that is fine enough; where none is, the finest, if finer ones gain anything."""
+    enough = [f for f, e in error.items() if e < ENOUGH]
+    return min(enough) if enough else max(error) if gain > CONVERGING else 1
+
+
+def _excess(error: Array, noise: Array) -> Array:
+    """Squares of errors beyond what does not show."""
+    known = np.isfinite(noise)
+    return np.maximum(error**2 - np.square(ENOUGH * noise, where=known, out=np.zeros_like(noise)), 0.0)
+
+
+def _size(error: Array, touching: bool) -> Array:
+    """Root mean square `[channels]` of errors `[W, H, channels]`; windows far off count less, with contacts hardly."""
+    each = np.mean(error**2, axis=1)
+    usual = np.median(each, axis=0)
+    return np.asarray(np.sqrt(usual if touching else np.mean(np.minimum(each, FAR**2 * usual), axis=0)))
+
+
+def contacts(physics: Physics) -> bool:
+    """Whether anything can touch."""
+    return bool(physics.template._impl.contact.dist.shape[0])
+
+
+def noise_free(logs: Sequence[Log], column: int) -> bool:
+    """Whether a position shows no noise: of white noise all differences have the same level, smooth motion has none."""
+    shares = [_level(log.qpos[:, column], 8) / max(_level(log.qpos[:, column], 4), 1e-300) for log in logs]
+    return bool(np.median(shares) < 0.1)
+
+
+def _level(x: Array, order: int) -> float:
+    """Standard deviation of white noise in x [T] by differences of an order: Var = binomial(2 n, n) sigma^2."""
+    return float(np.median(np.abs(np.diff(x, order))) / np.sqrt(comb(2 * order, order))) if len(x) > order else 0.0

@@ -1,0 +1,256 @@
+"""The robot under diagnosis, from a task or an MJCF: a model that MJX can simulate, parameters, control step."""
+
+import copy
+import dataclasses
+import math
+import warnings
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import mujoco
+import numpy as np
+
+from bayessim_mjx import config
+from bayessim_mjx.config import foreign
+from bayessim_mjx.effects.effect import Effect
+from bayessim_mjx.errors import UserError
+from bayessim_mjx.parameters import ParameterSpace, elements
+from bayessim_mjx.physics import Physics, mjx
+
+if TYPE_CHECKING:
+    from bayessim_mjx.env import Task
+
+TRAINING = ("frequency", "observations", "actions", "sim_params")
+WITHIN = (0.8, 1.2)  # the default range of a scale
+_IMPLICIT = int(mujoco.mjtIntegrator.mjINT_IMPLICIT)
+_FREE = int(mujoco.mjtJoint.mjJNT_FREE)
+_AXIAL = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Robot:
+    """What a diagnosis needs of a robot.
+
+    Attributes:
+        mj_model: the nominal model.
+        spec: gives a fresh specification that compiles to it.
+        control_dt: s; None: the logs' own period holds.
+        space: the parameters that the simulator already has and may recalibrate.
+        name: the task's, or the file's without its ending.
+        max_qvel: the task's limit of simulated speeds, see `Physics`.
+    """
+
+    mj_model: mujoco.MjModel
+    spec: Callable[[], mujoco.MjSpec]
+    control_dt: float | None
+    space: ParameterSpace
+    name: str
+    max_qvel: float | Sequence[float] | None = None
+
+    def physics(
+        self, control_dt: float, effects: Sequence[Effect] = (), space: ParameterSpace | None = None
+    ) -> Physics:
+        """The robot at control steps of `control_dt` s, with `space` in the place of its own parameters."""
+        model = with_timestep(self.mj_model, control_dt)
+        return Physics(model, control_dt, self.space if space is None else space, effects, self.max_qvel)
+
+
+def of_task(env: "Task", parameters: str | Path | None = None) -> Robot:
+    """The robot of one of our own tasks (`registry.make`); parameters: a params.yaml, None: the default space.
+
+    Raises:
+        UserError: the task is not MuJoCo's, or the file is wrong.
+    """
+    if not hasattr(env, "physics") or not hasattr(env, "spec"):
+        raise UserError(f"--task {env.name}: it has no MuJoCo model of ours; give its MJCF with --model")
+    _check(env.mj_model, f"--task {env.name}")
+    space, limit = _space(env.mj_model, parameters), env.physics.max_qvel
+    return Robot(env.mj_model, env.spec, env.dt, space, env.name, None if limit is None else limit.tolist())
+
+
+def of_file(path: str | Path, parameters: str | Path | None = None) -> Robot:
+    """The robot of an MJCF (or URDF) file with hinge or slide joints and actuators.
+
+    Raises:
+        UserError: the file is missing, MuJoCo cannot load it, it has nothing to diagnose, or MJX lacks a feature.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise UserError(f"--model {path}: no such file")
+    spec = _loaded(path)
+    if int(spec.option.integrator) == _IMPLICIT:
+        warnings.warn(f"{path}: MJX has no integrator implicit; implicitfast is used (no Coriolis terms)", stacklevel=2)
+        spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    model = _compiled(spec, path)
+    _check(model, str(path))
+    return Robot(model, spec.copy, None, _space(model, parameters), path.stem)
+
+
+def _loaded(path: Path) -> mujoco.MjSpec:
+    try:
+        return mujoco.MjSpec.from_file(str(path))
+    except ValueError as error:
+        raise UserError(f"{path}: MuJoCo cannot load it: {_one_line(error)}") from None
+
+
+def _compiled(spec: mujoco.MjSpec, path: Path) -> mujoco.MjModel:
+    try:
+        return spec.compile()
+    except ValueError as error:
+        raise UserError(f"{path}: MuJoCo cannot compile it: {_one_line(error)}") from None
+
+
+def _one_line(error: Exception) -> str:
+    return "; ".join(line.strip() for line in str(error).splitlines() if line.strip())
+
+
+def _check(model: mujoco.MjModel, source: str) -> None:
+    """Refuse a model without motion or commands, and what MJX cannot simulate."""
+    if not np.isin(model.jnt_type, _AXIAL).any():
+        raise UserError(f"{source}: the model has no hinge or slide joint, so there is no motion to compare")
+    if not model.nu:
+        raise UserError(f"{source}: the model has no actuator, so the logged commands cannot act on it")
+    step = float(model.opt.timestep)
+    if not (math.isfinite(step) and step > 0):
+        raise UserError(f"{source}: <option timestep> = {step:g}; allowed: seconds > 0")
+    if broken := _not_finite(model):
+        raise UserError(f"{source}: numbers that are not finite in {', '.join(broken)}; allowed: finite numbers")
+    idle = [_label(model, "actuator", i) for i in range(model.nu) if not np.any(model.actuator_gear[i])]
+    if len(idle) == model.nu:
+        raise UserError(f"{source}: gear = 0 of every actuator ({', '.join(idle)}): the logged commands cannot act")
+    if idle:
+        warnings.warn(f"{source}: gear = 0 of {', '.join(idle)}: these commands do nothing", stacklevel=3)
+    if model.nplugin:
+        raise UserError(f"{source}: MJX cannot simulate this model: it has plugins")
+    ignored = [what for field, what in _IGNORED.items() if np.any(getattr(model, field, 0.0))]
+    if ignored:
+        warnings.warn(
+            f"{source}: MJX leaves out {', '.join(ignored)}: effects may be found in their place", stacklevel=3
+        )
+    try:
+        mjx.make_data(mjx.put_model(model, impl="jax"))
+    except (NotImplementedError, ValueError, TypeError) as error:
+        raise UserError(f"{source}: MJX cannot simulate this model: {_one_line(error)}{_remedy(str(error))}") from None
+
+
+def _not_finite(model: mujoco.MjModel) -> list[str]:
+    """MuJoCo's arrays with a NaN or an infinity in them, by name: a gain, a mass, and what follows from them."""
+    fields = ((name, getattr(model, name, None)) for name in dir(model) if not name.startswith("_"))
+    floats = ((name, x) for name, x in fields if isinstance(x, np.ndarray) and x.dtype.kind == "f")
+    return [name for name, x in floats if not np.isfinite(x).all()]
+
+
+_IGNORED = {  # in the model but not in MJX's equations
+    "actuator_delay": "the actuators' delay",
+    "actuator_damping": "the actuators' damping",
+    "dof_dampingpoly": "nonlinear damping",
+    "jnt_stiffnesspoly": "nonlinear stiffness",
+}
+
+
+def _remedy(message: str) -> str:
+    """What to change in the MJCF."""
+    for word, remedy in _REMEDIES.items():
+        if word in message:
+            return f" ({remedy})"
+    return ""
+
+
+_REMEDIES = {
+    "mjtIntegrator": "use Euler, implicitfast or RK4 in <option integrator=...>",
+    "mjtSolver": "use CG or Newton in <option solver=...>",
+    "collisions": "switch the contacts of these geoms off by contype and conaffinity, or use other shapes",
+    "margin/gap": "take margin and gap off these geoms",
+    "Flex": "take the flexible bodies out",
+    "mjtEnableBit": "take it out of <option><flag>",
+    "mjGEOM": "use other shapes for these geoms",
+    "fluid": "use the integrator Euler, or density and viscosity 0",
+    "mjtSensor": "take these sensors out: a diagnosis reads joints",
+    "not supported": "MJX has motor, position, velocity and general actuators on joints, tendons and sites",
+}
+
+
+def with_timestep(model: mujoco.MjModel, control_dt: float) -> mujoco.MjModel:
+    """A copy whose timestep is the largest that divides `control_dt` s and is no longer than the model's own."""
+    if not control_dt > 0:
+        raise ValueError(f"control_dt = {control_dt} s: must be positive")
+    substeps = max(1, math.ceil(control_dt / model.opt.timestep - 1e-6))
+    model = copy.copy(model)
+    model.opt.timestep = control_dt / substeps
+    return model
+
+
+def _space(model: mujoco.MjModel, parameters: str | Path | None) -> ParameterSpace:
+    return default_space(model) if parameters is None else read_params(parameters, model)
+
+
+def default_space(model: mujoco.MjModel) -> ParameterSpace:
+    """Scales of damping, armature and mass, 1 within 20 %, wherever the model has some that can move.
+
+    The mass of a body scales its inertia too. Names are those of the loop: `<joint>_damping_mult` ...
+    """
+    joints = [j for j in range(model.njnt) if model.jnt_type[j] != _FREE]
+    dofs = model.jnt_dofadr[joints]
+    damped = [_label(model, "joint", j) for j, d in zip(joints, dofs, strict=True) if model.dof_damping[d] > 0]
+    geared = [_label(model, "joint", j) for j, d in zip(joints, dofs, strict=True) if model.dof_armature[d] > 0]
+    moving = np.flatnonzero((model.body_weldid != 0) & (model.body_mass > mujoco.mjMINVAL))
+    heavy = [_label(model, "body", int(b)) for b in moving]
+    groups = {
+        "dof_properties": {"damping": damped, "armature": geared},
+        "rigid_body_properties": {"mass": heavy},
+    }
+    section = {g: {a: _scale(found) for a, found in members.items() if found} for g, members in groups.items()}
+    return ParameterSpace.from_config({"actor_params": {_whole(model): section}}, model)
+
+
+def _label(model: mujoco.MjModel, kind: str, i: int) -> str:
+    return getattr(model, kind)(i).name or f"{kind}{i}"
+
+
+def _scale(include: Sequence[str]) -> dict[str, Any]:
+    return {"range": list(WITHIN), "operation": "scaling", "include": [_literal(name) for name in include]}
+
+
+def _literal(name: str) -> str:
+    """The name as a pattern that matches nothing else."""
+    return "".join(f"[{c}]" if c in "*?[" else c for c in name)
+
+
+def _whole(model: mujoco.MjModel) -> str:
+    """A name of the whole model as an actor: none of its bodies is called so."""
+    name = elements.WHOLE
+    while name in {model.body(b).name for b in range(model.nbody)}:
+        name += "_"
+    return name
+
+
+def _of_training(raw: Any) -> list[str]:
+    """Keys of the section that are about training: a diagnosis takes its noise from the logs."""
+    section = raw.get("task") if isinstance(raw.get("task"), dict) else raw
+    section = section.get("randomization_params", section)
+    return [key for key in TRAINING if isinstance(section, dict) and section.get(key) not in (None, 1)]
+
+
+def read_params(path: str | Path, model: mujoco.MjModel) -> ParameterSpace:
+    """The space of a params.yaml in the loop's format.
+
+    The file holds `task: {randomization_params: ...}`, as a task's YAML does, or that section's contents directly
+    (`actor_params: ...`, `option: ...`). Other sections of a task's YAML are passed over.
+
+    Raises:
+        UserError: naming the file and the key.
+    """
+    raw = config.read_yaml(path)
+    foreign.note(raw, str(path), more=_of_training(raw))
+    section = (raw.get("task") or {}) if "task" in raw else raw
+    section = section.get("randomization_params", section) if isinstance(section, dict) else section
+    if not isinstance(section, dict) or not {"actor_params", "option"} & set(section):
+        raise UserError(f"{path}: no parameters: expected task.randomization_params, or actor_params, with ranges")
+    try:
+        space = ParameterSpace.from_config(section, model)
+    except UserError as error:
+        raise UserError(f"{path}: {error}") from None
+    if not len(space):
+        raise UserError(f"{path}: it names no parameter; leave --parameters out for damping, armature and mass")
+    return space

@@ -1,0 +1,178 @@
+"""How large forces, speeds and travel are at each place of this robot in these logs: what effects' ranges grow with."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from bayessim_mjx.diagnosis.logcheck import loads
+from bayessim_mjx.effects.effect import Effect, Quantity
+from bayessim_mjx.effects.support.site import element_names
+from bayessim_mjx.errors import UserError
+from bayessim_mjx.logs.log import Log
+from bayessim_mjx.parameters import Parameter
+
+Array = NDArray[np.float64]
+LARGE = 98.0  # percentile that counts as the largest
+LOAD = 3.0  # times its own mass that a body may carry at least
+
+
+@dataclass(frozen=True)
+class Scales:
+    """Per dof `[nv]`: force [N m or N], speed, travel [rad or m], inertia; per actuator `[nu]`: command, effort.
+
+    moves: `[nv]` bool, whether the joint moved by more than its noise at all; carried: `[nbody]`, kg that the robot can
+    hold at each body; period: s between the logs' rows.
+    """
+
+    model: mujoco.MjModel
+    force: Array
+    speed: Array
+    travel: Array
+    inertia: Array
+    command: Array
+    effort: Array
+    moves: NDArray[np.bool_]
+    carried: Array
+    period: float
+
+    def at(self, kind: str, place: str) -> dict[str, float]:
+        """{word of `Quantity.per`: scale} at one place."""
+        model = self.model
+        if kind == "joint":
+            return self._of_dof(int(model.jnt_dofadr[element_names(model, "joint").index(place)]))
+        if kind == "actuator":
+            i = element_names(model, "actuator").index(place)
+            joint = int(model.actuator_trnid[i, 0])
+            on_joint = int(model.actuator_trntype[i]) <= int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+            own = self._of_dof(int(model.jnt_dofadr[joint])) if on_joint else {}
+            if own:
+                own["travel"] *= abs(float(model.actuator_gear[i, 0])) or 1.0  # of the actuator's own length
+            return own | {"command": float(self.command[i]), "force": float(self.effort[i]), "period": self.period}
+        if kind == "body":
+            i = element_names(model, "body").index(place)
+            gravity = float(np.linalg.norm(model.opt.gravity)) or 9.81
+            below = float(model.body_subtreemass[i])
+            mass = max(float(model.body_mass[i]), 0.1 * below)
+            load = max(LOAD * mass, float(self.carried[i]))
+            own = {"mass": mass, "weight": below * gravity, "size": loads.size(model, i)}
+            return own | {"carried": load, "tool": loads.reach(model, i)}
+        return {"moment": _moment(model)}
+
+    def _of_dof(self, v: int) -> dict[str, float]:
+        words = ("force", "speed", "travel", "inertia")
+        return {word: float(getattr(self, word)[v]) for word in words} | {"period": self.period}
+
+
+def measure(model: mujoco.MjModel, logs: Sequence[Log]) -> Scales:
+    """Scales from logs on an even grid; forces by inverse dynamics of the measured motion, and from the commands."""
+    speed = _large([log.qvel for log in logs])
+    ptp = np.max([_span(model, log) for log in logs], axis=0)
+    data = mujoco.MjData(model)
+    torque, inertia, places = [], [], []
+    for log in logs:
+        acceleration = np.gradient(log.qvel, log.time, axis=0)
+        for k in range(0, len(log), max(1, len(log) // 100)):
+            places.append(log.qpos[k])
+            data.qpos[:], data.qvel[:], data.qacc[:] = log.qpos[k], log.qvel[k], acceleration[k]
+            mujoco.mj_inverse(model, data)
+            torque.append(np.abs(data.qfrc_inverse))
+            inertia.append(_diagonal(model, data))
+    command = _large([log.ctrl for log in logs])
+    force = np.percentile(torque, LARGE, axis=0)
+    effort = np.zeros(model.nu)
+    for i in range(model.nu):
+        gear = float(model.actuator_gear[i, 0]) or 1.0
+        joint = int(model.actuator_trnid[i, 0])
+        on_joint = int(model.actuator_trntype[i]) <= int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+        needed = float(force[model.jnt_dofadr[joint]]) / abs(gear) if on_joint else 0.0
+        direct = command[i] * abs(float(model.actuator_gainprm[i, 0])) if model.actuator_biasprm[i, 1] == 0 else 0.0
+        effort[i] = max(needed, direct, 1e-9)
+        if on_joint:
+            force[model.jnt_dofadr[joint]] = max(force[model.jnt_dofadr[joint]], direct * abs(gear))
+    noise = np.sqrt(np.mean([log.sigma_dofs**2 for log in logs], axis=0))
+    return Scales(
+        model=model,
+        force=np.maximum(force, 1e-9),
+        speed=np.maximum(speed, 1e-6),
+        travel=np.maximum(ptp / 2, 1e-6),
+        inertia=np.maximum(np.mean(inertia, axis=0), 1e-12),
+        command=np.maximum(command, 1e-9),
+        effort=effort,
+        moves=ptp > 10 * noise + 1e-9,
+        carried=loads.carried(model, np.array(places)),
+        period=float(np.median([log.period for log in logs])),
+    )
+
+
+def _moment(model: mujoco.MjModel) -> float:
+    """N m: what the robot weighs on its base when stretched out: masses times the lengths that carry them."""
+    length = np.zeros(model.nbody)
+    for b in range(1, model.nbody):
+        length[b] = length[model.body_parentid[b]] + np.linalg.norm(model.body_pos[b]) * (model.body_parentid[b] > 0)
+    arms = length[1:] + np.linalg.norm(model.body_ipos[1:], axis=1)
+    gravity = float(np.linalg.norm(model.opt.gravity)) or 9.81
+    return float(model.body_mass[1:] @ arms) * gravity or 1.0
+
+
+def _large(parts: Sequence[Array]) -> Array:
+    return np.percentile(np.abs(np.concatenate(parts)), LARGE, axis=0) if parts[0].shape[1] else np.zeros(0)
+
+
+def _span(model: mujoco.MjModel, log: Log) -> Array:
+    """Range of motion per dof `[nv]`; orientations as rotation vectors from the first one."""
+    away = np.zeros((len(log), model.nv))
+    for row, qpos in zip(away, log.qpos, strict=True):
+        mujoco.mj_differentiatePos(model, row, 1.0, log.qpos[0], qpos)
+    return np.ptp(away, axis=0) if len(log) else np.zeros(model.nv)
+
+
+def _diagonal(model: mujoco.MjModel, data: mujoco.MjData) -> Array:
+    """Diagonal of the mass matrix `[nv]`, by its product with each unit vector (the same call in every MuJoCo)."""
+    column, out = np.zeros(model.nv), np.zeros(model.nv)
+    for v in range(model.nv):
+        mujoco.mj_mulM(model, data, column, np.eye(model.nv)[v])
+        out[v] = column[v]
+    return out
+
+
+def ranges(effect: type[Effect], place: str, scales: Scales) -> tuple[Parameter, ...]:
+    """The effect's parameters at a place, with ranges that fit this robot.
+
+    Raises:
+        UserError: a quantity grows with something that its kind of place does not have.
+    """
+    here = scales.at(effect.kind, place)
+    own = effect(where=place).defaults().parameters
+    return tuple(_ranged(p, q, here, effect) for p, q in zip(own, effect.quantities, strict=True))
+
+
+def _ranged(p: Parameter, q: Quantity, here: dict[str, float], effect: type[Effect]) -> Parameter:
+    if not q.per or q.reach is None:
+        return p
+    unit = _product(q.per, here, effect)
+    low, high = (float(q.neutral + r * unit) if q.neutral == 0 else float(r * unit) for r in q.reach)
+    low, high = (max(low, q.low), max(high, q.high)) if q.at_least else (low, high)
+    nominal = min(max(q.neutral, low), high)
+    low, high = (low, high) if low < high else (q.low, q.high)
+    prior = q.prior if low > 0 else "uniform"
+    return Parameter(
+        p.name, nominal, low, high, unit=p.unit, prior=prior, attribute=p.attribute, target=p.target, kind="effect"
+    )
+
+
+def _product(expression: str, here: dict[str, float], effect: type[Effect]) -> float:
+    """'force/speed^2' -> number."""
+    value = 1.0
+    for i, factor in enumerate(expression.split("/")):
+        word, _, power = factor.strip().partition("^")
+        if word in ("1", ""):
+            continue
+        if word not in here:
+            raise UserError(f"{effect.name}: range per {word!r}; a {effect.kind} has {', '.join(here) or 'no scales'}")
+        value *= here[word] ** ((-1 if i else 1) * float(power or 1))
+    return value

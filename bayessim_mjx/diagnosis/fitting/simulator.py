@@ -1,0 +1,156 @@
+"""One compiled simulator for every candidate: (theta, window, start, force) -> measured minus simulated motion."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from bayessim_mjx.device import compiler_options, cores
+from bayessim_mjx.diagnosis.fitting.windows import Batch, Windows
+from bayessim_mjx.physics import Drive, Physics, begin, control_step, staggered
+
+Array = NDArray[np.float64]
+# worlds in one call; fewer are padded, more are cut. A CPU wants them in its cache (a pendulum's: 2.2 times as fast as
+# 1024) and one call on each core, an accelerator as many as it can get
+CPU_LANES = 128
+LANES = 4096
+
+
+def difference(model: mujoco.MjModel, measured: jax.Array, simulated: jax.Array) -> jax.Array:
+    """qpos minus qpos in the tangent space `[nv]`: rotation vectors where there are quaternions."""
+    parts = []
+    for j in range(model.njnt):
+        q, kind = int(model.jnt_qposadr[j]), int(model.jnt_type[j])
+        if kind == int(mujoco.mjtJoint.mjJNT_FREE):
+            parts.append(measured[q : q + 3] - simulated[q : q + 3])
+            q += 3
+        if kind in (int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)):
+            parts.append(_rotation(measured[q : q + 4], simulated[q : q + 4]))
+        else:
+            parts.append(measured[q : q + 1] - simulated[q : q + 1])
+    return jnp.concatenate(parts)
+
+
+def _rotation(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Rotation vector of conj(b) a, small-angle safe (2 Im, exact to third order at the errors of a window)."""
+    w = a[0] * b[0] + jnp.dot(a[1:], b[1:])
+    v = b[0] * a[1:] - a[0] * b[1:] - jnp.cross(b[1:], a[1:])
+    return 2.0 * v * jnp.sign(w)
+
+
+def integrate(model: mujoco.MjModel, qpos: jax.Array, step: jax.Array) -> jax.Array:
+    """qpos moved by `step` `[nv]` in the tangent space."""
+    out = qpos
+    for j in range(model.njnt):
+        q, v, kind = int(model.jnt_qposadr[j]), int(model.jnt_dofadr[j]), int(model.jnt_type[j])
+        if kind == int(mujoco.mjtJoint.mjJNT_FREE):
+            out = out.at[q : q + 3].add(step[v : v + 3])
+            q, v = q + 3, v + 3
+        if kind in (int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)):
+            out = out.at[q : q + 4].set(_turned(qpos[q : q + 4], step[v : v + 3]))
+        else:
+            out = out.at[q].add(step[v])
+    return out
+
+
+def _turned(quat: jax.Array, by: jax.Array) -> jax.Array:
+    r = jnp.concatenate([jnp.sqrt(jnp.maximum(0.0, 1.0 - jnp.sum(by * by) / 4))[None], by / 2])
+    w = quat[0] * r[0] - jnp.dot(quat[1:], r[1:])
+    v = quat[0] * r[1:] + r[0] * quat[1:] + jnp.cross(quat[1:], r[1:])
+    new = jnp.concatenate([w[None], v])
+    return new / jnp.linalg.norm(new)
+
+
+class Simulator:
+    """Windows under a stack of effects. One program for every value and subset of effects, and every start and force.
+
+    Args:
+        physics: with all effects in its stack.
+        windows: what to simulate.
+        lanes: worlds per call.
+
+    Attributes:
+        traces: number of times the program was traced (1, whatever is asked).
+        rollouts: windows simulated so far.
+    """
+
+    def __init__(self, physics: Physics, windows: Windows, lanes: int | None = None) -> None:
+        self.physics, self.windows = physics, windows
+        on_cpu = jax.default_backend() == "cpu"
+        self.lanes = lanes or (CPU_LANES if on_cpu else LANES)
+        self.workers = cores() if on_cpu else 1
+        self.nv = int(physics.mj_model.nv)
+        self.channels = 2 * self.nv
+        self.traces = self.rollouts = 0
+        self._run = jax.jit(jax.vmap(self._one, in_axes=(None, 0, 0, 0, 0)), compiler_options=compiler_options())
+        self._no_offset = np.zeros((self.lanes, 2 * self.nv), np.float32)
+        self._no_force = jnp.zeros((self.lanes, windows.steps, self.nv))
+
+    def _one(
+        self, batch: Batch, index: jax.Array, theta: jax.Array, offset: jax.Array, force: jax.Array
+    ) -> tuple[jax.Array, Any]:
+        """Errors `[H, 2 nv]` of one window (positions, velocities) and the actuators' forces `[H, nu]`."""
+        self.traces += 1
+        model = self.physics.mj_model
+        # s, by which the integrator's velocities lie before its positions
+        early = 0.5 * float(model.opt.timestep) if staggered(model) else 0.0
+        own = jax.tree.map(lambda x: x[index], batch)
+        world = begin(self.physics, theta, own.around)
+        world = world.replace(qpos=integrate(model, world.qpos, offset[: self.nv]), qvel=world.qvel + offset[self.nv :])
+
+        def step(world: Any, row: tuple) -> tuple[Any, tuple]:
+            command, extra, enabled = row
+            world, data = control_step(self.physics, world, command, Drive(extra, enabled, own.law))
+            late = world.measurement["qvel"] + early * data.qacc
+            return world, (world.measurement["qpos"], late, data.actuator_force)
+
+        _, (qpos, qvel, effort) = jax.lax.scan(step, world, (own.command, force, own.enabled))
+        error = jax.vmap(lambda a, b: difference(model, a, b))(own.qpos, qpos)
+        return jnp.concatenate([error, own.qvel - qvel], axis=1), effort
+
+    def run(
+        self,
+        thetas: Array,
+        offsets: Array | None = None,
+        windows: NDArray[np.int64] | None = None,
+        force: Array | None = None,
+    ) -> Array:
+        """Measured minus simulated motion.
+
+        Args:
+            thetas: `[n, P]`, values of `physics.space`.
+            offsets: `[n, W, 2 nv]`, changes of the measured start states; None: none.
+            windows: indices `[W]` of the windows wanted; None: all.
+            force: `[n, W, H, nv]`, extra generalised force; None: none.
+
+        Returns:
+            `[n, W, H, 2 nv]`, positions then velocities; not finite values (diverged) are large numbers.
+        """
+        chosen = np.arange(len(self.windows)) if windows is None else np.asarray(windows)
+        n, w = len(thetas), len(chosen)
+        flat_offsets = None if offsets is None else np.asarray(offsets, np.float32).reshape(n * w, -1)
+        flat_force = None if force is None else np.asarray(force, np.float32).reshape(n * w, *force.shape[2:])
+        thetas, of_theta, of_window = np.asarray(thetas, np.float32), np.repeat(np.arange(n), w), np.tile(chosen, n)
+
+        def part(first: int) -> NDArray[np.float32]:
+            count = min(self.lanes, n * w - first)
+            own = first + np.minimum(np.arange(self.lanes), count - 1)
+            offset = self._no_offset if flat_offsets is None else flat_offsets[own]
+            extra = self._no_force if flat_force is None else flat_force[own]
+            errors, _ = self._run(self.windows.batch, of_window[own], thetas[of_theta[own]], offset, extra)
+            return np.asarray(errors)[:count]
+
+        firsts = list(range(0, n * w, self.lanes))
+        alone = firsts[:1] if self.traces == 0 else []  # traced once, not by every thread
+        done = [part(first) for first in alone]
+        with ThreadPoolExecutor(self.workers) as pool:
+            done += pool.map(part, firsts[len(alone) :])
+        self.rollouts += n * w
+        result = np.concatenate(done).astype(np.float64)
+        return np.nan_to_num(result, nan=1e3, posinf=1e3, neginf=-1e3).reshape(n, w, *result.shape[1:])

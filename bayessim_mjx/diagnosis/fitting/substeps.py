@@ -1,0 +1,111 @@
+"""Windows simulated without effects at any sub-step, by one compiled program; what start states can take away."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from bayessim_mjx.device import compiler_options
+from bayessim_mjx.diagnosis.fitting.quadratic import eliminate
+from bayessim_mjx.diagnosis.fitting.simulator import difference, integrate
+from bayessim_mjx.diagnosis.fitting.windows import Batch, Windows
+from bayessim_mjx.physics import Drive, Physics, begin, staggered, substep
+
+Array = NDArray[np.float64]
+STARTS = 5  # Newton steps of the start states
+NUDGE = 1e-4  # rad or rad/s, at least, of the start states for their finite differences
+
+
+def held(cut: Windows) -> Windows:
+    """Windows whose commands are held over the whole control step, as in training."""
+    length, substeps = cut.batch.command.shape[1:3]
+    rows = np.stack([cut.logs[r].ctrl[a : a + length] for r, a in zip(cut.log, cut.start, strict=True)])
+    command = jnp.asarray(np.repeat(rows[:, :, None], substeps, 2), jnp.float32)
+    return dataclasses.replace(cut, batch=cut.batch.replace(command=command))
+
+
+class Errors:
+    """Windows without effects at any sub-step, by one compiled program: measured minus simulated, `[W, H, 2 nv]`."""
+
+    def __init__(self, physics: Physics, cut: Windows, most: int) -> None:
+        self.physics, self.cut, self.most = physics, cut, most * physics.substeps
+        self.theta = jnp.asarray(physics.space.nominal, jnp.float32)
+        self.offsets = np.zeros((len(cut), 2 * physics.mj_model.nv))  # of the measured start states
+        self._run = jax.jit(jax.vmap(self._one, in_axes=(0, 0, None, None, None)), compiler_options=compiler_options())
+
+    def run(self, cut: Windows, factor: int, corrected: bool = True, offsets: Array | None = None) -> Array:
+        """With the commands of `cut` at the sub-step h / factor; corrected: velocities lie half of it early."""
+        count = cut.batch.command.shape[2]
+        missing = [(0, 0), (0, 0), (0, self.most - count), (0, 0)]
+        batch = self.cut.batch.replace(command=jnp.pad(cut.batch.command, missing))  # the past keeps its shape
+        offsets = self.offsets if offsets is None else self.offsets + offsets
+        h = np.float32(self.physics.mj_model.opt.timestep / factor)
+        error = self._run(batch, np.asarray(offsets, np.float32), count, h, np.float32(corrected))
+        return np.nan_to_num(np.asarray(error, np.float64), nan=1e3, posinf=1e3, neginf=-1e3)
+
+    def _one(self, own: Batch, offset: jax.Array, count: jax.Array, h: jax.Array, corrected: jax.Array) -> jax.Array:
+        with jax.default_matmul_precision("highest"):
+            return self._errors(own, offset, count, h, corrected)
+
+    def _errors(self, own: Batch, offset: jax.Array, count: jax.Array, h: jax.Array, corrected: jax.Array) -> jax.Array:
+        physics, nv = self.physics, self.physics.mj_model.nv
+        world = begin(physics, self.theta, own.around)
+        world = world.replace(qpos=integrate(physics.mj_model, world.qpos, offset[:nv]), qvel=world.qvel + offset[nv:])
+        model = physics.model_of(world).tree_replace({"opt.timestep": h})
+        early = 0.5 * corrected * h if staggered(physics.mj_model) else 0.0
+
+        def step(data: Any, row: tuple) -> tuple[Any, tuple]:
+            command, enabled = row
+            seen = {"qpos": data.qpos, "qvel": data.qvel}
+            drive = Drive(None, enabled, own.law)
+
+            def sub(k: jax.Array, data: Any) -> Any:
+                return substep(physics, model, data.replace(ctrl=command[k]), ((), world.forces), (), seen, drive)[0]
+
+            data = jax.lax.fori_loop(0, count, sub, data)
+            return data, (data.qpos, data.qvel + early * data.qacc)
+
+        _, (qpos, qvel) = jax.lax.scan(step, physics.data_of(world), (own.command, own.enabled))
+        error = jax.vmap(lambda a, b: difference(physics.mj_model, a, b))(own.qpos, qpos)
+        return jnp.concatenate([error, own.qvel - qvel], axis=1)
+
+    def columns(self, sigma: Array) -> Array:
+        """`[W, n, 2 nv]`, minus the derivatives of the whitened errors by the start states."""
+        here = self.run(self.cut, 1)
+        nudges = np.diag(np.maximum(0.2 * self.cut.spread, NUDGE))
+        moved = [(here - self.run(self.cut, 1, offsets=n)) / n.max() / sigma for n in nudges]
+        return np.stack([m.reshape(len(m), -1) for m in moved], -1)
+
+    def start(self, sigma: Array) -> None:
+        """Fit the start states: far from the measured motion the time step is worth something else."""
+        spread = self.cut.spread
+        for _ in range(STARTS):
+            before, columns = self.run(self.cut, 1) / sigma, self.columns(sigma)
+            step = _step(before, columns, self.offsets, spread)
+            after = self.run(self.cut, 1, offsets=step) / sigma
+            better = np.sum(after**2, (1, 2)) < np.sum(before**2, (1, 2))
+            self.offsets = self.offsets + np.where(better[:, None], step, 0.0)
+
+    def settler(self, sigma: Array) -> Callable[[Array], Array]:
+        """Errors -> errors that no change of the start states takes away, by linearisation."""
+        columns, spread = self.columns(sigma), self.cut.spread
+
+        def settle(error: Array) -> Array:
+            step = _step(error / sigma, columns, np.zeros_like(self.offsets), spread)
+            moved = np.einsum("wns,ws->wn", columns, step).reshape(error.shape)
+            return np.asarray((error / sigma - moved) * np.where(np.isfinite(sigma), sigma, 0.0))
+
+        return settle
+
+
+def _step(whitened: Array, columns: Array, offsets: Array, spread: Array) -> Array:
+    """Best change of the start states `[W, 2 nv]`."""
+    r = whitened.reshape(len(whitened), -1)
+    nothing = np.zeros((*r.shape, 0))
+    return eliminate(r, nothing, columns, offsets, spread)[1].step(nothing, np.zeros(0))

@@ -1,0 +1,265 @@
+"""Logs cut into windows for multiple shooting: commands per sub-step, measured motion at each start, noise, groups."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from flax import struct
+from numpy.typing import NDArray
+
+from bayessim_mjx.effects.support.site import AROUND, Motion
+from bayessim_mjx.errors import UserError
+from bayessim_mjx.logs.log import Log
+from bayessim_mjx.logs.resample import around as rows_around
+from bayessim_mjx.logs.resample import resample
+from bayessim_mjx.physics import controllers, staggered
+
+Array = NDArray[np.float64]
+MAX_AROUND = 24  # control steps
+
+
+class Batch(struct.PyTreeNode):
+    """What the simulator needs of every window, leading axis W.
+
+    Attributes:
+        command: `[W, H, S, nu]`, mean over each sub-step (or over the interval centred on its beginning).
+        around: Motion, `[W, 2 L + 1, ...]`, row L is the start.
+        qpos: `[W, H, nq]`, qvel: `[W, H, nv]`: measured after each control step.
+        drive: enabled `[W, H, nu]` or None; law `[W, nu]` or None.
+    """
+
+    command: jax.Array
+    around: Motion
+    qpos: jax.Array
+    qvel: jax.Array
+    enabled: jax.Array | None
+    law: controllers.Law | None
+
+
+@dataclass(frozen=True, eq=False)
+class Windows:
+    """Windows of one length, cut from logs on the control period.
+
+    Attributes:
+        batch: for the simulator.
+        log, start, group: `[W]`, index of the log, first row in it, index of the operating condition.
+        groups: names of the conditions.
+        sigma_q, sigma_v: `[nv]`, noise of positions (tangent) and of velocities (inf where they are not used).
+        spread: `[2 nv]`, standard deviation of the measured start state.
+        logs: the resampled logs.
+        dt: control period, s.
+        notes: what else is held out than was asked for.
+    """
+
+    batch: Batch
+    log: NDArray[np.int64]
+    start: NDArray[np.int64]
+    group: NDArray[np.int64]
+    groups: tuple[str, ...]
+    sigma_q: Array
+    sigma_v: Array
+    spread: Array
+    logs: tuple[Log, ...]
+    dt: float
+    notes: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.log)
+
+    @property
+    def steps(self) -> int:
+        return int(self.batch.command.shape[1])
+
+
+def groups_of(logs: Sequence[Log], key: str | None = None) -> tuple[list[int], tuple[str, ...]]:
+    """Operating condition of each log: metadata `key`, else `condition` or `operating_condition`, else one per log.
+
+    Raises:
+        UserError: the key that was asked for is in no log's metadata.
+    """
+    labels = _labels(logs, key)
+    if key and not any(labels):
+        have = ", ".join(sorted({k for log in logs for k in log.metadata})) or "no keys"
+        raise UserError(f"--group {key}: no log's metadata has this key; there are: {have}")
+    told = len(set(labels)) > 1  # the same condition everywhere cannot be held out
+    labels = [label if label and told else log.name for label, log in zip(labels, logs, strict=True)]
+    names = tuple(dict.fromkeys(labels))
+    return [names.index(label) for label in labels], names
+
+
+def _labels(logs: Sequence[Log], key: str | None) -> list[str]:
+    """Each log's condition, "" where its metadata do not tell."""
+    found = [
+        log.metadata.get(key) if key else log.metadata.get("condition", log.metadata.get("operating_condition"))
+        for log in logs
+    ]
+    return ["" if value is None else str(value) for value in found]
+
+
+def group_notes(logs: Sequence[Log], key: str | None) -> tuple[str, ...]:
+    """What is held out in place of the conditions that were asked for, where these cannot be."""
+    labels = _labels(logs, key)
+    if not key or not any(labels):
+        return ()
+    without = [log.name for log, label in zip(logs, labels, strict=True) if not label]
+    if without:
+        return (f"--group {key}: {', '.join(without)} without this key: each is held out as a condition of its own",)
+    if len(set(labels)) > 1:
+        return ()
+    instead = "single logs" if len(logs) > 1 else "blocks of the only log in time"
+    return (f"--group {key}: {labels[0]!r} in all logs, so nothing can be held out by it; {instead} are held out",)
+
+
+def cut(
+    logs: Sequence[Log],
+    model: mujoco.MjModel,
+    dt: float,
+    substeps: int,
+    length: int,
+    *,
+    limit: int,
+    group: str | None = None,
+    use_qvel: bool = True,
+    first_only: bool = False,
+    starts: list[tuple[int, int]] | None = None,
+    centred: bool = True,
+) -> Windows:
+    """Windows of `length` control steps, at most `limit`, spread evenly over the logs.
+
+    Args:
+        use_qvel: compare measured velocities too (where all logs have them).
+        first_only: one window per log, at its beginning (whole episodes).
+        starts: (log, row) of the windows wanted; beyond the end of a log its last row is held.
+        centred: commands are centred on the force evaluations, where the integrator is `staggered`; False: the physics
+            does that (`centred.physics_of`).
+
+    Raises:
+        UserError: no log is long enough.
+    """
+    even, centred = [resample(log, dt) for log in logs], centred and staggered(model)
+    fine = [_fine_commands(log, e, dt, substeps, centred) for log, e in zip(logs, even, strict=True)]
+    group_of, names = groups_of(logs, group)
+    starts = _starts(even, length, limit, first_only) if starts is None else starts
+    if not starts:
+        longest = max(len(e) - 1 for e in even)
+        raise UserError(
+            f"no log holds {length} control steps of {dt:.4g} s; the longest has {longest}; allowed: longer logs"
+        )
+    if len(names) == 1:  # one condition only: blocks in time stand in for conditions
+        names, group_of_window = _blocks(starts, even)
+    else:
+        group_of_window = [group_of[r] for r, _ in starts]
+    around = min(MAX_AROUND, max(2, int(np.ceil(AROUND / dt))))
+    law = controllers.of_logs(logs, model)
+    pick = np.asarray([r for r, _ in starts])
+    enabled = _enabled(even, starts, length, model) if any(not e.enabled.all() for e in even) else None
+    batch = Batch(
+        command=_stack([fine[r][_rows(even[r], a, length)] for r, a in starts]),
+        around=_around(even, fine, starts, around),
+        qpos=_stack([even[r].qpos[_rows(even[r], a + 1, length)] for r, a in starts]),
+        qvel=_stack([even[r].qvel[_rows(even[r], a + 1, length)] for r, a in starts]),
+        enabled=enabled,
+        law=None if law is None else jax.tree.map(lambda x: x[pick], law),
+    )
+    sigma_q, sigma_v, spread = _noise(even, model, use_qvel and all(log.has_qvel for log in logs))
+    return Windows(
+        batch=batch,
+        log=pick,
+        start=np.asarray([a for _, a in starts]),
+        group=np.asarray(group_of_window),
+        groups=names,
+        sigma_q=sigma_q,
+        sigma_v=sigma_v,
+        spread=spread,
+        logs=tuple(even),
+        dt=dt,
+        notes=group_notes(logs, group),
+    )
+
+
+def _starts(logs: Sequence[Log], length: int, limit: int, first_only: bool) -> list[tuple[int, int]]:
+    every = []
+    for r, log in enumerate(logs):
+        last = len(log) - 1 - length
+        if last < 0:
+            continue
+        every += [(r, 0)] if first_only else [(r, a) for a in range(0, last + 1, length)]
+    if len(every) <= limit:
+        return every
+    keep = np.unique(np.linspace(0, len(every) - 1, limit).round().astype(int))
+    return [every[i] for i in keep]
+
+
+def _rows(log: Log, first: int, count: int) -> NDArray[np.int64]:
+    return np.minimum(np.arange(first, first + count), len(log) - 1)
+
+
+def _blocks(starts: list[tuple[int, int]], logs: Sequence[Log]) -> tuple[tuple[str, ...], list[int]]:
+    """Up to five contiguous blocks in time, over all windows in order."""
+    count = min(5, len(starts))
+    of = [i * count // len(starts) for i in range(len(starts))]
+    return tuple(f"part {i + 1} of {count}" for i in range(count)), of
+
+
+def _fine_commands(raw: Log, even: Log, dt: float, substeps: int, centred: bool) -> NDArray[np.float32]:
+    """`[rows, S, nu]`: mean of the held command over each sub-step; centred: half a sub-step early.
+
+    Semi-implicit Euler advances with the force at the beginning of a sub-step; read as a leapfrog (velocities half a
+    sub-step before positions) that force stands for the interval centred there. With the command averaged over this
+    interval the positions are second order accurate, and no delay of half a sub-step is found in anybody's data.
+    """
+    h = dt / substeps
+    rows, nu = len(even), raw.ctrl.shape[1]
+    edges = even.time[0] - centred * h / 2 + h * np.arange(rows * substeps + 1)
+    times = np.concatenate([[min(edges[0], raw.time[0]) - dt], raw.time[1:], [max(edges[-1], raw.time[-1]) + dt]])
+    held = np.concatenate([raw.ctrl])  # row k holds from time[k] to time[k+1]; the first and last for ever
+    area = np.concatenate([np.zeros((1, nu)), np.cumsum(held * np.diff(times)[:, None], axis=0)])
+    means = (
+        np.stack([np.diff(np.interp(edges, times, a)) / h for a in area.T], 1) if nu else np.zeros((rows * substeps, 0))
+    )
+    return means.reshape(rows, substeps, nu).astype(np.float32)
+
+
+def _around(even: Sequence[Log], fine: list, starts: list[tuple[int, int]], around: int) -> Motion:
+    """Recorded rows `a - around .. a + around`; beyond the ends of a log the end is held."""
+    rows = [(r, rows_around(even[r], a, around)) for r, a in starts]
+    return Motion(
+        qpos=_stack([even[r].qpos[i] for r, i in rows]),
+        qvel=_stack([even[r].qvel[i] for r, i in rows]),
+        command=_stack([fine[r][i] for r, i in rows]),
+        start=around,
+    )
+
+
+def _enabled(even: Sequence[Log], starts: list[tuple[int, int]], length: int, model: mujoco.MjModel) -> jax.Array:
+    """`[W, H, nu]`, 0 where an actuator's drive was off."""
+    out = []
+    for r, a in starts:
+        rows = np.ones((length, model.nu))
+        for name, stream in even[r].streams.items():
+            if name.startswith("enabled:"):
+                on = np.nan_to_num(stream[_rows(even[r], a, length)], nan=1.0) > 0.5
+                rows[:, even[r].actuators.index(name.split(":", 1)[1])] = on
+        out.append(rows)
+    return _stack(out)
+
+
+def _noise(logs: Sequence[Log], model: mujoco.MjModel, use_qvel: bool) -> tuple[Array, Array, Array]:
+    """(sigma_q [nv], sigma_v [nv], spread of the start [2 nv]), pooled over logs."""
+    dofs = np.sqrt(np.mean([log.sigma_dofs**2 for log in logs], axis=0))
+    motion = np.sqrt(np.mean([np.mean(log.qvel**2, axis=0) for log in logs], axis=0))
+    travel = np.maximum(motion * 0.05, 1e-9)
+    sigma_q = np.maximum(dofs, 1e-5 * travel)  # data without noise: the simulator's own precision
+    rate = np.sqrt(np.mean([log.sigma_qvel**2 for log in logs], axis=0))
+    sigma_v = np.maximum(rate, 1e-3 * motion) if use_qvel else np.full(model.nv, np.inf)
+    start_v = np.maximum(3 * rate, 0.1 * motion + 10 * sigma_q)
+    return sigma_q, sigma_v, np.concatenate([3 * sigma_q, start_v])
+
+
+def _stack(parts: list) -> jax.Array:
+    return jnp.asarray(np.stack(parts), jnp.float32)

@@ -1,0 +1,1 @@
+"""Can these logs be used, and what do they show before anything is simulated?"""

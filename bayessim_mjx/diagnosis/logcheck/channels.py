@@ -1,0 +1,173 @@
+"""The chain command -> effort -> motion -> measurement, each link tested alone with its measured input and output."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from bayessim_mjx.diagnosis.logcheck.drives import dof_of
+from bayessim_mjx.diagnosis.logcheck.effort import efforts
+from bayessim_mjx.diagnosis.logcheck.filtered_motion import Mask, filtered, motion
+from bayessim_mjx.diagnosis.logcheck.inverse_dynamics import Dynamics
+from bayessim_mjx.diagnosis.logcheck.single_log import velocities
+from bayessim_mjx.logs.log import Array, Log
+from bayessim_mjx.physics import controllers
+from bayessim_mjx.quantities import percent
+
+_LAGS = np.linspace(-0.2, 0.2, 161)  # s
+
+
+@dataclass(frozen=True)
+class Link:
+    """One link of the chain at one place.
+
+    Attributes:
+        name: "command -> effort", "effort -> motion" (or "command -> motion"), "motion -> measurement".
+        where: the actuator, joint or velocity channel.
+        tested: whether the log allows the test; otherwise the numbers are NaN and `text` says why.
+        slope: output = slope * what the input predicts.
+        correlation: at the best lag.
+        lag: s by which the output is late.
+        sound: this link does what the model says; the gap is not here.
+        text: the verdict in words.
+    """
+
+    name: str
+    where: str
+    tested: bool
+    slope: float
+    correlation: float
+    lag: float
+    sound: bool
+    text: str
+
+
+def links(log: Log, mj_model: mujoco.MjModel) -> list[Link]:
+    """All links of one log, in the order of the chain."""
+    return [*_controllers(log, mj_model), *_drives(log, mj_model), *_sensors(log)]
+
+
+def _link(name: str, where: str, slope: float, correlation: float, lag: float, step: float, scaled: bool) -> Link:
+    """The verdict: sound where slope, shape and time agree within 5 %, 1 % and a sample."""
+    faults = []
+    if correlation < 0.99:
+        faults.append(f"the shape differs (correlation {correlation:.3f})")
+    if scaled and abs(slope - 1.0) > 0.05:
+        faults.append(f"the scale is off by {percent(slope - 1.0, sign=True)}")
+    if abs(lag) > step:
+        faults.append(f"it is {abs(lag) * 1e3:.0f} ms {'late' if lag > 0 else 'early'}")
+    numbers = f"corr {correlation:.3f}, slope {slope:.3g}, lag {lag * 1e3:+.1f} ms"
+    known = "as the model says" if scaled else "shape and time as the model says, the unit is not known"
+    verdict = "; ".join(faults) if faults else f"{known}: exonerated"
+    return Link(name, where, True, slope, correlation, lag, not faults, f"{name} at {where}: {verdict} ({numbers})")
+
+
+def _untested(name: str, where: str, why: str) -> Link:
+    nan = float("nan")
+    return Link(name, where, False, nan, nan, nan, False, f"{name} at {where}: not tested: {why}")
+
+
+def compare(predicted: Array, measured: Array, step: float, rows: Mask) -> tuple[float, float, float]:
+    """Slope, correlation and lag [s] of measured [T] against predicted [T] sampled every `step` s, over rows [T].
+
+    The lag is where the correlation is largest, if that explains half of what is unexplained without a lag; else 0.
+    """
+    time = step * np.arange(len(predicted))
+    late = [np.interp(time - lag, time, predicted)[rows] for lag in _LAGS]
+    y = measured[rows] - measured[rows].mean()
+    scores = []
+    for x in late:
+        norm = float(np.linalg.norm(x - x.mean()) * np.linalg.norm(y))
+        scores.append(float((x - x.mean()) @ y) / norm if norm > 0 else 0.0)
+    best, now = int(np.argmax(scores)), len(_LAGS) // 2
+    if 1.0 - scores[best] > 0.5 * (1.0 - scores[now]) or best in (0, len(_LAGS) - 1):
+        best = now
+    x = late[best] - late[best].mean()
+    return float(x @ y) / max(float(x @ x), 1e-300), scores[best], float(_LAGS[best])
+
+
+# Command -> effort
+
+
+def _controllers(log: Log, mj_model: mujoco.MjModel) -> Iterator[Link]:
+    name, grid = "command -> effort", np.linspace(log.time[0], log.time[-1], len(log))
+    expected = _expected(log, mj_model)
+    for i, actuator in enumerate(log.actuators):
+        stream = log.streams.get(f"effort:{actuator}")
+        if stream is None or not np.isfinite(stream).all():
+            yield _untested(name, actuator, "no complete effort stream was logged")
+            continue
+        pair = [np.interp(grid, log.time, x) for x in (expected[:, i], stream)]
+        rows = log.enabled & (np.ptp(pair[0]) > 0) & (np.ptp(pair[1]) > 0)
+        if rows.sum() < 20:
+            yield _untested(name, actuator, "command or effort never changes while the drive is on")
+            continue
+        slope, correlation, lag = compare(pair[0], pair[1], log.period, rows)
+        yield _link(name, actuator, slope, correlation, lag, log.period, _declared(log))
+
+
+def _declared(log: Log) -> bool:
+    """Whether the unit of the effort is known: a law says what it is."""
+    return controllers.declared(log.metadata)
+
+
+def _expected(log: Log, mj_model: mujoco.MjModel) -> Array:
+    """[T, nu] what each drive should have done: the declared law, else the model's own actuator with its servo."""
+    if _declared(log):
+        law = controllers.read(log.metadata, mj_model, log.actuators, log.name)
+        q, w = log.qpos[:, list(law.qadr)], log.qvel[:, list(law.dadr)]
+        kp, kd, limit, scale = (np.asarray(x, float) for x in (law.kp, law.kd, law.limit, law.scale))
+        closed = np.where(np.asarray(law.on_position) > 0, kp * (log.ctrl - q) - kd * w, kp * (log.ctrl - w))
+        loop = np.asarray(law.on_position) + np.asarray(law.on_velocity) > 0
+        return np.where(loop, np.clip(scale * closed, -limit, limit), scale * log.ctrl)
+    out = np.zeros_like(log.ctrl)
+    for i in range(mj_model.nu):
+        dof = dof_of(mj_model, i)
+        gear, gain, bias = mj_model.actuator_gear[i, 0], mj_model.actuator_gainprm[i, 0], mj_model.actuator_biasprm[i]
+        limited = mj_model.actuator_ctrllimited[i]
+        ctrl = np.clip(log.ctrl[:, i], *mj_model.actuator_ctrlrange[i]) if limited else log.ctrl[:, i]
+        out[:, i] = gain * ctrl
+        if dof is not None and mj_model.actuator_biastype[i] == int(mujoco.mjtBias.mjBIAS_AFFINE):
+            joint = int(mj_model.dof_jntid[dof])
+            length = gear * log.qpos[:, int(mj_model.jnt_qposadr[joint])]
+            # f = gain u + b0 + b1 l + b2 dl/dt
+            out[:, i] += bias[0] + bias[1] * length + bias[2] * gear * log.qvel[:, dof]
+        if mj_model.actuator_forcelimited[i]:
+            out[:, i] = np.clip(out[:, i], *mj_model.actuator_forcerange[i])
+    return out
+
+
+# Effort -> motion
+
+
+def _drives(log: Log, mj_model: mujoco.MjModel) -> Iterator[Link]:
+    """The measured effort, or the command where it is one, against the nominal inverse dynamics of the motion."""
+    found = {e.joint: e for e in reversed(list(efforts(log, mj_model)))}  # a stream comes before the command
+    if not found:
+        yield _untested("effort -> motion", "all joints", "no effort was logged, and the commands are targets")
+        return
+    moved = motion(log, mj_model)
+    needed = Dynamics.of(mj_model, moved).nominal(mj_model)
+    for effort in found.values():
+        name = "command -> motion" if effort.source == "ctrl" else "effort -> motion"
+        rows = moved.moving(effort.dof)
+        signal = filtered(effort.signal, log, moved)
+        if rows.sum() * moved.step * moved.cutoff < 4.0 or np.ptp(signal[rows]) == 0:
+            yield _untested(name, effort.joint, "too little motion free of contacts and limits")
+            continue
+        slope, correlation, lag = compare(signal, needed[:, effort.dof], moved.step, rows)
+        yield _link(name, effort.joint, slope, correlation, lag, log.period, effort.scaled)
+
+
+# Motion -> measurement
+
+
+def _sensors(log: Log) -> Iterator[Link]:
+    name = "motion -> measurement"
+    if not log.has_qvel:
+        yield _untested(name, "all joints", "no velocity was measured")
+    for v in velocities(log):
+        yield _link(name, v.channel, v.slope, v.correlation, v.lag, log.period, True)

@@ -1,0 +1,213 @@
+"""The data gate of the diagnosis: which logs can be used, which not and why, and what is odd about them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from bayessim_mjx.diagnosis.logcheck import single_log
+from bayessim_mjx.diagnosis.logcheck.drives import dof_of, is_effort
+from bayessim_mjx.diagnosis.logcheck.effort import DOUBTFUL, Relation, closed, relations
+from bayessim_mjx.diagnosis.logcheck.single_log import Finding, Velocity, refuse, warn
+from bayessim_mjx.errors import UserError
+from bayessim_mjx.logs.log import Array, Log
+from bayessim_mjx.quantities import percent
+
+ALIKE = 5.0  # at most so many times a target's range is the range of what follows it
+LATE = 0.3  # s; a larger offset between commands and motion is a fault of the clocks, not of the robot
+
+
+@dataclass(frozen=True, eq=False)
+class Report:
+    """What the gate says about one log.
+
+    Attributes:
+        relations: effort against motion, per joint and source.
+        velocities: measured velocities against derivatives of positions.
+    """
+
+    log: Log
+    remarks: tuple[Finding, ...]
+    relations: tuple[Relation, ...] = ()
+    velocities: tuple[Velocity, ...] = ()
+
+    @property
+    def usable(self) -> bool:
+        return not self.of("refused")
+
+    def of(self, kind: str) -> tuple[str, ...]:
+        """The texts of one kind: refused, warning or finding."""
+        return tuple(r.text for r in self.remarks if r.kind == kind)
+
+
+@dataclass(frozen=True, eq=False)
+class Gate:
+    """The reports of all logs, in their order.
+
+    Attributes:
+        qvel: per measured velocity channel, whether it agrees with its position in most of the usable logs.
+    """
+
+    reports: tuple[Report, ...]
+    qvel: dict[str, bool]
+
+    @property
+    def usable(self) -> tuple[Log, ...]:
+        return tuple(r.log for r in self.reports if r.usable)
+
+    @property
+    def refused(self) -> dict[str, str]:
+        """Reasons by the name of the log."""
+        return {r.log.name: "; ".join(r.of("refused")) for r in self.reports if not r.usable}
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """One sentence each, beginning with the name of the log."""
+        refused = tuple(f"{name}: refused: {reason}" for name, reason in self.refused.items())
+        return refused + self._all("warning") + self._not_compared()
+
+    @property
+    def findings(self) -> tuple[str, ...]:
+        """What is odd, but a property of the robot rather than of the log (delays)."""
+        return self._all("finding")
+
+    @property
+    def use_qvel(self) -> bool:
+        """Whether the measured velocities may be compared with the simulator's; otherwise the positions say it all."""
+        return bool(self.qvel) and all(self.qvel.values()) and all(log.has_qvel for log in self.usable)
+
+    def demand(self) -> tuple[Log, ...]:
+        """The usable logs.
+
+        Raises:
+            UserError: there is none; with every reason.
+        """
+        if not self.usable:
+            reasons = "; ".join(f"{name}: {reason}" for name, reason in self.refused.items()) or "no logs were given"
+            raise UserError(f"no usable log: {reasons}")
+        return self.usable
+
+    def _not_compared(self) -> tuple[str, ...]:
+        """One sentence per reason: many logs of many joints would bury everything else."""
+        reasons: dict[tuple[str, str], tuple[list[str], list[str]]] = {}
+        for report in self.reports:
+            for r in report.relations:
+                if report.usable and r.text:
+                    logs, joints = reasons.setdefault((r.source, r.text), ([], []))
+                    logs.append(report.log.name)
+                    joints.append(r.joint)
+        return tuple(
+            f"{_listed(logs)}: effort of {_listed(joints)} ({source}) not compared with the motion: {text}"
+            for (source, text), (logs, joints) in reasons.items()
+        )
+
+    def _all(self, kind: str) -> tuple[str, ...]:
+        return tuple(f"{r.log.name}: {text}" for r in self.reports if r.usable for text in r.of(kind))
+
+
+def _listed(names: Sequence[str]) -> str:
+    """The first three different names, and how many more there are."""
+    names = list(dict.fromkeys(names))
+    more = f" and {len(names) - 3} more" if len(names) > 3 else ""
+    return ", ".join(names[:3]) + more
+
+
+def check(logs: Sequence[Log], mj_model: mujoco.MjModel, dt: float) -> Gate:
+    """Judge every log against the model and the control period dt [s]. Nothing is raised: read the verdict.
+
+    Raises:
+        UserError: dt is no time.
+    """
+    if not (np.isfinite(dt) and dt > 0):
+        raise UserError(f"gate: dt = {dt!r}; allowed: seconds > 0")
+    reports = tuple(_report(log, mj_model, dt) for log in logs)
+    seen = [v for r in reports if r.usable for v in r.velocities]
+    step = max([dt, *(r.log.period for r in reports if r.usable)])
+    channels = dict.fromkeys(v.channel for v in seen)
+    # most logs have to agree: a joint that hardly moves in one of them proves nothing
+    qvel = {c: bool(np.median([v.usable(step) for v in seen if v.channel == c]) > 0.5) for c in channels}
+    return Gate(reports, qvel)
+
+
+def _report(log: Log, mj_model: mujoco.MjModel, dt: float) -> Report:
+    own = tuple(f for test in single_log.CHECKS for f in test(log, dt))
+    if any(f.kind == "refused" for f in own):
+        return Report(log, own)  # nothing further can be computed from it
+    related = tuple(relations(log, mj_model))
+    seen = tuple(single_log.velocities(log))
+    step = max(dt, log.period)
+    targets = _targets(log, mj_model)
+    own += (*single_log.clipped(log, targets), *single_log.units(log, _vouched(log, mj_model, related, targets)))
+    return Report(log, (*own, *_of_velocity(seen, step), *_of_effort(related)), related, seen)
+
+
+def _targets(log: Log, mj_model: mujoco.MjModel) -> dict[str, Array]:
+    """{joint: `[T]`} targets of the joints whose only drive follows one."""
+    out: dict[str, Array] = {}
+    dofs = [dof_of(mj_model, i) for i in range(mj_model.nu)]
+    for i, dof in enumerate(dofs):
+        if dof is not None and dofs.count(dof) == 1 and (closed(log) or not is_effort(mj_model, i)):
+            out[log.joints[int(mj_model.dof_jntid[dof])]] = log.ctrl[:, i]
+    return out
+
+
+def _vouched(log: Log, mj_model: mujoco.MjModel, related: Sequence[Relation], targets: Mapping[str, Array]) -> set[str]:
+    """Joints whose positions have the model's unit: its dynamics, its range or its drives' targets say so."""
+    found = {r.joint for r in related if r.source == "ctrl" and (r.explained or 0.0) >= DOUBTFUL}
+    for j, joint in enumerate(log.joints):
+        q = log.qpos[:, log.channels.columns(joint).start]
+        low, high = mj_model.jnt_range[j]
+        room = 0.1 * (high - low)
+        if mj_model.jnt_limited[j] and low - room <= q.min() and q.max() <= high + room:
+            found.add(joint)
+        moved = np.ptp(targets[joint]) if joint in targets else 0.0
+        if moved > 0 and 1 / ALIKE < np.ptp(q) / moved < ALIKE:
+            found.add(joint)
+    return found
+
+
+def _of_velocity(seen: Sequence[Velocity], step: float) -> list[Finding]:
+    return [
+        warn(
+            f"qvel:{v.channel} is {v.slope:.3g} times the derivative of its position, {v.lag * 1e3:+.0f} ms late "
+            f"(correlation {v.correlation:.3f}): positions are used instead"
+        )
+        for v in seen
+        if not v.usable(step)
+    ]
+
+
+def _of_effort(related: Sequence[Relation]) -> list[Finding]:
+    """A log is refused where at least half of its joints have no effort that fits their motion."""
+    best: dict[str, Relation] = {}
+    for r in related:
+        if r.explained is not None and (r.joint not in best or r.explained > (best[r.joint].explained or 0.0)):
+            best[r.joint] = r
+    bad = [r for r in best.values() if r.refused]
+    out: list[Finding] = []
+    for r in best.values():
+        assert r.explained is not None
+        if r in bad:
+            out.append((refuse if 2 * len(bad) >= len(best) else warn)(_unrelated(r)))
+        elif r.explained < DOUBTFUL:
+            text = f"{r.joint}: no model explains {percent(1 - r.explained)} of its effort ({r.source})"
+            out.append(warn(f"{text} ({r.mend})" if r.mend else text))
+        if r.lag and r not in bad:
+            text = f"{r.joint}: its motion follows the effort ({r.source}) {r.lag * 1e3:+.0f} ms late"
+            out.append(warn(f"{text}: do the clocks agree?") if abs(r.lag) > LATE else Finding("finding", text))
+    return out
+
+
+def _unrelated(r: Relation) -> str:
+    assert r.explained is not None
+    share = min(1.0, 1.0 - r.explained)
+    text = (
+        f"effort unrelated to motion: {percent(share)} of the effort of {r.joint} ({r.source}) unexplained by any model"
+    )
+    if r.explained >= 0.3:
+        text += f", and friction alone explains {percent(r.friction)}"
+    why = r.mend or "column not aligned in time, wrong scale, or forces that were not logged?"
+    return f"{text} ({why})"

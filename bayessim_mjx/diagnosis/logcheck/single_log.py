@@ -1,0 +1,226 @@
+"""Checks of one log on its own: enough of it, sampled evenly, channels that move and are not clipped or wrapped."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayessim_mjx.diagnosis.logcheck.filtered_motion import bandwidth, lowpass
+from bayessim_mjx.logs.log import Array, Log
+from bayessim_mjx.logs.signals import estimate_velocity, quantum
+from bayessim_mjx.quantities import percent
+
+MIN_ROWS, MIN_STEPS = 20, 10  # fewer rows or control steps than this hold no window
+CLIPPED = 0.05  # share of the rows on one flat top
+HELD = 0.01  # of a target's range: it does not change
+MOMENT = 0.05  # s
+_REGISTERS = (2.0**16, 2.0**32)
+_FASTEST = {"hinge": 150.0, "slide": 50.0}  # rad/s, m/s; faster: probably another unit
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One remark on a log: it refuses the log, warns, or is only told."""
+
+    kind: Literal["refused", "warning", "finding"]
+    text: str
+
+
+def refuse(text: str) -> Finding:
+    return Finding("refused", text)
+
+
+def warn(text: str) -> Finding:
+    return Finding("warning", text)
+
+
+def size(log: Log, dt: float) -> Iterator[Finding]:
+    """Rows, duration and rate against the control period dt [s]."""
+    if len(log) < MIN_ROWS or log.duration < MIN_STEPS * dt:
+        have = f"{len(log)} rows over {log.duration:.3g} s"
+        yield refuse(
+            f"too short: {have}; allowed: at least {MIN_ROWS} rows and {MIN_STEPS} control steps of {dt:.3g} s"
+        )
+    elif log.period > 20 * dt:
+        yield refuse(f"one row per {log.period:.3g} s; allowed: up to 20 control periods of {dt:.3g} s")
+    elif log.period > 1.5 * dt:
+        yield warn(
+            f"one row per {log.period:.3g} s against a control period of {dt:.3g} s: motion between rows is unknown"
+        )
+    if not log.enabled.any():
+        yield refuse("the drive is off throughout; allowed: a log with commands that act")
+
+
+def jitter(log: Log, dt: float) -> Iterator[Finding]:
+    """Steps of time more than a fifth off their median."""
+    steps = np.diff(log.time)
+    off = float(np.mean(np.abs(steps / log.period - 1.0) > 0.2))
+    if off > 0.1:
+        worst = float(np.max(np.abs(steps / log.period - 1.0)))
+        yield warn(
+            f"time: {percent(off)} of the steps are more than 20 % off their median (the worst by {percent(worst)})"
+        )
+
+
+def constant(log: Log, dt: float) -> Iterator[Finding]:
+    """Joints that never move, commands that never change; nothing moving at all is refused."""
+    ranges = np.ptp(log.qpos, axis=0)
+    level = 6.0 * log.sigma_qpos + 1e-12
+    still = [j for j in log.joints if not (ranges > level)[log.channels.columns(j)].any()]
+    if len(still) == len(log.joints):
+        yield refuse(f"nothing moves: {', '.join(still)} stay within their noise")
+        return
+    for joint in still:
+        yield warn(f"qpos:{joint} never moves: nothing can be said about this joint")
+    for name, x in zip(log.actuators, log.ctrl.T, strict=True):
+        if np.ptp(x) <= 1e-9 * max(1.0, float(np.abs(x).max())):
+            yield warn(f"ctrl:{name} never changes ({x[0]:.4g}): nothing can be said about what it causes")
+    for name, stream in log.streams.items():
+        if name.startswith("effort:") and np.ptp(stream) == 0:
+            yield warn(f"{name} never changes ({stream[0]:.4g}): it is not used")
+
+
+def clipped(log: Log, targets: Mapping[str, Array]) -> Iterator[Finding]:
+    """Flat tops: a sensor that runs into its end at speed and stays on one value.
+
+    Args:
+        targets: {joint: `[T]`}, of joints whose drives follow a target: while it does not change they hold still.
+    """
+    for name, x in _measured(log):
+        target = targets.get(name.partition(":")[2])
+        for end in (float(x.max()), float(x.min())):
+            flat = _flat(x, end)
+            share = float(np.mean(flat))
+            if share > CLIPPED and not (target is not None and _steady(target, flat)):
+                text = f"{name} is clipped at {end:.5g} ({percent(share)} of the rows"
+                drive = name.startswith("effort:")
+                yield Finding("finding", f"{text}; the drive's limit?)") if drive else warn(f"{text}; a hard stop?)")
+
+
+def _measured(log: Log) -> Iterator[tuple[str, Array]]:
+    kinds = dict(zip(log.joints, log.channels.kinds, strict=True))
+    for stream, values in (("qpos", log.qpos), *((("qvel", log.qvel),) if log.has_qvel else ())):
+        names = getattr(log.channels, stream)
+        yield from ((f"{stream}:{n}", c) for n, c in zip(names, values.T, strict=True) if n in kinds)
+    yield from ((n, s) for n, s in log.streams.items() if n.startswith("effort:") and np.isfinite(s).all())
+
+
+def _steady(target: Array, rows: NDArray[np.bool_]) -> bool:
+    """Whether a target has one value in most of these rows (a coarse encoder is there early), but not everywhere."""
+    low, high = np.quantile(target[rows], (0.1, 0.9))
+    return bool(high - low < HELD * np.ptp(target))
+
+
+def _flat(x: Array, end: float) -> NDArray[np.bool_]:
+    """Rows `[T]` in runs of four or more on the value `end` that are entered faster than a fifth of the top rate."""
+    on = np.concatenate([[False], x == end, [False]])
+    edges = np.flatnonzero(np.diff(on.astype(int))).reshape(-1, 2)
+    rate = np.abs(np.diff(x))
+    top = float(np.percentile(rate[rate > 0], 95)) if (rate > 0).any() else 0.0
+    rows = np.zeros(len(x), bool)
+    for a, b in edges:
+        rows[a:b] = b - a >= 4 and a >= 2 and rate[a - 2] > 0.2 * top > 0
+    return rows
+
+
+def wrapped(log: Log, dt: float) -> Iterator[Finding]:
+    """Signed registers read as unsigned: jumps by 2^16 or 2^32 resolution steps."""
+    for name, x in log.streams.items():
+        x = x[np.isfinite(x)]
+        jump = float(np.abs(np.diff(x)).max(initial=0.0))
+        for grain in {1.0, quantum(x)} - {0.0}:
+            for register in _REGISTERS:
+                if abs(jump / grain - register) < 0.05 * register:
+                    bits = int(np.log2(register))
+                    text = f"{name} jumps by {jump:.6g}: a signed {bits}-bit register read as unsigned"
+                    mend = f"{text} (mend it with `signed: {bits}` in the map)"
+                    yield refuse(mend) if name.startswith("effort:") else warn(mend)
+                    break
+            else:
+                continue
+            break
+
+
+def units(log: Log, known: Collection[str] = ()) -> Iterator[Finding]:
+    """Speeds that robots do not reach: degrees, counts, millimetres.
+
+    Args:
+        known: joints whose unit something else vouches for.
+    """
+    for joint, kind in zip(log.joints, log.channels.kinds, strict=True):
+        if kind not in _FASTEST or joint in known:
+            continue
+        q, v = log.channels.columns(joint).start, log.channels.columns(joint, "qvel").start
+        fastest = float(np.percentile(_speed(log, q), 99))
+        unit = "rad/s (degrees or counts?)" if kind == "hinge" else "m/s (millimetres or counts?)"
+        if fastest > _FASTEST[kind]:
+            yield warn(f"qpos:{joint} moves at {fastest:.4g} {unit}: mend the unit with `scale` in the map")
+        measured = float(np.percentile(np.abs(log.qvel[:, v]), 99))
+        if log.has_qvel and measured > _FASTEST[kind] and measured > 5.0 * fastest:
+            yield warn(f"qvel:{joint} reads {measured:.4g} {unit}, its position moves at {fastest:.4g}")
+
+
+def _speed(log: Log, column: int) -> Array:
+    """Speeds over MOMENT s: between two rows noise and jitter of the stamps are fast as well."""
+    each = max(1, round(MOMENT / log.period))
+    return np.asarray(
+        np.abs((log.qpos[each:, column] - log.qpos[:-each, column]) / (log.time[each:] - log.time[:-each]))
+    )
+
+
+@dataclass(frozen=True)
+class Velocity:
+    """A measured velocity against the derivative of its position: v(t) ~ slope dq/dt(t - lag)."""
+
+    channel: str
+    slope: float
+    lag: float  # s by which the measured velocity is late
+    correlation: float
+
+    def usable(self, step: float) -> bool:
+        """Within 10 % and late by no more than half a step [s]."""
+        return abs(self.slope - 1.0) < 0.1 and abs(self.lag) <= 0.6 * step and self.correlation > 0.95
+
+
+def velocities(log: Log) -> list[Velocity]:
+    """One comparison per measured velocity whose joint moves well above the noise, in logs long enough."""
+    if not log.has_qvel:
+        return []
+    cutoff = bandwidth(log)
+    rows = slice(None, None, max(1, int(1.0 / (20.0 * cutoff * log.period))))
+    time = log.time[rows]
+    rates, spread = estimate_velocity(time, log.qpos[rows], log.channels, log.sigma_qpos)
+    grid = np.linspace(time[0], time[-1], len(time))
+    step = float(grid[1] - grid[0])
+    if grid[-1] - grid[0] < 2.0 / cutoff:
+        return []  # all of it is edge
+    out = []
+    for name, v, w, noise in zip(log.channels.qvel, log.qvel[rows].T, rates.T, spread, strict=True):
+        even = [lowpass(np.interp(grid, time, x), step, cutoff) for x in (v, w)]
+        if float(np.std(even[1])) > 2.0 * float(noise) and np.ptp(v) > 0:
+            out.append(_compare(name, grid, even[0], even[1], 0.5 / cutoff))
+    return out
+
+
+def _compare(name: str, grid: Array, v: Array, w: Array, edge: float) -> Velocity:
+    jerk = np.abs(np.gradient(w))
+    # samples on either side of an impact say nothing about the velocity between them
+    rows = (grid > grid[0] + edge) & (grid < grid[-1] - edge) & (jerk <= np.percentile(jerk, 90))
+    # odd count: a lag of exactly 0 is among them
+    lags = np.linspace(-0.1, 0.1, 201) if grid[-1] - grid[0] > 1.0 else np.zeros(1)
+    late = [np.interp(grid - lag, grid, w)[rows] for lag in lags]
+    v = v[rows]
+    errors = [float(np.sum((v - (v @ x) / (x @ x) * x) ** 2)) for x in late]
+    best, now = int(np.argmin(errors)), len(lags) // 2
+    if errors[best] > 0.5 * errors[now] or best in (0, len(lags) - 1):
+        best = now  # a lag has to explain something
+    x = late[best]
+    correlation = float(v @ x) / float(np.linalg.norm(v) * np.linalg.norm(x))
+    return Velocity(name, float(v @ x) / float(x @ x), float(lags[best]), correlation)
+
+
+CHECKS = (size, jitter, constant, wrapped)

@@ -1,0 +1,1 @@
+"""What a fitted model leaves: the force that is missing, and where, when and with what it goes."""

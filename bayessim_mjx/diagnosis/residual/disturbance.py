@@ -1,0 +1,232 @@
+"""The generalised force that is missing in each window: finite-difference columns, a smooth estimate, its spread.
+
+Around a fit a window's residual is  r = D d + B x + A p + noise:  d the force at nodes in time, x the start state,
+p the parameters. The force has a Gaussian-process prior; the marginal likelihood chooses its strength and smoothness.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayessim_mjx.diagnosis.fitting.fitter import Fitter, Job
+from bayessim_mjx.diagnosis.fitting.quadratic import eliminate, solve
+from bayessim_mjx.diagnosis.residual.forcing import Linear, columns, linearise, node_basis
+
+__all__ = ["Disturbance", "Linear", "columns", "estimate", "linearise", "node_basis", "pooled", "step_of_starts"]
+Array = NDArray[np.float64]
+AMPLITUDES = (1e-4, 1e-3, 1e-2, 1e-1)  # of the force scale, first guesses
+MEMORIES = (1.0, 4.0, 16.0)  # node spacings over which the force stays alike
+NOISE = (0.3, 1e6)  # limits of the factor on the noise's variance
+
+
+@dataclass(frozen=True, eq=False)
+class Disturbance:
+    """The estimated force.
+
+    Attributes:
+        force, sd: `[W, m, nv]`, posterior mean and standard deviation, N m or N.
+        gain: `[W, nv, m, m]`, expected mean = gain times a true force on this dof (the prior pulls to zero).
+        amplitude: `[nv]`, prior standard deviation; memory: s, its correlation time.
+        noise: factor on the standard deviation of the measurement noise.
+        values: `[k]`, the job's parameters, estimated together with the force.
+        evidence: log marginal likelihood; without: the same for no force at all.
+        time: `[m]` s after the windows' starts.
+        linear: what it was computed from.
+    """
+
+    force: Array
+    sd: Array
+    gain: Array
+    amplitude: Array
+    memory: float
+    noise: float
+    values: Array
+    evidence: float
+    without: float
+    time: Array
+    linear: Linear
+
+    @property
+    def reliability(self) -> Array:
+        """`[W, m, nv]`, how much of a constant force the mean shows at each node."""
+        return np.moveaxis(self.gain.sum(3), 1, 2)
+
+    @property
+    def flat(self) -> Array:
+        """`[W, nv m]`, in the order of the columns."""
+        return np.swapaxes(self.force, 1, 2).reshape(len(self.force), -1)
+
+
+def estimate(
+    fitter: Fitter,
+    job: Job,
+    knots: int | None = None,
+    *,
+    linear: Linear | None = None,
+    free: bool = True,
+    rounds: int = 2,
+) -> Disturbance:
+    """The smooth force that explains the job's residuals best.
+
+    Args:
+        knots: nodes per window; None: as many as are cheap.
+        linear: from `linearise`, None: made here.
+        free: the job's parameters are estimated with the force (within their bounds), else they stay.
+        rounds: how often the residuals are linearised anew around the estimate.
+    """
+    linear = linearise(fitter, job, knots) if linear is None else linear
+    posterior = _strongest(fitter, job, linear, free)
+    for _ in range(rounds):
+        linear = _relinearise(fitter, job, linear, posterior)
+        posterior = _refined(replace(posterior, linear=linear), 6)
+    return _finish(fitter, job, posterior)
+
+
+@dataclass(frozen=True, eq=False)
+class _Posterior:
+    """State of the search: hyperparameters and what follows from them."""
+
+    linear: Linear
+    job: Job
+    free: bool
+    memory: float  # in node spacings
+    amplitude: Array
+    noise: float = 1.0  # variance
+    p: Array = None  # type: ignore[assignment]  # [k]
+    d: Array = None  # type: ignore[assignment]  # [W, nv m]
+    cov: Array = None  # type: ignore[assignment]  # [W, nv m, nv m], given p
+    evidence: float = -np.inf
+
+    @property
+    def correlation(self) -> Array:
+        lag = np.abs(np.subtract.outer(np.arange(self.linear.nodes), np.arange(self.linear.nodes)))
+        return np.exp(-lag / self.memory)
+
+    def solved(self) -> _Posterior:
+        """p by generalised least squares, then d given p; all windows at once."""
+        q, k = self.linear.quadratic, self.job.A.shape[2]
+        inner = np.linalg.inv(self.correlation)
+        P = np.kron(np.diag(1 / self.amplitude**2), inner)
+        S = q.S / self.noise
+        cov = np.asarray(np.linalg.inv(S[:, k:, k:] + P), np.float64)
+        gain = cov @ S[:, k:, :k]  # [W, nv m, k]
+        precision, pull, low, high = self.job.prior()
+        p = np.zeros(k)
+        weight = self.job.weight
+        if self.free and k:
+            Spp = np.einsum("w,wij->ij", weight, S[:, :k, :k] - np.einsum("wdi,wdj->wij", S[:, k:, :k], gain))
+            gp = weight @ (q.g[:, :k] / self.noise - np.einsum("wdi,wd->wi", gain, q.g[:, k:] / self.noise))
+            p = solve(Spp + np.diag(precision), gp + pull, low, high)
+        g = q.g[:, k:] / self.noise - S[:, k:, :k] @ p
+        d = np.einsum("wij,wj->wi", cov, g)
+        cost = q.subset(np.arange(k)).at(p) / self.noise - np.einsum("wd,wd->w", g, d)
+        logs = np.linalg.slogdet(cov)[1] + np.linalg.slogdet(P)[1]
+        n = self.linear.r.shape[1]
+        each = -0.5 * (cost - logs + n * np.log(self.noise))
+        penalty = 0.5 * float(precision @ p**2 - 2 * pull @ p)
+        return replace(self, p=p, d=d, cov=cov, evidence=float(weight @ each) - penalty)
+
+    def learnt(self) -> _Posterior:
+        """One step of expectation maximisation for amplitudes and noise, then solved."""
+        q, k, nv = self.linear.quadratic, self.job.A.shape[2], len(self.linear.scale)
+        inner, weight = np.linalg.inv(self.correlation), self.job.weight
+        blocks = self.d.reshape(len(self.d), nv, -1)
+        second = np.einsum("wvi,ij,wvj->wv", blocks, inner, blocks)
+        cov = self.cov.reshape(len(self.d), nv, self.linear.nodes, nv, self.linear.nodes)
+        second += np.einsum("wvivj,ij->wv", cov, inner)
+        amplitude = np.sqrt(weight @ second / (weight.sum() * self.linear.nodes))
+        full = np.concatenate([np.repeat(self.p[None], len(self.d), 0), self.d], 1)
+        left = q.at(full) + np.einsum("wij,wji->w", q.S[:, k:, k:], self.cov)
+        noise = float(np.clip(weight @ left / (weight.sum() * self.linear.r.shape[1]), *NOISE))
+        return replace(self, amplitude=np.maximum(amplitude, 1e-7 * self.linear.scale), noise=noise).solved()
+
+
+def _strongest(fitter: Fitter, job: Job, linear: Linear, free: bool) -> _Posterior:
+    """The best of a grid of amplitudes and memories, then refined."""
+    trials = [
+        _refined(_Posterior(linear, job, free, memory, a * linear.scale).solved(), 2)
+        for memory in MEMORIES
+        for a in AMPLITUDES
+    ]
+    return _refined(max(trials, key=lambda t: t.evidence), 12)
+
+
+def _refined(posterior: _Posterior, times: int) -> _Posterior:
+    posterior = posterior.solved()
+    for _ in range(times):
+        posterior = posterior.learnt()
+    return posterior
+
+
+def step_of_starts(linear: Linear, job: Job, p: Array, d: Array) -> Array:
+    """dx `[W, s]`, the start states that go with a parameter step p `[k]` or `[W, k]` and forces d `[W, nv m]`."""
+    full = np.concatenate([np.broadcast_to(p, (len(d), job.A.shape[2])), d], 1)
+    moved = np.einsum("wnk,wk->wn", np.concatenate([job.A, linear.D], 2), full)
+    b = linear.starts.b - np.einsum("wns,wn->ws", job.B, moved)
+    return np.einsum("wst,wt->ws", linear.starts.M, b)
+
+
+def _relinearise(fitter: Fitter, job: Job, linear: Linear, found: _Posterior) -> Linear:
+    """Residuals simulated at the estimate and taken back along the columns; kept only where it fits better there."""
+    p, d = found.p, found.d
+    dx = step_of_starts(linear, job, p, d)
+    theta = fitter.vector(job.coordinates, job.values + p)
+    r = fitter.whiten(fitter.simulator.run(theta[None], (job.offsets + dx)[None], force=linear.forces(d)[None]))[0]
+    back = r + np.einsum("wnd,wd->wn", linear.D, d) + np.einsum("wns,ws->wn", job.B, dx) + job.A @ p
+    better = np.sum(r**2, 1) < np.sum(job.r**2, 1)
+    back = np.where(better[:, None], back, linear.r)
+    q, starts = eliminate(back, np.concatenate([job.A, linear.D], 2), job.B, job.offsets, fitter.spread)
+    return replace(linear, r=back, quadratic=q, starts=starts)
+
+
+def _finish(fitter: Fitter, job: Job, found: _Posterior) -> Disturbance:
+    linear, windows = found.linear, fitter.simulator.windows
+    shape = (len(found.d), len(linear.scale), linear.nodes)
+    variance = np.einsum("wii->wi", found.cov) + _from_parameters(job, found)
+    sd = np.sqrt(np.swapaxes(variance.reshape(shape), 1, 2))
+    k = job.A.shape[2]
+    whole = found.cov @ linear.quadratic.S[:, k:, k:] / found.noise
+    gain = np.einsum("wvivj->wvij", whole.reshape(*shape, *shape[1:]))
+    nothing = replace(found, amplitude=1e-7 * linear.scale)
+    spacing = windows.steps * windows.dt / linear.nodes
+    return Disturbance(
+        force=np.swapaxes(found.d.reshape(shape), 1, 2),
+        sd=sd,
+        gain=gain,
+        amplitude=found.amplitude,
+        memory=found.memory * spacing,
+        noise=float(np.sqrt(found.noise)),
+        values=job.values + found.p,
+        evidence=found.evidence,
+        without=_refined_noise(nothing).evidence,
+        time=np.asarray((np.arange(linear.nodes) + 0.5) * spacing, np.float64),
+        linear=linear,
+    )
+
+
+def _from_parameters(job: Job, found: _Posterior) -> Array:
+    """`[W, nv m]`: variance of the force from not knowing the parameters exactly."""
+    q, k = found.linear.quadratic, job.A.shape[2]
+    if not (found.free and k):
+        return np.zeros_like(found.d)
+    S = q.S / found.noise
+    gain = found.cov @ S[:, k:, :k]
+    Spp = np.einsum("w,wij->ij", job.weight, S[:, :k, :k] - np.einsum("wdi,wdj->wij", S[:, k:, :k], gain))
+    return np.einsum("wdi,ij,wdj->wd", gain, np.linalg.inv(Spp + np.diag(job.prior()[0])), gain)
+
+
+def _refined_noise(found: _Posterior) -> _Posterior:
+    """Only the noise learnt, the force staying nothing."""
+    for _ in range(4):
+        found = replace(found.solved().learnt(), amplitude=found.amplitude)
+    return found.solved()
+
+
+def pooled(values: Array, reliability: Array, axis: int | Sequence[int] | None = None) -> Array:
+    """Mean of a true force from posterior means: their sum over the sum of their reliabilities."""
+    axis = tuple(axis) if isinstance(axis, Sequence) else axis
+    return np.sum(values, axis) / np.maximum(np.sum(reliability, axis), 1e-9)

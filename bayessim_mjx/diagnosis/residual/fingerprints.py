@@ -1,0 +1,163 @@
+"""Signatures of known causes in the estimated force: the "why" shown to people before any effect is fitted.
+
+All regressions read  estimate = gain X beta,  with intervals by a jackknife over operating conditions.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayessim_mjx.diagnosis.fitting.fitter import Fitter, Job
+from bayessim_mjx.diagnosis.residual.disturbance import Disturbance, step_of_starts
+from bayessim_mjx.diagnosis.residual.motion_inputs import Inputs
+from bayessim_mjx.diagnosis.residual.regions import Nodes
+from bayessim_mjx.diagnosis.statistics import interval
+
+Array = NDArray[np.float64]
+RECENT = 0.1  # s after a reversal
+SMALL = 0.2  # of the force's rms: contributions below are not mentioned
+
+
+@dataclass(frozen=True)
+class Number:
+    """One coefficient with its 90 % interval."""
+
+    value: float
+    low: float
+    high: float
+    unit: str
+
+    @property
+    def clear(self) -> bool:
+        """Zero lies outside of the interval."""
+        return self.low > 0 or self.high < 0
+
+    def __str__(self) -> str:
+        return f"{self.value:.2g} [{self.low:.2g}, {self.high:.2g}] {self.unit}"
+
+
+@dataclass(frozen=True)
+class Fingerprint:
+    """One signature at one joint: what it says, its numbers, and the share of the force's rms that each one carries."""
+
+    name: str
+    joint: str
+    text: str
+    numbers: dict[str, Number]
+    weight: dict[str, float]
+
+
+def regress(y: Array, X: Array, gain: Array, without: Array) -> tuple[Array, Array, Array]:
+    """(beta `[k]`, replicates `[G, k]`, rms of terms `[k]`): y `[W, m]`, X `[W, m, k]`, gain `[W, m, m]`.
+
+    `without`: `[G, W]`, windows without each condition (`clusters.leave_one_out`).
+    """
+    rows = gain @ X
+    scale = np.sqrt(np.mean(rows**2, axis=(0, 1))) + 1e-300
+    rows = rows / scale
+    S, g = np.einsum("wmi,wmj->wij", rows, rows), np.einsum("wmi,wm->wi", rows, y)
+    ridge = 1e-6 * np.eye(X.shape[2]) * rows[..., 0].size
+    beta = np.linalg.solve(S.sum(0) + ridge, g.sum(0)) / scale
+    replicates = (
+        np.linalg.solve(np.tensordot(without, S, 1) + ridge, np.tensordot(without, g, 1)[..., None])[..., 0] / scale
+    )
+    term = np.sqrt(np.mean((X * beta) ** 2, axis=(0, 1)))
+    return beta, replicates, term
+
+
+def _fingerprint(
+    name: str,
+    node: Nodes,
+    y: Array,
+    terms: dict[str, tuple[Array, str]],
+    without: Array,
+    say: dict[str, str],
+    head: str,
+) -> Fingerprint:
+    """terms: {name: (column `[W, m]`, unit)}; say: {name: words} for those that matter."""
+    X = np.stack([column for column, _ in terms.values()], 2)
+    used = node.used
+    beta, replicates, rms = regress(np.where(used, y, 0.0), X, used[..., None] * node.gain, without)
+    numbers = {
+        key: Number(float(b), *interval(float(b), s), unit)
+        for (key, (_, unit)), b, s in zip(terms.items(), beta, replicates.T, strict=True)
+    }
+    size = max(float(np.sqrt(np.mean(y[node.used] ** 2))) if node.used.any() else 0.0, 1e-300)
+    weight = {key: float(r) / size for key, r in zip(terms, rms, strict=True)}
+    told = [_told(numbers[key], words) for key, words in say.items() if numbers[key].clear and weight[key] > SMALL]
+    return Fingerprint(name, node.joint, f"{node.joint}: {head} {', '.join(told)}" if told else "", numbers, weight)
+
+
+def _told(number: Number, words: str) -> str:
+    """The number; its sign in words where these have a place for it: against/with, more/less."""
+    for pair in ("against/with", "more/less"):
+        if pair in words:
+            positive = number.value > 0
+            shown = number if positive else Number(-number.value, -number.high, -number.low, number.unit)
+            return f"{shown} {words.replace(pair, pair.split('/')[0 if positive else 1])}"
+    return f"{number} {words}"
+
+
+def fingerprints(
+    fitter: Fitter, job: Job, disturbance: Disturbance, inputs: Inputs, dof: int, node: Nodes, without: Array
+) -> list[Fingerprint]:
+    """F1 odd and even in speed, F2 load, F3 lag and speed, F8 time, F10 time since reversal."""
+    w, unit = node.axes["speed"], node.force_unit
+    rate = inputs.angle_unit[dof] + "/s"
+    s, one = np.sign(node.axes["direction"]), np.ones_like(w)
+    load = np.abs(node.axes["load"])
+    late = node.axes["time"] - node.axes["time"].mean()
+    recent = np.exp(-node.axes["time since reversal"] / RECENT)
+    y = node.force
+    slope, square = f"{unit}/({rate})", f"{unit}/({rate})^2"
+    odd = {"offset": (one, unit), "constant": (-s, unit), "linear": (-w, slope), "quadratic": (-w * np.abs(w), square)}
+    drift = {"constant": (-s, unit), "friction": (-s * late, f"{unit}/s"), "level": (one, unit)}
+    heavy = {"constant": (-s, unit), "linear": (-w, slope)}
+    out = [
+        _fingerprint(
+            "odd and even in speed", node, y, odd | {"even": (-np.abs(w), slope)}, without,
+            {"constant": "against/with the motion at any speed", "linear": "against/with the motion, linear in speed",
+             "quadratic": "against/with the motion, quadratic in speed", "offset": "always the same way",
+             "even": "with speed but always the same way"},
+            "of the missing force",
+        ),
+        _fingerprint(
+            "load", node, y, heavy | {"load": (-s * (load - load.mean()), f"{unit} per {unit}")}, without,
+            {"load": "of gravity load"}, "the force against the motion changes by",
+        ),
+        _fingerprint(
+            "time", node, y, drift | {"drift": (late, f"{unit}/s")}, without,
+            {"friction": "against the motion", "drift": "always the same way"},
+            "in the course of a log the force changes by",
+        ),
+        _fingerprint(
+            "time since reversal", node, y, {"constant": (-s, unit), "recent": (-s * recent, unit)}, without,
+            {"recent": "more/less"}, f"within {RECENT:g} s after reversals the force against the motion is",
+        ),
+    ]  # fmt: skip
+    return [*out, _lag(fitter, job, disturbance, inputs, dof, node, without)]
+
+
+def _lag(
+    fitter: Fitter, job: Job, disturbance: Disturbance, inputs: Inputs, dof: int, node: Nodes, without: Array
+) -> Fingerprint:
+    """|error| = c + T |speed|: how far the measured motion lags behind the simulated one (F3)."""
+    linear, nv = disturbance.linear, fitter.simulator.nv
+    step = disturbance.values - job.values
+    dx = step_of_starts(linear, job, step, np.zeros_like(disturbance.flat))
+    r = linear.r - np.einsum("wns,ws->wn", job.B, dx) - job.A @ step
+    windows = fitter.simulator.windows
+    channels = r.reshape(len(r), windows.steps, -1)
+    behind = -channels[..., dof] * windows.sigma_q[dof] if fitter.used[:nv].all() else np.zeros(r.shape[:1] + (1,))
+    average = linear.basis / linear.basis.sum(0)
+    one = np.broadcast_to(np.eye(average.shape[1]), node.gain.shape)
+    whole = Nodes(behind @ average, one, node.axes, node.units, node.joint, node.force_unit)
+    angle = inputs.angle_unit[dof]
+    s, w = np.sign(node.axes["direction"]), node.axes["speed"]
+    return _fingerprint(
+        "lag", whole, whole.force, {"constant": (s, angle), "lag": (w, "s")}, without,
+        {"constant": "at any speed", "lag": "times the speed"}, "the measured motion lags behind the simulated one by",
+    )  # fmt: skip

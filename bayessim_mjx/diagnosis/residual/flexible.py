@@ -1,0 +1,199 @@
+"""A flexible residual force on top of a fitted model: the demonstrated floor of the gap, and what the rest depends on.
+
+Linear regression through the simulator:  r_w = D_w Phi_w beta + B_w x + A_w p + noise,  Phi features of the measured
+motion at the nodes of the force. Scored on held-out operating conditions and on held-out blocks within conditions, over
+several seeds of its random features and several ridges, because one black box tells nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayessim_mjx.diagnosis.fitting.fitter import Fitter, Job
+from bayessim_mjx.diagnosis.residual import motion_inputs
+from bayessim_mjx.diagnosis.residual.disturbance import Disturbance, estimate
+from bayessim_mjx.diagnosis.residual.motion_inputs import WORDS, Inputs
+from bayessim_mjx.diagnosis.residual.regression import Regression, Seeded
+from bayessim_mjx.diagnosis.statistics import normal_deviate
+from bayessim_mjx.quantities import percent
+
+Array = NDArray[np.float64]
+RIDGES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)  # of the mean curvature of each joint's features
+BLOCK = 1.0  # s, held-out blocks within conditions
+FOLDS = 4
+SLACK = 0.02  # of the best ridge's gain, for a plainer model
+QUIET = 1.1  # squared residual per sample that counts as noise alone
+IMPORTANT = 0.1  # share of the gain that an input must carry to be named
+
+
+@dataclass(frozen=True, eq=False)
+class Held:
+    """Held-out costs under one way of splitting.
+
+    Attributes:
+        cost: `[W]`, of the median seed with the best ridge, unweighted; base: `[W]`, of the model without the force.
+        totals: `[seeds, ridges]`; ridge, seed: the one in `cost`.
+        gain, se: how much cheaper all windows together are, and its standard error over folds.
+        t: of the windows' log gain above the noise by folds, as a normal deviate; unlike the gain itself
+            it is not ruled by the conditions with the largest errors.
+    """
+
+    cost: Array
+    base: Array
+    totals: Array
+    ridge: float
+    seed: int
+    plain: float
+    gain: float
+    se: float
+    t: float
+
+    @property
+    def significant(self) -> bool:
+        return self.gain > 0 and self.t > 2
+
+
+@dataclass(frozen=True, eq=False)
+class Flexible:
+    """Outcome of the flexible force.
+
+    Attributes:
+        condition, interpolation: held out by operating condition, by blocks within conditions.
+        depends_on: [{"input": "elbow speed", "joint", "quantity", "importance"}], largest first; importance: share of
+            the gain that is lost when it is shuffled.
+        where: {joint: share of the gain lost without the force on it}.
+        text: one sentence each.
+        force: `[W, m, nv]`, of the median seed on all windows, N m or N.
+    """
+
+    condition: Held
+    interpolation: Held
+    depends_on: list[dict]
+    where: dict[str, float]
+    text: list[str]
+    force: Array = field(repr=False)
+
+    @property
+    def cost_by_window(self) -> Array:
+        return self.condition.cost
+
+    def details(self, base_rms: float = np.nan, winner_rms: float = np.nan) -> dict:
+        """Numbers for pictures."""
+        count = self.force.shape[0]
+        seeds = np.sqrt(np.maximum(self.condition.totals.min(1), 0.0) / count)
+        return {
+            "depends_on": [{"input": d["input"], "importance": d["importance"]} for d in self.depends_on],
+            "where": self.text, "seeds": seeds.tolist(), "rms_on_base": base_rms, "rms_on_winner": winner_rms,
+        }  # fmt: skip
+
+
+def flexible(
+    fitter: Fitter,
+    job: Job,
+    disturbance: Disturbance | None = None,
+    *,
+    seeds: Sequence[int] = (0, 1, 2, 3, 4),
+    ridges: Sequence[float] = RIDGES,
+) -> Flexible:
+    """Fit and score a flexible force on top of a fitted job.
+
+    Args:
+        disturbance: of this job, for its columns and its linearisation; None: estimated here.
+    """
+    disturbance = estimate(fitter, job) if disturbance is None else disturbance
+    windows = fitter.simulator.windows
+    inputs = motion_inputs.measured(windows, fitter.simulator.physics.mj_model)
+    problem = Regression(fitter, job, disturbance, inputs)
+    folds = {"condition": windows.group, "interpolation": blocks(windows.log, windows.start, round(BLOCK / windows.dt))}
+    folds = {name: np.unique(fold, return_inverse=True)[1] for name, fold in folds.items()}
+    runs = {seed: Seeded(problem, seed) for seed in seeds}
+    held = {name: _held(problem, runs, fold, ridges) for name, fold in folds.items()}
+    name = max(held, key=lambda n: held[n].gain)
+    best, fold = held[name], folds[name]
+    run = runs[best.seed]
+    fits = run.without(fold, [best.plain])[0]
+    importance = _importance(problem, run, fold, fits, best)
+    where = _by_joint(problem, run, fold, fits, best)
+    text = _words(held, importance, where, fitter.size)
+    return Flexible(held["condition"], held["interpolation"], importance, where, text, run.whole(best.plain))
+
+
+def blocks(log: NDArray[np.int64], start: NDArray[np.int64], steps: int) -> NDArray[np.int64]:
+    """Fold `[W]` of each window: consecutive blocks of `steps` control steps go to the folds in turn."""
+    return (start // max(steps, 1) + log) % FOLDS
+
+
+def _held(problem: Regression, runs: dict[int, Seeded], fold: NDArray[np.int64], ridges: Sequence[float]) -> Held:
+    costs = np.array([
+        [run.costs(fold, fits, run.features.phi) for fits in run.without(fold, ridges)] for run in runs.values()
+    ])  # [seeds, ridges, W]  # fmt: skip
+    totals = costs.sum(2)
+    median = np.median(totals, 0)
+    at = int(np.argmin(median))
+    seed = int(np.argsort(totals[:, at])[(len(runs) - 1) // 2])
+    base, cost = problem.base(fold), costs[seed, at]
+    plain = float(ridges[_widest(median, base.sum())])
+    by_fold = np.array([np.sum((base - cost)[fold == name]) for name in np.unique(fold)])
+    se = float(np.sqrt(len(by_fold)) * np.std(by_fold, ddof=1)) if len(by_fold) > 1 else np.inf
+    size = problem.fitter.size
+    t = normal_deviate(np.log(np.maximum(base, 0) + size) - np.log(np.maximum(cost, 0) + size), fold)
+    return Held(cost, base, totals, float(ridges[at]), list(runs)[seed], plain, float(by_fold.sum()), se, t)
+
+
+def _widest(totals: Array, base: float) -> int:
+    """The largest ridge that loses little of the best one's gain: fewer features that cancel each other."""
+    allowed = totals.min() + SLACK * max(base - totals.min(), 0.0)
+    return int(np.flatnonzero(totals <= allowed).max())
+
+
+def _shuffled(inputs: Inputs, joint: int, quantity: str, order: NDArray[np.int64]) -> Inputs:
+    values = np.array(inputs.of(quantity))
+    values[:, :, joint] = values[order][:, :, joint]
+    return replace(inputs, **{quantity: values})  # type: ignore[arg-type]
+
+
+def _importance(problem: Regression, run: Seeded, fold: NDArray[np.int64], fits: list, best: Held) -> list[dict]:
+    """Share of the held-out gain that is lost when an input comes from other windows, largest first."""
+    rng = np.random.default_rng(0)
+    order = [rng.permutation(len(fold)) for _ in range(3 if problem.nv <= 2 else 1)]
+    reference, found = run.costs(fold, fits, run.features.phi).sum(), []
+    for v, quantity in run.features.names:
+        lost = []
+        for shuffle in order:
+            phi = run.mapping(_shuffled(problem.inputs, v, quantity, shuffle), problem.average).phi
+            lost.append(float(run.costs(fold, fits, phi).sum()) - reference)
+        share = float(np.clip(np.mean(lost) / best.gain, 0.0, 1.0)) if best.gain > 0 else 0.0
+        joint = problem.inputs.joints[v]
+        found.append({"input": f"{joint} {WORDS[quantity]}", "joint": joint, "quantity": quantity, "importance": share})
+    return sorted(found, key=lambda d: -d["importance"])
+
+
+def _by_joint(problem: Regression, run: Seeded, fold: NDArray[np.int64], fits: list, best: Held) -> dict[str, float]:
+    """{joint: share of the held-out gain lost without the force on it}."""
+    reference, out = run.costs(fold, fits, run.features.phi).sum(), {}
+    for v, joint in enumerate(problem.inputs.joints):
+        phi = run.features.phi.copy()
+        phi[:, :, v] = 0.0
+        lost = float(run.costs(fold, fits, phi).sum()) - reference
+        out[joint] = float(np.clip(lost / best.gain, 0.0, 1.0)) if best.gain > 0 else 0.0
+    return out
+
+
+def _words(held: dict[str, Held], importance: list[dict], where: dict[str, float], samples: int) -> list[str]:
+    if not any(h.significant for h in held.values()):
+        return ["a flexible force finds nothing more that would hold on data not used for fitting"]
+    if all(float(h.base.mean()) < QUIET * samples for h in held.values()):
+        return ["what is left lies within the measurement noise; of it a flexible force still finds a part"]
+    text = []
+    for name, h in held.items():
+        how = "other operating conditions" if name == "condition" else "the same conditions at other times"
+        share = h.gain / max(float(h.base.sum()), 1e-300)
+        text.append(f"on {how} a flexible force removes {percent(share)} of the squared gap that is left")
+    joints = [j for j, share in where.items() if share > 0.2 * max(where.values())]
+    inputs = [d["input"] for d in importance if d["importance"] > IMPORTANT * max(importance[0]["importance"], 0.5)][:4]
+    depends = f"depends on {', '.join(inputs)}" if inputs else "depends on nothing that was measured: it is constant"
+    return [*text, f"what is missing acts at {', '.join(joints)} and {depends}"]

@@ -1,0 +1,1 @@
+"""Which effects the logs call for, which others would do as well, and how sure the numbers are."""

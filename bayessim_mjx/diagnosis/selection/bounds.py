@@ -1,0 +1,154 @@
+"""Effects' parameters that end at a bound: ranges grow as long as the logs ask for it, and what stays there is told."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from bayessim_mjx.diagnosis.fitting.candidates import Candidate, Coordinate, shrink
+from bayessim_mjx.diagnosis.selection.models import Model, scored
+from bayessim_mjx.diagnosis.selection.race import Progress, Race, fresh, ranked
+from bayessim_mjx.effects.effect import Quantity
+from bayessim_mjx.physics import Physics
+
+NEAR = 1e-3  # of a range: at its end
+TWICE, FARTHEST = 2.0, 8.0  # a range grows by this factor, up to so many times what it was at first
+NATS = 2.0  # of held-out evidence that a wider range has to bring
+LEADING = 3  # single effects whose ranges grow before pairs are looked at
+STEPS = 8  # of a fit in a wider range
+
+
+@dataclass(frozen=True)
+class Bound:
+    """How a parameter ends at a bound.
+
+    Attributes:
+        kind: "at least", "at most" (nothing larger or smaller was tried), "end" (physics ends there, or a wider range
+            explains no more), "off" (it has no part in the effect).
+        why: a clause for people, after the parameter's name.
+    """
+
+    kind: str
+    why: str
+
+
+def widened(race: Race, model: Model, say: Progress) -> Model:
+    """The model with ranges as wide as it takes for its effects' parameters to lie within, refitted.
+
+    A range doubles as long as that brings held-out evidence, up to FARTHEST times what it was. It stays where its end
+    means that the effect is off, where physics ends, and where it sizes an effect's memory.
+    """
+    while True:
+        effects = tuple(_wider(race, model, e) for e in model.effects)
+        if all(new is old for new, old in zip(effects, model.effects, strict=True)):
+            return model
+        say("wider ranges", 0, 1)
+        new = _refitted(race, model, effects)
+        if 0.5 * new.samples * math.log(model.total / new.total) < NATS:
+            return model
+        _adopt(race, new)
+        model = new
+
+
+def widen_leading(race: Race, say: Progress) -> None:
+    """Wider ranges for the leading single effects: one that is held back at a bound must not lose for that."""
+    for model in ranked(race, 1)[:LEADING]:
+        widened(race, model, say)
+
+
+def of(physics: Physics, effect: Candidate, coordinate: Coordinate, value: float) -> Bound | None:
+    """How a parameter ends at a bound; None where it does not."""
+    end = _end(coordinate, value)
+    if not end:
+        return None
+    quantity = _quantity(physics, effect, coordinate)
+    at = getattr(coordinate, end)
+    if at == quantity.neutral and not quantity.shape:
+        return Bound("off", f"is {at:.3g}, where it has no part in the effect")
+    least, most = quantity.ends()
+    unit = f" {coordinate.unit}" if coordinate.unit else ""
+    if at == (most if end == "high" else least):
+        return Bound("end", f"ends at {at:.3g}{unit}, where physics ends")
+    if at == _farthest(physics, effect, coordinate, end):
+        kind, which = ("at least", "largest") if end == "high" else ("at most", "smallest")
+        return Bound(kind, f"ends at {at:.3g}{unit}, the {which} value tried: {kind} this, or another law is behind it")
+    return Bound("end", f"ends at its bound {at:.3g}{unit}; a wider range explains no more")
+
+
+def _end(c: Coordinate, value: float) -> str:
+    room = NEAR * (c.high - c.low)
+    return "high" if c.high - value < room else "low" if value - c.low < room else ""
+
+
+def _quantity(physics: Physics, effect: Candidate, coordinate: Coordinate) -> Quantity:
+    (kind,) = (e for e in physics.effects if e.name == effect.effect)
+    word = coordinate.name.rpartition(".")[2]
+    return next(q for q in kind.quantities if q.name == word)
+
+
+def _farthest(physics: Physics, effect: Candidate, coordinate: Coordinate, end: str) -> float:
+    """Where a range may end at most."""
+    own = [physics.space.parameters[i] for i in coordinate.index]
+    low, high = min(p.low for p in own), max(p.high for p in own)
+    quantity = _quantity(physics, effect, coordinate)
+    least, most = quantity.ends()
+    if quantity.remembered:
+        return high if end == "high" else low
+    if end == "high":
+        return high if high >= most else min(most, coordinate.neutral + FARTHEST * (high - coordinate.neutral))
+    if low <= least:
+        return low
+    return low / FARTHEST if low > 0 else coordinate.neutral + FARTHEST * (low - coordinate.neutral)
+
+
+def _wider(race: Race, model: Model, effect: Candidate) -> Candidate:
+    """The effect with twice the range where one of its parameters ends at a bound that may move."""
+    physics = race.fitter.simulator.physics
+    values = model.values_of(effect)
+    coordinates = tuple(_grown(physics, effect, c, float(v)) for c, v in zip(effect.coordinates, values, strict=True))
+    return effect if coordinates == effect.coordinates else replace(effect, coordinates=coordinates)
+
+
+def _grown(physics: Physics, effect: Candidate, c: Coordinate, value: float) -> Coordinate:
+    end = _end(c, value)
+    if not end or getattr(c, end) == _farthest(physics, effect, c, end):
+        return c
+    if c.neutral == getattr(c, end) and not _quantity(physics, effect, c).shape:
+        return c
+    far = _farthest(physics, effect, c, end)
+    if end == "high":
+        wider = replace(c, high=min(far, c.neutral + TWICE * (c.high - c.neutral)))
+    else:
+        low = c.low / TWICE if c.low > 0 else c.neutral + TWICE * (c.low - c.neutral)
+        wider = replace(c, low=max(far, low))
+    return replace(wider, precision=shrink(wider))
+
+
+def _refitted(race: Race, model: Model, effects: Sequence[Candidate]) -> Model:
+    fitter, base = race.fitter, len(race.fitter.base)
+    own = {c.name: c for e in effects for c in e.coordinates}
+    coordinates = tuple(c if i < base else own[c.name] for i, c in enumerate(model.job.coordinates))
+    job = fitter.refresh(replace(model.job, coordinates=coordinates, history=[], damping=1e-3))
+    fitter.iterate([job], STEPS, lambda j: fresh(race, j))
+    fitter.refresh(job)
+    return scored(fitter, job, tuple(effects))
+
+
+def _adopt(race: Race, new: Model) -> None:
+    """The race with a model's effects in their new ranges; what was fitted with the old ones stays as it is."""
+    own = {e.label: e for e in new.effects}
+    race.models[frozenset(own)] = new
+    race.candidates = [own.get(c.label, c) for c in race.candidates]
+    race.screened = [replace(s, candidate=own.get(s.candidate.label, s.candidate)) for s in race.screened]
+
+
+def spread_out(covariance: np.ndarray, values: np.ndarray, neutral: np.ndarray, at: Sequence[int]) -> np.ndarray:
+    """A covariance `[k, k]` that says of the parameters `at` a bound no more than that they are not neutral."""
+    out = covariance.copy()
+    for i in at:
+        out[i, :] = out[:, i] = 0.0
+        out[i, i] = (0.5 * (values[i] - neutral[i])) ** 2
+    return out

@@ -1,0 +1,168 @@
+"""How far: held-out distance of measured and simulated motion, in noise units, at several horizons and by joint."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayessim_mjx.diagnosis import statistics
+from bayessim_mjx.diagnosis.fitting.fitter import Fitter, Job
+from bayessim_mjx.diagnosis.fitting.quadratic import eliminate
+from bayessim_mjx.diagnosis.selection.models import Model
+
+Array = NDArray[np.float64]
+WORSE, WITHIN = 2.0, 1.02  # held-out squares over those promised; those of the other windows over the common fit's
+SHORTER = (1.0, 0.5, 0.25, 0.125, 0.0)
+GRID = 400  # shares looked at
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """A model really simulated, with the parameters found without each window's condition.
+
+    Attributes:
+        error: `[W, H, channels]`, whitened; offsets: `[W, s]`, of the start states.
+    """
+
+    error: Array
+    offsets: Array
+
+    def cost(self, steps: int, channels: slice = slice(None)) -> Array:
+        """Mean square over the first steps, per window `[W]`."""
+        return np.asarray(np.mean(self.error[:, :steps, channels] ** 2, axis=(1, 2)))
+
+
+def predict(fitter: Fitter, model: Model) -> Prediction:
+    """Simulate each condition's windows with the parameters found without it; starts re-estimated on the window."""
+    windows = fitter.simulator.windows
+    names = np.unique(windows.group)
+    error = np.zeros((len(windows), windows.steps, int(fitter.used.sum())))
+    offsets = np.zeros_like(model.job.offsets)
+    for name, values in zip(names, model.estimates, strict=True):
+        own = np.flatnonzero(windows.group == name)
+        error[own], offsets[own] = _settled(fitter, model.job, values, own)
+    return Prediction(error, offsets)
+
+
+def steadied(fitter: Fitter, model: Model) -> Model:
+    """The model with estimates without each condition that the other conditions bear out.
+
+    They come of one linear step from the common fit. Where parameters are hardly told (a wind's sideways force) that
+    step can lead where the model is no longer linear. A condition whose windows are predicted much worse than the step
+    promised gets a shorter one, by halves, until the *other* windows are no worse off than at the common fit.
+    """
+    windows, job = fitter.simulator.windows, model.job
+    names, estimates = np.unique(windows.group), model.estimates.copy()
+    for g, name in enumerate(names):
+        own, others = np.flatnonzero(windows.group == name), np.flatnonzero(windows.group != name)
+        if _squares(fitter, job, estimates[g], own).sum() <= WORSE * model.cost[own].sum():
+            continue
+        limit = WITHIN * float(job.weight[others] @ _squares(fitter, job, job.values, others))
+        for share in SHORTER:
+            at = job.values + share * (model.estimates[g] - job.values)
+            if job.weight[others] @ _squares(fitter, job, at, others) <= limit:
+                break
+        estimates[g] = at
+    return replace(model, estimates=estimates)
+
+
+def _squares(fitter: Fitter, job: Job, values: Array, own: NDArray[np.int64]) -> Array:
+    """Sums of squared errors of some windows, starts re-estimated, `[w]`."""
+    return np.asarray(np.sum(_settled(fitter, job, values, own)[0] ** 2, axis=(1, 2)))
+
+
+def nominal(fitter: Fitter, job: Job) -> Prediction:
+    """The simulator as delivered, starts estimated."""
+    values = np.array([c.neutral for c in job.coordinates])
+    return Prediction(*_settled(fitter, job, values, np.arange(len(job.r))))
+
+
+def _settled(fitter: Fitter, job: Job, values: Array, own: NDArray[np.int64]) -> tuple[Array, Array]:
+    """(errors `[w, H, channels]`, starts `[w, s]`) of some windows after two Newton steps of their start states."""
+    theta = fitter.vector(job.coordinates, values)[None]
+    best_offsets = offsets = job.offsets[own]
+    B = job.B[own]
+    best = errors = fitter.simulator.run(theta, offsets[None], own)[0]
+    for _ in range(2):
+        r = fitter.whiten(errors)
+        _, starts = eliminate(r, np.zeros((*r.shape, 0)), B, offsets, fitter.spread)
+        offsets = offsets + starts.step(np.zeros((*r.shape, 0)), np.zeros(0))
+        errors = fitter.simulator.run(theta, offsets[None], own)[0]
+        better = np.sum(fitter.whiten(errors) ** 2, 1) < np.sum(fitter.whiten(best) ** 2, 1)
+        best = np.where(better[:, None, None], errors, best)
+        best_offsets = np.where(better[:, None], offsets, best_offsets)
+        errors, offsets = best, best_offsets
+    return np.asarray(best[..., fitter.used] / fitter.sigma), best_offsets
+
+
+def stages(costs: dict[str, Array], group: NDArray[np.int64]) -> dict[str, Any]:
+    """Root mean squares of the stages, each with a 90 % interval by operating conditions.
+
+    Args:
+        costs: {stage: `[W]` mean squares of windows}; group: `[W]`.
+    """
+    out: dict[str, Any] = {"ci": {}, "noise_floor": 1.0}
+    for name, cost in costs.items():
+        out[name] = float(np.sqrt(cost.mean()))
+        out["ci"][name] = list(statistics.interval_of_rms(cost, group))
+    return out
+
+
+@dataclass(frozen=True, eq=False)
+class Closed:
+    """Share of the squared gap above the noise that goes from one simulator to a better one: (E0 - E1) / (E0 - 1).
+
+    Attributes:
+        before, after: `[W]` mean squares of windows in units of the noise; group: `[W]`, their conditions.
+        own, every: `[W]`, what one of several effects closes of what all do, where the share is of that one alone. Then
+            what undercuts the noise is nobody's, so that parts add up to the whole.
+    """
+
+    before: Array
+    after: Array
+    group: NDArray[np.int64]
+    own: Array | None = None
+    every: Array | None = None
+
+    def _sums(self, rows: Array) -> tuple[Array, Array, Array]:
+        """Sums of what there was, what is left and of the noise, over windows with weights `[..., W]`."""
+        before, after, noise = rows @ self.before, rows @ self.after, rows.sum(-1)
+        if self.own is None or self.every is None:
+            return before, after, noise
+        own, every = (rows @ (x * np.ones_like(self.before)) for x in (self.own, self.every))
+        part = np.where(np.abs(every) > 1e-12 * rows.sum(-1), own / np.where(every == 0, 1.0, every), 0.0)
+        return before, before - part * (before - np.maximum(after, noise)), noise
+
+    @property
+    def value(self) -> float:
+        """At most 1: nothing undercuts the noise."""
+        before, left, noise = self._sums(np.ones_like(self.before))
+        return min(float(before - left) / max(float(before - noise), 1e-9), 1.0)
+
+    def interval(self) -> tuple[float, float]:
+        """90 % interval between -1 and 1, NaN of one condition.
+
+        A share s is kept where what is left, E1, could be what it says, (1 - s) E0 + s: where the logarithm of their
+        ratio is no more standard errors off 0 than Student's t allows. That holds near the noise, where E1 - 1 has no
+        logarithm, and near 0 alike. As many conditions count as rule the one or the other, whichever are fewer.
+        """
+        rows = statistics.leave_one_out(self.group)
+        if len(rows) < 2:
+            return statistics.NOTHING
+        shares = np.concatenate([1.0 - np.geomspace(2.0, 1e-4, GRID), [1.0]])[:, None]
+
+        def both(rows: Array) -> tuple[Array, Array]:
+            before, left, noise = self._sums(rows)
+            return np.maximum(left, 1e-9), np.maximum((1 - shares) * before + shares * noise, 1e-9)
+
+        (left, said), (left_without, said_without) = both(np.ones((1, len(self.before)))), both(rows)
+        counting = [np.maximum(left - left_without, 0.0)[:, None], np.maximum(said - said_without, 0.0).T]
+        freedom = np.minimum(*(statistics.freedom(own, statistics.RULED) for own in counting))
+        allowed = statistics.quantile(freedom) * statistics.error(np.log(left_without / said_without).T)
+        far = np.log(left / said)
+        kept = shares[:, 0][np.abs(far[:, 0]) <= allowed]
+        value = self.value
+        return float(min([*kept[:1], value])), float(max([*kept[-1:], value]))

@@ -1,0 +1,307 @@
+"""The state of the race: what was fitted, what counts as better, and fitting more models."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from bayessim_mjx.diagnosis.fitting.candidates import Candidate, Coordinate
+from bayessim_mjx.diagnosis.fitting.discretisation import contacts
+from bayessim_mjx.diagnosis.fitting.fitter import Fitter, Job
+from bayessim_mjx.diagnosis.selection.models import Comparison, Model, compare, scored
+from bayessim_mjx.diagnosis.selection.screen import Screened, screen
+from bayessim_mjx.diagnosis.selection.uncertainty import deviations
+from bayessim_mjx.effects import load, names
+
+Progress = Callable[[str, int, int], None]
+ROUNDS = 5  # of polishing, where it has to be done again and again
+ASTRAY = 10.0  # noises that a fit leaves: from there on nothing is as it was a step before
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Thresholds and budgets of the race, fixed before any data are seen.
+
+    Attributes:
+        relevance: an effect must close this share of the gap above the noise; more: a further effect, of what the
+            others leave; least: and of the whole gap; drop: and lower the cost by this share.
+        evidence: and gain this many nats plus the logarithm of the number of candidates (family-wise).
+        t: and improve windows of all conditions: mean over standard error by conditions, as a normal deviate.
+        floor: a model within this factor of the noise (rms) is not improved further.
+        believed: share of the noise (rms) that is the sensors'; the rest is what the time step may be worth at most.
+        tie: rivals are models whose share of the gap closed is within this of the winner's.
+        singles, pairs: how many candidates are fitted, and of how many all pairs; screened: windows looked at in
+            screening.
+        most: effects in one model; iterations: of a fit; fresh: base columns are differenced anew if
+            there are at most so many.
+    """
+
+    relevance: float = 0.05
+    more: float = 0.15
+    least: float = 0.003
+    drop: float = 0.03
+    evidence: float = 5.0
+    t: float = 2.0
+    floor: float = 1.3
+    believed: float = 1.0
+    tie: float = 0.04
+    singles: int = 48
+    pairs: int = 7
+    most: int = 5
+    screened: int = 96
+    iterations: int = 12
+    tolerance: float = 5e-3
+    fresh: int = 6
+    starts: int = 20
+
+
+@dataclass(eq=False)
+class Race:
+    """What was tried. `models` maps the labels of a model's effects to it."""
+
+    fitter: Fitter
+    candidates: Sequence[Candidate]
+    settings: Settings
+    nominal: Job
+    base: Model
+    winner: Model
+    models: dict[frozenset[str], Model] = field(default_factory=dict)
+    screened: list[Screened] = field(default_factory=list)
+
+    @property
+    def rough(self) -> bool:
+        """Whether contacts make what columns tell hold only nearby: fits then need them anew at every step."""
+        return contacts(self.fitter.simulator.physics)
+
+    @property
+    def noise(self) -> float:
+        """Expected cost of a window under a perfect model."""
+        return float(self.fitter.size)
+
+    def better(self, old: Model, new: Model) -> Comparison:
+        return compare(old, new, self.fitter.simulator.windows.group, self.noise)
+
+    def passes(self, old: Model, new: Model) -> bool:
+        """Whether `new`'s additional effects are both real and relevant."""
+        c, s = self.better(old, new), self.settings
+        if not self.above_noise(old):
+            return False
+        many = np.log(max(len(self.candidates), 2)) * max(1, len(new.effects) - len(old.effects))
+        added = [e for e in new.effects if e not in old.effects]
+        # by an effect that is hardly there a fit may only have come further
+        if not all(self.distinct(new, e, 2.0 if c.share < 0.3 else 1.0) for e in added):
+            return False
+        if old.effects and old.total - new.total < s.least * self._above(self.base):
+            return False
+        relevance = s.more if old.effects else s.relevance
+        if not (c.share > relevance and c.drop > s.drop and c.evidence > s.evidence + many):
+            return False
+        # what acts in few windows only (a limit, drag at speed) helps few of them, but then by much and harms no other
+        rare = c.evidence > 10 * s.evidence + many and c.share > 0.3 and c.worst > -0.1
+        return c.t > s.t or rare
+
+    def at_noise(self, model: Model, factor: float = 1.0) -> bool:
+        """Whether the model predicts as well as the noise (of `factor` times the variance) allows."""
+        return model.total <= factor * self.noise * len(model.cost)
+
+    def best_of(self, old: Model, models: Sequence[Model]) -> Model | None:
+        """The best model; of those that leave nearly as little of the gap of `old`, the one with the fewest numbers."""
+        if not models:
+            return None
+        best = min(models, key=lambda m: m.total)
+        room = 0.1 * max(old.total - self.noise * len(old.cost), 0.0)
+        near = [m for m in models if m.total <= best.total + room and self.at_noise(m) >= self.at_noise(best)]
+        told = [m for m in near if self.at_noise(m) or m.total < 2.0 * best.total]
+        return min(told, key=lambda m: (m.size, m.total))
+
+    def above_noise(self, model: Model) -> bool:
+        """Whether the model's held-out error is worth explaining.
+
+        Errors of the time step may be smaller than feared: what has effects already has to reach the sensors' noise.
+        """
+        share = self.settings.believed if model.effects else 1.0
+        return model.total > (share * self.settings.floor) ** 2 * self.noise * len(model.cost)
+
+    def distinct(self, model: Model, effect: Candidate, far: float = 2.0) -> bool:
+        """Whether at least one amplitude of the effect is `far` standard deviations away from neutral."""
+        sd = deviations(self.fitter, model)
+        own = [model.job.names.index(c.name) for c in effect.coordinates]
+        off = [
+            abs(model.job.values[i] - c.neutral) / max(sd[i], 1e-300)
+            for i, c in zip(own, effect.coordinates, strict=True)
+        ]
+        return any(z > far for z, shape in zip(off, effect.shapes, strict=True) if not shape)
+
+    def closure(self, model: Model) -> float:
+        """Share of the base model's squared gap above the noise that `model` closes, held out; at most 1.
+
+        The noise alone is the floor: the best of many models tried is below its own expected error by selection.
+        """
+        return 1.0 - self.left(model)
+
+    def left(self, model: Model) -> float:
+        """Share of the base model's squared gap above the noise that `model` leaves."""
+        return max(self._above(model), 0.0) / max(self._above(self.base), 1e-12)
+
+    def _above(self, model: Model) -> float:
+        return model.total - self.noise * len(model.cost)
+
+
+def fresh(race: Race, job: Job) -> list[int]:
+    """Columns to be differenced anew: the effects' at every step, the known parameters' at every third if cheap.
+
+    Far from the logs, where they change from step to step, at every one.
+    """
+    base = len(race.fitter.base)
+    turn = base <= race.settings.fresh and (_astray(race, job) or len(job.history) % 3 == 0)
+    return list(range(0 if turn else base, len(job.coordinates)))
+
+
+def fit_models(race: Race, plans: Sequence[tuple[Model, Screened]], label: str, say: Progress) -> list[Model]:
+    """Models of the plans' effects plus one more each, fitted together; what was fitted before is looked up."""
+    fitter = race.fitter
+    todo: dict[frozenset[str], tuple[list[Job], tuple[Candidate, ...]]] = {}
+    for model, extra in plans:
+        key = frozenset([*(c.label for c in model.effects), extra.candidate.label])
+        if key not in race.models and key not in todo:
+            todo[key] = (_starts(race, model, extra, len(todo)), (*model.effects, extra.candidate))
+    jobs = [job for several, _ in todo.values() for job in several]
+    total = len(jobs)
+    fitter.iterate(
+        jobs,
+        race.settings.iterations,
+        lambda j: fresh(race, j),
+        race.settings.tolerance,
+        progress=lambda left: say(label, total - left, total),
+        keep=_Heats([several for several, _ in todo.values()]),
+    )
+    for key, (several, effects) in todo.items():
+        race.models[key] = scored(fitter, min(several, key=lambda job: job.cost), effects)
+    keys = [frozenset([*(c.label for c in m.effects), e.candidate.label]) for m, e in plans]
+    return [race.models[k] for k in keys]
+
+
+class _Heats:
+    """Successive halving: which fits go on. Starts far behind their candidate's best stop first, then candidates that
+    are far behind the best candidate (they keep the cost they reached, and their place far down the table). What still
+    falls fast goes on, and what was refused a step that would have brought much."""
+
+    STARTS = {1: 4.0, 2: 2.0, 3: 1.3, 5: 1.03}  # steps made -> cost over the best start's
+    CANDIDATES = {2: 8.0, 3: 5.0, 5: 3.0}  # and over the best candidate's
+    FAST = 0.7  # cost after over cost before a step
+
+    def __init__(self, entries: Sequence[Sequence[Job]]) -> None:
+        self.entries = entries
+        self.owner = {id(job): i for i, several in enumerate(entries) for job in several}
+
+    def __call__(self, made: int, running: Sequence[Job]) -> list[Job]:
+        best = [min(job.cost for job in several) for several in self.entries]
+        limits = np.full(len(best), np.inf)
+        if made in self.STARTS:
+            limits = self.STARTS[made] * np.array(best)
+        if made in self.CANDIDATES:
+            limits[np.array(best) > self.CANDIDATES[made] * min(best)] = 0.0
+        return [job for job in running if job.cost <= limits[self.owner[id(job)]] or self._falls(job)]
+
+    def _falls(self, job: Job) -> bool:
+        refused = len(job.history) > 1 and job.history[-1] == job.history[-2]
+        fell = len(job.history) > 1 and job.history[-1] < self.FAST * job.history[-2]
+        return fell or (refused and job.promise > (1 - self.FAST) * job.cost)
+
+
+def _starts(race: Race, model: Model, extra: Screened, rank: int) -> list[Job]:
+    """Jobs from several starting points: costs have several minima (an inertia hides in another, a shape is wrong)."""
+    fitter, coordinates = race.fitter, extra.candidate.coordinates
+    jobs = [fitter.derive(model.job, coordinates, extra.start)]
+    if rank < race.settings.starts and extra.others:
+        anew = _delivered(race, model, coordinates, extra)
+        # a limit has no derivative below its threshold, so also from the probe itself, not scaled down to its step
+        jobs += [anew, fitter.derive(model.job, coordinates, extra.others[0])]
+        jobs += [fitter.derive(model.job, coordinates, other) for other in extra.others[1:]]
+    return jobs
+
+
+def _delivered(race: Race, model: Model, coordinates: Sequence[Coordinate], extra: Screened) -> Job:
+    """A job from the known parameters as they were delivered, not from where they went without the effect.
+
+    Far from the logs the start states went astray as well, and what they do depends on the effect.
+    """
+    fitter, base = race.fitter, len(race.fitter.base)
+    known = np.concatenate([[c.neutral for c in fitter.base], model.job.values[base:]])
+    if _astray(race, model.job):
+        return fitter.begin((*model.job.coordinates, *coordinates), np.concatenate([known, extra.start]))
+    anew = fitter.derive(model.job, coordinates, extra.others[0])
+    anew.values[: len(known)] = known
+    return anew
+
+
+def _astray(race: Race, job: Job) -> bool:
+    """Whether a fit is so far from the logs that its derivatives hold nowhere else."""
+    return job.cost > ASTRAY**2 * race.noise * len(job.r)
+
+
+def ranked(race: Race, size: int | None = None) -> list[Model]:
+    """Models tried, best first."""
+    chosen = [m for m in race.models.values() if size is None or len(m.effects) == size]
+    return sorted(chosen, key=lambda m: m.total)
+
+
+def compatible(a: Candidate, b: Candidate) -> bool:
+    """Not the same numbers twice (an effect at one joint and tied over all)."""
+    return not {i for c in a.coordinates for i in c.index} & {i for c in b.coordinates for i in c.index}
+
+
+def start_of(race: Race, candidate: Candidate) -> Screened:
+    """The candidate with its values from its single fit as the start."""
+    single = race.models.get(frozenset([candidate.label]))
+    found = next(s for s in race.screened if s.candidate.label == candidate.label)
+    if single is None:
+        return found
+    return Screened(candidate, single.values_of(candidate), found.gain, found.absorbed, found.column)
+
+
+def polish(race: Race, model: Model) -> Model:
+    """All columns anew at the fit, and some more steps; with contacts again and again, as long as it helps much."""
+    fitter, job = race.fitter, race.fitter.refresh(model.job)
+    if race.rough:
+        for _ in range(ROUNDS):
+            before, job.history = job.cost, []
+            fitter.iterate([job], 2, lambda j: range(len(j.coordinates)))
+            if fitter.refresh(job).cost > 0.9 * before:
+                break
+    else:
+        fitter.iterate([job], 4, lambda j: fresh(race, j))
+        fitter.refresh(job)
+    new = scored(fitter, job, model.effects)
+    race.models[frozenset(c.label for c in model.effects)] = new
+    return new
+
+
+def without(race: Race, model: Model, effect: Candidate, say: Progress) -> Model:
+    """The model without one of its effects, refitted."""
+    rest = [e for e in model.effects if e != effect]
+    key = frozenset(c.label for c in rest)
+    if key not in race.models:
+        small = race.base
+        for e in rest:
+            start = Screened(e, model.values_of(e), 0.0, 0.0, np.zeros(0))
+            (small,) = fit_models(race, [(small, start)], "dropping", say)
+        if rest and race.rough:
+            polish(race, small)
+    return race.models[key]
+
+
+def exchange(race: Race, model: Model, old: Candidate, new: Candidate, say: Progress) -> Model:
+    """The model with one effect in the place of another, refitted."""
+    rest = without(race, model, old, say)
+    if rest.effects:
+        start = next(s for s in screen(race.fitter, rest.job, [new], race.settings.screened))
+        return fit_models(race, [(rest, start)], "exchanges", say)[0]
+    return fit_models(race, [(race.base, start_of(race, new))], "exchanges", say)[0]
+
+
+def special_cases(effect: Candidate) -> tuple[str, ...]:
+    """Names of the effects that it contains, from its class."""
+    return tuple(getattr(load(effect.effect), "contains", ())) if effect.effect in names() else ()

@@ -1,0 +1,174 @@
+"""Secant screening: how much would each candidate gain, from one simulation per starting point, base refitted linearly.
+
+Tangents at neutral mislead where laws have kinks (dry friction, play): the columns are secants to finite values.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayessim_mjx.diagnosis.fitting.candidates import Candidate
+from bayessim_mjx.diagnosis.fitting.fitter import Fitter, Job
+
+Array = NDArray[np.float64]
+MANY = 400  # starting points, from which on they are screened in two stages
+CANDIDATES, POINTS, FEWEST = 64, 4, 8  # looked at again, starting points of each, windows of the first look
+
+
+@dataclass(frozen=True, eq=False)
+class Screened:
+    """One candidate's best starting point on top of a fitted model.
+
+    Attributes:
+        candidate; start: `[k]`, values to start a fit from.
+        gain: predicted drop of the cost; absorbed: share of the effect that refitting the model hides.
+        whole: drop of the cost at the starting point itself, as it was simulated.
+        column: `[W, n]`, the projected change of the residual per unit of the way to the start (for isolability).
+        others: further starting points `[m, k]`, in other places of its range.
+    """
+
+    candidate: Candidate
+    start: Array
+    gain: float
+    absorbed: float
+    column: Array
+    others: tuple[Array, ...] = ()
+    whole: float = 0.0
+
+
+def screen(fitter: Fitter, job: Job, candidates: Sequence[Candidate], limit: int = 96) -> list[Screened]:
+    """All candidates on top of `job`, best first, on at most `limit` windows.
+
+    Where there are many starting points, a third of the windows tells which are worth a second look on all of them.
+    Gains are scaled to all windows as if those looked at were typical: good for ranking, too high as an estimate.
+    """
+    every = [(i, point) for i, candidate in enumerate(candidates) for point in candidate.probes]
+    if len(every) <= MANY:
+        return _ordered(_looked_at(fitter, job, candidates, every, limit))
+    coarse = _looked_at(fitter, job, candidates, every, max(limit // 3, FEWEST))
+    order = sorted(coarse, key=lambda i: -max(s.gain for s, _ in coarse[i]))[:CANDIDATES]
+    again = [(i, p) for i in order for _, p in sorted(coarse[i], key=lambda f: -f[0].gain)[:POINTS]]
+    fine = _looked_at(fitter, job, candidates, again, limit)
+    return _ordered(fine) + _ordered({i: found for i, found in coarse.items() if i not in fine})
+
+
+def _looked_at(
+    fitter: Fitter, job: Job, candidates: Sequence[Candidate], plans: Sequence[tuple[int, Array]], limit: int
+) -> dict[int, list[tuple[Screened, Array]]]:
+    """{candidate: [(what its starting point gains, the point)]} for plans of (candidate, point)."""
+    count = len(job.r)
+    own = _telling(job, limit)
+    part = _part(job, own)
+    if not plans:
+        return {}
+    thetas = [
+        fitter.vector((*job.coordinates, *candidates[i].coordinates), np.concatenate([job.values, point]))
+        for i, point in plans
+    ]
+    run = fitter.simulator.run
+    shifted = fitter.whiten(run(np.stack(thetas), np.repeat(part.offsets[None], len(thetas), 0), own))
+    columns = part.r[None] - shifted  # [m, W, n]
+    project = _Projection(fitter, part)
+    each: dict[int, list[tuple[Screened, Array]]] = {}
+    for (i, point), column in zip(plans, columns, strict=True):
+        one = _one(project, candidates[i], point, column)
+        each.setdefault(i, []).append((replace(one, gain=one.gain * count / len(own)), point))
+    return each
+
+
+def _telling(job: Job, limit: int) -> NDArray[np.int64]:
+    """At most `limit` windows: half of them where most is left to explain (a limit acts in few), the rest spread."""
+    count = len(job.r)
+    if count <= limit:
+        return np.arange(count)
+    worst = np.argsort(-np.sum(job.r**2, 1), kind="stable")[: limit // 2]
+    others = np.setdiff1d(np.arange(count), worst)
+    spread = others[np.linspace(0, len(others) - 1, limit - len(worst)).round().astype(int)]
+    return np.sort(np.concatenate([worst, spread]))
+
+
+def _ordered(each: dict[int, list[tuple[Screened, Array]]]) -> list[Screened]:
+    return sorted((_with_others(found) for found in each.values()), key=lambda s: -s.gain)
+
+
+def _with_others(found: list[tuple[Screened, Array]]) -> Screened:
+    """The best start, with the best that differs in what it moves or in its shape, and the best at other levels.
+
+    The point that leaves least as it was simulated comes too: a secant says little of laws that act beyond a threshold.
+    """
+    found = sorted(found, key=lambda f: -f[0].gain)
+    first, point = found[0]
+    neutral = np.array([c.neutral for c in first.candidate.coordinates])
+    shapes = np.array(first.candidate.shapes)
+
+    def sort_of(p: Array) -> tuple:
+        return tuple(np.sign(p - neutral)[~shapes]) + tuple(p[shapes])
+
+    useful = [(s, p) for s, p in found[1:] if s.gain > 0]
+    others = [s.start for s, p in useful if sort_of(p) != sort_of(point)][:1]
+    levels = [p for _, p in useful if sort_of(p) == sort_of(point)][:2]
+    least, seen = max(found, key=lambda f: f[0].whole)
+    whole = [seen] if least.whole > 0 and not any(np.array_equal(seen, p) for p in (point, *levels)) else []
+    return replace(first, others=(point, *others, *levels, *whole))
+
+
+def _part(job: Job, own: NDArray[np.int64]) -> Job:
+    """The job on some of its windows."""
+    return replace(
+        job, offsets=job.offsets[own], r=job.r[own], A=job.A[own], B=job.B[own], weight=job.weight[own], history=[]
+    )
+
+
+class _Projection:
+    """The job's own parameters and start states, projected out of columns and residuals."""
+
+    def __init__(self, fitter: Fitter, job: Job) -> None:
+        precision, pull, low, high = job.prior()
+        q, starts = job.quadratic(fitter.spread)
+        g, S = q.weighted(job.weight)
+        slope = g + pull
+        pinned = ((low >= -1e-12) & (slope < 0)) | ((high <= 1e-12) & (slope > 0))
+        self.free = np.flatnonzero(~pinned)
+        self.job, self.starts, self.root = job, starts, np.sqrt(job.weight)[:, None]
+        H = (S + np.diag(precision))[np.ix_(self.free, self.free)]
+        self.inverse = np.linalg.pinv(H) if len(self.free) else H
+        self.slope = slope[self.free]
+        self.A = job.A[:, :, self.free]
+        self.BA = np.einsum("wns,wnk->wsk", starts.B, self.A)
+
+    def moments(self, a: Array) -> tuple[float, float, float, Array]:
+        """(s, g, full norm, projected column) of a column `[W, n]`."""
+        w, starts = self.job.weight, self.starts
+        Ba = np.einsum("wns,wn->ws", starts.B, a)
+        MBa = np.einsum("wst,wt->ws", starts.M, Ba)
+        s_aa = float(w @ (np.sum(a * a, 1) - np.sum(Ba * MBa, 1)))
+        g_a = float(w @ (np.sum(a * self.job.r, 1) - np.sum(MBa * starts.b, 1)))
+        s_ab = np.einsum("w,wnk,wn->k", w, self.A, a) - np.einsum("w,wsk,ws->k", w, self.BA, MBa)
+        along = self.inverse @ s_ab
+        projected = a - np.einsum("wns,ws->wn", starts.B, MBa)
+        projected = (
+            projected
+            - self.A @ along
+            + np.einsum("wns,wst,wtk,k->wn", starts.B, starts.M, self.BA, along, optimize=True)
+        )
+        return s_aa - float(s_ab @ along), g_a - float(s_ab @ (self.inverse @ self.slope)), s_aa, projected * self.root
+
+
+def _one(project: _Projection, candidate: Candidate, point: Array, column: Array) -> Screened:
+    s, g, norm, projected = project.moments(column)
+    neutral = np.array([c.neutral for c in candidate.coordinates])
+    low, high = (np.array([getattr(c, e) for c in candidate.coordinates]) for e in ("low", "high"))
+    if norm < 1e-9 or s <= 1e-9 * norm:
+        return Screened(candidate, point, 0.0, 1.0, projected)
+    way = np.where(candidate.shapes, 0.0, point - neutral)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ahead = np.where(way > 0, (high - neutral) / way, np.where(way < 0, (low - neutral) / way, np.inf))
+        behind = np.where(way > 0, (neutral - low) / way, np.where(way < 0, (neutral - high) / way, np.inf))
+    t = float(np.clip(g / s, -np.min(behind), np.min(ahead)))
+    gain = 2 * t * g - t * t * s
+    start = np.where(candidate.shapes, point, neutral + (t if abs(t) > 0.02 else 0.02) * (point - neutral))
+    return Screened(candidate, np.clip(start, low, high), max(gain, 0.0), 1.0 - s / norm, projected, whole=2 * g - s)

@@ -1,0 +1,103 @@
+"""Standard deviations of identified numbers, by operating conditions, and weights among rivals."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayessim_mjx.diagnosis import statistics
+from bayessim_mjx.diagnosis.fitting.fitter import Fitter
+from bayessim_mjx.diagnosis.selection import weak_directions
+from bayessim_mjx.diagnosis.selection.models import Model
+from bayessim_mjx.diagnosis.selection.weak_directions import Ridges
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Spread:
+    """What limits a fit's parameters.
+
+    Attributes:
+        formal: `[k, k]`, Laplace covariance, inflated by the misfit and by the residuals' correlation.
+        between: `[k, k]`, jackknife over operating conditions.
+        freedom: `[k]`, degrees of freedom of `between`: conditions that tell the parameter, less one.
+    """
+
+    formal: Array
+    between: Array
+    freedom: Array
+
+
+def spread(fitter: Fitter, model: Model, along: Ridges | None = None) -> Spread:
+    """The uncertainty of the model's parameters at its fit; `along`: what was simulated along its ridges."""
+    q, _ = model.job.quadratic(fitter.spread)
+    precision = np.diag(weak_directions.beliefs(model.job, len(fitter.base)))
+    _, S = q.weighted(model.job.weight)
+    S = S if along is None else along.corrected(S, weak_directions.scales(model.job))
+    inflation = weak_directions.inflation(model)
+    covariance = np.linalg.pinv(S / inflation + precision)
+    group = fitter.simulator.windows.group
+    told = [covariance @ q.weighted(model.job.weight * (group == n))[1] @ covariance for n in np.unique(group)]
+    share = np.diagonal(told, axis1=1, axis2=2)  # of the parameter's variance, by the condition it comes from
+    return Spread(np.asarray(covariance), statistics.covariance(model.estimates), statistics.freedom(share))
+
+
+TIMES = 0.07  # of a time step; measured on single effects in MuJoCo C at a tenth of the step
+LAWS = 0.01  # of the distance from neutral
+MISFIT = 0.15  # of it, for a law that leaves all of the gap's root mean square; measured likewise
+
+
+def deviations(fitter: Fitter, model: Model) -> Array:
+    """Standard deviations `[k]` of the model's parameters: the larger of the formal and the jackknife's."""
+    found = spread(fitter, model)
+    return np.sqrt(np.maximum(np.diag(found.formal), np.diag(found.between)))
+
+
+def covariance(fitter: Fitter, model: Model, along: Ridges | None = None) -> Array:
+    """`[k, k]`, of a Gaussian with the 90 % intervals of the parameters and their correlations.
+
+    Few conditions: Student's quantile in the normal's place, where what differs between conditions decides.
+    """
+    found = spread(fitter, model, along)
+    formal, between = np.diag(found.formal), np.diag(found.between)
+    wide = statistics.quantile(found.freedom) / statistics.quantile(np.inf)
+    sd = np.sqrt(np.where(between > formal, between * wide**2, formal))
+    base = len(fitter.base)
+    sd[:base] = np.minimum(
+        sd[:base], 1.0 / np.sqrt(weak_directions.beliefs(model.job, base)[:base])
+    )  # data take nothing away
+    both = found.formal + found.between
+    scale = sd / np.sqrt(np.maximum(np.diag(both), 1e-300))
+    return np.asarray(both * scale[:, None] * scale[None, :])
+
+
+def systematic(model: Model, timestep: float, left: float = 0.0) -> Array:
+    """Standard deviations `[k]` of what simulators differ by, whatever the data: nothing for the known parameters.
+
+    Two simulators with the same effect agree on its times (delays, time constants) to a part of a time step, on its
+    other numbers to about a percent; to less where the law leaves a share `left` of the squared gap unexplained.
+    """
+    laws = LAWS + MISFIT * float(np.sqrt(np.clip(left, 0.0, 1.0)))
+    own = {c.name for effect in model.effects for c in effect.coordinates}
+    return np.array([
+        0.0 if c.name not in own else TIMES * timestep if c.unit == "s" else laws * abs(value - c.neutral)
+        for c, value in zip(model.job.coordinates, model.job.values, strict=True)
+    ])  # fmt: skip
+
+
+def win_share(models: list[Model], group: NDArray[np.int64], noise: float, rng: np.random.Generator) -> Array:
+    """Pseudo-BMA+ weights (Yao et al., 2018, arXiv:1704.02030): held-out log scores under a Bayesian bootstrap.
+
+    Of conditions; of the windows where there is one condition only.
+    """
+    names, index = np.unique(group, return_inverse=True)
+    index = index if len(names) > 1 else np.arange(len(group))
+    draws = (rng.dirichlet(np.ones(index.max() + 1), size=500) * (index.max() + 1))[:, index]
+    totals = np.stack([draws @ m.cost for m in models], 1) + 1e-9  # [draws, models]
+    samples = min(m.samples for m in models)
+    score = -0.5 * samples * np.log(totals)
+    weight = np.exp(score - score.max(1, keepdims=True))
+    return np.asarray((weight / weight.sum(1, keepdims=True)).mean(0))

@@ -1,0 +1,173 @@
+"""Directions in the parameters that the data hardly tell: their curvature as simulated, and what decides along them.
+
+Where two laws do the same (a stronger motor on a heavier link), columns by finite differences still differ, by their
+own errors, and these would pass for knowledge; and a fit stops wherever it came to such a ridge. Along it the costs are
+simulated, and the fit moves to what was believed beforehand: known parameters near their nominal values.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayessim_mjx.diagnosis.fitting.fitter import Fitter, Job
+from bayessim_mjx.diagnosis.fitting.quadratic import eliminate
+from bayessim_mjx.diagnosis.selection.models import Model, scored
+
+Array = NDArray[np.float64]
+UNIFORM = 0.289  # standard deviation of a uniform distribution, of its range
+WEAK = 1e-4  # of the largest curvature, in units of UNIFORM ranges: there the columns' own errors may decide
+INVOLVED = 0.1  # share of an effect's variance that comes from a direction
+MOST, ROUNDS, STEPS = 6, 2, 2  # directions, moves along them, Newton steps in all others
+SHARES = (1.0, 0.5, 0.25)  # of the step along the ridges, tried in turn
+REACH = 1.5  # in units of UNIFORM: how far along a direction is simulated
+NATS = 2.0  # of log-likelihood, and
+ROUNDING = 0.005  # of the cost: a smaller rise is no knowledge (single precision alone brings as much)
+
+
+@dataclass(frozen=True, eq=False)
+class Ridges:
+    """Curvature of the cost as simulated.
+
+    Attributes:
+        ways: `[k, m]`, unit steps in the parameters' units; differenced, simulated: `[m]`, by columns and by rollouts.
+    """
+
+    ways: Array
+    differenced: Array
+    simulated: Array
+
+    def corrected(self, S: Array, scale: Array) -> Array:
+        """`[k, k]` curvature S with what was simulated along the ridges, where that is less."""
+        units = self.ways / scale[:, None] ** 2  # to covectors: ways are scale * (unit eigenvectors)
+        return np.asarray(S - (units * np.maximum(self.differenced - self.simulated, 0.0)) @ units.T)
+
+
+def scales(job: Job) -> Array:
+    """Standard deviations `[k]` of uniform distributions over the parameters' ranges."""
+    return np.array([UNIFORM * (c.high - c.low) for c in job.coordinates])
+
+
+def beliefs(job: Job, base: int) -> Array:
+    """Precisions `[k]` of what was believed beforehand: the first `base` parameters at least as a uniform one."""
+    precision = np.array([c.precision for c in job.coordinates])
+    precision[:base] = np.maximum(precision[:base], 1.0 / scales(job)[:base] ** 2)
+    return precision
+
+
+def inflation(model: Model) -> float:
+    """Squared misfit per effective residual: by how much less the data know than independent noise would tell."""
+    count = model.job.r.size
+    return max(model.total / count, 0.5) * count / model.samples
+
+
+def settled(fitter: Fitter, model: Model) -> tuple[Model, Ridges]:
+    """The model moved along its ridges to what was believed beforehand, and the curvature along them there."""
+    for _ in range(ROUNDS):
+        found = _Profile(fitter, model)
+        moved = found.moved()
+        if moved is None:
+            return model, found.ridges
+        model = moved
+    return model, _Profile(fitter, model).ridges
+
+
+class _Profile:
+    """Costs along a model's ridges, minimised over the start states and all directions that the data do tell."""
+
+    def __init__(self, fitter: Fitter, model: Model) -> None:
+        self.fitter, self.model, self.job = fitter, model, model.job
+        base, scale = len(fitter.base), scales(self.job)
+        q, _ = self.job.quadratic(fitter.spread)
+        _, S = q.weighted(self.job.weight)
+        curvature, V = np.linalg.eigh(scale[:, None] * S * scale)
+        variance = V[base:] ** 2 / np.maximum(curvature, 1e-12 * curvature[-1])
+        share = np.max(variance / np.maximum(variance.sum(1, keepdims=True), 1e-300), axis=0)
+        self.weak = weak = np.flatnonzero((curvature < WEAK * curvature[-1]) & (share > INVOLVED))[:MOST]
+        self.every = scale[:, None] * V
+        self.ways, self.columns = self.every[:, weak], self.job.A @ self.every
+        self.less = inflation(model)
+        self.slopes, simulated = self._along()
+        self.ridges = Ridges(self.ways, np.maximum(curvature[weak], 0.0), simulated)
+
+    def _along(self) -> tuple[Array, Array]:
+        """Slopes and curvatures `[m]` of the cost: a parabola through two more places along each way."""
+        along = [self._places(way) for way in self.ways.T]
+        slopes, curvature = np.zeros(len(along)), np.zeros(len(along))
+        if not along:
+            return slopes, curvature
+        points = [self.job.values + t * w for ts, w in zip(along, self.ways.T, strict=True) for t in ts]
+        costs, _ = self.costs([self.job.values, *points], [self.weak, *([i] for i in np.repeat(self.weak, 2))])
+        for k, (s, t) in enumerate(along):
+            rise = costs[1 + 2 * k : 3 + 2 * k] - costs[0]  # = slope t + curvature t^2
+            rise = np.sign(rise) * np.maximum(np.abs(rise) - self.allowed(costs[0]), 0.0)
+            slopes[k], curvature[k] = np.linalg.solve([[s, s * s], [t, t * t]], rise)
+        return slopes, np.maximum(curvature, 0.0)
+
+    def allowed(self, cost: float) -> float:
+        """A rise of the cost that says nothing."""
+        return float(max(2 * NATS * self.less, ROUNDING * cost))
+
+    def _places(self, way: Array) -> tuple[float, float]:
+        """Two places along a way, one on either side where there is room."""
+        behind, ahead = self._room(way)
+        if min(-behind, ahead) > 0.1 * REACH:
+            return max(behind, -REACH), min(ahead, REACH)
+        end = min(ahead, REACH) if ahead > -behind else max(behind, -REACH)
+        end = end if abs(end) > 1e-6 else 1e-6  # a corner: nowhere to go
+        return end / 2, end
+
+    def _room(self, way: Array) -> tuple[float, float]:
+        """How far one can go along a way (backwards, forwards) before a parameter meets its bound."""
+        _, _, low, high = self.job.prior()
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ends = np.sort(np.stack([low / way, high / way]), axis=0)
+        moving = np.abs(way) > 1e-3 * scales(self.job)
+        return float(np.max(ends[0][moving], initial=-np.inf)), float(np.min(ends[1][moving], initial=np.inf))
+
+    def costs(self, points: Sequence[Array], fixed: Sequence[Any]) -> tuple[Array, list[Array]]:
+        """Costs of the data near some values of the parameters, and the points that reach them.
+
+        fixed: of each point, indices of the directions in which it stays where it is.
+        """
+        fitter, job = self.fitter, self.job
+        low, high = (np.array([getattr(c, end) for c in job.coordinates]) for end in ("low", "high"))
+        reached, costs = [np.clip(p, low, high) for p in points], np.zeros(len(points))
+        for _ in range(STEPS):
+            thetas = np.stack([fitter.vector(job.coordinates, p) for p in reached])
+            rows = fitter.whiten(fitter.simulator.run(thetas, np.repeat(job.offsets[None], len(thetas), 0)))
+            for k, (r, stays) in enumerate(zip(rows, fixed, strict=True)):
+                free = np.setdiff1d(np.arange(len(job.values)), stays)
+                q, _ = eliminate(r, self.columns[..., free], job.B, job.offsets, fitter.spread)
+                g, S = q.weighted(job.weight)
+                step = np.linalg.lstsq(S, g, rcond=None)[0]
+                costs[k] = job.weight @ q.c - g @ step
+                reached[k] = np.clip(reached[k] + self.every[:, free] @ step, low, high)
+        return costs, reached
+
+    def moved(self) -> Model | None:
+        """One step to the posterior's mode along ridges where beliefs weigh more, if it costs next to nothing."""
+        job = self.job
+        known = self.ridges.simulated / self.less
+        flat = np.flatnonzero(known < 1.0)
+        if not len(flat):
+            return None
+        ways, belief = self.ways[:, flat], beliefs(job, len(self.fitter.base))
+        neutral = np.array([c.neutral for c in job.coordinates])
+        H = np.diag(known[flat]) + ways.T @ (belief[:, None] * ways)
+        slope = self.slopes[flat] / self.less / 2 + ways.T @ (belief * (job.values - neutral))
+        step = np.clip(-np.linalg.solve(H, slope), -REACH, REACH)
+        points = [job.values, *(job.values + ways @ (share * step) for share in SHARES)]
+        (here, *_), reached = self.costs(points, [self.weak[flat]] * len(points))
+        for point in reached[1:]:
+            if np.all(np.abs(point - job.values) <= 1e-3 * scales(job)):
+                continue
+            new = self.fitter.refresh(replace(job, values=point, history=[]))
+            q, _ = new.quadratic(self.fitter.spread)
+            if float(new.weight @ q.c) - here <= self.allowed(here):
+                return scored(self.fitter, new, self.model.effects)
+        return None

@@ -1,0 +1,180 @@
+"""What is fixed before the race: usable logs, the model and its time step, windows, candidates, noise, tolerance."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from bayessim_mjx import effects as library
+from bayessim_mjx.diagnosis import tolerance
+from bayessim_mjx.diagnosis.fitting import candidates, discretisation, scales, windows
+from bayessim_mjx.diagnosis.fitting.centred_commands import physics_of
+from bayessim_mjx.diagnosis.fitting.fitter import Fitter
+from bayessim_mjx.diagnosis.fitting.robot import Robot
+from bayessim_mjx.diagnosis.fitting.simulator import Simulator
+from bayessim_mjx.diagnosis.logcheck import gate, noise
+from bayessim_mjx.diagnosis.selection import search
+from bayessim_mjx.effects.effect import Effect
+from bayessim_mjx.logs.log import Log
+from bayessim_mjx.logs.resample import resample
+from bayessim_mjx.physics import Physics
+
+WINDOW = 0.5  # s
+SHORTER = (1.0, 0.5, 0.25)  # of it, tried in turn while the time step with contacts is worth more than LOTTERY noises
+LOTTERY = 5.0
+SHORTEST_WINDOW = 8  # control steps
+SHORTEST = 0.004  # s, control period of the diagnosis; faster logs are resampled
+LIMITS = ((1, 160), (3, 96), (7, 64), (100, 48))  # (up to so many dofs, windows)
+BUDGET = 24000  # sub-steps of one simulation of all windows; half of it for robots of more than MANY dofs
+MANY = 3
+FEWEST = 24  # windows that are simulated whatever the budget
+LEAST = 6  # windows: with fewer nothing can be held out
+
+
+class TooLittleData(Exception):
+    """There is something to look at, but not enough to hold anything out; the text says what is missing."""
+
+
+@dataclass(frozen=True, eq=False)
+class Setup:
+    """Everything that is fixed before the race."""
+
+    robot: Robot
+    physics: Physics
+    gate: gate.Gate
+    floors: noise.Floors
+    fitter: Fitter
+    candidates: list[candidates.Candidate]
+    scales: scales.Scales
+    settings: search.Settings
+    seed: int
+    tolerance: tolerance.Tolerance
+    warnings: list[str] = field(default_factory=list)
+    discretisation: discretisation.Discretisation | None = None
+
+    @property
+    def logs(self) -> tuple[Log, ...]:
+        return self.gate.usable
+
+
+def control_period(robot: Robot, logs: Sequence[Log]) -> float:
+    """s: the task's, else the logs' own, or a multiple of it that is not too short to simulate."""
+    if robot.control_dt is not None:
+        return robot.control_dt
+    period = float(np.median([log.period for log in logs]))
+    return period * max(1, int(np.ceil(SHORTEST / period - 1e-6)))
+
+
+def prepare(
+    robot: Robot,
+    logs: Sequence[Log],
+    effects: str | Sequence[str | type[Effect]] = "all",
+    *,
+    group: str | None = None,
+    seed: int = 0,
+    settings: search.Settings | None = None,
+    tolerated: Sequence[str] = (),
+) -> Setup:
+    """Everything up to the first simulation.
+
+    Raises:
+        UserError: unknown effects, no usable log, a tolerance that cannot be read.
+        TooLittleData: too few windows.
+    """
+    asked = tolerance.read(tolerated, robot.mj_model)
+    dt = control_period(robot, logs)
+    seen = gate.check(logs, robot.mj_model, dt)
+    usable = seen.demand()
+    notes = [*seen.warnings, *(f"{text} (found, not assumed)" for text in seen.findings)]
+    floors = noise.floors(usable)
+    kinds = [library.load(n) if isinstance(n, str) else n for n in (library.names() if effects == "all" else effects)]
+    size = scales.measure(robot.mj_model, [resample(log, dt) for log in usable])
+    stack, left_out = candidates.stack(kinds, size)
+    own = robot.physics(dt)
+    cuts, step = _measured(own, usable, group, seen.use_qvel)
+    robot = step.robot(robot)
+    physics = physics_of(robot, dt, stack)
+    cut = step.noisier(cuts(step.factor, _limit(physics, cuts(1).steps), centred=False))
+    fitter = Fitter(Simulator(physics, cut), candidates.base_coordinates(robot.space), physics.space.nominal)
+    every = candidates.enumerate_candidates(physics)
+    settings = dataclasses.replace(settings or _settings(robot), believed=step.believed)
+    allowed = tolerance.judge(robot.mj_model, 2 * size.travel, cut.sigma_q, asked)
+    notes += [*floors.warnings, *step.warnings(), *(f"not tried: {text}" for text in left_out), *_few_conditions(cut)]
+    notes += allowed.warnings()
+    return Setup(robot, physics, seen, floors, fitter, every, size, settings, seed, allowed, notes, step)
+
+
+def _settings(robot: Robot) -> search.Settings:
+    """Budgets for the robot's size; thresholds are the same for all."""
+    big = robot.mj_model.nv > MANY
+    return search.Settings(singles=24, pairs=5, screened=24, starts=16) if big else search.Settings()
+
+
+def _measured(
+    own: Physics, usable: Sequence[Log], group: str | None, use_qvel: bool
+) -> tuple[Callable[..., windows.Windows], discretisation.Discretisation]:
+    """The windows, and what the time step is worth in them; shorter ones where contacts make longer ones a lottery."""
+    for share in SHORTER:
+        cuts = _windows(own, usable, group, use_qvel, share * WINDOW)
+        step = discretisation.measure(own, cuts, usable, _finest(own, len(cuts(1)), cuts(1).steps))
+        known = np.isfinite(step.sigma)
+        worth = float(np.median(step.floor[known] / step.sigma[known]))
+        if worth < LOTTERY or not discretisation.contacts(own) or cuts(1).steps <= SHORTEST_WINDOW:
+            break
+    return cuts, step
+
+
+def _windows(
+    physics: Physics, logs: Sequence[Log], group: str | None, use_qvel: bool, seconds: float = WINDOW
+) -> Callable[..., windows.Windows]:
+    """(factor, limit) -> the windows with that many times the sub-steps of `physics`, by default the same ones."""
+    dt = physics.dt
+    longest = max(int(log.duration / dt) for log in logs)
+    length = int(np.clip(round(seconds / dt), SHORTEST_WINDOW, 100))
+    if longest < length:
+        raise TooLittleData(f"the longest log has {longest} control steps of {dt:.3g} s, one window needs {length}")
+    own = _limit(physics, length)
+
+    @functools.cache
+    def cuts(factor: int, limit: int = own, centred: bool = True) -> windows.Windows:
+        return windows.cut(
+            logs,
+            physics.mj_model,
+            dt,
+            physics.substeps * factor,
+            length,
+            limit=limit,
+            group=group,
+            use_qvel=use_qvel,
+            centred=centred,
+        )
+
+    if len(cuts(1)) < LEAST:
+        raise TooLittleData(f"{len(cuts(1))} windows of {length * dt:.2g} s; holding conditions out needs {LEAST}")
+    return cuts
+
+
+def _limit(physics: Physics, length: int) -> int:
+    """Most windows of so many control steps that are simulated at once."""
+    nv = physics.mj_model.nv
+    budget = BUDGET if nv <= MANY else BUDGET // 2
+    limit = next(n for dofs, n in LIMITS if nv <= dofs)
+    return min(limit, max(FEWEST, budget // (length * physics.substeps)))
+
+
+def _finest(physics: Physics, count: int, length: int) -> int:
+    """How many times the sub-steps the budget allows when at most half of `count` windows are given up for it."""
+    budget = BUDGET if physics.mj_model.nv <= MANY else BUDGET // 2
+    return max(1, budget // (length * physics.substeps * max(FEWEST, (count + 1) // 2)))
+
+
+def _few_conditions(cut: windows.Windows) -> list[str]:
+    count = len(cut.groups)
+    if cut.groups[0].startswith("part 1 of"):
+        blocks = "one operating condition only: blocks in time are held out, which tells little about other conditions"
+        return [*cut.notes, blocks]
+    return [*cut.notes, *([f"{count} operating conditions: intervals are rough"] if count < 4 else [])]

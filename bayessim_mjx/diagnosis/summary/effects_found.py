@@ -1,0 +1,127 @@
+"""Numbers of the named effects: estimates, weight among rivals, what each closes, as promised and as realised."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from bayessim_mjx.diagnosis.findings import Findings
+from bayessim_mjx.diagnosis.fitting.candidates import Candidate
+from bayessim_mjx.diagnosis.result import Estimate, FoundEffect
+from bayessim_mjx.diagnosis.selection import bounds, heldout, predicted_gain, uncertainty, verdict
+from bayessim_mjx.diagnosis.selection.models import Model
+from bayessim_mjx.diagnosis.selection.race import Progress
+from bayessim_mjx.diagnosis.setup import Setup
+
+
+def effects_of(found: Findings, sd: np.ndarray, closed: dict[str, Any], say: Progress) -> list[FoundEffect]:
+    """The effects of the verdict with all their numbers, the one that closes most first."""
+    parts = _parts(found, closed, say)
+    out = [_effect(found, e, sd, parts[e.label]) for e in found.ruling.model.effects]
+    return sorted(out, key=lambda e: -e.gap_closed)
+
+
+@dataclass(frozen=True)
+class _Part:
+    """One effect's part of what all close: its share of that (Shapley), closed, with interval, and promised."""
+
+    share: float
+    closed: float
+    ci: tuple[float, float]
+    promised: float
+
+
+def _parts(found: Findings, closed: dict[str, Any], say: Progress) -> dict[str, _Part]:
+    """{label: part}; the shares are of the linear promise where too many effects are named to fit all subsets."""
+    model, race = found.ruling.model, found.race
+    labels = [e.label for e in model.effects]
+    if not labels:
+        return {}
+    fitted = verdict.subsets(race, model, say) if len(labels) > 1 else {}
+    if fitted:
+        each = predicted_gain.shapley(
+            len(labels), lambda some: race.base.cost - fitted[frozenset(labels[i] for i in some)].cost
+        )
+    else:
+        each = np.array([[closed["each"][n] if len(labels) > 1 else 1.0] for n in labels])
+        each = each if each.sum() else np.ones_like(each)
+    out = {}
+    for label, own in zip(labels, each, strict=True):
+        part = replace(_closed(found), own=own, every=each.sum(0))
+        share = float(own.sum() / each.sum())
+        out[label] = _Part(share, part.value, part.interval(), closed["each"][label])
+    return out
+
+
+def closed_by(found: Findings) -> dict[str, Any]:
+    """Share of the recalibrated simulator's squared gap that all effects close: promised, and then really."""
+    model = found.ruling.model
+    if not model.effects:
+        return {}
+    closed = _closed(found)
+    total, each = predicted_gain.promised(found.race, model.effects)
+    return {"predicted": total, "realised": closed.value, "ci": closed.interval(), "each": each}
+
+
+def _closed(found: Findings) -> heldout.Closed:
+    cut = found.setup.fitter.simulator.windows
+    before, after = (found.predictions[k].cost(cut.steps) for k in ("calibrated", "with_effects"))
+    return heldout.Closed(before, after, cut.group)
+
+
+def _effect(found: Findings, effect: Candidate, sd: np.ndarray, part: _Part) -> FoundEffect:
+    setup, model = found.setup, found.ruling.model
+    rivals = found.ruling.rivals.get(effect.label, [])
+    weighed = [r for r in rivals if not r.contains]
+    own_weight, *others = _weights(found, [model, *(r.model for r in weighed)])
+    weight_of = dict(zip(map(id, weighed), others, strict=True))
+    own = [model.job.names.index(c.name) for c in effect.coordinates]
+    numbers, ends = {}, []
+    for i, c in zip(own, effect.coordinates, strict=True):
+        value, word = float(model.job.values[i]), c.name.rsplit(".", 1)[1]
+        bound = bounds.of(setup.physics, effect, c, value)
+        deviation = float(sd[i]) if bound is None or bound.kind == "off" else float("nan")
+        numbers[word] = Estimate(value, deviation, _unit(setup, effect, c.unit), bound.kind if bound else "")
+        ends += [f"{word.replace('_', ' ')} {bound.why}"] if bound else []
+    return FoundEffect(
+        name=effect.effect,
+        where=effect.where,
+        parameters=numbers,
+        weight_among_rivals=own_weight,
+        gap_closed=part.closed,
+        gap_closed_ci=part.ci,
+        equivalent_to=[r.to_dict() | ({"weight": weight_of[id(r)]} if id(r) in weight_of else {}) for r in rivals],
+        sentence=_sentence(ends),
+        predicted_gap_closed=part.promised,
+        share=part.share if len(model.effects) > 1 else float("nan"),
+    )
+
+
+def _sentence(clauses: list[str]) -> str:
+    text = "; ".join(clauses)
+    return f"{text[:1].upper()}{text[1:]}." if text else ""
+
+
+def _weights(found: Findings, models: list[Model]) -> list[float]:
+    """Weights of a model and its rivals; NaN of one that has none."""
+    if len(models) < 2:
+        return [float("nan")]
+    group, rng = found.setup.fitter.simulator.windows.group, np.random.default_rng(found.setup.seed)
+    return uncertainty.win_share(models, group, found.race.noise, rng).tolist()
+
+
+def _unit(setup: Setup, effect: Candidate, unit: str) -> str:
+    """A hinge's unit as a slide's, where the place is a slide."""
+    model = setup.physics.mj_model
+    if effect.kind not in ("joint", "actuator") or effect.where == "all":
+        return unit
+    try:
+        joint = model.joint(effect.where).id if effect.kind == "joint" else int(model.actuator(effect.where).trnid[0])
+    except KeyError:
+        return unit
+    if joint < 0 or int(model.jnt_type[joint]) != 2:
+        return unit
+    swap = {"N m/rad": "N/m", "N m s/rad": "N s/m", "N m s": "N s/m", "kg m^2": "kg", "N m": "N", "rad": "m"}
+    return swap.get(unit, unit.replace("N m", "N").replace("rad", "m"))

@@ -1,0 +1,179 @@
+"""The verdict in words."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+from bayessim_mjx.diagnosis.findings import Findings
+from bayessim_mjx.diagnosis.result import FoundEffect, Gap
+from bayessim_mjx.diagnosis.selection.verdict import Rival
+from bayessim_mjx.diagnosis.tolerance import extent
+from bayessim_mjx.diagnosis.vocabulary import listed, missing
+from bayessim_mjx.quantities import percent
+
+CLEAR = 1.2  # noise variances above which a horizon's gap is worth a share
+TOLD = 6  # joints told one by one
+HEADS = {
+    "no_gap": "No gap above the noise: the logs differ from the simulator by {nominal}.",
+    "parameters": "The parameters are off, the structure is right: recalibrated, the gap falls from {nominal} to "
+    "{calibrated}.",
+    "effects": "The simulator lacks {named}.",
+    "ambiguous": "The simulator lacks something like {named}, but these logs fit other explanations as well.",
+    "unexplained": "Something is missing that no effect of the library explains.",
+}
+PARTLY = (
+    "Partly explained: {named} {close} {realised} of the squared gap above the noise, but more than the tolerance "
+    "remains at {beyond}."
+)
+NEAREST = "Of the library, {named} {come} nearest"
+BEATEN = "; a flexible force alone predicts held-out conditions far better"
+ON_TOP = "; a flexible force on top of {them} still closes {remains} of the gap"
+FALLS = (
+    "With {them} the recalibrated simulator's gap falls from {calibrated} to {with_effects} on held-out conditions. "
+    "Before {they} fitted, {predicted} of the squared gap above the noise was predicted to close; {realised} did."
+)
+WITHIN = "What remains is within the tolerance at every joint: {within}."
+CHANCE = (
+    "What remains, {calibrated}, no candidate and no flexible force predicts on held-out conditions: process noise, an "
+    "input that was not logged, or noise larger than estimated."
+)
+
+
+def sentences(
+    name: str,
+    effects: list[FoundEffect],
+    parameters: dict[str, dict[str, Any]],
+    found: Findings,
+    far: Gap,
+    remains: float,
+    beaten: bool,
+) -> list[str]:
+    """The verdict, most important first; `remains`, `beaten`: see `verdict_in_words`."""
+    told = verdict_in_words(name, effects, far, remains, beaten)
+    if found.ruling.ambiguous:
+        told += [_instead(e, found.ruling.rivals.get(f"{e.name}@{e.where}", [])) for e in effects]
+    if not effects and remains == 0.0 and found.race.above_noise(found.race.base):
+        told.append(CHANCE.format(calibrated=stage_in_words(far, "calibrated")))
+    if name == "unexplained" and found.flexible_winner is not None:
+        told += [f"{text[:1].upper()}{text[1:]}." for text in found.flexible_winner.text]
+    told += [f"At its bound: {missing(e.name, e.where)}. {e.sentence}" for e in effects if _at_bound(e)]
+    told += [f"{k} {v['structural']}." for k, v in parameters.items() if v["structural"]]
+    return [text for text in told if text]
+
+
+def verdict_in_words(
+    name: str, effects: list[FoundEffect], far: Gap, remains: float = 0.0, beaten: bool = False
+) -> list[str]:
+    """Verdict, how far, and what remains against the tolerance.
+
+    Args:
+        remains: share of the gap that a flexible force closes on top of the effects; beaten: whether a flexible force
+            alone does better than they do.
+    """
+    promised, went = (sum(getattr(e, k) for e in effects) for k in ("predicted_gap_closed", "gap_closed"))
+    one = len(effects) == 1
+    fill = {s: stage_in_words(far, s) for s in ("nominal", "calibrated", "with_effects")} | {
+        "named": listed([missing(e.name, e.where) for e in effects]),
+        "them": "it" if one else "them",
+        "they": "it was" if one else "they were",
+        "come": "comes" if one else "come",
+        "close": "closes" if one else "close",
+        "remains": percent(remains),
+        "predicted": percent(promised),
+        "realised": percent(went),
+        "beyond": listed([_left(n, far.physical[n]) for n in _worst(far) if n in far.beyond][:3]),
+        "within": _within(far),
+    }
+    partly = name == "unexplained" and effects and far.beyond
+    out = [PARTLY if partly else HEADS[name]]
+    if effects:
+        more = ON_TOP if remains > 0.05 else BEATEN if beaten else ""
+        out += [f"{NEAREST}{more}."] if name == "unexplained" and (more or not partly) else []
+        out.append(FALLS)
+    if name == "unexplained" and not effects:
+        rest = [_left(n, far.physical[n]) for n in _worst(far) if "largest" in far.physical[n]]
+        out += [f"What remains after recalibration: {listed(rest[:3])}."] if rest else []
+    joints = list(far.physical)
+    if len(joints) > 1 and name != "no_gap":
+        out.append(_by_joint(far, bool(effects)))
+    if effects and _within(far) and not far.beyond:
+        out.append(WITHIN)
+    return [text.format(**fill) for text in out]
+
+
+def _at_bound(effect: FoundEffect) -> bool:
+    return any(v.bound not in ("", "off") for v in effect.parameters.values())
+
+
+def stage_in_words(far: Gap, stage: str) -> str:
+    """`1.2 deg (2.1 % of the motion, 27.0 noise sd)`; of several joints the share alone."""
+    parts = [percent(far.shares[stage]) + " of the motion"] if stage in far.shares else []
+    noises = f"{number(getattr(far, stage))} noise sd"
+    if len(far.physical) == 1:
+        (row,) = far.physical.values()
+        return f"{extent(row[stage], row['unit'])} ({', '.join([*parts, noises])})"
+    return f"{parts[0]} ({noises})" if parts else noises
+
+
+def _worst(far: Gap) -> list[str]:
+    """Joints, what remains against the tolerance largest first."""
+    return sorted(far.physical, key=lambda n: -_against(far.physical[n]))
+
+
+def _against(row: dict[str, Any]) -> float:
+    return float(row["with_effects"] / row["tolerance"]) if row.get("tolerance") else 0.0
+
+
+def _left(name: str, row: dict[str, Any]) -> str:
+    """`elbow: 1.2 deg rms, 3.4 deg at most (2.1 % of its motion; tolerance 0.8 deg)`."""
+    unit = row["unit"]
+    most = f"{extent(row['with_effects'], unit)} rms, {extent(row['largest'], unit)} at most"
+    part = f"{percent(row['with_effects'] / row['motion'])} of its motion; " if row["motion"] else ""
+    return f"{name}: {most} ({part}tolerance {extent(row['tolerance'], unit)})"
+
+
+def _within(far: Gap) -> str:
+    """The joint that comes nearest to its tolerance."""
+    name = next((n for n in _worst(far) if far.physical[n].get("tolerance")), "")
+    if not name:
+        return ""
+    row = far.physical[name]
+    noise, unit = row.get("noise", 0.0), row["unit"]
+    above = math.sqrt(max(row["with_effects"] ** 2 - noise**2, 0.0))
+    return f"{extent(above, unit)} above the noise, of {extent(max(row['tolerance'], noise), unit)}, at {name}"
+
+
+def _by_joint(far: Gap, effects: bool) -> str:
+    """`By joint, recalibrated and with the effects: elbow 1.2 deg, 0.05 deg; ...`, the worst first."""
+    stages = ("calibrated", "with_effects") if effects else ("nominal", "calibrated")
+    words = "recalibrated and with the effects" if effects else "as delivered and recalibrated"
+    names = _worst(far)
+    rows = [(n, [extent(far.physical[n][s], far.physical[n]["unit"]) for s in stages]) for n in names[:TOLD]]
+    more = f"; {len(names) - TOLD} more in the table" if len(names) > TOLD else ""
+    return f"By joint, {words}: {'; '.join(f'{n} {a}, {b}' for n, (a, b) in rows)}{more}."
+
+
+def number(value: float) -> str:
+    """Three digits, in plain notation."""
+    return f"{value:.2f}" if value < 9.995 else f"{value:.1f}" if value < 99.95 else f"{value:.0f}"
+
+
+def _instead(effect: FoundEffect, rivals: Sequence[Rival]) -> str:
+    """What else it could be."""
+    others = [listed([missing(c.effect, c.where) for c in r.effects]) for r in rivals if not r.contains][:4]
+    return f"Instead of {missing(effect.name, effect.where)} it could be {listed(others, 'or')}." if others else ""
+
+
+def horizon_warning(gap: Gap) -> list[str]:
+    """A verdict that changes with the horizon is flagged."""
+    closed = {
+        row["name"]: (row["calibrated"] ** 2 - row["with_effects"] ** 2) / (row["calibrated"] ** 2 - 1.0)
+        for row in gap.horizons
+        if row["calibrated"] ** 2 > CLEAR
+    }
+    if len(closed) < 2 or max(closed.values()) - min(closed.values()) < 0.3:
+        return []
+    shares = ", ".join(f"{percent(share)} ({name})" for name, share in closed.items())
+    return [f"the gap closed depends on the horizon: {shares}"]

@@ -1,0 +1,195 @@
+"""How far over whole logs: simulated open loop from a log's first window on, as long as a motion can be predicted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayessim_mjx.diagnosis.findings import Findings
+from bayessim_mjx.diagnosis.fitting import windows
+from bayessim_mjx.diagnosis.fitting.centred_commands import physics_of
+from bayessim_mjx.diagnosis.fitting.simulator import Simulator
+from bayessim_mjx.diagnosis.selection.heldout import Prediction
+from bayessim_mjx.diagnosis.selection.models import Model
+from bayessim_mjx.diagnosis.setup import Setup
+from bayessim_mjx.quantities import percent
+
+Array = NDArray[np.float64]
+LOGS, SECONDS = 8, 10.0  # at most
+DRAWS = 4  # of the start state
+CLEAR, PART = 3.0, 0.1  # noise sd and share of the motion: what a start's uncertainty may grow to
+LEAST = 2  # windows that a log must be predictable for
+LOST = 999.0  # the simulator's mark of what is not finite
+
+
+@dataclass(frozen=True, eq=False)
+class Whole:
+    """Held-out errors over whole logs.
+
+    Attributes:
+        cost: {stage: `[L]`}, mean squares in noise variances, of the logs that can be predicted; by_channel: {stage:
+            `[L, nv]`}, of positions alone.
+        chance: `[L]`, mean squares that come of the uncertain start alone.
+        group: `[L]`, operating conditions; name, seconds: of the horizon; notes: for the warnings.
+    """
+
+    cost: dict[str, Array]
+    by_channel: dict[str, Array]
+    chance: Array
+    group: NDArray[np.int64]
+    name: str
+    seconds: float
+    notes: list[str]
+
+
+@dataclass(frozen=True, eq=False)
+class _Stage:
+    """A stage of the gap; nominal: with the known parameters as they were delivered."""
+
+    model: Model
+    prediction: Prediction
+    nominal: bool
+
+
+def simulate(found: Findings) -> Whole:
+    """Every stage on at most LOGS logs; parameters are those found without the log's condition, where it has one."""
+    setup, cut = found.setup, found.setup.fitter.simulator.windows
+    stages = {
+        "nominal": _Stage(found.race.base, found.predictions["nominal"], True),
+        "calibrated": _Stage(found.race.base, found.predictions["calibrated"], False),
+    }
+    if found.ruling.model.effects:
+        stages["with_effects"] = _Stage(found.ruling.model, found.predictions["with_effects"], False)
+    logs = np.unique(cut.log)
+    logs = logs[np.unique(np.linspace(0, len(logs) - 1, min(len(logs), LOGS)).round().astype(int))]
+    first = [int(np.flatnonzero(cut.log == r)[0]) for r in logs]
+    starts = [int(cut.start[w]) for w in first]
+    most = round(SECONDS / cut.dt)
+    length = [min(len(cut.logs[r]) - 1 - a, most) for r, a in zip(logs, starts, strict=True)]
+    simulator = _simulator(found, logs, starts, max(length), len(stages) + DRAWS)
+    errors, spread = [], []
+    for i, (w, steps) in enumerate(zip(first, length, strict=True)):
+        rows = _one(found, simulator, stages, i, w)[:, :steps]
+        errors.append(rows[: len(stages)])
+        spread.append(rows[len(stages) :] - rows[len(stages) - 1])
+    return _judged(setup, list(stages), [cut.logs[r].name for r in logs], cut.group[first], errors, spread)
+
+
+def _simulator(found: Findings, logs: Array, starts: list[int], length: int, lanes: int) -> Simulator:
+    """Of the named effects only: a small program, compiled in seconds."""
+    setup, named = found.setup, {e.effect for e in found.ruling.model.effects}
+    cut = setup.fitter.simulator.windows
+    physics = physics_of(setup.robot, cut.dt, [e for e in setup.physics.effects if e.name in named])
+    some = [setup.logs[r] for r in logs]
+    where = list(enumerate(starts))
+    own = windows.cut(
+        some, physics.mj_model, cut.dt, physics.substeps, length, limit=len(some), starts=where, centred=False
+    )
+    return Simulator(physics, own, lanes)
+
+
+def _one(found: Findings, simulator: Simulator, stages: dict[str, _Stage], i: int, w: int) -> Array:
+    """Whitened errors `[stages + DRAWS, H, channels]` of one log; the draws are of the last stage's start state."""
+    fitter = found.setup.fitter
+    thetas = [_theta(found, simulator, s, w) for s in stages.values()]
+    offsets = [s.prediction.offsets[w] for s in stages.values()]
+    B = list(stages.values())[-1].model.job.B[w]
+    root = np.linalg.cholesky(np.linalg.inv(B.T @ B + np.diag(1 / fitter.spread**2)))
+    draws = np.random.default_rng(found.setup.seed).normal(size=(DRAWS, len(root))) @ root.T
+    thetas += [thetas[-1]] * DRAWS
+    moved = np.stack([*offsets, *(offsets[-1] + draws)])[:, None]
+    raw = simulator.run(np.stack(thetas), moved, np.array([i]))[:, 0]
+    raw[np.abs(raw) >= LOST] = np.nan
+    return np.asarray(raw[..., fitter.used] / fitter.sigma)
+
+
+def _theta(found: Findings, simulator: Simulator, stage: _Stage, w: int) -> Array:
+    """theta of the small simulator found without the condition of window w (with all, where the log has several)."""
+    fitter, job = found.setup.fitter, stage.model.job
+    cut = fitter.simulator.windows
+    own = np.unique(cut.group[cut.log == cut.log[w]])
+    values = stage.model.estimates[list(np.unique(cut.group)).index(own[0])] if len(own) == 1 else job.values
+    values = np.array([c.neutral for c in job.coordinates]) if stage.nominal else values
+    space, small = found.setup.physics.space, simulator.physics.space
+    return fitter.vector(job.coordinates, values)[[space.index(name) for name in small.names]]
+
+
+def _judged(
+    setup: Setup,
+    stages: list[str],
+    names: list[str],
+    group: NDArray[np.int64],
+    errors: list[Array],
+    spread: list[Array],
+) -> Whole:
+    """Costs of the logs that can be predicted, each as long as it can be, and what is to be said of the others."""
+    cut = setup.fitter.simulator.windows
+    size = [_motion(setup, name) for name in names]
+    last = [_predictable(s, m) for s, m in zip(spread, size, strict=True)]
+    chaotic = [n for n, k, e in zip(names, last, errors, strict=True) if k < e.shape[1]]
+    broken = [n for n, k, e in zip(names, last, errors, strict=True) if not np.isfinite(e[:, :k]).all()]
+    kept = [i for i, n in enumerate(names) if n not in broken and last[i] >= LEAST * cut.steps]
+    cost = {s: np.array([np.mean(errors[i][k, : last[i]] ** 2) for i in kept]) for k, s in enumerate(stages)}
+    nv = setup.physics.mj_model.nv
+    each = {s: np.array([np.mean(errors[i][k, : last[i], :nv] ** 2, 0) for i in kept]) for k, s in enumerate(stages)}
+    for table in (cost, each):
+        table.setdefault("with_effects", table["calibrated"])
+    longest = max((last[i] for i in kept), default=0) * cut.dt
+    notes = _notes(names, kept, chaotic, broken, longest)
+    notes += _away(stages, [[errors[i][k, : last[i]] / size[i] for i in kept] for k in range(len(stages))])
+    whole = not chaotic and longest < SECONDS - cut.dt
+    return Whole(
+        cost=cost,
+        by_channel=each,
+        chance=np.array([np.mean(spread[i][:, : last[i]] ** 2) for i in kept]),
+        group=group[kept],
+        name="whole log" if whole else f"up to {longest:.2g} s",
+        seconds=float(np.median([last[i] for i in kept]) * cut.dt) if kept else 0.0,
+        notes=notes,
+    )
+
+
+def _motion(setup: Setup, name: str) -> Array:
+    """Standard deviation of the measured motion `[channels]`, in noise standard deviations."""
+    log = next(log for log in setup.fitter.simulator.windows.logs if log.name == name)
+    model = setup.physics.mj_model
+    moved = np.concatenate([log.qvel, log.qvel], axis=1)
+    if model.nq == model.nv:
+        moved[:, : model.nv] = log.qpos
+    else:  # quaternions: the path travelled stands for the coordinates
+        moved[:, : model.nv] = np.cumsum(log.qvel, axis=0) * log.period
+    return np.maximum(np.std(moved, axis=0)[setup.fitter.used] / setup.fitter.sigma, CLEAR / PART)
+
+
+def _predictable(spread: Array, size: Array) -> int:
+    """Control steps until the start's uncertainty has grown to a part of the motion (or left what is finite)."""
+    with np.errstate(invalid="ignore"):
+        grown = np.sqrt(np.mean((spread / size) ** 2, axis=(0, 2)))
+    far = np.flatnonzero(~(grown < PART))
+    return int(far[0]) if len(far) else spread.shape[1]
+
+
+def _notes(names: list[str], kept: list[int], chaotic: list[str], broken: list[str], longest: float) -> list[str]:
+    out = []
+    if chaotic:
+        used = f"they count up to there (at most {longest:.2g} s)" if kept else "no horizon beyond the windows is given"
+        which = f"{len(chaotic)} of {len(names)} logs ({', '.join(chaotic[:4])})"
+        out.append(
+            f"unstable or chaotic motion: in {which} the uncertainty of the start alone grows to {percent(PART)} "
+            f"of the motion, so no simulator can predict them whole; {used}"
+        )
+    if broken:
+        which = f"{len(broken)} of {len(names)} logs ({', '.join(broken[:4])})"
+        out.append(f"simulated open loop, {which} diverge: left out of the longest horizon")
+    return out
+
+
+def _away(stages: list[str], errors: list[list[Array]]) -> list[str]:
+    """Stages whose error is larger than the motion itself."""
+    words = {"nominal": "as delivered", "calibrated": "recalibrated", "with_effects": "with the effects"}
+    lost = {words[s]: sum(float(np.mean(e**2)) > 1.0 for e in each) for s, each in zip(stages, errors, strict=True)}
+    found = ", ".join(f"{name} in {count} of {len(errors[0])}" for name, count in lost.items() if count)
+    text = f"over whole logs the simulator leaves the measured motion altogether ({found}): there the size of its error"
+    return [f"{text} says little"] if found else []

@@ -1,0 +1,73 @@
+"""Dry and viscous friction with real sticking, shared by the friction effects; and the joints they are written into."""
+
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from bayessim_mjx.effects.support.site import Site, SubStep
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+SWEEPS = 2
+_SINGLE = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+
+
+def resist(at: Site, step: SubStep, level: jax.Array, damping: jax.Array) -> jax.Array:
+    """Generalised force `[nv]` of friction that opposes the motion and never reverses it.
+
+    F = -(level + damping |w|) sgn(w), w at the *end* of the sub-step (implicit: stable for any damping). At rest F is
+    whatever holds the joint, up to the level. Coupled joints: projected Gauss-Seidel from the forces of the last
+    sub-step. Constraint forces are not known yet: a joint that rests against a stop may creep within one sub-step.
+
+    Args:
+        level: `[n, 2]` >= 0, dry friction against forward (w > 0) and against backward motion, N m (hinge) or N.
+        damping: `[n, 2]` >= 0, likewise, N m s/rad or N s/m.
+    """
+    inverse, dt = step.inverse, step.dt
+    force = step.last[at.dadr]
+    pull = step.force + at.scatter(force)
+    speed = step.qvel + dt * (inverse * pull).sum(-1)  # at the end of the sub-step
+    for _ in range(SWEEPS if len(at) > 1 else 1):
+        for i, dof in enumerate(at.dadr):
+            gain = dt * inverse[dof, dof]  # dw/dF
+            stop = force[i] - speed[dof] / gain  # the force that would bring the joint to rest
+            # no clip: at level 0 its derivative in the level would be lost
+            held = jnp.where(stop < -level[i, 0], -level[i, 0], jnp.where(stop > level[i, 1], level[i, 1], stop))
+            left = gain * (held - stop)  # the speed that dry friction leaves; 0 where it holds
+            slope = jnp.where(left > 0, damping[i, 0], damping[i, 1])
+            new = held - slope * left / (1.0 + gain * slope)
+            speed = speed + dt * inverse[:, dof] * (new - force[i])
+            force = force.at[i].set(new)
+    return at.scatter(force)
+
+
+def dry(at: Site, step: SubStep, level: jax.Array) -> jax.Array:
+    """Generalised force `[nv]` of dry friction up to `level` `[n]` (>= 0) in both directions; see `resist`."""
+    both = jnp.stack([level, level], axis=-1)
+    return resist(at, step, both, jnp.zeros_like(both))
+
+
+def viscous(at: Site, step: SubStep, damping: jax.Array) -> jax.Array:
+    """Generalised force `[nv]` of viscous friction `damping` `[n]` (>= 0), implicit; see `resist`."""
+    both = jnp.stack([damping, damping], axis=-1)
+    return resist(at, step, jnp.zeros_like(both), both)
+
+
+def native(spec: mujoco.MjSpec, values: dict[str, dict[str, float]]) -> "Iterator[tuple[Any, dict[str, float]]]":
+    """(joint of the spec, its values) for every place of an effect on joints; "all": every hinge and slide."""
+    for place, own in values.items():
+        for joint in spec.joints:
+            everywhere = place == "all" and int(joint.type) in _SINGLE
+            if everywhere or place in (joint.name, f"joint{joint.id}"):
+                yield joint, own
+
+
+def add(joint: Any, field: str, value: float) -> None:
+    """Add to a number of a spec's joint; in MuJoCo 4 some are polynomials, and the first number is the linear one."""
+    number = np.array(getattr(joint, field), float)
+    number.flat[0] += value
+    setattr(joint, field, number if number.ndim else float(number))

@@ -1,0 +1,197 @@
+"""Motor and link as two inertias with something soft or loose between them, shared by the transmission effects.
+
+The joint of the model is the link. The motors of the site's joints live in the effect's memory: `twist`, motor angle
+less link angle, and `speed`, the motors' velocity. Both sides are solved together at the end of the sub-step, so that a
+stiff transmission tends to the rigid joint of the model and no stiffness is unstable. Position servos close their loop
+on the motor's side, where their encoder is.
+"""
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from bayessim_mjx.effects.support.site import Site, SubStep, joint_dofs, ranges
+
+if TYPE_CHECKING:
+    from mujoco import mjx
+
+SHARE = 0.2  # of the joint's inertia is the motor's where the model has no armature
+REAL = 2.0**-10  # armature below this part of the joint's inertia counts as none
+_IMPLICIT, _RK4 = int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST), int(mujoco.mjtIntegrator.mjINT_RK4)
+
+
+def start(at: Site) -> dict[str, jax.Array]:
+    """Memory at the start; `fresh`: the first sub-step is rigid and shows where the load leaves the motor."""
+    return {"twist": jnp.zeros(len(at)), "speed": jnp.zeros(len(at)), "fresh": jnp.ones((), bool)}
+
+
+def split(at: Site, model: "mjx.Model", on: jax.Array, mark: float) -> "mjx.Model":
+    """Take the armature off the links where `on` `[n]`: it is the motors'.
+
+    The hooks of the sub-step must find it again, with parameters written into it, and have no other place for a number
+    of the episode than the model: it stays there times `mark`, a power of 2 that makes it weigh nothing.
+    """
+    armature = model.dof_armature[at.dadr]
+    taken = on & (armature > REAL * model.dof_M0[at.dadr])
+    return model.replace(dof_armature=model.dof_armature.at[at.dadr].set(jnp.where(taken, mark * armature, armature)))
+
+
+def follow(at: Site, memory: Any, step: SubStep) -> tuple[jax.Array, jax.Array]:
+    """(twist, slip), `[n]`: motor less link, now; the link moved as the whole simulation let it."""
+    slip = jnp.where(memory["fresh"], 0.0, memory["speed"] - step.qvel[at.dadr])
+    return memory["twist"] + step.dt * slip, slip
+
+
+def servos(at: Site) -> tuple[np.ndarray, np.ndarray]:
+    """(ids of the actuators with feedback from joints of the site, their places in it)."""
+    model, dof = at.mj_model, joint_dofs(at.mj_model)
+    affine = model.actuator_biastype == int(mujoco.mjtBias.mjBIAS_AFFINE)
+    ids = np.flatnonzero(affine & np.isin(dof, at.dadr))
+    return ids, np.asarray([int(np.flatnonzero(at.dadr == dof[i])[0]) for i in ids], int)
+
+
+def feedback(at: Site, memory: Any, step: SubStep, force: jax.Array, on: jax.Array) -> jax.Array:
+    """Actuator forces `[nu]` with the servos' feedback taken from the motors instead of the links."""
+    ids, places = servos(at)
+    if not len(ids):
+        return force
+    model = step.model
+    twist, slip = (x[places] for x in follow(at, memory, step))
+    if int(at.mj_model.opt.integrator) == _RK4:  # its link stands where the sub-step begins, the motor at its middle
+        twist = twist + 0.5 * step.dt * step.qvel[at.dadr[places]]
+    gear, bias = model.actuator_gear[ids, 0], model.actuator_biasprm[ids]
+    extra = gear * (bias[:, 1] * twist + bias[:, 2] * slip)
+    low, high = ranges(model.actuator_forcelimited[ids], model.actuator_forcerange[ids])
+    own = step.data.actuator_force[ids]
+    inside = jnp.where((own > low) & (own < high), own, step.asked[ids])
+    change = jnp.clip(inside + extra, low, high) - own
+    return force.at[ids].add(jnp.where(on[places], change, 0.0))
+
+
+class Sides(NamedTuple):
+    """Motors and links of a sub-step before anything passes between them, `[n]` each; on: the effect is active there.
+
+    twist, slip: motor less link, angle and velocity; torque: the actuators', on the motor; motor: its inertia; kp, kv:
+    the servos' feedback that follows the motor within the sub-step; inside: what of the matrix that the integrator
+    solves is not the link's (servo damping, the motor's share), kg m^2; servo: the first of these two; series: inertia
+    of motor against link; inertia `[n, n]`: of the links, as felt at the joints, with `inside`; push: impulse of all
+    other forces on the links.
+    """
+
+    on: jax.Array
+    twist: jax.Array
+    slip: jax.Array
+    torque: jax.Array
+    motor: jax.Array
+    kp: jax.Array
+    kv: jax.Array
+    inside: jax.Array
+    servo: jax.Array
+    series: jax.Array
+    inertia: jax.Array
+    push: jax.Array
+
+
+def sides(at: Site, memory: Any, step: SubStep, on: jax.Array, mark: float) -> Sides:
+    """Both sides of the site's joints in this sub-step; `mark` as in `split`."""
+    model, dof, dt = step.model, at.dadr, step.dt
+    torque = jnp.where(on, step.data.qfrc_actuator[dof], 0.0)
+    kp, kv = _gains(at, step, on)
+    mobility = step.inverse[np.ix_(dof, dof)]
+    inertia = inverse(mobility)
+    servo = dt * kv if int(at.mj_model.opt.integrator) == _IMPLICIT else jnp.zeros(len(at))
+    alone = mobility if not _has_inner_damping(at) else inverse(inertia - jnp.diag(servo))
+    felt = 1.0 / jnp.diagonal(alone)
+    part = min(SHARE, 0.8 / len(at))  # trace bound: what the motors leave stays positive definite
+    armature = model.dof_armature[dof] / mark
+    whole = model.dof_M0[dof]
+    own = (armature > REAL * whole) & (armature < whole / REAL)
+    motor, link = jnp.where(own, armature, part * felt), jnp.where(own, felt, (1 - part) * felt)
+    free = step.dt * (step.inverse[dof] * (step.force - at.scatter(torque))).sum(-1)
+    twist, slip = follow(at, memory, step)
+    return Sides(
+        on=on,
+        twist=jnp.where(on, twist, 0.0),
+        slip=jnp.where(on, slip, 0.0),
+        torque=torque,
+        motor=motor,
+        kp=kp,
+        kv=kv,
+        inside=jnp.where(on, servo + jnp.where(own, 0.0, motor), 0.0),
+        servo=servo,
+        series=motor * link / (motor + link),
+        inertia=inertia,
+        push=(inertia * free).sum(-1),
+    )
+
+
+def _has_inner_damping(at: Site) -> bool:
+    return int(at.mj_model.opt.integrator) == _IMPLICIT and len(servos(at)[0]) > 0
+
+
+def _gains(at: Site, step: SubStep, on: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """(kp, kv) of the servos as far as they respond, at the joints `[n]`; MuJoCo's matrix holds this kv too."""
+    ids, places = servos(at)
+    none = jnp.zeros(len(at))
+    if not len(ids):
+        return none, none
+    own = step.response[ids] * step.model.actuator_gear[ids, 0] ** 2
+    gains = (-own * step.model.actuator_biasprm[ids, k] for k in (1, 2))
+    kp, kv = (jnp.where(on, jnp.maximum(none.at[places].add(g), 0.0), 0.0) for g in gains)
+    return kp, kv
+
+
+class Passed(NamedTuple):
+    """At the end of a sub-step, `[n]`: torque through the transmission, change of the links' speed, motor's slip."""
+
+    torque: jax.Array
+    change: jax.Array
+    slip: jax.Array
+
+
+def transmit(
+    both: Sides, dt: float, soft: jax.Array, loss: jax.Array, late: jax.Array, rest: jax.Array, held: jax.Array
+) -> Passed:
+    """Solve motors and links together where `held` `[n]`; elsewhere nothing passes between them.
+
+    soft s = (twist - rest) + (late + loss) slip', with compliance `soft` 1/k, `loss` d/k (s), `late` theta dt: where in
+    the sub-step the spring is looked at (0: its beginning, dt: its end), and slip' at the end of the sub-step.
+    """
+    # motor: J (w' - w) = dt (tau - s - kp late slip' - kv (slip' - slip) - servo (v' - v) / dt)
+    slow = both.motor + dt * late * both.kp + dt * both.kv
+    rigid = both.motor + both.servo
+    drive = dt * both.torque + (both.motor + dt * both.kv) * both.slip
+    over = late + loss
+    below = jnp.where(held, slow * soft + dt * over, 1.0)
+    gain = jnp.where(held, over / below, 0.0)
+    pull = jnp.where(held, (over * drive + slow * (both.twist - rest)) / below, 0.0)
+    # link: Y (v' - v) = push + dt s, with s = pull - gain rigid (v' - v)
+    matrix = both.inertia + jnp.diag(dt * gain * rigid - both.inside)
+    change = (inverse(matrix) * (both.push + dt * pull)).sum(-1)
+    torque = pull - gain * rigid * change
+    return Passed(torque, change, (drive - dt * torque - rigid * change) / slow)
+
+
+def finish(at: Site, step: SubStep, both: Sides, passed: Passed, twist: jax.Array) -> tuple[dict, jax.Array]:
+    """(memory, generalised force `[nv]`): the link gets what passed instead of what the actuators exert."""
+    own = passed.torque + both.inside * passed.change / step.dt - both.torque
+    speed = step.qvel[at.dadr] + passed.change + jnp.where(both.on, passed.slip, 0.0)
+    memory = {"twist": jnp.where(both.on, twist, 0.0), "speed": speed, "fresh": jnp.zeros((), bool)}
+    return memory, at.scatter(jnp.where(both.on, own, 0.0))
+
+
+def inverse(matrix: jax.Array) -> jax.Array:
+    """Inverse of a positive definite matrix `[n, n]`, by Gauss-Jordan: small, and needs no pivots."""
+    size = matrix.shape[0]
+
+    def step(k: jax.Array, a: jax.Array) -> jax.Array:
+        here = jnp.arange(size) == k
+        row, column = jnp.sum(a * here[:, None], axis=0), jnp.sum(a * here, axis=1)
+        row = jnp.where(here, 1.0, row) / jnp.sum(row * here)
+        rest = jnp.where(here, 0.0, a) - column[:, None] * row
+        return jnp.where(here[:, None], row, rest)
+
+    return 1.0 / matrix if size == 1 else jax.lax.fori_loop(0, size, step, matrix)

@@ -1,0 +1,77 @@
+"""How deep held-out truths lie in their posteriors, and how much sharper or wider these would have to be."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from bayessim_mjx.distributions import charts
+from bayessim_mjx.inference.calibration import LEVELS
+from bayessim_mjx.linalg import inverse_lower
+
+Mixtures = tuple[Array, Array, Array]  # log weights [n, K], means [n, K, d], Cholesky factors of covariances
+
+DRAWS = 64  # of each posterior
+MOST = 512  # rows looked at
+FACTORS = np.geomspace(0.75, 1 / 0.75, 15).astype(np.float32)
+REGIONS = np.asarray(LEVELS, np.float32)  # that should hold as many truths as they say
+DOUBT = 0.15  # standard deviation of the factor's log before anything is seen: a few rows are off by chance
+
+
+def levels(key: Array, mixtures: Mixtures, z: Array, chart: str) -> Array:
+    """Mass of a posterior that is denser than the truth z [n, d], by its rank among draws, [n].
+
+    Ranks are spread at random between their neighbours and ties broken at random, so that of exact posteriors a share
+    of exactly p has levels up to p. The mixtures are those in the chart; draws outside the box of the plain chart are
+    none of the posterior's.
+    """
+
+    def one(inputs: tuple[Array, Array, Array, Array, Array]) -> Array:
+        key, logits, means, scales, z = inputs
+        key_part, key_noise, key_rank = jax.random.split(key, 3)
+        part = jax.random.categorical(key_part, logits, shape=(DRAWS,))
+        noise = jax.random.normal(key_noise, (DRAWS, z.shape[0]))
+        draws = means[part] + jnp.sum(scales[part] * noise[:, None, :], axis=-1)
+        points = jnp.concatenate([z[None], draws])
+        gap = points[:, None, None, :] - means[None, :, None, :]
+        away = jnp.sum(inverse_lower(scales)[None] * gap, axis=-1)  # [1 + DRAWS, K, d]
+        size = jnp.sum(jnp.log(jnp.diagonal(scales, axis1=-2, axis2=-1)), axis=-1)
+        density = jax.nn.logsumexp((logits - size)[None] - 0.5 * jnp.sum(away * away, axis=-1), axis=-1)
+        density = density + charts.log_slope(points, chart)
+        inside = jnp.all((draws >= 0) & (draws <= 1), axis=-1) | (chart != "plain")
+        which = jnp.stack([density[1:] > density[0], density[1:] == density[0], jnp.ones(DRAWS, bool)])
+        denser, equal, whole = jnp.sum(inside[None] & which, axis=-1, dtype=jnp.float32)
+        return (denser + (equal + 1.0) * jax.random.uniform(key_rank)) / (whole + 1.0)
+
+    return jax.lax.map(one, (jax.random.split(key, z.shape[0]), *mixtures, z), batch_size=64)
+
+
+def factor(key: Array, at: Callable[[Array], Mixtures], z: Array, mask: Array, chart: str) -> Array:
+    """The factor on sharpness, of FACTORS, at which REGIONS hold truths z [n, d] (with mask [n] 1) as they should.
+
+    at(factor) gives the mixtures. A region of p holds p of n truths to within sqrt(p (1 - p) / n), and the log of the
+    factor is held to be within DOUBT of 0 beforehand.
+    """
+    count = jnp.maximum(jnp.sum(mask), 1.0)
+
+    def against(factor: Array) -> Array:
+        # the same draws for every factor
+        level = levels(key, at(factor), z, chart)
+        held = mask @ (level[:, None] <= REGIONS[None, :]).astype(jnp.float32) / count
+        off = jnp.where(jnp.sum(mask) > 0, count * (held - REGIONS) ** 2 / (REGIONS * (1 - REGIONS)), 0.0)
+        return jnp.mean(off) + (jnp.log(factor) / DOUBT) ** 2
+
+    # as it is first: what is right within its error is left alone, which also saves the time
+    factors = jnp.asarray(np.concatenate([np.ones(1, np.float32), FACTORS]))
+
+    def better(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        i, least, best = carry
+        value = against(factors[i])
+        return i + 1, jnp.fmin(value, least), jnp.where(value < least, factors[i], best)
+
+    start = jnp.asarray(0, jnp.int32), jnp.asarray(jnp.inf, jnp.float32), factors[0]
+    return jax.lax.while_loop(lambda c: (c[0] < len(factors)) & ((c[0] != 1) | (c[1] >= 1.0)), better, start)[2]

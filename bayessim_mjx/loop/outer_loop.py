@@ -1,0 +1,215 @@
+"""The outer loop: train on physics drawn from the domain, try the policy on the real side, infer a sharper domain.
+
+One round (BayesSimIG's order): PPO under the current domain; evaluation on the surrogate real; simulated trajectories
+over the prior (or over the last posterior, see inference/rounds.py) and a fit of q(theta | summary); the real
+trajectories so far, multiplied, give the next domain. All of a round runs on the device.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from bayessim_mjx import memory, rl
+from bayessim_mjx.config import Config
+from bayessim_mjx.device import mesh
+from bayessim_mjx.distributions import Distribution
+from bayessim_mjx.env import Env
+from bayessim_mjx.errors import UserError
+from bayessim_mjx.loop.round_inference import PREDICTIVE_DRAWS, blank, infer, reexamine, score
+from bayessim_mjx.loop.sources import Recorded, make_source
+from bayessim_mjx.loop.state import KEPT_ROUNDS, Loop, LoopState, RoundInfo
+from bayessim_mjx.rl import Policy, TrainState
+from bayessim_mjx.rl.recurrent import remembering
+
+__all__ = [
+    "PREDICTIVE_DRAWS", "Checkpoints", "Loop", "LoopState", "Monitor", "RoundInfo", "checkpoint_step", "init", "make",
+    "meta_of", "reexamine", "run", "score", "step", "train", "training_target", "tree_of",
+]  # fmt: skip
+
+
+class Monitor(Protocol):
+    """What the loop tells while it runs; every method may do nothing."""
+
+    def training(self, round_: int, metrics: dict[str, float], state: LoopState) -> None: ...
+    def round(self, info: RoundInfo, policy: Policy) -> None: ...
+
+
+class Checkpoints(Protocol):
+    def save(
+        self,
+        step: int,
+        tree: Any,
+        *,
+        evaluation: float | None = None,
+        meta: dict | None = None,
+        supersede: bool = False,
+    ) -> Any: ...
+
+
+def make(config: Config, env: Env) -> Loop:
+    """Build the loop's static parts; refuses configurations that cannot work."""
+    b, units = config.bayessim, config.ppo.memory_size
+    env = remembering(env, units) if units else env
+    if b.modelClass is None:
+        # The ablation infers nothing, but is scored on the same surrogate.
+        source = make_source(config, env) if len(env.space) else None
+        return Loop(env, config, source, 0)
+    if not len(env.space):
+        raise UserError(
+            f"task {env.name!r} has no parameters to infer: name some under task.randomization_params, "
+            "or set bayessim.modelClass=None to train without inference"
+        )
+    source = make_source(config, env)
+    if isinstance(source, Recorded) and source.supply is not None and source.supply < b.realTrajs * b.realIters:
+        most = source.supply // b.realTrajs
+        raise UserError(
+            f"real.logs hold {source.supply} segments, enough for {most} rounds of bayessim.realTrajs={b.realTrajs}; "
+            f"set bayessim.realIters={most} or fewer, or a shorter bayessim.trainTrajLen"
+        )
+    names = source.channels.features(b.summarizerFxn)
+    rows = b.trainTrajs * (min(b.realIters, KEPT_ROUNDS) if b.ftune else 1)
+    what = f"bayessim.trainTrajs = {b.trainTrajs} summaries of {len(names)} features"
+    memory.refuse([(what, 4.0 * rows * (len(names) + len(env.space)))])
+    return Loop(env, config, source, len(names), names)
+
+
+def init(loop: Loop, trains: bool = True) -> LoopState:
+    """The state before round 0: an untrained policy, the prior as domain, no data.
+
+    trains: whether training comes next, its program then being compiled beside the first reset's.
+    """
+    fields = blank(loop)
+    policy = _new_policy(loop, 0, fields["domain"], rl.start if trains else rl.init)
+    return LoopState(round=jnp.int32(0), train=policy, **fields)
+
+
+def _new_policy(
+    loop: Loop, round_: int, domain: Distribution | None, begin: Callable[..., TrainState] = rl.init
+) -> TrainState:
+    ppo = loop.config.ppo
+    clock = round_ * ppo.max_iterations * ppo.num_steps  # schedules of randomisation go on from round to round
+    return begin(loop.env, ppo, loop.key(round_, "init"), domain, mesh(loop.config), clock=clock)
+
+
+def training_target(loop: Loop, round_: int) -> int:
+    """PPO iterations after which the training of `round_` is over (BayesSimIG: max_iterations *per round*)."""
+    n = loop.config.ppo.max_iterations
+    return n * (round_ + 1) if loop.settings.ftuneRL else n
+
+
+def train(loop: Loop, state: LoopState, progress: Callable[[dict, TrainState], None] | None = None) -> LoopState:
+    """PPO under the current domain until this round's iterations are done (the rest of them, after a resume)."""
+    todo = training_target(loop, int(state.round)) - int(state.train.iteration)
+    if todo <= 0:
+        return state
+    trained, _ = rl.run(loop.env, loop.config.ppo, state.train, state.domain, iterations=todo, progress=progress)
+    return dataclasses.replace(state, train=trained)
+
+
+def step(loop: Loop, state: LoopState) -> tuple[LoopState, RoundInfo]:
+    """The rest of a round, after training: evaluate, collect, fit, condition on all real trajectories."""
+    started, seconds = time.perf_counter(), {}
+    round_, policy = int(state.round), rl.policy_of(state.train)
+    returns, lengths = _evaluate(loop, state, policy)
+    seconds["evaluate"] = time.perf_counter() - started
+    info = RoundInfo(
+        round=round_,
+        rounds=loop.settings.realIters,
+        domain=state.domain,
+        posterior=None,
+        truth=None if loop.source is None else loop.source.truth,
+        returns=returns,
+        lengths=lengths,
+        real=None,
+        predictive=None,
+        fit={},
+        scores={},
+        seconds=seconds,
+        warnings=[],
+    )
+    if loop.settings.modelClass is not None:
+        state = infer(loop, state, policy, info)
+    state = dataclasses.replace(state, round=state.round + 1)
+    if round_ + 1 < loop.settings.realIters:
+        # new episodes under the new domain also where the policy goes on
+        new = _new_policy(loop, round_ + 1, state.domain)
+        kept = rl.ppo.in_worlds_of(state.train, new) if loop.settings.ftuneRL else new
+        state = dataclasses.replace(state, train=kept)
+    return state, info
+
+
+def _evaluate(loop: Loop, state: LoopState, policy: Policy) -> tuple[np.ndarray, np.ndarray]:
+    """Deterministic episodes on the surrogate real; without one (logs), on physics drawn from the domain."""
+    key, n = loop.key(int(state.round), "evaluate"), loop.settings.realEvals
+    if isinstance(loop.source, Recorded) or loop.source is None:
+        # no truth to try it on: the physics it will be randomised over next, as far as that is known now
+        thetas = jnp.zeros((n, 0)) if state.domain is None else state.domain.sample(key, n)
+    else:
+        thetas = loop.source.sample(key, n)
+    result = rl.evaluate(loop.env, policy, jax.random.fold_in(key, 1), thetas)
+    return np.asarray(result["return"]), np.asarray(result["length"])
+
+
+def run(
+    loop: Loop,
+    state: LoopState,
+    checkpoints: Checkpoints | None = None,
+    monitor: Monitor | None = None,
+) -> tuple[LoopState, list[RoundInfo]]:
+    """All rounds from `state` on. Checkpoints every ppo.save_interval iterations and after each round.
+
+    A round's checkpoint holds the state *after* it and the policy that was evaluated in it, so that "best" is the best
+    evaluated policy.
+    """
+    infos = []
+    while int(state.round) < loop.settings.realIters:
+        round_, last = int(state.round), [int(state.train.iteration)]
+
+        def progress(
+            metrics: dict, trained: TrainState, state: LoopState = state, round_: int = round_, last: list[int] = last
+        ) -> None:
+            current, every = dataclasses.replace(state, train=trained), loop.config.ppo.save_interval
+            if monitor is not None:
+                monitor.training(round_, metrics, current)
+            if checkpoints is not None and int(trained.iteration) // every > last[0] // every:
+                last[0] = int(trained.iteration)
+                checkpoints.save(checkpoint_step(loop, round_, trained), tree_of(loop, current), meta=meta_of(current))
+
+        clock = time.perf_counter()
+        state = train(loop, state, progress)
+        seconds = time.perf_counter() - clock
+        policy, number = rl.policy_of(state.train), checkpoint_step(loop, round_, state.train) + 1
+        state, info = step(loop, state)
+        info.seconds["train"] = seconds
+        if monitor is not None:
+            monitor.round(info, policy)  # first: a round that was not reported is not finished
+        if checkpoints is not None:
+            evaluation, tree = float(info.returns.mean()), {"policy": policy, "state": state}
+            # under logs every round is evaluated on its own physics: only the newest evaluation counts
+            checkpoints.save(number, tree, evaluation=evaluation, meta=meta_of(state), supersede=info.truth is None)
+        infos.append(info)
+    return state, infos
+
+
+def tree_of(loop: Loop, state: LoopState) -> dict[str, Any]:
+    """What a checkpoint holds; also the template to restore one."""
+    return {"policy": rl.policy_of(state.train), "state": state}
+
+
+def checkpoint_step(loop: Loop, round_: int, trained: TrainState) -> int:
+    """Checkpoints are numbered by PPO iterations and rounds together, so that they always grow."""
+    n = loop.config.ppo.max_iterations
+    done = int(trained.iteration) - (n * round_ if loop.settings.ftuneRL else 0)
+    return round_ * (n + 1) + done
+
+
+def meta_of(state: LoopState) -> dict[str, int]:
+    """What a checkpoint says of itself beside its arrays."""
+    return {"round": int(state.round), "iteration": int(state.train.iteration)}

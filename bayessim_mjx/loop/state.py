@@ -1,0 +1,105 @@
+"""What the outer loop is made of: its static parts, the state between rounds (the checkpoint), what a round tells."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import flax.struct
+import jax
+import numpy as np
+from jax import Array
+
+from bayessim_mjx.config import BayesSimConfig, Config
+from bayessim_mjx.distributions import Distribution
+from bayessim_mjx.env import Env
+from bayessim_mjx.inference import InferenceSettings, checks, rounds
+from bayessim_mjx.loop.sources import Source
+from bayessim_mjx.parameters import ParameterSpace
+from bayessim_mjx.rl import TrainState
+from bayessim_mjx.rollout import Trajectory
+
+KEPT_ROUNDS = 4  # rounds of simulated trajectories kept for the fit where the collection policy does not change
+
+
+@flax.struct.dataclass
+class LoopState:
+    """All that the next round needs, as arrays: it is the checkpoint."""
+
+    round: Array  # int32, rounds finished
+    train: TrainState
+    domain: Distribution | None  # what physics is drawn from
+    fit: Any  # FitState of the inference network; None for the uniform ablation
+    thetas: Array  # [kept rounds * trainTrajs, d] simulated parameters; none where every round uses its own alone
+    features: Array  # [capacity, D] and their summaries
+    real_features: Array  # [realIters * realTrajs, D], the first round * realTrajs rows are filled
+    real_posteriors: Distribution | None  # q(theta | x) of each real trajectory at the time it was seen
+    proposal: Distribution | None  # what the next round is simulated from; None: the prior, in all rounds
+    proposals: Distribution | None  # what the simulations kept come from, leaves [kept rounds, ...]
+    temperature: Array  # [] factor on standard deviations that the last round's posterior was given
+
+
+@dataclasses.dataclass
+class RoundInfo:
+    """What a person wants to see of a round; numbers on the host."""
+
+    round: int
+    rounds: int
+    domain: Distribution | None  # what this round trained on
+    posterior: Distribution | None  # what it inferred
+    truth: np.ndarray | None
+    returns: np.ndarray  # [n] on the real side (surrogate) or under the domain (logs)
+    lengths: np.ndarray
+    real: Trajectory | None  # this round's real trajectories
+    predictive: dict[str, np.ndarray] | None  # qpos [n, T+1, nq], qvel: the first one, re-simulated
+    fit: dict[str, Any]
+    scores: dict[str, float]  # log p(truth), gain over the prior, credible level, contraction per parameter
+    seconds: dict[str, float]
+    warnings: list[str]
+    checks: checks.Checks | None = None  # calibration, misfit, walls; None: none asked for
+
+
+def chart_of(settings: BayesSimConfig, space: ParameterSpace) -> str:
+    """Coordinates in which the loop's domain over `space` is a mixture of Gaussians."""
+    if settings.modelClass is None:
+        return "plain"
+    return rounds.chart_of(InferenceSettings.of(settings).at(space).chart)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Loop:
+    """The parts that do not move."""
+
+    env: Env
+    config: Config
+    source: Source | None
+    feature_size: int
+    feature_names: tuple[str, ...] = ()
+
+    @property
+    def settings(self) -> BayesSimConfig:
+        return self.config.bayessim
+
+    @property
+    def capacity(self) -> int:
+        """Rows of simulated trajectories kept from round to round; 0: a round's own are fitted and dropped."""
+        b = self.settings
+        keeps = b.ftune and self.source is not None and not self.source.policy_dependent and b.proposal != "division"
+        return b.trainTrajs * min(b.realIters, KEPT_ROUNDS) if keeps else 0
+
+    @property
+    def sequential(self) -> bool:
+        """Whether later rounds are simulated from the posterior."""
+        return self.settings.modelClass is not None and self.settings.proposal != "prior"
+
+    @property
+    def chart(self) -> str:
+        """Coordinates in which the domain is a mixture of Gaussians."""
+        return chart_of(self.settings, self.env.space)
+
+    def key(self, round_: int, purpose: str) -> Array:
+        """Every random draw has its own key, a function of the seed alone: a resumed run draws the same."""
+        purposes = ("init", "train", "evaluate", "simulate", "fit", "real", "predict")
+        return jax.random.fold_in(
+            jax.random.PRNGKey(self.config.seed), round_ * len(purposes) + purposes.index(purpose)
+        )

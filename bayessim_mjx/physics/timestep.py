@@ -1,0 +1,285 @@
+"""One timestep: MJX's own stages in the order of `mjx.step`, the effects between them, and the integrators.
+
+An actuator's force is corrected in one place, `_actuated`, which every stage of every integrator goes through: effects,
+then drives that are off, then gravity compensation and the joint's limit (`actuatorfrcrange`), in MuJoCo's order.
+"""
+
+import contextlib
+import dataclasses
+import io
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from flax import struct
+
+with contextlib.redirect_stdout(io.StringIO()):  # MJX announces on import that the optional warp is absent
+    from mujoco import mjx
+
+from bayessim_mjx.effects.effect import overrides
+from bayessim_mjx.effects.support.site import SubStep, joint_dofs, ranges
+
+if TYPE_CHECKING:
+    from bayessim_mjx.physics import Physics
+
+EULER, RK4, IMPLICITFAST = (int(getattr(mujoco.mjtIntegrator, f"mjINT_{n}")) for n in ("EULER", "RK4", "IMPLICITFAST"))
+STAGES = ((0.5, 1 / 3), (0.5, 1 / 3), (1.0, 1 / 6))  # of RK4 after the first: (how far from the start, weight)
+_NO_DAMPING = int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
+
+Memory = tuple[tuple, jax.Array]  # (memories of the effects, their last forces [effects, nv])
+
+
+def staggered(model: mujoco.MjModel) -> bool:
+    """Whether the integrator is read best as a leapfrog: velocities, and what acts, half a timestep before positions.
+
+    So it is where positions move with the new velocities (Euler, implicitfast); RK4 has all of them at one time.
+    """
+    return int(model.opt.integrator) != RK4
+
+
+class Drive(struct.PyTreeNode):
+    """What acts on a world besides its command, all optional.
+
+    Attributes:
+        force: `[nv]`, a generalised force of unknown origin.
+        enabled: `[nu]`, 1 where the drive is on; 0: the actuator exerts no force at all (open leads), and a joint whose
+            actuators are all off has no gravity compensation from them either (`actuatorgravcomp`).
+        law: a controller between the command and the actuators, `laws.Law`; what it asks for is held over a timestep.
+    """
+
+    force: jax.Array | None = None
+    enabled: jax.Array | None = None
+    law: Any = None
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Timestep:
+    """What does not change during one timestep of one world.
+
+    Attributes:
+        physics: static.
+        model: with the world's parameters.
+        thetas: one slice per effect.
+        seen: what the sensors showed after the last control step, {"qpos", "qvel"}.
+        drive: what else acts.
+    """
+
+    physics: "Physics"
+    model: mjx.Model
+    thetas: tuple[jax.Array, ...]
+    seen: dict[str, jax.Array]
+    drive: Drive
+
+    def having(self, hook: str) -> list[tuple]:
+        """(index, effect, site, slice of theta) of the effects that have this hook."""
+        each = zip(self.physics.effects, self.physics.sites, self.thetas, strict=True)
+        return [(i, *one) for i, one in enumerate(each) if overrides(one[0], hook)]
+
+    def view(self, data: mjx.Data, **known: Any) -> SubStep:
+        """The timestep as effects see it."""
+        return SubStep(self.model, data, self.seen, float(self.physics.mj_model.opt.timestep), **known)
+
+    @property
+    def corrected(self) -> bool:
+        """Whether anything may change the actuators' forces."""
+        return self.drive.enabled is not None or bool(self.having("on_actuator"))
+
+
+def substep(
+    physics: "Physics",
+    model: mjx.Model,
+    data: mjx.Data,
+    carry: Memory,
+    thetas: tuple[jax.Array, ...],
+    seen: dict[str, jax.Array],
+    drive: Drive = Drive(),  # noqa: B008  # immutable
+) -> tuple[mjx.Data, Memory]:
+    """One timestep from the state and ctrl in `data`. Returns (data, (memory, forces)).
+
+    The state in data is the new one; its poses, contacts, forces and sensors are those of the timestep's beginning.
+    """
+    if physics.warp is not None:
+        data = physics.warp.step(model, data)
+    else:
+        own, memory = Timestep(physics, model, thetas, seen, drive), carry[0]
+        data, carry, step = forward(own, data, carry)
+        data = _integrated(own, data, memory, step)
+    if physics.max_qvel is not None:
+        data = data.replace(qvel=jnp.clip(data.qvel, -physics.max_qvel, physics.max_qvel))
+    return data, carry
+
+
+def forward(own: Timestep, data: mjx.Data, carry: Memory) -> tuple[mjx.Data, Memory, SubStep]:
+    """`mjx.forward` and what effects and drives add to it. Returns (data, (memory, forces), the timestep as seen)."""
+    physics, model = own.physics, own.model
+    sensors = physics.mj_model.nsensor > 0
+    data = mjx.fwd_position(model, data)
+    data = mjx.sensor_pos(model, data) if sensors else data
+    data = mjx.fwd_velocity(model, data)
+    data = mjx.sensor_vel(model, data) if sensors else data
+    if own.drive.law is not None:
+        data = data.replace(ctrl=own.drive.law(data.ctrl, *physics.encoders(own.thetas, data.qpos, data.qvel)))
+    data, memory, step = _actuated(own, data, carry[0])
+    data, carry = _pushed(own, data, (memory, carry[1]), step)
+    data = _accelerated(model, data)
+    return (mjx.sensor_acc(model, data) if sensors and data._impl.efc_J.size else data), carry, step
+
+
+def _accelerated(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    data = mjx.fwd_acceleration(model, data)
+    return mjx.solve(model, data) if data._impl.efc_J.size else data.replace(qacc=data.qacc_smooth)
+
+
+def _actuated(own: Timestep, data: mjx.Data, memory: tuple) -> tuple[mjx.Data, tuple, SubStep]:
+    """The actuators' forces as effects and drives leave them. Returns (data, memory, the timestep as seen)."""
+    model, before = own.model, memory
+    data = plain = mjx.fwd_actuation(model, data.replace(ctrl=_within_range(own, data.ctrl)))
+    if not model.nu or int(model.opt.disableflags) & int(mujoco.mjtDisableBit.mjDSBL_ACTUATION):
+        return data, memory, own.view(data)
+    if own.corrected:
+        memory, acting = _acting(own, own.view(plain), memory, plain.actuator_force)
+        data = data.replace(actuator_force=acting, qfrc_actuator=_torque(own, plain, acting))
+    return data, memory, own.view(data, response=lambda: _response(own, plain, data.actuator_force, before))
+
+
+def _within_range(own: Timestep, ctrl: jax.Array) -> jax.Array:
+    """ctrl inside its range where the integrator's derivative needs it so: that of MJX takes it as it is given."""
+    model = own.physics.mj_model
+    grows = model.actuator_gaintype == int(mujoco.mjtGain.mjGAIN_AFFINE)
+    off = int(model.opt.disableflags) & int(mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL)
+    if off or int(model.opt.integrator) != IMPLICITFAST or not np.any(grows & (model.actuator_ctrllimited > 0)):
+        return ctrl
+    return jnp.clip(ctrl, *ranges(own.model.actuator_ctrllimited, own.model.actuator_ctrlrange))
+
+
+def _acting(own: Timestep, step: SubStep, memory: tuple, force: jax.Array) -> tuple[tuple, jax.Array]:
+    """(memory, forces `[nu]`) behind all effects on actuators, and where the drive is on."""
+    remembered = list(memory)
+    for i, effect, at, theta in own.having("on_actuator"):
+        remembered[i], force = effect.on_actuator(at, remembered[i], step, force, theta)
+    return tuple(remembered), force if own.drive.enabled is None else force * own.drive.enabled
+
+
+def _torque(own: Timestep, plain: mjx.Data, acting: jax.Array) -> jax.Array:
+    """Generalised force `[nv]` of the actuators, gravity compensation included, within the joints' limits.
+
+    Where nothing changed it is MJX's own number, bit for bit; its derivative is that of the changed force either way.
+    """
+    model, enabled = own.model, own.drive.enabled
+    torque = jnp.clip(_unclipped(own, plain, acting), *_joint_ranges(model))
+    same = jnp.all(acting == plain.actuator_force)
+    if enabled is not None:
+        same &= jnp.all(enabled == 1)
+    value = jax.lax.stop_gradient(jnp.where(same, plain.qfrc_actuator, torque))
+    return value + (torque - jax.lax.stop_gradient(torque))
+
+
+def _unclipped(own: Timestep, data: mjx.Data, acting: jax.Array) -> jax.Array:
+    model, moment, enabled = own.model, data._impl.actuator_moment, own.drive.enabled
+    torque = acting @ moment
+    if not model.flg_gravcomp or not np.any(model.jnt_actgravcomp):
+        return torque
+    compensation = data.qfrc_gravcomp * model.jnt_actgravcomp[model.dof_jntid]
+    if enabled is not None:
+        reached = moment != 0
+        powered = jnp.max(jnp.where(reached, enabled[:, None], 0.0), axis=0)
+        compensation = compensation * jnp.where(jnp.any(reached, axis=0), powered, 1.0)
+    return torque + compensation
+
+
+def _joint_ranges(model: mjx.Model) -> tuple[jax.Array, jax.Array]:
+    return ranges(model.jnt_actfrclimited[model.dof_jntid], model.jnt_actfrcrange[model.dof_jntid])
+
+
+def _response(own: Timestep, plain: mjx.Data, acting: jax.Array, memory: tuple) -> jax.Array | None:
+    """How much of a change of its damping force an actuator passes on, `[nu]`; None: all of it, always.
+
+    0 at a limit of the actuator or of its joint, as in MuJoCo's own derivative (MJX has none), and where it is off.
+    """
+    model, nominal = own.model, own.physics.mj_model
+    limited = np.any(nominal.actuator_forcelimited), np.any(nominal.jnt_actfrclimited)
+    if not own.corrected and not any(limited):
+        return None
+    low, high = ranges(model.actuator_forcelimited, model.actuator_forcerange)
+    response = ((plain.actuator_force > low) & (plain.actuator_force < high)).astype(acting.dtype)
+    if own.corrected:
+
+        def chain(force: jax.Array, asked: jax.Array) -> jax.Array:
+            return _acting(own, own.view(plain.replace(actuator_force=force), asked=asked), memory, force)[1]
+
+        forces = plain.actuator_force, own.view(plain).asked
+        response = jax.jvp(chain, forces, (response, jnp.ones_like(response)))[1]
+    if not limited[1]:
+        return response
+    low, high = _joint_ranges(model)
+    torque, dof = _unclipped(own, plain, acting), joint_dofs(nominal)
+    return response * jnp.where(dof >= 0, ((torque > low) & (torque < high))[dof], True)
+
+
+def _pushed(own: Timestep, data: mjx.Data, carry: Memory, step: SubStep) -> tuple[mjx.Data, Memory]:
+    """The sum of the effects' own forces in qfrc_applied.
+
+    Each effect sees the newest forces of the others (Gauss-Seidel). They start from those of the last sub-step, so that
+    dry friction in several coupled joints settles to sticking.
+    """
+    drive = own.drive
+    if not own.physics.effects and drive.force is None:
+        return data, carry
+    memory, forces = list(carry[0]), carry[1]
+    known = data.qfrc_passive - data.qfrc_bias + data.qfrc_actuator
+    outside = jnp.zeros_like(data.qfrc_applied) if drive.force is None else drive.force
+    for i, effect, at, theta in own.having("on_force"):
+        others = known + outside + jnp.sum(forces.at[i].set(0.0), axis=0)
+        memory[i], force = effect.on_force(at, memory[i], step.seen_by(others, forces[i]), theta)
+        forces = forces.at[i].set(force)
+    return data.replace(qfrc_applied=jnp.sum(forces, axis=0) + outside), (tuple(memory), forces)
+
+
+def _integrated(own: Timestep, data: mjx.Data, memory: tuple, step: SubStep) -> mjx.Data:
+    """The state at the end of the timestep; memory: of the effects, as it was at its beginning."""
+    integrator = int(own.physics.mj_model.opt.integrator)
+    if integrator == RK4:
+        return _rk4(own, data, memory)
+    return mjx.euler(own.model, data) if integrator == EULER else mjx.implicit(step.solved, data)
+
+
+def _rk4(own: Timestep, first: mjx.Data, memory: tuple) -> mjx.Data:
+    """The classical Runge-Kutta method of fourth order, from its first stage.
+
+    Actuators' forces are corrected in every stage, from the same memory: what effects remember is of the first one.
+    Held over the timestep are the controller's output, the effects' own forces (their friction is that of its end
+    already) and the torque of actuators that act through an effect (`Effect.transmits`).
+    """
+    model, dt = own.model, own.model.opt.timestep
+    flags = mjx.DisableBit(int(model.opt.disableflags) | _NO_DAMPING)
+
+    def moved(slope: tuple[jax.Array, ...], time: jax.Array) -> mjx.Data:
+        """`time` after the beginning, at this velocity and rate of the activations; qvel is not moved."""
+        # MJX's own steps, quaternions and activations come with Euler's method: at no acceleration it goes along qvel
+        straight = model.tree_replace({"opt.timestep": time, "opt.disableflags": flags})
+        velocity, acceleration, rate = slope
+        along = first.replace(qvel=velocity, qacc=jnp.zeros_like(acceleration), act_dot=rate)
+        return mjx.euler(straight, along)
+
+    def stage(carry: tuple, row: jax.Array) -> tuple[tuple, None]:
+        total, slope = carry
+        time = row[0] * dt
+        act, qvel = first.act + time * slope[2], first.qvel + time * slope[1]
+        data = first.replace(qpos=moved(slope, time).qpos, qvel=qvel, act=act, time=first.time + time)
+        data = mjx.fwd_velocity(model, mjx.fwd_position(model, data))
+        data, _, _ = _actuated(own, data, memory)
+        for _, effect, at, theta in own.having("transmits"):
+            torque = jnp.where(effect.transmits(at, theta), first.qfrc_actuator, data.qfrc_actuator)
+            data = data.replace(qfrc_actuator=torque)
+        data = _accelerated(model, data)
+        slope = (qvel, data.qacc, data.act_dot)
+        return (jax.tree.map(lambda t, s: t + row[1] * s, total, slope), slope), None
+
+    start = (first.qvel, first.qacc, first.act_dot)
+    total, last = jax.lax.scan(stage, (jax.tree.map(lambda x: x / 6, start), start), jnp.asarray(STAGES))[0]
+    end = moved(total, dt)
+    return first.replace(
+        qpos=end.qpos, qvel=first.qvel + dt * total[1], act=end.act, time=end.time, qacc_warmstart=last[1]
+    )

@@ -1,0 +1,186 @@
+"""The time step's own error: known for a pushed mass, mended where motion is fast, the floor of logs without noise.
+
+Logs come from MuJoCo C: by Runge-Kutta at a tenth of the step (the continuous truth), or by the very same step.
+"""
+
+from types import SimpleNamespace
+
+import mujoco
+import numpy as np
+import pytest
+
+from bayessim_mjx.diagnosis.fitting import discretisation, robot
+from bayessim_mjx.diagnosis.fitting.quadratic import eliminate
+from bayessim_mjx.diagnosis.fitting.substeps import Errors
+from bayessim_mjx.diagnosis.setup import _measured, _windows
+from bayessim_mjx.logs import Channels, Log, estimate_velocity
+
+pytestmark = [pytest.mark.slow, pytest.mark.ci]  # whole diagnoses and fits
+
+STEP, PERIOD, NOISE = 0.005, 0.01, 3e-4  # s, s, rad
+MASS = """<mujoco><option timestep=".005" gravity="0 0 0"/><worldbody><body><joint name="rail" type="slide"/>
+<geom size=".1" mass="2" contype="0" conaffinity="0"/></body></worldbody>
+<actuator><motor joint="rail"/></actuator></mujoco>"""
+ARM = """<mujoco><option timestep=".005" integrator="implicitfast"/>
+<default><geom type="capsule" contype="0" conaffinity="0"/></default>
+<worldbody><body><joint name="shoulder" axis="0 1 0" damping=".06" armature=".02"/>
+<geom fromto="0 0 0 0 0 -.3" size=".025" mass="1"/><body pos="0 0 -.3">
+<joint name="elbow" axis="0 1 0" damping=".03" armature=".01"/><geom fromto="0 0 0 0 0 -.25" size=".02" mass=".6"/>
+</body></body></worldbody><actuator><motor joint="shoulder"/><motor joint="elbow"/></actuator></mujoco>"""
+
+
+def the(xml: str) -> robot.Robot:
+    model = mujoco.MjModel.from_xml_string(xml)
+    return robot.Robot(model, lambda: mujoco.MjSpec.from_string(xml), None, robot.default_space(model), "it")
+
+
+def logs(xml: str, command, finer: int = 10, noise: float = NOISE, count: int = 4, rows: int = 160) -> list[Log]:
+    """command: (log, time, qpos, qvel) -> ctrl, held for PERIOD."""
+    spec = mujoco.MjSpec.from_string(xml)
+    spec.option.timestep = STEP / finer
+    if finer > 1:
+        spec.option.integrator = mujoco.mjtIntegrator.mjINT_RK4
+    model, rng = spec.compile(), np.random.default_rng(0)
+    channels, sigma = Channels.of(model), np.full(model.nq, max(noise, 1e-7))
+    out = []
+    for i in range(count):
+        data, table = mujoco.MjData(model), []
+        for k in range(rows):
+            data.ctrl[:] = command(i, k * PERIOD, data.qpos, data.qvel)
+            table.append((data.ctrl.copy(), data.qpos + noise * rng.normal(size=model.nq)))
+            mujoco.mj_step(model, data, round(PERIOD / model.opt.timestep))
+        ctrl, qpos = (np.array(c) for c in zip(*table, strict=True))
+        time = PERIOD * np.arange(rows)
+        qvel, spread = estimate_velocity(time, qpos, channels, sigma)
+        out.append(Log(f"log{i}", time, ctrl, qpos, qvel, False, channels, sigma, spread))
+    return out
+
+
+def push(i, time, qpos, qvel):
+    return 3.0
+
+
+def swing(i, time, qpos, qvel):
+    rate = 2 * np.pi * (0.5 + 0.1 * i)
+    target = np.array([0.9 * np.sin(rate * time), 0.8 * np.sin(1.3 * rate * time + i)])
+    return np.array([40.0, 14.0]) * (target - qpos) - np.array([3.0, 1.0]) * qvel
+
+
+def measured(xml, recorded):
+    """(discretisation, rms of measured minus simulated positions by factor, start states fitted)."""
+    physics = the(xml).physics(PERIOD)
+    cuts = _windows(physics, recorded, None, False)
+    found = discretisation.measure(physics, cuts, recorded, 4)
+    errors = Errors(physics, cuts(1), 4)
+    columns, spread, nv = errors.columns(found.sigma), cuts(1).spread, physics.mj_model.nv
+
+    def left(factor):
+        offsets = np.zeros((len(columns), len(spread)))
+        for _ in range(4):
+            error = errors.run(cuts(factor), factor, offsets=offsets)
+            r = (error / found.sigma).reshape(len(error), -1)
+            nothing = np.zeros((*r.shape, 0))
+            offsets = offsets + eliminate(r, nothing, columns, offsets, spread)[1].step(nothing, np.zeros(0))
+        error = errors.run(cuts(factor), factor, offsets=offsets)[..., :nv]
+        return np.sqrt(np.mean(error**2, (0, 1)))
+
+    return found, {f: left(f) for f in (1, 2, 4)}
+
+
+def test_a_pushed_mass_is_ahead_by_half_a_step():
+    found, _ = measured(MASS, logs(MASS, push))
+    # x_n = a h^2 n (n + 1) / 2 against a t^2 / 2: ahead by a h t / 2, as if it had started faster
+    since = PERIOD * np.arange(1, 51)
+    assert found.own[0] == pytest.approx(3.0 / 2.0 * STEP / 2 * np.sqrt(np.mean(since**2)), rel=0.02)
+    assert found.settled[0] < 0.02 * found.own[0]
+    assert found.factor == 1 and found.floor[0] == pytest.approx(found.sigma[0], rel=0.01)
+
+
+def test_fast_motion_is_simulated_more_finely_until_the_step_does_not_show():
+    found, left = measured(ARM, logs(ARM, swing))
+    assert found.factor > 1 and not found.simulated.any()
+    assert (left[1] / NOISE).max() > 1.3  # would be explained by some effect
+    assert (left[found.factor] / found.floor[:2]).max() < 1.2
+    true = np.sqrt(np.maximum(left[1] ** 2 - NOISE**2, 0.0))  # the time step's part, told beforehand within a third
+    told = found.left * found.factor
+    assert told[:2].max() == pytest.approx(true.max(), rel=0.35)
+    (text,) = found.warnings()
+    assert (
+        "time step of 5 ms" in text
+        and "noise standard deviations" in text
+        and any(n in text for n in ("shoulder", "elbow"))
+    )
+    fine = found.robot(the(ARM)).physics(PERIOD)
+    assert fine.substeps == 2 * found.factor and fine.dt == pytest.approx(PERIOD)
+    assert found.to_dict()["substep"] == pytest.approx(STEP / found.factor)
+
+
+@pytest.mark.slow
+@pytest.mark.ci
+def test_the_integrator_that_is_recommended_leaves_nothing():
+    """RK4 at the same step: commands act when they are sent, and velocities are those of the positions' time."""
+    found, left = measured(ARM.replace("implicitfast", "RK4"), logs(ARM, swing))
+    assert found.factor == 1 and (found.own[:2] / NOISE).max() < 0.1 and not found.warnings()
+    assert (left[1] / NOISE).max() < 1.05  # nothing but the sensors' noise
+
+
+@pytest.mark.parametrize("finer", [1, 10])
+def test_without_noise_the_step_itself_is_the_floor(finer):
+    found, left = measured(ARM, logs(ARM, swing, finer, noise=0.0))
+    assert found.simulated.all()
+    assert (left[min(found.factor, 4)] / found.floor[:2]).max() < 1.2
+    assert (left[1] / found.sigma[:2]).max() > 10  # a huge gap, were the floor the sensors' alone
+    assert "no noise" in found.warnings()[0]
+
+
+def test_noise_is_seen_whatever_the_motion():
+    def log(qpos):
+        time, channels = 0.02 * np.arange(len(qpos)), Channels.of(mujoco.MjModel.from_xml_string(MASS))
+        zero = np.zeros((len(qpos), 1))
+        return Log("a", time, zero, qpos[:, None], zero, False, channels, np.ones(1), np.ones(1))
+
+    smooth = np.sin(9 * 0.02 * np.arange(300)) + 0.3 * np.sin(17 * 0.02 * np.arange(300))
+    rng = np.random.default_rng(0)
+    assert discretisation.noise_free([log(smooth)], 0)
+    assert not discretisation.noise_free([log(smooth + 1e-3 * rng.normal(size=300))], 0)
+    assert not discretisation.noise_free([log(np.round(smooth, 3))], 0)
+
+
+def test_the_coarsest_that_is_fine_enough_is_chosen():
+    assert discretisation._choose({1: 0.4, 2: 0.2}, 2.0) == 1
+    assert discretisation._choose({1: 2.0, 2: 1.0, 4: 0.45, 8: 0.2}, 2.0) == 4
+    assert discretisation._choose({1: 9.0, 2: 5.0, 4: 2.0}, 2.0) == 4  # what can be had
+    assert discretisation._choose({1: 9.0, 2: 8.0, 4: 7.0}, 1.1) == 1  # chaos: nothing gained
+
+
+def test_where_nothing_touches_there_are_no_contacts():
+    ball = MASS.replace('contype="0" conaffinity="0"', "").replace("<body>", '<geom type="plane" size="1 1 1"/><body>')
+    assert discretisation.contacts(the(ball).physics(PERIOD))
+    assert not discretisation.contacts(the(ARM).physics(PERIOD))
+
+
+@pytest.mark.parametrize(("touching", "steps"), [(True, 25), (False, 50)])
+def test_windows_get_shorter_where_contacts_make_the_step_worth_many_noises(monkeypatch, touching: bool, steps: int):
+    """The step's worth grows with the window, 8.3 noises after 50 steps; without contacts finer steps mend it."""
+
+    def worth(physics, cuts, logs, most):
+        sigma = np.ones(2)
+        return SimpleNamespace(sigma=sigma, floor=sigma * cuts(1).steps / 6)
+
+    monkeypatch.setattr(discretisation, "measure", worth)
+    monkeypatch.setattr(discretisation, "contacts", lambda physics: touching)
+    pushed = logs(MASS, lambda i, t, q, v: np.sin(3 * t + i))
+    cuts, step = _measured(the(MASS).physics(PERIOD), pushed, None, False)
+    assert cuts(1).steps == steps and step.floor[0] == steps / 6
+
+
+@pytest.mark.parametrize(
+    ("floor", "simulated", "share"), [(1e-3, False, 1.0), (2e-3, False, 0.5), (2e-2, False, 0.4), (2e-2, True, 1.0)]
+)
+def test_how_much_of_the_noise_is_the_sensors(floor, simulated, share):
+    """At least .4; logs of a simulation have no noise of their own to compare with."""
+    sigma, none = np.full(4, 1e-3), np.zeros(4)
+    found = discretisation.Discretisation(
+        0.01, 1, 1.0, none, none, none, sigma, np.full(4, floor), np.full(2, simulated), ("a", "b")
+    )
+    assert found.believed == pytest.approx(share)

@@ -1,0 +1,44 @@
+"""Scales of a robot with a floating base: noise and range of motion belong to the joint whose they are."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from bayessim_mjx.diagnosis.fitting import scales
+from bayessim_mjx.logs import Channels, Log
+
+FLOATING = """<mujoco><option gravity="0 0 0"/><worldbody><body><freejoint/><geom size=".1"/>
+  <body><joint type="ball"/><geom size=".1"/>
+    <body pos="0 0 .3"><joint name="one" axis="0 1 0"/><geom size=".1"/>
+      <body pos="0 0 .3"><joint name="two" axis="0 1 0"/><geom size=".1"/></body></body></body>
+</body></worldbody><actuator><motor joint="two"/></actuator></mujoco>"""
+
+
+@pytest.fixture(scope="module")
+def setting():
+    """The base turns by 0.4 rad about its x axis; of the hinges only "two" moves, by 0.02 rad."""
+    model = mujoco.MjModel.from_xml_string(FLOATING)
+    time = np.linspace(0.0, 2.0, 101)
+    wave = (1 - np.cos(np.pi * time)) / 2
+    qpos = np.tile(model.qpos0, (len(time), 1))
+    qpos[:, 3], qpos[:, 4] = np.cos(0.2 * wave), np.sin(0.2 * wave)
+    qpos[:, 12] = 0.02 * wave
+    qvel = np.zeros((len(time), model.nv))
+    qvel[:, 3], qvel[:, 10] = np.gradient(0.4 * wave, time), np.gradient(0.02 * wave, time)
+    sigma = np.array([0.1, 0.2, 0.3, 3e-3, 4e-3, 3e-3, 4e-3, 0.01, 0.01, 0.01, 0.01, 0.5, 1e-4])
+    ctrl, noise = np.zeros((len(time), 1)), np.full(model.nv, 1e-3)
+    return model, Log("log", time, ctrl, qpos, qvel, True, Channels.of(model), sigma, noise)
+
+
+def test_noise_by_degree_of_freedom(setting):
+    """A quaternion changes by half the angle: q = (cos a/2, n sin a/2)."""
+    turn = 2 * np.sqrt(12.5e-6)
+    expected = [0.1, 0.2, 0.3, turn, turn, turn, 0.02, 0.02, 0.02, 0.5, 1e-4]
+    np.testing.assert_allclose(setting[1].sigma_dofs, expected, rtol=1e-12)
+
+
+def test_a_joint_moves_by_its_own_noise(setting):
+    found = scales.measure(setting[0], [setting[1]])
+    np.testing.assert_array_equal(np.flatnonzero(found.moves), [3, 10])  # roll, and "two" by 200 of its own noises
+    np.testing.assert_allclose(found.travel[[3, 10]], [0.2, 0.01], rtol=1e-6)
+    assert found.at("joint", "two")["travel"] == pytest.approx(0.01)

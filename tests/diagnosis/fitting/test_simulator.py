@@ -1,0 +1,109 @@
+"""One compiled program for all candidates; second order against MuJoCo C; tangent spaces of quaternions."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from bayessim_mjx.diagnosis.fitting.simulator import Simulator
+from bayessim_mjx.diagnosis.setup import prepare
+from tests.diagnosis.pendulums import nominal, recorded
+
+FLOATING = """<mujoco><worldbody><body><freejoint/><geom size=".1"/>
+  <body><joint type="ball"/><geom size=".1"/><body><joint name="h"/><geom size=".1"/></body></body></body></worldbody>
+</mujoco>"""
+
+
+@pytest.fixture(scope="module")
+def setup(tmp_path_factory):
+    logs = recorded(count=3, seconds=2.0, sigma=0.0)
+    return prepare(nominal(tmp_path_factory.mktemp("model")), logs, ["coulomb_friction", "actuator_delay"])
+
+
+@pytest.fixture(scope="module")
+def simulator(setup):
+    return Simulator(setup.physics, setup.fitter.simulator.windows, lanes=32)
+
+
+def test_one_trace_whatever_is_asked(simulator):
+    rng = np.random.default_rng(0)
+    theta, windows = simulator.physics.space.nominal, len(simulator.windows)
+    before = simulator.rollouts
+    still = simulator.run(theta[None])
+    thetas = np.array([rng.uniform(p.low, p.high) for p in simulator.physics.space.parameters for _ in range(7)])
+    many = simulator.run(thetas.reshape(-1, 7).T)
+    moved = simulator.run(theta[None], 0.01 * rng.normal(size=(1, windows, 2)))
+    pushed = simulator.run(theta[None], force=np.full((1, windows, simulator.windows.steps, 1), 0.1))
+    some = simulator.run(theta[None], windows=np.array([2, 0]))
+    assert simulator.traces == 1
+    assert simulator.rollouts - before == (1 + 7 + 1 + 1) * windows + 2
+    assert still.shape == (1, windows, simulator.windows.steps, 2) and many.shape[0] == 7
+    np.testing.assert_allclose(some[0], still[0, [2, 0]], atol=1e-6)
+    for other in (many, moved, pushed):
+        assert np.isfinite(other).all() and np.abs(other[0] - still[0]).max() > 1e-4
+
+
+def test_its_own_motion_has_no_error(simulator):
+    theta = simulator.physics.space.nominal
+    cut = simulator.windows
+    errors = simulator.run(theta[None])[0]
+    batch = cut.batch.replace(
+        qpos=cut.batch.qpos - jnp.asarray(errors[..., :1], jnp.float32),
+        qvel=cut.batch.qvel - jnp.asarray(errors[..., 1:], jnp.float32),
+    )
+    own = Simulator(simulator.physics, dataclasses.replace(cut, batch=batch), lanes=32)
+    again = own.run(np.stack([theta, theta * 1.1]))
+    assert np.abs(again[0]).max() < 2e-6 < 1e-4 < np.abs(again[1]).max()
+
+
+def test_a_right_simulator_follows_mujoco_at_a_tenth_of_the_step(setup):
+    """Errors left are second order in the step, after the start states are estimated."""
+    fitter = setup.fitter
+    job = fitter.begin(())
+    fitter.iterate([job], 4, lambda j: ())
+    errors = fitter.simulator.run(fitter.theta[None], job.offsets[None])[0]
+    late = 0.5 * fitter.simulator.physics.mj_model.opt.timestep  # s, what a naive reading of the step would leave
+    speed = np.asarray(fitter.simulator.windows.batch.qvel)
+    assert np.sqrt(np.mean(errors[..., 0] ** 2)) < 0.1 * late * np.sqrt(np.mean(speed**2))
+
+
+def test_a_force_is_the_torque_of_a_motor(simulator):
+    theta, cut = simulator.physics.space.nominal, simulator.windows
+    force = np.full((1, len(cut), cut.steps, 1), 0.05)
+    pushed = simulator.run(theta[None], force=force)
+    past = cut.batch.around.replace(command=cut.batch.around.command + 0.05)
+    batch = cut.batch.replace(command=cut.batch.command + 0.05, around=past)
+    motor = Simulator(simulator.physics, dataclasses.replace(cut, batch=batch), lanes=32).run(theta[None])
+    assert np.abs(pushed - motor).max() < 1e-5
+
+
+@pytest.mark.parametrize("size", [1e-3, 0.3])
+def test_steps_in_the_tangent_space_are_undone(size):
+    model = mujoco.MjModel.from_xml_string(FLOATING)
+    rng = np.random.default_rng(1)
+    qpos = rng.normal(size=model.nq)
+    mujoco.mj_normalizeQuat(model, qpos)
+    step = size * rng.uniform(-1, 1, model.nv)
+    moved = simulator.integrate(model, jnp.asarray(qpos), jnp.asarray(step))
+    back = simulator.difference(model, moved, jnp.asarray(qpos))
+    np.testing.assert_allclose(back, step, atol=2e-6)
+    np.testing.assert_allclose(simulator.difference(model, -moved, -jnp.asarray(qpos))[3:9], step[3:9], atol=2e-6)
+    flipped = moved.at[3:7].multiply(-1.0).at[7:11].multiply(-1.0)  # the same rotations
+    np.testing.assert_allclose(simulator.difference(model, flipped, jnp.asarray(qpos)), step, atol=2e-6)
+
+
+def test_small_steps_are_those_of_mujoco():
+    model = mujoco.MjModel.from_xml_string(FLOATING)
+    rng = np.random.default_rng(2)
+    qpos = rng.normal(size=model.nq)
+    mujoco.mj_normalizeQuat(model, qpos)
+    step = 0.02 * rng.uniform(-1, 1, model.nv)
+    theirs, theirs_back = qpos.copy(), np.zeros(model.nv)
+    mujoco.mj_integratePos(model, theirs, step, 1.0)
+    np.testing.assert_allclose(simulator.integrate(model, jnp.asarray(qpos), jnp.asarray(step)), theirs, atol=2e-6)
+    mujoco.mj_differentiatePos(model, theirs_back, 1.0, qpos, theirs)
+    np.testing.assert_allclose(
+        simulator.difference(model, jnp.asarray(theirs), jnp.asarray(qpos)), theirs_back, atol=2e-6
+    )

@@ -1,0 +1,107 @@
+"""Screening from one simulation per starting point: the true effect first, its gain foretold."""
+
+import importlib
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bayessim_mjx.diagnosis.fitting.candidates import Coordinate, _probes
+from bayessim_mjx.diagnosis.selection.screen import screen
+from bayessim_mjx.diagnosis.setup import prepare
+from bayessim_mjx.effects.speed_torque_limit import SpeedTorqueLimit
+from tests.diagnosis.pendulums import FEW, fitted, nominal, recorded, refit
+
+pytestmark = [pytest.mark.slow, pytest.mark.ci]  # whole diagnoses and fits
+
+SCALE = (1.1, 1.08, 0.95)
+TRUTHS: dict[str, dict[str, Any]] = {"coulomb_friction": {"friction": 0.03}, "actuator_delay": {"delay": 0.008}}
+
+
+@pytest.fixture(scope="module")
+def setup(tmp_path_factory):
+    return prepare(nominal(tmp_path_factory.mktemp("screen")), recorded(scale=SCALE), FEW)
+
+
+@pytest.fixture(scope="module", params=TRUTHS)
+def screened(request, setup):
+    fitter, job = refit(setup, recorded(scale=SCALE, **TRUTHS[request.param]))
+    return request.param, setup, fitter, job, screen(fitter, job, setup.candidates)
+
+
+def test_the_true_effect_gains_most(screened):
+    truth, setup, _, _, found = screened
+    assert {s.candidate.label for s in found} == {c.label for c in setup.candidates}
+    assert found[0].candidate.effect == truth
+    assert [s.gain for s in found] == sorted((s.gain for s in found), reverse=True)
+
+
+def test_predicted_gains_are_realised(screened):
+    _, _, fitter, job, found = screened
+    best = found[0]
+    new = fitter.derive(job, best.candidate.coordinates, best.start)
+    fitter.iterate([new], 10, lambda j: range(len(j.coordinates)))
+    assert 0.5 < best.gain / (job.cost - new.cost) < 2.0
+
+
+def test_starts_lie_within_their_ranges_and_shares_are_shares(screened):
+    *_, found = screened
+    for s in found:
+        bounds = [(c.low, c.high) for c in s.candidate.coordinates]
+        assert all(low <= v <= high for v, (low, high) in zip(s.start, bounds, strict=True))
+        assert s.gain >= 0 and -1e-6 <= s.absorbed <= 1 + 1e-6 and np.isfinite(s.column).all()
+
+
+def test_what_the_known_parameters_already_do_is_absorbed(setup):
+    fitter, job = fitted(setup)
+    found = {s.candidate.effect: s for s in screen(fitter, job, setup.candidates)}
+    assert found["viscous_friction"].absorbed > 0.95  # the same column as damping
+    assert found["viscous_friction"].absorbed > found["coulomb_friction"].absorbed
+    assert fitter.simulator.traces == 1
+
+
+def test_the_point_that_explains_most_as_simulated_is_among_the_starts(screened):
+    """A secant, scaled down, ends below a limit's threshold: what was really simulated has to be tried as it is."""
+    _, _, fitter, job, found = screened
+
+    def reached(s, point):
+        start = fitter.derive(job, s.candidate.coordinates, point)
+        fitter.iterate([start], 4, lambda j: range(len(j.coordinates) - len(point)))  # the effect stays where it is
+        return start.cost
+
+    true = found[0]
+    best = min(reached(true, point) for point in true.candidate.probes)
+    assert min(reached(true, point) for point in true.others) < 1.05 * best
+
+
+def test_amplitudes_that_act_together_alone_are_tried_in_all_combinations():
+    scales = {"force": 2.0, "speed": 10.0}
+    first, second = (np.array(q.grid) * q.reach[1] for q in SpeedTorqueLimit.quantities)
+    coordinates = [
+        Coordinate(q.name, (i,), 0.0, 0.0, q.reach[1] / s)
+        for i, (q, s) in enumerate(zip(SpeedTorqueLimit.quantities, scales.values(), strict=True))
+    ]
+    points = _probes(SpeedTorqueLimit("motor"), coordinates)
+    pairs = {(round(a, 6), round(b, 6)) for a, b in points}
+    assert pairs >= {(round(a / 2.0, 6), round(b / 10.0, 6)) for a in (0, *first) for b in (0, *second)} - {(0, 0)}
+
+
+def test_no_candidates_no_answers(screened):
+    _, _, fitter, job, _ = screened
+    assert screen(fitter, job, []) == []
+
+
+def test_a_first_look_at_few_windows_keeps_what_matters(screened, monkeypatch):
+    truth, setup, fitter, job, _ = screened
+    whole = screen(fitter, job, setup.candidates, 24)
+    module = importlib.import_module("bayessim_mjx.diagnosis.selection.screen")
+    monkeypatch.setattr(module, "MANY", 0)
+    monkeypatch.setattr(module, "CANDIDATES", 3)
+    before = fitter.simulator.rollouts
+    found = screen(fitter, job, setup.candidates, 24)
+    points = sum(len(c.probes) for c in setup.candidates)
+    assert fitter.simulator.rollouts - before <= 8 * points + 24 * 3 * module.POINTS
+    assert {s.candidate.label for s in found} == {c.label for c in setup.candidates}
+    assert found[0].candidate.effect == truth
+    np.testing.assert_allclose(found[0].gain, whole[0].gain)
+    np.testing.assert_allclose(found[0].start, whole[0].start)

@@ -1,0 +1,166 @@
+"""Intervals of parameters on a linear problem whose answer is known: they cover it as often as they say."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from bayessim_mjx.diagnosis import statistics
+from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
+from bayessim_mjx.diagnosis.fitting.fitter import Fitter, Job
+from bayessim_mjx.diagnosis.fitting.quadratic import solve
+from bayessim_mjx.diagnosis.selection import heldout, uncertainty
+from bayessim_mjx.diagnosis.selection.models import Model, scored
+
+TRUTH = np.array([0.1, 0.3])
+NAMES = ("known", "effect")
+STEPS, EACH = 12, 4  # residuals of a window, windows of a condition
+
+
+def problem(
+    conditions: int, rng: np.random.Generator, differs: float, uneven: float = 0.0, alike: float = 0.0
+) -> tuple[Fitter, Model]:
+    """Residuals of a known parameter and an effect whose values differ by `differs` from condition to condition.
+
+    Args:
+        uneven: how differently strong the conditions excite them; alike: how similarly the two act.
+    """
+    group = np.repeat(np.arange(conditions), EACH)
+    strength = np.exp(uneven * rng.normal(size=conditions))[group]
+    A = 0.2 * rng.normal(size=(len(group), STEPS, 2)) * strength[:, None, None]
+    A[..., 1] = alike * A[..., 0] + (1 - alike) * A[..., 1]
+    B = rng.normal(size=(len(group), STEPS, 1))
+    own = TRUTH + differs * rng.normal(size=(conditions, 2))
+    start = 0.5 * rng.normal(size=(len(group), 1))
+    r = np.einsum("wnk,wk->wn", A, own[group]) + np.einsum("wns,ws->wn", B, start)
+    r += rng.normal(size=r.shape)
+    coordinates = tuple(Coordinate(n, (i,), 0.0, -2.0, 2.0, 1 / 16) for i, n in enumerate(NAMES))
+    fitter = SimpleNamespace(
+        spread=np.array([0.5]), used=np.ones(1, bool), base=coordinates[:1],
+        simulator=SimpleNamespace(windows=SimpleNamespace(group=group)),
+    )  # fmt: skip
+    fitter.scores = lambda job, group=None: Fitter.scores(fitter, job, group)
+    job = Job(coordinates, np.zeros(2), np.zeros((len(group), 1)), r, A, B, np.ones(len(group)), 0.0)
+    q, starts = job.quadratic(fitter.spread)
+    g, S = q.weighted(job.weight)
+    precision, pull, low, high = job.prior()
+    job.values = solve(S + np.diag(precision), g + pull, low, high)
+    job.offsets = starts.step(A, job.values)
+    job.r = r - A @ job.values - np.einsum("wns,ws->wn", B, job.offsets)
+    return fitter, scored(fitter, job, ())
+
+
+@pytest.mark.parametrize("conditions", [3, 5])
+@pytest.mark.parametrize(("differs", "uneven"), [(0.0, 0.0), (1.0, 0.0), (0.3, 0.5)])
+def test_90_percent_intervals_cover_85_to_95_percent(conditions, differs, uneven):
+    rng = np.random.default_rng(conditions)
+    covered = []
+    for _ in range(300):
+        fitter, model = problem(conditions, rng, differs, uneven)
+        sd = np.sqrt(np.diag(uncertainty.covariance(fitter, model)))
+        covered.append(np.abs(model.job.values - TRUTH) < 1.645 * sd)
+    rate = np.mean(covered)
+    assert 0.85 <= rate <= 0.96
+
+
+def test_what_acts_alike_is_known_together_better_than_each():
+    fitter, model = problem(5, np.random.default_rng(0), 0.0, alike=0.9)
+    found = uncertainty.covariance(fitter, model)
+    sd = np.sqrt(np.diag(found))
+    assert found[0, 1] / sd[0] / sd[1] < -0.9  # what one takes the other gives
+    together = np.array([1.0, 0.9])  # the direction that the residuals see
+    assert together @ found @ together < 0.1 * (sd @ sd)
+    assert np.linalg.eigvalsh(found).min() > 0
+
+
+def test_simulators_differ_by_a_part_of_a_step_and_a_percent():
+    """Known parameters keep their interval; times are uncertain by the step, other numbers by their size."""
+    known = Coordinate("arm_mass_mult", (0,), 1.0, 0.8, 1.2)
+    delay = Coordinate("motor.actuator_delay.delay", (1,), 0.0, 0.0, 0.1, unit="s")
+    gain = Coordinate("motor.actuator_gain.gain", (2,), 1.0, 0.2, 2.0)
+    job = SimpleNamespace(coordinates=(known, delay, gain), values=np.array([1.1, 0.02, 0.7]))
+    model = SimpleNamespace(effects=(SimpleNamespace(coordinates=(delay, gain)),), job=job)
+    np.testing.assert_allclose(uncertainty.systematic(model, 0.01), [0.0, 0.07 * 0.01, 0.01 * 0.3])
+    np.testing.assert_allclose(uncertainty.systematic(model, 0.01, 0.04), [0.0, 0.07 * 0.01, (0.01 + 0.15 * 0.2) * 0.3])
+
+
+def alike_within(rng: np.random.Generator, conditions: int, windows: int = 6) -> tuple[np.ndarray, np.ndarray]:
+    """(values of windows that differ by condition much more than within one, their conditions)."""
+    group = np.repeat(np.arange(conditions), windows)
+    return rng.normal(size=conditions)[group] + 0.1 * rng.normal(size=len(group)), group
+
+
+@pytest.mark.parametrize("conditions", [2, 3, 4, 8])
+def test_a_mean_that_is_zero_exceeds_two_deviations_as_often_at_every_number_of_conditions(conditions):
+    rng = np.random.default_rng(conditions)
+    hits = [statistics.normal_deviate(*alike_within(rng, conditions)) > 2.0 for _ in range(1500)]
+    assert 0.01 < np.mean(hits) < 0.04  # 2.3 % by the normal law, standard error .4; as independent windows 30 %
+
+
+def test_the_deviate_of_two_conditions_by_hand():
+    """Means 3 and 5: t = 4 / 1 with one degree of freedom, P(T > 4) = 1/2 - atan(4) / pi = .0780."""
+    found = statistics.normal_deviate(np.array([3.0, 3.0, 5.0, 5.0]), np.array([0, 0, 1, 1]))
+    assert stats.norm.sf(found) == pytest.approx(0.5 - np.arctan(4.0) / np.pi, rel=1e-6)
+    assert statistics.normal_deviate(-np.array([3.0, 3.0, 5.0, 5.0]), np.array([0, 0, 1, 1])) == pytest.approx(-found)
+
+
+def test_one_condition_says_nothing_of_others():
+    cost, group = np.array([4.0, 5.0, 6.0]), np.zeros(3, int)
+    assert statistics.normal_deviate(cost, group) == 0.0
+    ends = [statistics.interval_of_rms(cost, group), heldout.Closed(cost, cost / 2, group).interval()]
+    ends += statistics.interval_of_shares(np.ones((3, 2)), group)
+    assert np.isnan(ends).all()
+
+
+def test_conditions_that_count():
+    assert statistics.freedom(np.ones((5, 1))) == pytest.approx(4.0)
+    assert statistics.freedom(np.array([[1.0], [1.0], [2.0]])) == pytest.approx(16 / 6 - 1)
+    assert statistics.freedom(np.array([[1e9], [1.0]]), 0.5) == pytest.approx(0.5)
+
+
+def squares(rng: np.random.Generator, conditions: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Windows before and after, heavy-tailed between conditions: a share of .25 is left on average."""
+    group = np.repeat(np.arange(conditions), 5)
+    size, left = 30 * rng.gamma(0.8, size=conditions), rng.beta(2, 6, conditions)
+    each = rng.gamma(1.5, size=len(group)) / 1.5 * size[group]
+    noise = rng.chisquare(25, size=(2, len(group))) / 25
+    return noise[0] + each, noise[1] + left[group] * each, group
+
+
+@pytest.mark.parametrize("conditions", [2, 3, 5, 8])
+def test_intervals_of_the_share_closed_cover_it(conditions):
+    """Nominal 90 %; a bootstrap of windows covers half. The figures: benchmarks/intervals.py."""
+    rng = np.random.default_rng(conditions)
+    found = [heldout.Closed(*squares(rng, conditions)).interval() for _ in range(400)]
+    assert 0.86 < np.mean([low <= 0.75 <= high for low, high in found]) < 0.98
+
+
+def test_parts_of_what_is_closed_add_up_and_stay_below_one():
+    before, after, group = squares(np.random.default_rng(0), 6)
+    whole = heldout.Closed(before, after, group)
+    assert whole.value == pytest.approx((before - after).sum() / (before - 1).sum())
+    own = np.stack([0.7 * (before - after), 0.3 * (before - after)])
+    parts = [heldout.Closed(before, after, group, o, own.sum(0)) for o in own]
+    assert [p.value for p in parts] == pytest.approx([0.7 * whole.value, 0.3 * whole.value])
+    for part in (whole, *parts):
+        low, high = part.interval()
+        assert low < part.value < high <= 1.0
+    lucky = np.full_like(before, 0.9)  # below the noise: all is closed, and no more
+    assert sum(heldout.Closed(before, lucky, group, o, own.sum(0)).value for o in own) == pytest.approx(1.0)
+    at_noise = heldout.Closed(before, np.full_like(before, 0.9), group)
+    assert at_noise.value == 1.0 and at_noise.interval()[1] == 1.0
+
+
+def test_weights_among_rivals_are_one_together_and_equal_where_the_rivals_are():
+    rng = np.random.default_rng(0)
+    cost, group = 1.0 + rng.random(24), np.repeat(np.arange(4), 6)
+    model = lambda factor: SimpleNamespace(cost=factor * cost, samples=200.0)  # noqa: E731
+    same = uncertainty.win_share([model(1.0), model(1.0)], group, 1.0, rng)
+    np.testing.assert_allclose(same, [0.5, 0.5])
+    # twice the cost: 100 log 2 nats behind
+    assert uncertainty.win_share([model(2.0), model(1.0)], group, 1.0, rng)[0] < 1e-20
+    # each better on half of the conditions: resampled conditions decide, not the pooled score
+    better = np.where(group < 2, 0.5, 2.0)
+    split = uncertainty.win_share([model(better), model(1 / better)], group, 1.0, rng)
+    assert split.sum() == pytest.approx(1.0) and 0.2 < split[0] < 0.8

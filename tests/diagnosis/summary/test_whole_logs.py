@@ -1,0 +1,66 @@
+"""The longest horizon: at its beginning the windows' own simulation; honest where nothing is predictable."""
+
+import numpy as np
+import pytest
+
+from bayessim_mjx.diagnosis import run
+from bayessim_mjx.diagnosis.summary import assemble, whole_logs
+from tests.diagnosis import pendulums
+from tests.diagnosis.pendulums import PERIOD, nominal, recorded
+
+pytestmark = [pytest.mark.slow, pytest.mark.ci]  # whole diagnoses and fits
+
+EFFECTS = ("coulomb_friction", "viscous_friction")
+
+
+@pytest.fixture(scope="module")
+def rubbing(tmp_path_factory):
+    logs = recorded(friction=0.04, scale=(0.9, 1.1, 0.95), count=5, seconds=3.0)
+    return run.diagnose(nominal(tmp_path_factory.mktemp("rubbing")), logs, EFFECTS)
+
+
+def test_a_log_begins_as_its_first_window(rubbing):
+    cut = rubbing.setup.fitter.simulator.windows
+    stages = {
+        "nominal": whole_logs._Stage(rubbing.race.base, rubbing.predictions["nominal"], True),
+        "with_effects": whole_logs._Stage(rubbing.ruling.model, rubbing.predictions["with_effects"], False),
+    }
+    first = int(np.flatnonzero(cut.log == 2)[0])
+    simulator = whole_logs._simulator(
+        rubbing, np.array([2]), [int(cut.start[first])], 3 * cut.steps, 2 + whole_logs.DRAWS
+    )
+    rows = whole_logs._one(rubbing, simulator, stages, 0, first)
+    for row, stage in zip(rows, stages.values(), strict=False):
+        np.testing.assert_allclose(row[: cut.steps], stage.prediction.error[first], atol=0.05)
+
+
+def test_whole_logs_are_the_third_horizon(rubbing):
+    diagnosis = assemble.diagnosis_of(rubbing)
+    short, window, log = diagnosis.gap.horizons
+    assert short["seconds"] < window["seconds"] == pytest.approx(0.5) and log["seconds"] == pytest.approx(3.0, abs=0.1)
+    assert log["name"] == "whole log"
+    assert log["nominal"] > log["with_effects"] and log["calibrated"] > 2 * log["with_effects"]
+    assert log["with_effects"] >= log["reducible_floor"] >= 1.0
+    for row in diagnosis.gap.horizons:
+        for stage, (low, high) in row["ci"].items():
+            assert low <= row[stage] * 1.01 and row[stage] <= high * 1.01, (row["name"], stage)
+    assert diagnosis.gap.nominal == window["nominal"]
+
+
+@pytest.mark.slow
+@pytest.mark.ci
+def test_an_unstable_motion_counts_as_long_as_it_can_be_predicted(tmp_path, monkeypatch):
+    upside_down = pendulums.MODEL.replace("<option ", '<option gravity="0 0 9.81" ')
+    monkeypatch.setattr(pendulums, "MODEL", upside_down)  # held upright by its controller; open loop it falls
+    found = run.diagnose(nominal(tmp_path), recorded(friction=0.04, count=4, seconds=3.0), EFFECTS[:1])
+    over = whole_logs.simulate(found)
+    assert "unstable or chaotic motion: in 4 of 4 logs" in over.notes[0]
+    assert over.seconds < 2.5 and (over.name.startswith("up to") or not len(over.group))
+
+
+def test_the_start_s_uncertainty_decides_how_long():
+    grows = 1e-3 * np.exp(5.0 * PERIOD * np.arange(200))  # in parts of the motion, 5/s
+    steps = whole_logs._predictable(np.repeat(grows[None, :, None], 4, 0), np.ones(1))
+    assert steps * PERIOD == pytest.approx(np.log(whole_logs.PART / 1e-3) / 5.0, abs=PERIOD)
+    assert whole_logs._predictable(np.full((4, 200, 1), 0.01), np.ones(1)) == 200
+    assert whole_logs._predictable(np.where(np.arange(200) < 50, 0.0, np.nan)[None, :, None], np.ones(1)) == 50

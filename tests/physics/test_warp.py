@@ -1,0 +1,110 @@
+"""`env.impl=warp`: refused in words where it cannot work; where warp-lang is installed, the motion is that of MJX."""
+
+import importlib.util
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from bayessim_mjx import config, registry
+from bayessim_mjx.effects import make
+from bayessim_mjx.errors import UserError
+from bayessim_mjx.parameters import ParameterSpace
+from bayessim_mjx.physics import Physics, control_step
+from bayessim_mjx.physics.warp import wrenches
+
+INSTALLED = importlib.util.find_spec("warp") is not None
+
+
+@pytest.mark.skipif(INSTALLED, reason="warp-lang is installed")
+def test_without_the_package_the_extra_is_named():
+    with pytest.raises(UserError, match=r"env.impl = 'warp'.*bayessim-mjx\[warp\]"):
+        registry.make("Pendulum", impl="warp")
+
+
+def test_other_implementations_and_foreign_environments_are_refused():
+    with pytest.raises(UserError, match="env.impl = 'cpp': allowed are jax, warp"):
+        registry.make("Pendulum", impl="cpp")
+    with pytest.raises(UserError, match="env.impl = 'warp': brax:ant is not simulated here"):
+        registry.make("brax:ant", config=config.load("Pendulum", overrides=["env.impl=warp"]))
+
+
+def test_effects_inside_the_timestep_are_refused():
+    with pytest.raises(UserError, match="env.impl = 'warp': coulomb_friction acts inside the timestep"):
+        registry.make("Pendulum", impl="warp", effects=[make("coulomb_friction", where="all")])
+
+
+def motions(env, thetas, steps=5):
+    """Positions and velocities [N, T, nq + nv] from random states, in worlds of their own physics."""
+
+    def one(theta, key):
+        def step(world, i):
+            world, _ = control_step(env.physics, world, env.command(0.5 * jnp.sin(jnp.arange(env.action_size) + i)))
+            return world, jnp.concatenate([world.qpos, world.qvel])
+
+        return jax.lax.scan(step, env.physics.world(theta, *env.initial(key)), jnp.arange(steps))[1]
+
+    return jax.jit(jax.vmap(one))(thetas, jax.random.split(jax.random.PRNGKey(0), len(thetas)))
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not INSTALLED, reason="warp-lang is not installed")
+@pytest.mark.parametrize("name", ["Pendulum", "Cartpole"])
+def test_the_motion_is_that_of_the_other_implementation(name):
+    """In every world that of its own parameters, and a delay on the way to the actuators acts as well."""
+    effects = [make("actuator_delay", where="all")]
+    ours, warp = (registry.make(name, impl=impl, effects=effects) for impl in ("jax", "warp"))
+    low, high = (jnp.asarray(x, jnp.float32) for x in (ours.space.low, ours.space.high))
+    thetas = low + (high - low) * jax.random.uniform(jax.random.PRNGKey(1), (4, len(ours.space)))
+    expected = motions(ours, thetas)
+    np.testing.assert_allclose(motions(warp, thetas), expected, rtol=1e-4, atol=1e-4)
+    assert np.ptp(expected[:, -1], axis=0).max() > 0.1  # worlds differ
+
+
+BALL = """
+<mujoco><option timestep="0.002"/><worldbody>
+  <geom type="plane" size="5 5 1"/>
+  <body pos="0 0 0.1"><freejoint/><geom type="sphere" size="0.1" mass="2"/></body>
+</worldbody></mujoco>
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not INSTALLED, reason="warp-lang is not installed")
+def test_contacts_of_many_worlds_and_what_they_carry():
+    """A ball of 2 kg is carried by 2 g; pushed sidewise it rolls as in the other implementation, in every world."""
+    model = mujoco.MjModel.from_xml_string(BALL)
+    ours, warp = (Physics(model, 0.02, ParameterSpace(), impl=impl, worlds=4) for impl in ("jax", "warp"))
+    assert warp.warp.room == 256  # one contact for each of the least number of worlds
+
+    def roll(physics, speed):
+        def step(world, _):
+            world, data = control_step(physics, world, jnp.zeros(0))
+            return world, (world.qpos, wrenches(physics.model, data)[1])
+
+        world = physics.world(jnp.zeros(0), qvel=jnp.zeros(6).at[0].set(speed))
+        return jax.lax.scan(step, world, None, 25)[1]
+
+    speeds = jnp.array([0.0, 0.5, 1.0, 1.0])
+    (expected, _), (qpos, wrench) = (jax.jit(jax.vmap(lambda v, p=p: roll(p, v)))(speeds) for p in (ours, warp))
+    np.testing.assert_allclose(qpos, expected, atol=1e-4)
+    np.testing.assert_allclose(wrench[:, -1, 5], 2 * 9.81, rtol=1e-3)
+    assert qpos[2, -1, 0] > 0.2
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not INSTALLED, reason="warp-lang is not installed")
+def test_where_contacts_have_no_room_worlds_diverge():
+    model = mujoco.MjModel.from_xml_string(BALL)
+    physics = Physics(model, 0.002, ParameterSpace(), impl="warp", worlds=1)
+    nominal = jnp.asarray(model.qpos0, jnp.float32)
+
+    def height(start):
+        world = physics.world(jnp.zeros(0), nominal.at[2].set(start))
+        return control_step(physics, world, jnp.zeros(0))[0].qpos[2]
+
+    step = jax.jit(jax.vmap(height))
+    assert np.isfinite(step(jnp.linspace(0.09, 0.095, 256))).all()
+    assert np.isnan(step(jnp.linspace(0.09, 0.095, 300))).all()
