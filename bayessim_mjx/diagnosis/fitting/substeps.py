@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from bayessim_mjx.device import compiler_options
 from bayessim_mjx.diagnosis.fitting.quadratic import eliminate
-from bayessim_mjx.diagnosis.fitting.simulator import difference, integrate
 from bayessim_mjx.diagnosis.fitting.windows import Batch, Windows
 from bayessim_mjx.physics import Drive, Physics, begin, staggered, substep
+from bayessim_mjx.physics.tangent import difference, integrate
 
 Array = NDArray[np.float64]
 STARTS = 5  # Newton steps of the start states
