@@ -1,7 +1,7 @@
 """Uncertainty from few operating conditions: a jackknife over conditions, with Student's t.
 
 Windows of one condition err alike, as the model errs there alike. So conditions are what is independent, however few
-they are; of one condition alone nothing can be said. Coverage of the intervals: benchmarks/intervals.py.
+they are; of one condition alone nothing can be said. Coverage of the intervals: benchmarks/diagnosis/intervals.py.
 """
 
 from __future__ import annotations

@@ -12,11 +12,11 @@ from bayessim_mjx.diagnosis.fitting.candidates import Candidate, Coordinate
 from bayessim_mjx.diagnosis.fitting.fitter import Job
 from bayessim_mjx.diagnosis.selection.models import Model
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
-baselines = pytest.importorskip("diagnosis_baselines")
-import diagnosis_lda as lda  # noqa: E402
-import diagnosis_worker as worker  # noqa: E402
-from diagnosis_families import FAMILIES, relatives, without  # noqa: E402
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks" / "diagnosis"))
+baselines = pytest.importorskip("baselines")
+import lda  # noqa: E402
+import worker  # noqa: E402
+from families import FAMILIES, relatives, without  # noqa: E402
 
 WINDOWS, SAMPLES, WIDE = 12, 10, 1e6
 RNG = np.random.default_rng(0)

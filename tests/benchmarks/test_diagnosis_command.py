@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
-pytest.importorskip("diagnosis_cases")
-import diagnosis as command  # noqa: E402
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks" / "diagnosis"))
+pytest.importorskip("cases")
+import blind as command  # noqa: E402
 
 WORKER = """import json, sys
 from pathlib import Path

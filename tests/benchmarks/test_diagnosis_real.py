@@ -9,9 +9,9 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 DATA = ROOT.parent / "shared" / "data"
-sys.path.insert(0, str(ROOT / "benchmarks"))
+sys.path.insert(0, str(ROOT / "benchmarks" / "diagnosis"))
 pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason="no published logs in ../shared/data")
-real = pytest.importorskip("diagnosis_real")
+real = pytest.importorskip("real")
 
 from bayessim_mjx.logs import read_logs  # noqa: E402
 

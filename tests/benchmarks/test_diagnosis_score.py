@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
-score = pytest.importorskip("diagnosis_score")
-import diagnosis_systems as systems  # noqa: E402
-import diagnosis_tables as tables  # noqa: E402
-import diagnosis_weights as weights  # noqa: E402
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks" / "diagnosis"))
+score = pytest.importorskip("score")
+import systems  # noqa: E402
+import tables  # noqa: E402
+import weights  # noqa: E402
 
 ELBOW = {"name": "coulomb_friction", "where": "elbow", "parameters": {"level": 0.11}, "raw": 20.0, "left": 9.0}
 HIP = {"name": "actuator_gain", "where": "shoulder_motor", "parameters": {"gain": 1.2}, "raw": 20.0, "left": 9.0}

@@ -9,15 +9,15 @@ import pytest
 
 from bayessim_mjx import effects
 
-BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
+BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks" / "diagnosis"
 sys.path.insert(0, str(BENCHMARKS))
 sysid = pytest.importorskip("mujoco.sysid")
 if not hasattr(sysid, "optimize"):  # the package is there without what it needs
     pytest.skip('mujoco.sysid lacks its dependencies: pip install "mujoco[sysid]"', allow_module_level=True)
-import diagnosis_native as native  # noqa: E402
-import diagnosis_sysid as comparison  # noqa: E402
-import diagnosis_systems as systems  # noqa: E402
-import diagnosis_truth as truth  # noqa: E402
+import native  # noqa: E402
+import sysid as comparison  # noqa: E402
+import systems  # noqa: E402
+import truth  # noqa: E402
 
 VALUES = {
     "actuator_bias": (0.3,), "actuator_gain": (1.2,), "actuator_saturation": (2.0,), "armature": (0.02,),

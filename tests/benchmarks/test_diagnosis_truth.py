@@ -10,12 +10,12 @@ import pytest
 
 from bayessim_mjx.logs import read_logs
 
-BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
+BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks" / "diagnosis"
 sys.path.insert(0, str(BENCHMARKS))
-cases = pytest.importorskip("diagnosis_cases")
-import diagnosis_isolable as isolable  # noqa: E402
-import diagnosis_strength as strength  # noqa: E402
-import diagnosis_truth as truth  # noqa: E402
+cases = pytest.importorskip("cases")
+import isolable  # noqa: E402
+import strength  # noqa: E402
+import truth  # noqa: E402
 
 PENDULUM = cases.SYSTEMS["pendulum"]
 
@@ -52,7 +52,8 @@ def inertia(plant: truth.Plant) -> float:
 
 
 def test_nothing_of_the_library_is_used():
-    for file in BENCHMARKS.glob("diagnosis_[cist]*.py"):
+    truths = ("cases", "isolable", "score", "strength", "sysid", "systems", "tables", "truth")
+    for file in (*BENCHMARKS.glob("causes*.py"), *(BENCHMARKS / f"{name}.py" for name in truths)):
         text = file.read_text()
         assert not any(word in text for word in ("import bayessim_mjx", "from bayessim_mjx", "mjx.")), file.name
 

@@ -1,4 +1,4 @@
-"""A few of the inputs of benchmarks/fuzz.py, and of the kills of benchmarks/kills.py; both are run whole by hand."""
+"""A few of the inputs and kills of benchmarks/tests/fuzz.py and kills.py, which are run whole by hand."""
 
 import sys
 import warnings
@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks" / "tests"))
 import fuzz  # noqa: E402
 import fuzz_cases  # noqa: E402
 import kills  # noqa: E402

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
-from inference_c2st import c2st  # noqa: E402
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks" / "inference"))
+from c2st import c2st  # noqa: E402
 
 
 # the best classifier of N(0, I) and N(shift e_1, I) is right in Phi(shift / 2) of cases

@@ -130,7 +130,7 @@ def squares(rng: np.random.Generator, conditions: int) -> tuple[np.ndarray, np.n
 
 @pytest.mark.parametrize("conditions", [2, 3, 5, 8])
 def test_intervals_of_the_share_closed_cover_it(conditions):
-    """Nominal 90 %; a bootstrap of windows covers half. The figures: benchmarks/intervals.py."""
+    """Nominal 90 %; a bootstrap of windows covers half. The figures: benchmarks/diagnosis/intervals.py."""
     rng = np.random.default_rng(conditions)
     found = [heldout.Closed(*squares(rng, conditions)).interval() for _ in range(400)]
     assert 0.86 < np.mean([low <= 0.75 <= high for low, high in found]) < 0.98

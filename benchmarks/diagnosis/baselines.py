@@ -1,0 +1,166 @@
+"""Baselines of the diagnosis on the very fits that its race made: same simulator, windows, known parameters, effects.
+
+Each returns what a diagnosis says (verdict, effects with place, parameters, equivalents), so that one score is for all.
+"""
+
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from families import FAMILIES
+
+from bayessim_mjx.diagnosis.findings import Findings
+from bayessim_mjx.diagnosis.fitting.candidates import Candidate
+from bayessim_mjx.diagnosis.fitting.quadratic import TRUST, solve
+from bayessim_mjx.diagnosis.selection import heldout, uncertainty
+from bayessim_mjx.diagnosis.selection.models import Model
+from bayessim_mjx.diagnosis.selection.race import Race, fit_models, start_of
+
+TESTED = 0.3  # share of the operating conditions in the one test set of the single fold
+# what the flexible force depends on most -> the effect that a reader would name; not here: nothing that can be named
+MEANS = {
+    "position": "joint_spring", "speed": "viscous_friction", "direction": "coulomb_friction",
+    "stop": "coulomb_friction", "load": "payload", "effort": "actuator_gain", "past": "actuator_delay",
+    "pull": "armature", "since_reversal": "backlash",
+}  # fmt: skip
+Said = dict[str, Any]
+
+
+def _quiet(text: str, done: int, total: int) -> None:
+    """No progress."""
+
+
+def candidate_of(race: Race, name: str, where: str, joint_of: dict[str, str]) -> Candidate | None:
+    """The race's candidate of that name at that place; an actuator and its joint are one place."""
+    same = lambda place: joint_of.get(place, place)  # noqa: E731
+    found = [c for c in race.candidates if c.effect == name and same(c.where) == same(where)]
+    return found[0] if found else None
+
+
+def fitted(race: Race, effects: Sequence[Candidate]) -> Model:
+    """The model of these effects, fitted one after the other, as the race does it."""
+    model = race.base
+    for effect in effects:
+        (model,) = fit_models(race, [(model, start_of(race, effect))], "", _quiet)
+    return model
+
+
+def singles(race: Race) -> list[Model]:
+    """Every effect at every place that screening gave a chance, also where the race saw nothing to explain."""
+    chosen = [s for s in race.screened if s.gain > 0][: race.settings.singles]
+    return fit_models(race, [(race.base, s) for s in chosen], "", _quiet)
+
+
+def closure(found: Findings, model: Model) -> float:
+    """Share of the calibrated gap that a model closes on held-out conditions, as in diagnosis.json."""
+    fitter = found.setup.fitter
+    cut = fitter.simulator.windows
+    after = heldout.predict(fitter, model).cost(cut.steps)
+    before = found.predictions["calibrated"].cost(cut.steps)
+    return heldout.Closed(before, after, cut.group).value
+
+
+def told(found: Findings, model: Model) -> Said:
+    """A model as a verdict: each of its effects is named, with intervals."""
+    if not model.effects:
+        return {"verdict": "parameters", "effects": []}
+    sd = uncertainty.deviations(found.setup.fitter, model)
+    closed = closure(found, model)
+    effects = []
+    for effect in model.effects:
+        own = [model.job.names.index(c.name) for c in effect.coordinates]
+        numbers = {model.job.names[i].rsplit(".", 1)[1]: {"mean": model.job.values[i], "sd": sd[i]} for i in own}
+        effects.append(_named(effect.effect, effect.where, numbers, closed / len(model.effects)))
+    return {"verdict": "effects", "effects": effects}
+
+
+def _named(name: str, where: str, parameters: Said, closed: float | None, rivals: Sequence[str] = ()) -> Said:
+    others = [{"effects": [f"{rival}@{where}"]} for rival in rivals]
+    return {"name": name, "where": where, "parameters": parameters, "gap_closed": closed, "equivalent_to": others}
+
+
+def refit(found: Findings) -> Said:
+    """The known parameters alone, as mujoco.sysid: it never names an effect."""
+    return told(found, found.race.base)
+
+
+def bic(model: Model, spread: np.ndarray) -> float:
+    """N log(RSS / N) + k log N (Schwarz, 1978) in sample, every residual counted as independent."""
+    q, _ = model.job.quadratic(spread)
+    n = model.job.r.size
+    return float(n * np.log(q.c.sum() / n) + model.size * np.log(n))
+
+
+def naive_bic(found: Findings) -> Said:
+    """The lowest BIC of all models that were fitted, the known parameters alone among them."""
+    race = found.race
+    return told(found, min(race.models.values(), key=lambda m: bic(m, race.fitter.spread)))
+
+
+def fold_error(race: Race, model: Model, test: np.ndarray) -> float:
+    """Cost of the windows `test` `[W]` (bool) under the estimates from the others, by one Newton step from the fit."""
+    q, _ = model.job.quadratic(race.fitter.spread)
+    precision, pull, low, high = model.job.prior()
+    g, S = q.weighted(model.job.weight * ~test)
+    p = solve(S + np.diag(precision + TRUST * np.diag(S)), g + pull, low, high)
+    return float(np.maximum(q.at(p)[test], 0.0).sum())
+
+
+def single_fold(found: Findings) -> Said:
+    """The smallest error on one test set of operating conditions, as BAM: no threshold, no interval."""
+    race, group = found.race, found.race.fitter.simulator.windows.group
+    names = np.unique(group)
+    rng = np.random.default_rng(found.setup.seed)
+    tested = rng.choice(names, max(1, round(TESTED * len(names))), replace=False)
+    test = np.isin(group, tested)
+    return told(found, min(race.models.values(), key=lambda m: fold_error(race, m, test)))
+
+
+def importance(found: Findings) -> Said:
+    """What the flexible force depends on most, read as an effect; its family counts as equivalent."""
+    flex = found.flexible_base
+    if flex is None or not flex.condition.significant or not flex.depends_on:
+        return {"verdict": "parameters", "effects": []}
+    first = flex.depends_on[0]
+    if first["quantity"] not in MEANS:
+        return {"verdict": "unexplained", "effects": []}
+    name = MEANS[first["quantity"]]
+    rivals = sorted({e for family in FAMILIES if name in family for e in family} - {name})
+    model = found.setup.physics.mj_model
+    where = f"{first['joint']}+{model.body(int(model.joint(first['joint']).bodyid[0])).name}"  # or the body behind it
+    whole, left = flex.condition.base.sum(), flex.condition.cost.sum()
+    floor = found.race.noise * len(flex.condition.base)
+    closed = float(np.clip((whole - left) / max(whole - min(floor, left), 1e-9), 0.0, 1.0))
+    return {"verdict": "effects", "effects": [_named(name, where, {}, closed, rivals)]}
+
+
+def classifier(found: Findings) -> Said:
+    """A classifier trained on simulations of every candidate on the case's own windows."""
+    from lda import classify
+
+    race = found.race
+    effect = classify(race.fitter, race.base.job, race.candidates, np.random.default_rng(found.setup.seed))
+    return told(found, race.base if effect is None else fitted(race, [effect]))
+
+
+BASELINES: dict[str, Callable[[Findings], Said]] = {
+    "parameter refit": refit,
+    "naive BIC": naive_bic,
+    "single fold": single_fold,
+    "classifier": classifier,
+    "flexible importance": importance,
+}
+
+
+def all_baselines(found: Findings) -> dict[str, Said]:
+    """{baseline: what it says}; `seconds` beyond the fits, which all share."""
+    started = time.perf_counter()
+    singles(found.race)
+    shared = time.perf_counter() - started
+    out = {}
+    for name, baseline in BASELINES.items():
+        started = time.perf_counter()
+        said = baseline(found)
+        out[name] = said | {"seconds": time.perf_counter() - started, "shared_seconds": shared}
+    return out

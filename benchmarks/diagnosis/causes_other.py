@@ -1,0 +1,237 @@
+"""Causes at bodies, the base and the sensors."""
+
+import math
+from collections import deque
+from typing import TYPE_CHECKING
+
+import mujoco
+import numpy as np
+from causes import Cause
+
+if TYPE_CHECKING:
+    from truth import Plant
+
+
+class Payload(Cause):
+    """A lump welded to the body, somewhere along it."""
+
+    name = "payload"
+    kind = "body"
+
+    def draw(self, rng: np.random.Generator) -> None:
+        self.share, self.aside = rng.uniform(0.2, 1.0), rng.uniform(-0.03, 0.03, 3)
+        self.largest = 1.5 * self.scales.mass[self.where]
+
+    def edit(self, spec: mujoco.MjSpec) -> None:
+        body = spec.body(self.where)
+        end = np.array(body.geoms[0].fromto[3:])
+        self.position = self.share * np.nan_to_num(end) + self.aside
+        lump = body.add_body(name=f"{self.where}/payload", pos=self.position)
+        lump.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.01, 0, 0], mass=max(self.size, 1e-9), contype=0, conaffinity=0
+        )
+
+    def parameters(self) -> dict[str, float]:
+        x, y, z = self.position
+        return {"mass": self.size, "x": x, "y": y, "z": z}
+
+
+class GravityTilt(Cause):
+    """The base does not stand level: gravity leans in the direction that the joints can feel."""
+
+    name = "gravity_tilt"
+    kind = "world"
+    largest = 0.25
+
+    def draw(self, rng: np.random.Generator) -> None:
+        spread = 0.3 if len(self.scales.force) < 3 else np.pi
+        self.heading = float(rng.choice([0, np.pi])) + rng.uniform(-spread, spread)
+
+    def edit(self, spec: mujoco.MjSpec) -> None:
+        g, lean = 9.81, self.size
+        aside = g * math.sin(lean)
+        spec.option.gravity = [aside * math.cos(self.heading), aside * math.sin(self.heading), -g * math.cos(lean)]
+
+    def parameters(self) -> dict[str, float]:
+        pitch = math.asin(math.sin(self.size) * math.cos(self.heading))
+        roll = -math.asin(math.sin(self.size) * math.sin(self.heading) / math.cos(pitch))
+        return {"roll": roll, "pitch": pitch}
+
+
+class ExternalForce(Cause):
+    """A constant force on a body in world axes (a spring balancer, wind), with gusts in one case of three."""
+
+    name = "external_force"
+    kind = "body"
+    stepped = True
+
+    def draw(self, rng: np.random.Generator) -> None:
+        heading = rng.uniform(0, 2 * np.pi) if len(self.scales.force) >= 3 else float(rng.choice([0, np.pi]))
+        self.direction = np.array([math.cos(heading), math.sin(heading), rng.uniform(-0.3, 0.3)])
+        self.gusts = 0.4 if rng.uniform() < 1 / 3 else 0.0
+        self.seed = int(rng.integers(2**31))
+        self.largest = 3 * max(self.scales.force.values())
+
+    def reset(self, plant: "Plant", command: np.ndarray) -> None:
+        self.id, self.wind = plant.model.body(self.where).id, 0.0
+        self.rng = np.random.default_rng(self.seed)
+
+    def force(self, plant: "Plant") -> None:
+        if self.gusts:  # Ornstein-Uhlenbeck of 0.5 s
+            step = plant.timestep / 0.5
+            self.wind += -self.wind * step + math.sqrt(2 * step) * self.rng.normal()
+        plant.data.xfrc_applied[self.id, :3] += self.size * (1 + self.gusts * self.wind) * self.direction
+
+    def parameters(self) -> dict[str, float]:
+        return {f"force_{a}": float(self.size * x) for a, x in zip("xyz", self.direction, strict=True)}
+
+
+class BaseFlexibility(Cause):
+    """The base leans on springs about its horizontal axes, unseen by any encoder."""
+
+    name = "base_flexibility"
+    kind = "world"
+
+    def draw(self, rng: np.random.Generator) -> None:
+        self.zeta = rng.uniform(0.03, 0.1)
+        self.inertia = 0.05 * sum(self.scales.mass.values())
+        self.smallest = 1 / (self.inertia * (2 * np.pi * 30) ** 2)
+        self.largest = 1 / (self.inertia * (2 * np.pi * 2) ** 2)
+
+    def edit(self, spec: mujoco.MjSpec) -> None:
+        k = 1 / max(self.size, self.smallest)
+        base = spec.body("base")
+        for name, axis in (("base/x", [1, 0, 0]), ("base/y", [0, 1, 0])):
+            joint = base.add_joint(name=name, axis=axis, pos=[0, 0, -0.1], armature=0.1 * self.inertia)
+            joint.stiffness[0], joint.damping[0] = k, 2 * self.zeta * math.sqrt(k * self.inertia)
+
+    def parameters(self) -> dict[str, float]:
+        return {"compliance": max(self.size, self.smallest)}
+
+
+class ContactFriction(Cause):
+    """MuJoCo's sliding friction of a geom, larger or smaller by a factor."""
+
+    name = "contact_friction"
+    kind = "geom"
+
+    def draw(self, rng: np.random.Generator) -> None:
+        self.sign = float(rng.choice([-1, 1]))
+        self.largest = 4.0 if self.sign < 0 else 2.0
+
+    def edit(self, spec: mujoco.MjSpec) -> None:
+        geom = spec.geom(self.where)
+        geom.friction = geom.friction * [self.factor, 1, 1]
+
+    @property
+    def factor(self) -> float:
+        return (1 + self.size) ** self.sign
+
+    def parameters(self) -> dict[str, float]:
+        return {"scale": self.factor}
+
+
+class ContactCompliance(Cause):
+    """MuJoCo's time constant of a geom's contacts, longer by a factor."""
+
+    name = "contact_compliance"
+    kind = "geom"
+    largest = 2.0
+
+    def edit(self, spec: mujoco.MjSpec) -> None:
+        geom = spec.geom(self.where)
+        geom.solref = geom.solref * [math.exp(self.size), 1]
+
+    def parameters(self) -> dict[str, float]:
+        return {"softness": self.size}
+
+
+class JointOffset(Cause):
+    """The encoder's zero is wrong: everything that reads it, the servo included."""
+
+    name = "joint_offset"
+    largest = 0.15
+
+    def draw(self, rng: np.random.Generator) -> None:
+        self.sign = float(rng.choice([-1, 1]))
+
+    def edit(self, spec: mujoco.MjSpec) -> None:
+        if self.scales.servo:
+            actuator = next(a for a, joint in self.scales.drives.items() if joint == self.where)
+            servo = spec.actuator(actuator)
+            servo.biasprm[0] += servo.biasprm[1] * self.sign * self.size
+
+    def sense(self, plant: "Plant", q: np.ndarray, v: np.ndarray) -> None:
+        q[plant.column(self.where)] += self.sign * self.size
+
+    def parameters(self) -> dict[str, float]:
+        return {"offset": self.sign * self.size}
+
+
+class SensorDelay(Cause):
+    """Old readings: a buffer of true positions, interpolated."""
+
+    name = "sensor_delay"
+    stepped = True
+    largest = 0.06
+
+    def reset(self, plant: "Plant", command: np.ndarray) -> None:
+        lag = self.size / plant.timestep
+        self.whole, self.part = int(lag), lag - int(lag)
+        self.buffer: deque[tuple[float, float]] = deque(maxlen=self.whole + 2)
+
+    def watch(self, plant: "Plant", q: np.ndarray, v: np.ndarray) -> None:
+        i = plant.column(self.where)
+        self.buffer.append((float(q[i]), float(v[i])))
+
+    def sense(self, plant: "Plant", q: np.ndarray, v: np.ndarray) -> None:
+        i = plant.column(self.where)
+        recent = self.buffer[max(len(self.buffer) - 1 - self.whole, 0)]
+        older = self.buffer[max(len(self.buffer) - 2 - self.whole, 0)]
+        q[i], v[i] = ((1 - self.part) * a + self.part * b for a, b in zip(recent, older, strict=True))
+
+    def parameters(self) -> dict[str, float]:
+        return {"delay": self.size}
+
+
+class SensorFilter(Cause):
+    """First-order low pass of the readings, exact per sub-step."""
+
+    name = "sensor_filter"
+    stepped = True
+    largest = 0.08
+    smallest = 1e-4
+
+    def reset(self, plant: "Plant", command: np.ndarray) -> None:
+        self.state: tuple[float, float] | None = None
+        self.keep = math.exp(-plant.timestep / max(self.size, self.smallest))
+
+    def watch(self, plant: "Plant", q: np.ndarray, v: np.ndarray) -> None:
+        i = plant.column(self.where)
+        new = (float(q[i]), float(v[i]))
+        old = self.state or new
+        self.state = tuple(self.keep * a + (1 - self.keep) * b for a, b in zip(old, new, strict=True))  # type: ignore[assignment]
+
+    def sense(self, plant: "Plant", q: np.ndarray, v: np.ndarray) -> None:
+        i = plant.column(self.where)
+        assert self.state
+        q[i], v[i] = self.state
+
+    def parameters(self) -> dict[str, float]:
+        return {"time_constant": self.size}
+
+
+class SensorGain(Cause):
+    name = "sensor_gain"
+    largest = 0.2
+
+    def draw(self, rng: np.random.Generator) -> None:
+        self.sign = float(rng.choice([-1, 1]))
+
+    def sense(self, plant: "Plant", q: np.ndarray, v: np.ndarray) -> None:
+        i = plant.column(self.where)
+        q[i] *= 1 + self.sign * self.size
+        v[i] *= 1 + self.sign * self.size
+
+    def parameters(self) -> dict[str, float]:
+        return {"gain": 1 + self.sign * self.size}

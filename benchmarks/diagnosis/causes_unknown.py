@@ -1,0 +1,87 @@
+"""Causes that no library knows: the honest verdict is that something unexplained is there."""
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+from causes import Cause
+from causes_actuator import ActuatorCause
+from causes_joint import Friction
+
+if TYPE_CHECKING:
+    from truth import Plant
+
+
+class PositionHysteresis(Friction):
+    """Bristles that grip only in some angles, so that the loop's width depends on position."""
+
+    name = "unknown_position_hysteresis"
+
+    def draw(self, rng: np.random.Generator) -> None:
+        super().draw(rng)
+        low, high = self.scales.travel[self.where]
+        self.wave, self.phase = rng.uniform(2.0, 3.5) * 2 * np.pi / (high - low), rng.uniform(0, 2 * np.pi)
+
+    def level(self, plant: "Plant", w: float) -> float:
+        q = float(plant.data.qpos[plant.address(self.where)])
+        return self.size * max(math.sin(self.wave * q + self.phase), 1e-3)
+
+
+class CrossCoupling(ActuatorCause):
+    """Part of this actuator's effort arrives at another joint (a differential, a taut cable)."""
+
+    name = "unknown_cross_coupling"
+    stepped = True
+
+    def draw(self, rng: np.random.Generator) -> None:
+        self.other = str(rng.choice([j for j in self.scales.force if j != self.joint]))
+
+    def force(self, plant: "Plant") -> None:
+        effort = plant.data.qfrc_actuator[plant.dof(self.joint)]
+        plant.data.qfrc_applied[plant.dof(self.other)] += self.size * effort
+
+
+class VaryingGain(ActuatorCause):
+    """The gain wanders with time."""
+
+    name = "unknown_varying_gain"
+    largest = 0.9
+    stepped = True
+
+    def draw(self, rng: np.random.Generator) -> None:
+        self.rate, self.phase = rng.uniform(0.25, 0.6), rng.uniform(0, 2 * np.pi)
+
+    def reset(self, plant: "Plant", command: np.ndarray) -> None:
+        super().reset(plant, command)
+        self.gain = plant.model.actuator_gainprm[self.id].copy()
+        self.bias = plant.model.actuator_biasprm[self.id].copy()
+
+    def command(self, plant: "Plant", u: np.ndarray) -> None:
+        g = 1 + self.size * math.sin(2 * math.pi * self.rate * plant.data.time + self.phase)
+        plant.model.actuator_gainprm[self.id] = self.gain * g
+        plant.model.actuator_biasprm[self.id] = self.bias * g
+
+
+class Pushes(Cause):
+    """Somebody pushes at times that no log tells."""
+
+    name = "unknown_pushes"
+    kind = "body"
+    stepped = True
+
+    def draw(self, rng: np.random.Generator) -> None:
+        self.seed = int(rng.integers(2**31))
+        self.runs = 0
+        self.largest = 10 * max(self.scales.force.values())
+
+    def reset(self, plant: "Plant", command: np.ndarray) -> None:
+        self.id = plant.model.body(self.where).id
+        rng = np.random.default_rng((self.seed, round(1e6 * float(np.sum(np.abs(command))))))
+        self.starts = np.sort(rng.uniform(0.2, 3.7, 4))
+        self.forces = rng.uniform(0.5, 1.0, (4, 1)) * rng.choice([-1, 1], (4, 1)) * [1.0, 0.6, 0.2]
+
+    def force(self, plant: "Plant") -> None:
+        for start, force in zip(self.starts, self.forces, strict=True):
+            s = (plant.data.time - start) / 0.25
+            if 0 < s < 1:
+                plant.data.xfrc_applied[self.id, :3] += self.size * math.sin(math.pi * s) * force

@@ -1,0 +1,201 @@
+"""What diagnosis.json files are worth against sealed truths: rates with Wilson intervals, coverage, confusions."""
+
+import json
+import math
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+from isolable import isolable
+
+Z90, Z95 = 1.645, 1.960
+# parameters that do not mean the same in generator and library (another pivot, gusts, signed loads)
+LOOSE = ("base_flexibility", "external_force", "load_friction")
+VERDICTS = ("no_gap", "parameters", "unexplained", "insufficient_data", "no result")
+GOALS = {"weak": 3.0, "medium": 10.0, "strong": 30.0, "severe": 100.0}
+REACHED = 0.8  # of the strength that was asked for, or the case does not count
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One case: its truth, its diagnosis (None where there is none), and whether two places are the same."""
+
+    folder: Path
+    truth: dict[str, Any]
+    said: dict[str, Any] | None
+    joint_of: dict[str, str]
+    seconds: float
+    compile_seconds: float = math.nan
+    true_closure: float | None = None  # what the true effects close, fitted by the same race
+    isolable: bool | None = None  # None: not looked at
+
+    @property
+    def kind(self) -> str:
+        return self.truth.get("kind") or ("null", "single", "double")[len(self.truth["effects"])]
+
+    @property
+    def strong_enough(self) -> bool:
+        goal = REACHED * GOALS[self.truth["strength"]]
+        return all(min(e["raw"], 3 * e["left"]) >= goal for e in self.truth["effects"])
+
+    def named(self) -> list[dict[str, Any]]:
+        """Effects of the verdict; of one that names none, an empty list."""
+        return self.said["effects"] if self.said and self.said["verdict"] in ("effects", "ambiguous") else []
+
+    def same(self, name: str, where: str, effect: dict[str, Any]) -> bool:
+        """Whether a named effect at a place is the hidden one; actuators and their joints are one place."""
+        if name != effect["name"]:
+            return False
+        at = self.joint_of.get(effect["where"], effect["where"])
+        given = [self.joint_of.get(w, w) for w in where.replace("+", ",").split(",")]
+        return at == "world" or at in given or (where == "all" and len(set(self.joint_of.values())) <= 1)
+
+    def right(self, effect: dict[str, Any]) -> bool:
+        return any(self.same(f["name"], str(f["where"]), effect) for f in self.named())
+
+    def inside(self, effect: dict[str, Any]) -> bool:
+        """Named, or in the set of what cannot be told from what is named."""
+        rivals = [label for f in self.named() for entry in f["equivalent_to"] for label in labels_of(entry)]
+        return self.right(effect) or any(self.same(*label, effect) for label in rivals)
+
+
+def labels_of(entry: Any) -> list[tuple[str, str]]:
+    """ "effect@place" labels of an entry of equivalent_to, however it is written."""
+    if isinstance(entry, str):
+        name, _, where = entry.partition("@")
+        return [(name, where)]
+    if "effects" in entry:
+        return [label for e in entry["effects"] for label in labels_of(e)]
+    return [(entry["name"], str(entry.get("where", "")))]
+
+
+def read(folder: Path, results: str = "diagnosis", baseline: str | None = None) -> Outcome:
+    """One case as the diagnosis, or one of the baselines on its fits, tells it."""
+    model = mujoco.MjModel.from_xml_path(str(folder / "model.xml"))
+    joints = {model.actuator(i).name: model.joint(model.actuator_trnid[i, 0]).name for i in range(model.nu)}
+    truth, where = json.loads((folder / "truth.json").read_text()), folder / results
+    said = (
+        _json(where / "diagnosis.json") if baseline is None else (_json(where / "baselines.json") or {}).get(baseline)
+    )
+    ended, oracle, rivals = (
+        _json(where / "exit.json") or {},
+        _json(where / "oracle.json") or {},
+        _json(folder / "isolable.json"),
+    )
+    seconds = ended.get("seconds", math.nan) if baseline is None else (said or {}).get("seconds", math.nan)
+    return Outcome(
+        folder, truth, said, joints, seconds,
+        ended.get("compile_seconds", math.nan), oracle.get("closure"),
+        None if rivals is None else isolable(rivals, truth["effects"][0]["left"]),
+    )  # fmt: skip
+
+
+def _json(path: Path) -> Any:
+    return json.loads(path.read_text()) if path.exists() else None
+
+
+def wilson(hits: int, n: int, z: float = Z95) -> tuple[float, float]:
+    """Interval of a rate."""
+    if not n:
+        return 0.0, 1.0
+    p, z2 = hits / n, z * z
+    middle, half = p + z2 / (2 * n), z * math.sqrt(p * (1 - p) / n + z2 / (4 * n * n))
+    return (middle - half) / (1 + z2 / n), (middle + half) / (1 + z2 / n)
+
+
+def covered(outcome: Outcome) -> list[bool]:
+    """Of the rightly named effects: whether each parameter with the same meaning lies in its 90 % interval."""
+    found = []
+    for effect in outcome.truth["effects"]:
+        for f in outcome.named():
+            if effect["name"] in LOOSE or not outcome.same(f["name"], str(f["where"]), effect):
+                continue
+            for name, value in effect["parameters"].items():
+                given = f["parameters"].get(name)
+                if given and given["sd"]:
+                    found.append(abs(given["mean"] - value) <= Z90 * given["sd"])
+    return found
+
+
+def closure_errors(outcomes: Sequence[Outcome]) -> list[float]:
+    """|share of the gap that what is named closes - share the true effects close|; nothing named closes nothing."""
+    told = [o for o in outcomes if o.said and o.true_closure is not None]
+    return [abs(sum(f["gap_closed"] or 0.0 for f in o.named()) - o.true_closure) for o in told]
+
+
+def label(outcome: Outcome) -> str:
+    """Column of the confusion matrix: the first effect named, else the verdict."""
+    if not outcome.said:
+        return "no result"
+    return outcome.named()[0]["name"] if outcome.named() else str(outcome.said["verdict"])
+
+
+@dataclass(frozen=True)
+class Rate:
+    """What is asked, the answer of every case that counts, and the goal: at least, or (`most`) at most."""
+
+    what: str
+    answers: list[bool]
+    goal: float
+    most: bool = False
+
+    def to_dict(self) -> dict[str, Any]:
+        low, high = wilson(sum(self.answers), len(self.answers))
+        hits, n = sum(self.answers), len(self.answers)
+        return {"hits": hits, "n": n, "low": low, "high": high, "goal": self.goal, "at_most": self.most}
+
+    @property
+    def text(self) -> str:
+        """ "93 %", or nothing where nothing was asked."""
+        return f"{100 * sum(self.answers) / len(self.answers):.0f} %" if self.answers else "-"
+
+
+def rates(outcomes: Sequence[Outcome], left_out: Sequence[Outcome] = ()) -> list[Rate]:
+    """The measures over all cases whose hidden effects are as strong as asked for."""
+    of: Callable[[str], list[Outcome]] = lambda kind: [o for o in outcomes if o.kind == kind and o.strong_enough]  # noqa: E731
+    single, double, unknown = of("single"), of("double"), of("unknown")
+    null = [o for o in of("null") if o.said]  # a failure is no alarm; the footer counts them
+    right = lambda o: all(o.right(e) for e in o.truth["effects"])  # noqa: E731
+    inside = lambda o: all(o.inside(e) for e in o.truth["effects"])  # noqa: E731
+    left_out = [o for o in left_out if o.strong_enough]
+    errors = closure_errors(single)
+    return [
+        Rate("single, isolable: effect and place named", [right(o) for o in single if o.isolable], 0.95),
+        Rate("single, all: effect and place named", [right(o) for o in single], 0.95),
+        Rate("single: effect named, any place", [_names(o) for o in single], 0.95),
+        Rate("single: truth in the equivalence set", [inside(o) for o in single], 0.98),
+        Rate("single: nothing else named", [right(o) and len(o.named()) == 1 for o in single], 0.9),
+        Rate("double: both named", [right(o) for o in double], 0.85),
+        Rate("double: both in the equivalence set", [inside(o) for o in double], 0.85),
+        Rate("nothing wrong: false alarm", [label(o) not in ("no_gap", "parameters") for o in null], 0.02, most=True),
+        Rate("unknown cause: unexplained", [_unexplained(o) for o in unknown], 0.9),
+        Rate("family left out: unexplained", [_unexplained(o) for o in left_out], 0.9),
+        Rate("closure within 5 points of the truth's", [e <= 0.05 for e in errors], 0.9),
+        Rate("90 % intervals that cover", [c for o in (*single, *double) for c in covered(o)], 0.9),
+    ]
+
+
+def _unexplained(outcome: Outcome) -> bool:
+    return bool(outcome.said) and outcome.said["verdict"] == "unexplained"
+
+
+def _names(outcome: Outcome) -> bool:
+    return outcome.truth["effects"][0]["name"] in {f["name"] for f in outcome.named()}
+
+
+def confusion(outcomes: Sequence[Outcome]) -> tuple[list[str], list[str], np.ndarray]:
+    """(rows, columns, counts): hidden (singles, nothing, an unknown cause) against named first, or the verdict."""
+    pairs: Counter[tuple[str, str]] = Counter()
+    for o in outcomes:
+        if len(o.truth["effects"]) <= 1 and o.strong_enough:
+            pairs[next((e["name"] for e in o.truth["effects"]), "nothing"), label(o)] += 1
+    effects = sorted({h for h, _ in pairs} | {s for _, s in pairs} - set(VERDICTS))
+    rows = [e for e in effects if any(h == e for h, _ in pairs)]
+    columns = [e for e in effects if any(s == e for _, s in pairs)] + [
+        v for v in VERDICTS if any(s == v for _, s in pairs)
+    ]
+    return rows, columns, np.array([[pairs[r, c] for c in columns] for r in rows], int).reshape(len(rows), len(columns))
