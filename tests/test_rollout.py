@@ -13,7 +13,9 @@ import probes  # noqa: E402
 
 from bayessim_mjx.registry import make  # noqa: E402
 from bayessim_mjx.rl import networks, normalise  # noqa: E402
-from bayessim_mjx.rollout import _rollout, _stride, collect, replay, rollout  # noqa: E402
+from bayessim_mjx.rollout import collect, replay, rollout  # noqa: E402
+from bayessim_mjx.rollout.collection import _stride  # noqa: E402
+from bayessim_mjx.rollout.episodes import _rollout  # noqa: E402
 
 
 def key(seed):

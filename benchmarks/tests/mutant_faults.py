@@ -1,13 +1,14 @@
-"""One-line faults outside PPO, in ten rooms from physics to diagnosis.
+"""One-line faults outside PPO, in eleven rooms from physics to environment.
 
 Rows of `mutants.py`, which puts them into the code one at a time: (fault, file, old, new, tests). `old` stands in the
 file exactly once; `tests` are arguments of pytest for tests of the default suite that can see the fault.
 """
 
 P = "bayessim_mjx"
-TIMESTEP, PHYSICS, ROLLOUT, RUNS, LOOP = (
-    f"{P}/{name}.py" for name in ("physics/timestep", "physics/step", "rollout", "runs/folder", "loop/outer_loop")
+TIMESTEP, PHYSICS, RUNS, LOOP, TASK = (
+    f"{P}/{name}.py" for name in ("physics/timestep", "physics/step", "runs/folder", "loop/outer_loop", "env/task")
 )
+EPISODES, COLLECTION = f"{P}/rollout/episodes.py", f"{P}/rollout/collection.py"
 EFFECTS, DISTRIBUTIONS, LOGS = f"{P}/effects", f"{P}/distributions", f"{P}/logs"
 FORCES = "tests/effects/test_actuator_forces.py"
 SENSORS = "tests/effects/test_sensor_effects.py"
@@ -100,7 +101,7 @@ FAULTS: tuple[tuple[str, str, str, str, tuple[str, ...]], ...] = (
     ),
     # rollout
     (
-        "a world goes on after its end", ROLLOUT, "alive & (terminated + truncated == 0), action)", "alive, action)",
+        "a world goes on after its end", EPISODES, "alive & (terminated + truncated == 0), action)", "alive, action)",
         ("tests/test_rollout.py", "-k", "stands_still"),
     ),
     (
@@ -108,7 +109,7 @@ FAULTS: tuple[tuple[str, str, str, str, tuple[str, ...]], ...] = (
         ("tests/physics/test_physics.py", RECORDED, "-k", "before_it or past_commands"),
     ),
     (
-        "a termination on the last step counts as a truncation too", ROLLOUT,
+        "a termination on the last step counts as a truncation too", COLLECTION,
         'truncated = after.info["truncated"] * (1 - terminated)', 'truncated = after.info["truncated"]',
         ("tests/test_rollout.py", "-k", "termination"),
     ),
@@ -168,5 +169,10 @@ FAULTS: tuple[tuple[str, str, str, str, tuple[str, ...]], ...] = (
         "a law gives way to a special case that closes far less", f"{P}/diagnosis/selection/search.py",
         "race.closure(model) - race.closure(m) < race.settings.tie / 2]", "race.closure(model) - race.closure(m) < 2]",
         (SEARCH, "-k", "gives_way"),
+    ),
+    # environment
+    (
+        "a diverged world goes on from where it diverged", TASK, "lambda new, old: jnp.where(sound, new, old)",
+        "lambda new, old: new", ("tests/test_env.py", "-k", "held_in_its_last_sound_state"),
     ),
 )  # fmt: skip
