@@ -13,6 +13,7 @@ import mujoco
 import numpy as np
 
 from bayessim_mjx.env import Observations, Task
+from bayessim_mjx.frames import rotation, wrap
 from bayessim_mjx.mirrors import Mirror
 from bayessim_mjx.physics import World, mjx
 from bayessim_mjx.physics.warp import wrenches
@@ -52,10 +53,6 @@ def _mirror() -> Mirror:
     )
 
 
-def _range(low: float, high: float, operation: str) -> dict:
-    return {"range": [low, high], "operation": operation, "distribution": "uniform"}
-
-
 class Ant(Task):
     """60 observations (see NAMES; scales: joint velocity 0.2, foot forces 0.1); actions: joint torque / 15 N m."""
 
@@ -66,17 +63,6 @@ class Ant(Task):
     # explodes (one solver iteration), and a single reward of 1e11 ruins the critic.
     speed_limit: ClassVar[float] = 200.0
     observation_names: ClassVar[tuple[str, ...]] = NAMES
-    real_parameters: ClassVar[tuple[float, ...]] = (0.9, 1.0, 5.0, 3.4, 0.5, 3.7, 4.8, 4.2, 2.3, *(0.1, 15.0) * 4)
-    randomization: ClassVar[dict] = {
-        "randomization_params": {
-            "actor_params": {
-                "ant": {
-                    "rigid_body_properties": {"mass": _range(0.01, 5.0, "scaling")},
-                    "dof_properties": {"stiffness": _range(0.01, 20.0, "additive")},
-                }
-            }
-        }
-    }
     mirror = (_mirror(),)
 
     def spec(self) -> mujoco.MjSpec:
@@ -143,23 +129,6 @@ class Ant(Task):
         torque = torque + jnp.cross(arm, force)
         wrench = jnp.stack([force, torque], axis=1)
         return jnp.einsum("fji,fkj->fki", data.xmat[feet], wrench).ravel()
-
-
-def rotation(quat: jax.Array) -> jax.Array:
-    """Rotation matrix `[3, 3]` of a unit quaternion (w, x, y, z): body to world."""
-    w, x, y, z = quat
-    return jnp.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-
-
-def wrap(angle: jax.Array) -> jax.Array:
-    """The angle in (-pi, pi]."""
-    return jnp.pi - jnp.mod(jnp.pi - angle, 2 * jnp.pi)
 
 
 def _approach(before: jax.Array, after: jax.Array) -> jax.Array:

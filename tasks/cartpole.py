@@ -57,10 +57,6 @@ XML = """
 MAX_FORCE = 400.0  # N
 
 
-def _range(low: float, high: float, operation: str) -> dict:
-    return {"range": [low, high], "operation": operation, "distribution": "uniform"}
-
-
 class Cartpole(Task):
     """Observation: cart position and velocity, pole angle (0 upright) and velocity; action: force / 400 N."""
 
@@ -69,24 +65,6 @@ class Cartpole(Task):
     diverged_reward: ClassVar[float] = -2.0
     options: ClassVar[dict] = {"resetDist": 3.0}
     observation_names: ClassVar[tuple[str, ...]] = ("cart_position", "cart_velocity", "pole_angle", "pole_velocity")
-    real_parameters: ClassVar[tuple[float, ...]] = (1.0, 0.7, 8.0, 2.0, 0.9, 6.0, 0.8, 0.5, 0.7, 2.0, 0.4, 60.0, 20.0)
-    randomization: ClassVar[dict] = {
-        "randomization_params": {
-            "actor_params": {
-                "cartpole": {
-                    "rigid_body_properties": {"mass": _range(0.01, 20.0, "scaling")},
-                    "rigid_shape_properties": {
-                        "friction": _range(0.01, 10.0, "scaling"),
-                        "restitution": _range(0.01, 1.0, "additive"),
-                    },
-                    "dof_properties": {
-                        "stiffness": _range(0.01, 2.0, "additive"),
-                        "damping": _range(0.01, 100.0, "additive"),
-                    },
-                }
-            }
-        }
-    }
     mirror = (
         Mirror(
             joints={"slider_to_cart": "-slider_to_cart", "cart_to_pole": "-cart_to_pole"},

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import mujoco
 
 from bayessim_mjx.env import Observations, Task
+from bayessim_mjx.frames import wrap
 from bayessim_mjx.mirrors import Mirror
 from bayessim_mjx.physics import World, mjx
 
@@ -43,10 +44,6 @@ MAX_TORQUE = 2.0  # N m
 MAX_SPEED = 8.0  # rad/s
 
 
-def _scaled(low: float, high: float) -> dict:
-    return {"range": [low, high], "operation": "scaling", "distribution": "uniform"}
-
-
 class Pendulum(Task):
     """Observation: cos, sin, angular velocity; action: torque / 2 N m; the angle is 0 upright."""
 
@@ -55,17 +52,6 @@ class Pendulum(Task):
     max_qvel: ClassVar[float | None] = MAX_SPEED
     diverged_reward: ClassVar[float] = -16.3
     observation_names: ClassVar[tuple[str, ...]] = ("cos_theta", "sin_theta", "theta_dot")
-    real_parameters: ClassVar[tuple[float, ...]] = (1.0, 0.5)
-    randomization: ClassVar[dict] = {
-        "randomization_params": {
-            "actor_params": {
-                "pendulum": {
-                    "rigid_body_properties": {"mass": _scaled(0.01, 2.0)},
-                    "rigid_shape_properties": {"length": _scaled(0.01, 2.0)},
-                }
-            }
-        }
-    }
     mirror = (Mirror(joints={"hinge": "-hinge"}, observations={"sin_theta": "-sin_theta", "theta_dot": "-theta_dot"}),)
 
     def spec(self) -> mujoco.MjSpec:
@@ -89,8 +75,3 @@ class Pendulum(Task):
         angle, speed, torque = wrap(before.qpos[0]), before.qvel[0], self.command(action)[0]
         reward = -(angle**2 + 0.1 * speed**2 + 0.001 * torque**2)
         return reward, jnp.zeros((), bool), {"upright": jnp.cos(angle)}
-
-
-def wrap(angle: jax.Array) -> jax.Array:
-    """The angle in (-pi, pi]."""
-    return jnp.pi - jnp.mod(jnp.pi - angle, 2 * jnp.pi)

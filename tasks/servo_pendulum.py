@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import mujoco
 
 from bayessim_mjx.env import Observations, Task
+from bayessim_mjx.frames import wrap
 from bayessim_mjx.mirrors import Mirror
 from bayessim_mjx.physics import World, mjx
 
@@ -55,10 +56,6 @@ XML = f"""
 """
 
 
-def _absolute(low: float, high: float, distribution: str = "uniform", **more: Any) -> dict[str, Any]:
-    return {"range": [low, high], "operation": "absolute", "distribution": distribution, **more}
-
-
 class ServoPendulum(Task):
     """Observation: cos, sin of the angle, speed / 10, cos and sin of (target - angle); action: voltage / 7.4 V.
 
@@ -75,23 +72,6 @@ class ServoPendulum(Task):
     options: ClassVar[dict[str, Any]] = {"target": 1.2}
     diverged_reward: ClassVar[float] = 0.0
     observation_names: ClassVar[tuple[str, ...]] = ("cos_q", "sin_q", "speed", "cos_error", "sin_error")
-    # the surrogate: BAM's own fit of this servo (their model M1, file params/xl330_HEAD_m1.json): kt 0.387, R 4.02
-    real_parameters: ClassVar[tuple[float, ...]] = (0.49, 0.0409, 0.0128, 0.00181, 0.0963)
-    randomization: ClassVar[dict] = {
-        "randomization_params": {
-            "actor_params": {
-                "load": {
-                    "rigid_body_properties": {"mass": _absolute(0.4, 0.6, "gaussian", mean=0.49, sd=0.02)},
-                    "dof_properties": {
-                        "damping": _absolute(0.003, 0.12, "loguniform"),
-                        "friction": _absolute(0.003, 0.25, "loguniform"),
-                        "armature": _absolute(0.0004, 0.01, "loguniform"),
-                    },
-                    "actuator_properties": {"gain": _absolute(0.04, 0.16, unit="N m/V")},
-                }
-            }
-        }
-    }
     mirror = (
         Mirror(
             joints={"servo": "-servo"},
@@ -124,12 +104,7 @@ class ServoPendulum(Task):
         self, before: World, after: World, data: mjx.Data, action: jax.Array
     ) -> tuple[jax.Array, jax.Array, dict[str, jax.Array]]:
         error, speed = after.task["target"] - after.qpos[0], after.qvel[0]
-        near = jnp.exp(-((_wrap(error) / 0.1) ** 2))
+        near = jnp.exp(-((wrap(error) / 0.1) ** 2))
         # 0.25 (1 + cos e) + 0.5 exp(-(e/0.1)^2) - 0.02 (w/10)^2 - 0.01 a^2
         reward = 0.25 * (1.0 + jnp.cos(error)) + 0.5 * near - 0.02 * (speed / 10.0) ** 2 - 0.01 * action[0] ** 2
-        return reward, jnp.zeros((), bool), {"error": jnp.abs(_wrap(error)), "near": near}
-
-
-def _wrap(angle: jax.Array) -> jax.Array:
-    """The angle in [-pi, pi)."""
-    return jnp.mod(angle + jnp.pi, 2.0 * jnp.pi) - jnp.pi
+        return reward, jnp.zeros((), bool), {"error": jnp.abs(wrap(error)), "near": near}

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 
+from bayessim_mjx.config.of_file import OfFile
 from bayessim_mjx.config.settings import IMPLEMENTATIONS
 from bayessim_mjx.effects.effect import Effect
 from bayessim_mjx.effects.support.reading import stack
@@ -32,8 +33,9 @@ class Task(Env):
     Args:
         config: settings of `env:` (a mapping, or `config.EnvConfig`): `episodeLength`, `variant` and the task's own
             keys, which are listed with their defaults in `options`.
-        randomization: the BayesSimIG `task:` section (key `randomization_params`); None or empty: the task's default.
-            `randomize: False` means the model's own physics: no parameters, and no effects from the section.
+        randomization: the BayesSimIG `task:` section (key `randomization_params`); None or empty: that of the task's
+            file in cfg/, if it has one. `randomize: False` means the model's own physics: no parameters, and no effects
+            from the section.
         effects: unmodelled effects to simulate, whose ranges the section's `effects` may change; effects that only the
             section names come after them. theta holds the model's parameters, then those of the effects.
         calibrated: parameters of the model as identified by a diagnosis; see `effects.storage.corrected`.
@@ -48,8 +50,8 @@ class Task(Env):
     control_dt: ClassVar[float]
     default_episode_length: ClassVar[int]
     options: ClassVar[dict[str, Any]] = {}
-    randomization: ClassVar[dict[str, Any]]
-    real_parameters: ClassVar[Sequence[float]]
+    randomization: ClassVar[Any] = OfFile("task")
+    real_parameters: ClassVar[Any] = OfFile("env", "realParams", "means", 0)
     observation_names: ClassVar[tuple[str, ...]]
     mirror: ClassVar[tuple[Mirror, ...]] = ()  # symmetries of the robot by name; resolved in `mirrors`
     observation_clip: ClassVar[dict[str, float | None]] = {"isaacgymenvs": None, "bayessim2021": 100.0}
@@ -68,7 +70,7 @@ class Task(Env):
         self.settings = self._read(config if config is not None else {})
         self.variant: str = self.settings["variant"]
         self.episode_length = int(self.settings["episodeLength"])
-        randomization = randomization or self.randomization
+        randomization = randomization or getattr(self, "randomization", {})
         section = {} if randomization.get("randomize") is False else randomization.get("randomization_params", {})
         spec, mj_model, space = corrected(self.spec(), section, calibrated)
         if calibrated:
@@ -112,9 +114,9 @@ class Task(Env):
     def initial(self, key: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Random (qpos `[nq]`, qvel `[nv]`) at the start of an episode."""
 
-    @abc.abstractmethod
     def command(self, action: jax.Array) -> jax.Array:
         """Actuator commands `[nu]` in physical units for an action in [-1, 1]."""
+        raise NotImplementedError(f"{self.name} gives its commands in `actuate`")
 
     @abc.abstractmethod
     def observe(self, world: World, data: mjx.Data, action: jax.Array) -> Observations:
@@ -129,6 +131,10 @@ class Task(Env):
         self, before: World, after: World, data: mjx.Data, action: jax.Array
     ) -> tuple[jax.Array, jax.Array, dict[str, jax.Array]]:
         """(reward, terminated (bool), metrics) of one step, from the true states."""
+
+    def actuate(self, world: World, action: jax.Array) -> tuple[World, jax.Array]:
+        """(world, actuator commands `[nu]`); instead of `command` where commands have a memory, in `world.task`."""
+        return world, self.command(action)
 
     def start(self, key: jax.Array, world: World) -> dict[str, Any]:
         """Numbers the task carries along in `world.task` (commands, goals, a key), drawn at reset."""
@@ -194,7 +200,8 @@ class Task(Env):
             drawn, action = self.nuisance.act(state.info["nuisance"], action)
             drawn = self.nuisance.after_step(drawn)
         action = jnp.clip(action, -1.0, 1.0)
-        after, data = control_step(self.physics, before, self.command(action))
+        before, command = self.actuate(before, action)
+        after, data = control_step(self.physics, before, command)
         after, sound = _hold_if_diverged(before, after, self.speed_limit)
         steps = before.task["steps"] + 1
         after = after.replace(task=after.task | {"steps": steps})
