@@ -1,7 +1,8 @@
-"""README and docs name only flags, settings, files and links that exist."""
+"""README, docs and benchmarks name only links, anchors, commands, flags, settings and files that exist."""
 
 import contextlib
 import dataclasses
+import functools
 import importlib
 import io
 import re
@@ -12,22 +13,34 @@ import pytest
 from bayessim_mjx.config import settings
 
 ROOT = Path(__file__).parents[1]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 COMMANDS = ("main", "train", "play", "calibrate", "diagnose", "gap_loop")
-OTHERS = {"--logdir", "--samples_per_plugin"}  # tensorboard's
-PYTHON = {"env.py", "env.reset", "env.step", "env.dt", "env.mj_model", "ppo.train"}  # in Python, not settings
+FOLDERS = ("docs", "benchmarks")
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(p for f in FOLDERS for p in sorted((ROOT / f).glob("*.md")))]
+PYTHON = {"env.reset", "env.step", "env.dt", "env.mj_model", "ppo.train"}  # in Python, not settings
+COMMAND = re.compile(
+    r"(?:python -m bayessim_mjx\.(\w+)|(bayessim-mjx)|python ((?:benchmarks|examples|docs)/[\w/]+\.py))([^`\n#&]*)"
+)
+PROSE = re.compile(r"`(main|train|play|calibrate|diagnose|gap_loop) (--[^`\n]*)`")
 
 
-@pytest.fixture(scope="module")
-def flags():
+@functools.cache
+def flags_of(command: str) -> set[str]:
+    """Flags of a command of the library, as its --help has them, or of a script, as its source has them."""
+    if command.endswith(".py"):
+        return set(re.findall(r'"(--[a-z][\w-]*)"', (ROOT / command).read_text())) | {"--help"}
     text = io.StringIO()
-    for name in COMMANDS:
-        with contextlib.redirect_stdout(text):
-            importlib.import_module(f"bayessim_mjx.{name}").main(["--help"])
-    return set(re.findall(r"--[a-z_]+", text.getvalue())) | OTHERS
+    with contextlib.redirect_stdout(text):
+        importlib.import_module(f"bayessim_mjx.{command}").main(["--help"])
+    return set(re.findall(r"--[a-z][a-z_-]*", text.getvalue()))
 
 
-def keys():
+def commands(text: str) -> list[tuple[str, str]]:
+    """(command or script, its arguments) of all that a page tells to type."""
+    found = [(module or script or "main", words) for module, plain, script, words in COMMAND.findall(text)]
+    return found + PROSE.findall(text)
+
+
+def keys() -> set[str]:
     """`section.key` of every setting; sections within sections by their prefix."""
     found = set()
     for thing in vars(settings).values():
@@ -36,12 +49,67 @@ def keys():
     return found | {"env.maxEpisodeLength"}  # BayesSimIG's other name of env.episodeLength
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
-def test_what_a_page_names_exists(page, flags):
+def anchors(page: Path) -> set[str]:
+    """Anchors of a page's headings, as GitHub makes them."""
+    text = re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL)
+    titles = [re.sub(r"[`*]", "", title).strip().lower() for title in re.findall(r"^#+ (.*)$", text, re.MULTILINE)]
+    return {re.sub(r"[^\w\- ]", "", title).replace(" ", "-") for title in titles}
+
+
+def broken(page: Path) -> list[str]:
+    """Links of a page to files or anchors that are not there."""
+    found = []
+    for link in re.findall(r"\]\(([^)\s]+)", page.read_text()):
+        if link.startswith("http"):
+            continue
+        name, _, anchor = link.partition("#")
+        target = (page.parent / name).resolve() if name else page
+        if not target.exists() or (anchor and anchor not in anchors(target)):
+            found.append(link)
+    return found
+
+
+def by_name(page: Path) -> str:
+    return str(page.relative_to(ROOT))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=by_name)
+def test_links_and_anchors_resolve(page):
+    assert broken(page) == []
+    files = re.findall(r"`((?:examples|benchmarks|tests|docs|cfg|tasks)/[\w/.]+\.(?:py|md|yaml))`", page.read_text())
+    assert [name for name in files if not (ROOT / name).exists()] == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=by_name)
+def test_commands_and_their_flags_exist(page):
+    for command, words in commands(page.read_text()):
+        assert command in COMMANDS or (ROOT / command).is_file(), command
+        assert set(re.findall(r"(?<![\w-])--[a-z][a-z_-]*", words.split(" -- ")[0])) <= flags_of(command), (
+            command,
+            words,
+        )
+
+
+@pytest.mark.parametrize("page", PAGES, ids=by_name)
+def test_settings_and_flags_in_prose_exist(page):
     text, known = page.read_text(), keys()
-    assert set(re.findall(r"--[a-z_]+", text)) <= flags
-    named = set(re.findall(r"\b((?:bayessim|ppo|monitor|env|real)\.[a-zA-Z_]+)\b", text)) - PYTHON
+    named = set(re.findall(r"\b(?<!/)((?:bayessim|ppo|monitor|env|real)\.(?!py\b|json\b)[a-zA-Z_]+)\b", text)) - PYTHON
     assert {name for name in named if name not in known} == set()
-    links = [link for link in re.findall(r"\]\(([^)#]+)", text) if not link.startswith("http")]
-    files = re.findall(r"`((?:examples|benchmarks|tests|docs|cfg)/[\w/.]+\.(?:py|md|yaml))`", text)
-    assert [x for x in links if not (page.parent / x).exists()] + [x for x in files if not (ROOT / x).exists()] == []
+    somewhere = set().union(*(flags_of(c) for c in COMMANDS), *(flags_of(c) for c, _ in commands(text)))
+    assert set(re.findall(r"`(--[a-z][a-z_-]*)", text)) <= somewhere | scripts_flags(page)
+
+
+def scripts_flags(page: Path) -> set[str]:
+    """A page among the benchmarks may name flags of their scripts without the script beside them."""
+    scripts = (ROOT / "benchmarks").glob("*/*.py") if page.parent.name == "benchmarks" else ()
+    return set().union(*(flags_of(str(path.relative_to(ROOT))) for path in scripts))
+
+
+def test_a_missing_file_an_absent_anchor_and_an_unknown_flag_are_noticed(tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text(
+        "# A `b` c?\n[x](#a-b-c) [y](#not) [z](none.md) `train --tasks Ant`\npython -m bayessim_mjx.main --hidden 3\n"
+    )
+    assert broken(page) == ["#not", "none.md"]
+    assert commands(page.read_text()) == [("main", " --hidden 3"), ("train", "--tasks Ant")]
+    assert "--tasks" not in flags_of("train") and "--task" in flags_of("train")

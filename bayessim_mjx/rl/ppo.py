@@ -306,7 +306,7 @@ def _statistics(config: PPOConfig, state: TrainState, data: dict) -> dict[str, n
     """Those of the observations up to these: learnt with at once, as the policy will act with them.
 
     A policy that learns with the statistics that it was collected with acts with others than it learnt with, which
-    costs most where they are still young (CartpoleBalance of Playground: twice the samples; benchmarks/README.md).
+    costs most where they are still young (CartpoleBalance of Playground: twice the samples; benchmarks/history.md).
     """
     if not config.normalize_observations:
         return state.normalizer

@@ -1,7 +1,7 @@
 """Advantages over segments of a few steps that every minibatch estimates anew, with the critic of that moment.
 
 As Brax does. The critic that collected is a whole update old at the last minibatch; and a short segment rests on the
-critic after a few steps, where rewards summed up further vary more. Measured on ant: benchmarks/README.md.
+critic after a few steps, where rewards summed up further vary more. Measured on ant: benchmarks/history.md.
 """
 
 import dataclasses
