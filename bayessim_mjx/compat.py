@@ -1,5 +1,7 @@
-"""What a library that we build on still asks of jax, where jax no longer has it."""
+"""Libraries that we build on, where they say or ask what they should not."""
 
+import contextlib
+import io
 from collections.abc import Sequence
 from typing import Any
 
@@ -7,6 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+with contextlib.redirect_stdout(io.StringIO()):  # MJX announces on import that the optional warp is absent
+    from mujoco import mjx
+
+__all__ = ["mjx", "put_replicated", "supply"]
 
 
 def put_replicated(tree: Any, devices: Sequence[jax.Device]) -> Any:

@@ -9,7 +9,8 @@ import mujoco
 from bayessim_mjx.effects.actuator_gain import addressed, nonlinear
 from bayessim_mjx.effects.actuator_saturation import limits
 from bayessim_mjx.effects.effect import Effect, Quantity
-from bayessim_mjx.effects.support.site import Site, SubStep
+from bayessim_mjx.effects.support.site import Site
+from bayessim_mjx.effects.support.substep import SubStep
 
 
 @dataclasses.dataclass(frozen=True)

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import mujoco
 
 from bayessim_mjx.effects.effect import Effect, Quantity
-from bayessim_mjx.effects.support.site import Site, SubStep, ranges
+from bayessim_mjx.effects.support.site import Site, ranges
+from bayessim_mjx.effects.support.substep import SubStep
 from bayessim_mjx.errors import UserError
 
 _FIXED = int(mujoco.mjtGain.mjGAIN_FIXED)

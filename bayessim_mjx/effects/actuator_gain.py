@@ -7,7 +7,8 @@ import jax
 import mujoco
 
 from bayessim_mjx.effects.effect import Effect, Quantity
-from bayessim_mjx.effects.support.site import Site, SubStep
+from bayessim_mjx.effects.support.site import Site
+from bayessim_mjx.effects.support.substep import SubStep
 
 GAINS = (mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtGain.mjGAIN_AFFINE)  # linear in their parameters
 BIASES = (mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtBias.mjBIAS_AFFINE)

@@ -10,7 +10,8 @@ import numpy as np
 
 from bayessim_mjx.effects.actuator_gain import addressed
 from bayessim_mjx.effects.effect import Effect, Quantity
-from bayessim_mjx.effects.support.site import Site, SubStep
+from bayessim_mjx.effects.support.site import Site
+from bayessim_mjx.effects.support.substep import SubStep
 
 
 def limits(actuator: Any) -> np.ndarray | None:

@@ -7,7 +7,8 @@ import jax
 
 from bayessim_mjx.effects.effect import Effect, Quantity
 from bayessim_mjx.effects.support.friction import resist
-from bayessim_mjx.effects.support.site import Site, SubStep
+from bayessim_mjx.effects.support.site import Site
+from bayessim_mjx.effects.support.substep import SubStep
 
 if TYPE_CHECKING:
     import mujoco

@@ -11,7 +11,9 @@ import numpy as np
 from bayessim_mjx.effects.effect import Effect, Quantity
 from bayessim_mjx.effects.gravity_tilt import tilted
 from bayessim_mjx.effects.support.bodies import moved
-from bayessim_mjx.effects.support.site import Motion, Site, SubStep, find
+from bayessim_mjx.effects.support.motion import Motion
+from bayessim_mjx.effects.support.site import Site, find
+from bayessim_mjx.effects.support.substep import SubStep
 from bayessim_mjx.errors import UserError
 
 STOP = 0.3  # rad: a base that topples leans against something

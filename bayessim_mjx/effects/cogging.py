@@ -8,7 +8,8 @@ import jax
 import jax.numpy as jnp
 
 from bayessim_mjx.effects.effect import Effect, Quantity
-from bayessim_mjx.effects.support.site import Site, SubStep
+from bayessim_mjx.effects.support.site import Site
+from bayessim_mjx.effects.support.substep import SubStep
 from bayessim_mjx.linalg import product
 
 # With fewer periods in the range of motion (or per turn) it is any smooth force: of gravity, a spring, a rough place.

@@ -9,7 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from bayessim_mjx.effects.support.site import Motion, Site, SubStep, find, under_tendon_limit
+from bayessim_mjx.effects.support.motion import Motion
+from bayessim_mjx.effects.support.site import Site, find, under_tendon_limit
+from bayessim_mjx.effects.support.substep import SubStep
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 
 from bayessim_mjx.effects.effect import Effect, Quantity
 from bayessim_mjx.effects.support.bodies import project, velocity
-from bayessim_mjx.effects.support.site import Site, SubStep
+from bayessim_mjx.effects.support.site import Site
+from bayessim_mjx.effects.support.substep import SubStep
 
 if TYPE_CHECKING:
     import mujoco

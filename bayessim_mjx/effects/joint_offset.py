@@ -9,7 +9,8 @@ import mujoco
 import numpy as np
 
 from bayessim_mjx.effects.effect import Effect, Measurement, Quantity
-from bayessim_mjx.effects.support.site import Motion, Site
+from bayessim_mjx.effects.support.motion import Motion
+from bayessim_mjx.effects.support.site import Site
 
 if TYPE_CHECKING:
     from mujoco import mjx

@@ -9,7 +9,8 @@ import numpy as np
 
 from bayessim_mjx.effects.effect import Effect, Quantity
 from bayessim_mjx.effects.support.friction import add, native
-from bayessim_mjx.effects.support.site import Site, SubStep
+from bayessim_mjx.effects.support.site import Site
+from bayessim_mjx.effects.support.substep import SubStep
 
 _RK4, _HINGE = int(mujoco.mjtIntegrator.mjINT_RK4), int(mujoco.mjtJoint.mjJNT_HINGE)
 

@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 
 from bayessim_mjx.effects.effect import Effect, Measurement, Quantity
-from bayessim_mjx.effects.support.site import Motion, Site
+from bayessim_mjx.effects.support.motion import Motion
+from bayessim_mjx.effects.support.site import Site
 from bayessim_mjx.errors import UserError
 
 if TYPE_CHECKING:

@@ -9,7 +9,8 @@ import mujoco
 
 from bayessim_mjx.effects.effect import Effect, Quantity
 from bayessim_mjx.effects.support import friction
-from bayessim_mjx.effects.support.site import Site, SubStep
+from bayessim_mjx.effects.support.site import Site
+from bayessim_mjx.effects.support.substep import SubStep
 
 if TYPE_CHECKING:
     from mujoco import mjx

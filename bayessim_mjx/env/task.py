@@ -38,7 +38,7 @@ class Task(Env):
             from the section.
         effects: unmodelled effects to simulate, whose ranges the section's `effects` may change; effects that only the
             section names come after them. theta holds the model's parameters, then those of the effects.
-        calibrated: parameters of the model as identified by a diagnosis; see `effects.storage.corrected`.
+        calibrated: parameters of the model as identified by a diagnosis; see `effects.support.storage.corrected`.
 
     A world that is no longer finite, or where a velocity reaches `speed_limit`, counts as diverged: it stays in its
     last sound state, and the episode terminates with the reward `diverged_reward`. Observations are always finite.

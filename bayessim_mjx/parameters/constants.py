@@ -3,8 +3,6 @@
 The equations are those of `mj_setConst` (MuJoCo, engine_setconst.c), at qpos0.
 """
 
-import contextlib
-import io
 from collections.abc import Collection
 
 import jax
@@ -12,9 +10,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-with contextlib.redirect_stdout(io.StringIO()):  # MJX announces on import that the optional warp is absent
-    from mujoco import mjx
-
+from bayessim_mjx.compat import mjx
 from bayessim_mjx.linalg import inverse_lower
 from bayessim_mjx.parameters import geometry
 

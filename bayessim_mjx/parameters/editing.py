@@ -5,8 +5,8 @@ recompiling the edited spec an independent check of `write`. What the compiler f
 automatic `springlength`) keeps its nominal number.
 """
 
-from collections.abc import Callable, Iterable
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -17,23 +17,20 @@ from bayessim_mjx.parameters.attributes import FIELDS, Field
 from bayessim_mjx.parameters.parameter import Parameter
 from bayessim_mjx.parameters.writing import MIN_RATIO
 
-if TYPE_CHECKING:
-    from bayessim_mjx.parameters.space import ParameterSpace
-
 _FROM_GEOM_ALWAYS = int(mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE)
 _FROM_GEOM_NEVER = int(mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE)
 
 
-def edit(space: "ParameterSpace", spec: mujoco.MjSpec, theta: Any) -> mujoco.MjSpec:
+def edit(parameters: Sequence[Parameter], spec: mujoco.MjSpec, theta: np.ndarray) -> mujoco.MjSpec:
     """See `ParameterSpace.edit`.
 
     Raises:
         UserError: if the spec uses `settotalmass` (no single mass could change), or a body to be stretched has frames.
     """
-    theta = np.asarray(space.vector(theta), np.float64)
+    theta = np.asarray(theta, np.float64)
     spec = spec.copy()
     nominal = spec.compile()
-    physical = [(p, v) for p, v in zip(space.parameters, theta, strict=True) if p.kind != "effect"]
+    physical = [(p, v) for p, v in zip(parameters, theta, strict=True) if p.kind != "effect"]
     if spec.compiler.settotalmass > 0 and any(p.attribute in ("mass", "scale") for p, _ in physical):
         raise UserError(
             f"compiler settotalmass={spec.compiler.settotalmass:g} rescales all masses; take it out of the MJCF"

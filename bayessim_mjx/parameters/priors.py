@@ -1,17 +1,24 @@
 """Prior CDF, its inverse and log density, elementwise over the parameters of a space."""
 
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import ndtr, ndtri
 
-if TYPE_CHECKING:
-    from bayessim_mjx.parameters.space import ParameterSpace
+from bayessim_mjx.parameters.parameter import Parameter
 
 
-def to_unit(space: "ParameterSpace", theta: jax.Array) -> jax.Array:
+class Space(Protocol):
+    """What is read of a `ParameterSpace`, `[d]` each."""
+
+    parameters: tuple[Parameter, ...]
+    low: np.ndarray
+    high: np.ndarray
+
+
+def to_unit(space: Space, theta: jax.Array) -> jax.Array:
     """theta `[..., d]` -> CDF values `[..., d]`; 0 below and 1 above the range."""
     theta = jnp.clip(theta, space.low, space.high)
     u = (theta - space.low) / (space.high - space.low)
@@ -27,7 +34,7 @@ def to_unit(space: "ParameterSpace", theta: jax.Array) -> jax.Array:
     return jnp.clip(u, 0.0, 1.0)
 
 
-def from_unit(space: "ParameterSpace", u: jax.Array) -> jax.Array:
+def from_unit(space: Space, u: jax.Array) -> jax.Array:
     """CDF values `[..., d]` -> theta `[..., d]`, clipped to the range."""
     u = jnp.clip(u, 0.0, 1.0)
     theta = space.low + u * (space.high - space.low)
@@ -43,7 +50,7 @@ def from_unit(space: "ParameterSpace", u: jax.Array) -> jax.Array:
     return jnp.clip(theta, space.low, space.high)
 
 
-def log_density(space: "ParameterSpace", theta: jax.Array) -> jax.Array:
+def log_density(space: Space, theta: jax.Array) -> jax.Array:
     """Log density per parameter `[..., d]`, in theta units; meaningful inside the range only."""
     width = (space.high - space.low).astype(np.float64)
     density = jnp.broadcast_to(jnp.asarray(-np.log(width), jnp.float32), theta.shape)
@@ -61,11 +68,11 @@ def log_density(space: "ParameterSpace", theta: jax.Array) -> jax.Array:
     return density
 
 
-def _is(space: "ParameterSpace", prior: str) -> np.ndarray:
+def _is(space: Space, prior: str) -> np.ndarray:
     return np.asarray([p.prior == prior for p in space.parameters], bool)
 
 
-def _normal(space: "ParameterSpace") -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _normal(space: Space) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """mean, sd and the standardised ends; harmless numbers in the columns of other priors."""
     gauss = _is(space, "gaussian")
     mean = np.asarray([p.mean if g else 0.0 for p, g in zip(space.parameters, gauss, strict=True)], np.float32)

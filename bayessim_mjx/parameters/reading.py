@@ -196,7 +196,7 @@ def _driven(model: mujoco.MjModel, kind: str, attribute: str, target: str, opera
     """
     if kind != "joint" or operation != "scaling" or attribute not in ("stiffness", "damping"):
         return kind, attribute, target
-    if _default(model, kind, attribute, target) != 0:
+    if own_value(model, kind, attribute, target) != 0:
         return kind, attribute, target
     joint = attributes.element(model, "joint", target)
     on_joint = (model.actuator_trnid[:, 0] == joint) & (model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT))
@@ -231,11 +231,11 @@ def _unit(model: mujoco.MjModel, kind: str, attribute: str, target: str) -> str:
 def _own(model: mujoco.MjModel, kind: str, attribute: str, target: str, operation: str, factor: float) -> float:
     """theta at which the model stays as it is."""
     if operation == "absolute":
-        return _default(model, kind, attribute, target) / factor
+        return own_value(model, kind, attribute, target) / factor
     return 1.0 if operation == "scaling" else 0.0
 
 
-def _default(model: mujoco.MjModel, kind: str, attribute: str, target: str) -> float:
+def own_value(model: mujoco.MjModel, kind: str, attribute: str, target: str) -> float:
     """The model's own number; restitution counts as 0, lengths and scales as 1."""
     if kind == "option":
         return float(model.opt.gravity[2])
@@ -253,7 +253,7 @@ def _default(model: mujoco.MjModel, kind: str, attribute: str, target: str) -> f
 
 
 def _check_default(model: mujoco.MjModel, kind: str, attribute: str, target: str, operation: str, where: str) -> None:
-    default = _default(model, kind, attribute, target)
+    default = own_value(model, kind, attribute, target)
     if attribute.startswith("com_"):
         attributes.refuse_simple(model, attributes.element(model, kind, target), where)
     if operation == "scaling" and default == 0:

@@ -40,7 +40,7 @@ class ParameterSpace:
     def from_config(cls, randomization_params: Mapping[str, Any], mj_model: "mujoco.MjModel") -> "ParameterSpace":
         """The space of a `randomization_params` section in BayesSimIG's YAML format (see `reading.py`).
 
-        Without the parameters of its `effects`, which `effects.reading.stack` makes.
+        Without the parameters of its `effects`, which `effects.support.reading.stack` makes.
 
         Raises:
             UserError: unknown actor, group, attribute or element; empty range; scaling of a number that is 0.
@@ -125,13 +125,13 @@ class ParameterSpace:
         """
         from bayessim_mjx.parameters import writing
 
-        return writing.write(self, model, theta)
+        return writing.write(self.parameters, model, theta)
 
     def edit(self, spec: "mujoco.MjSpec", theta: Any) -> "mujoco.MjSpec":
         """A copy of the nominal `spec` with the same change made in the MJCF; it compiles to what `write` makes."""
         from bayessim_mjx.parameters import editing
 
-        return editing.edit(self, spec, theta)
+        return editing.edit(self.parameters, spec, self.vector(theta))
 
 
 _VECTORS = ("low", "high", "nominal")

@@ -19,17 +19,15 @@ from bayessim_mjx.parameters.parameter import Parameter
 if TYPE_CHECKING:
     from mujoco import mjx
 
-    from bayessim_mjx.parameters.space import ParameterSpace
-
 MIN_RATIO = 0.05  # damping ratio of contacts at restitution 1: undamped contacts never settle
 
 
-def write(space: "ParameterSpace", model: "mjx.Model", theta: Any) -> "mjx.Model":
+def write(parameters: Sequence[Parameter], model: "mjx.Model", theta: Any) -> "mjx.Model":
     """See `ParameterSpace.write`."""
     theta = jnp.asarray(theta, jnp.float32)
-    if theta.shape != (len(space),):
-        raise UserError(f"theta has shape {theta.shape}, the space {len(space)} parameters; write many under vmap")
-    physical = tuple((i, _with_axis(p, model)) for i, p in enumerate(space.parameters) if p.kind != "effect")
+    if theta.shape != (len(parameters),):
+        raise UserError(f"theta has shape {theta.shape}, the space {len(parameters)} parameters; write many under vmap")
+    physical = tuple((i, _with_axis(p, model)) for i, p in enumerate(parameters) if p.kind != "effect")
     return model.tree_replace(_changes(physical, model, theta)) if physical else model
 
 

@@ -4,10 +4,8 @@ An actuator's force is corrected in one place, `_actuated`, which every stage of
 then drives that are off, then gravity compensation and the joint's limit (`actuatorfrcrange`), in MuJoCo's order.
 """
 
-import contextlib
 import dataclasses
-import io
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,16 +13,13 @@ import mujoco
 import numpy as np
 from flax import struct
 
-with contextlib.redirect_stdout(io.StringIO()):  # MJX announces on import that the optional warp is absent
-    from mujoco import mjx
-
+from bayessim_mjx.compat import mjx
 from bayessim_mjx.effects.effect import overrides
-from bayessim_mjx.effects.support.site import SubStep, joint_dofs, ranges
+from bayessim_mjx.effects.support.site import joint_dofs, ranges
+from bayessim_mjx.effects.support.substep import SubStep
+from bayessim_mjx.physics.controllers import Law
+from bayessim_mjx.physics.model import EULER, IMPLICITFAST, RK4, Physics
 
-if TYPE_CHECKING:
-    from bayessim_mjx.physics import Physics
-
-EULER, RK4, IMPLICITFAST = (int(getattr(mujoco.mjtIntegrator, f"mjINT_{n}")) for n in ("EULER", "RK4", "IMPLICITFAST"))
 STAGES = ((0.5, 1 / 3), (0.5, 1 / 3), (1.0, 1 / 6))  # of RK4 after the first: (how far from the start, weight)
 _NO_DAMPING = int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
 
@@ -46,12 +41,12 @@ class Drive(struct.PyTreeNode):
         force: `[nv]`, a generalised force of unknown origin.
         enabled: `[nu]`, 1 where the drive is on; 0: the actuator exerts no force at all (open leads), and a joint whose
             actuators are all off has no gravity compensation from them either (`actuatorgravcomp`).
-        law: a controller between the command and the actuators, `laws.Law`; what it asks for is held over a timestep.
+        law: a controller between the command and the actuators; what it asks for is held over a timestep.
     """
 
     force: jax.Array | None = None
     enabled: jax.Array | None = None
-    law: Any = None
+    law: Law | None = None
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -66,7 +61,7 @@ class Timestep:
         drive: what else acts.
     """
 
-    physics: "Physics"
+    physics: Physics
     model: mjx.Model
     thetas: tuple[jax.Array, ...]
     seen: dict[str, jax.Array]
@@ -88,7 +83,7 @@ class Timestep:
 
 
 def substep(
-    physics: "Physics",
+    physics: Physics,
     model: mjx.Model,
     data: mjx.Data,
     carry: Memory,

@@ -4,18 +4,14 @@ Warp computes a timestep as a whole, so effects that act inside of it cannot be 
 buffer for all worlds, here of the size that MJX's own would have for that many; where it is full, worlds diverge.
 """
 
-import contextlib
 import copy
-import io
 from collections.abc import Mapping, Sequence
 
 import jax
 import jax.numpy as jnp
 import mujoco
 
-with contextlib.redirect_stdout(io.StringIO()):  # MJX announces on import that the optional warp is absent
-    from mujoco import mjx
-
+from bayessim_mjx.compat import mjx
 from bayessim_mjx.effects.effect import Effect, overrides
 from bayessim_mjx.errors import UserError
 

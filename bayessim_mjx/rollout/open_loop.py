@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from bayessim_mjx.effects.support.site import AROUND, Motion
+from bayessim_mjx.effects.support.motion import AROUND, Motion
 from bayessim_mjx.physics import Drive, Physics, begin, control_step
 from bayessim_mjx.physics.controllers import Law
 

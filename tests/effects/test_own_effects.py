@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bayessim_mjx import config, effects, registry
-from bayessim_mjx.effects.support import storage
+from bayessim_mjx.effects.support import reading, storage
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.physics import control_step
 
@@ -104,7 +104,7 @@ def test_a_missing_file_is_named(tmp_path):
         effects.load(f"{tmp_path}/nothing.py:Magnets")
     with pytest.raises(UserError, match=r"effects\[0\]: .*no file nothing\.py \(from "):
         settings = [{"effect": "nothing.py:Magnets", "where": "all"}]
-        effects.reading.listed(settings)
+        reading.listed(settings)
 
 
 def installed(monkeypatch, **points):

@@ -13,7 +13,7 @@ from scipy.signal import lsim
 
 from bayessim_mjx import registry
 from bayessim_mjx.effects import make
-from bayessim_mjx.effects.support.site import Motion
+from bayessim_mjx.effects.support.motion import Motion
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.parameters import ParameterSpace
 from bayessim_mjx.physics import Drive, Physics, begin, control_step

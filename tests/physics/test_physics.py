@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from bayessim_mjx.effects import make
-from bayessim_mjx.effects.support.site import Motion
+from bayessim_mjx.effects.support.motion import Motion
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 from bayessim_mjx.physics import Physics, begin, control_step, mjx
 

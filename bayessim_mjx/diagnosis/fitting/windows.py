@@ -12,7 +12,7 @@ import numpy as np
 from flax import struct
 from numpy.typing import NDArray
 
-from bayessim_mjx.effects.support.site import AROUND, Motion
+from bayessim_mjx.effects.support.motion import AROUND, Motion
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Log
 from bayessim_mjx.logs.resample import around as rows_around

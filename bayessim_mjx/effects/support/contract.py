@@ -15,7 +15,9 @@ import mujoco
 import numpy as np
 
 from bayessim_mjx.effects.effect import overrides
-from bayessim_mjx.effects.support.site import Motion, Site, SubStep
+from bayessim_mjx.effects.support.motion import Motion
+from bayessim_mjx.effects.support.site import Site
+from bayessim_mjx.effects.support.substep import SubStep
 from bayessim_mjx.errors import UserError
 
 if TYPE_CHECKING:

@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from bayessim_mjx.effects.support.site import Site, SubStep
+from bayessim_mjx.effects.support.site import Site
+from bayessim_mjx.effects.support.substep import SubStep
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

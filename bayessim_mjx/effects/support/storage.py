@@ -22,7 +22,7 @@ from bayessim_mjx.effects.effect import Effect
 from bayessim_mjx.effects.support import reading
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.parameters import Parameter, ParameterSpace, attributes
-from bayessim_mjx.parameters.reading import _default
+from bayessim_mjx.parameters.reading import own_value
 
 if TYPE_CHECKING:
     import mujoco
@@ -223,5 +223,5 @@ def _merged(own: Parameter, found: Parameter | None, model: "mujoco.MjModel") ->
 
 def _line(p: Parameter, model: "mujoco.MjModel") -> tuple[float, float]:
     """(slope, offset) of the model's number as a function of theta."""
-    own = _default(model, p.kind, p.attribute, p.target)
+    own = own_value(model, p.kind, p.attribute, p.target)
     return {"scaling": (own, 0.0), "additive": (p.factor, own), "absolute": (p.factor, 0.0)}[p.operation]

@@ -13,7 +13,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from bayessim_mjx.effects.support.site import Site, SubStep, joint_dofs, ranges
+from bayessim_mjx.effects.support.site import Site, joint_dofs, ranges
+from bayessim_mjx.effects.support.substep import SubStep
 
 if TYPE_CHECKING:
     from mujoco import mjx

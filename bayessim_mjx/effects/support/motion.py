@@ -1,0 +1,53 @@
+"""Recorded motion around a start, which effects with memory and sensors' effects look at."""
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from bayessim_mjx.effects.support.site import Site
+
+AROUND = 0.1  # s of recorded motion before and after a start that effects with memory may look at, at least
+
+
+class Motion(struct.PyTreeNode):
+    """Recorded motion around a start, one row per control step; row `start` is the start itself.
+
+    Attributes:
+        qpos: `[rows, nq]`, qvel: `[rows, nv]`.
+        command: `[rows, substeps, nu]`; row k acts from row k to row k + 1.
+        start: static int.
+    """
+
+    qpos: jax.Array
+    qvel: jax.Array
+    command: jax.Array
+    start: int = struct.field(pytree_node=False)
+
+    def shifted(self, at: Site, steps: jax.Array) -> jax.Array:
+        """Position and velocity of each joint of `at` read its own number of control steps later, `[rows, n, 2]`.
+
+        Args: steps: `[n]`, in control steps, of any sign, with fractions; the recording's ends are held.
+        """
+        last = self.qpos.shape[0] - 1
+        when = jnp.clip(jnp.arange(last + 1)[:, None] + steps, 0, last)
+        low = jnp.clip(jnp.floor(when).astype(jnp.int32), 0, max(last - 1, 0))
+        part = when - low
+
+        def row(x: jax.Array, ahead: int) -> jax.Array:
+            return jnp.take_along_axis(x, jnp.clip(low + ahead, 0, last), axis=0)
+
+        qpos, qvel = self.qpos[:, at.qadr], self.qvel[:, at.dadr]
+        before, here, there, after = (row(qvel, k) for k in (-1, 0, 1, 2))
+        # cubic through four velocities: the derivative of a Hermite spline would divide the encoders' noise by dt
+        inner, outer = (1 + part) * (2 - part) / 2, -part * (1 - part) / 6
+        velocity = inner * ((1 - part) * here + part * there) + outer * ((2 - part) * before + (1 + part) * after)
+        return jnp.stack([between(row(qpos, 0), row(qpos, 1), there - here, part, at.dt), velocity], axis=-1)
+
+
+def between(one: jax.Array, two: jax.Array, gained: jax.Array, part: jax.Array, dt: float) -> jax.Array:
+    """Position a `part` of the way from `one` to `two`, dt apart, at constant acceleration gained / dt.
+
+    Only the *difference* of the velocities bends the path: where an end is held it is a line, and the half sub-step by
+    which semi-implicit Euler's velocities lag, the same at both ends, cancels (not so in a Hermite spline).
+    """
+    return (1 - part) * one + part * two - 0.5 * jnp.float32(dt) * part * (1 - part) * gained

@@ -1,0 +1,207 @@
+"""A compiled model with its parameters and effects, and the state of one world of it."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from flax import struct
+
+from bayessim_mjx.compat import mjx
+from bayessim_mjx.effects.effect import Effect, Measurement, overrides
+from bayessim_mjx.effects.support import contract
+from bayessim_mjx.errors import UserError
+from bayessim_mjx.parameters import ParameterSpace
+from bayessim_mjx.physics.warp import Warp
+
+EULER, RK4, IMPLICITFAST = (int(getattr(mujoco.mjtIntegrator, f"mjINT_{n}")) for n in ("EULER", "RK4", "IMPLICITFAST"))
+
+
+class World(struct.PyTreeNode):
+    """Everything the next control step of one world needs. Lean: no `mjx.Data`; `vmap` adds leading axes.
+
+    Attributes:
+        qpos: `[nq]`, qvel: `[nv]`, act: `[na]`; MuJoCo's state.
+        warmstart: `[nv]`, the last acceleration, where the constraint solver starts.
+        time: `[]`, s.
+        theta: `[d]`, the values of `physics.space` that hold in this episode.
+        fields: model arrays that differ from the nominal ones, by dotted name (computed at reset, constant afterwards).
+        memory: one pytree per effect.
+        forces: `[effects, nv]`, each effect's generalised force in the last sub-step.
+        measurement: `{"qpos", "qvel"}` as the sensors show them; equal to qpos, qvel unless an effect says otherwise.
+        task: numbers a task carries along (commands, counters); physics does not read them.
+    """
+
+    qpos: jax.Array
+    qvel: jax.Array
+    act: jax.Array
+    warmstart: jax.Array
+    time: jax.Array
+    theta: jax.Array
+    fields: dict[str, jax.Array]
+    memory: tuple
+    forces: jax.Array
+    measurement: dict[str, jax.Array]
+    task: dict[str, Any] = struct.field(default_factory=dict)
+
+
+class Physics:
+    """A compiled model with its parameters and effects. Immutable and hashable by identity: static under `jit`.
+
+    Args:
+        mj_model: the nominal MuJoCo model.
+        control_dt: control step, s; a whole multiple of the model's timestep.
+        space: parameters written into the model.
+        effects: effects in the order in which their hooks are called.
+        max_qvel: `[nv]` or scalar; velocities are clipped to +-max_qvel after each sub-step (the position has moved
+            with the unclipped one). None: no clipping.
+        impl: what computes a timestep: MJX's stages in "jax", or all of it in "warp"; see `warp.Warp`.
+        worlds: how many are simulated together, for "warp".
+
+    Raises:
+        ValueError: if control_dt is no multiple of the timestep, the integrator is unknown to MJX, or an effect's
+            `where` is not in the model.
+    """
+
+    def __init__(
+        self,
+        mj_model: mujoco.MjModel,
+        control_dt: float,
+        space: ParameterSpace,
+        effects: Sequence[Effect] = (),
+        max_qvel: float | Sequence[float] | None = None,
+        impl: str = "jax",
+        worlds: int | None = None,
+    ) -> None:
+        self.mj_model = mj_model
+        self.effects = tuple(effects)
+        self.model_space = space
+        self.space = space
+        for effect in self.effects:
+            self.space = self.space + effect.space()
+        self.substeps = _substeps(control_dt, mj_model.opt.timestep)
+        self.dt = float(self.substeps * mj_model.opt.timestep)
+        if int(mj_model.opt.integrator) not in (EULER, RK4, IMPLICITFAST):
+            raise UserError(f"integrator {mj_model.opt.integrator}: MJX has Euler, RK4 and implicitfast")
+        self.max_qvel = None if max_qvel is None else np.broadcast_to(np.asarray(max_qvel, np.float32), (mj_model.nv,))
+        self.model = mjx.put_model(mj_model, impl="jax")
+        self.template = mjx.make_data(mj_model, impl="jax")
+        self.warp = Warp(mj_model, self.template, self.effects, worlds) if impl == "warp" else None
+        timestep = float(mj_model.opt.timestep)
+        for effect in filter(contract.brought, self.effects):
+            contract.check(effect, mj_model, self.model, self.substeps)
+        self.sites = tuple(effect.bind(mj_model, timestep, self.substeps) for effect in self.effects)
+        self._memory = tuple(effect.init(at) for effect, at in zip(self.effects, self.sites, strict=True))
+
+    def split(self, theta: jax.Array) -> tuple[jax.Array, tuple[jax.Array, ...]]:
+        """(values of the model's parameters, one slice per effect)."""
+        start = len(self.model_space)
+        own, slices = theta[:start], []
+        for effect in self.effects:
+            end = start + len(effect.space())
+            slices.append(theta[start:end])
+            start = end
+        return own, tuple(slices)
+
+    def world(self, theta: jax.Array, qpos: jax.Array | None = None, qvel: jax.Array | None = None) -> World:
+        """A world at the start of an episode, as the sensors show it at rest; writes `theta` into the model once.
+
+        Args:
+            theta: `[d]`, values of `self.space`.
+            qpos: `[nq]`, default the model's qpos0.
+            qvel: `[nv]`, default zero.
+
+        Raises:
+            ValueError: on a wrong shape.
+        """
+        with jax.default_matmul_precision("highest"):
+            world = self.unseen(theta, qpos, qvel)
+            memory, shown = self.sense(self.split(world.theta)[1], world.memory, world.measurement)
+            return world.replace(memory=memory, measurement=shown)
+
+    def unseen(self, theta: jax.Array, qpos: jax.Array | None, qvel: jax.Array | None) -> World:
+        """`world` without sensors: they have not measured yet."""
+        theta = jnp.asarray(theta, jnp.float32)
+        qpos = jnp.asarray(self.mj_model.qpos0 if qpos is None else qpos, jnp.float32)
+        qvel = jnp.zeros(self.mj_model.nv) if qvel is None else jnp.asarray(qvel, jnp.float32)
+        for label, value, size in (
+            ("theta", theta, len(self.space)),
+            ("qpos", qpos, self.mj_model.nq),
+            ("qvel", qvel, self.mj_model.nv),
+        ):
+            if value.shape != (size,):
+                raise ValueError(f"{label} has shape {value.shape}, expected ({size},)")
+        own, slices = self.split(theta)
+        model = self.model_space.write(self.model, own)
+        for effect, at, part in zip(self.effects, self.sites, slices, strict=True):
+            model = effect.on_model(at, model, part)
+        return World(
+            qpos=qpos,
+            qvel=qvel,
+            act=jnp.zeros(self.mj_model.na),
+            warmstart=jnp.zeros(self.mj_model.nv),
+            time=jnp.zeros(()),
+            theta=theta,
+            fields=_changed(self.model, model),
+            memory=self._memory,
+            forces=jnp.zeros((len(self.effects), self.mj_model.nv)),
+            measurement={"qpos": qpos, "qvel": qvel},
+        )
+
+    def sense(self, thetas: tuple, memory: Sequence[Any], true: Measurement) -> tuple[tuple, Measurement]:
+        """(effects' memories, what the sensors show) of the true {"qpos", "qvel"}; thetas: one slice per effect."""
+        remembered, shown = list(memory), true
+        for i, (effect, at, theta) in enumerate(zip(self.effects, self.sites, thetas, strict=True)):
+            if overrides(effect, "on_measurement"):
+                remembered[i], shown = effect.on_measurement(at, remembered[i], shown, theta)
+        return tuple(remembered), shown
+
+    def encoders(self, thetas: tuple, qpos: jax.Array, qvel: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """(qpos, qvel) as the joints' own encoders show them to their drives: with the sensors' static errors.
+
+        Delays and filters lie between the drive and whoever records; without a past they show what is.
+        """
+        shown = self.sense(thetas, self._memory, {"qpos": qpos, "qvel": qvel})[1]
+        return shown["qpos"], shown["qvel"]
+
+    def model_of(self, world: World) -> mjx.Model:
+        """The model with this world's parameters."""
+        return self.model.tree_replace(world.fields) if world.fields else self.model
+
+    def data_of(self, world: World, template: mjx.Data | None = None) -> mjx.Data:
+        """`mjx.Data` in this world's state; everything derived from the state is the template's (not this state's)."""
+        return (self.template if template is None else template).replace(
+            qpos=world.qpos, qvel=world.qvel, act=world.act, qacc_warmstart=world.warmstart, time=world.time
+        )
+
+    def kinematics(self, world: World) -> mjx.Data:
+        """`mjx.Data` with the poses and velocities of all bodies in this world's state; no contacts, no forces."""
+        return _poses(self.model_of(world), self.data_of(world))
+
+
+@jax.jit  # a reset outside of any program would compile hundreds
+def _poses(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    return mjx.com_vel(model, mjx.com_pos(model, mjx.kinematics(model, data)))
+
+
+def _substeps(control_dt: float, timestep: float) -> int:
+    count = round(control_dt / timestep)
+    if count < 1 or abs(count * timestep - control_dt) > 1e-6 * control_dt:
+        raise UserError(f"control step {control_dt} s is no whole multiple of the model's timestep {timestep} s")
+    return count
+
+
+def _changed(nominal: mjx.Model, model: mjx.Model) -> dict[str, jax.Array]:
+    """Leaves of `model` that are not the nominal objects, by dotted name."""
+    before, _ = jax.tree_util.tree_flatten_with_path(nominal)
+    after = jax.tree.leaves(model)
+    if jax.tree.structure(nominal) != jax.tree.structure(model):  # type: ignore[operator]  # jaxlib's stubs
+        raise UserError("an effect or parameter changed the structure of the model; only array values may change")
+    pairs = zip(before, after, strict=True)
+    return {_dotted(path): new for (path, old), new in pairs if new is not old}
+
+
+def _dotted(path: Sequence[Any]) -> str:
+    return jax.tree_util.keystr(tuple(path), simple=True, separator=".")
