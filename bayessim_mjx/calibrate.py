@@ -29,7 +29,7 @@ ADVICE = {
 
 def _parser() -> cli.PlainParser:
     parser = cli.PlainParser(
-        prog="python -m bayessim_mjx.calibrate",
+        prog=cli.prog_of("calibrate"),
         description="Test a finished run's posterior on fresh simulations, and whether real motion looks like them.",
         usage="%(prog)s --run RUN [options]",
     )

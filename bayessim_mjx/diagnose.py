@@ -25,7 +25,7 @@ PRELIMINARY = "preliminary.json"  # what is known while the race goes on
 
 def _parser() -> cli.PlainParser:
     parser = cli.PlainParser(
-        prog="python -m bayessim_mjx.diagnose",
+        prog=cli.prog_of("diagnose"),
         description="Find where logs and simulator differ, which missing effects cause it, and how much they explain.",
         usage="%(prog)s [options]\n       (--task NAME | --model FILE) --data PATH [PATH ...]",
     )

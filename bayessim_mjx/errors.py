@@ -1,6 +1,8 @@
 """Errors that are the user's to mend: the commands print them in one line, without a traceback."""
 
+import difflib
 import errno
+from collections.abc import Iterable
 
 # What the system refuses for reasons outside of this program: the disk is full, a folder may not be written, a name is
 # too long. (An OSError of another kind, such as a file that ought to be there, is a bug.)
@@ -15,6 +17,15 @@ class UserError(ValueError):
 
 class DivergedError(UserError, FloatingPointError):
     """Numbers are no longer finite, under settings that the user can change."""
+
+
+def unknown(what: str, given: str, allowed: Iterable[str]) -> UserError:
+    """The error for a name that does not exist: with the close ones first, then all allowed."""
+    names = list(allowed)
+    last = {n.rpartition(".")[2].lower(): n for n in names}
+    close = [last[n] for n in difflib.get_close_matches(given.rpartition(".")[2].lower(), last, n=3, cutoff=0.6)]
+    hint = f" Did you mean {' or '.join(close)}?" if close else ""
+    return UserError(f"{what} {given!r} is unknown.{hint} Allowed: {', '.join(names)}")
 
 
 def disk_is_full(error: BaseException) -> bool:

@@ -1,4 +1,7 @@
-"""`python -m bayessim_mjx.main --task Pendulum`: adaptive domain randomisation; also `bayessim-mjx [train|play]`."""
+"""`python -m bayessim_mjx.main --task Pendulum`: adaptive domain randomisation.
+
+It is also the console script: `bayessim-mjx train --task Ant` is `python -m bayessim_mjx.train --task Ant`.
+"""
 
 from __future__ import annotations
 
@@ -6,16 +9,26 @@ import argparse
 import dataclasses
 import sys
 from collections.abc import Sequence
+from importlib import import_module
 from typing import Any
 
 from bayessim_mjx import cli
 from bayessim_mjx.config import Config, to_yaml
 from bayessim_mjx.device import setup_jax
-from bayessim_mjx.errors import UserError
+from bayessim_mjx.errors import UserError, unknown
 
 DESCRIPTION = (
     "Adaptive domain randomisation: rounds of PPO training, evaluation, simulation and inference of the physics."
 )
+
+COMMANDS = {  # all of them, and what each is for
+    "main": "adaptive domain randomisation, the command without a name",
+    "train": "PPO alone",
+    "play": "returns, videos and ONNX files of a saved policy",
+    "calibrate": "how far a finished run's posterior can be trusted",
+    "diagnose": "what a simulator is missing, from recorded motion",
+    "gap_loop": "what a diagnosis is worth in return",
+}
 
 
 class Watched:
@@ -52,6 +65,13 @@ class Watched:
         self.run.save(step, tree, evaluation=evaluation, meta=clock, supersede=supersede)
         if int(tree["state"].round) < self.parts.settings.realIters:  # else all is done
             self.stop.check()
+
+
+def _parser() -> cli.Parser:
+    parser = cli.Parser("main", DESCRIPTION, resume=True)
+    others = "; ".join(f"{name.replace('_', '-')}: {text}" for name, text in COMMANDS.items())
+    parser.add_argument_group(f"commands of {cli.SCRIPT}", others)
+    return parser
 
 
 def _prepare(args: argparse.Namespace) -> tuple[Config, Any]:
@@ -150,7 +170,7 @@ def _report(console: Any, parts: Any, state: Any) -> None:
 def _adapt(argv: Sequence[str] | None) -> int:
     """The outer loop; exit code 0, 2 (bad input) or 130 (Ctrl-C, after a checkpoint)."""
     argv = list(sys.argv[1:] if argv is None else argv)
-    args = cli.Parser("main", DESCRIPTION, resume=True).parse(argv)
+    args = _parser().parse(argv)
     if args.list_tasks:
         return cli.list_tasks()
     config, run = _prepare(args)
@@ -164,17 +184,21 @@ def _adapt(argv: Sequence[str] | None) -> int:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """`bayessim-mjx`: the outer loop, or train or play if that is the first word."""
+    """`bayessim-mjx`: the command that the first word names; without one the outer loop."""
     argv = list(sys.argv[1:] if argv is None else argv)
-    if argv[:1] == ["train"]:
-        from bayessim_mjx.train import main as train
+    first = argv[0] if argv else ""
+    if first.startswith("-") or "=" in first or not first:
+        return cli.command(_adapt)(argv)
+    return cli.command(_named)(argv)
 
-        return train(argv[1:])
-    if argv[:1] == ["play"]:
-        from bayessim_mjx.play import main as play
 
-        return play(argv[1:])
-    return cli.command(_adapt)(argv[1:] if argv[:1] == ["main"] else argv)
+def _named(argv: Sequence[str] | None) -> int:
+    """The command that the first word names, with a hyphen or an underscore."""
+    name, *rest = argv or ()
+    module = name.replace("-", "_")
+    if module not in COMMANDS:
+        raise unknown("command", name, [c.replace("_", "-") for c in COMMANDS])
+    return _adapt(rest) if module == "main" else import_module(f"bayessim_mjx.{module}").main(rest)
 
 
 if __name__ == "__main__":

@@ -171,6 +171,33 @@ def test_help_and_task_list_need_no_task(capsys: pytest.CaptureFixture) -> None:
     assert {"Pendulum", "Cartpole", "Ant"} <= set(capsys.readouterr().out.split())
 
 
+@pytest.mark.parametrize("name", main.COMMANDS)
+def test_one_console_script_takes_all_commands(name: str, capsys: pytest.CaptureFixture, monkeypatch: Any) -> None:
+    monkeypatch.setattr(sys, "argv", ["/usr/bin/bayessim-mjx"])
+    for written in {name, name.replace("_", "-")}:
+        assert main.main([written, "--help"]) == 0
+        usage = capsys.readouterr().out.split("\n\n")[0]
+        assert usage.startswith(f"usage: bayessim-mjx {name.replace('_', '-')} ")
+
+
+def test_a_command_that_does_not_exist_is_one_line(capsys: pytest.CaptureFixture) -> None:
+    line = error_of(capsys, main.main, "gap-lop", "--task", "Pendulum")
+    assert "command 'gap-lop' is unknown. Did you mean gap-loop?" in line and "calibrate, diagnose" in line
+
+
+def test_version(capsys: pytest.CaptureFixture) -> None:
+    for command in (main.main, play.main, diagnose.main):
+        assert command(["--version"]) == 0
+        assert f"jax {jax.__version__}, mujoco {mujoco.__version__})" in capsys.readouterr().out
+
+
+def test_flags_are_read_before_jax_is_imported() -> None:
+    slow = "{'jax', 'mujoco', 'numpy', 'rich', 'yaml'} & set(sys.modules)"
+    for call in (["diagnose", "--help"], ["--version"], ["nothing"]):
+        code = f"import sys; from bayessim_mjx.main import main; main({call}); assert not ({slow}), {slow}"
+        subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
+
+
 def test_help_fits_into_80_columns(monkeypatch: Any, capsys: pytest.CaptureFixture) -> None:
     from bayessim_mjx import calibrate, diagnose, gap_loop
 

@@ -36,7 +36,7 @@ from bayessim_mjx.config.settings import (
     thaw,
 )
 from bayessim_mjx.config.yaml_text import DEPTH, read_value, read_yaml, to_yaml
-from bayessim_mjx.errors import UserError
+from bayessim_mjx.errors import UserError, unknown
 
 __all__ = [
     "BayesSimConfig", "Config", "EnvConfig", "Frozen", "MonitorConfig", "PPOConfig", "RNDConfig", "RealConfig",
@@ -128,15 +128,6 @@ def read_effects(path: str | Path) -> dict[str, Any]:
             f"{path}: schema = {raw.get('schema')!r}: expected schema: {EFFECTS_SCHEMA}, as a diagnosis writes"
         )
     return {key: raw.get(key) or [] for key in EFFECTS_KEYS[1:]}
-
-
-def unknown(what: str, given: str, allowed: Iterable[str]) -> UserError:
-    """The error for a name that does not exist: with the close ones first, then all allowed."""
-    names = list(allowed)
-    last = {n.rpartition(".")[2].lower(): n for n in names}
-    close = [last[n] for n in difflib.get_close_matches(given.rpartition(".")[2].lower(), last, n=3, cutoff=0.6)]
-    hint = f" Did you mean {' or '.join(close)}?" if close else ""
-    return UserError(f"{what} {given!r} is unknown.{hint} Allowed: {', '.join(names)}")
 
 
 def _train_layer(path: str | Path) -> dict[str, Any]:

@@ -9,29 +9,24 @@ import datetime
 import json
 import math
 import os
-import platform
 import re
 import shlex
 import shutil
-import subprocess
 import sys
 from collections.abc import Mapping, Sequence
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 from bayessim_mjx import config
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.runs import checkpoints
+from bayessim_mjx.runs.manifest import FOLDER, MANIFEST, SCHEMA, advice, best_of, differences, read
+from bayessim_mjx.versions import git_state, versions
 
-MANIFEST = "run.json"
-SCHEMA = 1
-FOLDER = "checkpoints"
 DAMAGED = ".damaged"
 OURS = re.compile(r"\d+(-\d+)?(\.\d+\.tmp)?")  # folders that `save` makes
 RESERVE, RESERVED = ".reserve", 1 << 16  # bytes given up on a full disk, so that the manifest can say so
 KEEP = 3  # newest checkpoints kept beside the best
-PACKAGES = ("bayessim-mjx", "jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy", "optax", "flax", "orbax-checkpoint")
 
 
 class Run:
@@ -78,20 +73,7 @@ class Run:
     @classmethod
     def open(cls, path: str | Path) -> "Run":
         """An existing run folder; UserError where it is none or its manifest is damaged."""
-        path = Path(path)
-        file = path / MANIFEST
-        if not file.is_file():
-            raise UserError(f"{path}: not a run folder (no {MANIFEST} in it)")
-        try:
-            manifest = json.loads(file.read_text(encoding="utf-8"))
-        except (OSError, ValueError, RecursionError) as error:
-            raise UserError(f"{file}: damaged manifest: {type(error).__name__}: {error}") from None
-        schema = manifest.get("schema") if isinstance(manifest, dict) else None
-        if type(schema) is int and schema != SCHEMA:
-            raise UserError(f"{file}: written by another version (schema {schema}, this one reads {SCHEMA})")
-        if fault := _fault(manifest):
-            raise UserError(f"{file}: damaged manifest: {fault}")
-        return cls(path, manifest)
+        return cls(Path(path), read(Path(path)))
 
     @property
     def config(self) -> config.Config:
@@ -121,7 +103,7 @@ class Run:
         for key, title in (("settings", ""), ("versions", "version of "), ("git", "git ")):
             then = self.manifest.get(key)
             if isinstance(then, Mapping):  # earlier versions did not write them
-                found += [title + text for text in _differences(then, json.loads(json.dumps(now[key] or {})))]
+                found += [title + text for text in differences(then, json.loads(json.dumps(now[key] or {})))]
         return found
 
     def resumed(self) -> list[str]:
@@ -155,7 +137,7 @@ class Run:
         entry = {"step": int(step), "path": str(path.relative_to(self.path)), "evaluation": score, "kind": kind}
         older = [c for c in self.checkpoints if c["step"] != int(step)]
         listed = [{**c, "evaluation": None} if supersede else c for c in older] + [entry]
-        best = _best(listed)
+        best = best_of(listed)
         kept = [c for i, c in enumerate(listed) if i >= len(listed) - self.keep or c["step"] == best]
         self.manifest.update(checkpoints=kept, latest=int(step), best=best)
         self._write()
@@ -186,9 +168,9 @@ class Run:
         except checkpoints.CorruptedError as error:
             older = [c for c in self.checkpoints if self.path / c["path"] != path]
             if not fall_back or not older:
-                raise UserError(f"{error}. {_advice(older)}") from None
+                raise UserError(f"{error}. {advice(older)}") from None
             print(f"note: {error}; going on from the checkpoint of step {older[-1]['step']}", file=sys.stderr)
-            self.manifest.update(checkpoints=older, latest=older[-1]["step"], best=_best(older))
+            self.manifest.update(checkpoints=older, latest=older[-1]["step"], best=best_of(older))
             self._write()
             if path.exists() and not (path.is_symlink() or path.parent.is_symlink()):
                 path.rename(_free(path.with_name(path.name + DAMAGED)))
@@ -213,55 +195,6 @@ class Run:
         for path in folder.iterdir():
             if OURS.fullmatch(path.name) and path.name not in listed and not path.is_symlink():
                 shutil.rmtree(path, ignore_errors=True)
-
-
-def _fault(manifest: Any) -> str | None:
-    """What is wrong with the contents of run.json; None: nothing."""
-    if not isinstance(manifest, dict):
-        return "not an object"
-    for key, kind in (("schema", int), ("task", str), ("created", str), ("status", str), ("checkpoints", list)):
-        if type(manifest.get(key)) is not kind:
-            return f"{key} = {manifest.get(key)!r}"
-    for entry in manifest["checkpoints"]:
-        ok = isinstance(entry, dict) and type(entry.get("step")) is int and isinstance(entry.get("path"), str)
-        score = entry.get("evaluation", "") if ok else ""
-        if not ok or isinstance(score, bool) or not isinstance(score, int | float | None):
-            return f"checkpoints: {entry!r}"
-        if not _inside(entry["path"]):
-            return f"checkpoints: path = {entry['path']!r}; allowed: {FOLDER}/<name>"
-    steps = [entry["step"] for entry in manifest["checkpoints"]]
-    for key in ("latest", "best"):
-        step = manifest.get(key, "absent")
-        if step is not None and (type(step) is not int or step not in steps):
-            return f"{key} = {step!r} is none of the checkpoints {steps}"
-    return None
-
-
-def _inside(path: str) -> bool:
-    """Whether a manifest's path names a folder of the run's own checkpoints."""
-    parts = path.split("/")
-    return len(parts) == 2 and parts[0] == FOLDER and parts[1] not in ("", ".", "..") and "\\" not in path
-
-
-def _differences(then: Any, now: Any, path: str = "") -> list[str]:
-    """`ppo.gamma: 0.9, was 0.99` for every leaf of nested mappings that differs."""
-    if isinstance(then, Mapping) and isinstance(now, Mapping):
-        keys = dict.fromkeys([*then, *now])
-        inner = [(f"{path}.{key}".lstrip("."), then.get(key), now.get(key)) for key in keys]
-        return [text for at, a, b in inner for text in _differences(a, b, at)]
-    return [] if then == now else [f"{path}: {now}, was {then}"]
-
-
-def _best(listed: Sequence[Mapping[str, Any]]) -> int | None:
-    """Step of the highest evaluation (the first of equals)."""
-    evaluated = [c for c in listed if c["evaluation"] is not None]
-    return max(evaluated, key=lambda c: c["evaluation"])["step"] if evaluated else None
-
-
-def _advice(others: Sequence[Mapping[str, Any]]) -> str:
-    if not others:
-        return "There is no other checkpoint: start the run again"
-    return f"Use another checkpoint of the run: {', '.join(str(c['step']) for c in others)}"
 
 
 def find_runs(logdir: str | Path, task: str) -> list[Run]:
@@ -309,28 +242,3 @@ def _free(path: Path) -> Path:
 
 def _now() -> str:
     return datetime.datetime.now(datetime.UTC).isoformat(timespec="microseconds")
-
-
-def versions() -> dict[str, str]:
-    """Python and the packages that decide results."""
-    found = {"python": platform.python_version(), "platform": platform.platform()}
-    for package in PACKAGES:
-        try:
-            found[package] = metadata.version(package)
-        except metadata.PackageNotFoundError:
-            continue
-    return found
-
-
-def git_state() -> dict[str, Any] | None:
-    """Commit and whether anything is changed, of the checkout that this package runs from; None outside of one."""
-    root = Path(__file__).resolve().parents[1]
-    if not (root / ".git").exists():
-        return None
-    options: dict[str, Any] = {"capture_output": True, "text": True, "check": True, "timeout": 20}
-    try:
-        commit = subprocess.run(["git", "-C", str(root), "rev-parse", "HEAD"], **options).stdout
-        status = subprocess.run(["git", "-C", str(root), "status", "--porcelain"], **options).stdout
-    except (OSError, subprocess.SubprocessError):
-        return None
-    return {"commit": commit.strip(), "dirty": bool(status.strip())}

@@ -1,0 +1,56 @@
+"""How a command ends: its exit code, and one line or a traceback on stderr."""
+
+import os
+import sys
+import traceback
+from collections.abc import Callable, Sequence
+
+from bayessim_mjx.errors import UserError, out_of_memory, refused
+
+DEBUG_VARIABLE = "BAYESSIM_MJX_DEBUG"  # set: errors come with a traceback
+BUGS = "to the issue tracker of bayessim_mjx"
+
+
+def command(run: Callable[[Sequence[str] | None], int]) -> Callable[..., int]:
+    """A `main(argv=None)` that returns an exit code.
+
+    0; 2 and one line on stderr for what the user can mend; 1 and a traceback for a bug; 130 after Ctrl-C.
+    """
+
+    def main(argv: Sequence[str] | None = None) -> int:
+        try:
+            return run(argv)
+        except KeyboardInterrupt:
+            return 130
+        except BrokenPipeError:  # `... | head`: nobody reads on
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return 1
+        except SystemExit as end:  # --help
+            if end.code in (None, 0):
+                return 0
+            return _bug()
+        except Exception as error:
+            if os.environ.get(DEBUG_VARIABLE):
+                raise
+            if not isinstance(error, UserError) and not refused(error):
+                return _bug()
+            print(f"error: {one_line(error)}", file=sys.stderr)
+            return 2
+
+    main.__doc__ = run.__doc__
+    return main
+
+
+def one_line(error: Exception) -> str:
+    """The message without line ends; where memory was short, with the settings to lower."""
+    text = " ".join(str(error).split("\n"))
+    if not out_of_memory(error):
+        return text
+    return f"{text.rstrip('. ') or 'out of memory'}; lower env.numEnvs, ppo.num_steps or bayessim.trainTrajs"
+
+
+def _bug() -> int:
+    """The traceback of the present error, and what to do with it."""
+    traceback.print_exc()
+    print(f"\nThis is a bug: please report it with the lines above and your command, {BUGS}", file=sys.stderr)
+    return 1

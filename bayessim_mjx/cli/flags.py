@@ -1,0 +1,165 @@
+"""Flags of the commands, and `section.key=value` overrides. No jax before parsing."""
+
+import argparse
+import re
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+from bayessim_mjx import trust
+from bayessim_mjx.errors import UserError, unknown
+
+SCRIPT = "bayessim-mjx"  # the console script, and the name of the package as it is installed
+
+
+def whole(low: int, high: int) -> Callable[[str], int]:
+    """The type of a flag that takes a whole number from `low` to `high`, in the digits 0 to 9."""
+
+    def number(text: str) -> int:
+        if not re.fullmatch("[+-]?[0-9]{1,25}", text):
+            raise argparse.ArgumentTypeError(f"invalid int value: {text[:60]!r}")
+        if not low <= int(text) <= high:
+            raise argparse.ArgumentTypeError(f"{text}: must be from {low} to {high}")
+        return int(text)
+
+    return number
+
+
+integer = whole(-(10**25), 10**25)  # where the settings know the limits
+
+# flag -> (dotted key, type, help); None as type: a switch
+FLAGS: dict[str, tuple[str, Any, str]] = {
+    "--num_envs": ("env.numEnvs", integer, "number of simulated worlds in parallel"),
+    "--seed": ("seed", integer, "random seed; -1 draws one"),
+    "--max_iterations": ("ppo.max_iterations", integer, "PPO iterations; in main the number per round"),
+    "--video": ("monitor.video", None, "record videos"),
+    "--video_length": ("monitor.video_length", integer, "length of a video in control steps"),
+    "--video_interval": ("monitor.video_interval", integer, "control steps of each world from one video to the next"),
+    "--logdir": ("logdir", str, "folder of all runs (default: logs)"),
+    "--name": ("name", str, "word added to the name of the run folder"),
+    "--device": ("device", str, "auto, cpu, gpu, gpu:1 or cuda:0 (default: auto)"),
+    "--devices": ("devices", str, "number of devices that share the worlds, or all"),
+    "--cache_dir": ("cache_dir", str, "folder of compiled programs, or off (default: $BAYESSIM_MJX_CACHE)"),
+}
+CHECKPOINTS = {
+    "play": "policy to play (default: best)",
+    "gap_loop": "policies to evaluate in place of training new ones on the simulator as it was",
+}
+METAVARS = {str: "TEXT", integer: "N"} | {
+    "--devices": "N|all",
+    "--logdir": "DIR",
+    "--name": "NAME",
+    "--device": "NAME",
+    "--cache_dir": "DIR",
+}
+RESUMABLE = (
+    "--device", "--devices", "--cache_dir", "--video", "--video_length", "--video_interval", "--headless", "--resume",
+    trust.FLAG,
+)  # fmt: skip
+
+
+def prog_of(command: str) -> str:
+    """How `command` was started, for its usage line: by the console script or as a module."""
+    script = Path(sys.argv[0]).stem == SCRIPT
+    return f"{SCRIPT} {command.replace('_', '-')}" if script else f"python -m bayessim_mjx.{command}"
+
+
+class PlainParser(argparse.ArgumentParser):
+    """Flags; what is wrong with them is a UserError. The usage line does not repeat the list of options."""
+
+    def __init__(self, **options: Any):
+        plain: dict[str, Any] = {"usage": "%(prog)s [options]", "allow_abbrev": False}
+        super().__init__(**(plain | options))
+        self.add_argument("--version", action=Version, nargs=0, help="print the version and stop")
+
+    def trusting(self) -> None:
+        """Add the flag that lets code run which settings name."""
+        text = "allow settings to use effects from this Python file; repeat for more files (docs/trust.md)"
+        self.add_argument(trust.FLAG, metavar="FILE", action=Allow, default=[], help=text)
+
+    def error(self, message: str) -> NoReturn:
+        raise UserError(message.removeprefix("argument "))
+
+
+class Version(argparse.Action):
+    """Prints the version of this package, and those of what decides its results, and stops."""
+
+    def __call__(self, parser: Any, *_: Any, **__: Any) -> None:
+        from bayessim_mjx.versions import versions
+
+        found = versions()
+        others = ", ".join(f"{name} {found[name]}" for name in ("python", "jax", "mujoco") if name in found)
+        print(f"{SCRIPT} {found.get(SCRIPT, 'not installed')} ({others})")
+        parser.exit()
+
+
+class Allow(argparse.Action):
+    """Takes a file of code and allows it."""
+
+    def __call__(self, parser: Any, namespace: Any, value: Any, option: str | None = None) -> None:
+        if not Path(value).is_file():
+            raise UserError(f"{option} {value}: no such file; give the Python file that is to run")
+        trust.allow([value])
+        setattr(namespace, self.dest, [*getattr(namespace, self.dest), value])
+
+
+class Parser(PlainParser):
+    """Flags of one command and `section.key=value` overrides; all that is wrong is a UserError."""
+
+    def __init__(
+        self,
+        prog: str,
+        description: str,
+        resume: bool = False,
+        without: Sequence[str] = (),
+        unused: Sequence[str] = (),
+        but: Sequence[str] = (),
+    ):
+        """`without`: flags, and `unused`: sections of settings (`but` these keys), that the command does not take."""
+        usage = "%(prog)s [options] [section.key=value ...]"
+        super().__init__(prog=prog_of(prog), description=description, usage=usage)
+        self.command, self.without, self.unused, self.but = prog, without, unused, but
+        self.add_argument("--task", metavar="NAME", help="name of the task; --list_tasks prints them")
+        for flag, (_, kind, text) in FLAGS.items():
+            if flag in without:
+                continue
+            shown = METAVARS.get(flag, METAVARS.get(kind))
+            options: dict[str, Any] = {"action": "store_true"} if kind is None else {"type": kind, "metavar": shown}
+            self.add_argument(flag, default=None, help=text, **options)
+        self.trusting()
+        self.add_argument("--cfg_env", metavar="FILE", help="YAML file with settings, read after cfg/<task>.yaml")
+        self.add_argument("--cfg_train", metavar="FILE", help="YAML file with PPO settings")
+        self.add_argument(
+            "--checkpoint", metavar="PATH|latest|best", help=CHECKPOINTS.get(prog, "policy to start from")
+        )
+        self.add_argument("--use_last_checkpoint", action="store_true", help="same as --checkpoint latest")
+        self.add_argument("--headless", action="store_true", help="plain lines instead of progress bars")
+        self.add_argument("--list_tasks", action="store_true", help="print the names of the tasks and stop")
+        if resume:
+            self.add_argument("--resume", metavar="RUN", help="continue an interrupted run")
+        self.epilog = "section.key=value changes any setting, for example bayessim.components=5 (see cfg/*.yaml)"
+
+    def parse(self, argv: Sequence[str] | None) -> argparse.Namespace:
+        """Namespace with the flags, `overrides`, and `given` (flags that were used)."""
+        argv = list(sys.argv[1:] if argv is None else argv)
+        args, rest = self.parse_known_args(argv)
+        for text in rest:
+            if text.split("=")[0] in self.without:
+                raise UserError(f"{text.split('=')[0]}: {self.command} has no use for it")
+            if text.startswith("-"):
+                raise unknown("flag", text.split("=")[0], sorted(self._option_string_actions))
+            if "=" not in text:
+                raise UserError(f"{text!r} is neither a flag nor an override section.key=value")
+        args.overrides = rest
+        args.idle = [key for key in (text.split("=")[0] for text in rest) if self._has_no_use_for(key)]
+        args.command = self.command
+        args.given = [a.split("=")[0] for a in argv if a.startswith("--")]
+        if args.use_last_checkpoint:
+            if args.checkpoint not in (None, "latest"):
+                raise UserError(f"--use_last_checkpoint and --checkpoint {args.checkpoint}: give one of them")
+            args.checkpoint = "latest"
+        return args
+
+    def _has_no_use_for(self, key: str) -> bool:
+        return key.split(".")[0] in self.unused and key not in self.but

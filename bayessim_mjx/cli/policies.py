@@ -1,0 +1,81 @@
+"""Checkpoints by name, and the policies in them."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from bayessim_mjx.config import Config, replace
+from bayessim_mjx.errors import UserError
+
+if TYPE_CHECKING:
+    from bayessim_mjx.runs import Run
+
+
+def find_checkpoint(which: str, task: str | None, logdir: str) -> tuple[Path, "Run | None"]:
+    """(checkpoint folder, its run) for "latest", "best" (of the task's newest run) or a run's or checkpoint's path."""
+    from bayessim_mjx.runs import MANIFEST, Run, checkpoints, latest_run
+
+    if which in ("latest", "best"):
+        if not task:
+            raise UserError(f"--checkpoint {which}: give --task NAME, or the path of a run")
+        run = latest_run(logdir, task)
+        return run.checkpoint(which), run
+    path = Path(which)
+    if (path / MANIFEST).is_file():
+        run = Run.open(path)
+        return run.checkpoint("latest" if run.manifest["best"] is None else "best"), run
+    if not path.is_dir():
+        raise UserError(f"--checkpoint {which}: no such folder; give a run, one of its checkpoints, latest or best")
+    checkpoints.read_index(path)
+    parents = path.absolute().parents
+    return path, Run.open(parents[1]) if (parents[1] / MANIFEST).is_file() else None
+
+
+def pin_policy(config: Config) -> Config:
+    """`bayessim.policyCheckpt` as the path of one checkpoint folder, which has to be there."""
+    if config.bayessim.policyCheckpt is None:
+        return config
+    path, _ = find_checkpoint(config.bayessim.policyCheckpt, config.task, config.logdir)
+    return replace(config, bayessim={"policyCheckpt": str(path.absolute())})
+
+
+def load_policy(path: Path, env: Any, config: Config) -> Any:
+    """The policy in a checkpoint folder; its networks have to be those of `config`."""
+    import jax
+
+    from bayessim_mjx import rl
+    from bayessim_mjx.runs import checkpoints
+
+    make = lambda key: rl.policy_of(rl.init(env, config.ppo, key))  # noqa: E731
+    return checkpoints.restore(path, {"policy": jax.eval_shape(make, jax.random.PRNGKey(0))})[0]["policy"]
+
+
+def privileged(config: Config, env: Any) -> tuple[Any, Any]:
+    """(`env` as the policy of `config` is trained in it, the teacher of ppo.teacher or None)."""
+    from bayessim_mjx.rl import privileged as shown
+    from bayessim_mjx.rl import recurrent
+
+    if config.ppo.memory:
+        env = recurrent.remembering(env, config.ppo.memory_size)
+    if config.ppo.policy_theta:
+        env = shown.for_policy(env)
+    if config.ppo.teacher is None:
+        return env, None
+    path, run = find_checkpoint(config.ppo.teacher, None, "")
+    settings = config if run is None else run.config
+    seen = shown.for_policy(env) if settings.ppo.policy_theta else env
+    teacher = load_policy(path, seen, settings)
+    return (shown.for_teacher(env) if settings.ppo.policy_theta else env), teacher
+
+
+def warm_start(train: Any, config: Config, env: Any) -> Any:
+    """The training state with actor and normaliser of `bayessim.policyCheckpt`, if that is set; the critic is new.
+
+    `main` and `train` call it for the state that a run begins with, not when they resume one. `loop.init` does not read
+    files: a program of your own that is to start from a policy calls this on `loop.init(parts).train`. With
+    `bayessim.ftuneRL=False` only round 0 starts from the policy, as later rounds train new ones.
+    """
+    if config.bayessim.policyCheckpt is None:
+        return train
+    policy = load_policy(Path(config.bayessim.policyCheckpt), env, config)
+    normalizer = {**train.normalizer, "policy": policy.normalizer}
+    return train.replace(params={**train.params, "actor": policy.actor}, normalizer=normalizer)

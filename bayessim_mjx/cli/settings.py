@@ -1,0 +1,73 @@
+"""The configuration that flags ask for, and the names of tasks."""
+
+import argparse
+import dataclasses
+import random
+import sys
+import warnings
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from bayessim_mjx.cli.flags import FLAGS, RESUMABLE
+from bayessim_mjx.config import Config, load
+from bayessim_mjx.errors import UserError, unknown
+
+if TYPE_CHECKING:
+    from bayessim_mjx.runs import Run
+
+
+def config_of(args: argparse.Namespace, more: Mapping[str, tuple[str, Any]] | None = None) -> Config:
+    """The configuration that flags (and `more` like them), files and overrides ask for; the task has to exist."""
+    flags = dict(more or {})
+    for flag, (key, _, _) in FLAGS.items():
+        value = getattr(args, flag[2:], None)  # not every command has every flag
+        if value is not None:
+            drawn = flag == "--seed" and value == -1
+            flags[flag] = (key, random.SystemRandom().randrange(10_000) if drawn else value)
+    task = args.task and task_name(args.task)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", UserWarning)
+        settings = load(task, cfg_env=args.cfg_env, cfg_train=args.cfg_train, flags=flags, overrides=args.overrides)
+    for warning in caught:
+        print(f"note: {warning.message}", file=sys.stderr)
+    task_name(settings.task)
+    if args.idle:
+        raise UserError(f"{args.idle[0]}: {args.command} has no use for it")
+    return settings
+
+
+def resumed_config(args: argparse.Namespace, config: Config) -> Config:
+    """The settings of the run to resume, with what may change: devices, cache and videos. Anything else is refused."""
+    fixed = [flag for flag in args.given if flag not in RESUMABLE] + list(args.overrides)
+    if fixed:
+        raise UserError(f"--resume goes on with the run's own settings, which {fixed[0]} would change; start a new run")
+    video = {k: getattr(args, k) for k in ("video_length", "video_interval", "video") if getattr(args, k) is not None}
+    top = {k: getattr(args, k) for k in ("device", "devices", "cache_dir") if getattr(args, k) is not None}
+    monitor = dataclasses.replace(config.monitor, **video)
+    return dataclasses.replace(config, monitor=monitor, **top)
+
+
+def say_changes(run: "Run", console: Any) -> None:
+    """Warn of all that is not as it was when the run to go on with was started; its manifest keeps it."""
+    for text in run.resumed():
+        console.warning(f"changed since the run was started: {text}")
+
+
+def task_name(name: str) -> str:
+    """The task's proper name; UserError with the close ones where there is none."""
+    from bayessim_mjx import registry
+
+    if ":" in name:
+        return name
+    known = {title.lower(): title for title in registry.names()}
+    if name.lower().replace("_", "") not in known:
+        raise unknown("--task", name, [*known.values(), *(f"{prefix}:<env>" for prefix in registry.EXTERNAL)])
+    return known[name.lower().replace("_", "")]
+
+
+def list_tasks() -> int:
+    """Print the names of our own tasks."""
+    from bayessim_mjx import registry
+
+    print("\n".join(registry.names()))
+    return 0
