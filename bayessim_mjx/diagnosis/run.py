@@ -101,7 +101,7 @@ def _verified(setup: Setup, race: search.Race, say: Progress) -> Model:
 
 def _disturbance(setup: Setup, race: search.Race) -> Disturbance | None:
     """The force that the recalibrated simulator lacks, where its gap is above the noise."""
-    return estimate(setup.fitter, race.base.job) if race.above_noise(race.base) else None
+    return estimate(setup.fitter, race.base.fit) if race.above_noise(race.base) else None
 
 
 def _flexible(setup: Setup, model: Model, race: search.Race, missing: Disturbance | None = None) -> Flexible | None:
@@ -110,4 +110,4 @@ def _flexible(setup: Setup, model: Model, race: search.Race, missing: Disturbanc
         return None
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        return flexible(setup.fitter, model.job, missing)
+        return flexible(setup.fitter, model.fit, missing)

@@ -69,8 +69,8 @@ def told(found: Findings, model: Model) -> Said:
     closed = closure(found, model)
     effects = []
     for effect in model.effects:
-        own = [model.job.names.index(c.name) for c in effect.coordinates]
-        numbers = {model.job.names[i].rsplit(".", 1)[1]: {"mean": model.job.values[i], "sd": sd[i]} for i in own}
+        own = [model.fit.names.index(c.name) for c in effect.coordinates]
+        numbers = {model.fit.names[i].rsplit(".", 1)[1]: {"mean": model.fit.values[i], "sd": sd[i]} for i in own}
         effects.append(_named(effect.effect, effect.where, numbers, closed / len(model.effects)))
     return {"verdict": "effects", "effects": effects}
 
@@ -87,8 +87,8 @@ def refit(found: Findings) -> Said:
 
 def bic(model: Model, spread: np.ndarray) -> float:
     """N log(RSS / N) + k log N (Schwarz, 1978) in sample, every residual counted as independent."""
-    q, _ = model.job.quadratic(spread)
-    n = model.job.r.size
+    q, _ = model.fit.quadratic(spread)
+    n = model.fit.r.size
     return float(n * np.log(q.c.sum() / n) + model.size * np.log(n))
 
 
@@ -100,9 +100,9 @@ def naive_bic(found: Findings) -> Said:
 
 def fold_error(race: Race, model: Model, test: np.ndarray) -> float:
     """Cost of the windows `test` `[W]` (bool) under the estimates from the others, by one Newton step from the fit."""
-    q, _ = model.job.quadratic(race.fitter.spread)
-    precision, pull, low, high = model.job.prior()
-    g, S = q.weighted(model.job.weight * ~test)
+    q, _ = model.fit.quadratic(race.fitter.spread)
+    precision, pull, low, high = model.fit.prior()
+    g, S = q.weighted(model.fit.weight * ~test)
     p = solve(S + np.diag(precision + TRUST * np.diag(S)), g + pull, low, high)
     return float(np.maximum(q.at(p)[test], 0.0).sum())
 
@@ -140,7 +140,7 @@ def classifier(found: Findings) -> Said:
     from lda import classify
 
     race = found.race
-    effect = classify(race.fitter, race.base.job, race.candidates, np.random.default_rng(found.setup.seed))
+    effect = classify(race.fitter, race.base.fit, race.candidates, np.random.default_rng(found.setup.seed))
     return told(found, race.base if effect is None else fitted(race, [effect]))
 
 

@@ -40,27 +40,27 @@ def prepare(folder: Path, effects: Any, without: str | None) -> tuple[float, flo
 
 def fit_base(fitter: Fitter) -> Any:
     """The known parameters, as the race begins."""
-    job = fitter.begin(fitter.base)
-    fitter.iterate([job], 10, lambda j: range(len(j.coordinates)))
-    return fitter.refresh(job)
+    fit = fitter.begin(fitter.base)
+    (fit,) = fitter.iterate([fit], 10, lambda f: range(len(f.coordinates)))
+    return fitter.refresh(fit)
 
 
 def fit(folder: Path, without: str) -> dict:
     """The parameter fit alone. `x`: {name as in truth.json: factor}."""
     reading, compiling, setup = prepare(folder, (), without)
-    fitting, job = timed(lambda: fit_base(setup.fitter))
+    fitting, fit = timed(lambda: fit_base(setup.fitter))
     names = [f"{p.target}.{p.attribute}" for p in setup.robot.space.parameters]
-    return {"prepare": reading, "compile": compiling, "fit": fitting, "x": dict(zip(names, job.values, strict=True))}
+    return {"prepare": reading, "compile": compiling, "fit": fitting, "x": dict(zip(names, fit.values, strict=True))}
 
 
 def race_all(folder: Path) -> tuple[dict, list[Candidate]]:
     """Screening of all candidates and the fits of all singles that could gain, each in its share of the whole."""
     reading, compiling, setup = prepare(folder, "all", None)
     fitter, settings = setup.fitter, dataclasses.replace(setup.settings, singles=len(setup.candidates))
-    known, job = timed(lambda: fit_base(fitter))
-    model = scored(fitter, job, ())
-    tried = race.Race(fitter, setup.candidates, settings, job, model, winner=model)
-    screening, tried.screened = timed(lambda: screen(fitter, job, setup.candidates, settings.screened))
+    known, fit = timed(lambda: fit_base(fitter))
+    model = scored(fitter, fit, ())
+    tried = race.Race(fitter, setup.candidates, settings, fit, model, winner=model)
+    screening, tried.screened = timed(lambda: screen(fitter, fit, setup.candidates, settings.screened))
     singles, models = timed(lambda: _singles(tried))
     assert fitter.simulator.traces == 1
     out = {"candidates": len(setup.candidates), "fitted": len(models), "prepare": reading, "compile": compiling}

@@ -71,12 +71,12 @@ def draw(candidate: Candidate, rng: np.random.Generator) -> tuple[Array, tuple[i
 class Outside:
     """Projects whitened gaps `[..., W, n]` onto what base parameters inside their bounds and start states cannot do."""
 
-    def __init__(self, job: Any, own: Array) -> None:
-        self.starts = np.linalg.qr(job.B[own])[0]
-        _, _, below, above = job.prior()
+    def __init__(self, fit: Any, own: Array) -> None:
+        self.starts = np.linalg.qr(fit.B[own])[0]
+        _, _, below, above = fit.prior()
         inside = np.minimum(-below, above) > 1e-6 * (above - below)
-        A = self._without_starts(np.moveaxis(job.A[own][:, :, inside], 2, 0))
-        flat = A.reshape(len(A), own.size * job.A.shape[1]).T
+        A = self._without_starts(np.moveaxis(fit.A[own][:, :, inside], 2, 0))
+        flat = A.reshape(len(A), own.size * fit.A.shape[1]).T
         left, size, _ = np.linalg.svd(flat, full_matrices=False)
         self.base = left[:, size > 1e-6 * max(size.max(initial=0.0), 1e-300)]
 
@@ -88,24 +88,24 @@ class Outside:
         return flat - (flat @ self.base) @ self.base.T
 
 
-def classify(fitter: Any, job: Any, candidates: Sequence[Candidate], rng: np.random.Generator) -> Candidate | None:
-    """The candidate whose simulations look most like the gap that the fitted job leaves; None: looks like noise.
+def classify(fitter: Any, fit: Any, candidates: Sequence[Candidate], rng: np.random.Generator) -> Candidate | None:
+    """The candidate whose simulations look most like the gap that the fit leaves; None: looks like noise.
 
     The simulations stand on the recalibrated simulator, with fresh noise; those that noise hides teach nothing.
     """
-    own = np.unique(np.linspace(0, len(job.r) - 1, min(len(job.r), WINDOWS)).round().astype(int))
+    own = np.unique(np.linspace(0, len(fit.r) - 1, min(len(fit.r), WINDOWS)).round().astype(int))
     each = int(np.clip(SIMULATED // max(len(candidates), 1), FEW, MANY))
     thetas, drawn = [], []
     for i, candidate in enumerate(candidates):
         for _ in range(each):
             values, kind = draw(candidate, rng)
             drawn.append((i, *kind))
-            thetas.append(fitter.vector((*job.coordinates, *candidate.coordinates), np.append(job.values, values)))
-    offsets = np.repeat(job.offsets[None], len(thetas), 0)[:, own]
+            thetas.append(fitter.vector((*fit.coordinates, *candidate.coordinates), np.append(fit.values, values)))
+    offsets = np.repeat(fit.offsets[None], len(thetas), 0)[:, own]
     # reality minus the recalibrated simulator, were the candidate reality
-    column = job.r[own] - fitter.whiten(fitter.simulator.run(np.stack(thetas), offsets, own))
-    outside = Outside(job, own)
-    clean, recorded = outside(column), outside(job.r[own])
+    column = fit.r[own] - fitter.whiten(fitter.simulator.run(np.stack(thetas), offsets, own))
+    outside = Outside(fit, own)
+    clean, recorded = outside(column), outside(fit.r[own])
     noise = outside(rng.normal(size=column.shape))
     loud = np.linalg.norm(noise, axis=1)
     if np.linalg.norm(recorded) < QUIET * loud.max():

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate, Coordinate
-from bayessim_mjx.diagnosis.fitting.fitter import Job
+from bayessim_mjx.diagnosis.fitting.fitter import Fit
 from bayessim_mjx.diagnosis.selection.models import Model
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks" / "diagnosis"))
@@ -36,12 +36,12 @@ def model(r: np.ndarray, own: list[int]) -> Model:
     for w in range(WINDOWS):
         blocks[w, :, w] = STARTS[w, :, 0]
     design = np.concatenate([A, blocks], 2).reshape(WINDOWS * SAMPLES, -1)
-    fit = np.linalg.lstsq(design, r.ravel(), rcond=None)[0]
+    x = np.linalg.lstsq(design, r.ravel(), rcond=None)[0]
     k = len(own)
-    left = (r.ravel() - design @ fit).reshape(r.shape)
+    left = (r.ravel() - design @ x).reshape(r.shape)
     coordinates = tuple(coordinate(f"p{i}", i) for i in own)
-    job = Job(coordinates, fit[:k], fit[k:, None], left, A, STARTS, np.ones(WINDOWS), float(np.sum(left**2)))
-    return Model((), job, np.ones(WINDOWS), np.zeros((2, k)), 1.0)
+    fit = Fit(coordinates, x[:k], x[k:, None], left, A, STARTS, np.ones(WINDOWS), float(np.sum(left**2)))
+    return Model((), fit, np.ones(WINDOWS), np.zeros((2, k)), 1.0)
 
 
 def test_bic_is_schwarz_on_the_least_squares_residual():
@@ -49,7 +49,7 @@ def test_bic_is_schwarz_on_the_least_squares_residual():
     small, right = model(r, [0]), model(r, [0, 1])
     n = r.size
     for m in (small, right):
-        expected = n * np.log(np.sum(m.job.r**2) / n) + m.size * np.log(n)
+        expected = n * np.log(np.sum(m.fit.r**2) / n) + m.size * np.log(n)
         assert baselines.bic(m, SPREAD) == pytest.approx(expected, rel=1e-6)
     assert baselines.bic(right, SPREAD) < baselines.bic(small, SPREAD)
 
@@ -79,7 +79,7 @@ class Line:
 RECORDED = np.zeros((WINDOWS, SAMPLES))
 
 
-def toy(size: float) -> tuple[SimpleNamespace, Job, list[Candidate]]:
+def toy(size: float) -> tuple[SimpleNamespace, Fit, list[Candidate]]:
     """Reality has `size` of the second effect; noise of 1."""
     RECORDED[:] = size * COLUMNS[:, :, 2] + np.random.default_rng(5).normal(size=RECORDED.shape)
     fitter = SimpleNamespace(
@@ -89,15 +89,15 @@ def toy(size: float) -> tuple[SimpleNamespace, Job, list[Candidate]]:
     )
     base = Coordinate("base", (0,), 0.0, -1.0, 1.0)
     blank = np.zeros((WINDOWS, 1))
-    job = Job((base,), np.zeros(1), blank, RECORDED, COLUMNS[:, :, :1], STARTS, np.ones(WINDOWS), 0.0)
+    fit = Fit((base,), np.zeros(1), blank, RECORDED, COLUMNS[:, :, :1], STARTS, np.ones(WINDOWS), 0.0)
     one = [Coordinate(n, (i,), 0.0, -20.0, 20.0) for i, n in ((1, "first"), (2, "second"))]
-    return fitter, job, [Candidate(c.name, "here", "joint", (c,), (False,)) for c in one]
+    return fitter, fit, [Candidate(c.name, "here", "joint", (c,), (False,)) for c in one]
 
 
 @pytest.mark.parametrize(("size", "expected"), [(6.0, "second"), (-6.0, "second"), (0.0, None)])
 def test_the_classifier_knows_a_direction_either_way_and_noise(size, expected):
-    fitter, job, candidates = toy(size)
-    found = lda.classify(fitter, job, candidates, np.random.default_rng(1))
+    fitter, fit, candidates = toy(size)
+    found = lda.classify(fitter, fit, candidates, np.random.default_rng(1))
     assert (found and found.effect) == expected
 
 

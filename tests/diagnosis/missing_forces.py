@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 
 from bayessim_mjx.diagnosis.fitting import candidates, robot, windows
-from bayessim_mjx.diagnosis.fitting.fitter import Fitter, Job
+from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 from bayessim_mjx.diagnosis.fitting.simulator import Simulator
 from bayessim_mjx.logs import Channels, Log, estimate_velocity
 from bayessim_mjx.physics import Physics
@@ -70,14 +70,14 @@ def record(
     return out
 
 
-def fitted(logs: list[Log], iterations: int = 8) -> tuple[Fitter, Job]:
+def fitted(logs: list[Log], iterations: int = 8) -> tuple[Fitter, Fit]:
     """The simulator's own parameters fitted to the logs, with fresh columns."""
     model = arm(logs[0].qpos.shape[1], STEP)
     space = robot.default_space(model)
     physics = Physics(model, DT, space, ())
     cut = windows.cut(logs, model, DT, physics.substeps, 25, limit=64)
     fitter = Fitter(Simulator(physics, cut, lanes=512), candidates.base_coordinates(space), physics.space.nominal)
-    job = fitter.begin(fitter.base)
+    fit = fitter.begin(fitter.base)
     if iterations:
-        fitter.iterate([job], iterations, lambda j: range(len(j.coordinates)))
-    return fitter, fitter.refresh(job)
+        (fit,) = fitter.iterate([fit], iterations, lambda f: range(len(f.coordinates)))
+    return fitter, fitter.refresh(fit)

@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from bayessim_mjx.diagnosis.fitting import robot, windows
-from bayessim_mjx.diagnosis.fitting.fitter import Fitter, Job
+from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 from bayessim_mjx.diagnosis.setup import Setup
 from bayessim_mjx.logs import Channels, Log, estimate_velocity, write_log
 
@@ -85,15 +85,15 @@ def _one(
     return Log(f"log{i}", time, ctrl[:, None], qpos, qvel, False, channels, noise, spread, metadata=metadata)
 
 
-def fitted(setup: Setup) -> tuple[Fitter, Job]:
+def fitted(setup: Setup) -> tuple[Fitter, Fit]:
     """The fit of the known parameters alone."""
     fitter = setup.fitter
-    job = fitter.begin(fitter.base)
-    fitter.iterate([job], 8, lambda j: range(len(j.coordinates)))
-    return fitter, fitter.refresh(job)
+    fit = fitter.begin(fitter.base)
+    (fit,) = fitter.iterate([fit], 8, lambda f: range(len(f.coordinates)))
+    return fitter, fitter.refresh(fit)
 
 
-def refit(setup: Setup, logs: list[Log]) -> tuple[Fitter, Job]:
+def refit(setup: Setup, logs: list[Log]) -> tuple[Fitter, Fit]:
     """`fitted` on other logs of the same number and length, by the program that is already compiled."""
     simulator = copy.copy(setup.fitter.simulator)
     old, model, physics = simulator.windows, setup.physics.mj_model, setup.physics

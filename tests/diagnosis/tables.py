@@ -36,15 +36,15 @@ class Table:
         for module in (race, search, verdict):
             for name, instead in (("fit_models", self.fit), ("polish", lambda race, m: m), ("screen", self.screen)):
                 monkeypatch.setattr(module, name, instead, raising=False)
-        monkeypatch.setattr(race, "deviations", lambda fitter, model: np.full(len(model.job.names), 0.1))
+        monkeypatch.setattr(race, "deviations", lambda fitter, model: np.full(len(model.fit.names), 0.1))
 
     def model(self, effects):
         error = min(value for laws, value in self.errors.items() if laws <= set(effects))
         coordinates = [c for effect in effects for c in effect.coordinates]
         names, values = [c.name for c in coordinates], np.ones(len(coordinates))
-        job = SimpleNamespace(coordinates=coordinates, names=names, values=values)
+        fit = SimpleNamespace(coordinates=coordinates, names=names, values=values)
         cost = NOISE * error * (1 + 0.01 * np.cos(np.arange(WINDOWS)))
-        return Model(tuple(effects), job, cost, np.zeros((WINDOWS, len(names))), 1e4)
+        return Model(tuple(effects), fit, cost, np.zeros((WINDOWS, len(names))), 1e4)
 
     def fit(self, race, plans, label, say):
         models = [self.model((*model.effects, extra.candidate)) for model, extra in plans]
@@ -52,7 +52,7 @@ class Table:
         return models
 
     @staticmethod
-    def screen(fitter, job, candidates, screened):
+    def screen(fitter, fit, candidates, screened):
         return [SimpleNamespace(candidate=c, start=None, gain=1.0, absorbed=0.0, column=None) for c in candidates]
 
     def tried(self, *singles):

@@ -179,14 +179,14 @@ def test_the_floor_is_what_repeats_differ_by(monkeypatch):
     fitter = SimpleNamespace(
         simulator=simulator, used=np.array([True, False]), sigma=np.array([sigma]), spread=np.array([10.0, 10.0])
     )
-    job = SimpleNamespace(B=B, offsets=np.zeros((count, 2)))
+    fit = SimpleNamespace(B=B, offsets=np.zeros((count, 2)))
     monkeypatch.setattr(repeated.noise, "repeats", lambda logs: [logs[:2]])
-    prediction, group = repeated.floor(fitter, job, logs)
+    prediction, group = repeated.floor(fitter, fit, logs)
     assert len(group) == count
     # two of ten numbers of a window go into its start state
     assert np.sqrt(prediction.cost(steps).mean() / 0.8) == pytest.approx(np.sqrt(5.0), rel=0.05)
     monkeypatch.setattr(repeated.noise, "repeats", lambda logs: [])
-    assert repeated.floor(fitter, job, logs) is None
+    assert repeated.floor(fitter, fit, logs) is None
 
 
 def test_without_repeats_the_floor_is_the_noise_whatever_was_tried():

@@ -163,7 +163,7 @@ def _article(name: str) -> str:
 
 def _sharpening(scorer: Any, chosen: Any, action: str) -> str:
     index, variance = scorer.loosest(0)
-    c = scorer.models[0].job.coordinates[index]
+    c = scorer.models[0].fit.coordinates[index]
     before = math.sqrt(variance)
     after = before * math.exp(-chosen.evidence)
     return f"{action}: sharpens {c.name}, standard deviation from {before:.2g} to {after:.2g} {c.unit}".rstrip()

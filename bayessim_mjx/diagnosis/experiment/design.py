@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.experiment.rehearsal import Played
 from bayessim_mjx.diagnosis.fitting import windows
-from bayessim_mjx.diagnosis.fitting.fitter import Fitter, Job
+from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 from bayessim_mjx.diagnosis.fitting.quadratic import eliminate, solve
 from bayessim_mjx.diagnosis.selection.models import Model
 
@@ -49,7 +49,7 @@ class Scorer:
 
     def __init__(self, setup: Setup, models: Sequence[Model], weights: Array, seed: int = 0) -> None:
         self.setup, self.fitter, self.models, self.weights = setup, setup.fitter, list(models), weights
-        count = models[0].job.r.size
+        count = models[0].fit.r.size
         self.ratio = np.array([min(m.samples / count, 1.0) for m in models])
         self.misfit = np.array([max(m.total / count, 0.5) for m in models])
         self.posterior = [self._posterior(m, k) for m, k in zip(models, self.ratio / self.misfit, strict=True)]
@@ -57,9 +57,9 @@ class Scorer:
         self.draws = [self._draw(i, rng) for i in range(len(models))]
 
     def _posterior(self, model: Model, discount: float) -> Array:
-        q, _ = model.job.quadratic(self.fitter.spread)
-        _, S = q.weighted(model.job.weight)
-        return discount * S + np.diag(model.job.prior()[0])
+        q, _ = model.fit.quadratic(self.fitter.spread)
+        _, S = q.weighted(model.fit.weight)
+        return discount * S + np.diag(model.fit.prior()[0])
 
     def score(self, played: Sequence[Played], shift: Array, each: int) -> list[Array]:
         """Evidence `[M, M]` in nats of every experiment: row the truth, column the rival that adapts.
@@ -83,15 +83,15 @@ class Scorer:
             out.append(self._evidence(where, full / max(len(own), 1), full))
         return out
 
-    def _jobs(self, chunk: windows.Windows, shift: Array) -> list[Job]:
+    def _jobs(self, chunk: windows.Windows, shift: Array) -> list[Fit]:
         simulator = copy.copy(self.fitter.simulator)  # shares the compiled program
         simulator.windows = chunk
         fitter = _Shifted(self.fitter, simulator, shift)
-        jobs = [fitter.begin(m.job.coordinates, m.job.values) for m in self.models]
+        fits = [fitter.begin(m.fit.coordinates, m.fit.values) for m in self.models]
         self.fitter.simulator.rollouts = simulator.rollouts
-        return jobs
+        return fits
 
-    def _evidence(self, where: list[tuple[list[Job], NDArray[np.int64]]], scale: float, full: int) -> Array:
+    def _evidence(self, where: list[tuple[list[Fit], NDArray[np.int64]]], scale: float, full: int) -> Array:
         m = len(self.models)
         out = np.zeros((m, m))
         for i in range(m):
@@ -106,10 +106,10 @@ class Scorer:
         """|y_i(p_i + dq) - y_j(p_j + dp)|^2, summed over windows, starts free, as a quadratic in z = (dp, dq)."""
         size = self.models[j].size + self.models[i].size
         c, g, S = 0.0, np.zeros(size), np.zeros((size, size))
-        for jobs, some in where:
-            r, x = (jobs[j].r - jobs[i].r)[some], np.zeros_like(jobs[j].offsets[some])
-            A = np.concatenate([jobs[j].A[some], -jobs[i].A[some]], axis=2)
-            q, _ = eliminate(r, A, jobs[j].B[some], x, self.fitter.spread)
+        for fits, some in where:
+            r, x = (fits[j].r - fits[i].r)[some], np.zeros_like(fits[j].offsets[some])
+            A = np.concatenate([fits[j].A[some], -fits[i].A[some]], axis=2)
+            q, _ = eliminate(r, A, fits[j].B[some], x, self.fitter.spread)
             c, g, S = c + q.c.sum(), g + q.g.sum(0), S + q.S.sum(0)
         return float(c), g, S
 
@@ -132,7 +132,7 @@ class Scorer:
         k = self.models[j].size
         rest = c - 2 * float(g[k:] @ dq) + float(dq @ S[k:, k:] @ dq)
         pull = discount * (g[:k] - S[:k, k:] @ dq)
-        _, _, low, high = self.models[j].job.prior()
+        _, _, low, high = self.models[j].fit.prior()
         H = discount * S[:k, :k] + self.posterior[j]
         p = solve(H, pull, low, high)
         return max(discount * rest - 2 * float(pull @ p) + float(p @ H @ p), 0.0)
@@ -141,7 +141,7 @@ class Scorer:
         """Deviations `[DRAWS, k]` of model i's parameters, in pairs of opposite sign, kept inside their bounds."""
         covariance = np.linalg.pinv(self.posterior[i])
         half = rng.multivariate_normal(np.zeros(len(covariance)), covariance, DRAWS // 2, method="eigh")
-        _, _, low, high = self.models[i].job.prior()
+        _, _, low, high = self.models[i].fit.prior()
         return np.clip(np.concatenate([half, -half]), low, high)
 
     def _sharper(self, S: Array, i: int, scale: float) -> float:
@@ -153,7 +153,7 @@ class Scorer:
     def loosest(self, i: int) -> tuple[int, float]:
         """(index, variance) of model i's least certain parameter, relative to its range; effects' before known ones."""
         variance = np.diag(np.linalg.pinv(self.posterior[i]))
-        coordinates, base = self.models[i].job.coordinates, len(self.fitter.base)
+        coordinates, base = self.models[i].fit.coordinates, len(self.fitter.base)
         relative = np.sqrt(variance) / np.array([c.high - c.low for c in coordinates])
         first = base if len(coordinates) > base else 0
         worst = first + int(np.argmax(relative[first:]))

@@ -146,7 +146,7 @@ def _touched(joints: dict[str, int], models: Sequence[Model], model: Any) -> dic
 
 def _thetas(scorer: Scorer, shift: Array) -> Array:
     vector = scorer.fitter.vector
-    return np.stack([vector(m.job.coordinates, m.job.values) + shift for m in scorer.models])
+    return np.stack([vector(m.fit.coordinates, m.fit.values) + shift for m in scorer.models])
 
 
 def _look(scorer: Scorer, stage: Rehearsal, every: Sequence[Excitation]) -> list[Scored]:

@@ -1,14 +1,15 @@
 """Multiple shooting: bounded Levenberg-Marquardt for many candidate models in lockstep, so that one call simulates all.
 
-Each job has its own free coordinates; parameters common to all and start states keep the columns of the base fit until
-a refresh. Residuals are whitened by the noise; windows in which the simulation is far off everywhere are weighted down.
+A fit is a value: a step gives a new one. Each has its own free coordinates; parameters common to all and start states
+keep the columns of the base fit until a refresh. Residuals are whitened by the noise; windows in which the simulation
+is far off everywhere are weighted down.
 """
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,15 +22,15 @@ Array = NDArray[np.float64]
 START_STEP = 0.2  # of the spread of the start states, for their finite differences
 
 
-@dataclass(eq=False)
-class Job:
-    """One model being fitted.
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A model fitted so far.
 
     Attributes:
         coordinates: free ones; values: `[k]`; offsets: `[W, s]` of the start states.
         r: whitened residuals `[W, n]`; A: `[W, n, k]`, minus their derivatives; B: `[W, n, s]` by the start states.
-        weight: `[W]`; cost: weighted, priors included; damping: Levenberg's.
-        promise: by how much the step now tried would lower the cost if the model were linear.
+        weight: `[W]`; cost: weighted, priors included; damping: Levenberg's, of the next step.
+        promise: by how much the next step would lower the cost if the model were linear; history: costs, step by step.
         reach: `[W]`, share of their own steps that the start states make: less after one that did a window harm.
     """
 
@@ -43,7 +44,7 @@ class Job:
     cost: float
     damping: float = 1e-3
     promise: float = np.inf
-    history: list[float] = field(default_factory=list)
+    history: tuple[float, ...] = ()
     reach: Array = field(default_factory=lambda: np.ones(1))
 
     @property
@@ -119,120 +120,119 @@ class Fitter:
 
     def begin(
         self, coordinates: Sequence[Coordinate], values: Array | None = None, offsets: Array | None = None
-    ) -> Job:
-        """A job with fresh columns for everything."""
+    ) -> Fit:
+        """A fit with fresh columns for everything."""
         coordinates = tuple(coordinates)
         values = np.array([c.neutral for c in coordinates]) if values is None else np.asarray(values, float)
         offsets = np.zeros((len(self.simulator.windows), len(self.spread))) if offsets is None else offsets
-        job = Job(coordinates, values, offsets, np.empty(0), np.empty(0), np.empty(0), np.ones(len(offsets)), np.inf)
-        return self.refresh(job)
+        fit = Fit(coordinates, values, offsets, np.empty(0), np.empty(0), np.empty(0), np.ones(len(offsets)), np.inf)
+        return self.refresh(fit)
 
-    def refresh(self, job: Job) -> Job:
-        """Residuals and all columns anew at the job's point."""
-        theta = self.vector(job.coordinates, job.values)
-        thetas, steps = self._differences(job.coordinates, job.values, range(len(job.coordinates)))
-        offsets = np.repeat(job.offsets[None], 1 + len(thetas), 0)
+    def refresh(self, fit: Fit) -> Fit:
+        """Residuals and all columns anew at the fit's point."""
+        theta = self.vector(fit.coordinates, fit.values)
+        thetas, steps = self._differences(fit.coordinates, fit.values, range(len(fit.coordinates)))
+        offsets = np.repeat(fit.offsets[None], 1 + len(thetas), 0)
         r = self.whiten(self.simulator.run(np.stack([theta, *thetas]), offsets))
-        job.r = r[0]
-        job.A = _columns(r[0], r[1:], steps)
-        job.B = self.start_columns(theta, job.offsets, job.r)
-        job.weight = weights(job)
-        job.cost = self.cost(job, job.r, job.offsets, job.values)
-        return job
+        B = self.start_columns(theta, fit.offsets, r[0])
+        new = replace(fit, r=r[0], A=_columns(r[0], r[1:], steps), B=B, weight=weights(r[0]))
+        return replace(new, cost=self.cost(new, new.r, new.offsets, new.values))
 
-    def cost(self, job: Job, r: Array, offsets: Array, values: Array) -> float:
-        return float(job.weight @ self._each(r, offsets)) + job.penalty(values)
+    def cost(self, fit: Fit, r: Array, offsets: Array, values: Array) -> float:
+        return float(fit.weight @ self._each(r, offsets)) + fit.penalty(values)
 
     def _each(self, r: Array, offsets: Array) -> Array:
         return np.sum(r**2, 1) + np.sum((offsets / self.spread) ** 2, 1)
 
-    def derive(self, job: Job, extra: Sequence[Coordinate], values: Array) -> Job:
-        """A job with more coordinates, starting at `values` for these; its first columns come with the first step."""
-        own = tuple(job.coordinates) + tuple(extra)
-        blank = np.zeros((*job.r.shape, len(extra)))
-        start, columns = np.concatenate([job.values, values]), np.concatenate([job.A, blank], 2)
-        return Job(own, start, job.offsets, job.r, columns, job.B, job.weight, np.inf)
+    def derive(self, fit: Fit, extra: Sequence[Coordinate], values: Array) -> Fit:
+        """A fit with more coordinates, starting at `values` for these; its first columns come with the first step."""
+        own = tuple(fit.coordinates) + tuple(extra)
+        blank = np.zeros((*fit.r.shape, len(extra)))
+        start, columns = np.concatenate([fit.values, values]), np.concatenate([fit.A, blank], 2)
+        return Fit(own, start, fit.offsets, fit.r, columns, fit.B, fit.weight, np.inf)
 
     def iterate(
         self,
-        jobs: Sequence[Job],
+        fits: Sequence[Fit],
         iterations: int,
-        fresh: Callable[[Job], Sequence[int]],
+        fresh: Callable[[Fit], Sequence[int]],
         tolerance: float = 1e-3,
         progress: Callable[[int], None] | None = None,
-        keep: Callable[[int, Sequence[Job]], Sequence[Job]] | None = None,
-    ) -> None:
-        """Levenberg-Marquardt in lockstep, in place.
+        keep: Callable[[int, Sequence[Fit], Sequence[int]], Sequence[int]] | None = None,
+    ) -> list[Fit]:
+        """Levenberg-Marquardt in lockstep -> the fits where they came to, in order.
 
         Args:
-            jobs: to be fitted; iterations: steps at most.
-            fresh: columns of a job that are differenced anew at every point.
-            tolerance: a job rests when three steps gain less than this share of its cost.
-            progress: told how many jobs still run.
-            keep: (steps made, running jobs) -> those worth going on with.
+            fits: to be fitted; iterations: steps at most.
+            fresh: columns of a fit that are differenced anew at every point.
+            tolerance: a fit rests when three steps gain less than this share of its cost.
+            progress: told how many fits still run.
+            keep: (steps made, all fits, indices of those that run) -> indices of those worth going on with.
         """
-        state = {id(j): (j.values.copy(), j.offsets.copy()) for j in jobs}  # trial points
-        active = list(jobs)
+        now, trial = list(fits), [(f.values, f.offsets) for f in fits]
+        running: Sequence[int] = range(len(now))
         for made in range(iterations + 1):
-            if not active:
-                return
+            if not running:
+                return now
             plans, thetas, offsets = [], [], []
-            for job in active:
-                values, x = state[id(job)]
-                which = list(fresh(job))
-                shifted, steps = self._differences(job.coordinates, values, which)
-                plans.append((job, which, steps))
-                thetas += [self.vector(job.coordinates, values), *shifted]
+            for i in running:
+                values, x = trial[i]
+                which = list(fresh(now[i]))
+                shifted, steps = self._differences(now[i].coordinates, values, which)
+                plans.append((i, which, steps))
+                thetas += [self.vector(now[i].coordinates, values), *shifted]
                 offsets += [x] * (1 + len(shifted))
             r = self.whiten(self.simulator.run(np.stack(thetas), np.stack(offsets)))
             at = 0
-            for job, which, steps in plans:
+            for i, which, steps in plans:
                 own = r[at : at + 1 + len(which)]
                 at += 1 + len(which)
-                self._accept(job, *state[id(job)], own, which, steps)
-                state[id(job)] = self._propose(job)
-            active = [j for j in active if not _settled(j, tolerance)]
-            active = active if keep is None else list(keep(made, active))
+                now[i] = self._stepped(now[i], *trial[i], own, which, steps)
+                now[i], trial[i] = self._propose(now[i])
+            running = [i for i in running if not _settled(now[i], tolerance)]
+            running = running if keep is None else keep(made, now, running)
             if progress is not None:
-                progress(len(active))
+                progress(len(running))
+        return now
 
-    def _accept(
-        self, job: Job, values: Array, x: Array, r: Array, which: Sequence[int], steps: Sequence[float]
-    ) -> None:
-        cost = self.cost(job, r[0], x, values)
-        if cost < job.cost or not np.isfinite(job.cost):
-            if np.isfinite(job.cost) and len(which) < len(job.coordinates):
-                _broyden(job, values, x, r[0], which)
-            job.values, job.offsets, job.r, job.cost = values, x, r[0], cost
-            job.A = job.A.copy()
-            job.A[:, :, which] = _columns(r[0], r[1:], steps)
-            job.damping = max(job.damping / 5, 1e-7)
-            job.reach = np.minimum(2 * job.reach, 1.0)
+    def _stepped(
+        self, fit: Fit, values: Array, x: Array, r: Array, which: Sequence[int], steps: Sequence[float]
+    ) -> Fit:
+        """The fit at a trial point where that is better, else more damped where it was."""
+        cost = self.cost(fit, r[0], x, values)
+        if cost < fit.cost or not np.isfinite(fit.cost):
+            A = fit.A.copy()
+            if np.isfinite(fit.cost) and len(which) < len(fit.coordinates):
+                _broyden(A, fit, values, x, r[0], which)
+            A[:, :, which] = _columns(r[0], r[1:], steps)
+            fit = replace(fit, values=values, offsets=x, r=r[0], A=A, cost=cost)
+            damping, reach = max(fit.damping / 5, 1e-7), np.minimum(2 * fit.reach, 1.0)
         else:
-            job.damping *= 6
             # near a contact a start state's full step may be far too long, and no damping of the parameters shortens it
-            harmed = self._each(r[0], x) > self._each(job.r, job.offsets)
-            job.reach = np.where(harmed, 0.25, 1.0) * job.reach
-        job.history.append(job.cost)
+            harmed = self._each(r[0], x) > self._each(fit.r, fit.offsets)
+            damping, reach = fit.damping * 6, np.where(harmed, 0.25, 1.0) * fit.reach
+        return replace(fit, damping=damping, reach=reach, history=(*fit.history, fit.cost))
 
-    def _propose(self, job: Job) -> tuple[Array, Array]:
-        q, starts = job.quadratic(self.spread)
-        g, S = q.weighted(job.weight)
-        precision, pull, low, high = job.prior()
+    def _propose(self, fit: Fit) -> tuple[Fit, tuple[Array, Array]]:
+        """(the fit with its next step's promise, the point to be tried next: values and offsets)."""
+        q, starts = fit.quadratic(self.spread)
+        g, S = q.weighted(fit.weight)
+        precision, pull, low, high = fit.prior()
         S = S + np.diag(precision)
-        p = solve(S + job.damping * np.diag(np.diag(S)), g + pull, low, high)
-        by_starts = job.cost - job.penalty(job.values) - float(job.weight @ q.c)
-        job.promise = by_starts + float(2 * (g + pull) @ p - p @ S @ p)
-        return job.values + p, job.offsets + np.reshape(job.reach, (-1, 1)) * starts.step(job.A, p)
+        p = solve(S + fit.damping * np.diag(np.diag(S)), g + pull, low, high)
+        by_starts = fit.cost - fit.penalty(fit.values) - float(fit.weight @ q.c)
+        promise = by_starts + float(2 * (g + pull) @ p - p @ S @ p)
+        moved = fit.offsets + np.reshape(fit.reach, (-1, 1)) * starts.step(fit.A, p)
+        return replace(fit, promise=promise), (fit.values + p, moved)
 
-    def scores(self, job: Job, group: NDArray[np.int64] | None = None) -> tuple[Array, Array]:
+    def scores(self, fit: Fit, group: NDArray[np.int64] | None = None) -> tuple[Array, Array]:
         """Held-out costs `[W]` (unweighted) and estimates without each condition, relative to the fit `[G, k]`."""
-        q, starts = job.quadratic(self.spread)
-        precision, pull, low, high = job.prior()
+        q, starts = fit.quadratic(self.spread)
+        precision, pull, low, high = fit.prior()
         group = self.simulator.windows.group if group is None else group
-        watched = np.arange(len(self.base), len(job.coordinates))
-        split = functools.partial(blocks, q, starts, job.r, job.A)
-        return held_out(q, group, job.weight, precision, pull, low, high, watched, split)
+        watched = np.arange(len(self.base), len(fit.coordinates))
+        split = functools.partial(blocks, q, starts, fit.r, fit.A)
+        return held_out(q, group, fit.weight, precision, pull, low, high, watched, split)
 
 
 def _columns(r: Array, shifted: Array, steps: Sequence[float]) -> Array:
@@ -242,29 +242,29 @@ def _columns(r: Array, shifted: Array, steps: Sequence[float]) -> Array:
     return np.moveaxis((r[None] - shifted) / np.asarray(steps)[:, None, None], 0, -1)
 
 
-def _broyden(job: Job, values: Array, x: Array, r: Array, which: Sequence[int]) -> None:
-    """Rank-one correction of the columns that are not differenced anew, so that they explain the step just made."""
-    dp = values - job.values
+def _broyden(A: Array, fit: Fit, values: Array, x: Array, r: Array, which: Sequence[int]) -> None:
+    """Rank-one correction, in place, of the columns A not differenced anew, so that they explain the step just made."""
+    dp = values - fit.values
     kept = [i for i in range(len(dp)) if i not in set(which)]
     if not kept or not np.any(dp[kept]):
         return
-    missed = (job.r - r) - job.A @ dp - np.einsum("wns,ws->wn", job.B, x - job.offsets)
-    scaled = dp[kept] / np.array([job.coordinates[i].high - job.coordinates[i].low for i in kept]) ** 2
+    missed = (fit.r - r) - fit.A @ dp - np.einsum("wns,ws->wn", fit.B, x - fit.offsets)
+    scaled = dp[kept] / np.array([fit.coordinates[i].high - fit.coordinates[i].low for i in kept]) ** 2
     weight = scaled / max(float(scaled @ dp[kept]), 1e-300)
-    share = float(scaled @ dp[kept]) / max(float(np.sum((dp / [c.high - c.low for c in job.coordinates]) ** 2)), 1e-300)
-    job.A[:, :, kept] += share * missed[:, :, None] * weight[None, None, :]
+    share = float(scaled @ dp[kept]) / max(float(np.sum((dp / [c.high - c.low for c in fit.coordinates]) ** 2)), 1e-300)
+    A[:, :, kept] += share * missed[:, :, None] * weight[None, None, :]
 
 
-def weights(job: Job) -> Array:
+def weights(r: Array) -> Array:
     """Huber weights of whole windows: those far worse than the rest (a stop, a stick phase, a push) count less."""
-    each = np.sqrt(np.mean(job.r**2, 1))
+    each = np.sqrt(np.mean(r**2, 1))
     limit = 4.0 * np.median(each) + 1e-12
     return np.minimum(1.0, limit / np.maximum(each, 1e-300))
 
 
-def _settled(job: Job, tolerance: float) -> bool:
+def _settled(fit: Fit, tolerance: float) -> bool:
     """No step is promising, or those that were accepted gain little; refused ones are no sign of convergence."""
-    if job.promise < tolerance * abs(job.cost) / 3 or job.damping > 1e6:
+    if fit.promise < tolerance * abs(fit.cost) / 3 or fit.damping > 1e6:
         return True
-    last = list(dict.fromkeys(job.history))[-4:]  # accepted costs
+    last = list(dict.fromkeys(fit.history))[-4:]  # accepted costs
     return len(last) == 4 and np.isfinite(last[0]) and last[0] - last[-1] < tolerance * abs(last[-1])

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bayessim_mjx.diagnosis.fitting.fitter import Fitter, Job
+from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 from bayessim_mjx.diagnosis.fitting.quadratic import eliminate, solve
 from bayessim_mjx.diagnosis.residual.forcing import Linear, columns, linearise, node_basis
 
@@ -32,7 +32,7 @@ class Disturbance:
         gain: `[W, nv, m, m]`, expected mean = gain times a true force on this dof (the prior pulls to zero).
         amplitude: `[nv]`, prior standard deviation; memory: s, its correlation time.
         noise: factor on the standard deviation of the measurement noise.
-        values: `[k]`, the job's parameters, estimated together with the force.
+        values: `[k]`, the fit's parameters, estimated together with the force.
         evidence: log marginal likelihood; without: the same for no force at all.
         time: `[m]` s after the windows' starts.
         linear: what it was computed from.
@@ -63,27 +63,27 @@ class Disturbance:
 
 def estimate(
     fitter: Fitter,
-    job: Job,
+    fit: Fit,
     knots: int | None = None,
     *,
     linear: Linear | None = None,
     free: bool = True,
     rounds: int = 2,
 ) -> Disturbance:
-    """The smooth force that explains the job's residuals best.
+    """The smooth force that explains the fit's residuals best.
 
     Args:
         knots: nodes per window; None: as many as are cheap.
         linear: from `linearise`, None: made here.
-        free: the job's parameters are estimated with the force (within their bounds), else they stay.
+        free: the fit's parameters are estimated with the force (within their bounds), else they stay.
         rounds: how often the residuals are linearised anew around the estimate.
     """
-    linear = linearise(fitter, job, knots) if linear is None else linear
-    posterior = _strongest(fitter, job, linear, free)
+    linear = linearise(fitter, fit, knots) if linear is None else linear
+    posterior = _strongest(fitter, fit, linear, free)
     for _ in range(rounds):
-        linear = _relinearise(fitter, job, linear, posterior)
+        linear = _relinearise(fitter, fit, linear, posterior)
         posterior = _refined(replace(posterior, linear=linear), 6)
-    return _finish(fitter, job, posterior)
+    return _finish(fitter, fit, posterior)
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +91,7 @@ class _Posterior:
     """State of the search: hyperparameters and what follows from them."""
 
     linear: Linear
-    job: Job
+    fit: Fit
     free: bool
     memory: float  # in node spacings
     amplitude: Array
@@ -108,15 +108,15 @@ class _Posterior:
 
     def solved(self) -> _Posterior:
         """p by generalised least squares, then d given p; all windows at once."""
-        q, k = self.linear.quadratic, self.job.A.shape[2]
+        q, k = self.linear.quadratic, self.fit.A.shape[2]
         inner = np.linalg.inv(self.correlation)
         P = np.kron(np.diag(1 / self.amplitude**2), inner)
         S = q.S / self.noise
         cov = np.asarray(np.linalg.inv(S[:, k:, k:] + P), np.float64)
         gain = cov @ S[:, k:, :k]  # [W, nv m, k]
-        precision, pull, low, high = self.job.prior()
+        precision, pull, low, high = self.fit.prior()
         p = np.zeros(k)
-        weight = self.job.weight
+        weight = self.fit.weight
         if self.free and k:
             Spp = np.einsum("w,wij->ij", weight, S[:, :k, :k] - np.einsum("wdi,wdj->wij", S[:, k:, :k], gain))
             gp = weight @ (q.g[:, :k] / self.noise - np.einsum("wdi,wd->wi", gain, q.g[:, k:] / self.noise))
@@ -132,8 +132,8 @@ class _Posterior:
 
     def learnt(self) -> _Posterior:
         """One step of expectation maximisation for amplitudes and noise, then solved."""
-        q, k, nv = self.linear.quadratic, self.job.A.shape[2], len(self.linear.scale)
-        inner, weight = np.linalg.inv(self.correlation), self.job.weight
+        q, k, nv = self.linear.quadratic, self.fit.A.shape[2], len(self.linear.scale)
+        inner, weight = np.linalg.inv(self.correlation), self.fit.weight
         blocks = self.d.reshape(len(self.d), nv, -1)
         second = np.einsum("wvi,ij,wvj->wv", blocks, inner, blocks)
         cov = self.cov.reshape(len(self.d), nv, self.linear.nodes, nv, self.linear.nodes)
@@ -145,10 +145,10 @@ class _Posterior:
         return replace(self, amplitude=np.maximum(amplitude, 1e-7 * self.linear.scale), noise=noise).solved()
 
 
-def _strongest(fitter: Fitter, job: Job, linear: Linear, free: bool) -> _Posterior:
+def _strongest(fitter: Fitter, fit: Fit, linear: Linear, free: bool) -> _Posterior:
     """The best of a grid of amplitudes and memories, then refined."""
     trials = [
-        _refined(_Posterior(linear, job, free, memory, a * linear.scale).solved(), 2)
+        _refined(_Posterior(linear, fit, free, memory, a * linear.scale).solved(), 2)
         for memory in MEMORIES
         for a in AMPLITUDES
     ]
@@ -162,33 +162,33 @@ def _refined(posterior: _Posterior, times: int) -> _Posterior:
     return posterior
 
 
-def step_of_starts(linear: Linear, job: Job, p: Array, d: Array) -> Array:
+def step_of_starts(linear: Linear, fit: Fit, p: Array, d: Array) -> Array:
     """dx `[W, s]`, the start states that go with a parameter step p `[k]` or `[W, k]` and forces d `[W, nv m]`."""
-    full = np.concatenate([np.broadcast_to(p, (len(d), job.A.shape[2])), d], 1)
-    moved = np.einsum("wnk,wk->wn", np.concatenate([job.A, linear.D], 2), full)
-    b = linear.starts.b - np.einsum("wns,wn->ws", job.B, moved)
+    full = np.concatenate([np.broadcast_to(p, (len(d), fit.A.shape[2])), d], 1)
+    moved = np.einsum("wnk,wk->wn", np.concatenate([fit.A, linear.D], 2), full)
+    b = linear.starts.b - np.einsum("wns,wn->ws", fit.B, moved)
     return np.einsum("wst,wt->ws", linear.starts.M, b)
 
 
-def _relinearise(fitter: Fitter, job: Job, linear: Linear, found: _Posterior) -> Linear:
+def _relinearise(fitter: Fitter, fit: Fit, linear: Linear, found: _Posterior) -> Linear:
     """Residuals simulated at the estimate and taken back along the columns; kept only where it fits better there."""
     p, d = found.p, found.d
-    dx = step_of_starts(linear, job, p, d)
-    theta = fitter.vector(job.coordinates, job.values + p)
-    r = fitter.whiten(fitter.simulator.run(theta[None], (job.offsets + dx)[None], force=linear.forces(d)[None]))[0]
-    back = r + np.einsum("wnd,wd->wn", linear.D, d) + np.einsum("wns,ws->wn", job.B, dx) + job.A @ p
-    better = np.sum(r**2, 1) < np.sum(job.r**2, 1)
+    dx = step_of_starts(linear, fit, p, d)
+    theta = fitter.vector(fit.coordinates, fit.values + p)
+    r = fitter.whiten(fitter.simulator.run(theta[None], (fit.offsets + dx)[None], force=linear.forces(d)[None]))[0]
+    back = r + np.einsum("wnd,wd->wn", linear.D, d) + np.einsum("wns,ws->wn", fit.B, dx) + fit.A @ p
+    better = np.sum(r**2, 1) < np.sum(fit.r**2, 1)
     back = np.where(better[:, None], back, linear.r)
-    q, starts = eliminate(back, np.concatenate([job.A, linear.D], 2), job.B, job.offsets, fitter.spread)
+    q, starts = eliminate(back, np.concatenate([fit.A, linear.D], 2), fit.B, fit.offsets, fitter.spread)
     return replace(linear, r=back, quadratic=q, starts=starts)
 
 
-def _finish(fitter: Fitter, job: Job, found: _Posterior) -> Disturbance:
+def _finish(fitter: Fitter, fit: Fit, found: _Posterior) -> Disturbance:
     linear, windows = found.linear, fitter.simulator.windows
     shape = (len(found.d), len(linear.scale), linear.nodes)
-    variance = np.einsum("wii->wi", found.cov) + _from_parameters(job, found)
+    variance = np.einsum("wii->wi", found.cov) + _from_parameters(fit, found)
     sd = np.sqrt(np.swapaxes(variance.reshape(shape), 1, 2))
-    k = job.A.shape[2]
+    k = fit.A.shape[2]
     whole = found.cov @ linear.quadratic.S[:, k:, k:] / found.noise
     gain = np.einsum("wvivj->wvij", whole.reshape(*shape, *shape[1:]))
     nothing = replace(found, amplitude=1e-7 * linear.scale)
@@ -200,7 +200,7 @@ def _finish(fitter: Fitter, job: Job, found: _Posterior) -> Disturbance:
         amplitude=found.amplitude,
         memory=found.memory * spacing,
         noise=float(np.sqrt(found.noise)),
-        values=job.values + found.p,
+        values=fit.values + found.p,
         evidence=found.evidence,
         without=_refined_noise(nothing).evidence,
         time=np.asarray((np.arange(linear.nodes) + 0.5) * spacing, np.float64),
@@ -208,15 +208,15 @@ def _finish(fitter: Fitter, job: Job, found: _Posterior) -> Disturbance:
     )
 
 
-def _from_parameters(job: Job, found: _Posterior) -> Array:
+def _from_parameters(fit: Fit, found: _Posterior) -> Array:
     """`[W, nv m]`: variance of the force from not knowing the parameters exactly."""
-    q, k = found.linear.quadratic, job.A.shape[2]
+    q, k = found.linear.quadratic, fit.A.shape[2]
     if not (found.free and k):
         return np.zeros_like(found.d)
     S = q.S / found.noise
     gain = found.cov @ S[:, k:, :k]
-    Spp = np.einsum("w,wij->ij", job.weight, S[:, :k, :k] - np.einsum("wdi,wdj->wij", S[:, k:, :k], gain))
-    return np.einsum("wdi,ij,wdj->wd", gain, np.linalg.inv(Spp + np.diag(job.prior()[0])), gain)
+    Spp = np.einsum("w,wij->ij", fit.weight, S[:, :k, :k] - np.einsum("wdi,wdj->wij", S[:, k:, :k], gain))
+    return np.einsum("wdi,ij,wdj->wd", gain, np.linalg.inv(Spp + np.diag(fit.prior()[0])), gain)
 
 
 def _refined_noise(found: _Posterior) -> _Posterior:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayessim_mjx.diagnosis.fitting.fitter import Fitter, Job
+from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 from bayessim_mjx.diagnosis.residual.disturbance import Disturbance, step_of_starts
 from bayessim_mjx.diagnosis.residual.motion_inputs import Inputs
 from bayessim_mjx.diagnosis.residual.regions import Nodes
@@ -102,7 +102,7 @@ def _told(number: Number, words: str) -> str:
 
 
 def fingerprints(
-    fitter: Fitter, job: Job, disturbance: Disturbance, inputs: Inputs, dof: int, node: Nodes, without: Array
+    fitter: Fitter, fit: Fit, disturbance: Disturbance, inputs: Inputs, dof: int, node: Nodes, without: Array
 ) -> list[Fingerprint]:
     """F1 odd and even in speed, F2 load, F3 lag and speed, F8 time, F10 time since reversal."""
     w, unit = node.axes["speed"], node.force_unit
@@ -138,17 +138,17 @@ def fingerprints(
             {"recent": "more/less"}, f"within {RECENT:g} s after reversals the force against the motion is",
         ),
     ]  # fmt: skip
-    return [*out, _lag(fitter, job, disturbance, inputs, dof, node, without)]
+    return [*out, _lag(fitter, fit, disturbance, inputs, dof, node, without)]
 
 
 def _lag(
-    fitter: Fitter, job: Job, disturbance: Disturbance, inputs: Inputs, dof: int, node: Nodes, without: Array
+    fitter: Fitter, fit: Fit, disturbance: Disturbance, inputs: Inputs, dof: int, node: Nodes, without: Array
 ) -> Fingerprint:
     """|error| = c + T |speed|: how far the measured motion lags behind the simulated one (F3)."""
     linear, nv = disturbance.linear, fitter.simulator.nv
-    step = disturbance.values - job.values
-    dx = step_of_starts(linear, job, step, np.zeros_like(disturbance.flat))
-    r = linear.r - np.einsum("wns,ws->wn", job.B, dx) - job.A @ step
+    step = disturbance.values - fit.values
+    dx = step_of_starts(linear, fit, step, np.zeros_like(disturbance.flat))
+    r = linear.r - np.einsum("wns,ws->wn", fit.B, dx) - fit.A @ step
     windows = fitter.simulator.windows
     channels = r.reshape(len(r), windows.steps, -1)
     behind = -channels[..., dof] * windows.sigma_q[dof] if fitter.used[:nv].all() else np.zeros(r.shape[:1] + (1,))

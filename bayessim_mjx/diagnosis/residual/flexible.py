@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bayessim_mjx.diagnosis.fitting.fitter import Fitter, Job
+from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 from bayessim_mjx.diagnosis.residual import motion_inputs
 from bayessim_mjx.diagnosis.residual.disturbance import Disturbance, estimate
 from bayessim_mjx.diagnosis.residual.motion_inputs import WORDS, Inputs
@@ -93,21 +93,21 @@ class Flexible:
 
 def flexible(
     fitter: Fitter,
-    job: Job,
+    fit: Fit,
     disturbance: Disturbance | None = None,
     *,
     seeds: Sequence[int] = (0, 1, 2, 3, 4),
     ridges: Sequence[float] = RIDGES,
 ) -> Flexible:
-    """Fit and score a flexible force on top of a fitted job.
+    """Fit and score a flexible force on top of a fit.
 
     Args:
-        disturbance: of this job, for its columns and its linearisation; None: estimated here.
+        disturbance: of this fit, for its columns and its linearisation; None: estimated here.
     """
-    disturbance = estimate(fitter, job) if disturbance is None else disturbance
+    disturbance = estimate(fitter, fit) if disturbance is None else disturbance
     windows = fitter.simulator.windows
     inputs = motion_inputs.measured(windows, fitter.simulator.physics.mj_model)
-    problem = Regression(fitter, job, disturbance, inputs)
+    problem = Regression(fitter, fit, disturbance, inputs)
     folds = {"condition": windows.group, "interpolation": blocks(windows.log, windows.start, round(BLOCK / windows.dt))}
     folds = {name: np.unique(fold, return_inverse=True)[1] for name, fold in folds.items()}
     runs = {seed: Seeded(problem, seed) for seed in seeds}

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.fitting import scales
-from bayessim_mjx.diagnosis.fitting.fitter import Fitter, Job
+from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 from bayessim_mjx.diagnosis.fitting.quadratic import Quadratic, Starts, eliminate
 
 Array = NDArray[np.float64]
@@ -25,7 +25,7 @@ class Linear:
         basis: `[H, m]`, force in each control step from the forces at the nodes.
         scale: `[nv]`, size of the forces of this robot, N m or N.
         r: `[W, n]`, residuals extrapolated to no force, no parameter step and the fit's start states.
-        quadratic: in (the job's parameters' steps, forces), start states eliminated; starts: what was eliminated.
+        quadratic: in (the fit's parameters' steps, forces), start states eliminated; starts: what was eliminated.
     """
 
     D: Array
@@ -64,8 +64,8 @@ def force_scale(fitter: Fitter) -> Array:
     return np.maximum(found.force, found.inertia * found.speed / (windows.steps * windows.dt))
 
 
-def columns(fitter: Fitter, job: Job, knots: int, scale: Array | None = None) -> Array:
-    """D `[W, n, nv knots]`, one simulation of all windows per column, start states as in the job."""
+def columns(fitter: Fitter, fit: Fit, knots: int, scale: Array | None = None) -> Array:
+    """D `[W, n, nv knots]`, one simulation of all windows per column, start states as in the fit."""
     windows, nv = fitter.simulator.windows, fitter.simulator.nv
     basis = node_basis(windows.steps, knots)
     pulse = PULSE * (force_scale(fitter) if scale is None else scale)
@@ -74,15 +74,15 @@ def columns(fitter: Fitter, job: Job, knots: int, scale: Array | None = None) ->
         force[v, :, 0, :, v] = basis.T * pulse[v]
     count = nv * knots
     spread = np.broadcast_to(force.reshape(count, 1, windows.steps, nv), (count, len(windows), windows.steps, nv))
-    theta = np.repeat(fitter.vector(job.coordinates, job.values)[None], count, 0)
-    shifted = fitter.whiten(fitter.simulator.run(theta, np.repeat(job.offsets[None], count, 0), force=spread))
-    return np.moveaxis((job.r[None] - shifted) / np.repeat(pulse, knots)[:, None, None], 0, -1)
+    theta = np.repeat(fitter.vector(fit.coordinates, fit.values)[None], count, 0)
+    shifted = fitter.whiten(fitter.simulator.run(theta, np.repeat(fit.offsets[None], count, 0), force=spread))
+    return np.moveaxis((fit.r[None] - shifted) / np.repeat(pulse, knots)[:, None, None], 0, -1)
 
 
-def linearise(fitter: Fitter, job: Job, knots: int | None = None, D: Array | None = None) -> Linear:
-    """Columns and quadratic at the job's point; D: columns of another job, to save the simulations."""
+def linearise(fitter: Fitter, fit: Fit, knots: int | None = None, D: Array | None = None) -> Linear:
+    """Columns and quadratic at the fit's point; D: columns of another fit, to save the simulations."""
     knots = default_nodes(fitter) if knots is None else knots
     scale = force_scale(fitter)
-    D = columns(fitter, job, knots, scale) if D is None else D
-    q, starts = eliminate(job.r, np.concatenate([job.A, D], 2), job.B, job.offsets, fitter.spread)
-    return Linear(D, node_basis(fitter.simulator.windows.steps, knots), scale, job.r, q, starts)
+    D = columns(fitter, fit, knots, scale) if D is None else D
+    q, starts = eliminate(fit.r, np.concatenate([fit.A, D], 2), fit.B, fit.offsets, fitter.spread)
+    return Linear(D, node_basis(fitter.simulator.windows.steps, knots), scale, fit.r, q, starts)

@@ -11,7 +11,7 @@ from scipy.signal import detrend
 from scipy.signal.windows import dpss
 
 from bayessim_mjx.diagnosis import statistics
-from bayessim_mjx.diagnosis.fitting.fitter import Fitter, Job
+from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 from bayessim_mjx.diagnosis.fitting.windows import Windows
 from bayessim_mjx.diagnosis.residual import motion_inputs
 from bayessim_mjx.diagnosis.residual.disturbance import Disturbance, estimate
@@ -150,22 +150,22 @@ def line(hz: Array, power: Array, lowest: float = 1.0) -> tuple[float, float]:
     return (float(hz[best]), float(height[best])) if height[best] > LINE else (float("nan"), 0.0)
 
 
-def analyse(fitter: Fitter, job: Job, disturbance: Disturbance | None = None) -> tuple[list[dict], list[str]]:
+def analyse(fitter: Fitter, fit: Fit, disturbance: Disturbance | None = None) -> tuple[list[dict], list[str]]:
     """(one entry per joint for pictures, sentences).
 
     Simulated motion is that of the windows, put together: it starts at the measured state in each of them, so that what
     accumulates over longer times than a window does not show. The equivalent delay therefore comes from forces: effort
     plus missing force against effort.
     """
-    disturbance = estimate(fitter, job) if disturbance is None else disturbance
+    disturbance = estimate(fitter, fit) if disturbance is None else disturbance
     windows = fitter.simulator.windows
     inputs = motion_inputs.measured(windows, fitter.simulator.physics.mj_model)
     nodes = disturbance.linear.nodes
     parts = [part for part in runs(windows) if len(part) * min(nodes, windows.steps) >= LEAST]
     if not parts:  # windows of chaotic motion lie apart
         return [], []
-    theta = fitter.vector(job.coordinates, job.values)
-    error = fitter.simulator.run(theta[None], job.offsets[None])[0]
+    theta = fitter.vector(fit.coordinates, fit.values)
+    error = fitter.simulator.run(theta[None], fit.offsets[None])[0]
     without = statistics.leave_one_out(windows.group)
     found, text = [], []
     for dof, joint in enumerate(inputs.joints):

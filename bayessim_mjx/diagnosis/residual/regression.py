@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
-from bayessim_mjx.diagnosis.fitting.fitter import Fitter, Job
+from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 from bayessim_mjx.diagnosis.fitting.quadratic import TRUST, Quadratic, solve
 from bayessim_mjx.diagnosis.residual.disturbance import Disturbance
 from bayessim_mjx.diagnosis.residual.features import Mapping
@@ -22,17 +22,17 @@ Array = NDArray[np.float64]
 class Regression:
     """What all seeds share: the quadratic in (parameters, forces), inputs, weights, costs without the force."""
 
-    def __init__(self, fitter: Fitter, job: Job, disturbance: Disturbance, inputs: Inputs) -> None:
+    def __init__(self, fitter: Fitter, fit: Fit, disturbance: Disturbance, inputs: Inputs) -> None:
         linear = disturbance.linear
         self.q: Quadratic = linear.quadratic
-        self.k, self.nv, self.m = job.A.shape[2], len(linear.scale), linear.nodes
-        self.job, self.fitter, self.inputs, self.scale = job, fitter, inputs, linear.scale
+        self.k, self.nv, self.m = fit.A.shape[2], len(linear.scale), linear.nodes
+        self.fit, self.fitter, self.inputs, self.scale = fit, fitter, inputs, linear.scale
         self.average = linear.basis / linear.basis.sum(0)  # [H, m], features at the nodes
-        self.precision, self.pull, self.low, self.high = job.prior()
+        self.precision, self.pull, self.low, self.high = fit.prior()
 
     def base(self, fold: NDArray[np.int64]) -> Array:
-        """Held-out costs `[W]` of the job itself."""
-        return self.fitter.scores(self.job, fold)[0]
+        """Held-out costs `[W]` of the fit itself."""
+        return self.fitter.scores(self.fit, fold)[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +69,7 @@ class Seeded:
         return [self._sums(np.flatnonzero(fold == name)) for name in range(fold.max() + 1)]
 
     def _sums(self, rows: NDArray[np.int64]) -> Sums:
-        problem, weight = self.problem, self.problem.job.weight[rows]
+        problem, weight = self.problem, self.problem.fit.weight[rows]
         k, nv, m, W = problem.k, problem.nv, problem.m, len(rows)
         q, size = problem.q, nv * self.each
         scaled = self.features.phi[rows] * problem.scale[:, None]

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis import statistics
-from bayessim_mjx.diagnosis.fitting.fitter import Fitter, Job
+from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 from bayessim_mjx.diagnosis.residual import motion_inputs, regions
 from bayessim_mjx.diagnosis.residual.disturbance import Disturbance, estimate
 from bayessim_mjx.diagnosis.residual.fingerprints import fingerprints
@@ -20,24 +20,24 @@ TOLD = 0.15  # share of a joint's missing power that a region must explain to be
 
 
 def locate(
-    fitter: Fitter, job: Job, disturbance: Disturbance | None = None, *, seed: int = 0
+    fitter: Fitter, fit: Fit, disturbance: Disturbance | None = None, *, seed: int = 0
 ) -> tuple[list[Place], list[dict], list[str]]:
-    """Places of the gap that a fitted job leaves.
+    """Places of the gap that a fit leaves.
 
     Args:
-        disturbance: of this job; None: estimated here.
+        disturbance: of this fit; None: estimated here.
 
     Returns:
         (places, largest share first; maps of the missing force, see `regions.force_map`; sentences).
     """
-    if float(job.quadratic(fitter.spread)[0].c.mean()) < QUIET * fitter.size:
+    if float(fit.quadratic(fitter.spread)[0].c.mean()) < QUIET * fitter.size:
         return [], [], ["what this model leaves lies within the measurement noise"]
-    disturbance = estimate(fitter, job) if disturbance is None else disturbance
+    disturbance = estimate(fitter, fit) if disturbance is None else disturbance
     windows, model = fitter.simulator.windows, fitter.simulator.physics.mj_model
     inputs = motion_inputs.measured(windows, model)
     rng = np.random.default_rng(seed)
     without = statistics.leave_one_out(windows.group)
-    each = explained(job, disturbance)
+    each = explained(fit, disturbance)
     kept = np.maximum(each.sum(0), 0.0)
     share, spread = kept / max(kept.sum(), 1e-300), statistics.interval_of_shares(each, windows.group)
     node = [regions.nodes(disturbance, inputs, v) for v in range(len(share))]
@@ -45,7 +45,7 @@ def locate(
     maps = _maps([node[v] for v in worth], without, rng)
     trees = {v: regions.tree(node[v], windows.group) for v in worth}
     sentences = [s for v in worth for s in _sentences(node[v], trees[v])]
-    prints = [f for v in worth for f in fingerprints(fitter, job, disturbance, inputs, v, node[v], without)]
+    prints = [f for v in worth for f in fingerprints(fitter, fit, disturbance, inputs, v, node[v], without)]
     sentences += [f.text for f in prints if f.text]
     places = [
         Place(node[v].joint, float(share[v]), spread[v], _region(node[v], trees.get(v))) for v in np.argsort(-share)
@@ -53,16 +53,16 @@ def locate(
     return places, maps, sentences
 
 
-def explained(job: Job, disturbance: Disturbance) -> Array:
+def explained(fit: Fit, disturbance: Disturbance) -> Array:
     """`[W, nv]`: drop of each window's cost by the force on each joint; the sum is the drop by all of them.
 
     cost(0) - cost(d) = d'(2 g - S d), split by the entries of d.
     """
-    q, k = disturbance.linear.quadratic, job.A.shape[2]
-    step, d = disturbance.values - job.values, disturbance.flat
+    q, k = disturbance.linear.quadratic, fit.A.shape[2]
+    step, d = disturbance.values - fit.values, disturbance.flat
     g = q.g[:, k:] - q.S[:, k:, :k] @ step
     drop = d * (2 * g - np.einsum("wij,wj->wi", q.S[:, k:, k:], d))
-    return drop.reshape(len(d), disturbance.force.shape[2], -1).sum(2) * job.weight[:, None]
+    return drop.reshape(len(d), disturbance.force.shape[2], -1).sum(2) * fit.weight[:, None]
 
 
 def _maps(nodes: list[Nodes], without: Array, rng: np.random.Generator) -> list[dict]:

@@ -130,11 +130,10 @@ def _grown(physics: Physics, effect: Candidate, c: Coordinate, value: float) -> 
 def _refitted(race: Race, model: Model, effects: Sequence[Candidate]) -> Model:
     fitter, base = race.fitter, len(race.fitter.base)
     own = {c.name: c for e in effects for c in e.coordinates}
-    coordinates = tuple(c if i < base else own[c.name] for i, c in enumerate(model.job.coordinates))
-    job = fitter.refresh(replace(model.job, coordinates=coordinates, history=[], damping=1e-3))
-    fitter.iterate([job], STEPS, lambda j: fresh(race, j))
-    fitter.refresh(job)
-    return scored(fitter, job, tuple(effects))
+    coordinates = tuple(c if i < base else own[c.name] for i, c in enumerate(model.fit.coordinates))
+    start = fitter.refresh(replace(model.fit, coordinates=coordinates, history=(), damping=1e-3))
+    (fit,) = fitter.iterate([start], STEPS, lambda f: fresh(race, f))
+    return scored(fitter, fitter.refresh(fit), tuple(effects))
 
 
 def _adopt(race: Race, new: Model) -> None:

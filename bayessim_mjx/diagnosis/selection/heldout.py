@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis import statistics
-from bayessim_mjx.diagnosis.fitting.fitter import Fitter, Job
+from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 from bayessim_mjx.diagnosis.fitting.quadratic import eliminate
 from bayessim_mjx.diagnosis.selection.models import Model
 
@@ -40,10 +40,10 @@ def predict(fitter: Fitter, model: Model) -> Prediction:
     windows = fitter.simulator.windows
     names = np.unique(windows.group)
     error = np.zeros((len(windows), windows.steps, int(fitter.used.sum())))
-    offsets = np.zeros_like(model.job.offsets)
+    offsets = np.zeros_like(model.fit.offsets)
     for name, values in zip(names, model.estimates, strict=True):
         own = np.flatnonzero(windows.group == name)
-        error[own], offsets[own] = _settled(fitter, model.job, values, own)
+        error[own], offsets[own] = _settled(fitter, model.fit, values, own)
     return Prediction(error, offsets)
 
 
@@ -54,37 +54,37 @@ def steadied(fitter: Fitter, model: Model) -> Model:
     step can lead where the model is no longer linear. A condition whose windows are predicted much worse than the step
     promised gets a shorter one, by halves, until the *other* windows are no worse off than at the common fit.
     """
-    windows, job = fitter.simulator.windows, model.job
+    windows, fit = fitter.simulator.windows, model.fit
     names, estimates = np.unique(windows.group), model.estimates.copy()
     for g, name in enumerate(names):
         own, others = np.flatnonzero(windows.group == name), np.flatnonzero(windows.group != name)
-        if _squares(fitter, job, estimates[g], own).sum() <= WORSE * model.cost[own].sum():
+        if _squares(fitter, fit, estimates[g], own).sum() <= WORSE * model.cost[own].sum():
             continue
-        limit = WITHIN * float(job.weight[others] @ _squares(fitter, job, job.values, others))
+        limit = WITHIN * float(fit.weight[others] @ _squares(fitter, fit, fit.values, others))
         for share in SHORTER:
-            at = job.values + share * (model.estimates[g] - job.values)
-            if job.weight[others] @ _squares(fitter, job, at, others) <= limit:
+            at = fit.values + share * (model.estimates[g] - fit.values)
+            if fit.weight[others] @ _squares(fitter, fit, at, others) <= limit:
                 break
         estimates[g] = at
     return replace(model, estimates=estimates)
 
 
-def _squares(fitter: Fitter, job: Job, values: Array, own: NDArray[np.int64]) -> Array:
+def _squares(fitter: Fitter, fit: Fit, values: Array, own: NDArray[np.int64]) -> Array:
     """Sums of squared errors of some windows, starts re-estimated, `[w]`."""
-    return np.asarray(np.sum(_settled(fitter, job, values, own)[0] ** 2, axis=(1, 2)))
+    return np.asarray(np.sum(_settled(fitter, fit, values, own)[0] ** 2, axis=(1, 2)))
 
 
-def nominal(fitter: Fitter, job: Job) -> Prediction:
+def nominal(fitter: Fitter, fit: Fit) -> Prediction:
     """The simulator as delivered, starts estimated."""
-    values = np.array([c.neutral for c in job.coordinates])
-    return Prediction(*_settled(fitter, job, values, np.arange(len(job.r))))
+    values = np.array([c.neutral for c in fit.coordinates])
+    return Prediction(*_settled(fitter, fit, values, np.arange(len(fit.r))))
 
 
-def _settled(fitter: Fitter, job: Job, values: Array, own: NDArray[np.int64]) -> tuple[Array, Array]:
+def _settled(fitter: Fitter, fit: Fit, values: Array, own: NDArray[np.int64]) -> tuple[Array, Array]:
     """(errors `[w, H, channels]`, starts `[w, s]`) of some windows after two Newton steps of their start states."""
-    theta = fitter.vector(job.coordinates, values)[None]
-    best_offsets = offsets = job.offsets[own]
-    B = job.B[own]
+    theta = fitter.vector(fit.coordinates, values)[None]
+    best_offsets = offsets = fit.offsets[own]
+    B = fit.B[own]
     best = errors = fitter.simulator.run(theta, offsets[None], own)[0]
     for _ in range(2):
         r = fitter.whiten(errors)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis import statistics
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
-from bayessim_mjx.diagnosis.fitting.fitter import Fitter, Job
+from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 
 Array = NDArray[np.float64]
 
@@ -20,14 +20,14 @@ class Model:
     """A fitted model.
 
     Attributes:
-        effects: its candidates; job: the fit.
+        effects: its candidates; fit: of its parameters.
         cost: `[W]`, held-out cost of each window (leave one operating condition out), starts re-estimated.
         estimates: `[G, k]`, parameters without each condition.
         samples: effective number of independent residuals.
     """
 
     effects: tuple[Candidate, ...]
-    job: Job
+    fit: Fit
     cost: Array
     estimates: Array
     samples: float
@@ -42,24 +42,24 @@ class Model:
 
     @property
     def size(self) -> int:
-        return len(self.job.coordinates)
+        return len(self.fit.coordinates)
 
     def values_of(self, candidate: Candidate) -> Array:
         """The candidate's parameters in this model, `[k]`."""
-        own = [self.job.names.index(c.name) for c in candidate.coordinates]
-        return self.job.values[own]
+        own = [self.fit.names.index(c.name) for c in candidate.coordinates]
+        return self.fit.values[own]
 
 
-def scored(fitter: Fitter, job: Job, effects: Sequence[Candidate]) -> Model:
-    """The held-out score of a fitted job."""
-    cost, moves = fitter.scores(job)
-    return Model(tuple(effects), job, np.maximum(cost, 1e-9), job.values + moves, effective_samples(job, fitter))
+def scored(fitter: Fitter, fit: Fit, effects: Sequence[Candidate]) -> Model:
+    """The held-out score of a fit."""
+    cost, moves = fitter.scores(fit)
+    return Model(tuple(effects), fit, np.maximum(cost, 1e-9), fit.values + moves, effective_samples(fit, fitter))
 
 
-def effective_samples(job: Job, fitter: Fitter) -> float:
+def effective_samples(fit: Fit, fitter: Fitter) -> float:
     """N / (2 tau), tau the integrated autocorrelation time of the residuals within windows, pooled over channels."""
-    windows, channels = len(job.r), int(fitter.used.sum())
-    r = job.r.reshape(windows, -1, channels)
+    windows, channels = len(fit.r), int(fitter.used.sum())
+    r = fit.r.reshape(windows, -1, channels)
     variance = float(np.mean(r**2)) + 1e-300
     tau = 0.5
     for lag in range(1, r.shape[1] // 2):

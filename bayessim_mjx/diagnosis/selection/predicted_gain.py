@@ -26,8 +26,8 @@ def promised(race: Race, effects: Sequence[Candidate]) -> tuple[float, dict[str,
     q, precision, high = _linear(race, effects)
     base = len(race.fitter.base)
 
-    _, pull, low, top = race.base.job.prior()
-    even = np.ones(len(race.base.job.r))  # all windows count alike, as in what is realised
+    _, pull, low, top = race.base.fit.prior()
+    even = np.ones(len(race.base.fit.r))  # all windows count alike, as in what is realised
 
     def left(some: frozenset[int]) -> float:
         """Mean square with some of the effects, the known parameters refitted."""
@@ -55,14 +55,14 @@ def _linear(race: Race, effects: Sequence[Candidate]) -> tuple[Quadratic, Array,
 
     An amount of 1 is the start that the screening chose.
     """
-    fitter, job = race.fitter, race.base.job
+    fitter, fit = race.fitter, race.base.fit
     starts = [next(s.start for s in race.screened if s.candidate.label == e.label) for e in effects]
     pairs = list(zip(effects, starts, strict=True))
-    thetas = [fitter.vector((*job.coordinates, *e.coordinates), np.concatenate([job.values, s])) for e, s in pairs]
-    moved = fitter.whiten(fitter.simulator.run(np.stack(thetas), np.repeat(job.offsets[None], len(thetas), 0)))
-    A = np.concatenate([job.A, np.moveaxis(job.r[None] - moved, 0, -1)], axis=2)
-    q, _ = eliminate(job.r, A, job.B, job.offsets, fitter.spread)
-    known = [c.precision for c in job.coordinates]
+    thetas = [fitter.vector((*fit.coordinates, *e.coordinates), np.concatenate([fit.values, s])) for e, s in pairs]
+    moved = fitter.whiten(fitter.simulator.run(np.stack(thetas), np.repeat(fit.offsets[None], len(thetas), 0)))
+    A = np.concatenate([fit.A, np.moveaxis(fit.r[None] - moved, 0, -1)], axis=2)
+    q, _ = eliminate(fit.r, A, fit.B, fit.offsets, fitter.spread)
+    known = [c.precision for c in fit.coordinates]
     return q, np.array([*known, *(_precision(e, s) for e, s in pairs)]), np.array([_furthest(e, s) for e, s in pairs])
 
 

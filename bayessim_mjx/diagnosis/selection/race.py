@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate, Coordinate
 from bayessim_mjx.diagnosis.fitting.discretisation import contacts
-from bayessim_mjx.diagnosis.fitting.fitter import Fitter, Job
+from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 from bayessim_mjx.diagnosis.selection.models import Comparison, Model, compare, scored
 from bayessim_mjx.diagnosis.selection.screen import Screened, screen
 from bayessim_mjx.diagnosis.selection.uncertainty import deviations
@@ -64,7 +64,7 @@ class Race:
     fitter: Fitter
     candidates: Sequence[Candidate]
     settings: Settings
-    nominal: Job
+    nominal: Fit
     base: Model
     winner: Model
     models: dict[frozenset[str], Model] = field(default_factory=dict)
@@ -127,9 +127,9 @@ class Race:
     def distinct(self, model: Model, effect: Candidate, far: float = 2.0) -> bool:
         """Whether at least one amplitude of the effect is `far` standard deviations away from neutral."""
         sd = deviations(self.fitter, model)
-        own = [model.job.names.index(c.name) for c in effect.coordinates]
+        own = [model.fit.names.index(c.name) for c in effect.coordinates]
         off = [
-            abs(model.job.values[i] - c.neutral) / max(sd[i], 1e-300)
+            abs(model.fit.values[i] - c.neutral) / max(sd[i], 1e-300)
             for i, c in zip(own, effect.coordinates, strict=True)
         ]
         return any(z > far for z, shape in zip(off, effect.shapes, strict=True) if not shape)
@@ -149,36 +149,37 @@ class Race:
         return model.total - self.noise * len(model.cost)
 
 
-def fresh(race: Race, job: Job) -> list[int]:
+def fresh(race: Race, fit: Fit) -> list[int]:
     """Columns to be differenced anew: the effects' at every step, the known parameters' at every third if cheap.
 
     Far from the logs, where they change from step to step, at every one.
     """
     base = len(race.fitter.base)
-    turn = base <= race.settings.fresh and (_astray(race, job) or len(job.history) % 3 == 0)
-    return list(range(0 if turn else base, len(job.coordinates)))
+    turn = base <= race.settings.fresh and (_astray(race, fit) or len(fit.history) % 3 == 0)
+    return list(range(0 if turn else base, len(fit.coordinates)))
 
 
 def fit_models(race: Race, plans: Sequence[tuple[Model, Screened]], label: str, say: Progress) -> list[Model]:
     """Models of the plans' effects plus one more each, fitted together; what was fitted before is looked up."""
     fitter = race.fitter
-    todo: dict[frozenset[str], tuple[list[Job], tuple[Candidate, ...]]] = {}
+    todo: dict[frozenset[str], tuple[list[Fit], tuple[Candidate, ...]]] = {}
     for model, extra in plans:
         key = frozenset([*(c.label for c in model.effects), extra.candidate.label])
         if key not in race.models and key not in todo:
             todo[key] = (_starts(race, model, extra, len(todo)), (*model.effects, extra.candidate))
-    jobs = [job for several, _ in todo.values() for job in several]
-    total = len(jobs)
-    fitter.iterate(
-        jobs,
+    fits = [fit for several, _ in todo.values() for fit in several]
+    total = len(fits)
+    fits = fitter.iterate(
+        fits,
         race.settings.iterations,
-        lambda j: fresh(race, j),
+        lambda f: fresh(race, f),
         race.settings.tolerance,
         progress=lambda left: say(label, total - left, total),
-        keep=_Heats([several for several, _ in todo.values()]),
+        keep=_Heats([len(several) for several, _ in todo.values()]),
     )
     for key, (several, effects) in todo.items():
-        race.models[key] = scored(fitter, min(several, key=lambda job: job.cost), effects)
+        own, fits = fits[: len(several)], fits[len(several) :]
+        race.models[key] = scored(fitter, min(own, key=lambda fit: fit.cost), effects)
     keys = [frozenset([*(c.label for c in m.effects), e.candidate.label]) for m, e in plans]
     return [race.models[k] for k in keys]
 
@@ -192,54 +193,53 @@ class _Heats:
     CANDIDATES = {2: 8.0, 3: 5.0, 5: 3.0}  # and over the best candidate's
     FAST = 0.7  # cost after over cost before a step
 
-    def __init__(self, entries: Sequence[Sequence[Job]]) -> None:
-        self.entries = entries
-        self.owner = {id(job): i for i, several in enumerate(entries) for job in several}
+    def __init__(self, starts: Sequence[int]) -> None:
+        self.owner = np.repeat(np.arange(len(starts)), starts)  # `[fits]`, of each candidate's several starts
 
-    def __call__(self, made: int, running: Sequence[Job]) -> list[Job]:
-        best = [min(job.cost for job in several) for several in self.entries]
+    def __call__(self, made: int, fits: Sequence[Fit], running: Sequence[int]) -> list[int]:
+        cost = np.array([fit.cost for fit in fits])
+        best = [float(np.min(cost[self.owner == i])) for i in range(self.owner[-1] + 1)]
         limits = np.full(len(best), np.inf)
         if made in self.STARTS:
             limits = self.STARTS[made] * np.array(best)
         if made in self.CANDIDATES:
             limits[np.array(best) > self.CANDIDATES[made] * min(best)] = 0.0
-        return [job for job in running if job.cost <= limits[self.owner[id(job)]] or self._falls(job)]
+        return [i for i in running if cost[i] <= limits[self.owner[i]] or self._falls(fits[i])]
 
-    def _falls(self, job: Job) -> bool:
-        refused = len(job.history) > 1 and job.history[-1] == job.history[-2]
-        fell = len(job.history) > 1 and job.history[-1] < self.FAST * job.history[-2]
-        return fell or (refused and job.promise > (1 - self.FAST) * job.cost)
+    def _falls(self, fit: Fit) -> bool:
+        refused = len(fit.history) > 1 and fit.history[-1] == fit.history[-2]
+        fell = len(fit.history) > 1 and fit.history[-1] < self.FAST * fit.history[-2]
+        return fell or (refused and fit.promise > (1 - self.FAST) * fit.cost)
 
 
-def _starts(race: Race, model: Model, extra: Screened, rank: int) -> list[Job]:
+def _starts(race: Race, model: Model, extra: Screened, rank: int) -> list[Fit]:
     """Jobs from several starting points: costs have several minima (an inertia hides in another, a shape is wrong)."""
     fitter, coordinates = race.fitter, extra.candidate.coordinates
-    jobs = [fitter.derive(model.job, coordinates, extra.start)]
+    fits = [fitter.derive(model.fit, coordinates, extra.start)]
     if rank < race.settings.starts and extra.others:
         anew = _delivered(race, model, coordinates, extra)
         # a limit has no derivative below its threshold, so also from the probe itself, not scaled down to its step
-        jobs += [anew, fitter.derive(model.job, coordinates, extra.others[0])]
-        jobs += [fitter.derive(model.job, coordinates, other) for other in extra.others[1:]]
-    return jobs
+        fits += [anew, fitter.derive(model.fit, coordinates, extra.others[0])]
+        fits += [fitter.derive(model.fit, coordinates, other) for other in extra.others[1:]]
+    return fits
 
 
-def _delivered(race: Race, model: Model, coordinates: Sequence[Coordinate], extra: Screened) -> Job:
-    """A job from the known parameters as they were delivered, not from where they went without the effect.
+def _delivered(race: Race, model: Model, coordinates: Sequence[Coordinate], extra: Screened) -> Fit:
+    """A fit from the known parameters as they were delivered, not from where they went without the effect.
 
     Far from the logs the start states went astray as well, and what they do depends on the effect.
     """
     fitter, base = race.fitter, len(race.fitter.base)
-    known = np.concatenate([[c.neutral for c in fitter.base], model.job.values[base:]])
-    if _astray(race, model.job):
-        return fitter.begin((*model.job.coordinates, *coordinates), np.concatenate([known, extra.start]))
-    anew = fitter.derive(model.job, coordinates, extra.others[0])
-    anew.values[: len(known)] = known
-    return anew
+    known = np.concatenate([[c.neutral for c in fitter.base], model.fit.values[base:]])
+    if _astray(race, model.fit):
+        return fitter.begin((*model.fit.coordinates, *coordinates), np.concatenate([known, extra.start]))
+    anew = fitter.derive(model.fit, coordinates, extra.others[0])
+    return replace(anew, values=np.concatenate([known, anew.values[len(known) :]]))
 
 
-def _astray(race: Race, job: Job) -> bool:
+def _astray(race: Race, fit: Fit) -> bool:
     """Whether a fit is so far from the logs that its derivatives hold nowhere else."""
-    return job.cost > ASTRAY**2 * race.noise * len(job.r)
+    return fit.cost > ASTRAY**2 * race.noise * len(fit.r)
 
 
 def ranked(race: Race, size: int | None = None) -> list[Model]:
@@ -264,17 +264,18 @@ def start_of(race: Race, candidate: Candidate) -> Screened:
 
 def polish(race: Race, model: Model) -> Model:
     """All columns anew at the fit, and some more steps; with contacts again and again, as long as it helps much."""
-    fitter, job = race.fitter, race.fitter.refresh(model.job)
+    fitter, fit = race.fitter, race.fitter.refresh(model.fit)
     if race.rough:
         for _ in range(ROUNDS):
-            before, job.history = job.cost, []
-            fitter.iterate([job], 2, lambda j: range(len(j.coordinates)))
-            if fitter.refresh(job).cost > 0.9 * before:
+            before = fit.cost
+            (fit,) = fitter.iterate([replace(fit, history=())], 2, lambda f: range(len(f.coordinates)))
+            fit = fitter.refresh(fit)
+            if fit.cost > 0.9 * before:
                 break
     else:
-        fitter.iterate([job], 4, lambda j: fresh(race, j))
-        fitter.refresh(job)
-    new = scored(fitter, job, model.effects)
+        (fit,) = fitter.iterate([fit], 4, lambda f: fresh(race, f))
+        fit = fitter.refresh(fit)
+    new = scored(fitter, fit, model.effects)
     race.models[frozenset(c.label for c in model.effects)] = new
     return new
 
@@ -297,7 +298,7 @@ def exchange(race: Race, model: Model, old: Candidate, new: Candidate, say: Prog
     """The model with one effect in the place of another, refitted."""
     rest = without(race, model, old, say)
     if rest.effects:
-        start = next(s for s in screen(race.fitter, rest.job, [new], race.settings.screened))
+        start = next(s for s in screen(race.fitter, rest.fit, [new], race.settings.screened))
         return fit_models(race, [(rest, start)], "exchanges", say)[0]
     return fit_models(race, [(race.base, start_of(race, new))], "exchanges", say)[0]
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
-from bayessim_mjx.diagnosis.fitting.fitter import Fitter, Job
+from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 
 Array = NDArray[np.float64]
 MANY = 400  # starting points, from which on they are screened in two stages
@@ -40,33 +40,33 @@ class Screened:
     whole: float = 0.0
 
 
-def screen(fitter: Fitter, job: Job, candidates: Sequence[Candidate], limit: int = 96) -> list[Screened]:
-    """All candidates on top of `job`, best first, on at most `limit` windows.
+def screen(fitter: Fitter, fit: Fit, candidates: Sequence[Candidate], limit: int = 96) -> list[Screened]:
+    """All candidates on top of `fit`, best first, on at most `limit` windows.
 
     Where there are many starting points, a third of the windows tells which are worth a second look on all of them.
     Gains are scaled to all windows as if those looked at were typical: good for ranking, too high as an estimate.
     """
     every = [(i, point) for i, candidate in enumerate(candidates) for point in candidate.probes]
     if len(every) <= MANY:
-        return _ordered(_looked_at(fitter, job, candidates, every, limit))
-    coarse = _looked_at(fitter, job, candidates, every, max(limit // 3, FEWEST))
+        return _ordered(_looked_at(fitter, fit, candidates, every, limit))
+    coarse = _looked_at(fitter, fit, candidates, every, max(limit // 3, FEWEST))
     order = sorted(coarse, key=lambda i: -max(s.gain for s, _ in coarse[i]))[:CANDIDATES]
     again = [(i, p) for i in order for _, p in sorted(coarse[i], key=lambda f: -f[0].gain)[:POINTS]]
-    fine = _looked_at(fitter, job, candidates, again, limit)
+    fine = _looked_at(fitter, fit, candidates, again, limit)
     return _ordered(fine) + _ordered({i: found for i, found in coarse.items() if i not in fine})
 
 
 def _looked_at(
-    fitter: Fitter, job: Job, candidates: Sequence[Candidate], plans: Sequence[tuple[int, Array]], limit: int
+    fitter: Fitter, fit: Fit, candidates: Sequence[Candidate], plans: Sequence[tuple[int, Array]], limit: int
 ) -> dict[int, list[tuple[Screened, Array]]]:
     """{candidate: [(what its starting point gains, the point)]} for plans of (candidate, point)."""
-    count = len(job.r)
-    own = _telling(job, limit)
-    part = _part(job, own)
+    count = len(fit.r)
+    own = _telling(fit, limit)
+    part = _part(fit, own)
     if not plans:
         return {}
     thetas = [
-        fitter.vector((*job.coordinates, *candidates[i].coordinates), np.concatenate([job.values, point]))
+        fitter.vector((*fit.coordinates, *candidates[i].coordinates), np.concatenate([fit.values, point]))
         for i, point in plans
     ]
     run = fitter.simulator.run
@@ -80,12 +80,12 @@ def _looked_at(
     return each
 
 
-def _telling(job: Job, limit: int) -> NDArray[np.int64]:
+def _telling(fit: Fit, limit: int) -> NDArray[np.int64]:
     """At most `limit` windows: half of them where most is left to explain (a limit acts in few), the rest spread."""
-    count = len(job.r)
+    count = len(fit.r)
     if count <= limit:
         return np.arange(count)
-    worst = np.argsort(-np.sum(job.r**2, 1), kind="stable")[: limit // 2]
+    worst = np.argsort(-np.sum(fit.r**2, 1), kind="stable")[: limit // 2]
     others = np.setdiff1d(np.arange(count), worst)
     spread = others[np.linspace(0, len(others) - 1, limit - len(worst)).round().astype(int)]
     return np.sort(np.concatenate([worst, spread]))
@@ -116,37 +116,35 @@ def _with_others(found: list[tuple[Screened, Array]]) -> Screened:
     return replace(first, others=(point, *others, *levels, *whole))
 
 
-def _part(job: Job, own: NDArray[np.int64]) -> Job:
-    """The job on some of its windows."""
-    return replace(
-        job, offsets=job.offsets[own], r=job.r[own], A=job.A[own], B=job.B[own], weight=job.weight[own], history=[]
-    )
+def _part(fit: Fit, own: NDArray[np.int64]) -> Fit:
+    """The fit on some of its windows."""
+    return replace(fit, offsets=fit.offsets[own], r=fit.r[own], A=fit.A[own], B=fit.B[own], weight=fit.weight[own])
 
 
 class _Projection:
-    """The job's own parameters and start states, projected out of columns and residuals."""
+    """The fit's own parameters and start states, projected out of columns and residuals."""
 
-    def __init__(self, fitter: Fitter, job: Job) -> None:
-        precision, pull, low, high = job.prior()
-        q, starts = job.quadratic(fitter.spread)
-        g, S = q.weighted(job.weight)
+    def __init__(self, fitter: Fitter, fit: Fit) -> None:
+        precision, pull, low, high = fit.prior()
+        q, starts = fit.quadratic(fitter.spread)
+        g, S = q.weighted(fit.weight)
         slope = g + pull
         pinned = ((low >= -1e-12) & (slope < 0)) | ((high <= 1e-12) & (slope > 0))
         self.free = np.flatnonzero(~pinned)
-        self.job, self.starts, self.root = job, starts, np.sqrt(job.weight)[:, None]
+        self.fit, self.starts, self.root = fit, starts, np.sqrt(fit.weight)[:, None]
         H = (S + np.diag(precision))[np.ix_(self.free, self.free)]
         self.inverse = np.linalg.pinv(H) if len(self.free) else H
         self.slope = slope[self.free]
-        self.A = job.A[:, :, self.free]
+        self.A = fit.A[:, :, self.free]
         self.BA = np.einsum("wns,wnk->wsk", starts.B, self.A)
 
     def moments(self, a: Array) -> tuple[float, float, float, Array]:
         """(s, g, full norm, projected column) of a column `[W, n]`."""
-        w, starts = self.job.weight, self.starts
+        w, starts = self.fit.weight, self.starts
         Ba = np.einsum("wns,wn->ws", starts.B, a)
         MBa = np.einsum("wst,wt->ws", starts.M, Ba)
         s_aa = float(w @ (np.sum(a * a, 1) - np.sum(Ba * MBa, 1)))
-        g_a = float(w @ (np.sum(a * self.job.r, 1) - np.sum(MBa * starts.b, 1)))
+        g_a = float(w @ (np.sum(a * self.fit.r, 1) - np.sum(MBa * starts.b, 1)))
         s_ab = np.einsum("w,wnk,wn->k", w, self.A, a) - np.einsum("w,wsk,ws->k", w, self.BA, MBa)
         along = self.inverse @ s_ab
         projected = a - np.einsum("wns,ws->wn", starts.B, MBa)

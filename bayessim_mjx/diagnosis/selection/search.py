@@ -56,19 +56,19 @@ def run(
     """The whole race on the windows of `fitter`; `keep` is called with it after each stage."""
     say = progress or (lambda text, done, total: None)
     nominal = fitter.begin(fitter.base)
-    job = replace(nominal, A=nominal.A.copy(), history=[])  # the same point, simulated once
     say("known parameters", 0, 1)
-    fitter.iterate([job], 10, lambda j: range(len(j.coordinates)))
-    job = fitter.refresh(job)
-    base = scored(fitter, job, ())
+    start = replace(nominal, A=nominal.A.copy())  # in the memory order of later steps: sums round alike
+    (fit,) = fitter.iterate([start], 10, lambda f: range(len(f.coordinates)))
+    fit = fitter.refresh(fit)
+    base = scored(fitter, fit, ())
     race = Race(fitter, candidates, settings, nominal, base, winner=base)
     if race.rough:
         race.base = race.winner = polish(race, base)
-        job = race.base.job
+        fit = race.base.fit
     race.models[frozenset()] = race.base
     keep(race)
     say("screening", 0, 1)
-    race.screened = screen(fitter, job, candidates, settings.screened)
+    race.screened = screen(fitter, fit, candidates, settings.screened)
     if not race.above_noise(race.base):  # nothing to explain: a few fits for the table
         fit_models(race, [(race.base, s) for s in race.screened[:4]], "single effects", say)
         race.winner = race.base
@@ -190,7 +190,7 @@ def _forward(race: Race, model: Model, say: Progress, barred: Sequence[str], siz
         return None
     others = [c for c in race.candidates if all(compatible(c, e) for e in model.effects) and c.effect not in barred]
     others = [c for c in others if model.size + len(c.coordinates) <= size]
-    found = [s for s in screen(race.fitter, model.job, others, race.settings.screened) if s.gain > 0][
+    found = [s for s in screen(race.fitter, model.fit, others, race.settings.screened) if s.gain > 0][
         : race.settings.pairs
     ]
     bigger = fit_models(race, [(model, s) for s in found], f"{len(model.effects) + 1} effects", say)

@@ -33,14 +33,14 @@ class Spread:
 
 def spread(fitter: Fitter, model: Model, along: Ridges | None = None) -> Spread:
     """The uncertainty of the model's parameters at its fit; `along`: what was simulated along its ridges."""
-    q, _ = model.job.quadratic(fitter.spread)
-    precision = np.diag(weak_directions.beliefs(model.job, len(fitter.base)))
-    _, S = q.weighted(model.job.weight)
-    S = S if along is None else along.corrected(S, weak_directions.scales(model.job))
+    q, _ = model.fit.quadratic(fitter.spread)
+    precision = np.diag(weak_directions.beliefs(model.fit, len(fitter.base)))
+    _, S = q.weighted(model.fit.weight)
+    S = S if along is None else along.corrected(S, weak_directions.scales(model.fit))
     inflation = weak_directions.inflation(model)
     covariance = np.linalg.pinv(S / inflation + precision)
     group = fitter.simulator.windows.group
-    told = [covariance @ q.weighted(model.job.weight * (group == n))[1] @ covariance for n in np.unique(group)]
+    told = [covariance @ q.weighted(model.fit.weight * (group == n))[1] @ covariance for n in np.unique(group)]
     share = np.diagonal(told, axis1=1, axis2=2)  # of the parameter's variance, by the condition it comes from
     return Spread(np.asarray(covariance), statistics.covariance(model.estimates), statistics.freedom(share))
 
@@ -67,7 +67,7 @@ def covariance(fitter: Fitter, model: Model, along: Ridges | None = None) -> Arr
     sd = np.sqrt(np.where(between > formal, between * wide**2, formal))
     base = len(fitter.base)
     sd[:base] = np.minimum(
-        sd[:base], 1.0 / np.sqrt(weak_directions.beliefs(model.job, base)[:base])
+        sd[:base], 1.0 / np.sqrt(weak_directions.beliefs(model.fit, base)[:base])
     )  # data take nothing away
     both = found.formal + found.between
     scale = sd / np.sqrt(np.maximum(np.diag(both), 1e-300))
@@ -84,7 +84,7 @@ def systematic(model: Model, timestep: float, left: float = 0.0) -> Array:
     own = {c.name for effect in model.effects for c in effect.coordinates}
     return np.array([
         0.0 if c.name not in own else TIMES * timestep if c.unit == "s" else laws * abs(value - c.neutral)
-        for c, value in zip(model.job.coordinates, model.job.values, strict=True)
+        for c, value in zip(model.fit.coordinates, model.fit.values, strict=True)
     ])  # fmt: skip
 
 

@@ -112,7 +112,7 @@ def _rivals(race: Race, winner: Model, effect: Candidate, say: Progress) -> list
     rest = without(race, winner, effect, say)
     others = [c for c in race.candidates if c != effect and all(compatible(c, e) for e in rest.effects)]
     if rest.effects:
-        found = [s for s in screen(race.fitter, rest.job, others, race.settings.screened) if s.gain > 0][
+        found = [s for s in screen(race.fitter, rest.fit, others, race.settings.screened) if s.gain > 0][
             : race.settings.pairs
         ]
         models = fit_models(race, [(rest, s) for s in found], "rivals", say)
@@ -181,14 +181,14 @@ def structural(race: Race, model: Model, sd: np.ndarray) -> dict[str, str]:
     out = {}
     base = len(race.fitter.base)
     groups = len(model.estimates)
-    for i, c in enumerate(model.job.coordinates[:base]):
-        value, width = model.job.values[i], c.high - c.low
+    for i, c in enumerate(model.fit.coordinates[:base]):
+        value, width = model.fit.values[i], c.high - c.low
         if min(value - c.low, c.high - value) < 1e-3 * width:
             out[c.name] = f"sits at its bound {value:.4g}: it stands in for something else, or its range is too narrow"
     if groups < 3:
         return out
     each, deviation = per_condition(race, model)
-    for i, c in enumerate(model.job.coordinates[:base]):
+    for i, c in enumerate(model.fit.coordinates[:base]):
         z2 = float(
             np.sum(((each[:, i] - np.average(each[:, i], weights=1 / deviation[:, i] ** 2)) / deviation[:, i]) ** 2)
         )
@@ -201,16 +201,16 @@ def structural(race: Race, model: Model, sd: np.ndarray) -> dict[str, str]:
 
 def per_condition(race: Race, model: Model) -> tuple[np.ndarray, np.ndarray]:
     """Each condition's own estimate and standard deviation, `[G, k]`, one Newton step from the common fit."""
-    q, _ = model.job.quadratic(race.fitter.spread)
-    precision, pull, low, high = model.job.prior()
+    q, _ = model.fit.quadratic(race.fitter.spread)
+    precision, pull, low, high = model.fit.prior()
     group = race.fitter.simulator.windows.group
     each, deviation = [], []
-    inflation = max(model.total / model.job.r.size, 0.5) * model.job.r.size / model.samples
+    inflation = max(model.total / model.fit.r.size, 0.5) * model.fit.r.size / model.samples
     for name in np.unique(group):
-        g, S = q.weighted(model.job.weight * (group == name))
+        g, S = q.weighted(model.fit.weight * (group == name))
         H = S / inflation + np.diag(precision)
         covariance = np.linalg.pinv(H)
-        each.append(model.job.values + np.clip(covariance @ (g / inflation + pull), low, high))
+        each.append(model.fit.values + np.clip(covariance @ (g / inflation + pull), low, high))
         deviation.append(np.sqrt(np.diag(covariance)))
     return np.array(each), np.array(deviation)
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bayessim_mjx.diagnosis.fitting.fitter import Fitter, Job
+from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 from bayessim_mjx.diagnosis.fitting.quadratic import eliminate
 from bayessim_mjx.diagnosis.selection.models import Model, scored
 
@@ -47,21 +47,21 @@ class Ridges:
         return np.asarray(S - (units * np.maximum(self.differenced - self.simulated, 0.0)) @ units.T)
 
 
-def scales(job: Job) -> Array:
+def scales(fit: Fit) -> Array:
     """Standard deviations `[k]` of uniform distributions over the parameters' ranges."""
-    return np.array([UNIFORM * (c.high - c.low) for c in job.coordinates])
+    return np.array([UNIFORM * (c.high - c.low) for c in fit.coordinates])
 
 
-def beliefs(job: Job, base: int) -> Array:
+def beliefs(fit: Fit, base: int) -> Array:
     """Precisions `[k]` of what was believed beforehand: the first `base` parameters at least as a uniform one."""
-    precision = np.array([c.precision for c in job.coordinates])
-    precision[:base] = np.maximum(precision[:base], 1.0 / scales(job)[:base] ** 2)
+    precision = np.array([c.precision for c in fit.coordinates])
+    precision[:base] = np.maximum(precision[:base], 1.0 / scales(fit)[:base] ** 2)
     return precision
 
 
 def inflation(model: Model) -> float:
     """Squared misfit per effective residual: by how much less the data know than independent noise would tell."""
-    count = model.job.r.size
+    count = model.fit.r.size
     return max(model.total / count, 0.5) * count / model.samples
 
 
@@ -80,16 +80,16 @@ class _Profile:
     """Costs along a model's ridges, minimised over the start states and all directions that the data do tell."""
 
     def __init__(self, fitter: Fitter, model: Model) -> None:
-        self.fitter, self.model, self.job = fitter, model, model.job
-        base, scale = len(fitter.base), scales(self.job)
-        q, _ = self.job.quadratic(fitter.spread)
-        _, S = q.weighted(self.job.weight)
+        self.fitter, self.model, self.fit = fitter, model, model.fit
+        base, scale = len(fitter.base), scales(self.fit)
+        q, _ = self.fit.quadratic(fitter.spread)
+        _, S = q.weighted(self.fit.weight)
         curvature, V = np.linalg.eigh(scale[:, None] * S * scale)
         variance = V[base:] ** 2 / np.maximum(curvature, 1e-12 * curvature[-1])
         share = np.max(variance / np.maximum(variance.sum(1, keepdims=True), 1e-300), axis=0)
         self.weak = weak = np.flatnonzero((curvature < WEAK * curvature[-1]) & (share > INVOLVED))[:MOST]
         self.every = scale[:, None] * V
-        self.ways, self.columns = self.every[:, weak], self.job.A @ self.every
+        self.ways, self.columns = self.every[:, weak], self.fit.A @ self.every
         self.less = inflation(model)
         self.slopes, simulated = self._along()
         self.ridges = Ridges(self.ways, np.maximum(curvature[weak], 0.0), simulated)
@@ -100,8 +100,8 @@ class _Profile:
         slopes, curvature = np.zeros(len(along)), np.zeros(len(along))
         if not along:
             return slopes, curvature
-        points = [self.job.values + t * w for ts, w in zip(along, self.ways.T, strict=True) for t in ts]
-        costs, _ = self.costs([self.job.values, *points], [self.weak, *([i] for i in np.repeat(self.weak, 2))])
+        points = [self.fit.values + t * w for ts, w in zip(along, self.ways.T, strict=True) for t in ts]
+        costs, _ = self.costs([self.fit.values, *points], [self.weak, *([i] for i in np.repeat(self.weak, 2))])
         for k, (s, t) in enumerate(along):
             rise = costs[1 + 2 * k : 3 + 2 * k] - costs[0]  # = slope t + curvature t^2
             rise = np.sign(rise) * np.maximum(np.abs(rise) - self.allowed(costs[0]), 0.0)
@@ -123,10 +123,10 @@ class _Profile:
 
     def _room(self, way: Array) -> tuple[float, float]:
         """How far one can go along a way (backwards, forwards) before a parameter meets its bound."""
-        _, _, low, high = self.job.prior()
+        _, _, low, high = self.fit.prior()
         with np.errstate(divide="ignore", invalid="ignore"):
             ends = np.sort(np.stack([low / way, high / way]), axis=0)
-        moving = np.abs(way) > 1e-3 * scales(self.job)
+        moving = np.abs(way) > 1e-3 * scales(self.fit)
         return float(np.max(ends[0][moving], initial=-np.inf)), float(np.min(ends[1][moving], initial=np.inf))
 
     def costs(self, points: Sequence[Array], fixed: Sequence[Any]) -> tuple[Array, list[Array]]:
@@ -134,39 +134,39 @@ class _Profile:
 
         fixed: of each point, indices of the directions in which it stays where it is.
         """
-        fitter, job = self.fitter, self.job
-        low, high = (np.array([getattr(c, end) for c in job.coordinates]) for end in ("low", "high"))
+        fitter, fit = self.fitter, self.fit
+        low, high = (np.array([getattr(c, end) for c in fit.coordinates]) for end in ("low", "high"))
         reached, costs = [np.clip(p, low, high) for p in points], np.zeros(len(points))
         for _ in range(STEPS):
-            thetas = np.stack([fitter.vector(job.coordinates, p) for p in reached])
-            rows = fitter.whiten(fitter.simulator.run(thetas, np.repeat(job.offsets[None], len(thetas), 0)))
+            thetas = np.stack([fitter.vector(fit.coordinates, p) for p in reached])
+            rows = fitter.whiten(fitter.simulator.run(thetas, np.repeat(fit.offsets[None], len(thetas), 0)))
             for k, (r, stays) in enumerate(zip(rows, fixed, strict=True)):
-                free = np.setdiff1d(np.arange(len(job.values)), stays)
-                q, _ = eliminate(r, self.columns[..., free], job.B, job.offsets, fitter.spread)
-                g, S = q.weighted(job.weight)
+                free = np.setdiff1d(np.arange(len(fit.values)), stays)
+                q, _ = eliminate(r, self.columns[..., free], fit.B, fit.offsets, fitter.spread)
+                g, S = q.weighted(fit.weight)
                 step = np.linalg.lstsq(S, g, rcond=None)[0]
-                costs[k] = job.weight @ q.c - g @ step
+                costs[k] = fit.weight @ q.c - g @ step
                 reached[k] = np.clip(reached[k] + self.every[:, free] @ step, low, high)
         return costs, reached
 
     def moved(self) -> Model | None:
         """One step to the posterior's mode along ridges where beliefs weigh more, if it costs next to nothing."""
-        job = self.job
+        fit = self.fit
         known = self.ridges.simulated / self.less
         flat = np.flatnonzero(known < 1.0)
         if not len(flat):
             return None
-        ways, belief = self.ways[:, flat], beliefs(job, len(self.fitter.base))
-        neutral = np.array([c.neutral for c in job.coordinates])
+        ways, belief = self.ways[:, flat], beliefs(fit, len(self.fitter.base))
+        neutral = np.array([c.neutral for c in fit.coordinates])
         H = np.diag(known[flat]) + ways.T @ (belief[:, None] * ways)
-        slope = self.slopes[flat] / self.less / 2 + ways.T @ (belief * (job.values - neutral))
+        slope = self.slopes[flat] / self.less / 2 + ways.T @ (belief * (fit.values - neutral))
         step = np.clip(-np.linalg.solve(H, slope), -REACH, REACH)
-        points = [job.values, *(job.values + ways @ (share * step) for share in SHARES)]
+        points = [fit.values, *(fit.values + ways @ (share * step) for share in SHARES)]
         (here, *_), reached = self.costs(points, [self.weak[flat]] * len(points))
         for point in reached[1:]:
-            if np.all(np.abs(point - job.values) <= 1e-3 * scales(job)):
+            if np.all(np.abs(point - fit.values) <= 1e-3 * scales(fit)):
                 continue
-            new = self.fitter.refresh(replace(job, values=point, history=[]))
+            new = self.fitter.refresh(replace(fit, values=point, history=()))
             q, _ = new.quadratic(self.fitter.spread)
             if float(new.weight @ q.c) - here <= self.allowed(here):
                 return scored(self.fitter, new, self.model.effects)

@@ -54,7 +54,7 @@ def diagnosis_of(found: Findings, say: search.Progress = lambda text, done, tota
         next_experiment={},
         versions=versions(),
         details=details(found, effects, closed),
-        covariance={"names": list(model.job.names), "matrix": together},
+        covariance={"names": list(model.fit.names), "matrix": together},
     )
 
 
@@ -65,9 +65,9 @@ def _told(found: Findings, covariance: np.ndarray) -> np.ndarray:
     for effect in model.effects:
         for c, value in zip(effect.coordinates, model.values_of(effect), strict=True):
             bound = bounds.of(physics, effect, c, float(value))
-            at += [model.job.names.index(c.name)] if bound is not None and bound.kind != "off" else []
-    neutral = np.array([c.neutral for c in model.job.coordinates])
-    return bounds.spread_out(covariance, model.job.values, neutral, at)
+            at += [model.fit.names.index(c.name)] if bound is not None and bound.kind != "off" else []
+    neutral = np.array([c.neutral for c in model.fit.coordinates])
+    return bounds.spread_out(covariance, model.fit.values, neutral, at)
 
 
 def _remains(found: Findings) -> float:
@@ -120,7 +120,7 @@ def _parameters(race: search.Race, model: Model, sd: np.ndarray) -> dict[str, di
     remarks = verdict.structural(race, model, sd)
     return {
         c.name: {
-            "mean": float(model.job.values[i]), "sd": float(sd[i]), "nominal": c.neutral, "low": c.low, "high": c.high,
+            "mean": float(model.fit.values[i]), "sd": float(sd[i]), "nominal": c.neutral, "low": c.low, "high": c.high,
             "unit": c.unit, "structural": remarks.get(c.name, ""),
         }
         for i, c in enumerate(race.fitter.base)
@@ -143,8 +143,8 @@ def ranking(race: search.Race) -> list[dict[str, Any]]:
             "score": 0.5 * samples * float(np.log(race.base.total / model.total)),
             "se": error,
             "gap_closed": race.closure(model),
-            "rms": float(np.sqrt(model.total / model.job.r.size)),
-            "parameters": dict(zip(model.job.names, map(float, model.job.values), strict=True)),
+            "rms": float(np.sqrt(model.total / model.fit.r.size)),
+            "parameters": dict(zip(model.fit.names, map(float, model.fit.values), strict=True)),
             "absorbed": absorbed.get(model.effects[0].label) if len(model.effects) == 1 else None,
         })  # fmt: skip
     return out
@@ -200,9 +200,9 @@ def _with_places(result: Diagnosis, found: Findings, folder: Path) -> Diagnosis:
 
     if found.disturbance is None:
         return result
-    fitter, job = found.setup.fitter, found.race.base.job
-    places, maps, told = where.locate(fitter, job, found.disturbance, seed=found.setup.seed)
-    spectra, heard = frequency.analyse(fitter, job, found.disturbance)
+    fitter, fit = found.setup.fitter, found.race.base.fit
+    places, maps, told = where.locate(fitter, fit, found.disturbance, seed=found.setup.seed)
+    spectra, heard = frequency.analyse(fitter, fit, found.disturbance)
     more = result.details | {"maps": maps, "frequency": spectra}
     return replace(result, where=places or result.where, sentences=[*result.sentences, *told, *heard], details=more)
 

@@ -19,7 +19,7 @@ MANY = 24  # candidates in the isolability matrix, overlays in the report
 def details(found: Findings, effects: list[FoundEffect], closed: dict[str, Any]) -> dict[str, Any]:
     ruling, cut = found.ruling, found.setup.fitter.simulator.windows
     each, deviation = verdict.per_condition(found.race, ruling.model)
-    names = ruling.model.job.names
+    names = ruling.model.fit.names
     return {
         "effect_specs": {e.name: spec_of(e) for e in found.setup.physics.effects if e.quantities},
         "overlays": _overlays(found),

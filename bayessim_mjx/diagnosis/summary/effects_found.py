@@ -77,10 +77,10 @@ def _effect(found: Findings, effect: Candidate, sd: np.ndarray, part: _Part) -> 
     weighed = [r for r in rivals if not r.contains]
     own_weight, *others = _weights(found, [model, *(r.model for r in weighed)])
     weight_of = dict(zip(map(id, weighed), others, strict=True))
-    own = [model.job.names.index(c.name) for c in effect.coordinates]
+    own = [model.fit.names.index(c.name) for c in effect.coordinates]
     numbers, ends = {}, []
     for i, c in zip(own, effect.coordinates, strict=True):
-        value, word = float(model.job.values[i]), c.name.rsplit(".", 1)[1]
+        value, word = float(model.fit.values[i]), c.name.rsplit(".", 1)[1]
         bound = bounds.of(setup.physics, effect, c, value)
         deviation = float(sd[i]) if bound is None or bound.kind == "off" else float("nan")
         numbers[word] = Estimate(value, deviation, _unit(setup, effect, c.unit), bound.kind if bound else "")

@@ -22,7 +22,7 @@ def measured(found: Findings, closed: dict[str, Any]) -> Gap:
     """The gap over the windows and a shorter horizon; `with_whole` adds that over whole logs."""
     setup, predictions = found.setup, found.predictions
     cut, allowed = setup.fitter.simulator.windows, setup.tolerance
-    again = repeated.floor(setup.fitter, found.ruling.model.job, setup.logs)
+    again = repeated.floor(setup.fitter, found.ruling.model.fit, setup.logs)
     short = max(1, min(round(SHORT / cut.dt), cut.steps // 2))
     rows = []
     for steps in (short, cut.steps):

@@ -32,12 +32,12 @@ def write(path: Path, about: dict[str, Any], warnings: Sequence[str], setup: Set
 
 def _so_far(race: Race) -> dict[str, Any]:
     """Gaps in noise standard deviations, recalibrated parameters and the best models."""
-    job, noise = race.base.job, race.noise * len(race.base.cost)
+    fit, noise = race.base.fit, race.noise * len(race.base.cost)
     nominal, _ = race.nominal.quadratic(race.fitter.spread)
     gap = {"nominal": np.sqrt(nominal.c.sum() / noise), "calibrated": np.sqrt(race.base.total / noise)}
     best = [{k: row[k] for k in ("label", "score", "se", "gap_closed", "parameters")} for row in ranking(race)[:BEST]]
     return {
         "gap": {k: float(v) for k, v in gap.items()},
-        "parameters": dict(zip(job.names, map(float, job.values), strict=True)),
+        "parameters": dict(zip(fit.names, map(float, fit.values), strict=True)),
         "candidates": best,
     }

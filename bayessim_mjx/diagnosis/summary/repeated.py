@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from bayessim_mjx.diagnosis.fitting.fitter import Fitter, Job
+from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 from bayessim_mjx.diagnosis.logcheck import noise
 from bayessim_mjx.diagnosis.selection.heldout import Prediction
 from bayessim_mjx.logs.log import Log
@@ -19,11 +19,11 @@ FEWEST = 3  # windows with a repeat: with fewer nothing is said
 SAME = 1e-3  # of a command's range: commands that are the same
 
 
-def floor(fitter: Fitter, job: Job, logs: Sequence[Log]) -> tuple[Prediction, NDArray[np.int64]] | None:
+def floor(fitter: Fitter, fit: Fit, logs: Sequence[Log]) -> tuple[Prediction, NDArray[np.int64]] | None:
     """The error of a perfect model of what repeats, window by window, and the windows' conditions `[P]`.
 
     Two runs of the same commands differ by twice the variance of what is not reproducible. What comes of their
-    different start states is taken out as it is from a model's errors, by the job's derivatives.
+    different start states is taken out as it is from a model's errors, by the fit's derivatives.
 
     Args:
         logs: as recorded, in the order of the windows' logs.
@@ -37,11 +37,11 @@ def floor(fitter: Fitter, job: Job, logs: Sequence[Log]) -> tuple[Prediction, ND
         a, b = (_states(fitter.simulator.physics.mj_model, cut.logs[r]) for r in (cut.log[w], partner))
         rows = slice(int(cut.start[w]) + 1, int(cut.start[w]) + 1 + cut.steps)
         d = _apart(fitter.simulator.physics.mj_model, a[rows], b[rows])[:, fitter.used] / fitter.sigma / np.sqrt(2)
-        errors.append(_settled(d, job.B[w], fitter.spread))
+        errors.append(_settled(d, fit.B[w], fitter.spread))
         group.append(cut.group[w])
     if len(errors) < FEWEST:
         return None
-    return Prediction(np.stack(errors), np.zeros((len(errors), job.offsets.shape[1]))), np.array(group)
+    return Prediction(np.stack(errors), np.zeros((len(errors), fit.offsets.shape[1]))), np.array(group)
 
 
 def _pairs(fitter: Fitter, logs: Sequence[Log]) -> Iterator[tuple[int, int]]:

@@ -95,7 +95,7 @@ def _one(found: Findings, simulator: Simulator, stages: dict[str, _Stage], i: in
     fitter = found.setup.fitter
     thetas = [_theta(found, simulator, s, w) for s in stages.values()]
     offsets = [s.prediction.offsets[w] for s in stages.values()]
-    B = list(stages.values())[-1].model.job.B[w]
+    B = list(stages.values())[-1].model.fit.B[w]
     root = np.linalg.cholesky(np.linalg.inv(B.T @ B + np.diag(1 / fitter.spread**2)))
     draws = np.random.default_rng(found.setup.seed).normal(size=(DRAWS, len(root))) @ root.T
     thetas += [thetas[-1]] * DRAWS
@@ -107,13 +107,13 @@ def _one(found: Findings, simulator: Simulator, stages: dict[str, _Stage], i: in
 
 def _theta(found: Findings, simulator: Simulator, stage: _Stage, w: int) -> Array:
     """theta of the small simulator found without the condition of window w (with all, where the log has several)."""
-    fitter, job = found.setup.fitter, stage.model.job
+    fitter, fit = found.setup.fitter, stage.model.fit
     cut = fitter.simulator.windows
     own = np.unique(cut.group[cut.log == cut.log[w]])
-    values = stage.model.estimates[list(np.unique(cut.group)).index(own[0])] if len(own) == 1 else job.values
-    values = np.array([c.neutral for c in job.coordinates]) if stage.nominal else values
+    values = stage.model.estimates[list(np.unique(cut.group)).index(own[0])] if len(own) == 1 else fit.values
+    values = np.array([c.neutral for c in fit.coordinates]) if stage.nominal else values
     space, small = found.setup.physics.space, simulator.physics.space
-    return fitter.vector(job.coordinates, values)[[space.index(name) for name in small.names]]
+    return fitter.vector(fit.coordinates, values)[[space.index(name) for name in small.names]]
 
 
 def _judged(

@@ -159,7 +159,7 @@ def test_the_command_file_round_trips(tmp_path):
 def test_identical_rivals_are_said_to_be_inseparable():
     setup, race, ruling, models = contest()
     drag = models["quadratic_drag"]
-    twin = scored(setup.fitter, drag.job, drag.effects)
+    twin = scored(setup.fitter, drag.fit, drag.effects)
     found = propose(setup, race, ruling, [twin], LIMITS)
     assert abs(found.evidence) < 0.05 and found.name == "none" and found.chosen is None
     assert "no safe excitation separates" in found.why and "speeds of five to one" in found.why

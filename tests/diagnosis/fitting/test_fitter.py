@@ -24,65 +24,64 @@ def clean(tmp_path_factory):
 @pytest.fixture(scope="module")
 def rubbing(tmp_path_factory):
     setup = prepare(nominal(tmp_path_factory.mktemp("dry")), recorded(friction=FRICTION), ["coulomb_friction"])
-    fitter, job = fitted(setup)
+    fitter, fit = fitted(setup)
     (candidate,) = setup.candidates
-    new = fitter.derive(job, candidate.coordinates, np.array([0.01]))
-    fitter.iterate([new], 12, lambda j: range(len(j.coordinates)))
-    return fitter, job, fitter.refresh(new), candidate
+    new = fitter.derive(fit, candidate.coordinates, np.array([0.01]))
+    (new,) = fitter.iterate([new], 12, lambda f: range(len(f.coordinates)))
+    return fitter, fit, fitter.refresh(new), candidate
 
 
 def test_known_parameters_are_recovered(clean):
-    _, job = clean
-    assert job.names == tuple(n for n in job.names if n.endswith(NAMES)) and len(job.names) == 3
-    found = {n: v for n, v in zip(job.names, job.values, strict=True)}
+    _, fit = clean
+    assert fit.names == tuple(n for n in fit.names if n.endswith(NAMES)) and len(fit.names) == 3
+    found = {n: v for n, v in zip(fit.names, fit.values, strict=True)}
     for name, true in zip(NAMES, SCALE, strict=True):
         (value,) = [v for n, v in found.items() if n.endswith(name)]
         assert value == pytest.approx(true, rel=0.02), name
 
 
 def test_the_right_model_is_left_with_noise(clean):
-    fitter, job = clean
-    cost = np.mean(job.r**2)
+    fitter, fit = clean
+    cost = np.mean(fit.r**2)
     assert 0.7 < cost < 1.1  # start states take some of it
-    held, moves = fitter.scores(job)
-    assert held.shape == (len(job.r),) and moves.shape == (8, 3)
+    held, moves = fitter.scores(fit)
+    assert held.shape == (len(fit.r),) and moves.shape == (8, 3)
     assert held.mean() / fitter.size == pytest.approx(1.0, abs=0.2)
 
 
 def test_costs_of_accepted_steps_never_rise(clean):
     fitter, _ = clean
-    job = fitter.begin(fitter.base)
-    first = fitter.cost(job, job.r, job.offsets, job.values)
-    fitter.iterate([job], 3, lambda j: range(3))
-    assert job.cost <= min(job.history) * (1 + 1e-12) and job.cost < 0.1 * first
+    start = fitter.begin(fitter.base)
+    first = fitter.cost(start, start.r, start.offsets, start.values)
+    (fit,) = fitter.iterate([start], 3, lambda f: range(3))
+    assert start.history == () and np.array_equal(start.values, [c.neutral for c in fitter.base])  # a value: unchanged
+    assert fit.cost <= min(fit.history) * (1 + 1e-12) and fit.cost < 0.1 * first
 
 
 def test_columns_are_derivatives_of_the_residual(clean):
     """A step of 1 % moves the residual by minus column times step."""
-    fitter, job = clean
-    moved = job.values.copy()
+    fitter, fit = clean
+    moved = fit.values.copy()
     moved[0] += 0.01
-    r = fitter.whiten(fitter.simulator.run(fitter.vector(job.coordinates, moved)[None], job.offsets[None]))[0]
-    predicted = job.r - 0.01 * job.A[..., 0]
-    assert np.linalg.norm(r - predicted) < 0.1 * np.linalg.norm(r - job.r)
+    r = fitter.whiten(fitter.simulator.run(fitter.vector(fit.coordinates, moved)[None], fit.offsets[None]))[0]
+    predicted = fit.r - 0.01 * fit.A[..., 0]
+    assert np.linalg.norm(r - predicted) < 0.1 * np.linalg.norm(r - fit.r)
 
 
 def test_a_level_of_dry_friction_is_recovered(rubbing):
-    fitter, base, job, candidate = rubbing
-    assert job.values[-1] == pytest.approx(FRICTION, rel=0.05)
-    assert job.values[:3] == pytest.approx([1, 1, 1], rel=0.1)
-    assert job.cost < 0.5 * base.cost
-    model = scored(fitter, job, (candidate,))
+    fitter, base, fit, candidate = rubbing
+    assert fit.values[-1] == pytest.approx(FRICTION, rel=0.05)
+    assert fit.values[:3] == pytest.approx([1, 1, 1], rel=0.1)
+    assert fit.cost < 0.5 * base.cost
+    model = scored(fitter, fit, (candidate,))
     assert model.total < 0.5 * scored(fitter, base, ()).total
-    assert abs(job.values[-1] - FRICTION) < 4 * deviations(fitter, model)[-1] + 0.02 * FRICTION
-    assert model.values_of(candidate) == pytest.approx([job.values[-1]])
+    assert abs(fit.values[-1] - FRICTION) < 4 * deviations(fitter, model)[-1] + 0.02 * FRICTION
+    assert model.values_of(candidate) == pytest.approx([fit.values[-1]])
 
 
 def test_windows_far_worse_than_the_rest_count_less(rubbing):
-    fitter, _, job, _ = rubbing
-    job = fitter.derive(job, (), np.zeros(0))
-    job.r = job.r / np.sqrt(np.mean(job.r**2, 1, keepdims=True))
-    assert weights(job) == pytest.approx(np.ones(len(job.r)))
-    job.r[3] *= 40.0
-    found = weights(job)
-    assert found[3] == pytest.approx(0.1, rel=1e-6) and np.delete(found, 3) == pytest.approx(np.ones(len(job.r) - 1))
+    r = rubbing[2].r / np.sqrt(np.mean(rubbing[2].r ** 2, 1, keepdims=True))
+    assert weights(r) == pytest.approx(np.ones(len(r)))
+    r[3] *= 40.0
+    found = weights(r)
+    assert found[3] == pytest.approx(0.1, rel=1e-6) and np.delete(found, 3) == pytest.approx(np.ones(len(r) - 1))

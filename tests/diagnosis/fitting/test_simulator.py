@@ -62,9 +62,9 @@ def test_its_own_motion_has_no_error(simulator):
 def test_a_right_simulator_follows_mujoco_at_a_tenth_of_the_step(setup):
     """Errors left are second order in the step, after the start states are estimated."""
     fitter = setup.fitter
-    job = fitter.begin(())
-    fitter.iterate([job], 4, lambda j: ())
-    errors = fitter.simulator.run(fitter.theta[None], job.offsets[None])[0]
+    fit = fitter.begin(())
+    (fit,) = fitter.iterate([fit], 4, lambda f: ())
+    errors = fitter.simulator.run(fitter.theta[None], fit.offsets[None])[0]
     late = 0.5 * fitter.simulator.physics.mj_model.opt.timestep  # s, what a naive reading of the step would leave
     speed = np.asarray(fitter.simulator.windows.batch.qvel)
     assert np.sqrt(np.mean(errors[..., 0] ** 2)) < 0.1 * late * np.sqrt(np.mean(speed**2))

@@ -11,8 +11,8 @@ pytestmark = [pytest.mark.slow, pytest.mark.ci]  # whole diagnoses and fits
 
 @pytest.fixture(scope="module")
 def pushed():
-    fitter, job = fitted(record(force=lambda t, data: np.array([0.08])))
-    return fitter, job, d.estimate(fitter, job)
+    fitter, fit = fitted(record(force=lambda t, data: np.array([0.08])))
+    return fitter, fit, d.estimate(fitter, fit)
 
 
 def test_nodes_share_out_every_step():
@@ -24,12 +24,12 @@ def test_nodes_share_out_every_step():
 
 
 def test_columns_predict_what_the_simulator_does_under_a_force(pushed):
-    fitter, job, found = pushed
+    fitter, fit, found = pushed
     rng = np.random.default_rng(0)
     small = 0.02 * rng.standard_normal(found.flat.shape)
     force = found.linear.forces(small)
-    theta = fitter.vector(job.coordinates, job.values)
-    moved = job.r - fitter.whiten(fitter.simulator.run(theta[None], job.offsets[None], force=force[None]))[0]
+    theta = fitter.vector(fit.coordinates, fit.values)
+    moved = fit.r - fitter.whiten(fitter.simulator.run(theta[None], fit.offsets[None], force=force[None]))[0]
     predicted = np.einsum("wnd,wd->wn", found.linear.D, small)
     assert np.sqrt(np.mean((moved - predicted) ** 2)) < 0.02 * np.sqrt(np.mean(moved**2))
 
@@ -44,16 +44,16 @@ def test_a_constant_push_is_recovered(pushed):
 
 
 def test_the_parameters_are_right_once_the_force_is_there(pushed):
-    fitter, job, found = pushed
+    fitter, fit, found = pushed
     # damping, armature, mass: truth 1.06, 1, 1.06 times nominal; the fit without the force is further off
     truth = np.array([1.06, 1.0, 1.06])
     assert np.abs(found.values - truth).max() < 0.02
-    assert np.abs(found.values - truth).max() < np.abs(job.values - truth).max()
+    assert np.abs(found.values - truth).max() < np.abs(fit.values - truth).max()
 
 
 def test_friction_is_recovered_as_a_force_against_the_motion():
-    fitter, job = fitted(record(friction=(0.05, 0.0), wrong=1.0), iterations=0)
-    found = d.estimate(fitter, job, free=False)
+    fitter, fit = fitted(record(friction=(0.05, 0.0), wrong=1.0), iterations=0)
+    found = d.estimate(fitter, fit, free=False)
     speed = np.asarray(fitter.simulator.windows.batch.qvel)[..., 0]
     fast = np.abs(speed) > 0.5  # rad/s
     against = -found.force[..., 0] * np.sign(speed)
@@ -61,16 +61,16 @@ def test_friction_is_recovered_as_a_force_against_the_motion():
 
 
 def test_nothing_is_found_where_nothing_is_missing():
-    fitter, job = fitted(record())
-    found = d.estimate(fitter, job)
+    fitter, fit = fitted(record())
+    found = d.estimate(fitter, fit)
     # N m; the drive's efforts are a few N m
     assert np.sqrt(np.mean(found.force**2)) < 2e-3
     assert found.noise == pytest.approx(1.0, abs=0.1)
 
 
 def test_a_force_is_found_at_the_joint_where_it_acts():
-    fitter, job = fitted(record(joints=2, friction=(0.0, 0.05)))
-    found = d.estimate(fitter, job, knots=12)
+    fitter, fit = fitted(record(joints=2, friction=(0.0, 0.05)))
+    found = d.estimate(fitter, fit, knots=12)
     assert found.force.shape == (len(fitter.simulator.windows), 12, 2)
     power = np.mean((found.force / found.linear.scale) ** 2, axis=(0, 1))
     assert power[1] > 4 * power[0]

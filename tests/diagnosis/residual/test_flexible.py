@@ -20,8 +20,8 @@ def coupling(t, data):
 
 
 def solved(**case):
-    fitter, job = fitted(record(**case))
-    return fitter, job, f.flexible(fitter, job)
+    fitter, fit = fitted(record(**case))
+    return fitter, fit, f.flexible(fitter, fit)
 
 
 @pytest.fixture(scope="module")
@@ -30,12 +30,12 @@ def outside():
 
 
 def test_an_effect_outside_of_the_library_is_found_on_other_conditions(outside):
-    fitter, job, found = outside
+    fitter, fit, found = outside
     for held in (found.condition, found.interpolation):
         assert held.significant
         assert held.cost.shape == held.base.shape == (len(fitter.simulator.windows),)
         # the gap above the noise, squared
-        assert held.cost.sum() - job.r.size < 0.05 * (held.base.sum() - job.r.size)
+        assert held.cost.sum() - fit.r.size < 0.05 * (held.base.sum() - fit.r.size)
 
 
 def test_all_seeds_and_ridges_are_reported(outside):
@@ -53,11 +53,11 @@ def test_it_says_that_it_depends_on_the_direction_of_motion(outside):
 
 
 def test_nothing_more_than_noise_where_nothing_is_missing():
-    _, job, found = solved()
+    _, fit, found = solved()
     for held in (found.condition, found.interpolation):
-        assert held.base.sum() < 1.15 * job.r.size  # noise alone, to begin with
-        assert held.cost.sum() > 0.85 * job.r.size  # noise is not explained
-        assert abs(held.gain) < 0.2 * job.r.size
+        assert held.base.sum() < 1.15 * fit.r.size  # noise alone, to begin with
+        assert held.cost.sum() > 0.85 * fit.r.size  # noise is not explained
+        assert abs(held.gain) < 0.2 * fit.r.size
     assert "noise" in found.text[0] or "nothing" in found.text[0]
 
 
@@ -70,8 +70,8 @@ def test_irreproducible_pushes_are_not_explained():
         return np.array([pushes[random.calls // 1000]])  # changes every 0.2 s, never the same again
 
     random.calls = 0
-    _, job, found = solved(force=random)
-    assert found.condition.base.sum() > 20 * job.r.size
+    _, fit, found = solved(force=random)
+    assert found.condition.base.sum() > 20 * fit.r.size
     assert not found.condition.significant
     assert found.condition.gain < 0.2 * found.condition.base.sum()
 

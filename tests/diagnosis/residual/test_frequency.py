@@ -66,16 +66,16 @@ def test_windows_without_gaps_are_joined():
 
 
 def test_cogging_is_found_with_its_order_and_amplitude():
-    fitter, job = fitted(record(force=lambda t, d: np.array([0.05 * np.sin(11 * d.qpos[0])])))
-    found, text = frequency.analyse(fitter, job)
+    fitter, fit = fitted(record(force=lambda t, d: np.array([0.05 * np.sin(11 * d.qpos[0])])))
+    found, text = frequency.analyse(fitter, fit)
     assert [o["order"] for o in found[0]["orders"]] == [11]
     assert found[0]["orders"][0]["amplitude"] == pytest.approx(0.05, rel=0.1)  # N m
     assert any("11 times per turn" in t for t in text)
 
 
 def test_a_delay_of_the_effort_is_found():
-    fitter, job = fitted(record(delay=0.006, wrong=1.0), iterations=0)
-    found, text = frequency.analyse(fitter, job, disturbance.estimate(fitter, job, free=False))
+    fitter, fit = fitted(record(delay=0.006, wrong=1.0), iterations=0)
+    found, text = frequency.analyse(fitter, fit, disturbance.estimate(fitter, fit, free=False))
     assert found[0]["delay"]["mean"] == pytest.approx(0.006, rel=0.12)  # s
     assert any("later than commanded" in t for t in text)
     for key in ("coherence_real", "coherence_sim", "gain_real", "gain_sim", "phase_real_deg", "phase_sim_deg"):
@@ -85,7 +85,7 @@ def test_a_delay_of_the_effort_is_found():
 
 def test_windows_too_short_and_apart_have_no_spectrum(monkeypatch):
     """Of unstable motion only some windows are kept, so that none follows another."""
-    fitter, job = fitted(record(logs=2, seconds=2.0), iterations=0)
+    fitter, fit = fitted(record(logs=2, seconds=2.0), iterations=0)
     monkeypatch.setattr(frequency, "runs", lambda windows: [np.array([i]) for i in range(len(windows.log))])
     monkeypatch.setattr(frequency, "LEAST", 2 * fitter.simulator.windows.steps)
-    assert frequency.analyse(fitter, job, disturbance.estimate(fitter, job)) == ([], [])
+    assert frequency.analyse(fitter, fit, disturbance.estimate(fitter, fit)) == ([], [])

@@ -12,8 +12,8 @@ pytestmark = [pytest.mark.slow, pytest.mark.ci]  # whole diagnoses and fits
 
 
 def located(**case):
-    fitter, job = fitted(record(**case))
-    return fitter, job, disturbance.estimate(fitter, job)
+    fitter, fit = fitted(record(**case))
+    return fitter, fit, disturbance.estimate(fitter, fit)
 
 
 @pytest.fixture(scope="module")
@@ -25,17 +25,17 @@ def elbow():
 def backward():
     """A force of 0.06 N m against the motion, only below zero rad."""
     logs = record(force=lambda t, d: np.array([-0.06 * np.tanh(d.qvel[0] / 0.02) * (d.qpos[0] < 0)]), wrong=1.0)
-    fitter, job = fitted(logs, iterations=0)
-    return fitter, job, disturbance.estimate(fitter, job, free=False)
+    fitter, fit = fitted(logs, iterations=0)
+    return fitter, fit, disturbance.estimate(fitter, fit, free=False)
 
 
 def prints(case, dof):
-    fitter, job, found = case
+    fitter, fit, found = case
     windows = fitter.simulator.windows
     inputs = motion_inputs.measured(windows, fitter.simulator.physics.mj_model)
     node = regions.nodes(found, inputs, dof)
     return {
-        f.name: f for f in fingerprints(fitter, job, found, inputs, dof, node, statistics.leave_one_out(windows.group))
+        f.name: f for f in fingerprints(fitter, fit, found, inputs, dof, node, statistics.leave_one_out(windows.group))
     }
 
 

@@ -49,10 +49,10 @@ def race_of(true, quantity=None, low=0.0, high=1.0, neutral=0.0, start=0.5):
     candidate = Candidate("toy", "place", "joint", (coordinate,), (False,))
     fitter = Fitter(simulator, (), np.zeros(1))
     empty = scored(fitter, fitter.begin(()), ())
-    job = fitter.begin((coordinate,), np.array([start]))
-    fitter.iterate([job], 10, lambda j: [0])
-    model = scored(fitter, fitter.refresh(job), (candidate,))
-    race = Race(fitter, [candidate], Settings(), empty.job, empty, winner=model)
+    fit = fitter.begin((coordinate,), np.array([start]))
+    (fit,) = fitter.iterate([fit], 10, lambda f: [0])
+    model = scored(fitter, fitter.refresh(fit), (candidate,))
+    race = Race(fitter, [candidate], Settings(), empty.fit, empty, winner=model)
     race.models[frozenset([candidate.label])] = model
     return race, model
 
@@ -64,7 +64,7 @@ def silent(*args):
 def ended(race, model):
     (effect,) = model.effects
     (c,) = effect.coordinates
-    return bounds.of(race.fitter.simulator.physics, effect, c, float(model.values_of(effect)[0])), model.job.values[0]
+    return bounds.of(race.fitter.simulator.physics, effect, c, float(model.values_of(effect)[0])), model.fit.values[0]
 
 
 @pytest.mark.parametrize(("true", "high"), [(0.4, 1.0), (1.7, 2.0), (5.3, 8.0)])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate, Coordinate
-from bayessim_mjx.diagnosis.fitting.fitter import Job
+from bayessim_mjx.diagnosis.fitting.fitter import Fit
 from bayessim_mjx.diagnosis.selection import predicted_gain
 
 GROUPS, EACH, STEPS = 4, 5, 30
@@ -41,16 +41,16 @@ def race() -> SimpleNamespace:
     )  # fmt: skip
     start = np.zeros((len(group), 1))
     B = np.zeros((len(group), STEPS, 1))
-    job = Job((), np.zeros(0), start, r, np.zeros((*r.shape, 0)), B, np.ones(len(group)), 0.0)
+    fit = Fit((), np.zeros(0), start, r, np.zeros((*r.shape, 0)), B, np.ones(len(group)), 0.0)
     effects = [Candidate(n, "joint", "joint", (c,), (False,)) for n, c in coordinates.items()]
     screened = [SimpleNamespace(candidate=e, start=np.array([0.7 * TRUTH[e.effect]])) for e in effects]
-    base = SimpleNamespace(job=job)
+    base = SimpleNamespace(fit=fit)
     return SimpleNamespace(fitter=fitter, base=base, screened=screened, noise=float(STEPS), effects=effects, left=noise)
 
 
 def test_on_a_linear_problem_the_promise_is_kept():
     found = race()
-    before, after = (float(np.mean(x**2)) for x in (found.base.job.r, found.left))
+    before, after = (float(np.mean(x**2)) for x in (found.base.fit.r, found.left))
     total, each = predicted_gain.promised(found, found.effects)
     assert total == pytest.approx((before - after) / (before - 1.0), abs=0.02)
     assert sum(each.values()) == pytest.approx(total, abs=1e-9)

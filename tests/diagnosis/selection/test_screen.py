@@ -25,8 +25,8 @@ def setup(tmp_path_factory):
 
 @pytest.fixture(scope="module", params=TRUTHS)
 def screened(request, setup):
-    fitter, job = refit(setup, recorded(scale=SCALE, **TRUTHS[request.param]))
-    return request.param, setup, fitter, job, screen(fitter, job, setup.candidates)
+    fitter, fit = refit(setup, recorded(scale=SCALE, **TRUTHS[request.param]))
+    return request.param, setup, fitter, fit, screen(fitter, fit, setup.candidates)
 
 
 def test_the_true_effect_gains_most(screened):
@@ -37,11 +37,11 @@ def test_the_true_effect_gains_most(screened):
 
 
 def test_predicted_gains_are_realised(screened):
-    _, _, fitter, job, found = screened
+    _, _, fitter, fit, found = screened
     best = found[0]
-    new = fitter.derive(job, best.candidate.coordinates, best.start)
-    fitter.iterate([new], 10, lambda j: range(len(j.coordinates)))
-    assert 0.5 < best.gain / (job.cost - new.cost) < 2.0
+    new = fitter.derive(fit, best.candidate.coordinates, best.start)
+    (new,) = fitter.iterate([new], 10, lambda f: range(len(f.coordinates)))
+    assert 0.5 < best.gain / (fit.cost - new.cost) < 2.0
 
 
 def test_starts_lie_within_their_ranges_and_shares_are_shares(screened):
@@ -53,8 +53,8 @@ def test_starts_lie_within_their_ranges_and_shares_are_shares(screened):
 
 
 def test_what_the_known_parameters_already_do_is_absorbed(setup):
-    fitter, job = fitted(setup)
-    found = {s.candidate.effect: s for s in screen(fitter, job, setup.candidates)}
+    fitter, fit = fitted(setup)
+    found = {s.candidate.effect: s for s in screen(fitter, fit, setup.candidates)}
     assert found["viscous_friction"].absorbed > 0.95  # the same column as damping
     assert found["viscous_friction"].absorbed > found["coulomb_friction"].absorbed
     assert fitter.simulator.traces == 1
@@ -62,12 +62,12 @@ def test_what_the_known_parameters_already_do_is_absorbed(setup):
 
 def test_the_point_that_explains_most_as_simulated_is_among_the_starts(screened):
     """A secant, scaled down, ends below a limit's threshold: what was really simulated has to be tried as it is."""
-    _, _, fitter, job, found = screened
+    _, _, fitter, fit, found = screened
 
     def reached(s, point):
-        start = fitter.derive(job, s.candidate.coordinates, point)
-        fitter.iterate([start], 4, lambda j: range(len(j.coordinates) - len(point)))  # the effect stays where it is
-        return start.cost
+        start = fitter.derive(fit, s.candidate.coordinates, point)
+        (end,) = fitter.iterate([start], 4, lambda f: range(len(f.coordinates) - len(point)))  # the effect stays
+        return end.cost
 
     true = found[0]
     best = min(reached(true, point) for point in true.candidate.probes)
@@ -87,18 +87,18 @@ def test_amplitudes_that_act_together_alone_are_tried_in_all_combinations():
 
 
 def test_no_candidates_no_answers(screened):
-    _, _, fitter, job, _ = screened
-    assert screen(fitter, job, []) == []
+    _, _, fitter, fit, _ = screened
+    assert screen(fitter, fit, []) == []
 
 
 def test_a_first_look_at_few_windows_keeps_what_matters(screened, monkeypatch):
-    truth, setup, fitter, job, _ = screened
-    whole = screen(fitter, job, setup.candidates, 24)
+    truth, setup, fitter, fit, _ = screened
+    whole = screen(fitter, fit, setup.candidates, 24)
     module = importlib.import_module("bayessim_mjx.diagnosis.selection.screen")
     monkeypatch.setattr(module, "MANY", 0)
     monkeypatch.setattr(module, "CANDIDATES", 3)
     before = fitter.simulator.rollouts
-    found = screen(fitter, job, setup.candidates, 24)
+    found = screen(fitter, fit, setup.candidates, 24)
     points = sum(len(c.probes) for c in setup.candidates)
     assert fitter.simulator.rollouts - before <= 8 * points + 24 * 3 * module.POINTS
     assert {s.candidate.label for s in found} == {c.label for c in setup.candidates}

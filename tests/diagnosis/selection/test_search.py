@@ -1,8 +1,5 @@
 """Which models the race ends at, where how well each predicts is known: pairs, steps, ways round, special cases."""
 
-from dataclasses import dataclass, field
-
-import numpy as np
 import pytest
 
 from bayessim_mjx.diagnosis.selection import search
@@ -10,13 +7,6 @@ from bayessim_mjx.diagnosis.selection.race import Settings
 from tests.diagnosis.tables import Table, law
 
 A, B, C, X = (law(name) for name in "abcx")
-
-
-@dataclass
-class Point:
-    A: np.ndarray = field(default_factory=lambda: np.zeros(0))
-    history: list = field(default_factory=list)
-    coordinates: tuple = ()
 
 
 def silent(*_):
@@ -27,9 +17,9 @@ def winner(monkeypatch, errors, **settings):
     """The laws of the model that the whole search ends at."""
     table = Table(monkeypatch, errors, Settings(**settings))
     fitter = table.race.fitter
-    fitter.base, fitter.begin, fitter.refresh = (), lambda base: Point(), lambda job: job
-    fitter.iterate = lambda *args, **kwargs: None
-    monkeypatch.setattr(search, "scored", lambda fitter, job, effects: table.model(effects))
+    fitter.base, fitter.begin, fitter.refresh = (), lambda base: None, lambda fit: fit
+    fitter.iterate = lambda fits, *args: fits
+    monkeypatch.setattr(search, "scored", lambda fitter, fit, effects: table.model(effects))
     monkeypatch.setattr(search, "widen_leading", silent)
     race = search.run(fitter, table.laws, table.race.settings)
     assert race.base.effects == ()

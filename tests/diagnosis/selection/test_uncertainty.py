@@ -1,5 +1,6 @@
 """Intervals of parameters on a linear problem whose answer is known: they cover it as often as they say."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,7 +9,7 @@ from scipy import stats
 
 from bayessim_mjx.diagnosis import statistics
 from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
-from bayessim_mjx.diagnosis.fitting.fitter import Fitter, Job
+from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 from bayessim_mjx.diagnosis.fitting.quadratic import solve
 from bayessim_mjx.diagnosis.selection import heldout, uncertainty
 from bayessim_mjx.diagnosis.selection.models import Model, scored
@@ -40,15 +41,15 @@ def problem(
         spread=np.array([0.5]), used=np.ones(1, bool), base=coordinates[:1],
         simulator=SimpleNamespace(windows=SimpleNamespace(group=group)),
     )  # fmt: skip
-    fitter.scores = lambda job, group=None: Fitter.scores(fitter, job, group)
-    job = Job(coordinates, np.zeros(2), np.zeros((len(group), 1)), r, A, B, np.ones(len(group)), 0.0)
-    q, starts = job.quadratic(fitter.spread)
-    g, S = q.weighted(job.weight)
-    precision, pull, low, high = job.prior()
-    job.values = solve(S + np.diag(precision), g + pull, low, high)
-    job.offsets = starts.step(A, job.values)
-    job.r = r - A @ job.values - np.einsum("wns,ws->wn", B, job.offsets)
-    return fitter, scored(fitter, job, ())
+    fitter.scores = lambda fit, group=None: Fitter.scores(fitter, fit, group)
+    fit = Fit(coordinates, np.zeros(2), np.zeros((len(group), 1)), r, A, B, np.ones(len(group)), 0.0)
+    q, starts = fit.quadratic(fitter.spread)
+    g, S = q.weighted(fit.weight)
+    precision, pull, low, high = fit.prior()
+    values = solve(S + np.diag(precision), g + pull, low, high)
+    offsets = starts.step(A, values)
+    r = r - A @ values - np.einsum("wns,ws->wn", B, offsets)
+    return fitter, scored(fitter, replace(fit, values=values, offsets=offsets, r=r), ())
 
 
 @pytest.mark.parametrize("conditions", [3, 5])
@@ -59,7 +60,7 @@ def test_90_percent_intervals_cover_85_to_95_percent(conditions, differs, uneven
     for _ in range(300):
         fitter, model = problem(conditions, rng, differs, uneven)
         sd = np.sqrt(np.diag(uncertainty.covariance(fitter, model)))
-        covered.append(np.abs(model.job.values - TRUTH) < 1.645 * sd)
+        covered.append(np.abs(model.fit.values - TRUTH) < 1.645 * sd)
     rate = np.mean(covered)
     assert 0.85 <= rate <= 0.96
 
@@ -79,8 +80,8 @@ def test_simulators_differ_by_a_part_of_a_step_and_a_percent():
     known = Coordinate("arm_mass_mult", (0,), 1.0, 0.8, 1.2)
     delay = Coordinate("motor.actuator_delay.delay", (1,), 0.0, 0.0, 0.1, unit="s")
     gain = Coordinate("motor.actuator_gain.gain", (2,), 1.0, 0.2, 2.0)
-    job = SimpleNamespace(coordinates=(known, delay, gain), values=np.array([1.1, 0.02, 0.7]))
-    model = SimpleNamespace(effects=(SimpleNamespace(coordinates=(delay, gain)),), job=job)
+    fit = SimpleNamespace(coordinates=(known, delay, gain), values=np.array([1.1, 0.02, 0.7]))
+    model = SimpleNamespace(effects=(SimpleNamespace(coordinates=(delay, gain)),), fit=fit)
     np.testing.assert_allclose(uncertainty.systematic(model, 0.01), [0.0, 0.07 * 0.01, 0.01 * 0.3])
     np.testing.assert_allclose(uncertainty.systematic(model, 0.01, 0.04), [0.0, 0.07 * 0.01, (0.01 + 0.15 * 0.2) * 0.3])
 

@@ -51,9 +51,9 @@ def test_an_effect_is_there_when_an_amplitude_is_off_neutral(monkeypatch, value,
     monkeypatch.setattr(races, "deviations", lambda fitter, model: np.array([0.3, 0.01, 1e-9]))
     gain, speed = SimpleNamespace(name="gain", neutral=1.0), SimpleNamespace(name="speed", neutral=0.0)
     effect = SimpleNamespace(coordinates=[gain, speed], shapes=[False, True])  # a shape says nothing
-    job = SimpleNamespace(names=["mass", "gain", "speed"], values=np.array([1.0, value, 5.0]))
+    fit = SimpleNamespace(names=["mass", "gain", "speed"], values=np.array([1.0, value, 5.0]))
     race = SimpleNamespace(fitter=None)
-    assert races.Race.distinct(race, SimpleNamespace(job=job), effect, far) is there
+    assert races.Race.distinct(race, SimpleNamespace(fit=fit), effect, far) is there
 
 
 @pytest.mark.parametrize(("rms", "believed", "goes_on"), [(1.2, 1.0, False), (1.4, 1.0, True), (1.2, 0.4, True)])
