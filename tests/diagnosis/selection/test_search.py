@@ -1,5 +1,8 @@
 """Which models the race ends at, where how well each predicts is known: pairs, steps, ways round, special cases."""
 
+from dataclasses import dataclass, field
+
+import numpy as np
 import pytest
 
 from bayessim_mjx.diagnosis.selection import search
@@ -7,6 +10,12 @@ from bayessim_mjx.diagnosis.selection.race import Settings
 from tests.diagnosis.tables import Table, law
 
 A, B, C, X = (law(name) for name in "abcx")
+
+
+@dataclass
+class Point:
+    A: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    coordinates: tuple = ()
 
 
 def silent(*_):
@@ -17,7 +26,7 @@ def winner(monkeypatch, errors, **settings):
     """The laws of the model that the whole search ends at."""
     table = Table(monkeypatch, errors, Settings(**settings))
     fitter = table.race.fitter
-    fitter.base, fitter.begin, fitter.refresh = (), lambda base: None, lambda fit: fit
+    fitter.base, fitter.begin, fitter.refresh = (), lambda base: Point(), lambda fit: fit
     fitter.iterate = lambda fits, *args: fits
     monkeypatch.setattr(search, "scored", lambda fitter, fit, effects: table.model(effects))
     monkeypatch.setattr(search, "widen_leading", silent)
