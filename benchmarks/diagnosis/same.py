@@ -1,7 +1,7 @@
 """Whether a change of the code leaves diagnoses as they were, byte for byte: three pendulums with few effects on offer.
 
-    python benchmarks/diagnosis_same.py record FOLDER    at the commit before
-    python benchmarks/diagnosis_same.py compare FOLDER   at the commit after; exit code 1 where anything differs
+    python benchmarks/diagnosis/same.py record FOLDER    at the commit before
+    python benchmarks/diagnosis/same.py compare FOLDER   at the commit after; exit code 1 where anything differs
 
 `record` writes logs and model too, and `compare` diagnoses the same files. Compared is everything that the command
 writes but for pictures; versions and the date are left out. Both have to run on one machine with the same libraries.
@@ -17,7 +17,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).parent.parent))
+sys.path.insert(0, str(Path(__file__).parents[2]))
 
 SHORT: dict[str, Any] = {"count": 4, "seconds": 3.0}
 FEW = "coulomb_friction,viscous_friction,actuator_delay,actuator_gain,payload"
