@@ -151,7 +151,7 @@ class Judge:
         Both, because an effect that ends every episode at once hides all others.
         """
         env = self.simulators.corrected
-        full, neutral = env.space.nominal, neutral_theta(env.physics)
+        full, neutral = env.space.nominal, env.physics.neutral
         labels = places(env.physics)
         thetas = [full, neutral]
         for own in labels.values():
@@ -179,15 +179,8 @@ def _alike(plans: Sequence[Plan]) -> list[list[int]]:
 
 def places(physics: Physics) -> dict[tuple[str, str], NDArray[np.bool_]]:
     """{(effect, where): which entries of theta are its parameters}, `[d]` each."""
-    labels = [(p.name.rsplit(".", 2)[1], p.target) for e in physics.effects for p in e.space().parameters]
-    every = [None] * len(physics.model_space) + labels
-    return {label: np.array([own == label for own in every]) for label in dict.fromkeys(labels)}
-
-
-def neutral_theta(physics: Physics) -> Array:
-    """Nominal, with all effects switched off."""
-    off = [e.defaults().nominal for e in physics.effects]
-    return np.concatenate([physics.model_space.nominal, *off])
+    index = np.arange(len(physics.space))
+    return {(b.effect.name, b.place): (index >= b.start) & (index < b.stop) for b in physics.blocks if b.effect}
 
 
 def replay(logs: Sequence[Log], nominal: Physics, corrected: Physics) -> dict[str, Any] | None:

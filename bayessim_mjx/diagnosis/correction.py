@@ -15,7 +15,7 @@ import numpy as np
 
 from bayessim_mjx import effects as library
 from bayessim_mjx.distributions import Distribution
-from bayessim_mjx.effects.effect import Effect, Quantity
+from bayessim_mjx.effects.effect import Effect, Quantity, layout
 from bayessim_mjx.effects.support import native, storage
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.parameters import Parameter, ParameterSpace
@@ -53,8 +53,9 @@ def _effect(kind: type[Effect], found: list[FoundEffect]) -> Effect:
     where = found[0].where if len(found) == 1 else tuple(f.where for f in found)
     plain = kind(where=where)
     estimates = [e for f in found for e in _in_order(kind, f)]
-    rows = zip(plain.defaults().parameters, kind.quantities * len(found), estimates, strict=True)
-    return dataclasses.replace(plain, parameters=tuple(_identified(p, q, e) for p, q, e in rows))
+    pairs = (pair for block in plain.blocks() for pair in block.pairs())
+    identified = (_identified(p, q, e) for (p, q), e in zip(pairs, estimates, strict=True))
+    return dataclasses.replace(plain, parameters=tuple(identified))
 
 
 def _in_order(kind: type[Effect], found: FoundEffect) -> list[Estimate]:
@@ -136,9 +137,8 @@ def prior(diagnosis: Diagnosis, physics: Physics | ParameterSpace | None = None)
         known = ParameterSpace(_recorded(name, row) for name, row in diagnosis.parameters.items())
     else:
         known = physics.model_space if isinstance(physics, Physics) else physics
-    space = calibrated_of(diagnosis, known)
-    for effect in effects_of(diagnosis):
-        space = space + effect.space()
+    blocks = layout(calibrated_of(diagnosis, known), effects_of(diagnosis))
+    space = ParameterSpace(p for block in blocks for p in block.parameters)
     return _jointly(diagnosis.covariance, space) if diagnosis.covariance else Distribution.prior(space)
 
 

@@ -3,6 +3,7 @@
 import abc
 import dataclasses
 import math
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import jax
@@ -10,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from bayessim_mjx.effects.support.motion import Motion
+from bayessim_mjx.effects.support.quantity import Quantity
 from bayessim_mjx.effects.support.site import Site, find, under_tendon_limit
 from bayessim_mjx.effects.support.substep import SubStep
 from bayessim_mjx.errors import UserError
@@ -19,50 +21,9 @@ if TYPE_CHECKING:
     import mujoco
     from mujoco import mjx
 
+__all__ = ["Block", "Effect", "Measurement", "Quantity", "layout", "overrides"]
+
 Measurement = dict[str, jax.Array]
-
-
-@dataclasses.dataclass(frozen=True)
-class Quantity:
-    """One number of an effect at one place.
-
-    Attributes:
-        name: of the parameter.
-        neutral: the value that switches it off (its part of the effect) exactly.
-        low, high: range where nothing is known of the robot.
-        unit: for a hinge; a slide's is derived from it.
-        per: what the range grows with, so that one library fits a toy servo and an industrial arm: "force" (largest
-            effort or load at the place), "command" (largest command), "speed", "travel", "inertia" (M_ii), "period" (of
-            the logs); of bodies "mass", "weight", "size", "carried" (mass that the robot can hold there), "tool" (how
-            far a load may reach); or products such as "force/speed"; "" for absolute ranges.
-        reach: (low, high) in multiples of `per`, used by the diagnosis in the place of low, high.
-        grid: starting values for a fit, as fractions of the way from neutral to each end of the range.
-        prior: "uniform" or "loguniform".
-        shape: it only shapes the effect (a speed, an order, a lever arm): where the other quantities are neutral the
-            effect is off whatever this one is; `grid` is then in fractions of the range from low to high.
-        at_least: ends of the range that `reach` gives are raised to `low` and `high` where they are below.
-        most: end that physics sets, whatever the range is (friction that outgrows its load).
-        remembered: the range sizes the effect's memory, so that no fit can go beyond it.
-    """
-
-    name: str
-    neutral: float
-    low: float
-    high: float
-    unit: str = ""
-    per: str = ""
-    reach: tuple[float, float] | None = None
-    grid: tuple[float, ...] = (0.03, 0.15, 0.5)
-    prior: str = "uniform"
-    shape: bool = False
-    at_least: bool = False
-    most: float = math.inf
-    remembered: bool = False
-
-    def ends(self) -> tuple[float, float]:
-        """Where physics ends: at neutral, where the range does; at 0 for what is positive; at `most`."""
-        least = self.low if self.low == self.neutral else 0.0 if self.low > 0 else -math.inf
-        return least, self.high if self.high == self.neutral else self.most
 
 
 @dataclasses.dataclass(frozen=True)
@@ -108,13 +69,18 @@ class Effect(abc.ABC):
         other = {p.name: p for p in self.parameters}
         return ParameterSpace(other.get(p.name, p) for p in self.defaults().parameters)
 
+    def blocks(self, start: int = 0) -> "tuple[Block, ...]":
+        """Its numbers by place, the first of them at `start` of theta."""
+        k, parameters = len(self.quantities), self.space().parameters
+        return tuple(Block(self, p, start + i * k, parameters[i * k :][:k]) for i, p in enumerate(self.places()))
+
     def check(self) -> None:
         """Refuse ranges that reach where the physics has no meaning: beyond the end of a quantity that ends at neutral.
 
         Raises:
             UserError: naming the parameter, its range and the end.
         """
-        for p, q in zip(self.space().parameters, self.quantities * len(self.places()), strict=True):
+        for p, q in ((p, q) for block in self.blocks() for p, q in block.pairs()):
             if q.neutral == q.low and p.low < q.low:
                 raise UserError(f"{p.name}: range begins at {p.low:g} {p.unit}; allowed: from {q.low:g} (off) upwards")
             if q.neutral == q.high and p.high > q.high:
@@ -209,3 +175,54 @@ class Effect(abc.ABC):
 def overrides(effect: Effect, hook: str) -> bool:
     """Whether the effect has this hook; those it does not have are not called."""
     return getattr(type(effect), hook) is not getattr(Effect, hook)
+
+
+@dataclasses.dataclass(frozen=True)
+class Block:
+    """Numbers that stand together in theta: the model's parameters, or those of one effect at one place.
+
+    Attributes:
+        effect: None: the model.
+        place: as the effect's `where` calls it; "" of the model.
+        start: of the first one in theta.
+        parameters: in the order of theta; of an effect in that of its quantities.
+    """
+
+    effect: Effect | None
+    place: str
+    start: int
+    parameters: tuple[Parameter, ...]
+
+    @property
+    def stop(self) -> int:
+        return self.start + len(self.parameters)
+
+    @property
+    def slice(self) -> slice:
+        """Of theta."""
+        return slice(self.start, self.stop)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(p.name for p in self.parameters)
+
+    @property
+    def quantities(self) -> tuple[Quantity, ...]:
+        return () if self.effect is None else self.effect.quantities
+
+    @property
+    def neutral(self) -> tuple[float, ...]:
+        """The values that switch the effect off; of the model the nominal ones."""
+        return tuple(q.neutral for q in self.quantities) if self.effect else tuple(p.nominal for p in self.parameters)
+
+    def pairs(self) -> Iterable[tuple[Parameter, Quantity]]:
+        """Each parameter with what the effect says of it."""
+        return zip(self.parameters, self.quantities, strict=True)
+
+
+def layout(space: ParameterSpace, effects: Iterable[Effect]) -> tuple[Block, ...]:
+    """theta: the model's parameters, then those of each effect at each of its places."""
+    out = [Block(None, "", 0, space.parameters)]
+    for effect in effects:
+        out += effect.blocks(out[-1].stop)
+    return tuple(out)

@@ -10,7 +10,7 @@ import numpy as np
 from flax import struct
 
 from bayessim_mjx.compat import mjx
-from bayessim_mjx.effects.effect import Effect, Measurement, overrides
+from bayessim_mjx.effects.effect import Block, Effect, Measurement, Quantity, layout, overrides
 from bayessim_mjx.effects.support import contract
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.parameters import ParameterSpace
@@ -50,6 +50,10 @@ class World(struct.PyTreeNode):
 class Physics:
     """A compiled model with its parameters and effects. Immutable and hashable by identity: static under `jit`.
 
+    Attributes:
+        blocks: the layout of theta: the model's parameters, then those of each effect at each of its places.
+        space: all of them; model_space: the model's.
+
     Args:
         mj_model: the nominal MuJoCo model.
         control_dt: control step, s; a whole multiple of the model's timestep.
@@ -78,9 +82,9 @@ class Physics:
         self.mj_model = mj_model
         self.effects = tuple(effects)
         self.model_space = space
-        self.space = space
-        for effect in self.effects:
-            self.space = self.space + effect.space()
+        self.blocks = layout(space, self.effects)
+        self.space = ParameterSpace(p for block in self.blocks for p in block.parameters)
+        self._slices = tuple(slice(own[0].start, own[-1].stop) for own in map(self.blocks_of, self.effects))
         self.substeps = _substeps(control_dt, mj_model.opt.timestep)
         self.dt = float(self.substeps * mj_model.opt.timestep)
         if int(mj_model.opt.integrator) not in (EULER, RK4, IMPLICITFAST):
@@ -97,13 +101,20 @@ class Physics:
 
     def split(self, theta: jax.Array) -> tuple[jax.Array, tuple[jax.Array, ...]]:
         """(values of the model's parameters, one slice per effect)."""
-        start = len(self.model_space)
-        own, slices = theta[:start], []
-        for effect in self.effects:
-            end = start + len(effect.space())
-            slices.append(theta[start:end])
-            start = end
-        return own, tuple(slices)
+        return theta[self.blocks[0].slice], tuple(theta[own] for own in self._slices)
+
+    def blocks_of(self, effect: Effect) -> tuple[Block, ...]:
+        """Those of one of `effects`, one per place."""
+        return tuple(block for block in self.blocks if block.effect is effect)
+
+    def quantity(self, index: int) -> Quantity:
+        """What its effect says of the number at `index` of theta."""
+        return next(b.quantities[index - b.start] for b in self.blocks if b.start <= index < b.stop)
+
+    @property
+    def neutral(self) -> np.ndarray:
+        """theta `[d]` with all effects off, the model's parameters nominal."""
+        return np.asarray([value for block in self.blocks for value in block.neutral], np.float32)
 
     def world(self, theta: jax.Array, qpos: jax.Array | None = None, qvel: jax.Array | None = None) -> World:
         """A world at the start of an episode, as the sensors show it at rest; writes `theta` into the model once.

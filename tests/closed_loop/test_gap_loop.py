@@ -273,7 +273,7 @@ def test_wide_ranges_marks_and_effects_switched_off(robot):
     assert [(p.low, p.high, p.prior) for p in space.parameters] == [(0.5, 1.5, "uniform"), (0.0, 0.3, "uniform")]
     assert judge.marks(80) == [0, 10, 20, 30, 40, 50, 60, 70, 80] and judge.marks(2) == [0, 1, 2]
     physics = correction.apply(diagnosis(TRUTH, MASS), robot.physics(robot.control_dt))
-    np.testing.assert_allclose(judge.neutral_theta(physics), [1.1, 1.0, 0.0], rtol=1e-6)
+    np.testing.assert_allclose(physics.neutral, [1.1, 1.0, 0.0], rtol=1e-6)
     own = judge.places(physics)
     assert {k: v.tolist() for k, v in own.items()} == {
         ("actuator_gain", "torque"): [False, True, False],

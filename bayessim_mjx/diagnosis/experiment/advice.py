@@ -90,22 +90,20 @@ class Help:
 def helps(setup: Setup) -> list[Help]:
     """A known payload on the last body, and two other mounts: where the effects that describe them are in the stack."""
     physics, out = setup.physics, []
-    start = len(physics.model_space)
     for effect in physics.effects:
+        *_, last = physics.blocks_of(effect)
         if effect.name == "payload":
-            k, place = len(effect.quantities), effect.places()[-1]
-            own = effect.space().parameters[-k]
+            place, own = last.place, last.parameters[0]
             mass = float(f"{PAYLOAD_SHARE * own.high:.2g}")
             shift = np.zeros(len(physics.space))
-            shift[start + len(effect.space()) - k] = mass
+            shift[last.start] = mass
             needs = f"a person: fix a known mass of {mass:g} kg at the centre of {place}"
             out.append(Help(f"with a known payload of {mass:g} kg on {place}", needs, shift))
         if effect.name == "gravity_tilt" and not _floats(physics.mj_model):
             for name, tilt in STANDING:
                 shift = np.zeros(len(physics.space))
-                shift[start : start + 2] = tilt
+                shift[last.slice] = tilt
                 out.append(Help(f"base {name}", f"a person: mount the base {name}", shift, tilt))
-        start += len(effect.space())
     return out
 
 

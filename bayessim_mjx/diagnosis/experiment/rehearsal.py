@@ -211,15 +211,9 @@ class Rehearsal:
 
 def _columns(physics: Physics, effects: set[str]) -> tuple[NDArray[np.int64], list]:
     """(columns of theta, effects) that are left when only the named effects stay in the stack."""
-    start = len(physics.model_space)
-    kept, some = list(range(start)), []
-    for effect in physics.effects:
-        width = len(effect.space())
-        if effect.name in effects:
-            kept += range(start, start + width)
-            some.append(effect)
-        start += width
-    return np.array(kept, np.int64), some
+    kept = [b for b in physics.blocks if b.effect is None or b.effect.name in effects]
+    columns = np.concatenate([np.arange(b.start, b.stop, dtype=np.int64) for b in kept])
+    return columns, [e for e in physics.effects if e.name in effects]
 
 
 def _rounded(x: Array, width: float, dt: float) -> Array:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.fitting.scales import Scales, ranges
-from bayessim_mjx.effects.effect import Effect, Quantity
+from bayessim_mjx.effects.effect import Block, Effect, Quantity
 from bayessim_mjx.effects.support.site import element_names, places
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.parameters import Parameter, ParameterSpace
@@ -117,27 +117,21 @@ def _alive(kind: type[Effect], place: str, scales: Scales) -> bool:
 
 def enumerate_candidates(physics: Physics) -> list[Candidate]:
     """All candidates of a stack: each effect at each of its places; tied where there are several places."""
-    out, start = [], len(physics.model_space)
+    out = []
     for effect in (e for e in physics.effects if e.quantities):
-        parameters, k = effect.space().parameters, len(effect.quantities)
-        count = len(effect.places())
-        rows = [range(start + i * k, start + (i + 1) * k) for i in range(count)]
-        for i, place in enumerate(effect.places()):
-            out.append(_candidate(effect, place, [parameters[i * k : (i + 1) * k]], [rows[i]]))
-        if count > 1 and effect.kind != "geom":
-            out.append(_candidate(effect, "all", [parameters[i * k : (i + 1) * k] for i in range(count)], rows))
-        start += count * k
+        blocks = physics.blocks_of(effect)
+        out += [_candidate(effect, block.place, [block]) for block in blocks]
+        if len(blocks) > 1 and effect.kind != "geom":
+            out.append(_candidate(effect, "all", blocks))
     return out
 
 
-def _candidate(
-    effect: Effect, where: str, parameters: Sequence[Sequence[Parameter]], rows: Sequence[range]
-) -> Candidate:
+def _candidate(effect: Effect, where: str, blocks: Sequence[Block]) -> Candidate:
     coordinates = []
     for j, q in enumerate(effect.quantities):
-        own = [p[j] for p in parameters]
+        own = [block.parameters[j] for block in blocks]
         low, high = min(p.low for p in own), max(p.high for p in own)
-        index = tuple(row[j] for row in rows)
+        index = tuple(block.start + j for block in blocks)
         name = own[0].name if len(own) == 1 else f"all.{effect.name}.{q.name}"
         coordinates.append(Coordinate(name, index, own[0].nominal, low, high, unit=own[0].unit))
     shown = tuple(replace(c, precision=shrink(c)) for c in coordinates)

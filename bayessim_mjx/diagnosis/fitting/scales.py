@@ -147,8 +147,8 @@ def ranges(effect: type[Effect], place: str, scales: Scales) -> tuple[Parameter,
         UserError: a quantity grows with something that its kind of place does not have.
     """
     here = scales.at(effect.kind, place)
-    own = effect(where=place).defaults().parameters
-    return tuple(_ranged(p, q, here, effect) for p, q in zip(own, effect.quantities, strict=True))
+    (block,) = effect(where=place).blocks()
+    return tuple(_ranged(p, q, here, effect) for p, q in block.pairs())
 
 
 def _ranged(p: Parameter, q: Quantity, here: dict[str, float], effect: type[Effect]) -> Parameter:

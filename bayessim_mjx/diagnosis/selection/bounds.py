@@ -11,7 +11,6 @@ import numpy as np
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate, Coordinate, shrink
 from bayessim_mjx.diagnosis.selection.models import Model, scored
 from bayessim_mjx.diagnosis.selection.race import Progress, Race, fresh, ranked
-from bayessim_mjx.effects.effect import Quantity
 from bayessim_mjx.physics import Physics
 
 NEAR = 1e-3  # of a range: at its end
@@ -64,7 +63,7 @@ def of(physics: Physics, effect: Candidate, coordinate: Coordinate, value: float
     end = _end(coordinate, value)
     if not end:
         return None
-    quantity = _quantity(physics, effect, coordinate)
+    quantity = physics.quantity(coordinate.index[0])
     at = getattr(coordinate, end)
     if at == quantity.neutral and not quantity.shape:
         return Bound("off", f"is {at:.3g}, where it has no part in the effect")
@@ -83,17 +82,11 @@ def _end(c: Coordinate, value: float) -> str:
     return "high" if c.high - value < room else "low" if value - c.low < room else ""
 
 
-def _quantity(physics: Physics, effect: Candidate, coordinate: Coordinate) -> Quantity:
-    (kind,) = (e for e in physics.effects if e.name == effect.effect)
-    word = coordinate.name.rpartition(".")[2]
-    return next(q for q in kind.quantities if q.name == word)
-
-
 def _farthest(physics: Physics, effect: Candidate, coordinate: Coordinate, end: str) -> float:
     """Where a range may end at most."""
     own = [physics.space.parameters[i] for i in coordinate.index]
     low, high = min(p.low for p in own), max(p.high for p in own)
-    quantity = _quantity(physics, effect, coordinate)
+    quantity = physics.quantity(coordinate.index[0])
     least, most = quantity.ends()
     if quantity.remembered:
         return high if end == "high" else low
@@ -116,7 +109,7 @@ def _grown(physics: Physics, effect: Candidate, c: Coordinate, value: float) -> 
     end = _end(c, value)
     if not end or getattr(c, end) == _farthest(physics, effect, c, end):
         return c
-    if c.neutral == getattr(c, end) and not _quantity(physics, effect, c).shape:
+    if c.neutral == getattr(c, end) and not physics.quantity(c.index[0]).shape:
         return c
     far = _farthest(physics, effect, c, end)
     if end == "high":

@@ -49,7 +49,7 @@ def check(effect: "Effect", mj_model: mujoco.MjModel, model: "mjx.Model", subste
     if key in _tried:
         return
     space = effect.space()
-    neutral = [q.neutral for q in effect.quantities] * len(effect.places())
+    neutral = [value for block in effect.blocks() for value in block.neutral]
     given = _inputs(at, mj_model)
     for hook in (h for h in HOOKS if overrides(effect, h)):
         call = jax.jit(partial(_called, effect, at, model, hook))

@@ -46,10 +46,7 @@ def write_model(
 
 
 def _values(effect: Effect, given: Mapping[str, float]) -> Values:
-    own: Values = {}
-    for p in effect.space().parameters:
-        own.setdefault(p.target, {})[p.attribute] = float(given.get(p.name, p.nominal))
-    return own
+    return {b.place: {p.attribute: float(given.get(p.name, p.nominal)) for p in b.parameters} for b in effect.blocks()}
 
 
 def _add(spec: mujoco.MjSpec, effect: Effect, values: Values) -> tuple[mujoco.MjSpec, str | None]:

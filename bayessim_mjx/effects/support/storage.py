@@ -101,9 +101,7 @@ def _gaussian(p: Parameter, mean: float, sd: float) -> Parameter:
 
 
 def _entry(effect: Effect, found: Mapping[str, tuple[float, float]]) -> dict[str, Any]:
-    places: dict[str, dict[str, Any]] = {}
-    for p in effect.space().parameters:
-        places.setdefault(p.target, {})[p.attribute] = _setting(_identified(p, found))
+    places = {b.place: {p.attribute: _setting(_identified(p, found)) for p in b.parameters} for b in effect.blocks()}
     single = isinstance(effect.where, str)
     fields = [f for f in dataclasses.fields(effect) if f.name not in ("where", "parameters")]
     own = {f.name: getattr(effect, f.name) for f in fields if getattr(effect, f.name) != f.default}

@@ -24,8 +24,8 @@ class Linear:
         self.noise = 0.01 * np.random.default_rng(0).normal(size=MOTION.shape)
         self.true = true
         parameter = SimpleNamespace(low=low, high=high)
-        kind = SimpleNamespace(name="toy", quantities=(quantity,))
-        self.physics = SimpleNamespace(effects=(kind,), space=SimpleNamespace(parameters=(parameter,)))
+        space = SimpleNamespace(parameters=(parameter,))
+        self.physics = SimpleNamespace(quantity=lambda index: quantity, space=space)
         self.windows = Windows()
 
     def run(self, thetas, offsets, own=None):

@@ -1,0 +1,47 @@
+"""What an effect says of each of its numbers."""
+
+import dataclasses
+import math
+
+
+@dataclasses.dataclass(frozen=True)
+class Quantity:
+    """One number of an effect at one place.
+
+    Attributes:
+        name: of the parameter.
+        neutral: the value that switches it off (its part of the effect) exactly.
+        low, high: range where nothing is known of the robot.
+        unit: for a hinge; a slide's is derived from it.
+        per: what the range grows with, so that one library fits a toy servo and an industrial arm: "force" (largest
+            effort or load at the place), "command" (largest command), "speed", "travel", "inertia" (M_ii), "period" (of
+            the logs); of bodies "mass", "weight", "size", "carried" (mass that the robot can hold there), "tool" (how
+            far a load may reach); or products such as "force/speed"; "" for absolute ranges.
+        reach: (low, high) in multiples of `per`, used by the diagnosis in the place of low, high.
+        grid: starting values for a fit, as fractions of the way from neutral to each end of the range.
+        prior: "uniform" or "loguniform".
+        shape: it only shapes the effect (a speed, an order, a lever arm): where the other quantities are neutral the
+            effect is off whatever this one is; `grid` is then in fractions of the range from low to high.
+        at_least: ends of the range that `reach` gives are raised to `low` and `high` where they are below.
+        most: end that physics sets, whatever the range is (friction that outgrows its load).
+        remembered: the range sizes the effect's memory, so that no fit can go beyond it.
+    """
+
+    name: str
+    neutral: float
+    low: float
+    high: float
+    unit: str = ""
+    per: str = ""
+    reach: tuple[float, float] | None = None
+    grid: tuple[float, ...] = (0.03, 0.15, 0.5)
+    prior: str = "uniform"
+    shape: bool = False
+    at_least: bool = False
+    most: float = math.inf
+    remembered: bool = False
+
+    def ends(self) -> tuple[float, float]:
+        """Where physics ends: at neutral, where the range does; at 0 for what is positive; at `most`."""
+        least = self.low if self.low == self.neutral else 0.0 if self.low > 0 else -math.inf
+        return least, self.high if self.high == self.neutral else self.most
