@@ -58,7 +58,7 @@ def widen_leading(race: Race, say: Progress) -> None:
         widened(race, model, say)
 
 
-def of(physics: Physics, effect: Candidate, coordinate: Coordinate, value: float) -> Bound | None:
+def of(physics: Physics, coordinate: Coordinate, value: float) -> Bound | None:
     """How a parameter ends at a bound; None where it does not."""
     end = _end(coordinate, value)
     if not end:
@@ -71,7 +71,7 @@ def of(physics: Physics, effect: Candidate, coordinate: Coordinate, value: float
     unit = f" {coordinate.unit}" if coordinate.unit else ""
     if at == (most if end == "high" else least):
         return Bound("end", f"ends at {at:.3g}{unit}, where physics ends")
-    if at == _farthest(physics, effect, coordinate, end):
+    if at == _farthest(physics, coordinate, end):
         kind, which = ("at least", "largest") if end == "high" else ("at most", "smallest")
         return Bound(kind, f"ends at {at:.3g}{unit}, the {which} value tried: {kind} this, or another law is behind it")
     return Bound("end", f"ends at its bound {at:.3g}{unit}; a wider range explains no more")
@@ -82,7 +82,7 @@ def _end(c: Coordinate, value: float) -> str:
     return "high" if c.high - value < room else "low" if value - c.low < room else ""
 
 
-def _farthest(physics: Physics, effect: Candidate, coordinate: Coordinate, end: str) -> float:
+def _farthest(physics: Physics, coordinate: Coordinate, end: str) -> float:
     """Where a range may end at most."""
     own = [physics.space.parameters[i] for i in coordinate.index]
     low, high = min(p.low for p in own), max(p.high for p in own)
@@ -101,17 +101,17 @@ def _wider(race: Race, model: Model, effect: Candidate) -> Candidate:
     """The effect with twice the range where one of its parameters ends at a bound that may move."""
     physics = race.fitter.simulator.physics
     values = model.values_of(effect)
-    coordinates = tuple(_grown(physics, effect, c, float(v)) for c, v in zip(effect.coordinates, values, strict=True))
+    coordinates = tuple(_grown(physics, c, float(v)) for c, v in zip(effect.coordinates, values, strict=True))
     return effect if coordinates == effect.coordinates else replace(effect, coordinates=coordinates)
 
 
-def _grown(physics: Physics, effect: Candidate, c: Coordinate, value: float) -> Coordinate:
+def _grown(physics: Physics, c: Coordinate, value: float) -> Coordinate:
     end = _end(c, value)
-    if not end or getattr(c, end) == _farthest(physics, effect, c, end):
+    if not end or getattr(c, end) == _farthest(physics, c, end):
         return c
     if c.neutral == getattr(c, end) and not physics.quantity(c.index[0]).shape:
         return c
-    far = _farthest(physics, effect, c, end)
+    far = _farthest(physics, c, end)
     if end == "high":
         wider = replace(c, high=min(far, c.neutral + TWICE * (c.high - c.neutral)))
     else:

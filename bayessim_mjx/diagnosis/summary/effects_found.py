@@ -81,7 +81,7 @@ def _effect(found: Findings, effect: Candidate, sd: np.ndarray, part: _Part) -> 
     numbers, ends = {}, []
     for i, c in zip(own, effect.coordinates, strict=True):
         value, word = float(model.fit.values[i]), c.name.rsplit(".", 1)[1]
-        bound = bounds.of(setup.physics, effect, c, value)
+        bound = bounds.of(setup.physics, c, value)
         deviation = float(sd[i]) if bound is None or bound.kind == "off" else float("nan")
         numbers[word] = Estimate(value, deviation, _unit(setup, effect, c.unit), bound.kind if bound else "")
         ends += [f"{word.replace('_', ' ')} {bound.why}"] if bound else []

@@ -64,7 +64,7 @@ def silent(*args):
 def ended(race, model):
     (effect,) = model.effects
     (c,) = effect.coordinates
-    return bounds.of(race.fitter.simulator.physics, effect, c, float(model.values_of(effect)[0])), model.fit.values[0]
+    return bounds.of(race.fitter.simulator.physics, c, float(model.values_of(effect)[0])), model.fit.values[0]
 
 
 @pytest.mark.parametrize(("true", "high"), [(0.4, 1.0), (1.7, 2.0), (5.3, 8.0)])
