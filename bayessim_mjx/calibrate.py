@@ -15,7 +15,7 @@ from bayessim_mjx.config import Config
 from bayessim_mjx.config.settings import COUNT, SEEDS
 from bayessim_mjx.device import setup_jax
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.quantities import estimate, fixed
+from bayessim_mjx.quantities import fixed, percent, percent_estimate
 
 FOLDER = "calibration"
 ADVICE = {
@@ -90,7 +90,7 @@ def show(console: Any, found: Any) -> None:
     report = found.calibration
     for line in verdict_lines(found):
         console.say(line, indent=12)
-    rows = [[f"{100 * a:.0f} %", f"{estimate(100 * c, 100 * e)} %"] for a, (c, e) in report.coverage.items()]
+    rows = [[percent(a), percent_estimate(c, e)] for a, (c, e) in report.coverage.items()]
     console.grid(["region of the posterior", "truths inside"], rows)
     columns = zip(report.names, report.bias, report.spread, report.contraction, strict=True)
     rows = [[n, f"{report.p[n]:.2g}", fixed(bias, 1), fixed(wide, 1), fixed(c, 2)] for n, bias, wide, c in columns]

@@ -14,6 +14,7 @@ from bayessim_mjx.config import Config
 from bayessim_mjx.config.settings import SEEDS
 from bayessim_mjx.device import setup_jax
 from bayessim_mjx.errors import UserError
+from bayessim_mjx.quantities import duration
 
 if TYPE_CHECKING:
     from bayessim_mjx.diagnosis.fitting.robot import Robot
@@ -148,7 +149,7 @@ def _diagnose(argv: Sequence[str] | None) -> int:
         say("writing the report", 0, 1)
         result = _write(result, robot, Path(args.out), report)
     report.console(result, Path(args.out))
-    print(f"{time.monotonic() - began:.0f} s; open {Path(args.out) / 'report.html'}")
+    print(f"{duration(time.monotonic() - began)}; open {Path(args.out) / 'report.html'}")
     return 0
 
 

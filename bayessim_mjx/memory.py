@@ -5,6 +5,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from bayessim_mjx.errors import UserError
+from bayessim_mjx.quantities import size as said
 
 GROUP = Path("/sys/fs/cgroup/memory.max")  # a container's limit
 
@@ -35,12 +36,5 @@ def refuse(needs: Iterable[tuple[str, float]], room: float | None = None) -> Non
     for what, size in needs:
         if size > room:
             raise UserError(
-                f"{what}: needs at least {_said(size)} of memory, and there are {_said(room)}; lower the number"
+                f"{what}: needs at least {said(size)} of memory, and there are {said(room)}; lower the number"
             )
-
-
-def _said(size: float) -> str:
-    for unit, name in ((1e12, "TB"), (1e9, "GB"), (1e6, "MB")):
-        if size >= unit:
-            return f"{size / unit:.3g} {name}"
-    return f"{size:.0f} bytes"

@@ -17,7 +17,7 @@ from bayessim_mjx.config import Config, freeze, replace
 from bayessim_mjx.config.settings import COUNT
 from bayessim_mjx.device import setup_jax
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.quantities import estimate
+from bayessim_mjx.quantities import compact, estimate
 
 DESCRIPTION = "Evaluate, film or export a saved policy."
 KINDS = {
@@ -92,13 +92,13 @@ def _video(config: Config, env: Any, policy: Any, physics: tuple[str, Any], key:
     import numpy as np
 
     from bayessim_mjx.monitor import film, video
-    from bayessim_mjx.monitor.words import without_prefix
+    from bayessim_mjx.monitor.names import without_prefix
 
     if not hasattr(env, "physics"):
         raise UserError(f"--video: {env.name} has no MuJoCo model of ours to draw; leave it out")
     kind, theta = physics
     shown = film.motion(env, policy, key, theta, config.monitor.video_length)
-    values = [f"{value:.3g}" for value in np.asarray(theta)]
+    values = [compact(value, 3) for value in np.asarray(theta)]
     about = dict(zip(without_prefix(env.space.names), values, strict=True))
     path.parent.mkdir(parents=True, exist_ok=True)
     title = f"{config.task}, {KINDS[kind]}"
@@ -156,7 +156,7 @@ def _show(args: argparse.Namespace, config: Config, path: Path, run: Any, count:
     for name, thetas in chosen.items():
         result = rl.evaluate(env, policy, jax.random.fold_in(key, 1), thetas)
         r, length = result["return"], result["length"]
-        rows.append([name, estimate(r.mean(), r.std()), *(f"{v:.4g}" for v in (r.min(), r.max(), length.mean()))])
+        rows.append([name, estimate(r.mean(), r.std()), *map(compact, (r.min(), r.max(), length.mean()))])
     console.grid(["physics", "return", "lowest", "highest", "episode length"], rows)
     if config.monitor.video:
         name = next(n for n in ("real", "posterior", "prior", "nominal") if n in chosen)

@@ -1,10 +1,15 @@
-"""Numbers as people read them: a value and its uncertainty are rounded together, to the same decimal place."""
+"""Numbers, shares, units, durations and counts as people read them, the same on the terminal, in pictures and reports.
+
+A value and its uncertainty are rounded together, to the same decimal place.
+"""
 
 import math
+import re
 from typing import Any, TypeGuard
 
 MISSING = "–"
 SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+PLAIN_DIGITS = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789")
 DIGITS = 2  # of an uncertainty: more are never known (GUM, JCGM 100:2008, 7.2.6)
 PLAIN = range(-4, 6)  # powers of ten that are written without an exponent
 EXACT = 1e-6  # an uncertainty below this share of the value is not shown
@@ -13,6 +18,14 @@ EXACT = 1e-6  # an uncertainty below this share of the value is not shown
 def finite(value: Any) -> TypeGuard[float]:
     """A number that can be shown; None, NaN, infinities and text cannot."""
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def is_number(value: Any) -> bool:
+    """A number that can be told: also a scalar of NumPy or JAX, and an infinity, but no NaN and no text."""
+    try:
+        return value is not None and not isinstance(value, str) and not math.isnan(float(value))
+    except (TypeError, ValueError):
+        return False
 
 
 def power(value: float) -> int:
@@ -43,6 +56,16 @@ def number(value: Any, digits: int = 3) -> str:
     return text.rstrip("0").rstrip(".") if "." in text and abs(value) >= 10**digits else text
 
 
+def compact(value: Any, digits: int = 4) -> str:
+    """`digits` significant digits, whole numbers as such, large ones with k and M: for lines on the terminal."""
+    x = float(value)
+    if abs(x) >= 1e6 and math.isfinite(x):
+        return f"{x / 1e6:.{digits}g}M"
+    if abs(x) >= 1e4 and math.isfinite(x):
+        return f"{x / 1e3:.{digits}g}k"
+    return f"{x:.{digits}g}"
+
+
 def percent(share: Any, sign: bool = False) -> str:
     """A share in per cent: whole from 10 % on, two digits below; 99.5 to 99.9 % with a decimal, as they are not all."""
     if not finite(share := float(share) if _is_float(share) else share):
@@ -66,6 +89,65 @@ def estimate(value: Any, uncertainty: Any = math.nan, digits: int = DIGITS) -> s
         return f"({estimate(value / 10**largest, uncertainty / 10**largest, digits)}){exponent(largest)}"
     places = digits - 1 - power(uncertainty)
     return f"{fixed(value, places)} ± {fixed(uncertainty, places)}"
+
+
+def percent_estimate(share: Any, uncertainty: Any, digits: int = DIGITS) -> str:
+    """`93.0 ± 1.2 %`: a share and its uncertainty, see `estimate`."""
+    return f"{estimate(100 * share, 100 * uncertainty, digits)} %"
+
+
+def duration(seconds: float | None) -> str:
+    """`3.2 s`, `2 min 05 s`, `2 h 01 min`; `?` where it is not known."""
+    if seconds is None or not math.isfinite(seconds):
+        return "?"
+    whole = int(seconds)
+    if whole < 60:
+        return f"{whole} s" if whole >= 10 else f"{seconds:.1f} s"
+    return (
+        f"{whole // 60} min {whole % 60:02d} s" if whole < 3600 else f"{whole // 3600} h {whole % 3600 // 60:02d} min"
+    )
+
+
+def count(n: int, thing: str) -> str:
+    """`1 log`, `2 logs`."""
+    return f"{n} {thing}" if n == 1 else f"{n} {thing}s"
+
+
+def size(count: float) -> str:
+    """Bytes: `1.5 GB`."""
+    for unit_, name in ((1e12, "TB"), (1e9, "GB"), (1e6, "MB")):
+        if count >= unit_:
+            return f"{count / unit_:.3g} {name}"
+    return f"{count:.0f} bytes"
+
+
+def extent(value: float, unit: str) -> str:
+    """`0.0087` rad -> `0.50 deg`; `0.0012` m -> `1.2 mm`: two digits, three from ten on."""
+    if unit == "rad":
+        value, unit = math.degrees(value), "deg"
+    elif abs(value) < 1.0:
+        value, unit = 1e3 * value, "mm"
+    digits = 1 - math.floor(math.log10(abs(value))) if value else 0
+    return f"{value:.{min(max(digits, 1 if abs(value) < 99.5 else 0), 6)}f} {unit}"
+
+
+def unit(text: str) -> str:
+    """`N m s^2/rad^2` -> `N m s²/rad²`."""
+    parts = text.split("^")
+    return parts[0] + "".join(p[:1].translate(SUPERSCRIPT) + p[1:] for p in parts[1:])
+
+
+def typeset(text: str) -> str:
+    """A number as it is printed on a page: with a minus sign in place of a hyphen."""
+    return text.replace("-", "−")
+
+
+def ascii_of(text: str) -> str:
+    """The nearest text of ASCII characters: `(1.2 ± 0.3)·10⁻⁶` -> `(1.2 +/- 0.3)*10^-6`."""
+    for sign, words in (("±", "+/-"), ("…", "..."), ("–", "-"), ("−", "-"), ("·", "*"), ("×", "x"), ("─", "-")):
+        text = text.replace(sign, words)
+    text = re.sub("[⁻⁰¹²³⁴⁵⁶⁷⁸⁹]+", lambda found: "^" + found[0].translate(PLAIN_DIGITS), text)
+    return text.encode("ascii", "replace").decode()
 
 
 def _is_float(value: Any) -> bool:

@@ -1,12 +1,25 @@
-"""A value and its uncertainty end at the same decimal place; the right answers are written down by hand."""
+"""Numbers, shares, units, durations and counts; the right answers are written down by hand."""
 
 import math
 
 import numpy as np
 import pytest
 
-from bayessim_mjx.monitor.words import ascii_of
-from bayessim_mjx.quantities import estimate, number, percent
+from bayessim_mjx.quantities import (
+    ascii_of,
+    compact,
+    count,
+    duration,
+    estimate,
+    extent,
+    is_number,
+    number,
+    percent,
+    percent_estimate,
+    size,
+    typeset,
+    unit,
+)
 
 
 @pytest.mark.parametrize(
@@ -62,3 +75,34 @@ def test_shares(share, text):
 
 def test_a_change_has_a_sign():
     assert percent(0.25, sign=True) == "+25 %" and percent(-0.25, sign=True) == "-25 %"
+
+
+def test_a_share_with_its_uncertainty():
+    assert percent_estimate(0.93, 0.012) == "93.0 ± 1.2 %" and percent_estimate(0.93, 0.012, 1) == "93 ± 1 %"
+
+
+def test_compact_numbers_and_durations():
+    assert [compact(v) for v in (0.0123456, 12345.6, 2.5e6, 3, -1e9)] == ["0.01235", "12.35k", "2.5M", "3", "-1000M"]
+    assert compact(12345.6, 3) == "12.3k" and compact(math.inf) == "inf"
+    assert [duration(v) for v in (3.21, 42, 59.9, 125, 7300, None)] == [
+        "3.2 s", "42 s", "59 s", "2 min 05 s", "2 h 01 min", "?",
+    ]  # fmt: skip
+
+
+def test_counts_and_sizes():
+    assert [count(n, "log") for n in (0, 1, 2)] == ["0 logs", "1 log", "2 logs"]
+    assert [size(n) for n in (1.25e13, 2e9, 3.456e6, 999.0)] == ["12.5 TB", "2 GB", "3.46 MB", "999 bytes"]
+
+
+def test_lengths_and_angles_in_the_units_of_a_workshop():
+    # 0.0087 rad = 0.498 deg
+    assert extent(0.0087, "rad") == "0.50 deg" and extent(0.0012, "m") == "1.2 mm" and extent(2.5, "m") == "2.5 m"
+
+
+def test_units_and_signs_as_printed():
+    assert unit("N m s^2/rad^2") == "N m s²/rad²" and typeset("-1.5") == "−1.5"
+
+
+def test_what_can_be_told_as_a_number():
+    assert [v for v in (1, np.float32(2.5), math.inf) if is_number(v)] == [1, 2.5, math.inf]
+    assert not any(map(is_number, (None, math.nan, "3", [1])))

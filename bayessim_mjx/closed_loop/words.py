@@ -9,8 +9,7 @@ import numpy as np
 
 from bayessim_mjx.closed_loop.measures import FEWEST
 from bayessim_mjx.monitor.console import Console
-from bayessim_mjx.monitor.words import number
-from bayessim_mjx.quantities import estimate
+from bayessim_mjx.quantities import compact, count, estimate, percent
 
 ROLES = {
     "nominal": "trained on the simulator as it was",
@@ -42,14 +41,14 @@ def sentences(found: Mapping[str, Any]) -> list[str]:
 
 
 def _prediction(found: Mapping[str, Any]) -> str:
-    was, now = (number(mean_return(found, "nominal", s)) for s in ("nominal", "corrected"))
+    was, now = (compact(mean_return(found, "nominal", s)) for s in ("nominal", "corrected"))
     text = f"The policy {ROLES['nominal']} was predicted to reach {was} there; the corrected simulator predicts {now}"
     if not found["gap"]:
-        better = number(mean_return(found, "corrected", "corrected"))
+        better = compact(mean_return(found, "corrected", "corrected"))
         return f"{text}, and {better} after retraining on it."
-    reached, closed = number(mean_return(found, "nominal", "real")), found["gap"]["policy"]["closure"]
+    reached, closed = compact(mean_return(found, "nominal", "real")), found["gap"]["policy"]["closure"]
     share = (
-        "; there was no gap to close" if closed is None else f": {_percent(closed)} of the gap of the return is closed"
+        "; there was no gap to close" if closed is None else f": {percent(closed)} of the gap of the return is closed"
     )
     return f"{text}; on the real system it reaches {reached}{share}."
 
@@ -59,18 +58,17 @@ def _recovery(r: Mapping[str, Any]) -> str:
         return "The gap costs no measurable return: a policy trained on the real system itself is not clearly better."
     wide = r["wide"]["recovered"]
     return (
-        f"Retraining on the corrected simulator recovers {_percent(r['corrected']['recovered'])} of the lost return "
-        f"({_interval(r)}); wide randomisation without a diagnosis {_percent(wide)}."
+        f"Retraining on the corrected simulator recovers {percent(r['corrected']['recovered'])} of the lost return "
+        f"({_interval(r)}); wide randomisation without a diagnosis {percent(wide)}."
     )
 
 
 def _interval(r: Mapping[str, Any]) -> str:
     if r["corrected"]["ci"]:
-        return "90 % interval {} to {}".format(*map(_percent, r["corrected"]["ci"]))
+        return "90 % interval {} to {}".format(*map(percent, r["corrected"]["ci"]))
     if r["seeds"] >= FEWEST:
         return "no interval: what was lost is not known well enough"
-    seeds = "1 seed" if r["seeds"] == 1 else f"{r['seeds']} seeds"
-    return f"{seeds}: no interval; trainings differ, --seeds {FEWEST} gives one"
+    return f"{count(r['seeds'], 'seed')}: no interval; trainings differ, --seeds {FEWEST} gives one"
 
 
 def _ranking(r: Mapping[str, Any]) -> str:
@@ -84,12 +82,8 @@ def _replay(r: Mapping[str, Any]) -> str:
     rms = {s: float(np.sqrt(np.mean([e[s] ** 2 for e in r["error"].values()]))) for s in ("nominal", "corrected")}
     return (
         f"With each log's controller in closed loop over {r['seconds']:.3g} s, the position error is "
-        f"{number(rms['nominal'])} on the simulator as it was and {number(rms['corrected'])} on the corrected one."
+        f"{compact(rms['nominal'])} on the simulator as it was and {compact(rms['corrected'])} on the corrected one."
     )
-
-
-def _percent(share: float) -> str:
-    return f"{100 * share:.0f} %"
 
 
 def show(found: Mapping[str, Any], console: Console) -> None:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Channels
 from bayessim_mjx.parameters.attributes import suggest
+from bayessim_mjx.quantities import extent
 
 Array = NDArray[np.float64]
 NOISES, SHARE = 3.0, 0.02  # the default: the larger of so many noise sd and of this share of the range of motion
@@ -120,13 +121,3 @@ def judge(model: mujoco.MjModel, motion: Array, noise: Array, asked: dict[int, L
     given = np.isin(np.arange(model.nv), list(asked))
     units = tuple(length_unit(model, v) for v in range(model.nv))
     return Tolerance(Channels.of(model).qvel, units, limit, np.asarray(motion, float), np.asarray(noise, float), given)
-
-
-def extent(value: float, unit: str) -> str:
-    """`0.0087` rad -> `0.50 deg`; `0.0012` m -> `1.2 mm`: two digits, three from ten on."""
-    if unit == "rad":
-        value, unit = math.degrees(value), "deg"
-    elif abs(value) < 1.0:
-        value, unit = 1e3 * value, "mm"
-    digits = 1 - math.floor(math.log10(abs(value))) if value else 0
-    return f"{value:.{min(max(digits, 1 if abs(value) < 99.5 else 0), 6)}f} {unit}"

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from bayessim_mjx.monitor.words import duration, escape
+from bayessim_mjx.quantities import duration
 
 LONGEST = "ETA 59 min 59 s"  # room that the time to go may take
 
@@ -44,6 +44,8 @@ class Bars:
         if done is not None:
             [total] = [task.total for task in self._progress.tasks if task.id == self._tasks[kind]]
             more["count"] = _count(done, total)
+        from rich.markup import escape
+
         said = f"ETA {duration(eta)}" if eta else ""
         self._progress.update(self._tasks[kind], completed=done, note=escape(note), eta=said, **more)
 

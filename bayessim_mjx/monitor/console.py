@@ -13,10 +13,9 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any, TextIO
 
 from bayessim_mjx.monitor.bars import Bars
-from bayessim_mjx.monitor.draws import shorten
-from bayessim_mjx.monitor.tables import TIE, shell, table, wrapped
-from bayessim_mjx.monitor.words import ascii_of, duration, fit, is_number, named, number, spoken, without_prefix
-from bayessim_mjx.quantities import estimate
+from bayessim_mjx.monitor.names import named, shorten, spoken, without_prefix
+from bayessim_mjx.monitor.tables import TIE, fit, shell, table, wrapped
+from bayessim_mjx.quantities import ascii_of, compact, duration, estimate, is_number
 
 FILE_WIDTH = 140  # columns that tables and lists may take where there is no terminal
 WIDTHS = "posterior/prior sd"
@@ -150,7 +149,7 @@ class Console:
         not repeated among the numbers.
         """
         shown = {k: v for k, v in metrics.items() if k not in ("iteration", "round") and is_number(v)}
-        numbers = [f"{spoken(k)} {number(v)}" for k, v in shown.items()]
+        numbers = [f"{spoken(k)} {compact(v)}" for k, v in shown.items()]
         at = metrics.get("iteration") if iteration is None else iteration
         where, eta, done = self._phase or "iteration", None, None
         if self._steps is not None:
@@ -189,7 +188,7 @@ class Console:
             rounds = rounds or self._rounds.total
         parts = [f"round {int(round) + 1}" + (f"/{rounds}" if rounds else "")]
         if reward is not None:
-            parts.append(f"{where} return {estimate(*reward) if isinstance(reward, Sequence) else number(reward)}")
+            parts.append(f"{where} return {estimate(*reward) if isinstance(reward, Sequence) else compact(reward)}")
         if gain is not None and is_number(gain):
             parts.append(f"log density at the truth {float(gain):+.2f} nats over the prior")
         eta = self._rounds.eta() if self._rounds is not None else None
@@ -212,9 +211,9 @@ class Console:
         rows = []
         for row in ordered:
             unit = f" [{row['unit']}]" if row.get("unit") else ""
-            cells = [f"{row['name']}{unit}", f"{number(row['low'])} to {number(row['high'])}"]
+            cells = [f"{row['name']}{unit}", f"{compact(row['low'])} to {compact(row['high'])}"]
             cells.append(estimate(row["mean"], row["sd"]))
-            cells += [number(row["truth"]) if is_number(row.get("truth")) else "-"] if known else []
+            cells += [compact(row["truth"]) if is_number(row.get("truth")) else "-"] if known else []
             rows.append([*cells, f"{float(row['contraction']):.2f}" if is_number(row.get("contraction")) else "-"])
         self.grid(["parameter", "prior range", "posterior", *(["truth"] if known else []), "contraction"], rows, title)
 

@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from bayessim_mjx.quantities import compact
+
 STRIP = 16  # the strip's part of a picture's height is 1 / STRIP
 INK = (20, 20, 20)
 
@@ -67,5 +69,5 @@ def underline(frames: np.ndarray, strip: int, title: str, captions: Sequence[str
 
 def _lines(text: str | Mapping | Sequence) -> list[str]:
     if isinstance(text, Mapping):
-        return [f"{k} {v:.3g}" if isinstance(v, float | np.floating) else f"{k} {v}" for k, v in text.items()]
+        return [f"{k} {compact(v, 3)}" if isinstance(v, float | np.floating) else f"{k} {v}" for k, v in text.items()]
     return text.splitlines() if isinstance(text, str) else [str(line) for line in text]

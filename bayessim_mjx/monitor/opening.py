@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from bayessim_mjx.config import Config
-from bayessim_mjx.monitor.words import number
+from bayessim_mjx.quantities import compact
 
 COMPILES = "the first start compiles its programs (about a minute on a CPU), later starts load them from the cache"
 
@@ -27,7 +27,7 @@ def opening(config: Config, env: Any, device: Any, infers: bool = True) -> dict[
 
 def _range(p: Any) -> str:
     unit = f" {p.unit}" if p.unit else ""
-    return f"{p.name} {number(p.low)} to {number(p.high)}{unit}"
+    return f"{p.name} {compact(p.low)} to {compact(p.high)}{unit}"
 
 
 def _budget(config: Config, infers: bool) -> str:
@@ -35,8 +35,8 @@ def _budget(config: Config, infers: bool) -> str:
     steps = ppo.max_iterations * ppo.num_steps * ppo.num_envs
     training = f"{ppo.max_iterations} PPO iterations × {ppo.num_envs} worlds × {ppo.num_steps} steps"
     if not infers:
-        return f"{training} = {number(steps)} steps"
-    whole = f"{b.realIters} rounds × ({training}) = {number(b.realIters * steps)} steps"
+        return f"{training} = {compact(steps)} steps"
+    whole = f"{b.realIters} rounds × ({training}) = {compact(b.realIters * steps)} steps"
     if b.modelClass is None:
         return f"{whole}; no inference (bayessim.modelClass=None)"
     return f"{whole}; {b.trainTrajs} simulated trajectories per round to infer from"

@@ -4,9 +4,10 @@ from typing import Any
 
 import numpy as np
 
-from bayessim_mjx.monitor.draws import Draws, correlations, density, density2, levels, shorten
+from bayessim_mjx.monitor.draws import Draws, correlations, density, density2, levels
+from bayessim_mjx.monitor.names import shorten
 from bayessim_mjx.monitor.style import BLUE, DASHED, GREEN, GREY, NAVY, RED, YELLOW, blues, size_of
-from bayessim_mjx.quantities import estimate, fixed
+from bayessim_mjx.quantities import compact, estimate, fixed
 
 Limits = tuple[float, float]
 NARROWEST = 1e-4  # of the prior range: no axis is narrower, as its ticks would have too many digits
@@ -188,7 +189,7 @@ def label(draws: Draws, k: int, width: int, lines: int, ranges: bool = False) ->
 
 
 def prior_range(draws: Draws, k: int) -> str:
-    return f"{natural(draws, k, draws.low[k]):.3g} to {natural(draws, k, draws.high[k]):.3g}"
+    return " to ".join(compact(natural(draws, k, end[k]), 3) for end in (draws.low, draws.high))
 
 
 def mean_and_sd(draws: Draws, k: int) -> str:

@@ -5,7 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from bayessim_mjx.monitor.draws import Draws, correlations, draws_of, shorten
+from bayessim_mjx.monitor.draws import Draws, correlations, draws_of
+from bayessim_mjx.monitor.names import shorten
 from bayessim_mjx.monitor.panels import (
     best_first,
     correlation,
@@ -23,7 +24,7 @@ from bayessim_mjx.monitor.panels import (
 )
 from bayessim_mjx.monitor.predictive import predictive
 from bayessim_mjx.monitor.style import handles, head, heading, new_figure, size_of
-from bayessim_mjx.quantities import fixed
+from bayessim_mjx.quantities import compact, fixed
 
 __all__ = ["corner", "forest", "pair", "predictive"]
 
@@ -160,7 +161,7 @@ def _facts(draws: Draws, true: np.ndarray | None, log_gain: float | None) -> str
     for k, gain in enumerate(draws.contraction()):
         unit = f" {draws.units[k]}" if draws.units[k] else ""
         lines += [shorten(draws.names, 44)[k], f"    mean ± sd   {mean_and_sd(draws, k)}{unit}"]
-        lines += [f"    truth   {natural(draws, k, true[k]):.4g}{unit}"] if true is not None else []
+        lines += [f"    truth   {compact(natural(draws, k, true[k]))}{unit}"] if true is not None else []
         lines += [f"    contraction   {fixed(gain, 2)}", ""]
     lines += [f"correlation   {fixed(correlations(draws.values)[0, 1], 2)}"]
     lines += [f"log gain at the truth   {log_gain:+.2f} nats"] if log_gain is not None else []

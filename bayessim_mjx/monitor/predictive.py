@@ -5,8 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from bayessim_mjx.monitor.draws import shorten
+from bayessim_mjx.monitor.names import shorten
 from bayessim_mjx.monitor.style import BLUE, GREEN, handles, heading, new_figure
+from bayessim_mjx.quantities import percent
 
 
 def predictive(
@@ -129,4 +130,4 @@ def _title(channel: str, unit: str, real: np.ndarray, simulated: np.ndarray) -> 
     if not known.any():
         return name
     inside = ((real >= low) & (real <= high))[known].mean()
-    return f"{name}   ({100 * inside:.0f} % inside the 90 % band)"
+    return f"{name}   ({percent(inside)} inside the 90 % band)"

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any, TextIO
 
-from bayessim_mjx.monitor.words import duration
+from bayessim_mjx.quantities import duration
 
 Say = Callable[[str, int, int], None]  # (what is being done, done, total)
 EVERY = 10.0  # s between two lines of one stage

@@ -35,6 +35,16 @@ def wrapped(text: str, width: int | None, indent: int = 0) -> list[str]:
     return [line.replace(TIE, " ") for line in lines] or [""]
 
 
+def fit(parts: Sequence[str], room: int, joint: str = ", ", count: bool = True) -> str:
+    """The first parts that fit into `room` characters, then (`count`) how many more; nothing if not even one fits."""
+    for shown in range(len(parts), 0, -1):
+        more = [f"+{len(parts) - shown} more"] if count and shown < len(parts) else []
+        text = joint.join([*parts[:shown], *more])
+        if len(text) <= room:
+            return text
+    return ""
+
+
 def shell(command: str, width: int | None, indent: int = 0) -> list[str]:
     """A command in lines that can be pasted as they are: broken at spaces, with a backslash at the end."""
     before = " " * indent

@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from bayessim_mjx.monitor.draws import shorten
+from bayessim_mjx.monitor.names import shorten
 from bayessim_mjx.monitor.style import BLUE, GREEN, GREY, RED, heading, new_figure
-from bayessim_mjx.quantities import estimate
+from bayessim_mjx.quantities import percent, percent_estimate
 
 MOST = 8  # parameters by name, those whose ranks are least uniform
 BAND = 1.36  # of sqrt(n) sup |F_n - F|: 95 % (Kolmogorov)
@@ -43,7 +43,7 @@ def _coverage(axes: Any, report: Any) -> None:
     axes.set(xlim=(0, 1), ylim=(0, 1), xlabel="probability of the region", ylabel="share of true parameters inside")
     axes.set_title("coverage: below the band the posterior is too narrow, above too wide", fontsize=9, loc="left")
     axes.legend(loc="upper left", frameon=False, fontsize=8)
-    rows = [f"{100 * a:.0f} %:  {estimate(100 * c, 100 * e, 1)} %" for a, (c, e) in report.coverage.items()]
+    rows = [f"{percent(a)}:  {percent_estimate(c, e, 1)}" for a, (c, e) in report.coverage.items()]
     told = "\n".join(["observed coverage", *rows])
     axes.text(0.97, 0.03, told, ha="right", va="bottom", fontsize=8, linespacing=1.4, transform=axes.transAxes)
 

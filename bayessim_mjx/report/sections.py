@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from bayessim_mjx.diagnosis.result import Diagnosis, FoundEffect
+from bayessim_mjx.quantities import count
 from bayessim_mjx.report import gap_figures, marks, place_figures
 from bayessim_mjx.report.choice import choice
 from bayessim_mjx.report.look import STAGE
@@ -25,7 +26,6 @@ from bayessim_mjx.report.words import (
     percent,
     quantity,
     repeated,
-    small,
     stages_told,
     verdict_of,
 )
@@ -69,10 +69,10 @@ def _tile(d: Diagnosis, stage: str) -> dict[str, str]:
     part = d.gap.shares.get(stage)
     if len(rows) == len(d.gap.physical) == 1:
         value, _, unit_ = length(rows[0][stage], rows[0]["unit"]).partition(" ")
-        parts = [f"{small(part)} of the motion", noises] if finite(part) else [noises]
+        parts = [f"{percent(part)} of the motion", noises] if finite(part) else [noises]
         return {"value": value, "unit": unit_, "below": ", ".join(parts)}
     if finite(part):
-        return {"value": small(part), "unit": "", "below": f"of the motion, {noises}"}
+        return {"value": percent(part), "unit": "", "below": f"of the motion, {noises}"}
     return {"value": number(getattr(d.gap, stage)), "unit": "noise sd", "below": ""}
 
 
@@ -81,7 +81,7 @@ def about(d: Diagnosis) -> list[str]:
     a = d.about
     data = [str(p) for p in a.get("data") or []]
     where_ = f" in {', '.join(data[:3])}" + (f" and {len(data) - 3} more" if len(data) > 3 else "") if data else ""
-    logs = f"{a['logs']} log{'s' if a['logs'] != 1 else ''}" if a.get("logs") else "logs"
+    logs = count(a["logs"], "log") if a.get("logs") else "logs"
     size = [f"{number(a['seconds'])} s"] if finite(a.get("seconds")) else []
     size += [f"{a['conditions']} operating conditions"] if (a.get("conditions") or 0) > 1 else []
     return [
@@ -129,7 +129,7 @@ def _stages_row(row: Mapping[str, Any], joints: int) -> dict[str, Any]:
     for stage in STAGES:
         span = known_span((row.get("ci") or {}).get(stage))
         noises = number(row.get(stage)) + (f" ({number(span[0])} – {number(span[1])})" if span else "")
-        value = length(own.get(stage), own.get("unit", "")) if own else small(shares.get(stage))
+        value = length(own.get(stage), own.get("unit", "")) if own else percent(shares.get(stage))
         known = value != MISSING
         cells[stage] = {"value": value, "between": f"{noises} sd"} if known else {"value": noises, "between": ""}
     return {"name": str(row["name"]), "cells": cells, "closed": percent(gap_closed(row)), "more": [], "beyond": False}

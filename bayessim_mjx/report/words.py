@@ -7,9 +7,8 @@ from typing import Any
 
 from bayessim_mjx import quantities
 from bayessim_mjx.diagnosis.result import Diagnosis, Estimate, FoundEffect
-from bayessim_mjx.diagnosis.tolerance import extent
 from bayessim_mjx.diagnosis.vocabulary import EFFECTS
-from bayessim_mjx.quantities import SUPERSCRIPT, finite
+from bayessim_mjx.quantities import finite, typeset, unit
 
 MISSING = quantities.MISSING  # where there is no number
 
@@ -100,13 +99,8 @@ def repeated(d: Diagnosis) -> bool:
 
 
 def length(value: Any, in_unit: str) -> str:
-    """An error in degrees, millimetres or metres, see `tolerance.extent`."""
-    return extent(value, in_unit).replace("-", "−") if finite(value) else MISSING
-
-
-def small(share: Any) -> str:
-    """A share with two digits, `0.16 %`: of a motion, of which little is left."""
-    return quantities.fixed(100 * share, 2) + " %" if finite(share) and 0 < share < 0.00995 else percent(share)
+    """An error in degrees, millimetres or metres, see `quantities.extent`."""
+    return typeset(quantities.extent(value, in_unit)) if finite(value) else MISSING
 
 
 def closure(share: Any) -> str:
@@ -121,18 +115,12 @@ def known_span(span: Any) -> tuple[float, float] | None:
 
 def number(value: Any, digits: int = 3) -> str:
     """`quantities.number` with a minus sign in place of a hyphen."""
-    return quantities.number(value, digits).replace("-", "−")
+    return typeset(quantities.number(value, digits))
 
 
 def percent(share: Any, sign: bool = False) -> str:
     """`quantities.percent` with a minus sign in place of a hyphen."""
-    return quantities.percent(share, sign).replace("-", "−")
-
-
-def unit(text: str) -> str:
-    """`N m s^2/rad^2` -> `N m s²/rad²`."""
-    parts = text.split("^")
-    return parts[0] + "".join(p[:1].translate(SUPERSCRIPT) + p[1:] for p in parts[1:])
+    return typeset(quantities.percent(share, sign))
 
 
 def estimate(mean: Any, sd: Any = math.nan, in_unit: str = "") -> str:
@@ -140,7 +128,7 @@ def estimate(mean: Any, sd: Any = math.nan, in_unit: str = "") -> str:
     if in_unit == "s" and finite(mean) and abs(mean) < 0.5:
         mean, sd, in_unit = 1e3 * mean, 1e3 * sd if finite(sd) else sd, "ms"
     tail = f" {unit(in_unit)}" if in_unit else ""
-    return quantities.estimate(mean, sd).replace("-", "−") + tail
+    return typeset(quantities.estimate(mean, sd)) + tail
 
 
 def effect_noun(name: str) -> str:

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from bayessim_mjx.monitor import plots
-from bayessim_mjx.monitor.draws import correlations, density, density2, draws_of, levels, shorten
+from bayessim_mjx.monitor.draws import correlations, density, density2, draws_of, levels
+from bayessim_mjx.monitor.names import shorten
 
 LONG = ["hand_robot0_forearm_joint_stiffness_mult", "index_finger_proximal_damping", "slider_mass_mult"]
 

@@ -9,9 +9,8 @@ from typing import Any
 from bayessim_mjx.diagnosis.findings import Findings
 from bayessim_mjx.diagnosis.result import FoundEffect, Gap
 from bayessim_mjx.diagnosis.selection.verdict import Rival
-from bayessim_mjx.diagnosis.tolerance import extent
 from bayessim_mjx.diagnosis.vocabulary import listed, missing
-from bayessim_mjx.quantities import percent
+from bayessim_mjx.quantities import extent, percent
 
 CLEAR = 1.2  # noise variances above which a horizon's gap is worth a share
 TOLD = 6  # joints told one by one
