@@ -55,7 +55,7 @@ class Task(Env):
     observation_names: ClassVar[tuple[str, ...]]
     mirror: ClassVar[tuple[Mirror, ...]] = ()  # symmetries of the robot by name; resolved in `mirrors`
     observation_clip: ClassVar[dict[str, float | None]] = {"isaacgymenvs": None, "bayessim2021": 100.0}
-    max_qvel: ClassVar[float | None] = None
+    max_qvel: ClassVar[float | Sequence[float] | None] = None  # `[nv]`, or one for all
     diverged_reward: ClassVar[float] = 0.0  # of the step in which a world diverges
     speed_limit: ClassVar[float] = 1e5  # |qvel|, m/s or rad/s, from which on a world counts as diverged
 

@@ -1,0 +1,39 @@
+"""What Isaac Gym's two aircraft share: what they observe of their flight, and how hovering at a point is paid."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from bayessim_mjx.frames import rotation, xyzw
+from bayessim_mjx.mirrors import Mirror
+
+NAMES = (
+    *(f"to_target_{i}" for i in "xyz"),
+    *(f"quaternion_{i}" for i in "xyzw"),
+    *(f"velocity_{i}" for i in "xyz"),
+    *(f"angular_velocity_{i}" for i in "xyz"),
+)
+TURNED = ("to_target_y", "quaternion_x", "quaternion_z", "velocity_y", "angular_velocity_x", "angular_velocity_z")
+MAX_SPIN = 4 * np.pi  # rad/s, of the body (each of its axes): `max_angular_velocity` of the assets
+
+
+def flight(target: jax.Array | np.ndarray, qpos: jax.Array, qvel: jax.Array) -> jax.Array:
+    """`[13]`, world axes: way to the target / 3 m, quaternion (x, y, z, w), velocity / 2 m/s, turning / pi rad/s."""
+    spin = rotation(qpos[3:7]) @ qvel[3:6]  # MuJoCo's is in the body frame
+    return jnp.concatenate([(target - qpos[:3]) / 3, xyzw(qpos[3:7]), qvel[:3] / 2, spin / jnp.pi])
+
+
+def hovering(
+    target: jax.Array | np.ndarray, qpos: jax.Array, qvel: jax.Array, upright: float = 1.0
+) -> tuple[jax.Array, jax.Array]:
+    """(reward of a step, distance to the target in m): at most 2 + `upright`, near the target, level, not turning."""
+    distance, turn = jnp.linalg.norm(target - qpos[:3]), rotation(qpos[3:7])
+    tilt, spin = jnp.abs(1 - turn[2, 2]), turn[2] @ qvel[3:6]
+    near = 1 / (1 + distance**2)
+    # p + p (w / (1 + tilt^2) + 1 / (1 + spin^2))
+    return near + near * (upright / (1 + tilt**2) + 1 / (1 + spin**2)), distance
+
+
+def left_right(joints: dict[str, str], task: tuple[str, ...] = ()) -> Mirror:
+    """The mirror y -> -y with these images of joints and of entries of the task."""
+    return Mirror(joints=joints, observations={name: f"-{name}" for name in TURNED}, normal="y", task=task)
