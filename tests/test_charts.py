@@ -7,8 +7,8 @@ import pytest
 from scipy import special, stats
 
 from bayessim_mjx.distributions import Distribution, charts
-from bayessim_mjx.inference.calibration import _spread
 from bayessim_mjx.inference.identify import restore_prior
+from bayessim_mjx.inference.temperature import _spread
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 
 MASS = Parameter("mass", 1.0, 0.5, 2.5)

@@ -8,7 +8,7 @@ from brax.envs import training
 
 from bayessim_mjx import config, effects, registry
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.loop import sources
+from bayessim_mjx.loop.state import domain_or_prior
 
 
 @pytest.fixture(scope="module")
@@ -72,7 +72,7 @@ def test_a_world_is_held_in_its_last_sound_state():
 
 def test_without_randomisation_the_space_is_empty_and_the_domain_none():
     env = registry.make("Cartpole", config=config.load("Cartpole", overrides=["task.randomize=False"]))
-    assert len(env.space) == 0 and sources.domain_or_prior(env.space, 3) is None
+    assert len(env.space) == 0 and domain_or_prior(env.space, 3) is None
     assert jax.jit(env.step)(env.reset(jax.random.PRNGKey(0)), jnp.zeros(1)).pipeline_state.fields == {}
 
 

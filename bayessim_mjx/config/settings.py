@@ -4,7 +4,6 @@ The names in `bayessim:`, `env:` and `task:` are BayesSimIG's. Nothing here impo
 """
 
 import dataclasses
-import difflib
 import math
 import os
 import re
@@ -15,20 +14,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from bayessim_mjx import memory
+from bayessim_mjx.config.names import model_of, summary_name, summary_of
 from bayessim_mjx.errors import UserError
 
 COLLECT_POLICIES = ("policy_random", "policy_ones", "policy_rl", "policy_rl_randomized", "policy_replay")
-SUMMARIZERS = {  # summaries of a trajectory, and what a number at the end of the name means
-    "summary_start": "steps",
-    "summary_waypts": "waypoints",
-    "summary_corr": "lags",
-    "summary_corrdiff": "lags",
-    "summary_signatory": "depth",
-    "summary_logsignature": "depth",
-    "summary_learned": None,
-}
-# classes of posterior networks: MDNN, or random Fourier features as MDRFF[_<kernel>[_<bandwidth>]]
-MODEL = re.compile(r"MDNN|MDRFF(?:_(RBF|Laplace|Matern12|Matern32|Matern52)(?:_(median|validation|[0-9][0-9.e+-]*))?)?")
 COORDINATES = ("plain", "truncated", "probit", "logit", "auto")
 PROPOSALS = ("prior", "apt", "truncated", "division")
 UNCORRECTED = (("apt", "truncated"), ("apt", "logit"), ("division", "logit"))  # (proposal, coordinates)
@@ -110,52 +99,6 @@ def checked(value: Any, annotation: Any, metadata: Mapping[str, Any], path: str,
 def _prefixed(prefix: str) -> Callable[[Any], Any]:
     """Short names: `random` for `policy_random`."""
     return lambda value: prefix + value if isinstance(value, str) and not value.startswith(prefix) else value
-
-
-def summary_of(name: str, key: str = "summarizer") -> tuple[str, dict[str, int]]:
-    """("summary_corrdiff", {"lags": 3}) of `corrdiff_3`, like BayesSimIG's MDRFF_<kernel>_<sigma>.
-
-    Raises:
-        UserError: naming the value, where it came from (`key`) and the summaries that there are.
-    """
-    stem, _, number = name.rpartition("_")
-    numbered = re.fullmatch("[0-9]{1,6}", number) is not None
-    full = _prefixed("summary_")(stem if numbered else name)
-    if full not in SUMMARIZERS:
-        close = difflib.get_close_matches(full, SUMMARIZERS, n=1)
-        hint = f" (did you mean {close[0]}?)" if close else ""
-        raise UserError(f"{key} = {name!r}{hint}: allowed are {', '.join(SUMMARIZERS)}")
-    if not numbered:
-        return full, {}
-    option = SUMMARIZERS[full]
-    if option is None:
-        raise UserError(f"{key} = {name!r}: {full} takes no number")
-    return full, {option: int(number)}
-
-
-def model_of(name: str, key: str = "modelClass") -> tuple[str, str | None, str | float]:
-    """("MDRFF", "RBF", 4.0) of `MDRFF_RBF_4.0`: class, kernel, bandwidth (a number, "median" or "validation").
-
-    Raises:
-        UserError: naming the value, where it came from (`key`) and what there is.
-    """
-    match = MODEL.fullmatch(name)
-    if match is None:
-        raise UserError(
-            f"{key} = {name!r}: allowed are MDNN, MDRFF, MDRFF_<kernel>, MDRFF_<kernel>_<bandwidth> (kernel RBF, "
-            "Laplace, Matern12, Matern32 or Matern52; bandwidth a number, median or validation); and in a run "
-            "None, plain uniform randomisation"
-        )
-    kernel, bandwidth = match.groups()
-    if bandwidth in (None, "median", "validation"):
-        return name.partition("_")[0], kernel or (None if name == "MDNN" else "RBF"), bandwidth or "validation"
-    try:
-        width = float(bandwidth)
-    except ValueError:
-        width = math.nan
-    if not 0 < width < math.inf:
-        raise UserError(f"{key} = {name!r}: the bandwidth {bandwidth} is no positive finite number")
-    return "MDRFF", kernel, width
 
 
 def number(value: Any) -> float | None:
@@ -301,7 +244,7 @@ class BayesSimConfig(Section):
         "summary_start",
         "trajectory summary: summary_start, _waypts, _corr, _corrdiff, _signatory, _logsignature or _learned; with its "
         "number of steps, waypoints, lags or levels as in summary_corrdiff_3",
-        spell=_prefixed("summary_"),
+        spell=summary_name,
     )
     trainTrajLen: int = setting(
         20, "control steps per training trajectory (arrays have one more row)", low=1, high=COUNT

@@ -18,6 +18,7 @@ from bayessim_mjx.inference.fit import condition
 from bayessim_mjx.inference.identify import flat_sentences, restore_prior
 from bayessim_mjx.inference.misspecification import Misfit
 from bayessim_mjx.inference.range_ends import Pile, piles
+from bayessim_mjx.inference.temperature import widened
 
 CANDIDATES = 16  # draws of q for each one of q tilt / prior
 
@@ -94,7 +95,7 @@ def examine(
     if temperature is None:
         report = calibration.corrected(key, posteriors, held[0], tilt)
     else:
-        report = calibration.check(key, calibration.widened(posteriors, temperature), held[0], tilt=tilt)
+        report = calibration.check(key, widened(posteriors, temperature), held[0], tilt=tilt)
         report = replace(report, temperature=None if temperature == 1.0 else temperature)
     misfit = misspecification.detect(network, *simulated, held[1], real, names)
     return report, misfit.part(rows)
@@ -134,7 +135,7 @@ def replicated(
     `tilt`: the x were simulated at thetas from it instead of the prior, so draws are those of q tilt / prior.
     """
     x, keys = x[:pairs], jax.random.split(key, 3)
-    posteriors = calibration.widened(conditioned(network, x), temperature)
+    posteriors = widened(conditioned(network, x), temperature)
     many = each if tilt is None else CANDIDATES * each
     draws = jax.vmap(lambda k, q: q.sample(k, many))(jax.random.split(keys[0], x.shape[0]), posteriors)
     if tilt is not None:

@@ -1,15 +1,14 @@
 """Mixture density network: standardised features -> mixture of Gaussians over z-scored coordinates of the parameters.
 
-y is the chart's coordinate with mean 0 and variance 1 under the prior. The network (MLP, or random Fourier features)
-gives centres mu and lower triangular A. A component is N(y; mu, (A^T A)^-1), so training needs no solve and its
-log-determinant is exact; in the probit chart it is N(y; 0, I) exp(-|A (y - mu)|^2 / 2) / Z: precision I + A^T A, never
-broader than the prior, for products and sequential rounds (reference/sbi.md section 2).
+y is the chart's coordinate with mean 0 and variance 1 under the prior. The network (a density, see densities/, and one
+layer of heads) gives centres mu and lower triangular A. A component is N(y; mu, (A^T A)^-1), so training needs no solve
+and its log-determinant is exact; in the probit chart it is N(y; 0, I) exp(-|A (y - mu)|^2 / 2) / Z: precision
+I + A^T A, never broader than the prior, for products and sequential rounds.
 """
 
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -17,24 +16,18 @@ import numpy as np
 from jax import Array
 
 from bayessim_mjx.distributions import Distribution, box, charts
-from bayessim_mjx.inference import features
+from bayessim_mjx.inference import densities
+from bayessim_mjx.inference.densities import Drop, Params
+from bayessim_mjx.inference.gaussians import LOG_2PI, log_gaussian, overlap
 from bayessim_mjx.inference.settings import InferenceSettings
 from bayessim_mjx.linalg import inverse_lower, lower_factor, product
 
-Params = dict[str, Any]
-Drop = tuple[Array, Array]  # key, rate
-RIDGE_LIMIT = 1024  # features up to which linear_start is worth its cost
-RIDGE = 1e-3  # of the features' variance
-WEAK = 0.05  # smallest precision beyond the prior's that linear_start gives to a component of the probit chart
-MULTIPLES = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0)  # of the median distance: bandwidths tried by validation
 UNUSED = -60.0  # log weight of components that a member does not use
 CUT_POINTS = 16  # quasi-Monte-Carlo points of a component's mass inside the box, in training
-GOLDEN = np.uint32(2654435769)  # 2^32 / golden ratio
 AT_ONCE = 1024  # trajectories embedded at once
 LEAST_INSIDE = float(np.log(0.1))  # log mass inside the box that training reckons with at least
 # of the parameters, those that are not trained by gradients; the last three belong to the parts of the mixture
-FIXED = ("omega", "rate", "used", "sharpness", "share", "member")
-LOG_2PI = float(np.log(2 * np.pi))
+FIXED = ("used", "sharpness", "share", "member")
 
 
 def to_y(u: Array, chart: str = "plain") -> Array:
@@ -52,6 +45,11 @@ def log_volume(y: Array, chart: str) -> Array:
 def bounded(settings: InferenceSettings) -> bool:
     """Whether components have the precision I + A^T A."""
     return settings.coordinates == "probit"
+
+
+def fixed(settings: InferenceSettings) -> tuple[str, ...]:
+    """Names of the parameters that are not trained by gradients."""
+    return (*densities.density_of(settings).fixed, *FIXED)
 
 
 def head_size(d: int, settings: InferenceSettings) -> int:
@@ -77,12 +75,8 @@ def init(key: Array, settings: InferenceSettings, dim_x: int, d: int, count: Arr
         key, key_embedding = jax.random.split(key)
         more = {"embedding": settings.embedding.init(key_embedding, jnp.zeros((1, dim_x)))}
         dim_x = settings.embedding.size(dim_x)
-    sizes: tuple[int, ...] = (dim_x, *settings.hiddenLayers, head_size(d, settings))
-    if settings.kernel is not None:
-        omega = features.frequencies(settings.kernel, dim_x, settings.fourierFeatures)
-        rate = jnp.asarray(1 / (settings.fixed_bandwidth or 1.0), jnp.float32)
-        more = {**more, "omega": jnp.asarray(omega), "rate": rate}
-        sizes = (2 * settings.fourierFeatures, sizes[-1])
+    own, widths = densities.started(jax.random.fold_in(key, 1), settings, dim_x)
+    more, sizes = {**more, **own}, (*widths, head_size(d, settings))
     keys = jax.random.split(key, len(sizes))
     gains = [1.0] * (len(sizes) - 2) + [0.1]
     layers = [
@@ -109,99 +103,9 @@ def embedded(params: Params, x: Array, settings: InferenceSettings) -> Array:
     return apply(x) if x.shape[0] <= AT_ONCE else jax.lax.map(apply, x, batch_size=AT_ONCE)
 
 
-def hidden(params: Params, x: Array, drop: Drop | None = None) -> Array:
-    """What the last layer sees: hidden units (some dropped in training) or Fourier features, [n, D] -> [n, H]."""
-    if "omega" in params:
-        return features.fourier(x, params["omega"], params["rate"])
-    for layer in params["layers"][:-1]:
-        x = jax.nn.silu(x @ layer["w"] + layer["b"][None, :])
-        if drop is not None:
-            key, rate = drop
-            kept = _noise(key, x.shape) >= (2.0**31 * rate).astype(jnp.uint32)
-            x, drop = jnp.where(kept, x / (1 - rate), 0.0), (key + GOLDEN, rate)
-    return x
-
-
-def _noise(key: Array, shape: tuple[int, ...]) -> Array:
-    """Numbers below 2^31 by hashing places: random enough to drop units by, in a tenth of jax.random's time."""
-    value = jnp.arange(shape[0] * shape[1], dtype=jnp.uint32).reshape(shape) * GOLDEN + key[0]
-    for multiplier in (np.uint32(0x7FEB352D), np.uint32(0x846CA68B)):
-        value = (value ^ (value >> 16)) * multiplier + key[1]
-    return (value ^ (value >> 15)) >> 1
-
-
-def choose_bandwidth(
-    params: Params, x: Array, y: Array, train: Array, held: Array, settings: InferenceSettings
-) -> Params:
-    """Set the features' bandwidth from the data (`train`, `held` [n] are bool); nothing to do for MDNN or a number."""
-    if settings.kernel is None or settings.fixed_bandwidth is not None:
-        return params
-    median = features.median_distance(x, train)
-    if settings.bandwidth == "median" or x.shape[1] + 2 * settings.fourierFeatures > RIDGE_LIMIT:
-        return {**params, "rate": 1 / median}
-
-    def held_out(rate: Array) -> Array:
-        """log det of the held-out residuals' covariance."""
-        design = jnp.concatenate([features.fourier(x, params["omega"], rate), x], axis=1)
-        mean, slope = ridge(design, y, train.astype(jnp.float32))
-        residual = jnp.where(held[:, None], y - mean[None, :] - product(design, slope), 0.0)
-        cov = product(residual.T, residual) / jnp.maximum(jnp.sum(held.astype(jnp.float32)), 1.0)
-        return jnp.linalg.slogdet(cov + 1e-6 * jnp.eye(y.shape[1]))[1]
-
-    rates = 1 / (median * jnp.asarray(MULTIPLES, jnp.float32))
-    return {**params, "rate": rates[jnp.argmin(jax.lax.map(held_out, rates))]}
-
-
-def ridge(design: Array, y: Array, weights: Array) -> tuple[Array, Array]:
-    """Ridge regression of y [n, d] on design [n, H] with weights [n] of 0 or 1 -> mean [d], slope [H, d]."""
-    n = jnp.maximum(jnp.sum(weights), 1.0)
-    mean = weights @ y / n
-    weighted = (design * weights[:, None]).T
-    gram = product(weighted, design) / n + RIDGE * jnp.eye(design.shape[1])
-    return mean, jnp.linalg.solve(gram, product(weighted, y - mean[None, :]) / n)
-
-
-def linear_start(params: Params, x: Array, y: Array, weights: Array, settings: InferenceSettings) -> Params:
-    """Set the linear path to the ridge regression of y [n, d] on x [n, D] and every component to its residuals.
-
-    Training then starts at the best linear-Gaussian posterior instead of the prior; components keep their spread, in
-    units of the residual sd. With Fourier features these are regressed on too. `weights` [n] are 1 for rows to use and
-    0 for the rest. No change beyond RIDGE_LIMIT features, where the normal equations would cost more than they save.
-    """
-    (dim_x, d), k = (x.shape[1], y.shape[1]), settings.components
-    design = jnp.concatenate([hidden(params, x), x], axis=1) if "omega" in params else x
-    if design.shape[1] > RIDGE_LIMIT or d == 0:
-        return params
-    mean, slope = ridge(design, y, weights)
-    residual = (y - mean[None, :] - product(design, slope)) * weights[:, None]
-    cov = product(residual.T, residual) / jnp.maximum(jnp.sum(weights), 1.0) + 1e-4 * jnp.eye(d)
-    sd = jnp.sqrt(jnp.diagonal(cov))
-    if bounded(settings):
-        mean, slope, cov = _beyond_prior(mean, slope, cov)
-    factor = inverse_lower(jnp.linalg.cholesky(cov))  # A^T A = cov^-1
-    if not settings.fullCovariance:
-        factor = jnp.diag(1.0 / jnp.sqrt(jnp.diagonal(cov)))
-    last = params["layers"][-1]
-    spread = last["b"][k : k + k * d].reshape(k, d)
-    log_diagonal = 8 * jnp.arctanh(jnp.clip(jnp.log(jnp.diagonal(factor)) / 8, -0.99, 0.99))
-    parts = [jnp.zeros(k), (mean[None, :] + spread * sd[None, :]).reshape(-1), jnp.tile(log_diagonal, k)]
-    if settings.fullCovariance:
-        parts.append(jnp.tile(factor[np.tril_indices(d, -1)], k))
-    columns = jnp.tile(slope, (1, k))
-    weight = last["w"]
-    if "omega" in params:
-        weight = weight.at[:, k : k + k * d].add(columns[:-dim_x])
-    skip = params["skip"].at[:, k : k + k * d].set(columns[-dim_x:])
-    layers = [*params["layers"][:-1], {"w": weight, "b": jnp.concatenate(parts)}]
-    return {**params, "layers": layers, "skip": skip}
-
-
-def _beyond_prior(mean: Array, slope: Array, cov: Array) -> tuple[Array, Array, Array]:
-    """Centre mu, its slope and (A^T A)^-1 of the component of precision I + A^T A with that posterior mean and cov."""
-    values, vectors = jnp.linalg.eigh(cov)
-    extra = jnp.maximum(1 / values - 1, WEAK)  # eigenvalues of A^T A
-    stretch = product(vectors * ((1 + extra) / extra)[None, :], vectors.T)  # m = (I + A^T A)^-1 A^T A mu
-    return stretch @ mean, product(slope, stretch), product(vectors / extra[None, :], vectors.T)
+def hidden(params: Params, x: Array, settings: InferenceSettings, drop: Drop | None = None) -> Array:
+    """What the last layer sees: the density's hidden units (some dropped in training) or features, [n, F] -> [n, H]."""
+    return densities.density_of(settings).hidden(params, x, drop)
 
 
 def forward(
@@ -210,7 +114,7 @@ def forward(
     """Standardised x [n, D] -> log weights [n, K], centres mu [n, K, d], factors A [n, K, d, d] in y coordinates."""
     n, k = x.shape[0], settings.components
     last, x = params["layers"][-1], embedded(params, x, settings)
-    out = hidden(params, x, drop) @ last["w"] + last["b"][None, :] + x @ params["skip"]
+    out = hidden(params, x, settings, drop) @ last["w"] + last["b"][None, :] + x @ params["skip"]
     logits, means, diagonal, lower = jnp.split(out, np.cumsum([k, k * d, k * d]), axis=1)
     # A_ii = exp(8 tanh(r / 8)): between exp(-8) and exp(8), slope 1 at r = 0
     diagonal = jnp.exp(8 * jnp.tanh(diagonal.reshape(n, k, d) / 8))
@@ -229,69 +133,6 @@ def log_normaliser(means: Array, factors: Array, settings: InferenceSettings) ->
         return log_gaussian(product(factors, means[..., None])[..., 0], gram)
     log_det = jnp.sum(jnp.log(jnp.diagonal(factors, axis1=-2, axis2=-1)), axis=-1)
     return np.float32(0.5 * d * LOG_2PI) - log_det
-
-
-def overlap(means: Array, factors: Array, centres: Array, scales: Array) -> Array:
-    """log of the integral of N(y; centre, S S^T) exp(-|A (y - mu)|^2 / 2).
-
-    It is the evidence N(A mu; A centre, I + A S S^T A^T) less its constant: nothing is inverted, nothing cancels.
-    """
-    spread = product(factors, scales)
-    gap = product(factors, (means - centres)[..., None])
-    gram = product(spread, jnp.swapaxes(spread, -1, -2)) + jnp.eye(means.shape[-1])[(None,) * (spread.ndim - 2)]
-    return log_gaussian(gap[..., 0], gram)
-
-
-@jax.custom_jvp
-def log_gaussian(v: Array, cov: Array) -> Array:
-    """log N(v; 0, cov) + d/2 log 2 pi: v [..., d], cov [..., d, d] -> [...].
-
-    Elimination row by row with the batch as the last axis: in training many times faster than loops over batches of
-    small matrices, and no LAPACK (see triangular.py).
-    """
-    d = v.shape[-1]
-    rows = jnp.moveaxis(cov.reshape(-1, d, d), 0, -1)  # [d, d, n]
-
-    def eliminate(carry: tuple[Array, Array, Array], _: None) -> tuple[tuple[Array, Array, Array], None]:
-        rows, right, value = carry
-        pivot = jnp.maximum(rows[0, 0], 1e-20)
-        value = value - 0.5 * jnp.log(pivot) - 0.5 * right[0] * right[0] / pivot
-        column = rows[1:, 0] / pivot[None]
-        right = jnp.pad(right[1:] - column * right[:1], ((0, 1), (0, 0)))
-        rows = jnp.pad(rows[1:, 1:] - column[:, None] * rows[:1, 1:], ((0, 1), (0, 1), (0, 0)))
-        return (rows, right, value), None
-
-    start = rows, v.reshape(-1, d).T, jnp.zeros(rows.shape[-1], v.dtype)
-    return jax.lax.scan(eliminate, start, length=d)[0][2].reshape(v.shape[:-1])
-
-
-@log_gaussian.defjvp
-def _log_gaussian_slope(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
-    """d log N(v; 0, C) = -a dv + (a a^T - C^-1) : dC / 2, a = C^-1 v: a tenth of the time of going back by each row."""
-    (v, cov), (dv, dcov) = primals, tangents
-    inverse = _inverse(cov)
-    a = jnp.sum(inverse * v[..., None, :], axis=-1)
-    by_cov = 0.5 * (a[..., :, None] * a[..., None, :] - inverse)
-    return log_gaussian(v, cov), jnp.sum(by_cov * dcov, axis=(-2, -1)) - jnp.sum(a * dv, axis=-1)
-
-
-def _inverse(cov: Array) -> Array:
-    """Inverse of symmetric positive definite matrices [..., d, d], by sweeping every pivot; the batch as last axis."""
-    d = cov.shape[-1]
-    place = jnp.arange(d, dtype=jnp.int32)[:, None]
-
-    def sweep(k: Array, rows: Array) -> Array:
-        row, column = (jax.lax.dynamic_index_in_dim(rows, k, axis, keepdims=False) for axis in (0, 1))  # [d, n]
-        pivot = jnp.maximum(jax.lax.dynamic_index_in_dim(row, k, 0), 1e-20)  # [1, n]
-        row, column = (jnp.where(place == k, side, side / pivot) for side in (row, column))
-        swept = rows - (column * pivot)[:, None] * row[None]
-        swept = jnp.where((place == k)[None], column[:, None], swept)
-        swept = jnp.where((place == k)[:, None], row[None], swept)
-        both = (place == k)[None] & (place == k)[:, None]
-        return jnp.where(both, -1 / pivot[None], swept)
-
-    rows = jax.lax.fori_loop(0, d, sweep, jnp.moveaxis(cov.reshape(-1, d, d), 0, -1))
-    return -jnp.moveaxis(rows, -1, 0).reshape(cov.shape)
 
 
 def log_prob(params: Params, x: Array, y: Array, settings: InferenceSettings) -> Array:

@@ -4,7 +4,7 @@ Three scores of a summary z, each ranked among those of fresh simulations (excha
 nothing is wrong): the distance of z from what emulator.py says is simulated at the theta that explains it best, in
 units of the noise at that theta; its part that is as smooth as what theta does; the distance to the nearest simulations
 in the network's last hidden layer. The first is two-sided, as noise that is lower than assumed makes the residual too
-small (reference/sbi.md section 3.4). The three p-values are combined and the combination is ranked again, which makes
+small. The three p-values are combined and the combination is ranked again, which makes
 it one p-value.
 """
 
@@ -154,7 +154,9 @@ def _two_sided(held: np.ndarray, real: np.ndarray) -> np.ndarray:
 def latent(state: Any, x: Array) -> Array:
     """What the network made of summaries x [n, D]: the last hidden layers of all members of the ensemble, [n, E H]."""
     z = state.inputs(x)
-    layers = jax.vmap(lambda params: mdn.hidden(params, mdn.embedded(params, z, state.settings)))(state.params)
+    layers = jax.vmap(lambda params: mdn.hidden(params, mdn.embedded(params, z, state.settings), state.settings))(
+        state.params
+    )
     return jnp.moveaxis(layers, 0, 1).reshape(x.shape[0], -1)
 
 

@@ -2,86 +2,83 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
-from bayessim_mjx.config.settings import COORDINATES, BayesSimConfig, model_of
+import numpy as np
+
+from bayessim_mjx.config.names import model_of
+from bayessim_mjx.config.settings import BayesSimConfig, Section, setting
 from bayessim_mjx.errors import UserError
 
-if TYPE_CHECKING:
-    from bayessim_mjx.inference.embedding import Embedding
+
+def _of_run(name: str) -> Any:
+    """The setting `bayessim.<name>`: its default, meaning and limits stand there alone."""
+    given = BayesSimConfig.__dataclass_fields__[name]
+    return field(default=given.default, metadata=given.metadata)
 
 
 @dataclass(frozen=True)
-class InferenceSettings:
-    """The first five keep BayesSimIG's names and, like `ensemble` and `coordinates`, have the defaults of `bayessim:`.
+class InferenceSettings(Section):
+    """Those that `bayessim:` has too (config/settings.py) have its defaults and limits.
 
     modelClass is MDNN, or MDRFF[_<kernel>[_<bandwidth>]] with the kernels RBF, Matern12 (Laplace), Matern32, Matern52
     and as bandwidth a number (in standard deviations of the features), `median` (of the distances) or `validation`
-    (the multiple of the median that a ridge regression predicts held-out rows with best; the default).
+    (the multiple of the median that a ridge regression predicts held-out rows with best; the default); or a density of
+    one's own (densities/).
 
     coordinates are those in which the posterior is a Gaussian mixture: `plain` unit coordinates (cut off at the box
     afterwards), `truncated` (the same, cut off in training too), `probit` (the prior is exactly N(0, I) and no
     component is broader; exact for Gaussian priors) or `logit`. `auto` is `probit` where every prior is Gaussian,
     otherwise `plain`: in plain coordinates the Gaussian posterior of a Gaussian prior is bent (0.09 nats a parameter).
+
+    A single network is over-confident at a few thousand simulations: its 50 / 80 / 95 % regions held .31 / .58 / .82 of
+    truths. An ensemble's posterior has ensemble * components Gaussians.
     """
 
-    modelClass: str = BayesSimConfig.modelClass or "MDNN"
-    components: int = BayesSimConfig.components
-    fullCovariance: bool = BayesSimConfig.fullCovariance
-    hiddenLayers: tuple[int, ...] = BayesSimConfig.hiddenLayers
-    lr: float = BayesSimConfig.lr  # peak of the cosine schedule
-    weight_decay: float = 1e-4
-    batch: int = 64  # a quarter of the rows in four times the steps: more per second, measured on noise-free data
-    epochs: int = 40  # passes over the capacity, within [min_steps, max_steps]
-    min_steps: int = 1000
-    max_steps: int = 8000
-    grad_clip: float = 5.0  # global norm
-    validation: float = 0.1  # share of rows held out
-    restandardise: bool = False  # inputs anew at every fit: for data whose distribution changes from fit to fit
-    clip: float = 10.0  # standardised inputs are clipped to +-clip
-    defensive: float = 1e-4  # prior mass in every posterior: one that is wildly wrong cannot veto the others
-    coordinates: str = BayesSimConfig.coordinates
-    # networks side by side, weighted by held-out score; their posterior has ensemble * components Gaussians. A single
-    # one is over-confident at a few thousand simulations: its 50 / 80 / 95 % regions held .31 / .58 / .82 of truths
-    ensemble: int = BayesSimConfig.ensemble
-    # of the last member, the first has none; less with more than 3000 rows, which need none and suffer
-    dropout: float = 0.1
-    fourierFeatures: int = 256  # frequencies of MDRFF: twice as many features
-    embedding: Embedding | None = None  # trained with the network, which then takes in rows of summary_learned
+    modelClass: str | None = _of_run("modelClass")  # None is a run without inference: refused here
+    components: int = _of_run("components")
+    fullCovariance: bool = _of_run("fullCovariance")
+    hiddenLayers: tuple[int, ...] = _of_run("hiddenLayers")
+    lr: float = _of_run("lr")
+    weight_decay: float = setting(1e-4, "of AdamW", low=0)
+    # a quarter of the rows in four times the steps: more per second, measured on noise-free data
+    batch: int = setting(64, "rows of a gradient step", low=1)
+    epochs: int = setting(40, "passes over the capacity, within [min_steps, max_steps]", low=1)
+    min_steps: int = setting(1000, "gradient steps at least", low=1)
+    max_steps: int = setting(8000, "gradient steps at most", low=1)
+    grad_clip: float = setting(5.0, "largest global norm of a gradient", above=0)
+    validation: float = setting(0.1, "share of rows held out, below 1", above=0)
+    restandardise: bool = setting(False, "inputs anew at every fit: for data whose distribution changes")
+    clip: float = setting(10.0, "standardised inputs are clipped to +- this", above=0)
+    defensive: float = setting(
+        1e-4, "prior mass in every posterior, below 1: one that is wildly wrong cannot veto the others", low=0
+    )
+    coordinates: str = _of_run("coordinates")
+    ensemble: int = _of_run("ensemble")
+    # the first member has none; less with more than 3000 rows, which need none and suffer
+    dropout: float = setting(0.1, "of the last member, below 1", low=0)
+    fourierFeatures: int = setting(256, "frequencies of MDRFF: twice as many features", low=1)
+    embedding: Any = setting(
+        None, "trained with the network, which then takes in rows of summary_learned (embedding.py)"
+    )
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "hiddenLayers", tuple(int(width) for width in self.hiddenLayers))
+        for f in fields(self):  # numbers of arrays are as good as Python's
+            if isinstance(value := getattr(self, f.name), np.generic):
+                object.__setattr__(self, f.name, value.item())
+        super().__post_init__()
+
+    def check(self) -> None:
         model_of(str(self.modelClass))
-        positive = ("components", "batch", "epochs", "min_steps", "max_steps", "lr", "grad_clip", "clip")
-        for name in (*positive, "ensemble", "fourierFeatures"):
-            if not getattr(self, name) > 0:
-                raise UserError(f"{name} = {getattr(self, name)!r} must be positive")
-        if not 0 < self.validation < 1:
-            raise UserError(f"validation = {self.validation!r} must lie between 0 and 1")
-        for name in ("defensive", "dropout"):
-            if not 0 <= getattr(self, name) < 1:
-                raise UserError(f"{name} = {getattr(self, name)!r} must lie in [0, 1)")
-        if any(width < 1 for width in self.hiddenLayers):
-            raise UserError(f"hiddenLayers = {self.hiddenLayers!r}: widths must be positive")
-        if self.coordinates not in COORDINATES:
-            raise UserError(f"coordinates = {self.coordinates!r}: allowed are {', '.join(COORDINATES)}")
+        for name in ("validation", "defensive", "dropout"):
+            if not getattr(self, name) < 1:
+                raise UserError(f"{name} = {getattr(self, name)!r}: must be less than 1")
 
     @property
-    def kernel(self) -> str | None:
-        """Kernel of the Fourier features; None for MDNN."""
-        return model_of(self.modelClass)[1]
-
-    @property
-    def bandwidth(self) -> str:
-        """`median`, `validation` or a number, as text."""
-        return str(model_of(self.modelClass)[2])
-
-    @property
-    def fixed_bandwidth(self) -> float | None:
-        """The bandwidth where it is given as a number."""
-        width = model_of(self.modelClass)[2]
-        return width if isinstance(width, float) else None
+    def density(self) -> tuple[str, Any]:
+        """Name of the density, and what it makes of the text after the name: of MDRFF, kernel and bandwidth."""
+        return model_of(str(self.modelClass))
 
     @property
     def chart(self) -> str:

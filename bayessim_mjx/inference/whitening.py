@@ -5,6 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jax import Array
 
+from bayessim_mjx.inference.densities import density_of
 from bayessim_mjx.inference.settings import InferenceSettings
 from bayessim_mjx.linalg import product
 
@@ -14,7 +15,7 @@ FLOOR = 1e-3  # added to the whitened variances: rounding is not to be blown up
 
 def count(settings: InferenceSettings, dim_x: int) -> int:
     """How many bases are tried, each by another member of the ensemble (the last one is linear at first)."""
-    whole = settings.embedding is not None or settings.kernel is not None or dim_x > LIMIT
+    whole = settings.embedding is not None or not density_of(settings).whitened or dim_x > LIMIT
     return 1 if whole or settings.ensemble < 3 else 2
 
 

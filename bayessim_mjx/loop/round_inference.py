@@ -7,7 +7,6 @@ q(theta | summary), tests of it, and the product of the posteriors of all real t
 from __future__ import annotations
 
 import dataclasses
-import functools
 import time
 from typing import Any
 
@@ -17,79 +16,19 @@ import numpy as np
 from jax import Array
 
 from bayessim_mjx import inference
-from bayessim_mjx.config.settings import summary_of
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.inference import InferenceSettings, calibration, checks, misspecification, rounds
-from bayessim_mjx.loop.sources import Source, domain_or_prior
+from bayessim_mjx.inference import calibration, checks, misspecification, rounds
+from bayessim_mjx.inference.temperature import widened
+from bayessim_mjx.loop.inference_state import new_network
+from bayessim_mjx.loop.simulations import at, proposal_of, simulated
 from bayessim_mjx.loop.state import Loop, LoopState, RoundInfo
 from bayessim_mjx.rl import Policy
 from bayessim_mjx.rollout import Trajectory, select
 
-CHUNK = 2500  # trajectories simulated at once while collecting
 PREDICTIVE_DRAWS = 64
-REFERENCE = 10000  # simulations that `reexamine` compares real trajectories with, at most
 CLIPPED = 0.01  # share of clipped summary entries worth a warning
 LOST = 0.05  # weight of a posterior that cannot be divided by the proposal worth a warning
-
-
-def blank(loop: Loop) -> dict[str, Any]:
-    """The inference's fields of a LoopState before the first round: no data, the prior as domain."""
-    b, space, d = loop.settings, loop.env.space, len(loop.env.space)
-    domain = domain_or_prior(space, b.components, loop.chart)
-    infers = b.modelClass is not None
-    capacity, real_rows = (loop.capacity, b.realIters * b.realTrajs) if infers else (0, 0)
-    return {
-        "domain": domain,
-        "fit": _new_network(loop, 0) if infers else None,
-        "thetas": jnp.zeros((capacity, d)),
-        "features": jnp.zeros((capacity, loop.feature_size)),
-        "real_features": jnp.zeros((real_rows, loop.feature_size)),
-        "real_posteriors": _no_factors(loop, real_rows) if infers else None,
-        **_no_proposals(loop),
-        "temperature": jnp.float32(1.0),
-    }
-
-
-def _no_factors(loop: Loop, rows: int) -> Distribution:
-    settings = InferenceSettings.of(loop.settings).at(loop.env.space)
-    factor = Distribution.prior(loop.env.space, settings.components * settings.ensemble, settings.chart)
-    return jax.tree.map(lambda leaf: jnp.zeros((rows, *leaf.shape)), factor)
-
-
-def _no_proposals(loop: Loop) -> dict[str, Any]:
-    if not loop.sequential:
-        return {"proposal": None, "proposals": None}
-    b = loop.settings
-    prior = rounds.first(loop.env.space, b.proposal, b.components, loop.chart)
-    return {"proposal": prior, "proposals": rounds.repeated(prior, max(1, loop.capacity // b.trainTrajs))}
-
-
-def _new_network(loop: Loop, round_: int) -> Any:
-    changing = loop.source is not None and loop.source.policy_dependent
-    learned = summary_of(loop.settings.summarizerFxn)[0] == "summary_learned"
-    embedding = loop.source.channels.embedding() if learned and loop.source is not None else None
-    settings = InferenceSettings.of(loop.settings, restandardise=changing, embedding=embedding)
-    return inference.init(jax.random.fold_in(loop.key(round_, "fit"), 1), settings, loop.env.space, loop.feature_size)
-
-
-def _simulate(
-    source: Source, key: Array, policy: Policy, proposal: Distribution, method: str, count: int
-) -> tuple[Array, Array]:
-    """`count` simulated trajectories: theta [count, d], features [count, D], in chunks that fit the memory."""
-    chunks = -(-count // CHUNK)
-    k_theta, k_roll = jax.random.split(key)
-    thetas = rounds.draw(k_theta, proposal, method, -(-count // chunks) * chunks)
-    features = _features(source, k_roll, thetas.reshape(chunks, -1, thetas.shape[-1]), policy)
-    return thetas[:count], features[:count]
-
-
-@functools.partial(jax.jit, static_argnums=0)
-def _features(source: Source, key: Array, thetas: Array, policy: Policy) -> Array:
-    """Features [chunks * n, D] of trajectories at thetas [chunks, n, d]."""
-    keys = jax.random.split(key, thetas.shape[0])
-    features = jax.lax.map(lambda at: source.simulate(at[0], at[1], policy), (keys, thetas))
-    return features.reshape(-1, features.shape[-1])
 
 
 def infer(loop: Loop, state: LoopState, policy: Policy, info: RoundInfo) -> LoopState:
@@ -138,11 +77,11 @@ def _collect(
     """Simulate this round's trajectories: (thetas, features, valid rows) to fit, and fresh pairs that test the fit."""
     b, round_ = loop.settings, int(state.round)
     # one program for what is fitted and what tests the fit
-    thetas, x = _simulate(
+    thetas, x = simulated(
         loop.source,  # type: ignore[arg-type]
         loop.key(round_, "simulate"),
         policy,
-        _proposal(loop, state),
+        proposal_of(loop, state),
         b.proposal,
         b.trainTrajs + b.checkTrajs,
     )
@@ -159,15 +98,10 @@ def _collect(
     return dataclasses.replace(state, thetas=thetas, features=x), (thetas, x, count), held
 
 
-def _proposal(loop: Loop, state: LoopState) -> Distribution:
-    """What this round is simulated from."""
-    return Distribution.prior(loop.env.space, loop.settings.components) if state.proposal is None else state.proposal
-
-
 def _learn(loop: Loop, state: LoopState, fitted: tuple[Array, Array, int], info: RoundInfo) -> LoopState:
     """Fit the network, the one so far or a new one."""
     b, round_, (thetas, x, count) = loop.settings, int(state.round), fitted
-    network = state.fit if b.ftune or round_ == 0 else _new_network(loop, round_)
+    network = state.fit if b.ftune or round_ == 0 else new_network(loop, round_)
     correction: dict[str, Any] = {}
     if b.proposal == "apt":
         correction = {"proposals": state.proposals, "origin": np.arange(len(thetas), dtype=np.int32) // b.trainTrajs}
@@ -186,7 +120,7 @@ def _examine(
     known = slice(round_ * b.realTrajs if loop.source.policy_dependent else 0, (round_ + 1) * b.realTrajs)  # type: ignore[union-attr]
     # what the network of this round is tested on comes from what it was simulated from
     tilt = (
-        state.proposals and _at(state.proposals, round_ % state.proposals.logits.shape[0])
+        state.proposals and at(state.proposals, round_ % state.proposals.logits.shape[0])
         if b.proposal == "apt"
         else None
     )
@@ -211,7 +145,7 @@ def _factors(loop: Loop, state: LoopState, info: RoundInfo) -> Distribution:
         assert state.proposals is not None
         rows = jax.tree.map(np.asarray, factors).split()
         done = seen + b.realTrajs
-        quotients, lost = rounds.divided(rows[:done], _at(state.proposals, 0))
+        quotients, lost = rounds.divided(rows[:done], at(state.proposals, 0))
         factors = jax.tree.map(lambda *leaves: jnp.stack(leaves), *quotients, *rows[done:])
         if lost > LOST:
             info.warnings.append(f"{100 * lost:.0f} % of the posterior's weight cannot be divided by the proposal")
@@ -224,7 +158,7 @@ def _factors(loop: Loop, state: LoopState, info: RoundInfo) -> Distribution:
 
 @jax.jit
 def _conditioned(network: Any, features: Array, widening: Array) -> Distribution:
-    return calibration.widened(inference.condition(network, features), widening)
+    return widened(inference.condition(network, features), widening)
 
 
 @jax.jit
@@ -232,10 +166,6 @@ def _kept(factors: Distribution, identified: Array, prior_share: float) -> Distr
     """The prior where nothing is identified, and a share of it everywhere."""
     factors = jax.vmap(inference.restore_prior, in_axes=(0, None))(factors, identified)
     return dataclasses.replace(factors, prior_weight=jnp.full_like(factors.prior_weight, prior_share))
-
-
-def _at(batch: Distribution, row: int) -> Distribution:
-    return jax.tree.map(lambda leaf: leaf[row], batch)
 
 
 def _posterior(loop: Loop, state: LoopState, info: RoundInfo) -> Distribution:
@@ -264,34 +194,6 @@ def _complaints(names: tuple[str, ...], fit: dict[str, Any], known_before: np.nd
     if fit["skipped"] > 0:
         texts.append(f"{int(fit['skipped'])} steps of the fit skipped: gradient not finite")
     return texts
-
-
-def reexamine(loop: Loop, state: LoopState, policy: Policy, pairs: int, seed: int = 0) -> checks.Checks:
-    """The checks of a round done again, on `pairs` fresh simulations and with a posterior predictive check.
-
-    `state` is that after the round and `policy` the one that it was evaluated with, as in its checkpoint. The posterior
-    is tested as the round used it: with its temperature, on parameters from what the round was simulated from.
-    """
-    b, source, done = loop.settings, loop.source, int(state.round)
-    domain = state.domain
-    assert source is not None and domain is not None
-    key = jax.random.fold_in(jax.random.fold_in(jax.random.PRNGKey(seed), 0xCA11), done)  # seen by no fit
-    known, last = min(b.trainTrajs, REFERENCE), max(1, loop.capacity // b.trainTrajs)
-    used = None if state.proposals is None else _at(state.proposals, (done - 1) % last)
-    state, temperature = dataclasses.replace(state, proposal=used), float(state.temperature)
-    thetas, x = _simulate(source, jax.random.fold_in(key, 1), policy, _proposal(loop, state), b.proposal, known + pairs)
-    held = thetas[known:], x[known:]
-    rows = slice((done - 1) * b.realTrajs if source.policy_dependent else 0, done * b.realTrajs)
-    judged: dict[str, Any] = {"temperature": temperature, "tilt": used if b.proposal == "apt" else None}
-    verdict = checks.examine(
-        key, state.fit, (thetas[:known], x[:known], known), held, state.real_features, rows,
-        names=loop.feature_names, **judged,
-    )  # fmt: skip
-    again = checks.replicated(
-        jax.random.fold_in(key, 2), state.fit, held[1], lambda k, t: source.simulate(k, t, policy), **judged
-    )
-    report = dataclasses.replace(verdict[0], predictive=again)
-    return checks.conclude(report, verdict[1], domain, b.distrust)
 
 
 def _unknown(names: tuple[str, ...], fit: dict[str, Any]) -> tuple[str, ...]:

@@ -103,3 +103,8 @@ class Loop:
         return jax.random.fold_in(
             jax.random.PRNGKey(self.config.seed), round_ * len(purposes) + purposes.index(purpose)
         )
+
+
+def domain_or_prior(space: ParameterSpace, components: int, chart: str = "plain") -> Distribution | None:
+    """The prior as a distribution with room for `components` Gaussians; None for a task without parameters."""
+    return Distribution.prior(space, components, chart) if len(space) else None

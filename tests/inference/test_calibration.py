@@ -10,6 +10,7 @@ from scipy.stats import kstest
 
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.inference import calibration
+from bayessim_mjx.inference.temperature import tempered
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 
 pytestmark = [pytest.mark.slow, pytest.mark.ci]  # whole diagnoses and fits
@@ -114,14 +115,14 @@ def test_the_predictive_check_notices_replicates_that_lie_elsewhere():
 def test_a_temperature_widens_up_to_the_prior(chart):
     """probit: (q / p)^(1 / f^2) p has precision (P - 1) / f^2 + 1; plain: sd times f."""
     q = Distribution.from_unit(SPACE, jnp.zeros(1), jnp.full((1, 2), 0.4), 0.05 * jnp.eye(2)[None], 0.0, chart)
-    wide = calibration.tempered(q, 2.0)
+    wide = tempered(q, 2.0)
     if chart == "plain":
         np.testing.assert_allclose(wide.scales[0], 0.1 * np.eye(2), rtol=1e-5)
         return
     precision = (1 / 0.05**2 - 1) / 4 + 1
     np.testing.assert_allclose(wide.scales[0], precision**-0.5 * np.eye(2), rtol=1e-4)
     np.testing.assert_allclose(wide.means[0], 0.4 / 0.05**2 / 4 / precision, rtol=1e-4)
-    flat = calibration.tempered(q, 1e4)  # nothing is left but the prior
+    flat = tempered(q, 1e4)  # nothing is left but the prior
     np.testing.assert_allclose(flat.contraction(), [0.0, 0.0], atol=0.01)
 
 

@@ -51,9 +51,10 @@ def test_median_distance_and_unusable_rows():
 
 def test_names_of_models():
     parsed = {name: InferenceSettings(modelClass=name) for name in ("MDNN", "MDRFF", "MDRFF_Matern32", "MDRFF_RBF_4.0")}
-    assert [s.kernel for s in parsed.values()] == [None, "RBF", "Matern32", "RBF"]
-    assert [s.fixed_bandwidth for s in parsed.values()] == [None, None, None, 4.0]
-    assert InferenceSettings(modelClass="MDRFF_Matern52_median").bandwidth == "median"
+    assert [s.density[0] for s in parsed.values()] == ["MDNN", "MDRFF", "MDRFF", "MDRFF"]
+    validated = [(kernel, "validation") for kernel in ("RBF", "Matern32")]
+    assert [s.density[1] for s in parsed.values()] == [None, *validated, ("RBF", 4.0)]
+    assert InferenceSettings(modelClass="MDRFF_Matern52_median").density == ("MDRFF", ("Matern52", "median"))
     for name in ("MDRFF_RBF_0", "MDRFF_RBF_1e999", "MDRFF_Cosine", "MDRFF_RBF_1.2.3", "MDNN_RBF", None):
         with pytest.raises(ValueError, match="modelClass = .*(allowed are MDNN, MDRFF|no positive finite)"):
             InferenceSettings(modelClass=name)

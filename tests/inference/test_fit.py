@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from bayessim_mjx.inference import InferenceSettings, combine, condition, fit, infer, init, mdn
-from bayessim_mjx.inference.fit import _Data, _weigh
+from bayessim_mjx.inference.data import Data
+from bayessim_mjx.inference.ensemble import weigh
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 
 SPACE = ParameterSpace([Parameter("mass", 1.0, 0.5, 2.5), Parameter("length", 1.0, -2.0, 4.0)])
@@ -154,8 +155,8 @@ def test_each_member_has_the_sharpness_that_held_out_rows_ask_for():
     n = 20_000
     y = np.where(np.arange(n) % 2, 0.2, 0.6) * np.random.default_rng(0).normal(size=n)
     y, rows = jnp.asarray(y[:, None], jnp.float32), jnp.arange(n)
-    data = _Data(jnp.zeros((n, 1)), y, jnp.zeros(n), rows < 0, rows, jnp.ones(n), None, None)
-    found = jax.jit(lambda p: _weigh(p, data, settings))(params)
+    data = Data(jnp.zeros((n, 1)), y, jnp.zeros(n), rows < 0, rows, jnp.ones(n), None, None)
+    found = jax.jit(lambda p: weigh(p, data, settings))(params)
     order = np.argsort(found["sharpness"])
     np.testing.assert_allclose(np.asarray(found["sharpness"])[order], [0.35 / 0.6, 0.35 / 0.2], rtol=0.15)
     np.testing.assert_allclose(np.exp(found["share"]), 0.5, atol=0.12)

@@ -1,0 +1,169 @@
+"""Training of one member of the ensemble: where a first fit starts and in which basis, gradient steps, best weights."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from jax import Array
+from jax.flatten_util import ravel_pytree
+
+from bayessim_mjx.inference import densities, mdn
+from bayessim_mjx.inference.data import Data
+from bayessim_mjx.inference.linear_start import linear_start
+from bayessim_mjx.inference.settings import InferenceSettings
+
+CURVE = 40  # points of the loss curves, at least
+PACE = 0.5  # of steps in the trials of bases: at the full rate one was once judged by how it shook (damped pendulum)
+TRIED = 150  # gradient steps at least (and a fortieth) that bases are tried for, and before a training may end early
+MEMBERS = "members"  # axis of the ensemble
+
+
+def schedule_length(settings: InferenceSettings, capacity: int) -> tuple[int, int]:
+    """(points of the loss curve, gradient steps per point) for arrays of `capacity` rows."""
+    per_epoch = -(-capacity // settings.batch)
+    total = min(max(settings.epochs * per_epoch, settings.min_steps), settings.max_steps)
+    chunk = max(1, min(per_epoch, total // CURVE)) if per_epoch > 1 else max(1, total // (2 * CURVE))
+    return -(-total // chunk), chunk
+
+
+def objective(
+    params: Any,
+    rows: Array,
+    data: Data,
+    settings: InferenceSettings,
+    drop: densities.Drop | None = None,
+    x: Array | None = None,
+) -> Array:
+    """What training maximises, per row: log q(theta | x), less the log of what the proposal makes of it."""
+    x, y = data.x[rows] if x is None else x, data.y[rows]
+    heads = mdn.forward(params, x, y.shape[-1], settings, drop)
+    if data.proposals is None or data.origin is None:
+        return mdn.density(heads, y, settings)
+    own = data.origin[rows]
+    proposal = jax.tree.map(lambda leaf: leaf[own], data.proposals)
+    return mdn.density(heads, y, settings) - mdn.log_tilt(heads, proposal, settings)
+
+
+@dataclass(frozen=True)
+class _Member:
+    """What stays the same in all steps of a member's training.
+
+    Its weights are one vector [W]: a few kernels per step instead of some for every layer.
+    """
+
+    data: Data
+    settings: InferenceSettings
+    rate: Array  # of dropout
+    fixed: dict[str, Any]  # parameters that are not trained
+    unravel: Callable[[Array], dict[str, Any]]  # [W] -> those that are
+    optimiser: optax.GradientTransformation
+
+    def objective(self, flat: Array, basis: Array, rows: Array, drop: densities.Drop | None = None) -> Array:
+        params = {**self.unravel(flat), **self.fixed}
+        return objective(params, rows, self.data, self.settings, drop, self.data.x[basis, rows])
+
+    def loss(self, flat: Array, basis: Array, rows: Array, key: Array) -> Array:
+        drop = (key, self.rate) if self.settings.ensemble > 1 and self.settings.dropout > 0 else None
+        return -jnp.mean(self.objective(flat, basis, rows, drop))
+
+    def held_out(self, flat: Array, basis: Array) -> Array:
+        value, mask = self.objective(flat, basis, self.data.held), self.data.mask
+        return -jnp.sum(jnp.where(mask > 0, value, 0.0)) / jnp.sum(mask)
+
+    def step(self, basis: Array, pace: Array, carry: tuple, inputs: tuple[Array, Array]) -> tuple[tuple, Array]:
+        """One gradient step of (weights, optimiser's state, steps skipped) on (rows, key)."""
+        flat, opt_state, skipped = carry
+        value, gradient = jax.value_and_grad(self.loss)(flat, basis, *inputs)
+        usable = jnp.isfinite(optax.global_norm(gradient))
+        with jax.numpy_dtype_promotion("standard"):  # optax computes decay**count, a float to an int32
+            updates, new_opt = self.optimiser.update(gradient, opt_state, flat)
+        new = flat + pace * updates, new_opt
+        flat, opt_state = jax.tree.map(lambda a, b: jnp.where(usable, a, b), new, (flat, opt_state))
+        return (flat, opt_state, skipped + 1 - usable.astype(jnp.int32)), value
+
+    def batches(self, key: Array, chunk: int) -> tuple[Array, Array]:
+        """Rows [chunk, batch] and keys of as many steps: a fresh order of the training rows, walked through in turn."""
+        train, batch = self.data.train, min(self.settings.batch, self.data.x.shape[1])
+        order = jnp.argsort(jnp.where(train, jax.random.uniform(key, train.shape), jnp.inf))
+        count = jnp.maximum(jnp.sum(train.astype(jnp.int32)), 1)
+        place = jnp.arange(chunk * batch, dtype=jnp.int32).reshape(chunk, batch) % count
+        return order[place], jax.random.split(jax.random.fold_in(key, 1), chunk)
+
+
+def train(
+    key: Array, params: Any, rate: Array, data: Data, settings: InferenceSettings, fresh: Array
+) -> tuple[Any, Array, Array, Array, Array, Array]:
+    """One member: its best weights, their basis, where they were on the curve, steps taken and skipped, curves [2, P].
+
+    In a first training each member tries another basis for a while, then all start anew in the best of them. It ends
+    early if no member has beaten the best start, the linear-Gaussian posterior, in a fortieth of it.
+
+    Args:
+        key: consumed.
+        params: of this member.
+        rate: of dropout.
+        data: with summaries in each of the bases, x [M, N, D]. Mapped over MEMBERS.
+        fresh: whether this is the first fit.
+    """
+    (points, chunk), tried = schedule_length(settings, data.x.shape[1]), data.x.shape[0]
+    params = jax.vmap(lambda x: _start(params, data._replace(x=x), settings, fresh))(data.x)
+    member, starts = _member(params, rate, data, settings, points * chunk)
+    patience = max(points // 40, -(-TRIED // chunk))
+    trial = patience if tried > 1 else 0
+    keys = jax.random.split(key, trial + points)
+    values = jax.vmap(member.held_out)(starts, jnp.arange(tried, dtype=jnp.int32))
+
+    def begin(basis: Array) -> tuple[tuple, tuple]:
+        """What is trained, and the best so far: held-out loss, weights, place on the curve."""
+        flat, zero = starts[basis], jnp.asarray(0, jnp.int32)
+        return (flat, member.optimiser.init(flat), zero), (values[basis], flat, zero - 1)
+
+    def point(carry: tuple) -> tuple:
+        i, _, basis, inner, best, curves = carry
+        # the members' trials are over
+        basis = jnp.where(i == 0, jnp.argmin(jax.lax.all_gather(best[0], MEMBERS)[:tried]), basis)
+        inner, best = jax.tree.map(lambda a, b: jnp.where(i == 0, a, b), begin(basis), (inner, best))
+        step = partial(member.step, basis, jnp.where(i < 0, PACE, 1.0))
+        inner, losses = jax.lax.scan(step, inner, member.batches(keys[i + trial], chunk))
+        value = member.held_out(inner[0], basis)
+        better = value < best[0]
+        best = jax.tree.map(lambda a, b: jnp.where(better, a, b), (value, inner[0], i), best)
+        curves = curves.at[:, jnp.maximum(i, 0)].set(jnp.stack([jnp.mean(losses), value]))
+        beaten = jax.lax.pmin(best[0], MEMBERS) < jax.lax.pmin(values[basis], MEMBERS)
+        return i + 1, ~fresh | beaten | (i + 1 < patience), basis, inner, best, curves
+
+    basis = jax.lax.axis_index(MEMBERS) % tried
+    first = jnp.where(fresh, -trial, 0)
+    carry = (first, jnp.asarray(True), basis, *begin(basis), jnp.zeros((2, points)))
+    done, _, basis, inner, best, curves = jax.lax.while_loop(lambda c: c[1] & (c[0] < points), point, carry)
+    curves = curves[:, jnp.minimum(jnp.arange(points, dtype=jnp.int32), done - 1)]
+    return {**member.unravel(best[1]), **member.fixed}, basis, best[2], done * chunk, inner[2], curves
+
+
+def _member(params: Any, rate: Array, data: Data, settings: InferenceSettings, steps: int) -> tuple[_Member, Array]:
+    """The parts of a training of so many steps, and its weights [M, W] in each basis; params have leaves [M, ...]."""
+    optimiser = optax.chain(
+        optax.clip_by_global_norm(settings.grad_clip),
+        optax.adamw(optax.cosine_decay_schedule(settings.lr, steps), weight_decay=settings.weight_decay),
+    )
+    fixed = {name: params[name][0] for name in mdn.fixed(settings)}
+    trained = {name: leaf for name, leaf in params.items() if name not in fixed}
+    unravel = ravel_pytree(jax.tree.map(lambda leaf: leaf[0], trained))[1]
+    starts = jax.vmap(lambda tree: ravel_pytree(tree)[0])(trained)
+    return _Member(data, settings, rate, fixed, unravel, optimiser), starts
+
+
+def _start(params: Any, data: Data, settings: InferenceSettings, fresh: Array) -> Any:
+    """The weights that training starts from: of a first fit, the linear-Gaussian posterior."""
+    held = jnp.zeros_like(data.train).at[data.held].set(data.mask > 0)
+    x, prepare, new = mdn.embedded(params, data.x, settings), densities.density_of(settings).prepare, params
+    if prepare is not None:
+        new = prepare(new, x, data.y, data.train, held, settings)
+    new = linear_start(new, x, data.y, data.train.astype(jnp.float32), settings)
+    return jax.tree.map(lambda a, b: jnp.where(fresh, a, b), new, params)

@@ -1,0 +1,56 @@
+"""Who acts while trajectories are collected."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from bayessim_mjx.rl import Policy
+
+RANDOM_SHARE = 0.1  # policy_rl_randomized: share of the steps with a uniformly random action (BayesSimIG)
+POLICY_DEPENDENT = ("policy_rl", "policy_rl_randomized")
+
+
+def policy_function(name: str, policy: Policy, action_size: int, memory: int = 0) -> Callable[[Array, dict], Array]:
+    """The collection policy `name` as a function (key, obs of one world) -> action [action_size].
+
+    memory: numbers at the end of an action that are the policy's memory (`rl.recurrent`), 0 where it is not asked.
+    random is symmetric, U[-1, 1]; rl_randomized flips its coin for every world and step by itself. The policy's arrays
+    are leaves of the function, so a new policy does not recompile.
+    """
+    if name == "policy_rl":
+        return jax.tree_util.Partial(_act, policy)
+    if name == "policy_rl_randomized":
+        return jax.tree_util.Partial(_randomized(memory), policy)
+    return {"policy_random": _random, "policy_ones": _ones}[name](action_size - memory, memory)
+
+
+def _act(policy: Policy, key: Array, obs: dict) -> Array:
+    return dataclasses.replace(policy, deterministic=False).act(key, obs)
+
+
+@functools.lru_cache  # the same function again, which does not recompile
+def _randomized(memory: int) -> Callable[[Policy, Array, dict], Array]:
+    def act(policy: Policy, key: Array, obs: dict) -> Array:
+        k_coin, k_random, k_policy = jax.random.split(key, 3)
+        action = _act(policy, k_policy, obs)
+        acted, remembered = jnp.split(action, [action.shape[-1] - memory])
+        other = jax.random.uniform(k_random, acted.shape, minval=-1.0, maxval=1.0)
+        return jnp.concatenate([jnp.where(jax.random.bernoulli(k_coin, RANDOM_SHARE), other, acted), remembered])
+
+    return act
+
+
+@functools.lru_cache
+def _random(actions: int, memory: int) -> Callable[[Array, dict], Array]:
+    return lambda key, obs: jnp.pad(jax.random.uniform(key, (actions,), minval=-1.0, maxval=1.0), (0, memory))
+
+
+@functools.lru_cache
+def _ones(actions: int, memory: int) -> Callable[[Array, dict], Array]:
+    return lambda key, obs: jnp.pad(jnp.ones(actions), (0, memory))

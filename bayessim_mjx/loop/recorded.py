@@ -1,0 +1,165 @@
+"""Segments of recorded logs as real trajectories, and their replay as simulated ones."""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from bayessim_mjx.config import Config
+from bayessim_mjx.errors import UserError
+from bayessim_mjx.inference.summaries import Summarizer
+from bayessim_mjx.logs import Channels, Log, noise, read_logs, segments
+from bayessim_mjx.loop.seen import Seen, tiled
+from bayessim_mjx.parameters import ParameterSpace
+from bayessim_mjx.physics import controllers
+from bayessim_mjx.physics.controllers import Law
+from bayessim_mjx.rl import Policy
+from bayessim_mjx.rollout import Trajectory, recording, remembered, replay
+
+ESTIMATED_SPEED = 3.0  # error of a velocity estimated from positions, in its noise part: it lags at transients
+REPLAYED = 512  # segments replayed at once at nominal parameters
+
+
+@dataclasses.dataclass(frozen=True, eq=False)  # compared by identity: static under jit
+class Recorded:
+    """Segments of recorded logs. In simulation the logged commands are replayed from the logged state, as recorded.
+
+    Features are of the *difference* to the replay with nominal parameters, in which the effect of theta is not dwarfed
+    by the motion itself, and of the first state.
+    """
+
+    env: Any
+    space: ParameterSpace
+    data: dict[str, np.ndarray]  # of `logs.segments`, M of them; expected_qpos, expected_qvel: of the nominal replay
+    law: Law | None  # the controllers that the logs declare, leaves [M, nu]; None: commands go to the actuators
+    order: np.ndarray  # [M] the order in which segments are used
+    noise: dict[str, np.ndarray]  # standard deviation of the measurement noise: qpos [nq], qvel [nv]
+    with_qvel: (
+        bool  # velocities were measured; estimated ones are no features, simulation has nothing like their errors
+    )
+    summarizer: Summarizer
+    truth: None = None
+    policy_dependent: bool = False  # the logged commands act, whatever bayessim.collectPolicy says
+
+    @property
+    def supply(self) -> int:
+        return len(self.order)
+
+    @property
+    def channels(self) -> Seen:
+        """What the summarizer sees: deviations from the nominal replay, and commands; then come the first states."""
+        named = Channels.of(self.env.mj_model)
+        speeds = [f"{name} speed" for name in named.qvel]
+        states = [f"deviation of {name}" for name in (*named.qpos, *(speeds if self.with_qvel else ()))]
+        first = tuple(f"first {name}" for name in (*named.qpos, *speeds))
+        return Seen(self.data["command"].shape[1], tuple(states), named.actuators, first)
+
+    def features(self, index: Array | np.ndarray, qpos: Array, qvel: Array) -> Array:
+        """[N, D] of measured motion qpos [N, T+1, nq], qvel [N, T+1, nv] under the commands of the segments index [N].
+
+        Both are deviations from the nominal replay of the segment, from its logged start.
+        """
+        expected_qpos, expected_qvel, command = self._of("expected_qpos", "expected_qvel", "command", index=index)
+        states = qpos - expected_qpos
+        if self.with_qvel:
+            states = jnp.concatenate([states, qvel - expected_qvel], axis=-1)
+        summaries = jax.vmap(self.summarizer)(states, command)
+        return jnp.concatenate([summaries, qpos[:, 0], qvel[:, 0]], axis=-1)
+
+    def simulate(self, key: Array, thetas: Array, policy: Policy) -> Array:
+        """Replay randomly drawn segments at `thetas` [N, d], with measurement noise; features [N, D].
+
+        The logged first state is a measurement too: the replay starts where the system may really have been.
+        """
+        del policy  # the logged commands act
+        k_segment, *keys = jax.random.split(key, 5)
+        index = jnp.asarray(self.order)[jax.random.randint(k_segment, (thetas.shape[0],), 0, len(self.order))]
+        qpos0, qvel0 = self._of("qpos0", "qvel0", index=index)
+        speed_error = self.noise["qvel"] * (1.0 if self.with_qvel else ESTIMATED_SPEED)
+        start = qpos0 + self.noise["qpos"] * jax.random.normal(keys[0], qpos0.shape)
+        speed = qvel0 + speed_error * jax.random.normal(keys[1], qvel0.shape)
+        motion = self._replayed(index, start, speed, thetas)
+        qpos = motion["qpos"] + self.noise["qpos"] * jax.random.normal(keys[2], motion["qpos"].shape)
+        qvel = motion["qvel"] + self.noise["qvel"] * jax.random.normal(keys[3], motion["qvel"].shape)
+        return self.features(index, qpos.at[:, 0].set(qpos0), qvel.at[:, 0].set(qvel0))
+
+    def real(self, key: Array, first: int, count: int, policy: Policy) -> tuple[Array, Trajectory]:
+        """The next `count` segments of the logs and their features."""
+        del key, policy
+        index = self.order[(first + np.arange(count)) % len(self.order)]
+        qpos, qvel, command = self._of("qpos", "qvel", "command", index=index)
+        zeros = jnp.zeros(command.shape[:2])
+        trajectory = Trajectory(
+            observation=jnp.concatenate([qpos, qvel], axis=-1),
+            action=command,
+            reward=zeros,
+            terminated=zeros,
+            truncated=zeros,
+            valid=zeros + 1.0,
+            theta=jnp.zeros((count, len(self.space))),
+            qpos=qpos,
+            qvel=qvel,
+            command=command,
+        )
+        return self.features(index, qpos, qvel), trajectory
+
+    def repeated(self, first: int, real: Trajectory, thetas: Array) -> dict[str, Array]:
+        """The segment asked for as number `first` replayed at thetas [n, d]: its motion, see `rollout.replay`."""
+        del real
+        index = jnp.full(len(thetas), self.order[first % len(self.order)])
+        qpos0, qvel0 = self._of("qpos0", "qvel0", index=index)
+        return self._replayed(index, qpos0, qvel0, thetas)
+
+    def _of(self, *names: str, index: Array | np.ndarray) -> list[Array]:
+        return [jnp.asarray(self.data[name])[index] for name in names]
+
+    def _replayed(self, index: Array, qpos0: Array, qvel0: Array, thetas: Array) -> dict[str, Array]:
+        """The segments index [N] from measured states, as they were recorded: past commands, controllers."""
+        physics = self.env.physics
+        near = recording(physics, *self._of("around_qpos", "around_qvel", "around_command", index=index))
+        law = None if self.law is None else jax.tree.map(lambda x: x[index], self.law)
+        (command,) = self._of("command", index=index)
+        return replay(physics, qpos0, qvel0, command, thetas, near, law)
+
+
+def recorded(config: Config, env: Any, summarizer: Summarizer) -> Recorded:
+    if not hasattr(env, "physics"):
+        raise UserError(f"real.logs needs a task with its own MuJoCo model; {env.name!r} is not one")
+    logs: list[Log] = read_logs(config.real.logs, env.mj_model, config.real.map)
+    length = config.real.segment_length or config.bayessim.trainTrajLen
+    stride = config.real.segment_stride or length
+    data = segments(logs, length, dt=env.dt, stride=stride, rows=remembered(env.physics))
+    count = len(data["qpos0"])
+    needed = config.bayessim.realTrajs
+    if count < needed:
+        raise UserError(
+            f"real.logs: the logs hold {count} segments of {length} steps ({length * env.dt:.3g} s), "
+            f"bayessim.realTrajs={needed} are asked for; shorten bayessim.trainTrajLen or record more"
+        )
+    if config.bayessim.collectPolicy != "policy_replay":
+        policy = config.bayessim.collectPolicy
+        warnings.warn(f"real.logs: the logged commands act, bayessim.collectPolicy={policy} does not", stacklevel=2)
+    order = np.random.default_rng(config.seed).permutation(count)
+    measured = all(log.has_qvel for log in logs)
+    law = controllers.of_logs(logs, env.mj_model)
+    law = None if law is None else jax.tree.map(lambda x: x[data["run"]], law)
+    source = Recorded(env, env.space, data, law, order, noise(logs), measured, summarizer)
+    return dataclasses.replace(source, data=data | _expected(source))
+
+
+def _expected(source: Recorded) -> dict[str, np.ndarray]:
+    """What the logs would show at nominal parameters: expected_qpos [M, T+1, nq], expected_qvel [M, T+1, nv]."""
+    count = len(source.order)
+    size = min(count, REPLAYED)
+    thetas, found = tiled(jnp.asarray(source.space.nominal, jnp.float32), size), []
+    for first in range(0, count, size):
+        index = jnp.minimum(first + jnp.arange(size), count - 1)
+        qpos0, qvel0 = source._of("qpos0", "qvel0", index=index)
+        found.append(jax.tree.map(np.asarray, source._replayed(index, qpos0, qvel0, thetas)))
+    return {f"expected_{name}": np.concatenate([part[name] for part in found])[:count] for name in found[0]}

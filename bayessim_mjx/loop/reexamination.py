@@ -1,0 +1,45 @@
+"""The checks of a finished round done again, as the command `calibrate` asks for."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+
+from bayessim_mjx.inference import checks
+from bayessim_mjx.loop.simulations import at, proposal_of, simulated
+from bayessim_mjx.loop.state import Loop, LoopState
+from bayessim_mjx.rl import Policy
+
+REFERENCE = 10000  # simulations that `reexamine` compares real trajectories with, at most
+
+
+def reexamine(loop: Loop, state: LoopState, policy: Policy, pairs: int, seed: int = 0) -> checks.Checks:
+    """The checks of a round done again, on `pairs` fresh simulations and with a posterior predictive check.
+
+    `state` is that after the round and `policy` the one that it was evaluated with, as in its checkpoint. The posterior
+    is tested as the round used it: with its temperature, on parameters from what the round was simulated from.
+    """
+    b, source, done = loop.settings, loop.source, int(state.round)
+    domain = state.domain
+    assert source is not None and domain is not None
+    key = jax.random.fold_in(jax.random.fold_in(jax.random.PRNGKey(seed), 0xCA11), done)  # seen by no fit
+    known, last = min(b.trainTrajs, REFERENCE), max(1, loop.capacity // b.trainTrajs)
+    used = None if state.proposals is None else at(state.proposals, (done - 1) % last)
+    state, temperature = dataclasses.replace(state, proposal=used), float(state.temperature)
+    thetas, x = simulated(
+        source, jax.random.fold_in(key, 1), policy, proposal_of(loop, state), b.proposal, known + pairs
+    )
+    held = thetas[known:], x[known:]
+    rows = slice((done - 1) * b.realTrajs if source.policy_dependent else 0, done * b.realTrajs)
+    judged: dict[str, Any] = {"temperature": temperature, "tilt": used if b.proposal == "apt" else None}
+    verdict = checks.examine(
+        key, state.fit, (thetas[:known], x[:known], known), held, state.real_features, rows,
+        names=loop.feature_names, **judged,
+    )  # fmt: skip
+    again = checks.replicated(
+        jax.random.fold_in(key, 2), state.fit, held[1], lambda k, t: source.simulate(k, t, policy), **judged
+    )
+    report = dataclasses.replace(verdict[0], predictive=again)
+    return checks.conclude(report, verdict[1], domain, b.distrust)

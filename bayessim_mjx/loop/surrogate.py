@@ -1,0 +1,98 @@
+"""The simulator at hidden parameters, standing in for hardware."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from bayessim_mjx.env import Env
+from bayessim_mjx.inference.summaries import Summarizer
+from bayessim_mjx.logs import Channels
+from bayessim_mjx.loop.collection import POLICY_DEPENDENT, policy_function
+from bayessim_mjx.loop.seen import Seen, named, summarise, tiled
+from bayessim_mjx.parameters import ParameterSpace
+from bayessim_mjx.rl import Policy
+from bayessim_mjx.rollout import Trajectory, replay, rollout
+
+
+@dataclasses.dataclass(frozen=True, eq=False)  # compared by identity: static under jit
+class Surrogate:
+    """The simulator at hidden parameters, standing in for hardware (`env.realParams`)."""
+
+    env: Env
+    space: ParameterSpace
+    weights: np.ndarray  # [K]
+    means: np.ndarray  # [K, d]
+    sds: np.ndarray  # [K, d]
+    policy_name: str
+    length: int
+    noise: float  # standard deviation of the noise on observations, in simulation and in reality
+    summarizer: Summarizer
+
+    @property
+    def truth(self) -> np.ndarray:
+        """Mean of the heaviest component [d]: the line in the plots and the point that is scored."""
+        return self.means[int(np.argmax(self.weights))]
+
+    @property
+    def supply(self) -> int | None:
+        """How many real trajectories there are; None: as many as asked for."""
+        return None
+
+    @property
+    def policy_dependent(self) -> bool:
+        """Whether the trajectories, simulated and real, are made by the policy of their round."""
+        return self.policy_name in POLICY_DEPENDENT
+
+    @property
+    def memory(self) -> int:
+        """Numbers of memory at the end of the policy's actions (`rl.recurrent`)."""
+        return getattr(self.env, "memory_size", 0)
+
+    @property
+    def channels(self) -> Seen:
+        """What the summarizer sees: observations and actions."""
+        (size,) = self.env.observation_size["policy"]
+        states = named(getattr(self.env, "observation_names", ()), size, "observation")
+        model = getattr(self.env, "mj_model", None)
+        commands = () if model is None else Channels.of(model).actuators
+        return Seen(self.length, states, named(commands, self.env.action_size - self.memory, "action"))
+
+    def sample(self, key: Array, count: int) -> Array:
+        """theta [count, d] of the surrogate, inside the box."""
+        k_component, k_noise = jax.random.split(key)
+        component = jax.random.choice(k_component, len(self.weights), (count,), p=jnp.asarray(self.weights))
+        noise_ = jax.random.normal(k_noise, (count, len(self.space)))
+        theta = jnp.asarray(self.means)[component] + jnp.asarray(self.sds)[component] * noise_
+        return jnp.clip(theta, self.space.low, self.space.high).astype(jnp.float32)
+
+    def simulate(self, key: Array, thetas: Array, policy: Policy) -> Array:
+        """Features [N, D] of simulated trajectories at `thetas`."""
+        return summarise(self.summarizer, self._observe(key, thetas, policy))
+
+    def _observe(self, key: Array, thetas: Array, policy: Policy) -> Trajectory:
+        k_roll, k_noise = jax.random.split(key)
+        actions = self.env.action_size
+        act = policy_function(self.policy_name, policy, actions, self.memory)
+        trajectory = rollout(self.env, act, k_roll, thetas, self.length)
+        seen, action = trajectory.observation, trajectory.action[..., : actions - self.memory]
+        noisy = seen + self.noise * jax.random.normal(k_noise, seen.shape)
+        return dataclasses.replace(trajectory, observation=noisy, action=action)
+
+    def real(self, key: Array, first: int, count: int, policy: Policy) -> tuple[Array, Trajectory]:
+        """`count` real trajectories and their features [count, D]; `first` of them were asked for before."""
+        del first
+        k_theta, k_roll = jax.random.split(key)
+        trajectory = self._observe(k_roll, self.sample(k_theta, count), policy)
+        return summarise(self.summarizer, trajectory), trajectory
+
+    def repeated(self, first: int, real: Trajectory, thetas: Array) -> dict[str, Array]:
+        """The first of the trajectories `real` replayed at thetas [n, d]: its motion, see `rollout.replay`."""
+        del first
+        first_rows = (real.qpos[:, 0], real.qvel[:, 0], real.command)
+        qpos0, qvel0, command = (tiled(x[0], len(thetas)) for x in first_rows)
+        return replay(self.env.physics, qpos0, qvel0, command, thetas)  # type: ignore[attr-defined]
