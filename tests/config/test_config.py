@@ -12,7 +12,6 @@ import pytest
 
 from bayessim_mjx import config, memory, registry
 from bayessim_mjx.config import (
-    BayesSimConfig,
     Config,
     EnvConfig,
     PPOConfig,
@@ -26,7 +25,6 @@ from bayessim_mjx.config import (
     to_yaml,
 )  # fmt: skip
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.inference import InferenceSettings
 from bayessim_mjx.parameters import ParameterSpace
 from bayessim_mjx.physics import nuisance
 
@@ -135,14 +133,6 @@ def test_memory_is_what_the_system_and_its_container_have(monkeypatch, tmp_path:
         (tmp_path / "memory.max").write_text(content)
         monkeypatch.setattr(memory, "GROUP", tmp_path / "memory.max")
         assert memory.installed() == expected
-
-
-def test_inference_has_one_set_of_defaults() -> None:
-    """What `bayessim:` leaves out is what the inference room takes by itself."""
-    own, section = InferenceSettings(), BayesSimConfig()
-    shared = [f.name for f in dataclasses.fields(InferenceSettings) if hasattr(section, f.name)]
-    assert {"lr", "fullCovariance", "components", "ensemble"} <= set(shared)
-    assert {name: getattr(own, name) for name in shared} == {name: getattr(section, name) for name in shared}
 
 
 @pytest.mark.parametrize("stem", CFG)
