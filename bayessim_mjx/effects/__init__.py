@@ -4,6 +4,7 @@ A user's own effect is a frozen dataclass like those here: installed under the e
 `bayessim_mjx.effects`, or in a file, called `path.py:MyEffect`.
 """
 
+import contextlib
 import dataclasses
 import difflib
 import functools
@@ -24,9 +25,10 @@ from bayessim_mjx import trust
 from bayessim_mjx.effects.effect import Effect, Quantity
 from bayessim_mjx.errors import UserError
 
-__all__ = ["Effect", "load", "make", "names", "recorded", "spec_of"]
+__all__ = ["Effect", "known", "load", "make", "names", "recorded", "spec_of"]
 
 ENTRY_POINTS = "bayessim_mjx.effects"
+_brought: dict[str, type[Effect]] = {}  # by name: the newest of those that files and packages brought
 KINDS = ("actuator", "joint", "body", "geom", "world")
 
 
@@ -43,7 +45,7 @@ def _library() -> tuple[str, ...]:
 
 def _own(name: Any) -> type[Effect] | None:
     """The class CamelCase of the file of that name, if it is an effect."""
-    if not isinstance(name, str) or not (Path(__file__).parent / f"{name}.py").is_file():
+    if not isinstance(name, str) or not name.isidentifier() or not (Path(__file__).parent / f"{name}.py").is_file():
         return None
     module = importlib.import_module(f"{__name__}.{name}")
     kind = getattr(module, "".join(part.capitalize() for part in name.split("_")), None)
@@ -95,6 +97,15 @@ def recorded(spec: str) -> type[Effect]:
     raise UserError(f"no effect {spec!r}; {hint}there are: {', '.join(names())}; or a file: path.py:MyEffect")
 
 
+def known(name: str) -> type[Effect] | None:
+    """The effect of that name: the library's, one that was loaded from a file, or an installed one; None: no such."""
+    found = _own(name) or _brought.get(name)
+    if found is None and name in _installed():
+        with contextlib.suppress(UserError):
+            return recorded(name)
+    return found
+
+
 def _from_file(path: Path, title: str) -> Any:
     if not path.is_file():
         raise UserError(f"effect {path}:{title}: no file {path} (from {Path.cwd()})")
@@ -141,6 +152,11 @@ def _checked(kind: Any, spec: str, name: str | None = None) -> type[Effect]:
         raise UserError(f"effect {spec}: name = {kind.name!r}: expected one word of letters, digits and _")
     if kind.kind not in KINDS:
         raise UserError(f"effect {spec}: kind = {kind.kind!r}: allowed are {', '.join(KINDS)}")
+    for attribute in ("noun", "lacks", "separates"):
+        if not isinstance(getattr(kind, attribute), str):
+            raise UserError(f"effect {spec}: {attribute} = {getattr(kind, attribute)!r}: expected a text")
+    if kind.witness is not None and not _is_pair_of_texts(kind.witness):
+        raise UserError(f"effect {spec}: witness = {kind.witness!r}: expected (stream of a log, what to record)")
     if not all(isinstance(q, Quantity) for q in kind.quantities):
         raise UserError(f"effect {spec}: quantities = {kind.quantities!r}: expected a tuple of effects.effect.Quantity")
     if "__dataclass_params__" not in vars(kind) or not kind.__dataclass_params__.frozen:  # type: ignore[attr-defined]
@@ -149,7 +165,12 @@ def _checked(kind: Any, spec: str, name: str | None = None) -> type[Effect]:
         raise UserError(f"effect {spec}: the class calls itself {kind.name!r}; name the entry point so")
     if _own(kind.name) is not None or (name is None and kind.name in _installed()):
         raise UserError(f"effect {spec}: there is an effect {kind.name!r} already; give the class another name")
+    _brought[kind.name] = kind
     return kind
+
+
+def _is_pair_of_texts(value: Any) -> bool:
+    return isinstance(value, tuple) and len(value) == 2 and all(isinstance(text, str) for text in value)
 
 
 def spec_of(effect: Effect) -> str:

@@ -22,6 +22,13 @@ class ActuatorBias(Effect):
 
     name: ClassVar[str] = "actuator_bias"
     kind: ClassVar[str] = "actuator"
+    noun: ClassVar[str] = "effort bias"
+    lacks: ClassVar[str] = "an effort bias"
+    separates: ClassVar[str] = "two mount orientations, or the drive switched off"
+    witness: ClassVar[tuple[str, str] | None] = (
+        "effort",
+        "the drive's measured effort or current (`effort:<actuator>`)",
+    )
     quantities: ClassVar[tuple[Quantity, ...]] = (
         Quantity("bias", 0.0, -1.0, 1.0, unit="N m", per="force", reach=(-0.5, 0.5)),
     )

@@ -32,6 +32,10 @@ class ActuatorDeadband(Effect):
     high: float = 0.2
     name: ClassVar[str] = "actuator_deadband"
     kind: ClassVar[str] = "actuator"
+    noun: ClassVar[str] = "command deadband"
+    lacks: ClassVar[str] = "a command deadband"
+    separates: ClassVar[str] = "slow ramps and holds with the drive's measured effort in the log"
+    witness: ClassVar[tuple[str, str] | None] = ("effort", "the drive's measured effort (`effort:<actuator>`)")
     quantities: ClassVar[tuple[Quantity, ...]] = (
         Quantity("half_width", 0.0, 0.0, 0.2, unit="ctrl", per="command", reach=(0.0, 0.3), grid=(0.01, 0.05, 0.2)),
     )

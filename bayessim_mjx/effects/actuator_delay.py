@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from bayessim_mjx.effects.effect import Effect, Quantity
+from bayessim_mjx.effects.support.quantity import delay
 from bayessim_mjx.effects.support.site import Site
 
 if TYPE_CHECKING:
@@ -34,20 +35,14 @@ class ActuatorDelay(Effect):
     high: float = 0.1
     name: ClassVar[str] = "actuator_delay"
     kind: ClassVar[str] = "actuator"
-    quantities: ClassVar[tuple[Quantity, ...]] = (
-        Quantity(
-            "delay",
-            0.0,
-            0.0,
-            0.1,
-            unit="s",
-            per="period",
-            reach=(0.0, 3.0),
-            grid=(0.05, 0.2, 0.5),
-            at_least=True,
-            remembered=True,
-        ),
+    noun: ClassVar[str] = "command delay"
+    lacks: ClassVar[str] = "a command delay"
+    separates: ClassVar[str] = "a wide-band chirp with the drive's measured effort in the log; the onset time of a step"
+    witness: ClassVar[tuple[str, str] | None] = (
+        "effort",
+        "the drive's measured effort with its own time stamps (`effort:<actuator>`)",
     )
+    quantities: ClassVar[tuple[Quantity, ...]] = (delay(0.1, grid=(0.05, 0.2, 0.5)),)
 
     def init(self, at: Site) -> Any:
         """{"history": `[lag, nu]` commands of past sub-steps, newest last; "fresh"}."""

@@ -37,6 +37,15 @@ class ActuatorGain(Effect):
 
     name: ClassVar[str] = "actuator_gain"
     kind: ClassVar[str] = "actuator"
+    noun: ClassVar[str] = "wrong actuator gain"
+    lacks: ClassVar[str] = "the true actuator gain"
+    separates: ClassVar[str] = (
+        "a known added mass, or a force gauge: without a force reference only ratios to inertia show"
+    )
+    witness: ClassVar[tuple[str, str] | None] = (
+        "effort",
+        "the drive's measured effort or current (`effort:<actuator>`)",
+    )
     quantities: ClassVar[tuple[Quantity, ...]] = (Quantity("gain", 1.0, 0.5, 1.5, grid=(0.1, 0.3, 0.6)),)
 
     def on_actuator(

@@ -50,6 +50,10 @@ class ActuatorLag(Effect):
     high: float = 0.2
     name: ClassVar[str] = "actuator_lag"
     kind: ClassVar[str] = "actuator"
+    noun: ClassVar[str] = "actuator lag"
+    lacks: ClassVar[str] = "an actuator lag"
+    separates: ClassVar[str] = "steps and a chirp: a lag is the slope after a step, a delay its dead time"
+    witness: ClassVar[tuple[str, str] | None] = ("effort", "the drive's measured effort (`effort:<actuator>`)")
     quantities: ClassVar[tuple[Quantity, ...]] = (
         Quantity("time_constant", 0.0, 0.0, 0.2, unit="s", grid=(0.02, 0.1, 0.3)),
     )

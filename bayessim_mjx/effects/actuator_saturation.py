@@ -36,6 +36,13 @@ class ActuatorSaturation(Effect):
     high: float = 10.0
     name: ClassVar[str] = "actuator_saturation"
     kind: ClassVar[str] = "actuator"
+    noun: ClassVar[str] = "effort saturation"
+    lacks: ClassVar[str] = "an effort limit"
+    separates: ClassVar[str] = "the same motion at several amplitudes, up to the limit"
+    witness: ClassVar[tuple[str, str] | None] = (
+        "effort",
+        "the drive's measured effort or current (`effort:<actuator>`)",
+    )
     quantities: ClassVar[tuple[Quantity, ...]] = (
         Quantity(
             "inverse_limit",

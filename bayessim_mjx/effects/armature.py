@@ -29,6 +29,11 @@ class Armature(Effect):
     high: float = 1.0
     name: ClassVar[str] = "armature"
     kind: ClassVar[str] = "joint"
+    noun: ClassVar[str] = "added rotor inertia"
+    lacks: ClassVar[str] = "rotor inertia"
+    separates: ClassVar[str] = (
+        "fast chirps in two poses of the other joints, which change the link's inertia but not the rotor's"
+    )
     quantities: ClassVar[tuple[Quantity, ...]] = (
         Quantity("inertia", 0.0, 0.0, 1.0, unit="kg m^2", per="inertia", reach=(0.0, 1.5)),
     )

@@ -24,6 +24,8 @@ class AsymmetricFriction(Effect):
 
     name: ClassVar[str] = "asymmetric_friction"
     kind: ClassVar[str] = "joint"
+    noun: ClassVar[str] = "direction-dependent friction"
+    separates: ClassVar[str] = "symmetric strokes both ways, in two mount orientations"
     contains: ClassVar[tuple[str, ...]] = ("coulomb_friction", "viscous_friction")
     quantities: ClassVar[tuple[Quantity, ...]] = (
         Quantity("level_forward", 0.0, 0.0, 1.0, unit="N m", per="force", reach=(0.0, 1.0)),

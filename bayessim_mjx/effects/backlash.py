@@ -32,6 +32,9 @@ class Backlash(Effect):
 
     name: ClassVar[str] = "backlash"
     kind: ClassVar[str] = "joint"
+    noun: ClassVar[str] = "backlash"
+    separates: ClassVar[str] = "slow triangles with and without gravity's pre-load, a link-side encoder"
+    witness: ClassVar[tuple[str, str] | None] = ("link", "an encoder on the link side of the gearbox (`link:<joint>`)")
     quantities: ClassVar[tuple[Quantity, ...]] = (
         Quantity("gap", 0.0, 0.0, 0.05, unit="rad", per="travel", reach=(0.0, 0.1), grid=(0.03, 0.1, 0.4)),
     )

@@ -36,6 +36,10 @@ class BaseFlexibility(Effect):
     where: str | tuple[str, ...] = "world"
     name: ClassVar[str] = "base_flexibility"
     kind: ClassVar[str] = "world"
+    noun: ClassVar[str] = "flexible mount"
+    lacks: ClassVar[str] = "a flexible mount"
+    separates: ClassVar[str] = "one joint moved and the resting ones (or an IMU on the base) watched; the base clamped"
+    witness: ClassVar[tuple[str, str] | None] = ("imu", "an IMU on the base (`imu:...`)")
     quantities: ClassVar[tuple[Quantity, ...]] = (
         Quantity(
             "compliance", 0.0, 0.0, 0.01, unit="rad/(N m)", per="1/moment", reach=(0.0, 0.6), grid=(0.003, 0.03, 0.3)

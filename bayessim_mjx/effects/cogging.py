@@ -32,6 +32,9 @@ class Cogging(Effect):
 
     name: ClassVar[str] = "cogging"
     kind: ClassVar[str] = "actuator"
+    noun: ClassVar[str] = "cogging"
+    separates: ClassVar[str] = "constant slow speeds at several values"
+    witness: ClassVar[tuple[str, str] | None] = ("current", "motor current (`current:<actuator>`)")
     quantities: ClassVar[tuple[Quantity, ...]] = (
         Quantity("sine", 0.0, -1.0, 1.0, unit="N m", per="force", reach=(-1.0, 1.0), grid=(0.03,)),
         Quantity("cosine", 0.0, -1.0, 1.0, unit="N m", per="force", reach=(-1.0, 1.0), grid=(0.03,)),

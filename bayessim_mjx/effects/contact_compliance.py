@@ -29,6 +29,8 @@ class ContactCompliance(Effect):
 
     name: ClassVar[str] = "contact_compliance"
     kind: ClassVar[str] = "geom"
+    noun: ClassVar[str] = "contact compliance"
+    separates: ClassVar[str] = "drops from several heights"
     quantities: ClassVar[tuple[Quantity, ...]] = (Quantity("softness", 0.0, -2.0, 2.0, grid=(0.1, 0.3, 0.7)),)
 
     def bind(self, mj_model: mujoco.MjModel, timestep: float, substeps: int) -> Site:

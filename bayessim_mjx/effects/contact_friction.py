@@ -26,6 +26,9 @@ class ContactFriction(Effect):
 
     name: ClassVar[str] = "contact_friction"
     kind: ClassVar[str] = "geom"
+    noun: ClassVar[str] = "changed contact friction"
+    lacks: ClassVar[str] = "the true contact friction"
+    separates: ClassVar[str] = "sliding at two normal loads"
     quantities: ClassVar[tuple[Quantity, ...]] = (Quantity("scale", 1.0, 0.2, 3.0, grid=(0.1, 0.3, 0.7)),)
 
     def bind(self, mj_model: mujoco.MjModel, timestep: float, substeps: int) -> Site:

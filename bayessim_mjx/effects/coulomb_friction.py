@@ -30,6 +30,9 @@ class CoulombFriction(Effect):
     high: float = 1.0
     name: ClassVar[str] = "coulomb_friction"
     kind: ClassVar[str] = "joint"
+    noun: ClassVar[str] = "Coulomb friction"
+    separates: ClassVar[str] = "slow triangles at three speeds and with two payloads"
+    witness: ClassVar[tuple[str, str] | None] = ("temperature", "temperature of motor or gearbox (`temperature`)")
     quantities: ClassVar[tuple[Quantity, ...]] = (
         Quantity("level", 0.0, 0.0, 1.0, unit="N m", per="force", reach=(0.0, 1.0)),
     )

@@ -48,6 +48,11 @@ class Effect(abc.ABC):
     quantities: ClassVar[tuple[Quantity, ...]]
     contains: ClassVar[tuple[str, ...]] = ()  # effects that are special cases of this one
     joint: ClassVar[bool] = False  # its amplitudes are searched together: one alone may not act at all
+    # for people; where these are empty, `support.words` says something by name and docstring
+    noun: ClassVar[str] = ""  # what it is called: "command delay"
+    lacks: ClassVar[str] = ""  # after "the simulator lacks", where that is not the noun: "a command delay"
+    separates: ClassVar[str] = ""  # the experiment that tells it from its look-alikes
+    witness: ClassVar[tuple[str, str] | None] = None  # (stream of a log that shows it directly, what to record)
 
     def places(self) -> tuple[str, ...]:
         """Names that own a set of parameters."""

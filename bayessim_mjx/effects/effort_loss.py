@@ -30,6 +30,13 @@ class EffortLoss(Effect):
     high: float = 10.0
     name: ClassVar[str] = "effort_loss"
     kind: ClassVar[str] = "actuator"
+    noun: ClassVar[str] = "effort loss at high load"
+    lacks: ClassVar[str] = "an effort loss at high load"
+    separates: ClassVar[str] = "the same motion on a full and on an empty battery (or two supply voltages)"
+    witness: ClassVar[tuple[str, str] | None] = (
+        "voltage",
+        "bus voltage and motor current (`voltage`, `current:<actuator>`)",
+    )
     quantities: ClassVar[tuple[Quantity, ...]] = (
         Quantity("loss", 0.0, 0.0, 10.0, unit="1/(N m)", per="1/force", reach=(0.0, 1.5), grid=(0.05, 0.2, 0.4, 0.7)),
     )

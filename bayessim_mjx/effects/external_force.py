@@ -29,6 +29,9 @@ class ExternalForce(Effect):
 
     name: ClassVar[str] = "external_force"
     kind: ClassVar[str] = "body"
+    noun: ClassVar[str] = "external force"
+    lacks: ClassVar[str] = "an external force"
+    separates: ClassVar[str] = "the robot turned round in the room; the same motion in another direction"
     quantities: ClassVar[tuple[Quantity, ...]] = (
         Quantity("force_x", 0.0, -10.0, 10.0, unit="N", per="weight", reach=(-0.3, 0.3)),
         Quantity("force_y", 0.0, -10.0, 10.0, unit="N", per="weight", reach=(-0.3, 0.3)),

@@ -36,6 +36,10 @@ class GravityTilt(Effect):
     where: str | tuple[str, ...] = "world"
     name: ClassVar[str] = "gravity_tilt"
     kind: ClassVar[str] = "world"
+    noun: ClassVar[str] = "tilted base"
+    lacks: ClassVar[str] = "the tilt of the base"
+    separates: ClassVar[str] = "two mount orientations; a spirit level or an IMU on the base"
+    witness: ClassVar[tuple[str, str] | None] = ("imu", "an IMU at rest on the base (`imu:...`)")
     quantities: ClassVar[tuple[Quantity, ...]] = (
         Quantity("roll", 0.0, -0.1, 0.1, unit="rad"),
         Quantity("pitch", 0.0, -0.1, 0.1, unit="rad"),

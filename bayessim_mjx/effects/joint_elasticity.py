@@ -33,6 +33,10 @@ class JointElasticity(Effect):
 
     name: ClassVar[str] = "joint_elasticity"
     kind: ClassVar[str] = "joint"
+    noun: ClassVar[str] = "elastic transmission"
+    lacks: ClassVar[str] = "an elastic transmission"
+    separates: ClassVar[str] = "a chirp beyond the suspected resonance; known static loads with the motor held"
+    witness: ClassVar[tuple[str, str] | None] = ("link", "an encoder on the link side of the gearbox (`link:<joint>`)")
     quantities: ClassVar[tuple[Quantity, ...]] = (
         Quantity(
             "compliance", 0.0, 0.0, 0.05, unit="rad/(N m)", per="1/force", reach=(0.0, 0.3), grid=(0.01, 0.03, 0.1, 0.3)

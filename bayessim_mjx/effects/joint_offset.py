@@ -31,6 +31,9 @@ class JointOffset(Effect):
 
     name: ClassVar[str] = "joint_offset"
     kind: ClassVar[str] = "joint"
+    noun: ClassVar[str] = "angle offset"
+    lacks: ClassVar[str] = "an angle offset"
+    separates: ClassVar[str] = "two mount orientations; a mechanical stop as the reference"
     quantities: ClassVar[tuple[Quantity, ...]] = (
         Quantity("offset", 0.0, -0.1, 0.1, unit="rad", per="travel", reach=(-0.1, 0.1)),
     )

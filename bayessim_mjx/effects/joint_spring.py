@@ -25,6 +25,9 @@ class JointSpring(Effect):
 
     name: ClassVar[str] = "joint_spring"
     kind: ClassVar[str] = "joint"
+    noun: ClassVar[str] = "spring"
+    lacks: ClassVar[str] = "a spring"
+    separates: ClassVar[str] = "slow sweeps of the whole range in two mount orientations"
     quantities: ClassVar[tuple[Quantity, ...]] = (
         Quantity("stiffness", 0.0, 0.0, 10.0, unit="N m/rad", per="force/travel", reach=(0.0, 1.0)),
         Quantity("cubic", 0.0, 0.0, 10.0, unit="N m/rad^3", per="force/travel^3", reach=(0.0, 1.0)),

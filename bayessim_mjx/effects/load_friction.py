@@ -32,6 +32,12 @@ class LoadFriction(Effect):
 
     name: ClassVar[str] = "load_friction"
     kind: ClassVar[str] = "joint"
+    noun: ClassVar[str] = "load-dependent friction"
+    separates: ClassVar[str] = "two payloads or arm angles; lifting and then letting drop with the drive off"
+    witness: ClassVar[tuple[str, str] | None] = (
+        "effort",
+        "a torque sensor on the link side, or the motor current (`effort:<actuator>`)",
+    )
     quantities: ClassVar[tuple[Quantity, ...]] = (
         Quantity("motor", 0.0, 0.0, 0.6, most=1.0),
         Quantity("external", 0.0, 0.0, 0.6, most=1.0),

@@ -70,6 +70,9 @@ class Payload(Effect):
 
     name: ClassVar[str] = "payload"
     kind: ClassVar[str] = "body"
+    noun: ClassVar[str] = "extra payload"
+    lacks: ClassVar[str] = "an extra payload"
+    separates: ClassVar[str] = "many poses with accelerations; a known payload of a different mass"
     quantities: ClassVar[tuple[Quantity, ...]] = (
         Quantity("mass", 0.0, 0.0, 1.0, unit="kg", per="carried", reach=(0.0, 1.0), grid=(0.01, 0.05, 0.2, 0.5)),
         *(

@@ -30,6 +30,8 @@ class QuadraticDrag(Effect):
     high: float = 1.0
     name: ClassVar[str] = "quadratic_drag"
     kind: ClassVar[str] = "joint"
+    noun: ClassVar[str] = "quadratic drag"
+    separates: ClassVar[str] = "a range of speeds of five to one or more"
     quantities: ClassVar[tuple[Quantity, ...]] = (
         Quantity("coefficient", 0.0, 0.0, 1.0, unit="N m s^2/rad^2", per="force/speed^2", reach=(0.0, 1.0)),
     )

@@ -26,6 +26,13 @@ class RateLimit(Effect):
     high: float = 2.0
     name: ClassVar[str] = "rate_limit"
     kind: ClassVar[str] = "actuator"
+    noun: ClassVar[str] = "command rate limit"
+    lacks: ClassVar[str] = "a command rate limit"
+    separates: ClassVar[str] = "steps of several sizes"
+    witness: ClassVar[tuple[str, str] | None] = (
+        "effort",
+        "the drive's own set-point, or its measured effort (`effort:<actuator>`)",
+    )
     quantities: ClassVar[tuple[Quantity, ...]] = (
         # per the largest command: seconds from 0 to it
         Quantity(

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from bayessim_mjx.effects.effect import Effect, Measurement, Quantity
 from bayessim_mjx.effects.sensor_gain import columns, written
 from bayessim_mjx.effects.support.motion import Motion, between
+from bayessim_mjx.effects.support.quantity import delay
 from bayessim_mjx.effects.support.site import Site
 
 if TYPE_CHECKING:
@@ -32,20 +33,14 @@ class SensorDelay(Effect):
     high: float = 0.05
     name: ClassVar[str] = "sensor_delay"
     kind: ClassVar[str] = "joint"
-    quantities: ClassVar[tuple[Quantity, ...]] = (
-        Quantity(
-            "delay",
-            0.0,
-            0.0,
-            0.05,
-            unit="s",
-            per="period",
-            reach=(0.0, 3.0),
-            grid=(0.1, 0.3, 0.6),
-            at_least=True,
-            remembered=True,
-        ),
+    noun: ClassVar[str] = "measurement delay"
+    lacks: ClassVar[str] = "a measurement delay"
+    separates: ClassVar[str] = "the loop closed in the drive against the loop closed outside; an independent clock"
+    witness: ClassVar[tuple[str, str] | None] = (
+        "imu",
+        "an IMU or a second sensor with its own time stamps (`imu:...`)",
     )
+    quantities: ClassVar[tuple[Quantity, ...]] = (delay(0.05, grid=(0.1, 0.3, 0.6)),)
 
     def init(self, at: Site) -> Any:
         """{"history": `[lag, n, 2]` positions and velocities after past control steps, newest last; "fresh"}."""

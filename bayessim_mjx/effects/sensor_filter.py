@@ -32,6 +32,10 @@ class SensorFilter(Effect):
     high: float = 0.05
     name: ClassVar[str] = "sensor_filter"
     kind: ClassVar[str] = "joint"
+    noun: ClassVar[str] = "measurement filter"
+    lacks: ClassVar[str] = "a measurement filter"
+    separates: ClassVar[str] = "a second sensor of the same joint; steps"
+    witness: ClassVar[tuple[str, str] | None] = ("imu", "a second, unfiltered sensor (`link:<joint>` or `imu:...`)")
     quantities: ClassVar[tuple[Quantity, ...]] = (
         Quantity("time_constant", 0.0, 0.0, 0.05, unit="s", grid=(0.1, 0.3, 0.6)),
     )

@@ -24,6 +24,9 @@ class SensorGain(Effect):
 
     name: ClassVar[str] = "sensor_gain"
     kind: ClassVar[str] = "joint"
+    noun: ClassVar[str] = "wrong sensor gain"
+    lacks: ClassVar[str] = "the true sensor gain"
+    separates: ClassVar[str] = "two positions known from outside (stops, a gauge)"
     quantities: ClassVar[tuple[Quantity, ...]] = (Quantity("gain", 1.0, 0.8, 1.2),)
 
     def check(self) -> None:

@@ -28,6 +28,13 @@ class SpeedTorqueLimit(Effect):
 
     name: ClassVar[str] = "speed_torque_limit"
     kind: ClassVar[str] = "actuator"
+    noun: ClassVar[str] = "speed-torque limit"
+    lacks: ClassVar[str] = "a speed-torque limit"
+    separates: ClassVar[str] = "fast driving and braking"
+    witness: ClassVar[tuple[str, str] | None] = (
+        "voltage",
+        "bus voltage and motor current (`voltage`, `current:<actuator>`)",
+    )
     joint: ClassVar[bool] = True
     quantities: ClassVar[tuple[Quantity, ...]] = (
         Quantity(

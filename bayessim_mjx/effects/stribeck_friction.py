@@ -30,6 +30,8 @@ class StribeckFriction(Effect):
 
     name: ClassVar[str] = "stribeck_friction"
     kind: ClassVar[str] = "joint"
+    noun: ClassVar[str] = "Stribeck friction"
+    separates: ClassVar[str] = "a sweep of speeds through the suspected Stribeck speed, several crossings"
     contains: ClassVar[tuple[str, ...]] = ("coulomb_friction",)
     quantities: ClassVar[tuple[Quantity, ...]] = (
         Quantity("level", 0.0, 0.0, 1.0, unit="N m", per="force", reach=(0.0, 1.0)),

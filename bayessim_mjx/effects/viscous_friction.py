@@ -32,6 +32,12 @@ class ViscousFriction(Effect):
     high: float = 1.0
     name: ClassVar[str] = "viscous_friction"
     kind: ClassVar[str] = "joint"
+    noun: ClassVar[str] = "viscous friction"
+    separates: ClassVar[str] = "a staircase of constant speeds; swings with the drive off tell it from back-EMF"
+    witness: ClassVar[tuple[str, str] | None] = (
+        "temperature",
+        "temperature of motor or gearbox (`temperature`): grease thins as it warms",
+    )
     quantities: ClassVar[tuple[Quantity, ...]] = (
         Quantity("damping", 0.0, 0.0, 1.0, unit="N m s/rad", per="force/speed", reach=(0.0, 1.0)),
     )

@@ -7,7 +7,7 @@ from typing import Any
 
 from bayessim_mjx import quantities
 from bayessim_mjx.diagnosis.result import Diagnosis, Estimate, FoundEffect
-from bayessim_mjx.diagnosis.vocabulary import EFFECTS
+from bayessim_mjx.effects.support.words import words
 from bayessim_mjx.quantities import finite, typeset, unit
 
 MISSING = quantities.MISSING  # where there is no number
@@ -132,12 +132,12 @@ def estimate(mean: Any, sd: Any = math.nan, in_unit: str = "") -> str:
 
 
 def effect_noun(name: str) -> str:
-    return EFFECTS.get(name, (name.replace("_", " "), ""))[0]
+    return words(name).noun
 
 
 def effect_title(name: str, where: str) -> str:
     """`Coulomb friction at joint 'elbow'`."""
-    noun, kind = effect_noun(name), EFFECTS.get(name, ("", ""))[1]
+    noun, kind = effect_noun(name), words(name).kind
     noun = noun[:1].upper() + noun[1:]
     if where in ("", "world") or (kind == "world" and where == "all"):
         return noun
@@ -152,7 +152,7 @@ def label_title(label: str, short: bool = False) -> str:
     if short and where:
         title = effect_noun(name)
         return f"{title[:1].upper()}{title[1:]} · {where}"
-    return effect_title(name, where) if where or name in EFFECTS else str(label)
+    return effect_title(name, where) if where or words(name).kind else str(label)
 
 
 def candidate_title(candidate: Mapping[str, Any]) -> str:

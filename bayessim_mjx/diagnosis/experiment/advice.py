@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.selection.models import Model
+from bayessim_mjx.effects.support.words import words
 from bayessim_mjx.logs.log import Log
 
 if TYPE_CHECKING:
@@ -19,59 +20,6 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-SEPARATES = {
-    "actuator_delay": "a wide-band chirp with the drive's measured effort in the log; the onset time of a step",
-    "actuator_lag": "steps and a chirp: a lag is the slope after a step, a delay its dead time",
-    "actuator_gain": "a known added mass, or a force gauge: without a force reference only ratios to inertia show",
-    "actuator_bias": "two mount orientations, or the drive switched off",
-    "actuator_deadband": "slow ramps and holds with the drive's measured effort in the log",
-    "actuator_saturation": "the same motion at several amplitudes, up to the limit",
-    "speed_torque_limit": "fast driving and braking",
-    "effort_loss": "the same motion on a full and on an empty battery (or two supply voltages)",
-    "cogging": "constant slow speeds at several values",
-    "rate_limit": "steps of several sizes",
-    "coulomb_friction": "slow triangles at three speeds and with two payloads",
-    "stribeck_friction": "a sweep of speeds through the suspected Stribeck speed, several crossings",
-    "viscous_friction": "a staircase of constant speeds; swings with the drive off tell it from back-EMF",
-    "load_friction": "two payloads or arm angles; lifting and then letting drop with the drive off",
-    "asymmetric_friction": "symmetric strokes both ways, in two mount orientations",
-    "quadratic_drag": "a range of speeds of five to one or more",
-    "backlash": "slow triangles with and without gravity's pre-load, a link-side encoder",
-    "joint_elasticity": "a chirp beyond the suspected resonance; known static loads with the motor held",
-    "joint_spring": "slow sweeps of the whole range in two mount orientations",
-    "armature": "fast chirps in two poses of the other joints, which change the link's inertia but not the rotor's",
-    "joint_offset": "two mount orientations; a mechanical stop as the reference",
-    "payload": "many poses with accelerations; a known payload of a different mass",
-    "gravity_tilt": "two mount orientations; a spirit level or an IMU on the base",
-    "external_force": "the robot turned round in the room; the same motion in another direction",
-    "base_flexibility": "one joint moved and the resting ones (or an IMU on the base) watched; the base clamped",
-    "contact_friction": "sliding at two normal loads",
-    "contact_compliance": "drops from several heights",
-    "sensor_delay": "the loop closed in the drive against the loop closed outside; an independent clock",
-    "sensor_filter": "a second sensor of the same joint; steps",
-    "sensor_gain": "two positions known from outside (stops, a gauge)",
-}
-WITNESS = {
-    "effort_loss": ("voltage", "bus voltage and motor current (`voltage`, `current:<actuator>`)"),
-    "speed_torque_limit": ("voltage", "bus voltage and motor current (`voltage`, `current:<actuator>`)"),
-    "actuator_gain": ("effort", "the drive's measured effort or current (`effort:<actuator>`)"),
-    "actuator_bias": ("effort", "the drive's measured effort or current (`effort:<actuator>`)"),
-    "actuator_delay": ("effort", "the drive's measured effort with its own time stamps (`effort:<actuator>`)"),
-    "actuator_lag": ("effort", "the drive's measured effort (`effort:<actuator>`)"),
-    "actuator_deadband": ("effort", "the drive's measured effort (`effort:<actuator>`)"),
-    "actuator_saturation": ("effort", "the drive's measured effort or current (`effort:<actuator>`)"),
-    "rate_limit": ("effort", "the drive's own set-point, or its measured effort (`effort:<actuator>`)"),
-    "cogging": ("current", "motor current (`current:<actuator>`)"),
-    "viscous_friction": ("temperature", "temperature of motor or gearbox (`temperature`): grease thins as it warms"),
-    "coulomb_friction": ("temperature", "temperature of motor or gearbox (`temperature`)"),
-    "load_friction": ("effort", "a torque sensor on the link side, or the motor current (`effort:<actuator>`)"),
-    "backlash": ("link", "an encoder on the link side of the gearbox (`link:<joint>`)"),
-    "joint_elasticity": ("link", "an encoder on the link side of the gearbox (`link:<joint>`)"),
-    "base_flexibility": ("imu", "an IMU on the base (`imu:...`)"),
-    "gravity_tilt": ("imu", "an IMU at rest on the base (`imu:...`)"),
-    "sensor_delay": ("imu", "an IMU or a second sensor with its own time stamps (`imu:...`)"),
-    "sensor_filter": ("imu", "a second, unfiltered sensor (`link:<joint>` or `imu:...`)"),
-}
 PAYLOAD_SHARE = 0.5  # of the largest payload that is thought possible at the body
 STANDING = (("turned on its side (90 degrees about the world's x axis)", (math.pi / 2, 0.0)),
             ("turned forward (90 degrees about the world's y axis)", (0.0, math.pi / 2)))  # fmt: skip
@@ -122,14 +70,14 @@ def title(model: Model) -> str:
 def witnesses(models: Sequence[Model], logs: Sequence[Log]) -> list[str]:
     """Streams that would decide between the models' effects and that the logs do not have."""
     have = {name.split(":", 1)[0] for log in logs for name in log.streams}
-    wanted = dict(WITNESS[c.effect] for m in models for c in m.effects if c.effect in WITNESS)
+    wanted = dict(seen for m in models for c in m.effects if (seen := words(c.effect).witness) is not None)
     return [text for key, text in wanted.items() if key not in have]
 
 
 def instead(models: Sequence[Model]) -> str:
-    """What else would separate the models' effects, from the literature's table."""
+    """What else would separate the models' effects, in the effects' own words."""
     effects = dict.fromkeys(c.effect for m in models for c in m.effects)
-    known = [f"{e.replace('_', ' ')}: {SEPARATES[e]}" for e in effects if e in SEPARATES]
+    known = [f"{e.replace('_', ' ')}: {how}" for e in effects if (how := words(e).separates)]
     return "; ".join(known) or "a known payload, two mount orientations, or a measured effort"
 
 

@@ -45,3 +45,11 @@ class Quantity:
         """Where physics ends: at neutral, where the range does; at 0 for what is positive; at `most`."""
         least = self.low if self.low == self.neutral else 0.0 if self.low > 0 else -math.inf
         return least, self.high if self.high == self.neutral else self.most
+
+
+def delay(high: float, grid: tuple[float, ...]) -> Quantity:
+    """A time by which something is late, s; up to three periods of the logs, and at least up to `high`."""
+    periods = (0.0, 3.0)
+    return Quantity(
+        "delay", 0.0, 0.0, high, unit="s", per="period", reach=periods, grid=grid, at_least=True, remembered=True
+    )

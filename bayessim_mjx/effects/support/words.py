@@ -1,0 +1,42 @@
+"""What is said of effects, for sentences, tables and advice: by their own words, else by name and docstring."""
+
+import dataclasses
+import inspect
+
+from bayessim_mjx import effects as room
+from bayessim_mjx.effects.effect import Effect
+
+
+@dataclasses.dataclass(frozen=True)
+class Words:
+    """Of one effect.
+
+    Attributes:
+        noun: what people call it.
+        kind: of its places; "" where the effect is not known.
+        lacks: what a simulator lacks that lacks it.
+        separates: what experiment tells it from look-alikes; "" where nothing is known of it.
+        witness: (stream of a log that shows it directly, what to record), or None.
+    """
+
+    noun: str
+    kind: str = ""
+    lacks: str = ""
+    separates: str = ""
+    witness: tuple[str, str] | None = None
+
+
+def words(name: str) -> Words:
+    """Of the effect called `name`, which may be unknown here: a diagnosis from elsewhere, a file not loaded."""
+    kind, plain = room.known(name), name.replace("_", " ")
+    if kind is None:
+        return Words(plain, lacks=plain)
+    noun = kind.noun or plain
+    return Words(noun, kind.kind, kind.lacks or noun, kind.separates or _law(kind), kind.witness)
+
+
+def _law(kind: type[Effect]) -> str:
+    """What its motion must excite, by the docstring's first line; "" without a docstring of its own."""
+    text = inspect.cleandoc(kind.__doc__ or "").partition("\n")[0].rstrip(".")
+    written = text and not text.startswith(f"{kind.__name__}(")  # a dataclass's own
+    return f"a motion that excites its law, {text}" if written else ""
