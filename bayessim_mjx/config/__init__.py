@@ -1,15 +1,7 @@
 """Settings: their defaults and limits (settings.py), and how files, flags and overrides are read (loading.py)."""
 
-from bayessim_mjx.config.loading import (
-    EFFECTS_SCHEMA,
-    cfg_folder,
-    from_dict,
-    load,
-    read_effects,
-    replace,
-    task_file,
-    unknown,
-)
+from bayessim_mjx.config.effects_file import EFFECTS_SCHEMA, read_effects
+from bayessim_mjx.config.loading import cfg_folder, from_dict, load, replace, task_file
 from bayessim_mjx.config.settings import (
     BayesSimConfig,
     Config,
@@ -23,6 +15,7 @@ from bayessim_mjx.config.settings import (
     freeze,
 )
 from bayessim_mjx.config.yaml_text import read_yaml, to_yaml
+from bayessim_mjx.errors import unknown
 
 __all__ = [
     "EFFECTS_SCHEMA", "BayesSimConfig", "Config", "EnvConfig", "MonitorConfig", "PPOConfig", "RNDConfig", "RealConfig",

@@ -1,4 +1,4 @@
-"""All settings with their defaults, meaning and limits, as frozen dataclasses. `config.py` loads them from files.
+"""All settings with their defaults, meaning and limits, as frozen dataclasses. `loading.py` loads them from files.
 
 The names in `bayessim:`, `env:` and `task:` are BayesSimIG's. Nothing here imports jax.
 """

@@ -5,7 +5,6 @@ broken at spaces, at the terminal's width or $COLUMNS; without either, what is s
 searched.
 """
 
-import os
 import sys
 import time
 import warnings
@@ -13,34 +12,13 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any, TextIO
 
 from bayessim_mjx.monitor.bars import Bars
+from bayessim_mjx.monitor.clock import Clock
 from bayessim_mjx.monitor.names import named, shorten, spoken, without_prefix
-from bayessim_mjx.monitor.tables import TIE, fit, shell, table, wrapped
-from bayessim_mjx.quantities import ascii_of, compact, duration, estimate, is_number
+from bayessim_mjx.monitor.output import Output
+from bayessim_mjx.monitor.tables import TIE, fit
+from bayessim_mjx.quantities import compact, duration, estimate, is_number
 
-FILE_WIDTH = 140  # columns that tables and lists may take where there is no terminal
 WIDTHS = "posterior/prior sd"
-LEAST_WIDTH = 40  # narrower terminals break words
-
-
-class Clock:
-    """Time to go, from the mean duration of the steps done here; compiling is not counted as a step's time."""
-
-    def __init__(self, total: int, done: int = 0, now: Callable[[], float] = time.monotonic):
-        self.total, self.done, self.now = total, done, now
-        self.first, self.begun, self.excluded = done, now(), 0.0
-
-    def exclude(self, seconds: float) -> None:
-        self.excluded += seconds
-
-    def advance(self, to: int | None = None) -> None:
-        self.done = self.done + 1 if to is None else to
-
-    def eta(self) -> float | None:
-        """Seconds to go; None before the first step is done."""
-        steps = self.done - self.first
-        if steps <= 0:
-            return None
-        return max(self.now() - self.begun - self.excluded, 0.0) / steps * max(self.total - self.done, 0)
 
 
 class Console:
@@ -60,17 +38,7 @@ class Console:
     def __init__(
         self, *, headless: bool = False, file: TextIO | None = None, now: Callable[[], float] = time.monotonic
     ):
-        from rich.console import Console as RichConsole
-
-        file = file or sys.stdout
-        self.live = not headless and bool(getattr(file, "isatty", lambda: False)())
-        options: dict[str, Any] = dict(file=file, highlight=False, soft_wrap=True)
-        self._columns = int(c) if (c := os.environ.get("COLUMNS", "")).isdigit() else None  # as rich reads it
-        if not self.live:
-            options |= dict(force_terminal=False, no_color=True, width=self._columns or FILE_WIDTH)
-        self._rich = RichConsole(**options)
-        self._unicode = "utf" in (getattr(file, "encoding", None) or "utf-8").lower()
-        self._now, self._blank = now, False
+        self._out, self._now = Output(headless, file or sys.stdout), now
         self._bars: Bars | None = None
         self._rounds: Clock | None = None
         self._steps: Clock | None = None
@@ -95,13 +63,14 @@ class Console:
         self.close()
 
     @property
-    def width(self) -> int:
-        return max(self._rich.width, LEAST_WIDTH)
+    def live(self) -> bool:
+        """Whether there is a terminal to draw on."""
+        return self._out.live
 
     @property
-    def _limit(self) -> int | None:
-        """Columns at which lines are broken; None: they are not."""
-        return self.width if self.live or self._columns else None
+    def width(self) -> int:
+        """Columns."""
+        return self._out.width
 
     # ---- what happens
 
@@ -113,10 +82,10 @@ class Console:
             # an entry of a list is not torn apart
             items = [str(v).replace(" ", TIE) for v in value] if many else []
             text = fit(items, 3 * (self.width - wide - 2)) if many else str(value)
-            first, *more = self._broken(f"{key:<{wide}}  {text}", wide + 2)
-            self._line(first, "bold", len(key))
+            first, *more = self._out.broken(f"{key:<{wide}}  {text}", wide + 2)
+            self._out.line(first, "bold", len(key))
             for line in more:
-                self._line(line)
+                self._out.line(line)
 
     def begin(self, rounds: int, done: int = 0) -> None:
         """Rounds to come, `done` of them finished before (resume)."""
@@ -131,7 +100,7 @@ class Console:
         if not self.live:
             clock = self._rounds
             where = "" if clock is None else f"round {min(clock.done + 1, clock.total)}/{clock.total}: "
-            self._say(f"{where}{name} ..." if not total else f"{where}{name}, {total - done} iterations ...")
+            self._out.say(f"{where}{name} ..." if not total else f"{where}{name}, {total - done} iterations ...")
 
     def compile(self, message: str, seconds: float, cached: bool = False) -> None:
         """A program was compiled; its time is kept out of the ETA. `cached`: it came from the compilation cache."""
@@ -140,7 +109,7 @@ class Console:
                 clock.exclude(seconds)
         how = "loaded" if cached else "compiled"
         tail = "from the cache" if cached else "cached for the next start"
-        self._say(f"{how} {message} in {duration(seconds)} ({tail})", "dim")
+        self._out.say(f"{how} {message} in {duration(seconds)} ({tail})", "dim")
 
     def iteration(self, metrics: Mapping[str, Any], iteration: int | None = None) -> None:
         """One log interval of training: numbers in the order given, as many as fit.
@@ -162,7 +131,7 @@ class Console:
             self._bars.move("phase", done, fit(numbers, self._bars.note_room(), "  ", count=False), eta)
             return
         ahead = f"  ETA {duration(eta)}" if eta else ""
-        self._say(f"{where}  " + fit(numbers, self.width - len(where) - len(ahead) - 2, "  ", count=False) + ahead)
+        self._out.say(f"{where}  " + fit(numbers, self.width - len(where) - len(ahead) - 2, "  ", count=False) + ahead)
 
     def round_line(
         self,
@@ -199,7 +168,7 @@ class Console:
             brief = without_prefix(list(widths))
             fitting = fit(named(brief, widths), room) or fit(named(shorten(brief, 18), widths), room)
             parts += [f"{WIDTHS} {fitting}"] if fitting else []
-        self._facts(parts + tail, "bold")
+        self._out.facts(parts + tail, "bold")
         if self._rounds is not None and self._bars is not None:
             done, total = self._rounds.done, self._rounds.total
             self._bars.move("round", done, "", eta, f"round {min(done + 1, total)}/{total}")
@@ -225,43 +194,22 @@ class Console:
         left: Collection[int] = (0,),
     ) -> None:
         """A table of texts: the columns `left` hold words, the others numbers. See `tables.table`."""
-        plain = [[self._plain(cell) for cell in row] for row in (header, *rows)]
-        laid = table(plain[0], plain[1:], self.width, left)
-        if not self._blank:
-            self._line("")
-        for line in wrapped(self._plain(title), self._limit) if title else []:
-            self._line(line, "italic")
-        for line in laid.header:
-            self._line(line, "bold")
-        self._line(("─" if self._unicode else "-") * max(map(len, [*laid.header, *laid.rows])))
-        for line in laid.rows:
-            self._line(line)
-        self._line("")
+        self._out.grid(header, rows, title, left)
 
     def panel(self, title: str, lines: Sequence[tuple[str, str]], colour: str) -> None:
         """A frame of `colour` round lines of (text, style), with a title."""
-        from rich import box
-        from rich.panel import Panel
-        from rich.text import Text
-
-        parts = [(part, style) for text, style in lines for part in wrapped(self._plain(text), self.width - 4)]
-        body = Text("\n").join(Text(part, style) for part, style in parts)
-        edge = box.ROUNDED if self._unicode else box.ASCII
-        name = Text(self._plain(title), f"bold {colour}")
-        self._rich.print(Panel(body, title=name, title_align="left", border_style=colour, box=edge), soft_wrap=False)
+        self._out.panel(title, lines, colour)
 
     def say(self, text: str, indent: int = 4) -> None:
         """One plain line, or a paragraph whose later lines are indented."""
-        self._say(text, indent=indent)
+        self._out.say(text, indent=indent)
 
     def command(self, what: str, command: str) -> None:
         """A command that the user may want to paste, on lines of its own: it stays whole, whatever the width."""
-        self._say(f"{what}:")
-        for line in shell(command, self._limit, 2):
-            self._line(line)
+        self._out.command(what, command)
 
     def warning(self, text: str) -> None:
-        self._say(f"warning: {text}", "yellow")
+        self._out.say(f"warning: {text}", "yellow")
 
     def close(self) -> None:
         """Take the progress bars away; a second call does nothing."""
@@ -269,39 +217,7 @@ class Console:
             self._bars.close()
         self._bars = None
 
-    # ---- how it is written
-
-    def _plain(self, text: str) -> str:
-        return text if self._unicode else TIE.join(map(ascii_of, text.split(TIE)))
-
-    def _broken(self, text: str, indent: int) -> list[str]:
-        return wrapped(self._plain(text), self._limit, indent)
-
-    def _say(self, text: str, style: str = "", indent: int = 4) -> None:
-        for line in self._broken(text, indent):
-            self._line(line, style)
-
-    def _facts(self, facts: Sequence[str], style: str) -> None:
-        """Short texts in a row, on as many lines as it takes; one that fits on a line is not broken."""
-        lines = [facts[0]]
-        for fact in facts[1:]:
-            if self._limit is None or len(lines[-1]) + 3 + len(fact) <= self._limit:
-                lines[-1] += f"   {fact}"
-            else:
-                lines.append(f"    {fact}")
-        for line in lines:
-            self._say(line, style, 6)
-
-    def _line(self, text: str, style: str = "", styled: int | None = None) -> None:
-        """Print one line as it is; on a terminal the first `styled` characters (default: all) in `style`."""
-        from rich.text import Text
-
-        line, self._blank = Text(self._plain(text)), not text
-        if self.live and style:
-            line.stylize(style, 0, styled)
-        self._rich.print(line)
-
     def _bar(self, kind: str, text: str, total: int | None, done: int) -> None:
         if self.live:
-            self._bars = self._bars or Bars(self._rich, self.width)
+            self._bars = self._bars or Bars(self._out.rich, self.width)
             self._bars.show(kind, text, total, done)

@@ -5,8 +5,9 @@ file exactly once; `tests` are arguments of pytest for tests of the default suit
 """
 
 P = "bayessim_mjx"
-TIMESTEP, PHYSICS, RUNS, LOOP, TASK = (
-    f"{P}/{name}.py" for name in ("physics/timestep", "physics/step", "runs/folder", "loop/outer_loop", "env/task")
+TIMESTEP, PHYSICS, RUNS, JSON, LOOP, TASK = (
+    f"{P}/{name}.py"
+    for name in ("physics/timestep", "physics/step", "runs/folder", "runs/manifest", "loop/outer_loop", "env/task")
 )
 EPISODES, COLLECTION = f"{P}/rollout/episodes.py", f"{P}/rollout/collection.py"
 EFFECTS, DISTRIBUTIONS, LOGS = f"{P}/effects", f"{P}/distributions", f"{P}/logs"
@@ -115,7 +116,7 @@ FAULTS: tuple[tuple[str, str, str, str, tuple[str, ...]], ...] = (
     ),
     # runs
     (
-        "the worst evaluation is best", RUNS, 'return max(evaluated, key=lambda c: c["evaluation"])',
+        "the worst evaluation is best", JSON, 'return max(evaluated, key=lambda c: c["evaluation"])',
         'return min(evaluated, key=lambda c: c["evaluation"])', (MANIFEST, "-k", "latest_and_best"),
     ),
     (
@@ -123,7 +124,7 @@ FAULTS: tuple[tuple[str, str, str, str, tuple[str, ...]], ...] = (
         (MANIFEST, "-k", "something_else"),
     ),
     (
-        "a manifest may name a path outside of its run", RUNS,
+        "a manifest may name a path outside of its run", JSON,
         'parts[1] not in ("", ".", "..")', 'parts[1] not in ("",)', (MANIFEST, "-k", "outside"),
     ),
     # logs

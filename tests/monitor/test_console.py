@@ -6,7 +6,8 @@ import warnings
 
 import pytest
 
-from bayessim_mjx.monitor.console import Clock, Console
+from bayessim_mjx.monitor.clock import Clock
+from bayessim_mjx.monitor.console import Console
 from bayessim_mjx.monitor.names import without_prefix
 from bayessim_mjx.monitor.tables import fit
 

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from bayessim_mjx.monitor import lettering, video
+from bayessim_mjx.monitor import lettering, rendering, video
 from bayessim_mjx.monitor.camera import view_of
 
 PENDULUM = """<mujoco><worldbody><body name="pole"><joint type="hinge" axis="0 1 0"/>
@@ -38,7 +38,7 @@ def red(frame):
 
 @pytest.fixture(autouse=True)
 def fresh(monkeypatch):
-    monkeypatch.setattr(video, "_warned", set())
+    monkeypatch.setattr(rendering, "_warned", set())
 
 
 def test_the_pole_is_seen_where_it_points():
@@ -100,18 +100,18 @@ def test_without_opengl_training_goes_on(monkeypatch):
         raise ImportError("libEGL.so not found")
 
     monkeypatch.delenv("MUJOCO_GL", raising=False)
-    monkeypatch.setattr(video, "_make_context", fail)
+    monkeypatch.setattr(rendering, "_make_context", fail)
     with pytest.warns(UserWarning, match="libEGL.so not found"):
         assert video.record(model(PENDULUM), np.zeros((2, 1))) is None
 
 
 def test_the_users_choice_is_the_only_one_tried(monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", "osmesa")
-    assert video.backends() == ["osmesa"]
+    assert rendering.backends() == ["osmesa"]
     monkeypatch.delenv("MUJOCO_GL")
     monkeypatch.delenv("DISPLAY", raising=False)
-    monkeypatch.setattr(video.platform, "system", lambda: "Linux")
-    assert video.backends() == ["egl", "osmesa"]
+    monkeypatch.setattr(rendering.platform, "system", lambda: "Linux")
+    assert rendering.backends() == ["egl", "osmesa"]
 
 
 def test_wrong_sizes_are_refused():
@@ -146,7 +146,7 @@ def test_title_and_captions_stand_on_a_strip_below_the_picture():
 
 def test_captions_follow_the_rows_that_are_picked(monkeypatch):
     drawn = {}
-    monkeypatch.setattr(video, "_render", lambda m, worlds, w, h, c: [np.zeros((len(worlds[0]), h, w, 3), np.uint8)])
+    monkeypatch.setattr(video, "render", lambda m, worlds, w, h, c: [np.zeros((len(worlds[0]), h, w, 3), np.uint8)])
     monkeypatch.setattr(video.lettering, "underline", lambda frames, *rest: drawn.setdefault("rest", rest) and frames)
     video.record(model(PENDULUM), np.zeros((5, 1)), fps=5, dt=0.1, title="P", captions=list("abcde"))
     assert drawn["rest"] == (15, "P", ["a", "c"])  # half a second at 5 frames a second: seconds 0 and 0.2
