@@ -11,6 +11,7 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parent / "rl"))
 import probes  # noqa: E402
 
+from bayessim_mjx.config import PPOConfig  # noqa: E402
 from bayessim_mjx.registry import make  # noqa: E402
 from bayessim_mjx.rl import networks, normalise  # noqa: E402
 from bayessim_mjx.rollout import collect, replay, rollout  # noqa: E402
@@ -54,9 +55,8 @@ def test_the_time_limit_is_a_truncation_with_the_true_last_observation():
 
 def test_another_key_theta_or_policy_of_the_same_kind_does_not_recompile():
     env = probes.Lifetime()
-    policies = [
-        networks.Policy(networks.init(key(i), 1, 1, 1, (4,), (4,), 1.0)["actor"], normalise.init(1)) for i in (0, 1)
-    ]
+    sizes, config = networks.Sizes(1, 1, 1), PPOConfig(hidden_actor=(4,), hidden_critic=(4,))
+    policies = [networks.Policy(networks.init(key(i), sizes, config)["actor"], normalise.init(1)) for i in (0, 1)]
     a = rollout(env, policies[0], key(0), jnp.ones((2, 1)), 3)
     b = rollout(env, policies[1], key(1), 2 * jnp.ones((2, 1)), 3)
     assert _rollout(env, 3)._cache_size() == 1

@@ -13,6 +13,7 @@ from bayessim_mjx.config.settings import (
     SymmetryConfig,
     WeightSchedule,
     freeze,
+    refuse_together,
 )
 from bayessim_mjx.config.yaml_text import read_yaml, to_yaml
 from bayessim_mjx.errors import unknown
@@ -20,5 +21,5 @@ from bayessim_mjx.errors import unknown
 __all__ = [
     "EFFECTS_SCHEMA", "BayesSimConfig", "Config", "EnvConfig", "MonitorConfig", "PPOConfig", "RNDConfig", "RealConfig",
     "SymmetryConfig", "WeightSchedule", "cfg_folder", "freeze", "from_dict", "load", "read_effects", "read_yaml",
-    "replace", "task_file", "to_yaml", "unknown",
+    "refuse_together", "replace", "task_file", "to_yaml", "unknown",
 ]  # fmt: skip

@@ -70,6 +70,7 @@ class Section:
     """A group of settings; checks its own types and limits however it is made."""
 
     SECTION: typing.ClassVar[str] = ""
+    incompatible_with: typing.ClassVar[Mapping[str, str]] = {}  # settings beside it, and what to say of them
 
     def __post_init__(self) -> None:
         hints = typing.get_type_hints(type(self))
@@ -339,6 +340,9 @@ class RNDConfig(Section):
     """`ppo.rnd:`, random network distillation; the names and defaults of rsl_rl."""
 
     SECTION: typing.ClassVar[str] = "ppo.rnd"
+    incompatible_with: typing.ClassVar[Mapping[str, str]] = {
+        "teacher": "a student has no use for ppo.rnd; set one of them to null"
+    }
     num_outputs: int = setting(1, "size of the embedding", low=1, high=WIDTH)
     predictor_hidden_dims: tuple[int, ...] = setting(
         (-1,), "widths of the predictor; -1: size of its input", low=-1, high=WIDTH
@@ -365,6 +369,12 @@ class SymmetryConfig(Section):
     """`ppo.symmetry:`, use of the robot's mirror maps; all off: its asymmetry is only logged."""
 
     SECTION: typing.ClassVar[str] = "ppo.symmetry"
+    incompatible_with: typing.ClassVar[Mapping[str, str]] = {
+        "teacher": "a student has no use for ppo.symmetry; set one of them to null",
+        "critic_theta": "theta has no mirror image, so ppo.symmetry has to be null",
+        "policy_theta": "theta has no mirror image, so ppo.symmetry has to be null",
+        "memory": "not with ppo.symmetry; set one of them to 0 or null",
+    }
     use_data_augmentation: bool = setting(False, "train on the mirrored samples too")
     use_mirror_loss: bool = setting(False, "add the mirror loss, the squared difference of a(M o) and M a(o)")
     mirror_loss_coeff: float = setting(0.0, "weight of the mirror loss", low=0)
@@ -412,10 +422,17 @@ class PPOConfig(Section):
     action_bound: str = setting("clip", "how: clipped, or squashed by action_clip * tanh", choices=("clip", "tanh"))
     rnd: RNDConfig | None = setting(None, "random network distillation: rewards for what is new; null: none")
     symmetry: SymmetryConfig | None = setting(None, "use of the robot's mirror symmetry; null: none")
+    extensions: tuple[typing.Any, ...] = setting(
+        (), "extensions of your own: list of {extension: NAME, setting: value, ...}; docs/ppo_extensions.md"
+    )
     max_iterations: int = setting(100, "iterations (per round of the outer loop)", low=0, high=COUNT)
     log_interval: int = setting(10, "iterations between log lines", low=1, high=COUNT)
     save_interval: int = setting(50, "iterations between checkpoints", low=1, high=COUNT)
     eval_episodes: int = setting(100, "episodes per evaluation", low=1, high=COUNT)
+
+    def to_dict(self) -> dict[str, Any]:
+        """As of every section; an extension that is an object by its name and fields."""
+        return {**super().to_dict(), "extensions": [_described(e) for e in self.extensions]}
 
     @property
     def memory_size(self) -> int:
@@ -435,13 +452,16 @@ class PPOConfig(Section):
             raise UserError(
                 "ppo.critic_theta = True: with ppo.shared_trunk the actor would see theta too; use one of them"
             )
-        if self.teacher is not None and (self.rnd is not None or self.symmetry is not None):
-            raise UserError("ppo.teacher: a student has no use for ppo.rnd and ppo.symmetry; set them to null")
-        if (self.critic_theta or self.policy_theta) and self.symmetry is not None:
-            which = "ppo.critic_theta" if self.critic_theta else "ppo.policy_theta"
-            raise UserError(f"{which} = True: theta has no mirror image, so ppo.symmetry has to be null")
-        if self.memory and (self.symmetry is not None or self.teacher is not None):
-            raise UserError(f"ppo.memory = {self.memory}: not with ppo.symmetry or ppo.teacher; set them to null")
+        for section in (self.rnd, self.symmetry):
+            refuse_together({} if section is None else section.incompatible_with, self)
+        for given in self.extensions:
+            object_ = dataclasses.is_dataclass(given) and not isinstance(given, type)
+            if not object_ and not (isinstance(given, Mapping) and isinstance(given.get("extension"), str)):
+                raise UserError(f"ppo.extensions: {given!r}: expected {{extension: NAME, setting: value, ...}}")
+        if self.extensions:
+            refuse_together({"teacher": "a student has no use for ppo.extensions; leave one of them out"}, self)
+        if self.memory and self.teacher is not None:
+            raise UserError(f"ppo.memory = {self.memory}: not with ppo.teacher; set one of them to 0 or null")
         if self.memory and self.num_minibatches > self.num_envs:
             raise UserError(
                 f"ppo.num_minibatches = {self.num_minibatches}: with ppo.memory a minibatch is of whole sequences, and "
@@ -462,6 +482,23 @@ class PPOConfig(Section):
             raise UserError(f"{said} needs ppo.normalize_advantage_per_minibatch=True: each has advantages of its own")
         if self.memory:
             raise UserError(f"{said}: not with ppo.memory, whose minibatches are of whole sequences; set one to 0")
+
+
+def _described(extension: Any) -> Any:
+    """`{extension: NAME, ...}` of an extension in either of its two forms."""
+    if isinstance(extension, Mapping):
+        return thaw(extension)
+    fields = {f.name: getattr(extension, f.name) for f in dataclasses.fields(extension)}
+    return {"extension": extension.name, **thaw(fields)}
+
+
+def refuse_together(others: Mapping[str, str], config: PPOConfig) -> None:
+    """UserError where one of the settings `others` of `ppo:` is on; their values are what to say then."""
+    for name, why in others.items():
+        value = getattr(config, name)
+        if value not in (None, 0, ()):
+            shown = "" if isinstance(value, Section) else f" = {value!r}"
+            raise UserError(f"ppo.{name}{shown}: {why}")
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,9 @@ import jax.numpy as jnp
 import optax
 
 from bayessim_mjx.config import PPOConfig
-from bayessim_mjx.rl import episodes, losses, networks, normalise, ppo, sharding
+from bayessim_mjx.rl import catalogue, episodes, losses, networks, normalise, ppo, sharding, worlds
 from bayessim_mjx.rl.networks import Params, Policy
+from bayessim_mjx.rl.state import TrainState, policy_of
 
 if TYPE_CHECKING:
     from bayessim_mjx.distributions import Distribution
@@ -44,12 +45,12 @@ def loss(params: Params, observation: jax.Array, target: jax.Array, config: PPOC
 
 
 def update(
-    env: Env, config: PPOConfig, state: ppo.TrainState, domain: Distribution | None, teacher: Policy
-) -> tuple[ppo.TrainState, dict[str, jax.Array]]:
+    env: Env, config: PPOConfig, state: TrainState, domain: Distribution | None, teacher: Policy
+) -> tuple[TrainState, dict[str, jax.Array]]:
     """One iteration, to be jitted: the student's rollout, the teacher's actions there, epochs of minibatches."""
     key, collect_key, epochs_key = jax.random.split(state.key, 3)
-    group = teacher_group(env)
-    env_states, data = ppo._collect(env, config, state, domain, collect_key, (group,))
+    learner, group = catalogue.learner(env, config, state.mesh), teacher_group(env)
+    env_states, data = worlds.gather(learner, state, domain, collect_key, (group,))
     seen = data["observation"]["policy"]
     normalizer, observation = state.normalizer, seen
     if config.normalize_observations:  # learnt with the statistics that the student will act with
@@ -70,7 +71,7 @@ def update(
     )
     metrics: dict[str, Any] = {name: x.mean() for name, x in figures.items()} | {
         "Loss/learning_rate": rate,
-        "Policy/mean_std": jnp.exp(ppo.policy_of(after).distribution(seen)[1]).mean(),
+        "Policy/mean_std": jnp.exp(policy_of(after).distribution(seen)[1]).mean(),
         "env_steps": after.env_steps,
         **episodes.metrics(after.episodes),
     }

@@ -1,8 +1,13 @@
 """Returns and lengths of the episodes seen while training: running sums per world, and a window of the last ones."""
 
+from dataclasses import replace
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from flax import struct
+
+from bayessim_mjx.rl.sharding import FIRST
 
 WINDOW = 100
 
@@ -23,6 +28,11 @@ def init(partial: jax.Array) -> Episodes:
     """No episodes yet; partial [N] marks worlds whose first time limit comes early: it does not count as an episode."""
     zeros = jnp.zeros_like(partial)
     return Episodes(zeros, zeros, partial, jnp.zeros(WINDOW), jnp.zeros(WINDOW), jnp.zeros((), jnp.int32))
+
+
+def layout(everywhere: Any) -> Any:
+    """Where the counters lie, of their layout `everywhere`: the running sums with their worlds."""
+    return replace(everywhere, running_return=FIRST, running_length=FIRST, partial=FIRST)
 
 
 def update(episodes: Episodes, reward: jax.Array, terminated: jax.Array, truncated: jax.Array) -> Episodes:

@@ -1,20 +1,20 @@
 """Proximal policy optimisation (Schulman et al. 2017): the losses, and the epochs of minibatches over one batch."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import optax
-from flax import struct
 from jax.flatten_util import ravel_pytree
 from jax.sharding import Mesh
 
 from bayessim_mjx.config import PPOConfig
-from bayessim_mjx.mirrors import MirrorMap
-from bayessim_mjx.rl import networks, segments, sharding, symmetry
+from bayessim_mjx.rl import networks, segments, sharding
+from bayessim_mjx.rl.batch import Batch
+from bayessim_mjx.rl.extension import Learner
 from bayessim_mjx.rl.networks import Params
 
 MIN_LEARNING_RATE, MAX_LEARNING_RATE = 1e-5, 1e-2  # bounds of the adaptive schedule
@@ -23,24 +23,6 @@ RATE_FACTOR = 1.5
 # itself (H200, five epochs of a million: 4.4 ms against 1.3; of 65 536: .36 against .86)
 MANY = 200_000
 FARTHEST = 3.0  # log of the ratio of probabilities beyond which it goes on in a line
-
-
-@struct.dataclass
-class Batch:
-    """B transitions; observations normalised by statistics that include them."""
-
-    observation: jax.Array  # [B, S]
-    critic_observation: Any  # [B, S'] array
-    action: jax.Array  # [B, A] unclipped sample
-    mean: jax.Array  # [B, A] of the policy before learning
-    log_prob: jax.Array  # [B] by the policy that collected: with older statistics
-    value: jax.Array  # [B]
-    advantage: jax.Array  # [B]
-    returns: jax.Array  # [B]
-    log_std: jax.Array | None = None  # [B, A] like the mean, where it depends on the state
-    copies: symmetry.Copies | None = None  # mirror images, where ppo.symmetry is on
-    weight: jax.Array | None = None  # [B] of samples and copies, where these were joined
-    future: segments.Future | None = None  # where ppo.segment is: all arrays are then segments [B / L, L, ...]
 
 
 def surrogate_loss(
@@ -73,27 +55,26 @@ def standardise(x: jax.Array) -> jax.Array:
     return (x - x.mean()) / (x.std() + 1e-8)
 
 
-def loss(
-    params: Params, old_log_std: Any, batch: Batch, config: PPOConfig, mirrors: Sequence[MirrorMap] = ()
-) -> tuple[jax.Array, dict]:
-    """Surrogate + c_v value loss - c_e entropy [+ mirror loss], and the figures of this minibatch.
+def loss(params: Params, old_log_std: Any, batch: Batch, learner: Learner) -> tuple[jax.Array, dict]:
+    """Surrogate + c_v value loss - c_e entropy + the terms of extensions, and the figures of this minibatch.
 
     old_log_std [A] is that of the collecting policy; not used where the batch has its own. KL is of old || new,
-    analytic; it, the entropy and the clip fraction are of the batch's own samples, not of their mirrored copies.
+    analytic; it, the entropy and the clip fraction are of the batch's own samples, not of those that extensions add.
     """
-    known = None
+    config, known = learner.config, None
     if config.segment:
         batch, known = segments.renewed(params, batch, config)
     act, size = networks.activation(config.activation), batch.advantage.shape[0]
     if config.normalize_advantage_per_minibatch:
         batch = dataclasses.replace(batch, advantage=standardise(batch.advantage))
-    augmented = config.symmetry is not None and config.symmetry.use_data_augmentation
-    samples = symmetry.augmented(batch) if augmented else batch
+    samples = batch
+    for extension in learner.extensions:
+        samples = extension.samples(samples)
     means, log_stds = networks.gaussian(params["actor"], samples.observation, act)
     log_prob = networks.log_prob(means, log_stds, samples.action)  # of raw actions: tanh's slope cancels in the ratio
     surrogate = surrogate_loss(log_prob, samples.log_prob, samples.advantage, config.clip_param, samples.weight)
     value = value_loss(
-        networks.value(params, samples.critic_observation, act) if known is None or augmented else known,
+        networks.value(params, samples.critic_observation, act) if known is None or samples is not batch else known,
         samples.value,
         samples.returns,
         config.clip_param if config.use_clipped_value_loss else None,
@@ -111,29 +92,10 @@ def loss(
         "Loss/clip_fraction": (jnp.abs(jnp.exp(log_prob[:size] - batch.log_prob) - 1) > config.clip_param).mean(),
     }
     total = surrogate + config.value_loss_coef * value - config.entropy_coef * entropy
-    if config.symmetry is not None:
-        asymmetry = _asymmetry(params, batch, mean, means[size:] if augmented else None, config, mirrors)
-        metrics["Loss/symmetry"] = asymmetry
-        if config.symmetry.use_mirror_loss:
-            total = total + config.symmetry.mirror_loss_coeff * asymmetry
+    for extension in learner.extensions:
+        term, figures = extension.loss(params, batch, means, learner)
+        total, metrics = total if term is None else total + term, metrics | figures
     return total, metrics
-
-
-def _asymmetry(
-    params: Params,
-    batch: Batch,
-    mean: jax.Array,
-    mirrored: jax.Array | None,
-    config: PPOConfig,
-    mirrors: Sequence[MirrorMap],
-) -> jax.Array:
-    """The mirror loss; mirrored [B K, A]: mean actions at the copies, where they are known already."""
-    assert batch.copies is not None
-    if mirrored is None:
-        act = networks.activation(config.activation)
-        mirrored = networks.mean_action(params, batch.copies.observation, act)
-    mirrored = mirrored.reshape(len(mean), -1, mean.shape[-1])
-    return symmetry.mirror_loss(mean, mirrored, [mirror.action for mirror in mirrors])
 
 
 def adapt(learning_rate: jax.Array, kl: jax.Array, desired_kl: float) -> jax.Array:
@@ -173,19 +135,17 @@ def optimise(
     opt_state: optax.OptState,
     learning_rate: jax.Array,
     batch: Batch,
-    config: PPOConfig,
-    mirrors: Sequence[MirrorMap] = (),
-    mesh: Mesh | None = None,
+    learner: Learner,
 ) -> tuple[Params, optax.OptState, jax.Array, dict[str, jax.Array]]:
     """All epochs of minibatches: new parameters, Adam state, learning rate, and figures [epochs * minibatches] each."""
     old_log_std = params["actor"].get("log_std")
-    if not config.normalize_advantage_per_minibatch:
+    if not learner.config.normalize_advantage_per_minibatch:
         batch = dataclasses.replace(batch, advantage=standardise(batch.advantage))
 
     def objective(params: Params, part: Batch) -> tuple[jax.Array, dict]:
-        return loss(params, old_log_std, part, config, mirrors)
+        return loss(params, old_log_std, part, learner)
 
-    return descend(key, params, opt_state, learning_rate, batch, config, objective, mesh)
+    return descend(key, params, opt_state, learning_rate, batch, learner.config, objective, learner.mesh)
 
 
 def descend(

@@ -5,7 +5,9 @@ parameters' structure says what they are: without "log_std" the actor's last lay
 critic of one "head" stands on the actor's hidden layers.
 """
 
+import functools
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -13,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from bayessim_mjx.config import PPOConfig
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.rl import normalise, recurrent
 from bayessim_mjx.rl.normalise import Moments
@@ -62,44 +65,50 @@ def mlp(layers: list[Params], x: jax.Array, act: Callable[[jax.Array], jax.Array
     return x @ layers[-1]["w"] + layers[-1]["b"]
 
 
-def init(
-    key: jax.Array,
-    observation_size: int,
-    critic_size: int,
-    action_size: int,
-    hidden_actor: Sequence[int],
-    hidden_critic: Sequence[int],
-    init_std: float,
-    state_dependent_std: bool = False,
-    shared_trunk: bool = False,
-    memory: int = 0,
-    memory_cell: str = "gru",
-    weight_init: str = "orthogonal",
-) -> Params:
-    """Parameters of both networks; weight_init: see `mlp_init`.
+@dataclass(frozen=True)
+class Sizes:
+    """What the networks have to fit."""
+
+    policy: int  # numbers that the actor sees
+    critic: int
+    action: int  # without a memory
+
+
+def init(key: jax.Array, sizes: Sizes, config: PPOConfig) -> Params:
+    """Parameters of both networks: widths, kind and first weights as the settings say.
 
     Orthogonal weights make the actor's last layer small: the first policy is nearly N(0, init_std^2).
-    memory: units of a recurrent layer (`memory_cell`: gru or lstm) before the actor's others; 0: none.
     """
     actor_key, critic_key = jax.random.split(key)
-    layers = mlp_init(actor_key, [memory or observation_size, *hidden_actor, action_size], 0.01, weight_init)
-    actor: Params = {"layers": layers, "log_std": jnp.full(action_size, jnp.log(init_std))}
-    if state_dependent_std:  # outputs for the spread begin at init_std, orthogonal weights everywhere
-        bias = jnp.full(action_size, LOG_STD_LIMIT * np.arctanh(np.log(init_std) / LOG_STD_LIMIT))
-        weights = jnp.zeros_like(layers[-1]["w"])
-        if weight_init == "lecun_uniform":
-            weights = jax.nn.initializers.lecun_uniform()(jax.random.fold_in(actor_key, 2), weights.shape)
-        spread = {"w": weights, "b": bias}
+    layers = functools.partial(mlp_init, kind=config.weight_init)
+    actor = _actor(actor_key, sizes, config)
+    if config.shared_trunk:
+        return {"actor": actor, "critic": {"head": layers(critic_key, [config.hidden_actor[-1], 1], 1.0)}}
+    return {"actor": actor, "critic": {"layers": layers(critic_key, [sizes.critic, *config.hidden_critic, 1], 1.0)}}
+
+
+def _actor(key: jax.Array, sizes: Sizes, config: PPOConfig) -> Params:
+    """Its layers, the spread of its actions, and a recurrent layer before all where there is a memory."""
+    widths = [config.memory or sizes.policy, *config.hidden_actor, sizes.action]
+    layers = mlp_init(key, widths, 0.01, config.weight_init)
+    actor: Params = {"layers": layers, "log_std": jnp.full(sizes.action, jnp.log(config.init_std))}
+    if config.state_dependent_std:
+        spread = _spread(jax.random.fold_in(key, 2), layers[-1]["w"], config)
         joined = jax.tree.map(lambda mean, log_std: jnp.concatenate([mean, log_std], -1), layers[-1], spread)
         actor = {"layers": [*layers[:-1], joined]}
-    if memory:
-        actor[memory_cell] = recurrent.init(jax.random.fold_in(actor_key, 1), observation_size, memory, memory_cell)
-    if shared_trunk:
-        return {"actor": actor, "critic": {"head": mlp_init(critic_key, [hidden_actor[-1], 1], 1.0, weight_init)}}
-    return {
-        "actor": actor,
-        "critic": {"layers": mlp_init(critic_key, [critic_size, *hidden_critic, 1], 1.0, weight_init)},
-    }
+    if config.memory:
+        memory_key = jax.random.fold_in(key, 1)
+        actor[config.memory_cell] = recurrent.init(memory_key, sizes.policy, config.memory, config.memory_cell)
+    return actor
+
+
+def _spread(key: jax.Array, like: jax.Array, config: PPOConfig) -> Params:
+    """Outputs for a spread that depends on the state: they begin at init_std, orthogonal weights everywhere."""
+    bias = jnp.full(like.shape[-1], LOG_STD_LIMIT * np.arctanh(np.log(config.init_std) / LOG_STD_LIMIT))
+    weights = jnp.zeros_like(like)
+    if config.weight_init == "lecun_uniform":
+        weights = jax.nn.initializers.lecun_uniform()(key, weights.shape)
+    return {"w": weights, "b": bias}
 
 
 def _trunk(actor: Params, x: Any) -> jax.Array:

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from bayessim_mjx.config import PPOConfig
 from bayessim_mjx.errors import UserError
+from bayessim_mjx.rl.extension import Extension
 
 if TYPE_CHECKING:
     from bayessim_mjx.env import Env, State
@@ -33,6 +36,20 @@ def for_policy(env: Env) -> Any:
 def for_teacher(env: Env) -> Any:
     """`env` with a group "teacher": its "policy" with theta at the end."""
     return _knowing(env, "policy", "teacher", "ppo.teacher")
+
+
+@dataclass(frozen=True)
+class CriticTheta(Extension):
+    """`ppo.critic_theta` as an extension of PPO."""
+
+    name: ClassVar[str] = "critic_theta"
+
+    @classmethod
+    def of(cls, config: PPOConfig) -> CriticTheta | None:
+        return cls() if config.critic_theta else None
+
+    def shown(self, env: Env) -> Any:
+        return for_critic(env)
 
 
 class ThetaSeen:

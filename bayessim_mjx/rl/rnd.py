@@ -5,8 +5,8 @@ predictor learns on the same observations: what ends an episode is as novel as i
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -14,9 +14,11 @@ import optax
 from flax import struct
 from jax.sharding import Mesh
 
-from bayessim_mjx.config import RNDConfig
+from bayessim_mjx.config import PPOConfig, RNDConfig
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.rl import episodes, losses, networks, normalise
+from bayessim_mjx.rl import episodes, losses, networks, normalise, sharding
+from bayessim_mjx.rl.extension import Extension, Figures, Learner, Sizes
+from bayessim_mjx.rl.sharding import FIRST
 
 EPSILON = 1e-2  # added to the standard deviation of observations
 UNTIL = 1e8  # samples after which the statistics stay as they are
@@ -175,3 +177,45 @@ def metrics(rnd: RND, extrinsic: jax.Array, config: RNDConfig) -> dict[str, jax.
         "Rnd/mean_intrinsic_reward": episodes.metrics(rnd.episodes)["Train/mean_reward"],
         "Rnd/weight": weight(config, rnd.steps),
     }
+
+
+@dataclass(frozen=True)
+class Novelty(Extension):
+    """`ppo.rnd` as an extension of PPO."""
+
+    settings: RNDConfig
+    name: ClassVar[str] = "rnd"
+    incompatible_with = RNDConfig.incompatible_with
+    means = ("Loss/rnd",)
+    latest = ("Rnd/mean_extrinsic_reward", "Rnd/mean_intrinsic_reward", "Rnd/weight")
+
+    @classmethod
+    def of(cls, config: PPOConfig) -> "Novelty | None":
+        return None if config.rnd is None else cls(config.rnd)
+
+    def groups(self, sizes: Mapping[str, tuple[int, ...]]) -> tuple[str, ...]:
+        return groups(sizes, self.settings)
+
+    def init(self, key: jax.Array, sizes: Sizes, config: PPOConfig) -> RND:
+        size = sum(sizes.observation[group][0] for group in self.groups(sizes.observation))
+        return init(jax.random.fold_in(key, 1), size, sizes.partial, self.settings)
+
+    def reward(self, own: RND, data: dict, key: jax.Array, learner: Learner) -> tuple[RND, jax.Array, Figures]:
+        """The reward is for the novelty before the predictor learns what was collected."""
+        config, mesh = learner.config, learner.mesh
+        after = joined(data["final_observation"], self.groups(learner.env.observation_size))
+        ends = (data["terminated"], data["truncated"])
+        own, x, bonus = reward(own, after, *ends, self.settings, learner.env.dt, config.gamma)
+        x = sharding.pinned(x, mesh).reshape(-1, x.shape[-1])
+        own, values = train(key, own, x, self.settings, config.num_epochs, config.num_minibatches, mesh)
+        return own, bonus, {"Loss/rnd": values}
+
+    def metrics(self, own: RND, figures: Figures, learner: Learner) -> Figures:
+        return metrics(own, figures["Train/mean_reward"], self.settings)
+
+    def layout(self, own: RND) -> Any:
+        everywhere = super().layout(own)
+        return replace(everywhere, discounted=FIRST, episodes=episodes.layout(everywhere.episodes))
+
+    def in_worlds_of(self, own: RND, other: RND) -> RND:
+        return replace(own, discounted=other.discounted, episodes=other.episodes)

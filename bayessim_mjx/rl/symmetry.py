@@ -2,19 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 
-from bayessim_mjx.config import PPOConfig
+from bayessim_mjx.config import PPOConfig, SymmetryConfig
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.mirrors import MirrorMap, SignedPermutation
+from bayessim_mjx.rl import networks, normalise
+from bayessim_mjx.rl.batch import Batch
+from bayessim_mjx.rl.extension import Extension, Figures, Learner
+from bayessim_mjx.rl.networks import Params
+from bayessim_mjx.rl.state import TrainState
 
 if TYPE_CHECKING:
     from bayessim_mjx.env import Env
+
+
+NAME = "symmetry"
 
 
 @struct.dataclass
@@ -29,10 +38,8 @@ class Copies:
     weight: jax.Array  # [B, K] up to 1: how much likelier the policy would have done this than its own original
 
 
-def mirrors(env: Env, config: PPOConfig, groups: Iterable[str]) -> tuple[MirrorMap, ...]:
-    """The maps of the environment; none where ppo.symmetry is off. UserError where it has none, or none for a group."""
-    if config.symmetry is None:
-        return ()
+def mirrors(env: Env, groups: Iterable[str]) -> tuple[MirrorMap, ...]:
+    """The maps of the environment. UserError where it has none, or none for a group."""
     maps = tuple(getattr(env, "mirrors", ()))
     name = getattr(env, "name", "") or type(env).__name__
     if not maps:
@@ -54,14 +61,14 @@ def images(x: jax.Array, parts: Sequence[SignedPermutation]) -> jax.Array:
     return jnp.stack([mirrored(x, part) for part in parts], -2)
 
 
-def augmented(batch: Any) -> Any:
+def augmented(batch: Batch) -> Batch:
     """The B samples of a minibatch and behind them their K copies: B (1 + K). What is for KL and entropy stays B.
 
     A copy was drawn by the mirrored policy, which tells how often it occurs: by its weight p(M a | M s) / p(a | s),
     held at 1, it counts as if the policy itself had drawn it. Without, what a policy far from symmetric would never do
     drives it away (Ant: returns fell from 3000 to 1000).
     """
-    copies = batch.copies
+    copies = batch.extra[NAME]
 
     def join(name: str) -> jax.Array:
         own = getattr(batch, name)
@@ -70,10 +77,11 @@ def augmented(batch: Any) -> Any:
     def again(x: jax.Array) -> jax.Array:
         return jnp.concatenate([x, jnp.repeat(x, copies.value.shape[1], axis=0)])
 
-    both = {name: join(name) for name in ("observation", "critic_observation", "action", "log_prob", "value")}
+    both: dict[str, Any] = {name: join(name) for name in ("observation", "critic_observation", "action", "log_prob", "value")}
     both |= {name: again(getattr(batch, name)) for name in ("advantage", "returns")}
     weight = jnp.concatenate([jnp.ones_like(batch.advantage), copies.weight.reshape(-1)])
-    return batch.replace(**both, weight=weight, copies=None)
+    extra = {name: x for name, x in batch.extra.items() if name != NAME}
+    return replace(batch, **both, weight=weight, extra=extra)
 
 
 def mirror_loss(mean: jax.Array, mean_of_copies: jax.Array, actions: Sequence[SignedPermutation]) -> jax.Array:
@@ -82,3 +90,65 @@ def mirror_loss(mean: jax.Array, mean_of_copies: jax.Array, actions: Sequence[Si
     mean [B, A] at the observations, mean_of_copies [B, K, A] at their mirror images.
     """
     return ((mean_of_copies - jax.lax.stop_gradient(images(mean, actions))) ** 2).mean()
+
+
+@dataclass(frozen=True)
+class Symmetry(Extension):
+    """`ppo.symmetry` as an extension of PPO."""
+
+    settings: SymmetryConfig
+    name: ClassVar[str] = NAME
+    incompatible_with = SymmetryConfig.incompatible_with
+    means = ("Loss/symmetry",)
+
+    @classmethod
+    def of(cls, config: PPOConfig) -> Symmetry | None:
+        return None if config.symmetry is None else cls(config.symmetry)
+
+    def check(self, learner: Learner) -> None:
+        self._maps(learner)
+
+    def _maps(self, learner: Learner) -> tuple[MirrorMap, ...]:
+        return mirrors(learner.env, {"policy", learner.critic_group})
+
+    def attach(
+        self,
+        state: TrainState,
+        data: dict,
+        normalizer: Mapping[str, normalise.Moments],
+        log_prob: jax.Array,
+        learner: Learner,
+    ) -> Copies:
+        """Mirror images [T, N, K, ...] of the collected transitions, as the collecting policy would have rated them."""
+        maps, group, config = self._maps(learner), learner.critic_group, learner.config
+        act = networks.activation(config.activation)
+
+        def seen(group: str, moments: Mapping[str, normalise.Moments]) -> jax.Array:
+            raw = images(data["observation"][group], [m.observation[group] for m in maps])
+            return normalise.normalise(moments[group], raw) if config.normalize_observations else raw
+
+        observation, critic_observation = seen("policy", normalizer), seen(group, normalizer)
+        action = images(data["extras"]["action"], [m.action for m in maps])
+        collector = networks.gaussian(state.params["actor"], seen("policy", state.normalizer), act)
+        density = networks.log_prob(*collector, action)
+        value = networks.value(state.params, critic_observation, act)
+        weight = jnp.exp(jnp.minimum(0.0, density - log_prob[..., None]))
+        return Copies(observation, critic_observation, action, density, value, weight)
+
+    def samples(self, batch: Batch) -> Batch:
+        return augmented(batch) if self.settings.use_data_augmentation else batch
+
+    def loss(
+        self, params: Params, batch: Batch, means: jax.Array, learner: Learner
+    ) -> tuple[jax.Array | None, Figures]:
+        """The mirror loss; mean actions at the copies are known already where these are samples too."""
+        mean, copies = means[: len(batch.action)], batch.extra[NAME]
+        if self.settings.use_data_augmentation:  # the copies are the first samples behind the batch
+            mirrored = means[len(mean) : len(mean) * (1 + copies.value.shape[1])]
+        else:
+            act = networks.activation(learner.config.activation)
+            mirrored = networks.mean_action(params, copies.observation, act)
+        mirrored = mirrored.reshape(len(mean), -1, mean.shape[-1])
+        asymmetry = mirror_loss(mean, mirrored, [mirror.action for mirror in self._maps(learner)])
+        term = self.settings.mirror_loss_coeff * asymmetry if self.settings.use_mirror_loss else None
+        return term, {"Loss/symmetry": asymmetry}

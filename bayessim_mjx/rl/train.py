@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
@@ -15,10 +15,10 @@ from jax.sharding import Mesh
 
 from bayessim_mjx.config import PPOConfig
 from bayessim_mjx.device import cores
-from bayessim_mjx.errors import DivergedError
-from bayessim_mjx.rl import distil, ppo, sharding
+from bayessim_mjx.errors import DivergedError, UserError
+from bayessim_mjx.rl import catalogue, checks, distil, ppo, sharding
 from bayessim_mjx.rl.networks import Policy
-from bayessim_mjx.rl.ppo import TrainState
+from bayessim_mjx.rl.state import TrainState, policy_of
 
 if TYPE_CHECKING:
     from bayessim_mjx.distributions import Distribution
@@ -33,15 +33,12 @@ MEANS = (
 )  # fmt: skip
 LATEST = (
     "Train/mean_reward", "Train/mean_episode_length", "Loss/learning_rate", "Policy/mean_std", "env_steps",
-    "Rnd/mean_extrinsic_reward", "Rnd/mean_intrinsic_reward", "Rnd/weight",
 )  # fmt: skip
 
 
 def tags(config: PPOConfig) -> tuple[str, ...]:
     """What an update reports under these settings."""
-    always = MEANS + tuple(tag for tag in LATEST if not tag.startswith("Rnd/"))
-    novelty = () if config.rnd is None else ("Loss/rnd", *(tag for tag in LATEST if tag.startswith("Rnd/")))
-    return always + novelty + (() if config.symmetry is None else ("Loss/symmetry",))
+    return MEANS + LATEST + tuple(tag for e in catalogue.active(config) for tag in (*e.means, *e.latest))
 
 
 @lru_cache(maxsize=32)
@@ -51,16 +48,27 @@ def _make_chunk(env: Env, config: PPOConfig, distils: bool = False) -> Any:
     given: what an update needs besides, the domain, and the teacher where one is imitated.
     """
     update, reported = (distil.update, distil.TAGS) if distils else (ppo.update, tags(config))
+    latest = {*LATEST, *(tag for extension in catalogue.active(config) for tag in extension.latest)}
 
     def chunk(state: TrainState, given: tuple, count: jax.Array) -> tuple[TrainState, Metrics]:
         def body(_: jax.Array, carry: tuple[TrainState, Metrics]) -> tuple[TrainState, Metrics]:
             state, metrics = update(env, config, carry[0], *given)
-            return state, {k: v if k in LATEST else carry[1][k] + v / count for k, v in metrics.items()}
+            _check_announced(metrics, reported)
+            return state, {k: v if k in latest else carry[1][k] + v / count for k, v in metrics.items()}
 
         zeros = {tag: jnp.float32(0) for tag in reported} | {"env_steps": jnp.uint32(0)}
         return jax.lax.fori_loop(0, count, body, (state, zeros))
 
     return jax.jit(chunk, donate_argnums=0)
+
+
+def _check_announced(metrics: Metrics, reported: Sequence[str]) -> None:
+    """Refuse an extension whose figures are not those of its `means` and `latest`."""
+    if wrong := {*metrics} ^ {*reported}:
+        raise UserError(
+            f"ppo.extensions: {', '.join(sorted(wrong))}: the tags of an extension's figures have to be those that its "
+            "`means` and `latest` announce"
+        )
 
 
 def start(
@@ -73,7 +81,7 @@ def start(
     clock: int = 0,
 ) -> TrainState:
     """`ppo.init`, with the program of `run` compiled beside its own where there are processor cores for both."""
-    ppo.check(env, config, mesh)
+    checks.check(env, config, mesh)
     if cores() == 1 or jax.process_count() > 1:
         return ppo.init(env, config, key, domain, mesh, clock)
     given = _given(domain, teacher, mesh)
@@ -149,4 +157,4 @@ def train(
     if state is None:
         state = start(env, config, key, domain, mesh)
     state, metrics = run(env, config, state, domain, iterations, progress)
-    return ppo.policy_of(state), metrics
+    return policy_of(state), metrics

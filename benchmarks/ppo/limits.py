@@ -17,7 +17,10 @@ from mujoco import mjx
 from bayessim_mjx import config, device, registry, rl
 from bayessim_mjx.env import Task
 from bayessim_mjx.rl import ppo
+from bayessim_mjx.rl.catalogue import learner
 from bayessim_mjx.rl.train import LATEST
+from bayessim_mjx.rl.worlds import gather
+from bayessim_mjx.rl.worlds import reset as reset_worlds
 
 HUMANOID = (400, 200, 100)  # widths of Isaac Gym's Humanoid
 PEAK = {"NVIDIA H200": (494e12, 67e12, 4.8e12)}  # dense TF32 and float32 FLOP/s, bytes/s, as the data sheet says
@@ -128,8 +131,8 @@ def limit(task: str, worlds: int, say: Say) -> None:
     count = worlds * settings.num_steps
     say({"row": "programs", **row, "init": init_s, "update": update_s, "update_s": round(whole, 5),
          "train_steps_per_s": round(count / whole)})  # fmt: skip
-    reset = built(lambda state: ppo._reset(env, state.key, None, worlds), state)[0]
-    collect = built(lambda state: ppo._collect(env, settings, state, None, state.key), state)[0]
+    reset = built(lambda state: reset_worlds(env, state.key, None, worlds), state)[0]
+    collect = built(lambda state: gather(learner(env, settings), state, None, state.key), state)[0]
     resets, rollout = seconds(lambda: reset(state)), seconds(lambda: collect(state))
     physics = {n: seconds(bare(env, worlds, settings.num_steps * substeps, n == "lean")) for n in ("lean", "whole")}
     best, sgd = min(physics.values()), whole - rollout

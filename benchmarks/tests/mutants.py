@@ -25,7 +25,7 @@ from mutant_faults import FAULTS
 ROOT = Path(__file__).resolve().parents[2]
 COPIED = ("bayessim_mjx", "tasks", "cfg", "tests", "pyproject.toml")
 LOSSES, PPO, RND, SYMMETRY = (f"bayessim_mjx/rl/{name}.py" for name in ("losses", "ppo", "rnd", "symmetry"))
-GAE, EPISODES, TRAIN = (f"bayessim_mjx/rl/{name}.py" for name in ("gae", "episodes", "train"))
+GAE, EPISODES, TRAIN, WORLDS = (f"bayessim_mjx/rl/{name}.py" for name in ("gae", "episodes", "train", "worlds"))
 COMMAND = "bayessim_mjx/train.py"
 T = "tests/rl/test_"
 RESUME = ("tests/test_commands.py", "-k", "test_train_killed_and_resumed_equals_unkilled and 1")
@@ -58,13 +58,14 @@ PPO_MUTANTS = (
         "return x - x.mean()", (f"{T}losses.py", "-k", "standardised"), True,
     ),
     Mutant(
-        4, "mirror loss on the wrong half", LOSSES, "means[size:] if augmented", "means[:size] if augmented",
+        4, "mirror loss on the wrong half", SYMMETRY, "means[len(mean) : len(mean) * (1 + copies.value.shape[1])]",
+        "means[: len(mean) * copies.value.shape[1]]",
         (f"{T}symmetry.py", "-k", "weighted_and_added"), True,
     ),
     Mutant(
-        5, "log-probabilities of mirrored samples zeroed", PPO,
-        "symmetry.Copies(observation, critic_observation, action, log_prob, value, weight)",
-        "symmetry.Copies(observation, critic_observation, action, 0 * log_prob, value, weight)",
+        5, "log-probabilities of mirrored samples zeroed", SYMMETRY,
+        "Copies(observation, critic_observation, action, density, value, weight)",
+        "Copies(observation, critic_observation, action, 0 * density, value, weight)",
         (f"{T}symmetry.py", "-k", "seen_and_rated"), True,
     ),
     Mutant(
@@ -104,7 +105,7 @@ PPO_MUTANTS = (
         'return tree["state"].replace(learning_rate=state.learning_rate), marked(meta)', RESUME,
     ),
     Mutant(
-        15, "intrinsic reward never added", PPO, 'data | {"reward": data["reward"] + bonus}', "data",
+        15, "intrinsic reward never added", PPO, "reward + bonus", "reward",
         (f"{T}rnd.py", "-k", "sum_of_both"),
     ),
     Mutant(
@@ -113,11 +114,11 @@ PPO_MUTANTS = (
     ),
     Mutant(
         17, "resumed without the state of RND", COMMAND, RESTORED,
-        'return tree["state"].replace(rnd=state.rnd), marked(meta)', RESUME,
+        'return tree["state"].replace(extensions=state.extensions), marked(meta)', RESUME,
     ),
     Mutant(
-        18, "mirror loss never added", LOSSES, "total = total + config.symmetry.mirror_loss_coeff * asymmetry",
-        "pass", (f"{T}symmetry.py", "-k", "weighted_and_added"),
+        18, "mirror loss never added", LOSSES, "total if term is None else total + term", "total",
+        (f"{T}symmetry.py", "-k", "weighted_and_added"),
     ),
     Mutant(
         19, "arguments of KL swapped", LOSSES, "networks.kl(batch.mean, old, mean, log_std)",
@@ -169,7 +170,7 @@ PPO_MUTANTS = (
         (f"{T}train.py", "-k", "not_finite"),
     ),
     Mutant(
-        31, "one device's new episodes taken for those of all", PPO, "(EVERYWHERE, SECOND, FIRST, FIRST)",
+        31, "one device's new episodes taken for those of all", WORLDS, "(EVERYWHERE, SECOND, FIRST, FIRST)",
         "(EVERYWHERE, SECOND, FIRST, EVERYWHERE)", (f"{T}devices.py", "-m", "ci", "-k", "curves"),
     ),
 )  # fmt: skip

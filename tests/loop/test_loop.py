@@ -204,16 +204,17 @@ def test_a_policy_that_goes_on_starts_its_sums_anew_in_new_worlds(env):
     """Curiosity's discounted sums run over worlds: those of worlds that are gone do not go on in their successors."""
     curious = loop.make(settings("bayessim.modelClass=None", "ppo.rnd.weight=1.0"), env)
     state = loop.init(curious, trains=False)
-    rnd = state.train.rnd
+    rnd = state.train.extensions["rnd"]
     old = rnd.episodes.replace(running_return=jnp.full(8, 5.0), running_length=jnp.full(8, 7.0))
     rnd = rnd.replace(discounted=jnp.full(8, 3.0), episodes=old, steps=jnp.int32(24))
-    state = dataclasses.replace(state, train=state.train.replace(rnd=rnd, iteration=jnp.int32(3)))
+    state = dataclasses.replace(state, train=state.train.replace(extensions={"rnd": rnd}, iteration=jnp.int32(3)))
     after = loop.step(curious, state)[0].train
-    for sums in (after.rnd.discounted, after.rnd.episodes.running_return, after.episodes.running_return):
+    novel = after.extensions["rnd"]
+    for sums in (novel.discounted, novel.episodes.running_return, after.episodes.running_return):
         assert np.array_equal(sums, np.zeros(8))
-    assert np.array_equal(after.rnd.episodes.partial, after.episodes.partial)  # of the new worlds' first episodes
-    assert int(after.rnd.steps) == 24 and int(after.iteration) == 3  # the learner's own are kept
-    assert_equal(after.rnd.predictor, rnd.predictor)
+    assert np.array_equal(novel.episodes.partial, after.episodes.partial)  # of the new worlds' first episodes
+    assert int(novel.steps) == 24 and int(after.iteration) == 3  # the learner's own are kept
+    assert_equal(novel.predictor, rnd.predictor)
 
 
 @pytest.mark.slow

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from bayessim_mjx.config import PPOConfig
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.loop import sources
 from bayessim_mjx.parameters import Parameter, ParameterSpace
@@ -20,7 +21,8 @@ SPACE = ParameterSpace(
 
 
 def policy_of_size(actions: int) -> networks.Policy:
-    actor = networks.init(jax.random.PRNGKey(0), 3, 3, actions, (4,), (4,), 0.5)["actor"]
+    config = PPOConfig(hidden_actor=(4,), hidden_critic=(4,), init_std=0.5)
+    actor = networks.init(jax.random.PRNGKey(0), networks.Sizes(3, 3, actions), config)["actor"]
     return networks.Policy(actor=actor, normalizer=normalise.init(3), activation="elu", normalize=True, action_clip=1.0)
 
 

@@ -16,7 +16,7 @@ from bayessim_mjx.errors import UserError
 from bayessim_mjx.parameters import ParameterSpace
 from bayessim_mjx.parameters.schedule import OVER, Schedule
 from bayessim_mjx.physics import nuisance
-from bayessim_mjx.rl import ppo
+from bayessim_mjx.rl import worlds
 from bayessim_mjx.rl.recurrent import remembering
 from bayessim_mjx.rollout import collect, rollout
 
@@ -183,7 +183,7 @@ def test_training_draws_parameters_wider_and_wider() -> None:
     """theta = 1 + min(clock / 20, 1) (draw - 1)."""
     env = ramped()
     domain, key = Distribution.prior(env.space, 1), jax.random.PRNGKey(0)
-    draw = jax.jit(lambda clock: ppo._reset(env, key, domain, 32, clock=clock))
+    draw = jax.jit(lambda clock: worlds.reset(env, key, domain, 32, clock=clock))
     full = np.asarray(draw(OVER).pipeline_state.theta)
     assert np.ptp(full[:, 0]) > 1.5
     for clock, s in ((0, 0.0), (5, 0.25), (19, 0.95), (20, 1.0)):
@@ -210,7 +210,7 @@ def test_updates_carry_the_clock_on(wrapped: bool) -> None:
     domain, key = Distribution.prior(env.space, 1), jax.random.PRNGKey(0)
     state, seen = rl.init(env, config, key, domain, clock=5), []
     assert np.ptp(state.env_states.pipeline_state.theta[:, 0]) < 0.5
-    step = ppo.make_update(env, config)
+    step = rl.make_update(env, config)
     for i in range(4):
         state, metrics = step(state, domain)
         seen.append(np.asarray(state.env_states.info["nuisance"].course.clock))
@@ -242,7 +242,7 @@ def test_new_parameters_come_at_the_first_reset_after_so_many_steps(frequency: i
 def history(env: Any) -> tuple[np.ndarray, ...]:
     """theta, gravity, bias and angle [24, 8, .] of 8 worlds that collect 24 steps, four in an update."""
     domain, zero = Distribution.prior(env.space, 1), jnp.zeros((8, 1))
-    reset = lambda key, worlds: ppo._reset(env, key, domain, worlds)  # noqa: E731
+    reset = lambda key, worlds: worlds.reset(env, key, domain, worlds)  # noqa: E731
 
     @jax.jit
     def updates(key: jax.Array) -> tuple:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from bayessim_mjx import registry
+from bayessim_mjx.config import PPOConfig
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.rl import export, networks, normalise, recurrent
 from bayessim_mjx.rl.networks import Policy
@@ -25,7 +26,8 @@ def env():
 def policy(activation="elu", state_dependent_std=False, size=3, actions=1, **changes):
     """A policy with statistics of its own, whose actions reach their limits."""
     keys = jax.random.split(jax.random.PRNGKey(1))
-    params = networks.init(keys[0], size, size, actions, (16, 8), (8,), 1.0, state_dependent_std)
+    config = PPOConfig(hidden_actor=(16, 8), hidden_critic=(8,), state_dependent_std=state_dependent_std)
+    params = networks.init(keys[0], networks.Sizes(size, size, actions), config)
     layers = params["actor"]["layers"]
     actor = {**params["actor"], "layers": [*layers[:-1], jax.tree.map(lambda x: 60 * x, layers[-1])]}
     scale = jnp.resize(SPREAD, size)
@@ -60,7 +62,8 @@ def test_every_kind_of_policy_answers_alike_in_any_batch(env, kind, tmp_path):
 @pytest.mark.parametrize(("cell", "numbers"), [("gru", 4), ("lstm", 8)])
 def test_a_memory_goes_in_and_comes_out(env, tmp_path, cell, numbers):
     """Three steps from zeros: the file's actions and memories are those of the policy."""
-    params = networks.init(jax.random.PRNGKey(0), 3, 3, 1, (8,), (8,), 1.0, memory=4, memory_cell=cell)
+    config = PPOConfig(hidden_actor=(8,), hidden_critic=(8,), memory=4, memory_cell=cell)
+    params = networks.init(jax.random.PRNGKey(0), networks.Sizes(3, 3, 1), config)
     actor = {**params["actor"], "layers": jax.tree.map(lambda x: 9 * x, params["actor"]["layers"])}
     p, remembering = Policy(actor, normalise.init(3)), recurrent.remembering(env, numbers)
     assert export.write(tmp_path / "policy.onnx", p, remembering) < 2e-6

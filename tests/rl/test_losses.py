@@ -10,6 +10,7 @@ import pytest
 
 from bayessim_mjx.config import PPOConfig
 from bayessim_mjx.rl import losses, networks
+from bayessim_mjx.rl.extension import Learner
 
 CONFIG = PPOConfig(
     num_envs=4, num_steps=4, num_epochs=1, num_minibatches=1, schedule="fixed", hidden_actor=(8,), hidden_critic=(8,)
@@ -23,7 +24,7 @@ def config(**changes):
 def example(size=16, seed=0, cfg=CONFIG):
     """Parameters, and a batch that they collected themselves: old and new policy agree."""
     keys = jax.random.split(jax.random.PRNGKey(seed), 5)
-    params = networks.init(keys[0], 3, 2, 2, cfg.hidden_actor, cfg.hidden_critic, 0.7)
+    params = networks.init(keys[0], networks.Sizes(3, 2, 2), dataclasses.replace(cfg, init_std=0.7))
     obs, critic_obs = jax.random.normal(keys[1], (size, 3)), jax.random.normal(keys[2], (size, 2))
     act = networks.activation(cfg.activation)
     mean, log_std = networks.mean_action(params, obs, act), params["actor"]["log_std"]
@@ -38,7 +39,7 @@ def example(size=16, seed=0, cfg=CONFIG):
 
 def optimise(params, batch, cfg, rate=1e-3, seed=1):
     state = losses.optimiser_init(params)
-    return losses.optimise(jax.random.PRNGKey(seed), params, state, jnp.float32(rate), batch, cfg)
+    return losses.optimise(jax.random.PRNGKey(seed), params, state, jnp.float32(rate), batch, Learner(None, cfg))
 
 
 def change(old, new):
@@ -83,9 +84,9 @@ def test_value_loss_takes_the_worse_of_value_and_clipped_value(value, clip, expe
 
 def test_loss_is_the_weighted_sum_with_entropy_subtracted():
     params, batch = example()
-    parts = losses.loss(params, params["actor"]["log_std"], batch, CONFIG)[1]
+    parts = losses.loss(params, params["actor"]["log_std"], batch, Learner(None, CONFIG))[1]
     cfg = config(value_loss_coef=3.0, entropy_coef=0.5)
-    total, _ = losses.loss(params, params["actor"]["log_std"], batch, cfg)
+    total, _ = losses.loss(params, params["actor"]["log_std"], batch, Learner(None, cfg))
     expected = parts["Loss/surrogate"] + 3 * parts["Loss/value"] - 0.5 * parts["Loss/entropy"]
     assert total == pytest.approx(float(expected), rel=1e-5)
     # mean ratio 1: the surrogate is minus the mean advantage, the value error the mean squared advantage
@@ -107,14 +108,16 @@ def test_reported_kl_is_of_the_old_policy_from_the_new():
     layers = params["actor"]["layers"]
     layers = [*layers[:-1], {"w": 0 * layers[-1]["w"], "b": jnp.array([1.0, 0.0])}]
     params["actor"] = {"layers": layers, "log_std": jnp.log(jnp.array([2.0, 1.0]))}
-    metrics = losses.loss(params, jnp.zeros(2), batch.replace(mean=jnp.zeros((16, 2))), CONFIG)[1]
+    metrics = losses.loss(params, jnp.zeros(2), batch.replace(mean=jnp.zeros((16, 2))), Learner(None, CONFIG))[1]
     assert metrics["Loss/kl"] == pytest.approx(math.log(2) + 0.25 - 0.5, rel=1e-5)
 
 
 def test_clip_fraction_counts_ratios_outside():
     params, batch = example()
     shift = jnp.zeros(16).at[:4].set(0.3)  # ratio exp(-0.3) = 0.74
-    metrics = losses.loss(params, jnp.zeros(2), batch.replace(log_prob=batch.log_prob + shift), CONFIG)[1]
+    metrics = losses.loss(params, jnp.zeros(2), batch.replace(log_prob=batch.log_prob + shift), Learner(None, CONFIG))[
+        1
+    ]
     assert metrics["Loss/clip_fraction"] == pytest.approx(0.25)
 
 
@@ -148,7 +151,9 @@ def test_first_minibatch_leaves_the_adaptive_rate_alone_and_later_ones_obey_it()
     for step in range(3):
         fixed, number = config(schedule="fixed"), jnp.float32(1e-3 / 1.5**step)
         batch_ = batch.replace(advantage=batch.advantage)
-        expected, state, _, _ = losses.optimise(jax.random.PRNGKey(step), expected, state, number, batch_, fixed)
+        expected, state, _, _ = losses.optimise(
+            jax.random.PRNGKey(step), expected, state, number, batch_, Learner(None, fixed)
+        )
     np.testing.assert_allclose(change(params, after), change(params, expected), atol=2e-6)
     assert rate == pytest.approx(1e-3 / 2.25, rel=1e-5)
 

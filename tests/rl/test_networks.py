@@ -6,12 +6,19 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from bayessim_mjx.config import PPOConfig
 from bayessim_mjx.rl import networks, normalise
 from bayessim_mjx.rl.networks import Policy
 
 
+def made(policy, critic, action, hidden_actor, hidden_critic, init_std, **changes):
+    """Parameters for observations of `policy` and `critic` numbers."""
+    config = PPOConfig(hidden_actor=hidden_actor, hidden_critic=hidden_critic, init_std=init_std, **changes)
+    return networks.init(jax.random.PRNGKey(0), networks.Sizes(policy, critic, action), config)
+
+
 def test_weights_are_orthogonal_and_the_first_policy_is_nearly_its_noise():
-    params = networks.init(jax.random.PRNGKey(0), 5, 7, 2, (16, 16), (8,), 0.5)
+    params = made(5, 7, 2, (16, 16), (8,), 0.5)
     w = np.asarray(params["actor"]["layers"][1]["w"])
     np.testing.assert_allclose(w @ w.T, 2 * np.eye(16), atol=1e-5)
     obs = jax.random.normal(jax.random.PRNGKey(1), (100, 5))
@@ -35,7 +42,7 @@ def test_kl_is_zero_for_equal_and_known_for_different_gaussians():
 
 
 def policy(**changes):
-    params = networks.init(jax.random.PRNGKey(0), 3, 3, 2, (8,), (8,), 1.0)
+    params = made(3, 3, 2, (8,), (8,), 1.0)
     return Policy(params["actor"], normalise.init(3), **changes)
 
 
@@ -117,7 +124,7 @@ def test_divergence_of_squashed_policies_is_that_of_their_gaussians():
 
 
 def test_a_spread_that_depends_on_the_state_begins_at_init_std_and_stays_bounded():
-    params = networks.init(jax.random.PRNGKey(0), 3, 3, 2, (8,), (8,), 0.3, state_dependent_std=True)
+    params = made(3, 3, 2, (8,), (8,), 0.3, state_dependent_std=True)
     x = jax.random.normal(jax.random.PRNGKey(1), (50, 3))
     mean, log_std = networks.gaussian(params["actor"], x, jnp.tanh)
     assert mean.shape == log_std.shape == (50, 2)
@@ -129,22 +136,17 @@ def test_a_spread_that_depends_on_the_state_begins_at_init_std_and_stays_bounded
 
 
 def test_lecun_uniform_weights_have_the_variance_of_one_over_their_inputs():
-    made = networks.init(
-        jax.random.PRNGKey(0), 50, 80, 30, (400,), (300,), 0.5, state_dependent_std=True, weight_init="lecun_uniform"
-    )
-    for layer in [*made["actor"]["layers"], *made["critic"]["layers"]]:
+    params = made(50, 80, 30, (400,), (300,), 0.5, state_dependent_std=True, weight_init="lecun_uniform")
+    for layer in [*params["actor"]["layers"], *params["critic"]["layers"]]:
         inputs = layer["w"].shape[0]
         assert float(jnp.abs(layer["w"]).max()) <= (3 / inputs) ** 0.5
         assert float(layer["w"].var()) * inputs == pytest.approx(1, abs=0.15)
-    spread = networks.gaussian(made["actor"], jnp.zeros((1, 50)), jnp.tanh)[1]
+    spread = networks.gaussian(params["actor"], jnp.zeros((1, 50)), jnp.tanh)[1]
     np.testing.assert_allclose(jnp.exp(spread), 0.5, rtol=1e-5)
 
 
 def test_means_are_the_same_with_either_kind_of_spread():
-    plain, dependent = (
-        networks.init(jax.random.PRNGKey(0), 3, 3, 2, (8,), (8,), 0.3, state_dependent_std=flag)
-        for flag in (False, True)
-    )
+    plain, dependent = (made(3, 3, 2, (8,), (8,), 0.3, state_dependent_std=flag) for flag in (False, True))
     x = jnp.ones((4, 3))
     mean = networks.mean_action(plain, x, jnp.tanh)
     np.testing.assert_allclose(networks.mean_action(dependent, x, jnp.tanh), mean, rtol=1e-5)
@@ -160,5 +162,5 @@ def test_a_shared_trunk_is_trained_by_both():
     slope = jax.grad(lambda p: networks.value(p, x, jnp.tanh))(params)["actor"]["layers"]
     assert slope[0]["w"][0, 0] == pytest.approx(3 * 0.5 * (1 - np.tanh(0.5) ** 2), rel=1e-5)
     assert slope[1]["w"][0, 0] == 0
-    made = networks.init(jax.random.PRNGKey(0), 5, 5, 2, (8, 6), (3,), 1.0, shared_trunk=True)
-    assert made["critic"]["head"][0]["w"].shape == (6, 1)
+    params = made(5, 5, 2, (8, 6), (3,), 1.0, shared_trunk=True)
+    assert params["critic"]["head"][0]["w"].shape == (6, 1)

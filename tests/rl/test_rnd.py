@@ -11,7 +11,8 @@ import pytest
 from bayessim_mjx import rl
 from bayessim_mjx.config import PPOConfig, RNDConfig, WeightSchedule
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.rl import normalise, ppo, rnd
+from bayessim_mjx.rl import normalise, ppo, rnd, worlds
+from bayessim_mjx.rl.catalogue import learner
 from bayessim_mjx.rl.train import tags
 
 RND = RNDConfig(num_outputs=2, weight=1.0)
@@ -175,17 +176,19 @@ def test_novelty_is_that_of_the_true_last_observation_and_is_learnt_there():
 
     @jax.jit
     def collect_and_rate(state):
-        _, data = ppo._collect(env, setting, state, None, state.key)
-        return ppo._novelty(env, setting, state, data, key(2))
+        known = learner(env, setting)
+        _, data = worlds.gather(known, state, None, state.key)
+        return rnd.Novelty(setting.rnd).reward(state.extensions["rnd"], data, key(2), known)
 
+    networks = state.extensions["rnd"]
     novel, bonus, losses = collect_and_rate(state)
     times = jnp.tile(jnp.arange(1.0, 5.0), 2)[:, None]
     np.testing.assert_allclose(novel.states.mean, 2.5, rtol=1e-5)
     np.testing.assert_allclose(novel.states.var, 1.25, rtol=1e-4)
     x = (times - 2.5) / (1.25**0.5 + 0.01)
-    expected = 2.0 * 0.5 * rnd.novelty(state.rnd, x, setting.rnd)  # the networks from before this update
+    expected = 2.0 * 0.5 * rnd.novelty(networks, x, setting.rnd)  # the networks from before this update
     np.testing.assert_allclose(bonus, np.tile(expected[:, None], (1, 16)), rtol=1e-4)
-    whole = rnd.loss(state.rnd.predictor, state.rnd, x, setting.rnd)
+    whole = rnd.loss(networks.predictor, networks, x, setting.rnd)
     assert losses["Loss/rnd"].shape == (4,) and losses["Loss/rnd"][0] == pytest.approx(float(whole), rel=0.3)
 
 
@@ -209,7 +212,7 @@ def test_the_learner_gets_the_sum_of_both_rewards_and_statistics_keep_them_apart
         abs(metrics["Train/mean_reward"]) < 4 and metrics["Rnd/mean_extrinsic_reward"] == metrics["Train/mean_reward"]
     )
     assert metrics["Rnd/weight"] == 4.0
-    assert after.rnd.steps == 8
+    assert after.extensions["rnd"].steps == 8
 
 
 MOVING = config(
@@ -225,12 +228,11 @@ def test_training_in_two_halves_is_training_at_once():
     saved = jax.tree.map(np.array, jax.device_get(half))
     resumed, again = rl.run(WALK, MOVING, saved, iterations=2)
     assert_bitwise(whole, resumed)
-    assert whole.rnd.steps == 32 and metrics["Rnd/weight"] == again["Rnd/weight"] == pytest.approx(0.2)
-    assert_bitwise(whole.rnd.target, start.rnd.target)
-    assert whole.rnd.states.count == whole.rnd.sums.count == 4 * 8 * 16
-    assert all(
-        (a != b).any() for a, b in zip(*map(jax.tree.leaves, (start.rnd.predictor, half.rnd.predictor)), strict=True)
-    )
+    before, middle, end = (state.extensions["rnd"] for state in (start, half, whole))
+    assert end.steps == 32 and metrics["Rnd/weight"] == again["Rnd/weight"] == pytest.approx(0.2)
+    assert_bitwise(end.target, before.target)
+    assert end.states.count == end.sums.count == 4 * 8 * 16
+    assert all((a != b).any() for a, b in zip(*map(jax.tree.leaves, (before.predictor, middle.predictor)), strict=True))
 
 
 def test_without_weight_it_changes_nothing_and_with_weight_it_does():
@@ -238,7 +240,7 @@ def test_without_weight_it_changes_nothing_and_with_weight_it_does():
     plain, idle, busy = (
         rl.run(WALK, cfg, rl.init(WALK, cfg, key(0)), iterations=2)[0] for cfg in (CONFIG, config(weight=0.0), MOVING)
     )
-    assert plain.rnd is None
+    assert plain.extensions == {}
     assert_bitwise(plain.key, idle.key)
     for x, y in zip(*map(jax.tree.leaves, (plain.params, idle.params)), strict=True):
         np.testing.assert_allclose(x, y, atol=1e-4)

@@ -10,7 +10,8 @@ import pytest
 from bayessim_mjx import rl
 from bayessim_mjx.config import PPOConfig
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.rl import losses, ppo, segments
+from bayessim_mjx.rl import losses, segments, transitions, worlds
+from bayessim_mjx.rl.catalogue import learner
 
 CONFIG = PPOConfig(
     num_envs=4, num_steps=6, num_epochs=2, num_minibatches=2, segment=3, normalize_advantage_per_minibatch=True,
@@ -96,9 +97,10 @@ def test_one_segment_of_all_steps_is_the_estimate_of_the_whole_batch():
     env = probes.Walk()
     env.dt = 1.0
     state = rl.init(env, config, jax.random.PRNGKey(0))
-    _, data = ppo._collect(env, config, state, None, jax.random.PRNGKey(1))
-    cut = ppo._batch(env, config, state, data, state.normalizer)
-    whole = ppo._batch(env, dataclasses.replace(config, segment=0), state, data, state.normalizer)
+    _, data = worlds.gather(learner(env, config), state, None, jax.random.PRNGKey(1))
+    cut = transitions.batch(learner(env, config), state, data, state.normalizer)
+    uncut = learner(env, dataclasses.replace(config, segment=0))
+    whole = transitions.batch(uncut, state, data, state.normalizer)
     assert cut.advantage.shape == (4, 6) and cut.future.last.shape[0] == 4
     renewed = segments.renewed(state.params, cut, config)[0]
     for name in ("advantage", "returns"):  # step-major there, world-major here

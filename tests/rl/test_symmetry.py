@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import types
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +14,9 @@ from bayessim_mjx import rl
 from bayessim_mjx.config import PPOConfig, SymmetryConfig
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.mirrors import MirrorMap
-from bayessim_mjx.rl import losses, networks, normalise, ppo, symmetry
+from bayessim_mjx.rl import losses, networks, normalise, symmetry
+from bayessim_mjx.rl.catalogue import active, learner
+from bayessim_mjx.rl.extension import Learner
 from bayessim_mjx.rl.train import tags
 
 CONFIG = PPOConfig(
@@ -55,7 +58,7 @@ def example(size=8, mirrors=MIRRORS, activation="elu"):
 
 def _example(size, mirrors, activation):
     keys = jax.random.split(key(0), 4)
-    params = networks.init(keys[0], 3, 3, 2, (8,), (8,), 0.7)
+    params = networks.init(keys[0], networks.Sizes(3, 3, 2), dataclasses.replace(CONFIG, init_std=0.7))
     params["actor"]["layers"] = jax.tree.map(lambda x: 3 * x + 0.3, params["actor"]["layers"])  # far from symmetric
     act, log_std = networks.activation(activation), params["actor"]["log_std"]
 
@@ -72,12 +75,20 @@ def _example(size, mirrors, activation):
     _, mirrored, values = rate(seen, done)
     weight = jnp.minimum(1, jnp.exp(mirrored - log_prob[:, None]))
     copies = symmetry.Copies(seen, seen, done, mirrored, values, weight)
-    batch = losses.Batch(obs, obs, action, mean, log_prob, value, advantage, value + advantage, copies=copies)
+    batch = losses.Batch(
+        obs, obs, action, mean, log_prob, value, advantage, value + advantage, extra={"symmetry": copies}
+    )
     return params, batch
 
 
+def mirrored(cfg, mirrors=MIRRORS):
+    """A learner whose environment has these mirrors."""
+    return Learner(types.SimpleNamespace(mirrors=mirrors, observation_size={"policy": (3,)}), cfg, active(cfg))
+
+
 def loss(params, batch, cfg, mirrors=MIRRORS):
-    total, metrics = jax.jit(lambda p, b: losses.loss(p, p["actor"]["log_std"], b, cfg, mirrors))(params, batch)
+    learner = mirrored(cfg, mirrors)
+    total, metrics = jax.jit(lambda p, b: losses.loss(p, p["actor"]["log_std"], b, learner))(params, batch)
     return float(total), {name: float(x) for name, x in metrics.items()}
 
 
@@ -87,7 +98,7 @@ def test_images_are_signed_permutations_and_the_originals_come_first():
     np.testing.assert_array_equal(symmetry.images(x, [SWAP, TURN, BOTH]), expected)
     _, batch = example(size=5)
     both = symmetry.augmented(batch)
-    assert both.observation.shape == (20, 3) and both.copies is None
+    assert both.observation.shape == (20, 3) and both.extra == {}
     for name in ("observation", "critic_observation", "action", "log_prob", "value", "advantage", "returns"):
         np.testing.assert_array_equal(getattr(both, name)[:5], getattr(batch, name))
     for i in range(5):  # sample i's copies, with sample i's advantage and return
@@ -96,7 +107,7 @@ def test_images_are_signed_permutations_and_the_originals_come_first():
         np.testing.assert_array_equal(both.action[rows], symmetry.images(batch.action[i], [PAIR, KEEP, KEEP]))
         np.testing.assert_array_equal(both.advantage[rows], np.full(3, batch.advantage[i]))
         np.testing.assert_array_equal(both.returns[rows], np.full(3, batch.returns[i]))
-        np.testing.assert_array_equal(both.log_prob[rows], batch.copies.log_prob[i])
+        np.testing.assert_array_equal(both.log_prob[rows], batch.extra["symmetry"].log_prob[i])
 
 
 def test_augmentation_is_training_on_the_copies_as_samples_of_their_own():
@@ -106,8 +117,8 @@ def test_augmentation_is_training_on_the_copies_as_samples_of_their_own():
     both = symmetry.augmented(batch)
     plain = dataclasses.replace(both, mean=jnp.tile(batch.mean, (4, 1)))
     old = params["actor"]["log_std"]
-    one = jax.jit(jax.grad(lambda p: losses.loss(p, old, batch, config(augment=True), MIRRORS)[0]))(moved)
-    two = jax.jit(jax.grad(lambda p: losses.loss(p, old, plain, CONFIG)[0]))(moved)
+    one = jax.jit(jax.grad(lambda p: losses.loss(p, old, batch, mirrored(config(augment=True)))[0]))(moved)
+    two = jax.jit(jax.grad(lambda p: losses.loss(p, old, plain, mirrored(CONFIG))[0]))(moved)
     for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(two), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-5)
     with_copies, without = loss(moved, batch, config(augment=True))[1], loss(moved, batch, CONFIG, ())[1]
@@ -120,13 +131,14 @@ def test_augmentation_is_training_on_the_copies_as_samples_of_their_own():
 def test_copies_that_the_policy_would_never_make_do_not_move_it():
     """A policy that turns left where its mirror image would turn right learns from what it did itself alone."""
     params, batch = example()
-    copies = batch.copies.replace(log_prob=batch.copies.log_prob - 40, weight=jnp.exp(batch.copies.log_prob - 40))
+    copies = batch.extra["symmetry"]
+    copies = copies.replace(log_prob=copies.log_prob - 40, weight=jnp.exp(copies.log_prob - 40))
     old = params["actor"]["log_std"]
 
     def gradient(batch, cfg, mirrors):
-        return jax.jit(jax.grad(lambda p: losses.loss(p, old, batch, cfg, mirrors)[0]))(params)["actor"]
+        return jax.jit(jax.grad(lambda p: losses.loss(p, old, batch, mirrored(cfg, mirrors))[0]))(params)["actor"]
 
-    one = gradient(dataclasses.replace(batch, copies=copies), config(augment=True), MIRRORS)
+    one = gradient(dataclasses.replace(batch, extra={"symmetry": copies}), config(augment=True), MIRRORS)
     two = gradient(batch, CONFIG, ())
     for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(two), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-5)
@@ -143,10 +155,11 @@ def test_copies_keep_the_standardised_advantages_of_their_samples():
 def test_nothing_has_moved_before_the_first_minibatch_though_the_policy_is_not_symmetric():
     """All ratios are 1: the surrogate is minus the mean weighted advantage. With their own densities it is not."""
     params, batch = example()
+    copies = batch.extra["symmetry"]
     surrogate = loss(params, batch, config(augment=True))[1]["Loss/surrogate"]
-    weight = 1 + np.minimum(1, np.exp(batch.copies.log_prob - batch.log_prob[:, None])).sum(1)
+    weight = 1 + np.minimum(1, np.exp(copies.log_prob - batch.log_prob[:, None])).sum(1)
     assert surrogate == pytest.approx(-float((weight * batch.advantage).sum() / weight.sum()), abs=1e-5)
-    assert np.abs(batch.copies.log_prob - batch.log_prob[:, None]).max() > 1
+    assert np.abs(copies.log_prob - batch.log_prob[:, None]).max() > 1
 
 
 def test_mirror_loss_by_hand_and_without_gradient_through_its_target():
@@ -172,7 +185,9 @@ def test_mirror_loss_is_weighted_and_added_or_only_shown(augment):
     assert on - off == pytest.approx(3 * parts["Loss/symmetry"], rel=1e-4)
     assert same["Loss/symmetry"] == parts["Loss/symmetry"]
     act = networks.activation("elu")
-    mean, seen = (networks.mean_action(params, x, act) for x in (batch.observation, batch.copies.observation))
+    mean, seen = (
+        networks.mean_action(params, x, act) for x in (batch.observation, batch.extra["symmetry"].observation)
+    )
     expected = np.mean((seen - symmetry.images(mean, [PAIR, KEEP, KEEP])) ** 2)
     assert parts["Loss/symmetry"] == pytest.approx(float(expected), rel=1e-5)
 
@@ -205,7 +220,7 @@ def test_copies_are_seen_and_rated_as_the_collecting_policy_would():
     later = {"policy": normalise.Moments(jnp.array([0.6]), jnp.array([3.0]), jnp.float32(20))}
     policy = rl.policy_of(state)
     own = policy.log_prob(raw, action)
-    copies = ppo._copies(ONE_SIDED, cfg, state, data, later, own)
+    copies = symmetry.Symmetry(cfg.symmetry).attach(state, data, later, own, learner(ONE_SIDED, cfg))
     seen = normalise.normalise(later["policy"], -raw["policy"][0])
     np.testing.assert_allclose(copies.observation[0, :, 0], seen, rtol=1e-6)
     np.testing.assert_allclose(copies.weight[..., 0], np.minimum(1, np.exp(copies.log_prob[..., 0] - own)), rtol=1e-5)
@@ -214,7 +229,7 @@ def test_copies_are_seen_and_rated_as_the_collecting_policy_would():
     np.testing.assert_allclose(copies.log_prob[0, :, 0], policy.log_prob(-raw["policy"][0], -action[0]), rtol=1e-5)
     value = networks.value(state.params, copies.observation, networks.activation(cfg.activation))
     np.testing.assert_allclose(copies.value, value, rtol=1e-6)
-    assert ppo._copies(ONE_SIDED, CONFIG, state, data, later, own) is None
+    assert active(CONFIG) == ()
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,8 @@ import pytest
 from bayessim_mjx import memory, rl
 from bayessim_mjx.config import PPOConfig
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.rl import networks, normalise, ppo
+from bayessim_mjx.rl import networks, normalise, ppo, transitions, worlds
+from bayessim_mjx.rl.catalogue import learner
 from bayessim_mjx.rl.train import time as clock
 
 # the package has functions of these names
@@ -132,7 +133,7 @@ def test_statistics_are_pooled_before_learning():
     seen = []
     for i in range(3):
         assert state.normalizer["policy"].count == i * 16 * 8
-        _, data = jax.jit(lambda s: ppo._collect(WALK, config, s, None, jax.random.split(s.key, 3)[1]))(state)
+        _, data = jax.jit(lambda s: worlds.gather(learner(WALK, config), s, None, jax.random.split(s.key, 3)[1]))(state)
         seen.append(np.asarray(data["observation"]["policy"]).reshape(-1))
         state, metrics = update(state, None)
         assert metrics["Loss/kl"] < 1e-9
@@ -173,7 +174,7 @@ def test_a_policy_learns_with_the_statistics_that_it_will_act_with(monkeypatch):
         with monkeypatch.context() as patched:
             patched.setattr(ppo.losses, "optimise", spy)
             after, _ = ppo.update(env, config, state, None)
-        _, data = ppo._collect(env, config, state, None, jax.random.split(state.key, 3)[1])
+        _, data = worlds.gather(learner(env, config), state, None, jax.random.split(state.key, 3)[1])
         raw, batch = data["observation"], batches[-1]
         for group, seen in (("policy", batch.observation), ("critic", batch.critic_observation)):
             expected = normalise.normalise(after.normalizer[group], raw[group]).reshape(seen.shape)
@@ -191,8 +192,8 @@ def test_advantages_bootstrap_from_the_true_last_observation():
     config = dataclasses.replace(CONFIG, gae_lambda=0.0, normalize_observations=False, reward_scale=2.0)
     state = rl.init(env, config, key(0))
     state = state.replace(env_states=jax.vmap(env.reset)(jax.random.split(key(1), 16), jnp.zeros((16, 1))))
-    _, data = jax.jit(lambda s: ppo._collect(env, config, s, None, s.key))(state)
-    batch = ppo._batch(env, config, state, data, state.normalizer)
+    _, data = jax.jit(lambda s: worlds.gather(learner(env, config), s, None, s.key))(state)
+    batch = transitions.batch(learner(env, config), state, data, state.normalizer)
     cut = np.asarray(data["truncated"]).reshape(-1) > 0
     assert cut.sum() == 32
     first = np.asarray(data["observation"]["critic"][:, :, 0]).reshape(-1)
@@ -208,7 +209,7 @@ def test_actions_are_clipped_for_the_environment_but_not_for_the_learner():
     env = probes.ActionReward()
     config = dataclasses.replace(CONFIG, init_std=3.0, action_clip=0.5)
     state = rl.init(env, config, key(0))
-    _, data = ppo._collect(env, config, state, None, key(1))
+    _, data = worlds.gather(learner(env, config), state, None, key(1))
     action = np.asarray(data["extras"]["action"])[..., 0]
     assert np.abs(action).max() > 2
     np.testing.assert_allclose(data["reward"], -((np.clip(action, -0.5, 0.5) - 0.5) ** 2), atol=1e-6)

@@ -1,0 +1,86 @@
+"""The worlds of a training: fresh episodes, and what the policy does in them between two updates."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+from jax.sharding import Mesh
+
+from bayessim_mjx.physics.nuisance import starting
+from bayessim_mjx.rl import sharding
+from bayessim_mjx.rl.extension import Learner
+from bayessim_mjx.rl.networks import Policy
+from bayessim_mjx.rl.sharding import EVERYWHERE, FIRST, SECOND
+from bayessim_mjx.rl.state import TrainState, policy_of
+from bayessim_mjx.rollout import collect, traced
+
+if TYPE_CHECKING:
+    from bayessim_mjx.distributions import Distribution
+    from bayessim_mjx.env import Env, State
+
+
+def reset(
+    env: Env, key: jax.Array, domain: Distribution | None, worlds: int, mesh: Mesh | None = None, clock: Any = 0
+) -> State:
+    """Fresh episodes in `worlds` worlds with theta from the domain (None: nominal), `clock` steps into training."""
+    theta_key, reset_key = jax.random.split(key)
+    if domain is None:
+        thetas = jnp.tile(jnp.asarray(env.space.nominal, jnp.float32), (worlds, 1))
+    else:
+        thetas = domain.sample(theta_key, worlds)
+    given: tuple[Any, ...] = (jax.random.split(reset_key, worlds), thetas)
+    if getattr(env, "nuisance", None) is not None:
+        given = (given[0], env.space.scheduled(thetas, clock), starting(clock, worlds))
+    return sharding.local(jax.vmap(traced(env.reset)), mesh, (FIRST,) * len(given), FIRST)(*given)
+
+
+def clock(env: Env, env_states: State) -> jax.Array:
+    """Control steps of each world since training began; 0 where nothing goes by them."""
+    if getattr(env, "nuisance", None) is None:
+        return jnp.int32(0)
+    return env_states.info["nuisance"].course.clock.max()
+
+
+def stagger(key: jax.Array, state: State, episode_length: int) -> tuple[State, jax.Array]:
+    """First episodes' clocks spread out, so that time limits do not come all at once; and which are late, [N]."""
+    steps = jax.random.randint(key, state.reward.shape, 0, episode_length).astype(state.info["steps"].dtype)
+    world = state.pipeline_state
+    if "steps" in getattr(world, "task", {}):  # our tasks count in the world, the others in info
+        world = world.replace(task={**world.task, "steps": steps})
+    state = dataclasses.replace(state, pipeline_state=world, info={**state.info, "steps": steps})
+    return state, (steps > 0).astype(jnp.float32)
+
+
+def gather(
+    learner: Learner, state: TrainState, domain: Distribution | None, key: jax.Array, more: Sequence[str] = ()
+) -> tuple[State, dict]:
+    """num_steps in every world with the current policy; resets come from a pool drawn once per update.
+
+    Returns the worlds' states after them, and arrays [T, N, ...]: those of `rollout.collect`. The observation groups
+    are those that the networks and the extensions need, and `more`.
+    """
+    pool_key, noise_key = jax.random.split(key)
+    env, config, mesh = learner.env, learner.config, state.mesh
+    needed = [group for extension in learner.extensions for group in extension.groups(env.observation_size)]
+    memory = ("memory",) if config.memory else ()
+    groups = tuple(sorted({*state.normalizer, *needed, *memory, *more}))
+
+    def run(policy: Policy, noise: jax.Array, env_states: State, pool: State) -> tuple[State, dict]:
+        def act(noise: jax.Array, obs: dict[str, jax.Array]) -> tuple[jax.Array, dict]:
+            mean, log_std = policy.distribution(obs)
+            action = mean + jnp.exp(log_std) * noise
+            extras = {"action": action, "mean": mean}
+            done = policy.carried(obs, policy.bounded(action))
+            return done, extras if log_std.ndim == 1 else extras | {"log_std": log_std}
+
+        return collect(env, act, noise, env_states, pool, groups)
+
+    shape = (config.num_steps, config.num_envs, env.action_size - config.memory_size)
+    noise = sharding.pinned(jax.random.normal(noise_key, shape), mesh, SECOND)
+    pool = reset(env, pool_key, domain, config.num_envs, mesh, clock(env, state.env_states))
+    run = sharding.local(run, mesh, (EVERYWHERE, SECOND, FIRST, FIRST), (FIRST, SECOND))
+    return run(policy_of(state), noise, state.env_states, pool)
