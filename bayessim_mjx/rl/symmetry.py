@@ -77,7 +77,8 @@ def augmented(batch: Batch) -> Batch:
     def again(x: jax.Array) -> jax.Array:
         return jnp.concatenate([x, jnp.repeat(x, copies.value.shape[1], axis=0)])
 
-    both: dict[str, Any] = {name: join(name) for name in ("observation", "critic_observation", "action", "log_prob", "value")}
+    names = ("observation", "critic_observation", "action", "log_prob", "value")
+    both: dict[str, Any] = {name: join(name) for name in names}
     both |= {name: again(getattr(batch, name)) for name in ("advantage", "returns")}
     weight = jnp.concatenate([jnp.ones_like(batch.advantage), copies.weight.reshape(-1)])
     extra = {name: x for name, x in batch.extra.items() if name != NAME}

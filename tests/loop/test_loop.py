@@ -170,9 +170,11 @@ def test_under_logs_only_the_newest_evaluation_counts(monkeypatch, truth):
     """There is no truth then, and every round was evaluated on physics of its own."""
     told, returns = [], np.array([1.0, 3.0])
     saves = types.SimpleNamespace(save=lambda step, tree, **kwargs: told.append(kwargs))
-    monkeypatch.setattr(loop, "train", lambda parts, state, progress: state)
+    monkeypatch.setattr(loop.outer_loop, "train", lambda parts, state, progress: state)
     info = types.SimpleNamespace(truth=truth, returns=returns, seconds={})
-    monkeypatch.setattr(loop, "step", lambda parts, state: (dataclasses.replace(state, round=state.round + 1), info))
+    monkeypatch.setattr(
+        loop.outer_loop, "step", lambda parts, state: (dataclasses.replace(state, round=state.round + 1), info)
+    )
     monkeypatch.setattr(rl, "policy_of", lambda state: None)
     blank = dict.fromkeys((f.name for f in dataclasses.fields(loop.LoopState)), jnp.zeros(0))
     train = types.SimpleNamespace(iteration=jnp.int32(3), env_steps=jnp.uint32(24))
