@@ -1,0 +1,145 @@
+"""The house rules that can be counted: short files and functions, and no circle of imports between files.
+
+Imports inside functions and under TYPE_CHECKING count too. What is listed as an exception is to be mended, not added to.
+"""
+
+import ast
+import functools
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+FILE, FUNCTION = 300, 60  # lines at most
+TREES = ("bayessim_mjx", "tasks", "examples", "benchmarks")
+SETTINGS = "bayessim_mjx/config/settings.py"  # a list of settings, as long as there are settings
+
+LONG_FILES = (
+    "bayessim_mjx/diagnosis/selection/race.py",
+    "bayessim_mjx/report/sections.py",
+    "bayessim_mjx/rl/ppo.py",
+    "benchmarks/tests/fuzz_cases.py",
+)
+LONG_FUNCTIONS = (
+    "bayessim_mjx/diagnosis/fitting/quadratic.py:held_out",
+    "bayessim_mjx/diagnosis/fitting/windows.py:cut",
+    "bayessim_mjx/report/gap_figures.py:waterfall",
+    "bayessim_mjx/report/motion_figures.py:overlay",
+    "bayessim_mjx/report/place_figures.py:frequency",
+    "bayessim_mjx/report/rival_figures.py:isolability",
+)
+CIRCLES = (
+    {f"bayessim_mjx.distributions.{name}" for name in ("convert", "distribution", "evaluate")},
+    {f"bayessim_mjx.diagnosis.{name}" for name in ("correction", "result")},
+)
+
+
+@functools.cache
+def sources(root: Path, trees: tuple[str, ...]) -> Mapping[str, str]:
+    """{path: text} of the Python files below `root`."""
+    files = (file for tree in trees for file in sorted((root / tree).rglob("*.py")))
+    return {file.relative_to(root).as_posix(): file.read_text(encoding="utf-8") for file in files}
+
+
+def long_files(texts: Mapping[str, str]) -> dict[str, int]:
+    lines = {path: text.count("\n") for path, text in texts.items()}
+    return {path: n for path, n in lines.items() if n > FILE}
+
+
+def long_functions(texts: Mapping[str, str]) -> dict[str, int]:
+    """{"path:name": lines}; decorators do not count."""
+    found: dict[str, int] = {}
+    for path, text in texts.items():
+        for node in ast.walk(ast.parse(text)):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                lines = (node.end_lineno or 0) - node.lineno + 1
+                name = f"{path}:{node.name}"  # of several the longest
+                found[name] = max(lines, found.get(name, 0))
+    return {name: n for name, n in found.items() if n > FUNCTION}
+
+
+def imports(texts: Mapping[str, str]) -> dict[str, set[str]]:
+    """{module: modules among `texts` that it names in an import}, wherever in the file the import stands."""
+    names = {path: path.removesuffix(".py").removesuffix("/__init__").replace("/", ".") for path in texts}
+    known = set(names.values())
+
+    def named(path: str) -> Iterator[str]:
+        package = names[path].split(".") if path.endswith("__init__.py") else names[path].split(".")[:-1]
+        for node in ast.walk(ast.parse(texts[path])):
+            if isinstance(node, ast.Import):
+                yield from (alias.name for alias in node.names)
+            elif isinstance(node, ast.ImportFrom):
+                above = package[: len(package) - node.level + 1] if node.level else []
+                base = ".".join([*above, *([node.module] if node.module else [])])
+                inner = (f"{base}.{alias.name}" for alias in node.names)
+                yield from (module if module in known else base for module in inner)
+
+    return {names[path]: set(named(path)) & known - {names[path]} for path in texts}
+
+
+def circles(graph: Mapping[str, set[str]]) -> set[frozenset[str]]:
+    """Groups of modules that reach each other (Tarjan's strongly connected components of two or more)."""
+    index: dict[str, int] = {}
+    low: dict[str, int] = {}
+    stack: list[str] = []
+    found: set[frozenset[str]] = set()
+
+    def visit(module: str) -> None:
+        index[module] = low[module] = len(index)
+        stack.append(module)
+        for other in graph[module]:
+            if other not in index:
+                visit(other)
+            if other in stack:
+                low[module] = min(low[module], low[other])
+        if low[module] == index[module]:
+            group = frozenset(stack[stack.index(module) :])
+            del stack[stack.index(module) :]
+            if len(group) > 1:
+                found.add(group)
+
+    for module in graph:
+        if module not in index:
+            visit(module)
+    return found
+
+
+def test_files_are_short() -> None:
+    assert {p: n for p, n in long_files(sources(ROOT, TREES)).items() if p not in {SETTINGS, *LONG_FILES}} == {}
+
+
+def test_functions_are_short() -> None:
+    assert {f: n for f, n in long_functions(sources(ROOT, TREES)).items() if f not in LONG_FUNCTIONS} == {}
+
+
+def test_no_circle_of_imports() -> None:
+    found = circles(imports(sources(ROOT, ("bayessim_mjx",))))
+    assert [sorted(circle) for circle in found if not any(circle <= known for known in CIRCLES)] == []
+
+
+@pytest.mark.parametrize(
+    "back",
+    [
+        "import room.a\n",
+        "from room import a\n",
+        "from . import a\n",
+        "from .a import f\n",
+        "def f():\n    import room.a\n",
+    ],
+)
+def test_a_circle_is_found_however_it_is_closed(back: str) -> None:
+    typed = "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from room.c import x\n"
+    texts = {"room/__init__.py": "", "room/a.py": "import room.b\n", "room/b.py": typed, "room/c.py": back}
+    assert circles(imports(texts)) == {frozenset({"room.a", "room.b", "room.c"})}
+    assert circles(imports({**texts, "room/c.py": "import json\n"})) == set()
+
+
+def test_long_ones_are_counted() -> None:
+    body = "    x = 1\n" * FUNCTION
+    texts = {
+        "a.py": "@cached\ndef short():\n" + body[10:],
+        "b.py": "class A:\n  def long():\n" + body,
+        "c.py": "\n" * 301,
+    }
+    assert long_functions(texts) == {"b.py:long": FUNCTION + 1} and long_files(texts) == {"c.py": 301}
