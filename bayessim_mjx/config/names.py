@@ -6,7 +6,6 @@ points of installed packages, which are loaded when their name is used.
 """
 
 import difflib
-import importlib.metadata
 import math
 import re
 from collections.abc import Iterator, Mapping
@@ -74,8 +73,10 @@ class Names:
             self.register(self._loaded(name))
         return self._entries[name]
 
-    def _installed(self) -> dict[str, importlib.metadata.EntryPoint]:
-        return {point.name: point for point in importlib.metadata.entry_points(group=self.group)}
+    def _installed(self) -> dict[str, Any]:
+        from importlib import metadata  # here, so that commands start fast
+
+        return {point.name: point for point in metadata.entry_points(group=self.group)}
 
     def _loaded(self, name: str) -> Any:
         try:
