@@ -20,7 +20,18 @@ if TYPE_CHECKING:
 def evaluate(
     env: Env, policy: Policy, key: jax.Array, thetas: jax.Array, deterministic: bool = True
 ) -> dict[str, jax.Array]:
-    """One episode in each world of thetas [n, d]: {"return": [n], "length": [n]}; by default the mean action."""
+    """One episode in each world: {"return": [n], "length": [n]}.
+
+    Args:
+        env: the environment.
+        policy: who acts.
+        key: of resets and actions.
+        thetas: [n, d] of each world.
+        deterministic: the mean action, else a sample.
+
+    Raises:
+        ValueError: thetas' shape.
+    """
     thetas = jnp.asarray(thetas, jnp.float32)
     if thetas.ndim != 2:
         raise ValueError(f"thetas has shape {thetas.shape}: expected [episodes, parameters]")
@@ -33,6 +44,11 @@ def evaluate_together(
     """`evaluate` of several policies in one program: thetas [policies, n, d] -> {"return", "length": [policies, n]}.
 
     On an accelerator this takes hardly longer than one of them alone. The random numbers are the same for all.
+
+    Args:
+        env, key, deterministic: as for `evaluate`.
+        policies: of one kind.
+        thetas: of each policy's worlds.
 
     Raises:
         ValueError: the policies' networks differ, or thetas' shape.

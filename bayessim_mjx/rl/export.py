@@ -20,71 +20,13 @@ import numpy as np
 
 from bayessim_mjx.env import Env
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.rl import normalise, recurrent
+from bayessim_mjx.rl import recurrent
 from bayessim_mjx.rl.networks import Policy
+from bayessim_mjx.rl.onnx_graph import Graph, network
 
 OPSET, IR_VERSION = 17, 8  # of 2022: every runtime since reads it
 GOLDEN = 8  # observations with the policy's answers, for a check on the target machine
 PACKAGES = ("bayessim-mjx", "jax", "mujoco", "onnx")
-ONE_NODE = {"elu": "Elu", "relu": "Relu", "selu": "Selu", "tanh": "Tanh"}
-
-
-class Graph:
-    """A chain of ONNX nodes on one running value."""
-
-    def __init__(self, value: str) -> None:
-        self.value, self.nodes, self.constants = value, [], []  # type: ignore[var-annotated]
-
-    def then(self, operation: str, *others: Any, output: str = "", **attributes: Any) -> str:
-        """value = operation(value, *others); arrays become constants, texts are names of other values."""
-        from onnx import helper
-
-        names = [self.value, *(o if isinstance(o, str) else self.constant(o) for o in others)]
-        self.value = output or f"value_{len(self.nodes)}"
-        self.nodes.append(helper.make_node(operation, names, [self.value], **attributes))
-        return self.value
-
-    def at(self, value: str) -> Graph:
-        """The same graph, to be gone on with from another value."""
-        self.value = value
-        return self
-
-    def split(self, count: int) -> list[str]:
-        """Names of as many equal parts of the value's columns."""
-        from onnx import helper
-
-        names = [f"value_{len(self.nodes)}_{i}" for i in range(count)]
-        self.nodes.append(helper.make_node("Split", [self.value], names, axis=1))
-        return names
-
-    def constant(self, array: Any) -> str:
-        """Name of a float32 constant."""
-        from onnx import numpy_helper
-
-        name = f"constant_{len(self.constants)}"
-        self.constants.append(numpy_helper.from_array(np.asarray(array, np.float32), name))
-        return name
-
-    def activate(self, name: str) -> None:
-        """The activations of `networks.ACTIVATIONS`."""
-        x = self.value
-        if name in ONE_NODE:
-            self.then(ONE_NODE[name])
-        elif name == "swish":  # x sigmoid(x)
-            self.then("Sigmoid")
-            self.then("Mul", x)
-        else:  # gelu, as JAX's: x (1 + tanh(sqrt(2 / pi) (x + 0.044715 x^3))) / 2
-            for operation, other in (
-                ("Mul", x),
-                ("Mul", 0.044715),
-                ("Add", 1.0),
-                ("Mul", x),
-                ("Mul", (2 / np.pi) ** 0.5),
-            ):
-                self.then(operation, other)
-            self.then("Tanh")
-            for operation, other in (("Add", 1.0), ("Mul", x), ("Mul", 0.5)):
-                self.then(operation, other)
 
 
 def command_scale(env: Env, actions: int) -> tuple[np.ndarray, np.ndarray] | None:
@@ -101,75 +43,10 @@ def command_scale(env: Env, actions: int) -> tuple[np.ndarray, np.ndarray] | Non
     return (scale, offset) if np.allclose(commands, offset + scale * probes, rtol=1e-4, atol=1e-6) else None
 
 
-def _network(graph: Graph, policy: Policy, env: Env, size: int) -> None:
-    """Observation -> mean of the raw action."""
-    limit = getattr(env, "observation_clip", {}).get(getattr(env, "variant", ""))
-    if limit is not None:  # as the task does before the policy sees it
-        graph.then("Clip", -limit, limit)
-    if policy.normalize:
-        graph.then("Sub", policy.normalizer.mean)
-        graph.then("Div", jnp.sqrt(policy.normalizer.var) + normalise.EPSILON)
-        graph.then("Clip", -normalise.LIMIT, normalise.LIMIT)
-    kind = recurrent.kind(policy.actor)
-    if kind is not None:
-        {"gru": _gru, "lstm": _lstm}[kind](graph, jax.device_get(policy.actor[kind]))
-    *hidden, last = jax.device_get(policy.actor["layers"])
-    for layer in hidden:
-        graph.then("Gemm", layer["w"], layer["b"])
-        graph.activate(policy.activation)
-    graph.then("Gemm", last["w"][:, :size], last["b"][:size])  # a spread by state comes after the means
-
-
-def _gates(graph: Graph, value: str, side: Any, count: int) -> list[str]:
-    """The sums of each gate over the input, or over the hidden units."""
-    graph.at(value).then("Gemm", side["w"], side["b"])
-    return graph.split(count)
-
-
-def _gru(graph: Graph, layer: Any) -> None:
-    """Observation -> memory_next, as `recurrent.gru` does."""
-    observed = _gates(graph, graph.value, layer["x"], 3)
-    remembered = _gates(graph, "memory", layer["h"], 3)
-    sums = [graph.at(x).then("Add", h) for x, h in zip(observed[:2], remembered[:2], strict=True)]
-    reset, update = [graph.at(x).then("Sigmoid") for x in sums]
-    graph.at(remembered[2]).then("Mul", reset)
-    graph.then("Add", observed[2])
-    new = graph.then("Tanh")
-    graph.at("memory").then("Sub", new)  # new + z (memory - new)
-    graph.then("Mul", update)
-    graph.then("Add", new, output="memory_next")
-
-
-def _lstm(graph: Graph, layer: Any) -> None:
-    """Observation -> hidden units, and memory_next, as `recurrent.lstm` does."""
-    observed = graph.then("Gemm", layer["x"]["w"], layer["x"]["b"])
-    hidden, cells = graph.at("memory").split(2)
-    graph.at(hidden).then("Gemm", layer["h"]["w"], layer["h"]["b"])
-    graph.then("Add", observed)
-    sums = graph.split(4)
-    take, keep, new, show = [graph.at(x).then("Tanh" if i == 2 else "Sigmoid") for i, x in enumerate(sums)]
-    kept = graph.at(keep).then("Mul", cells)
-    graph.at(take).then("Mul", new)
-    cells = graph.then("Add", kept)
-    graph.then("Tanh")
-    hidden = graph.then("Mul", show)
-    graph.then("Concat", cells, output="memory_next", axis=1)
-    graph.at(hidden)
-
-
-def onnx_model(policy: Policy, env: Env, notes: Mapping[str, Any] | None = None) -> Any:
-    """The `onnx.ModelProto` of a policy of `env`; `notes`: more metadata. UserError where onnx is not installed."""
-    try:
-        import onnx
-        from onnx import helper
-    except ImportError:
-        raise UserError('--export needs the package onnx: pip install "bayessim-mjx[export]"') from None
-    graph, limit, actions = (
-        Graph("observation"),
-        policy.action_clip,
-        env.action_size - recurrent.memory_size(policy.actor),
-    )
-    _network(graph, policy, env, actions)
+def _graph(policy: Policy, env: Env, actions: int) -> tuple[Graph, dict[str, int]]:
+    """From observation to action and command; and how many numbers each of them has."""
+    graph, limit = Graph("observation"), policy.action_clip
+    network(graph, policy, env, actions)
     if policy.squash:
         graph.then("Tanh")
         graph.then("Mul", limit)
@@ -180,6 +57,18 @@ def onnx_model(policy: Policy, env: Env, notes: Mapping[str, Any] | None = None)
         graph.then("Mul", scaling[0])
         graph.then("Add", scaling[1], output="command")
         outputs["command"] = actions
+    return graph, outputs
+
+
+def onnx_model(policy: Policy, env: Env, notes: Mapping[str, Any] | None = None) -> Any:
+    """The `onnx.ModelProto` of a policy of `env`; `notes`: more metadata. UserError where onnx is not installed."""
+    try:
+        import onnx
+        from onnx import helper
+    except ImportError:
+        raise UserError('--export needs the package onnx: pip install "bayessim-mjx[export]"') from None
+    actions = env.action_size - recurrent.memory_size(policy.actor)
+    graph, outputs = _graph(policy, env, actions)
     value = lambda name, size: helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, ["batch", size])  # noqa: E731
     inputs = {"observation": env.observation_size["policy"][0]}
     if recurrent.memory_size(policy.actor):

@@ -58,8 +58,14 @@ def standardise(x: jax.Array) -> jax.Array:
 def loss(params: Params, old_log_std: Any, batch: Batch, learner: Learner) -> tuple[jax.Array, dict]:
     """Surrogate + c_v value loss - c_e entropy + the terms of extensions, and the figures of this minibatch.
 
-    old_log_std [A] is that of the collecting policy; not used where the batch has its own. KL is of old || new,
-    analytic; it, the entropy and the clip fraction are of the batch's own samples, not of those that extensions add.
+    KL is of old || new, analytic; it, the entropy and the clip fraction are of the batch's own samples, not of those
+    that extensions add.
+
+    Args:
+        params: actor and critic.
+        old_log_std: [A] of the collecting policy; not used where the batch has its own.
+        batch: a minibatch.
+        learner: settings and extensions.
     """
     config, known = learner.config, None
     if config.segment:
@@ -137,7 +143,16 @@ def optimise(
     batch: Batch,
     learner: Learner,
 ) -> tuple[Params, optax.OptState, jax.Array, dict[str, jax.Array]]:
-    """All epochs of minibatches: new parameters, Adam state, learning rate, and figures [epochs * minibatches] each."""
+    """All epochs of minibatches: new parameters, Adam state, learning rate, and figures [epochs * minibatches] each.
+
+    Args:
+        key: of the shuffles.
+        params: actor and critic.
+        opt_state: of `optimiser_init`, or of the last call.
+        learning_rate: [] at the start.
+        batch: all that was collected.
+        learner: settings and extensions.
+    """
     old_log_std = params["actor"].get("log_std")
     if not learner.config.normalize_advantage_per_minibatch:
         batch = dataclasses.replace(batch, advantage=standardise(batch.advantage))
@@ -161,6 +176,13 @@ def descend(
     """Adam on objective(params, minibatch) -> (loss, figures) over all epochs of minibatches; returns as `optimise`.
 
     The rate adapts to the figure "Loss/kl" where there is one and ppo.schedule says so.
+
+    Args:
+        key, params, opt_state, learning_rate: as for `optimise`.
+        batch: a pytree of arrays with one leading axis.
+        config: epochs, minibatches and the schedule of the rate.
+        objective: pure.
+        mesh: devices that share each minibatch; None: one.
     """
     flat, unravel = ravel_pytree(params)
     size = jax.tree.leaves(batch)[0].shape[0]

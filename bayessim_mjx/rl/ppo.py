@@ -53,10 +53,18 @@ def init(
     mesh: Mesh | None = None,
     clock: int = 0,
 ) -> TrainState:
-    """The state before the first update; domain None trains at the nominal theta.
+    """The state before the first update.
 
-    clock: control steps that each world has trained before, which schedules of randomisation go by.
-    mesh: the devices that share the worlds, see `device.mesh`; None: the default device. Results differ by rounding.
+    Args:
+        env: the environment.
+        config: settings; the state keeps them.
+        key: of everything random in this training.
+        domain: where worlds draw theta from; None: all at the nominal one.
+        mesh: the devices that share the worlds, see `device.mesh`; None: the default one. Results differ by rounding.
+        clock: control steps that each world has trained before, which schedules of randomisation go by.
+
+    Raises:
+        UserError: environment, settings and devices do not go together.
     """
     check(env, config, mesh)
     program = _init(env, config, mesh)
@@ -65,7 +73,7 @@ def init(
 
 
 def outline(env: Env, config: PPOConfig, domain: Distribution | None = None, mesh: Mesh | None = None) -> TrainState:
-    """Shapes, types and layout of what `init` returns."""
+    """Shapes, types and layout of what `init` returns, of the same arguments."""
     shapes = jax.eval_shape(_init(env, config, mesh), jax.random.PRNGKey(0), domain, np.int32(0))
     if mesh is None:
         return shapes
@@ -139,7 +147,14 @@ def moved_on(config: PPOConfig, state: TrainState, env_states: State, data: dict
 def update(
     env: Env, config: PPOConfig, state: TrainState, domain: Distribution | None
 ) -> tuple[TrainState, dict[str, jax.Array]]:
-    """One iteration, to be jitted: the new state and its metrics, scalars under their TensorBoard tags."""
+    """One iteration, to be jitted: the new state and its metrics, scalars under their TensorBoard tags.
+
+    Args:
+        env: the environment.
+        config: the settings that the state was made with.
+        state: before.
+        domain: where new episodes draw theta from; None: all at the nominal one.
+    """
     learner = catalogue.learner(env, config, state.mesh)
     key, collect_key, epochs_key = jax.random.split(state.key, 3)
     env_states, data = worlds.gather(learner, state, domain, collect_key)

@@ -124,9 +124,17 @@ def in_spreads(rnd: RND, values: jax.Array, gamma: float) -> tuple[RND, jax.Arra
 def reward(
     rnd: RND, obs: jax.Array, terminated: jax.Array, truncated: jax.Array, config: RNDConfig, dt: float, gamma: float
 ) -> tuple[RND, jax.Array, jax.Array]:
-    """Of observations [T, N, S] after each step: the state, they as the networks see them, and the reward [T, N].
+    """The state after what was collected, the observations as the networks see them, and the reward [T, N].
 
-    The reward is weight(t) dt novelty: `weight` is per second, at every control step dt. gamma is the learner's.
+    The reward is weight(t) dt novelty: `weight` is per second, at every control step.
+
+    Args:
+        rnd: networks and statistics.
+        obs: [T, N, S] after each step.
+        terminated, truncated: [T, N].
+        config: `ppo.rnd`.
+        dt: control step in s.
+        gamma: the learner's discount, also of the sums of novelty.
     """
     x = obs
     if config.state_normalization:
@@ -156,7 +164,17 @@ def train(
     minibatches: int,
     mesh: Mesh | None = None,
 ) -> tuple[RND, jax.Array]:
-    """One Adam step of the predictor per minibatch of x [B, S]; and the losses before them [epochs minibatches]."""
+    """One Adam step of the predictor per minibatch, and the losses before them [epochs minibatches].
+
+    Args:
+        key: of the shuffles.
+        rnd: networks.
+        x: [B, S] as the networks see them.
+        config: `ppo.rnd`.
+        epochs: passes over x.
+        minibatches: per pass.
+        mesh: devices that share each minibatch; None: one.
+    """
     optimiser = optax.adam(config.learning_rate)
 
     def step(carry: tuple[Any, Any], index: jax.Array) -> tuple[tuple[Any, Any], jax.Array]:

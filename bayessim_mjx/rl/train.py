@@ -80,7 +80,12 @@ def start(
     teacher: Policy | None = None,
     clock: int = 0,
 ) -> TrainState:
-    """`ppo.init`, with the program of `run` compiled beside its own where there are processor cores for both."""
+    """`ppo.init`, with the program of `run` compiled beside its own where there are processor cores for both.
+
+    Args:
+        env, config, key, domain, mesh, clock: see `ppo.init`.
+        teacher: what `run` will be given.
+    """
     checks.check(env, config, mesh)
     if cores() == 1 or jax.process_count() > 1:
         return ppo.init(env, config, key, domain, mesh, clock)
@@ -113,11 +118,21 @@ def run(
     progress: Callable[[Metrics, TrainState], None] | None = None,
     teacher: Policy | None = None,
 ) -> tuple[TrainState, Metrics]:
-    """`iterations` more updates (config.max_iterations by default): the new state, and metrics of the last interval.
+    """`iterations` more updates: the new state, and metrics of the last interval.
 
-    The host sees metrics every config.log_interval updates, Loss/* averaged over them, and then calls
-    progress(metrics, state). That state's buffers are reused by the next interval: copy what is to be kept.
-    DivergedError where the loss is no longer finite. With a `teacher` its actions are imitated, see `distil`.
+    The host sees metrics every config.log_interval updates, Loss/* averaged over them.
+
+    Args:
+        env, config: as the state was made with.
+        state: to go on from; it stays valid.
+        domain: where new episodes draw theta from; None: all at the nominal one.
+        iterations: None: config.max_iterations.
+        progress: called with the metrics and the state of each interval. That state's buffers are reused by the next
+            interval: copy what is to be kept.
+        teacher: its actions are imitated, see `distil`; None: PPO.
+
+    Raises:
+        DivergedError: the loss is no longer finite.
     """
     total = config.max_iterations if iterations is None else iterations
     state = sharding.put(state, state.mesh, ppo.layout(state))  # the caller's state stays valid
@@ -153,7 +168,13 @@ def train(
     progress: Callable[[Metrics, TrainState], None] | None = None,
     mesh: Mesh | None = None,
 ) -> tuple[Policy, Metrics]:
-    """Train from scratch, or go on from `state` (`key` and `mesh` are then not used); see `run`."""
+    """Train from scratch or go on from a state: the policy, and metrics of the last interval.
+
+    Args:
+        env, config, domain, iterations, progress: see `run`.
+        key, mesh: see `ppo.init`; not used with `state`.
+        state: to go on from; None: `start`.
+    """
     if state is None:
         state = start(env, config, key, domain, mesh)
     state, metrics = run(env, config, state, domain, iterations, progress)

@@ -32,6 +32,12 @@ def batch(learner: Learner, state: TrainState, data: dict, normalizer: dict[str,
     With a memory as N sequences of T steps instead, with ppo.segment as B / L segments of L steps. Observations are
     normalised by `normalizer`; the actions' probabilities are those of the policy that acted, by the state's. KL counts
     from the policy that learning starts from: new statistics alone would slow an adaptive rate down.
+
+    Args:
+        learner: environment, settings and extensions.
+        state: before the update.
+        data: of `worlds.gather`, with the rewards that are learnt from.
+        normalizer: of `statistics`.
     """
     config, group = learner.config, learner.critic_group
     act = networks.activation(config.activation)

@@ -26,7 +26,16 @@ if TYPE_CHECKING:
 def reset(
     env: Env, key: jax.Array, domain: Distribution | None, worlds: int, mesh: Mesh | None = None, clock: Any = 0
 ) -> State:
-    """Fresh episodes in `worlds` worlds with theta from the domain (None: nominal), `clock` steps into training."""
+    """Fresh episodes in all worlds.
+
+    Args:
+        env: the environment as the learner sees it.
+        key: of theta and of the episodes' beginnings.
+        domain: where theta comes from; None: all at the nominal one.
+        worlds: how many.
+        mesh: the devices that share them; None: one.
+        clock: control steps since training began.
+    """
     theta_key, reset_key = jax.random.split(key)
     if domain is None:
         thetas = jnp.tile(jnp.asarray(env.space.nominal, jnp.float32), (worlds, 1))
@@ -60,8 +69,15 @@ def gather(
 ) -> tuple[State, dict]:
     """num_steps in every world with the current policy; resets come from a pool drawn once per update.
 
-    Returns the worlds' states after them, and arrays [T, N, ...]: those of `rollout.collect`. The observation groups
-    are those that the networks and the extensions need, and `more`.
+    Returns the worlds' states after them, and arrays [T, N, ...]: those of `rollout.collect`, with the observation
+    groups that networks and extensions need.
+
+    Args:
+        learner: environment and settings.
+        state: the policy, and the worlds as they are.
+        domain: where new episodes draw theta from; None: all at the nominal one.
+        key: of the resets and of the actions' noise.
+        more: observation groups beside these.
     """
     pool_key, noise_key = jax.random.split(key)
     env, config, mesh = learner.env, learner.config, state.mesh
