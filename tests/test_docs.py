@@ -1,4 +1,4 @@
-"""README, docs and benchmarks name only links, anchors, commands, flags, settings and files that exist."""
+"""README, docs and benchmarks name only what exists (links, anchors, commands, flags, settings, files); code runs."""
 
 import contextlib
 import dataclasses
@@ -6,6 +6,8 @@ import functools
 import importlib
 import io
 import re
+import sys
+import types
 from pathlib import Path
 
 import pytest
@@ -16,11 +18,18 @@ ROOT = Path(__file__).parents[1]
 COMMANDS = ("main", "train", "play", "calibrate", "diagnose", "gap_loop")
 FOLDERS = ("docs", "benchmarks")
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(p for f in FOLDERS for p in sorted((ROOT / f).glob("*.md")))]
-PYTHON = {"env.reset", "env.step", "env.dt", "env.mj_model", "ppo.train"}  # in Python, not settings
+PYTHON = {"env.reset", "env.step", "env.dt", "env.mj_model", "env.space", "ppo.train"}  # in Python, not settings
 COMMAND = re.compile(
     r"(?:python -m bayessim_mjx\.(\w+)|(bayessim-mjx)|python ((?:benchmarks|examples|docs)/[\w/]+\.py))([^`\n#&]*)"
 )
 PROSE = re.compile(r"`(main|train|play|calibrate|diagnose|gap_loop) (--[^`\n]*)`")
+
+CODE = re.compile(r"```python\n(.*?)```", re.DOTALL)
+FILE = re.compile(r'"""(\w+\.py): ')  # a block that begins so is that file
+TINY = [
+    "env.numEnvs=8", "ppo.num_envs=8", "ppo.num_steps=16", "ppo.max_iterations=2", "bayessim.trainTrajs=200",
+    "bayessim.realEvals=4", "bayessim.checkTrajs=40",
+]  # fmt: skip
 
 
 @functools.cache
@@ -59,7 +68,7 @@ def anchors(page: Path) -> set[str]:
 def broken(page: Path) -> list[str]:
     """Links of a page to files or anchors that are not there."""
     found = []
-    for link in re.findall(r"\]\(([^)\s]+)", page.read_text()):
+    for link in map("".join, re.findall(r'\]\(([^)\s]+)|src="([^"]+)"', page.read_text())):
         if link.startswith("http"):
             continue
         name, _, anchor = link.partition("#")
@@ -71,6 +80,21 @@ def broken(page: Path) -> list[str]:
 
 def by_name(page: Path) -> str:
     return str(page.relative_to(ROOT))
+
+
+def code_of(page: Path) -> list[str]:
+    return CODE.findall(page.read_text())
+
+
+def run(blocks: list[str], name: str, monkeypatch: pytest.MonkeyPatch) -> types.ModuleType:
+    """Run a page's blocks one after the other, as one module, in the working directory."""
+    module = types.ModuleType(name)
+    monkeypatch.setitem(sys.modules, name, module)
+    for block in blocks:
+        if named := FILE.match(block):
+            Path(named[1]).write_text(block)
+        exec(compile(block, f"{name}.md", "exec"), module.__dict__)
+    return module
 
 
 @pytest.mark.parametrize("page", PAGES, ids=by_name)
@@ -92,7 +116,7 @@ def test_commands_and_their_flags_exist(page):
 
 @pytest.mark.parametrize("page", PAGES, ids=by_name)
 def test_settings_and_flags_in_prose_exist(page):
-    text, known = page.read_text(), keys()
+    text, known = CODE.sub("", page.read_text()), keys()
     named = set(re.findall(r"\b(?<!/)((?:bayessim|ppo|monitor|env|real)\.(?!py\b|json\b)[a-zA-Z_]+)\b", text)) - PYTHON
     assert {name for name in named if name not in known} == set()
     somewhere = set().union(*(flags_of(c) for c in COMMANDS), *(flags_of(c) for c, _ in commands(text)))
@@ -103,6 +127,32 @@ def scripts_flags(page: Path) -> set[str]:
     """A page among the benchmarks may name flags of their scripts without the script beside them."""
     scripts = (ROOT / "benchmarks").glob("*/*.py") if page.parent.name == "benchmarks" else ()
     return set().union(*(flags_of(str(path.relative_to(ROOT))) for path in scripts))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=by_name)
+def test_code_is_python(page):
+    for block in code_of(page):
+        compile(block, page.name, "exec")
+
+
+@pytest.mark.slow
+@pytest.mark.ci
+@pytest.mark.parametrize("name", ["own_effect", "own_task"])
+def test_code_of_a_how_to_runs(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    run(code_of(ROOT / "docs" / f"{name}.md"), name, monkeypatch)
+
+
+@pytest.mark.slow
+@pytest.mark.ci
+def test_the_loop_of_the_readme_runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    import bayessim_mjx as bm
+
+    load = bm.load
+    monkeypatch.setattr(bm, "load", lambda task, overrides: load(task, overrides=[*overrides, *TINY]))
+    page = run(code_of(ROOT / "README.md")[:1], "readme", monkeypatch)
+    assert len(page.rounds) == 2 and page.posterior.mean().shape == (2,)
 
 
 def test_a_missing_file_an_absent_anchor_and_an_unknown_flag_are_noticed(tmp_path):

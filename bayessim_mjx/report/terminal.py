@@ -83,7 +83,7 @@ def _longest(d: Diagnosis) -> list[str]:
 
 
 def _effects(d: Diagnosis) -> Table:
-    header = ["effect", "parameters", "gap closed", "90 %", "promised", "weight among rivals"]
+    header = ["effect", "parameters", "gap closed", "90 %", "predicted", "weight among rivals"]
     rows = []
     for e in d.effects:
         found = [quantity(k, v) for k, v in e.parameters.items()]

@@ -12,13 +12,13 @@ from bayessim_mjx.effects.support import reading, storage
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.physics import control_step
 
-DOCS = Path(__file__).parents[2] / "docs" / "effects.md"
+DOCS = Path(__file__).parents[2] / "docs" / "own_effect.md"
 
 
 @pytest.fixture(scope="module")
 def source():
     """The example of the documentation."""
-    (text,) = re.findall(r"```python\n(.*?)```", DOCS.read_text(encoding="utf-8"), re.DOTALL)
+    text = re.findall(r"```python\n(.*?)```", DOCS.read_text(encoding="utf-8"), re.DOTALL)[0]
     assert len(text.splitlines()) <= 28
     return text
 
@@ -128,8 +128,8 @@ def test_installed_effects_are_found_by_entry_point(monkeypatch, file):
 
 HOOK = "        return memory, at.scatter(-pull * jnp.sin(self.poles * step.qpos[at.qadr]))\n"
 BAD_HOOKS = {
-    "raises": ("        return memory, undefined\n", r"on_force fails \(.*magnets\.py, line 24\): NameError: "),
-    "exits": ("        raise SystemExit(0)\n", r"on_force fails \(.*magnets\.py, line 24\): SystemExit"),
+    "raises": ("        return memory, undefined\n", r"on_force fails \(.*magnets\.py, line 25\): NameError: "),
+    "exits": ("        raise SystemExit(0)\n", r"on_force fails \(.*magnets\.py, line 25\): SystemExit"),
     "returns nothing": ("", r"on_force returns nothing \(a missing return\?\); expected \(memory, an array \[1\]\)"),
     "forgets the memory": (HOOK.replace("memory, ", ""), r"on_force returns an array \[1\]; expected \(memory"),
     "another shape": (
