@@ -1,6 +1,5 @@
 """Errors that are the user's to mend: the commands print them in one line, without a traceback."""
 
-import difflib
 import errno
 from collections.abc import Iterable
 
@@ -19,11 +18,18 @@ class DivergedError(UserError, FloatingPointError):
     """Numbers are no longer finite, under settings that the user can change."""
 
 
+def nearest(given: str, names: Iterable[str], n: int = 3, cutoff: float = 0.6) -> list[str]:
+    """At most `n` of `names` that look like `given`, the likest first."""
+    import difflib  # here, so that commands start fast
+
+    return difflib.get_close_matches(given, list(names), n, cutoff)
+
+
 def unknown(what: str, given: str, allowed: Iterable[str]) -> UserError:
     """The error for a name that does not exist: with the close ones first, then all allowed."""
     names = list(allowed)
     last = {n.rpartition(".")[2].lower(): n for n in names}
-    close = [last[n] for n in difflib.get_close_matches(given.rpartition(".")[2].lower(), last, n=3, cutoff=0.6)]
+    close = [last[n] for n in nearest(given.rpartition(".")[2].lower(), last)]
     hint = f" Did you mean {' or '.join(close)}?" if close else ""
     return UserError(f"{what} {given!r} is unknown.{hint} Allowed: {', '.join(names)}")
 

@@ -2,7 +2,6 @@
 
 import os
 import sys
-import traceback
 from collections.abc import Callable, Sequence
 
 from bayessim_mjx.errors import UserError, out_of_memory, refused
@@ -51,6 +50,8 @@ def one_line(error: Exception) -> str:
 
 def _bug() -> int:
     """The traceback of the present error, and what to do with it."""
+    import traceback
+
     traceback.print_exc()
     print(f"\nThis is a bug: please report it with the lines above and your command, {BUGS}", file=sys.stderr)
     return 1

@@ -2,7 +2,6 @@
 
 import argparse
 import dataclasses
-import random
 import sys
 import warnings
 from collections.abc import Mapping
@@ -22,8 +21,7 @@ def config_of(args: argparse.Namespace, more: Mapping[str, tuple[str, Any]] | No
     for flag, (key, _, _) in FLAGS.items():
         value = getattr(args, flag[2:], None)  # not every command has every flag
         if value is not None:
-            drawn = flag == "--seed" and value == -1
-            flags[flag] = (key, random.SystemRandom().randrange(10_000) if drawn else value)
+            flags[flag] = (key, _drawn() if flag == "--seed" and value == -1 else value)
     task = args.task and task_name(args.task)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
@@ -34,6 +32,13 @@ def config_of(args: argparse.Namespace, more: Mapping[str, tuple[str, Any]] | No
     if args.idle:
         raise UserError(f"{args.idle[0]}: {args.command} has no use for it")
     return settings
+
+
+def _drawn() -> int:
+    """A seed from the system."""
+    import random  # here, so that commands start fast
+
+    return random.SystemRandom().randrange(10_000)
 
 
 def resumed_config(args: argparse.Namespace, config: Config) -> Config:

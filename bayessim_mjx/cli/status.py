@@ -3,10 +3,8 @@
 import contextlib
 import dataclasses
 import os
-import shutil
 import signal
 import sys
-import tempfile
 import threading
 import types
 from collections.abc import Callable, Iterator
@@ -66,6 +64,9 @@ def first_writes(config: Config, run: "Run | None") -> Iterator[tuple[Config, "R
     if jax.process_count() == 1:
         yield config, run
         return
+    import shutil
+    import tempfile
+
     from jax.experimental.multihost_utils import sync_global_devices
 
     from bayessim_mjx.runs import Run

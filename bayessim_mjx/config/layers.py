@@ -1,7 +1,6 @@
 """One layer of settings after the other: each is checked on its own and written over what is there."""
 
 import dataclasses
-import difflib
 import typing
 from collections.abc import Mapping
 from pathlib import Path
@@ -22,7 +21,7 @@ from bayessim_mjx.config.settings import (
     checked,
     coerce,
 )
-from bayessim_mjx.errors import UserError, unknown
+from bayessim_mjx.errors import UserError, nearest, unknown
 
 Layer = tuple[str, Mapping[str, Any], bool]  # where it comes from, nested values, is it a file (else flag or override)
 SECTIONS: dict[str, type[Section]] = {
@@ -151,4 +150,4 @@ def _like(value: Any, default: Any, path: str, source: str) -> Any:
 def _dotted(key: str) -> list[str]:
     """Full names of the section keys that are called nearly `key`: the hint for a forgotten section."""
     names = {f.name: f"{s}.{f.name}" for s, cls in SECTIONS.items() for f in dataclasses.fields(cls)}  # type: ignore[arg-type]
-    return [names[n] for n in difflib.get_close_matches(key, names, n=2, cutoff=0.7)]
+    return [names[n] for n in nearest(key, names, 2, 0.7)]

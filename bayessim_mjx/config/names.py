@@ -5,13 +5,12 @@ registered where it is defined (inference/summaries, inference/densities). Other
 points of installed packages, which are loaded when their name is used.
 """
 
-import difflib
 import math
 import re
 from collections.abc import Iterator, Mapping
 from typing import Any, Protocol
 
-from bayessim_mjx.errors import UserError
+from bayessim_mjx.errors import UserError, nearest
 
 
 class Entry(Protocol):
@@ -138,7 +137,7 @@ def summary_of(name: str, key: str = "summarizer") -> tuple[str, dict[str, int]]
     numbered = re.fullmatch("[0-9]{1,6}", number) is not None
     full = summary_name(stem if numbered else name)
     if full not in SUMMARIES:
-        close = difflib.get_close_matches(full, list(SUMMARIES), n=1)
+        close = nearest(full, list(SUMMARIES), 1)
         hint = f" (did you mean {close[0]}?)" if close else ""
         raise UserError(f"{key} = {name!r}{hint}: allowed are {', '.join(SUMMARIES)}")
     if not numbered:
