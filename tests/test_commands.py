@@ -90,7 +90,7 @@ def error_of(capsys: pytest.CaptureFixture, run: Any, *argv: str) -> str:
 @pytest.mark.parametrize(
     ("argv", "words"),
     [
-        (["--task", "Pendulm"], ["'Pendulm'", "Did you mean Pendulum", "Ant, Cartpole"]),
+        (["--task", "Pendulm"], ["'Pendulm'", "Did you mean Pendulum", "Allowed: Ant, "]),
         (["--tsk", "Pendulum"], ["'--tsk'", "Did you mean --task"]),
         (["--task", "Pendulum", "--num_envs", "many"], ["--num_envs", "'many'"]),
         (["--task", "Pendulum", "--num_envs", "0"], ["env.numEnvs = 0", "--num_envs", "at least 1"]),
