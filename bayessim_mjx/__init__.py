@@ -10,6 +10,7 @@ The public names, by room (imported when first used, so that the commands start 
     effects       Effect                                   what the nominal simulator leaves out
     env           Env, State, Task                         environments
     logs          Log, read_logs                           recorded motion
+    diagnose      diagnose                                 logs and a simulator -> Diagnosis (also a command's module)
 
 Rooms to import as modules: rollout (rollout, replay), rl (train, evaluate), inference (fit, condition, combine),
 loop (make, init, run).
@@ -34,7 +35,7 @@ _WHERE = {name: room for room, names in _ROOMS.items() for name in names}
 
 __all__ = [
     "Distribution", "Effect", "Env", "Log", "Parameter", "ParameterSpace", "Physics", "State", "Task", "World",
-    "control_step", "load", "make", "names", "read_logs",
+    "control_step", "diagnose", "load", "make", "names", "read_logs",
 ]  # fmt: skip
 
 
@@ -42,6 +43,8 @@ announce()  # bayessim_mjx/<Task>-v0 in Gymnasium
 
 
 def __getattr__(name: str) -> Any:
+    if name == "diagnose":  # the command's module, which can be called
+        return import_module("bayessim_mjx.diagnose")
     if name in _WHERE:
         return getattr(import_module(f"bayessim_mjx.{_WHERE[name]}"), name)
     raise AttributeError(f"module 'bayessim_mjx' has no attribute {name!r}; it has {', '.join(__all__)}")

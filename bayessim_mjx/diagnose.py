@@ -1,11 +1,14 @@
-"""Gap diagnosis of recorded motion: python -m bayessim_mjx.diagnose --model robot.xml --data LOGS."""
+"""Gap diagnosis of recorded motion: python -m bayessim_mjx.diagnose --model robot.xml --data LOGS.
+
+From Python `bayessim_mjx.diagnose("robot.xml", "logs")`.
+"""
 
 import argparse
 import sys
 import time
+import types
 import warnings
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,9 +22,6 @@ from bayessim_mjx.quantities import duration
 if TYPE_CHECKING:
     from bayessim_mjx.diagnosis.fitting.robot import Robot
     from bayessim_mjx.diagnosis.result import Diagnosis
-
-
-PRELIMINARY = "preliminary.json"  # what is known while the race goes on
 
 
 def _parser() -> cli.PlainParser:
@@ -74,62 +74,38 @@ def _checked(args: argparse.Namespace) -> None:
         raise UserError(f"--out {out}: there is a file of that name; give a folder")
 
 
-def _robot(args: argparse.Namespace) -> "Robot":
+def _robot(task: str, model: str | None, parameters: str | None) -> "Robot":
     from bayessim_mjx.diagnosis.fitting import robot
 
-    if args.model is not None:
-        return robot.of_file(args.model, args.parameters)
+    if model is not None:
+        return robot.of_file(model, parameters)
     from bayessim_mjx import registry
     from bayessim_mjx.config import load
 
-    task = cli.task_name(args.task)
-    env: Any = registry.make(task, config=load(task))
-    return robot.of_task(env, args.parameters)
+    name = cli.task_name(task)
+    env: Any = registry.make(name, config=load(name))
+    return robot.of_task(env, parameters)
 
 
-def _diagnosis(args: argparse.Namespace, robot: "Robot", notes: list[str], say: Any) -> "Diagnosis":
-    """The result; too little data is a verdict, not an error."""
+def _diagnosis(args: argparse.Namespace, say: Any) -> "Diagnosis":
     from bayessim_mjx.diagnosis import run
-    from bayessim_mjx.diagnosis.setup import TooLittleData
-    from bayessim_mjx.diagnosis.summary import assemble, preliminary
-    from bayessim_mjx.logs import read_logs
 
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", UserWarning)
-        logs = read_logs(args.data if len(args.data) > 1 else args.data[0], robot.mj_model, args.map)
-    notes += list(dict.fromkeys(str(w.message) for w in caught))
-    about = _about(args, robot, [log.duration for log in logs])
     names = "all" if args.effects == "all" else [n.strip() for n in args.effects.split(",") if n.strip()]
-    so_far = Path(args.out) / PRELIMINARY
-
-    def keep(setup: Any, race: Any) -> None:
-        """What is known before there is a verdict: killed there, this stays."""
-        preliminary.write(so_far, about, [*notes, *setup.warnings], setup, race)
-
-    try:
-        asked = {"group": args.group, "seed": args.seed, "tolerated": args.tolerance}
-        found = run.diagnose(robot, logs, names, **asked, progress=say, keep=keep)
-    except TooLittleData as reason:
-        return replace(assemble.insufficient(str(reason), notes), about=about)
-    found.setup.warnings[:0] = notes
-    conditions = len(found.setup.fitter.simulator.windows.groups)
-    result = replace(assemble.diagnosis_of(found, say), about=about | {"conditions": conditions})
-    result.save(Path(args.out))  # maps and the next experiment take time; killed there, the verdict stays
-    so_far.unlink(missing_ok=True)
-    return assemble.with_more(result, found, Path(args.out), say)
-
-
-def _about(args: argparse.Namespace, robot: "Robot", seconds: Sequence[float]) -> dict[str, Any]:
-    """What is diagnosed, for the report's header."""
-    return {
-        "robot": robot.name,
-        "model": str(args.model or args.task),
-        "data": [str(p) for p in args.data],
-        "logs": len(seconds),
-        "seconds": float(sum(seconds)),
-        "date": time.strftime("%Y-%m-%d %H:%M"),
-        "seed": args.seed,
-    }
+    with run.noting() as notes:
+        robot = _robot(args.task, args.model, args.parameters)
+    return run.diagnose(
+        robot,
+        args.data,
+        effects=names,
+        map=args.map,
+        group=args.group,
+        tolerance=args.tolerance,
+        seed=args.seed,
+        out=args.out,
+        progress=say,
+        notes=notes,
+        about={"model": str(args.model or args.task)},
+    )
 
 
 def _diagnose(argv: Sequence[str] | None) -> int:
@@ -140,34 +116,34 @@ def _diagnose(argv: Sequence[str] | None) -> int:
     from bayessim_mjx.monitor.stages import stages
 
     began = time.monotonic()
-    notes: list[str] = []
-    with warnings.catch_warnings(record=True) as caught, stages(args.headless) as say:
-        warnings.simplefilter("always", UserWarning)
-        robot = _robot(args)
-        notes += list(dict.fromkeys(str(w.message) for w in caught))
-        result = _diagnosis(args, robot, notes, say)
+    with warnings.catch_warnings(record=True), stages(args.headless) as say:  # what matters is told with the result
+        result = _diagnosis(args, say)
         say("writing the report", 0, 1)
-        result = _write(result, robot, Path(args.out), report)
+        report.write(result, Path(args.out))
+        report.tensorboard(result, Path(args.out))
     report.console(result, Path(args.out))
     print(f"{duration(time.monotonic() - began)}; open {Path(args.out) / 'report.html'}")
     return 0
 
 
-def _write(result: "Diagnosis", robot: "Robot", folder: Path, report: Any) -> "Diagnosis":
-    from bayessim_mjx.diagnosis import correction
-    from bayessim_mjx.diagnosis.result import load
-
-    result.save(folder)  # before anything that could fail: nothing computed is lost
-    result = load(folder)
-    if result.verdict != "insufficient_data":
-        result.warnings.extend(correction.write_outputs(result, robot, folder))
-        result.save(folder)
-    report.write(result, folder)
-    report.tensorboard(result, folder)
-    return result
-
-
 main = cli.command(_diagnose)
+
+
+class _Command(types.ModuleType):
+    """This module, which is also the function of its name: `bayessim_mjx.diagnose(model, logs)`."""
+
+    def __call__(self, model: Any, logs: Any, **options: Any) -> "Diagnosis":
+        """One diagnosis; arguments as of `bayessim_mjx.diagnosis.diagnose`, and `model` may be the name of a task."""
+        from bayessim_mjx.diagnosis import run
+
+        if not isinstance(model, str) or Path(model).suffix or Path(model).exists():
+            return run.diagnose(model, logs, **options)
+        with run.noting() as notes:
+            robot = _robot(model, None, options.pop("parameters", None))
+        return run.diagnose(robot, logs, **{"notes": notes, "about": {"model": model}, **options})
+
+
+sys.modules[__name__].__class__ = _Command  # whichever is asked for first, module or function, both are there
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -7,13 +7,15 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any, Protocol
 
 import mujoco
 import numpy as np
 
 from bayessim_mjx import effects as library
+from bayessim_mjx.diagnosis.estimates import Estimate, FoundEffect
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.effects.effect import Effect, Quantity, layout
 from bayessim_mjx.effects.support import native, storage
@@ -21,17 +23,35 @@ from bayessim_mjx.errors import UserError
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 from bayessim_mjx.physics import Physics
 
-if TYPE_CHECKING:
-    from bayessim_mjx.diagnosis.fitting.robot import Robot
-    from bayessim_mjx.diagnosis.result import Diagnosis, Estimate, FoundEffect
-
 REACH = 4.0  # sd that a range holds on both sides, where physics allows
 LEAST_SD = 1e-6  # of the range: a prior needs a width
 UNKNOWN_SD = 0.5  # of the way from neutral, where the diagnosis could not tell
 OWN_EFFECTS = "effect_specs"  # in `Diagnosis.details`: {name: path.py:MyEffect} of effects that are not the library's
 
 
-def effects_of(diagnosis: Diagnosis) -> tuple[Effect, ...]:
+class Found(Protocol):
+    """What is read of a diagnosis (`result.Diagnosis`)."""
+
+    @property
+    def effects(self) -> list[FoundEffect]: ...
+    @property
+    def parameters(self) -> dict[str, dict[str, Any]]: ...
+    @property
+    def covariance(self) -> dict[str, Any]: ...
+    @property
+    def details(self) -> dict[str, Any]: ...
+
+
+class Source(Protocol):
+    """What is read of a robot: its known parameters, and what gives a fresh specification of it (None: nothing)."""
+
+    @property
+    def space(self) -> ParameterSpace: ...
+    @property
+    def spec(self) -> Callable[[], mujoco.MjSpec] | None: ...
+
+
+def effects_of(diagnosis: Found) -> tuple[Effect, ...]:
     """The effects found, with nominal = identified mean and prior Gaussian(mean, sd) truncated to a sensible range.
 
     One effect at several places is one `Effect` with values of its own at each; "all" is tied. Their order is the
@@ -86,7 +106,7 @@ def _gaussian(p: Parameter, mean: float, sd: float) -> Parameter:
     return dataclasses.replace(p, nominal=mean, prior="gaussian", mean=mean, sd=max(sd, LEAST_SD * (p.high - p.low)))
 
 
-def calibrated_of(diagnosis: Diagnosis, space: ParameterSpace) -> ParameterSpace:
+def calibrated_of(diagnosis: Found, space: ParameterSpace) -> ParameterSpace:
     """`space` with nominal = identified mean and Gaussian priors; parameters that were not calibrated stay as they are.
 
     Raises:
@@ -109,7 +129,7 @@ def _number(value: float | None) -> float:
     return math.nan if value is None or not math.isfinite(value) else float(value)
 
 
-def apply(diagnosis: Diagnosis, physics: Physics) -> Physics:
+def apply(diagnosis: Found, physics: Physics) -> Physics:
     """The corrected simulator: the same model and control step; nominal values are the identified ones.
 
     Args:
@@ -123,7 +143,7 @@ def apply(diagnosis: Diagnosis, physics: Physics) -> Physics:
     return Physics(physics.mj_model, physics.dt, space, effects_of(diagnosis), limit)
 
 
-def prior(diagnosis: Diagnosis, physics: Physics | ParameterSpace | None = None) -> Distribution:
+def prior(diagnosis: Found, physics: Physics | ParameterSpace | None = None) -> Distribution:
     """What is known of the corrected simulator's theta: jointly Gaussian, truncated to the ranges.
 
     Where a diagnosis brings no covariance, the parameters are independent. Else the distribution's space has the names
@@ -161,14 +181,14 @@ def _recorded(name: str, row: dict) -> Parameter:
     return Parameter(name, row["nominal"], row["low"], row["high"], unit=row.get("unit") or "")
 
 
-def correction(diagnosis: Diagnosis, space: ParameterSpace) -> storage.Correction:
+def correction(diagnosis: Found, space: ParameterSpace) -> storage.Correction:
     """The effects found, and those parameters of `space` that were calibrated: the contents of effects.yaml."""
     known = calibrated_of(diagnosis, space).parameters
     return storage.Correction(effects_of(diagnosis), tuple(p for p in known if p not in space.parameters))
 
 
-def write_outputs(diagnosis: Diagnosis, robot: Robot, folder: str | Path) -> list[str]:
-    """Write effects.yaml and model_with_effects.xml.
+def write_outputs(diagnosis: Found, robot: Source, folder: str | Path) -> list[str]:
+    """Write effects.yaml and, where the robot has a specification, model_with_effects.xml.
 
     Returns:
         One sentence for each thing that the XML leaves out because MuJoCo has no element for it.
@@ -179,6 +199,8 @@ def write_outputs(diagnosis: Diagnosis, robot: Robot, folder: str | Path) -> lis
     every = [*calibrated.parameters, *(p for e in effects for p in e.space().parameters)]
     identified = {p.name: (p.mean, p.sd) for p in every if p.mean is not None and p.sd is not None}
     storage.write(folder / "effects.yaml", effects, identified, calibrated)
+    if robot.spec is None:
+        return ["model_with_effects.xml is not written: a compiled model has no specification; give its MJCF or MjSpec"]
     source = robot.spec()
     spec, missing = native.write_model(source, calibrated, calibrated.nominal, effects)
     spec = _friction_acting(_at_home(spec, source.modelfiledir))

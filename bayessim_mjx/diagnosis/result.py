@@ -7,62 +7,18 @@ import json
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from bayessim_mjx.distributions import Distribution
-    from bayessim_mjx.parameters import ParameterSpace
-    from bayessim_mjx.physics import Physics
+from bayessim_mjx.diagnosis import correction
+from bayessim_mjx.diagnosis.estimates import Estimate, FoundEffect
+from bayessim_mjx.distributions import Distribution
+from bayessim_mjx.parameters import ParameterSpace
+from bayessim_mjx.physics import Physics
 
 SCHEMA = 1
 VERDICTS = ("no_gap", "parameters", "effects", "ambiguous", "unexplained", "insufficient_data")
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """One identified number.
-
-    bound: "" where it lies inside its range; "at least" or "at most" (nothing larger or smaller was tried), "end" (of
-    what physics allows, or of what the logs tell), "off" (it has no part in the effect). At a bound, but for "off", sd
-    is NaN: an interval around the end of a range says nothing.
-    """
-
-    mean: float
-    sd: float
-    unit: str = ""
-    bound: str = ""
-
-
-@dataclass(frozen=True)
-class FoundEffect:
-    """An effect that reality has and the simulator has not.
-
-    Attributes:
-        name, where: of the library, of the model.
-        parameters: {parameter: Estimate}.
-        weight_among_rivals: of this effect against `equivalent_to`, 1 together: how often and how clearly its model
-            predicts held-out conditions better (pseudo-BMA+). It is no probability that the effect is there: what is
-            there may be none of them. NaN where there is no rival to be weighed against.
-        gap_closed, gap_closed_ci: its part of what all effects close, as a share of the recalibrated simulator's
-            squared gap above the noise, on held-out windows, with a 90 % interval (NaN of one condition).
-        equivalent_to: [{"effects": ["payload@link", ...], "gap_closed": ..., "why": sentence, "weight": among the
-            rivals}], which these logs cannot tell from it; of an effect that contains it as a special case, no weight.
-        sentence: for people; predicted_gap_closed: the same share as promised before any effect was fitted.
-        share: of the gap closed by all effects together (Shapley).
-    """
-
-    name: str
-    where: str
-    parameters: dict[str, Estimate]
-    weight_among_rivals: float
-    gap_closed: float
-    gap_closed_ci: tuple[float, float]
-    equivalent_to: list[dict[str, Any]] = field(default_factory=list)
-    sentence: str = ""
-    predicted_gap_closed: float = math.nan
-    share: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -147,15 +103,11 @@ class Diagnosis:
         return out
 
     def apply(self, physics: Physics) -> Physics:
-        """The corrected simulator, see `apply.apply`."""
-        from bayessim_mjx.diagnosis import correction
-
+        """The corrected simulator, see `correction.apply`."""
         return correction.apply(self, physics)
 
     def prior(self, physics: Physics | ParameterSpace | None = None) -> Distribution:
-        """What is known of the corrected simulator's theta, for the loop; see `apply.prior`."""
-        from bayessim_mjx.diagnosis import correction
-
+        """What is known of the corrected simulator's theta, for the loop; see `correction.prior`."""
         return correction.prior(self, physics)
 
     def save(self, folder: str | Path) -> Path:

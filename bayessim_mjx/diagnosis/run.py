@@ -1,113 +1,231 @@
-"""The diagnosis from logs to result: gate, known parameters, race, verdict, how far, where, next experiment."""
+"""The diagnosis from logs to result: what was logged, the race, and the stages after it, one after the other."""
 
 from __future__ import annotations
 
-import dataclasses
+import time
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
 
-import numpy as np
+import mujoco
 
-from bayessim_mjx.diagnosis.findings import Findings
-from bayessim_mjx.diagnosis.fitting.robot import Robot
+from bayessim_mjx.diagnosis.experiment import propose
+from bayessim_mjx.diagnosis.findings import Findings, Progress, Where
+from bayessim_mjx.diagnosis.fitting.robot import Robot, Source, robot_of
 from bayessim_mjx.diagnosis.logcheck import channels
+from bayessim_mjx.diagnosis.residual import frequency, where
 from bayessim_mjx.diagnosis.residual.disturbance import Disturbance, estimate
 from bayessim_mjx.diagnosis.residual.flexible import Flexible, flexible
-from bayessim_mjx.diagnosis.selection import bounds, heldout, search, verdict, weak_directions
+from bayessim_mjx.diagnosis.result import Diagnosis
+from bayessim_mjx.diagnosis.selection import heldout, outcome
 from bayessim_mjx.diagnosis.selection.models import Model
-from bayessim_mjx.diagnosis.selection.race import Race
-from bayessim_mjx.diagnosis.selection.weak_directions import Ridges
-from bayessim_mjx.diagnosis.setup import Setup, prepare
+from bayessim_mjx.diagnosis.selection.tried import Settings, Tried
+from bayessim_mjx.diagnosis.setup import Setup, TooLittleData, prepare
+from bayessim_mjx.diagnosis.summary import assemble, whole_logs
+from bayessim_mjx.diagnosis.summary.files import Files
 from bayessim_mjx.effects.effect import Effect
+from bayessim_mjx.logs import read_logs
 from bayessim_mjx.logs.log import Log
 
-Progress = Callable[[str, int, int], None]
+Effects = str | Sequence[str | type[Effect]]
 
 
-def diagnose(
+@dataclass(frozen=True)
+class Stage:
+    """One stage: its name, told while it runs; `run(findings, say) -> findings`.
+
+    optional: its failure becomes a warning, as the verdict stands without it.
+    """
+
+    name: str
+    run: Callable[[Findings, Progress], Findings]
+    optional: bool = False
+
+
+def how_far(found: Findings, say: Progress) -> Findings:
+    """With the held-out motion of the simulator as delivered, recalibrated and with the effects."""
+    fitter, base, model = found.setup.fitter, found.outcome.base, found.model
+    predictions = {
+        "nominal": heldout.nominal(fitter, found.outcome.nominal),
+        "calibrated": heldout.predict(fitter, base),
+    }
+    predictions["with_effects"] = heldout.predict(fitter, model) if model.effects else predictions["calibrated"]
+    return replace(found, predictions=MappingProxyType(predictions))
+
+
+def none_of_these(found: Findings, say: Progress) -> Findings:
+    """With the force that is missing, what a flexible force makes of it, and which links of the chain are sound."""
+    base, model, setup = found.outcome.base, found.model, found.setup
+    missing = estimate(setup.fitter, base.fit) if found.outcome.above_noise(base) else None
+    on_base = _flexible(found, base, missing)
+    on_winner = _flexible(found, model) if model.effects else on_base
+    links = tuple(link for log in setup.logs[:1] for link in channels.links(log, setup.robot.mj_model))
+    return replace(found, disturbance=missing, flexible_base=on_base, flexible_winner=on_winner, links=links)
+
+
+def _flexible(found: Findings, model: Model, missing: Disturbance | None = None) -> Flexible | None:
+    """The flexible force on a model whose gap is above the noise."""
+    if not found.outcome.above_noise(model):
+        return None
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return flexible(found.setup.fitter, model.fit, missing)
+
+
+def where_it_lies(found: Findings, say: Progress) -> Findings:
+    """With the places of the recalibrated simulator's gap, maps of the missing force and its spectra."""
+    if found.disturbance is None:
+        return found
+    fitter, fit = found.setup.fitter, found.outcome.base.fit
+    places, maps, told = where.locate(fitter, fit, found.disturbance, seed=found.setup.seed)
+    spectra, heard = frequency.analyse(fitter, fit, found.disturbance)
+    return found.having(Where(tuple(places), maps, spectra, (*told, *heard)))
+
+
+STAGES = (
+    Stage("how far", how_far),
+    Stage("none of these?", none_of_these),
+    Stage("whole logs", whole_logs.stage),
+    Stage("where", where_it_lies, optional=True),
+    Stage("next experiment", propose.stage, optional=True),
+)
+
+
+def investigate(
     robot: Robot,
     logs: Sequence[Log],
-    effects: str | Sequence[str | type[Effect]] = "all",
+    effects: Effects = "all",
     *,
     group: str | None = None,
     seed: int = 0,
-    settings: search.Settings | None = None,
+    settings: Settings | None = None,
     tolerated: Sequence[str] = (),
+    notes: Sequence[str] = (),
+    stages: Sequence[Stage] | None = None,
     progress: Progress | None = None,
-    keep: Callable[[Setup, Race | None], None] | None = None,
+    keep: Callable[[Setup, Tried | None], None] | None = None,
+    verdict: Callable[[Findings], None] | None = None,
 ) -> Findings:
-    """The whole computation.
+    """The whole computation, before anything is put into words or written.
 
     Args:
         robot: the model with the parameters that it may recalibrate.
-        logs: recorded motion.
-        effects: "all", or names (also of one's own, `path.py:Class`) or classes.
-        group: metadata key of the operating conditions that are held out in turn.
-        tolerated: what may stay unexplained, as `--tolerance` (`tolerance.read`).
-        progress: called with (what is being done, done, total).
-        keep: called with what is known so far: the setup, and after each stage the race.
+        logs, effects, group, seed, progress: see `diagnose`; tolerated: its `tolerance`.
+        settings: of the race; None: by the robot's size.
+        notes: what was noticed while model and logs were read, for the warnings.
+        stages: after the race; None: `STAGES`.
+        keep: called with what is known while the race goes on: the setup, and after each part what was tried.
+        verdict: called with the findings before the first optional stage.
 
     Raises:
         UserError: nothing usable. TooLittleData: nothing could be held out.
     """
     say = progress or (lambda text, done, total: None)
+    known = keep or (lambda setup, tried: None)
     say("looking at the logs", 0, 1)
-    setup = prepare(robot, logs, effects, group=group, seed=seed, settings=settings, tolerated=tolerated)
-    known = keep or (lambda setup, race: None)
+    setup = prepare(robot, logs, effects, group=group, seed=seed, settings=settings, tolerated=tolerated, notes=notes)
     known(setup, None)
-    race = search.run(setup.fitter, setup.candidates, setup.settings, say, lambda race: known(setup, race))
-    race.winner = bounds.widened(race, _verified(setup, race, say), say)
-    ruling = verdict.rule(race, say)
-    ruling = dataclasses.replace(ruling, model=bounds.widened(race, ruling.model, say))
-    ruling, along = _on_ridges(race, ruling)
-    fitter, model = setup.fitter, ruling.model
-    say("how far", 0, 1)
-    predictions = {"nominal": heldout.nominal(fitter, race.nominal), "calibrated": heldout.predict(fitter, race.base)}
-    predictions["with_effects"] = heldout.predict(fitter, model) if model.effects else predictions["calibrated"]
-    say("none of these?", 0, 1)
-    missing = _disturbance(setup, race)
-    on_base = _flexible(setup, race.base, race, missing)
-    on_winner = _flexible(setup, model, race) if model.effects else on_base
-    links = [link for log in setup.logs[:1] for link in channels.links(log, robot.mj_model)]
-    return Findings(setup, race, ruling, predictions, on_base, on_winner, missing, links, along)
+    race = setup.fitter, setup.candidates, setup.settings
+    found = Findings(setup, outcome.select(*race, say, lambda tried: known(setup, tried)))
+    for stage in STAGES if stages is None else stages:
+        if stage.optional and verdict is not None:
+            verdict(found)
+            verdict = None
+        say(stage.name, 0, 1)
+        found = _after(stage, found, say)
+    return found
 
 
-def _on_ridges(race: search.Race, ruling: verdict.Ruling) -> tuple[verdict.Ruling, Ridges | None]:
-    """The ruling with its model where data and beliefs together put it, and what was simulated along its ridges."""
-    if not ruling.model.effects:
-        return ruling, None
-    model, along = weak_directions.settled(race.fitter, ruling.model)
-    race.models[frozenset(c.label for c in model.effects)] = race.winner = model
-    return dataclasses.replace(ruling, model=model), along
+def _after(stage: Stage, found: Findings, say: Progress) -> Findings:
+    try:
+        return stage.run(found, say)
+    except Exception as error:
+        if not stage.optional:
+            raise
+        # the verdict is there: a picture or proposal less must not lose it
+        lost = f"{stage.name}: not available ({type(error).__name__}: {error})"
+        return replace(found, warnings=(*found.warnings, lost))
 
 
-def _verified(setup: Setup, race: search.Race, say: Progress) -> Model:
-    """The winner without effects that do not help when held-out windows are really simulated (not by linearisation)."""
-    model = race.winner
-    if model.effects:
-        model = heldout.steadied(setup.fitter, model)
-    steps = setup.fitter.simulator.windows.steps
-    while model.effects:
-        full = heldout.predict(setup.fitter, model).cost(steps).mean()
-        smaller = [heldout.steadied(setup.fitter, search.without(race, model, e, say)) for e in model.effects]
-        error = [heldout.predict(setup.fitter, m).cost(steps).mean() for m in smaller]
-        helps = [(e - full) / max(e - 1.0, 1e-9) for e in error]
-        least = int(np.argmin(helps))
-        if helps[least] > race.settings.more / 2:
-            return model
-        model = smaller[least]
-    return model
+def diagnose(
+    model: Source,
+    logs: str | Path | Log | Sequence[str | Path | Log],
+    *,
+    effects: Effects = "all",
+    parameters: str | Path | None = None,
+    map: str | Path | None = None,
+    group: str | None = None,
+    tolerance: str | Sequence[str] = (),
+    seed: int = 0,
+    out: str | Path | None = None,
+    progress: Progress | None = None,
+    notes: Sequence[str] = (),
+    about: Mapping[str, Any] | None = None,
+) -> Diagnosis:
+    """Where logs and simulator differ, which missing effects cause it, and how much they explain.
+
+    Args:
+        model: an MJCF file, a MuJoCo specification or model, or a `Robot`; `bayessim_mjx.diagnose` takes a task's name
+            as well.
+        logs: recorded motion: a folder, files (docs/logs.md), or `Log`s.
+        effects: "all", or names (also of one's own, `path.py:Class`) or classes.
+        parameters: YAML file with the parameters that may be recalibrated; None: damping, armature and mass.
+        map: YAML file that maps the columns of the logs to the model.
+        group: metadata key of the operating conditions that are held out in turn.
+        tolerance: what may stay unexplained, as `--tolerance`: "0.5deg", "elbow=2mm", "3%".
+        seed: of all random numbers.
+        out: folder for what the command writes, but for the report; None: nothing is written.
+        progress: called with (what is being done, done, total).
+        notes: what was noticed before, first among the warnings.
+        about: entries of the report's header in the place of those made here.
+
+    Returns:
+        The result; too little data is a verdict, not an error.
+
+    Raises:
+        UserError: model, logs, effects or tolerance are not usable.
+    """
+    with noting() as noticed:
+        robot = robot_of(model, parameters)
+        recorded = _logs(logs, robot.mj_model, map)
+    noticed = [*notes, *noticed]
+    told = {
+        "robot": robot.name, "model": str(model) if isinstance(model, str | Path) else robot.name,
+        "data": _names(logs), "logs": len(recorded), "seconds": float(sum(log.duration for log in recorded)),
+        "date": time.strftime("%Y-%m-%d %H:%M"), "seed": seed,
+        **(about or {}),
+    }  # fmt: skip
+    files = Files(None if out is None else Path(out), told)
+    asked: Any = {"group": group, "seed": seed, "notes": noticed, "progress": progress}
+    asked["tolerated"] = [tolerance] if isinstance(tolerance, str) else tolerance
+    try:
+        found = investigate(robot, recorded, effects, **asked, keep=files.so_far, verdict=files.verdict)
+    except TooLittleData as reason:
+        return files.whole(assemble.insufficient(str(reason), noticed, told), robot)
+    return files.whole(files.result(found), robot)
 
 
-def _disturbance(setup: Setup, race: search.Race) -> Disturbance | None:
-    """The force that the recalibrated simulator lacks, where its gap is above the noise."""
-    return estimate(setup.fitter, race.base.fit) if race.above_noise(race.base) else None
+@contextmanager
+def noting() -> Iterator[list[str]]:
+    """A list that holds the warnings of its block, each once, when the block ends."""
+    notes: list[str] = []
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", UserWarning)
+        yield notes
+    notes += dict.fromkeys(str(w.message) for w in caught)
 
 
-def _flexible(setup: Setup, model: Model, race: search.Race, missing: Disturbance | None = None) -> Flexible | None:
-    """The flexible force on a model whose gap is above the noise."""
-    if not race.above_noise(model):
-        return None
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        return flexible(setup.fitter, model.fit, missing)
+def _logs(logs: Any, model: mujoco.MjModel, map: str | Path | None) -> list[Log]:
+    each: list[Any] = [logs] if isinstance(logs, str | Path | Log) else list(logs)
+    if all(isinstance(log, Log) for log in each):
+        return each
+    return read_logs(each if len(each) > 1 else each[0], model, map)
+
+
+def _names(logs: Any) -> list[str]:
+    each = [logs] if isinstance(logs, str | Path | Log) else logs
+    return [log.name if isinstance(log, Log) else str(log) for log in each]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from bayessim_mjx.diagnosis.fitting.fitter import Fitter
 from bayessim_mjx.diagnosis.fitting.robot import Robot
 from bayessim_mjx.diagnosis.fitting.simulator import Simulator
 from bayessim_mjx.diagnosis.logcheck import gate, noise
-from bayessim_mjx.diagnosis.selection import search
+from bayessim_mjx.diagnosis.selection.tried import Settings
 from bayessim_mjx.effects.effect import Effect
 from bayessim_mjx.logs.log import Log
 from bayessim_mjx.logs.resample import resample
@@ -48,12 +48,12 @@ class Setup:
     gate: gate.Gate
     floors: noise.Floors
     fitter: Fitter
-    candidates: list[candidates.Candidate]
+    candidates: tuple[candidates.Candidate, ...]
     scales: scales.Scales
-    settings: search.Settings
+    settings: Settings
     seed: int
     tolerance: tolerance.Tolerance
-    warnings: list[str] = field(default_factory=list)
+    warnings: tuple[str, ...] = ()
     discretisation: discretisation.Discretisation | None = None
 
     @property
@@ -76,10 +76,16 @@ def prepare(
     *,
     group: str | None = None,
     seed: int = 0,
-    settings: search.Settings | None = None,
+    settings: Settings | None = None,
     tolerated: Sequence[str] = (),
+    notes: Sequence[str] = (),
 ) -> Setup:
     """Everything up to the first simulation.
+
+    Args:
+        robot, logs, effects, group, seed, tolerated: see `run.diagnose`.
+        settings: of the race; None: by the robot's size.
+        notes: what was noticed before, first among the warnings.
 
     Raises:
         UserError: unknown effects, no usable log, a tolerance that cannot be read.
@@ -89,7 +95,7 @@ def prepare(
     dt = control_period(robot, logs)
     seen = gate.check(logs, robot.mj_model, dt)
     usable = seen.demand()
-    notes = [*seen.warnings, *(f"{text} (found, not assumed)" for text in seen.findings)]
+    told = [*notes, *seen.warnings, *(f"{text} (found, not assumed)" for text in seen.findings)]
     floors = noise.floors(usable)
     kinds = [library.load(n) if isinstance(n, str) else n for n in (library.names() if effects == "all" else effects)]
     size = scales.measure(robot.mj_model, [resample(log, dt) for log in usable])
@@ -100,18 +106,18 @@ def prepare(
     physics = physics_of(robot, dt, stack)
     cut = step.noisier(cuts(step.factor, _limit(physics, cuts(1).steps), centred=False))
     fitter = Fitter(Simulator(physics, cut), candidates.base_coordinates(robot.space), physics.space.nominal)
-    every = candidates.enumerate_candidates(physics)
+    every = tuple(candidates.enumerate_candidates(physics))
     settings = dataclasses.replace(settings or _settings(robot), believed=step.believed)
     allowed = tolerance.judge(robot.mj_model, 2 * size.travel, cut.sigma_q, asked)
-    notes += [*floors.warnings, *step.warnings(), *(f"not tried: {text}" for text in left_out), *_few_conditions(cut)]
-    notes += allowed.warnings()
-    return Setup(robot, physics, seen, floors, fitter, every, size, settings, seed, allowed, notes, step)
+    told += [*floors.warnings, *step.warnings(), *(f"not tried: {text}" for text in left_out), *_few_conditions(cut)]
+    told += allowed.warnings()
+    return Setup(robot, physics, seen, floors, fitter, every, size, settings, seed, allowed, tuple(told), step)
 
 
-def _settings(robot: Robot) -> search.Settings:
+def _settings(robot: Robot) -> Settings:
     """Budgets for the robot's size; thresholds are the same for all."""
     big = robot.mj_model.nv > MANY
-    return search.Settings(singles=24, pairs=5, screened=24, starts=16) if big else search.Settings()
+    return Settings(singles=24, pairs=5, screened=24, starts=16) if big else Settings()
 
 
 def _measured(

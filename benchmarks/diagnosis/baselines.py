@@ -31,6 +31,14 @@ def _quiet(text: str, done: int, total: int) -> None:
     """No progress."""
 
 
+class Reopened:
+    """What a diagnosis found, with its race open again: further models are fitted on the same windows."""
+
+    def __init__(self, found: Findings) -> None:
+        self.setup, self.predictions, self.flexible_base = found.setup, found.predictions, found.flexible_base
+        self.race = found.outcome.reopened()
+
+
 def candidate_of(race: Race, name: str, where: str, joint_of: dict[str, str]) -> Candidate | None:
     """The race's candidate of that name at that place; an actuator and its joint are one place."""
     same = lambda place: joint_of.get(place, place)  # noqa: E731
@@ -52,7 +60,7 @@ def singles(race: Race) -> list[Model]:
     return fit_models(race, [(race.base, s) for s in chosen], "", _quiet)
 
 
-def closure(found: Findings, model: Model) -> float:
+def closure(found: Reopened, model: Model) -> float:
     """Share of the calibrated gap that a model closes on held-out conditions, as in diagnosis.json."""
     fitter = found.setup.fitter
     cut = fitter.simulator.windows
@@ -61,7 +69,7 @@ def closure(found: Findings, model: Model) -> float:
     return heldout.Closed(before, after, cut.group).value
 
 
-def told(found: Findings, model: Model) -> Said:
+def told(found: Reopened, model: Model) -> Said:
     """A model as a verdict: each of its effects is named, with intervals."""
     if not model.effects:
         return {"verdict": "parameters", "effects": []}
@@ -80,7 +88,7 @@ def _named(name: str, where: str, parameters: Said, closed: float | None, rivals
     return {"name": name, "where": where, "parameters": parameters, "gap_closed": closed, "equivalent_to": others}
 
 
-def refit(found: Findings) -> Said:
+def refit(found: Reopened) -> Said:
     """The known parameters alone, as mujoco.sysid: it never names an effect."""
     return told(found, found.race.base)
 
@@ -92,7 +100,7 @@ def bic(model: Model, spread: np.ndarray) -> float:
     return float(n * np.log(q.c.sum() / n) + model.size * np.log(n))
 
 
-def naive_bic(found: Findings) -> Said:
+def naive_bic(found: Reopened) -> Said:
     """The lowest BIC of all models that were fitted, the known parameters alone among them."""
     race = found.race
     return told(found, min(race.models.values(), key=lambda m: bic(m, race.fitter.spread)))
@@ -107,7 +115,7 @@ def fold_error(race: Race, model: Model, test: np.ndarray) -> float:
     return float(np.maximum(q.at(p)[test], 0.0).sum())
 
 
-def single_fold(found: Findings) -> Said:
+def single_fold(found: Reopened) -> Said:
     """The smallest error on one test set of operating conditions, as BAM: no threshold, no interval."""
     race, group = found.race, found.race.fitter.simulator.windows.group
     names = np.unique(group)
@@ -117,7 +125,7 @@ def single_fold(found: Findings) -> Said:
     return told(found, min(race.models.values(), key=lambda m: fold_error(race, m, test)))
 
 
-def importance(found: Findings) -> Said:
+def importance(found: Reopened) -> Said:
     """What the flexible force depends on most, read as an effect; its family counts as equivalent."""
     flex = found.flexible_base
     if flex is None or not flex.condition.significant or not flex.depends_on:
@@ -135,7 +143,7 @@ def importance(found: Findings) -> Said:
     return {"verdict": "effects", "effects": [_named(name, where, {}, closed, rivals)]}
 
 
-def classifier(found: Findings) -> Said:
+def classifier(found: Reopened) -> Said:
     """A classifier trained on simulations of every candidate on the case's own windows."""
     from lda import classify
 
@@ -144,7 +152,7 @@ def classifier(found: Findings) -> Said:
     return told(found, race.base if effect is None else fitted(race, [effect]))
 
 
-BASELINES: dict[str, Callable[[Findings], Said]] = {
+BASELINES: dict[str, Callable[[Reopened], Said]] = {
     "parameter refit": refit,
     "naive BIC": naive_bic,
     "single fold": single_fold,
@@ -153,7 +161,7 @@ BASELINES: dict[str, Callable[[Findings], Said]] = {
 }
 
 
-def all_baselines(found: Findings) -> dict[str, Said]:
+def all_baselines(found: Reopened) -> dict[str, Said]:
     """{baseline: what it says}; `seconds` beyond the fits, which all share."""
     started = time.perf_counter()
     singles(found.race)

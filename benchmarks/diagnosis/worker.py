@@ -21,6 +21,7 @@ def diagnose(arguments: list[str]) -> tuple[int, dict[str, float], Any]:
     """(exit code, seconds in all and of compilation, findings or None) of the diagnosis's own command."""
     started = time.perf_counter()
     import jax.monitoring
+    from baselines import Reopened
 
     from bayessim_mjx import diagnose as command
     from bayessim_mjx.diagnosis import run
@@ -28,7 +29,7 @@ def diagnose(arguments: list[str]) -> tuple[int, dict[str, float], Any]:
 
     compiling: list[tuple[float, float]] = []
     kept = []
-    original = run.diagnose
+    original = run.investigate
 
     def listen(event: str, seconds: float, **_: Any) -> None:
         if event.startswith(COMPILING):
@@ -39,18 +40,18 @@ def diagnose(arguments: list[str]) -> tuple[int, dict[str, float], Any]:
         return kept[0]
 
     jax.monitoring.register_event_duration_secs_listener(listen)
-    run.diagnose = keep
+    run.investigate = keep
     code = command.main(arguments)
     times = {"seconds": time.perf_counter() - started, "compile_seconds": covered(compiling)}
-    return code, times, kept[0] if kept else None
+    return code, times, Reopened(kept[0]) if kept else None
 
 
 def without_pictures() -> None:
     """Only the verdict and its numbers: no maps, proposal, report and curves, which no score is made of."""
     from bayessim_mjx import report
-    from bayessim_mjx.diagnosis.summary import assemble
+    from bayessim_mjx.diagnosis import run
 
-    assemble.with_more = lambda result, found, folder, say: result
+    run.STAGES = tuple(stage for stage in run.STAGES if not stage.optional)
     report.write = lambda result, folder: None
     report.tensorboard = lambda result, folder: None
 

@@ -349,7 +349,7 @@ def begins(module: Any, argv: Sequence[str]) -> None:
     with contextlib.ExitStack() as stack:
         for target, name in (
             (__import__("bayessim_mjx.registry").registry, "make"),
-            (run, "diagnose"),
+            (run, "investigate"),
             (cli, "list_tasks"),
         ):
             stack.enter_context(mock.patch.object(target, name, reached))

@@ -104,14 +104,16 @@ def findings(rms, noise=50.0, windows=8):
         return Prediction(np.full((windows, 5, 2), float(level)), np.zeros((windows, 4)))
 
     winner = SimpleNamespace(effects=(FRICTION,), total=windows * noise * rms**2)
-    race = SimpleNamespace(
+    outcome = SimpleNamespace(
+        ambiguous=False,
+        rivals={},
         noise=noise,
         above_noise=lambda m: True,
         base=SimpleNamespace(total=windows * noise * 1e6, cost=np.ones(windows)),
     )
     cut = SimpleNamespace(windows=SimpleNamespace(steps=5))
     return SimpleNamespace(
-        race=race, ruling=SimpleNamespace(model=winner, ambiguous=False, rivals={}), flexible_winner=None,
+        outcome=outcome, model=winner, flexible_winner=None,
         flexible_base=None, setup=SimpleNamespace(fitter=SimpleNamespace(simulator=cut)),
         predictions={"nominal": prediction(2000), "calibrated": prediction(1000), "with_effects": prediction(rms)},
     )  # fmt: skip

@@ -5,18 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.selection.models import Model
+from bayessim_mjx.diagnosis.setup import Setup
 from bayessim_mjx.effects.support.words import words
 from bayessim_mjx.logs.log import Log
-
-if TYPE_CHECKING:
-    from bayessim_mjx.diagnosis.setup import Setup
 
 Array = NDArray[np.float64]
 

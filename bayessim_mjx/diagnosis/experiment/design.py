@@ -9,7 +9,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import numpy as np
@@ -20,9 +20,7 @@ from bayessim_mjx.diagnosis.fitting import windows
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 from bayessim_mjx.diagnosis.fitting.quadratic import eliminate, solve
 from bayessim_mjx.diagnosis.selection.models import Model
-
-if TYPE_CHECKING:
-    from bayessim_mjx.diagnosis.setup import Setup
+from bayessim_mjx.diagnosis.setup import Setup
 
 Array = NDArray[np.float64]
 DRAWS = 8  # from the posterior of the truth's parameters

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -15,14 +15,13 @@ from bayessim_mjx.diagnosis.experiment.design import Scored, Scorer
 from bayessim_mjx.diagnosis.experiment.excitation import Excitation, menu
 from bayessim_mjx.diagnosis.experiment.limits import Limits, limits_of
 from bayessim_mjx.diagnosis.experiment.rehearsal import Drives, Played, Rehearsal
+from bayessim_mjx.diagnosis.findings import Findings, Progress
 from bayessim_mjx.diagnosis.selection.models import Model
-from bayessim_mjx.diagnosis.selection.search import Race, ranked
+from bayessim_mjx.diagnosis.selection.outcome import Outcome
+from bayessim_mjx.diagnosis.selection.tried import ranked
 from bayessim_mjx.diagnosis.selection.uncertainty import win_share
-from bayessim_mjx.diagnosis.selection.verdict import MILD, Ruling
+from bayessim_mjx.diagnosis.selection.verdict import MILD
 from bayessim_mjx.effects.gravity_tilt import tilted
-
-if TYPE_CHECKING:
-    from bayessim_mjx.diagnosis.setup import Setup
 
 Array = NDArray[np.float64]
 SECONDS = 10.0
@@ -77,52 +76,56 @@ class Experiment:
         return out
 
 
+def stage(found: Findings, say: Progress) -> Findings:
+    """With a proposal, where there is anything left to tell apart."""
+    wanted = found.model.effects or found.outcome.above_noise(found.outcome.base)
+    return found.having(propose(found)) if wanted else found
+
+
 def propose(
-    setup: Setup,
-    race: Race,
-    ruling: Ruling,
-    rivals_models: Sequence[Model] | None = None,
-    limits: Mapping[str, Any] | None = None,
-    seed: int = 0,
+    found: Findings, rivals_models: Sequence[Model] | None = None, limits: Mapping[str, Any] | None = None
 ) -> Experiment:
     """The experiment that separates the surviving models best, within the limits.
 
     Args:
-        rivals_models: models to be told from the winner; None: the ruling's rivals, and without any the closest losers.
+        rivals_models: models to be told from the winner; None: its rivals, and without any the closest losers.
         limits: see `excitation.limits_of`.
     """
+    setup, seed = found.setup, found.setup.seed
     cut, model = setup.fitter.simulator.windows, setup.physics.mj_model
-    models, contested = _contenders(race, ruling, rivals_models)
-    weights = np.maximum(win_share(models, cut.group, race.noise, np.random.default_rng(seed)), WEIGHT)
+    models, contested = _contenders(found.outcome, rivals_models)
+    weights = np.maximum(win_share(models, cut.group, found.outcome.noise, np.random.default_rng(seed)), WEIGHT)
     scorer = Scorer(setup, models, weights, seed)
     allowed = limits_of(model, cut.logs, limits)
     rows = max(cut.steps, int(round(SECONDS / cut.dt)) // cut.steps * cut.steps)
     time = np.asarray(cut.dt * np.arange(rows), np.float64)
     effects = {c.effect for m in models for c in m.effects} | {"payload", "gravity_tilt"}
-    stage = Rehearsal(setup, effects, time, allowed)
-    joints = _touched(stage.drives.joints(), models, model)
+    stand = Rehearsal(setup, effects, time, allowed)
+    joints = _touched(stand.drives.joints(), models, model)
     loaded = sorted(joints, key=lambda n: -setup.scales.force[joints[n]])[:ALONE]
-    every = menu(time, joints, loaded, stage.half, allowed.speed, stage.release, seed) if joints else []
-    scored = _look(scorer, stage, every)
-    attended = _with_help(scorer, stage, scored, model)
-    final = _in_full(scorer, stage, scored, attended)
+    every = menu(time, joints, loaded, stand.half, allowed.speed, stand.release, seed) if joints else []
+    scored = _look(scorer, stand, every)
+    attended = _with_help(scorer, stand, scored, model)
+    final = _in_full(scorer, stand, scored, attended)
     safe = {s.played.excitation.name for s in scored}
-    found = _decide(scorer, stage, final, scored, attended, contested)
-    return replace(found, unsafe=[e.name for e in every if e.name not in safe])
+    chosen = _decide(scorer, stand, final, scored, attended, contested)
+    return replace(chosen, unsafe=[e.name for e in every if e.name not in safe])
 
 
-def _contenders(race: Race, ruling: Ruling, given: Sequence[Model] | None) -> tuple[list[Model], bool]:
+def _contenders(outcome: Outcome, given: Sequence[Model] | None) -> tuple[list[Model], bool]:
     """(winner and rivals, whether the logs left it open between them)."""
-    found = [r.model for rivals in ruling.rivals.values() for r in rivals if not r.contains] if given is None else given
-    found = list({id(m): m for m in found if m is not ruling.model}.values())
+    found = (
+        [r.model for rivals in outcome.rivals.values() for r in rivals if not r.contains] if given is None else given
+    )
+    found = list({id(m): m for m in found if m is not outcome.answer}.values())
     if found:
-        return [ruling.model, *found[: MOST - 1]], True
-    own = {c.effect for c in ruling.model.effects}
-    losers = [m for m in ranked(race) if m is not ruling.model and not {c.effect for c in m.effects} & own]
-    close = [m for m in losers if abs(race.better(m, ruling.model).evidence) < 3 * MILD and (m.effects or own)]
-    if not ruling.model.effects:  # nothing is wrong as far as these logs can tell: what could still hide?
+        return [outcome.answer, *found[: MOST - 1]], True
+    own = {c.effect for c in outcome.answer.effects}
+    losers = [m for m in ranked(outcome) if m is not outcome.answer and not {c.effect for c in m.effects} & own]
+    close = [m for m in losers if abs(outcome.better(m, outcome.answer).evidence) < 3 * MILD and (m.effects or own)]
+    if not outcome.answer.effects:  # nothing is wrong as far as these logs can tell: what could still hide?
         close = close[:2]
-    return [ruling.model, *close[: MOST - 2]], False
+    return [outcome.answer, *close[: MOST - 2]], False
 
 
 def _touched(joints: dict[str, int], models: Sequence[Model], model: Any) -> dict[str, int]:
@@ -149,14 +152,14 @@ def _thetas(scorer: Scorer, shift: Array) -> Array:
     return np.stack([vector(m.fit.coordinates, m.fit.values) + shift for m in scorer.models])
 
 
-def _look(scorer: Scorer, stage: Rehearsal, every: Sequence[Excitation]) -> list[Scored]:
+def _look(scorer: Scorer, stand: Rehearsal, every: Sequence[Excitation]) -> list[Scored]:
     """A first look at the whole menu, on as many windows as the budget allows, best first."""
     shift = np.zeros(len(scorer.fitter.theta))
-    played = [p for p in stage.play(every, _thetas(scorer, shift)) if p.safe] if every else []
+    played = [p for p in stand.play(every, _thetas(scorer, shift)) if p.safe] if every else []
     if not played:
         return []
     columns = sum(1 + m.size + 2 * scorer.fitter.simulator.nv for m in scorer.models)
-    full = (len(stage.time)) // scorer.fitter.simulator.windows.steps
+    full = (len(stand.time)) // scorer.fitter.simulator.windows.steps
     each = int(np.clip(BUDGET / (columns * len(played)), 2, full))
     pairs = scorer.score(played, shift, each)
     return sorted((_scored(scorer, p, e) for p, e in zip(played, pairs, strict=True)), key=lambda s: -s.evidence)
@@ -167,25 +170,25 @@ def _scored(scorer: Scorer, played: Played, pairs: Array, help_: advice.Help | N
     return Scored(name, played, scorer.mean(pairs), pairs, help_.needs if help_ else "")
 
 
-def _with_help(scorer: Scorer, stage: Rehearsal, scored: list[Scored], model: Any) -> list[Scored]:
+def _with_help(scorer: Scorer, stand: Rehearsal, scored: list[Scored], model: Any) -> list[Scored]:
     """The best two motions again, with a known payload and with the robot mounted on its side."""
     out = []
     top = [s.played.excitation for s in scored[:2]]
     for own in advice.helps(scorer.setup) if top else []:
         gravity = np.asarray(tilted(jnp.asarray(model.opt.gravity), *(jnp.asarray(a) for a in own.tilt)))
-        played = [p for p in stage.play(top, _thetas(scorer, own.shift), gravity) if p.safe]
-        full = len(stage.time) // scorer.fitter.simulator.windows.steps
+        played = [p for p in stand.play(top, _thetas(scorer, own.shift), gravity) if p.safe]
+        full = len(stand.time) // scorer.fitter.simulator.windows.steps
         if played:
             pairs = scorer.score(played, own.shift, max(2, full // 3))
             out += [_scored(scorer, p, e, own) for p, e in zip(played, pairs, strict=True)]
     return sorted(out, key=lambda s: -s.evidence)
 
 
-def _in_full(scorer: Scorer, stage: Rehearsal, scored: list[Scored], attended: list[Scored]) -> list[Scored]:
+def _in_full(scorer: Scorer, stand: Rehearsal, scored: list[Scored], attended: list[Scored]) -> list[Scored]:
     """The best ones on all of their windows."""
     if not scored:
         return []
-    full = len(stage.time) // scorer.fitter.simulator.windows.steps
+    full = len(stand.time) // scorer.fitter.simulator.windows.steps
     best = [s.played for s in scored[:FINAL]]
     pairs = scorer.score(best, np.zeros(len(scorer.fitter.theta)), full)
     exact = [_scored(scorer, p, e) for p, e in zip(best, pairs, strict=True)]
@@ -193,7 +196,7 @@ def _in_full(scorer: Scorer, stage: Rehearsal, scored: list[Scored], attended: l
 
 
 def _decide(
-    scorer: Scorer, stage: Rehearsal, final: list[Scored], scored: list[Scored], attended: list[Scored], contested: bool
+    scorer: Scorer, stand: Rehearsal, final: list[Scored], scored: list[Scored], attended: list[Scored], contested: bool
 ) -> Experiment:
     labels = [advice.title(m) for m in scorer.models]
     alone = [s for s in final if not s.needs]
@@ -202,7 +205,7 @@ def _decide(
     if helped and (chosen is None or (chosen.evidence < MILD and helped.evidence > 1.5 * chosen.evidence + NOTHING)):
         chosen = helped
     useful = chosen is not None and (chosen.evidence > NOTHING or (len(labels) == 1 and chosen.evidence > 0.1))
-    why = advice.reason(scorer, chosen, labels, contested, useful, stage.limits)
+    why = advice.reason(scorer, chosen, labels, contested, useful, stand.limits)
     witnesses = advice.witnesses(scorer.models, scorer.fitter.simulator.windows.logs)
     kept = {s.name for s in final}
     table = [*final, *(s for s in [*scored, *attended] if s.name not in kept)]
@@ -217,8 +220,8 @@ def _decide(
         witnesses=witnesses,
         chosen=chosen if useful else None,
         menu=final,
-        drives=stage.drives,
-        limits=stage.limits,
+        drives=stand.drives,
+        limits=stand.limits,
         labels=labels,
     )
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -17,11 +17,9 @@ from bayessim_mjx.device import compiler_options
 from bayessim_mjx.diagnosis.experiment.excitation import Excitation, middle
 from bayessim_mjx.diagnosis.experiment.limits import Limits
 from bayessim_mjx.diagnosis.logcheck.drives import Drives, drives_of
+from bayessim_mjx.diagnosis.setup import Setup
 from bayessim_mjx.logs.log import Log
 from bayessim_mjx.physics import Drive, Physics, control_step
-
-if TYPE_CHECKING:
-    from bayessim_mjx.diagnosis.setup import Setup
 
 Array = NDArray[np.float64]
 LANES = 32  # worlds in one call

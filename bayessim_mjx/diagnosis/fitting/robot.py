@@ -6,7 +6,7 @@ import math
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import mujoco
 import numpy as np
@@ -34,7 +34,7 @@ class Robot:
 
     Attributes:
         mj_model: the nominal model.
-        spec: gives a fresh specification that compiles to it.
+        spec: gives a fresh specification that compiles to it; None: only the compiled model is known.
         control_dt: s; None: the logs' own period holds.
         space: the parameters that the simulator already has and may recalibrate.
         name: the task's, or the file's without its ending.
@@ -42,7 +42,7 @@ class Robot:
     """
 
     mj_model: mujoco.MjModel
-    spec: Callable[[], mujoco.MjSpec]
+    spec: Callable[[], mujoco.MjSpec] | None
     control_dt: float | None
     space: ParameterSpace
     name: str
@@ -54,6 +54,30 @@ class Robot:
         """The robot at control steps of `control_dt` s, with `space` in the place of its own parameters."""
         model = with_timestep(self.mj_model, control_dt)
         return Physics(model, control_dt, self.space if space is None else space, effects, self.max_qvel)
+
+
+Source: TypeAlias = str | Path | mujoco.MjSpec | mujoco.MjModel | Robot
+
+
+def robot_of(source: Source, parameters: str | Path | None = None) -> Robot:
+    """The robot of an MJCF file, a MuJoCo specification or a compiled model; a robot as it is.
+
+    Args:
+        parameters: a params.yaml; None: the default space, or the robot's own.
+
+    Raises:
+        UserError: see `of_file`.
+    """
+    if isinstance(source, Robot):
+        space = source.space if parameters is None else read_params(parameters, source.mj_model)
+        return dataclasses.replace(source, space=space)
+    if isinstance(source, mujoco.MjModel):
+        name = bytes(source.names).split(b"\0")[0].decode() or "model"
+        _check(source, name)
+        return Robot(source, None, None, _space(source, parameters), name)
+    if isinstance(source, mujoco.MjSpec):
+        return _of_spec(source.copy(), source.modelname or "model", source.modelname, parameters)
+    return of_file(source, parameters)
 
 
 def of_task(env: "Task", parameters: str | Path | None = None) -> Robot:
@@ -78,13 +102,18 @@ def of_file(path: str | Path, parameters: str | Path | None = None) -> Robot:
     path = Path(path)
     if not path.is_file():
         raise UserError(f"--model {path}: no such file")
-    spec = _loaded(path)
+    return _of_spec(_loaded(path), str(path), path.stem, parameters)
+
+
+def _of_spec(spec: mujoco.MjSpec, source: str, name: str, parameters: str | Path | None) -> Robot:
     if int(spec.option.integrator) == _IMPLICIT:
-        warnings.warn(f"{path}: MJX has no integrator implicit; implicitfast is used (no Coriolis terms)", stacklevel=2)
+        warnings.warn(
+            f"{source}: MJX has no integrator implicit; implicitfast is used (no Coriolis terms)", stacklevel=3
+        )
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    model = _compiled(spec, path)
-    _check(model, str(path))
-    return Robot(model, spec.copy, None, _space(model, parameters), path.stem)
+    model = _compiled(spec, source)
+    _check(model, source)
+    return Robot(model, spec.copy, None, _space(model, parameters), name)
 
 
 def _loaded(path: Path) -> mujoco.MjSpec:
@@ -94,11 +123,11 @@ def _loaded(path: Path) -> mujoco.MjSpec:
         raise UserError(f"{path}: MuJoCo cannot load it: {_one_line(error)}") from None
 
 
-def _compiled(spec: mujoco.MjSpec, path: Path) -> mujoco.MjModel:
+def _compiled(spec: mujoco.MjSpec, source: str) -> mujoco.MjModel:
     try:
         return spec.compile()
     except ValueError as error:
-        raise UserError(f"{path}: MuJoCo cannot compile it: {_one_line(error)}") from None
+        raise UserError(f"{source}: MuJoCo cannot compile it: {_one_line(error)}") from None
 
 
 def _one_line(error: Exception) -> str:

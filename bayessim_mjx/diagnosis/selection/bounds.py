@@ -10,7 +10,8 @@ import numpy as np
 
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate, Coordinate, shrink
 from bayessim_mjx.diagnosis.selection.models import Model, scored
-from bayessim_mjx.diagnosis.selection.race import Progress, Race, fresh, ranked
+from bayessim_mjx.diagnosis.selection.race import Progress, Race, fresh
+from bayessim_mjx.diagnosis.selection.tried import ranked
 from bayessim_mjx.physics import Physics
 
 NEAR = 1e-3  # of a range: at its end

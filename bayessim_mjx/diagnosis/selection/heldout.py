@@ -140,7 +140,7 @@ class Closed:
     def value(self) -> float:
         """At most 1: nothing undercuts the noise."""
         before, left, noise = self._sums(np.ones_like(self.before))
-        return min(float(before - left) / max(float(before - noise), 1e-9), 1.0)
+        return min(statistics.share_of_gap(float(before - left), float(before), float(noise)), 1.0)
 
     def interval(self) -> tuple[float, float]:
         """90 % interval between -1 and 1, NaN of one condition.

@@ -92,10 +92,9 @@ class Comparison:
 def compare(old: Model, new: Model, group: NDArray[np.int64], noise: float) -> Comparison:
     """`noise`: expected cost of a perfect model per window."""
     gain = old.total - new.total
-    above = max(old.total - noise * len(old.cost), 1e-9 * old.total)
     log_gain = np.log(old.cost + noise) - np.log(new.cost + noise)
     return Comparison(
-        share=gain / above,
+        share=statistics.share_of_gap(gain, old.total, noise * len(old.cost)),
         drop=gain / old.total,
         evidence=0.5 * new.samples * float(np.log(old.total / new.total)),
         t=statistics.normal_deviate(log_gain, group),

@@ -13,15 +13,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bayessim_mjx.diagnosis import statistics
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.quadratic import Quadratic, eliminate, solve
-from bayessim_mjx.diagnosis.selection.race import Race
+from bayessim_mjx.diagnosis.selection.tried import Tried
 
 Array = NDArray[np.float64]
 FURTHEST = 2.0  # times the screened start: further a secant is not trusted
 
 
-def promised(race: Race, effects: Sequence[Candidate]) -> tuple[float, dict[str, float]]:
+def promised(race: Tried, effects: Sequence[Candidate]) -> tuple[float, dict[str, float]]:
     """Shares of the recalibrated simulator's squared gap above the noise: of all, and of each (Shapley, 1953)."""
     q, precision, high = _linear(race, effects)
     base = len(race.fitter.base)
@@ -40,17 +41,18 @@ def promised(race: Race, effects: Sequence[Candidate]) -> tuple[float, dict[str,
         return float(own.at(p).mean()) / race.noise
 
     before = left(frozenset())
-    above = max(before - 1.0, 1e-9)
     every = frozenset(range(len(effects)))
 
     def share(some: frozenset[int]) -> float:
-        return float(np.clip((before - left(some)) / above, 0.0, 1.0))  # what promises harm is not added
+        return float(
+            np.clip(statistics.share_of_gap(before - left(some), before), 0.0, 1.0)
+        )  # what promises harm is not added
 
     each, total = shapley(len(effects), share), share(every)
     return total, {e.label: share for e, share in zip(effects, each, strict=True)}
 
 
-def _linear(race: Race, effects: Sequence[Candidate]) -> tuple[Quadratic, Array, Array]:
+def _linear(race: Tried, effects: Sequence[Candidate]) -> tuple[Quadratic, Array, Array]:
     """(quadratic in the known parameters' steps and the amounts of the effects, precisions, largest amounts).
 
     An amount of 1 is the start that the screening chose.

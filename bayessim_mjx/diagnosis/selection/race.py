@@ -10,8 +10,9 @@ import numpy as np
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate, Coordinate
 from bayessim_mjx.diagnosis.fitting.discretisation import contacts
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
-from bayessim_mjx.diagnosis.selection.models import Comparison, Model, compare, scored
+from bayessim_mjx.diagnosis.selection.models import Model, scored
 from bayessim_mjx.diagnosis.selection.screen import Screened, screen
+from bayessim_mjx.diagnosis.selection.tried import Settings, Tried
 from bayessim_mjx.diagnosis.selection.uncertainty import deviations
 from bayessim_mjx.effects import load, names
 
@@ -20,45 +21,8 @@ ROUNDS = 5  # of polishing, where it has to be done again and again
 ASTRAY = 10.0  # noises that a fit leaves: from there on nothing is as it was a step before
 
 
-@dataclass(frozen=True)
-class Settings:
-    """Thresholds and budgets of the race, fixed before any data are seen.
-
-    Attributes:
-        relevance: an effect must close this share of the gap above the noise; more: a further effect, of what the
-            others leave; least: and of the whole gap; drop: and lower the cost by this share.
-        evidence: and gain this many nats plus the logarithm of the number of candidates (family-wise).
-        t: and improve windows of all conditions: mean over standard error by conditions, as a normal deviate.
-        floor: a model within this factor of the noise (rms) is not improved further.
-        believed: share of the noise (rms) that is the sensors'; the rest is what the time step may be worth at most.
-        tie: rivals are models whose share of the gap closed is within this of the winner's.
-        singles, pairs: how many candidates are fitted, and of how many all pairs; screened: windows looked at in
-            screening.
-        most: effects in one model; iterations: of a fit; fresh: base columns are differenced anew if
-            there are at most so many.
-    """
-
-    relevance: float = 0.05
-    more: float = 0.15
-    least: float = 0.003
-    drop: float = 0.03
-    evidence: float = 5.0
-    t: float = 2.0
-    floor: float = 1.3
-    believed: float = 1.0
-    tie: float = 0.04
-    singles: int = 48
-    pairs: int = 7
-    most: int = 5
-    screened: int = 96
-    iterations: int = 12
-    tolerance: float = 5e-3
-    fresh: int = 6
-    starts: int = 20
-
-
 @dataclass(eq=False)
-class Race:
+class Race(Tried):
     """What was tried. `models` maps the labels of a model's effects to it."""
 
     fitter: Fitter
@@ -74,14 +38,6 @@ class Race:
     def rough(self) -> bool:
         """Whether contacts make what columns tell hold only nearby: fits then need them anew at every step."""
         return contacts(self.fitter.simulator.physics)
-
-    @property
-    def noise(self) -> float:
-        """Expected cost of a window under a perfect model."""
-        return float(self.fitter.size)
-
-    def better(self, old: Model, new: Model) -> Comparison:
-        return compare(old, new, self.fitter.simulator.windows.group, self.noise)
 
     def passes(self, old: Model, new: Model) -> bool:
         """Whether `new`'s additional effects are both real and relevant."""
@@ -102,10 +58,6 @@ class Race:
         rare = c.evidence > 10 * s.evidence + many and c.share > 0.3 and c.worst > -0.1
         return c.t > s.t or rare
 
-    def at_noise(self, model: Model, factor: float = 1.0) -> bool:
-        """Whether the model predicts as well as the noise (of `factor` times the variance) allows."""
-        return model.total <= factor * self.noise * len(model.cost)
-
     def best_of(self, old: Model, models: Sequence[Model]) -> Model | None:
         """The best model; of those that leave nearly as little of the gap of `old`, the one with the fewest numbers."""
         if not models:
@@ -116,14 +68,6 @@ class Race:
         told = [m for m in near if self.at_noise(m) or m.total < 2.0 * best.total]
         return min(told, key=lambda m: (m.size, m.total))
 
-    def above_noise(self, model: Model) -> bool:
-        """Whether the model's held-out error is worth explaining.
-
-        Errors of the time step may be smaller than feared: what has effects already has to reach the sensors' noise.
-        """
-        share = self.settings.believed if model.effects else 1.0
-        return model.total > (share * self.settings.floor) ** 2 * self.noise * len(model.cost)
-
     def distinct(self, model: Model, effect: Candidate, far: float = 2.0) -> bool:
         """Whether at least one amplitude of the effect is `far` standard deviations away from neutral."""
         sd = deviations(self.fitter, model)
@@ -133,20 +77,6 @@ class Race:
             for i, c in zip(own, effect.coordinates, strict=True)
         ]
         return any(z > far for z, shape in zip(off, effect.shapes, strict=True) if not shape)
-
-    def closure(self, model: Model) -> float:
-        """Share of the base model's squared gap above the noise that `model` closes, held out; at most 1.
-
-        The noise alone is the floor: the best of many models tried is below its own expected error by selection.
-        """
-        return 1.0 - self.left(model)
-
-    def left(self, model: Model) -> float:
-        """Share of the base model's squared gap above the noise that `model` leaves."""
-        return max(self._above(model), 0.0) / max(self._above(self.base), 1e-12)
-
-    def _above(self, model: Model) -> float:
-        return model.total - self.noise * len(model.cost)
 
 
 def fresh(race: Race, fit: Fit) -> list[int]:
@@ -240,12 +170,6 @@ def _delivered(race: Race, model: Model, coordinates: Sequence[Coordinate], extr
 def _astray(race: Race, fit: Fit) -> bool:
     """Whether a fit is so far from the logs that its derivatives hold nowhere else."""
     return fit.cost > ASTRAY**2 * race.noise * len(fit.r)
-
-
-def ranked(race: Race, size: int | None = None) -> list[Model]:
-    """Models tried, best first."""
-    chosen = [m for m in race.models.values() if size is None or len(m.effects) == size]
-    return sorted(chosen, key=lambda m: m.total)
 
 
 def compatible(a: Candidate, b: Candidate) -> bool:

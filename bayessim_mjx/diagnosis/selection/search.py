@@ -18,12 +18,12 @@ from bayessim_mjx.diagnosis.selection.race import (
     exchange,
     fit_models,
     polish,
-    ranked,
     special_cases,
     start_of,
     without,
 )
 from bayessim_mjx.diagnosis.selection.screen import screen
+from bayessim_mjx.diagnosis.selection.tried import ranked
 
 __all__ = [
     "Progress",

@@ -24,6 +24,7 @@ from bayessim_mjx.diagnosis.selection.search import (
     together,
     without,
 )
+from bayessim_mjx.diagnosis.selection.tried import Tried
 from bayessim_mjx.quantities import percent
 
 NEAR = 1.2  # noise variances: models that leave less than that explain the same
@@ -174,7 +175,7 @@ def _rival(race: Race, winner: Model, effect: Candidate, others: tuple[Candidate
     return [Rival(others, model, race.closure(model), why, contains or same, c.evidence)]
 
 
-def structural(race: Race, model: Model, sd: np.ndarray) -> dict[str, str]:
+def structural(race: Tried, model: Model, sd: np.ndarray) -> dict[str, str]:
     """Known parameters that sit at a bound or move between operating conditions (Wald test, Bonferroni)."""
     from scipy import stats
 
@@ -199,7 +200,7 @@ def structural(race: Race, model: Model, sd: np.ndarray) -> dict[str, str]:
     return out
 
 
-def per_condition(race: Race, model: Model) -> tuple[np.ndarray, np.ndarray]:
+def per_condition(race: Tried, model: Model) -> tuple[np.ndarray, np.ndarray]:
     """Each condition's own estimate and standard deviation, `[G, k]`, one Newton step from the common fit."""
     q, _ = model.fit.quadratic(race.fitter.spread)
     precision, pull, low, high = model.fit.prior()

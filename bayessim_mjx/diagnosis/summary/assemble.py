@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import importlib.metadata
-from dataclasses import replace
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from bayessim_mjx.diagnosis import statistics
-from bayessim_mjx.diagnosis.findings import Findings
+from bayessim_mjx.diagnosis.experiment.propose import Experiment
+from bayessim_mjx.diagnosis.findings import Findings, Where
 from bayessim_mjx.diagnosis.result import Diagnosis, Gap, Place
-from bayessim_mjx.diagnosis.selection import bounds, search, uncertainty, verdict
+from bayessim_mjx.diagnosis.selection import bounds, uncertainty, verdict
 from bayessim_mjx.diagnosis.selection.models import Model
-from bayessim_mjx.diagnosis.summary import effects_found, how_far, whole_logs
+from bayessim_mjx.diagnosis.selection.tried import Tried, ranked
+from bayessim_mjx.diagnosis.summary import effects_found, how_far
 from bayessim_mjx.diagnosis.summary.details import details
 from bayessim_mjx.diagnosis.summary.sentences import horizon_warning, sentences
+from bayessim_mjx.diagnosis.summary.whole_logs import Whole
 from bayessim_mjx.logs.log import Channels
 
 UNEXPLAINED = 1.5  # noise standard deviations that remain and that nothing predicts
@@ -24,43 +26,49 @@ LITTLE = 0.3  # share of the calibrated gap that named effects may leave
 REMAINS = 0.3  # share of the calibrated gap that a flexible force closes on top of named effects: not in the library
 
 
-def diagnosis_of(found: Findings, say: search.Progress = lambda text, done, total: None) -> Diagnosis:
-    """The result of a diagnosis."""
-    setup, race, ruling = found.setup, found.race, found.ruling
-    model = ruling.model
+def diagnosis_of(found: Findings, about: Mapping[str, Any] | None = None, file: str = "") -> Diagnosis:
+    """The result of what was found.
+
+    Args:
+        about: what was diagnosed, see `Diagnosis`; file: name of the proposal's command file, where there is one.
+    """
+    setup, outcome, model = found.setup, found.outcome, found.model
     timestep = float(setup.robot.mj_model.opt.timestep) * (setup.discretisation.factor if setup.discretisation else 1)
-    together = uncertainty.covariance(setup.fitter, model, found.weak_directions)
-    together = together + np.diag(uncertainty.systematic(model, timestep, race.left(model)) ** 2)
+    together = uncertainty.covariance(setup.fitter, model, outcome.along)
+    together = together + np.diag(uncertainty.systematic(model, timestep, outcome.left(model)) ** 2)
     together = _told(found, together)
     sd = np.sqrt(np.diag(together))
     closed = effects_found.closed_by(found)
-    effects = effects_found.effects_of(found, sd, closed, say)
+    effects = effects_found.effects_of(found, sd, closed)
     remains = _remains(found)
     far = how_far.measured(found, {k: v for k, v in closed.items() if k != "each"})
     name = _verdict(found, remains, far)
-    parameters = _parameters(race, model, sd)
-    say("whole logs", 0, 1)
-    over = whole_logs.simulate(found)
-    far = how_far.with_whole(far, over, setup.tolerance)
+    parameters = _parameters(outcome, model, sd)
+    over, where, proposal = found.part(Whole), found.part(Where), found.part(Experiment)
+    far = how_far.with_whole(far, over, setup.tolerance) if over else far
+    told = sentences(name, effects, parameters, found, far, remains, _beaten(found))
+    notes = [*setup.warnings, *(over.notes if over else ()), *(horizon_warning(far) if effects else [])]
+    more = {"maps": where.maps, "frequency": where.spectra} if where else {}
     return Diagnosis(
         verdict=name,
-        sentences=sentences(name, effects, parameters, found, far, remains, _beaten(found)),
+        sentences=[*told, *(where.sentences if where else ())],
         effects=effects,
-        where=_where(found),
+        where=list(where.places) if where and where.places else _where(found),
         gap=far,
         parameters=parameters,
-        candidates=ranking(race),
-        warnings=[*setup.warnings, *over.notes, *(horizon_warning(far) if effects else [])],
-        next_experiment={},
+        candidates=ranking(outcome),
+        warnings=[*notes, *found.warnings],
+        next_experiment=proposal.to_dict(file) if proposal else {},
         versions=versions(),
-        details=details(found, effects, closed),
+        details=details(found, effects, closed) | more | ({"experiments": proposal.details()} if proposal else {}),
         covariance={"names": list(model.fit.names), "matrix": together},
+        about={**about, "conditions": len(setup.fitter.simulator.windows.groups)} if about else {},
     )
 
 
 def _told(found: Findings, covariance: np.ndarray) -> np.ndarray:
     """The covariance without what it says of parameters that end at a bound."""
-    model, physics = found.ruling.model, found.setup.physics
+    model, physics = found.model, found.setup.physics
     at = []
     for effect in model.effects:
         for c, value in zip(effect.coordinates, model.values_of(effect), strict=True):
@@ -72,16 +80,15 @@ def _told(found: Findings, covariance: np.ndarray) -> np.ndarray:
 
 def _remains(found: Findings) -> float:
     """Share of the calibrated gap that a flexible force still closes on top of the winner; 0 where not significant."""
-    flex, race, model = found.flexible_winner, found.race, found.ruling.model
+    flex, base, model = found.flexible_winner, found.outcome.base, found.model
     if flex is None or not flex.condition.significant:
         return 0.0
-    floor = race.noise * len(race.base.cost)
     top = model.total - min(float(flex.condition.cost.sum()), model.total)
-    return float(top / max(race.base.total - floor, 1e-9))
+    return statistics.share_of_gap(top, base.total, found.outcome.noise * len(base.cost))
 
 
 def _verdict(found: Findings, remains: float, far: Gap) -> str:
-    race, model = found.race, found.ruling.model
+    race, model = found.outcome, found.model
     if model.effects and far.beyond:
         return "unexplained"  # partly explained: what is left still matters
     cost = {k: float(p.cost(found.setup.fitter.simulator.windows.steps).mean()) for k, p in found.predictions.items()}
@@ -95,7 +102,7 @@ def _verdict(found: Findings, remains: float, far: Gap) -> str:
     ):
         return "unexplained"
     if model.effects:
-        return "ambiguous" if found.ruling.ambiguous else "effects"
+        return "ambiguous" if found.outcome.ambiguous else "effects"
     if np.sqrt(race.base.total / (race.noise * len(race.base.cost))) > UNEXPLAINED:
         return "unexplained"
     q, _ = race.nominal.quadratic(race.fitter.spread)
@@ -108,15 +115,15 @@ def _beaten(found: Findings) -> bool:
 
     By a relevant share of the gap too: of effects that close 99.9 % something is left that a force can learn.
     """
-    race, base, model = found.race, found.flexible_base, found.ruling.model
+    race, base, model = found.outcome, found.flexible_base, found.model
     if base is None or not base.condition.significant:
         return False
     better = model.total - float(base.condition.cost.sum())
-    above = race.base.total - race.noise * len(race.base.cost)
-    return better > 0.4 * model.total and better > race.settings.relevance * above
+    share = statistics.share_of_gap(better, race.base.total, race.noise * len(race.base.cost))
+    return better > 0.4 * model.total and share > race.settings.relevance
 
 
-def _parameters(race: search.Race, model: Model, sd: np.ndarray) -> dict[str, dict[str, Any]]:
+def _parameters(race: Tried, model: Model, sd: np.ndarray) -> dict[str, dict[str, Any]]:
     remarks = verdict.structural(race, model, sd)
     return {
         c.name: {
@@ -127,12 +134,12 @@ def _parameters(race: search.Race, model: Model, sd: np.ndarray) -> dict[str, di
     }  # fmt: skip
 
 
-def ranking(race: search.Race) -> list[dict[str, Any]]:
+def ranking(race: Tried) -> list[dict[str, Any]]:
     """Models tried, best first: held-out score, nats over the known parameters alone, and its standard error."""
     rows = statistics.leave_one_out(race.fitter.simulator.windows.group)
     absorbed = {s.candidate.label: s.absorbed for s in race.screened}
     out: list[dict[str, Any]] = []
-    tried = search.ranked(race)[:60]
+    tried = ranked(race)[:60]
     samples = tried[0].samples  # one for all, so that scores are in the order of the errors
     for model in tried:
         ratio = np.log((rows @ race.base.cost) / (rows @ model.cost))
@@ -176,46 +183,10 @@ def versions() -> dict[str, str]:
     return out
 
 
-def insufficient(reason: str, notes: list[str]) -> Diagnosis:
+def insufficient(reason: str, notes: Sequence[str], about: Mapping[str, Any] | None = None) -> Diagnosis:
     """The verdict where nothing can be held out."""
     nothing = Gap(1.0, *(float("nan"),) * 4)
+    said = [f"Too little data: {reason}."]
     return Diagnosis(
-        "insufficient_data", [f"Too little data: {reason}."], [], [], nothing, {}, [], notes, {}, versions()
+        "insufficient_data", said, [], [], nothing, {}, [], list(notes), {}, versions(), about=dict(about or {})
     )
-
-
-def with_more(result: Diagnosis, found: Findings, folder: Path, say: search.Progress) -> Diagnosis:
-    """The result with maps, spectra and the next experiment; what fails there becomes a warning, the verdict stands."""
-    for part, text in ((_with_places, "where"), (_with_experiment, "next experiment")):
-        say(text, 0, 1)
-        try:
-            result = part(result, found, folder)
-        except Exception as error:  # the verdict is there: a picture or proposal less must not lose it
-            result.warnings.append(f"{text}: not available ({type(error).__name__}: {error})")
-    return result
-
-
-def _with_places(result: Diagnosis, found: Findings, folder: Path) -> Diagnosis:
-    from bayessim_mjx.diagnosis.residual import frequency, where
-
-    if found.disturbance is None:
-        return result
-    fitter, fit = found.setup.fitter, found.race.base.fit
-    places, maps, told = where.locate(fitter, fit, found.disturbance, seed=found.setup.seed)
-    spectra, heard = frequency.analyse(fitter, fit, found.disturbance)
-    more = result.details | {"maps": maps, "frequency": spectra}
-    return replace(result, where=places or result.where, sentences=[*result.sentences, *told, *heard], details=more)
-
-
-def _with_experiment(result: Diagnosis, found: Findings, folder: Path) -> Diagnosis:
-    from bayessim_mjx.diagnosis.experiment import command_file, propose
-
-    if not (found.ruling.model.effects or found.race.above_noise(found.race.base)):
-        return result
-    proposal = propose.propose(found.setup, found.race, found.ruling, seed=found.setup.seed)
-    file = ""
-    if proposal.chosen is not None:
-        folder.mkdir(parents=True, exist_ok=True)
-        file = command_file.write_command(folder / "next_experiment.csv", proposal, str(folder / "diagnosis.json")).name
-    more = result.details | {"experiments": proposal.details()}
-    return replace(result, next_experiment=proposal.to_dict(file), details=more)

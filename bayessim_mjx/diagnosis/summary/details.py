@@ -8,7 +8,8 @@ import numpy as np
 
 from bayessim_mjx.diagnosis.findings import Findings
 from bayessim_mjx.diagnosis.result import FoundEffect
-from bayessim_mjx.diagnosis.selection import race, verdict
+from bayessim_mjx.diagnosis.selection import verdict
+from bayessim_mjx.diagnosis.selection.tried import Tried
 from bayessim_mjx.diagnosis.tolerance import length_unit
 from bayessim_mjx.effects import spec_of
 from bayessim_mjx.logs.log import Channels
@@ -17,13 +18,13 @@ MANY = 24  # candidates in the isolability matrix, overlays in the report
 
 
 def details(found: Findings, effects: list[FoundEffect], closed: dict[str, Any]) -> dict[str, Any]:
-    ruling, cut = found.ruling, found.setup.fitter.simulator.windows
-    each, deviation = verdict.per_condition(found.race, ruling.model)
-    names = ruling.model.fit.names
+    model, cut = found.model, found.setup.fitter.simulator.windows
+    each, deviation = verdict.per_condition(found.outcome, model)
+    names = model.fit.names
     return {
         "effect_specs": {e.name: spec_of(e) for e in found.setup.physics.effects if e.quantities},
         "overlays": _overlays(found),
-        "isolability": _isolability(found.race),
+        "isolability": _isolability(found.outcome),
         "episodes": _episodes(found),
         "closure": _closure(effects, closed),
         "shapley": [{"effect": f"{e.name}@{e.where}", "share": e.share} for e in effects if e.share == e.share],
@@ -60,7 +61,7 @@ def _closure(effects: list[FoundEffect], closed: dict[str, Any]) -> list[dict[st
 def _flexible(found: Findings) -> dict[str, Any]:
     """The flexible force on the recalibrated simulator and on top of the effects, in noise standard deviations."""
     base = found.flexible_base
-    winner = found.flexible_winner if found.ruling.model.effects else None
+    winner = found.flexible_winner if found.model.effects else None
     shown = winner or base
     if shown is None:
         return {}
@@ -86,14 +87,14 @@ def _overlays(found: Findings) -> list[dict[str, Any]]:
                 "time": log.time[rows] - log.time[0], "measured": log.qpos[rows, q],
                 "starts": log.time[cut.start[own]] - log.time[0],
             }  # fmt: skip
-            told = {k: p for k, p in found.predictions.items() if k != "with_effects" or found.ruling.model.effects}
+            told = {k: p for k, p in found.predictions.items() if k != "with_effects" or found.model.effects}
             for stage, prediction in told.items():
                 entry[stage] = log.qpos[rows, q] - (prediction.error[own, :, v] * cut.sigma_q[v]).reshape(-1)
             out.append(entry)
     return out
 
 
-def _isolability(of: race.Race) -> dict[str, Any]:
+def _isolability(of: Tried) -> dict[str, Any]:
     """|cos| between what the candidates change in the residual, known parameters and starts projected out."""
     some = [s for s in of.screened if s.absorbed < 0.999][:MANY]
     if len(some) < 2:

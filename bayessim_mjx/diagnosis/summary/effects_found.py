@@ -10,16 +10,15 @@ import numpy as np
 from bayessim_mjx.diagnosis.findings import Findings
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.result import Estimate, FoundEffect
-from bayessim_mjx.diagnosis.selection import bounds, heldout, predicted_gain, uncertainty, verdict
+from bayessim_mjx.diagnosis.selection import bounds, heldout, predicted_gain, uncertainty
 from bayessim_mjx.diagnosis.selection.models import Model
-from bayessim_mjx.diagnosis.selection.race import Progress
 from bayessim_mjx.diagnosis.setup import Setup
 
 
-def effects_of(found: Findings, sd: np.ndarray, closed: dict[str, Any], say: Progress) -> list[FoundEffect]:
+def effects_of(found: Findings, sd: np.ndarray, closed: dict[str, Any]) -> list[FoundEffect]:
     """The effects of the verdict with all their numbers, the one that closes most first."""
-    parts = _parts(found, closed, say)
-    out = [_effect(found, e, sd, parts[e.label]) for e in found.ruling.model.effects]
+    parts = _parts(found, closed)
+    out = [_effect(found, e, sd, parts[e.label]) for e in found.model.effects]
     return sorted(out, key=lambda e: -e.gap_closed)
 
 
@@ -33,16 +32,15 @@ class _Part:
     promised: float
 
 
-def _parts(found: Findings, closed: dict[str, Any], say: Progress) -> dict[str, _Part]:
+def _parts(found: Findings, closed: dict[str, Any]) -> dict[str, _Part]:
     """{label: part}; the shares are of the linear promise where too many effects are named to fit all subsets."""
-    model, race = found.ruling.model, found.race
-    labels = [e.label for e in model.effects]
+    base, fitted = found.outcome.base, found.outcome.subsets
+    labels = [e.label for e in found.model.effects]
     if not labels:
         return {}
-    fitted = verdict.subsets(race, model, say) if len(labels) > 1 else {}
     if fitted:
         each = predicted_gain.shapley(
-            len(labels), lambda some: race.base.cost - fitted[frozenset(labels[i] for i in some)].cost
+            len(labels), lambda some: base.cost - fitted[frozenset(labels[i] for i in some)].cost
         )
     else:
         each = np.array([[closed["each"][n] if len(labels) > 1 else 1.0] for n in labels])
@@ -57,11 +55,9 @@ def _parts(found: Findings, closed: dict[str, Any], say: Progress) -> dict[str, 
 
 def closed_by(found: Findings) -> dict[str, Any]:
     """Share of the recalibrated simulator's squared gap that all effects close: promised, and then really."""
-    model = found.ruling.model
-    if not model.effects:
+    if not found.model.effects:
         return {}
-    closed = _closed(found)
-    total, each = predicted_gain.promised(found.race, model.effects)
+    closed, (total, each) = _closed(found), found.outcome.promised
     return {"predicted": total, "realised": closed.value, "ci": closed.interval(), "each": each}
 
 
@@ -72,8 +68,8 @@ def _closed(found: Findings) -> heldout.Closed:
 
 
 def _effect(found: Findings, effect: Candidate, sd: np.ndarray, part: _Part) -> FoundEffect:
-    setup, model = found.setup, found.ruling.model
-    rivals = found.ruling.rivals.get(effect.label, [])
+    setup, model = found.setup, found.model
+    rivals = found.outcome.rivals.get(effect.label, ())
     weighed = [r for r in rivals if not r.contains]
     own_weight, *others = _weights(found, [model, *(r.model for r in weighed)])
     weight_of = dict(zip(map(id, weighed), others, strict=True))
@@ -109,7 +105,7 @@ def _weights(found: Findings, models: list[Model]) -> list[float]:
     if len(models) < 2:
         return [float("nan")]
     group, rng = found.setup.fitter.simulator.windows.group, np.random.default_rng(found.setup.seed)
-    return uncertainty.win_share(models, group, found.race.noise, rng).tolist()
+    return uncertainty.win_share(models, group, found.outcome.noise, rng).tolist()
 
 
 def _unit(setup: Setup, effect: Candidate, unit: str) -> str:

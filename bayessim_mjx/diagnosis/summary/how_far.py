@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,7 @@ def measured(found: Findings, closed: dict[str, Any]) -> Gap:
     """The gap over the windows and a shorter horizon; `with_whole` adds that over whole logs."""
     setup, predictions = found.setup, found.predictions
     cut, allowed = setup.fitter.simulator.windows, setup.tolerance
-    again = repeated.floor(setup.fitter, found.ruling.model.fit, setup.logs)
+    again = repeated.floor(setup.fitter, found.model.fit, setup.logs)
     short = max(1, min(round(SHORT / cut.dt), cut.steps // 2))
     rows = []
     for steps in (short, cut.steps):
@@ -60,8 +61,8 @@ def with_whole(far: Gap, over: whole_logs.Whole, allowed: Tolerance) -> Gap:
     level = np.sqrt(max(floor, 1.0) ** 2 + float(over.chance.mean()))
     row |= _level(level, (level, level), row, "start")
     each = {s: np.sqrt(c.mean(0)) * allowed.noise for s, c in over.by_channel.items()}
-    far.horizons.append({"name": over.name, "seconds": over.seconds, **row, **_physical(each, allowed)})
-    return far
+    longest = {"name": over.name, "seconds": over.seconds, **row, **_physical(each, allowed)}
+    return replace(far, horizons=[*far.horizons, longest])
 
 
 def by_joint(prediction: Prediction, steps: int, allowed: Tolerance) -> Array:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+from bayessim_mjx.diagnosis import statistics
 from bayessim_mjx.diagnosis.findings import Findings
 from bayessim_mjx.diagnosis.result import FoundEffect, Gap
 from bayessim_mjx.diagnosis.selection.verdict import Rival
@@ -51,9 +52,9 @@ def sentences(
 ) -> list[str]:
     """The verdict, most important first; `remains`, `beaten`: see `verdict_in_words`."""
     told = verdict_in_words(name, effects, far, remains, beaten)
-    if found.ruling.ambiguous:
-        told += [_instead(e, found.ruling.rivals.get(f"{e.name}@{e.where}", [])) for e in effects]
-    if not effects and remains == 0.0 and found.race.above_noise(found.race.base):
+    if found.outcome.ambiguous:
+        told += [_instead(e, found.outcome.rivals.get(f"{e.name}@{e.where}", ())) for e in effects]
+    if not effects and remains == 0.0 and found.outcome.above_noise(found.outcome.base):
         told.append(CHANCE.format(calibrated=stage_in_words(far, "calibrated")))
     if name == "unexplained" and found.flexible_winner is not None:
         told += [f"{text[:1].upper()}{text[1:]}." for text in found.flexible_winner.text]
@@ -168,7 +169,7 @@ def _instead(effect: FoundEffect, rivals: Sequence[Rival]) -> str:
 def horizon_warning(gap: Gap) -> list[str]:
     """A verdict that changes with the horizon is flagged."""
     closed = {
-        row["name"]: (row["calibrated"] ** 2 - row["with_effects"] ** 2) / (row["calibrated"] ** 2 - 1.0)
+        row["name"]: statistics.share_of_gap(row["calibrated"] ** 2 - row["with_effects"] ** 2, row["calibrated"] ** 2)
         for row in gap.horizons
         if row["calibrated"] ** 2 > CLEAR
     }

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayessim_mjx.diagnosis.findings import Findings
+from bayessim_mjx.diagnosis.findings import Findings, Progress
 from bayessim_mjx.diagnosis.fitting import windows
 from bayessim_mjx.diagnosis.fitting.centred_commands import physics_of
 from bayessim_mjx.diagnosis.fitting.simulator import Simulator
@@ -41,7 +41,7 @@ class Whole:
     group: NDArray[np.int64]
     name: str
     seconds: float
-    notes: list[str]
+    notes: tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,15 +53,20 @@ class _Stage:
     nominal: bool
 
 
+def stage(found: Findings, say: Progress) -> Findings:
+    """With what every stage of the gap is over whole logs."""
+    return found.having(simulate(found))
+
+
 def simulate(found: Findings) -> Whole:
     """Every stage on at most LOGS logs; parameters are those found without the log's condition, where it has one."""
     setup, cut = found.setup, found.setup.fitter.simulator.windows
     stages = {
-        "nominal": _Stage(found.race.base, found.predictions["nominal"], True),
-        "calibrated": _Stage(found.race.base, found.predictions["calibrated"], False),
+        "nominal": _Stage(found.outcome.base, found.predictions["nominal"], True),
+        "calibrated": _Stage(found.outcome.base, found.predictions["calibrated"], False),
     }
-    if found.ruling.model.effects:
-        stages["with_effects"] = _Stage(found.ruling.model, found.predictions["with_effects"], False)
+    if found.model.effects:
+        stages["with_effects"] = _Stage(found.model, found.predictions["with_effects"], False)
     logs = np.unique(cut.log)
     logs = logs[np.unique(np.linspace(0, len(logs) - 1, min(len(logs), LOGS)).round().astype(int))]
     first = [int(np.flatnonzero(cut.log == r)[0]) for r in logs]
@@ -79,7 +84,7 @@ def simulate(found: Findings) -> Whole:
 
 def _simulator(found: Findings, logs: Array, starts: list[int], length: int, lanes: int) -> Simulator:
     """Of the named effects only: a small program, compiled in seconds."""
-    setup, named = found.setup, {e.effect for e in found.ruling.model.effects}
+    setup, named = found.setup, {e.effect for e in found.model.effects}
     cut = setup.fitter.simulator.windows
     physics = physics_of(setup.robot, cut.dt, [e for e in setup.physics.effects if e.name in named])
     some = [setup.logs[r] for r in logs]
@@ -147,7 +152,7 @@ def _judged(
         group=group[kept],
         name="whole log" if whole else f"up to {longest:.2g} s",
         seconds=float(np.median([last[i] for i in kept]) * cut.dt) if kept else 0.0,
-        notes=notes,
+        notes=tuple(notes),
     )
 
 

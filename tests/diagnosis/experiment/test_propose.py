@@ -1,7 +1,7 @@
 """The next experiment on pendulums in C MuJoCo with drag that slow logs cannot tell from viscous friction."""
 
 import functools
-import types
+from dataclasses import replace
 
 import mujoco
 import numpy as np
@@ -10,9 +10,11 @@ import pytest
 from bayessim_mjx.diagnosis.experiment.command_file import read_command, write_command
 from bayessim_mjx.diagnosis.experiment.limits import limits_of
 from bayessim_mjx.diagnosis.experiment.propose import propose
+from bayessim_mjx.diagnosis.findings import Findings
 from bayessim_mjx.diagnosis.fitting.robot import Robot, default_space
-from bayessim_mjx.diagnosis.selection import search, verdict
+from bayessim_mjx.diagnosis.selection import search
 from bayessim_mjx.diagnosis.selection.models import scored
+from bayessim_mjx.diagnosis.selection.outcome import frozen
 from bayessim_mjx.diagnosis.setup import prepare
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Channels, Log
@@ -76,17 +78,16 @@ def diagnosed(logs):
 
 @functools.cache
 def contest():
-    """(setup, race, ruling, both models) after slow logs."""
+    """(findings, both models) after slow logs."""
     setup, race = diagnosed(slow_logs())
     models = {m.effects[0].effect: m for m in search.ranked(race, 1)}
-    ruling = verdict.Ruling(models["quadratic_drag"])
-    return setup, race, ruling, models
+    return Findings(setup, frozen(race, models["quadratic_drag"], {})), models
 
 
 @functools.cache
 def proposal():
-    setup, race, ruling, models = contest()
-    return propose(setup, race, ruling, [models["viscous_friction"]], LIMITS)
+    found, models = contest()
+    return propose(found, [models["viscous_friction"]], LIMITS)
 
 
 def evidence(race):
@@ -98,7 +99,7 @@ def evidence(race):
 @pytest.mark.slow
 @pytest.mark.ci
 def test_fast_motion_is_proposed_where_only_fast_motion_separates():
-    setup, _, _, _ = contest()
+    setup = contest()[0].setup
     found = proposal()
     by_name = {row["experiment"]: row["evidence"] for row in found.table if not row["needs"]}
     slow = max(np.abs(log.qvel).max() for log in setup.fitter.simulator.windows.logs)
@@ -109,7 +110,7 @@ def test_fast_motion_is_proposed_where_only_fast_motion_separates():
 
 
 def test_the_program_of_the_diagnosis_is_used_as_it_is():
-    setup, _, _, _ = contest()
+    setup = contest()[0].setup
     proposal()
     assert setup.fitter.simulator.traces == 1
 
@@ -123,7 +124,7 @@ def test_limits_hold_in_everything_that_is_proposed():
 
 
 def test_the_promised_evidence_comes_true(tmp_path):
-    _, race, _, _ = contest()
+    race = contest()[0].outcome
     found = proposal()
     command = read_command(write_command(tmp_path / "next.csv", found))
     kp, kd = (command.notes["closed_loop"][k]["motor"] for k in ("kp", "kd"))
@@ -157,10 +158,10 @@ def test_the_command_file_round_trips(tmp_path):
 
 
 def test_identical_rivals_are_said_to_be_inseparable():
-    setup, race, ruling, models = contest()
+    contested, models = contest()
     drag = models["quadratic_drag"]
-    twin = scored(setup.fitter, drag.fit, drag.effects)
-    found = propose(setup, race, ruling, [twin], LIMITS)
+    twin = scored(contested.setup.fitter, drag.fit, drag.effects)
+    found = propose(contested, [twin], LIMITS)
     assert abs(found.evidence) < 0.05 and found.name == "none" and found.chosen is None
     assert "no safe excitation separates" in found.why and "speeds of five to one" in found.why
     assert found.to_dict("next.csv")["file"] == ""
@@ -169,9 +170,9 @@ def test_identical_rivals_are_said_to_be_inseparable():
 
 
 def test_a_single_survivor_is_sharpened():
-    setup, race, ruling, _ = contest()
-    lonely = types.SimpleNamespace(**{**race.__dict__, "models": {}, "noise": race.noise})
-    found = propose(setup, lonely, ruling, [], LIMITS)
+    contested, _ = contest()
+    lonely = replace(contested, outcome=replace(contested.outcome, models={}))
+    found = propose(lonely, [], LIMITS)
     assert "sharpens hinge.quadratic_drag.coefficient" in found.why
     assert found.evidence > 0.3 and found.pairs == []
 

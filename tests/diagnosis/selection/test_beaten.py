@@ -17,14 +17,14 @@ def found(base: float, named: float, flexible: float, significant: bool = True):
     def total(level):
         return level * NOISE * WINDOWS
 
-    race = SimpleNamespace(
+    outcome = SimpleNamespace(
         base=SimpleNamespace(total=total(base), cost=np.full(WINDOWS, total(base) / WINDOWS)),
         noise=NOISE,
         settings=Settings(),
     )
     condition = SimpleNamespace(significant=significant, cost=np.full(WINDOWS, total(flexible) / WINDOWS))
-    ruling = SimpleNamespace(model=SimpleNamespace(total=total(named)))
-    return SimpleNamespace(race=race, ruling=ruling, flexible_base=SimpleNamespace(condition=condition))
+    model = SimpleNamespace(total=total(named))
+    return SimpleNamespace(outcome=outcome, model=model, flexible_base=SimpleNamespace(condition=condition))
 
 
 @pytest.mark.parametrize(

@@ -16,14 +16,14 @@ EFFECTS = ("coulomb_friction", "viscous_friction")
 @pytest.fixture(scope="module")
 def rubbing(tmp_path_factory):
     logs = recorded(friction=0.04, scale=(0.9, 1.1, 0.95), count=5, seconds=3.0)
-    return run.diagnose(nominal(tmp_path_factory.mktemp("rubbing")), logs, EFFECTS)
+    return run.investigate(nominal(tmp_path_factory.mktemp("rubbing")), logs, EFFECTS)
 
 
 def test_a_log_begins_as_its_first_window(rubbing):
     cut = rubbing.setup.fitter.simulator.windows
     stages = {
-        "nominal": whole_logs._Stage(rubbing.race.base, rubbing.predictions["nominal"], True),
-        "with_effects": whole_logs._Stage(rubbing.ruling.model, rubbing.predictions["with_effects"], False),
+        "nominal": whole_logs._Stage(rubbing.outcome.base, rubbing.predictions["nominal"], True),
+        "with_effects": whole_logs._Stage(rubbing.model, rubbing.predictions["with_effects"], False),
     }
     first = int(np.flatnonzero(cut.log == 2)[0])
     simulator = whole_logs._simulator(
@@ -52,7 +52,7 @@ def test_whole_logs_are_the_third_horizon(rubbing):
 def test_an_unstable_motion_counts_as_long_as_it_can_be_predicted(tmp_path, monkeypatch):
     upside_down = pendulums.MODEL.replace("<option ", '<option gravity="0 0 9.81" ')
     monkeypatch.setattr(pendulums, "MODEL", upside_down)  # held upright by its controller; open loop it falls
-    found = run.diagnose(nominal(tmp_path), recorded(friction=0.04, count=4, seconds=3.0), EFFECTS[:1])
+    found = run.investigate(nominal(tmp_path), recorded(friction=0.04, count=4, seconds=3.0), EFFECTS[:1])
     over = whole_logs.simulate(found)
     assert "unstable or chaotic motion: in 4 of 4 logs" in over.notes[0]
     assert over.seconds < 2.5 and (over.name.startswith("up to") or not len(over.group))

@@ -1,0 +1,63 @@
+"""The folder of a diagnosis: what is known so far, the verdict as soon as it stands, and everything at the end."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from bayessim_mjx.diagnosis import correction
+from bayessim_mjx.diagnosis.experiment import command_file
+from bayessim_mjx.diagnosis.experiment.propose import Experiment
+from bayessim_mjx.diagnosis.findings import Findings
+from bayessim_mjx.diagnosis.fitting.robot import Robot
+from bayessim_mjx.diagnosis.result import Diagnosis, load
+from bayessim_mjx.diagnosis.selection.tried import Tried
+from bayessim_mjx.diagnosis.setup import Setup
+from bayessim_mjx.diagnosis.summary import assemble, preliminary
+
+PRELIMINARY = "preliminary.json"  # what is known while the race goes on
+COMMAND = "next_experiment.csv"
+
+
+class Files:
+    """Writes into a folder, or nowhere where there is none.
+
+    Args:
+        folder: made when there is something to write; about: what is diagnosed.
+    """
+
+    def __init__(self, folder: Path | None, about: Mapping[str, Any]) -> None:
+        self.folder, self.about = folder, about
+
+    def so_far(self, setup: Setup, tried: Tried | None) -> None:
+        """What is known before there is a verdict: killed there, this stays."""
+        if self.folder is not None:
+            preliminary.write(self.folder / PRELIMINARY, self.about, setup, tried)
+
+    def verdict(self, found: Findings) -> None:
+        """The verdict on its own: maps and the next experiment take time; killed there, it stays."""
+        if self.folder is not None:
+            assemble.diagnosis_of(found, self.about).save(self.folder)
+            (self.folder / PRELIMINARY).unlink(missing_ok=True)
+
+    def result(self, found: Findings) -> Diagnosis:
+        """What was found as a Diagnosis, its proposal as a file that can be played."""
+        proposal, name = found.part(Experiment), ""
+        if self.folder is not None and proposal is not None and proposal.chosen is not None:
+            source = str(self.folder / "diagnosis.json")
+            name = command_file.write_command(self.folder / COMMAND, proposal, source).name
+        return assemble.diagnosis_of(found, self.about, name)
+
+    def whole(self, result: Diagnosis, robot: Robot) -> Diagnosis:
+        """Write everything but the report; returns what can be loaded again."""
+        if self.folder is None:
+            return result
+        result.save(self.folder)  # before anything that could fail: nothing computed is lost
+        result = load(self.folder)
+        if result.verdict != "insufficient_data":
+            left_out = correction.write_outputs(result, robot, self.folder)
+            result = replace(result, warnings=[*result.warnings, *left_out])
+            result.save(self.folder)
+        return result
