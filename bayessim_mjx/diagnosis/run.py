@@ -117,9 +117,9 @@ def investigate(
         logs, effects, group, seed, progress: see `diagnose`; tolerated: its `tolerance`.
         settings: of the race; None: by the robot's size.
         notes: what was noticed while model and logs were read, for the warnings.
-        stages: after the race; None: `STAGES`.
+        stages: after the race, optional ones last; None: `STAGES`.
         keep: called with what is known while the race goes on: the setup, and after each part what was tried.
-        verdict: called with the findings before the first optional stage.
+        verdict: called with the findings before the optional stages.
 
     Raises:
         UserError: nothing usable. TooLittleData: nothing could be held out.
@@ -131,16 +131,18 @@ def investigate(
     known(setup, None)
     race = setup.fitter, setup.candidates, setup.settings
     found = Findings(setup, outcome.select(*race, say, lambda tried: known(setup, tried)))
-    for stage in STAGES if stages is None else stages:
-        if stage.optional and verdict is not None:
-            verdict(found)
-            verdict = None
-        say(stage.name, 0, 1)
-        found = _after(stage, found, say)
+    stages = STAGES if stages is None else stages
+    for stage in stages:
+        found = found if stage.optional else _after(stage, found, say)
+    if verdict is not None:
+        verdict(found)
+    for stage in stages:
+        found = _after(stage, found, say) if stage.optional else found
     return found
 
 
 def _after(stage: Stage, found: Findings, say: Progress) -> Findings:
+    say(stage.name, 0, 1)
     try:
         return stage.run(found, say)
     except Exception as error:
