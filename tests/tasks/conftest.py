@@ -18,6 +18,7 @@ WORLDS = 8
 @functools.cache
 def _compiled(name):
     env = registry.make(name)
+    env.nuisance = None  # noise has no mirror image and no value known beforehand
     step = jax.jit(jax.vmap(env.step))
     reset = jax.jit(jax.vmap(env.reset))
 

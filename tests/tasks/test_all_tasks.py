@@ -8,7 +8,10 @@ import pytest
 
 from bayessim_mjx import registry
 
-NAMES = registry.names()
+DEAR = {"Humanoid"}  # half a minute of compilation
+NAMES = [
+    pytest.param(name, marks=[pytest.mark.slow, pytest.mark.ci] if name in DEAR else []) for name in registry.names()
+]
 
 
 @pytest.fixture(params=NAMES)
