@@ -6,9 +6,8 @@ from typing import Any, ClassVar
 import jax
 import mujoco
 
-from bayessim_mjx.effects.actuator_gain import addressed, nonlinear
-from bayessim_mjx.effects.actuator_saturation import limits
 from bayessim_mjx.effects.effect import Effect, Quantity
+from bayessim_mjx.effects.support.actuators import addressed, limits, nonlinear
 from bayessim_mjx.effects.support.site import Site
 from bayessim_mjx.effects.support.substep import SubStep
 

@@ -7,25 +7,9 @@ import jax
 import mujoco
 
 from bayessim_mjx.effects.effect import Effect, Quantity
+from bayessim_mjx.effects.support.actuators import addressed, nonlinear
 from bayessim_mjx.effects.support.site import Site
 from bayessim_mjx.effects.support.substep import SubStep
-
-GAINS = (mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtGain.mjGAIN_AFFINE)  # linear in their parameters
-BIASES = (mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtBias.mjBIAS_AFFINE)
-
-
-def addressed(spec: mujoco.MjSpec, values: dict[str, dict[str, float]]) -> list[tuple[Any, dict[str, float]]]:
-    """(actuator, its values) for the actuators that `values` names; "all": every one."""
-    named = [(a.name or f"actuator{i}", a) for i, a in enumerate(spec.actuators)]
-    return [(a, values[key]) for name, a in named for key in (name, "all") if key in values]
-
-
-def nonlinear(spec: mujoco.MjSpec, values: dict[str, dict[str, float]]) -> str | None:
-    """Why an actuator's force cannot be scaled or shifted by its parameters, if so."""
-    for actuator, _ in addressed(spec, values):
-        if actuator.gaintype not in GAINS or actuator.biastype not in BIASES:
-            return f"actuator {actuator.name} is a muscle or a motor model, whose force has no parameter for it"
-    return None
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,38 +1,18 @@
 """First-order lag of the command: current loops, drive filters, hydraulic and pneumatic valves, a servo's smoothing."""
 
 import dataclasses
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 import mujoco
 
-from bayessim_mjx.effects.actuator_gain import addressed
 from bayessim_mjx.effects.effect import Effect, Quantity
+from bayessim_mjx.effects.support.actuators import addressed, at_rest, follow
 from bayessim_mjx.effects.support.site import Site
 
 if TYPE_CHECKING:
     from mujoco import MjSpec
-
-# (state, command) of one sub-step -> (state at its end, mean of the state over it); all [n]
-Advance = Callable[[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]
-
-
-def at_rest(at: Site) -> dict[str, jax.Array]:
-    """Memory of a follower of the command before its first command."""
-    return {"state": jnp.zeros(len(at)), "fresh": jnp.ones((), bool)}
-
-
-def follow(at: Site, memory: Any, command: jax.Array, advance: Advance) -> tuple[Any, jax.Array]:
-    """The command `[substeps, nu]` with what follows it in its place, at rest at the first command of all.
-
-    Each sub-step applies the follower's mean over the sub-step, so that the impulse is exact.
-    """
-    own = command[:, at.ids]
-    start = jnp.where(memory["fresh"], own[0], memory["state"])
-    state, means = jax.lax.scan(advance, start, own)
-    return {"state": state, "fresh": jnp.zeros((), bool)}, command.at[:, at.ids].set(means)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -8,16 +8,10 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from bayessim_mjx.effects.actuator_gain import addressed
 from bayessim_mjx.effects.effect import Effect, Quantity
+from bayessim_mjx.effects.support.actuators import addressed, limits
 from bayessim_mjx.effects.support.site import Site
 from bayessim_mjx.effects.support.substep import SubStep
-
-
-def limits(actuator: Any) -> np.ndarray | None:
-    """(lowest, highest) force of a spec's actuator, None where it has no limit."""
-    unlimited = actuator.forcelimited == mujoco.mjtLimited.mjLIMITED_FALSE or not np.any(actuator.forcerange)
-    return None if unlimited else np.array(actuator.forcerange)
 
 
 @dataclasses.dataclass(frozen=True)

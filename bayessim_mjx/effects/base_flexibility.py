@@ -9,8 +9,7 @@ import mujoco
 import numpy as np
 
 from bayessim_mjx.effects.effect import Effect, Quantity
-from bayessim_mjx.effects.gravity_tilt import tilted
-from bayessim_mjx.effects.support.bodies import moved
+from bayessim_mjx.effects.support.bodies import moved, tilted
 from bayessim_mjx.effects.support.motion import Motion
 from bayessim_mjx.effects.support.site import Site, find
 from bayessim_mjx.effects.support.substep import SubStep

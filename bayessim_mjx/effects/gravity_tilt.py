@@ -10,20 +10,12 @@ import jax
 import jax.numpy as jnp
 
 from bayessim_mjx.effects.effect import Effect, Quantity
+from bayessim_mjx.effects.support.bodies import tilted
 from bayessim_mjx.effects.support.site import Site
 
 if TYPE_CHECKING:
     import mujoco
     from mujoco import mjx
-
-
-def tilted(gravity: jax.Array, roll: jax.Array | float, pitch: jax.Array | float) -> jax.Array:
-    """Gravity `[3]` in the frame of a robot turned by roll about the world's x, then by pitch about its y (rad)."""
-    x, y, z = gravity
-    # g' = R^T g, R = Ry(pitch) Rx(roll)
-    x, z = jnp.cos(pitch) * x - jnp.sin(pitch) * z, jnp.sin(pitch) * x + jnp.cos(pitch) * z
-    y, z = jnp.cos(roll) * y + jnp.sin(roll) * z, jnp.cos(roll) * z - jnp.sin(roll) * y
-    return jnp.stack([x, y, z])
 
 
 @dataclasses.dataclass(frozen=True)

@@ -6,8 +6,8 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 
-from bayessim_mjx.effects.actuator_lag import at_rest, follow
 from bayessim_mjx.effects.effect import Effect, Quantity
+from bayessim_mjx.effects.support.actuators import at_rest, follow
 from bayessim_mjx.effects.support.site import Site
 
 

@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 
 from bayessim_mjx.effects.effect import Effect, Measurement, Quantity
-from bayessim_mjx.effects.sensor_gain import columns, written
 from bayessim_mjx.effects.support.motion import Motion
+from bayessim_mjx.effects.support.sensors import columns, written
 from bayessim_mjx.effects.support.site import Site
 
 if TYPE_CHECKING:

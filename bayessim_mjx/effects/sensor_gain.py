@@ -4,10 +4,10 @@ import dataclasses
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import jax
-import jax.numpy as jnp
 
 from bayessim_mjx.effects.effect import Effect, Measurement, Quantity
 from bayessim_mjx.effects.support.motion import Motion
+from bayessim_mjx.effects.support.sensors import columns, written
 from bayessim_mjx.effects.support.site import Site
 from bayessim_mjx.errors import UserError
 
@@ -47,13 +47,3 @@ class SensorGain(Effect):
 
     def edit(self, spec: "mujoco.MjSpec", values: dict[str, dict[str, float]]) -> str | None:
         return "MuJoCo's joint sensors have no scale; use effects.yaml"
-
-
-def columns(at: Site, qpos: jax.Array, qvel: jax.Array) -> jax.Array:
-    """Position and velocity of the site's joints, `[..., n, 2]`, of qpos `[..., nq]` and qvel `[..., nv]`."""
-    return jnp.stack([qpos[..., at.qadr], qvel[..., at.dadr]], axis=-1)
-
-
-def written(at: Site, qpos: jax.Array, qvel: jax.Array, values: jax.Array) -> Measurement:
-    """{"qpos", "qvel"} with the site's joints showing `values`; the inverse of `columns`."""
-    return {"qpos": qpos.at[..., at.qadr].set(values[..., 0]), "qvel": qvel.at[..., at.dadr].set(values[..., 1])}

@@ -21,7 +21,7 @@ from bayessim_mjx.diagnosis.selection.outcome import Outcome
 from bayessim_mjx.diagnosis.selection.tried import ranked
 from bayessim_mjx.diagnosis.selection.uncertainty import win_share
 from bayessim_mjx.diagnosis.selection.verdict import MILD
-from bayessim_mjx.effects.gravity_tilt import tilted
+from bayessim_mjx.effects.support.bodies import tilted
 
 Array = NDArray[np.float64]
 SECONDS = 10.0

@@ -1,4 +1,4 @@
-"""Bodies and the joints that move them, shared by the effects on bodies; and bodies of a spec by place."""
+"""Bodies, the joints that move them and gravity, shared by the effects on them; and bodies of a spec by place."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -46,3 +46,12 @@ def native(spec: mujoco.MjSpec, values: dict[str, dict[str, float]]) -> "Iterato
             everywhere = place == "all" and compiled.body_weldid[i] != 0 and compiled.body_mass[i] > 0
             if everywhere or place in (body.name, f"body{i}"):
                 yield body, i, own
+
+
+def tilted(gravity: jax.Array, roll: jax.Array | float, pitch: jax.Array | float) -> jax.Array:
+    """Gravity `[3]` in the frame of a robot turned by roll about the world's x, then by pitch about its y (rad)."""
+    x, y, z = gravity
+    # g' = R^T g, R = Ry(pitch) Rx(roll)
+    x, z = jnp.cos(pitch) * x - jnp.sin(pitch) * z, jnp.sin(pitch) * x + jnp.cos(pitch) * z
+    y, z = jnp.cos(roll) * y + jnp.sin(roll) * z, jnp.cos(roll) * z - jnp.sin(roll) * y
+    return jnp.stack([x, y, z])

@@ -1,0 +1,52 @@
+"""Actuators of a spec by place, and what follows a command, shared by the effects on actuators."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from bayessim_mjx.effects.support.site import Site
+
+GAINS = (mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtGain.mjGAIN_AFFINE)  # linear in their parameters
+BIASES = (mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtBias.mjBIAS_AFFINE)
+# (state, command) of one sub-step -> (state at its end, mean of the state over it); all [n]
+Advance = Callable[[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]
+
+
+def addressed(spec: mujoco.MjSpec, values: dict[str, dict[str, float]]) -> list[tuple[Any, dict[str, float]]]:
+    """(actuator, its values) for the actuators that `values` names; "all": every one."""
+    named = [(a.name or f"actuator{i}", a) for i, a in enumerate(spec.actuators)]
+    return [(a, values[key]) for name, a in named for key in (name, "all") if key in values]
+
+
+def nonlinear(spec: mujoco.MjSpec, values: dict[str, dict[str, float]]) -> str | None:
+    """Why an actuator's force cannot be scaled or shifted by its parameters, if so."""
+    for actuator, _ in addressed(spec, values):
+        if actuator.gaintype not in GAINS or actuator.biastype not in BIASES:
+            return f"actuator {actuator.name} is a muscle or a motor model, whose force has no parameter for it"
+    return None
+
+
+def limits(actuator: Any) -> np.ndarray | None:
+    """(lowest, highest) force of a spec's actuator, None where it has no limit."""
+    unlimited = actuator.forcelimited == mujoco.mjtLimited.mjLIMITED_FALSE or not np.any(actuator.forcerange)
+    return None if unlimited else np.array(actuator.forcerange)
+
+
+def at_rest(at: Site) -> dict[str, jax.Array]:
+    """Memory of a follower of the command before its first command."""
+    return {"state": jnp.zeros(len(at)), "fresh": jnp.ones((), bool)}
+
+
+def follow(at: Site, memory: Any, command: jax.Array, advance: Advance) -> tuple[Any, jax.Array]:
+    """The command `[substeps, nu]` with what follows it in its place, at rest at the first command of all.
+
+    Each sub-step applies the follower's mean over the sub-step, so that the impulse is exact.
+    """
+    own = command[:, at.ids]
+    start = jnp.where(memory["fresh"], own[0], memory["state"])
+    state, means = jax.lax.scan(advance, start, own)
+    return {"state": state, "fresh": jnp.zeros((), bool)}, command.at[:, at.ids].set(means)
