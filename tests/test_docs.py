@@ -145,6 +145,16 @@ def test_code_of_a_how_to_runs(name, tmp_path, monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.ci
+def test_the_how_to_of_an_own_robot_finds_its_hidden_friction(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    page = run(code_of(ROOT / "docs" / "own_robot.md"), "own_robot", monkeypatch)
+    [effect] = page.diagnosis.effects
+    assert (effect.name, effect.where) == ("coulomb_friction", "elbow")
+    assert 0.10 < effect.parameters["level"].mean < 0.14  # 0.12 N m; masses are free within 20 %
+
+
+@pytest.mark.slow
+@pytest.mark.ci
 def test_the_loop_of_the_readme_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     import bayessim_mjx as bm
