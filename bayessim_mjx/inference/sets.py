@@ -1,0 +1,135 @@
+"""Posteriors of several trajectories, judged as they are used: products of a network's factors on simulated sets.
+
+A network's errors at one theta are shared by all trajectories there, so a product of n factors narrows as 1 / sqrt(n)
+while its bias stays. Sets of trajectories simulated at one theta each show by how much a product is over-confident, and
+after how many trajectories another one no longer helps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from bayessim_mjx.distributions import Distribution
+from bayessim_mjx.inference.posterior import combine
+from bayessim_mjx.inference.temperature import tempered, widened
+
+FACTORS = np.geomspace(1.0, 12.0, 31)  # on standard deviations
+HALVES = 2  # the factor is fitted on one part of the sets and judged on the other, in turn
+
+
+@dataclass(frozen=True)
+class Count:
+    """How posteriors of `trajectories` trajectories each did on simulated sets.
+
+    Attributes:
+        widening: factor on standard deviations with the highest mean log density at the truths.
+        gain: mean log posterior over prior at the truths, nats, so widened, on sets that did not choose the factor.
+        error: its standard error.
+        plain: the same without widening.
+        levels: credible level of each truth [m], widened by the factor of the other sets: uniform where calibrated.
+    """
+
+    trajectories: int
+    widening: float
+    gain: float
+    error: float
+    plain: float
+    levels: np.ndarray
+
+    def coverage(self, level: float) -> float:
+        """Share of truths in the region of highest density that should hold `level`."""
+        return float(np.mean(self.levels <= level))
+
+
+@dataclass(frozen=True)
+class Sets:
+    """The result for n = 1, 2, 4 ... trajectories."""
+
+    counts: tuple[Count, ...]
+
+    @property
+    def carried(self) -> int:
+        """After how many trajectories another one does not raise the gain any more."""
+        best = self.counts[0]
+        for one in self.counts[1:]:
+            if one.gain > best.gain:
+                best = one
+        return best.trajectories
+
+    def at(self, trajectories: int) -> Count:
+        """The row of so many trajectories, or of the next smaller number that was judged."""
+        return max((c for c in self.counts if c.trajectories <= trajectories), key=lambda c: c.trajectories)
+
+    def sentence(self) -> str:
+        """One line for a person."""
+        last = self.counts[-1]
+        told = f"with {last.trajectories} trajectories standard deviations are widened {last.widening:.2f} times"
+        if self.carried < last.trajectories:
+            told += f"; the network carries {self.carried}, more do not sharpen the posterior"
+        return told
+
+
+def counts_to(trajectories: int) -> list[int]:
+    """1, 2, 4, ... up to `trajectories`, which is the last."""
+    below = [2**k for k in range(trajectories.bit_length()) if 2**k < trajectories]
+    return [*below, trajectories]
+
+
+def judge(
+    factors: Sequence[Sequence[Distribution]],
+    thetas: np.ndarray,
+    components: int,
+    used: Callable[[Distribution], Distribution] = lambda q: q,
+) -> Sets:
+    """Products of the first 1, 2, 4 ... n factors of each set, judged at the thetas that the sets were simulated at.
+
+    Args:
+        factors: m sets of n posteriors of one trajectory each, as they are multiplied in use.
+        thetas: [m, d].
+        components: of the products.
+        used: what else is done to a product before it is used.
+    """
+    rows = []
+    for n in counts_to(len(factors[0])):
+        products = [used(combine(list(each[:n]), components)) for each in factors]
+        rows.append(_count(n, _stacked(products), np.asarray(thetas)))
+    return Sets(tuple(rows))
+
+
+def _stacked(items: Sequence[Distribution]) -> Distribution:
+    return jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(x) for x in leaves]), *items)
+
+
+@jax.jit
+def _gains(q: Distribution, thetas: jax.Array) -> jax.Array:
+    """Log gain [factors, m] of batched posteriors at thetas [m, d], widened by each of FACTORS."""
+
+    def at(factor: jax.Array) -> jax.Array:
+        return jax.vmap(lambda q, t: q.log_gain(t))(widened(q, factor), thetas)
+
+    return jax.lax.map(at, jnp.asarray(FACTORS, jnp.float32))
+
+
+@jax.jit
+def _levels(q: Distribution, thetas: jax.Array, factors: jax.Array) -> jax.Array:
+    return jax.vmap(lambda q, t, f: tempered(q, f).credible_level(t))(q, thetas, factors)
+
+
+def _count(n: int, products: Distribution, thetas: np.ndarray) -> Count:
+    at = jnp.asarray(thetas, jnp.float32)
+    gains = np.nan_to_num(np.asarray(_gains(products, at), float), nan=-100.0, neginf=-100.0)
+    part = np.arange(len(thetas)) % HALVES
+    chosen = np.array([int(np.argmax(gains[:, part != p].mean(1))) for p in range(HALVES)])[part]
+    own = gains[chosen, np.arange(len(thetas))]
+    levels = np.asarray(_levels(products, at, jnp.asarray(FACTORS[chosen], jnp.float32)), float)
+    best = float(FACTORS[int(np.argmax(gains.mean(1)))])
+    error = float(own.std(ddof=1) / np.sqrt(len(own)))
+    return Count(n, best, float(own.mean()), error, float(gains[0].mean()), levels)
+
+
+__all__ = ["Count", "Sets", "counts_to", "judge"]
