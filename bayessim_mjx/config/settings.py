@@ -285,6 +285,13 @@ class BayesSimConfig(Section):
     priorShare: float = setting(
         0.05, "prior mixed into each trajectory's posterior: a misjudged one cannot rule out the truth", low=0, high=1
     )
+    refine: str = setting(
+        "off",
+        "sharpen the posterior by the simulator's own likelihood of the real trajectories, replayed under their "
+        "commands: off, likelihood, or auto (where the task has a model to replay them on, without a word where too "
+        "few draws count)",
+        choices=("auto", "off", "likelihood"),
+    )
     checkTrajs: int = setting(
         300,
         "fresh simulations a round that test calibration and misfit; 0: no tests (else 40 or more)",

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from bayessim_mjx import inference
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.inference import InferenceSettings, rounds
+from bayessim_mjx.loop import refining
 from bayessim_mjx.loop.state import Loop, domain_or_prior
 
 
@@ -28,6 +29,7 @@ def blank(loop: Loop) -> dict[str, Any]:
         "real_posteriors": _no_factors(loop, real_rows) if infers else None,
         **_no_proposals(loop),
         "temperature": jnp.float32(1.0),
+        "motion": refining.no_motion(loop, real_rows) if infers and loop.refines else None,
     }
 
 

@@ -68,6 +68,11 @@ def make(config: Config, env: Env) -> Loop:
             f"task {env.name!r} has no parameters to infer: name some under task.randomization_params, "
             "or set bayessim.modelClass=None to train without inference"
         )
+    if b.refine == "likelihood" and getattr(env, "physics", None) is None:
+        raise UserError(
+            f"bayessim.refine=likelihood replays trajectories on a task's own MuJoCo model; {env.name!r} has none; "
+            "allowed: auto, off"
+        )
     source = make_source(config, env)
     if isinstance(source, Recorded) and source.supply is not None and source.supply < b.realTrajs * b.realIters:
         most = source.supply // b.realTrajs

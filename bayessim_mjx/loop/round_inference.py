@@ -20,6 +20,7 @@ from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.inference import calibration, checks, misspecification, rounds
 from bayessim_mjx.inference.temperature import widened
+from bayessim_mjx.loop import refining
 from bayessim_mjx.loop.inference_state import new_network
 from bayessim_mjx.loop.simulations import at, proposal_of, simulated
 from bayessim_mjx.loop.state import Loop, LoopState, RoundInfo
@@ -56,9 +57,11 @@ def infer(loop: Loop, state: LoopState, policy: Policy, info: RoundInfo) -> Loop
     state = dataclasses.replace(state, temperature=jnp.float32(widening))
     state = dataclasses.replace(state, real_posteriors=_factors(loop, state, info))
     posterior = _posterior(loop, state, info)
+    if loop.refines:
+        state, posterior = refining.refined(loop, state, real, posterior, info)
     info.warnings += _complaints(posterior.names, info.fit, known_before)
     info.posterior, info.real = posterior, jax.tree.map(np.asarray, real)
-    info.scores = score(posterior, source.truth)
+    info.scores |= score(posterior, source.truth)
     domain = posterior
     if verdict is not None:
         info.checks = checks.conclude(*verdict, posterior, b.distrust)
@@ -66,7 +69,8 @@ def infer(loop: Loop, state: LoopState, policy: Policy, info: RoundInfo) -> Loop
         info.warnings += info.checks.warnings(told)
         domain = checks.guarded(posterior, info.checks.prior_share)
     info.predictive = _predict(loop, posterior, seen, real, loop.key(round_, "predict"))
-    info.seconds["condition"] = time.perf_counter() - clock - info.seconds.get("check", 0.0)
+    others = info.seconds.get("check", 0.0) + info.seconds.get("refine", 0.0)
+    info.seconds["condition"] = time.perf_counter() - clock - others
     following = rounds.following(posterior, b.proposal) if loop.sequential else None
     return dataclasses.replace(state, domain=domain, proposal=following)
 

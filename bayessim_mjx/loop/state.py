@@ -37,6 +37,7 @@ class LoopState:
     proposal: Distribution | None  # what the next round is simulated from; None: the prior, in all rounds
     proposals: Distribution | None  # what the simulations kept come from, leaves [kept rounds, ...]
     temperature: Array  # [] factor on standard deviations that the last round's posterior was given
+    motion: dict[str, Array] | None = None  # measured motion of the real trajectories, where bayessim.refine needs it
 
 
 @dataclasses.dataclass
@@ -57,6 +58,7 @@ class RoundInfo:
     seconds: dict[str, float]
     warnings: list[str]
     checks: checks.Checks | None = None  # calibration, misfit, walls; None: none asked for
+    refinement: Any = None  # what bayessim.refine made of the posterior, see loop/refinement.py
 
 
 def chart_of(settings: BayesSimConfig, space: ParameterSpace) -> str:
@@ -91,6 +93,11 @@ class Loop:
     def sequential(self) -> bool:
         """Whether later rounds are simulated from the posterior."""
         return self.settings.modelClass is not None and self.settings.proposal != "prior"
+
+    @property
+    def refines(self) -> bool:
+        """Whether posteriors are refined by replays of the real trajectories."""
+        return self.settings.refine != "off" and getattr(self.env, "physics", None) is not None
 
     @property
     def chart(self) -> str:

@@ -1,0 +1,81 @@
+"""Mixtures of Gaussians fitted to weighted draws."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import logsumexp
+
+from bayessim_mjx.inference.pareto import effective
+
+
+@dataclass(frozen=True)
+class Mixture:
+    """Gaussians in z: weights [K], means [K, d], covariances [K, d, d]."""
+
+    weights: np.ndarray
+    means: np.ndarray
+    covariances: np.ndarray
+
+    def log_density(self, z: np.ndarray) -> np.ndarray:
+        """[N] of z [N, d], as Gaussians."""
+        return logsumexp(self.each(z), axis=1)
+
+    def each(self, z: np.ndarray) -> np.ndarray:
+        """[N, K] of each weighted Gaussian."""
+        rows = []
+        for w, m, c in zip(self.weights, self.means, self.covariances, strict=True):
+            lower = np.linalg.cholesky(c)
+            away = np.linalg.solve(lower, (z - m).T)
+            size = np.log(np.diag(lower)).sum() + 0.5 * len(m) * np.log(2 * np.pi)
+            rows.append(np.log(np.maximum(w, 1e-300)) - 0.5 * (away**2).sum(0) - size)
+        return np.stack(rows, axis=1)
+
+
+def fitted(rng: np.random.Generator, z: np.ndarray, weights: np.ndarray, most: int) -> Mixture:
+    """Gaussians fitted to weighted draws: as many, of 1, 2, 4 ... `most`, as explain draws that were held out best."""
+    keep = weights > 1e-12
+    z, weights = z[keep], weights[keep] / weights[keep].sum()
+    fold = rng.permutation(len(z)) % 2
+    counts = [k for k in (1, 2, 4, 8, 16, 32) if k <= most]
+    best, score = 1, -np.inf
+    for k in counts:
+        held = 0.0
+        for part in (0, 1):
+            one, other = fold == part, fold != part
+            if effective(weights[one] / weights[one].sum()) < 3 * z.shape[1] * k:
+                held = -np.inf
+                break
+            q = em(rng, z[one], weights[one] / weights[one].sum(), k)
+            held += float(weights[other] @ q.log_density(z[other]))
+        if held > score + 1e-3:
+            best, score = k, held
+    return em(rng, z, weights, best)
+
+
+def em(rng: np.random.Generator, z: np.ndarray, weights: np.ndarray, k: int, steps: int = 60) -> Mixture:
+    """Expectation maximisation on weighted draws, begun at k-means++ centres; variances are at least 1e-3 of all."""
+    mean = weights @ z
+    whole = (z - mean).T @ ((z - mean) * weights[:, None]) + 1e-12 * np.eye(z.shape[1])
+    if k == 1:
+        return Mixture(np.ones(1), mean[None], whole[None])
+    root = np.linalg.inv(np.linalg.cholesky(whole))
+    white = (z - mean) @ root.T
+    centres = [rng.choice(len(z), p=weights)]
+    for _ in range(k - 1):
+        far = np.min([((white - white[c]) ** 2).sum(1) for c in centres], axis=0) * weights
+        centres.append(rng.choice(len(z), p=far / far.sum()) if far.sum() > 0 else int(rng.integers(len(z))))
+    q = Mixture(np.full(k, 1 / k), z[centres], np.repeat(whole[None] / k ** (2 / z.shape[1]), k, axis=0))
+    for _ in range(steps):
+        each = q.each(z)
+        share = np.exp(each - logsumexp(each, axis=1, keepdims=True)) * weights[:, None]
+        mass = np.maximum(share.sum(0), 1e-9)
+        means = share.T @ z / mass[:, None]
+        gap = z[None] - means[:, None]
+        covariances = np.einsum("nk,kni,knj->kij", share, gap, gap) / mass[:, None, None] + 1e-3 * whole
+        new = Mixture(mass / mass.sum(), means, covariances)
+        if np.max(np.abs(new.weights - q.weights)) < 1e-4 and np.max(np.abs((new.means - q.means) @ root.T)) < 1e-3:
+            return new
+        q = new
+    return q

@@ -1,0 +1,109 @@
+"""`bayessim.refine`: the product of the network's posteriors proposes, replays of the real trajectories decide."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from bayessim_mjx.distributions import Distribution
+from bayessim_mjx.loop.recorded import Recorded
+from bayessim_mjx.loop.refinement import Likelihood, Refinement, refine
+from bayessim_mjx.loop.state import Loop, LoopState, RoundInfo
+from bayessim_mjx.rollout import Trajectory, recording
+from bayessim_mjx.tracking import Record
+
+DRAWS = 1024  # thetas of one call
+
+
+def no_motion(loop: Loop, rows: int) -> dict[str, Array] | None:
+    """Room for the measured motion of `rows` real trajectories; None where logs keep it."""
+    if isinstance(loop.source, Recorded):
+        return None
+    model, length = loop.env.physics.mj_model, loop.settings.trainTrajLen  # type: ignore[attr-defined]
+    sizes = {"qpos": (length + 1, model.nq), "qvel": (length + 1, model.nv), "command": (length, model.nu)}
+    return {name: jnp.zeros((rows, *size)) for name, size in (sizes | {"valid": (length,)}).items()}
+
+
+def refined(
+    loop: Loop, state: LoopState, real: Trajectory, proposal: Distribution, info: RoundInfo
+) -> tuple[LoopState, Distribution]:
+    """The state with this round's motion, and the posterior of all trajectories so far; what was found in `info`."""
+    clock, b, round_ = time.perf_counter(), loop.settings, int(state.round)
+    state = _stored(loop, state, real)
+    record, valid, sensor = _record(loop, state, (round_ + 1) * b.realTrajs)
+    likelihood = Likelihood(loop.env.physics, record, valid, sensor, together=b.realTrajs)  # type: ignore[attr-defined]
+    seed = int(jax.random.randint(jax.random.fold_in(loop.key(round_, "fit"), 3), (), 0, 2**31 - 1))
+    found = refine(proposal, likelihood, seed=seed, draws=DRAWS, components=b.components)
+    info.refinement = found
+    info.seconds["refine"] = time.perf_counter() - clock
+    info.scores |= scores(found)
+    if found.refined.reason is not None:
+        if b.refine == "likelihood":
+            info.warnings.append(f"bayessim.refine: the network's posterior is kept: {found.refined.reason}")
+        return state, proposal
+    posterior = found.posterior.reduce(b.components).rechart(loop.chart)
+    return state, dataclasses.replace(posterior, prior_weight=jnp.float32(b.priorShare))
+
+
+def scores(found: Refinement) -> dict[str, float]:
+    """Numbers for curves."""
+    told = {"effective": found.refined.effective, "tail": found.refined.tail, "rate": found.rate}
+    told |= {"simulations": float(found.refined.simulations), "used": float(found.refined.reason is None)}
+    return {f"refine/{name}": float(value) for name, value in told.items()}
+
+
+def _stored(loop: Loop, state: LoopState, real: Trajectory) -> LoopState:
+    """The state with the measured motion of this round's trajectories: a surrogate's sensors are as noisy as its
+    observations.
+    """
+    if state.motion is None:
+        return state
+    first, source = int(state.round) * loop.settings.realTrajs, loop.source
+    keys = jax.random.split(jax.random.fold_in(loop.key(int(state.round), "real"), 7))
+    rows = {name: jnp.asarray(getattr(real, name)) for name in state.motion}
+    for key, name in zip(keys, ("qpos", "qvel"), strict=True):
+        rows[name] = rows[name] + source.noise * jax.random.normal(key, rows[name].shape)  # type: ignore[union-attr,operator]
+    kept = {
+        name: jax.lax.dynamic_update_slice(old, rows[name], (first, *[0] * (old.ndim - 1)))
+        for name, old in state.motion.items()
+    }
+    return dataclasses.replace(state, motion=kept)
+
+
+def _record(loop: Loop, state: LoopState, known: int) -> tuple[Record, np.ndarray, np.ndarray]:
+    """(record, valid [N, T], sensor noise [2 nv]) of the first `known` real trajectories."""
+    physics, source = loop.env.physics, loop.source  # type: ignore[attr-defined]
+    model = physics.mj_model
+    if isinstance(source, Recorded):
+        index = source.order[np.arange(known) % len(source.order)]
+        qpos, qvel, command = source._of("qpos", "qvel", "command", index=index)
+        around = recording(physics, *source._of("around_qpos", "around_qvel", "around_command", index=index))
+        law = None if source.law is None else jax.tree.map(lambda x: x[index], source.law)
+        record = Record(qpos, qvel, command, around, law)
+        speeds = np.asarray(source.noise["qvel"]) if source.with_qvel else np.full(model.nv, np.inf)
+        sensor = np.concatenate([_tangent(model, np.asarray(source.noise["qpos"])), speeds])
+        return record, np.ones(command.shape[:2]), sensor
+    motion = state.motion
+    assert motion is not None
+    rows = {name: value[:known] for name, value in motion.items()}
+    record = Record(rows["qpos"], rows["qvel"], rows["command"])
+    return record, np.asarray(rows["valid"]), np.full(2 * model.nv, source.noise, float)  # type: ignore[union-attr]
+
+
+def _tangent(model: object, noise: np.ndarray) -> np.ndarray:
+    """Noise of the positions [nq] as noise of the tangent [nv]: a rotation is twice its quaternion's imaginary part."""
+    parts = []
+    for kind, q in zip(model.jnt_type, model.jnt_qposadr, strict=True):  # type: ignore[attr-defined]
+        if kind == 0:
+            parts.append(noise[q : q + 3])
+            q = q + 3
+        parts.append(2 * noise[q + 1 : q + 4] if kind in (0, 1) else noise[q : q + 1])
+    return np.concatenate(parts)
+
+
+__all__ = ["no_motion", "refined", "scores"]

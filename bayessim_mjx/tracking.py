@@ -1,0 +1,214 @@
+"""How likely recorded motion is in the worlds theta: one-step prediction errors of a filter that follows the record.
+
+A simulation of the logged commands from the logged start drifts off by every small force that is not modelled, and in
+contact it may end anywhere. So the simulated state is drawn to the measured one by a Kalman gain: x <- x + K (y - x).
+The gains come from linear error dynamics along the record (an extended Kalman filter with the gains of one reference
+theta for all): without process noise they vanish, and what is left is the free simulation from an estimated start.
+Ljung (1999), System Identification, 7.4; Sarkka (2013), Bayesian Filtering and Smoothing, 5.2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array
+from jax.typing import ArrayLike
+
+from bayessim_mjx.effects.support.motion import Motion
+from bayessim_mjx.physics import Drive, Physics, begin, control_step
+from bayessim_mjx.physics.controllers import Law
+from bayessim_mjx.physics.tangent import difference, integrate
+
+STEP = 1e-3  # of the perturbed states, relative to `scale`
+BLOCKS = 8  # stretches of time
+
+
+class Record(struct.PyTreeNode):
+    """N recorded trajectories of T control steps, as measured.
+
+    Attributes:
+        qpos: `[N, T+1, nq]`; qvel: `[N, T+1, nv]`; command: `[N, T, nu]`.
+        around: the recording around the starts, as for `rollout.replay`; None: nothing is known but the start.
+        law: controllers between commands and actuators, leaves `[N, nu]`, or None.
+    """
+
+    qpos: Array
+    qvel: Array
+    command: Array
+    around: Motion | None = None
+    law: Law | None = None
+
+
+class Gains(struct.PyTreeNode):
+    """Of a filter along N recorded trajectories, for errors (position tangent, velocity) of 2 nv numbers.
+
+    Attributes:
+        gain: `[N, T, 2 nv, 2 nv]`, 0 in the columns of what is not measured.
+        whitener: `[N, T, 2 nv, 2 nv]`, W with W^T W the inverse of the innovations' covariance (0 where not measured).
+        log_size: `[N, T]`, log |W| over what is measured.
+    """
+
+    gain: Array
+    whitener: Array
+    log_size: Array
+
+
+def errors(physics: Physics, thetas: ArrayLike, record: Record, gains: Gains) -> Array:
+    """Whitened one-step prediction errors of every record in every world; compiled once for each (physics, shapes).
+
+    Args:
+        thetas: `[M, d]`.
+
+    Returns:
+        Sums of squares `[M, N, B]` of each world and record in B = BLOCKS equal stretches of time.
+    """
+    return _errors(physics)(jnp.asarray(thetas, jnp.float32), record, gains)
+
+
+@lru_cache(maxsize=16)
+def _errors(physics: Physics) -> Callable[..., Any]:
+    def one(theta: Array, record: Record, gains: Gains) -> Array:
+        world = _begin(physics, theta, record)
+        drive = Drive(law=record.law)
+
+        def step(world: Any, row: tuple) -> tuple[Any, Array]:
+            command, qpos, qvel, gain, whitener = row
+            world, _ = control_step(physics, world, command, drive)
+            gap = _gap(physics, world, qpos, qvel)
+            return _drawn(physics, world, gain @ gap), jnp.sum((whitener @ gap) ** 2)
+
+        rows = record.command, record.qpos[1:], record.qvel[1:], gains.gain, gains.whitener
+        return jax.lax.scan(step, world, rows)[1]
+
+    def run(thetas: Array, record: Record, gains: Gains) -> Array:
+        def of(at: tuple[Record, Gains]) -> Array:
+            squares = jax.vmap(one, in_axes=(0, None, None))(thetas, *at)
+            return jnp.stack([part.sum(-1) for part in jnp.array_split(squares, BLOCKS, axis=-1)], axis=-1)
+
+        return jnp.moveaxis(jax.lax.map(of, (record, gains)), 0, 1)
+
+    return jax.jit(run)
+
+
+def _begin(physics: Physics, theta: Array, record: Record) -> Any:
+    around = record.around
+    if around is None:
+        held = jnp.broadcast_to(record.command[:1, None, :], (1, physics.substeps, record.command.shape[-1]))
+        around = Motion(record.qpos[:1], record.qvel[:1], held, start=0)
+    else:
+        moved_ = [
+            x + (own - x[around.start]) for x, own in ((around.qpos, record.qpos[0]), (around.qvel, record.qvel[0]))
+        ]
+        around = around.replace(qpos=moved_[0], qvel=moved_[1])
+    return begin(physics, theta, around)
+
+
+def _gap(physics: Physics, world: Any, qpos: Array, qvel: Array) -> Array:
+    shown = world.measurement
+    return jnp.concatenate([difference(physics.mj_model, qpos, shown["qpos"]), qvel - shown["qvel"]])
+
+
+def _drawn(physics: Physics, world: Any, by: Array) -> Any:
+    """The world moved by [2 nv] in position and velocity."""
+    nv = physics.mj_model.nv
+    return world.replace(qpos=integrate(physics.mj_model, world.qpos, by[:nv]), qvel=world.qvel + by[nv:])
+
+
+@lru_cache(maxsize=16)
+def _transitions(physics: Physics) -> Callable[..., Any]:
+    nv = physics.mj_model.nv
+
+    def one(theta: Array, record: Record, gains: Gains, scale: Array) -> tuple[Array, Array]:
+        world = _begin(physics, theta, record)
+        drive = Drive(law=record.law)
+
+        def step(world: Any, row: tuple) -> tuple[Any, tuple[Array, Array]]:
+            command, qpos, qvel, gain = row
+
+            def ahead(by: Array) -> Any:
+                return control_step(physics, _drawn(physics, world, by), command, drive)[0]
+
+            way = STEP * scale
+            pushed = jnp.concatenate([jnp.zeros((1, 2 * nv)), jnp.diag(way), -jnp.diag(way)])
+            after = jax.vmap(ahead)(pushed)
+            first = jax.tree.map(lambda x: x[0], after)
+
+            def state(w: Any) -> Array:
+                return jnp.concatenate([difference(physics.mj_model, w.qpos, first.qpos), w.qvel - first.qvel])
+
+            states = jax.vmap(state)(after)
+            columns = (states[1 : 1 + 2 * nv] - states[1 + 2 * nv :]) / (2 * way[:, None])
+            gap = _gap(physics, first, qpos, qvel)
+            return _drawn(physics, first, gain @ gap), (columns.T, gap)
+
+        rows = record.command, record.qpos[1:], record.qvel[1:], gains.gain
+        return jax.lax.scan(step, world, rows)[1]
+
+    return jax.jit(jax.vmap(one, in_axes=(None, 0, 0, None)))
+
+
+def transitions(
+    physics: Physics, theta: ArrayLike, record: Record, gains: Gains, scale: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Linear error dynamics [N, T, 2 nv, 2 nv] along the records at theta [d], and prediction errors [N, T, 2 nv].
+
+    scale [2 nv]: how large a position's and a velocity's motion is; columns are central differences of 1e-3 of it.
+    """
+    found = _transitions(physics)(jnp.asarray(theta, jnp.float32), record, gains, jnp.asarray(scale, jnp.float32))
+    return tuple(np.asarray(x, np.float64) for x in found)  # type: ignore[return-value]
+
+
+def free(record: Record, nv: int) -> Gains:
+    """Gains that never correct: a free simulation from the measured start, unit weights."""
+    n, t = record.command.shape[:2]
+    zero = jnp.zeros((n, t, 2 * nv, 2 * nv))
+    return Gains(zero, zero + jnp.eye(2 * nv), jnp.zeros((n, t)))
+
+
+def close(record: Record, nv: int) -> Gains:
+    """Gains that correct at once: every step begins where it was measured."""
+    n, t = record.command.shape[:2]
+    eye = jnp.zeros((n, t, 2 * nv, 2 * nv)) + jnp.eye(2 * nv)
+    return Gains(eye, eye, jnp.zeros((n, t)))
+
+
+def riccati(ways: np.ndarray, sensor: np.ndarray, process: np.ndarray, start: np.ndarray) -> Gains:
+    """Gains of the Kalman filter along linear error dynamics.
+
+    Args:
+        ways: `[N, T, 2 nv, 2 nv]`, see `transitions`.
+        sensor: `[2 nv]` standard deviations of the measurement noise; inf where nothing is measured.
+        process: `[2 nv]` standard deviations of what a control step adds to the state.
+        start: `[2 nv]` standard deviations of the start state's error.
+    """
+    n, steps, size, _ = ways.shape
+    seen = np.isfinite(sensor)
+    noise, added = np.diag(sensor[seen] ** 2), np.diag(process**2)
+    spread = np.repeat(np.diag(start**2)[None], n, axis=0)
+    gain, whitener = np.zeros((n, steps, size, size)), np.zeros((n, steps, size, size))
+    log_size = np.zeros((n, steps))
+    at = np.ix_(seen, seen)
+    for t in range(steps):
+        way = np.nan_to_num(ways[:, t])
+        spread = way @ spread @ np.swapaxes(way, -1, -2) + added
+        spread = np.minimum(np.maximum(spread, -1e12), 1e12)
+        inner = spread[:, seen][:, :, seen] + noise
+        k = np.swapaxes(np.linalg.solve(inner, spread[:, seen, :]), -1, -2)
+        gain[:, t, :, seen] = np.moveaxis(k, 2, 0)
+        lower = np.linalg.cholesky(inner)
+        white = np.linalg.inv(lower)
+        for row in range(n):
+            whitener[row, t][at] = white[row]
+        log_size[:, t] = -np.log(np.diagonal(lower, axis1=-2, axis2=-1)).sum(-1)
+        keep = np.eye(size) - gain[:, t]
+        spread = keep @ spread @ np.swapaxes(keep, -1, -2) + gain[:, t][:, :, seen] @ noise @ np.swapaxes(
+            gain[:, t][:, :, seen], -1, -2
+        )
+    arrays = (jnp.asarray(x, jnp.float32) for x in (gain, whitener, log_size))
+    return Gains(*arrays)

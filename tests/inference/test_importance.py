@@ -1,0 +1,88 @@
+"""Refinement by importance sampling against posteriors that are known, from proposals that are wrong."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.stats import genpareto, norm
+
+from bayessim_mjx.distributions import Distribution
+from bayessim_mjx.inference.importance import refine
+from bayessim_mjx.inference.pareto import effective, generalised_pareto, smoothed
+from bayessim_mjx.parameters import Parameter, ParameterSpace
+
+SPACE = ParameterSpace([Parameter(name, 0.0, -1.0, 1.0) for name in "abc"])
+DESIGN = np.random.default_rng(0).normal(size=(40, 3))
+SIGMA = 0.3
+TRUTH = np.array([0.3, -0.5, 0.6])
+DATA = DESIGN @ TRUTH + SIGMA * np.random.default_rng(1).normal(size=40)
+COVARIANCE = SIGMA**2 * np.linalg.inv(DESIGN.T @ DESIGN)  # of the posterior: its box is far away
+MEAN = COVARIANCE @ DESIGN.T @ DATA / SIGMA**2
+
+
+def gaussian(theta):
+    return -0.5 * ((theta @ DESIGN.T - DATA) ** 2).sum(1) / SIGMA**2
+
+
+SD = np.sqrt(np.diag(COVARIANCE))
+PROPOSALS = {
+    "the prior": Distribution.prior(SPACE),
+    "too narrow and beside it": Distribution.gaussian(SPACE, MEAN + 3 * SD, SD / 2),
+    "too wide": Distribution.gaussian(SPACE, MEAN - 2 * SD, 6 * SD),
+}
+
+
+@pytest.mark.parametrize("name", PROPOSALS)
+def test_a_linear_gaussian_posterior_is_found_from_wrong_proposals(name):
+    found = refine(PROPOSALS[name], gaussian, seed=3)
+    assert found.reason is None and found.effective >= 200 and found.tail < 0.7
+    np.testing.assert_allclose(found.weights @ found.theta, MEAN, atol=0.25 * SD.min())
+    np.testing.assert_allclose(found.posterior.mean(), MEAN, atol=0.3 * SD.min())
+    np.testing.assert_allclose(found.posterior.sd(), SD, rtol=0.2)
+    # log of the integral of likelihood x prior density (1/8 in the box)
+    evidence = gaussian(MEAN[None])[0] + 0.5 * np.linalg.slogdet(2 * np.pi * COVARIANCE)[1] + np.log(1 / 8)
+    assert found.evidence == pytest.approx(evidence, abs=0.15)
+
+
+def test_two_modes_are_both_kept():
+    def mirrored(theta):
+        return norm.logpdf(np.abs(theta[:, 0]), 0.5, 0.02) + norm.logpdf(theta[:, 1:], 0.1, 0.05).sum(1)
+
+    found = refine(Distribution.prior(SPACE), mirrored, draws=2048)
+    assert found.reason is None
+    left = found.posterior.sample(jnp.asarray([0, 1], jnp.uint32), 2000)[:, 0] < 0
+    assert float(left.mean()) == pytest.approx(0.5, abs=0.08)
+    truth = np.array([[0.5, 0.1, 0.1], [-0.5, 0.1, 0.1]])
+    exact = np.log(0.5) + norm.logpdf(0, 0, 0.02) + 2 * norm.logpdf(0, 0, 0.05)
+    np.testing.assert_allclose(found.posterior.log_prob(jnp.asarray(truth)), exact, atol=0.35)
+
+
+def test_a_posterior_at_the_end_of_a_range():
+    found = refine(
+        Distribution.prior(SPACE), lambda t: norm.logpdf(t[:, 0], 1.2, 0.2) + norm.logpdf(t[:, 1:], 0, 0.1).sum(1)
+    )
+    z = np.linspace(-1, 1, 4001)
+    weight = norm.pdf(z, 1.2, 0.2)
+    assert found.reason is None
+    assert float(found.weights @ found.theta[:, 0]) == pytest.approx(np.average(z, weights=weight), abs=0.02)
+    assert float(found.posterior.mean()[0]) == pytest.approx(np.average(z, weights=weight), abs=0.03)
+
+
+def test_what_cannot_be_sampled_keeps_the_proposal_and_says_why():
+    prior = PROPOSALS["the prior"]
+    rough = np.random.default_rng(0)
+    lottery = refine(prior, lambda t: 400.0 * rough.normal(size=len(t)), rounds=3)
+    assert lottery.posterior is prior and "effective draws of" in lottery.reason
+    nowhere = refine(prior, lambda t: np.full(len(t), np.nan), rounds=3)
+    assert nowhere.posterior is prior and nowhere.reason == "none of 3072 simulations has a finite likelihood"
+
+
+def test_weights_are_smoothed_by_the_tail_that_they_have():
+    rng = np.random.default_rng(0)
+    for shape in (0.2, 0.5, 0.9):
+        x = np.sort(genpareto.rvs(shape, size=4000, random_state=1))
+        found, scale = generalised_pareto(x)
+        assert found == pytest.approx(shape, abs=0.06) and scale == pytest.approx(1.0, rel=0.1)
+    weights, tail = smoothed(rng.normal(size=4000))
+    assert weights.sum() == pytest.approx(1.0) and tail < 0.5
+    assert smoothed(6 * rng.normal(size=4000))[1] > 0.7
+    assert effective(np.full(50, 1 / 50)) == pytest.approx(50)

@@ -1,0 +1,56 @@
+"""`bayessim.refine` in rounds of the loop: the surrogate's truth, what is kept for a resume, what cannot be refined."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+from bayessim_mjx import config, loop
+from bayessim_mjx.errors import UserError
+from bayessim_mjx.loop import inference_state, round_inference
+from bayessim_mjx.registry import make
+
+SMALL = [
+    "bayessim.trainTrajs=400", "bayessim.realTrajs=2", "bayessim.realIters=2", "bayessim.components=2",
+    "bayessim.hiddenLayers=[16]", "bayessim.checkTrajs=0", "bayessim.ensemble=1", "bayessim.trainTrajLen=40",
+    "bayessim.collectPolicy=policy_random", "real.noise=0.02",
+]  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.ci
+def test_two_rounds_close_in_on_the_surrogate_and_can_be_resumed():
+    settings = config.load("Pendulum", overrides=[*SMALL, "bayessim.refine=likelihood"])
+    parts = loop.make(settings, make("Pendulum", config=settings))
+    state = loop.LoopState(round=jax.numpy.int32(0), train=None, **inference_state.blank(parts))
+    shapes = jax.tree.map(lambda x: (x.shape, x.dtype), state)
+    plain, gains = [], []
+    for _ in range(2):
+        info = loop.RoundInfo(
+            round=int(state.round), rounds=2, domain=state.domain, posterior=None, truth=parts.source.truth,
+            returns=np.zeros(1), lengths=np.zeros(1), real=None, predictive=None, fit={}, scores={}, seconds={},
+            warnings=[],
+        )  # fmt: skip
+        state = dataclasses.replace(round_inference.infer(parts, state, None, info), round=state.round + 1)
+        assert info.scores["refine/used"] == 1 and info.scores["refine/effective"] >= 200
+        away = (np.asarray(info.posterior.mean()) - parts.source.truth) / np.asarray(info.posterior.sd())
+        assert np.abs(away).max() < 3.5
+        plain.append(info.refinement.refined.evidence)
+        gains.append(info.scores["gain_over_prior"])
+    assert gains[1] > gains[0] > 4 and np.isfinite(plain).all()
+    assert jax.tree.map(lambda x: (x.shape, x.dtype), state) == shapes
+    assert np.all(np.asarray(state.motion["valid"]) == 1) and np.ptp(state.motion["qpos"], axis=1).min() > 0
+
+
+def test_an_environment_without_our_physics_cannot_be_replayed():
+    settings = config.load("Pendulum", overrides=[*SMALL, "bayessim.refine=likelihood"])
+    env = make("Pendulum", config=settings)
+    foreign = type("Foreign", (), {"space": env.space, "name": "brax:ant", "physics": None})()
+    with pytest.raises(UserError, match="bayessim.refine=likelihood.*brax:ant.*allowed: auto, off"):
+        loop.make(settings, foreign)
+
+
+def test_nothing_is_kept_where_nothing_is_refined():
+    settings = config.load("Pendulum", overrides=SMALL)
+    assert loop.make(settings, make("Pendulum", config=settings)).refines is False
