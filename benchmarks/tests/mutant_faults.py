@@ -15,8 +15,8 @@ FORCES = "tests/effects/test_actuator_forces.py"
 SENSORS = "tests/effects/test_sensor_effects.py"
 RECORDED = "tests/loop/test_recorded.py"
 ALGEBRA = "tests/test_algebra.py"
-MANIFEST = "tests/runs/test_runs.py"
-LOG = "tests/test_logs.py"
+MANIFEST = "tests/runs"
+LOG = "tests/logs/test_resample.py"
 SEARCH = "tests/diagnosis/selection/test_search.py"
 
 FAULTS: tuple[tuple[str, str, str, str, tuple[str, ...]], ...] = (

@@ -28,7 +28,7 @@ LOSSES, PPO, RND, SYMMETRY = (f"bayessim_mjx/rl/{name}.py" for name in ("losses"
 GAE, EPISODES, TRAIN, WORLDS = (f"bayessim_mjx/rl/{name}.py" for name in ("gae", "episodes", "train", "worlds"))
 COMMAND = "bayessim_mjx/train.py"
 T = "tests/rl/test_"
-RESUME = ("tests/test_commands.py", "-k", "test_train_killed_and_resumed_equals_unkilled and 1")
+RESUME = ("tests/commands/test_train_command.py", "-k", "test_train_killed_and_resumed_equals_unkilled and 1")
 RESTORED = 'return tree["state"], marked(meta)'
 
 

@@ -1,0 +1,182 @@
+"""The commands, called in this process: bad input is one line and exit code 2, and help needs nothing but flags."""
+
+import ast
+import errno
+import runpy
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import jax
+import mujoco
+import pytest
+from toy_runs import SMALL, error_of
+
+from bayessim_mjx import cli, diagnose, main, play, train
+from bayessim_mjx.errors import UserError
+
+
+@pytest.mark.parametrize(
+    ("argv", "words"),
+    [
+        (["--task", "Pendulm"], ["'Pendulm'", "Did you mean Pendulum", "Allowed: Ant, "]),
+        (["--tsk", "Pendulum"], ["'--tsk'", "Did you mean --task"]),
+        (["--task", "Pendulum", "--num_envs", "many"], ["--num_envs", "'many'"]),
+        (["--task", "Pendulum", "--num_envs", "0"], ["env.numEnvs = 0", "--num_envs", "at least 1"]),
+        (["--task", "Pendulum", "--task"], ["--task", "expected one argument"]),
+        (["--task", "Pendulum", "word"], ["'word'", "section.key=value"]),
+        (["--task", "Pendulum", "bayessim.component=5"], ["bayessim.component", "Did you mean bayessim.components"]),
+        (["--task", "Pendulum", "--device", "tpu:7"], ["device = 'tpu:7'", "available: cpu:0"]),
+        (["--task", "Pendulum", "--device", "abacus"], ["device = 'abacus'", "cuda:0"]),
+        (["--task", "Pendulum", "--device", "auto:1"], ["device = 'auto:1'", "expected auto, cpu, gpu"]),
+        (["--task", "Pendulum", "--cfg_env", "nowhere.yaml"], ["nowhere.yaml", "cannot be read"]),
+        (["--task", "Pendulum", "--name", "../up"], ["name = '../up'"]),
+        (["--resume", "nowhere"], ["nowhere: not a run folder"]),
+        (["--task", "Pendulum", "--checkpoint", "nowhere"], ["--checkpoint nowhere: no such folder"]),
+        (["--task", "Pendulum", "--use_last_checkpoint"], ["no run of 'Pendulum' with a checkpoint"]),
+        (["--task", "Pendulum", "--use_last_checkpoint", "--checkpoint", "best"], ["give one of them"]),
+        (["--task", "Pendulum", "--num_envs", "\u0663"], ["--num_envs", "'\u0663'"]),
+        (["--task", "Pendulum", "--seed", "9" * 20], ["seed = 99999999999999999999", "at most 4294967295"]),
+        (["--task", "Pendulum", "--num_envs", str(10**13)], ["env.numEnvs = 10000000000000", "--num_envs", "at most"]),
+        (["--task", "Pendulum", "--num_envs", "4", "ppo.num_envs=8"], ["--num_envs", "num_envs=8", "one setting"]),
+        ([], ["no task", "--list_tasks"]),
+    ],
+)
+@pytest.mark.parametrize("command", [main.main, train.main])
+def test_bad_input_is_one_line(command: Any, argv: list[str], words: list[str], capsys: Any, toy: None) -> None:
+    line = error_of(capsys, command, *argv)
+    assert all(word in line for word in words), line
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("env.realParams.means=[[1.0, 5.0]]", ["env.realParams.means", "length", "5", "[0.01, 2]"]),
+        ("env.realParams.means=[[1.0, 0.5, 3.0]]", ["env.realParams.means", "3"]),
+        ("env.realParams.means=[{mass: 1.0}]", ["mass"]),
+        ("real.logs=[empty]", ["empty"]),
+    ],
+)
+def test_bad_real_side_is_one_line(override: str, words: list[str], capsys: Any, tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    line = error_of(capsys, main.main, "--task", "Pendulum", override)
+    assert all(word in line for word in words), line
+
+
+@pytest.mark.parametrize(
+    ("command", "override", "words"),
+    [
+        (main.main, "ppo.teacher=/nope", ["ppo.teacher = '/nope'", "train --distil"]),
+        (train.main, "bayessim.components=5", ["bayessim.components: train has no use for it"]),
+        (train.main, "real.logs=[a]", ["real.logs: train has no use for it"]),
+    ],
+)
+def test_settings_of_another_command_are_refused(command: Any, override: str, words: list[str], capsys: Any) -> None:
+    line = error_of(capsys, command, "--task", "Pendulum", override)
+    assert all(word in line for word in words), line
+
+
+def test_what_means_nothing_here_is_one_note(capsys: Any, tmp_path: Path, toy: None) -> None:
+    (tmp_path / "f.yaml").write_text("sim: {substeps: 2}\nenv: {envSpacing: 2}\n")
+    assert train.main(["--task", "Pendulum", *SMALL, "--cfg_env", "f.yaml", "--max_iterations", "0"]) == 0
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if "mean nothing" in line]
+    assert line == "note: f.yaml: left out, as they mean nothing here: sim, env.envSpacing"
+
+
+def test_help_and_task_list_need_no_task(capsys: pytest.CaptureFixture) -> None:
+    for command in (main.main, train.main, play.main):
+        assert command(["--help"]) == 0
+        assert "section.key=value" in capsys.readouterr().out
+    assert main.main(["--list_tasks"]) == 0
+    assert {"Pendulum", "Cartpole", "Ant"} <= set(capsys.readouterr().out.split())
+
+
+@pytest.mark.parametrize("name", main.COMMANDS)
+def test_one_console_script_takes_all_commands(name: str, capsys: pytest.CaptureFixture, monkeypatch: Any) -> None:
+    monkeypatch.setattr(sys, "argv", ["/usr/bin/bayessim-mjx"])
+    for written in {name, name.replace("_", "-")}:
+        assert main.main([written, "--help"]) == 0
+        usage = capsys.readouterr().out.split("\n\n")[0]
+        assert usage.startswith(f"usage: bayessim-mjx {name.replace('_', '-')} ")
+
+
+def test_a_command_that_does_not_exist_is_one_line(capsys: pytest.CaptureFixture) -> None:
+    line = error_of(capsys, main.main, "gap-lop", "--task", "Pendulum")
+    assert "command 'gap-lop' is unknown. Did you mean gap-loop?" in line and "calibrate, diagnose" in line
+
+
+def test_version(capsys: pytest.CaptureFixture) -> None:
+    for command in (main.main, play.main, diagnose.main):
+        assert command(["--version"]) == 0
+        assert f"jax {jax.__version__}, mujoco {mujoco.__version__})" in capsys.readouterr().out
+
+
+def test_flags_are_read_before_jax_is_imported() -> None:
+    slow = "{'jax', 'mujoco', 'numpy', 'rich', 'yaml'} & set(sys.modules)"
+    for call in (["diagnose", "--help"], ["--version"], ["nothing"]):
+        code = f"import sys; from bayessim_mjx.main import main; main({call}); assert not ({slow}), {slow}"
+        subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
+
+
+def test_help_fits_into_80_columns(monkeypatch: Any, capsys: pytest.CaptureFixture) -> None:
+    from bayessim_mjx import calibrate, diagnose, gap_loop
+
+    monkeypatch.setenv("COLUMNS", "80")
+    for command in (main, train, play, calibrate, diagnose, gap_loop):
+        assert command.main(["--help"]) == 0
+        usage, *lines = capsys.readouterr().out.splitlines()
+        assert usage.startswith(f"usage: python -m {command.__name__} ") and max(map(len, [usage, *lines])) <= 80
+        flags = [line for line in lines if line.startswith("  -")]
+        assert all(len(line.split()) > 2 or lines[lines.index(line) + 1].startswith(" " * 8) for line in flags), flags
+
+
+def test_every_ancestor_flag_is_known() -> None:
+    flags = "--task --num_envs --seed --max_iterations --headless --video --video_length --video_interval --checkpoint"
+    flags += " --use_last_checkpoint --logdir --cfg_env --cfg_train --device"
+    for prog in ("main", "train", "play"):
+        assert set(flags.split()) <= set(cli.Parser(prog, "")._option_string_actions)
+
+
+def test_seed_minus_one_is_drawn_and_recorded() -> None:
+    args = cli.Parser("main", "").parse(["--task", "pendulum", "--seed", "-1", "ppo.gamma=0.5"])
+    config = cli.config_of(args)
+    assert 0 <= config.seed < 10_000 and config.task == "Pendulum" and config.ppo.gamma == 0.5
+
+
+def test_only_what_the_user_can_mend_is_one_line(capsys: pytest.CaptureFixture) -> None:
+    """Exit codes: 2 for a user's error and for what the system refuses, 1 with the traceback for a bug."""
+
+    def ends(error: BaseException) -> tuple[int, str]:
+        def run(argv: Any) -> int:
+            raise error
+
+        return cli.command(run)([]), capsys.readouterr().err
+
+    assert ends(UserError("x = 3:\nallowed: 4")) == (2, "error: x = 3: allowed: 4\n")
+    assert ends(PermissionError(errno.EACCES, "Permission denied", "out")) == (
+        2, f"error: [Errno {errno.EACCES}] Permission denied: 'out'\n",
+    )  # fmt: skip
+    assert ends(KeyboardInterrupt())[0] == 130 and ends(SystemExit(0)) == (0, "")
+    for bug in (ValueError("math domain error"), FloatingPointError("x"), KeyError("k"), SystemExit("bye")):
+        code, err = ends(bug)
+        assert code == 1 and "Traceback" in err and "please report it" in err.splitlines()[-1]
+
+
+def test_a_path_that_no_system_takes_is_one_line(capsys: pytest.CaptureFixture) -> None:
+    xml = "<mujoco><worldbody><body><joint name='j'/><geom size='.1'/></body></worldbody>"
+    Path("arm.xml").write_text(xml + "<actuator><motor name='m' joint='j'/></actuator></mujoco>")
+    line = error_of(capsys, diagnose.main, "--model", "arm.xml", "--data", "a" * 300)
+    assert "a" * 300 in line and "too long" in line
+
+
+@pytest.mark.parametrize("name", [p.name for p in sorted((Path(__file__).parents[2] / "examples").glob("*.py"))])
+def test_examples_say_what_they_are(name: str, monkeypatch: Any, capsys: pytest.CaptureFixture) -> None:
+    file = Path(__file__).parents[2] / "examples" / name
+    monkeypatch.syspath_prepend(file.parent)
+    monkeypatch.setattr(sys, "argv", [name, "--help"])
+    with pytest.raises(SystemExit) as end:
+        runpy.run_path(str(file), run_name="__main__")
+    first = ast.get_docstring(ast.parse(file.read_text()))
+    assert end.value.code in (None, 0) and first is not None
+    assert first.split()[:6] == capsys.readouterr().out.partition("\n\n")[2].split()[:6]

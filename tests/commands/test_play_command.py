@@ -1,0 +1,86 @@
+"""Saved policies: found by name, played on every kind of physics, imitated."""
+
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+from toy_runs import SMALL, error_of
+
+from bayessim_mjx import config, play, registry, train
+from bayessim_mjx.runs import checkpoints, latest_run
+
+
+@pytest.mark.parametrize("flag", ["--max_iterations=3", "--video_interval", "--name", "--resume"])
+def test_play_neither_shows_nor_takes_flags_of_training(flag: str, capsys: pytest.CaptureFixture) -> None:
+    assert f"{flag.split('=')[0]}: play has no use for it" in error_of(capsys, play.main, flag, "3")
+    assert play.main(["--help"]) == 0
+    assert flag.split("=")[0] not in capsys.readouterr().out
+
+
+def test_play_draws_from_the_posterior_in_the_coordinates_that_it_was_saved_in(tmp_path: Path) -> None:
+    """A probit posterior's mean is that of its own draws; read as a plain one it was (1.35, 1.99) for (1.50, 1.90)."""
+    from bayessim_mjx.distributions import Distribution
+    from bayessim_mjx.distributions.charts import to_chart
+
+    settings = config.load("Pendulum", overrides=["bayessim.components=1"])
+    env, key = registry.make("Pendulum", config=settings), jax.random.PRNGKey(0)
+    centre = np.asarray(to_chart(env.space.to_unit(np.float32([1.5, 1.9])), "probit"))
+    posterior = Distribution.from_unit(env.space, [0.0], [centre], 0.05 * np.eye(2)[None], chart="probit")
+    checkpoints.save(tmp_path / "1", {"state": {"domain": posterior}}, 1, {})
+    drawn = np.asarray(play._physics(settings, env, tmp_path / "1", key, 400)["posterior"])
+    np.testing.assert_array_equal(drawn, posterior.sample(key, 400))
+    np.testing.assert_allclose(drawn.mean(0), [1.5, 1.9], atol=0.01)
+
+
+@pytest.mark.slow
+@pytest.mark.ci
+def test_play_prints_returns_of_latest_best_run_and_path(toy: None, capsys: pytest.CaptureFixture) -> None:
+    assert train.main(["--task", "Pendulum", *SMALL]) == 0
+    run = latest_run("logs", "Pendulum")
+    for which in ("latest", "best", str(run.path), str(run.checkpoint(2))):
+        capsys.readouterr()
+        assert play.main(["--task", "Pendulum", "--checkpoint", which, "--episodes", "3"]) == 0
+        rows = {line.split()[0]: line.split()[1:] for line in capsys.readouterr().out.splitlines() if line}
+        assert {"nominal", "prior", "real"} <= set(rows) and float(rows["nominal"][0]) < 0
+    assert "have nominal, prior, real" in error_of(
+        capsys, play.main, "--checkpoint", str(run.path), "--physics=posterior"
+    )
+    line = error_of(capsys, play.main, "--checkpoint", str(run.path), "ppo.hidden_actor=[5]")
+    assert "policy.actor" in line and "settings that it was made with" in line
+    assert "give --task NAME" in error_of(capsys, play.main, "--checkpoint", "latest")
+    assert "p.pt: the file's name has to end with .onnx" in error_of(
+        capsys, play.main, "--checkpoint", str(run.path), "--export", "p.pt"
+    )
+    pytest.importorskip("onnxruntime", reason="the extra [export] is not installed")
+    for flags in ([], ["deploy/p.onnx"]):
+        assert play.main(["--checkpoint", str(run.checkpoint(2)), "--export", *flags]) == 0
+        where, _, rest = capsys.readouterr().out.rpartition("exported ")[2].partition(": differs by ")
+        assert float(rest.split()[0]) < 1e-5 and Path(where).is_file()
+    assert where == "deploy/p.onnx"
+
+
+@pytest.mark.parametrize("where", ["--logdir=elsewhere", "logdir=elsewhere"])
+def test_play_looks_where_logdir_says(toy: None, capsys: pytest.CaptureFixture, where: str) -> None:
+    assert train.main(["--task", "Pendulum", *SMALL, where, "--max_iterations=0"]) == 0
+    assert play.main(["--task", "Pendulum", "--checkpoint", "latest", "--episodes", "2", where]) == 0
+    assert "checkpoint elsewhere" in capsys.readouterr().out
+    assert "no run of 'Pendulum'" in error_of(capsys, play.main, "--task", "Pendulum", "--checkpoint", "latest")
+
+
+@pytest.mark.slow
+@pytest.mark.ci
+def test_a_teacher_that_sees_theta_is_imitated_by_a_student_that_does_not(toy: None, capsys: Any) -> None:
+    argv = ["--task", "Pendulum", "--randomize", *SMALL]
+    assert train.main([*argv, "ppo.policy_theta=True", "--logdir", "teachers"]) == 0
+    teacher = latest_run("teachers", "Pendulum")
+    assert play.main(["--checkpoint", str(teacher.path), "--episodes", "3"]) == 0
+    assert train.main([*argv, "--distil", str(teacher.path)]) == 0
+    student = latest_run("logs", "Pendulum")
+    assert Path(student.config.ppo.teacher or "") == teacher.checkpoint("best").absolute()
+    assert train.main(["--resume", str(student.path), "--headless"]) == 0
+    capsys.readouterr()
+    assert play.main(["--checkpoint", str(student.path), "--episodes", "3", "--physics", "nominal"]) == 0
+    assert "nominal" in capsys.readouterr().out
+    assert "no such folder" in error_of(capsys, train.main, *argv, "--distil", "nowhere")

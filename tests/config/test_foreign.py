@@ -1,0 +1,124 @@
+"""BayesSimIG's own task files load whole: what means nothing here is named in one note."""
+
+import warnings
+from pathlib import Path
+
+import mujoco
+import pytest
+
+from bayessim_mjx import registry
+from bayessim_mjx.config import (
+    from_dict,
+    load,
+)  # fmt: skip
+from bayessim_mjx.errors import UserError
+from bayessim_mjx.parameters import ParameterSpace
+from bayessim_mjx.physics import nuisance
+
+ISAAC = {  # as BayesSimIG's files are made: other simulators' keys beside those that count here
+    "Humanoid": """
+env: {numEnvs: 4096, envSpacing: 5, episodeLength: 1000, isFlagrun: False, powerScale: 1.0, upWeight: 0.1,
+  realParams: {weights: [1.0], means: [[1.9, 0.2]], stds: [[0.001, 0.001]]},
+  asset: {assetRoot: somewhere, assetFileName: humanoid.xml}, plane: {staticFriction: 1.0, restitution: 0.0}}
+sim: {substeps: 2, physx: {num_threads: 4, solver_type: 1, contact_offset: 0.02}, flex: {warm_start: 0.25}}
+bayessim: {trainTrajs: 10000, collectPolicy: policy_random, summarizerFxn: summary_start, trainTrajLen: 10, ftune: True,
+  modelClass: MDNN, components: 10, hiddenLayers: [128, 128], lr: 1.e-4, realEvals: 100, realTrajs: 1, realIters: 100,
+  ftuneRL: False}
+task:
+  randomize: True
+  randomization_params:
+    actions: {range: [0., 0.1], operation: additive, distribution: gaussian, schedule: constant, schedule_steps: 0}
+    actor_params:
+      torso:
+        color: True
+        rigid_body_properties:
+          mass: {range: [0.1, 2.0], operation: scaling, distribution: uniform, schedule: constant, schedule_steps: 0}
+        dof_properties:
+          stiffness: {range: [0.0, 10.0], operation: additive, distribution: uniform, schedule: constant}
+""",
+    "ShadowHand": """
+env: {numEnvs: 1024, envSpacing: 0.75, maxEpisodeLength: 600, aggregateMode: 1, objectType: block, rotEps: 0.1,
+  realParams: {weights: [1.0], means: [[1.8]], stds: [[0.001]]}, asset: {assetFileName: hand.xml}}
+sim: {substeps: 2, physx: {num_threads: 4}}
+bayessim: {trainTrajs: 50000, components: 4, lr: 1.e-4}
+task:
+  randomize: True
+  randomization_params:
+    observations: {range: [0, .002], range_correlated: [0, .001], operation: additive, distribution: gaussian,
+      schedule: linear, schedule_steps: 40000}
+    actions: {range: [0., .05], range_correlated: [0, .015], operation: additive, distribution: gaussian,
+      schedule: linear, schedule_steps: 40000}
+    sim_params:
+      gravity: {range: [0, 0.4], operation: additive, distribution: gaussian, schedule: linear, schedule_steps: 40000}
+    frequency: 720
+    actor_params:
+      torso:
+        color: True
+        rigid_body_properties:
+          mass: {range: [0.1, 10], operation: scaling, distribution: uniform, schedule: constant, schedule_steps: 0}
+        rigid_shape_properties:
+          friction: {num_buckets: 250, range: [0.7, 1.3], operation: scaling, distribution: uniform, setup_only: True}
+""",
+    "Pendulum": """
+env: {numEnvs: 100, episodeLength: 200, realParams: {weights: [1.0], means: [[1.0, 0.5]], stds: [[1.0e-5, 1.0e-5]]}}
+rkhsnet: {enable: True, nFeat: 100}
+bayessim: {trainTrajs: 10000, summarizerFxn: summary_start, realIters: 20, lr: 1.e-4}
+task:
+  randomize: True
+  randomization_params:
+    actor_params:
+      pendulum:
+        rigid_body_properties: {mass: {range: [0.01, 2.0], operation: scaling, schedule: constant}}
+        rigid_shape_properties: {length: {range: [0.01, 2.0], operation: scaling, distribution: uniform}}
+""",
+}
+
+
+LEFT_OUT = {
+    "Humanoid": "sim, env.envSpacing, env.isFlagrun, env.powerScale, env.upWeight, env.asset, env.plane, color",
+    "ShadowHand": "sim, env.envSpacing, env.aggregateMode, env.objectType, env.rotEps, env.asset, color, num_buckets, "
+    "setup_only",
+    "Pendulum": "rkhsnet",
+}
+
+
+BODY = """<mujoco model="hand"><worldbody><body name="torso"><freejoint/><geom name="palm" size=".1"/><body name="arm">
+<joint name="elbow" axis="0 1 0"/><geom size=".05" pos=".1 0 0"/></body></body></worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize("task", ISAAC)
+def test_files_made_like_bayessimigs_load_whole_with_one_note(task: str, tmp_path: Path) -> None:
+    (tmp_path / "f.yaml").write_text(ISAAC[task])
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        loaded = load(task, cfg_env=tmp_path / "f.yaml")
+    assert [str(w.message).partition("nothing here: ")[2] for w in caught] == [LEFT_OUT[task]]
+    assert str(caught[0].message).startswith(f"{tmp_path}/f.yaml: ")
+    section = loaded.to_dict()["task"]
+    if task == "Pendulum":
+        assert registry.make(task, config=loaded).space.names == ("pendulum_mass_mult", "pendulum_length_mult")
+        return
+    model = mujoco.MjModel.from_xml_string(BODY)
+    space = ParameterSpace.from_config(section, model)
+    found = nuisance.read(section["randomization_params"], space)
+    assert space.names[:2] == ("torso_mass_mult", "arm_mass_mult") and found is not None
+    spread = found.actions.white
+    if task == "Humanoid":
+        assert space.names[2:] == ("elbow_stiffness",) and loaded.env.episodeLength == 1000
+        assert (spread.first, spread.second, found.observations, found.frequency) == (0.0, 0.1, None, 1)
+    else:
+        assert loaded.env.episodeLength == 600 and found.frequency == 720 and found.gravity.white.second == 0.4
+        assert (found.observations.lasting.second, found.actions.schedule.steps) == (0.001, 40000)
+    assert from_dict(loaded.to_dict()) == loaded
+
+
+def test_names_of_one_length_agree_and_slips_are_still_refused(tmp_path: Path) -> None:
+    assert load("Pendulum", overrides=["env.maxEpisodeLength=30"]).env.episodeLength == 30
+    (tmp_path / "f.yaml").write_text("env: {episodeLength: 3, maxEpisodeLength: 4}\n")
+    with pytest.raises(UserError, match=r"env\.episodeLength = 3 and env\.maxEpisodeLength = 4 are one setting"):
+        load("Pendulum", cfg_env=tmp_path / "f.yaml")
+    for text, word in (("env: {envSpacin: 1}", "env.envSpacin"), ("simm: {}", "simm")):
+        (tmp_path / "f.yaml").write_text(text)
+        with pytest.raises(UserError, match=f"key '{word}' is unknown"):
+            load("Pendulum", cfg_env=tmp_path / "f.yaml")
+    assert load("Cartpole", overrides=["env.resetDist=2"]).env["resetDist"] == 2.0  # the task has it
