@@ -155,7 +155,7 @@ def diagnosis_pictures(work: Path, out: Path) -> None:
     if not (work / "motion").exists():
         record_motion(work / "motion")
     text = in_terminal([*DIAGNOSIS.split(), "--effects", EFFECTS], work, "diagnosis")
-    terminal_picture(text, DIAGNOSIS, out / "diagnosis.svg")
+    terminal_picture(text, f"{DIAGNOSIS} --effects LIST", out / "diagnosis.svg")
     browser = next((path for name in BROWSERS if (path := shutil.which(name))), None)
     if browser is None:
         print(f"report.png: left out, there is no {', '.join(BROWSERS)}")
