@@ -19,7 +19,6 @@ LONG_FILES = (
     "bayessim_mjx/diagnosis/selection/race.py",
     "bayessim_mjx/report/sections.py",
     "bayessim_mjx/rl/ppo.py",
-    "benchmarks/tests/fuzz_cases.py",
 )
 LONG_FUNCTIONS = (
     "bayessim_mjx/diagnosis/fitting/quadratic.py:held_out",

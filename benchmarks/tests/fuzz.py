@@ -2,9 +2,10 @@
 
     python benchmarks/tests/fuzz.py [--cases 1000] [--seed 0] [--only KIND ...] [--commands 30] [--out DIR]
 
-Kinds of input, and what is done with them, stand in fuzz_cases.py. Every case is called in a worker process with a
-limit of time; a worker that dies or stands still is counted and replaced. `--commands` of the refused command lines are
-then run as commands of their own: one line on stderr and exit code 2. Exit code 0 if nothing was found.
+Kinds of input, and what is done with them, stand in fuzz_cases.py and fuzz_files.py. Every case is called in a worker
+process with a limit of time; a worker that dies or stands still is counted and replaced. `--commands` of the refused
+command lines are then run as commands of their own: one line on stderr and exit code 2. Exit code 0 if nothing was
+found.
 """
 
 import argparse

@@ -10,6 +10,8 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks" / "tests"))
 import fuzz  # noqa: E402
 import fuzz_cases  # noqa: E402
+import fuzz_files  # noqa: E402
+import fuzz_inputs  # noqa: E402
 import kills  # noqa: E402
 
 
@@ -29,17 +31,17 @@ def test_what_the_inputs_are_made_from_is_sound(tmp_path: Path) -> None:
     """Else all of them would be refused for the same reason."""
     from bayessim_mjx.diagnosis.fitting import robot
 
-    rows = [",".join(f"{x:.6g}" for x in row) for row in fuzz_cases.table()]
-    (tmp_path / "run.csv").write_text("\n".join([fuzz_cases.HEADER, *rows]))
-    (tmp_path / "arm.xml").write_text(fuzz_cases.ARM)
-    (tmp_path / "params").write_text(fuzz_cases.PARAMS)
-    (tmp_path / "effects").write_text(fuzz_cases.EFFECTS)
+    rows = [",".join(f"{x:.6g}" for x in row) for row in fuzz_inputs.table()]
+    (tmp_path / "run.csv").write_text("\n".join([fuzz_inputs.HEADER, *rows]))
+    (tmp_path / "arm.xml").write_text(fuzz_inputs.ARM)
+    (tmp_path / "params").write_text(fuzz_inputs.PARAMS)
+    (tmp_path / "effects").write_text(fuzz_inputs.EFFECTS)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        for name, text in ((None, None), ("run.yaml", fuzz_cases.SIDE), ("map.yaml", fuzz_cases.MAP)):
+        for name, text in ((None, None), ("run.yaml", fuzz_inputs.SIDE), ("map.yaml", fuzz_inputs.MAP)):
             if name is not None and text is not None:
                 (tmp_path / name).write_text(text)
-            fuzz_cases._read(tmp_path, None)
+            fuzz_files.read(tmp_path, None)
         body = robot.of_file(tmp_path / "arm.xml", tmp_path / "params")
         fuzz_cases._effects(tmp_path / "effects")
     assert len(body.space) == 3
