@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from bayessim_mjx.distributions import algebra, box, charts, evaluate
+from bayessim_mjx.distributions.parts import Parts
 from bayessim_mjx.errors import UserError
-
-if TYPE_CHECKING:
-    from bayessim_mjx.distributions.distribution import Distribution
 
 OFF = np.float32(-1e9)  # logit of a component that is not in use
 
@@ -22,7 +20,7 @@ def empty(components: int, d: int, centre: float = 0.5) -> tuple[np.ndarray, np.
     return np.full(components, OFF), np.full((components, d), centre), np.tile(np.eye(d), (components, 1, 1))
 
 
-def to_mixture(q: Distribution) -> algebra.Mixture:
+def to_mixture(q: Parts) -> algebra.Mixture:
     """The density of q (plain or probit) as a part of the prior + weighted, untruncated Gaussians.
 
     Components of no weight are left out where they are no Gaussians. ValueError where q is no density.
@@ -42,7 +40,7 @@ def to_mixture(q: Distribution) -> algebra.Mixture:
     return algebra.Mixture(float(flat), weights, means, scales, charts.PRIOR_PRECISION.get(q.chart, 1.0))
 
 
-def recharted(q: Distribution, chart: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def recharted(q: Parts, chart: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Means, scales and logits in another chart: moments of each component (of its part inside the cube)."""
     u, log_weights = evaluate.component_points(q, evaluate.POINTS)
     z, log_weights = (np.asarray(v, np.float64) for v in (charts.to_chart(u, chart), log_weights))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,10 +13,8 @@ from jax import Array
 from jax.scipy.special import ndtri
 
 from bayessim_mjx.distributions import box, charts
+from bayessim_mjx.distributions.parts import Parts
 from bayessim_mjx.linalg import lower_factor, product, solve_lower
-
-if TYPE_CHECKING:
-    from bayessim_mjx.distributions.distribution import Distribution
 
 POINTS = 1024  # quadrature points per component behind mean, cov, mode, credible_level
 TRIES, SPARE = 50, 32  # rejection rounds of sample, and points per row that is then still outside
@@ -44,7 +42,7 @@ def log_inside(logits: Array, means: Array, scales: Array) -> Array:
     return jax.nn.logsumexp(jax.nn.log_softmax(logits) + box.log_masses(means, scales))
 
 
-def log_unit(q: Distribution, u: Array) -> Array:
+def log_unit(q: Parts, u: Array) -> Array:
     """Unit-cube log density of u [n, d] (taken to be inside) -> [n]."""
     z = charts.to_chart(u, q.chart)
     mog = jax.nn.logsumexp(jax.nn.log_softmax(q.logits)[None, :] + box.log_density(z, q.means, q.scales), axis=1)
@@ -53,7 +51,7 @@ def log_unit(q: Distribution, u: Array) -> Array:
 
 
 @jax.jit
-def log_gain(q: Distribution, theta: Array) -> Array:
+def log_gain(q: Parts, theta: Array) -> Array:
     rows = as_rows(theta)
     inside = jax.vmap(q.space.contains)(rows)
     u = jnp.clip(
@@ -63,7 +61,7 @@ def log_gain(q: Distribution, theta: Array) -> Array:
 
 
 @partial(jax.jit, static_argnames="n")
-def sample(q: Distribution, key: Array, n: int) -> Array:
+def sample(q: Parts, key: Array, n: int) -> Array:
     key_flat, key_u, key_mog = jax.random.split(key, 3)
     flat = jax.random.uniform(key_flat, (n,)) < q.prior_weight
     u = jax.random.uniform(key_u, (n, q.means.shape[-1]))
@@ -77,7 +75,7 @@ def sample(q: Distribution, key: Array, n: int) -> Array:
 
 
 @partial(jax.jit, static_argnames="points")
-def component_points(q: Distribution, points: int) -> tuple[Array, Array]:
+def component_points(q: Parts, points: int) -> tuple[Array, Array]:
     """Unit coordinates [K, n, d] of each component inside the cube and log weights [K, n]; mean weight = its mass."""
     w = jnp.asarray(box.lattice(points, q.means.shape[-1]))
     if q.chart == "plain":
@@ -87,7 +85,7 @@ def component_points(q: Distribution, points: int) -> tuple[Array, Array]:
 
 
 @partial(jax.jit, static_argnames="points")
-def quadrature(q: Distribution, points: int) -> tuple[Array, Array]:
+def quadrature(q: Parts, points: int) -> tuple[Array, Array]:
     u, log_weight = component_points(q, points)
     mass = jax.nn.softmax((jax.nn.log_softmax(q.logits)[:, None] + log_weight).reshape(-1))
     weights = jnp.concatenate([jnp.full((points,), 1 / points) * q.prior_weight, (1 - q.prior_weight) * mass])
@@ -96,20 +94,20 @@ def quadrature(q: Distribution, points: int) -> tuple[Array, Array]:
 
 
 @jax.jit
-def moments(q: Distribution) -> tuple[Array, Array]:
+def moments(q: Parts) -> tuple[Array, Array]:
     theta, weights = quadrature(q, POINTS)
     mean = weights @ theta
     deviation = theta - mean[None, :]
     return mean, (deviation * weights[:, None]).T @ deviation
 
 
-def centres_unit(q: Distribution) -> Array:
+def centres_unit(q: Parts) -> Array:
     """Centres of the Gaussians in unit coordinates, kept in the cube [K, d]."""
     return jnp.clip(charts.from_chart(q.means, q.chart), 0, 1)
 
 
 @jax.jit
-def mode(q: Distribution) -> Array:
+def mode(q: Parts) -> Array:
     theta, _ = quadrature(q, POINTS)
     centres = to_theta(q.space, centres_unit(q))
     candidates = jnp.concatenate([centres, moments(q)[0][None, :], theta])
@@ -117,7 +115,7 @@ def mode(q: Distribution) -> Array:
 
 
 @jax.jit
-def credible_level(q: Distribution, theta: Array) -> Array:
+def credible_level(q: Parts, theta: Array) -> Array:
     points, weights = quadrature(q, POINTS)
     here, there = log_gain(q, as_rows(theta)), log_gain(q, points)
     level = (there[None, :] > here[:, None]).astype(jnp.float32) @ weights
@@ -125,7 +123,7 @@ def credible_level(q: Distribution, theta: Array) -> Array:
 
 
 @partial(jax.jit, static_argnums=1)
-def marginal(q: Distribution, index: tuple[int, ...]) -> tuple[Array, Array, Array]:
+def marginal(q: Parts, index: tuple[int, ...]) -> tuple[Array, Array, Array]:
     """logits, means and scales of the coordinates `index`; each component keeps its mass inside the cube."""
     ids = np.asarray(index)
     rows = q.scales[:, ids, :]
@@ -137,9 +135,7 @@ def marginal(q: Distribution, index: tuple[int, ...]) -> tuple[Array, Array, Arr
 
 
 @partial(jax.jit, static_argnums=(1, 2))
-def conditional(
-    q: Distribution, given: tuple[int, ...], free: tuple[int, ...], u: Array
-) -> tuple[Array, Array, Array, Array]:
+def conditional(q: Parts, given: tuple[int, ...], free: tuple[int, ...], u: Array) -> tuple[Array, Array, Array, Array]:
     """logits, means, scales and prior weight of the coordinates `free` where those `given` are u [g]. Exact."""
     # the factor of the coordinates in this order: its blocks are those of the marginal and of the conditional
     ids, g = np.asarray(given + free), len(given)

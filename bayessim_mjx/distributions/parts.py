@@ -1,0 +1,26 @@
+"""The numbers that a Distribution is made of, as the functions on them read them."""
+
+from typing import Any, Protocol
+
+from jax import Array
+
+
+class Parts(Protocol):
+    """See `Distribution`."""
+
+    @property
+    def prior_weight(self) -> Array: ...
+    @property
+    def logits(self) -> Array: ...
+    @property
+    def means(self) -> Array: ...
+    @property
+    def scales(self) -> Array: ...
+    @property
+    def log_inside(self) -> Array: ...
+    @property
+    def space(self) -> Any: ...
+    @property
+    def chart(self) -> str: ...
+    @property
+    def components(self) -> int: ...
