@@ -12,13 +12,19 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 FILE, FUNCTION = 300, 60  # lines at most
-TREES = ("bayessim_mjx", "tasks", "examples", "benchmarks")
+TREES = ("bayessim_mjx", "tasks", "examples", "benchmarks", "docs", "tests")
 SETTINGS = "bayessim_mjx/config/settings.py"  # a list of settings, as long as there are settings
 
 LONG_FILES = (
     "bayessim_mjx/diagnosis/selection/race.py",
     "bayessim_mjx/report/sections.py",
     "bayessim_mjx/rl/ppo.py",
+    "tests/diagnosis/logcheck/test_gate.py",
+    "tests/effects/test_actuator_forces.py",
+    "tests/effects/test_friction_effects.py",
+    "tests/effects/test_sensor_effects.py",
+    "tests/report/fake.py",
+    "tests/rl/test_train.py",
 )
 LONG_FUNCTIONS = (
     "bayessim_mjx/diagnosis/fitting/quadratic.py:held_out",
@@ -27,6 +33,8 @@ LONG_FUNCTIONS = (
     "bayessim_mjx/report/motion_figures.py:overlay",
     "bayessim_mjx/report/place_figures.py:frequency",
     "bayessim_mjx/report/rival_figures.py:isolability",
+    "tests/report/fake.py:details",
+    "tests/report/fake.py:full",
 )
 CIRCLES = (
     {f"bayessim_mjx.distributions.{name}" for name in ("convert", "distribution", "evaluate")},
