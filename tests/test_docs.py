@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from bayessim_mjx import registry
 from bayessim_mjx.config import settings
 
 ROOT = Path(__file__).parents[1]
@@ -20,7 +21,9 @@ FOLDERS = ("docs", "benchmarks")
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(p for f in FOLDERS for p in sorted((ROOT / f).glob("*.md")))]
 PYTHON = {"env.reset", "env.step", "env.dt", "env.mj_model", "env.space", "ppo.train"}  # in Python, not settings
 COMMAND = re.compile(
-    r"(?:python -m bayessim_mjx\.(\w+)|(bayessim-mjx)|python ((?:benchmarks|examples|docs)/[\w/]+\.py))([^`\n#&]*)"
+    r"(?:python -m bayessim_mjx\.(\w+)"
+    r"|bayessim-mjx ((?:main|train|play|calibrate|diagnose|gap-loop)?)"
+    r"|python ((?:benchmarks|examples|docs)/[\w/]+\.py))([^`\n#&]*)"
 )
 PROSE = re.compile(r"`(main|train|play|calibrate|diagnose|gap_loop) (--[^`\n]*)`")
 
@@ -45,7 +48,10 @@ def flags_of(command: str) -> set[str]:
 
 def commands(text: str) -> list[tuple[str, str]]:
     """(command or script, its arguments) of all that a page tells to type."""
-    found = [(module or script or "main", words) for module, plain, script, words in COMMAND.findall(text)]
+    found = [
+        (module or script or named.replace("-", "_") or "main", words)
+        for module, named, script, words in COMMAND.findall(text)
+    ]
     return found + PROSE.findall(text)
 
 
@@ -129,6 +135,14 @@ def scripts_flags(page: Path) -> set[str]:
     return set().union(*(flags_of(str(path.relative_to(ROOT))) for path in scripts))
 
 
+def test_all_tasks_and_rooms_are_told_of():
+    tasks, rooms = (ROOT / "docs" / "commands.md").read_text(), (ROOT / "docs" / "architecture.md").read_text()
+    assert [name for name in registry.names() if f"| {name} |" not in tasks] == []
+    packages = [p.parent for p in (ROOT / "bayessim_mjx").rglob("__init__.py")]
+    own = {p.name for p in packages if p.parent in (ROOT / "bayessim_mjx", ROOT / "bayessim_mjx" / "diagnosis")}
+    assert {name for name in own - {"tasks"} if f"{name}/" not in rooms} == set()
+
+
 @pytest.mark.parametrize("page", PAGES, ids=by_name)
 def test_code_is_python(page):
     for block in code_of(page):
@@ -169,7 +183,12 @@ def test_a_missing_file_an_absent_anchor_and_an_unknown_flag_are_noticed(tmp_pat
     page = tmp_path / "page.md"
     page.write_text(
         "# A `b` c?\n[x](#a-b-c) [y](#not) [z](none.md) `train --tasks Ant`\npython -m bayessim_mjx.main --hidden 3\n"
+        "bayessim-mjx gap-loop --real logs\n"
     )
     assert broken(page) == ["#not", "none.md"]
-    assert commands(page.read_text()) == [("main", " --hidden 3"), ("train", "--tasks Ant")]
+    assert commands(page.read_text()) == [
+        ("main", " --hidden 3"),
+        ("gap_loop", " --real logs"),
+        ("train", "--tasks Ant"),
+    ]
     assert "--tasks" not in flags_of("train") and "--task" in flags_of("train")
