@@ -19,8 +19,9 @@ from bayessim_mjx import inference
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.inference import calibration, checks, misspecification, rounds
-from bayessim_mjx.inference.temperature import widened
-from bayessim_mjx.loop import refining
+from bayessim_mjx.inference.temperature import tempered
+from bayessim_mjx.loop import refining, set_checks
+from bayessim_mjx.loop.factors import conditioned, kept
 from bayessim_mjx.loop.inference_state import new_network
 from bayessim_mjx.loop.simulations import at, proposal_of, simulated
 from bayessim_mjx.loop.state import Loop, LoopState, RoundInfo
@@ -56,7 +57,7 @@ def infer(loop: Loop, state: LoopState, policy: Policy, info: RoundInfo) -> Loop
     widening = b.temperature or (verdict[0].temperature if verdict is not None else None) or 1.0
     state = dataclasses.replace(state, temperature=jnp.float32(widening))
     state = dataclasses.replace(state, real_posteriors=_factors(loop, state, info))
-    posterior = _posterior(loop, state, info)
+    posterior = _widened(loop, state, policy, _posterior(loop, state, info), info)
     if loop.refines:
         state, posterior = refining.refined(loop, state, real, posterior, info)
     info.warnings += _complaints(posterior.names, info.fit, known_before)
@@ -144,7 +145,7 @@ def _examine(
 def _factors(loop: Loop, state: LoopState, info: RoundInfo) -> Distribution:
     """q(theta | x) of every real trajectory, leaves [real trajectories, ...]."""
     b, seen = loop.settings, int(state.round) * loop.settings.realTrajs
-    factors = _conditioned(state.fit, state.real_features, state.temperature)
+    factors = conditioned(state.fit, state.real_features, state.temperature)
     if b.proposal == "division":
         assert state.proposals is not None
         rows = jax.tree.map(np.asarray, factors).split()
@@ -153,23 +154,11 @@ def _factors(loop: Loop, state: LoopState, info: RoundInfo) -> Distribution:
         factors = jax.tree.map(lambda *leaves: jnp.stack(leaves), *quotients, *rows[done:])
         if lost > LOST:
             info.warnings.append(f"{100 * lost:.0f} % of the posterior's weight cannot be divided by the proposal")
-    factors = _kept(factors, state.fit.identified, b.priorShare)
+    factors = kept(factors, state.fit.identified, b.priorShare)
     if not loop.source.policy_dependent:  # type: ignore[union-attr]
         return factors
     # an older trajectory was made by an older policy: its posterior stays that of the network of its time
     return select(jnp.arange(factors.logits.shape[0]) >= seen, factors, state.real_posteriors)
-
-
-@jax.jit
-def _conditioned(network: Any, features: Array, widening: Array) -> Distribution:
-    return widened(inference.condition(network, features), widening)
-
-
-@jax.jit
-def _kept(factors: Distribution, identified: Array, prior_share: float) -> Distribution:
-    """The prior where nothing is identified, and a share of it everywhere."""
-    factors = jax.vmap(inference.restore_prior, in_axes=(0, None))(factors, identified)
-    return dataclasses.replace(factors, prior_weight=jnp.full_like(factors.prior_weight, prior_share))
 
 
 def _posterior(loop: Loop, state: LoopState, info: RoundInfo) -> Distribution:
@@ -184,6 +173,18 @@ def _posterior(loop: Loop, state: LoopState, info: RoundInfo) -> Distribution:
     if not usable:
         return Distribution.prior(loop.env.space, b.components, loop.chart)
     return inference.combine(usable, b.components).rechart(loop.chart)
+
+
+def _widened(loop: Loop, state: LoopState, policy: Policy, posterior: Distribution, info: RoundInfo) -> Distribution:
+    """The product, wider by what simulated sets of as many trajectories ask for."""
+    clock, known = time.perf_counter(), (int(state.round) + 1) * loop.settings.realTrajs
+    found = None if loop.settings.temperature else set_checks.judge(loop, state, policy, known)
+    if found is None:
+        return posterior
+    info.sets = found
+    info.scores |= set_checks.scores(found, known)
+    info.seconds["check"] = info.seconds.get("check", 0.0) + time.perf_counter() - clock
+    return tempered(posterior, found.at(known).widening)
 
 
 def _complaints(names: tuple[str, ...], fit: dict[str, Any], known_before: np.ndarray) -> list[str]:

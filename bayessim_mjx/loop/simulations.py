@@ -23,12 +23,12 @@ def simulated(
     chunks = -(-count // CHUNK)
     k_theta, k_roll = jax.random.split(key)
     thetas = rounds.draw(k_theta, proposal, method, -(-count // chunks) * chunks)
-    features = _features(source, k_roll, thetas.reshape(chunks, -1, thetas.shape[-1]), policy)
-    return thetas[:count], features[:count]
+    x = features(source, k_roll, thetas.reshape(chunks, -1, thetas.shape[-1]), policy)
+    return thetas[:count], x[:count]
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _features(source: Source, key: Array, thetas: Array, policy: Policy) -> Array:
+def features(source: Source, key: Array, thetas: Array, policy: Policy) -> Array:
     """Features [chunks * n, D] of trajectories at thetas [chunks, n, d]."""
     keys = jax.random.split(key, thetas.shape[0])
     features = jax.lax.map(lambda at: source.simulate(at[0], at[1], policy), (keys, thetas))

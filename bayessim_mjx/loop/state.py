@@ -58,6 +58,7 @@ class RoundInfo:
     seconds: dict[str, float]
     warnings: list[str]
     checks: checks.Checks | None = None  # calibration, misfit, walls; None: none asked for
+    sets: Any = None  # how products of several posteriors did on simulated sets, see inference/sets.py
     refinement: Any = None  # what bayessim.refine made of the posterior, see loop/refinement.py
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from bayessim_mjx import config, loop
-from bayessim_mjx.loop import inference_state, round_inference, sources
+from bayessim_mjx.loop import inference_state, round_inference, set_checks, sources
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 
 SPACE = ParameterSpace([Parameter("mass", 0.0, -1.0, 1.0), Parameter("unseen", 0.0, -1.0, 1.0)])
@@ -163,3 +163,23 @@ def test_an_over_confident_network_gets_a_temperature_which_is_told_kept_and_use
     network = float(given.posterior.sd()[0]) * np.sqrt(2)
     assert network == pytest.approx(0.5 * NOISE, rel=0.25) and factor == pytest.approx(NOISE / network, rel=0.2)
     assert float(info.posterior.sd()[0] / given.posterior.sd()[0]) == pytest.approx(factor, rel=0.1)
+
+
+@pytest.mark.slow
+@pytest.mark.ci
+def test_products_of_several_trajectories_are_judged_and_widened():
+    """A network's errors are the same for all trajectories at one theta; sets of them show it."""
+    parts, state = made("bayessim.checkTrajs=40", "bayessim.realTrajs=8", "bayessim.ensemble=1")
+    state, info = infer(parts, state)
+    assert [c.trajectories for c in info.sets.counts] == [1, 2, 4, 8]
+    last = info.sets.at(8)
+    assert info.scores["sets/widening"] == last.widening >= 1
+    for level in (0.5, 0.8, 0.95):
+        assert info.scores[f"sets/coverage_{100 * level:.0f}"] == pytest.approx(level, abs=0.2)
+    assert last.gain >= last.plain - 0.1
+    assert float(state.domain.sd()[0]) > 0.9 * NOISE / 8**0.5  # never surer than the exact posterior
+
+
+def test_a_single_trajectory_needs_no_set():
+    parts, state = made("bayessim.checkTrajs=40", "bayessim.realTrajs=1")
+    assert set_checks.judge(parts, state, None, 1) is None

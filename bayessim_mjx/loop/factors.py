@@ -1,0 +1,27 @@
+"""q(theta | x) of single trajectories as they are multiplied."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from bayessim_mjx import inference
+from bayessim_mjx.distributions import Distribution
+from bayessim_mjx.inference.temperature import widened
+
+
+@jax.jit
+def conditioned(network: Any, features: Array, widening: Array) -> Distribution:
+    """Batched posteriors of summaries [n, D], widened."""
+    return widened(inference.condition(network, features), widening)
+
+
+@jax.jit
+def kept(factors: Distribution, identified: Array, prior_share: float) -> Distribution:
+    """The prior where nothing is identified, and a share of it everywhere."""
+    factors = jax.vmap(inference.restore_prior, in_axes=(0, None))(factors, identified)
+    return dataclasses.replace(factors, prior_weight=jnp.full_like(factors.prior_weight, prior_share))

@@ -1,0 +1,51 @@
+"""Is the product of several trajectories' posteriors as sure as it may be? Judged on simulated sets of as many."""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+
+from bayessim_mjx.inference import rounds, sets
+from bayessim_mjx.inference.sets import Sets
+from bayessim_mjx.loop.factors import conditioned, kept
+from bayessim_mjx.loop.simulations import features, proposal_of
+from bayessim_mjx.loop.state import Loop, LoopState
+from bayessim_mjx.rl import Policy
+
+SETS = 64  # thetas at which sets are simulated
+MOST = 32  # trajectories in one, at most: beyond that the widening of the last is taken
+
+
+def judge(loop: Loop, state: LoopState, policy: Policy, known: int) -> Sets | None:
+    """Products of 1, 2, 4 ... `known` posteriors on fresh sets, as the round multiplies them.
+
+    None where there is nothing to judge: a single trajectory, tests switched off, or a division by the proposal, which
+    takes the real posteriors alone.
+    """
+    b, source = loop.settings, loop.source
+    if known < 2 or not b.checkTrajs or b.proposal == "division" or source is None:
+        return None
+    key = jax.random.fold_in(loop.key(int(state.round), "fit"), 4)
+    k_theta, *keys = jax.random.split(key, 1 + min(known, MOST))
+    thetas = rounds.draw(k_theta, proposal_of(loop, state), b.proposal, SETS)
+    columns = []
+    for k in keys:  # the same program for any number of trajectories
+        x = features(source, k, thetas[None], policy)
+        factors = kept(conditioned(state.fit, x, state.temperature), state.fit.identified, b.priorShare)
+        columns.append(jax.tree.map(np.asarray, factors).split())
+    rows = [[column[i] for column in columns] for i in range(SETS)]
+    good = [i for i, row in enumerate(rows) if all(q.sound for q in row)]
+    if len(good) < SETS // 2:
+        return None
+    return sets.judge([rows[i] for i in good], np.asarray(thetas)[good], b.components)
+
+
+def scores(found: Sets, known: int) -> dict[str, float]:
+    """Numbers for curves, of the posterior of `known` trajectories."""
+    one = found.at(known)
+    told = {"widening": one.widening, "gain": one.gain, "carried": float(found.carried)}
+    told |= {f"coverage_{100 * level:.0f}": one.coverage(level) for level in (0.5, 0.8, 0.95)}
+    return {f"sets/{name}": float(value) for name, value in told.items()}
+
+
+__all__ = ["judge", "scores"]
