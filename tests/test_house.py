@@ -36,10 +36,7 @@ LONG_FUNCTIONS = (
     "tests/report/fake.py:details",
     "tests/report/fake.py:full",
 )
-CIRCLES = (
-    {f"bayessim_mjx.distributions.{name}" for name in ("convert", "distribution", "evaluate")},
-    {f"bayessim_mjx.diagnosis.{name}" for name in ("correction", "result")},
-)
+CIRCLES: tuple[set[str], ...] = ()
 
 
 @functools.cache
