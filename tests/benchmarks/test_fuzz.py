@@ -47,8 +47,7 @@ def test_what_the_inputs_are_made_from_is_sound(tmp_path: Path) -> None:
     assert len(body.space) == 3
 
 
-@pytest.mark.slow
-@pytest.mark.ci
+@pytest.mark.slow  # CI kills whole runs in tests/commands
 def test_a_run_that_is_killed_goes_on_bit_for_bit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "argv", ["kills.py", "--kills", "2", "--commands", "train", "--out", str(tmp_path)])
     assert kills.main() == 0

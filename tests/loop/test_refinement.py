@@ -51,7 +51,7 @@ def refined(seed, theta, gust=0.0):
 @pytest.fixture(scope="module")
 def found():
     rng = np.random.default_rng(5)
-    thetas = np.asarray([[rng.uniform(0.7, 1.7), rng.uniform(0.5, 2.5)] for _ in range(12)])
+    thetas = np.asarray([[rng.uniform(0.7, 1.7), rng.uniform(0.5, 2.5)] for _ in range(8)])
     return thetas, [refined(i, t) for i, t in enumerate(thetas)]
 
 
@@ -64,7 +64,7 @@ def test_truths_lie_where_the_posteriors_say(found):
             for t, r in zip(thetas, results, strict=True)
         ]
     )
-    assert 0.55 < np.sqrt(np.mean(z**2)) < 1.5  # of 24 numbers the rms is 1 +- .15
+    assert 0.5 < np.sqrt(np.mean(z**2)) < 1.6  # of 16 numbers the rms is 1 +- .18
     gains = [float(r.posterior.log_gain(jnp.asarray(t))) for t, r in zip(thetas, results, strict=True)]
     assert np.mean(gains) > 5.5
 
