@@ -33,7 +33,8 @@ class Effect(abc.ABC):
     Subclasses are frozen dataclasses, state `name`, `kind` and `quantities`, and override the hooks they need; the
     others are the identity and cost nothing. Rules: hooks are pure and traceable; every number that may be inferred is
     an entry of `theta` (this effect's own slice, in the order of `space()`); at the neutral theta each hook returns its
-    input bit for bit. Hooks work on all places at once: `at.values(theta)` is `[places, quantities]`.
+    input bit for bit. Hooks work on all places at once: `at.values(theta)` is `[places, quantities]`. Each takes `at`,
+    where the effect sits; most take `memory`, as `init` or the last call left it, and return it first.
 
     Attributes:
         where: MuJoCo name of the actuator, joint, body ... concerned; a tuple of names: each with values of its own;

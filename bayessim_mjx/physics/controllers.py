@@ -70,6 +70,12 @@ def declared(metadata: Mapping[str, Any]) -> bool:
 def read(metadata: Mapping[str, Any], model: mujoco.MjModel, actuators: Sequence[str], source: str) -> Law:
     """The law of one log: `controller: {law, kp, kd, limit, scale}`, numbers or one per actuator by name.
 
+    Args:
+        metadata: of the log.
+        model: its actuators drive the joints whose angles the loops close on.
+        actuators: the model's, by name.
+        source: the log's file, for errors.
+
     Raises:
         UserError: unknown key, law or actuator; a position law without kp; an actuator that drives no joint.
     """

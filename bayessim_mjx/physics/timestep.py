@@ -94,6 +94,15 @@ def substep(
     """One timestep from the state and ctrl in `data`. Returns (data, (memory, forces)).
 
     The state in data is the new one; its poses, contacts, forces and sensors are those of the timestep's beginning.
+
+    Args:
+        physics: static.
+        model: with the world's parameters.
+        data: the state, and ctrl `[nu]`.
+        carry: the effects' memories, and their forces of the last timestep `[effects, nv]`.
+        thetas: one slice per effect.
+        seen: what the sensors showed after the last control step, {"qpos", "qvel"}.
+        drive: what else acts.
     """
     if physics.warp is not None:
         data = physics.warp.step(model, data)

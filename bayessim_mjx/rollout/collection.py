@@ -27,13 +27,20 @@ def collect(
 ) -> tuple[State, dict[str, Any]]:
     """T steps in N worlds, each starting a new episode wherever one ends; to be called inside a jitted function.
 
-    policy_fn(draw, obs: {group: [N, S]}) -> (action [N, A], extras) acts in all worlds at once; extras is kept.
-    draws: keys or noise, leaves [T, ...], one for each step. pool: N freshly reset states, shared in rings of R =
-    `ring(N)` worlds: for its k-th new episode in this call a world takes the entry k `_stride(R)` further in its ring,
-    so that all draw different ones, and theta is drawn anew with each episode. Whole rings can be run apart.
-    Returns the last states and time-major arrays [T, N, ...]: observation and final_observation (the next one,
-    before any reset) by group, reward, terminated, truncated, extras. What later steps do not depend on is not carried
-    on: it stays in the states as it was.
+    Args:
+        env: any environment.
+        policy_fn: (draw, obs {group: [N, S]}) -> (action [N, A], extras), in all worlds at once; extras is kept.
+        draws: keys or noise, leaves [T, ...], one for each step.
+        env_states: of the N worlds.
+        pool: N freshly reset states, shared in rings of R = `ring(N)` worlds: for its k-th new episode in this call a
+            world takes the entry k `_stride(R)` further in its ring, so that all draw different ones, and theta is
+            drawn anew with each episode. Whole rings can be run apart.
+        groups: of observations to be kept.
+
+    Returns:
+        (the last states, time-major arrays [T, N, ...]): observation and final_observation (the next one, before any
+        reset) by group, reward, terminated, truncated, extras. What later steps do not depend on is not carried on: it
+        stays in the states as it was.
     """
     worlds = env_states.reward.shape[0]
     size, lasting = ring(worlds), _lasting(env, env_states, tuple(groups))
@@ -77,6 +84,12 @@ def next_episodes(env: Env, ended: jax.Array, after: State, fresh: State) -> Sta
 
     Training's clock goes on; where `frequency` asks for it, an ended world keeps its parameters, gravity and lasting
     noise, and is reset anew with them.
+
+    Args:
+        env: any environment.
+        ended: [N] bool, whose episode ended.
+        after: [N] states at that end.
+        fresh: [N] states after a reset.
     """
     random = getattr(env, "nuisance", None)
     if random is None:

@@ -58,8 +58,17 @@ def traced(function: Callable[..., Any]) -> Callable[..., Any]:
 def rollout(env: Env, policy_fn: PolicyFn, key: jax.Array, thetas: jax.Array, length: int) -> Trajectory:
     """One episode of at most `length` steps in each of N worlds; all fields with a leading N.
 
-    policy_fn(key, obs: {group: [S]}) -> action [A] acts in one world; a `Policy`, its method `act`, or any function.
-    thetas [N, d]. Compiled once per (env, function, length, N): another key, theta or policy of its kind reuses it.
+    Compiled once per (env, function, length, N): another key, theta or policy of its kind reuses it.
+
+    Args:
+        env: any environment.
+        policy_fn: (key, obs {group: [S]}) -> action [A] of one world; a `Policy`, its method `act`, or any function.
+        key: of resets and actions.
+        thetas: [N, d], one row per world.
+        length: control steps.
+
+    Raises:
+        ValueError: length below 1; thetas of another shape.
     """
     if length < 1:
         raise ValueError(f"length = {length}: a rollout has at least 1 step")

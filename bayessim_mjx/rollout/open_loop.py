@@ -74,7 +74,13 @@ def _throughout(physics: Physics, command: jax.Array) -> jax.Array:
 
 
 def recording(physics: Physics, qpos: jax.Array, qvel: jax.Array, command: jax.Array) -> Motion:
-    """The recording around starts, `around_*` of `logs.segments` [N, 2 L + 1, ...], as `replay` takes it."""
+    """The recording around starts, as `replay` takes it.
+
+    Args:
+        physics: its sub-steps are what a command is held over.
+        qpos, qvel: [N, 2 L + 1, nq] and [N, 2 L + 1, nv], `around_*` of `logs.segments`; the start is row L.
+        command: [N, 2 L + 1, nu].
+    """
     qpos, qvel, command = (jnp.asarray(x, jnp.float32) for x in (qpos, qvel, command))
     return Motion(qpos, qvel, _throughout(physics, command), start=(qpos.shape[-2] - 1) // 2)
 

@@ -45,9 +45,14 @@ class Motion(struct.PyTreeNode):
 
 
 def between(one: jax.Array, two: jax.Array, gained: jax.Array, part: jax.Array, dt: float) -> jax.Array:
-    """Position a `part` of the way from `one` to `two`, dt apart, at constant acceleration gained / dt.
+    """Position at constant acceleration gained / dt between two that are dt apart.
 
     Only the *difference* of the velocities bends the path: where an end is held it is a line, and the half sub-step by
     which semi-implicit Euler's velocities lag, the same at both ends, cancels (not so in a Hermite spline).
+
+    Args:
+        one, two: positions; gained: by how much the velocity grows from one to the other.
+        part: of the way, from 0 to 1.
+        dt: s.
     """
     return (1 - part) * one + part * two - 0.5 * jnp.float32(dt) * part * (1 - part) * gained
