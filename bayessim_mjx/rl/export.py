@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from bayessim_mjx.env import Env
+from bayessim_mjx.env import Env, Task
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.rl import recurrent
 from bayessim_mjx.rl.networks import Policy
@@ -31,8 +31,8 @@ PACKAGES = ("bayessim-mjx", "jax", "mujoco", "onnx")
 
 def command_scale(env: Env, actions: int) -> tuple[np.ndarray, np.ndarray] | None:
     """(scale [A], offset [A]) of the commands offset + scale action; None where they are not of that form."""
-    command = getattr(env, "command", None)
-    if command is None:
+    command, actuate = getattr(env, "command", None), getattr(env, "actuate", None)
+    if command is None or getattr(actuate, "__func__", None) is not Task.actuate:  # else commands have a memory
         return None
     probes = np.random.default_rng(0).uniform(-1, 1, (16, actions)).astype(np.float32)
     offset = np.asarray(command(jnp.zeros(actions)))

@@ -97,7 +97,7 @@ def _rollout(env: Env, length: int) -> Callable[..., Trajectory]:
                 terminated,
                 truncated,
                 alive.astype(jnp.float32),
-                _command(env, action),
+                _command(env, state, action),
             )
             return (after, alive & (terminated + truncated == 0), action), (row, _seen(after))
 
@@ -123,7 +123,9 @@ def _seen(state: State) -> tuple[jax.Array, jax.Array, jax.Array]:
     return observation, measurement["qpos"], measurement["qvel"]
 
 
-def _command(env: Env, action: jax.Array) -> jax.Array:
+def _command(env: Env, state: State, action: jax.Array) -> jax.Array:
     """Actuator commands [N, nu] of the actions [N, A], clipped as by the task (empty without physics of ours)."""
-    command = getattr(env, "command", None)
-    return jnp.zeros((action.shape[0], 0)) if command is None else jax.vmap(command)(jnp.clip(action, -1.0, 1.0))
+    actuate = getattr(env, "actuate", None)
+    if actuate is None:
+        return jnp.zeros((action.shape[0], 0))
+    return jax.vmap(actuate)(state.pipeline_state, jnp.clip(action, -1.0, 1.0))[1]
