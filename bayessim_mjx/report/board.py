@@ -11,7 +11,6 @@ from bayessim_mjx.monitor.style import new_figure
 from bayessim_mjx.monitor.writer import Writer
 from bayessim_mjx.report.gap_figures import PARTS, part_words, squares
 from bayessim_mjx.report.look import DASH, FAINT, STAGE
-from bayessim_mjx.report.sections import stages_of
 from bayessim_mjx.report.words import (
     STAGES,
     candidate_title,
@@ -22,6 +21,7 @@ from bayessim_mjx.report.words import (
     number,
     percent,
     repeated,
+    stages_of,
     unit,
     verdict_of,
 )

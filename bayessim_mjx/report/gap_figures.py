@@ -71,8 +71,37 @@ def waterfall(
     columns += [_drop(s, level, stages.get("floor", "")) for s in ("reducible_floor", "noise_floor") if s in level]
     columns += [_total("measurement noise", "noise_floor", stages, level, ci)] if "noise_floor" in level else []
     xs = list(range(len(columns)))
+    tops = [c["base"] + c["height"] + c["error"][1] for c in columns]
+    marks = [
+        note(c["label"], k, t, xref="x", yref="y", yanchor="bottom", yshift=3, font={"size": 13 if c["total"] else 12})
+        for k, (c, t) in enumerate(zip(columns, tops, strict=True))
+    ]
+    return figure(
+        [_bars(columns), _spans(columns)],
+        WIDTH,
+        350,
+        least=100 * len(columns) + 80,
+        shapes=_links(columns),
+        annotations=marks,
+        xaxis=axis(
+            tickvals=xs,
+            ticktext=[c["x"] for c in columns],
+            showgrid=False,
+            ticks="",
+            tickangle=0,
+            range=[-0.5, len(xs) - 0.5],
+        ),
+        yaxis=axis(
+            "squared gap, share of the largest", tickvals=TICKS, tickformat=".0%", range=[0, max(1.12, 1.1 * max(tops))]
+        ),
+        margin={"l": 70, "r": 10, "t": 12, "b": 64},
+    )
+
+
+def _spans(columns: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Intervals of the bars that have one."""
     sure = [k for k, c in enumerate(columns) if any(c["error"])]
-    spans = {
+    return {
         "type": "scatter",
         "mode": "markers",
         "x": sure,
@@ -89,9 +118,12 @@ def waterfall(
             "width": 4,
         },
     }
-    bars = {
+
+
+def _bars(columns: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    return {
         "type": "bar",
-        "x": xs,
+        "x": list(range(len(columns))),
         "y": [c["height"] for c in columns],
         "base": [c["base"] for c in columns],
         "width": 0.62,
@@ -103,8 +135,12 @@ def waterfall(
         "hovertext": [c["hover"] for c in columns],
         "hoverinfo": "text",
     }
+
+
+def _links(columns: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Dotted lines from the end of each bar to the next."""
     ends = [c["end"] for c in columns]
-    links = [
+    return [
         {
             "type": "line",
             "x0": k + 0.31,
@@ -115,31 +151,6 @@ def waterfall(
         }
         for k, e in enumerate(ends[:-1])
     ]
-    tops = [c["base"] + c["height"] + c["error"][1] for c in columns]
-    marks = [
-        note(c["label"], k, t, xref="x", yref="y", yanchor="bottom", yshift=3, font={"size": 13 if c["total"] else 12})
-        for k, (c, t) in enumerate(zip(columns, tops, strict=True))
-    ]
-    return figure(
-        [bars, spans],
-        WIDTH,
-        350,
-        least=100 * len(columns) + 80,
-        shapes=links,
-        annotations=marks,
-        xaxis=axis(
-            tickvals=xs,
-            ticktext=[c["x"] for c in columns],
-            showgrid=False,
-            ticks="",
-            tickangle=0,
-            range=[-0.5, len(xs) - 0.5],
-        ),
-        yaxis=axis(
-            "squared gap, share of the largest", tickvals=TICKS, tickformat=".0%", range=[0, max(1.12, 1.1 * max(tops))]
-        ),
-        margin={"l": 70, "r": 10, "t": 12, "b": 64},
-    )
 
 
 def _total(words: str, stage: str, stages: Mapping[str, Any], level: Mapping[str, float], ci: Any) -> dict[str, Any]:

@@ -85,45 +85,15 @@ def overlay(row: Mapping[str, Any], points: int = 2000) -> dict[str, Any]:
         "t": numbers(broken(time[keep].tolist(), breaks), 6),
         "m": numbers(broken(measured, breaks)),
     }
-    style = {"type": "scatter", "mode": "lines", "x": "t"}
-    data = [style | {"y": "m", "name": "measured", "opacity": 0.3, "line": {"color": STAGE["measured"], "width": 5}}]
     for stage in stages:
         simulated = _series(row[stage])[keep]
         columns[stage] = numbers(broken(simulated, breaks))
         columns[f"{stage}-"] = numbers(broken(measured - simulated, breaks), 4)
-        line = {"color": STAGE[stage], "width": 1.8 if stage == "with_effects" else 1.5, "dash": DASH[stage]}
-        data.append(style | {"y": stage, "name": STAGES[stage], "line": line})
-        lower = {
-            "y": f"{stage}-",
-            "name": STAGES[stage],
-            "line": line,
-            "yaxis": "y2",
-            "xaxis": "x2",
-            "showlegend": False,
-        }
-        data.append(style | lower)
-    for trace in data:
-        trace["hovertemplate"] = "%{y:.4g}"
     tail = f" ({unit(str(row['unit']))})" if row.get("unit") else ""
     name = text(row.get("joint", "motion"), 30)
-    shape = {"color": "#d5dade", "width": 1}
-    ticks = [
-        {
-            "type": "line",
-            "x0": s,
-            "x1": s,
-            "y0": 0,
-            "y1": 1,
-            "xref": "x",
-            "yref": "paper",
-            "layer": "below",
-            "line": shape,
-        }
-        for s in (row.get("starts") or [])
-        if finite(s)
-    ]
+    ticks = _starts(row)
     return figure(
-        data,
+        _lines(stages),
         WIDTH,
         430,
         least=640,
@@ -138,6 +108,25 @@ def overlay(row: Mapping[str, Any], points: int = 2000) -> dict[str, Any]:
         legend={"orientation": "h", "x": 1, "xanchor": "right", "y": 1.01, "yanchor": "bottom", "font": {"size": 12}},
         margin={"l": 56, "r": 12, "t": 30, "b": 46},
     ) | {"columns": columns}
+
+
+def _lines(stages: Sequence[str]) -> list[dict[str, Any]]:
+    """Traces of measured and simulated motion above, and of their difference below."""
+    style = {"type": "scatter", "mode": "lines", "x": "t", "hovertemplate": "%{y:.4g}"}
+    data = [style | {"y": "m", "name": "measured", "opacity": 0.3, "line": {"color": STAGE["measured"], "width": 5}}]
+    for stage in stages:
+        line = {"color": STAGE[stage], "width": 1.8 if stage == "with_effects" else 1.5, "dash": DASH[stage]}
+        data.append(style | {"y": stage, "name": STAGES[stage], "line": line})
+        lower = {"xaxis": "x2", "yaxis": "y2", "showlegend": False}
+        data.append(style | {"y": f"{stage}-", "name": STAGES[stage], "line": line} | lower)
+    return data
+
+
+def _starts(row: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """A thin line at the start of each window."""
+    line = {"color": "#d5dade", "width": 1}
+    style = {"type": "line", "y0": 0, "y1": 1, "xref": "x", "yref": "paper", "layer": "below", "line": line}
+    return [style | {"x0": s, "x1": s} for s in (row.get("starts") or []) if finite(s)]
 
 
 def _series(values: Sequence[Any]) -> np.ndarray:

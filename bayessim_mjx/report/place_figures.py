@@ -112,57 +112,33 @@ def _reach(upper: float | None, lower: float | None) -> float:
     return max(upper - lower, 0.0) if upper is not None and lower is not None else 0.0
 
 
+PANELS: tuple[tuple[str, str, str, dict[str, Any]], ...] = (  # (quantity, words, ending of its key, its axis)
+    ("gain", "gain", "", {}),
+    ("phase", "phase (deg)", "_deg", {}),
+    ("coherence", "coherence", "", {"range": [0, 1.04]}),
+)
+
+
 def frequency(row: Mapping[str, Any]) -> dict[str, Any]:
     """Gain, phase and coherence from command to motion, measured and simulated; amplitudes by order, if any."""
-    wanted = [
-        ("gain", "gain", "", {}),
-        ("phase", "phase (deg)", "_deg", {}),
-        ("coherence", "coherence", "", {"range": [0, 1.04]}),
-    ]
-    panels = [w for w in wanted if row.get(f"{w[0]}_real{w[2]}") is not None]
+    panels = [p for p in PANELS if row.get(f"{p[0]}_real{p[2]}") is not None]
     orders = row.get("orders") or []
     count = len(panels) + bool(orders)
-    data, layout, titles = [], {}, []
+    data: list[dict[str, Any]] = []
+    layout: dict[str, Any] = {}
+    titles = []
     for k, (across, _) in enumerate(cells(count, count, 0.075, 0)):
         x, y = panel(k)
         if k < len(panels):
             key, words, tail, more = panels[k]
-            for who, style in (("real", "measured"), ("sim", "calibrated")):
-                if row.get(f"{key}_{who}{tail}") is None:
-                    continue
-                line = {"color": STAGE[style], "width": 1.8, "dash": DASH[style]}
-                data.append(
-                    {
-                        "type": "scatter",
-                        "mode": "lines",
-                        "x": numbers(row["hz"]),
-                        "y": numbers(row[f"{key}_{who}{tail}"]),
-                        "xaxis": x,
-                        "yaxis": y,
-                        "line": line,
-                        "showlegend": k == 0,
-                        "name": "measured" if who == "real" else "recalibrated simulation",
-                        "hovertemplate": "%{x:.3g} Hz: %{y:.3g}<extra></extra>",
-                    }
-                )
+            data += _responses(row, key, tail, (x, y), k == 0)
             layout[layout_key(x)] = log_axis("frequency (Hz)", row["hz"], domain=across, anchor=y)
             both = [v for who in ("real", "sim") for v in row.get(f"{key}_{who}{tail}") or []]
             logs = key == "gain" and any(finite(v) and v > 0 for v in both)
             layout[layout_key(y)] = (log_axis("", both, anchor=x) if logs else axis(anchor=x, nticks=6)) | more
         else:
             words = "residual by order"
-            data.append(
-                {
-                    "type": "bar",
-                    "x": [o.get("order") for o in orders],
-                    "y": numbers([o.get("amplitude") for o in orders]),
-                    "xaxis": x,
-                    "yaxis": y,
-                    "marker": {"color": BLUE},
-                    "showlegend": False,
-                    "hovertemplate": "order %{x}: %{y:.3g}<extra></extra>",
-                }
-            )
+            data.append(_by_order(orders, x, y))
             layout[layout_key(x)] = axis("cycles per revolution", domain=across, anchor=y, showgrid=False)
             layout[layout_key(y)] = axis(anchor=x, nticks=6)
         titles.append(heading(words, x, y))
@@ -178,3 +154,39 @@ def frequency(row: Mapping[str, Any]) -> dict[str, Any]:
         margin={"l": 50, "r": 12, "t": 62, "b": 48},
         **layout,
     )
+
+
+def _responses(row: Mapping[str, Any], key: str, tail: str, at: tuple[str, str], legend: bool) -> list[dict[str, Any]]:
+    """Measured and simulated curves of one quantity in the panel with axes `at`."""
+    out = []
+    for who, style in (("real", "measured"), ("sim", "calibrated")):
+        if row.get(f"{key}_{who}{tail}") is None:
+            continue
+        out.append(
+            {
+                "type": "scatter",
+                "mode": "lines",
+                "x": numbers(row["hz"]),
+                "y": numbers(row[f"{key}_{who}{tail}"]),
+                "xaxis": at[0],
+                "yaxis": at[1],
+                "line": {"color": STAGE[style], "width": 1.8, "dash": DASH[style]},
+                "showlegend": legend,
+                "name": "measured" if who == "real" else "recalibrated simulation",
+                "hovertemplate": "%{x:.3g} Hz: %{y:.3g}<extra></extra>",
+            }
+        )
+    return out
+
+
+def _by_order(orders: Sequence[Mapping[str, Any]], x: str, y: str) -> dict[str, Any]:
+    return {
+        "type": "bar",
+        "x": [o.get("order") for o in orders],
+        "y": numbers([o.get("amplitude") for o in orders]),
+        "xaxis": x,
+        "yaxis": y,
+        "marker": {"color": BLUE},
+        "showlegend": False,
+        "hovertemplate": "order %{x}: %{y:.3g}<extra></extra>",
+    }

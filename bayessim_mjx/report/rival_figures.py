@@ -94,21 +94,6 @@ def isolability(labels: Sequence[str], cosine: Sequence[Sequence[float]], absorb
     hide = [absorbed[i] if i < len(absorbed) and finite(absorbed[i]) else None for i in range(n)]
     cell = 30 if n <= 18 else 20
     at = list(range(n))
-    heat = {
-        "type": "heatmap",
-        "z": table,
-        "x": at,
-        "y": at,
-        "zmin": 0,
-        "zmax": 1,
-        "xgap": 1,
-        "ygap": 1,
-        "hoverongaps": False,
-        "colorscale": [[0, "#f7fafc"], [0.5, SKY], [1, "#00507d"]],
-        "showscale": False,
-        "customdata": [[f"{names[i]}<br>and {names[j]}" for j in range(n)] for i in range(n)],
-        "hovertemplate": "%{customdata}<br>|cos| = %{z:.2f}<extra></extra>",
-    }
     values = [
         note(
             f"{v:.2f}".replace("0.", ".") if v < 0.995 else "1",
@@ -122,21 +107,6 @@ def isolability(labels: Sequence[str], cosine: Sequence[Sequence[float]], absorb
         for j, v in enumerate(row)
         if v is not None and j < i and v >= (0.3 if cell == 30 else 0.8)
     ]
-    bars = {
-        "type": "bar",
-        "orientation": "h",
-        "x": hide,
-        "y": at,
-        "xaxis": "x2",
-        "yaxis": "y",
-        "width": 0.62,
-        "marker": {"color": "#E69F00", "line": {"color": INK, "width": 0.5}},
-        "text": [percent(h) for h in hide],
-        "textposition": "outside",
-        "cliponaxis": False,
-        "hoverinfo": "skip",
-        "textfont": {"size": 11},
-    }
     left = 8 + 6.6 * max(map(len, names), default=10)
     rows = names if cell == 30 else [f"{name}  <b>{k + 1}</b>" for k, name in enumerate(names)]
     below = names if cell == 30 else [str(k + 1) for k in at]  # long names would overlap there
@@ -147,7 +117,7 @@ def isolability(labels: Sequence[str], cosine: Sequence[Sequence[float]], absorb
     split = split if split[1] < 0.85 else (0.78, 0.82)
     over = [heading("similarity |cos|", "x", "y"), heading("hidden share", "x2", "y")]
     return figure(
-        [heat, bars],
+        [_similar(table, names), _hidden(hide)],
         width,
         round(side + 34 + foot),
         least=width,
@@ -166,6 +136,44 @@ def isolability(labels: Sequence[str], cosine: Sequence[Sequence[float]], absorb
         yaxis=axis(tickvals=at, ticktext=rows, range=[n - 0.5, -0.5], showgrid=False, ticks="", showline=False),
         margin={"l": round(left), "r": 60, "t": 34, "b": round(foot)},
     )
+
+
+def _similar(table: Sequence[Sequence[float | None]], names: Sequence[str]) -> dict[str, Any]:
+    n, at = len(names), list(range(len(names)))
+    return {
+        "type": "heatmap",
+        "z": table,
+        "x": at,
+        "y": at,
+        "zmin": 0,
+        "zmax": 1,
+        "xgap": 1,
+        "ygap": 1,
+        "hoverongaps": False,
+        "colorscale": [[0, "#f7fafc"], [0.5, SKY], [1, "#00507d"]],
+        "showscale": False,
+        "customdata": [[f"{names[i]}<br>and {names[j]}" for j in range(n)] for i in range(n)],
+        "hovertemplate": "%{customdata}<br>|cos| = %{z:.2f}<extra></extra>",
+    }
+
+
+def _hidden(hide: Sequence[float | None]) -> dict[str, Any]:
+    at = list(range(len(hide)))
+    return {
+        "type": "bar",
+        "orientation": "h",
+        "x": hide,
+        "y": at,
+        "xaxis": "x2",
+        "yaxis": "y",
+        "width": 0.62,
+        "marker": {"color": "#E69F00", "line": {"color": INK, "width": 0.5}},
+        "text": [percent(h) for h in hide],
+        "textposition": "outside",
+        "cliponaxis": False,
+        "hoverinfo": "skip",
+        "textfont": {"size": 11},
+    }
 
 
 def importance(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

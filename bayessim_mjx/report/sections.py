@@ -26,6 +26,7 @@ from bayessim_mjx.report.words import (
     percent,
     quantity,
     repeated,
+    stages_of,
     stages_told,
     verdict_of,
 )
@@ -87,10 +88,6 @@ def about(d: Diagnosis) -> list[str]:
     return [
         text for text in (a.get("robot"), f"{logs}{where_}" if data else "", ", ".join(size), a.get("date")) if text
     ]
-
-
-def stages_of(d: Diagnosis) -> dict[str, float]:
-    return {s: getattr(d.gap, s) for s in STAGES}
 
 
 def shares_of(d: Diagnosis) -> list[dict[str, Any]]:

@@ -6,7 +6,7 @@ from typing import TextIO
 from bayessim_mjx.diagnosis.result import Diagnosis, FoundEffect
 from bayessim_mjx.monitor.console import Console
 from bayessim_mjx.monitor.tables import TIE
-from bayessim_mjx.report.sections import between, stages_of
+from bayessim_mjx.report.sections import between
 from bayessim_mjx.report.words import (
     MISSING,
     candidate_title,
@@ -18,6 +18,7 @@ from bayessim_mjx.report.words import (
     number,
     percent,
     quantity,
+    stages_of,
     stages_told,
     verdict_of,
 )

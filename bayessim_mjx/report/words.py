@@ -7,6 +7,7 @@ from typing import Any
 
 from bayessim_mjx import quantities
 from bayessim_mjx.diagnosis.result import Diagnosis, Estimate, FoundEffect
+from bayessim_mjx.diagnosis.statistics import share_of_gap
 from bayessim_mjx.effects.support.words import words
 from bayessim_mjx.quantities import finite, typeset, unit
 
@@ -198,4 +199,8 @@ def gap_closed(stages: Mapping[str, Any]) -> float:
     before, after, floor = (stages.get(k) for k in ("nominal", "with_effects", "reducible_floor"))
     if not (finite(before) and finite(after) and finite(floor)) or before <= floor:
         return math.nan
-    return (before**2 - after**2) / (before**2 - floor**2)
+    return share_of_gap(before**2 - after**2, before**2, floor**2)
+
+
+def stages_of(d: Diagnosis) -> dict[str, float]:
+    return {s: getattr(d.gap, s) for s in STAGES}

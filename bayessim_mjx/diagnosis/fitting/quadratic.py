@@ -8,7 +8,7 @@ Everything after the rollouts (steps, held-out scores, bootstraps, screening of 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -160,43 +160,62 @@ def held_out(
     Returns:
         (costs of the held-out windows `[W]`, estimates relative to the fit `[G, K]`).
     """
+    fit = _Rest(q, weight, precision, pull, low, high)
     watched = np.arange(0) if watched is None else watched
-
-    def without(out: NDArray[np.bool_], blocks: Sequence[tuple[float, Array, Array]] = ()) -> tuple[Array, Array]:
-        g, S = q.weighted(weight * ~out)
-        for share, g_block, S_block in blocks:
-            g, S = g - share * g_block, S - share * S_block
-        return g, S + np.diag(precision + TRUST * np.diag(S))
-
-    def step(out: NDArray[np.bool_], blocks: Sequence[tuple[float, Array, Array]] = ()) -> Array:
-        g, S = without(out, blocks)
-        return solve(S, g + pull, low, high)
+    known = _variances(fit.curvature(np.zeros(len(group), bool))[1])
 
     def tells(out: NDArray[np.bool_]) -> bool:
-        return bool((_variances(without(out)[1]) > ONLY * known)[watched].any())
+        return bool((_variances(fit.curvature(out)[1]) > ONLY * known)[watched].any())
 
-    known = _variances(without(np.zeros(len(group), bool))[1])
     costs, moves = np.zeros(len(group)), []
     for name in np.unique(group):
         out = group == name
         if tells(out):
             own = np.flatnonzero(out)
             alone = [w for w in own if split and tells(np.arange(len(group)) == w)]
-            blocks = {w: split(int(w)) for w in alone} if split else {}
-            own, steps = np.setdiff1d(own, alone), []
-            for k in range(PARTS if alone else min(PARTS, len(own))):
-                part = np.isin(np.arange(len(group)), own[k::PARTS])
-                p = step(part, [(weight[w], *blocks[w].of(k)) for w in alone])
-                costs[part] = q.at(p)[part]
-                for w in alone:
-                    costs[w] += blocks[w].at(p)[k]
-                steps.append(p)
-            p = np.mean(steps, axis=0)
+            p = fit.by_parts(np.setdiff1d(own, alone), {int(w): split(int(w)) for w in alone} if split else {}, costs)
         else:
-            p = step(out)
+            p = fit.step(out)
             costs[out] = q.at(p)[out]
         moves.append(p)
     return costs, np.array(moves)
+
+
+@dataclass(frozen=True, eq=False)
+class _Rest:
+    """Newton steps from a fit to what is left without some windows, or without blocks of them."""
+
+    q: Quadratic
+    weight: Array
+    precision: Array
+    pull: Array
+    low: Array
+    high: Array
+
+    def curvature(
+        self, out: NDArray[np.bool_], blocks: Sequence[tuple[float, Array, Array]] = ()
+    ) -> tuple[Array, Array]:
+        """(gradient, curvature with the prior); blocks: (weight, gradient, curvature) of parts of windows left out."""
+        g, S = self.q.weighted(self.weight * ~out)
+        for share, g_block, S_block in blocks:
+            g, S = g - share * g_block, S - share * S_block
+        return g, S + np.diag(self.precision + TRUST * np.diag(S))
+
+    def step(self, out: NDArray[np.bool_], blocks: Sequence[tuple[float, Array, Array]] = ()) -> Array:
+        g, S = self.curvature(out, blocks)
+        return solve(S, g + self.pull, self.low, self.high)
+
+    def by_parts(self, own: NDArray[np.int64], blocks: Mapping[int, Quadratic], costs: Array) -> Array:
+        """The mean of the steps without each part of the windows `own` and of the split ones; fills in their costs."""
+        windows, steps = np.arange(len(self.weight)), []
+        for k in range(PARTS if blocks else min(PARTS, len(own))):
+            part = np.isin(windows, own[k::PARTS])
+            p = self.step(part, [(self.weight[w], *split.of(k)) for w, split in blocks.items()])
+            costs[part] = self.q.at(p)[part]
+            for w, split in blocks.items():
+                costs[w] += split.at(p)[k]
+            steps.append(p)
+        return np.asarray(np.mean(steps, axis=0))
 
 
 def _variances(S: Array) -> Array:

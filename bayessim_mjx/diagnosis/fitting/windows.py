@@ -154,22 +154,10 @@ def cut(
         names, group_of_window = _blocks(starts, even)
     else:
         group_of_window = [group_of[r] for r, _ in starts]
-    around = min(MAX_AROUND, max(2, int(np.ceil(AROUND / dt))))
-    law = controllers.of_logs(logs, model)
-    pick = np.asarray([r for r, _ in starts])
-    enabled = _enabled(even, starts, length, model) if any(not e.enabled.all() for e in even) else None
-    batch = Batch(
-        command=_stack([fine[r][_rows(even[r], a, length)] for r, a in starts]),
-        around=_around(even, fine, starts, around),
-        qpos=_stack([even[r].qpos[_rows(even[r], a + 1, length)] for r, a in starts]),
-        qvel=_stack([even[r].qvel[_rows(even[r], a + 1, length)] for r, a in starts]),
-        enabled=enabled,
-        law=None if law is None else jax.tree.map(lambda x: x[pick], law),
-    )
     sigma_q, sigma_v, spread = _noise(even, model, use_qvel and all(log.has_qvel for log in logs))
     return Windows(
-        batch=batch,
-        log=pick,
+        batch=_batch(even, fine, starts, length, dt, model, controllers.of_logs(logs, model)),
+        log=np.asarray([r for r, _ in starts]),
         start=np.asarray([a for _, a in starts]),
         group=np.asarray(group_of_window),
         groups=names,
@@ -179,6 +167,28 @@ def cut(
         logs=tuple(even),
         dt=dt,
         notes=group_notes(logs, group),
+    )
+
+
+def _batch(
+    even: Sequence[Log],
+    fine: list[NDArray[np.float32]],
+    starts: list[tuple[int, int]],
+    length: int,
+    dt: float,
+    model: mujoco.MjModel,
+    law: controllers.Law | None,
+) -> Batch:
+    """The windows of `length` rows at `starts`, for the simulator."""
+    around = min(MAX_AROUND, max(2, int(np.ceil(AROUND / dt))))
+    pick = np.asarray([r for r, _ in starts])
+    return Batch(
+        command=_stack([fine[r][_rows(even[r], a, length)] for r, a in starts]),
+        around=_around(even, fine, starts, around),
+        qpos=_stack([even[r].qpos[_rows(even[r], a + 1, length)] for r, a in starts]),
+        qvel=_stack([even[r].qvel[_rows(even[r], a + 1, length)] for r, a in starts]),
+        enabled=_enabled(even, starts, length, model) if any(not e.enabled.all() for e in even) else None,
+        law=None if law is None else jax.tree.map(lambda x: x[pick], law),
     )
 
 
