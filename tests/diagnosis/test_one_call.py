@@ -1,0 +1,127 @@
+"""One call from Python: model and logs in, a Diagnosis out; stages that fail; both names of `bayessim_mjx.diagnose`."""
+
+import dataclasses
+import json
+import subprocess
+import sys
+from types import MappingProxyType, SimpleNamespace
+
+import mujoco
+import numpy as np
+import pytest
+
+import bayessim_mjx
+from bayessim_mjx import diagnosis
+from bayessim_mjx.diagnosis import run
+from bayessim_mjx.diagnosis.findings import Findings, Where
+from bayessim_mjx.errors import UserError
+from tests.diagnosis.pendulums import MODEL, nominal, recorded, saved
+
+FRICTION = 0.04
+XML = MODEL % (0.002, "Euler", 0.02, 0.005, 0.0, 0.5)
+
+
+def found() -> Findings:
+    return Findings(SimpleNamespace(), SimpleNamespace(answer="a model"))
+
+
+def broken(findings, say):
+    raise ValueError("no map")
+
+
+def test_an_optional_stage_that_fails_is_a_warning_and_any_other_an_error():
+    start, said = found(), []
+    after = run._after(run.Stage("maps", broken, optional=True), start, lambda *told: said.append(told))
+    assert after.warnings == ("maps: not available (ValueError: no map)",) and said == [("maps", 0, 1)]
+    assert start.warnings == () and after.model == "a model"
+    with pytest.raises(ValueError, match="no map"):
+        run._after(run.Stage("maps", broken), start, lambda *told: None)
+
+
+def test_findings_are_values():
+    start, part = found(), Where((), [], [], ("here",))
+    more = start.having(part)
+    assert start.part(Where) is None and more.part(Where) is part and more.part(int) is None
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        more.warnings = ("x",)
+    with pytest.raises(TypeError):
+        more.parts[int] = 1
+    assert isinstance(start.predictions, MappingProxyType)
+
+
+BOTH = "assert callable(b.diagnose) and b.diagnose.main(['--headless']) == 2"
+ORDERS = (
+    "import bayessim_mjx as b",
+    "import bayessim_mjx.diagnose, bayessim_mjx as b",
+    "import bayessim_mjx as b; from bayessim_mjx import diagnose; assert diagnose is b.diagnose",
+    "from bayessim_mjx.diagnose import main; import bayessim_mjx as b; assert b.diagnose.main is main",
+)
+
+
+@pytest.mark.parametrize("code", ORDERS)
+def test_module_and_function_are_there_in_any_order_of_imports(code):
+    told = subprocess.run([sys.executable, "-c", f"{code}; {BOTH}"], capture_output=True, text=True, check=False)
+    assert told.returncode == 0 and "give one of --task NAME and --model FILE" in told.stderr, told.stderr
+
+
+def test_a_path_is_a_model_and_a_plain_name_a_task():
+    with pytest.raises(UserError, match=r"x\.xml: no such file"):
+        bayessim_mjx.diagnose("x.xml", "logs")
+    with pytest.raises(UserError, match="'x' is unknown.*Pendulum"):
+        bayessim_mjx.diagnose("x", "logs")
+
+
+def test_a_robot_comes_from_a_file_a_specification_a_model_or_itself(tmp_path):
+    own = nominal(tmp_path)
+    spec = mujoco.MjSpec.from_string(XML)
+    spec.modelname = "swing"
+    sources = (tmp_path / "pendulum.xml", str(tmp_path / "pendulum.xml"), spec, spec.compile())
+    robots = [diagnosis.robot(source) for source in sources]
+    assert [r.name for r in robots] == ["pendulum", "pendulum", "swing", "swing"]
+    assert all(r.space.names == own.space.names for r in robots)
+    assert diagnosis.robot(own).space.names == own.space.names and robots[2].spec is not None and robots[3].spec is None
+    with pytest.raises(UserError, match="no actuator"):
+        bare = "<mujoco><worldbody><body><joint/><geom size='.1'/></body></worldbody></mujoco>"
+        diagnosis.robot(mujoco.MjModel.from_xml_string(bare))
+
+
+@pytest.mark.slow
+@pytest.mark.ci
+def test_one_call_finds_the_friction_and_gives_a_corrected_simulator(tmp_path):
+    nominal(tmp_path)
+    (tmp_path / "logs").mkdir()
+    logs = recorded(friction=FRICTION, count=4, seconds=3.0)
+    saved(tmp_path / "logs", logs)
+    told = []
+    result = bayessim_mjx.diagnose(
+        str(tmp_path / "pendulum.xml"), tmp_path / "logs", effects=["coulomb_friction"], tolerance="5deg",
+        out=tmp_path / "found", progress=lambda text, done, total: told.append(text),
+    )  # fmt: skip
+    assert result.verdict == "effects" and told[0] == "looking at the logs" and "next experiment" in told
+    (effect,) = result.effects
+    assert effect.parameters["level"].mean == pytest.approx(FRICTION, rel=0.05)
+    physics = diagnosis.robot(tmp_path / "pendulum.xml").physics(0.02)
+    corrected = result.apply(physics)
+    assert "coulomb_friction" in {e.name for e in corrected.effects}
+    level = corrected.space.nominal[corrected.space.index("hinge.coulomb_friction.level")]
+    assert level == pytest.approx(FRICTION, rel=0.05)
+    prior = result.prior(physics)
+    assert prior.space.names == corrected.space.names and np.isfinite(prior.mean()).all()
+    assert diagnosis.load(tmp_path / "found").to_dict() == result.to_dict()
+    assert json.loads((tmp_path / "found" / "diagnosis.json").read_text())["about"]["logs"] == 4
+    written = {p.name for p in (tmp_path / "found").iterdir()}
+    assert {"diagnosis.json", "details.json", "effects.yaml", "model_with_effects.xml"} <= written
+    assert "preliminary.json" not in written and "report.html" not in written
+
+
+@pytest.mark.slow
+@pytest.mark.ci
+def test_logs_in_memory_and_a_compiled_model_leave_no_files(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    model = mujoco.MjModel.from_xml_string(XML)
+    monkeypatch.setattr(run, "STAGES", tuple(stage for stage in run.STAGES if not stage.optional))
+    result = diagnosis.diagnose(model, recorded(count=4, seconds=3.0), effects=["coulomb_friction"])
+    assert result.verdict == "no_gap" and list(tmp_path.iterdir()) == [] and result.about["data"][0] == "log0"
+    assert result.save(tmp_path / "kept").is_file()
+    short = diagnosis.diagnose(model, recorded(count=1, seconds=2.0)[0], effects=["coulomb_friction"])
+    assert short.verdict == "insufficient_data" and short.about["logs"] == 1
