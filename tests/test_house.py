@@ -28,10 +28,6 @@ LONG_FUNCTIONS = (
     "tests/report/fake.py:details",
     "tests/report/fake.py:full",
 )
-LONG_FUNCTIONS = (
-    "tests/report/fake.py:details",
-    "tests/report/fake.py:full",
-)
 CIRCLES: tuple[set[str], ...] = ()
 
 
