@@ -16,7 +16,7 @@ from jax import Array
 from jax.scipy.special import logsumexp
 
 from bayessim_mjx.distributions import Distribution, box, charts
-from bayessim_mjx.linalg import lower_factor
+from bayessim_mjx.linalg import lower_factor, product
 
 SIGNIFICANT = 3.0  # standard errors of the mean held-out gain
 RELEVANT = 0.01  # nats
@@ -52,14 +52,50 @@ def identified(gain: Array, mask: Array) -> tuple[Array, Array]:
 def restore_prior(posterior: Distribution, keep: Array) -> Distribution:
     """The posterior over the parameters to keep [d], the prior over the others, independent of them."""
     q, keep, (centre, sd) = posterior, jnp.asarray(keep), charts.NEUTRAL[posterior.chart]
-    means = jnp.where(keep[None, :], q.means, centre)
+    means, scales = q.means, q.scales
+    if q.chart == "plain":  # the others are cut off at their ranges, which moves what is correlated with them
+        cut = jax.vmap(_beside_cut, in_axes=(0, 0, None))(means, scales, keep)
+        means, scales = (jnp.where(jnp.all(keep), *pair) for pair in zip((means, scales), cut, strict=True))
+    means = jnp.where(keep[None, :], means, centre)
     # a factor of (S S^T on the kept rows) + sd^2 on the others; forming S S^T would lose thin components
-    kept = jnp.where(keep[None, :, None], q.scales, 0.0)
+    kept = jnp.where(keep[None, :, None], scales, 0.0)
     flat = jnp.broadcast_to(jnp.diag(jnp.where(keep, 0.0, sd)), kept.shape)
     scales, logits = lower_factor(jnp.concatenate([kept, flat], axis=-1)), jax.nn.log_softmax(q.logits)
     if q.chart == "plain":  # each component keeps its mass inside the cube
         logits = logits + box.log_masses(q.means, q.scales) - box.log_masses(means, scales)
     return Distribution.from_unit(q.space, logits, means, scales, q.prior_weight, q.chart)
+
+
+def _beside_cut(mean: Array, scale: Array, keep: Array) -> tuple[Array, Array]:
+    """A Gaussian over the parameters to keep [d] as it is where the others lie inside the cube: mean, rows of a factor.
+
+    Its moments change by what they change under the cut of the others where its own is made already: a Gaussian's
+    own cut is not counted twice. By the separation of variables of Genz (1992), the kept coordinates first.
+    """
+    d = mean.shape[0]
+    order = jnp.argsort(~keep)
+    lower, first = lower_factor(scale[order]), keep[order]
+    w = jnp.asarray(box.lattice(box.MASS_POINTS, d))
+
+    def coordinate(carry: tuple[Array, Array], i: Array) -> tuple[tuple[Array, Array], None]:
+        z, logs = carry
+        here = mean[order][i] + product(z, lower[i])  # the columns from i on are still zero
+        a, b = -here / lower[i, i], (1 - here) / lower[i, i]
+        inside = box.log_interval(a, b)
+        logs = logs + jnp.stack([inside, jnp.where(first[i], inside, 0.0)])
+        return (z.at[:, i].set(box.truncated_normal(a, b, w[:, i])), logs), None
+
+    start = jnp.zeros(w.shape), jnp.zeros((2, len(w)))
+    (z, logs), _ = jax.lax.scan(coordinate, start, jnp.arange(d))
+    z, weights = jnp.where(first[None, :], z, 0.0), jax.nn.softmax(logs, axis=1)  # under both cuts, under its own
+    centres = product(weights, z)
+    away = z[None] - centres[:, None, :]
+    after, before = product(jnp.swapaxes(away * weights[:, :, None], 1, 2), away)
+    change = after - before  # of the covariance, at most the identity
+    square = product(change, change)
+    root = jnp.eye(d) + change / 2 - square / 8 + product(square, change) / 16  # of identity + change, to fourth order
+    back = jnp.argsort(order)
+    return mean + product(lower, centres[0] - centres[1])[back], product(lower, root)[back]
 
 
 def flat_sentences(names: Sequence[str], expected: np.ndarray, real: np.ndarray) -> list[str]:

@@ -77,6 +77,24 @@ def test_thin_components_survive():
     )
 
 
+@pytest.mark.parametrize("corr", [0.6, -0.6])
+def test_what_a_cut_moves_stays_moved(corr):
+    """One Gaussian whose other parameter lies beyond its range: the kept marginal by quadrature over both."""
+    mean, sd = np.array([0.4, 1.6]), np.array([0.05, 0.7])
+    cov = np.outer(sd, sd) * [[1, corr], [corr, 1]]
+    q = Distribution.from_unit(SPACE, jnp.zeros(1), jnp.asarray(mean)[None], jnp.asarray(np.linalg.cholesky(cov))[None])
+    kept = identify.restore_prior(q, jnp.asarray([True, False]))
+    axis = (np.arange(400) + 0.5) / 400
+    gap = np.stack(np.meshgrid(axis, axis, indexing="ij"), -1) - mean
+    density = np.exp(-0.5 * np.einsum("abi,ij,abj->ab", gap, np.linalg.inv(cov), gap)).sum(1)
+    density /= density.sum()
+    exact = density @ axis
+    assert abs(exact - mean[0]) > 0.8 * sd[0]  # what the Gaussian's own marginal would have missed
+    assert float(kept.means[0, 0]) == pytest.approx(exact, abs=0.01 * sd[0])
+    assert float(kept.scales[0, 0, 0]) == pytest.approx(np.sqrt(density @ (axis - exact) ** 2), rel=0.01)
+    assert abs(float(kept.contraction()[1])) < 0.003
+
+
 def test_flat_parameters_are_named():
     texts = identify.flat_sentences(
         ("arm mass", "slider mass", "friction"), np.array([0.9, 0.01, 0.6]), np.array([0.8, 0.0, 0.01])
