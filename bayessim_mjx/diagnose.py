@@ -51,6 +51,12 @@ def _parser() -> cli.PlainParser:
         help="what may stay unexplained at a joint: 0.5deg, 2mm, 3%% of the motion, or elbow=0.5deg for one joint "
         "(default: the larger of 3 noise standard deviations and 2%% of the motion)",
     )
+    parser.add_argument(
+        "--criteria",
+        metavar="KEY=VALUE",
+        nargs="*",
+        help="decide by one comparison of all models tried, instead of step by step, with these numbers changed",
+    )
     parser.add_argument("--out", metavar="DIR", default="diagnosis", help="folder for the results (default: diagnosis)")
     parser.add_argument("--seed", metavar="N", type=cli.whole(0, SEEDS), default=0, help="random seed (default: 0)")
     parser.add_argument(
@@ -89,6 +95,7 @@ def _robot(task: str, model: str | None, parameters: str | None) -> "Robot":
 
 def _diagnosis(args: argparse.Namespace, say: Any) -> "Diagnosis":
     from bayessim_mjx.diagnosis import run
+    from bayessim_mjx.diagnosis.selection.criteria import Criteria
 
     names = "all" if args.effects == "all" else [n.strip() for n in args.effects.split(",") if n.strip()]
     with run.noting() as notes:
@@ -100,6 +107,7 @@ def _diagnosis(args: argparse.Namespace, say: Any) -> "Diagnosis":
         map=args.map,
         group=args.group,
         tolerance=args.tolerance,
+        criteria=None if args.criteria is None else Criteria().changed(args.criteria),
         seed=args.seed,
         out=args.out,
         progress=say,

@@ -22,6 +22,7 @@ from bayessim_mjx.diagnosis.residual.disturbance import Disturbance, estimate
 from bayessim_mjx.diagnosis.residual.flexible import Flexible, flexible
 from bayessim_mjx.diagnosis.result import Diagnosis
 from bayessim_mjx.diagnosis.selection import heldout, outcome
+from bayessim_mjx.diagnosis.selection.criteria import Criteria
 from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.selection.tried import Settings, Tried
 from bayessim_mjx.diagnosis.setup import Setup, TooLittleData, prepare
@@ -104,6 +105,7 @@ def investigate(
     seed: int = 0,
     settings: Settings | None = None,
     tolerated: Sequence[str] = (),
+    criteria: Criteria | None = None,
     notes: Sequence[str] = (),
     stages: Sequence[Stage] | None = None,
     progress: Progress | None = None,
@@ -114,7 +116,7 @@ def investigate(
 
     Args:
         robot: the model with the parameters that it may recalibrate.
-        logs, effects, group, seed, progress: see `diagnose`; tolerated: its `tolerance`.
+        logs, effects, group, seed, criteria, progress: see `diagnose`; tolerated: its `tolerance`.
         settings: of the race; None: by the robot's size.
         notes: what was noticed while model and logs were read, for the warnings.
         stages: after the race, optional ones last; None: `STAGES`.
@@ -130,7 +132,7 @@ def investigate(
     setup = prepare(robot, logs, effects, group=group, seed=seed, settings=settings, tolerated=tolerated, notes=notes)
     known(setup, None)
     race = setup.fitter, setup.candidates, setup.settings
-    found = Findings(setup, outcome.select(*race, say, lambda tried: known(setup, tried)))
+    found = Findings(setup, outcome.select(*race, say, lambda tried: known(setup, tried), criteria))
     stages = STAGES if stages is None else stages
     for stage in stages:
         found = found if stage.optional else _after(stage, found, say)
@@ -162,6 +164,7 @@ def diagnose(
     map: str | Path | None = None,
     group: str | None = None,
     tolerance: str | Sequence[str] = (),
+    criteria: Criteria | None = None,
     seed: int = 0,
     out: str | Path | None = None,
     progress: Progress | None = None,
@@ -179,6 +182,7 @@ def diagnose(
         map: YAML file that maps the columns of the logs to the model.
         group: metadata key of the operating conditions that are held out in turn.
         tolerance: what may stay unexplained, as `--tolerance`: "0.5deg", "elbow=2mm", "3%".
+        criteria: of one decision over all models tried; None: the rules of the race, step by step.
         seed: of all random numbers.
         out: folder for what the command writes, but for the report; None: nothing is written.
         progress: called with (what is being done, done, total).
@@ -203,6 +207,7 @@ def diagnose(
     }  # fmt: skip
     files = Files(None if out is None else Path(out), told)
     asked: Any = {"group": group, "seed": seed, "notes": noticed, "progress": progress}
+    asked["criteria"] = criteria
     asked["tolerated"] = [tolerance] if isinstance(tolerance, str) else tolerance
     try:
         found = investigate(robot, recorded, effects, **asked, keep=files.so_far, verdict=files.verdict)

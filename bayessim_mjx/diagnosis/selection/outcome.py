@@ -11,7 +11,8 @@ import numpy as np
 from bayessim_mjx.diagnosis import statistics
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
-from bayessim_mjx.diagnosis.selection import bounds, heldout, predicted_gain, search, verdict, weak_directions
+from bayessim_mjx.diagnosis.selection import bounds, chosen, heldout, predicted_gain, search, verdict, weak_directions
+from bayessim_mjx.diagnosis.selection.criteria import Criteria
 from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.selection.race import Progress, Race
 from bayessim_mjx.diagnosis.selection.screen import Screened
@@ -62,14 +63,28 @@ def select(
     settings: Settings,
     say: Progress,
     keep: Callable[[Tried], None] = lambda tried: None,
+    criteria: Criteria | None = None,
 ) -> Outcome:
-    """Race the candidates on the windows of `fitter`; `keep` is called with what was tried so far."""
-    race = search.run(fitter, candidates, settings, say, keep)
-    race.winner = bounds.widened(race, _verified(race, say), say)
-    ruling = verdict.rule(race, say)
+    """Race the candidates on the windows of `fitter`.
+
+    Args:
+        keep: called with what was tried so far.
+        criteria: of one decision over all models tried; None: the rules of the race, step by step.
+    """
+    if criteria is None:
+        race = search.run(fitter, candidates, settings, say, keep)
+        race.winner = bounds.widened(race, _verified(race, say), say)
+        ruling = verdict.rule(race, say)
+    else:
+        race, ruling = chosen.run(fitter, candidates, settings, criteria, say, keep)
+    return concluded(race, ruling, say)
+
+
+def concluded(race: Race, ruling: verdict.Ruling, say: Progress) -> Outcome:
+    """The outcome of a race: the answer where data and beliefs together put it, and its parts."""
     answer, along = bounds.widened(race, ruling.model, say), None
     if answer.effects:
-        answer, along = weak_directions.settled(fitter, answer)
+        answer, along = weak_directions.settled(race.fitter, answer)
         race.models[frozenset(c.label for c in answer.effects)] = race.winner = answer
     subsets = verdict.subsets(race, answer, say) if len(answer.effects) > 1 else {}
     total, each = predicted_gain.promised(race, answer.effects) if answer.effects else (0.0, {})

@@ -91,13 +91,23 @@ def fresh(race: Race, fit: Fit) -> list[int]:
 
 def fit_models(race: Race, plans: Sequence[tuple[Model, Screened]], label: str, say: Progress) -> list[Model]:
     """Models of the plans' effects plus one more each, fitted together; what was fitted before is looked up."""
-    fitter = race.fitter
-    todo: dict[frozenset[str], tuple[list[Fit], tuple[Candidate, ...]]] = {}
+    todo: Entries = {}
     for model, extra in plans:
         key = frozenset([*(c.label for c in model.effects), extra.candidate.label])
         if key not in race.models and key not in todo:
-            todo[key] = (_starts(race, model, extra, len(todo)), (*model.effects, extra.candidate))
-    fits = [fit for several, _ in todo.values() for fit in several]
+            todo[key] = (starts(race, model, extra, len(todo)), (*model.effects, extra.candidate))
+    fit_entries(race, todo, label, say)
+    keys = [frozenset([*(c.label for c in m.effects), e.candidate.label]) for m, e in plans]
+    return [race.models[k] for k in keys]
+
+
+Entries = dict[frozenset[str], tuple[list[Fit], tuple[Candidate, ...]]]  # {labels: (a fit per start, effects)}
+
+
+def fit_entries(race: Race, entries: Entries, label: str, say: Progress) -> None:
+    """Fit models in lockstep, each from all of its starts, and keep the best of each."""
+    fitter = race.fitter
+    fits = [fit for several, _ in entries.values() for fit in several]
     total = len(fits)
     fits = fitter.iterate(
         fits,
@@ -105,13 +115,11 @@ def fit_models(race: Race, plans: Sequence[tuple[Model, Screened]], label: str, 
         lambda f: fresh(race, f),
         race.settings.tolerance,
         progress=lambda left: say(label, total - left, total),
-        keep=_Heats([len(several) for several, _ in todo.values()]),
+        keep=_Heats([len(several) for several, _ in entries.values()]),
     )
-    for key, (several, effects) in todo.items():
+    for key, (several, effects) in entries.items():
         own, fits = fits[: len(several)], fits[len(several) :]
         race.models[key] = scored(fitter, min(own, key=lambda fit: fit.cost), effects)
-    keys = [frozenset([*(c.label for c in m.effects), e.candidate.label]) for m, e in plans]
-    return [race.models[k] for k in keys]
 
 
 class _Heats:
@@ -142,7 +150,7 @@ class _Heats:
         return fell or (refused and fit.promise > (1 - self.FAST) * fit.cost)
 
 
-def _starts(race: Race, model: Model, extra: Screened, rank: int) -> list[Fit]:
+def starts(race: Race, model: Model, extra: Screened, rank: int) -> list[Fit]:
     """Jobs from several starting points: costs have several minima (an inertia hides in another, a shape is wrong)."""
     fitter, coordinates = race.fitter, extra.candidate.coordinates
     fits = [fitter.derive(model.fit, coordinates, extra.start)]

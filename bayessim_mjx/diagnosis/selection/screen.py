@@ -39,6 +39,39 @@ class Screened:
     others: tuple[Array, ...] = ()
     whole: float = 0.0
 
+    @property
+    def way(self) -> Array:
+        """`[k]` from neutral to the point whose column it is; 0 for shapes."""
+        neutral = np.array([c.neutral for c in self.candidate.coordinates])
+        return np.where(self.candidate.shapes, 0.0, (self.others[0] if self.others else self.start) - neutral)
+
+    @property
+    def room(self) -> tuple[float, float]:
+        """(least, largest) multiple of the way that stays within the ranges."""
+        return _room(self.candidate, self.way)
+
+    def at(self, amount: float) -> Screened:
+        """The same with a start at so many times the way, but not at neutral, where many laws have no slope."""
+        neutral = np.array([c.neutral for c in self.candidate.coordinates])
+        amount = amount if abs(amount) > 0.02 else 0.02
+        shapes = np.array(self.candidate.shapes)
+        return replace(self, start=np.where(shapes, self.start, neutral + amount * self.way))
+
+
+def _room(candidate: Candidate, way: Array) -> tuple[float, float]:
+    neutral = np.array([c.neutral for c in candidate.coordinates])
+    low, high = (np.array([getattr(c, e) for c in candidate.coordinates]) for e in ("low", "high"))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ahead = np.where(way > 0, (high - neutral) / way, np.where(way < 0, (low - neutral) / way, np.inf))
+        behind = np.where(way > 0, (neutral - low) / way, np.where(way < 0, (neutral - high) / way, np.inf))
+    return -float(np.min(behind)), float(np.min(ahead))
+
+
+def residual(fit: Fit, limit: int) -> Array:
+    """`[w, n]` residuals of the windows that were looked at, weighted as the columns are."""
+    own = _telling(fit, limit)
+    return np.asarray(fit.r[own] * np.sqrt(fit.weight[own])[:, None])
+
 
 def screen(fitter: Fitter, fit: Fit, candidates: Sequence[Candidate], limit: int = 96) -> list[Screened]:
     """All candidates on top of `fit`, best first, on at most `limit` windows.
@@ -163,10 +196,7 @@ def _one(project: _Projection, candidate: Candidate, point: Array, column: Array
     if norm < 1e-9 or s <= 1e-9 * norm:
         return Screened(candidate, point, 0.0, 1.0, projected)
     way = np.where(candidate.shapes, 0.0, point - neutral)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ahead = np.where(way > 0, (high - neutral) / way, np.where(way < 0, (low - neutral) / way, np.inf))
-        behind = np.where(way > 0, (neutral - low) / way, np.where(way < 0, (neutral - high) / way, np.inf))
-    t = float(np.clip(g / s, -np.min(behind), np.min(ahead)))
+    t = float(np.clip(g / s, *_room(candidate, way)))
     gain = 2 * t * g - t * t * s
     start = np.where(candidate.shapes, point, neutral + (t if abs(t) > 0.02 else 0.02) * (point - neutral))
     return Screened(candidate, np.clip(start, low, high), max(gain, 0.0), 1.0 - s / norm, projected, whole=2 * g - s)

@@ -55,6 +55,24 @@ def run(
 ) -> Race:
     """The whole race on the windows of `fitter`; `keep` is called with it after each stage."""
     say = progress or (lambda text, done, total: None)
+    race = begin(fitter, candidates, settings, say, keep)
+    if not race.above_noise(race.base):
+        return race
+    best = _pairs(race, say)
+    keep(race)
+    best = _elsewhere(race, _greedy(race, best, say), say)
+    race.winner = simplest(race, best, say)
+    return race
+
+
+def begin(
+    fitter: Fitter,
+    candidates: Sequence[Candidate],
+    settings: Settings,
+    say: Progress,
+    keep: Callable[[Race], None] = lambda race: None,
+) -> Race:
+    """The race up to its single effects; of these a few for the table where there is nothing to explain."""
     nominal = fitter.begin(fitter.base)
     say("known parameters", 0, 1)
     start = replace(nominal, A=nominal.A.copy())  # in the memory order of later steps: sums round alike
@@ -69,17 +87,12 @@ def run(
     keep(race)
     say("screening", 0, 1)
     race.screened = screen(fitter, fit, candidates, settings.screened)
-    if not race.above_noise(race.base):  # nothing to explain: a few fits for the table
+    if not race.above_noise(race.base):
         fit_models(race, [(race.base, s) for s in race.screened[:4]], "single effects", say)
-        race.winner = race.base
         return race
     _singles(race, say)
     widen_leading(race, say)
     keep(race)
-    best = _pairs(race, say)
-    keep(race)
-    best = _elsewhere(race, _greedy(race, best, say), say)
-    race.winner = simplest(race, best, say)
     return race
 
 

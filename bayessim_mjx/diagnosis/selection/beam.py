@@ -1,0 +1,142 @@
+"""One search over sets of effects: a beam over neighbours, beside a dense start, with a table of what was visited.
+
+Neighbours of a model: one effect added, dropped, exchanged for another one, or replaced by its special cases. What is
+fitted is asked of `Fitting`, so that the search can be tried on planted tables.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+from bayessim_mjx.diagnosis.selection.criteria import Criteria
+from bayessim_mjx.diagnosis.selection.decide import Selection, admissible, decide, order, relevant, same, settled, value
+from bayessim_mjx.diagnosis.selection.table import BASE, Key, Table
+
+ROUNDS = 4  # of growing and looking around, at most
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A model to be fitted from a fitted one.
+
+    Attributes:
+        key: its effects; parent: the fitted model that it starts from.
+    """
+
+    key: Key
+    parent: Key = BASE
+
+
+class Fitting(Protocol):
+    """What can fit models; the single effects are fitted beforehand."""
+
+    @property
+    def table(self) -> Table:
+        """All models so far."""
+
+    def additions(self, key: Key) -> list[str]:
+        """Effects that may bring something on top of a fitted model, the most promising first."""
+
+    def together(self, most: int, count: int) -> list[Key]:
+        """Sets of up to so many effects that promise most when all amplitudes are free at once."""
+
+    def fit(self, plans: Sequence[Plan], label: str) -> None:
+        """Fit what was not fitted before."""
+
+    def polish(self, key: Key) -> None:
+        """Bring the fit of a model to its end."""
+
+    def simulate(self, keys: Sequence[Key]) -> Table:
+        """A table of some models, whose held-out windows are simulated and not predicted by linearisation."""
+
+
+def search(fits: Fitting, criteria: Criteria) -> Selection:
+    """Visit models until the best has no better neighbour, decide, and ask held-out simulations of the answer."""
+    for _ in range(ROUNDS):
+        best = _grow(fits, criteria)
+        if not best:
+            break
+        other = _around(fits, best, criteria)
+        if other == best or same(fits.table, best, other, criteria):
+            break
+    table = fits.table
+    return _verified(fits, decide(table, order(table.laws), criteria), criteria)
+
+
+def leading(table: Table, criteria: Criteria) -> list[Key]:
+    """Models in the order in which the search goes on from them: density, less what their effects have to bring."""
+    rows = [k for k, r in table.rows.items() if admissible(r, criteria)]
+    return sorted(rows, key=lambda k: -value(table, k, criteria))
+
+
+def _best(fits: Fitting, criteria: Criteria) -> Key:
+    """The leading model with its fit brought to its end."""
+    for _ in range(criteria.beam):
+        best = leading(fits.table, criteria)[0]
+        fits.polish(best)
+        if leading(fits.table, criteria)[0] == best:
+            break
+    return leading(fits.table, criteria)[0]
+
+
+def _grow(fits: Fitting, criteria: Criteria) -> Key:
+    """Add to the models of the beam as long as that brings something worth naming, and the best is above the noise."""
+    best = BASE if settled(fits.table, BASE, criteria) else _best(fits, criteria)
+    for size in range(1, criteria.most):
+        if settled(fits.table, best, criteria):
+            break
+        beam = [k for k in leading(fits.table, criteria)[: criteria.beam] if len(k) < criteria.most]
+        plans = [p for k in beam for p in _added(fits, k, criteria.width - 2 * (k != best))]
+        if size == 1:
+            plans += [Plan(k) for k in fits.together(min(3, criteria.most), criteria.beam)]
+        fits.fit(plans, f"{len(best) + 1} effects")
+        before, best = best, _best(fits, criteria)
+        if best == before or same(fits.table, before, best, criteria):
+            break
+    return best
+
+
+def _added(fits: Fitting, key: Key, count: int) -> list[Plan]:
+    return [Plan(key | {label}, key) for label in fits.additions(key)[: max(count, 1)]]
+
+
+def _around(fits: Fitting, best: Key, criteria: Criteria) -> Key:
+    """The best of a model's neighbours: an effect dropped, exchanged, or in its place special cases or one place."""
+    fits.fit([Plan(best - {label}, best) for label in best], "dropping")
+    plans = []
+    for label in sorted(best):
+        rest = best - {label}
+        plans += _added(fits, rest, criteria.width) if rest else []
+        plans += [Plan(rest | own, rest) for own in specialised(fits.table, best, label)]
+    fits.fit([p for p in plans if len(p.key) <= criteria.most], "exchanges")
+    table = fits.table
+    for key in leading(table, criteria)[: 2 * criteria.beam]:  # simpler ones that may not have come to their end
+        if table.rows[key].size < table.rows[best].size:
+            fits.polish(key)
+    return _best(fits, criteria)
+
+
+def specialised(table: Table, key: Key, label: str) -> list[Key]:
+    """What may stand in the place of one effect of a model: its special cases, each and together, or single places."""
+    law, rest = table.laws[label], key - {label}
+    fits_in = [c for c in table.laws.values() if all(c.beside(table.laws[other]) for other in rest)]
+    parts = [c.label for c in fits_in if c.effect in law.special and c.where == law.where]
+    places = [c.label for c in fits_in if c.effect == law.effect and law.where == "all" != c.where]
+    return [frozenset([p]) for p in parts + places] + ([frozenset(parts)] if len(parts) > 1 else [])
+
+
+def _verified(fits: Fitting, found: Selection, criteria: Criteria) -> Selection:
+    """The selection without effects that do not help when held-out windows are really simulated."""
+    while found.answer:
+        smaller = [found.answer - {label} for label in found.answer]
+        fits.fit([Plan(k, found.answer) for k in smaller], "dropping")
+        seen = fits.simulate([BASE, found.answer, *smaller])
+        idle = [k for k in smaller if not relevant(seen, k, found.answer, criteria, criteria.same / 2)]
+        if not idle:
+            return found
+        answer = min(idle, key=lambda k: seen.rows[k].total)
+        told = f"simulated: {' + '.join(sorted(found.answer - answer))} brings nothing"
+        found = replace(found, answer=answer, trace=(*found.trace, told))
+    return found

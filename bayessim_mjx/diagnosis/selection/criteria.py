@@ -1,0 +1,63 @@
+"""The numbers that a decision depends on, fixed before any data are seen."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+from bayessim_mjx.errors import UserError
+
+
+@dataclass(frozen=True)
+class Criteria:
+    """When one model predicts better than another, and how much of the search is worth its time.
+
+    Attributes:
+        errors: standard errors (clustered by operating condition) by which a better model's held-out log predictive
+            density is higher.
+        nats: and by so many nats plus the logarithm of the number of candidates for each further effect.
+        rare: so many times these nats tell where not all conditions gain, if none loses more than the share `harm`.
+        same: the region of practical equivalence: share of what a model leaves of the squared gap that further effects
+            have to close, and by which two models' costs (noise included) may differ.
+        least: and of the whole gap.
+        floor: a model within this factor of the noise (rms) is not improved further.
+        far: standard deviations by which an amplitude of a named effect is away from neutral.
+        beam: models that the search goes on from; width: additions tried to each; most: effects in one model.
+    """
+
+    errors: float = 2.0
+    nats: float = 5.0
+    rare: float = 5.0
+    harm: float = 0.1
+    same: float = 0.15
+    least: float = 0.003
+    floor: float = 1.3
+    far: float = 1.0
+    beam: int = 3
+    width: int = 5
+    most: int = 5
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            value = getattr(self, f.name)
+            if not value >= 0 or (f.type == "int" and (value < 1 or value != int(value))):
+                raise UserError(f"criteria {f.name}={value}: allowed is a {'count' if f.type == 'int' else 'number'}")
+
+    def changed(self, given: Iterable[str]) -> Criteria:
+        """With `key=value` texts applied.
+
+        Raises:
+            UserError: an unknown key, or a value that is no number.
+        """
+        kinds = {f.name: int if f.type == "int" else float for f in fields(self)}
+        new: dict[str, Any] = {}
+        for text in given:
+            key, _, value = text.partition("=")
+            if key not in kinds:
+                raise UserError(f"criteria {text}: there is no {key}; allowed: {', '.join(kinds)}")
+            try:
+                new[key] = kinds[key](value)
+            except ValueError:
+                raise UserError(f"criteria {text}: {value!r} is no number; allowed: {key}=NUMBER") from None
+        return replace(self, **new)

@@ -1,0 +1,194 @@
+"""From a table of scores to one answer and its rivals: a pure function.
+
+1. Score: held-out log predictive density of every window, a Student's t as heavy as the window is long, so that neither
+   the scale of a misfit nor one bad window decides; its standard error is clustered by operating condition.
+2. Same: the better of two models is not better by `errors` standard errors and `nats` plus the logarithm of the number
+   of candidates, or what it closes of what the other leaves is not worth naming (`same`).
+3. Answer: of the models that are the same as the best, the least: a special case before its general law, one place
+   before all of them, fewer numbers. The others that are least in their own right are its rivals.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayessim_mjx.diagnosis import statistics
+from bayessim_mjx.diagnosis.selection.criteria import Criteria
+from bayessim_mjx.diagnosis.selection.table import BASE, Key, Law, Row, Table
+
+Array = NDArray[np.float64]
+Order = Callable[[Key, Key], bool]  # whether the first model is less than the second
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """A model that these logs do not tell from the answer.
+
+    Attributes:
+        key: its effects; nats: by how much the answer predicts better; closed: share of the base model's gap.
+    """
+
+    key: Key
+    nats: float
+    closed: float
+
+
+@dataclass(frozen=True, eq=False)
+class Selection:
+    """What was decided.
+
+    Attributes:
+        base: the known parameters alone; answer: the model that is named (`base` where nothing is).
+        rivals: the other least models that are the same, most likely first.
+        table: what it rests on; trace: the steps in words.
+    """
+
+    base: Key
+    answer: Key
+    rivals: tuple[Alternative, ...]
+    table: Table
+    trace: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Difference:
+    """By how much one model predicts better than another.
+
+    Attributes:
+        nats: of held-out log predictive density; deviate: over its clustered standard error, as a normal deviate.
+        closed: share of what the worse leaves of the squared gap; worst: share of its cost that the condition that
+            gains least saves.
+    """
+
+    nats: float
+    deviate: float
+    closed: float
+    worst: float
+
+
+def compare(table: Table, worse: Key, better: Key) -> Difference:
+    """How much `better` predicts better than `worse`."""
+    old, new = table.rows[worse], table.rows[better]
+    gain = log_gain(old, new, table.noise)
+    left, above = table.excess(better), table.excess(worse)
+    drop = [_drop(old.cost[table.group == g], new.cost[table.group == g], table.noise) for g in np.unique(table.group)]
+    return Difference(
+        float(gain.sum()), statistics.normal_deviate(gain, table.group), 1.0 - left / max(above, 1e-9), min(drop)
+    )
+
+
+def log_gain(old: Row, new: Row, noise: float) -> Array:
+    """`[W]` nats of log predictive density that `new` has more: n log(1 + cost / n), in independent residuals."""
+    each = new.samples / len(new.cost)
+    return np.asarray(each * (np.log(old.cost + noise) - np.log(new.cost + noise)))
+
+
+def _drop(old: Array, new: Array, noise: float) -> float:
+    return float((old.sum() - new.sum()) / (old.sum() + noise * len(old)))
+
+
+def settled(table: Table, key: Key, criteria: Criteria) -> bool:
+    """Whether a model leaves too little to be worth explaining.
+
+    Errors of the time step may be smaller than feared: what has effects has to reach the sensors' noise.
+    """
+    share = table.believed if key else 1.0
+    return table.excess(key) + 1.0 <= (share * criteria.floor) ** 2
+
+
+def real(table: Table, worse: Key, better: Key, criteria: Criteria) -> bool:
+    """Whether the evidence tells that one model is better: of all conditions, or without harm in any."""
+    found = compare(table, worse, better)
+    price = criteria.nats + np.log(max(len(table.laws), 2)) * max(1, len(better) - len(worse))
+    if found.nats <= price:
+        return False
+    # what acts in few windows only (a limit, drag at speed) helps few of them, but then by much and harms no other
+    rare = found.nats > criteria.rare * price and found.worst > -criteria.harm
+    return found.deviate > criteria.errors or rare
+
+
+def relevant(table: Table, worse: Key, better: Key, criteria: Criteria, share: float) -> bool:
+    """Whether a better model closes enough of what another leaves, and that one leaves anything."""
+    left, above = table.excess(better), table.excess(worse)
+    if settled(table, worse, criteria):
+        return False
+    return above - left > share * above and above - left > criteria.least * table.excess(BASE)
+
+
+def same(table: Table, worse: Key, better: Key, criteria: Criteria) -> bool:
+    """Whether two models predict the same, for all that these logs tell and all that matters.
+
+    Effects beside the same others have to close enough of what is left; in the place of others, predict as well.
+    """
+    if not worse < better:
+        ratio = (1.0 + table.excess(worse)) / max(1.0 + table.excess(better), 1e-9)
+        return ratio < 1.0 + criteria.same or not real(table, worse, better, criteria)
+    return not (relevant(table, worse, better, criteria, criteria.same) and real(table, worse, better, criteria))
+
+
+def order(laws: Mapping[str, Law]) -> Order:
+    """The partial order of models: subsets, special cases in a law's place, one place instead of all of them."""
+
+    def lesser(a: Law, b: Law) -> bool:
+        if a.effect == b.effect:
+            return b.where == "all" != a.where
+        return a.effect in b.special and a.where == b.where
+
+    def less(a: Key, b: Key) -> bool:
+        if a < b:
+            return True
+        own, other = sorted(a - b), sorted(b - a)
+        if not own or not other or len(own) > max(len(other), 1):
+            return False
+        return all(any(lesser(laws[x], laws[y]) for y in other) for x in own)
+
+    return less
+
+
+def admissible(row: Row, criteria: Criteria) -> bool:
+    """Whether all effects of a model are there: by one that hardly is a fit may only have come further."""
+    return all(z > criteria.far for z in row.distance.values())
+
+
+def value(table: Table, key: Key, criteria: Criteria) -> float:
+    """Nats of log predictive density over the known parameters alone, less the price of the model's effects."""
+    row = table.rows[key]
+    gain = float(log_gain(table.rows[BASE], row, table.noise).sum())
+    return gain - len(key) * (criteria.nats + float(np.log(max(len(table.laws), 2))))
+
+
+def decide(table: Table, less: Order, criteria: Criteria) -> Selection:
+    """The answer that a table gives; pure."""
+    rows = {k: r for k, r in table.rows.items() if admissible(r, criteria)}
+    best = max(rows, key=lambda k: value(table, k, criteria))
+    trace = [f"best: {_told(best)}, leaves {table.excess(best):.3g}"]
+    equal = [k for k in rows if k == best or same(table, k, best, criteria)]
+    answer = least(table, equal, less)
+    trace.append(f"the same as the best: {len(equal)}; least: {_told(answer)}, leaves {table.excess(answer):.3g}")
+    # also where no amplitude is told, as of one that another number makes up for
+    alike = [k for k in table.rows if k in equal or same(table, k, best, criteria)]
+    return Selection(BASE, answer, rivals(table, alike, answer, less), table, tuple(trace))
+
+
+def least(table: Table, equal: Iterable[Key], less: Order) -> Key:
+    """Of models that are the same, one that no other is less than: fewest effects, then numbers, then least error."""
+    equal = list(equal)
+    lowest = [k for k in equal if not any(less(other, k) for other in equal)]
+    return min(lowest, key=lambda k: (len(k), table.rows[k].size, table.rows[k].total, sorted(k)))
+
+
+def rivals(table: Table, equal: Iterable[Key], answer: Key, less: Order) -> tuple[Alternative, ...]:
+    """The other least ones, the fewest effects and the best first; what is the answer and more is none."""
+    others = [k for k in equal if k and k != answer and not answer < k]
+    others = [k for k in others if not any(less(other, k) for other in others)]
+    above = max(table.excess(BASE), 1e-9)
+    found = [Alternative(k, compare(table, k, answer).nats, 1.0 - max(table.excess(k), 0.0) / above) for k in others]
+    return tuple(sorted(found, key=lambda a: (len(a.key), a.nats, sorted(a.key))))
+
+
+def _told(key: Key) -> str:
+    return " + ".join(sorted(key)) or "known parameters"

@@ -1,0 +1,92 @@
+"""The search on planted sums of effects: two and three of them, hidden behind each other and behind stand-ins."""
+
+import numpy as np
+import pytest
+
+from bayessim_mjx.diagnosis.selection import beam
+from bayessim_mjx.diagnosis.selection.criteria import Criteria
+from tests.diagnosis.selection.planted import Linear, columns, law, table
+
+A, B, C, D = "a@hinge", "b@hinge", "c@hinge", "d@hinge"
+
+
+def found(laws, amounts, seed=0, **criteria):
+    fits = Linear(laws, amounts, seed)
+    selection = beam.search(fits, Criteria(**criteria))
+    return set(selection.answer), fits
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_where_nothing_is_planted_nothing_is_named_and_nothing_more_is_fitted(seed):
+    answer, fits = found(columns(20, seed), {}, seed)
+    assert answer == set() and fits.fitted == 1 + 20
+
+
+@pytest.mark.parametrize("amounts", [{A: 3.0}, {A: 3.0, B: -3.0}, {A: 4.0, B: 2.0, C: -3.0}, {A: 10.0, B: 1.0}])
+def test_planted_effects_are_named_and_no_others(amounts):
+    answer, fits = found(columns(20), amounts)
+    assert answer == set(amounts)
+    assert fits.fitted < 21 + 80  # of 1350 models of two or three
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_two_effects_that_hide_each_other_behind_a_stand_in_for_both(seed):
+    """Neither a nor b shows in a fit of its own; c explains a third of what both do."""
+    laws = columns(20, seed)
+    left = np.random.default_rng(9).normal(size=len(laws[A]))
+    laws[B] = -laws[A] + 0.3 * left
+    laws[C] = 0.6 * left + 0.8 * laws[C]
+    answer, fits = found(laws, {A: 10.0, B: 10.0}, seed)
+    singles = [fits.table.excess(frozenset([x])) / fits.table.excess(frozenset()) for x in (A, B, C)]
+    assert min(singles[:2]) > 0.85 and singles[2] < 0.75
+    assert answer == {A, B}
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_three_effects_of_which_no_two_show(seed):
+    laws = columns(12, seed)
+    left = np.random.default_rng(9).normal(size=len(laws[A]))
+    laws[C] = -laws[A] - laws[B] + 0.5 * left
+    answer, fits = found(laws, {A: 6.0, B: 6.0, C: 6.0}, seed)
+    pairs = [frozenset(p) for p in ((A, B), (A, C), (B, C))]
+    assert all(fits.table.excess(frozenset([x])) > 0.8 * fits.table.excess(frozenset()) for x in (A, B, C))
+    assert all(p not in fits.rows or fits.table.excess(p) > 0.5 * fits.table.excess(frozenset()) for p in pairs)
+    assert answer == {A, B, C}
+
+
+def test_a_first_effect_that_later_ones_make_superfluous_is_dropped():
+    """d is nearly the sum of a and b: the best single, and idle beside both."""
+    laws = columns(15)
+    laws[D] = laws[A] + laws[B] + 0.5 * laws[D]
+    assert found(laws, {A: 4.0, B: 4.0})[0] == {A, B}
+
+
+def test_no_more_effects_than_allowed():
+    answer, _ = found(columns(12), {A: 6.0, B: 5.0, C: 4.0, D: 3.0}, most=2)
+    assert answer == {A, B}
+
+
+def test_an_effect_whose_help_was_only_linearised_is_not_named():
+    class Optimist(Linear):
+        """Simulated, b helps nothing."""
+
+        def simulate(self, keys):
+            seen = super().simulate(keys)
+            rows = {k: seen.rows[frozenset([A])] if k == frozenset([A, B]) else r for k, r in seen.rows.items()}
+            return type(seen)(rows, seen.laws, seen.group, seen.noise)
+
+    fits = Optimist(columns(10), {A: 5.0, B: 2.0})
+    selection = beam.search(fits, Criteria())
+    assert set(selection.answer) == {A} and "brings nothing" in selection.trace[-1]
+
+
+def test_what_may_stand_in_the_place_of_an_effect():
+    dry, viscous = law("coulomb_friction"), law("viscous_friction")
+    both = law("asymmetric_friction", numbers=2, special=("coulomb_friction", "viscous_friction"))
+    tied, one = law("armature", "all", places=("hinge", "wrist")), law("armature", "wrist")
+    known = table({(): 9, (dry,): 9, (viscous,): 9, (both,): 9, (tied,): 9, (one,): 9})
+    parts = beam.specialised(known, frozenset([both.label]), both.label)
+    assert parts == [{dry.label}, {viscous.label}, {dry.label, viscous.label}]
+    assert beam.specialised(known, frozenset([tied.label]), tied.label) == [{one.label}]
+    beside = frozenset([both.label, dry.label])  # what is there already cannot come again
+    assert beam.specialised(known, beside, both.label) == [{viscous.label}]

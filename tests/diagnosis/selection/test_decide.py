@@ -1,0 +1,137 @@
+"""What is named and what is told beside it, from a table of scores alone."""
+
+import numpy as np
+import pytest
+
+from bayessim_mjx.diagnosis.selection.criteria import Criteria
+from bayessim_mjx.diagnosis.selection.decide import compare, decide, order
+from bayessim_mjx.diagnosis.selection.table import BASE, read
+from bayessim_mjx.errors import UserError
+from tests.diagnosis.selection.planted import law, table
+
+A, B, C = (law(name) for name in "abc")
+GROUP = np.repeat(np.arange(5), 4)
+
+
+def decided(errors, criteria=None, **options):
+    known = table(errors, **options)
+    return decide(known, order(known.laws), criteria or Criteria())
+
+
+def named(errors, **options):
+    return set(decided(errors, **options).answer)
+
+
+def labels(*laws):
+    return {c.label for c in laws}
+
+
+def test_nothing_is_named_where_the_known_parameters_are_at_the_noise():
+    assert named({(): 1.2, (A,): 0.5, (B,): 1.1}) == set()
+
+
+def test_the_best_is_named_where_it_is_better_by_evidence_and_closes_enough():
+    assert named({(): 100, (A,): 1.0, (B,): 60}) == labels(A)
+    assert named({(): 100, (A,): 90}) == set()  # closes too little
+    assert named({(): 100, (A,): 40}, samples=4) == set()  # too few residuals to tell
+
+
+def test_a_further_effect_has_to_close_enough_of_what_the_others_leave():
+    assert named({(): 100, (A,): 50, (A, B): 44}) == labels(A)
+    assert named({(): 100, (A,): 50, (A, B): 30}) == labels(A, B)
+    assert named({(): 1e4, (A,): 20, (A, B): 2}) == labels(A)  # .2 % of the whole gap
+    assert named({(): 1e4, (A,): 60, (A, B): 2}) == labels(A, B)
+
+
+def test_a_set_needs_no_member_that_shows_alone():
+    assert named({(): 100, (A,): 99, (B,): 101, (C,): 40, (A, B): 1.0}) == labels(A, B)
+    assert named({(): 100, (A,): 99, (B,): 98, (A, B): 97, (A, B, C): 1.0}) == labels(A, B, C)
+
+
+def test_what_helps_one_condition_only_is_chance_unless_it_helps_much_and_harms_nowhere():
+    """A limit acts in few windows: of five conditions one gains."""
+    rare = np.where(GROUP == 3, 1.0, 50.0)
+    bare = np.where(GROUP == 3, 400.0, 50.0)
+    assert named({(): bare, (A,): rare}, group=GROUP) == labels(A)
+    assert named({(): bare, (A,): rare}, group=GROUP, samples=20) == set()
+    harmed = np.where(GROUP == 1, 90.0, rare)
+    assert named({(): bare, (A,): harmed}, group=GROUP) == set()
+
+
+def test_the_standard_error_is_that_of_conditions_not_of_windows():
+    """Windows of a condition err alike: gains in all conditions are evidence, the same gains within one are not."""
+    mixed = np.where(np.arange(20) % 4 == 0, 5.0, 55.0)
+    together = np.sort(mixed)
+    each = [
+        compare(table({(): 50.0, (A,): cost}, group=GROUP), BASE, frozenset([A.label])) for cost in (mixed, together)
+    ]
+    assert each[0].nats == pytest.approx(each[1].nats, rel=0.02)
+    assert each[0].deviate > 4 > 2 > each[1].deviate
+
+
+def test_a_special_case_is_named_before_its_law_which_is_told():
+    dry, general = law("coulomb_friction"), law("asymmetric_friction", numbers=2, special=("coulomb_friction",))
+    found = decided({(): 100, (dry,): 1.05, (general,): 1.0})
+    assert found.answer == labels(dry) and [r.key for r in found.rivals] == [labels(general)]
+    assert decided({(): 100, (dry,): 30.0, (general,): 1.0}).answer == labels(general)
+
+
+def test_one_place_is_named_before_all_of_them():
+    tied, one = law("armature", "all", places=("pole", "cart")), law("armature", "pole")
+    assert decided({(): 100, (tied,): 1.1, (one,): 1.15}).answer == labels(one)
+    assert decided({(): 100, (tied,): 1.1, (one,): 3.0}).answer == labels(tied)
+
+
+def test_one_effect_of_many_numbers_before_several_of_few():
+    """Friction that differs by direction is dry friction and a bias, of as many numbers."""
+    dry, bias, both = law("coulomb_friction"), law("actuator_bias"), law("asymmetric_friction", numbers=3)
+    found = decided({(): 100, (dry,): 40, (bias,): 60, (both,): 1.0, (dry, bias): 1.0})
+    assert found.answer == labels(both) and [r.key for r in found.rivals] == [labels(dry, bias)]
+
+
+def test_rivals_are_what_the_logs_cannot_tell_the_fewest_effects_first_and_no_supersets():
+    errors = {(): 100, (A,): 1.0, (B,): 1.01, (C,): 1.6, (B, C): 1.0, (A, C): 1.0}
+    found = decided(errors)
+    assert found.answer == labels(A)
+    assert [r.key for r in found.rivals] == [labels(B)]  # c is told apart by its evidence
+    assert found.rivals[0].closed == pytest.approx(1.0, abs=1e-3) and abs(found.rivals[0].nats) < 60
+
+
+def test_of_what_is_alike_the_least_even_if_another_is_better_by_chance():
+    two = law("two", numbers=2)
+    assert named({(): 100, (two,): 0.9, (A,): 0.95}) == labels(A)
+
+
+def test_a_model_of_which_an_effect_is_hardly_there_is_not_named():
+    known = table({(): 100, (A,): 2.5, (A, B): 1.0})
+    known.rows[frozenset([A.label, B.label])].distance[B.label] = 0.5
+    assert set(decide(known, order(known.laws), Criteria()).answer) == labels(A)
+
+
+def test_with_effects_the_sensors_own_noise_is_reached_where_the_time_step_costs_less_than_feared():
+    errors = {(): 100, (A,): 1.5, (A, B): 0.3}
+    assert named(errors) == labels(A) and named(errors, believed=0.5) == labels(A, B)
+
+
+def test_the_order_of_the_rows_and_a_round_trip_decide_nothing():
+    errors = {(): 100, (A,): 30, (B,): 60, (A, B): 1.0, (B, C): 1.0}  # a tie
+    known = table(errors)
+    turned = table(dict(reversed(errors.items())))
+    first, second, third = (decide(t, order(t.laws), Criteria()) for t in (known, turned, read(known.to_dict())))
+    assert first.answer == second.answer == third.answer
+    assert first.rivals == second.rivals and [r.key for r in third.rivals] == [r.key for r in first.rivals]
+
+
+def test_conditions_can_be_left_out_of_a_table():
+    known = table({(): 100, (A,): np.where(GROUP == 2, 70.0, 1.0)}, group=GROUP)
+    less = known.without(2)
+    assert set(less.group) == {0, 1, 3, 4}
+    assert less.excess(frozenset([A.label])) < 0.1 < known.excess(frozenset([A.label]))
+
+
+def test_criteria_are_given_as_texts():
+    changed = Criteria().changed(["same=.3", "beam=5"])
+    assert changed.same == 0.3 and changed.beam == 5 and changed.errors == Criteria().errors
+    for wrong in ("sme=1", "same=much", "beam=2.5", "same=-1", "beam=0"):
+        with pytest.raises(UserError, match=wrong.partition("=")[0]):
+            Criteria().changed([wrong])
