@@ -40,6 +40,7 @@ def fixed(value: float, decimals: int) -> str:
 
 
 def exponent(p: int) -> str:
+    """`·10⁻⁶`."""
     return f"·10{str(p).translate(SUPERSCRIPT)}"
 
 

@@ -92,7 +92,14 @@ def train(
     keep: Callable[[int, Policy], Any],
     progress: Callable[[dict, Any], None] | None = None,
 ) -> None:
-    """PPO from scratch; `keep(iteration, policy)` at the iterations `at` (increasing)."""
+    """PPO from scratch.
+
+    Args:
+        env, ppo, key, domain: as `rl.start` takes them.
+        at: iterations, increasing, at which the policy is kept; the last one ends the training.
+        keep: called with (iteration, policy).
+        progress: called with (metrics, state) at every log interval.
+    """
     state, done = rl.start(env, ppo, key, domain), 0
     for mark in at:
         if mark > done:

@@ -43,8 +43,14 @@ def load(
 ) -> Config:
     """The configuration of `task` with all layers applied.
 
-    `flags` maps a flag's name to (dotted key, value), e.g. {"--num_envs": ("env.numEnvs", 64)}; `overrides` are
-    "section.key=value" texts. `task` may be left out where `cfg_env` holds `task_name`. Raises UserError.
+    Args:
+        task: its name; may be left out where `cfg_env` holds `task_name`.
+        cfg_env, cfg_train: YAML files over cfg/<task>.yaml; the second holds PPO settings.
+        flags: {flag: (dotted key, value)}, e.g. {"--num_envs": ("env.numEnvs", 64)}.
+        overrides: "section.key=value" texts.
+
+    Raises:
+        UserError: naming the value, its file, flag or override, and what is allowed.
     """
     files: list[Layer] = []
     if cfg_env is not None:

@@ -77,9 +77,15 @@ def derivative(time: Array, x: Array, sigma: float) -> tuple[Array, float]:
 
 
 def estimate_velocity(time: Array, qpos: Array, channels: Channels, sigma: Array) -> tuple[Array, Array]:
-    """Velocities [T, nv] and their standard deviations [nv] from positions [T, nq] with noise sigma [nq].
+    """Velocities [T, nv] and their standard deviations [nv] from positions.
 
     Quaternions: omega = 2 Im(conj(q) * dq/dt) in the body's frame, as MuJoCo stores it.
+
+    Args:
+        time: [T] seconds.
+        qpos: [T, nq] rad, m and quaternions.
+        channels: which column is what.
+        sigma: [nq] standard deviations of the noise of qpos.
     """
     rates = [derivative(time, qpos[:, i], float(sigma[i])) for i in range(qpos.shape[1])]
     columns, spreads = [], []

@@ -38,7 +38,14 @@ class Motion:
 
 
 def motion(env: Any, policy: Any, key: Any, theta: Any, length: int) -> Motion:
-    """The motion of a policy, without its exploration, at theta [d] for at most `length` control steps."""
+    """The motion of a policy, without its exploration, until the episode ends.
+
+    Args:
+        env, policy: a task of ours and a policy for it.
+        key: of the start and of what else is drawn.
+        theta: [d] physics.
+        length: control steps at most.
+    """
     thetas = jnp.asarray(theta, jnp.float32)[None]
     t = jax.tree.map(lambda x: np.asarray(x[0]), rollout(env, policy.replace(deterministic=True), key, thetas, length))
     n = int(t.valid.sum())

@@ -47,7 +47,14 @@ def corner(frames: np.ndarray, text: str | Mapping | Sequence | None) -> np.ndar
 
 
 def underline(frames: np.ndarray, strip: int, title: str, captions: Sequence[str]) -> np.ndarray:
-    """Frames [T, H, W, 3] above a white strip with the title to the left and each frame's caption to the right."""
+    """Frames above a white strip with the title to the left and each frame's caption to the right.
+
+    Args:
+        frames: [T, H, W, 3] uint8.
+        strip: its height in pixels.
+        title: the same on all frames.
+        captions: [T], one per frame.
+    """
     from PIL import Image, ImageDraw
 
     length, height, width, _ = frames.shape

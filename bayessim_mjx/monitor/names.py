@@ -22,6 +22,7 @@ def spoken(tag: str) -> str:
 
 
 def named(names: Sequence[str], values: Mapping[str, float]) -> list[str]:
+    """`mass 0.31` for every name and the value in its place."""
     return [f"{name} {float(value):.2g}" for name, value in zip(names, values.values(), strict=True)]
 
 

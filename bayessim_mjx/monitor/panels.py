@@ -150,6 +150,7 @@ def correlation(figure: Any, draws: Draws) -> None:
 
 
 def best_first(draws: Draws) -> np.ndarray:
+    """Parameters [d] by contraction, best identified first."""
     return np.argsort(-draws.contraction(), kind="stable")
 
 
@@ -189,10 +190,12 @@ def label(draws: Draws, k: int, width: int, lines: int, ranges: bool = False) ->
 
 
 def prior_range(draws: Draws, k: int) -> str:
+    """`0.5 to 2`, in the parameter's own unit."""
     return " to ".join(compact(natural(draws, k, end[k]), 3) for end in (draws.low, draws.high))
 
 
 def mean_and_sd(draws: Draws, k: int) -> str:
+    """`1.04 ± 0.06`, in the parameter's own unit."""
     values = natural(draws, k, draws.values[:, k])
     return estimate(values.mean(), values.std())
 

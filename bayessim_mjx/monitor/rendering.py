@@ -79,7 +79,14 @@ def _make_context(name: str, width: int, height: int) -> Any:
 
 
 def render(model: Any, worlds: list[np.ndarray], width: int, height: int, camera: str | int | None) -> Any:
-    """Frames [T, H, W, 3] of each world, all T as long as the longest (the last pose is held)."""
+    """Frames [T, H, W, 3] of each world, all T as long as the longest (the last pose is held); None without OpenGL.
+
+    Args:
+        model: `mujoco.MjModel`, which stays as it is.
+        worlds: qpos [T, nq] of each.
+        width, height: pixels of a frame.
+        camera: name or number, see `camera.view_of`.
+    """
     import mujoco
 
     model = copy.copy(model)  # the buffer and the lights are set for the video only

@@ -29,6 +29,7 @@ def size_of(figure: Any) -> tuple[float, float]:
 
 
 def blues() -> Any:
+    """Colours from white to blue, for densities."""
     from matplotlib.colors import LinearSegmentedColormap
 
     return LinearSegmentedColormap.from_list("posterior", ["#FFFFFF", SKY, BLUE])
@@ -67,4 +68,5 @@ def head(figure: Any, heading: str, items: Sequence[str], truth_label: str = "tr
 
 
 def heading(what: str, round: int | None) -> str:
+    """`Round 3: posterior`."""
     return what if round is None else f"Round {round}: {what}"

@@ -36,7 +36,14 @@ def wrapped(text: str, width: int | None, indent: int = 0) -> list[str]:
 
 
 def fit(parts: Sequence[str], room: int, joint: str = ", ", count: bool = True) -> str:
-    """The first parts that fit into `room` characters, then (`count`) how many more; nothing if not even one fits."""
+    """The first parts that fit, then how many more; nothing if not even one fits.
+
+    Args:
+        parts: texts, the most important first.
+        room: characters.
+        joint: what stands between them.
+        count: say how many are left out.
+    """
     for shown in range(len(parts), 0, -1):
         more = [f"+{len(parts) - shown} more"] if count and shown < len(parts) else []
         text = joint.join([*parts[:shown], *more])

@@ -47,7 +47,13 @@ def write_text(path: Path, text: str) -> None:
 
 
 def save(path: Path, tree: Any, step: int, meta: Mapping[str, Any]) -> None:
-    """Write `tree` as the folder `path`, which must not exist. A dict's entries can be restored one by one."""
+    """Write `tree` as a folder that appears whole or not at all.
+
+    Args:
+        path: the folder, which must not exist.
+        tree: a pytree of arrays; a dict's entries can be restored one by one.
+        step, meta: kept in the index.
+    """
     import jax
 
     temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")

@@ -77,6 +77,7 @@ def best_of(listed: Sequence[Mapping[str, Any]]) -> int | None:
 
 
 def advice(others: Sequence[Mapping[str, Any]]) -> str:
+    """What to do about a damaged checkpoint, where these others are left."""
     if not others:
         return "There is no other checkpoint: start the run again"
     return f"Use another checkpoint of the run: {', '.join(str(c['step']) for c in others)}"

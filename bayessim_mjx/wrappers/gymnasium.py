@@ -38,7 +38,14 @@ def make_vec(
     render_mode: str | None = None,
     **env_settings: Any,
 ) -> "GymnasiumVectorEnv":
-    """Many worlds of the task; what `gymnasium.make_vec` calls."""
+    """Many worlds of the task; what `gymnasium.make_vec` calls.
+
+    Args:
+        task: its name.
+        num_envs: worlds.
+        domain, autoreset_mode, render_mode: see `GymnasiumVectorEnv`.
+        env_settings: settings of `env:`, e.g. `episodeLength=100`.
+    """
     return GymnasiumVectorEnv(registry.make(task, **env_settings), num_envs, domain, autoreset_mode, render_mode)
 
 
