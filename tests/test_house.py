@@ -16,7 +16,6 @@ TREES = ("bayessim_mjx", "tasks", "examples", "benchmarks", "docs", "tests")
 SETTINGS = "bayessim_mjx/config/settings.py"  # a list of settings, as long as there are settings
 
 LONG_FILES = (
-    "bayessim_mjx/rl/ppo.py",
     "tests/diagnosis/logcheck/test_gate.py",
     "tests/effects/test_actuator_forces.py",
     "tests/effects/test_friction_effects.py",
