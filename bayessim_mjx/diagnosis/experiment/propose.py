@@ -24,13 +24,22 @@ from bayessim_mjx.diagnosis.selection.verdict import MILD
 from bayessim_mjx.effects.support.bodies import tilted
 
 Array = NDArray[np.float64]
-SECONDS = 10.0
-MOST = 4  # models compared
-NOTHING = 1.0  # nats: less separates nobody
-BUDGET = 6_000  # windows simulated for a first look at the whole menu
-FINAL = 3  # experiments looked at in full
-WEIGHT = 0.1  # least share of a surviving model
-ALONE = 2  # joints that are moved one at a time where more are concerned
+
+
+@dataclass(frozen=True)
+class Budget:
+    """What a proposal may cost, and how many experiments are looked at."""
+
+    seconds: float = 10.0
+    most: int = 4  # models compared
+    nothing: float = 1.0  # nats: less separates nobody
+    budget: int = 6000  # windows simulated for a first look at the whole menu
+    final: int = 3  # experiments looked at in full
+    weight: float = 0.1  # least share of a surviving model
+    alone: int = 2  # joints that are moved one at a time where more are concerned
+
+
+BUDGET = Budget()
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,15 +103,15 @@ def propose(
     setup, seed = found.setup, found.setup.seed
     cut, model = setup.fitter.simulator.windows, setup.physics.mj_model
     models, contested = _contenders(found.outcome, rivals_models)
-    weights = np.maximum(win_share(models, cut.group, found.outcome.noise, np.random.default_rng(seed)), WEIGHT)
+    weights = np.maximum(win_share(models, cut.group, found.outcome.noise, np.random.default_rng(seed)), BUDGET.weight)
     scorer = Scorer(setup, models, weights, seed)
     allowed = limits_of(model, cut.logs, limits)
-    rows = max(cut.steps, int(round(SECONDS / cut.dt)) // cut.steps * cut.steps)
+    rows = max(cut.steps, int(round(BUDGET.seconds / cut.dt)) // cut.steps * cut.steps)
     time = np.asarray(cut.dt * np.arange(rows), np.float64)
     effects = {c.effect for m in models for c in m.effects} | {"payload", "gravity_tilt"}
     stand = Rehearsal(setup, effects, time, allowed)
     joints = _touched(stand.drives.joints(), models, model)
-    loaded = sorted(joints, key=lambda n: -setup.scales.force[joints[n]])[:ALONE]
+    loaded = sorted(joints, key=lambda n: -setup.scales.force[joints[n]])[: BUDGET.alone]
     every = menu(time, joints, loaded, stand.half, allowed.speed, stand.release, seed) if joints else []
     scored = _look(scorer, stand, every)
     attended = _with_help(scorer, stand, scored, model)
@@ -119,13 +128,13 @@ def _contenders(outcome: Outcome, given: Sequence[Model] | None) -> tuple[list[M
     )
     found = list({id(m): m for m in found if m is not outcome.answer}.values())
     if found:
-        return [outcome.answer, *found[: MOST - 1]], True
+        return [outcome.answer, *found[: BUDGET.most - 1]], True
     own = {c.effect for c in outcome.answer.effects}
     losers = [m for m in ranked(outcome) if m is not outcome.answer and not {c.effect for c in m.effects} & own]
     close = [m for m in losers if abs(outcome.better(m, outcome.answer).evidence) < 3 * MILD and (m.effects or own)]
     if not outcome.answer.effects:  # nothing is wrong as far as these logs can tell: what could still hide?
         close = close[:2]
-    return [outcome.answer, *close[: MOST - 2]], False
+    return [outcome.answer, *close[: BUDGET.most - 2]], False
 
 
 def _touched(joints: dict[str, int], models: Sequence[Model], model: Any) -> dict[str, int]:
@@ -160,7 +169,7 @@ def _look(scorer: Scorer, stand: Rehearsal, every: Sequence[Excitation]) -> list
         return []
     columns = sum(1 + m.size + 2 * scorer.fitter.simulator.nv for m in scorer.models)
     full = (len(stand.time)) // scorer.fitter.simulator.windows.steps
-    each = int(np.clip(BUDGET / (columns * len(played)), 2, full))
+    each = int(np.clip(BUDGET.budget / (columns * len(played)), 2, full))
     pairs = scorer.score(played, shift, each)
     return sorted((_scored(scorer, p, e) for p, e in zip(played, pairs, strict=True)), key=lambda s: -s.evidence)
 
@@ -189,7 +198,7 @@ def _in_full(scorer: Scorer, stand: Rehearsal, scored: list[Scored], attended: l
     if not scored:
         return []
     full = len(stand.time) // scorer.fitter.simulator.windows.steps
-    best = [s.played for s in scored[:FINAL]]
+    best = [s.played for s in scored[: BUDGET.final]]
     pairs = scorer.score(best, np.zeros(len(scorer.fitter.theta)), full)
     exact = [_scored(scorer, p, e) for p, e in zip(best, pairs, strict=True)]
     return sorted([*exact, *attended[:2]], key=lambda s: -s.evidence)
@@ -202,9 +211,11 @@ def _decide(
     alone = [s for s in final if not s.needs]
     chosen = alone[0] if alone else None
     helped = next((s for s in final if s.needs), None)
-    if helped and (chosen is None or (chosen.evidence < MILD and helped.evidence > 1.5 * chosen.evidence + NOTHING)):
+    if helped and (
+        chosen is None or (chosen.evidence < MILD and helped.evidence > 1.5 * chosen.evidence + BUDGET.nothing)
+    ):
         chosen = helped
-    useful = chosen is not None and (chosen.evidence > NOTHING or (len(labels) == 1 and chosen.evidence > 0.1))
+    useful = chosen is not None and (chosen.evidence > BUDGET.nothing or (len(labels) == 1 and chosen.evidence > 0.1))
     why = advice.reason(scorer, chosen, labels, contested, useful, stand.limits)
     witnesses = advice.witnesses(scorer.models, scorer.fitter.simulator.windows.logs)
     kept = {s.name for s in final}

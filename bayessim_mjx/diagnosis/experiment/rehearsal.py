@@ -22,10 +22,19 @@ from bayessim_mjx.logs.log import Log
 from bayessim_mjx.physics import Drive, Physics, control_step
 
 Array = NDArray[np.float64]
-LANES = 32  # worlds in one call
-ROUNDS = 5  # of making an experiment smaller until it is safe
-SHRINK = 0.7
-SLACK = 1.02  # of a limit: rounding and noise in what the logs did
+
+
+@dataclass(frozen=True)
+class Rules:
+    """How an experiment is rehearsed and made smaller until it keeps its limits."""
+
+    lanes: int = 32  # worlds in one call
+    rounds: int = 5  # of making an experiment smaller until it is safe
+    shrink: float = 0.7
+    slack: float = 1.02  # of a limit: rounding and noise in what the logs did
+
+
+RULES = Rules()
 
 
 class Plan(struct.PyTreeNode):
@@ -109,15 +118,15 @@ class Rehearsal:
         """
         scale, done = np.ones(len(excitations)), {}
         left = list(range(len(excitations)))
-        for _ in range(ROUNDS):
+        for _ in range(RULES.rounds):
             plans = [self._plan(excitations[k], scale[k], gravity) for k in left]
             runs = self._simulate(plans, thetas)
             for k, own in zip(left, runs, strict=True):
                 worst = max(self._used(*run) for run in own)
                 log = self._log(excitations[k], *own[0])
-                done[k] = Played(excitations[k], float(scale[k]), log, worst, worst <= SLACK)
+                done[k] = Played(excitations[k], float(scale[k]), log, worst, worst <= RULES.slack)
             left = [k for k in left if not done[k].safe]
-            scale[left] *= SHRINK
+            scale[left] *= RULES.shrink
             if not left:
                 break
         return [done[k] for k in range(len(excitations))]
@@ -128,9 +137,9 @@ class Rehearsal:
         stacked = jax.tree.map(lambda *x: np.stack(x), *plans)
         small = np.asarray(thetas[:, self.kept], np.float32)
         out: list[list[tuple]] = [[] for _ in plans]
-        for a in range(0, len(pairs), LANES):
-            some = pairs[a : a + LANES]
-            padded = some + [some[-1]] * (LANES - len(some))
+        for a in range(0, len(pairs), RULES.lanes):
+            some = pairs[a : a + RULES.lanes]
+            padded = some + [some[-1]] * (RULES.lanes - len(some))
             index = np.array([p for p, _ in padded])
             chosen = Plan(**{f.name: getattr(stacked, f.name)[index] for f in fields(Plan)})
             rows, ends = self._run(small[[m for _, m in padded]], chosen)

@@ -16,11 +16,23 @@ from bayessim_mjx.logs.log import Array, Log
 from bayessim_mjx.physics import controllers
 from bayessim_mjx.quantities import percent
 
-REFUSED, DOUBTFUL = 0.3, 0.7  # share of the effort's variance explained
-CAUSAL = (-0.003, 0.15)  # s by which motion may follow the command for physical reasons: delay, lag, elasticity
-LOADED = 0.5  # of what another remedy leaves unexplained, which a load has to undercut
-FAR_BETTER = 1 / 3  # of what the lags of a robot leave unexplained, which those of a clock have to undercut
-_FAR = 0.5  # s, the largest offset between clocks that is looked for
+
+@dataclass(frozen=True)
+class Limits:
+    """How much of a logged effort the motion has to bear out."""
+
+    # share of the effort's variance explained
+    refused: float = 0.3
+    doubtful: float = 0.7
+    # s by which motion may follow the command for physical reasons: delay, lag, elasticity
+    causal: tuple[float, float] = (-0.003, 0.15)
+    loaded: float = 0.5  # of what another remedy leaves unexplained, which a load has to undercut
+    # of what the lags of a robot leave unexplained, which those of a clock have to undercut
+    far_better: float = 1 / 3
+    far: float = 0.5  # s, the largest offset between clocks that is looked for
+
+
+LIMITS = Limits()
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +72,7 @@ class Relation:
         """Too little is explained; or what is explained is a sign of the velocity that owes nothing to the masses."""
         e = self.explained
         vain = self.certain or e is not None and e < self.friction + 0.05
-        return e is not None and (e < REFUSED or (e < DOUBTFUL and vain))
+        return e is not None and (e < LIMITS.refused or (e < LIMITS.doubtful and vain))
 
 
 def efforts(log: Log, mj_model: mujoco.MjModel) -> Iterator[Effort]:
@@ -120,28 +132,30 @@ def _relation(
         return replace(own, text="too little motion, free of contacts and limits, to compare the effort with")
     if any(t.small for t in tests):
         share = _in_radians(log, mj_model, tests[0])
-        if share > DOUBTFUL:
+        if share > LIMITS.doubtful:
             return replace(
                 own, explained=0.0, certain=True, mend=f"positions in degrees would explain {percent(share)}"
             )
         return replace(own, text="the effort hardly changes against the inertial forces; free motion tests nothing")
-    lags = np.linspace(-_FAR, _FAR, 41)
+    lags = np.linspace(-LIMITS.far, LIMITS.far, 41)
     curves = [t.over(lags) for t in tests]
     test, curve = max(zip(tests, curves, strict=True), key=lambda p: float(np.max(p[1])))
-    physical = (lags >= CAUSAL[0]) & (lags <= CAUSAL[1])
+    physical = (lags >= LIMITS.causal[0]) & (lags <= LIMITS.causal[1])
     explained = max(float(c[physical].max()) for c in curves)
     best = float(curve.max())
     relation = replace(own, explained=explained, friction=test.friction(), lag=_nearest(lags, curve))
-    if explained >= DOUBTFUL and 1.0 - best > FAR_BETTER * (1.0 - explained):
+    if explained >= LIMITS.doubtful and 1.0 - best > LIMITS.far_better * (1.0 - explained):
         # a periodic motion fits one period later too
         relation = replace(relation, lag=_nearest(lags[physical], curve[physical]))
-    if explained >= DOUBTFUL and not relation.lag:
+    if explained >= LIMITS.doubtful and not relation.lag:
         return relation
-    share, mend, certain = (best, "", False) if explained >= DOUBTFUL else _mend(log, mj_model, relation, curve, test)
+    share, mend, certain = (
+        (best, "", False) if explained >= LIMITS.doubtful else _mend(log, mj_model, relation, curve, test)
+    )
     if laden is not None:
         other = _relation(log, mj_model, effort, laden())
         told = other.explained or 0.0
-        if told >= DOUBTFUL and not other.refused and 1.0 - told < LOADED * (1.0 - share):
+        if told >= LIMITS.doubtful and not other.refused and 1.0 - told < LIMITS.loaded * (1.0 - share):
             return other
     return replace(relation, mend=mend, certain=certain)
 
@@ -226,16 +240,16 @@ class _Test:
 def _mend(log: Log, mj_model: mujoco.MjModel, now: Relation, curve: Array, test: _Test) -> tuple[float, str, bool]:
     """One remedy that would explain the effort, (how much of it, in words or nothing, whether a sign or a unit)."""
     best = float(curve.max())
-    if now.lag and best > DOUBTFUL:
+    if now.lag and best > LIMITS.doubtful:
         return best, f"shifting the command by {now.lag:+.3f} s would explain {percent(best)}", False
     turned = test.share(sign=-1.0)
-    if turned > DOUBTFUL:
+    if turned > LIMITS.doubtful:
         return turned, f"the opposite sign would explain {percent(turned)}", True
     radians = _in_radians(log, mj_model, test)
-    if radians > DOUBTFUL:
+    if radians > LIMITS.doubtful:
         return radians, f"positions in degrees would explain {percent(radians)}", True
     free = test.share(scaled=False)
-    if test.effort.scaled and free > DOUBTFUL:
+    if test.effort.scaled and free > LIMITS.doubtful:
         return free, f"another scale of the command would explain {percent(free)}", False
     spans = ", ".join(f"{a:.1f} to {b:.1f} s" for a, b in test.pieces())
     return 0.0, (f"the part from {spans} alone can be explained: cut the file there" if spans else ""), False

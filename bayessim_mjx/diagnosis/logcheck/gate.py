@@ -10,14 +10,24 @@ import numpy as np
 
 from bayessim_mjx.diagnosis.logcheck import single_log
 from bayessim_mjx.diagnosis.logcheck.drives import dof_of, is_effort
-from bayessim_mjx.diagnosis.logcheck.effort import DOUBTFUL, Relation, closed, relations
+from bayessim_mjx.diagnosis.logcheck.effort import LIMITS as OF_EFFORT
+from bayessim_mjx.diagnosis.logcheck.effort import Relation, closed, relations
 from bayessim_mjx.diagnosis.logcheck.single_log import Finding, Velocity, refuse, warn
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Array, Log
 from bayessim_mjx.quantities import percent
 
-ALIKE = 5.0  # at most so many times a target's range is the range of what follows it
-LATE = 0.3  # s; a larger offset between commands and motion is a fault of the clocks, not of the robot
+
+@dataclass(frozen=True)
+class Limits:
+    """When two logs count as the same motion, and when measurements come late."""
+
+    alike: float = 5.0  # at most so many times a target's range is the range of what follows it
+    # s; a larger offset between commands and motion is a fault of the clocks, not of the robot
+    late: float = 0.3
+
+
+LIMITS = Limits()
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,7 +166,7 @@ def _targets(log: Log, mj_model: mujoco.MjModel) -> dict[str, Array]:
 
 def _vouched(log: Log, mj_model: mujoco.MjModel, related: Sequence[Relation], targets: Mapping[str, Array]) -> set[str]:
     """Joints whose positions have the model's unit: its dynamics, its range or its drives' targets say so."""
-    found = {r.joint for r in related if r.source == "ctrl" and (r.explained or 0.0) >= DOUBTFUL}
+    found = {r.joint for r in related if r.source == "ctrl" and (r.explained or 0.0) >= OF_EFFORT.doubtful}
     for j, joint in enumerate(log.joints):
         q = log.qpos[:, log.channels.columns(joint).start]
         low, high = mj_model.jnt_range[j]
@@ -164,7 +174,7 @@ def _vouched(log: Log, mj_model: mujoco.MjModel, related: Sequence[Relation], ta
         if mj_model.jnt_limited[j] and low - room <= q.min() and q.max() <= high + room:
             found.add(joint)
         moved = np.ptp(targets[joint]) if joint in targets else 0.0
-        if moved > 0 and 1 / ALIKE < np.ptp(q) / moved < ALIKE:
+        if moved > 0 and 1 / LIMITS.alike < np.ptp(q) / moved < LIMITS.alike:
             found.add(joint)
     return found
 
@@ -192,12 +202,12 @@ def _of_effort(related: Sequence[Relation]) -> list[Finding]:
         assert r.explained is not None
         if r in bad:
             out.append((refuse if 2 * len(bad) >= len(best) else warn)(_unrelated(r)))
-        elif r.explained < DOUBTFUL:
+        elif r.explained < OF_EFFORT.doubtful:
             text = f"{r.joint}: no model explains {percent(1 - r.explained)} of its effort ({r.source})"
             out.append(warn(f"{text} ({r.mend})" if r.mend else text))
         if r.lag and r not in bad:
             text = f"{r.joint}: its motion follows the effort ({r.source}) {r.lag * 1e3:+.0f} ms late"
-            out.append(warn(f"{text}: do the clocks agree?") if abs(r.lag) > LATE else Finding("finding", text))
+            out.append(warn(f"{text}: do the clocks agree?") if abs(r.lag) > LIMITS.late else Finding("finding", text))
     return out
 
 

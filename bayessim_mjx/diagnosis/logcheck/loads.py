@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
@@ -9,8 +11,19 @@ from numpy.typing import NDArray
 from bayessim_mjx.diagnosis.logcheck.drives import dof_of, is_effort
 
 Array = NDArray[np.float64]
-BESIDE, OUT = 1.2, 0.3  # reach of a load: of the body's own size, of the robot's length
-LEVER = 1e-6  # m: a shorter one carries nothing
+
+
+@dataclass(frozen=True)
+class Limits:
+    """When a load beside the model explains more than the model."""
+
+    # reach of a load: of the body's own size, of the robot's length
+    beside: float = 1.2
+    out: float = 0.3
+    lever: float = 1e-06  # m: a shorter one carries nothing
+
+
+LIMITS = Limits()
 
 
 def carried(model: mujoco.MjModel, places: Array) -> Array:
@@ -35,7 +48,7 @@ def carried(model: mujoco.MjModel, places: Array) -> Array:
         for body in np.flatnonzero(model.body_weldid):
             mujoco.mj_jacBodyCom(model, data, jacobian, None, int(body))
             torque = np.abs(model.opt.gravity @ jacobian)  # N m per kg
-            ruled = np.isfinite(room) & (torque > LEVER * 9.81)
+            ruled = np.isfinite(room) & (torque > LIMITS.lever * 9.81)
             out[body] = np.min(room[ruled] / torque[ruled], initial=out[body])
     return out
 
@@ -73,7 +86,7 @@ def weight(model: mujoco.MjModel, body: int) -> float:
 
 def reach(model: mujoco.MjModel, body: int) -> float:
     """m from the body's centre of mass to that of what it may carry: beyond the body itself, a tool's length."""
-    return max(BESIDE * size(model, body), OUT * _length(model, body))
+    return max(LIMITS.beside * size(model, body), LIMITS.out * _length(model, body))
 
 
 def _length(model: mujoco.MjModel, body: int) -> float:

@@ -14,11 +14,21 @@ from bayessim_mjx.logs.log import Array, Log
 from bayessim_mjx.logs.signals import estimate_velocity, quantum
 from bayessim_mjx.quantities import percent
 
-MIN_ROWS, MIN_STEPS = 20, 10  # fewer rows or control steps than this hold no window
-CLIPPED = 0.05  # share of the rows on one flat top
-HELD = 0.01  # of a target's range: it does not change
-MOMENT = 0.05  # s
-_REGISTERS = (2.0**16, 2.0**32)
+
+@dataclass(frozen=True)
+class Limits:
+    """What one log has to have, and which values are no measurements."""
+
+    # fewer rows or control steps than this hold no window
+    min_rows: int = 20
+    min_steps: int = 10
+    clipped: float = 0.05  # share of the rows on one flat top
+    held: float = 0.01  # of a target's range: it does not change
+    moment: float = 0.05  # s
+    registers: tuple[float, float] = (2.0**16, 2.0**32)
+
+
+LIMITS = Limits()
 _FASTEST = {"hinge": 150.0, "slide": 50.0}  # rad/s, m/s; faster: probably another unit
 
 
@@ -40,10 +50,11 @@ def warn(text: str) -> Finding:
 
 def size(log: Log, dt: float) -> Iterator[Finding]:
     """Rows, duration and rate against the control period dt [s]."""
-    if len(log) < MIN_ROWS or log.duration < MIN_STEPS * dt:
+    if len(log) < LIMITS.min_rows or log.duration < LIMITS.min_steps * dt:
         have = f"{len(log)} rows over {log.duration:.3g} s"
         yield refuse(
-            f"too short: {have}; allowed: at least {MIN_ROWS} rows and {MIN_STEPS} control steps of {dt:.3g} s"
+            f"too short: {have}; allowed: at least {LIMITS.min_rows} rows and {LIMITS.min_steps} control steps "
+            f"of {dt:.3g} s"
         )
     elif log.period > 20 * dt:
         yield refuse(f"one row per {log.period:.3g} s; allowed: up to 20 control periods of {dt:.3g} s")
@@ -95,7 +106,7 @@ def clipped(log: Log, targets: Mapping[str, Array]) -> Iterator[Finding]:
         for end in (float(x.max()), float(x.min())):
             flat = _flat(x, end)
             share = float(np.mean(flat))
-            if share > CLIPPED and not (target is not None and _steady(target, flat)):
+            if share > LIMITS.clipped and not (target is not None and _steady(target, flat)):
                 text = f"{name} is clipped at {end:.5g} ({percent(share)} of the rows"
                 drive = name.startswith("effort:")
                 yield Finding("finding", f"{text}; the drive's limit?)") if drive else warn(f"{text}; a hard stop?)")
@@ -112,7 +123,7 @@ def _measured(log: Log) -> Iterator[tuple[str, Array]]:
 def _steady(target: Array, rows: NDArray[np.bool_]) -> bool:
     """Whether a target has one value in most of these rows (a coarse encoder is there early), but not everywhere."""
     low, high = np.quantile(target[rows], (0.1, 0.9))
-    return bool(high - low < HELD * np.ptp(target))
+    return bool(high - low < LIMITS.held * np.ptp(target))
 
 
 def _flat(x: Array, end: float) -> NDArray[np.bool_]:
@@ -133,7 +144,7 @@ def wrapped(log: Log, dt: float) -> Iterator[Finding]:
         x = x[np.isfinite(x)]
         jump = float(np.abs(np.diff(x)).max(initial=0.0))
         for grain in {1.0, quantum(x)} - {0.0}:
-            for register in _REGISTERS:
+            for register in LIMITS.registers:
                 if abs(jump / grain - register) < 0.05 * register:
                     bits = int(np.log2(register))
                     text = f"{name} jumps by {jump:.6g}: a signed {bits}-bit register read as unsigned"
@@ -166,7 +177,7 @@ def units(log: Log, known: Collection[str] = ()) -> Iterator[Finding]:
 
 def _speed(log: Log, column: int) -> Array:
     """Speeds over MOMENT s: between two rows noise and jitter of the stamps are fast as well."""
-    each = max(1, round(MOMENT / log.period))
+    each = max(1, round(LIMITS.moment / log.period))
     return np.asarray(
         np.abs((log.qpos[each:, column] - log.qpos[:-each, column]) / (log.time[each:] - log.time[:-each]))
     )

@@ -18,9 +18,18 @@ from bayessim_mjx.diagnosis.residual.forcing import Linear, columns, linearise, 
 
 __all__ = ["Disturbance", "Linear", "columns", "estimate", "linearise", "node_basis", "pooled", "step_of_starts"]
 Array = NDArray[np.float64]
-AMPLITUDES = (1e-4, 1e-3, 1e-2, 1e-1)  # of the force scale, first guesses
-MEMORIES = (1.0, 4.0, 16.0)  # node spacings over which the force stays alike
-NOISE = (0.3, 1e6)  # limits of the factor on the noise's variance
+
+
+@dataclass(frozen=True)
+class Priors:
+    """Sizes and memories of the missing force that are tried, and ends of the noise."""
+
+    amplitudes: tuple[float, ...] = (0.0001, 0.001, 0.01, 0.1)  # of the force scale, first guesses
+    memories: tuple[float, ...] = (1.0, 4.0, 16.0)  # node spacings over which the force stays alike
+    noise: tuple[float, float] = (0.3, 1000000.0)  # limits of the factor on the noise's variance
+
+
+PRIORS = Priors()
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +150,7 @@ class _Posterior:
         amplitude = np.sqrt(weight @ second / (weight.sum() * self.linear.nodes))
         full = np.concatenate([np.repeat(self.p[None], len(self.d), 0), self.d], 1)
         left = q.at(full) + np.einsum("wij,wji->w", q.S[:, k:, k:], self.cov)
-        noise = float(np.clip(weight @ left / (weight.sum() * self.linear.r.shape[1]), *NOISE))
+        noise = float(np.clip(weight @ left / (weight.sum() * self.linear.r.shape[1]), *PRIORS.noise))
         return replace(self, amplitude=np.maximum(amplitude, 1e-7 * self.linear.scale), noise=noise).solved()
 
 
@@ -149,8 +158,8 @@ def _strongest(fitter: Fitter, fit: Fit, linear: Linear, free: bool) -> _Posteri
     """The best of a grid of amplitudes and memories, then refined."""
     trials = [
         _refined(_Posterior(linear, fit, free, memory, a * linear.scale).solved(), 2)
-        for memory in MEMORIES
-        for a in AMPLITUDES
+        for memory in PRIORS.memories
+        for a in PRIORS.amplitudes
     ]
     return _refined(max(trials, key=lambda t: t.evidence), 12)
 

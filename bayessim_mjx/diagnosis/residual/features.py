@@ -10,9 +10,18 @@ from numpy.typing import NDArray
 from bayessim_mjx.diagnosis.residual.motion_inputs import QUANTITIES, Inputs
 
 Array = NDArray[np.float64]
-RANDOM = 24  # random features per joint and seed
-PICKED = 5  # inputs of each
-LIMIT = 4.0  # standard deviations at which features are clipped: no extrapolation
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """How many features are drawn and kept, and how far they may extrapolate."""
+
+    random: int = 24  # random features per joint and seed
+    picked: int = 5  # inputs of each
+    limit: float = 4.0  # standard deviations at which features are clipped: no extrapolation
+
+
+SIZES = Sizes()
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,14 +46,14 @@ class Mapping:
         nv = len(inputs.joints)
         names = tuple((v, quantity) for v in range(nv) for quantity in QUANTITIES)
         rng = np.random.default_rng(seed)
-        weights = np.zeros((nv, RANDOM, len(names)))
+        weights = np.zeros((nv, SIZES.random, len(names)))
         for v in range(nv):
             own = np.array([1.0 if joint == v else 0.5 / max(nv - 1, 1) for joint, _ in names])
             own[[i for i, (_, q) in enumerate(names) if q == "time"]] *= 0.3
-            for f in range(RANDOM):
-                picked = rng.choice(len(names), PICKED, replace=False, p=own / own.sum())
-                weights[v, f, picked] = rng.normal(size=PICKED) * rng.choice([0.5, 1.0, 2.0])
-        return cls(names, weights, rng.uniform(-1.5, 1.5, (nv, RANDOM)))
+            for f in range(SIZES.random):
+                picked = rng.choice(len(names), SIZES.picked, replace=False, p=own / own.sum())
+                weights[v, f, picked] = rng.normal(size=SIZES.picked) * rng.choice([0.5, 1.0, 2.0])
+        return cls(names, weights, rng.uniform(-1.5, 1.5, (nv, SIZES.random)))
 
     def __call__(self, inputs: Inputs, average: Array) -> Features:
         """Standardised features at the nodes; the first call fixes the standardisation."""
@@ -64,7 +73,7 @@ class Mapping:
             mean, sd = values.mean((0, 1)), values.std((0, 1))
             self.moments.append((mean, np.where(sd > 1e-9 * (np.abs(mean) + 1e-9), sd, np.inf)))
         mean, sd = self.moments[which]
-        return np.clip((values - mean) / sd, -LIMIT, LIMIT)
+        return np.clip((values - mean) / sd, -SIZES.limit, SIZES.limit)
 
 
 def _single(values: Array) -> Array:

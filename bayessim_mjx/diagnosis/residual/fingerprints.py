@@ -17,8 +17,17 @@ from bayessim_mjx.diagnosis.residual.regions import Nodes
 from bayessim_mjx.diagnosis.statistics import interval
 
 Array = NDArray[np.float64]
-RECENT = 0.1  # s after a reversal
-SMALL = 0.2  # of the force's rms: contributions below are not mentioned
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What counts as just now, and as small."""
+
+    recent: float = 0.1  # s after a reversal
+    small: float = 0.2  # of the force's rms: contributions below are not mentioned
+
+
+LIMITS = Limits()
 
 
 @dataclass(frozen=True)
@@ -87,7 +96,9 @@ def _fingerprint(
     }
     size = max(float(np.sqrt(np.mean(y[node.used] ** 2))) if node.used.any() else 0.0, 1e-300)
     weight = {key: float(r) / size for key, r in zip(terms, rms, strict=True)}
-    told = [_told(numbers[key], words) for key, words in say.items() if numbers[key].clear and weight[key] > SMALL]
+    told = [
+        _told(numbers[key], words) for key, words in say.items() if numbers[key].clear and weight[key] > LIMITS.small
+    ]
     return Fingerprint(name, node.joint, f"{node.joint}: {head} {', '.join(told)}" if told else "", numbers, weight)
 
 
@@ -110,7 +121,7 @@ def fingerprints(
     s, one = np.sign(node.axes["direction"]), np.ones_like(w)
     load = np.abs(node.axes["load"])
     late = node.axes["time"] - node.axes["time"].mean()
-    recent = np.exp(-node.axes["time since reversal"] / RECENT)
+    recent = np.exp(-node.axes["time since reversal"] / LIMITS.recent)
     y = node.force
     slope, square = f"{unit}/({rate})", f"{unit}/({rate})^2"
     odd = {"offset": (one, unit), "constant": (-s, unit), "linear": (-w, slope), "quadratic": (-w * np.abs(w), square)}
@@ -135,7 +146,7 @@ def fingerprints(
         ),
         _fingerprint(
             "time since reversal", node, y, {"constant": (-s, unit), "recent": (-s * recent, unit)}, without,
-            {"recent": "more/less"}, f"within {RECENT:g} s after reversals the force against the motion is",
+            {"recent": "more/less"}, f"within {LIMITS.recent:g} s after reversals the force against the motion is",
         ),
     ]  # fmt: skip
     return [*out, _lag(fitter, fit, disturbance, inputs, dof, node, without)]

@@ -22,12 +22,21 @@ from bayessim_mjx.diagnosis.statistics import normal_deviate
 from bayessim_mjx.quantities import percent
 
 Array = NDArray[np.float64]
-RIDGES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)  # of the mean curvature of each joint's features
-BLOCK = 1.0  # s, held-out blocks within conditions
-FOLDS = 4
-SLACK = 0.02  # of the best ridge's gain, for a plainer model
-QUIET = 1.1  # squared residual per sample that counts as noise alone
-IMPORTANT = 0.1  # share of the gain that an input must carry to be named
+
+
+@dataclass(frozen=True)
+class Rules:
+    """How a flexible force is fitted and when it counts."""
+
+    ridges: tuple[float, ...] = (0.0001, 0.001, 0.01, 0.1, 1.0)  # of the mean curvature of each joint's features
+    block: float = 1.0  # s, held-out blocks within conditions
+    folds: int = 4
+    slack: float = 0.02  # of the best ridge's gain, for a plainer model
+    quiet: float = 1.1  # squared residual per sample that counts as noise alone
+    important: float = 0.1  # share of the gain that an input must carry to be named
+
+
+RULES = Rules()
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +106,7 @@ def flexible(
     disturbance: Disturbance | None = None,
     *,
     seeds: Sequence[int] = (0, 1, 2, 3, 4),
-    ridges: Sequence[float] = RIDGES,
+    ridges: Sequence[float] = RULES.ridges,
 ) -> Flexible:
     """Fit and score a flexible force on top of a fit.
 
@@ -108,7 +117,10 @@ def flexible(
     windows = fitter.simulator.windows
     inputs = motion_inputs.measured(windows, fitter.simulator.physics.mj_model)
     problem = Regression(fitter, fit, disturbance, inputs)
-    folds = {"condition": windows.group, "interpolation": blocks(windows.log, windows.start, round(BLOCK / windows.dt))}
+    folds = {
+        "condition": windows.group,
+        "interpolation": blocks(windows.log, windows.start, round(RULES.block / windows.dt)),
+    }
     folds = {name: np.unique(fold, return_inverse=True)[1] for name, fold in folds.items()}
     runs = {seed: Seeded(problem, seed) for seed in seeds}
     held = {name: _held(problem, runs, fold, ridges) for name, fold in folds.items()}
@@ -124,7 +136,7 @@ def flexible(
 
 def blocks(log: NDArray[np.int64], start: NDArray[np.int64], steps: int) -> NDArray[np.int64]:
     """Fold `[W]` of each window: consecutive blocks of `steps` control steps go to the folds in turn."""
-    return (start // max(steps, 1) + log) % FOLDS
+    return (start // max(steps, 1) + log) % RULES.folds
 
 
 def _held(problem: Regression, runs: dict[int, Seeded], fold: NDArray[np.int64], ridges: Sequence[float]) -> Held:
@@ -146,7 +158,7 @@ def _held(problem: Regression, runs: dict[int, Seeded], fold: NDArray[np.int64],
 
 def _widest(totals: Array, base: float) -> int:
     """The largest ridge that loses little of the best one's gain: fewer features that cancel each other."""
-    allowed = totals.min() + SLACK * max(base - totals.min(), 0.0)
+    allowed = totals.min() + RULES.slack * max(base - totals.min(), 0.0)
     return int(np.flatnonzero(totals <= allowed).max())
 
 
@@ -186,7 +198,7 @@ def _by_joint(problem: Regression, run: Seeded, fold: NDArray[np.int64], fits: l
 def _words(held: dict[str, Held], importance: list[dict], where: dict[str, float], samples: int) -> list[str]:
     if not any(h.significant for h in held.values()):
         return ["a flexible force finds nothing more that would hold on data not used for fitting"]
-    if all(float(h.base.mean()) < QUIET * samples for h in held.values()):
+    if all(float(h.base.mean()) < RULES.quiet * samples for h in held.values()):
         return ["what is left lies within the measurement noise; of it a flexible force still finds a part"]
     text = []
     for name, h in held.items():
@@ -194,6 +206,8 @@ def _words(held: dict[str, Held], importance: list[dict], where: dict[str, float
         share = h.gain / max(float(h.base.sum()), 1e-300)
         text.append(f"on {how} a flexible force removes {percent(share)} of the squared gap that is left")
     joints = [j for j, share in where.items() if share > 0.2 * max(where.values())]
-    inputs = [d["input"] for d in importance if d["importance"] > IMPORTANT * max(importance[0]["importance"], 0.5)][:4]
+    inputs = [
+        d["input"] for d in importance if d["importance"] > RULES.important * max(importance[0]["importance"], 0.5)
+    ][:4]
     depends = f"depends on {', '.join(inputs)}" if inputs else "depends on nothing that was measured: it is constant"
     return [*text, f"what is missing acts at {', '.join(joints)} and {depends}"]

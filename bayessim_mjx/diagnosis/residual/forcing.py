@@ -12,8 +12,18 @@ from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 from bayessim_mjx.diagnosis.fitting.quadratic import Quadratic, Starts, eliminate
 
 Array = NDArray[np.float64]
-PULSE = 0.03  # of the robot's force scale: finite differences
-COLUMNS = 72  # about so many forces per window unless told otherwise; each costs one simulation of all windows
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Pulses by which the missing force is told."""
+
+    pulse: float = 0.03  # of the robot's force scale: finite differences
+    # about so many forces per window unless told otherwise; each costs one simulation of all windows
+    columns: int = 72
+
+
+SIZES = Sizes()
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +58,7 @@ class Linear:
 def default_nodes(fitter: Fitter) -> int:
     """One node per control step for small robots, fewer where every joint needs its own columns."""
     steps, nv = fitter.simulator.windows.steps, fitter.simulator.nv
-    return min(steps, max(6, COLUMNS // nv))
+    return min(steps, max(6, SIZES.columns // nv))
 
 
 def node_basis(steps: int, nodes: int) -> Array:
@@ -68,7 +78,7 @@ def columns(fitter: Fitter, fit: Fit, knots: int, scale: Array | None = None) ->
     """D `[W, n, nv knots]`, one simulation of all windows per column, start states as in the fit."""
     windows, nv = fitter.simulator.windows, fitter.simulator.nv
     basis = node_basis(windows.steps, knots)
-    pulse = PULSE * (force_scale(fitter) if scale is None else scale)
+    pulse = SIZES.pulse * (force_scale(fitter) if scale is None else scale)
     force = np.zeros((nv, knots, 1, windows.steps, nv))
     for v in range(nv):
         force[v, :, 0, :, v] = basis.T * pulse[v]

@@ -20,14 +20,25 @@ from bayessim_mjx.diagnosis.residual.motion_inputs import Inputs
 from bayessim_mjx.diagnosis.residual.regions import discoveries
 
 Array = NDArray[np.float64]
-SEGMENT = 4.0  # s
-TAPERS, BANDWIDTH = 4, 2.5  # of the multitaper estimate (Thomson, 1982)
-COHERENT = 0.5  # below this a frequency says nothing about phase
-LINE = 6.0  # a line stands so many times above its surroundings
-SMALL = 0.1  # of the force's rms: smaller orders are not mentioned
-STANDS = 4.0  # an order stands so many times above the others
-LEAST = 16  # values in a row that a spectrum is made of
-TURNS = 2.0  # periods that an order must have within the range of motion
+
+
+@dataclass(frozen=True)
+class Rules:
+    """How spectra are estimated and when something stands out of them."""
+
+    segment: float = 4.0  # s
+    # of the multitaper estimate (Thomson, 1982)
+    tapers: int = 4
+    bandwidth: float = 2.5
+    coherent: float = 0.5  # below this a frequency says nothing about phase
+    line: float = 6.0  # a line stands so many times above its surroundings
+    small: float = 0.1  # of the force's rms: smaller orders are not mentioned
+    stands: float = 4.0  # an order stands so many times above the others
+    least: int = 16  # values in a row that a spectrum is made of
+    turns: float = 2.0  # periods that an order must have within the range of motion
+
+
+RULES = Rules()
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,8 +69,8 @@ class Spectra:
 def spectra(x: Sequence[Array], y: Sequence[Array], dt: float, log: Sequence[int] | None = None) -> Spectra:
     """Of pairs of series of any lengths; each is cut into segments of one common length that overlap by half."""
     shortest = min(len(a) for a in x)
-    size = min(int(round(SEGMENT / dt)), max(shortest, LEAST))
-    tapers = np.asarray(dpss(size, BANDWIDTH, TAPERS))
+    size = min(int(round(RULES.segment / dt)), max(shortest, RULES.least))
+    tapers = np.asarray(dpss(size, RULES.bandwidth, RULES.tapers))
     rows, owner = [], []
     for i, (a, b) in enumerate(zip(x, y, strict=True)):
         for start in range(0, len(a) - size + 1, max(size // 2, 1)):
@@ -79,7 +90,7 @@ def delay(found: Spectra, top: float = np.inf) -> Number:
     coherence = found.coherence
     # where a wrapped phase could be meant, a delay is ambiguous: stop at the first jump of the phase
     phase = np.unwrap(np.angle(found.response))
-    use = (coherence > COHERENT) & (found.hz <= top)
+    use = (coherence > RULES.coherent) & (found.hz <= top)
     weight = np.where(use, coherence / np.maximum(1 - coherence, 1e-3), 0.0)
     omega = 2 * np.pi * found.hz
 
@@ -115,7 +126,7 @@ def orders(disturbance: Disturbance, inputs: Inputs, dof: int, without: Array, m
     average = basis / basis.sum(0)
     spacing = float(np.median(np.diff(disturbance.time))) if len(disturbance.time) > 1 else np.inf
     pace = float(np.median(np.abs(inputs.speed[..., dof])))
-    first, last = int(np.ceil(TURNS * 2 * np.pi / np.ptp(q))), int(min(most, np.pi / max(pace * spacing, 1e-9)))
+    first, last = int(np.ceil(RULES.turns * 2 * np.pi / np.ptp(q))), int(min(most, np.pi / max(pace * spacing, 1e-9)))
     tried = np.arange(max(first, 1), last + 1)
     if not len(tried):
         return []
@@ -127,7 +138,7 @@ def orders(disturbance: Disturbance, inputs: Inputs, dof: int, without: Array, m
     size = np.array([f["amplitude"] for f in found])
     padded = np.pad(size, 1)
     peak = (size >= padded[2:]) & (size >= padded[:-2])  # a short range of motion smears an order over its neighbours
-    large = peak & (size > SMALL * np.sqrt(np.mean(y**2))) & (size > STANDS * np.median(size))
+    large = peak & (size > RULES.small * np.sqrt(np.mean(y**2))) & (size > RULES.stands * np.median(size))
     return [f for f, is_strong in zip(found, strong & large, strict=True) if is_strong]
 
 
@@ -147,7 +158,7 @@ def line(hz: Array, power: Array, lowest: float = 1.0) -> tuple[float, float]:
     around = np.array([np.median(power[max(0, i - 12) : i + 13]) for i in range(len(power))])
     height = np.where(hz >= lowest, power / np.maximum(around, 1e-300), 0.0)
     best = int(np.argmax(height))
-    return (float(hz[best]), float(height[best])) if height[best] > LINE else (float("nan"), 0.0)
+    return (float(hz[best]), float(height[best])) if height[best] > RULES.line else (float("nan"), 0.0)
 
 
 def analyse(fitter: Fitter, fit: Fit, disturbance: Disturbance | None = None) -> tuple[list[dict], list[str]]:
@@ -161,7 +172,7 @@ def analyse(fitter: Fitter, fit: Fit, disturbance: Disturbance | None = None) ->
     windows = fitter.simulator.windows
     inputs = motion_inputs.measured(windows, fitter.simulator.physics.mj_model)
     nodes = disturbance.linear.nodes
-    parts = [part for part in runs(windows) if len(part) * min(nodes, windows.steps) >= LEAST]
+    parts = [part for part in runs(windows) if len(part) * min(nodes, windows.steps) >= RULES.least]
     if not parts:  # windows of chaotic motion lie apart
         return [], []
     theta = fitter.vector(fit.coordinates, fit.values)

@@ -15,7 +15,18 @@ from bayessim_mjx.logs.log import Log
 
 Array = NDArray[np.float64]
 _AXIAL = (int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE))
-MOVING = (0.003, 0.03)  # of the speed scale: limits of the speed below which a joint has no direction of its own
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """What counts as moving, and how far back inputs reach."""
+
+    # of the speed scale: limits of the speed below which a joint has no direction of its own
+    moving: tuple[float, float] = (0.003, 0.03)
+    lags: tuple[int, int] = (1, 3)  # control steps of past effort
+
+
+SIZES = Sizes()
 # no measured acceleration: with effort and pose it *is* the residual of inverse dynamics, noise included, so that a
 # force that depends on it explains everything, held out or not
 QUANTITIES = ("position", "speed", "direction", "stop", "load", "effort", "past", "pull", "since_reversal", "time")
@@ -25,7 +36,6 @@ WORDS = {
     "load": "gravity load", "effort": "effort", "past": "past effort", "pull": "expected acceleration",
     "since_reversal": "time since reversal", "time": "time",
 }  # fmt: skip
-LAGS = (1, 3)  # control steps of past effort
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,12 +121,12 @@ def _scale(values: Array) -> Array:
 
 def _of_log(log: Log, index: int, windows: Windows, model: mujoco.MjModel, speed_scale: Array) -> dict[str, Array]:
     position = _positions(log, model)
-    slow = np.clip(3 * log.sigma_qvel, MOVING[0] * speed_scale, MOVING[1] * speed_scale)
+    slow = np.clip(3 * log.sigma_qvel, SIZES.moving[0] * speed_scale, SIZES.moving[1] * speed_scale)
     direction, since = _direction(log.qvel, slow, windows.dt)
     travel = np.maximum(np.ptp(position, axis=0), 1e-9)
     widths = [np.maximum(f * travel, 4 * windows.sigma_q) for f in (0.01, 0.05)]
     load, effort, pull = _forces(log, model, windows, index)
-    past = [np.concatenate([effort[:lag] * 0, effort[:-lag] - effort[lag:]]) for lag in LAGS]
+    past = [np.concatenate([effort[:lag] * 0, effort[:-lag] - effort[lag:]]) for lag in SIZES.lags]
     return {
         "position": position,
         "speed": log.qvel,

@@ -13,10 +13,22 @@ from bayessim_mjx.diagnosis.residual.motion_inputs import Inputs
 from bayessim_mjx.diagnosis.statistics import interval
 
 Array = NDArray[np.float64]
-BINS = 8
-LEAST = 0.3  # of the best reliability: nodes below tell nothing
-RATE = 0.05  # false discoveries among the significant bins
-SHUFFLES = 300
+
+
+@dataclass(frozen=True)
+class Rules:
+    """How states are split into regions, and when a region is told."""
+
+    bins: int = 8
+    least: float = 0.3  # of the best reliability: nodes below tell nothing
+    rate: float = 0.05  # false discoveries among the significant bins
+    shuffles: int = 300
+    depth: int = 3
+    filled: float = 0.05  # of all nodes, at least, in every leaf
+    worth: float = 0.05  # of held-out power that a deeper tree must gain
+
+
+RULES = Rules()
 ALONG = "force along the motion"
 # axis -> (quantity, of what force): along the motion means times the direction of motion
 AXES = {
@@ -50,7 +62,7 @@ class Nodes:
 
     @property
     def used(self) -> NDArray[np.bool_]:
-        return self.reliability > LEAST * self.reliability.max()
+        return self.reliability > RULES.least * self.reliability.max()
 
     def along(self) -> Array:
         """Force times direction of motion: negative is against it."""
@@ -81,7 +93,9 @@ def bins(node: Nodes, axis: str) -> tuple[Array, NDArray[np.int64]]:
         edges = np.array([-1.0, 0.0, 1.0])
     else:
         edges = (
-            np.unique(np.quantile(values[node.used], np.linspace(0, 1, BINS + 1))) if node.used.any() else np.zeros(1)
+            np.unique(np.quantile(values[node.used], np.linspace(0, 1, RULES.bins + 1)))
+            if node.used.any()
+            else np.zeros(1)
         )
     if len(edges) < 3:
         return np.zeros(0), np.full(values.shape, -1)
@@ -124,8 +138,8 @@ def _p_values(
     used = index >= 0
     centre = np.sum(force[used]) / max(float(np.sum(reliability[used])), 1e-9)
     left = np.where(used, force - centre * reliability, 0.0)
-    null = np.zeros((SHUFFLES, count))
-    for k in range(SHUFFLES):
+    null = np.zeros((RULES.shuffles, count))
+    for k in range(RULES.shuffles):
         shuffled = index[rng.permutation(len(index))]
         both = used & (shuffled >= 0)
         below = np.bincount(shuffled[both], reliability[both], count)
@@ -134,7 +148,7 @@ def _p_values(
     return np.array([erfc(x / np.sqrt(2)) for x in z])
 
 
-def discoveries(p: Array, rate: float = RATE) -> NDArray[np.bool_]:
+def discoveries(p: Array, rate: float = RULES.rate) -> NDArray[np.bool_]:
     """Benjamini and Hochberg (1995): which of many hypotheses to reject."""
     order = np.argsort(p)
     passed = np.flatnonzero(p[order] <= rate * np.arange(1, len(p) + 1) / max(len(p), 1))
@@ -167,18 +181,15 @@ SPLITS = {
     "force": ("position", "direction", "load", "effort", "time", "speed"),
     ALONG: ("speed size", "load size", "effort size", "time since reversal", "position", "direction", "time"),
 }
-DEPTH = 3
-FILLED = 0.05  # of all nodes, at least, in every leaf
-WORTH = 0.05  # of held-out power that a deeper tree must gain
 
 
 def tree(node: Nodes, group: NDArray[np.int64]) -> Tree:
     """The shallowest tree, of either kind of force, that predicts the force of held-out groups about best."""
     best: tuple[float, str, int] | None = None
-    for depth in range(DEPTH + 1):
+    for depth in range(RULES.depth + 1):
         for target in SPLITS:
             r2 = _held_out(node, target, depth, group)
-            if best is None or r2 > best[0] + WORTH:
+            if best is None or r2 > best[0] + RULES.worth:
                 best = (r2, target, depth)
     assert best is not None
     r2, target, depth = best
@@ -206,7 +217,7 @@ def _table(node: Nodes, target: str) -> tuple[Array, Array, dict[str, Array]]:
 def _grow(y: Array, rel: Array, x: dict[str, Array], pick: NDArray[np.bool_], depth: int, where: tuple) -> list:
     """[(conditions, rows)] of the leaves below the rows `pick`."""
     best = (0.0, "", 0.0)
-    least = FILLED * len(y)
+    least = RULES.filled * len(y)
     if depth and pick.any():
         for axis, values in x.items():
             for limit in np.unique(np.quantile(values[pick], np.linspace(0.1, 0.9, 9))):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,9 +16,18 @@ from bayessim_mjx.diagnosis.residual.regions import ALONG, Leaf, Nodes, Tree
 from bayessim_mjx.diagnosis.result import Place
 
 Array = NDArray[np.float64]
-QUIET = 1.1  # squared residual per sample that counts as noise alone
-WORTH = 0.1  # share of the gap that makes a joint worth a sentence
-TOLD = 0.15  # share of a joint's missing power that a region must explain to be told
+
+
+@dataclass(frozen=True)
+class Rules:
+    """When a place is worth telling."""
+
+    quiet: float = 1.1  # squared residual per sample that counts as noise alone
+    worth: float = 0.1  # share of the gap that makes a joint worth a sentence
+    told: float = 0.15  # share of a joint's missing power that a region must explain to be told
+
+
+RULES = Rules()
 
 
 def locate(
@@ -30,7 +41,7 @@ def locate(
     Returns:
         (places, largest share first; maps of the missing force, see `regions.force_map`; sentences).
     """
-    if float(fit.quadratic(fitter.spread)[0].c.mean()) < QUIET * fitter.size:
+    if float(fit.quadratic(fitter.spread)[0].c.mean()) < RULES.quiet * fitter.size:
         return [], [], ["what this model leaves lies within the measurement noise"]
     disturbance = estimate(fitter, fit) if disturbance is None else disturbance
     windows, model = fitter.simulator.windows, fitter.simulator.physics.mj_model
@@ -41,7 +52,7 @@ def locate(
     kept = np.maximum(each.sum(0), 0.0)
     share, spread = kept / max(kept.sum(), 1e-300), statistics.interval_of_shares(each, windows.group)
     node = [regions.nodes(disturbance, inputs, v) for v in range(len(share))]
-    worth = [v for v in np.argsort(-share) if share[v] > WORTH]
+    worth = [v for v in np.argsort(-share) if share[v] > RULES.worth]
     maps = _maps([node[v] for v in worth], without, rng)
     trees = {v: regions.tree(node[v], windows.group) for v in worth}
     sentences = [s for v in worth for s in _sentences(node[v], trees[v])]
@@ -78,7 +89,7 @@ def _maps(nodes: list[Nodes], without: Array, rng: np.random.Generator) -> list[
 
 
 def _told(found: Tree) -> list[Leaf]:
-    return [leaf for leaf in found.leaves if leaf.share > TOLD and found.r2 > TOLD][:3]
+    return [leaf for leaf in found.leaves if leaf.share > RULES.told and found.r2 > RULES.told][:3]
 
 
 def _sentences(node: Nodes, found: Tree) -> list[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.metadata
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,9 +22,18 @@ from bayessim_mjx.diagnosis.summary.sentences import horizon_warning, sentences
 from bayessim_mjx.diagnosis.summary.whole_logs import Whole
 from bayessim_mjx.logs.log import Channels
 
-UNEXPLAINED = 1.5  # noise standard deviations that remain and that nothing predicts
-LITTLE = 0.3  # share of the calibrated gap that named effects may leave
-REMAINS = 0.3  # share of the calibrated gap that a flexible force closes on top of named effects: not in the library
+
+@dataclass(frozen=True)
+class Limits:
+    """When a verdict says that something remains unexplained."""
+
+    unexplained: float = 1.5  # noise standard deviations that remain and that nothing predicts
+    little: float = 0.3  # share of the calibrated gap that named effects may leave
+    # share of the calibrated gap that a flexible force closes on top of named effects: not in the library
+    remains: float = 0.3
+
+
+LIMITS = Limits()
 
 
 def diagnosis_of(found: Findings, about: Mapping[str, Any] | None = None, file: str = "") -> Diagnosis:
@@ -93,17 +103,17 @@ def _verdict(found: Findings, remains: float, far: Gap) -> str:
         return "unexplained"  # partly explained: what is left still matters
     cost = {k: float(p.cost(found.setup.fitter.simulator.windows.steps).mean()) for k, p in found.predictions.items()}
     left = cost["with_effects"] - 1.0
-    if model.effects and left > UNEXPLAINED**2 - 1.0 and left > LITTLE * (cost["calibrated"] - 1.0):
+    if model.effects and left > LIMITS.unexplained**2 - 1.0 and left > LIMITS.little * (cost["calibrated"] - 1.0):
         return "unexplained"  # what is named closes little of it
     if (
         race.above_noise(model)
-        and remains > REMAINS
+        and remains > LIMITS.remains
         or (model.effects and found.flexible_winner is not None and _beaten(found))
     ):
         return "unexplained"
     if model.effects:
         return "ambiguous" if found.outcome.ambiguous else "effects"
-    if np.sqrt(race.base.total / (race.noise * len(race.base.cost))) > UNEXPLAINED:
+    if np.sqrt(race.base.total / (race.noise * len(race.base.cost))) > LIMITS.unexplained:
         return "unexplained"
     q, _ = race.nominal.quadratic(race.fitter.spread)
     floor = race.noise * len(race.base.cost) * race.settings.floor**2

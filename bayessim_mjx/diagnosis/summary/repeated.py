@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import mujoco
 import numpy as np
@@ -15,8 +16,17 @@ from bayessim_mjx.diagnosis.selection.heldout import Prediction
 from bayessim_mjx.logs.log import Log
 
 Array = NDArray[np.float64]
-FEWEST = 3  # windows with a repeat: with fewer nothing is said
-SAME = 1e-3  # of a command's range: commands that are the same
+
+
+@dataclass(frozen=True)
+class Limits:
+    """When runs count as repeated."""
+
+    fewest: int = 3  # windows with a repeat: with fewer nothing is said
+    same: float = 0.001  # of a command's range: commands that are the same
+
+
+LIMITS = Limits()
 
 
 def floor(fitter: Fitter, fit: Fit, logs: Sequence[Log]) -> tuple[Prediction, NDArray[np.int64]] | None:
@@ -39,7 +49,7 @@ def floor(fitter: Fitter, fit: Fit, logs: Sequence[Log]) -> tuple[Prediction, ND
         d = _apart(fitter.simulator.physics.mj_model, a[rows], b[rows])[:, fitter.used] / fitter.sigma / np.sqrt(2)
         errors.append(_settled(d, fit.B[w], fitter.spread))
         group.append(cut.group[w])
-    if len(errors) < FEWEST:
+    if len(errors) < LIMITS.fewest:
         return None
     return Prediction(np.stack(errors), np.zeros((len(errors), fit.offsets.shape[1]))), np.array(group)
 
@@ -59,7 +69,7 @@ def _pairs(fitter: Fitter, logs: Sequence[Log]) -> Iterator[tuple[int, int]]:
 
 
 def _same(a: Array, b: Array, rows: slice) -> bool:
-    return bool((np.abs(a[rows] - b[rows]) <= SAME * np.ptp(a, axis=0) + 1e-12).all())
+    return bool((np.abs(a[rows] - b[rows]) <= LIMITS.same * np.ptp(a, axis=0) + 1e-12).all())
 
 
 def _states(model: mujoco.MjModel, log: Log) -> Array:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from bayessim_mjx.diagnosis import statistics
@@ -13,8 +14,16 @@ from bayessim_mjx.diagnosis.selection.verdict import Rival
 from bayessim_mjx.diagnosis.vocabulary import listed, missing
 from bayessim_mjx.quantities import extent, percent
 
-CLEAR = 1.2  # noise variances above which a horizon's gap is worth a share
-TOLD = 6  # joints told one by one
+
+@dataclass(frozen=True)
+class Limits:
+    """What is worth a sentence, and how much of it is told."""
+
+    clear: float = 1.2  # noise variances above which a horizon's gap is worth a share
+    told: int = 6  # joints told one by one
+
+
+LIMITS = Limits()
 HEADS = {
     "no_gap": "No gap above the noise: the logs differ from the simulator by {nominal}.",
     "parameters": "The parameters are off, the structure is right: recalibrated, the gap falls from {nominal} to "
@@ -150,8 +159,8 @@ def _by_joint(far: Gap, effects: bool) -> str:
     stages = ("calibrated", "with_effects") if effects else ("nominal", "calibrated")
     words = "recalibrated and with the effects" if effects else "as delivered and recalibrated"
     names = _worst(far)
-    rows = [(n, [extent(far.physical[n][s], far.physical[n]["unit"]) for s in stages]) for n in names[:TOLD]]
-    more = f"; {len(names) - TOLD} more in the table" if len(names) > TOLD else ""
+    rows = [(n, [extent(far.physical[n][s], far.physical[n]["unit"]) for s in stages]) for n in names[: LIMITS.told]]
+    more = f"; {len(names) - LIMITS.told} more in the table" if len(names) > LIMITS.told else ""
     return f"By joint, {words}: {'; '.join(f'{n} {a}, {b}' for n, (a, b) in rows)}{more}."
 
 
@@ -171,7 +180,7 @@ def horizon_warning(gap: Gap) -> list[str]:
     closed = {
         row["name"]: statistics.share_of_gap(row["calibrated"] ** 2 - row["with_effects"] ** 2, row["calibrated"] ** 2)
         for row in gap.horizons
-        if row["calibrated"] ** 2 > CLEAR
+        if row["calibrated"] ** 2 > LIMITS.clear
     }
     if len(closed) < 2 or max(closed.values()) - min(closed.values()) < 0.3:
         return []

@@ -17,11 +17,24 @@ from bayessim_mjx.diagnosis.setup import Setup
 from bayessim_mjx.quantities import percent
 
 Array = NDArray[np.float64]
-LOGS, SECONDS = 8, 10.0  # at most
-DRAWS = 4  # of the start state
-CLEAR, PART = 3.0, 0.1  # noise sd and share of the motion: what a start's uncertainty may grow to
-LEAST = 2  # windows that a log must be predictable for
-LOST = 999.0  # the simulator's mark of what is not finite
+
+
+@dataclass(frozen=True)
+class Rules:
+    """How much of whole logs is simulated, and what is told of it."""
+
+    # at most
+    logs: int = 8
+    seconds: float = 10.0
+    draws: int = 4  # of the start state
+    # noise sd and share of the motion: what a start's uncertainty may grow to
+    clear: float = 3.0
+    part: float = 0.1
+    least: int = 2  # windows that a log must be predictable for
+    lost: float = 999.0  # the simulator's mark of what is not finite
+
+
+RULES = Rules()
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,12 +81,12 @@ def simulate(found: Findings) -> Whole:
     if found.model.effects:
         stages["with_effects"] = _Stage(found.model, found.predictions["with_effects"], False)
     logs = np.unique(cut.log)
-    logs = logs[np.unique(np.linspace(0, len(logs) - 1, min(len(logs), LOGS)).round().astype(int))]
+    logs = logs[np.unique(np.linspace(0, len(logs) - 1, min(len(logs), RULES.logs)).round().astype(int))]
     first = [int(np.flatnonzero(cut.log == r)[0]) for r in logs]
     starts = [int(cut.start[w]) for w in first]
-    most = round(SECONDS / cut.dt)
+    most = round(RULES.seconds / cut.dt)
     length = [min(len(cut.logs[r]) - 1 - a, most) for r, a in zip(logs, starts, strict=True)]
-    simulator = _simulator(found, logs, starts, max(length), len(stages) + DRAWS)
+    simulator = _simulator(found, logs, starts, max(length), len(stages) + RULES.draws)
     errors, spread = [], []
     for i, (w, steps) in enumerate(zip(first, length, strict=True)):
         rows = _one(found, simulator, stages, i, w)[:, :steps]
@@ -102,11 +115,11 @@ def _one(found: Findings, simulator: Simulator, stages: dict[str, _Stage], i: in
     offsets = [s.prediction.offsets[w] for s in stages.values()]
     B = list(stages.values())[-1].model.fit.B[w]
     root = np.linalg.cholesky(np.linalg.inv(B.T @ B + np.diag(1 / fitter.spread**2)))
-    draws = np.random.default_rng(found.setup.seed).normal(size=(DRAWS, len(root))) @ root.T
-    thetas += [thetas[-1]] * DRAWS
+    draws = np.random.default_rng(found.setup.seed).normal(size=(RULES.draws, len(root))) @ root.T
+    thetas += [thetas[-1]] * RULES.draws
     moved = np.stack([*offsets, *(offsets[-1] + draws)])[:, None]
     raw = simulator.run(np.stack(thetas), moved, np.array([i]))[:, 0]
-    raw[np.abs(raw) >= LOST] = np.nan
+    raw[np.abs(raw) >= RULES.lost] = np.nan
     return np.asarray(raw[..., fitter.used] / fitter.sigma)
 
 
@@ -135,7 +148,7 @@ def _judged(
     last = [_predictable(s, m) for s, m in zip(spread, size, strict=True)]
     chaotic = [n for n, k, e in zip(names, last, errors, strict=True) if k < e.shape[1]]
     broken = [n for n, k, e in zip(names, last, errors, strict=True) if not np.isfinite(e[:, :k]).all()]
-    kept = [i for i, n in enumerate(names) if n not in broken and last[i] >= LEAST * cut.steps]
+    kept = [i for i, n in enumerate(names) if n not in broken and last[i] >= RULES.least * cut.steps]
     cost = {s: np.array([np.mean(errors[i][k, : last[i]] ** 2) for i in kept]) for k, s in enumerate(stages)}
     nv = setup.physics.mj_model.nv
     each = {s: np.array([np.mean(errors[i][k, : last[i], :nv] ** 2, 0) for i in kept]) for k, s in enumerate(stages)}
@@ -144,7 +157,7 @@ def _judged(
     longest = max((last[i] for i in kept), default=0) * cut.dt
     notes = _notes(names, kept, chaotic, broken, longest)
     notes += _away(stages, [[errors[i][k, : last[i]] / size[i] for i in kept] for k in range(len(stages))])
-    whole = not chaotic and longest < SECONDS - cut.dt
+    whole = not chaotic and longest < RULES.seconds - cut.dt
     return Whole(
         cost=cost,
         by_channel=each,
@@ -165,14 +178,14 @@ def _motion(setup: Setup, name: str) -> Array:
         moved[:, : model.nv] = log.qpos
     else:  # quaternions: the path travelled stands for the coordinates
         moved[:, : model.nv] = np.cumsum(log.qvel, axis=0) * log.period
-    return np.maximum(np.std(moved, axis=0)[setup.fitter.used] / setup.fitter.sigma, CLEAR / PART)
+    return np.maximum(np.std(moved, axis=0)[setup.fitter.used] / setup.fitter.sigma, RULES.clear / RULES.part)
 
 
 def _predictable(spread: Array, size: Array) -> int:
     """Control steps until the start's uncertainty has grown to a part of the motion (or left what is finite)."""
     with np.errstate(invalid="ignore"):
         grown = np.sqrt(np.mean((spread / size) ** 2, axis=(0, 2)))
-    far = np.flatnonzero(~(grown < PART))
+    far = np.flatnonzero(~(grown < RULES.part))
     return int(far[0]) if len(far) else spread.shape[1]
 
 
@@ -182,7 +195,7 @@ def _notes(names: list[str], kept: list[int], chaotic: list[str], broken: list[s
         used = f"they count up to there (at most {longest:.2g} s)" if kept else "no horizon beyond the windows is given"
         which = f"{len(chaotic)} of {len(names)} logs ({', '.join(chaotic[:4])})"
         out.append(
-            f"unstable or chaotic motion: in {which} the uncertainty of the start alone grows to {percent(PART)} "
+            f"unstable or chaotic motion: in {which} the uncertainty of the start alone grows to {percent(RULES.part)} "
             f"of the motion, so no simulator can predict them whole; {used}"
         )
     if broken:

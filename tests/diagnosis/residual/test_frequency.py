@@ -1,5 +1,7 @@
 """Delays, responses, orders and lines of signals and of logs where they are known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -87,5 +89,5 @@ def test_windows_too_short_and_apart_have_no_spectrum(monkeypatch):
     """Of unstable motion only some windows are kept, so that none follows another."""
     fitter, fit = fitted(record(logs=2, seconds=2.0), iterations=0)
     monkeypatch.setattr(frequency, "runs", lambda windows: [np.array([i]) for i in range(len(windows.log))])
-    monkeypatch.setattr(frequency, "LEAST", 2 * fitter.simulator.windows.steps)
+    monkeypatch.setattr(frequency, "RULES", replace(frequency.RULES, least=2 * fitter.simulator.windows.steps))
     assert frequency.analyse(fitter, fit, disturbance.estimate(fitter, fit)) == ([], [])

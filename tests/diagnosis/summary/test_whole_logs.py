@@ -27,7 +27,7 @@ def test_a_log_begins_as_its_first_window(rubbing):
     }
     first = int(np.flatnonzero(cut.log == 2)[0])
     simulator = whole_logs._simulator(
-        rubbing, np.array([2]), [int(cut.start[first])], 3 * cut.steps, 2 + whole_logs.DRAWS
+        rubbing, np.array([2]), [int(cut.start[first])], 3 * cut.steps, 2 + whole_logs.RULES.draws
     )
     rows = whole_logs._one(rubbing, simulator, stages, 0, first)
     for row, stage in zip(rows, stages.values(), strict=False):
@@ -61,6 +61,6 @@ def test_an_unstable_motion_counts_as_long_as_it_can_be_predicted(tmp_path, monk
 def test_the_start_s_uncertainty_decides_how_long():
     grows = 1e-3 * np.exp(5.0 * PERIOD * np.arange(200))  # in parts of the motion, 5/s
     steps = whole_logs._predictable(np.repeat(grows[None, :, None], 4, 0), np.ones(1))
-    assert steps * PERIOD == pytest.approx(np.log(whole_logs.PART / 1e-3) / 5.0, abs=PERIOD)
+    assert steps * PERIOD == pytest.approx(np.log(whole_logs.RULES.part / 1e-3) / 5.0, abs=PERIOD)
     assert whole_logs._predictable(np.full((4, 200, 1), 0.01), np.ones(1)) == 200
     assert whole_logs._predictable(np.where(np.arange(200) < 50, 0.0, np.nan)[None, :, None], np.ones(1)) == 50
