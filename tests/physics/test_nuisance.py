@@ -242,7 +242,7 @@ def test_new_parameters_come_at_the_first_reset_after_so_many_steps(frequency: i
 def history(env: Any) -> tuple[np.ndarray, ...]:
     """theta, gravity, bias and angle [24, 8, .] of 8 worlds that collect 24 steps, four in an update."""
     domain, zero = Distribution.prior(env.space, 1), jnp.zeros((8, 1))
-    reset = lambda key, worlds: worlds.reset(env, key, domain, worlds)  # noqa: E731
+    reset = lambda key, count: worlds.reset(env, key, domain, count)  # noqa: E731
 
     @jax.jit
     def updates(key: jax.Array) -> tuple:
