@@ -5,6 +5,9 @@ exert no torque. Unlike the original: its drives (kp 1000 N m/rad, integrated im
 kp is 5 N m/rad with kv 0.1 N m s/rad and an armature of 5e-4 kg m^2; joints have no limits of their own, as their
 targets have; and the largest angular velocity of 4 pi rad/s holds for each axis of the chassis. BayesSimIG's true
 masses are too heavy to fly with: 18 N against 8 N of thrust.
+
+The drives are integrated explicitly. They are stable at any mass (kv h / armature = 1), and implicitfast would factor
+two matrices at once, which can wait for each other for ever in jaxlib's thread pool (see `linalg`).
 """
 
 import math
@@ -52,8 +55,8 @@ def _rotor(k: int) -> str:
 XML = f"""
 <mujoco model="quadcopter">
   <compiler angle="degree" autolimits="true"/>
-  <option timestep="0.005" integrator="implicitfast" iterations="1" ls_iterations="4">
-    <flag contact="disable"/>
+  <option timestep="0.005" integrator="Euler" iterations="1" ls_iterations="4">
+    <flag contact="disable" eulerdamp="disable"/>
   </option>{scene()}
   <default>
     <geom contype="0" conaffinity="0"/>
