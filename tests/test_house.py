@@ -16,12 +16,10 @@ TREES = ("bayessim_mjx", "tasks", "examples", "benchmarks", "docs", "tests")
 SETTINGS = "bayessim_mjx/config/settings.py"  # a list of settings, as long as there are settings
 
 LONG_FILES = (
-    "tests/diagnosis/logcheck/test_gate.py",
     "tests/effects/test_actuator_forces.py",
     "tests/effects/test_friction_effects.py",
     "tests/effects/test_sensor_effects.py",
     "tests/report/fake.py",
-    "tests/rl/test_train.py",
 )
 LONG_FUNCTIONS = (
     "tests/report/fake.py:details",

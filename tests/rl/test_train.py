@@ -16,17 +16,22 @@ from bayessim_mjx.rl import networks, normalise, ppo, transitions, worlds
 from bayessim_mjx.rl.catalogue import learner
 from bayessim_mjx.rl.train import time as clock
 
-# the package has functions of these names
-training, evaluation = (importlib.import_module(f"bayessim_mjx.rl.{name}") for name in ("train", "evaluate"))
+# the package has a function of this name
+training = importlib.import_module("bayessim_mjx.rl.train")
+
 
 CONFIG = PPOConfig(
     num_envs=16, num_steps=8, num_epochs=2, num_minibatches=2, hidden_actor=(8,), hidden_critic=(8,), log_interval=2
 )
+
+
 TAGS = {
     "Loss/value", "Loss/surrogate", "Loss/entropy", "Loss/learning_rate", "Loss/kl", "Loss/clip_fraction",
     "Loss/explained_variance", "Policy/mean_std", "Policy/grad_norm", "Train/mean_reward", "Train/mean_episode_length",
     "env_steps",
 }  # fmt: skip
+
+
 WALK = probes.Walk()
 
 
@@ -246,44 +251,6 @@ def test_an_environment_without_the_group_policy_is_refused():
 
     with pytest.raises(ValueError, match=r"\['state'\].*'policy'"):
         rl.init(Odd(), CONFIG, key(0))
-
-
-def test_evaluation_runs_whole_episodes_deterministically_and_compiles_once():
-    env = probes.Lifetime()
-    policy, other = (rl.policy_of(rl.init(env, CONFIG, key(seed))) for seed in (0, 1))
-    thetas = jnp.array([[1.0], [3.0], [7.0], [50.0]])
-    result = rl.evaluate(env, policy, key(0), thetas)
-    np.testing.assert_array_equal(result["return"], [1, 3, 7, 10])
-    np.testing.assert_array_equal(result["length"], [1, 3, 7, 10])
-    rl.evaluate(env, other, key(1), thetas + 1)
-    assert evaluation._evaluate(env)._cache_size() == 1
-
-
-def test_evaluation_uses_the_mean_action_unless_told_otherwise():
-    env = probes.Clock()
-    policy = rl.policy_of(rl.init(env, CONFIG, key(0)))
-    thetas = jnp.array([[0.0], [2.0]])
-    a, b = (rl.evaluate(env, policy, key(seed), thetas)["return"] for seed in (0, 1))
-    np.testing.assert_array_equal(a, b)
-    expected = sum(float(policy.act(None, jnp.array([t]))[0]) for t in (0.0, 1.0, 2.0, 3.0))
-    np.testing.assert_allclose(a, [expected, expected + 8], atol=1e-5)
-    c, d = (rl.evaluate(env, policy, key(seed), thetas, deterministic=False)["return"] for seed in (0, 1))
-    assert (c != d).all()
-    with pytest.raises(ValueError, match="parameters"):
-        rl.evaluate(env, policy, key(0), jnp.zeros(2))
-
-
-def test_policies_evaluated_together_return_what_each_returns_alone():
-    env = probes.Clock()
-    policies = [rl.policy_of(rl.init(env, CONFIG, key(seed))) for seed in (0, 1)]
-    thetas = jnp.array([[[0.0], [2.0], [5.0]], [[1.0], [1.0], [3.0]]])
-    both = rl.evaluate_together(env, policies, key(0), thetas)
-    for i, policy in enumerate(policies):
-        alone = rl.evaluate(env, policy, key(0), thetas[i])
-        np.testing.assert_allclose(both["return"][i], alone["return"], rtol=1e-5)
-        np.testing.assert_array_equal(both["length"][i], alone["length"])
-    with pytest.raises(ValueError, match="2 policies"):
-        rl.evaluate_together(env, policies, key(0), thetas[0])
 
 
 def test_speed_is_environment_steps_per_second(monkeypatch):
