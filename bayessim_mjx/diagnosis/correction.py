@@ -23,9 +23,17 @@ from bayessim_mjx.errors import UserError
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 from bayessim_mjx.physics import Physics
 
-REACH = 4.0  # sd that a range holds on both sides, where physics allows
-LEAST_SD = 1e-6  # of the range: a prior needs a width
-UNKNOWN_SD = 0.5  # of the way from neutral, where the diagnosis could not tell
+
+@dataclasses.dataclass(frozen=True)
+class Limits:
+    """How wide the priors are that a correction writes."""
+
+    reach: float = 4.0  # sd that a range holds on both sides, where physics allows
+    least_sd: float = 1e-06  # of the range: a prior needs a width
+    unknown_sd: float = 0.5  # of the way from neutral, where the diagnosis could not tell
+
+
+LIMITS = Limits()
 OWN_EFFECTS = "effect_specs"  # in `Diagnosis.details`: {name: path.py:MyEffect} of effects that are not the library's
 
 
@@ -90,8 +98,8 @@ def _in_order(kind: type[Effect], found: FoundEffect) -> list[Estimate]:
 
 def _identified(p: Parameter, q: Quantity, e: Estimate) -> Parameter:
     """The effect's parameter as identified; the library's range is widened where it must be."""
-    sd = e.sd if math.isfinite(e.sd) else UNKNOWN_SD * abs(e.mean - q.neutral)
-    low, high = min(p.low, e.mean - REACH * sd), max(p.high, e.mean + REACH * sd)
+    sd = e.sd if math.isfinite(e.sd) else LIMITS.unknown_sd * abs(e.mean - q.neutral)
+    low, high = min(p.low, e.mean - LIMITS.reach * sd), max(p.high, e.mean + LIMITS.reach * sd)
     if q.low == q.neutral:  # beyond it the physics has no meaning
         low = p.low
     elif p.low > 0:  # a gain, a frequency: it stays positive
@@ -103,7 +111,9 @@ def _identified(p: Parameter, q: Quantity, e: Estimate) -> Parameter:
 
 def _gaussian(p: Parameter, mean: float, sd: float) -> Parameter:
     mean = min(max(mean, p.low), p.high)
-    return dataclasses.replace(p, nominal=mean, prior="gaussian", mean=mean, sd=max(sd, LEAST_SD * (p.high - p.low)))
+    return dataclasses.replace(
+        p, nominal=mean, prior="gaussian", mean=mean, sd=max(sd, LIMITS.least_sd * (p.high - p.low))
+    )
 
 
 def calibrated_of(diagnosis: Found, space: ParameterSpace) -> ParameterSpace:
@@ -171,7 +181,7 @@ def _jointly(covariance: dict, space: ParameterSpace) -> Distribution:
     at = [space.index(n) for n in found]
     of = [covariance["names"].index(n) for n in found]
     known = np.asarray(covariance["matrix"], float)[np.ix_(of, of)]
-    least = (LEAST_SD * width[at]) ** 2
+    least = (LIMITS.least_sd * width[at]) ** 2
     matrix[np.ix_(at, at)] = known + np.diag(np.maximum(least - np.diag(known), 0.0))
     return Distribution.gaussian(flat, np.asarray(space.nominal, float), matrix)
 

@@ -23,16 +23,26 @@ from bayessim_mjx.logs.log import Log
 from bayessim_mjx.logs.resample import resample
 from bayessim_mjx.physics import Physics
 
-WINDOW = 0.5  # s
-SHORTER = (1.0, 0.5, 0.25)  # of it, tried in turn while the time step with contacts is worth more than LOTTERY noises
-LOTTERY = 5.0
-SHORTEST_WINDOW = 8  # control steps
-SHORTEST = 0.004  # s, control period of the diagnosis; faster logs are resampled
-LIMITS = ((1, 160), (3, 96), (7, 64), (100, 48))  # (up to so many dofs, windows)
-BUDGET = 24000  # sub-steps of one simulation of all windows; half of it for robots of more than MANY dofs
-MANY = 3
-FEWEST = 24  # windows that are simulated whatever the budget
-LEAST = 6  # windows: with fewer nothing can be held out
+
+@dataclass(frozen=True)
+class Cutting:
+    """How logs are cut into windows, and how many are simulated."""
+
+    window: float = 0.5  # s
+    # of it, tried in turn while the time step with contacts is worth more than `lottery` noises
+    shorter: tuple[float, ...] = (1.0, 0.5, 0.25)
+    lottery: float = 5.0
+    shortest_window: int = 8  # control steps
+    shortest: float = 0.004  # s, control period of the diagnosis; faster logs are resampled
+    limits: tuple[tuple[int, int], ...] = ((1, 160), (3, 96), (7, 64), (100, 48))  # (up to so many dofs, windows)
+    # sub-steps of one simulation of all windows; half of it for robots of more than `many` dofs
+    budget: int = 24000
+    many: int = 3
+    fewest: int = 24  # windows that are simulated whatever the budget
+    least: int = 6  # windows: with fewer nothing can be held out
+
+
+CUTTING = Cutting()
 
 
 class TooLittleData(Exception):
@@ -66,7 +76,7 @@ def control_period(robot: Robot, logs: Sequence[Log]) -> float:
     if robot.control_dt is not None:
         return robot.control_dt
     period = float(np.median([log.period for log in logs]))
-    return period * max(1, int(np.ceil(SHORTEST / period - 1e-6)))
+    return period * max(1, int(np.ceil(CUTTING.shortest / period - 1e-6)))
 
 
 def prepare(
@@ -116,7 +126,7 @@ def prepare(
 
 def _settings(robot: Robot) -> Settings:
     """Budgets for the robot's size; thresholds are the same for all."""
-    big = robot.mj_model.nv > MANY
+    big = robot.mj_model.nv > CUTTING.many
     return Settings(singles=24, pairs=5, screened=24, starts=16) if big else Settings()
 
 
@@ -124,23 +134,23 @@ def _measured(
     own: Physics, usable: Sequence[Log], group: str | None, use_qvel: bool
 ) -> tuple[Callable[..., windows.Windows], discretisation.Discretisation]:
     """The windows, and what the time step is worth in them; shorter ones where contacts make longer ones a lottery."""
-    for share in SHORTER:
-        cuts = _windows(own, usable, group, use_qvel, share * WINDOW)
+    for share in CUTTING.shorter:
+        cuts = _windows(own, usable, group, use_qvel, share * CUTTING.window)
         step = discretisation.measure(own, cuts, usable, _finest(own, len(cuts(1)), cuts(1).steps))
         known = np.isfinite(step.sigma)
         worth = float(np.median(step.floor[known] / step.sigma[known]))
-        if worth < LOTTERY or not discretisation.contacts(own) or cuts(1).steps <= SHORTEST_WINDOW:
+        if worth < CUTTING.lottery or not discretisation.contacts(own) or cuts(1).steps <= CUTTING.shortest_window:
             break
     return cuts, step
 
 
 def _windows(
-    physics: Physics, logs: Sequence[Log], group: str | None, use_qvel: bool, seconds: float = WINDOW
+    physics: Physics, logs: Sequence[Log], group: str | None, use_qvel: bool, seconds: float = CUTTING.window
 ) -> Callable[..., windows.Windows]:
     """(factor, limit) -> the windows with that many times the sub-steps of `physics`, by default the same ones."""
     dt = physics.dt
     longest = max(int(log.duration / dt) for log in logs)
-    length = int(np.clip(round(seconds / dt), SHORTEST_WINDOW, 100))
+    length = int(np.clip(round(seconds / dt), CUTTING.shortest_window, 100))
     if longest < length:
         raise TooLittleData(f"the longest log has {longest} control steps of {dt:.3g} s, one window needs {length}")
     own = _limit(physics, length)
@@ -159,23 +169,25 @@ def _windows(
             centred=centred,
         )
 
-    if len(cuts(1)) < LEAST:
-        raise TooLittleData(f"{len(cuts(1))} windows of {length * dt:.2g} s; holding conditions out needs {LEAST}")
+    if len(cuts(1)) < CUTTING.least:
+        raise TooLittleData(
+            f"{len(cuts(1))} windows of {length * dt:.2g} s; holding conditions out needs {CUTTING.least}"
+        )
     return cuts
 
 
 def _limit(physics: Physics, length: int) -> int:
     """Most windows of so many control steps that are simulated at once."""
     nv = physics.mj_model.nv
-    budget = BUDGET if nv <= MANY else BUDGET // 2
-    limit = next(n for dofs, n in LIMITS if nv <= dofs)
-    return min(limit, max(FEWEST, budget // (length * physics.substeps)))
+    budget = CUTTING.budget if nv <= CUTTING.many else CUTTING.budget // 2
+    limit = next(n for dofs, n in CUTTING.limits if nv <= dofs)
+    return min(limit, max(CUTTING.fewest, budget // (length * physics.substeps)))
 
 
 def _finest(physics: Physics, count: int, length: int) -> int:
     """How many times the sub-steps the budget allows when at most half of `count` windows are given up for it."""
-    budget = BUDGET if physics.mj_model.nv <= MANY else BUDGET // 2
-    return max(1, budget // (length * physics.substeps * max(FEWEST, (count + 1) // 2)))
+    budget = CUTTING.budget if physics.mj_model.nv <= CUTTING.many else CUTTING.budget // 2
+    return max(1, budget // (length * physics.substeps * max(CUTTING.fewest, (count + 1) // 2)))
 
 
 def _few_conditions(cut: windows.Windows) -> list[str]:

@@ -6,14 +6,26 @@ they are; of one condition alone nothing can be said. Coverage of the intervals:
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
 Array = NDArray[np.float64]
-LEVEL = 0.9
-LEAST_GAP = 1e-12  # keeps shares of no gap finite; where there is a gap, it says nothing
-RULED = 0.5  # degrees of freedom where one condition rules a mean of squares: measured, see above
+
+
+@dataclass(frozen=True)
+class Levels:
+    """Of intervals and of what they divide by."""
+
+    level: float = 0.9
+    least_gap: float = 1e-12  # keeps shares of no gap finite; where there is a gap, it says nothing
+    # degrees of freedom where one condition rules a mean of squares: measured, see above
+    ruled: float = 0.5
+
+
+LEVELS = Levels()
 NOTHING = (float("nan"), float("nan"))  # the interval of one condition
 
 
@@ -22,7 +34,7 @@ def share_of_gap(part: float, before: float, noise: float = 1.0) -> float:
 
     `share_of_gap(E0 - E1, E0)` is what a model closes, `share_of_gap(E1 - 1, E0)` what it leaves.
     """
-    return part / max(before - noise, LEAST_GAP)
+    return part / max(before - noise, LEVELS.least_gap)
 
 
 def leave_one_out(group: NDArray[np.int64]) -> Array:
@@ -56,7 +68,7 @@ def error(replicates: Array) -> Array:
 
 def quantile(freedom: Array | float) -> Array:
     """Student's t that 90 % intervals reach to on either side."""
-    return np.asarray(stats.t.ppf((1 + LEVEL) / 2, freedom))
+    return np.asarray(stats.t.ppf((1 + LEVELS.level) / 2, freedom))
 
 
 def interval(value: float, replicates: Array) -> tuple[float, float]:
@@ -74,7 +86,7 @@ def interval_of_rms(cost: Array, group: NDArray[np.int64]) -> tuple[float, float
         return NOTHING
     own = np.sum(cost) - rows @ cost
     replicates = np.log(np.maximum(rows @ cost, 1e-300) / rows.sum(1))
-    half = float(quantile(freedom(own, RULED)) * error(replicates))
+    half = float(quantile(freedom(own, LEVELS.ruled)) * error(replicates))
     centre = np.log(max(float(np.mean(cost)), 1e-300))
     # squares of numbers beyond 1e100 are of no use to anybody
     low, high = np.exp(np.clip([0.5 * (centre - half), 0.5 * (centre + half)], -230.0, 230.0))

@@ -17,7 +17,18 @@ from bayessim_mjx.parameters.attributes import suggest
 from bayessim_mjx.quantities import extent
 
 Array = NDArray[np.float64]
-NOISES, SHARE = 3.0, 0.02  # the default: the larger of so many noise sd and of this share of the range of motion
+
+
+@dataclass(frozen=True)
+class Default:
+    """What may stay unexplained: the larger of the two."""
+
+    # the default: the larger of so many noise sd and of this share of the range of motion
+    noises: float = 3.0
+    share: float = 0.02
+
+
+DEFAULT = Default()
 UNITS = {"rad": {"rad": 1.0, "mrad": 1e-3, "deg": math.pi / 180}, "m": {"m": 1.0, "cm": 1e-2, "mm": 1e-3}}
 _FORM = re.compile(r"(?P<value>[0-9.]+(?:e[+-]?[0-9]+)?)\s*(?P<unit>%|[a-z]*)")
 
@@ -115,7 +126,7 @@ def judge(model: mujoco.MjModel, motion: Array, noise: Array, asked: dict[int, L
     Args:
         motion, noise: `[nv]`, range of motion and standard deviation of the noise, rad or m.
     """
-    limit = np.maximum(NOISES * noise, SHARE * motion)
+    limit = np.maximum(DEFAULT.noises * noise, DEFAULT.share * motion)
     for dof, own in asked.items():
         limit[dof] = own.value * motion[dof] if own.relative else own.value
     given = np.isin(np.arange(model.nv), list(asked))

@@ -12,7 +12,7 @@ from families import FAMILIES
 
 from bayessim_mjx.diagnosis.findings import Findings
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
-from bayessim_mjx.diagnosis.fitting.quadratic import TRUST, solve
+from bayessim_mjx.diagnosis.fitting.quadratic import RULES, solve
 from bayessim_mjx.diagnosis.selection import heldout, uncertainty
 from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.selection.race import Race, fit_models, start_of
@@ -111,7 +111,7 @@ def fold_error(race: Race, model: Model, test: np.ndarray) -> float:
     q, _ = model.fit.quadratic(race.fitter.spread)
     precision, pull, low, high = model.fit.prior()
     g, S = q.weighted(model.fit.weight * ~test)
-    p = solve(S + np.diag(precision + TRUST * np.diag(S)), g + pull, low, high)
+    p = solve(S + np.diag(precision + RULES.trust * np.diag(S)), g + pull, low, high)
     return float(np.maximum(q.at(p)[test], 0.0).sum())
 
 

@@ -20,7 +20,7 @@ from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.selection.outcome import Outcome
 from bayessim_mjx.diagnosis.selection.tried import ranked
 from bayessim_mjx.diagnosis.selection.uncertainty import win_share
-from bayessim_mjx.diagnosis.selection.verdict import MILD
+from bayessim_mjx.diagnosis.selection.verdict import ALIKE
 from bayessim_mjx.effects.support.bodies import tilted
 
 Array = NDArray[np.float64]
@@ -131,7 +131,9 @@ def _contenders(outcome: Outcome, given: Sequence[Model] | None) -> tuple[list[M
         return [outcome.answer, *found[: BUDGET.most - 1]], True
     own = {c.effect for c in outcome.answer.effects}
     losers = [m for m in ranked(outcome) if m is not outcome.answer and not {c.effect for c in m.effects} & own]
-    close = [m for m in losers if abs(outcome.better(m, outcome.answer).evidence) < 3 * MILD and (m.effects or own)]
+    close = [
+        m for m in losers if abs(outcome.better(m, outcome.answer).evidence) < 3 * ALIKE.mild and (m.effects or own)
+    ]
     if not outcome.answer.effects:  # nothing is wrong as far as these logs can tell: what could still hide?
         close = close[:2]
     return [outcome.answer, *close[: BUDGET.most - 2]], False
@@ -212,7 +214,7 @@ def _decide(
     chosen = alone[0] if alone else None
     helped = next((s for s in final if s.needs), None)
     if helped and (
-        chosen is None or (chosen.evidence < MILD and helped.evidence > 1.5 * chosen.evidence + BUDGET.nothing)
+        chosen is None or (chosen.evidence < ALIKE.mild and helped.evidence > 1.5 * chosen.evidence + BUDGET.nothing)
     ):
         chosen = helped
     useful = chosen is not None and (chosen.evidence > BUDGET.nothing or (len(labels) == 1 and chosen.evidence > 0.1))

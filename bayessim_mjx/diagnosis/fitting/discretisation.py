@@ -22,14 +22,24 @@ from bayessim_mjx.logs.log import Channels, Log
 from bayessim_mjx.physics import Physics
 
 Array = NDArray[np.float64]
-FACTORS = (1, 2, 4, 8)
-CONTACTS = 4  # the finest with contacts: what is left there is chaos, which no step removes
-ENOUGH = 0.6  # noises: an error of the time step that does not show
-SHORTER = 5  # halvings of the time step that can be recommended
-WORTH = 1.0  # noises: from here on the user is told
-CONVERGING = 1.3  # errors that shrink by less from one sub-step to its half are not worth finer ones
-SURE = 0.4  # of what is taken for noise: below, the estimates themselves are too coarse
-FAR = 4.0  # medians: windows with larger errors are no measure, as in the fit
+
+
+@dataclass(frozen=True)
+class Rules:
+    """How fine a time step is looked for, and when its error is known."""
+
+    factors: tuple[int, ...] = (1, 2, 4, 8)
+    contacts: int = 4  # the finest with contacts: what is left there is chaos, which no step removes
+    enough: float = 0.6  # noises: an error of the time step that does not show
+    shorter: int = 5  # halvings of the time step that can be recommended
+    worth: float = 1.0  # noises: from here on the user is told
+    # errors that shrink by less from one sub-step to its half are not worth finer ones
+    converging: float = 1.3
+    sure: float = 0.4  # of what is taken for noise: below, the estimates themselves are too coarse
+    far: float = 4.0  # medians: windows with larger errors are no measure, as in the fit
+
+
+RULES = Rules()
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,13 +82,13 @@ class Discretisation:
     def believed(self) -> float:
         """Share of what is taken for noise that is the sensors' (median over channels), at least SURE."""
         known = np.isfinite(self.sigma) & ~np.tile(self.simulated, 2)
-        return float(np.clip(np.median(self.sigma[known] / self.floor[known]), SURE, 1.0)) if known.any() else 1.0
+        return float(np.clip(np.median(self.sigma[known] / self.floor[known]), RULES.sure, 1.0)) if known.any() else 1.0
 
     def warnings(self) -> list[str]:
         """In words, where the simulator's own time step is worth more than the noise."""
         nv = len(self.channels)
         noises = self.own[:nv] / self.sigma[:nv]
-        if noises.max() < WORTH:
+        if noises.max() < RULES.worth:
             return []
         at = int(np.argmax(noises))
         size = "" if self.simulated[at] else f"{noises[at]:.1f} noise standard deviations, "
@@ -89,8 +99,8 @@ class Discretisation:
         return [text + self._remedy(noises[at], bool(self.simulated[at]))]
 
     def _remedy(self, noises: float, simulated: bool) -> str:
-        halvings = int(np.ceil(np.log2(noises / WORTH)))
-        told = not simulated and halvings <= SHORTER
+        halvings = int(np.ceil(np.log2(noises / RULES.worth)))
+        told = not simulated and halvings <= RULES.shorter
         other = f"a step of {1e3 * self.timestep / 2**halvings:.2g} ms" if told else "a shorter step"
         text = f"{other}, or the integrator RK4 where nothing is in contact, reduces it"
         if self.factor > 1:
@@ -99,7 +109,9 @@ class Discretisation:
             return f"{text}; the logs show no noise, so everything smaller than this counts as noise"
         known = np.isfinite(self.sigma)
         left = np.sqrt(np.maximum((self.floor[known] / self.sigma[known]) ** 2 - 1, 0.0)).max()
-        return f"{text}; the rest, {left:.2g} noise standard deviations, counts as noise" if left > ENOUGH else text
+        return (
+            f"{text}; the rest, {left:.2g} noise standard deviations, counts as noise" if left > RULES.enough else text
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """For diagnosis.json: numbers by channel, in noise units and physical ones."""
@@ -147,11 +159,11 @@ def measure(physics: Physics, cuts: Callable[[int], Windows], logs: Sequence[Log
     one, two = settle(coarse - mid), settle(mid - fine)
     gain = _gain(one / sigma, two / sigma)
     limit = fine + (fine - mid) / max(gain - 1, 1.0)
-    at = {f: _size(one, touching) * gain / (gain - 1) / gain ** np.log2(f) for f in FACTORS}
+    at = {f: _size(one, touching) * gain / (gain - 1) / gain ** np.log2(f) for f in RULES.factors}
     settled = _size(settle(plain - limit), touching)
     clean = np.array([noise_free(logs, i) for i in physics.mj_model.jnt_qposadr[physics.mj_model.dof_jntid]])
     base = np.hypot(sigma, np.tile(clean, 2) * settled)  # who simulated such logs may have used this step or another
-    allowed = [f for f in FACTORS if f <= (min(most, CONTACTS) if touching else most)]
+    allowed = [f for f in RULES.factors if f <= (min(most, RULES.contacts) if touching else most)]
     factor = _choose({f: float(np.max(at[f] / base)) for f in allowed}, gain)
     return Discretisation(
         timestep=float(physics.mj_model.opt.timestep),
@@ -176,21 +188,21 @@ def _gain(one: Array, two: Array) -> float:
 
 def _choose(error: dict[int, float], gain: float) -> int:
     """The coarsest factor that is fine enough; where none is, the finest, if finer ones gain anything."""
-    enough = [f for f, e in error.items() if e < ENOUGH]
-    return min(enough) if enough else max(error) if gain > CONVERGING else 1
+    enough = [f for f, e in error.items() if e < RULES.enough]
+    return min(enough) if enough else max(error) if gain > RULES.converging else 1
 
 
 def _excess(error: Array, noise: Array) -> Array:
     """Squares of errors beyond what does not show."""
     known = np.isfinite(noise)
-    return np.maximum(error**2 - np.square(ENOUGH * noise, where=known, out=np.zeros_like(noise)), 0.0)
+    return np.maximum(error**2 - np.square(RULES.enough * noise, where=known, out=np.zeros_like(noise)), 0.0)
 
 
 def _size(error: Array, touching: bool) -> Array:
     """Root mean square `[channels]` of errors `[W, H, channels]`; windows far off count less, with contacts hardly."""
     each = np.mean(error**2, axis=1)
     usual = np.median(each, axis=0)
-    return np.asarray(np.sqrt(usual if touching else np.mean(np.minimum(each, FAR**2 * usual), axis=0)))
+    return np.asarray(np.sqrt(usual if touching else np.mean(np.minimum(each, RULES.far**2 * usual), axis=0)))
 
 
 def contacts(physics: Physics) -> bool:

@@ -15,9 +15,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-PARTS = 8
-ONLY = 9.0  # a parameter whose variance grows by this without a condition is told by that condition alone
-TRUST = 1e-3  # of the curvature: without a condition the fit stays put along directions that no data decide
+
+
+@dataclass(frozen=True)
+class Rules:
+    """How conditions are held out where one alone tells a parameter."""
+
+    parts: int = 8
+    # a parameter whose variance grows by this without a condition is told by that condition alone
+    only: float = 9.0
+    # of the curvature: without a condition the fit stays put along directions that no data decide
+    trust: float = 0.001
+
+
+RULES = Rules()
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +84,7 @@ def eliminate(r: Array, A: Array, B: Array, x: Array, spread: Array) -> tuple[Qu
     return Quadratic(c, g, S), Starts(B, M, b)
 
 
-def blocks(q: Quadratic, starts: Starts, r: Array, A: Array, w: int, count: int = PARTS) -> Quadratic:
+def blocks(q: Quadratic, starts: Starts, r: Array, A: Array, w: int, count: int = RULES.parts) -> Quadratic:
     """One window's cost as a sum over `count` blocks of its rows, which are in the order of time.
 
     r `[W, n]`, A `[W, n, K]` as for `eliminate`. The start state stays eliminated by the whole window: rows of the
@@ -153,7 +164,7 @@ def held_out(
         precision, pull: `[K]` of the Gaussian prior, pull = precision (mean - value).
         low, high: `[K]`, how far each parameter may move.
         watched: parameters that may be told by one condition alone (a limit only reached there, drag only felt there).
-            That condition's windows are then held out in PARTS: extrapolating a parameter to where it first matters
+            That condition's windows are then held out in parts: extrapolating a parameter to where it first matters
             would judge its uncertainty, not the model.
         split: blocks in time of a window. One that alone tells a watched parameter is held out block by block.
 
@@ -165,7 +176,7 @@ def held_out(
     known = _variances(fit.curvature(np.zeros(len(group), bool))[1])
 
     def tells(out: NDArray[np.bool_]) -> bool:
-        return bool((_variances(fit.curvature(out)[1]) > ONLY * known)[watched].any())
+        return bool((_variances(fit.curvature(out)[1]) > RULES.only * known)[watched].any())
 
     costs, moves = np.zeros(len(group)), []
     for name in np.unique(group):
@@ -199,7 +210,7 @@ class _Rest:
         g, S = self.q.weighted(self.weight * ~out)
         for share, g_block, S_block in blocks:
             g, S = g - share * g_block, S - share * S_block
-        return g, S + np.diag(self.precision + TRUST * np.diag(S))
+        return g, S + np.diag(self.precision + RULES.trust * np.diag(S))
 
     def step(self, out: NDArray[np.bool_], blocks: Sequence[tuple[float, Array, Array]] = ()) -> Array:
         g, S = self.curvature(out, blocks)
@@ -208,8 +219,8 @@ class _Rest:
     def by_parts(self, own: NDArray[np.int64], blocks: Mapping[int, Quadratic], costs: Array) -> Array:
         """The mean of the steps without each part of the windows `own` and of the split ones; fills in their costs."""
         windows, steps = np.arange(len(self.weight)), []
-        for k in range(PARTS if blocks else min(PARTS, len(own))):
-            part = np.isin(windows, own[k::PARTS])
+        for k in range(RULES.parts if blocks else min(RULES.parts, len(own))):
+            part = np.isin(windows, own[k :: RULES.parts])
             p = self.step(part, [(self.weight[w], *split.of(k)) for w, split in blocks.items()])
             costs[part] = self.q.at(p)[part]
             for w, split in blocks.items():

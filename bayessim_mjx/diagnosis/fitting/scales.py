@@ -17,8 +17,17 @@ from bayessim_mjx.logs.log import Log
 from bayessim_mjx.parameters import Parameter
 
 Array = NDArray[np.float64]
-LARGE = 98.0  # percentile that counts as the largest
-LOAD = 3.0  # times its own mass that a body may carry at least
+
+
+@dataclass(frozen=True)
+class Limits:
+    """How large effects may be, from what the logs show."""
+
+    large: float = 98.0  # percentile that counts as the largest
+    load: float = 3.0  # times its own mass that a body may carry at least
+
+
+LIMITS = Limits()
 
 
 @dataclass(frozen=True)
@@ -58,7 +67,7 @@ class Scales:
             gravity = float(np.linalg.norm(model.opt.gravity)) or 9.81
             below = float(model.body_subtreemass[i])
             mass = max(float(model.body_mass[i]), 0.1 * below)
-            load = max(LOAD * mass, float(self.carried[i]))
+            load = max(LIMITS.load * mass, float(self.carried[i]))
             own = {"mass": mass, "weight": below * gravity, "size": loads.size(model, i)}
             return own | {"carried": load, "tool": loads.reach(model, i)}
         return {"moment": _moment(model)}
@@ -83,7 +92,7 @@ def measure(model: mujoco.MjModel, logs: Sequence[Log]) -> Scales:
             torque.append(np.abs(data.qfrc_inverse))
             inertia.append(_diagonal(model, data))
     command = _large([log.ctrl for log in logs])
-    force = np.percentile(torque, LARGE, axis=0)
+    force = np.percentile(torque, LIMITS.large, axis=0)
     effort = np.zeros(model.nu)
     for i in range(model.nu):
         gear = float(model.actuator_gear[i, 0]) or 1.0
@@ -120,7 +129,7 @@ def _moment(model: mujoco.MjModel) -> float:
 
 
 def _large(parts: Sequence[Array]) -> Array:
-    return np.percentile(np.abs(np.concatenate(parts)), LARGE, axis=0) if parts[0].shape[1] else np.zeros(0)
+    return np.percentile(np.abs(np.concatenate(parts)), LIMITS.large, axis=0) if parts[0].shape[1] else np.zeros(0)
 
 
 def _span(model: mujoco.MjModel, log: Log) -> Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -16,10 +17,19 @@ from bayessim_mjx.physics import Drive, Physics, begin, control_step, staggered
 from bayessim_mjx.physics.tangent import difference, integrate
 
 Array = NDArray[np.float64]
-# worlds in one call; fewer are padded, more are cut. A CPU wants them in its cache (a pendulum's: 2.2 times as fast as
-# 1024) and one call on each core, an accelerator as many as it can get
-CPU_LANES = 128
-LANES = 4096
+
+
+@dataclass(frozen=True)
+class Call:
+    """Worlds in one call."""
+
+    # worlds in one call; fewer are padded, more are cut. A CPU wants them in its cache (a pendulum's: 2.2 times as
+    # fast as 1024) and one call on each core, an accelerator as many as it can get
+    cpu_lanes: int = 128
+    lanes: int = 4096
+
+
+CALL = Call()
 
 
 class Simulator:
@@ -38,7 +48,7 @@ class Simulator:
     def __init__(self, physics: Physics, windows: Windows, lanes: int | None = None) -> None:
         self.physics, self.windows = physics, windows
         on_cpu = jax.default_backend() == "cpu"
-        self.lanes = lanes or (CPU_LANES if on_cpu else LANES)
+        self.lanes = lanes or (CALL.cpu_lanes if on_cpu else CALL.lanes)
         self.workers = cores() if on_cpu else 1
         self.nv = int(physics.mj_model.nv)
         self.channels = 2 * self.nv

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -18,8 +19,17 @@ from bayessim_mjx.physics import Drive, Physics, begin, staggered, substep
 from bayessim_mjx.physics.tangent import difference, integrate
 
 Array = NDArray[np.float64]
-STARTS = 5  # Newton steps of the start states
-NUDGE = 1e-4  # rad or rad/s, at least, of the start states for their finite differences
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """How sub-steps are compared."""
+
+    starts: int = 5  # Newton steps of the start states
+    nudge: float = 0.0001  # rad or rad/s, at least, of the start states for their finite differences
+
+
+SIZES = Sizes()
 
 
 def held(cut: Windows) -> Windows:
@@ -78,14 +88,14 @@ class Errors:
     def columns(self, sigma: Array) -> Array:
         """`[W, n, 2 nv]`, minus the derivatives of the whitened errors by the start states."""
         here = self.run(self.cut, 1)
-        nudges = np.diag(np.maximum(0.2 * self.cut.spread, NUDGE))
+        nudges = np.diag(np.maximum(0.2 * self.cut.spread, SIZES.nudge))
         moved = [(here - self.run(self.cut, 1, offsets=n)) / n.max() / sigma for n in nudges]
         return np.stack([m.reshape(len(m), -1) for m in moved], -1)
 
     def start(self, sigma: Array) -> None:
         """Fit the start states: far from the measured motion the time step is worth something else."""
         spread = self.cut.spread
-        for _ in range(STARTS):
+        for _ in range(SIZES.starts):
             before, columns = self.run(self.cut, 1) / sigma, self.columns(sigma)
             step = _step(before, columns, self.offsets, spread)
             after = self.run(self.cut, 1, offsets=step) / sigma

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
-from bayessim_mjx.diagnosis.fitting.quadratic import TRUST, Quadratic, solve
+from bayessim_mjx.diagnosis.fitting.quadratic import RULES, Quadratic, solve
 from bayessim_mjx.diagnosis.residual.disturbance import Disturbance
 from bayessim_mjx.diagnosis.residual.features import Mapping
 from bayessim_mjx.diagnosis.residual.motion_inputs import Inputs
@@ -90,7 +90,7 @@ class Seeded:
         both = cho_solve(cho_factor(S), np.concatenate([sums.g[:, None], sums.C.T], 1))
         step = np.zeros(0)
         if problem.k:
-            left = sums.Spp - sums.C @ both[:, 1:] + np.diag(problem.precision + TRUST * np.diag(sums.Spp))
+            left = sums.Spp - sums.C @ both[:, 1:] + np.diag(problem.precision + RULES.trust * np.diag(sums.Spp))
             step = solve(left, sums.gp + problem.pull - sums.C @ both[:, 0], problem.low, problem.high)
         beta = both[:, 0] - both[:, 1:] @ step
         return step, beta * np.repeat(problem.scale, self.each)

@@ -14,11 +14,21 @@ from bayessim_mjx.diagnosis.selection.race import Progress, Race, fresh
 from bayessim_mjx.diagnosis.selection.tried import ranked
 from bayessim_mjx.physics import Physics
 
-NEAR = 1e-3  # of a range: at its end
-TWICE, FARTHEST = 2.0, 8.0  # a range grows by this factor, up to so many times what it was at first
-NATS = 2.0  # of held-out evidence that a wider range has to bring
-LEADING = 3  # single effects whose ranges grow before pairs are looked at
-STEPS = 8  # of a fit in a wider range
+
+@dataclass(frozen=True)
+class Widening:
+    """How ranges grow, and when an estimate is at the end of one."""
+
+    near: float = 0.001  # of a range: at its end
+    # a range grows by this factor, up to so many times what it was at first
+    twice: float = 2.0
+    farthest: float = 8.0
+    nats: float = 2.0  # of held-out evidence that a wider range has to bring
+    leading: int = 3  # single effects whose ranges grow before pairs are looked at
+    steps: int = 8  # of a fit in a wider range
+
+
+WIDENING = Widening()
 
 
 @dataclass(frozen=True)
@@ -38,7 +48,7 @@ class Bound:
 def widened(race: Race, model: Model, say: Progress) -> Model:
     """The model with ranges as wide as it takes for its effects' parameters to lie within, refitted.
 
-    A range doubles as long as that brings held-out evidence, up to FARTHEST times what it was. It stays where its end
+    A range doubles as long as that brings held-out evidence, up to `farthest` times what it was. It stays where its end
     means that the effect is off, where physics ends, and where it sizes an effect's memory.
     """
     while True:
@@ -47,7 +57,7 @@ def widened(race: Race, model: Model, say: Progress) -> Model:
             return model
         say("wider ranges", 0, 1)
         new = _refitted(race, model, effects)
-        if 0.5 * new.samples * math.log(model.total / new.total) < NATS:
+        if 0.5 * new.samples * math.log(model.total / new.total) < WIDENING.nats:
             return model
         _adopt(race, new)
         model = new
@@ -55,7 +65,7 @@ def widened(race: Race, model: Model, say: Progress) -> Model:
 
 def widen_leading(race: Race, say: Progress) -> None:
     """Wider ranges for the leading single effects: one that is held back at a bound must not lose for that."""
-    for model in ranked(race, 1)[:LEADING]:
+    for model in ranked(race, 1)[: WIDENING.leading]:
         widened(race, model, say)
 
 
@@ -79,7 +89,7 @@ def of(physics: Physics, coordinate: Coordinate, value: float) -> Bound | None:
 
 
 def _end(c: Coordinate, value: float) -> str:
-    room = NEAR * (c.high - c.low)
+    room = WIDENING.near * (c.high - c.low)
     return "high" if c.high - value < room else "low" if value - c.low < room else ""
 
 
@@ -92,10 +102,10 @@ def _farthest(physics: Physics, coordinate: Coordinate, end: str) -> float:
     if quantity.remembered:
         return high if end == "high" else low
     if end == "high":
-        return high if high >= most else min(most, coordinate.neutral + FARTHEST * (high - coordinate.neutral))
+        return high if high >= most else min(most, coordinate.neutral + WIDENING.farthest * (high - coordinate.neutral))
     if low <= least:
         return low
-    return low / FARTHEST if low > 0 else coordinate.neutral + FARTHEST * (low - coordinate.neutral)
+    return low / WIDENING.farthest if low > 0 else coordinate.neutral + WIDENING.farthest * (low - coordinate.neutral)
 
 
 def _wider(race: Race, model: Model, effect: Candidate) -> Candidate:
@@ -114,9 +124,9 @@ def _grown(physics: Physics, c: Coordinate, value: float) -> Coordinate:
         return c
     far = _farthest(physics, c, end)
     if end == "high":
-        wider = replace(c, high=min(far, c.neutral + TWICE * (c.high - c.neutral)))
+        wider = replace(c, high=min(far, c.neutral + WIDENING.twice * (c.high - c.neutral)))
     else:
-        low = c.low / TWICE if c.low > 0 else c.neutral + TWICE * (c.low - c.neutral)
+        low = c.low / WIDENING.twice if c.low > 0 else c.neutral + WIDENING.twice * (c.low - c.neutral)
         wider = replace(c, low=max(far, low))
     return replace(wider, precision=shrink(wider))
 
@@ -126,7 +136,7 @@ def _refitted(race: Race, model: Model, effects: Sequence[Candidate]) -> Model:
     own = {c.name: c for e in effects for c in e.coordinates}
     coordinates = tuple(c if i < base else own[c.name] for i, c in enumerate(model.fit.coordinates))
     start = fitter.refresh(replace(model.fit, coordinates=coordinates, history=(), damping=1e-3))
-    (fit,) = fitter.iterate([start], STEPS, lambda f: fresh(race, f))
+    (fit,) = fitter.iterate([start], WIDENING.steps, lambda f: fresh(race, f))
     return scored(fitter, fitter.refresh(fit), tuple(effects))
 
 

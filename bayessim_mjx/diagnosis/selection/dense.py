@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,15 +18,24 @@ from bayessim_mjx.diagnosis.fitting.fitter import Fit
 from bayessim_mjx.diagnosis.selection.screen import Screened, residual
 
 Array = NDArray[np.float64]
-PATH = 0.7  # from one price to the next
-LEAST = 1e-3  # of the first price: the last one
-SWEEPS = 200
+
+
+@dataclass(frozen=True)
+class Prices:
+    """Prices of the sparse path."""
+
+    path: float = 0.7  # from one price to the next
+    least: float = 0.001  # of the first price: the last one
+    sweeps: int = 200
+
+
+PRICES = Prices()
 
 
 def lasso(S: Array, g: Array, low: Array, high: Array, price: Array, t: Array) -> Array:
     """argmin t'St - 2 g't + 2 sum(price |t|) with low <= t <= high, from t, by coordinate descent."""
     t = t.copy()
-    for _ in range(SWEEPS):
+    for _ in range(PRICES.sweeps):
         before = t.copy()
         for j in range(len(t)):
             rest = g[j] - S[j] @ t + S[j, j] * t[j]
@@ -41,9 +51,9 @@ def path(S: Array, g: Array, low: Array, high: Array, most: int) -> list[int]:
     reach = np.abs(g) / scale
     order: list[int] = []
     price, t = float(reach.max(initial=0.0)), np.zeros(len(g))
-    end = LEAST * price
+    end = PRICES.least * price
     while price > end and len(order) < most:
-        price *= PATH
+        price *= PRICES.path
         t = lasso(S, g, low, high, price * scale, t)
         new = [j for j in np.argsort(-np.abs(t) * scale) if t[j] and j not in order]
         order += [int(j) for j in new]

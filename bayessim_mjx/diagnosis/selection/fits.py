@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,8 +17,17 @@ from bayessim_mjx.diagnosis.selection.screen import Screened, screen
 from bayessim_mjx.diagnosis.selection.table import BASE, Key, Law, Row, Table
 from bayessim_mjx.diagnosis.selection.uncertainty import deviations
 
-MANY = 5  # models of one call that are fitted from many starts
-CONTENDERS = 3.0  # models within this factor of the least cost are asked whether their effects are there
+
+@dataclass(frozen=True)
+class Limits:
+    """How much is fitted and looked at."""
+
+    many: int = 5  # models of one call that are fitted from many starts
+    # models within this factor of the least cost are asked whether their effects are there
+    contenders: float = 3.0
+
+
+LIMITS = Limits()
 
 
 class Fits:
@@ -39,7 +48,7 @@ class Fits:
         """All models so far."""
         race = self.race
         least = min(m.total for m in race.models.values())
-        rows = {key: self._row(key, m, m.total < CONTENDERS * least) for key, m in race.models.items()}
+        rows = {key: self._row(key, m, m.total < LIMITS.contenders * least) for key, m in race.models.items()}
         group = race.fitter.simulator.windows.group
         return Table(rows, self.laws, group, race.noise, race.settings.believed)
 
@@ -88,7 +97,7 @@ class Fits:
         fits = [self._from(fit, several) for several in every]
         if len(new) == 1:
             from_here = replace(model, effects=kept, fit=fit)
-            if rank < MANY:
+            if rank < LIMITS.many:
                 fits[:1] = race.starts(self.race, from_here, every[0][0], rank)
         return fits, (*kept, *(s.candidate for s in every[0]))
 

@@ -14,9 +14,20 @@ from bayessim_mjx.diagnosis.fitting.quadratic import eliminate
 from bayessim_mjx.diagnosis.selection.models import Model
 
 Array = NDArray[np.float64]
-WORSE, WITHIN = 2.0, 1.02  # held-out squares over those promised; those of the other windows over the common fit's
-SHORTER = (1.0, 0.5, 0.25, 0.125, 0.0)
-GRID = 400  # shares looked at
+
+
+@dataclass(frozen=True)
+class Rules:
+    """When a linear step without a condition is shortened, and how finely intervals are looked for."""
+
+    # held-out squares over those promised; those of the other windows over the common fit's
+    worse: float = 2.0
+    within: float = 1.02
+    shorter: tuple[float, ...] = (1.0, 0.5, 0.25, 0.125, 0.0)
+    grid: int = 400  # shares looked at
+
+
+RULES = Rules()
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,10 +69,10 @@ def steadied(fitter: Fitter, model: Model) -> Model:
     names, estimates = np.unique(windows.group), model.estimates.copy()
     for g, name in enumerate(names):
         own, others = np.flatnonzero(windows.group == name), np.flatnonzero(windows.group != name)
-        if _squares(fitter, fit, estimates[g], own).sum() <= WORSE * model.cost[own].sum():
+        if _squares(fitter, fit, estimates[g], own).sum() <= RULES.worse * model.cost[own].sum():
             continue
-        limit = WITHIN * float(fit.weight[others] @ _squares(fitter, fit, fit.values, others))
-        for share in SHORTER:
+        limit = RULES.within * float(fit.weight[others] @ _squares(fitter, fit, fit.values, others))
+        for share in RULES.shorter:
             at = fit.values + share * (model.estimates[g] - fit.values)
             if fit.weight[others] @ _squares(fitter, fit, at, others) <= limit:
                 break
@@ -152,7 +163,7 @@ class Closed:
         rows = statistics.leave_one_out(self.group)
         if len(rows) < 2:
             return statistics.NOTHING
-        shares = np.concatenate([1.0 - np.geomspace(2.0, 1e-4, GRID), [1.0]])[:, None]
+        shares = np.concatenate([1.0 - np.geomspace(2.0, 1e-4, RULES.grid), [1.0]])[:, None]
 
         def both(rows: Array) -> tuple[Array, Array]:
             before, left, noise = self._sums(rows)
@@ -160,7 +171,7 @@ class Closed:
 
         (left, said), (left_without, said_without) = both(np.ones((1, len(self.before)))), both(rows)
         counting = [np.maximum(left - left_without, 0.0)[:, None], np.maximum(said - said_without, 0.0).T]
-        freedom = np.minimum(*(statistics.freedom(own, statistics.RULED) for own in counting))
+        freedom = np.minimum(*(statistics.freedom(own, statistics.LEVELS.ruled) for own in counting))
         allowed = statistics.quantile(freedom) * statistics.error(np.log(left_without / said_without).T)
         far = np.log(left / said)
         kept = shares[:, 0][np.abs(far[:, 0]) <= allowed]

@@ -17,8 +17,17 @@ from bayessim_mjx.diagnosis.selection.uncertainty import deviations
 from bayessim_mjx.effects import load, names
 
 Progress = Callable[[str, int, int], None]
-ROUNDS = 5  # of polishing, where it has to be done again and again
-ASTRAY = 10.0  # noises that a fit leaves: from there on nothing is as it was a step before
+
+
+@dataclass(frozen=True)
+class Rules:
+    """How fits far from the logs are brought to their end."""
+
+    rounds: int = 5  # of polishing, where it has to be done again and again
+    astray: float = 10.0  # noises that a fit leaves: from there on nothing is as it was a step before
+
+
+RULES = Rules()
 
 
 @dataclass(eq=False)
@@ -177,7 +186,7 @@ def _delivered(race: Race, model: Model, coordinates: Sequence[Coordinate], extr
 
 def _astray(race: Race, fit: Fit) -> bool:
     """Whether a fit is so far from the logs that its derivatives hold nowhere else."""
-    return fit.cost > ASTRAY**2 * race.noise * len(fit.r)
+    return fit.cost > RULES.astray**2 * race.noise * len(fit.r)
 
 
 def compatible(a: Candidate, b: Candidate) -> bool:
@@ -198,7 +207,7 @@ def polish(race: Race, model: Model) -> Model:
     """All columns anew at the fit, and some more steps; with contacts again and again, as long as it helps much."""
     fitter, fit = race.fitter, race.fitter.refresh(model.fit)
     if race.rough:
-        for _ in range(ROUNDS):
+        for _ in range(RULES.rounds):
             before = fit.cost
             (fit,) = fitter.iterate([replace(fit, history=())], 2, lambda f: range(len(f.coordinates)))
             fit = fitter.refresh(fit)

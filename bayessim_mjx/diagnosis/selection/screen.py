@@ -15,8 +15,20 @@ from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 
 Array = NDArray[np.float64]
-MANY = 400  # starting points, from which on they are screened in two stages
-CANDIDATES, POINTS, FEWEST = 64, 4, 8  # looked at again, starting points of each, windows of the first look
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """When and how candidates are screened in two stages."""
+
+    many: int = 400  # starting points, from which on they are screened in two stages
+    # looked at again, starting points of each, windows of the first look
+    candidates: int = 64
+    points: int = 4
+    fewest: int = 8
+
+
+SIZES = Sizes()
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,11 +92,11 @@ def screen(fitter: Fitter, fit: Fit, candidates: Sequence[Candidate], limit: int
     Gains are scaled to all windows as if those looked at were typical: good for ranking, too high as an estimate.
     """
     every = [(i, point) for i, candidate in enumerate(candidates) for point in candidate.probes]
-    if len(every) <= MANY:
+    if len(every) <= SIZES.many:
         return _ordered(_looked_at(fitter, fit, candidates, every, limit))
-    coarse = _looked_at(fitter, fit, candidates, every, max(limit // 3, FEWEST))
-    order = sorted(coarse, key=lambda i: -max(s.gain for s, _ in coarse[i]))[:CANDIDATES]
-    again = [(i, p) for i in order for _, p in sorted(coarse[i], key=lambda f: -f[0].gain)[:POINTS]]
+    coarse = _looked_at(fitter, fit, candidates, every, max(limit // 3, SIZES.fewest))
+    order = sorted(coarse, key=lambda i: -max(s.gain for s, _ in coarse[i]))[: SIZES.candidates]
+    again = [(i, p) for i in order for _, p in sorted(coarse[i], key=lambda f: -f[0].gain)[: SIZES.points]]
     fine = _looked_at(fitter, fit, candidates, again, limit)
     return _ordered(fine) + _ordered({i: found for i, found in coarse.items() if i not in fine})
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fitter import Fitter
@@ -40,10 +40,17 @@ __all__ = [
 ]
 
 
-FAR = 1.5  # noises that remain: beyond, the search also tries other ways
-MUCH = 0.03  # and of the whole gap
-ELSEWHERE = 3  # times
-BETTER = 0.5  # of the gap that remains, which another way has to undercut
+@dataclass(frozen=True)
+class OtherWays:
+    """When the search also tries other ways than the greedy one."""
+
+    far: float = 1.5  # noises that remain: beyond, the search also tries other ways
+    much: float = 0.03  # and of the whole gap
+    elsewhere: int = 3  # times
+    better: float = 0.5  # of the gap that remains, which another way has to undercut
+
+
+OTHER_WAYS = OtherWays()
 
 
 def run(
@@ -177,15 +184,15 @@ def _elsewhere(race: Race, model: Model, say: Progress) -> Model:
     Each of its effects in turn is left out, and the search goes on from the rest without that law.
     """
     settings = race.settings
-    for _ in range(ELSEWHERE):
-        if not model.effects or race.at_noise(model, (settings.believed * FAR) ** 2):
+    for _ in range(OTHER_WAYS.elsewhere):
+        if not model.effects or race.at_noise(model, (settings.believed * OTHER_WAYS.far) ** 2):
             return model
         noise = settings.believed**2 * race.noise * len(model.cost)
-        if model.total - noise < MUCH * (race.base.total - noise):
+        if model.total - noise < OTHER_WAYS.much * (race.base.total - noise):
             return model
         others = [_instead(race, model, e, say) for e in model.effects]
         best = min((m for m in others if m is not None), key=lambda m: m.total, default=model)
-        if best.total - noise > BETTER * (model.total - noise):
+        if best.total - noise > OTHER_WAYS.better * (model.total - noise):
             return model
         model = best
     return model

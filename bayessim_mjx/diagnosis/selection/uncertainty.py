@@ -45,9 +45,18 @@ def spread(fitter: Fitter, model: Model, along: Ridges | None = None) -> Spread:
     return Spread(np.asarray(covariance), statistics.covariance(model.estimates), statistics.freedom(share))
 
 
-TIMES = 0.07  # of a time step; measured on single effects in MuJoCo C at a tenth of the step
-LAWS = 0.01  # of the distance from neutral
-MISFIT = 0.15  # of it, for a law that leaves all of the gap's root mean square; measured likewise
+@dataclass(frozen=True)
+class Systematic:
+    """What simulators differ by, whatever the data."""
+
+    # of a time step; measured on single effects in MuJoCo C at a tenth of the step
+    times: float = 0.07
+    laws: float = 0.01  # of the distance from neutral
+    # of it, for a law that leaves all of the gap's root mean square; measured likewise
+    misfit: float = 0.15
+
+
+SYSTEMATIC = Systematic()
 
 
 def deviations(fitter: Fitter, model: Model) -> Array:
@@ -80,10 +89,10 @@ def systematic(model: Model, timestep: float, left: float = 0.0) -> Array:
     Two simulators with the same effect agree on its times (delays, time constants) to a part of a time step, on its
     other numbers to about a percent; to less where the law leaves a share `left` of the squared gap unexplained.
     """
-    laws = LAWS + MISFIT * float(np.sqrt(np.clip(left, 0.0, 1.0)))
+    laws = SYSTEMATIC.laws + SYSTEMATIC.misfit * float(np.sqrt(np.clip(left, 0.0, 1.0)))
     own = {c.name for effect in model.effects for c in effect.coordinates}
     return np.array([
-        0.0 if c.name not in own else TIMES * timestep if c.unit == "s" else laws * abs(value - c.neutral)
+        0.0 if c.name not in own else SYSTEMATIC.times * timestep if c.unit == "s" else laws * abs(value - c.neutral)
         for c, value in zip(model.fit.coordinates, model.fit.values, strict=True)
     ])  # fmt: skip
 

@@ -27,10 +27,18 @@ from bayessim_mjx.diagnosis.selection.search import (
 from bayessim_mjx.diagnosis.selection.tried import Tried
 from bayessim_mjx.quantities import percent
 
-NEAR = 1.2  # noise variances: models that leave less than that explain the same
-SAME = 0.02  # of what an effect closes
-MOST = 8  # rivals told of one effect, single ones first
-MILD = 10.0  # nats: below, held-out evidence between two models is called a tie
+
+@dataclass(frozen=True)
+class Alike:
+    """When two explanations are told as the same."""
+
+    near: float = 1.2  # noise variances: models that leave less than that explain the same
+    same: float = 0.02  # of what an effect closes
+    most: int = 8  # rivals told of one effect, single ones first
+    mild: float = 10.0  # nats: below, held-out evidence between two models is called a tie
+
+
+ALIKE = Alike()
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,16 +91,18 @@ def rule(race: Race, say: Progress) -> Ruling:
 def _fewer(race: Race, winner: Model, effect: Candidate, rivals: Sequence[Rival], say: Progress) -> list[Model]:
     """Rivals with fewer numbers that close as much of what the other effects leave."""
     rest = without(race, winner, effect, say).total
-    least = (1.0 - SAME) * (rest - winner.total)
+    least = (1.0 - ALIKE.same) * (rest - winner.total)
     models = [r.model for r in rivals if not r.contains and r.model.size < winner.size or _narrower(effect, r)]
     models = [m for m in models if rest - m.total >= least]
-    return [m for m in models if race.at_noise(m, NEAR) >= race.at_noise(winner, NEAR)]
+    return [m for m in models if race.at_noise(m, ALIKE.near) >= race.at_noise(winner, ALIKE.near)]
 
 
 def _narrower(effect: Candidate, rival: Rival) -> bool:
     """Whether the rival is the same law at one of the places only, and the logs cannot tell."""
     (*others, own) = rival.effects
-    return not others and own.effect == effect.effect and effect.where == "all" != own.where and rival.behind < MILD
+    return (
+        not others and own.effect == effect.effect and effect.where == "all" != own.where and rival.behind < ALIKE.mild
+    )
 
 
 def _in_parts(race: Race, winner: Model, effect: Candidate, say: Progress) -> list[Rival]:
@@ -133,7 +143,7 @@ def _rivals(race: Race, winner: Model, effect: Candidate, say: Progress) -> list
                     for r in _rival(race, winner, effect, model.effects, model)
                     if r.closure > race.closure(winner) + 0.01
                 ]
-    return sorted(out, key=lambda r: (len(r.effects), -r.closure))[:MOST]
+    return sorted(out, key=lambda r: (len(r.effects), -r.closure))[: ALIKE.most]
 
 
 def _instead_of_all(race: Race, winner: Model) -> list[Rival]:
@@ -151,16 +161,20 @@ def _instead_of_all(race: Race, winner: Model) -> list[Rival]:
 def _finished(race: Race, winner: Model, model: Model) -> Model:
     """A simpler rival that may not have come to its end: a few steps more where the winner is at the noise already."""
     simpler = model.size < winner.size and model.total < 100.0 * winner.total
-    return polish(race, model) if simpler and race.at_noise(winner, NEAR) and not race.at_noise(model, NEAR) else model
+    return (
+        polish(race, model)
+        if simpler and race.at_noise(winner, ALIKE.near) and not race.at_noise(model, ALIKE.near)
+        else model
+    )
 
 
 def _rival(race: Race, winner: Model, effect: Candidate, others: tuple[Candidate, ...], model: Model) -> list[Rival]:
     c = race.better(model, winner)
     behind = race.closure(winner) - race.closure(model)
     misfit = race.above_noise(winner)
-    told_apart = c.evidence > MILD and (c.t > 2.0 or c.evidence > 3 * MILD)
+    told_apart = c.evidence > ALIKE.mild and (c.t > 2.0 or c.evidence > 3 * ALIKE.mild)
     # what is left of both is worth less than the simulators' own differences: significant, not relevant
-    told_apart = told_apart and not (race.at_noise(winner, NEAR) and race.at_noise(model, NEAR))
+    told_apart = told_apart and not (race.at_noise(winner, ALIKE.near) and race.at_noise(model, ALIKE.near))
     if told_apart and not (misfit and behind < race.settings.tie / 2):
         return []
     if behind > 3 * race.settings.tie:

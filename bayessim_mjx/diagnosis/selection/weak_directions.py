@@ -19,14 +19,28 @@ from bayessim_mjx.diagnosis.fitting.quadratic import eliminate
 from bayessim_mjx.diagnosis.selection.models import Model, scored
 
 Array = NDArray[np.float64]
-UNIFORM = 0.289  # standard deviation of a uniform distribution, of its range
-WEAK = 1e-4  # of the largest curvature, in units of UNIFORM ranges: there the columns' own errors may decide
-INVOLVED = 0.1  # share of an effect's variance that comes from a direction
-MOST, ROUNDS, STEPS = 6, 2, 2  # directions, moves along them, Newton steps in all others
-SHARES = (1.0, 0.5, 0.25)  # of the step along the ridges, tried in turn
-REACH = 1.5  # in units of UNIFORM: how far along a direction is simulated
-NATS = 2.0  # of log-likelihood, and
-ROUNDING = 0.005  # of the cost: a smaller rise is no knowledge (single precision alone brings as much)
+
+
+@dataclass(frozen=True)
+class Rules:
+    """When the data hardly tell a direction, and how it is followed."""
+
+    uniform: float = 0.289  # standard deviation of a uniform distribution, of its range
+    # of the largest curvature, in units of `uniform` ranges: there the columns' own errors may decide
+    weak: float = 0.0001
+    involved: float = 0.1  # share of an effect's variance that comes from a direction
+    # directions, moves along them, Newton steps in all others
+    most: int = 6
+    rounds: int = 2
+    steps: int = 2
+    shares: tuple[float, ...] = (1.0, 0.5, 0.25)  # of the step along the ridges, tried in turn
+    reach: float = 1.5  # in units of `uniform`: how far along a direction is simulated
+    nats: float = 2.0  # of log-likelihood, and
+    # of the cost: a smaller rise is no knowledge (single precision alone brings as much)
+    rounding: float = 0.005
+
+
+RULES = Rules()
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +63,7 @@ class Ridges:
 
 def scales(fit: Fit) -> Array:
     """Standard deviations `[k]` of uniform distributions over the parameters' ranges."""
-    return np.array([UNIFORM * (c.high - c.low) for c in fit.coordinates])
+    return np.array([RULES.uniform * (c.high - c.low) for c in fit.coordinates])
 
 
 def beliefs(fit: Fit, base: int) -> Array:
@@ -67,7 +81,7 @@ def inflation(model: Model) -> float:
 
 def settled(fitter: Fitter, model: Model) -> tuple[Model, Ridges]:
     """The model moved along its ridges to what was believed beforehand, and the curvature along them there."""
-    for _ in range(ROUNDS):
+    for _ in range(RULES.rounds):
         found = _Profile(fitter, model)
         moved = found.moved()
         if moved is None:
@@ -87,7 +101,8 @@ class _Profile:
         curvature, V = np.linalg.eigh(scale[:, None] * S * scale)
         variance = V[base:] ** 2 / np.maximum(curvature, 1e-12 * curvature[-1])
         share = np.max(variance / np.maximum(variance.sum(1, keepdims=True), 1e-300), axis=0)
-        self.weak = weak = np.flatnonzero((curvature < WEAK * curvature[-1]) & (share > INVOLVED))[:MOST]
+        flat = (curvature < RULES.weak * curvature[-1]) & (share > RULES.involved)
+        self.weak = weak = np.flatnonzero(flat)[: RULES.most]
         self.every = scale[:, None] * V
         self.ways, self.columns = self.every[:, weak], self.fit.A @ self.every
         self.less = inflation(model)
@@ -110,14 +125,14 @@ class _Profile:
 
     def allowed(self, cost: float) -> float:
         """A rise of the cost that says nothing."""
-        return float(max(2 * NATS * self.less, ROUNDING * cost))
+        return float(max(2 * RULES.nats * self.less, RULES.rounding * cost))
 
     def _places(self, way: Array) -> tuple[float, float]:
         """Two places along a way, one on either side where there is room."""
         behind, ahead = self._room(way)
-        if min(-behind, ahead) > 0.1 * REACH:
-            return max(behind, -REACH), min(ahead, REACH)
-        end = min(ahead, REACH) if ahead > -behind else max(behind, -REACH)
+        if min(-behind, ahead) > 0.1 * RULES.reach:
+            return max(behind, -RULES.reach), min(ahead, RULES.reach)
+        end = min(ahead, RULES.reach) if ahead > -behind else max(behind, -RULES.reach)
         end = end if abs(end) > 1e-6 else 1e-6  # a corner: nowhere to go
         return end / 2, end
 
@@ -137,7 +152,7 @@ class _Profile:
         fitter, fit = self.fitter, self.fit
         low, high = (np.array([getattr(c, end) for c in fit.coordinates]) for end in ("low", "high"))
         reached, costs = [np.clip(p, low, high) for p in points], np.zeros(len(points))
-        for _ in range(STEPS):
+        for _ in range(RULES.steps):
             thetas = np.stack([fitter.vector(fit.coordinates, p) for p in reached])
             rows = fitter.whiten(fitter.simulator.run(thetas, np.repeat(fit.offsets[None], len(thetas), 0)))
             for k, (r, stays) in enumerate(zip(rows, fixed, strict=True)):
@@ -160,8 +175,8 @@ class _Profile:
         neutral = np.array([c.neutral for c in fit.coordinates])
         H = np.diag(known[flat]) + ways.T @ (belief[:, None] * ways)
         slope = self.slopes[flat] / self.less / 2 + ways.T @ (belief * (fit.values - neutral))
-        step = np.clip(-np.linalg.solve(H, slope), -REACH, REACH)
-        points = [fit.values, *(fit.values + ways @ (share * step) for share in SHARES)]
+        step = np.clip(-np.linalg.solve(H, slope), -RULES.reach, RULES.reach)
+        points = [fit.values, *(fit.values + ways @ (share * step) for share in RULES.shares)]
         (here, *_), reached = self.costs(points, [self.weak[flat]] * len(points))
         for point in reached[1:]:
             if np.all(np.abs(point - fit.values) <= 1e-3 * scales(fit)):

@@ -1,5 +1,7 @@
 """Start states eliminated, bounded steps and held-out costs, against dense algebra that does the same the long way."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
@@ -86,7 +88,7 @@ def test_a_direction_that_no_data_see_does_not_move():
 
 
 def test_held_out_costs_are_those_of_refitting_without_the_condition(monkeypatch):
-    monkeypatch.setattr(quadratic, "TRUST", 1e-12)
+    monkeypatch.setattr(quadratic, "RULES", replace(quadratic.RULES, trust=1e-12))
     rng = np.random.default_rng(11)
     windows, group = 12, np.repeat([0, 1, 2, 3], 3)
     A, B = rng.normal(size=(windows, N, K)), rng.normal(size=(windows, N, S))

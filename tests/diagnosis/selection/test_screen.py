@@ -1,6 +1,7 @@
 """Screening from one simulation per starting point: the true effect first, its gain foretold."""
 
 import importlib
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -95,8 +96,7 @@ def test_a_first_look_at_few_windows_keeps_what_matters(screened, monkeypatch):
     truth, setup, fitter, fit, _ = screened
     whole = screen(fitter, fit, setup.candidates, 24)
     module = importlib.import_module("bayessim_mjx.diagnosis.selection.screen")
-    monkeypatch.setattr(module, "MANY", 0)
-    monkeypatch.setattr(module, "CANDIDATES", 3)
+    monkeypatch.setattr(module, "SIZES", replace(module.SIZES, many=0, candidates=3))
     before = fitter.simulator.rollouts
     found = screen(fitter, fit, setup.candidates, 24)
     points = sum(len(c.probes) for c in setup.candidates)
