@@ -38,7 +38,8 @@ class Density:
         prepare: (params, x [N, D], y [N, d], train [N], held [N], settings) -> params with what a first fit sets by its
             data; rows are used where train or held is True. None: nothing.
         regressed: whether the heads' weights start at a regression on the hidden features as well as on the summaries:
-            for features that do not change in training.
+            for features that do not change in training. Their means should be 0: the regression has no intercept for
+            them.
         whitened: whether whitened summaries are tried too (whitening.py).
     """
 
