@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 from bayessim_mjx.diagnosis.logcheck.channels import Link
 from bayessim_mjx.diagnosis.residual.disturbance import Disturbance
 from bayessim_mjx.diagnosis.residual.flexible import Flexible
+from bayessim_mjx.diagnosis.residual.frequency import Heard
 from bayessim_mjx.diagnosis.result import Place
 from bayessim_mjx.diagnosis.selection.heldout import Prediction
 from bayessim_mjx.diagnosis.selection.models import Model
@@ -22,11 +23,11 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, eq=False)
 class Where:
-    """Where the gap lies: places, largest share first; maps of the missing force, spectra (for pictures); in words."""
+    """Where the gap lies: places, largest share first, and in words; maps of the missing force; what spectra show."""
 
     places: tuple[Place, ...]
-    maps: list[dict[str, Any]]
-    spectra: list[dict[str, Any]]
+    maps: tuple[dict[str, Any], ...]
+    spectra: tuple[Heard, ...]
     sentences: tuple[str, ...]
 
 

@@ -83,8 +83,8 @@ def where_it_lies(found: Findings, say: Progress) -> Findings:
         return found
     fitter, fit = found.setup.fitter, found.outcome.base.fit
     places, maps, told = where.locate(fitter, fit, found.disturbance, seed=found.setup.seed)
-    spectra, heard = frequency.analyse(fitter, fit, found.disturbance)
-    return found.having(Where(tuple(places), maps, spectra, (*told, *heard)))
+    spectra = frequency.analyse(fitter, fit, found.disturbance)
+    return found.having(Where(tuple(places), tuple(maps), spectra, tuple(told)))
 
 
 STAGES = (

@@ -39,7 +39,7 @@ def test_an_optional_stage_that_fails_is_a_warning_and_any_other_an_error():
 
 
 def test_findings_are_values():
-    start, part = found(), Where((), [], [], ("here",))
+    start, part = found(), Where((), (), (), ("here",))
     more = start.having(part)
     assert start.part(Where) is None and more.part(Where) is part and more.part(int) is None
     with pytest.raises(dataclasses.FrozenInstanceError):

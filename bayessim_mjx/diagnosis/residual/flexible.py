@@ -19,7 +19,6 @@ from bayessim_mjx.diagnosis.residual.disturbance import Disturbance, estimate
 from bayessim_mjx.diagnosis.residual.motion_inputs import WORDS, Inputs
 from bayessim_mjx.diagnosis.residual.regression import Regression, Seeded
 from bayessim_mjx.diagnosis.statistics import normal_deviate
-from bayessim_mjx.quantities import percent
 
 Array = NDArray[np.float64]
 
@@ -32,8 +31,6 @@ class Rules:
     block: float = 1.0  # s, held-out blocks within conditions
     folds: int = 4
     slack: float = 0.02  # of the best ridge's gain, for a plainer model
-    quiet: float = 1.1  # squared residual per sample that counts as noise alone
-    important: float = 0.1  # share of the gain that an input must carry to be named
 
 
 RULES = Rules()
@@ -75,29 +72,19 @@ class Flexible:
         depends_on: [{"input": "elbow speed", "joint", "quantity", "importance"}], largest first; importance: share of
             the gain that is lost when it is shuffled.
         where: {joint: share of the gain lost without the force on it}.
-        text: one sentence each.
-        force: `[W, m, nv]`, of the median seed on all windows, N m or N.
+        force: `[W, m, nv]`, of the median seed on all windows, N m or N; samples: residuals in a window.
     """
 
     condition: Held
     interpolation: Held
     depends_on: list[dict]
     where: dict[str, float]
-    text: list[str]
     force: Array = field(repr=False)
+    samples: int
 
     @property
     def cost_by_window(self) -> Array:
         return self.condition.cost
-
-    def details(self, base_rms: float = np.nan, winner_rms: float = np.nan) -> dict:
-        """Numbers for pictures."""
-        count = self.force.shape[0]
-        seeds = np.sqrt(np.maximum(self.condition.totals.min(1), 0.0) / count)
-        return {
-            "depends_on": [{"input": d["input"], "importance": d["importance"]} for d in self.depends_on],
-            "where": self.text, "seeds": seeds.tolist(), "rms_on_base": base_rms, "rms_on_winner": winner_rms,
-        }  # fmt: skip
 
 
 def flexible(
@@ -130,8 +117,7 @@ def flexible(
     fits = run.without(fold, [best.plain])[0]
     importance = _importance(problem, run, fold, fits, best)
     where = _by_joint(problem, run, fold, fits, best)
-    text = _words(held, importance, where, fitter.size)
-    return Flexible(held["condition"], held["interpolation"], importance, where, text, run.whole(best.plain))
+    return Flexible(held["condition"], held["interpolation"], importance, where, run.whole(best.plain), fitter.size)
 
 
 def blocks(log: NDArray[np.int64], start: NDArray[np.int64], steps: int) -> NDArray[np.int64]:
@@ -193,21 +179,3 @@ def _by_joint(problem: Regression, run: Seeded, fold: NDArray[np.int64], fits: l
         lost = float(run.costs(fold, fits, phi).sum()) - reference
         out[joint] = float(np.clip(lost / best.gain, 0.0, 1.0)) if best.gain > 0 else 0.0
     return out
-
-
-def _words(held: dict[str, Held], importance: list[dict], where: dict[str, float], samples: int) -> list[str]:
-    if not any(h.significant for h in held.values()):
-        return ["a flexible force finds nothing more that would hold on data not used for fitting"]
-    if all(float(h.base.mean()) < RULES.quiet * samples for h in held.values()):
-        return ["what is left lies within the measurement noise; of it a flexible force still finds a part"]
-    text = []
-    for name, h in held.items():
-        how = "other operating conditions" if name == "condition" else "the same conditions at other times"
-        share = h.gain / max(float(h.base.sum()), 1e-300)
-        text.append(f"on {how} a flexible force removes {percent(share)} of the squared gap that is left")
-    joints = [j for j, share in where.items() if share > 0.2 * max(where.values())]
-    inputs = [
-        d["input"] for d in importance if d["importance"] > RULES.important * max(importance[0]["importance"], 0.5)
-    ][:4]
-    depends = f"depends on {', '.join(inputs)}" if inputs else "depends on nothing that was measured: it is constant"
-    return [*text, f"what is missing acts at {', '.join(joints)} and {depends}"]

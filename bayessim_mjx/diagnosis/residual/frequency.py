@@ -161,8 +161,36 @@ def line(hz: Array, power: Array, lowest: float = 1.0) -> tuple[float, float]:
     return (float(hz[best]), float(height[best])) if height[best] > RULES.line else (float("nan"), 0.0)
 
 
-def analyse(fitter: Fitter, fit: Fit, disturbance: Disturbance | None = None) -> tuple[list[dict], list[str]]:
-    """(one entry per joint for pictures, sentences).
+@dataclass(frozen=True, eq=False)
+class Heard:
+    """What the spectra of one joint show.
+
+    Attributes:
+        late: delay of the acting effort, s; orders: [{"order", "amplitude", ...}] per turn, in `unit`.
+        line_hz, height: of a line of the missing force above its surroundings (NaN, 0: none); period: of control, s.
+        picture: spectra, for the report.
+    """
+
+    joint: str
+    late: Number
+    orders: list[dict]
+    unit: str
+    line_hz: float
+    height: float
+    period: float
+    picture: dict
+
+    def details(self) -> dict:
+        """For the report."""
+        more = {
+            "orders": [{k: t[k] for k in ("order", "amplitude")} for t in self.orders],
+            "delay": {"mean": self.late.value, "low": self.late.low, "high": self.late.high}, "line_hz": self.line_hz,
+        }  # fmt: skip
+        return {"joint": self.joint, **self.picture, **more}
+
+
+def analyse(fitter: Fitter, fit: Fit, disturbance: Disturbance | None = None) -> tuple[Heard, ...]:
+    """What the spectra of effort, motion and missing force show, joint by joint.
 
     Simulated motion is that of the windows, put together: it starts at the measured state in each of them, so that what
     accumulates over longer times than a window does not show. The equivalent delay therefore comes from forces: effort
@@ -174,21 +202,20 @@ def analyse(fitter: Fitter, fit: Fit, disturbance: Disturbance | None = None) ->
     nodes = disturbance.linear.nodes
     parts = [part for part in runs(windows) if len(part) * min(nodes, windows.steps) >= RULES.least]
     if not parts:  # windows of chaotic motion lie apart
-        return [], []
+        return ()
     theta = fitter.vector(fit.coordinates, fit.values)
     error = fitter.simulator.run(theta[None], fit.offsets[None])[0]
     without = statistics.leave_one_out(windows.group)
-    found, text = [], []
+    found = []
     for dof, joint in enumerate(inputs.joints):
         if not np.any(np.ptp(inputs.effort[..., dof], axis=1) > 0):
             continue
-        entry, says = _joint(windows, inputs, disturbance, error, parts, dof, without)
-        found.append({"joint": joint, **entry})
-        text += [f"{joint}: {s}" for s in says]
-    return found, text + _shared([(e["joint"], e["line_hz"]) for e in found])
+        found.append(_joint(joint, windows, inputs, disturbance, error, parts, dof, without))
+    return tuple(found)
 
 
 def _joint(
+    joint: str,
     windows: Windows,
     inputs: Inputs,
     disturbance: Disturbance,
@@ -196,7 +223,7 @@ def _joint(
     parts: list[NDArray[np.int64]],
     dof: int,
     without: Array,
-) -> tuple[dict, list[str]]:
+) -> Heard:
     logs = [int(windows.log[part[0]]) for part in parts]
     effort = [inputs.effort[part][..., dof].ravel() for part in parts]
     # measured positions as the simulation's errors have them: after each control step
@@ -212,11 +239,8 @@ def _joint(
     late = delay(through, top=_busy(through))
     turning = orders(disturbance, inputs, dof, without)
     peak, height = _resonance(spectra(drive, missing, spacing, logs))
-    entry = _picture(measured, simulated) | {
-        "orders": [{k: t[k] for k in ("order", "amplitude")} for t in turning],
-        "delay": {"mean": late.value, "low": late.low, "high": late.high}, "line_hz": peak,
-    }  # fmt: skip
-    return entry, _words(late, turning, inputs.force_unit[dof], peak, height, windows.dt)
+    picture, unit = _picture(measured, simulated), inputs.force_unit[dof]
+    return Heard(joint, late, turning, unit, peak, height, windows.dt, picture)
 
 
 def _resonance(found: Spectra) -> tuple[float, float]:
@@ -245,27 +269,3 @@ def _picture(measured: Spectra, simulated: Spectra) -> dict:
         out[f"gain_{name}"] = np.abs(s.response).tolist()
         out[f"phase_{name}_deg"] = np.degrees(np.unwrap(np.angle(s.response))).tolist()
     return out
-
-
-def _words(late: Number, turning: list[dict], unit: str, peak: float, height: float, dt: float) -> list[str]:
-    says = []
-    if late.low > 0.02 * dt:
-        ms = [f"{1e3 * x:.2g}" for x in (late.value, late.low, late.high)]
-        says.append(f"the effort acts {ms[0]} ms [{ms[1]}, {ms[2]}] later than commanded")
-    if turning:
-        top = max(turning, key=lambda t: t["amplitude"])
-        says.append(f"the missing force repeats {top['order']} times per turn, amplitude {top['amplitude']:.2g} {unit}")
-    if height:
-        says.append(f"the missing force has a line at {peak:.3g} Hz, {height:.2g} times above its surroundings")
-    return says
-
-
-def _shared(lines: list[tuple[str, float]]) -> list[str]:
-    """A line common to several joints points to the mount, one in a single joint to its transmission."""
-    hz = [(name, f) for name, f in lines if np.isfinite(f)]
-    if len(hz) < 2 or max(f for _, f in hz) > 1.1 * min(f for _, f in hz):
-        return []
-    mean = float(np.mean([f for _, f in hz]))
-    return [
-        f"the same line near {mean:.3g} Hz in {', '.join(n for n, _ in hz)}: the mount or base rather than one joint"
-    ]

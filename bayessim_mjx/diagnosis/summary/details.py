@@ -10,6 +10,7 @@ from bayessim_mjx.diagnosis.findings import Findings
 from bayessim_mjx.diagnosis.result import FoundEffect
 from bayessim_mjx.diagnosis.selection import verdict
 from bayessim_mjx.diagnosis.selection.tried import Tried
+from bayessim_mjx.diagnosis.summary.left_in_words import flexible_in_words
 from bayessim_mjx.diagnosis.tolerance import length_unit
 from bayessim_mjx.effects import spec_of
 from bayessim_mjx.logs.log import Channels
@@ -67,8 +68,14 @@ def _flexible(found: Findings) -> dict[str, Any]:
         return {}
     size = found.setup.fitter.size
     levels = [np.nan if f is None else float(np.sqrt(f.condition.cost.mean() / size)) for f in (base, winner)]
-    told = shown.details(*levels)
-    return told | {"seeds": [s / np.sqrt(size) for s in told["seeds"]]}
+    seeds = np.sqrt(np.maximum(shown.condition.totals.min(1), 0.0) / shown.force.shape[0])
+    return {
+        "depends_on": [{"input": d["input"], "importance": d["importance"]} for d in shown.depends_on],
+        "where": flexible_in_words(shown),
+        "seeds": [s / np.sqrt(size) for s in seeds.tolist()],
+        "rms_on_base": levels[0],
+        "rms_on_winner": levels[1],
+    }
 
 
 def _overlays(found: Findings) -> list[dict[str, Any]]:

@@ -11,6 +11,7 @@ from bayessim_mjx.diagnosis import statistics
 from bayessim_mjx.diagnosis.findings import Findings
 from bayessim_mjx.diagnosis.result import FoundEffect, Gap
 from bayessim_mjx.diagnosis.selection.verdict import Rival
+from bayessim_mjx.diagnosis.summary.left_in_words import flexible_in_words
 from bayessim_mjx.diagnosis.vocabulary import listed, missing
 from bayessim_mjx.quantities import extent, percent
 
@@ -66,7 +67,7 @@ def sentences(
     if not effects and remains == 0.0 and found.outcome.above_noise(found.outcome.base):
         told.append(CHANCE.format(calibrated=stage_in_words(far, "calibrated")))
     if name == "unexplained" and found.flexible_winner is not None:
-        told += [f"{text[:1].upper()}{text[1:]}." for text in found.flexible_winner.text]
+        told += [f"{text[:1].upper()}{text[1:]}." for text in flexible_in_words(found.flexible_winner)]
     told += [f"At its bound: {missing(e.name, e.where)}. {e.sentence}" for e in effects if _at_bound(e)]
     told += [f"{k} {v['structural']}." for k, v in parameters.items() if v["structural"]]
     return [text for text in told if text]

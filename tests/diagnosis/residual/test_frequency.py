@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from bayessim_mjx.diagnosis.residual import disturbance, frequency
+from bayessim_mjx.diagnosis.summary.left_in_words import spectra_in_words
 from tests.diagnosis.missing_forces import fitted, record
 
 pytestmark = [pytest.mark.slow, pytest.mark.ci]  # whole diagnoses and fits
@@ -69,7 +70,8 @@ def test_windows_without_gaps_are_joined():
 
 def test_cogging_is_found_with_its_order_and_amplitude():
     fitter, fit = fitted(record(force=lambda t, d: np.array([0.05 * np.sin(11 * d.qpos[0])])))
-    found, text = frequency.analyse(fitter, fit)
+    heard = frequency.analyse(fitter, fit)
+    found, text = [h.details() for h in heard], spectra_in_words(heard)
     assert [o["order"] for o in found[0]["orders"]] == [11]
     assert found[0]["orders"][0]["amplitude"] == pytest.approx(0.05, rel=0.1)  # N m
     assert any("11 times per turn" in t for t in text)
@@ -77,7 +79,8 @@ def test_cogging_is_found_with_its_order_and_amplitude():
 
 def test_a_delay_of_the_effort_is_found():
     fitter, fit = fitted(record(delay=0.006, wrong=1.0), iterations=0)
-    found, text = frequency.analyse(fitter, fit, disturbance.estimate(fitter, fit, free=False))
+    heard = frequency.analyse(fitter, fit, disturbance.estimate(fitter, fit, free=False))
+    found, text = [h.details() for h in heard], spectra_in_words(heard)
     assert found[0]["delay"]["mean"] == pytest.approx(0.006, rel=0.12)  # s
     assert any("later than commanded" in t for t in text)
     for key in ("coherence_real", "coherence_sim", "gain_real", "gain_sim", "phase_real_deg", "phase_sim_deg"):
@@ -90,4 +93,4 @@ def test_windows_too_short_and_apart_have_no_spectrum(monkeypatch):
     fitter, fit = fitted(record(logs=2, seconds=2.0), iterations=0)
     monkeypatch.setattr(frequency, "runs", lambda windows: [np.array([i]) for i in range(len(windows.log))])
     monkeypatch.setattr(frequency, "RULES", replace(frequency.RULES, least=2 * fitter.simulator.windows.steps))
-    assert frequency.analyse(fitter, fit, disturbance.estimate(fitter, fit)) == ([], [])
+    assert frequency.analyse(fitter, fit, disturbance.estimate(fitter, fit)) == ()

@@ -1,0 +1,73 @@
+"""What named effects leave, in words: what a flexible force makes of it, and what its spectrum shows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from bayessim_mjx.diagnosis.residual.flexible import Flexible
+from bayessim_mjx.diagnosis.residual.frequency import Heard
+from bayessim_mjx.quantities import percent
+
+
+@dataclass(frozen=True)
+class Rules:
+    """What is worth a word of a flexible force."""
+
+    quiet: float = 1.1  # squared residual per sample that counts as noise alone
+    important: float = 0.1  # share of the gain that an input must carry to be named
+
+
+RULES = Rules()
+
+
+def flexible_in_words(found: Flexible) -> list[str]:
+    """How much of what is left a flexible force removes, where it acts, and what it depends on."""
+    held = {"other operating conditions": found.condition, "the same conditions at other times": found.interpolation}
+    if not any(h.significant for h in held.values()):
+        return ["a flexible force finds nothing more that would hold on data not used for fitting"]
+    if all(float(h.base.mean()) < RULES.quiet * found.samples for h in held.values()):
+        return ["what is left lies within the measurement noise; of it a flexible force still finds a part"]
+    text = []
+    for how, h in held.items():
+        share = h.gain / max(float(h.base.sum()), 1e-300)
+        text.append(f"on {how} a flexible force removes {percent(share)} of the squared gap that is left")
+    least = RULES.important * max(found.depends_on[0]["importance"], 0.5)
+    joints = [j for j, share in found.where.items() if share > 0.2 * max(found.where.values())]
+    inputs = [d["input"] for d in found.depends_on if d["importance"] > least][:4]
+    depends = f"depends on {', '.join(inputs)}" if inputs else "depends on nothing that was measured: it is constant"
+    return [*text, f"what is missing acts at {', '.join(joints)} and {depends}"]
+
+
+def spectra_in_words(found: Sequence[Heard]) -> list[str]:
+    """Delays, orders and lines, joint by joint, and a line that several joints share."""
+    each = [f"{heard.joint}: {text}" for heard in found for text in _heard(heard)]
+    return each + _shared([(heard.joint, heard.line_hz) for heard in found])
+
+
+def _heard(found: Heard) -> list[str]:
+    says, late = [], found.late
+    if late.low > 0.02 * found.period:
+        ms = [f"{1e3 * x:.2g}" for x in (late.value, late.low, late.high)]
+        says.append(f"the effort acts {ms[0]} ms [{ms[1]}, {ms[2]}] later than commanded")
+    if found.orders:
+        top = max(found.orders, key=lambda t: t["amplitude"])
+        size = f"{top['amplitude']:.2g} {found.unit}"
+        says.append(f"the missing force repeats {top['order']} times per turn, amplitude {size}")
+    if found.height:
+        above = f"{found.height:.2g} times above its surroundings"
+        says.append(f"the missing force has a line at {found.line_hz:.3g} Hz, {above}")
+    return says
+
+
+def _shared(lines: list[tuple[str, float]]) -> list[str]:
+    """A line common to several joints points to the mount, one in a single joint to its transmission."""
+    hz = [(name, f) for name, f in lines if np.isfinite(f)]
+    if len(hz) < 2 or max(f for _, f in hz) > 1.1 * min(f for _, f in hz):
+        return []
+    mean = float(np.mean([f for _, f in hz]))
+    return [
+        f"the same line near {mean:.3g} Hz in {', '.join(n for n, _ in hz)}: the mount or base rather than one joint"
+    ]
