@@ -4,12 +4,14 @@ A simulation of the logged commands from the logged start drifts off by every sm
 contact it may end anywhere. So the simulated state is drawn to the measured one by a Kalman gain: x <- x + K (y - x).
 The gains come from linear error dynamics along the record (an extended Kalman filter with the gains of one reference
 theta for all): without process noise they vanish, and what is left is the free simulation from an estimated start.
+A force that is not modelled and lasts is followed too: otherwise whatever it moves with would be taken for its cause.
 Ljung (1999), System Identification, 7.4; Sarkka (2013), Bayesian Filtering and Smoothing, 5.2.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -45,18 +47,36 @@ class Record(struct.PyTreeNode):
     law: Law | None = None
 
 
+@dataclass(frozen=True)
+class Force:
+    """A force that is not modelled and lasts: a stationary first-order process in each degree of freedom.
+
+    Attributes:
+        sd: `[nv]` standard deviations of the velocity that it gives in a control step.
+        lasting: its correlation from one control step to the next.
+        dt: control step, s.
+    """
+
+    sd: np.ndarray
+    lasting: float
+    dt: float
+
+
 class Gains(struct.PyTreeNode):
     """Of a filter along N recorded trajectories, for errors (position tangent, velocity) of 2 nv numbers.
 
     Attributes:
-        gain: `[N, T, 2 nv, 2 nv]`, 0 in the columns of what is not measured.
+        gain: `[N, T, 3 nv, 2 nv]`, 0 in the columns of what is not measured; the last nv rows are those of a force that
+            is not modelled, as the velocity that it gives in a control step.
         whitener: `[N, T, 2 nv, 2 nv]`, W with W^T W the inverse of the innovations' covariance (0 where not measured).
         log_size: `[N, T]`, log |W| over what is measured.
+        lasting: `[N]`, the share of that force that is still there a control step later.
     """
 
     gain: Array
     whitener: Array
     log_size: Array
+    lasting: Array
 
 
 def errors(physics: Physics, thetas: ArrayLike, record: Record, gains: Gains) -> Array:
@@ -77,14 +97,15 @@ def _errors(physics: Physics) -> Callable[..., Any]:
         world = _begin(physics, theta, record)
         drive = Drive(law=record.law)
 
-        def step(world: Any, row: tuple) -> tuple[Any, Array]:
+        def step(carry: tuple, row: tuple) -> tuple[tuple, Array]:
+            world, force = carry
             command, qpos, qvel, gain, whitener = row
             world, _ = control_step(physics, world, command, drive)
-            gap = _gap(physics, world, qpos, qvel)
-            return _drawn(physics, world, gain @ gap), jnp.sum((whitener @ gap) ** 2)
+            world, force, gap = _followed(physics, world, force, gains.lasting, gain, qpos, qvel)
+            return (world, force), jnp.sum((whitener @ gap) ** 2)
 
         rows = record.command, record.qpos[1:], record.qvel[1:], gains.gain, gains.whitener
-        return jax.lax.scan(step, world, rows)[1]
+        return jax.lax.scan(step, (world, jnp.zeros(physics.mj_model.nv)), rows)[1]
 
     def run(thetas: Array, record: Record, gains: Gains) -> Array:
         def of(at: tuple[Record, Gains]) -> Array:
@@ -109,6 +130,17 @@ def _begin(physics: Physics, theta: Array, record: Record) -> Any:
     return begin(physics, theta, around)
 
 
+def _followed(
+    physics: Physics, world: Any, force: Array, lasting: Array, gain: Array, qpos: Array, qvel: Array
+) -> tuple[Any, Array, Array]:
+    """(world, force) drawn to what was measured, and the prediction error [2 nv]."""
+    size = 2 * physics.mj_model.nv
+    pushed = jnp.concatenate([0.5 * physics.dt * force, force])
+    gap = _gap(physics, world, qpos, qvel) - pushed
+    by = gain @ gap
+    return _drawn(physics, world, pushed + by[:size]), lasting * force + by[size:], gap
+
+
 def _gap(physics: Physics, world: Any, qpos: Array, qvel: Array) -> Array:
     shown = world.measurement
     return jnp.concatenate([difference(physics.mj_model, qpos, shown["qpos"]), qvel - shown["qvel"]])
@@ -128,7 +160,8 @@ def _transitions(physics: Physics) -> Callable[..., Any]:
         world = _begin(physics, theta, record)
         drive = Drive(law=record.law)
 
-        def step(world: Any, row: tuple) -> tuple[Any, tuple[Array, Array]]:
+        def step(carry: tuple, row: tuple) -> tuple[tuple, tuple[Array, Array]]:
+            world, force = carry
             command, qpos, qvel, gain = row
 
             def ahead(by: Array) -> Any:
@@ -144,11 +177,11 @@ def _transitions(physics: Physics) -> Callable[..., Any]:
 
             states = jax.vmap(state)(after)
             columns = (states[1 : 1 + 2 * nv] - states[1 + 2 * nv :]) / (2 * way[:, None])
-            gap = _gap(physics, first, qpos, qvel)
-            return _drawn(physics, first, gain @ gap), (columns.T, gap)
+            world, force, gap = _followed(physics, first, force, gains.lasting, gain, qpos, qvel)
+            return (world, force), (columns.T, gap)
 
         rows = record.command, record.qpos[1:], record.qvel[1:], gains.gain
-        return jax.lax.scan(step, world, rows)[1]
+        return jax.lax.scan(step, (world, jnp.zeros(nv)), rows)[1]
 
     return jax.jit(jax.vmap(one, in_axes=(None, 0, 0, None)))
 
@@ -167,18 +200,19 @@ def transitions(
 def free(record: Record, nv: int) -> Gains:
     """Gains that never correct: a free simulation from the measured start, unit weights."""
     n, t = record.command.shape[:2]
-    zero = jnp.zeros((n, t, 2 * nv, 2 * nv))
-    return Gains(zero, zero + jnp.eye(2 * nv), jnp.zeros((n, t)))
+    zero = jnp.zeros((n, t, 3 * nv, 2 * nv))
+    return Gains(zero, zero[:, :, : 2 * nv] + jnp.eye(2 * nv), jnp.zeros((n, t)), jnp.zeros(n))
 
 
 def close(record: Record, nv: int) -> Gains:
     """Gains that correct at once: every step begins where it was measured."""
-    n, t = record.command.shape[:2]
-    eye = jnp.zeros((n, t, 2 * nv, 2 * nv)) + jnp.eye(2 * nv)
-    return Gains(eye, eye, jnp.zeros((n, t)))
+    gains = free(record, nv)
+    return gains.replace(gain=gains.gain + jnp.eye(3 * nv, 2 * nv))
 
 
-def riccati(ways: np.ndarray, sensor: np.ndarray, process: np.ndarray, start: np.ndarray) -> Gains:
+def riccati(
+    ways: np.ndarray, sensor: np.ndarray, process: np.ndarray, start: np.ndarray, force: Force | None = None
+) -> Gains:
     """Gains of the Kalman filter along linear error dynamics.
 
     Args:
@@ -186,29 +220,33 @@ def riccati(ways: np.ndarray, sensor: np.ndarray, process: np.ndarray, start: np
         sensor: `[2 nv]` standard deviations of the measurement noise; inf where nothing is measured.
         process: `[2 nv]` standard deviations of what a control step adds to the state.
         start: `[2 nv]` standard deviations of the start state's error.
+        force: one that lasts, or None.
     """
     n, steps, size, _ = ways.shape
-    seen = np.isfinite(sensor)
-    noise, added = np.diag(sensor[seen] ** 2), np.diag(process**2)
-    spread = np.repeat(np.diag(start**2)[None], n, axis=0)
-    gain, whitener = np.zeros((n, steps, size, size)), np.zeros((n, steps, size, size))
-    log_size = np.zeros((n, steps))
-    at = np.ix_(seen, seen)
+    nv, seen = size // 2, np.isfinite(sensor)
+    force = force or Force(np.zeros(nv), 0.0, 0.0)
+    noise = np.diag(sensor[seen] ** 2)
+    fresh = force.sd**2 * (1 - force.lasting**2)
+    added = np.diag(np.concatenate([process**2, fresh]))
+    spread = np.repeat(np.diag(np.concatenate([start**2, force.sd**2]))[None], n, axis=0)
+    gain, whitener = np.zeros((n, steps, size + nv, size)), np.zeros((n, steps, size, size))
+    log_size, at = np.zeros((n, steps)), np.ix_(seen, seen)
+    way = np.zeros((n, size + nv, size + nv))
+    way[:, :nv, size:], way[:, nv:size, size:] = 0.5 * force.dt * np.eye(nv), np.eye(nv)
+    way[:, size:, size:] = force.lasting * np.eye(nv)
     for t in range(steps):
-        way = np.nan_to_num(ways[:, t])
-        spread = way @ spread @ np.swapaxes(way, -1, -2) + added
-        spread = np.minimum(np.maximum(spread, -1e12), 1e12)
-        inner = spread[:, seen][:, :, seen] + noise
-        k = np.swapaxes(np.linalg.solve(inner, spread[:, seen, :]), -1, -2)
-        gain[:, t, :, seen] = np.moveaxis(k, 2, 0)
+        way[:, :size, :size] = np.nan_to_num(ways[:, t])
+        spread = np.clip(way @ spread @ np.swapaxes(way, -1, -2) + added, -1e12, 1e12)
+        known = np.concatenate([seen, np.zeros(nv, bool)])
+        inner = spread[:, known][:, :, known] + noise
+        k = np.swapaxes(np.linalg.solve(inner, spread[:, known, :]), -1, -2)
+        gain[:, t][:, :, seen] = k
         lower = np.linalg.cholesky(inner)
         white = np.linalg.inv(lower)
         for row in range(n):
             whitener[row, t][at] = white[row]
         log_size[:, t] = -np.log(np.diagonal(lower, axis1=-2, axis2=-1)).sum(-1)
-        keep = np.eye(size) - gain[:, t]
-        spread = keep @ spread @ np.swapaxes(keep, -1, -2) + gain[:, t][:, :, seen] @ noise @ np.swapaxes(
-            gain[:, t][:, :, seen], -1, -2
-        )
-    arrays = (jnp.asarray(x, jnp.float32) for x in (gain, whitener, log_size))
+        keep = np.eye(size + nv) - np.concatenate([gain[:, t], np.zeros((n, size + nv, nv))], axis=-1)
+        spread = keep @ spread @ np.swapaxes(keep, -1, -2) + k @ noise @ np.swapaxes(k, -1, -2)
+    arrays = (jnp.asarray(x, jnp.float32) for x in (gain, whitener, log_size, np.full(n, force.lasting)))
     return Gains(*arrays)

@@ -8,7 +8,7 @@ import pytest
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 from bayessim_mjx.physics import Physics
 from bayessim_mjx.rollout import replay
-from bayessim_mjx.tracking import Record, close, errors, free, riccati, transitions
+from bayessim_mjx.tracking import Force, Record, close, errors, free, riccati, transitions
 
 SLIDER = """<mujoco><option timestep=".01" gravity="0 0 0"/><worldbody><body name="cart">
   <joint name="x" type="slide" axis="1 0 0"/><geom size=".1" mass="2"/></body></worldbody>
@@ -54,17 +54,32 @@ def test_error_dynamics_of_a_free_mass(slider, record):
 def test_gains_of_a_random_walk_become_the_textbook_ones():
     # x a random walk of q, measured with r = 1: steady P- solves P-^2 = q^2 (P- + r^2), K = P- / (P- + r^2)
     q, count = 0.5, 60
-    gains = riccati(np.ones((1, count, 1, 1)), np.array([1.0]), np.array([q]), np.array([1.0]))
+    gains = riccati(np.eye(2)[None, None].repeat(count, 1), np.ones(2), np.full(2, q), np.ones(2))
     ahead = (q**2 + np.sqrt(q**4 + 4 * q**2)) / 2
     assert float(gains.gain[0, -1, 0, 0]) == pytest.approx(ahead / (ahead + 1), rel=1e-5)
     assert float(gains.whitener[0, -1, 0, 0]) == pytest.approx((ahead + 1) ** -0.5, rel=1e-5)
-    assert float(gains.log_size[0, -1]) == pytest.approx(-0.5 * np.log(ahead + 1), rel=1e-5)
-    still = riccati(np.ones((1, count, 1, 1)), np.array([1.0]), np.zeros(1), np.array([1.0]))
+    assert float(gains.log_size[0, -1]) == pytest.approx(-np.log(ahead + 1), rel=1e-5)
+    still = riccati(np.eye(2)[None, None].repeat(count, 1), np.ones(2), np.zeros(2), np.ones(2))
     np.testing.assert_allclose(still.gain[0, :, 0, 0], 1 / (2 + np.arange(count)), rtol=1e-5)  # the mean so far
+
+
+def test_a_force_that_lasts_is_followed():
+    """A constant force: the filter's estimate becomes the velocity that it gives in a step, and no error is left."""
+    ways = np.broadcast_to([[1.0, 0.1], [0.0, 1.0]], (1, 200, 2, 2))
+    gains = riccati(ways, np.full(2, 0.01), np.zeros(2), np.full(2, 0.01), Force(np.array([0.5]), 0.99, 0.1))
+    state, known, force = np.zeros(2), np.zeros(2), 0.0
+    for t in range(200):
+        state = ways[0, 0] @ state + np.array([0.5 * 0.1, 1.0]) * 0.2
+        known = ways[0, 0] @ known + np.array([0.5 * 0.1, 1.0]) * force
+        gap = state - known
+        by = np.asarray(gains.gain[0, t], float) @ gap
+        known, force = known + by[:2], 0.99 * force + by[2]
+    assert force == pytest.approx(0.2, rel=0.03) and np.abs(gap).max() < 0.01
 
 
 def test_what_is_not_measured_is_not_used():
     ways = np.broadcast_to([[1.0, 0.1], [0.0, 1.0]], (1, 50, 2, 2))
     gains = riccati(ways, np.array([0.1, np.inf]), np.array([0.0, 0.3]), np.array([0.1, 5.0]))
+    assert gains.gain.shape == (1, 50, 3, 2)
     assert not np.asarray(gains.gain)[..., 1].any() and not np.asarray(gains.whitener)[..., 1, :].any()
     assert float(gains.gain[0, -1, 1, 0]) > 0.5  # the speed is learnt from positions

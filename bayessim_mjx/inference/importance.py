@@ -135,6 +135,16 @@ def tempered(found: Refined, power: float, components: int = 8, seed: int = 0) -
     return replace(found, posterior=answer, fitted=answer, effective=effective(weights), tail=tail, weights=weights)
 
 
+def stretched(found: Refined, by: np.ndarray, seed: int = 0) -> Refined:
+    """The same draws away from their mean by the factor `by` [d, d], in coordinates of unit covariance."""
+    z, space = coordinates(found), found.fitted.space
+    mean = found.weights @ z
+    lower = np.linalg.cholesky((z - mean).T @ ((z - mean) * found.weights[:, None]))
+    away = mean + (z - mean) @ np.linalg.solve(lower.T, by @ lower.T)
+    answer = _distribution(space, fitted(np.random.default_rng(seed), away, found.weights, 1))
+    return replace(found, posterior=answer, fitted=answer, theta=_theta(space, away))
+
+
 def coordinates(found: Refined) -> np.ndarray:
     """The draws in z [N, d]."""
     return _z(found.fitted.space, found.theta)
@@ -221,4 +231,4 @@ def _tempering(base: np.ndarray, like: np.ndarray, wanted: float) -> float:
     return low
 
 
-__all__ = ["Refined", "coordinates", "refine", "tempered"]
+__all__ = ["Refined", "coordinates", "refine", "stretched", "tempered"]

@@ -2,9 +2,8 @@
 
 The product of a network's posteriors proposes; `inference.importance` weighs thetas by how well a filter predicts the
 recorded motion one step ahead (`tracking`). Sensor and process noise are estimated with theta: what the simulator
-cannot follow counts as noise. Where the prediction errors of different trajectories disagree about theta by more than
-the likelihood admits, its logarithm is scaled down (Ribatet et al. 2012; the magnitude adjustment of a composite
-likelihood), so that model error widens the posterior.
+cannot follow counts as noise. Where the prediction errors of different stretches of time disagree about theta by more
+than the likelihood admits, the posterior is widened in those directions, so that model error does not make it sure.
 """
 
 from __future__ import annotations
@@ -20,17 +19,11 @@ from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.inference import importance
 from bayessim_mjx.inference.importance import Refined
 from bayessim_mjx.physics import Physics
-from bayessim_mjx.tracking import Gains, Record, close, errors, riccati, transitions
+from bayessim_mjx.tracking import Force, Gains, Record, close, errors, riccati, transitions
 
 FINEST = 1e-3  # of a channel's range of motion: no sensor is believed to be better
-PROCESS = (
-    0.0,
-    1e-3,
-    1e-2,
-    0.1,
-    1.0,
-    10.0,
-)  # process noise of a control step, sd in units of the velocity's sensor noise
+PROCESS = (1e-3, 1e-2, 0.03, 0.1, 0.3, 1.0, 10.0)  # of unmodelled forces, in the velocity's sensor noise
+LASTING = (0.7, 0.9, 0.97)  # their correlations from step to step
 RATIOS = (0.1, 0.3, 1.0, 3.0, 10.0)  # velocity's sensor noise against position's, times what was given
 PASSES = 3  # of noise and posterior in turn
 SETTLED = 0.1  # relative change of the log likelihood's unit at which noise and posterior agree
@@ -40,10 +33,17 @@ LOOKED = 4  # trajectories at which noise is estimated
 
 @dataclass(frozen=True)
 class Noise:
-    """Standard deviations [2 nv] per control step, positions first."""
+    """What the simulator does not explain.
+
+    Attributes:
+        sensor: `[2 nv]` standard deviations, positions first; inf where nothing is measured.
+        process: `[nv]` standard deviations of the velocity that unmodelled forces give in a control step.
+        lasting: their correlation from one control step to the next.
+    """
 
     sensor: np.ndarray
     process: np.ndarray
+    lasting: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -54,13 +54,13 @@ class Refinement:
         posterior: refined, or the proposal where `refined.reason` is not None.
         refined: see `inference.importance`.
         noise: sensor and process noise as estimated.
-        rate: power of the likelihood, 1 where the simulator can explain the trajectories.
+        widening: largest factor on its standard deviations, 1 where the simulator can explain the trajectories.
     """
 
     posterior: Distribution
     refined: Refined
     noise: Noise
-    rate: float
+    widening: float
 
 
 class Likelihood:
@@ -87,7 +87,7 @@ class Likelihood:
         self.floor = np.where(np.isfinite(sensor), np.maximum(np.nan_to_num(sensor, posinf=0.0), FINEST * size), np.inf)
         self.seen = np.isfinite(self.floor)
         self.nv = nv
-        self.noise = Noise(self.floor, np.zeros(2 * nv))
+        self.noise = Noise(self.floor, np.zeros(nv))
         self.gains: Gains | None = None
         self.count = float(self.valid.sum() * self.seen.sum())
 
@@ -96,25 +96,50 @@ class Likelihood:
         parts = [self._dynamics(theta, part) for part in self.parts]
         ways, gaps = (np.concatenate([p[i] for p in parts]) for i in (0, 1))
         few = min(LOOKED, len(self.valid))
-        best, noise = -np.inf, self.noise
-        paid = 0.5 * np.log(self.valid[:few].sum() * self.seen.sum())  # for each number that is not needed (BIC)
-        for ratio in RATIOS:
-            sensor = self.floor * np.concatenate([np.ones(self.nv), np.full(self.nv, ratio)])
-            unit = np.where(np.isfinite(sensor), sensor, FINEST * self.scale)
-            for q in PROCESS:
-                process = q * np.concatenate([np.zeros(self.nv), unit[self.nv :]])
-                value, size = self._fit(ways[:few], gaps[:few], sensor, process, self.valid[:few])
-                value -= paid * ((ratio != 1.0) + (q > 0))
-                if value > best:
-                    best, noise = value, Noise(sensor * size, process * size)
-        before, self.noise = self.noise, noise
-        gains = riccati(ways, noise.sensor, noise.process, self._start(noise))
+        before, self.noise = self.noise, self._noise(ways[:few], gaps[:few], self.valid[:few])
+        gains = self._gains(ways, self.noise)
         mask = jnp.asarray(self.valid, jnp.float32)[:, :, None, None]
         self.gains = gains.replace(gain=gains.gain * mask, whitener=gains.whitener * mask)
+        noise = self.noise
         seen = self.seen
         moved = np.abs(np.log(noise.sensor[seen] / before.sensor[seen])).max()
-        drift = np.abs(noise.process - before.process).max() / max(before.process.max(), noise.process.max(), 1e-30)
+        most = max(before.process.max(), noise.process.max(), 1e-30)
+        drift = np.abs(noise.process - before.process).max() / most + abs(noise.lasting - before.lasting)
         return bool(moved > SETTLED or drift > SETTLED)
+
+    def _noise(self, ways: np.ndarray, gaps: np.ndarray, valid: np.ndarray) -> Noise:
+        """The most likely noise, each number that is not needed left out (BIC): first what acts, then the sensors."""
+        paid = 0.5 * np.log(valid.sum() * self.seen.sum())
+        unit = np.where(self.seen, self.floor, FINEST * self.scale)[self.nv :]
+        still = np.zeros(self.nv)
+        acting = [(0.0, still, 0.0), *((1.0, q * unit, 0.0) for q in PROCESS)]
+        acting += [(2.0, q * unit, lasting) for q in PROCESS for lasting in LASTING]
+        best, noise = -np.inf, self.noise
+
+        def tried(ratio: float, cost: float, force: np.ndarray, lasting: float) -> None:
+            nonlocal best, noise
+            sensor = self.floor * np.concatenate([np.ones(self.nv), np.full(self.nv, ratio)])
+            guess = Noise(sensor, force, lasting)
+            value, size = self._fit(ways, gaps, guess, valid)
+            value -= paid * (cost + (ratio != 1.0))
+            if value > best:
+                best, noise = value, replace(guess, sensor=sensor * size, process=force * size)
+
+        for cost, force, lasting in acting:
+            tried(1.0, cost, force, lasting)
+        size = float(np.median(noise.sensor[self.seen] / self.floor[self.seen]))
+        cost = float(noise.process.any()) + float(noise.lasting > 0)
+        for ratio in RATIOS:
+            tried(ratio, cost, noise.process / size, noise.lasting)
+        return noise
+
+    def _gains(self, ways: np.ndarray, noise: Noise) -> Gains:
+        nothing = np.zeros(2 * self.nv)
+        if noise.lasting:
+            force = Force(noise.process, noise.lasting, self.physics.dt)
+            return riccati(ways, noise.sensor, nothing, self._start(noise), force)
+        white = np.concatenate([nothing[self.nv :], noise.process])
+        return riccati(ways, noise.sensor, white, self._start(noise))
 
     def _dynamics(self, theta: np.ndarray, part: slice) -> tuple[np.ndarray, np.ndarray]:
         record = _rows(self.record, part)
@@ -124,23 +149,22 @@ class Likelihood:
         """Standard deviations of the start state: as measured, or anything where it is not."""
         return np.where(self.seen, np.where(np.isfinite(noise.sensor), noise.sensor, 0.0), 0.3 * self.scale)
 
-    def _fit(
-        self, ways: np.ndarray, gaps: np.ndarray, sensor: np.ndarray, process: np.ndarray, valid: np.ndarray
-    ) -> tuple[float, float]:
+    def _fit(self, ways: np.ndarray, gaps: np.ndarray, noise: Noise, valid: np.ndarray) -> tuple[float, float]:
         """(log likelihood at the best common factor on the noise, that factor), by linear error dynamics."""
-        gains = riccati(ways, sensor, process, self._start(Noise(sensor, process)))
+        gains, size = self._gains(ways, noise), 2 * self.nv
         gain, white = np.asarray(gains.gain, float), np.asarray(gains.whitener, float)
-        away = np.zeros(gaps.shape[:1] + gaps.shape[2:])
+        away, force = np.zeros((len(gaps), size)), np.zeros((len(gaps), self.nv))
         squares = 0.0
         for t in range(gaps.shape[1]):
-            ahead = np.einsum("nij,nj->ni", np.nan_to_num(ways[:, t]), away) - gaps[:, t]
-            miss = -ahead
-            squares += float(np.sum(np.einsum("nij,nj->ni", white[:, t], miss) ** 2 * valid[:, t, None]))
-            away = ahead + np.einsum("nij,nj->ni", gain[:, t], miss)
+            pushed = np.concatenate([0.5 * self.physics.dt * force, force], axis=1)
+            ahead = np.einsum("nij,nj->ni", np.nan_to_num(ways[:, t]), away) + pushed - gaps[:, t]
+            by = np.einsum("nij,nj->ni", gain[:, t], -ahead)
+            squares += float(np.sum(np.einsum("nij,nj->ni", white[:, t], ahead) ** 2 * valid[:, t, None]))
+            away, force = ahead + by[:, :size], noise.lasting * force + by[:, size:]
         count = valid.sum() * self.seen.sum()
-        size = max(squares / count, 1.0)  # not below the floor
+        factor = max(squares / count, 1.0)  # not below the floor
         sizes = float(np.sum(np.asarray(gains.log_size, float) * valid))
-        return sizes - 0.5 * count * np.log(size) - 0.5 * squares / size, float(np.sqrt(size))
+        return sizes - 0.5 * count * np.log(factor) - 0.5 * squares / factor, float(np.sqrt(factor))
 
     def squares(self, thetas: np.ndarray) -> np.ndarray:
         """Sums of squared whitened prediction errors [M, N, blocks] at thetas [M, d]."""
@@ -191,36 +215,50 @@ def refine(
         theta = found.theta[np.argmax(found.log_likelihood)]
         current = found.fitted
     assert found is not None
-    rate = 1.0 if found.reason else _rate(found, kept, likelihood)
-    if rate < 1.0:
-        found = importance.tempered(found, rate, components, seed)
+    widening = 1.0
+    if not found.reason:
+        found, widening = _adjusted(found, _spread(found, kept, likelihood), components, seed)
     posterior = proposal if found.reason else found.posterior
-    return Refinement(posterior, replace(found, posterior=posterior), likelihood.noise, rate)
+    return Refinement(posterior, replace(found, posterior=posterior), likelihood.noise, widening)
 
 
-def _rate(found: Refined, squares: np.ndarray, likelihood: Likelihood) -> float:
-    """The power of the likelihood at which its scores spread as its curvature says they should.
+def _spread(found: Refined, squares: np.ndarray, likelihood: Likelihood) -> np.ndarray:
+    """Covariance of the scores over that which the likelihood promises [d, d], in whitened z: I where it is right.
 
-    Scores are of stretches of time; those up to half a trajectory apart may go together (Newey and West, 1987).
+    Scores are of stretches of time; those up to half a trajectory apart may go together (Newey and West, 1987). BELIEF
+    stretches more say that the likelihood is right.
     """
     unit = float(found.weights @ squares.sum((1, 2))) / likelihood.count
     use = found.weights > 1e-6 * found.weights.max()
     weights, z = found.weights[use] / found.weights[use].sum(), importance.coordinates(found)[use]
     gap = z - weights @ z
     covariance = gap.T @ (gap * weights[:, None])
+    lower = np.linalg.cholesky(covariance)
     parts = -0.5 * squares[use].reshape(use.sum(), -1) / unit
-    slopes = np.linalg.solve(covariance, gap.T @ (weights[:, None] * parts)).reshape(
-        -1, *squares.shape[1:]
-    )  # [d, N, B]
+    slopes = np.linalg.solve(lower, gap.T @ (weights[:, None] * parts))  # L^T C^-1 gap parts: whitened scores
+    slopes = slopes.reshape(-1, *squares.shape[1:])  # [d, N, B]
     slopes = slopes - slopes.mean((1, 2), keepdims=True)
     lags = squares.shape[2] // 2
     spread = np.einsum("inb,jnb->ij", slopes, slopes)
     for lag in range(1, lags + 1):
         both = np.einsum("inb,jnb->ij", slopes[..., lag:], slopes[..., :-lag])
         spread += (1 - lag / (lags + 1)) * (both + both.T)
-    ratio = max(float(np.trace(covariance @ spread)) / len(covariance), 0.0)
     clusters = squares.shape[1] * squares.shape[2] / lags
-    return float(min(1.0, (clusters + BELIEF) / (clusters * ratio + BELIEF)))
+    return (clusters * spread + BELIEF * np.eye(len(spread))) / (clusters + BELIEF)
+
+
+def _adjusted(found: Refined, spread: np.ndarray, components: int, seed: int) -> tuple[Refined, float]:
+    """The draws as wide as the scores say, in no direction narrower; and the largest factor on standard deviations.
+
+    A posterior of one mode is stretched (open-faced sandwich, Shaby 2014), one of several is tempered.
+    """
+    values, axes = np.linalg.eigh(spread)
+    values = np.maximum(values, 1.0)
+    if values.max() < 1.0 + SETTLED:
+        return found, 1.0
+    if found.fitted.components > 1:
+        return importance.tempered(found, 1 / float(values.mean()), components, seed), float(np.sqrt(values.mean()))
+    return importance.stretched(found, axes @ np.diag(np.sqrt(values)) @ axes.T, seed), float(np.sqrt(values.max()))
 
 
 def _travel(record: Record, physics: Physics) -> np.ndarray:
