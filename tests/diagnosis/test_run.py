@@ -8,6 +8,8 @@ import pytest
 
 from bayessim_mjx.diagnosis import result, run
 from bayessim_mjx.diagnosis.findings import Findings
+from bayessim_mjx.diagnosis.selection import chosen, outcome
+from bayessim_mjx.diagnosis.selection.criteria import Criteria
 from bayessim_mjx.diagnosis.setup import TooLittleData
 from bayessim_mjx.diagnosis.summary import assemble, preliminary
 
@@ -60,6 +62,23 @@ def test_dry_friction_is_named_with_its_level(rubbing):
     weighed = [r["weight"] for r in effect.equivalent_to if "weight" in r]
     expected = 1.0 - sum(weighed) if weighed else np.nan  # nothing to be weighed against is no certainty
     np.testing.assert_allclose(effect.weight_among_rivals, expected, atol=1e-9)
+    assert found.setup.fitter.simulator.traces == 1
+
+
+def decided(found):
+    """What one decision makes of the single effects of a race that has ended."""
+    race = found.outcome.reopened()
+    race.models = {key: model for key, model in race.models.items() if len(key) < 2}
+    ruling, selection = chosen.ruled(race, Criteria(), lambda *_: None)
+    return outcome.concluded(race, ruling, lambda *_: None), selection
+
+
+def test_one_decision_names_what_the_rules_of_the_race_name(rubbing):
+    found, _ = rubbing
+    ended, selection = decided(found)
+    assert selection.answer == {"coulomb_friction@hinge"} == {e.label for e in ended.answer.effects}
+    np.testing.assert_allclose(ended.answer.fit.values, found.model.fit.values, rtol=0.02)
+    assert selection.table.rows[selection.answer].distance["coulomb_friction@hinge"] > 10
     assert found.setup.fitter.simulator.traces == 1
 
 
@@ -161,7 +180,7 @@ def test_nothing_wrong_is_no_gap(tmp_path):
 
 @pytest.mark.slow
 def test_two_effects_are_both_named(tmp_path):
-    _, diagnosis = diagnosed(tmp_path, recorded(friction=0.06, delay=0.008, scale=(1.1, 0.92, 1.05), seed=3))
+    found, diagnosis = diagnosed(tmp_path, recorded(friction=0.06, delay=0.008, scale=(1.1, 0.92, 1.05), seed=3))
     assert {e.name for e in diagnosis.effects} == {"coulomb_friction", "actuator_delay"}
     assert diagnosis.verdict in ("effects", "ambiguous")
     numbers = {e.name: next(iter(e.parameters.values())).mean for e in diagnosis.effects}
@@ -169,6 +188,7 @@ def test_two_effects_are_both_named(tmp_path):
     assert numbers["actuator_delay"] == pytest.approx(0.008, rel=0.1)
     assert sum(e.share for e in diagnosis.effects) == pytest.approx(1.0)
     assert all(e.share > 0.02 for e in diagnosis.effects)
+    assert decided(found)[1].answer == {"coulomb_friction@hinge", "actuator_delay@motor"}
 
 
 @pytest.mark.slow
