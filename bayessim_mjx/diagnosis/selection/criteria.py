@@ -13,16 +13,16 @@ from bayessim_mjx.errors import UserError
 class Criteria:
     """When one model predicts better than another, and how much of the search is worth its time.
 
-    Error rates are those of benchmarks/results.md: 0 false alarms in 62 cases with nothing wrong by the rules of the race,
-    which have the same `errors`, `nats`, `rare`, `least` and `floor`, and 0 in 4 by one decision.
+    Error rates are those of benchmarks/results.md: 0 false alarms in 62 cases with nothing wrong by the rules of the
+    race, which have the same `errors`, `nats`, `least` and `floor`; 0 in 4 by one decision.
 
     Attributes:
         errors: standard errors (clustered by operating condition) by which a better model's held-out log predictive
             density is higher. Where nothing differs, 2 are exceeded in 1.0 to 2.5 % (normal and Student's conditions).
-        nats: and by so many nats plus the logarithm of the number of candidates for each further effect (Bonferroni: one
-            error rate for any number of candidates). 5 nats are odds of 150 to 1.
-        rare: so many times these nats tell where not all conditions gain, if none loses more than the share `harm` (limits
-            that act in few windows were missed by a standard error alone).
+        nats: and by so many nats plus the logarithm of the number of candidates for each further effect (Bonferroni:
+            one error rate for any number of candidates). 5 nats are odds of 150 to 1.
+        rare: so many times these nats tell where not all conditions gain, if none loses more than the share `harm`
+            (limits that act in few windows were missed by a standard error alone).
         same: the region of practical equivalence: share of what a model leaves of the squared gap that further effects
             have to close, and by which two models' costs (noise included) may differ. On 39 recorded tables with hidden
             effects .15 to .5 name the same, .1 one less.
