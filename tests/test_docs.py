@@ -168,7 +168,6 @@ def test_the_how_to_of_an_own_robot_finds_its_hidden_friction(tmp_path, monkeypa
 
 
 @pytest.mark.slow
-@pytest.mark.ci
 def test_the_loop_of_the_readme_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     import bayessim_mjx as bm
