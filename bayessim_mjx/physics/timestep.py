@@ -246,7 +246,18 @@ def _integrated(own: Timestep, data: mjx.Data, memory: tuple, step: SubStep) -> 
     integrator = int(own.physics.mj_model.opt.integrator)
     if integrator == RK4:
         return _rk4(own, data, memory)
+    data = _in_turn(data)
     return mjx.euler(own.model, data) if integrator == EULER else mjx.implicit(step.solved, data)
+
+
+def _in_turn(data: mjx.Data) -> mjx.Data:
+    """The same numbers, the inertia only once the acceleration is known: the integrators factor a second matrix.
+
+    On a CPU two of LAPACK's batched factorisations at once can wait for each other for ever (linalg.py).
+    """
+    inertia = getattr(data._impl, "M", None)
+    known = inertia is not None and data.qacc.size
+    return data.tree_replace({"_impl.M": inertia + 0.0 * data.qacc[0]}) if known else data
 
 
 def _rk4(own: Timestep, first: mjx.Data, memory: tuple) -> mjx.Data:
