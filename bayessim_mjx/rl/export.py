@@ -32,7 +32,7 @@ PACKAGES = ("bayessim-mjx", "jax", "mujoco", "onnx")
 def command_scale(env: Env, actions: int) -> tuple[np.ndarray, np.ndarray] | None:
     """(scale [A], offset [A]) of the commands offset + scale action; None where they are not of that form."""
     command, actuate = getattr(env, "command", None), getattr(env, "actuate", None)
-    if command is None or getattr(actuate, "__func__", None) is not Task.actuate:  # else commands have a memory
+    if command is None or getattr(actuate, "__func__", Task.actuate) is not Task.actuate:  # commands have a memory
         return None
     probes = np.random.default_rng(0).uniform(-1, 1, (16, actions)).astype(np.float32)
     offset = np.asarray(command(jnp.zeros(actions)))

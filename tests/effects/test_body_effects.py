@@ -78,6 +78,8 @@ def test_neutral_changes_no_bit_also_beside_another_effect():
     np.testing.assert_array_equal(beside, alone)
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_payload_is_a_point_mass_welded_on():
     """To 1e-4 rad, while it moves the arm by much more; in both places at once, at the body's own centre too."""
     own = {"upper": [0.4, 0.05, -0.1, 0.02], "fore": [0.7, -0.03, 0.08, 0.1]}

@@ -9,7 +9,7 @@ from bayessim_mjx.inference import sets
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 
 SPACE = ParameterSpace([Parameter(name, 0.0, -1.0, 1.0) for name in "ab"])
-SD, COUNT, MANY = 0.1, 16, 64
+SD, COUNT, MANY = 0.1, 8, 40
 
 
 def made(bias: float, seed: int = 0):
@@ -33,28 +33,28 @@ def exact():
 
 
 def test_exact_products_are_left_as_they_are(exact):
-    assert [c.trajectories for c in exact.counts] == [1, 2, 4, 8, 16] and exact.carried == 16
+    assert [c.trajectories for c in exact.counts] == [1, 2, 4, 8] and exact.carried == 8
     for c in exact.counts:
         assert c.widening < 1.2
         # two numbers known to SD / sqrt(n) of a range of 2: log(4) - log(2 pi SD^2 / n) - 1
         expected = np.log(4) - np.log(2 * np.pi * SD**2 / c.trajectories) - 1
         assert c.gain == pytest.approx(expected, abs=0.35)
         for level in (0.5, 0.8):
-            assert c.coverage(level) == pytest.approx(level, abs=0.15)
+            assert c.coverage(level) == pytest.approx(level, abs=0.2)
 
 
 def test_a_shared_error_is_found_and_widened(exact):
     found = sets.judge(*made(0.5, 1), components=1)
-    last = found.at(16)
-    # of n = 16 the error is sqrt(1/16 + .25) SD, the claim SD / 4
-    assert last.widening == pytest.approx(np.sqrt(1 + 16 * 0.25), rel=0.2)
-    assert last.plain < last.gain < exact.at(16).gain
+    last = found.at(8)
+    # of n = 8 the error is sqrt(1/8 + .25) SD, the claim SD / sqrt(8)
+    assert last.widening == pytest.approx(np.sqrt(1 + 8 * 0.25), rel=0.2)
+    assert last.plain < last.gain < exact.at(8).gain
     for level in (0.5, 0.8):
-        assert last.coverage(level) == pytest.approx(level, abs=0.15)
+        assert last.coverage(level) == pytest.approx(level, abs=0.2)
     assert found.at(5).trajectories == 4 and "widened" in found.sentence()
 
 
 def test_a_truth_outside_of_a_product_does_not_spoil_the_mean():
     rows, thetas = made(0.0)
-    found = sets.judge(rows[:8], np.asarray(thetas[:8]) * 0 + 0.99, components=1)
+    found = sets.judge(rows, np.asarray(thetas) * 0 + 0.99, components=1)
     assert np.isfinite([c.gain for c in found.counts]).all() and jnp.isfinite(found.at(1).widening)

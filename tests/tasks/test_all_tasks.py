@@ -8,7 +8,7 @@ import pytest
 
 from bayessim_mjx import registry
 
-DEAR = {"Humanoid"}  # half a minute of compilation
+DEAR = {"Humanoid", "BallBalance"}  # up to half a minute of compilation
 NAMES = [
     pytest.param(name, marks=[pytest.mark.slow, pytest.mark.ci] if name in DEAR else []) for name in registry.names()
 ]
