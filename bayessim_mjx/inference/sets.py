@@ -19,6 +19,7 @@ from bayessim_mjx.inference.posterior import combine
 from bayessim_mjx.inference.temperature import tempered, widened
 
 FACTORS = np.geomspace(1.0, 12.0, 31)  # on standard deviations
+DOUBT = 0.3  # standard deviation of the factor's log before anything is seen: a few sets are off by chance
 HALVES = 2  # the factor is fitted on one part of the sets and judged on the other, in turn
 
 
@@ -120,14 +121,19 @@ def _levels(q: Distribution, thetas: jax.Array, factors: jax.Array) -> jax.Array
     return jax.vmap(lambda q, t, f: tempered(q, f).credible_level(t))(q, thetas, factors)
 
 
+def _best(gains: np.ndarray) -> int:
+    """Which of FACTORS serves the sets best, by gains [factors, m] and what is believed beforehand."""
+    return int(np.argmax(gains.sum(1) - 0.5 * (np.log(FACTORS) / DOUBT) ** 2))
+
+
 def _count(n: int, products: Distribution, thetas: np.ndarray) -> Count:
     at = jnp.asarray(thetas, jnp.float32)
     gains = np.nan_to_num(np.asarray(_gains(products, at), float), nan=-100.0, neginf=-100.0)
     part = np.arange(len(thetas)) % HALVES
-    chosen = np.array([int(np.argmax(gains[:, part != p].mean(1))) for p in range(HALVES)])[part]
+    chosen = np.array([_best(gains[:, part != p]) for p in range(HALVES)])[part]
     own = gains[chosen, np.arange(len(thetas))]
     levels = np.asarray(_levels(products, at, jnp.asarray(FACTORS[chosen], jnp.float32)), float)
-    best = float(FACTORS[int(np.argmax(gains.mean(1)))])
+    best = float(FACTORS[_best(gains)])
     error = float(own.std(ddof=1) / np.sqrt(len(own)))
     return Count(n, best, float(own.mean()), error, float(gains[0].mean()), levels)
 

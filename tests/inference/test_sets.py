@@ -9,7 +9,7 @@ from bayessim_mjx.inference import sets
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 
 SPACE = ParameterSpace([Parameter(name, 0.0, -1.0, 1.0) for name in "ab"])
-SD, COUNT, MANY = 0.1, 8, 40
+SD, COUNT, MANY = 0.1, 8, 48
 
 
 def made(bias: float, seed: int = 0):
@@ -35,7 +35,7 @@ def exact():
 def test_exact_products_are_left_as_they_are(exact):
     assert [c.trajectories for c in exact.counts] == [1, 2, 4, 8] and exact.carried == 8
     for c in exact.counts:
-        assert c.widening < 1.2
+        assert c.widening < 1.3
         # two numbers known to SD / sqrt(n) of a range of 2: log(4) - log(2 pi SD^2 / n) - 1
         expected = np.log(4) - np.log(2 * np.pi * SD**2 / c.trajectories) - 1
         assert c.gain == pytest.approx(expected, abs=0.35)
