@@ -41,7 +41,7 @@ def test_an_effect_outside_of_the_library_is_found_on_other_conditions(outside):
 
 def test_all_seeds_and_ridges_are_reported(outside):
     _, _, found = outside
-    assert found.condition.totals.shape == (5, len(f.RIDGES))
+    assert found.condition.totals.shape == (5, len(f.RULES.ridges))
     assert len(found.condition.totals) == 5
     assert found.condition.cost.sum() == pytest.approx(np.median(found.condition.totals.min(1)), rel=0.5)
 

@@ -100,7 +100,7 @@ def test_a_first_look_at_few_windows_keeps_what_matters(screened, monkeypatch):
     before = fitter.simulator.rollouts
     found = screen(fitter, fit, setup.candidates, 24)
     points = sum(len(c.probes) for c in setup.candidates)
-    assert fitter.simulator.rollouts - before <= 8 * points + 24 * 3 * module.POINTS
+    assert fitter.simulator.rollouts - before <= 8 * points + 24 * 3 * module.SIZES.points
     assert {s.candidate.label for s in found} == {c.label for c in setup.candidates}
     assert found[0].candidate.effect == truth
     np.testing.assert_allclose(found[0].gain, whole[0].gain)
