@@ -23,6 +23,8 @@ def emps(tmp_path_factory):
     return out
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 @pytest.mark.parametrize(
     ("values", "percent"),  # of the authors' parameters, and without friction and offset
     [((95.1089, 203.5034, 20.3935, 3.1648), 4.04), ((95.1089, 0.0, 0.0, 0.0), 69.3)],
@@ -61,6 +63,8 @@ def test_the_position_law_of_the_xl330_gives_the_logged_duty(tmp_path):
     assert len(slopes) == 16 and min(slopes) > 0.96 and max(slopes) < 1.01
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_what_is_wrong_with_the_logs_of_the_dfki_pendulum(tmp_path, capsys):
     assert real.main(["dfki", "--data", str(DATA), "--out", str(tmp_path)]) == 0
     found = json.loads((tmp_path / "real.json").read_text())

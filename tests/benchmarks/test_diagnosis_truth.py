@@ -125,6 +125,8 @@ def test_the_link_moves_inside_the_play_and_no_farther():
     assert high - low < 0.045 and abs(plant.data.qpos[1]) <= 0.0225
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 @pytest.mark.parametrize("name", ["viscous_friction", "sensor_delay"])
 def test_a_cause_of_the_asked_strength_is_that_far_from_the_model(name):
     ruler = pendulum_ruler()
@@ -154,6 +156,8 @@ def test_logs_are_read_with_the_right_noise_and_conditions(tmp_path):
     np.testing.assert_allclose(noise, cases.SYSTEMS["leg"].sigma, rtol=0.3)
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_a_cause_is_drawn_again_from_the_truth_of_its_case(tmp_path):
     told = cases.make_case("pendulum", ["joint_spring"], "medium", 11, tmp_path).truth
     cause_again, ruler = isolable.hidden(told)

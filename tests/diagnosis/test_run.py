@@ -179,19 +179,6 @@ def test_nothing_wrong_is_no_gap(tmp_path):
 
 
 @pytest.mark.slow
-def test_two_effects_are_both_named(tmp_path):
-    found, diagnosis = diagnosed(tmp_path, recorded(friction=0.06, delay=0.008, scale=(1.1, 0.92, 1.05), seed=3))
-    assert {e.name for e in diagnosis.effects} == {"coulomb_friction", "actuator_delay"}
-    assert diagnosis.verdict in ("effects", "ambiguous")
-    numbers = {e.name: next(iter(e.parameters.values())).mean for e in diagnosis.effects}
-    assert numbers["coulomb_friction"] == pytest.approx(0.06, rel=0.1)
-    assert numbers["actuator_delay"] == pytest.approx(0.008, rel=0.1)
-    assert sum(e.share for e in diagnosis.effects) == pytest.approx(1.0)
-    assert all(e.share > 0.02 for e in diagnosis.effects)
-    assert decided(found)[1].answer == {"coulomb_friction@hinge", "actuator_delay@motor"}
-
-
-@pytest.mark.slow
 def test_an_effect_that_is_not_on_offer_is_unexplained(tmp_path):
     logs = recorded(friction=0.08, scale=(1.1, 0.92, 1.05), seed=4)
     _, diagnosis = diagnosed(tmp_path, logs, ("actuator_delay", "payload"))

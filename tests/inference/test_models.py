@@ -33,13 +33,13 @@ def trained(space: ParameterSpace, **options):
     return fit(key(3), init(key(4), settings, space, 2), *pairs(space))
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 @pytest.mark.parametrize(
     "options",
     [
         {"modelClass": "MDRFF"},
-        pytest.param(
-            {"modelClass": "MDRFF_Matern32_median", "fullCovariance": False}, marks=[pytest.mark.slow, pytest.mark.ci]
-        ),
+        {"modelClass": "MDRFF_Matern32_median", "fullCovariance": False},
     ],
     ids=lambda o: " ".join(map(str, o.values())),
 )

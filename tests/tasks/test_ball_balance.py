@@ -61,6 +61,8 @@ def test_the_knee_opens_the_leg_as_its_angle_says():
         assert length == pytest.approx(2 * 0.36 * np.sin((np.pi / 2 + q) / 2), abs=1e-6)
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_sensors_carry_the_ball(compiled):
     """A ball at rest beside the middle: its weight, and the torques of its lever about the three sensors."""
     task = compiled("BallBalance")
@@ -81,6 +83,8 @@ def test_sensors_carry_the_ball(compiled):
     np.testing.assert_allclose(loads[3], 0, atol=0.2)
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_observations_by_hand(compiled):
     task = compiled("BallBalance")
     qpos, qvel = at((0.1, 0.2, 1.5))
@@ -89,6 +93,8 @@ def test_observations_by_hand(compiled):
     np.testing.assert_allclose(obs, [0.1, 0.2, 0.3, 1, 2, 3, 0.1, 0.2, 1.5, -1, 2, -4, *[0] * 12], rtol=1e-6)
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_targets_rewards_and_ends_by_hand(compiled):
     task = compiled("BallBalance")
     qpos, qvel = at((0, 0, 0.14), (0.9, 0, 0.2), (0.3, 0, 1.7))
@@ -108,6 +114,8 @@ def test_targets_rewards_and_ends_by_hand(compiled):
     )
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_a_ball_at_rest_pays_0_97(compiled):
     task = compiled("BallBalance")
     state = task.reset_to(*at())

@@ -86,6 +86,8 @@ def test_reward_is_one_at_rest_on_target(env) -> None:
     assert len(set(targets)) == 3 and max(map(abs, targets)) <= 1.2
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_a_simulated_log_replays_in_mjx(env, tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     commands = np.repeat(rng.uniform(-6, 6, 33), 10)[: 8 * STEPS + 1]
@@ -110,6 +112,8 @@ def test_a_simulated_log_replays_in_mjx(env, tmp_path: Path) -> None:
     assert rms < 0.015, rms
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 @pytest.mark.skipif(not RAW.is_dir(), reason="the XL330 logs are not in ../shared/data")
 def test_the_real_logs_convert_and_replay(env, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(EXAMPLES))

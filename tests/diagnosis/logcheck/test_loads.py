@@ -88,7 +88,7 @@ def test_a_load_fifteen_times_its_flange_is_found_again(tmp_path):
     truth = compiled(load=LOAD, step=0.0005, integrator="RK4")
     path = tmp_path / "arm.xml"
     path.write_text(ARM % (0.002, "Euler", *LIMITS, ""))
-    setup = prepare(robot.of_file(path), [follow(truth, i, 3.0) for i in range(4)], ("payload",))
+    setup = prepare(robot.of_file(path), [follow(truth, i, 2.0) for i in range(3)], ("payload",))
     settings = search.Settings(singles=1, pairs=1, most=1, starts=1)
     candidates = [c for c in setup.candidates if c.where == "flange"]  # the same rigid body as the lower arm
     found = search.run(setup.fitter, candidates, settings).winner

@@ -48,7 +48,6 @@ def test_whole_logs_are_the_third_horizon(rubbing):
 
 
 @pytest.mark.slow
-@pytest.mark.ci
 def test_an_unstable_motion_counts_as_long_as_it_can_be_predicted(tmp_path, monkeypatch):
     upside_down = pendulums.MODEL.replace("<option ", '<option gravity="0 0 9.81" ')
     monkeypatch.setattr(pendulums, "MODEL", upside_down)  # held upright by its controller; open loop it falls
