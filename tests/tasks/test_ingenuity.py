@@ -40,6 +40,8 @@ def test_golden_numbers_of_the_model():
     assert env.space.names == (*[f"{b}_mass_mult" for b in ("chassis", *parts)], *[f"{j}_stiffness" for j in parts])
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_hovers_and_its_locked_joints_do_not_reach_the_chassis(compiled):
     """It stays where it is but for the first step's fall, whatever the stiffness of joints."""
     task = compiled("Ingenuity")
@@ -68,6 +70,8 @@ def test_forces_by_hand():
     np.testing.assert_allclose(env.command(action), [1.0, -2.0, 10.0, -1.0, -0.25, -5.0], rtol=1e-6)
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_observations_by_hand(compiled):
     task = compiled("Ingenuity")
     qpos, qvel = at((0.3, -0.6, 1.9))
@@ -79,6 +83,8 @@ def test_observations_by_hand(compiled):
     np.testing.assert_allclose(state.obs["policy"][0], want, atol=1e-5)
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 @pytest.mark.parametrize("variant", ["isaacgymenvs", "bayessim2021"])
 def test_reward_and_ends_by_hand(compiled, variant):
     env, weight = registry.make("Ingenuity", variant=variant), {"isaacgymenvs": 5, "bayessim2021": 1}[variant]

@@ -45,6 +45,8 @@ def test_bayessimigs_true_masses_are_too_heavy_to_fly():
     assert heavy.body_mass.sum() * 9.81 > 4 * 2.0
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_hovers_on_a_quarter_of_its_weight_per_rotor(compiled):
     task = compiled("Quadcopter")
     state = task.reset_to(*at())
@@ -59,6 +61,8 @@ def test_hovers_on_a_quarter_of_its_weight_per_rotor(compiled):
     np.testing.assert_allclose(state.reward, 3.0, atol=1e-4)
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_commands_move_at_their_rates_within_their_ranges(compiled):
     task = compiled("Quadcopter")
     qpos, qvel = at()
@@ -73,6 +77,8 @@ def test_commands_move_at_their_rates_within_their_ranges(compiled):
     np.testing.assert_allclose(down.pipeline_state.task["command"][0], [*[0.2722714] * 8, *[0.0] * 4], atol=1e-5)
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_observations_by_hand(compiled):
     task = compiled("Quadcopter")
     qpos, qvel = at((0.3, -0.6, 1.9))
@@ -83,6 +89,8 @@ def test_observations_by_hand(compiled):
     np.testing.assert_allclose(obs, want, atol=1e-5)
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_reward_and_ends_by_hand(compiled):
     task = compiled("Quadcopter")
     qpos, qvel = at((1, 0, 1), (0, 0, 0.31), (0, 0, 0.25), (2.9, 0, 1), (2.9, 0.9, 1), (0, 0, 1))
@@ -100,6 +108,8 @@ def test_reward_and_ends_by_hand(compiled):
     assert np.array_equal(after.done, [0, 0, 1, 0, 1, 0, 0, 0])
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_the_chassis_turns_no_faster_than_four_pi(compiled):
     task = compiled("Quadcopter")
     qpos, qvel = at()
