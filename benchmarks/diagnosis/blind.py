@@ -74,8 +74,8 @@ def _make(job: Job) -> str:
 
 
 def generate(args: argparse.Namespace) -> None:
-    first, _, last = args.seeds.partition(":")
-    seeds = range(int(first), int(last or int(first) + 1))
+    first, *rest = (int(n) for n in args.seeds.split(":"))
+    seeds = range(first, *(rest or [first + 1]))
     todo = jobs(args.out, seeds, args.kinds.split(","), args.systems.split(","), args.strengths.split(","))
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # one core per case is faster than all cores per case
     with multiprocessing.get_context("spawn").Pool(args.workers) as pool:
@@ -171,7 +171,7 @@ def main() -> None:
     commands = parser.add_subparsers(required=True)
     new = commands.add_parser("generate", help="write cases")
     new.add_argument("--out", type=Path, required=True)
-    new.add_argument("--seeds", default="2000:2010", help="first:last, last not included")
+    new.add_argument("--seeds", default="2000:2010", help="first:last or first:last:step, last not included")
     new.add_argument("--kinds", default=",".join(KINDS))
     new.add_argument("--systems", default=",".join(SYSTEMS))
     new.add_argument("--strengths", default="medium,strong", help=f"of {', '.join(STRENGTHS)}; they take turns")

@@ -2,7 +2,7 @@
 
     python benchmarks/diagnosis/record.py run CASES --workers 8 [--gpu 4] [--seconds 500]   # CASE/record/table.json.gz
     python benchmarks/diagnosis/record.py one CASE                                          # one case in this process
-    python benchmarks/diagnosis/record.py score CASES [--criteria same=.3 far=2]
+    python benchmarks/diagnosis/record.py score CASES [--left-out SINGLES] [--criteria same=.3 far=2]
 
 A record holds every model that the race and the beam search visited with its held-out costs, what each of the two
 named, and what either took. Cases come from `diagnosis/blind.py generate`; those below seed 2000 are for development.
@@ -13,13 +13,17 @@ import dataclasses
 import gzip
 import json
 import os
-import queue
 import subprocess
 import sys
+import threading
 import time
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
+
+from cases import KNOWN
+from families import without
 
 RECORD = "record"
 
@@ -32,12 +36,13 @@ def work(case: Path, arguments: list[str]) -> None:
     from bayessim_mjx.diagnosis import run
 
     worker.without_pictures()
-    marks: list[tuple[str, float, float, int]] = []
+    marks: list[tuple[str, float, float, int, float]] = []
     kept: dict[str, Any] = {}
+    compiling = worker.compilations()
 
     def mark(name: str, race: Any = None) -> None:
         rollouts = race.fitter.simulator.rollouts if race is not None else 0
-        marks.append((name, time.perf_counter(), time.process_time(), rollouts))
+        marks.append((name, time.perf_counter(), time.process_time(), rollouts, worker.covered(compiling)))
 
     original = run.investigate
 
@@ -50,15 +55,14 @@ def work(case: Path, arguments: list[str]) -> None:
             if name in ("base", "singles"):
                 kept["snapshot"] = snapshot(race)
 
-        def selected(*given: Any) -> Any:
-            outcome = select(*given)
-            mark("verdict", outcome)
-            return outcome
+        def concluding(race: Any, *given: Any) -> Any:
+            mark("verdict", race)
+            return conclude(race, *given)
 
-        select, run.outcome.select = run.outcome.select, selected
+        conclude, run.outcome.concluded = run.outcome.concluded, concluding
         kept["asked"] = (args, options)
         kept["found"] = original(*args, **options | {"keep": keep})
-        run.outcome.select = select
+        run.outcome.concluded = conclude
         return kept["found"]
 
     run.investigate = watched
@@ -126,45 +130,54 @@ def concluded(kept: dict[str, Any]) -> dict[str, Any]:
 
 
 def run_all(args: argparse.Namespace) -> None:
-    """Every case without a record, each in a process of its own, until the time is over."""
-    every = sorted(
-        (p.parent for p in args.cases.glob("*/truth.json")), key=lambda f: (f.name.rpartition("_s")[2], f.name)
-    )
-    every = [f for f in every if not (f / RECORD / "table.json.gz").exists()]
-    small: queue.Queue[Path] = queue.Queue()
-    large: queue.Queue[Path] = queue.Queue()
-    for folder in every:
-        (small if folder.name.startswith(tuple(args.on_cpu.split(","))) else large).put(folder)
+    """Every case without a record, each in a process of its own, until the time is over; new ones are taken up too."""
     until = time.monotonic() + args.seconds
+    waiting = Waiting([args.cases, *filter(None, [args.left_out])], tuple(args.on_cpu.split(",")))
     with ThreadPoolExecutor(args.workers + args.gpu) as pool:
         for i in range(args.workers + args.gpu):
-            own = (small, large) if i < args.workers else (large, small)
-            pool.submit(_drain, own, "cpu" if i < args.workers else "gpu", i, until, args.more)
+            pool.submit(_drain, waiting, i, i < args.workers, args, until)
 
 
-def _drain(
-    queues: tuple[queue.Queue[Path], queue.Queue[Path]], device: str, core: int, until: float, more: list[str]
-) -> None:
+class Waiting:
+    """Cases that nobody began, by seed and name: all systems and kinds are tried equally often."""
+
+    def __init__(self, folders: Sequence[Path], small: tuple[str, ...]) -> None:
+        self.folders, self.small, self.begun, self.lock = folders, small, set[Path](), threading.Lock()
+
+    def take(self, small: bool) -> Path | None:
+        """The next case, for a worker on a core (`small`) preferably one of the small systems."""
+        with self.lock:
+            every = [p.parent for folder in self.folders for p in folder.glob("*/truth.json")]
+            every = [f for f in every if f not in self.begun and not (f / RECORD / "table.json.gz").exists()]
+            turn = lambda f: (f.name.startswith(self.small) != small, f.name.rpartition("_s")[2], f.name)  # noqa: E731
+            found = min(every, key=turn, default=None)
+            if found is not None:
+                self.begun.add(found)
+            return found
+
+
+def _drain(waiting: Waiting, core: int, small: bool, args: argparse.Namespace, until: float) -> None:
     quiet = {name: "1" for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")}
-    own = {"JAX_PLATFORMS": "cpu"} if device == "cpu" else {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
-    for waiting in queues:
-        while time.monotonic() < until:
+    card = {"XLA_PYTHON_CLIENT_PREALLOCATE": "false", "CUDA_VISIBLE_DEVICES": str(core % args.cards)}
+    own = {"JAX_PLATFORMS": "cpu"} if small else card
+    while time.monotonic() < until and (folder := waiting.take(small)) is not None:
+        more = args.more
+        if folder.parent == args.left_out:
+            effects = json.loads((folder / "truth.json").read_text())["effects"]
+            more = ["--effects", without((e["name"] for e in effects), KNOWN), *more]
+        (folder / RECORD).mkdir(exist_ok=True)
+        started = time.monotonic()
+        command = [sys.executable, __file__, "one", str(folder), "--core", str(core), "--more", *more]
+        with (folder / RECORD / "output.txt").open("w") as text:
             try:
-                folder = waiting.get_nowait()
-            except queue.Empty:
-                break
-            (folder / RECORD).mkdir(exist_ok=True)
-            started = time.monotonic()
-            command = [sys.executable, __file__, "one", str(folder), "--core", str(core), "--more", *more]
-            with (folder / RECORD / "output.txt").open("w") as text:
-                try:
-                    code = subprocess.run(
-                        command, stdout=text, stderr=subprocess.STDOUT, env=os.environ | quiet | own,
-                        timeout=max(until - time.monotonic(), 1.0),
-                    ).returncode  # fmt: skip
-                except subprocess.TimeoutExpired:
-                    code = 124
-            print(f"{folder.name}: {device} exit {code}, {time.monotonic() - started:.0f} s", flush=True)
+                code = subprocess.run(
+                    command, stdout=text, stderr=subprocess.STDOUT, env=os.environ | quiet | own,
+                    timeout=max(until - time.monotonic(), 1.0),
+                ).returncode  # fmt: skip
+            except subprocess.TimeoutExpired:
+                code = 124
+        took = f"{time.monotonic() - started:.0f} s"
+        print(f"{folder.name}: {'cpu' if small else 'gpu'} exit {code}, {took}", flush=True)
 
 
 def redecided(case: Path, given: list[str]) -> dict[str, Any]:
@@ -183,35 +196,58 @@ def redecided(case: Path, given: list[str]) -> dict[str, Any]:
 
 
 def score(args: argparse.Namespace) -> None:
-    """Rates of both rules on the same cases, and what they took."""
+    """Rates of both rules on the same cases, where they differ, and what they took."""
     import blind
-    import numpy as np
-    from score import rates
+    from score import mcnemar, rates, wilson
     from score import read as outcome_of
 
-    done = [f for f in blind.cases(args.cases) if (f / RECORD / "new.json").exists()]
-    said = {
-        "rules of the race": [json.loads((f / RECORD / "diagnosis.json").read_text()) for f in done],
-        "one decision": [json.loads((f / RECORD / "new.json").read_text()) for f in done],
-        "one decision, again on the tables (names alone)": [redecided(f, args.criteria) for f in done],
-    }
-    for name, told in said.items():
-        outcomes = [dataclasses.replace(outcome_of(f, RECORD), said=one) for f, one in zip(done, told, strict=True)]
-        print(f"{name}: {len(outcomes)} cases")
-        for rate in rates(outcomes):
+    folders = [args.cases, *filter(None, [args.left_out])]
+    every = [[f for f in blind.cases(folder) if (f / RECORD).exists()] for folder in folders]
+    done = [[f for f in some if (f / RECORD / "new.json").exists()] for some in every]
+    print(f"{sum(map(len, done))} cases ended, {sum(map(len, every)) - sum(map(len, done))} did not")
+    told = {}
+    for name, said in (
+        ("rules of the race", lambda f: json.loads((f / RECORD / "diagnosis.json").read_text())),
+        ("one decision", lambda f: json.loads((f / RECORD / "new.json").read_text())),
+        ("one decision, again on the tables (names alone)", lambda f: redecided(f, args.criteria)),
+    ):
+        told[name] = rates(*([dataclasses.replace(outcome_of(f, RECORD), said=said(f)) for f in some] for some in done))
+        print(name)
+        for rate in told[name]:
             if rate.answers:
-                print(f"  {rate.what}: {sum(rate.answers)} of {len(rate.answers)}")
-    took = []
+                low, high = wilson(sum(rate.answers), len(rate.answers))
+                print(f"  {rate.what}: {sum(rate.answers)} of {len(rate.answers)} ({low:.2f} to {high:.2f})")
+    old, new, _ = told.values()
+    print("right by one of the two alone: rules, one decision, p of McNemar's exact test")
+    for a, b in zip(old, new, strict=True):
+        if a.answers and len(a.answers) == len(b.answers):
+            pairs = list(zip(a.answers, b.answers, strict=True))
+            only = [sum(x > y for x, y in pairs), sum(x < y for x, y in pairs)]
+            print(f"  {a.what}: {only[0]}, {only[1]}, {mcnemar(*only):.2f}")
+    costs([f for some in done for f in some])
+
+
+def costs(done: Sequence[Path]) -> None:
+    """What both took from the single effects to the model that they name."""
+    import numpy as np
+
+    took: dict[str, list[list[float]]] = {}
     for f in done:
         record = json.loads(gzip.decompress((f / RECORD / "table.json.gz").read_bytes()))
         at = {m[0]: m for m in record["marks"]}
         if "singles" in at:
-            took.append([at["verdict"][i] - at["singles"][i] for i in (2, 3)])
-            took[-1] += [at["decision"][i] - at["rest"][i] for i in (2, 3)]
-    if took:
-        cpu, rollouts, new_cpu, new_rollouts = np.sum(took, 0)
-        print(f"after the single effects, {len(took)} cases: rules {cpu:.0f} CPU s, {rollouts:.0f} rollouts;", end=" ")
-        print(f"one decision {new_cpu:.0f} CPU s, {new_rollouts:.0f} rollouts")
+            spent = [
+                (at[end][i] - at[begin][i])
+                for begin, end in (("singles", "verdict"), ("rest", "decision"))
+                for i in (2, 4, 3)
+            ]
+            took.setdefault(f.name.rsplit("_", 2)[0], []).append(spent)
+    for name, each in [*took.items(), ("all", [x for some in took.values() for x in some])]:
+        a, c, r, a2, c2, r2 = np.sum(each, 0)
+        print(
+            f"{name}, {len(each)} cases: rules {a:.0f} CPU s ({c:.0f} s compiling), {r:.0f} rollouts;"
+            f" one decision {a2:.0f} CPU s ({c2:.0f} s compiling), {r2:.0f} rollouts"
+        )
 
 
 def main() -> None:
@@ -225,8 +261,11 @@ def main() -> None:
         "--on-cpu", default="pendulum,cartpole,two_link", help="systems that a core each is enough for"
     )
     several.add_argument("--seconds", type=float, default=1e9)
+    several.add_argument("--cards", type=int, default=1, help="GPUs that those processes take turns on")
+    several.add_argument("--left-out", type=Path, help="folder of singles, diagnosed without the effect's family")
     told = commands.add_parser("score")
     told.add_argument("cases", type=Path)
+    told.add_argument("--left-out", type=Path, help="folder of singles that were diagnosed without the effect's family")
     told.add_argument("--criteria", nargs="*", default=[], help="key=value, for the decision on the tables")
     single = commands.add_parser("one")
     single.add_argument("case", type=Path)

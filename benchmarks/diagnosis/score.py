@@ -107,6 +107,12 @@ def wilson(hits: int, n: int, z: float = Z95) -> tuple[float, float]:
     return (middle - half) / (1 + z2 / n), (middle + half) / (1 + z2 / n)
 
 
+def mcnemar(a: int, b: int) -> float:
+    """Two-sided exact p of McNemar's test: cases that one of two rules alone has right split as unevenly by chance."""
+    n = a + b
+    return min(1.0, 2.0 * sum(math.comb(n, k) for k in range(min(a, b) + 1)) / 2**n)
+
+
 def covered(outcome: Outcome) -> list[bool]:
     """Of the rightly named effects: whether each parameter with the same meaning lies in its 90 % interval."""
     found = []

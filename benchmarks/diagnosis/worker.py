@@ -20,30 +20,38 @@ COMPILING = "/jax/core/compile/"  # JAX's events: tracing, lowering, compiling (
 def diagnose(arguments: list[str]) -> tuple[int, dict[str, float], Any]:
     """(exit code, seconds in all and of compilation, findings or None) of the diagnosis's own command."""
     started = time.perf_counter()
-    import jax.monitoring
     from baselines import Reopened
 
     from bayessim_mjx import diagnose as command
     from bayessim_mjx.diagnosis import run
     from bayessim_mjx.diagnosis.findings import Findings
 
-    compiling: list[tuple[float, float]] = []
     kept = []
     original = run.investigate
-
-    def listen(event: str, seconds: float, **_: Any) -> None:
-        if event.startswith(COMPILING):
-            compiling.append((time.perf_counter() - seconds, time.perf_counter()))
+    compiling = compilations()
 
     def keep(*args: Any, **options: Any) -> Findings:
         kept.append(original(*args, **options))
         return kept[0]
 
-    jax.monitoring.register_event_duration_secs_listener(listen)
     run.investigate = keep
     code = command.main(arguments)
     times = {"seconds": time.perf_counter() - started, "compile_seconds": covered(compiling)}
     return code, times, Reopened(kept[0]) if kept else None
+
+
+def compilations() -> list[tuple[float, float]]:
+    """A list that takes (first, last second) of each compilation from now on."""
+    import jax.monitoring
+
+    spans: list[tuple[float, float]] = []
+
+    def listen(event: str, seconds: float, **_: Any) -> None:
+        if event.startswith(COMPILING):
+            spans.append((time.perf_counter() - seconds, time.perf_counter()))
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    return spans
 
 
 def without_pictures() -> None:

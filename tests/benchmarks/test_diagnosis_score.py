@@ -162,6 +162,12 @@ def test_weights_among_rivals_are_scored_as_probabilities(tmp_path):
     assert "Brier score 0.340; of the base rate 0.250" in (tmp_path / "out" / "score.md").read_text()
 
 
+def test_mcnemars_exact_p_of_pairs_that_differ():
+    assert [score.mcnemar(0, 0), score.mcnemar(3, 3)] == [1.0, 1.0]
+    assert score.mcnemar(0, 5) == score.mcnemar(5, 0) == pytest.approx(1 / 16)
+    assert score.mcnemar(1, 7) == pytest.approx(18 / 256)
+
+
 def test_wilson_interval_of_nine_in_ten():
     # (p + z^2/2n -+ z sqrt(p q / n + z^2 / 4n^2)) / (1 + z^2/n) with z = 1.96: Wilson (1927), 0.596 to 0.982
     assert score.wilson(9, 10) == pytest.approx((0.596, 0.982), abs=1e-3)
