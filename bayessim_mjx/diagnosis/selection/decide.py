@@ -5,7 +5,8 @@
 2. Same: the better of two models is not better by `errors` standard errors and `nats` plus the logarithm of the number
    of candidates, or what it closes of what the other leaves is not worth naming (`same`).
 3. Answer: of the models that are the same as the best, the least: a special case before its general law, one place
-   before all of them, fewer numbers. The others that are least in their own right are its rivals.
+   before all of them, fewer numbers. The others that are least in their own right are its rivals. Nothing is named only
+   where no model at all is better than the known parameters.
 """
 
 from __future__ import annotations
@@ -167,6 +168,8 @@ def decide(table: Table, less: Order, criteria: Criteria) -> Selection:
     best = max(rows, key=lambda k: value(table, k, criteria))
     trace = [f"best: {_told(best)}, leaves {table.excess(best):.3g}"]
     equal = [k for k in rows if k == best or same(table, k, best, criteria)]
+    if any(not same(table, BASE, k, criteria) for k in rows):
+        equal = [k for k in equal if k]  # one effect may show what it and a doubtful one together blur
     answer = least(table, equal, less)
     trace.append(f"the same as the best: {len(equal)}; least: {_told(answer)}, leaves {table.excess(answer):.3g}")
     # also where no amplitude is told, as of one that another number makes up for

@@ -58,6 +58,14 @@ def test_what_helps_one_condition_only_is_chance_unless_it_helps_much_and_harms_
     assert named({(): bare, (A,): harmed}, group=GROUP) == set()
 
 
+def test_a_doubtful_effect_on_top_of_a_sure_one_leaves_the_sure_one_named():
+    """Both together are the best, but not in all conditions: alone they would not tell that anything is missing."""
+    bare, one = np.where(GROUP == 3, 400.0, 50.0), np.where(GROUP == 3, 1.0, 50.0)
+    both = np.select([GROUP == 0, GROUP == 1], [30.0, 60.0], one)
+    assert named({(): bare, (A, B): both}, group=GROUP) == set()
+    assert named({(): bare, (A,): one, (A, B): both}, group=GROUP) == labels(A)
+
+
 def test_the_standard_error_is_that_of_conditions_not_of_windows():
     """Windows of a condition err alike: gains in all conditions are evidence, the same gains within one are not."""
     mixed = np.where(np.arange(20) % 4 == 0, 5.0, 55.0)
