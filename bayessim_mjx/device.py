@@ -13,6 +13,7 @@ from bayessim_mjx.errors import UserError
 
 WORLDS = "worlds"  # the only axis of a mesh of devices
 CACHE_VARIABLE = "BAYESSIM_MJX_CACHE"
+CHAIN = 5  # bodies, one after the other, from which on a robot is a long chain
 PROCESSES = ("JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID")  # host:port, how many, which of them
 
 
@@ -135,6 +136,19 @@ def compiler_options() -> dict[str, Any]:
     except jax.errors.JaxRuntimeError:
         return {}
     return options
+
+
+def options_for(env: Any) -> dict[str, Any]:
+    """`compiler_options` where the environment's robot is a serial chain, as arms are; none for others.
+
+    Bodies as deep in their trees as others are computed together, so that trees with several limbs are not slowed down.
+    """
+    parents = getattr(getattr(env, "mj_model", None), "body_parentid", ())
+    depth = [0]
+    for parent in parents[1:]:
+        depth.append(depth[parent] + 1)
+    serial = max(depth) >= CHAIN and len(parents) - 1 < 2 * max(depth)
+    return compiler_options() if serial else {}
 
 
 def cores() -> int:

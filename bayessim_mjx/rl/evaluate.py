@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 
+from bayessim_mjx.device import options_for
 from bayessim_mjx.rl.networks import Policy
 from bayessim_mjx.rollout import traced
 
@@ -62,7 +63,7 @@ def evaluate_together(
 
 @lru_cache(maxsize=32)
 def _evaluate_together(env: Env) -> Callable[..., dict[str, jax.Array]]:
-    return jax.jit(jax.vmap(_evaluate(env), in_axes=(0, None, 0)))
+    return jax.jit(jax.vmap(_evaluate(env), in_axes=(0, None, 0)), compiler_options=options_for(env))
 
 
 @lru_cache(maxsize=32)
@@ -86,4 +87,4 @@ def _evaluate(env: Env) -> Callable[..., dict[str, jax.Array]]:
         _, _, _, total, length = jax.lax.while_loop(going, step, carry)
         return {"return": total, "length": length}
 
-    return jax.jit(run)
+    return jax.jit(run, compiler_options=options_for(env))

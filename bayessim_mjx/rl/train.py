@@ -14,7 +14,7 @@ import numpy as np
 from jax.sharding import Mesh
 
 from bayessim_mjx.config import PPOConfig
-from bayessim_mjx.device import cores
+from bayessim_mjx.device import cores, options_for
 from bayessim_mjx.errors import DivergedError, UserError
 from bayessim_mjx.rl import catalogue, checks, distil, ppo, sharding
 from bayessim_mjx.rl.networks import Policy
@@ -59,7 +59,7 @@ def _make_chunk(env: Env, config: PPOConfig, distils: bool = False) -> Any:
         zeros = {tag: jnp.float32(0) for tag in reported} | {"env_steps": jnp.uint32(0)}
         return jax.lax.fori_loop(0, count, body, (state, zeros))
 
-    return jax.jit(chunk, donate_argnums=0)
+    return jax.jit(chunk, donate_argnums=0, compiler_options=options_for(env))
 
 
 def _check_announced(metrics: Metrics, reported: Sequence[str]) -> None:
