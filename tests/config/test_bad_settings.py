@@ -178,7 +178,9 @@ def test_an_override_may_add_effects_and_gravity_but_no_unknown_group() -> None:
         load("Pendulum", overrides=[f"{PARAMS}.efects.actuator_delay.all.delay.range=[0,0.1]"])
 
 
-@pytest.mark.parametrize("task", ["Pendulum", "Cartpole", "Ant", "Quadcopter", "Ingenuity", "Humanoid"])
+@pytest.mark.parametrize(
+    "task", ["Pendulum", "Cartpole", "Ant", "Quadcopter", "Ingenuity", "Humanoid", "FrankaCabinet"]
+)
 def test_a_section_as_bayessimig_writes_it_loads(task: str, tmp_path: Path) -> None:
     """It has `color` beside the groups, no frequency, and schedules that are constant."""
     section = load(task).to_dict()["task"]

@@ -59,6 +59,24 @@ task:
         rigid_shape_properties:
           friction: {num_buckets: 250, range: [0.7, 1.3], operation: scaling, distribution: uniform, setup_only: True}
 """,
+    "FrankaCabinet": """
+env: {numEnvs: 2048, envSpacing: 1.5, episodeLength: 500, startPositionNoise: 0.0, startRotationNoise: 0.0,
+  numProps: 16, aggregateMode: 3, actionScale: 7.5, dofVelocityScale: 0.1, distRewardScale: 1.5, rotRewardScale: 0.5,
+  aroundHandleRewardScale: 1.0, openRewardScale: 4.0, fingerDistRewardScale: 10.0, actionPenaltyScale: 0.01,
+  realParams: {weights: [1.0], means: [[0.8, 0.1]], stds: [[0.001, 0.001]]}, asset: {assetRoot: somewhere}}
+sim: {substeps: 1, physx: {num_threads: 4}}
+bayessim: {trainTrajs: 10000, collectPolicy: policy_random, summarizerFxn: summary_start, trainTrajLen: 10, lr: 1.e-4}
+task:
+  randomize: True
+  randomization_params:
+    actor_params:
+      franka:
+        color: True
+        rigid_body_properties:
+          mass: {range: [0.01, 1.0], operation: scaling, distribution: uniform, schedule: constant, schedule_steps: 0}
+        dof_properties:
+          stiffness: {range: [0.1, 2.0], operation: scaling, distribution: uniform, schedule: constant}
+""",
     "Pendulum": """
 env: {numEnvs: 100, episodeLength: 200, realParams: {weights: [1.0], means: [[1.0, 0.5]], stds: [[1.0e-5, 1.0e-5]]}}
 rkhsnet: {enable: True, nFeat: 100}
@@ -78,6 +96,10 @@ LEFT_OUT = {
     "Humanoid": "sim, env.envSpacing, env.isFlagrun, env.powerScale, env.upWeight, env.asset, env.plane, color",
     "ShadowHand": "sim, env.envSpacing, env.aggregateMode, env.objectType, env.rotEps, env.asset, color, num_buckets, "
     "setup_only",
+    "FrankaCabinet": "sim, env.envSpacing, env.startPositionNoise, env.startRotationNoise, env.numProps, "
+    "env.aggregateMode, env.actionScale, env.dofVelocityScale, env.distRewardScale, env.rotRewardScale, "
+    "env.aroundHandleRewardScale, env.openRewardScale, env.fingerDistRewardScale, env.actionPenaltyScale, env.asset, "
+    "color",
     "Pendulum": "rkhsnet",
 }
 
@@ -97,6 +119,9 @@ def test_files_made_like_bayessimigs_load_whole_with_one_note(task: str, tmp_pat
     section = loaded.to_dict()["task"]
     if task == "Pendulum":
         assert registry.make(task, config=loaded).space.names == ("pendulum_mass_mult", "pendulum_length_mult")
+        return
+    if task == "FrankaCabinet":
+        assert registry.make(task, config=loaded).space == registry.make(task).space
         return
     model = mujoco.MjModel.from_xml_string(BODY)
     space = ParameterSpace.from_config(section, model)

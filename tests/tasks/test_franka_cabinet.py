@@ -190,10 +190,10 @@ def test_observations_and_targets_by_hand(compiled):
 @pytest.mark.slow
 @pytest.mark.ci
 def test_mjx_agrees_with_mujoco_in_the_air_and_pulling_the_handle(compiled, both_engines):
-    """Half a second of random targets; and a hand that closes around the handle, pulls, and opens the drawer."""
+    """A second of random targets; and a hand that closes around the handle, pulls, and opens the drawer."""
     env, rng = compiled("FrankaCabinet").env, np.random.default_rng(3)
-    targets = HOME + np.cumsum(rng.uniform(-0.05, 0.05, (30, 9)), axis=0)
-    targets[:, 7:] = rng.uniform(0, 0.04, (30, 2))
+    targets = HOME + np.cumsum(rng.uniform(-0.05, 0.05, (60, 9)), axis=0)
+    targets[:, 7:] = rng.uniform(0, 0.04, (60, 2))
     fast, exact = both_engines(env, np.append(HOME, 0), np.zeros(10), targets)
     np.testing.assert_allclose(fast[0], exact[0], atol=2e-4)
     start, pull = grasping(env.mj_model)
