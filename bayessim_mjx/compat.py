@@ -1,8 +1,9 @@
 """Libraries that we build on, where they say or ask what they should not."""
 
 import contextlib
+import functools
 import io
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -13,7 +14,9 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 with contextlib.redirect_stdout(io.StringIO()):  # MJX announces on import that the optional warp is absent
     from mujoco import mjx
 
-__all__ = ["mjx", "put_replicated", "supply"]
+__all__ = ["compiler_options", "mjx", "program", "put_replicated", "supply"]
+
+CHAIN = 5  # bodies, one after the other, from which on a robot is a long chain
 
 
 def put_replicated(tree: Any, devices: Sequence[jax.Device]) -> Any:
@@ -37,3 +40,49 @@ def supply() -> None:
     """
     if not hasattr(jax, "device_put_replicated"):
         jax.device_put_replicated = put_replicated  # type: ignore[assignment]
+
+
+@functools.cache
+def compiler_options() -> dict[str, Any]:
+    """Options for `jax.jit` of programs with kinematic chains; none where the compiler does not know them.
+
+    XLA's fusion on CPU may compute shared subexpressions anew in every consumer: for a chain of six joints MJX's
+    kinematics then cost 150 times what they should (jaxlib 0.10).
+    """
+    options = {"xla_cpu_use_fusion_emitters": False}
+    if jax.default_backend() != "cpu":
+        return {}
+    try:
+        jax.jit(lambda x: x + 1, compiler_options=options)(0.0)
+    except jax.errors.JaxRuntimeError:
+        return {}
+    return options
+
+
+def program(function: Callable[..., Any], env: Any, **settings: Any) -> Any:
+    """`jax.jit(function, **settings)`, with `compiler_options` where the environment's robot is a serial chain (an arm).
+
+    Bodies as deep in their trees as others are computed together, so that trees with several limbs are not slowed down,
+    and their programs stay as they are. Inside another program its options hold: jax takes none there.
+    """
+    inner = jax.jit(function, **settings)
+    options = compiler_options() if _serial(getattr(env, "mj_model", None)) else {}
+    if not options:
+        return inner
+    outer = jax.jit(function, compiler_options=options, **settings)
+
+    @functools.wraps(function)
+    def call(*args: Any, **named: Any) -> Any:
+        inside = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((args, named)))
+        return (inner if inside else outer)(*args, **named)
+
+    call.lower = outer.lower  # type: ignore[attr-defined]
+    return call
+
+
+def _serial(model: Any) -> bool:
+    parents = getattr(model, "body_parentid", ())
+    depth = [0]
+    for parent in parents[1:]:
+        depth.append(depth[parent] + 1)
+    return max(depth) >= CHAIN and len(parents) - 1 < 2 * max(depth)

@@ -1,6 +1,5 @@
 """The devices, the processes and the persistent compilation cache, chosen before jax does anything."""
 
-import functools
 import gc
 import os
 import re
@@ -13,7 +12,6 @@ from bayessim_mjx.errors import UserError
 
 WORLDS = "worlds"  # the only axis of a mesh of devices
 CACHE_VARIABLE = "BAYESSIM_MJX_CACHE"
-CHAIN = 5  # bodies, one after the other, from which on a robot is a long chain
 PROCESSES = ("JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID")  # host:port, how many, which of them
 
 
@@ -117,38 +115,6 @@ def _collect_rarely() -> None:
     """Tracing makes objects by the million that live on: looking for garbage among them took a quarter of its time."""
     gc.freeze()
     gc.set_threshold(100_000, 50, 100)
-
-
-@functools.cache
-def compiler_options() -> dict[str, Any]:
-    """Options for `jax.jit` of programs with kinematic chains; none where the compiler does not know them.
-
-    XLA's fusion on CPU may compute shared subexpressions anew in every consumer: for a chain of six joints MJX's
-    kinematics then cost 150 times what they should (jaxlib 0.10).
-    """
-    import jax
-
-    options = {"xla_cpu_use_fusion_emitters": False}
-    if jax.default_backend() != "cpu":
-        return {}
-    try:
-        jax.jit(lambda x: x + 1, compiler_options=options)(0.0)
-    except jax.errors.JaxRuntimeError:
-        return {}
-    return options
-
-
-def options_for(env: Any) -> dict[str, Any]:
-    """`compiler_options` where the environment's robot is a serial chain, as arms are; none for others.
-
-    Bodies as deep in their trees as others are computed together, so that trees with several limbs are not slowed down.
-    """
-    parents = getattr(getattr(env, "mj_model", None), "body_parentid", ())
-    depth = [0]
-    for parent in parents[1:]:
-        depth.append(depth[parent] + 1)
-    serial = max(depth) >= CHAIN and len(parents) - 1 < 2 * max(depth)
-    return compiler_options() if serial else {}
 
 
 def cores() -> int:

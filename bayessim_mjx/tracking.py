@@ -22,7 +22,7 @@ from flax import struct
 from jax import Array
 from jax.typing import ArrayLike
 
-from bayessim_mjx.device import options_for
+from bayessim_mjx.compat import program
 from bayessim_mjx.effects.support.motion import Motion
 from bayessim_mjx.physics import Drive, Physics, begin, control_step
 from bayessim_mjx.physics.controllers import Law
@@ -115,7 +115,7 @@ def _errors(physics: Physics) -> Callable[..., Any]:
 
         return jnp.moveaxis(jax.lax.map(of, (record, gains)), 0, 1)
 
-    return jax.jit(run, compiler_options=options_for(physics))
+    return program(run, physics)
 
 
 def _begin(physics: Physics, theta: Array, record: Record) -> Any:
@@ -184,7 +184,7 @@ def _transitions(physics: Physics) -> Callable[..., Any]:
         rows = record.command, record.qpos[1:], record.qvel[1:], gains.gain
         return jax.lax.scan(step, (world, jnp.zeros(nv)), rows)[1]
 
-    return jax.jit(jax.vmap(one, in_axes=(None, 0, 0, None)), compiler_options=options_for(physics))
+    return program(jax.vmap(one, in_axes=(None, 0, 0, None)), physics)
 
 
 def transitions(

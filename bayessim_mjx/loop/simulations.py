@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 
 import jax
 from jax import Array
 
+from bayessim_mjx.compat import program
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.inference import rounds
 from bayessim_mjx.loop.sources import Source
@@ -27,12 +29,19 @@ def simulated(
     return thetas[:count], x[:count]
 
 
-@functools.partial(jax.jit, static_argnums=0)
 def features(source: Source, key: Array, thetas: Array, policy: Policy) -> Array:
     """Features [chunks * n, D] of trajectories at thetas [chunks, n, d]."""
-    keys = jax.random.split(key, thetas.shape[0])
-    features = jax.lax.map(lambda at: source.simulate(at[0], at[1], policy), (keys, thetas))
-    return features.reshape(-1, features.shape[-1])
+    return _features(source)(key, thetas, policy)
+
+
+@functools.lru_cache(maxsize=32)
+def _features(source: Source) -> Callable[[Array, Array, Policy], Array]:
+    def run(key: Array, thetas: Array, policy: Policy) -> Array:
+        keys = jax.random.split(key, thetas.shape[0])
+        features = jax.lax.map(lambda at: source.simulate(at[0], at[1], policy), (keys, thetas))
+        return features.reshape(-1, features.shape[-1])
+
+    return program(run, source.env)
 
 
 def proposal_of(loop: Loop, state: LoopState) -> Distribution:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 
-from bayessim_mjx.device import options_for
+from bayessim_mjx.compat import program
 from bayessim_mjx.rl.networks import Policy
 from bayessim_mjx.rollout import traced
 
@@ -63,11 +63,15 @@ def evaluate_together(
 
 @lru_cache(maxsize=32)
 def _evaluate_together(env: Env) -> Callable[..., dict[str, jax.Array]]:
-    return jax.jit(jax.vmap(_evaluate(env), in_axes=(0, None, 0)), compiler_options=options_for(env))
+    return program(jax.vmap(_episodes(env), in_axes=(0, None, 0)), env)
 
 
 @lru_cache(maxsize=32)
 def _evaluate(env: Env) -> Callable[..., dict[str, jax.Array]]:
+    return program(_episodes(env), env)
+
+
+def _episodes(env: Env) -> Callable[..., dict[str, jax.Array]]:
     def run(policy: Policy, key: jax.Array, thetas: jax.Array) -> dict[str, jax.Array]:
         count = thetas.shape[0]
         reset_key, key = jax.random.split(key)
@@ -87,4 +91,4 @@ def _evaluate(env: Env) -> Callable[..., dict[str, jax.Array]]:
         _, _, _, total, length = jax.lax.while_loop(going, step, carry)
         return {"return": total, "length": length}
 
-    return jax.jit(run, compiler_options=options_for(env))
+    return run

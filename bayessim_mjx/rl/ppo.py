@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from bayessim_mjx.compat import program
 from bayessim_mjx.config import PPOConfig
-from bayessim_mjx.device import options_for
 from bayessim_mjx.rl import catalogue, episodes, losses, networks, normalise, sharding, transitions, worlds
 from bayessim_mjx.rl.checks import check
 from bayessim_mjx.rl.extension import Learner, Sizes
@@ -112,7 +112,7 @@ def _init(env: Env, config: PPOConfig, mesh: Mesh | None) -> Callable[..., Train
         )
         return sharding.pinned(strong(state), mesh, layout(state))
 
-    return jax.jit(run, compiler_options=options_for(env))
+    return program(run, env)
 
 
 def _begun(learner: Learner, key: jax.Array, sizes: Sizes) -> dict[str, Any]:
@@ -190,8 +190,4 @@ def update(
 @lru_cache(maxsize=32)
 def make_update(env: Env, config: PPOConfig) -> Update:
     """update(state, domain) -> (state, metrics of scalars), one jitted program; the same one for the same arguments."""
-
-    def program(state: TrainState, domain: Any = None) -> tuple[TrainState, Any]:
-        return update(env, config, state, domain)
-
-    return jax.jit(program, compiler_options=options_for(env))
+    return program(lambda state, domain=None: update(env, config, state, domain), env)

@@ -13,8 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
+from bayessim_mjx.compat import program
 from bayessim_mjx.config import PPOConfig
-from bayessim_mjx.device import cores, options_for
+from bayessim_mjx.device import cores
 from bayessim_mjx.errors import DivergedError, UserError
 from bayessim_mjx.rl import catalogue, checks, distil, ppo, sharding
 from bayessim_mjx.rl.networks import Policy
@@ -59,7 +60,7 @@ def _make_chunk(env: Env, config: PPOConfig, distils: bool = False) -> Any:
         zeros = {tag: jnp.float32(0) for tag in reported} | {"env_steps": jnp.uint32(0)}
         return jax.lax.fori_loop(0, count, body, (state, zeros))
 
-    return jax.jit(chunk, donate_argnums=0, compiler_options=options_for(env))
+    return program(chunk, env, donate_argnums=0)
 
 
 def _check_announced(metrics: Metrics, reported: Sequence[str]) -> None:
@@ -90,11 +91,11 @@ def start(
     if cores() == 1 or jax.process_count() > 1:
         return ppo.init(env, config, key, domain, mesh, clock)
     given = _given(domain, teacher, mesh)
-    program = _make_chunk(env, config, teacher is not None)
+    chunk = _make_chunk(env, config, teacher is not None)
 
     def compile_program() -> None:
         state = ppo.outline(env, config, domain, mesh)
-        program.lower(state, given, np.int32(1)).compile()
+        chunk.lower(state, given, np.int32(1)).compile()
 
     with ThreadPoolExecutor(1) as beside:
         compiling = beside.submit(compile_program)

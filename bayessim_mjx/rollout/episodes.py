@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from bayessim_mjx.device import options_for
+from bayessim_mjx.compat import program
 
 if TYPE_CHECKING:
     from bayessim_mjx.env import Env, State
@@ -112,7 +112,7 @@ def _rollout(env: Env, length: int) -> Callable[..., Trajectory]:
         )
         return Trajectory(observation, action, reward, terminated, truncated, valid, thetas, qpos, qvel, command)
 
-    return jax.jit(run, compiler_options=options_for(env))
+    return program(run, env)
 
 
 def _seen(state: State) -> tuple[jax.Array, jax.Array, jax.Array]:

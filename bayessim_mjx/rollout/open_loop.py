@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from bayessim_mjx.device import options_for
+from bayessim_mjx.compat import program
 from bayessim_mjx.effects.support.motion import AROUND, Motion
 from bayessim_mjx.physics import Drive, Physics, begin, control_step
 from bayessim_mjx.physics.controllers import Law
@@ -65,7 +65,7 @@ def _replay(physics: Physics) -> Callable[..., dict[str, jax.Array]]:
         _, after = jax.lax.scan(step, world, command)
         return jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), world.measurement, after)
 
-    return jax.jit(jax.vmap(one), compiler_options=options_for(physics))
+    return program(jax.vmap(one), physics)
 
 
 def _throughout(physics: Physics, command: jax.Array) -> jax.Array:

@@ -4,7 +4,7 @@
 too; keyword arguments beside those here are the task's `env:` settings (`episodeLength=100`).
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium
@@ -15,7 +15,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from bayessim_mjx import registry
-from bayessim_mjx.device import options_for
+from bayessim_mjx.compat import program
 from bayessim_mjx.env import Env
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.monitor import video
@@ -48,10 +48,6 @@ def make_vec(
         env_settings: settings of `env:`, e.g. `episodeLength=100`.
     """
     return GymnasiumVectorEnv(registry.make(task, **env_settings), num_envs, domain, autoreset_mode, render_mode)
-
-
-def _compiled(env: Env, *functions: Callable[..., Any]) -> list[Callable[..., Any]]:
-    return [jax.jit(function, compiler_options=options_for(env)) for function in functions]
 
 
 def _spaces(env: Env) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
@@ -120,7 +116,7 @@ class GymnasiumEnv(gymnasium.Env):
         self.metadata = _metadata(env, render_mode)
         self.observation_space, self.action_space = _spaces(env)
         self._theta = _theta(env, env.space.nominal if theta is None else theta)
-        self._reset, self._step, self._camera = *_compiled(env, env.reset, env.step), _Camera(env)
+        self._reset, self._step, self._camera = program(env.reset, env), program(env.step, env), _Camera(env)
         self._state: Any = None
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
@@ -184,7 +180,7 @@ class GymnasiumVectorEnv(VectorEnv):
         self.single_observation_space, self.single_action_space = _spaces(env)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        self._reset, self._step = _compiled(env, self._restarted, self._advanced)
+        self._reset, self._step = program(self._restarted, env), program(self._advanced, env)
         self._camera = _Camera(env)
         self._key: Any = None
         self._state: Any = None

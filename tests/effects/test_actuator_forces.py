@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from bayessim_mjx.device import compiler_options
+from bayessim_mjx.compat import compiler_options
 from bayessim_mjx.effects import make
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.parameters import ParameterSpace

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bayessim_mjx import effects, registry
-from bayessim_mjx.device import compiler_options
+from bayessim_mjx.compat import compiler_options
 
 STEPS = 200
 WHERE = {"Pendulum": "hinge", "Cartpole": "cart_to_pole", "Ant": "ankle_1"}

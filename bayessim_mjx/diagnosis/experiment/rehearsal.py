@@ -13,7 +13,7 @@ import numpy as np
 from flax import struct
 from numpy.typing import NDArray
 
-from bayessim_mjx.device import compiler_options
+from bayessim_mjx.compat import compiler_options
 from bayessim_mjx.diagnosis.experiment.excitation import Excitation, middle
 from bayessim_mjx.diagnosis.experiment.limits import Limits
 from bayessim_mjx.diagnosis.logcheck.drives import Drives, drives_of

@@ -11,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from bayessim_mjx.device import compiler_options, cores
+from bayessim_mjx.compat import compiler_options
+from bayessim_mjx.device import cores
 from bayessim_mjx.diagnosis.fitting.windows import Batch, Windows
 from bayessim_mjx.physics import Drive, Physics, begin, control_step, staggered
 from bayessim_mjx.physics.tangent import difference, integrate

@@ -1,0 +1,32 @@
+"""Programs of arms have options for the compiler, those of other robots none; both give what the function gives."""
+
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from bayessim_mjx import compat
+
+ARM = SimpleNamespace(mj_model=SimpleNamespace(body_parentid=[0, 0, 1, 2, 3, 4, 5, 5]))
+LEGS = SimpleNamespace(mj_model=SimpleNamespace(body_parentid=[0, 0, *[1, 2, 3, 4], *[1, 6, 7, 8], *[1, 10, 11, 12]]))
+
+
+def doubled(x, more=0.0):
+    return 2 * x + more
+
+
+@pytest.mark.parametrize("env", [ARM, LEGS, SimpleNamespace()])
+def test_a_program_is_the_function_also_inside_of_another(env):
+    program = compat.program(doubled, env)
+    assert program(1.0, more=3.0) == 5.0
+    assert jax.jit(lambda x: program(x) + 1)(jnp.ones(())) == 3.0
+    assert jnp.array_equal(jax.vmap(program)(jnp.arange(3.0)), 2 * jnp.arange(3.0))
+    assert program.lower(1.0).compile()(1.0) == 2.0
+
+
+def test_only_arms_are_compiled_otherwise():
+    plain = type(jax.jit(doubled))
+    assert isinstance(compat.program(doubled, LEGS), plain) and isinstance(compat.program(doubled, None), plain)
+    if compat.compiler_options():  # on a CPU
+        assert not isinstance(compat.program(doubled, ARM), plain)
