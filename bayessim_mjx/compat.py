@@ -60,7 +60,7 @@ def compiler_options() -> dict[str, Any]:
 
 
 def program(function: Callable[..., Any], env: Any, **settings: Any) -> Any:
-    """`jax.jit(function, **settings)`, with `compiler_options` where the environment's robot is a serial chain (an arm).
+    """`jax.jit(function, **settings)`, with `compiler_options` where the environment's robot is a serial chain.
 
     Bodies as deep in their trees as others are computed together, so that trees with several limbs are not slowed down,
     and their programs stay as they are. Inside another program its options hold: jax takes none there.
