@@ -11,7 +11,6 @@ Ljung (1999), System Identification, 7.4; Sarkka (2013), Bayesian Filtering and 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -24,9 +23,11 @@ from jax.typing import ArrayLike
 
 from bayessim_mjx.compat import program
 from bayessim_mjx.effects.support.motion import Motion
-from bayessim_mjx.physics import Drive, Physics, begin, control_step
+from bayessim_mjx.kalman import Gains, push
+from bayessim_mjx.physics import Drive, Physics, control_step
 from bayessim_mjx.physics.controllers import Law
 from bayessim_mjx.physics.tangent import difference, integrate
+from bayessim_mjx.rollout import started
 
 STEP = 1e-3  # of the perturbed states, relative to `scale`
 BLOCKS = 8  # stretches of time
@@ -48,38 +49,6 @@ class Record(struct.PyTreeNode):
     law: Law | None = None
 
 
-@dataclass(frozen=True)
-class Force:
-    """A force that is not modelled and lasts: a stationary first-order process in each degree of freedom.
-
-    Attributes:
-        sd: `[nv]` standard deviations of the velocity that it gives in a control step.
-        lasting: its correlation from one control step to the next.
-        dt: control step, s.
-    """
-
-    sd: np.ndarray
-    lasting: float
-    dt: float
-
-
-class Gains(struct.PyTreeNode):
-    """Of a filter along N recorded trajectories, for errors (position tangent, velocity) of 2 nv numbers.
-
-    Attributes:
-        gain: `[N, T, 3 nv, 2 nv]`, 0 in the columns of what is not measured; the last nv rows are those of a force that
-            is not modelled, as the velocity that it gives in a control step.
-        whitener: `[N, T, 2 nv, 2 nv]`, W with W^T W the inverse of the innovations' covariance (0 where not measured).
-        log_size: `[N, T]`, log |W| over what is measured.
-        lasting: `[N]`, the share of that force that is still there a control step later.
-    """
-
-    gain: Array
-    whitener: Array
-    log_size: Array
-    lasting: Array
-
-
 def errors(physics: Physics, thetas: ArrayLike, record: Record, gains: Gains) -> Array:
     """Whitened one-step prediction errors of every record in every world; compiled once for each (physics, shapes).
 
@@ -95,7 +64,7 @@ def errors(physics: Physics, thetas: ArrayLike, record: Record, gains: Gains) ->
 @lru_cache(maxsize=16)
 def _errors(physics: Physics) -> Callable[..., Any]:
     def one(theta: Array, record: Record, gains: Gains) -> Array:
-        world = _begin(physics, theta, record)
+        world = started(physics, theta, record.qpos[0], record.qvel[0], record.command, record.around)
         drive = Drive(law=record.law)
 
         def step(carry: tuple, row: tuple) -> tuple[tuple, Array]:
@@ -118,25 +87,12 @@ def _errors(physics: Physics) -> Callable[..., Any]:
     return program(run, physics)
 
 
-def _begin(physics: Physics, theta: Array, record: Record) -> Any:
-    around = record.around
-    if around is None:
-        held = jnp.broadcast_to(record.command[:1, None, :], (1, physics.substeps, record.command.shape[-1]))
-        around = Motion(record.qpos[:1], record.qvel[:1], held, start=0)
-    else:
-        moved_ = [
-            x + (own - x[around.start]) for x, own in ((around.qpos, record.qpos[0]), (around.qvel, record.qvel[0]))
-        ]
-        around = around.replace(qpos=moved_[0], qvel=moved_[1])
-    return begin(physics, theta, around)
-
-
 def _followed(
     physics: Physics, world: Any, force: Array, lasting: Array, gain: Array, qpos: Array, qvel: Array
 ) -> tuple[Any, Array, Array]:
     """(world, force) drawn to what was measured, and the prediction error [2 nv]."""
     size = 2 * physics.mj_model.nv
-    pushed = jnp.concatenate([0.5 * physics.dt * force, force])
+    pushed = push(size // 2, physics.dt) @ force
     gap = _gap(physics, world, qpos, qvel) - pushed
     by = gain @ gap
     return _drawn(physics, world, pushed + by[:size]), lasting * force + by[size:], gap
@@ -158,7 +114,7 @@ def _transitions(physics: Physics) -> Callable[..., Any]:
     nv = physics.mj_model.nv
 
     def one(theta: Array, record: Record, gains: Gains, scale: Array) -> tuple[Array, Array]:
-        world = _begin(physics, theta, record)
+        world = started(physics, theta, record.qpos[0], record.qvel[0], record.command, record.around)
         drive = Drive(law=record.law)
 
         def step(carry: tuple, row: tuple) -> tuple[tuple, tuple[Array, Array]]:
@@ -209,45 +165,3 @@ def close(record: Record, nv: int) -> Gains:
     """Gains that correct at once: every step begins where it was measured."""
     gains = free(record, nv)
     return gains.replace(gain=gains.gain + jnp.eye(3 * nv, 2 * nv))
-
-
-def riccati(
-    ways: np.ndarray, sensor: np.ndarray, process: np.ndarray, start: np.ndarray, force: Force | None = None
-) -> Gains:
-    """Gains of the Kalman filter along linear error dynamics.
-
-    Args:
-        ways: `[N, T, 2 nv, 2 nv]`, see `transitions`.
-        sensor: `[2 nv]` standard deviations of the measurement noise; inf where nothing is measured.
-        process: `[2 nv]` standard deviations of what a control step adds to the state.
-        start: `[2 nv]` standard deviations of the start state's error.
-        force: one that lasts, or None.
-    """
-    n, steps, size, _ = ways.shape
-    nv, seen = size // 2, np.isfinite(sensor)
-    force = force or Force(np.zeros(nv), 0.0, 0.0)
-    noise = np.diag(sensor[seen] ** 2)
-    fresh = force.sd**2 * (1 - force.lasting**2)
-    added = np.diag(np.concatenate([process**2, fresh]))
-    spread = np.repeat(np.diag(np.concatenate([start**2, force.sd**2]))[None], n, axis=0)
-    gain, whitener = np.zeros((n, steps, size + nv, size)), np.zeros((n, steps, size, size))
-    log_size, at = np.zeros((n, steps)), np.ix_(seen, seen)
-    way = np.zeros((n, size + nv, size + nv))
-    way[:, :nv, size:], way[:, nv:size, size:] = 0.5 * force.dt * np.eye(nv), np.eye(nv)
-    way[:, size:, size:] = force.lasting * np.eye(nv)
-    for t in range(steps):
-        way[:, :size, :size] = np.nan_to_num(ways[:, t])
-        spread = np.clip(way @ spread @ np.swapaxes(way, -1, -2) + added, -1e12, 1e12)
-        known = np.concatenate([seen, np.zeros(nv, bool)])
-        inner = spread[:, known][:, :, known] + noise
-        k = np.swapaxes(np.linalg.solve(inner, spread[:, known, :]), -1, -2)
-        gain[:, t][:, :, seen] = k
-        lower = np.linalg.cholesky(inner)
-        white = np.linalg.inv(lower)
-        for row in range(n):
-            whitener[row, t][at] = white[row]
-        log_size[:, t] = -np.log(np.diagonal(lower, axis1=-2, axis2=-1)).sum(-1)
-        keep = np.eye(size + nv) - np.concatenate([gain[:, t], np.zeros((n, size + nv, nv))], axis=-1)
-        spread = keep @ spread @ np.swapaxes(keep, -1, -2) + k @ noise @ np.swapaxes(k, -1, -2)
-    arrays = (jnp.asarray(x, jnp.float32) for x in (gain, whitener, log_size, np.full(n, force.lasting)))
-    return Gains(*arrays)

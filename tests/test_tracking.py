@@ -5,10 +5,11 @@ import mujoco
 import numpy as np
 import pytest
 
+from bayessim_mjx.kalman import Force, riccati
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 from bayessim_mjx.physics import Physics
 from bayessim_mjx.rollout import replay
-from bayessim_mjx.tracking import Force, Record, close, errors, free, riccati, transitions
+from bayessim_mjx.tracking import Record, close, errors, free, transitions
 
 SLIDER = """<mujoco><option timestep=".01" gravity="0 0 0"/><worldbody><body name="cart">
   <joint name="x" type="slide" axis="1 0 0"/><geom size=".1" mass="2"/></body></worldbody>

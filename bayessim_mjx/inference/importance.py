@@ -16,10 +16,11 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from scipy.special import logsumexp, ndtr, ndtri
+from scipy.special import logsumexp
 from scipy.stats import multivariate_t
 
 from bayessim_mjx.distributions import Distribution
+from bayessim_mjx.distributions.charts import EDGE, from_chart
 from bayessim_mjx.inference.pareto import effective, normalised, smoothed
 from bayessim_mjx.inference.weighted import Mixture, fitted
 
@@ -30,7 +31,6 @@ FREEDOM = 5.0  # degrees of freedom of the proposals: their tails are heavier th
 WIDER = 1.2  # standard deviations of a fitted proposal, times
 EFFECTIVE = 0.5  # share of the draws of one round that should count when the next proposal is fitted
 TRUSTED = 0.7  # shape of the weights' tail beyond which they have no finite mean error (PSIS)
-EDGE = 1e-6  # unit coordinates are kept this far from 0 and 1
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Refined:
         simulations: how many thetas were simulated.
         rounds: in how many rounds.
         reason: why the proposal was kept, or None.
-        theta: the draws [N, d] with `weights` [N] that sum to 1.
+        z: the draws [N, d] in probit coordinates; theta: in the parameters' units; weights: [N], they sum to 1.
         log_likelihood: of the draws [N]; base: their log prior density less that of the draws' own mixture [N].
     """
 
@@ -58,6 +58,7 @@ class Refined:
     simulations: int
     rounds: int
     reason: str | None
+    z: np.ndarray
     theta: np.ndarray
     weights: np.ndarray
     log_likelihood: np.ndarray
@@ -110,9 +111,8 @@ def refine(
     if not len(weights):
         reason = f"none of {len(z)} simulations has a finite likelihood"
         flat = np.full(len(z), 1 / len(z))
-        return Refined(
-            proposal, proposal, 0.0, np.inf, np.nan, len(z), done, reason, _theta(space, z), flat, like, base
-        )
+        theta = _theta(space, z)
+        return Refined(proposal, proposal, 0.0, np.inf, np.nan, len(z), done, reason, z, theta, flat, like, base)
     log_weights = base + like
     evidence = float(logsumexp(log_weights[np.isfinite(log_weights)]) - np.log(len(z)))
     size, reason = effective(weights), ""
@@ -123,31 +123,24 @@ def refine(
     theta = _theta(space, z)
     answer = _distribution(space, fitted(rng, z, weights, components))
     posterior = proposal if reason else answer
-    return Refined(posterior, answer, size, tail, evidence, len(z), done, reason or None, theta, weights, like, base)
+    return Refined(posterior, answer, size, tail, evidence, len(z), done, reason or None, z, theta, weights, like, base)
 
 
 def tempered(found: Refined, power: float, components: int = 8, seed: int = 0) -> Refined:
     """The same draws weighted by the likelihood to a power below 1, a generalised posterior (Bissiri et al. 2016)."""
     weights, tail = smoothed(found.base + power * found.log_likelihood)
-    space = found.fitted.space
-    z = _z(space, found.theta)
-    answer = _distribution(space, fitted(np.random.default_rng(seed), z, weights, components))
+    answer = _distribution(found.fitted.space, fitted(np.random.default_rng(seed), found.z, weights, components))
     return replace(found, posterior=answer, fitted=answer, effective=effective(weights), tail=tail, weights=weights)
 
 
 def stretched(found: Refined, by: np.ndarray, seed: int = 0) -> Refined:
     """The same draws away from their mean by the factor `by` [d, d], in coordinates of unit covariance."""
-    z, space = coordinates(found), found.fitted.space
+    z, space = found.z, found.fitted.space
     mean = found.weights @ z
     lower = np.linalg.cholesky((z - mean).T @ ((z - mean) * found.weights[:, None]))
     away = mean + (z - mean) @ np.linalg.solve(lower.T, by @ lower.T)
     answer = _distribution(space, fitted(np.random.default_rng(seed), away, found.weights, 1))
-    return replace(found, posterior=answer, fitted=answer, theta=_theta(space, away))
-
-
-def coordinates(found: Refined) -> np.ndarray:
-    """The draws in z [N, d]."""
-    return _z(found.fitted.space, found.theta)
+    return replace(found, posterior=answer, fitted=answer, z=away, theta=_theta(space, away))
 
 
 def _distribution(space: Any, q: Mixture) -> Distribution:
@@ -210,13 +203,8 @@ def _log_prior(z: np.ndarray) -> np.ndarray:
 
 
 def _theta(space: Any, z: np.ndarray) -> np.ndarray:
-    u = np.clip(ndtr(z), EDGE, 1 - EDGE)
-    return np.asarray(space.from_unit(jnp.asarray(u, jnp.float32)))
-
-
-def _z(space: Any, theta: np.ndarray) -> np.ndarray:
-    u = np.asarray(space.to_unit(jnp.asarray(theta, jnp.float32)), np.float64)
-    return ndtri(np.clip(u, EDGE, 1 - EDGE))
+    u = from_chart(jnp.asarray(z, jnp.float32), "probit")
+    return np.asarray(space.from_unit(jnp.clip(u, EDGE, 1 - EDGE)))
 
 
 def _tempering(base: np.ndarray, like: np.ndarray, wanted: float) -> float:
@@ -231,4 +219,4 @@ def _tempering(base: np.ndarray, like: np.ndarray, wanted: float) -> float:
     return low
 
 
-__all__ = ["Refined", "coordinates", "refine", "stretched", "tempered"]
+__all__ = ["Refined", "refine", "stretched", "tempered"]

@@ -21,6 +21,7 @@ from bayessim_mjx.physics import controllers
 from bayessim_mjx.physics.controllers import Law
 from bayessim_mjx.rl import Policy
 from bayessim_mjx.rollout import Trajectory, recording, remembered, replay
+from bayessim_mjx.tracking import Record
 
 ESTIMATED_SPEED = 3.0  # error of a velocity estimated from positions, in its noise part: it lags at transients
 REPLAYED = 512  # segments replayed at once at nominal parameters
@@ -116,16 +117,19 @@ class Recorded:
         qpos0, qvel0 = self._of("qpos0", "qvel0", index=index)
         return self._replayed(index, qpos0, qvel0, thetas)
 
+    def records(self, index: Array | np.ndarray) -> Record:
+        """The segments index [N] as they were recorded: with the past of their starts, and their controllers."""
+        near = self._of("around_qpos", "around_qvel", "around_command", index=index)
+        law = None if self.law is None else jax.tree.map(lambda x: x[index], self.law)
+        return Record(*self._of("qpos", "qvel", "command", index=index), recording(self.env.physics, *near), law)
+
     def _of(self, *names: str, index: Array | np.ndarray) -> list[Array]:
         return [jnp.asarray(self.data[name])[index] for name in names]
 
     def _replayed(self, index: Array, qpos0: Array, qvel0: Array, thetas: Array) -> dict[str, Array]:
         """The segments index [N] from measured states, as they were recorded: past commands, controllers."""
-        physics = self.env.physics
-        near = recording(physics, *self._of("around_qpos", "around_qvel", "around_command", index=index))
-        law = None if self.law is None else jax.tree.map(lambda x: x[index], self.law)
-        (command,) = self._of("command", index=index)
-        return replay(physics, qpos0, qvel0, command, thetas, near, law)
+        record = self.records(index)
+        return replay(self.env.physics, qpos0, qvel0, record.command, thetas, record.around, record.law)
 
 
 def recorded(config: Config, env: Any, summarizer: Summarizer) -> Recorded:

@@ -18,8 +18,10 @@ import numpy as np
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.inference import importance
 from bayessim_mjx.inference.importance import Refined
+from bayessim_mjx.kalman import Force, Gains, innovations, riccati
 from bayessim_mjx.physics import Physics
-from bayessim_mjx.tracking import Force, Gains, Record, close, errors, riccati, transitions
+from bayessim_mjx.physics.tangent import addresses
+from bayessim_mjx.tracking import Record, close, errors, transitions
 
 FINEST = 1e-3  # of a channel's range of motion: no sensor is believed to be better
 PROCESS = (1e-3, 1e-2, 0.03, 0.1, 0.3, 1.0, 10.0)  # of unmodelled forces, in the velocity's sensor noise
@@ -51,16 +53,19 @@ class Refinement:
     """A refined posterior and what it rests on.
 
     Attributes:
-        posterior: refined, or the proposal where `refined.reason` is not None.
         refined: see `inference.importance`.
         noise: sensor and process noise as estimated.
         widening: largest factor on its standard deviations, 1 where the simulator can explain the trajectories.
     """
 
-    posterior: Distribution
     refined: Refined
     noise: Noise
     widening: float
+
+    @property
+    def posterior(self) -> Distribution:
+        """Refined, or the proposal where `refined.reason` is not None."""
+        return self.refined.posterior
 
 
 class Likelihood:
@@ -147,20 +152,12 @@ class Likelihood:
 
     def _start(self, noise: Noise) -> np.ndarray:
         """Standard deviations of the start state: as measured, or anything where it is not."""
-        return np.where(self.seen, np.where(np.isfinite(noise.sensor), noise.sensor, 0.0), 0.3 * self.scale)
+        return np.where(self.seen, noise.sensor, 0.3 * self.scale)
 
     def _fit(self, ways: np.ndarray, gaps: np.ndarray, noise: Noise, valid: np.ndarray) -> tuple[float, float]:
         """(log likelihood at the best common factor on the noise, that factor), by linear error dynamics."""
-        gains, size = self._gains(ways, noise), 2 * self.nv
-        gain, white = np.asarray(gains.gain, float), np.asarray(gains.whitener, float)
-        away, force = np.zeros((len(gaps), size)), np.zeros((len(gaps), self.nv))
-        squares = 0.0
-        for t in range(gaps.shape[1]):
-            pushed = np.concatenate([0.5 * self.physics.dt * force, force], axis=1)
-            ahead = np.einsum("nij,nj->ni", np.nan_to_num(ways[:, t]), away) + pushed - gaps[:, t]
-            by = np.einsum("nij,nj->ni", gain[:, t], -ahead)
-            squares += float(np.sum(np.einsum("nij,nj->ni", white[:, t], ahead) ** 2 * valid[:, t, None]))
-            away, force = ahead + by[:, :size], noise.lasting * force + by[:, size:]
+        gains = self._gains(ways, noise)
+        squares = float(np.sum(innovations(ways, gaps, gains, self.physics.dt) ** 2 * valid[:, :, None]))
         count = valid.sum() * self.seen.sum()
         factor = max(squares / count, 1.0)  # not below the floor
         sizes = float(np.sum(np.asarray(gains.log_size, float) * valid))
@@ -218,8 +215,7 @@ def refine(
     widening = 1.0
     if not found.reason:
         found, widening = _adjusted(found, _spread(found, kept, likelihood), components, seed)
-    posterior = proposal if found.reason else found.posterior
-    return Refinement(posterior, replace(found, posterior=posterior), likelihood.noise, widening)
+    return Refinement(replace(found, posterior=proposal) if found.reason else found, likelihood.noise, widening)
 
 
 def _spread(found: Refined, squares: np.ndarray, likelihood: Likelihood) -> np.ndarray:
@@ -230,7 +226,7 @@ def _spread(found: Refined, squares: np.ndarray, likelihood: Likelihood) -> np.n
     """
     unit = float(found.weights @ squares.sum((1, 2))) / likelihood.count
     use = found.weights > 1e-6 * found.weights.max()
-    weights, z = found.weights[use] / found.weights[use].sum(), importance.coordinates(found)[use]
+    weights, z = found.weights[use] / found.weights[use].sum(), found.z[use]
     gap = z - weights @ z
     covariance = gap.T @ (gap * weights[:, None])
     lower = np.linalg.cholesky(covariance)
@@ -267,19 +263,8 @@ def _travel(record: Record, physics: Physics) -> np.ndarray:
     speed = np.asarray(record.qvel, float).reshape(-1, nv)
     span = np.ptp(speed, axis=0)
     qpos = np.asarray(record.qpos, float).reshape(-1, physics.mj_model.nq)
-    travel = np.array([min(np.ptp(qpos[:, q]), np.pi) if q is not None else 1.0 for q in _addresses(physics)])
+    travel = np.array([min(np.ptp(qpos[:, q]), np.pi) if q is not None else 1.0 for q in addresses(physics.mj_model)])
     return np.maximum(np.concatenate([travel, span]), 1e-6)
-
-
-def _addresses(physics: Physics) -> list[int | None]:
-    """For each degree of freedom its place in qpos; None for a rotation's."""
-    out: list[int | None] = []
-    for kind, q in zip(physics.mj_model.jnt_type, physics.mj_model.jnt_qposadr, strict=True):
-        if kind == 0:
-            out += [int(q), int(q) + 1, int(q) + 2, None, None, None]
-        else:
-            out += [None] * 3 if kind == 1 else [int(q)]
-    return out
 
 
 def _rows(tree: Any, rows: slice) -> Any:

@@ -14,7 +14,8 @@ from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.loop.recorded import Recorded
 from bayessim_mjx.loop.refinement import Likelihood, Refinement, refine
 from bayessim_mjx.loop.state import Loop, LoopState, RoundInfo
-from bayessim_mjx.rollout import Trajectory, recording
+from bayessim_mjx.physics.tangent import in_tangent
+from bayessim_mjx.rollout import Trajectory
 from bayessim_mjx.tracking import Record
 
 DRAWS = 1024  # thetas of one call
@@ -77,33 +78,18 @@ def _stored(loop: Loop, state: LoopState, real: Trajectory) -> LoopState:
 
 def _record(loop: Loop, state: LoopState, known: int) -> tuple[Record, np.ndarray, np.ndarray]:
     """(record, valid [N, T], sensor noise [2 nv]) of the first `known` real trajectories."""
-    physics, source = loop.env.physics, loop.source  # type: ignore[attr-defined]
-    model = physics.mj_model
+    model, source = loop.env.physics.mj_model, loop.source  # type: ignore[attr-defined]
     if isinstance(source, Recorded):
         index = source.order[np.arange(known) % len(source.order)]
-        qpos, qvel, command = source._of("qpos", "qvel", "command", index=index)
-        around = recording(physics, *source._of("around_qpos", "around_qvel", "around_command", index=index))
-        law = None if source.law is None else jax.tree.map(lambda x: x[index], source.law)
-        record = Record(qpos, qvel, command, around, law)
+        record = source.records(index)
         speeds = np.asarray(source.noise["qvel"]) if source.with_qvel else np.full(model.nv, np.inf)
-        sensor = np.concatenate([_tangent(model, np.asarray(source.noise["qpos"])), speeds])
-        return record, np.ones(command.shape[:2]), sensor
+        sensor = np.concatenate([in_tangent(model, np.asarray(source.noise["qpos"])), speeds])
+        return record, np.ones(record.command.shape[:2]), sensor
     motion = state.motion
     assert motion is not None
     rows = {name: value[:known] for name, value in motion.items()}
     record = Record(rows["qpos"], rows["qvel"], rows["command"])
     return record, np.asarray(rows["valid"]), np.full(2 * model.nv, source.noise, float)  # type: ignore[union-attr]
-
-
-def _tangent(model: object, noise: np.ndarray) -> np.ndarray:
-    """Noise of the positions [nq] as noise of the tangent [nv]: a rotation is twice its quaternion's imaginary part."""
-    parts = []
-    for kind, q in zip(model.jnt_type, model.jnt_qposadr, strict=True):  # type: ignore[attr-defined]
-        if kind == 0:
-            parts.append(noise[q : q + 3])
-            q = q + 3
-        parts.append(2 * noise[q + 1 : q + 4] if kind in (0, 1) else noise[q : q + 1])
-    return np.concatenate(parts)
 
 
 __all__ = ["no_motion", "refined", "scores"]

@@ -2,24 +2,42 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 
 
 def difference(model: mujoco.MjModel, measured: jax.Array, simulated: jax.Array) -> jax.Array:
     """qpos minus qpos in the tangent space `[nv]`: rotation vectors where there are quaternions."""
-    parts = []
+    return jnp.concatenate(
+        [_rotation(measured[q], simulated[q]) if turns else measured[q] - simulated[q] for q, _, turns in _parts(model)]
+    )
+
+
+def addresses(model: mujoco.MjModel) -> list[int | None]:
+    """For each degree of freedom its place in qpos; None for a rotation's."""
+    return [at for q, _, turns in _parts(model) for at in ([None] * 3 if turns else range(q.start, q.stop))]
+
+
+def in_tangent(model: mujoco.MjModel, sd: np.ndarray) -> np.ndarray:
+    """Errors of qpos [nq] as errors of its tangent [nv]: a rotation is twice its quaternion's imaginary part."""
+    return np.concatenate([2 * sd[q][1:] if turns else sd[q] for q, _, turns in _parts(model)])
+
+
+def _parts(model: mujoco.MjModel) -> Iterator[tuple[slice, slice, bool]]:
+    """(place in qpos, place in qvel, is it a rotation) of every joint; a free joint has two parts."""
     for j in range(model.njnt):
-        q, kind = int(model.jnt_qposadr[j]), int(model.jnt_type[j])
+        q, v, kind = int(model.jnt_qposadr[j]), int(model.jnt_dofadr[j]), int(model.jnt_type[j])
         if kind == int(mujoco.mjtJoint.mjJNT_FREE):
-            parts.append(measured[q : q + 3] - simulated[q : q + 3])
-            q += 3
+            yield slice(q, q + 3), slice(v, v + 3), False
+            q, v = q + 3, v + 3
         if kind in (int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)):
-            parts.append(_rotation(measured[q : q + 4], simulated[q : q + 4]))
+            yield slice(q, q + 4), slice(v, v + 3), True
         else:
-            parts.append(measured[q : q + 1] - simulated[q : q + 1])
-    return jnp.concatenate(parts)
+            yield slice(q, q + 1), slice(v, v + 1), False
 
 
 def _rotation(a: jax.Array, b: jax.Array) -> jax.Array:
@@ -32,15 +50,8 @@ def _rotation(a: jax.Array, b: jax.Array) -> jax.Array:
 def integrate(model: mujoco.MjModel, qpos: jax.Array, step: jax.Array) -> jax.Array:
     """qpos moved by `step` `[nv]` in the tangent space."""
     out = qpos
-    for j in range(model.njnt):
-        q, v, kind = int(model.jnt_qposadr[j]), int(model.jnt_dofadr[j]), int(model.jnt_type[j])
-        if kind == int(mujoco.mjtJoint.mjJNT_FREE):
-            out = out.at[q : q + 3].add(step[v : v + 3])
-            q, v = q + 3, v + 3
-        if kind in (int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)):
-            out = out.at[q : q + 4].set(_turned(qpos[q : q + 4], step[v : v + 3]))
-        else:
-            out = out.at[q].add(step[v])
+    for q, v, turns in _parts(model):
+        out = out.at[q].set(_turned(qpos[q], step[v])) if turns else out.at[q].add(step[v])
     return out
 
 

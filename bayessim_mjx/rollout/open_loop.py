@@ -52,10 +52,7 @@ def _replay(physics: Physics) -> Callable[..., dict[str, jax.Array]]:
     def one(
         qpos: jax.Array, qvel: jax.Array, command: jax.Array, theta: jax.Array, around: Motion | None, law: Law | None
     ) -> dict[str, jax.Array]:
-        if around is None:
-            around = Motion(qpos[None], qvel[None], _throughout(physics, command[:1]), start=0)
-        moved = [x + (own - x[around.start]) for x, own in ((around.qpos, qpos), (around.qvel, qvel))]
-        world = begin(physics, theta, around.replace(qpos=moved[0], qvel=moved[1]))
+        world = started(physics, theta, qpos, qvel, command, around)
         drive = Drive(law=law)
 
         def step(world: Any, command: jax.Array) -> tuple[Any, dict]:
@@ -66,6 +63,19 @@ def _replay(physics: Physics) -> Callable[..., dict[str, jax.Array]]:
         return jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), world.measurement, after)
 
     return program(jax.vmap(one), physics)
+
+
+def started(
+    physics: Physics, theta: jax.Array, qpos: jax.Array, qvel: jax.Array, command: jax.Array, around: Motion | None
+) -> Any:
+    """The world theta [d] before the commands [T, nu], in the true state behind the measured qpos [nq], qvel [nv].
+
+    around: as in `replay`, of one start; None: the first command was held.
+    """
+    if around is None:
+        around = Motion(qpos[None], qvel[None], _throughout(physics, command[:1]), start=0)
+    moved = [x + (own - x[around.start]) for x, own in ((around.qpos, qpos), (around.qvel, qvel))]
+    return begin(physics, theta, around.replace(qpos=moved[0], qvel=moved[1]))
 
 
 def _throughout(physics: Physics, command: jax.Array) -> jax.Array:
