@@ -19,6 +19,7 @@ from bayessim_mjx.inference.identify import flat_sentences, restore_prior
 from bayessim_mjx.inference.misspecification import Misfit
 from bayessim_mjx.inference.range_ends import Pile, piles
 from bayessim_mjx.inference.temperature import widened
+from bayessim_mjx.quantities import percent
 
 CANDIDATES = 16  # draws of q for each one of q tilt / prior
 
@@ -58,7 +59,7 @@ class Checks:
         if self.calibration.verdict != calibration.CALIBRATED:
             texts.append(f"posterior {self.calibration.words}: simulate more (bayessim.trainTrajs)")
         if self.misfit.flagged:
-            share = f"; {100 * self.prior_share:.0f} % of the randomisation is drawn from the prior"
+            share = f"; {percent(self.prior_share)} of the randomisation is drawn from the prior"
             texts.append(self.misfit.sentence() + (share if self.prior_share else ""))
         return texts + [pile.sentence() for pile in self.piles]
 

@@ -25,6 +25,7 @@ from bayessim_mjx.loop.factors import conditioned, kept
 from bayessim_mjx.loop.inference_state import new_network
 from bayessim_mjx.loop.simulations import at, proposal_of, simulated
 from bayessim_mjx.loop.state import Loop, LoopState, RoundInfo
+from bayessim_mjx.quantities import percent
 from bayessim_mjx.rl import Policy
 from bayessim_mjx.rollout import Trajectory, select
 
@@ -153,7 +154,7 @@ def _factors(loop: Loop, state: LoopState, info: RoundInfo) -> Distribution:
         quotients, lost = rounds.divided(rows[:done], at(state.proposals, 0))
         factors = jax.tree.map(lambda *leaves: jnp.stack(leaves), *quotients, *rows[done:])
         if lost > LOST:
-            info.warnings.append(f"{100 * lost:.0f} % of the posterior's weight cannot be divided by the proposal")
+            info.warnings.append(f"{percent(lost)} of the posterior's weight cannot be divided by the proposal")
     factors = kept(factors, state.fit.identified, b.priorShare)
     if not loop.source.policy_dependent:  # type: ignore[union-attr]
         return factors
@@ -193,7 +194,7 @@ def _complaints(names: tuple[str, ...], fit: dict[str, Any], known_before: np.nd
     if unknown and not np.array_equal(fit["identified"], known_before):
         texts.append(f"not identified by these trajectories, kept at the prior: {', '.join(unknown)}")
     if fit["clipped"] > CLIPPED:
-        texts.append(f"{100 * float(fit['clipped']):.1f} % of the summaries' entries lie beyond 10 sd and were clipped")
+        texts.append(f"{percent(fit['clipped'])} of the summaries' entries lie beyond 10 sd and were clipped")
     if fit["n_invalid"] > 0:
         texts.append(f"{int(fit['n_invalid'])} simulated trajectories left out: their summaries are not finite")
     if fit["skipped"] > 0:

@@ -7,7 +7,6 @@ zeros at the start, and gives memory_next. Metadata are texts, lists in JSON.
 
 from __future__ import annotations
 
-import importlib.metadata
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -18,6 +17,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from bayessim_mjx import versions
 from bayessim_mjx.env import Env, Task
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.rl import recurrent
@@ -96,7 +96,7 @@ def metadata(policy: Policy, env: Env) -> dict[str, Any]:
         "joint_names": _names(env.mj_model, mujoco.mjtObj.mjOBJ_JOINT, env.mj_model.njnt),
         "control_dt": env.dt,
         "action_clip": policy.action_clip,
-        "versions": {name: _version(name) for name in PACKAGES},
+        "versions": versions.of(PACKAGES),
         "golden_action": np.asarray(answer(policy, golden)).tolist(),
         **{f"golden_{name}": np.asarray(x).tolist() for name, x in golden.items()},
     }
@@ -143,10 +143,3 @@ def write(path: Path, policy: Policy, env: Env, notes: Mapping[str, Any] | None 
 
 def _names(model: mujoco.MjModel, kind: mujoco.mjtObj, count: int) -> Sequence[str]:
     return [mujoco.mj_id2name(model, kind, i) or f"{i}" for i in range(count)]
-
-
-def _version(package: str) -> str:
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return "unknown"

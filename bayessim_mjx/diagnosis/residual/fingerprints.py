@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bayessim_mjx.diagnosis import phrases
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 from bayessim_mjx.diagnosis.residual.disturbance import Disturbance, step_of_starts
 from bayessim_mjx.diagnosis.residual.motion_inputs import Inputs
@@ -45,7 +46,7 @@ class Number:
         return self.low > 0 or self.high < 0
 
     def __str__(self) -> str:
-        return f"{self.value:.2g} [{self.low:.2g}, {self.high:.2g}] {self.unit}"
+        return phrases.bracketed(self.value, self.low, self.high, self.unit)
 
 
 @dataclass(frozen=True)
@@ -83,10 +84,8 @@ def _fingerprint(
     y: Array,
     terms: dict[str, tuple[Array, str]],
     without: Array,
-    say: dict[str, str],
-    head: str,
 ) -> Fingerprint:
-    """terms: {name: (column `[W, m]`, unit)}; say: {name: words} for those that matter."""
+    """terms: {name: (column `[W, m]`, unit)}; those that matter are told in the words of `phrases.SIGNATURES`."""
     X = np.stack([column for column, _ in terms.values()], 2)
     used = node.used
     beta, replicates, rms = regress(np.where(used, y, 0.0), X, used[..., None] * node.gain, without)
@@ -96,20 +95,12 @@ def _fingerprint(
     }
     size = max(float(np.sqrt(np.mean(y[node.used] ** 2))) if node.used.any() else 0.0, 1e-300)
     weight = {key: float(r) / size for key, r in zip(terms, rms, strict=True)}
-    told = [
-        _told(numbers[key], words) for key, words in say.items() if numbers[key].clear and weight[key] > LIMITS.small
-    ]
+    own, told = phrases.SIGNATURES[name], []
+    for key, words in own.terms.items():
+        if (n := numbers[key]).clear and weight[key] > LIMITS.small:
+            told.append(phrases.signed(n.value, n.low, n.high, n.unit, words))
+    head = own.head.format(recent=LIMITS.recent)
     return Fingerprint(name, node.joint, f"{node.joint}: {head} {', '.join(told)}" if told else "", numbers, weight)
-
-
-def _told(number: Number, words: str) -> str:
-    """The number; its sign in words where these have a place for it: against/with, more/less."""
-    for pair in ("against/with", "more/less"):
-        if pair in words:
-            positive = number.value > 0
-            shown = number if positive else Number(-number.value, -number.high, -number.low, number.unit)
-            return f"{shown} {words.replace(pair, pair.split('/')[0 if positive else 1])}"
-    return f"{number} {words}"
 
 
 def fingerprints(
@@ -127,28 +118,13 @@ def fingerprints(
     odd = {"offset": (one, unit), "constant": (-s, unit), "linear": (-w, slope), "quadratic": (-w * np.abs(w), square)}
     drift = {"constant": (-s, unit), "friction": (-s * late, f"{unit}/s"), "level": (one, unit)}
     heavy = {"constant": (-s, unit), "linear": (-w, slope)}
-    out = [
-        _fingerprint(
-            "odd and even in speed", node, y, odd | {"even": (-np.abs(w), slope)}, without,
-            {"constant": "against/with the motion at any speed", "linear": "against/with the motion, linear in speed",
-             "quadratic": "against/with the motion, quadratic in speed", "offset": "always the same way",
-             "even": "with speed but always the same way"},
-            "of the missing force",
-        ),
-        _fingerprint(
-            "load", node, y, heavy | {"load": (-s * (load - load.mean()), f"{unit} per {unit}")}, without,
-            {"load": "of gravity load"}, "the force against the motion changes by",
-        ),
-        _fingerprint(
-            "time", node, y, drift | {"drift": (late, f"{unit}/s")}, without,
-            {"friction": "against the motion", "drift": "always the same way"},
-            "in the course of a log the force changes by",
-        ),
-        _fingerprint(
-            "time since reversal", node, y, {"constant": (-s, unit), "recent": (-s * recent, unit)}, without,
-            {"recent": "more/less"}, f"within {LIMITS.recent:g} s after reversals the force against the motion is",
-        ),
-    ]  # fmt: skip
+    terms = {
+        "odd and even in speed": odd | {"even": (-np.abs(w), slope)},
+        "load": heavy | {"load": (-s * (load - load.mean()), f"{unit} per {unit}")},
+        "time": drift | {"drift": (late, f"{unit}/s")},
+        "time since reversal": {"constant": (-s, unit), "recent": (-s * recent, unit)},
+    }
+    out = [_fingerprint(name, node, y, own, without) for name, own in terms.items()]
     return [*out, _lag(fitter, fit, disturbance, inputs, dof, node, without)]
 
 
@@ -168,7 +144,4 @@ def _lag(
     whole = Nodes(behind @ average, one, node.axes, node.units, node.joint, node.force_unit)
     angle = inputs.angle_unit[dof]
     s, w = np.sign(node.axes["direction"]), node.axes["speed"]
-    return _fingerprint(
-        "lag", whole, whole.force, {"constant": (s, angle), "lag": (w, "s")}, without,
-        {"constant": "at any speed", "lag": "times the speed"}, "the measured motion lags behind the simulated one by",
-    )  # fmt: skip
+    return _fingerprint("lag", whole, whole.force, {"constant": (s, angle), "lag": (w, "s")}, without)

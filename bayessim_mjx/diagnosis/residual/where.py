@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayessim_mjx.diagnosis import statistics
+from bayessim_mjx.diagnosis import phrases, statistics
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 from bayessim_mjx.diagnosis.residual import motion_inputs, regions
 from bayessim_mjx.diagnosis.residual.disturbance import Disturbance, estimate
@@ -42,7 +42,7 @@ def locate(
         (places, largest share first; maps of the missing force, see `regions.force_map`; sentences).
     """
     if float(fit.quadratic(fitter.spread)[0].c.mean()) < RULES.quiet * fitter.size:
-        return [], [], ["what this model leaves lies within the measurement noise"]
+        return [], [], [phrases.WITHIN_NOISE]
     disturbance = estimate(fitter, fit) if disturbance is None else disturbance
     windows, model = fitter.simulator.windows, fitter.simulator.physics.mj_model
     inputs = motion_inputs.measured(windows, model)
@@ -96,44 +96,12 @@ def _sentences(node: Nodes, found: Tree) -> list[str]:
     told = _told(found)
     if not told:
         size = float(np.sqrt(np.mean(node.force[node.used] ** 2))) if node.used.any() else 0.0
-        return [
-            f"{node.joint}: a missing force of {size:.2g} {node.force_unit} rms without a simple place in the state"
-        ]
-    return [f"{node.joint}, {in_words(leaf, node)}: {_force(leaf, node, found.target)}" for leaf in told]
-
-
-def _force(leaf: Leaf, node: Nodes, target: str) -> str:
-    if target == ALONG:
-        return f"{abs(leaf.mean):.2g} {node.force_unit} {'against' if leaf.mean < 0 else 'with'} the motion"
-    return f"{leaf.mean:+.2g} {node.force_unit}"
+        return [phrases.placeless_force(node.joint, size, node.force_unit)]
+    along = found.target == ALONG
+    force = [phrases.missing_force(leaf.mean, node.force_unit, along) for leaf in told]
+    return [f"{node.joint}, {phrases.region(leaf.where, node.units)}: {f}" for leaf, f in zip(told, force, strict=True)]
 
 
 def _region(node: Nodes, found: Tree | None) -> str:
     told = _told(found) if found is not None else []
-    return in_words(told[0], node) if told else ""
-
-
-def in_words(leaf: Leaf, node: Nodes) -> str:
-    """'at speeds below 0.2 rad/s, moving forward'."""
-    words = {
-        "position": "position", "speed": "speed", "load": "gravity load", "effort": "effort", "time": "time in the log",
-        "speed size": "speed", "load size": "gravity load (size)", "effort size": "effort (size)",
-    }  # fmt: skip
-    limits: dict[str, dict[bool, float]] = {}
-    for axis, above, limit in leaf.where:  # nested splits on one axis: the tighter one
-        own = limits.setdefault(axis, {})
-        own[above] = limit if above not in own else (max if above else min)(own[above], limit)
-    parts = []
-    for axis, own in limits.items():
-        unit = node.units[axis]
-        if axis == "direction":
-            parts.append("moving forward" if True in own else "moving backward")
-        elif axis == "time since reversal":
-            ends = [f"{'later than' if above else 'within'} {limit:.2g} s" for above, limit in own.items()]
-            parts.append(f"{' and '.join(ends)} after a reversal")
-        elif len(own) == 2:
-            parts.append(f"{words[axis]} between {own[True]:.2g} and {own[False]:.2g} {unit}".rstrip())
-        else:
-            above, limit = next(iter(own.items()))
-            parts.append(f"{words[axis]} {'above' if above else 'below'} {limit:.2g} {unit}".rstrip())
-    return ", ".join(parts) if parts else "everywhere"
+    return phrases.region(told[0].where, node.units) if told else ""

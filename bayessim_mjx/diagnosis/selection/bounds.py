@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from bayessim_mjx.diagnosis import phrases
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate, Coordinate, shrink
 from bayessim_mjx.diagnosis.selection.models import Model, scored
 from bayessim_mjx.diagnosis.selection.race import Progress, Race, fresh
@@ -77,15 +78,15 @@ def of(physics: Physics, coordinate: Coordinate, value: float) -> Bound | None:
     quantity = physics.quantity(coordinate.index[0])
     at = getattr(coordinate, end)
     if at == quantity.neutral and not quantity.shape:
-        return Bound("off", f"is {at:.3g}, where it has no part in the effect")
+        return Bound("off", phrases.off(at))
     least, most = quantity.ends()
     unit = f" {coordinate.unit}" if coordinate.unit else ""
     if at == (most if end == "high" else least):
-        return Bound("end", f"ends at {at:.3g}{unit}, where physics ends")
+        return Bound("end", phrases.physical_end(at, unit))
     if at == _farthest(physics, coordinate, end):
-        kind, which = ("at least", "largest") if end == "high" else ("at most", "smallest")
-        return Bound(kind, f"ends at {at:.3g}{unit}, the {which} value tried: {kind} this, or another law is behind it")
-    return Bound("end", f"ends at its bound {at:.3g}{unit}; a wider range explains no more")
+        kind = "at least" if end == "high" else "at most"
+        return Bound(kind, phrases.farthest_tried(at, unit, kind))
+    return Bound("end", phrases.bound(at, unit))
 
 
 def _end(c: Coordinate, value: float) -> str:

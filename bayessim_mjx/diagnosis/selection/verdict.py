@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from bayessim_mjx.diagnosis import phrases
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.selection.race import polish
@@ -25,7 +26,6 @@ from bayessim_mjx.diagnosis.selection.search import (
     without,
 )
 from bayessim_mjx.diagnosis.selection.tried import Tried
-from bayessim_mjx.quantities import percent
 
 
 @dataclass(frozen=True)
@@ -115,7 +115,7 @@ def _in_parts(race: Race, winner: Model, effect: Candidate, say: Progress) -> li
     if effect in model.effects or behind > race.settings.tie:
         return []
     own = tuple(e for e in model.effects if e not in winner.effects)
-    why = f"simpler laws in its place close {percent(race.closure(model))} against {percent(race.closure(winner))}"
+    why = phrases.simpler_instead(race.closure(model), race.closure(winner))
     return [Rival(own, model, race.closure(model), why, contains=True)]
 
 
@@ -181,11 +181,7 @@ def _rival(race: Race, winner: Model, effect: Candidate, others: tuple[Candidate
         return []
     contains = any(effect.effect in special_cases(o) and o.where == effect.where for o in others)
     same = any(o.effect == effect.effect and compatible(o, effect) is False for o in others)
-    why = (
-        "contains it as a special case and explains no more"
-        if contains
-        else f"held-out evidence differs by {c.evidence:.1f} nats, {percent(max(behind, 0.0))} of the gap"
-    )
+    why = phrases.CONTAINS if contains else phrases.close_by(c.evidence, behind)
     return [Rival(others, model, race.closure(model), why, contains or same, c.evidence)]
 
 
@@ -199,7 +195,7 @@ def structural(race: Tried, model: Model, sd: np.ndarray) -> dict[str, str]:
     for i, c in enumerate(model.fit.coordinates[:base]):
         value, width = model.fit.values[i], c.high - c.low
         if min(value - c.low, c.high - value) < 1e-3 * width:
-            out[c.name] = f"sits at its bound {value:.4g}: it stands in for something else, or its range is too narrow"
+            out[c.name] = phrases.stuck(value)
     if groups < 3:
         return out
     each, deviation = per_condition(race, model)
@@ -210,7 +206,7 @@ def structural(race: Tried, model: Model, sd: np.ndarray) -> dict[str, str]:
         p = float(stats.chi2.sf(z2, groups - 1)) * base
         spread = float(np.std(each[:, i]))
         if p < 1e-3 and spread > 0.05 * (c.high - c.low) and c.name not in out:
-            out[c.name] = f"moves between operating conditions (sd {spread:.3g} over {groups}): structure is missing"
+            out[c.name] = phrases.moves(spread, groups)
     return out
 
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from bayessim_mjx import versions
 from bayessim_mjx.diagnosis import statistics
 from bayessim_mjx.diagnosis.experiment.propose import Experiment
 from bayessim_mjx.diagnosis.findings import Findings, Where
@@ -35,6 +35,7 @@ class Limits:
 
 
 LIMITS = Limits()
+PACKAGES = ("bayessim-mjx", "mujoco", "mujoco-mjx", "jax", "numpy")  # what the result depends on
 
 
 def diagnosis_of(found: Findings, about: Mapping[str, Any] | None = None, file: str = "") -> Diagnosis:
@@ -71,7 +72,7 @@ def diagnosis_of(found: Findings, about: Mapping[str, Any] | None = None, file: 
         candidates=ranking(outcome),
         warnings=[*notes, *found.warnings],
         next_experiment=proposal.to_dict(file) if proposal else {},
-        versions=versions(),
+        versions=versions.of(PACKAGES),
         details=details(found, effects, closed) | more | ({"experiments": proposal.details()} if proposal else {}),
         covariance={"names": list(model.fit.names), "matrix": together},
         about={**about, "conditions": len(setup.fitter.simulator.windows.groups)} if about else {},
@@ -184,21 +185,20 @@ def _where(found: Findings) -> list[Place]:
     return sorted(out, key=lambda p: -p.share)
 
 
-def versions() -> dict[str, str]:
-    """Versions of what the result depends on."""
-    out: dict[str, str] = {}
-    for package in ("bayessim-mjx", "mujoco", "mujoco-mjx", "jax", "numpy"):
-        try:
-            out[package] = importlib.metadata.version(package)
-        except importlib.metadata.PackageNotFoundError:  # run from a checkout that was not installed
-            out[package] = "unknown"
-    return out
-
-
 def insufficient(reason: str, notes: Sequence[str], about: Mapping[str, Any] | None = None) -> Diagnosis:
     """The verdict where nothing can be held out."""
     nothing = Gap(1.0, *(float("nan"),) * 4)
     said = [f"Too little data: {reason}."]
     return Diagnosis(
-        "insufficient_data", said, [], [], nothing, {}, [], list(notes), {}, versions(), about=dict(about or {})
+        "insufficient_data",
+        said,
+        [],
+        [],
+        nothing,
+        {},
+        [],
+        list(notes),
+        {},
+        versions.of(PACKAGES),
+        about=dict(about or {}),
     )

@@ -1,0 +1,135 @@
+"""How facts about fits are put into words: places in the state, missing forces, bounds, rivals; effects: vocabulary."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+from bayessim_mjx.quantities import percent
+
+AXES = {
+    "position": "position", "speed": "speed", "load": "gravity load", "effort": "effort", "time": "time in the log",
+    "speed size": "speed", "load size": "gravity load (size)", "effort size": "effort (size)",
+}  # fmt: skip
+WITHIN_NOISE = "what this model leaves lies within the measurement noise"
+CONTAINS = "contains it as a special case and explains no more"
+OPPOSITES = ("against/with", "more/less")  # of which a number's sign chooses one
+
+
+@dataclass(frozen=True)
+class Phrases:
+    """How a signature of the missing force is told.
+
+    Attributes:
+        head: what its sentence begins with; terms: {name of a number: words after it}, for those that are told.
+    """
+
+    head: str
+    terms: Mapping[str, str]
+
+
+SIGNATURES = {
+    "odd and even in speed": Phrases(
+        "of the missing force",
+        {"constant": "against/with the motion at any speed", "linear": "against/with the motion, linear in speed",
+         "quadratic": "against/with the motion, quadratic in speed", "offset": "always the same way",
+         "even": "with speed but always the same way"},
+    ),
+    "load": Phrases("the force against the motion changes by", {"load": "of gravity load"}),
+    "time": Phrases(
+        "in the course of a log the force changes by",
+        {"friction": "against the motion", "drift": "always the same way"},
+    ),
+    "time since reversal": Phrases(
+        "within {recent:g} s after reversals the force against the motion is", {"recent": "more/less"}
+    ),
+    "lag": Phrases(
+        "the measured motion lags behind the simulated one by",
+        {"constant": "at any speed", "lag": "times the speed"},
+    ),
+}  # fmt: skip
+
+
+def region(limits: Iterable[tuple[str, bool, float]], units: Mapping[str, str]) -> str:
+    """`speed below 0.2 rad/s, moving forward`, of (axis, above, limit); nested limits of one axis: the tighter one."""
+    kept: dict[str, dict[bool, float]] = {}
+    for axis, above, limit in limits:
+        own = kept.setdefault(axis, {})
+        own[above] = limit if above not in own else (max if above else min)(own[above], limit)
+    return ", ".join(_side(axis, own, units[axis]) for axis, own in kept.items()) or "everywhere"
+
+
+def _side(axis: str, own: Mapping[bool, float], unit: str) -> str:
+    if axis == "direction":
+        return "moving forward" if True in own else "moving backward"
+    if axis == "time since reversal":
+        ends = [f"{'later than' if above else 'within'} {limit:.2g} s" for above, limit in own.items()]
+        return f"{' and '.join(ends)} after a reversal"
+    if len(own) == 2:
+        return f"{AXES[axis]} between {own[True]:.2g} and {own[False]:.2g} {unit}".rstrip()
+    ((above, limit),) = own.items()
+    return f"{AXES[axis]} {'above' if above else 'below'} {limit:.2g} {unit}".rstrip()
+
+
+def missing_force(mean: float, unit: str, along: bool) -> str:
+    """`0.3 N m against the motion`; with a sign where it does not go along with the motion."""
+    return f"{abs(mean):.2g} {unit} {'against' if mean < 0 else 'with'} the motion" if along else f"{mean:+.2g} {unit}"
+
+
+def placeless_force(joint: str, size: float, unit: str) -> str:
+    """Of a missing force that no region of the state tells."""
+    return f"{joint}: a missing force of {size:.2g} {unit} rms without a simple place in the state"
+
+
+def bracketed(value: float, low: float, high: float, unit: str) -> str:
+    """`0.3 [0.2, 0.4] N m`."""
+    return f"{value:.2g} [{low:.2g}, {high:.2g}] {unit}"
+
+
+def signed(value: float, low: float, high: float, unit: str, phrase: str) -> str:
+    """A number with its interval and phrase; its sign in words where the phrase has a place for it."""
+    for pair in OPPOSITES:
+        if pair in phrase:
+            positive = value > 0
+            shown = (value, low, high) if positive else (-value, -high, -low)
+            return f"{bracketed(*shown, unit)} {phrase.replace(pair, pair.split('/')[0 if positive else 1])}"
+    return f"{bracketed(value, low, high, unit)} {phrase}"
+
+
+def off(at: float) -> str:
+    """Of a parameter that takes its effect away."""
+    return f"is {at:.3g}, where it has no part in the effect"
+
+
+def physical_end(at: float, unit: str) -> str:
+    """Of a parameter at a physical limit."""
+    return f"ends at {at:.3g}{unit}, where physics ends"
+
+
+def farthest_tried(at: float, unit: str, kind: str) -> str:
+    """Of a parameter at the end of the widest range, of which no more is known than `kind`: at least, at most."""
+    which = "largest" if kind == "at least" else "smallest"
+    return f"ends at {at:.3g}{unit}, the {which} value tried: {kind} this, or another law is behind it"
+
+
+def bound(at: float, unit: str) -> str:
+    """Of a parameter at a bound beyond which nothing is gained."""
+    return f"ends at its bound {at:.3g}{unit}; a wider range explains no more"
+
+
+def simpler_instead(closed: float, against: float) -> str:
+    """Why special cases together are a rival of their law."""
+    return f"simpler laws in its place close {percent(closed)} against {percent(against)}"
+
+
+def close_by(nats: float, behind: float) -> str:
+    """Why a model is a rival: how little evidence and closure part it from what is named."""
+    return f"held-out evidence differs by {nats:.1f} nats, {percent(max(behind, 0.0))} of the gap"
+
+
+def stuck(value: float) -> str:
+    """Of a known parameter at its bound."""
+    return f"sits at its bound {value:.4g}: it stands in for something else, or its range is too narrow"
+
+
+def moves(spread: float, groups: int) -> str:
+    """Of a known parameter that differs between operating conditions."""
+    return f"moves between operating conditions (sd {spread:.3g} over {groups}): structure is missing"
