@@ -153,13 +153,14 @@ def _report(console: Any, parts: Any, state: Any) -> None:
 
     if parts.settings.modelClass is None:
         return
-    posterior, space, truth = state.domain, parts.env.space, parts.source.truth
+    posterior, space, truth = state.domain, state.domain.space, parts.source.truth
+    low, high = np.asarray(space.low), np.asarray(space.high)
     mean, sd = np.asarray(posterior.mean()), np.asarray(posterior.sd())
     contraction = np.asarray(posterior.contraction())
     console.table(
         [
             {
-                "name": name, "unit": space.units[i], "low": space.low[i], "high": space.high[i], "mean": mean[i],
+                "name": name, "unit": space.units[i], "low": low[i], "high": high[i], "mean": mean[i],
                 "sd": sd[i], "truth": None if truth is None else truth[i], "contraction": contraction[i],
             }
             for i, name in enumerate(space.names)

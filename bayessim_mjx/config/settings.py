@@ -298,6 +298,12 @@ class BayesSimConfig(Section):
         low=0,
         high=COUNT,
     )
+    range_ends: str = setting(
+        "report",
+        "where the posterior piles up at an end of a parameter's range: report (say so), or move (that end also moves "
+        "out for the next round, as far as physics allows)",
+        choices=("report", "move"),
+    )
     distrust: float = setting(
         0.5, "most of the prior mixed into the randomisation where the real trajectories look unlike simulated ones",
         low=0, high=1,

@@ -12,6 +12,7 @@ from bayessim_mjx.distributions import algebra, box, charts, evaluate
 from bayessim_mjx.distributions.parts import Parts
 from bayessim_mjx.errors import UserError
 
+ROUNDING = 1e-5  # of unit coordinates in float32
 OFF = np.float32(-1e9)  # logit of a component that is not in use
 
 
@@ -55,6 +56,33 @@ def recharted(q: Parts, chart: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     if chart == "plain":
         mass = mass - np.asarray(box.log_masses(jnp.asarray(means, jnp.float32), jnp.asarray(scales, jnp.float32)))
     return means, scales, np.asarray(q.logits, np.float64) + mass
+
+
+def regrown(q: Parts, space: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Means, scales and logits over `space`, whose ranges contain those of q; each component keeps its weight.
+
+    Priors keep their kind, so that the old unit coordinates are the new ones but for shift and scale.
+    """
+    start, end = (np.asarray(space.to_unit(x), np.float64) for x in (q.space.low, q.space.high))
+    growth, logits = start + 1 - end, np.asarray(q.logits, np.float64)
+    growth = np.where(growth > ROUNDING, growth, 0.0)
+    if q.chart == "plain":
+        old = jnp.asarray(q.means, jnp.float32), jnp.asarray(q.scales, jnp.float32)
+        means = start + (end - start) * np.asarray(old[0], np.float64)
+        means = np.where(growth > 0, np.clip(means, 0, 1), means)
+        rows = np.swapaxes((end - start)[:, None] * np.asarray(old[1], np.float64), -1, -2)
+        more = np.broadcast_to(np.diag(growth / 2), rows.shape)
+        scales = algebra.root(np.concatenate([rows, more], axis=1))
+        new = jnp.asarray(means, jnp.float32), jnp.asarray(scales, jnp.float32)
+        return means, scales, logits + np.asarray(box.log_masses(*old) - box.log_masses(*new), np.float64)
+    u = start + (end - start) * np.asarray(evaluate.component_points(q, evaluate.POINTS)[0], np.float64)
+    # each point as far as it may lie: evenly between where it is and half the growth to either side
+    u = np.clip(u + growth * (np.random.default_rng(0).random(u.shape) - 0.5), 0, 1)
+    z = np.asarray(charts.to_chart(jnp.asarray(u, jnp.float32), q.chart), np.float64)
+    means = z.mean(axis=1)
+    least = np.broadcast_to(1e-6 * np.eye(z.shape[-1]), (len(means), z.shape[-1], z.shape[-1]))
+    gap = (z - means[:, None]) / np.sqrt(z.shape[1])
+    return means, algebra.root(np.concatenate([gap, least], axis=1)), logits
 
 
 def padded(mixture: algebra.Mixture, components: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:

@@ -35,7 +35,7 @@ class Distribution:
     means: Array  # [K, d] in the chart's coordinates
     scales: Array  # [K, d, d] lower Cholesky factors of the covariances
     log_inside: Array  # [] log mass of the untruncated MoG inside the cube
-    space: Any = struct.field(pytree_node=False)  # ParameterSpace
+    space: Any  # ParameterSpace; where ranges may move, a `parameters.ranged.Ranged`
     chart: str = struct.field(pytree_node=False, default="plain")
 
     # ---- constructors -------------------------------------------------------------------------------------------
@@ -229,6 +229,14 @@ class Distribution:
         means, scales, logits = convert.recharted(self, chart)
         return Distribution.from_unit(self.space, logits, means, scales, self.prior_weight, chart)
 
+    def over(self, space: Any) -> Distribution:
+        """The same distribution where ranges have grown to those of `space`, on the host; half the growth wider there.
+
+        A component that was cut off at an end which has moved goes on beyond it: an extrapolation, to simulate from.
+        """
+        means, scales, logits = convert.regrown(self, space)
+        return Distribution.from_unit(space, logits, means, scales, self.prior_weight, self.chart)
+
     @classmethod
     def _of(cls, space: Any, mixture: algebra.Mixture, components: int, chart: str) -> Distribution:
         """Pad to `components` and weigh the flat part against the mass of the Gaussians inside the cube."""
@@ -251,7 +259,7 @@ class Distribution:
     @classmethod
     def load(cls, path: str | Path, space: ParameterSpace) -> Distribution:
         """Read what `save` wrote; ValueError if its parameters are not those of `space`."""
-        arrays, chart = storage.read(path, space)
+        arrays, chart, space = storage.read(path, space)
         return cls(**{k: jnp.asarray(v) for k, v in arrays.items()}, space=space, chart=chart)
 
     def describe(self) -> dict[str, dict[str, float]]:

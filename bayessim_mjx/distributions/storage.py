@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from bayessim_mjx.errors import UserError
+from bayessim_mjx.parameters.ranged import Ranged
 
 FIELDS = ("prior_weight", "logits", "means", "scales", "log_inside")
 FORMAT, VERSION = "bayessim_mjx.Distribution", 1
@@ -22,6 +23,8 @@ def write(path: str | Path, arrays: dict[str, np.ndarray], space: Any, chart: st
     try:
         with os.fdopen(descriptor, "wb") as file:
             header = {"format": FORMAT, "version": VERSION, **coordinates(space, chart)}
+            if isinstance(space, Ranged):
+                header["range"] = _box(space)
             np.savez(file, **{"header": np.asarray(json.dumps(header)), **arrays})  # type: ignore[arg-type]
             file.flush()
             os.fsync(file.fileno())
@@ -33,10 +36,17 @@ def write(path: str | Path, arrays: dict[str, np.ndarray], space: Any, chart: st
 
 
 def coordinates(space: Any, chart: str) -> dict[str, Any]:
-    """What arrays in unit coordinates mean: names, box and priors of the space, and the chart; plain, for JSON."""
-    box = {name: [float(low), float(high)] for name, low, high in zip(space.names, space.low, space.high, strict=True)}
+    """What arrays in unit coordinates mean: names, box and priors of the space, and the chart; plain, for JSON.
+
+    The box is that which a run begins with. Where ranges have moved, they are arrays beside the others.
+    """
+    box = _box(getattr(space, "start", space))
     priors = {p.name: [p.prior, *(None if v is None else float(v) for v in (p.mean, p.sd))] for p in space.parameters}
     return {"names": list(space.names), "box": box, "priors": priors, "chart": chart}
+
+
+def _box(space: Any) -> dict[str, list[float]]:
+    return {name: [float(low), float(high)] for name, low, high in zip(space.names, space.low, space.high, strict=True)}
 
 
 def disagreement(stored: dict[str, Any], own: dict[str, Any]) -> str:
@@ -64,8 +74,11 @@ def _words(prior: list) -> str:
     return kind if mean is None else f"{kind} ({mean:g} +- {sd:g})"
 
 
-def read(path: str | Path, space: Any) -> tuple[dict[str, np.ndarray], str]:
-    """Arrays and chart of a file written by `write`; ValueError naming the first disagreement with `space`."""
+def read(path: str | Path, space: Any) -> tuple[dict[str, np.ndarray], str, Any]:
+    """Arrays, chart and space of a file written by `write`: that given, with the file's ranges where they have moved.
+
+    ValueError naming the first disagreement with `space`.
+    """
     with np.load(path, allow_pickle=False) as file:
         if "header" not in file or any(name not in file for name in FIELDS):
             raise UserError(f"{path} holds no distribution: it has {sorted(file)}, needed are header and {FIELDS}")
@@ -76,4 +89,7 @@ def read(path: str | Path, space: Any) -> tuple[dict[str, np.ndarray], str]:
     chart = stored.get("chart", "plain")
     if words := disagreement(stored, coordinates(space, chart)):
         raise UserError(f"{path} {words}")
-    return arrays, chart
+    if moved := stored.get("range"):
+        low, high = np.asarray([moved[name] for name in space.names], np.float32).T
+        space = Ranged(getattr(space, "start", space), low, high)
+    return arrays, chart, space

@@ -47,7 +47,7 @@ def ranks(
 
     `tilt`: the thetas come from it instead of the prior, so they are ranked among draws of q tilt / prior.
     """
-    space = posteriors.space
+    space = posteriors.space.unbatched
     u = jax.vmap(space.to_unit)(thetas)
 
     def one(key: Array, q: Distribution, theta: Array, u: Array, reference: Array) -> Ranks:
@@ -140,7 +140,7 @@ def check(
     Pairs that are not finite are left out; ValueError where hardly any remains.
     """
     found = jax.tree.map(np.asarray, ranks(key, posteriors, jnp.asarray(thetas), draws, tilt))
-    return judge(_usable(found), posteriors.space)
+    return judge(_usable(found), posteriors.space.unbatched)
 
 
 def _usable(found: Ranks) -> Ranks:
@@ -229,7 +229,7 @@ def corrected(key: Array, posteriors: Distribution, thetas: Array, tilt: Distrib
     wider = widened(posteriors, factor)
     # all of them: a program that is compiled already
     found = jax.tree.map(np.asarray, ranks(jax.random.fold_in(key, 1), wider, jnp.asarray(thetas), DRAWS, tilt))
-    after = judge(_usable(Ranks(*(part[n // 2 :] for part in found))), posteriors.space)
+    after = judge(_usable(Ranks(*(part[n // 2 :] for part in found))), posteriors.space.unbatched)
     words = f"{report.words}; standard deviations times {factor:.2f}, then {after.words}"
     return replace(after, words=words, temperature=factor, before=report.verdict)
 

@@ -66,7 +66,7 @@ class Checks:
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers, for JSON."""
         misfit = {"p": self.misfit.joint, "trajectories": self.misfit.p.tolist(), "sentence": self.misfit.sentence()}
-        walls = [pile._asdict() for pile in self.piles]
+        walls = [pile.to_dict() for pile in self.piles]
         return {
             "calibration": self.calibration.to_dict(), "misfit": misfit, "walls": walls, "flat": list(self.flat),
             "prior_share": self.prior_share,
@@ -108,11 +108,13 @@ def conditioned(network: Any, x: Array) -> Distribution:
     return jax.vmap(restore_prior, in_axes=(0, None))(condition(network, x), network.identified)
 
 
-def conclude(report: Report, misfit: Misfit, posterior: Distribution, distrust: float) -> Checks:
-    """The checks' result for the posterior given all real trajectories."""
+def conclude(
+    report: Report, misfit: Misfit, posterior: Distribution, distrust: float, at_ends: Sequence[Pile] | None = None
+) -> Checks:
+    """The checks' result for the posterior given all real trajectories; at_ends: its `piles`, as far as known."""
     flat = flat_sentences(posterior.names, report.contraction, np.asarray(posterior.contraction()))
     share = misspecification.prior_share(misfit.joint, distrust)
-    return Checks(report, misfit, tuple(piles(posterior)), tuple(flat), share)
+    return Checks(report, misfit, tuple(piles(posterior) if at_ends is None else at_ends), tuple(flat), share)
 
 
 def guarded(posterior: Distribution, share: float) -> Distribution:

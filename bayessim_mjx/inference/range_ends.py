@@ -1,32 +1,59 @@
-"""Where a posterior piles up at the wall of a parameter's range: the truth probably lies beyond it."""
+"""Where a posterior piles up at the wall of a parameter's range: the truth probably lies beyond it.
+
+The range can then move (compare EDGE, Kamaras et al. 2025, arXiv 2510.26656, which moves the support to where the mode
+goes). Here it only grows, so that the prior over it, restricted to the range before, is the prior of before: what was
+simulated there stays of use.
+"""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import jax
 import numpy as np
 
 from bayessim_mjx.distributions import Distribution
+from bayessim_mjx.parameters.ranged import Ranged
 
 OUTER = 0.05  # of the range, in unit coordinates: mass of the prior that lies there
 PILED = 0.25  # mass of the posterior that does not get there by chance
+STEEPEST = 0.1  # of a limit above 0: nearer to 0 it does not move at once, and so never reaches it
+LEAST = 0.05  # of a range's width: a smaller move is none
 
 
-class Pile(NamedTuple):
-    """Mass of a posterior at one wall."""
+@dataclass(frozen=True)
+class Pile:
+    """Mass of a posterior at one wall.
+
+    Attributes:
+        name: of the parameter.
+        upper: which end of its range.
+        mass: within the outer 5 % of the range.
+        limit: where the wall is.
+        moved: where it is in the next round; None: it was not asked to move.
+    """
 
     name: str
     upper: bool
-    mass: float  # within the outer 5 % of the range
-    limit: float  # where the wall is
+    mass: float
+    limit: float
+    moved: float | None = None
 
     def sentence(self) -> str:
         side, way = ("upper", "raise") if self.upper else ("lower", "reduce")
-        return (
-            f"{self.name}: {100 * self.mass:.0f} % of the posterior lies at the {side} end of its range; "
-            f"{way} its limit {self.limit:.4g} if that is physically possible"
-        )
+        told = f"{self.name}: {100 * self.mass:.0f} % of the posterior lies at the {side} end of its range; "
+        if self.moved is None:
+            return told + f"{way} its limit {self.limit:.4g} if that is physically possible"
+        if self.moved == self.limit:
+            return told + f"its limit {self.limit:.4g} stays: nothing beyond it can be simulated"
+        return told + f"its limit moves from {self.limit:.4g} to {self.moved:.4g}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, for JSON."""
+        told = {"name": self.name, "upper": self.upper, "mass": self.mass, "limit": self.limit}
+        return told if self.moved is None else {**told, "moved": self.moved}
 
 
 def piles(posterior: Distribution) -> list[Pile]:
@@ -43,3 +70,41 @@ def piles(posterior: Distribution) -> list[Pile]:
                 limit = (posterior.space.high if upper else posterior.space.low)[i]
                 found.append(Pile(name, upper, float(outer), float(limit)))
     return found
+
+
+def moved(space: Ranged, found: Sequence[Pile], lowest: np.ndarray, highest: np.ndarray) -> tuple[Ranged, list[Pile]]:
+    """The space of the next round, and the piles as they moved: each wall by the width of its range, as far as it may.
+
+    Widths of a log-uniform prior are those of the logarithm. Physics ends at lowest, highest [d].
+    """
+    low, high = np.array(space.low, np.float64), np.array(space.high, np.float64)
+    told = []
+    for pile in found:
+        i = space.index(pile.name)
+        log = space.parameters[i].prior == "loguniform"
+        grown = np.clip(_grown(pile.upper, low[i], high[i], log), lowest[i], highest[i])
+        scale = np.log if log else np.asarray
+        way = (scale(grown) - scale(pile.limit)) * (1 if pile.upper else -1)
+        far = way >= LEAST * (scale(high[i]) - scale(low[i]))
+        told.append(replace(pile, moved=float(np.float32(grown)) if far else pile.limit))
+    for pile in told:
+        assert pile.moved is not None
+        (high if pile.upper else low)[space.index(pile.name)] = pile.moved
+    return Ranged(space.start, low, high), told
+
+
+def _grown(upper: bool, low: float, high: float, log: bool) -> float:
+    if log:
+        return high * high / low if upper else low * low / high
+    if upper:
+        return high + (high - low)
+    return max(low - (high - low), STEEPEST * low) if low > 0 else low - (high - low)
+
+
+def share(before: Ranged, after: Ranged) -> float:
+    """Mass of the prior over the range after a move that lies in the range before."""
+    start, end = (np.asarray(after.to_unit(x), np.float64) for x in (before.low, before.high))
+    return float(np.prod(end - start))
+
+
+__all__ = ["Pile", "moved", "piles", "share"]

@@ -24,7 +24,7 @@ class FitState:
     fits: Array  # [] int32, fits done so far
     identified: Array  # [d] bool, parameters whose marginal beats the prior on the last fit's held-out rows
     settings: InferenceSettings = struct.field(pytree_node=False)
-    space: Any = struct.field(pytree_node=False)
+    space: Any  # ParameterSpace, or where ranges may move a `Ranged` one
 
     @property
     def coordinates(self) -> dict[str, Any]:

@@ -11,8 +11,12 @@ from bayessim_mjx.errors import UserError
 from bayessim_mjx.parameters import ParameterSpace
 
 
-def real_parameters(settings: Any, space: ParameterSpace) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def real_parameters(
+    settings: Any, space: ParameterSpace, ends: tuple[np.ndarray, np.ndarray] | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """weights [K], means [K, d], sds [K, d] of `env.realParams`; a one-number list stands for every parameter.
+
+    Means lie in the ranges of `space`, or where these may move within `ends`, (lowest, highest) [d].
 
     Rows may leave the effects' parameters out: these are nominal (as a diagnosis identified them, or neutral).
 
@@ -42,7 +46,7 @@ def real_parameters(settings: Any, space: ParameterSpace) -> tuple[np.ndarray, n
     if np.any(weights < 0) or weights.sum() <= 0:
         raise UserError(f"env.realParams.weights={list(weights)}: must be >= 0 and not all 0")
     for row in means:
-        for name, value, low, high in zip(space.names, row, space.low, space.high, strict=True):
+        for name, value, low, high in zip(space.names, row, *(ends or (space.low, space.high)), strict=True):
             if not low <= value <= high:
                 raise UserError(f"env.realParams.means: {name}={value:g} lies outside its range [{low:g}, {high:g}]")
     if any(np.any(row < 0) for row in stds):

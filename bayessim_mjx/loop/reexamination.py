@@ -8,8 +8,9 @@ from typing import Any
 import jax
 
 from bayessim_mjx.inference import checks
+from bayessim_mjx.loop import ranges
 from bayessim_mjx.loop.simulations import at, proposal_of, simulated
-from bayessim_mjx.loop.state import Loop, LoopState
+from bayessim_mjx.loop.state import Loop, LoopState, slot_of
 from bayessim_mjx.rl import Policy
 
 REFERENCE = 10000  # simulations that `reexamine` compares real trajectories with, at most
@@ -25,9 +26,9 @@ def reexamine(loop: Loop, state: LoopState, policy: Policy, pairs: int, seed: in
     domain = state.domain
     assert source is not None and domain is not None
     key = jax.random.fold_in(jax.random.fold_in(jax.random.PRNGKey(seed), 0xCA11), done)  # seen by no fit
-    known, last = min(b.trainTrajs, REFERENCE), max(1, loop.capacity // b.trainTrajs)
-    used = None if state.proposals is None else at(state.proposals, (done - 1) % last)
-    state, temperature = dataclasses.replace(state, proposal=used), float(state.temperature)
+    known = min(b.trainTrajs, REFERENCE)
+    used = None if state.proposals is None else at(state.proposals, slot_of(loop, state, done))
+    state, temperature = ranges.as_fitted(dataclasses.replace(state, proposal=used)), float(state.temperature)
     thetas, x = simulated(
         source, jax.random.fold_in(key, 1), policy, proposal_of(loop, state), b.proposal, known + pairs
     )

@@ -7,6 +7,7 @@ q(theta | summary), tests of it, and the product of the posteriors of all real t
 from __future__ import annotations
 
 import dataclasses
+import functools
 import time
 from typing import Any
 
@@ -20,11 +21,11 @@ from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.inference import calibration, checks, misspecification, rounds
 from bayessim_mjx.inference.temperature import tempered
-from bayessim_mjx.loop import refining, set_checks
+from bayessim_mjx.loop import ranges, refining, set_checks
 from bayessim_mjx.loop.factors import conditioned, kept
 from bayessim_mjx.loop.inference_state import new_network
 from bayessim_mjx.loop.simulations import at, proposal_of, simulated
-from bayessim_mjx.loop.state import Loop, LoopState, RoundInfo
+from bayessim_mjx.loop.state import Loop, LoopState, RoundInfo, slot_of, space_of
 from bayessim_mjx.quantities import percent
 from bayessim_mjx.rl import Policy
 from bayessim_mjx.rollout import Trajectory, select
@@ -64,16 +65,18 @@ def infer(loop: Loop, state: LoopState, policy: Policy, info: RoundInfo) -> Loop
     info.warnings += _complaints(posterior.names, info.fit, known_before)
     info.posterior, info.real = posterior, jax.tree.map(np.asarray, real)
     info.scores |= score(posterior, source.truth)
-    domain = posterior
+    state, domain = ranges.move(loop, state, posterior, info)
+    following = rounds.following(domain, b.proposal) if loop.sequential else None
     if verdict is not None:
-        info.checks = checks.conclude(*verdict, posterior, b.distrust)
+        info.checks = checks.conclude(*verdict, posterior, b.distrust, info.moves or None)
         told = posterior.names if round_ else _unknown(posterior.names, info.fit)
         info.warnings += info.checks.warnings(told)
-        domain = checks.guarded(posterior, info.checks.prior_share)
+        domain = checks.guarded(domain, info.checks.prior_share)
+    else:
+        info.warnings += [pile.sentence() for pile in info.moves]
     info.predictive = _predict(loop, posterior, seen, real, loop.key(round_, "predict"))
     others = info.seconds.get("check", 0.0) + info.seconds.get("refine", 0.0)
     info.seconds["condition"] = time.perf_counter() - clock - others
-    following = rounds.following(posterior, b.proposal) if loop.sequential else None
     return dataclasses.replace(state, domain=domain, proposal=following)
 
 
@@ -90,24 +93,27 @@ def _collect(
         proposal_of(loop, state),
         b.proposal,
         b.trainTrajs + b.checkTrajs,
+        functools.partial(ranges.completed, loop, state),
     )
     held, thetas, x = (thetas[b.trainTrajs :], x[b.trainTrajs :]), thetas[: b.trainTrajs], x[: b.trainTrajs]
-    slot = round_ % max(1, loop.capacity // b.trainTrajs)
+    state, row, count = ranges.room(loop, state)
     if loop.sequential:
         assert state.proposals is not None and state.proposal is not None
+        slot = slot_of(loop, state, round_ + 1)
         state = dataclasses.replace(state, proposals=rounds.stored(state.proposals, slot, state.proposal))
     if not loop.capacity:
         return state, (thetas, x, b.trainTrajs), held
-    row, count = slot * b.trainTrajs, min((round_ + 1) * b.trainTrajs, loop.capacity)
     thetas = jax.lax.dynamic_update_slice(state.thetas, thetas, (row, 0))
     x = jax.lax.dynamic_update_slice(state.features, x, (row, 0))
+    state, thetas, x = ranges.mixed(loop, state, thetas, x)
     return dataclasses.replace(state, thetas=thetas, features=x), (thetas, x, count), held
 
 
 def _learn(loop: Loop, state: LoopState, fitted: tuple[Array, Array, int], info: RoundInfo) -> LoopState:
     """Fit the network, the one so far or a new one."""
     b, round_, (thetas, x, count) = loop.settings, int(state.round), fitted
-    network = state.fit if b.ftune or round_ == 0 else new_network(loop, round_)
+    keeps = (b.ftune or round_ == 0) and not ranges.has_moved(state)
+    network = state.fit if keeps else new_network(loop, round_, space_of(loop, state))
     correction: dict[str, Any] = {}
     if b.proposal == "apt":
         correction = {"proposals": state.proposals, "origin": np.arange(len(thetas), dtype=np.int32) // b.trainTrajs}
@@ -125,11 +131,7 @@ def _examine(
         return None
     known = slice(round_ * b.realTrajs if loop.source.policy_dependent else 0, (round_ + 1) * b.realTrajs)  # type: ignore[union-attr]
     # what the network of this round is tested on comes from what it was simulated from
-    tilt = (
-        state.proposals and at(state.proposals, round_ % state.proposals.logits.shape[0])
-        if b.proposal == "apt"
-        else None
-    )
+    tilt = state.proposals and at(state.proposals, slot_of(loop, state, round_ + 1)) if b.proposal == "apt" else None
     key = jax.random.fold_in(loop.key(round_, "fit"), 2)
     try:
         return checks.examine(
@@ -172,7 +174,7 @@ def _posterior(loop: Loop, state: LoopState, info: RoundInfo) -> Distribution:
     if len(usable) < known:
         info.warnings.append(f"{known - len(usable)} real trajectories left out: their posteriors are no densities")
     if not usable:
-        return Distribution.prior(loop.env.space, b.components, loop.chart)
+        return Distribution.prior(space_of(loop, state), b.components, loop.chart)
     return inference.combine(usable, b.components).rechart(loop.chart)
 
 
@@ -212,8 +214,9 @@ def score(domain: Distribution, truth: np.ndarray | None) -> dict[str, float]:
     contraction = np.asarray(domain.contraction())
     scores = {f"contraction/{name}": float(c) for name, c in zip(domain.space.names, contraction, strict=True)}
     if truth is not None:
-        scores["log_p_truth"] = float(domain.log_prob(jnp.asarray(truth)))
-        scores["gain_over_prior"] = float(domain.log_gain(jnp.asarray(truth)))
+        if np.isfinite(gain := float(domain.log_gain(jnp.asarray(truth)))):  # a truth beyond the range has no density
+            scores["log_p_truth"] = float(domain.log_prob(jnp.asarray(truth)))
+            scores["gain_over_prior"] = gain
         scores["credible_level"] = float(domain.credible_level(jnp.asarray(truth)))
     return scores
 

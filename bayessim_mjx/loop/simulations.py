@@ -12,19 +12,35 @@ from bayessim_mjx.compat import program
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.inference import rounds
 from bayessim_mjx.loop.sources import Source
-from bayessim_mjx.loop.state import Loop, LoopState
+from bayessim_mjx.loop.state import Loop, LoopState, space_of
 from bayessim_mjx.rl import Policy
 
 CHUNK = 2500  # trajectories simulated at once while collecting
 
 
 def simulated(
-    source: Source, key: Array, policy: Policy, proposal: Distribution, method: str, count: int
+    source: Source,
+    key: Array,
+    policy: Policy,
+    proposal: Distribution,
+    method: str,
+    count: int,
+    chosen: Callable[[Array], Array] = lambda thetas: thetas,
 ) -> tuple[Array, Array]:
-    """`count` simulated trajectories: theta [count, d], features [count, D], in chunks that fit the memory."""
+    """`count` simulated trajectories: theta [count, d], features [count, D], in chunks that fit the memory.
+
+    Args:
+        source: what simulates.
+        key: consumed.
+        policy: that acts.
+        proposal, method: what theta is drawn from, see `rounds.draw`.
+        count: how many.
+        chosen: the thetas that are simulated in the place of those drawn, as many.
+    """
     chunks = -(-count // CHUNK)
     k_theta, k_roll = jax.random.split(key)
     thetas = rounds.draw(k_theta, proposal, method, -(-count // chunks) * chunks)
+    thetas = chosen(thetas)
     x = features(source, k_roll, thetas.reshape(chunks, -1, thetas.shape[-1]), policy)
     return thetas[:count], x[:count]
 
@@ -46,7 +62,9 @@ def _features(source: Source) -> Callable[[Array, Array, Policy], Array]:
 
 def proposal_of(loop: Loop, state: LoopState) -> Distribution:
     """What this round is simulated from."""
-    return Distribution.prior(loop.env.space, loop.settings.components) if state.proposal is None else state.proposal
+    if state.proposal is not None:
+        return state.proposal
+    return Distribution.prior(space_of(loop, state), loop.settings.components)
 
 
 def at(batch: Distribution, row: int) -> Distribution:

@@ -10,6 +10,7 @@ from bayessim_mjx.env import Env
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.inference import summarizers
 from bayessim_mjx.loop.collection import policy_function
+from bayessim_mjx.loop.range_limits import limits_of
 from bayessim_mjx.loop.real_parameters import real_parameters
 from bayessim_mjx.loop.recorded import Recorded, recorded
 from bayessim_mjx.loop.seen import Seen
@@ -27,8 +28,9 @@ def make_source(config: Config, env: Env) -> Source:
         return recorded(config, env, summarizer)
     if config.bayessim.collectPolicy == "policy_replay":
         raise UserError("bayessim.collectPolicy=policy_replay replays logged commands and needs real.logs=DIR")
-    weights, means, sds = real_parameters(config.env.realParams, env.space)
     b = config.bayessim
+    ends = limits_of(env) if b.range_ends == "move" else None  # reality may lie beyond a range that may move
+    weights, means, sds = real_parameters(config.env.realParams, env.space, ends)
     return Surrogate(
-        env, env.space, weights, means, sds, b.collectPolicy, b.trainTrajLen, config.real.noise, summarizer
+        env, env.space, weights, means, sds, b.collectPolicy, b.trainTrajLen, config.real.noise, summarizer, ends
     )

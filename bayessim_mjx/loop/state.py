@@ -14,12 +14,25 @@ from bayessim_mjx.config import BayesSimConfig, Config
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.env import Env
 from bayessim_mjx.inference import InferenceSettings, checks, rounds
+from bayessim_mjx.inference.range_ends import Pile
 from bayessim_mjx.loop.sources import Source
 from bayessim_mjx.parameters import ParameterSpace
+from bayessim_mjx.parameters.ranged import Ranged
 from bayessim_mjx.rl import TrainState
 from bayessim_mjx.rollout import Trajectory
 
 KEPT_ROUNDS = 4  # rounds of simulated trajectories kept for the fit where the collection policy does not change
+
+
+@flax.struct.dataclass
+class Moving:
+    """Where ranges may move: those of the next round, and which simulations were drawn from them."""
+
+    space: Ranged
+    covered: Ranged  # what the simulations kept are draws of the prior over
+    rows: Array  # [] int32, simulations kept, the first rows
+    next: Array  # [] int32, row at which those of the next round begin, if there is room behind it
+    slot: Array  # [] int32, of the last round's among `LoopState.proposals`
 
 
 @flax.struct.dataclass
@@ -38,6 +51,7 @@ class LoopState:
     proposals: Distribution | None  # what the simulations kept come from, leaves [kept rounds, ...]
     temperature: Array  # [] factor on standard deviations that the last round's posterior was given
     motion: dict[str, Array] | None = None  # measured motion of the real trajectories, where bayessim.refine needs it
+    moving: Moving | None = None  # None: all rounds have the ranges of the task
 
 
 @dataclasses.dataclass
@@ -60,6 +74,7 @@ class RoundInfo:
     checks: checks.Checks | None = None  # calibration, misfit, walls; None: none asked for
     sets: Any = None  # how products of several posteriors did on simulated sets, see inference/sets.py
     refinement: Any = None  # what bayessim.refine made of the posterior, see loop/refinement.py
+    moves: tuple[Pile, ...] = ()  # ends of ranges at which the posterior piles up, and where they are in the next round
 
 
 def chart_of(settings: BayesSimConfig, space: ParameterSpace) -> str:
@@ -91,6 +106,16 @@ class Loop:
         return b.trainTrajs * min(b.realIters, KEPT_ROUNDS) if keeps else 0
 
     @property
+    def moves(self) -> bool:
+        """Whether ranges may move from round to round."""
+        return self.settings.range_ends == "move" and self.settings.modelClass is not None
+
+    @property
+    def space(self) -> ParameterSpace:
+        """That of the first round."""
+        return Ranged(self.env.space) if self.moves else self.env.space
+
+    @property
     def sequential(self) -> bool:
         """Whether later rounds are simulated from the posterior."""
         return self.settings.modelClass is not None and self.settings.proposal != "prior"
@@ -111,6 +136,20 @@ class Loop:
         return jax.random.fold_in(
             jax.random.PRNGKey(self.config.seed), round_ * len(purposes) + purposes.index(purpose)
         )
+
+
+def space_of(loop: Loop, state: LoopState) -> ParameterSpace:
+    """The parameters, with the ranges of the round that comes."""
+    return loop.env.space if state.moving is None else state.moving.space
+
+
+def slot_of(loop: Loop, state: LoopState, done: int) -> int:
+    """Where the last of `done` rounds stands among the proposals and the simulations kept."""
+    return (
+        (done - 1) % max(1, loop.capacity // loop.settings.trainTrajs)
+        if state.moving is None
+        else int(state.moving.slot)
+    )
 
 
 def domain_or_prior(space: ParameterSpace, components: int, chart: str = "plain") -> Distribution | None:

@@ -32,6 +32,7 @@ class Surrogate:
     length: int
     noise: float  # standard deviation of the noise on observations, in simulation and in reality
     summarizer: Summarizer
+    ends: tuple[np.ndarray, np.ndarray] | None = None  # lowest, highest theta [d]; None: those of `space`
 
     @property
     def truth(self) -> np.ndarray:
@@ -63,12 +64,13 @@ class Surrogate:
         return Seen(self.length, states, named(commands, self.env.action_size - self.memory, "action"))
 
     def sample(self, key: Array, count: int) -> Array:
-        """theta [count, d] of the surrogate, inside the box."""
+        """theta [count, d] of the surrogate, inside the box, or between `ends`."""
         k_component, k_noise = jax.random.split(key)
         component = jax.random.choice(k_component, len(self.weights), (count,), p=jnp.asarray(self.weights))
         noise_ = jax.random.normal(k_noise, (count, len(self.space)))
         theta = jnp.asarray(self.means)[component] + jnp.asarray(self.sds)[component] * noise_
-        return jnp.clip(theta, self.space.low, self.space.high).astype(jnp.float32)
+        low, high = self.ends or (self.space.low, self.space.high)
+        return jnp.clip(theta, low, high).astype(jnp.float32)
 
     def simulate(self, key: Array, thetas: Array, policy: Policy) -> Array:
         """Features [N, D] of simulated trajectories at `thetas`."""

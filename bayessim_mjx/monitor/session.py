@@ -148,6 +148,8 @@ class Session:
             self.console.say(info.checks.sentence())
         for text in info.warnings:
             self.console.warning(text)
+        if info.moves:
+            self.inference.text("BayesSim/range_ends", "\n\n".join(p.sentence() for p in info.moves), info.round + 1)
         self.flush()
         self.compiling.take()  # the plots' small programs are not worth a line
         self._phase(info.round + 1)
@@ -193,6 +195,8 @@ class Session:
             row["posterior"] = info.posterior.describe()
         if info.checks is not None:
             row["checks"] = info.checks.to_dict()
+        if info.moves:
+            row["range_ends"] = [pile.to_dict() for pile in info.moves]
         with open(self.path / ROUNDS, "a", encoding="utf-8") as file:
             file.write(json.dumps(row) + "\n")
 

@@ -17,14 +17,18 @@ if TYPE_CHECKING:
     from mujoco import mjx
 
 
+@jax.tree_util.register_static
 class ParameterSpace:
     """An ordered set of named parameters; theta is a float32 vector `[d]` in this order.
 
-    Immutable, equal and hashable by content: a static argument under `jit`, never a pytree.
+    Immutable, equal and hashable by content: a static argument under `jit`, and as a pytree one without leaves.
 
     Raises:
         UserError: two parameters of one name.
     """
+
+    low: Any  # numpy's here; arrays where ranges may move (`ranged.Ranged`)
+    high: Any
 
     def __init__(self, parameters: Iterable[Parameter] = ()) -> None:
         self.parameters = tuple(parameters)
@@ -48,6 +52,11 @@ class ParameterSpace:
         from bayessim_mjx.parameters import reading
 
         return cls(reading.read(randomization_params, mj_model))
+
+    @property
+    def unbatched(self) -> "ParameterSpace":
+        """The space of one distribution of a batch."""
+        return self
 
     def __len__(self) -> int:
         return len(self.parameters)
