@@ -15,9 +15,10 @@ from bayessim_mjx.config import Config
 from bayessim_mjx.config.settings import COUNT, SEEDS
 from bayessim_mjx.device import setup_jax
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.quantities import fixed, percent, percent_estimate
+from bayessim_mjx.quantities import estimate, fixed, percent, percent_estimate
 
 FOLDER = "calibration"
+LEVELS = (0.5, 0.8, 0.95)  # regions of posteriors of several trajectories
 ADVICE = {
     "calibrated": "its regions contain the truth as often as they should",
     "over-confident": "do not trust its width; raise bayessim.trainTrajs or bayessim.ensemble",
@@ -95,8 +96,19 @@ def show(console: Any, found: Any) -> None:
     columns = zip(report.names, report.bias, report.spread, report.contraction, strict=True)
     rows = [[n, f"{report.p[n]:.2g}", fixed(bias, 1), fixed(wide, 1), fixed(c, 2)] for n, bias, wide, c in columns]
     console.grid(["parameter", "p of ranks", "bias [se]", "too narrow [se]", "contraction"], rows)
+    if found.sets is not None:
+        console.grid(["trajectories", "widened", "gain [nats]", "50 %", "80 %", "95 %"], set_rows(found.sets))
     for text in found.warnings():
         console.warning(text)
+
+
+def set_rows(sets: Any) -> list[list[str]]:
+    """The table of inference.sets.Sets: each number of trajectories, and the share of truths in its regions."""
+    rows = []
+    for c in sets.counts:
+        shares = [percent_estimate(c.coverage(a), (a * (1 - a) / len(c.levels)) ** 0.5) for a in LEVELS]
+        rows.append([str(c.trajectories), f"{c.widening:.2f} x", estimate(c.gain, c.error), *shares])
+    return rows
 
 
 def verdict_lines(found: Any) -> list[str]:
@@ -108,6 +120,8 @@ def verdict_lines(found: Any) -> list[str]:
     lines += [f"gain        {report.gain:.2f} nats over the prior, on average"]
     if report.predictive is not None:
         lines += [f"predictive  p = {report.predictive:.2g} that simulations at the posterior reproduce the summaries"]
+    if found.sets is not None:
+        lines += [f"sets        {found.sets.told}"]
     each = "" if len(misfit.p) == 1 else f" (each: {' '.join(f'{value:.2g}' for value in misfit.p)})"
     reality = "unlike anything simulated" if misfit.flagged else "like simulated ones"
     return [*lines, f"reality     the real trajectories are {reality}, p = {misfit.joint:.2g}{each}"]
@@ -121,8 +135,9 @@ def write(folder: Path, found: Any, round_: int) -> Path:
 
     folder.mkdir(exist_ok=True)
     write_text(folder / "report.json", json.dumps({"round": round_, **found.to_dict()}, indent=1) + "\n")
+    picture = trust.calibration(found.calibration, round=round_, sets=found.sets)
     with Writer(folder, purge_step={"Calibration": round_}, media=folder) as writer:
-        writer.figure("Calibration/regions_and_ranks", trust.calibration(found.calibration, round=round_), round_)
+        writer.figure("Calibration/regions_and_ranks", picture, round_)
         writer.scalars(round_, found.scalars, prefix="Calibration/")
     return folder
 

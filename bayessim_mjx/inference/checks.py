@@ -18,6 +18,7 @@ from bayessim_mjx.inference.fit import condition
 from bayessim_mjx.inference.identify import flat_sentences, restore_prior
 from bayessim_mjx.inference.misspecification import Misfit
 from bayessim_mjx.inference.range_ends import Pile, piles
+from bayessim_mjx.inference.sets import LEVELS, Sets
 from bayessim_mjx.inference.temperature import widened
 from bayessim_mjx.quantities import percent
 
@@ -33,6 +34,7 @@ class Checks:
     piles: tuple[Pile, ...]  # walls at which the posterior piles up
     flat: tuple[str, ...]  # sentences on parameters that were not identified
     prior_share: float  # of the prior, mixed into the randomisation because of the misfit
+    sets: Sets | None = None  # posteriors of several trajectories as they are used, judged on simulated sets
 
     @property
     def scalars(self) -> dict[str, float]:
@@ -42,6 +44,10 @@ class Checks:
         found |= {f"calibration_p/{name}": p for name, p in report.p.items()}
         found |= {f"expected_contraction/{n}": float(c) for n, c in zip(names, report.contraction, strict=True)}
         found |= {"temperature": report.temperature or 1.0, "misfit_p": self.misfit.joint}
+        if self.sets is not None:
+            last = self.sets.counts[-1]
+            found |= {"sets/carried": float(self.sets.carried), "sets/gain": last.gain, "sets/widening": last.widening}
+            found |= {f"sets/coverage_{100 * level:.0f}": last.coverage(level) for level in LEVELS}
         return found | {"misfit_prior_share": self.prior_share}
 
     def sentence(self) -> str:
@@ -61,16 +67,23 @@ class Checks:
         if self.misfit.flagged:
             share = f"; {percent(self.prior_share)} of the randomisation is drawn from the prior"
             texts.append(self.misfit.sentence() + (share if self.prior_share else ""))
+        if self.sets is not None and self.sets.off:
+            told = ", ".join(
+                f"its {100 * a:.0f} % region holds {100 * c:.0f} ± {100 * e:.0f} %" for a, c, e in self.sets.off
+            )
+            n = self.sets.counts[-1].trajectories
+            texts.append(f"the posterior of {n} trajectories is over-confident as used: {told} of true parameters")
         return texts + [pile.sentence() for pile in self.piles]
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers, for JSON."""
         misfit = {"p": self.misfit.joint, "trajectories": self.misfit.p.tolist(), "sentence": self.misfit.sentence()}
         walls = [pile.to_dict() for pile in self.piles]
-        return {
+        told = {
             "calibration": self.calibration.to_dict(), "misfit": misfit, "walls": walls, "flat": list(self.flat),
             "prior_share": self.prior_share,
         }  # fmt: skip
+        return told if self.sets is None else {**told, "sets": self.sets.to_dict()}
 
 
 def examine(

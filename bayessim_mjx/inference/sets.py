@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +21,8 @@ from bayessim_mjx.inference.temperature import tempered, widened
 
 FACTORS = np.geomspace(1.0, 12.0, 31)  # on standard deviations
 DOUBT = 0.3  # standard deviation of the factor's log before anything is seen: a few sets are off by chance
+LEVELS = (0.5, 0.8, 0.95)  # regions that are told
+SURE = 2.58  # standard errors that chance exceeds once in a hundred times
 HALVES = 2  # the factor is fitted on one part of the sets and judged on the other, in turn
 
 
@@ -66,6 +69,35 @@ class Sets:
         """The row of so many trajectories, or of the next smaller number that was judged."""
         return max((c for c in self.counts if c.trajectories <= trajectories), key=lambda c: c.trajectories)
 
+    @property
+    def off(self) -> list[tuple[float, float, float]]:
+        """(region, share of truths in it, its standard error) where the last count's regions hold too few, at 1 %."""
+        last, found = self.counts[-1], []
+        for level in LEVELS:
+            error = float(np.sqrt(level * (1 - level) / len(last.levels)))
+            if last.coverage(level) < level - SURE * error:
+                found.append((level, last.coverage(level), error))
+        return found
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain numbers, for JSON."""
+        rows = [
+            {
+                "trajectories": c.trajectories, "widening": c.widening, "gain": c.gain, "se": c.error,
+                "coverage": {f"{level:g}": c.coverage(level) for level in LEVELS},
+            }
+            for c in self.counts
+        ]  # fmt: skip
+        return {"carried": self.carried, "sets": len(self.counts[-1].levels), "counts": rows}
+
+    @property
+    def told(self) -> str:
+        """How many trajectories the network can carry, in words."""
+        last = self.counts[-1].trajectories
+        if self.carried == last:
+            return f"the network carries all {last} trajectories: each more sharpened the posterior"
+        return f"the network carries {self.carried} of {last} trajectories: more do not sharpen the posterior"
+
     def sentence(self) -> str:
         """One line for a person."""
         last = self.counts[-1]
@@ -86,6 +118,7 @@ def judge(
     thetas: np.ndarray,
     components: int,
     used: Callable[[Distribution], Distribution] = lambda q: q,
+    widened_by: Callable[[int], float] | None = None,
 ) -> Sets:
     """Products of the first 1, 2, 4 ... n factors of each set, judged at the thetas that the sets were simulated at.
 
@@ -94,11 +127,13 @@ def judge(
         thetas: [m, d].
         components: of the products.
         used: what else is done to a product before it is used.
+        widened_by: the factor that products of n are used with; None: the best is found, by sets it is not judged on.
     """
     rows = []
     for n in counts_to(len(factors[0])):
         products = [used(combine(list(each[:n]), components)) for each in factors]
-        rows.append(_count(n, _stacked(products), np.asarray(thetas)))
+        given = None if widened_by is None else widened_by(n)
+        rows.append(_count(n, _stacked(products), np.asarray(thetas), given))
     return Sets(tuple(rows))
 
 
@@ -126,16 +161,20 @@ def _best(gains: np.ndarray) -> int:
     return int(np.argmax(gains.sum(1) - 0.5 * (np.log(FACTORS) / DOUBT) ** 2))
 
 
-def _count(n: int, products: Distribution, thetas: np.ndarray) -> Count:
+def _count(n: int, products: Distribution, thetas: np.ndarray, given: float | None = None) -> Count:
     at = jnp.asarray(thetas, jnp.float32)
     gains = np.nan_to_num(np.asarray(_gains(products, at), float), nan=-100.0, neginf=-100.0)
     part = np.arange(len(thetas)) % HALVES
-    chosen = np.array([_best(gains[:, part != p]) for p in range(HALVES)])[part]
+    if given is None:
+        chosen = np.array([_best(gains[:, part != p]) for p in range(HALVES)])[part]
+        best = _best(gains)
+    else:
+        best = int(np.argmin(np.abs(FACTORS - given)))
+        chosen = np.full(len(thetas), best)
     own = gains[chosen, np.arange(len(thetas))]
     levels = np.asarray(_levels(products, at, jnp.asarray(FACTORS[chosen], jnp.float32)), float)
-    best = float(FACTORS[_best(gains)])
     error = float(own.std(ddof=1) / np.sqrt(len(own)))
-    return Count(n, best, float(own.mean()), error, float(gains[0].mean()), levels)
+    return Count(n, float(FACTORS[best]), float(own.mean()), error, float(gains[0].mean()), levels)
 
 
 __all__ = ["Count", "Sets", "counts_to", "judge"]

@@ -8,11 +8,12 @@ from typing import Any
 import jax
 
 from bayessim_mjx.inference import checks
-from bayessim_mjx.loop import ranges
+from bayessim_mjx.loop import ranges, set_checks
 from bayessim_mjx.loop.simulations import at, proposal_of, simulated
 from bayessim_mjx.loop.state import Loop, LoopState, slot_of
 from bayessim_mjx.rl import Policy
 
+PAIRS, MOST = 500, 4  # sets are judged in as many lots as there are such parts of the pairs, up to this
 REFERENCE = 10000  # simulations that `reexamine` compares real trajectories with, at most
 
 
@@ -20,7 +21,9 @@ def reexamine(loop: Loop, state: LoopState, policy: Policy, pairs: int, seed: in
     """The checks of a round done again, on `pairs` fresh simulations and with a posterior predictive check.
 
     `state` is that after the round and `policy` the one that it was evaluated with, as in its checkpoint. The posterior
-    is tested as the round used it: with its temperature, on parameters from what the round was simulated from.
+    is tested as the round used it: with its temperature, on parameters from what the round was simulated from. So are
+    products of as many trajectories as it had, with the round's widening; where `bayessim.refine` refined it, they are
+    what was refined.
     """
     b, source, done = loop.settings, loop.source, int(state.round)
     domain = state.domain
@@ -43,4 +46,7 @@ def reexamine(loop: Loop, state: LoopState, policy: Policy, pairs: int, seed: in
         jax.random.fold_in(key, 2), state.fit, held[1], lambda k, t: source.simulate(k, t, policy), **judged
     )
     report = dataclasses.replace(verdict[0], predictive=again)
-    return checks.conclude(report, verdict[1], domain, b.distrust)
+    before = dataclasses.replace(state, round=state.round - 1)
+    more = min(max(pairs // PAIRS, 1), MOST)
+    sets = set_checks.rejudge(loop, before, policy, done * b.realTrajs, jax.random.fold_in(key, 3), more)
+    return dataclasses.replace(checks.conclude(report, verdict[1], domain, b.distrust), sets=sets)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import jax
 import numpy as np
+from jax import Array
 
+from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.inference import rounds, sets
 from bayessim_mjx.inference.sets import Sets
 from bayessim_mjx.loop.factors import conditioned, kept
@@ -22,10 +24,35 @@ def judge(loop: Loop, state: LoopState, policy: Policy, known: int) -> Sets | No
     None where there is nothing to judge: a single trajectory, tests switched off, or a division by the proposal, which
     takes the real posteriors alone.
     """
-    b, source = loop.settings, loop.source
-    if known < 2 or not b.checkTrajs or b.proposal == "division" or source is None:
+    if not loop.settings.checkTrajs:
         return None
     key = jax.random.fold_in(loop.key(int(state.round), "fit"), 4)
+    found = _simulated(loop, state, policy, known, key)
+    return None if found is None else sets.judge(*found, loop.settings.components)
+
+
+def rejudge(loop: Loop, state: LoopState, policy: Policy, known: int, key: Array, more: int = 1) -> Sets | None:
+    """Products as the round used them, with its widening, judged on `more` times as many sets that it did not see.
+
+    `state` is that of the round, with its network, temperature and proposal.
+    """
+    used = None if loop.settings.temperature else judge(loop, state, policy, known)
+    parts = [_simulated(loop, state, policy, known, jax.random.fold_in(key, i)) for i in range(more)]
+    good = [part for part in parts if part is not None]
+    if not good:
+        return None
+    rows, thetas = [row for part in good for row in part[0]], np.concatenate([part[1] for part in good])
+    by = (lambda n: 1.0) if used is None else (lambda n: used.at(n).widening)
+    return sets.judge(rows, thetas, loop.settings.components, widened_by=by)
+
+
+def _simulated(
+    loop: Loop, state: LoopState, policy: Policy, known: int, key: Array
+) -> tuple[list[list[Distribution]], np.ndarray] | None:
+    """Sets of factors and the thetas [m, d] that they were simulated at; None where hardly any is a density."""
+    b, source = loop.settings, loop.source
+    if known < 2 or b.proposal == "division" or source is None:
+        return None
     k_theta, *keys = jax.random.split(key, 1 + min(known, MOST))
     thetas = rounds.draw(k_theta, proposal_of(loop, state), b.proposal, SETS)
     columns = []
@@ -37,15 +64,15 @@ def judge(loop: Loop, state: LoopState, policy: Policy, known: int) -> Sets | No
     good = [i for i, row in enumerate(rows) if all(q.sound for q in row)]
     if len(good) < SETS // 2:
         return None
-    return sets.judge([rows[i] for i in good], np.asarray(thetas)[good], b.components)
+    return [rows[i] for i in good], np.asarray(thetas)[good]
 
 
 def scores(found: Sets, known: int) -> dict[str, float]:
     """Numbers for curves, of the posterior of `known` trajectories."""
     one = found.at(known)
     told = {"widening": one.widening, "gain": one.gain, "carried": float(found.carried)}
-    told |= {f"coverage_{100 * level:.0f}": one.coverage(level) for level in (0.5, 0.8, 0.95)}
+    told |= {f"coverage_{100 * level:.0f}": one.coverage(level) for level in sets.LEVELS}
     return {f"sets/{name}": float(value) for name, value in told.items()}
 
 
-__all__ = ["judge", "scores"]
+__all__ = ["judge", "rejudge", "scores"]

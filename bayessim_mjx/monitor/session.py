@@ -160,7 +160,8 @@ class Session:
             return
         step, names = info.round + 1, posterior.space.names
         if info.checks is not None:
-            self.inference.figure("BayesSim/calibration", trust.calibration(info.checks.calibration, round=step), step)
+            picture = trust.calibration(info.checks.calibration, round=step, sets=info.sets)
+            self.inference.figure("BayesSim/calibration", picture, step)
         self.inference.figure("BayesSim/posterior", plots.corner(posterior, truth=info.truth, round=step), step)
         pairs = list(itertools.combinations(range(len(names)), 2))
         for i, j in pairs if len(pairs) <= MOST_PAIRS else []:

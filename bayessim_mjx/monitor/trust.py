@@ -13,16 +13,20 @@ MOST = 8  # parameters by name, those whose ranks are least uniform
 BAND = 1.36  # of sqrt(n) sup |F_n - F|: 95 % (Kolmogorov)
 
 
-def calibration(report: Any, *, round: int | None = None) -> Any:
+def calibration(report: Any, *, round: int | None = None, sets: Any = None) -> Any:
     """Left: share of truths inside the posterior's regions against their nominal mass. Right: ranks of each parameter.
 
     Args:
         report: inference.calibration.Report.
+        round: for the heading.
+        sets: inference.sets.Sets, in a third picture: posteriors of several trajectories as they are used.
     """
-    figure = new_figure(11.0, 5.2, layout="constrained")
-    left, right = figure.subplots(1, 2)
-    _coverage(left, report)
-    _ranks(right, report)
+    figure = new_figure(11.0 if sets is None else 16.0, 5.2, layout="constrained")
+    axes = figure.subplots(1, 2 if sets is None else 3)
+    _coverage(axes[0], report)
+    _ranks(axes[1], report)
+    if sets is not None:
+        _sets(axes[2], sets)
     figure.suptitle(textwrap.fill(heading(f"posterior {report.words}", round), 120), fontsize=11)
     return figure
 
@@ -46,6 +50,28 @@ def _coverage(axes: Any, report: Any) -> None:
     rows = [f"{percent(a)}:  {percent_estimate(c, e, 1)}" for a, (c, e) in report.coverage.items()]
     told = "\n".join(["observed coverage", *rows])
     axes.text(0.97, 0.03, told, ha="right", va="bottom", fontsize=8, linespacing=1.4, transform=axes.transAxes)
+
+
+def _sets(axes: Any, sets: Any) -> None:
+    """Coverage against the number of trajectories, as used; the gain stands above each number."""
+    counts = [c.trajectories for c in sets.counts]
+    for level, colour in zip((0.5, 0.8, 0.95), (BLUE, GREEN, RED), strict=True):
+        error = np.asarray([np.sqrt(level * (1 - level) / len(c.levels)) for c in sets.counts])
+        axes.fill_between(counts, level - 2 * error, np.minimum(level + 2 * error, 1), color=colour, alpha=0.12, lw=0)
+        axes.axhline(level, color=colour, lw=0.6, ls=":")
+        shares = [c.coverage(level) for c in sets.counts]
+        axes.plot(counts, shares, color=colour, marker="o", lw=1.8, label=f"{percent(level)} region", clip_on=False)
+    for c in sets.counts:
+        axes.text(c.trajectories, 1.04, f"{c.gain:.1f}", ha="center", fontsize=8)
+    axes.set_xscale("log", base=2)
+    axes.set_xticks(counts, [str(n) for n in counts])
+    axes.minorticks_off()
+    axes.set(
+        ylim=(0, 1.1), xlabel="trajectories", ylabel="share of true parameters inside (bands: ± 2 standard errors)"
+    )
+    title = "as used, on simulated sets; above: gain in nats"
+    axes.set_title("\n".join([title, *textwrap.wrap(sets.told, 56)]), fontsize=9, loc="left")
+    axes.legend(loc="lower left", frameon=False, fontsize=8)
 
 
 def _ranks(axes: Any, report: Any) -> None:

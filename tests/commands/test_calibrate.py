@@ -1,5 +1,6 @@
 """The command that tests a finished run: what it says, what it leaves, what it refuses."""
 
+import dataclasses
 import io
 import json
 import types
@@ -12,6 +13,7 @@ from bayessim_mjx.inference import calibration
 from bayessim_mjx.inference.calibration import Ranks
 from bayessim_mjx.inference.checks import Checks
 from bayessim_mjx.inference.misspecification import Misfit
+from bayessim_mjx.inference.sets import Count, Sets
 from bayessim_mjx.monitor.console import Console
 from bayessim_mjx.monitor.writer import event_files, records
 from bayessim_mjx.parameters import Parameter, ParameterSpace
@@ -29,6 +31,28 @@ def found(power: float = 1.0, p: float = 0.4) -> Checks:
         ("corr(angle, torque)", "variance of angle"),
     )  # fmt: skip
     return Checks(report, misfit, (), ("length: not identified by these trajectories",), 0.0)
+
+
+def several(shares: tuple[float, float]) -> Sets:
+    """Posteriors of 1 and 4 trajectories whose regions of p hold p^share of 100 truths; the second gains nothing."""
+    even = (np.arange(100) + 0.5) / 100
+    counts = [
+        Count(n, 1.3, gain, 0.1, gain, even**share) for n, gain, share in zip((1, 4), (2.0, 1.9), shares, strict=True)
+    ]
+    return Sets(tuple(counts))
+
+
+def test_posteriors_of_several_trajectories_are_told_as_they_are_used(tmp_path):
+    fine = dataclasses.replace(found(), sets=several((1.0, 1.0)))
+    text = said(fine)
+    assert "the network carries 1 of 4 trajectories" in text and "over-confident" not in text
+    (row,) = [line for line in text.splitlines() if line.strip().startswith("4 ")]
+    assert "1.30 x" in row and "1.9" in row and row.split().count("%") == 3
+    narrow = said(dataclasses.replace(fine, sets=several((1.0, 0.4))))  # half the truths' levels are 0.76
+    assert "warning: the posterior of 4 trajectories is over-confident as used: its 50 % region holds 18" in narrow
+    calibrate.write(tmp_path / "calibration", fine, 2)
+    report = json.loads((tmp_path / "calibration" / "report.json").read_text())
+    assert report["sets"]["carried"] == 1 and report["sets"]["counts"][1]["trajectories"] == 4
 
 
 def said(checks: Checks) -> str:

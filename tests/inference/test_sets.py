@@ -54,6 +54,21 @@ def test_a_shared_error_is_found_and_widened(exact):
     assert found.at(5).trajectories == 4 and "widened" in found.sentence()
 
 
+def test_products_as_they_are_used_are_judged_with_the_widening_that_they_have(exact):
+    """Errors shared by a set: as sure as they claim to be, and widened by what they ask for."""
+    shared = made(0.5, 2)
+    as_they_are = sets.judge(*shared, components=1, widened_by=lambda n: 1.0)
+    last = as_they_are.at(8)
+    assert last.widening == 1.0 and last.gain == pytest.approx(last.plain)
+    # a product of 8 claims a third of the variance: half of the 50 % regions' truths lie outside of them
+    assert [level for level, *_ in as_they_are.off] == [0.5, 0.8, 0.95] and last.coverage(0.5) < 0.35
+    wider = sets.judge(*shared, components=1, widened_by=lambda n: np.sqrt(1 + n * 0.25))
+    assert not wider.off and wider.at(8).gain > last.gain and wider.at(8).coverage(0.8) == pytest.approx(0.8, abs=0.2)
+    assert exact.told.startswith("the network carries all 8 trajectories")
+    told = as_they_are.to_dict()
+    assert told["carried"] == as_they_are.carried and told["counts"][-1]["coverage"]["0.5"] == last.coverage(0.5)
+
+
 def test_a_truth_outside_of_a_product_does_not_spoil_the_mean():
     rows, thetas = made(0.0)
     found = sets.judge(rows, np.asarray(thetas) * 0 + 0.99, components=1)

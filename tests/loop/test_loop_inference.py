@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from stub_source import FITTED, NOISE, NORMAL, SPACE, infer, made
 
+from bayessim_mjx import loop
 from bayessim_mjx.loop import set_checks
 
 
@@ -127,6 +128,12 @@ def test_products_of_several_trajectories_are_judged_and_widened():
         assert info.scores[f"sets/coverage_{100 * level:.0f}"] == pytest.approx(level, abs=0.2)
     assert last.gain >= last.plain - 0.1
     assert float(state.domain.sd()[0]) > 0.9 * NOISE / 8**0.5  # never surer than the exact posterior
+    again = loop.reexamine(parts, state, None, 1000)  # as the command `calibrate` asks for it
+    assert [c.trajectories for c in again.sets.counts] == [1, 2, 4, 8]
+    assert [c.widening for c in again.sets.counts] == [c.widening for c in info.sets.counts]  # as the round used it
+    assert len(again.sets.at(8).levels) == 128 and not again.sets.off
+    assert not np.array_equal(again.sets.at(8).levels[:64], last.levels)  # on sets that the round did not see
+    assert again.to_dict()["sets"]["sets"] == 128 and again.scalars["sets/carried"] == again.sets.carried
 
 
 def test_a_single_trajectory_needs_no_set():

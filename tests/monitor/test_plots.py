@@ -262,6 +262,19 @@ def test_all_that_a_calibration_picture_says_is_inside_of_it(d):
     assert sum("(p = " in text for text, _ in words) == min(d, 8)
 
 
+def test_a_calibration_picture_shows_posteriors_of_several_trajectories():
+    from bayessim_mjx.inference.sets import Count, Sets
+    from bayessim_mjx.monitor import trust
+
+    even = (np.arange(64) + 0.5) / 64
+    sets = Sets(tuple(Count(n, 1.2, 2.0 + n, 0.1, 2.0, even) for n in (1, 2, 4, 8, 11)))
+    figure = trust.calibration(report_of(2), round=2, sets=sets)
+    assert overlaps(figure) == [] and outside(figure) == []
+    words = [text for text, _ in texts(figure)]
+    assert any("carries all 11 trajectories" in " ".join(text.split()) for text in words) and "13.0" in words
+    assert figure.axes[2].get_xlabel() == "trajectories"
+
+
 def test_predictive_axes_name_quantity_joint_and_unit():
     time = np.linspace(0, 1, 20)
     real = {f"{stream}:{joint}": np.sin(time) for stream in ("qpos", "qvel") for joint in ("elbow", "rail")}
