@@ -20,7 +20,7 @@ from bayessim_mjx.inference.misspecification import Misfit
 from bayessim_mjx.inference.range_ends import Pile, piles
 from bayessim_mjx.inference.sets import LEVELS, Sets
 from bayessim_mjx.inference.temperature import widened
-from bayessim_mjx.quantities import percent
+from bayessim_mjx.quantities import percent, percent_estimate
 
 CANDIDATES = 16  # draws of q for each one of q tilt / prior
 
@@ -68,9 +68,7 @@ class Checks:
             share = f"; {percent(self.prior_share)} of the randomisation is drawn from the prior"
             texts.append(self.misfit.sentence() + (share if self.prior_share else ""))
         if self.sets is not None and self.sets.off:
-            told = ", ".join(
-                f"its {100 * a:.0f} % region holds {100 * c:.0f} ± {100 * e:.0f} %" for a, c, e in self.sets.off
-            )
+            told = ", ".join(f"its {percent(a)} region holds {percent_estimate(c, e)}" for a, c, e in self.sets.off)
             n = self.sets.counts[-1].trajectories
             texts.append(f"the posterior of {n} trajectories is over-confident as used: {told} of true parameters")
         return texts + [pile.sentence() for pile in self.piles]
