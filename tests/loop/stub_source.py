@@ -30,6 +30,7 @@ class Stub:
     mass: float = 0.3  # of the real one; it need not lie in its range
     quiet: float = 1.0  # noise of the simulations that are fitted: < 1 makes a network that is too sure
     policy_dependent: bool = False
+    env: None = None  # no robot that programs are compiled for
     truth: np.ndarray = dataclasses.field(default_factory=lambda: TRUTH)
     channels: sources.Seen = sources.Seen(1, ("height",), ("push",))
 
