@@ -93,22 +93,28 @@ def riccati(
     return Gains(*arrays)
 
 
-def innovations(ways: np.ndarray, gaps: np.ndarray, gains: Gains, dt: float) -> np.ndarray:
-    """Whitened prediction errors [N, T, 2 nv] of the filter, by the linear error dynamics.
+def innovations(ways: np.ndarray, gaps: np.ndarray, path: Gains, gains: Gains, dt: float) -> np.ndarray:
+    """Whitened prediction errors [N, T, 2 nv] of a filter, by linear error dynamics along the path of another.
 
     Args:
-        ways: `[N, T, 2 nv, 2 nv]`; gaps: `[N, T, 2 nv]` one-step errors of predictions from where it was measured.
-        gains: of the filter.
+        ways: `[N, T, 2 nv, 2 nv]` along that path; gaps: `[N, T, 2 nv]` prediction errors of the filter that took it.
+        path: gains of the filter that took it.
+        gains: of the filter that is asked for.
         dt: control step, s.
     """
     size = gaps.shape[-1]
     gain, white = np.asarray(gains.gain, float), np.asarray(gains.whitener, float)
     lasting, pushes = np.asarray(gains.lasting, float)[:, None], push(size // 2, dt).T
-    away, force = np.zeros((len(gaps), size)), np.zeros((len(gaps), size // 2))
+    drawn = np.einsum("ntij,ntj->nti", np.asarray(path.gain, float), np.nan_to_num(gaps))
+    their_lasting = np.asarray(path.lasting, float)[:, None]
+    away = np.zeros((len(gaps), size))  # of this filter's state from the path's
+    force, theirs = np.zeros((2, len(gaps), size // 2))
     out = np.zeros(gaps.shape)
     for t in range(gaps.shape[1]):
-        ahead = np.einsum("nij,nj->ni", np.nan_to_num(ways[:, t]), away) + force @ pushes - gaps[:, t]
-        by = np.einsum("nij,nj->ni", gain[:, t], -ahead)
-        out[:, t] = np.einsum("nij,nj->ni", white[:, t], ahead)
-        away, force = ahead + by[:, :size], lasting * force + by[:, size:]
+        ahead = np.einsum("nij,nj->ni", np.nan_to_num(ways[:, t]), away) + (force - theirs) @ pushes
+        gap = gaps[:, t] - ahead
+        by = np.einsum("nij,nj->ni", gain[:, t], gap)
+        out[:, t] = np.einsum("nij,nj->ni", white[:, t], gap)
+        away = ahead + by[:, :size] - drawn[:, t, :size]
+        force, theirs = lasting * force + by[:, size:], their_lasting * theirs + drawn[:, t, size:]
     return out

@@ -29,7 +29,6 @@ LASTING = (0.7, 0.9, 0.97)  # their correlations from step to step
 RATIOS = (0.1, 0.3, 1.0, 3.0, 10.0)  # velocity's sensor noise against position's, times what was given
 PASSES = 3  # of noise and posterior in turn
 SETTLED = 0.1  # relative change of the log likelihood's unit at which noise and posterior agree
-BELIEF = 4.0  # trajectories' worth of belief that the simulator is right, against which they are heard
 LOOKED = 4  # trajectories at which noise is estimated
 
 
@@ -98,21 +97,31 @@ class Likelihood:
 
     def settle(self, theta: np.ndarray) -> bool:
         """Estimate the noise at theta [d]; returns whether it has changed much."""
-        parts = [self._dynamics(theta, part) for part in self.parts]
-        ways, gaps = (np.concatenate([p[i] for p in parts]) for i in (0, 1))
-        few = min(LOOKED, len(self.valid))
-        before, self.noise = self.noise, self._noise(ways[:few], gaps[:few], self.valid[:few])
-        gains = self._gains(ways, self.noise)
-        mask = jnp.asarray(self.valid, jnp.float32)[:, :, None, None]
-        self.gains = gains.replace(gain=gains.gain * mask, whitener=gains.whitener * mask)
-        noise = self.noise
-        seen = self.seen
+        before = self.noise
+        if self.gains is None:
+            self._linearise(theta, close(self.record, self.nv))
+        self._linearise(theta, self.gains)
+        noise, seen = self.noise, self.seen
         moved = np.abs(np.log(noise.sensor[seen] / before.sensor[seen])).max()
         most = max(before.process.max(), noise.process.max(), 1e-30)
         drift = np.abs(noise.process - before.process).max() / most + abs(noise.lasting - before.lasting)
         return bool(moved > SETTLED or drift > SETTLED)
 
-    def _noise(self, ways: np.ndarray, gaps: np.ndarray, valid: np.ndarray) -> Noise:
+    def _linearise(self, theta: np.ndarray, path: Gains) -> None:
+        """Noise and gains from the dynamics along the filter's path with those gains.
+
+        Around the measurements themselves, half the dynamics' curvature times the sensors' variance would look like a
+        force that lasts (Jazwinski 1970, 9.7: the iterated filter).
+        """
+        parts = [self._dynamics(theta, path, part) for part in self.parts]
+        ways, gaps = (np.concatenate([p[i] for p in parts]) for i in (0, 1))
+        few = slice(0, min(LOOKED, len(self.valid)))
+        self.noise = self._noise(ways[few], gaps[few], _rows(path, few), self.valid[few])
+        gains = self._gains(ways, self.noise)
+        mask = jnp.asarray(self.valid, jnp.float32)[:, :, None, None]
+        self.gains = gains.replace(gain=gains.gain * mask, whitener=gains.whitener * mask)
+
+    def _noise(self, ways: np.ndarray, gaps: np.ndarray, path: Gains, valid: np.ndarray) -> Noise:
         """The most likely noise, each number that is not needed left out (BIC): first what acts, then the sensors."""
         paid = 0.5 * np.log(valid.sum() * self.seen.sum())
         unit = np.where(self.seen, self.floor, FINEST * self.scale)[self.nv :]
@@ -125,7 +134,7 @@ class Likelihood:
             nonlocal best, noise
             sensor = self.floor * np.concatenate([np.ones(self.nv), np.full(self.nv, ratio)])
             guess = Noise(sensor, force, lasting)
-            value, size = self._fit(ways, gaps, guess, valid)
+            value, size = self._fit(ways, gaps, path, guess, valid)
             value -= paid * (cost + (ratio != 1.0))
             if value > best:
                 best, noise = value, replace(guess, sensor=sensor * size, process=force * size)
@@ -146,18 +155,19 @@ class Likelihood:
         white = np.concatenate([nothing[self.nv :], noise.process])
         return riccati(ways, noise.sensor, white, self._start(noise))
 
-    def _dynamics(self, theta: np.ndarray, part: slice) -> tuple[np.ndarray, np.ndarray]:
-        record = _rows(self.record, part)
-        return transitions(self.physics, theta, record, close(record, self.nv), self.scale)
+    def _dynamics(self, theta: np.ndarray, path: Gains, part: slice) -> tuple[np.ndarray, np.ndarray]:
+        return transitions(self.physics, theta, _rows(self.record, part), _rows(path, part), self.scale)
 
     def _start(self, noise: Noise) -> np.ndarray:
         """Standard deviations of the start state: as measured, or anything where it is not."""
         return np.where(self.seen, noise.sensor, 0.3 * self.scale)
 
-    def _fit(self, ways: np.ndarray, gaps: np.ndarray, noise: Noise, valid: np.ndarray) -> tuple[float, float]:
+    def _fit(
+        self, ways: np.ndarray, gaps: np.ndarray, path: Gains, noise: Noise, valid: np.ndarray
+    ) -> tuple[float, float]:
         """(log likelihood at the best common factor on the noise, that factor), by linear error dynamics."""
         gains = self._gains(ways, noise)
-        squares = float(np.sum(innovations(ways, gaps, gains, self.physics.dt) ** 2 * valid[:, :, None]))
+        squares = float(np.sum(innovations(ways, gaps, path, gains, self.physics.dt) ** 2 * valid[:, :, None]))
         count = valid.sum() * self.seen.sum()
         factor = max(squares / count, 1.0)  # not below the floor
         sizes = float(np.sum(np.asarray(gains.log_size, float) * valid))
@@ -221,8 +231,8 @@ def refine(
 def _spread(found: Refined, squares: np.ndarray, likelihood: Likelihood) -> np.ndarray:
     """Covariance of the scores over that which the likelihood promises [d, d], in whitened z: I where it is right.
 
-    Scores are of stretches of time; those up to half a trajectory apart may go together (Newey and West, 1987). BELIEF
-    stretches more say that the likelihood is right.
+    Scores are of stretches of time; those up to half a trajectory apart may go together (Newey and West, 1987). What
+    so few stretches show by chance is not believed.
     """
     unit = float(found.weights @ squares.sum((1, 2))) / likelihood.count
     use = found.weights > 1e-6 * found.weights.max()
@@ -239,8 +249,24 @@ def _spread(found: Refined, squares: np.ndarray, likelihood: Likelihood) -> np.n
     for lag in range(1, lags + 1):
         both = np.einsum("inb,jnb->ij", slopes[..., lag:], slopes[..., :-lag])
         spread += (1 - lag / (lags + 1)) * (both + both.T)
-    clusters = squares.shape[1] * squares.shape[2] / lags
-    return (clusters * spread + BELIEF * np.eye(len(spread))) / (clusters + BELIEF)
+    return _shrunk(spread, squares.shape[1] * squares.shape[2] / lags)
+
+
+def _shrunk(spread: np.ndarray, count: float) -> np.ndarray:
+    """A covariance [d, d] of `count` draws, nearer to I by what chance explains of the way to it.
+
+    First its mean variance to 1, then the rest to that (positive-part James-Stein; Ledoit and Wolf, 2004).
+    """
+    d = len(spread)
+    away = np.trace(spread) / d - 1
+    common = 1 + away * _beyond(away**2, 2 / (count * d))
+    gap = spread - common * np.eye(d)
+    return common * np.eye(d) + gap * _beyond(float(np.sum(gap**2)), common**2 * (d * d + d) / count)
+
+
+def _beyond(seen: float, chance: float) -> float:
+    """Share of a squared distance that is not chance."""
+    return max(0.0, 1 - chance / max(seen, 1e-30))
 
 
 def _adjusted(found: Refined, spread: np.ndarray, components: int, seed: int) -> tuple[Refined, float]:
