@@ -5,7 +5,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from bayessim_mjx.kalman import Force, riccati
+from bayessim_mjx.kalman import Force, innovations, riccati
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 from bayessim_mjx.physics import Physics
 from bayessim_mjx.rollout import replay
@@ -76,6 +76,21 @@ def test_a_force_that_lasts_is_followed():
         by = np.asarray(gains.gain[0, t], float) @ gap
         known, force = known + by[:2], 0.99 * force + by[2]
     assert force == pytest.approx(0.2, rel=0.03) and np.abs(gap).max() < 0.01
+
+
+def test_where_motion_is_linear_the_path_does_not_matter(slider, record):
+    theta, scale = np.array([1.0]), np.ones(2)
+    near = close(record, 1)
+    ways, gaps = transitions(slider, theta, record, near, scale)
+    lasting = riccati(ways, np.full(2, 0.5), np.zeros(2), np.full(2, 0.5), Force(np.array([0.3]), 0.9, DT))
+    along, own = transitions(slider, theta, record, lasting, scale)
+    expected = np.einsum("ntij,ntj->nti", np.asarray(lasting.whitener, float), own)
+    np.testing.assert_allclose(innovations(ways, gaps, near, lasting, DT), expected, atol=2e-3)
+    np.testing.assert_allclose(innovations(along, own, lasting, lasting, DT), expected, atol=2e-3)
+    free_ = free(record, 1)
+    np.testing.assert_allclose(
+        innovations(along, own, lasting, free_, DT), innovations(ways, gaps, near, free_, DT), atol=5e-3
+    )
 
 
 def test_what_is_not_measured_is_not_used():

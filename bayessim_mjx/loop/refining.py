@@ -11,8 +11,9 @@ import numpy as np
 from jax import Array
 
 from bayessim_mjx.distributions import Distribution
+from bayessim_mjx.loop.likelihood import Likelihood
 from bayessim_mjx.loop.recorded import Recorded
-from bayessim_mjx.loop.refinement import Likelihood, Refinement, refine
+from bayessim_mjx.loop.refinement import Refinement, refine
 from bayessim_mjx.loop.state import Loop, LoopState, RoundInfo
 from bayessim_mjx.physics.tangent import in_tangent
 from bayessim_mjx.rollout import Trajectory

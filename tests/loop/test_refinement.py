@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from bayessim_mjx.distributions import Distribution
-from bayessim_mjx.loop.refinement import Likelihood, refine
+from bayessim_mjx.loop.likelihood import Likelihood
+from bayessim_mjx.loop.refinement import refine
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 from bayessim_mjx.physics import Physics
 from bayessim_mjx.rollout import replay

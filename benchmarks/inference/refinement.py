@@ -1,0 +1,201 @@
+"""Coverage and gain of posteriors refined by replays (`bayessim.refine`), for more and more trajectories.
+
+    python benchmarks/inference/refinement.py --system linear --n 1 4 16 --truths 50 --out refinement.json
+
+The prior proposes, so a network's quality is no part of it. Posteriors are judged as the loop uses them: with
+`bayessim.components` Gaussians and the share of the prior that `bayessim.priorShare` asks for. A table tells how often
+the 50, 80 and 95 % regions hold the truth, with binomial standard errors, the mean gain over the prior in nats, and how
+many posteriors were not refined (they are out of the coverage and in the gain). Systems: `linear` is a cart under two
+motors of unknown strength, whose exact posterior is known; `damped` a pendulum of unknown mass, damping and motor;
+`Pendulum` (BayesSimIG's) and `Cartpole` are the library's tasks. `--wrong` adds to reality what the simulator lacks.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import time
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from scipy.stats import multivariate_normal
+
+from bayessim_mjx import make
+from bayessim_mjx.distributions import Distribution
+from bayessim_mjx.loop.likelihood import Likelihood
+from bayessim_mjx.loop.refinement import refine
+from bayessim_mjx.parameters import Parameter, ParameterSpace
+from bayessim_mjx.physics import Physics
+from bayessim_mjx.rollout import replay
+from bayessim_mjx.tracking import Record
+
+LEVELS = (0.5, 0.8, 0.95)
+STEPS, HELD = 60, 5  # control steps of a trajectory; those for which a random command is held
+MOST = 32  # trajectories behind a truth, of which the first n are used
+PRIOR_SHARE, COMPONENTS = 0.05, 8  # defaults of `bayessim:`
+WRONG = {"none": "nothing", "gusts": "forces as large as .3 of the commands, .5 s each", "delay": "2 steps of delay"}
+
+CART = """<mujoco><option timestep=".02" gravity="0 0 0"/><worldbody><body name="cart">
+  <joint name="x" type="slide" axis="1 0 0" damping="1" stiffness="4"/><geom size=".1" mass="2"/></body></worldbody>
+  <actuator><general name="a" joint="x" gainprm="10" ctrlrange="-1 1"/>
+  <general name="b" joint="x" gainprm="5" ctrlrange="-1 1"/></actuator></mujoco>"""
+HINGE = """<mujoco><option timestep=".02"/><worldbody><body name="link">
+  <joint name="q" type="hinge" axis="0 1 0" damping=".2"/>
+  <geom type="capsule" fromto="0 0 0 0 0 -.5" size=".02" mass="1"/>
+  </body></worldbody><actuator><general name="a" joint="q" gainprm="3" ctrlrange="-1 1"/></actuator></mujoco>"""
+
+
+@dataclass(frozen=True)
+class System:
+    """A simulator, and the sensors' standard deviation relative to a typical motion of each channel."""
+
+    physics: Physics
+    sd: float
+    linear: bool = False
+
+    @property
+    def space(self) -> ParameterSpace:
+        return self.physics.space
+
+
+def scaled(name: str, attribute: str, kind: str, target: str, low: float, high: float) -> Parameter:
+    return Parameter(name, 1.0, low, high, operation="scaling", attribute=attribute, target=target, kind=kind)
+
+
+def system(name: str) -> System:
+    if name == "linear":
+        space = ParameterSpace([scaled(f"gain {m}", "gain", "actuator", m, 0.2, 3.0) for m in "ab"])
+        return System(Physics(mujoco.MjModel.from_xml_string(CART), 0.04, space), 0.1, linear=True)
+    if name == "damped":
+        parts = [("mass", "body", "link", 0.5, 2), ("damping", "joint", "q", 0.2, 3), ("gain", "actuator", "a", 0.5, 2)]
+        space = ParameterSpace([scaled(attribute, attribute, *rest) for attribute, *rest in parts])
+        return System(Physics(mujoco.MjModel.from_xml_string(HINGE), 0.04, space), 0.05)
+    return System(make(name).physics, 0.05)
+
+
+def gusty(rng: np.random.Generator, command: np.ndarray, strength: float = 0.3) -> np.ndarray:
+    gust = np.repeat(rng.normal(size=(len(command), -(-STEPS // 10), command.shape[-1])), 10, axis=1)[:, :STEPS]
+    return command + strength * np.std(command) * gust
+
+
+def recorded(at: System, seed: int, wrong: str) -> tuple[np.ndarray, Record, np.ndarray]:
+    """(theta, MOST trajectories, sensors' sd [2 nv]) of truth number `seed`."""
+    rng, model = np.random.default_rng([17, seed]), at.physics.mj_model
+    theta = np.asarray(at.space.from_unit(jnp.asarray(rng.uniform(0, 1, len(at.space)), jnp.float32)))
+    start = rng.uniform(-1, 1, (2, MOST, model.nv))
+    high = np.where(model.actuator_ctrllimited, model.actuator_ctrlrange[:, 1], 1.0)
+    if model.nv > 1:  # a cart stays on its rail
+        start, high = 0.3 * start, 0.02 * high
+    command = np.repeat(rng.uniform(-1, 1, (MOST, STEPS // HELD, model.nu)), HELD, axis=1) * high
+    acted = {
+        "none": lambda c: c,
+        "gusts": partial(gusty, rng),
+        "delay": lambda c: np.concatenate([c[:, :1], c[:, :1], c[:, :-2]], axis=1),
+    }[wrong](command)
+    motion = replay(at.physics, *start, acted, np.tile(theta, (MOST, 1)))
+    sd = np.full(2 * model.nv, at.sd)
+    seen = [np.asarray(motion[k]) + at.sd * rng.normal(size=motion[k].shape) for k in ("qpos", "qvel")]
+    return theta, Record(*(jnp.asarray(x, jnp.float32) for x in (*seen, command))), sd
+
+
+def exact(at: System, record: Record, n: int, theta: np.ndarray) -> float:
+    """Gain in nats at theta of the exact posterior where motion is linear in theta and the start; start unknown."""
+    d, count = len(at.space), record.command.shape[0]
+    low, high = (np.array([getattr(p, side) for p in at.space.parameters]) for side in ("low", "high"))
+    zero = np.zeros((count, 1))
+
+    def motion(q: np.ndarray, v: np.ndarray, at_theta: np.ndarray, command: np.ndarray) -> np.ndarray:
+        found = replay(at.physics, q, v, command, np.tile(at_theta, (count, 1)))
+        return np.concatenate([np.asarray(found[k], float)[:n, :, 0] for k in ("qpos", "qvel")], axis=1)
+
+    command, middle = np.asarray(record.command), 0.5 * (low + high)
+    still = motion(zero, zero, middle, command)
+    starts = [motion(*x, middle, 0 * command) for x in ((zero + 1, zero), (zero, zero + 1))]
+    columns = [motion(zero, zero, middle + e, command) - still for e in np.eye(d)]
+    y = np.concatenate([np.asarray(x, float)[:n, :, 0] for x in (record.qpos, record.qvel)], axis=1) - still
+    precision, pull = np.zeros((d, d)), np.zeros(d)
+    for row in range(n):
+        own = np.stack([s[row] for s in starts], axis=1)
+        rest = np.eye(len(own)) - own @ np.linalg.pinv(own)  # a start that is free takes its directions out
+        design = rest @ np.stack([c[row] for c in columns], axis=1)
+        precision += design.T @ design / at.sd**2
+        pull += design.T @ (rest @ y[row]) / at.sd**2
+    covariance = np.linalg.inv(precision)
+    mean = middle + covariance @ pull
+    inside = np.random.default_rng(0).multivariate_normal(mean, covariance, 4000)
+    share = np.mean(np.all((inside > low) & (inside < high), axis=1))
+    return float(multivariate_normal.logpdf(theta, mean, covariance) + np.log(high - low).sum() - np.log(share))
+
+
+def judged(at: System, name: str, seed: int, n: int, wrong: str, draws: int) -> dict:
+    """What the refined posterior of the first n trajectories of one truth is worth."""
+    clock, began = time.perf_counter(), time.process_time()
+    theta, record, sd = recorded(at, seed, wrong)
+    rows = Record(*(x[:n] for x in (record.qpos, record.qvel, record.command)))
+    likelihood = Likelihood(at.physics, rows, np.ones((n, STEPS)), sd, together=1)
+    found = refine(Distribution.prior(at.space), likelihood, seed=seed, draws=draws)
+    posterior = found.posterior.reduce(COMPONENTS)
+    z = (np.asarray(posterior.mean()) - theta) / np.asarray(posterior.sd())
+    if found.refined.reason is None:
+        posterior = dataclasses.replace(posterior, prior_weight=jnp.float32(PRIOR_SHARE))
+    truth = jnp.asarray(theta, jnp.float32)
+    out = {
+        "system": name, "wrong": wrong, "n": n, "truth": seed, "reason": found.refined.reason,
+        "level": float(posterior.credible_level(truth)), "gain": float(posterior.log_gain(truth)),
+        "widening": found.widening, "effective": found.refined.effective, "simulations": found.refined.simulations,
+        "sensor": found.noise.sensor.tolist(), "process": found.noise.process.tolist(), "lasting": found.noise.lasting,
+        "z": z.tolist(),
+    }  # fmt: skip
+    if at.linear and wrong == "none":
+        out["exact"] = exact(at, record, n, theta)
+    return out | {"seconds": time.perf_counter() - clock, "cpu": time.process_time() - began}
+
+
+def line(rows: list[dict]) -> str:
+    """One row of the table."""
+    used = [r for r in rows if r["reason"] is None]
+    first = rows[0]
+    cells = []
+    for p in LEVELS:
+        held = np.mean([r["level"] <= p for r in used]) if used else np.nan
+        cells.append(f"{held:.2f} +- {np.sqrt(p * (1 - p) / max(1, len(used))):.2f}")
+    gains = [r["gain"] for r in rows]
+    known = [r["exact"] for r in rows if "exact" in r]
+    text = f"| {first['system']} | {first['wrong']} | {first['n']} | {' | '.join(cells)} "
+    text += f"| {np.mean(gains):.2f} +- {np.std(gains) / len(gains) ** 0.5:.2f} "
+    text += f"| {np.mean(known):.2f} " if known else "| "
+    return text + f"| {np.median([r['widening'] for r in rows]):.2f} | {len(rows)} | {len(rows) - len(used)} |"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--system", nargs="+", default=["linear"], choices=["linear", "damped", "Pendulum", "Cartpole"])
+    parser.add_argument("--wrong", nargs="+", default=["none"], choices=list(WRONG), help=str(WRONG))
+    parser.add_argument("--n", nargs="+", type=int, default=[1, 2, 4, 8, 16, 32], help=f"trajectories, at most {MOST}")
+    parser.add_argument("--truths", type=int, default=100)
+    parser.add_argument("--first", type=int, default=0, help="number of the first truth")
+    parser.add_argument("--draws", type=int, default=512, help="thetas of one call (the loop: 1024)")
+    parser.add_argument("--out", type=Path, default=Path("refinement.json"), help="kept after every truth, taken up")
+    a = parser.parse_args()
+    rows = json.loads(a.out.read_text()) if a.out.exists() else []
+    done = {(r["system"], r["wrong"], r["n"], r["truth"]) for r in rows}
+    for name in a.system:
+        at = system(name)
+        for seed in range(a.first, a.first + a.truths):
+            for wrong, n in ((w, n) for w in a.wrong for n in a.n):
+                if (name, wrong, n, seed) not in done:
+                    rows.append(judged(at, name, seed, n, wrong, a.draws))
+                    a.out.write_text(json.dumps(rows))
+    print("| system | wrong | n | 50 % | 80 % | 95 % | gain, nats | exact | widening | truths | not refined |")
+    print("|---|---|---|---|---|---|---|---|---|---|---|")
+    for key in sorted({(r["system"], r["wrong"], r["n"]) for r in rows}):
+        print(line([r for r in rows if (r["system"], r["wrong"], r["n"]) == key]))
+
+
+if __name__ == "__main__":
+    main()
