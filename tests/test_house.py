@@ -15,12 +15,7 @@ FILE, FUNCTION = 300, 60  # lines at most
 TREES = ("bayessim_mjx", "tasks", "examples", "benchmarks", "docs", "tests")
 SETTINGS = "bayessim_mjx/config/settings.py"  # a list of settings, as long as there are settings
 
-LONG_FILES = (
-    "tests/effects/test_actuator_forces.py",
-    "tests/effects/test_friction_effects.py",
-    "tests/effects/test_sensor_effects.py",
-    "tests/report/fake.py",
-)
+LONG_FILES = ("tests/report/fake.py",)
 LONG_FUNCTIONS = (
     "tests/report/fake.py:details",
     "tests/report/fake.py:full",

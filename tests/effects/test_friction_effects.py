@@ -10,7 +10,6 @@ import pytest
 from scipy.optimize import least_squares
 
 from bayessim_mjx.effects import make
-from bayessim_mjx.errors import UserError
 from bayessim_mjx.parameters import ParameterSpace
 from bayessim_mjx.physics import Physics, control_step
 from bayessim_mjx.rollout import replay
@@ -289,21 +288,3 @@ def test_the_gradient_at_neutral_is_that_of_the_law():
         return world.qvel[0]
 
     np.testing.assert_allclose(jax.jit(jax.grad(speed))(jnp.zeros(4)), [-0.01, 0, -0.02, 0], atol=1e-4)
-
-
-def test_what_cannot_be_written_says_so():
-    spec = mujoco.MjSpec.from_string(ARM)
-    for name in ("stribeck_friction", "load_friction", "asymmetric_friction", "quadratic_drag"):
-        assert "use effects.yaml" in make(name, where="a").edit(spec, {"a": {}})
-    spring = make("joint_spring", where="a")
-    assert "cubic" in spring.edit(spec, {"a": {"stiffness": 1.0, "cubic": 1.0, "rest": 0.0}})
-    assert spring.edit(spec, {"all": {"stiffness": 1.0, "cubic": 0.0, "rest": np.pi}}) is None
-    np.testing.assert_allclose(spec.compile().qpos_spring, np.pi, rtol=1e-6)
-    assert "has a spring already" in spring.edit(spec, {"a": {"stiffness": 1.0, "cubic": 0.0, "rest": 0.0}})
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_negative_friction_is_refused(name):
-    own = make(name, where="z").space().parameters[0]
-    with pytest.raises(UserError, match=f"{own.name}: range begins at -1"):
-        dataclasses.replace(make(name, where="z"), parameters=(dataclasses.replace(own, low=-1.0),))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+from bayessim_mjx.diagnosis import phrases
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fitter import Fitter
 from bayessim_mjx.diagnosis.selection import beam, search
@@ -13,7 +14,6 @@ from bayessim_mjx.diagnosis.selection.fits import Fits
 from bayessim_mjx.diagnosis.selection.race import Progress, Race, compatible, special_cases
 from bayessim_mjx.diagnosis.selection.tried import Settings
 from bayessim_mjx.diagnosis.selection.verdict import Rival, Ruling
-from bayessim_mjx.quantities import percent
 
 TOLD = 8  # rivals of one effect, single ones first
 
@@ -53,9 +53,5 @@ def _rival(race: Race, effect: Candidate, found: Alternative, selection: Selecti
     contains = any(effect.effect in special_cases(o) and o.where == effect.where for o in others)
     same = any(o.effect == effect.effect and not compatible(o, effect) for o in others)
     behind = max(race.closure(race.winner) - found.closed, 0.0)
-    why = (
-        "contains it as a special case and explains no more"
-        if contains
-        else f"held-out evidence differs by {found.nats:.1f} nats, {percent(behind)} of the gap"
-    )
+    why = phrases.CONTAINS if contains else phrases.close_by(found.nats, behind)
     return Rival(others, model, found.closed, why, contains or same, found.nats)

@@ -195,3 +195,22 @@ def rivals(table: Table, equal: Iterable[Key], answer: Key, less: Order) -> tupl
 
 def _told(key: Key) -> str:
     return " + ".join(sorted(key)) or "known parameters"
+
+
+def closed_elsewhere(table: Table, less: Order, criteria: Criteria) -> float:
+    """Share of the squared gap closed on operating conditions that had no part in the decision, at most 1.
+
+    The decision is taken anew without each condition, and what it names then is scored on that condition. A share much
+    below that of the answer means that the answer was chosen for what it does by chance. The search saw all conditions:
+    only the choice among what it tried is taken anew. NaN of one condition, and where there is no gap.
+    """
+    names = np.unique(table.group)
+    above = table.rows[BASE].total - table.noise * len(table.group)
+    if len(names) < 2 or above <= 0:
+        return float("nan")
+    drop = 0.0
+    for name in names:
+        answer = decide(table.without(name), less, criteria).answer
+        own = table.group == name
+        drop += float(np.sum(table.rows[BASE].cost[own] - table.rows[answer].cost[own]))
+    return min(drop / above, 1.0)

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from bayessim_mjx.diagnosis.selection.criteria import Criteria
-from bayessim_mjx.diagnosis.selection.decide import compare, decide, order
+from bayessim_mjx.diagnosis.selection.decide import closed_elsewhere, compare, decide, order
 from bayessim_mjx.diagnosis.selection.table import BASE, read
 from bayessim_mjx.errors import UserError
 from tests.diagnosis.selection.planted import law, table
 
-A, B, C = (law(name) for name in "abc")
+A, B, C, D, E = (law(name) for name in "abcde")
 GROUP = np.repeat(np.arange(5), 4)
 
 
@@ -143,3 +143,21 @@ def test_criteria_are_given_as_texts():
     for wrong in ("sme=1", "same=much", "beam=2.5", "same=-1", "beam=0"):
         with pytest.raises(UserError, match=wrong.partition("=")[0]):
             Criteria().changed([wrong])
+
+
+def elsewhere(errors):
+    known = table(errors, group=GROUP)
+    return closed_elsewhere(known, order(known.laws), Criteria())
+
+
+def test_what_is_quoted_of_conditions_that_did_not_choose():
+    """The same where every condition names the same; less where the winner of the others fails on the one left out."""
+    assert elsewhere({(): 101, (A,): 51, (B,): 90}) == pytest.approx(0.5, abs=0.01)
+    assert elsewhere({(): 101}) == 0.0 and np.isnan(elsewhere({(): 0.9}))
+    lucky = {(c,): np.where(g == GROUP, 301.0, 41.0) for g, c in enumerate((A, B, C, D, E))}
+    assert elsewhere({(): 101, **lucky}) == pytest.approx(-2.0, abs=0.05)
+
+
+def test_one_condition_says_nothing_of_others():
+    known = table({(): 100, (A,): 1.0}, group=np.zeros(8, int))
+    assert np.isnan(closed_elsewhere(known, order(known.laws), Criteria()))
