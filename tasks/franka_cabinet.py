@@ -33,7 +33,7 @@ SPEED_SCALE = 0.1
 NEAR = 0.02  # m, from which on being there counts twice
 REACH = 0.04  # m: fingers count as close to the handle up to here, and as beyond it from here on
 OPENED = 0.35  # m, of a success
-INWARDS, UP = np.array([-1.0, 0.0, 0.0], np.float32), np.array([0.0, 0.0, 1.0], np.float32)  # of the drawer
+INWARDS, UP = np.array([-1.0, 0.0, 0.0], np.float32), np.array([0.0, 0.0, 1.0], np.float32)  # world axes
 POINTS = {  # sites: what has to reach the handle, left and right finger
     "fingertips": ("grasp", "left_tip", "right_tip"),
     "isaac": ("isaac_grasp", "left_finger", "right_finger"),

@@ -99,7 +99,7 @@ def closeness(distance: jax.Array, near: float = 0.0) -> jax.Array:
     return jnp.where(distance <= near, 2 * reward, reward)
 
 
-def alignment(one: jax.Array, two: jax.Array) -> jax.Array:
+def alignment(one: jax.Array, two: jax.Array | np.ndarray) -> jax.Array:
     """How much two unit vectors `[3]` agree: their cosine squared, with its sign."""
     cosine = one @ two
     return jnp.sign(cosine) * cosine**2

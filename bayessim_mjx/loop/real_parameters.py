@@ -47,7 +47,7 @@ def real_parameters(
         raise UserError(f"env.realParams.weights={list(weights)}: must be >= 0 and not all 0")
     for row in means:
         for name, value, low, high in zip(space.names, row, *(ends or (space.low, space.high)), strict=True):
-            if not low <= value <= high:
+            if not low <= np.float32(value) <= high:  # the ends of a range are rounded as well
                 raise UserError(f"env.realParams.means: {name}={value:g} lies outside its range [{low:g}, {high:g}]")
     if any(np.any(row < 0) for row in stds):
         raise UserError("env.realParams.stds must be >= 0")

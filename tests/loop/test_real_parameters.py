@@ -22,6 +22,13 @@ def test_lists_mappings_and_one_number_are_rows():
     np.testing.assert_array_equal(real_parameters(MEANS, SPACE)[2], [[0, 0]])
 
 
+def test_the_ends_of_a_range_are_in_it():
+    """Also those that no float32 is equal to."""
+    low, high = 0.1, 0.7
+    space = ParameterSpace([Parameter("mass", 0.5, low, high), Parameter("length", 0.5, low, high)])
+    np.testing.assert_array_equal(real_parameters({"means": [[low, high]]}, space)[1], np.float32([[low, high]]))
+
+
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
