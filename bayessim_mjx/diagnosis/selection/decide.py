@@ -167,13 +167,14 @@ def decide(table: Table, less: Order, criteria: Criteria) -> Selection:
     rows = {k: r for k, r in table.rows.items() if admissible(r, criteria)}
     best = max(rows, key=lambda k: value(table, k, criteria))
     trace = [f"best: {_told(best)}, leaves {table.excess(best):.3g}"]
-    equal = [k for k in rows if k == best or same(table, k, best, criteria)]
-    if any(not same(table, BASE, k, criteria) for k in rows):
-        equal = [k for k in equal if k]  # one effect may show what it and a doubtful one together blur
+    # also where no amplitude is told, as of one that another number makes up for
+    alike = [k for k in table.rows if same(table, k, best, criteria)]
+    if BASE in alike:  # one effect may show what it and a doubtful one together blur
+        shown = {k for k in table.rows if not same(table, BASE, k, criteria)}
+        alike = [k for k in alike if k in shown] if shown & rows.keys() else alike
+    equal = [k for k in alike if k in rows] or [best]
     answer = least(table, equal, less)
     trace.append(f"the same as the best: {len(equal)}; least: {_told(answer)}, leaves {table.excess(answer):.3g}")
-    # also where no amplitude is told, as of one that another number makes up for
-    alike = [k for k in table.rows if k in equal or same(table, k, best, criteria)]
     return Selection(BASE, answer, rivals(table, alike, answer, less), table, tuple(trace))
 
 

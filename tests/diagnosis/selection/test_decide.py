@@ -63,7 +63,8 @@ def test_a_doubtful_effect_on_top_of_a_sure_one_leaves_the_sure_one_named():
     bare, one = np.where(GROUP == 3, 400.0, 50.0), np.where(GROUP == 3, 1.0, 50.0)
     both = np.select([GROUP == 0, GROUP == 1], [30.0, 60.0], one)
     assert named({(): bare, (A, B): both}, group=GROUP) == set()
-    assert named({(): bare, (A,): one, (A, B): both}, group=GROUP) == labels(A)
+    found = decided({(): bare, (A,): one, (B,): bare, (C,): 0.9 * bare, (A, B): both}, group=GROUP)
+    assert found.answer == labels(A) and not found.rivals  # what shows nothing is no rival
 
 
 def test_the_standard_error_is_that_of_conditions_not_of_windows():
