@@ -31,7 +31,7 @@ class Checks:
 
     calibration: Report
     misfit: Misfit
-    piles: tuple[Pile, ...]  # walls at which the posterior piles up
+    piles: tuple[Pile, ...]  # ends of ranges at which the posterior piles up
     flat: tuple[str, ...]  # sentences on parameters that were not identified
     prior_share: float  # of the prior, mixed into the randomisation because of the misfit
     sets: Sets | None = None  # posteriors of several trajectories as they are used, judged on simulated sets

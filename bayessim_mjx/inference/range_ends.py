@@ -1,4 +1,4 @@
-"""Where a posterior piles up at the wall of a parameter's range: the truth probably lies beyond it.
+"""Where a posterior piles up at the end of a parameter's range: the truth probably lies beyond it.
 
 The range can then move (compare EDGE, Kamaras et al. 2025, arXiv 2510.26656, which moves the support to where the mode
 goes). Here it only grows, so that the prior over it, restricted to the range before, is the prior of before: what was
@@ -16,6 +16,7 @@ import numpy as np
 
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.parameters.ranged import Ranged
+from bayessim_mjx.quantities import percent
 
 OUTER = 0.05  # of the range, in unit coordinates: mass of the prior that lies there
 PILED = 0.25  # mass of the posterior that does not get there by chance
@@ -25,13 +26,13 @@ LEAST = 0.05  # of a range's width: a smaller move is none
 
 @dataclass(frozen=True)
 class Pile:
-    """Mass of a posterior at one wall.
+    """Mass of a posterior at one end of a parameter's range.
 
     Attributes:
         name: of the parameter.
         upper: which end of its range.
         mass: within the outer 5 % of the range.
-        limit: where the wall is.
+        limit: where that end is.
         moved: where it is in the next round; None: it was not asked to move.
     """
 
@@ -43,7 +44,7 @@ class Pile:
 
     def sentence(self) -> str:
         side, way = ("upper", "raise") if self.upper else ("lower", "reduce")
-        told = f"{self.name}: {100 * self.mass:.0f} % of the posterior lies at the {side} end of its range; "
+        told = f"{self.name}: {percent(self.mass)} of the posterior lies at the {side} end of its range; "
         if self.moved is None:
             return told + f"{way} its limit {self.limit:.4g} if that is physically possible"
         if self.moved == self.limit:
@@ -57,7 +58,7 @@ class Pile:
 
 
 def piles(posterior: Distribution) -> list[Pile]:
-    """Walls at which more than a quarter of the posterior lies, densest at the wall itself; parameters in order."""
+    """Ends at which more than a quarter of the posterior lies, densest at the end itself; parameters in order."""
     theta, weights = posterior.quadrature()
     u = np.asarray(jax.vmap(posterior.space.to_unit)(theta), np.float64)
     w = np.asarray(weights, np.float64)
@@ -73,7 +74,7 @@ def piles(posterior: Distribution) -> list[Pile]:
 
 
 def moved(space: Ranged, found: Sequence[Pile], lowest: np.ndarray, highest: np.ndarray) -> tuple[Ranged, list[Pile]]:
-    """The space of the next round, and the piles as they moved: each wall by the width of its range, as far as it may.
+    """The space of the next round, and the piles as they moved: each end by the width of its range, as far as it may.
 
     Widths of a log-uniform prior are those of the logarithm. Physics ends at lowest, highest [d].
     """

@@ -71,7 +71,7 @@ class RoundInfo:
     scores: dict[str, float]  # log p(truth), gain over the prior, credible level, contraction per parameter
     seconds: dict[str, float]
     warnings: list[str]
-    checks: checks.Checks | None = None  # calibration, misfit, walls; None: none asked for
+    checks: checks.Checks | None = None  # calibration, misfit, ends of ranges; None: none asked for
     sets: Any = None  # how products of several posteriors did on simulated sets, see inference/sets.py
     refinement: Any = None  # what bayessim.refine made of the posterior, see loop/refinement.py
     moves: tuple[Pile, ...] = ()  # ends of ranges at which the posterior piles up, and where they are in the next round
