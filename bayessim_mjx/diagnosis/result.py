@@ -43,9 +43,10 @@ class Gap:
     range of the logged motion), "tolerance", "largest" (error that the last stage leaves), "beyond" (whether it leaves
     more than tolerated); shares: {stage: value}, of the range of motion, root mean square over the joints; beyond: the
     joints where more than tolerated remains;
-    closed: {"predicted", "realised", "ci"}, share of the recalibrated simulator's squared gap above the noise that all
-    effects close together: as promised before any was fitted, and on held-out windows afterwards; integrator: what the
-    simulator's own time step is worth (`discretisation.Discretisation.to_dict`).
+    closed: {"predicted", "realised", "ci", "elsewhere" (by one decision only)}, share of the recalibrated simulator's
+    squared gap above the noise that all effects close together: as promised before any was fitted, on held-out windows
+    afterwards, and on conditions that had no part in the choice of the effects; integrator: what the simulator's own
+    time step is worth (`discretisation.Discretisation.to_dict`).
     """
 
     noise_floor: float

@@ -2,6 +2,7 @@
 
 import itertools
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -74,11 +75,14 @@ def decided(found):
 
 
 def test_one_decision_names_what_the_rules_of_the_race_name(rubbing):
-    found, _ = rubbing
+    found, by_rules = rubbing
     ended, selection = decided(found)
     assert selection.answer == {"coulomb_friction@hinge"} == {e.label for e in ended.answer.effects}
     np.testing.assert_allclose(ended.answer.fit.values, found.model.fit.values, rtol=0.02)
     assert selection.table.rows[selection.answer].distance["coulomb_friction@hinge"] > 10
+    diagnosis = assemble.diagnosis_of(replace(found, outcome=ended))
+    assert diagnosis.gap.closed["elsewhere"] == pytest.approx(diagnosis.gap.closed["realised"], abs=0.05)
+    assert "elsewhere" not in by_rules.gap.closed and any("chosen anew" in text for text in diagnosis.sentences)
     assert found.setup.fitter.simulator.traces == 1
 
 

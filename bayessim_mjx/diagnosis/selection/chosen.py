@@ -9,7 +9,7 @@ from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fitter import Fitter
 from bayessim_mjx.diagnosis.selection import beam, search
 from bayessim_mjx.diagnosis.selection.criteria import Criteria
-from bayessim_mjx.diagnosis.selection.decide import Alternative, Selection
+from bayessim_mjx.diagnosis.selection.decide import Alternative, Selection, closed_elsewhere, order
 from bayessim_mjx.diagnosis.selection.fits import Fits
 from bayessim_mjx.diagnosis.selection.race import Progress, Race, compatible, special_cases
 from bayessim_mjx.diagnosis.selection.tried import Settings
@@ -38,7 +38,9 @@ def ruled(race: Race, criteria: Criteria, say: Progress) -> tuple[Ruling, Select
     selection = beam.search(Fits(race, say), criteria)
     race.winner = race.models[selection.answer]
     rivals = {e.label: _rivals(race, e, selection) for e in race.winner.effects}
-    return Ruling(race.winner, rivals), selection
+    table = selection.table
+    elsewhere = closed_elsewhere(table, order(table.laws), criteria) if selection.answer else float("nan")
+    return Ruling(race.winner, rivals, elsewhere), selection
 
 
 def _rivals(race: Race, effect: Candidate, selection: Selection) -> list[Rival]:

@@ -31,6 +31,8 @@ class Outcome(Tried):
         subsets: {labels: the model with these of its effects}, every one refitted; {} of one effect or of too many.
         promised: share of the base model's gap that its effects promised to close before any was fitted, {label: part}.
         along: what was simulated along its weak directions.
+        elsewhere: share of the gap closed on operating conditions that had no part in the choice; NaN where that is not
+            known.
     """
 
     fitter: Fitter
@@ -45,6 +47,7 @@ class Outcome(Tried):
     subsets: Mapping[frozenset[str], Model] = field(default_factory=dict)
     promised: tuple[float, Mapping[str, float]] = (0.0, MappingProxyType({}))
     along: Ridges | None = None
+    elsewhere: float = float("nan")
 
     @property
     def ambiguous(self) -> bool:
@@ -88,7 +91,8 @@ def concluded(race: Race, ruling: verdict.Ruling, say: Progress) -> Outcome:
         race.models[frozenset(c.label for c in answer.effects)] = race.winner = answer
     subsets = verdict.subsets(race, answer, say) if len(answer.effects) > 1 else {}
     total, each = predicted_gain.promised(race, answer.effects) if answer.effects else (0.0, {})
-    return replace(frozen(race, answer, ruling.rivals), subsets=subsets, promised=(total, each), along=along)
+    found = frozen(race, answer, ruling.rivals)
+    return replace(found, subsets=subsets, promised=(total, each), along=along, elsewhere=ruling.elsewhere)
 
 
 def frozen(race: Race, answer: Model, rivals: Mapping[str, Sequence[Rival]]) -> Outcome:

@@ -58,10 +58,11 @@ class Rival:
 
 @dataclass(frozen=True, eq=False)
 class Ruling:
-    """The winner's effects with their rivals."""
+    """The winner's effects with their rivals; elsewhere: see `decide.closed_elsewhere`, NaN where it is not known."""
 
     model: Model
     rivals: dict[str, list[Rival]] = field(default_factory=dict)
+    elsewhere: float = float("nan")
 
     @property
     def ambiguous(self) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -57,8 +58,9 @@ def closed_by(found: Findings) -> dict[str, Any]:
     """Share of the recalibrated simulator's squared gap that all effects close: promised, and then really."""
     if not found.model.effects:
         return {}
-    closed, (total, each) = _closed(found), found.outcome.promised
-    return {"predicted": total, "realised": closed.value, "ci": closed.interval(), "each": each}
+    closed, (total, each), elsewhere = _closed(found), found.outcome.promised, found.outcome.elsewhere
+    known = {} if math.isnan(elsewhere) else {"elsewhere": elsewhere}
+    return {"predicted": total, "realised": closed.value, "ci": closed.interval(), "each": each} | known
 
 
 def _closed(found: Findings) -> heldout.Closed:

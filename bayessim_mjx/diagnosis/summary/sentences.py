@@ -44,6 +44,10 @@ FALLS = (
     "With {them} the recalibrated simulator's gap falls from {calibrated} to {with_effects} on held-out conditions. "
     "Before {they} fitted, {predicted} of the squared gap above the noise was predicted to close; {realised} did."
 )
+ELSEWHERE = (
+    "Where the effects are chosen anew without each operating condition in turn, they close {elsewhere} of the gap of "
+    "the condition that was left out."
+)
 WITHIN = "What remains is within the tolerance at every joint: {within}."
 CHANCE = (
     "What remains, {calibrated}, no candidate and no flexible force predicts on held-out conditions: process noise, an "
@@ -93,6 +97,7 @@ def verdict_in_words(
         "remains": percent(remains),
         "predicted": percent(promised),
         "realised": percent(went),
+        "elsewhere": percent(far.closed.get("elsewhere")),
         "beyond": listed([_left(n, far.physical[n]) for n in _worst(far) if n in far.beyond][:3]),
         "within": _within(far),
     }
@@ -102,6 +107,7 @@ def verdict_in_words(
         more = ON_TOP if remains > 0.05 else BEATEN if beaten else ""
         out += [f"{NEAREST}{more}."] if name == "unexplained" and (more or not partly) else []
         out.append(FALLS)
+        out += [ELSEWHERE] if "elsewhere" in far.closed else []
     if name == "unexplained" and not effects:
         rest = [_left(n, far.physical[n]) for n in _worst(far) if "largest" in far.physical[n]]
         out += [f"What remains after recalibration: {listed(rest[:3])}."] if rest else []

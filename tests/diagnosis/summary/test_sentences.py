@@ -1,5 +1,7 @@
 """The verdict in words: one effect or several, promised and realised, every verdict a plain sentence."""
 
+import dataclasses
+
 import pytest
 
 from bayessim_mjx.diagnosis.result import VERDICTS, FoundEffect, Gap
@@ -31,6 +33,13 @@ def test_one_effect():
     assert falls.endswith(
         "Before it was fitted, 66 % of the squared gap above the noise was predicted to close; 68 % did."
     )
+
+
+def test_what_conditions_without_a_part_in_the_choice_say():
+    known = dataclasses.replace(LEVEL, closed={"predicted": 0.66, "realised": 0.68, "elsewhere": 0.41})
+    told = sentences.verdict_in_words("effects", [FRICTION], known)[2]
+    assert told.endswith("they close 41 % of the gap of the condition that was left out.")
+    assert told not in sentences.verdict_in_words("effects", [FRICTION], LEVEL)
 
 
 def test_several_effects():
