@@ -1,6 +1,6 @@
 """The simulator's own likelihood of recorded trajectories: one-step prediction errors, with noise that is estimated.
 
-Sensor and process noise are estimated at a theta: what the simulator cannot follow counts as noise.
+Sensor and process noise are estimated near a theta: what the simulator cannot follow counts as noise.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from bayessim_mjx.distributions.charts import from_chart, to_chart
 from bayessim_mjx.kalman import Force, Gains, innovations, riccati
 from bayessim_mjx.physics import Physics
 from bayessim_mjx.physics.tangent import addresses
@@ -23,6 +24,7 @@ LASTING = (0.7, 0.9, 0.97)  # their correlations from step to step
 RATIOS = (0.1, 0.3, 1.0, 3.0, 10.0)  # velocity's sensor noise against position's, times what was given
 SETTLED = 0.1  # relative change of the log likelihood's unit at which noise and posterior agree
 LOOKED = 4  # trajectories at which noise is estimated
+SLOPE = 0.01  # step of central differences in z
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,33 @@ class Noise:
     sensor: np.ndarray
     process: np.ndarray
     lasting: float = 0.0
+
+
+@dataclass(frozen=True)
+class _Linear:
+    """Dynamics of n records near a theta: `ways`, `gaps`, `path` as in `kalman.innovations`.
+
+    slopes: `[d, n, T, 2 nv]` of the gaps in the probit coordinates z `[d]` of theta; valid: `[n, T]`.
+    """
+
+    ways: np.ndarray
+    gaps: np.ndarray
+    slopes: np.ndarray
+    z: np.ndarray
+    path: Gains
+    valid: np.ndarray
+
+    def whitened(self, gains: Gains, dt: float) -> tuple[np.ndarray, np.ndarray]:
+        """Prediction errors [R] of the filter with those gains, and their slopes [R, d] in z."""
+        rows = [self.gaps, *self.slopes]
+
+        def again(x: Any) -> np.ndarray:
+            return np.concatenate([np.asarray(x, float)] * len(rows))
+
+        path, gains = jax.tree.map(again, self.path), jax.tree.map(again, gains)
+        found = innovations(again(self.ways), np.concatenate(rows), path, gains, dt)
+        found = found.reshape(len(rows), *self.gaps.shape) * self.valid[:, :, None]
+        return found[0].ravel(), found[1:].reshape(len(self.slopes), -1).T
 
 
 class Likelihood:
@@ -86,17 +115,29 @@ class Likelihood:
         Around the measurements themselves, half the dynamics' curvature times the sensors' variance would look like a
         force that lasts (Jazwinski 1970, 9.7: the iterated filter).
         """
-        parts = [self._dynamics(theta, path, part) for part in self.parts]
-        ways, gaps = (np.concatenate([p[i] for p in parts]) for i in (0, 1))
-        few = slice(0, min(LOOKED, len(self.valid)))
-        self.noise = self._noise(ways[few], gaps[few], _rows(path, few), self.valid[few])
+        ways, gaps = self._dynamics(theta, path, self.parts)
+        self.noise = self._noise(self._linear(theta, path, ways, gaps))
         gains = self._gains(ways, self.noise)
         mask = jnp.asarray(self.valid, jnp.float32)[:, :, None, None]
         self.gains = gains.replace(gain=gains.gain * mask, whitener=gains.whitener * mask)
 
-    def _noise(self, ways: np.ndarray, gaps: np.ndarray, path: Gains, valid: np.ndarray) -> Noise:
+    def _linear(self, theta: np.ndarray, path: Gains, ways: np.ndarray, gaps: np.ndarray) -> _Linear:
+        few, each = min(LOOKED, len(self.valid)), self.parts[0].stop
+        parts = self.parts[: -(-few // each)]
+        space = self.physics.space
+        z = to_chart(space.to_unit(jnp.asarray(theta, jnp.float32)), "probit")
+
+        def moved(k: int, by: float) -> np.ndarray:
+            at = space.from_unit(from_chart(z.at[k].add(by), "probit"))
+            return self._dynamics(np.asarray(at), path, parts)[1][:few]
+
+        slopes = np.stack([(moved(k, SLOPE) - moved(k, -SLOPE)) / (2 * SLOPE) for k in range(len(z))])
+        rows = slice(0, few)
+        return _Linear(ways[rows], gaps[rows], slopes, np.asarray(z, float), _rows(path, rows), self.valid[rows])
+
+    def _noise(self, linear: _Linear) -> Noise:
         """The most likely noise, each number that is not needed left out (BIC): first what acts, then the sensors."""
-        paid = 0.5 * np.log(valid.sum() * self.seen.sum())
+        paid = 0.5 * np.log(linear.valid.sum() * self.seen.sum())
         unit = np.where(self.seen, self.floor, FINEST * self.scale)[self.nv :]
         still = np.zeros(self.nv)
         acting = [(0.0, still, 0.0), *((1.0, q * unit, 0.0) for q in PROCESS)]
@@ -107,7 +148,7 @@ class Likelihood:
             nonlocal best, noise
             sensor = self.floor * np.concatenate([np.ones(self.nv), np.full(self.nv, ratio)])
             guess = Noise(sensor, force, lasting)
-            value, size = self._fit(ways, gaps, path, guess, valid)
+            value, size = self._fit(linear, guess)
             value -= paid * (cost + (ratio != 1.0))
             if value > best:
                 best, noise = value, replace(guess, sensor=sensor * size, process=force * size)
@@ -128,23 +169,33 @@ class Likelihood:
         white = np.concatenate([nothing[self.nv :], noise.process])
         return riccati(ways, noise.sensor, white, self._start(noise))
 
-    def _dynamics(self, theta: np.ndarray, path: Gains, part: slice) -> tuple[np.ndarray, np.ndarray]:
-        return transitions(self.physics, theta, _rows(self.record, part), _rows(path, part), self.scale)
+    def _dynamics(self, theta: np.ndarray, path: Gains, parts: list[slice]) -> tuple[np.ndarray, np.ndarray]:
+        found = [
+            transitions(self.physics, theta, _rows(self.record, part), _rows(path, part), self.scale) for part in parts
+        ]
+        return np.concatenate([ways for ways, _ in found]), np.concatenate([gaps for _, gaps in found])
 
     def _start(self, noise: Noise) -> np.ndarray:
         """Standard deviations of the start state: as measured, or anything where it is not."""
         return np.where(self.seen, noise.sensor, 0.3 * self.scale)
 
-    def _fit(
-        self, ways: np.ndarray, gaps: np.ndarray, path: Gains, noise: Noise, valid: np.ndarray
-    ) -> tuple[float, float]:
-        """(log likelihood at the best common factor on the noise, that factor), by linear error dynamics."""
-        gains = self._gains(ways, noise)
-        squares = float(np.sum(innovations(ways, gaps, path, gains, self.physics.dt) ** 2 * valid[:, :, None]))
-        count = valid.sum() * self.seen.sum()
-        factor = max(squares / count, 1.0)  # not below the floor
-        sizes = float(np.sum(np.asarray(gains.log_size, float) * valid))
-        return sizes - 0.5 * count * np.log(factor) - 0.5 * squares / factor, float(np.sqrt(factor))
+    def _fit(self, linear: _Linear, noise: Noise) -> tuple[float, float]:
+        """(log evidence at the best common factor on the noise, that factor), by linear dynamics.
+
+        Theta is integrated out near where it was: at one theta, what a better one explains would count as noise.
+        """
+        gains = self._gains(linear.ways, noise)
+        error, slope = linear.whitened(gains, self.physics.dt)
+        count, factor = linear.valid.sum() * self.seen.sum(), 1.0
+        for _ in range(2):
+            precision = slope.T @ slope / factor + np.eye(len(linear.z))
+            step = -np.linalg.solve(precision, slope.T @ error / factor + linear.z)
+            squares = float(np.sum((error + slope @ step) ** 2))
+            factor = max(squares / count, 1.0)  # not below the floor
+        sizes = float(np.sum(np.asarray(gains.log_size, float) * linear.valid))
+        value = sizes - 0.5 * count * np.log(factor) - 0.5 * squares / factor
+        value -= 0.5 * float(np.sum((linear.z + step) ** 2)) + 0.5 * float(np.linalg.slogdet(precision)[1])
+        return value, float(np.sqrt(factor))
 
     def squares(self, thetas: np.ndarray) -> np.ndarray:
         """Sums of squared whitened prediction errors [M, N, blocks] at thetas [M, d]."""

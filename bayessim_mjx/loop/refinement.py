@@ -61,7 +61,7 @@ def refine(
     found, kept = None, np.zeros(0)
     for turn in range(PASSES):
         changed = likelihood.settle(theta)
-        if found is not None and not changed:
+        if found is not None and not changed and not found.reason:
             break
         parts: list[np.ndarray] = []
 
