@@ -92,7 +92,7 @@ def _followed(
 ) -> tuple[Any, Array, Array]:
     """(world, force) drawn to what was measured, and the prediction error [2 nv]."""
     size = 2 * physics.mj_model.nv
-    pushed = push(size // 2, physics.dt) @ force
+    pushed = jnp.asarray(push(size // 2, physics.dt), jnp.float32) @ force
     gap = _gap(physics, world, qpos, qvel) - pushed
     by = gain @ gap
     return _drawn(physics, world, pushed + by[:size]), lasting * force + by[size:], gap

@@ -100,17 +100,16 @@ class Likelihood:
     def settle(self, theta: np.ndarray) -> bool:
         """Estimate the noise at theta [d]; returns whether it has changed much."""
         before = self.noise
-        if self.gains is None:
-            self._linearise(theta, close(self.record, self.nv))
-        self._linearise(theta, self.gains)
+        path = self.gains or self._linearised(theta, close(self.record, self.nv))
+        self.gains = self._linearised(theta, path)
         noise, seen = self.noise, self.seen
         moved = np.abs(np.log(noise.sensor[seen] / before.sensor[seen])).max()
         most = max(before.process.max(), noise.process.max(), 1e-30)
         drift = np.abs(noise.process - before.process).max() / most + abs(noise.lasting - before.lasting)
         return bool(moved > SETTLED or drift > SETTLED)
 
-    def _linearise(self, theta: np.ndarray, path: Gains) -> None:
-        """Noise and gains from the dynamics along the filter's path with those gains.
+    def _linearised(self, theta: np.ndarray, path: Gains) -> Gains:
+        """Gains, and the noise behind them, from the dynamics along the filter's path with those gains.
 
         Around the measurements themselves, half the dynamics' curvature times the sensors' variance would look like a
         force that lasts (Jazwinski 1970, 9.7: the iterated filter).
@@ -119,7 +118,7 @@ class Likelihood:
         self.noise = self._noise(self._linear(theta, path, ways, gaps))
         gains = self._gains(ways, self.noise)
         mask = jnp.asarray(self.valid, jnp.float32)[:, :, None, None]
-        self.gains = gains.replace(gain=gains.gain * mask, whitener=gains.whitener * mask)
+        return gains.replace(gain=gains.gain * mask, whitener=gains.whitener * mask)
 
     def _linear(self, theta: np.ndarray, path: Gains, ways: np.ndarray, gaps: np.ndarray) -> _Linear:
         few, each = min(LOOKED, len(self.valid)), self.parts[0].stop
@@ -186,6 +185,8 @@ class Likelihood:
         """
         gains = self._gains(linear.ways, noise)
         error, slope = linear.whitened(gains, self.physics.dt)
+        if not (np.isfinite(error).all() and np.isfinite(slope).all()):
+            return -np.inf, 1.0
         count, factor = linear.valid.sum() * self.seen.sum(), 1.0
         for _ in range(2):
             precision = slope.T @ slope / factor + np.eye(len(linear.z))

@@ -121,7 +121,8 @@ class Recorded:
         """The segments index [N] as they were recorded: with the past of their starts, and their controllers."""
         near = self._of("around_qpos", "around_qvel", "around_command", index=index)
         law = None if self.law is None else jax.tree.map(lambda x: x[index], self.law)
-        return Record(*self._of("qpos", "qvel", "command", index=index), recording(self.env.physics, *near), law)
+        qpos, qvel, command = self._of("qpos", "qvel", "command", index=index)
+        return Record(qpos, qvel, command, recording(self.env.physics, *near), law)
 
     def _of(self, *names: str, index: Array | np.ndarray) -> list[Array]:
         return [jnp.asarray(self.data[name])[index] for name in names]
