@@ -132,7 +132,7 @@ def exact(at: System, record: Record, n: int, theta: np.ndarray) -> float:
     return float(multivariate_normal.logpdf(theta, mean, covariance) + np.log(high - low).sum() - np.log(share))
 
 
-def judged(at: System, name: str, seed: int, n: int, wrong: str, draws: int) -> dict:
+def judged(at: System, name: str, seed: int, n: int, wrong: str, draws: int, prior_share: float = PRIOR_SHARE) -> dict:
     """What the refined posterior of the first n trajectories of one truth is worth."""
     clock, began = time.perf_counter(), time.process_time()
     theta, record, sd = recorded(at, seed, wrong)
@@ -142,7 +142,7 @@ def judged(at: System, name: str, seed: int, n: int, wrong: str, draws: int) -> 
     posterior = found.posterior.reduce(COMPONENTS)
     z = (np.asarray(posterior.mean()) - theta) / np.asarray(posterior.sd())
     if found.refined.reason is None:
-        posterior = dataclasses.replace(posterior, prior_weight=jnp.float32(PRIOR_SHARE))
+        posterior = dataclasses.replace(posterior, prior_weight=jnp.float32(prior_share))
     truth = jnp.asarray(theta, jnp.float32)
     out = {
         "system": name, "wrong": wrong, "n": n, "truth": seed, "reason": found.refined.reason,
@@ -180,6 +180,7 @@ def main() -> None:
     parser.add_argument("--truths", type=int, default=100)
     parser.add_argument("--first", type=int, default=0, help="number of the first truth")
     parser.add_argument("--draws", type=int, default=512, help="thetas of one call (the loop: 1024)")
+    parser.add_argument("--prior_share", type=float, default=PRIOR_SHARE, help="as bayessim.priorShare; one per file")
     parser.add_argument("--out", type=Path, default=Path("refinement.json"), help="kept after every truth, taken up")
     a = parser.parse_args()
     rows = json.loads(a.out.read_text()) if a.out.exists() else []
@@ -189,7 +190,7 @@ def main() -> None:
         for seed in range(a.first, a.first + a.truths):
             for wrong, n in ((w, n) for w in a.wrong for n in a.n):
                 if (name, wrong, n, seed) not in done:
-                    rows.append(judged(at, name, seed, n, wrong, a.draws))
+                    rows.append(judged(at, name, seed, n, wrong, a.draws, a.prior_share))
                     a.out.write_text(json.dumps(rows))
     print("| system | wrong | n | 50 % | 80 % | 95 % | gain, nats | exact | widening | truths | not refined |")
     print("|---|---|---|---|---|---|---|---|---|---|---|")
