@@ -8,8 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.scipy.special import ndtri
 
-from bayessim_mjx.distributions import charts
+from bayessim_mjx.distributions import box, charts
 from bayessim_mjx.inference.calibration import LEVELS
 from bayessim_mjx.linalg import inverse_lower
 
@@ -17,6 +18,7 @@ Mixtures = tuple[Array, Array, Array]  # log weights [n, K], means [n, K, d], Ch
 
 DRAWS = 64  # of each posterior
 MOST = 512  # rows looked at
+TOGETHER = 64  # of them at once
 FACTORS = np.geomspace(0.75, 1 / 0.75, 15).astype(np.float32)
 REGIONS = np.asarray(LEVELS, np.float32)  # that should hold as many truths as they say
 DOUBT = 0.15  # standard deviation of the factor's log before anything is seen: a few rows are off by chance
@@ -30,11 +32,15 @@ def levels(key: Array, mixtures: Mixtures, z: Array, chart: str) -> Array:
     none of the posterior's.
     """
 
+    n, d = z.shape
+    # one call for all random numbers: each is a program of its own size, and several were a fifth of the compilation
+    uniforms = jax.random.uniform(key, (n, DRAWS * (1 + d) + 1), minval=1e-7)
+
     def one(inputs: tuple[Array, Array, Array, Array, Array]) -> Array:
-        key, logits, means, scales, z = inputs
-        key_part, key_noise, key_rank = jax.random.split(key, 3)
-        part = jax.random.categorical(key_part, logits, shape=(DRAWS,))
-        noise = jax.random.normal(key_noise, (DRAWS, z.shape[0]))
+        uniform, logits, means, scales, z = inputs
+        chance, rank = uniform[:-1].reshape(DRAWS, 1 + d), uniform[-1]
+        part = box.choose(chance[:, 0], logits)
+        noise = ndtri(chance[:, 1:])
         draws = means[part] + jnp.sum(scales[part] * noise[:, None, :], axis=-1)
         points = jnp.concatenate([z[None], draws])
         gap = points[:, None, None, :] - means[None, :, None, :]
@@ -45,9 +51,9 @@ def levels(key: Array, mixtures: Mixtures, z: Array, chart: str) -> Array:
         inside = jnp.all((draws >= 0) & (draws <= 1), axis=-1) | (chart != "plain")
         which = jnp.stack([density[1:] > density[0], density[1:] == density[0], jnp.ones(DRAWS, bool)])
         denser, equal, whole = jnp.sum(inside[None] & which, axis=-1, dtype=jnp.float32)
-        return (denser + (equal + 1.0) * jax.random.uniform(key_rank)) / (whole + 1.0)
+        return (denser + (equal + 1.0) * rank) / (whole + 1.0)
 
-    return jax.lax.map(one, (jax.random.split(key, z.shape[0]), *mixtures, z), batch_size=64)
+    return jax.lax.map(one, (uniforms, *mixtures, z), batch_size=TOGETHER)
 
 
 def factor(key: Array, at: Callable[[Array], Mixtures], z: Array, mask: Array, chart: str) -> Array:

@@ -12,8 +12,10 @@ from jax import Array
 
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.inference import mdn
+from bayessim_mjx.inference.coverage_factor import TOGETHER
 from bayessim_mjx.inference.state import FitState, standardise
 
+MOST = 4096  # held-out rows
 GOLDEN = np.uint32(2654435769)  # 2^32 / golden ratio: spreads the validation rows evenly over any number of rows
 
 
@@ -45,7 +47,8 @@ def prepare(state: FitState, thetas: Array, x: Array, count: Array) -> tuple[Fit
     share = np.uint32(round(state.settings.validation * 2**32))
     held = valid & (rows.astype(jnp.uint32) * GOLDEN < share)
     held = jnp.where(jnp.any(held), held, valid)  # a handful of rows: better to validate on them than not at all
-    room = min(x.shape[0], int(state.settings.validation * x.shape[0]) + 8, 4096)
+    # a multiple of what is looked at together: a remainder would be another program of the same
+    room = min(x.shape[0], -(-(int(state.settings.validation * x.shape[0]) + 8) // TOGETHER) * TOGETHER, MOST)
     order = jnp.argsort(~held)[:room]
     train = jnp.where(jnp.any(valid & ~held), valid & ~held, valid)
     y = mdn.to_y(u, state.settings.chart)

@@ -11,12 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from bayessim_mjx.distributions import Distribution, charts
+from bayessim_mjx.distributions import Distribution, charts, evaluate
 from bayessim_mjx.inference import coverage_factor, identify, mdn
 from bayessim_mjx.inference.data import Data
 from bayessim_mjx.inference.settings import InferenceSettings
 from bayessim_mjx.inference.state import FitState
-from bayessim_mjx.inference.train import objective
+from bayessim_mjx.inference.train import objective_of
 
 SCORED = 256  # validation rows for which the truncated density is reported
 SHARPNESS = np.geomspace(0.35, 4.0, 21).astype(np.float32)  # of the parts, tried on the held-out rows
@@ -32,13 +32,11 @@ def posteriors(state: FitState, z: Array) -> Distribution:
     return jax.vmap(build)(*mixtures(state, z))
 
 
-def mixtures(state: FitState, z: Array) -> tuple[Array, Array, Array]:
+def mixtures(state: FitState, z: Array) -> mdn.Heads:
     """Log weights [n, E K], means and factors of the ensemble's mixture."""
     d, settings = len(state.space), state.settings
-    logits, *others = jax.vmap(lambda params: mdn.mixture(params, z, d, settings))(parts(state.params))
-    leaves = logits + state.params["share"][:, None, None], *others
-    joined = [jnp.moveaxis(leaf, 0, 1).reshape(z.shape[0], -1, *leaf.shape[3:]) for leaf in leaves]
-    return joined[0], joined[1], joined[2]
+    each = jax.vmap(lambda params: mdn.mixture(params, z, d, settings))(parts(state.params))
+    return joined(each, state.params["share"])
 
 
 def parts(params: Any) -> Any:
@@ -47,17 +45,39 @@ def parts(params: Any) -> Any:
     return {**jax.tree.map(lambda leaf: leaf[params["member"]], params), **own}
 
 
-def weigh(params: Any, data: Data, settings: InferenceSettings) -> Any:
+def heads(params: Any, data: Data, settings: InferenceSettings) -> mdn.Heads:
+    """What each member makes of the held-out rows, as it is by itself: leaves [E, V, K, ...].
+
+    All that follows training is computed from it: each forward pass would be compiled once more.
+    """
+    x, d = data.x[data.held], data.y.shape[-1]
+    return jax.vmap(lambda p: mdn.forward({**p, "sharpness": jnp.ones(())}, x, d, settings))(params)
+
+
+def parts_of(members: mdn.Heads, params: Any) -> mdn.Heads:
+    """The mixture's parts, from what the members make of the same rows: leaves [E, V, K, ...]."""
+    weights, means, factors = (leaf[params["member"]] for leaf in members)
+    return weights, means, factors * params["sharpness"].reshape(-1, *[1] * (factors.ndim - 1))
+
+
+def joined(leaves: mdn.Heads, share: Array) -> mdn.Heads:
+    """One mixture per row of those of its parts, leaves [E, n, K, ...] -> [n, E K, ...]."""
+    logits = leaves[0] + share[:, None, None]
+    found = [jnp.moveaxis(leaf, 0, 1).reshape(leaf.shape[1], -1, *leaf.shape[3:]) for leaf in (logits, *leaves[1:])]
+    return found[0], found[1], found[2]
+
+
+def weigh(params: Any, data: Data, settings: InferenceSettings, members: mdn.Heads | None = None) -> Any:
     """The mixture's parts, as many as members: whose network each is, how sharp, its weight; by the held-out density.
 
     Networks that disagree make a mixture that is wider than it need be, a single one is narrower than it may be; and
     where a network is far better in some places than in others, itself sharper and itself wider make the peak and the
-    tails of a posterior that holds as often as it says.
+    tails of a posterior that holds as often as it says. `members` are their `heads`, where they are known.
     """
-    score = partial(objective, rows=data.held, data=data, settings=settings)
+    own = heads(params, data, settings) if members is None else members
 
     def scores(sharpness: Array) -> Array:
-        density = jax.vmap(lambda p: score({**p, "sharpness": sharpness}))(params)
+        density = jax.vmap(lambda h: objective_of(mdn.sharper(h, sharpness), data.held, data, settings))(own)
         return jnp.where(data.mask[None, :] > 0, jnp.maximum(density, -1e6), 0.0)  # [E, V]
 
     table = jax.lax.map(scores, jnp.asarray(SHARPNESS))  # [S, E, V]
@@ -95,54 +115,67 @@ def weigh(params: Any, data: Data, settings: InferenceSettings) -> Any:
     return {**params, "sharpness": sharpness, "member": member, "share": mixed(choice, share, CLIMBS)[0]}
 
 
-def as_deep(state: FitState, data: Data) -> FitState:
+def as_deep(state: FitState, data: Data, members: mdn.Heads) -> FitState:
     """All parts sharper or wider by one factor, so that held-out truths lie as deep in their posteriors as they should.
 
     The weights and sharpnesses of the best density leave them too wide where errors have long tails, as most are then
     smaller than it says: 62 % of truths in the 50 % regions of BayesSimIG's data.
     """
-    rows = data.held[: coverage_factor.MOST]
-    centre, sd = (np.float32(v) for v in charts.SCORE[state.settings.chart])
+    most, settings, share = coverage_factor.MOST, state.settings, state.params["share"]
+    centre, sd = (np.float32(v) for v in charts.SCORE[settings.chart])
+    own = parts_of(jax.tree.map(lambda leaf: leaf[:, :most], members), state.params)
+    logits, means, scales = joined(mdn.converted(own, settings), share)
 
-    def at(factor: Array) -> tuple[Array, Array, Array]:
-        params = {**state.params, "sharpness": state.params["sharpness"] * factor}
-        return mixtures(replace(state, params=params), data.x[rows])
+    def at(factor: Array) -> mdn.Heads:
+        if mdn.bounded(settings):
+            return joined(mdn.converted(mdn.sharper(own, factor), settings), share)
+        return logits, means, scales / factor
 
-    mask = data.mask[: coverage_factor.MOST]
+    mask, truth = data.mask[:most], data.y[data.held[:most]] * sd + centre
     # the same draws in every fit: weights that are kept keep their factor
-    factor = coverage_factor.factor(jax.random.PRNGKey(0), at, data.y[rows] * sd + centre, mask, state.settings.chart)
+    factor = coverage_factor.factor(jax.random.PRNGKey(0), at, truth, mask, settings.chart)
     return replace(state, params={**state.params, "sharpness": state.params["sharpness"] * factor})
 
 
-def held_out_gain(state: FitState, data: Data) -> Array:
-    """Mean log density of y of the ensemble's mixture over the held-out rows."""
-    value = jax.vmap(lambda params: objective(params, data.held, data, state.settings))(parts(state.params))
-    value = jax.nn.logsumexp(value + state.params["share"][:, None], axis=0)
-    return jnp.sum(jnp.where(data.mask > 0, value, 0.0)) / jnp.sum(data.mask)
+def held_out(own: mdn.Heads, share: Array, data: Data, settings: InferenceSettings) -> Array:
+    """Log density of y of the mixture of these parts at the held-out rows [V]."""
+    value = jax.vmap(lambda h: objective_of(h, data.held, data, settings))(own)
+    return jax.nn.logsumexp(value + share[:, None], axis=0)
 
 
-def marginal_gain(heads: tuple[Array, Array, Array], y: Array, settings: InferenceSettings) -> Array:
+def average(value: Array, mask: Array) -> Array:
+    """Mean over the held-out rows [V]."""
+    return jnp.sum(jnp.where(mask > 0, value, 0.0)) / jnp.sum(mask)
+
+
+def marginal_gain(mixture: mdn.Heads, y: Array, settings: InferenceSettings) -> Array:
     """log marginal density of each parameter relative to its prior at y [n, d] -> [n, d]."""
     centre, sd = (np.float32(v) for v in charts.SCORE[settings.chart])
     z = y * sd + centre
     if settings.chart == "plain":
-        return identify.marginal_gain(*heads, z)
-    logits, means, scales = heads
+        return identify.marginal_gain(*mixture, z)
+    logits, means, scales = mixture
     spread = jnp.sqrt(jnp.sum(scales**2, axis=-1))  # [n, K, d]
     density = jax.scipy.stats.norm.logpdf((z[:, None, :] - means) / spread) - jnp.log(spread)
     marginal = jax.nn.logsumexp(jax.nn.log_softmax(logits)[:, :, None] + density, axis=1)
     return marginal + charts.log_slope(z[..., None], settings.chart)
 
 
-def truncated_scores(state: FitState, data: Data, thetas: Array) -> dict[str, Array]:
-    rows, mask = data.held[:SCORED], data.mask[:SCORED]
-    posterior = posteriors(state, data.x[rows])
+def truncated_scores(
+    state: FitState, data: Data, thetas: Array, own: mdn.Heads, mixture: mdn.Heads
+) -> dict[str, Array]:
+    """Scores of the density cut off at the box, from the parts and from their mixture at the held-out rows."""
+    settings, rows, mask = state.settings, data.held[:SCORED], data.mask[:SCORED]
     truth = jnp.where(mask[:, None] > 0, thetas[rows], jnp.asarray(state.space.nominal)[None, :])
-    gain = jax.vmap(lambda q, theta: q.log_gain(theta))(posterior, truth)
+    # as a `Distribution` has it: of the prior, not of a proposal, and cut off afterwards
+    plain = settings if settings.coordinates != "truncated" else replace(settings, coordinates="plain")
+    value = held_out(own, state.params["share"], data._replace(proposals=None, origin=None), plain)[:SCORED]
+    inside = jnp.zeros(len(rows))
+    if settings.chart == "plain":
+        inside = jax.vmap(evaluate.log_inside)(*(leaf[:SCORED] for leaf in mixture))
+    w0 = settings.defensive
+    gain = jnp.log1p(-w0) + value + data.slopes[rows] - inside
+    gain = jnp.logaddexp(jnp.log(w0), gain)
     prior = jax.vmap(state.space.log_prior)(truth)
-
-    def average(value: Array) -> Array:
-        return jnp.sum(jnp.where(mask > 0, value, 0.0)) / jnp.sum(mask)
-
-    scores = {"gain_truncated": average(gain), "log_q": average(gain + prior)}
-    return {**scores, "inside": average(jnp.exp(posterior.log_inside))}
+    scores = {"gain_truncated": average(gain, mask), "log_q": average(gain + prior, mask)}
+    return {**scores, "inside": average(jnp.exp(inside), mask)}

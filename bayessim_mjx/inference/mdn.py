@@ -9,6 +9,7 @@ I + A^T A, never broader than the prior, for products and sequential rounds.
 from __future__ import annotations
 
 from functools import partial
+from itertools import pairwise
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +22,8 @@ from bayessim_mjx.inference.densities import Drop, Params
 from bayessim_mjx.inference.gaussians import LOG_2PI, log_gaussian, overlap
 from bayessim_mjx.inference.settings import InferenceSettings
 from bayessim_mjx.linalg import inverse_lower, lower_factor, product
+
+Heads = tuple[Array, Array, Array]  # log weights [n, K], centres [n, K, d], factors A [n, K, d, d]
 
 UNUSED = -60.0  # log weight of components that a member does not use
 CUT_POINTS = 16  # quasi-Monte-Carlo points of a component's mass inside the box, in training
@@ -77,16 +80,19 @@ def init(key: Array, settings: InferenceSettings, dim_x: int, d: int, count: Arr
         dim_x = settings.embedding.size(dim_x)
     own, widths = densities.started(jax.random.fold_in(key, 1), settings, dim_x)
     more, sizes = {**more, **own}, (*widths, head_size(d, settings))
-    keys = jax.random.split(key, len(sizes))
     gains = [1.0] * (len(sizes) - 2) + [0.1]
-    layers = [
-        {"w": jax.random.normal(k, (n, m)) * np.float32(gain / np.sqrt(n)), "b": jnp.zeros(m)}
-        for k, n, m, gain in zip(keys, sizes, sizes[1:], gains, strict=False)
-    ]
     k = settings.components
+    # one call for all random numbers: each is a program of its own size, and they took half of the compilation
+    shapes = list(pairwise(sizes))
+    drawn = jax.random.normal(key, (sum(n * m for n, m in shapes) + k * d,))
+    *drawn, spread = jnp.split(drawn, np.cumsum([n * m for n, m in shapes]))
+    layers = [
+        {"w": w.reshape(n, m) * np.float32(gain / np.sqrt(n)), "b": jnp.zeros(m)}
+        for w, (n, m), gain in zip(drawn, shapes, gains, strict=True)
+    ]
     count = jnp.asarray(k if count is None else count)
     several = (count > 1).astype(jnp.float32)
-    biases = layers[-1]["b"].at[k : k + k * d].set(0.7 * several * jax.random.normal(keys[-1], (k * d,)))
+    biases = layers[-1]["b"].at[k : k + k * d].set(0.7 * several * spread)
     layers[-1] = {"w": layers[-1]["w"] * several, "b": biases}
     more["used"] = jnp.where(jnp.arange(k, dtype=jnp.int32) < count, 0.0, UNUSED)
     # set by held-out rows: factor on all precisions' square roots, log weight in the ensemble, whose network it is
@@ -108,9 +114,7 @@ def hidden(params: Params, x: Array, settings: InferenceSettings, drop: Drop | N
     return densities.density_of(settings).hidden(params, x, drop)
 
 
-def forward(
-    params: Params, x: Array, d: int, settings: InferenceSettings, drop: Drop | None = None
-) -> tuple[Array, Array, Array]:
+def forward(params: Params, x: Array, d: int, settings: InferenceSettings, drop: Drop | None = None) -> Heads:
     """Standardised x [n, D] -> log weights [n, K], centres mu [n, K, d], factors A [n, K, d, d] in y coordinates."""
     n, k = x.shape[0], settings.components
     last, x = params["layers"][-1], embedded(params, x, settings)
@@ -140,7 +144,12 @@ def log_prob(params: Params, x: Array, y: Array, settings: InferenceSettings) ->
     return density(forward(params, x, y.shape[-1], settings), y, settings)
 
 
-def density(heads: tuple[Array, Array, Array], y: Array, settings: InferenceSettings) -> Array:
+def sharper(heads: Heads, factor: Array) -> Heads:
+    """All factors A times one number."""
+    return heads[0], heads[1], heads[2] * factor
+
+
+def density(heads: Heads, y: Array, settings: InferenceSettings) -> Array:
     """`log_prob` from what `forward` gives."""
     weights, means, factors = heads
     z = jnp.sum(factors * (y[:, None, :] - means)[:, :, None, :], axis=-1)  # A (y - mu)
@@ -153,7 +162,7 @@ def density(heads: tuple[Array, Array, Array], y: Array, settings: InferenceSett
     return value
 
 
-def log_inside(heads: tuple[Array, Array, Array]) -> Array:
+def log_inside(heads: Heads) -> Array:
     """log mass of each row's mixture inside the cube, plain chart -> [n]; differentiable."""
     weights, means, factors = heads
     n, k, d = means.shape
@@ -165,7 +174,7 @@ def log_inside(heads: tuple[Array, Array, Array]) -> Array:
     return jnp.maximum(jax.nn.logsumexp(weights + mass.reshape(n, k), axis=-1), LEAST_INSIDE)
 
 
-def log_tilt(heads: tuple[Array, Array, Array], proposal: Distribution, settings: InferenceSettings) -> Array:
+def log_tilt(heads: Heads, proposal: Distribution, settings: InferenceSettings) -> Array:
     """log of the integral of q(theta | x) proposal(theta) / prior(theta), in closed form: one proposal per row -> [n].
 
     Non-atomic SNPE-C (Greenberg et al. 2019): pairs simulated from the proposal follow q proposal / (prior Z), with
@@ -193,13 +202,18 @@ def log_tilt(heads: tuple[Array, Array, Array], proposal: Distribution, settings
 
 def mixture(params: Params, x: Array, d: int, settings: InferenceSettings) -> tuple[Array, Array, Array]:
     """Mixture in the chart: log weights [n, K], means [n, K, d], Cholesky factors of the covariances [n, K, d, d]."""
-    weights, means, factors = forward(params, x, d, settings)
+    return converted(forward(params, x, d, settings), settings)
+
+
+def converted(heads: Heads, settings: InferenceSettings) -> tuple[Array, Array, Array]:
+    """`mixture` from what `forward` gives, [..., K] in place of [n, K]."""
+    weights, means, factors = heads
     centre, sd = (np.float32(v) for v in charts.SCORE[settings.chart])
     if not bounded(settings):
         # covariance (A^T A)^-1 = A^-1 A^-T, and A^-1 is lower triangular
         return weights, centre + means * sd, inverse_lower(factors) * sd
     # I + A^T A = L L^T, its inverse is (L^-T) (L^-T)^T; mean = mu - (I + A^T A)^-1 mu
-    eye = jnp.broadcast_to(jnp.eye(d), factors.shape)
+    eye = jnp.broadcast_to(jnp.eye(means.shape[-1]), factors.shape)
     lower = lower_factor(jnp.concatenate([jnp.swapaxes(factors, -1, -2), eye], axis=-1))
     scales = lower_factor(jnp.swapaxes(inverse_lower(lower), -1, -2))
     shrunk = product(scales, product(jnp.swapaxes(scales, -1, -2), means[..., None]))[..., 0]

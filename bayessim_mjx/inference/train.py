@@ -9,6 +9,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from jax import Array
 from jax.flatten_util import ravel_pytree
@@ -18,6 +19,7 @@ from bayessim_mjx.inference.data import Data
 from bayessim_mjx.inference.linear_start import linear_start
 from bayessim_mjx.inference.settings import InferenceSettings
 
+APART = np.uint32(2654435769)  # between the keys of points of the curve: the steps of each have the next ones
 CURVE = 40  # points of the loss curves, at least
 PACE = 0.5  # of steps in the trials of bases: at the full rate one was once judged by how it shook (damped pendulum)
 TRIED = 150  # gradient steps at least (and a fortieth) that bases are tried for, and before a training may end early
@@ -41,8 +43,13 @@ def objective(
     x: Array | None = None,
 ) -> Array:
     """What training maximises, per row: log q(theta | x), less the log of what the proposal makes of it."""
-    x, y = data.x[rows] if x is None else x, data.y[rows]
-    heads = mdn.forward(params, x, y.shape[-1], settings, drop)
+    x = data.x[rows] if x is None else x
+    return objective_of(mdn.forward(params, x, data.y.shape[-1], settings, drop), rows, data, settings)
+
+
+def objective_of(heads: mdn.Heads, rows: Array, data: Data, settings: InferenceSettings) -> Array:
+    """`objective` from what the network makes of the rows' summaries."""
+    y = data.y[rows]
     if data.proposals is None or data.origin is None:
         return mdn.density(heads, y, settings)
     own = data.origin[rows]
@@ -93,7 +100,8 @@ class _Member:
         order = jnp.argsort(jnp.where(train, jax.random.uniform(key, train.shape), jnp.inf))
         count = jnp.maximum(jnp.sum(train.astype(jnp.int32)), 1)
         place = jnp.arange(chunk * batch, dtype=jnp.int32).reshape(chunk, batch) % count
-        return order[place], jax.random.split(jax.random.fold_in(key, 1), chunk)
+        # the next keys: those of other points of the curve are APART, and what drops units hashes its key
+        return order[place], key[None, :] + jnp.arange(1, chunk + 1, dtype=key.dtype)[:, None]
 
 
 def train(
@@ -116,7 +124,6 @@ def train(
     member, starts = _member(params, rate, data, settings, points * chunk)
     patience = max(points // 40, -(-TRIED // chunk))
     trial = patience if tried > 1 else 0
-    keys = jax.random.split(key, trial + points)
     values = jax.vmap(member.held_out)(starts, jnp.arange(tried, dtype=jnp.int32))
 
     def begin(basis: Array) -> tuple[tuple, tuple]:
@@ -130,7 +137,7 @@ def train(
         basis = jnp.where(i == 0, jnp.argmin(jax.lax.all_gather(best[0], MEMBERS)[:tried]), basis)
         inner, best = jax.tree.map(lambda a, b: jnp.where(i == 0, a, b), begin(basis), (inner, best))
         step = partial(member.step, basis, jnp.where(i < 0, PACE, 1.0))
-        inner, losses = jax.lax.scan(step, inner, member.batches(keys[i + trial], chunk))
+        inner, losses = jax.lax.scan(step, inner, member.batches(key + (i + trial).astype(key.dtype) * APART, chunk))
         value = member.held_out(inner[0], basis)
         better = value < best[0]
         best = jax.tree.map(lambda a, b: jnp.where(better, a, b), (value, inner[0], i), best)

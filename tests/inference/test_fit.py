@@ -46,7 +46,7 @@ def exact(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def trained():
     thetas, x = linear_gaussian(4000)
     settings = dataclasses.replace(SMALL, max_steps=2000, epochs=100)
-    return fit(key(1), init(key(), settings, SPACE, 4), thetas, x)
+    return fit(key(1), init(key(2), settings, SPACE, 4), thetas, x)
 
 
 THETA = np.asarray([1.5, 1.0])
