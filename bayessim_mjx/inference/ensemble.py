@@ -67,14 +67,14 @@ def joined(leaves: mdn.Heads, share: Array) -> mdn.Heads:
     return found[0], found[1], found[2]
 
 
-def weigh(params: Any, data: Data, settings: InferenceSettings, members: mdn.Heads | None = None) -> Any:
+def weigh(params: Any, data: Data, settings: InferenceSettings, known: mdn.Heads | None = None) -> Any:
     """The mixture's parts, as many as members: whose network each is, how sharp, its weight; by the held-out density.
 
     Networks that disagree make a mixture that is wider than it need be, a single one is narrower than it may be; and
     where a network is far better in some places than in others, itself sharper and itself wider make the peak and the
-    tails of a posterior that holds as often as it says. `members` are their `heads`, where they are known.
+    tails of a posterior that holds as often as it says. `known` are the `heads`, where there are.
     """
-    own = heads(params, data, settings) if members is None else members
+    own = heads(params, data, settings) if known is None else known
 
     def scores(sharpness: Array) -> Array:
         density = jax.vmap(lambda h: objective_of(mdn.sharper(h, sharpness), data.held, data, settings))(own)

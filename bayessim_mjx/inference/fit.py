@@ -39,7 +39,7 @@ def _run(function: Any, *given: Any, static: tuple[int, ...] = ()) -> Any:
     return function(*given) if inside else _program(function, static)(*given)
 
 
-def _blank(key: Array, settings: InferenceSettings, dim_x: int, d: int) -> tuple:
+def _blank(key: Array, settings: InferenceSettings, dim_x: int, d: int) -> dict[str, Any]:
     """Weights of the whole ensemble `[E, ...]`, and what a FitState has besides them: one program."""
     counts = jnp.asarray(mdn.counts(settings))
     params = jax.vmap(lambda k, count: mdn.init(k, settings, dim_x, d, count))(
@@ -47,7 +47,8 @@ def _blank(key: Array, settings: InferenceSettings, dim_x: int, d: int) -> tuple
     )
     params["member"] = jnp.arange(settings.ensemble, dtype=jnp.int32)
     basis = jnp.eye(dim_x) if whitening.count(settings, dim_x) > 1 else None
-    return params, jnp.zeros(dim_x), jnp.ones(dim_x), basis, jnp.asarray(0, jnp.int32), jnp.ones(d, bool)
+    scales = {"x_mean": jnp.zeros(dim_x), "x_rate": jnp.ones(dim_x), "basis": basis}
+    return {"params": params, **scales, "fits": jnp.asarray(0, jnp.int32), "identified": jnp.ones(d, bool)}
 
 
 def init(key: Array, settings: InferenceSettings, space: Any, dim_x: int) -> FitState:
@@ -55,7 +56,8 @@ def init(key: Array, settings: InferenceSettings, space: Any, dim_x: int) -> Fit
     if dim_x < 1:
         raise UserError(f"dim_x = {dim_x}: a summary needs at least one feature")
     settings = settings.at(space)
-    return FitState(*_run(_blank, key, settings, dim_x, len(space), static=(1, 2, 3)), settings, space)
+    blank = _run(_blank, key, settings, dim_x, len(space), static=(1, 2, 3))
+    return FitState(**blank, settings=settings, space=space)
 
 
 def fit(

@@ -85,10 +85,10 @@ def init(key: Array, settings: InferenceSettings, dim_x: int, d: int, count: Arr
     # one call for all random numbers: each is a program of its own size, and they took half of the compilation
     shapes = list(pairwise(sizes))
     drawn = jax.random.normal(key, (sum(n * m for n, m in shapes) + k * d,))
-    *drawn, spread = jnp.split(drawn, np.cumsum([n * m for n, m in shapes]))
+    *weights, spread = jnp.split(drawn, np.cumsum([n * m for n, m in shapes]))
     layers = [
         {"w": w.reshape(n, m) * np.float32(gain / np.sqrt(n)), "b": jnp.zeros(m)}
-        for w, (n, m), gain in zip(drawn, shapes, gains, strict=True)
+        for w, (n, m), gain in zip(weights, shapes, gains, strict=True)
     ]
     count = jnp.asarray(k if count is None else count)
     several = (count > 1).astype(jnp.float32)

@@ -32,15 +32,17 @@ def main() -> None:
     parser.add_argument("--problem", default="pendulum", choices=list(PROBLEMS))
     parser.add_argument("--simulations", type=int, default=1000)
     args, rest = parser.parse_known_args()
-    if jax.config.jax_compilation_cache_dir:
+    if jax.config.values["jax_compilation_cache_dir"]:
         parser.error("unset JAX_COMPILATION_CACHE_DIR: programs that are found there are not compiled")
     problem, settings = PROBLEMS[args.problem](), InferenceSettings(**dict(map(option, rest)))
     thetas, x = jax.block_until_ready(problem.pairs(jax.random.PRNGKey(0), args.simulations))
     seconds: dict[str, dict[str, float]] = collections.defaultdict(lambda: collections.defaultdict(float))
 
-    def listen(event: str, duration: float, **more: Any) -> None:
+    def listen(event: str, duration_secs: float, **kwargs: str | int) -> None:
         if event in STAGES:
-            seconds[str(more.get("fun_name", "")).removeprefix("jit(").removesuffix(")")][STAGES[event]] += duration
+            seconds[str(kwargs.get("fun_name", "")).removeprefix("jit(").removesuffix(")")][STAGES[event]] += (
+                duration_secs
+            )
 
     jax.monitoring.register_event_duration_secs_listener(listen)
     for number in ("first", "second"):
