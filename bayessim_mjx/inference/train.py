@@ -19,7 +19,7 @@ from bayessim_mjx.inference.data import Data
 from bayessim_mjx.inference.linear_start import linear_start
 from bayessim_mjx.inference.settings import InferenceSettings
 
-APART = np.uint32(0x85EBCA6B)  # between the keys of points of the curve: the steps of each have the next ones
+APART = np.uint32(2654435769)  # between the keys of points of the curve: the steps of each have the next ones
 CURVE = 40  # points of the loss curves, at least
 PACE = 0.5  # of steps in the trials of bases: at the full rate one was once judged by how it shook (damped pendulum)
 TRIED = 150  # gradient steps at least (and a fortieth) that bases are tried for, and before a training may end early

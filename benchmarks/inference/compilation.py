@@ -40,9 +40,8 @@ def main() -> None:
 
     def listen(event: str, duration_secs: float, **kwargs: str | int) -> None:
         if event in STAGES:
-            seconds[str(kwargs.get("fun_name", "")).removeprefix("jit(").removesuffix(")")][STAGES[event]] += (
-                duration_secs
-            )
+            name = str(kwargs.get("fun_name", "")).removeprefix("jit(").removesuffix(")")
+            seconds[name][STAGES[event]] += duration_secs
 
     jax.monitoring.register_event_duration_secs_listener(listen)
     for number in ("first", "second"):
