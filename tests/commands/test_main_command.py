@@ -88,7 +88,6 @@ def interrupted_round(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.ci
 def test_main_interrupted_in_a_round_keeps_the_round(toy: None, monkeypatch: Any) -> None:
     with monkeypatch.context() as patch:
         interrupted_round(patch)
@@ -117,7 +116,6 @@ def write_pendulum_logs(folder: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.ci
 def test_a_real_process_on_logs_survives_sigkill(tmp_path: Path) -> None:
     """kill -9 after the first checkpoint, --resume: the last checkpoint is that of an unkilled run, and it plays."""
     write_pendulum_logs(tmp_path / "recorded")

@@ -249,7 +249,6 @@ def recorded(env, tmp_path_factory):
 
 
 @pytest.mark.slow
-@pytest.mark.ci
 def test_logs_give_back_the_parameters_they_were_made_with(env, recorded):
     folder, truth = recorded
     from_logs = settings(

@@ -90,7 +90,6 @@ def test_reality_unlike_simulation_is_told_by_name_and_part_of_the_randomisation
 
 
 @pytest.mark.slow
-@pytest.mark.ci
 def test_a_truth_beyond_the_range_is_told_with_parameter_and_side():
     _, info = infer(*made(*TESTED, mass=1.15))
     (told,) = [text for text in info.warnings if "end of its range" in text]
@@ -98,7 +97,6 @@ def test_a_truth_beyond_the_range_is_told_with_parameter_and_side():
 
 
 @pytest.mark.slow
-@pytest.mark.ci
 def test_an_over_confident_network_gets_a_temperature_which_is_told_kept_and_used(usual):
     parts, start = made(*TESTED, quiet=0.5)
     state, info = infer(parts, start)
@@ -116,7 +114,6 @@ def test_an_over_confident_network_gets_a_temperature_which_is_told_kept_and_use
 
 
 @pytest.mark.slow
-@pytest.mark.ci
 def test_products_of_several_trajectories_are_judged_and_widened():
     """A network's errors are the same for all trajectories at one theta; sets of them show it."""
     parts, state = made("bayessim.checkTrajs=40", "bayessim.realTrajs=8", "bayessim.ensemble=1")

@@ -13,7 +13,7 @@ from bayessim_mjx.physics import Physics
 from bayessim_mjx.rollout import replay
 from bayessim_mjx.tracking import Record
 
-pytestmark = [pytest.mark.slow, pytest.mark.ci]
+pytestmark = pytest.mark.slow  # CI runs two rounds of the loop with it, test_refining.py
 
 SLIDER = """<mujoco><option timestep=".02" gravity="0 0 0"/><worldbody><body name="cart">
   <joint name="x" type="slide" axis="1 0 0" damping="1"/><geom size=".1" mass="2"/></body></worldbody>

@@ -82,7 +82,6 @@ def follow(model, i, seconds, period=0.02, sigma=1e-4):
 
 
 @pytest.mark.slow
-@pytest.mark.ci
 def test_a_load_fifteen_times_its_flange_is_found_again(tmp_path):
     """3 kg, 0.2 m beyond and 0.05 m above the flange's centre; integrated by Runge-Kutta at a quarter of the step."""
     truth = compiled(load=LOAD, step=0.0005, integrator="RK4")

@@ -8,7 +8,7 @@ from bayessim_mjx.diagnosis.summary import assemble, whole_logs
 from tests.diagnosis import pendulums
 from tests.diagnosis.pendulums import PERIOD, nominal, recorded
 
-pytestmark = [pytest.mark.slow, pytest.mark.ci]  # whole diagnoses and fits
+pytestmark = pytest.mark.slow  # whole diagnoses; CI runs those of one of them
 
 EFFECTS = ("coulomb_friction", "viscous_friction")
 
@@ -19,6 +19,7 @@ def rubbing(tmp_path_factory):
     return run.investigate(nominal(tmp_path_factory.mktemp("rubbing")), logs, EFFECTS)
 
 
+@pytest.mark.ci
 def test_a_log_begins_as_its_first_window(rubbing):
     cut = rubbing.setup.fitter.simulator.windows
     stages = {
@@ -34,6 +35,7 @@ def test_a_log_begins_as_its_first_window(rubbing):
         np.testing.assert_allclose(row[: cut.steps], stage.prediction.error[first], atol=0.05)
 
 
+@pytest.mark.ci
 def test_whole_logs_are_the_third_horizon(rubbing):
     diagnosis = assemble.diagnosis_of(rubbing)
     short, window, log = diagnosis.gap.horizons
@@ -57,6 +59,7 @@ def test_an_unstable_motion_counts_as_long_as_it_can_be_predicted(tmp_path, monk
     assert over.seconds < 2.5 and (over.name.startswith("up to") or not len(over.group))
 
 
+@pytest.mark.ci
 def test_the_start_s_uncertainty_decides_how_long():
     grows = 1e-3 * np.exp(5.0 * PERIOD * np.arange(200))  # in parts of the motion, 5/s
     steps = whole_logs._predictable(np.repeat(grows[None, :, None], 4, 0), np.ones(1))
