@@ -134,7 +134,7 @@ BUDGET = [
     "ppo.num_envs=4", "ppo.num_steps=4", "ppo.num_epochs=1", "ppo.num_minibatches=1", "ppo.hidden_actor=[4]",
     "ppo.hidden_critic=[4]", "ppo.eval_episodes=4", "--max_iterations=1", "bayessim.realEvals=4",
     "bayessim.realIters=1", "bayessim.realTrajs=6", "bayessim.trainTrajs=6000", "bayessim.trainTrajLen=20",
-    "bayessim.hiddenLayers=[64,64]", "bayessim.ensemble=2", "bayessim.components=3", "bayessim.checkTrajs=0",
+    "bayessim.hiddenLayers=[64,64]", "bayessim.ensemble=2", "bayessim.components=3", "bayessim.checkTrajs=100",
     "monitor.posterior_plots=False", "monitor.video=False", "--headless", "--seed", "1",
     "task.randomization_params.actor_params.pendulum.rigid_body_properties.mass.range=[0.7,1.7]",
     "task.randomization_params.actor_params.pendulum.rigid_shape_properties.length.range=[0.6,1.2]",
@@ -159,11 +159,12 @@ CASES = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "case", [pytest.param(c, marks=[] if c == "position controller" else [pytest.mark.ci]) for c in CASES]
-)
+@pytest.mark.parametrize("case", [pytest.param(c, marks=pytest.mark.ci if "actuator" in c else []) for c in CASES])
 def test_main_gives_back_what_the_logs_were_made_with(case: str, tmp_path: Path, monkeypatch) -> None:
-    """Segments begin in the middle of logs: `main real.logs=` finds mass, length and what is hidden, |z| < 2 each."""
+    """Segments begin in the middle of logs: `main real.logs=` finds mass, length and what is hidden, |z| < 2 each.
+
+    With the posterior of all segments judged and widened as users have it: without, a delay's |z| was up to 2.5.
+    """
     monkeypatch.chdir(tmp_path)
     hidden, effects, expected = CASES[case]
     folder = write_logs(tmp_path / "logs", hidden)
