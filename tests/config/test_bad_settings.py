@@ -179,7 +179,7 @@ def test_an_override_may_add_effects_and_gravity_but_no_unknown_group() -> None:
 
 
 @pytest.mark.parametrize(
-    "task", ["Pendulum", "Cartpole", "Ant", "Quadcopter", "Ingenuity", "Humanoid", "FrankaCabinet"]
+    "task", ["Pendulum", "Cartpole", "Ant", "Quadcopter", "Ingenuity", "Humanoid", "FrankaCabinet", "Anymal"]
 )
 def test_a_section_as_bayessimig_writes_it_loads(task: str, tmp_path: Path) -> None:
     """It has `color` beside the groups, no frequency, and schedules that are constant."""

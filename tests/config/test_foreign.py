@@ -77,6 +77,23 @@ task:
         dof_properties:
           stiffness: {range: [0.1, 2.0], operation: scaling, distribution: uniform, schedule: constant}
 """,
+    "Anymal": """
+env: {numEnvs: 4000, envSpacing: 4., realParams: {weights: [1.0], means: [[4.0, 0.2]], stds: [[0.001, 0.001]]},
+  plane: {staticFriction: 1.0}, baseInitState: {pos: [0.0, 0.0, 0.62]}, randomCommandVelocityRanges: {yaw: [-1., 1.]},
+  control: {stiffness: 85.0, damping: 2.0, actionScale: 0.5}, defaultJointAngles: {LF_HAA: 0.03},
+  urdfAsset: {fixBaseLink: False}, learn: {torqueRewardScale: -0.000025, episodeLength_s: 50}, viewer: {refEnv: 0},
+  asset: {assetRoot: somewhere}}
+sim: {substeps: 2, physx: {num_threads: 4}}
+bayessim: {trainTrajs: 10000, collectPolicy: policy_random, summarizerFxn: summary_corrdiff, trainTrajLen: 20}
+task:
+  randomize: True
+  randomization_params:
+    actor_params:
+      anymal:
+        color: True
+        rigid_body_properties:
+          mass: {range: [0.01, 5.0], operation: scaling, distribution: uniform, schedule: constant, schedule_steps: 0}
+""",
     "Pendulum": """
 env: {numEnvs: 100, episodeLength: 200, realParams: {weights: [1.0], means: [[1.0, 0.5]], stds: [[1.0e-5, 1.0e-5]]}}
 rkhsnet: {enable: True, nFeat: 100}
@@ -100,6 +117,8 @@ LEFT_OUT = {
     "env.aggregateMode, env.actionScale, env.dofVelocityScale, env.distRewardScale, env.rotRewardScale, "
     "env.aroundHandleRewardScale, env.openRewardScale, env.fingerDistRewardScale, env.actionPenaltyScale, env.asset, "
     "color",
+    "Anymal": "sim, env.envSpacing, env.plane, env.baseInitState, env.randomCommandVelocityRanges, env.control, "
+    "env.defaultJointAngles, env.urdfAsset, env.learn, env.viewer, env.asset, color",
     "Pendulum": "rkhsnet",
 }
 
@@ -120,7 +139,7 @@ def test_files_made_like_bayessimigs_load_whole_with_one_note(task: str, tmp_pat
     if task == "Pendulum":
         assert registry.make(task, config=loaded).space.names == ("pendulum_mass_mult", "pendulum_length_mult")
         return
-    if task == "FrankaCabinet":
+    if task in ("Anymal", "FrankaCabinet"):
         assert registry.make(task, config=loaded).space == registry.make(task).space
         return
     model = mujoco.MjModel.from_xml_string(BODY)
