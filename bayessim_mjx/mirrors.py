@@ -242,6 +242,31 @@ def _difference(model: mujoco.MjModel, i: int, k: int, cosine: float) -> float:
     return sum(float(np.linalg.norm(a - b) / (np.linalg.norm(a) + np.linalg.norm(b) + 1e-12)) for a, b in pairs)
 
 
+def joints_by_side(model: mujoco.MjModel, sides: tuple[str, str], normal: str = "y") -> dict[str, str]:
+    """`Mirror.joints` of a robot whose joints are named after their sides, ("left", "right"); signs by their axes.
+
+    Raises:
+        UserError: naming a joint that turns about no mirror image of its partner's axis in the pose qpos0.
+    """
+    data, names = mujoco.MjData(model), [_joint_name(model, i) for i in range(model.njnt)]
+    mujoco.mj_kinematics(model, data)
+    polar = np.array([-1.0 if axis == normal else 1.0 for axis in AXES])
+    images = {}
+    for i, name in enumerate(names):
+        others = (name.replace(*sides, 1), name.replace(*sides[::-1], 1))
+        k = next((names.index(other) for other in others if other != name and other in names), i)
+        if model.jnt_type[i] == mujoco.mjtJoint.mjJNT_FREE or names[k] in images:
+            continue
+        hinge = model.jnt_type[i] == mujoco.mjtJoint.mjJNT_HINGE
+        cosine = float((-polar if hinge else polar) * data.xaxis[i] @ data.xaxis[k])
+        if abs(cosine) < PARALLEL:
+            raise UserError(
+                f"mirror: the axis of {names[k]!r} is not the mirror image of {name!r}'s; name the pairs by hand"
+            )
+        images[name] = "-" * (cosine < 0) + names[k]
+    return images
+
+
 def resolve(mirror: Mirror, model: mujoco.MjModel, groups: Mapping[str, Sequence[str]]) -> MirrorMap:
     """The maps that `mirror` means for this model and the observations called `groups[group]`; UserError."""
     known = {name for names in groups.values() for name in names}

@@ -4,7 +4,7 @@ import pkgutil
 
 from bayessim_mjx import tasks
 
-BASES = ("manipulation",)  # public modules of tasks/ that hold what several tasks share
+BASES = ("locomotion", "manipulation")  # public modules of tasks/ that hold what several tasks share
 
 
 def names() -> list[str]:

@@ -1,6 +1,6 @@
 """What Isaac Gym's two runners share: they run along +x, to a target 1000 m away, and observe their feet's loads."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -13,25 +13,16 @@ from bayessim_mjx.physics.warp import wrenches
 
 TARGET = np.array([1000.0, 0.0], np.float32)  # m
 LOADS = tuple(f"{kind}_{i}" for kind in ("force", "torque") for i in "xyz")  # of a foot
-ROOT = (
-    "height",
-    *(f"velocity_{i}" for i in "xyz"),
-    *(f"angular_velocity_{i}" for i in "xyz"),
-    *("yaw", "roll", "angle_to_target", "up_projection", "heading_projection"),
-)
-TURNED = ("velocity_y", "angular_velocity_x", "angular_velocity_z", "yaw", "roll", "angle_to_target")
+HEADING = ("yaw", "roll", "angle_to_target", "up_projection", "heading_projection")
 
 
-def root(qpos: jax.Array, qvel: jax.Array, spin_scale: float = 1.0) -> jax.Array:
-    """`[12]`, see ROOT: m, m/s and `spin_scale` x rad/s in the torso's axes, rad, cosines."""
+def heading(qpos: jax.Array) -> jax.Array:
+    """`[5]`, see HEADING: rad, cosines."""
     turn = rotation(qpos[3:7])
     yaw, roll = jnp.arctan2(turn[1, 0], turn[0, 0]), jnp.arctan2(turn[2, 1], turn[2, 2])
     to_target = TARGET - qpos[:2]
     bearing = jnp.arctan2(to_target[1], to_target[0])
-    up, heading = posture(qpos)
-    angles = jnp.stack([wrap(yaw), wrap(roll), wrap(bearing - yaw), up, heading])
-    # MuJoCo's angular velocity of a free joint is in the body frame already
-    return jnp.concatenate([qpos[2:3], turn.T @ qvel[:3], spin_scale * qvel[3:6], angles])
+    return jnp.stack([wrap(yaw), wrap(roll), wrap(bearing - yaw), *posture(qpos)])
 
 
 def posture(qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -51,18 +42,6 @@ def approach(before: jax.Array, after: jax.Array) -> jax.Array:
     return (after[:2] - before[:2]) @ (a + b) / (jnp.linalg.norm(a) + jnp.linalg.norm(b))
 
 
-def limits(mj_model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper ends `[nv - 6]` of the joints behind the floating base, rad."""
-    low, high = mj_model.jnt_range[1:].astype(np.float32).T
-    return low, high
-
-
-def scaled_joints(mj_model: mujoco.MjModel, qpos: jax.Array) -> jax.Array:
-    """Joint positions `[nv - 6]`, -1 at the lower and 1 at the upper limit."""
-    low, high = limits(mj_model)
-    return (2 * qpos[7:] - high - low) / (high - low)
-
-
 def foot_loads(model: mjx.Model, mj_model: mujoco.MjModel, data: mjx.Data, feet: Sequence[str]) -> jax.Array:
     """`[6 feet]`: contact force (N) and torque about the foot's origin (N m) of each foot, in the foot's frame."""
     by_body = wrenches(model, data)
@@ -72,3 +51,9 @@ def foot_loads(model: mjx.Model, mj_model: mujoco.MjModel, data: mjx.Data, feet:
     arm = data.subtree_com[1] - data.xpos[bodies]
     wrench = jnp.stack([force, torque + jnp.cross(arm, force)], axis=1)
     return jnp.einsum("fji,fkj->fki", data.xmat[bodies], wrench).ravel()
+
+
+def mirrored_loads(partner: Mapping[str, str]) -> dict[str, str]:
+    """Images of the loads of these feet in a mirror of left and right, by the names of observations."""
+    turned = ("force_y", "torque_x", "torque_z")
+    return {f"{a}_{load}": "-" * (load in turned) + f"{b}_{load}" for a, b in partner.items() for load in LOADS}

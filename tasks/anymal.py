@@ -6,70 +6,53 @@ it the other way, so that a tilt could not be told from the yaw. Joints have an 
 integrates the drives' gains explicitly; their speeds are not limited.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 import mujoco
-import numpy as np
 
-from bayessim_mjx.env import Observations, Task
-from bayessim_mjx.frames import rotation
-from bayessim_mjx.mirrors import Mirror
 from bayessim_mjx.physics import World, mjx
+from bayessim_mjx.tasks.locomotion import Locomotion
 
 LEGS = ("LF", "LH", "RF", "RH")  # left fore, left hind, right fore, right hind
-JOINTS = tuple(f"{leg}_{joint}" for leg in LEGS for joint in ("HAA", "HFE", "KFE"))
-HOME = np.array([0.03, 0.4, -0.8, 0.03, -0.4, 0.8, -0.03, 0.4, -0.8, -0.03, -0.4, 0.8], np.float32)  # rad
-REACH = 0.5  # rad, of a joint's target from HOME at the action 1
-START = (0.0, 0.0, 0.62, 1.0, 0.0, 0.0, 0.0)  # of the base, m and quaternion
-COMMANDS = {"command_x": 2.0, "command_y": 1.0, "command_yaw": 1.0}  # largest, m/s and rad/s
 SECONDS = 50.0  # of an episode
 STEP = {"isaacgymenvs": 0.02, "bayessim2021": 1 / 60}  # s
-SPEED_SCALE, SPIN_SCALE, JOINT_SPEED_SCALE = 2.0, 0.25, 0.05
-TRACKING, TURNING, TORQUE = 1.0, 0.5, 2.5e-5  # weights, per second
-WIDTH = 0.25  # of tracking rewards, m^2/s^2 and rad^2/s^2
-
-NAMES = (
-    *(f"{kind}_{i}" for kind in ("velocity", "angular_velocity", "gravity") for i in "xyz"),
-    *COMMANDS,
-    *(f"{joint}_{kind}" for kind in ("position", "velocity", "action") for joint in JOINTS),
-)
 
 
-def _mirror() -> Mirror:
-    """Left and right (y -> -y): hips' roll joints (HAA) turn the other way."""
-    turned = ("velocity_y", "angular_velocity_x", "angular_velocity_z", "gravity_y", "command_y", "command_yaw")
-    return Mirror(
-        joints={j: "-" * j.endswith("HAA") + j.replace("L", "R", 1) for j in JOINTS if j.startswith("L")},
-        observations={name: f"-{name}" for name in turned},
-        task=("command_y", "command_yaw"),
-        normal="y",
-    )
+def _home(leg: str) -> dict[str, float]:
+    """rad; hind legs are bent the other way, right ones are spread the other way."""
+    spread, bent = (0.03 if leg[0] == "L" else -0.03), (1 if leg[1] == "F" else -1)
+    return {f"{leg}_HAA": spread, f"{leg}_HFE": 0.4 * bent, f"{leg}_KFE": -0.8 * bent}
 
 
-class Anymal(Task):
-    """48 observations: NAMES, speeds x 2, turning x 0.25, joints' places from HOME (rad), their speeds x 0.05 (rad/s).
+class Anymal(Locomotion):
+    """48 observations: speeds x 2, turning x 0.25, joints' places from home (rad), their speeds x 0.05 (rad/s).
 
-    Actions: the joints' targets from HOME / 0.5 rad. The reward, all of it times the control step and never negative:
+    Actions: the joints' targets from home / 0.5 rad. The reward, all of it times the control step and never negative:
     exp(-|velocity error|^2 / 0.25) + 0.5 exp(-(turning error)^2 / 0.25) - 2.5e-5 |torques|^2.
     """
 
     control_dt: ClassVar[float] = STEP["isaacgymenvs"]
     default_episode_length: ClassVar[int] = 2500
     options: ClassVar[dict[str, Any]] = {"episodeLength": None}  # 50 s
-    speed_limit: ClassVar[float] = 1000.0  # what explodes must not reach the critic
     observation_clip: ClassVar[dict[str, float | None]] = {"isaacgymenvs": 5.0, "bayessim2021": 100.0}
-    observation_names: ClassVar[tuple[str, ...]] = NAMES
-    mirror = (_mirror(),)
-
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
-        model = self.mj_model
-        guards = [i for i in range(model.ngeom) if model.geom(i).name.endswith("_guard")]
-        self._guards, self._reach = np.array(guards), model.geom_size[guards, 0].astype(np.float32)
+    observations: ClassVar[Mapping[str, Any]] = {
+        **{"velocity": 2.0, "turning": 0.25, "gravity": 1.0, "commands": (2.0, 2.0, 0.25)},
+        **{"joints": 1.0, "joint_speeds": 0.05, "actions": 1.0},
+    }
+    rewards: ClassVar[Mapping[str, float]] = {"velocity": 1.0, "turning": 0.5, "torques": -2.5e-5}  # per second
+    commands: ClassVar[Mapping[str, float]] = {"command_x": 2.0, "command_y": 1.0, "command_yaw": 1.0}
+    home: ClassVar[Mapping[str, float]] = {joint: place for leg in LEGS for joint, place in _home(leg).items()}
+    speed_spread: ClassVar[float] = 0.1
+    reach: ClassVar[float] = 0.5  # rad
+    guards: ClassVar[Sequence[str]] = (
+        *(f"{leg}_{place}_guard" for place in ("base", "thigh", "knee") for leg in LEGS),
+        "lidar_guard",
+    )
+    sides: ClassVar[tuple[str, str]] = ("L", "R")
 
     def _read(self, config: Mapping[str, Any] | Any) -> dict[str, Any]:
         settings = super()._read(config)
@@ -82,40 +65,13 @@ class Anymal(Task):
         return spec
 
     def initial(self, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        key_q, key_v = jax.random.split(key)
-        joints = HOME * jax.random.uniform(key_q, (12,), minval=0.5, maxval=1.5)
-        qvel = jax.random.uniform(key_v, (12,), minval=-0.1, maxval=0.1)
-        return jnp.concatenate([jnp.array(START), joints]), jnp.concatenate([jnp.zeros(6), qvel])
-
-    def start(self, key: jax.Array, world: World) -> dict[str, Any]:
-        share = jax.random.uniform(key, (len(COMMANDS),), minval=-1.0, maxval=1.0)
-        return {name: most * share[i] for i, (name, most) in enumerate(COMMANDS.items())}
-
-    def command(self, action: jax.Array) -> jax.Array:
-        return HOME + REACH * action
-
-    def observe(self, world: World, data: mjx.Data, action: jax.Array) -> Observations:
-        qpos, qvel = world.measurement["qpos"], world.measurement["qvel"]
-        turn, commands = rotation(qpos[3:7]), jnp.stack([world.task[name] for name in COMMANDS])
-        parts = [
-            SPEED_SCALE * (turn.T @ qvel[:3]),
-            SPIN_SCALE * qvel[3:6],  # MuJoCo's angular velocity of a free joint is in the body frame already
-            -turn[2],
-            jnp.array([SPEED_SCALE, SPEED_SCALE, SPIN_SCALE]) * commands,
-            qpos[7:] - HOME,
-            JOINT_SPEED_SCALE * qvel[6:],
-            action,
-        ]
-        return {"policy": jnp.concatenate(parts)}
+        """As the base has it, but with joints at 0.5 to 1.5 times home."""
+        qpos, qvel = super().initial(key)
+        share = jax.random.uniform(jax.random.fold_in(key, 2), (12,), minval=0.5, maxval=1.5)
+        return qpos.at[7:].multiply(share), qvel
 
     def reward(
         self, before: World, after: World, data: mjx.Data, action: jax.Array
     ) -> tuple[jax.Array, jax.Array, dict[str, jax.Array]]:
-        velocity, task = rotation(after.qpos[3:7]).T @ after.qvel[:3], after.task
-        error = (task["command_x"] - velocity[0]) ** 2 + (task["command_y"] - velocity[1]) ** 2
-        turning = (task["command_yaw"] - after.qvel[5]) ** 2
-        cost = TORQUE * jnp.sum(data.qfrc_actuator[6:] ** 2)
-        reward = TRACKING * jnp.exp(-error / WIDTH) + TURNING * jnp.exp(-turning / WIDTH) - cost
-        fallen = jnp.any(data.geom_xpos[self._guards, 2] < self._reach)
-        metrics = {"velocity_error": jnp.sqrt(error), "turning_error": jnp.sqrt(turning), "height": after.qpos[2]}
+        reward, fallen, metrics = super().reward(before, after, data, action)
         return self.dt * jnp.maximum(reward, 0.0), fallen, metrics
