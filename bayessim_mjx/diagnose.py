@@ -55,7 +55,8 @@ def _parser() -> cli.PlainParser:
         "--criteria",
         metavar="KEY=VALUE",
         nargs="*",
-        help="decide by one comparison of all models tried, instead of step by step, with these numbers changed",
+        default=[],
+        help="change numbers by which models are compared and one is named, as same=.3 (docs/diagnosis.md)",
     )
     parser.add_argument("--out", metavar="DIR", default="diagnosis", help="folder for the results (default: diagnosis)")
     parser.add_argument("--seed", metavar="N", type=cli.whole(0, SEEDS), default=0, help="random seed (default: 0)")
@@ -107,7 +108,7 @@ def _diagnosis(args: argparse.Namespace, say: Any) -> "Diagnosis":
         map=args.map,
         group=args.group,
         tolerance=args.tolerance,
-        criteria=None if args.criteria is None else Criteria().changed(args.criteria),
+        criteria=Criteria().changed(args.criteria),
         seed=args.seed,
         out=args.out,
         progress=say,

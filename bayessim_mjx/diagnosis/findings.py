@@ -14,7 +14,7 @@ from bayessim_mjx.diagnosis.residual.frequency import Heard
 from bayessim_mjx.diagnosis.result import Place
 from bayessim_mjx.diagnosis.selection.heldout import Prediction
 from bayessim_mjx.diagnosis.selection.models import Model
-from bayessim_mjx.diagnosis.selection.outcome import Outcome
+from bayessim_mjx.diagnosis.selection.selected import Selection
 from bayessim_mjx.diagnosis.setup import Setup
 
 Progress = Callable[[str, int, int], None]  # (what is being done, done, total)
@@ -36,7 +36,7 @@ class Findings:
     """What is known so far; `assemble.diagnosis_of` turns it into a Diagnosis.
 
     Attributes:
-        setup, outcome: what was fixed before the race, and what the race came to.
+        setup, selection: what was fixed before any fit, and what the selection came to.
         predictions: {"nominal", "calibrated", "with_effects": held-out motion}.
         disturbance: the force that the recalibrated simulator lacks; None where its gap is the noise.
         flexible_base, flexible_winner: a flexible force on the recalibrated simulator, on top of the effects.
@@ -46,7 +46,7 @@ class Findings:
     """
 
     setup: Setup
-    outcome: Outcome
+    selection: Selection
     predictions: Mapping[str, Prediction] = field(default_factory=lambda: MappingProxyType({}))
     disturbance: Disturbance | None = None
     flexible_base: Flexible | None = None
@@ -58,7 +58,7 @@ class Findings:
     @property
     def model(self) -> Model:
         """The model of the verdict: the known parameters with the effects that are named."""
-        return self.outcome.answer
+        return self.selection.answer
 
     def having(self, part: Any) -> Findings:
         """With what one more stage found."""

@@ -115,11 +115,6 @@ def bound(at: float, unit: str) -> str:
     return f"ends at its bound {at:.3g}{unit}; a wider range explains no more"
 
 
-def simpler_instead(closed: float, against: float) -> str:
-    """Why special cases together are a rival of their law."""
-    return f"simpler laws in its place close {percent(closed)} against {percent(against)}"
-
-
 def close_by(nats: float, behind: float) -> str:
     """Why a model is a rival: how little evidence and closure part it from what is named."""
     return f"held-out evidence differs by {nats:.1f} nats, {percent(max(behind, 0.0))} of the gap"

@@ -1,4 +1,4 @@
-"""The diagnosis from logs to result: what was logged, the race, and the stages after it, one after the other."""
+"""The diagnosis from logs to result: what was logged, the selection, and the stages after it, one after the other."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from bayessim_mjx.diagnosis.residual import frequency, where
 from bayessim_mjx.diagnosis.residual.disturbance import Disturbance, estimate
 from bayessim_mjx.diagnosis.residual.flexible import Flexible, flexible
 from bayessim_mjx.diagnosis.result import Diagnosis
-from bayessim_mjx.diagnosis.selection import heldout, outcome
+from bayessim_mjx.diagnosis.selection import heldout, selected
 from bayessim_mjx.diagnosis.selection.criteria import Criteria
 from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.selection.tried import Settings, Tried
@@ -49,9 +49,9 @@ class Stage:
 
 def how_far(found: Findings, say: Progress) -> Findings:
     """With the held-out motion of the simulator as delivered, recalibrated and with the effects."""
-    fitter, base, model = found.setup.fitter, found.outcome.base, found.model
+    fitter, base, model = found.setup.fitter, found.selection.base, found.model
     predictions = {
-        "nominal": heldout.nominal(fitter, found.outcome.nominal),
+        "nominal": heldout.nominal(fitter, found.selection.nominal),
         "calibrated": heldout.predict(fitter, base),
     }
     predictions["with_effects"] = heldout.predict(fitter, model) if model.effects else predictions["calibrated"]
@@ -60,8 +60,8 @@ def how_far(found: Findings, say: Progress) -> Findings:
 
 def none_of_these(found: Findings, say: Progress) -> Findings:
     """With the force that is missing, what a flexible force makes of it, and which links of the chain are sound."""
-    base, model, setup = found.outcome.base, found.model, found.setup
-    missing = estimate(setup.fitter, base.fit) if found.outcome.above_noise(base) else None
+    base, model, setup = found.selection.base, found.model, found.setup
+    missing = estimate(setup.fitter, base.fit) if found.selection.above_noise(base) else None
     on_base = _flexible(found, base, missing)
     on_winner = _flexible(found, model) if model.effects else on_base
     links = tuple(link for log in setup.logs[:1] for link in channels.links(log, setup.robot.mj_model))
@@ -70,7 +70,7 @@ def none_of_these(found: Findings, say: Progress) -> Findings:
 
 def _flexible(found: Findings, model: Model, missing: Disturbance | None = None) -> Flexible | None:
     """The flexible force on a model whose gap is above the noise."""
-    if not found.outcome.above_noise(model):
+    if not found.selection.above_noise(model):
         return None
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -81,7 +81,7 @@ def where_it_lies(found: Findings, say: Progress) -> Findings:
     """With the places of the recalibrated simulator's gap, maps of the missing force and its spectra."""
     if found.disturbance is None:
         return found
-    fitter, fit = found.setup.fitter, found.outcome.base.fit
+    fitter, fit = found.setup.fitter, found.selection.base.fit
     places, maps, told = where.locate(fitter, fit, found.disturbance, seed=found.setup.seed)
     spectra = frequency.analyse(fitter, fit, found.disturbance)
     return found.having(Where(tuple(places), tuple(maps), spectra, tuple(told)))
@@ -117,10 +117,10 @@ def investigate(
     Args:
         robot: the model with the parameters that it may recalibrate.
         logs, effects, group, seed, criteria, progress: see `diagnose`; tolerated: its `tolerance`.
-        settings: of the race; None: by the robot's size.
+        settings: budgets of the search; None: by the robot's size.
         notes: what was noticed while model and logs were read, for the warnings.
-        stages: after the race, optional ones last; None: `STAGES`.
-        keep: called with what is known while the race goes on: the setup, and after each part what was tried.
+        stages: after the selection, optional ones last; None: `STAGES`.
+        keep: called with what is known while the search goes on: the setup, and after each part what was tried.
         verdict: called with the findings before the optional stages.
 
     Raises:
@@ -131,8 +131,8 @@ def investigate(
     say("looking at the logs", 0, 1)
     setup = prepare(robot, logs, effects, group=group, seed=seed, settings=settings, tolerated=tolerated, notes=notes)
     known(setup, None)
-    race = setup.fitter, setup.candidates, setup.settings
-    found = Findings(setup, outcome.select(*race, say, lambda tried: known(setup, tried), criteria))
+    given = setup.fitter, setup.candidates, setup.settings, criteria or Criteria()
+    found = Findings(setup, selected.select(*given, say, lambda tried: known(setup, tried)))
     stages = STAGES if stages is None else stages
     for stage in stages:
         found = found if stage.optional else _after(stage, found, say)
@@ -182,7 +182,7 @@ def diagnose(
         map: YAML file that maps the columns of the logs to the model.
         group: metadata key of the operating conditions that are held out in turn.
         tolerance: what may stay unexplained, as `--tolerance`: "0.5deg", "elbow=2mm", "3%".
-        criteria: of one decision over all models tried; None: the rules of the race, step by step.
+        criteria: when one model is better than another and which is named; None: as measured in benchmarks/results.md.
         seed: of all random numbers.
         out: folder for what the command writes, but for the report; None: nothing is written.
         progress: called with (what is being done, done, total).

@@ -1,4 +1,4 @@
-"""What is fixed before the race: usable logs, the model and its time step, windows, candidates, noise, tolerance."""
+"""What is fixed before any fit: usable logs, the model and its time step, windows, candidates, noise, tolerance."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class TooLittleData(Exception):
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """Everything that is fixed before the race."""
+    """Everything that is fixed before any fit."""
 
     robot: Robot
     physics: Physics
@@ -94,7 +94,7 @@ def prepare(
 
     Args:
         robot, logs, effects, group, seed, tolerated: see `run.diagnose`.
-        settings: of the race; None: by the robot's size.
+        settings: budgets of the search; None: by the robot's size.
         notes: what was noticed before, first among the warnings.
 
     Raises:
@@ -125,9 +125,9 @@ def prepare(
 
 
 def _settings(robot: Robot) -> Settings:
-    """Budgets for the robot's size; thresholds are the same for all."""
+    """Budgets for the robot's size; criteria are the same for all."""
     big = robot.mj_model.nv > CUTTING.many
-    return Settings(singles=24, pairs=5, screened=24, starts=16) if big else Settings()
+    return Settings(singles=24, screened=24, starts=16) if big else Settings()
 
 
 def _measured(

@@ -16,11 +16,10 @@ from bayessim_mjx.diagnosis.experiment.excitation import Excitation, menu
 from bayessim_mjx.diagnosis.experiment.limits import Limits, limits_of
 from bayessim_mjx.diagnosis.experiment.rehearsal import Drives, Played, Rehearsal
 from bayessim_mjx.diagnosis.findings import Findings, Progress
-from bayessim_mjx.diagnosis.selection.models import Model
-from bayessim_mjx.diagnosis.selection.outcome import Outcome
+from bayessim_mjx.diagnosis.selection.models import Model, nats
+from bayessim_mjx.diagnosis.selection.selected import Selection
 from bayessim_mjx.diagnosis.selection.tried import ranked
 from bayessim_mjx.diagnosis.selection.uncertainty import win_share
-from bayessim_mjx.diagnosis.selection.verdict import ALIKE
 from bayessim_mjx.effects.support.bodies import tilted
 
 Array = NDArray[np.float64]
@@ -33,6 +32,7 @@ class Budget:
     seconds: float = 10.0
     most: int = 4  # models compared
     nothing: float = 1.0  # nats: less separates nobody
+    mild: float = 10.0  # nats: below, evidence between two models is called a tie
     budget: int = 6000  # windows simulated for a first look at the whole menu
     final: int = 3  # experiments looked at in full
     weight: float = 0.1  # least share of a surviving model
@@ -87,7 +87,7 @@ class Experiment:
 
 def stage(found: Findings, say: Progress) -> Findings:
     """With a proposal, where there is anything left to tell apart."""
-    wanted = found.model.effects or found.outcome.above_noise(found.outcome.base)
+    wanted = found.model.effects or found.selection.above_noise(found.selection.base)
     return found.having(propose(found)) if wanted else found
 
 
@@ -102,8 +102,10 @@ def propose(
     """
     setup, seed = found.setup, found.setup.seed
     cut, model = setup.fitter.simulator.windows, setup.physics.mj_model
-    models, contested = _contenders(found.outcome, rivals_models)
-    weights = np.maximum(win_share(models, cut.group, found.outcome.noise, np.random.default_rng(seed)), BUDGET.weight)
+    models, contested = _contenders(found.selection, rivals_models)
+    weights = np.maximum(
+        win_share(models, cut.group, found.selection.noise, np.random.default_rng(seed)), BUDGET.weight
+    )
     scorer = Scorer(setup, models, weights, seed)
     allowed = limits_of(model, cut.logs, limits)
     rows = max(cut.steps, int(round(BUDGET.seconds / cut.dt)) // cut.steps * cut.steps)
@@ -121,22 +123,18 @@ def propose(
     return replace(chosen, unsafe=[e.name for e in every if e.name not in safe])
 
 
-def _contenders(outcome: Outcome, given: Sequence[Model] | None) -> tuple[list[Model], bool]:
+def _contenders(of: Selection, given: Sequence[Model] | None) -> tuple[list[Model], bool]:
     """(winner and rivals, whether the logs left it open between them)."""
-    found = (
-        [r.model for rivals in outcome.rivals.values() for r in rivals if not r.contains] if given is None else given
-    )
-    found = list({id(m): m for m in found if m is not outcome.answer}.values())
+    found = [r.model for rivals in of.rivals.values() for r in rivals if not r.contains] if given is None else given
+    found = list({id(m): m for m in found if m is not of.answer}.values())
     if found:
-        return [outcome.answer, *found[: BUDGET.most - 1]], True
-    own = {c.effect for c in outcome.answer.effects}
-    losers = [m for m in ranked(outcome) if m is not outcome.answer and not {c.effect for c in m.effects} & own]
-    close = [
-        m for m in losers if abs(outcome.better(m, outcome.answer).evidence) < 3 * ALIKE.mild and (m.effects or own)
-    ]
-    if not outcome.answer.effects:  # nothing is wrong as far as these logs can tell: what could still hide?
+        return [of.answer, *found[: BUDGET.most - 1]], True
+    own = {c.effect for c in of.answer.effects}
+    losers = [m for m in ranked(of) if m is not of.answer and not {c.effect for c in m.effects} & own]
+    close = [m for m in losers if abs(nats(m, of.answer)) < 3 * BUDGET.mild and (m.effects or own)]
+    if not of.answer.effects:  # nothing is wrong as far as these logs can tell: what could still hide?
         close = close[:2]
-    return [outcome.answer, *close[: BUDGET.most - 2]], False
+    return [of.answer, *close[: BUDGET.most - 2]], False
 
 
 def _touched(joints: dict[str, int], models: Sequence[Model], model: Any) -> dict[str, int]:
@@ -214,7 +212,7 @@ def _decide(
     chosen = alone[0] if alone else None
     helped = next((s for s in final if s.needs), None)
     if helped and (
-        chosen is None or (chosen.evidence < ALIKE.mild and helped.evidence > 1.5 * chosen.evidence + BUDGET.nothing)
+        chosen is None or (chosen.evidence < BUDGET.mild and helped.evidence > 1.5 * chosen.evidence + BUDGET.nothing)
     ):
         chosen = helped
     useful = chosen is not None and (chosen.evidence > BUDGET.nothing or (len(labels) == 1 and chosen.evidence > 0.1))

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
-from bayessim_mjx.diagnosis.fitting.quadratic import Quadratic, Starts, blocks, eliminate, held_out, solve
+from bayessim_mjx.diagnosis.fitting.quadratic import Quadratic, Rest, Starts, blocks, eliminate, held_out, solve
 from bayessim_mjx.diagnosis.fitting.simulator import Simulator
 
 Array = NDArray[np.float64]
@@ -230,9 +230,19 @@ class Fitter:
         q, starts = fit.quadratic(self.spread)
         precision, pull, low, high = fit.prior()
         group = self.simulator.windows.group if group is None else group
-        watched = np.arange(len(self.base), len(fit.coordinates))
+        watched = self._watched(fit)
         split = functools.partial(blocks, q, starts, fit.r, fit.A)
         return held_out(q, group, fit.weight, precision, pull, low, high, watched, split)
+
+    def told_alone(self, fit: Fit) -> list[bool]:
+        """Of each condition, whether it alone tells a parameter of an effect (a limit that is reached there only)."""
+        q, _ = fit.quadratic(self.spread)
+        tells = Rest(q, fit.weight, *fit.prior()).told_by(self._watched(fit))
+        group = self.simulator.windows.group
+        return [tells(group == name) for name in np.unique(group)]
+
+    def _watched(self, fit: Fit) -> NDArray[np.int64]:
+        return np.arange(len(self.base), len(fit.coordinates))
 
 
 def _columns(r: Array, shifted: Array, steps: Sequence[float]) -> Array:

@@ -171,13 +171,8 @@ def held_out(
     Returns:
         (costs of the held-out windows `[W]`, estimates relative to the fit `[G, K]`).
     """
-    fit = _Rest(q, weight, precision, pull, low, high)
-    watched = np.arange(0) if watched is None else watched
-    known = _variances(fit.curvature(np.zeros(len(group), bool))[1])
-
-    def tells(out: NDArray[np.bool_]) -> bool:
-        return bool((_variances(fit.curvature(out)[1]) > RULES.only * known)[watched].any())
-
+    fit = Rest(q, weight, precision, pull, low, high)
+    tells = fit.told_by(np.arange(0) if watched is None else watched)
     costs, moves = np.zeros(len(group)), []
     for name in np.unique(group):
         out = group == name
@@ -193,7 +188,7 @@ def held_out(
 
 
 @dataclass(frozen=True, eq=False)
-class _Rest:
+class Rest:
     """Newton steps from a fit to what is left without some windows, or without blocks of them."""
 
     q: Quadratic
@@ -211,6 +206,11 @@ class _Rest:
         for share, g_block, S_block in blocks:
             g, S = g - share * g_block, S - share * S_block
         return g, S + np.diag(self.precision + RULES.trust * np.diag(S))
+
+    def told_by(self, watched: NDArray[np.int64]) -> Callable[[NDArray[np.bool_]], bool]:
+        """Whether some windows (given as `[W]` flags) alone tell one of the parameters `watched`."""
+        known = _variances(self.curvature(np.zeros(len(self.weight), bool))[1])
+        return lambda out: bool((_variances(self.curvature(out)[1]) > RULES.only * known)[watched].any())
 
     def step(self, out: NDArray[np.bool_], blocks: Sequence[tuple[float, Array, Array]] = ()) -> Array:
         g, S = self.curvature(out, blocks)

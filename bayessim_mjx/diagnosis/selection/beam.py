@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 from bayessim_mjx.diagnosis.selection.criteria import Criteria
-from bayessim_mjx.diagnosis.selection.decide import Selection, admissible, decide, order, relevant, same, settled, value
+from bayessim_mjx.diagnosis.selection.decide import Decision, admissible, decide, order, same, settled, value
 from bayessim_mjx.diagnosis.selection.table import BASE, Key, Table
 
 ROUNDS = 4  # of growing and looking around, at most
@@ -45,15 +45,15 @@ class Fitting(Protocol):
     def fit(self, plans: Sequence[Plan], label: str) -> None:
         """Fit what was not fitted before."""
 
-    def polish(self, key: Key) -> None:
-        """Bring the fit of a model to its end."""
+    def polish(self, keys: Sequence[Key]) -> None:
+        """Bring the fits of models to their end."""
 
     def simulate(self, keys: Sequence[Key]) -> Table:
-        """A table of some models, whose held-out windows are simulated and not predicted by linearisation."""
+        """A table of some models, refitted without each condition, whose held-out windows are then simulated."""
 
 
-def search(fits: Fitting, criteria: Criteria) -> Selection:
-    """Visit models until the best has no better neighbour, decide, and ask held-out simulations of the answer."""
+def search(fits: Fitting, criteria: Criteria) -> Decision:
+    """Visit models until the best has no better neighbour, and decide among finalists that are fitted to their end."""
     for _ in range(ROUNDS):
         best = _grow(fits, criteria)
         if not best:
@@ -61,8 +61,7 @@ def search(fits: Fitting, criteria: Criteria) -> Selection:
         other = _around(fits, best, criteria)
         if other == best or same(fits.table, best, other, criteria):
             break
-    table = fits.table
-    return _verified(fits, decide(table, order(table.laws), criteria), criteria)
+    return _final(fits, criteria)
 
 
 def leading(table: Table, criteria: Criteria) -> list[Key]:
@@ -75,7 +74,7 @@ def _best(fits: Fitting, criteria: Criteria) -> Key:
     """The leading model with its fit brought to its end."""
     for _ in range(criteria.beam):
         best = leading(fits.table, criteria)[0]
-        fits.polish(best)
+        fits.polish([best])
         if leading(fits.table, criteria)[0] == best:
             break
     return leading(fits.table, criteria)[0]
@@ -112,9 +111,8 @@ def _around(fits: Fitting, best: Key, criteria: Criteria) -> Key:
         plans += [Plan(rest | own, rest) for own in specialised(fits.table, best, label)]
     fits.fit([p for p in plans if len(p.key) <= criteria.most], "exchanges")
     table = fits.table
-    for key in leading(table, criteria)[: 2 * criteria.beam]:  # simpler ones that may not have come to their end
-        if table.rows[key].size < table.rows[best].size:
-            fits.polish(key)
+    ahead = leading(table, criteria)[: 2 * criteria.beam]  # simpler ones may not have come to their end
+    fits.polish([key for key in ahead if table.rows[key].size < table.rows[best].size])
     return _best(fits, criteria)
 
 
@@ -127,16 +125,32 @@ def specialised(table: Table, key: Key, label: str) -> list[Key]:
     return [frozenset([p]) for p in parts + places] + ([frozenset(parts)] if len(parts) > 1 else [])
 
 
-def _verified(fits: Fitting, found: Selection, criteria: Criteria) -> Selection:
-    """The selection without effects that do not help when held-out windows are really simulated."""
-    while found.answer:
+def finalists(found: Decision, criteria: Criteria) -> list[Key]:
+    """The known parameters, the best model, the answer and what may stand in its place."""
+    told = [a.key for a in found.rivals[: criteria.finalists]]
+    return list(dict.fromkeys([BASE, found.best, found.answer, *told]))
+
+
+def _final(fits: Fitting, criteria: Criteria) -> Decision:
+    """The decision among finalists whose fits came to their end and whose held-out windows are simulated.
+
+    With each effect of the answer left out: it is named only if it helps there as well.
+    """
+    less = order(fits.table.laws)
+    keys: list[Key] = []
+    for _ in range(ROUNDS):
+        found = decide(fits.table, less, criteria)
+        if set(finalists(found, criteria)) <= set(keys):
+            break
+        keys = finalists(found, criteria)
+        fits.polish(keys)
+    searched, table = found, fits.table
+    while True:
         smaller = [found.answer - {label} for label in found.answer]
         fits.fit([Plan(k, found.answer) for k in smaller], "dropping")
-        seen = fits.simulate([BASE, found.answer, *smaller])
-        idle = [k for k in smaller if not relevant(seen, k, found.answer, criteria, criteria.same / 2)]
-        if not idle:
-            return found
-        answer = min(idle, key=lambda k: seen.rows[k].total)
-        told = f"simulated: {' + '.join(sorted(found.answer - answer))} brings nothing"
-        found = replace(found, answer=answer, trace=(*found.trace, told))
-    return found
+        keys = list(dict.fromkeys([*keys, found.answer, *smaller]))
+        found = decide(fits.simulate(keys), less, criteria)
+        if all(found.answer - {label} in keys for label in found.answer):
+            return replace(
+                found, searched=table, trace=(*searched.trace, *(f"simulated: {step}" for step in found.trace))
+            )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -10,8 +9,8 @@ import numpy as np
 
 from bayessim_mjx.diagnosis import phrases
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate, Coordinate, shrink
-from bayessim_mjx.diagnosis.selection.models import Model, scored
-from bayessim_mjx.diagnosis.selection.race import Progress, Race, fresh
+from bayessim_mjx.diagnosis.selection.models import Model, nats, scored
+from bayessim_mjx.diagnosis.selection.pool import Pool, Progress, fresh
 from bayessim_mjx.diagnosis.selection.tried import ranked
 from bayessim_mjx.physics import Physics
 
@@ -25,7 +24,7 @@ class Widening:
     twice: float = 2.0
     farthest: float = 8.0
     nats: float = 2.0  # of held-out evidence that a wider range has to bring
-    leading: int = 3  # single effects whose ranges grow before pairs are looked at
+    leading: int = 3  # single effects whose ranges grow before further ones are added
     steps: int = 8  # of a fit in a wider range
 
 
@@ -46,28 +45,28 @@ class Bound:
     why: str
 
 
-def widened(race: Race, model: Model, say: Progress) -> Model:
+def widened(pool: Pool, model: Model, say: Progress) -> Model:
     """The model with ranges as wide as it takes for its effects' parameters to lie within, refitted.
 
     A range doubles as long as that brings held-out evidence, up to `farthest` times what it was. It stays where its end
     means that the effect is off, where physics ends, and where it sizes an effect's memory.
     """
     while True:
-        effects = tuple(_wider(race, model, e) for e in model.effects)
+        effects = tuple(_wider(pool, model, e) for e in model.effects)
         if all(new is old for new, old in zip(effects, model.effects, strict=True)):
             return model
         say("wider ranges", 0, 1)
-        new = _refitted(race, model, effects)
-        if 0.5 * new.samples * math.log(model.total / new.total) < WIDENING.nats:
+        new = _refitted(pool, model, effects)
+        if nats(model, new) < WIDENING.nats:
             return model
-        _adopt(race, new)
+        _adopt(pool, new)
         model = new
 
 
-def widen_leading(race: Race, say: Progress) -> None:
+def widen_leading(pool: Pool, say: Progress) -> None:
     """Wider ranges for the leading single effects: one that is held back at a bound must not lose for that."""
-    for model in ranked(race, 1)[: WIDENING.leading]:
-        widened(race, model, say)
+    for model in ranked(pool, 1)[: WIDENING.leading]:
+        widened(pool, model, say)
 
 
 def of(physics: Physics, coordinate: Coordinate, value: float) -> Bound | None:
@@ -109,9 +108,9 @@ def _farthest(physics: Physics, coordinate: Coordinate, end: str) -> float:
     return low / WIDENING.farthest if low > 0 else coordinate.neutral + WIDENING.farthest * (low - coordinate.neutral)
 
 
-def _wider(race: Race, model: Model, effect: Candidate) -> Candidate:
+def _wider(pool: Pool, model: Model, effect: Candidate) -> Candidate:
     """The effect with twice the range where one of its parameters ends at a bound that may move."""
-    physics = race.fitter.simulator.physics
+    physics = pool.fitter.simulator.physics
     values = model.values_of(effect)
     coordinates = tuple(_grown(physics, c, float(v)) for c, v in zip(effect.coordinates, values, strict=True))
     return effect if coordinates == effect.coordinates else replace(effect, coordinates=coordinates)
@@ -132,21 +131,21 @@ def _grown(physics: Physics, c: Coordinate, value: float) -> Coordinate:
     return replace(wider, precision=shrink(wider))
 
 
-def _refitted(race: Race, model: Model, effects: Sequence[Candidate]) -> Model:
-    fitter, base = race.fitter, len(race.fitter.base)
+def _refitted(pool: Pool, model: Model, effects: Sequence[Candidate]) -> Model:
+    fitter, base = pool.fitter, len(pool.fitter.base)
     own = {c.name: c for e in effects for c in e.coordinates}
     coordinates = tuple(c if i < base else own[c.name] for i, c in enumerate(model.fit.coordinates))
     start = fitter.refresh(replace(model.fit, coordinates=coordinates, history=(), damping=1e-3))
-    (fit,) = fitter.iterate([start], WIDENING.steps, lambda f: fresh(race, f))
+    (fit,) = fitter.iterate([start], WIDENING.steps, lambda f: fresh(pool, f))
     return scored(fitter, fitter.refresh(fit), tuple(effects))
 
 
-def _adopt(race: Race, new: Model) -> None:
-    """The race with a model's effects in their new ranges; what was fitted with the old ones stays as it is."""
+def _adopt(pool: Pool, new: Model) -> None:
+    """The pool with a model's effects in their new ranges; what was fitted with the old ones stays as it is."""
     own = {e.label: e for e in new.effects}
-    race.models[frozenset(own)] = new
-    race.candidates = [own.get(c.label, c) for c in race.candidates]
-    race.screened = [replace(s, candidate=own.get(s.candidate.label, s.candidate)) for s in race.screened]
+    pool.models[frozenset(own)] = new
+    pool.candidates = [own.get(c.label, c) for c in pool.candidates]
+    pool.screened = [replace(s, candidate=own.get(s.candidate.label, s.candidate)) for s in pool.screened]
 
 
 def spread_out(covariance: np.ndarray, values: np.ndarray, neutral: np.ndarray, at: Sequence[int]) -> np.ndarray:

@@ -39,20 +39,22 @@ class Alternative:
 
 
 @dataclass(frozen=True, eq=False)
-class Selection:
+class Decision:
     """What was decided.
 
     Attributes:
-        base: the known parameters alone; answer: the model that is named (`base` where nothing is).
+        answer: the model that is named (`BASE` where nothing is); best: the one that predicts best.
         rivals: the other least models that are the same, most likely first.
         table: what it rests on; trace: the steps in words.
+        searched: all models of the search that the table's were chosen from; None where these are all.
     """
 
-    base: Key
     answer: Key
+    best: Key
     rivals: tuple[Alternative, ...]
     table: Table
     trace: tuple[str, ...] = ()
+    searched: Table | None = None
 
 
 @dataclass(frozen=True)
@@ -162,7 +164,7 @@ def value(table: Table, key: Key, criteria: Criteria) -> float:
     return gain - len(key) * (criteria.nats + float(np.log(max(len(table.laws), 2))))
 
 
-def decide(table: Table, less: Order, criteria: Criteria) -> Selection:
+def decide(table: Table, less: Order, criteria: Criteria) -> Decision:
     """The answer that a table gives; pure."""
     rows = {k: r for k, r in table.rows.items() if admissible(r, criteria)}
     best = max(rows, key=lambda k: value(table, k, criteria))
@@ -175,7 +177,7 @@ def decide(table: Table, less: Order, criteria: Criteria) -> Selection:
     equal = [k for k in alike if k in rows] or [best]
     answer = least(table, equal, less)
     trace.append(f"the same as the best: {len(equal)}; least: {_told(answer)}, leaves {table.excess(answer):.3g}")
-    return Selection(BASE, answer, rivals(table, alike, answer, less), table, tuple(trace))
+    return Decision(answer, best, rivals(table, alike, answer, less), table, tuple(trace))
 
 
 def least(table: Table, equal: Iterable[Key], less: Order) -> Key:
@@ -189,8 +191,7 @@ def rivals(table: Table, equal: Iterable[Key], answer: Key, less: Order) -> tupl
     """The other least ones, the fewest effects and the best first; what is the answer and more is none."""
     others = [k for k in equal if k and k != answer and not answer < k]
     others = [k for k in others if not any(less(other, k) for other in others)]
-    above = max(table.excess(BASE), 1e-9)
-    found = [Alternative(k, compare(table, k, answer).nats, 1.0 - max(table.excess(k), 0.0) / above) for k in others]
+    found = [Alternative(k, compare(table, k, answer).nats, table.closed(k)) for k in others]
     return tuple(sorted(found, key=lambda a: (len(a.key), a.nats, sorted(a.key))))
 
 

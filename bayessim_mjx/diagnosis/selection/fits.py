@@ -1,4 +1,4 @@
-"""Fits of whole sets of effects for the search, on a race's simulator: extended, cut back, or all at once."""
+"""Fits of whole sets of effects for the search, on a pool's simulator: extended, cut back, or all at once."""
 
 from __future__ import annotations
 
@@ -9,10 +9,19 @@ import numpy as np
 
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fitter import Fit
-from bayessim_mjx.diagnosis.selection import dense, heldout, race
+from bayessim_mjx.diagnosis.selection import dense, heldout
 from bayessim_mjx.diagnosis.selection.beam import Plan
 from bayessim_mjx.diagnosis.selection.models import Model
-from bayessim_mjx.diagnosis.selection.race import Progress, Race
+from bayessim_mjx.diagnosis.selection.pool import (
+    Pool,
+    Progress,
+    compatible,
+    fit_entries,
+    polish,
+    special_cases,
+    start_of,
+    starts,
+)
 from bayessim_mjx.diagnosis.selection.screen import Screened, screen
 from bayessim_mjx.diagnosis.selection.table import BASE, Key, Law, Row, Table
 from bayessim_mjx.diagnosis.selection.uncertainty import deviations
@@ -31,31 +40,31 @@ LIMITS = Limits()
 
 
 class Fits:
-    """The models of a race, as a table of scores that grows with what the search asks for."""
+    """The models of a pool, as a table of scores that grows with what the search asks for."""
 
-    def __init__(self, race: Race, say: Progress) -> None:
-        self.race, self.say = race, say
-        self.candidates = {c.label: c for c in race.candidates}
-        self.laws = {c.label: law_of(c) for c in race.candidates}
+    def __init__(self, pool: Pool, say: Progress) -> None:
+        self.pool, self.say = pool, say
+        self.candidates = {c.label: c for c in pool.candidates}
+        self.laws = {c.label: law_of(c) for c in pool.candidates}
         self._rows: dict[Key, tuple[Model, Row]] = {}
         self._folds: dict[Key, tuple[Model, Row]] = {}
-        self._screened: dict[Key, list[Screened]] = {BASE: list(race.screened)}
+        self._screened: dict[Key, list[Screened]] = {BASE: list(pool.screened)}
         self._polished: set[Key] = set()
         self._amounts: dict[Key, tuple[Screened, ...]] = {}
 
     @property
     def table(self) -> Table:
         """All models so far."""
-        race = self.race
-        least = min(m.total for m in race.models.values())
-        rows = {key: self._row(key, m, m.total < LIMITS.contenders * least) for key, m in race.models.items()}
-        group = race.fitter.simulator.windows.group
-        return Table(rows, self.laws, group, race.noise, race.settings.believed)
+        pool = self.pool
+        least = min(m.total for m in pool.models.values())
+        rows = {key: self._row(key, m, m.total < LIMITS.contenders * least) for key, m in pool.models.items()}
+        group = pool.fitter.simulator.windows.group
+        return Table(rows, self.laws, group, pool.noise, pool.settings.believed)
 
     def _row(self, key: Key, model: Model, contender: bool) -> Row:
         fitted, row = self._rows.get(key, (None, None))
         if fitted is not model or row is None or (contender and len(row.distance) < len(key)):
-            distance = distances(self.race, model) if contender else {}
+            distance = distances(self.pool, model) if contender else {}
             row = Row(key, model.size, model.cost, model.samples, distance)
             self._rows[key] = (model, row)
         return row
@@ -63,15 +72,15 @@ class Fits:
     def additions(self, key: Key) -> list[str]:
         """Candidates that may bring something on top of a model, the most promising first."""
         if key not in self._screened:
-            model = self.race.models[key]
-            others = [c for c in self.race.candidates if all(race.compatible(c, e) for e in model.effects)]
+            model = self.pool.models[key]
+            others = [c for c in self.pool.candidates if all(compatible(c, e) for e in model.effects)]
             self.say("screening", 0, 1)
-            self._screened[key] = screen(self.race.fitter, model.fit, others, self.race.settings.screened)
+            self._screened[key] = screen(self.pool.fitter, model.fit, others, self.pool.settings.screened)
         return [s.candidate.label for s in self._screened[key] if s.gain > 0]
 
     def together(self, most: int, count: int) -> list[Key]:
         """Sets of effects that promise most when all amplitudes are free at once (`dense`)."""
-        found = dense.supports(self.race.base.fit, self.race.screened, self.race.settings.screened, most, count)
+        found = dense.supports(self.pool.base.fit, self.pool.screened, self.pool.settings.screened, most, count)
         self._amounts = {frozenset(s.candidate.label for s in starts): tuple(starts) for starts in found}
         return list(self._amounts)
 
@@ -79,31 +88,31 @@ class Fits:
         """Fit what was not fitted before, all in lockstep."""
         entries: dict[Key, tuple[list[Fit], tuple[Candidate, ...]]] = {}
         for plan in plans:
-            if plan.key not in self.race.models and plan.key not in entries:
+            if plan.key not in self.pool.models and plan.key not in entries:
                 entries[plan.key] = self._entry(plan, len(entries))
-        race.fit_entries(self.race, entries, label, self.say)
+        fit_entries(self.pool, entries, label, self.say)
 
     def _entry(self, plan: Plan, rank: int) -> tuple[list[Fit], tuple[Candidate, ...]]:
-        model = self.race.models[plan.parent]
+        model = self.pool.models[plan.parent]
         kept = tuple(e for e in model.effects if e.label in plan.key)
         new = [self.candidates[label] for label in sorted(plan.key - plan.parent)]
-        fit = model.fit if len(kept) == len(model.effects) else cut_back(self.race, model, kept)
+        fit = model.fit if len(kept) == len(model.effects) else cut_back(self.pool, model, kept)
         if not new:
             return [fit], kept
-        starts = self._amounts.get(plan.key) if plan.parent == BASE else None
-        every = [starts or tuple(self._start(plan.parent, c) for c in new)]
-        if all(frozenset([c.label]) in self.race.models for c in new):
-            every.append(tuple(race.start_of(self.race, c) for c in new))  # a limit far off has no derivative
+        given = self._amounts.get(plan.key) if plan.parent == BASE else None
+        every = [given or tuple(self._start(plan.parent, c) for c in new)]
+        if all(frozenset([c.label]) in self.pool.models for c in new):
+            every.append(tuple(start_of(self.pool, c) for c in new))  # a limit far off has no derivative
         fits = [self._from(fit, several) for several in every]
         if len(new) == 1:
             from_here = replace(model, effects=kept, fit=fit)
             if rank < LIMITS.many:
-                fits[:1] = race.starts(self.race, from_here, every[0][0], rank)
+                fits[:1] = starts(self.pool, from_here, every[0][0], rank)
         return fits, (*kept, *(s.candidate for s in every[0]))
 
     def _from(self, fit: Fit, starts: Sequence[Screened]) -> Fit:
         coordinates = [c for s in starts for c in s.candidate.coordinates]
-        return self.race.fitter.derive(fit, coordinates, np.concatenate([s.start for s in starts]))
+        return self.pool.fitter.derive(fit, coordinates, np.concatenate([s.start for s in starts]))
 
     def _start(self, parent: Key, candidate: Candidate) -> Screened:
         for key in (parent, BASE):
@@ -112,39 +121,40 @@ class Fits:
                     return found
         raise KeyError(f"{candidate.label} was not screened")
 
-    def polish(self, key: Key) -> None:
-        """All columns anew at a model's fit, and some more steps."""
-        if key and key not in self._polished:
-            self._polished.add(key)
+    def polish(self, keys: Sequence[Key]) -> None:
+        """All columns anew at the models' fits, and some more steps."""
+        todo = [k for k in keys if k and k not in self._polished]
+        if todo:
+            self._polished.update(todo)
             self.say("polishing", 0, 1)
-            race.polish(self.race, self.race.models[key])
+            polish(self.pool, [self.pool.models[k] for k in todo])
 
     def simulate(self, keys: Sequence[Key]) -> Table:
-        """A table of some models, whose held-out windows are simulated with the parameters found without them."""
-        fitter, known = self.race.fitter, self.table
-        steps = fitter.simulator.windows.steps
-        for key in keys:
-            model = self.race.models[key]
-            if self._folds.get(key, (None, None))[0] is model:
-                continue
+        """A table of some models, refitted without each condition, whose windows are then simulated."""
+        fitter, known, models = self.pool.fitter, self.table, self.pool.models
+        todo = [k for k in keys if self._folds.get(k, (None, None))[0] is not models[k]]
+        if todo:
             self.say("held out", 0, 1)
-            cost = heldout.predict(fitter, heldout.steadied(fitter, model)).cost(steps) * self.race.noise
-            self._folds[key] = (model, replace(known.rows[key], cost=cost, simulated=True))
+        steps = fitter.simulator.windows.steps
+        for key, model in zip(todo, heldout.refitted(fitter, [models[k] for k in todo]), strict=True):
+            models[key] = model
+            cost = heldout.predict(fitter, model).cost(steps) * self.pool.noise
+            self._folds[key] = (model, replace(self._row(key, model, True), cost=cost, simulated=True))
         return replace(known, rows={key: self._folds[key][1] for key in keys})
 
 
 def law_of(candidate: Candidate) -> Law:
     """What a decision knows of a candidate."""
     index = frozenset(i for c in candidate.coordinates for i in c.index)
-    special = race.special_cases(candidate)
+    special = special_cases(candidate)
     return Law(candidate.label, candidate.effect, candidate.where, len(candidate.coordinates), index, special)
 
 
-def distances(race: Race, model: Model) -> dict[str, float]:
+def distances(pool: Pool, model: Model) -> dict[str, float]:
     """{effect: standard deviations that its best told amplitude is away from neutral}."""
     if not model.effects:
         return {}
-    sd = deviations(race.fitter, model)
+    sd = deviations(pool.fitter, model)
     out = {}
     for effect in model.effects:
         own = [
@@ -158,9 +168,9 @@ def distances(race: Race, model: Model) -> dict[str, float]:
     return out
 
 
-def cut_back(race: Race, model: Model, kept: Sequence[Candidate]) -> Fit:
+def cut_back(pool: Pool, model: Model, kept: Sequence[Candidate]) -> Fit:
     """A fit of some of a model's effects, from where the model is; its first residuals come with the first step."""
-    fit, base = model.fit, len(race.fitter.base)
+    fit, base = model.fit, len(pool.fitter.base)
     names = {c.name for e in kept for c in e.coordinates}
     own = [i for i, c in enumerate(fit.coordinates) if i < base or c.name in names]
     coordinates = tuple(fit.coordinates[i] for i in own)

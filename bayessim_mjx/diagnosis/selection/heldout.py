@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis import statistics
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
+from bayessim_mjx.diagnosis.fitting.quadratic import RULES as HELD_OUT
 from bayessim_mjx.diagnosis.fitting.quadratic import eliminate
 from bayessim_mjx.diagnosis.selection.models import Model
 
@@ -18,12 +20,10 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Rules:
-    """When a linear step without a condition is shortened, and how finely intervals are looked for."""
+    """How a fit without a condition goes on from the common one, and how finely intervals are looked for."""
 
-    # held-out squares over those promised; those of the other windows over the common fit's
-    worse: float = 2.0
-    within: float = 1.02
-    shorter: tuple[float, ...] = (1.0, 0.5, 0.25, 0.125, 0.0)
+    steps: int = 3  # of a fit without a condition
+    damping: float = 1e-6
     grid: int = 400  # shares looked at
 
 
@@ -58,31 +58,38 @@ def predict(fitter: Fitter, model: Model) -> Prediction:
     return Prediction(error, offsets)
 
 
-def steadied(fitter: Fitter, model: Model) -> Model:
-    """The model with estimates without each condition that the other conditions bear out.
+def refitted(fitter: Fitter, models: Sequence[Model]) -> list[Model]:
+    """The models with estimates without each condition that come of fits without it, all in lockstep.
 
-    They come of one linear step from the common fit. Where parameters are hardly told (a wind's sideways force) that
-    step can lead where the model is no longer linear. A condition whose windows are predicted much worse than the step
-    promised gets a shorter one, by halves, until the *other* windows are no worse off than at the common fit.
+    One linear step from the common fit stands for such a fit in the search: good enough to rank by, but where
+    parameters are hardly told (a wind's sideways force) it can lead where the model is no longer linear. Columns stay
+    those of the common fit, corrected by the steps made, and directions that no other condition tells stay where they
+    are. A condition that alone tells a parameter is held out in parts (`Fitter.scores`): there the linear steps stay.
     """
-    windows, fit = fitter.simulator.windows, model.fit
-    names, estimates = np.unique(windows.group), model.estimates.copy()
-    for g, name in enumerate(names):
-        own, others = np.flatnonzero(windows.group == name), np.flatnonzero(windows.group != name)
-        if _squares(fitter, fit, estimates[g], own).sum() <= RULES.worse * model.cost[own].sum():
-            continue
-        limit = RULES.within * float(fit.weight[others] @ _squares(fitter, fit, fit.values, others))
-        for share in RULES.shorter:
-            at = fit.values + share * (model.estimates[g] - fit.values)
-            if fit.weight[others] @ _squares(fitter, fit, at, others) <= limit:
-                break
-        estimates[g] = at
-    return replace(model, estimates=estimates)
+    group = fitter.simulator.windows.group
+    names = np.unique(group)
+    alone = [fitter.told_alone(m.fit) for m in models]
+    plans = [(i, g) for i in range(len(models)) for g in range(len(names)) if not alone[i][g]]
+    fits = [_without(fitter, models[i].fit, group != names[g]) for i, g in plans]
+    fits = fitter.iterate(fits, RULES.steps, lambda fit: (), tolerance=0.0)
+    estimates = [m.estimates.copy() for m in models]
+    for (i, g), fit in zip(plans, fits, strict=True):
+        estimates[i][g] = fit.values
+    return [replace(m, estimates=e) for m, e in zip(models, estimates, strict=True)]
 
 
-def _squares(fitter: Fitter, fit: Fit, values: Array, own: NDArray[np.int64]) -> Array:
-    """Sums of squared errors of some windows, starts re-estimated, `[w]`."""
-    return np.asarray(np.sum(_settled(fitter, fit, values, own)[0] ** 2, axis=(1, 2)))
+def _without(fitter: Fitter, fit: Fit, kept: NDArray[np.bool_]) -> Fit:
+    """A fit that goes on with some of the windows alone, held where it is along directions that these do not tell."""
+    q, _ = fit.quadratic(fitter.spread)
+    held = HELD_OUT.trust * np.diag(q.weighted(fit.weight * kept)[1])
+    coordinates = []
+    for c, value, precision in zip(fit.coordinates, fit.values, held, strict=True):
+        every = max(c.precision + float(precision), 1e-300)
+        neutral = (c.precision * c.neutral + precision * value) / every
+        coordinates.append(replace(c, precision=every, neutral=float(neutral)))
+    return replace(
+        fit, coordinates=tuple(coordinates), weight=fit.weight * kept, cost=np.inf, damping=RULES.damping, history=()
+    )
 
 
 def nominal(fitter: Fitter, fit: Fit) -> Prediction:

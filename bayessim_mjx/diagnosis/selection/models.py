@@ -1,14 +1,14 @@
-"""Models in the race (the known parameters plus some effects), their held-out scores, and what makes one better."""
+"""Models (the known parameters plus some effects) and their held-out scores."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bayessim_mjx.diagnosis import statistics
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 
@@ -70,37 +70,6 @@ def effective_samples(fit: Fit, fitter: Fitter) -> float:
     return max(r.size / (2 * tau), 2.0 * windows**0.5)
 
 
-@dataclass(frozen=True)
-class Comparison:
-    """How much better `new` predicts than `old`.
-
-    Attributes:
-        share: drop of the held-out cost, as a share of the old one above the noise.
-        drop: as a share of the old cost itself.
-        evidence: N_eff/2 log(cost ratio), nats.
-        t: mean over windows of the robust log gain, over its standard error by conditions, as a normal deviate.
-        worst: the smallest drop among the conditions, as a share of the condition's old cost.
-    """
-
-    share: float
-    drop: float
-    evidence: float
-    t: float
-    worst: float
-
-
-def compare(old: Model, new: Model, group: NDArray[np.int64], noise: float) -> Comparison:
-    """`noise`: expected cost of a perfect model per window."""
-    gain = old.total - new.total
-    log_gain = np.log(old.cost + noise) - np.log(new.cost + noise)
-    return Comparison(
-        share=statistics.share_of_gap(gain, old.total, noise * len(old.cost)),
-        drop=gain / old.total,
-        evidence=0.5 * new.samples * float(np.log(old.total / new.total)),
-        t=statistics.normal_deviate(log_gain, group),
-        worst=min(_drop(old.cost[group == g], new.cost[group == g], noise) for g in np.unique(group)),
-    )
-
-
-def _drop(old: Array, new: Array, noise: float) -> float:
-    return float((old.sum() - new.sum()) / (old.sum() + noise * len(old)))
+def nats(old: Model, new: Model) -> float:
+    """Held-out log predictive density that `new` has more, of Gaussian residuals of unknown scale."""
+    return 0.5 * new.samples * math.log(old.total / new.total)

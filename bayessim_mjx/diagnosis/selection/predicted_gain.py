@@ -22,13 +22,13 @@ Array = NDArray[np.float64]
 FURTHEST = 2.0  # times the screened start: further a secant is not trusted
 
 
-def promised(race: Tried, effects: Sequence[Candidate]) -> tuple[float, dict[str, float]]:
+def promised(tried: Tried, effects: Sequence[Candidate]) -> tuple[float, dict[str, float]]:
     """Shares of the recalibrated simulator's squared gap above the noise: of all, and of each (Shapley, 1953)."""
-    q, precision, high = _linear(race, effects)
-    base = len(race.fitter.base)
+    q, precision, high = _linear(tried, effects)
+    base = len(tried.fitter.base)
 
-    _, pull, low, top = race.base.fit.prior()
-    even = np.ones(len(race.base.fit.r))  # all windows count alike, as in what is realised
+    _, pull, low, top = tried.base.fit.prior()
+    even = np.ones(len(tried.base.fit.r))  # all windows count alike, as in what is realised
 
     def left(some: frozenset[int]) -> float:
         """Mean square with some of the effects, the known parameters refitted."""
@@ -38,7 +38,7 @@ def promised(race: Tried, effects: Sequence[Candidate]) -> tuple[float, dict[str
         g, S = own.weighted(even)
         limits = np.concatenate([low, more]), np.concatenate([top, high[sorted(some)]])
         p = solve(S + np.diag(precision[columns]), g + np.concatenate([pull, more]), *limits)
-        return float(own.at(p).mean()) / race.noise
+        return float(own.at(p).mean()) / tried.noise
 
     before = left(frozenset())
     every = frozenset(range(len(effects)))
@@ -52,13 +52,13 @@ def promised(race: Tried, effects: Sequence[Candidate]) -> tuple[float, dict[str
     return total, {e.label: share for e, share in zip(effects, each, strict=True)}
 
 
-def _linear(race: Tried, effects: Sequence[Candidate]) -> tuple[Quadratic, Array, Array]:
+def _linear(tried: Tried, effects: Sequence[Candidate]) -> tuple[Quadratic, Array, Array]:
     """(quadratic in the known parameters' steps and the amounts of the effects, precisions, largest amounts).
 
     An amount of 1 is the start that the screening chose.
     """
-    fitter, fit = race.fitter, race.base.fit
-    starts = [next(s.start for s in race.screened if s.candidate.label == e.label) for e in effects]
+    fitter, fit = tried.fitter, tried.base.fit
+    starts = [next(s.start for s in tried.screened if s.candidate.label == e.label) for e in effects]
     pairs = list(zip(effects, starts, strict=True))
     thetas = [fitter.vector((*fit.coordinates, *e.coordinates), np.concatenate([fit.values, s])) for e, s in pairs]
     moved = fitter.whiten(fitter.simulator.run(np.stack(thetas), np.repeat(fit.offsets[None], len(thetas), 0)))

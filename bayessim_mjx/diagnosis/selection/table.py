@@ -80,6 +80,10 @@ class Table:
         """Held-out cost above the noise, as a multiple of the noise: squared gap that the model leaves."""
         return self.rows[key].total / (self.noise * len(self.group)) - 1.0
 
+    def closed(self, key: Key) -> float:
+        """Share of the known parameters' squared gap above the noise that a model closes, at most 1."""
+        return 1.0 - max(self.excess(key), 0.0) / max(self.excess(BASE), 1e-9)
+
     def without(self, condition: int) -> Table:
         """The table of all other operating conditions."""
         kept = self.group != condition

@@ -13,7 +13,7 @@ from bayessim_mjx.diagnosis import statistics
 from bayessim_mjx.diagnosis.experiment.propose import Experiment
 from bayessim_mjx.diagnosis.findings import Findings, Where
 from bayessim_mjx.diagnosis.result import Diagnosis, Gap, Place
-from bayessim_mjx.diagnosis.selection import bounds, uncertainty, verdict
+from bayessim_mjx.diagnosis.selection import bounds, conditions, uncertainty
 from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.selection.tried import Tried, ranked
 from bayessim_mjx.diagnosis.summary import effects_found, how_far
@@ -32,6 +32,9 @@ class Limits:
     little: float = 0.3  # share of the calibrated gap that named effects may leave
     # share of the calibrated gap that a flexible force closes on top of named effects: not in the library
     remains: float = 0.3
+    # shares of the named effects' cost, and of the gap, by which a flexible force alone does better
+    beaten: float = 0.4
+    relevant: float = 0.05
 
 
 LIMITS = Limits()
@@ -44,10 +47,10 @@ def diagnosis_of(found: Findings, about: Mapping[str, Any] | None = None, file: 
     Args:
         about: what was diagnosed, see `Diagnosis`; file: name of the proposal's command file, where there is one.
     """
-    setup, outcome, model = found.setup, found.outcome, found.model
+    setup, selection, model = found.setup, found.selection, found.model
     timestep = float(setup.robot.mj_model.opt.timestep) * (setup.discretisation.factor if setup.discretisation else 1)
-    together = uncertainty.covariance(setup.fitter, model, outcome.along)
-    together = together + np.diag(uncertainty.systematic(model, timestep, outcome.left(model)) ** 2)
+    together = uncertainty.covariance(setup.fitter, model, selection.along)
+    together = together + np.diag(uncertainty.systematic(model, timestep, selection.left(model)) ** 2)
     together = _told(found, together)
     sd = np.sqrt(np.diag(together))
     closed = effects_found.closed_by(found)
@@ -55,7 +58,7 @@ def diagnosis_of(found: Findings, about: Mapping[str, Any] | None = None, file: 
     remains = _remains(found)
     far = how_far.measured(found, {k: v for k, v in closed.items() if k != "each"})
     name = _verdict(found, remains, far)
-    parameters = _parameters(outcome, model, sd)
+    parameters = _parameters(selection, model, sd)
     over, where, proposal = found.part(Whole), found.part(Where), found.part(Experiment)
     far = how_far.with_whole(far, over, setup.tolerance) if over else far
     told = sentences(name, effects, parameters, found, far, remains, _beaten(found))
@@ -69,7 +72,7 @@ def diagnosis_of(found: Findings, about: Mapping[str, Any] | None = None, file: 
         where=list(where.places) if where and where.places else _where(found),
         gap=far,
         parameters=parameters,
-        candidates=ranking(outcome),
+        candidates=ranking(selection),
         warnings=[*notes, *found.warnings],
         next_experiment=proposal.to_dict(file) if proposal else {},
         versions=versions.of(PACKAGES),
@@ -93,15 +96,15 @@ def _told(found: Findings, covariance: np.ndarray) -> np.ndarray:
 
 def _remains(found: Findings) -> float:
     """Share of the calibrated gap that a flexible force still closes on top of the winner; 0 where not significant."""
-    flex, base, model = found.flexible_winner, found.outcome.base, found.model
+    flex, base, model = found.flexible_winner, found.selection.base, found.model
     if flex is None or not flex.condition.significant:
         return 0.0
     top = model.total - min(float(flex.condition.cost.sum()), model.total)
-    return statistics.share_of_gap(top, base.total, found.outcome.noise * len(base.cost))
+    return statistics.share_of_gap(top, base.total, found.selection.noise * len(base.cost))
 
 
 def _verdict(found: Findings, remains: float, far: Gap) -> str:
-    race, model = found.outcome, found.model
+    tried, model = found.selection, found.model
     if model.effects and far.beyond:
         return "unexplained"  # partly explained: what is left still matters
     cost = {k: float(p.cost(found.setup.fitter.simulator.windows.steps).mean()) for k, p in found.predictions.items()}
@@ -109,18 +112,18 @@ def _verdict(found: Findings, remains: float, far: Gap) -> str:
     if model.effects and left > LIMITS.unexplained**2 - 1.0 and left > LIMITS.little * (cost["calibrated"] - 1.0):
         return "unexplained"  # what is named closes little of it
     if (
-        race.above_noise(model)
+        tried.above_noise(model)
         and remains > LIMITS.remains
         or (model.effects and found.flexible_winner is not None and _beaten(found))
     ):
         return "unexplained"
     if model.effects:
-        return "ambiguous" if found.outcome.ambiguous else "effects"
-    if np.sqrt(race.base.total / (race.noise * len(race.base.cost))) > LIMITS.unexplained:
+        return "ambiguous" if found.selection.ambiguous else "effects"
+    if np.sqrt(tried.base.total / (tried.noise * len(tried.base.cost))) > LIMITS.unexplained:
         return "unexplained"
-    q, _ = race.nominal.quadratic(race.fitter.spread)
-    floor = race.noise * len(race.base.cost) * race.settings.floor**2
-    return "parameters" if q.c.sum() > max(1.1 * race.base.total, floor) else "no_gap"
+    q, _ = tried.nominal.quadratic(tried.fitter.spread)
+    floor = tried.noise * len(tried.base.cost) * tried.criteria.floor**2
+    return "parameters" if q.c.sum() > max(1.1 * tried.base.total, floor) else "no_gap"
 
 
 def _beaten(found: Findings) -> bool:
@@ -128,41 +131,41 @@ def _beaten(found: Findings) -> bool:
 
     By a relevant share of the gap too: of effects that close 99.9 % something is left that a force can learn.
     """
-    race, base, model = found.outcome, found.flexible_base, found.model
+    tried, base, model = found.selection, found.flexible_base, found.model
     if base is None or not base.condition.significant:
         return False
     better = model.total - float(base.condition.cost.sum())
-    share = statistics.share_of_gap(better, race.base.total, race.noise * len(race.base.cost))
-    return better > 0.4 * model.total and share > race.settings.relevance
+    share = statistics.share_of_gap(better, tried.base.total, tried.noise * len(tried.base.cost))
+    return better > LIMITS.beaten * model.total and share > LIMITS.relevant
 
 
-def _parameters(race: Tried, model: Model, sd: np.ndarray) -> dict[str, dict[str, Any]]:
-    remarks = verdict.structural(race, model, sd)
+def _parameters(tried: Tried, model: Model, sd: np.ndarray) -> dict[str, dict[str, Any]]:
+    remarks = conditions.structural(tried, model)
     return {
         c.name: {
             "mean": float(model.fit.values[i]), "sd": float(sd[i]), "nominal": c.neutral, "low": c.low, "high": c.high,
             "unit": c.unit, "structural": remarks.get(c.name, ""),
         }
-        for i, c in enumerate(race.fitter.base)
+        for i, c in enumerate(tried.fitter.base)
     }  # fmt: skip
 
 
-def ranking(race: Tried) -> list[dict[str, Any]]:
+def ranking(tried: Tried) -> list[dict[str, Any]]:
     """Models tried, best first: held-out score, nats over the known parameters alone, and its standard error."""
-    rows = statistics.leave_one_out(race.fitter.simulator.windows.group)
-    absorbed = {s.candidate.label: s.absorbed for s in race.screened}
+    rows = statistics.leave_one_out(tried.fitter.simulator.windows.group)
+    absorbed = {s.candidate.label: s.absorbed for s in tried.screened}
     out: list[dict[str, Any]] = []
-    tried = ranked(race)[:60]
-    samples = tried[0].samples  # one for all, so that scores are in the order of the errors
-    for model in tried:
-        ratio = np.log((rows @ race.base.cost) / (rows @ model.cost))
+    rows_of = ranked(tried)[:60]
+    samples = rows_of[0].samples  # one for all, so that scores are in the order of the errors
+    for model in rows_of:
+        ratio = np.log((rows @ tried.base.cost) / (rows @ model.cost))
         error = float(0.5 * samples * statistics.error(ratio)) if len(rows) else float("nan")
         out.append({
             "effects": [e.label for e in model.effects],
             "label": model.label,
-            "score": 0.5 * samples * float(np.log(race.base.total / model.total)),
+            "score": 0.5 * samples * float(np.log(tried.base.total / model.total)),
             "se": error,
-            "gap_closed": race.closure(model),
+            "gap_closed": tried.closure(model),
             "rms": float(np.sqrt(model.total / model.fit.r.size)),
             "parameters": dict(zip(model.fit.names, map(float, model.fit.values), strict=True)),
             "absorbed": absorbed.get(model.effects[0].label) if len(model.effects) == 1 else None,

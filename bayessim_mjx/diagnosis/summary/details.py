@@ -8,7 +8,7 @@ import numpy as np
 
 from bayessim_mjx.diagnosis.findings import Findings
 from bayessim_mjx.diagnosis.result import FoundEffect
-from bayessim_mjx.diagnosis.selection import verdict
+from bayessim_mjx.diagnosis.selection import conditions
 from bayessim_mjx.diagnosis.selection.tried import Tried
 from bayessim_mjx.diagnosis.summary.left_in_words import flexible_in_words
 from bayessim_mjx.diagnosis.tolerance import length_unit
@@ -20,12 +20,12 @@ MANY = 24  # candidates in the isolability matrix, overlays in the report
 
 def details(found: Findings, effects: list[FoundEffect], closed: dict[str, Any]) -> dict[str, Any]:
     model, cut = found.model, found.setup.fitter.simulator.windows
-    each, deviation = verdict.per_condition(found.outcome, model)
+    each, deviation = conditions.per_condition(found.selection, model)
     names = model.fit.names
     return {
         "effect_specs": {e.name: spec_of(e) for e in found.setup.physics.effects if e.quantities},
         "overlays": _overlays(found),
-        "isolability": _isolability(found.outcome),
+        "isolability": _isolability(found.selection),
         "episodes": _episodes(found),
         "closure": _closure(effects, closed),
         "shapley": [{"effect": f"{e.name}@{e.where}", "share": e.share} for e in effects if e.share == e.share],

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -35,7 +34,7 @@ class _Part:
 
 def _parts(found: Findings, closed: dict[str, Any]) -> dict[str, _Part]:
     """{label: part}; the shares are of the linear promise where too many effects are named to fit all subsets."""
-    base, fitted = found.outcome.base, found.outcome.subsets
+    base, fitted = found.selection.base, found.selection.subsets
     labels = [e.label for e in found.model.effects]
     if not labels:
         return {}
@@ -58,9 +57,9 @@ def closed_by(found: Findings) -> dict[str, Any]:
     """Share of the recalibrated simulator's squared gap that all effects close: promised, and then really."""
     if not found.model.effects:
         return {}
-    closed, (total, each), elsewhere = _closed(found), found.outcome.promised, found.outcome.elsewhere
-    known = {} if math.isnan(elsewhere) else {"elsewhere": elsewhere}
-    return {"predicted": total, "realised": closed.value, "ci": closed.interval(), "each": each} | known
+    closed, (total, each) = _closed(found), found.selection.promised
+    own = {"predicted": total, "realised": closed.value, "ci": closed.interval(), "each": each}
+    return own | {"elsewhere": found.selection.elsewhere}
 
 
 def _closed(found: Findings) -> heldout.Closed:
@@ -71,7 +70,7 @@ def _closed(found: Findings) -> heldout.Closed:
 
 def _effect(found: Findings, effect: Candidate, sd: np.ndarray, part: _Part) -> FoundEffect:
     setup, model = found.setup, found.model
-    rivals = found.outcome.rivals.get(effect.label, ())
+    rivals = found.selection.rivals.get(effect.label, ())
     weighed = [r for r in rivals if not r.contains]
     own_weight, *others = _weights(found, [model, *(r.model for r in weighed)])
     weight_of = dict(zip(map(id, weighed), others, strict=True))
@@ -107,7 +106,7 @@ def _weights(found: Findings, models: list[Model]) -> list[float]:
     if len(models) < 2:
         return [float("nan")]
     group, rng = found.setup.fitter.simulator.windows.group, np.random.default_rng(found.setup.seed)
-    return uncertainty.win_share(models, group, found.outcome.noise, rng).tolist()
+    return uncertainty.win_share(models, group, found.selection.noise, rng).tolist()
 
 
 def _unit(setup: Setup, effect: Candidate, unit: str) -> str:

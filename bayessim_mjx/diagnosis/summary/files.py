@@ -17,7 +17,7 @@ from bayessim_mjx.diagnosis.selection.tried import Tried
 from bayessim_mjx.diagnosis.setup import Setup
 from bayessim_mjx.diagnosis.summary import assemble, preliminary
 
-PRELIMINARY = "preliminary.json"  # what is known while the race goes on
+PRELIMINARY = "preliminary.json"  # what is known while the search goes on
 COMMAND = "next_experiment.csv"
 
 

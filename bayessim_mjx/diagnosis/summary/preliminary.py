@@ -1,4 +1,4 @@
-"""What a diagnosis knows while its race goes on, on disk: a verdict takes minutes, and a process may be killed."""
+"""What a diagnosis knows while its search goes on, on disk: a verdict takes minutes, and a process may be killed."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from bayessim_mjx.diagnosis.summary.assemble import ranking
 BEST = 20  # models listed
 
 
-def write(path: Path, about: Mapping[str, Any], setup: Setup, race: Tried | None) -> None:
+def write(path: Path, about: Mapping[str, Any], setup: Setup, tried: Tried | None) -> None:
     """Write what is known so far, whole or not at all; no verdict is among it.
 
     Args:
-        about: what is diagnosed; race: None before the first fit.
+        about: what is diagnosed; tried: None before the first fit.
     """
     found = {"verdict": None, "about": dict(about), "warnings": list(setup.warnings)} | (
-        {} if race is None else _so_far(race)
+        {} if tried is None else _so_far(tried)
     )
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_suffix(".tmp")
@@ -32,12 +32,12 @@ def write(path: Path, about: Mapping[str, Any], setup: Setup, race: Tried | None
     os.replace(temporary, path)
 
 
-def _so_far(race: Tried) -> dict[str, Any]:
+def _so_far(tried: Tried) -> dict[str, Any]:
     """Gaps in noise standard deviations, recalibrated parameters and the best models."""
-    fit, noise = race.base.fit, race.noise * len(race.base.cost)
-    nominal, _ = race.nominal.quadratic(race.fitter.spread)
-    gap = {"nominal": np.sqrt(nominal.c.sum() / noise), "calibrated": np.sqrt(race.base.total / noise)}
-    best = [{k: row[k] for k in ("label", "score", "se", "gap_closed", "parameters")} for row in ranking(race)[:BEST]]
+    fit, noise = tried.base.fit, tried.noise * len(tried.base.cost)
+    nominal, _ = tried.nominal.quadratic(tried.fitter.spread)
+    gap = {"nominal": np.sqrt(nominal.c.sum() / noise), "calibrated": np.sqrt(tried.base.total / noise)}
+    best = [{k: row[k] for k in ("label", "score", "se", "gap_closed", "parameters")} for row in ranking(tried)[:BEST]]
     return {
         "gap": {k: float(v) for k, v in gap.items()},
         "parameters": dict(zip(fit.names, map(float, fit.values), strict=True)),

@@ -10,7 +10,7 @@ from typing import Any
 from bayessim_mjx.diagnosis import statistics
 from bayessim_mjx.diagnosis.findings import Findings
 from bayessim_mjx.diagnosis.result import FoundEffect, Gap
-from bayessim_mjx.diagnosis.selection.verdict import Rival
+from bayessim_mjx.diagnosis.selection.selected import Rival
 from bayessim_mjx.diagnosis.summary.left_in_words import flexible_in_words
 from bayessim_mjx.diagnosis.vocabulary import listed, missing
 from bayessim_mjx.quantities import extent, percent
@@ -66,9 +66,9 @@ def sentences(
 ) -> list[str]:
     """The verdict, most important first; `remains`, `beaten`: see `verdict_in_words`."""
     told = verdict_in_words(name, effects, far, remains, beaten)
-    if found.outcome.ambiguous:
-        told += [_instead(e, found.outcome.rivals.get(f"{e.name}@{e.where}", ())) for e in effects]
-    if not effects and remains == 0.0 and found.outcome.above_noise(found.outcome.base):
+    if found.selection.ambiguous:
+        told += [_instead(e, found.selection.rivals.get(f"{e.name}@{e.where}", ())) for e in effects]
+    if not effects and remains == 0.0 and found.selection.above_noise(found.selection.base):
         told.append(CHANCE.format(calibrated=stage_in_words(far, "calibrated")))
     if name == "unexplained" and found.flexible_winner is not None:
         told += [f"{text[:1].upper()}{text[1:]}." for text in flexible_in_words(found.flexible_winner)]
@@ -107,7 +107,7 @@ def verdict_in_words(
         more = ON_TOP if remains > 0.05 else BEATEN if beaten else ""
         out += [f"{NEAREST}{more}."] if name == "unexplained" and (more or not partly) else []
         out.append(FALLS)
-        out += [ELSEWHERE] if "elsewhere" in far.closed else []
+        out += [ELSEWHERE] if math.isfinite(far.closed.get("elsewhere", math.nan)) else []
     if name == "unexplained" and not effects:
         rest = [_left(n, far.physical[n]) for n in _worst(far) if "largest" in far.physical[n]]
         out += [f"What remains after recalibration: {listed(rest[:3])}."] if rest else []

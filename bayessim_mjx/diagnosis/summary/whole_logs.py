@@ -75,8 +75,8 @@ def simulate(found: Findings) -> Whole:
     """Every stage on at most LOGS logs; parameters are those found without the log's condition, where it has one."""
     setup, cut = found.setup, found.setup.fitter.simulator.windows
     stages = {
-        "nominal": _Stage(found.outcome.base, found.predictions["nominal"], True),
-        "calibrated": _Stage(found.outcome.base, found.predictions["calibrated"], False),
+        "nominal": _Stage(found.selection.base, found.predictions["nominal"], True),
+        "calibrated": _Stage(found.selection.base, found.predictions["calibrated"], False),
     }
     if found.model.effects:
         stages["with_effects"] = _Stage(found.model, found.predictions["with_effects"], False)
