@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from bayessim_mjx.diagnosis import statistics
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 from bayessim_mjx.diagnosis.fitting.quadratic import RULES as HELD_OUT
-from bayessim_mjx.diagnosis.fitting.quadratic import eliminate
+from bayessim_mjx.diagnosis.fitting.quadratic import eliminate, solve
 from bayessim_mjx.diagnosis.selection.models import Model
 
 Array = NDArray[np.float64]
@@ -23,7 +23,7 @@ class Rules:
     """How a fit without a condition goes on from the common one, and how finely intervals are looked for."""
 
     steps: int = 3  # of a fit without a condition
-    damping: float = 1e-6
+    within: float = 1.02  # of the common fit's cost: the most that such a fit leaves of the same windows
     grid: int = 400  # shares looked at
 
 
@@ -61,35 +61,57 @@ def predict(fitter: Fitter, model: Model) -> Prediction:
 def refitted(fitter: Fitter, models: Sequence[Model]) -> list[Model]:
     """The models with estimates without each condition that come of fits without it, all in lockstep.
 
-    One linear step from the common fit stands for such a fit in the search: good enough to rank by, but where
-    parameters are hardly told (a wind's sideways force) it can lead where the model is no longer linear. Columns stay
-    those of the common fit, corrected by the steps made, and directions that no other condition tells stay where they
-    are. A condition that alone tells a parameter is held out in parts (`Fitter.scores`): there the linear steps stay.
+    In the search one linear step from the common fit stands for such a fit: good enough to rank by, but where numbers
+    are hardly told (a wind's sideways force) it can lead where the model is no longer linear. A condition that alone
+    tells a parameter is held out in parts (`Fitter.scores`): its linear steps stay.
     """
     group = fitter.simulator.windows.group
     names = np.unique(group)
     alone = [fitter.told_alone(m.fit) for m in models]
     plans = [(i, g) for i in range(len(models)) for g in range(len(names)) if not alone[i][g]]
-    fits = [_without(fitter, models[i].fit, group != names[g]) for i, g in plans]
-    fits = fitter.iterate(fits, RULES.steps, lambda fit: (), tolerance=0.0)
+    folds = [_Fold(fitter, models[i].fit, group != names[g]) for i, g in plans]
+    for _ in range(RULES.steps if folds else 0):
+        thetas = np.stack([fitter.vector(fold.fit.coordinates, fold.values) for fold in folds])
+        seen = fitter.whiten(fitter.simulator.run(thetas, np.stack([fold.offsets for fold in folds])))
+        for fold, r in zip(folds, seen, strict=True):
+            fold.go_on(r)
     estimates = [m.estimates.copy() for m in models]
-    for (i, g), fit in zip(plans, fits, strict=True):
-        estimates[i][g] = fit.values
+    for (i, g), fold in zip(plans, folds, strict=True):
+        estimates[i][g] = fold.found
     return [replace(m, estimates=e) for m, e in zip(models, estimates, strict=True)]
 
 
-def _without(fitter: Fitter, fit: Fit, kept: NDArray[np.bool_]) -> Fit:
-    """A fit that goes on with some of the windows alone, held where it is along directions that these do not tell."""
-    q, _ = fit.quadratic(fitter.spread)
-    held = HELD_OUT.trust * np.diag(q.weighted(fit.weight * kept)[1])
-    coordinates = []
-    for c, value, precision in zip(fit.coordinates, fit.values, held, strict=True):
-        every = max(c.precision + float(precision), 1e-300)
-        neutral = (c.precision * c.neutral + precision * value) / every
-        coordinates.append(replace(c, precision=every, neutral=float(neutral)))
-    return replace(
-        fit, coordinates=tuple(coordinates), weight=fit.weight * kept, cost=np.inf, damping=RULES.damping, history=()
-    )
+class _Fold:
+    """A fit that goes on from the common one with some of the windows alone.
+
+    Gauss-Newton steps on the common fit's columns, not descent: at the scale of these steps costs are rough (contacts,
+    dry friction, single precision), and a descent would stay where it is. A step that leaves the windows much worse
+    off than the common fit is halved. Directions that these windows do not tell stay where the common fit has them.
+    """
+
+    def __init__(self, fitter: Fitter, fit: Fit, kept: NDArray[np.bool_]) -> None:
+        self.fitter, self.fit = fitter, replace(fit, weight=fit.weight * kept)
+        self.limit = RULES.within * fitter.cost(self.fit, fit.r, fit.offsets, fit.values)
+        self.found = fit.values
+        self.values, self.offsets = self._step(fit.values, fit.offsets, fit.r)
+
+    def go_on(self, r: Array) -> None:
+        """With the residuals `[W, n]` at the values that were to be tried."""
+        if self.fitter.cost(self.fit, r, self.offsets, self.values) <= self.limit:
+            self.found = self.values
+            self.values, self.offsets = self._step(self.values, self.offsets, r)
+        else:
+            self.values = (self.found + self.values) / 2
+            self.offsets = (self.fit.offsets + self.offsets) / 2
+
+    def _step(self, values: Array, offsets: Array, r: Array) -> tuple[Array, Array]:
+        q, starts = eliminate(r, self.fit.A, self.fit.B, offsets, self.fitter.spread)
+        g, S = q.weighted(self.fit.weight)
+        precision, pull, low, high = replace(self.fit, values=values).prior()
+        held = HELD_OUT.trust * np.diag(S)
+        pull = pull + held * (self.fit.values - values)
+        p = solve(S + np.diag(precision + held), g + pull, low, high)
+        return values + p, offsets + starts.step(self.fit.A, p)
 
 
 def nominal(fitter: Fitter, fit: Fit) -> Prediction:
