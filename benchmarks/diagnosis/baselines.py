@@ -1,4 +1,4 @@
-"""Baselines of the diagnosis on the very fits that its race made: same simulator, windows, known parameters, effects.
+"""Baselines of the diagnosis on the very fits that it made: same simulator, windows, known parameters, effects.
 
 Each returns what a diagnosis says (verdict, effects with place, parameters, equivalents), so that one score is for all.
 """
@@ -15,7 +15,7 @@ from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.quadratic import RULES, solve
 from bayessim_mjx.diagnosis.selection import heldout, uncertainty
 from bayessim_mjx.diagnosis.selection.models import Model
-from bayessim_mjx.diagnosis.selection.race import Race, fit_models, start_of
+from bayessim_mjx.diagnosis.selection.pool import Pool, fit_models, start_of
 
 TESTED = 0.3  # share of the operating conditions in the one test set of the single fold
 # what the flexible force depends on most -> the effect that a reader would name; not here: nothing that can be named
@@ -32,32 +32,32 @@ def _quiet(text: str, done: int, total: int) -> None:
 
 
 class Reopened:
-    """What a diagnosis found, with its race open again: further models are fitted on the same windows."""
+    """What a diagnosis found, with its pool of models open again: further models are fitted on the same windows."""
 
     def __init__(self, found: Findings) -> None:
         self.setup, self.predictions, self.flexible_base = found.setup, found.predictions, found.flexible_base
-        self.race = found.outcome.reopened()
+        self.pool = found.selection.reopened()
 
 
-def candidate_of(race: Race, name: str, where: str, joint_of: dict[str, str]) -> Candidate | None:
-    """The race's candidate of that name at that place; an actuator and its joint are one place."""
+def candidate_of(pool: Pool, name: str, where: str, joint_of: dict[str, str]) -> Candidate | None:
+    """The pool's candidate of that name at that place; an actuator and its joint are one place."""
     same = lambda place: joint_of.get(place, place)  # noqa: E731
-    found = [c for c in race.candidates if c.effect == name and same(c.where) == same(where)]
+    found = [c for c in pool.candidates if c.effect == name and same(c.where) == same(where)]
     return found[0] if found else None
 
 
-def fitted(race: Race, effects: Sequence[Candidate]) -> Model:
-    """The model of these effects, fitted one after the other, as the race does it."""
-    model = race.base
+def fitted(pool: Pool, effects: Sequence[Candidate]) -> Model:
+    """The model of these effects, fitted one after the other, as the pool does it."""
+    model = pool.base
     for effect in effects:
-        (model,) = fit_models(race, [(model, start_of(race, effect))], "", _quiet)
+        (model,) = fit_models(pool, [(model, start_of(pool, effect))], "", _quiet)
     return model
 
 
-def singles(race: Race) -> list[Model]:
-    """Every effect at every place that screening gave a chance, also where the race saw nothing to explain."""
-    chosen = [s for s in race.screened if s.gain > 0][: race.settings.singles]
-    return fit_models(race, [(race.base, s) for s in chosen], "", _quiet)
+def singles(pool: Pool) -> list[Model]:
+    """Every effect at every place that screening gave a chance, also where the pool saw nothing to explain."""
+    chosen = [s for s in pool.screened if s.gain > 0][: pool.settings.singles]
+    return fit_models(pool, [(pool.base, s) for s in chosen], "", _quiet)
 
 
 def closure(found: Reopened, model: Model) -> float:
@@ -90,7 +90,7 @@ def _named(name: str, where: str, parameters: Said, closed: float | None, rivals
 
 def refit(found: Reopened) -> Said:
     """The known parameters alone, as mujoco.sysid: it never names an effect."""
-    return told(found, found.race.base)
+    return told(found, found.pool.base)
 
 
 def bic(model: Model, spread: np.ndarray) -> float:
@@ -102,13 +102,13 @@ def bic(model: Model, spread: np.ndarray) -> float:
 
 def naive_bic(found: Reopened) -> Said:
     """The lowest BIC of all models that were fitted, the known parameters alone among them."""
-    race = found.race
-    return told(found, min(race.models.values(), key=lambda m: bic(m, race.fitter.spread)))
+    pool = found.pool
+    return told(found, min(pool.models.values(), key=lambda m: bic(m, pool.fitter.spread)))
 
 
-def fold_error(race: Race, model: Model, test: np.ndarray) -> float:
+def fold_error(pool: Pool, model: Model, test: np.ndarray) -> float:
     """Cost of the windows `test` `[W]` (bool) under the estimates from the others, by one Newton step from the fit."""
-    q, _ = model.fit.quadratic(race.fitter.spread)
+    q, _ = model.fit.quadratic(pool.fitter.spread)
     precision, pull, low, high = model.fit.prior()
     g, S = q.weighted(model.fit.weight * ~test)
     p = solve(S + np.diag(precision + RULES.trust * np.diag(S)), g + pull, low, high)
@@ -117,12 +117,12 @@ def fold_error(race: Race, model: Model, test: np.ndarray) -> float:
 
 def single_fold(found: Reopened) -> Said:
     """The smallest error on one test set of operating conditions, as BAM: no threshold, no interval."""
-    race, group = found.race, found.race.fitter.simulator.windows.group
+    pool, group = found.pool, found.pool.fitter.simulator.windows.group
     names = np.unique(group)
     rng = np.random.default_rng(found.setup.seed)
     tested = rng.choice(names, max(1, round(TESTED * len(names))), replace=False)
     test = np.isin(group, tested)
-    return told(found, min(race.models.values(), key=lambda m: fold_error(race, m, test)))
+    return told(found, min(pool.models.values(), key=lambda m: fold_error(pool, m, test)))
 
 
 def importance(found: Reopened) -> Said:
@@ -138,7 +138,7 @@ def importance(found: Reopened) -> Said:
     model = found.setup.physics.mj_model
     where = f"{first['joint']}+{model.body(int(model.joint(first['joint']).bodyid[0])).name}"  # or the body behind it
     whole, left = flex.condition.base.sum(), flex.condition.cost.sum()
-    floor = found.race.noise * len(flex.condition.base)
+    floor = found.pool.noise * len(flex.condition.base)
     closed = float(np.clip((whole - left) / max(whole - min(floor, left), 1e-9), 0.0, 1.0))
     return {"verdict": "effects", "effects": [_named(name, where, {}, closed, rivals)]}
 
@@ -147,9 +147,9 @@ def classifier(found: Reopened) -> Said:
     """A classifier trained on simulations of every candidate on the case's own windows."""
     from lda import classify
 
-    race = found.race
-    effect = classify(race.fitter, race.base.fit, race.candidates, np.random.default_rng(found.setup.seed))
-    return told(found, race.base if effect is None else fitted(race, [effect]))
+    pool = found.pool
+    effect = classify(pool.fitter, pool.base.fit, pool.candidates, np.random.default_rng(found.setup.seed))
+    return told(found, pool.base if effect is None else fitted(pool, [effect]))
 
 
 BASELINES: dict[str, Callable[[Reopened], Said]] = {
@@ -164,7 +164,7 @@ BASELINES: dict[str, Callable[[Reopened], Said]] = {
 def all_baselines(found: Reopened) -> dict[str, Said]:
     """{baseline: what it says}; `seconds` beyond the fits, which all share."""
     started = time.perf_counter()
-    singles(found.race)
+    singles(found.pool)
     shared = time.perf_counter() - started
     out = {}
     for name, baseline in BASELINES.items():

@@ -1,4 +1,4 @@
-"""The library's side of the comparison with mujoco.sysid: its own parameter fit and its race, timed in parts."""
+"""The library's side of the comparison with mujoco.sysid: its parameter fit and its single effects, timed in parts."""
 
 import dataclasses
 import time
@@ -9,9 +9,11 @@ from typing import Any
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fitter import Fitter
 from bayessim_mjx.diagnosis.fitting.robot import of_file
-from bayessim_mjx.diagnosis.selection import race, search
+from bayessim_mjx.diagnosis.selection.criteria import Criteria
 from bayessim_mjx.diagnosis.selection.models import scored
+from bayessim_mjx.diagnosis.selection.pool import Pool, fit_models
 from bayessim_mjx.diagnosis.selection.screen import screen
+from bayessim_mjx.diagnosis.selection.tried import ranked
 from bayessim_mjx.diagnosis.setup import Setup
 from bayessim_mjx.diagnosis.setup import prepare as prepared
 from bayessim_mjx.logs import read_logs
@@ -39,7 +41,7 @@ def prepare(folder: Path, effects: Any, without: str | None) -> tuple[float, flo
 
 
 def fit_base(fitter: Fitter) -> Any:
-    """The known parameters, as the race begins."""
+    """The known parameters, as a diagnosis begins."""
     fit = fitter.begin(fitter.base)
     (fit,) = fitter.iterate([fit], 10, lambda f: range(len(f.coordinates)))
     return fitter.refresh(fit)
@@ -59,15 +61,15 @@ def race_all(folder: Path) -> tuple[dict, list[Candidate]]:
     fitter, settings = setup.fitter, dataclasses.replace(setup.settings, singles=len(setup.candidates))
     known, fit = timed(lambda: fit_base(fitter))
     model = scored(fitter, fit, ())
-    tried = race.Race(fitter, setup.candidates, settings, fit, model, winner=model)
+    tried = Pool(fitter, setup.candidates, settings, Criteria(), fit, model)
     screening, tried.screened = timed(lambda: screen(fitter, fit, setup.candidates, settings.screened))
     singles, models = timed(lambda: _singles(tried))
     assert fitter.simulator.traces == 1
     out = {"candidates": len(setup.candidates), "fitted": len(models), "prepare": reading, "compile": compiling}
     out |= {"known": known, "screening": screening, "singles": singles}
-    return out | {"seconds": known + screening + singles, "best": search.ranked(tried, 1)[0].label}, setup.candidates
+    return out | {"seconds": known + screening + singles, "best": ranked(tried, 1)[0].label}, setup.candidates
 
 
-def _singles(tried: race.Race) -> list:
+def _singles(tried: Pool) -> list:
     plans = [(tried.base, s) for s in tried.screened if s.gain > 0]
-    return race.fit_models(tried, plans, "single effects", lambda text, done, total: None)
+    return fit_models(tried, plans, "single effects", lambda text, done, total: None)

@@ -1,11 +1,11 @@
-"""Race tables of benchmark cases, on which rules of decision can be compared in milliseconds.
+"""Tables of all models that were tried on benchmark cases, on which criteria can be compared in milliseconds.
 
     python benchmarks/diagnosis/record.py run CASES --workers 8 [--gpu 4] [--seconds 500]   # CASE/record/table.json.gz
     python benchmarks/diagnosis/record.py one CASE                                          # one case in this process
     python benchmarks/diagnosis/record.py score CASES [--left-out SINGLES] [--criteria same=.3 far=2]
 
-A record holds every model that the race and the beam search visited with its held-out costs, what each of the two
-named, and what either took. Cases come from `diagnosis/blind.py generate`; those below seed 2000 are for development.
+A record holds every model that the search visited with its held-out costs, the finalists' costs as simulated, what was
+named, and what it took. Cases come from `diagnosis/blind.py generate`; those below seed 2000 are for development.
 """
 
 import argparse
@@ -26,10 +26,11 @@ from cases import KNOWN
 from families import without
 
 RECORD = "record"
+STAGES = ("setup", "base", "singles", "choice")  # what is known so far is kept after each
 
 
 def work(case: Path, arguments: list[str]) -> None:
-    """One case: today's diagnosis, then the one decision from the same single fits."""
+    """One case: the diagnosis as the command makes it, and the tables that its choice rests on."""
     import worker
 
     from bayessim_mjx import diagnose as command
@@ -40,29 +41,16 @@ def work(case: Path, arguments: list[str]) -> None:
     kept: dict[str, Any] = {}
     compiling = worker.compilations()
 
-    def mark(name: str, race: Any = None) -> None:
-        rollouts = race.fitter.simulator.rollouts if race is not None else 0
+    def mark(name: str, tried: Any = None) -> None:
+        rollouts = tried.fitter.simulator.rollouts if tried is not None else 0
         marks.append((name, time.perf_counter(), time.process_time(), rollouts, worker.covered(compiling)))
 
     original = run.investigate
 
     def watched(*args: Any, **options: Any) -> Any:
-        stages = iter(("base", "singles", "pairs"))
-
-        def keep(setup: Any, race: Any) -> None:
-            name = next(stages, "more") if race is not None else "setup"
-            mark(name, race)
-            if name in ("base", "singles"):
-                kept["snapshot"] = snapshot(race)
-
-        def concluding(race: Any, *given: Any) -> Any:
-            mark("verdict", race)
-            return conclude(race, *given)
-
-        conclude, run.outcome.concluded = run.outcome.concluded, concluding
-        kept["asked"] = (args, options)
+        stages = iter(STAGES)
+        keep = lambda setup, tried: mark(next(stages, "more"), tried)  # noqa: E731
         kept["found"] = original(*args, **options | {"keep": keep})
-        run.outcome.concluded = conclude
         return kept["found"]
 
     run.investigate = watched
@@ -72,61 +60,17 @@ def work(case: Path, arguments: list[str]) -> None:
     code = command.main([str(a) for a in [*given, *arguments]])
     run.investigate = original
     if "found" in kept:
-        mark("rest", kept["found"].outcome)
-        record = decided(kept, mark) | {"code": code, "marks": marks}
-        said = json.loads((out / "diagnosis.json").read_text())
-        if record["new"] != sorted(record["old"]):
-            said = concluded(kept)
-        named = {e["name"] + "@" + e["where"]: e for e in said["effects"]}
-        for label, rivals in record["rivals"].items():
-            if label in named:
-                named[label]["equivalent_to"] = rivals
-        (out / "new.json").write_text(json.dumps(said, default=float))
+        selection = kept["found"].selection
+        mark("rest", selection)
+        record = {"code": code, "marks": marks, "named": [e.label for e in selection.answer.effects]}
+        record |= {
+            "trace": selection.trace,
+            "rivals": {k: [r.to_dict() for r in v] for k, v in selection.rivals.items()},
+        }
+        record |= {"searched": selection.searched.to_dict(), "finalists": selection.table.to_dict()}
         with gzip.open(out / "table.part", "wt") as file:
             json.dump(record, file, default=float)
         (out / "table.part").rename(out / "table.json.gz")
-
-
-def snapshot(race: Any) -> Any:
-    """The race as it is now."""
-    base = race.models[frozenset()]
-    own = {"models": dict(race.models), "screened": list(race.screened), "candidates": list(race.candidates)}
-    return dataclasses.replace(race, base=base, winner=base, **own)
-
-
-def decided(kept: dict[str, Any], mark: Any) -> dict[str, Any]:
-    """What one decision makes of the race's single fits, and the tables of all that either visited."""
-    from bayessim_mjx.diagnosis.selection import chosen
-    from bayessim_mjx.diagnosis.selection.criteria import Criteria
-    from bayessim_mjx.diagnosis.selection.fits import Fits
-
-    found, race = kept["found"], kept["snapshot"]
-    before = race.fitter.simulator.rollouts
-    ruling, selection = chosen.ruled(race, Criteria(), lambda *_: None)
-    mark("decision", race)
-    kept["ruled"] = (race, ruling)
-    return {
-        "old": [e.label for e in found.model.effects],
-        "new": sorted(selection.answer),
-        "rivals": {label: [r.to_dict() for r in rivals] for label, rivals in ruling.rivals.items()},
-        "trace": selection.trace,
-        "rollouts": race.fitter.simulator.rollouts - before,
-        "visited": selection.table.to_dict(),
-        "raced": Fits(found.outcome.reopened(), lambda *_: None).table.to_dict()["rows"],
-    }
-
-
-def concluded(kept: dict[str, Any]) -> dict[str, Any]:
-    """The diagnosis that follows from the one decision: how far, what remains, the verdict."""
-    from bayessim_mjx.diagnosis import run
-    from bayessim_mjx.diagnosis.selection.criteria import Criteria
-    from bayessim_mjx.diagnosis.summary import assemble
-
-    args, options = kept["asked"]
-    run.prepare = lambda *_, **__: kept["found"].setup
-    run.outcome.chosen.run = lambda *_: kept["ruled"]
-    found = run.investigate(*args, **options | {"criteria": Criteria(), "keep": None, "verdict": None})
-    return assemble.diagnosis_of(found).to_dict()
 
 
 def run_all(args: argparse.Namespace) -> None:
@@ -181,45 +125,54 @@ def _drain(waiting: Waiting, core: int, small: bool, args: argparse.Namespace, u
 
 
 def redecided(case: Path, given: list[str]) -> dict[str, Any]:
-    """What a decision with other criteria names on the table of a case, before finalists are simulated."""
-    from bayessim_mjx.diagnosis.selection import decide, table
+    """What other criteria name on the tables of a case: among its finalists, or before any are simulated.
+
+    The latter where they would have others.
+    """
+    from bayessim_mjx.diagnosis.selection import beam, decide, table
     from bayessim_mjx.diagnosis.selection.criteria import Criteria
 
-    record = json.loads(gzip.decompress((case / RECORD / "table.json.gz").read_bytes()))
-    known = table.read(record["visited"])
-    found = decide.decide(known, decide.order(known.laws), Criteria().changed(given))
+    record = recorded(case)
+    known, seen, criteria = table.read(record["searched"]), table.read(record["finalists"]), Criteria().changed(given)
+    less = decide.order(known.laws)
+    found = decide.decide(known, less, criteria)
+    if set(beam.finalists(found, criteria)) <= seen.rows.keys():
+        found = decide.decide(seen, less, criteria)
     laws = [known.laws[label] for label in sorted(found.answer)]
     rivals = [{"effects": sorted(r.key - found.answer)} for r in found.rivals]
-    verdict = json.loads((case / RECORD / "new.json").read_text())["verdict"]
+    verdict = json.loads((case / RECORD / "diagnosis.json").read_text())["verdict"]
     effects = [{"name": c.effect, "where": c.where, "parameters": {}, "equivalent_to": rivals} for c in laws]
     return {"verdict": verdict if not laws or verdict == "unexplained" else "effects", "effects": effects}
 
 
+def recorded(case: Path) -> dict[str, Any]:
+    return dict(json.loads(gzip.decompress((case / RECORD / "table.json.gz").read_bytes())))
+
+
 def score(args: argparse.Namespace) -> None:
-    """Rates of both rules on the same cases, where they differ, and what they took."""
+    """Rates as diagnosed and with other criteria, cases that one alone has right, and what the choice took."""
     import blind
     from score import mcnemar, rates, wilson
     from score import read as outcome_of
 
     folders = [args.cases, *filter(None, [args.left_out])]
     every = [[f for f in blind.cases(folder) if (f / RECORD).exists()] for folder in folders]
-    done = [[f for f in some if (f / RECORD / "new.json").exists()] for some in every]
+    done = [[f for f in some if (f / RECORD / "table.json.gz").exists()] for some in every]
     print(f"{sum(map(len, done))} cases ended, {sum(map(len, every)) - sum(map(len, done))} did not")
     told = {}
     for name, said in (
-        ("rules of the race", lambda f: json.loads((f / RECORD / "diagnosis.json").read_text())),
-        ("one decision", lambda f: json.loads((f / RECORD / "new.json").read_text())),
-        ("one decision, again on the tables (names alone)", lambda f: redecided(f, args.criteria)),
-    ):
+        ("as diagnosed", lambda f: json.loads((f / RECORD / "diagnosis.json").read_text())),
+        (f"again on the tables, criteria {' '.join(args.criteria) or 'unchanged'} (names alone)",
+         lambda f: redecided(f, args.criteria)),
+    ):  # fmt: skip
         told[name] = rates(*([dataclasses.replace(outcome_of(f, RECORD), said=said(f)) for f in some] for some in done))
         print(name)
         for rate in told[name]:
             if rate.answers:
                 low, high = wilson(sum(rate.answers), len(rate.answers))
                 print(f"  {rate.what}: {sum(rate.answers)} of {len(rate.answers)} ({low:.2f} to {high:.2f})")
-    old, new, _ = told.values()
-    print("right by one of the two alone: rules, one decision, p of McNemar's exact test")
-    for a, b in zip(old, new, strict=True):
+    print("right by one of the two alone: as diagnosed, again, p of McNemar's exact test")
+    for a, b in zip(*told.values(), strict=True):
         if a.answers and len(a.answers) == len(b.answers):
             pairs = list(zip(a.answers, b.answers, strict=True))
             only = [sum(x > y for x, y in pairs), sum(x < y for x, y in pairs)]
@@ -228,26 +181,24 @@ def score(args: argparse.Namespace) -> None:
 
 
 def costs(done: Sequence[Path]) -> None:
-    """What both took from the single effects to the model that they name."""
+    """What the diagnoses took up to the single effects, and from there to the model that they name."""
     import numpy as np
 
     took: dict[str, list[list[float]]] = {}
     for f in done:
-        record = json.loads(gzip.decompress((f / RECORD / "table.json.gz").read_bytes()))
-        at = {m[0]: m for m in record["marks"]}
-        if "singles" in at:
+        at = {m[0]: m for m in recorded(f)["marks"]}
+        if "choice" in at:
             spent = [
-                (at[end][i] - at[begin][i])
-                for begin, end in (("singles", "verdict"), ("rest", "decision"))
-                for i in (2, 4, 3)
+                at[end][i] - at[begin][i] for begin, end in zip(STAGES, STAGES[1:], strict=False) for i in (2, 4, 3)
             ]
-            took.setdefault(f.name.rsplit("_", 2)[0], []).append(spent)
+            took.setdefault(f.name.rsplit("_", 2)[0], []).append(spent[3:])
     for name, each in [*took.items(), ("all", [x for some in took.values() for x in some])]:
-        a, c, r, a2, c2, r2 = np.sum(each, 0)
-        print(
-            f"{name}, {len(each)} cases: rules {a:.0f} CPU s ({c:.0f} s compiling), {r:.0f} rollouts;"
-            f" one decision {a2:.0f} CPU s ({c2:.0f} s compiling), {r2:.0f} rollouts"
-        )
+        if each:
+            a, c, r, a2, c2, r2 = np.sum(each, 0)
+            print(
+                f"{name}, {len(each)} cases: single effects {a:.0f} CPU s ({c:.0f} s compiling), {r:.0f} rollouts;"
+                f" choice {a2:.0f} CPU s ({c2:.0f} s compiling), {r2:.0f} rollouts"
+            )
 
 
 def main() -> None:

@@ -74,13 +74,13 @@ def covered(spans: list[tuple[float, float]]) -> float:
 
 
 def oracle(found: Any, effects: list[dict[str, Any]], joint_of: dict[str, str]) -> dict[str, Any]:
-    """What the true effects close, fitted like any other model of the race; None where the library lacks one."""
+    """What the true effects close, fitted like any other model of the search; None where the library lacks one."""
     from baselines import candidate_of, closure, fitted
 
-    chosen = [candidate_of(found.race, e["name"], e["where"], joint_of) for e in effects]
+    chosen = [candidate_of(found.pool, e["name"], e["where"], joint_of) for e in effects]
     if not effects or None in chosen:
         return {"closure": None, "effects": [e["name"] for e in effects]}
-    model = fitted(found.race, chosen)
+    model = fitted(found.pool, chosen)
     return {"closure": closure(found, model), "effects": [c.label for c in chosen]}
 
 

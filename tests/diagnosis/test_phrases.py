@@ -26,6 +26,5 @@ def test_a_sign_stands_in_the_words_where_they_have_a_place_for_it():
 
 def test_why_a_model_is_a_rival_and_a_parameter_at_its_end():
     assert phrases.close_by(3.21, -0.1) == "held-out evidence differs by 3.2 nats, 0 % of the gap"
-    assert phrases.simpler_instead(0.93, 0.95) == "simpler laws in its place close 93 % against 95 %"
     told = phrases.farthest_tried(0.5, " N m", "at most")
     assert told.startswith("ends at 0.5 N m, the smallest value tried: at most")

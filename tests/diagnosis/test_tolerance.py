@@ -98,13 +98,13 @@ def gap(left, limit=0.02):
 
 
 def findings(rms, noise=50.0, windows=8):
-    """A race whose winner names friction and leaves `rms` noises of a gap of 1000."""
+    """A selection that names friction and leaves `rms` noises of a gap of 1000."""
 
     def prediction(level):
         return Prediction(np.full((windows, 5, 2), float(level)), np.zeros((windows, 4)))
 
     winner = SimpleNamespace(effects=(FRICTION,), total=windows * noise * rms**2)
-    outcome = SimpleNamespace(
+    selection = SimpleNamespace(
         ambiguous=False,
         rivals={},
         noise=noise,
@@ -113,7 +113,7 @@ def findings(rms, noise=50.0, windows=8):
     )
     cut = SimpleNamespace(windows=SimpleNamespace(steps=5))
     return SimpleNamespace(
-        outcome=outcome, model=winner, flexible_winner=None,
+        selection=selection, model=winner, flexible_winner=None,
         flexible_base=None, setup=SimpleNamespace(fitter=SimpleNamespace(simulator=cut)),
         predictions={"nominal": prediction(2000), "calibrated": prediction(1000), "with_effects": prediction(rms)},
     )  # fmt: skip

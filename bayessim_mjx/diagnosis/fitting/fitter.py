@@ -230,19 +230,16 @@ class Fitter:
         q, starts = fit.quadratic(self.spread)
         precision, pull, low, high = fit.prior()
         group = self.simulator.windows.group if group is None else group
-        watched = self._watched(fit)
+        watched = np.arange(len(self.base), len(fit.coordinates))
         split = functools.partial(blocks, q, starts, fit.r, fit.A)
         return held_out(q, group, fit.weight, precision, pull, low, high, watched, split)
 
     def told_alone(self, fit: Fit) -> list[bool]:
         """Of each condition, whether it alone tells a parameter of an effect (a limit that is reached there only)."""
         q, _ = fit.quadratic(self.spread)
-        tells = Rest(q, fit.weight, *fit.prior()).told_by(self._watched(fit))
+        tells = Rest(q, fit.weight, *fit.prior()).told_by(np.arange(len(self.base), len(fit.coordinates)))
         group = self.simulator.windows.group
         return [tells(group == name) for name in np.unique(group)]
-
-    def _watched(self, fit: Fit) -> NDArray[np.int64]:
-        return np.arange(len(self.base), len(fit.coordinates))
 
 
 def _columns(r: Array, shifted: Array, steps: Sequence[float]) -> Array:

@@ -12,9 +12,11 @@ from bayessim_mjx.diagnosis.experiment.limits import limits_of
 from bayessim_mjx.diagnosis.experiment.propose import propose
 from bayessim_mjx.diagnosis.findings import Findings
 from bayessim_mjx.diagnosis.fitting.robot import Robot, default_space
-from bayessim_mjx.diagnosis.selection import search
-from bayessim_mjx.diagnosis.selection.models import scored
-from bayessim_mjx.diagnosis.selection.outcome import frozen
+from bayessim_mjx.diagnosis.selection import singles
+from bayessim_mjx.diagnosis.selection.criteria import Criteria
+from bayessim_mjx.diagnosis.selection.models import nats, scored
+from bayessim_mjx.diagnosis.selection.selected import frozen
+from bayessim_mjx.diagnosis.selection.tried import ranked
 from bayessim_mjx.diagnosis.setup import prepare
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Channels, Log
@@ -72,16 +74,15 @@ def slow_logs():
 
 def diagnosed(logs):
     setup = prepare(robot(), logs, ["viscous_friction", "quadratic_drag"])
-    race = search.run(setup.fitter, setup.candidates, setup.settings)
-    return setup, race
+    return setup, singles.begin(setup.fitter, setup.candidates, setup.settings, Criteria())
 
 
 @functools.cache
 def contest():
     """(findings, both models) after slow logs."""
-    setup, race = diagnosed(slow_logs())
-    models = {m.effects[0].effect: m for m in search.ranked(race, 1)}
-    return Findings(setup, frozen(race, models["quadratic_drag"], {})), models
+    setup, pool = diagnosed(slow_logs())
+    models = {m.effects[0].effect: m for m in ranked(pool, 1)}
+    return Findings(setup, frozen(pool, models["quadratic_drag"], {})), models
 
 
 @functools.cache
@@ -90,10 +91,10 @@ def proposal():
     return propose(found, [models["viscous_friction"]], LIMITS)
 
 
-def evidence(race):
-    """What the race says for drag against viscous friction, nats, held out."""
-    models = {m.effects[0].effect: m for m in search.ranked(race, 1)}
-    return race.better(models["viscous_friction"], models["quadratic_drag"]).evidence
+def evidence(tried):
+    """What the logs say for drag against viscous friction, nats, held out."""
+    models = {m.effects[0].effect: m for m in ranked(tried, 1)}
+    return nats(models["viscous_friction"], models["quadratic_drag"])
 
 
 @pytest.mark.slow
@@ -124,7 +125,7 @@ def test_limits_hold_in_everything_that_is_proposed():
 
 
 def test_the_promised_evidence_comes_true(tmp_path):
-    race = contest()[0].outcome
+    before = contest()[0].selection
     found = proposal()
     command = read_command(write_command(tmp_path / "next.csv", found))
     kp, kd = (command.notes["closed_loop"][k]["motor"] for k in ("kp", "kd"))
@@ -137,11 +138,11 @@ def test_the_promised_evidence_comes_true(tmp_path):
     q, u = real(law, len(ref) - 1, start=ref[0])
     assert np.abs(q).max() < RANGE
     _, after = diagnosed([*slow_logs(), log_of("next", q, u, 99)])
-    realised = evidence(after) - evidence(race)
-    assert evidence(race) < 5
+    realised = evidence(after) - evidence(before)
+    assert evidence(before) < 5
     # promised is what refitted rivals leave apart; held out, the wrong one fails on the fast log by more
     assert found.evidence / 3 < realised < 10 * found.evidence
-    assert after.winner.effects[0].effect == "quadratic_drag"
+    assert ranked(after, 1)[0].effects[0].effect == "quadratic_drag"
 
 
 def test_the_command_file_round_trips(tmp_path):
@@ -171,7 +172,7 @@ def test_identical_rivals_are_said_to_be_inseparable():
 
 def test_a_single_survivor_is_sharpened():
     contested, _ = contest()
-    lonely = replace(contested, outcome=replace(contested.outcome, models={}))
+    lonely = replace(contested, selection=replace(contested.selection, models={}))
     found = propose(lonely, [], LIMITS)
     assert "sharpens hinge.quadratic_drag.coefficient" in found.why
     assert found.evidence > 0.3 and found.pairs == []

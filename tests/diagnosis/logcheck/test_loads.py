@@ -7,7 +7,9 @@ import pytest
 from bayessim_mjx import effects
 from bayessim_mjx.diagnosis.fitting import robot, scales
 from bayessim_mjx.diagnosis.logcheck import loads
-from bayessim_mjx.diagnosis.selection import search
+from bayessim_mjx.diagnosis.selection import singles
+from bayessim_mjx.diagnosis.selection.criteria import Criteria
+from bayessim_mjx.diagnosis.selection.tried import Settings, ranked
 from bayessim_mjx.diagnosis.setup import prepare
 from bayessim_mjx.logs import Channels, Log, estimate_velocity
 
@@ -88,9 +90,9 @@ def test_a_load_fifteen_times_its_flange_is_found_again(tmp_path):
     path = tmp_path / "arm.xml"
     path.write_text(ARM % (0.002, "Euler", *LIMITS, ""))
     setup = prepare(robot.of_file(path), [follow(truth, i, 2.0) for i in range(3)], ("payload",))
-    settings = search.Settings(singles=1, pairs=1, most=1, starts=1)
+    settings = Settings(singles=1, starts=1)
     candidates = [c for c in setup.candidates if c.where == "flange"]  # the same rigid body as the lower arm
-    found = search.run(setup.fitter, candidates, settings).winner
+    found = ranked(singles.begin(setup.fitter, candidates, settings, Criteria()))[0]
     assert [c.label for c in found.effects] == ["payload@flange"]
     mass, x, _, z = found.values_of(found.effects[0])
     assert mass == pytest.approx(3.0, rel=0.03) and x == pytest.approx(0.2, abs=0.02)

@@ -93,8 +93,8 @@ class Linear:
             assert plan.parent in self.rows, f"{plan.key} from {plan.parent}, which was not fitted"
             self._fit(plan.key)
 
-    def polish(self, key):
-        assert key in self.rows
+    def polish(self, keys):
+        assert all(key in self.rows for key in keys)
 
     def simulate(self, keys):
         return Table({k: self.rows[k] for k in keys}, self.laws, self.group, float(ROWS))

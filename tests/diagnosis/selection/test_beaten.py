@@ -5,7 +5,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from bayessim_mjx.diagnosis.selection.race import Settings
 from bayessim_mjx.diagnosis.summary.assemble import _beaten
 
 WINDOWS, NOISE = 10, 50.0
@@ -17,14 +16,13 @@ def found(base: float, named: float, flexible: float, significant: bool = True):
     def total(level):
         return level * NOISE * WINDOWS
 
-    outcome = SimpleNamespace(
+    selection = SimpleNamespace(
         base=SimpleNamespace(total=total(base), cost=np.full(WINDOWS, total(base) / WINDOWS)),
         noise=NOISE,
-        settings=Settings(),
     )
     condition = SimpleNamespace(significant=significant, cost=np.full(WINDOWS, total(flexible) / WINDOWS))
     model = SimpleNamespace(total=total(named))
-    return SimpleNamespace(outcome=outcome, model=model, flexible_base=SimpleNamespace(condition=condition))
+    return SimpleNamespace(selection=selection, model=model, flexible_base=SimpleNamespace(condition=condition))
 
 
 @pytest.mark.parametrize(

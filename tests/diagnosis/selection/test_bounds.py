@@ -9,8 +9,10 @@ from bayessim_mjx.diagnosis.fitting.candidates import Candidate, Coordinate, shr
 from bayessim_mjx.diagnosis.fitting.fitter import Fitter
 from bayessim_mjx.diagnosis.result import Estimate
 from bayessim_mjx.diagnosis.selection import bounds
+from bayessim_mjx.diagnosis.selection.criteria import Criteria
 from bayessim_mjx.diagnosis.selection.models import scored
-from bayessim_mjx.diagnosis.selection.race import Race, Settings
+from bayessim_mjx.diagnosis.selection.pool import Pool
+from bayessim_mjx.diagnosis.selection.tried import Settings
 from bayessim_mjx.effects.effect import Quantity
 from bayessim_mjx.report import words
 
@@ -41,8 +43,8 @@ class Windows:
         return len(MOTION)
 
 
-def race_of(true, quantity=None, low=0.0, high=1.0, neutral=0.0, start=0.5):
-    """A race whose only model is the toy effect, fitted within its range."""
+def pool_of(true, quantity=None, low=0.0, high=1.0, neutral=0.0, start=0.5):
+    """A pool whose only model is the toy effect, fitted within its range."""
     simulator = Linear(true, quantity or Quantity("amount", neutral, low, high), low, high)
     coordinate = Coordinate("place.toy.amount", (0,), neutral, low, high, unit="N m")
     coordinate = Coordinate(**{**coordinate.__dict__, "precision": shrink(coordinate)})
@@ -52,42 +54,42 @@ def race_of(true, quantity=None, low=0.0, high=1.0, neutral=0.0, start=0.5):
     fit = fitter.begin((coordinate,), np.array([start]))
     (fit,) = fitter.iterate([fit], 10, lambda f: [0])
     model = scored(fitter, fitter.refresh(fit), (candidate,))
-    race = Race(fitter, [candidate], Settings(), empty.fit, empty, winner=model)
-    race.models[frozenset([candidate.label])] = model
-    return race, model
+    pool = Pool(fitter, [candidate], Settings(), Criteria(), empty.fit, empty)
+    pool.models[frozenset([candidate.label])] = model
+    return pool, model
 
 
 def silent(*args):
     pass
 
 
-def ended(race, model):
+def ended(pool, model):
     (effect,) = model.effects
     (c,) = effect.coordinates
-    return bounds.of(race.fitter.simulator.physics, c, float(model.values_of(effect)[0])), model.fit.values[0]
+    return bounds.of(pool.fitter.simulator.physics, c, float(model.values_of(effect)[0])), model.fit.values[0]
 
 
 @pytest.mark.parametrize(("true", "high"), [(0.4, 1.0), (1.7, 2.0), (5.3, 8.0)])
 def test_a_range_grows_until_it_holds_the_truth(true, high):
-    race, model = race_of(true)
-    new = bounds.widened(race, model, silent)
-    bound, value = ended(race, new)
+    pool, model = pool_of(true)
+    new = bounds.widened(pool, model, silent)
+    bound, value = ended(pool, new)
     assert bound is None and value == pytest.approx(true, abs=0.01)
-    assert new.effects[0].coordinates[0].high == high and race.candidates[0].coordinates[0].high == high
+    assert new.effects[0].coordinates[0].high == high and pool.candidates[0].coordinates[0].high == high
     assert new.effects[0] == model.effects[0]  # the same effect at the same place
 
 
 def test_beyond_the_largest_range_the_value_is_a_bound():
-    race, model = race_of(20.0)
-    bound, value = ended(race, bounds.widened(race, model, silent))
+    pool, model = pool_of(20.0)
+    bound, value = ended(pool, bounds.widened(pool, model, silent))
     assert bound.kind == "at least" and value == pytest.approx(8.0) and "8 N m, the largest value tried" in bound.why
 
 
 def test_negative_and_positive_ranges_grow_too():
-    race, model = race_of(-3.1, low=-1.0)
-    assert ended(race, bounds.widened(race, model, silent))[1] == pytest.approx(-3.1, abs=0.01)
-    race, model = race_of(0.15, low=0.5, high=1.5, neutral=1.0, start=1.0)  # a gain halves: it stays positive
-    assert ended(race, bounds.widened(race, model, silent))[1] == pytest.approx(0.15, abs=0.01)
+    pool, model = pool_of(-3.1, low=-1.0)
+    assert ended(pool, bounds.widened(pool, model, silent))[1] == pytest.approx(-3.1, abs=0.01)
+    pool, model = pool_of(0.15, low=0.5, high=1.5, neutral=1.0, start=1.0)  # a gain halves: it stays positive
+    assert ended(pool, bounds.widened(pool, model, silent))[1] == pytest.approx(0.15, abs=0.01)
 
 
 @pytest.mark.parametrize(
@@ -99,9 +101,9 @@ def test_negative_and_positive_ranges_grow_too():
     ],
 )
 def test_ends_that_stay(true, quantity, kind, value):
-    race, model = race_of(true, quantity)
-    new = bounds.widened(race, model, silent)
-    bound, at = ended(race, new)
+    pool, model = pool_of(true, quantity)
+    new = bounds.widened(pool, model, silent)
+    bound, at = ended(pool, new)
     assert new is model and bound.kind == kind and at == pytest.approx(value, abs=1e-6)
 
 

@@ -82,7 +82,8 @@ def test_a_special_case_is_named_before_its_law_which_is_told():
     dry, general = law("coulomb_friction"), law("asymmetric_friction", numbers=2, special=("coulomb_friction",))
     found = decided({(): 100, (dry,): 1.05, (general,): 1.0})
     assert found.answer == labels(dry) and [r.key for r in found.rivals] == [labels(general)]
-    assert decided({(): 100, (dry,): 30.0, (general,): 1.0}).answer == labels(general)
+    for bare, special in ((100, 30.0), (100, 10.0), (20, 2.8)):
+        assert decided({(): bare, (dry,): special, (general,): 1.0}).answer == labels(general)
 
 
 def test_one_place_is_named_before_all_of_them():
