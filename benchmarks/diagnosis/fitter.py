@@ -55,7 +55,7 @@ def fit(folder: Path, without: str) -> dict:
     return {"prepare": reading, "compile": compiling, "fit": fitting, "x": dict(zip(names, fit.values, strict=True))}
 
 
-def race_all(folder: Path) -> tuple[dict, list[Candidate]]:
+def fit_all(folder: Path) -> tuple[dict, list[Candidate]]:
     """Screening of all candidates and the fits of all singles that could gain, each in its share of the whole."""
     reading, compiling, setup = prepare(folder, "all", None)
     fitter, settings = setup.fitter, dataclasses.replace(setup.settings, singles=len(setup.candidates))

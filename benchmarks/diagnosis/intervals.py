@@ -1,5 +1,5 @@
 """Do 90 % intervals of a diagnosis cover? Shares of the gap from few operating conditions, return recovered from few
-trainings, and the race's t where nothing differs.
+trainings, and the t of a comparison where nothing differs.
 
     python benchmarks/diagnosis/intervals.py > figures            # four minutes on one core
 
@@ -169,7 +169,7 @@ def recovered(repeats: int, seed: int) -> None:
 
 
 def false_alarms(repeats: int, seed: int) -> None:
-    """How often the race's t says more than 2 where two models predict equally well: 2.3 % by the normal law."""
+    """How often the t of a comparison says more than 2 where two models predict equally well (2.3 %)."""
     print("\nt > 2 where nothing differs: 2.3 % by the normal law")
     for name, kind in (("normal", lambda r, n: r.normal(size=n)), ("heavy", lambda r, n: r.standard_t(3, size=n))):
         rng, row = np.random.default_rng(seed), []

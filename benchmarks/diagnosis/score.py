@@ -30,7 +30,7 @@ class Outcome:
     joint_of: dict[str, str]
     seconds: float
     compile_seconds: float = math.nan
-    true_closure: float | None = None  # what the true effects close, fitted by the same race
+    true_closure: float | None = None  # what the true effects close, fitted by the same search
     isolable: bool | None = None  # None: not looked at
 
     @property

@@ -122,7 +122,7 @@ def compare_fit(folder: Path, variants: Sequence[str]) -> dict:
 
 def compare_race(folder: Path, variant: str, one_place: bool) -> dict:
     """All candidates by the library; by mujoco.sysid those that MuJoCo has, from off the bounds."""
-    ours, candidates = fitter.race_all(folder)
+    ours, candidates = fitter.fit_all(folder)
     print(json.dumps(ours), file=sys.stderr, flush=True)
     if one_place:
         candidates = list({c.effect: c for c in reversed(candidates) if c.where != "all"}.values())

@@ -17,7 +17,7 @@ RECORDED = "tests/loop/test_recorded.py"
 ALGEBRA = "tests/test_algebra.py"
 MANIFEST = "tests/runs"
 LOG = "tests/logs/test_resample.py"
-SEARCH = "tests/diagnosis/selection/test_search.py"
+DECIDE = "tests/diagnosis/selection/test_decide.py"
 
 FAULTS: tuple[tuple[str, str, str, str, tuple[str, ...]], ...] = (
     # physics
@@ -158,8 +158,8 @@ FAULTS: tuple[tuple[str, str, str, str, tuple[str, ...]], ...] = (
     ),
     # diagnosis
     (
-        "superfluous effects stay in the answer", f"{P}/diagnosis/selection/search.py",
-        "idle = [m for m in smaller if not race.passes(m, model)]", "idle = []", (SEARCH, "-k", "superfluous"),
+        "superfluous effects stay in the answer", f"{P}/diagnosis/selection/decide.py",
+        "criteria.same) and real(", "0.0) and real(", (DECIDE, "-k", "further_effect"),
     ),
     (
         "noise is not taken out before the tolerance", f"{P}/diagnosis/tolerance.py",
@@ -167,9 +167,8 @@ FAULTS: tuple[tuple[str, str, str, str, tuple[str, ...]], ...] = (
         ("tests/diagnosis/test_tolerance.py", "-k", "taken_out"),
     ),
     (
-        "a law gives way to a special case that closes far less", f"{P}/diagnosis/selection/search.py",
-        "race.closure(model) - race.closure(m) < race.settings.tie / 2]", "race.closure(model) - race.closure(m) < 2]",
-        (SEARCH, "-k", "gives_way"),
+        "a law gives way to a special case that closes far less", f"{P}/diagnosis/selection/decide.py",
+        "ratio < 1.0 + criteria.same or", "ratio < 100.0 + criteria.same or", (DECIDE, "-k", "special_case"),
     ),
     # environment
     (

@@ -20,7 +20,7 @@ def test_shapley_s_shares_by_hand():
     np.testing.assert_allclose(shares, [0.6, 0.2])
 
 
-def race() -> SimpleNamespace:
+def toy() -> SimpleNamespace:
     """Windows whose residuals are linear in two effects, noise 1; nothing known to refit."""
     rng = np.random.default_rng(0)
     group = np.repeat(np.arange(GROUPS), EACH)
@@ -49,7 +49,7 @@ def race() -> SimpleNamespace:
 
 
 def test_on_a_linear_problem_the_promise_is_kept():
-    found = race()
+    found = toy()
     before, after = (float(np.mean(x**2)) for x in (found.base.fit.r, found.left))
     total, each = predicted_gain.promised(found, found.effects)
     assert total == pytest.approx((before - after) / (before - 1.0), abs=0.02)
