@@ -11,7 +11,7 @@ from bayessim_mjx.diagnosis.logcheck.channels import Link
 from bayessim_mjx.diagnosis.residual.disturbance import Disturbance
 from bayessim_mjx.diagnosis.residual.flexible import Flexible
 from bayessim_mjx.diagnosis.residual.frequency import Heard
-from bayessim_mjx.diagnosis.result import Place
+from bayessim_mjx.diagnosis.residual.where import Located
 from bayessim_mjx.diagnosis.selection.heldout import Prediction
 from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.selection.selected import Selection
@@ -23,12 +23,10 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, eq=False)
 class Where:
-    """Where the gap lies: places, largest share first, and in words; maps of the missing force; what spectra show."""
+    """Where the gap lies: joints, regions of the state, signatures; and what spectra of the missing force show."""
 
-    places: tuple[Place, ...]
-    maps: tuple[dict[str, Any], ...]
+    found: Located
     spectra: tuple[Heard, ...]
-    sentences: tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,8 +1,10 @@
-"""How facts about fits are put into words: places in the state, missing forces, bounds, rivals; effects: vocabulary."""
+"""How facts are put into words: places in the state, missing forces, bounds, rivals, experiments (not effects)."""
 
-from collections.abc import Iterable, Mapping
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
+from bayessim_mjx.effects.support.words import words
 from bayessim_mjx.quantities import percent
 
 AXES = {
@@ -128,3 +130,68 @@ def stuck(value: float) -> str:
 def moves(spread: float, groups: int) -> str:
     """Of a known parameter that differs between operating conditions."""
     return f"moves between operating conditions (sd {spread:.3g} over {groups}): structure is missing"
+
+
+def model_title(effects: Sequence[tuple[str, str]]) -> str:
+    """`load friction at elbow and actuator delay at elbow_motor`, of (effect, where)."""
+    places = ["everywhere" if where == "all" else f"at {where}" for _, where in effects]
+    named = [f"{name.replace('_', ' ')} {place}" for (name, _), place in zip(effects, places, strict=True)]
+    return " and ".join(named) or "the known parameters alone"
+
+
+def known_payload(mass: float, place: str) -> tuple[str, str]:
+    """(what is added to an experiment's name, what a person does)."""
+    return (
+        f"with a known payload of {mass:g} kg on {place}",
+        f"a person: fix a known mass of {mass:g} kg at the centre of {place}",
+    )
+
+
+def other_mount(way: str) -> tuple[str, str]:
+    """The same of a base that is mounted another way."""
+    return f"base {way}", f"a person: mount the base {way}"
+
+
+def separating(effects: Iterable[str]) -> str:
+    """What else would tell effects apart, in their own words."""
+    known = [f"{e.replace('_', ' ')}: {how}" for e in dict.fromkeys(effects) if (how := words(e).separates)]
+    return "; ".join(known) or "a known payload, two mount orientations, or a measured effort"
+
+
+def nats(evidence: float) -> str:
+    """Ten or more as a whole number."""
+    return f"{evidence:.0f}" if evidence >= 10 else f"{evidence:.1f}"
+
+
+def nothing_safe(help: str) -> str:
+    """Why no experiment is proposed: none of the menu can be run; `help`: of `separating`."""
+    return f"no experiment of the menu stays within the limits; what would help: {help}"
+
+
+def run_experiment(name: str, seconds: float) -> str:
+    """`run a chirp on hinge for 10 s`."""
+    article = "a " if name.startswith(("slow triangle", "staircase", "chirp", "multisine")) else ""
+    return f"run {article}{name} for {seconds:.0f} s"
+
+
+def sharpens(action: str, parameter: str, before: float, after: float, unit: str) -> str:
+    """What an experiment does to the standard deviation of a parameter, where no rival is left."""
+    return f"{action}: sharpens {parameter}, standard deviation from {before:.2g} to {after:.2g} {unit}".rstrip()
+
+
+def separates_nobody(labels: Sequence[str], best: str, evidence: float, help: str) -> str:
+    """Why an experiment does not help, of models' titles, its name and the nats that it would give."""
+    most = f"the best, {best}, is expected to give {nats(evidence)} nats"
+    return f"no safe excitation separates {_apart(labels)} ({most}); what would: {help}"
+
+
+def tells_apart(action: str, labels: Sequence[str], evidence: float, contested: bool) -> str:
+    """What an experiment separates; contested: whether the logs left it open."""
+    weak = 10.0 / max(evidence, 1e-9)
+    again = f"; repeat it {math.ceil(weak)} times for a decision" if 1.3 < weak <= 10 else ""
+    whom = f"separates {_apart(labels)}" if contested else f"makes sure of {_apart(labels, 'against')}"
+    return f"{action}: {whom}, expected evidence {nats(evidence)} nats{again}"
+
+
+def _apart(labels: Sequence[str], word: str = "from") -> str:
+    return f"{labels[0]} {word} {', '.join(labels[1:-1]) + ' and ' if len(labels) > 2 else ''}{labels[-1]}"

@@ -82,9 +82,8 @@ def where_it_lies(found: Findings, say: Progress) -> Findings:
     if found.disturbance is None:
         return found
     fitter, fit = found.setup.fitter, found.selection.base.fit
-    places, maps, told = where.locate(fitter, fit, found.disturbance, seed=found.setup.seed)
-    spectra = frequency.analyse(fitter, fit, found.disturbance)
-    return found.having(Where(tuple(places), tuple(maps), spectra, tuple(told)))
+    located = where.locate(fitter, fit, found.disturbance, seed=found.setup.seed)
+    return found.having(Where(located, frequency.analyse(fitter, fit, found.disturbance)))
 
 
 STAGES = (

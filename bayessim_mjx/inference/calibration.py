@@ -20,7 +20,7 @@ from scipy.special import ndtr
 from bayessim_mjx.distributions import Distribution, box, charts
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.inference.temperature import TEMPERATURES, temperature, widened
-from bayessim_mjx.quantities import estimate
+from bayessim_mjx.quantities import percent, percent_estimate
 
 LEVELS = (0.5, 0.8, 0.95)
 DRAWS = 256  # proposals per pair; those outside the box are left out
@@ -116,8 +116,8 @@ class Report:
         return len(self.ranks.level)
 
     def table(self) -> str:
-        """Coverage in words: `50 %: 49 ± 2, 80 %: ...`."""
-        rows = [f"{100 * a:.0f} %: {estimate(100 * c, 100 * s, 1)}" for a, (c, s) in self.coverage.items()]
+        """Coverage in words: `50 %: 49 ± 2 %, 80 %: ...`."""
+        rows = [f"{percent(a)}: {percent_estimate(c, s, 1)}" for a, (c, s) in self.coverage.items()]
         return ", ".join(rows)
 
     def to_dict(self) -> dict[str, Any]:

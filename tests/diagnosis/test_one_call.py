@@ -14,6 +14,7 @@ import bayessim_mjx
 from bayessim_mjx import diagnosis
 from bayessim_mjx.diagnosis import run
 from bayessim_mjx.diagnosis.findings import Findings, Where
+from bayessim_mjx.diagnosis.residual.where import Located
 from bayessim_mjx.errors import UserError
 from tests.diagnosis.pendulums import MODEL, nominal, recorded, saved
 
@@ -39,7 +40,7 @@ def test_an_optional_stage_that_fails_is_a_warning_and_any_other_an_error():
 
 
 def test_findings_are_values():
-    start, part = found(), Where((), (), (), ("here",))
+    start, part = found(), Where(Located(), ())
     more = start.having(part)
     assert start.part(Where) is None and more.part(Where) is part and more.part(int) is None
     with pytest.raises(dataclasses.FrozenInstanceError):

@@ -1,16 +1,17 @@
-"""Words about experiments: what separates an effect from its look-alikes, what else to record, why one is proposed."""
+"""What a person can do for an experiment, what else is worth recording, and why one is proposed; words: phrases."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from bayessim_mjx.diagnosis import phrases
+from bayessim_mjx.diagnosis.experiment.design import Scored, Scorer
 from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.setup import Setup
 from bayessim_mjx.effects.support.words import words
@@ -43,13 +44,12 @@ def helps(setup: Setup) -> list[Help]:
             mass = float(f"{PAYLOAD_SHARE * own.high:.2g}")
             shift = np.zeros(len(physics.space))
             shift[last.start] = mass
-            needs = f"a person: fix a known mass of {mass:g} kg at the centre of {place}"
-            out.append(Help(f"with a known payload of {mass:g} kg on {place}", needs, shift))
+            out.append(Help(*phrases.known_payload(mass, place), shift))
         if effect.name == "gravity_tilt" and not _floats(physics.mj_model):
-            for name, tilt in STANDING:
+            for way, tilt in STANDING:
                 shift = np.zeros(len(physics.space))
                 shift[last.slice] = tilt
-                out.append(Help(f"base {name}", f"a person: mount the base {name}", shift, tilt))
+                out.append(Help(*phrases.other_mount(way), shift, tilt))
     return out
 
 
@@ -58,11 +58,8 @@ def _floats(model: mujoco.MjModel) -> bool:
 
 
 def title(model: Model) -> str:
-    """'load friction at elbow and actuator delay at elbow_motor'."""
-    if not model.effects:
-        return "the known parameters alone"
-    places = ["everywhere" if c.where == "all" else f"at {c.where}" for c in model.effects]
-    return " and ".join(f"{c.effect.replace('_', ' ')} {p}" for c, p in zip(model.effects, places, strict=True))
+    """Of a model, by its effects."""
+    return phrases.model_title([(c.effect, c.where) for c in model.effects])
 
 
 def witnesses(models: Sequence[Model], logs: Sequence[Log]) -> list[str]:
@@ -73,41 +70,19 @@ def witnesses(models: Sequence[Model], logs: Sequence[Log]) -> list[str]:
 
 
 def instead(models: Sequence[Model]) -> str:
-    """What else would separate the models' effects, in the effects' own words."""
-    effects = dict.fromkeys(c.effect for m in models for c in m.effects)
-    known = [f"{e.replace('_', ' ')}: {how}" for e in effects if (how := words(e).separates)]
-    return "; ".join(known) or "a known payload, two mount orientations, or a measured effort"
+    """What else would separate the models' effects."""
+    return phrases.separating(c.effect for m in models for c in m.effects)
 
 
-def reason(scorer: Any, chosen: Any, labels: Sequence[str], contested: bool, useful: bool, limits: Any) -> str:
+def reason(scorer: Scorer, chosen: Scored | None, labels: Sequence[str], contested: bool, useful: bool) -> str:
     """One sentence: the motion, the rivals, the expected evidence."""
-    rivals = f"{labels[0]} from {', '.join(labels[1:-1]) + ' and ' if len(labels) > 2 else ''}{labels[-1]}"
     if chosen is None:
-        return f"no experiment of the menu stays within the limits; what would help: {instead(scorer.models)}"
-    action = f"run {_article(chosen.name)}{chosen.name} for {chosen.played.log.duration:.0f} s"
+        return phrases.nothing_safe(instead(scorer.models))
+    action = phrases.run_experiment(chosen.name, chosen.played.log.duration)
     if len(labels) == 1:
-        return _sharpening(scorer, chosen, action)
+        index, variance = scorer.loosest(0)
+        c, before = scorer.models[0].fit.coordinates[index], math.sqrt(variance)
+        return phrases.sharpens(action, c.name, before, before * math.exp(-chosen.evidence), c.unit)
     if not useful:
-        most = f"the best, {chosen.name}, is expected to give {nats(chosen.evidence)} nats"
-        return f"no safe excitation separates {rivals} ({most}); what would: {instead(scorer.models)}"
-    verb = "separates" if contested else "makes sure of"
-    weak = 10.0 / max(chosen.evidence, 1e-9)
-    again = f"; repeat it {math.ceil(weak)} times for a decision" if 1.3 < weak <= 10 else ""
-    rivals = rivals if contested else rivals.replace(" from ", " against ", 1)
-    return f"{action}: {verb} {rivals}, expected evidence {nats(chosen.evidence)} nats{again}"
-
-
-def nats(evidence: float) -> str:
-    return f"{evidence:.0f}" if evidence >= 10 else f"{evidence:.1f}"
-
-
-def _article(name: str) -> str:
-    return "a " if name.startswith(("slow triangle", "staircase", "chirp", "multisine")) else ""
-
-
-def _sharpening(scorer: Any, chosen: Any, action: str) -> str:
-    index, variance = scorer.loosest(0)
-    c = scorer.models[0].fit.coordinates[index]
-    before = math.sqrt(variance)
-    after = before * math.exp(-chosen.evidence)
-    return f"{action}: sharpens {c.name}, standard deviation from {before:.2g} to {after:.2g} {c.unit}".rstrip()
+        return phrases.separates_nobody(labels, chosen.name, chosen.evidence, instead(scorer.models))
+    return phrases.tells_apart(action, labels, chosen.evidence, contested)

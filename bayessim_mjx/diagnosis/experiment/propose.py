@@ -216,7 +216,7 @@ def _decide(
     ):
         chosen = helped
     useful = chosen is not None and (chosen.evidence > BUDGET.nothing or (len(labels) == 1 and chosen.evidence > 0.1))
-    why = advice.reason(scorer, chosen, labels, contested, useful, stand.limits)
+    why = advice.reason(scorer, chosen, labels, contested, useful)
     witnesses = advice.witnesses(scorer.models, scorer.fitter.simulator.windows.logs)
     kept = {s.name for s in final}
     table = [*final, *(s for s in [*scored, *attended] if s.name not in kept)]

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayessim_mjx.diagnosis import phrases
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 from bayessim_mjx.diagnosis.residual.disturbance import Disturbance, step_of_starts
 from bayessim_mjx.diagnosis.residual.motion_inputs import Inputs
@@ -45,19 +44,20 @@ class Number:
         """Zero lies outside of the interval."""
         return self.low > 0 or self.high < 0
 
-    def __str__(self) -> str:
-        return phrases.bracketed(self.value, self.low, self.high, self.unit)
-
 
 @dataclass(frozen=True)
 class Fingerprint:
-    """One signature at one joint: what it says, its numbers, and the share of the force's rms that each one carries."""
+    """One signature at one joint: its numbers, and the share of the force's rms that each one carries."""
 
     name: str
     joint: str
-    text: str
     numbers: dict[str, Number]
     weight: dict[str, float]
+
+    @property
+    def told(self) -> dict[str, Number]:
+        """The numbers that matter: clear, and not small."""
+        return {k: n for k, n in self.numbers.items() if n.clear and self.weight[k] > LIMITS.small}
 
 
 def regress(y: Array, X: Array, gain: Array, without: Array) -> tuple[Array, Array, Array]:
@@ -85,7 +85,7 @@ def _fingerprint(
     terms: dict[str, tuple[Array, str]],
     without: Array,
 ) -> Fingerprint:
-    """terms: {name: (column `[W, m]`, unit)}; those that matter are told in the words of `phrases.SIGNATURES`."""
+    """terms: {name: (column `[W, m]`, unit)}."""
     X = np.stack([column for column, _ in terms.values()], 2)
     used = node.used
     beta, replicates, rms = regress(np.where(used, y, 0.0), X, used[..., None] * node.gain, without)
@@ -95,12 +95,7 @@ def _fingerprint(
     }
     size = max(float(np.sqrt(np.mean(y[node.used] ** 2))) if node.used.any() else 0.0, 1e-300)
     weight = {key: float(r) / size for key, r in zip(terms, rms, strict=True)}
-    own, told = phrases.SIGNATURES[name], []
-    for key, words in own.terms.items():
-        if (n := numbers[key]).clear and weight[key] > LIMITS.small:
-            told.append(phrases.signed(n.value, n.low, n.high, n.unit, words))
-    head = own.head.format(recent=LIMITS.recent)
-    return Fingerprint(name, node.joint, f"{node.joint}: {head} {', '.join(told)}" if told else "", numbers, weight)
+    return Fingerprint(name, node.joint, numbers, weight)
 
 
 def fingerprints(

@@ -1,19 +1,19 @@
-"""Where the gap lies: shares by joint, the missing force over regions of the state, one sentence per finding."""
+"""Where the gap lies: shares by joint, the missing force over regions of the state, signatures of known causes."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bayessim_mjx.diagnosis import phrases, statistics
+from bayessim_mjx.diagnosis import statistics
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 from bayessim_mjx.diagnosis.residual import motion_inputs, regions
 from bayessim_mjx.diagnosis.residual.disturbance import Disturbance, estimate
-from bayessim_mjx.diagnosis.residual.fingerprints import fingerprints
+from bayessim_mjx.diagnosis.residual.fingerprints import Fingerprint, fingerprints
 from bayessim_mjx.diagnosis.residual.regions import ALONG, Leaf, Nodes, Tree
-from bayessim_mjx.diagnosis.result import Place
 
 Array = NDArray[np.float64]
 
@@ -30,19 +30,46 @@ class Rules:
 RULES = Rules()
 
 
-def locate(
-    fitter: Fitter, fit: Fit, disturbance: Disturbance | None = None, *, seed: int = 0
-) -> tuple[list[Place], list[dict], list[str]]:
-    """Places of the gap that a fit leaves.
+@dataclass(frozen=True)
+class Spot:
+    """What one joint has of the gap.
 
-    Args:
-        disturbance: of this fit; None: estimated here.
-
-    Returns:
-        (places, largest share first; maps of the missing force, see `regions.force_map`; sentences).
+    Attributes:
+        joint, unit: its name, and of its force; share, ci: of the gap, with its 90 % interval.
+        size: rms of the missing force; looked: whether the share is large enough for a look at regions.
+        leaves: regions of the state that explain enough of the force; units: {axis: of their limits}.
+        along: whether the leaves' force is that along the motion.
     """
+
+    joint: str
+    unit: str
+    share: float
+    ci: tuple[float, float]
+    size: float
+    looked: bool
+    leaves: tuple[Leaf, ...]
+    units: Mapping[str, str]
+    along: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Located:
+    """Where a gap lies.
+
+    Attributes:
+        spots: joints, the largest share first; none where the gap is within the noise.
+        maps: of the missing force, see `regions.force_map`; prints: signatures of known causes.
+    """
+
+    spots: tuple[Spot, ...] = ()
+    maps: tuple[dict, ...] = ()
+    prints: tuple[Fingerprint, ...] = ()
+
+
+def locate(fitter: Fitter, fit: Fit, disturbance: Disturbance | None = None, *, seed: int = 0) -> Located:
+    """Places of the gap that a fit leaves; `disturbance`: of this fit, None: estimated here."""
     if float(fit.quadratic(fitter.spread)[0].c.mean()) < RULES.quiet * fitter.size:
-        return [], [], [phrases.WITHIN_NOISE]
+        return Located()
     disturbance = estimate(fitter, fit) if disturbance is None else disturbance
     windows, model = fitter.simulator.windows, fitter.simulator.physics.mj_model
     inputs = motion_inputs.measured(windows, model)
@@ -55,13 +82,16 @@ def locate(
     worth = [v for v in np.argsort(-share) if share[v] > RULES.worth]
     maps = _maps([node[v] for v in worth], without, rng)
     trees = {v: regions.tree(node[v], windows.group) for v in worth}
-    sentences = [s for v in worth for s in _sentences(node[v], trees[v])]
     prints = [f for v in worth for f in fingerprints(fitter, fit, disturbance, inputs, v, node[v], without)]
-    sentences += [f.text for f in prints if f.text]
-    places = [
-        Place(node[v].joint, float(share[v]), spread[v], _region(node[v], trees.get(v))) for v in np.argsort(-share)
-    ]
-    return places, maps, sentences
+    spots = [_spot(node[v], trees.get(v), float(share[v]), spread[v]) for v in np.argsort(-share)]
+    return Located(tuple(spots), tuple(maps), tuple(prints))
+
+
+def _spot(node: Nodes, found: Tree | None, share: float, ci: tuple[float, float]) -> Spot:
+    size = float(np.sqrt(np.mean(node.force[node.used] ** 2))) if node.used.any() else 0.0
+    leaves = _told(found) if found is not None else ()
+    along = found is not None and found.target == ALONG
+    return Spot(node.joint, node.force_unit, share, ci, size, found is not None, leaves, node.units, along)
 
 
 def explained(fit: Fit, disturbance: Disturbance) -> Array:
@@ -88,20 +118,5 @@ def _maps(nodes: list[Nodes], without: Array, rng: np.random.Generator) -> list[
     return [m | {"significant": part.tolist()} for (m, _), part in zip(made, parts, strict=True)]
 
 
-def _told(found: Tree) -> list[Leaf]:
-    return [leaf for leaf in found.leaves if leaf.share > RULES.told and found.r2 > RULES.told][:3]
-
-
-def _sentences(node: Nodes, found: Tree) -> list[str]:
-    told = _told(found)
-    if not told:
-        size = float(np.sqrt(np.mean(node.force[node.used] ** 2))) if node.used.any() else 0.0
-        return [phrases.placeless_force(node.joint, size, node.force_unit)]
-    along = found.target == ALONG
-    force = [phrases.missing_force(leaf.mean, node.force_unit, along) for leaf in told]
-    return [f"{node.joint}, {phrases.region(leaf.where, node.units)}: {f}" for leaf, f in zip(told, force, strict=True)]
-
-
-def _region(node: Nodes, found: Tree | None) -> str:
-    told = _told(found) if found is not None else []
-    return phrases.region(told[0].where, node.units) if told else ""
+def _told(found: Tree) -> tuple[Leaf, ...]:
+    return tuple([leaf for leaf in found.leaves if leaf.share > RULES.told and found.r2 > RULES.told][:3])

@@ -18,7 +18,7 @@ from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.selection.tried import Tried, ranked
 from bayessim_mjx.diagnosis.summary import effects_found, how_far
 from bayessim_mjx.diagnosis.summary.details import details
-from bayessim_mjx.diagnosis.summary.left_in_words import spectra_in_words
+from bayessim_mjx.diagnosis.summary.left_in_words import located_in_words, places_of, spectra_in_words
 from bayessim_mjx.diagnosis.summary.sentences import horizon_warning, sentences
 from bayessim_mjx.diagnosis.summary.whole_logs import Whole
 from bayessim_mjx.logs.log import Channels
@@ -63,13 +63,13 @@ def diagnosis_of(found: Findings, about: Mapping[str, Any] | None = None, file: 
     far = how_far.with_whole(far, over, setup.tolerance) if over else far
     told = sentences(name, effects, parameters, found, far, remains, _beaten(found))
     notes = [*setup.warnings, *(over.notes if over else ()), *(horizon_warning(far) if effects else [])]
-    more = {"maps": where.maps, "frequency": [heard.details() for heard in where.spectra]} if where else {}
-    lies = [*where.sentences, *spectra_in_words(where.spectra)] if where else []
+    more = {"maps": where.found.maps, "frequency": [heard.details() for heard in where.spectra]} if where else {}
+    lies = [*located_in_words(where.found), *spectra_in_words(where.spectra)] if where else []
     return Diagnosis(
         verdict=name,
         sentences=[*told, *lies],
         effects=effects,
-        where=list(where.places) if where and where.places else _where(found),
+        where=places_of(where.found) if where and where.found.spots else _where(found),
         gap=far,
         parameters=parameters,
         candidates=ranking(selection),

@@ -7,8 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from bayessim_mjx.diagnosis import phrases
+from bayessim_mjx.diagnosis.residual import fingerprints
+from bayessim_mjx.diagnosis.residual.fingerprints import Fingerprint
 from bayessim_mjx.diagnosis.residual.flexible import Flexible
 from bayessim_mjx.diagnosis.residual.frequency import Heard
+from bayessim_mjx.diagnosis.residual.where import Located
+from bayessim_mjx.diagnosis.result import Place
 from bayessim_mjx.quantities import percent
 
 
@@ -39,6 +44,38 @@ def flexible_in_words(found: Flexible) -> list[str]:
     inputs = [d["input"] for d in found.depends_on if d["importance"] > least][:4]
     depends = f"depends on {', '.join(inputs)}" if inputs else "depends on nothing that was measured: it is constant"
     return [*text, f"what is missing acts at {', '.join(joints)} and {depends}"]
+
+
+def places_of(found: Located) -> list[Place]:
+    """Joints with their shares, and the first region told of each."""
+    return [
+        Place(s.joint, s.share, s.ci, phrases.region(s.leaves[0].where, s.units) if s.leaves else "")
+        for s in found.spots
+    ]
+
+
+def located_in_words(found: Located) -> list[str]:
+    """One sentence per region of a joint's missing force, and per signature of a known cause."""
+    if not found.spots:
+        return [phrases.WITHIN_NOISE]
+    text = []
+    for spot in found.spots:
+        for leaf in spot.leaves:
+            force = phrases.missing_force(leaf.mean, spot.unit, spot.along)
+            text.append(f"{spot.joint}, {phrases.region(leaf.where, spot.units)}: {force}")
+        if spot.looked and not spot.leaves:
+            text.append(phrases.placeless_force(spot.joint, spot.size, spot.unit))
+    return text + [told for f in found.prints if (told := _signature(f))]
+
+
+def _signature(found: Fingerprint) -> str:
+    own, numbers = phrases.SIGNATURES[found.name], found.told
+    told = [
+        phrases.signed(n.value, n.low, n.high, n.unit, words)
+        for key, words in own.terms.items()
+        if (n := numbers.get(key)) is not None
+    ]
+    return f"{found.joint}: {own.head.format(recent=fingerprints.LIMITS.recent)} {', '.join(told)}" if told else ""
 
 
 def spectra_in_words(found: Sequence[Heard]) -> list[str]:

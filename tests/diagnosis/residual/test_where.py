@@ -6,6 +6,7 @@ import pytest
 from bayessim_mjx.diagnosis import statistics
 from bayessim_mjx.diagnosis.residual import disturbance, motion_inputs, regions, where
 from bayessim_mjx.diagnosis.residual.fingerprints import fingerprints
+from bayessim_mjx.diagnosis.summary.left_in_words import located_in_words, places_of
 from tests.diagnosis.missing_forces import fitted, record
 
 pytestmark = [pytest.mark.slow, pytest.mark.ci]  # whole diagnoses and fits
@@ -40,7 +41,8 @@ def prints(case, dof):
 
 
 def test_the_joint_is_found(elbow):
-    places, _, sentences = where.locate(*elbow)
+    found = where.locate(*elbow)
+    places, sentences = places_of(found), located_in_words(found)
     assert places[0].channel == "elbow"
     assert places[0].share > 0.9
     assert places[0].ci[0] <= places[0].share <= places[0].ci[1]
@@ -57,7 +59,7 @@ def test_friction_shows_as_a_constant_against_the_motion(elbow):
 
 
 def test_maps_are_significant_over_direction_and_not_over_time(elbow):
-    _, maps, _ = where.locate(*elbow)
+    maps = where.locate(*elbow).maps
     assert {m["joint"] for m in maps} == {"elbow"}
     by_axis = {m["axis"]: m for m in maps}
     assert by_axis["direction"]["significant"] == [True, True]
@@ -69,7 +71,7 @@ def test_maps_are_significant_over_direction_and_not_over_time(elbow):
 
 
 def test_the_region_of_a_force_is_told(backward):
-    _, _, sentences = where.locate(*backward)
+    sentences = located_in_words(where.locate(*backward))
     assert "position below" in sentences[0] and "against the motion" in sentences[0]
     _, _, found = backward
     inputs = motion_inputs.measured(backward[0].simulator.windows, backward[0].simulator.physics.mj_model)
@@ -81,7 +83,8 @@ def test_the_region_of_a_force_is_told(backward):
 
 def test_a_push_is_the_same_way_everywhere():
     case = located(force=lambda t, d: np.array([0.08]))
-    places, _, sentences = where.locate(*case)
+    found = where.locate(*case)
+    places, sentences = places_of(found), located_in_words(found)
     assert places[0].region == "everywhere"
     assert sentences[0] == "shoulder, everywhere: +0.08 N m"
     assert prints(case, 0)["odd and even in speed"].numbers["offset"].value == pytest.approx(0.08, rel=0.05)
@@ -104,9 +107,9 @@ def test_friction_that_grows_with_load_shows_in_its_slope():
 
 
 def test_within_the_noise_nothing_is_placed():
-    places, maps, sentences = where.locate(*located())
-    assert (places, maps) == ([], [])
-    assert "noise" in sentences[0]
+    found = where.locate(*located())
+    assert (found.spots, found.maps) == ((), ())
+    assert "noise" in located_in_words(found)[0] and places_of(found) == []
 
 
 def test_discoveries_are_those_of_benjamini_and_hochberg():
