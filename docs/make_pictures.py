@@ -7,6 +7,7 @@ pseudo-terminal (Linux, macOS), about five minutes together on two cores. What i
 
 - loop.svg, diagnosis.svg: the terminal, by rich's export
 - posterior.png: the corner plot of the last round
+- pendulum.gif: the policy of the best round, by `play --video`; left out with a reason where nothing can be drawn
 - report.png: the head of report.html, by a headless Chromium or Chrome; left out with a reason where there is none
 """
 
@@ -34,7 +35,9 @@ ROOT = Path(__file__).resolve().parents[1]
 ROWS, COLUMNS = 60, 100
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 WINDOW = "1180,1290"  # of the browser
-LARGEST = 200_000  # bytes of a picture
+LARGEST = {".svg": 200_000, ".png": 200_000, ".gif": 1_000_000}  # bytes of a picture
+GIF = "fps=15,scale=240:-1:flags=lanczos,split[a][b];[a]palettegen=max_colors=64[p];[b][p]paletteuse=dither=none"
+PLAY = "play --task Pendulum --checkpoint best --video"
 LOOP = "main --task Pendulum bayessim.realIters=3"
 DIAGNOSIS = "diagnose --task Pendulum --data motion --out found"
 EFFECTS = "coulomb_friction,viscous_friction,actuator_gain,actuator_delay,joint_offset"
@@ -139,6 +142,15 @@ def loop_pictures(work: Path, out: Path) -> None:
     terminal_picture(text, LOOP, out / "loop.svg")
     corners = sorted(work.glob("logs/Pendulum/*/pictures/BayesSim_posterior_0*.png"))
     shutil.copyfile(corners[-1], out / "posterior.png")
+    in_terminal(PLAY.split(), work, "play")
+    films = sorted(work.glob("logs/Pendulum/*/videos/play/*.mp4"))
+    if not films:
+        print(f"pendulum.gif: left out, see {work / 'play.txt'}")
+        return
+    import imageio_ffmpeg
+
+    encoder = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-i", str(films[-1]), "-filter_complex", GIF, "-loop", "0"]
+    subprocess.run([*encoder, str(out / "pendulum.gif")], check=True, capture_output=True)
 
 
 def record_motion(folder: Path) -> None:
@@ -182,7 +194,8 @@ def main() -> None:
         PICTURES[name](work, args.out)
     for picture in sorted(args.out.iterdir()):
         size = picture.stat().st_size
-        print(f"{picture}: {size / 1000:.0f} kB{' (too large)' if size > LARGEST else ''}")
+        large = " (too large)" if size > LARGEST[picture.suffix] else ""
+        print(f"{picture}: {size / 1000:.0f} kB{large}")
 
 
 if __name__ == "__main__":
