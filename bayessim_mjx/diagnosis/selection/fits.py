@@ -138,7 +138,9 @@ class Fits:
         steps = fitter.simulator.windows.steps
         for key, model in zip(todo, heldout.refitted(fitter, [models[k] for k in todo]), strict=True):
             models[key] = model
-            cost = heldout.predict(fitter, model).cost(steps) * self.pool.noise
+            seen = heldout.predict(fitter, model)
+            # start states count as in the search, or all models would come nearer to the noise than they did there
+            cost = seen.cost(steps) * self.pool.noise + np.sum((seen.offsets / fitter.spread) ** 2, axis=1)
             self._folds[key] = (model, replace(self._row(key, model, True), cost=cost, simulated=True))
         return replace(known, rows={key: self._folds[key][1] for key in keys})
 
