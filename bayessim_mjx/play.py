@@ -68,10 +68,8 @@ def _physics(config: Config, env: Any, checkpoint: Path, key: Any, count: int) -
     import jax.numpy as jnp
 
     from bayessim_mjx.distributions import Distribution
+    from bayessim_mjx.loop.posterior import restored
     from bayessim_mjx.loop.sources import make_source
-    from bayessim_mjx.loop.state import chart_of
-    from bayessim_mjx.parameters.ranged import Ranged
-    from bayessim_mjx.runs import checkpoints
 
     kinds = {"nominal": jnp.tile(jnp.asarray(env.space.nominal, jnp.float32), (count, 1))}
     if not len(env.space):
@@ -80,11 +78,7 @@ def _physics(config: Config, env: Any, checkpoint: Path, key: Any, count: int) -
     kinds["prior"] = prior.sample(key, count)
     if config.env.realParams is not None and not config.real.logs:
         kinds["real"] = make_source(config, env).sample(key, count)  # type: ignore[union-attr]
-    if checkpoints.has(checkpoint, "state.domain"):
-        own = checkpoints.chart(checkpoint, "state.domain") or chart_of(config.bayessim, env.space)
-        moves = checkpoints.has(checkpoint, "state.domain.space")
-        like = Distribution.prior(Ranged(env.space) if moves else env.space, config.bayessim.components, own)
-        domain = checkpoints.restore(checkpoint, {"state.domain": like})[0]["state.domain"]
+    if (domain := restored(checkpoint, env, config)) is not None:
         kinds["posterior"] = domain.sample(key, count)
     return kinds
 

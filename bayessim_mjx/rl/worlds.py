@@ -37,11 +37,20 @@ def reset(
         clock: control steps since training began.
     """
     theta_key, reset_key = jax.random.split(key)
-    if domain is None:
-        thetas = jnp.tile(jnp.asarray(env.space.nominal, jnp.float32), (worlds, 1))
-    else:
-        thetas = domain.sample(theta_key, worlds)
-    given: tuple[Any, ...] = (jax.random.split(reset_key, worlds), thetas)
+    return reset_at(env, reset_key, drawn(env, theta_key, domain, worlds), mesh, clock)
+
+
+def drawn(env: Env, key: jax.Array, domain: Distribution | None, worlds: int) -> jax.Array:
+    """theta `[worlds, d]` from `domain`; None: the nominal one."""
+    if domain is not None:
+        return domain.sample(key, worlds)
+    return jnp.tile(jnp.asarray(env.space.nominal, jnp.float32), (worlds, 1))
+
+
+def reset_at(env: Env, key: jax.Array, thetas: jax.Array, mesh: Mesh | None = None, clock: Any = 0) -> State:
+    """Fresh episodes with parameters `thetas` `[N, d]`; the rest as for `reset`."""
+    worlds = thetas.shape[0]
+    given: tuple[Any, ...] = (jax.random.split(key, worlds), thetas)
     if getattr(env, "nuisance", None) is not None:
         given = (given[0], env.space.scheduled(thetas, clock), starting(clock, worlds))
     return sharding.local(jax.vmap(traced(env.reset)), mesh, (FIRST,) * len(given), FIRST)(*given)

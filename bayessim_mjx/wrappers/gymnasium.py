@@ -20,6 +20,7 @@ from bayessim_mjx.env import Env
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.monitor import video
 from bayessim_mjx.rollout import next_episodes, select
+from bayessim_mjx.wrappers.spaces import boxes
 
 RENDER_MODES = ("rgb_array",)
 WIDTH, HEIGHT = 480, 360  # pixels of a picture
@@ -48,14 +49,6 @@ def make_vec(
         env_settings: settings of `env:`, e.g. `episodeLength=100`.
     """
     return GymnasiumVectorEnv(registry.make(task, **env_settings), num_envs, domain, autoreset_mode, render_mode)
-
-
-def _spaces(env: Env) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
-    (size,) = env.observation_size["policy"]
-    return (
-        gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float32),
-        gymnasium.spaces.Box(-1.0, 1.0, (env.action_size,), np.float32),
-    )
 
 
 def _metadata(env: Env, render_mode: str | None) -> dict[str, Any]:
@@ -89,7 +82,7 @@ def _options(options: Mapping[str, Any] | None, allowed: tuple[str, ...]) -> dic
     return given
 
 
-class _Camera:
+class Camera:
     """Pictures of worlds, each with its own parameters; compiled models are kept while theta stays."""
 
     def __init__(self, env: Env) -> None:
@@ -114,9 +107,9 @@ class GymnasiumEnv(gymnasium.Env):
     def __init__(self, env: Env, theta: Any = None, render_mode: str | None = None) -> None:
         self.env, self.render_mode = env, render_mode
         self.metadata = _metadata(env, render_mode)
-        self.observation_space, self.action_space = _spaces(env)
+        self.observation_space, self.action_space = boxes(env)
         self._theta = _theta(env, env.space.nominal if theta is None else theta)
-        self._reset, self._step, self._camera = program(env.reset, env), program(env.step, env), _Camera(env)
+        self._reset, self._step, self._camera = program(env.reset, env), program(env.step, env), Camera(env)
         self._state: Any = None
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
@@ -177,11 +170,11 @@ class GymnasiumVectorEnv(VectorEnv):
             raise UserError(f"autoreset_mode = {autoreset_mode!r}; allowed: {allowed}") from None
         self.env, self.num_envs, self._domain, self.render_mode = env, int(num_envs), domain, render_mode
         self.metadata = _metadata(env, render_mode) | {"autoreset_mode": self.mode}
-        self.single_observation_space, self.single_action_space = _spaces(env)
+        self.single_observation_space, self.single_action_space = boxes(env)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._reset, self._step = program(self._restarted, env), program(self._advanced, env)
-        self._camera = _Camera(env)
+        self._camera = Camera(env)
         self._key: Any = None
         self._state: Any = None
         self._ended = np.zeros(self.num_envs, bool)

@@ -1,0 +1,239 @@
+"""Many worlds in one batch that restart by themselves: what the wrappers for foreign trainers stand on.
+
+    worlds("Ant", 1024)                          nominal physics
+    worlds("Ant", 1024, domain="prior")          physics from the task's ranges, new in every episode
+    worlds("logs/Ant/RUN", 1024)                 the run's own task under the posterior that it ended with
+
+Arrays stay on their device; the wrappers hand them on by DLPack, or copy them where a trainer wants numpy.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from bayessim_mjx import registry
+from bayessim_mjx.compat import program
+from bayessim_mjx.distributions import Distribution
+from bayessim_mjx.env import Env, Observations
+from bayessim_mjx.errors import UserError
+from bayessim_mjx.rl.worlds import clock, drawn, reset_at
+from bayessim_mjx.rollout import next_episodes, select, traced
+
+
+class Batch(NamedTuple):
+    """What a step led to in N worlds; ended ones have begun again.
+
+    Attributes:
+        obs: groups `[N, ...]`, of the new episode where the old one ended.
+        reward: `[N]` float32.
+        terminated: `[N]` bool, the episode ended for good; truncated: `[N]` bool, by its time limit alone.
+        final: groups `[N, ...]`, the observations that the step itself led to: the last ones of ended episodes.
+        returns: `[N]` float32, sum of the episode's rewards; lengths: `[N]` int32, its steps; both with this one.
+        metrics: the task's scalars `[N]`.
+        theta: `[N, d]`, the parameters of the episodes that `obs` belongs to.
+    """
+
+    obs: Observations
+    reward: jax.Array
+    terminated: jax.Array
+    truncated: jax.Array
+    final: Observations
+    returns: jax.Array
+    lengths: jax.Array
+    metrics: dict[str, jax.Array]
+    theta: jax.Array
+
+
+class _Running(NamedTuple):
+    """Worlds between two steps: states, their theta, sums so far; and new episodes in store, with which were used."""
+
+    state: Any
+    theta: jax.Array
+    returns: jax.Array
+    lengths: jax.Array
+    store: tuple[Any, jax.Array]
+    used: jax.Array
+
+
+class Worlds:
+    """`num_envs` worlds of `env`; theta comes from `domain` anew in each episode (None: nominal).
+
+    Raises:
+        UserError: `num_envs` below 1; a step before the first reset; actions or theta of another shape.
+    """
+
+    def __init__(self, env: Env, num_envs: int, domain: Distribution | None = None, seed: int = 0) -> None:
+        if not isinstance(num_envs, int | np.integer) or num_envs < 1:
+            raise UserError(f"num_envs = {num_envs!r}: must be a whole number of at least 1")
+        self.env, self.num_envs, self.domain = env, int(num_envs), domain
+        self._key = jax.random.PRNGKey(seed)
+        self._begin, self._advance = program(self._began, env), program(self._advanced, env)
+        self._running: _Running | None = None
+        self._fixed: jax.Array | None = None  # theta [N, d] that `set_theta` gave
+
+    def seed(self, seed: int) -> None:
+        """What is drawn from now on."""
+        self._key = jax.random.PRNGKey(seed)
+
+    def set_theta(self, theta: Any = None) -> None:
+        """Episodes that begin from now on have `theta`, `[d]` or `[num_envs, d]`; None: what `domain` draws."""
+        if self._running is not None:  # episodes in store have others
+            self._running = self._running._replace(used=jnp.ones(self.num_envs, bool))
+        if theta is None:
+            self._fixed = None
+            return
+        d, value = len(self.env.space.nominal), np.asarray(theta, np.float32)
+        if value.shape not in ((d,), (self.num_envs, d)):
+            raise UserError(f"theta has shape {list(value.shape)}; expected {[d]} or {[self.num_envs, d]}")
+        self._fixed = jnp.broadcast_to(value, (self.num_envs, d))
+
+    def reset(self) -> Observations:
+        """New episodes in all worlds; their first observations, groups `[N, ...]`."""
+        self._key, key = jax.random.split(self._key)
+        self._running = self._begin(key, self.domain, self._fixed)
+        return self._running.state.obs
+
+    def step(self, action: Any) -> Batch:
+        """One control step with `action` `[N, A]` in [-1, 1]."""
+        if self._running is None:
+            raise UserError("step before reset: call reset() first")
+        if tuple(action.shape) != (expected := (self.num_envs, self.env.action_size)):
+            raise UserError(f"actions have shape {list(action.shape)}; expected {list(expected)}")
+        self._key, key = jax.random.split(self._key)
+        batch, self._running = self._advance(key, self._running, action, self.domain, self._fixed)
+        return batch
+
+    @property
+    def obs(self) -> Observations:
+        """The worlds' observations now, groups `[N, ...]`; the first call resets."""
+        return self.reset() if self._running is None else self._running.state.obs
+
+    @property
+    def theta(self) -> jax.Array:
+        """Parameters of the running episodes, `[N, d]`."""
+        if self._running is None:
+            raise UserError("theta before reset: call reset() first")
+        return self._running.theta
+
+    @property
+    def lengths(self) -> jax.Array:
+        """Steps of the running episodes, `[N]` int32."""
+        return jnp.zeros(self.num_envs, jnp.int32) if self._running is None else self._running.lengths
+
+    @property
+    def qpos(self) -> jax.Array:
+        """Positions `[N, nq]`, for pictures."""
+        if self._running is None:
+            raise UserError("a picture before reset: call reset() first")
+        return self._running.state.pipeline_state.qpos
+
+    def _episodes(self, key: jax.Array, domain: Any, fixed: jax.Array | None, now: Any = 0) -> tuple[Any, jax.Array]:
+        theta_key, reset_key = jax.random.split(key)
+        theta = drawn(self.env, theta_key, domain, self.num_envs) if fixed is None else fixed
+        return reset_at(self.env, reset_key, theta, None, now), theta
+
+    def _began(self, key: jax.Array, domain: Any, fixed: jax.Array | None) -> _Running:
+        first, later = (self._episodes(k, domain, fixed) for k in jax.random.split(key))
+        zero, n = jnp.zeros, self.num_envs
+        return _Running(*first, zero(n), zero(n, jnp.int32), later, zero(n, bool))
+
+    def _advanced(
+        self, key: jax.Array, old: _Running, action: jax.Array, domain: Any, fixed: jax.Array | None
+    ) -> tuple[Batch, _Running]:
+        after = jax.vmap(traced(self.env.step))(old.state, jnp.asarray(action, jnp.float32))
+        terminated = after.info["terminated"] > 0
+        truncated = (after.info["truncated"] > 0) & ~terminated
+        ended = terminated | truncated
+        returns, lengths = old.returns + after.reward, old.lengths + 1
+        # resets are dear: new episodes are drawn for all worlds at once, when one of them needs its second
+        empty = (ended & old.used).any()
+        renew = lambda: self._episodes(key, domain, fixed, clock(self.env, old.state))  # noqa: E731
+        store = jax.lax.cond(empty, lambda: _as(renew(), old.store), lambda: old.store)
+        fresh, theta = store
+        fresh = next_episodes(self.env, ended, after, fresh)
+        if getattr(self.env, "nuisance", None) is not None:  # where parameters last, these are the old ones
+            theta = fresh.pipeline_state.theta
+        state, theta = select(ended, (fresh, theta), (after, old.theta))
+        batch = Batch(
+            state.obs, after.reward, terminated, truncated, after.obs, returns, lengths, dict(after.metrics), theta
+        )
+        returns, lengths = jnp.where(ended, 0.0, returns), jnp.where(ended, 0, lengths)
+        return batch, _Running(state, theta, returns, lengths, store, (old.used & ~empty) | ended)
+
+
+def _as(tree: Any, reference: Any) -> Any:
+    """`tree` with the dtypes of `reference`, as both ends of a condition need the same."""
+    return jax.tree.map(lambda x, ref: jnp.asarray(x, jnp.result_type(ref)), tree, reference)
+
+
+def worlds(task: Any, num_envs: int = 64, domain: Any = None, seed: int = 0, **env_settings: Any) -> Worlds:
+    """Worlds of a task, or of a run's task under its posterior.
+
+    Args:
+        task: a task's name, an environment, or the folder of a run of `bayessim_mjx.main` or `bayessim_mjx.train`:
+            then everything of the environment is as in the run, and `domain` is its posterior unless another is given.
+        num_envs: worlds in the batch.
+        domain: where theta comes from, anew in each episode. None or "nominal": the nominal one; "prior": the task's
+            ranges; a `Distribution`; the folder of a run or of a checkpoint: its posterior; a file that
+            `Distribution.save` wrote.
+        seed: of resets and theta.
+        env_settings: settings of `env:`, e.g. `episodeLength=100`.
+
+    Raises:
+        UserError: a task, run or file that there is not; a distribution over other parameters.
+    """
+    config = None
+    if isinstance(task, Path) or (isinstance(task, str) and Path(task).is_dir()):
+        config, checkpoint = _run(task)
+        env = registry.make(config.task, config=config, **env_settings)
+        domain = checkpoint if domain is None else domain
+    elif isinstance(task, str):
+        env = registry.make(task, **env_settings)
+    else:
+        if env_settings:
+            raise UserError(f"{next(iter(env_settings))}: settings go with a task's name, not with an environment")
+        env = task
+    return Worlds(env, num_envs, domain_of(env, domain), seed)
+
+
+def domain_of(env: Env, source: Any) -> Distribution | None:
+    """The distribution over theta that `source` names (see `worlds`)."""
+    if source is None or source == "nominal":
+        return None
+    if not isinstance(source, str | Path):
+        return source
+    if source == "prior":
+        return Distribution.prior(env.space, 1) if len(env.space) else None
+    path = Path(source)
+    if path.is_file():
+        return Distribution.load(path, env.space)
+    if not path.is_dir():
+        raise UserError(
+            f"domain = {str(source)!r}: allowed are nominal, prior, a Distribution, the folder of a run or checkpoint, "
+            "and a file that Distribution.save wrote"
+        )
+    from bayessim_mjx.loop.posterior import restored
+
+    config, checkpoint = _run(path)
+    found = restored(checkpoint, env, config)
+    if found is None and config.randomization.get("randomize") and len(env.space):
+        return Distribution.prior(env.space, 1)  # PPO alone, on the prior
+    return found
+
+
+def _run(path: str | Path) -> tuple[Any, Path]:
+    """(settings, checkpoint with the last state) of a run or of one of its checkpoints."""
+    from bayessim_mjx.runs import MANIFEST, Run
+
+    folder = Path(path).absolute()
+    if (folder / MANIFEST).is_file():
+        run = Run.open(folder)
+        return run.config, run.checkpoint("latest")
+    if (folder.parents[1] / MANIFEST).is_file():
+        return Run.open(folder.parents[1]).config, folder
+    raise UserError(f"{path}: neither a run nor a checkpoint of one (there is no {MANIFEST})")
