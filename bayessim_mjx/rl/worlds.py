@@ -66,11 +66,16 @@ def clock(env: Env, env_states: State) -> jax.Array:
 def stagger(key: jax.Array, state: State, episode_length: int) -> tuple[State, jax.Array]:
     """First episodes' clocks spread out, so that time limits do not come all at once; and which are late, [N]."""
     steps = jax.random.randint(key, state.reward.shape, 0, episode_length).astype(state.info["steps"].dtype)
+    return aged(state, steps), (steps > 0).astype(jnp.float32)
+
+
+def aged(state: State, steps: jax.Array) -> State:
+    """The same worlds as if their episodes were `steps` `[N]` control steps old, for the time limit."""
+    steps = steps.astype(state.info["steps"].dtype)
     world = state.pipeline_state
     if "steps" in getattr(world, "task", {}):  # our tasks count in the world, the others in info
         world = world.replace(task={**world.task, "steps": steps})
-    state = dataclasses.replace(state, pipeline_state=world, info={**state.info, "steps": steps})
-    return state, (steps > 0).astype(jnp.float32)
+    return dataclasses.replace(state, pipeline_state=world, info={**state.info, "steps": steps})
 
 
 def gather(

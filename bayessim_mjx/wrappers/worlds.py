@@ -21,7 +21,7 @@ from bayessim_mjx.compat import program
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.env import Env, Observations
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.rl.worlds import clock, drawn, reset_at
+from bayessim_mjx.rl.worlds import aged, clock, drawn, reset_at
 from bayessim_mjx.rollout import next_episodes, select, traced
 
 
@@ -71,14 +71,16 @@ class Worlds:
         if not isinstance(num_envs, int | np.integer) or num_envs < 1:
             raise UserError(f"num_envs = {num_envs!r}: must be a whole number of at least 1")
         self.env, self.num_envs, self.domain = env, int(num_envs), domain
-        self._key = jax.random.PRNGKey(seed)
+        self.seed(seed)
         self._begin, self._advance = program(self._began, env), program(self._advanced, env)
         self._running: _Running | None = None
         self._fixed: jax.Array | None = None  # theta [N, d] that `set_theta` gave
 
     def seed(self, seed: int) -> None:
         """What is drawn from now on."""
-        self._key = jax.random.PRNGKey(seed)
+        # bound to its device as tensors of other libraries are: else the second step would be compiled again
+        key = jax.random.PRNGKey(seed)
+        self._key = jax.device_put(key, key.devices().pop())
 
     def set_theta(self, theta: Any = None) -> None:
         """Episodes that begin from now on have `theta`, `[d]` or `[num_envs, d]`; None: what `domain` draws."""
@@ -91,6 +93,14 @@ class Worlds:
         if value.shape not in ((d,), (self.num_envs, d)):
             raise UserError(f"theta has shape {list(value.shape)}; expected {[d]} or {[self.num_envs, d]}")
         self._fixed = jnp.broadcast_to(value, (self.num_envs, d))
+
+    def set_lengths(self, steps: jax.Array) -> None:
+        """The running episodes are `steps` `[N]` old from now on, so that their time limits do not come all at once."""
+        if self._running is None:
+            self.reset()
+        old: _Running = self._running  # type: ignore[assignment]
+        steps = jnp.asarray(steps, jnp.int32)
+        self._running = old._replace(state=aged(old.state, steps), lengths=steps)
 
     def reset(self) -> Observations:
         """New episodes in all worlds; their first observations, groups `[N, ...]`."""

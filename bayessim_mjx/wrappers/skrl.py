@@ -1,0 +1,157 @@
+"""Our worlds as environments of skrl, for its JAX agents (`make`) and its PyTorch ones (`make(..., library="torch")`).
+
+The group "policy" is the observation; the group "critic", where a task has one, is the state. The last observations of
+ended episodes are `info["final_observation"]`.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from bayessim_mjx.errors import UserError
+from bayessim_mjx.wrappers.spaces import boxes
+from bayessim_mjx.wrappers.worlds import Worlds, worlds
+
+try:
+    import skrl  # noqa: F401
+except ImportError as error:
+    raise UserError(f"wrappers.skrl needs skrl: pip install 'bayessim-mjx[skrl]' ({error})") from error
+
+LIBRARIES = ("jax", "torch")
+
+
+def make(
+    task: Any, num_envs: int = 64, domain: Any = None, seed: int = 0, library: str = "jax", **env_settings: Any
+) -> Any:
+    """Worlds of a task, or of a run under its posterior, as a wrapped environment of skrl.
+
+    Args:
+        task, num_envs, domain, seed, env_settings: as for `wrappers.worlds.worlds`.
+        library: what the agents are written in, "jax" or "torch".
+    """
+    return wrapped(worlds(task, num_envs, domain, seed, **env_settings), library)
+
+
+def wrapped(worlds: Worlds, library: str = "jax") -> Any:
+    """`worlds` as an environment that skrl's trainers take as it is."""
+    if library not in LIBRARIES:
+        raise UserError(f"library = {library!r}: allowed are {', '.join(LIBRARIES)}")
+    return _JaxEnv(worlds) if library == "jax" else _torch_env()(worlds)
+
+
+class _Env:
+    """What both kinds share; observations are taken over by `_out`, actions by `_in`."""
+
+    def __init__(self, worlds: Worlds) -> None:
+        self.worlds = self._env = self._unwrapped = worlds
+        self.spaces = boxes(worlds.env)
+        self._begun = False
+        self._obs = worlds.obs
+
+    @property
+    def num_envs(self) -> int:
+        return self.worlds.num_envs
+
+    @property
+    def num_agents(self) -> int:
+        return 1
+
+    @property
+    def observation_space(self) -> Any:
+        return self.spaces[0]
+
+    @property
+    def action_space(self) -> Any:
+        return self.spaces[1]
+
+    @property
+    def state_space(self) -> Any:
+        return boxes(self.worlds.env, "critic")[0] if "critic" in self.worlds.env.observation_size else None
+
+    def reset(self) -> tuple[Any, dict]:
+        """New episodes the first time; after that the running ones, as they restart by themselves."""
+        if not self._begun:
+            self._begun, self._obs = True, self.worlds.reset()
+        return self._out(self._obs["policy"]), {}
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict]:
+        batch = self.worlds.step(jnp.clip(self._in(actions), -1.0, 1.0))
+        self._obs = batch.obs
+        columns = (self._out(x.reshape(-1, 1)) for x in (batch.reward, batch.terminated, batch.truncated))
+        info = {"final_observation": self._out(batch.final["policy"])}
+        return self._out(batch.obs["policy"]), *columns, info
+
+    def state(self) -> Any:
+        return self._out(self._obs["critic"]) if "critic" in self._obs else None
+
+    def render(self, *args: Any, **kwargs: Any) -> None:
+        return None
+
+    def close(self) -> None:
+        pass
+
+    def _out(self, x: jax.Array) -> Any:
+        raise NotImplementedError
+
+    def _in(self, x: Any) -> jax.Array:
+        raise NotImplementedError
+
+
+class _JaxEnv(_Env):
+    @property
+    def device(self) -> jax.Device:
+        return self._obs["policy"].devices().pop()
+
+    def _out(self, x: jax.Array) -> jax.Array:
+        return x
+
+    def _in(self, x: Any) -> jax.Array:
+        return jnp.asarray(x)
+
+
+def _torch_env() -> type:
+    from bayessim_mjx.wrappers.tensors import device_of, to_jax, to_torch, torch
+
+    class TorchEnv(_Env):
+        @property
+        def device(self) -> Any:
+            return torch().device(device_of(self._obs["policy"]))
+
+        def _out(self, x: jax.Array) -> Any:
+            return to_torch(x).clone()
+
+        def _in(self, x: Any) -> jax.Array:
+            return to_jax(x, self._obs["policy"].devices().pop())
+
+    return TorchEnv
+
+
+def settings(timesteps: int, folder: str = "logs/skrl", **changes: Any) -> dict[str, Any]:
+    """Settings of skrl's `Runner` with which small tasks learn by PPO, in skrl's names.
+
+    Args:
+        timesteps: control steps of each world.
+        folder: for TensorBoard and checkpoints.
+        changes: replace settings of the agent, e.g. `rollouts=24`.
+    """
+    network = {"name": "net", "input": "OBSERVATIONS", "layers": [64, 64], "activations": "elu"}
+    policy = {
+        "class": "GaussianMixin", "clip_actions": False, "clip_log_std": True, "min_log_std": -20.0, "max_log_std": 2.0,
+        "initial_log_std": 0.0, "network": [network], "output": "ACTIONS",
+    }  # fmt: skip
+    value = {"class": "DeterministicMixin", "clip_actions": False, "network": [network], "output": "ONE"}
+    agent = {
+        "class": "PPO", "rollouts": 32, "learning_epochs": 5, "mini_batches": 4, "discount_factor": 0.99,
+        "gae_lambda": 0.95, "learning_rate": 1e-3, "learning_rate_scheduler": "KLAdaptiveLR",
+        "learning_rate_scheduler_kwargs": {"kl_threshold": 0.01}, "observation_preprocessor": "RunningStandardScaler",
+        "value_preprocessor": "RunningStandardScaler", "grad_norm_clip": 1.0, "time_limit_bootstrap": True,
+        "experiment": {"directory": folder, "write_interval": 0, "checkpoint_interval": 0},
+    }  # fmt: skip
+    return {
+        "seed": 0,
+        "models": {"separate": True, "policy": policy, "value": value},
+        "memory": {"class": "RandomMemory", "memory_size": -1},
+        "agent": agent | changes,
+        "trainer": {"class": "SequentialTrainer", "timesteps": timesteps, "environment_info": "log"},
+    }
