@@ -74,3 +74,38 @@ class RlGamesVecEnv(IVecEnv):
 
     def seed(self, seed: int) -> None:
         self.worlds.seed(seed)
+
+
+def settings(name: str, num_envs: int, epochs: int, folder: str = "logs/rl_games", **changes: Any) -> dict[str, Any]:
+    """What `Runner.load` takes, with which small tasks learn by PPO, in rl_games' names.
+
+    Args:
+        name: as registered.
+        num_envs: worlds.
+        epochs: PPO iterations.
+        folder: for TensorBoard and checkpoints.
+        changes: replace entries of `config`, e.g. `horizon_length=16`.
+    """
+    continuous = {
+        "mu_activation": "None", "sigma_activation": "None", "mu_init": {"name": "default"},
+        "sigma_init": {"name": "const_initializer", "val": 0}, "fixed_sigma": True,
+    }  # fmt: skip
+    layers = {"units": [64, 64], "activation": "elu", "initializer": {"name": "default"}}
+    config = {
+        "name": name, "env_name": name, "num_actors": num_envs, "train_dir": folder, "max_epochs": epochs, "ppo": True,
+        "mixed_precision": False, "normalize_input": True, "normalize_value": True, "value_bootstrap": True,
+        "reward_shaper": {"scale_value": 1.0}, "normalize_advantage": True, "gamma": 0.99, "tau": 0.95,
+        "learning_rate": 1e-3, "lr_schedule": "adaptive", "kl_threshold": 0.01, "score_to_win": 1e9,
+        "save_best_after": 10_000, "save_frequency": 0, "grad_norm": 1.0, "entropy_coef": 0.0, "truncate_grads": True,
+        "e_clip": 0.2, "horizon_length": 32, "minibatch_size": 8 * num_envs, "mini_epochs": 5, "critic_coef": 2,
+        "clip_value": True, "bounds_loss_coef": 1e-4, "device": "cpu",
+    }  # fmt: skip
+    return {
+        "params": {
+            "seed": 0,
+            "algo": {"name": "a2c_continuous"},
+            "model": {"name": "continuous_a2c_logstd"},
+            "network": {"name": "actor_critic", "separate": False, "space": {"continuous": continuous}, "mlp": layers},
+            "config": config | changes,
+        }
+    }

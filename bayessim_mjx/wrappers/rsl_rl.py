@@ -1,8 +1,8 @@
 """Our worlds as rsl_rl's `VecEnv`: `OnPolicyRunner(make("Ant", 1024), settings(), "logs").learn(300)`.
 
 Observations are a `TensorDict` of all groups ("policy", "critic" where the task has one, ...), on the device of the
-worlds. rsl_rl adds to a reward that a time limit cut off the value of the observation *before* the step; `PPO` here adds
-that of the observation which the step led to.
+worlds. Where a time limit ends an episode, rsl_rl adds the value of the observation *before* the step to the reward;
+`PPO` here adds that of the observation which the step led to.
 """
 
 from typing import Any

@@ -87,11 +87,17 @@ class SB3VecEnv(VecEnv):
         rows = list(self._get_indices(indices))
         if attr_name == "theta":
             return [np.asarray(self.worlds.theta)[i] for i in rows]
-        owner = self if hasattr(self, attr_name) else self.worlds if hasattr(self.worlds, attr_name) else self.worlds.env
+        owner = (
+            self if hasattr(self, attr_name) else self.worlds if hasattr(self.worlds, attr_name) else self.worlds.env
+        )
         return [getattr(owner, attr_name)] * len(rows)
 
     def has_attr(self, attr_name: str) -> bool:
-        return any(hasattr(owner, attr_name) for owner in (self, self.worlds, self.worlds.env))
+        return hasattr(self._owner(attr_name), attr_name)
+
+    def _owner(self, name: str) -> Any:
+        """Who has the attribute `name`; the task's environment where nobody does."""
+        return next((owner for owner in (self, self.worlds) if hasattr(owner, name)), self.worlds.env)
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
         if attr_name != "theta":

@@ -9,6 +9,7 @@ Arrays stay on their device; the wrappers hand them on by DLPack, or copy them w
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -67,7 +68,7 @@ class Worlds:
         UserError: `num_envs` below 1; a step before the first reset; actions or theta of another shape.
     """
 
-    def __init__(self, env: Env, num_envs: int, domain: Distribution | None = None, seed: int = 0) -> None:
+    def __init__(self, env: Env, domain: Distribution | None = None, num_envs: int = 64, seed: int = 0) -> None:
         if not isinstance(num_envs, int | np.integer) or num_envs < 1:
             raise UserError(f"num_envs = {num_envs!r}: must be a whole number of at least 1")
         self.env, self.num_envs, self.domain = env, int(num_envs), domain
@@ -197,18 +198,25 @@ def worlds(task: Any, num_envs: int = 64, domain: Any = None, seed: int = 0, **e
     Raises:
         UserError: a task, run or file that there is not; a distribution over other parameters.
     """
-    config = None
+    return Worlds(*environment(task, domain, env_settings), num_envs=num_envs, seed=seed)
+
+
+def environment(
+    task: Any, domain: Any = None, env_settings: Mapping[str, Any] | None = None
+) -> tuple[Env, Distribution | None]:
+    """(environment, distribution over its theta) that `worlds` is asked for."""
+    settings = dict(env_settings or {})
     if isinstance(task, Path) or (isinstance(task, str) and Path(task).is_dir()):
         config, checkpoint = _run(task)
-        env = registry.make(config.task, config=config, **env_settings)
-        domain = checkpoint if domain is None else domain
-    elif isinstance(task, str):
-        env = registry.make(task, **env_settings)
+        env = registry.make(config.task, config=config, **settings)
+        return env, domain_of(env, checkpoint if domain is None else domain)
+    if isinstance(task, str):
+        env = registry.make(task, **settings)
+    elif settings:
+        raise UserError(f"{next(iter(settings))}: settings go with a task's name, not with an environment")
     else:
-        if env_settings:
-            raise UserError(f"{next(iter(env_settings))}: settings go with a task's name, not with an environment")
         env = task
-    return Worlds(env, num_envs, domain_of(env, domain), seed)
+    return env, domain_of(env, domain)
 
 
 def domain_of(env: Env, source: Any) -> Distribution | None:

@@ -1,0 +1,34 @@
+"""A counter as an environment: all of it can be computed by hand."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+
+from bayessim_mjx.env import Env, State
+from bayessim_mjx.parameters import Parameter, ParameterSpace
+
+
+class Counter(Env):
+    """Observation [steps, start, theta]; ends for good after `theta` steps, by time after 5; reward 1 + the action."""
+
+    name, episode_length, action_size, dt = "Counter", 5, 1, 0.1
+    mj_model = mujoco.MjModel.from_xml_string("<mujoco/>")
+    space = ParameterSpace((Parameter("life", nominal=9.0, low=1.0, high=9.0),))
+
+    def reset(self, key, theta=None):
+        life = jnp.asarray(self.space.nominal if theta is None else theta, jnp.float32)[0]
+        start = jax.random.uniform(key)
+        zero, no = jnp.zeros(()), jnp.zeros(())
+        return self._state(jnp.stack([zero, start, life]), no, no, no, jnp.int32(0))
+
+    def step(self, state, action):
+        obs = state.obs["policy"].at[0].add(1)
+        steps = state.info["steps"] + 1
+        terminated = (obs[0] >= obs[2]).astype(jnp.float32)
+        truncated = (steps >= self.episode_length).astype(jnp.float32)
+        return self._state(obs, 1 + action[0], terminated, truncated, steps)
+
+    def _state(self, obs, reward, terminated, truncated, steps):
+        groups = {"policy": obs, "critic": jnp.concatenate([obs, obs])}
+        info = {"terminated": terminated, "truncated": truncated, "final_observation": groups, "steps": steps}
+        return State(obs, groups, reward, terminated, {"age": obs[0]}, info)
