@@ -87,6 +87,8 @@ def _prepare(args: argparse.Namespace) -> tuple[Config, Any]:
         raise UserError(
             f"ppo.teacher = {config.ppo.teacher!r}: main has no use for it; bayessim_mjx.train --distil has"
         )
+    if config.agent != "own":
+        raise UserError(f"agent = {config.agent!r}: main has our own PPO alone; train --agent has others")
     return config, None
 
 

@@ -5,13 +5,18 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
+import time
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from bayessim_mjx import cli
 from bayessim_mjx.config import Config, to_yaml
+from bayessim_mjx.config.settings import AGENTS
 from bayessim_mjx.device import mesh, setup_jax
+from bayessim_mjx.errors import UserError
 from bayessim_mjx.quantities import estimate
 
 DESCRIPTION = "Train a policy with PPO alone, on nominal physics or on physics drawn from the prior."
@@ -37,6 +42,7 @@ def _parser() -> cli.Parser:
         metavar="RUN",
         help="train a student that imitates the policy of this run or checkpoint, instead of PPO",
     )
+    parser.add_argument("--agent", choices=AGENTS, help="whose PPO trains (default: own; docs/trainers.md)")
     return parser
 
 
@@ -86,11 +92,15 @@ class Training:
         self.writer.close()
         self.wall.close()
 
-    def tree(self, state: Any) -> dict[str, Any]:
-        """What a checkpoint holds."""
+    def policy(self, state: Any) -> Any:
+        """The policy now."""
         from bayessim_mjx import rl
 
-        return {"policy": rl.policy_of(state), "state": state}
+        return rl.policy_of(state)
+
+    def tree(self, state: Any) -> dict[str, Any]:
+        """What a checkpoint holds."""
+        return {"policy": self.policy(state), "state": state}
 
     def progress(self, metrics: dict[str, Any], state: Any) -> None:
         iteration = int(state.iteration)
@@ -119,14 +129,13 @@ class Training:
     def _video(self, iteration: int, state: Any) -> None:
         """An episode at nominal physics every `monitor.video_interval` steps, and at the end."""
         from bayessim_mjx.monitor.film import FPS, frames
-        from bayessim_mjx.rl import policy_of
 
         every, last = self._film_every(), iteration >= self.config.ppo.max_iterations
         if self.film is None or not (iteration // every > self.filmed or last):
             return
         self.filmed = iteration // every
         monitor, title = self.config.monitor, f"{self.config.task}, training iteration {iteration}"
-        shown = self.film(policy_of(state), monitor.video_length, self.env.space.nominal)
+        shown = self.film(self.policy(state), monitor.video_length, self.env.space.nominal)
         pictures = frames(self.env.mj_model, shown, monitor, title, half=not last)
         self.writer.video("Train/video", pictures, FPS, iteration)
 
@@ -140,7 +149,7 @@ class Training:
         key, count = self.evaluation_key, self.config.ppo.eval_episodes
         nominal = jnp.tile(jnp.asarray(self.env.space.nominal, jnp.float32), (count, 1))
         thetas = nominal if self.domain is None else self.domain.sample(key, count)
-        result = rl.evaluate(self.env, rl.policy_of(state), jax.random.fold_in(key, 1), thetas)
+        result = rl.evaluate(self.env, self.policy(state), jax.random.fold_in(key, 1), thetas)
         score = float(result["return"].mean())
         figures = {"Eval/mean_reward": score, "Eval/mean_episode_length": float(result["length"].mean())}
         self.writer.scalars(int(state.iteration), figures)
@@ -174,6 +183,58 @@ class Training:
         return state
 
 
+class AgentTraining(Training):
+    """The same with another library's PPO: `state` is the agent, whose own files lie in `agent/` beside checkpoints."""
+
+    def state(self, resume: bool) -> tuple[Any, int | None]:
+        from bayessim_mjx.monitor.wall import marked
+        from bayessim_mjx.wrappers import agents
+
+        if self.config.bayessim.policyCheckpt is not None:
+            raise UserError(f"--checkpoint: --agent {self.config.agent} begins with a policy of its own; leave it out")
+        agent = agents.make(self.config, self.env, self.domain)
+        if not (resume and self.run.checkpoints):
+            return agent, -1 if resume else None
+        _, meta = self.run.restore("latest", {"policy": agent.policy()}, fall_back=True)
+        agent.load(self._folder(meta["iteration"]))
+        agent.iteration = meta["iteration"]
+        return agent, marked(meta)
+
+    def policy(self, state: Any) -> Any:
+        return state.policy()
+
+    def tree(self, state: Any) -> dict[str, Any]:
+        return {"policy": state.policy()}
+
+    def _folder(self, iteration: int) -> Path:
+        return self.run.path / "agent" / str(iteration)
+
+    def save(self, state: Any, evaluation: float | None = None) -> None:
+        """A checkpoint, after the agent's own files; older ones go."""
+        folder = self._folder(state.iteration)
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+        state.save(folder)
+        super().save(state, evaluation)
+        kept = {str(c["step"]) for c in self.run.checkpoints}
+        for old in folder.parent.iterdir():
+            if old.name not in kept:
+                shutil.rmtree(old, ignore_errors=True)
+
+    def train(self, state: Any) -> Any:
+        ppo = self.config.ppo
+        while (done := state.iteration) < ppo.max_iterations:
+            self.stop.check()
+            due = min(ppo.save_interval - done % ppo.save_interval, ppo.max_iterations - done)
+            started, chunk = time.perf_counter(), min(ppo.log_interval, due)
+            metrics = state.learn(chunk)
+            metrics[SPEED] = chunk * ppo.num_steps * ppo.num_envs / (time.perf_counter() - started)
+            self.progress(metrics, state)
+            if chunk == due:
+                self.save(state, self.evaluate(state))
+        return state
+
+
 def _run(config: Config, run: Any, command: Sequence[str], headless: bool) -> int:
     from bayessim_mjx import registry, runs
     from bayessim_mjx.monitor.console import Console
@@ -191,7 +252,7 @@ def _run(config: Config, run: Any, command: Sequence[str], headless: bool) -> in
             cli.say_changes(run, console)
         console.say(f"run folder {run.path}")
         with cli.running(run, console.say):
-            training = Training(config, env, run, console, stop)
+            training = (Training if config.agent == "own" else AgentTraining)(config, env, run, console, stop)
             state, resumed_at = training.state(resume)
             done = int(state.iteration)
             if done >= config.ppo.max_iterations and not training.owes_evaluation(done):
@@ -221,6 +282,8 @@ def _train(argv: Sequence[str] | None) -> int:
         run = Run.open(args.resume)
         return _run(cli.resumed_config(args, run.config), run, command, args.headless)
     more: dict[str, tuple[str, Any]] = {"--randomize": ("task.randomize", args.randomize)}
+    if args.agent:
+        more["--agent"] = ("agent", args.agent)
     if args.distil:
         more["--distil"] = ("ppo.teacher", str(cli.find_checkpoint(args.distil, None, "")[0]))
     if args.checkpoint:

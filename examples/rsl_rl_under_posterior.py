@@ -1,7 +1,7 @@
 """Train with rsl_rl, random network distillation and symmetry on, under a task's ranges or the posterior of a run.
 
-    python examples/rsl_rl_under_posterior.py --task Cartpole --domain prior
-    python examples/rsl_rl_under_posterior.py --task logs/Ant/RUN --domain posterior --num_envs 1024
+python examples/rsl_rl_under_posterior.py --task Cartpole --domain prior
+python examples/rsl_rl_under_posterior.py --task logs/Ant/RUN --domain posterior --num_envs 1024
 """
 
 import argparse

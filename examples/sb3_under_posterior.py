@@ -1,8 +1,8 @@
 """Train with Stable-Baselines3 on nominal physics, a task's ranges or the posterior of a run; play it, and film it.
 
-    python examples/sb3_under_posterior.py --task Cartpole --domain prior
-    python examples/sb3_under_posterior.py --task logs/Pendulum/RUN --domain posterior --out logs/sb3/pendulum
-    python examples/sb3_under_posterior.py --task Cartpole --out logs/sb3/cartpole --play --video
+python examples/sb3_under_posterior.py --task Cartpole --domain prior
+python examples/sb3_under_posterior.py --task logs/Pendulum/RUN --domain posterior --out logs/sb3/pendulum
+python examples/sb3_under_posterior.py --task Cartpole --out logs/sb3/cartpole --play --video
 """
 
 import argparse

@@ -23,6 +23,7 @@ PROPOSALS = ("prior", "apt", "truncated", "division")
 UNCORRECTED = (("apt", "truncated"), ("apt", "logit"), ("division", "logit"))  # (proposal, coordinates)
 MEMORIES = {"gru": 1, "lstm": 2}  # recurrent layers, and how many numbers each unit remembers
 IMPLEMENTATIONS = ("jax", "warp")  # of MJX
+AGENTS = ("own", "sb3", "rsl_rl", "skrl")  # own: bayessim_mjx.rl
 ACTIVATIONS = ("elu", "relu", "selu", "tanh", "swish", "gelu")
 SEEDS = 2**32 - 1  # the largest seed: jax keeps 32 bits of it
 COUNT = 10**9  # beyond it a number of steps, episodes or trajectories is a slip of the finger
@@ -559,6 +560,7 @@ class Config(Section):
     seed: int = setting(0, "seed of everything random", low=0, high=SEEDS)
     name: str = setting("", "last part of the run folder's name")
     logdir: str = setting("logs", "root of the run folders")
+    agent: str = setting("own", "whose PPO trains (train alone)", choices=AGENTS)
     device: str = setting("auto", "auto, cpu, gpu, gpu:1, cuda:0")
     devices: str = setting("1", "how many share the worlds of PPO: a number, or all", spell=_counted)
     cache_dir: str | None = setting(None, "compilation cache; null: $BAYESSIM_MJX_CACHE or ~/.cache/bayessim_mjx/jax")

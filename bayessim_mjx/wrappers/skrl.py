@@ -153,5 +153,10 @@ def settings(timesteps: int, folder: str = "logs/skrl", **changes: Any) -> dict[
         "models": {"separate": True, "policy": policy, "value": value},
         "memory": {"class": "RandomMemory", "memory_size": -1},
         "agent": agent | changes,
-        "trainer": {"class": "SequentialTrainer", "timesteps": timesteps, "environment_info": "log"},
+        "trainer": {
+            "class": "SequentialTrainer",
+            "timesteps": timesteps,
+            "environment_info": "log",
+            "close_environment_at_exit": False,
+        },  # fmt: skip
     }

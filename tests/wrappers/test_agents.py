@@ -1,0 +1,103 @@
+"""Other libraries' PPO as agents of `train`: their networks as our policies, saved and taken up again."""
+
+import sys
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+from toys import Counter  # noqa: E402
+
+from bayessim_mjx.config import load, replace  # noqa: E402
+from bayessim_mjx.errors import UserError  # noqa: E402
+from bayessim_mjx.wrappers import agents  # noqa: E402
+from bayessim_mjx.wrappers.agents import networks  # noqa: E402
+
+ENV = Counter()
+NEEDED = {"sb3": "stable_baselines3", "rsl_rl": "rsl_rl", "skrl": "skrl"}
+TINY = [
+    "env.numEnvs=8", "ppo.num_envs=8", "ppo.num_steps=8", "ppo.num_minibatches=2", "ppo.num_epochs=2",
+    "ppo.hidden_actor=[8,6]", "ppo.hidden_critic=[5]", "ppo.init_std=0.5", "ppo.symmetry=null",
+]  # fmt: skip
+
+
+def settings(agent, *more):
+    return load("Cartpole", flags={"--agent": ("agent", agent)}, overrides=[*TINY, *more])
+
+
+def actions(agent, x):
+    """What the library itself does at observations x, without noise."""
+    if agent.__class__.__name__ == "SB3Agent":
+        return agent.model.predict(agent.env.normalize_obs(x), deterministic=True)[0]
+    if agent.__class__.__name__ == "RslRlAgent":
+        import torch
+        from tensordict import TensorDict
+
+        runner = agent.runner
+        runner.alg.eval_mode()
+        with torch.no_grad():
+            seen = TensorDict({"policy": torch.from_numpy(x), "critic": torch.zeros(len(x), 6)}, batch_size=len(x))
+            return runner.alg.get_policy()(seen).clamp(-1, 1).numpy()
+    agent.agent.enable_training_mode(False)
+    return np.clip(agent.agent.act(jnp.asarray(x), None, timestep=0, timesteps=1)[1]["mean_actions"], -1, 1)
+
+
+@pytest.mark.parametrize("name", NEEDED)
+def test_a_policy_of_ours_acts_as_the_librarys_network(name, tmp_path):
+    pytest.importorskip(NEEDED[name])
+    agent = agents.make(settings(name), ENV, None)
+    found = agent.learn(2)
+    assert agent.iteration == 2 and found["Train/mean_episode_length"] == 5.0
+    assert found["Train/mean_reward"] == pytest.approx(5.0, abs=2.5)  # 1 + the action in each of 5 steps
+    x = (np.array([2.0, 0.5, 9.0]) + np.random.default_rng(0).normal(size=(64, 3)) * [1, 0.2, 0]).astype(np.float32)
+    ours = agent.policy()
+    np.testing.assert_allclose(ours.act(None, jnp.asarray(x)), actions(agent, x), atol=2e-5)
+    assert ours.actor["log_std"].shape == (1,) and abs(float(ours.actor["log_std"][0]) - np.log(0.5)) < 0.1
+    again = agents.make(settings(name, "seed=7"), ENV, None)
+    before = np.asarray(again.policy().act(None, jnp.asarray(x)))
+    agent.save(tmp_path)
+    again.load(tmp_path)
+    after = np.asarray(again.policy().act(None, jnp.asarray(x)))
+    np.testing.assert_array_equal(after, ours.act(None, jnp.asarray(x)))
+    assert (after != before).any()
+    assert np.isfinite(again.learn(1)["Train/mean_reward"])
+
+
+def test_a_network_by_hand():
+    """elu(x W + b) v with observations (x - 1) / 2."""
+    config = settings("sb3").ppo
+    layers = [(np.array([[2.0]]), np.array([1.0])), (np.array([[0.1]]), np.array([0.0]))]
+    policy = networks.policy(layers, np.array([-1.0]), config, mean=[1.0], scale=[2.0])
+    np.testing.assert_allclose(policy.act(None, jnp.array([[3.0]])), [[0.3]], rtol=1e-5)
+    np.testing.assert_allclose(policy.act(None, jnp.array([[-1.0]])), [[0.1 * np.expm1(-1)]], rtol=1e-4)
+    plain = networks.policy(layers, np.array([-1.0]), config)
+    np.testing.assert_allclose(plain.act(None, jnp.array([[3.0]])), [[0.7]], rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("agent", "takes", "override", "words"),
+    [
+        ("sb3", (), "ppo.memory=4", r"ppo.memory = 4: --agent sb3 has no such thing; allowed is 0"),
+        ("skrl", (), "ppo.rnd={weight: 0.5}", r"ppo.rnd = .*: --agent skrl has no such thing; allowed is None"),
+        ("rsl_rl", ("rnd", "symmetry"), "ppo.action_bound=tanh", "ppo.action_bound = 'tanh'.*allowed is 'clip'"),
+        ("sb3", (), "devices=2", "devices = '2': --agent sb3 trains on one device"),
+    ],
+)
+def test_what_a_library_has_not_is_refused_by_name(agent, takes, override, words):
+    with pytest.raises(UserError, match=words):
+        agents.refuse(settings(agent, override), takes)
+    agents.refuse(settings(agent), takes)
+
+
+def test_main_trains_with_our_own_ppo_alone(capsys):
+    from bayessim_mjx.main import main
+
+    assert main(["--task", "Cartpole", "agent=sb3"]) == 2
+    assert "train --agent has others" in capsys.readouterr().err
+
+
+def test_an_agent_that_is_not_there_is_named():
+    with pytest.raises(UserError, match="own, sb3, rsl_rl, skrl"):
+        replace(settings("sb3"), agent="rllib")
