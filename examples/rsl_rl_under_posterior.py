@@ -6,10 +6,6 @@ python examples/rsl_rl_under_posterior.py --task logs/Ant/RUN --domain posterior
 
 import argparse
 
-from rsl_rl.runners import OnPolicyRunner
-
-from bayessim_mjx.wrappers import rsl_rl
-
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 parser.add_argument("--task", default="Cartpole", help="a task, or the folder of a run")
 parser.add_argument("--domain", default="nominal", help="nominal, prior, posterior (of the run), or a saved one's path")
@@ -17,7 +13,11 @@ parser.add_argument("--num_envs", type=int, default=64)
 parser.add_argument("--iterations", type=int, default=150)
 parser.add_argument("--rnd", type=float, default=0.1, help="weight of the reward for what is new; 0: none")
 parser.add_argument("--out", default="logs/rsl_rl/cartpole")
-args = parser.parse_args()
+args = parser.parse_args()  # --help works without the library
+
+from rsl_rl.runners import OnPolicyRunner  # noqa: E402
+
+from bayessim_mjx.wrappers import rsl_rl  # noqa: E402
 
 env = rsl_rl.make(args.task, args.num_envs, None if args.domain == "posterior" else args.domain)
 settings = rsl_rl.settings(symmetry=bool(env.env.mirrors), rnd=args.rnd)

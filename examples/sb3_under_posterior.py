@@ -8,13 +8,6 @@ python examples/sb3_under_posterior.py --task Cartpole --out logs/sb3/cartpole -
 import argparse
 from pathlib import Path
 
-from stable_baselines3 import PPO
-from stable_baselines3.common.callbacks import CheckpointCallback
-from stable_baselines3.common.evaluation import evaluate_policy
-from stable_baselines3.common.vec_env import VecNormalize
-
-from bayessim_mjx.wrappers import sb3
-
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 parser.add_argument("--task", default="Cartpole", help="a task, or the folder of a run")
 parser.add_argument("--domain", default="nominal", help="nominal, prior, posterior (of the run), or a saved one's path")
@@ -23,7 +16,15 @@ parser.add_argument("--timesteps", type=int, default=300_000, help="of all world
 parser.add_argument("--out", type=Path, default=Path("logs/sb3/cartpole"))
 parser.add_argument("--play", action="store_true", help="do not train: evaluate what is in --out")
 parser.add_argument("--video", action="store_true", help="and film an episode, --out/episode.mp4")
-args = parser.parse_args()
+args = parser.parse_args()  # --help works without the library
+
+from stable_baselines3 import PPO  # noqa: E402
+from stable_baselines3.common.callbacks import CheckpointCallback  # noqa: E402
+from stable_baselines3.common.evaluation import evaluate_policy  # noqa: E402
+from stable_baselines3.common.vec_env import VecNormalize  # noqa: E402
+
+from bayessim_mjx.wrappers import sb3  # noqa: E402
+
 domain = None if args.domain == "posterior" else args.domain  # a run's own is its posterior
 worlds = sb3.make(args.task, args.num_envs, domain)
 model_file, scales = args.out / "model.zip", args.out / "scales.pkl"
