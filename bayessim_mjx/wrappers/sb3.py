@@ -48,7 +48,7 @@ class SB3VecEnv(VecEnv):
 
     def reset(self) -> np.ndarray:
         observation = np.array(self.worlds.reset()["policy"])
-        self.reset_infos = [{} for _ in range(self.num_envs)]
+        self.reset_infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         return observation
 
     def step_async(self, actions: np.ndarray) -> None:
