@@ -151,7 +151,7 @@ def test_code_is_python(page):
 
 @pytest.mark.slow
 @pytest.mark.ci
-@pytest.mark.parametrize("name", ["own_effect", "own_task"])
+@pytest.mark.parametrize("name", ["own_effect", "own_task", "own_walker"])
 def test_code_of_a_how_to_runs(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     run(code_of(ROOT / "docs" / f"{name}.md"), name, monkeypatch)
