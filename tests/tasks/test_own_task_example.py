@@ -15,6 +15,7 @@ SHORT = [
     "ppo.log_interval=2",
     "bayessim.trainTrajs=300",
     "bayessim.realIters=1",
+    "bayessim.checkTrajs=0",
 ]
 
 
