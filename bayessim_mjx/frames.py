@@ -21,6 +21,17 @@ def rotation(quat: jax.Array) -> jax.Array:
     )
 
 
+def product(one: jax.Array, two: jax.Array) -> jax.Array:
+    """The quaternion `[4]` of the rotation `two` followed by `one`."""
+    w, v, x, u = one[0], one[1:], two[0], two[1:]
+    return jnp.concatenate([jnp.array([w * x - v @ u]), w * u + x * v + jnp.cross(v, u)])
+
+
+def conjugate(quat: jax.Array) -> jax.Array:
+    """The quaternion `[4]` of the rotation back."""
+    return quat * jnp.array([1.0, -1.0, -1.0, -1.0])
+
+
 def xyzw(quat: jax.Array) -> jax.Array:
     """A quaternion `[4]` in Isaac Gym's order."""
     return jnp.roll(quat, -1)
