@@ -146,7 +146,7 @@ class _Picture:
         mj.mj_tendon(self.model, data)
         everything = mj.mjtCatBit.mjCAT_ALL.value
         mj.mjv_updateScene(self.model, data, self.option, None, view, everything, self.scene)
-        mj.mjrrender(rect, self.scene, self.context)
+        mj.mjr_render(rect, self.scene, self.context)
         pixels = np.empty((rect.height, rect.width, 3), np.uint8)
         depth = np.empty((rect.height, rect.width), np.float32)
         mj.mjr_readPixels(pixels, depth, rect, self.context)

@@ -111,6 +111,7 @@ def test_names_are_as_many_as_numbers_for_every_task():
             "FrankaCabinet",
             "Ingenuity",
             "Quadcopter",
+            "ShadowHand",
         ):  # commands have a memory, or forces are a product
             assert "action_scale" not in facts
         else:
