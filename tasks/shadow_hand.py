@@ -218,7 +218,7 @@ class ShadowHand(Manipulation):
         return jnp.concatenate([place, jax.vmap(_positive)(data.xquat[tips]), velocity, spin], axis=1)
 
     def _loads(self, data: mjx.Data) -> jax.Array:
-        """`[30]` forces of contacts on the last links, and their moments about the links' origins (N, N m; own axes)."""
+        """`[30]` contacts' forces on the last links and their moments about the links' origins (N, N m; own axes)."""
         wrench, turn, tips = wrenches(self.sys, data), data.xmat[self._tips], self._tips
         arm = data.subtree_com[self._root] - data.xpos[tips]
         force = wrench[tips, 3:]
