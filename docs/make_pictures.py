@@ -149,7 +149,18 @@ def loop_pictures(work: Path, out: Path) -> None:
         return
     import imageio_ffmpeg
 
-    encoder = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-i", str(films[-1]), "-filter_complex", GIF, "-loop", "0"]
+    encoder = [
+        imageio_ffmpeg.get_ffmpeg_exe(),
+        "-y",
+        "-i",
+        str(films[-1]),
+        "-t",
+        "4",
+        "-filter_complex",
+        GIF,
+        "-loop",
+        "0",
+    ]
     subprocess.run([*encoder, str(out / "pendulum.gif")], check=True, capture_output=True)
 
 
