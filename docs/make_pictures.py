@@ -34,7 +34,7 @@ from rich.text import Text
 ROOT = Path(__file__).resolve().parents[1]
 ROWS, COLUMNS = 60, 100
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
-WINDOW = "1180,1290"  # of the browser
+WINDOW = "1180,1260"  # of the browser
 LARGEST = {".svg": 200_000, ".png": 200_000, ".gif": 1_000_000}  # bytes of a picture
 GIF = "fps=15,scale=240:-1:flags=lanczos,split[a][b];[a]palettegen=max_colors=64[p];[b][p]paletteuse=dither=none"
 PLAY = "play --task Pendulum --checkpoint best --video"

@@ -27,7 +27,7 @@ class Rules:
 
     uniform: float = 0.289  # standard deviation of a uniform distribution, of its range
     # of the largest curvature, in units of `uniform` ranges: there the columns' own errors may decide
-    weak: float = 0.0001
+    weak: float = 0.001
     involved: float = 0.1  # share of an effect's variance that comes from a direction
     # directions, moves along them, Newton steps in all others
     most: int = 6
