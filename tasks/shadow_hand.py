@@ -35,6 +35,7 @@ TURN, SPIN = slice(27, 31), slice(27, 30)  # of the cube: in qpos, in qvel
 
 HEIGHT = {"isaacgymenvs": 0.10, "bayessim2021": 0.04}  # m, of the cube above the hand at the start
 DROP = 0.04  # m, from there to the goal
+SHOWN = np.array([-0.2, -0.06, 0.12])  # m, from the goal to where pictures show it
 PLACE_NOISE, JOINT_NOISE = 0.01, 0.2  # m; share of the joints' ranges
 FALLEN = 0.24  # m from the goal
 DECAY, DECAY_TIME = 0.99, 0.08  # of pushes: by this share in this time, s
@@ -177,6 +178,13 @@ class ShadowHand(Manipulation):
         return world.replace(
             task=world.task | {"reached": reached, "successes": world.task["successes"] + reached.astype(jnp.float32)}
         )
+
+    def marks(self, qpos: np.ndarray, observation: np.ndarray) -> np.ndarray:
+        """A cube beside the hand in the orientation of the goal: that of the cube, turned back by how they differ."""
+        between = [self.observation_names.index(f"cube_from_goal_quaternion_{i}") for i in "wxyz"]
+        goal = jax.vmap(lambda turn, cube: product(conjugate(turn), cube))(observation[:, between], qpos[:, TURN])
+        place = np.broadcast_to(self.goal_place + SHOWN, (len(qpos), 3))
+        return np.concatenate([place, np.asarray(goal)], axis=1)[:, None]
 
     # What is seen and paid.
 

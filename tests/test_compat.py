@@ -1,4 +1,4 @@
-"""Programs of arms have options for the compiler, those of other robots none; both give what the function gives."""
+"""Programs of arms and hands have options for the compiler, those of others none; both give what the function gives."""
 
 from types import SimpleNamespace
 
@@ -10,6 +10,8 @@ from bayessim_mjx import compat
 
 ARM = SimpleNamespace(mj_model=SimpleNamespace(body_parentid=[0, 0, 1, 2, 3, 4, 5, 5]))
 LEGS = SimpleNamespace(mj_model=SimpleNamespace(body_parentid=[0, 0, *[1, 2, 3, 4], *[1, 6, 7, 8], *[1, 10, 11, 12]]))
+
+HAND = SimpleNamespace(mj_model=SimpleNamespace(body_parentid=[0, *range(8), *range(4, 8), *range(4, 8), *range(4, 8)]))
 
 
 def doubled(x, more=0.0):
@@ -25,8 +27,9 @@ def test_a_program_is_the_function_also_inside_of_another(env):
     assert program.lower(1.0).compile()(1.0) == 2.0
 
 
-def test_only_arms_are_compiled_otherwise():
+def test_only_arms_and_hands_are_compiled_otherwise():
     plain = type(jax.jit(doubled))
     assert isinstance(compat.program(doubled, LEGS), plain) and isinstance(compat.program(doubled, None), plain)
     if compat.compiler_options():  # on a CPU
         assert not isinstance(compat.program(doubled, ARM), plain)
+        assert not isinstance(compat.program(doubled, HAND), plain)

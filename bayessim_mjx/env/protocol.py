@@ -9,6 +9,7 @@ from typing import Any
 
 import jax
 import mujoco
+import numpy as np
 from flax import struct
 
 from bayessim_mjx import compat
@@ -83,6 +84,15 @@ class Env(abc.ABC):
         """Shape of each observation group."""
         state = jax.eval_shape(self.reset, jax.random.PRNGKey(0))
         return {group: value.shape for group, value in state.obs.items()}
+
+    def marks(self, qpos: np.ndarray, observation: np.ndarray) -> np.ndarray | None:
+        """Poses `[T, nmocap, 7]` (m, quaternion) of the model's mocap bodies, as goals that pictures show; None: none.
+
+        Args:
+            qpos: `[T, nq]`, as measured.
+            observation: `[T, S]` of the group "policy".
+        """
+        return None
 
     @property
     def unwrapped(self) -> "Env":

@@ -29,6 +29,7 @@ class Motion:
     total: np.ndarray  # [T+1] return so far
     dt: float  # s between rows
     end: str = ""  # why it ended early
+    mocap: np.ndarray | None = None  # [T+1, nmocap, 7] what the task marks in pictures, see `Task.marks`
 
     def captions(self) -> list[str]:
         """What is written over each row of qpos, `T+1` lines."""
@@ -50,7 +51,8 @@ def motion(env: Any, policy: Any, key: Any, theta: Any, length: int) -> Motion:
     t = jax.tree.map(lambda x: np.asarray(x[0]), rollout(env, policy.replace(deterministic=True), key, thetas, length))
     n = int(t.valid.sum())
     end = "terminated" if t.terminated.any() else "time limit" if t.truncated.any() else ""
-    return Motion(t.qpos[: n + 1], np.concatenate([[0.0], np.cumsum(t.reward[:n])]), float(env.dt), end)
+    qpos, total = t.qpos[: n + 1], np.concatenate([[0.0], np.cumsum(t.reward[:n])])
+    return Motion(qpos, total, float(env.dt), end, env.marks(qpos, t.observation[: n + 1]))
 
 
 def film(env: Any, config: Config) -> Callable[[Any, int, Any], Motion] | None:
@@ -89,4 +91,5 @@ def frames(
         overlay_text=about,
         title=title,
         captions=[captions[k] for k in rows],
+        mocap=None if shown.mocap is None else shown.mocap[rows],
     )

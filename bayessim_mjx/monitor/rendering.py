@@ -78,7 +78,14 @@ def _make_context(name: str, width: int, height: int) -> Any:
         raise
 
 
-def render(model: Any, worlds: list[np.ndarray], width: int, height: int, camera: str | int | None) -> Any:
+def render(
+    model: Any,
+    worlds: list[np.ndarray],
+    width: int,
+    height: int,
+    camera: str | int | None,
+    mocap: list[np.ndarray | None] | None = None,
+) -> Any:
     """Frames [T, H, W, 3] of each world, all T as long as the longest (the last pose is held); None without OpenGL.
 
     Args:
@@ -86,6 +93,7 @@ def render(model: Any, worlds: list[np.ndarray], width: int, height: int, camera
         worlds: qpos [T, nq] of each.
         width, height: pixels of a frame.
         camera: name or number, see `camera.view_of`.
+        mocap: poses [T, nmocap, 7] (m, quaternion) of the mocap bodies of each; None: where the model has them.
     """
     import mujoco
 
@@ -102,20 +110,23 @@ def render(model: Any, worlds: list[np.ndarray], width: int, height: int, camera
         picture = _Picture(model, width, height)
         try:
             tiles = []
-            for world in worlds:
+            for world, marks in zip(worlds, mocap or [None] * len(worlds), strict=True):
                 view = view_of(model, data, world, camera, width / height)
-                frames = _frames(picture, data, world, view)
+                frames = _frames(picture, data, world, marks, view)
                 tiles.append(np.stack(frames + [frames[-1]] * (length - len(frames))))
         finally:
             picture.free()
     return tiles
 
 
-def _frames(picture: "_Picture", data: Any, world: np.ndarray, view: Any) -> list[np.ndarray]:
+def _frames(picture: "_Picture", data: Any, world: np.ndarray, marks: np.ndarray | None, view: Any) -> list[np.ndarray]:
     """A picture of every row; rows that repeat the one before are not drawn again."""
     out: list[np.ndarray] = []
     for k, pose in enumerate(world):
         same = k > 0 and np.array_equal(pose, world[k - 1])
+        if marks is not None:
+            same = same and np.array_equal(marks[k], marks[k - 1])
+            data.mocap_pos[:], data.mocap_quat[:] = marks[k, :, :3], marks[k, :, 3:]
         out.append(out[-1] if same else picture.take(data, pose, view))
     return out
 

@@ -28,6 +28,7 @@ def record(
     dt: float | None = None,
     title: str = "",
     captions: Sequence[str] | None = None,
+    mocap: np.ndarray | None = None,
 ) -> np.ndarray | None:
     """Render qpos [T, nq] (or a list of them, one per world, shown as a grid) to frames [T', H, W, 3] uint8.
 
@@ -40,6 +41,7 @@ def record(
         dt: seconds between rows of qpos. When given, rows are picked so that the video runs in real time.
         title, captions: one world only; a text, and one for each row of qpos [T]. They stand on a strip at the bottom,
             so that they never hide the robot.
+        mocap: one world only; poses [T, nmocap, 7] of the model's mocap bodies, m and quaternions.
     Returns:
         None, with one warning, where no OpenGL works (or MUJOCO_GL=disable).
     """
@@ -50,11 +52,12 @@ def record(
     if captions is not None and (len(worlds) != 1 or len(captions) != len(worlds[0])):
         raise ValueError(f"{len(captions)} captions for {len(worlds)} world(s) of {len(worlds[0])} rows: one per row")
     picked = [_rows(len(world), dt, fps) for world in worlds]
+    marks = None if mocap is None else [np.asarray(mocap)[picked[0]]]
     worlds = [world[rows] for world, rows in zip(worlds, picked, strict=True)]
     texts = [overlay_text] if len(worlds) == 1 else list(overlay_text or [None] * len(worlds))
     strip = 0 if captions is None else lettering.strip_of(height)
     try:
-        tiles = render(mj_model, worlds, width, height - strip, camera)
+        tiles = render(mj_model, worlds, width, height - strip, camera, marks)
     except Exception as error:  # drivers fail in many ways, and a picture is never worth a run
         if isinstance(error, ValueError):
             raise

@@ -88,12 +88,13 @@ class Camera:
     def __init__(self, env: Env) -> None:
         self.env, self._models = env, {}  # type: ignore[var-annotated]
 
-    def __call__(self, qpos: np.ndarray, theta: np.ndarray) -> np.ndarray | None:
+    def __call__(self, qpos: np.ndarray, theta: np.ndarray, observation: np.ndarray | None = None) -> np.ndarray | None:
         """`[HEIGHT, WIDTH, 3]` uint8; None, with a warning, where no OpenGL works."""
         key = theta.tobytes()
         if key not in self._models:
             self._models = {**dict(list(self._models.items())[-63:]), key: video.model_at(self.env, theta)}
-        frames = video.record(self._models[key], qpos[None], width=WIDTH, height=HEIGHT)
+        marks = None if observation is None else self.env.marks(qpos[None], observation[None])
+        frames = video.record(self._models[key], qpos[None], width=WIDTH, height=HEIGHT, mocap=marks)
         return None if frames is None else frames[0]
 
 
@@ -135,7 +136,9 @@ class GymnasiumEnv(gymnasium.Env):
         """The present state as `[HEIGHT, WIDTH, 3]` uint8 where `render_mode` is "rgb_array"."""
         if self.render_mode is None or self._state is None:
             return None
-        return self._camera(np.asarray(self._state.pipeline_state.qpos), self._theta)
+        return self._camera(
+            np.asarray(self._state.pipeline_state.qpos), self._theta, np.asarray(self._state.obs["policy"])
+        )
 
 
 class GymnasiumVectorEnv(VectorEnv):
@@ -265,6 +268,6 @@ class GymnasiumVectorEnv(VectorEnv):
         """A picture of each world, as `GymnasiumEnv.render`."""
         if self.render_mode is None or self._state is None:
             return None
-        qpos, thetas = np.asarray(self._state.pipeline_state.qpos), np.asarray(self._thetas)
-        frames = [self._camera(q, theta) for q, theta in zip(qpos, thetas, strict=True)]
+        shown = self._state.pipeline_state.qpos, self._thetas, self._state.obs["policy"]
+        frames = [self._camera(*world) for world in zip(*map(np.asarray, shown), strict=True)]
         return None if any(frame is None for frame in frames) else tuple(frames)  # type: ignore[arg-type]

@@ -148,7 +148,7 @@ def test_title_and_captions_stand_on_a_strip_below_the_picture():
 
 def test_captions_follow_the_rows_that_are_picked(monkeypatch):
     drawn = {}
-    monkeypatch.setattr(video, "render", lambda m, worlds, w, h, c: [np.zeros((len(worlds[0]), h, w, 3), np.uint8)])
+    monkeypatch.setattr(video, "render", lambda m, worlds, w, h, *_: [np.zeros((len(worlds[0]), h, w, 3), np.uint8)])
     monkeypatch.setattr(video.lettering, "underline", lambda frames, *rest: drawn.setdefault("rest", rest) and frames)
     video.record(model(PENDULUM), np.zeros((5, 1)), fps=5, dt=0.1, title="P", captions=list("abcde"))
     assert drawn["rest"] == (15, "P", ["a", "c"])  # half a second at 5 frames a second: seconds 0 and 0.2
@@ -161,6 +161,9 @@ class Env:
 
     dt, physics = 0.1, None
 
+    def marks(self, qpos, observation):
+        return np.tile(observation[:, None, :1], (1, 1, 7))
+
 
 def episode(monkeypatch, terminated):
     from types import SimpleNamespace
@@ -169,6 +172,7 @@ def episode(monkeypatch, terminated):
 
     rows = SimpleNamespace(
         qpos=np.arange(6.0)[None, :, None],
+        observation=np.arange(6.0)[None, :, None],
         reward=np.array([[1.0, 2.0, 0.5, 0.0, 0.0]]),
         valid=np.array([[1.0, 1.0, 1.0, 0.0, 0.0]]),
         terminated=np.array([[0.0, 0.0, float(terminated), 0.0, 0.0]]),
@@ -200,5 +204,16 @@ def test_films_have_the_size_that_is_set_and_trainings_half_of_it(monkeypatch):
         film.frames(None, shown, MonitorConfig(), "Pendulum, surrogate real", {"mass": 2}, half=half)
     assert [(more["width"], more["height"]) for _, more in asked] == [(960, 720), (480, 360)]
     length, more = asked[0]
+    assert more["mocap"].shape == (14, 1, 7) and more["mocap"][:, 0, 0].tolist() == [0, 1, 2, *11 * [3]]
     assert length == 4 + 10 == len(more["captions"])  # the last pose stays for a second
     assert more["overlay_text"] == {"mass": 2} and more["title"] == "Pendulum, surrogate real"
+
+
+def test_what_a_task_marks_moves_with_it():
+    marked = model(
+        FLOATING.replace("</worldbody>", '<body name="goal" mocap="true"><geom size=".3"/></body></worldbody>')
+    )
+    qpos, marks = np.tile(marked.qpos0, (2, 1)), np.tile([[[0, 0, 1.0, 1, 0, 0, 0]]], (2, 1, 1))
+    marks[1, 0, 2] = 50.0  # out of sight
+    still, moved = rendered(marked, qpos, mocap=marks, width=80, height=60)
+    assert (still != moved).any()

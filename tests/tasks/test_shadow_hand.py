@@ -49,10 +49,10 @@ def test_golden_numbers_of_the_model(env):
     model = env.mj_model
     assert (model.nq, model.nv, model.nu, model.ntendon) == (31, 30, 20, 4)
     assert env.joint_names == (*shadow_hand.JOINTS, "object") and env.actuator_names == shadow_hand.ACTIONS
-    moving = [i for i in range(3, model.nbody - 1)]
+    moving = range(3, model.body("object").id)
     assert model.body_mass[moving].sum() == pytest.approx(0.911)
     assert model.body("object").mass[0] == pytest.approx(567 * 0.05**3) and model.body("forearm").mass[0] == 4
-    np.testing.assert_array_equal(model.body_gravcomp, [0] + [1] * 26 + [0])  # gravity pulls the cube alone
+    np.testing.assert_array_equal(model.body_gravcomp, [0] + [1] * 26 + [0, 0])  # gravity pulls the cube alone
     np.testing.assert_allclose(model.actuator_ctrlrange, model.jnt_range[model.actuator_trnid[:, 0]])
     np.testing.assert_allclose(model.actuator_gainprm[:, 0], [5, 5] + [1] * 18)
     finger = [0.9, 0.9, 0.7245]
@@ -232,3 +232,22 @@ def test_bad_settings():
     }.items():
         with pytest.raises(UserError, match=f"env.{setting[0]} = .*{message}"):
             registry.make("ShadowHand", **dict([setting]))
+
+
+def test_pictures_show_the_goal_beside_the_hand(env):
+    """Its orientation follows from what is seen: the cube's, and how it differs from the goal."""
+    observation = np.zeros((2, 211), np.float32)
+    observation[:, [env.observation_names.index(name) for name in shadow_hand.PARTS["turn"]]] = [
+        isaac(turned(0.0)),
+        isaac(turned(0.5)),
+    ]
+    qpos = np.tile(env.mj_model.qpos0, (2, 1))
+    qpos[:, 27:] = turned(0.2)
+    marks = env.marks(qpos, observation)
+    assert marks.shape == (2, env.mj_model.nmocap, 7)
+    np.testing.assert_allclose(marks[:, 0, :3], np.tile(GOAL + np.float32([-0.2, -0.06, 0.12]), (2, 1)), atol=1e-6)
+    np.testing.assert_allclose(marks[:, 0, 3:], [turned(0.2), turned(-0.3)], atol=1e-6)
+
+
+def isaac(quat):
+    return np.roll(quat, -1)
