@@ -22,7 +22,7 @@ COORDINATES = ("plain", "truncated", "probit", "logit", "auto")
 PROPOSALS = ("prior", "apt", "truncated", "division")
 UNCORRECTED = (("apt", "truncated"), ("apt", "logit"), ("division", "logit"))  # (proposal, coordinates)
 MEMORIES = {"gru": 1, "lstm": 2}  # recurrent layers, and how many numbers each unit remembers
-IMPLEMENTATIONS = ("jax", "warp")  # of MJX
+IMPLEMENTATIONS = ("jax", "warp", "auto")  # of MJX
 AGENTS = ("own", "sb3", "rsl_rl", "skrl")  # own: bayessim_mjx.rl
 ACTIVATIONS = ("elu", "relu", "selu", "tanh", "swish", "gelu")
 SEEDS = 2**32 - 1  # the largest seed: jax keeps 32 bits of it
@@ -207,7 +207,9 @@ class EnvConfig(Section):
     numEnvs: int = setting(256, "worlds simulated in parallel; the same number as ppo.num_envs", low=1, high=COUNT)
     episodeLength: int | None = setting(None, "control steps per episode; null: the task's own", low=1, high=COUNT)
     realParams: Frozen | None = setting(None, "surrogate real: {weights, means, stds}, rows or {name: value}")
-    impl: str = setting("jax", "what computes the physics: jax, or warp (needs warp-lang)", choices=IMPLEMENTATIONS)
+    impl: str = setting(
+        "jax", "what computes the physics: jax, warp (needs warp-lang), or auto", choices=IMPLEMENTATIONS
+    )
     options: Frozen = field(default_factory=Frozen, metadata={"doc": "settings of this task alone"})
 
     def to_dict(self) -> dict[str, Any]:

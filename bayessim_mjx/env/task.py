@@ -20,6 +20,7 @@ from bayessim_mjx.errors import UserError
 from bayessim_mjx.mirrors import Mirror, resolve
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 from bayessim_mjx.physics import Physics, World, control_step, mjx
+from bayessim_mjx.physics.implementation import choose
 from bayessim_mjx.physics.nuisance import Course, Drawn
 from bayessim_mjx.physics.nuisance import read as read_nuisance
 
@@ -76,7 +77,10 @@ class Task(Env):
         if calibrated:
             self.spec = spec.copy  # type: ignore[method-assign]  # of the corrected model
         impl, worlds = self.settings["impl"], (config or {}).get("numEnvs")
-        self.physics = Physics(mj_model, self.control_dt, space, stack(section, effects), self.max_qvel, impl, worlds)
+        every = stack(section, effects)
+        if impl == "auto":
+            impl = choose(self.name, worlds, every)
+        self.physics = Physics(mj_model, self.control_dt, space, every, self.max_qvel, impl, worlds)
         self.joint_names = _names(mj_model, mujoco.mjtObj.mjOBJ_JOINT, mj_model.njnt)
         self.actuator_names = _names(mj_model, mujoco.mjtObj.mjOBJ_ACTUATOR, mj_model.nu)
         self.nuisance = read_nuisance(section, self.physics.space)

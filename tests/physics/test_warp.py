@@ -13,6 +13,7 @@ from bayessim_mjx.effects import make
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.parameters import ParameterSpace
 from bayessim_mjx.physics import Physics, control_step
+from bayessim_mjx.physics.implementation import choose
 from bayessim_mjx.physics.warp import wrenches
 
 INSTALLED = importlib.util.find_spec("warp") is not None
@@ -25,7 +26,7 @@ def test_without_the_package_the_extra_is_named():
 
 
 def test_other_implementations_and_foreign_environments_are_refused():
-    with pytest.raises(UserError, match="env.impl = 'cpp': allowed are jax, warp"):
+    with pytest.raises(UserError, match="env.impl = 'cpp': allowed are jax, warp, auto"):
         registry.make("Pendulum", impl="cpp")
     with pytest.raises(UserError, match="env.impl = 'warp': brax:ant is not simulated here"):
         registry.make("brax:ant", config=config.load("Pendulum", overrides=["env.impl=warp"]))
@@ -34,6 +35,23 @@ def test_other_implementations_and_foreign_environments_are_refused():
 def test_effects_inside_the_timestep_are_refused():
     with pytest.raises(UserError, match="env.impl = 'warp': coulomb_friction acts inside the timestep"):
         registry.make("Pendulum", impl="warp", effects=[make("coulomb_friction", where="all")])
+
+
+def test_auto_takes_warp_where_it_was_faster_and_can_simulate_what_acts(monkeypatch):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: name == "warp")
+    friction, delay = make("coulomb_friction", where="all"), make("actuator_delay", where="all")
+    assert choose("Ant", 16384, [delay], "NVIDIA H200") == choose("Cartpole", 40000, [], "NVIDIA H200") == "warp"
+    assert choose("Ant", 16383, [], "NVIDIA H200") == choose("Ant", None, [], "NVIDIA H200") == "jax"
+    assert choose("Ant", 16384, [friction], "NVIDIA H200") == choose("Humanoid", 16384, [], "NVIDIA H200") == "jax"
+    assert choose("Ant", 16384, [], "cpu") == "jax"  # not measured
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    assert choose("Ant", 16384, [], "NVIDIA H200") == "jax"
+
+
+def test_auto_is_a_setting_of_every_task():
+    env = registry.make("Pendulum", impl="auto")
+    assert env.settings["impl"] == "auto" and env.physics.warp is None
+    assert config.load("Ant", overrides=["env.impl=auto"]).env.impl == "auto"
 
 
 def motions(env, thetas, steps=5):
