@@ -148,6 +148,7 @@ def _final(fits: Fitting, criteria: Criteria) -> Decision:
     while True:
         smaller = [found.answer - {label} for label in found.answer]
         fits.fit([Plan(k, found.answer) for k in smaller], "dropping")
+        fits.polish(smaller)
         keys = list(dict.fromkeys([*keys, found.answer, *smaller]))
         found = decide(fits.simulate(keys), less, criteria)
         if all(found.answer - {label} in keys for label in found.answer):
