@@ -81,10 +81,12 @@ class Training:
     def open(self, iteration: int, resumed_at: int | None) -> None:
         """Begin to write; on resume what lies after the checkpoint goes, as it is written again."""
         from bayessim_mjx.monitor.wall import Wall
-        from bayessim_mjx.monitor.writer import Writer
+        from bayessim_mjx.monitor.writers import opened
 
         path, late = self.run.path, None if resumed_at is None else {"cfg": 0, "": iteration + 1}
-        self.writer, self.wall = Writer(path, late, media=path / "videos"), Wall(path, resumed_at)
+        more = self.config.monitor.writers
+        self.writer = opened(path, late, path / "videos", more, path)
+        self.wall = Wall(path, resumed_at, writers=more)
         self.filmed = iteration // self._film_every()
         self.writer.text("cfg", to_yaml(self.config.to_dict()), code=True)
 

@@ -17,7 +17,7 @@ from bayessim_mjx.closed_loop.judge import Simulators
 from bayessim_mjx.config import Config
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.monitor.compile_clock import CompileClock
-from bayessim_mjx.monitor.writer import Writer
+from bayessim_mjx.monitor.writer import TensorBoard
 from bayessim_mjx.rl import Policy
 from bayessim_mjx.runs import checkpoints
 
@@ -73,7 +73,7 @@ class Keeper:
         out: Policies = {}
         ppo, (env, domain) = self.config.ppo, self.simulators.training(role)
         console.phase(f"{role} {seed}", ppo.max_iterations)
-        with Writer(folder) as writer:
+        with TensorBoard(folder) as writer:
 
             def progress(metrics: dict[str, Any], state: Any) -> None:
                 writer.scalars(int(state.iteration), {k: v for k, v in metrics.items() if "/" in k})

@@ -24,7 +24,7 @@ from bayessim_mjx.effects.support import storage
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Log
 from bayessim_mjx.logs.read import read_logs
-from bayessim_mjx.monitor.writer import Writer
+from bayessim_mjx.monitor.writer import TensorBoard
 from bayessim_mjx.parameters import ParameterSpace
 from bayessim_mjx.physics import Physics
 from bayessim_mjx.runs import checkpoints, versions
@@ -181,7 +181,7 @@ class Study:
         """gap_loop.json and the scalars; returns the former's path."""
         path = self.out / "gap_loop.json"
         checkpoints.write_text(path, json.dumps(found, indent=1, allow_nan=False) + "\n")
-        with Writer(self.out, purge_step=0) as writer:
+        with TensorBoard(self.out, purge_step=0) as writer:
             writer.scalars(0, _scalars(found))
             writer.text("closed_loop", "\n\n".join(found["sentences"]))
         return path

@@ -23,6 +23,7 @@ PROPOSALS = ("prior", "apt", "truncated", "division")
 UNCORRECTED = (("apt", "truncated"), ("apt", "logit"), ("division", "logit"))  # (proposal, coordinates)
 MEMORIES = {"gru": 1, "lstm": 2}  # recurrent layers, and how many numbers each unit remembers
 IMPLEMENTATIONS = ("jax", "warp", "auto")  # of MJX
+WRITERS = ("jsonl", "csv", "wandb")  # beside TensorBoard
 AGENTS = ("own", "sb3", "rsl_rl", "skrl")  # own: bayessim_mjx.rl
 ACTIVATIONS = ("elu", "relu", "selu", "tanh", "swish", "gelu")
 SEEDS = 2**32 - 1  # the largest seed: jax keeps 32 bits of it
@@ -546,6 +547,9 @@ class MonitorConfig(Section):
     """`monitor:`, what is shown and recorded."""
 
     SECTION: typing.ClassVar[str] = "monitor"
+    writers: tuple[str, ...] = setting(
+        (), "where figures go beside TensorBoard: jsonl, csv, wandb (needs wandb)", choices=WRITERS
+    )
     posterior_plots: bool = setting(True, "picture of the posterior each round")
     video: bool = setting(False, "record videos")
     video_length: int = setting(200, "control steps per video", low=1, high=COUNT)

@@ -18,7 +18,7 @@ from bayessim_mjx.monitor.compile_clock import CompileClock
 from bayessim_mjx.monitor.console import Console
 from bayessim_mjx.monitor.film import FPS, Motion, frames
 from bayessim_mjx.monitor.wall import Wall
-from bayessim_mjx.monitor.writer import Writer
+from bayessim_mjx.monitor.writers import Writer, opened
 from bayessim_mjx.rl import Policy, policy_of
 from bayessim_mjx.runs.checkpoints import write_text
 
@@ -64,9 +64,10 @@ class Session:
         first_round = 0 if start is None else int(start.round)
         done = 0 if start is None else self._overall(first_round, int(start.train.iteration))
         late = None if resumed_at is None else {SETTINGS: 0, "": first_round + 1}  # the settings are written again
-        self.inference = Writer(path / "bsim", purge_step=late, media=path / "pictures")
-        self.learning = Writer(path / "rl", purge_step=None if late is None else done + 1, media=path / "videos")
-        self.wall = Wall(path, resumed_at)
+        more = config.monitor.writers
+        self.inference: Writer = opened(path / "bsim", late, path / "pictures", more, path)
+        self.learning: Writer = opened(path / "rl", None if late is None else done + 1, path / "videos", more, path)
+        self.wall = Wall(path, resumed_at, writers=more)
         self.filmed = done // self._film_every()
         self._show_physics(env.space.nominal if truth is None else truth)
         if truth is None and start is not None and first_round:

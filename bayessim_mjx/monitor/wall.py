@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from bayessim_mjx.monitor.writer import Writer
+from bayessim_mjx.monitor.writers import opened
 
 TAGS = ("Train/mean_reward", "Train/mean_episode_length")
 FOLDER = "rl_time"
@@ -20,12 +20,20 @@ class Wall:
         path: folder of the run; the events lie in its folder `rl_time`.
         resumed_at: None for a new run; else what `mark` said at the checkpoint that the run goes on from, -1 without.
         now: clock in seconds.
+        writers: what to write to beside TensorBoard.
     """
 
-    def __init__(self, path: Path, resumed_at: int | None = None, now: Callable[[], float] = time.perf_counter):
+    def __init__(
+        self,
+        path: Path,
+        resumed_at: int | None = None,
+        now: Callable[[], float] = time.perf_counter,
+        writers: Sequence[str] = (),
+    ):
         self.last = -1 if resumed_at is None else resumed_at
         self.now, self.started = now, now() - (self.last + 1)
-        self.writer = Writer(path / FOLDER, purge_step=None if resumed_at is None else resumed_at + 1)
+        late = None if resumed_at is None else resumed_at + 1
+        self.writer = opened(path / FOLDER, late, more=writers, run=path)
 
     def scalars(self, metrics: Mapping[str, Any]) -> None:
         """A point for the present second, unless it has one."""

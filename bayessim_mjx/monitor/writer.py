@@ -9,7 +9,7 @@ import os
 import struct
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -56,7 +56,7 @@ def purge(folder: str | os.PathLike, step: int | Mapping[str, int]) -> int:
         return 0
     for path in event_files(folder):
         old = list(records(path))
-        kept = [raw for raw, event in old if not _is_late(event, step)]
+        kept = [raw for raw, event in old if not _late_event(event, step)]
         if len(kept) < len(old):
             temporary = path.with_name(f".{path.name}.tmp")
             temporary.write_bytes(b"".join(kept))
@@ -65,16 +65,18 @@ def purge(folder: str | os.PathLike, step: int | Mapping[str, int]) -> int:
     return dropped
 
 
-def _is_late(event: Any, step: int | Mapping[str, int]) -> bool:
-    if not event.HasField("summary"):
-        return False
+def _late_event(event: Any, step: int | Mapping[str, int]) -> bool:
+    return event.HasField("summary") and is_late([value.tag for value in event.summary.value], event.step, step)
+
+
+def is_late(tags: Sequence[str], at: int, step: int | Mapping[str, int]) -> bool:
+    """Whether what stands at step `at` under `tags` is written again by a run that goes on at `step` (see `purge`)."""
     if isinstance(step, Mapping):
-        tags = [value.tag for value in event.summary.value]
-        return any(tag.startswith(prefix) and event.step >= first for prefix, first in step.items() for tag in tags)
-    return event.step >= step
+        return any(tag.startswith(prefix) and at >= first for prefix, first in step.items() for tag in tags)
+    return at >= step
 
 
-class Writer:
+class TensorBoard:
     """Event files of one TensorBoard run.
 
     Args:
@@ -101,11 +103,11 @@ class Writer:
     def scalars(self, step: int, values: Mapping[str, Any], prefix: str = "") -> None:
         """Write {tag: number} (Python, NumPy or device scalars) at `step`. None and NaN are left out."""
         for tag, value in values.items():
-            number = _number(prefix + tag, value)
-            if number is not None:
+            found = number(prefix + tag, value)
+            if found is not None:
                 from tensorboardX.summary import scalar
 
-                self._event(int(step), summary=scalar(prefix + tag, number))
+                self._event(int(step), summary=scalar(prefix + tag, found))
 
     def text(self, tag: str, text: str, step: int = 0, code: bool = False) -> None:
         """Write Markdown; `code` shows it as it is, line for line (a YAML file, say)."""
@@ -143,7 +145,7 @@ class Writer:
             self._closed = True  # also where that fails: it is not tried twice
             self._file.close()
 
-    def __enter__(self) -> "Writer":
+    def __enter__(self) -> "TensorBoard":
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -180,7 +182,8 @@ def _file(folder: Path, suffix: str) -> Any:
     return EventsWriter(str(folder / "events"), suffix)
 
 
-def _number(tag: str, value: Any) -> float | None:
+def number(tag: str, value: Any) -> float | None:
+    """A scalar of Python, NumPy or a device; None for None and NaN."""
     if value is None:
         return None
     array = np.asarray(value)

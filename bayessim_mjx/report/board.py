@@ -8,7 +8,7 @@ import numpy as np
 
 from bayessim_mjx.diagnosis.result import Diagnosis
 from bayessim_mjx.monitor.style import new_figure
-from bayessim_mjx.monitor.writer import Writer
+from bayessim_mjx.monitor.writer import TensorBoard
 from bayessim_mjx.report.gap_figures import PARTS, part_words, squares
 from bayessim_mjx.report.look import DASH, FAINT, STAGE
 from bayessim_mjx.report.words import (
@@ -32,7 +32,7 @@ LINES = {"solid": "-", "dash": "--", "dot": ":"}
 
 def tensorboard(diagnosis: Diagnosis, folder: str | Path) -> Path:
     """Write event files into `folder` (and the pictures beside them, in `media`); returns it."""
-    with Writer(folder) as writer:
+    with TensorBoard(folder) as writer:
         writer.scalars(0, scalars(diagnosis))
         writer.text("Diagnosis/verdict", _markdown(diagnosis))
         for tag, figure in pictures(diagnosis).items():

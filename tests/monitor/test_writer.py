@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from bayessim_mjx.monitor.writer import Writer, event_files, purge, records
+from bayessim_mjx.monitor.writer import TensorBoard, event_files, purge, records
 
 
 def rows(folder):
@@ -27,25 +27,25 @@ def scalars(folder):
 def test_scalars_come_back_and_missing_ones_are_left_out(tmp_path):
     import jax.numpy as jnp
 
-    with Writer(tmp_path) as writer:
+    with TensorBoard(tmp_path) as writer:
         writer.scalars(3, {"a": 1.5, "b": jnp.float32(2.0), "c": np.array([4]), "nan": float("nan"), "none": None})
         writer.scalars(4, {"mean": -7}, prefix="Train/")
     assert scalars(tmp_path) == [("a", 3, 1.5), ("b", 3, 2.0), ("c", 3, 4.0), ("Train/mean", 4, -7.0)]
 
 
 def test_infinity_is_written(tmp_path):
-    with Writer(tmp_path) as writer:
+    with TensorBoard(tmp_path) as writer:
         writer.scalars(0, {"log_gain": -np.inf})
     assert scalars(tmp_path) == [("log_gain", 0, -np.inf)]
 
 
 def test_a_vector_is_no_scalar(tmp_path):
-    with Writer(tmp_path) as writer, pytest.raises(ValueError, match=r"'loss' has shape \(2,\)"):
+    with TensorBoard(tmp_path) as writer, pytest.raises(ValueError, match=r"'loss' has shape \(2,\)"):
         writer.scalars(0, {"loss": np.zeros(2)})
 
 
 def test_code_is_kept_line_for_line(tmp_path):
-    with Writer(tmp_path) as writer:
+    with TensorBoard(tmp_path) as writer:
         writer.text("BayesSim/cfg", "ppo:\n  num_envs: 8", code=True)
     [(tag, step, tensor)] = rows(tmp_path)
     assert (tag, step) == ("BayesSim/cfg/text_summary", 0)
@@ -57,7 +57,7 @@ def test_figure_is_a_png_that_is_kept_and_the_figure_is_closed(tmp_path):
 
     figure = Figure(figsize=(3, 2), dpi=100)
     figure.subplots().plot([0, 1])
-    with Writer(tmp_path / "tb", media=tmp_path / "media") as writer:
+    with TensorBoard(tmp_path / "tb", media=tmp_path / "media") as writer:
         writer.figure("BayesSim/posterior", figure, 2)
     [(tag, step, image)] = rows(tmp_path / "tb")
     assert (tag, step, image.width, image.height) == ("BayesSim/posterior", 2, 300, 200)
@@ -70,7 +70,7 @@ def test_video_is_a_gif_with_every_frame_and_an_mp4(tmp_path):
     frames = np.zeros((7, 24, 32, 3), np.uint8)
     for t, frame in enumerate(frames):
         frame[:, 4 * t : 4 * t + 4] = (250, 120, 0)
-    with Writer(tmp_path) as writer:
+    with TensorBoard(tmp_path) as writer:
         writer.video("SurrogateReal/video", frames, 25, 1)
         writer.video("SurrogateReal/video", None, 25, 2)
     [(tag, step, image)] = rows(tmp_path)
@@ -84,10 +84,10 @@ def test_video_is_a_gif_with_every_frame_and_an_mp4(tmp_path):
 
 
 def test_resume_repeats_no_step(tmp_path):
-    with Writer(tmp_path) as writer:
+    with TensorBoard(tmp_path) as writer:
         for step in range(5):
             writer.scalars(step, {"loss": float(step), "old/only": 1.0})
-    with Writer(tmp_path, purge_step=3) as writer:
+    with TensorBoard(tmp_path, purge_step=3) as writer:
         for step in range(3, 6):
             writer.scalars(step, {"loss": 100.0 + step})
     assert [(s, v) for tag, s, v in scalars(tmp_path) if tag == "loss"] == [
@@ -98,14 +98,14 @@ def test_resume_repeats_no_step(tmp_path):
 
 def test_writers_of_one_second_share_no_file(tmp_path):
     for step in range(3):
-        with Writer(tmp_path) as writer:
+        with TensorBoard(tmp_path) as writer:
             writer.scalars(step, {"loss": 0.0})
     assert len(event_files(tmp_path)) == 3
     assert [step for _, step, _ in scalars(tmp_path)] == [0, 1, 2]
 
 
 def test_purge_by_prefix_where_tags_count_different_things(tmp_path):
-    with Writer(tmp_path) as writer:
+    with TensorBoard(tmp_path) as writer:
         for step in range(4):
             writer.scalars(step, {"BayesSim/gain": 0.0})
             writer.scalars(100 * step, {"Train/reward": 0.0})
@@ -116,7 +116,7 @@ def test_purge_by_prefix_where_tags_count_different_things(tmp_path):
 
 
 def test_a_file_cut_short_by_a_kill_is_read_up_to_the_cut(tmp_path):
-    with Writer(tmp_path) as writer:
+    with TensorBoard(tmp_path) as writer:
         for step in range(5):
             writer.scalars(step, {"loss": 0.0})
     [path] = event_files(tmp_path)
@@ -128,10 +128,10 @@ def test_a_file_cut_short_by_a_kill_is_read_up_to_the_cut(tmp_path):
 
 def test_tensorboard_agrees(tmp_path):
     accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
-    with Writer(tmp_path) as writer:
+    with TensorBoard(tmp_path) as writer:
         for step in range(5):
             writer.scalars(step, {"loss": float(step)})
-    with Writer(tmp_path, purge_step=3) as writer:
+    with TensorBoard(tmp_path, purge_step=3) as writer:
         writer.scalars(3, {"loss": 30.0})
         writer.video("video", np.random.default_rng(0).integers(0, 255, (3, 8, 8, 3)).astype(np.uint8), 10, 3)
     events = accumulator.EventAccumulator(str(tmp_path))
