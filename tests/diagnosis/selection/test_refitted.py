@@ -9,7 +9,12 @@ import pytest
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate, Coordinate
 from bayessim_mjx.diagnosis.fitting.fitter import Fitter
 from bayessim_mjx.diagnosis.selection import heldout
+from bayessim_mjx.diagnosis.selection.criteria import Criteria
+from bayessim_mjx.diagnosis.selection.fits import Fits
 from bayessim_mjx.diagnosis.selection.models import scored
+from bayessim_mjx.diagnosis.selection.pool import Pool
+from bayessim_mjx.diagnosis.selection.table import BASE
+from bayessim_mjx.diagnosis.selection.tried import Settings
 
 MOTION = np.sin(np.arange(8 * 20) * 0.7).reshape(8, 20)  # of eight windows
 GROUP = np.repeat(np.arange(4), 2)
@@ -18,7 +23,8 @@ GROUP = np.repeat(np.arange(4), 2)
 class Bent:
     """Windows whose error is (what theta does in truth - what it does) MOTION; conditions differ in their truth."""
 
-    def __init__(self, true, roughness=0.0, felt=1.0):
+    def __init__(self, true, roughness=0.0, felt=1.0, bend=0.4, start=0.0):
+        self.bend, self.start = bend, start
         self.true, self.roughness, self.felt = np.asarray(true)[GROUP], roughness, np.broadcast_to(felt, 4)[GROUP]
         noise = 0.01 * np.random.default_rng(0).normal(size=MOTION.shape)
         self.noise, self.physics, self.rollouts = noise, SimpleNamespace(), 0
@@ -29,8 +35,8 @@ class Bent:
         theta = np.asarray(thetas)[:, :1]
         self.rollouts += len(theta)
         rough = self.roughness * np.sin(1e5 * theta)
-        size = self.felt[own] * (self.true[own] - theta - 0.4 * theta**2 + rough)
-        error = size[..., None] * MOTION[own] + self.noise[own] - offsets[..., 0, None]
+        size = self.felt[own] * (self.true[own] - theta - self.bend * theta**2 + rough)
+        error = size[..., None] * MOTION[own] + self.noise[own] + self.start - offsets[..., 0, None]
         return np.stack([error, np.zeros_like(error)], -1)
 
 
@@ -74,6 +80,19 @@ def test_on_rough_costs_estimates_differ_between_conditions_as_the_data_do():
     rough, model = fitted(Bent((0.3, 0.5, 0.7, 0.9), roughness=0.003))
     (found,) = heldout.refitted(rough, [replace(model, fit=replace(model.fit, A=smooth.fit.A))])
     np.testing.assert_allclose(found.estimates - found.fit.values, expected.estimates - expected.fit.values, atol=0.01)
+
+
+def test_simulated_costs_are_in_the_unit_of_those_of_the_search():
+    """Start states that are off count in both: without them all models would come nearer to the noise."""
+    fitter, model = fitted(Bent((0.5, 0.5, 0.5, 0.5), bend=0.0, start=0.06))
+    base = scored(fitter, fitter.begin(()), ())
+    key = frozenset(["toy@place"])
+    pool = Pool(fitter, list(model.effects), Settings(), Criteria(), base.fit, base)
+    pool.models.update({BASE: base, key: model})
+    seen = Fits(pool, lambda *_: None).simulate([BASE, key])
+    assert seen.rows[key].total == pytest.approx(model.total, rel=0.02)
+    errors = heldout.predict(fitter, pool.models[key]).cost(20).sum() * pool.noise
+    assert seen.rows[key].total > 1.1 * errors and all(row.simulated for row in seen.rows.values())
 
 
 def test_a_condition_that_alone_tells_the_parameter_keeps_its_linear_steps():
