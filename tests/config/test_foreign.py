@@ -38,6 +38,8 @@ task:
 """,
     "ShadowHand": """
 env: {numEnvs: 1024, envSpacing: 0.75, maxEpisodeLength: 600, aggregateMode: 1, objectType: block, rotEps: 0.1,
+  observationType: full_state, asymmetric_observations: False, useRelativeControl: False, dofSpeedScale: 20.0,
+  actionsMovingAverage: 1.0, successTolerance: 0.1, fallDistance: 0.24, fallPenalty: 0.0, reachGoalBonus: 250,
   realParams: {weights: [1.0], means: [[1.8]], stds: [[0.001]]}, asset: {assetFileName: hand.xml}}
 sim: {substeps: 2, physx: {num_threads: 4}}
 bayessim: {trainTrajs: 50000, components: 4, lr: 1.e-4}
@@ -52,12 +54,16 @@ task:
       gravity: {range: [0, 0.4], operation: additive, distribution: gaussian, schedule: linear, schedule_steps: 40000}
     frequency: 720
     actor_params:
-      torso:
+      hand:
         color: True
+        tendon_properties:
+          stiffness: {range: [0, 200], operation: additive, distribution: uniform, schedule: constant}
         rigid_body_properties:
           mass: {range: [0.1, 10], operation: scaling, distribution: uniform, schedule: constant, schedule_steps: 0}
-        rigid_shape_properties:
-          friction: {num_buckets: 250, range: [0.7, 1.3], operation: scaling, distribution: uniform, setup_only: True}
+      object:
+        scale: {range: [0.5, 2.0], operation: scaling, distribution: uniform, schedule: constant, setup_only: True}
+        rigid_body_properties:
+          mass: {num_buckets: 250, range: [0.1, 10], operation: scaling, distribution: uniform, setup_only: True}
 """,
     "FrankaCabinet": """
 env: {numEnvs: 2048, envSpacing: 1.5, episodeLength: 500, startPositionNoise: 0.0, startRotationNoise: 0.0,
@@ -111,8 +117,8 @@ task:
 
 LEFT_OUT = {
     "Humanoid": "sim, env.envSpacing, env.isFlagrun, env.powerScale, env.upWeight, env.asset, env.plane, color",
-    "ShadowHand": "sim, env.envSpacing, env.aggregateMode, env.objectType, env.rotEps, env.asset, color, num_buckets, "
-    "setup_only",
+    "ShadowHand": "sim, env.envSpacing, env.aggregateMode, env.objectType, env.rotEps, env.fallDistance, "
+    "env.reachGoalBonus, env.asset, color, setup_only, num_buckets",
     "FrankaCabinet": "sim, env.envSpacing, env.startPositionNoise, env.startRotationNoise, env.numProps, "
     "env.aggregateMode, env.actionScale, env.dofVelocityScale, env.distRewardScale, env.rotRewardScale, "
     "env.aroundHandleRewardScale, env.openRewardScale, env.fingerDistRewardScale, env.actionPenaltyScale, env.asset, "
@@ -142,13 +148,17 @@ def test_files_made_like_bayessimigs_load_whole_with_one_note(task: str, tmp_pat
     if task in ("Anymal", "FrankaCabinet"):
         assert registry.make(task, config=loaded).space == registry.make(task).space
         return
-    model = mujoco.MjModel.from_xml_string(BODY)
-    space = ParameterSpace.from_config(section, model)
+    if task == "ShadowHand":
+        space = registry.make(task, config=loaded).space
+        assert space == registry.make(task).space
+    else:
+        space = ParameterSpace.from_config(section, mujoco.MjModel.from_xml_string(BODY))
+        assert space.names == ("torso_mass_mult", "arm_mass_mult", "elbow_stiffness")
     found = nuisance.read(section["randomization_params"], space)
-    assert space.names[:2] == ("torso_mass_mult", "arm_mass_mult") and found is not None
+    assert found is not None
     spread = found.actions.white
     if task == "Humanoid":
-        assert space.names[2:] == ("elbow_stiffness",) and loaded.env.episodeLength == 1000
+        assert loaded.env.episodeLength == 1000
         assert (spread.first, spread.second, found.observations, found.frequency) == (0.0, 0.1, None, 1)
     else:
         assert loaded.env.episodeLength == 600 and found.frequency == 720 and found.gravity.white.second == 0.4

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from bayessim_mjx import registry
+from bayessim_mjx.compat import program
 from bayessim_mjx.physics import control_step
 
 WORLDS = 8
@@ -19,8 +20,8 @@ WORLDS = 8
 def _compiled(name):
     env = registry.make(name)
     env.nuisance = None  # noise has no mirror image and no value known beforehand
-    step = jax.jit(jax.vmap(env.step))
-    reset = jax.jit(jax.vmap(env.reset))
+    step = program(jax.vmap(env.step), env)
+    reset = program(jax.vmap(env.reset), env)
 
     @jax.jit
     def reset_to(qpos, qvel, thetas):
@@ -48,7 +49,7 @@ def _mjx_rollout(env):
 
         return jax.lax.scan(body, world, commands)[1]
 
-    return jax.jit(run)
+    return program(run, env)
 
 
 @pytest.fixture
