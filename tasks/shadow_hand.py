@@ -123,7 +123,7 @@ class ShadowHand(Manipulation):
         for name, (allowed, words) in ALLOWED.items():
             _check(name, self.settings[name], allowed, words)
         self.observation_names = _names(self.settings["observationType"])  # type: ignore[misc]
-        self.smoothing = self.settings["actionsMovingAverage"]
+        self.smoothing = self.settings["actionsMovingAverage"]  # type: ignore[misc]
         if self.settings["useRelativeControl"]:
             self.rates = (self.settings["dofSpeedScale"],) * self.mj_model.nu  # type: ignore[misc]
         self._tips = np.array([self.mj_model.body(tip).id for tip in TIPS])
