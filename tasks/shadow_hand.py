@@ -3,6 +3,8 @@
 Unlike the original: quaternions in observations have w >= 0, as q and -q are one orientation. The palm is made of
 capsules. Forces of joints are those of their drives. Pushes (`env.forceScale`) act on the cube as one impulse at the
 beginning of a step. Tendons pull the last joint of a finger along by a constraint, firmer than Isaac's spring.
+A cube that lies still on the palm's edge in MuJoCo C rocks by about a degree in MJX, which meets a box and a capsule in
+other points.
 """
 
 from collections.abc import Callable, Mapping, Sequence
