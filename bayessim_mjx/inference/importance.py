@@ -107,7 +107,7 @@ def refine(
             break
         if done < rounds:
             power = _tempering(base, like, min(EFFECTIVE * draws, enough))
-            used.append(_wider(fitted(rng, z, normalised(base + power * like), components)))
+            used.append(_wider(fitted(rng, z, normalised(_powered(base, like, power)), components)))
     if not len(weights):
         reason = f"none of {len(z)} simulations has a finite likelihood"
         flat = np.full(len(z), 1 / len(z))
@@ -205,6 +205,12 @@ def _log_prior(z: np.ndarray) -> np.ndarray:
 def _theta(space: Any, z: np.ndarray) -> np.ndarray:
     u = from_chart(jnp.asarray(z, jnp.float32), "probit")
     return np.asarray(space.from_unit(jnp.clip(u, EDGE, 1 - EDGE)))
+
+
+def _powered(base: np.ndarray, like: np.ndarray, power: float) -> np.ndarray:
+    """Log weights [N] by a power of the likelihood that may be 0: what is impossible stays so."""
+    possible = np.isfinite(like)
+    return base + np.where(possible, power * np.where(possible, like, 0.0), -np.inf)
 
 
 def _tempering(base: np.ndarray, like: np.ndarray, wanted: float) -> float:

@@ -57,7 +57,9 @@ def fitted(rng: np.random.Generator, z: np.ndarray, weights: np.ndarray, most: i
 def em(rng: np.random.Generator, z: np.ndarray, weights: np.ndarray, k: int, steps: int = 60) -> Mixture:
     """Expectation maximisation on weighted draws, begun at k-means++ centres; variances are at least 1e-3 of all."""
     mean = weights @ z
-    whole = (z - mean).T @ ((z - mean) * weights[:, None]) + 1e-12 * np.eye(z.shape[1])
+    whole = (z - mean).T @ ((z - mean) * weights[:, None])
+    # a few draws span a plane only: densities need every direction, well above rounding
+    whole += (1e-12 + 1e-8 * np.trace(whole) / z.shape[1]) * np.eye(z.shape[1])
     if k == 1:
         return Mixture(np.ones(1), mean[None], whole[None])
     root = np.linalg.inv(np.linalg.cholesky(whole))

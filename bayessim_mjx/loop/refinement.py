@@ -90,13 +90,13 @@ def _spread(found: Refined, squares: np.ndarray, likelihood: Likelihood) -> np.n
     Scores are of stretches of time; those up to half a trajectory apart may go together (Newey and West, 1987). What
     so few stretches show by chance is not believed.
     """
-    unit = float(found.weights @ squares.sum((1, 2))) / likelihood.count
-    use = found.weights > 1e-6 * found.weights.max()
-    weights, z = found.weights[use] / found.weights[use].sum(), found.z[use]
+    use = found.weights > 1e-6 * found.weights.max()  # diverged simulations have infinite squares and no weight
+    weights, z, squares = found.weights[use] / found.weights[use].sum(), found.z[use], squares[use]
+    unit = float(weights @ squares.sum((1, 2))) / likelihood.count
     gap = z - weights @ z
     covariance = gap.T @ (gap * weights[:, None])
     lower = np.linalg.cholesky(covariance)
-    parts = -0.5 * squares[use].reshape(use.sum(), -1) / unit
+    parts = -0.5 * squares.reshape(len(squares), -1) / unit
     slopes = np.linalg.solve(lower, gap.T @ (weights[:, None] * parts))  # L^T C^-1 gap parts: whitened scores
     slopes = slopes.reshape(-1, *squares.shape[1:])  # [d, N, B]
     slopes = slopes - slopes.mean((1, 2), keepdims=True)

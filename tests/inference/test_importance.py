@@ -86,3 +86,15 @@ def test_weights_are_smoothed_by_the_tail_that_they_have():
     assert weights.sum() == pytest.approx(1.0) and tail < 0.5
     assert smoothed(6 * rng.normal(size=4000))[1] > 0.7
     assert effective(np.full(50, 1 / 50)) == pytest.approx(50)
+
+
+def test_where_few_draws_are_possible_the_next_are_drawn_among_them():
+    """Fewer than should count: the likelihood's power is 0, and 0 times minus infinity is no number."""
+
+    def hardly(theta):
+        return np.where(np.abs(theta).max(1) < 0.25, gaussian(0 * theta), -np.inf)
+
+    with np.errstate(invalid="raise"):
+        found = refine(Distribution.prior(SPACE), hardly, draws=256)
+    assert np.isfinite(found.z).all() and found.reason is None
+    np.testing.assert_allclose(found.posterior.mean(), 0, atol=0.05)

@@ -1,5 +1,7 @@
 """Posteriors refined by the simulator's likelihood: truths covered, noise estimated, model error widens."""
 
+from types import SimpleNamespace
+
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -7,7 +9,7 @@ import pytest
 
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.loop.likelihood import Likelihood
-from bayessim_mjx.loop.refinement import refine
+from bayessim_mjx.loop.refinement import _spread, refine
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 from bayessim_mjx.physics import Physics
 from bayessim_mjx.rollout import replay
@@ -96,3 +98,14 @@ def test_a_likelihood_that_is_a_lottery_keeps_the_proposal():
     prior = Distribution.prior(SPACE)
     found = refine(prior, Likelihood(PHYSICS, nowhere, np.ones((COUNT, STEPS)), np.full(2, SD)), draws=256)
     assert found.posterior is prior and found.refined.reason
+
+
+@pytest.mark.parametrize("impossible", [np.inf, np.nan])
+def test_simulations_that_diverge_count_for_nothing(impossible):
+    rng = np.random.default_rng(0)
+    z, squares = rng.normal(size=(50, 2)), rng.chisquare(6, (50, 3, 4))
+    weights, likelihood = np.full(50, 1 / 50), SimpleNamespace(count=72.0)
+    without = _spread(SimpleNamespace(z=z, weights=weights), squares, likelihood)
+    more = SimpleNamespace(z=np.concatenate([z, np.ones((1, 2))]), weights=np.append(weights, 0.0))
+    diverged = np.concatenate([squares, np.full((1, 3, 4), impossible)])
+    np.testing.assert_allclose(_spread(more, diverged, likelihood), without)
