@@ -31,7 +31,7 @@ CODE = re.compile(r"```python\n(.*?)```", re.DOTALL)
 FILE = re.compile(r'"""(\w+\.py): ')  # a block that begins so is that file
 TINY = [
     "env.numEnvs=8", "ppo.num_envs=8", "ppo.num_steps=16", "ppo.max_iterations=2", "bayessim.trainTrajs=200",
-    "bayessim.realEvals=4", "bayessim.checkTrajs=40",
+    "bayessim.realEvals=4", "bayessim.checkTrajs=40", "bayessim.refine=off",
 ]  # fmt: skip
 
 

@@ -290,11 +290,11 @@ class BayesSimConfig(Section):
         0.05, "prior mixed into each trajectory's posterior: a misjudged one cannot rule out the truth", low=0, high=1
     )
     refine: str = setting(
-        "off",
+        "auto",
         "sharpen the posterior by the simulator's own likelihood of the real trajectories, replayed under their "
-        "commands: off, likelihood, or auto (where the task has a model to replay them on, without a word where too "
-        "few draws count)",
+        "commands: off, likelihood, or auto (where the task has a model to replay them on in which nothing touches)",
         choices=("auto", "off", "likelihood"),
+        spell=lambda value: "off" if value is False else value,  # YAML reads a plain off so
     )
     checkTrajs: int = setting(
         300,

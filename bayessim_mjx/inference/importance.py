@@ -74,6 +74,7 @@ def refine(
     rounds: int = 8,
     components: int = 8,
     enough: float | None = None,
+    also: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> Refined:
     """The posterior prior x likelihood, found from `proposal`.
 
@@ -85,6 +86,8 @@ def refine(
         rounds: at most so many rounds.
         components: at most so many Gaussians in the posterior.
         enough: effective draws to end with; by default 40 for each parameter, at least 200.
+        also: mean [d] and covariance [d, d] of z (theta in the probit chart) where the posterior may be too: half of
+            the first draws are from there.
 
     Returns:
         The refined posterior, or the proposal with the reason why it was kept.
@@ -92,7 +95,7 @@ def refine(
     space, d = proposal.space, len(proposal.space)
     enough = max(200.0, 40.0 * d) if enough is None else enough
     rng = np.random.default_rng(seed)
-    used = [_begin(proposal)]
+    used = [_begin(proposal) if also is None else _joined(_begin(proposal), *also)]
     z, like, base = np.zeros((0, d)), np.zeros(0), np.zeros(0)
     done, weights, tail = 0, np.zeros(0), np.inf
     for done in range(1, rounds + 1):  # noqa: B007
@@ -158,6 +161,15 @@ def _begin(proposal: Distribution) -> Mixture:
     covariances = scales @ np.swapaxes(scales, -1, -2) * WIDER**2
     return _defended(
         Mixture(weights[keep] / weights[keep].sum(), np.asarray(q.means, np.float64)[keep], covariances[keep])
+    )
+
+
+def _joined(q: Mixture, mean: np.ndarray, covariance: np.ndarray) -> Mixture:
+    """`q`, whose last part is the prior, and a Gaussian of as much weight before it."""
+    return Mixture(
+        np.concatenate([[0.5], 0.5 * q.weights]),
+        np.concatenate([mean[None], q.means]),
+        np.concatenate([(covariance * WIDER**2)[None], q.covariances]),
     )
 
 

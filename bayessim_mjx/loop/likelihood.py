@@ -25,6 +25,7 @@ RATIOS = (0.1, 0.3, 1.0, 3.0, 10.0)  # velocity's sensor noise against position'
 SETTLED = 0.1  # relative change of the log likelihood's unit at which noise and posterior agree
 LOOKED = 4  # trajectories at which noise is estimated
 SLOPE = 0.01  # step of central differences in z
+LEAP = 1.0  # longest step in z that linear dynamics are believed
 
 
 @dataclass(frozen=True)
@@ -95,6 +96,7 @@ class Likelihood:
         self.nv = nv
         self.noise = Noise(self.floor, np.zeros(nv))
         self.gains: Gains | None = None
+        self.laplace: tuple[np.ndarray, np.ndarray] | None = None  # of z, by the last linear dynamics
         self.count = float(self.valid.sum() * self.seen.sum())
 
     def settle(self, theta: np.ndarray) -> bool:
@@ -115,7 +117,9 @@ class Likelihood:
         force that lasts (Jazwinski 1970, 9.7: the iterated filter).
         """
         ways, gaps = self._dynamics(theta, path, self.parts)
-        self.noise = self._noise(self._linear(theta, path, ways, gaps))
+        linear = self._linear(theta, path, ways, gaps)
+        self.noise = self._noise(linear)
+        self.laplace = self._posterior(linear)
         gains = self._gains(ways, self.noise)
         mask = jnp.asarray(self.valid, jnp.float32)[:, :, None, None]
         return gains.replace(gain=gains.gain * mask, whitener=gains.whitener * mask)
@@ -177,6 +181,18 @@ class Likelihood:
     def _start(self, noise: Noise) -> np.ndarray:
         """Standard deviations of the start state: as measured, or anything where it is not."""
         return np.where(self.seen, noise.sensor, 0.3 * self.scale)
+
+    def _posterior(self, linear: _Linear) -> tuple[np.ndarray, np.ndarray] | None:
+        """Mean [d] and covariance [d, d] of z by the linear dynamics of the first trajectories, all they tell.
+
+        A step of Gauss-Newton, at most LEAP in any direction: farther away the dynamics are others.
+        """
+        error, slope = linear.whitened(self._gains(linear.ways, self.noise), self.physics.dt)
+        if not (np.isfinite(error).all() and np.isfinite(slope).all()):
+            return None
+        precision = slope.T @ slope + np.eye(len(linear.z))
+        step = -np.linalg.solve(precision, slope.T @ error + linear.z)
+        return linear.z + step * min(1.0, LEAP / max(np.abs(step).max(), 1e-30)), np.linalg.inv(precision)
 
     def _fit(self, linear: _Linear, noise: Noise) -> tuple[float, float]:
         """(log evidence at the best common factor on the noise, that factor), by linear dynamics.

@@ -1,9 +1,9 @@
 """A posterior refined with the simulator's own likelihood of the real trajectories, replayed under their commands.
 
-The product of a network's posteriors proposes; `inference.importance` weighs thetas by how well a filter predicts the
-recorded motion one step ahead (`tracking`, `likelihood`), with noise that is estimated in turn. Where the prediction
-errors of different stretches of time disagree about theta by more than the likelihood admits, the posterior is widened
-in those directions, so that model error does not make it sure.
+The product of a network's posteriors proposes, and so do the linear dynamics along the records. `inference.importance`
+weighs thetas by how well a filter predicts the recorded motion one step ahead (`tracking`, `likelihood`), with noise
+that is estimated in turn. Where the prediction errors of different stretches of time disagree about theta by more than
+the likelihood admits, the posterior is widened in those directions, so that model error does not make it sure.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from bayessim_mjx.inference import importance
 from bayessim_mjx.inference.importance import Refined
 from bayessim_mjx.loop.likelihood import Likelihood, Noise
 
-PASSES = 3  # of noise and posterior in turn
+PASSES = 5  # at most, of noise and posterior in turn
 WIDER = 1.1  # variance of the scores, in what the likelihood promises, from which on a posterior is widened
 
 
@@ -70,8 +70,9 @@ def refine(
             return likelihood.log_likelihood(parts[-1])
 
         found = importance.refine(
-            current, log_likelihood, seed=seed + turn, draws=draws, rounds=rounds, components=components
-        )
+            current, log_likelihood, seed=seed + turn, draws=draws, rounds=rounds, components=components,
+            also=likelihood.laplace,
+        )  # fmt: skip
         kept = np.concatenate(parts)
         if not np.isfinite(found.evidence):
             break

@@ -18,6 +18,7 @@ from bayessim_mjx.inference.range_ends import Pile
 from bayessim_mjx.loop.sources import Source
 from bayessim_mjx.parameters import ParameterSpace
 from bayessim_mjx.parameters.ranged import Ranged
+from bayessim_mjx.physics.contact import collides
 from bayessim_mjx.rl import TrainState
 from bayessim_mjx.rollout import Trajectory
 
@@ -123,7 +124,10 @@ class Loop:
     @property
     def refines(self) -> bool:
         """Whether posteriors are refined by replays of the real trajectories."""
-        return self.settings.refine != "off" and getattr(self.env, "physics", None) is not None
+        physics, asked = getattr(self.env, "physics", None), self.settings.refine
+        if physics is None or self.settings.modelClass is None:
+            return False
+        return asked == "likelihood" or (asked == "auto" and not collides(physics.mj_model))
 
     @property
     def chart(self) -> str:

@@ -77,9 +77,13 @@ class Run:
 
     @property
     def config(self) -> config.Config:
-        """The settings that the run was started with."""
+        """The settings that the run was started with; what came later is off."""
         params = self.path / "params"
-        return config.load(cfg_env=params / "env.yaml", cfg_train=params / "train.yaml")
+        found = config.load(cfg_env=params / "env.yaml", cfg_train=params / "train.yaml")
+        text = (params / "env.yaml").read_text()
+        return (
+            found if re.search(r"^ *refine:", text, re.MULTILINE) else config.replace(found, bayessim={"refine": "off"})
+        )
 
     @property
     def checkpoints(self) -> list[dict[str, Any]]:

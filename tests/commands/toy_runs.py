@@ -25,7 +25,7 @@ SMALL += [
 ]
 SMALL += ["env.realParams.means=[[1.5]]", "env.realParams.stds=[[0.0]]", "--headless"]
 LOOP = ["bayessim.realIters=2", "bayessim.trainTrajs=32", "bayessim.realEvals=4", "bayessim.components=2"]
-LOOP += ["bayessim.hiddenLayers=[4]", "bayessim.trainTrajLen=4", "monitor.posterior_plots=False"]
+LOOP += ["bayessim.hiddenLayers=[4]", "bayessim.trainTrajLen=4", "monitor.posterior_plots=False", "bayessim.refine=off"]
 
 
 class Toy(Env):

@@ -18,7 +18,7 @@ NORMAL = ParameterSpace(
 NOISE, TRUTH, FITTED = 0.1, np.array([0.3, 0.0], np.float32), 2000
 SMALL = [
     f"bayessim.trainTrajs={FITTED}", "bayessim.realTrajs=2", "bayessim.realIters=3", "bayessim.components=2",
-    "bayessim.hiddenLayers=[16]", "bayessim.checkTrajs=0", "bayessim.priorShare=0.01",
+    "bayessim.hiddenLayers=[16]", "bayessim.checkTrajs=0", "bayessim.priorShare=0.01", "bayessim.refine=off",
 ]  # fmt: skip
 
 

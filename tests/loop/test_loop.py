@@ -17,7 +17,7 @@ TINY = [
     "ppo.log_interval=1", "ppo.save_interval=1", "ppo.hidden_actor=[8]", "ppo.hidden_critic=[8]",
     "bayessim.trainTrajs=400", "bayessim.realEvals=4", "bayessim.realIters=2", "bayessim.realTrajs=2",
     "bayessim.components=3", "bayessim.hiddenLayers=[16]", "bayessim.trainTrajLen=8", "bayessim.ftuneRL=True",
-    "bayessim.checkTrajs=0",
+    "bayessim.checkTrajs=0", "bayessim.refine=off",
 ]  # fmt: skip
 
 

@@ -135,7 +135,7 @@ BUDGET = [
     "ppo.hidden_critic=[4]", "ppo.eval_episodes=4", "--max_iterations=1", "bayessim.realEvals=4",
     "bayessim.realIters=1", "bayessim.realTrajs=6", "bayessim.trainTrajs=6000", "bayessim.trainTrajLen=20",
     "bayessim.hiddenLayers=[64,64]", "bayessim.ensemble=2", "bayessim.components=3", "bayessim.checkTrajs=100",
-    "monitor.posterior_plots=False", "monitor.video=False", "--headless", "--seed", "1",
+    "bayessim.refine=off", "monitor.posterior_plots=False", "monitor.video=False", "--headless", "--seed", "1",
     "task.randomization_params.actor_params.pendulum.rigid_body_properties.mass.range=[0.7,1.7]",
     "task.randomization_params.actor_params.pendulum.rigid_shape_properties.length.range=[0.6,1.2]",
 ]  # fmt: skip

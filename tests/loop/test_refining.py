@@ -51,6 +51,22 @@ def test_an_environment_without_our_physics_cannot_be_replayed():
         loop.make(settings, foreign)
 
 
-def test_nothing_is_kept_where_nothing_is_refined():
-    settings = config.load("Pendulum", overrides=SMALL)
-    assert loop.make(settings, make("Pendulum", config=settings)).refines is False
+@pytest.mark.parametrize(
+    ("task", "asked", "refines"),
+    [("Pendulum", "auto", True), ("Pendulum", "off", False), ("Ant", "auto", False), ("Ant", "likelihood", True)],
+)
+def test_by_default_what_touches_nothing_is_refined(task, asked, refines):
+    settings = config.load(task, overrides=[f"bayessim.refine={asked}"])
+    assert loop.make(settings, make(task, config=settings)).refines is refines
+    assert config.load(task).bayessim.refine == "auto"
+
+
+def test_a_run_from_before_refinement_goes_on_without(tmp_path):
+    from bayessim_mjx import runs
+
+    run = runs.Run.create(tmp_path, "Pendulum", "", config.load("Pendulum"), ["test"])
+    assert run.config.bayessim.refine == "auto"
+    for path in (run.path / "params").glob("*.yaml"):
+        kept = [line for line in path.read_text().splitlines() if "refine:" not in line]
+        path.write_text("\n".join(kept) + "\n")
+    assert run.config.bayessim.refine == "off"
