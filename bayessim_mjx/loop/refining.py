@@ -20,6 +20,7 @@ from bayessim_mjx.rollout import Trajectory
 from bayessim_mjx.tracking import Record
 
 DRAWS = 1024  # thetas of one call
+SHARE = 0.01  # of the prior, at most: none of 280 refined posteriors of benchmarks/inference/refinement.py was wrong
 
 
 def no_motion(loop: Loop, rows: int) -> dict[str, Array] | None:
@@ -49,7 +50,7 @@ def refined(
             info.warnings.append(f"bayessim.refine: the network's posterior is kept: {found.refined.reason}")
         return state, proposal
     posterior = found.posterior.reduce(b.components).rechart(loop.chart)
-    return state, dataclasses.replace(posterior, prior_weight=jnp.float32(b.priorShare))
+    return state, dataclasses.replace(posterior, prior_weight=jnp.float32(min(b.priorShare, SHARE)))
 
 
 def scores(found: Refinement) -> dict[str, float]:

@@ -10,6 +10,8 @@ Arrays stay on their device; the wrappers hand them on by DLPack, or copy them w
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -83,7 +85,7 @@ class Worlds:
             raise UserError(f"num_envs = {num_envs!r}: must be a whole number of at least 1")
         self.env, self.num_envs, self.domain, self.reward_scale = env, int(num_envs), domain, float(reward_scale)
         self.seed(seed)
-        self._begin, self._advance = program(self._began, env), program(self._advanced, env)
+        self._begin, self._advance = _programs(env, self.num_envs, self.reward_scale)
         self._running: _Running | None = None
         self.watch: Callable[[Batch], None] | None = None  # is shown every batch
         self._fixed: jax.Array | None = None  # theta [N, d] that `set_theta` gave
@@ -156,17 +158,26 @@ class Worlds:
             raise UserError("a picture before reset: call reset() first")
         return self._running.state.pipeline_state.qpos
 
-    def _episodes(self, key: jax.Array, domain: Any, fixed: jax.Array | None, now: Any = 0) -> tuple[Any, jax.Array]:
+
+@dataclass(frozen=True)
+class _Steps:
+    """What happens to `num_envs` worlds, as pure functions."""
+
+    env: Env
+    num_envs: int
+    reward_scale: float
+
+    def episodes(self, key: jax.Array, domain: Any, fixed: jax.Array | None, now: Any = 0) -> tuple[Any, jax.Array]:
         theta_key, reset_key = jax.random.split(key)
         theta = drawn(self.env, theta_key, domain, self.num_envs) if fixed is None else fixed
         return reset_at(self.env, reset_key, theta, None, now), theta
 
-    def _began(self, key: jax.Array, domain: Any, fixed: jax.Array | None) -> _Running:
-        first, later = (self._episodes(k, domain, fixed) for k in jax.random.split(key))
+    def began(self, key: jax.Array, domain: Any, fixed: jax.Array | None) -> _Running:
+        first, later = (self.episodes(k, domain, fixed) for k in jax.random.split(key))
         zero, n = jnp.zeros, self.num_envs
         return _Running(*first, zero(n), zero(n, jnp.int32), later, zero(n, bool))
 
-    def _advanced(
+    def advanced(
         self, key: jax.Array, old: _Running, action: jax.Array, domain: Any, fixed: jax.Array | None
     ) -> tuple[Batch, _Running]:
         after = jax.vmap(traced(self.env.step))(old.state, jnp.asarray(action, jnp.float32))
@@ -176,7 +187,7 @@ class Worlds:
         returns, lengths = old.returns + after.reward, old.lengths + 1
         # resets are dear: new episodes are drawn for all worlds at once, when one of them needs its second
         empty = (ended & old.used).any()
-        renew = lambda: self._episodes(key, domain, fixed, clock(self.env, old.state))  # noqa: E731
+        renew = lambda: self.episodes(key, domain, fixed, clock(self.env, old.state))  # noqa: E731
         store = jax.lax.cond(empty, lambda: _as(renew(), old.store), lambda: old.store)
         fresh, theta = store
         fresh = next_episodes(self.env, ended, after, fresh)
@@ -187,6 +198,13 @@ class Worlds:
         batch = Batch(state.obs, reward, terminated, truncated, after.obs, returns, lengths, metrics, theta)
         returns, lengths = jnp.where(ended, 0.0, returns), jnp.where(ended, 0, lengths)
         return batch, _Running(state, theta, returns, lengths, store, (old.used & ~empty) | ended)
+
+
+@lru_cache(maxsize=16)
+def _programs(env: Env, num_envs: int, reward_scale: float) -> tuple[Any, Any]:
+    """Compiled once for each environment and number of worlds, however many `Worlds` there are of them."""
+    steps = _Steps(env, num_envs, reward_scale)
+    return program(steps.began, env), program(steps.advanced, env)
 
 
 def _as(tree: Any, reference: Any) -> Any:

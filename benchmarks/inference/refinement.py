@@ -3,7 +3,7 @@
     python benchmarks/inference/refinement.py --system linear --n 1 4 16 --truths 50 --out refinement.json
 
 The prior proposes, so a network's quality is no part of it. Posteriors are judged as the loop uses them: with
-`bayessim.components` Gaussians and the share of the prior that `bayessim.priorShare` asks for. A table tells how often
+`bayessim.components` Gaussians and a share of the prior. A table tells how often
 the 50, 80 and 95 % regions hold the truth, with binomial standard errors, the mean gain over the prior in nats, and how
 many posteriors were not refined (they are out of the coverage and in the gain). Systems: `linear` is a cart under two
 motors of unknown strength, whose exact posterior is known; `damped` a pendulum of unknown mass, damping and motor;
@@ -37,7 +37,7 @@ from bayessim_mjx.tracking import Record
 LEVELS = (0.5, 0.8, 0.95)
 STEPS, HELD = 60, 5  # control steps of a trajectory; those for which a random command is held
 MOST = 32  # trajectories behind a truth, of which the first n are used
-PRIOR_SHARE, COMPONENTS = 0.05, 8  # defaults of `bayessim:`
+PRIOR_SHARE, COMPONENTS = 0.01, 8  # as the loop has them
 WRONG = {"none": "nothing", "gusts": "forces as large as .3 of the commands, .5 s each", "delay": "2 steps of delay"}
 
 CART = """<mujoco><option timestep=".02" gravity="0 0 0"/><worldbody><body name="cart">
@@ -180,7 +180,7 @@ def main() -> None:
     parser.add_argument("--truths", type=int, default=100)
     parser.add_argument("--first", type=int, default=0, help="number of the first truth")
     parser.add_argument("--draws", type=int, default=512, help="thetas of one call (the loop: 1024)")
-    parser.add_argument("--prior_share", type=float, default=PRIOR_SHARE, help="as bayessim.priorShare; one per file")
+    parser.add_argument("--prior_share", type=float, default=PRIOR_SHARE, help="as the loop has; one per file")
     parser.add_argument("--out", type=Path, default=Path("refinement.json"), help="kept after every truth, taken up")
     a = parser.parse_args()
     rows = json.loads(a.out.read_text()) if a.out.exists() else []
