@@ -14,7 +14,7 @@ from bayessim_mjx.tasks import shadow_hand
 GOAL = np.float32([0, -0.39, 0.56])
 TURNED = np.float32([0.1, 0.7, -0.1, 0.7])
 TURNED /= np.linalg.norm(TURNED)
-pytestmark = [pytest.mark.slow, pytest.mark.ci]
+pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
@@ -105,6 +105,7 @@ def isaac(quat):
     return np.roll(quat if quat[0] >= 0 else -quat, -1)
 
 
+@pytest.mark.ci
 def test_mjx_agrees_with_mujoco_on_a_cube_that_rests_and_one_that_is_held(env, both_engines):
     """A second without action, in which the cube falls on the palm; and hands that close on it and move.
 
