@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import mujoco
 import numpy as np
@@ -21,11 +21,18 @@ SHORTEST = 1e-6  # s between rows
 STREAMS = ("ctrl", "qpos", "qvel", "effort", "enabled")
 
 
-def check_channels(table: Table, columns: Mapping[str, Array], channels: Channels) -> None:
-    """Every name is known, nothing needed is missing, and what is needed is finite.
+def needed_columns(columns: Iterable[str], channels: Channels) -> list[str]:
+    """Columns without which there is no log; velocities of all joints where one is there."""
+    needed = ["time", *(f"ctrl:{n}" for n in channels.actuators), *(f"qpos:{n}" for n in channels.qpos)]
+    velocities = [f"qvel:{n}" for n in channels.qvel]
+    return needed + velocities if set(velocities) & set(columns) else needed
+
+
+def check_names(table: Table, columns: Mapping[str, Array], channels: Channels) -> None:
+    """Every name is known and nothing needed is missing.
 
     Raises:
-        UserError: a name that is no joint or actuator, a missing column, NaN or infinity.
+        UserError: a name that is no joint or actuator, a missing column.
     """
     named = {
         "ctrl": channels.actuators,
@@ -42,19 +49,25 @@ def check_channels(table: Table, columns: Mapping[str, Array], channels: Channel
         if prefix not in named and column != "time" and near and (name or near[0] == "time") and near[0] not in columns:
             right = f"{near[0]}:{name}" if name else near[0]
             raise UserError(f"{table.path}: unknown column {column!r}; did you mean {right!r}?")
-    needed = ["time"] + [f"{s}:{n}" for s in ("ctrl", "qpos") for n in named[s]]
-    if any(f"qvel:{n}" in columns for n in channels.qvel):
-        needed += [f"qvel:{n}" for n in channels.qvel]
-    missing = [c for c in needed if c not in columns]
+    missing = [c for c in needed_columns(columns, channels) if c not in columns]
     if missing:
         names = ", ".join(table.columns)
         constant = "a joint that was not recorded can be held constant in the map (qpos: {<joint>: {value: 0.0}})"
         raise UserError(f"{table.path}: missing column(s) {', '.join(missing)}; it has {names}; {constant}")
-    for column in needed:
+
+
+def check_finite(table: Table, columns: Mapping[str, Array], channels: Channels) -> None:
+    """What is needed is finite.
+
+    Raises:
+        UserError: NaN, infinity, or a number too large to compute with.
+    """
+    for column in needed_columns(columns, channels):
         bad = np.flatnonzero(~(np.abs(columns[column]) < LARGEST))
         if len(bad):
             at = f"{table.path}: column {column!r}, {table.where(int(bad[0]))}: {columns[column][bad[0]]}"
-            raise UserError(f"{at} ({len(bad)} such row(s)); allowed: finite numbers below {LARGEST:g}")
+            mend = "`bad_rows: drop` in a map leaves such rows out"
+            raise UserError(f"{at} ({len(bad)} such row(s)); allowed: finite numbers below {LARGEST:g}; {mend}")
 
 
 def _kind(prefix: str) -> str:

@@ -13,11 +13,11 @@ from bayessim_mjx.config import read_yaml
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.mapping import LogMap
 
-METADATA = ("condition", "operating_condition", "controller", "payload", "repeat_of", "sigma", "quantum")
-SUFFIXES = (".csv", ".npz")
+METADATA = ("condition", "operating_condition", "controller", "payload", "repeat_of", "sigma", "quantum", "hold")
+SUFFIXES = (".csv", ".npz", ".jsonl")
 FORMAT = (
     "CSV with the columns time, ctrl:<actuator>, qpos:<joint>[, qvel:<joint>], "
-    "or NPZ with time, ctrl, qpos[, qvel], joints, actuators"
+    "NPZ with time, ctrl, qpos[, qvel], joints, actuators, or JSON lines with the keys of the CSV's columns"
 )
 
 Paths = str | Path | Sequence[str | Path]

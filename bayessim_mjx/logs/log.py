@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from bayessim_mjx.errors import UserError
 
 Array = NDArray[np.float64]
+HOLDS = ("previous", "linear")  # how a command goes on from its row to the next
 
 # width in qpos and in qvel of every joint type
 _WIDTHS = {
@@ -75,7 +76,7 @@ def _single(joint_type: int) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Log:
-    """One run, in SI units, arrays read-only. The command of row k is the one in force from time[k] to time[k+1].
+    """One run, in SI units, arrays read-only. The command of row k is in force until time[k+1], unless `linear`.
 
     Attributes:
         name: file name, with `#k` for the k-th piece of a file cut at its gaps.
@@ -88,7 +89,7 @@ class Log:
         sigma_qpos, sigma_qvel: [nq], [nv] standard deviation of the measurement noise.
         streams: whatever else was recorded, [T] each: `effort:<actuator>`, `enabled:<actuator>` (0 = drive off, the
             command did not act), witnesses such as `voltage`; NaN where not sampled.
-        metadata: the file's side YAML (condition, controller, payload, repeat_of ...) and `source`, its path.
+        metadata: the file's side YAML (condition, controller, payload, repeat_of, hold ...) and `source`, its path.
     """
 
     name: str
@@ -154,6 +155,11 @@ class Log:
     def aliases(self) -> set[str]:
         """Names that another log's `repeat_of` may call it by."""
         return {self.name, Path(self.name).stem, str(self.metadata.get("source", self.name))}
+
+    @property
+    def linear(self) -> bool:
+        """Whether commands run linearly from row to row (`hold: linear`), in place of being held until the next."""
+        return self.metadata.get("hold") == "linear"
 
     @property
     def condition(self) -> str | None:

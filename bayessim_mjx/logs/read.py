@@ -1,9 +1,10 @@
-"""Read recorded motion: CSV or NPZ, one file per run, checked row by row before anything is simulated."""
+"""Read recorded motion: CSV, NPZ or JSON lines, one file per run, checked row by row before anything is simulated."""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +12,11 @@ import mujoco
 import numpy as np
 
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.logs.check import STREAMS, check_channels, check_motion, check_time
+from bayessim_mjx.logs.bad_rows import leave_out
+from bayessim_mjx.logs.check import STREAMS, check_finite, check_motion, check_names, check_time
 from bayessim_mjx.logs.files import FORMAT, Paths, distinct, files_of, map_of_folder, side_yaml
-from bayessim_mjx.logs.log import Array, Channels, Log, suggest
+from bayessim_mjx.logs.jsonl import read_jsonl
+from bayessim_mjx.logs.log import HOLDS, Array, Channels, Log, suggest
 from bayessim_mjx.logs.mapping import LogMap
 from bayessim_mjx.logs.pieces import MIN_ROWS, pieces
 from bayessim_mjx.logs.table import Table, read_csv, read_npz
@@ -25,7 +28,8 @@ def read_logs(
 ) -> list[Log]:
     """Read all runs of a folder (or the files named), in the model's order of joints and actuators.
 
-    A folder's own `map.yaml` is used where `map` is not given. Files are cut at gaps longer than 5 periods and 10 ms;
+    A folder's own `map.yaml` is used where `map` is not given; columns keep their names if it names no channel. Files
+    are cut at gaps longer than 5 periods and 10 ms;
     `<file stem>.yaml` beside a file becomes its metadata; `sigma` and `quantum` there, {<channel>: value}, replace the
     estimates of a channel's noise and resolution.
 
@@ -56,14 +60,21 @@ def _check_repeats(logs: Sequence[Log]) -> None:
 
 
 def _read_one(path: Path, mj_model: mujoco.MjModel, channels: Channels, log_map: LogMap | None) -> list[Log]:
-    if path.suffix == ".npz":
-        table = read_npz(path)
+    log_map = log_map or LogMap()
+    table = _table(path, log_map)
+    if log_map.names_channels:
+        columns, sources = log_map.apply(table), log_map.sources(table)
     else:
-        table = read_csv(path, *((log_map.delimiter, log_map.header) if log_map else ()))
-    columns = log_map.apply(table) if log_map is not None else _columns(table, channels)
-    check_channels(table, columns, channels)
+        columns, sources = _columns(table, channels, log_map)
+    check_names(table, columns, channels)
+    if table.lenient:
+        table, columns = leave_out(table, columns, sources, channels, log_map.bad_rows)
+    check_finite(table, columns, channels)
     check_time(table, columns["time"], MIN_ROWS)
-    metadata = {**(log_map.metadata if log_map else {}), **side_yaml(path), "source": str(path)}
+    hold = {} if log_map.hold is None else {"hold": log_map.hold}
+    metadata = {**hold, **log_map.metadata, **side_yaml(path), "source": str(path)}
+    if metadata.get("hold", HOLDS[0]) not in HOLDS:
+        raise UserError(f"{path}: hold = {metadata['hold']!r} in its side YAML; allowed: {', '.join(HOLDS)}")
     law = controllers.read(
         metadata, mj_model, channels.actuators, str(path)
     )  # refused here, before anything is simulated
@@ -72,6 +83,15 @@ def _read_one(path: Path, mj_model: mujoco.MjModel, channels: Channels, log_map:
     if "condition" in metadata:
         metadata.setdefault("operating_condition", metadata["condition"])
     return pieces(table, columns, channels, metadata)
+
+
+def _table(path: Path, log_map: LogMap) -> Table:
+    lenient = log_map.bad_rows != "error"
+    if path.suffix == ".npz":
+        return replace(read_npz(path), lenient=lenient)
+    if path.suffix == ".jsonl":
+        return read_jsonl(path, log_map.skip_rows, lenient)
+    return read_csv(path, log_map.delimiter, log_map.header, log_map.skip_rows, lenient)
 
 
 def _with_numbers(table: Table, columns: dict[str, Array]) -> dict[str, Array]:
@@ -89,12 +109,19 @@ def _check_map(log_map: LogMap, channels: Channels) -> None:
                 raise UserError(f"{log_map.path}: {stream}.{name} is no channel of the model; {suggest(name, allowed)}")
 
 
-def _columns(table: Table, channels: Channels) -> dict[str, Array]:
-    """The file's own columns as channels; text columns nobody asked for are left out with a warning."""
+def _columns(table: Table, channels: Channels, log_map: LogMap) -> tuple[dict[str, Array], dict[str, str]]:
+    """The file's own columns as channels, and {channel: column} of what is needed.
+
+    Text columns that nobody asked for are left out with a warning.
+    """
     names = {c: c for c in table.columns} if table.first_line is not None else _npz_names(table, channels)
-    out = {}
+    clock = log_map.rate is not None or log_map.time != LogMap.time
+    own = log_map.sources(table).values() if clock else ()
+    out = {"time": log_map.clock(table)} if clock or "time" in table.columns else {}
     for column, name in names.items():
-        needed = name == "time" or name.split(":")[0] in STREAMS
+        if name == "time" or (clock and column in own):
+            continue
+        needed = name.split(":")[0] in STREAMS
         if name in out:
             raise UserError(f"{table.path}: two columns are {name!r}; allowed: one column per channel")
         try:
@@ -103,7 +130,10 @@ def _columns(table: Table, channels: Channels) -> dict[str, Array]:
             if needed:
                 raise
             warnings.warn(f"{error}; the column is left out", stacklevel=2)
-    return out
+    sources = {name: column for column, name in names.items() if name == "time" or name.split(":")[0] in STREAMS}
+    if clock:
+        sources = {**sources, **log_map.sources(table)}
+    return out, sources
 
 
 def _npz_names(table: Table, channels: Channels) -> dict[str, str]:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from bayessim_mjx.errors import UserError
+from bayessim_mjx.logs.commands import means
 from bayessim_mjx.logs.log import Array, Log
 
 
@@ -26,7 +27,8 @@ def resample(log: Log, dt: float, kind: Literal["cubic", "linear"] = "cubic") ->
     Positions and velocities are interpolated. A logged command is held until the next row; the command of a step is
     the *mean* of that held signal over the step (its impulse is kept, no sample is skipped and no delay added).
     `enabled:` streams are 1 only where the drive was on throughout the step. A log that is already even is returned as
-    it is.
+    it is. Where commands run linearly (`Log.linear`), theirs is the mean of that, also on an even log, and the result
+    is held.
 
     Raises:
         UserError: dt or kind out of range, a log shorter than two steps, a rate so low that steps would be invented.
@@ -36,7 +38,7 @@ def resample(log: Log, dt: float, kind: Literal["cubic", "linear"] = "cubic") ->
     if kind not in ("cubic", "linear"):
         raise UserError(f"resample: kind = {kind!r}; allowed: cubic, linear")
     if is_even(log, dt):
-        return replace(log, time=log.time[0] + dt * np.arange(len(log)))
+        return _held(replace(log, time=log.time[0] + dt * np.arange(len(log))), dt)
     if log.period > 20 * dt:
         text = f"log {log.name!r}: one row per {log.period:.4g} s against a control period of {dt:.4g} s"
         raise UserError(f"{text}; allowed: up to 20 control periods per row")
@@ -50,7 +52,8 @@ def resample(log: Log, dt: float, kind: Literal["cubic", "linear"] = "cubic") ->
     return replace(
         log,
         time=grid,
-        ctrl=_mean_held(log.time, log.ctrl, grid, dt),
+        ctrl=_mean(log.time, log.ctrl, grid, dt, log.linear),
+        metadata=_without_hold(log),
         qpos=_normalised(log, _interpolate(log.time, log.qpos, inside, kind)),
         qvel=_interpolate(log.time, log.qvel, inside, kind),
         streams={k: _stream(log.time, k, s, grid, dt) for k, s in log.streams.items()},
@@ -63,22 +66,26 @@ def _interpolate(time: Array, x: Array, grid: Array, kind: str) -> Array:
     return np.stack([np.interp(grid, time, c) for c in x.T], 1) if x.shape[1] else np.zeros((len(grid), 0))
 
 
-def _mean_held(time: Array, x: Array, grid: Array, dt: float) -> Array:
-    """(1/dt) integral over [t_k, t_k + dt) of x held from each row to the next; the last row is held for ever."""
-    ends = np.append(grid, grid[-1] + dt)
-    times = np.append(time, max(time[-1], ends[-1]) + dt)
-    area = np.concatenate([np.zeros((1, x.shape[1])), np.cumsum(x * np.diff(times)[:, None], axis=0)])
-    return (
-        np.stack([np.diff(np.interp(ends, times, a)) / dt for a in area.T], 1)
-        if x.shape[1]
-        else np.zeros((len(grid), 0))
-    )
+def _mean(time: Array, x: Array, grid: Array, dt: float, linear: bool = False) -> Array:
+    """Mean of x over each [t_k, t_k + dt), held or linear from row to row; the last row is held for ever."""
+    return means(time, x, np.append(grid, grid[-1] + dt), dt, (0.0, dt), linear)
+
+
+def _held(even: Log, dt: float) -> Log:
+    """An even log with the means of its linear commands in their place."""
+    if not even.linear:
+        return even
+    return replace(even, ctrl=_mean(even.time, even.ctrl, even.time, dt, True), metadata=_without_hold(even))
+
+
+def _without_hold(log: Log) -> dict[str, Any]:
+    return {key: value for key, value in log.metadata.items() if key != "hold"}
 
 
 def _stream(time: Array, name: str, x: Array, grid: Array, dt: float) -> Array:
     if name.startswith("enabled"):
         on = np.nan_to_num(x, nan=1.0)[:, None] > 0.5
-        return (_mean_held(time, on.astype(float), grid, dt)[:, 0] > 1.0 - 1e-6).astype(float)
+        return (_mean(time, on.astype(float), grid, dt)[:, 0] > 1.0 - 1e-6).astype(float)
     seen = np.isfinite(x)
     return np.interp(grid, time[seen], x[seen]) if seen.any() else np.full(len(grid), np.nan)
 

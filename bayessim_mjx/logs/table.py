@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayessim_mjx.errors import UserError
+from bayessim_mjx.logs import instants
 from bayessim_mjx.logs.log import Array
 
 _WORDS = {"true": 1.0, "yes": 1.0, "on": 1.0, "false": 0.0, "no": 0.0, "off": 0.0, "": float("nan")}
@@ -28,13 +29,42 @@ class Table:
     first_line: int | None = None  # line of row 0 in a text file; None: rows are counted from 0
     names: Mapping[str, tuple[str, ...]] = field(default_factory=dict)  # NPZ: joints, actuators
     widths: Mapping[str, int] = field(default_factory=dict)  # NPZ: columns of each array
+    lenient: bool = False  # what is no number is NaN (`bad_rows` in a map)
+    ragged: Mapping[int, str] = field(default_factory=dict)  # lenient: rows that hold nothing, and what is wrong there
+    kept: Sequence[int] | None = None  # rows of the file, counted from its first, where some were left out
 
     @property
     def rows(self) -> int:
         return len(next(iter(self.columns.values())))
 
+    def row(self, row: int) -> int:
+        """The row as the file counts it."""
+        return row if self.kept is None else int(self.kept[row])
+
     def where(self, row: int) -> str:
-        return f"row {row}" if self.first_line is None else f"line {row + self.first_line}"
+        return f"row {self.row(row)}" if self.first_line is None else f"line {self.row(row) + self.first_line}"
+
+    def times(self, column: str) -> Array:
+        """The column [T] in its own unit, or in seconds since the first row where it holds dates (ISO 8601).
+
+        Raises:
+            UserError: a field that is neither, naming its line.
+        """
+        values = self.columns[column]
+        texts = values.dtype.kind in "US" if isinstance(values, np.ndarray) else True
+        if not texts or not instants.dated(map(str, values)):
+            return self.numbers(column)
+        at = f"{self.path}: column {column!r}, "
+        return instants.seconds([str(v) for v in values], lambda row: at + self.where(row), self.lenient)
+
+    def unreadable(self, column: str) -> dict[int, str]:
+        """Rows of a column whose field is neither blank nor a number, and what is there; only where `lenient`."""
+        values = self.columns[column]
+        if isinstance(values, np.ndarray) and values.dtype.kind not in "US":
+            return {}
+        nothing = ~np.isfinite(self.times(column))
+        rows = (int(row) for row in np.flatnonzero(nothing) if str(values[row]).strip().lower() not in ("", "nan"))
+        return {row: f"column {column!r} holds {values[row]!r}" for row in rows}
 
     def numbers(self, column: str) -> Array:
         """The column as float64 [T]; blank fields are NaN. A column of words alone: true, yes, on are 1, the others 0.
@@ -51,32 +81,51 @@ class Table:
             return np.asarray(values).astype(np.float64)
         except (TypeError, ValueError):
             words = [str(v).strip().lower() for v in values]
-            switch = all(word in _WORDS for word in words)
+            switch = self._switch(words)
             return np.array([self._number(column, row, word, switch) for row, word in enumerate(words)])
+
+    def _switch(self, words: Sequence[str]) -> bool:
+        """Whether words stand for on and off; where `lenient`, besides others that stand for nothing."""
+        known = [word in _WORDS for word in words if word]
+        return any(known) and not any(map(_is_number, words)) if self.lenient else all(known)
 
     def _number(self, column: str, row: int, text: str, switch: bool) -> float:
         try:
             if not text.isascii():
                 raise ValueError("digits of other scripts")
             return _WORDS[text] if switch or not text else float(text)
-        except ValueError:
+        except (ValueError, KeyError):
+            if self.lenient:
+                return float("nan")
             at = f"{self.path}: {self.where(row)}, column {column!r}"
             raise UserError(
                 f"{at}: {text!r} is not a number; allowed: numbers, or a column of true, false, yes, no, on, off"
             ) from None
 
 
-def read_csv(path: Path, delimiter: str = ",", header: bool = True) -> Table:
+def _is_number(text: str) -> bool:
+    try:
+        return np.isfinite(float(text))
+    except ValueError:
+        return False
+
+
+def read_csv(path: Path, delimiter: str = ",", header: bool = True, skip_rows: int = 0, lenient: bool = False) -> Table:
     """Read a CSV file; columns of a file without a header line are called 0, 1, 2 ...
 
     A column without a name is called `unnamed <its number>`, or left out where it is blank throughout, as after a comma
     at the end of each line.
 
+    Args:
+        skip_rows: lines before the header, or before the first row where there is none.
+        lenient: a row of the wrong length becomes one that holds nothing (`bad_rows`).
+
     Raises:
         UserError: no rows, a repeated column, a row of the wrong length, another delimiter.
     """
     try:
-        lines = list(csv.reader(path.read_text(encoding="utf-8-sig").splitlines(), delimiter=delimiter))
+        text = path.read_text(encoding="utf-8-sig").splitlines()[skip_rows:]
+        lines = list(csv.reader(text, delimiter=delimiter))
     except (UnicodeDecodeError, csv.Error) as error:
         raise UserError(f"{path}: not a text file ({error}); allowed: CSV with a header line, or NPZ") from None
     while lines and not any(f.strip() for f in lines[-1]):
@@ -96,14 +145,16 @@ def read_csv(path: Path, delimiter: str = ",", header: bool = True) -> Table:
     repeated = sorted({n for n in names if names.count(n) > 1})
     if repeated:
         raise UserError(f"{path}: column {repeated[0]!r} appears more than once in the header")
-    first = 2 if header else 1
-    for row, fields in enumerate(body):
-        if len(fields) != len(names):
-            allowed = f"allowed: {len(names)} ({', '.join(names)})"
-            raise UserError(f"{path}: line {row + first} has {len(fields)} fields; {allowed}")
+    first = skip_rows + (2 if header else 1)
+    ragged = {row: f"{len(fields)} fields" for row, fields in enumerate(body) if len(fields) != len(names)}
+    if ragged and not lenient:
+        row = min(ragged)
+        raise UserError(f"{path}: line {row + first} has {ragged[row]}; allowed: {len(names)} ({', '.join(names)})")
+    body = [[""] * len(names) if row in ragged else fields for row, fields in enumerate(body)]
     columns = {name: [r[i] for r in body] for i, name in enumerate(names)}
     blank = {names[i] for i in unnamed if not any(r[i].strip() for r in body)}
-    return Table(path, {name: column for name, column in columns.items() if name not in blank}, first)
+    columns = {name: column for name, column in columns.items() if name not in blank}
+    return Table(path, columns, first, lenient=lenient, ragged=ragged)
 
 
 def read_npz(path: Path) -> Table:

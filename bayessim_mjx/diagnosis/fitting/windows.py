@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from bayessim_mjx.effects.support.motion import AROUND, Motion
 from bayessim_mjx.errors import UserError
+from bayessim_mjx.logs.commands import means
 from bayessim_mjx.logs.log import Log
 from bayessim_mjx.logs.resample import around as rows_around
 from bayessim_mjx.logs.resample import resample
@@ -217,7 +218,7 @@ def _blocks(starts: list[tuple[int, int]], logs: Sequence[Log]) -> tuple[tuple[s
 
 
 def _fine_commands(raw: Log, even: Log, dt: float, substeps: int, centred: bool) -> NDArray[np.float32]:
-    """`[rows, S, nu]`: mean of the held command over each sub-step; centred: half a sub-step early.
+    """`[rows, S, nu]`: mean of the logged command over each sub-step; centred: half a sub-step early.
 
     Semi-implicit Euler advances with the force at the beginning of a sub-step; read as a leapfrog (velocities half a
     sub-step before positions) that force stands for the interval centred there. With the command averaged over this
@@ -226,13 +227,8 @@ def _fine_commands(raw: Log, even: Log, dt: float, substeps: int, centred: bool)
     h = dt / substeps
     rows, nu = len(even), raw.ctrl.shape[1]
     edges = even.time[0] - centred * h / 2 + h * np.arange(rows * substeps + 1)
-    times = np.concatenate([[min(edges[0], raw.time[0]) - dt], raw.time[1:], [max(edges[-1], raw.time[-1]) + dt]])
-    held = np.concatenate([raw.ctrl])  # row k holds from time[k] to time[k+1]; the first and last for ever
-    area = np.concatenate([np.zeros((1, nu)), np.cumsum(held * np.diff(times)[:, None], axis=0)])
-    means = (
-        np.stack([np.diff(np.interp(edges, times, a)) / h for a in area.T], 1) if nu else np.zeros((rows * substeps, 0))
-    )
-    return means.reshape(rows, substeps, nu).astype(np.float32)
+    fine = means(raw.time, raw.ctrl, edges, h, (dt, dt), raw.linear)
+    return fine.reshape(rows, substeps, nu).astype(np.float32)
 
 
 def _around(even: Sequence[Log], fine: list, starts: list[tuple[int, int]], around: int) -> Motion:

@@ -102,6 +102,14 @@ def test_a_step_of_the_command_acts_half_a_substep_before_its_row():
     np.testing.assert_allclose(command, expected, atol=1e-5)
 
 
+def test_a_linear_command_is_its_value_where_the_force_acts():
+    """Its mean over the sub-step centred on that time; held, it would be the last row's."""
+    time, ramp = LOGS[0].time, dataclasses.replace(with_command(5.0 * LOGS[0].time), metadata={"hold": "linear"})
+    command = np.asarray(cut([ramp]).batch.command[1, :, :, 0])
+    at = time[LENGTH] + PERIOD / SUBSTEPS * np.arange(LENGTH * SUBSTEPS)
+    np.testing.assert_allclose(command.ravel(), 5.0 * at, rtol=1e-5)
+
+
 def test_impulses_of_commands_survive_fast_logs():
     fast = 5  # rows of the log per control step
     rng = np.random.default_rng(0)

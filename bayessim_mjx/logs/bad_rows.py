@@ -1,0 +1,70 @@
+"""Rows that cannot be used: refused, left out, or kept for what else they hold (`bad_rows` in a map), and counted."""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+
+from bayessim_mjx.logs.check import LARGEST, needed_columns
+from bayessim_mjx.logs.log import Array, Channels
+from bayessim_mjx.logs.table import Table
+from bayessim_mjx.quantities import percent
+
+
+def leave_out(
+    table: Table, columns: dict[str, Array], sources: Mapping[str, str], channels: Channels, policy: str
+) -> tuple[Table, dict[str, Array]]:
+    """Table and columns without the rows that cannot be used, with a warning that counts them.
+
+    `drop` leaves out a row with any field that is no number, `nan` only those without a time, a command or a
+    position: its other fields that are no number are then missing values.
+
+    Args:
+        columns: channels [T], NaN where a field is no number.
+        sources: the table's column of each channel.
+        policy: drop or nan.
+    """
+    unreadable = {row: text for source in sources.values() for row, text in table.unreadable(source).items()}
+    bad = dict(table.ragged) | (unreadable if policy == "drop" else {})
+    for name in needed_columns(columns, channels):
+        for row in np.flatnonzero(~(np.abs(columns[name]) < LARGEST)):
+            bad.setdefault(int(row), unreadable.get(int(row), f"column {name!r} holds {columns[name][row]}"))
+    for row in _not_after(columns["time"], bad):
+        bad[row] = f"time {columns['time'][row]:.9g} s is not after that of the row before"
+    missing = len(set(unreadable) - set(bad))
+    if not bad and not missing:
+        return table, columns
+    _tell(table, bad, unreadable, missing, policy, len(columns["time"]))
+    rows = np.array([row for row in range(len(columns["time"])) if row not in bad], dtype=np.int64)
+    lines = [table.row(int(row)) for row in rows]
+    return dataclasses.replace(table, kept=lines), {name: column[rows] for name, column in columns.items()}
+
+
+def _not_after(time: Array, bad: Iterable[int]) -> list[int]:
+    """Rows whose time stands still or runs back, seen from the last row that is kept."""
+    out, last, left_out = [], -np.inf, set(bad)
+    for row, now in enumerate(time):
+        if row in left_out:
+            continue
+        if now <= last:
+            out.append(row)
+        else:
+            last = now
+    return out
+
+
+def _tell(
+    table: Table, bad: Mapping[int, str], unreadable: Mapping[int, str], missing: int, policy: str, rows: int
+) -> None:
+    told = []
+    if bad:
+        first = min(bad)
+        told += [f"{len(bad)} of {rows} rows ({percent(len(bad) / rows)}) left out"]
+        told += [f"first {table.where(first)}: {bad[first]}"]
+    if missing:
+        first = min(set(unreadable) - set(bad))
+        told += [f"fields of {missing} row(s) count as missing, first {table.where(first)}: {unreadable[first]}"]
+    warnings.warn(f"{table.path}: bad_rows: {policy}: {'; '.join(told)}", stacklevel=4)
