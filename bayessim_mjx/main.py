@@ -28,7 +28,9 @@ COMMANDS = {  # all of them, and what each is for
     "calibrate": "how far a finished run's posterior can be trusted",
     "diagnose": "what a simulator is missing, from recorded motion",
     "gap_loop": "what a diagnosis is worth in return",
+    "logs": "recordings of other tools (MCAP, ROS bags, LeRobot, HDF5) as logs for a diagnosis",
 }
+MODULES = {"logs": "import_logs"}  # of commands that are called otherwise
 
 
 class Watched:
@@ -201,7 +203,7 @@ def _named(argv: Sequence[str] | None) -> int:
     module = name.replace("-", "_")
     if module not in COMMANDS:
         raise unknown("command", name, [c.replace("_", "-") for c in COMMANDS])
-    return _adapt(rest) if module == "main" else import_module(f"bayessim_mjx.{module}").main(rest)
+    return _adapt(rest) if module == "main" else import_module(f"bayessim_mjx.{MODULES.get(module, module)}").main(rest)
 
 
 if __name__ == "__main__":

@@ -3,7 +3,6 @@
 import contextlib
 import dataclasses
 import functools
-import importlib
 import io
 import re
 import sys
@@ -12,17 +11,18 @@ from pathlib import Path
 
 import pytest
 
-from bayessim_mjx import registry
+from bayessim_mjx import main, registry
 from bayessim_mjx.config import settings
 
 ROOT = Path(__file__).parents[1]
-COMMANDS = ("main", "train", "play", "calibrate", "diagnose", "gap_loop")
+COMMANDS = ("main", "train", "play", "calibrate", "diagnose", "gap_loop", "logs")
+FORMATS = ("from-mcap", "from-rosbag", "from-lerobot", "from-hdf5")  # of `logs`, each with flags of its own
 FOLDERS = ("docs", "benchmarks")
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(p for f in FOLDERS for p in sorted((ROOT / f).glob("*.md")))]
 PYTHON = {"env.reset", "env.step", "env.dt", "env.mj_model", "env.space", "ppo.train"}  # in Python, not settings
 COMMAND = re.compile(
     r"(?:python -m bayessim_mjx\.(\w+)"
-    r"|bayessim-mjx ((?:main|train|play|calibrate|diagnose|gap-loop)?)"
+    r"|bayessim-mjx ((?:main|train|play|calibrate|diagnose|gap-loop|logs)?)"
     r"|python ((?:benchmarks|examples|docs)/[\w/]+\.py))([^`\n#&]*)"
 )
 PROSE = re.compile(r"`(main|train|play|calibrate|diagnose|gap_loop) (--[^`\n]*)`")
@@ -42,7 +42,8 @@ def flags_of(command: str) -> set[str]:
         return set(re.findall(r'"(--[a-z][\w-]*)"', (ROOT / command).read_text())) | {"--help"}
     text = io.StringIO()
     with contextlib.redirect_stdout(text):
-        importlib.import_module(f"bayessim_mjx.{command}").main(["--help"])
+        for first in FORMATS if command == "logs" else ("",):
+            main.main([command, *filter(None, [first]), "--help"])
     return set(re.findall(r"--[a-z][a-z_-]*", text.getvalue()))
 
 

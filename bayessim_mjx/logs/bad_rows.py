@@ -30,8 +30,8 @@ def leave_out(
     unreadable = {row: text for source in sources.values() for row, text in table.unreadable(source).items()}
     bad = dict(table.ragged) | (unreadable if policy == "drop" else {})
     for name in needed_columns(columns, channels):
-        for row in np.flatnonzero(~(np.abs(columns[name]) < LARGEST)):
-            bad.setdefault(int(row), unreadable.get(int(row), f"column {name!r} holds {columns[name][row]}"))
+        for row in np.flatnonzero(~(np.abs(columns[name]) < LARGEST)).tolist():
+            bad.setdefault(row, unreadable.get(row, f"column {name!r} holds {columns[name][row]}"))
     for row in _not_after(columns["time"], bad):
         bad[row] = f"time {columns['time'][row]:.9g} s is not after that of the row before"
     missing = len(set(unreadable) - set(bad))

@@ -20,22 +20,26 @@ def means(time: Array, x: Array, edges: Array, step: float, beyond: tuple[float,
     Returns:
         [K, n].
     """
+    return np.diff(integrals(time, x, edges, beyond, linear), axis=0) / step
+
+
+def integrals(time: Array, x: Array, edges: Array, beyond: tuple[float, float], linear: bool = False) -> Array:
+    """Integrals of x [K + 1, n] from the same beginning to each edge; arguments as of `means`."""
     if not x.shape[1]:
-        return np.zeros((len(edges) - 1, 0))
+        return np.zeros((len(edges), 0))
     before = min(edges[0], time[0]) - beyond[0]
     after = max(edges[-1], time[-1]) + beyond[1]
-    areas = _linear(time, x, edges, before) if linear else _held(time, x, edges, before, after)
-    return np.stack([np.diff(a) / step for a in areas], 1)
+    return _linear(time, x, edges, before) if linear else _held(time, x, edges, before, after)
 
 
-def _held(time: Array, x: Array, edges: Array, before: float, after: float) -> list[Array]:
+def _held(time: Array, x: Array, edges: Array, before: float, after: float) -> Array:
     """Integrals of each column from `before` to the edges."""
     times = np.concatenate([[before], time[1:], [after]])
     area = np.concatenate([np.zeros((1, x.shape[1])), np.cumsum(x * np.diff(times)[:, None], axis=0)])
-    return [np.interp(edges, times, a) for a in area.T]
+    return np.stack([np.interp(edges, times, a) for a in area.T], 1)
 
 
-def _linear(time: Array, x: Array, edges: Array, before: float) -> list[Array]:
+def _linear(time: Array, x: Array, edges: Array, before: float) -> Array:
     """The same of the trapezoids between rows: within a row the integral is a parabola."""
     times, values = np.append(before, time), np.concatenate([x[:1], x])
     steps = np.diff(times)
@@ -44,4 +48,4 @@ def _linear(time: Array, x: Array, edges: Array, before: float) -> list[Array]:
     slope = rise * np.concatenate([np.diff(values, axis=0), np.zeros((1, x.shape[1]))])
     at = np.clip(np.searchsorted(times, edges, side="right") - 1, 0, len(times) - 1)
     since = (edges - times[at])[:, None]
-    return list((area[at] + values[at] * since + 0.5 * slope[at] * since**2).T)
+    return np.asarray(area[at] + values[at] * since + 0.5 * slope[at] * since**2)

@@ -48,14 +48,10 @@ def seconds(fields: Sequence[str], where: Callable[[int], str], lenient: bool = 
 
 def _instant(field: str, row: int, where: Callable[[int], str], lenient: bool) -> datetime | None:
     try:
-        return datetime.fromisoformat(field) if field and _DATE.match(field) else _nothing(field)
+        if _DATE.match(field):
+            return datetime.fromisoformat(field)
     except ValueError:
-        if lenient:
-            return None
-        raise UserError(f"{where(row)}: {field!r} is not a time; {ALLOWED}") from None
-
-
-def _nothing(field: str) -> None:
-    """No time, if the field is blank."""
-    if field:
-        raise ValueError(field)
+        pass
+    if field and not lenient:
+        raise UserError(f"{where(row)}: {field!r} is not a time; {ALLOWED}")
+    return None

@@ -63,7 +63,7 @@ class Table:
         if isinstance(values, np.ndarray) and values.dtype.kind not in "US":
             return {}
         nothing = ~np.isfinite(self.times(column))
-        rows = (int(row) for row in np.flatnonzero(nothing) if str(values[row]).strip().lower() not in ("", "nan"))
+        rows = (row for row in np.flatnonzero(nothing).tolist() if str(values[row]).strip().lower() not in ("", "nan"))
         return {row: f"column {column!r} holds {values[row]!r}" for row in rows}
 
     def numbers(self, column: str) -> Array:

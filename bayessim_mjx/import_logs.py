@@ -1,0 +1,160 @@
+"""`bayessim-mjx logs from-mcap FILE --out DIR`: recordings of other tools as logs that the diagnosis reads."""
+
+import argparse
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from bayessim_mjx import cli
+from bayessim_mjx.errors import UserError
+
+if TYPE_CHECKING:
+    from bayessim_mjx.logs.importers.ros import Choice
+    from bayessim_mjx.logs.importers.streams import Recording
+
+FORMATS = {
+    "from-mcap": "MCAP files with ROS 2 messages",
+    "from-rosbag": "ROS 1 bags (files) and ROS 2 bags (folders)",
+    "from-lerobot": "data sets of LeRobot (folders)",
+    "from-hdf5": "HDF5 files",
+}
+
+
+def _parser() -> cli.PlainParser:
+    text = "Convert recordings to a folder of CSV files and a map of their columns (docs/logs.md)."
+    prog = cli.prog_of("logs").replace("bayessim_mjx.logs", "bayessim_mjx.import_logs")
+    parser = cli.PlainParser(prog=prog, description=text, usage="%(prog)s FORMAT PATH [PATH ...] --out DIR")
+    formats = parser.add_subparsers(dest="format", metavar="FORMAT", required=True, prog=prog)
+    of = {name: formats.add_parser(name, help=what, description=f"Convert {what}.") for name, what in FORMATS.items()}
+    for name, each in of.items():
+        each.usage = f"{each.prog} PATH [PATH ...] --out DIR [options]"
+        each.add_argument("paths", metavar="PATH", nargs="+", help=FORMATS[name])
+        each.add_argument("--out", metavar="DIR", required=True, help="folder for the logs, new")
+        each.add_argument("--model", metavar="FILE", help="MJCF model; its names go into the map")
+        each.add_argument(
+            "--rename", metavar="A=B", nargs="+", default=[], help="names in the recording, and those in the model"
+        )
+    for name in ("from-mcap", "from-rosbag"):
+        _ros(of[name])
+    of["from-lerobot"].add_argument(
+        "--episodes", metavar="N", type=int, nargs="+", help="numbers of the episodes (default: all)"
+    )
+    _hdf5(of["from-hdf5"])
+    for name in ("from-lerobot", "from-hdf5"):
+        _units(of[name])
+    return parser
+
+
+def _ros(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--states", metavar="TOPIC", help="the joint states (default: the topic of that type)")
+    text = "commands, for arrays with the joints in their order (default: all topics of commands)"
+    parser.add_argument("--commands", metavar="TOPIC[=A,B]", nargs="+", default=[], help=text)
+    text = "what is commanded, where messages have several: position, velocity or effort"
+    parser.add_argument("--field", choices=("position", "velocity", "effort"), help=text)
+    text = "times of headers, or when messages were received (default: header)"
+    parser.add_argument("--stamps", choices=("header", "received"), default="header", help=text)
+
+
+def _units(parser: argparse.ArgumentParser) -> None:
+    text = "unit of positions and velocities in rad or m, as 0.017453293 of degrees (default: 1)"
+    parser.add_argument("--scale", metavar="X", type=float, default=1.0, help=text)
+    text = "unit of commands in that of the actuators (default: that of --scale)"
+    parser.add_argument("--command_scale", metavar="X", type=float, help=text)
+
+
+def _hdf5(parser: argparse.ArgumentParser) -> None:
+    for what in ("positions", "commands", "velocities", "efforts", "time"):
+        parser.add_argument(f"--{what}", metavar="PATH", help="array in the file; a * stands for the group of a run")
+    parser.add_argument("--rate", metavar="HZ", type=float, help="rows per second, without an array of times")
+    parser.add_argument("--joints", metavar="NAME", nargs="+", help="columns of positions, velocities and efforts")
+    parser.add_argument(
+        "--commands_of", metavar="NAME", nargs="+", help="columns of the commands (default: the joints)"
+    )
+
+
+def _pairs(given: Sequence[str]) -> dict[str, str]:
+    for text in given:
+        if "=" not in text:
+            raise UserError(f"--rename {text}; allowed: NAME_IN_THE_RECORDING=NAME_IN_THE_MODEL")
+    return dict(text.split("=", 1) for text in given)
+
+
+def _choice(args: argparse.Namespace) -> "Choice":
+    from bayessim_mjx.logs.importers.ros import Choice
+
+    topics = (text.partition("=") for text in args.commands)
+    commands = {topic: [n for n in names.split(",") if n] for topic, _, names in topics}
+    return Choice(args.states, commands or None, args.field, args.stamps)
+
+
+def _recordings(args: argparse.Namespace) -> Iterator["Recording"]:
+    for path in map(Path, args.paths):
+        if not path.exists():
+            raise UserError(f"{path}: no such file or folder")
+        if args.format == "from-lerobot":
+            from bayessim_mjx.logs.importers import lerobot
+
+            yield from lerobot.recordings(path, args.episodes)
+        elif args.format == "from-hdf5":
+            from bayessim_mjx.logs.importers import hdf5
+
+            yield from hdf5.recordings(path, _arrays(args))
+        else:
+            from bayessim_mjx.logs.importers import ros, ros_files
+
+            read = ros_files.of_mcap if args.format == "from-mcap" else ros_files.of_rosbag
+            yield ros.recording(path.stem, read(path), _choice(args))
+
+
+def _arrays(args: argparse.Namespace) -> Any:
+    from bayessim_mjx.logs.importers.hdf5 import USUAL, WHAT, Paths
+
+    given = {what: getattr(args, what) for what in WHAT if getattr(args, what)}
+    usual = USUAL if not {"positions", "commands"} & set(given) else {}
+    missing = [what for what in ("positions", "commands") if what not in given and what not in usual]
+    if missing:
+        raise UserError(f"--{missing[0]} is missing; allowed: the path of an array in the file")
+    return Paths({**usual, **given}, args.rate, args.joints, args.commands_of)
+
+
+def _logs(argv: Sequence[str] | None) -> int:
+    """Recordings of other tools as a folder of logs; exit code 0, or 2 (bad input)."""
+    args = _parser().parse_args(argv)
+    scale, of_commands = _scales(args)
+    from bayessim_mjx.logs.importers.folder import Target
+
+    target = Target(Path(args.out), _model(args.model), _pairs(args.rename), scale, of_commands)
+    written = target.write(_recordings(args))
+    for note in target.notes:
+        print(note)
+    print(f"{len(written)} log(s) and map.yaml in {target.folder}")
+    model = args.model or "robot.xml"
+    print(f"next: bayessim-mjx diagnose --model {model} --data {target.folder}")
+    return 0
+
+
+def _scales(args: argparse.Namespace) -> tuple[float, float]:
+    scale = getattr(args, "scale", 1.0)
+    of_commands = getattr(args, "command_scale", None)
+    of_commands = scale if of_commands is None else of_commands
+    for flag, value in (("--scale", scale), ("--command_scale", of_commands)):
+        if not 1e-12 < abs(value) < 1e12:
+            raise UserError(f"{flag} {value:g}; allowed: a number other than 0")
+    if getattr(args, "rate", None) is not None and not 0 < args.rate < 1e12:
+        raise UserError(f"--rate {args.rate:g}; allowed: rows per second, above 0")
+    return scale, of_commands
+
+
+def _model(path: str | None) -> Any:
+    if path is None:
+        return None
+    from bayessim_mjx.diagnosis.fitting import robot
+
+    return robot.of_file(path).mj_model
+
+
+main = cli.command(_logs)
+
+if __name__ == "__main__":
+    sys.exit(main())
