@@ -21,7 +21,7 @@ from bayessim_mjx.errors import UserError
 DESCRIPTION = (
     "Measure how much return a diagnosed gap costs, and how much retraining on the corrected simulator recovers."
 )
-WITHOUT = ("--max_iterations", "--video", "--video_length", "--video_interval", "--logdir", "--name")
+WITHOUT = ("--max_iterations", "--video", "--video_length", "--video_interval", "--logger", "--logdir", "--name")
 
 
 def _parser() -> cli.Parser:

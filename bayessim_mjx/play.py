@@ -29,7 +29,8 @@ KINDS = {
 
 
 def _parser() -> cli.Parser:
-    parser = cli.Parser("play", DESCRIPTION, without=("--max_iterations", "--video_interval", "--name", "--resume"))
+    without = ("--max_iterations", "--video_interval", "--logger", "--name", "--resume")
+    parser = cli.Parser("play", DESCRIPTION, without=without)
     parser.add_argument(
         "--episodes",
         metavar="N",

@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from bayessim_mjx import trust
+from bayessim_mjx.cli import ancestors
+from bayessim_mjx.config.settings import WRITERS
 from bayessim_mjx.errors import UserError, unknown
 
 SCRIPT = "bayessim-mjx"  # the console script, and the name of the package as it is installed
@@ -28,14 +30,24 @@ def whole(low: int, high: int) -> Callable[[str], int]:
 
 integer = whole(-(10**25), 10**25)  # where the settings know the limits
 
+
+def _writers(text: str) -> tuple[str, ...]:
+    """The writers beside TensorBoard that --logger names."""
+    if text not in (allowed := ("tensorboard", *WRITERS)):
+        raise argparse.ArgumentTypeError(f"{text[:60]!r}: allowed are {', '.join(allowed)}")
+    return () if text == "tensorboard" else (text,)
+
+
 # flag -> (dotted key, type, help); None as type: a switch
 FLAGS: dict[str, tuple[str, Any, str]] = {
     "--num_envs": ("env.numEnvs", integer, "number of simulated worlds in parallel"),
+    "--episode_length": ("env.episodeLength", integer, "control steps of an episode; 0: the task's own"),
     "--seed": ("seed", integer, "random seed; -1 draws one"),
     "--max_iterations": ("ppo.max_iterations", integer, "PPO iterations; in main the number per round"),
     "--video": ("monitor.video", None, "record videos"),
     "--video_length": ("monitor.video_length", integer, "length of a video in control steps"),
     "--video_interval": ("monitor.video_interval", integer, "control steps of each world from one video to the next"),
+    "--logger": ("monitor.writers", _writers, "where figures go beside TensorBoard: wandb, jsonl or csv"),
     "--logdir": ("logdir", str, "folder of all runs (default: logs)"),
     "--name": ("name", str, "word added to the name of the run folder"),
     "--device": ("device", str, "auto, cpu, gpu, gpu:1 or cuda:0 (default: auto)"),
@@ -48,6 +60,7 @@ CHECKPOINTS = {
 }
 METAVARS = {str: "TEXT", integer: "N"} | {
     "--devices": "N|all",
+    "--logger": "WRITER",
     "--logdir": "DIR",
     "--name": "NAME",
     "--device": "NAME",
@@ -127,6 +140,9 @@ class Parser(PlainParser):
             shown = METAVARS.get(flag, METAVARS.get(kind))
             options: dict[str, Any] = {"action": "store_true"} if kind is None else {"type": kind, "metavar": shown}
             self.add_argument(flag, default=None, help=text, **options)
+        for flag, ours in ancestors.SAME.items():
+            if ours not in without:
+                self.add_argument(flag, help=argparse.SUPPRESS)
         self.trusting()
         self.add_argument("--cfg_env", metavar="FILE", help="YAML file with settings, read after cfg/<task>.yaml")
         self.add_argument("--cfg_train", metavar="FILE", help="YAML file with PPO settings")
@@ -145,21 +161,33 @@ class Parser(PlainParser):
         argv = list(sys.argv[1:] if argv is None else argv)
         args, rest = self.parse_known_args(argv)
         for text in rest:
-            if text.split("=")[0] in self.without:
-                raise UserError(f"{text.split('=')[0]}: {self.command} has no use for it")
-            if text.startswith("-"):
-                raise unknown("flag", text.split("=")[0], sorted(self._option_string_actions))
-            if "=" not in text:
-                raise UserError(f"{text!r} is neither a flag nor an override section.key=value")
+            self._refuse(text)
+        for ours in dict.fromkeys(ancestors.SAME.values()):
+            if ours not in self.without:
+                names = [ours, *(flag for flag, same in ancestors.SAME.items() if same == ours)]
+                setattr(args, ours[2:], ancestors.one_value({name: getattr(args, name[2:]) for name in names}))
         args.overrides = rest
         args.idle = [key for key in (text.split("=")[0] for text in rest) if self._has_no_use_for(key)]
         args.command = self.command
-        args.given = [a.split("=")[0] for a in argv if a.startswith("--")]
+        given = [a.split("=")[0] for a in argv if a.startswith("--")]
+        args.given = [ancestors.SAME.get(flag, flag) for flag in given]
         if args.use_last_checkpoint:
             if args.checkpoint not in (None, "latest"):
                 raise UserError(f"--use_last_checkpoint and --checkpoint {args.checkpoint}: give one of them")
             args.checkpoint = "latest"
         return args
+
+    def _refuse(self, text: str) -> None:
+        """UserError for what is neither one of this command's flags nor an override."""
+        flag = text.split("=")[0]
+        if ancestors.SAME.get(flag, flag) in self.without:
+            raise UserError(f"{flag}: {self.command} has no use for it")
+        if flag.startswith("--") and (said := ancestors.word(flag)):
+            raise UserError(f"{flag}: {said}")
+        if text.startswith("-"):
+            raise unknown("flag", flag, sorted(self._option_string_actions))
+        if "=" not in text:
+            raise UserError(f"{text!r} is neither a flag nor an override section.key=value")
 
     def _has_no_use_for(self, key: str) -> bool:
         return key.split(".")[0] in self.unused and key not in self.but

@@ -20,7 +20,7 @@ def config_of(args: argparse.Namespace, more: Mapping[str, tuple[str, Any]] | No
     flags = dict(more or {})
     for flag, (key, _, _) in FLAGS.items():
         value = getattr(args, flag[2:], None)  # not every command has every flag
-        if value is not None:
+        if value is not None and not (flag == "--episode_length" and value == 0):
             flags[flag] = (key, _drawn() if flag == "--seed" and value == -1 else value)
     task = args.task and task_name(args.task)
     with warnings.catch_warnings(record=True) as caught:
