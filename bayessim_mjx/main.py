@@ -13,6 +13,7 @@ from importlib import import_module
 from typing import Any
 
 from bayessim_mjx import cli
+from bayessim_mjx.cli import completion
 from bayessim_mjx.config import Config, to_yaml
 from bayessim_mjx.device import setup_jax
 from bayessim_mjx.errors import UserError, unknown
@@ -29,7 +30,12 @@ COMMANDS = {  # all of them, and what each is for
     "diagnose": "what a simulator is missing, from recorded motion",
     "gap_loop": "what a diagnosis is worth in return",
     "logs": "recordings of other tools (MCAP, ROS bags, LeRobot, HDF5) as logs for a diagnosis",
+    "completion": "a script by which bash, zsh or fish completes commands and flags",
 }
+COMPLETION = (
+    'Print a script of completions. bash: eval "$(bayessim-mjx completion bash)" in ~/.bashrc; '
+    "fish: bayessim-mjx completion fish | source; zsh: write it to _bayessim-mjx in a folder of $fpath."
+)
 MODULES = {"logs": "import_logs"}  # of commands that are called otherwise
 
 
@@ -197,13 +203,28 @@ def main(argv: Sequence[str] | None = None) -> int:
     return cli.command(_named)(argv)
 
 
+def _module(command: str) -> Any:
+    return import_module(f"bayessim_mjx.{MODULES.get(command, command)}")
+
+
 def _named(argv: Sequence[str] | None) -> int:
     """The command that the first word names, with a hyphen or an underscore."""
     name, *rest = argv or ()
-    module = name.replace("-", "_")
-    if module not in COMMANDS:
+    command = name.replace("-", "_")
+    if command not in COMMANDS:
         raise unknown("command", name, [c.replace("_", "-") for c in COMMANDS])
-    return _adapt(rest) if module == "main" else import_module(f"bayessim_mjx.{MODULES.get(module, module)}").main(rest)
+    own = {"main": _adapt, "completion": _completion}
+    return own[command](rest) if command in own else _module(command).main(rest)
+
+
+def _completion(argv: Sequence[str] | None) -> int:
+    """Print the script for a shell; exit code 0, or 2 (another shell, or shtab is not installed)."""
+    parser = cli.PlainParser(prog=f"{cli.SCRIPT} completion", description=COMPLETION, usage="%(prog)s SHELL")
+    parser.add_argument("shell", choices=completion.SHELLS, help="whose script")
+    shell, parsers = parser.parse_args(argv).shell, {"main": _parser(), "completion": parser}
+    of = {name: parsers.get(name) or _module(name)._parser() for name in COMMANDS}
+    print(completion.script(shell, {name.replace("_", "-"): (COMMANDS[name], of[name]) for name in of}))
+    return 0
 
 
 if __name__ == "__main__":
