@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from bayessim_mjx import main, registry
+from bayessim_mjx.cli import ancestors
 from bayessim_mjx.config import settings
 
 ROOT = Path(__file__).parents[1]
@@ -127,6 +128,7 @@ def test_settings_and_flags_in_prose_exist(page):
     named = set(re.findall(r"\b(?<!/)((?:bayessim|ppo|monitor|env|real)\.(?!py\b|json\b)[a-zA-Z_]+)\b", text)) - PYTHON
     assert {name for name in named if name not in known} == set()
     somewhere = set().union(*(flags_of(c) for c in COMMANDS), *(flags_of(c) for c, _ in commands(text)))
+    somewhere |= {*ancestors.SAME, *ancestors.INSTEAD, "--real-time"}
     assert set(re.findall(r"`(--[a-z][a-z_-]*)", text)) <= somewhere | scripts_flags(page)
 
 
