@@ -1,7 +1,8 @@
-"""Environments of Brax and of MuJoCo Playground behind our protocol, for our trainer: `brax:ant`, `playground:<name>`.
+"""Brax: its environments for our trainer (`brax:ant`, `playground:<name>`), and its trainers on our tasks.
 
-They have no parameters of ours: their space is empty and theta is ignored. (The other way needs no wrapper: our tasks
-follow Brax's protocol as they are.)
+Its environments have no parameters of ours: their space is empty and theta is ignored. Our tasks follow its protocol as
+they are. `train(task, domain)` is its PPO on one of them under a distribution over the physics; its other trainers take
+`ours(task, domain)` as environment and `wrap` as `wrap_env_fn`.
 """
 
 import dataclasses
@@ -16,6 +17,7 @@ import mujoco
 from bayessim_mjx.env import Env, Observations, State
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.parameters import ParameterSpace
+from bayessim_mjx.wrappers.under import Under
 
 if TYPE_CHECKING:
     from bayessim_mjx.config import Config
@@ -119,3 +121,24 @@ def _known(name: str, names: list[str], library: str) -> None:
         close = difflib.get_close_matches(name, names)
         hint = f"did you mean {close[0]}? " if close else ""
         raise UserError(f"task {library}:{name}: {hint}there are: {', '.join(sorted(names))}")
+
+
+def ours(task: Any, domain: Any = None, **env_settings: Any) -> Under:
+    """A task, or a run's task under its posterior (arguments as for `wrappers.worlds.worlds`), for Brax's trainers."""
+    from bayessim_mjx.wrappers.worlds import environment  # here: it imports the registry, which imports this
+
+    return Under(*environment(task, domain, env_settings))
+
+
+def train(task: Any, domain: Any = None, **settings: Any) -> tuple[Any, Any, dict]:
+    """Brax's PPO on `ours(task, domain)`: (function that makes a policy of parameters, parameters, metrics).
+
+    Every episode begins anew, with its own physics. `settings` are those of `brax.training.agents.ppo.train.train`;
+    `episode_length` is the task's own unless given.
+    """
+    from brax.training.agents.ppo import train as ppo
+
+    from bayessim_mjx.wrappers.fresh import wrap
+
+    env = task if isinstance(task, Env) and domain is None else ours(task, domain)
+    return ppo.train(environment=env, wrap_env_fn=wrap, **({"episode_length": env.episode_length} | settings))

@@ -1,5 +1,8 @@
 """Brax's trainer on our tasks and our trainer on Brax's and Playground's environments."""
 
+import sys
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,9 +10,14 @@ import pytest
 
 from bayessim_mjx import rl
 from bayessim_mjx.config import PPOConfig
+from bayessim_mjx.errors import UserError
 from bayessim_mjx.registry import make
 from bayessim_mjx.rollout import rollout
-from bayessim_mjx.wrappers.brax import BraxEnv
+from bayessim_mjx.wrappers.brax import BraxEnv, ours, train
+from bayessim_mjx.wrappers.fresh import wrap
+
+sys.path.insert(0, str(Path(__file__).parent))
+from toys import Counter  # noqa: E402
 
 CONFIG = PPOConfig(num_envs=8, num_steps=4, num_epochs=1, num_minibatches=2, hidden_actor=(8,), hidden_critic=(8,))
 
@@ -98,6 +106,44 @@ def test_what_braxs_trainers_ask_of_jax_is_there():
         np.testing.assert_array_equal(y, np.stack([np.asarray(x)] * len(devices)))
     doubled = jax.pmap(lambda t: 2 * t["w"], axis_name="i")(there)
     np.testing.assert_array_equal(doubled, [[0, 2, 4]] * len(devices))
+
+
+def test_braxs_trainers_get_fresh_episodes_each_with_its_own_physics():
+    """Counter shows [steps, start, theta]; it ends for good after theta steps, by time after 5."""
+    worlds = 16
+    env = wrap(ours(Counter(), "prior"), action_repeat=1)
+
+    def step(state, _):
+        before = state.obs["policy"]
+        state = env.step(state, jnp.zeros((worlds, 1)))
+        return state, (before.at[:, 0].add(1), state.obs["policy"], state.done, state.info["truncation"])
+
+    first = jax.jit(env.reset)(jax.random.split(jax.random.PRNGKey(0), worlds))
+    _, (last, seen, done, cut) = jax.jit(lambda state: jax.lax.scan(step, state, length=20))(first)
+    last, seen, done, cut = map(np.asarray, (last, seen, done, cut))
+    np.testing.assert_array_equal(done > 0, (last[..., 0] >= last[..., 2]) | (last[..., 0] == 5))
+    np.testing.assert_array_equal(cut > 0, (last[..., 0] < last[..., 2]) & (last[..., 0] == 5))
+    np.testing.assert_array_equal(seen[..., 0], np.where(done > 0, 0, last[..., 0]))
+    starts = np.concatenate([np.asarray(first.obs["policy"])[:, 1], seen[done > 0][:, 1]])
+    lives = np.concatenate([np.asarray(first.obs["policy"])[:, 2], seen[done > 0][:, 2]])
+    assert done.sum() > 3 * worlds and len(set(starts)) == len(set(lives)) == len(starts)
+    assert 1 <= lives.min() < 2 and 8 < lives.max() <= 9  # the prior's range
+
+
+def test_braxs_own_randomisation_is_refused():
+    with pytest.raises(UserError, match="randomization_fn: physics comes from a domain"):
+        wrap(Counter(), 5, 1, lambda sys: sys)
+
+
+@pytest.mark.slow
+def test_braxs_trainer_learns_under_a_domain():
+    found = {}
+    train(
+        "Cartpole", "prior", num_timesteps=400_000, num_evals=2, num_envs=64, batch_size=16, num_minibatches=4,
+        unroll_length=16, num_updates_per_batch=4, learning_rate=1e-3, normalize_observations=True, discounting=0.99,
+        entropy_cost=1e-3, progress_fn=lambda step, metrics: found.update({step: metrics["eval/episode_reward"]}),
+    )  # fmt: skip
+    assert found[max(found)] > 200  # of 500; a pole that nobody holds falls within 30
 
 
 @pytest.mark.slow

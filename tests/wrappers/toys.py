@@ -26,7 +26,8 @@ class Counter(Env):
         steps = state.info["steps"] + 1
         terminated = (obs[0] >= obs[2]).astype(jnp.float32)
         truncated = (steps >= self.episode_length).astype(jnp.float32)
-        return self._state(obs, 1 + action[0], terminated, truncated, steps)
+        after = self._state(obs, 1 + action[0], terminated, truncated, steps)
+        return after.replace(info={**state.info, **after.info})
 
     def _state(self, obs, reward, terminated, truncated, steps):
         groups = {"policy": obs, "critic": jnp.concatenate([obs, obs])}
