@@ -136,14 +136,14 @@ def test_braxs_own_randomisation_is_refused():
 
 
 @pytest.mark.slow
-def test_braxs_trainer_learns_under_a_domain():
+def test_braxs_trainer_learns():
     found = {}
     train(
-        "Cartpole", "prior", num_timesteps=400_000, num_evals=2, num_envs=64, batch_size=16, num_minibatches=4,
+        "Cartpole", num_timesteps=400_000, num_evals=2, num_envs=64, batch_size=16, num_minibatches=4,
         unroll_length=16, num_updates_per_batch=4, learning_rate=1e-3, normalize_observations=True, discounting=0.99,
         entropy_cost=1e-3, progress_fn=lambda step, metrics: found.update({step: metrics["eval/episode_reward"]}),
     )  # fmt: skip
-    assert found[max(found)] > 200  # of 500; a pole that nobody holds falls within 30
+    assert found[max(found)] > 300  # of 500; random actions get 3
 
 
 @pytest.mark.slow

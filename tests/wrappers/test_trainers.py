@@ -23,7 +23,9 @@ NEEDED = {
     "playground": "mujoco_playground",
 }  # fmt: skip
 
-BALANCED = 300  # mean return on Cartpole, of 500; policies that have not learnt get 20 to 100
+# mean return on Cartpole at its nominal parameters, of 500; random actions get 3, none at all 35
+# (its ranges have springs that hold the pole: there doing nothing gets 210)
+BALANCED = 300
 
 
 def wrapper(name):
@@ -199,7 +201,7 @@ def test_sb3_learns():
     from stable_baselines3 import PPO
     from stable_baselines3.common.evaluation import evaluate_policy
 
-    env = ours.make("Cartpole", 64, domain="prior")
+    env = ours.make("Cartpole", 64)
     model = PPO("MlpPolicy", env, n_steps=64, batch_size=1024, n_epochs=5, learning_rate=1e-3, device="cpu", seed=0)
     assert evaluate_policy(model.learn(300_000), env, 64)[0] > BALANCED
 
@@ -210,7 +212,7 @@ def test_rsl_rl_learns(more, tmp_path):
     ours = wrapper("rsl_rl")
     from rsl_rl.runners import OnPolicyRunner
 
-    env = ours.make("Cartpole", 64, domain="prior")
+    env = ours.make("Cartpole", 64)
     runner = OnPolicyRunner(env, ours.settings(**more), log_dir=str(tmp_path), device="cpu")
     runner.learn(150, init_at_random_ep_len=True)
     assert np.mean(runner.logger.rewbuffer) > BALANCED
@@ -223,7 +225,7 @@ def test_skrl_learns(library, tmp_path):
     from importlib import import_module
 
     runner = import_module(f"skrl.utils.runner.{library}").Runner
-    env = ours.make("Cartpole", 64, domain="prior", library=library)
+    env = ours.make("Cartpole", 64, library=library)
     trained = runner(env, ours.settings(5000, str(tmp_path)))
     trained.run("train")
     assert max(trained.agent._track_rewards) > BALANCED
@@ -234,7 +236,7 @@ def test_rl_games_learns(tmp_path):
     ours = wrapper("rl_games")
     from rl_games.torch_runner import Runner
 
-    ours.register("Cartpole", domain="prior")
+    ours.register("Cartpole")
     runner = Runner()
     runner.load(ours.settings("Cartpole", 64, 150, str(tmp_path)))
     agent = runner.algo_factory.create("a2c_continuous", base_name="run", params=runner.params)
@@ -252,7 +254,7 @@ def test_playgrounds_training_learns():
     sizes = {"policy_hidden_layer_sizes": (64, 64), "value_hidden_layer_sizes": (64, 64)}
     keys = {"policy_obs_key": "state", "value_obs_key": "privileged_state"}
     train.train(
-        environment=ours.make("Cartpole", domain="prior"),
+        environment=ours.make("Cartpole"),
         wrap_env_fn=functools.partial(theirs.wrap_for_brax_training, full_reset=True),
         num_timesteps=400_000, num_evals=2, episode_length=500, num_envs=64, batch_size=16, num_minibatches=4,
         unroll_length=16, num_updates_per_batch=4, learning_rate=1e-3, normalize_observations=True, discounting=0.99,
