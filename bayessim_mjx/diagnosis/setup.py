@@ -11,7 +11,7 @@ import numpy as np
 
 from bayessim_mjx import effects as library
 from bayessim_mjx.diagnosis import tolerance
-from bayessim_mjx.diagnosis.fitting import candidates, discretisation, scales, windows
+from bayessim_mjx.diagnosis.fitting import candidates, command_shift, discretisation, scales, windows
 from bayessim_mjx.diagnosis.fitting.centred_commands import physics_of
 from bayessim_mjx.diagnosis.fitting.fitter import Fitter
 from bayessim_mjx.diagnosis.fitting.robot import Robot
@@ -33,7 +33,9 @@ class Cutting:
     shorter: tuple[float, ...] = (1.0, 0.5, 0.25)
     lottery: float = 5.0
     shortest_window: int = 8  # control steps
-    shortest: float = 0.004  # s, control period of the diagnosis; faster logs are resampled
+    longest_window: int = 100  # control steps, or as many as `long` s hold
+    long: float = 0.4  # s
+    shortest: float = 0.0005  # s, control period of the diagnosis; faster logs are resampled
     limits: tuple[tuple[int, int], ...] = ((1, 160), (3, 96), (7, 64), (100, 48))  # (up to so many dofs, windows)
     # sub-steps of one simulation of all windows; half of it for robots of more than `many` dofs
     budget: int = 24000
@@ -43,6 +45,7 @@ class Cutting:
 
 
 CUTTING = Cutting()
+SHIFT_FACTOR = 4  # the finest sub-steps by which a shift of commands is looked for
 
 
 class TooLittleData(Exception):
@@ -112,13 +115,19 @@ def prepare(
     stack, left_out = candidates.stack(kinds, size)
     own = robot.physics(dt)
     cuts, step = _measured(own, usable, group, seen.use_qvel)
+    shift = _shift(cuts, step, size)
+    lead = min(shift.late, 0.0) if shift is not None and shift.certain else 0.0
+    seen, delivered = seen.shifted(lead) if lead else seen, float(robot.mj_model.opt.timestep)
     robot = step.robot(robot)
     physics = physics_of(robot, dt, stack)
-    cut = step.noisier(cuts(step.factor, _limit(physics, cuts(1).steps), centred=False))
+    cut = step.noisier(cuts(step.factor, _limit(physics, cuts(1).steps), centred=False, late=lead))
     fitter = Fitter(Simulator(physics, cut), candidates.base_coordinates(robot.space), physics.space.nominal)
     every = tuple(candidates.enumerate_candidates(physics))
     settings = dataclasses.replace(settings or _settings(robot), believed=step.believed)
     allowed = tolerance.judge(robot.mj_model, 2 * size.travel, cut.sigma_q, asked)
+    told += _faster(seen.usable, delivered, dt)
+    if shift is not None and shift.certain:
+        told.append(shift.sentence(float(np.median([log.period for log in logs]))))
     told += [*floors.warnings, *step.warnings(), *(f"not tried: {text}" for text in left_out), *_few_conditions(cut)]
     told += allowed.warnings()
     return Setup(robot, physics, seen, floors, fitter, every, size, settings, seed, allowed, tuple(told), step)
@@ -144,21 +153,34 @@ def _measured(
     return cuts, step
 
 
+def _shift(
+    cuts: Callable[..., windows.Windows], step: discretisation.Discretisation, size: scales.Scales
+) -> command_shift.Shift | None:
+    """By how much commands act later or earlier than the logs say."""
+    if step.errors is None or not step.errors.physics.mj_model.nu:
+        return None
+    factor = min(step.factor, SHIFT_FACTOR)
+    return command_shift.estimate(
+        step.errors, lambda late: cuts(factor, late=round(late, 9)), step.floor, size.force, factor
+    )
+
+
 def _windows(
     physics: Physics, logs: Sequence[Log], group: str | None, use_qvel: bool, seconds: float = CUTTING.window
 ) -> Callable[..., windows.Windows]:
     """(factor, limit) -> the windows with that many times the sub-steps of `physics`, by default the same ones."""
     dt = physics.dt
     longest = max(int(log.duration / dt) for log in logs)
-    length = int(np.clip(round(seconds / dt), CUTTING.shortest_window, 100))
+    longest_window = max(CUTTING.longest_window, round(CUTTING.long / dt))
+    length = int(np.clip(round(seconds / dt), CUTTING.shortest_window, longest_window))
     if longest < length:
         raise TooLittleData(f"the longest log has {longest} control steps of {dt:.3g} s, one window needs {length}")
     own = _limit(physics, length)
 
     @functools.cache
-    def cuts(factor: int, limit: int = own, centred: bool = True) -> windows.Windows:
+    def cuts(factor: int, limit: int = own, centred: bool = True, late: float = 0.0) -> windows.Windows:
         return windows.cut(
-            logs,
+            [log.shifted(late) for log in logs] if late else logs,
             physics.mj_model,
             dt,
             physics.substeps * factor,
@@ -188,6 +210,17 @@ def _finest(physics: Physics, count: int, length: int) -> int:
     """How many times the sub-steps the budget allows when at most half of `count` windows are given up for it."""
     budget = CUTTING.budget if physics.mj_model.nv <= CUTTING.many else CUTTING.budget // 2
     return max(1, budget // (length * physics.substeps * max(CUTTING.fewest, (count + 1) // 2)))
+
+
+def _faster(logs: Sequence[Log], timestep: float, dt: float) -> list[str]:
+    """What logs faster than the simulator, or than the diagnosis goes, are told."""
+    period = float(np.median([log.period for log in logs]))
+    if period < dt * (1 - 1e-6) and dt <= 2 * CUTTING.shortest:
+        return [f"the logs have a row every {1e3 * period:.3g} ms; one every {1e3 * dt:.3g} ms is compared"]
+    if timestep > dt * (1 + 1e-6):
+        text = f"the logs have a row every {1e3 * period:.3g} ms, and the model steps {1e3 * timestep:.3g} ms"
+        return [f"{text}: it is simulated at {1e3 * dt:.3g} ms"]
+    return []
 
 
 def _few_conditions(cut: windows.Windows) -> list[str]:

@@ -13,7 +13,10 @@ from bayessim_mjx.config import read_yaml
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.mapping import LogMap
 
-METADATA = ("condition", "operating_condition", "controller", "payload", "repeat_of", "sigma", "quantum", "hold")
+METADATA = (
+    "condition", "operating_condition", "controller", "payload", "repeat_of", "sigma", "quantum", "hold",
+    "commands_late",
+)  # fmt: skip
 SUFFIXES = (".csv", ".npz", ".jsonl")
 FORMAT = (
     "CSV with the columns time, ctrl:<actuator>, qpos:<joint>[, qvel:<joint>], "

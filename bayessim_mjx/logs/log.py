@@ -16,6 +16,7 @@ from bayessim_mjx.errors import UserError
 
 Array = NDArray[np.float64]
 HOLDS = ("previous", "linear")  # how a command goes on from its row to the next
+TIMING = ("hold", "commands_late")  # metadata that say when commands act; what is resampled has done with them
 
 # width in qpos and in qvel of every joint type
 _WIDTHS = {
@@ -160,6 +161,15 @@ class Log:
     def linear(self) -> bool:
         """Whether commands run linearly from row to row (`hold: linear`), in place of being held until the next."""
         return self.metadata.get("hold") == "linear"
+
+    @property
+    def late(self) -> float:
+        """s by which commands act later than their rows say (`commands_late`); negative: earlier."""
+        return float(self.metadata.get("commands_late", 0.0))
+
+    def shifted(self, late: float) -> Log:
+        """The log with commands that act `late` s later than they did, without a change of its rows."""
+        return replace(self, metadata={**self.metadata, "commands_late": self.late + late})
 
     @property
     def condition(self) -> str | None:

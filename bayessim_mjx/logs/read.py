@@ -22,6 +22,8 @@ from bayessim_mjx.logs.pieces import MIN_ROWS, pieces
 from bayessim_mjx.logs.table import Table, read_csv, read_npz
 from bayessim_mjx.physics import controllers
 
+LATEST = 1.0  # s by which commands may act later or earlier than their rows say
+
 
 def read_logs(
     paths: Paths, mj_model: mujoco.MjModel, map: str | Path | Mapping[str, Any] | LogMap | None = None
@@ -75,6 +77,9 @@ def _read_one(path: Path, mj_model: mujoco.MjModel, channels: Channels, log_map:
     metadata = {**hold, **log_map.metadata, **side_yaml(path), "source": str(path)}
     if metadata.get("hold", HOLDS[0]) not in HOLDS:
         raise UserError(f"{path}: hold = {metadata['hold']!r} in its side YAML; allowed: {', '.join(HOLDS)}")
+    late = metadata.get("commands_late", 0.0)
+    if not isinstance(late, int | float) or isinstance(late, bool) or not abs(late) < LATEST:
+        raise UserError(f"{path}: commands_late = {late!r}; allowed: seconds between -{LATEST:g} and {LATEST:g}")
     law = controllers.read(
         metadata, mj_model, channels.actuators, str(path)
     )  # refused here, before anything is simulated

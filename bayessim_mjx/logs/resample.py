@@ -12,7 +12,7 @@ from scipy.interpolate import CubicSpline
 
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.commands import means
-from bayessim_mjx.logs.log import Array, Log
+from bayessim_mjx.logs.log import TIMING, Array, Log
 
 
 def is_even(log: Log, dt: float) -> bool:
@@ -27,8 +27,8 @@ def resample(log: Log, dt: float, kind: Literal["cubic", "linear"] = "cubic") ->
     Positions and velocities are interpolated. A logged command is held until the next row; the command of a step is
     the *mean* of that held signal over the step (its impulse is kept, no sample is skipped and no delay added).
     `enabled:` streams are 1 only where the drive was on throughout the step. A log that is already even is returned as
-    it is. Where commands run linearly (`Log.linear`), theirs is the mean of that, also on an even log, and the result
-    is held.
+    it is. Where commands run linearly (`Log.linear`) or act later than their rows (`Log.late`), theirs is the mean of
+    that, also on an even log, and the result is held and on time.
 
     Raises:
         UserError: dt or kind out of range, a log shorter than two steps, a rate so low that steps would be invented.
@@ -52,8 +52,8 @@ def resample(log: Log, dt: float, kind: Literal["cubic", "linear"] = "cubic") ->
     return replace(
         log,
         time=grid,
-        ctrl=_mean(log.time, log.ctrl, grid, dt, log.linear),
-        metadata=_without_hold(log),
+        ctrl=_mean(log.time + log.late, log.ctrl, grid, dt, log.linear),
+        metadata=_on_time(log),
         qpos=_normalised(log, _interpolate(log.time, log.qpos, inside, kind)),
         qvel=_interpolate(log.time, log.qvel, inside, kind),
         streams={k: _stream(log.time, k, s, grid, dt) for k, s in log.streams.items()},
@@ -72,14 +72,15 @@ def _mean(time: Array, x: Array, grid: Array, dt: float, linear: bool = False) -
 
 
 def _held(even: Log, dt: float) -> Log:
-    """An even log with the means of its linear commands in their place."""
-    if not even.linear:
+    """An even log with the means of its commands in their place, where these are linear or late."""
+    if not even.linear and not even.late:
         return even
-    return replace(even, ctrl=_mean(even.time, even.ctrl, even.time, dt, True), metadata=_without_hold(even))
+    ctrl = _mean(even.time + even.late, even.ctrl, even.time, dt, even.linear)
+    return replace(even, ctrl=ctrl, metadata=_on_time(even))
 
 
-def _without_hold(log: Log) -> dict[str, Any]:
-    return {key: value for key, value in log.metadata.items() if key != "hold"}
+def _on_time(log: Log) -> dict[str, Any]:
+    return {key: value for key, value in log.metadata.items() if key not in TIMING}
 
 
 def _stream(time: Array, name: str, x: Array, grid: Array, dt: float) -> Array:

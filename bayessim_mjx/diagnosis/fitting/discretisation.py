@@ -54,6 +54,7 @@ class Discretisation:
         sigma: noise of the logs; floor: what the diagnosis takes for noise.
         simulated: `[nv]`, channels that show no noise at all: logs of a simulation.
         channels: names `[nv]`.
+        errors: the windows simulated without effects, for what else is asked of them.
     """
 
     timestep: float
@@ -66,6 +67,7 @@ class Discretisation:
     floor: Array
     simulated: NDArray[np.bool_]
     channels: tuple[str, ...]
+    errors: Errors | None = None
 
     def robot(self, robot: Robot) -> Robot:
         """The robot at the sub-steps of the diagnosis."""
@@ -176,6 +178,7 @@ def measure(physics: Physics, cuts: Callable[[int], Windows], logs: Sequence[Log
         floor=np.sqrt(base**2 + _excess(at[factor], base)),
         simulated=clean,
         channels=Channels.of(physics.mj_model).qvel,
+        errors=errors,
     )
 
 

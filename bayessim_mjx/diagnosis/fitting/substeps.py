@@ -47,33 +47,61 @@ class Errors:
         self.physics, self.cut, self.most = physics, cut, most * physics.substeps
         self.theta = jnp.asarray(physics.space.nominal, jnp.float32)
         self.offsets = np.zeros((len(cut), 2 * physics.mj_model.nv))  # of the measured start states
-        self._run = jax.jit(jax.vmap(self._one, in_axes=(0, 0, None, None, None)), compiler_options=compiler_options())
+        self._no_force = np.zeros((len(cut), cut.steps, physics.mj_model.nv), np.float32)
+        axes = (0, 0, 0, None, None, None, None)
+        self._run = jax.jit(jax.vmap(self._one, in_axes=axes), compiler_options=compiler_options())
 
-    def run(self, cut: Windows, factor: int, corrected: bool = True, offsets: Array | None = None) -> Array:
-        """With the commands of `cut` at the sub-step h / factor; corrected: velocities lie half of it early."""
+    def run(
+        self,
+        cut: Windows,
+        factor: int,
+        corrected: bool = True,
+        offsets: Array | None = None,
+        theta: Array | None = None,
+        force: Array | None = None,
+    ) -> Array:
+        """With the commands of `cut` at the sub-step h / factor.
+
+        Args:
+            corrected: velocities lie half of the sub-step early.
+            offsets: `[W, 2 nv]`, further changes of the start states.
+            theta: `[P]`, parameters; None: nominal.
+            force: `[W, H, nv]`, generalised force that acts besides.
+        """
         count = cut.batch.command.shape[2]
         missing = [(0, 0), (0, 0), (0, self.most - count), (0, 0)]
         batch = self.cut.batch.replace(command=jnp.pad(cut.batch.command, missing))  # the past keeps its shape
         offsets = self.offsets if offsets is None else self.offsets + offsets
         h = np.float32(self.physics.mj_model.opt.timestep / factor)
-        error = self._run(batch, np.asarray(offsets, np.float32), count, h, np.float32(corrected))
+        acting = self._no_force if force is None else np.asarray(force, np.float32)
+        values = self.theta if theta is None else jnp.asarray(theta, jnp.float32)
+        error = self._run(batch, np.asarray(offsets, np.float32), acting, values, count, h, np.float32(corrected))
         return np.nan_to_num(np.asarray(error, np.float64), nan=1e3, posinf=1e3, neginf=-1e3)
 
-    def _one(self, own: Batch, offset: jax.Array, count: jax.Array, h: jax.Array, corrected: jax.Array) -> jax.Array:
+    def _one(self, own: Batch, *given: jax.Array) -> jax.Array:
         with jax.default_matmul_precision("highest"):
-            return self._errors(own, offset, count, h, corrected)
+            return self._errors(own, *given)
 
-    def _errors(self, own: Batch, offset: jax.Array, count: jax.Array, h: jax.Array, corrected: jax.Array) -> jax.Array:
+    def _errors(
+        self,
+        own: Batch,
+        offset: jax.Array,
+        force: jax.Array,
+        theta: jax.Array,
+        count: jax.Array,
+        h: jax.Array,
+        corrected: jax.Array,
+    ) -> jax.Array:
         physics, nv = self.physics, self.physics.mj_model.nv
-        world = begin(physics, self.theta, own.around)
+        world = begin(physics, theta, own.around)
         world = world.replace(qpos=integrate(physics.mj_model, world.qpos, offset[:nv]), qvel=world.qvel + offset[nv:])
         model = physics.model_of(world).tree_replace({"opt.timestep": h})
         early = 0.5 * corrected * h if staggered(physics.mj_model) else 0.0
 
         def step(data: Any, row: tuple) -> tuple[Any, tuple]:
-            command, enabled = row
+            command, enabled, extra = row
             seen = {"qpos": data.qpos, "qvel": data.qvel}
-            drive = Drive(None, enabled, own.law)
+            drive = Drive(extra, enabled, own.law)
 
             def sub(k: jax.Array, data: Any) -> Any:
                 return substep(physics, model, data.replace(ctrl=command[k]), ((), world.forces), (), seen, drive)[0]
@@ -81,7 +109,7 @@ class Errors:
             data = jax.lax.fori_loop(0, count, sub, data)
             return data, (data.qpos, data.qvel + early * data.qacc)
 
-        _, (qpos, qvel) = jax.lax.scan(step, physics.data_of(world), (own.command, own.enabled))
+        _, (qpos, qvel) = jax.lax.scan(step, physics.data_of(world), (own.command, own.enabled, force))
         error = jax.vmap(lambda a, b: difference(physics.mj_model, a, b))(own.qpos, qpos)
         return jnp.concatenate([error, own.qvel - qvel], axis=1)
 

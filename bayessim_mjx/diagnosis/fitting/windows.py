@@ -21,7 +21,6 @@ from bayessim_mjx.logs.resample import resample
 from bayessim_mjx.physics import controllers, staggered
 
 Array = NDArray[np.float64]
-MAX_AROUND = 24  # control steps
 
 
 class Batch(struct.PyTreeNode):
@@ -181,7 +180,7 @@ def _batch(
     law: controllers.Law | None,
 ) -> Batch:
     """The windows of `length` rows at `starts`, for the simulator."""
-    around = min(MAX_AROUND, max(2, int(np.ceil(AROUND / dt))))
+    around = max(2, int(np.ceil(AROUND / dt)))
     pick = np.asarray([r for r, _ in starts])
     return Batch(
         command=_stack([fine[r][_rows(even[r], a, length)] for r, a in starts]),
@@ -227,7 +226,7 @@ def _fine_commands(raw: Log, even: Log, dt: float, substeps: int, centred: bool)
     h = dt / substeps
     rows, nu = len(even), raw.ctrl.shape[1]
     edges = even.time[0] - centred * h / 2 + h * np.arange(rows * substeps + 1)
-    fine = means(raw.time, raw.ctrl, edges, h, (dt, dt), raw.linear)
+    fine = means(raw.time + raw.late, raw.ctrl, edges, h, (dt, dt), raw.linear)
     return fine.reshape(rows, substeps, nu).astype(np.float32)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
@@ -99,6 +99,11 @@ class Gate:
             reasons = "; ".join(f"{name}: {reason}" for name, reason in self.refused.items()) or "no logs were given"
             raise UserError(f"no usable log: {reasons}")
         return self.usable
+
+    def shifted(self, late: float) -> Gate:
+        """With logs whose commands act `late` s later than they did."""
+        reports = tuple(replace(r, log=r.log.shifted(late)) for r in self.reports)
+        return replace(self, reports=reports)
 
     def _not_compared(self) -> tuple[str, ...]:
         """One sentence per reason: many logs of many joints would bury everything else."""

@@ -1,0 +1,177 @@
+"""Do commands act when the log says? The time by which they act later or earlier, beside all that forces can explain.
+
+Windows are simulated at shifted commands, and linearised in the shift, the known parameters, the actuators' gains and
+forces of each joint (constant, with position, with speed, with its direction). What remains for the shift is its own:
+friction or a wrong damping do not become one. No drive acts before its command, so a lead is a fault of the log.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from bayessim_mjx.diagnosis.fitting.quadratic import Quadratic, eliminate
+from bayessim_mjx.diagnosis.fitting.substeps import Errors
+from bayessim_mjx.diagnosis.fitting.windows import Windows
+
+Array = NDArray[np.float64]
+Late = Callable[[float], Windows]  # s -> the windows with commands that act so much later
+
+
+@dataclass(frozen=True)
+class Rules:
+    """How a shift is estimated, and when it is told."""
+
+    rounds: int = 3  # Newton steps with the first one's derivatives
+    nudge: float = 0.1  # control steps, of the shift for its finite difference
+    shares: tuple[float, ...] = (1.0, 0.5, 0.2)  # of a step, until the error falls
+    small: float = 0.02  # of scales, of the other columns' finite differences
+    prior: float = 0.3  # standard deviation of parameters (of their range), gains and forces (of their scale)
+    least: float = 0.2  # of the lower end of a range, of a positive parameter
+    furthest: float = 0.02  # s, or three control steps
+    direction: float = 0.1  # of the typical speed, at which friction has turned round
+    least_late: tuple[float, float] = (0.05, 0.0001)  # control steps and s: what a simulator's own step may be worth
+    sure: float = 4.0  # standard errors, by windows
+    explains: float = 0.75  # of the cost above the noise: what else is missing would leave more
+    seen: float = 0.02  # of the noise's own cost
+    alike: float = 0.4  # of the shift, by which that of a condition may differ
+
+
+RULES = Rules()
+
+
+@dataclass(frozen=True)
+class Shift:
+    """When commands act.
+
+    Attributes:
+        late: s later than the log says; negative: earlier. error: its standard error.
+        explains: share of the cost above the noise that the shift alone removes.
+        apart: largest difference of a condition's own shift, beyond its error, in shifts.
+        seen: cost that it removes, in costs of the noise.
+        step: s, the control step.
+    """
+
+    late: float
+    error: float
+    explains: float
+    apart: float
+    seen: float
+    step: float
+
+    @property
+    def certain(self) -> bool:
+        """Whether nothing else that is known would do as well."""
+        steps, least = RULES.least_late
+        told = abs(self.late) > max(RULES.sure * self.error, steps * self.step, least) and self.seen > RULES.seen
+        return told and self.explains > RULES.explains and self.apart < RULES.alike
+
+    def sentence(self, period: float) -> str:
+        """The finding; period: s between rows of the log."""
+        text = f"commands look shifted by {1e3 * self.late:+.2g} ms (+- {1e3 * self.error:.1g} ms)"
+        if self.late > 0:
+            return f"{text}: they act later than the log says, by time stamps or by what the drives and sensors need"
+        text += ": they act before their rows, which no drive does; they were moved by as much"
+        between = abs(self.late / period + 0.5) < 0.15
+        smooth = ", as those of samples of a smooth signal do (`hold: linear`)" if between else ""
+        return f"{text}{smooth} (`commands_late: {self.late:.4g}` beside the logs does the same)"
+
+
+def estimate(errors: Errors, late: Late, sigma: Array, force: Array, factor: int) -> Shift | None:
+    """The shift of all commands together; None: the fit finds no end.
+
+    Args:
+        errors: with its start states fitted.
+        late: windows with shifted commands, at the sub-steps of `factor`.
+        sigma: `[2 nv]`, noise; infinite where nothing was measured.
+        force: `[nv]`, typical size of what acts on each joint.
+        factor: sub-steps per timestep of the model, at most `errors.most`.
+    """
+    cut, model = errors.cut, _Model(errors, late, sigma, force, factor)
+    precision = np.append(0.0, np.full(model.size - 1, RULES.prior**-2))
+    nudges = np.append(RULES.nudge * cut.dt, np.full(model.size - 1, RULES.small))
+    x, starts = np.zeros(model.size), np.zeros_like(errors.offsets)
+    r = model.residual(x, starts)
+    A = np.stack([(r - model.residual(n, starts)) / n.max() for n in np.diag(nudges)], -1)
+    B = errors.columns(sigma)
+    for _ in range(RULES.rounds):
+        q, found = eliminate(r, A, B, errors.offsets + starts, cut.spread)
+        g, S = q.weighted(np.ones(len(cut)))
+        step = np.asarray(np.linalg.solve(S + np.diag(precision), g - precision * x), np.float64)
+        for share in RULES.shares:
+            moved = x + share * step, starts + share * found.step(A, step)
+            there = model.residual(*moved)
+            if np.sum(there**2) < np.sum(r**2):
+                (x, starts), r = moved, there
+                break
+        if abs(x[0]) > max(RULES.furthest, 3 * cut.dt):
+            return None
+    return _judged(eliminate(r, A, B, errors.offsets + starts, cut.spread)[0], x, precision, cut, r.size - starts.size)
+
+
+class _Model:
+    """Whitened residuals `[W, n]` as a function of (shift, parameters, gains, forces)."""
+
+    def __init__(self, errors: Errors, late: Late, sigma: Array, force: Array, factor: int) -> None:
+        self.errors, self.late, self.sigma, self.factor = errors, late, sigma, factor
+        space = errors.physics.space
+        self.low, self.high = (np.array([getattr(p, end) for p in space.parameters]) for end in ("low", "high"))
+        self.nominal = np.asarray(space.nominal, float)
+        self.least = np.where(self.low > 0, RULES.least * self.low, -np.inf)
+        self.forces = _shapes(errors.cut) * force  # [4, W, H, nv]
+        self.parts = np.cumsum([1, len(self.low), errors.physics.mj_model.nu])
+        self.size = int(self.parts[-1]) + 4 * len(force)
+
+    def residual(self, x: Array, starts: Array) -> Array:
+        """starts: `[W, 2 nv]`, further changes of the start states."""
+        shift, p, gains, loads = np.split(x, self.parts)
+        theta = np.maximum(self.nominal + p * (self.high - self.low), self.least)  # beyond its range: nothing else may
+        cut = self.late(float(shift[0]))
+        command = cut.batch.command * (1 + jnp.asarray(gains, jnp.float32))
+        cut = dataclasses.replace(cut, batch=cut.batch.replace(command=command))
+        force = np.einsum("fv,fwhv->whv", loads.reshape(4, -1), self.forces)
+        error = self.errors.run(cut, self.factor, offsets=starts, theta=theta, force=force)
+        return np.asarray(np.clip(error / self.sigma, -1e4, 1e4).reshape(len(cut), -1))
+
+
+def _shapes(cut: Windows) -> Array:
+    """`[4, W, H, nv]`, of size 1 at most times: constant, with position, with speed, with the direction of motion.
+
+    Of measured motion, smoothed: the velocity of the logs, at the same rows.
+    """
+    rows = [slice(int(a) + 1, int(a) + 1 + cut.steps) for a in cut.start]
+    speed = np.stack([cut.logs[log].qvel[own] for log, own in zip(cut.log, rows, strict=True)])
+    typical = np.maximum(np.sqrt(np.mean(speed**2, (0, 1))), 1e-12)
+    travel = np.cumsum(speed, axis=1) * cut.dt
+    travel = travel - travel.mean(1, keepdims=True)
+    reach = np.maximum(np.abs(travel).max((0, 1)), 1e-12)
+    return np.stack([np.ones_like(speed), travel / reach, speed / typical, np.tanh(speed / typical / RULES.direction)])
+
+
+def _judged(q: Quadratic, x: Array, precision: Array, cut: Windows, count: int) -> Shift:
+    """At the end of the fit, whose residuals `q` is made of; count: of them, less the start states."""
+    H = q.S.sum(0) + np.diag(precision)
+    inverse = np.linalg.pinv(H, hermitian=True)
+    robust = inverse @ np.einsum("wi,wj->ij", q.g, q.g) @ inverse
+    seen = float(x[0] ** 2 / inverse[0, 0])
+    left = max(float(q.c.sum()) - (count - len(x)), 0.0)
+    error = float(np.sqrt(max(robust[0, 0], inverse[0, 0])))
+    return Shift(float(x[0]), error, seen / (seen + left), _apart(q, x, precision, cut), seen / count, cut.dt)
+
+
+def _apart(q: Quadratic, x: Array, precision: Array, cut: Windows) -> float:
+    """How far the shift of a condition lies from that of all, with the other columns free, beyond two errors."""
+    names = np.unique(cut.group)
+    own = (cut.group[:, None] == names).astype(float)  # [W, G]
+    cross = np.einsum("wg,wj->gj", own, q.S[:, 0, 1:])
+    H = np.block([[np.diag(own.T @ q.S[:, 0, 0]), cross], [cross.T, q.S[:, 1:, 1:].sum(0) + np.diag(precision[1:])]])
+    g = np.append(own.T @ q.g[:, 0], q.g[:, 1:].sum(0) - precision[1:] * x[1:])
+    inverse = np.linalg.pinv(H, hermitian=True)
+    away = np.abs(inverse @ g)[: len(names)]
+    errors = np.sqrt(np.diag(inverse))[: len(names)]
+    return float(np.max(np.maximum(away - 2 * errors, 0.0)) / max(abs(x[0]), 1e-12))

@@ -1,0 +1,80 @@
+"""Commands that act before or after their rows: found to a tenth of a millisecond, and nothing where there is none."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from bayessim_mjx.diagnosis.fitting import scales
+from bayessim_mjx.diagnosis.fitting.command_shift import Shift
+from bayessim_mjx.diagnosis.run import diagnose
+from bayessim_mjx.diagnosis.setup import _measured, _shift
+from bayessim_mjx.logs import resample
+from tests.diagnosis.pendulums import PERIOD, nominal, recorded
+
+SURE = {"error": 1e-4, "explains": 0.95, "apart": 0.1, "seen": 1.0, "step": PERIOD}
+
+
+def logged_late(logs):
+    """The same motion, each command in the row after its own: it seems to act one row early."""
+    return [dataclasses.replace(log, ctrl=np.concatenate([log.ctrl[:1], log.ctrl[:-1]])) for log in logs]
+
+
+def estimated(robot, logs) -> Shift:
+    size = scales.measure(robot.mj_model, [resample(log, PERIOD) for log in logs])
+    found = _shift(*_measured(robot.physics(PERIOD), logs, None, False), size)
+    assert found is not None
+    return found
+
+
+@pytest.mark.slow
+@pytest.mark.ci
+def test_shifts_of_either_sign_are_found_and_nothing_else_is_one(tmp_path):
+    robot = nominal(tmp_path)
+    for logs, late in (
+        (recorded(count=4, delay=0.005), 0.005),
+        (logged_late(recorded(count=4, delay=0.017)), -0.003),
+        (recorded(count=4), None),
+        (recorded(count=4, friction=0.1), None),
+        (recorded(count=4, scale=(4.0, 1.0, 1.2)), None),  # damping far beyond its range
+    ):
+        found = estimated(robot, logs)
+        assert found.certain == (late is not None)
+        assert late is None or (found.late == pytest.approx(late, abs=1.5e-4) and found.error < 1e-4)
+
+
+@pytest.mark.slow
+@pytest.mark.ci
+def test_a_lead_is_moved_away_and_told_not_explained_by_an_effect(tmp_path):
+    """Its truth is known: a simulator without any gap, whose commands were logged 3 ms late."""
+    effects = ["actuator_delay", "viscous_friction", "joint_elasticity"]
+    found = diagnose(nominal(tmp_path), logged_late(recorded(count=6, delay=0.017)), effects=effects)
+    assert found.verdict == "no_gap" and not found.effects
+    (told,) = [w for w in found.warnings if "commands look shifted" in w]
+    assert "-3 ms" in told and "which no drive does" in told
+    for parameter in found.parameters.values():
+        assert parameter["mean"] == pytest.approx(1.0, abs=0.01)
+
+
+def test_a_shift_is_told_only_if_nothing_else_would_do_as_well():
+    assert Shift(-0.003, **SURE).certain and Shift(0.003, **SURE).certain
+    assert not Shift(0.0009, **SURE).certain  # less than a twentieth of a step: a simulator's own
+    for worse in ({"error": 1e-3}, {"explains": 0.5}, {"apart": 0.6}, {"seen": 0.01}):
+        assert not Shift(-0.003, **{**SURE, **worse}).certain
+
+
+def test_the_sentence_names_size_sign_and_remedy():
+    lead, late = Shift(-0.003, **SURE).sentence(PERIOD), Shift(0.005, **SURE).sentence(PERIOD)
+    assert "shifted by -3 ms" in lead and "`commands_late: -0.003`" in lead and "linear" not in lead
+    assert "shifted by +5 ms" in late and "drives" in late and "moved" not in late
+    assert "`hold: linear`" in Shift(-PERIOD / 2, **SURE).sentence(PERIOD)
+
+
+def test_a_shifted_log_is_resampled_as_its_commands_act():
+    (log,) = recorded(count=1, seconds=1.0)
+    ramp = dataclasses.replace(log, ctrl=log.time[:, None], metadata={"hold": "linear"})
+    for late in (0.005, -0.013):
+        even = resample(ramp.shifted(late), PERIOD)
+        inside = slice(2, -2)
+        np.testing.assert_allclose(even.ctrl[inside, 0], even.time[inside] + PERIOD / 2 - late, atol=1e-9)
+        assert even.late == 0 and not even.linear
