@@ -129,6 +129,8 @@ def investigate(
     known = keep or (lambda setup, tried: None)
     say("looking at the logs", 0, 1)
     setup = prepare(robot, logs, effects, group=group, seed=seed, settings=settings, tolerated=tolerated, notes=notes)
+    for text in setup.said:
+        say(text, 0, 1)
     known(setup, None)
     given = setup.fitter, setup.candidates, setup.settings, criteria or Criteria()
     found = Findings(setup, selected.select(*given, say, lambda tried: known(setup, tried)))

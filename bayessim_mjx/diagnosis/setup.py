@@ -6,12 +6,14 @@ import dataclasses
 import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bayessim_mjx import effects as library
 from bayessim_mjx.diagnosis import tolerance
-from bayessim_mjx.diagnosis.fitting import candidates, command_shift, discretisation, scales, windows
+from bayessim_mjx.diagnosis.fitting import candidates, command_shift, discretisation, scales, stability, windows
 from bayessim_mjx.diagnosis.fitting.centred_commands import physics_of
 from bayessim_mjx.diagnosis.fitting.fitter import Fitter
 from bayessim_mjx.diagnosis.fitting.robot import Robot
@@ -22,6 +24,8 @@ from bayessim_mjx.effects.effect import Effect
 from bayessim_mjx.logs.log import Log
 from bayessim_mjx.logs.resample import resample
 from bayessim_mjx.physics import Physics
+
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -40,12 +44,13 @@ class Cutting:
     # sub-steps of one simulation of all windows; half of it for robots of more than `many` dofs
     budget: int = 24000
     many: int = 3
+    dearest: float = 4.0  # budgets, where the time step is worth more than the tolerance
     fewest: int = 24  # windows that are simulated whatever the budget
     least: int = 6  # windows: with fewer nothing can be held out
 
 
 CUTTING = Cutting()
-SHIFT_FACTOR = 4  # the finest sub-steps by which a shift of commands is looked for
+SHIFT_FACTOR = 4  # times the coarsest sub-steps, the finest by which a shift of commands is looked for
 
 
 class TooLittleData(Exception):
@@ -67,6 +72,7 @@ class Setup:
     seed: int
     tolerance: tolerance.Tolerance
     warnings: tuple[str, ...] = ()
+    said: tuple[str, ...] = ()  # of the warnings, what is said before the search
     discretisation: discretisation.Discretisation | None = None
 
     @property
@@ -113,24 +119,36 @@ def prepare(
     kinds = [library.load(n) if isinstance(n, str) else n for n in (library.names() if effects == "all" else effects)]
     size = scales.measure(robot.mj_model, [resample(log, dt) for log in usable])
     stack, left_out = candidates.stack(kinds, size)
-    own = robot.physics(dt)
-    cuts, step = _measured(own, usable, group, seen.use_qvel)
+    own, delivered = robot.physics(dt), float(robot.mj_model.opt.timestep)
+    stable = stability.needed(own.mj_model, usable)
+    robot = stable.robot(robot)
+    own = robot.physics(dt) if stable.changed else own
+    limit = tolerance.judge(robot.mj_model, 2 * size.travel, _noise(usable), asked).limit
+    cuts, step = _measured(own, usable, group, seen.use_qvel, stable.factor, limit)
     shift = _shift(cuts, step, size)
     lead = min(shift.late, 0.0) if shift is not None and shift.certain else 0.0
-    seen, delivered = seen.shifted(lead) if lead else seen, float(robot.mj_model.opt.timestep)
+    seen = seen.shifted(lead) if lead else seen
     robot = step.robot(robot)
     physics = physics_of(robot, dt, stack)
-    cut = step.noisier(cuts(step.factor, _limit(physics, cuts(1).steps), centred=False, late=lead))
+    most = _limit(physics, step.errors.cut.steps if step.errors else cuts(1).steps)
+    cut = step.noisier(cuts(step.factor, limit=most, centred=False, late=lead))
     fitter = Fitter(Simulator(physics, cut), candidates.base_coordinates(robot.space), physics.space.nominal)
     every = tuple(candidates.enumerate_candidates(physics))
     settings = dataclasses.replace(settings or _settings(robot), believed=step.believed)
     allowed = tolerance.judge(robot.mj_model, 2 * size.travel, cut.sigma_q, asked)
-    told += _faster(seen.usable, delivered, dt)
+    said = [*stable.sentences(), *step.beyond(), *_faster(seen.usable, delivered, dt)]
     if shift is not None and shift.certain:
-        told.append(shift.sentence(float(np.median([log.period for log in logs]))))
-    told += [*floors.warnings, *step.warnings(), *(f"not tried: {text}" for text in left_out), *_few_conditions(cut)]
+        said.append(shift.sentence(float(np.median([log.period for log in logs]))))
+    told += [
+        *said,
+        *floors.warnings,
+        *(step.warnings() if stable.factor == 1 else ()),
+        *(f"not tried: {text}" for text in left_out),
+        *_few_conditions(cut),
+    ]
     told += allowed.warnings()
-    return Setup(robot, physics, seen, floors, fitter, every, size, settings, seed, allowed, tuple(told), step)
+    fixed = (robot, physics, seen, floors, fitter, every, size, settings, seed, allowed)
+    return Setup(*fixed, tuple(told), tuple(said), step)
 
 
 def _settings(robot: Robot) -> Settings:
@@ -139,13 +157,32 @@ def _settings(robot: Robot) -> Settings:
     return Settings(singles=24, screened=24, starts=16) if big else Settings()
 
 
+def _noise(logs: Sequence[Log]) -> Array:
+    """Noise of positions `[nv]`, pooled over logs."""
+    return np.asarray(np.sqrt(np.mean([log.sigma_dofs**2 for log in logs], axis=0)))
+
+
 def _measured(
-    own: Physics, usable: Sequence[Log], group: str | None, use_qvel: bool
+    own: Physics,
+    usable: Sequence[Log],
+    group: str | None,
+    use_qvel: bool,
+    first: int = 1,
+    limit: Array | None = None,
 ) -> tuple[Callable[..., windows.Windows], discretisation.Discretisation]:
-    """The windows, and what the time step is worth in them; shorter ones where contacts make longer ones a lottery."""
+    """The windows, and what the time step is worth in them; shorter ones where contacts make longer ones a lottery.
+
+    Args:
+        first: the coarsest factor on the sub-steps that is stable: as many windows fewer are looked at.
+        limit: `[nv]`, the tolerance: steps are made finer than the budget allows until they are worth less.
+    """
     for share in CUTTING.shorter:
-        cuts = _windows(own, usable, group, use_qvel, share * CUTTING.window)
-        step = discretisation.measure(own, cuts, usable, _finest(own, len(cuts(1)), cuts(1).steps))
+        cuts = _windows(own, usable, group, use_qvel, share * CUTTING.window, first)
+        finest = [_finest(own, len(cuts(1)), cuts(1).steps, budget) for budget in (1.0, CUTTING.dearest)]
+        more: dict[str, Any] = (
+            {"first": first, "limit": limit, "utmost": finest[1]} if first > 1 or limit is not None else {}
+        )
+        step = discretisation.measure(own, cuts, usable, finest[0], **more)
         known = np.isfinite(step.sigma)
         worth = float(np.median(step.floor[known] / step.sigma[known]))
         if worth < CUTTING.lottery or not discretisation.contacts(own) or cuts(1).steps <= CUTTING.shortest_window:
@@ -159,23 +196,31 @@ def _shift(
     """By how much commands act later or earlier than the logs say."""
     if step.errors is None or not step.errors.physics.mj_model.nu:
         return None
-    factor = min(step.factor, SHIFT_FACTOR)
+    factor = min(step.factor, SHIFT_FACTOR * step.errors.first)
     return command_shift.estimate(
         step.errors, lambda late: cuts(factor, late=round(late, 9)), step.floor, size.force, factor
     )
 
 
 def _windows(
-    physics: Physics, logs: Sequence[Log], group: str | None, use_qvel: bool, seconds: float = CUTTING.window
+    physics: Physics,
+    logs: Sequence[Log],
+    group: str | None,
+    use_qvel: bool,
+    seconds: float = CUTTING.window,
+    first: int = 1,
 ) -> Callable[..., windows.Windows]:
-    """(factor, limit) -> the windows with that many times the sub-steps of `physics`, by default the same ones."""
+    """(factor, limit) -> the windows with that many times the sub-steps of `physics`, by default the same ones.
+
+    first: the coarsest factor that will be asked for, for which the number of windows is chosen.
+    """
     dt = physics.dt
     longest = max(int(log.duration / dt) for log in logs)
     longest_window = max(CUTTING.longest_window, round(CUTTING.long / dt))
     length = int(np.clip(round(seconds / dt), CUTTING.shortest_window, longest_window))
     if longest < length:
         raise TooLittleData(f"the longest log has {longest} control steps of {dt:.3g} s, one window needs {length}")
-    own = _limit(physics, length)
+    own = max(min(CUTTING.fewest, _limit(physics, length)), _limit(physics, length) // first)
 
     @functools.cache
     def cuts(factor: int, limit: int = own, centred: bool = True, late: float = 0.0) -> windows.Windows:
@@ -206,9 +251,9 @@ def _limit(physics: Physics, length: int) -> int:
     return min(limit, max(CUTTING.fewest, budget // (length * physics.substeps)))
 
 
-def _finest(physics: Physics, count: int, length: int) -> int:
-    """How many times the sub-steps the budget allows when at most half of `count` windows are given up for it."""
-    budget = CUTTING.budget if physics.mj_model.nv <= CUTTING.many else CUTTING.budget // 2
+def _finest(physics: Physics, count: int, length: int, share: float = 1.0) -> int:
+    """How many times the sub-steps `share` budgets allow when at most half of `count` windows are given up for it."""
+    budget = int(share * (CUTTING.budget if physics.mj_model.nv <= CUTTING.many else CUTTING.budget // 2))
     return max(1, budget // (length * physics.substeps * max(CUTTING.fewest, (count + 1) // 2)))
 
 

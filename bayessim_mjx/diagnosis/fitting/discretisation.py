@@ -29,6 +29,7 @@ class Rules:
     """How fine a time step is looked for, and when its error is known."""
 
     factors: tuple[int, ...] = (1, 2, 4, 8)
+    more: tuple[int, ...] = (16, 32)  # beyond the budget, where the step is worth more than the tolerance
     contacts: int = 4  # the finest with contacts: what is left there is chaos, which no step removes
     enough: float = 0.6  # noises: an error of the time step that does not show
     shorter: int = 5  # halvings of the time step that can be recommended
@@ -55,6 +56,7 @@ class Discretisation:
         simulated: `[nv]`, channels that show no noise at all: logs of a simulation.
         channels: names `[nv]`.
         errors: the windows simulated without effects, for what else is asked of them.
+        limit: `[nv]`, the tolerance, rad or m; None: none is known.
     """
 
     timestep: float
@@ -68,6 +70,7 @@ class Discretisation:
     simulated: NDArray[np.bool_]
     channels: tuple[str, ...]
     errors: Errors | None = None
+    limit: Array | None = None
 
     def robot(self, robot: Robot) -> Robot:
         """The robot at the sub-steps of the diagnosis."""
@@ -115,6 +118,19 @@ class Discretisation:
             f"{text}; the rest, {left:.2g} noise standard deviations, counts as noise" if left > RULES.enough else text
         )
 
+    def beyond(self) -> list[str]:
+        """In words, where no step that can be afforded is fine enough: to be told before anything is fitted."""
+        nv = len(self.channels)
+        if self.limit is None or not (over := self.left[:nv] / self.limit).max() > 1:
+            return []
+        at, step = int(np.argmax(over)), 1e3 * self.timestep / self.factor
+        text = (
+            f"the simulator cannot be made fine enough: sub-steps of {step:.2g} ms are still worth {self.left[at]:.2g}"
+        )
+        return [
+            f"{text} rad or m at {self.channels[at]}, where {self.limit[at]:.2g} may stay; smaller gaps are not seen"
+        ]
+
     def to_dict(self) -> dict[str, Any]:
         """For diagnosis.json: numbers by channel, in noise units and physical ones."""
         nv = len(self.channels)
@@ -142,36 +158,51 @@ def refined(robot: Robot, timestep: float) -> Robot:
     return dataclasses.replace(robot, mj_model=model)
 
 
-def measure(physics: Physics, cuts: Callable[[int], Windows], logs: Sequence[Log], most: int) -> Discretisation:
+def measure(
+    physics: Physics,
+    cuts: Callable[[int], Windows],
+    logs: Sequence[Log],
+    most: int,
+    *,
+    first: int = 1,
+    limit: Array | None = None,
+    utmost: int | None = None,
+) -> Discretisation:
     """The errors of `physics` (without effects) in the windows, and the sub-steps that the diagnosis should take.
 
     Args:
         cuts: factor -> the same windows with commands for that many times the sub-steps.
         logs: as recorded.
         most: the finest factor that can be afforded.
+        first: the coarsest factor that is stable.
+        limit: `[nv]`, the tolerance, rad or m. utmost: the finest factor where the step is worth more than that.
     """
-    first = cuts(1)
+    start = cuts(first)
     touching = contacts(physics)
-    sigma = np.concatenate([first.sigma_q, first.sigma_v])
-    errors = Errors(physics, first, 4)
+    sigma = np.concatenate([start.sigma_q, start.sigma_v])
+    errors = Errors(physics, start, 4 * first)
     errors.start(sigma)
-    coarse, mid, fine = (errors.run(cuts(f), f) for f in (1, 2, 4))
-    plain = errors.run(held(first), 1, corrected=False)
+    coarse, mid, fine = (errors.run(cuts(first * f), first * f) for f in (1, 2, 4))
+    plain = errors.run(held(start), first, corrected=False)
     settle = errors.settler(sigma)
     one, two = settle(coarse - mid), settle(mid - fine)
     gain = _gain(one / sigma, two / sigma)
-    limit = fine + (fine - mid) / max(gain - 1, 1.0)
-    at = {f: _size(one, touching) * gain / (gain - 1) / gain ** np.log2(f) for f in RULES.factors}
-    settled = _size(settle(plain - limit), touching)
+    truth = fine + (fine - mid) / max(gain - 1, 1.0)
+    worth = _size(one, touching) * gain / (gain - 1)
+    at = {first * f: worth / gain ** np.log2(f) for f in (*RULES.factors, *RULES.more)}
+    settled = _size(settle(plain - truth), touching)
     clean = np.array([noise_free(logs, i) for i in physics.mj_model.jnt_qposadr[physics.mj_model.dof_jntid]])
     base = np.hypot(sigma, np.tile(clean, 2) * settled)  # who simulated such logs may have used this step or another
-    allowed = [f for f in RULES.factors if f <= (min(most, RULES.contacts) if touching else most)]
-    factor = _choose({f: float(np.max(at[f] / base)) for f in allowed}, gain)
+    most = max(first, min(most, RULES.contacts) if touching else most)
+    allowed = [first * f for f in RULES.factors if first * f <= most]
+    factor = _choose({f: float(np.max(at[f] / base)) for f in allowed}, gain, first)
+    if limit is not None and not touching and gain > RULES.converging:
+        factor = _within({f: float(np.max(x[: len(limit)] / limit)) for f, x in at.items()}, factor, utmost or factor)
     return Discretisation(
         timestep=float(physics.mj_model.opt.timestep),
         factor=factor,
         order=float(np.log2(gain)),
-        own=_size(plain - limit, touching),
+        own=_size(plain - truth, touching),
         settled=settled,
         left=at[factor],
         sigma=sigma,
@@ -179,6 +210,7 @@ def measure(physics: Physics, cuts: Callable[[int], Windows], logs: Sequence[Log
         simulated=clean,
         channels=Channels.of(physics.mj_model).qvel,
         errors=errors,
+        limit=limit,
     )
 
 
@@ -189,10 +221,18 @@ def _gain(one: Array, two: Array) -> float:
     return float(np.clip(ratio, 1.1, 4.0))
 
 
-def _choose(error: dict[int, float], gain: float) -> int:
+def _choose(error: dict[int, float], gain: float, first: int = 1) -> int:
     """The coarsest factor that is fine enough; where none is, the finest, if finer ones gain anything."""
     enough = [f for f, e in error.items() if e < RULES.enough]
-    return min(enough) if enough else max(error) if gain > RULES.converging else 1
+    return min(enough) if enough else max(error) if gain > RULES.converging else first
+
+
+def _within(error: dict[int, float], factor: int, utmost: int) -> int:
+    """`factor`, or where its error is more than the tolerance the coarsest one up to `utmost` whose error is not."""
+    if error[factor] <= 1:
+        return factor
+    finer = [f for f in sorted(error) if factor < f <= utmost]
+    return next((f for f in finer if error[f] <= 1), finer[-1] if finer else factor)
 
 
 def _excess(error: Array, noise: Array) -> Array:

@@ -41,10 +41,15 @@ def held(cut: Windows) -> Windows:
 
 
 class Errors:
-    """Windows without effects at any sub-step, by one compiled program: measured minus simulated, `[W, H, 2 nv]`."""
+    """Windows without effects at any sub-step, by one compiled program: measured minus simulated, `[W, H, 2 nv]`.
+
+    Args:
+        cut: the windows, with commands for the coarsest sub-steps that are asked for; most: the finest factor.
+    """
 
     def __init__(self, physics: Physics, cut: Windows, most: int) -> None:
         self.physics, self.cut, self.most = physics, cut, most * physics.substeps
+        self.first = cut.batch.command.shape[2] // physics.substeps
         self.theta = jnp.asarray(physics.space.nominal, jnp.float32)
         self.offsets = np.zeros((len(cut), 2 * physics.mj_model.nv))  # of the measured start states
         self._no_force = np.zeros((len(cut), cut.steps, physics.mj_model.nv), np.float32)
@@ -115,18 +120,18 @@ class Errors:
 
     def columns(self, sigma: Array) -> Array:
         """`[W, n, 2 nv]`, minus the derivatives of the whitened errors by the start states."""
-        here = self.run(self.cut, 1)
+        here = self.run(self.cut, self.first)
         nudges = np.diag(np.maximum(0.2 * self.cut.spread, SIZES.nudge))
-        moved = [(here - self.run(self.cut, 1, offsets=n)) / n.max() / sigma for n in nudges]
+        moved = [(here - self.run(self.cut, self.first, offsets=n)) / n.max() / sigma for n in nudges]
         return np.stack([m.reshape(len(m), -1) for m in moved], -1)
 
     def start(self, sigma: Array) -> None:
         """Fit the start states: far from the measured motion the time step is worth something else."""
         spread = self.cut.spread
         for _ in range(SIZES.starts):
-            before, columns = self.run(self.cut, 1) / sigma, self.columns(sigma)
+            before, columns = self.run(self.cut, self.first) / sigma, self.columns(sigma)
             step = _step(before, columns, self.offsets, spread)
-            after = self.run(self.cut, 1, offsets=step) / sigma
+            after = self.run(self.cut, self.first, offsets=step) / sigma
             better = np.sum(after**2, (1, 2)) < np.sum(before**2, (1, 2))
             self.offsets = self.offsets + np.where(better[:, None], step, 0.0)
 
