@@ -174,14 +174,13 @@ def _measured(
 
     Args:
         first: the coarsest factor on the sub-steps that is stable: as many windows fewer are looked at.
-        limit: `[nv]`, the tolerance: steps are made finer than the budget allows until they are worth less.
+        limit: `[nv]`, the tolerance: steps are made finer than the budget allows until they are worth less; None: they
+            are not, and `first` is 1.
     """
     for share in CUTTING.shorter:
         cuts = _windows(own, usable, group, use_qvel, share * CUTTING.window, first)
         finest = [_finest(own, len(cuts(1)), cuts(1).steps, budget) for budget in (1.0, CUTTING.dearest)]
-        more: dict[str, Any] = (
-            {"first": first, "limit": limit, "utmost": finest[1]} if first > 1 or limit is not None else {}
-        )
+        more: dict[str, Any] = {} if limit is None else {"first": first, "limit": limit, "utmost": finest[1]}
         step = discretisation.measure(own, cuts, usable, finest[0], **more)
         known = np.isfinite(step.sigma)
         worth = float(np.median(step.floor[known] / step.sigma[known]))
