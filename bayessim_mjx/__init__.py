@@ -10,6 +10,7 @@ The public names, by room (imported when first used, so that the commands start 
     effects       Effect                                   what the nominal simulator leaves out
     env           Env, State, Task                         environments
     logs          Log, read_logs                           recorded motion
+    rl.pretrained pretrained                               a policy that comes with the package
     diagnose      diagnose                                 logs and a simulator -> Diagnosis (also a command's module)
 
 Rooms to import as modules: rollout (rollout, replay), rl (train, evaluate), inference (fit, condition, combine),
@@ -30,12 +31,13 @@ _ROOMS = {
     "effects": ("Effect",),
     "env": ("Env", "State", "Task"),
     "logs": ("Log", "read_logs"),
+    "rl.pretrained": ("pretrained",),
 }
 _WHERE = {name: room for room, names in _ROOMS.items() for name in names}
 
 __all__ = [
     "Distribution", "Effect", "Env", "Log", "Parameter", "ParameterSpace", "Physics", "State", "Task", "World",
-    "control_step", "diagnose", "load", "make", "names", "read_logs",
+    "control_step", "diagnose", "load", "make", "names", "pretrained", "read_logs",
 ]  # fmt: skip
 
 

@@ -8,6 +8,7 @@ pseudo-terminal (Linux, macOS), about five minutes together on two cores. What i
 - loop.svg, diagnosis.svg: the terminal, by rich's export
 - posterior.png: the corner plot of the last round
 - pendulum.gif: the policy of the best round, by `play --video`; left out with a reason where nothing can be drawn
+- report.html: the report, with its plotting library beside it instead of inside (the site adds plotly.min.js)
 - report.png: the head of report.html, by a headless Chromium or Chrome; left out with a reason where there is none
 """
 
@@ -35,7 +36,8 @@ ROOT = Path(__file__).resolve().parents[1]
 ROWS, COLUMNS = 60, 100
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 WINDOW = "1180,1260"  # of the browser
-LARGEST = {".svg": 200_000, ".png": 200_000, ".gif": 1_000_000}  # bytes of a picture
+LARGEST = {".svg": 200_000, ".png": 200_000, ".gif": 1_000_000, ".html": 300_000}  # bytes of a picture
+PLOTLY = re.compile(r"<script>/\*\*\s*\* plotly\.js.*?</script>", re.DOTALL)
 GIF = "fps=15,scale=240:-1:flags=lanczos,split[a][b];[a]palettegen=max_colors=64[p];[b][p]paletteuse=dither=none"
 PLAY = "play --task Pendulum --checkpoint best --video"
 LOOP = "main --task Pendulum bayessim.realIters=3"
@@ -179,6 +181,9 @@ def diagnosis_pictures(work: Path, out: Path) -> None:
         record_motion(work / "motion")
     text = in_terminal([*DIAGNOSIS.split(), "--effects", EFFECTS], work, "diagnosis")
     terminal_picture(text, f"{DIAGNOSIS} --effects LIST", out / "diagnosis.svg")
+    report = (work / "found" / "report.html").read_text(encoding="utf-8")
+    small = PLOTLY.sub('<script src="plotly.min.js"></script>', report)
+    (out / "report.html").write_text(small.replace("which is inside this file", "and plotly.min.js"), encoding="utf-8")
     browser = next((path for name in BROWSERS if (path := shutil.which(name))), None)
     if browser is None:
         print(f"report.png: left out, there is no {', '.join(BROWSERS)}")
@@ -203,7 +208,7 @@ def main() -> None:
         folder.mkdir(parents=True, exist_ok=True)
     for name in args.only:
         PICTURES[name](work, args.out)
-    for picture in sorted(args.out.iterdir()):
+    for picture in sorted(p for p in args.out.iterdir() if p.is_file()):
         size = picture.stat().st_size
         large = " (too large)" if size > LARGEST[picture.suffix] else ""
         print(f"{picture}: {size / 1000:.0f} kB{large}")

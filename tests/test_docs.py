@@ -19,7 +19,7 @@ ROOT = Path(__file__).parents[1]
 COMMANDS = ("main", "train", "play", "calibrate", "diagnose", "gap_loop", "logs")
 FORMATS = ("from-mcap", "from-rosbag", "from-lerobot", "from-hdf5")  # of `logs`, each with flags of its own
 FOLDERS = ("docs", "benchmarks")
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(p for f in FOLDERS for p in sorted((ROOT / f).glob("*.md")))]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(p for f in FOLDERS for p in sorted((ROOT / f).rglob("*.md")))]
 PYTHON = {"env.reset", "env.step", "env.dt", "env.mj_model", "env.space", "ppo.train"}  # in Python, not settings
 COMMAND = re.compile(
     r"(?:python -m bayessim_mjx\.(\w+)"

@@ -170,7 +170,7 @@ class Effect(abc.ABC):
         return memory, measurement
 
     def edit(self, spec: "mujoco.MjSpec", values: dict[str, dict[str, float]]) -> str | None:
-        """Write the effect into `spec` where MuJoCo can express it natively: values[place][quantity].
+        """Write the effect into `spec` where MuJoCo can express it natively; `values[place][quantity]`.
 
         Returns:
             None where written, else why not (one sentence for people).

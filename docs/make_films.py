@@ -1,0 +1,154 @@
+"""Make the film of every task, docs/pictures/tasks/<task>.gif, at most 200 kB each.
+
+    python docs/make_films.py [--only pendulum cartpole] [--runs FOLDER]
+
+A film shows, whichever there is first: the best policy of the task's newest run in FOLDER, the policy that comes with
+the package, or, without any policy, the robot while its actuators are moved to and fro (MuJoCo alone). films.json says
+which, and so does docs/tasks.md. Needs OpenGL (EGL or OSMesa).
+"""
+
+import argparse
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import imageio_ffmpeg
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from bayessim_mjx import cli, registry
+from bayessim_mjx.config import load
+from bayessim_mjx.config.settings import MonitorConfig
+from bayessim_mjx.errors import UserError
+from bayessim_mjx.monitor import film, video
+from bayessim_mjx.rl import pretrained
+
+FOLDER = Path(__file__).parent / "pictures" / "tasks"
+PAGE = Path(__file__).with_name("tasks.md")
+LARGEST, SECONDS, WIDTH, HEIGHT, FPS = 200_000, 5.0, 280, 210, 15
+SWAY, PERIOD = 0.15, 2.0  # share of a range by which a command moves to and fro; s
+COLOURS = (64, 40, 24, 16)  # tried until the film is small enough
+FILTER = "fps={fps},split[a][b];[a]palettegen=max_colors={colours}[p];[b][p]paletteuse=dither=none:diff_mode=rectangle"
+
+
+class Swaying(film.Motion):
+    """Motion that nobody rewards."""
+
+    def captions(self) -> list[str]:
+        return [f"{self.dt * k:.2f} s" for k in range(len(self.qpos))]
+
+
+def of_run(task: str, folder: Path) -> tuple[film.Motion, Any, str]:
+    """(motion, model, what it shows) of the best policy of the newest run."""
+    path, run = cli.find_checkpoint("best", task, str(folder))
+    assert run is not None
+    env: Any = registry.make(task, config=run.config)
+    steps = run.manifest["checkpoints"][-1]["step"]
+    return _acting(env, cli.load_policy(path, env, run.config)), env.mj_model, f"a policy after {steps} updates of PPO"
+
+
+def of_package(task: str) -> tuple[film.Motion, Any, str]:
+    """(motion, model, what it shows) of the policy that comes with the package."""
+    env: Any = registry.make(task, config=load(task))
+    return _acting(env, pretrained.pretrained(task)), env.mj_model, "the policy that comes with the package"
+
+
+def _acting(env: Any, policy: Any) -> film.Motion:
+    theta = jnp.asarray(env.space.nominal, jnp.float32)
+    return film.motion(env, policy, jax.random.PRNGKey(0), theta, round(SECONDS / env.dt))
+
+
+def swaying(task: str) -> tuple[film.Motion, Any, str]:
+    """(motion, model, what it shows) of actuators that are moved to and fro around where the robot stands."""
+    env: Any = registry.make(task, config=load(task))
+    model = env.mj_model
+    data = mujoco.MjData(model)
+    if model.nkey:
+        mujoco.mj_resetDataKeyframe(model, data, 0)
+    mujoco.mj_forward(model, data)
+    rest, (low, high) = data.ctrl.copy(), model.actuator_ctrlrange.T
+    for k in range(model.nu):  # a servo holds the pose that it begins with
+        if model.actuator_biasprm[k, 1] and model.actuator_trntype[k] == mujoco.mjtTrn.mjTRN_JOINT:
+            rest[k] = data.qpos[model.jnt_qposadr[model.actuator_trnid[k, 0]]]
+    poses = [data.qpos.copy()]
+    phases = np.random.default_rng(0).uniform(0, 2 * np.pi, model.nu)
+    for k in range(round(SECONDS * FPS)):
+        wave = np.sin(2 * np.pi * k / FPS / PERIOD + phases) - np.sin(phases)
+        limited = model.actuator_ctrllimited.astype(bool)
+        data.ctrl[:] = np.where(limited, np.clip(rest + SWAY * (high - low) * wave, low, high), rest)
+        mujoco.mj_step(model, data, round(1 / FPS / model.opt.timestep))
+        poses.append(data.qpos.copy())
+    shown = np.stack(poses)
+    return Swaying(shown, np.zeros(len(shown)), 1 / FPS), model, "no policy: its actuators are moved to and fro"
+
+
+def motion_of(task: str, runs: Path | None) -> tuple[film.Motion, Any, str]:
+    """What there is to show of a task."""
+    if runs is not None:
+        try:
+            return of_run(task, runs)
+        except UserError as error:
+            print(f"{task}: {error}")
+    return of_package(task) if task in pretrained.names() else swaying(task)
+
+
+def gif(frames: np.ndarray, path: Path) -> int:
+    """Write frames [T, H, W, 3] at 25 frames a second with as many colours as fit; bytes of the file."""
+    source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{WIDTH}x{HEIGHT}", "-r", f"{film.FPS}", "-i", "-"]
+    for fps, colours in [(FPS, c) for c in COLOURS] + [(10, c) for c in COLOURS]:
+        words = ["-filter_complex", FILTER.format(fps=fps, colours=colours), "-loop", "0", str(path)]
+        command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error", *source, *words]
+        subprocess.run(command, input=frames.tobytes(), check=True, capture_output=True)
+        if path.stat().st_size <= LARGEST:
+            break
+    return path.stat().st_size
+
+
+def make(task: str, runs: Path | None) -> str | None:
+    """Film one task; what the film shows, None where nothing can be drawn."""
+    shown, model, words = motion_of(task, runs)
+    frames = film.frames(model, shown, MonitorConfig(video_width=WIDTH, video_height=HEIGHT), task)
+    if frames is None:
+        return None
+    path = FOLDER / f"{_snake(task)}.gif"
+    print(f"{path}: {gif(frames, path) / 1000:.0f} kB, {(len(shown.qpos) - 1) * shown.dt:.1f} s, {words}")
+    return words
+
+
+def captioned(page: str, shown: dict[str, str]) -> str:
+    """The page of films, with what each of them shows."""
+    for task, words in shown.items():
+        page = re.sub(rf"(\*\*{task}\*\*: .*Shown: ).*(</figcaption>)", rf"\g<1>{words}.\g<2>", page)
+    return page
+
+
+def _snake(task: str) -> str:
+    return "".join(f"_{c.lower()}" if c.isupper() else c for c in task).lstrip("_")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument(
+        "--only", nargs="+", metavar="TASK", default=list(registry.names()), help="tasks (default: all)"
+    )
+    parser.add_argument("--runs", type=Path, help="folder of runs whose policies are shown")
+    args = parser.parse_args()
+    FOLDER.mkdir(parents=True, exist_ok=True)
+    index = FOLDER / "films.json"
+    shown = json.loads(index.read_text()) if index.exists() else {}
+    for task in args.only:
+        words = make(cli.task_name(task), args.runs)
+        if words is None:
+            sys.exit("nothing can be drawn here: no EGL, no OSMesa")
+        shown[cli.task_name(task)] = words
+        index.write_text(json.dumps(dict(sorted(shown.items())), indent=1) + "\n")
+    PAGE.write_text(captioned(PAGE.read_text(encoding="utf-8"), shown), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
