@@ -1,4 +1,4 @@
-"""Docstrings on the site: `<name>` outside of code is text, no HTML element (an extension of Griffe, see mkdocs.yml)."""
+"""Docstrings on the site: `<name>` outside of code is text, no HTML element. An extension of Griffe (mkdocs.yml)."""
 
 import re
 from typing import Any

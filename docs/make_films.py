@@ -25,7 +25,7 @@ from bayessim_mjx import cli, registry
 from bayessim_mjx.config import load
 from bayessim_mjx.config.settings import MonitorConfig
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.monitor import film, video
+from bayessim_mjx.monitor import film
 from bayessim_mjx.rl import pretrained
 
 FOLDER = Path(__file__).parent / "pictures" / "tasks"

@@ -8,7 +8,6 @@ of its file go into index.json.
 
 import argparse
 import re
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp

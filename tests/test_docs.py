@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import functools
 import io
+import json
 import re
 import sys
 import types
@@ -11,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+import bayessim_mjx
 from bayessim_mjx import main, registry
 from bayessim_mjx.cli import ancestors
 from bayessim_mjx.config import settings
@@ -29,6 +31,7 @@ COMMAND = re.compile(
 PROSE = re.compile(r"`(main|train|play|calibrate|diagnose|gap_loop) (--[^`\n]*)`")
 
 CODE = re.compile(r"```python\n(.*?)```", re.DOTALL)
+API = re.compile(r"^::: .*$", re.MULTILINE)  # a name in Python, whose docstring the site shows
 FILE = re.compile(r'"""(\w+\.py): ')  # a block that begins so is that file
 TINY = [
     "env.numEnvs=8", "ppo.num_envs=8", "ppo.num_steps=16", "ppo.max_iterations=2", "bayessim.trainTrajs=200",
@@ -124,7 +127,7 @@ def test_commands_and_their_flags_exist(page):
 
 @pytest.mark.parametrize("page", PAGES, ids=by_name)
 def test_settings_and_flags_in_prose_exist(page):
-    text, known = CODE.sub("", page.read_text()), keys()
+    text, known = API.sub("", CODE.sub("", page.read_text())), keys()
     named = set(re.findall(r"\b(?<!/)((?:bayessim|ppo|monitor|env|real)\.(?!py\b|json\b)[a-zA-Z_]+)\b", text)) - PYTHON
     assert {name for name in named if name not in known} == set()
     somewhere = set().union(*(flags_of(c) for c in COMMANDS), *(flags_of(c) for c, _ in commands(text)))
@@ -144,6 +147,24 @@ def test_all_tasks_and_rooms_are_told_of():
     packages = [p.parent for p in (ROOT / "bayessim_mjx").rglob("__init__.py")]
     own = {p.name for p in packages if p.parent in (ROOT / "bayessim_mjx", ROOT / "bayessim_mjx" / "diagnosis")}
     assert {name for name in own - {"tasks"} if f"{name}/" not in rooms} == set()
+
+
+def test_every_page_is_in_the_menu_of_the_site_and_every_public_name_in_its_api():
+    menu = (ROOT / "mkdocs.yml").read_text()
+    pages = [page.relative_to(ROOT / "docs").as_posix() for page in PAGES if page.is_relative_to(ROOT / "docs")]
+    assert [name for name in pages if f" {name}\n" not in menu] == []
+    shown = set(re.findall(r"^::: .*\.(\w+)$", "".join(p.read_text() for p in (ROOT / "docs/api").glob("*.md")), re.M))
+    assert set(bayessim_mjx.__all__) <= shown
+
+
+def test_a_film_of_every_task_says_what_it_shows():
+    films, page = ROOT / "docs" / "pictures" / "tasks", (ROOT / "docs" / "tasks.md").read_text()
+    shown = json.loads((films / "films.json").read_text())
+    assert set(shown) == set(registry.names())
+    assert [
+        task for task, words in shown.items() if f"**{task}**: " not in page or f"Shown: {words}." not in page
+    ] == []
+    assert [path.name for path in films.glob("*.gif") if path.stat().st_size > 200_000] == []
 
 
 @pytest.mark.parametrize("page", PAGES, ids=by_name)
