@@ -8,7 +8,7 @@ import sys
 import time
 import types
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -50,6 +50,21 @@ def _parser() -> cli.PlainParser:
         default=[],
         help="what may stay unexplained at a joint: 0.5deg, 2mm, 3%% of the motion, or elbow=0.5deg for one joint "
         "(default: the larger of 3 noise standard deviations and 2%% of the motion)",
+    )
+    parser.add_argument(
+        "--accuracy",
+        metavar="SHARE",
+        nargs="+",
+        default=[],
+        help="how accurate known parameters are (standard deviation): 5%%, mass=2%%, elbow*=20%% (default: 5%% of a "
+        "model's own numbers; the ranges of a task or of --parameters)",
+    )
+    parser.add_argument(
+        "--payload",
+        metavar="KG",
+        nargs="+",
+        default=[],
+        help="what the robot is rated to carry: 12kg, or tool=12kg (default: what its drives hold, up to its weight)",
     )
     parser.add_argument(
         "--criteria",
@@ -94,7 +109,7 @@ def _robot(task: str, model: str | None, parameters: str | None) -> "Robot":
     return robot.of_task(env, parameters)
 
 
-def _diagnosis(args: argparse.Namespace, say: Any) -> "Diagnosis":
+def _diagnosis(args: argparse.Namespace, say: Any, early: Callable[[Sequence[str]], None]) -> "Diagnosis":
     from bayessim_mjx.diagnosis import run
     from bayessim_mjx.diagnosis.selection.criteria import Criteria
 
@@ -108,12 +123,15 @@ def _diagnosis(args: argparse.Namespace, say: Any) -> "Diagnosis":
         map=args.map,
         group=args.group,
         tolerance=args.tolerance,
+        accuracy=args.accuracy,
+        payload=args.payload,
         criteria=Criteria().changed(args.criteria),
         seed=args.seed,
         out=args.out,
         progress=say,
         notes=notes,
         about={"model": str(args.model or args.task)},
+        early=early,
     )
 
 
@@ -126,13 +144,18 @@ def _diagnose(argv: Sequence[str] | None) -> int:
 
     began = time.monotonic()
     with warnings.catch_warnings(record=True), stages(args.headless) as say:  # what matters is told with the result
-        result = _diagnosis(args, say)
+        result = _diagnosis(args, say, lambda lines: _told(lines, time.monotonic() - began))
         say("writing the report", 0, 1)
         report.write(result, Path(args.out))
         report.tensorboard(result, Path(args.out))
     report.console(result, Path(args.out))
     print(f"{duration(time.monotonic() - began)}; open {Path(args.out) / 'report.html'}")
     return 0
+
+
+def _told(lines: Sequence[str], seconds: float) -> None:
+    """What the logs tell before anything is simulated, as soon as it is known."""
+    print(f"Before any simulation ({seconds:.1f} s):", *(f"  {line}" for line in lines), sep="\n", flush=True)
 
 
 main = cli.command(_diagnose)

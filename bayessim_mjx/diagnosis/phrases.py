@@ -127,6 +127,11 @@ def stuck(value: float) -> str:
     return f"sits at its bound {value:.4g}: it stands in for something else, or its range is too narrow"
 
 
+def far_from_data_sheet(value: float, away: float) -> str:
+    """Of a known parameter whose accuracy was stated."""
+    return f"is {value:.4g}, {away:.1f} sd from the data sheet"
+
+
 def moves(spread: float, groups: int) -> str:
     """Of a known parameter that differs between operating conditions."""
     return f"moves between operating conditions (sd {spread:.3g} over {groups}): structure is missing"

@@ -26,7 +26,7 @@ from bayessim_mjx.diagnosis.selection.criteria import Criteria
 from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.selection.tried import Settings, Tried
 from bayessim_mjx.diagnosis.setup import Setup, TooLittleData, prepare
-from bayessim_mjx.diagnosis.summary import assemble, whole_logs
+from bayessim_mjx.diagnosis.summary import assemble, first_look, whole_logs
 from bayessim_mjx.diagnosis.summary.files import Files
 from bayessim_mjx.effects.effect import Effect
 from bayessim_mjx.logs import read_logs
@@ -110,6 +110,7 @@ def investigate(
     progress: Progress | None = None,
     keep: Callable[[Setup, Tried | None], None] | None = None,
     verdict: Callable[[Findings], None] | None = None,
+    early: Callable[[Sequence[str]], None] | None = None,
 ) -> Findings:
     """The whole computation, before anything is put into words or written.
 
@@ -121,14 +122,16 @@ def investigate(
         stages: after the selection, optional ones last; None: `STAGES`.
         keep: called with what is known while the search goes on: the setup, and after each part what was tried.
         verdict: called with the findings before the optional stages.
+        early: called with what the logs tell before any simulation, in lines.
 
     Raises:
         UserError: nothing usable. TooLittleData: nothing could be held out.
     """
     say = progress or (lambda text, done, total: None)
-    known = keep or (lambda setup, tried: None)
+    known, tell = keep or (lambda setup, tried: None), early or (lambda lines: None)
     say("looking at the logs", 0, 1)
-    setup = prepare(robot, logs, effects, group=group, seed=seed, settings=settings, tolerated=tolerated, notes=notes)
+    asked: dict[str, Any] = {"group": group, "seed": seed, "settings": settings, "tolerated": tolerated, "notes": notes}
+    setup = prepare(robot, logs, effects, **asked, seen_first=lambda seen: tell(first_look.lines(seen)))
     for text in setup.said:
         say(text, 0, 1)
     known(setup, None)
@@ -166,11 +169,14 @@ def diagnose(
     group: str | None = None,
     tolerance: str | Sequence[str] = (),
     criteria: Criteria | None = None,
+    accuracy: str | Sequence[str] = (),
+    payload: str | Sequence[str] = (),
     seed: int = 0,
     out: str | Path | None = None,
     progress: Progress | None = None,
     notes: Sequence[str] = (),
     about: Mapping[str, Any] | None = None,
+    early: Callable[[Sequence[str]], None] | None = None,
 ) -> Diagnosis:
     """Where logs and simulator differ, which missing effects cause it, and how much they explain.
 
@@ -183,12 +189,11 @@ def diagnose(
         map: YAML file that maps the columns of the logs to the model.
         group: metadata key of the operating conditions that are held out in turn.
         tolerance: what may stay unexplained, as `--tolerance`: "0.5deg", "elbow=2mm", "3%".
+        accuracy, payload: of a data sheet, as the flags: "5%", "mass=2%"; "12kg", "tool=12".
         criteria: when one model is better than another and which is named; None: as measured in benchmarks/results.md.
-        seed: of all random numbers.
-        out: folder for what the command writes, but for the report; None: nothing is written.
-        progress: called with (what is being done, done, total).
-        notes: what was noticed before, first among the warnings.
-        about: entries of the report's header in the place of those made here.
+        seed: of all random numbers; out: folder for what the command writes, but for the report; None: nothing.
+        progress: called with (what is being done, done, total); early: with what logs tell at once, in lines.
+        notes: first among the warnings; about: entries of the report's header.
 
     Returns:
         The result; too little data is a verdict, not an error.
@@ -197,7 +202,7 @@ def diagnose(
         UserError: model, logs, effects or tolerance are not usable.
     """
     with noting() as noticed:
-        robot = robot_of(model, parameters)
+        robot = robot_of(model, parameters).stated(_several(accuracy), _several(payload))
         recorded = _logs(logs, robot.mj_model, map)
     noticed = [*notes, *noticed]
     told = {
@@ -207,9 +212,8 @@ def diagnose(
         **(about or {}),
     }  # fmt: skip
     files = Files(None if out is None else Path(out), told)
-    asked: Any = {"group": group, "seed": seed, "notes": noticed, "progress": progress}
-    asked["criteria"] = criteria
-    asked["tolerated"] = [tolerance] if isinstance(tolerance, str) else tolerance
+    asked: Any = {"group": group, "seed": seed, "notes": noticed, "progress": progress, "criteria": criteria}
+    asked |= {"tolerated": _several(tolerance), "early": early}
     try:
         found = investigate(robot, recorded, effects, **asked, keep=files.so_far, verdict=files.verdict)
     except TooLittleData as reason:
@@ -232,6 +236,10 @@ def _logs(logs: Any, model: mujoco.MjModel, map: str | Path | None) -> list[Log]
     if all(isinstance(log, Log) for log in each):
         return each
     return read_logs(each if len(each) > 1 else each[0], model, map)
+
+
+def _several(texts: str | Sequence[str]) -> Sequence[str]:
+    return [texts] if isinstance(texts, str) else texts
 
 
 def _names(logs: Any) -> list[str]:

@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 
 from bayessim_mjx import effects as library
 from bayessim_mjx.diagnosis import tolerance
+from bayessim_mjx.diagnosis.equation_error import leads
+from bayessim_mjx.diagnosis.equation_error.look import Look
 from bayessim_mjx.diagnosis.fitting import candidates, command_shift, discretisation, scales, stability, windows
 from bayessim_mjx.diagnosis.fitting.centred_commands import physics_of
 from bayessim_mjx.diagnosis.fitting.fitter import Fitter
@@ -74,6 +76,7 @@ class Setup:
     warnings: tuple[str, ...] = ()
     said: tuple[str, ...] = ()  # of the warnings, what is said before the search
     discretisation: discretisation.Discretisation | None = None
+    look: Look = Look()
 
     @property
     def logs(self) -> tuple[Log, ...]:
@@ -98,6 +101,7 @@ def prepare(
     settings: Settings | None = None,
     tolerated: Sequence[str] = (),
     notes: Sequence[str] = (),
+    seen_first: Callable[[Look], None] = lambda seen: None,
 ) -> Setup:
     """Everything up to the first simulation.
 
@@ -105,6 +109,7 @@ def prepare(
         robot, logs, effects, group, seed, tolerated: see `run.diagnose`.
         settings: budgets of the search; None: by the robot's size.
         notes: what was noticed before, first among the warnings.
+        seen_first: called with what the logs tell before any simulation.
 
     Raises:
         UserError: unknown effects, no usable log, a tolerance that cannot be read.
@@ -112,12 +117,13 @@ def prepare(
     """
     asked = tolerance.read(tolerated, robot.mj_model)
     dt = control_period(robot, logs)
-    seen = gate.check(logs, robot.mj_model, dt)
+    told = [*notes]
+    seen, before = leads.checked(logs, robot, dt, told, seen_first)
     usable = seen.demand()
-    told = [*notes, *seen.warnings, *(f"{text} (found, not assumed)" for text in seen.findings)]
+    told += [*seen.warnings, *(f"{text} (found, not assumed)" for text in seen.findings)]
     floors = noise.floors(usable)
     kinds = [library.load(n) if isinstance(n, str) else n for n in (library.names() if effects == "all" else effects)]
-    size = scales.measure(robot.mj_model, [resample(log, dt) for log in usable])
+    size = scales.measure(robot.mj_model, [resample(log, dt) for log in usable], robot.rating)
     stack, left_out = candidates.stack(kinds, size)
     own, delivered = robot.physics(dt), float(robot.mj_model.opt.timestep)
     stable = stability.needed(own.mj_model, usable)
@@ -132,23 +138,19 @@ def prepare(
     physics = physics_of(robot, dt, stack)
     most = _limit(physics, step.errors.cut.steps if step.errors else cuts(1).steps)
     cut = step.noisier(cuts(step.factor, limit=most, centred=False, late=lead))
-    fitter = Fitter(Simulator(physics, cut), candidates.base_coordinates(robot.space), physics.space.nominal)
-    every = tuple(candidates.enumerate_candidates(physics))
-    settings = dataclasses.replace(settings or _settings(robot), believed=step.believed)
+    base = candidates.base_coordinates(robot.space, robot.accuracy)
+    fitter = Fitter(Simulator(physics, cut), base, physics.space.nominal)
+    led = leads.lead(candidates.enumerate_candidates(physics), before)
+    settings = dataclasses.replace(settings or _settings(robot), believed=step.believed, **led.order)
     allowed = tolerance.judge(robot.mj_model, 2 * size.travel, cut.sigma_q, asked)
     said = [*stable.sentences(), *step.beyond(), *_faster(seen.usable, delivered, dt)]
     if shift is not None and shift.certain:
         said.append(shift.sentence(float(np.median([log.period for log in logs]))))
-    told += [
-        *said,
-        *floors.warnings,
-        *(step.warnings() if stable.factor == 1 else ()),
-        *(f"not tried: {text}" for text in left_out),
-        *_few_conditions(cut),
-    ]
-    told += allowed.warnings()
-    fixed = (robot, physics, seen, floors, fitter, every, size, settings, seed, allowed)
-    return Setup(*fixed, tuple(told), tuple(said), step)
+    told += [*said, *floors.warnings, *(step.warnings() if stable.factor == 1 else ())]
+    told += [*(f"not tried: {text}" for text in left_out), *_few_conditions(cut)]
+    told += [*allowed.warnings(), *led.sentences()]
+    fixed = (robot, physics, seen, floors, fitter, led.candidates, size, settings, seed, allowed)
+    return Setup(*fixed, tuple(told), tuple(said), step, before)
 
 
 def _settings(robot: Robot) -> Settings:

@@ -57,7 +57,7 @@ class Scorer:
     def _posterior(self, model: Model, discount: float) -> Array:
         q, _ = model.fit.quadratic(self.fitter.spread)
         _, S = q.weighted(model.fit.weight)
-        return discount * S + np.diag(model.fit.prior()[0])
+        return discount * S + np.diag(model.fit.belief())
 
     def score(self, played: Sequence[Played], shift: Array, each: int) -> list[Array]:
         """Evidence `[M, M]` in nats of every experiment: row the truth, column the rival that adapts.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import mujoco
@@ -29,6 +29,8 @@ class Coordinate:
         name: of the (first) parameter; index: its entries in theta.
         neutral, low, high: unit as the parameter's.
         precision: of a Gaussian prior around neutral, 1/unit^2 (0: flat between the bounds).
+        stated: the prior is what a data sheet states. It then weighs as much as the misfit says that the data know:
+            while an effect is missing, no parameter takes its place because the noise alone is small.
         unit: for people.
     """
 
@@ -39,6 +41,7 @@ class Coordinate:
     high: float
     precision: float = 0.0
     unit: str = ""
+    stated: bool = False
 
     @property
     def step(self) -> float:
@@ -69,15 +72,22 @@ class Candidate:
         return f"{self.effect}@{self.where}"
 
 
-def base_coordinates(space: ParameterSpace) -> tuple[Coordinate, ...]:
-    """The parameters that the simulator already has: a weak Gaussian prior inside their ranges."""
+def base_coordinates(space: ParameterSpace, accuracy: Mapping[str, float] | None = None) -> tuple[Coordinate, ...]:
+    """The parameters that the simulator already has, Gaussian where a data sheet states them, else nearly flat.
+
+    Args:
+        accuracy: {name: standard deviation as a share of the nominal value}, of those that are stated.
+    """
+    stated = accuracy or {}
     return tuple(
-        Coordinate(p.name, (i,), p.nominal, p.low, p.high, _precision(p), p.unit)
+        Coordinate(p.name, (i,), p.nominal, p.low, p.high, _precision(p, stated.get(p.name)), p.unit, p.name in stated)
         for i, p in enumerate(space.parameters)
     )
 
 
-def _precision(p: Parameter) -> float:
+def _precision(p: Parameter, accuracy: float | None) -> float:
+    if accuracy is not None and p.nominal != 0:
+        return 1.0 / (accuracy * p.nominal) ** 2
     if p.prior == "gaussian" and p.sd:
         return 1.0 / p.sd**2
     return 1.0 / (0.58 * (p.high - p.low)) ** 2  # sd of a uniform prior, doubled: between the bounds nearly flat

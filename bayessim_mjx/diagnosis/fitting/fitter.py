@@ -14,12 +14,23 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from bayessim_mjx.diagnosis.fitting import quadratic
 from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
-from bayessim_mjx.diagnosis.fitting.quadratic import Quadratic, Rest, Starts, blocks, eliminate, held_out, solve
+from bayessim_mjx.diagnosis.fitting.quadratic import (
+    Quadratic,
+    Rest,
+    Starts,
+    blocks,
+    eliminate,
+    held_out,
+    solve,
+    weights,
+)
 from bayessim_mjx.diagnosis.fitting.simulator import Simulator
 
 Array = NDArray[np.float64]
 START_STEP = 0.2  # of the spread of the start states, for their finite differences
+NUMBERS = 2  # independent ones that one channel of one window holds: a missing force shows as a smooth curve
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,6 +42,7 @@ class Fit:
         r: whitened residuals `[W, n]`; A: `[W, n, k]`, minus their derivatives; B: `[W, n, s]` by the start states.
         weight: `[W]`; cost: weighted, priors included; damping: Levenberg's, of the next step.
         promise: by how much the next step would lower the cost if the model were linear; history: costs, step by step.
+        doubt: squared misfit per independent number in the data, by which priors of stated parameters are multiplied.
         reach: `[W]`, share of their own steps that the start states make: less after one that did a window harm.
     """
 
@@ -45,6 +57,7 @@ class Fit:
     damping: float = 1e-3
     promise: float = np.inf
     history: tuple[float, ...] = ()
+    doubt: float = 1.0
     reach: Array = field(default_factory=lambda: np.ones(1))
 
     @property
@@ -52,15 +65,21 @@ class Fit:
         return tuple(c.name for c in self.coordinates)
 
     def prior(self) -> tuple[Array, Array, Array, Array]:
-        """(precision, pull, room below, room above), `[k]` each."""
-        precision = np.array([c.precision for c in self.coordinates])
+        """(precision, pull, room below, room above), `[k]` each, in units of the cost."""
+        precision = np.array([c.precision * (self.doubt if c.stated else 1.0) for c in self.coordinates])
         neutral = np.array([c.neutral for c in self.coordinates])
         low = np.array([c.low for c in self.coordinates]) - self.values
         high = np.array([c.high for c in self.coordinates]) - self.values
         return precision, precision * (neutral - self.values), low, high
 
-    def penalty(self, values: Array) -> float:
-        return float(sum(c.precision * (v - c.neutral) ** 2 for c, v in zip(self.coordinates, values, strict=True)))
+    def belief(self) -> Array:
+        """Precision of the priors `[k]` in units of the parameters, for use beside a curvature in nats."""
+        return np.array([c.precision for c in self.coordinates])
+
+    def penalty(self, values: Array, stated: bool = False) -> float:
+        """Of the priors, as they are: of parameters that are stated, or of the others."""
+        pairs = zip(self.coordinates, values, strict=True)
+        return float(sum(c.precision * (v - c.neutral) ** 2 for c, v in pairs if c.stated == stated))
 
     def quadratic(self, spread: Array) -> tuple[Quadratic, Starts]:
         return eliminate(self.r, self.A, self.B, self.offsets, spread)
@@ -83,6 +102,7 @@ class Fitter:
         self.sigma = sigma[self.used]
         self.spread = windows.spread
         self.size = windows.steps * int(self.used.sum())
+        self.numbers = float(NUMBERS * len(windows) * int(np.isfinite(windows.sigma_q).sum()))
 
     def whiten(self, errors: Array) -> Array:
         """`[..., W, H, channels]` -> `[..., W, n]`."""
@@ -135,11 +155,25 @@ class Fitter:
         offsets = np.repeat(fit.offsets[None], 1 + len(thetas), 0)
         r = self.whiten(self.simulator.run(np.stack([theta, *thetas]), offsets))
         B = self.start_columns(theta, fit.offsets, r[0])
-        new = replace(fit, r=r[0], A=_columns(r[0], r[1:], steps), B=B, weight=weights(r[0]))
+        new = replace(fit, r=r[0], A=quadratic.columns(r[0], r[1:], steps), B=B, weight=weights(r[0]))
+        new = replace(new, doubt=self._doubt(self._data(new, new.r, new.offsets)))
         return replace(new, cost=self.cost(new, new.r, new.offsets, new.values))
 
     def cost(self, fit: Fit, r: Array, offsets: Array, values: Array) -> float:
-        return float(fit.weight @ self._each(r, offsets)) + fit.penalty(values)
+        """Of data and priors. Those of stated parameters belong to errors of unknown size: data * exp(prior / numbers).
+
+        That is the likelihood with the size of the errors at its best, n log(data) + prior, as a cost.
+        """
+        data = self._data(fit, r, offsets)
+        stated = fit.penalty(values, stated=True) / self.numbers
+        return data + fit.penalty(values) + self.numbers * self._doubt(data) * float(np.expm1(min(stated, 50.0)))
+
+    def _data(self, fit: Fit, r: Array, offsets: Array) -> float:
+        return float(fit.weight @ self._each(r, offsets))
+
+    def _doubt(self, data: float) -> float:
+        """Squared misfit per independent number; under a perfect model the noise's own."""
+        return max(data, float(self.size * len(self.simulator.windows))) / self.numbers
 
     def _each(self, r: Array, offsets: Array) -> Array:
         return np.sum(r**2, 1) + np.sum((offsets / self.spread) ** 2, 1)
@@ -149,7 +183,7 @@ class Fitter:
         own = tuple(fit.coordinates) + tuple(extra)
         blank = np.zeros((*fit.r.shape, len(extra)))
         start, columns = np.concatenate([fit.values, values]), np.concatenate([fit.A, blank], 2)
-        return Fit(own, start, fit.offsets, fit.r, columns, fit.B, fit.weight, np.inf)
+        return Fit(own, start, fit.offsets, fit.r, columns, fit.B, fit.weight, np.inf, doubt=fit.doubt)
 
     def iterate(
         self,
@@ -204,8 +238,9 @@ class Fitter:
             A = fit.A.copy()
             if np.isfinite(fit.cost) and len(which) < len(fit.coordinates):
                 _broyden(A, fit, values, x, r[0], which)
-            A[:, :, which] = _columns(r[0], r[1:], steps)
-            fit = replace(fit, values=values, offsets=x, r=r[0], A=A, cost=cost)
+            A[:, :, which] = quadratic.columns(r[0], r[1:], steps)
+            doubt = self._doubt(self._data(fit, r[0], x))
+            fit = replace(fit, values=values, offsets=x, r=r[0], A=A, cost=cost, doubt=doubt)
             damping, reach = max(fit.damping / 5, 1e-7), np.minimum(2 * fit.reach, 1.0)
         else:
             # near a contact a start state's full step may be far too long, and no damping of the parameters shortens it
@@ -220,7 +255,7 @@ class Fitter:
         precision, pull, low, high = fit.prior()
         S = S + np.diag(precision)
         p = solve(S + fit.damping * np.diag(np.diag(S)), g + pull, low, high)
-        by_starts = fit.cost - fit.penalty(fit.values) - float(fit.weight @ q.c)
+        by_starts = self._data(fit, fit.r, fit.offsets) - float(fit.weight @ q.c)
         promise = by_starts + float(2 * (g + pull) @ p - p @ S @ p)
         moved = fit.offsets + np.reshape(fit.reach, (-1, 1)) * starts.step(fit.A, p)
         return replace(fit, promise=promise), (fit.values + p, moved)
@@ -242,13 +277,6 @@ class Fitter:
         return [tells(group == name) for name in np.unique(group)]
 
 
-def _columns(r: Array, shifted: Array, steps: Sequence[float]) -> Array:
-    """A `[W, n, k]`: minus the derivative of the residual."""
-    if not len(steps):
-        return np.zeros((*r.shape, 0))
-    return np.moveaxis((r[None] - shifted) / np.asarray(steps)[:, None, None], 0, -1)
-
-
 def _broyden(A: Array, fit: Fit, values: Array, x: Array, r: Array, which: Sequence[int]) -> None:
     """Rank-one correction, in place, of the columns A not differenced anew, so that they explain the step just made."""
     dp = values - fit.values
@@ -260,13 +288,6 @@ def _broyden(A: Array, fit: Fit, values: Array, x: Array, r: Array, which: Seque
     weight = scaled / max(float(scaled @ dp[kept]), 1e-300)
     share = float(scaled @ dp[kept]) / max(float(np.sum((dp / [c.high - c.low for c in fit.coordinates]) ** 2)), 1e-300)
     A[:, :, kept] += share * missed[:, :, None] * weight[None, None, :]
-
-
-def weights(r: Array) -> Array:
-    """Huber weights of whole windows: those far worse than the rest (a stop, a stick phase, a push) count less."""
-    each = np.sqrt(np.mean(r**2, 1))
-    limit = 4.0 * np.median(each) + 1e-12
-    return np.minimum(1.0, limit / np.maximum(each, 1e-300))
 
 
 def _settled(fit: Fit, tolerance: float) -> bool:

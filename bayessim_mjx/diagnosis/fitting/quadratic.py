@@ -234,3 +234,17 @@ def _variances(S: Array) -> Array:
     scale = 1 / np.sqrt(np.maximum(np.diag(S), 1e-300))
     inverse = np.diag(np.linalg.pinv(S * scale[:, None] * scale[None, :], hermitian=True)) * scale**2
     return np.where(np.diag(S) > 0, inverse, np.inf)
+
+
+def weights(r: Array) -> Array:
+    """Huber weights of whole windows: those far worse than the rest (a stop, a stick phase, a push) count less."""
+    each = np.sqrt(np.mean(r**2, 1))
+    limit = 4.0 * np.median(each) + 1e-12
+    return np.minimum(1.0, limit / np.maximum(each, 1e-300))
+
+
+def columns(r: Array, shifted: Array, steps: Sequence[float]) -> Array:
+    """A `[W, n, k]`: minus the derivative of the residual."""
+    if not len(steps):
+        return np.zeros((*r.shape, 0))
+    return np.moveaxis((r[None] - shifted) / np.asarray(steps)[:, None, None], 0, -1)

@@ -4,7 +4,7 @@ import copy
 import dataclasses
 import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -13,6 +13,7 @@ import numpy as np
 
 from bayessim_mjx import config
 from bayessim_mjx.config import foreign
+from bayessim_mjx.diagnosis import data_sheet
 from bayessim_mjx.effects.effect import Effect
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.parameters import ParameterSpace, elements
@@ -39,6 +40,7 @@ class Robot:
         space: the parameters that the simulator already has and may recalibrate.
         name: the task's, or the file's without its ending.
         max_qvel: the task's limit of simulated speeds, see `Physics`.
+        accuracy: {parameter: standard deviation as a share}, of what a data sheet states; rating: {body: kg carried}.
     """
 
     mj_model: mujoco.MjModel
@@ -47,6 +49,19 @@ class Robot:
     space: ParameterSpace
     name: str
     max_qvel: float | Sequence[float] | None = None
+    accuracy: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    rating: Mapping[int, float] = dataclasses.field(default_factory=dict)
+
+    def stated(self, accuracy: Sequence[str] = (), payload: Sequence[str] = ()) -> "Robot":
+        """With what was said of its data sheet, as `--accuracy` and `--payload` (`data_sheet`)."""
+        shares = data_sheet.accuracies(accuracy, self.space, None)
+        rated = data_sheet.rating(payload, self.mj_model)
+        return dataclasses.replace(self, accuracy={**self.accuracy, **shares}, rating={**self.rating, **rated})
+
+    def _from_data_sheet(self, own: bool) -> "Robot":
+        """A model's own numbers are taken for a data sheet's; ranges of a file say themselves what is known."""
+        accuracy = data_sheet.accuracies((), self.space, data_sheet.ACCURACY) if own else {}
+        return dataclasses.replace(self, accuracy=accuracy)
 
     def physics(
         self, control_dt: float, effects: Sequence[Effect] = (), space: ParameterSpace | None = None
@@ -70,11 +85,11 @@ def robot_of(source: Source, parameters: str | Path | None = None) -> Robot:
     """
     if isinstance(source, Robot):
         space = source.space if parameters is None else read_params(parameters, source.mj_model)
-        return dataclasses.replace(source, space=space)
+        return dataclasses.replace(source, space=space, accuracy=source.accuracy if parameters is None else {})
     if isinstance(source, mujoco.MjModel):
         name = bytes(source.names).split(b"\0")[0].decode() or "model"
         _check(source, name)
-        return Robot(source, None, None, _space(source, parameters), name)
+        return Robot(source, None, None, _space(source, parameters), name)._from_data_sheet(parameters is None)
     if isinstance(source, mujoco.MjSpec):
         return _of_spec(source.copy(), source.modelname or "model", source.modelname, parameters)
     return of_file(source, parameters)
@@ -113,7 +128,7 @@ def _of_spec(spec: mujoco.MjSpec, source: str, name: str, parameters: str | Path
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     model = _compiled(spec, source)
     _check(model, source)
-    return Robot(model, spec.copy, None, _space(model, parameters), name)
+    return Robot(model, spec.copy, None, _space(model, parameters), name)._from_data_sheet(parameters is None)
 
 
 def _loaded(path: Path) -> mujoco.MjSpec:

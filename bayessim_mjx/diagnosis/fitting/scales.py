@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from bayessim_mjx.diagnosis import data_sheet
 from bayessim_mjx.diagnosis.logcheck import loads
 from bayessim_mjx.effects.effect import Effect, Quantity
 from bayessim_mjx.effects.support.site import element_names
@@ -77,8 +78,12 @@ class Scales:
         return {word: float(getattr(self, word)[v]) for word in words} | {"period": self.period}
 
 
-def measure(model: mujoco.MjModel, logs: Sequence[Log]) -> Scales:
-    """Scales from logs on an even grid; forces by inverse dynamics of the measured motion, and from the commands."""
+def measure(model: mujoco.MjModel, logs: Sequence[Log], rating: Mapping[int, float] | None = None) -> Scales:
+    """Scales from logs on an even grid; forces by inverse dynamics of the measured motion, and from the commands.
+
+    Args:
+        rating: {body: kg} that the robot is rated to carry there.
+    """
     speed = _large([log.qvel for log in logs])
     ptp = np.max([_span(model, log) for log in logs], axis=0)
     data = mujoco.MjData(model)
@@ -113,7 +118,7 @@ def measure(model: mujoco.MjModel, logs: Sequence[Log]) -> Scales:
         command=np.maximum(command, 1e-9),
         effort=effort,
         moves=ptp > 10 * noise + 1e-9,
-        carried=loads.carried(model, np.array(places)),
+        carried=data_sheet.rated(loads.carried(model, np.array(places)), rating or {}),
         period=float(np.median([log.period for log in logs])),
     )
 

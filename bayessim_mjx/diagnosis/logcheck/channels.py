@@ -94,35 +94,43 @@ def compare(predicted: Array, measured: Array, step: float, rows: Mask) -> tuple
 
 def _controllers(log: Log, mj_model: mujoco.MjModel) -> Iterator[Link]:
     name, grid = "command -> effort", np.linspace(log.time[0], log.time[-1], len(log))
-    expected = _expected(log, mj_model)
+    target = expected(log, mj_model)
     for i, actuator in enumerate(log.actuators):
         stream = log.streams.get(f"effort:{actuator}")
         if stream is None or not np.isfinite(stream).all():
             yield _untested(name, actuator, "no complete effort stream was logged")
             continue
-        pair = [np.interp(grid, log.time, x) for x in (expected[:, i], stream)]
+        pair = [np.interp(grid, log.time, x) for x in (target[:, i], stream)]
         rows = log.enabled & (np.ptp(pair[0]) > 0) & (np.ptp(pair[1]) > 0)
         if rows.sum() < 20:
             yield _untested(name, actuator, "command or effort never changes while the drive is on")
             continue
         slope, correlation, lag = compare(pair[0], pair[1], log.period, rows)
-        yield _link(name, actuator, slope, correlation, lag, log.period, _declared(log))
+        yield _link(name, actuator, slope, correlation, lag, log.period, declared(log))
 
 
-def _declared(log: Log) -> bool:
+def declared(log: Log) -> bool:
     """Whether the unit of the effort is known: a law says what it is."""
     return controllers.declared(log.metadata)
 
 
-def _expected(log: Log, mj_model: mujoco.MjModel) -> Array:
+def expected(log: Log, mj_model: mujoco.MjModel) -> Array:
     """[T, nu] what each drive should have done: the declared law, else the model's own actuator with its servo."""
-    if _declared(log):
-        law = controllers.read(log.metadata, mj_model, log.actuators, log.name)
-        q, w = log.qpos[:, list(law.qadr)], log.qvel[:, list(law.dadr)]
-        kp, kd, limit, scale = (np.asarray(x, float) for x in (law.kp, law.kd, law.limit, law.scale))
-        closed = np.where(np.asarray(law.on_position) > 0, kp * (log.ctrl - q) - kd * w, kp * (log.ctrl - w))
-        loop = np.asarray(law.on_position) + np.asarray(law.on_velocity) > 0
-        return np.where(loop, np.clip(scale * closed, -limit, limit), scale * log.ctrl)
+    return through_law(log, mj_model) if declared(log) else forces(log, mj_model)
+
+
+def through_law(log: Log, mj_model: mujoco.MjModel) -> Array:
+    """[T, nu] ctrl that the declared law makes of the commands."""
+    law = controllers.read(log.metadata, mj_model, log.actuators, log.name)
+    q, w = log.qpos[:, list(law.qadr)], log.qvel[:, list(law.dadr)]
+    kp, kd, limit, scale = (np.asarray(x, float) for x in (law.kp, law.kd, law.limit, law.scale))
+    closed = np.where(np.asarray(law.on_position) > 0, kp * (log.ctrl - q) - kd * w, kp * (log.ctrl - w))
+    loop = np.asarray(law.on_position) + np.asarray(law.on_velocity) > 0
+    return np.where(loop, np.clip(scale * closed, -limit, limit), scale * log.ctrl)
+
+
+def forces(log: Log, mj_model: mujoco.MjModel) -> Array:
+    """[T, nu] forces of the model's own actuators for the log's ctrl and motion, before the gear."""
     out = np.zeros_like(log.ctrl)
     for i in range(mj_model.nu):
         dof = dof_of(mj_model, i)

@@ -147,8 +147,17 @@ def check(logs: Sequence[Log], mj_model: mujoco.MjModel, dt: float) -> Gate:
     return Gate(reports, qvel)
 
 
+def unusable(log: Log, dt: float) -> bool:
+    """Whether a log is refused on its own, before it is compared with a model."""
+    return any(f.kind == "refused" for f in _alone(log, dt))
+
+
+def _alone(log: Log, dt: float) -> tuple[Finding, ...]:
+    return tuple(f for test in single_log.CHECKS for f in test(log, dt))
+
+
 def _report(log: Log, mj_model: mujoco.MjModel, dt: float) -> Report:
-    own = tuple(f for test in single_log.CHECKS for f in test(log, dt))
+    own = _alone(log, dt)
     if any(f.kind == "refused" for f in own):
         return Report(log, own)  # nothing further can be computed from it
     related = tuple(relations(log, mj_model))

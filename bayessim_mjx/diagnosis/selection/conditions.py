@@ -40,7 +40,9 @@ def structural(tried: Tried, model: Model) -> dict[str, str]:
 def per_condition(tried: Tried, model: Model) -> tuple[Array, Array]:
     """Each condition's own estimate and standard deviation, `[G, k]`, one Newton step from the common fit."""
     q, _ = model.fit.quadratic(tried.fitter.spread)
-    precision, pull, low, high = model.fit.prior()
+    _, _, low, high = model.fit.prior()
+    precision = model.fit.belief()
+    pull = precision * (np.array([c.neutral for c in model.fit.coordinates]) - model.fit.values)
     group = tried.fitter.simulator.windows.group
     each, deviation = [], []
     inflation = max(model.total / model.fit.r.size, 0.5) * model.fit.r.size / model.samples

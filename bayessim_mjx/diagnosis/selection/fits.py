@@ -79,10 +79,17 @@ class Fits:
         return [s.candidate.label for s in self._screened[key] if s.gain > 0]
 
     def together(self, most: int, count: int) -> list[Key]:
-        """Sets of effects that promise most when all amplitudes are free at once (`dense`)."""
+        """Sets of effects that promise most when all amplitudes are free at once (`dense`), and what was proposed."""
         found = dense.supports(self.pool.base.fit, self.pool.screened, self.pool.settings.screened, most, count)
         self._amounts = {frozenset(s.candidate.label for s in starts): tuple(starts) for starts in found}
-        return list(self._amounts)
+        return list(dict.fromkeys([*self._amounts, *self._proposed(most)]))
+
+    def _proposed(self, most: int) -> list[Key]:
+        """The set of effects that was proposed before the search, from where each one's own screening starts it."""
+        known = [c for c in self.pool.screened if c.candidate.label in self.pool.settings.together]
+        own = [s.candidate for s in known]
+        apart = all(compatible(a, b) for i, a in enumerate(own) for b in own[:i])
+        return [frozenset(c.label for c in own)] if 1 < len(own) <= most and apart else []
 
     def fit(self, plans: Sequence[Plan], label: str) -> None:
         """Fit what was not fitted before, all in lockstep."""
@@ -176,4 +183,5 @@ def cut_back(pool: Pool, model: Model, kept: Sequence[Candidate]) -> Fit:
     names = {c.name for e in kept for c in e.coordinates}
     own = [i for i, c in enumerate(fit.coordinates) if i < base or c.name in names]
     coordinates = tuple(fit.coordinates[i] for i in own)
-    return Fit(coordinates, fit.values[own], fit.offsets, fit.r, fit.A[:, :, own], fit.B, fit.weight, np.inf)
+    columns = fit.A[:, :, own]
+    return Fit(coordinates, fit.values[own], fit.offsets, fit.r, columns, fit.B, fit.weight, np.inf, doubt=fit.doubt)

@@ -43,7 +43,9 @@ def begin(
     if not pool.above_noise(pool.base):
         fit_models(pool, [(pool.base, s) for s in pool.screened[:FEW]], "single effects", say)
         return pool
-    promising = [s for s in pool.screened if s.gain > 0][: settings.singles]
+    led = [s for s in pool.screened if s.candidate.label in settings.first]
+    others = [s for s in pool.screened if s.gain > 0 and s.candidate.label not in settings.first]
+    promising = [*led, *others][: max(settings.singles, len(led))]
     fit_models(pool, [(pool.base, s) for s in promising], "single effects", say)
     widen_leading(pool, say)
     keep(pool)

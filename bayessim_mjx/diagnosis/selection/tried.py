@@ -21,6 +21,7 @@ class Settings:
         singles: how many single effects are fitted; screened: windows looked at in screening.
         starts: of these fitted from several starts; iterations, tolerance: of a fit.
         fresh: base columns are differenced anew if there are at most so many.
+        first: labels of candidates that are fitted whatever the screening says; together: of a set of them that is.
         believed: share of the noise (rms) that is the sensors'; the rest is what the time step may be worth at most.
     """
 
@@ -31,6 +32,8 @@ class Settings:
     tolerance: float = 5e-3
     fresh: int = 6
     believed: float = 1.0
+    first: tuple[str, ...] = ()
+    together: tuple[str, ...] = ()
 
 
 class Tried:

@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 
 from bayessim_mjx import versions
-from bayessim_mjx.diagnosis import statistics
+from bayessim_mjx.diagnosis import phrases, statistics
 from bayessim_mjx.diagnosis.experiment.propose import Experiment
 from bayessim_mjx.diagnosis.findings import Findings, Where
+from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
 from bayessim_mjx.diagnosis.result import Diagnosis, Gap, Place
 from bayessim_mjx.diagnosis.selection import bounds, conditions, uncertainty
 from bayessim_mjx.diagnosis.selection.models import Model
@@ -35,6 +36,7 @@ class Limits:
     # shares of the named effects' cost, and of the gap, by which a flexible force alone does better
     beaten: float = 0.4
     relevant: float = 0.05
+    far: float = 2.0  # standard deviations from what a data sheet states, from where on that is told
 
 
 LIMITS = Limits()
@@ -145,9 +147,16 @@ def _parameters(tried: Tried, model: Model, sd: np.ndarray) -> dict[str, dict[st
         c.name: {
             "mean": float(model.fit.values[i]), "sd": float(sd[i]), "nominal": c.neutral, "low": c.low, "high": c.high,
             "unit": c.unit, "structural": remarks.get(c.name, ""),
+            "data_sheet": _against_data_sheet(c, float(model.fit.values[i])),
         }
         for i, c in enumerate(tried.fitter.base)
     }  # fmt: skip
+
+
+def _against_data_sheet(c: Coordinate, value: float) -> str:
+    """How far a known parameter is from what was stated of it, where that is far."""
+    away = abs(value - c.neutral) * c.precision**0.5
+    return phrases.far_from_data_sheet(value, away) if c.stated and away > LIMITS.far else ""
 
 
 def ranking(tried: Tried) -> list[dict[str, Any]]:

@@ -10,6 +10,7 @@ from bayessim_mjx.diagnosis.findings import Findings
 from bayessim_mjx.diagnosis.result import FoundEffect
 from bayessim_mjx.diagnosis.selection import conditions
 from bayessim_mjx.diagnosis.selection.tried import Tried
+from bayessim_mjx.diagnosis.summary import first_look
 from bayessim_mjx.diagnosis.summary.left_in_words import flexible_in_words
 from bayessim_mjx.diagnosis.tolerance import length_unit
 from bayessim_mjx.effects import spec_of
@@ -41,6 +42,7 @@ def details(found: Findings, effects: list[FoundEffect], closed: dict[str, Any])
             }
             for k in found.links
         ],
+        "before_simulation": {"lines": first_look.lines(found.setup.look)} | found.setup.look.to_dict(),
         "noise": [
             {"channel": n, "sigma": float(s)}
             for n, s in zip(Channels.of(found.setup.physics.mj_model).qvel, cut.sigma_q, strict=True)

@@ -12,6 +12,7 @@ import numpy as np
 
 from bayessim_mjx.diagnosis.selection.tried import Tried
 from bayessim_mjx.diagnosis.setup import Setup
+from bayessim_mjx.diagnosis.summary import first_look
 from bayessim_mjx.diagnosis.summary.assemble import ranking
 
 BEST = 20  # models listed
@@ -23,9 +24,8 @@ def write(path: Path, about: Mapping[str, Any], setup: Setup, tried: Tried | Non
     Args:
         about: what is diagnosed; tried: None before the first fit.
     """
-    found = {"verdict": None, "about": dict(about), "warnings": list(setup.warnings)} | (
-        {} if tried is None else _so_far(tried)
-    )
+    found = {"verdict": None, "about": dict(about), "before_simulation": first_look.lines(setup.look)}
+    found |= {"warnings": list(setup.warnings)} | ({} if tried is None else _so_far(tried))
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_suffix(".tmp")
     temporary.write_text(json.dumps(found | {"windows": len(setup.fitter.simulator.windows)}, indent=1) + "\n")

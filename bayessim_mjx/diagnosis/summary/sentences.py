@@ -11,6 +11,7 @@ from bayessim_mjx.diagnosis import statistics
 from bayessim_mjx.diagnosis.findings import Findings
 from bayessim_mjx.diagnosis.result import FoundEffect, Gap
 from bayessim_mjx.diagnosis.selection.selected import Rival
+from bayessim_mjx.diagnosis.summary import first_look
 from bayessim_mjx.diagnosis.summary.left_in_words import flexible_in_words
 from bayessim_mjx.diagnosis.vocabulary import listed, missing
 from bayessim_mjx.quantities import extent, percent
@@ -72,8 +73,10 @@ def sentences(
         told.append(CHANCE.format(calibrated=stage_in_words(far, "calibrated")))
     if name == "unexplained" and found.flexible_winner is not None:
         told += [f"{text[:1].upper()}{text[1:]}." for text in flexible_in_words(found.flexible_winner)]
+    told += [first_look.apart(found.setup.look)]
     told += [f"At its bound: {missing(e.name, e.where)}. {e.sentence}" for e in effects if _at_bound(e)]
     told += [f"{k} {v['structural']}." for k, v in parameters.items() if v["structural"]]
+    told += [f"{k} {v['data_sheet']}." for k, v in parameters.items() if v.get("data_sheet")]
     return [text for text in told if text]
 
 

@@ -1,0 +1,87 @@
+"""What a data sheet states of a robot: how accurate its numbers are, and what it is rated to carry."""
+
+from __future__ import annotations
+
+import fnmatch
+import math
+from collections.abc import Mapping, Sequence
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from bayessim_mjx.errors import UserError
+from bayessim_mjx.parameters import ParameterSpace
+from bayessim_mjx.parameters.attributes import suggest
+
+Array = NDArray[np.float64]
+ACCURACY = 0.05  # standard deviation of what a data sheet says, as a share of it
+
+
+def accuracies(texts: Sequence[str], space: ParameterSpace, default: float | None) -> dict[str, float]:
+    """{parameter: standard deviation as a share of its nominal value} of `5%`, `mass=2%`, `elbow*=20%`, also in one.
+
+    A name is one of a parameter, of what it changes (mass, damping, armature) or of the element that has it, or a
+    pattern. Later ones go before earlier ones; a parameter whose own prior is Gaussian keeps that.
+
+    Args:
+        default: of what nothing is said of; None: nothing is stated of it.
+
+    Raises:
+        UserError: no such parameter, or no share above 0.
+    """
+    own = {p.name: default for p in space.parameters if default is not None and _open(p)}
+    for part in (p.strip() for text in texts for p in text.split(",") if p.strip()):
+        name, _, value = part.rpartition("=")
+        share = _number(part, value, "%", "--accuracy", "a share above 0, as in 5% or mass=2%") / 100
+        named = [p.name for p in space.parameters if not name or _called(p, name)]
+        if not named:
+            every = [*dict.fromkeys(p.attribute for p in space.parameters), *space.names]
+            raise UserError(f"--accuracy {part}: no known parameter {name!r}; {suggest(name, every)}")
+        own |= {p.name: share for p in space.parameters if p.name in named and (name or _open(p))}
+    return {name: float(share) for name, share in own.items() if share is not None}
+
+
+def _open(p: object) -> bool:
+    """Whether a parameter leaves its accuracy to be stated."""
+    return getattr(p, "prior", "") != "gaussian" and getattr(p, "nominal", 0.0) != 0.0
+
+
+def _called(p: object, name: str) -> bool:
+    return any(fnmatch.fnmatchcase(str(getattr(p, k)), name) for k in ("name", "attribute", "target"))
+
+
+def rating(texts: Sequence[str], model: mujoco.MjModel) -> dict[int, float]:
+    """{body: kg} that a robot is rated to carry: `12kg` on every body that moves, `tool=12` on one.
+
+    Raises:
+        UserError: no such body, or no mass above 0.
+    """
+    moving = [b for b in range(1, model.nbody) if model.body_weldid[b] != 0]
+    names = {model.body(b).name or f"body{b}": b for b in moving}
+    out: dict[int, float] = {}
+    for part in sorted((p.strip() for text in texts for p in text.split(",") if p.strip()), key=lambda p: "=" in p):
+        name, _, value = part.rpartition("=")
+        mass = _number(part, value, "kg", "--payload", "a mass above 0 in kg, as in 12kg or tool=12kg")
+        if name and name not in names:
+            raise UserError(f"--payload {part}: no moving body {name!r}; {suggest(name, names)}")
+        out |= dict.fromkeys([names[name]] if name else moving, mass)
+    return out
+
+
+def rated(carried: Array, given: Mapping[int, float]) -> Array:
+    """`[nbody]` kg that may be on each body: as stated, else as found."""
+    out = np.array(carried, float)
+    for body, mass in given.items():
+        out[body] = mass
+    return out
+
+
+def _number(part: str, text: str, unit: str, flag: str, allowed: str) -> float:
+    try:
+        value = float(text.strip().removesuffix(unit))
+    except ValueError:
+        raise UserError(f"{flag} {part}: {text!r} is no number; allowed: {allowed}") from None
+    if not 0 < value < math.inf:
+        raise UserError(f"{flag} {part}: {text} is not above 0; allowed: {allowed}")
+    return value * (100 if unit == "%" and not text.strip().endswith("%") else 1)

@@ -1,0 +1,1 @@
+"""What logs say before anything is simulated: regression of measured efforts on inverse dynamics, in seconds."""

@@ -1,0 +1,166 @@
+"""Which effects the efforts call for: added one by one as long as parts of the data that were held out gain by it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayessim_mjx.diagnosis.equation_error import fit as fitting
+from bayessim_mjx.diagnosis.equation_error.fit import Fit, Term
+from bayessim_mjx.diagnosis.equation_error.sums import Sums
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Criteria:
+    """When an effect is proposed. The error rates are those of benchmarks/results.md (diagnosis: seconds first).
+
+    Attributes:
+        nats: held-out log density that an effect has to bring, beside the logarithm of the number of effects tried.
+        least: share of a joint's effort (rms) that an effect has to be; above: and of what stays unexplained there.
+        looked: effects that are held out in each round, the best of all in sample.
+        most: effects proposed at most.
+        same: nats by which another effect may be behind to be told as well, and its share of the effect's own gain.
+    """
+
+    nats: float = 10.0
+    least: float = 0.03
+    above: float = 0.5
+    looked: int = 8
+    most: int = 4
+    same: float = 5.0
+    share: float = 0.1
+
+
+CRITERIA = Criteria()
+
+
+@dataclass(frozen=True, eq=False)
+class Proposal:
+    """An effect that the efforts call for.
+
+    Attributes:
+        term: the effect at its place; parameters, deviations: of the fit with all proposals.
+        nats: held-out log density that it brought; rivals: labels of what would do as well in its place.
+    """
+
+    term: Term
+    parameters: dict[str, float]
+    deviations: dict[str, float]
+    nats: float
+    rivals: tuple[str, ...] = ()
+
+    @property
+    def label(self) -> str:
+        return self.term.label
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """What the search came to: the known parameters alone, and with the proposals."""
+
+    base: Fit
+    fit: Fit
+    proposals: tuple[Proposal, ...]
+    density: tuple[float, float]  # held-out, of both
+
+
+def search(sums: Sums, known: Sequence[Term], terms: Sequence[Term]) -> Found:
+    """Forward selection with a look back; what is scaled or added twice is not tried."""
+    base = fitting.fit(sums, known)
+    threshold = CRITERIA.nats + math.log(max(len(terms), 1))
+    chosen: list[tuple[Term, tuple[str, ...]]] = []
+    now, density = base, fitting.score(sums, known)
+    before = density
+    while len(chosen) < CRITERIA.most:
+        own = [t for t, _ in chosen]
+        tried = _tried(sums, [*known, *own], [t for t in terms if _apart(t, own)], now)
+        if not tried:
+            break
+        (best, score), *others = tried
+        gain = float(score.sum() - density.sum())
+        if gain < threshold or not _everywhere(score - density):
+            break
+        after = fitting.fit(sums, [*known, *own, best])
+        if not _matters(sums, after, best):
+            break
+        near = max(CRITERIA.same, CRITERIA.share * gain)
+        same = tuple(t.label for t, s in others if score.sum() - s.sum() < near)
+        chosen.append((best, same))
+        now, density = after, score
+        chosen = _back(sums, known, chosen, density, threshold)
+    own = [t for t, _ in chosen]
+    now = fitting.fit(sums, [*known, *own])
+    density = fitting.score(sums, [*known, *own])
+    return Found(base, now, _proposals(sums, known, chosen, now, density), (before.sum(), density.sum()))
+
+
+def _tried(sums: Sums, kept: Sequence[Term], terms: Sequence[Term], now: Fit) -> list[tuple[Term, Array]]:
+    """Terms with their held-out densities, best first, of those that are best in sample."""
+    fits = [(t, fitting.fit(sums, [*kept, t], start=now.variance)) for t in terms]
+    good = sorted(
+        ((t, fitting.evidence(sums, f)) for t, f in fits if f.feasible and np.isfinite(f.values).all()),
+        key=lambda p: -p[1],
+    )
+    held = [(t, fitting.score(sums, [*kept, t], start=now.variance)) for t, _ in good[: CRITERIA.looked]]
+    return sorted(held, key=lambda p: -(p[1].sum() - 0.5 * p[0].count))
+
+
+def _everywhere(gains: Array) -> bool:
+    """Not by one part of the data alone."""
+    return len(gains) < 2 or float(gains.sum() - gains.max()) > 0
+
+
+def _matters(sums: Sums, after: Fit, term: Term) -> bool:
+    """Whether an effect is worth telling, and more than noise of the motion makes of the known parameters."""
+    left = np.sqrt(after.variance) / np.maximum(fitting.size_of(sums), 1e-300)
+    limit = np.maximum(CRITERIA.least, CRITERIA.above * left)
+    return bool(np.any(fitting.contribution(sums, after, term) > limit))
+
+
+def _apart(term: Term, chosen: Sequence[Term]) -> bool:
+    """Not the same effect twice at one place, at one and at all, nor two loads on one body."""
+    same = [t for t in chosen if t.effect == term.effect]
+    return all(t.where != term.where and "all" not in (t.where, term.where) for t in same)
+
+
+def _back(
+    sums: Sums, known: Sequence[Term], chosen: list[tuple[Term, tuple[str, ...]]], density: Array, threshold: float
+) -> list[tuple[Term, tuple[str, ...]]]:
+    """Without what a later effect made superfluous."""
+    for pair in chosen[:-1]:
+        rest = [t for t, _ in chosen if t is not pair[0]]
+        if density.sum() - fitting.score(sums, [*known, *rest]).sum() < threshold:
+            return [p for p in chosen if p is not pair]
+    return chosen
+
+
+def _proposals(
+    sums: Sums, known: Sequence[Term], chosen: Sequence[tuple[Term, tuple[str, ...]]], now: Fit, density: Array
+) -> tuple[Proposal, ...]:
+    out = []
+    for term, same in chosen:
+        rest = [t for t, _ in chosen if t is not term]
+        gain = float(density.sum() - fitting.score(sums, [*known, *rest]).sum())
+        values, own = now.of(term), now.at(term)
+        means = dict(term.read(values))
+        out.append(Proposal(term, means, _deviations(term, values, now.covariance[own, own]), gain, same))
+    return tuple(sorted(out, key=lambda p: -p.nats))
+
+
+def _deviations(term: Term, values: Array, covariance: Array) -> dict[str, float]:
+    """Standard deviations of what is read from coefficients, by finite differences."""
+    mean = term.read(values)
+    steps = 1e-4 * np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+    slopes = {k: np.zeros(len(values)) for k in mean}
+    for i, step in enumerate(steps):
+        moved = values.copy()
+        moved[i] += step
+        for k, x in term.read(moved).items():
+            slopes[k][i] = (x - mean[k]) / step
+    return {k: max(float(s @ covariance @ s), 0.0) ** 0.5 for k, s in slopes.items()}

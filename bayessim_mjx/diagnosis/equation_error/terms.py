@@ -1,0 +1,232 @@
+"""Known parameters and effects as terms of the effort: those of the library that are (nearly) linear in it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from bayessim_mjx.diagnosis.data_sheet import ACCURACY
+from bayessim_mjx.diagnosis.equation_error import rigid
+from bayessim_mjx.diagnosis.equation_error.columns import Layout
+from bayessim_mjx.diagnosis.equation_error.fit import Term
+from bayessim_mjx.diagnosis.logcheck import loads
+from bayessim_mjx.diagnosis.logcheck.drives import dof_of
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Ranges:
+    """What is taken for possible."""
+
+    gain: tuple[float, float] = (0.2, 3.0)
+    share: float = 1.0  # of the load that dry friction may be
+    tilt: float = 0.3  # rad
+    late: float = 3.0  # periods: standard deviation of how late efforts are
+
+
+RANGES = Ranges()
+# of one joint: {effect: (column, name of the parameter, sign allowed)}
+ON_JOINT = {
+    "coulomb_friction": ("dry", "level", 0.0),
+    "viscous_friction": ("speed", "damping", 0.0),
+    "quadratic_drag": ("drag", "coefficient", 0.0),
+    "armature": ("acceleration", "inertia", 0.0),
+}
+
+
+def names(model: mujoco.MjModel, kind: str, count: int) -> list[str]:
+    return [getattr(model, kind)(i).name or f"{kind}{i}" for i in range(count)]
+
+
+def known(
+    model: mujoco.MjModel, layout: Layout, accuracy: Mapping[tuple[str, str], float], period: float
+) -> list[Term]:
+    """Masses, rotor inertias and damping as accurate as they are known; and how late efforts are.
+
+    Args:
+        accuracy: {(mass, armature or damping; element): standard deviation as a share}; others: as of data sheets.
+        period: s between the logs' rows.
+    """
+    nominal = rigid.nominal(model)
+    out = []
+    for i, body in enumerate(rigid.moving_bodies(model)):
+        column = np.zeros(layout.size)
+        column[layout.body(i)] = nominal[i]
+        if nominal[i, 0] > 0:
+            name = model.body(body).name or f"body{body}"
+            sd = accuracy.get(("mass", name), ACCURACY)
+            out.append(_fixed("mass", name, np.tile(column, (layout.nv, 1)), sd=sd))
+    for effect, own, size in (
+        ("armature", "acceleration", model.dof_armature),
+        ("damping", "speed", model.dof_damping),
+    ):
+        for v in map(int, np.flatnonzero(size > 0)):
+            one = _one(layout, v, layout.own(own), float(size[v]))
+            sd = accuracy.get((effect, _joint(model, v)), ACCURACY)
+            out.append(_fixed(effect, _joint(model, v), one, sd=sd))
+    late = np.zeros((layout.nv, layout.size))
+    late[:, layout.late] = 1.0
+    return [*out, _fixed("lateness", "all", late, sd=RANGES.late * period)]
+
+
+def effects(model: mujoco.MjModel, layout: Layout, source: Sequence[str], carried: Array) -> list[Term]:
+    """Effects of the library that may add to, or scale, what the known parameters say; those over all joints too.
+
+    Args:
+        source: `[nv]`, where efforts come from; carried: `[nbody]`, kg that may be on each body.
+    """
+    joints = [v for v in range(model.nv) if model.jnt_type[model.dof_jntid[v]] >= int(mujoco.mjtJoint.mjJNT_SLIDE)]
+    driven = [
+        (i, v) for i in range(model.nu) if (v := dof_of(model, i)) is not None and source[v] in ("ctrl", "effort")
+    ]
+    out: list[Term] = []
+    for effect, (column, parameter, low) in ON_JOINT.items():
+        each = [_one(layout, v, layout.own(column)) for v in joints]
+        read = _reader(parameter)
+        out += [_fixed(effect, _joint(model, v), m, low=low, read=read) for v, m in zip(joints, each, strict=True)]
+        out += [_fixed(effect, "all", np.sum(each, 0), low=low, read=read)] if len(joints) > 1 else []
+    for v in joints:
+        load = np.stack([_one(layout, v, layout.own(n)) for n in ("effort_load", "load")], -1)
+        out.append(_wide("load_friction", _joint(model, v), load, 0.0, RANGES.share, _reader("motor", "external")))
+        spring = np.stack([_one(layout, v, layout.own(n)) for n in ("position", "one")], -1)
+        bounds = np.array([0.0, -np.inf]), np.inf
+        out.append(_wide("joint_spring", _joint(model, v), spring, *bounds, _spring))
+        if np.any(model.jnt_type == 3):
+            zero = _everywhere(layout, layout.zero(v))
+            out.append(_fixed("joint_offset", _joint(model, v), zero, read=_reader("offset", sign=-1.0)))
+    out += _on_actuators(model, layout, driven)
+    tilt = np.stack([_everywhere(layout, c) for c in range(layout.tilt.start, layout.tilt.stop)], -1)
+    if np.any(model.opt.gravity):
+        out.append(_wide("gravity_tilt", "world", tilt, -RANGES.tilt, RANGES.tilt, _reader("roll", "pitch")))
+    return [*out, *payloads(model, layout, carried)]
+
+
+def _on_actuators(model: mujoco.MjModel, layout: Layout, driven: Sequence[tuple[int, int]]) -> list[Term]:
+    out, title = [], names(model, "actuator", model.nu)
+    for i, v in driven:
+        out.append(scale("actuator_gain", title[i], np.arange(layout.nv) == v))
+        gear = float(model.actuator_gear[i, 0]) or 1.0
+        bias = _one(layout, v, layout.own("one"))
+        out.append(_fixed("actuator_bias", title[i], bias, read=_reader("bias", sign=-1.0 / gear)))
+    if len(driven) > 1:
+        out.append(scale("actuator_gain", "all", np.isin(np.arange(layout.nv), [v for _, v in driven])))
+    return out
+
+
+def scale(effect: str, where: str, on: NDArray[np.bool_]) -> Term:
+    """The effort that was logged times `gain` is what acts, so the logged one is the needed one over `gain`."""
+    low, high = 1.0 / RANGES.gain[1], 1.0 / RANGES.gain[0]
+    read: Callable[[Array], Mapping[str, float]] = lambda c: {"gain": 1.0 / float(c[0])}  # noqa: E731
+    return Term(effect, where, None, scaled=on, low=np.array([low]), high=np.array([high]), read=read)
+
+
+def payloads(model: mujoco.MjModel, layout: Layout, carried: Array) -> list[Term]:
+    """A point mass on each body: its mass, and its mass times where it sits from the body's own centre of mass."""
+    bodies, data = rigid.moving_bodies(model), mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    out = []
+    for body in range(1, model.nbody):
+        base = int(model.body_weldid[body])
+        if base == 0 or carried[body] <= 0 or (body != base and model.body_mass[body] <= 0):
+            continue
+        frame = data.xmat[base].reshape(3, 3)
+        centre = frame.T @ (data.xipos[body] - data.xpos[base])
+        turn = frame.T @ data.xmat[body].reshape(3, 3)
+        reach = loads.reach(model, body)
+        most = float(carried[body])
+        shape = _load(layout, bodies.index(base), centre, turn)
+        low, high = np.array([0.0, *(3 * [-np.inf])]), np.array([most, *(3 * [np.inf])])
+        name = model.body(body).name or f"body{body}"
+        sd, within = _spread(most, reach), _within(reach)
+        out.append(Term("payload", name, shape, 4, sd=sd, low=low, high=high, within=within, read=_payload))
+    return out
+
+
+def _load(layout: Layout, body: int, centre: Array, turn: Array) -> Callable[[Array], Array]:
+    """Maps `[nv, P, 4]` of (mass m, mass times place s in the body's own axes), linear near the last round's place.
+
+    Inertial parameters of a point mass grow with (m, s) as a whole, so they are their own first order (Euler).
+    """
+    steps = np.eye(3)
+
+    def point(place: Array) -> Array:
+        return rigid.inertial(1.0, centre + turn @ place, np.zeros((3, 3)))
+
+    def shape(last: Array) -> Array:
+        place = _place(last)
+        slopes = np.stack([(point(place + d) - point(place - d)) / 2 for d in steps], -1)  # exact: it is quadratic
+        out = np.zeros((layout.nv, layout.size, 4))
+        out[:, layout.body(body), 0] = point(place) - slopes @ place
+        out[:, layout.body(body), 1:] = slopes
+        return out
+
+    return shape
+
+
+def _place(c: Array) -> Array:
+    """m, `[3]` from the body's centre of mass."""
+    return c[1:] / c[0] if np.isfinite(c).all() and c[0] > 0 else np.zeros(3)
+
+
+def _spread(most: float, reach: float) -> Callable[[Array], Array]:
+    """What the logs do not tell of a load's place stays near the body's own centre."""
+
+    def sd(last: Array) -> Array:
+        mass = last[0] if np.isfinite(last[0]) and last[0] > 0 else most
+        return np.array([np.inf, *(3 * [max(mass, 1e-3 * most) * reach / 2])])
+
+    return sd
+
+
+def _within(reach: float) -> Callable[[Array], bool]:
+    return lambda c: bool(np.all(np.abs(_place(c)) <= reach))
+
+
+def _payload(c: Array) -> Mapping[str, float]:
+    return {"mass": float(c[0]), **{f"com_{a}": float(x) for a, x in zip("xyz", _place(c), strict=True)}}
+
+
+def _spring(c: Array) -> Mapping[str, float]:
+    k = max(float(c[0]), 1e-12)
+    return {"stiffness": k, "cubic": 0.0, "rest": -float(c[1]) / k}
+
+
+def _reader(*parameters: str, sign: float = 1.0) -> Callable[[Array], Mapping[str, float]]:
+    return lambda c: {n: sign * float(x) for n, x in zip(parameters, c, strict=True)}
+
+
+def _joint(model: mujoco.MjModel, dof: int) -> str:
+    joint = int(model.dof_jntid[dof])
+    return model.joint(joint).name or f"joint{joint}"
+
+
+def _one(layout: Layout, dof: int, column: int, size: float = 1.0) -> Array:
+    """`[nv, P]`, one column at one dof."""
+    out = np.zeros((layout.nv, layout.size))
+    out[dof, column] = size
+    return out
+
+
+def _everywhere(layout: Layout, column: int) -> Array:
+    out = np.zeros((layout.nv, layout.size))
+    out[:, column] = 1.0
+    return out
+
+
+def _fixed(effect: str, where: str, column: Array, low: float = -np.inf, sd: float = np.inf, **more: object) -> Term:
+    """A term of one coefficient and one map `[nv, P]`."""
+    believed = np.array([sd])
+    return Term(effect, where, lambda c: column[:, :, None], low=np.array([low]), sd=lambda c: believed, **more)  # type: ignore[arg-type]
+
+
+def _wide(effect: str, where: str, maps: Array, low: float | Array, high: float | Array, read: object) -> Term:
+    """A term of several coefficients and maps `[nv, P, k]`."""
+    k = maps.shape[-1]
+    ends = np.broadcast_to(low, (k,)).astype(float), np.broadcast_to(high, (k,)).astype(float)
+    return Term(effect, where, lambda c: maps, k, low=ends[0], high=ends[1], read=read)  # type: ignore[arg-type]

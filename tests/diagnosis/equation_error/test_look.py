@@ -1,0 +1,106 @@
+"""What logs of an arm from MuJoCo C say before any simulation: the load, the weak motor, what each contradicts."""
+
+import dataclasses
+import sys
+from pathlib import Path
+
+import pytest
+
+from bayessim_mjx.diagnosis.equation_error.leads import lead, proposed
+from bayessim_mjx.diagnosis.equation_error.look import look
+from bayessim_mjx.diagnosis.fitting import robot
+from bayessim_mjx.diagnosis.fitting.candidates import enumerate_candidates
+from bayessim_mjx.diagnosis.summary import first_look
+from bayessim_mjx.effects import load as effect
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[3] / "benchmarks" / "diagnosis"))
+rigs = pytest.importorskip("rigs")
+
+LOAD = rigs.Truth("payload", "tool", (1.0, 0.05, 0.0, 0.02))
+WEAK = rigs.Truth("actuator_gain", "elbow_motor", (0.8,))
+FEW = ("payload", "actuator_gain", "actuator_saturation")
+
+
+def recorded(truth, system="arm_torque", **how):
+    how = {"period": 0.01, "sigma": 3e-4, "quantum": 0.0, "effort": True, "seed": 3, "runs": 3, "seconds": 3.0} | how
+    return rigs.record(rigs.Rig(system, truth, **how))
+
+
+@pytest.fixture(scope="module")
+def loaded():
+    model, logs = recorded(LOAD)
+    return look(logs, model)
+
+
+@pytest.fixture(scope="module")
+def weak():
+    model, logs = recorded(WEAK)
+    return model, look(logs, model)
+
+
+def test_a_load_is_found_where_it_is(loaded):
+    (found,) = loaded.proposals
+    assert found.label == "payload@tool" and loaded.explained > 0.95 and loaded.seconds < 30
+    assert found.parameters["mass"] == pytest.approx(1.0, rel=0.1)
+    assert [found.parameters[f"com_{a}"] for a in "xyz"] == pytest.approx(LOAD.values[1:], abs=0.015)
+    assert {j.source for j in loaded.joints} == {"effort"} and all(c.sound for c in loaded.channels)
+
+
+def test_motors_that_obey_and_a_heavier_mechanism_are_told_apart(loaded, weak):
+    assert first_look.verdict(loaded) == (
+        "the motors do what they are told, but the mechanism is heavier or stiffer than the model"
+    )
+    assert first_look.verdict(weak[1]) == (
+        "the motors do not do what they are told, but the mechanism moves as the model says"
+    )
+    assert any("extra payload at tool: mass" in line for line in first_look.lines(loaded))
+    assert any("elbow_motor 0.80 of it" in line for line in first_look.lines(weak[1]))
+
+
+def test_a_weak_motor_is_found_with_and_without_measured_effort(weak):
+    _, seen = weak
+    assert not seen.proposals and proposed(seen)["actuator_gain@elbow_motor"]["gain"] == pytest.approx(0.8, abs=0.02)
+    model, logs = recorded(WEAK, effort=False)
+    blind = look(logs, model)
+    assert proposed(blind)["actuator_gain@elbow_motor"]["gain"] == pytest.approx(0.8, abs=0.03)
+    assert "actuator_gain@all" in blind.vetoes  # the others are not weak
+    assert first_look.verdict(blind) == ""
+
+
+def test_leads_start_order_and_veto_candidates(weak, tmp_path):
+    model, seen = weak
+    physics = robot.robot_of(model).physics(0.01, [effect(n)(where=places(model, n)) for n in FEW])
+    every = enumerate_candidates(physics)
+    led = lead(every, seen)
+    assert led.first[0] == "actuator_gain@elbow_motor"
+    left = {c.label for c in led.candidates}
+    assert "actuator_gain@elbow_motor" in left and "actuator_saturation@waist_motor" not in left
+    assert set(led.vetoed) == {c.label for c in every} - left
+    (own,) = [c for c in led.candidates if c.label == led.first[0]]
+    assert own.probes[-1] == pytest.approx([0.8], abs=0.02)
+
+
+def places(model, name):
+    kind = effect(name).kind
+    count = {"actuator": model.nu, "body": model.nbody}[kind]
+    return tuple(getattr(model, kind)(i).name for i in range(count) if kind != "body" or model.body_weldid[i] == i > 0)
+
+
+def test_efforts_in_a_unit_of_their_own_are_told(loaded):
+    model, logs = recorded(rigs.Truth())
+    half = [
+        dataclasses.replace(log, streams={k: 0.5 * s for k, s in log.streams.items()}, metadata=log.metadata)
+        for log in logs
+    ]
+    seen = look(half, model)
+    assert seen.unit == pytest.approx(2.0, rel=0.05) and not seen.proposals and not seen.vetoes
+    assert all(c.scale == pytest.approx(1.0, abs=0.02) for c in seen.channels)
+    stated = [dataclasses.replace(log, metadata={**log.metadata, "effort_unit": "N m"}) for log in half]
+    assert look(stated, model).unit == 1.0
+
+
+def test_nothing_to_look_at_is_no_error(loaded):
+    model, logs = recorded(rigs.Truth(), runs=1, seconds=0.5)
+    still = dataclasses.replace(logs[0], qpos=0 * logs[0].qpos, qvel=0 * logs[0].qvel)
+    assert look([still], model).joints == ()
+    assert "no joint" in first_look.lines(look([still], model))[0]
