@@ -51,20 +51,35 @@ def load_policy(path: Path, env: Any, config: Config) -> Any:
 
 def privileged(config: Config, env: Any) -> tuple[Any, Any]:
     """(`env` as the policy of `config` is trained in it, the teacher of ppo.teacher or None)."""
+    from bayessim_mjx.rl import groups, recurrent
     from bayessim_mjx.rl import privileged as shown
-    from bayessim_mjx.rl import recurrent
 
-    if config.ppo.memory:
-        env = recurrent.remembering(env, config.ppo.memory_size)
+    teacher = None
+    if config.ppo.teacher is not None:
+        env, teacher = _taught(config.ppo.teacher, config, env)
+    env = groups.for_policy(env, config.ppo.actor_groups)
     if config.ppo.policy_theta:
         env = shown.for_policy(env)
-    if config.ppo.teacher is None:
-        return env, None
-    path, run = find_checkpoint(config.ppo.teacher, None, "")
-    settings = config if run is None else run.config
-    seen = shown.for_policy(env) if settings.ppo.policy_theta else env
-    teacher = load_policy(path, seen, settings)
-    return (shown.for_teacher(env) if settings.ppo.policy_theta else env), teacher
+    return recurrent.remembering(env, config.ppo.memory_size) if config.ppo.memory else env, teacher
+
+
+def _taught(which: str, config: Config, env: Any) -> tuple[Any, Any]:
+    """(`env` with the group that the teacher sees where it is not the student's, the teacher)."""
+    from bayessim_mjx.rl import groups
+    from bayessim_mjx.rl import privileged as shown
+
+    path, run = find_checkpoint(which, None, "")
+    alone = {"memory": 0, "memory_layers": 1, "gradient_length": 0}
+    settings = replace(config, ppo=alone) if run is None else run.config
+    theirs = settings.ppo
+    if theirs.memory:
+        raise UserError(f"ppo.teacher = {which!r}: it has a memory, ppo.memory = {theirs.memory}; give one without")
+    seen = groups.for_policy(env, theirs.actor_groups)
+    teacher = load_policy(path, shown.for_policy(seen) if theirs.policy_theta else seen, settings)
+    if theirs.actor_groups or config.ppo.actor_groups:
+        env = groups.shown(env, "teacher", theirs.actor_groups or ("policy",))
+        return shown.teacher_knowing(env) if theirs.policy_theta else env, teacher
+    return shown.for_teacher(env) if theirs.policy_theta else env, teacher
 
 
 def warm_start(train: Any, config: Config, env: Any) -> Any:

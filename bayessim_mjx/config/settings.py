@@ -25,7 +25,9 @@ MEMORIES = {"gru": 1, "lstm": 2}  # recurrent layers, and how many numbers each 
 IMPLEMENTATIONS = ("jax", "warp", "auto")  # of MJX
 WRITERS = ("jsonl", "csv", "wandb")  # beside TensorBoard
 AGENTS = ("own", "sb3", "rsl_rl", "skrl")  # own: bayessim_mjx.rl
-ACTIVATIONS = ("elu", "relu", "selu", "tanh", "swish", "gelu")
+ACTIVATIONS = (
+    "elu", "relu", "selu", "tanh", "swish", "gelu", "celu", "lrelu", "mish", "softplus", "sigmoid",
+)  # fmt: skip
 SEEDS = 2**32 - 1  # the largest seed: jax keeps 32 bits of it
 COUNT = 10**9  # beyond it a number of steps, episodes or trajectories is a slip of the finger
 WIDTH = 10**5  # and of a network's units
@@ -391,6 +393,8 @@ class SymmetryConfig(Section):
         "critic_theta": "theta has no mirror image, so ppo.symmetry has to be null",
         "policy_theta": "theta has no mirror image, so ppo.symmetry has to be null",
         "memory": "not with ppo.symmetry; set one of them to 0 or null",
+        "actor_groups": "mirror maps are of the task's own groups, so ppo.symmetry has to be null",
+        "critic_groups": "mirror maps are of the task's own groups, so ppo.symmetry has to be null",
     }
     use_data_augmentation: bool = setting(False, "train on the mirrored samples too")
     use_mirror_loss: bool = setting(False, "add the mirror loss, the squared difference of a(M o) and M a(o)")
@@ -427,9 +431,27 @@ class PPOConfig(Section):
     hidden_critic: tuple[int, ...] = setting((64, 64), "widths of the critic", low=1, high=WIDTH)
     activation: str = setting("elu", "activation of both networks", choices=ACTIVATIONS)
     init_std: float = setting(1.0, "initial standard deviation of actions", above=0)
+    std_type: str = setting(
+        "log", "what is learnt: the logarithm of the standard deviation or itself", choices=("log", "scalar")
+    )
+    std_range: tuple[float, ...] = setting((), "least and greatest standard deviation; none: no limits", above=0)
+    distribution: str = setting(
+        "gaussian", "of actions: gaussian, or beta on the range +- action_clip (init_std is unused)",
+        choices=("gaussian", "beta"),
+    )  # fmt: skip
     state_dependent_std: bool = setting(False, "the actor gives the standard deviation too, else it is a parameter")
     shared_trunk: bool = setting(False, "the critic is one layer on the actor's hidden ones (hidden_critic is unused)")
     memory: int = setting(0, "units of a recurrent layer before the actor's others; 0: none", low=0, high=WIDTH)
+    memory_layers: int = setting(1, "recurrent layers, one on the other", low=1, high=20)
+    gradient_length: int = setting(
+        0, "steps that gradients of recurrent layers flow back through; 0: all ppo.num_steps", low=0, high=COUNT
+    )
+    actor_groups: tuple[str, ...] = setting(
+        (), "observation groups that the actor sees, one after the other; none: policy (train, play)"
+    )
+    critic_groups: tuple[str, ...] = setting(
+        (), "observation groups that the critic sees; none: critic where there is one, else what the actor sees"
+    )
     memory_cell: str = setting("gru", "kind of the recurrent layer: gru or lstm", choices=tuple(MEMORIES))
     critic_theta: bool = setting(False, "the critic also sees the physics, theta (not the actor)")
     policy_theta: bool = setting(False, "the policy sees theta too: a teacher, for simulation alone (train, play)")
@@ -454,7 +476,7 @@ class PPOConfig(Section):
     @property
     def memory_size(self) -> int:
         """Numbers that the policy carries on from step to step."""
-        return MEMORIES[self.memory_cell] * self.memory
+        return MEMORIES[self.memory_cell] * self.memory * self.memory_layers
 
     def check(self) -> None:
         batch = self.num_envs * self.num_steps
@@ -477,8 +499,7 @@ class PPOConfig(Section):
                 raise UserError(f"ppo.extensions: {given!r}: expected {{extension: NAME, setting: value, ...}}")
         if self.extensions:
             refuse_together({"teacher": "a student has no use for ppo.extensions; leave one of them out"}, self)
-        if self.memory and self.teacher is not None:
-            raise UserError(f"ppo.memory = {self.memory}: not with ppo.teacher; set one of them to 0 or null")
+        self._check_spread()
         if self.memory and self.num_minibatches > self.num_envs:
             raise UserError(
                 f"ppo.num_minibatches = {self.num_minibatches}: with ppo.memory a minibatch is of whole sequences, and "
@@ -488,6 +509,28 @@ class PPOConfig(Section):
             raise UserError("ppo.shared_trunk = True needs hidden layers to share: ppo.hidden_actor is []")
         if self.state_dependent_std and not 0.007 <= self.init_std <= 148:  # exp(+-5), networks.LOG_STD_LIMIT
             raise UserError(f"ppo.init_std = {self.init_std}: with ppo.state_dependent_std it is from 0.007 to 148")
+
+    def _check_spread(self) -> None:
+        """Which settings of the actions' distribution go together."""
+        if self.std_range and not (len(self.std_range) == 2 and self.std_range[0] < self.std_range[1]):
+            raise UserError(f"ppo.std_range = {list(self.std_range)}: expected [least, greatest], or [] for no limits")
+        if self.std_range and not self.std_range[0] <= self.init_std <= self.std_range[1]:
+            raise UserError(f"ppo.init_std = {self.init_std} lies outside ppo.std_range = {list(self.std_range)}")
+        if self.state_dependent_std and self.std_type != "log":
+            raise UserError("ppo.std_type = 'scalar': with ppo.state_dependent_std it is log")
+        if self.distribution == "beta":
+            given = {
+                "state_dependent_std": self.state_dependent_std, "std_range": self.std_range,
+                "std_type": self.std_type != "log", "action_bound": self.action_bound != "clip",
+            }  # fmt: skip
+            for name in (name for name, on in given.items() if on):
+                raise UserError(f"ppo.{name} = {getattr(self, name)!r}: not with ppo.distribution=beta, which has none")
+        if self.memory_layers > 1 and not self.memory:
+            raise UserError(f"ppo.memory_layers = {self.memory_layers}: there is no recurrent layer; set ppo.memory")
+        if self.gradient_length and not self.memory:
+            raise UserError(
+                f"ppo.gradient_length = {self.gradient_length}: there is no recurrent layer; set ppo.memory"
+            )
 
     def _check_segment(self) -> None:
         said = f"ppo.segment = {self.segment}"

@@ -17,6 +17,7 @@ from jax.sharding import Mesh
 from bayessim_mjx.config import PPOConfig, refuse_together
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.rl.extension import Extension, Learner
+from bayessim_mjx.rl.groups import CriticGroups
 from bayessim_mjx.rl.privileged import CriticTheta
 from bayessim_mjx.rl.rnd import Novelty
 from bayessim_mjx.rl.state import FIELDS
@@ -25,7 +26,7 @@ from bayessim_mjx.rl.symmetry import Symmetry
 if TYPE_CHECKING:
     from bayessim_mjx.env import Env
 
-EXTENSIONS: tuple[type[Extension], ...] = (CriticTheta, Novelty, Symmetry)
+EXTENSIONS: tuple[type[Extension], ...] = (CriticGroups, CriticTheta, Novelty, Symmetry)
 ENTRY_POINTS = "bayessim_mjx.ppo_extensions"
 
 

@@ -25,6 +25,9 @@ def check(env: Env, config: PPOConfig, mesh: Mesh | None = None) -> None:
         raise UserError(f"observation groups {sorted(env.observation_size)}: a policy needs the group 'policy'")
     if config.policy_theta and getattr(env, "target", "") != "policy":
         raise UserError("ppo.policy_theta = True trains a teacher; the commands that can are train and play")
+    if config.actor_groups != getattr(env, "actor_groups", ()):
+        given = list(config.actor_groups)
+        raise UserError(f"ppo.actor_groups = {given}: the commands that show an actor other groups are train and play")
     if config.memory_size != getattr(env, "memory_size", 0):
         raise UserError(
             f"ppo.memory = {config.memory}: the environment has to carry the memory on, see rl.recurrent.remembering"

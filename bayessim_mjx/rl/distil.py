@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import optax
 
 from bayessim_mjx.config import PPOConfig
-from bayessim_mjx.rl import catalogue, episodes, losses, networks, normalise, ppo, sharding, worlds
+from bayessim_mjx.rl import actions, catalogue, episodes, losses, networks, normalise, ppo, recurrent, sharding, worlds
 from bayessim_mjx.rl.networks import Params, Policy
 from bayessim_mjx.rl.state import TrainState, policy_of
 
@@ -33,12 +33,14 @@ def teacher_group(env: Env) -> str:
     return "teacher" if "teacher" in env.observation_size else "policy"
 
 
-def loss(params: Params, observation: jax.Array, target: jax.Array, config: PPOConfig) -> jax.Array:
+def loss(params: Params, observation: Any, target: jax.Array, config: PPOConfig) -> jax.Array:
     """Mean error of the student's deterministic action at normalised observations [B, S]; target [B, A].
+
+    Of a student with a memory at `recurrent.Sequences` [B, T, S]; target [B, T, A].
 
     Squared, or Huber's with threshold 1. An action that will be clipped is compared before that: it must not be stuck.
     """
-    mean = networks.mean_action(params, observation, networks.activation(config.activation))
+    mean = networks.mean_action(params, observation, networks.form(config), actions.of(config))
     action = networks.bounded(mean, config.action_clip, True) if config.action_bound == "tanh" else mean
     error = action - target
     return (optax.huber_loss(error) if config.distil_loss == "huber" else error**2).mean()
@@ -56,10 +58,17 @@ def update(
     if config.normalize_observations:  # learnt with the statistics that the student will act with
         normalizer = {**normalizer, "policy": normalise.update(normalizer["policy"], seen)}
         observation = normalise.normalise(normalizer["policy"], seen)
-    batch = sharding.pinned((observation, teacher.act(None, data["observation"][group])), state.mesh)
-    batch = jax.tree.map(lambda x: x.reshape(-1, x.shape[-1]), batch)
+    target = teacher.act(None, data["observation"][group])
+    if config.memory:
+        steps = recurrent.Remembered(observation, data["observation"]["memory"])
+        ended = jnp.maximum(data["terminated"], data["truncated"])
+        batch = sharding.pinned((recurrent.sequences(steps, ended, config.gradient_length), target), state.mesh)
+        batch = jax.tree.map(lambda x: x.swapaxes(0, 1), batch)
+    else:
+        batch = sharding.pinned((observation, target), state.mesh)
+        batch = jax.tree.map(lambda x: x.reshape(-1, x.shape[-1]), batch)
 
-    def objective(params: Params, part: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, dict]:
+    def objective(params: Params, part: tuple[Any, jax.Array]) -> tuple[jax.Array, dict]:
         error = loss(params, *part, config)
         return error, {"Loss/behavior": error}
 
@@ -69,10 +78,12 @@ def update(
     after = dataclasses.replace(
         ppo.moved_on(config, state, env_states, data, key), params=params, opt_state=opt_state, normalizer=normalizer
     )
+    student, groups = policy_of(after), data["observation"] | {"policy": seen}
     metrics: dict[str, Any] = {name: x.mean() for name, x in figures.items()} | {
         "Loss/learning_rate": rate,
-        "Policy/mean_std": jnp.exp(policy_of(after).distribution(seen)[1]).mean(),
+        "Policy/mean_std": student.law.sd(*student.distribution(groups)).mean(),
         "env_steps": after.env_steps,
         **episodes.metrics(after.episodes),
+        **episodes.terms(data),
     }
     return sharding.pinned(after, state.mesh, ppo.layout(after)), metrics

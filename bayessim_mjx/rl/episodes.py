@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from bayessim_mjx.rl.sharding import FIRST
+from bayessim_mjx.rollout.collection import TERM
 
 WINDOW = 100
 
@@ -68,3 +69,13 @@ def metrics(episodes: Episodes) -> dict[str, jax.Array]:
         "Train/mean_reward": jnp.where(seen, episodes.returns, 0).sum() / count,
         "Train/mean_episode_length": jnp.where(seen, episodes.lengths, 0).sum() / count,
     }
+
+
+def tags_of_terms(metrics: dict[str, Any]) -> dict[str, str]:
+    """{tag: metric} of the parts of the reward among a task's metrics."""
+    return {f"Reward/{name.removeprefix(TERM)}": name for name in metrics if name.startswith(TERM)}
+
+
+def terms(data: dict[str, Any]) -> dict[str, jax.Array]:
+    """Mean per step of each part of the reward that the task tells of, of what was collected."""
+    return {tag: data["terms"][name].mean() for tag, name in tags_of_terms(data["terms"]).items()}

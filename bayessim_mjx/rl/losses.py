@@ -12,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 from jax.sharding import Mesh
 
 from bayessim_mjx.config import PPOConfig
-from bayessim_mjx.rl import networks, segments, sharding
+from bayessim_mjx.rl import actions, networks, segments, sharding
 from bayessim_mjx.rl.batch import Batch
 from bayessim_mjx.rl.extension import Learner
 from bayessim_mjx.rl.networks import Params
@@ -70,14 +70,14 @@ def loss(params: Params, old_log_std: Any, batch: Batch, learner: Learner) -> tu
     config, known = learner.config, None
     if config.segment:
         batch, known = segments.renewed(params, batch, config)
-    act, size = networks.activation(config.activation), batch.advantage.shape[0]
+    act, law, size = networks.form(config), actions.of(config), batch.advantage.shape[0]
     if config.normalize_advantage_per_minibatch:
         batch = dataclasses.replace(batch, advantage=standardise(batch.advantage))
     samples = batch
     for extension in learner.extensions:
         samples = extension.samples(samples)
-    means, log_stds = networks.gaussian(params["actor"], samples.observation, act)
-    log_prob = networks.log_prob(means, log_stds, samples.action)  # of raw actions: tanh's slope cancels in the ratio
+    means, log_stds = networks.distribution(params["actor"], samples.observation, act)
+    log_prob = law.log_prob(means, log_stds, samples.action)  # of raw actions: tanh's slope cancels in the ratio
     surrogate = surrogate_loss(log_prob, samples.log_prob, samples.advantage, config.clip_param, samples.weight)
     value = value_loss(
         networks.value(params, samples.critic_observation, act) if known is None or samples is not batch else known,
@@ -87,19 +87,17 @@ def loss(params: Params, old_log_std: Any, batch: Batch, learner: Learner) -> tu
     )
     mean, log_std = means[:size], log_stds if log_stds.ndim == 1 else log_stds[:size]
     old = old_log_std if batch.log_std is None else batch.log_std
-    squash = config.action_bound == "tanh"
-    entropy = networks.squashed_entropy(mean, log_std, config.action_clip) if squash else networks.entropy(log_std)
-    entropy = entropy.mean()
+    entropy = law.entropy(mean, log_std).mean()
     metrics = {
         "Loss/surrogate": surrogate,
         "Loss/value": value,
         "Loss/entropy": entropy,
-        "Loss/kl": networks.kl(batch.mean, old, mean, log_std).mean(),
+        "Loss/kl": law.kl(batch.mean, old, mean, log_std).mean(),
         "Loss/clip_fraction": (jnp.abs(jnp.exp(log_prob[:size] - batch.log_prob) - 1) > config.clip_param).mean(),
     }
     total = surrogate + config.value_loss_coef * value - config.entropy_coef * entropy
     for extension in learner.extensions:
-        term, figures = extension.loss(params, batch, means, learner)
+        term, figures = extension.loss(params, batch, law.mean(means, log_stds), learner)
         total, metrics = total if term is None else total + term, metrics | figures
     return total, metrics
 
@@ -153,7 +151,7 @@ def optimise(
         batch: all that was collected.
         learner: settings and extensions.
     """
-    old_log_std = params["actor"].get("log_std")
+    old_log_std = networks.log_std(params["actor"], networks.form(learner.config))
     if not learner.config.normalize_advantage_per_minibatch:
         batch = dataclasses.replace(batch, advantage=standardise(batch.advantage))
 

@@ -1,8 +1,7 @@
-"""Actor and critic as multilayer perceptrons, apart or on one trunk; Gaussian actions, clipped or squashed by tanh.
+"""Actor and critic as multilayer perceptrons, apart or on one trunk; `actions` has the distributions of actions.
 
-A Gaussian acts on *raw* actions u; the environment gets clip(u, +- limit), or limit tanh(u) where it is squashed. The
-parameters' structure says what they are: without "log_std" the actor's last layer gives the spread as well, and a
-critic of one "head" stands on the actor's hidden layers.
+The parameters' structure says what they are: with neither "log_std" nor "std" the actor's last layer gives the spread
+as well, and a critic of one "head" stands on the actor's hidden layers. What it does not say is in `Form`.
 """
 
 import functools
@@ -17,8 +16,15 @@ from flax import struct
 
 from bayessim_mjx.config import PPOConfig
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.rl import normalise, recurrent
+from bayessim_mjx.rl import actions, normalise, recurrent
+from bayessim_mjx.rl.actions import bounded, entropy, kl, log_prob, log_slope, squashed_entropy
 from bayessim_mjx.rl.normalise import Moments
+
+__all__ = [
+    "ACTIVATIONS", "Form", "Params", "Policy", "Sizes", "activation", "bounded", "distribution", "entropy", "form",
+    "gaussian", "init", "kl", "log_prob", "log_slope", "log_std", "mean_action", "mlp", "mlp_init", "squashed_entropy",
+    "value",
+]  # fmt: skip
 
 Params = dict[str, Any]
 ACTIVATIONS: dict[str, Callable[[jax.Array], jax.Array]] = {
@@ -28,10 +34,14 @@ ACTIVATIONS: dict[str, Callable[[jax.Array], jax.Array]] = {
     "tanh": jnp.tanh,
     "swish": jax.nn.swish,
     "gelu": jax.nn.gelu,
+    "celu": jax.nn.celu,
+    "lrelu": jax.nn.leaky_relu,
+    "mish": jax.nn.mish,
+    "softplus": jax.nn.softplus,
+    "sigmoid": jax.nn.sigmoid,
 }
-HALF_LOG_2PI = 0.9189385332046727
 LOG_STD_LIMIT = 5.0  # of a spread that depends on the state: |log std| stays below it
-NODES, WEIGHTS = np.polynomial.hermite_e.hermegauss(16)  # sum w f(x) = sqrt(2 pi) E f(x), x ~ N(0, 1)
+LEAST_STD = 1e-6  # of a spread that is a parameter itself, without limits of its own
 
 
 def activation(name: str) -> Callable[[jax.Array], jax.Array]:
@@ -39,6 +49,23 @@ def activation(name: str) -> Callable[[jax.Array], jax.Array]:
     if name not in ACTIVATIONS:
         raise UserError(f"ppo.activation = {name!r}: allowed are {', '.join(ACTIVATIONS)}")
     return ACTIVATIONS[name]
+
+
+@dataclass(frozen=True)
+class Form:
+    """What the parameters' structure does not say. As a function: the activation."""
+
+    activation: str = "elu"
+    std_range: tuple[float, ...] = ()
+    beta: bool = False
+
+    def __call__(self, x: jax.Array) -> jax.Array:
+        return activation(self.activation)(x)
+
+
+def form(config: PPOConfig) -> Form:
+    """That of the networks that the settings ask for."""
+    return Form(config.activation, config.std_range, config.distribution == "beta")
 
 
 def mlp_init(key: jax.Array, sizes: Sequence[int], last_gain: float, kind: str = "orthogonal") -> list[Params]:
@@ -92,14 +119,23 @@ def _actor(key: jax.Array, sizes: Sizes, config: PPOConfig) -> Params:
     widths = [config.memory or sizes.policy, *config.hidden_actor, sizes.action]
     layers = mlp_init(key, widths, 0.01, config.weight_init)
     actor: Params = {"layers": layers, "log_std": jnp.full(sizes.action, jnp.log(config.init_std))}
-    if config.state_dependent_std:
-        spread = _spread(jax.random.fold_in(key, 2), layers[-1]["w"], config)
+    if config.std_type == "scalar":
+        actor = {"layers": layers, "std": jnp.full(sizes.action, config.init_std)}
+    if config.state_dependent_std or config.distribution == "beta":
+        new = _spread if config.state_dependent_std else _second
+        spread = new(jax.random.fold_in(key, 2), layers[-1]["w"], config)
         joined = jax.tree.map(lambda mean, log_std: jnp.concatenate([mean, log_std], -1), layers[-1], spread)
         actor = {"layers": [*layers[:-1], joined]}
     if config.memory:
         memory_key = jax.random.fold_in(key, 1)
-        actor[config.memory_cell] = recurrent.init(memory_key, sizes.policy, config.memory, config.memory_cell)
+        cell, count = config.memory_cell, config.memory_layers
+        actor |= recurrent.stacked(memory_key, sizes.policy, config.memory, cell, count)
     return actor
+
+
+def _second(key: jax.Array, like: jax.Array, config: PPOConfig) -> Params:
+    """A Beta's other concentration: small outputs, as the first."""
+    return mlp_init(key, like.shape, 0.01, config.weight_init)[0]
 
 
 def _spread(key: jax.Array, like: jax.Array, config: PPOConfig) -> Params:
@@ -116,18 +152,38 @@ def _trunk(actor: Params, x: Any) -> jax.Array:
     return recurrent.features(actor, x) if recurrent.kind(actor) else x
 
 
+def log_std(actor: Params, act: Any) -> jax.Array | None:
+    """Log standard deviation [A] where it is a parameter, within `std_range` of a `Form`; None elsewhere."""
+    limits = getattr(act, "std_range", ())
+    if "std" in actor:
+        return jnp.log(actions.clamped(actor["std"], *(limits or (LEAST_STD, np.inf))))
+    if "log_std" in actor:
+        return actions.clamped(actor["log_std"], *np.log(limits)) if limits else actor["log_std"]
+    return None
+
+
 def gaussian(actor: Params, x: Any, act: Callable[[jax.Array], jax.Array]) -> tuple[jax.Array, jax.Array]:
     """Mean [..., A] and log standard deviation ([A], or [..., A] where it depends on the state) at normalised x."""
-    out = mlp(actor["layers"], _trunk(actor, x), act)
-    if "log_std" in actor:
-        return out, actor["log_std"]
+    out, alike = mlp(actor["layers"], _trunk(actor, x), act), log_std(actor, act)
+    if alike is not None:
+        return out, alike
     mean, spread = jnp.split(out, 2, -1)
-    return mean, LOG_STD_LIMIT * jnp.tanh(spread / LOG_STD_LIMIT)
+    spread = LOG_STD_LIMIT * jnp.tanh(spread / LOG_STD_LIMIT)
+    limits = getattr(act, "std_range", ())
+    return mean, actions.clamped(spread, *np.log(limits)) if limits else spread
 
 
-def mean_action(params: Params, x: Any, act: Callable[[jax.Array], jax.Array]) -> jax.Array:
-    """Mean of the policy's Gaussian, [..., A], at normalised observations x [..., S]."""
-    return gaussian(params["actor"], x, act)[0]
+def distribution(actor: Params, x: Any, form: Any) -> tuple[jax.Array, jax.Array]:
+    """The two parameters of the distribution of raw actions (`actions`) at normalised observations x."""
+    if not getattr(form, "beta", False):
+        return gaussian(actor, x, form)
+    a, b = jnp.split(1 + jax.nn.softplus(mlp(actor["layers"], _trunk(actor, x), form)), 2, -1)
+    return a, b
+
+
+def mean_action(params: Params, x: Any, act: Callable[[jax.Array], jax.Array], law: actions.Law | None = None) -> Any:
+    """Mean raw action, [..., A], at normalised observations x [..., S]; law None: of a Gaussian."""
+    return (law or actions.Gaussian()).mean(*distribution(params["actor"], x, act))
 
 
 def value(params: Params, x: Any, act: Callable[[jax.Array], jax.Array]) -> jax.Array:
@@ -136,44 +192,6 @@ def value(params: Params, x: Any, act: Callable[[jax.Array], jax.Array]) -> jax.
         actor = params["actor"]
         return mlp([*actor["layers"][:-1], *params["critic"]["head"]], _trunk(actor, x), act)[..., 0]
     return mlp(params["critic"]["layers"], x, act)[..., 0]
-
-
-def bounded(raw: jax.Array, limit: float, squash: bool) -> jax.Array:
-    """What the environment gets of raw actions: within +- limit."""
-    return limit * jnp.tanh(raw) if squash else jnp.clip(raw, -limit, limit)
-
-
-def log_slope(raw: jax.Array, limit: float) -> jax.Array:
-    """log |d a / d u| of a = limit tanh(u), summed over the last axis: log limit + 2 (log 2 - u - softplus(-2 u))."""
-    return (jnp.log(limit) + 2 * (jnp.log(2.0) - raw - jax.nn.softplus(-2 * raw))).sum(-1)
-
-
-def log_prob(mean: jax.Array, log_std: jax.Array, action: jax.Array) -> jax.Array:
-    """log N(action; mean, diag(std^2)), summed over the last axis."""
-    z = (action - mean) * jnp.exp(-log_std)
-    return -(0.5 * z**2 + log_std + HALF_LOG_2PI).sum(-1)
-
-
-def entropy(log_std: jax.Array) -> jax.Array:
-    """Entropy of the Gaussian in nats: sum over dimensions of log std + (1 + log 2 pi) / 2."""
-    return (log_std + 0.5 + HALF_LOG_2PI).sum(-1)
-
-
-def squashed_entropy(mean: jax.Array, log_std: jax.Array, limit: float) -> jax.Array:
-    """Entropy of limit tanh(u), [...]: that of u plus E log |d a / d u|, by Gauss-Hermite quadrature."""
-    nodes, weights = jnp.asarray(NODES, jnp.float32), jnp.asarray(WEIGHTS / WEIGHTS.sum(), jnp.float32)
-    u = mean[..., None, :] + jnp.exp(log_std)[..., None, :] * nodes[:, None]  # [..., nodes, A]
-    return entropy(log_std) + log_slope(u, limit) @ weights
-
-
-def kl(mean: jax.Array, log_std: jax.Array, new_mean: jax.Array, new_log_std: jax.Array) -> jax.Array:
-    """KL(old || new) of diagonal Gaussians, [...]; exactly 0 where they agree. Squashing both leaves it as it is.
-
-    = sum 1/2 [ (r - 1 - log r) + ((mean - new_mean) / new_std)^2 ],  r = (std / new_std)^2
-    """
-    log_ratio = 2 * (log_std - new_log_std)
-    distance = (mean - new_mean) * jnp.exp(-new_log_std)
-    return 0.5 * (jnp.expm1(log_ratio) - log_ratio + distance**2).sum(-1)
 
 
 @struct.dataclass
@@ -187,6 +205,13 @@ class Policy:
     action_clip: float = struct.field(pytree_node=False, default=1.0)
     deterministic: bool = struct.field(pytree_node=False, default=False)
     squash: bool = struct.field(pytree_node=False, default=False)
+    std_range: tuple[float, ...] = struct.field(pytree_node=False, default=())
+    beta: bool = struct.field(pytree_node=False, default=False)
+
+    @property
+    def law(self) -> actions.Law:
+        """The distribution of its raw actions."""
+        return actions.Beta(self.action_clip) if self.beta else actions.Gaussian(self.action_clip, self.squash)
 
     def _seen(self, obs: Mapping[str, jax.Array] | jax.Array) -> Any:
         """What the actor sees: normalised, with the memory where it has one."""
@@ -198,8 +223,11 @@ class Policy:
         return x
 
     def distribution(self, obs: Mapping[str, jax.Array] | jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Mean [..., A] and log sd ([A] or [..., A]) of the raw action; obs: groups, or "policy" alone."""
-        return gaussian(self.actor, self._seen(obs), activation(self.activation))
+        """Mean [..., A] and log sd ([A] or [..., A]) of the raw action; obs: groups, or "policy" alone.
+
+        Of a Beta both concentrations.
+        """
+        return distribution(self.actor, self._seen(obs), Form(self.activation, self.std_range, self.beta))
 
     def carried(self, obs: Mapping[str, jax.Array] | jax.Array, action: jax.Array) -> jax.Array:
         """The action for the environment: with the memory after `obs` behind it, where there is one."""
@@ -209,19 +237,18 @@ class Policy:
 
     def bounded(self, raw: jax.Array) -> jax.Array:
         """The action within +- action_clip of a raw one."""
-        return bounded(raw, self.action_clip, self.squash)
+        return actions.bounded(raw, self.action_clip, self.squash)
 
     def log_prob(self, obs: Mapping[str, jax.Array] | jax.Array, raw: jax.Array) -> jax.Array:
         """Log density [...] of the raw action [..., A]; where it is squashed, that of what the environment gets."""
-        density = log_prob(*self.distribution(obs), raw)
+        density = self.law.log_prob(*self.distribution(obs), raw)
         return density - log_slope(raw, self.action_clip) if self.squash else density
 
     def act(self, key: jax.Array | None, obs: Mapping[str, jax.Array] | jax.Array) -> jax.Array:
         """Action [..., A] within +- action_clip: at the mean if `key` is None, else a sample; a memory behind it."""
-        mean, log_std = self.distribution(obs)
-        if key is not None:
-            mean = mean + jnp.exp(log_std) * jax.random.normal(key, mean.shape)
-        return self.carried(obs, self.bounded(mean))
+        found = self.distribution(obs)
+        raw = self.law.mean(*found) if key is None else self.law.drawn(key, *found)
+        return self.carried(obs, self.bounded(raw))
 
     def __call__(self, key: jax.Array | None, obs: Mapping[str, jax.Array] | jax.Array) -> jax.Array:
         return self.act(None if self.deterministic else key, obs)

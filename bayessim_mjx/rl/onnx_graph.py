@@ -12,7 +12,10 @@ from bayessim_mjx.env import Env
 from bayessim_mjx.rl import normalise, recurrent
 from bayessim_mjx.rl.networks import Policy
 
-ONE_NODE = {"elu": "Elu", "relu": "Relu", "selu": "Selu", "tanh": "Tanh"}
+ONE_NODE = {
+    "elu": "Elu", "relu": "Relu", "selu": "Selu", "tanh": "Tanh", "sigmoid": "Sigmoid", "softplus": "Softplus",
+    "celu": "Celu", "lrelu": "LeakyRelu",
+}  # fmt: skip
 
 
 class Graph:
@@ -59,6 +62,10 @@ class Graph:
         elif name == "swish":  # x sigmoid(x)
             self.then("Sigmoid")
             self.then("Mul", x)
+        elif name == "mish":  # x tanh(softplus(x))
+            self.then("Softplus")
+            self.then("Tanh")
+            self.then("Mul", x)
         else:  # gelu, as JAX's: x (1 + tanh(sqrt(2 / pi) (x + 0.044715 x^3))) / 2
             for operation, other in (
                 ("Mul", x),
@@ -82,14 +89,44 @@ def network(graph: Graph, policy: Policy, env: Env, size: int) -> None:
         graph.then("Sub", policy.normalizer.mean)
         graph.then("Div", jnp.sqrt(policy.normalizer.var) + normalise.EPSILON)
         graph.then("Clip", -normalise.LIMIT, normalise.LIMIT)
-    kind = recurrent.kind(policy.actor)
-    if kind is not None:
-        {"gru": _gru, "lstm": _lstm}[kind](graph, jax.device_get(policy.actor[kind]))
+    if recurrent.kind(policy.actor):
+        _remember(graph, jax.device_get(policy.actor))
     *hidden, last = jax.device_get(policy.actor["layers"])
     for layer in hidden:
         graph.then("Gemm", layer["w"], layer["b"])
         graph.activate(policy.activation)
-    graph.then("Gemm", last["w"][:, :size], last["b"][:size])  # a spread by state comes after the means
+    if policy.beta:
+        graph.then("Gemm", last["w"], last["b"])
+        _mean_of_beta(graph, policy.action_clip)
+    else:
+        graph.then("Gemm", last["w"][:, :size], last["b"][:size])  # a spread by state comes after the means
+
+
+def _mean_of_beta(graph: Graph, limit: float) -> None:
+    """limit (2 a / (a + b) - 1), both concentrations softplus(x) + 1."""
+    graph.then("Softplus")
+    graph.then("Add", 1.0)
+    a, b = graph.split(2)
+    whole = graph.at(a).then("Add", b)
+    graph.at(a).then("Div", whole)
+    graph.then("Mul", 2.0 * limit)
+    graph.then("Add", -limit)
+
+
+def _remember(graph: Graph, actor: Any) -> None:
+    """Observation -> outputs of the last recurrent layer, and memory_next."""
+    layers, observed = recurrent.layers(actor), graph.value
+    layer_of = {"gru": _gru, "lstm": _lstm}[recurrent.kind(actor)]  # type: ignore[index]
+    memories = ["memory"] if len(layers) == 1 else graph.at("memory").split(len(layers))
+    after = []
+    for layer, memory in zip(layers, memories, strict=True):
+        output = "memory_next" if len(layers) == 1 else f"memory_{len(after)}"
+        graph.at(observed)
+        after.append(output)
+        observed = layer_of(graph, layer, memory, output)
+    if len(layers) > 1:
+        graph.at(after[0]).then("Concat", *after[1:], output="memory_next", axis=1)
+    graph.at(observed)
 
 
 def _gates(graph: Graph, value: str, side: Any, count: int) -> list[str]:
@@ -98,24 +135,24 @@ def _gates(graph: Graph, value: str, side: Any, count: int) -> list[str]:
     return graph.split(count)
 
 
-def _gru(graph: Graph, layer: Any) -> None:
-    """Observation -> memory_next, as `recurrent.gru` does."""
+def _gru(graph: Graph, layer: Any, memory: str, output: str) -> str:
+    """The running value -> `output`, the memory after it, as `recurrent.gru` does; what the next layer sees."""
     observed = _gates(graph, graph.value, layer["x"], 3)
-    remembered = _gates(graph, "memory", layer["h"], 3)
+    remembered = _gates(graph, memory, layer["h"], 3)
     sums = [graph.at(x).then("Add", h) for x, h in zip(observed[:2], remembered[:2], strict=True)]
     reset, update = [graph.at(x).then("Sigmoid") for x in sums]
     graph.at(remembered[2]).then("Mul", reset)
     graph.then("Add", observed[2])
     new = graph.then("Tanh")
-    graph.at("memory").then("Sub", new)  # new + z (memory - new)
+    graph.at(memory).then("Sub", new)  # new + z (memory - new)
     graph.then("Mul", update)
-    graph.then("Add", new, output="memory_next")
+    return graph.then("Add", new, output=output)
 
 
-def _lstm(graph: Graph, layer: Any) -> None:
-    """Observation -> hidden units, and memory_next, as `recurrent.lstm` does."""
+def _lstm(graph: Graph, layer: Any, memory: str, output: str) -> str:
+    """The running value -> `output`, the memory after it, as `recurrent.lstm` does; its hidden units."""
     observed = graph.then("Gemm", layer["x"]["w"], layer["x"]["b"])
-    hidden, cells = graph.at("memory").split(2)
+    hidden, cells = graph.at(memory).split(2)
     graph.at(hidden).then("Gemm", layer["h"]["w"], layer["h"]["b"])
     graph.then("Add", observed)
     sums = graph.split(4)
@@ -125,5 +162,5 @@ def _lstm(graph: Graph, layer: Any) -> None:
     cells = graph.then("Add", kept)
     graph.then("Tanh")
     hidden = graph.then("Mul", show)
-    graph.then("Concat", cells, output="memory_next", axis=1)
-    graph.at(hidden)
+    graph.then("Concat", cells, output=output, axis=1)
+    return hidden

@@ -14,7 +14,8 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from bayessim_mjx.compat import program
 from bayessim_mjx.config import PPOConfig
-from bayessim_mjx.rl import catalogue, episodes, losses, networks, normalise, sharding, transitions, worlds
+from bayessim_mjx.rl import actions, catalogue, episodes, losses, networks, normalise, sharding, transitions, worlds
+from bayessim_mjx.rl.batch import Batch
 from bayessim_mjx.rl.checks import check
 from bayessim_mjx.rl.extension import Learner, Sizes
 from bayessim_mjx.rl.sharding import EVERYWHERE, FIRST
@@ -177,14 +178,21 @@ def update(
         "Loss/learning_rate": rate,
         # explained variance = 1 - var(R - V) / var(R)
         "Loss/explained_variance": 1 - (batch.returns - batch.value).var() / (batch.returns.var() + 1e-8),
-        "Policy/mean_std": jnp.exp(params["actor"]["log_std"] if batch.log_std is None else batch.log_std).mean(),
+        "Policy/mean_std": _spread(config, params, batch),
         "env_steps": after.env_steps,
         **episodes.metrics(after.episodes),
+        **episodes.terms(data),
     }
     for extension in learner.extensions:
         shown = extension.metrics(states.get(extension.name), metrics, learner)
         metrics |= {tag: jnp.asarray(x, jnp.float32) for tag, x in shown.items()}
     return sharding.pinned(after, state.mesh, layout(after)), metrics
+
+
+def _spread(config: PPOConfig, params: networks.Params, batch: Batch) -> jax.Array:
+    """Mean standard deviation of raw actions: the new one, or before learning where it depends on the state."""
+    alike = networks.log_std(params["actor"], networks.form(config))
+    return actions.of(config).sd(batch.mean, batch.log_std if alike is None else alike).mean()  # type: ignore[arg-type]
 
 
 @lru_cache(maxsize=32)

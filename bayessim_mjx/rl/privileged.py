@@ -38,6 +38,11 @@ def for_teacher(env: Env) -> Any:
     return _knowing(env, "policy", "teacher", "ppo.teacher")
 
 
+def teacher_knowing(env: Env) -> Any:
+    """`env` whose group "teacher" ends with theta."""
+    return _knowing(env, "teacher", "teacher", "ppo.teacher")
+
+
 @dataclass(frozen=True)
 class CriticTheta(Extension):
     """`ppo.critic_theta` as an extension of PPO."""

@@ -1,4 +1,4 @@
-"""Policies with a memory: a GRU (Cho et al. 2014) or LSTM (Gers et al. 2000) layer before the actor's others.
+"""Policies with a memory: GRU (Cho et al. 2014) or LSTM (Gers et al. 2000) layers before the actor's others.
 
 The memory travels through the environment, as an observation group that the action carries on: it is zero wherever an
 episode begins, and to all else a policy stays a function of its observations. The first numbers of a memory are the
@@ -38,7 +38,7 @@ class Sequences:
 
     observation: jax.Array  # [n, T, S] normalised
     memory: jax.Array  # [n, T, M] before each step, of the collecting policy
-    starts: jax.Array  # [n, T] 1 at the first step and wherever an episode begins
+    starts: jax.Array  # [n, T] 1 at the first step, wherever an episode begins, and where gradients are cut
 
 
 def init(key: jax.Array, size: int, units: int, cell: str = "gru") -> Params:
@@ -52,6 +52,16 @@ def init(key: jax.Array, size: int, units: int, cell: str = "gru") -> Params:
         "x": {"w": side(keys[:gates], size), "b": bias.at[units : 2 * units].set(1.0) if cell == "lstm" else bias},
         "h": {"w": side(keys[gates:], units), "b": bias},
     }
+
+
+def stacked(key: jax.Array, size: int, units: int, cell: str, count: int) -> dict[str, Params]:
+    """Parameters of `count` layers of `units`, one on the other, by their keys in an actor: gru, gru_1 ..."""
+    keys = [key, *(jax.random.fold_in(key, i) for i in range(1, count))]
+    return {_key(cell, i): init(k, units if i else size, units, cell) for i, k in enumerate(keys)}
+
+
+def _key(cell: str, i: int) -> str:
+    return f"{cell}_{i}" if i else cell
 
 
 def gru(layer: Params, memory: jax.Array, x: jax.Array) -> jax.Array:
@@ -89,8 +99,17 @@ def kind(actor: Params) -> str | None:
     return next((name for name in CELLS if name in actor), None)
 
 
+def layers(actor: Params) -> list[Params]:
+    """Its recurrent layers, from the first to the last."""
+    name = kind(actor)
+    if name is None:
+        return []
+    keys = [_key(name, i) for i in range(len(actor))]
+    return [actor[key] for key in keys if key in actor]
+
+
 def units(actor: Params) -> int:
-    """Outputs of its recurrent layer, 0 without one."""
+    """Outputs of a recurrent layer, 0 without one."""
     name = kind(actor)
     return 0 if name is None else len(actor[name]["h"]["w"])
 
@@ -98,20 +117,28 @@ def units(actor: Params) -> int:
 def memory_size(actor: Params) -> int:
     """Numbers of memory, 0 without one."""
     name = kind(actor)
-    return 0 if name is None else MEMORIES[name] * units(actor)
+    return 0 if name is None else MEMORIES[name] * units(actor) * len(layers(actor))
 
 
 def memories(actor: Params, x: Remembered | Sequences) -> jax.Array:
     """The memory after each observation, [..., M]."""
     name = kind(actor)
     assert name is not None
-    layer, after = actor[name], CELLS[name].after
+    stack, cell, outputs = layers(actor), CELLS[name], units(actor)
+
+    def after(memory: jax.Array, seen: jax.Array) -> jax.Array:
+        parts = []
+        for layer, part in zip(stack, jnp.split(memory, len(stack), -1), strict=True):
+            parts.append(cell.after(layer, part, seen))
+            seen = parts[-1][..., :outputs]
+        return jnp.concatenate(parts, -1)
+
     if isinstance(x, Remembered):
-        return after(layer, x.memory, x.observation)
+        return after(x.memory, x.observation)
 
     def step(memory: jax.Array, now: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         observation, stored, start = now
-        memory = after(layer, jnp.where(start[:, None] > 0, stored, memory), observation)
+        memory = after(jnp.where(start[:, None] > 0, stored, memory), observation)
         return memory, memory
 
     in_time = jax.tree.map(lambda leaf: leaf.swapaxes(0, 1), (x.observation, x.memory, x.starts))
@@ -119,13 +146,22 @@ def memories(actor: Params, x: Remembered | Sequences) -> jax.Array:
 
 
 def features(actor: Params, x: Remembered | Sequences) -> jax.Array:
-    """The units' outputs after each observation, [..., H]: what the actor's layers see."""
-    return memories(actor, x)[..., : units(actor)]
+    """The last layer's outputs after each observation, [..., H]: what the actor's other layers see."""
+    whole, last = memories(actor, x), memory_size(actor) - memory_size(actor) // len(layers(actor))
+    return whole[..., last : last + units(actor)]
 
 
-def sequences(x: Remembered, ended: jax.Array) -> Sequences:
-    """Time-major steps [T, N, ...], of which `ended` [T, N] were the last of an episode; still time-major."""
-    return Sequences(x.observation, x.memory, jnp.concatenate([jnp.ones_like(ended[:1]), ended[:-1]]))
+def sequences(x: Remembered, ended: jax.Array, length: int = 0) -> Sequences:
+    """Time-major steps [T, N, ...], of which `ended` [T, N] were the last of an episode; still time-major.
+
+    length: gradients flow back through so many steps at most, and on the first of them the memory is the collecting
+    policy's; 0: through all of them.
+    """
+    starts = jnp.concatenate([jnp.ones_like(ended[:1]), ended[:-1]])
+    if length:
+        cut = jnp.arange(len(starts)) % length == 0
+        starts = jnp.maximum(starts, cut[:, None].astype(starts.dtype))
+    return Sequences(x.observation, x.memory, starts)
 
 
 @lru_cache(maxsize=32)

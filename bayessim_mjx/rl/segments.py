@@ -52,7 +52,7 @@ def renewed(params: networks.Params, batch: Any, config: PPOConfig) -> tuple[Any
     episode is cut off: the true next observation is then not the next one seen. No gradient flows through advantages
     and returns; the values [S L] are those to learn from, so that the critic is asked once.
     """
-    act, future = networks.activation(config.activation), batch.future
+    act, future = networks.form(config), batch.future
     flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), dataclasses.replace(batch, future=None))
     values, last = (networks.value(params, x, act) for x in (flat.critic_observation, future.last))
     value = jax.lax.stop_gradient(values).reshape(future.reward.shape)

@@ -66,5 +66,7 @@ def policy_of(state: TrainState) -> Policy:
         normalize=config.normalize_observations,
         action_clip=config.action_clip,
         squash=config.action_bound == "tanh",
+        std_range=config.std_range,
+        beta=config.distribution == "beta",
     )
     return sharding.at_home(policy)

@@ -13,7 +13,7 @@ from flax import struct
 from bayessim_mjx.config import PPOConfig, SymmetryConfig
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.mirrors import MirrorMap, SignedPermutation
-from bayessim_mjx.rl import networks, normalise
+from bayessim_mjx.rl import actions, networks, normalise
 from bayessim_mjx.rl.batch import Batch
 from bayessim_mjx.rl.extension import Extension, Figures, Learner
 from bayessim_mjx.rl.networks import Params
@@ -122,7 +122,7 @@ class Symmetry(Extension):
     ) -> Copies:
         """Mirror images [T, N, K, ...] of the collected transitions, as the collecting policy would have rated them."""
         maps, group, config = self._maps(learner), learner.critic_group, learner.config
-        act = networks.activation(config.activation)
+        act, law = networks.form(config), actions.of(config)
 
         def seen(group: str, moments: Mapping[str, normalise.Moments]) -> jax.Array:
             raw = images(data["observation"][group], [m.observation[group] for m in maps])
@@ -130,8 +130,8 @@ class Symmetry(Extension):
 
         observation, critic_observation = seen("policy", normalizer), seen(group, normalizer)
         action = images(data["extras"]["action"], [m.action for m in maps])
-        collector = networks.gaussian(state.params["actor"], seen("policy", state.normalizer), act)
-        density = networks.log_prob(*collector, action)
+        collector = networks.distribution(state.params["actor"], seen("policy", state.normalizer), act)
+        density = law.log_prob(*collector, action)
         value = networks.value(state.params, critic_observation, act)
         weight = jnp.exp(jnp.minimum(0.0, density - log_prob[..., None]))
         return Copies(observation, critic_observation, action, density, value, weight)
@@ -147,8 +147,8 @@ class Symmetry(Extension):
         if self.settings.use_data_augmentation:  # the copies are the first samples behind the batch
             mirrored = means[len(mean) : len(mean) * (1 + copies.value.shape[1])]
         else:
-            act = networks.activation(learner.config.activation)
-            mirrored = networks.mean_action(params, copies.observation, act)
+            act, law = networks.form(learner.config), actions.of(learner.config)
+            mirrored = networks.mean_action(params, copies.observation, act, law)
         mirrored = mirrored.reshape(len(mean), -1, mean.shape[-1])
         asymmetry = mirror_loss(mean, mirrored, [mirror.action for mirror in self._maps(learner)])
         term = self.settings.mirror_loss_coeff * asymmetry if self.settings.use_mirror_loss else None

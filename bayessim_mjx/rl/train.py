@@ -17,7 +17,7 @@ from bayessim_mjx.compat import program
 from bayessim_mjx.config import PPOConfig
 from bayessim_mjx.device import cores
 from bayessim_mjx.errors import DivergedError, UserError
-from bayessim_mjx.rl import catalogue, checks, distil, ppo, sharding
+from bayessim_mjx.rl import catalogue, checks, distil, episodes, ppo, sharding
 from bayessim_mjx.rl.networks import Policy
 from bayessim_mjx.rl.state import TrainState, policy_of
 
@@ -52,12 +52,14 @@ def _make_chunk(env: Env, config: PPOConfig, distils: bool = False) -> Any:
     latest = {*LATEST, *(tag for extension in catalogue.active(config) for tag in extension.latest)}
 
     def chunk(state: TrainState, given: tuple, count: jax.Array) -> tuple[TrainState, Metrics]:
+        announced = (*reported, *episodes.tags_of_terms(getattr(state.env_states, "metrics", {})))
+
         def body(_: jax.Array, carry: tuple[TrainState, Metrics]) -> tuple[TrainState, Metrics]:
             state, metrics = update(env, config, carry[0], *given)
-            _check_announced(metrics, reported)
+            _check_announced(metrics, announced)
             return state, {k: v if k in latest else carry[1][k] + v / count for k, v in metrics.items()}
 
-        zeros = {tag: jnp.float32(0) for tag in reported} | {"env_steps": jnp.uint32(0)}
+        zeros = {tag: jnp.float32(0) for tag in announced} | {"env_steps": jnp.uint32(0)}
         return jax.lax.fori_loop(0, count, body, (state, zeros))
 
     return program(chunk, env, donate_argnums=0)

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from bayessim_mjx.config import PPOConfig
-from bayessim_mjx.rl import networks, normalise, recurrent, segments, sharding
+from bayessim_mjx.rl import actions, networks, normalise, recurrent, segments, sharding
 from bayessim_mjx.rl.batch import Batch
 from bayessim_mjx.rl.extension import Learner
 from bayessim_mjx.rl.gae import gae
@@ -40,7 +40,7 @@ def batch(learner: Learner, state: TrainState, data: dict, normalizer: dict[str,
         normalizer: of `statistics`.
     """
     config, group = learner.config, learner.critic_group
-    act = networks.activation(config.activation)
+    act = networks.form(config)
 
     def seen(which: str, group: str) -> Any:
         x = data[which][group]
@@ -55,7 +55,8 @@ def batch(learner: Learner, state: TrainState, data: dict, normalizer: dict[str,
     next_value = networks.value(state.params, valued("final_observation"), act)
     if config.memory:
         steps = recurrent.Remembered(observation, data["observation"]["memory"])
-        observation = recurrent.sequences(steps, jnp.maximum(data["terminated"], data["truncated"]))
+        ended = jnp.maximum(data["terminated"], data["truncated"])
+        observation = recurrent.sequences(steps, ended, config.gradient_length)
         critic_observation = observation if config.shared_trunk else critic_observation
     reward = config.reward_scale * data["reward"]
     ends = (data["terminated"], data["truncated"])
@@ -87,11 +88,12 @@ def _densities(
     The log sd is None where it does not depend on the state.
     """
     action, mean, log_std = data["extras"]["action"], data["extras"]["mean"], data["extras"].get("log_std")
-    actor = state.params["actor"]
-    log_prob = networks.log_prob(mean, actor.get("log_std") if log_std is None else log_std, action)
+    actor, form = state.params["actor"], networks.form(config)
+    spread = networks.log_std(actor, form) if log_std is None else log_std
+    log_prob = actions.of(config).log_prob(mean, spread, action)  # type: ignore[arg-type]
     if config.normalize_observations:
         turned = partial(jax.tree.map, lambda x: x.swapaxes(0, 1) if config.memory else x)
-        mean, spread = networks.gaussian(actor, turned(observation), networks.activation(config.activation))
+        mean, spread = networks.distribution(actor, turned(observation), form)
         mean, log_std = turned((mean, None if log_std is None else spread))
     return log_prob, mean, log_std
 

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax.sharding import Mesh
 
 from bayessim_mjx.physics.nuisance import starting
-from bayessim_mjx.rl import sharding
+from bayessim_mjx.rl import actions, sharding
 from bayessim_mjx.rl.extension import Learner
 from bayessim_mjx.rl.networks import Policy
 from bayessim_mjx.rl.sharding import EVERYWHERE, FIRST, SECOND
@@ -102,7 +102,7 @@ def gather(
     def run(policy: Policy, noise: jax.Array, env_states: State, pool: State) -> tuple[State, dict]:
         def act(noise: jax.Array, obs: dict[str, jax.Array]) -> tuple[jax.Array, dict]:
             mean, log_std = policy.distribution(obs)
-            action = mean + jnp.exp(log_std) * noise
+            action = law.made(noise, mean, log_std)
             extras = {"action": action, "mean": mean}
             done = policy.carried(obs, policy.bounded(action))
             return done, extras if log_std.ndim == 1 else extras | {"log_std": log_std}
@@ -110,7 +110,8 @@ def gather(
         return collect(env, act, noise, env_states, pool, groups)
 
     shape = (config.num_steps, config.num_envs, env.action_size - config.memory_size)
-    noise = sharding.pinned(jax.random.normal(noise_key, shape), mesh, SECOND)
+    law = actions.of(config)
+    noise = sharding.pinned(law.noise(noise_key, *shape), mesh, SECOND)
     pool = reset(env, pool_key, domain, config.num_envs, mesh, clock(env, state.env_states))
     run = sharding.local(run, mesh, (EVERYWHERE, SECOND, FIRST, FIRST), (FIRST, SECOND))
     return run(policy_of(state), noise, state.env_states, pool)

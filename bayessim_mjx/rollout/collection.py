@@ -16,6 +16,8 @@ from bayessim_mjx.rollout.episodes import PolicyFn, select, traced
 if TYPE_CHECKING:
     from bayessim_mjx.env import Env, State
 
+TERM = "reward_"  # how metrics are called that are parts of the reward
+
 
 def collect(
     env: Env,
@@ -39,8 +41,8 @@ def collect(
 
     Returns:
         (the last states, time-major arrays [T, N, ...]): observation and final_observation (the next one, before any
-        reset) by group, reward, terminated, truncated, extras. What later steps do not depend on is not carried on: it
-        stays in the states as it was.
+        reset) by group, reward, terminated, truncated, extras, and terms (metrics that are parts of the reward). What
+        later steps do not depend on is not carried on: it stays in the states as it was.
     """
     worlds = env_states.reward.shape[0]
     size, lasting = ring(worlds), _lasting(env, env_states, tuple(groups))
@@ -60,6 +62,7 @@ def collect(
             "terminated": terminated,
             "truncated": truncated,
             "extras": extras,
+            "terms": {name: x for name, x in getattr(after, "metrics", {}).items() if name.startswith(TERM)},
         }
         following = first + (index - first + stride) % size
         fresh = jax.tree.map(lambda lasts, new: new[index] if lasts else new, lasting, pool)

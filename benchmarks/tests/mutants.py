@@ -121,8 +121,8 @@ PPO_MUTANTS = (
         (f"{T}symmetry.py", "-k", "weighted_and_added"),
     ),
     Mutant(
-        19, "arguments of KL swapped", LOSSES, "networks.kl(batch.mean, old, mean, log_std)",
-        "networks.kl(mean, log_std, batch.mean, old)", (f"{T}losses.py", "-k", "reported_kl"),
+        19, "arguments of KL swapped", LOSSES, "law.kl(batch.mean, old, mean, log_std)",
+        "law.kl(mean, log_std, batch.mean, old)", (f"{T}losses.py", "-k", "reported_kl"),
     ),
     Mutant(
         20, "novelty by the L1 norm", RND, "networks.mlp(rnd.predictor, x, act), axis=-1)",

@@ -26,7 +26,8 @@ def env():
 def policy(activation="elu", state_dependent_std=False, size=3, actions=1, **changes):
     """A policy with statistics of its own, whose actions reach their limits."""
     keys = jax.random.split(jax.random.PRNGKey(1))
-    config = PPOConfig(hidden_actor=(16, 8), hidden_critic=(8,), state_dependent_std=state_dependent_std)
+    kind = {"distribution": "beta" if changes.get("beta") else "gaussian", "state_dependent_std": state_dependent_std}
+    config = PPOConfig(hidden_actor=(16, 8), hidden_critic=(8,), **kind)
     params = networks.init(keys[0], networks.Sizes(size, size, actions), config)
     layers = params["actor"]["layers"]
     actor = {**params["actor"], "layers": [*layers[:-1], jax.tree.map(lambda x: 60 * x, layers[-1])]}
@@ -44,7 +45,7 @@ def run(path, observation):
     "kind",
     [{"activation": name} for name in networks.ACTIVATIONS]
     + [{"squash": True, "action_clip": 0.8}, {"action_clip": 0.5}, {"action_clip": 3.0}, {"normalize": False},
-       {"state_dependent_std": True, "squash": True}],
+       {"state_dependent_std": True, "squash": True}, {"beta": True, "action_clip": 0.9}, {"std_range": (0.1, 3.0)}],
     ids=str,
 )  # fmt: skip
 def test_every_kind_of_policy_answers_alike_in_any_batch(env, kind, tmp_path):
@@ -59,10 +60,12 @@ def test_every_kind_of_policy_answers_alike_in_any_batch(env, kind, tmp_path):
     assert np.std(action) > 0.05 and np.abs(action).max() <= min(1.0, p.action_clip) + 1e-6
 
 
-@pytest.mark.parametrize(("cell", "numbers"), [("gru", 4), ("lstm", 8)])
-def test_a_memory_goes_in_and_comes_out(env, tmp_path, cell, numbers):
+@pytest.mark.parametrize(
+    ("cell", "layers", "numbers"), [("gru", 1, 4), ("lstm", 1, 8), ("gru", 3, 12), ("lstm", 2, 16)]
+)
+def test_a_memory_goes_in_and_comes_out(env, tmp_path, cell, layers, numbers):
     """Three steps from zeros: the file's actions and memories are those of the policy."""
-    config = PPOConfig(hidden_actor=(8,), hidden_critic=(8,), memory=4, memory_cell=cell)
+    config = PPOConfig(hidden_actor=(8,), hidden_critic=(8,), memory=4, memory_cell=cell, memory_layers=layers)
     params = networks.init(jax.random.PRNGKey(0), networks.Sizes(3, 3, 1), config)
     actor = {**params["actor"], "layers": jax.tree.map(lambda x: 9 * x, params["actor"]["layers"])}
     p, remembering = Policy(actor, normalise.init(3)), recurrent.remembering(env, numbers)

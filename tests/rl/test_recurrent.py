@@ -153,5 +153,3 @@ def test_what_cannot_work_is_refused():
         dataclasses.replace(CONFIG, memory_cell="rnn")
     with pytest.raises(UserError, match="whole sequences.*num_envs = 2"):
         dataclasses.replace(CONFIG, num_envs=2)
-    with pytest.raises(UserError, match="not with ppo.teacher"):
-        dataclasses.replace(CONFIG, teacher="somewhere")

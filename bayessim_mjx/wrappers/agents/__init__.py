@@ -21,6 +21,8 @@ Progress = Callable[[Mapping[str, float]], None]
 # settings that only our own PPO has, with the values at which they ask for nothing
 OURS: dict[str, tuple[Any, ...]] = {
     "memory": (0,), "policy_theta": (False,), "critic_theta": (False,), "shared_trunk": (False,), "segment": (0,),
+    "memory_layers": (1,), "gradient_length": (0,), "actor_groups": ((), []), "critic_groups": ((), []),
+    "distribution": ("gaussian",), "std_type": ("log",), "std_range": ((), []),
     "state_dependent_std": (False,), "teacher": (None,), "extensions": ((), []), "action_bound": ("clip",),
     "action_clip": (1.0,), "symmetry": (None,), "rnd": (None,),
 }  # fmt: skip

@@ -16,7 +16,9 @@ from bayessim_mjx.wrappers.agents.episodes import Recent
 from bayessim_mjx.wrappers.worlds import Worlds
 
 TAKES = ("rnd", "symmetry")
-ACTIVATIONS = ("elu", "relu", "selu", "tanh")  # that both know
+# that both know, and theirs of them; its gelu is another function
+ACTIVATIONS = {name: name for name in ("elu", "relu", "selu", "tanh", "swish", "mish", "lrelu", "softplus", "sigmoid")}
+ACTIVATIONS |= {"celu": "crelu"}
 
 
 def make(config: Config, worlds: Worlds) -> RslRlAgent:
@@ -43,7 +45,7 @@ class RslRlAgent:
     def _settings(self, env: Any) -> dict[str, Any]:
         ppo = self.config.ppo
         settings = rsl_rl.settings(symmetry=ppo.symmetry is not None, rnd=ppo.rnd.weight if ppo.rnd else 0.0)
-        net = {"activation": ppo.activation, "obs_normalization": ppo.normalize_observations}
+        net = {"activation": ACTIVATIONS[ppo.activation], "obs_normalization": ppo.normalize_observations}
         settings["actor"] |= net | {"hidden_dims": list(ppo.hidden_actor)}
         settings["actor"]["distribution_cfg"] |= {"init_std": ppo.init_std}
         settings["critic"] |= net | {"hidden_dims": list(ppo.hidden_critic)}

@@ -47,7 +47,10 @@ class SB3Agent:
         import torch
 
         ppo = self.config.ppo
-        names = {"elu": "ELU", "relu": "ReLU", "selu": "SELU", "tanh": "Tanh", "swish": "SiLU", "gelu": "GELU"}
+        names = {
+            "elu": "ELU", "relu": "ReLU", "selu": "SELU", "tanh": "Tanh", "swish": "SiLU", "gelu": "GELU",
+            "celu": "CELU", "lrelu": "LeakyReLU", "mish": "Mish", "softplus": "Softplus", "sigmoid": "Sigmoid",
+        }  # fmt: skip
         widths = {"pi": list(ppo.hidden_actor), "vf": list(ppo.hidden_critic)}
         activation = getattr(torch.nn, names[ppo.activation])
         return {"net_arch": widths, "activation_fn": activation, "log_std_init": float(np.log(ppo.init_std))}
