@@ -15,7 +15,7 @@ from bayessim_mjx import effects as library
 from bayessim_mjx.diagnosis import tolerance
 from bayessim_mjx.diagnosis.equation_error import leads
 from bayessim_mjx.diagnosis.equation_error.look import Look
-from bayessim_mjx.diagnosis.fitting import candidates, command_shift, discretisation, scales, stability, windows
+from bayessim_mjx.diagnosis.fitting import candidates, command_shift, discretisation, scales, stepping, windows
 from bayessim_mjx.diagnosis.fitting.centred_commands import physics_of
 from bayessim_mjx.diagnosis.fitting.fitter import Fitter
 from bayessim_mjx.diagnosis.fitting.robot import Robot
@@ -125,16 +125,16 @@ def prepare(
     kinds = [library.load(n) if isinstance(n, str) else n for n in (library.names() if effects == "all" else effects)]
     size = scales.measure(robot.mj_model, [resample(log, dt) for log in usable], robot.rating)
     stack, left_out = candidates.stack(kinds, size)
-    own, delivered = robot.physics(dt), float(robot.mj_model.opt.timestep)
-    stable = stability.needed(own.mj_model, usable)
-    robot = stable.robot(robot)
-    own = robot.physics(dt) if stable.changed else own
     limit = tolerance.judge(robot.mj_model, 2 * size.travel, _noise(usable), asked).limit
-    cuts, step = _measured(own, usable, group, seen.use_qvel, stable.factor, limit)
+    delivered = float(robot.mj_model.opt.timestep)
+    steps = stepping.stepping(
+        robot, dt, usable, lambda own, first: _measured(own, usable, group, seen.use_qvel, first, limit)
+    )
+    cuts, step = steps.cuts, steps.worth
     shift = _shift(cuts, step, size)
     lead = min(shift.late, 0.0) if shift is not None and shift.certain else 0.0
     seen = seen.shifted(lead) if lead else seen
-    robot = step.robot(robot)
+    robot = step.robot(steps.robot)
     physics = physics_of(robot, dt, stack)
     most = _limit(physics, step.errors.cut.steps if step.errors else cuts(1).steps)
     cut = step.noisier(cuts(step.factor, limit=most, centred=False, late=lead))
@@ -143,10 +143,10 @@ def prepare(
     led = leads.lead(candidates.enumerate_candidates(physics), before)
     settings = dataclasses.replace(settings or _settings(robot), believed=step.believed, **led.order)
     allowed = tolerance.judge(robot.mj_model, 2 * size.travel, cut.sigma_q, asked)
-    said = [*stable.sentences(), *step.beyond(), *_faster(seen.usable, delivered, dt)]
+    said = [*steps.said(), *_faster(seen.usable, delivered, dt)]
     if shift is not None and shift.certain:
         said.append(shift.sentence(float(np.median([log.period for log in logs]))))
-    told += [*said, *floors.warnings, *(step.warnings() if stable.factor == 1 else ())]
+    told += [*said, *floors.warnings, *steps.warnings()]
     told += [*(f"not tried: {text}" for text in left_out), *_few_conditions(cut)]
     told += [*allowed.warnings(), *led.sentences()]
     fixed = (robot, physics, seen, floors, fitter, led.candidates, size, settings, seed, allowed)

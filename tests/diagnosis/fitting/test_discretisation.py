@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from bayessim_mjx.diagnosis.fitting import discretisation, robot
+from bayessim_mjx.diagnosis.fitting import discretisation, robot, stepping
 from bayessim_mjx.diagnosis.fitting.quadratic import eliminate
 from bayessim_mjx.diagnosis.fitting.substeps import Errors
 from bayessim_mjx.diagnosis.setup import _measured, _windows
@@ -184,3 +184,30 @@ def test_how_much_of_the_noise_is_the_sensors(floor, simulated, share):
         0.01, 1, 1.0, none, none, none, sigma, np.full(4, floor), np.full(2, simulated), ("a", "b")
     )
     assert found.believed == pytest.approx(share)
+
+
+def test_beyond_the_tolerance_steps_get_finer_than_the_budget_and_what_is_left_is_told():
+    assert discretisation._within({1: 0.9, 2: 0.4, 4: 0.2}, 1, 4) == 1
+    assert discretisation._within({1: 5.0, 2: 2.5, 4: 1.2, 8: 0.6, 16: 0.3}, 2, 16) == 8
+    assert discretisation._within({1: 50.0, 2: 25.0, 4: 12.0, 8: 6.0, 16: 3.0}, 2, 8) == 8  # what can be had
+    none, sigma = np.zeros(4), np.full(4, 1e-3)
+    left = np.array([1e-3, 8e-3, 0.0, 0.0])
+    given = (0.01, 8, 1.0, none, none, left, sigma, sigma, np.zeros(2, bool), ("a", "b"))
+    (text,) = discretisation.Discretisation(*given, limit=np.full(2, 2e-3)).beyond()
+    assert "sub-steps of 1.2 ms are still worth 0.008 rad or m at b, where 0.002 may stay" in text
+    assert not discretisation.Discretisation(*given, limit=np.full(2, 1e-2)).beyond()
+    assert not discretisation.Discretisation(*given).beyond()
+
+
+def test_runge_and_kutta_step_in_where_sub_steps_do_not_suffice():
+    """A tolerance of a fiftieth of the noise: 3e-6 rad of a swing of two radians."""
+    recorded, limit, tried = logs(ARM, swing), np.full(2, 6e-6), []
+
+    def measured_by(own, first):
+        tried.append(int(own.mj_model.opt.integrator))
+        return _measured(own, recorded, None, False, first, limit)
+
+    found = stepping.stepping(the(ARM), PERIOD, recorded, measured_by)
+    assert tried[-1] == mujoco.mjtIntegrator.mjINT_RK4 and len(tried) == 2
+    assert not found.worth.beyond() and "by RK4 at" in found.said()[0]
+    assert found.robot.mj_model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4

@@ -1,0 +1,65 @@
+"""The simulator's step for a diagnosis: stable, and where sub-steps do not suffice by Runge and Kutta's method."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from bayessim_mjx.diagnosis.fitting import stability
+from bayessim_mjx.diagnosis.fitting.discretisation import Discretisation, contacts
+from bayessim_mjx.diagnosis.fitting.robot import Robot
+from bayessim_mjx.logs.log import Log
+from bayessim_mjx.physics import Physics
+
+# (robot's physics, coarsest stable factor) -> (the windows, what the time step is worth in them)
+Measured = Callable[[Physics, int], tuple[Any, Discretisation]]
+
+
+@dataclasses.dataclass(frozen=True)
+class Stepping:
+    """How the robot is simulated.
+
+    Attributes:
+        robot: with the integrator of the diagnosis; stable: its coarsest stable step.
+        cuts, worth: the windows, and what the time step is worth in them.
+        better: told where the integrator was changed for its accuracy.
+    """
+
+    robot: Robot
+    stable: stability.Step
+    cuts: Any
+    worth: Discretisation
+    better: tuple[str, ...] = ()
+
+    def said(self) -> list[str]:
+        """What the user is told before anything is fitted."""
+        return [*self.stable.sentences(), *self.better, *self.worth.beyond()]
+
+    def warnings(self) -> list[str]:
+        """What the model's own step costs, where it can be simulated at all."""
+        return self.worth.warnings() if self.stable.factor == 1 else []
+
+
+def stepping(robot: Robot, dt: float, logs: Sequence[Log], measured: Measured) -> Stepping:
+    """The coarsest stable step; where no sub-steps bring it below the tolerance and nothing can touch, RK4."""
+    stable = stability.needed(robot.physics(dt).mj_model, logs)
+    robot = stable.robot(robot)
+    own = robot.physics(dt)
+    plain = Stepping(robot, stable, *measured(own, stable.factor))
+    if not plain.worth.beyond() or contacts(own) or int(own.mj_model.opt.integrator) == stability.RK4:
+        return plain
+    model = copy.copy(robot.mj_model)
+    model.opt.integrator = stability.RK4
+    other = dataclasses.replace(robot, mj_model=model)
+    physics = other.physics(dt)
+    needs = stability.needed(physics.mj_model, logs)
+    if needs.changed or not needs.reached:
+        return plain
+    found = measured(physics, needs.factor)
+    if found[1].beyond():
+        return plain
+    step = 1e3 * found[1].timestep / found[1].factor
+    text = f"no sub-steps of the model's integrator are fine enough: the diagnosis simulates by RK4 at {step:.3g} ms"
+    return Stepping(other, dataclasses.replace(needs, joint=stable.joint), *found, better=(text,))
