@@ -118,7 +118,7 @@ def _remember(graph: Graph, actor: Any) -> None:
     layers, observed = recurrent.layers(actor), graph.value
     layer_of = {"gru": _gru, "lstm": _lstm}[recurrent.kind(actor)]  # type: ignore[index]
     memories = ["memory"] if len(layers) == 1 else graph.at("memory").split(len(layers))
-    after = []
+    after: list[str] = []
     for layer, memory in zip(layers, memories, strict=True):
         output = "memory_next" if len(layers) == 1 else f"memory_{len(after)}"
         graph.at(observed)

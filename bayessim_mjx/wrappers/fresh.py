@@ -12,6 +12,7 @@ from brax.envs.base import Wrapper
 from brax.envs.wrappers.training import EpisodeWrapper, VmapWrapper
 from flax import struct
 
+from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.env import Env, State
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.rl.worlds import clock, drawn, reset_at
@@ -67,8 +68,8 @@ class FreshEpisodes(Wrapper):
 
     def __init__(self, env: Any, source: Env) -> None:
         super().__init__(env)
-        under = isinstance(source, Under)
-        self._source, self._domain = (source.env, source.domain) if under else (source, None)  # type: ignore[attr-defined]
+        self._source: Env = source.env if isinstance(source, Under) else source
+        self._domain: Distribution | None = source.domain if isinstance(source, Under) else None
 
     def _drawn(self, key: jax.Array, count: int, now: Any = 0) -> State:
         theta_key, reset_key = jax.random.split(key)
