@@ -132,7 +132,7 @@ def prepare(
     )
     cuts, step = steps.cuts, steps.worth
     shift = _shift(cuts, step, size)
-    lead = min(shift.late, 0.0) if shift is not None and shift.certain else 0.0
+    lead = 0.0 if shift is None else shift.lead
     seen = seen.shifted(lead) if lead else seen
     robot = step.robot(steps.robot)
     physics = physics_of(robot, dt, stack)
@@ -144,8 +144,7 @@ def prepare(
     settings = dataclasses.replace(settings or _settings(robot), believed=step.believed, **led.order)
     allowed = tolerance.judge(robot.mj_model, 2 * size.travel, cut.sigma_q, asked)
     said = [*steps.said(), *_faster(seen.usable, delivered, dt)]
-    if shift is not None and shift.certain:
-        said.append(shift.sentence(float(np.median([log.period for log in logs]))))
+    said += [] if shift is None else shift.told(float(np.median([log.period for log in logs])))
     told += [*said, *floors.warnings, *steps.warnings()]
     told += [*(f"not tried: {text}" for text in left_out), *_few_conditions(cut)]
     told += [*allowed.warnings(), *led.sentences()]

@@ -40,6 +40,7 @@ class Rules:
     explains: float = 0.75  # of the cost above the noise: what else is missing would leave more
     seen: float = 0.02  # of the noise's own cost
     alike: float = 0.4  # of the shift, by which that of a condition may differ
+    hinted: tuple[float, float] = (6.0, 0.1)  # standard errors and control steps of a lead beside a gap of another kind
 
 
 RULES = Rules()
@@ -70,6 +71,26 @@ class Shift:
         steps, least = RULES.least_late
         told = abs(self.late) > max(RULES.sure * self.error, steps * self.step, least) and self.seen > RULES.seen
         return told and self.explains > RULES.explains and self.apart < RULES.alike
+
+    @property
+    def likely(self) -> bool:
+        """Whether there is a lead, but beside a gap that something else has to explain."""
+        errors, steps = RULES.hinted
+        return not self.certain and -self.late > max(errors * self.error, steps * self.step)
+
+    @property
+    def lead(self) -> float:
+        """s by which commands are moved: what is certainly a fault of the log; 0 or less."""
+        return min(self.late, 0.0) if self.certain else 0.0
+
+    def told(self, period: float) -> list[str]:
+        """What the user is told; period: s between rows of the log."""
+        return [self.sentence(period)] if self.certain else [self.hint()] if self.likely else []
+
+    def hint(self) -> str:
+        """In words, where the lead is only likely: the logs stay as they are."""
+        text = f"commands may act {-1e3 * self.late:.2g} ms (+- {1e3 * self.error:.1g} ms) before their rows"
+        return f"{text}, beside a gap of another kind; if so, put `commands_late: {self.late:.4g}` beside the logs"
 
     def sentence(self, period: float) -> str:
         """The finding; period: s between rows of the log."""

@@ -41,6 +41,9 @@ def test_shifts_of_either_sign_are_found_and_nothing_else_is_one(tmp_path):
         found = estimated(robot, logs)
         assert found.certain == (late is not None)
         assert late is None or (found.late == pytest.approx(late, abs=1.5e-4) and found.error < 1e-4)
+        assert not found.likely
+    beside = estimated(robot, logged_late(recorded(count=4, friction=0.1, delay=0.017)))  # friction takes part in it
+    assert beside.likely and not beside.certain and "`commands_late: -0.003" in beside.hint()
 
 
 @pytest.mark.slow
