@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import mujoco
 import numpy as np
 import pytest
 
@@ -9,8 +10,8 @@ from bayessim_mjx.diagnosis.fitting import scales
 from bayessim_mjx.diagnosis.fitting.command_shift import Shift
 from bayessim_mjx.diagnosis.run import diagnose
 from bayessim_mjx.diagnosis.setup import _measured, _shift
-from bayessim_mjx.logs import resample
-from tests.diagnosis.pendulums import PERIOD, nominal, recorded
+from bayessim_mjx.logs import Channels, Log, estimate_velocity, resample
+from tests.diagnosis.pendulums import ARMATURE, DAMPING, MASS, MODEL, PERIOD, STEP, nominal, recorded
 
 SURE = {"error": 1e-4, "explains": 0.95, "apart": 0.1, "seen": 1.0, "step": PERIOD}
 
@@ -44,6 +45,37 @@ def test_shifts_of_either_sign_are_found_and_nothing_else_is_one(tmp_path):
         assert not found.likely
     beside = estimated(robot, logged_late(recorded(count=4, friction=0.1, delay=0.017)))  # friction takes part in it
     assert beside.likely and not beside.certain and "`commands_late: -0.003" in beside.hint()
+
+
+def smooth(count: int = 3, noise: float = 4e-4) -> list[Log]:
+    """Commands that change all the time, of which the log has a sample per row."""
+    model = mujoco.MjModel.from_xml_string(MODEL % (STEP / 10, "RK4", DAMPING, ARMATURE, 0.0, MASS))
+    channels, sigma, each = Channels.of(model), np.array([noise]), round(PERIOD / model.opt.timestep)
+    rng, logs = np.random.default_rng(0), []
+    for i in range(count):
+        time = PERIOD / each * np.arange(200 * each)
+        command = 0.8 * np.sin((4 + i) * time + i) + 0.4 * np.sin(13 * time)
+        data, qpos = mujoco.MjData(model), np.zeros((200, 1))
+        for k, u in enumerate(command):
+            if k % each == 0:
+                qpos[k // each] = data.qpos + noise * rng.normal()
+            data.ctrl[0] = u
+            mujoco.mj_step(model, data)
+        rows = time[::each]
+        qvel, spread = estimate_velocity(rows, qpos, channels, sigma)
+        logs.append(Log(f"log{i}", rows, command[::each, None], qpos, qvel, False, channels, sigma, spread))
+    return logs
+
+
+@pytest.mark.slow
+@pytest.mark.ci
+def test_samples_of_a_smooth_command_lead_by_half_a_row_unless_they_are_held_linearly(tmp_path):
+    robot, logs = nominal(tmp_path), smooth()
+    found = estimated(robot, logs)
+    assert found.certain and found.late == pytest.approx(-PERIOD / 2, rel=0.05)
+    assert "`hold: linear`" in found.told(PERIOD)[0]
+    linear = estimated(robot, [dataclasses.replace(log, metadata={"hold": "linear"}) for log in logs])
+    assert not linear.certain and abs(linear.late) < 3e-4
 
 
 @pytest.mark.slow
