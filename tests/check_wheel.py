@@ -3,6 +3,7 @@
 import importlib.metadata
 import importlib.util
 import pathlib
+import re
 import sys
 
 files = importlib.metadata.files("bayessim-mjx") or []
@@ -15,4 +16,11 @@ import bayessim_mjx.tasks.pendulum  # noqa: E402
 
 assert "site-packages" in bayessim_mjx.tasks.pendulum.__file__, bayessim_mjx.tasks.pendulum.__file__
 assert "tasks" not in sys.modules
+readme = importlib.metadata.metadata("bayessim-mjx").get_payload()
+relative = re.findall(r'\]\((?!https?://|#)[^)]+\)|src="(?!https?://)[^"]+"', readme)
+assert "bayessim_mjx" in readme and not relative, f"PyPI cannot follow {relative}"
+
+from bayessim_mjx.rl import pretrained  # noqa: E402
+
+assert [pretrained.pretrained(name) for name in pretrained.names()], "the wheel lacks the policies"
 print("wheel: only bayessim_mjx is installed, tasks inside it")

@@ -1,0 +1,19 @@
+# docker build -t bayessim-mjx .                        CPU
+# docker build -t bayessim-mjx --build-arg ACCEL=cuda . NVIDIA GPU; run it with --gpus all
+# docker run --rm -v "$PWD/logs:/work/logs" bayessim-mjx --task Pendulum
+FROM python:3.12-slim
+
+# OSMesa draws videos without a display; git lets runs record the commit that they were made with
+RUN apt-get update && apt-get install -y --no-install-recommends git libosmesa6 \
+    && rm -rf /var/lib/apt/lists/*
+
+ARG ACCEL=cpu
+COPY . /src
+RUN if [ "$ACCEL" = cuda ]; then extras=cuda,export; else extras=export; fi \
+    && pip install --no-cache-dir "/src[$extras]" && rm -rf /src
+
+# the container's user need not be root; compiled programs are kept beside the logs
+ENV MUJOCO_GL=osmesa BAYESSIM_MJX_CACHE=/work/.cache
+WORKDIR /work
+ENTRYPOINT ["bayessim-mjx"]
+CMD ["--help"]
