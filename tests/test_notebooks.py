@@ -31,4 +31,4 @@ def test_a_notebook_runs(path, tmp_path, monkeypatch):
     shown = [
         output for cell in book.cells for output in cell.get("outputs", ()) if "image/png" in output.get("data", {})
     ]
-    assert shown, "no plot"
+    assert any("image/png" in output.get("data", {}) for output in outputs), "no plot"
