@@ -55,6 +55,7 @@ def parameters(d: Diagnosis) -> dict[str, Any]:
                 "value": estimate(mean, sd),
                 "unit": unit(p.get("unit") or ""),
                 "structural": p.get("structural") or "",
+                "data_sheet": p.get("data_sheet") or "",
                 "low": number(ranged[0]) if ranged else "",
                 "high": number(ranged[1]) if ranged else "",
                 "mark": marks.interval(mean, ci, limits, colour, (p.get("nominal"),), width=150),

@@ -279,6 +279,7 @@ def where(d: Diagnosis) -> dict[str, Any]:
             }
             for p in ranked
         ],
+        "before": list((d.details.get("before_simulation") or {}).get("lines") or []),
         "links": [_link(x) for x in d.details.get("links") or []],
         "maps": choice(["joint"], [((j,), place_figures.maps(by_joint[j])) for j in joints]),
         "frequency": choice(["joint"], [((str(r["joint"]),), place_figures.frequency(r)) for r in waves]),
@@ -287,8 +288,7 @@ def where(d: Diagnosis) -> dict[str, Any]:
 
 def _link(x: Mapping[str, Any]) -> dict[str, Any]:
     """A link of the chain; its verdict without the name and the numbers that stand beside it."""
-    told = str(x.get("verdict") or "")
-    head, _, rest = told.partition(": ")
+    head, _, rest = (told := str(x.get("verdict") or "")).partition(": ")
     told = (rest if "->" in head and rest else told).rpartition(" (corr ")[0] or (rest if "->" in head else told)
     return {
         "name": str(x["name"]).replace("->", "→"),

@@ -29,10 +29,10 @@ VALUES = {"payload": "mass", "actuator_gain": "gain", "coulomb_friction": "level
 VALUES |= {"actuator_bias": "bias"}
 
 
-def rigs(seeds: Sequence[int]) -> list[Rig]:
+def rigs(seeds: Sequence[int], systems: Sequence[str] = SYSTEMS, effects: Sequence[str] = EFFECTS) -> list[Rig]:
     """Every system with every effect, each seed with its own rate, noise, resolution and logged effort."""
     out = []
-    for seed, (system, effect) in itertools.product(seeds, itertools.product(SYSTEMS, EFFECTS)):
+    for seed, (system, effect) in itertools.product(seeds, itertools.product(systems, effects)):
         rng = np.random.default_rng((seed, *system.encode(), *effect.encode()))
         truth = draw(system, effect, rng)
         quantum = float(rng.choice([0.0, 2 * np.pi / 4096, 2 * np.pi / 16384]))
@@ -120,7 +120,7 @@ def _line(name: str, some: Sequence[dict[str, Any]]) -> None:
 
 
 def _vetoes(rows: Sequence[dict[str, Any]], named: Sequence[dict[str, Any]]) -> None:
-    """Vetoes that would have lost the truth, and those of a gain everywhere that should have come."""
+    """Vetoes that would have lost the truth, and those of one value for all places that should have come."""
     lost = sum(r["vetoed"] for r in named)
     print(
         f"vetoes: {sum(len(r['vetoes']) for r in rows)} in {len(rows)} cases, {lost} of {len(named)} truths among them"
@@ -128,10 +128,11 @@ def _vetoes(rows: Sequence[dict[str, Any]], named: Sequence[dict[str, Any]]) -> 
     for kind in ("@all", "actuator_saturation"):
         own = [r for r in named if kind in r["truth"]]
         print(f"  {kind}: {sum(r['vetoed'] for r in own)} of {len(own)}")
-    single = [r for r in named if r["truth"].startswith("actuator_gain@") and not r["truth"].endswith("@all")]
-    single = [r for r in single if r["system"] not in ("pendulum", "cartpole")]
-    out = sum("actuator_gain@all" in r["vetoes"] for r in single)
-    print(f"  where one of several drives is wrong, a gain at all is ruled out in {out} of {len(single)}")
+    several = [r for r in named if r["system"] not in ("pendulum", "cartpole") and not r["truth"].endswith("@all")]
+    for effect in ("actuator_gain", "coulomb_friction"):
+        own = [r for r in several if r["truth"].startswith(f"{effect}@")]
+        print(f"  {effect} at one of several places, everywhere ruled out: "
+              f"{sum(f'{effect}@all' in r['vetoes'] for r in own)} of {len(own)}")  # fmt: skip
 
 
 def _kind(row: dict[str, Any]) -> str:
@@ -165,6 +166,7 @@ def main() -> None:
         "--data", type=Path, help="folder of published logs: print what the look says of EMPS and XL330"
     )
     parser.add_argument("--systems", nargs="+", default=SYSTEMS, choices=SYSTEMS, metavar="NAME", help="robots")
+    parser.add_argument("--effects", nargs="+", default=EFFECTS, choices=EFFECTS, metavar="NAME", help="truths")
     parser.add_argument("--out", type=Path, help="file for every rig's row")
     args = parser.parse_args()
     if args.data:
@@ -172,7 +174,7 @@ def main() -> None:
         return
     first, last = map(int, args.seeds.split(":"))
     rows = []
-    for rig in (r for r in rigs(range(first, last)) if r.system in args.systems):
+    for rig in rigs(range(first, last), args.systems, args.effects):
         rows.append(judged(rig))
         if args.out:
             args.out.write_text(json.dumps(rows, indent=1, default=float))

@@ -167,6 +167,12 @@ def test_many_links_of_the_chain_become_a_table(tmp_path):
     assert not [a for _, a in page.tags if a.get("class") == "chain"]
 
 
+def test_what_was_seen_before_any_simulation_stands_with_the_chain(tmp_path):
+    lines = ["the motors do what they are told", "explained by extra payload at tool: mass 1.00 +- 0.01"]
+    page = rendered(dataclasses.replace(fake.full(), details={"before_simulation": {"lines": lines}}), tmp_path)
+    assert not page.open and all(line in page.text for line in lines)
+
+
 def rendered(diagnosis, tmp_path):
     return Page(report.write(diagnosis, tmp_path).read_text(encoding="utf-8"))
 

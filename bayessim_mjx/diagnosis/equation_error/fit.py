@@ -68,7 +68,7 @@ class Fit:
     """A fitted model.
 
     Attributes:
-        values, covariance: `[K]`, `[K, K]`, of all terms' coefficients, in order; precision: `[K]`, of the priors.
+        values, covariance: `[K]`, `[K, K]`, of all terms' coefficients, in order.
         model: `[nv, P]`, the effort as a map of the columns; variance: `[nv]`, of what is left, floor included.
         feasible: whether all coefficients are where they may be.
     """
@@ -80,12 +80,6 @@ class Fit:
     variance: Array
     feasible: bool
     penalty: float
-    precision: Array
-
-    def inflated(self, factor: float) -> Array:
-        """The covariance where errors hold `factor` times less than was thought; priors hold what they hold."""
-        data = np.linalg.inv(self.covariance) - np.diag(self.precision)
-        return np.asarray(np.linalg.inv(data / factor + np.diag(self.precision)))
 
     def at(self, term: Term) -> slice:
         """Where a term's coefficients stand."""
@@ -98,12 +92,6 @@ class Fit:
     def deviation(self, term: Term) -> Array:
         """Their standard deviations."""
         return np.sqrt(np.diag(self.covariance))[self.at(term)]
-
-    def acts(self, term: Term) -> NDArray[np.bool_]:
-        """`[nv]`: joints on whose effort a term acts."""
-        if term.shape is None:
-            return np.zeros(len(self.model), bool) if term.scaled is None else term.scaled
-        return np.any(term.shape(self.of(term)) != 0, axis=(1, 2))
 
 
 def _spans(terms: Sequence[Term]) -> list[slice]:
@@ -145,7 +133,7 @@ def fit(sums: Sums, terms: Sequence[Term], without: int | None = None, start: Ar
     nominal = np.zeros((lay.nv, lay.size))
     nominal[:, lay.known] = 1.0
     model, variance = nominal, left(sums, gram, nominal) / rows + floor if start is None else start
-    covariance, precision = np.zeros((size, size)), np.zeros(size)
+    covariance = np.zeros((size, size))
     neutral = np.concatenate([np.full(t.count, t.neutral) for t in terms] or [np.zeros(0)])
     for _ in range(RULES.rounds):
         design, target = _linearised(lay.effort, terms, spans, values, model, nominal)
@@ -163,7 +151,7 @@ def fit(sums: Sums, terms: Sequence[Term], without: int | None = None, start: Ar
     feasible = feasible and all(t.within(values[own]) for t, own in zip(terms, spans, strict=True))
     sd = np.concatenate([t.sd(values[own]) for t, own in zip(terms, spans, strict=True)] or [np.zeros(0)])
     penalty = 0.5 * float(np.sum(((values - neutral) / sd) ** 2))
-    return Fit(tuple(terms), values, covariance, model, variance, feasible, penalty, precision)
+    return Fit(tuple(terms), values, covariance, model, variance, feasible, penalty)
 
 
 def _scales(terms: Sequence[Term], spans: Sequence[slice], values: Array, nv: int) -> Array:

@@ -130,7 +130,7 @@ def look(
     offered = terms.effects(model, sums.layout, sums.source, carried)
     found, unit = _searched(sums, known, offered, _stated(logs))
     channels = channels_of(logs, model, unit == 1.0)
-    vetoes = contradicted(model, sums, known, offered, found, channels) if unit == 1.0 else {}
+    vetoes = contradicted(sums, known, offered, found, channels) if unit == 1.0 else {}
     return Look(
         channels,
         _joints(model, sums, known, found),

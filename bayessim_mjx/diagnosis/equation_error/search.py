@@ -18,7 +18,8 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Criteria:
-    """When an effect is proposed. The error rates are those of benchmarks/results.md (diagnosis: seconds first).
+    """When an effect is proposed. The error rates are those of benchmarks/results.md (diagnosis: before any
+    simulation).
 
     Attributes:
         nats: held-out log density that an effect has to bring, beside the logarithm of the number of effects tried.
