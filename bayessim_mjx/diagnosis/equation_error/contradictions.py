@@ -22,7 +22,8 @@ class Limits:
 
 
 LIMITS = Limits()
-TIED = ("actuator_gain", "coulomb_friction", "viscous_friction", "armature")
+# frictions are not among them: 1 of 16 that were the same everywhere would have been lost
+TIED = ("actuator_gain",)
 # what would make a drive's effort another function of its command than a scale and a constant
 OF_DRIVES = ("actuator_deadband", "actuator_saturation", "rate_limit", "speed_torque_limit", "effort_loss")
 
