@@ -21,15 +21,26 @@ from bayessim_mjx.errors import UserError
 from bayessim_mjx.monitor import video
 from bayessim_mjx.rollout import next_episodes, select
 from bayessim_mjx.wrappers.spaces import boxes
+from bayessim_mjx.wrappers.worlds import domain_of
 
 RENDER_MODES = ("rgb_array",)
 WIDTH, HEIGHT = 480, 360  # pixels of a picture
 SAME, NEXT, DISABLED = AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED
 
 
-def make(task: str, theta: Any = None, render_mode: str | None = None, **env_settings: Any) -> "GymnasiumEnv":
-    """One world of the task; what `gymnasium.make` calls."""
-    return GymnasiumEnv(registry.make(task, **env_settings), theta, render_mode)
+def make(
+    task: str, theta: Any = None, render_mode: str | None = None, domain: Any = None, **env_settings: Any
+) -> "GymnasiumEnv":
+    """One world of the task; what `gymnasium.make` calls.
+
+    Args:
+        task: its name.
+        theta, render_mode: see `GymnasiumEnv`.
+        domain: as for `make_vec`.
+        env_settings: settings of `env:`, e.g. `episodeLength=100`.
+    """
+    env = registry.make(task, **env_settings)
+    return GymnasiumEnv(env, theta, render_mode, domain_of(env, domain))
 
 
 def make_vec(
@@ -45,10 +56,13 @@ def make_vec(
     Args:
         task: its name.
         num_envs: worlds.
-        domain, autoreset_mode, render_mode: see `GymnasiumVectorEnv`.
+        domain: where theta comes from: a `Distribution`, "nominal", "prior", the folder of a run (its posterior), or a
+            file that `Distribution.save` wrote.
+        autoreset_mode, render_mode: see `GymnasiumVectorEnv`.
         env_settings: settings of `env:`, e.g. `episodeLength=100`.
     """
-    return GymnasiumVectorEnv(registry.make(task, **env_settings), num_envs, domain, autoreset_mode, render_mode)
+    env = registry.make(task, **env_settings)
+    return GymnasiumVectorEnv(env, num_envs, domain_of(env, domain), autoreset_mode, render_mode)
 
 
 def _metadata(env: Env, render_mode: str | None) -> dict[str, Any]:
@@ -101,12 +115,14 @@ class Camera:
 class GymnasiumEnv(gymnasium.Env):
     """One world; observations are the group "policy". `reset(options={"theta": [d]})` sets theta from then on.
 
+    With a `domain` every episode draws its own until then.
+
     Raises:
         UserError: theta of another shape or outside its box, an unknown option or render mode, a step before a reset.
     """
 
-    def __init__(self, env: Env, theta: Any = None, render_mode: str | None = None) -> None:
-        self.env, self.render_mode = env, render_mode
+    def __init__(self, env: Env, theta: Any = None, render_mode: str | None = None, domain: Any = None) -> None:
+        self.env, self.render_mode, self._domain = env, render_mode, domain if theta is None else None
         self.metadata = _metadata(env, render_mode)
         self.observation_space, self.action_space = boxes(env)
         self._theta = _theta(env, env.space.nominal if theta is None else theta)
@@ -117,8 +133,11 @@ class GymnasiumEnv(gymnasium.Env):
         super().reset(seed=seed)
         given = _options(options, ("theta",))
         if "theta" in given:
-            self._theta = _theta(self.env, given["theta"])
+            self._theta, self._domain = _theta(self.env, given["theta"]), None
         key = jax.random.PRNGKey(int(self.np_random.integers(2**31)))
+        if self._domain is not None:
+            key, theta_key = jax.random.split(key)
+            self._theta = np.asarray(self._domain.sample(theta_key, 1)[0], np.float32)
         self._state = self._reset(key, self._theta)
         return np.array(self._state.obs["policy"]), {"theta": np.array(self._theta)}
 

@@ -128,8 +128,7 @@ class Worlds:
             raise UserError("step before reset: call reset() first")
         if tuple(action.shape) != (expected := (self.num_envs, self.env.action_size)):
             raise UserError(f"actions have shape {list(action.shape)}; expected {list(expected)}")
-        self._key, key = jax.random.split(self._key)
-        batch, self._running = self._advance(key, self._running, action, self.domain, self._fixed)
+        batch, self._running, self._key = self._advance(self._key, self._running, action, self.domain, self._fixed)
         if self.watch is not None:
             self.watch(batch)
         return batch
@@ -179,7 +178,9 @@ class _Steps:
 
     def advanced(
         self, key: jax.Array, old: _Running, action: jax.Array, domain: Any, fixed: jax.Array | None
-    ) -> tuple[Batch, _Running]:
+    ) -> tuple[Batch, _Running, jax.Array]:
+        # split here: one more call from Python would cost as much as a small task's physics
+        later, key = jax.random.split(key)
         after = jax.vmap(traced(self.env.step))(old.state, jnp.asarray(action, jnp.float32))
         terminated = after.info["terminated"] > 0
         truncated = (after.info["truncated"] > 0) & ~terminated
@@ -197,7 +198,7 @@ class _Steps:
         reward, metrics = self.reward_scale * after.reward, dict(after.metrics)
         batch = Batch(state.obs, reward, terminated, truncated, after.obs, returns, lengths, metrics, theta)
         returns, lengths = jnp.where(ended, 0.0, returns), jnp.where(ended, 0, lengths)
-        return batch, _Running(state, theta, returns, lengths, store, (old.used & ~empty) | ended)
+        return batch, _Running(state, theta, returns, lengths, store, (old.used & ~empty) | ended), later
 
 
 @lru_cache(maxsize=16)

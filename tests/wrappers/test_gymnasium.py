@@ -80,6 +80,21 @@ def test_episode_of_one_world():
     assert info["theta"] == 9.0
 
 
+def test_one_world_draws_its_physics_anew_in_each_episode_until_it_is_given():
+    env = GymnasiumEnv(probes.Lifetime(), domain=probes.Domain(jnp.array([2.0]), jnp.array([5.0])))
+    drawn = [float(env.reset(seed=None if i else 0)[1]["theta"][0]) for i in range(6)]
+    assert len(set(drawn)) == 6 and min(drawn) >= 2 and max(drawn) <= 5
+    assert [env.reset(options=o)[1]["theta"].tolist() for o in ({"theta": [3.0]}, None)] == [[3.0], [3.0]]
+
+
+def test_many_worlds_under_a_domain_by_name():
+    env = gymnasium.make_vec(NAME, num_envs=8, domain="prior")
+    thetas = env.reset(seed=0)[1]["theta"]
+    assert len(np.unique(thetas[:, 0])) == 8
+    with pytest.raises(UserError, match="domain = 'posteriour'"):
+        gymnasium.make_vec(NAME, num_envs=2, domain="posteriour")
+
+
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
 def test_statistics_of_episodes_in_both_modes_of_restarting(mode):
     """Lifetime's theta is how many steps an episode takes, and its return."""
