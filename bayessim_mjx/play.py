@@ -1,6 +1,6 @@
 """`python -m bayessim_mjx.play --task Pendulum --checkpoint best --video`: returns of a saved policy, and a video.
 
-`--export` writes the policy as an ONNX file instead.
+`--export` writes the policy as an ONNX file instead, `--hub` a folder for a model hub.
 """
 
 from __future__ import annotations
@@ -44,6 +44,11 @@ def _parser() -> cli.Parser:
         nargs="?",
         const="",
         help="write the policy as an ONNX file and stop (default: in exported/ of the run)",
+    )
+    parser.add_argument(
+        "--hub",
+        metavar="FOLDER",
+        help="write a folder for a model hub: ONNX file, settings, and a card with the returns",
     )
     return parser
 
@@ -116,10 +121,22 @@ def _export(env: Any, policy: Any, checkpoint: Path, run: Any, target: str) -> s
     return f"exported {path}: {checked}"
 
 
+def _hub(args: argparse.Namespace, env: Any, policy: Any, config: Config, run: Any, returns: dict[str, Any]) -> str:
+    """Write the folder for a model hub; what to say of it."""
+    from bayessim_mjx.rl import hub
+
+    trained = config if run is None else run.config
+    command = "" if run is None else run.manifest["command"]
+    hub.write(Path(args.hub), policy, env, trained, {KINDS[kind]: r for kind, r in returns.items()}, command)
+    return f"for a model hub: {args.hub} ({', '.join(hub.OWN)})"
+
+
 def _play(argv: Sequence[str] | None) -> int:
     args = _parser().parse(argv)
     if args.list_tasks:
         return cli.list_tasks()
+    if args.hub and args.export is not None:
+        raise UserError("--hub and --export: give one of them; --hub writes the ONNX file too")
     config, path, run = _settings(args)
     count = args.episodes if args.episodes is not None else args.num_envs or config.bayessim.realEvals
     if count < 1:
@@ -150,11 +167,15 @@ def _show(args: argparse.Namespace, config: Config, path: Path, run: Any, count:
         raise UserError(f"--physics {args.physics}: this checkpoint and task have {', '.join(kinds)}")
     console.say(f"{config.task}, {count} episodes each, checkpoint {path}")
     chosen, rows = {args.physics: kinds[args.physics]} if args.physics else kinds, []
+    returns = {}
     for name, thetas in chosen.items():
         result = rl.evaluate(env, policy, jax.random.fold_in(key, 1), thetas)
         r, length = result["return"], result["length"]
+        returns[name] = r
         rows.append([name, estimate(r.mean(), r.std()), *map(compact, (r.min(), r.max(), length.mean()))])
     console.grid(["physics", "return", "lowest", "highest", "episode length"], rows)
+    if args.hub:
+        console.say(_hub(args, env, policy, config, run, returns))
     if config.monitor.video:
         name = next(n for n in ("real", "posterior", "prior", "nominal") if n in chosen)
         folder = (run.path if run is not None else path.parent) / "videos" / "play"

@@ -8,6 +8,7 @@ which, and so does docs/tasks.md. Needs OpenGL (EGL or OSMesa).
 """
 
 import argparse
+import itertools
 import json
 import re
 import subprocess
@@ -100,7 +101,7 @@ def motion_of(task: str, runs: Path | None) -> tuple[film.Motion, Any, str]:
 def gif(frames: np.ndarray, path: Path) -> int:
     """Write frames [T, H, W, 3] at 25 frames a second with as many colours as fit; bytes of the file."""
     source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{WIDTH}x{HEIGHT}", "-r", f"{film.FPS}", "-i", "-"]
-    for fps, colours in [(FPS, c) for c in COLOURS] + [(10, c) for c in COLOURS]:
+    for fps, colours in itertools.product((FPS, 10, 7), COLOURS):
         words = ["-filter_complex", FILTER.format(fps=fps, colours=colours), "-loop", "0", str(path)]
         command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error", *source, *words]
         subprocess.run(command, input=frames.tobytes(), check=True, capture_output=True)

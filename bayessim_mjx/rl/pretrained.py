@@ -20,7 +20,8 @@ from bayessim_mjx.rl.normalise import Moments
 
 FOLDER = Path(__file__).with_name("released")
 INDEX = "index.json"
-KEPT = ("activation", "normalize", "action_clip", "squash")  # what a policy is beside its arrays
+# what a policy is beside its arrays
+KEPT = ("activation", "normalize", "action_clip", "squash", "std_range", "beta")
 
 
 def names(folder: Path = FOLDER) -> tuple[str, ...]:
@@ -67,7 +68,10 @@ def pretrained(task: str, folder: Path = FOLDER) -> Policy:
         )
     with np.load(io.BytesIO(content), allow_pickle=False) as file:
         tree = _tree({name: jnp.asarray(file[name]) for name in file.files})
-    return Policy(tree["actor"], Moments(**tree["normalizer"]), **facts["settings"])
+    kept: dict[str, Any] = {
+        name: tuple(value) if isinstance(value, list) else value for name, value in facts["settings"].items()
+    }
+    return Policy(tree["actor"], Moments(**tree["normalizer"]), **kept)
 
 
 def write(policy: Policy, task: str, facts: Mapping[str, Any], folder: Path = FOLDER) -> Path:

@@ -59,6 +59,12 @@ def test_play_prints_returns_of_latest_best_run_and_path(toy: None, capsys: pyte
         where, _, rest = capsys.readouterr().out.rpartition("exported ")[2].partition(": differs by ")
         assert float(rest.split()[0]) < 1e-5 and Path(where).is_file()
     assert where == "deploy/p.onnx"
+    assert play.main(["--checkpoint", str(run.checkpoint(2)), "--episodes", "2", "--hub", "hub"]) == 0
+    assert (
+        "for a model hub: hub" in capsys.readouterr().out and "| nominal physics |" in Path("hub/README.md").read_text()
+    )
+    both = ("--checkpoint", str(run.path), "--hub", "other", "--export")
+    assert "--hub and --export: give one of them" in error_of(capsys, play.main, *both)
 
 
 @pytest.mark.parametrize("where", ["--logdir=elsewhere", "logdir=elsewhere"])

@@ -1,5 +1,6 @@
 """Policies that come with the package: whole, as good as stated, and refused where damaged."""
 
+import dataclasses
 import json
 import re
 import shutil
@@ -57,13 +58,19 @@ def test_files_are_whole_and_small_and_the_page_tells_of_them(task):
 
 def test_what_is_written_is_read_again(tmp_path):
     layers = [{"w": jnp.ones((2, 3)), "b": jnp.zeros(3)}, {"w": jnp.ones((3, 1)), "b": jnp.zeros(1)}]
-    policy = rl.Policy({"layers": layers, "log_std": jnp.zeros(1)}, Moments(jnp.zeros(2), jnp.ones(2), jnp.ones(())))
+    actor = {"layers": layers, "log_std": jnp.zeros(1)}
+    policy = rl.Policy(actor, Moments(jnp.zeros(2), jnp.ones(2), jnp.ones(())), squash=True, std_range=(0.1, 3.0))
     pretrained.write(policy, "MyTask", {"note": "x"}, tmp_path)
     read = pretrained.pretrained("my_task", tmp_path)
     assert (
         jax.tree.structure(read) == jax.tree.structure(policy) and pretrained.about("MyTask", tmp_path)["note"] == "x"
     )
     assert all(map(np.array_equal, jax.tree.leaves(read), jax.tree.leaves(policy)))
+
+
+def test_all_that_a_policy_is_beside_its_arrays_is_kept():
+    static = {field.name for field in dataclasses.fields(rl.Policy) if not field.metadata.get("pytree_node", True)}
+    assert set(pretrained.KEPT) == static - {"deterministic"}
 
 
 def test_an_unknown_task_is_refused_with_those_that_there_are():
