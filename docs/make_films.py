@@ -49,7 +49,8 @@ def of_run(task: str, folder: Path) -> tuple[film.Motion, Any, str]:
     path, run = cli.find_checkpoint("best", task, str(folder))
     assert run is not None
     env: Any = registry.make(task, config=run.config)
-    return _acting(env, cli.load_policy(path, env, run.config)), env.mj_model, f"a policy after {int(path.name)} updates of PPO"
+    shown = _acting(env, cli.load_policy(path, env, run.config))
+    return shown, env.mj_model, f"a policy after {int(path.name)} updates of PPO"
 
 
 def of_package(task: str) -> tuple[film.Motion, Any, str]:
