@@ -1,68 +1,82 @@
-"""A posterior refined by the simulator's own likelihood: adaptive importance sampling from a proposal.
+"""A posterior refined by the simulator's own likelihood: importance sampling from a proposal, then moves.
 
 Draws of all rounds are weighted by the mixture of all that they were drawn from (Cornuet et al. 2012, AMIS). While the
 proposal is far off, the likelihood is tempered so that enough draws count (Beskos et al. 2016) and the next proposal is
-fitted to those. The largest weights are smoothed by the generalised Pareto distribution of their tail, whose shape says
-whether the weights can be trusted at all (Vehtari et al. 2024, PSIS).
+fitted to those. What it has not reached by then, sequential Monte Carlo does (moves.py), which also finds out
+whether the draws are the posterior's.
 
-All of it is in probit coordinates z, in which the prior is N(0, I).
+Importance sampling is in probit coordinates z, in which the prior is N(0, I), moves and the answer in the unit cube.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from scipy.special import logsumexp
+from scipy.special import logsumexp, ndtr
 from scipy.stats import multivariate_t
 
 from bayessim_mjx.distributions import Distribution
-from bayessim_mjx.distributions.charts import EDGE, from_chart
-from bayessim_mjx.inference.pareto import effective, normalised, smoothed
-from bayessim_mjx.inference.weighted import Mixture, fitted
+from bayessim_mjx.distributions.charts import EDGE, to_chart
+from bayessim_mjx.inference.moves import KEPT, Population, begun, moved, powered, tempering
+from bayessim_mjx.inference.pareto import normalised
+from bayessim_mjx.inference.weighted import Mixture, fitted, fitted_to_islands, uncut
 
 LogLikelihood = Callable[[np.ndarray], np.ndarray]  # theta [N, d] -> [N]; not finite: impossible
 
 DEFENSIVE = 0.1  # share of the draws that come from the prior, whatever was learnt (Hesterberg 1995)
 FREEDOM = 5.0  # degrees of freedom of the proposals: their tails are heavier than a posterior's
 WIDER = 1.2  # standard deviations of a fitted proposal, times
-EFFECTIVE = 0.5  # share of the draws of one round that should count when the next proposal is fitted
-TRUSTED = 0.7  # shape of the weights' tail beyond which they have no finite mean error (PSIS)
 
 
 @dataclass(frozen=True)
 class Refined:
-    """What importance sampling found.
+    """What importance sampling and moves found.
 
     Attributes:
         posterior: `fitted`, or the proposal where `reason` is not None.
-        fitted: a mixture of Gaussians fitted to the weighted draws.
-        effective: effective number of draws, (sum w)^2 / sum w^2.
-        tail: shape k of the Pareto tail of the weights; above 0.7 they are not to be trusted.
-        evidence: log of the mean likelihood over the prior (NaN where nothing is finite).
+        fitted: a mixture of Gaussians fitted to draws of the posterior.
+        population: these draws, in the unit cube; None where no simulation has a finite likelihood.
+        effective: how many independent draws they are worth.
         simulations: how many thetas were simulated.
-        rounds: in how many rounds.
+        theta: the most likely theta that was simulated [d].
         reason: why the proposal was kept, or None.
-        z: the draws [N, d] in probit coordinates; theta: in the parameters' units; weights: [N], they sum to 1.
-        log_likelihood: of the draws [N]; base: their log prior density less that of the draws' own mixture [N].
     """
 
     posterior: Distribution
     fitted: Distribution
+    population: Population | None
     effective: float
-    tail: float
-    evidence: float
     simulations: int
-    rounds: int
-    reason: str | None
-    z: np.ndarray
     theta: np.ndarray
-    weights: np.ndarray
-    log_likelihood: np.ndarray
+    reason: str | None
+
+    @property
+    def evidence(self) -> float:
+        """Log of the mean likelihood over the prior; -inf where it is finite nowhere."""
+        return self.population.evidence if self.population else -np.inf
+
+
+@dataclass
+class _Draws:
+    """All that was simulated: z [N, d] in probit coordinates, log likelihood and log prior density less that drawn."""
+
+    space: Any
+    used: list[Mixture]
+    z: np.ndarray
+    like: np.ndarray
     base: np.ndarray
+
+    def more(self, rng: np.random.Generator, log_likelihood: LogLikelihood, count: int) -> None:
+        """`count` draws of the last mixture."""
+        fresh = _draw(rng, self.used[-1], count)
+        found = np.asarray(log_likelihood(_theta(self.space, ndtr(fresh))), np.float64)
+        self.z = np.concatenate([self.z, fresh])
+        self.like = np.concatenate([self.like, np.where(np.isfinite(found), found, -np.inf)])
+        self.base = _log_prior(self.z) - _mixed(self.used, self.z)
 
 
 def refine(
@@ -71,9 +85,10 @@ def refine(
     *,
     seed: int = 0,
     draws: int = 1024,
-    rounds: int = 8,
+    rounds: int = 4,
+    moves: int = 96,
     components: int = 8,
-    enough: float | None = None,
+    enough: float = 150.0,
     also: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> Refined:
     """The posterior prior x likelihood, found from `proposal`.
@@ -82,73 +97,74 @@ def refine(
         proposal: where the posterior may be, e.g. the product of a network's posteriors; it may be too narrow or off.
         log_likelihood: of all data, for thetas [draws, d] at once.
         seed: of the draws.
-        draws: thetas of one round; every round has as many, so one compiled program serves all.
-        rounds: at most so many rounds.
+        draws: thetas of one call; every call has as many, so one compiled program serves all. A multiple of ISLANDS.
+        rounds: of importance sampling, at most.
+        moves: of all draws after that, at most.
         components: at most so many Gaussians in the posterior.
-        enough: effective draws to end with; by default 40 for each parameter, at least 200.
+        enough: independent draws to end with.
         also: mean [d] and covariance [d, d] of z (theta in the probit chart) where the posterior may be too: half of
             the first draws are from there.
 
     Returns:
         The refined posterior, or the proposal with the reason why it was kept.
     """
-    space, d = proposal.space, len(proposal.space)
-    enough = max(200.0, 40.0 * d) if enough is None else enough
-    rng = np.random.default_rng(seed)
-    used = [_begin(proposal) if also is None else _joined(_begin(proposal), *also)]
-    z, like, base = np.zeros((0, d)), np.zeros(0), np.zeros(0)
-    done, weights, tail = 0, np.zeros(0), np.inf
-    for done in range(1, rounds + 1):  # noqa: B007
-        fresh = _draw(rng, used[-1], draws)
-        found = np.asarray(log_likelihood(_theta(space, fresh)), np.float64)
-        z, like = np.concatenate([z, fresh]), np.concatenate([like, np.where(np.isfinite(found), found, -np.inf)])
-        base = _log_prior(z) - _mixed(used, z)
-        if not np.isfinite(like).any():
+    space, rng = proposal.space, np.random.default_rng(seed)
+    near = _near(rng, proposal, log_likelihood, draws, rounds, also)
+    if not np.isfinite(near.like).any():
+        reason = f"none of {len(near.z)} simulations has a finite likelihood"
+        return Refined(proposal, proposal, None, 0.0, len(near.z), np.asarray(proposal.mode()), reason)
+    start = begun(rng, ndtr(near.z), near.like, near.base, draws)
+    found = moved(rng, lambda u: log_likelihood(_theta(space, u)), start, enough, moves)
+    return _answer(rng, proposal, found, components, enough, len(near.z))
+
+
+def tempered(
+    found: Refined, proposal: Distribution, log_likelihood: LogLikelihood, power: float,
+    *, moves: int = 48, components: int = 8, enough: float = 150.0, seed: int = 0,
+) -> Refined:  # fmt: skip
+    """The same with the likelihood to a power, a generalised posterior (Bissiri et al. 2016)."""
+    assert found.population is not None
+    rng, space = np.random.default_rng(seed), proposal.space
+    at = moved(rng, lambda u: log_likelihood(_theta(space, u)), found.population, enough, moves, power)
+    return _answer(rng, proposal, at, components, enough, found.simulations - found.population.simulations, power)
+
+
+def _near(
+    rng: np.random.Generator, proposal: Distribution, log_likelihood: LogLikelihood, draws: int, rounds: int,
+    also: tuple[np.ndarray, np.ndarray] | None,
+) -> _Draws:  # fmt: skip
+    """Draws by importance sampling, of which half of one call's number count if `rounds` are enough."""
+    d = len(proposal.space)
+    first = _begin(proposal) if also is None else _joined(_begin(proposal), *also)
+    near = _Draws(proposal.space, [first], np.zeros((0, d)), np.zeros(0), np.zeros(0))
+    for turn in range(rounds):
+        near.more(rng, log_likelihood, draws)
+        if not np.isfinite(near.like).any():
             continue
-        weights, tail = smoothed(base + like)
-        if effective(weights) >= enough and tail < TRUSTED and done > 1:
+        power = tempering(near.base, near.like, KEPT * draws)
+        if power == 1.0 or turn == rounds - 1:
             break
-        if done < rounds:
-            power = _tempering(base, like, min(EFFECTIVE * draws, enough))
-            used.append(_wider(fitted(rng, z, normalised(_powered(base, like, power)), components)))
-    if not len(weights):
-        reason = f"none of {len(z)} simulations has a finite likelihood"
-        flat = np.full(len(z), 1 / len(z))
-        theta = _theta(space, z)
-        return Refined(proposal, proposal, 0.0, np.inf, np.nan, len(z), done, reason, z, theta, flat, like, base)
-    log_weights = base + like
-    evidence = float(logsumexp(log_weights[np.isfinite(log_weights)]) - np.log(len(z)))
-    size, reason = effective(weights), ""
-    if size < enough:
-        reason = f"{size:.0f} effective draws of {len(z)} simulations, {enough:.0f} are needed"
-    elif tail >= TRUSTED:
-        reason = f"weights of {len(z)} simulations have a tail of shape {tail:.2f}, at most {TRUSTED:g} can be trusted"
-    theta = _theta(space, z)
-    answer = _distribution(space, fitted(rng, z, weights, components))
-    posterior = proposal if reason else answer
-    return Refined(posterior, answer, size, tail, evidence, len(z), done, reason or None, z, theta, weights, like, base)
+        weights = normalised(powered(near.base, near.like, power))
+        near.used.append(_wider(fitted(rng, near.z, weights, 2)))
+    return near
 
 
-def tempered(found: Refined, power: float, components: int = 8, seed: int = 0) -> Refined:
-    """The same draws weighted by the likelihood to a power below 1, a generalised posterior (Bissiri et al. 2016)."""
-    weights, tail = smoothed(found.base + power * found.log_likelihood)
-    answer = _distribution(found.fitted.space, fitted(np.random.default_rng(seed), found.z, weights, components))
-    return replace(found, posterior=answer, fitted=answer, effective=effective(weights), tail=tail, weights=weights)
-
-
-def stretched(found: Refined, by: np.ndarray, seed: int = 0) -> Refined:
-    """The same draws away from their mean by the factor `by` [d, d], in coordinates of unit covariance."""
-    z, space = found.z, found.fitted.space
-    mean = found.weights @ z
-    lower = np.linalg.cholesky((z - mean).T @ ((z - mean) * found.weights[:, None]))
-    away = mean + (z - mean) @ np.linalg.solve(lower.T, by @ lower.T)
-    answer = _distribution(space, fitted(np.random.default_rng(seed), away, found.weights, 1))
-    return replace(found, posterior=answer, fitted=answer, z=away, theta=_theta(space, away))
-
-
-def _distribution(space: Any, q: Mixture) -> Distribution:
+def _answer(
+    rng: np.random.Generator, proposal: Distribution, at: Population, components: int, enough: float, before: int,
+    power: float = 1.0,
+) -> Refined:  # fmt: skip
+    """What the population says, if its islands agree."""
+    chart = "plain" if proposal.chart == "plain" else "probit"
+    draws = np.asarray(to_chart(jnp.asarray(at.islands), chart), np.float64)
+    q = fitted_to_islands(rng, draws, components)
+    if chart == "plain":
+        q = uncut(rng, q, draws.reshape(-1, draws.shape[-1]))
     scales = np.linalg.cholesky(q.covariances)
-    return Distribution.from_unit(space, np.log(q.weights), q.means, scales, chart="probit")
+    fit = Distribution.from_unit(proposal.space, np.log(q.weights), q.means, scales, chart=chart)
+    simulations, missing = before + at.simulations, at.missing(enough, power)
+    reason = missing and f"{missing}, after {simulations} simulations"
+    best = _theta(proposal.space, at.u[np.argmax(at.like)][None])[0]
+    return Refined(proposal if reason else fit, fit, at, at.worth, simulations, best, reason)
 
 
 def _begin(proposal: Distribution) -> Mixture:
@@ -214,27 +230,8 @@ def _log_prior(z: np.ndarray) -> np.ndarray:
     return -0.5 * (z**2).sum(1) - 0.5 * z.shape[1] * np.log(2 * np.pi)
 
 
-def _theta(space: Any, z: np.ndarray) -> np.ndarray:
-    u = from_chart(jnp.asarray(z, jnp.float32), "probit")
-    return np.asarray(space.from_unit(jnp.clip(u, EDGE, 1 - EDGE)))
+def _theta(space: Any, u: np.ndarray) -> np.ndarray:
+    return np.asarray(space.from_unit(jnp.asarray(np.clip(u, EDGE, 1 - EDGE), jnp.float32)))
 
 
-def _powered(base: np.ndarray, like: np.ndarray, power: float) -> np.ndarray:
-    """Log weights [N] by a power of the likelihood that may be 0: what is impossible stays so."""
-    possible = np.isfinite(like)
-    return base + np.where(possible, power * np.where(possible, like, 0.0), -np.inf)
-
-
-def _tempering(base: np.ndarray, like: np.ndarray, wanted: float) -> float:
-    """The largest power of the likelihood, at most 1, at which `wanted` draws count."""
-    held = np.where(np.isfinite(like), like, -1e300)
-    if effective(normalised(base + held)) >= wanted:
-        return 1.0
-    low, high = 0.0, 1.0
-    for _ in range(40):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if effective(normalised(base + middle * held)) >= wanted else (low, middle)
-    return low
-
-
-__all__ = ["Refined", "refine", "stretched", "tempered"]
+__all__ = ["Refined", "refine", "tempered"]

@@ -9,6 +9,8 @@ from scipy.special import logsumexp
 
 from bayessim_mjx.inference.pareto import effective
 
+DRAWS = 4096  # at most, that are fitted to
+
 
 @dataclass(frozen=True)
 class Mixture:
@@ -54,12 +56,59 @@ def fitted(rng: np.random.Generator, z: np.ndarray, weights: np.ndarray, most: i
     return em(rng, z, weights, best)
 
 
+def fitted_to_islands(rng: np.random.Generator, islands: np.ndarray, most: int) -> Mixture:
+    """Gaussians fitted to draws [I, n, d]: as many, at most `most`, as explain those of the other islands best."""
+    count, each, d = islands.shape
+    islands = islands[:, :: -(-count * each // DRAWS)]
+    halves = [islands[part::2].reshape(-1, d) for part in (0, 1)]
+    best, score = 1, -np.inf
+    for k in (k for k in (1, 2, 4, 8, 16, 32) if k <= most and 3 * d * k <= len(halves[1])):
+        fits = [em(rng, half, np.full(len(half), 1 / len(half)), k) for half in halves]
+        held = sum(float(np.mean(q.log_density(other))) for q, other in zip(fits, halves[::-1], strict=True))
+        if held > score + 1e-3:
+            best, score = k, held
+    draws = islands.reshape(-1, d)
+    return em(rng, draws, np.full(len(draws), 1 / len(draws)), best)
+
+
+def uncut(rng: np.random.Generator, q: Mixture, draws: np.ndarray, steps: int = 30) -> Mixture:
+    """Gaussians that have the draws' [N, d] moments once they are cut off at the unit cube (Lee and Scott 2012).
+
+    Of a parameter of which nothing is known, draws fill the range and so must the Gaussian, cut off at both ends.
+    """
+    each = q.each(draws)
+    share = np.exp(each - logsumexp(each, axis=1, keepdims=True))
+    normal = rng.standard_normal((4096, draws.shape[1]))
+    means, covariances = q.means.copy(), q.covariances.copy()
+    for k, weight in enumerate((share / np.maximum(share.sum(0), 1e-9)).T):
+        mean = weight @ draws
+        wanted = (draws - mean).T @ ((draws - mean) * weight[:, None])
+        for _ in range(steps):
+            x = means[k] + normal @ np.linalg.cholesky(covariances[k]).T
+            x = x[np.all((x >= 0) & (x <= 1), axis=1)]
+            if not 2 * draws.shape[1] < len(x) < 0.98 * len(normal):
+                break
+            gap = x - x.mean(0)
+            means[k] = np.clip(means[k] + mean - x.mean(0), -1, 2)
+            covariances[k] = _positive(covariances[k] + wanted - gap.T @ gap / len(x), wanted)
+    return Mixture(q.weights, means, covariances)
+
+
+def _positive(covariance: np.ndarray, least: np.ndarray) -> np.ndarray:
+    """The covariance [d, d], in no direction narrower than nine tenths of `least`."""
+    root = np.linalg.cholesky(least)
+    inverse = np.linalg.inv(root)
+    values, axes = np.linalg.eigh(inverse @ covariance @ inverse.T)
+    side = root @ axes
+    return (side * np.maximum(values, 0.9)) @ side.T
+
+
 def em(rng: np.random.Generator, z: np.ndarray, weights: np.ndarray, k: int, steps: int = 60) -> Mixture:
     """Expectation maximisation on weighted draws, begun at k-means++ centres; variances are at least 1e-3 of all."""
     mean = weights @ z
     whole = (z - mean).T @ ((z - mean) * weights[:, None])
     # a few draws span a plane only: densities need every direction, well above rounding
-    whole += (1e-12 + 1e-8 * np.trace(whole) / z.shape[1]) * np.eye(z.shape[1])
+    whole += np.diag(1e-8 * np.diag(whole) + 1e-20)
     if k == 1:
         return Mixture(np.ones(1), mean[None], whole[None])
     root = np.linalg.inv(np.linalg.cholesky(whole))

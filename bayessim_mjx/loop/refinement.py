@@ -42,63 +42,57 @@ class Refinement:
 
 
 def refine(
-    proposal: Distribution,
-    likelihood: Likelihood,
-    *,
-    seed: int = 0,
-    draws: int = 1024,
-    rounds: int = 8,
-    components: int = 8,
+    proposal: Distribution, likelihood: Likelihood, *, seed: int = 0, draws: int = 1024, components: int = 8
 ) -> Refinement:
     """The posterior of all records, from a proposal that may be wrong.
 
     Args:
         proposal: e.g. the product of the network's posteriors of the trajectories.
         likelihood: of the records.
-        seed, draws, rounds, components: as in `importance.refine`.
+        seed, draws, components: as in `importance.refine`.
     """
     current, theta = proposal, np.asarray(proposal.mode())
-    found, kept = None, np.zeros(0)
+
+    def log_likelihood(thetas: np.ndarray) -> np.ndarray:
+        return likelihood.log_likelihood(likelihood.squares(thetas))
+
+    found, simulations = None, 0
     for turn in range(PASSES):
         changed = likelihood.settle(theta)
-        if found is not None and not changed and not found.reason:
+        if found is not None and not changed:
             break
-        parts: list[np.ndarray] = []
-
-        def log_likelihood(thetas: np.ndarray, parts: list[np.ndarray] = parts) -> np.ndarray:
-            parts.append(likelihood.squares(thetas))
-            return likelihood.log_likelihood(parts[-1])
-
         found = importance.refine(
-            current, log_likelihood, seed=seed + turn, draws=draws, rounds=rounds, components=components,
-            also=likelihood.laplace,
-        )  # fmt: skip
-        kept = np.concatenate(parts)
-        if not np.isfinite(found.evidence):
+            current, log_likelihood, seed=seed + turn, draws=draws, components=components, also=likelihood.laplace
+        )
+        simulations += found.simulations
+        if found.population is None:
             break
-        theta = found.theta[np.argmax(found.log_likelihood)]
-        current = found.fitted
+        theta, current = found.theta, found.fitted
     assert found is not None
-    widening = 1.0
+    found, widening = replace(found, simulations=simulations), 1.0
     if not found.reason:
-        found, widening = _adjusted(found, _spread(found, kept, likelihood), components, seed)
+        found, widening = _adjusted(found, proposal, likelihood, log_likelihood, components, seed)
     return Refinement(replace(found, posterior=proposal) if found.reason else found, likelihood.noise, widening)
 
 
-def _spread(found: Refined, squares: np.ndarray, likelihood: Likelihood) -> np.ndarray:
-    """Covariance of the scores over that which the likelihood promises [d, d], in whitened z: I where it is right.
+def _spread(draws: np.ndarray, squares: np.ndarray, likelihood: Likelihood) -> tuple[np.ndarray, np.ndarray]:
+    """Covariance of the scores over that which the likelihood promises [d, d], I where it is right; and its whitening.
+
+    Args:
+        draws: of the posterior [M, d].
+        squares: of their prediction errors [M, N, blocks].
+        likelihood: that they are from.
 
     Scores are of stretches of time; those up to half a trajectory apart may go together (Newey and West, 1987). What
     so few stretches show by chance is not believed.
     """
-    use = found.weights > 1e-6 * found.weights.max()  # diverged simulations have infinite squares and no weight
-    weights, z, squares = found.weights[use] / found.weights[use].sum(), found.z[use], squares[use]
-    unit = float(weights @ squares.sum((1, 2))) / likelihood.count
-    gap = z - weights @ z
-    covariance = gap.T @ (gap * weights[:, None])
-    lower = np.linalg.cholesky(covariance)
+    use = np.isfinite(squares).all((1, 2))  # a draw may be the next one's neighbour and diverge in another program
+    draws, squares = draws[use], squares[use]
+    unit = float(squares.sum((1, 2)).mean()) / likelihood.count
+    gap = draws - draws.mean(0)
+    lower = np.linalg.cholesky(gap.T @ gap / len(gap))
     parts = -0.5 * squares.reshape(len(squares), -1) / unit
-    slopes = np.linalg.solve(lower, gap.T @ (weights[:, None] * parts))  # L^T C^-1 gap parts: whitened scores
+    slopes = np.linalg.solve(lower, gap.T @ parts / len(gap))  # L^T C^-1 gap parts: whitened scores
     slopes = slopes.reshape(-1, *squares.shape[1:])  # [d, N, B]
     slopes = slopes - slopes.mean((1, 2), keepdims=True)
     lags = squares.shape[2] // 2
@@ -106,7 +100,7 @@ def _spread(found: Refined, squares: np.ndarray, likelihood: Likelihood) -> np.n
     for lag in range(1, lags + 1):
         both = np.einsum("inb,jnb->ij", slopes[..., lag:], slopes[..., :-lag])
         spread += (1 - lag / (lags + 1)) * (both + both.T)
-    return _shrunk(spread, squares.shape[1] * squares.shape[2] / lags)
+    return _shrunk(spread, squares.shape[1] * squares.shape[2] / lags), lower
 
 
 def _shrunk(spread: np.ndarray, count: float) -> np.ndarray:
@@ -126,18 +120,30 @@ def _beyond(seen: float, chance: float) -> float:
     return max(0.0, 1 - chance / max(seen, 1e-30))
 
 
-def _adjusted(found: Refined, spread: np.ndarray, components: int, seed: int) -> tuple[Refined, float]:
-    """The draws as wide as the scores say, in no direction narrower; and the largest factor on standard deviations.
+def _adjusted(
+    found: Refined, proposal: Distribution, likelihood: Likelihood, log_likelihood: importance.LogLikelihood,
+    components: int, seed: int,
+) -> tuple[Refined, float]:  # fmt: skip
+    """The posterior as wide as the scores say, in no direction narrower; and the largest factor on its sd.
 
-    A posterior of one mode is stretched (open-faced sandwich, Shaby 2014), one of several is tempered.
+    A posterior of one Gaussian is stretched (open-faced sandwich, Shaby 2014), one of several is tempered.
     """
+    assert found.population is not None
+    u = found.population.u
+    spread, lower = _spread(u, likelihood.squares(np.asarray(proposal.space.from_unit(u))), likelihood)
     values, axes = np.linalg.eigh(spread)
     values = np.maximum(values, 1.0)
     if values.max() < WIDER:
         return found, 1.0
-    if found.fitted.components > 1:
-        return importance.tempered(found, 1 / float(values.mean()), components, seed), float(np.sqrt(values.mean()))
-    return importance.stretched(found, axes @ np.diag(np.sqrt(values)) @ axes.T, seed), float(np.sqrt(values.max()))
+    if found.fitted.components > 1 or found.fitted.chart != "plain":
+        power, wider = 1 / float(values.mean()), float(np.sqrt(values.mean()))
+        again = importance.tempered(found, proposal, log_likelihood, power, components=components, seed=seed)
+        return again, wider
+    by = lower @ (axes * np.sqrt(values)) @ axes.T @ np.linalg.inv(lower)
+    q = found.fitted
+    covariance = by @ np.asarray(q.scales[0] @ q.scales[0].T, np.float64) @ by.T
+    wide = Distribution.from_unit(q.space, q.logits, q.means, np.linalg.cholesky(covariance)[None], chart=q.chart)
+    return replace(found, posterior=wide, fitted=wide), float(np.sqrt(values.max()))
 
 
 __all__ = ["Refinement", "refine"]

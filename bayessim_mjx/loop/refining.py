@@ -55,7 +55,7 @@ def refined(
 
 def scores(found: Refinement) -> dict[str, float]:
     """Numbers for curves."""
-    told = {"effective": found.refined.effective, "tail": found.refined.tail, "widening": found.widening}
+    told = {"effective": found.refined.effective, "widening": found.widening}
     told |= {"simulations": float(found.refined.simulations), "used": float(found.refined.reason is None)}
     return {f"refine/{name}": float(value) for name, value in told.items()}
 

@@ -132,21 +132,26 @@ def exact(at: System, record: Record, n: int, theta: np.ndarray) -> float:
     return float(multivariate_normal.logpdf(theta, mean, covariance) + np.log(high - low).sum() - np.log(share))
 
 
-def judged(at: System, name: str, seed: int, n: int, wrong: str, draws: int, prior_share: float = PRIOR_SHARE) -> dict:
+def judged(
+    at: System, name: str, seed: int, n: int, wrong: str, draws: int, prior_share: float = PRIOR_SHARE,
+    together: int = 1,
+) -> dict:  # fmt: skip
     """What the refined posterior of the first n trajectories of one truth is worth."""
     clock, began = time.perf_counter(), time.process_time()
     theta, record, sd = recorded(at, seed, wrong)
     rows = Record(*(x[:n] for x in (record.qpos, record.qvel, record.command)))
-    likelihood = Likelihood(at.physics, rows, np.ones((n, STEPS)), sd, together=1)
+    likelihood = Likelihood(at.physics, rows, np.ones((n, STEPS)), sd, together)
     found = refine(Distribution.prior(at.space), likelihood, seed=seed, draws=draws)
     posterior = found.posterior.reduce(COMPONENTS)
     z = (np.asarray(posterior.mean()) - theta) / np.asarray(posterior.sd())
+    bare = posterior
     if found.refined.reason is None:
         posterior = dataclasses.replace(posterior, prior_weight=jnp.float32(prior_share))
     truth = jnp.asarray(theta, jnp.float32)
     out = {
         "system": name, "wrong": wrong, "n": n, "truth": seed, "reason": found.refined.reason,
         "level": float(posterior.credible_level(truth)), "gain": float(posterior.log_gain(truth)),
+        "bare": float(bare.log_gain(truth)),
         "widening": found.widening, "effective": found.refined.effective, "simulations": found.refined.simulations,
         "sensor": found.noise.sensor.tolist(), "process": found.noise.process.tolist(), "lasting": found.noise.lasting,
         "z": z.tolist(),
@@ -181,6 +186,7 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0, help="number of the first truth")
     parser.add_argument("--draws", type=int, default=512, help="thetas of one call (the loop: 1024)")
     parser.add_argument("--prior_share", type=float, default=PRIOR_SHARE, help="as the loop has; one per file")
+    parser.add_argument("--together", type=int, default=1, help="trajectories of one call: more of them on a GPU")
     parser.add_argument("--out", type=Path, default=Path("refinement.json"), help="kept after every truth, taken up")
     a = parser.parse_args()
     rows = json.loads(a.out.read_text()) if a.out.exists() else []
@@ -190,7 +196,7 @@ def main() -> None:
         for seed in range(a.first, a.first + a.truths):
             for wrong, n in ((w, n) for w in a.wrong for n in a.n):
                 if (name, wrong, n, seed) not in done:
-                    rows.append(judged(at, name, seed, n, wrong, a.draws, a.prior_share))
+                    rows.append(judged(at, name, seed, n, wrong, a.draws, a.prior_share, a.together))
                     a.out.write_text(json.dumps(rows))
     print("| system | wrong | n | 50 % | 80 % | 95 % | gain, nats | exact | widening | truths | not refined |")
     print("|---|---|---|---|---|---|---|---|---|---|---|")
