@@ -5,11 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import eigh
 from scipy.special import logsumexp
 
 from bayessim_mjx.inference.pareto import effective
 
 DRAWS = 4096  # at most, that are fitted to
+STRIDE = 1.5  # power of a ratio of variances: what is cut off changes by less than its Gaussian
 
 
 @dataclass(frozen=True)
@@ -71,14 +73,14 @@ def fitted_to_islands(rng: np.random.Generator, islands: np.ndarray, most: int) 
     return em(rng, draws, np.full(len(draws), 1 / len(draws)), best)
 
 
-def uncut(rng: np.random.Generator, q: Mixture, draws: np.ndarray, steps: int = 30) -> Mixture:
+def uncut(rng: np.random.Generator, q: Mixture, draws: np.ndarray, steps: int = 20) -> Mixture:
     """Gaussians that have the draws' [N, d] moments once they are cut off at the unit cube (Lee and Scott 2012).
 
     Of a parameter of which nothing is known, draws fill the range and so must the Gaussian, cut off at both ends.
     """
     each = q.each(draws)
     share = np.exp(each - logsumexp(each, axis=1, keepdims=True))
-    normal = rng.standard_normal((4096, draws.shape[1]))
+    normal = rng.standard_normal((1024 * draws.shape[1], draws.shape[1]))
     means, covariances = q.means.copy(), q.covariances.copy()
     for k, weight in enumerate((share / np.maximum(share.sum(0), 1e-9)).T):
         mean = weight @ draws
@@ -86,21 +88,19 @@ def uncut(rng: np.random.Generator, q: Mixture, draws: np.ndarray, steps: int = 
         for _ in range(steps):
             x = means[k] + normal @ np.linalg.cholesky(covariances[k]).T
             x = x[np.all((x >= 0) & (x <= 1), axis=1)]
-            if not 2 * draws.shape[1] < len(x) < 0.98 * len(normal):
+            if not 20 * draws.shape[1] < len(x) < 0.98 * len(normal):
                 break
-            gap = x - x.mean(0)
             means[k] = np.clip(means[k] + mean - x.mean(0), -1, 2)
-            covariances[k] = _positive(covariances[k] + wanted - gap.T @ gap / len(x), wanted)
+            covariances[k] = _towards(covariances[k], wanted, np.cov(x.T, ddof=0).reshape(wanted.shape))
     return Mixture(q.weights, means, covariances)
 
 
-def _positive(covariance: np.ndarray, least: np.ndarray) -> np.ndarray:
-    """The covariance [d, d], in no direction narrower than nine tenths of `least`."""
-    root = np.linalg.cholesky(least)
-    inverse = np.linalg.inv(root)
-    values, axes = np.linalg.eigh(inverse @ covariance @ inverse.T)
-    side = root @ axes
-    return (side * np.maximum(values, 0.9)) @ side.T
+def _towards(covariance: np.ndarray, wanted: np.ndarray, cut: np.ndarray) -> np.ndarray:
+    """The covariance [d, d] changed so that, cut off, it comes nearer to `wanted` than it was, which is `cut`."""
+    ratio, axes = eigh(wanted, cut)  # axes.T @ cut @ axes = I
+    back = np.linalg.inv(axes)
+    by = back.T * np.clip(ratio, 0.5, 2.0) ** (0.5 * STRIDE) @ axes.T
+    return by @ covariance @ by.T
 
 
 def em(rng: np.random.Generator, z: np.ndarray, weights: np.ndarray, k: int, steps: int = 60) -> Mixture:
