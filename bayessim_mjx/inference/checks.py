@@ -55,19 +55,22 @@ class Checks:
         report = self.calibration
         reality = "unlike simulated ones" if self.misfit.flagged else "like simulated ones"
         return (
-            f"posterior {report.words} (HPD coverage {report.table()}); "
+            f"network's posterior {report.words} (HPD coverage {report.table()}); "
             f"real trajectories {reality}, p = {self.misfit.joint:.2g}"
         )
 
-    def warnings(self, told: Sequence[str] = ()) -> list[str]:
-        """What a person should act on; of the parameters `told` it is known already that they are not identified."""
+    def warnings(self, told: Sequence[str] = (), refined: bool = False) -> list[str]:
+        """What a person should act on; of the parameters `told` it is known already that they are not identified.
+
+        Where the posterior is `refined`, that of the network was only a beginning and its faults are not the answer's.
+        """
         texts = [text for text in self.flat if text.split(":")[0] not in told]
-        if self.calibration.verdict != calibration.CALIBRATED:
+        if self.calibration.verdict != calibration.CALIBRATED and not refined:
             texts.append(f"posterior {self.calibration.words}: simulate more (bayessim.trainTrajs)")
         if self.misfit.flagged:
             share = f"; {percent(self.prior_share)} of the randomisation is drawn from the prior"
             texts.append(self.misfit.sentence() + (share if self.prior_share else ""))
-        if self.sets is not None and self.sets.off:
+        if self.sets is not None and self.sets.off and not refined:
             told = ", ".join(f"its {percent(a)} region holds {percent_estimate(c, e)}" for a, c, e in self.sets.off)
             n = self.sets.counts[-1].trajectories
             texts.append(f"the posterior of {n} trajectories is over-confident as used: {told} of true parameters")

@@ -9,6 +9,7 @@ the likelihood admits, the posterior is widened in those directions, so that mod
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -39,6 +40,23 @@ class Refinement:
     def posterior(self) -> Distribution:
         """Refined, or the proposal where `refined.reason` is not None."""
         return self.refined.posterior
+
+    @property
+    def used(self) -> bool:
+        """Whether the posterior is refined."""
+        return self.refined.reason is None
+
+    def sentence(self) -> str:
+        """One line: what was done, or why it was not."""
+        if not self.used:
+            return f"the network's posterior is kept: {self.refined.reason}"
+        text = f"refined by {self.refined.simulations} replays, worth {self.refined.effective:.0f} independent draws"
+        return text + (f", {self.widening:.2g} times wider as trajectories disagree" if self.widening > 1 else "")
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain numbers, for JSON."""
+        told = {"used": self.used, "sentence": self.sentence(), "simulations": self.refined.simulations}
+        return told | {"effective": self.refined.effective, "widening": self.widening}
 
 
 def refine(

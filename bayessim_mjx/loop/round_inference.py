@@ -70,7 +70,7 @@ def infer(loop: Loop, state: LoopState, policy: Policy, info: RoundInfo) -> Loop
     if verdict is not None:
         info.checks = checks.conclude(*verdict, posterior, b.distrust, info.moves or None)
         told = posterior.names if round_ else _unknown(posterior.names, info.fit)
-        info.warnings += info.checks.warnings(told)
+        info.warnings += info.checks.warnings(told, info.refinement is not None and info.refinement.used)
         domain = checks.guarded(domain, info.checks.prior_share)
     else:
         info.warnings += [pile.sentence() for pile in info.moves]

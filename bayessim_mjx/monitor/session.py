@@ -147,6 +147,9 @@ class Session:
         self.console.round_line(**round_line(info))
         if info.checks is not None:
             self.console.say(info.checks.sentence())
+        if info.refinement is not None:
+            self.console.say(f"posterior: {info.refinement.sentence()}")
+            self.inference.text("BayesSim/refinement", info.refinement.sentence(), step)
         for text in info.warnings:
             self.console.warning(text)
         if info.moves:
@@ -197,6 +200,8 @@ class Session:
             row["posterior"] = info.posterior.describe()
         if info.checks is not None:
             row["checks"] = info.checks.to_dict()
+        if info.refinement is not None:
+            row["refinement"] = info.refinement.to_dict()
         if info.moves:
             row["range_ends"] = [pile.to_dict() for pile in info.moves]
         with open(self.path / ROUNDS, "a", encoding="utf-8") as file:

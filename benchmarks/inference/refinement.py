@@ -37,7 +37,7 @@ from bayessim_mjx.tracking import Record
 LEVELS = (0.5, 0.8, 0.95)
 STEPS, HELD = 60, 5  # control steps of a trajectory; those for which a random command is held
 MOST = 32  # trajectories behind a truth, of which the first n are used
-PRIOR_SHARE, COMPONENTS = 0.01, 8  # as the loop has them
+PRIOR_SHARE, COMPONENTS = 1e-4, 8  # as the loop has them
 WRONG = {"none": "nothing", "gusts": "forces as large as .3 of the commands, .5 s each", "delay": "2 steps of delay"}
 
 CART = """<mujoco><option timestep=".02" gravity="0 0 0"/><worldbody><body name="cart">
