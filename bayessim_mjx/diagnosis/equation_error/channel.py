@@ -22,6 +22,7 @@ class Limits:
 
     scale: float = 0.03
     left: float = 0.02  # of the effort, root mean square
+    peak: float = 0.06  # largest, of the same: a limit acts in few rows
     constant: float = 0.03
     # of the encoders' noise, taken for white: steps of an encoder are slower, and come through filters
     steps: float = 5.0
@@ -41,7 +42,7 @@ class Channel:
     """One drive: effort = scale * command's force, `late` s after it, plus a constant.
 
     Attributes:
-        scale, deviation; late: s; left: share of the effort (rms) that this does not explain.
+        scale, deviation; late: s; left, peak: share of the effort that this does not explain, rms and at most.
         constant: in the unit of the effort; size: of the effort, rms.
         noise: share of the effort that the encoders' noise may make of what a servo is thought to exert.
         cancels: the terms of a servo's force over their sum.
@@ -54,6 +55,7 @@ class Channel:
     deviation: float
     late: float
     left: float
+    peak: float
     constant: float
     size: float
     noise: float
@@ -64,7 +66,7 @@ class Channel:
     @property
     def static(self) -> bool:
         """Whether nothing but a scale and a constant lies between command and effort."""
-        return self.left < LIMITS.left and not self.echo
+        return self.left < LIMITS.left and self.peak < LIMITS.peak and not self.echo
 
     @property
     def told(self) -> bool:
@@ -182,8 +184,9 @@ def _channel(name: str, pairs: Sequence[_Pair], told: Sequence[Array], period: f
     size = float(np.sqrt(y @ y / max(rows, 1e-9)))
     noise = float(np.sqrt(np.mean(np.concatenate([p.noise for p in pairs]) ** 2))) * abs(scale) / varies
     left = float(np.sqrt(rest / max(spread, 1e-300)))
+    peak = float(np.max(np.abs(y - X @ c) / one, initial=0.0)) / max(size, 1e-300)
     noise = left if noise < left < LIMITS.steps * noise else noise
-    return Channel(name, scale, deviation, late, left, float(c[-1]), size, noise, _cancels(pairs), _echo(pairs))
+    return Channel(name, scale, deviation, late, left, peak, float(c[-1]), size, noise, _cancels(pairs), _echo(pairs))
 
 
 def _cancels(pairs: Sequence[_Pair]) -> float:
