@@ -55,7 +55,7 @@ from rl_games.torch_runner import Runner
 from bayessim_mjx.wrappers import rl_games
 rl_games.register(task)
 runner = Runner()
-runner.load(rl_games.settings(task, num_envs, 150, folder))
+runner.load(rl_games.settings(task, num_envs, 100, folder))
 agent = runner.algo_factory.create("a2c_continuous", base_name="run", params=runner.params)
 agent.train()
 found = agent.game_rewards.get_mean()[0]

@@ -239,7 +239,7 @@ def test_rl_games_learns(tmp_path):
 
     ours.register("Cartpole")
     runner = Runner()
-    runner.load(ours.settings("Cartpole", 64, 150, str(tmp_path)))
+    runner.load(ours.settings("Cartpole", 64, 100, str(tmp_path)))
     agent = runner.algo_factory.create("a2c_continuous", base_name="run", params=runner.params)
     agent.train()
     assert agent.game_rewards.get_mean()[0] > BALANCED
