@@ -62,7 +62,11 @@ def test_where_nothing_is_wrong_only_a_few_single_effects_are_fitted_for_the_tab
     plans = []
     monkeypatch.setattr(singles, "replace", lambda fit, **changes: fit)
     monkeypatch.setattr(singles, "scored", lambda fitter, fit, effects: base)
-    monkeypatch.setattr(singles, "screen", lambda *_: [SimpleNamespace(gain=7.0 - i) for i in range(10)])
+    monkeypatch.setattr(
+        singles,
+        "screen",
+        lambda *_: [SimpleNamespace(gain=7.0 - i, candidate=SimpleNamespace(label=str(i))) for i in range(10)],
+    )
     monkeypatch.setattr(singles, "fit_models", lambda pool, given, *rest: plans.extend(given))
     monkeypatch.setattr(singles, "widen_leading", lambda *_: None)
     seen = []
