@@ -1,6 +1,6 @@
 # docker build -t bayessim-mjx .                        CPU
 # docker build -t bayessim-mjx --build-arg ACCEL=cuda . NVIDIA GPU; run it with --gpus all
-# docker run --rm -v "$PWD/logs:/work/logs" bayessim-mjx --task Pendulum
+# docker run --rm -v "$PWD/logs:/runs/logs" bayessim-mjx --task Pendulum
 FROM python:3.12-slim
 
 # OSMesa draws videos without a display; git lets runs record the commit that they were made with
@@ -12,8 +12,8 @@ COPY . /src
 RUN if [ "$ACCEL" = cuda ]; then extras=cuda,export; else extras=export; fi \
     && pip install --no-cache-dir "/src[$extras]" && rm -rf /src
 
-# the container's user need not be root; compiled programs are kept beside the logs
-ENV MUJOCO_GL=osmesa BAYESSIM_MJX_CACHE=/work/.cache
-WORKDIR /work
+# compiled programs are kept beside the logs
+ENV MUJOCO_GL=osmesa BAYESSIM_MJX_CACHE=/runs/.cache
+WORKDIR /runs
 ENTRYPOINT ["bayessim-mjx"]
 CMD ["--help"]
