@@ -29,6 +29,7 @@ class Armature(Effect):
     high: float = 1.0
     name: ClassVar[str] = "armature"
     kind: ClassVar[str] = "joint"
+    effort: ClassVar[str] = "acceleration"
     noun: ClassVar[str] = "added rotor inertia"
     lacks: ClassVar[str] = "rotor inertia"
     separates: ClassVar[str] = (

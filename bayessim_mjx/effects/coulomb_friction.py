@@ -30,6 +30,7 @@ class CoulombFriction(Effect):
     high: float = 1.0
     name: ClassVar[str] = "coulomb_friction"
     kind: ClassVar[str] = "joint"
+    effort: ClassVar[str] = "dry"
     noun: ClassVar[str] = "Coulomb friction"
     separates: ClassVar[str] = "slow triangles at three speeds and with two payloads"
     witness: ClassVar[tuple[str, str] | None] = ("temperature", "temperature of motor or gearbox (`temperature`)")

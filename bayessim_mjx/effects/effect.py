@@ -48,6 +48,9 @@ class Effect(abc.ABC):
     kind: ClassVar[str]  # actuator | joint (hinge or slide) | body | geom | world
     quantities: ClassVar[tuple[Quantity, ...]]
     contains: ClassVar[tuple[str, ...]] = ()  # effects that are special cases of this one
+    effort: ClassVar[str] = (
+        ""  # of one parameter: acceleration, speed, drag or dry (sign of speed), to which it is a force
+    )
     joint: ClassVar[bool] = False  # its amplitudes are searched together: one alone may not act at all
     # for people; where these are empty, `support.words` says something by name and docstring
     noun: ClassVar[str] = ""  # what it is called: "command delay"

@@ -30,6 +30,7 @@ class QuadraticDrag(Effect):
     high: float = 1.0
     name: ClassVar[str] = "quadratic_drag"
     kind: ClassVar[str] = "joint"
+    effort: ClassVar[str] = "drag"
     noun: ClassVar[str] = "quadratic drag"
     separates: ClassVar[str] = "a range of speeds of five to one or more"
     quantities: ClassVar[tuple[Quantity, ...]] = (

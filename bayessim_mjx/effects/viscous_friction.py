@@ -32,6 +32,7 @@ class ViscousFriction(Effect):
     high: float = 1.0
     name: ClassVar[str] = "viscous_friction"
     kind: ClassVar[str] = "joint"
+    effort: ClassVar[str] = "speed"
     noun: ClassVar[str] = "viscous friction"
     separates: ClassVar[str] = "a staircase of constant speeds; swings with the drive off tell it from back-EMF"
     witness: ClassVar[tuple[str, str] | None] = (

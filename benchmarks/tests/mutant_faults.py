@@ -130,7 +130,7 @@ FAULTS: tuple[tuple[str, str, str, str, tuple[str, ...]], ...] = (
     # logs
     (
         "commands are sampled instead of averaged", f"{LOGS}/resample.py",
-        "ctrl=_mean(log.time, log.ctrl, grid, dt, log.linear)",
+        "ctrl=_mean(log.time + log.late, log.ctrl, grid, dt, log.linear)",
         'ctrl=_interpolate(log.time, log.ctrl, inside, "linear")', (LOG, "-k", "irregular"),
     ),
     (

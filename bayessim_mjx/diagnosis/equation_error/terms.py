@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from bayessim_mjx import effects as library
 from bayessim_mjx.diagnosis.data_sheet import ACCURACY
 from bayessim_mjx.diagnosis.equation_error import rigid
 from bayessim_mjx.diagnosis.equation_error.columns import Layout
@@ -30,13 +31,6 @@ class Ranges:
 
 
 RANGES = Ranges()
-# of one joint: {effect: (column, name of the parameter, sign allowed)}
-ON_JOINT = {
-    "coulomb_friction": ("dry", "level", 0.0),
-    "viscous_friction": ("speed", "damping", 0.0),
-    "quadratic_drag": ("drag", "coefficient", 0.0),
-    "armature": ("acceleration", "inertia", 0.0),
-}
 
 
 def names(model: mujoco.MjModel, kind: str, count: int) -> list[str]:
@@ -85,11 +79,12 @@ def effects(model: mujoco.MjModel, layout: Layout, source: Sequence[str], carrie
         (i, v) for i in range(model.nu) if (v := dof_of(model, i)) is not None and source[v] in ("ctrl", "effort")
     ]
     out: list[Term] = []
-    for effect, (column, parameter, low) in ON_JOINT.items():
-        each = [_one(layout, v, layout.own(column)) for v in joints]
-        read = _reader(parameter)
-        out += [_fixed(effect, _joint(model, v), m, low=low, read=read) for v, m in zip(joints, each, strict=True)]
-        out += [_fixed(effect, "all", np.sum(each, 0), low=low, read=read)] if len(joints) > 1 else []
+    for effect in map(library.load, library.names()):
+        if not effect.effort:
+            continue
+        each, read = [_one(layout, v, layout.own(effect.effort)) for v in joints], _reader(effect.quantities[0].name)
+        out += [_fixed(effect.name, _joint(model, v), m, low=0, read=read) for v, m in zip(joints, each, strict=True)]
+        out += [_fixed(effect.name, "all", np.sum(each, 0), low=0, read=read)] if len(joints) > 1 else []
     for v in joints:
         load = np.stack([_one(layout, v, layout.own(n)) for n in ("effort_load", "load")], -1)
         out.append(_wide("load_friction", _joint(model, v), load, 0.0, RANGES.share, _reader("motor", "external")))
