@@ -94,6 +94,8 @@ def test_payload_is_a_point_mass_welded_on():
     np.testing.assert_allclose(q[1], truth(edited(XML, make("payload", where="fore"), values), COMMAND), atol=1e-4)
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_gravity_tilt_is_a_robot_mounted_askew():
     """A robot turned by R under upright gravity moves as one under R^T g."""
     roll, pitch = 0.08, -0.06

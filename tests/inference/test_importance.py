@@ -105,6 +105,8 @@ def several(d):
     return ParameterSpace([Parameter(f"p{i}", 1.0, 0.5, 2.0) for i in range(d)])
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_parameters_times_one_number_leave_a_valley_that_is_followed_to_its_ends():
     """Two ratios of three parameters are known to .5 %, as of mass, damping and motor from motion alone."""
     space, rng, levels = several(3), np.random.default_rng(0), []
@@ -122,6 +124,8 @@ def test_parameters_times_one_number_leave_a_valley_that_is_followed_to_its_ends
     assert max(levels) < 0.99 and 1 <= np.sum(np.array(levels) < 0.5) <= 5
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_seventeen_parameters_of_which_eleven_are_not_seen():
     space, rng = several(17), np.random.default_rng(1)
     design, truth = np.zeros((8, 17)), rng.uniform(0.7, 1.8, 17)

@@ -54,6 +54,8 @@ def test_a_shared_error_is_found_and_widened(exact):
     assert found.at(5).trajectories == 4 and "widened" in found.sentence()
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_products_as_they_are_used_are_judged_with_the_widening_that_they_have(exact):
     """Errors shared by a set: as sure as they claim to be, and widened by what they ask for."""
     shared = made(0.5, 2)

@@ -159,7 +159,7 @@ CASES = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", [pytest.param(c, marks=pytest.mark.ci if "actuator" in c else []) for c in CASES])
+@pytest.mark.parametrize("case", CASES)
 def test_main_gives_back_what_the_logs_were_made_with(case: str, tmp_path: Path, monkeypatch) -> None:
     """Segments begin in the middle of logs: `main real.logs=` finds mass, length and what is hidden, |z| < 2 each.
 

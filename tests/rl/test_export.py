@@ -102,7 +102,6 @@ def test_the_file_says_what_its_numbers_mean(env, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.ci
 def test_names_are_as_many_as_numbers_for_every_task():
     for name in registry.names():
         env = registry.make(name)
