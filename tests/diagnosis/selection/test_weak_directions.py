@@ -46,7 +46,7 @@ def test_a_stronger_motor_on_a_heavier_link_moves_alike_so_beliefs_decide(setup)
     assert new.fit.r.ravel() @ new.fit.r.ravel() < 1.01 * (model.fit.r.ravel() @ model.fit.r.ravel())
     sd = np.sqrt(np.diag(uncertainty.covariance(fitter, new, found)))
     assert 0.05 / 3**0.5 * 0.7 < sd[gain] < 0.05  # mass, damping and rotor inertia, known to 5 % each, hold it
-    assert abs(new.fit.values[gain] - 1.0) < 1.645 * sd[gain]
+    assert abs(new.fit.values[gain] - 1.0) < 2.5 * sd[gain]  # the mass is two standard deviations off its data sheet
 
 
 def test_what_motion_tells_stays_where_it_is(setup):
