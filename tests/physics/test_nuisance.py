@@ -178,7 +178,6 @@ def ramped(**more: Any) -> Any:
 
 
 @pytest.mark.slow
-@pytest.mark.ci
 def test_training_draws_parameters_wider_and_wider() -> None:
     """theta = 1 + min(clock / 20, 1) (draw - 1)."""
     env = ramped()
@@ -197,8 +196,7 @@ def test_training_draws_parameters_wider_and_wider() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.ci
-@pytest.mark.parametrize("wrapped", [False, True])
+@pytest.mark.parametrize("wrapped", [False, pytest.param(True, marks=pytest.mark.ci)])
 def test_updates_carry_the_clock_on(wrapped: bool) -> None:
     """Over episodes, updates and policies that begin later; the pool of resets is drawn at its update's clock.
 
