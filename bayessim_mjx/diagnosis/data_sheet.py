@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from bayessim_mjx.effects.support.site import element_names
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.parameters import ParameterSpace
 from bayessim_mjx.parameters.attributes import suggest
@@ -58,7 +59,7 @@ def rating(texts: Sequence[str], model: mujoco.MjModel) -> dict[int, float]:
         UserError: no such body, or no mass above 0.
     """
     moving = [b for b in range(1, model.nbody) if model.body_weldid[b] != 0]
-    names = {model.body(b).name or f"body{b}": b for b in moving}
+    names = {element_names(model, "body")[b]: b for b in moving}
     out: dict[int, float] = {}
     for part in sorted((p.strip() for text in texts for p in text.split(",") if p.strip()), key=lambda p: "=" in p):
         name, _, value = part.rpartition("=")

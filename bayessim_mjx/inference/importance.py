@@ -73,7 +73,7 @@ class _Draws:
     def more(self, rng: np.random.Generator, log_likelihood: LogLikelihood, count: int) -> None:
         """`count` draws of the last mixture."""
         fresh = _draw(rng, self.used[-1], count)
-        found = np.asarray(log_likelihood(_theta(self.space, ndtr(fresh))), np.float64)
+        found = np.asarray(log_likelihood(thetas(self.space, ndtr(fresh))), np.float64)
         self.z = np.concatenate([self.z, fresh])
         self.like = np.concatenate([self.like, np.where(np.isfinite(found), found, -np.inf)])
         self.base = _log_prior(self.z) - _mixed(self.used, self.z)
@@ -114,7 +114,7 @@ def refine(
         reason = f"none of {len(near.z)} simulations has a finite likelihood"
         return Refined(proposal, proposal, None, 0.0, len(near.z), np.asarray(proposal.mode()), reason)
     start = begun(rng, ndtr(near.z), near.like, near.base, draws)
-    found = moved(rng, lambda u: log_likelihood(_theta(space, u)), start, enough, moves)
+    found = moved(rng, lambda u: log_likelihood(thetas(space, u)), start, enough, moves)
     return _answer(rng, proposal, found, components, enough, len(near.z))
 
 
@@ -125,7 +125,7 @@ def tempered(
     """The same with the likelihood to a power, a generalised posterior (Bissiri et al. 2016)."""
     assert found.population is not None
     rng, space = np.random.default_rng(seed), proposal.space
-    at = moved(rng, lambda u: log_likelihood(_theta(space, u)), found.population, enough, moves, power)
+    at = moved(rng, lambda u: log_likelihood(thetas(space, u)), found.population, enough, moves, power)
     return _answer(rng, proposal, at, components, enough, found.simulations - found.population.simulations, power)
 
 
@@ -163,7 +163,7 @@ def _answer(
     fit = Distribution.from_unit(proposal.space, np.log(q.weights), q.means, scales, chart=chart)
     simulations, missing = before + at.simulations, at.missing(enough, power)
     reason = missing and f"{missing}, after {simulations} simulations"
-    best = _theta(proposal.space, at.u[np.argmax(at.like)][None])[0]
+    best = thetas(proposal.space, at.u[np.argmax(at.like)][None])[0]
     return Refined(proposal if reason else fit, fit, at, at.worth, simulations, best, reason)
 
 
@@ -230,8 +230,9 @@ def _log_prior(z: np.ndarray) -> np.ndarray:
     return -0.5 * (z**2).sum(1) - 0.5 * z.shape[1] * np.log(2 * np.pi)
 
 
-def _theta(space: Any, u: np.ndarray) -> np.ndarray:
+def thetas(space: Any, u: np.ndarray) -> np.ndarray:
+    """theta [N, d] at u [N, d] in the unit cube, as it is simulated."""
     return np.asarray(space.from_unit(jnp.asarray(np.clip(u, EDGE, 1 - EDGE), jnp.float32)))
 
 
-__all__ = ["Refined", "refine", "tempered"]
+__all__ = ["Refined", "refine", "tempered", "thetas"]

@@ -42,35 +42,33 @@ def fitted(rng: np.random.Generator, z: np.ndarray, weights: np.ndarray, most: i
     keep = weights > 1e-12
     z, weights = z[keep], weights[keep] / weights[keep].sum()
     fold = rng.permutation(len(z)) % 2
-    counts = [k for k in (1, 2, 4, 8, 16, 32) if k <= most]
-    best, score = 1, -np.inf
-    for k in counts:
-        held = 0.0
-        for part in (0, 1):
-            one, other = fold == part, fold != part
-            if effective(weights[one] / weights[one].sum()) < 3 * z.shape[1] * k:
-                held = -np.inf
-                break
-            q = em(rng, z[one], weights[one] / weights[one].sum(), k)
-            held += float(weights[other] @ q.log_density(z[other]))
-        if held > score + 1e-3:
-            best, score = k, held
-    return em(rng, z, weights, best)
+    halves = [(z[fold == part], weights[fold == part]) for part in (0, 1)]
+    return em(rng, z, weights, _count(rng, halves, most))
 
 
 def fitted_to_islands(rng: np.random.Generator, islands: np.ndarray, most: int) -> Mixture:
     """Gaussians fitted to draws [I, n, d]: as many, at most `most`, as explain those of the other islands best."""
     count, each, d = islands.shape
     islands = islands[:, :: -(-count * each // DRAWS)]
-    halves = [islands[part::2].reshape(-1, d) for part in (0, 1)]
+    halves = [(half, np.full(len(half), 1 / len(half))) for half in (islands[k::2].reshape(-1, d) for k in (0, 1))]
+    draws = islands.reshape(-1, d)
+    return em(rng, draws, np.full(len(draws), 1 / len(draws)), _count(rng, halves, most))
+
+
+def _count(rng: np.random.Generator, halves: list[tuple[np.ndarray, np.ndarray]], most: int) -> int:
+    """How many Gaussians, fitted to either half (draws [N, d], weights [N]), explain the other one best."""
     best, score = 1, -np.inf
-    for k in (k for k in (1, 2, 4, 8, 16, 32) if k <= most and 3 * d * k <= len(halves[1])):
-        fits = [em(rng, half, np.full(len(half), 1 / len(half)), k) for half in halves]
-        held = sum(float(np.mean(q.log_density(other))) for q, other in zip(fits, halves[::-1], strict=True))
+    for k in (k for k in (1, 2, 4, 8, 16, 32) if k <= most):
+        held = 0.0
+        for (z, weights), (others, theirs) in (halves, halves[::-1]):
+            own = weights / weights.sum()
+            if effective(own) < 3 * z.shape[1] * k:
+                held = -np.inf
+                break
+            held += float(theirs @ em(rng, z, own, k).log_density(others))
         if held > score + 1e-3:
             best, score = k, held
-    draws = islands.reshape(-1, d)
-    return em(rng, draws, np.full(len(draws), 1 / len(draws)), best)
+    return best
 
 
 def uncut(rng: np.random.Generator, q: Mixture, draws: np.ndarray, steps: int = 20) -> Mixture:

@@ -104,7 +104,7 @@ def _spread(draws: np.ndarray, squares: np.ndarray, likelihood: Likelihood) -> t
     Scores are of stretches of time; those up to half a trajectory apart may go together (Newey and West, 1987). What
     so few stretches show by chance is not believed.
     """
-    use = np.isfinite(squares).all((1, 2))  # a draw may be the next one's neighbour and diverge in another program
+    use = np.isfinite(squares).all((1, 2))  # what diverged tells no slope
     draws, squares = draws[use], squares[use]
     unit = float(squares.sum((1, 2)).mean()) / likelihood.count
     gap = draws - draws.mean(0)
@@ -148,7 +148,7 @@ def _adjusted(
     """
     assert found.population is not None
     u = found.population.u
-    spread, lower = _spread(u, likelihood.squares(np.asarray(proposal.space.from_unit(u))), likelihood)
+    spread, lower = _spread(u, likelihood.squares(importance.thetas(proposal.space, u)), likelihood)
     values, axes = np.linalg.eigh(spread)
     values = np.maximum(values, 1.0)
     if values.max() < WIDER:

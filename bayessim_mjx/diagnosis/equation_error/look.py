@@ -179,8 +179,7 @@ def _joints(model: mujoco.MjModel, sums: Sums, known: Sequence[Term], found: Fou
         needed = float(whole[v, lay.known, lay.known])
         ratio = float(whole[v, lay.known, lay.effort]) / needed if needed > 0 else float("nan")
         ratio = ratio if sums.source[v] != "none" else float("nan")
-        joint = model.joint(int(model.dof_jntid[v])).name or f"joint{model.dof_jntid[v]}"
-        out.append(Joint(joint, sums.source[v], ratio, *(float(p[v]) for p in parts)))
+        out.append(Joint(terms.joint_of(model, int(v)), sums.source[v], ratio, *(float(p[v]) for p in parts)))
     return tuple(out)
 
 

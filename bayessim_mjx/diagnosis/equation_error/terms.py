@@ -16,6 +16,7 @@ from bayessim_mjx.diagnosis.equation_error.columns import Layout
 from bayessim_mjx.diagnosis.equation_error.fit import Term
 from bayessim_mjx.diagnosis.logcheck import loads
 from bayessim_mjx.diagnosis.logcheck.drives import dof_of
+from bayessim_mjx.effects.support.site import element_names
 
 Array = NDArray[np.float64]
 
@@ -33,10 +34,6 @@ class Ranges:
 RANGES = Ranges()
 
 
-def names(model: mujoco.MjModel, kind: str, count: int) -> list[str]:
-    return [getattr(model, kind)(i).name or f"{kind}{i}" for i in range(count)]
-
-
 def known(
     model: mujoco.MjModel, layout: Layout, accuracy: Mapping[tuple[str, str], float], period: float
 ) -> list[Term]:
@@ -52,7 +49,7 @@ def known(
         column = np.zeros(layout.size)
         column[layout.body(i)] = nominal[i]
         if nominal[i, 0] > 0:
-            name = model.body(body).name or f"body{body}"
+            name = element_names(model, "body")[body]
             sd = accuracy.get(("mass", name), ACCURACY)
             out.append(_fixed("mass", name, np.tile(column, (layout.nv, 1)), sd=sd))
     for effect, own, size in (
@@ -61,8 +58,8 @@ def known(
     ):
         for v in map(int, np.flatnonzero(size > 0)):
             one = _one(layout, v, layout.own(own), float(size[v]))
-            sd = accuracy.get((effect, _joint(model, v)), ACCURACY)
-            out.append(_fixed(effect, _joint(model, v), one, sd=sd))
+            sd = accuracy.get((effect, joint_of(model, v)), ACCURACY)
+            out.append(_fixed(effect, joint_of(model, v), one, sd=sd))
     late = np.zeros((layout.nv, layout.size))
     late[:, layout.late] = 1.0
     return [*out, _fixed("lateness", "all", late, sd=RANGES.late * period)]
@@ -83,17 +80,17 @@ def effects(model: mujoco.MjModel, layout: Layout, source: Sequence[str], carrie
         if not effect.effort:
             continue
         each, read = [_one(layout, v, layout.own(effect.effort)) for v in joints], _reader(effect.quantities[0].name)
-        out += [_fixed(effect.name, _joint(model, v), m, low=0, read=read) for v, m in zip(joints, each, strict=True)]
+        out += [_fixed(effect.name, joint_of(model, v), m, low=0, read=read) for v, m in zip(joints, each, strict=True)]
         out += [_fixed(effect.name, "all", np.sum(each, 0), low=0, read=read)] if len(joints) > 1 else []
     for v in joints:
         load = np.stack([_one(layout, v, layout.own(n)) for n in ("effort_load", "load")], -1)
-        out.append(_wide("load_friction", _joint(model, v), load, 0.0, RANGES.share, _reader("motor", "external")))
+        out.append(_wide("load_friction", joint_of(model, v), load, 0.0, RANGES.share, _reader("motor", "external")))
         spring = np.stack([_one(layout, v, layout.own(n)) for n in ("position", "one")], -1)
         bounds = np.array([0.0, -np.inf]), np.inf
-        out.append(_wide("joint_spring", _joint(model, v), spring, *bounds, _spring))
+        out.append(_wide("joint_spring", joint_of(model, v), spring, *bounds, _spring))
         if np.any(model.jnt_type == 3):
             zero = _everywhere(layout, layout.zero(v))
-            out.append(_fixed("joint_offset", _joint(model, v), zero, read=_reader("offset", sign=-1.0)))
+            out.append(_fixed("joint_offset", joint_of(model, v), zero, read=_reader("offset", sign=-1.0)))
     out += _on_actuators(model, layout, driven)
     tilt = np.stack([_everywhere(layout, c) for c in range(layout.tilt.start, layout.tilt.stop)], -1)
     if np.any(model.opt.gravity):
@@ -102,7 +99,7 @@ def effects(model: mujoco.MjModel, layout: Layout, source: Sequence[str], carrie
 
 
 def _on_actuators(model: mujoco.MjModel, layout: Layout, driven: Sequence[tuple[int, int]]) -> list[Term]:
-    out, title = [], names(model, "actuator", model.nu)
+    out, title = [], element_names(model, "actuator")
     for i, v in driven:
         out.append(scale("actuator_gain", title[i], np.arange(layout.nv) == v))
         gear = float(model.actuator_gear[i, 0]) or 1.0
@@ -137,7 +134,7 @@ def payloads(model: mujoco.MjModel, layout: Layout, carried: Array) -> list[Term
         most = float(carried[body])
         shape = _load(layout, bodies.index(base), centre, turn)
         low, high = np.array([0.0, *(3 * [-np.inf])]), np.array([most, *(3 * [np.inf])])
-        name = model.body(body).name or f"body{body}"
+        name = element_names(model, "body")[body]
         sd, within = _spread(most, reach), _within(reach)
         out.append(Term("payload", name, shape, 4, sd=sd, low=low, high=high, within=within, read=_payload))
     return out
@@ -196,9 +193,9 @@ def _reader(*parameters: str, sign: float = 1.0) -> Callable[[Array], Mapping[st
     return lambda c: {n: sign * float(x) for n, x in zip(parameters, c, strict=True)}
 
 
-def _joint(model: mujoco.MjModel, dof: int) -> str:
-    joint = int(model.dof_jntid[dof])
-    return model.joint(joint).name or f"joint{joint}"
+def joint_of(model: mujoco.MjModel, dof: int) -> str:
+    """Name of the joint that has this column of qvel."""
+    return element_names(model, "joint")[model.dof_jntid[dof]]
 
 
 def _one(layout: Layout, dof: int, column: int, size: float = 1.0) -> Array:
