@@ -5,12 +5,14 @@ from collections.abc import Iterable
 FAMILIES = (
     ("coulomb_friction", "stribeck_friction", "load_friction", "asymmetric_friction", "actuator_deadband"),
     ("viscous_friction", "quadratic_drag", "asymmetric_friction"),
-    ("actuator_delay", "actuator_lag", "rate_limit", "sensor_delay", "sensor_filter"),
+    ("actuator_delay", "actuator_lag", "rate_limit", "acceleration_limit", "sensor_delay", "sensor_filter"),
     ("backlash", "joint_elasticity", "base_flexibility", "actuator_deadband", "sensor_delay", "actuator_delay",
      "actuator_lag"),
     # a sine of the angle at order 1 is what gravity does to one joint
-    ("payload", "gravity_tilt", "external_force", "joint_spring", "joint_offset", "actuator_bias", "cogging"),
-    ("actuator_gain", "sensor_gain", "armature", "payload", "actuator_saturation", "effort_loss", "speed_torque_limit"),
+    ("payload", "gravity_tilt", "external_force", "joint_spring", "joint_offset", "actuator_bias", "cogging",
+     "gravity_compensation"),
+    ("actuator_gain", "sensor_gain", "armature", "payload", "actuator_saturation", "effort_loss", "speed_torque_limit",
+     "gain_drift"),
     ("contact_friction", "contact_compliance"),
 )  # fmt: skip
 

@@ -233,11 +233,14 @@ def _fine_commands(raw: Log, even: Log, dt: float, substeps: int, centred: bool)
 def _around(even: Sequence[Log], fine: list, starts: list[tuple[int, int]], around: int) -> Motion:
     """Recorded rows `a - around .. a + around`; beyond the ends of a log the end is held."""
     rows = [(r, rows_around(even[r], a, around)) for r, a in starts]
+    files = [log.metadata.get("source", log.name) for log in even]  # pieces of one file share its clock
+    begun = [min(o.time[0] for o, of in zip(even, files, strict=True) if of == file) for file in files]
     return Motion(
         qpos=_stack([even[r].qpos[i] for r, i in rows]),
         qvel=_stack([even[r].qvel[i] for r, i in rows]),
         command=_stack([fine[r][i] for r, i in rows]),
         start=around,
+        time=_stack([np.asarray(even[r].time[a] - begun[r]) for r, a in starts]),
     )
 
 

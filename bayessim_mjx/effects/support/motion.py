@@ -15,6 +15,7 @@ class Motion(struct.PyTreeNode):
     Attributes:
         qpos: `[rows, nq]`, qvel: `[rows, nv]`.
         command: `[rows, substeps, nu]`; row k acts from row k to row k + 1.
+        time: s since the recording began, at the start row; None: it begins there.
         start: static int.
     """
 
@@ -22,6 +23,7 @@ class Motion(struct.PyTreeNode):
     qvel: jax.Array
     command: jax.Array
     start: int = struct.field(pytree_node=False)
+    time: jax.Array | None = None
 
     def shifted(self, at: Site, steps: jax.Array) -> jax.Array:
         """Position and velocity of each joint of `at` read its own number of control steps later, `[rows, n, 2]`.
