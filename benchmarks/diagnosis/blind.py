@@ -29,7 +29,8 @@ from cases import KNOWN, STRENGTHS, SYSTEMS, UNKNOWN, make_case, places
 from families import without
 from isolable import hidden, rivals
 from tables import score
-from truth import Plant, run, scales_of
+
+from bayessim_mjx.blind.reality.plant import Plant, scales_of
 
 KINDS = ("single", "double", "null", "unknown")
 WORKER = Path(__file__).with_name("worker.py")
@@ -43,7 +44,7 @@ def jobs(out: Path, seeds: range, kinds: Iterable[str], systems: Iterable[str], 
     for system in systems:
         robot = SYSTEMS[system]
         plain = Plant(robot, {})
-        scales = scales_of(plain, [run(plain, 0, 0, noise=False)])
+        scales = scales_of(plain, [robot.record(plain, 0, 0, noise=False)])
         known, unknown = ([e for e in names if places(robot, e, scales)] for names in (KNOWN, UNKNOWN))
         shift = zlib.crc32(system.encode())
         known, unknown = (list(np.random.default_rng(shift).permutation(names)) for names in (known, unknown))

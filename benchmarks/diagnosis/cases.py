@@ -5,29 +5,20 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
-import causes_actuator as actuator
-import causes_joint as joint
-import causes_other as other
-import causes_unknown as unknown
 import numpy as np
-from causes import Cause, Scales
-from strength import Ruler, resize
-from systems import RUNS, SYSTEMS, System
-from truth import Plant, Run, base_parameters, run, scales_of
+from systems import SYSTEMS
+
+from bayessim_mjx.blind.reality.cause import Cause
+from bayessim_mjx.blind.reality.menu import CAUSES, KNOWN, UNKNOWN, draw_cause, places
+from bayessim_mjx.blind.reality.motion import RUNS
+from bayessim_mjx.blind.reality.plant import Plant, Run, base_parameters, scales_of
+from bayessim_mjx.blind.reality.strength import Ruler, resize
+from bayessim_mjx.blind.reality.system import System
+
+__all__ = ["CAUSES", "KNOWN", "STRENGTHS", "SYSTEMS", "UNKNOWN", "Case", "draw_cause", "make_case", "places"]
 
 STRENGTHS = {"weak": 3.0, "medium": 10.0, "strong": 30.0, "severe": 100.0}
 SPREAD = 0.2
-_ROTOR = ("backlash", "joint_elasticity")  # driven joints only
-
-
-def _causes(*rooms: object) -> dict[str, type[Cause]]:
-    every = [c for room in rooms for c in vars(room).values() if isinstance(c, type) and issubclass(c, Cause)]
-    return {c.name: c for c in every if "name" in vars(c)}
-
-
-KNOWN = _causes(joint, actuator, other)
-UNKNOWN = _causes(unknown)
-CAUSES = KNOWN | UNKNOWN
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,20 +27,6 @@ class Case:
 
     out: Path
     truth: dict
-
-
-def places(system: System, effect: str, scales: Scales) -> list[str]:
-    """Where the effect makes sense on this robot."""
-    cause, driven = CAUSES[effect], list(scales.drives.values())
-    if cause.kind == "actuator":
-        return [] if effect == "unknown_cross_coupling" and len(scales.force) < 2 else list(scales.drives)
-    if cause.kind == "world":
-        return [] if system.name == "cartpole" else ["world"]
-    if cause.kind == "geom":
-        return ["foot"] if 'name="foot"' in system.xml else []
-    if cause.kind == "body":
-        return list(scales.mass)[-2:]  # what is carried is carried at the end
-    return driven if effect in _ROTOR else list(scales.force)
 
 
 def make_case(
@@ -93,23 +70,11 @@ def make_case(
         told = {"name": cause.name, "where": cause.where, "parameters": cause.parameters(), "size": cause.size}
         truths.append(told | {"raw": raw, "left": left})
     plant = Plant(robot, base, causes)
-    runs = [run(plant, i, seed, noise) for i in range(len(RUNS))]
+    runs = [robot.record(plant, i, seed, noise) for i in range(len(RUNS))]
     logged = drawn if velocity is None else velocity
     truth = {"system": system, "seed": seed, "strength": strength, "velocity": logged, "base": base, "effects": truths}
     _write(out, robot, runs, truth)
     return Case(out, truth)
-
-
-def draw_cause(
-    effect: str | tuple[str, str], robot: System, scales: Scales, taken: Sequence[Cause], rng: np.random.Generator
-) -> Cause:
-    name, where = (effect, None) if isinstance(effect, str) else effect
-    allowed = places(robot, name, scales)
-    if not allowed:
-        raise ValueError(f"{name} makes no sense on {robot.name}")
-    free = [p for p in allowed if p not in {c.where for c in taken}]
-    drawn = str(rng.choice(free or allowed))
-    return CAUSES[name](where or drawn, scales, rng)
 
 
 def _write(out: Path, robot: System, runs: Sequence[Run], truth: dict) -> None:

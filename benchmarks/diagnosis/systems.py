@@ -1,89 +1,6 @@
-"""Robots of the diagnosis benchmark, from primitives, and their motion: eight runs in five operating conditions."""
+"""Robots of the diagnosis benchmark, from primitives."""
 
-import dataclasses
-from collections.abc import Callable
-
-import numpy as np
-
-SECONDS = 4.0
-RISE = 0.25  # s, of a step, so that a step asks for an effort that drives have
-# (operating condition, profile, amplitude and pace as multiples of the system's)
-RUNS = (
-    ("slow_triangle", "triangle", 1.0, 0.35),
-    ("slow_triangle", "triangle", 0.35, 0.6),
-    ("multisine", "multisine", 1.0, 1.0),
-    ("multisine", "multisine", 0.4, 1.8),
-    ("chirp", "chirp", 0.7, 1.0),
-    ("steps", "steps", 0.6, 1.0),
-    ("steps", "steps", 1.0, 1.6),
-    ("open_loop", "multisine", 1.0, 1.0),
-)
-Reference = Callable[[float], np.ndarray]
-
-
-@dataclasses.dataclass(frozen=True)
-class System:
-    """A robot without effects and what an experimenter does with it.
-
-    Attributes:
-        xml: the nominal model. Bodies that move carry geoms with stated masses; `base` is fixed and massive.
-        period: s, of log and outer controller.
-        servo: actuators take position targets (in the model's own servo); else torques of an outer PD controller.
-        kp, kd: of the outer controller, N m/rad and N m s/rad (N/m, N s/m) per actuator.
-        centre, swing: rad or m per actuator, of the reference motion; push: share of the command range in open loop.
-        lift: rad, how far off the reference the driven joints start, so that a foot starts above the floor.
-        pace: Hz, of the reference motion.
-        sigma: rad or m per joint, noise of the encoders.
-    """
-
-    name: str
-    xml: str
-    period: float
-    servo: bool
-    kp: tuple[float, ...]
-    kd: tuple[float, ...]
-    centre: tuple[float, ...]
-    swing: tuple[float, ...]
-    pace: float
-    sigma: tuple[float, ...]
-    push: float = 0.25
-    lift: float = 0.0
-
-
-def reference(profile: str, amplitude: np.ndarray, pace: float, rng: np.random.Generator) -> Reference:
-    """Motion around zero, `[n]` at any time: joints at different paces and phases, so that they can be told apart."""
-    n = len(amplitude)
-    paces = pace * rng.uniform(0.75, 1.25, n)
-    phases = rng.uniform(0, 1, n)
-    if profile == "triangle":
-
-        def at(t: float) -> np.ndarray:
-            s = (paces * t + phases) % 1.0
-            wave = 4 * np.abs(s - 0.5) - 1
-            return amplitude * np.clip(1.25 * wave, -1, 1)  # rests at both ends
-    elif profile == "multisine":
-        harmonics = np.outer([0.5, 1.0, 1.7, 2.9], paces)
-        shares = np.array([0.45, 0.4, 0.25, 0.12])[:, None]
-        shift = rng.uniform(0, 2 * np.pi, harmonics.shape)
-
-        def at(t: float) -> np.ndarray:
-            return amplitude * (shares * np.sin(2 * np.pi * harmonics * t + shift)).sum(0)
-    elif profile == "chirp":
-
-        def at(t: float) -> np.ndarray:
-            rate = 0.3 * t + (3.0 - 0.3) * t * t / (2 * SECONDS)  # 0.3 to 3 times the pace
-            return amplitude / (1 + 0.35 * t) * np.sin(2 * np.pi * (paces * rate + phases))
-    else:
-        levels = rng.uniform(-1, 1, (64, n))
-
-        def at(t: float) -> np.ndarray:
-            count = np.maximum(t * paces * 1.5 + phases, 0.0)
-            whole = count.astype(int)
-            s = np.clip((count - whole) / (1.5 * paces * RISE), 0, 1)
-            old, new = levels[whole, np.arange(n)], levels[whole + 1, np.arange(n)]
-            return amplitude * (old + (new - old) * s * s * (3 - 2 * s))
-
-    return at
+from bayessim_mjx.blind.reality.system import System
 
 
 def _model(name: str, timestep: float, worldbody: str, actuator: str) -> str:
@@ -140,7 +57,9 @@ def _cartpole() -> System:
       </body>"""
     motor = '    <motor name="slider_motor" joint="slider" ctrlrange="-20 20"/>'
     xml = _model("cartpole", 0.005, body, motor)
-    return System("cartpole", xml, 0.02, False, (60.0,), (10.0,), (0.0,), (0.25,), 0.45, (3e-4, 5e-4), push=0.1)
+    return System(
+        "cartpole", xml, 0.02, False, (60.0,), (10.0,), (0.0,), (0.25,), 0.45, (3e-4, 5e-4), push=0.1, tilts=False
+    )
 
 
 def _two_link() -> System:

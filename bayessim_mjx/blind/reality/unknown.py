@@ -1,15 +1,12 @@
 """Causes that no library knows: the honest verdict is that something unexplained is there."""
 
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
-from causes import Cause
-from causes_actuator import ActuatorCause
-from causes_joint import Friction
 
-if TYPE_CHECKING:
-    from truth import Plant
+from bayessim_mjx.blind.reality.actuators import ActuatorCause
+from bayessim_mjx.blind.reality.cause import Cause, Simulated
+from bayessim_mjx.blind.reality.joints import Friction
 
 
 class PositionHysteresis(Friction):
@@ -22,7 +19,7 @@ class PositionHysteresis(Friction):
         low, high = self.scales.travel[self.where]
         self.wave, self.phase = rng.uniform(2.0, 3.5) * 2 * np.pi / (high - low), rng.uniform(0, 2 * np.pi)
 
-    def level(self, plant: "Plant", w: float) -> float:
+    def level(self, plant: Simulated, w: float) -> float:
         q = float(plant.data.qpos[plant.address(self.where)])
         return self.size * max(math.sin(self.wave * q + self.phase), 1e-3)
 
@@ -36,7 +33,7 @@ class CrossCoupling(ActuatorCause):
     def draw(self, rng: np.random.Generator) -> None:
         self.other = str(rng.choice([j for j in self.scales.force if j != self.joint]))
 
-    def force(self, plant: "Plant") -> None:
+    def force(self, plant: Simulated) -> None:
         effort = plant.data.qfrc_actuator[plant.dof(self.joint)]
         plant.data.qfrc_applied[plant.dof(self.other)] += self.size * effort
 
@@ -51,12 +48,12 @@ class VaryingGain(ActuatorCause):
     def draw(self, rng: np.random.Generator) -> None:
         self.rate, self.phase = rng.uniform(0.25, 0.6), rng.uniform(0, 2 * np.pi)
 
-    def reset(self, plant: "Plant", command: np.ndarray) -> None:
+    def reset(self, plant: Simulated, command: np.ndarray) -> None:
         super().reset(plant, command)
         self.gain = plant.model.actuator_gainprm[self.id].copy()
         self.bias = plant.model.actuator_biasprm[self.id].copy()
 
-    def command(self, plant: "Plant", u: np.ndarray) -> None:
+    def command(self, plant: Simulated, u: np.ndarray) -> None:
         g = 1 + self.size * math.sin(2 * math.pi * self.rate * plant.data.time + self.phase)
         plant.model.actuator_gainprm[self.id] = self.gain * g
         plant.model.actuator_biasprm[self.id] = self.bias * g
@@ -74,13 +71,13 @@ class Pushes(Cause):
         self.runs = 0
         self.largest = 10 * max(self.scales.force.values())
 
-    def reset(self, plant: "Plant", command: np.ndarray) -> None:
+    def reset(self, plant: Simulated, command: np.ndarray) -> None:
         self.id = plant.model.body(self.where).id
         rng = np.random.default_rng((self.seed, round(1e6 * float(np.sum(np.abs(command))))))
         self.starts = np.sort(rng.uniform(0.2, 3.7, 4))
         self.forces = rng.uniform(0.5, 1.0, (4, 1)) * rng.choice([-1, 1], (4, 1)) * [1.0, 0.6, 0.2]
 
-    def force(self, plant: "Plant") -> None:
+    def force(self, plant: Simulated) -> None:
         for start, force in zip(self.starts, self.forces, strict=True):
             s = (plant.data.time - start) / 0.25
             if 0 < s < 1:

@@ -5,18 +5,45 @@ and elasticity are a second joint behind the rotor, springs, drag, lag and limit
 """
 
 import dataclasses
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar, Protocol
 
 import mujoco
 import numpy as np
 
-if TYPE_CHECKING:
-    from truth import Plant
+
+class Simulated(Protocol):
+    """What a cause sees of the robot that it acts on (`plant.Plant`)."""
+
+    model: mujoco.MjModel
+    data: mujoco.MjData
+    timestep: float
+
+    def column(self, joint: str) -> int:
+        """Of a joint in measured positions."""
+
+    def speed_column(self, joint: str) -> int:
+        """Of a joint in measured velocities."""
+
+    def address(self, joint: str) -> int:
+        """Of a joint in `data.qpos`."""
+
+    def dof(self, joint: str) -> int:
+        """Of a joint in `data.qvel`."""
+
+    def position(self, joint: str) -> float:
+        """True position of a joint, before any play behind it."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Scales:
-    """What the robot does without causes: largest force, speed, ... by joint, mass by body, command by actuator."""
+    """What the robot does without causes: largest force, speed, ... by joint, mass by body, command by actuator.
+
+    Attributes:
+        effort: largest force over the gear, by actuator; drives: {actuator: its joint}.
+        servo: actuators that take positions; base: the body that stands on the ground, "" where the robot has none.
+        ends: bodies at the ends of chains and those before them; rotors: driven joints that are alone in their body;
+        direct: actuators without a filter of their own.
+    """
 
     force: dict[str, float]
     speed: dict[str, float]
@@ -25,9 +52,14 @@ class Scales:
     command: dict[str, float]
     rate: dict[str, float]
     mass: dict[str, float]
-    drives: dict[str, str]  # actuator -> joint
+    drives: dict[str, str]
     timestep: float
-    servo: bool
+    servo: frozenset[str]
+    effort: dict[str, float]
+    base: str
+    ends: tuple[str, ...]
+    rotors: tuple[str, ...]
+    direct: frozenset[str]
 
 
 class Cause:
@@ -52,19 +84,19 @@ class Cause:
     def edit(self, spec: mujoco.MjSpec) -> None:
         """Write natively into the model."""
 
-    def reset(self, plant: "Plant", command: np.ndarray) -> None:
+    def reset(self, plant: Simulated, command: np.ndarray) -> None:
         """Clear the memory at the start of a run, `command` being the first one."""
 
-    def command(self, plant: "Plant", u: np.ndarray) -> None:
+    def command(self, plant: Simulated, u: np.ndarray) -> None:
         """Change the command `[nu]` of this sub-step in place."""
 
-    def force(self, plant: "Plant") -> None:
+    def force(self, plant: Simulated) -> None:
         """Add forces of this sub-step to `plant.data`."""
 
-    def watch(self, plant: "Plant", q: np.ndarray, v: np.ndarray) -> None:
+    def watch(self, plant: Simulated, q: np.ndarray, v: np.ndarray) -> None:
         """See the true joint positions and velocities at the end of a sub-step."""
 
-    def sense(self, plant: "Plant", q: np.ndarray, v: np.ndarray) -> None:
+    def sense(self, plant: Simulated, q: np.ndarray, v: np.ndarray) -> None:
         """Change the measured positions and velocities of a row in place."""
 
     def parameters(self) -> dict[str, float]:

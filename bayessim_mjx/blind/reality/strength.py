@@ -3,15 +3,15 @@
 from collections.abc import Sequence
 
 import numpy as np
-from causes import Cause
 from scipy.optimize import lsq_linear
-from systems import System
-from truth import Plant, Run, run
+
+from bayessim_mjx.blind.reality.cause import Cause
+from bayessim_mjx.blind.reality.plant import Plant, Rig, Run
 
 WINDOW = 0.5  # s, over which a cause is compared with the noise
-PUSHED = (0, 2, 4, 6)  # the runs that set a strength
 HIDDEN = 3.0  # a cause counts as no more than this many times what a refit leaves of it
 TRIALS = 14
+MOST = 64  # windows, about
 _NUDGE = 0.02
 
 
@@ -23,39 +23,43 @@ class Ruler:
     nominal and of each window's initial state. The tangents are those of the motion without causes.
     """
 
-    def __init__(self, system: System, base: dict[str, float], spread: float, seed: int) -> None:
+    def __init__(self, system: Rig, base: dict[str, float], spread: float, seed: int) -> None:
         self.system, self.seed, self.base = system, seed, base
         self.plain = Plant(system, base)
-        self.runs = [run(self.plain, i, seed, noise=False) for i in PUSHED]
+        self.runs = [system.record(self.plain, i, seed, noise=False) for i in system.pushed]
         self.rows = round(WINDOW / system.period)
         at_rest = self.windows(self.plain, self.runs)
         tangents = []
         for name in base:
             other = Plant(system, base | {name: base[name] + _NUDGE})
             tangents.append((self.windows(other, self.runs) - at_rest) / _NUDGE)
-        n = len(self.plain.joints)
+        sizes = [len(x) for x in self.plain.link()]
         starts = []
-        for i in range(2 * n):
-            shift = np.zeros((2, n))
-            shift[divmod(i, n)] = 1e-4
-            starts.append((self.windows(self.plain, self.runs, shift) - at_rest) / 1e-4)
+        for i in range(sum(sizes)):
+            shift = np.zeros(sum(sizes))
+            shift[i] = 1e-4
+            moved = self.windows(self.plain, self.runs, np.split(shift, sizes[:1]))
+            starts.append((moved - at_rest) / 1e-4)
         self.tangents = np.stack(tangents, -1)
         # orthonormal basis of what initial states can do, by window
-        self.free = np.linalg.qr(np.stack(starts, -1).reshape(len(at_rest), -1, 2 * n))[0]
+        self.free = np.linalg.qr(np.stack(starts, -1).reshape(len(at_rest), -1, len(starts)))[0]
         scale = np.array(list(base.values()))
         self.bounds = (np.minimum(1 - spread - scale, -1e-9), np.maximum(1 + spread - scale, 1e-9))
 
-    def windows(self, plant: Plant, runs: Sequence[Run], shift: np.ndarray | None = None, every: int = 1) -> np.ndarray:
-        """Simulated positions less recorded ones, `[windows, rows, joints]`, in noises; of every so many windows."""
-        dq, dv = np.zeros((2, len(plant.joints))) if shift is None else shift
+    def windows(
+        self, plant: Plant, runs: Sequence[Run], shift: Sequence[np.ndarray] | None = None, every: int = 1
+    ) -> np.ndarray:
+        """Simulated positions less recorded ones, `[windows, rows, n]`, in noises; of every so many windows."""
+        dq, dv = shift or (0.0, 0.0)
         out = []
         starts = [(r, start) for r in runs for start in range(0, len(r.time) - self.rows, self.rows)]
-        for r, start in starts[::every]:
+        thin = max(1, len(starts) // MOST)
+        for r, start in starts[::thin][::every]:
             plant.reset(r.clean[start] + dq, r.clean_v[start] + dv, r.ctrl[start])
             for k in range(start, start + self.rows):
                 plant.advance(r.ctrl[k])
                 out.append(plant.measure()[0] - r.clean[k + 1])
-        return np.array(out).reshape(-1, self.rows, len(plant.joints)) / np.asarray(self.system.sigma)
+        return np.array(out).reshape(-1, self.rows, len(self.system.sigma)) / np.asarray(self.system.sigma)
 
     def outside(self, x: np.ndarray, every: int = 1) -> np.ndarray:
         """Columns `[windows, rows, joints, ...]` without the part that initial states explain, flattened."""
@@ -83,7 +87,7 @@ def resize(cause: Cause, ruler: Ruler, goal: float) -> tuple[float, float]:
     def reached(size: float) -> tuple[float, float]:
         cause.size = float(size)
         plant = Plant(ruler.system, ruler.base, [cause])
-        return ruler.measure([run(plant, i, ruler.seed, noise=False) for i in PUSHED])
+        return ruler.measure([ruler.system.record(plant, i, ruler.seed, noise=False) for i in ruler.system.pushed])
 
     low, high = max(cause.smallest, 1e-4 * cause.largest), cause.largest
     size = np.sqrt(low * high)

@@ -1,14 +1,11 @@
 """Causes at joints."""
 
 import math
-from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
-from causes import Cause
 
-if TYPE_CHECKING:
-    from truth import Plant
+from bayessim_mjx.blind.reality.cause import Cause, Simulated
 
 PRESLIDING = 2e-4  # rad or m, bend of the bristles at the friction level
 
@@ -46,14 +43,14 @@ class Friction(Cause):
     def highest(self) -> float:
         return self.size
 
-    def level(self, plant: "Plant", w: float) -> float:
+    def level(self, plant: Simulated, w: float) -> float:
         return self.size
 
-    def reset(self, plant: "Plant", command: np.ndarray) -> None:
+    def reset(self, plant: Simulated, command: np.ndarray) -> None:
         self.dof = plant.dof(self.where)
         self.bristle = Bristle(self.highest(), self.scales.inertia[self.where], plant.timestep)
 
-    def force(self, plant: "Plant") -> None:
+    def force(self, plant: Simulated) -> None:
         w = float(plant.data.qvel[self.dof])
         plant.data.qfrc_applied[self.dof] += self.bristle.step(w, self.level(plant, w))
 
@@ -78,7 +75,7 @@ class StribeckFriction(Friction):
     def highest(self) -> float:
         return self.ratio * self.size
 
-    def level(self, plant: "Plant", w: float) -> float:
+    def level(self, plant: Simulated, w: float) -> float:
         return self.size * (1 + (self.ratio - 1) * math.exp(-((w / self.speed) ** 2)))
 
     def parameters(self) -> dict[str, float]:
@@ -96,7 +93,7 @@ class LoadFriction(Friction):
     def highest(self) -> float:
         return self.size * self.scales.force[self.where]
 
-    def level(self, plant: "Plant", w: float) -> float:
+    def level(self, plant: Simulated, w: float) -> float:
         d = plant.data
         return self.size * abs(d.qfrc_actuator[self.dof] + d.qfrc_bias[self.dof])
 
@@ -113,7 +110,7 @@ class AsymmetricFriction(Friction):
         super().draw(rng)
         self.part, self.side = rng.uniform(0.0, 0.35), float(rng.choice([-1, 1]))
 
-    def level(self, plant: "Plant", w: float) -> float:
+    def level(self, plant: Simulated, w: float) -> float:
         return self.size * (1.0 if w * self.side > 0 else max(self.part, 1e-3))
 
     def parameters(self) -> dict[str, float]:

@@ -1,15 +1,12 @@
-"""Causes at actuators."""
+"""Causes at actuators; efforts are the actuator's, joint forces over the gear."""
 
 import math
 from collections import deque
-from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
-from causes import Cause
 
-if TYPE_CHECKING:
-    from truth import Plant
+from bayessim_mjx.blind.reality.cause import Cause, Simulated
 
 
 class ActuatorCause(Cause):
@@ -19,9 +16,10 @@ class ActuatorCause(Cause):
     def joint(self) -> str:
         return self.scales.drives[self.where]
 
-    def reset(self, plant: "Plant", command: np.ndarray) -> None:
+    def reset(self, plant: Simulated, command: np.ndarray) -> None:
         self.id = plant.model.actuator(self.where).id
         self.value = float(command[self.id])
+        self.gear = float(plant.model.actuator_gear[self.id, 0])
 
 
 class ActuatorDelay(ActuatorCause):
@@ -31,13 +29,13 @@ class ActuatorDelay(ActuatorCause):
     stepped = True
     largest = 0.08
 
-    def reset(self, plant: "Plant", command: np.ndarray) -> None:
+    def reset(self, plant: Simulated, command: np.ndarray) -> None:
         super().reset(plant, command)
         lag = self.size / plant.timestep
         self.whole, self.part = int(lag), lag - int(lag)
         self.buffer = deque([self.value] * (self.whole + 2), maxlen=self.whole + 2)
 
-    def command(self, plant: "Plant", u: np.ndarray) -> None:
+    def command(self, plant: Simulated, u: np.ndarray) -> None:
         self.buffer.append(float(u[self.id]))
         u[self.id] = (1 - self.part) * self.buffer[1] + self.part * self.buffer[0]
 
@@ -57,7 +55,7 @@ class ActuatorLag(ActuatorCause):
         actuator.dyntype = mujoco.mjtDyn.mjDYN_FILTEREXACT
         actuator.dynprm[0] = max(self.size, self.smallest)
 
-    def reset(self, plant: "Plant", command: np.ndarray) -> None:
+    def reset(self, plant: Simulated, command: np.ndarray) -> None:
         super().reset(plant, command)
         plant.data.act[plant.model.actuator_actadr[self.id]] = self.value
 
@@ -86,7 +84,7 @@ class ActuatorBias(ActuatorCause):
 
     def draw(self, rng: np.random.Generator) -> None:
         self.sign = float(rng.choice([-1, 1]))
-        self.largest = 0.4 * self.scales.force[self.joint]
+        self.largest = 0.4 * self.scales.effort[self.where]
 
     def edit(self, spec: mujoco.MjSpec) -> None:
         actuator = spec.actuator(self.where)
@@ -104,10 +102,10 @@ class ActuatorDeadband(ActuatorCause):
     stepped = True
 
     def draw(self, rng: np.random.Generator) -> None:
-        self.largest = 0.05 if self.scales.servo else 0.4 * self.scales.command[self.where]
+        self.largest = 0.05 if self.where in self.scales.servo else 0.4 * self.scales.command[self.where]
 
-    def command(self, plant: "Plant", u: np.ndarray) -> None:
-        origin = plant.position(self.joint) if self.scales.servo else 0.0
+    def command(self, plant: Simulated, u: np.ndarray) -> None:
+        origin = self.gear * plant.position(self.joint) if self.where in self.scales.servo else 0.0
         error = u[self.id] - origin
         u[self.id] = origin + math.copysign(max(abs(error) - self.size, 0.0), error)
 
@@ -128,7 +126,7 @@ class ActuatorSaturation(ActuatorCause):
 
     @property
     def limit(self) -> float:
-        return self.scales.force[self.joint] / (1 + self.size)
+        return self.scales.effort[self.where] / (1 + self.size)
 
     def parameters(self) -> dict[str, float]:
         return {"inverse_limit": 1 / self.limit}
@@ -143,7 +141,7 @@ class SpeedTorqueLimit(ActuatorCause):
     smallest = 0.05
 
     def draw(self, rng: np.random.Generator) -> None:
-        self.stall = rng.uniform(1.0, 1.3) * self.scales.force[self.joint]
+        self.stall = rng.uniform(1.0, 1.3) * self.scales.effort[self.where]
 
     def edit(self, spec: mujoco.MjSpec) -> None:
         spec.actuator(self.where).forcelimited = True
@@ -153,8 +151,8 @@ class SpeedTorqueLimit(ActuatorCause):
     def free_speed(self) -> float:
         return self.scales.speed[self.joint] / max(self.size, self.smallest)
 
-    def command(self, plant: "Plant", u: np.ndarray) -> None:
-        w = float(plant.data.qvel[plant.dof(self.joint)]) / self.free_speed
+    def command(self, plant: Simulated, u: np.ndarray) -> None:
+        w = self.gear * float(plant.data.qvel[plant.dof(self.joint)]) / self.free_speed
         plant.model.actuator_forcerange[self.id] = (
             -self.stall * min(max(1 + w, 0.0), 1.0),
             self.stall * min(max(1 - w, 0.0), 1.0),
@@ -171,20 +169,21 @@ class EffortLoss(ActuatorCause):
     stepped = True
     largest = 1.5
 
-    def reset(self, plant: "Plant", command: np.ndarray) -> None:
+    def reset(self, plant: Simulated, command: np.ndarray) -> None:
         super().reset(plant, command)
         self.gain = plant.model.actuator_gainprm[self.id, 0].copy()
         self.bias = plant.model.actuator_biasprm[self.id].copy()
 
-    def command(self, plant: "Plant", u: np.ndarray) -> None:
-        w = float(plant.data.qvel[plant.dof(self.joint)])
-        tau = self.gain * u[self.id] + self.bias @ (1, plant.position(self.joint), w, *[0] * (len(self.bias) - 3))
-        part = 1 / (1 + self.size * abs(tau) / self.scales.force[self.joint])
+    def command(self, plant: Simulated, u: np.ndarray) -> None:
+        w = self.gear * float(plant.data.qvel[plant.dof(self.joint)])
+        q = self.gear * plant.position(self.joint)
+        tau = self.gain * u[self.id] + self.bias @ (1, q, w, *[0] * (len(self.bias) - 3))
+        part = 1 / (1 + self.size * abs(tau) / self.scales.effort[self.where])
         plant.model.actuator_gainprm[self.id, 0] = self.gain * part
         plant.model.actuator_biasprm[self.id] = self.bias * part
 
     def parameters(self) -> dict[str, float]:
-        return {"loss": self.size / self.scales.force[self.joint]}
+        return {"loss": self.size / self.scales.effort[self.where]}
 
 
 class Cogging(ActuatorCause):
@@ -195,7 +194,7 @@ class Cogging(ActuatorCause):
         self.count, self.phase = int(rng.integers(6, 25)), rng.uniform(0, 2 * np.pi)
         self.largest = 0.5 * self.scales.force[self.joint]
 
-    def force(self, plant: "Plant") -> None:
+    def force(self, plant: Simulated) -> None:
         q = plant.data.qpos[plant.address(self.joint)]
         plant.data.qfrc_applied[plant.dof(self.joint)] += self.size * math.sin(self.count * q + self.phase)
 
@@ -216,7 +215,7 @@ class RateLimit(ActuatorCause):
     def limit(self) -> float:
         return self.scales.rate[self.where] / max(self.size, self.smallest)
 
-    def command(self, plant: "Plant", u: np.ndarray) -> None:
+    def command(self, plant: Simulated, u: np.ndarray) -> None:
         reach = self.limit * plant.timestep
         self.value += min(max(float(u[self.id]) - self.value, -reach), reach)
         u[self.id] = self.value

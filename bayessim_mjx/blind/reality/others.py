@@ -2,14 +2,11 @@
 
 import math
 from collections import deque
-from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
-from causes import Cause
 
-if TYPE_CHECKING:
-    from truth import Plant
+from bayessim_mjx.blind.reality.cause import Cause, Simulated
 
 
 class Payload(Cause):
@@ -24,8 +21,7 @@ class Payload(Cause):
 
     def edit(self, spec: mujoco.MjSpec) -> None:
         body = spec.body(self.where)
-        end = np.array(body.geoms[0].fromto[3:])
-        self.position = self.share * np.nan_to_num(end) + self.aside
+        self.position = self.share * _end(body) + self.aside
         lump = body.add_body(name=f"{self.where}/payload", pos=self.position)
         lump.add_geom(
             type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.01, 0, 0], mass=max(self.size, 1e-9), contype=0, conaffinity=0
@@ -34,6 +30,14 @@ class Payload(Cause):
     def parameters(self) -> dict[str, float]:
         x, y, z = self.position
         return {"mass": self.size, "x": x, "y": y, "z": z}
+
+
+def _end(body: mujoco.MjsBody) -> np.ndarray:
+    """Where a body ends: the far end of its first geom, or where that sits, or the centre of mass."""
+    if not body.geoms:
+        return np.nan_to_num(np.array(body.ipos))
+    far = np.array(body.geoms[0].fromto[3:])
+    return far if np.isfinite(far).all() else np.array(body.geoms[0].pos)
 
 
 class GravityTilt(Cause):
@@ -48,7 +52,7 @@ class GravityTilt(Cause):
         self.heading = float(rng.choice([0, np.pi])) + rng.uniform(-spread, spread)
 
     def edit(self, spec: mujoco.MjSpec) -> None:
-        g, lean = 9.81, self.size
+        g, lean = abs(float(spec.option.gravity[2])), self.size
         aside = g * math.sin(lean)
         spec.option.gravity = [aside * math.cos(self.heading), aside * math.sin(self.heading), -g * math.cos(lean)]
 
@@ -72,11 +76,11 @@ class ExternalForce(Cause):
         self.seed = int(rng.integers(2**31))
         self.largest = 3 * max(self.scales.force.values())
 
-    def reset(self, plant: "Plant", command: np.ndarray) -> None:
+    def reset(self, plant: Simulated, command: np.ndarray) -> None:
         self.id, self.wind = plant.model.body(self.where).id, 0.0
         self.rng = np.random.default_rng(self.seed)
 
-    def force(self, plant: "Plant") -> None:
+    def force(self, plant: Simulated) -> None:
         if self.gusts:  # Ornstein-Uhlenbeck of 0.5 s
             step = plant.timestep / 0.5
             self.wind += -self.wind * step + math.sqrt(2 * step) * self.rng.normal()
@@ -100,7 +104,7 @@ class BaseFlexibility(Cause):
 
     def edit(self, spec: mujoco.MjSpec) -> None:
         k = 1 / max(self.size, self.smallest)
-        base = spec.body("base")
+        base = spec.body(self.scales.base)
         for name, axis in (("base/x", [1, 0, 0]), ("base/y", [0, 1, 0])):
             joint = base.add_joint(name=name, axis=axis, pos=[0, 0, -0.1], armature=0.1 * self.inertia)
             joint.stiffness[0], joint.damping[0] = k, 2 * self.zeta * math.sqrt(k * self.inertia)
@@ -156,12 +160,12 @@ class JointOffset(Cause):
         self.sign = float(rng.choice([-1, 1]))
 
     def edit(self, spec: mujoco.MjSpec) -> None:
-        if self.scales.servo:
-            actuator = next(a for a, joint in self.scales.drives.items() if joint == self.where)
+        own = [a for a, joint in self.scales.drives.items() if joint == self.where]
+        for actuator in self.scales.servo.intersection(own):
             servo = spec.actuator(actuator)
             servo.biasprm[0] += servo.biasprm[1] * self.sign * self.size
 
-    def sense(self, plant: "Plant", q: np.ndarray, v: np.ndarray) -> None:
+    def sense(self, plant: Simulated, q: np.ndarray, v: np.ndarray) -> None:
         q[plant.column(self.where)] += self.sign * self.size
 
     def parameters(self) -> dict[str, float]:
@@ -175,20 +179,19 @@ class SensorDelay(Cause):
     stepped = True
     largest = 0.06
 
-    def reset(self, plant: "Plant", command: np.ndarray) -> None:
+    def reset(self, plant: Simulated, command: np.ndarray) -> None:
         lag = self.size / plant.timestep
         self.whole, self.part = int(lag), lag - int(lag)
         self.buffer: deque[tuple[float, float]] = deque(maxlen=self.whole + 2)
 
-    def watch(self, plant: "Plant", q: np.ndarray, v: np.ndarray) -> None:
-        i = plant.column(self.where)
-        self.buffer.append((float(q[i]), float(v[i])))
+    def watch(self, plant: Simulated, q: np.ndarray, v: np.ndarray) -> None:
+        self.buffer.append((float(q[plant.column(self.where)]), float(v[plant.speed_column(self.where)])))
 
-    def sense(self, plant: "Plant", q: np.ndarray, v: np.ndarray) -> None:
-        i = plant.column(self.where)
+    def sense(self, plant: Simulated, q: np.ndarray, v: np.ndarray) -> None:
+        i, j = plant.column(self.where), plant.speed_column(self.where)
         recent = self.buffer[max(len(self.buffer) - 1 - self.whole, 0)]
         older = self.buffer[max(len(self.buffer) - 2 - self.whole, 0)]
-        q[i], v[i] = ((1 - self.part) * a + self.part * b for a, b in zip(recent, older, strict=True))
+        q[i], v[j] = ((1 - self.part) * a + self.part * b for a, b in zip(recent, older, strict=True))
 
     def parameters(self) -> dict[str, float]:
         return {"delay": self.size}
@@ -202,20 +205,18 @@ class SensorFilter(Cause):
     largest = 0.08
     smallest = 1e-4
 
-    def reset(self, plant: "Plant", command: np.ndarray) -> None:
+    def reset(self, plant: Simulated, command: np.ndarray) -> None:
         self.state: tuple[float, float] | None = None
         self.keep = math.exp(-plant.timestep / max(self.size, self.smallest))
 
-    def watch(self, plant: "Plant", q: np.ndarray, v: np.ndarray) -> None:
-        i = plant.column(self.where)
-        new = (float(q[i]), float(v[i]))
+    def watch(self, plant: Simulated, q: np.ndarray, v: np.ndarray) -> None:
+        new = (float(q[plant.column(self.where)]), float(v[plant.speed_column(self.where)]))
         old = self.state or new
         self.state = tuple(self.keep * a + (1 - self.keep) * b for a, b in zip(old, new, strict=True))  # type: ignore[assignment]
 
-    def sense(self, plant: "Plant", q: np.ndarray, v: np.ndarray) -> None:
-        i = plant.column(self.where)
+    def sense(self, plant: Simulated, q: np.ndarray, v: np.ndarray) -> None:
         assert self.state
-        q[i], v[i] = self.state
+        q[plant.column(self.where)], v[plant.speed_column(self.where)] = self.state
 
     def parameters(self) -> dict[str, float]:
         return {"time_constant": self.size}
@@ -228,10 +229,9 @@ class SensorGain(Cause):
     def draw(self, rng: np.random.Generator) -> None:
         self.sign = float(rng.choice([-1, 1]))
 
-    def sense(self, plant: "Plant", q: np.ndarray, v: np.ndarray) -> None:
-        i = plant.column(self.where)
-        q[i] *= 1 + self.sign * self.size
-        v[i] *= 1 + self.sign * self.size
+    def sense(self, plant: Simulated, q: np.ndarray, v: np.ndarray) -> None:
+        q[plant.column(self.where)] *= 1 + self.sign * self.size
+        v[plant.speed_column(self.where)] *= 1 + self.sign * self.size
 
     def parameters(self) -> dict[str, float]:
         return {"gain": 1 + self.sign * self.size}

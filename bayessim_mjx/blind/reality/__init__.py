@@ -1,0 +1,1 @@
+"""A finer reality in MuJoCo C with causes of its own; nothing of the library's physics and effects is used."""

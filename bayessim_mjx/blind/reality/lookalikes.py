@@ -1,0 +1,115 @@
+"""Can a hidden cause be told from every other one by these logs? From the truth alone, never from the library.
+
+Every other cause of the generator is put in the place of the hidden one, sized as well as it can be, with the base
+parameters within their spread and the start states free; what is left of the gap, without noise, is how far the two are
+apart. Draws of shapes are few, so that a rival may be better than found: then a case counts that should not.
+"""
+
+from typing import Any
+
+import numpy as np
+from scipy.optimize import lsq_linear
+
+from bayessim_mjx.blind.reality.cause import Cause, Scales
+from bayessim_mjx.blind.reality.menu import CAUSES, KNOWN, places
+from bayessim_mjx.blind.reality.plant import Plant, Run
+from bayessim_mjx.blind.reality.strength import Ruler
+
+APART = 1.0  # encoder noises (rms over time, largest over joints): below, a rival explains the same motion
+SHARE = 0.2  # and of what the known parameters leave: less is lost in the simulator's own step and in linearising
+DRAWS = 2  # of a rival's sign and shape
+STEPS = 3  # secant steps to its size
+TOLD = 5  # rivals kept
+EVERY = 2  # windows are thinned by this: a rival costs several simulations
+# what the laws can be besides what the generator draws: to a single joint a sine of its angle, or a force straight up,
+# is what gravity does
+SHAPES: dict[str, tuple[dict[str, Any], ...]] = {
+    "cogging": ({"count": 1, "phase": 0.0}, {"count": 1, "phase": np.pi / 2}),
+    "external_force": ({"direction": np.eye(3)[0], "gusts": 0.0}, {"direction": np.eye(3)[2], "gusts": 0.0}),
+}
+_FIRST = 0.1  # of the largest size
+_SIGNED = ("sign", "heading", "direction", "phase")  # what has one of these may act either way round
+
+
+def isolable(found: list[dict[str, Any]], left: float) -> bool:
+    """Whether every rival leaves enough; `left`: noises that base parameters alone leave (of the truth)."""
+    return all(r["left"] >= max(APART, SHARE * left) for r in found)
+
+
+def rivals(cause: Cause, ruler: Ruler) -> list[dict[str, Any]]:
+    """[{"name", "where", "left"}], the closest first: left in encoder noises."""
+    scales = cause.scales
+    runs = record(cause, ruler)
+    gap = ruler.windows(ruler.plain, runs, every=EVERY)
+    near = _joint(cause, ruler, gap)
+    found = []
+    for name, where in _others(cause, ruler, scales, near):
+        rng = np.random.default_rng((ruler.seed, *name.encode()))
+        left = min(_closest(rival, ruler, runs, gap) for rival in _drawn(name, where, scales, rng))
+        found.append({"name": name, "where": where, "left": left})
+    return sorted(found, key=lambda r: r["left"])[:TOLD]
+
+
+def record(cause: Cause, ruler: Ruler) -> list[Run]:
+    """The runs that measure strength, with a cause and without noise."""
+    plant = Plant(ruler.system, ruler.base, [cause])
+    return [ruler.system.record(plant, i, ruler.seed, noise=False) for i in ruler.system.pushed]
+
+
+def _joint(cause: Cause, ruler: Ruler, gap: np.ndarray) -> str:
+    """The cause's joint; of one at a body or the world the joint that shows most of it."""
+    if cause.kind in ("joint", "actuator"):
+        return cause.scales.drives.get(cause.where, cause.where)
+    return ruler.plain.joints[int(np.argmax(np.mean(gap**2, axis=(0, 1))))]
+
+
+def _others(cause: Cause, ruler: Ruler, scales: Scales, near: str) -> list[tuple[str, str]]:
+    """What else may be wrong at this joint, its actuator, at bodies, the world and contacts."""
+    out = []
+    for name in KNOWN:
+        for where in places(ruler.system, name, scales):
+            here = CAUSES[name].kind not in ("joint", "actuator") or scales.drives.get(where, where) == near
+            if here and name != cause.name:
+                out.append((name, where))
+    return out
+
+
+def _drawn(name: str, where: str, scales: Scales, rng: np.random.Generator) -> list[Cause]:
+    """A cause with some signs and shapes."""
+    out = [CAUSES[name](where, scales, rng) for _ in range(DRAWS)]
+    for shape in SHAPES.get(name, ()):
+        out.append(CAUSES[name](where, scales, rng))
+        vars(out[-1]).update(shape)
+    return out
+
+
+def _closest(rival: Cause, ruler: Ruler, runs: list[Run], gap: np.ndarray) -> float:
+    """What the best size of a rival leaves, in noises."""
+    either = any(hasattr(rival, a) for a in _SIGNED)
+    smallest = max(rival.smallest, 1e-4 * rival.largest)
+    rival.size, best = max(_FIRST * rival.largest, smallest), np.inf
+    for _ in range(STEPS):
+        other = ruler.windows(Plant(ruler.system, ruler.base, [rival]), runs, every=EVERY)
+        if not np.isfinite(other).all():
+            rival.size = max(0.3 * rival.size, smallest)
+            continue
+        scale, left = _scaled(ruler, gap, other, either)
+        best = min(best, left)
+        if best < APART / 2 or abs(scale - 1) < 0.1:
+            break
+        if scale < 0:
+            rival.sign = -getattr(rival, "sign", 1.0)
+        rival.size = float(np.clip(abs(scale) * rival.size, smallest, rival.largest))
+    return best
+
+
+def _scaled(ruler: Ruler, gap: np.ndarray, other: np.ndarray, either: bool) -> tuple[float, float]:
+    """(best multiple of the rival's change, what is left): base parameters and start states as they like."""
+    target, column = ruler.outside(gap, EVERY)[:, 0], ruler.outside(other - gap, EVERY)[:, 0]
+    size = max(float(np.abs(column).max()), 1e-12)
+    A = np.column_stack([ruler.outside(ruler.tangents[::EVERY], EVERY), column / size])
+    most = 1.5 * size
+    low, high = np.append(ruler.bounds[0], -most if either else 0.0), np.append(ruler.bounds[1], most)
+    fit = lsq_linear(A, -target, bounds=(low, high))
+    left = (target + A @ fit.x).reshape(gap.shape)
+    return float(fit.x[-1] / size), float(np.sqrt(np.mean(left**2, axis=(0, 1))).max())
