@@ -20,6 +20,7 @@ from scipy.special import ndtr
 from bayessim_mjx.distributions import Distribution, box, charts
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.inference.temperature import TEMPERATURES, temperature, widened
+from bayessim_mjx.keys import branch
 from bayessim_mjx.quantities import percent, percent_estimate
 
 LEVELS = (0.5, 0.8, 0.95)
@@ -228,7 +229,7 @@ def corrected(key: Array, posteriors: Distribution, thetas: Array, tilt: Distrib
         return report
     wider = widened(posteriors, factor)
     # all of them: a program that is compiled already
-    found = jax.tree.map(np.asarray, ranks(jax.random.fold_in(key, 1), wider, jnp.asarray(thetas), DRAWS, tilt))
+    found = jax.tree.map(np.asarray, ranks(branch(key, 1), wider, jnp.asarray(thetas), DRAWS, tilt))
     after = judge(_usable(Ranks(*(part[n // 2 :] for part in found))), posteriors.space.unbatched)
     words = f"{report.words}; standard deviations times {factor:.2f}, then {after.words}"
     return replace(after, words=words, temperature=factor, before=report.verdict)

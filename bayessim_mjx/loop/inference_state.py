@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from bayessim_mjx import inference
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.inference import InferenceSettings, rounds
+from bayessim_mjx.keys import branch
 from bayessim_mjx.loop import ranges, refining
 from bayessim_mjx.loop.state import Loop, domain_or_prior
 from bayessim_mjx.parameters import ParameterSpace
@@ -55,4 +56,4 @@ def new_network(loop: Loop, round_: int, space: ParameterSpace) -> Any:
     changing = loop.source is not None and loop.source.policy_dependent
     embedding = None if loop.source is None else loop.source.channels.embedding(loop.settings.summarizerFxn)
     settings = InferenceSettings.of(loop.settings, restandardise=changing, embedding=embedding)
-    return inference.init(jax.random.fold_in(loop.key(round_, "fit"), 1), settings, space, loop.feature_size)
+    return inference.init(branch(loop.key(round_, "fit"), 1), settings, space, loop.feature_size)

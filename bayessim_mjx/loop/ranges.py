@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import dataclasses
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.inference import range_ends
+from bayessim_mjx.keys import branch
 from bayessim_mjx.loop.range_limits import limits_of
 from bayessim_mjx.loop.state import Loop, LoopState, Moving, RoundInfo
 from bayessim_mjx.parameters.ranged import Ranged
@@ -55,7 +55,7 @@ def completed(loop: Loop, state: LoopState, thetas: Array) -> Array:
     prior, key = Distribution.prior(moving.space), loop.key(int(state.round), "simulate")
     found: list[np.ndarray] = []
     while sum(len(drawn) for drawn in found) < len(spare):
-        key = jax.random.fold_in(key, 1)
+        key = branch(key, 1)
         drawn = prior.sample(key, POOL)
         found.append(np.asarray(drawn)[~np.asarray(moving.covered.contains(drawn))])
     if found:
@@ -86,7 +86,7 @@ def mixed(loop: Loop, state: LoopState, thetas: Array, x: Array) -> tuple[LoopSt
     if loop.sequential:
         return state, thetas, x
     order, count = np.arange(len(thetas)), int(moving.rows)
-    rng = np.random.default_rng(np.asarray(jax.random.fold_in(loop.key(int(state.round), "simulate"), 2)))
+    rng = np.random.default_rng(np.asarray(branch(loop.key(int(state.round), "simulate"), 2)))
     order[:count] = rng.permutation(count)
     return state, thetas[order], x[order]
 

@@ -8,6 +8,7 @@ from typing import Any
 import jax
 
 from bayessim_mjx.inference import checks
+from bayessim_mjx.keys import branch
 from bayessim_mjx.loop import ranges, set_checks
 from bayessim_mjx.loop.simulations import at, proposal_of, simulated
 from bayessim_mjx.loop.state import Loop, LoopState, slot_of
@@ -32,9 +33,7 @@ def reexamine(loop: Loop, state: LoopState, policy: Policy, pairs: int, seed: in
     known = min(b.trainTrajs, REFERENCE)
     used = None if state.proposals is None else at(state.proposals, slot_of(loop, state, done))
     state, temperature = ranges.as_fitted(dataclasses.replace(state, proposal=used)), float(state.temperature)
-    thetas, x = simulated(
-        source, jax.random.fold_in(key, 1), policy, proposal_of(loop, state), b.proposal, known + pairs
-    )
+    thetas, x = simulated(source, branch(key, 1), policy, proposal_of(loop, state), b.proposal, known + pairs)
     held = thetas[known:], x[known:]
     rows = slice((done - 1) * b.realTrajs if source.policy_dependent else 0, done * b.realTrajs)
     judged: dict[str, Any] = {"temperature": temperature, "tilt": used if b.proposal == "apt" else None}
@@ -42,11 +41,9 @@ def reexamine(loop: Loop, state: LoopState, policy: Policy, pairs: int, seed: in
         key, state.fit, (thetas[:known], x[:known], known), held, state.real_features, rows,
         names=loop.feature_names, **judged,
     )  # fmt: skip
-    again = checks.replicated(
-        jax.random.fold_in(key, 2), state.fit, held[1], lambda k, t: source.simulate(k, t, policy), **judged
-    )
+    again = checks.replicated(branch(key, 2), state.fit, held[1], lambda k, t: source.simulate(k, t, policy), **judged)
     report = dataclasses.replace(verdict[0], predictive=again)
     before = dataclasses.replace(state, round=state.round - 1)
     more = min(max(pairs // PAIRS, 1), MOST)
-    sets = set_checks.rejudge(loop, before, policy, done * b.realTrajs, jax.random.fold_in(key, 3), more)
+    sets = set_checks.rejudge(loop, before, policy, done * b.realTrajs, branch(key, 3), more)
     return dataclasses.replace(checks.conclude(report, verdict[1], domain, b.distrust), sets=sets)

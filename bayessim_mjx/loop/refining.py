@@ -11,6 +11,7 @@ import numpy as np
 from jax import Array
 
 from bayessim_mjx.distributions import Distribution
+from bayessim_mjx.keys import branch
 from bayessim_mjx.loop.likelihood import Likelihood
 from bayessim_mjx.loop.recorded import Recorded
 from bayessim_mjx.loop.refinement import Refinement, refine
@@ -40,7 +41,7 @@ def refined(
     state = _stored(loop, state, real)
     record, valid, sensor = _record(loop, state, (round_ + 1) * b.realTrajs)
     likelihood = Likelihood(loop.env.physics, record, valid, sensor, together=b.realTrajs)  # type: ignore[attr-defined]
-    seed = int(jax.random.randint(jax.random.fold_in(loop.key(round_, "fit"), 3), (), 0, 2**31 - 1))
+    seed = int(jax.random.randint(branch(loop.key(round_, "fit"), 3), (), 0, 2**31 - 1))
     found = refine(proposal, likelihood, seed=seed, draws=DRAWS, components=b.components)
     info.refinement = found
     info.seconds["refine"] = time.perf_counter() - clock
@@ -67,7 +68,7 @@ def _stored(loop: Loop, state: LoopState, real: Trajectory) -> LoopState:
     if state.motion is None:
         return state
     first, source = int(state.round) * loop.settings.realTrajs, loop.source
-    keys = jax.random.split(jax.random.fold_in(loop.key(int(state.round), "real"), 7))
+    keys = jax.random.split(branch(loop.key(int(state.round), "real"), 7))
     rows = {name: jnp.asarray(getattr(real, name)) for name in state.motion}
     for key, name in zip(keys, ("qpos", "qvel"), strict=True):
         rows[name] = rows[name] + source.noise * jax.random.normal(key, rows[name].shape)  # type: ignore[union-attr,operator]

@@ -21,6 +21,7 @@ from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.inference import calibration, checks, misspecification, rounds
 from bayessim_mjx.inference.temperature import tempered
+from bayessim_mjx.keys import branch
 from bayessim_mjx.loop import ranges, refining, set_checks
 from bayessim_mjx.loop.factors import conditioned, kept
 from bayessim_mjx.loop.inference_state import new_network
@@ -132,7 +133,7 @@ def _examine(
     known = slice(round_ * b.realTrajs if loop.source.policy_dependent else 0, (round_ + 1) * b.realTrajs)  # type: ignore[union-attr]
     # what the network of this round is tested on comes from what it was simulated from
     tilt = state.proposals and at(state.proposals, slot_of(loop, state, round_ + 1)) if b.proposal == "apt" else None
-    key = jax.random.fold_in(loop.key(round_, "fit"), 2)
+    key = branch(loop.key(round_, "fit"), 2)
     try:
         return checks.examine(
             key, state.fit, fitted, held, state.real_features, known,

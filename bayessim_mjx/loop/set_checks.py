@@ -9,6 +9,7 @@ from jax import Array
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.inference import rounds, sets
 from bayessim_mjx.inference.sets import Sets
+from bayessim_mjx.keys import branch
 from bayessim_mjx.loop.factors import conditioned, kept
 from bayessim_mjx.loop.simulations import features, proposal_of
 from bayessim_mjx.loop.state import Loop, LoopState
@@ -26,7 +27,7 @@ def judge(loop: Loop, state: LoopState, policy: Policy, known: int) -> Sets | No
     """
     if not loop.settings.checkTrajs:
         return None
-    key = jax.random.fold_in(loop.key(int(state.round), "fit"), 4)
+    key = branch(loop.key(int(state.round), "fit"), 4)
     found = _simulated(loop, state, policy, known, key)
     return None if found is None else sets.judge(*found, loop.settings.components)
 

@@ -1,18 +1,22 @@
 """SIGKILL at random moments of real runs, each resumed: are all results bit for bit those of an unkilled run?
 
-    python benchmarks/tests/kills.py [--kills 50] [--seed 0] [--commands train main] [--out DIR]
+    python benchmarks/tests/kills.py [--kills 50] [--seed 0] [--commands train main refine] [--out DIR]
 
 One run of each command is left alone. Then runs are killed, resumed, killed again (up to eight times each) and left to
 end. One kill in five falls anywhere in the process (its start too), the others after a random number of checkpoints.
 Compared are the checksums of every array in every checkpoint, the evaluations, "latest" and "best", each round's line
 in rounds.jsonl (without its seconds), and that no TensorBoard event is there twice. Bit for bit is a matter of one CPU.
+`refine` is main with rounds that are mostly refinement; it is killed at any time of its work, by SIGABRT, after which
+Python's fault handler tells where it was.
 """
 
 import argparse
 import collections
 import json
 import os
+import resource
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -35,7 +39,16 @@ COMMANDS = {
         "bayessim.components=2", "bayessim.hiddenLayers=[8]", "bayessim.trainTrajLen=4",
         "monitor.posterior_plots=False",
     ],
+    "refine": [
+        "--max_iterations=2", "bayessim.realIters=2", "bayessim.realTrajs=2", "bayessim.trainTrajs=64",
+        "bayessim.realEvals=4", "bayessim.components=2", "bayessim.hiddenLayers=[8]", "bayessim.ensemble=1",
+        "bayessim.trainTrajLen=30", "bayessim.checkTrajs=0", "bayessim.refine=likelihood", "real.noise=0.02",
+        "bayessim.collectPolicy=policy_random", "monitor.posterior_plots=False",
+    ],
 }  # fmt: skip
+MODULES = {"refine": "main"}  # of those commands that have another name
+# files of a process that is refining a posterior
+REFINING = ("loop/refin", "loop/likelihood", "inference/importance", "inference/moves", "tracking")
 MOST = 8  # kills of one run
 MOST_SAVES = 4  # that a process lives to see
 NEXT_SAVE = 0.6  # s after one, in which the next one is begun
@@ -62,7 +75,9 @@ class Victim:
         if run is not None:
             args = ["--resume", str(run), "--headless"]
         log = (self.folder / "log.txt").open("ab")
-        command = [sys.executable, "-m", f"bayessim_mjx.{self.command}", *args, f"--cache_dir={self.cache}"]
+        module = MODULES.get(self.command, self.command)
+        command = [sys.executable, "-X", "faulthandler", "-m", f"bayessim_mjx.{module}", *args]
+        command.append(f"--cache_dir={self.cache}")
         return subprocess.Popen(command, cwd=self.folder, stdout=log, stderr=log)
 
     def begun(self, process: subprocess.Popen, before: int) -> float:
@@ -102,7 +117,10 @@ class Victim:
         """Start it and kill it at a random moment; False if it had ended before that."""
         before = 0 if (run := self.run()) is None else self.sessions(run)
         process = self.start()
-        if rng.random() < 0.2:
+        if self.command == "refine":
+            self.begun(process, before)
+            delay = rng.uniform(0.0, work)
+        elif rng.random() < 0.2:
             delay = rng.uniform(0.0, start + work)
         else:
             self.begun(process, before)
@@ -112,7 +130,7 @@ class Victim:
         try:
             process.wait(delay)
         except subprocess.TimeoutExpired:
-            process.kill()
+            process.send_signal(signal.SIGABRT if self.command == "refine" else signal.SIGKILL)
             process.wait()
             self.kills.append(self.place())
             return True
@@ -125,7 +143,9 @@ class Victim:
             return "before there was a run"
         saved = json.loads((run / "run.json").read_text())["latest"]
         halves = [p.name for p in run.glob("checkpoints/*.tmp")]
-        return f"checkpoint {saved}" + (f", half of {halves[0].partition('.')[0]}" if halves else "")
+        told = (self.folder / "log.txt").read_text(errors="replace").rpartition("Fatal Python error: Aborted")
+        refining = ", in a refinement" if told[1] and any(place in told[2] for place in REFINING) else ""
+        return f"checkpoint {saved}" + (f", half of {halves[0].partition('.')[0]}" if halves else "") + refining
 
     def results(self) -> dict[str, Any]:
         """All that has to be as if nothing had happened."""
@@ -179,6 +199,7 @@ def main() -> int:
     args = parser.parse_args()
     out = (args.out or Path(tempfile.mkdtemp(prefix="kills_"))).absolute()
     os.environ["JAX_PLATFORMS"] = "cpu"
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))  # processes that are aborted leave no image of their memory
     rng, began, kills, different = np.random.default_rng(args.seed), time.perf_counter(), 0, 0
     whole, spans = {}, {}
     for command in args.commands:

@@ -9,7 +9,9 @@ import pytest
 from bayessim_mjx import config, loop
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.loop import inference_state, round_inference
+from bayessim_mjx.loop.likelihood import Likelihood
 from bayessim_mjx.registry import make
+from bayessim_mjx.runs import checkpoints
 
 SMALL = [
     "bayessim.trainTrajs=400", "bayessim.realTrajs=2", "bayessim.realIters=2", "bayessim.components=2",
@@ -18,29 +20,61 @@ SMALL = [
 ]  # fmt: skip
 
 
+def begun(*more: str) -> tuple[loop.Loop, loop.LoopState]:
+    settings = config.load("Pendulum", overrides=[*SMALL, *more])
+    parts = loop.make(settings, make("Pendulum", config=settings))
+    return parts, loop.LoopState(round=jax.numpy.int32(0), train=None, **inference_state.blank(parts))
+
+
+def inferred(parts: loop.Loop, state: loop.LoopState) -> tuple[loop.LoopState, loop.RoundInfo]:
+    info = loop.RoundInfo(
+        round=int(state.round), rounds=2, domain=state.domain, posterior=None, truth=parts.source.truth,
+        returns=np.zeros(1), lengths=np.zeros(1), real=None, predictive=None, fit={}, scores={}, seconds={},
+        warnings=[],
+    )  # fmt: skip
+    return dataclasses.replace(round_inference.infer(parts, state, None, info), round=state.round + 1), info
+
+
+class Killed(Exception):
+    """The process ends here."""
+
+
 @pytest.mark.slow
 @pytest.mark.ci
-def test_two_rounds_close_in_on_the_surrogate():
-    settings = config.load("Pendulum", overrides=[*SMALL, "bayessim.refine=likelihood"])
-    parts = loop.make(settings, make("Pendulum", config=settings))
-    state = loop.LoopState(round=jax.numpy.int32(0), train=None, **inference_state.blank(parts))
-    shapes = jax.tree.map(lambda x: (x.shape, x.dtype), state)
-    plain, gains = [], []
-    for _ in range(2):
-        info = loop.RoundInfo(
-            round=int(state.round), rounds=2, domain=state.domain, posterior=None, truth=parts.source.truth,
-            returns=np.zeros(1), lengths=np.zeros(1), real=None, predictive=None, fit={}, scores={}, seconds={},
-            warnings=[],
-        )  # fmt: skip
-        state = dataclasses.replace(round_inference.infer(parts, state, None, info), round=state.round + 1)
+def test_two_rounds_close_in_on_the_surrogate_also_if_killed_in_a_refinement_and_resumed(tmp_path, monkeypatch):
+    parts, start = begun("bayessim.refine=likelihood")
+    first, one = inferred(parts, start)
+    checkpoints.save(tmp_path / "one", first, 1, {})
+    second, two = inferred(parts, first)
+    for info in (one, two):
         assert info.scores["refine/used"] == 1 and info.scores["refine/effective"] >= 200
+        assert np.isfinite(info.refinement.refined.evidence)
         away = (np.asarray(info.posterior.mean()) - parts.source.truth) / np.asarray(info.posterior.sd())
         assert np.abs(away).max() < 3.5
-        plain.append(info.refinement.refined.evidence)
-        gains.append(info.scores["gain_over_prior"])
-    assert min(gains) > 4 and gains[1] > gains[0] - 1.5 and np.isfinite(plain).all()
-    assert jax.tree.map(lambda x: (x.shape, x.dtype), state) == shapes
-    assert np.all(np.asarray(state.motion["valid"]) == 1) and np.ptp(state.motion["qpos"], axis=1).min() > 0
+    gains = [info.scores["gain_over_prior"] for info in (one, two)]
+    assert min(gains) > 4 and gains[1] > gains[0] - 1.5
+    assert np.all(np.asarray(second.motion["valid"]) == 1) and np.ptp(second.motion["qpos"], axis=1).min() > 0
+    shapes = [jax.tree.map(lambda x: (x.shape, x.dtype), state) for state in (start, second)]
+    assert shapes[0] == shapes[1]
+
+    def restored() -> tuple[loop.Loop, loop.LoopState]:
+        """As another process has them: nothing but the settings and the checkpoint."""
+        parts, blank = begun("bayessim.refine=likelihood")
+        return parts, checkpoints.restore(tmp_path / "one", blank)[0]
+
+    squares, left = Likelihood.squares, iter(range(9))
+
+    def until_killed(self, thetas):
+        if next(left, None) is None:
+            raise Killed
+        return squares(self, thetas)
+
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        patch.setattr(Likelihood, "squares", until_killed)
+        inferred(*restored())
+    resumed, again = inferred(*restored())
+    jax.tree.map(np.testing.assert_array_equal, jax.tree.leaves(resumed), jax.tree.leaves(second))
+    assert again.refinement.to_dict() == two.refinement.to_dict()
 
 
 def test_an_environment_without_our_physics_cannot_be_replayed():

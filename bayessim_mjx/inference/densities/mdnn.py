@@ -11,6 +11,7 @@ from bayessim_mjx.inference.densities.density import Density, Drop, Params, regi
 from bayessim_mjx.inference.settings import InferenceSettings
 
 GOLDEN = np.uint32(2654435769)  # 2^32 / golden ratio
+DEEPER = np.uint32(0x85EBCA6B)  # between the keys of layers: those of points of the curve are GOLDEN apart (train.py)
 
 
 def _start(key: Array, settings: InferenceSettings, dim_x: int) -> tuple[Params, tuple[int, ...]]:
@@ -23,7 +24,7 @@ def _hidden(params: Params, x: Array, drop: Drop | None = None) -> Array:
         if drop is not None:
             key, rate = drop
             kept = _noise(key, x.shape) >= (2.0**31 * rate).astype(jnp.uint32)
-            x, drop = jnp.where(kept, x / (1 - rate), 0.0), (key + GOLDEN, rate)
+            x, drop = jnp.where(kept, x / (1 - rate), 0.0), (key + DEEPER, rate)
     return x
 
 

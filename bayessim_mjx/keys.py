@@ -1,0 +1,20 @@
+"""Random keys that no other draw has."""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+from jax import Array
+
+BEYOND = 2**31  # no key is split into as many
+
+
+def branch(key: Array, number: int) -> Array:
+    """A key for a purpose of its own, beside those that `jax.random.split(key, n)` gives.
+
+    `jax.random.fold_in(key, i)` is the i-th of those: what both are used for would be drawn alike.
+    """
+    return jax.random.fold_in(key, np.uint32(BEYOND + number))
+
+
+__all__ = ["branch"]
