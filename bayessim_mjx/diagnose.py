@@ -67,6 +67,13 @@ def _parser() -> cli.PlainParser:
         help="what the robot is rated to carry: 12kg, or tool=12kg (default: what its drives hold, up to its weight)",
     )
     parser.add_argument(
+        "--minutes",
+        metavar="M",
+        type=_minutes,
+        help="time that it may take: the search is cut down to it, and what was not tried is told (default: no limit)",
+    )
+    parser.add_argument("--quick", action="store_true", help="a first answer: fewer windows and effects, no maps")
+    parser.add_argument(
         "--criteria",
         metavar="KEY=VALUE",
         nargs="*",
@@ -84,6 +91,16 @@ def _parser() -> cli.PlainParser:
     parser.add_argument("--cache_dir", metavar="DIR", help="folder of compiled programs, or off")
     parser.add_argument("--headless", action="store_true", help="plain lines instead of progress bars")
     return parser
+
+
+def _minutes(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0.0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text}: allowed is a number of minutes above 0")
+    return value
 
 
 def _checked(args: argparse.Namespace) -> None:
@@ -125,6 +142,8 @@ def _diagnosis(args: argparse.Namespace, say: Any, early: Callable[[Sequence[str
         tolerance=args.tolerance,
         accuracy=args.accuracy,
         payload=args.payload,
+        minutes=args.minutes,
+        quick=args.quick,
         criteria=Criteria().changed(args.criteria),
         seed=args.seed,
         out=args.out,

@@ -74,6 +74,7 @@ class Diagnosis:
         candidates: ranked [{"effects": [label ...], "label", "score", "se", "gap_closed", "parameters": {..},
             "absorbed"}].
         covariance: {"names": [...], "matrix": [[...]]} of parameters and effects' parameters together, or {}.
+        not_fitted: {reason: effects ("name@place") that were not fitted, and so not ruled out}.
         about: {"robot", "data": [paths], "logs", "seconds", "conditions", "date", "seed"}, what was diagnosed, or {}.
         next_experiment: {"name", "why", "evidence", "file", "table": [...]} or {}.
         details: numbers for pictures (see `report`); not part of diagnosis.json but saved beside it.
@@ -92,6 +93,7 @@ class Diagnosis:
     details: dict[str, Any] = field(default_factory=dict)
     covariance: dict[str, Any] = field(default_factory=dict)
     about: dict[str, Any] = field(default_factory=dict)
+    not_fitted: dict[str, list[str]] = field(default_factory=dict)
     schema: int = SCHEMA
 
     def to_dict(self) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from typing import Any
 
 import mujoco
 
+from bayessim_mjx.diagnosis import resumed
 from bayessim_mjx.diagnosis.experiment import propose
 from bayessim_mjx.diagnosis.findings import Findings, Progress, Where
 from bayessim_mjx.diagnosis.fitting.robot import Robot, Source, robot_of
@@ -21,7 +22,7 @@ from bayessim_mjx.diagnosis.residual import frequency, where
 from bayessim_mjx.diagnosis.residual.disturbance import Disturbance, estimate
 from bayessim_mjx.diagnosis.residual.flexible import Flexible, flexible
 from bayessim_mjx.diagnosis.result import Diagnosis
-from bayessim_mjx.diagnosis.selection import heldout, selected
+from bayessim_mjx.diagnosis.selection import budget, heldout, selected
 from bayessim_mjx.diagnosis.selection.criteria import Criteria
 from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.selection.tried import Settings, Tried
@@ -103,6 +104,9 @@ def investigate(
     group: str | None = None,
     seed: int = 0,
     settings: Settings | None = None,
+    minutes: float | None = None,
+    quick: bool = False,
+    remember: Path | None = None,
     tolerated: Sequence[str] = (),
     criteria: Criteria | None = None,
     notes: Sequence[str] = (),
@@ -116,8 +120,9 @@ def investigate(
 
     Args:
         robot: the model with the parameters that it may recalibrate.
-        logs, effects, group, seed, criteria, progress: see `diagnose`; tolerated: its `tolerance`.
+        logs, effects, group, minutes, quick, seed, criteria, progress: see `diagnose`; tolerated: its `tolerance`.
         settings: budgets of the search; None: by the robot's size.
+        remember: folder for the fits of the search, so that a killed one goes on where it was.
         notes: what was noticed while model and logs were read, for the warnings.
         stages: after the selection, optional ones last; None: `STAGES`.
         keep: called with what is known while the search goes on: the setup, and after each part what was tried.
@@ -130,21 +135,35 @@ def investigate(
     say = progress or (lambda text, done, total: None)
     known, tell = keep or (lambda setup, tried: None), early or (lambda lines: None)
     say("looking at the logs", 0, 1)
+    time_left, criteria = budget.begun(minutes), _smaller(criteria or Criteria()) if quick else criteria or Criteria()
     asked: dict[str, Any] = {"group": group, "seed": seed, "settings": settings, "tolerated": tolerated, "notes": notes}
-    setup = prepare(robot, logs, effects, **asked, seen_first=lambda seen: tell(first_look.lines(seen)))
+    setup = prepare(robot, logs, effects, quick=quick, **asked, seen_first=lambda seen: tell(first_look.lines(seen)))
+    setup = replace(setup, settings=replace(setup.settings, budget=time_left))
+    setup = setup if remember is None else resumed.remembering(setup, criteria, remember)
     for text in setup.said:
         say(text, 0, 1)
     known(setup, None)
-    given = setup.fitter, setup.candidates, setup.settings, criteria or Criteria()
+    given = setup.fitter, setup.candidates, setup.settings, criteria
     found = Findings(setup, selected.select(*given, say, lambda tried: known(setup, tried)))
+    resumed.ended(setup)
     stages = STAGES if stages is None else stages
+    stages = [stage for stage in stages if not (stage.optional and quick)]
     for stage in stages:
         found = found if stage.optional else _after(stage, found, say)
     if verdict is not None:
         verdict(found)
     for stage in stages:
-        found = _after(stage, found, say) if stage.optional else found
+        if stage.optional and time_left.now() - time_left.began > time_left.seconds:
+            found = replace(found, warnings=(*found.warnings, f"{stage.name}: left out, the time was over"))
+        elif stage.optional:
+            found = _after(stage, found, say)
     return found
+
+
+def _smaller(criteria: Criteria) -> Criteria:
+    """A smaller search, by the same rule."""
+    most = {"beam": 1, "width": 3, "most": 2, "finalists": 3}
+    return replace(criteria, **{name: min(limit, getattr(criteria, name)) for name, limit in most.items()})
 
 
 def _after(stage: Stage, found: Findings, say: Progress) -> Findings:
@@ -171,6 +190,8 @@ def diagnose(
     criteria: Criteria | None = None,
     accuracy: str | Sequence[str] = (),
     payload: str | Sequence[str] = (),
+    minutes: float | None = None,
+    quick: bool = False,
     seed: int = 0,
     out: str | Path | None = None,
     progress: Progress | None = None,
@@ -190,6 +211,7 @@ def diagnose(
         group: metadata key of the operating conditions that are held out in turn.
         tolerance: what may stay unexplained, as `--tolerance`: "0.5deg", "elbow=2mm", "3%".
         accuracy, payload: of a data sheet, as the flags: "5%", "mass=2%"; "12kg", "tool=12".
+        minutes: that it may take; what there was no time for is told. quick: a first answer, from few windows.
         criteria: when one model is better than another and which is named; None: as measured in benchmarks/results.md.
         seed: of all random numbers; out: folder for what the command writes, but for the report; None: nothing.
         progress: called with (what is being done, done, total); early: with what logs tell at once, in lines.
@@ -213,7 +235,8 @@ def diagnose(
     }  # fmt: skip
     files = Files(None if out is None else Path(out), told)
     asked: Any = {"group": group, "seed": seed, "notes": noticed, "progress": progress, "criteria": criteria}
-    asked |= {"tolerated": _several(tolerance), "early": early}
+    asked |= {"tolerated": _several(tolerance), "early": early, "minutes": minutes, "quick": quick}
+    asked |= {"remember": files.search}
     try:
         found = investigate(robot, recorded, effects, **asked, keep=files.so_far, verdict=files.verdict)
     except TooLittleData as reason:

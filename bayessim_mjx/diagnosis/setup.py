@@ -52,6 +52,7 @@ class Cutting:
 
 
 CUTTING = Cutting()
+QUICK = Settings(singles=12, screened=12, starts=4, iterations=8)  # of a first answer, for any robot
 SHIFT_FACTOR = 4  # times the coarsest sub-steps, the finest by which a shift of commands is looked for
 
 
@@ -99,6 +100,7 @@ def prepare(
     group: str | None = None,
     seed: int = 0,
     settings: Settings | None = None,
+    quick: bool = False,
     tolerated: Sequence[str] = (),
     notes: Sequence[str] = (),
     seen_first: Callable[[Look], None] = lambda seen: None,
@@ -107,7 +109,7 @@ def prepare(
 
     Args:
         robot, logs, effects, group, seed, tolerated: see `run.diagnose`.
-        settings: budgets of the search; None: by the robot's size.
+        settings: budgets of the search; None: by the robot's size; quick: as small as is sensible, few windows.
         notes: what was noticed before, first among the warnings.
         seen_first: called with what the logs tell before any simulation.
 
@@ -137,11 +139,14 @@ def prepare(
     robot = step.robot(steps.robot)
     physics = physics_of(robot, dt, stack)
     most = _limit(physics, step.errors.cut.steps if step.errors else cuts(1).steps)
+    most = min(most, CUTTING.fewest) if quick else most
     cut = step.noisier(cuts(step.factor, limit=most, centred=False, late=lead))
     base = candidates.base_coordinates(robot.space, robot.accuracy)
     fitter = Fitter(Simulator(physics, cut), base, physics.space.nominal)
     led = leads.lead(candidates.enumerate_candidates(physics), before)
-    settings = dataclasses.replace(settings or _settings(robot), believed=step.believed, **led.order)
+    settings = dataclasses.replace(
+        settings or (QUICK if quick else _settings(robot)), believed=step.believed, **led.order
+    )
     allowed = tolerance.judge(robot.mj_model, 2 * size.travel, cut.sigma_q, asked)
     said = [*steps.said(), *_faster(seen.usable, delivered, dt)]
     said += [] if shift is None else shift.told(float(np.median([log.period for log in logs])))

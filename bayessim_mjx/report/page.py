@@ -9,7 +9,7 @@ from markupsafe import Markup
 from bayessim_mjx.diagnosis.result import Diagnosis
 from bayessim_mjx.report import evidence, sections
 from bayessim_mjx.report.look import STAGE, WIDTH
-from bayessim_mjx.report.words import STAGES
+from bayessim_mjx.report.words import STAGES, not_fitted
 
 TEMPLATE = "template.html.j2"
 
@@ -47,6 +47,7 @@ def render(d: Diagnosis) -> str:
         gap=sections.how_far(d),
         effects=sections.effects(d),
         candidates=sections.candidates(d),
+        not_fitted=not_fitted(d),
         where=sections.where(d),
         overlays=evidence.overlays(d),
         parameters=evidence.parameters(d),

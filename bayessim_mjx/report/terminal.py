@@ -15,6 +15,7 @@ from bayessim_mjx.report.words import (
     estimate,
     finite,
     headline,
+    not_fitted,
     number,
     percent,
     quantity,
@@ -24,6 +25,7 @@ from bayessim_mjx.report.words import (
 )
 
 BEST = 8
+NOT_FITTED = 6  # named for each reason; diagnosis.json has all
 Table = tuple[list[str], list[list[str]], tuple[int, ...]]  # header, rows, columns of words
 COLOURS = {
     "no_gap": "green",
@@ -54,6 +56,8 @@ def console(
                 out.grid(header, rows, left=words)
         if len(diagnosis.candidates) > BEST:
             out.say(f"{len(diagnosis.candidates) - BEST} more candidates in diagnosis.json")
+        for line in not_fitted(diagnosis, NOT_FITTED):
+            out.say(f"not fitted, {line}")
         if plan := diagnosis.next_experiment:
             name, why = plan.get("name", MISSING), plan.get("why", "")
             out.say(f"next experiment: {why if name in why else f'{name}: {why}'} ({plan.get('file', '')})")

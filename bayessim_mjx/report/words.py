@@ -161,6 +161,16 @@ def candidate_title(candidate: Mapping[str, Any]) -> str:
     return " + ".join(label_title(x, short=True) for x in labels) or str(candidate.get("label") or "no effect")
 
 
+def not_fitted(d: Diagnosis, most: int | None = None) -> list[str]:
+    """`no gain at first order: Payload · link, ...` for each reason; at most so many of each."""
+    lines = []
+    for reason, labels in d.not_fitted.items():
+        more = len(labels) - len(labels[:most])
+        named = ", ".join(label_title(label, short=True) for label in labels[:most])
+        lines.append(f"{reason}: {named}" + (f" and {more} more" if more else ""))
+    return lines
+
+
 def quantity(name: str, value: Estimate) -> tuple[str, str]:
     """A parameter's name and value for people; reciprocals turned over (`inverse_limit` 0.5 1/(N m) -> limit 2 N m)."""
     if name in RECIPROCALS and finite(value.mean) and value.mean > 0:

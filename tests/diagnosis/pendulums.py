@@ -36,6 +36,7 @@ def recorded(
     *,
     friction: float = 0.0,
     delay: float = 0.0,
+    cubic: float = 0.0,
     scale: tuple[float, float, float] = (1.0, 1.0, 1.0),
     count: int = 8,
     seconds: float = 4.0,
@@ -46,13 +47,14 @@ def recorded(
     """`count` logs under a PD law that follows sines, slow to fast.
 
     Args:
-        friction: N m; delay: s; scale: of damping, armature and mass; sigma: rad.
+        friction: N m; delay: s; cubic: N m/rad^3, of a spring that is relaxed at 0.
+        scale: of damping, armature and mass; sigma: rad.
     """
     each = 10 * round(PERIOD / STEP)
     damping, armature, mass = np.multiply((DAMPING, ARMATURE, MASS), scale)
     model = mujoco.MjModel.from_xml_string(MODEL % (PERIOD / each, "RK4", damping, armature, friction, mass))
     rng = np.random.default_rng(seed)
-    return [_one(model, i, round(seconds / PERIOD), each, delay, sigma, rng, metadata) for i in range(count)]
+    return [_one(model, i, round(seconds / PERIOD), each, delay, cubic, sigma, rng, metadata) for i in range(count)]
 
 
 def _one(
@@ -61,6 +63,7 @@ def _one(
     rows: int,
     each: int,
     delay: float,
+    cubic: float,
     sigma: float,
     rng: np.random.Generator,
     metadata: dict[str, object],
@@ -77,6 +80,7 @@ def _one(
         for _ in range(each):
             held.append(command)
             data.ctrl[0] = held[max(0, len(held) - 1 - late)]
+            data.qfrc_applied[0] = -cubic * data.qpos[0] ** 3
             mujoco.mj_step(model, data)
     time, ctrl, qpos = (np.array(c) for c in zip(*table, strict=True))
     qpos = (qpos + sigma * rng.normal(size=len(qpos)))[:, None]

@@ -136,7 +136,7 @@ class Fitter:
         h = START_STEP * self.spread
         moved = offsets[None] + (np.eye(s) * h)[:, None, :]
         shifted = self.whiten(self.simulator.run(np.repeat(theta[None], s, 0), moved))
-        return np.moveaxis((r[None] - shifted) / h[:, None, None], 0, -1)
+        return np.ascontiguousarray(np.moveaxis((r[None] - shifted) / h[:, None, None], 0, -1))
 
     def begin(
         self, coordinates: Sequence[Coordinate], values: Array | None = None, offsets: Array | None = None

@@ -247,4 +247,4 @@ def columns(r: Array, shifted: Array, steps: Sequence[float]) -> Array:
     """A `[W, n, k]`: minus the derivative of the residual."""
     if not len(steps):
         return np.zeros((*r.shape, 0))
-    return np.moveaxis((r[None] - shifted) / np.asarray(steps)[:, None, None], 0, -1)
+    return np.ascontiguousarray(np.moveaxis((r[None] - shifted) / np.asarray(steps)[:, None, None], 0, -1))

@@ -15,6 +15,8 @@ from bayessim_mjx.diagnosis.selection.decide import Decision, admissible, decide
 from bayessim_mjx.diagnosis.selection.table import BASE, Key, Table
 
 ROUNDS = 4  # of growing and looking around, at most
+TOGETHER, FINALISTS = "effects together", "finalists"  # parts of the budget
+CLOSE = 4.0  # times the leading model's cost: from where polishing has brought others ahead of it
 
 
 @dataclass(frozen=True)
@@ -42,8 +44,11 @@ class Fitting(Protocol):
     def together(self, most: int, count: int) -> list[Key]:
         """Sets of up to so many effects that promise most when all amplitudes are free at once."""
 
-    def fit(self, plans: Sequence[Plan], label: str) -> None:
-        """Fit what was not fitted before."""
+    def over(self, part: str) -> bool:
+        """Whether a part of the search has had its time."""
+
+    def fit(self, plans: Sequence[Plan], label: str, needed: bool = False) -> None:
+        """Fit what was not fitted before, as far as the time goes; needed: all."""
 
     def polish(self, keys: Sequence[Key]) -> None:
         """Bring the fits of models to their end."""
@@ -70,28 +75,39 @@ def leading(table: Table, criteria: Criteria) -> list[Key]:
     return sorted(rows, key=lambda k: -value(table, k, criteria))
 
 
-def _best(fits: Fitting, criteria: Criteria) -> Key:
-    """The leading model with its fit brought to its end."""
+def close(table: Table, criteria: Criteria, most: int) -> list[Key]:
+    """The leading model and up to `most` that may be ahead of it once all are polished; none of them with it and more.
+
+    Until it is polished, a fit has start-state columns of the fit that it began at, which may be far from its own.
+    """
+    best, *others = leading(table, criteria)
+    limit = CLOSE * table.rows[best].total
+    near = [k for k in others if k and not (best and best < k) and table.rows[k].total < limit]
+    return [best, *near[:most]]
+
+
+def _best(fits: Fitting, criteria: Criteria, most: int) -> Key:
+    """The leading model, and those close to it, with their fits brought to their end before they are ranked."""
     for _ in range(criteria.beam):
-        best = leading(fits.table, criteria)[0]
-        fits.polish([best])
-        if leading(fits.table, criteria)[0] == best:
+        keys = close(fits.table, criteria, most)
+        fits.polish(keys)
+        if leading(fits.table, criteria)[0] in keys:
             break
     return leading(fits.table, criteria)[0]
 
 
 def _grow(fits: Fitting, criteria: Criteria) -> Key:
     """Add to the models of the beam as long as that brings something worth naming, and the best is above the noise."""
-    best = BASE if settled(fits.table, BASE, criteria) else _best(fits, criteria)
+    best = BASE if settled(fits.table, BASE, criteria) else _best(fits, criteria, criteria.finalists)
     for size in range(1, criteria.most):
-        if settled(fits.table, best, criteria):
+        if settled(fits.table, best, criteria) or fits.over(TOGETHER):
             break
         beam = [k for k in leading(fits.table, criteria)[: criteria.beam] if len(k) < criteria.most]
         plans = [p for k in beam for p in _added(fits, k, criteria.width - 2 * (k != best))]
         if size == 1:
             plans += [Plan(k) for k in fits.together(min(3, criteria.most), criteria.beam)]
         fits.fit(plans, f"{len(best) + 1} effects")
-        before, best = best, _best(fits, criteria)
+        before, best = best, _best(fits, criteria, criteria.beam)
         if best == before or same(fits.table, before, best, criteria):
             break
     return best
@@ -103,7 +119,9 @@ def _added(fits: Fitting, key: Key, count: int) -> list[Plan]:
 
 def _around(fits: Fitting, best: Key, criteria: Criteria) -> Key:
     """The best of a model's neighbours: an effect dropped, exchanged, or in its place special cases or one place."""
-    fits.fit([Plan(best - {label}, best) for label in best], "dropping")
+    if fits.over(TOGETHER):
+        return best
+    fits.fit([Plan(best - {label}, best) for label in best], "dropping", needed=True)
     plans = []
     for label in sorted(best):
         rest = best - {label}
@@ -113,7 +131,7 @@ def _around(fits: Fitting, best: Key, criteria: Criteria) -> Key:
     table = fits.table
     ahead = leading(table, criteria)[: 2 * criteria.beam]  # simpler ones may not have come to their end
     fits.polish([key for key in ahead if table.rows[key].size < table.rows[best].size])
-    return _best(fits, criteria)
+    return _best(fits, criteria, criteria.beam)
 
 
 def specialised(table: Table, key: Key, label: str) -> list[Key]:
@@ -125,33 +143,39 @@ def specialised(table: Table, key: Key, label: str) -> list[Key]:
     return [frozenset([p]) for p in parts + places] + ([frozenset(parts)] if len(parts) > 1 else [])
 
 
-def finalists(found: Decision, criteria: Criteria) -> list[Key]:
-    """The known parameters, the best model, the answer and what may stand in its place."""
-    told = [a.key for a in found.rivals[: criteria.finalists]]
+def finalists(found: Decision, most: int) -> list[Key]:
+    """The known parameters, the best model, the answer and up to `most` that may stand in its place."""
+    told = [a.key for a in found.rivals[:most]]
     return list(dict.fromkeys([BASE, found.best, found.answer, *told]))
 
 
 def _final(fits: Fitting, criteria: Criteria) -> Decision:
     """The decision among finalists whose fits came to their end and whose held-out windows are simulated.
 
-    With each effect of the answer left out: it is named only if it helps there as well.
+    With each effect of the answer left out: it is named only if it helps there as well. Where no time is left, rivals
+    stay as the search left them.
     """
     less = order(fits.table.laws)
     keys: list[Key] = []
+    most = 0 if fits.over(FINALISTS) else criteria.finalists
+    if most and not settled(fits.table, BASE, criteria):
+        _best(fits, criteria, most)
     for _ in range(ROUNDS):
         found = decide(fits.table, less, criteria)
-        if set(finalists(found, criteria)) <= set(keys):
+        if set(finalists(found, most)) <= set(keys):
             break
-        keys = finalists(found, criteria)
+        keys = finalists(found, most)
         fits.polish(keys)
+        most = 0 if fits.over(FINALISTS) else most
     searched, table = found, fits.table
     while True:
         smaller = [found.answer - {label} for label in found.answer]
-        fits.fit([Plan(k, found.answer) for k in smaller], "dropping")
+        fits.fit([Plan(k, found.answer) for k in smaller], "dropping", needed=True)
         fits.polish(smaller)
         keys = list(dict.fromkeys([*keys, found.answer, *smaller]))
         found = decide(fits.simulate(keys), less, criteria)
         if all(found.answer - {label} in keys for label in found.answer):
-            return replace(
-                found, searched=table, trace=(*searched.trace, *(f"simulated: {step}" for step in found.trace))
-            )
+            break
+    unseen = () if most else tuple(a for a in searched.rivals if a.key not in keys and not found.answer < a.key)
+    steps = (f"simulated: {step}" for step in found.trace)
+    return replace(found, rivals=(*found.rivals, *unseen), searched=table, trace=(*searched.trace, *steps))

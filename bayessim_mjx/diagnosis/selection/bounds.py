@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from bayessim_mjx.diagnosis import phrases
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate, Coordinate, shrink
+from bayessim_mjx.diagnosis.fitting.quadratic import solve
 from bayessim_mjx.diagnosis.selection.models import Model, nats, scored
 from bayessim_mjx.diagnosis.selection.pool import Pool, Progress, fresh
 from bayessim_mjx.diagnosis.selection.tried import ranked
@@ -22,9 +24,10 @@ class Widening:
     near: float = 0.001  # of a range: at its end
     # a range grows by this factor, up to so many times what it was at first
     twice: float = 2.0
-    farthest: float = 8.0
+    farthest: float = 64.0
     nats: float = 2.0  # of held-out evidence that a wider range has to bring
-    leading: int = 3  # single effects whose ranges grow before further ones are added
+    most: int = 6  # single effects whose ranges grow before further ones are added
+    close: float = 4.0  # times the best one's cost: as near as a wider range has to promise to bring them
     steps: int = 8  # of a fit in a wider range
 
 
@@ -48,25 +51,49 @@ class Bound:
 def widened(pool: Pool, model: Model, say: Progress) -> Model:
     """The model with ranges as wide as it takes for its effects' parameters to lie within, refitted.
 
-    A range doubles as long as that brings held-out evidence, up to `farthest` times what it was. It stays where its end
-    means that the effect is off, where physics ends, and where it sizes an effect's memory.
+    A range doubles as long as that brings held-out evidence, or a still wider one promises to, up to `farthest` times
+    what it was. It stays where its end means that the effect is off, where physics ends, and where it sizes an effect's
+    memory.
     """
-    while True:
-        effects = tuple(_wider(pool, model, e) for e in model.effects)
-        if all(new is old for new, old in zip(effects, model.effects, strict=True)):
-            return model
+    last, more = model, True
+    while more and _held(pool, last):
         say("wider ranges", 0, 1)
-        new = _refitted(pool, model, effects)
-        if nats(model, new) < WIDENING.nats:
-            return model
-        _adopt(pool, new)
-        model = new
+        last = _refitted(pool, last, _moved(pool, last, _grown))
+        if more := nats(model, last) >= WIDENING.nats:
+            _adopt(pool, last)
+            model = last
+        else:
+            more = (
+                0.5 * last.samples * math.log(last.total / max(last.total - promise(pool, last), 1e-9)) > WIDENING.nats
+            )
+    return model
 
 
 def widen_leading(pool: Pool, say: Progress) -> None:
-    """Wider ranges for the leading single effects: one that is held back at a bound must not lose for that."""
-    for model in ranked(pool, 1)[: WIDENING.leading]:
+    """Wider ranges for single effects that may lead with them: one that is held back at a bound must not lose for that.
+
+    What a range as wide as it may get promises is linear: finding those that are held back costs no simulation.
+    """
+    singles = ranked(pool, 1)
+    limit = WIDENING.close * min((m.total for m in singles), default=0.0)
+    held = sorted(((m.total - promise(pool, m), m) for m in singles), key=lambda h: h[0])
+    held = [(total, m) for total, m in held if total < limit and _held(pool, m)]
+    for _, model in held[: WIDENING.most]:
         widened(pool, model, say)
+
+
+def promise(pool: Pool, model: Model) -> float:
+    """By how much the cost would fall in ranges as wide as they may get, if the model were linear."""
+    fit = model.fit
+    q, _ = fit.quadratic(pool.fitter.spread)
+    g, S = q.weighted(fit.weight)
+    precision, pull, low, high = fit.prior()
+    S, g = S + np.diag(precision), g + pull
+    far = {c.name: c for e in _moved(pool, model, _freed) for c in e.coordinates}
+    wide = [far.get(c.name, c) for c in fit.coordinates]
+    ends = [np.array([getattr(c, end) for c in wide]) - fit.values for end in ("low", "high")]
+    near, free = solve(S, g, low, high), solve(S, g, *ends)
+    return max(float((2 * g - S @ free) @ free - (2 * g - S @ near) @ near), 0.0)
 
 
 def of(physics: Physics, coordinate: Coordinate, value: float) -> Bound | None:
@@ -108,12 +135,25 @@ def _farthest(physics: Physics, coordinate: Coordinate, end: str) -> float:
     return low / WIDENING.farthest if low > 0 else coordinate.neutral + WIDENING.farthest * (low - coordinate.neutral)
 
 
-def _wider(pool: Pool, model: Model, effect: Candidate) -> Candidate:
-    """The effect with twice the range where one of its parameters ends at a bound that may move."""
-    physics = pool.fitter.simulator.physics
-    values = model.values_of(effect)
-    coordinates = tuple(_grown(physics, c, float(v)) for c, v in zip(effect.coordinates, values, strict=True))
-    return effect if coordinates == effect.coordinates else replace(effect, coordinates=coordinates)
+def _moved(pool: Pool, model: Model, change: Callable[[Physics, Coordinate, float], Coordinate]) -> list[Candidate]:
+    """The model's effects with their ranges changed; the same objects where nothing is."""
+    physics, out = pool.fitter.simulator.physics, []
+    for effect in model.effects:
+        pairs = zip(effect.coordinates, model.values_of(effect), strict=True)
+        new = tuple(change(physics, c, float(v)) for c, v in pairs)
+        out.append(effect if new == effect.coordinates else replace(effect, coordinates=new))
+    return out
+
+
+def _held(pool: Pool, model: Model) -> bool:
+    """Whether a parameter ends at a bound that may move."""
+    return any(new is not old for new, old in zip(_moved(pool, model, _grown), model.effects, strict=True))
+
+
+def _freed(physics: Physics, c: Coordinate, value: float) -> Coordinate:
+    """As wide as it may get, where the value is at an end that may move."""
+    end = _end(c, value)
+    return c if _grown(physics, c, value) is c else replace(c, **{end: _farthest(physics, c, end)})
 
 
 def _grown(physics: Physics, c: Coordinate, value: float) -> Coordinate:

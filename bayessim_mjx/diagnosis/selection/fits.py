@@ -11,6 +11,7 @@ from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fitter import Fit
 from bayessim_mjx.diagnosis.selection import dense, heldout
 from bayessim_mjx.diagnosis.selection.beam import Plan
+from bayessim_mjx.diagnosis.selection.bounds import widened
 from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.selection.pool import (
     Pool,
@@ -44,13 +45,17 @@ class Fits:
 
     def __init__(self, pool: Pool, say: Progress) -> None:
         self.pool, self.say = pool, say
-        self.candidates = {c.label: c for c in pool.candidates}
         self.laws = {c.label: law_of(c) for c in pool.candidates}
         self._rows: dict[Key, tuple[Model, Row]] = {}
         self._folds: dict[Key, tuple[Model, Row]] = {}
         self._screened: dict[Key, list[Screened]] = {BASE: list(pool.screened)}
         self._polished: set[Key] = set()
         self._amounts: dict[Key, tuple[Screened, ...]] = {}
+
+    @property
+    def candidates(self) -> dict[str, Candidate]:
+        """By their labels, in ranges as wide as they are by now."""
+        return {c.label: c for c in self.pool.candidates}
 
     @property
     def table(self) -> Table:
@@ -74,8 +79,7 @@ class Fits:
         if key not in self._screened:
             model = self.pool.models[key]
             others = [c for c in self.pool.candidates if all(compatible(c, e) for e in model.effects)]
-            self.say("screening", 0, 1)
-            self._screened[key] = screen(self.pool.fitter, model.fit, others, self.pool.settings.screened)
+            self._screened[key] = screen(self.pool.fitter, model.fit, others, self.pool.settings.screened, self.say)
         return [s.candidate.label for s in self._screened[key] if s.gain > 0]
 
     def together(self, most: int, count: int) -> list[Key]:
@@ -91,13 +95,17 @@ class Fits:
         apart = all(compatible(a, b) for i, a in enumerate(own) for b in own[:i])
         return [frozenset(c.label for c in own)] if 1 < len(own) <= most and apart else []
 
-    def fit(self, plans: Sequence[Plan], label: str) -> None:
-        """Fit what was not fitted before, all in lockstep."""
+    def over(self, part: str) -> bool:
+        """Whether a part of the search has had its time."""
+        return self.pool.settings.budget.over(part)
+
+    def fit(self, plans: Sequence[Plan], label: str, needed: bool = False) -> None:
+        """Fit what was not fitted before; needed: whatever the time."""
         entries: dict[Key, tuple[list[Fit], tuple[Candidate, ...]]] = {}
         for plan in plans:
             if plan.key not in self.pool.models and plan.key not in entries:
                 entries[plan.key] = self._entry(plan, len(entries))
-        fit_entries(self.pool, entries, label, self.say)
+        fit_entries(self.pool, entries, label, self.say, "" if needed else "effects together")
 
     def _entry(self, plan: Plan, rank: int) -> tuple[list[Fit], tuple[Candidate, ...]]:
         model = self.pool.models[plan.parent]
@@ -129,21 +137,24 @@ class Fits:
         raise KeyError(f"{candidate.label} was not screened")
 
     def polish(self, keys: Sequence[Key]) -> None:
-        """All columns anew at the models' fits, and some more steps."""
+        """All columns anew at the models' fits, and some more steps, in ranges as wide as it takes."""
         todo = [k for k in keys if k and k not in self._polished]
         if todo:
             self._polished.update(todo)
-            self.say("polishing", 0, 1)
-            polish(self.pool, [self.pool.models[k] for k in todo])
+            for model in polish(self.pool, [self.pool.models[k] for k in todo], self.say):
+                widened(self.pool, model, self.say)
+            self.pool.keep(self.pool)
 
     def simulate(self, keys: Sequence[Key]) -> Table:
         """A table of some models, refitted without each condition, whose windows are then simulated."""
         fitter, known, models = self.pool.fitter, self.table, self.pool.models
         todo = [k for k in keys if self._folds.get(k, (None, None))[0] is not models[k]]
         if todo:
-            self.say("held out", 0, 1)
+            self.say("held out", 0, len(todo))
         steps = fitter.simulator.windows.steps
-        for key, model in zip(todo, heldout.refitted(fitter, [models[k] for k in todo]), strict=True):
+        refitted = heldout.refitted(fitter, [models[k] for k in todo])
+        for done, (key, model) in enumerate(zip(todo, refitted, strict=True)):
+            self.say("held out", done, len(todo))
             models[key] = model
             seen = heldout.predict(fitter, model)
             # start states count as in the search, or all models would come nearer to the noise than they did there

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -23,6 +24,7 @@ Progress = Callable[[str, int, int], None]
 class Rules:
     """How fits far from the logs are brought to their end."""
 
+    batch: int = 12  # models fitted in lockstep; after each batch what is known is told
     rounds: int = 5  # of polishing, where it has to be done again and again
     astray: float = 10.0  # noises that a fit leaves: from there on nothing is as it was a step before
 
@@ -32,7 +34,10 @@ RULES = Rules()
 
 @dataclass(eq=False)
 class Pool(Tried):
-    """What was fitted so far, and goes on. `models` maps the labels of a model's effects to it."""
+    """What was fitted so far, and goes on. `models` maps the labels of a model's effects to it.
+
+    `keep` is called with the pool after each batch of fits.
+    """
 
     fitter: Fitter
     candidates: Sequence[Candidate]
@@ -42,6 +47,9 @@ class Pool(Tried):
     base: Model
     models: dict[frozenset[str], Model] = field(default_factory=dict)
     screened: list[Screened] = field(default_factory=list)
+    cut_short: set[str] = field(default_factory=set)
+    skipped: dict[str, int] = field(default_factory=dict)
+    keep: Callable[[Pool], None] = lambda pool: None
 
     @property
     def rough(self) -> bool:
@@ -60,36 +68,61 @@ def fresh(pool: Pool, fit: Fit) -> list[int]:
 
 
 def fit_models(pool: Pool, plans: Sequence[tuple[Model, Screened]], label: str, say: Progress) -> list[Model]:
-    """Models of the plans' effects plus one more each, fitted together; what was fitted before is looked up."""
+    """Models of the plans' effects plus one more each, fitted together; what was fitted before is looked up.
+
+    Those for which no time is left are not among them.
+    """
     todo: Entries = {}
     for model, extra in plans:
         key = frozenset([*(c.label for c in model.effects), extra.candidate.label])
         if key not in pool.models and key not in todo:
             todo[key] = (starts(pool, model, extra, len(todo)), (*model.effects, extra.candidate))
-    fit_entries(pool, todo, label, say)
+    fit_entries(pool, todo, label, say, "single effects")
     keys = [frozenset([*(c.label for c in m.effects), e.candidate.label]) for m, e in plans]
-    return [pool.models[k] for k in keys]
+    return [pool.models[k] for k in keys if k in pool.models]
 
 
 Entries = dict[frozenset[str], tuple[list[Fit], tuple[Candidate, ...]]]  # {labels: (a fit per start, effects)}
 
 
-def fit_entries(pool: Pool, entries: Entries, label: str, say: Progress) -> None:
-    """Fit models in lockstep, each from all of its starts, and keep the best of each."""
-    fitter = pool.fitter
-    fits = [fit for several, _ in entries.values() for fit in several]
-    total = len(fits)
-    fits = fitter.iterate(
-        fits,
+def fit_entries(pool: Pool, entries: Entries, label: str, say: Progress, part: str = "") -> None:
+    """Fit models in lockstep, each from all of its starts, and keep the best of each.
+
+    Args:
+        part: of the budget, by whose end the rest is left out; "": all are fitted.
+    """
+    heats, total, done = _Heats(pool, part), sum(len(several) for several, _ in entries.values()), 0
+    every = list(entries.items())
+    for first in range(0, len(every), RULES.batch):
+        some = dict(every[first : first + RULES.batch])
+        if part and pool.settings.budget.over(part) and (first or part != "single effects"):
+            _left_out(pool, [effects for _, (_, effects) in every[first:]], label)
+            return
+        count = sum(len(several) for several, _ in some.values())
+        behind = total - done - count
+        _fit_batch(pool, some, heats, lambda left, behind=behind: say(label, total - behind - left, total))
+        done += count
+        pool.keep(pool)
+
+
+def _fit_batch(pool: Pool, entries: Entries, heats: _Heats, progress: Callable[[int], None]) -> None:
+    fits = pool.fitter.iterate(
+        [fit for several, _ in entries.values() for fit in several],
         pool.settings.iterations,
         lambda f: fresh(pool, f),
         pool.settings.tolerance,
-        progress=lambda left: say(label, total - left, total),
-        keep=_Heats([len(several) for several, _ in entries.values()]),
+        progress=progress,
+        keep=heats.among([len(several) for several, _ in entries.values()]),
     )
     for key, (several, effects) in entries.items():
         own, fits = fits[: len(several)], fits[len(several) :]
-        pool.models[key] = scored(fitter, min(own, key=lambda fit: fit.cost), effects)
+        pool.models[key] = scored(pool.fitter, min(own, key=lambda fit: fit.cost), effects)
+
+
+def _left_out(pool: Pool, models: Sequence[Sequence[Candidate]], label: str) -> None:
+    """Remembers what there was no time for."""
+    pool.cut_short.update(effects[0].label for effects in models if len(effects) == 1)
+    pool.skipped[label] = pool.skipped.get(label, 0) + len(models)
 
 
 class _Heats:
@@ -101,18 +134,26 @@ class _Heats:
     CANDIDATES = {2: 8.0, 3: 5.0, 5: 3.0}  # and over the best candidate's
     FAST = 0.7  # cost after over cost before a step
 
-    def __init__(self, starts: Sequence[int]) -> None:
-        self.owner = np.repeat(np.arange(len(starts)), starts)  # `[fits]`, of each candidate's several starts
+    def __init__(self, pool: Pool, part: str = "") -> None:
+        self.pool, self.part = pool, part
+        self.pace: dict[int, float] = {}  # steps made -> cost of the best candidate, of all batches
 
-    def __call__(self, made: int, fits: Sequence[Fit], running: Sequence[int]) -> list[int]:
-        cost = np.array([fit.cost for fit in fits])
-        best = [float(np.min(cost[self.owner == i])) for i in range(self.owner[-1] + 1)]
-        limits = np.full(len(best), np.inf)
-        if made in self.STARTS:
-            limits = self.STARTS[made] * np.array(best)
-        if made in self.CANDIDATES:
-            limits[np.array(best) > self.CANDIDATES[made] * min(best)] = 0.0
-        return [i for i in running if cost[i] <= limits[self.owner[i]] or self._falls(fits[i])]
+    def among(self, starts: Sequence[int]) -> Callable[[int, Sequence[Fit], Sequence[int]], list[int]]:
+        """Which fits of a batch go on, of candidates with so many starts each."""
+        owner = np.repeat(np.arange(len(starts)), starts)
+
+        def going(made: int, fits: Sequence[Fit], running: Sequence[int]) -> list[int]:
+            if self.part and self.pool.settings.budget.over(self.part):
+                return []
+            cost = np.array([fit.cost for fit in fits])
+            best = np.array([float(np.min(cost[owner == i])) for i in range(len(starts))])
+            self.pace[made] = min(self.pace.get(made, np.inf), float(best.min()))
+            limits = self.STARTS.get(made, np.inf) * best
+            if made in self.CANDIDATES:
+                limits[best > self.CANDIDATES[made] * self.pace[made]] = 0.0
+            return [i for i in running if cost[i] <= limits[owner[i]] or self._falls(fits[i])]
+
+        return going
 
     def _falls(self, fit: Fit) -> bool:
         refused = len(fit.history) > 1 and fit.history[-1] == fit.history[-2]
@@ -164,14 +205,20 @@ def start_of(pool: Pool, candidate: Candidate) -> Screened:
     return Screened(candidate, single.values_of(candidate), found.gain, found.absorbed, found.column)
 
 
-def polish(pool: Pool, models: Sequence[Model]) -> list[Model]:
+def polish(pool: Pool, models: Sequence[Model], say: Progress = lambda text, done, total: None) -> list[Model]:
     """All columns anew at the fits, and some more steps; with contacts again and again, as long as it helps much."""
-    fitter, fits = pool.fitter, [pool.fitter.refresh(m.fit) for m in models]
+    fitter, count = pool.fitter, itertools.count()
+
+    def told(fit: Fit) -> Fit:
+        say("polishing", next(count), 2 * len(models))
+        return fit
+
+    fits = [told(fitter.refresh(m.fit)) for m in models]
     if pool.rough:
-        fits = [_again(fitter, fit) for fit in fits]
+        fits = [told(_again(fitter, fit)) for fit in fits]
     else:
         fits = fitter.iterate(fits, 4, lambda f: fresh(pool, f))
-        fits = [fitter.refresh(fit) for fit in fits]
+        fits = [told(fitter.refresh(fit)) for fit in fits]
     new = [scored(fitter, fit, m.effects) for fit, m in zip(fits, models, strict=True)]
     pool.models.update({frozenset(c.label for c in m.effects): m for m in new})
     return new

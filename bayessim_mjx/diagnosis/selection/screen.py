@@ -5,7 +5,7 @@ Tangents at neutral mislead where laws have kinks (dry friction, play): the colu
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -26,6 +26,7 @@ class Sizes:
     candidates: int = 64
     points: int = 4
     fewest: int = 8
+    worlds: int = 8192  # simulated between two signs of life: whole calls, even of an accelerator
 
 
 SIZES = Sizes()
@@ -85,7 +86,16 @@ def residual(fit: Fit, limit: int) -> Array:
     return np.asarray(fit.r[own] * np.sqrt(fit.weight[own])[:, None])
 
 
-def screen(fitter: Fitter, fit: Fit, candidates: Sequence[Candidate], limit: int = 96) -> list[Screened]:
+Progress = Callable[[str, int, int], None]
+
+
+def screen(
+    fitter: Fitter,
+    fit: Fit,
+    candidates: Sequence[Candidate],
+    limit: int = 96,
+    say: Progress = lambda text, done, total: None,
+) -> list[Screened]:
     """All candidates on top of `fit`, best first, on at most `limit` windows.
 
     Where there are many starting points, a third of the windows tells which are worth a second look on all of them.
@@ -93,35 +103,40 @@ def screen(fitter: Fitter, fit: Fit, candidates: Sequence[Candidate], limit: int
     """
     every = [(i, point) for i, candidate in enumerate(candidates) for point in candidate.probes]
     if len(every) <= SIZES.many:
-        return _ordered(_looked_at(fitter, fit, candidates, every, limit))
-    coarse = _looked_at(fitter, fit, candidates, every, max(limit // 3, SIZES.fewest))
+        return _ordered(_looked_at(fitter, fit, candidates, every, limit, say))
+    coarse = _looked_at(fitter, fit, candidates, every, max(limit // 3, SIZES.fewest), say)
     order = sorted(coarse, key=lambda i: -max(s.gain for s, _ in coarse[i]))[: SIZES.candidates]
     again = [(i, p) for i in order for _, p in sorted(coarse[i], key=lambda f: -f[0].gain)[: SIZES.points]]
-    fine = _looked_at(fitter, fit, candidates, again, limit)
+    fine = _looked_at(fitter, fit, candidates, again, limit, lambda _, done, total: say("second look", done, total))
     return _ordered(fine) + _ordered({i: found for i, found in coarse.items() if i not in fine})
 
 
 def _looked_at(
-    fitter: Fitter, fit: Fit, candidates: Sequence[Candidate], plans: Sequence[tuple[int, Array]], limit: int
+    fitter: Fitter,
+    fit: Fit,
+    candidates: Sequence[Candidate],
+    plans: Sequence[tuple[int, Array]],
+    limit: int,
+    say: Progress,
 ) -> dict[int, list[tuple[Screened, Array]]]:
     """{candidate: [(what its starting point gains, the point)]} for plans of (candidate, point)."""
     count = len(fit.r)
     own = _telling(fit, limit)
     part = _part(fit, own)
-    if not plans:
-        return {}
-    thetas = [
-        fitter.vector((*fit.coordinates, *candidates[i].coordinates), np.concatenate([fit.values, point]))
-        for i, point in plans
-    ]
-    run = fitter.simulator.run
-    shifted = fitter.whiten(run(np.stack(thetas), np.repeat(part.offsets[None], len(thetas), 0), own))
-    columns = part.r[None] - shifted  # [m, W, n]
     project = _Projection(fitter, part)
     each: dict[int, list[tuple[Screened, Array]]] = {}
-    for (i, point), column in zip(plans, columns, strict=True):
-        one = _one(project, candidates[i], point, column)
-        each.setdefault(i, []).append((replace(one, gain=one.gain * count / len(own)), point))
+    at_once = max(SIZES.worlds // len(own), 1)
+    for first in range(0, len(plans), at_once):
+        say("screening", first, len(plans))
+        some = plans[first : first + at_once]
+        thetas = [
+            fitter.vector((*fit.coordinates, *candidates[i].coordinates), np.concatenate([fit.values, point]))
+            for i, point in some
+        ]
+        shifted = fitter.simulator.run(np.stack(thetas), np.repeat(part.offsets[None], len(thetas), 0), own)
+        for (i, point), column in zip(some, part.r[None] - fitter.whiten(shifted), strict=True):
+            one = _one(project, candidates[i], point, column)
+            each.setdefault(i, []).append((replace(one, gain=one.gain * count / len(own)), point))
     return each
 
 

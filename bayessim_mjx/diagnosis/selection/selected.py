@@ -11,7 +11,7 @@ from typing import Any
 from bayessim_mjx.diagnosis import phrases
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
-from bayessim_mjx.diagnosis.selection import beam, bounds, heldout, predicted_gain, singles, weak_directions
+from bayessim_mjx.diagnosis.selection import beam, heldout, predicted_gain, singles, weak_directions
 from bayessim_mjx.diagnosis.selection.criteria import Criteria
 from bayessim_mjx.diagnosis.selection.decide import Alternative, Decision, closed_elsewhere, order
 from bayessim_mjx.diagnosis.selection.fits import Fits
@@ -76,6 +76,8 @@ class Selection(Tried):
     promised: tuple[float, Mapping[str, float]] = (0.0, MappingProxyType({}))
     along: Ridges | None = None
     elsewhere: float = float("nan")
+    cut_short: frozenset[str] = frozenset()
+    skipped: Mapping[str, int] = field(default_factory=dict)
 
     @property
     def ambiguous(self) -> bool:
@@ -84,7 +86,7 @@ class Selection(Tried):
 
     def reopened(self) -> Pool:
         """A pool that goes on from here."""
-        found = dict(self.models), list(self.screened)
+        found = dict(self.models), list(self.screened), set(self.cut_short), dict(self.skipped)
         return Pool(self.fitter, self.candidates, self.settings, self.criteria, self.nominal, self.base, *found)
 
 
@@ -110,7 +112,7 @@ def concluded(pool: Pool, decision: Decision, say: Progress) -> Selection:
     named = pool.models[decision.answer]
     rivals = {e.label: _rivals(pool, e, named, decision) for e in named.effects}
     elsewhere = closed_elsewhere(searched, order(searched.laws), pool.criteria) if named.effects else float("nan")
-    answer, along = bounds.widened(pool, named, say), None
+    answer, along = named, None
     if answer.effects:
         answer, along = weak_directions.settled(fitter, answer)
         (answer,) = [answer] if answer is named else heldout.refitted(fitter, [answer])
@@ -140,6 +142,8 @@ def frozen(pool: Pool, answer: Model, rivals: Mapping[str, Sequence[Rival]]) -> 
         base=pool.base,
         models=MappingProxyType(dict(pool.models)),
         screened=tuple(pool.screened),
+        cut_short=frozenset(pool.cut_short),
+        skipped=MappingProxyType(dict(pool.skipped)),
         answer=answer,
         rivals=MappingProxyType({label: tuple(found) for label, found in rivals.items()}),
     )
@@ -166,6 +170,6 @@ def _subsets(pool: Pool, answer: Model, say: Progress) -> dict[frozenset[str], M
     every, fits = frozenset(e.label for e in answer.effects), Fits(pool, say)
     for size in range(len(every) - 1, 0, -1):
         some = [frozenset(own) for own in itertools.combinations(sorted(every), size)]
-        fits.fit([beam.Plan(own, own | {min(every - own)}) for own in some], "dropping")
+        fits.fit([beam.Plan(own, own | {min(every - own)}) for own in some], "dropping", needed=True)
     known = itertools.chain.from_iterable(itertools.combinations(every, n) for n in range(len(every) + 1))
     return {frozenset(own): pool.models[frozenset(own)] for own in known}

@@ -11,7 +11,7 @@ from bayessim_mjx.diagnosis.selection.bounds import widen_leading
 from bayessim_mjx.diagnosis.selection.criteria import Criteria
 from bayessim_mjx.diagnosis.selection.models import scored
 from bayessim_mjx.diagnosis.selection.pool import Pool, Progress, fit_models, polish
-from bayessim_mjx.diagnosis.selection.screen import screen
+from bayessim_mjx.diagnosis.selection.screen import SIZES, screen
 from bayessim_mjx.diagnosis.selection.tried import Settings
 
 FEW = 4  # single effects that are fitted, for the table, where nothing is to be explained
@@ -25,24 +25,26 @@ def begin(
     say: Progress = lambda text, done, total: None,
     keep: Callable[[Pool], None] = lambda pool: None,
 ) -> Pool:
-    """The pool with the single effects; `keep` is called with it after the known parameters and at the end."""
+    """The pool with the single effects; `keep` is called with it after each part, also of what follows."""
+    say("compiling the simulator", 0, 1)
     nominal = fitter.begin(fitter.base)
     say("known parameters", 0, 1)
-    start = replace(nominal, A=nominal.A.copy())  # in the memory order of later steps: sums round alike
-    (fit,) = fitter.iterate([start], 10, lambda f: range(len(f.coordinates)))
+    began = settings.budget.now()
+    (fit,) = fitter.iterate([nominal], 10, lambda f: range(len(f.coordinates)))
     fit = fitter.refresh(fit)
     base = scored(fitter, fit, ())
-    pool = Pool(fitter, candidates, settings, criteria, nominal, base)
+    settings = _affordable(fitter, candidates, settings, settings.budget.now() - began)
+    pool = Pool(fitter, candidates, settings, criteria, nominal, base, keep=keep)
     if pool.rough:
         (pool.base,) = polish(pool, [base])
         fit = pool.base.fit
     pool.models[frozenset()] = pool.base
     keep(pool)
-    say("screening", 0, 1)
-    pool.screened = screen(fitter, fit, candidates, settings.screened)
+    pool.screened = screen(fitter, fit, candidates, settings.screened, say)
     if not pool.above_noise(pool.base):
         fit_models(pool, [(pool.base, s) for s in pool.screened[:FEW]], "single effects", say)
         return pool
+    pool.keep(pool)
     led = [s for s in pool.screened if s.candidate.label in settings.first]
     others = [s for s in pool.screened if s.gain > 0 and s.candidate.label not in settings.first]
     promising = [*led, *others][: max(settings.singles, len(led))]
@@ -50,3 +52,13 @@ def begin(
     widen_leading(pool, say)
     keep(pool)
     return pool
+
+
+def _affordable(fitter: Fitter, candidates: Sequence[Candidate], settings: Settings, seconds: float) -> Settings:
+    """Fewer windows to screen on where time is limited, by the seconds that the fit of the known parameters took."""
+    if not settings.budget.limited:
+        return settings
+    worlds = len(fitter.simulator.windows) * 10 * (1 + len(fitter.base))  # of that fit, about
+    points = max(sum(len(c.probes) for c in candidates), 1)
+    windows = settings.budget.left("screening") * worlds / max(seconds, 1e-3) / points
+    return replace(settings, screened=int(min(max(windows, SIZES.fewest), settings.screened)))

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 from bayessim_mjx.diagnosis import statistics
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
+from bayessim_mjx.diagnosis.selection.budget import Budget
 from bayessim_mjx.diagnosis.selection.criteria import Criteria
 from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.selection.screen import Screened
@@ -22,6 +23,7 @@ class Settings:
         starts: of these fitted from several starts; iterations, tolerance: of a fit.
         fresh: base columns are differenced anew if there are at most so many.
         first: labels of candidates that are fitted whatever the screening says; together: of a set of them that is.
+        budget: time that the search may take.
         believed: share of the noise (rms) that is the sensors'; the rest is what the time step may be worth at most.
     """
 
@@ -34,6 +36,7 @@ class Settings:
     believed: float = 1.0
     first: tuple[str, ...] = ()
     together: tuple[str, ...] = ()
+    budget: Budget = Budget()
 
 
 class Tried:
@@ -41,6 +44,8 @@ class Tried:
 
     Attributes:
         nominal: the simulator as delivered; base: the known parameters alone; models: by the labels of their effects.
+        cut_short: labels of candidates for which no time was left; skipped: {part of the search: models for which none
+            was}.
     """
 
     fitter: Fitter
@@ -51,6 +56,8 @@ class Tried:
     base: Model
     models: Mapping[frozenset[str], Model]
     screened: Sequence[Screened]
+    cut_short: Collection[str]
+    skipped: Mapping[str, int]
 
     @property
     def noise(self) -> float:

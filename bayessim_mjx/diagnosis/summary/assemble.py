@@ -14,7 +14,7 @@ from bayessim_mjx.diagnosis.experiment.propose import Experiment
 from bayessim_mjx.diagnosis.findings import Findings, Where
 from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
 from bayessim_mjx.diagnosis.result import Diagnosis, Gap, Place
-from bayessim_mjx.diagnosis.selection import bounds, conditions, uncertainty
+from bayessim_mjx.diagnosis.selection import bounds, conditions, left_out, uncertainty
 from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.selection.tried import Tried, ranked
 from bayessim_mjx.diagnosis.summary import effects_found, how_far
@@ -69,7 +69,7 @@ def diagnosis_of(found: Findings, about: Mapping[str, Any] | None = None, file: 
     lies = [*located_in_words(where.found), *spectra_in_words(where.spectra)] if where else []
     return Diagnosis(
         verdict=name,
-        sentences=[*told, *lies],
+        sentences=[*told, *filter(None, [left_out.not_tried(selection)]), *lies],
         effects=effects,
         where=places_of(where.found) if where and where.found.spots else _where(found),
         gap=far,
@@ -80,6 +80,7 @@ def diagnosis_of(found: Findings, about: Mapping[str, Any] | None = None, file: 
         versions=versions.of(PACKAGES),
         details=details(found, effects, closed) | more | ({"experiments": proposal.details()} if proposal else {}),
         covariance={"names": list(model.fit.names), "matrix": together},
+        not_fitted=left_out.not_fitted(selection),
         about={**about, "conditions": len(setup.fitter.simulator.windows.groups)} if about else {},
     )
 

@@ -11,6 +11,7 @@ from bayessim_mjx.diagnosis import correction
 from bayessim_mjx.diagnosis.experiment import command_file
 from bayessim_mjx.diagnosis.experiment.propose import Experiment
 from bayessim_mjx.diagnosis.findings import Findings
+from bayessim_mjx.diagnosis.fitting import journal
 from bayessim_mjx.diagnosis.fitting.robot import Robot
 from bayessim_mjx.diagnosis.result import Diagnosis, load
 from bayessim_mjx.diagnosis.selection.tried import Tried
@@ -18,6 +19,7 @@ from bayessim_mjx.diagnosis.setup import Setup
 from bayessim_mjx.diagnosis.summary import assemble, preliminary
 
 PRELIMINARY = "preliminary.json"  # what is known while the search goes on
+SEARCH = "search_so_far"  # folder of what was fitted
 COMMAND = "next_experiment.csv"
 
 
@@ -31,6 +33,11 @@ class Files:
     def __init__(self, folder: Path | None, about: Mapping[str, Any]) -> None:
         self.folder, self.about = folder, about
 
+    @property
+    def search(self) -> Path | None:
+        """Folder for what is fitted, from which a killed search goes on."""
+        return None if self.folder is None else self.folder / SEARCH
+
     def so_far(self, setup: Setup, tried: Tried | None) -> None:
         """What is known before there is a verdict: killed there, this stays."""
         if self.folder is not None:
@@ -41,6 +48,7 @@ class Files:
         if self.folder is not None:
             assemble.diagnosis_of(found, self.about).save(self.folder)
             (self.folder / PRELIMINARY).unlink(missing_ok=True)
+            journal.remove(self.folder / SEARCH)
 
     def result(self, found: Findings) -> Diagnosis:
         """What was found as a Diagnosis, its proposal as a file that can be played."""

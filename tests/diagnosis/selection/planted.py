@@ -88,7 +88,10 @@ class Linear:
         found = dense.best_sets(self.X.T @ self.X, self.X.T @ self.y, -bound, bound, blocked, most, count)
         return [frozenset(self.names[i] for i in own) for own, _ in found]
 
-    def fit(self, plans, label):
+    def over(self, part):
+        return False
+
+    def fit(self, plans, label, needed=False):
         for plan in plans:
             assert plan.parent in self.rows, f"{plan.key} from {plan.parent}, which was not fitted"
             self._fit(plan.key)

@@ -1,5 +1,7 @@
 """The search on planted sums of effects: two and three of them, hidden behind each other and behind stand-ins."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -79,6 +81,48 @@ def test_an_effect_whose_help_was_only_linearised_is_not_named():
     selection = beam.search(fits, Criteria())
     assert set(selection.answer) == {A} and selection.trace[-1].startswith("simulated: ")
     assert frozenset([A, B]) in selection.table.rows and len(selection.searched.rows) > len(selection.table.rows)
+
+
+def test_a_rival_that_only_polishing_brings_ahead_is_named():
+    """Before it is polished, the cost of a, which is the truth, is three times what it is; c explains two thirds."""
+
+    class Rough(Linear):
+        def __init__(self, *args):
+            super().__init__(*args)
+            self.polished = set()
+
+        @property
+        def table(self):
+            known = super().table
+            key = frozenset([A])
+            own = known.rows[key]
+            raw = dataclasses.replace(own, cost=own.cost + 0.6 * known.rows[frozenset()].cost)
+            return known if key in self.polished else dataclasses.replace(known, rows=known.rows | {key: raw})
+
+        def polish(self, keys):
+            self.polished |= set(keys)
+
+    laws = columns(10)
+    laws[C] = 2.0 * laws[A] + laws[C]
+    fits = Rough(laws, {A: 3.0})
+    assert beam.leading(fits.table, Criteria())[0] == {C}  # as it was fitted
+    selection = beam.search(fits, Criteria())
+    assert set(selection.answer) == {A} and frozenset([C]) in fits.polished
+
+
+def test_where_no_time_is_left_nothing_is_added_and_rivals_stay_as_they_were():
+    class Late(Linear):
+        def over(self, part):
+            return True
+
+    fits = Late(columns(20), {A: 4.0, B: 3.0})
+    selection = beam.search(fits, Criteria())
+    assert set(selection.answer) == {A} and fits.fitted == 1 + 20
+    laws = columns(6)
+    laws[B] = laws[A] + 0.001 * laws[B]
+    late, whole = Late(laws, {A: 4.0}), Linear(laws, {A: 4.0})
+    told = [{r.key for r in beam.search(fits, Criteria()).rivals} for fits in (late, whole)]
+    assert told[0] == told[1] != set()
 
 
 def test_what_may_stand_in_the_place_of_an_effect():

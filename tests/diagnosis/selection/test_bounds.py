@@ -69,7 +69,7 @@ def ended(pool, model):
     return bounds.of(pool.fitter.simulator.physics, c, float(model.values_of(effect)[0])), model.fit.values[0]
 
 
-@pytest.mark.parametrize(("true", "high"), [(0.4, 1.0), (1.7, 2.0), (5.3, 8.0)])
+@pytest.mark.parametrize(("true", "high"), [(0.4, 1.0), (1.7, 2.0), (5.3, 8.0), (20.0, 32.0)])
 def test_a_range_grows_until_it_holds_the_truth(true, high):
     pool, model = pool_of(true)
     new = bounds.widened(pool, model, silent)
@@ -80,9 +80,18 @@ def test_a_range_grows_until_it_holds_the_truth(true, high):
 
 
 def test_beyond_the_largest_range_the_value_is_a_bound():
-    pool, model = pool_of(20.0)
+    pool, model = pool_of(200.0)
     bound, value = ended(pool, bounds.widened(pool, model, silent))
-    assert bound.kind == "at least" and value == pytest.approx(8.0) and "8 N m, the largest value tried" in bound.why
+    assert bound.kind == "at least" and value == pytest.approx(64.0) and "64 N m, the largest value tried" in bound.why
+
+
+def test_what_a_wider_range_promises_is_known_before_it_is_tried():
+    """The error is linear, so the promise is exact; inside of the range nothing is promised."""
+    pool, held = pool_of(5.3)
+    least = np.sum((pool.fitter.simulator.noise / 0.01) ** 2)  # cost at the truth, start states aside
+    promised = bounds.promise(pool, held)
+    assert held.fit.cost - promised == pytest.approx(least, abs=0.2 * least)
+    assert bounds.promise(*pool_of(0.4)) == 0.0
 
 
 def test_negative_and_positive_ranges_grow_too():

@@ -1,0 +1,41 @@
+"""Time that a search may take, and what of it each part may have: the later ones are cut down before the first."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+# share of the time at which a part ends, so that those after it have theirs; what follows the search has the rest
+ENDS = {"screening": 0.25, "single effects": 0.5, "effects together": 0.7, "finalists": 0.85}
+
+
+@dataclass(frozen=True)
+class Budget:
+    """Until when the search may go on.
+
+    Attributes:
+        seconds: for the whole diagnosis; infinite: as long as it takes.
+        began: reading of `now` when it began; now: clock in seconds.
+    """
+
+    seconds: float = float("inf")
+    began: float = 0.0
+    now: Callable[[], float] = time.monotonic
+
+    @property
+    def limited(self) -> bool:
+        return self.seconds < float("inf")
+
+    def left(self, part: str) -> float:
+        """Seconds until a part has to end; infinite where there is no limit."""
+        return self.seconds * ENDS[part] - (self.now() - self.began) if self.limited else self.seconds
+
+    def over(self, part: str) -> bool:
+        """Whether a part has had its time."""
+        return self.left(part) <= 0.0
+
+
+def begun(minutes: float | None) -> Budget:
+    """A budget that begins now; None: no limit."""
+    return Budget() if minutes is None else Budget(60.0 * minutes, time.monotonic())

@@ -1,0 +1,94 @@
+"""A fair race that can be killed: ranges that grow to hold the truth, fits that are found again, limits of time."""
+
+import dataclasses
+import itertools
+
+import numpy as np
+import pytest
+
+from bayessim_mjx.diagnosis import phrases, resumed
+from bayessim_mjx.diagnosis.selection import selected
+from bayessim_mjx.diagnosis.selection.budget import Budget
+from bayessim_mjx.diagnosis.selection.criteria import Criteria
+from bayessim_mjx.diagnosis.selection.left_out import not_fitted, not_tried
+from bayessim_mjx.diagnosis.setup import prepare
+
+from .pendulums import nominal, recorded
+
+pytestmark = [pytest.mark.slow, pytest.mark.ci]  # whole searches
+
+CUBIC = 2.0  # N m/rad^3
+SPRING = "joint_spring@hinge"
+
+
+@pytest.fixture(scope="module")
+def setup(tmp_path_factory):
+    """Of a pendulum with a cubic spring, whose range ends at a fifth of the truth."""
+    effects = ["joint_spring", "coulomb_friction", "viscous_friction"]
+    found = prepare(nominal(tmp_path_factory.mktemp("spring")), recorded(cubic=CUBIC), effects)
+    return dataclasses.replace(found, candidates=tuple(map(narrowed, found.candidates)))
+
+
+def narrowed(candidate):
+    if candidate.label != SPRING:
+        return candidate
+    stiffness, cubic, rest = candidate.coordinates
+    short = dataclasses.replace(cubic, high=CUBIC / 5, precision=(5 / CUBIC) ** 2)
+    probes = np.minimum(candidate.probes, [stiffness.high, short.high, rest.high])
+    return dataclasses.replace(candidate, coordinates=(stiffness, short, rest), probes=probes)
+
+
+def searched(setup, say=lambda *told: None, **budget):
+    settings = dataclasses.replace(setup.settings, budget=Budget(**budget))
+    given = setup.fitter, setup.candidates, settings, Criteria()
+    return selected.select(*given, say)
+
+
+@pytest.fixture(scope="module")
+def whole(setup, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("whole")
+    return searched(resumed.remembering(setup, Criteria(), folder))
+
+
+def test_a_truth_five_times_beyond_its_range_is_found(whole):
+    (effect,) = whole.answer.effects
+    assert effect.label == SPRING
+    values = dict(
+        zip([c.name.rpartition(".")[2] for c in effect.coordinates], whole.answer.values_of(effect), strict=True)
+    )
+    assert values["cubic"] == pytest.approx(CUBIC, rel=0.05)
+    cubic = next(c for c in effect.coordinates if c.name.endswith("cubic"))
+    assert CUBIC < cubic.high <= 4 * CUBIC and not whole.above_noise(whole.answer)
+
+
+def test_a_killed_search_goes_on_and_comes_to_the_same(setup, whole, tmp_path):
+    class Killed(Exception):
+        pass
+
+    counted = itertools.count()
+
+    def say(text, done, total):
+        if text == "polishing" and next(counted) == 3:
+            raise Killed
+
+    simulator = setup.fitter.simulator
+    with pytest.raises(Killed):
+        searched(resumed.remembering(setup, Criteria(), tmp_path), say)
+    before, again = simulator.rollouts, resumed.remembering(setup, Criteria(), tmp_path)
+    rest = searched(again)
+    there = again.fitter.journal.found
+    assert there > 3 and rest.answer.label == whole.answer.label
+    assert np.array_equal(rest.answer.fit.values, whole.answer.fit.values)
+    assert {k: m.total for k, m in rest.models.items()} == {k: m.total for k, m in whole.models.items()}
+    resumed_cost, before = simulator.rollouts - before, simulator.rollouts
+    fresh = searched(setup)  # without a folder
+    assert resumed_cost < 0.7 * (simulator.rollouts - before)
+    assert np.array_equal(fresh.answer.fit.values, whole.answer.fit.values)
+
+
+def test_without_time_the_first_answer_says_what_was_not_tried(setup):
+    clock = itertools.count()
+    short = searched(setup, seconds=8.0, now=lambda: float(next(clock)))
+    told = not_fitted(short)
+    assert short.answer is not None and (short.cut_short or short.skipped or told)
+    assert "not everything was tried" in not_tried(short) or told.get(phrases.NO_TIME_LEFT)
