@@ -66,6 +66,22 @@ def _parser() -> cli.PlainParser:
         default=[],
         help="what the robot is rated to carry: 12kg, or tool=12kg (default: what its drives hold, up to its weight)",
     )
+    _search_options(parser)
+    parser.add_argument("--out", metavar="DIR", default="diagnosis", help="folder for the results (default: diagnosis)")
+    parser.add_argument("--seed", metavar="N", type=cli.whole(0, SEEDS), default=0, help="random seed (default: 0)")
+    parser.add_argument(
+        "--group",
+        metavar="KEY",
+        help="metadata key that names the operating condition of a log; each condition is held out in turn",
+    )
+    parser.add_argument("--device", metavar="NAME", default="auto", help="auto, cpu or gpu (default: auto)")
+    parser.add_argument("--cache_dir", metavar="DIR", help="folder of compiled programs, or off")
+    parser.add_argument("--headless", action="store_true", help="plain lines instead of progress bars")
+    return parser
+
+
+def _search_options(parser: cli.PlainParser) -> None:
+    """How long the search may take, and by what rule it decides."""
     parser.add_argument(
         "--minutes",
         metavar="M",
@@ -80,17 +96,6 @@ def _parser() -> cli.PlainParser:
         default=[],
         help="change numbers by which models are compared and one is named, as same=.3 (docs/diagnosis.md)",
     )
-    parser.add_argument("--out", metavar="DIR", default="diagnosis", help="folder for the results (default: diagnosis)")
-    parser.add_argument("--seed", metavar="N", type=cli.whole(0, SEEDS), default=0, help="random seed (default: 0)")
-    parser.add_argument(
-        "--group",
-        metavar="KEY",
-        help="metadata key that names the operating condition of a log; each condition is held out in turn",
-    )
-    parser.add_argument("--device", metavar="NAME", default="auto", help="auto, cpu or gpu (default: auto)")
-    parser.add_argument("--cache_dir", metavar="DIR", help="folder of compiled programs, or off")
-    parser.add_argument("--headless", action="store_true", help="plain lines instead of progress bars")
-    return parser
 
 
 def _minutes(text: str) -> float:

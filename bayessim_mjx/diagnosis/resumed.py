@@ -16,8 +16,10 @@ from bayessim_mjx.diagnosis.selection.criteria import Criteria
 from bayessim_mjx.diagnosis.setup import Setup
 
 
-def remembering(setup: Setup, criteria: Criteria, folder: Path) -> Setup:
+def remembering(setup: Setup, criteria: Criteria, folder: Path | None) -> Setup:
     """The setup with a fitter that finds in the folder what it fitted there before, and writes what it fits."""
+    if folder is None:
+        return setup
     return replace(setup, fitter=Remembering(setup.fitter, Journal(folder, _question(setup, criteria))))
 
 

@@ -138,8 +138,7 @@ def investigate(
     time_left, criteria = budget.begun(minutes), _smaller(criteria or Criteria()) if quick else criteria or Criteria()
     asked: dict[str, Any] = {"group": group, "seed": seed, "settings": settings, "tolerated": tolerated, "notes": notes}
     setup = prepare(robot, logs, effects, quick=quick, **asked, seen_first=lambda seen: tell(first_look.lines(seen)))
-    setup = replace(setup, settings=replace(setup.settings, budget=time_left))
-    setup = setup if remember is None else resumed.remembering(setup, criteria, remember)
+    setup = resumed.remembering(_within(setup, time_left), criteria, remember)
     for text in setup.said:
         say(text, 0, 1)
     known(setup, None)
@@ -152,12 +151,19 @@ def investigate(
         found = found if stage.optional else _after(stage, found, say)
     if verdict is not None:
         verdict(found)
-    for stage in stages:
-        if stage.optional and time_left.now() - time_left.began > time_left.seconds:
-            found = replace(found, warnings=(*found.warnings, f"{stage.name}: left out, the time was over"))
-        elif stage.optional:
-            found = _after(stage, found, say)
+    for stage in (stage for stage in stages if stage.optional):
+        found = _in_time(stage, found, say, time_left)
     return found
+
+
+def _in_time(stage: Stage, found: Findings, say: Progress, time_left: budget.Budget) -> Findings:
+    if time_left.now() - time_left.began <= time_left.seconds:
+        return _after(stage, found, say)
+    return replace(found, warnings=(*found.warnings, f"{stage.name}: left out, the time was over"))
+
+
+def _within(setup: Setup, time_left: budget.Budget) -> Setup:
+    return replace(setup, settings=replace(setup.settings, budget=time_left))
 
 
 def _smaller(criteria: Criteria) -> Criteria:
@@ -227,12 +233,7 @@ def diagnose(
         robot = robot_of(model, parameters).stated(_several(accuracy), _several(payload))
         recorded = _logs(logs, robot.mj_model, map)
     noticed = [*notes, *noticed]
-    told = {
-        "robot": robot.name, "model": str(model) if isinstance(model, str | Path) else robot.name,
-        "data": _names(logs), "logs": len(recorded), "seconds": float(sum(log.duration for log in recorded)),
-        "date": time.strftime("%Y-%m-%d %H:%M"), "seed": seed,
-        **(about or {}),
-    }  # fmt: skip
+    told = _told(robot, model, logs, recorded) | {"seed": seed} | dict(about or {})
     files = Files(None if out is None else Path(out), told)
     asked: Any = {"group": group, "seed": seed, "notes": noticed, "progress": progress, "criteria": criteria}
     asked |= {"tolerated": _several(tolerance), "early": early, "minutes": minutes, "quick": quick}
@@ -242,6 +243,15 @@ def diagnose(
     except TooLittleData as reason:
         return files.whole(assemble.insufficient(str(reason), noticed, told), robot)
     return files.whole(files.result(found), robot)
+
+
+def _told(robot: Robot, model: Source, logs: Any, recorded: Sequence[Log]) -> dict[str, Any]:
+    """Entries of the report's header."""
+    return {
+        "robot": robot.name, "model": str(model) if isinstance(model, str | Path) else robot.name,
+        "data": _names(logs), "logs": len(recorded), "seconds": float(sum(log.duration for log in recorded)),
+        "date": time.strftime("%Y-%m-%d %H:%M"),
+    }  # fmt: skip
 
 
 @contextmanager

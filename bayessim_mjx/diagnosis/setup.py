@@ -138,15 +138,12 @@ def prepare(
     seen = seen.shifted(lead) if lead else seen
     robot = step.robot(steps.robot)
     physics = physics_of(robot, dt, stack)
-    most = _limit(physics, step.errors.cut.steps if step.errors else cuts(1).steps)
-    most = min(most, CUTTING.fewest) if quick else most
+    most = _limit(physics, step.errors.cut.steps if step.errors else cuts(1).steps, quick)
     cut = step.noisier(cuts(step.factor, limit=most, centred=False, late=lead))
     base = candidates.base_coordinates(robot.space, robot.accuracy)
     fitter = Fitter(Simulator(physics, cut), base, physics.space.nominal)
     led = leads.lead(candidates.enumerate_candidates(physics), before)
-    settings = dataclasses.replace(
-        settings or (QUICK if quick else _settings(robot)), believed=step.believed, **led.order
-    )
+    settings = dataclasses.replace(settings or _settings(robot, quick), believed=step.believed, **led.order)
     allowed = tolerance.judge(robot.mj_model, 2 * size.travel, cut.sigma_q, asked)
     said = [*steps.said(), *_faster(seen.usable, delivered, dt)]
     said += [] if shift is None else shift.told(float(np.median([log.period for log in logs])))
@@ -157,8 +154,10 @@ def prepare(
     return Setup(*fixed, tuple(told), tuple(said), step, before)
 
 
-def _settings(robot: Robot) -> Settings:
+def _settings(robot: Robot, quick: bool = False) -> Settings:
     """Budgets for the robot's size; criteria are the same for all."""
+    if quick:
+        return QUICK
     big = robot.mj_model.nv > CUTTING.many
     return Settings(singles=24, screened=24, starts=16) if big else Settings()
 
@@ -248,8 +247,10 @@ def _windows(
     return cuts
 
 
-def _limit(physics: Physics, length: int) -> int:
+def _limit(physics: Physics, length: int, quick: bool = False) -> int:
     """Most windows of so many control steps that are simulated at once."""
+    if quick:
+        return CUTTING.fewest
     nv = physics.mj_model.nv
     budget = CUTTING.budget if nv <= CUTTING.many else CUTTING.budget // 2
     limit = next(n for dofs, n in CUTTING.limits if nv <= dofs)

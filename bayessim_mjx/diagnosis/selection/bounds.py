@@ -12,7 +12,7 @@ from bayessim_mjx.diagnosis import phrases
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate, Coordinate, shrink
 from bayessim_mjx.diagnosis.fitting.quadratic import solve
 from bayessim_mjx.diagnosis.selection.models import Model, nats, scored
-from bayessim_mjx.diagnosis.selection.pool import Pool, Progress, fresh
+from bayessim_mjx.diagnosis.selection.pool import AFRESH, Pool, Progress, fresh
 from bayessim_mjx.diagnosis.selection.tried import ranked
 from bayessim_mjx.physics import Physics
 
@@ -152,8 +152,10 @@ def _held(pool: Pool, model: Model) -> bool:
 
 def _freed(physics: Physics, c: Coordinate, value: float) -> Coordinate:
     """As wide as it may get, where the value is at an end that may move."""
-    end = _end(c, value)
-    return c if _grown(physics, c, value) is c else replace(c, **{end: _farthest(physics, c, end)})
+    if _grown(physics, c, value) is c:
+        return c
+    far = _farthest(physics, c, end := _end(c, value))
+    return replace(c, high=far) if end == "high" else replace(c, low=far)
 
 
 def _grown(physics: Physics, c: Coordinate, value: float) -> Coordinate:
@@ -175,7 +177,7 @@ def _refitted(pool: Pool, model: Model, effects: Sequence[Candidate]) -> Model:
     fitter, base = pool.fitter, len(pool.fitter.base)
     own = {c.name: c for e in effects for c in e.coordinates}
     coordinates = tuple(c if i < base else own[c.name] for i, c in enumerate(model.fit.coordinates))
-    start = fitter.refresh(replace(model.fit, coordinates=coordinates, history=(), damping=1e-3))
+    start = fitter.refresh(replace(model.fit, coordinates=coordinates, **AFRESH))
     (fit,) = fitter.iterate([start], WIDENING.steps, lambda f: fresh(pool, f))
     return scored(fitter, fitter.refresh(fit), tuple(effects))
 

@@ -141,8 +141,10 @@ class Fits:
         todo = [k for k in keys if k and k not in self._polished]
         if todo:
             self._polished.update(todo)
-            for model in polish(self.pool, [self.pool.models[k] for k in todo], self.say):
-                widened(self.pool, model, self.say)
+            polished = polish(self.pool, [self.pool.models[k] for k in todo], self.say)
+            wider = [widened(self.pool, model, self.say) for model in polished]
+            if moved := [new for new, old in zip(wider, polished, strict=True) if new is not old]:
+                polish(self.pool, moved, self.say)
             self.pool.keep(self.pool)
 
     def simulate(self, keys: Sequence[Key]) -> Table:

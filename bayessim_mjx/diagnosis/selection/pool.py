@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -25,11 +27,16 @@ class Rules:
     """How fits far from the logs are brought to their end."""
 
     batch: int = 12  # models fitted in lockstep; after each batch what is known is told
-    rounds: int = 5  # of polishing, where it has to be done again and again
+    # of polishing, as long as a round of so many steps brings the cost down to this share
+    rounds: int = 5
+    steps: int = 4
+    falls: float = 0.99
     astray: float = 10.0  # noises that a fit leaves: from there on nothing is as it was a step before
 
 
 RULES = Rules()
+# of a fit that goes on with new columns: steps that were refused on old ones would hold it, and its start states, back
+AFRESH: dict[str, Any] = {"history": (), "damping": 1e-3, "reach": np.ones(1)}
 
 
 @dataclass(eq=False)
@@ -98,11 +105,13 @@ def fit_entries(pool: Pool, entries: Entries, label: str, say: Progress, part: s
         if part and pool.settings.budget.over(part) and (first or part != "single effects"):
             _left_out(pool, [effects for _, (_, effects) in every[first:]], label)
             return
-        count = sum(len(several) for several, _ in some.values())
-        behind = total - done - count
-        _fit_batch(pool, some, heats, lambda left, behind=behind: say(label, total - behind - left, total))
-        done += count
+        done += sum(len(several) for several, _ in some.values())
+        _fit_batch(pool, some, heats, functools.partial(_say_left, say, label, done, total))
         pool.keep(pool)
+
+
+def _say_left(say: Progress, label: str, done: int, total: int, left: int) -> None:
+    say(label, done - left, total)
 
 
 def _fit_batch(pool: Pool, entries: Entries, heats: _Heats, progress: Callable[[int], None]) -> None:
@@ -206,22 +215,32 @@ def start_of(pool: Pool, candidate: Candidate) -> Screened:
 
 
 def polish(pool: Pool, models: Sequence[Model], say: Progress = lambda text, done, total: None) -> list[Model]:
-    """All columns anew at the fits, and some more steps; with contacts again and again, as long as it helps much."""
+    """All columns anew at the fits, and more steps, again and again as long as it helps."""
     fitter, count = pool.fitter, itertools.count()
 
     def told(fit: Fit) -> Fit:
-        say("polishing", next(count), 2 * len(models))
+        say("polishing", min(next(count), 2 * len(models) - 1), 2 * len(models))
         return fit
 
     fits = [told(fitter.refresh(m.fit)) for m in models]
-    if pool.rough:
-        fits = [told(_again(fitter, fit)) for fit in fits]
-    else:
-        fits = fitter.iterate(fits, 4, lambda f: fresh(pool, f))
-        fits = [told(fitter.refresh(fit)) for fit in fits]
+    fits = [_again(fitter, fit) for fit in fits] if pool.rough else _to_the_end(pool, fits, told)
     new = [scored(fitter, fit, m.effects) for fit, m in zip(fits, models, strict=True)]
     pool.models.update({frozenset(c.label for c in m.effects): m for m in new})
     return new
+
+
+def _to_the_end(pool: Pool, fits: Sequence[Fit], told: Callable[[Fit], Fit]) -> list[Fit]:
+    """Fits with all columns anew every few steps, as long as that lowers their cost."""
+    fits, running = list(fits), list(range(len(fits)))
+    for _ in range(RULES.rounds):
+        start = [replace(fits[i], **AFRESH) for i in running]
+        moved = pool.fitter.iterate(start, RULES.steps, lambda f: fresh(pool, f))
+        for i, fit in zip(running, moved, strict=True):
+            fits[i] = told(pool.fitter.refresh(fit))
+        running = [i for i, before in zip(running, start, strict=True) if fits[i].cost < RULES.falls * before.cost]
+        if not running:
+            break
+    return fits
 
 
 def _again(fitter: Fitter, fit: Fit) -> Fit:

@@ -10,7 +10,7 @@ from bayessim_mjx.diagnosis.fitting.fitter import Fitter
 from bayessim_mjx.diagnosis.selection.bounds import widen_leading
 from bayessim_mjx.diagnosis.selection.criteria import Criteria
 from bayessim_mjx.diagnosis.selection.models import scored
-from bayessim_mjx.diagnosis.selection.pool import Pool, Progress, fit_models, polish
+from bayessim_mjx.diagnosis.selection.pool import AFRESH, Pool, Progress, fit_models, polish
 from bayessim_mjx.diagnosis.selection.screen import SIZES, screen
 from bayessim_mjx.diagnosis.selection.tried import Settings
 
@@ -30,8 +30,10 @@ def begin(
     nominal = fitter.begin(fitter.base)
     say("known parameters", 0, 1)
     began = settings.budget.now()
-    (fit,) = fitter.iterate([nominal], 10, lambda f: range(len(f.coordinates)))
-    fit = fitter.refresh(fit)
+    fit = nominal
+    for _ in range(2):  # the second time from start states' columns of its own
+        (fit,) = fitter.iterate([replace(fit, **AFRESH)], 10, lambda f: range(len(f.coordinates)))
+        fit = fitter.refresh(fit)
     base = scored(fitter, fit, ())
     settings = _affordable(fitter, candidates, settings, settings.budget.now() - began)
     pool = Pool(fitter, candidates, settings, criteria, nominal, base, keep=keep)
