@@ -46,7 +46,6 @@ def begin(
     if not pool.above_noise(pool.base):
         fit_models(pool, [(pool.base, s) for s in pool.screened[:FEW]], "single effects", say)
         return pool
-    pool.keep(pool)
     led = [s for s in pool.screened if s.candidate.label in settings.first]
     others = [s for s in pool.screened if s.gain > 0 and s.candidate.label not in settings.first]
     promising = [*led, *others][: max(settings.singles, len(led))]
