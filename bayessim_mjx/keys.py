@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 BEYOND = 2**31  # no key is split into as many
 
 
-def branch(key: Array, number: int) -> Array:
+def branch(key: Array, number: int | Array) -> Array:
     """A key for a purpose of its own, beside those that `jax.random.split(key, n)` gives.
 
     `jax.random.fold_in(key, i)` is the i-th of those: what both are used for would be drawn alike.
     """
-    return jax.random.fold_in(key, np.uint32(BEYOND + number))
+    return jax.random.fold_in(key, np.uint32(BEYOND) + jnp.asarray(number).astype(np.uint32))
 
 
 __all__ = ["branch"]

@@ -298,6 +298,13 @@ class BayesSimConfig(Section):
         choices=("auto", "off", "likelihood"),
         spell=lambda value: "off" if value is False else value,  # YAML reads a plain off so
     )
+    noiseDraws: int = setting(
+        16,
+        "draws of each simulated trajectory's measurement noise, of which training sees another one in every epoch; "
+        "fewer where they would need much memory",
+        low=1,
+        high=1000,
+    )
     checkTrajs: int = setting(
         300,
         "fresh simulations a round that test calibration and misfit; 0: no tests (else 40 or more)",

@@ -20,7 +20,8 @@ GOLDEN = np.uint32(2654435769)  # 2^32 / golden ratio: spreads the validation ro
 
 
 class Data(NamedTuple):
-    x: Array  # [N, D] as the network takes them in; in training [M, N, D] in each of the bases
+    # [N, D] as the network takes them in; in training [M, N + K m, D] in each of the bases, the draws of `Again` behind
+    x: Array
     y: Array  # [N, d]
     slopes: Array  # [N] log density of u = log density of y + this
     train: Array  # [N] bool
@@ -28,13 +29,26 @@ class Data(NamedTuple):
     mask: Array  # [V] float32
     origin: Array | None  # [N] the proposal each row was simulated from
     proposals: Distribution | None  # leaves [R, ...]
+    own: Array | None = None  # of `Again`
+    draws: int = 1  # 1 + K
 
 
-def prepare(state: FitState, thetas: Array, x: Array, count: Array) -> tuple[FitState, Data, Array, Array]:
+class Again(NamedTuple):
+    """Further draws of the measurement noise of some rows: training sees another one in every epoch."""
+
+    x: Array  # [m, K, D]
+    own: Array  # [N] int32: which of the m a row is, -1: none
+
+
+def prepare(
+    state: FitState, thetas: Array, x: Array, count: Array, again: Again | None = None
+) -> tuple[FitState, Data, Array, Array]:
     """Mask, standardise and split. The split depends on the row number only, so it survives from fit to fit."""
     rows = jnp.arange(x.shape[0], dtype=jnp.int32)
     given = rows < count
     valid = given & jnp.all(jnp.isfinite(x), axis=1) & jax.vmap(state.space.contains)(thetas)
+    if again is not None:
+        valid = valid & ((again.own < 0) | jnp.all(jnp.isfinite(again.x), axis=(1, 2))[again.own])
     nominal = jnp.asarray(state.space.nominal)[None, :]
     u = jnp.clip(jax.vmap(state.space.to_unit)(jnp.where(valid[:, None], thetas, nominal)), 0, 1)
     x = jnp.where(valid[:, None], x, 0.0)
@@ -53,7 +67,12 @@ def prepare(state: FitState, thetas: Array, x: Array, count: Array) -> tuple[Fit
     train = jnp.where(jnp.any(valid & ~held), valid & ~held, valid)
     y = mdn.to_y(u, state.settings.chart)
     slopes = mdn.log_volume(y, state.settings.chart)
+    if again is not None:
+        more = jnp.moveaxis(again.x, 1, 0).reshape(-1, x.shape[1])
+        z = jnp.concatenate([z, standardise(jnp.nan_to_num(more), mean, rate, state.settings.clip)[0]])
     data = Data(z, y, slopes, train, order, held[order].astype(jnp.float32), None, None)
+    if again is not None:
+        data = data._replace(own=again.own, draws=1 + again.x.shape[1])
     n_invalid = jnp.sum((given & ~valid).astype(jnp.int32))
     entries = jnp.maximum(jnp.sum(valid.astype(jnp.float32)), 1.0) * x.shape[1]
     share_clipped = jnp.sum(jnp.where(valid[:, None], clipped, 0.0)) / entries

@@ -17,7 +17,7 @@ from jax import Array
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.inference import ensemble, identify, mdn, whitening
-from bayessim_mjx.inference.data import Data, prepare
+from bayessim_mjx.inference.data import Again, Data, prepare
 from bayessim_mjx.inference.settings import InferenceSettings
 from bayessim_mjx.inference.state import FitInfo, FitState, rotated
 from bayessim_mjx.inference.train import MEMBERS, train
@@ -68,6 +68,7 @@ def fit(
     count: int | Array | None = None,
     proposals: Distribution | None = None,
     origin: Array | None = None,
+    again: Again | None = None,
 ) -> tuple[FitState, FitInfo]:
     """Maximum likelihood on the first `count` rows of thetas [N, d] and x [N, D]; the rest is padding.
 
@@ -87,6 +88,8 @@ def fit(
         count: how many of the rows there are; None: all. Traced, so that a growing data set does not recompile.
         proposals: what the rows were simulated from; None: the prior.
         origin: [N] the proposal of each row.
+        again: further draws of the measurement noise of rows, of which training sees another one in every epoch; None:
+            there are none. Scores are those of x.
     """
     count = thetas.shape[0] if count is None else count
     d, dim_x = len(state.space), state.x_mean.shape[0]
@@ -98,7 +101,7 @@ def fit(
         _check_proposals(state, thetas, proposals, origin)
         origin = jnp.asarray(origin, jnp.int32)
     thetas, x = jnp.asarray(thetas, jnp.float32), jnp.asarray(x, jnp.float32)
-    state, info = _run(_fit, key, state, thetas, x, jnp.asarray(count, np.int32), proposals, origin)
+    state, info = _run(_fit, key, state, thetas, x, jnp.asarray(count, np.int32), proposals, origin, again)
     if not isinstance(info.n_train, jax.core.Tracer) and int(info.n_train) == 0:
         raise UserError(f"none of the {int(count)} rows is usable: summaries not finite, or thetas outside the box")
     return state, info
@@ -134,9 +137,10 @@ def _fit(
     count: Array,
     proposals: Distribution | None,
     origin: Array | None,
+    again: Again | None = None,
 ) -> tuple[FitState, FitInfo]:
     settings = state.settings
-    state, data, clipped, n_invalid = prepare(state, thetas, x, count)
+    state, data, clipped, n_invalid = prepare(state, thetas, x, count, again)
     matrices = _bases(state, data)
     data = data._replace(
         proposals=proposals, origin=origin, x=jax.vmap(lambda m: rotated(data.x, m, settings.clip))(matrices)
@@ -148,7 +152,7 @@ def _fit(
     params, basis, best, steps, skipped, curves = jax.vmap(member, axis_name=MEMBERS)(
         jax.random.split(key, settings.ensemble), {**state.params, "sharpness": jnp.ones(settings.ensemble)}, rates
     )
-    data = data._replace(x=data.x[basis[0]])
+    data = data._replace(x=data.x[basis[0], : len(data.train)])
     state = replace(state, basis=None if state.basis is None else matrices[basis[0]])
     members = ensemble.heads(params, data, settings)
     state = replace(state, params=ensemble.weigh(params, data, settings, members), fits=state.fits + 1)
@@ -184,5 +188,6 @@ def _info(state: FitState, data: Data, gain: Array, curves: Array, told: dict[st
 
 def _bases(state: FitState, data: Data) -> Array:
     """The matrices [M, D, D] that a first fit chooses from; later ones keep its choice."""
-    found = whitening.candidates(data.x, data.train, whitening.count(state.settings, data.x.shape[1]))
+    x = data.x[: len(data.train)]
+    found = whitening.candidates(x, data.train, whitening.count(state.settings, x.shape[1]))
     return found if state.basis is None else jnp.where(state.fits == 0, found, state.basis[None])

@@ -71,20 +71,23 @@ class _Member:
     unravel: Callable[[Array], dict[str, Any]]  # [W] -> those that are
     optimiser: optax.GradientTransformation
 
-    def objective(self, flat: Array, basis: Array, rows: Array, drop: densities.Drop | None = None) -> Array:
+    def objective(
+        self, flat: Array, basis: Array, rows: Array, seen: Array, drop: densities.Drop | None = None
+    ) -> Array:
+        """Of rows [B] by the summaries x that are `seen` of them [B]."""
         params = {**self.unravel(flat), **self.fixed}
-        return objective(params, rows, self.data, self.settings, drop, self.data.x[basis, rows])
+        return objective(params, rows, self.data, self.settings, drop, self.data.x[basis, seen])
 
-    def loss(self, flat: Array, basis: Array, rows: Array, key: Array) -> Array:
+    def loss(self, flat: Array, basis: Array, rows: Array, seen: Array, key: Array) -> Array:
         drop = (key, self.rate) if self.settings.ensemble > 1 and self.settings.dropout > 0 else None
-        return -jnp.mean(self.objective(flat, basis, rows, drop))
+        return -jnp.mean(self.objective(flat, basis, rows, seen, drop))
 
     def held_out(self, flat: Array, basis: Array) -> Array:
-        value, mask = self.objective(flat, basis, self.data.held), self.data.mask
+        value, mask = self.objective(flat, basis, self.data.held, self.data.held), self.data.mask
         return -jnp.sum(jnp.where(mask > 0, value, 0.0)) / jnp.sum(mask)
 
-    def step(self, basis: Array, pace: Array, carry: tuple, inputs: tuple[Array, Array]) -> tuple[tuple, Array]:
-        """One gradient step of (weights, optimiser's state, steps skipped) on (rows, key)."""
+    def step(self, basis: Array, pace: Array, carry: tuple, inputs: tuple[Array, ...]) -> tuple[tuple, Array]:
+        """One gradient step of (weights, optimiser's state, steps skipped) on (rows, summaries seen, key)."""
         flat, opt_state, skipped = carry
         value, gradient = jax.value_and_grad(self.loss)(flat, basis, *inputs)
         usable = jnp.isfinite(optax.global_norm(gradient))
@@ -94,14 +97,26 @@ class _Member:
         flat, opt_state = jax.tree.map(lambda a, b: jnp.where(usable, a, b), new, (flat, opt_state))
         return (flat, opt_state, skipped + 1 - usable.astype(jnp.int32)), value
 
-    def batches(self, key: Array, chunk: int) -> tuple[Array, Array]:
-        """Rows [chunk, batch] and keys of as many steps: a fresh order of the training rows, walked through in turn."""
-        train, batch = self.data.train, min(self.settings.batch, self.data.x.shape[1])
+    def batches(self, key: Array, chunk: int) -> tuple[Array, Array, Array]:
+        """Rows [chunk, batch], summaries seen and keys of as many steps: a fresh order of the rows trained on."""
+        train = self.data.train
+        batch = min(self.settings.batch, len(train))
         order = jnp.argsort(jnp.where(train, jax.random.uniform(key, train.shape), jnp.inf))
         count = jnp.maximum(jnp.sum(train.astype(jnp.int32)), 1)
-        place = jnp.arange(chunk * batch, dtype=jnp.int32).reshape(chunk, batch) % count
+        place = jnp.arange(chunk * batch, dtype=jnp.int32).reshape(chunk, batch)
+        rows = order[place % count]
         # the next keys: those of other points of the curve are APART, and what drops units hashes its key
-        return order[place], key[None, :] + jnp.arange(1, chunk + 1, dtype=key.dtype)[:, None]
+        keys = key[None, :] + jnp.arange(1, chunk + 1, dtype=key.dtype)[:, None]
+        return rows, self.seen(rows, key[0] + (place // count).astype(key.dtype)), keys
+
+    def seen(self, rows: Array, turn: Array) -> Array:
+        """Where summaries of `rows` stand in x: each turn another draw of their noise, where there are several."""
+        if self.data.own is None:
+            return rows
+        own, n, more = self.data.own[rows], len(self.data.train), self.data.draws - 1
+        draw = ((turn + rows.astype(turn.dtype)) % np.uint32(more + 1)).astype(jnp.int32)
+        apart = (self.data.x.shape[1] - n) // more
+        return jnp.where((own < 0) | (draw == 0), rows, n + (draw - 1) * apart + own)
 
 
 def train(
@@ -116,11 +131,12 @@ def train(
         key: consumed.
         params: of this member.
         rate: of dropout.
-        data: with summaries in each of the bases, x [M, N, D]. Mapped over MEMBERS.
+        data: with summaries in each of the bases, x [M, N + K m, D]. Mapped over MEMBERS.
         fresh: whether this is the first fit.
     """
-    (points, chunk), tried = schedule_length(settings, data.x.shape[1]), data.x.shape[0]
-    params = jax.vmap(lambda x: _start(params, data._replace(x=x), settings, fresh))(data.x)
+    rows, tried = len(data.train), data.x.shape[0]
+    points, chunk = schedule_length(settings, rows)
+    params = jax.vmap(lambda x: _start(params, data._replace(x=x), settings, fresh))(data.x[:, :rows])
     member, starts = _member(params, rate, data, settings, points * chunk)
     patience = max(points // 40, -(-TRIED // chunk))
     trial = patience if tried > 1 else 0

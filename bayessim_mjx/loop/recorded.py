@@ -14,6 +14,7 @@ from jax import Array
 from bayessim_mjx.config import Config
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.inference.summaries import Summarizer
+from bayessim_mjx.keys import branch
 from bayessim_mjx.logs import Channels, Log, noise, read_logs, segments
 from bayessim_mjx.loop.seen import Seen, tiled
 from bayessim_mjx.parameters import ParameterSpace
@@ -78,6 +79,15 @@ class Recorded:
 
         The logged first state is a measurement too: the replay starts where the system may really have been.
         """
+        return self.measured(key, thetas, policy, 1)[:, 0]
+
+    @property
+    def noisy(self) -> bool:
+        """Whether sensors add anything."""
+        return any(np.any(np.asarray(value) > 0) for value in self.noise.values())
+
+    def measured(self, key: Array, thetas: Array, policy: Policy, draws: int) -> Array:
+        """Features [N, draws, D] of replays as of `simulate`, each measured so often."""
         del policy  # the logged commands act
         k_segment, *keys = jax.random.split(key, 5)
         index = jnp.asarray(self.order)[jax.random.randint(k_segment, (thetas.shape[0],), 0, len(self.order))]
@@ -86,9 +96,14 @@ class Recorded:
         start = qpos0 + self.noise["qpos"] * jax.random.normal(keys[0], qpos0.shape)
         speed = qvel0 + speed_error * jax.random.normal(keys[1], qvel0.shape)
         motion = self._replayed(index, start, speed, thetas)
-        qpos = motion["qpos"] + self.noise["qpos"] * jax.random.normal(keys[2], motion["qpos"].shape)
-        qvel = motion["qvel"] + self.noise["qvel"] * jax.random.normal(keys[3], motion["qvel"].shape)
-        return self.features(index, qpos.at[:, 0].set(qpos0), qvel.at[:, 0].set(qvel0))
+
+        def again(draw: Array) -> Array:
+            k_qpos, k_qvel = (jnp.where(draw > 0, branch(k, draw), k) for k in keys[2:])
+            qpos = motion["qpos"] + self.noise["qpos"] * jax.random.normal(k_qpos, motion["qpos"].shape)
+            qvel = motion["qvel"] + self.noise["qvel"] * jax.random.normal(k_qvel, motion["qvel"].shape)
+            return self.features(index, qpos.at[:, 0].set(qpos0), qvel.at[:, 0].set(qvel0))
+
+        return jnp.moveaxis(jax.lax.map(again, jnp.arange(draws, dtype=jnp.uint32)), 0, 1)
 
     def real(self, key: Array, first: int, count: int, policy: Policy) -> tuple[Array, Trajectory]:
         """The next `count` segments of the logs and their features."""

@@ -33,7 +33,7 @@ def reexamine(loop: Loop, state: LoopState, policy: Policy, pairs: int, seed: in
     known = min(b.trainTrajs, REFERENCE)
     used = None if state.proposals is None else at(state.proposals, slot_of(loop, state, done))
     state, temperature = ranges.as_fitted(dataclasses.replace(state, proposal=used)), float(state.temperature)
-    thetas, x = simulated(source, branch(key, 1), policy, proposal_of(loop, state), b.proposal, known + pairs)
+    thetas, x, _ = simulated(source, branch(key, 1), policy, proposal_of(loop, state), b.proposal, known + pairs)
     held = thetas[known:], x[known:]
     rows = slice((done - 1) * b.realTrajs if source.policy_dependent else 0, done * b.realTrajs)
     judged: dict[str, Any] = {"temperature": temperature, "tilt": used if b.proposal == "apt" else None}

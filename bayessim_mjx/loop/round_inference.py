@@ -25,7 +25,7 @@ from bayessim_mjx.keys import branch
 from bayessim_mjx.loop import ranges, refining, set_checks
 from bayessim_mjx.loop.factors import conditioned, kept
 from bayessim_mjx.loop.inference_state import new_network
-from bayessim_mjx.loop.simulations import at, proposal_of, simulated
+from bayessim_mjx.loop.simulations import at, noise_draws, proposal_of, simulated
 from bayessim_mjx.loop.state import Loop, LoopState, RoundInfo, slot_of, space_of
 from bayessim_mjx.quantities import percent
 from bayessim_mjx.rl import Policy
@@ -41,13 +41,13 @@ def infer(loop: Loop, state: LoopState, policy: Policy, info: RoundInfo) -> Loop
     b, source, round_ = loop.settings, loop.source, int(state.round)
     assert source is not None and state.domain is not None
     clock = time.perf_counter()
-    state, fitted, held = _collect(loop, state, policy)
+    state, fitted, held, again = _collect(loop, state, policy)
     jax.block_until_ready(fitted)
     info.seconds["simulate"] = time.perf_counter() - clock
 
     clock = time.perf_counter()
     known_before = np.asarray(state.fit.identified)
-    state = _learn(loop, state, fitted, info)
+    state = _learn(loop, state, fitted, again, info)
     info.seconds["fit"] = time.perf_counter() - clock
 
     clock = time.perf_counter()
@@ -83,11 +83,15 @@ def infer(loop: Loop, state: LoopState, policy: Policy, info: RoundInfo) -> Loop
 
 def _collect(
     loop: Loop, state: LoopState, policy: Policy
-) -> tuple[LoopState, tuple[Array, Array, int], tuple[Array, Array]]:
-    """Simulate this round's trajectories: (thetas, features, valid rows) to fit, and fresh pairs that test the fit."""
+) -> tuple[LoopState, tuple[Array, Array, int], tuple[Array, Array], inference.Again | None]:
+    """Simulate this round's trajectories: (thetas, features, valid rows) to fit, and fresh pairs that test the fit.
+
+    Last come further draws of their measurement noise; simulations of earlier rounds have but those that were kept.
+    """
     b, round_ = loop.settings, int(state.round)
     # one program for what is fitted and what tests the fit
-    thetas, x = simulated(
+    draws = noise_draws(loop)
+    thetas, x, more = simulated(
         loop.source,  # type: ignore[arg-type]
         loop.key(round_, "simulate"),
         policy,
@@ -95,6 +99,7 @@ def _collect(
         b.proposal,
         b.trainTrajs + b.checkTrajs,
         functools.partial(ranges.completed, loop, state),
+        draws,
     )
     held, thetas, x = (thetas[b.trainTrajs :], x[b.trainTrajs :]), thetas[: b.trainTrajs], x[: b.trainTrajs]
     state, row, count = ranges.room(loop, state)
@@ -103,21 +108,32 @@ def _collect(
         slot = slot_of(loop, state, round_ + 1)
         state = dataclasses.replace(state, proposals=rounds.stored(state.proposals, slot, state.proposal))
     if not loop.capacity:
-        return state, (thetas, x, b.trainTrajs), held
+        return state, (thetas, x, b.trainTrajs), held, _again(more[: b.trainTrajs], 0, b.trainTrajs)
     thetas = jax.lax.dynamic_update_slice(state.thetas, thetas, (row, 0))
     x = jax.lax.dynamic_update_slice(state.features, x, (row, 0))
     state, thetas, x = ranges.mixed(loop, state, thetas, x)
-    return dataclasses.replace(state, thetas=thetas, features=x), (thetas, x, count), held
+    again = _again(more[: b.trainTrajs], row, len(thetas))
+    return dataclasses.replace(state, thetas=thetas, features=x), (thetas, x, count), held, again
 
 
-def _learn(loop: Loop, state: LoopState, fitted: tuple[Array, Array, int], info: RoundInfo) -> LoopState:
+def _again(more: Array, first: int, rows: int) -> inference.Again | None:
+    """Further draws of the noise of as many rows as there are in `more`, from `first` on."""
+    if not more.shape[1]:
+        return None
+    place = np.arange(rows, dtype=np.int32) - first
+    return inference.Again(more, jnp.asarray(np.where((place >= 0) & (place < len(more)), place, -1)))
+
+
+def _learn(
+    loop: Loop, state: LoopState, fitted: tuple[Array, Array, int], again: inference.Again | None, info: RoundInfo
+) -> LoopState:
     """Fit the network, the one so far or a new one."""
     b, round_, (thetas, x, count) = loop.settings, int(state.round), fitted
     keeps = (b.ftune or round_ == 0) and not ranges.has_moved(state)
     network = state.fit if keeps else new_network(loop, round_, space_of(loop, state))
-    correction: dict[str, Any] = {}
+    correction: dict[str, Any] = {"again": again}
     if b.proposal == "apt":
-        correction = {"proposals": state.proposals, "origin": np.arange(len(thetas), dtype=np.int32) // b.trainTrajs}
+        correction |= {"proposals": state.proposals, "origin": np.arange(len(thetas), dtype=np.int32) // b.trainTrajs}
     network, fit_info = inference.fit(loop.key(round_, "fit"), network, thetas, x, jnp.int32(count), **correction)
     info.fit = {name: np.asarray(value) for name, value in dataclasses.asdict(fit_info).items()}
     return dataclasses.replace(state, fit=network)

@@ -16,6 +16,7 @@ from bayessim_mjx.loop.state import Loop, LoopState, space_of
 from bayessim_mjx.rl import Policy
 
 CHUNK = 2500  # trajectories simulated at once while collecting
+ROOM = 2**27  # bytes that draws of measurement noise may fill
 
 
 def simulated(
@@ -26,8 +27,11 @@ def simulated(
     method: str,
     count: int,
     chosen: Callable[[Array], Array] = lambda thetas: thetas,
-) -> tuple[Array, Array]:
+    draws: int = 1,
+) -> tuple[Array, Array, Array]:
     """`count` simulated trajectories: theta [count, d], features [count, D], in chunks that fit the memory.
+
+    Third come the features [count, draws - 1, D] of the same trajectories with other draws of the measurement noise.
 
     Args:
         source: what simulates.
@@ -36,26 +40,39 @@ def simulated(
         proposal, method: what theta is drawn from, see `rounds.draw`.
         count: how many.
         chosen: the thetas that are simulated in the place of those drawn, as many.
+        draws: how often each trajectory is measured.
     """
     chunks = -(-count // CHUNK)
     k_theta, k_roll = jax.random.split(key)
     thetas = rounds.draw(k_theta, proposal, method, -(-count // chunks) * chunks)
     thetas = chosen(thetas)
-    x = features(source, k_roll, thetas.reshape(chunks, -1, thetas.shape[-1]), policy)
-    return thetas[:count], x[:count]
+    x, again = _features(source, draws)(k_roll, thetas.reshape(chunks, -1, thetas.shape[-1]), policy)
+    return thetas[:count], x[:count], again[:count]
 
 
 def features(source: Source, key: Array, thetas: Array, policy: Policy) -> Array:
     """Features [chunks * n, D] of trajectories at thetas [chunks, n, d]."""
-    return _features(source)(key, thetas, policy)
+    return _features(source, 1)(key, thetas, policy)[0]
+
+
+def noise_draws(loop: Loop) -> int:
+    """How often each simulated trajectory is measured: as often as asked for and as there is room for."""
+    b, source = loop.settings, loop.source
+    if source is None or not source.noisy or loop.moves:  # simulations kept lose their order where ranges move
+        return 1
+    return max(1, min(b.noiseDraws, ROOM // (4 * (b.trainTrajs + b.checkTrajs) * max(1, loop.feature_size))))
 
 
 @functools.lru_cache(maxsize=32)
-def _features(source: Source) -> Callable[[Array, Array, Policy], Array]:
-    def run(key: Array, thetas: Array, policy: Policy) -> Array:
+def _features(source: Source, draws: int) -> Callable[[Array, Array, Policy], tuple[Array, Array]]:
+    def measured(at: tuple[Array, Array], policy: Policy) -> Array:
+        return source.simulate(*at, policy)[:, None] if draws == 1 else source.measured(*at, policy, draws)
+
+    def run(key: Array, thetas: Array, policy: Policy) -> tuple[Array, Array]:
         keys = jax.random.split(key, thetas.shape[0])
-        features = jax.lax.map(lambda at: source.simulate(at[0], at[1], policy), (keys, thetas))
-        return features.reshape(-1, features.shape[-1])
+        features = jax.lax.map(lambda at: measured(at, policy), (keys, thetas))
+        features = features.reshape(-1, *features.shape[-2:])
+        return features[:, 0], features[:, 1:]
 
     return program(run, source.env)
 

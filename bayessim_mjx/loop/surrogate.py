@@ -11,6 +11,7 @@ from jax import Array
 
 from bayessim_mjx.env import Env
 from bayessim_mjx.inference.summaries import Summarizer
+from bayessim_mjx.keys import branch
 from bayessim_mjx.logs import Channels
 from bayessim_mjx.loop.collection import POLICY_DEPENDENT, policy_function
 from bayessim_mjx.loop.seen import Seen, named, summarise, tiled
@@ -76,14 +77,36 @@ class Surrogate:
         """Features [N, D] of simulated trajectories at `thetas`."""
         return summarise(self.summarizer, self._observe(key, thetas, policy))
 
+    @property
+    def noisy(self) -> bool:
+        """Whether sensors add anything."""
+        return self.noise > 0
+
+    def measured(self, key: Array, thetas: Array, policy: Policy, draws: int) -> Array:
+        """Features [N, draws, D] of trajectories at `thetas`, each measured so often; first those of `simulate`."""
+        k_roll, k_noise = jax.random.split(key)
+        clean = self._acted(k_roll, thetas, policy)
+
+        def again(draw: Array) -> Array:
+            return summarise(self.summarizer, self._noisy(jnp.where(draw > 0, branch(k_noise, draw), k_noise), clean))
+
+        found = jax.lax.map(again, jnp.arange(draws, dtype=jnp.uint32))
+        return jnp.moveaxis(found, 0, 1)
+
     def _observe(self, key: Array, thetas: Array, policy: Policy) -> Trajectory:
         k_roll, k_noise = jax.random.split(key)
+        return self._noisy(k_noise, self._acted(k_roll, thetas, policy))
+
+    def _acted(self, key: Array, thetas: Array, policy: Policy) -> Trajectory:
+        """Trajectories without measurement noise."""
         actions = self.env.action_size
         act = policy_function(self.policy_name, policy, actions, self.memory)
-        trajectory = rollout(self.env, act, k_roll, thetas, self.length)
-        seen, action = trajectory.observation, trajectory.action[..., : actions - self.memory]
-        noisy = seen + self.noise * jax.random.normal(k_noise, seen.shape)
-        return dataclasses.replace(trajectory, observation=noisy, action=action)
+        trajectory = rollout(self.env, act, key, thetas, self.length)
+        return dataclasses.replace(trajectory, action=trajectory.action[..., : actions - self.memory])
+
+    def _noisy(self, key: Array, trajectory: Trajectory) -> Trajectory:
+        seen = trajectory.observation
+        return dataclasses.replace(trajectory, observation=seen + self.noise * jax.random.normal(key, seen.shape))
 
     def real(self, key: Array, first: int, count: int, policy: Policy) -> tuple[Array, Trajectory]:
         """`count` real trajectories and their features [count, D]; `first` of them were asked for before."""

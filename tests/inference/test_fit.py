@@ -1,6 +1,7 @@
 """The network against posteriors known in closed form."""
 
 import dataclasses
+import types
 
 import jax
 import jax.numpy as jnp
@@ -8,8 +9,9 @@ import numpy as np
 import pytest
 
 from bayessim_mjx.inference import InferenceSettings, combine, condition, fit, infer, init, mdn
-from bayessim_mjx.inference.data import Data
+from bayessim_mjx.inference.data import Again, Data
 from bayessim_mjx.inference.ensemble import weigh
+from bayessim_mjx.inference.train import _Member
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 
 SPACE = ParameterSpace([Parameter("mass", 1.0, 0.5, 2.5), Parameter("length", 1.0, -2.0, 4.0)])
@@ -133,6 +135,32 @@ def test_diverged_simulations_are_left_out_and_counted():
     assert int(info.skipped) == 0 and np.all(np.isfinite(info.val_loss))
     with pytest.raises(ValueError, match="none of the 240 rows"):
         fit(key(1), state, thetas, np.full_like(x, np.nan))
+
+
+@pytest.mark.slow
+@pytest.mark.ci
+def test_further_draws_of_noise_that_are_no_other_change_nothing():
+    thetas, x = linear_gaussian(ROWS)
+    own = jnp.asarray(np.where(np.arange(ROWS) < 80, np.arange(ROWS), -1), jnp.int32)
+    found = []
+    for change in (0.0, 0.1):
+        again = Again(jnp.asarray(np.repeat(x[:80, None], 3, axis=1) + change), own)
+        found.append(fit(key(1), init(key(), QUICK, SPACE, 4), thetas, x, again=again)[0])
+    plain, _ = fit(key(1), init(key(), QUICK, SPACE, 4), thetas, x)
+    same, other = ([np.asarray(leaf, float) for leaf in jax.tree.leaves(state.params)] for state in found)
+    before = [np.asarray(leaf, float) for leaf in jax.tree.leaves(plain.params)]
+    away = [max(np.abs(a - b).max() for a, b in zip(leaves, before, strict=True)) for leaves in (same, other)]
+    assert away[0] < 1e-4 < away[1]
+
+
+def test_each_turn_a_row_is_seen_with_the_next_of_its_draws():
+    own = jnp.asarray([-1, 0, 1, -1], jnp.int32)
+    data = Data(jnp.zeros((1, 4 + 2 * 2, 3)), None, None, jnp.ones(4, bool), None, None, None, None, own, 3)
+    member = types.SimpleNamespace(data=data)
+    rows = jnp.arange(4, dtype=jnp.int32)
+    seen = np.stack([_Member.seen(member, rows, jnp.full(4, turn, jnp.uint32)) for turn in range(6)])
+    assert {tuple(sorted(set(column.tolist()))) for column in seen.T} == {(0,), (1, 4, 6), (2, 5, 7), (3,)}
+    assert np.all((seen[1:, 1] != seen[:-1, 1]) & (seen[1:, 2] != seen[:-1, 2]))
 
 
 @pytest.mark.slow

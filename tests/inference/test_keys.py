@@ -24,13 +24,13 @@ def test_a_purpose_of_its_own_has_a_key_that_no_member_has():
 
 def test_units_are_dropped_by_other_keys_in_every_layer_step_and_point_of_the_curve(monkeypatch):
     points, chunk, used = 60, 5, []
-    data = types.SimpleNamespace(train=jnp.ones(12, bool), x=jnp.zeros((1, 12, 2)))
-    member = types.SimpleNamespace(data=data, settings=InferenceSettings(batch=4))
+    data = types.SimpleNamespace(train=jnp.ones(12, bool), x=jnp.zeros((1, 12, 2)), own=None)
+    member = types.SimpleNamespace(data=data, settings=InferenceSettings(batch=4), seen=lambda rows, turn: rows)
     monkeypatch.setattr(mdnn, "_noise", lambda key, shape: used.append(np.asarray(key)) or jnp.zeros(shape, jnp.uint32))
     monkeypatch.setattr(mdnn.jax.nn, "silu", lambda x: x)
     params = {"layers": [{"w": jnp.ones((2, 2)), "b": jnp.zeros(2)}] * 4}
     for i in range(-2, points):  # the trials of bases come before 0
-        _, keys = _Member.batches(member, KEY + jnp.asarray(i, jnp.int32).astype(KEY.dtype) * APART, chunk)
+        _, _, keys = _Member.batches(member, KEY + jnp.asarray(i, jnp.int32).astype(KEY.dtype) * APART, chunk)
         for key in keys:
             mdnn._hidden(params, jnp.ones((4, 2)), (key, jnp.float32(0.1)))
     assert len({tuple(key.tolist()) for key in used}) == len(used) == 62 * chunk * 3

@@ -31,6 +31,7 @@ class Stub:
     quiet: float = 1.0  # noise of the simulations that are fitted: < 1 makes a network that is too sure
     policy_dependent: bool = False
     env: None = None  # no robot that programs are compiled for
+    noisy: bool = False  # no other draws of noise are asked for
     truth: np.ndarray = dataclasses.field(default_factory=lambda: TRUTH)
     channels: sources.Seen = sources.Seen(1, ("height",), ("push",))
 

@@ -5,10 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from bayessim_mjx import config, loop
 from bayessim_mjx.config import PPOConfig
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.loop import sources
 from bayessim_mjx.parameters import Parameter, ParameterSpace
+from bayessim_mjx.registry import make
 from bayessim_mjx.rl import networks, normalise
 
 SPACE = ParameterSpace(
@@ -21,8 +23,8 @@ SPACE = ParameterSpace(
 
 
 def policy_of_size(actions: int) -> networks.Policy:
-    config = PPOConfig(hidden_actor=(4,), hidden_critic=(4,), init_std=0.5)
-    actor = networks.init(jax.random.PRNGKey(0), networks.Sizes(3, 3, actions), config)["actor"]
+    settings = PPOConfig(hidden_actor=(4,), hidden_critic=(4,), init_std=0.5)
+    actor = networks.init(jax.random.PRNGKey(0), networks.Sizes(3, 3, actions), settings)["actor"]
     return networks.Policy(actor=actor, normalizer=normalise.init(3), activation="elu", normalize=True, action_clip=1.0)
 
 
@@ -100,3 +102,20 @@ def test_the_truth_is_the_heaviest_component():
 def test_samples_stay_inside_the_box():
     samples = np.asarray(surrogate(sds=np.full((2, 3), 5.0)).sample(jax.random.PRNGKey(0), 1000))
     assert np.all(samples >= SPACE.low) and np.all(samples <= SPACE.high)
+
+
+def test_a_trajectory_measured_again_has_other_noise_and_nothing_else():
+    settings = config.load("Pendulum", overrides=["bayessim.collectPolicy=policy_random", "bayessim.trainTrajLen=5"])
+    source = loop.make(settings, make("Pendulum", config=settings)).source
+    key, thetas = jax.random.PRNGKey(0), jnp.tile(source.truth, (200, 1))
+    once = jax.jit(lambda k, t: source.simulate(k, t, None))(key, thetas)
+    often = np.asarray(jax.jit(lambda k, t: source.measured(k, t, None, 3))(key, thetas))
+    assert source.noisy and often.shape == (200, 3, once.shape[1])
+    np.testing.assert_allclose(often[:, 0], once, atol=1e-5)
+    spread = (often[:, 1:] - often[:, :1]).std((0, 1)) / np.sqrt(2)
+    seen = np.array([not name.startswith("action") for name in source.channels.features("summary_start")])
+    np.testing.assert_allclose(spread[spread > 0], source.noise, rtol=0.2)
+    assert 0 < (spread > 0).sum() <= seen.sum()
+    assert (
+        np.abs(np.corrcoef((often[:, 1] - often[:, 0]).ravel(), (often[:, 2] - often[:, 0]).ravel())[0, 1] - 0.5) < 0.1
+    )
