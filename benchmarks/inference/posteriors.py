@@ -26,24 +26,32 @@ from c2st import c2st
 from problems import PROBLEMS, Problem
 from sbi_peer import peer
 
-from bayessim_mjx.inference import InferenceSettings, calibration, condition, fit, init
+from bayessim_mjx.inference import Again, InferenceSettings, calibration, condition, fit, init
 
 OBSERVATIONS, HELD_OUT = 3, 1000
 
 
-def ours(problem: Problem, seed: int, thetas: Any, x: Any, options: dict) -> tuple[dict, Callable, Callable | None]:
+def ours(
+    problem: Problem, seed: int, thetas: Any, x: Any, options: dict, draws: int = 1
+) -> tuple[dict, Callable, Callable | None]:
     """Fit twice, the second time compiled; -> row, sampler of (x, n), and log score and credible levels of pairs."""
     settings = InferenceSettings(**{**problem.settings, **options})
+    again = None
+    if draws > 1 and problem.measured:
+        keys = jax.random.split(jax.random.PRNGKey(2000 + seed), draws - 1)
+        more = jnp.stack([problem.simulate(key, thetas) for key in keys], axis=1)
+        again = Again(more, jnp.arange(len(thetas), dtype=jnp.int32))
     seconds, cpu = [], []
     for _ in range(2):
         wall, process = time.perf_counter(), time.process_time()
         state = init(jax.random.PRNGKey(seed), settings, problem.space, x.shape[1])
-        state, info = fit(jax.random.PRNGKey(seed + 1), state, thetas, x)
+        state, info = fit(jax.random.PRNGKey(seed + 1), state, thetas, x, again=again)
         jax.block_until_ready(state.params)
         seconds.append(time.perf_counter() - wall)
         cpu.append(time.process_time() - process)
     row = {
         "model": settings.modelClass,
+        "draws of noise": 1 if again is None else draws,
         "coordinates": settings.coordinates,
         "wall s": round(seconds[1], 2),
         "cpu s": round(cpu[1], 2),
@@ -93,6 +101,7 @@ def main() -> None:
     parser.add_argument("--simulations", type=int, default=10_000)
     parser.add_argument("--samples", type=int, default=5000, help="of each posterior, for C2ST; 0: no C2ST")
     parser.add_argument("--defaults", action="store_true", help="not the settings that suit the problem")
+    parser.add_argument("--draws", type=int, default=16, help="of measurement noise, where a problem has any")
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--first", type=int, default=0, help="the first seed")
     parser.add_argument("--only-peers", action="store_true", help="not the library itself")
@@ -109,7 +118,7 @@ def main() -> None:
         problem = PROBLEMS[name]()
         if args.defaults:
             problem = replace(problem, settings={})
-        models: list[Callable] = [] if args.only_peers else [lambda *a: ours(*a, options)]
+        models: list[Callable] = [] if args.only_peers else [lambda *a: ours(*a, options, args.draws)]
         models += [lambda *a, e=e: peer(*a, e, args.epochs) for e in args.peers]
         for seed in range(args.first, args.first + args.seeds):
             for model in models:

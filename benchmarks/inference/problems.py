@@ -23,6 +23,7 @@ class Problem:
     simulate: Callable[[Array, Array], Array]  # key, theta [n, d] -> x [n, D]
     exact: Callable[[np.random.Generator, np.ndarray, int], np.ndarray]  # rng, x [D], n -> theta [n, d]
     settings: dict  # what suits the problem: Gaussian priors are exact in probit coordinates
+    measured: bool = False  # whether all that `simulate` draws is measurement noise, added to one motion of theta
 
     def pairs(self, key: Array, n: int) -> tuple[Array, Array]:
         """theta [n, d] from the prior, x [n, D]."""
@@ -111,7 +112,7 @@ def pendulum() -> Problem:
     def _log_likelihood(y: np.ndarray, x: np.ndarray) -> np.ndarray:
         return -0.5 * np.sum(((y - x) / noise) ** 2, axis=1, dtype=np.float64)
 
-    return Problem("pendulum", space, simulate, exact, {"coordinates": "plain", "components": 8, "ensemble": 5})
+    return Problem("pendulum", space, simulate, exact, {"coordinates": "plain", "components": 8, "ensemble": 5}, True)
 
 
 def _resample(rng: np.random.Generator, log_weights: np.ndarray, n: int) -> np.ndarray:
