@@ -6,6 +6,7 @@ import numpy as np
 
 from bayessim_mjx.frames import rotation, xyzw
 from bayessim_mjx.mirrors import Mirror
+from bayessim_mjx.tasks._terms import told
 
 NAMES = (
     *(f"to_target_{i}" for i in "xyz"),
@@ -25,13 +26,15 @@ def flight(target: jax.Array | np.ndarray, qpos: jax.Array, qvel: jax.Array) -> 
 
 def hovering(
     target: jax.Array | np.ndarray, qpos: jax.Array, qvel: jax.Array, upright: float = 1.0
-) -> tuple[jax.Array, jax.Array]:
-    """(reward of a step, distance to the target in m): at most 2 + `upright`, near the target, level, not turning."""
+) -> tuple[jax.Array, jax.Array, dict[str, jax.Array]]:
+    """(reward of a step, distance to the target in m, metrics): at most 2 + `upright`, near, level, not turning."""
     distance, turn = jnp.linalg.norm(target - qpos[:3]), rotation(qpos[3:7])
     tilt, spin = jnp.abs(1 - turn[2, 2]), turn[2] @ qvel[3:6]
     near = 1 / (1 + distance**2)
     # p + p (w / (1 + tilt^2) + 1 / (1 + spin^2))
-    return near + near * (upright / (1 + tilt**2) + 1 / (1 + spin**2)), distance
+    level, steady = upright / (1 + tilt**2), 1 / (1 + spin**2)
+    parts = told({"near": near, "level": near * level, "steady": near * steady})
+    return near + near * (level + steady), distance, {"distance": distance} | parts
 
 
 def left_right(joints: dict[str, str], task: tuple[str, ...] = ()) -> Mirror:

@@ -15,6 +15,7 @@ import mujoco
 from bayessim_mjx.mirrors import Mirror
 from bayessim_mjx.physics import World, mjx
 from bayessim_mjx.tasks._running import approach, mirrored_loads, posture, posture_reward
+from bayessim_mjx.tasks._terms import told
 from bayessim_mjx.tasks.locomotion import Locomotion
 
 FEET = ("front_left_foot", "front_right_foot", "left_back_foot", "right_back_foot")
@@ -66,4 +67,7 @@ class Ant(Locomotion):
             progress + 0.5 + posture_reward(up, heading) - 0.005 * jnp.sum(action**2) - 0.05 * energy - 0.1 * at_limit
         )
         fallen = after.qpos[2] < FALLEN
-        return jnp.where(fallen, -2.0, reward), fallen, {"forward_speed": progress, "height": after.qpos[2]}
+        parts = {"progress": progress, "alive": 0.5, "posture": posture_reward(up, heading)}
+        parts |= {"actions": -0.005 * jnp.sum(action**2), "energy": -0.05 * energy, "limits": -0.1 * at_limit}
+        metrics = {"forward_speed": progress, "height": after.qpos[2]}
+        return jnp.where(fallen, -2.0, reward), fallen, metrics | told(parts, fallen, -2.0)

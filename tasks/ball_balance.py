@@ -26,6 +26,7 @@ from bayessim_mjx.physics import World, mjx
 from bayessim_mjx.physics.warp import wrenches
 from bayessim_mjx.tasks._rate_control import RateControlled
 from bayessim_mjx.tasks._scene import FLOOR, scene
+from bayessim_mjx.tasks._terms import told
 
 LEGS = range(3)  # at 0, 120 and 240 degrees
 RADIUS, LENGTH = 0.4, 0.36  # m, of hips and feet about the middle; of a link
@@ -156,7 +157,7 @@ class BallBalance(RateControlled):
         ball, velocity = after.qpos[BALL_QPOS], after.qvel[BALL_QVEL]
         distance = jnp.linalg.norm(ball - AIM)
         reward = 1 / (1 + distance) / (1 + jnp.linalg.norm(velocity))
-        return reward, ball[2] < 1.5 * BALL_RADIUS, {"ball_distance": distance}
+        return reward, ball[2] < 1.5 * BALL_RADIUS, {"ball_distance": distance} | told({"ball": reward})
 
     def _loads(self, data: mjx.Data) -> jax.Array:
         """`[12]`: of the three sensors the force along x, then torques about x, about y and about z (N, N m)."""

@@ -13,6 +13,7 @@ import mujoco
 from bayessim_mjx.env import Observations, Task
 from bayessim_mjx.mirrors import Mirror
 from bayessim_mjx.physics import World, mjx
+from bayessim_mjx.tasks._terms import told
 
 # The URDF gives no inertias: those of the boxes. The slide limit of +-4 m lies outside |x| > 3 and is left out.
 XML = """
@@ -93,4 +94,5 @@ class Cartpole(Task):
         fallen = (jnp.abs(x) > self.settings["resetDist"]) | (jnp.abs(angle) > jnp.pi / 2)
         # 1 - theta^2 - 0.01 |x_dot| - 0.005 |theta_dot|, and -2 at the end
         reward = 1.0 - angle**2 - 0.01 * jnp.abs(speed) - 0.005 * jnp.abs(spin)
-        return jnp.where(fallen, -2.0, reward), fallen, {"pole_angle": jnp.abs(angle)}
+        parts = {"alive": 1.0, "angle": -(angle**2), "speed": -0.01 * jnp.abs(speed), "spin": -0.005 * jnp.abs(spin)}
+        return jnp.where(fallen, -2.0, reward), fallen, {"pole_angle": jnp.abs(angle)} | told(parts, fallen, -2.0)

@@ -20,6 +20,7 @@ import numpy as np
 from bayessim_mjx.env import Observations
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.physics import World, mjx
+from bayessim_mjx.tasks._terms import told
 from bayessim_mjx.tasks.manipulation import Manipulation, Pose, alignment, closeness
 
 JOINTS = (*(f"joint{i}" for i in range(1, 8)), "finger1", "finger2")
@@ -91,15 +92,20 @@ class FrankaCabinet(Manipulation):
         turn = 0.5 * (alignment(grasp.turn[:, 2], INWARDS) + alignment(grasp.turn[:, 1], UP))
         around, fingers = _around(left, right, handle)
         beyond = jnp.minimum(left.position[0], right.position[0]) < handle.position[0] - REACH
+        parts = {"turn": 0.5 * turn}
         if self.variant == "bayessim2021":
-            posture = 1.5 * closeness(distance, NEAR) + 0.5 * turn + around + 10 * fingers
-            reward, ends = posture + 4 * drawer + _ladder(drawer) - cost, beyond
+            parts |= {"near": 1.5 * closeness(distance, NEAR), "around": around, "fingers": 10 * fingers}
+            parts |= {"drawer": 4 * drawer, "steps": _ladder(drawer)}
+            ends = beyond
         else:
-            posture = 2 * closeness(distance, NEAR) + 0.5 * turn + 0.25 * around + 5 * fingers
-            reward = posture + 7.5 * drawer * (1 + around) + _bonus(drawer, around) - cost
+            parts |= {"near": 2 * closeness(distance, NEAR), "around": 0.25 * around, "fingers": 5 * fingers}
+            parts |= {"drawer": 7.5 * drawer * (1 + around), "steps": _bonus(drawer, around)}
             ends = drawer > 0.39
+        reward = parts["near"] + parts["turn"] + parts["around"] + parts["fingers"]
+        reward = reward + parts["drawer"] + parts["steps"] - cost
         opened = (after.task["opened"] > OPENED).astype(jnp.float32)
-        return jnp.where(beyond, -1.0, reward), ends, {"drawer": drawer, "opened": opened, "handle_distance": distance}
+        metrics = {"drawer": drawer, "opened": opened, "handle_distance": distance}
+        return jnp.where(beyond, -1.0, reward), ends, metrics | told(parts | {"actions": -cost}, beyond, -1.0)
 
 
 def _around(left: Pose, right: Pose, handle: Pose) -> tuple[jax.Array, jax.Array]:

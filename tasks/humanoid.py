@@ -15,6 +15,7 @@ import numpy as np
 
 from bayessim_mjx.physics import World, mjx
 from bayessim_mjx.tasks._running import approach, posture, posture_reward
+from bayessim_mjx.tasks._terms import told
 from bayessim_mjx.tasks.locomotion import Locomotion
 
 # N m at the action 1
@@ -52,4 +53,7 @@ class Humanoid(Locomotion):
         cost = 0.01 * jnp.sum(action**2) + 0.05 * energy + 0.25 * at_limits
         reward = progress + 2.0 + posture_reward(*posture(after.qpos)) - cost
         fallen = after.qpos[2] < FALLEN
-        return jnp.where(fallen, -1.0, reward), fallen, {"forward_speed": progress, "height": after.qpos[2]}
+        parts = {"progress": progress, "alive": 2.0, "posture": posture_reward(*posture(after.qpos))}
+        parts |= {"actions": -0.01 * jnp.sum(action**2), "energy": -0.05 * energy, "limits": -0.25 * at_limits}
+        metrics = {"forward_speed": progress, "height": after.qpos[2]}
+        return jnp.where(fallen, -1.0, reward), fallen, metrics | told(parts, fallen, -1.0)

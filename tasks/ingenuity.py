@@ -137,9 +137,9 @@ class Ingenuity(Task):
     def reward(
         self, before: World, after: World, data: mjx.Data, action: jax.Array
     ) -> tuple[jax.Array, jax.Array, dict[str, jax.Array]]:
-        reward, distance = hovering(self._target(after), after.qpos, after.qvel, UPRIGHT[self.variant])
+        reward, distance, metrics = hovering(self._target(after), after.qpos, after.qvel, UPRIGHT[self.variant])
         lost = (distance > MAX_DISTANCE) | (after.qpos[2] < LOWEST)
-        return reward, lost, {"distance": distance}
+        return reward, lost, metrics
 
     def _target(self, world: World) -> jax.Array:
         """The target `[3]` (m) of the step that led to this world; the second one begins with step 501."""

@@ -14,6 +14,7 @@ from bayessim_mjx.env import Observations, Task
 from bayessim_mjx.frames import wrap
 from bayessim_mjx.mirrors import Mirror
 from bayessim_mjx.physics import World, mjx
+from bayessim_mjx.tasks._terms import told
 
 # Rod of mass 1 kg and length 1 m: com at l/2, inertia m l^2 / 12 about it (and a negligible one along the rod).
 XML = """
@@ -74,4 +75,5 @@ class Pendulum(Task):
         # of the state before the step: -(angle^2 + 0.1 speed^2 + 0.001 u^2), angle in (-pi, pi]
         angle, speed, torque = wrap(before.qpos[0]), before.qvel[0], self.command(action)[0]
         reward = -(angle**2 + 0.1 * speed**2 + 0.001 * torque**2)
-        return reward, jnp.zeros((), bool), {"upright": jnp.cos(angle)}
+        parts = told({"angle": -(angle**2), "speed": -0.1 * speed**2, "torque": -0.001 * torque**2})
+        return reward, jnp.zeros((), bool), {"upright": jnp.cos(angle)} | parts

@@ -127,6 +127,6 @@ class Quadcopter(RateControlled):
     def reward(
         self, before: World, after: World, data: mjx.Data, action: jax.Array
     ) -> tuple[jax.Array, jax.Array, dict[str, jax.Array]]:
-        reward, distance = hovering(TARGET, after.qpos, after.qvel)
+        reward, distance, metrics = hovering(TARGET, after.qpos, after.qvel)
         lost = (distance > MAX_DISTANCE) | (after.qpos[2] < LOWEST)
-        return reward, lost, {"distance": distance}
+        return reward, lost, metrics

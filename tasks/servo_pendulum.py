@@ -14,6 +14,7 @@ from bayessim_mjx.env import Observations, Task
 from bayessim_mjx.frames import wrap
 from bayessim_mjx.mirrors import Mirror
 from bayessim_mjx.physics import World, mjx
+from bayessim_mjx.tasks._terms import told
 
 VOLTAGE = 7.4  # V, supply of the rig; command = duty * VOLTAGE
 # Nominal motor: the data sheet's stall (0.52 N m, 1.47 A at 5 V): kt = 0.354 N m/A, R = 3.40 Ohm; the rest is a guess.
@@ -107,4 +108,6 @@ class ServoPendulum(Task):
         near = jnp.exp(-((wrap(error) / 0.1) ** 2))
         # 0.25 (1 + cos e) + 0.5 exp(-(e/0.1)^2) - 0.02 (w/10)^2 - 0.01 a^2
         reward = 0.25 * (1.0 + jnp.cos(error)) + 0.5 * near - 0.02 * (speed / 10.0) ** 2 - 0.01 * action[0] ** 2
-        return reward, jnp.zeros((), bool), {"error": jnp.abs(wrap(error)), "near": near}
+        parts = {"towards": 0.25 * (1.0 + jnp.cos(error)), "near": 0.5 * near}
+        parts |= {"speed": -0.02 * (speed / 10.0) ** 2, "action": -0.01 * action[0] ** 2}
+        return reward, jnp.zeros((), bool), {"error": jnp.abs(wrap(error)), "near": near} | told(parts)

@@ -21,6 +21,7 @@ from bayessim_mjx.errors import UserError
 from bayessim_mjx.frames import conjugate, product, rotation, xyzw
 from bayessim_mjx.physics import World, mjx
 from bayessim_mjx.physics.warp import wrenches
+from bayessim_mjx.tasks._terms import told
 from bayessim_mjx.tasks.manipulation import Manipulation
 
 FINGERS = ("FF", "MF", "RF", "LF")
@@ -243,7 +244,10 @@ class ShadowHand(Manipulation):
         fallen = distance >= FALLEN
         reward = -10 * distance + 1 / (angle + 0.1) - 0.0002 * jnp.sum(action**2)
         reward += 250 * after.task["reached"] + self.settings["fallPenalty"] * fallen
-        return reward, fallen, {"consecutive_successes": after.task["successes"], "goal_angle": angle}
+        parts = {"distance": -10 * distance, "angle": 1 / (angle + 0.1), "actions": -0.0002 * jnp.sum(action**2)}
+        parts |= {"goals": 250 * after.task["reached"], "fall": self.settings["fallPenalty"] * fallen}
+        metrics = {"consecutive_successes": after.task["successes"], "goal_angle": angle}
+        return reward, fallen, metrics | told(parts)
 
 
 def _random_turn(key: jax.Array) -> jax.Array:

@@ -60,6 +60,18 @@ def test_steps_stay_finite_over_the_whole_prior(task):
     assert (np.asarray(state.info["steps"]) == 40).all()
 
 
+def test_the_parts_of_the_reward_add_up_to_it(task):
+    """Also in the steps that end an episode, which some tasks pay otherwise."""
+    state = task.reset(*draw(task, 7))
+    rng = np.random.default_rng(1)
+    for _ in range(40):
+        state = task.step(state, rng.uniform(-1, 1, (task.worlds, task.env.action_size)).astype(np.float32))
+        parts = [np.asarray(x) for name, x in state.metrics.items() if name.startswith("reward_")]
+        assert parts
+        size = np.maximum(np.max(np.abs(parts), axis=0), 1.0)
+        assert np.all(np.abs(sum(parts) - state.reward) < 1e-5 * size)
+
+
 def test_actions_are_clipped_to_one(task):
     state = task.reset(*draw(task, 4))
     shape = (task.worlds, task.env.action_size)
@@ -87,6 +99,7 @@ def test_a_diverged_world_terminates_with_finite_numbers(task):
     assert after.done[0] == after.info["terminated"][0] == 1
     assert np.isfinite(after.obs["policy"]).all() and np.isfinite(after.reward).all()
     assert after.reward[0] == np.float32(task.env.diverged_reward)
+    assert all(np.isfinite(x).all() for x in after.metrics.values())
     assert np.array_equal(after.obs["policy"][1:], reference.obs["policy"][1:])  # the others do not notice
 
 
