@@ -12,65 +12,27 @@ import mujoco
 import numpy as np
 from isolable import isolable
 
-Z90, Z95 = 1.645, 1.960
-# parameters that do not mean the same in generator and library (another pivot, gusts, signed loads)
-LOOSE = ("base_flexibility", "external_force", "load_friction")
-VERDICTS = ("no_gap", "parameters", "unexplained", "insufficient_data", "no result")
+from bayessim_mjx.blind import outcome as judged
+from bayessim_mjx.blind.outcome import LOOSE, VERDICTS, covered, label, labels_of, wilson
+
+__all__ = ["LOOSE", "Outcome", "confusion", "label", "labels_of", "rates", "read", "wilson"]
+
 GOALS = {"weak": 3.0, "medium": 10.0, "strong": 30.0, "severe": 100.0}
 REACHED = 0.8  # of the strength that was asked for, or the case does not count
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """One case: its truth, its diagnosis (None where there is none), and whether two places are the same."""
+class Outcome(judged.Outcome):
+    """One case of the benchmark, with what its worker tells."""
 
-    folder: Path
-    truth: dict[str, Any]
-    said: dict[str, Any] | None
-    joint_of: dict[str, str]
-    seconds: float
     compile_seconds: float = math.nan
     true_closure: float | None = None  # what the true effects close, fitted by the same search
     isolable: bool | None = None  # None: not looked at
 
     @property
-    def kind(self) -> str:
-        return self.truth.get("kind") or ("null", "single", "double")[len(self.truth["effects"])]
-
-    @property
     def strong_enough(self) -> bool:
         goal = REACHED * GOALS[self.truth["strength"]]
         return all(min(e["raw"], 3 * e["left"]) >= goal for e in self.truth["effects"])
-
-    def named(self) -> list[dict[str, Any]]:
-        """Effects of the verdict; of one that names none, an empty list."""
-        return self.said["effects"] if self.said and self.said["verdict"] in ("effects", "ambiguous") else []
-
-    def same(self, name: str, where: str, effect: dict[str, Any]) -> bool:
-        """Whether a named effect at a place is the hidden one; actuators and their joints are one place."""
-        if name != effect["name"]:
-            return False
-        at = self.joint_of.get(effect["where"], effect["where"])
-        given = [self.joint_of.get(w, w) for w in where.replace("+", ",").split(",")]
-        return at == "world" or at in given or (where == "all" and len(set(self.joint_of.values())) <= 1)
-
-    def right(self, effect: dict[str, Any]) -> bool:
-        return any(self.same(f["name"], str(f["where"]), effect) for f in self.named())
-
-    def inside(self, effect: dict[str, Any]) -> bool:
-        """Named, or in the set of what cannot be told from what is named."""
-        rivals = [label for f in self.named() for entry in f["equivalent_to"] for label in labels_of(entry)]
-        return self.right(effect) or any(self.same(*label, effect) for label in rivals)
-
-
-def labels_of(entry: Any) -> list[tuple[str, str]]:
-    """ "effect@place" labels of an entry of equivalent_to, however it is written."""
-    if isinstance(entry, str):
-        name, _, where = entry.partition("@")
-        return [(name, where)]
-    if "effects" in entry:
-        return [label for e in entry["effects"] for label in labels_of(e)]
-    return [(entry["name"], str(entry.get("where", "")))]
 
 
 def read(folder: Path, results: str = "diagnosis", baseline: str | None = None) -> Outcome:
@@ -98,46 +60,16 @@ def _json(path: Path) -> Any:
     return json.loads(path.read_text()) if path.exists() else None
 
 
-def wilson(hits: int, n: int, z: float = Z95) -> tuple[float, float]:
-    """Interval of a rate."""
-    if not n:
-        return 0.0, 1.0
-    p, z2 = hits / n, z * z
-    middle, half = p + z2 / (2 * n), z * math.sqrt(p * (1 - p) / n + z2 / (4 * n * n))
-    return (middle - half) / (1 + z2 / n), (middle + half) / (1 + z2 / n)
-
-
 def mcnemar(a: int, b: int) -> float:
     """Two-sided exact p of McNemar's test: cases that one of two rules alone has right split as unevenly by chance."""
     n = a + b
     return min(1.0, 2.0 * sum(math.comb(n, k) for k in range(min(a, b) + 1)) / 2**n)
 
 
-def covered(outcome: Outcome) -> list[bool]:
-    """Of the rightly named effects: whether each parameter with the same meaning lies in its 90 % interval."""
-    found = []
-    for effect in outcome.truth["effects"]:
-        for f in outcome.named():
-            if effect["name"] in LOOSE or not outcome.same(f["name"], str(f["where"]), effect):
-                continue
-            for name, value in effect["parameters"].items():
-                given = f["parameters"].get(name)
-                if given and given["sd"]:
-                    found.append(abs(given["mean"] - value) <= Z90 * given["sd"])
-    return found
-
-
 def closure_errors(outcomes: Sequence[Outcome]) -> list[float]:
     """|share of the gap that what is named closes - share the true effects close|; nothing named closes nothing."""
     told = [o for o in outcomes if o.said and o.true_closure is not None]
     return [abs(sum(f["gap_closed"] or 0.0 for f in o.named()) - o.true_closure) for o in told]
-
-
-def label(outcome: Outcome) -> str:
-    """Column of the confusion matrix: the first effect named, else the verdict."""
-    if not outcome.said:
-        return "no result"
-    return outcome.named()[0]["name"] if outcome.named() else str(outcome.said["verdict"])
 
 
 @dataclass(frozen=True)

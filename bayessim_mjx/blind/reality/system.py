@@ -25,7 +25,8 @@ class System:
         lift: rad, how far off the reference the driven joints start, so that a foot starts above the floor.
         pace: Hz, of the reference motion.
         sigma: rad or m per joint, noise of the encoders.
-        base: the body that stands on the ground; tilts: whether a tilt of the ground, or its give, makes sense.
+        base: the body that stands on the ground; tilts: whether a tilt of the ground, or its give, makes sense;
+            load: gives the model where there is no `xml`.
     """
 
     name: str
@@ -42,6 +43,7 @@ class System:
     lift: float = 0.0
     base: str = "base"
     tilts: bool = True
+    load: Callable[[], mujoco.MjSpec] | None = None
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -56,7 +58,7 @@ class System:
         return ("foot",) if 'name="foot"' in self.xml else ()
 
     def spec(self) -> mujoco.MjSpec:
-        return mujoco.MjSpec.from_string(self.xml)
+        return self.load() if self.load else mujoco.MjSpec.from_string(self.xml)
 
     def record(self, plant: Plant, index: int, seed: int, noise: bool = True) -> Run:
         """Run `index` of RUNS: the outer controller sees noisy encoders, as the log does."""

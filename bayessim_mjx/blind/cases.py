@@ -1,0 +1,112 @@
+"""One blind case: hidden effect of a given strength, wrong base parameters, logs; its truth goes under seal."""
+
+import dataclasses
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from bayessim_mjx.blind import seal
+from bayessim_mjx.blind.amounts import amount_of
+from bayessim_mjx.blind.check import WIDEST, Bench, Check
+from bayessim_mjx.blind.reality.cause import Cause
+from bayessim_mjx.blind.reality.menu import CAUSES
+from bayessim_mjx.blind.reality.plant import Plant, Rig, Run, base_names
+from bayessim_mjx.blind.reality.replay import Replay
+from bayessim_mjx.blind.reality.strength import HIDDEN, resize
+from bayessim_mjx.logs import Channels
+
+GIVE_UP = 4  # times that an effect is halved because the motion does not stay finite
+EFFORT_NOISE = 0.01  # of its root mean square
+
+
+@dataclasses.dataclass(frozen=True)
+class Item:
+    """What is hidden in a case: kind is single, unknown or null; strength in encoder noises."""
+
+    index: int
+    kind: str
+    effect: str = ""
+    where: str = ""
+    strength: float = 0.0
+
+
+def make(check: Check, bench: Bench, item: Item) -> None:
+    """Write the logs of a case, its truth and its seal; a case that is whole stays as it is."""
+    if check.seal(item.index).exists():
+        return
+    given = check.given(item.index)
+    if given.exists():  # a killed run's
+        shutil.rmtree(given)
+    rng = np.random.default_rng((check.seed, item.index))
+    base = data_sheet(bench.rig, check.accuracy, rng)
+    effects, causes = [], []
+    if item.effect:
+        cause = CAUSES[item.effect](item.where, bench.scales, rng)
+        raw, left = resize(cause, bench.ruler, item.strength)
+        causes.append(cause)
+        effects.append({"raw": raw, "left": left})
+    plant, runs = _moved(bench.rig, base, causes, seed=int(rng.integers(2**31)))
+    write_logs(given / "logs", bench.rig, plant, runs, bench.velocity, bench.effort, rng)
+    for cause, told in zip(plant.causes, effects, strict=True):
+        told |= {"strength": min(told["raw"], HIDDEN * told["left"]), **hidden(cause)}
+    truth = dataclasses.asdict(item) | {"seed": check.seed, "base": base, "effects": effects}
+    salt = seal.digest(rng.bytes(32))
+    code = seal.close(truth | {"salt": salt}, given, check.secret(item.index))
+    seal.write(check.seal(item.index), code)
+
+
+def data_sheet(rig: Rig, accuracy: float, rng: np.random.Generator) -> dict[str, float]:
+    """Factors of masses, damping and armature: normal, within three standard deviations."""
+    names = base_names(rig.spec().compile())
+    return {n: 1 + accuracy * float(np.clip(rng.normal(), -WIDEST, WIDEST)) for n in names}
+
+
+def hidden(cause: Cause) -> dict[str, Any]:
+    """A cause as the truth of a case tells it."""
+    parameters = {k: float(v) for k, v in cause.parameters().items()}
+    amount = amount_of(cause.name, parameters)
+    return {"name": cause.name, "where": cause.where, "parameters": parameters, "size": cause.size, "amount": amount}
+
+
+def _moved(rig: Rig, base: dict[str, float], causes: list[Cause], seed: int) -> tuple[Plant, list[Run]]:
+    """The plant and all runs of it; a cause under which a long run does not stay finite is halved."""
+    for _ in range(GIVE_UP + 1):
+        plant = Plant(rig, base, causes)
+        runs = [rig.record(plant, i, seed) for i in range(len(rig.labels))]
+        if all(np.isfinite(r.clean).all() for r in runs):
+            return plant, runs
+        for cause in causes:
+            cause.size = max(0.5 * cause.size, cause.smallest)
+    raise RuntimeError(f"{rig.name}: the motion does not stay finite under {[c.name for c in causes]}")
+
+
+def write_logs(
+    folder: Path, rig: Rig, plant: Plant, runs: list[Run], velocity: bool, effort: bool, rng: np.random.Generator
+) -> None:
+    """CSV files and their side YAMLs in the library's format (docs/logs.md)."""
+    folder.mkdir(parents=True)
+    names = Channels.of(rig.spec().compile())
+    for i, r in enumerate(runs):
+        blocks = [("ctrl", names.actuators, r.ctrl), ("qpos", names.qpos, r.qpos)]
+        blocks += [("qvel", names.qvel, r.qvel)] if velocity else []
+        if effort and r.pull is not None:
+            level = EFFORT_NOISE * np.sqrt(np.mean(r.pull**2, axis=0))
+            blocks.append(("effort", names.actuators, r.pull + level * rng.normal(size=r.pull.shape)))
+        header = ["time", *(f"{stream}:{n}" for stream, own, _ in blocks for n in own)]
+        stem = folder / f"{i:02d}_{_plain(rig.labels[i])}"
+        table = np.concatenate([r.time[:, None], *(values for *_, values in blocks)], 1)
+        np.savetxt(stem.with_suffix(".csv"), table, fmt="%.9g", delimiter=",", header=",".join(header), comments="")
+        stem.with_suffix(".yaml").write_text(yaml.safe_dump(_metadata(rig, i), sort_keys=False), encoding="utf-8")
+
+
+def _metadata(rig: Rig, index: int) -> dict[str, Any]:
+    label = rig.labels[index]
+    own = dict(rig.takes[index].metadata) if isinstance(rig, Replay) else {}
+    return {"condition": label, "operating_condition": label, **own}
+
+
+def _plain(label: str) -> str:
+    return "".join(c if c.isalnum() or c in "-_" else "_" for c in label)[:40]

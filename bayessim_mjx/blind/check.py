@@ -1,0 +1,151 @@
+"""What a blind check was asked for, the rig that follows from it, and where its files lie."""
+
+import dataclasses
+import json
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from bayessim_mjx.blind import seal
+from bayessim_mjx.blind.reality.cause import Scales
+from bayessim_mjx.blind.reality.menu import CAUSES, KNOWN, UNKNOWN, places
+from bayessim_mjx.blind.reality.plant import Rig, base_names, scales_of
+from bayessim_mjx.blind.reality.strength import Ruler
+from bayessim_mjx.blind.robot import Load, load_model, load_task, rig_of_logs, rig_of_menu, short
+from bayessim_mjx.errors import UserError, unknown
+
+WIDEST = 3.0  # standard deviations by which a data-sheet value is off at most
+SETTINGS = "check.json"
+OURS = "bayessim-mjx diagnose"  # the entry that is checked where none is named
+
+
+@dataclasses.dataclass(frozen=True)
+class Check:
+    """What was asked for.
+
+    Attributes:
+        model: path of an MJCF file, or task: name of a task; data: files or folders of logs, () for a menu of motions.
+        effects: names of the effects that are hidden, () for all; accuracy: of data-sheet values (standard deviation).
+        seed: of everything; command: an entry (see `runner.command`), "" for `diagnose`; more: further arguments of it.
+    """
+
+    out: str
+    model: str = ""
+    task: str = ""
+    data: tuple[str, ...] = ()
+    map: str = ""
+    effects: tuple[str, ...] = ()
+    accuracy: float = 0.05
+    seed: int = 0
+    command: str = ""
+    more: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name in self.effects:
+            if name not in KNOWN:
+                raise unknown("effect", name, sorted(KNOWN))
+
+    @property
+    def folder(self) -> Path:
+        return Path(self.out)
+
+    @property
+    def name(self) -> str:
+        return self.task or Path(self.model).stem
+
+    def given(self, index: int) -> Path:
+        """What a diagnosis of a case gets: logs."""
+        return self.folder / "cases" / f"{index:04d}" / "given"
+
+    def answer(self, index: int) -> Path:
+        return self.folder / "cases" / f"{index:04d}" / "answer"
+
+    def secret(self, index: int) -> Path:
+        return self.folder / "sealed" / f"{index:04d}.json"
+
+    def seal(self, index: int) -> Path:
+        return self.folder / "cases" / f"{index:04d}" / seal.SEAL
+
+    def begin(self) -> None:
+        """Write the settings, or go on with a check of the same ones.
+
+        Raises:
+            UserError: another check lies in the folder.
+        """
+        path = self.folder / SETTINGS
+        own = {k: v for k, v in json.loads(json.dumps(dataclasses.asdict(self))).items() if k != "out"}
+        if not path.exists():
+            self.folder.mkdir(parents=True, exist_ok=True)
+            seal.write(path, json.dumps(own, indent=1))
+            return
+        before = json.loads(path.read_text())
+        other = [k for k in own if own[k] != before.get(k)]
+        if other:
+            told = ", ".join(f"{k} = {before.get(k)!r}, not {own[k]!r}" for k in other)
+            raise UserError(f"--out {self.out}: a check with {told} lies there; give another folder, or the same flags")
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Bench:
+    """What cases are made with.
+
+    Attributes:
+        rig: the robot and its runs; ruler: measures strengths; scales: what the robot does without causes.
+        load: the nominal model; velocity, effort: whether logs show them; slides: joints that are no hinges.
+    """
+
+    rig: Rig
+    ruler: Ruler
+    scales: Scales
+    load: Load
+    velocity: bool
+    effort: bool
+    slides: frozenset[str]
+
+    def groups(self, effects: tuple[str, ...]) -> list[tuple[str, str]]:
+        """(effect, place) of all that can be hidden here."""
+        return [(e, w) for e in (effects or tuple(KNOWN)) for w in places(self.rig, e, self.scales)]
+
+    def unknown(self) -> list[tuple[str, str]]:
+        return [(e, w) for e in UNKNOWN for w in places(self.rig, e, self.scales)]
+
+    def joint(self, where: str) -> str:
+        """The joint of a place, or the place itself."""
+        return self.scales.drives.get(where, where)
+
+    def slide(self, effect: str, where: str) -> bool:
+        """Whether the units of an effect at a place are those of a slide."""
+        return CAUSES[effect].kind in ("joint", "actuator") and self.joint(where) in self.slides
+
+
+def loader(check: Check) -> Load:
+    if check.task:
+        return load_task(check.task)
+    load_model(Path(check.model))
+    return lambda: load_model(Path(check.model))
+
+
+@lru_cache(maxsize=1)
+def bench(check: Check) -> Bench:
+    """The bench of a check; once in every process.
+
+    Raises:
+        UserError: what is wrong with model, logs or effects.
+    """
+    load = loader(check)
+    logs: list[Any] = []
+    rig: Rig
+    if check.data:
+        rig, logs = rig_of_logs(load, check.data, check.name, check.map or None)
+    else:
+        rig = rig_of_menu(load, check.name)
+    model = load().compile()
+    base = dict.fromkeys(base_names(model), 1.0)
+    ruler = Ruler(short(rig), base, WIDEST * check.accuracy, check.seed)
+    scales = scales_of(ruler.plain, ruler.runs)
+    slides = frozenset(model.joint(i).name for i in range(model.njnt) if int(model.jnt_type[i]) == 2)
+    effort = bool(logs) and all(any(s.startswith("effort:") for s in log.streams) for log in logs)
+    found = Bench(rig, ruler, scales, load, any(log.has_qvel for log in logs), effort, slides)
+    if not found.groups(check.effects):
+        raise UserError(f"--effects {','.join(check.effects)}: none of them makes sense on {check.name}")
+    return found

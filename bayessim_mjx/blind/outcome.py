@@ -1,0 +1,98 @@
+"""What a diagnosis.json is worth against an opened truth."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+Z90, Z95 = 1.645, 1.960
+# parameters that do not mean the same in the finer reality and in the library (another pivot, gusts, signed loads)
+LOOSE = ("base_flexibility", "external_force", "load_friction")
+VERDICTS = ("no_gap", "parameters", "unexplained", "insufficient_data", "no result")
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One case: its truth, its diagnosis (None where there is none), and which joint each actuator drives."""
+
+    folder: Path
+    truth: dict[str, Any]
+    said: dict[str, Any] | None
+    joint_of: Mapping[str, str]
+    seconds: float
+
+    @property
+    def kind(self) -> str:
+        return self.truth.get("kind") or ("null", "single", "double")[len(self.truth["effects"])]
+
+    def named(self) -> list[dict[str, Any]]:
+        """Effects of the verdict; of one that names none, an empty list."""
+        return self.said["effects"] if self.said and self.said["verdict"] in ("effects", "ambiguous") else []
+
+    def same(self, name: str, where: str, effect: Mapping[str, Any]) -> bool:
+        """Whether a named effect at a place is the hidden one; actuators and their joints are one place."""
+        if name != effect["name"]:
+            return False
+        at = self.joint_of.get(effect["where"], effect["where"])
+        given = [self.joint_of.get(w, w) for w in where.replace("+", ",").split(",")]
+        return at == "world" or at in given or (where == "all" and len(set(self.joint_of.values())) <= 1)
+
+    def right(self, effect: Mapping[str, Any]) -> bool:
+        return any(self.same(f["name"], str(f["where"]), effect) for f in self.named())
+
+    def inside(self, effect: Mapping[str, Any]) -> bool:
+        """Named, or in the set of what cannot be told from what is named."""
+        rivals = [label for f in self.named() for entry in f.get("equivalent_to", ()) for label in labels_of(entry)]
+        return self.right(effect) or any(self.same(*label, effect) for label in rivals)
+
+
+def labels_of(entry: Any) -> list[tuple[str, str]]:
+    """ "effect@place" labels of an entry of equivalent_to, however it is written."""
+    if isinstance(entry, str):
+        name, _, where = entry.partition("@")
+        return [(name, where)]
+    if "effects" in entry:
+        return [label for e in entry["effects"] for label in labels_of(e)]
+    return [(entry["name"], str(entry.get("where", "")))]
+
+
+def wilson(hits: int, n: int, z: float = Z95) -> tuple[float, float]:
+    """Interval of a rate."""
+    if not n:
+        return 0.0, 1.0
+    p, z2 = hits / n, z * z
+    middle, half = p + z2 / (2 * n), z * math.sqrt(p * (1 - p) / n + z2 / (4 * n * n))
+    return (middle - half) / (1 + z2 / n), (middle + half) / (1 + z2 / n)
+
+
+def covered(outcome: Outcome) -> list[bool]:
+    """Of the rightly named effects: whether each parameter with the same meaning lies in its 90 % interval."""
+    found = []
+    for effect in outcome.truth["effects"]:
+        for f in outcome.named():
+            if effect["name"] in LOOSE or not outcome.same(f["name"], str(f["where"]), effect):
+                continue
+            for name, value in effect["parameters"].items():
+                given = f.get("parameters", {}).get(name)
+                if given and given["sd"]:
+                    found.append(abs(given["mean"] - value) <= Z90 * given["sd"])
+    return found
+
+
+def label(outcome: Outcome) -> str:
+    """The first effect named, else the verdict."""
+    if not outcome.said:
+        return "no result"
+    return outcome.named()[0]["name"] if outcome.named() else str(outcome.said["verdict"])
+
+
+def alarm(outcome: Outcome) -> bool:
+    """Whether something is said to be wrong besides parameters."""
+    return label(outcome) not in ("no_gap", "parameters", "insufficient_data", "no result")
+
+
+def rate(answers: Sequence[bool]) -> dict[str, float]:
+    """{"hits", "n", "low", "high"}: a rate with its 95 % Wilson interval."""
+    low, high = wilson(sum(answers), len(answers))
+    return {"hits": sum(answers), "n": len(answers), "low": low, "high": high}

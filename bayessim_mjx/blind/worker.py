@@ -1,0 +1,116 @@
+"""A process that makes cases and has them diagnosed, one after the other, as it reads them from its input.
+
+Every diagnosis is a process of its own, in a folder that holds nothing but the logs of its case.
+"""
+
+import dataclasses
+import json
+import os
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+from bayessim_mjx.blind import seal
+from bayessim_mjx.blind.cases import Item, make
+from bayessim_mjx.blind.check import Check, bench, loader
+from bayessim_mjx.errors import UserError
+
+STOPPED = (130, -signal.SIGINT, -signal.SIGTERM)  # by somebody: to be run again
+TIMEOUT = 3600.0  # s per diagnosis
+QUIET = {name: "1" for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")}
+KEPT = ("diagnosis.json", "answer.json")
+EXIT = "exit.json"
+
+
+def command(check: Check, data: Path, out: Path) -> list[str]:
+    """The command of an entry: `{model}`, `{data}` and `{out}` in it are replaced, or ours without one."""
+    model = str(Path(check.model).resolve()) if check.model else str(data.parent / "model.xml")
+    if check.command:
+        words = [w.format(model=model, data=data, out=out) for w in shlex.split(check.command)]
+        return [str(Path(w).resolve()) if Path(w).is_file() else w for w in words]  # it runs in another folder
+    robot = ["--task", check.task] if check.task else ["--model", model]
+    accuracy = ["--accuracy", f"{100 * check.accuracy:g}%"] if not check.task else []
+    own = [sys.executable, "-m", "bayessim_mjx.diagnose", *robot, "--data", str(data), "--out", str(out)]
+    return [*own, *accuracy, "--seed", "0", "--headless", *check.more]
+
+
+def diagnose(check: Check, index: int) -> str:
+    """Diagnose the logs of a case; what came of it, in one line."""
+    answer = check.answer(index)
+    if (answer / EXIT).exists():
+        return "was there"
+    answer.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix="blind_") as folder:
+        work = Path(folder)
+        shutil.copytree(check.given(index) / "logs", work / "logs")
+        if check.command and check.task:
+            (work / "model.xml").write_text(loader(check)().to_xml())
+        out, started = work / "out", time.perf_counter()
+        with (answer / "output.txt").open("w") as text:
+            code = _run(command(check, work / "logs", out), work, text)
+        seconds = time.perf_counter() - started
+        for name in KEPT:
+            if (out / name).exists():
+                shutil.copy(out / name, answer / name)
+    if code in STOPPED:
+        raise KeyboardInterrupt
+    told: dict[str, Any] = {"code": code, "seconds": seconds, "seal": check.seal(index).read_text()}
+    seal.write(answer / EXIT, json.dumps(told))
+    return f"exit {code}"
+
+
+def _run(words: list[str], work: Path, text: Any) -> int:
+    try:
+        done = subprocess.run(
+            words, cwd=work, stdout=text, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL, timeout=TIMEOUT,
+            env=os.environ | QUIET,
+        )  # fmt: skip
+    except subprocess.TimeoutExpired:
+        return 124
+    except OSError as error:
+        raise UserError(f"--command {words[0]}: {error.strerror}") from None
+    return done.returncode
+
+
+def work(check: Check, item: Item) -> dict[str, Any]:
+    """{"index", "told", "seconds"}, or {"error"} for what the user can mend."""
+    started = time.perf_counter()
+    try:
+        make(check, bench(check), item)
+        told = diagnose(check, item.index)
+    except UserError as error:
+        return {"error": str(error)}
+    return {"index": item.index, "told": told, "seconds": time.perf_counter() - started}
+
+
+def main() -> int:
+    """First line: the check and the core to stay on; then one item a line, answered by a line each."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that the diagnosis ends with its worker
+    first = json.loads(sys.stdin.readline())
+    if first["core"] is not None and hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {first["core"]})  # before JAX counts the cores
+    given = {k: tuple(v) if isinstance(v, list) else v for k, v in first["check"].items()}
+    check, answers = Check(**given), os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)  # whatever prints must not answer
+    for line in sys.stdin:
+        try:
+            answer = work(check, Item(**json.loads(line)))
+        except KeyboardInterrupt:
+            return 130
+        print(json.dumps(answer), file=answers, flush=True)
+    return 0
+
+
+def asked(check: Check, core: int | None) -> str:
+    """The first line for a worker."""
+    return json.dumps({"check": dataclasses.asdict(check), "core": core})
+
+
+if __name__ == "__main__":
+    sys.exit(main())
