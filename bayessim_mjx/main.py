@@ -28,6 +28,7 @@ COMMANDS = {  # all of them, and what each is for
     "play": "returns, videos and ONNX files of a saved policy",
     "calibrate": "how far a finished run's posterior can be trusted",
     "diagnose": "what a simulator is missing, from recorded motion",
+    "blind": "which missing effects a diagnosis would find on your robot and logs",
     "gap_loop": "what a diagnosis is worth in return",
     "logs": "recordings of other tools (MCAP, ROS bags, LeRobot, HDF5) as logs for a diagnosis",
     "completion": "a script by which bash, zsh or fish completes commands and flags",
@@ -36,7 +37,7 @@ COMPLETION = (
     'Print a script of completions. bash: eval "$(bayessim-mjx completion bash)" in ~/.bashrc; '
     "fish: bayessim-mjx completion fish | source; zsh: write it to _bayessim-mjx in a folder of $fpath."
 )
-MODULES = {"logs": "import_logs"}  # of commands that are called otherwise
+MODULES = {"logs": "import_logs", "blind": "blind_check"}  # of commands that are called otherwise
 
 
 class Watched:

@@ -14,7 +14,8 @@ class Amount:
     """One number of a cause.
 
     Attributes:
-        what: the number, in words: "half of the play"; unit: with F for N m or N, and q for rad or m; "1" for shares.
+        what: the number, in words: "half of the play".
+        unit: with F for N m or N, q for rad or m, I for inertia; "1" for shares.
         of: makes it of the cause's parameters; it grows with the effect.
         inverse: people state one over it (a limit).
     """
@@ -44,7 +45,7 @@ AMOUNTS: dict[str, Amount] = {
     "asymmetric_friction": Amount("larger level", "F", _either("level_forward", "level_backward")),
     "viscous_friction": Amount("damping", "F s/q", _take("damping")),
     "quadratic_drag": Amount("coefficient", "F s²/q²", _take("coefficient")),
-    "armature": Amount("inertia", "F s²/q", _take("inertia")),
+    "armature": Amount("inertia", "I", _take("inertia")),
     "joint_spring": Amount("stiffness", "F/q", _either("stiffness", "cubic")),
     "backlash": Amount("half of the play", "q", _take("gap")),
     "joint_elasticity": Amount("compliance", "q/F", _take("compliance")),
@@ -81,6 +82,8 @@ def amount_of(effect: str, parameters: Parameters) -> float:
 def unit_of(effect: str, slide: bool) -> str:
     """`N m s/rad`, or `N s/m` at a slide."""
     text = AMOUNTS.get(effect, OTHER).unit
+    if text == "I":
+        return "kg" if slide else "kg m²"
     force, way = ("N", "m") if slide else ("N m", "rad")
     compound = text not in ("F", "q")
     text = text.replace("q/F", f"{way}/({force})" if " " in force else f"{way}/{force}")

@@ -12,6 +12,7 @@ from bayessim_mjx.blind import seal
 from bayessim_mjx.blind.amounts import amount_of
 from bayessim_mjx.blind.check import WIDEST, Bench, Check
 from bayessim_mjx.blind.reality.cause import Cause
+from bayessim_mjx.blind.reality.lookalikes import record
 from bayessim_mjx.blind.reality.menu import CAUSES
 from bayessim_mjx.blind.reality.plant import Plant, Rig, Run, base_names
 from bayessim_mjx.blind.reality.replay import Replay
@@ -33,6 +34,9 @@ class Item:
     strength: float = 0.0
 
 
+ITEM = tuple(f.name for f in dataclasses.fields(Item))
+
+
 def make(check: Check, bench: Bench, item: Item) -> None:
     """Write the logs of a case, its truth and its seal; a case that is whole stays as it is."""
     if check.seal(item.index).exists():
@@ -40,15 +44,16 @@ def make(check: Check, bench: Bench, item: Item) -> None:
     given = check.given(item.index)
     if given.exists():  # a killed run's
         shutil.rmtree(given)
-    rng = np.random.default_rng((check.seed, item.index))
-    base = data_sheet(bench.rig, check.accuracy, rng)
-    effects, causes = [], []
-    if item.effect:
-        cause = CAUSES[item.effect](item.where, bench.scales, rng)
+    base, causes, rng = drawn(check, bench, item)
+    effects = []
+    for cause in causes:
         raw, left = resize(cause, bench.ruler, item.strength)
-        causes.append(cause)
         effects.append({"raw": raw, "left": left})
+    sizes = [c.size for c in causes]
     plant, runs = _moved(bench.rig, base, causes, seed=int(rng.integers(2**31)))
+    if sizes != [c.size for c in causes]:
+        raw, left = bench.ruler.measure(record(causes[0], bench.ruler))
+        effects = [{"raw": raw, "left": left}]
     write_logs(given / "logs", bench.rig, plant, runs, bench.velocity, bench.effort, rng)
     for cause, told in zip(plant.causes, effects, strict=True):
         told |= {"strength": min(told["raw"], HIDDEN * told["left"]), **hidden(cause)}
@@ -56,6 +61,20 @@ def make(check: Check, bench: Bench, item: Item) -> None:
     salt = seal.digest(rng.bytes(32))
     code = seal.close(truth | {"salt": salt}, given, check.secret(item.index))
     seal.write(check.seal(item.index), code)
+
+
+def drawn(check: Check, bench: Bench, item: Item) -> tuple[dict[str, float], list[Cause], np.random.Generator]:
+    """(base parameters, the cause without its size, the generator of what is drawn after them) of a case."""
+    rng = np.random.default_rng((check.seed, item.index))
+    base = data_sheet(bench.rig, check.accuracy, rng)
+    return base, [CAUSES[item.effect](item.where, bench.scales, rng)] if item.effect else [], rng
+
+
+def again(check: Check, bench: Bench, item: Item, size: float) -> Cause:
+    """The cause that is hidden in a case."""
+    (cause,) = drawn(check, bench, item)[1]
+    cause.size = size
+    return cause
 
 
 def data_sheet(rig: Rig, accuracy: float, rng: np.random.Generator) -> dict[str, float]:

@@ -39,6 +39,7 @@ def findings(outcomes: Sequence[Outcome], own: Bench, effects: tuple[str, ...], 
         "unknown_unexplained": rate([label(o) == "unexplained" for o in unknown]),
         "coverage": rate([c for o in singles for c in covered(o)]),
         "closure": closure(singles),
+        "really_closed": _really_closed(singles),
         "confusion": _confusion(outcomes),
         "mistaken": mistaken(singles),
     }
@@ -49,13 +50,15 @@ def _threshold(group: tuple[str, str], curves: Curves, singles: Sequence[Outcome
     effect, where = group
     tried = [(o, e) for o in singles for e in o.truth["effects"] if (e["name"], e["where"]) == group]
     middle, low, high = curves.of(effect, where).interval()
-    most = max((t.strength for t in curves.all_of(effect)), default=0.0)
+    strongest = max(curves.all_of(effect), key=lambda t: t.strength, default=None)
+    most = strongest.strength if strongest else 0.0
     pairs = [(e["strength"], e["amount"]) for _, e in tried if e["strength"] > 0 and e["amount"] > 0]
     pairs = pairs or ([sizes[group]] if group in sizes else [])
     slide = own.slide(effect, where)
     found: Found = {
         "effect": effect, "where": where, "tried": len(tried), "found": sum(o.right(e) for o, e in tried),
-        "strength": [middle, low, high], "largest": most, "beyond": bool(most) and middle > most,
+        "strength": [middle, low, high], "largest": most,
+        "beyond": strongest is not None and not strongest.found and middle > most,
         "unit": amounts.unit_of(effect, slide), "amount": None, "told": "", "interval": "",
     }  # fmt: skip
     if pairs:
@@ -90,7 +93,15 @@ def _curves(curves: Curves, effects: Sequence[str]) -> Found:
 def closure(singles: Sequence[Outcome]) -> Found:
     """Shares of the gap that diagnoses with the right effect say they close: median and 90 % range, and how many."""
     said = [(o.said or {}).get("gap", {}).get("closed", {}).get("realised") for o in singles if _all_right(o)]
-    known = [float(s) for s in said if s is not None]
+    return _spread([float(s) for s in said if s is not None])
+
+
+def _really_closed(singles: Sequence[Outcome]) -> Found:
+    told = [o.truth.get("closed") for o in singles if _all_right(o)]
+    return _spread([float(c) for c in told if c is not None])
+
+
+def _spread(known: Sequence[float]) -> Found:
     if not known:
         return {"n": 0}
     low, middle, high = np.quantile(known, (0.05, 0.5, 0.95))
@@ -131,15 +142,14 @@ def sentences(found: Found, most: int = 6) -> list[str]:
     """What would not have been seen, the clearest first: for the report of a diagnosis of the same logs."""
     rows = [r for r in found["thresholds"] if r["amount"] and r["tried"]]
     rows.sort(key=lambda r: math.log(r["strength"][2] / r["strength"][1]))
-    out = []
-    for r in rows[:most]:
-        name = amounts.spoken(r["effect"])
-        place = "" if r["where"] in ("world", "") else f" at {r['where']}"
-        bound = r["told"].lstrip("<> ")
-        side = "above" if amounts.AMOUNTS.get(r["effect"], amounts.OTHER).inverse else "under"
-        what = amounts.AMOUNTS.get(r["effect"], amounts.OTHER).what
-        out.append(
-            f"{name}{place} with a {what} {side} {bound} would not surely have been seen "
-            f"(found 9 times of 10 from there on; 90 % interval {r['interval']})"
-        )
-    return out
+    return [_sentence(r) for r in rows[:most]]
+
+
+def _sentence(r: Mapping[str, Any]) -> str:
+    amount = amounts.AMOUNTS.get(r["effect"], amounts.OTHER)
+    place = "" if r["where"] in ("world", "") else f" at {r['where']}"
+    side, bound = "above" if amount.inverse else "under", r["told"].lstrip("<> ")
+    return (
+        f"{amounts.spoken(r['effect'])}{place}: a {amount.what} {side} {bound} may be missed "
+        f"(found 9 times of 10 from {r['interval']} on, 90 % interval)"
+    )

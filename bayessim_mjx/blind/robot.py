@@ -82,10 +82,9 @@ def rig_of_logs(load: Load, paths: Sequence[str], name: str, log_map: str | None
     period = float(np.median([log.period for log in logs]))
     period = round(period / 1e-5) * 1e-5 if period > 1e-3 else period
     takes = tuple(_take(log) for log in logs)
-    rig = Replay(
-        name, load, period, takes, np.maximum(sigma, LEAST * np.maximum(span, 1e-9)), speed, steps, _base(model),
-        _stands(model),
-    )  # fmt: skip
+    sigma = np.maximum(sigma, LEAST * np.maximum(span, 1e-9))
+    noise = (tuple(sigma.tolist()), tuple(speed.tolist()), tuple(steps.tolist()))
+    rig = Replay(name, load, period, takes, *noise, _base(model), _stands(model))
     plain = Plant(rig, {})
     led = [dataclasses.replace(t, led=strays(plain, rig, i)) for i, t in enumerate(takes)]
     return dataclasses.replace(rig, takes=tuple(led), touching=geoms_in_touch(plain, rig)), logs
@@ -153,3 +152,26 @@ def rig_of_menu(load: Load, name: str) -> System:
 def short(rig: Rig) -> Rig:
     """The rig by which strengths are measured: the first seconds of long logs."""
     return rig.shortened() if isinstance(rig, Replay) else rig
+
+
+@dataclasses.dataclass(frozen=True)
+class Motion(System):
+    """One motion of the menu alone."""
+
+    only: int = 0
+
+    @property
+    def pushed(self) -> tuple[int, ...]:
+        return (self.only,)
+
+
+def motions(load: Load, name: str, sigma: tuple[float, ...]) -> dict[str, Motion]:
+    """{name: rig} of every kind of motion in the menu; sigma: noise of the encoders.
+
+    Raises:
+        UserError: see `rig_of_menu`.
+    """
+    menu = rig_of_menu(load, name)
+    own = {f.name: getattr(menu, f.name) for f in dataclasses.fields(menu)} | {"sigma": sigma}
+    first = {label: i for i, label in reversed(list(enumerate(menu.labels)))}
+    return {label.replace("_", " "): Motion(**own, only=i) for label, i in sorted(first.items(), key=lambda x: x[1])}

@@ -9,7 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
-from pathlib import Path
+from functools import partial
 from typing import Any
 
 from bayessim_mjx.blind import seal
@@ -42,31 +42,50 @@ def run(check: Check, limits: Limits, say: Say) -> list[Outcome]:
     check.begin()
     say("measuring what the robot does", 0, 1)
     own = bench(check)
-    end = None if limits.seconds is None else time.monotonic() + limits.seconds
     groups, unknown = own.groups(check.effects), own.unknown()
-    for indices in rounds(limits.cases):
-        before = trials(outcomes(check, range(indices.start), own))
-        items = plan(indices, groups, unknown, before, check.seed)
-        todo = [i for i in items if not (check.answer(i.index) / EXIT).exists()]
-        done = indices.stop - len(todo)
-        if todo and not _work_off(check, todo, limits, end, lambda k, d=done: say("cases", d + k, limits.cases)):
-            break
+    crew = _Crew(check, limits)
+    try:
+        for indices in rounds(limits.cases):
+            before = trials(outcomes(check, range(indices.start), own))
+            items = plan(indices, groups, unknown, before, check.seed)
+            todo = [i for i in items if not (check.answer(i.index) / EXIT).exists()]
+            told = partial(_told, say, indices.stop - len(todo), limits.cases)
+            if todo and not crew.work_off(todo, told):
+                break
+    finally:
+        crew.stop()
     return outcomes(check, range(limits.cases), own)
 
 
-def _work_off(
-    check: Check, items: Sequence[Item], limits: Limits, end: float | None, say: Callable[[int], None]
-) -> bool:
-    """Whether all items were finished before the time was over."""
-    todo: queue.SimpleQueue[Item] = queue.SimpleQueue()
-    for item in items:
-        todo.put(item)
-    answers: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
-    cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
-    count = min(limits.workers, len(items))
-    pinned = count > 1 and len(cores) >= count
-    workers = [_Worker(check, cores[k] if pinned else None, todo, answers, end) for k in range(count)]
-    try:
+def _told(say: Say, before: int, total: int, done: int) -> None:
+    say("cases", before + done, total)
+
+
+class _Crew:
+    """Workers that stay from round to round; none is started before there is something to do."""
+
+    def __init__(self, check: Check, limits: Limits) -> None:
+        self.check, self.workers = check, list[_Worker]()
+        self.end = None if limits.seconds is None else time.monotonic() + limits.seconds
+        cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+        pinned = 1 < limits.workers <= len(cores)
+        self.cores = [cores[k] if pinned else None for k in range(limits.workers)]
+
+    def work_off(self, items: Sequence[Item], say: Callable[[int], None]) -> bool:
+        """Whether all items were finished before the time was over.
+
+        Raises:
+            UserError: what is wrong with the robot or the entry, or where a worker says why it died.
+        """
+        todo: queue.SimpleQueue[Item] = queue.SimpleQueue()
+        for item in items:
+            todo.put(item)
+        answers: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
+        count = min(len(self.cores), len(items))
+        for k in range(len(self.workers), count):
+            self.workers.append(_Worker(self.check, k, self.cores[k], self.end))
+        for worker in self.workers[:count]:
+            threading.Thread(target=worker.feed, args=(todo, answers), daemon=True).start()
         finished, idle = 0, 0
         say(0)
         while idle < count:
@@ -76,35 +95,36 @@ def _work_off(
             idle += "idle" in answer
             finished += "index" in answer
             say(finished)
-    finally:
-        for worker in workers:
+        return finished == len(items)
+
+    def stop(self) -> None:
+        for worker in self.workers:
             worker.stop()
-    return finished == len(items)
 
 
 class _Worker:
-    """A process, and the thread that feeds it."""
+    """A process that makes and diagnoses cases, see `worker`; `last`: s that its last case took."""
 
-    def __init__(self, check: Check, core: int | None, todo: Any, answers: Any, end: float | None) -> None:
-        self.todo, self.answers, self.end, self.last = todo, answers, end, 0.0
-        path = check.folder / f"worker_{0 if core is None else core}.txt"
-        self.errors = path.open("w")
+    def __init__(self, check: Check, number: int, core: int | None, end: float | None) -> None:
+        self.end, self.last = end, 0.0
+        self.path = check.folder / f"worker_{number}.txt"
+        self.errors = self.path.open("w")
         self.process = subprocess.Popen(
             [sys.executable, "-m", "bayessim_mjx.blind.worker"], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
             stderr=self.errors, text=True,
         )  # fmt: skip
         self._write(asked(check, core))
-        threading.Thread(target=self._feed, args=(path,), daemon=True).start()
 
     def _write(self, line: str) -> None:
         assert self.process.stdin
         print(line, file=self.process.stdin, flush=True)
 
-    def _feed(self, path: Path) -> None:
+    def feed(self, todo: Any, answers: Any) -> None:
+        """Give it one item after the other, until there is none or no time; all that it answers goes to `answers`."""
         assert self.process.stdout
         while self.end is None or time.monotonic() + self.last < self.end:
             try:
-                item = self.todo.get_nowait()
+                item = todo.get_nowait()
             except queue.Empty:
                 break
             try:
@@ -113,12 +133,12 @@ class _Worker:
             except OSError:
                 line = ""
             if not line:
-                self.answers.put({"error": f"case {item.index}: its process died; see {path}"})
+                answers.put({"error": f"case {item.index}: its process died; see {self.path}"})
                 return
             answer = json.loads(line)
             self.last = answer.get("seconds", 0.0)
-            self.answers.put(answer)
-        self.answers.put({"idle": True})
+            answers.put(answer)
+        answers.put({"idle": True})
 
     def stop(self) -> None:
         """Let the process end: at once where it waits, else it is ended."""
@@ -150,6 +170,7 @@ def outcomes(check: Check, indices: range, own: Bench) -> list[Outcome]:
         truth = seal.opened(check.given(index), secret, seals)
         answer = next((p for p in (check.answer(index) / n for n in KEPT) if p.exists()), None)
         said = json.loads(answer.read_text()) if answer and told["code"] == 0 else None
+        truth["closed"] = told.get("closed")
         found.append(Outcome(check.given(index), truth, said, own.scales.drives, told["seconds"]))
     return found
 

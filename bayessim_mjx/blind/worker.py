@@ -17,8 +17,11 @@ from pathlib import Path
 from typing import Any
 
 from bayessim_mjx.blind import seal
-from bayessim_mjx.blind.cases import Item, make
+from bayessim_mjx.blind.cases import ITEM, Item, again, make
 from bayessim_mjx.blind.check import Check, bench, loader
+from bayessim_mjx.blind.reality.menu import KNOWN
+from bayessim_mjx.blind.reality.plant import Plant
+from bayessim_mjx.blind.reality.twin import base_of, closed, twins
 from bayessim_mjx.errors import UserError
 
 STOPPED = (130, -signal.SIGINT, -signal.SIGTERM)  # by somebody: to be run again
@@ -61,8 +64,24 @@ def diagnose(check: Check, index: int) -> str:
     if code in STOPPED:
         raise KeyboardInterrupt
     told: dict[str, Any] = {"code": code, "seconds": seconds, "seal": check.seal(index).read_text()}
+    told["closed"] = really_closed(check, index) if code == 0 else None
     seal.write(answer / EXIT, json.dumps(told))
     return f"exit {code}"
+
+
+def really_closed(check: Check, index: int) -> float | None:
+    """What a diagnosis closes of the gap in the finer reality; None where it names nothing that can be put there."""
+    answer = next((p for p in (check.answer(index) / n for n in KEPT) if p.exists()), None)
+    said = json.loads(answer.read_text()) if answer else {}
+    truth, own = json.loads(check.secret(index).read_text()), bench(check)
+    effects = said.get("effects", []) if said.get("verdict") in ("effects", "ambiguous") else []
+    known = all(e["name"] in KNOWN for e in truth["effects"])
+    causes = twins(own.ruler.system, own.scales, effects) if effects and truth["effects"] and known else None
+    if not causes:
+        return None
+    rig, base = own.ruler.system, base_of(said.get("parameters", {}), list(truth["base"]))
+    hidden = [again(check, own, Item(**{k: truth[k] for k in ITEM}), e["size"]) for e in truth["effects"]]
+    return closed(own.ruler, Plant(rig, truth["base"], hidden), Plant(rig, base, causes))
 
 
 def _run(words: list[str], work: Path, text: Any) -> int:
@@ -95,7 +114,7 @@ def main() -> int:
     first = json.loads(sys.stdin.readline())
     if first["core"] is not None and hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {first["core"]})  # before JAX counts the cores
-    given = {k: tuple(v) if isinstance(v, list) else v for k, v in first["check"].items()}
+    given: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in first["check"].items()}
     check, answers = Check(**given), os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)  # whatever prints must not answer
     for line in sys.stdin:

@@ -42,12 +42,21 @@ def rivals(cause: Cause, ruler: Ruler) -> list[dict[str, Any]]:
     runs = record(cause, ruler)
     gap = ruler.windows(ruler.plain, runs, every=EVERY)
     near = _joint(cause, ruler, gap)
-    found = []
+    found: list[dict[str, Any]] = []
     for name, where in _others(cause, ruler, scales, near):
-        rng = np.random.default_rng((ruler.seed, *name.encode()))
-        left = min(_closest(rival, ruler, runs, gap) for rival in _drawn(name, where, scales, rng))
-        found.append({"name": name, "where": where, "left": left})
+        found.append({"name": name, "where": where, "left": _best(name, where, scales, ruler, runs, gap)})
     return sorted(found, key=lambda r: r["left"])[:TOLD]
+
+
+def apart(cause: Cause, name: str, where: str, ruler: Ruler) -> float:
+    """Encoder noises that the best cause of that name and place leaves of the motion with another one."""
+    runs = record(cause, ruler)
+    return _best(name, where, cause.scales, ruler, runs, ruler.windows(ruler.plain, runs, every=EVERY))
+
+
+def _best(name: str, where: str, scales: Scales, ruler: Ruler, runs: list[Run], gap: np.ndarray) -> float:
+    rng = np.random.default_rng((ruler.seed, *name.encode()))
+    return min(_closest(rival, ruler, runs, gap) for rival in _drawn(name, where, scales, rng))
 
 
 def record(cause: Cause, ruler: Ruler) -> list[Run]:
@@ -98,7 +107,7 @@ def _closest(rival: Cause, ruler: Ruler, runs: list[Run], gap: np.ndarray) -> fl
         if best < APART / 2 or abs(scale - 1) < 0.1:
             break
         if scale < 0:
-            rival.sign = -getattr(rival, "sign", 1.0)
+            vars(rival)["sign"] = -getattr(rival, "sign", 1.0)
         rival.size = float(np.clip(abs(scale) * rival.size, smallest, rival.largest))
     return best
 

@@ -100,7 +100,9 @@ class Plant:
         """Where nominal joints and the play behind them lie in states of this model, and in what is measured."""
         model = self.model
         place = {model.joint(i).name: i for i in range(model.njnt)}
-        q, v, play = [], [], []
+        q: list[int] = []
+        v: list[int] = []
+        play: list[tuple[int, int, int, int]] = []
         self._columns: dict[str, tuple[int, int]] = {}
         for name in names:
             i = place[name]
@@ -110,7 +112,7 @@ class Plant:
                 play.append((len(q), len(v), int(model.jnt_qposadr[behind]), int(model.jnt_dofadr[behind])))
             q += range(model.jnt_qposadr[i], model.jnt_qposadr[i] + width)
             v += range(model.jnt_dofadr[i], model.jnt_dofadr[i] + speeds)
-        self._q, self._v, self._play = np.array(q, int), np.array(v, int), play
+        self._q, self._v, self._play = np.array(q, np.intp), np.array(v, np.intp), play
 
     def column(self, joint: str) -> int:
         return self._columns[joint][0]
@@ -126,7 +128,7 @@ class Plant:
 
     def dofs(self) -> np.ndarray:
         """Of `joints`, in `data.qvel`."""
-        return np.array([self.dof(j) for j in self.joints], int)
+        return np.array([self.dof(j) for j in self.joints], np.intp)
 
     def position(self, joint: str) -> float:
         return float(self.data.qpos[self.address(joint)])

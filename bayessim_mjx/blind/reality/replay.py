@@ -85,7 +85,8 @@ class Replay:
         take, rng = self.takes[index], np.random.default_rng((seed, index))
         h = plant.timestep
         at = np.round((take.time - take.time[0]) / h).astype(int)
-        kp, kd, driven = _lead(plant) if take.led else (0.0, 0.0, [])
+        kp, kd, driven = _lead(plant)
+        driven = driven if take.led else []
         low, high = _limits(plant.model)
         plant.reset(take.qpos[0], take.qvel[0], take.ctrl[0])
         rows: dict[str, list[np.ndarray]] = {k: [] for k in ("ctrl", "qpos", "qvel", "clean", "clean_v", "pull")}

@@ -1,0 +1,77 @@
+"""The command from flags to files, with a diagnosis that only pretends."""
+
+import json
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+from recorded import pendulum
+
+from bayessim_mjx import blind_check
+
+ENTRY = Path(__file__).with_name("entry.py")
+
+
+def call(*words: object) -> int:
+    return blind_check.main([str(w) for w in (*words, "--headless")])
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ((), "give one of --task NAME and --model FILE"),
+        (("--model", "none.xml"), "none.xml: no such file"),
+        (("--model", "m.xml", "--command", "mine {data}"), "has to hold {out}"),
+        (("--model", "m.xml", "--command", "mine {out}", "--more", "--quick"), "--more"),
+        (("--model", "m.xml", "--effects", "backslash"), "backlash"),
+        (("--model", "m.xml", "--accuracy", "5"), "allowed: per cent"),
+        (("--model", "m.xml", "--minutes", "-1"), "allowed: minutes"),
+        (("--model", "m.xml", "--cases", "0"), "must be from 1"),
+    ],
+)
+def test_what_is_wrong_is_told_in_one_line(words, said, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    # --headless first: --more takes the rest
+    assert blind_check.main(["--headless", *words]) == 2
+    assert said in capsys.readouterr().err
+
+
+def run(folder: Path, out: Path, *more: object) -> int:
+    entry = f"{sys.executable} {ENTRY} {out / 'sealed'} 8 {{data}} {{out}}"
+    robot = ("--model", folder / "model.xml", "--data", folder / "logs", "--out", out)
+    return call(*robot, "--effects", "viscous_friction,actuator_bias", "--command", entry, *more)
+
+
+def files(out: Path) -> dict[str, bytes]:
+    """What is hidden and what was said; not how long it took."""
+    found = [p for p in out.rglob("*") if p.is_file() and (p.suffix in (".csv", ".yaml") or p.name == "seal.txt")]
+    found += list((out / "sealed").iterdir())
+    return {str(p.relative_to(out)): p.read_bytes() for p in found}
+
+
+@pytest.mark.slow
+@pytest.mark.ci
+def test_a_check_is_a_function_of_its_seed_goes_on_and_notices_a_broken_seal(tmp_path, capsys):
+    folder = pendulum(tmp_path / "robot")
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    assert run(folder, whole, "--cases", 18, "--workers", 2) == 0
+    assert run(folder, parts, "--cases", 5, "--workers", 1) == 0
+    shutil.rmtree(parts / "cases" / "0002" / "answer")  # killed while it was diagnosed
+    (parts / "cases" / "0003" / "seal.txt").unlink()  # and while it was made
+    shutil.rmtree(parts / "cases" / "0003" / "answer")
+    assert run(folder, parts, "--cases", 18, "--workers", 1) == 0
+    assert files(whole) == files(parts)
+    found = json.loads((whole / "blind.json").read_text())
+    rows = {r["effect"]: r for r in found["thresholds"]}
+    assert found["cases"] == 18 and found["false_alarms"]["hits"] == 0 and found["coverage"]["hits"] > 0
+    for effect in ("viscous_friction", "actuator_bias"):
+        _, low, high = rows[effect]["strength"]
+        assert low < 8 < high and rows[effect]["amount"][1] < rows[effect]["amount"][2]
+    assert all((whole / name).exists() for name in ("blind.html", "media")) and list(whole.glob("events*"))
+
+    secret = whole / "sealed" / "0001.json"
+    secret.write_text(secret.read_text().replace("single", "null"))
+    capsys.readouterr()
+    assert run(folder, whole, "--cases", 18) == 2 and "0001.json" in capsys.readouterr().err
+    assert run(folder, parts, "--cases", 18, "--seed", 1) == 2 and "seed" in capsys.readouterr().err
