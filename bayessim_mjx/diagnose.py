@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from bayessim_mjx import cli
+from bayessim_mjx.blind.recall import beside, recall
 from bayessim_mjx.config import Config
 from bayessim_mjx.config.settings import SEEDS
 from bayessim_mjx.device import setup_jax
@@ -67,6 +68,11 @@ def _parser() -> cli.PlainParser:
         help="what the robot is rated to carry: 12kg, or tool=12kg (default: what its drives hold, up to its weight)",
     )
     _search_options(parser)
+    parser.add_argument(
+        "--blind",
+        metavar="DIR",
+        help="a finished blind check: what would have been missed is told (docs/blind.md)",
+    )
     parser.add_argument("--out", metavar="DIR", default="diagnosis", help="folder for the results (default: diagnosis)")
     parser.add_argument("--seed", metavar="N", type=cli.whole(0, SEEDS), default=0, help="random seed (default: 0)")
     parser.add_argument(
@@ -162,6 +168,7 @@ def _diagnosis(args: argparse.Namespace, say: Any, early: Callable[[Sequence[str
 def _diagnose(argv: Sequence[str] | None) -> int:
     args = _parser().parse_args(argv)
     _checked(args)
+    missed = recall(args.blind) if args.blind else beside(args.data)
     setup_jax(Config(task="", device=args.device, cache_dir=args.cache_dir))
     from bayessim_mjx import report
     from bayessim_mjx.monitor.stages import stages
@@ -170,9 +177,11 @@ def _diagnose(argv: Sequence[str] | None) -> int:
     with warnings.catch_warnings(record=True), stages(args.headless) as say:  # what matters is told with the result
         result = _diagnosis(args, say, lambda lines: _told(lines, time.monotonic() - began))
         say("writing the report", 0, 1)
-        report.write(result, Path(args.out))
+        report.write(result, Path(args.out), missed)
         report.tensorboard(result, Path(args.out))
     report.console(result, Path(args.out))
+    if missed:
+        print(f"On this robot and these logs ({missed.page}):", *(f"  {line}" for line in missed.sentences), sep="\n")
     print(f"{duration(time.monotonic() - began)}; open {Path(args.out) / 'report.html'}")
     return 0
 

@@ -15,12 +15,13 @@ from bayessim_mjx.blind.reality.lookalikes import APART, apart
 from bayessim_mjx.blind.reality.menu import KNOWN, places
 from bayessim_mjx.blind.reality.plant import Rig
 from bayessim_mjx.blind.reality.strength import Ruler
+from bayessim_mjx.blind.recall import FILE
 from bayessim_mjx.blind.robot import motions
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.quantities import count
 from bayessim_mjx.versions import versions
 
-FILE = "blind.json"
+__all__ = ["FILE", "about", "answer", "lookalikes"]
 PAIRS = 6  # looked at: each is simulated in every motion of the menu
 Say = Callable[[str, int, int], None]
 Pair = tuple[str, str, str, str]  # hidden effect and place, said effect and place

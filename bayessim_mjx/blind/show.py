@@ -8,11 +8,12 @@ from markupsafe import Markup
 
 from bayessim_mjx.blind.amounts import AMOUNTS, OTHER, spoken
 from bayessim_mjx.blind.figures import pictures, svg, title
+from bayessim_mjx.blind.recall import PAGE
 from bayessim_mjx.monitor.writer import TensorBoard
 from bayessim_mjx.quantities import MISSING, count, duration, finite, percent
 
 Found = Mapping[str, Any]
-PAGE, TEMPLATE = "blind.html", "page.html.j2"
+TEMPLATE = "page.html.j2"
 RATES = (
     ("found", "hidden effects named at their place"),
     ("in_the_set", "named, or among the rivals of what is named"),

@@ -14,16 +14,16 @@ from bayessim_mjx.report.words import STAGES, not_fitted
 TEMPLATE = "template.html.j2"
 
 
-def write(diagnosis: Diagnosis, folder: str | Path) -> Path:
-    """Write `folder/report.html`; returns its path."""
+def write(diagnosis: Diagnosis, folder: str | Path, missed: Any = None) -> Path:
+    """Write `folder/report.html`; returns its path. `missed`: of a blind check, `sentences`, `cases` and its `page`."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / "report.html"
-    path.write_text(render(diagnosis), encoding="utf-8")
+    path.write_text(render(diagnosis, missed), encoding="utf-8")
     return path
 
 
-def render(d: Diagnosis) -> str:
+def render(d: Diagnosis, missed: Any = None) -> str:
     """The page as text."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
     from plotly.offline import get_plotlyjs
@@ -56,6 +56,7 @@ def render(d: Diagnosis) -> str:
         experiment=evidence.experiment(d),
         data=evidence.data(d),
         warnings=d.warnings,
+        missed=missed,
         versions=d.versions,
     )
 

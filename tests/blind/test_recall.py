@@ -1,0 +1,40 @@
+"""A diagnosis is told what a blind check of the same logs would have missed."""
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+from bayessim_mjx.blind.recall import beside, recall
+from bayessim_mjx.errors import UserError
+from bayessim_mjx.report.page import render
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "report"))
+import fake  # noqa: E402
+
+SAID = "backlash at elbow: a half of the play under 3 mrad may be missed"
+
+
+@pytest.fixture
+def logs(tmp_path):
+    (tmp_path / "logs").mkdir()
+    (tmp_path / "blind").mkdir()
+    found = {"sentences": [SAID], "cases": 40, "settings": {"data": [str(tmp_path / "logs")], "command": ""}}
+    (tmp_path / "blind" / "blind.json").write_text(json.dumps(found))
+    return tmp_path / "logs"
+
+
+def test_a_check_beside_the_same_logs_is_found_and_no_other(logs):
+    missed = beside([str(logs)])
+    assert missed is not None and missed.sentences == (SAID,) and missed.cases == 40
+    (logs.parent / "others").mkdir()
+    assert beside([str(logs.parent / "others")]) is None
+    with pytest.raises(UserError, match=r"no blind\.json"):
+        recall(logs)
+
+
+def test_the_report_tells_what_would_have_been_missed(logs):
+    page = render(fake.full(), recall(logs.parent / "blind"))
+    assert SAID in page and "40 blind cases" in page and "What would have been missed" in page
+    assert "What would have been missed" not in render(fake.full())
