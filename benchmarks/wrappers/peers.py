@@ -67,14 +67,22 @@ settings |= dict(unroll_length=16, num_updates_per_batch=4, learning_rate=1e-3, 
 _, _, metrics = brax.train(task, normalize_observations=True, **settings)
 found = metrics["eval/episode_reward"]
 """,
+    "Playground": """
+from mujoco_playground import registry, wrapper
+from bayessim_mjx.wrappers import playground
+playground.register()
+env = wrapper.wrap_for_brax_training(registry.load(f"bayessim_mjx/{task}"), episode_length=500)
+""",
     "Gymnasium": """
 import gymnasium, bayessim_mjx
 env = gymnasium.make_vec(f"bayessim_mjx/{task}-v0", num_envs=num_envs)
 """,
 }
+IN_ONE_PROGRAM, UNTRAINED = ("Brax", "Playground"), ("Gymnasium", "Playground")  # Playground's trainers are Brax's
 NEEDS = {
     "sb3": ("stable_baselines3",), "rsl_rl": ("rsl_rl",), "skrl, JAX": ("skrl",), "skrl, PyTorch": ("skrl", "torch"),
-    "rl_games": ("rl_games",), "Brax": ("brax",), "Gymnasium": ("gymnasium",),
+    "rl_games": ("rl_games",), "Brax": ("brax",),
+    "Playground": ("mujoco_playground",), "Gymnasium": ("gymnasium",),
 }  # fmt: skip
 
 
@@ -118,7 +126,7 @@ def made(name: str, task: str, num_envs: int) -> Any:
         return vecenv.create_vec_env(task, num_envs)
     space: dict[str, Any] = {"task": task, "num_envs": num_envs}
     lines = SNIPPETS[name].strip().splitlines()
-    exec("\n".join(line for line in lines if line.startswith(("env =", "from bayessim", "import"))), space)
+    exec("\n".join(lines[: next(i for i, line in enumerate(lines) if line.startswith("env =")) + 1]), space)
     return space["env"]
 
 
@@ -128,9 +136,11 @@ def through(name: str, task: str, num_envs: int, actions: np.ndarray) -> Callabl
         from bayessim_mjx.wrappers import brax, fresh
 
         env = fresh.wrap(brax.ours(task))
+    else:
+        env = made(name, task, num_envs)
+    if name in IN_ONE_PROGRAM:
         state = jax.jit(env.reset)(jax.random.split(jax.random.PRNGKey(0), num_envs))
         return scanned(env.step, state, actions)
-    env = made(name, task, num_envs)
     env.reset()
     given: Any = actions
     if name in ("rsl_rl", "skrl, PyTorch", "rl_games"):
@@ -155,7 +165,7 @@ def measured(name: str, task: str, num_envs: int, repeats: int) -> tuple[float, 
     env = registry.make(task)
     actions = np.random.default_rng(0).uniform(-1, 1, (num_envs, env.action_size)).astype(np.float32)
     keys = jax.random.split(jax.random.PRNGKey(0), num_envs)
-    if name == "Brax":
+    if name in IN_ONE_PROGRAM:
         bare = scanned(jax.vmap(env.step), jax.jit(jax.vmap(env.reset))(keys), actions)
     else:
         bare = stepper(env, actions)
@@ -196,7 +206,7 @@ def main() -> None:
             continue
         speed, shares = measured(name, args.task, args.num_envs, args.repeats)
         share = f"{statistics.median(shares):.0%} ({min(shares):.0%} to {max(shares):.0%})"
-        reached = f"{trained(name, args.task):.0f}" if args.train and name != "Gymnasium" else ""
+        reached = f"{trained(name, args.task):.0f}" if args.train and name not in UNTRAINED else ""
         count = len(SNIPPETS[name].strip().splitlines())
         print(f"| {name} | {count} | {speed:,.0f} | {share} | {reached} |", flush=True)
 
