@@ -18,7 +18,7 @@ from bayessim_mjx.parameters import ParameterSpace
 from bayessim_mjx.physics import Physics
 
 SCHEMA = 1
-VERDICTS = ("no_gap", "parameters", "effects", "ambiguous", "unexplained", "insufficient_data")
+VERDICTS = ("no_gap", "parameters", "noise", "effects", "ambiguous", "unexplained", "insufficient_data")
 
 
 @dataclass(frozen=True)
@@ -43,10 +43,10 @@ class Gap:
     range of the logged motion), "tolerance", "largest" (error that the last stage leaves), "beyond" (whether it leaves
     more than tolerated); shares: {stage: value}, of the range of motion, root mean square over the joints; beyond: the
     joints where more than tolerated remains;
-    closed: {"predicted", "realised", "ci", "elsewhere" (by one decision only)}, share of the recalibrated simulator's
-    squared gap above the noise that all effects close together: as promised before any was fitted, on held-out windows
-    afterwards, and on conditions that had no part in the choice of the effects; integrator: what the simulator's own
-    time step is worth (`discretisation.Discretisation.to_dict`).
+    closed: {"predicted", "realised", "ci", "nested", "elsewhere"}, share of the recalibrated simulator's squared gap
+    above the noise that all effects close together: as promised before any was fitted, on held-out windows afterwards,
+    and on conditions that had no part in the choice of the effects; nested: whether realised and ci are of such
+    conditions too; integrator: what the simulator's own time step is worth (`discretisation.Discretisation.to_dict`).
     """
 
     noise_floor: float
@@ -76,6 +76,8 @@ class Diagnosis:
         covariance: {"names": [...], "matrix": [[...]]} of parameters and effects' parameters together, or {}.
         not_fitted: {reason: effects ("name@place") that were not fitted, and so not ruled out}.
         about: {"robot", "data": [paths], "logs", "seconds", "conditions", "date", "seed"}, what was diagnosed, or {}.
+        chance: {"probability", "each": {label: p}, "nats", "level", "draws", "candidates"}, how often the best
+            candidate gains as much where nothing is missing (`selection.chance`), or {}.
         next_experiment: {"name", "why", "evidence", "file", "table": [...]} or {}.
         details: numbers for pictures (see `report`); not part of diagnosis.json but saved beside it.
     """
@@ -94,6 +96,7 @@ class Diagnosis:
     covariance: dict[str, Any] = field(default_factory=dict)
     about: dict[str, Any] = field(default_factory=dict)
     not_fitted: dict[str, list[str]] = field(default_factory=dict)
+    chance: dict[str, Any] = field(default_factory=dict)
     schema: int = SCHEMA
 
     def to_dict(self) -> dict[str, Any]:

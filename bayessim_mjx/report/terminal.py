@@ -30,6 +30,7 @@ Table = tuple[list[str], list[list[str]], tuple[int, ...]]  # header, rows, colu
 COLOURS = {
     "no_gap": "green",
     "parameters": "blue",
+    "noise": "blue",
     "effects": "blue",
     "ambiguous": "yellow",
     "unexplained": "red",
@@ -119,7 +120,7 @@ def _parameters(d: Diagnosis) -> Table:
     rows = [
         [name, number(p.get("nominal")), estimate(p.get("mean"), p.get("sd"), p.get("unit") or "")]
         for name, p in d.parameters.items()
-        if d.verdict == "parameters"
+        if d.verdict in ("parameters", "noise")
     ]
     return ["parameter", "as delivered", "recalibrated"], rows, (0,)
 

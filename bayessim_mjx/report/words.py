@@ -50,6 +50,12 @@ VERDICTS = {
         "Take over the recalibrated parameters listed below: pass effects=effects.yaml, which holds them, to main, "
         "train or play. No effect needs to be added.",
     ),
+    "noise": Verdict(
+        "Noise larger than estimated",
+        "Nothing predicts what remains, and it has the covariance of noise of the sensors.",
+        "Take over the recalibrated parameters listed below. State what the sensors are worth (sigma: in the logs' "
+        "metadata), or repair them; no effect needs to be added.",
+    ),
     "effects": Verdict(
         "Missing effects found",
         "The simulator leaves out effects that these logs identify.",
@@ -83,8 +89,19 @@ PARTLY = Verdict(
 )
 
 
+REMAINDER = Verdict(
+    "Effects and a remainder",
+    "The named effects explain most of the gap; more than is tolerated remains.",
+    "Pass effects=effects.yaml to main, train or play. Their laws are not quite those of the real system: allow what "
+    "remains with --tolerance, or look at where the remaining force acts, below, and give a law of your own "
+    "(--effects file.py:Name).",
+)
+
+
 def verdict_of(d: Diagnosis) -> Verdict:
-    """The verdict's words; an unexplained rest beside named effects has its own."""
+    """The verdict's words; what remains beside named effects has its own."""
+    if d.verdict == "effects" and d.gap.beyond:
+        return REMAINDER
     return PARTLY if d.verdict == "unexplained" and d.effects else VERDICTS[d.verdict]
 
 

@@ -10,7 +10,7 @@ import pytest
 from bayessim_mjx.diagnosis import tolerance
 from bayessim_mjx.diagnosis.result import FoundEffect, Gap
 from bayessim_mjx.diagnosis.selection.heldout import Prediction
-from bayessim_mjx.diagnosis.summary import assemble, how_far, repeated, sentences
+from bayessim_mjx.diagnosis.summary import how_far, repeated, sentences, verdict
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs import Channels, Log
 
@@ -113,16 +113,27 @@ def findings(rms, noise=50.0, windows=8):
     )
     cut = SimpleNamespace(windows=SimpleNamespace(steps=5))
     return SimpleNamespace(
-        selection=selection, model=winner, flexible_winner=None,
+        selection=selection, model=winner, flexible_winner=None, disturbance=None,
         flexible_base=None, setup=SimpleNamespace(fitter=SimpleNamespace(simulator=cut)),
         predictions={"nominal": prediction(2000), "calibrated": prediction(1000), "with_effects": prediction(rms)},
     )  # fmt: skip
 
 
-def test_effects_that_leave_more_than_tolerated_explain_a_part():
-    """132 noises that remain are 2 % of the squared gap: all of it is closed, and yet 13 mrad may matter or not."""
-    assert assemble._verdict(findings(132.0), 0.0, gap(0.0132, limit=0.01)) == "unexplained"
-    assert assemble._verdict(findings(132.0), 0.0, gap(0.0132, limit=0.02)) == "effects"
+def test_effects_that_leave_a_small_share_are_named_with_what_remains():
+    """132 noises that remain are 2 % of the squared gap: an imperfect law, whether 13 mrad matter or not."""
+    for limit in (0.01, 0.02):
+        assert verdict.verdict_of(findings(132.0), gap(0.0132, limit)).name == "effects"
+    head, *_ = sentences.verdict_in_words("effects", [FRICTION], gap(0.0132, 0.01))
+    assert head.startswith(
+        "The simulator lacks Coulomb friction at elbow, and more than the tolerance remains at elbow:"
+    )
+    assert "tolerance" not in sentences.verdict_in_words("effects", [FRICTION], gap(0.0132, 0.02))[0]
+
+
+def test_effects_that_leave_a_large_share_are_no_explanation():
+    """600 of 1000 noises are 36 % of the squared gap."""
+    assert verdict.verdict_of(findings(600.0), gap(0.06)).name == "unexplained"
+    assert verdict.verdict_of(findings(500.0), gap(0.05)).name == "effects"  # 25 %
 
 
 def test_the_headline_says_partly_explained_and_what_remains_where():

@@ -21,6 +21,8 @@ class Criteria:
             density is higher. Where nothing differs, 2 are exceeded in 1.0 to 2.5 % (normal and Student's conditions).
         nats: and by so many nats plus the logarithm of the number of candidates for each further effect (Bonferroni:
             one error rate for any number of candidates). 5 nats are odds of 150 to 1.
+        chance: family-wise error: an effect is named only if it gains more nats than the best candidate does in all but
+            this share of null logs (`chance`).
         rare: so many times these nats tell where not all conditions gain, if none loses more than the share `harm`
             (limits that act in few windows were missed by a standard error alone).
         same: the region of practical equivalence: share of what a model leaves of the squared gap that further effects
@@ -36,6 +38,7 @@ class Criteria:
 
     errors: float = 2.0
     nats: float = 5.0
+    chance: float = 0.01
     rare: float = 5.0
     harm: float = 0.1
     same: float = 0.15
@@ -50,7 +53,11 @@ class Criteria:
     def __post_init__(self) -> None:
         for f in fields(self):
             value = getattr(self, f.name)
-            if not value >= 0 or (f.type == "int" and (value < 1 or value != int(value))):
+            if (
+                not value >= 0
+                or (f.name == "chance" and value > 1)
+                or (f.type == "int" and (value < 1 or value != int(value)))
+            ):
                 raise UserError(f"criteria {f.name}={value}: allowed is a {'count' if f.type == 'int' else 'number'}")
 
     def changed(self, given: Iterable[str]) -> Criteria:

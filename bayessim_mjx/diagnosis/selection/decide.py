@@ -107,6 +107,8 @@ def real(table: Table, worse: Key, better: Key, criteria: Criteria) -> bool:
     """Whether the evidence tells that one model is better: of all conditions, or without harm in any."""
     found = compare(table, worse, better)
     price = criteria.nats + np.log(max(len(table.laws), 2)) * max(1, len(better) - len(worse))
+    if worse == BASE and len(table.chance):  # and more than the best candidate gains where nothing is missing
+        price = max(price, float(np.quantile(table.chance, 1.0 - criteria.chance)))
     if found.nats <= price:
         return False
     # what acts in few windows only (a limit, drag at speed) helps few of them, but then by much and harms no other
@@ -199,20 +201,24 @@ def _told(key: Key) -> str:
     return " + ".join(sorted(key)) or "known parameters"
 
 
-def closed_elsewhere(table: Table, less: Order, criteria: Criteria) -> float:
-    """Share of the squared gap closed on operating conditions that had no part in the decision, at most 1.
+def chosen_elsewhere(table: Table, less: Order, criteria: Criteria) -> dict[int, Key]:
+    """{operating condition: what is named by all others}; {} of one condition.
 
-    The decision is taken anew without each condition, and what it names then is scored on that condition. A share much
-    below that of the answer means that the answer was chosen for what it does by chance. The search saw all conditions:
-    only the choice among what it tried is taken anew. NaN of one condition, and where there is no gap.
+    The search saw all conditions: only the choice among what it tried is taken anew.
     """
     names = np.unique(table.group)
+    return {int(g): decide(table.without(g), less, criteria).answer for g in names} if len(names) > 1 else {}
+
+
+def closed_elsewhere(table: Table, chosen: Mapping[int, Key]) -> float:
+    """Share of the squared gap closed on operating conditions that had no part in the decision, at most 1.
+
+    What the other conditions choose (`chosen_elsewhere`) is scored on each. A share much below that of the answer means
+    that the answer was chosen for what it does by chance. NaN of one condition, and where there is no gap.
+    """
     above = table.rows[BASE].total - table.noise * len(table.group)
-    if len(names) < 2 or above <= 0:
+    if not chosen or above <= 0:
         return float("nan")
-    drop = 0.0
-    for name in names:
-        answer = decide(table.without(name), less, criteria).answer
-        own = table.group == name
-        drop += float(np.sum(table.rows[BASE].cost[own] - table.rows[answer].cost[own]))
-    return min(drop / above, 1.0)
+    own = {name: table.group == name for name in chosen}
+    drop = [np.sum(table.rows[BASE].cost[w] - table.rows[chosen[g]].cost[w]) for g, w in own.items()]
+    return min(float(sum(drop)) / above, 1.0)

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fitter import Fit
-from bayessim_mjx.diagnosis.selection import dense, heldout
+from bayessim_mjx.diagnosis.selection import chance, dense, heldout
 from bayessim_mjx.diagnosis.selection.beam import Plan
 from bayessim_mjx.diagnosis.selection.bounds import widened
 from bayessim_mjx.diagnosis.selection.models import Model
@@ -26,6 +28,8 @@ from bayessim_mjx.diagnosis.selection.pool import (
 from bayessim_mjx.diagnosis.selection.screen import Screened, screen
 from bayessim_mjx.diagnosis.selection.table import BASE, Key, Law, Row, Table
 from bayessim_mjx.diagnosis.selection.uncertainty import deviations
+
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -52,6 +56,10 @@ class Fits:
         self._polished: set[Key] = set()
         self._amounts: dict[Key, tuple[Screened, ...]] = {}
 
+    @functools.cached_property
+    def _chance(self) -> Array:
+        return chance.of(self.pool) if self.pool.above_noise(self.pool.base) else np.zeros(0)
+
     @property
     def candidates(self) -> dict[str, Candidate]:
         """By their labels, in ranges as wide as they are by now."""
@@ -64,7 +72,7 @@ class Fits:
         least = min(m.total for m in pool.models.values())
         rows = {key: self._row(key, m, m.total < LIMITS.contenders * least) for key, m in pool.models.items()}
         group = pool.fitter.simulator.windows.group
-        return Table(rows, self.laws, group, pool.noise, pool.settings.believed)
+        return Table(rows, self.laws, group, pool.noise, pool.settings.believed, self._chance)
 
     def _row(self, key: Key, model: Model, contender: bool) -> Row:
         fitted, row = self._rows.get(key, (None, None))

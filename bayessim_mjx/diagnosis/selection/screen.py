@@ -82,7 +82,7 @@ def _room(candidate: Candidate, way: Array) -> tuple[float, float]:
 
 def residual(fit: Fit, limit: int) -> Array:
     """`[w, n]` residuals of the windows that were looked at, weighted as the columns are."""
-    own = _telling(fit, limit)
+    own = looked_at(fit, limit)
     return np.asarray(fit.r[own] * np.sqrt(fit.weight[own])[:, None])
 
 
@@ -121,7 +121,7 @@ def _looked_at(
 ) -> dict[int, list[tuple[Screened, Array]]]:
     """{candidate: [(what its starting point gains, the point)]} for plans of (candidate, point)."""
     count = len(fit.r)
-    own = _telling(fit, limit)
+    own = looked_at(fit, limit)
     part = _part(fit, own)
     project = _Projection(fitter, part)
     each: dict[int, list[tuple[Screened, Array]]] = {}
@@ -140,7 +140,7 @@ def _looked_at(
     return each
 
 
-def _telling(fit: Fit, limit: int) -> NDArray[np.int64]:
+def looked_at(fit: Fit, limit: int) -> NDArray[np.int64]:
     """At most `limit` windows: half of them where most is left to explain (a limit acts in few), the rest spread."""
     count = len(fit.r)
     if count <= limit:

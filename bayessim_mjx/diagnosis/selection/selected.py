@@ -13,12 +13,12 @@ from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 from bayessim_mjx.diagnosis.selection import beam, heldout, predicted_gain, singles, weak_directions
 from bayessim_mjx.diagnosis.selection.criteria import Criteria
-from bayessim_mjx.diagnosis.selection.decide import Alternative, Decision, closed_elsewhere, order
+from bayessim_mjx.diagnosis.selection.decide import Alternative, Decision, chosen_elsewhere, closed_elsewhere, order
 from bayessim_mjx.diagnosis.selection.fits import Fits
 from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.selection.pool import Pool, Progress, compatible, special_cases
 from bayessim_mjx.diagnosis.selection.screen import Screened
-from bayessim_mjx.diagnosis.selection.table import Table
+from bayessim_mjx.diagnosis.selection.table import Key, Table
 from bayessim_mjx.diagnosis.selection.tried import Settings, Tried
 from bayessim_mjx.diagnosis.selection.weak_directions import Ridges
 
@@ -56,6 +56,7 @@ class Selection(Tried):
         subsets: {labels: the model with these of its effects}, every one refitted; {} of one effect or of too many.
         promised: share of the base model's gap that its effects promised to close before any was fitted, {label: part}.
         along: what was simulated along its weak directions.
+        chosen: {operating condition: effects that are named without it}.
         elsewhere: share of the gap closed on operating conditions that had no part in the choice; NaN of one condition.
     """
 
@@ -75,6 +76,7 @@ class Selection(Tried):
     subsets: Mapping[frozenset[str], Model] = field(default_factory=dict)
     promised: tuple[float, Mapping[str, float]] = (0.0, MappingProxyType({}))
     along: Ridges | None = None
+    chosen: Mapping[int, Key] = field(default_factory=dict)
     elsewhere: float = float("nan")
     cut_short: frozenset[str] = frozenset()
     skipped: Mapping[str, int] = field(default_factory=dict)
@@ -111,7 +113,7 @@ def concluded(pool: Pool, decision: Decision, say: Progress) -> Selection:
     pool.base = pool.models[frozenset()]
     named = pool.models[decision.answer]
     rivals = {e.label: _rivals(pool, e, named, decision) for e in named.effects}
-    elsewhere = closed_elsewhere(searched, order(searched.laws), pool.criteria) if named.effects else float("nan")
+    chosen = chosen_elsewhere(searched, order(searched.laws), pool.criteria) if named.effects else {}
     answer, along = named, None
     if answer.effects:
         answer, along = weak_directions.settled(fitter, answer)
@@ -127,7 +129,8 @@ def concluded(pool: Pool, decision: Decision, say: Progress) -> Selection:
         subsets=subsets,
         promised=(total, each),
         along=along,
-        elsewhere=elsewhere,
+        chosen=chosen,
+        elsewhere=closed_elsewhere(searched, chosen),
     )
 
 

@@ -68,6 +68,7 @@ class Table:
         group: `[W]`, operating condition of each window.
         noise: expected cost of a window under a perfect model.
         believed: share of the noise (rms) that is the sensors'; the rest is what the time step may be worth at most.
+        chance: `[draws]` nats that the best candidate gains in null logs (see `chance`), ascending.
     """
 
     rows: Mapping[Key, Row]
@@ -75,6 +76,7 @@ class Table:
     group: NDArray[np.int64]
     noise: float
     believed: float = 1.0
+    chance: Array = field(default_factory=lambda: np.zeros(0))
 
     def excess(self, key: Key) -> float:
         """Held-out cost above the noise, as a multiple of the noise: squared gap that the model leaves."""
@@ -101,6 +103,7 @@ class Table:
             "group": self.group.tolist(),
             "noise": self.noise,
             "believed": self.believed,
+            "chance": [float(f"{c:.4g}") for c in self.chance],
             "rows": [
                 {
                     "effects": sorted(r.key),
@@ -138,4 +141,5 @@ def read(raw: Mapping[str, Any]) -> Table:
         np.array(raw["group"], np.int64),
         raw["noise"],
         raw["believed"],
+        np.array(raw.get("chance", ())),
     )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,25 +20,11 @@ from bayessim_mjx.diagnosis.summary import effects_found, how_far
 from bayessim_mjx.diagnosis.summary.details import details
 from bayessim_mjx.diagnosis.summary.left_in_words import located_in_words, places_of, spectra_in_words
 from bayessim_mjx.diagnosis.summary.sentences import horizon_warning, sentences
+from bayessim_mjx.diagnosis.summary.verdict import by_chance, verdict_of
 from bayessim_mjx.diagnosis.summary.whole_logs import Whole
 from bayessim_mjx.logs.log import Channels
 
-
-@dataclass(frozen=True)
-class Limits:
-    """When a verdict says that something remains unexplained."""
-
-    unexplained: float = 1.5  # noise standard deviations that remain and that nothing predicts
-    little: float = 0.3  # share of the calibrated gap that named effects may leave
-    # share of the calibrated gap that a flexible force closes on top of named effects: not in the library
-    remains: float = 0.3
-    # shares of the named effects' cost, and of the gap, by which a flexible force alone does better
-    beaten: float = 0.4
-    relevant: float = 0.05
-    far: float = 2.0  # standard deviations from what a data sheet states, from where on that is told
-
-
-LIMITS = Limits()
+FAR = 2.0  # standard deviations from what a data sheet states, from where on that is told
 PACKAGES = ("bayessim-mjx", "mujoco", "mujoco-mjx", "jax", "numpy")  # what the result depends on
 
 
@@ -57,18 +42,18 @@ def diagnosis_of(found: Findings, about: Mapping[str, Any] | None = None, file: 
     sd = np.sqrt(np.diag(together))
     closed = effects_found.closed_by(found)
     effects = effects_found.effects_of(found, sd, closed)
-    remains = _remains(found)
     far = how_far.measured(found, {k: v for k, v in closed.items() if k != "each"})
-    name = _verdict(found, remains, far)
+    verdict = verdict_of(found, far)
     parameters = _parameters(selection, model, sd)
     over, where, proposal = found.part(Whole), found.part(Where), found.part(Experiment)
     far = how_far.with_whole(far, over, setup.tolerance) if over else far
-    told = sentences(name, effects, parameters, found, far, remains, _beaten(found))
+    odds = by_chance(found)
+    told = sentences(verdict, effects, parameters, found, far, odds)
     notes = [*setup.warnings, *(over.notes if over else ()), *(horizon_warning(far) if effects else [])]
     more = {"maps": where.found.maps, "frequency": [heard.details() for heard in where.spectra]} if where else {}
     lies = [*located_in_words(where.found), *spectra_in_words(where.spectra)] if where else []
     return Diagnosis(
-        verdict=name,
+        verdict=verdict.name,
         sentences=[*told, *filter(None, [left_out.not_tried(selection)]), *lies],
         effects=effects,
         where=places_of(where.found) if where and where.found.spots else _where(found),
@@ -82,6 +67,7 @@ def diagnosis_of(found: Findings, about: Mapping[str, Any] | None = None, file: 
         covariance={"names": list(model.fit.names), "matrix": together},
         not_fitted=left_out.not_fitted(selection),
         about={**about, "conditions": len(setup.fitter.simulator.windows.groups)} if about else {},
+        chance=odds,
     )
 
 
@@ -95,51 +81,6 @@ def _told(found: Findings, covariance: np.ndarray) -> np.ndarray:
             at += [model.fit.names.index(c.name)] if bound is not None and bound.kind != "off" else []
     neutral = np.array([c.neutral for c in model.fit.coordinates])
     return bounds.spread_out(covariance, model.fit.values, neutral, at)
-
-
-def _remains(found: Findings) -> float:
-    """Share of the calibrated gap that a flexible force still closes on top of the winner; 0 where not significant."""
-    flex, base, model = found.flexible_winner, found.selection.base, found.model
-    if flex is None or not flex.condition.significant:
-        return 0.0
-    top = model.total - min(float(flex.condition.cost.sum()), model.total)
-    return statistics.share_of_gap(top, base.total, found.selection.noise * len(base.cost))
-
-
-def _verdict(found: Findings, remains: float, far: Gap) -> str:
-    tried, model = found.selection, found.model
-    if model.effects and far.beyond:
-        return "unexplained"  # partly explained: what is left still matters
-    cost = {k: float(p.cost(found.setup.fitter.simulator.windows.steps).mean()) for k, p in found.predictions.items()}
-    left = cost["with_effects"] - 1.0
-    if model.effects and left > LIMITS.unexplained**2 - 1.0 and left > LIMITS.little * (cost["calibrated"] - 1.0):
-        return "unexplained"  # what is named closes little of it
-    if (
-        tried.above_noise(model)
-        and remains > LIMITS.remains
-        or (model.effects and found.flexible_winner is not None and _beaten(found))
-    ):
-        return "unexplained"
-    if model.effects:
-        return "ambiguous" if found.selection.ambiguous else "effects"
-    if np.sqrt(tried.base.total / (tried.noise * len(tried.base.cost))) > LIMITS.unexplained:
-        return "unexplained"
-    q, _ = tried.nominal.quadratic(tried.fitter.spread)
-    floor = tried.noise * len(tried.base.cost) * tried.criteria.floor**2
-    return "parameters" if q.c.sum() > max(1.1 * tried.base.total, floor) else "no_gap"
-
-
-def _beaten(found: Findings) -> bool:
-    """Whether a flexible force alone predicts held-out conditions much better than the named effects do.
-
-    By a relevant share of the gap too: of effects that close 99.9 % something is left that a force can learn.
-    """
-    tried, base, model = found.selection, found.flexible_base, found.model
-    if base is None or not base.condition.significant:
-        return False
-    better = model.total - float(base.condition.cost.sum())
-    share = statistics.share_of_gap(better, tried.base.total, tried.noise * len(tried.base.cost))
-    return better > LIMITS.beaten * model.total and share > LIMITS.relevant
 
 
 def _parameters(tried: Tried, model: Model, sd: np.ndarray) -> dict[str, dict[str, Any]]:
@@ -157,7 +98,7 @@ def _parameters(tried: Tried, model: Model, sd: np.ndarray) -> dict[str, dict[st
 def _against_data_sheet(c: Coordinate, value: float) -> str:
     """How far a known parameter is from what was stated of it, where that is far."""
     away = abs(value - c.neutral) * c.precision**0.5
-    return phrases.far_from_data_sheet(value, away) if c.stated and away > LIMITS.far else ""
+    return phrases.far_from_data_sheet(value, away) if c.stated and away > FAR else ""
 
 
 def ranking(tried: Tried) -> list[dict[str, Any]]:

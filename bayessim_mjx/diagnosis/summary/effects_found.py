@@ -14,6 +14,8 @@ from bayessim_mjx.diagnosis.selection import bounds, heldout, predicted_gain, un
 from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.setup import Setup
 
+LEAST = 3  # operating conditions, from which on closure is quoted of those that had no part in the choice
+
 
 def effects_of(found: Findings, sd: np.ndarray, closed: dict[str, Any]) -> list[FoundEffect]:
     """The effects of the verdict with all their numbers, the one that closes most first."""
@@ -59,13 +61,27 @@ def closed_by(found: Findings) -> dict[str, Any]:
         return {}
     closed, (total, each) = _closed(found), found.selection.promised
     own = {"predicted": total, "realised": closed.value, "ci": closed.interval(), "each": each}
-    return own | {"elsewhere": found.selection.elsewhere}
+    return own | {"elsewhere": found.selection.elsewhere, "nested": nested(found)}
 
 
 def _closed(found: Findings) -> heldout.Closed:
-    cut = found.setup.fitter.simulator.windows
+    """On conditions that had no part in the fit; of three and more (`nested`) none in the choice of effects either.
+
+    Where the other conditions choose something else, that is what counts of a condition, as the search scored it.
+    """
+    selection, cut = found.selection, found.setup.fitter.simulator.windows
     before, after = (found.predictions[k].cost(cut.steps) for k in ("calibrated", "with_effects"))
+    answer = frozenset(e.label for e in found.model.effects)
+    for condition, chosen in selection.chosen.items() if nested(found) else ():
+        if chosen != answer and selection.searched is not None:
+            own, rows = cut.group == condition, selection.searched.rows
+            after[own] = before[own] * rows[chosen].cost[own] / rows[frozenset()].cost[own]
     return heldout.Closed(before, after, cut.group)
+
+
+def nested(found: Findings) -> bool:
+    """Whether there are conditions enough to choose without one: of two, the other alone tells no standard error."""
+    return len(found.selection.chosen) >= LEAST
 
 
 def _effect(found: Findings, effect: Candidate, sd: np.ndarray, part: _Part) -> FoundEffect:

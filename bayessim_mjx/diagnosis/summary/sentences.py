@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,6 +13,7 @@ from bayessim_mjx.diagnosis.result import FoundEffect, Gap
 from bayessim_mjx.diagnosis.selection.selected import Rival
 from bayessim_mjx.diagnosis.summary import first_look
 from bayessim_mjx.diagnosis.summary.left_in_words import flexible_in_words
+from bayessim_mjx.diagnosis.summary.verdict import Verdict
 from bayessim_mjx.diagnosis.vocabulary import listed, missing
 from bayessim_mjx.quantities import extent, percent
 
@@ -30,6 +31,8 @@ HEADS = {
     "no_gap": "No gap above the noise: the logs differ from the simulator by {nominal}.",
     "parameters": "The parameters are off, the structure is right: recalibrated, the gap falls from {nominal} to "
     "{calibrated}.",
+    "noise": "The noise is larger than estimated: what the recalibrated simulator leaves, {calibrated}, nothing "
+    "predicts, and no force leaves such a trace.",
     "effects": "The simulator lacks {named}.",
     "ambiguous": "The simulator lacks something like {named}, but these logs fit other explanations as well.",
     "unexplained": "Something is missing that no effect of the library explains.",
@@ -37,6 +40,14 @@ HEADS = {
 PARTLY = (
     "Partly explained: {named} {close} {realised} of the squared gap above the noise, but more than the tolerance "
     "remains at {beyond}."
+)
+REST = {
+    "effects": "The simulator lacks {named}, and more than the tolerance remains at {beyond}.",
+    "ambiguous": "The simulator lacks something like {named}, but these logs fit other explanations as well, and more "
+    "than the tolerance remains at {beyond}.",
+}
+IMPERFECT = (
+    "No candidate closes what remains, {remains_of} of the squared gap: the law is not quite that of the real system."
 )
 NEAREST = "Of the library, {named} {come} nearest"
 BEATEN = "; a flexible force alone predicts held-out conditions far better"
@@ -49,7 +60,13 @@ ELSEWHERE = (
     "Where the effects are chosen anew without each operating condition in turn, they close {elsewhere} of the gap of "
     "the condition that was left out."
 )
+NESTED = "These shares are of operating conditions that had no part in the choice of the effects nor in their fit."
 WITHIN = "What remains is within the tolerance at every joint: {within}."
+BY_CHANCE = (
+    "The best of {candidates} candidates gains as much in {chance} of logs in which nothing is missing (drawn from the "
+    "recalibrated simulator with noise as it is in these logs)."
+)
+OF_SENSORS = "What remains has the covariance of noise of the sensors, {colour}."
 CHANCE = (
     "What remains, {calibrated}, no candidate and no flexible force predicts on held-out conditions: process noise, an "
     "input that was not logged, or noise larger than estimated."
@@ -57,19 +74,22 @@ CHANCE = (
 
 
 def sentences(
-    name: str,
+    verdict: Verdict,
     effects: list[FoundEffect],
     parameters: dict[str, dict[str, Any]],
     found: Findings,
     far: Gap,
-    remains: float,
-    beaten: bool,
+    odds: Mapping[str, Any],
 ) -> list[str]:
-    """The verdict, most important first; `remains`, `beaten`: see `verdict_in_words`."""
-    told = verdict_in_words(name, effects, far, remains, beaten)
+    """The verdict, most important first; `odds`: what is named by chance, see `Diagnosis.chance`."""
+    name, cut = verdict.name, found.selection.fitter.simulator.windows
+    told = verdict_in_words(name, effects, far, verdict.remains, verdict.beaten)
+    told += [_by_chance(odds)]
     if found.selection.ambiguous:
         told += [_instead(e, found.selection.rivals.get(f"{e.name}@{e.where}", ())) for e in effects]
-    if not effects and remains == 0.0 and found.selection.above_noise(found.selection.base):
+    if verdict.noise is not None and (name == "noise" or far.beyond):
+        told.append(_of_sensors(verdict.noise.memory * cut.steps * cut.dt))
+    elif not effects and verdict.remains == 0.0 and found.selection.above_noise(found.selection.base):
         told.append(CHANCE.format(calibrated=stage_in_words(far, "calibrated")))
     if name == "unexplained" and found.flexible_winner is not None:
         told += [f"{text[:1].upper()}{text[1:]}." for text in flexible_in_words(found.flexible_winner)]
@@ -78,6 +98,19 @@ def sentences(
     told += [f"{k} {v['structural']}." for k, v in parameters.items() if v["structural"]]
     told += [f"{k} {v['data_sheet']}." for k, v in parameters.items() if v.get("data_sheet")]
     return [text for text in told if text]
+
+
+def _by_chance(odds: Mapping[str, Any]) -> str:
+    if not odds:
+        return ""
+    rare = odds["probability"] * (odds["draws"] + 1) < 1.5
+    share = f"{'less than ' if rare else ''}{percent(odds['probability'])}"
+    return BY_CHANCE.format(candidates=odds["candidates"], chance=share)
+
+
+def _of_sensors(memory: float) -> str:
+    """Of noise with a memory in s; 0 where it is white."""
+    return OF_SENSORS.format(colour=f"correlated over about {1e3 * memory:.2g} ms" if memory else "white")
 
 
 def verdict_in_words(
@@ -101,15 +134,19 @@ def verdict_in_words(
         "predicted": percent(promised),
         "realised": percent(went),
         "elsewhere": percent(far.closed.get("elsewhere")),
+        "remains_of": percent(1.0 - went),
         "beyond": listed([_left(n, far.physical[n]) for n in _worst(far) if n in far.beyond][:3]),
         "within": _within(far),
     }
     partly = name == "unexplained" and effects and far.beyond
-    out = [PARTLY if partly else HEADS[name]]
+    both = bool(effects and far.beyond) and name in REST
+    out = [PARTLY if partly else REST[name] if both else HEADS[name]]
     if effects:
         more = ON_TOP if remains > 0.05 else BEATEN if beaten else ""
         out += [f"{NEAREST}{more}."] if name == "unexplained" and (more or not partly) else []
         out.append(FALLS)
+        out += [IMPERFECT] if both and went < 1.0 else []
+        out += [NESTED if far.closed.get("nested") else ""]
         out += [ELSEWHERE] if math.isfinite(far.closed.get("elsewhere", math.nan)) else []
     if name == "unexplained" and not effects:
         rest = [_left(n, far.physical[n]) for n in _worst(far) if "largest" in far.physical[n]]
@@ -119,7 +156,7 @@ def verdict_in_words(
         out.append(_by_joint(far, bool(effects)))
     if effects and _within(far) and not far.beyond:
         out.append(WITHIN)
-    return [text.format(**fill) for text in out]
+    return [text.format(**fill) for text in out if text]
 
 
 def _at_bound(effect: FoundEffect) -> bool:

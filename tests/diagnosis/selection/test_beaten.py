@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from bayessim_mjx.diagnosis.summary.assemble import _beaten
+from bayessim_mjx.diagnosis.summary.verdict import beaten as is_beaten
 
 WINDOWS, NOISE = 10, 50.0
 
@@ -35,4 +35,4 @@ def found(base: float, named: float, flexible: float, significant: bool = True):
     ],
 )
 def test_beaten_is_relevant_and_significant(base, named, flexible, significant, beaten):
-    assert _beaten(found(base, named, flexible, significant)) is beaten
+    assert is_beaten(found(base, named, flexible, significant)) is beaten

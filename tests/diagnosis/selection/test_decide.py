@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from bayessim_mjx.diagnosis.selection.criteria import Criteria
-from bayessim_mjx.diagnosis.selection.decide import closed_elsewhere, compare, decide, order
+from bayessim_mjx.diagnosis.selection.decide import chosen_elsewhere, closed_elsewhere, compare, decide, order
 from bayessim_mjx.diagnosis.selection.table import BASE, read
 from bayessim_mjx.errors import UserError
 from tests.diagnosis.selection.planted import law, table
@@ -149,7 +149,7 @@ def test_criteria_are_given_as_texts():
 
 def elsewhere(errors):
     known = table(errors, group=GROUP)
-    return closed_elsewhere(known, order(known.laws), Criteria())
+    return closed_elsewhere(known, chosen_elsewhere(known, order(known.laws), Criteria()))
 
 
 def test_what_is_quoted_of_conditions_that_did_not_choose():
@@ -162,4 +162,4 @@ def test_what_is_quoted_of_conditions_that_did_not_choose():
 
 def test_one_condition_says_nothing_of_others():
     known = table({(): 100, (A,): 1.0}, group=np.zeros(8, int))
-    assert np.isnan(closed_elsewhere(known, order(known.laws), Criteria()))
+    assert np.isnan(closed_elsewhere(known, chosen_elsewhere(known, order(known.laws), Criteria())))

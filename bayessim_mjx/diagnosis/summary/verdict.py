@@ -1,0 +1,130 @@
+"""The verdict: whether what is named explains the gap, and what the rest is, where more of it remains than matters."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from bayessim_mjx.diagnosis import statistics
+from bayessim_mjx.diagnosis.findings import Findings
+from bayessim_mjx.diagnosis.residual.origin import Origin, origin
+from bayessim_mjx.diagnosis.result import Gap
+from bayessim_mjx.diagnosis.selection import chance
+from bayessim_mjx.diagnosis.selection.decide import compare
+from bayessim_mjx.diagnosis.selection.table import BASE
+
+
+@dataclass(frozen=True)
+class Limits:
+    """When a verdict says that something remains unexplained."""
+
+    matters: float = 1.5  # noise standard deviations that remain
+    # share of the calibrated gap: named effects that leave more, or on top of which a flexible force closes more, are
+    # not the explanation; what leaves less is, though its law may be imperfect
+    share: float = 0.3
+    # shares of the named effects' cost, and of the gap, by which a flexible force alone does better
+    beaten: float = 0.4
+    relevant: float = 0.05
+
+
+LIMITS = Limits()
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Its name, and what it rests on.
+
+    Attributes:
+        remains: share of the calibrated gap that a flexible force still closes on top of the effects; 0 where not
+            significant. beaten: whether a flexible force alone does much better than they do.
+        noise: where what remains comes from, if nothing predicts it and no force does; else None.
+    """
+
+    name: str
+    remains: float
+    beaten: bool
+    noise: Origin | None
+
+
+def verdict_of(found: Findings, far: Gap) -> Verdict:
+    """The verdict on what was found; `far`: what remains of the gap."""
+    left, alone, noise = remains(found), beaten(found), sensors_noise(found)
+    return Verdict(_name(found, far, left, alone, noise), left, alone, noise)
+
+
+def _name(found: Findings, far: Gap, remaining: float, alone: bool, noise: Origin | None) -> str:
+    tried, model = found.selection, found.model
+    if model.effects:
+        cost = {
+            k: float(p.cost(found.setup.fitter.simulator.windows.steps).mean()) for k, p in found.predictions.items()
+        }
+        above = cost["with_effects"] - 1.0
+        matters = above > LIMITS.matters**2 - 1.0 or bool(far.beyond)
+        little = above <= LIMITS.share * (cost["calibrated"] - 1.0) or noise is not None
+        structured = tried.above_noise(model) and remaining > LIMITS.share
+        if (matters and not little) or structured or (found.flexible_winner is not None and alone):
+            return "unexplained"
+        return "ambiguous" if tried.ambiguous else "effects"
+    if np.sqrt(tried.base.total / (tried.noise * len(tried.base.cost))) > LIMITS.matters:
+        return "unexplained" if noise is None or remaining > LIMITS.share else "noise"
+    if tried.above_noise(tried.base) and remaining > LIMITS.share:
+        return "unexplained"
+    q, _ = tried.nominal.quadratic(tried.fitter.spread)
+    floor = tried.noise * len(tried.base.cost) * tried.criteria.floor**2
+    return "parameters" if q.c.sum() > max(1.1 * tried.base.total, floor) else "no_gap"
+
+
+def remains(found: Findings) -> float:
+    """Share of the calibrated gap that a flexible force still closes on top of the winner; 0 where not significant."""
+    flex, base, model = found.flexible_winner, found.selection.base, found.model
+    if flex is None or not flex.condition.significant:
+        return 0.0
+    top = model.total - min(float(flex.condition.cost.sum()), model.total)
+    return statistics.share_of_gap(top, base.total, found.selection.noise * len(base.cost))
+
+
+def beaten(found: Findings) -> bool:
+    """Whether a flexible force alone predicts held-out conditions much better than the named effects do.
+
+    By a relevant share of the gap too: of effects that close 99.9 % something is left that a force can learn.
+    """
+    tried, base, model = found.selection, found.flexible_base, found.model
+    if base is None or not base.condition.significant:
+        return False
+    better = model.total - float(base.condition.cost.sum())
+    share = statistics.share_of_gap(better, tried.base.total, tried.noise * len(tried.base.cost))
+    return better > LIMITS.beaten * model.total and share > LIMITS.relevant
+
+
+def sensors_noise(found: Findings) -> Origin | None:
+    """Where what remains comes from, if that is noise of the sensors, larger than estimated; None if not.
+
+    A flexible force predicts nothing of it, neither in other conditions nor in between, and its covariance is not that
+    of the trace of forces.
+    """
+    flex, missing = found.flexible_winner, found.disturbance
+    if flex is None or missing is None or flex.condition.significant or flex.interpolation.significant:
+        return None
+    fit = found.model.fit
+    channels = int(found.selection.fitter.used.sum())
+    where = origin(fit.r, fit.B, missing.linear.D, missing.linear.nodes, channels, fit.weight)
+    return where if where.of_sensors else None
+
+
+def by_chance(found: Findings) -> dict[str, Any]:
+    """How often the best candidate gains as much in logs without a missing effect; {} where nothing is named.
+
+    {"probability" of the answer, "each": {label: of what it brings beside the others}, "nats", "draws", "candidates"}
+    """
+    selection, table = found.selection, found.selection.table
+    key = frozenset(e.label for e in found.model.effects)
+    if not key or table is None or not len(table.chance) or key not in table.rows:
+        return {}
+    nats = compare(table, BASE, key).nats
+    less = {label: key - {label} for label in sorted(key) if key - {label} in table.rows}
+    each = {k: chance.probability(table.chance, compare(table, rest, key).nats) for k, rest in less.items()}
+    own = chance.probability(table.chance, nats)
+    level = {"level": selection.criteria.chance, "draws": len(table.chance), "candidates": len(table.laws)}
+    return {"probability": own, "each": each, "nats": nats} | level

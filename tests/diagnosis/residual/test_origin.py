@@ -1,0 +1,41 @@
+"""Noise of a sensor and the work of a force are told apart on a mass whose forces and measurements are made up."""
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from bayessim_mjx.diagnosis.residual.origin import origin
+
+STEPS, WINDOWS, DT = 40, 40, 0.0125
+
+
+def columns():
+    """(start columns, force columns) of a mass of which the position is measured, in noise sd."""
+    t = np.arange(STEPS) * DT
+    push = np.tril(np.subtract.outer(np.arange(STEPS), np.arange(STEPS)), -1) * DT**2  # position per unit of force
+    tile = lambda a: np.repeat(a[None], WINDOWS, 0)  # noqa: E731
+    return tile(np.stack([np.ones(STEPS), t], 1)), tile(push / DT**2 / 50)
+
+
+def coloured(rng, memory):
+    white = rng.normal(size=(WINDOWS, STEPS + 100))
+    return lfilter([np.sqrt(1 - memory**2)], [1, -memory], white, axis=1)[:, 100:]
+
+
+@pytest.mark.parametrize(("size", "memory"), [(3.0, 0.0), (3.0, 0.8), (6.0, 0.9)])
+def test_larger_and_coloured_noise_of_sensors(size, memory):
+    """60 ms of memory at 80 Hz are .8 a row."""
+    rng, (B, D) = np.random.default_rng(0), columns()
+    r = rng.normal(size=(WINDOWS, STEPS)) + size * coloured(rng, memory)
+    found = origin(r, B, D, STEPS, 1, np.ones(WINDOWS))
+    assert found.of_sensors and (found.memory > 0) == (memory > 0)
+
+
+@pytest.mark.parametrize("memory", [0.5, 0.95])
+def test_forces(memory):
+    rng, (B, D) = np.random.default_rng(1), columns()
+    force = coloured(rng, memory)
+    moved = np.einsum("wnd,wd->wn", D, force)
+    r = rng.normal(size=(WINDOWS, STEPS)) + 4 * moved / np.sqrt(np.mean(moved**2))
+    found = origin(r, B, D, STEPS, 1, np.ones(WINDOWS))
+    assert not found.of_sensors
