@@ -33,6 +33,7 @@ FOLDER = Path(__file__).parent / "pictures" / "tasks"
 PAGE = Path(__file__).with_name("tasks.md")
 LARGEST, SECONDS, WIDTH, HEIGHT, FPS = 200_000, 5.0, 280, 210, 15
 SWAY, PERIOD = 0.15, 2.0  # share of a range by which a command moves to and fro; s
+FALLEN = 0.4  # by which share of its height a robot falls or rises until its film begins anew
 COLOURS = (64, 40, 24, 16)  # tried until the film is small enough
 FILTER = "fps={fps},split[a][b];[a]palettegen=max_colors={colours}[p];[b][p]paletteuse=dither=none:diff_mode=rectangle"
 
@@ -76,13 +77,17 @@ def swaying(task: str) -> tuple[film.Motion, Any, str]:
     for k in range(model.nu):  # a servo holds the pose that it begins with
         if model.actuator_biasprm[k, 1] and model.actuator_trntype[k] == mujoco.mjtTrn.mjTRN_JOINT:
             rest[k] = data.qpos[model.jnt_qposadr[model.actuator_trnid[k, 0]]]
-    poses = [data.qpos.copy()]
+    poses, begun = [data.qpos.copy()], (data.qpos.copy(), data.ctrl.copy())
+    free = model.jnt_type[0] == mujoco.mjtJoint.mjJNT_FREE
     phases = np.random.default_rng(0).uniform(0, 2 * np.pi, model.nu)
     for k in range(round(SECONDS * FPS)):
         wave = np.sin(2 * np.pi * k / FPS / PERIOD + phases) - np.sin(phases)
         limited = model.actuator_ctrllimited.astype(bool)
         data.ctrl[:] = np.where(limited, np.clip(rest + SWAY * (high - low) * wave, low, high), rest)
         mujoco.mj_step(model, data, round(1 / FPS / model.opt.timestep))
+        if free and abs(data.qpos[2] / begun[0][2] - 1) > FALLEN:  # as an episode that ends and begins anew
+            mujoco.mj_resetData(model, data)
+            data.qpos[:], data.ctrl[:] = begun
         poses.append(data.qpos.copy())
     shown = np.stack(poses)
     return Swaying(shown, np.zeros(len(shown)), 1 / FPS), model, "no policy: its actuators are moved to and fro"
