@@ -119,7 +119,7 @@ class Victim:
         process = self.start()
         if self.command == "refine":
             self.begun(process, before)
-            delay = rng.uniform(0.0, work)
+            delay = rng.uniform(0.3 * work, work)  # before that it simulates and fits
         elif rng.random() < 0.2:
             delay = rng.uniform(0.0, start + work)
         else:
