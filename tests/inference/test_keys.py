@@ -23,7 +23,7 @@ def test_a_purpose_of_its_own_has_a_key_that_no_member_has():
 
 
 def test_units_are_dropped_by_other_keys_in_every_layer_step_and_point_of_the_curve(monkeypatch):
-    points, chunk, used = 60, 5, []
+    points, chunk, used = 20, 4, []
     data = types.SimpleNamespace(train=jnp.ones(12, bool), x=jnp.zeros((1, 12, 2)), own=None)
     member = types.SimpleNamespace(data=data, settings=InferenceSettings(batch=4), seen=lambda rows, turn: rows)
     monkeypatch.setattr(mdnn, "_noise", lambda key, shape: used.append(np.asarray(key)) or jnp.zeros(shape, jnp.uint32))
@@ -33,4 +33,4 @@ def test_units_are_dropped_by_other_keys_in_every_layer_step_and_point_of_the_cu
         _, _, keys = _Member.batches(member, KEY + jnp.asarray(i, jnp.int32).astype(KEY.dtype) * APART, chunk)
         for key in keys:
             mdnn._hidden(params, jnp.ones((4, 2)), (key, jnp.float32(0.1)))
-    assert len({tuple(key.tolist()) for key in used}) == len(used) == 62 * chunk * 3
+    assert len({tuple(key.tolist()) for key in used}) == len(used) == (points + 2) * chunk * 3
