@@ -9,7 +9,7 @@ from typing import Any
 Z90, Z95 = 1.645, 1.960
 # parameters that do not mean the same in the finer reality and in the library (another pivot, gusts, signed loads)
 LOOSE = ("base_flexibility", "external_force", "load_friction")
-VERDICTS = ("no_gap", "parameters", "unexplained", "insufficient_data", "no result")
+VERDICTS = ("no_gap", "parameters", "noise", "unexplained", "insufficient_data", "no result")
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ def label(outcome: Outcome) -> str:
 
 def alarm(outcome: Outcome) -> bool:
     """Whether something is said to be wrong besides parameters."""
-    return label(outcome) not in ("no_gap", "parameters", "insufficient_data", "no result")
+    return label(outcome) not in ("no_gap", "parameters", "noise", "insufficient_data", "no result")
 
 
 def rate(answers: Sequence[bool]) -> dict[str, float]:

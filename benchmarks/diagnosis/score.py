@@ -109,7 +109,12 @@ def rates(outcomes: Sequence[Outcome], left_out: Sequence[Outcome] = ()) -> list
         Rate("single: nothing else named", [right(o) and len(o.named()) == 1 for o in single], 0.9),
         Rate("double: both named", [right(o) for o in double], 0.85),
         Rate("double: both in the equivalence set", [inside(o) for o in double], 0.85),
-        Rate("nothing wrong: false alarm", [label(o) not in ("no_gap", "parameters") for o in null], 0.02, most=True),
+        Rate(
+            "nothing wrong: false alarm",
+            [label(o) not in ("no_gap", "parameters", "noise") for o in null],
+            0.02,
+            most=True,
+        ),
         Rate("unknown cause: unexplained", [_unexplained(o) for o in unknown], 0.9),
         Rate("family left out: unexplained", [_unexplained(o) for o in left_out], 0.9),
         Rate("closure within 5 points of the truth's", [e <= 0.05 for e in errors], 0.9),

@@ -17,7 +17,19 @@ def columns(r, laws, samples=ROWS, group=None):
     """Candidates without limits on residuals whose noise is 1."""
     k, free = laws.shape[2], np.inf
     group = np.arange(len(r)) if group is None else group
-    return chance.Columns(laws, np.full(k, -free), np.full(k, free), r, np.ones(len(r)), group, samples, ROWS)
+    return chance.Columns(
+        laws,
+        np.full(k, -free),
+        np.full(k, free),
+        np.zeros((*r.shape, 1)),
+        np.ones(1),
+        r,
+        np.ones_like(r),
+        np.ones(len(r)),
+        group,
+        samples,
+        ROWS,
+    )
 
 
 def planted(rng, memory=0.0, size=1.0, smooth=False):
@@ -65,13 +77,22 @@ def test_a_planted_effect_is_beyond_chance_and_one_in_few_windows_too():
 
 def test_noise_keeps_size_and_covariance():
     rng = np.random.default_rng(3)
-    r, _ = planted(rng, 0.9)
+    r, laws = planted(rng, 0.9)
     r[:60] *= 2.0
-    drawn = chance.noise(r, rng, 40)
+    drawn = chance.noise(columns(r, laws), rng, 40)
     sizes = np.sqrt(np.mean(drawn**2, axis=(0, 2)))
     np.testing.assert_allclose(sizes / np.sqrt(np.mean(r**2, 1)), 1.0, atol=0.25)
     lagged = lambda x: np.mean(x[..., 1:] * x[..., :-1]) / np.mean(x**2)  # noqa: E731
     assert lagged(drawn) == pytest.approx(lagged(r), abs=0.03)
+
+
+def test_noise_that_grows_with_speed_is_told_from_noise_that_does_not():
+    rng = np.random.default_rng(4)
+    rate = rng.normal(size=(WINDOWS, ROWS))
+    for jitter in (0.0, 2.0):
+        sd = np.sqrt(1 + (jitter * rate) ** 2)
+        found = chance.profile(sd * rng.normal(size=rate.shape), np.ones_like(rate), rate**2)
+        np.testing.assert_allclose(found, sd, rtol=0.1)
 
 
 def test_what_chance_gains_as_often_is_not_named():
