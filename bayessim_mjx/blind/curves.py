@@ -15,7 +15,9 @@ import numpy as np
 LAPSE = 0.02  # of what is easily seen, missed for other reasons
 WANTED = 0.9
 LEVEL = 0.9  # of intervals
-THRESHOLD = np.linspace(np.log(0.3), np.log(3000.0), 80)  # log strength, in encoder noises, that is found half the time
+THRESHOLD = np.linspace(
+    np.log(0.3), np.log(3000.0), 185
+)  # log strength, in encoder noises, that is found half the time
 SLOPE = np.array([1.0, 1.6, 2.5, 4.0, 7.0, 14.0, 40.0])  # of the curve's logit, per unit of log strength
 AMONG_PLACES = np.array([0.08, 0.25, 0.6])  # standard deviations of thresholds, of an effect's places
 AMONG_EFFECTS = np.array([0.15, 0.4, 0.8, 1.3])  # and of effects
@@ -100,7 +102,7 @@ class Curves:
         self.trials: Mapping[Group, list[Trial]] = dict(groups)
         self._own = {g: self._likelihood(own) for g, own in groups.items()}  # [slopes, thresholds]
         # what each place says of its effect's threshold, [slopes, P, thresholds]
-        self._place = {g: np.einsum("ptu,bu->bpt", _PLACE, own) for g, own in self._own.items()}
+        self._place = {g: np.tensordot(own, _PLACE, ([1], [2])) for g, own in self._own.items()}
 
     @staticmethod
     def _likelihood(trials: Iterable[Trial]) -> np.ndarray:
@@ -125,7 +127,7 @@ class Curves:
     @cached_property
     def _evidence(self) -> dict[str, np.ndarray]:
         """{effect: its evidence [slopes, P, U, V]} for every population."""
-        return {e: np.einsum("uvt,bpt->bpuv", _EFFECT, m) for e, m in self._effects.items()}
+        return {e: np.tensordot(m, _EFFECT, ([2], [2])) for e, m in self._effects.items()}
 
     @cached_property
     def _population(self) -> np.ndarray:
@@ -141,10 +143,10 @@ class Curves:
         if effect in self._evidence:
             log = log - np.log(np.maximum(self._evidence[effect], 1e-290))
         weight = np.exp(log - log.max())
-        others = np.einsum("bpuv,uvt->bpt", weight, _EFFECT)
+        others = np.tensordot(weight, _EFFECT, ([2, 3], [0, 1]))
         for (e, w), said in self._place.items():
             if e == effect and w != where:
                 others = others * said / said.max()
         own = self._own.get((effect, where), np.ones((len(SLOPE), len(THRESHOLD))))
-        found = np.einsum("bpt,ptu->bu", others, _PLACE) * own
+        found = np.tensordot(others, _PLACE, ([1, 2], [0, 1])) * own
         return Belief(found / found.sum())

@@ -1,0 +1,95 @@
+"""The blind suite: baselines on motion whose missing effect is known, noise that lasts, and counts that are refused."""
+
+import json
+import sys
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from bayessim_mjx.blind import seal
+
+ROOT = Path(__file__).resolve().parents[2]
+for folder in ("diagnosis", "blind", "blind/entries"):
+    sys.path.insert(0, str(ROOT / "benchmarks" / folder))
+pytest.importorskip("systems")
+import bic  # noqa: E402
+import kinds  # noqa: E402
+import regression  # noqa: E402
+import release  # noqa: E402
+import residual  # noqa: E402
+import sindy  # noqa: E402
+import suite  # noqa: E402
+from systems import SYSTEMS  # noqa: E402
+
+from bayessim_mjx.blind.reality.plant import Plant  # noqa: E402
+
+PENDULUM = SYSTEMS["pendulum"]
+
+
+def problem(folder: Path, damping: float) -> regression.Problem:
+    """Logs without noise of a pendulum with more damping than its model."""
+    logs = folder / "logs"
+    logs.mkdir()
+    (folder / "model.xml").write_text(PENDULUM.xml)
+    model = mujoco.MjModel.from_xml_string(PENDULUM.xml)
+    model.dof_damping[0] += damping
+    model.opt.timestep /= 10
+    for k, pace in enumerate((2.0, 5.0)):
+        data, rows = mujoco.MjData(model), []
+        for row in range(200):
+            rows.append([row * 0.02, 0.8 * np.sin(pace * row * 0.02), data.qpos[0]])
+            data.ctrl[:] = rows[-1][1]
+            mujoco.mj_step(model, data, nstep=40)
+        np.savetxt(logs / f"{k}.csv", rows, delimiter=",", header="time,ctrl:hinge_motor,qpos:hinge", comments="")
+    (found,) = regression.problems(str(folder / "model.xml"), str(logs))
+    return found
+
+
+def test_baselines_name_what_is_plain_to_see(tmp_path):
+    p = problem(tmp_path, 0.2)
+    viscous = list(regression.EFFECTS).index("v")
+    assert regression.place(p, sindy.terms_of(p)[0]) == ("viscous_friction", "hinge")
+    assert viscous in bic.terms_of(p)
+    assert regression.least_squares(p, [viscous])[0][0] == pytest.approx(0.2, rel=0.1)
+    assert residual.predicted(p, np.random.default_rng(0)) > 0.5
+
+
+def test_coloured_noise_lasts_and_stamps_jitter():
+    plain = Plant(PENDULUM, {})
+    run = PENDULUM.record(plain, 0, 0, noise=False)
+    off = kinds.coloured(PENDULUM, run, np.random.default_rng(0))
+    noise = (off.qpos - run.qpos)[:, 0]
+    assert np.corrcoef(noise[1:], noise[:-1])[0, 1] == pytest.approx(np.exp(-0.02 / kinds.COLOUR), abs=0.12)
+    assert 0.0005 < np.std(np.diff(off.time)) < 0.003 and (np.diff(off.time) > 0).all()
+
+
+def test_a_case_is_written_once_and_sealed_and_scored(tmp_path):
+    assert kinds.make(PENDULUM, "null", 5, tmp_path) and not kinds.make(PENDULUM, "null", 5, tmp_path)
+    (case,) = suite.cases(tmp_path)
+    answer = tmp_path / "entries" / "says yes" / case.name
+    answer.mkdir(parents=True)
+    said = {"verdict": "effects", "effects": [{"name": "backlash", "where": "hinge", "equivalent_to": []}]}
+    (answer / "diagnosis.json").write_text(json.dumps(said))
+    seal.write(answer / "exit.json", json.dumps({"code": 0, "seconds": 1.0, "seal": (case / "seal.txt").read_text()}))
+    text, figures = suite.table(tmp_path)
+    assert figures["says yes"]["false alarms"]["hits"] == 1 and "| says yes |" in text and "1/1" in text
+
+
+def test_a_count_is_refused_unless_tree_and_seeds_are_fresh(monkeypatch):
+    said = {"status --porcelain": "", "rev-parse HEAD": "new"}
+    monkeypatch.setattr(release, "git", lambda *words: said[" ".join(words)])
+    counted = [{"commit": "old", "seeds": [2000, 2010]}]
+    assert release.refused(range(2010, 2020), counted) == ""
+    assert "development" in release.refused(range(1500, 1510), counted)
+    assert "has counted" in release.refused(range(2005, 2015), counted)
+    said["status --porcelain"] = " M file"
+    assert "not committed" in release.refused(range(2010, 2020), counted)
+
+
+def test_the_table_goes_between_its_marks():
+    page = (ROOT / "docs" / "leaderboard.md").read_text()
+    new = release.written(page, "| a |")
+    assert "| a |" in new and new.count(release.BEGIN) == new.count(release.END) == 1
+    assert release.written(new, "| b |") == release.written(page, "| b |")
