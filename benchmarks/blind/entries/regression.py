@@ -99,11 +99,15 @@ def _terms(p: dict[str, np.ndarray], i: int, dof: int, qadr: int) -> np.ndarray:
     return np.stack([*motion, u, p["du"][:, i], u * np.abs(u), np.sin(q), np.cos(q)], 1)
 
 
-def least_squares(p: Problem, terms: list[int]) -> tuple[np.ndarray, np.ndarray, float]:
-    """(coefficients, errors as if residuals were independent, rss), masses as their data sheet has them."""
+def least_squares(p: Problem, terms: list[int], shrink: float = 0.0) -> tuple[np.ndarray, np.ndarray, float]:
+    """(coefficients, errors as if residuals were independent, rss), masses as their data sheet has them.
+
+    shrink: ridge of the terms, as a share of their squares: some depend on each other.
+    """
     sigma = max(float(np.std(p.y)), 1e-12)
     A = np.column_stack([p.X[:, terms], p.nuisance])
-    ridge = np.diag([0.0] * len(terms) + [sigma**2] * p.nuisance.shape[1])
+    own = shrink * np.sum(p.X[:, terms] ** 2, axis=0)
+    ridge = np.diag([*own] + [sigma**2] * p.nuisance.shape[1])
     inverse = np.linalg.pinv(A.T @ A + ridge)
     x = inverse @ A.T @ p.y
     rss = float(np.sum((p.y - A @ x) ** 2))

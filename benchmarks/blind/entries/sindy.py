@@ -8,6 +8,7 @@ from regression import Problem, least_squares, place, problems, write
 
 SHARE = 0.15  # of the unexplained effort (rms): smaller terms are dropped
 MOST = 3  # terms at a joint: more cancel each other
+RIDGE = 0.05  # of the squares of a term, as in PySINDy's default
 LEAST = 0.1  # of its variance that the terms have to explain
 
 
@@ -16,7 +17,7 @@ def terms_of(p: Problem) -> list[int]:
     kept = list(range(p.X.shape[1]))
     size = np.sqrt(np.mean(p.X**2, 0))
     while kept:
-        x, _, rss = least_squares(p, kept)
+        x, _, rss = least_squares(p, kept, RIDGE)
         part = np.abs(x) * size[kept] / max(float(np.sqrt(np.mean(p.y**2))), 1e-12)
         smallest = int(np.argmin(part))
         if part[smallest] >= SHARE and len(kept) <= MOST:
