@@ -3,13 +3,15 @@
 # docker run --rm -v "$PWD/logs:/runs/logs" bayessim-mjx --task Pendulum
 FROM python:3.12-slim
 
-# OSMesa draws videos without a display; git lets runs record the commit that they were made with
+# OSMesa draws videos without a display; git lets runs record the commit that they were made with. No versions are
+# pinned: Debian's mirrors keep only the latest ones.
+# hadolint ignore=DL3008
 RUN apt-get update && apt-get install -y --no-install-recommends git libosmesa6 \
     && rm -rf /var/lib/apt/lists/*
 
 ARG ACCEL=cpu
 COPY . /src
-RUN if [ "$ACCEL" = cuda ]; then extras=cuda,export; else extras=export; fi \
+RUN if [ "$ACCEL" = cuda ]; then extras="cuda,export"; else extras="export"; fi \
     && pip install --no-cache-dir "/src[$extras]" && rm -rf /src
 
 # compiled programs are kept beside the logs

@@ -28,9 +28,9 @@ COMMANDS = {  # all of them, and what each is for
     "play": "returns, videos and ONNX files of a saved policy",
     "calibrate": "how far a finished run's posterior can be trusted",
     "diagnose": "what a simulator is missing, from recorded motion",
-    "blind": "which missing effects a diagnosis would find on your robot and logs",
+    "blind": "which missing effects a diagnosis would find on your robot",
     "gap_loop": "what a diagnosis is worth in return",
-    "logs": "recordings of other tools (MCAP, ROS bags, LeRobot, HDF5) as logs for a diagnosis",
+    "logs": "logs of MCAP, ROS bags, LeRobot and HDF5, for a diagnosis",
     "completion": "a script by which bash, zsh or fish completes commands and flags",
 }
 COMPLETION = (
@@ -78,7 +78,7 @@ class Watched:
 
 def _parser() -> cli.Parser:
     parser = cli.Parser("main", DESCRIPTION, resume=True)
-    others = "; ".join(f"{name.replace('_', '-')}: {text}" for name, text in COMMANDS.items())
+    others = "\n".join(f"{name.replace('_', '-'):12}{text}" for name, text in COMMANDS.items())
     parser.add_argument_group(f"commands of {cli.SCRIPT}", others)
     return parser
 

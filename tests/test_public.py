@@ -1,7 +1,10 @@
 """The table of contents: every public name is there, and none is imported before it is used."""
 
+import re
 import subprocess
 import sys
+import tomllib
+from pathlib import Path
 
 import pytest
 
@@ -22,3 +25,12 @@ def test_importing_the_package_imports_neither_jax_nor_mujoco():
 
 def test_tasks_are_not_importable_by_their_plain_name():
     assert "tasks" not in sys.modules and "cfg" not in sys.modules
+
+
+def test_the_repository_has_one_address():
+    root = Path(__file__).parents[1]
+    urls = tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))["project"]["urls"]
+    for name in ("pyproject.toml", "CITATION.cff", "mkdocs.yml", "bayessim_mjx/rl/hub.py"):
+        text = (root / name).read_text(encoding="utf-8")
+        assert set(re.findall(r"https://github\.com/[\w-]+/bayessim_mjx", text)) == {urls["Homepage"]}, name
+    assert f"site_url: {urls['Documentation']}\n" in (root / "mkdocs.yml").read_text(encoding="utf-8")

@@ -78,11 +78,20 @@ def prog_of(command: str) -> str:
     return f"{SCRIPT} {command.replace('_', '-')}" if script else f"python -m bayessim_mjx.{command}"
 
 
+class Lines(argparse.HelpFormatter):
+    """Texts of several lines, as tables, keep them."""
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        if "\n" in text:
+            return "\n".join(indent + line for line in text.splitlines())
+        return super()._fill_text(text, width, indent)
+
+
 class PlainParser(argparse.ArgumentParser):
     """Flags; what is wrong with them is a UserError. The usage line does not repeat the list of options."""
 
     def __init__(self, **options: Any):
-        plain: dict[str, Any] = {"usage": "%(prog)s [options]", "allow_abbrev": False}
+        plain: dict[str, Any] = {"usage": "%(prog)s [options]", "allow_abbrev": False, "formatter_class": Lines}
         super().__init__(**(plain | options))
         self.add_argument("--version", action=Version, nargs=0, help="print the version and stop")
 
