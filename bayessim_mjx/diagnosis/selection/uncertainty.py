@@ -97,16 +97,19 @@ def systematic(model: Model, timestep: float, left: float = 0.0) -> Array:
     ])  # fmt: skip
 
 
-def win_share(models: list[Model], group: NDArray[np.int64], noise: float, rng: np.random.Generator) -> Array:
+def win_share(
+    models: list[Model], group: NDArray[np.int64], noise: float, rng: np.random.Generator, numbers: float = np.inf
+) -> Array:
     """Pseudo-BMA+ weights (Yao et al., 2018, arXiv:1704.02030): held-out log scores under a Bayesian bootstrap.
 
-    Of conditions; of the windows where there is one condition only.
+    Of conditions; of the windows where there is one condition only. Rivals differ by smooth errors of their laws,
+    however white the noise is: no more residuals count as independent than `numbers` (`Fitter.numbers`).
     """
     names, index = np.unique(group, return_inverse=True)
     index = index if len(names) > 1 else np.arange(len(group))
     draws = (rng.dirichlet(np.ones(index.max() + 1), size=500) * (index.max() + 1))[:, index]
     totals = np.stack([draws @ m.cost for m in models], 1) + 1e-9  # [draws, models]
-    samples = min(m.samples for m in models)
+    samples = min(*(m.samples for m in models), numbers)
     score = -0.5 * samples * np.log(totals)
     weight = np.exp(score - score.max(1, keepdims=True))
     return np.asarray((weight / weight.sum(1, keepdims=True)).mean(0))

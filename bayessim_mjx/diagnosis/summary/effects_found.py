@@ -122,7 +122,7 @@ def _weights(found: Findings, models: list[Model]) -> list[float]:
     if len(models) < 2:
         return [float("nan")]
     group, rng = found.setup.fitter.simulator.windows.group, np.random.default_rng(found.setup.seed)
-    return uncertainty.win_share(models, group, found.selection.noise, rng).tolist()
+    return uncertainty.win_share(models, group, found.selection.noise, rng, found.setup.fitter.numbers).tolist()
 
 
 def _unit(setup: Setup, effect: Candidate, unit: str) -> str:

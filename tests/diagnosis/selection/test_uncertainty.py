@@ -161,6 +161,9 @@ def test_weights_among_rivals_are_one_together_and_equal_where_the_rivals_are():
     np.testing.assert_allclose(same, [0.5, 0.5])
     # twice the cost: 100 log 2 nats behind
     assert uncertainty.win_share([model(2.0), model(1.0)], group, 1.0, rng)[0] < 1e-20
+    # of which only ten are independent numbers: 5 log 2 nats
+    few = uncertainty.win_share([model(2.0), model(1.0)], group, 1.0, rng, numbers=10.0)[0]
+    assert few == pytest.approx(1 / (1 + 2**5))
     # each better on half of the conditions: resampled conditions decide, not the pooled score
     better = np.where(group < 2, 0.5, 2.0)
     split = uncertainty.win_share([model(better), model(1 / better)], group, 1.0, rng)
