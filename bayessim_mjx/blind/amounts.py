@@ -56,7 +56,7 @@ AMOUNTS: dict[str, Amount] = {
     "actuator_deadband": Amount("half width", "command", _take("half_width")),
     "actuator_saturation": Amount("limit", "F", _take("inverse_limit"), inverse=True),
     "speed_torque_limit": Amount("free speed", "q/s", _take("inverse_speed"), inverse=True),
-    "effort_loss": Amount("loss at half the effort", "1/F", _take("loss")),
+    "effort_loss": Amount("loss", "1/F", _take("loss")),
     "cogging": Amount("amplitude", "F", _root("sine", "cosine")),
     "rate_limit": Amount("limit", "command/s", _take("slowness"), inverse=True),
     "payload": Amount("mass", "kg", _take("mass")),
@@ -71,7 +71,6 @@ AMOUNTS: dict[str, Amount] = {
     "sensor_gain": Amount("error", "1", lambda p: abs(p["gain"] - 1)),
 }
 OTHER = Amount("size", "", _take("size"))
-AMOUNTS["effort_loss"] = dataclasses.replace(AMOUNTS["effort_loss"], what="loss")
 
 
 def amount_of(effect: str, parameters: Parameters) -> float:
@@ -104,11 +103,6 @@ def told(effect: str, value: float, slide: bool = False) -> str:
     if unit == "1":
         return percent(shown)
     return f"{number(shown, 2)} {unit}".replace(" command", "").strip()
-
-
-def stronger(effect: str) -> str:
-    """How a stronger one is told: `above`, or of a limit `below`."""
-    return "below" if AMOUNTS.get(effect, OTHER).inverse else "above"
 
 
 def spoken(effect: str) -> str:

@@ -70,6 +70,8 @@ def curves(found: Mapping[str, Any]) -> Any:
         _strengths(axes)
         axes.set_ylim(-0.08, 1.08)
         axes.set_yticks((0, 0.5, 0.9), ("0", "50", "90 %"))
+    for axes in grid.flat[max(len(shown) - COLUMNS, 0) :]:  # below these there is nothing
+        axes.tick_params(labelbottom=True)
     for axes in grid.flat[len(shown) :]:
         axes.set_visible(False)
     figure.supxlabel("strength, encoder noises within half a second", fontsize=9)

@@ -14,16 +14,16 @@ from bayessim_mjx.blind.outcome import VERDICTS, Outcome, alarm, covered, label,
 from bayessim_mjx.blind.runner import trials
 
 STEEP = (0.3, 2.0)  # how an amount may grow with strength: its power
+SHARP = 15.0  # largest strength over smallest of an interval that is worth a sentence
 PLOTTED = np.geomspace(1.0, 300.0, 41)
-Sizes = Mapping[tuple[str, str], tuple[float, float]]  # (effect, place) -> (strength, amount) where no case is
 Found = dict[str, Any]
 
 
-def findings(outcomes: Sequence[Outcome], own: Bench, effects: tuple[str, ...], sizes: Sizes | None = None) -> Found:
+def findings(outcomes: Sequence[Outcome], own: Bench, effects: tuple[str, ...]) -> Found:
     """The answer as it is written to blind.json."""
     curves = Curves(trials(outcomes))
     singles = [o for o in outcomes if o.kind == "single" and o.said]
-    rows = [_threshold(g, curves, singles, own, sizes or {}) for g in own.groups(effects)]
+    rows = [_threshold(g, curves, singles, own) for g in own.groups(effects)]
     nulls = [o for o in outcomes if o.kind == "null" and o.said]
     unknown = [o for o in outcomes if o.kind == "unknown" and o.said]
     told = {
@@ -46,14 +46,13 @@ def findings(outcomes: Sequence[Outcome], own: Bench, effects: tuple[str, ...], 
     return told | {"sentences": sentences(told)}
 
 
-def _threshold(group: tuple[str, str], curves: Curves, singles: Sequence[Outcome], own: Bench, sizes: Sizes) -> Found:
+def _threshold(group: tuple[str, str], curves: Curves, singles: Sequence[Outcome], own: Bench) -> Found:
     effect, where = group
     tried = [(o, e) for o in singles for e in o.truth["effects"] if (e["name"], e["where"]) == group]
     middle, low, high = curves.of(effect, where).interval()
     strongest = max(curves.all_of(effect), key=lambda t: t.strength, default=None)
     most = strongest.strength if strongest else 0.0
     pairs = [(e["strength"], e["amount"]) for _, e in tried if e["strength"] > 0 and e["amount"] > 0]
-    pairs = pairs or ([sizes[group]] if group in sizes else [])
     slide = own.slide(effect, where)
     found: Found = {
         "effect": effect, "where": where, "tried": len(tried), "found": sum(o.right(e) for o, e in tried),
@@ -142,7 +141,8 @@ def sentences(found: Found, most: int = 6) -> list[str]:
     """What would not have been seen, the clearest first: for the report of a diagnosis of the same logs."""
     rows = [r for r in found["thresholds"] if r["amount"] and r["tried"]]
     rows.sort(key=lambda r: math.log(r["strength"][2] / r["strength"][1]))
-    return [_sentence(r) for r in rows[:most]]
+    sharp = [r for r in rows[:most] if r["strength"][2] < SHARP * r["strength"][1]]
+    return [_sentence(r) for r in sharp] or ["too few cases to say what would be missed: go on with more of them"]
 
 
 def _sentence(r: Mapping[str, Any]) -> str:
@@ -150,6 +150,6 @@ def _sentence(r: Mapping[str, Any]) -> str:
     place = "" if r["where"] in ("world", "") else f" at {r['where']}"
     side, bound = "above" if amount.inverse else "under", r["told"].lstrip("<> ")
     return (
-        f"{amounts.spoken(r['effect'])}{place}: a {amount.what} {side} {bound} may be missed "
-        f"(found 9 times of 10 from {r['interval']} on, 90 % interval)"
+        f"{amounts.spoken(r['effect'])}{place}: {amount.what} {side} {bound} may be missed "
+        f"(found 9 times of 10 from there on; 90 % interval {r['interval']})"
     )

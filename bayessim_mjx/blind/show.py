@@ -55,7 +55,9 @@ def rates(found: Found) -> tuple[list[str], list[list[str]]]:
                      str(closed["n"])])  # fmt: skip
     if (real := found.get("really_closed")) and real["n"]:
         between = f"{percent(real['low'])} to {percent(real['high'])}"
-        rows.append(["the same on fresh motion of the finer reality", percent(real["median"]), between, str(real["n"])])
+        rows.append(
+            ["of that in the finer reality itself, without noise", percent(real["median"]), between, str(real["n"])]
+        )
     return ["", "share", "interval", "n"], rows
 
 

@@ -13,7 +13,7 @@ from bayessim_mjx.report.page import render
 sys.path.insert(0, str(Path(__file__).parents[1] / "report"))
 import fake  # noqa: E402
 
-SAID = "backlash at elbow: a half of the play under 3 mrad may be missed"
+SAID = "backlash at elbow: half of the play under 3 mrad may be missed"
 
 
 @pytest.fixture
