@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -13,6 +13,7 @@ import numpy as np
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate, Coordinate
 from bayessim_mjx.diagnosis.fitting.discretisation import contacts
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
+from bayessim_mjx.diagnosis.selection import shortlist
 from bayessim_mjx.diagnosis.selection.criteria import Criteria
 from bayessim_mjx.diagnosis.selection.models import Model, scored
 from bayessim_mjx.diagnosis.selection.screen import Screened
@@ -115,17 +116,36 @@ def _say_left(say: Progress, label: str, done: int, total: int, left: int) -> No
 
 
 def _fit_batch(pool: Pool, entries: Entries, heats: _Heats, progress: Callable[[int], None]) -> None:
-    fits = pool.fitter.iterate(
-        [fit for several, _ in entries.values() for fit in several],
-        pool.settings.iterations,
-        lambda f: fresh(pool, f),
-        pool.settings.tolerance,
-        progress=progress,
-        keep=heats.among([len(several) for several, _ in entries.values()]),
-    )
-    for key, (several, effects) in entries.items():
-        own, fits = fits[: len(several)], fits[len(several) :]
-        pool.models[key] = scored(pool.fitter, min(own, key=lambda fit: fit.cost), effects)
+    """All starts on some windows, where there are many; the best start of each model then on all of them."""
+    rules = pool.settings.iterations, lambda f: fresh(pool, f), pool.settings.tolerance
+    every = [several for several, _ in entries.values()]
+    own = shortlist.windows_of(pool.base.fit)
+    if own is None:
+        fits = pool.fitter.iterate(
+            [f for fs in every for f in fs], *rules, progress, heats.among(list(map(len, every)))
+        )
+        best = [min(some, key=lambda fit: fit.cost) for some in _in_turn(fits, every)]
+    else:
+        starts = [shortlist.cut(f, own) for fs in every for f in fs]
+        part = shortlist.on(pool.fitter, own)
+        fits = part.iterate(starts, *rules, progress, heats.among(list(map(len, every))))
+        first = [
+            min(zip(some, fs, strict=True), key=lambda pair: pair[0].cost)
+            for some, fs in zip(_in_turn(fits, every), every, strict=True)
+        ]
+        cost = np.array([ranked.cost for ranked, _ in first])
+        heats.least = min(heats.least, float(cost.min()))
+        going = shortlist.close(cost, heats.least)
+        again = [shortlist.back(fit, ranked, own) for ranked, fit in first]
+        best = pool.fitter.iterate(again, *rules, None, lambda made, fits, running: heats.finals(made, running, going))
+    for key, fit in zip(entries, best, strict=True):
+        pool.models[key] = scored(pool.fitter, fit, entries[key][1])
+
+
+def _in_turn(fits: Sequence[Fit], like: Sequence[Sequence[Fit]]) -> Iterator[Sequence[Fit]]:
+    """The fits in groups of the same sizes."""
+    rest = iter(fits)
+    return (list(itertools.islice(rest, len(several))) for several in like)
 
 
 def _left_out(pool: Pool, models: Sequence[Sequence[Candidate]], label: str) -> None:
@@ -146,6 +166,7 @@ class _Heats:
     def __init__(self, pool: Pool, part: str = "") -> None:
         self.pool, self.part = pool, part
         self.pace: dict[int, float] = {}  # steps made -> cost of the best candidate, of all batches
+        self.least = np.inf  # cost of the best candidate in the end
 
     def among(self, starts: Sequence[int]) -> Callable[[int, Sequence[Fit], Sequence[int]], list[int]]:
         """Which fits of a batch go on, of candidates with so many starts each."""
@@ -163,6 +184,11 @@ class _Heats:
             return [i for i in running if cost[i] <= limits[owner[i]] or self._falls(fits[i])]
 
         return going
+
+    def finals(self, made: int, running: Sequence[int], close: Sequence[bool]) -> list[int]:
+        """Which fits go on with all windows: one step tells their place in the table, those that are close go on."""
+        over = self.part and self.pool.settings.budget.over(self.part)
+        return [] if over else [i for i in running if made < 1 or close[i]]
 
     def _falls(self, fit: Fit) -> bool:
         refused = len(fit.history) > 1 and fit.history[-1] == fit.history[-2]

@@ -1,5 +1,6 @@
 """Parameters that end at a bound: ranges grow to hold what the logs say, end where physics does, and it is told."""
 
+import dataclasses
 from types import SimpleNamespace
 
 import numpy as np
@@ -28,19 +29,25 @@ class Linear:
         parameter = SimpleNamespace(low=low, high=high)
         space = SimpleNamespace(parameters=(parameter,))
         self.physics = SimpleNamespace(quantity=lambda index: quantity, space=space)
-        self.windows = Windows()
+        self.windows, self.rollouts = Windows(), 0
 
     def run(self, thetas, offsets, own=None):
-        error = (self.true - np.asarray(thetas)[:, :1, None]) * MOTION + self.noise
+        own = np.arange(len(MOTION)) if own is None else own
+        self.rollouts += len(thetas) * len(own)
+        error = (self.true - np.asarray(thetas)[:, :1, None]) * MOTION[own] + self.noise[own]
         return np.stack([error - offsets[..., 0, None], np.zeros_like(error)], -1)
 
 
+@dataclasses.dataclass(frozen=True)
 class Windows:
+    log: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(len(MOTION), int))
+    start: np.ndarray = dataclasses.field(default_factory=lambda: np.arange(len(MOTION)))
+    group: np.ndarray = dataclasses.field(default_factory=lambda: np.repeat(np.arange(4), 2))
+
     sigma_q, sigma_v, spread, steps = np.array([0.01]), np.array([np.inf]), np.array([0.03, 0.1]), 20
-    group = np.repeat(np.arange(4), 2)
 
     def __len__(self):
-        return len(MOTION)
+        return len(self.log)
 
 
 def pool_of(true, quantity=None, low=0.0, high=1.0, neutral=0.0, start=0.5):
