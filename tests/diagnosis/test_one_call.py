@@ -50,6 +50,12 @@ def test_findings_are_values():
     assert isinstance(start.predictions, MappingProxyType)
 
 
+@pytest.mark.parametrize("minutes", ["0", "-2", "soon", "inf"])
+def test_a_limit_of_time_is_a_number_of_minutes(minutes, capsys):
+    assert bayessim_mjx.diagnose.main(["--minutes", minutes]) == 2
+    assert f"{minutes}: allowed is a number of minutes above 0" in capsys.readouterr().err
+
+
 BOTH = "assert callable(b.diagnose) and b.diagnose.main(['--headless']) == 2"
 ORDERS = (
     "import bayessim_mjx as b",

@@ -73,11 +73,16 @@ def remove(folder: Path) -> None:
 
 
 class Remembering(Fitter):
-    """A fitter whose fits are in a journal, until that is None."""
+    """A fitter whose fits are in a journal, until that is None.
 
-    def __init__(self, fitter: Fitter, journal: Journal) -> None:
+    Args:
+        bare: what it comes to goes without residuals and columns, which are by far the most of it.
+    """
+
+    def __init__(self, fitter: Fitter, journal: Journal, bare: bool = False) -> None:
         super().__init__(fitter.simulator, fitter.base, fitter.theta)
         self.journal: Journal | None = journal
+        self.bare = bare
 
     def refresh(self, fit: Fit) -> Fit:
         """As of `Fitter`."""
@@ -91,7 +96,13 @@ class Remembering(Fitter):
         if self.journal is None:
             return super().iterate(fits, iterations, *args, **options)
         asked = _asked(f"iterate {iterations}", fits)
-        return self.journal.play(asked, lambda: super(Remembering, self).iterate(fits, iterations, *args, **options))
+
+        def fitted() -> list[Fit]:
+            found = super(Remembering, self).iterate(fits, iterations, *args, **options)
+            none = np.empty(0)
+            return [dataclasses.replace(fit, r=none, A=none, B=none) for fit in found] if self.bare else found
+
+        return self.journal.play(asked, fitted)
 
 
 def digest(*parts: Any) -> str:

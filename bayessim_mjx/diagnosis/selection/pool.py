@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate, Coordinate
 from bayessim_mjx.diagnosis.fitting.discretisation import contacts
@@ -185,7 +186,7 @@ class _Heats:
 
         return going
 
-    def finals(self, made: int, running: Sequence[int], close: Sequence[bool]) -> list[int]:
+    def finals(self, made: int, running: Sequence[int], close: NDArray[np.bool_]) -> list[int]:
         """Which fits go on with all windows: one step tells their place in the table, those that are close go on."""
         over = self.part and self.pool.settings.budget.over(self.part)
         return [] if over else [i for i in running if made < 1 or close[i]]

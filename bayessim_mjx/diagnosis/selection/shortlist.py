@@ -55,11 +55,11 @@ def windows_of(fit: Fit) -> NDArray[np.int64] | None:
 
 
 def on(fitter: Fitter, own: NDArray[np.int64]) -> Fitter:
-    """The fitter on some of its windows; in the same journal."""
+    """The fitter on some of its windows; in the same journal, without the columns that nobody asks for."""
     some: Any = Some(fitter.simulator, own)
     part = Fitter(some, fitter.base, fitter.theta)
     journal = fitter.journal if isinstance(fitter, Remembering) else None
-    return part if journal is None else Remembering(part, journal)
+    return part if journal is None else Remembering(part, journal, bare=True)
 
 
 def cut(fit: Fit, own: NDArray[np.int64]) -> Fit:

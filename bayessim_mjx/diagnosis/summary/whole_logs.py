@@ -68,10 +68,10 @@ class _Stage:
 
 def stage(found: Findings, say: Progress) -> Findings:
     """With what every stage of the gap is over whole logs."""
-    return found.having(simulate(found))
+    return found.having(simulate(found, say))
 
 
-def simulate(found: Findings) -> Whole:
+def simulate(found: Findings, say: Progress = lambda text, done, total: None) -> Whole:
     """Every stage on at most LOGS logs; parameters are those found without the log's condition, where it has one."""
     setup, cut = found.setup, found.setup.fitter.simulator.windows
     stages = {
@@ -89,6 +89,7 @@ def simulate(found: Findings) -> Whole:
     simulator = _simulator(found, logs, starts, max(length), len(stages) + RULES.draws)
     errors, spread = [], []
     for i, (w, steps) in enumerate(zip(first, length, strict=True)):
+        say("whole logs", i, len(first))
         rows = _one(found, simulator, stages, i, w)[:, :steps]
         errors.append(rows[: len(stages)])
         spread.append(rows[len(stages) :] - rows[len(stages) - 1])
