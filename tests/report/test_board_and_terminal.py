@@ -51,6 +51,17 @@ def test_console_says_what_was_found_in_plain_lines(tmp_path):
     assert "3 more candidates in diagnosis.json" in text
 
 
+def test_what_was_not_fitted_is_listed_with_the_reason(tmp_path):
+    labels = [f"payload@link{i}" for i in range(9)]
+    found = dataclasses.replace(fake.full(), not_fitted={"no time left": labels, "no gain at first order": ["x@y"]})
+    file = io.StringIO()
+    report.console(found, file=file)
+    text = " ".join(file.getvalue().split())
+    assert "not fitted, no time left: Extra payload · link0" in text and "link5 and 3 more" in text
+    page = report.write(found, tmp_path).read_text()
+    assert "no gain at first order: X · y" in page and "link8" in page
+
+
 @pytest.mark.parametrize("verdict", VERDICTS)
 def test_console_of_every_verdict_also_in_ascii(verdict):
     file = io.TextIOWrapper(io.BytesIO(), encoding="ascii", write_through=True)
