@@ -120,7 +120,7 @@ def _fit_batch(pool: Pool, entries: Entries, heats: _Heats, progress: Callable[[
     """All starts on some windows, where there are many; the best start of each model then on all of them."""
     rules = pool.settings.iterations, lambda f: fresh(pool, f), pool.settings.tolerance
     every = [several for several, _ in entries.values()]
-    own = shortlist.windows_of(pool.base.fit)
+    own = shortlist.windows_of(pool.base.fit) if pool.settings.shortlisted else None
     if own is None:
         fits = pool.fitter.iterate(
             [f for fs in every for f in fs], *rules, progress, heats.among(list(map(len, every)))

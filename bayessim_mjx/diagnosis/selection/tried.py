@@ -24,6 +24,7 @@ class Settings:
         fresh: base columns are differenced anew if there are at most so many.
         first: labels of candidates that are fitted whatever the screening says; together: of a set of them that is.
         budget: time that the search may take.
+        shortlisted: whether candidates are ranked on some of the windows first: faster, and their order is rougher.
         believed: share of the noise (rms) that is the sensors'; the rest is what the time step may be worth at most.
     """
 
@@ -37,6 +38,7 @@ class Settings:
     first: tuple[str, ...] = ()
     together: tuple[str, ...] = ()
     budget: Budget = Budget()
+    shortlisted: bool = False
 
 
 class Tried:

@@ -13,6 +13,7 @@ from tests.diagnosis.selection.test_bounds import pool_of, silent
 def fitted(true=0.4, starts=(0.9, 0.1, 0.6)):
     """(the pool's toy effect fitted from several starts, windows simulated for it)."""
     pool, model = pool_of(true)
+    pool.settings = dataclasses.replace(pool.settings, shortlisted=True)
     effect, simulator = model.effects[0], pool.fitter.simulator
     simulator.physics.template = None
     fits = [pool.fitter.derive(pool.base.fit, effect.coordinates, np.array([s])) for s in starts]
