@@ -15,6 +15,7 @@ import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from score import wilson
@@ -73,8 +74,8 @@ def count(args: argparse.Namespace) -> None:
     print(f"{'noise':16}{'price alone':>24}", *(f"{f'bootstrap, {100 * level:g} %':>24}" for level in LEVELS))
     for kind, rows in alarms.items():
         each = [[row[i] for row in rows] for i in range(1 + len(LEVELS))]
-        told = [(100 * np.mean(x), *(100 * end for end in wilson(sum(x), len(x)))) for x in each]
-        print(f"{kind:16}", *(f"{f'{a:.1f} % ({low:.1f} to {high:.1f})':>24}" for a, low, high in told), len(rows))
+        shares = [[100 * share for share in (float(np.mean(x)), *wilson(sum(x), len(x)))] for x in each]
+        print(f"{kind:16}", *(f"{f'{a:.1f} % ({low:.1f} to {high:.1f})':>24}" for a, low, high in shares), len(rows))
 
 
 def of_case(case: Path, draws: int) -> dict[str, list[list[bool]]]:
@@ -108,17 +109,18 @@ def of_case(case: Path, draws: int) -> dict[str, list[list[bool]]]:
     return out
 
 
-def passes(tried: object, price: float, rng: np.random.Generator) -> list[bool]:
+def passes(tried: Any, price: float, rng: np.random.Generator) -> list[bool]:
     """Whether the best candidate on these residuals passes the price, and each level of a bootstrap of them."""
     from bayessim_mjx.diagnosis.selection import chance
 
     columns = chance.columns_of(tried)
+    assert columns is not None, "no candidate does anything"
     best = float(chance.gains(columns, columns.r[None]).max())
     odds = chance.probability(chance.best_gains(columns, rng, 100), best)
     return [best > price, *(odds <= level for level in LEVELS)]
 
 
-def rows_of(fitter: object) -> Rows:
+def rows_of(fitter: Any) -> Rows:
     """What was measured at the windows' rows."""
     cut = fitter.simulator.windows
     rows = cut.start[:, None] + 1 + np.arange(cut.steps)
@@ -127,7 +129,7 @@ def rows_of(fitter: object) -> Rows:
     return Rows(q, v, cut.sigma_q, cut.dt)
 
 
-def left_over(fitter: object, fit: object, error: np.ndarray) -> np.ndarray:
+def left_over(fitter: Any, fit: Any, error: np.ndarray) -> np.ndarray:
     """`[W, n]` residuals of errors `[W, H, nv]` of the positions, with those of the velocities that follow from them.
 
     Start states and known parameters take what they can, linearly.
