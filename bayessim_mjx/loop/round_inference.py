@@ -63,7 +63,8 @@ def infer(loop: Loop, state: LoopState, policy: Policy, info: RoundInfo) -> Loop
     posterior = _widened(loop, state, policy, _posterior(loop, state, info), info)
     if loop.refines:
         state, posterior = refining.refined(loop, state, real, posterior, info)
-    info.warnings += _complaints(posterior.names, info.fit, known_before)
+    by_replays = info.refinement is not None and info.refinement.used
+    info.warnings += _complaints(posterior.names, info.fit, known_before, by_replays)
     info.posterior, info.real = posterior, jax.tree.map(np.asarray, real)
     info.scores |= score(posterior, source.truth)
     state, domain = ranges.move(loop, state, posterior, info)
@@ -71,7 +72,7 @@ def infer(loop: Loop, state: LoopState, policy: Policy, info: RoundInfo) -> Loop
     if verdict is not None:
         info.checks = checks.conclude(*verdict, posterior, b.distrust, info.moves or None)
         told = posterior.names if round_ else _unknown(posterior.names, info.fit)
-        info.warnings += info.checks.warnings(told, info.refinement is not None and info.refinement.used)
+        info.warnings += info.checks.warnings(told, by_replays)
         domain = checks.guarded(domain, info.checks.prior_share)
     else:
         info.warnings += [pile.sentence() for pile in info.moves]
@@ -207,11 +208,13 @@ def _widened(loop: Loop, state: LoopState, policy: Policy, posterior: Distributi
     return tempered(posterior, found.at(known).widening)
 
 
-def _complaints(names: tuple[str, ...], fit: dict[str, Any], known_before: np.ndarray) -> list[str]:
-    """What a person should know about this round's fit."""
+def _complaints(names: tuple[str, ...], fit: dict[str, Any], known_before: np.ndarray, by_replays: bool) -> list[str]:
+    """What a person should know about this round's fit; by_replays: the posterior is not the network's alone."""
     texts, unknown = [], _unknown(names, fit)
     if unknown and not np.array_equal(fit["identified"], known_before):
-        texts.append(f"not identified by these trajectories, kept at the prior: {', '.join(unknown)}")
+        what = ", ".join(unknown)
+        from_network = f"the network does not tell {what} from these trajectories; the posterior is that of replays"
+        texts.append(from_network if by_replays else f"not identified by these trajectories, kept at the prior: {what}")
     if fit["clipped"] > CLIPPED:
         texts.append(f"{percent(fit['clipped'])} of the summaries' entries lie beyond 10 sd and were clipped")
     if fit["n_invalid"] > 0:

@@ -104,3 +104,14 @@ def test_a_run_from_before_refinement_goes_on_without(tmp_path):
         kept = [line for line in path.read_text().splitlines() if "refine:" not in line]
         path.write_text("\n".join(kept) + "\n")
     assert run.config.bayessim.refine == "off"
+
+
+def test_what_replays_tell_is_not_said_to_be_the_prior():
+    """A network that identifies nothing: its posterior is the prior, but not the one that replays refined."""
+    fit = {"identified": np.array([False, True]), "clipped": 0.0, "n_invalid": 0, "skipped": 0}
+    before = np.ones(2, bool)
+    (alone,) = round_inference._complaints(("mass", "length"), fit, before, by_replays=False)
+    (refined,) = round_inference._complaints(("mass", "length"), fit, before, by_replays=True)
+    assert alone == "not identified by these trajectories, kept at the prior: mass"
+    assert "prior" not in refined
+    assert "mass" in refined and "length" not in refined
