@@ -269,7 +269,7 @@ def _logs(logs: Any, model: mujoco.MjModel, map: str | Path | None) -> list[Log]
     each: list[Any] = [logs] if isinstance(logs, str | Path | Log) else list(logs)
     if all(isinstance(log, Log) for log in each):
         return each
-    return read_logs(each if len(each) > 1 else each[0], model, map)
+    return read_logs(each if len(each) > 1 else each[0], model, map, partial=True)
 
 
 def _several(texts: str | Sequence[str]) -> Sequence[str]:

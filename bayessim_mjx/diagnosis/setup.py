@@ -15,7 +15,15 @@ from bayessim_mjx import effects as library
 from bayessim_mjx.diagnosis import tolerance
 from bayessim_mjx.diagnosis.equation_error import leads
 from bayessim_mjx.diagnosis.equation_error.look import Look
-from bayessim_mjx.diagnosis.fitting import candidates, command_shift, discretisation, scales, stepping, windows
+from bayessim_mjx.diagnosis.fitting import (
+    candidates,
+    command_shift,
+    discretisation,
+    observation,
+    scales,
+    stepping,
+    windows,
+)
 from bayessim_mjx.diagnosis.fitting.centred_commands import physics_of
 from bayessim_mjx.diagnosis.fitting.fitter import Fitter
 from bayessim_mjx.diagnosis.fitting.robot import Robot
@@ -121,7 +129,8 @@ def prepare(
     dt = control_period(robot, logs)
     told = [*notes]
     seen, before = leads.checked(logs, robot, dt, told, seen_first)
-    usable = seen.demand()
+    seen = seen.of_logs(observation.completed(seen.demand(), robot.mj_model))
+    usable = seen.usable
     told += [*seen.warnings, *(f"{text} (found, not assumed)" for text in seen.findings)]
     floors = noise.floors(usable)
     kinds = [library.load(n) if isinstance(n, str) else n for n in (library.names() if effects == "all" else effects)]
@@ -147,9 +156,8 @@ def prepare(
     allowed = tolerance.judge(robot.mj_model, 2 * size.travel, cut.sigma_q, asked)
     said = [*steps.said(), *_faster(seen.usable, delivered, dt)]
     said += [] if shift is None else shift.told(float(np.median([log.period for log in logs])))
-    told += [*said, *floors.warnings, *steps.warnings()]
-    told += [*(f"not tried: {text}" for text in left_out), *_few_conditions(cut)]
-    told += [*allowed.warnings(), *led.sentences()]
+    told += [*said, *floors.warnings, *steps.warnings(), *(f"not tried: {text}" for text in left_out)]
+    told += [*_few_conditions(cut), *allowed.warnings(), *led.sentences()]
     fixed = (robot, physics, seen, floors, fitter, led.candidates, size, settings, seed, allowed)
     return Setup(*fixed, tuple(told), tuple(said), step, before)
 

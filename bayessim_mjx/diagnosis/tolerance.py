@@ -65,8 +65,21 @@ class Tolerance:
             f"--tolerance {n}: {extent(t, u)} is below the noise of {extent(s, u)}: what is smaller cannot be told, "
             "the noise is taken"
             for n, u, t, s, own in zip(self.names, self.units, self.limit, self.noise, self.given, strict=True)
-            if own and t < s
+            if own and t < s and math.isfinite(s)
         ]
+
+    def measured(self) -> list[tuple[int, str]]:
+        """(degree of freedom, channel) of the positions that were measured: of others no gap is told."""
+        return [(i, n) for i, n in enumerate(self.names) if math.isfinite(self.noise[i])]
+
+    def by_dof(self, channels: Array) -> Array:
+        """The positions among measured channels `[..., channels]` as `[..., nv]`; NaN where none was measured."""
+        seen = np.isfinite(self.noise)
+        if seen.all():
+            return channels[..., : len(seen)]
+        out = np.full((*channels.shape[:-1], len(seen)), np.nan)
+        out[..., seen] = channels[..., : int(seen.sum())]
+        return out
 
     def exceeded(self, rms: Array) -> NDArray[np.bool_]:
         """`[nv]`, where a root mean square error `[nv]` (rad or m) leaves more than tolerated above the noise."""

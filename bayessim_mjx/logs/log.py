@@ -91,6 +91,8 @@ class Log:
         streams: whatever else was recorded, [T] each: `effort:<actuator>`, `enabled:<actuator>` (0 = drive off, the
             command did not act), witnesses such as `voltage`; NaN where not sampled.
         metadata: the file's side YAML (condition, controller, payload, repeat_of, hold ...) and `source`, its path.
+        absent: channels (`qpos:elbow`) that were not measured; their values are guesses, with the standard deviations
+            that sigma_qpos and sigma_qvel have there. Velocities only where others were measured (has_qvel).
     """
 
     name: str
@@ -104,6 +106,7 @@ class Log:
     sigma_qvel: Array
     streams: Mapping[str, Array] = field(default_factory=dict)
     metadata: Mapping[str, Any] = field(default_factory=dict)
+    absent: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         rows = len(self.time)
@@ -151,6 +154,20 @@ class Log:
             turned = [2.0 * float(np.sqrt(np.mean(own[-4:] ** 2)))] * 3 if kind in ("free", "ball") else []
             out += [*map(float, moved), *turned]
         return np.array(out)
+
+    @property
+    def seen_dofs(self) -> NDArray[np.bool_]:
+        """[nv]: whether the position was measured."""
+        out: list[bool] = []
+        for joint in self.joints:
+            seen = not any(f"qpos:{n}" in self.absent for n in self.channels.of_joint(joint))
+            out += [seen] * len(self.channels.of_joint(joint, "qvel"))
+        return np.array(out, bool)
+
+    @property
+    def seen_speeds(self) -> NDArray[np.bool_]:
+        """[nv]: whether the velocity was measured."""
+        return np.array([self.has_qvel and f"qvel:{n}" not in self.absent for n in self.channels.qvel], bool)
 
     @property
     def aliases(self) -> set[str]:

@@ -18,8 +18,19 @@ MAX_GAP = 5.0  # sample periods without a sample after which a file is cut in tw
 SHORT_GAP = 0.01  # s; shorter pauses are bridged however fast the file is
 
 
-def pieces(table: Table, columns: Mapping[str, Array], channels: Channels, metadata: Mapping[str, Any]) -> list[Log]:
-    """The file as one log, or as several where samples are missing for long."""
+def pieces(
+    table: Table,
+    columns: Mapping[str, Array],
+    channels: Channels,
+    metadata: Mapping[str, Any],
+    absent: tuple[str, ...] = (),
+) -> list[Log]:
+    """The file as one log, or as several where samples are missing for long.
+
+    Args:
+        table: the file; columns: its channels; metadata: of its logs.
+        channels: the model's; absent: those that were not measured.
+    """
     time = columns["time"]
     steps = np.diff(time)
     gaps = np.flatnonzero(steps > max(MAX_GAP * float(np.median(steps)), SHORT_GAP))
@@ -36,18 +47,25 @@ def pieces(table: Table, columns: Mapping[str, Array], channels: Channels, metad
         warnings.warn(f"{text}; cut into {len(spans)} run(s)", stacklevel=2)
     names = [table.path.name] if len(spans) == 1 else [f"{table.path.name}#{k}" for k in range(len(spans))]
     return [
-        _log(name, {k: c[a:b] for k, c in columns.items()}, channels, metadata)
+        _log(name, {k: c[a:b] for k, c in columns.items()}, channels, metadata, absent)
         for name, (a, b) in zip(names, spans, strict=True)
     ]
 
 
-def _log(name: str, columns: Mapping[str, Array], channels: Channels, metadata: Mapping[str, Any]) -> Log:
+def _log(
+    name: str,
+    columns: Mapping[str, Array],
+    channels: Channels,
+    metadata: Mapping[str, Any],
+    absent: tuple[str, ...] = (),
+) -> Log:
     rows = len(columns["time"])
 
     def stack(stream: str, names: Sequence[str]) -> Array:
         return np.stack([columns[f"{stream}:{n}"] for n in names], 1) if names else np.zeros((rows, 0))
 
-    sigma, grain = (_known(metadata, key, columns, channels) for key in ("sigma", "quantum"))
+    given = {k: c for k, c in columns.items() if k not in absent}
+    sigma, grain = (_known(metadata, key, given, channels) for key in ("sigma", "quantum"))
 
     def spread_of(stream: str, names: Sequence[str], x: Array) -> Array:
         keys = [f"{stream}:{n}" for n in names]
@@ -60,8 +78,15 @@ def _log(name: str, columns: Mapping[str, Array], channels: Channels, metadata: 
     has_qvel = all(f"qvel:{n}" in columns for n in channels.qvel)
     if has_qvel:
         measured = stack("qvel", channels.qvel)
-        _compare(name, measured, velocity, spread, channels)
-        velocity, spread = measured, spread_of("qvel", channels.qvel, measured)
+        if absent:
+            seen = np.array([f"qvel:{n}" not in absent for n in channels.qvel])
+            both = seen & ~np.isin([f"qpos:{n}" for n in channels.qvel], absent)
+            _compare(name, measured, np.where(both, velocity, 0.0), spread, channels)
+            velocity = np.where(seen, measured, velocity)
+            spread = np.where(seen, spread_of("qvel", channels.qvel, measured), spread)
+        else:
+            _compare(name, measured, velocity, spread, channels)
+            velocity, spread = measured, spread_of("qvel", channels.qvel, measured)
     used = {"time"} | {
         f"{s}:{n}" for s in ("ctrl", "qpos", "qvel") for n in getattr(channels, s if s != "ctrl" else "actuators")
     }
@@ -77,6 +102,7 @@ def _log(name: str, columns: Mapping[str, Array], channels: Channels, metadata: 
         sigma_qvel=spread,
         streams={k: c for k, c in columns.items() if k not in used},
         metadata=metadata,
+        absent=absent,
     )
 
 

@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 
 from bayessim_mjx.errors import UserError
+from bayessim_mjx.logs.absent import filled
 from bayessim_mjx.logs.bad_rows import leave_out
 from bayessim_mjx.logs.check import STREAMS, check_finite, check_motion, check_names, check_time
 from bayessim_mjx.logs.files import FORMAT, Paths, distinct, files_of, map_of_folder, side_yaml
@@ -26,7 +27,10 @@ LATEST = 1.0  # s by which commands may act later or earlier than their rows say
 
 
 def read_logs(
-    paths: Paths, mj_model: mujoco.MjModel, map: str | Path | Mapping[str, Any] | LogMap | None = None
+    paths: Paths,
+    mj_model: mujoco.MjModel,
+    map: str | Path | Mapping[str, Any] | LogMap | None = None,
+    partial: bool = False,
 ) -> list[Log]:
     """Read all runs of a folder (or the files named), in the model's order of joints and actuators.
 
@@ -34,6 +38,10 @@ def read_logs(
     are cut at gaps longer than 5 periods and 10 ms;
     `<file stem>.yaml` beside a file becomes its metadata; `sigma` and `quantum` there, {<channel>: value}, replace the
     estimates of a channel's noise and resolution.
+
+    Args:
+        paths: a folder or files; mj_model: names their channels; map: where columns come from.
+        partial: positions and velocities may be missing (`Log.absent`); else they are refused.
 
     Raises:
         UserError: whatever is wrong with a file, naming the file, its column and row, and what is allowed.
@@ -44,7 +52,7 @@ def read_logs(
     if log_map is not None:
         _check_map(log_map, channels)
     files = distinct(files_of(paths, log_map))
-    logs = [log for path in files for log in _read_one(path, mj_model, channels, log_map)]
+    logs = [log for path in files for log in _read_one(path, mj_model, channels, log_map, partial)]
     _check_repeats(logs)
     return logs
 
@@ -61,13 +69,16 @@ def _check_repeats(logs: Sequence[Log]) -> None:
             warnings.warn(f"{text}; allowed: {names}", stacklevel=3)
 
 
-def _read_one(path: Path, mj_model: mujoco.MjModel, channels: Channels, log_map: LogMap | None) -> list[Log]:
+def _read_one(
+    path: Path, mj_model: mujoco.MjModel, channels: Channels, log_map: LogMap | None, partial: bool
+) -> list[Log]:
     log_map = log_map or LogMap()
     table = _table(path, log_map)
     if log_map.names_channels:
         columns, sources = log_map.apply(table), log_map.sources(table)
     else:
         columns, sources = _columns(table, channels, log_map)
+    columns, absent = filled(table, columns, channels, mj_model) if partial else (columns, ())
     check_names(table, columns, channels)
     if table.lenient:
         table, columns = leave_out(table, columns, sources, channels, log_map.bad_rows)
@@ -87,7 +98,7 @@ def _read_one(path: Path, mj_model: mujoco.MjModel, channels: Channels, log_map:
     columns = _with_numbers(table, columns)
     if "condition" in metadata:
         metadata.setdefault("operating_condition", metadata["condition"])
-    return pieces(table, columns, channels, metadata)
+    return pieces(table, columns, channels, metadata, absent)
 
 
 def _table(path: Path, log_map: LogMap) -> Table:

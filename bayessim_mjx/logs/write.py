@@ -48,4 +48,4 @@ def _columns(log: Log, with_qvel: bool) -> dict[str, Array]:
         blocks["qvel"] = (log.channels.qvel, log.qvel)
     for stream, (names, values) in blocks.items():
         table.update({f"{stream}:{n}": c for n, c in zip(names, values.T, strict=True)})
-    return table | dict(log.streams)
+    return {name: column for name, column in (table | dict(log.streams)).items() if name not in log.absent}

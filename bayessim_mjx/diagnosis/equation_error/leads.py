@@ -61,6 +61,8 @@ def checked(
 
 def looked(logs: Sequence[Log], robot: Robot, told: list[str]) -> Look:
     """The look before any simulation; a failure costs the race its leads, not the diagnosis, and is `told`."""
+    if any(log.absent for log in logs):
+        return Look()  # what a joint needs is known only with the motion of all
     try:
         return look(logs, robot.mj_model, _deviations(robot), robot.rating)
     except Exception as error:

@@ -79,7 +79,8 @@ class Discretisation:
     def noisier(self, cut: Windows) -> Windows:
         """Windows in which what cannot be removed is noise."""
         nv = len(self.channels)
-        more = self.floor[:nv] - self.sigma[:nv]
+        known = np.isfinite(self.floor[:nv])
+        more = np.subtract(self.floor[:nv], self.sigma[:nv], where=known, out=np.zeros(nv))
         spread = cut.spread + np.concatenate([3 * more, 10 * more])  # as of windows with this noise
         return dataclasses.replace(cut, sigma_q=self.floor[:nv], sigma_v=self.floor[nv:], spread=spread)
 

@@ -102,7 +102,8 @@ class Fitter:
         self.sigma = sigma[self.used]
         self.spread = windows.spread
         self.size = windows.steps * int(self.used.sum())
-        self.numbers = float(NUMBERS * len(windows) * int(np.isfinite(windows.sigma_q).sum()))
+        joints = int((np.isfinite(windows.sigma_q) | np.isfinite(windows.sigma_v)).sum())
+        self.numbers = float(NUMBERS * len(windows) * joints)
 
     def whiten(self, errors: Array) -> Array:
         """`[..., W, H, channels]` -> `[..., W, n]`."""

@@ -49,7 +49,8 @@ class Windows:
         batch: for the simulator.
         log, start, group: `[W]`, index of the log, first row in it, index of the operating condition.
         groups: names of the conditions.
-        sigma_q, sigma_v: `[nv]`, noise of positions (tangent) and of velocities (inf where they are not used).
+        sigma_q, sigma_v: `[nv]`, noise of positions (tangent) and of velocities (inf where they are not measured in all
+            logs, or not used).
         spread: `[2 nv]`, standard deviation of the measured start state.
         logs: the resampled logs.
         dt: control period, s.
@@ -266,7 +267,13 @@ def _noise(logs: Sequence[Log], model: mujoco.MjModel, use_qvel: bool) -> tuple[
     rate = np.sqrt(np.mean([log.sigma_qvel**2 for log in logs], axis=0))
     sigma_v = np.maximum(rate, 1e-3 * motion) if use_qvel else np.full(model.nv, np.inf)
     start_v = np.maximum(3 * rate, 0.1 * motion + 10 * sigma_q)
-    return sigma_q, sigma_v, np.concatenate([3 * sigma_q, start_v])
+    if not any(log.absent for log in logs):
+        return sigma_q, sigma_v, np.concatenate([3 * sigma_q, start_v])
+    seen, fast = (np.all([getattr(log, k) for log in logs], axis=0) for k in ("seen_dofs", "seen_speeds"))
+    kept = fast & (use_qvel | ~seen)  # the only measurement of a joint is compared in any case
+    sigma_v = np.where(kept, np.maximum(rate, 1e-3 * motion), np.inf)
+    start_v = np.where(seen, start_v, 3 * rate + 0.1 * motion)  # what is guessed is not tied to its position's guess
+    return np.where(seen, sigma_q, np.inf), sigma_v, np.concatenate([3 * sigma_q, start_v])
 
 
 def _stack(parts: list) -> jax.Array:

@@ -87,7 +87,8 @@ class Gate:
     @property
     def use_qvel(self) -> bool:
         """Whether the measured velocities may be compared with the simulator's; otherwise the positions say it all."""
-        return bool(self.qvel) and all(self.qvel.values()) and all(log.has_qvel for log in self.usable)
+        alone = any((log.seen_speeds & ~log.seen_dofs).any() for log in self.usable)  # with no position beside it
+        return (alone or bool(self.qvel)) and all(self.qvel.values()) and all(log.has_qvel for log in self.usable)
 
     def demand(self) -> tuple[Log, ...]:
         """The usable logs.
@@ -99,6 +100,13 @@ class Gate:
             reasons = "; ".join(f"{name}: {reason}" for name, reason in self.refused.items()) or "no logs were given"
             raise UserError(f"no usable log: {reasons}")
         return self.usable
+
+    def of_logs(self, logs: Sequence[Log]) -> Gate:
+        """With others in the place of the usable logs."""
+        if all(a is b for a, b in zip(self.usable, logs, strict=True)):
+            return self
+        own = iter(logs)
+        return replace(self, reports=tuple(replace(r, log=next(own)) if r.usable else r for r in self.reports))
 
     def shifted(self, late: float) -> Gate:
         """With logs whose commands act `late` s later than they did."""
@@ -160,7 +168,7 @@ def _report(log: Log, mj_model: mujoco.MjModel, dt: float) -> Report:
     own = _alone(log, dt)
     if any(f.kind == "refused" for f in own):
         return Report(log, own)  # nothing further can be computed from it
-    related = tuple(relations(log, mj_model))
+    related = () if log.absent else tuple(relations(log, mj_model))  # forces on a joint need the motion of all
     seen = tuple(single_log.velocities(log))
     step = max(dt, log.period)
     targets = _targets(log, mj_model)

@@ -81,8 +81,10 @@ def constant(log: Log, dt: float) -> Iterator[Finding]:
     """Joints that never move, commands that never change; nothing moving at all is refused."""
     ranges = np.ptp(log.qpos, axis=0)
     level = 6.0 * log.sigma_qpos + 1e-12
-    still = [j for j in log.joints if not (ranges > level)[log.channels.columns(j)].any()]
-    if len(still) == len(log.joints):
+    seen = [j for j in log.joints if log.seen_dofs[log.channels.columns(j, "qvel")].all()]
+    still = [j for j in seen if not (ranges > level)[log.channels.columns(j)].any()]
+    fast = np.ptp(log.qvel, axis=0) > 6.0 * log.sigma_qvel + 1e-12
+    if len(still) == len(seen) and not (log.absent and (fast & log.seen_speeds).any()):
         yield refuse(f"nothing moves: {', '.join(still)} stay within their noise")
         return
     for joint in still:
@@ -115,8 +117,9 @@ def clipped(log: Log, targets: Mapping[str, Array]) -> Iterator[Finding]:
 def _measured(log: Log) -> Iterator[tuple[str, Array]]:
     kinds = dict(zip(log.joints, log.channels.kinds, strict=True))
     for stream, values in (("qpos", log.qpos), *((("qvel", log.qvel),) if log.has_qvel else ())):
-        names = getattr(log.channels, stream)
-        yield from ((f"{stream}:{n}", c) for n, c in zip(names, values.T, strict=True) if n in kinds)
+        names = [(n, f"{stream}:{n}") for n in getattr(log.channels, stream)]
+        pairs = zip(names, values.T, strict=True)
+        yield from ((name, c) for (n, name), c in pairs if n in kinds and name not in log.absent)
     yield from ((n, s) for n, s in log.streams.items() if n.startswith("effort:") and np.isfinite(s).all())
 
 
@@ -163,7 +166,7 @@ def units(log: Log, known: Collection[str] = ()) -> Iterator[Finding]:
         known: joints whose unit something else vouches for.
     """
     for joint, kind in zip(log.joints, log.channels.kinds, strict=True):
-        if kind not in _FASTEST or joint in known:
+        if kind not in _FASTEST or joint in known or f"qpos:{joint}" in log.absent:
             continue
         q, v = log.channels.columns(joint).start, log.channels.columns(joint, "qvel").start
         fastest = float(np.percentile(_speed(log, q), 99))
@@ -210,7 +213,9 @@ def velocities(log: Log) -> list[Velocity]:
     if grid[-1] - grid[0] < 2.0 / cutoff:
         return []  # all of it is edge
     out = []
-    for name, v, w, noise in zip(log.channels.qvel, log.qvel[rows].T, rates.T, spread, strict=True):
+    both = log.seen_dofs & log.seen_speeds
+    for i in np.flatnonzero(both):
+        name, v, w, noise = log.channels.qvel[i], log.qvel[rows, i], rates[:, i], spread[i]
         even = [lowpass(np.interp(grid, time, x), step, cutoff) for x in (v, w)]
         if float(np.std(even[1])) > 2.0 * float(noise) and np.ptp(v) > 0:
             out.append(_compare(name, grid, even[0], even[1], 0.5 / cutoff))

@@ -129,7 +129,10 @@ def _where(found: Findings) -> list[Place]:
     setup = found.setup
     cut = setup.fitter.simulator.windows
     calibrated = found.predictions["calibrated"]
-    names = Channels.of(setup.physics.mj_model).qvel
+    channels, used = Channels.of(setup.physics.mj_model).qvel, setup.fitter.used[: setup.physics.mj_model.nv]
+    names = [n for n, seen in zip(channels, used, strict=True) if seen]
+    if not names:
+        return []
     costs = np.stack([np.maximum(calibrated.cost(cut.steps, slice(i, i + 1)) - 1.0, 0.0) for i in range(len(names))], 1)
     total = costs.sum()
     if total <= 0.1 * costs.size:

@@ -87,9 +87,9 @@ def _overlays(found: Findings) -> list[dict[str, Any]]:
     for r, log in enumerate(cut.logs):
         own = np.flatnonzero(cut.log == r)
         for joint in range(model.njnt):
-            if int(model.jnt_type[joint]) not in (2, 3) or len(out) >= MANY or not len(own):
-                continue
             q, v = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
+            if int(model.jnt_type[joint]) not in (2, 3) or len(out) >= MANY or not len(own) or not log.seen_dofs[v]:
+                continue
             rows = np.concatenate([np.arange(cut.start[w] + 1, cut.start[w] + 1 + cut.steps) for w in own])
             entry: dict[str, Any] = {
                 "log": log.name, "joint": model.joint(joint).name or f"joint{joint}", "unit": length_unit(model, v),
@@ -98,7 +98,8 @@ def _overlays(found: Findings) -> list[dict[str, Any]]:
             }  # fmt: skip
             told = {k: p for k, p in found.predictions.items() if k != "with_effects" or found.model.effects}
             for stage, prediction in told.items():
-                entry[stage] = log.qpos[rows, q] - (prediction.error[own, :, v] * cut.sigma_q[v]).reshape(-1)
+                error = setup.tolerance.by_dof(prediction.error[own])[..., v]
+                entry[stage] = log.qpos[rows, q] - (error * cut.sigma_q[v]).reshape(-1)
             out.append(entry)
     return out
 

@@ -34,7 +34,7 @@ def measured(found: Findings, closed: dict[str, Any]) -> Gap:
         rows.append({"name": f"{seconds:.2g} s", "seconds": seconds, **row, **_physical(each, allowed)})
     main = rows[-1]
     noises = {s: by_joint(p, cut.steps, allowed) / cut.sigma_q for s, p in predictions.items()}
-    by_channel = {n: {s: float(v[i]) for s, v in noises.items()} for i, n in enumerate(allowed.names)}
+    by_channel = {n: {s: float(v[i]) for s, v in noises.items()} for i, n in allowed.measured()}
     physical = {n: main["physical"][n] | own for n, own in _remains(predictions["with_effects"], allowed).items()}
     return Gap(
         noise_floor=1.0,
@@ -67,22 +67,20 @@ def with_whole(far: Gap, over: whole_logs.Whole, allowed: Tolerance) -> Gap:
 
 def by_joint(prediction: Prediction, steps: int, allowed: Tolerance) -> Array:
     """Root mean square errors `[nv]`, rad or m, over the first steps."""
-    return np.sqrt(np.mean(prediction.error[:, :steps, : len(allowed.noise)] ** 2, axis=(0, 1))) * allowed.noise
+    return np.sqrt(np.mean(allowed.by_dof(prediction.error[:, :steps]) ** 2, axis=(0, 1))) * allowed.noise
 
 
 def _physical(each: dict[str, Array], allowed: Tolerance) -> dict[str, Any]:
     """{"physical": {joint: {stage: rad or m}}, "shares": {stage: share of the range of motion}} of `[nv]` errors."""
-    rows = {
-        n: {s: float(v[i]) for s, v in each.items()} | {"unit": allowed.units[i]} for i, n in enumerate(allowed.names)
-    }
-    moves = allowed.motion > 0
+    rows = {n: {s: float(v[i]) for s, v in each.items()} | {"unit": allowed.units[i]} for i, n in allowed.measured()}
+    moves = (allowed.motion > 0) & np.isfinite(allowed.noise)
     shares = {s: float(np.sqrt(np.mean((v[moves] / allowed.motion[moves]) ** 2))) for s, v in each.items()}
     return {"physical": rows, "shares": shares if moves.any() else {}}
 
 
 def _remains(last: Prediction, allowed: Tolerance) -> dict[str, dict[str, Any]]:
     """By joint, what the last stage leaves against what is tolerated, rad or m."""
-    error = last.error[..., : len(allowed.noise)] * allowed.noise
+    error = allowed.by_dof(last.error) * allowed.noise
     rms = np.sqrt(np.mean(error**2, axis=(0, 1)))
     largest, beyond = np.max(np.abs(error), axis=(0, 1)), allowed.exceeded(rms)
     return {
@@ -90,7 +88,7 @@ def _remains(last: Prediction, allowed: Tolerance) -> dict[str, dict[str, Any]]:
             "noise": float(allowed.noise[i]), "motion": float(allowed.motion[i]), "tolerance": float(allowed.limit[i]),
             "largest": float(largest[i]), "beyond": bool(beyond[i]),
         }
-        for i, n in enumerate(allowed.names)
+        for i, n in allowed.measured()
     }  # fmt: skip
 
 

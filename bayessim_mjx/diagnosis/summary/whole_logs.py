@@ -151,8 +151,8 @@ def _judged(
     broken = [n for n, k, e in zip(names, last, errors, strict=True) if not np.isfinite(e[:, :k]).all()]
     kept = [i for i, n in enumerate(names) if n not in broken and last[i] >= RULES.least * cut.steps]
     cost = {s: np.array([np.mean(errors[i][k, : last[i]] ** 2) for i in kept]) for k, s in enumerate(stages)}
-    nv = setup.physics.mj_model.nv
-    each = {s: np.array([np.mean(errors[i][k, : last[i], :nv] ** 2, 0) for i in kept]) for k, s in enumerate(stages)}
+    of = setup.tolerance.by_dof
+    each = {s: np.array([np.mean(of(errors[i][k, : last[i]]) ** 2, 0) for i in kept]) for k, s in enumerate(stages)}
     for table in (cost, each):
         table.setdefault("with_effects", table["calibrated"])
     longest = max((last[i] for i in kept), default=0) * cut.dt

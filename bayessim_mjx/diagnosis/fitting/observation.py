@@ -1,0 +1,230 @@
+"""Logs in which not every joint was measured: the motion of the others, and whether what was measured tells it.
+
+An extended Kalman filter and smoother (Rauch, Tung and Striebel) of the model as it was delivered runs along each log.
+What it finds only says where the windows' start states are first looked for, and how far from there: nothing of it
+enters the likelihood. An unknown acceleration, as large as makes the measurements most likely, stands for what the
+model lacks.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from bayessim_mjx.diagnosis.fitting.stepper import Stepper
+from bayessim_mjx.errors import UserError
+from bayessim_mjx.logs.log import Log
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Rules:
+    """What is believed before anything is measured, and what counts as told."""
+
+    angle: float = 0.5  # rad or m, of a position at a log's first row
+    speed: float = 2.0  # rad/s or m/s, of a velocity there
+    shares: tuple[float, ...] = (0.003, 0.03, 0.3)  # of typical accelerations, that the model may lack
+    passes: int = 2  # smoothed start states are filtered from again
+    second: float = 0.5  # s, in which a start state has to show
+    told: float = 0.5  # of its standard deviation that may be left after that
+    least: float = 1e-6  # rad, rad/s: as precise as the model is taken to be
+
+
+RULES = Rules()
+
+
+def completed(logs: Sequence[Log], model: mujoco.MjModel) -> tuple[Log, ...]:
+    """The logs with the motion of joints that were not measured, and its standard deviations; others as they are.
+
+    Args:
+        model: as it was delivered.
+
+    Raises:
+        UserError: what was measured does not tell the state of a joint.
+    """
+    if not any(log.absent for log in logs):
+        return tuple(logs)
+    ways = [_smoothed(log, model) if log.absent else None for log in logs]
+    _demand([(log, way) for log, way in zip(logs, ways, strict=True) if way is not None], model)
+    return tuple(log if way is None else _with(log, way, model) for log, way in zip(logs, ways, strict=True))
+
+
+@dataclass(frozen=True, eq=False)
+class Way:
+    """A smoothed motion: qpos `[T, nq]`, qvel `[T, nv]`, sd `[T, 2 nv]` and `known [2 nv]`, see `_left`."""
+
+    qpos: Array
+    qvel: Array
+    sd: Array
+    known: Array
+
+
+def _with(log: Log, way: Way, model: mujoco.MjModel) -> Log:
+    """Guesses in the place of what was not measured; its noise is the typical error of the guess."""
+    nv = model.nv
+    typical = np.sqrt(np.median(way.sd**2, axis=0))
+    qpos, sigma_qpos = log.qpos.copy(), log.sigma_qpos.copy()
+    seen = log.seen_dofs
+    for joint in log.joints:
+        q, v = log.channels.columns(joint), log.channels.columns(joint, "qvel")
+        if not seen[v].all():
+            qpos[:, q] = way.qpos[:, q]
+            sigma_qpos[q] = _of_columns(typical[:nv][v])
+    guessed = ~log.seen_speeds & ~seen  # a derivative of measured positions stays
+    qvel = np.where(guessed, way.qvel, log.qvel)
+    sigma_qvel = np.where(guessed, typical[nv:], log.sigma_qvel)
+    return dataclasses.replace(log, qpos=qpos, qvel=qvel, sigma_qpos=sigma_qpos, sigma_qvel=sigma_qvel)
+
+
+def _of_columns(typical: Array) -> Array:
+    """Standard deviations of a joint's columns in qpos from those of its degrees of freedom (`Log.sigma_dofs`)."""
+    if len(typical) < 3:
+        return typical
+    return np.concatenate([typical[:-3], np.full(4, 0.5 * np.sqrt(np.mean(typical[-3:] ** 2)))])
+
+
+def _smoothed(log: Log, model: mujoco.MjModel) -> Way:
+    """The best of some sizes of what the model lacks."""
+    stepper = Stepper(model, log)
+    measured = _Measured.of(log)
+    lacking = _accelerations(model, log)
+    tried = [_Filter(stepper, log, measured, share * lacking) for share in RULES.shares]
+    return max(tried, key=lambda f: np.nan_to_num(f.likelihood, nan=-np.inf)).smoothed()
+
+
+def _accelerations(model: mujoco.MjModel, log: Log) -> Array:
+    """Typical accelerations `[nv]`: of gravity and of the largest commands, at each joint alone."""
+    data, rng, forces = mujoco.MjData(model), np.random.default_rng(0), []
+    inertia = np.zeros(model.nv)
+    for _ in range(20):
+        data.qpos[:] = model.qpos0
+        mujoco.mj_integratePos(model, data.qpos, rng.normal(size=model.nv), 1.0)
+        data.ctrl[:] = np.percentile(np.abs(log.ctrl), 95, axis=0) if model.nu else 0.0
+        mujoco.mj_forward(model, data)
+        forces.append(np.abs(data.qfrc_bias) + np.abs(data.qfrc_actuator))
+        for v in range(model.nv):
+            column = np.zeros(model.nv)
+            mujoco.mj_mulM(model, data, column, np.eye(model.nv)[v])
+            inertia[v] += column[v] / 20
+    return np.maximum(np.mean(forces, axis=0) / np.maximum(inertia, 1e-12), 1e-3)
+
+
+@dataclass(frozen=True, eq=False)
+class _Measured:
+    """Rows of the state `[2 nv]` that are measured, and their noise."""
+
+    rows: NDArray[np.int64]
+    sigma: Array
+
+    @classmethod
+    def of(cls, log: Log) -> _Measured:
+        seen = np.concatenate([log.seen_dofs, log.seen_speeds])
+        noise = np.maximum(np.concatenate([log.sigma_dofs, log.sigma_qvel]), RULES.least)
+        return cls(np.flatnonzero(seen), noise[seen])
+
+
+class _Filter:
+    """The filter along one log, and what its smoother needs.
+
+    Args:
+        lacking: `[nv]`, standard deviation of accelerations that the model lacks.
+    """
+
+    def __init__(self, stepper: Stepper, log: Log, measured: _Measured, lacking: Array) -> None:
+        self.stepper, self.log, self.measured, self.lacking = stepper, log, measured, lacking
+        nv = stepper.nv
+        seen = np.concatenate([log.seen_dofs, log.seen_dofs | log.seen_speeds])
+        noise = np.concatenate([log.sigma_dofs, np.maximum(log.sigma_qvel, RULES.least)])
+        wide = np.repeat([RULES.angle, RULES.speed], nv)
+        self.prior = np.where(seen, np.minimum(3 * np.maximum(noise, RULES.least), wide), wide)
+        start = log.qpos[0], np.where(seen[nv:], log.qvel[0], 0.0)
+        for _ in range(RULES.passes):
+            self._run(*start)
+            qpos, qvel, _ = self._back()
+            start = qpos[0], qvel[0]
+
+    def smoothed(self) -> Way:
+        qpos, qvel, spread = self._back()
+        sd = np.sqrt(np.maximum(np.diagonal(spread, axis1=1, axis2=2), 0.0))
+        return Way(qpos, qvel, sd, _left(self.ways, self.measured, self.log.period))
+
+    def _run(self, qpos: Array, qvel: Array) -> None:
+        log, stepper, nv = self.log, self.stepper, self.stepper.nv
+        stepper.reset()
+        rows, sigma = self.measured.rows, self.measured.sigma
+        spread, self.likelihood = np.diag(self.prior**2), 0.0
+        kept: list[tuple[Array, Array, Array]] = []
+        predicted: list[tuple[Array, Array, Array]] = []
+        ways: list[Array] = []
+        for k in range(len(log)):
+            if k:
+                dt = float(log.time[k] - log.time[k - 1])
+                qpos, qvel, way = stepper.linearised(qpos, qvel, k - 1)
+                push = np.concatenate([0.5 * dt**2 * np.diag(self.lacking), dt * np.diag(self.lacking)])
+                spread = way @ spread @ way.T + push @ push.T + RULES.least**2 * np.eye(2 * nv)
+                ways.append(way)
+            predicted.append((qpos, qvel, spread))
+            gap = stepper.difference(qpos, qvel, log.qpos[k], log.qvel[k])[rows]
+            inner = spread[np.ix_(rows, rows)] + np.diag(sigma**2)
+            gain = np.linalg.solve(inner, spread[rows]).T
+            self.likelihood -= 0.5 * (float(gap @ np.linalg.solve(inner, gap)) + np.linalg.slogdet(inner)[1])
+            qpos, qvel = stepper.moved(qpos, qvel, gain @ gap)
+            spread = spread - gain @ spread[rows]
+            spread = 0.5 * (spread + spread.T)
+            kept.append((qpos, qvel, spread))
+        self.kept, self.predicted, self.ways = kept, predicted, ways
+
+    def _back(self) -> tuple[Array, Array, Array]:
+        """Smoothed positions, velocities and covariances of all rows."""
+        out = [self.kept[-1]]
+        for k in range(len(self.ways) - 1, -1, -1):
+            qpos, qvel, spread = self.kept[k]
+            ahead_q, ahead_v, ahead = self.predicted[k + 1]
+            gain = np.linalg.solve(ahead, self.ways[k] @ spread).T
+            known_q, known_v, known = out[-1]
+            moved = self.stepper.moved(qpos, qvel, gain @ self.stepper.difference(ahead_q, ahead_v, known_q, known_v))
+            out.append((*moved, spread + gain @ (known - ahead) @ gain.T))
+        qpos, qvel, spread = zip(*reversed(out), strict=True)
+        return np.stack(qpos), np.stack(qvel), np.stack(spread)
+
+
+def _left(ways: Sequence[Array], measured: _Measured, period: float) -> Array:
+    """`[2 nv]`, share of a start state's standard deviation that is left after a window without unknown forces."""
+    size = len(ways[0])
+    prior = np.repeat([RULES.angle, RULES.speed], size // 2)
+    length = int(np.clip(round(RULES.second / period), 2, len(ways)))
+    left = []
+    for first in np.linspace(0, len(ways) - length, 5).astype(int):
+        way, information = np.eye(size), np.diag(prior**-2.0)
+        for A in ways[first : first + length]:
+            seen = way[measured.rows] / measured.sigma[:, None]
+            information = information + seen.T @ seen
+            way = A @ way
+        left.append(np.sqrt(np.diag(np.linalg.inv(information))) / prior)
+    return np.asarray(np.min(left, axis=0))
+
+
+def _demand(ways: Sequence[tuple[Log, Way]], model: mujoco.MjModel) -> None:
+    """Every hinge and slide joint's velocity shows in what was measured; a position may be anywhere if it does not.
+
+    Raises:
+        UserError: naming those that do not.
+    """
+    log = ways[0][0]
+    nv = model.nv
+    known = np.min([way.known for _, way in ways], axis=0)
+    axial = np.isin(model.jnt_type[model.dof_jntid], (2, 3))
+    names = [n for i, n in enumerate(log.channels.qvel) if axial[i] and known[nv + i] > RULES.told]
+    if names:
+        given = [f"qpos:{n}" for n in log.channels.qpos if f"qpos:{n}" not in log.absent]
+        given += [f"qvel:{n}" for n, s in zip(log.channels.qvel, log.seen_speeds, strict=True) if s]
+        raise UserError(
+            f"{log.name}: what was measured ({', '.join(given)}) does not tell the motion of {', '.join(names)}; "
+            "allowed: logs that measure these joints, or joints that they move"
+        )

@@ -1,0 +1,54 @@
+"""Channels that were not measured: which of them a log may lack, and what stands in their place."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+
+import mujoco
+import numpy as np
+
+from bayessim_mjx.errors import UserError
+from bayessim_mjx.logs.log import Array, Channels
+from bayessim_mjx.logs.table import Table
+
+
+def filled(
+    table: Table, columns: Mapping[str, Array], channels: Channels, mj_model: mujoco.MjModel
+) -> tuple[dict[str, Array], tuple[str, ...]]:
+    """(columns with the model's own position where none was measured, names of what was not measured).
+
+    Velocities count as not measured only where some others were; without any they are derived from the positions.
+
+    Raises:
+        UserError: nothing was measured, or only a part of a joint with several numbers.
+    """
+    absent = [f"qpos:{n}" for n in channels.qpos if f"qpos:{n}" not in columns]
+    slow = [f"qvel:{n}" for n in channels.qvel if f"qvel:{n}" not in columns]
+    absent += slow if len(slow) < len(channels.qvel) else []
+    if not absent:
+        return dict(columns), ()
+    _whole_joints(table, absent, channels)
+    if len(absent) == len(channels.qpos) and len(slow) == len(channels.qvel):
+        raise UserError(
+            f"{table.path}: no column qpos:<joint> or qvel:<joint>, so there is no motion to compare; it has "
+            f"{', '.join(table.columns)}"
+        )
+    home = dict(zip((f"qpos:{n}" for n in channels.qpos), mj_model.qpos0, strict=True))
+    blank = {name: np.full(table.rows, home.get(name, 0.0)) for name in absent}
+    positions = [name for name in absent if name.startswith("qpos:")]
+    if positions:
+        text = f"{table.path}: no column {', '.join(positions)}: this motion is estimated from what was measured"
+        warnings.warn(text, stacklevel=4)
+    return {**columns, **blank}, tuple(absent)
+
+
+def _whole_joints(table: Table, absent: list[str], channels: Channels) -> None:
+    """Several numbers of one joint (a quaternion) are measured together or not at all."""
+    for joint in channels.joints:
+        for stream in ("qpos", "qvel"):
+            own = [f"{stream}:{n}" for n in channels.of_joint(joint, stream)]
+            lost = [name for name in own if name in absent]
+            if lost and len(lost) < len(own):
+                text = f"{table.path}: missing column(s) {', '.join(lost)}"
+                raise UserError(f"{text}; allowed: all {len(own)} of joint {joint!r}, or none")

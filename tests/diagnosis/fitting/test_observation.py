@@ -1,0 +1,84 @@
+"""Joints that were not measured: their motion from that of the others, and what cannot be told."""
+
+import dataclasses
+
+import mujoco
+import numpy as np
+import pytest
+
+from bayessim_mjx.diagnosis.fitting import observation
+from bayessim_mjx.diagnosis.logcheck import gate
+from bayessim_mjx.errors import UserError
+from bayessim_mjx.logs import Log, read_logs, write_log
+from tests.diagnosis.recordings import ARM, record, sines
+
+COARSE = ARM.replace('timestep="0.001"', 'timestep="0.005"')
+APART = """<mujoco><option timestep="0.005"/><worldbody>
+  <body><joint name="shoulder" axis="0 1 0"/><geom size=".05" pos="0 0 -.4" contype="0"/></body>
+  <body pos="1 0 0"><joint name="elbow" axis="0 1 0"/><geom size=".05" pos="0 0 -.4" contype="0"/></body>
+</worldbody><actuator><motor name="m_shoulder" joint="shoulder"/><motor name="m_elbow" joint="elbow"/></actuator>
+</mujoco>"""
+
+
+def recorded(xml: str = COARSE, qvel: bool = False) -> Log:
+    return record(xml, sines((4.0, 1.5)), seconds=1.6, period=0.02, name="run.csv", qvel=qvel)
+
+
+def without(log: Log, *absent: str) -> Log:
+    """As read from a file without these columns."""
+    seen = [np.array([f"{kind}:{n}" not in absent for n in log.joints]) for kind in ("qpos", "qvel")]
+    qvel = log.qvel * (seen[1] if log.has_qvel else seen[0])
+    return dataclasses.replace(log, qpos=log.qpos * seen[0], qvel=qvel, absent=absent)
+
+
+@pytest.fixture(scope="module")
+def arm() -> mujoco.MjModel:
+    return mujoco.MjModel.from_xml_string(COARSE)
+
+
+def test_a_log_of_all_positions_stays_the_object_that_it_is(arm):
+    log = recorded()
+    assert observation.completed([log], arm)[0] is log
+
+
+def test_an_elbow_is_found_from_the_shoulder_and_its_error_is_stated(arm):
+    log = recorded()
+    (found,) = observation.completed([without(log, "qpos:elbow")], arm)
+    error = found.qpos - log.qpos
+    assert (error[:, 0] == 0).all() and not found.has_qvel
+    assert np.sqrt(np.mean(error[:, 1] ** 2)) < min(0.02, found.sigma_qpos[1])
+    assert np.ptp(log.qpos[:, 1]) > 50 * found.sigma_qpos[1]
+    assert list(found.seen_dofs) == [True, False] and not found.seen_speeds.any()
+
+
+def test_a_joint_with_a_velocity_alone(arm):
+    log = recorded(qvel=True)
+    log = dataclasses.replace(log, sigma_qvel=np.full(2, 1e-3))
+    (found,) = observation.completed([without(log, "qpos:elbow", "qvel:shoulder")], arm)
+    assert np.abs(found.qpos[:, 1] - log.qpos[:, 1]).max() < 0.02
+    assert (found.qvel[:, 1] == log.qvel[:, 1]).all() and list(found.seen_speeds) == [False, True]
+    seen = gate.check([found], arm, 0.02)
+    assert seen.usable and seen.use_qvel  # no position is there that could contradict it
+
+
+def test_what_the_logs_cannot_tell_is_refused_by_name():
+    model = mujoco.MjModel.from_xml_string(APART)
+    with pytest.raises(UserError, match=r"run\.csv: .*\(qpos:shoulder\) does not tell the motion of elbow;"):
+        observation.completed([without(recorded(APART), "qpos:elbow")], model)
+
+
+def test_files_may_lack_columns_where_that_is_asked_for(tmp_path, arm):
+    log = recorded(qvel=True)
+    write_log(tmp_path / "run.csv", without(log, "qpos:elbow", "qvel:shoulder"))
+    with pytest.raises(UserError, match=r"missing column\(s\) qpos:elbow, qvel:shoulder"):
+        read_logs(tmp_path, arm)
+    with pytest.warns(UserWarning, match="no column qpos:elbow: this motion is estimated"):
+        (read,) = read_logs(tmp_path, arm, partial=True)
+    assert read.absent == ("qpos:elbow", "qvel:shoulder") and read.has_qvel
+    assert np.allclose(read.qvel[:, 1], log.qvel[:, 1]) and np.allclose(read.qpos[:, 0], log.qpos[:, 0])
+    columns = np.loadtxt(tmp_path / "run.csv", delimiter=",", skiprows=1)
+    np.savetxt(
+        tmp_path / "run.csv", columns[:, :3], "%.9g", ",", header="time,ctrl:m_shoulder,ctrl:m_elbow", comments=""
+    )
+    with pytest.raises(UserError, match="no column qpos:<joint> or qvel:<joint>, so there is no motion"):
+        read_logs(tmp_path, arm, partial=True)

@@ -1,0 +1,38 @@
+"""A diagnosis of logs in which not every joint was measured."""
+
+import dataclasses
+
+import pytest
+
+from bayessim_mjx import diagnosis
+from bayessim_mjx.diagnosis import run
+from bayessim_mjx.logs import write_log
+from tests.diagnosis.recordings import ARM, record, sines
+
+LEVEL = 0.15  # N m, of the joint without an encoder
+NOMINAL = ARM.replace('timestep="0.001"', 'timestep="0.002"')
+TRUE = ARM.replace('timestep="0.001"', 'timestep="0.0005" integrator="RK4"').replace(
+    'damping="0.1"', f'damping="0.1" frictionloss="{LEVEL}"'
+)
+
+
+@pytest.mark.slow
+@pytest.mark.ci
+def test_friction_of_a_joint_that_was_not_measured(tmp_path, monkeypatch):
+    """MuJoCo C at a quarter of the step; only the shoulder has an encoder, and the elbow the friction."""
+    monkeypatch.setattr(run, "STAGES", tuple(stage for stage in run.STAGES if not stage.optional))
+    for i in range(5):
+        law = sines((5.0, 1.5), pace=0.3 + 0.1 * i, seed=i)
+        log = record(TRUE, law, seconds=4.0, period=0.02, sigma=3e-4, seed=i)
+        write_log(tmp_path / "logs" / f"run{i}.csv", dataclasses.replace(log, absent=("qpos:elbow",)))
+    (tmp_path / "arm.xml").write_text(NOMINAL)
+    found = diagnosis.diagnose(
+        tmp_path / "arm.xml", tmp_path / "logs", effects=["coulomb_friction"], quick=True, out=tmp_path / "found"
+    )
+    assert found.verdict == "effects" and [(e.name, e.where) for e in found.effects] == [("coulomb_friction", "elbow")]
+    assert found.effects[0].parameters["level"].mean == pytest.approx(LEVEL, rel=0.05)
+    assert found.gap.physical["shoulder"]["with_effects"] < 2 * 3e-4
+    assert set(found.gap.physical) == set(found.gap.by_channel) == {"shoulder"}
+    assert any("no column qpos:elbow: this motion is estimated" in text for text in found.warnings)
+    loaded = diagnosis.load(tmp_path / "found")
+    assert loaded.to_dict() == found.to_dict()
