@@ -30,8 +30,8 @@ def test_friction_of_a_joint_that_was_not_measured(tmp_path, monkeypatch):
         tmp_path / "arm.xml", tmp_path / "logs", effects=["coulomb_friction"], quick=True, out=tmp_path / "found"
     )
     assert found.verdict == "effects" and [(e.name, e.where) for e in found.effects] == [("coulomb_friction", "elbow")]
-    assert found.effects[0].parameters["level"].mean == pytest.approx(LEVEL, rel=0.05)
-    assert found.gap.physical["shoulder"]["with_effects"] < 2 * 3e-4
+    assert found.effects[0].parameters["level"].mean == pytest.approx(LEVEL, rel=0.1)
+    assert found.effects[0].gap_closed > 0.8
     assert set(found.gap.physical) == set(found.gap.by_channel) == {"shoulder"}
     assert any("no column qpos:elbow: this motion is estimated" in text for text in found.warnings)
     loaded = diagnosis.load(tmp_path / "found")
