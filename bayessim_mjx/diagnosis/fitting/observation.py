@@ -190,8 +190,8 @@ class _Filter:
             known_q, known_v, known = out[-1]
             moved = self.stepper.moved(qpos, qvel, gain @ self.stepper.difference(ahead_q, ahead_v, known_q, known_v))
             out.append((*moved, spread + gain @ (known - ahead) @ gain.T))
-        qpos, qvel, spread = zip(*reversed(out), strict=True)
-        return np.stack(qpos), np.stack(qvel), np.stack(spread)
+        positions, velocities, spreads = zip(*reversed(out), strict=True)
+        return np.stack(positions), np.stack(velocities), np.stack(spreads)
 
 
 def _left(ways: Sequence[Array], measured: _Measured, period: float) -> Array:
