@@ -60,7 +60,7 @@ def without_pictures() -> None:
     from bayessim_mjx.diagnosis import run
 
     run.STAGES = tuple(stage for stage in run.STAGES if not stage.optional)
-    report.write = lambda result, folder: None
+    report.write = lambda result, folder, *more: None
     report.tensorboard = lambda result, folder: None
 
 
