@@ -61,8 +61,12 @@ def checked(
 
 def looked(logs: Sequence[Log], robot: Robot, told: list[str]) -> Look:
     """The look before any simulation; a failure costs the race its leads, not the diagnosis, and is `told`."""
-    if any(log.absent for log in logs):
-        return Look()  # what a joint needs is known only with the motion of all
+    lost = sorted({name for log in logs for name in log.absent})
+    if lost:
+        need = f"they need the motion of all joints, and {', '.join(lost)} was not measured"
+        text = f"checks and proposals before any simulation are left out: {need}"
+        told += [text] if text not in told else []  # the gate may ask for a second look
+        return Look()
     try:
         return look(logs, robot.mj_model, _deviations(robot), robot.rating)
     except Exception as error:

@@ -6,7 +6,9 @@ import mujoco
 import numpy as np
 import pytest
 
+from bayessim_mjx.diagnosis.equation_error import leads
 from bayessim_mjx.diagnosis.fitting import observation
+from bayessim_mjx.diagnosis.fitting.robot import robot_of
 from bayessim_mjx.diagnosis.logcheck import gate
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs import Log, read_logs, write_log
@@ -59,6 +61,13 @@ def test_a_joint_with_a_velocity_alone(arm):
     assert (found.qvel[:, 1] == log.qvel[:, 1]).all() and list(found.seen_speeds) == [False, True]
     seen = gate.check([found], arm, 0.02)
     assert seen.usable and seen.use_qvel  # no position is there that could contradict it
+
+
+def test_checks_that_need_the_motion_of_all_joints_are_said_to_be_left_out(arm):
+    log, told = without(recorded(), "qpos:elbow"), []
+    for _ in range(2):
+        assert not leads.looked([log], robot_of(arm), told).proposals
+    assert len(told) == 1 and "left out: they need the motion of all joints, and qpos:elbow was not" in told[0]
 
 
 def test_what_the_logs_cannot_tell_is_refused_by_name():
