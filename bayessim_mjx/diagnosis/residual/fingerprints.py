@@ -120,6 +120,8 @@ def fingerprints(
         "time since reversal": {"constant": (-s, unit), "recent": (-s * recent, unit)},
     }
     out = [_fingerprint(name, node, y, own, without) for name, own in terms.items()]
+    if not fitter.used[dof]:
+        return out  # no measured position that could lag
     return [*out, _lag(fitter, fit, disturbance, inputs, dof, node, without)]
 
 
@@ -127,13 +129,13 @@ def _lag(
     fitter: Fitter, fit: Fit, disturbance: Disturbance, inputs: Inputs, dof: int, node: Nodes, without: Array
 ) -> Fingerprint:
     """|error| = c + T |speed|: how far the measured motion lags behind the simulated one (F3)."""
-    linear, nv = disturbance.linear, fitter.simulator.nv
+    linear, own = disturbance.linear, int(fitter.used[:dof].sum())  # its place among the measured channels
     step = disturbance.values - fit.values
     dx = step_of_starts(linear, fit, step, np.zeros_like(disturbance.flat))
     r = linear.r - np.einsum("wns,ws->wn", fit.B, dx) - fit.A @ step
     windows = fitter.simulator.windows
     channels = r.reshape(len(r), windows.steps, -1)
-    behind = -channels[..., dof] * windows.sigma_q[dof] if fitter.used[:nv].all() else np.zeros(r.shape[:1] + (1,))
+    behind = -channels[..., own] * windows.sigma_q[dof]
     average = linear.basis / linear.basis.sum(0)
     one = np.broadcast_to(np.eye(average.shape[1]), node.gain.shape)
     whole = Nodes(behind @ average, one, node.axes, node.units, node.joint, node.force_unit)

@@ -208,7 +208,7 @@ def analyse(fitter: Fitter, fit: Fit, disturbance: Disturbance | None = None) ->
     without = statistics.leave_one_out(windows.group)
     found = []
     for dof, joint in enumerate(inputs.joints):
-        if not np.any(np.ptp(inputs.effort[..., dof], axis=1) > 0):
+        if not fitter.used[dof] or not np.any(np.ptp(inputs.effort[..., dof], axis=1) > 0):
             continue
         found.append(_joint(joint, windows, inputs, disturbance, error, parts, dof, without))
     return tuple(found)
