@@ -21,13 +21,14 @@ def filled(
     Velocities count as not measured only where some others were; without any they are derived from the positions.
 
     Raises:
-        UserError: nothing was measured, or only a part of a joint with several numbers.
+        UserError: nothing was measured, a joint that the model lacks, or only a part of a joint with several numbers.
     """
     absent = [f"qpos:{n}" for n in channels.qpos if f"qpos:{n}" not in columns]
     slow = [f"qvel:{n}" for n in channels.qvel if f"qvel:{n}" not in columns]
     absent += slow if len(slow) < len(channels.qvel) else []
     if not absent:
         return dict(columns), ()
+    _known(table, channels)
     _whole_joints(table, absent, channels)
     if len(absent) == len(channels.qpos) and len(slow) == len(channels.qvel):
         raise UserError(
@@ -41,6 +42,15 @@ def filled(
         text = f"{table.path}: no column {', '.join(positions)}: this motion is estimated from what was measured"
         warnings.warn(text, stacklevel=4)
     return {**columns, **blank}, tuple(absent)
+
+
+def _known(table: Table, channels: Channels) -> None:
+    """A column of a joint that the model lacks is a wrong name, not a joint without an encoder."""
+    for stream, allowed in (("qpos", channels.qpos), ("qvel", channels.qvel)):
+        for column in table.columns:
+            if column.startswith(f"{stream}:") and column.partition(":")[2] not in allowed:
+                names = ", ".join(f"{stream}:{n}" for n in allowed)
+                raise UserError(f"{table.path}: column {column}: the model has no such joint; allowed: {names}")
 
 
 def _whole_joints(table: Table, absent: list[str], channels: Channels) -> None:

@@ -108,7 +108,7 @@ def test_refusals_of_the_group_name_the_key(section, words):
     ("spec", "words"),
     [
         ({"effect": "actuator_delay"}, r"effects\[0\]\.where is missing"),
-        ({"where": "all"}, r"effects\[0\]\.effect is missing.*one of actuator_"),
+        ({"where": "all"}, r"effects\[0\]\.effect is missing.*one of acceleration_limit, actuator_"),
         ({"effect": "actuator_delay", "where": "all", "high": "abc"}, r"effects\[0\].*high = 'abc': expected a number"),
         ({"effect": "actuator_delay", "where": "all", "hgih": 1}, r"effects\[0\].*'hgih'; allowed are high"),
         ({"effect": "actuator_delay", "where": "all", "high": -1}, r"effects\[0\].*high = -1 s, must be positive"),
