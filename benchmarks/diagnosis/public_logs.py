@@ -99,7 +99,9 @@ def bare(tree: ElementTree.Element, keep: Sequence[str]) -> None:
                 child.attrib.pop("class", None)
 
 
-def held_in_place(path: Path, joints: Sequence[str], root: str, axes: dict[str, str], **nominal: float) -> tuple[str, dict]:
+def held_in_place(
+    path: Path, joints: Sequence[str], root: str, axes: dict[str, str], **nominal: float
+) -> tuple[str, dict]:
     """The part of an MJCF below `root`, with motors, on a fixed base; and the fitted joint numbers that it had."""
     tree = ElementTree.parse(path).getroot()
     bare(tree, joints)
@@ -110,7 +112,9 @@ def held_in_place(path: Path, joints: Sequence[str], root: str, axes: dict[str, 
         fitted[name] = {k: float(joint.attrib.pop(k, 0.0)) for k in ("damping", "armature", "frictionloss")}
         for limit in ("range", "limited"):
             joint.attrib.pop(limit, None)
-        joint.attrib.setdefault("axis", axes.get(name.split("_")[-2] if "_" in name else name, joint.get("axis", "0 0 1")))
+        joint.attrib.setdefault(
+            "axis", axes.get(name.split("_")[-2] if "_" in name else name, joint.get("axis", "0 0 1"))
+        )
         joint.attrib |= {k: f"{v:g}" for k, v in nominal.items()}
     body = ElementTree.tostring(top, encoding="unicode")
     motors = "".join(f'<motor name="{j}" joint="{j}"/>' for j in joints)
@@ -129,10 +133,17 @@ def chirps(clone: Path, out: Logs, robot: str) -> None:
         joints = [f"FL_{part}_joint" for part in ("hip", "thigh", "calf")]
         axes = {"hip": "1 0 0", "thigh": "0 1 0", "calf": "0 1 0"}
         model, fitted = held_in_place(path, joints, "FL_hip", axes, damping=0.1, armature=0.01)
-    law = {j: {"law": "position", "kp": float(k), "kd": float(d)} for j, k, d in zip(joints, data["kp"], data["kd"], strict=False)}
+    law = {
+        j: {"law": "position", "kp": float(k), "kd": float(d)}
+        for j, k, d in zip(joints, data["kp"], data["kd"], strict=False)
+    }
     columns = {"time": np.arange(len(data["time"])) / 200.0}
     for i, j in enumerate(joints):
-        columns |= {f"ctrl:{j}": data["des_dof_pos"][:, i], f"qpos:{j}": data["dof_pos"][:, i], f"qvel:{j}": data["dof_vel"][:, i]}
+        columns |= {
+            f"ctrl:{j}": data["des_dof_pos"][:, i],
+            f"qpos:{j}": data["dof_pos"][:, i],
+            f"qvel:{j}": data["dof_vel"][:, i],
+        }
     for k, rows in enumerate(np.array_split(np.arange(len(columns["time"])), CONDITIONS)):
         out.log(f"block{k}", {n: v[rows] for n, v in columns.items()}, controller=law, condition=f"block {k}")
     out.done(model, {"fitted by mujoco.sysid to the same log": fitted})
@@ -161,7 +172,9 @@ def ur10e(clone: Path, out: Logs) -> None:
     body = "".join(
         f'<body name="{n}_link" pos="{p}" euler="{r}"><inertial pos="{c}" mass="{m}" diaginertia="{i}"/>'
         f'<joint name="{n}" axis="{a}" damping="{d}" armature="{max(j, 0.01)}" frictionloss="{f}"/>'
-        for (n, p, r, a, m, c), i, d, j, f in zip(UR_LINKS, UR_INERTIA, UR_VISCOUS, UR_ARMATURE, UR_COULOMB, strict=True)
+        for (n, p, r, a, m, c), i, d, j, f in zip(
+            UR_LINKS, UR_INERTIA, UR_VISCOUS, UR_ARMATURE, UR_COULOMB, strict=True
+        )
     )
     names = [link[0] for link in UR_LINKS]
     motors = "".join(f'<motor name="{n}" joint="{n}" gear="{g}"/>' for n, g in zip(names, UR_GAINS, strict=True))
@@ -172,7 +185,11 @@ def ur10e(clone: Path, out: Logs) -> None:
         for i, rows in enumerate(np.array_split(table, CONDITIONS // 2)):
             columns = {"time": rows[:, 0] - rows[0, 0]}
             for j, joint in enumerate(names):
-                columns |= {f"ctrl:{joint}": rows[:, 13 + j], f"qpos:{joint}": rows[:, 1 + j], f"qvel:{joint}": rows[:, 7 + j]}
+                columns |= {
+                    f"ctrl:{joint}": rows[:, 13 + j],
+                    f"qpos:{joint}": rows[:, 1 + j],
+                    f"qvel:{joint}": rows[:, 7 + j],
+                }
             out.log(f"load{k}_{i}", columns, condition=f"load {k} {i}")
     out.done(model, {"load, weighed": "2.805 kg at the tool (wrist_3_link)"})
 
@@ -185,7 +202,10 @@ def double_pendulum(clone: Path, out: Logs) -> None:
     published = {
         p.parent.name: yaml.safe_load(p.read_text()) for p in sorted((clone / DESIGN).glob("*/model_parameters.yml"))
     }
-    rods = ((0.2, 0.52, 0.2, 0.032), (0.3, 0.63, 0.26, 0.051))  # length, mass, centre of mass m, inertia about the joint: CAD
+    rods = (
+        (0.2, 0.52, 0.2, 0.032),
+        (0.3, 0.63, 0.26, 0.051),
+    )  # length, mass, centre of mass m, inertia about the joint: CAD
     bodies = "".join(
         f'<body name="link{i + 1}" pos="0 0 {-rods[0][0] * i:g}"><joint name="joint{i + 1}" axis="0 -1 0" armature="0.0023"/>'
         f'<inertial pos="0 0 {-c}" mass="{m}" diaginertia="{max(j - m * c * c, 0.004):.4f} {max(j - m * c * c, 0.004):.4f} 0.0005"/>'
