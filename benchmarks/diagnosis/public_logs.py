@@ -1,15 +1,17 @@
 """Public logs of robots with several joints, as `diagnose` reads them, and the fits that were published with them.
 
-    python benchmarks/diagnosis/public_logs.py SET --clone REPOSITORY --out DIR     # DIR/model.xml, DIR/logs/, DIR/published.json
+    python benchmarks/diagnosis/public_logs.py SET --clone REPOSITORY --out DIR
+
+writes DIR/model.xml, DIR/logs/ and DIR/published.json.
 
 `--clone` is a clone of the repository that holds the logs. Nothing of it is part of this project:
 
-    go2, aliengo, z1  github.com/iit-DLSLab/simple-robot-identification-isaaclab   quadrupeds on a stand (front left leg), an arm
+    go2, aliengo, z1  github.com/iit-DLSLab/simple-robot-identification-isaaclab   legs on a stand, an arm
     ur10e             github.com/shamilmamedov/dynamic_calibration                 an arm that carries 2.805 kg
     double_pendulum   github.com/dfki-ric-underactuated-lab/double_pendulum        design C.1
 
-The model is what a user has: kinematics and masses, no dry friction. What was fitted to the logs by others is not in it, but for
-the UR10e: there it is the robot as identified without its load. Open `published.json` after the verdict.
+The model is what a user has: kinematics and masses, no dry friction. What was fitted to the logs by others is not in
+it, but for the UR10e: there it is the robot as identified without its load. Open `published.json` after the verdict.
 """
 
 from __future__ import annotations
@@ -168,7 +170,7 @@ UR_INERTIA = (  # about the centre of mass
 
 
 def ur10e(clone: Path, out: Logs) -> None:
-    """Currents of the drives as commands, at 100 Hz; two recordings with the load, as two conditions and their blocks."""
+    """Currents of the drives as commands, at 100 Hz; two recordings with the load, cut into blocks."""
     body = "".join(
         f'<body name="{n}_link" pos="{p}" euler="{r}"><inertial pos="{c}" mass="{m}" diaginertia="{i}"/>'
         f'<joint name="{n}" axis="{a}" damping="{d}" armature="{max(j, 0.01)}" frictionloss="{f}"/>'
@@ -207,8 +209,9 @@ def double_pendulum(clone: Path, out: Logs) -> None:
         (0.3, 0.63, 0.26, 0.051),
     )  # length, mass, centre of mass m, inertia about the joint: CAD
     bodies = "".join(
-        f'<body name="link{i + 1}" pos="0 0 {-rods[0][0] * i:g}"><joint name="joint{i + 1}" axis="0 -1 0" armature="0.0023"/>'
-        f'<inertial pos="0 0 {-c}" mass="{m}" diaginertia="{max(j - m * c * c, 0.004):.4f} {max(j - m * c * c, 0.004):.4f} 0.0005"/>'
+        f'<body name="link{i + 1}" pos="0 0 {-rods[0][0] * i:g}">'
+        f'<joint name="joint{i + 1}" axis="0 -1 0" armature="0.0023"/>'
+        f'<inertial pos="0 0 {-c}" mass="{m}" diaginertia="{max(j - m * c * c, 4e-3):.4f} {max(j - m * c * c, 4e-3):.4f} 0.0005"/>'
         for i, (_, m, c, j) in enumerate(rods)
     )
     motors = '<motor name="shoulder" joint="joint1"/><motor name="elbow" joint="joint2"/>'
