@@ -211,8 +211,9 @@ def double_pendulum(clone: Path, out: Logs) -> None:
     bodies = "".join(
         f'<body name="link{i + 1}" pos="0 0 {-rods[0][0] * i:g}">'
         f'<joint name="joint{i + 1}" axis="0 -1 0" armature="0.0023"/>'
-        f'<inertial pos="0 0 {-c}" mass="{m}" diaginertia="{max(j - m * c * c, 4e-3):.4f} {max(j - m * c * c, 4e-3):.4f} 0.0005"/>'
+        f'<inertial pos="0 0 {-c}" mass="{m}" diaginertia="{own:.4f} {own:.4f} 0.0005"/>'
         for i, (_, m, c, j) in enumerate(rods)
+        for own in (max(j - m * c * c, 4e-3),)
     )
     motors = '<motor name="shoulder" joint="joint1"/><motor name="elbow" joint="joint2"/>'
     option = '<option timestep="0.001" integrator="implicitfast"/>'
