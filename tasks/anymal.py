@@ -74,4 +74,6 @@ class Anymal(Locomotion):
         self, before: World, after: World, data: mjx.Data, action: jax.Array
     ) -> tuple[jax.Array, jax.Array, dict[str, jax.Array]]:
         reward, fallen, metrics = super().reward(before, after, data, action)
+        metrics = {name: self.dt * part if name.startswith("reward_") else part for name, part in metrics.items()}
+        metrics["reward_floor"] = self.dt * jnp.maximum(-reward, 0.0)  # what lifts a negative sum to nothing
         return self.dt * jnp.maximum(reward, 0.0), fallen, metrics
