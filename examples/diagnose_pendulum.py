@@ -1,6 +1,6 @@
 """A pendulum with a sticky bearing and a weak motor: find out from its motion, correct the simulator, and look again.
 
-    python examples/diagnose_pendulum.py [--out DIR]
+    python examples/diagnose_pendulum.py [--out DIR] [flags and settings of diagnose]
 
 The "real" pendulum is MuJoCo's own (in C, at a tenth of the step), with native friction and gain. Takes about five
 minutes on a laptop, most of it compilation.
@@ -61,7 +61,7 @@ def returns(env: Task, policy: rl.Policy) -> float:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, help="logs and results (default: a temporary folder)")
-    args = parser.parse_args()
+    args, more = parser.parse_known_args()
     out = args.out or Path(tempfile.mkdtemp(prefix="diagnose_"))
     plain = registry.make("Pendulum", config=load("Pendulum", overrides=["task.randomize=False"]))
     assert isinstance(plain, Task)
@@ -69,7 +69,7 @@ def main() -> None:
 
     candidates = "coulomb_friction,viscous_friction,actuator_gain,actuator_delay,joint_offset"
     given = ["--task", "Pendulum", "--data", str(out / "logs"), "--effects", candidates, "--out", str(out / "found")]
-    if code := diagnose.main(given):
+    if code := diagnose.main([*given, *more]):
         raise SystemExit(code)
     found = load_diagnosis(out / "found")
     print(f"\nverdict: {found.verdict}; truth: coulomb_friction {FRICTION} N m, actuator_gain {GAIN}")

@@ -32,10 +32,10 @@ NOVELTY = RNDConfig(
     weight_schedule=WeightSchedule("linear", initial_step=2500, final_step=5000, final_value=0.0),
     learning_rate=1e-4,
 )
-alone = PPOConfig(
-    num_envs=128, num_steps=50, num_minibatches=8, learning_rate=1e-3, gamma=0.98, max_iterations=200, log_interval=25
-)
-argparse.ArgumentParser(description=__doc__).parse_args()  # --help says what this is
+alone = PPOConfig(num_envs=128, num_steps=50, num_minibatches=8, learning_rate=1e-3, gamma=0.98, log_interval=25)
+parser = argparse.ArgumentParser(description=__doc__)
+parser.add_argument("--iterations", type=int, default=200, help="of PPO, for each of the two (default: 200)")
+alone = replace(alone, max_iterations=parser.parse_args().iterations)
 env = Standing({}, randomization={"randomize": False})
 for name, config in {"PPO alone": alone, "with novelty": replace(alone, rnd=NOVELTY)}.items():
 

@@ -34,3 +34,27 @@ def test_the_repository_has_one_address():
         text = (root / name).read_text(encoding="utf-8")
         assert set(re.findall(r"https://github\.com/[\w-]+/bayessim_mjx", text)) == {urls["Homepage"]}, name
     assert f"site_url: {urls['Documentation']}\n" in (root / "mkdocs.yml").read_text(encoding="utf-8")
+
+
+def test_the_lock_file_has_what_the_package_asks_for():
+    """As `uv lock --check` has it for names, extras and limits."""
+    root = Path(__file__).parents[1]
+    project = tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    asked = {_asked(text) for text in project["dependencies"]}
+    for extra, texts in project["optional-dependencies"].items():
+        asked |= {_asked(text, extra) for text in texts}
+    lock = tomllib.loads((root / "uv.lock").read_text(encoding="utf-8"))
+    own = next(p for p in lock["package"] if p["name"] == project["name"])
+    kept = own["metadata"]["requires-dist"]
+    marker = lambda row: re.sub(r"extra == '(.*)'", r"\1", row.get("marker", ""))  # noqa: E731
+    assert {(r["name"], ",".join(r.get("extras", ())), r["specifier"], marker(r)) for r in kept} == asked
+    assert {(p["name"], extra) for extra, rows in own["optional-dependencies"].items() for p in rows} == {
+        (name, extra) for name, _, _, extra in asked if extra
+    }
+    assert own["version"] == project["version"]
+
+
+def _asked(text, extra=""):
+    """(name, extras, limits, extra of ours) of a requirement; limits as uv writes them, the lower one first."""
+    name, extras, limits = re.match(r"([\w.-]+)(?:\[(.*)\])?(.*)", text).groups()
+    return name.lower().replace("_", "-"), extras or "", limits, extra

@@ -13,6 +13,7 @@ from bayessim_mjx.config import PPOConfig
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.rl import catalogue, sharding
 from bayessim_mjx.rl.extension import Learner
+from bayessim_mjx.rl.groups import size_of
 from bayessim_mjx.rollout import ring, traced
 
 if TYPE_CHECKING:
@@ -23,6 +24,7 @@ def check(env: Env, config: PPOConfig, mesh: Mesh | None = None) -> None:
     """Refuse what does not go together."""
     if "policy" not in env.observation_size:
         raise UserError(f"observation groups {sorted(env.observation_size)}: a policy needs the group 'policy'")
+    size_of(env, "policy")
     if config.policy_theta and getattr(env, "target", "") != "policy":
         raise UserError("ppo.policy_theta = True trains a teacher; the commands that can are train and play")
     if config.actor_groups != getattr(env, "actor_groups", ()):
@@ -65,7 +67,7 @@ def _check_memory(learner: Learner) -> None:
     env, config = learner.env, learner.config
     key, theta = jax.random.PRNGKey(0), np.asarray(env.space.nominal, np.float32)
     world = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(jax.eval_shape(traced(env.reset), key, theta)))
-    seen = sum(env.observation_size[group][0] for group in {"policy", learner.critic_group})
+    seen = sum(size_of(env, group) for group in {"policy", learner.critic_group})
     # observations before and after; actions, rewards, values ...; the critic judges all steps at once
     step = 4 * (2 * seen + 3 * env.action_size + 8 + max(config.hidden_critic, default=0))
     share = config.num_envs / sharding.count(learner.mesh)

@@ -17,6 +17,21 @@ if TYPE_CHECKING:
     from bayessim_mjx.env import Env, State
 
 
+def size_of(env: Env, group: str) -> int:
+    """Numbers in an observation group.
+
+    Raises:
+        UserError: it is no vector but a picture, say: the networks here have no convolutions.
+    """
+    shape = env.observation_size[group]
+    if len(shape) != 1:
+        raise UserError(
+            f"observation group {group!r} has shape {list(shape)}: our networks take vectors; flatten it in the task, "
+            "or train with another library's convolutions (docs/trainers.md, Pictures)"
+        )
+    return shape[0]
+
+
 @lru_cache(maxsize=32)
 def shown(env: Env, target: str, groups: tuple[str, ...]) -> Any:
     """`env` whose group `target` is its `groups`, one after the other; the same object for the same arguments."""
@@ -62,7 +77,7 @@ class Grouped:
                     f"ppo.{setting} = {list(groups)}: no group {name!r}; there are {', '.join(sorted(sizes))}"
                 )
         kept = {f"_{target}": sizes[target]} if target in sizes else {}
-        self.observation_size = {**sizes, **kept, target: (sum(sizes[name][0] for name in groups),)}
+        self.observation_size = {**sizes, **kept, target: (sum(size_of(env, name) for name in groups),)}
         self.actor_groups = groups if target == "policy" else getattr(env, "actor_groups", ())
 
     def __getattr__(self, name: str) -> Any:

@@ -13,6 +13,7 @@ import numpy as np
 from bayessim_mjx.config import PPOConfig
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.rl.extension import Extension
+from bayessim_mjx.rl.groups import size_of
 
 if TYPE_CHECKING:
     from bayessim_mjx.env import Env, State
@@ -75,7 +76,7 @@ class ThetaSeen:
         low, high = (np.asarray(x, np.float32) for x in (env.space.low, env.space.high))
         self.middle = (low + high) / 2
         self.half = np.where(high > low, (high - low) / 2, 1).astype(np.float32)
-        size = env.observation_size[source][0] + len(env.space)
+        size = size_of(env, source) + len(env.space)
         self.observation_size = {**env.observation_size, target: (size,)}
 
     def __getattr__(self, name: str) -> Any:

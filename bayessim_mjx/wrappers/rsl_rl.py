@@ -1,8 +1,9 @@
 """Our worlds as rsl_rl's `VecEnv`: `OnPolicyRunner(make("Ant", 1024), settings(), "logs").learn(300)`.
 
 Observations are a `TensorDict` of all groups ("policy", "critic" where the task has one, ...), on the device of the
-worlds. Where a time limit ends an episode, rsl_rl adds the value of the observation *before* the step to the reward;
-`PPO` here adds that of the observation which the step led to.
+worlds; pictures of bytes have their channels first there, and values from 0 to 1. Where a time limit ends an episode,
+rsl_rl adds the value of the observation *before* the step to the reward; `PPO` here adds that of the observation which
+the step led to.
 """
 
 from typing import Any
@@ -77,10 +78,16 @@ class RslRlVecEnv(VecEnv):
         return {"time_outs": truncated.clone(), "final_observations": self._groups(batch.final), "log": log}
 
     def _groups(self, obs: dict[str, Any]) -> TensorDict:
-        return TensorDict(to_torch(obs), batch_size=[self.num_envs], device=self.device)
+        seen = {group: _convolved(x) for group, x in to_torch(obs).items()}
+        return TensorDict(seen, batch_size=[self.num_envs], device=self.device)
 
     def close(self) -> None:
         pass
+
+
+def _convolved(x: Any) -> Any:
+    """Pictures of bytes `[N, H, W, C]` as rsl_rl's convolutions take them, `[N, C, H, W]` from 0 to 1; others as is."""
+    return x.permute(0, 3, 1, 2) / 255.0 if x.dim() == 4 and x.dtype == torch().uint8 else x
 
 
 class PPO(algorithms.PPO):

@@ -73,17 +73,21 @@ class _Env:
         """New episodes the first time; after that the running ones, as they restart by themselves."""
         if not self._begun:
             self._begun, self._obs = True, self.worlds.reset()
-        return self._out(self._obs["policy"]), {}
+        return self._flat(self._obs["policy"]), {}
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict]:
         batch = self.worlds.step(jnp.clip(self._in(actions), -1.0, 1.0))
         self._obs = batch.obs
         columns = (self._out(x.reshape(-1, 1)) for x in (batch.reward, batch.terminated, batch.truncated))
-        info = {"final_observation": self._out(batch.final["policy"])}
-        return self._out(batch.obs["policy"]), *columns, info
+        info = {"final_observation": self._flat(batch.final["policy"])}
+        return self._flat(batch.obs["policy"]), *columns, info
 
     def state(self) -> Any:
-        return self._out(self._obs["critic"]) if "critic" in self._obs else None
+        return self._flat(self._obs["critic"]) if "critic" in self._obs else None
+
+    def _flat(self, x: jax.Array) -> Any:
+        """As skrl has observations of any shape: `[N, S]`; its models take the shape from the space."""
+        return self._out(x.reshape(len(x), -1))
 
     def render(self, *args: Any, **kwargs: Any) -> None:
         return None

@@ -68,17 +68,23 @@ _, _, metrics = brax.train(task, normalize_observations=True, **settings)
 found = metrics["eval/episode_reward"]
 """,
     "Playground": """
+from brax.training.agents.ppo import train as ppo
 from mujoco_playground import registry, wrapper
 from bayessim_mjx.wrappers import playground
 playground.register()
-env = wrapper.wrap_for_brax_training(registry.load(f"bayessim_mjx/{task}"), episode_length=500)
+env = registry.load(f"bayessim_mjx/{task}")
+settings = dict(num_timesteps=400_000, num_evals=2, num_envs=num_envs, batch_size=16, num_minibatches=4)
+settings |= dict(unroll_length=16, num_updates_per_batch=4, learning_rate=1e-3, discounting=0.99, entropy_cost=1e-3)
+settings |= dict(wrap_env_fn=wrapper.wrap_for_brax_training, episode_length=500, normalize_observations=True)
+_, _, metrics = ppo.train(environment=env, **settings)
+found = metrics["eval/episode_reward"]
 """,
     "Gymnasium": """
 import gymnasium, bayessim_mjx
 env = gymnasium.make_vec(f"bayessim_mjx/{task}-v0", num_envs=num_envs)
 """,
 }
-IN_ONE_PROGRAM, UNTRAINED = ("Brax", "Playground"), ("Gymnasium", "Playground")  # Playground's trainers are Brax's
+IN_ONE_PROGRAM, UNTRAINED = ("Brax", "Playground"), ("Gymnasium",)  # it has no trainer
 NEEDS = {
     "sb3": ("stable_baselines3",), "rsl_rl": ("rsl_rl",), "skrl, JAX": ("skrl",), "skrl, PyTorch": ("skrl", "torch"),
     "rl_games": ("rl_games",), "Brax": ("brax",),
@@ -138,6 +144,10 @@ def through(name: str, task: str, num_envs: int, actions: np.ndarray) -> Callabl
         env = fresh.wrap(brax.ours(task))
     else:
         env = made(name, task, num_envs)
+    if name == "Playground":
+        from mujoco_playground import wrapper
+
+        env = wrapper.wrap_for_brax_training(env, episode_length=500)
     if name in IN_ONE_PROGRAM:
         state = jax.jit(env.reset)(jax.random.split(jax.random.PRNGKey(0), num_envs))
         return scanned(env.step, state, actions)
@@ -185,7 +195,7 @@ def trained(name: str, task: str) -> float:
         space: dict[str, Any] = {"task": task, "num_envs": WORLDS, "folder": folder}
         for line in lines:
             exec(line, space)
-            if line.startswith("env ="):
+            if line.startswith("env =") and "found" not in lines[-1]:
                 recent = Recent(space["env"].worlds)
     return float(space["found"]) if recent is None else recent.metrics()["Train/mean_reward"]
 

@@ -15,7 +15,9 @@ THEIRS = (
     " --log_project_name --export_io_descriptors --real-time --algorithm --ml_framework --sigma --track"
     " --wandb-project-name --wandb-entity --wandb-name --log_interval --keep_all_info --disable_fabric --enable_cameras"
     " --use_pretrained_checkpoint --use_last_checkpoint --headless --task --seed --num_envs --max_iterations --logdir"
-    " --cfg_env --cfg_train --video --video_length --video_interval --rl_library --viz"
+    " --cfg_env --cfg_train --video --video_length --video_interval --rl_library --viz --frontend --train_env_cfg"
+    " --ray-proc-id --set --xr --experience --rendering_mode --kit_args --livestream --cpu --multi_gpu --deterministic"
+    " --device --compute_device_id --use_gpu --use_gpu_pipeline --nographics"
 )
 
 

@@ -3,6 +3,7 @@
 import json
 import sys
 import types
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -80,6 +81,12 @@ class Fake(types.ModuleType):
             finish=self.finish,
         )  # fmt: skip
 
+    def Image(self, picture):
+        return ("picture", picture.size)
+
+    def Video(self, path, format):
+        return ("video", format, Path(path).read_bytes()[4:8])
+
     def configured(self, values, allow_val_change):
         self.logged.append(values)
 
@@ -102,6 +109,22 @@ def test_wandb_has_one_run_for_a_folder_and_goes_on_with_it(tmp_path, monkeypatc
     assert [g["id"] for g in fake.begun] == [None, "run-7"] and fake.finished == 2
     assert {(g["project"], g["name"], g["resume"]) for g in fake.begun} == {("arm", "2026_run", "allow")}
     assert fake.logged[:2] == [{"rl/Train/a": 1.0, "rl/step": 7}, {"cfg": {"seed": 3}}]
+
+
+def test_wandb_gets_pictures_and_videos(tmp_path, monkeypatch):
+    from matplotlib.figure import Figure
+
+    fake = Fake()
+    monkeypatch.setitem(sys.modules, "wandb", fake)
+    writer, figure = opened(tmp_path / "bsim", more=("wandb",), run=tmp_path), Figure(figsize=(3, 2), dpi=100)
+    writer.figure("BayesSim/posterior", figure, 2)
+    writer.video("SurrogateReal/video", np.zeros((4, 24, 32, 3), np.uint8), 25, 2)
+    writer.video("SurrogateReal/video", None, 25, 3)
+    writer.close()
+    assert fake.logged == [
+        {"bsim/BayesSim/posterior": ("picture", (300, 200)), "bsim/step": 2},
+        {"bsim/SurrogateReal/video": ("video", "mp4", b"ftyp"), "bsim/step": 2},
+    ]
 
 
 def test_wandb_that_is_not_there_is_named(tmp_path, monkeypatch):

@@ -46,6 +46,7 @@ def test_the_balancer_rolls_and_falls_as_it_should(example):
 
 
 @pytest.mark.slow
+@pytest.mark.ci
 def test_the_example_runs(example, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", [str(FILE), *SHORT])
     example.main()

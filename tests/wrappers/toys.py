@@ -1,4 +1,4 @@
-"""A counter as an environment: all of it can be computed by hand."""
+"""A counter as an environment, and a picture of it: all of it can be computed by hand."""
 
 import jax
 import jax.numpy as jnp
@@ -33,3 +33,20 @@ class Counter(Env):
         groups = {"policy": obs, "critic": jnp.concatenate([obs, obs])}
         info = {"terminated": terminated, "truncated": truncated, "final_observation": groups, "steps": steps}
         return State(obs, groups, reward, terminated, {"age": obs[0]}, info)
+
+
+class Camera(Counter):
+    """The counter as a picture: "policy" is `[36, 36, 1]` bytes, 40 times the steps; "numbers" is the counter's own."""
+
+    name = "Camera"
+
+    def reset(self, key, theta=None):
+        return self._filmed(super().reset(key, theta))
+
+    def step(self, state, action):
+        return self._filmed(super().step(state.replace(obs={"policy": state.obs["numbers"]}), action))
+
+    def _filmed(self, state):
+        picture = jnp.full((36, 36, 1), 40 * state.obs["policy"][0]).astype(jnp.uint8)
+        groups = {"policy": picture, "numbers": state.obs["policy"]}
+        return state.replace(obs=groups, info={**state.info, "final_observation": groups})

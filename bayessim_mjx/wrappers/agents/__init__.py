@@ -14,6 +14,7 @@ from typing import Any, Protocol
 from bayessim_mjx.config import Config
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.rl import Policy
+from bayessim_mjx.rl.groups import size_of
 from bayessim_mjx.wrappers.worlds import Worlds
 
 Progress = Callable[[Mapping[str, float]], None]
@@ -50,10 +51,11 @@ def make(config: Config, env: Any, domain: Any) -> Agent:
     """The agent that `config.agent` names, with the settings of `ppo:` in its library's terms.
 
     Raises:
-        UserError: the library is not installed; a setting that its PPO has not.
+        UserError: the library is not installed; a setting that its PPO has not; observations that are no vectors.
     """
     module = importlib.import_module(f"bayessim_mjx.wrappers.agents.{config.agent}")
     refuse(config, module.TAKES)
+    size_of(env, "policy")
     scale = config.ppo.reward_scale
     return module.make(config, Worlds(env, domain, config.ppo.num_envs, config.seed, reward_scale=scale))
 
