@@ -6,8 +6,10 @@ ended episodes are `info["final_observation"]`.
 
 from typing import Any
 
+import gymnasium
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.wrappers.spaces import boxes
@@ -40,6 +42,11 @@ def wrapped(worlds: Worlds, library: str = "jax") -> Any:
     return _JaxEnv(worlds) if library == "jax" else _torch_env()(worlds)
 
 
+def _numbers(box: gymnasium.spaces.Box) -> gymnasium.spaces.Box:
+    """The box; that of bytes as one of float32 from 0 to 1, as skrl's models cannot take bytes."""
+    return box if box.dtype != np.uint8 else gymnasium.spaces.Box(0.0, 1.0, box.shape, np.float32)
+
+
 class _Env:
     """What both kinds share; observations are taken over by `_out`, actions by `_in`."""
 
@@ -59,7 +66,7 @@ class _Env:
 
     @property
     def observation_space(self) -> Any:
-        return self.spaces[0]
+        return _numbers(self.spaces[0])
 
     @property
     def action_space(self) -> Any:
@@ -67,7 +74,7 @@ class _Env:
 
     @property
     def state_space(self) -> Any:
-        return boxes(self.worlds.env, "critic")[0] if "critic" in self.worlds.env.observation_size else None
+        return _numbers(boxes(self.worlds.env, "critic")[0]) if "critic" in self.worlds.env.observation_size else None
 
     def reset(self) -> tuple[Any, dict]:
         """New episodes the first time; after that the running ones, as they restart by themselves."""
@@ -86,8 +93,9 @@ class _Env:
         return self._flat(self._obs["critic"]) if "critic" in self._obs else None
 
     def _flat(self, x: jax.Array) -> Any:
-        """As skrl has observations of any shape: `[N, S]`; its models take the shape from the space."""
-        return self._out(x.reshape(len(x), -1))
+        """As skrl has observations of any shape: `[N, S]`, the shape is in the space; bytes of pictures from 0 to 1."""
+        flat = x.reshape(len(x), -1)
+        return self._out(flat / 255.0 if flat.dtype == jnp.uint8 else flat)
 
     def render(self, *args: Any, **kwargs: Any) -> None:
         return None

@@ -89,11 +89,47 @@ def test_rsl_rls_convolutions_train():
     assert any((p != q).any() for p, q in zip(runner.alg.actor.parameters(), before, strict=True))
 
 
-@pytest.mark.parametrize("library", ["jax", "torch"])
-def test_skrl_gets_them_flat_with_their_shape_beside(library):
+@pytest.mark.parametrize(
+    ("library", "seen"), [("jax", "OBSERVATIONS"), ("torch", "permute(OBSERVATIONS, (0, 3, 1, 2))")]
+)
+def test_skrls_convolutions_train(library, seen, tmp_path):
     pytest.importorskip("skrl")
+    from importlib import import_module
+
     from bayessim_mjx.wrappers import skrl
 
-    env = skrl.make(ENV, 2, library=library)
-    seen, _ = env.reset()
-    assert seen.shape == (2, 36 * 36) and env.observation_space.shape == (36, 36, 1)
+    env = skrl.make(ENV, 4, library=library)
+    env.step(env.reset()[0][:, :1])
+    bright, _ = env.reset()
+    assert bright.shape == (4, 36 * 36) and env.observation_space.shape == (36, 36, 1)
+    assert float(bright[0, 0]) == pytest.approx(40 / 255)
+    settings = skrl.settings(
+        4, str(tmp_path), rollouts=4, mini_batches=1, learning_epochs=1, observation_preprocessor=None
+    )
+    eye = {"name": "eye", "input": seen, "layers": [{"conv2d": {"out_channels": 4, "kernel_size": 8, "stride": 4}}]}
+    eye["layers"].append("flatten")
+    for model in ("policy", "value"):
+        settings["models"][model]["network"] = [
+            eye | {"activations": "elu"}, {"name": "net", "input": "eye", "layers": [8], "activations": "elu"},
+        ]  # fmt: skip
+    import_module(f"skrl.utils.runner.{library}").Runner(env, settings).run("train")
+
+
+def test_rl_games_convolutions_train(tmp_path):
+    pytest.importorskip("rl_games")
+    from rl_games.torch_runner import Runner
+
+    from bayessim_mjx.wrappers import rl_games
+
+    rl_games.register("Camera", ENV)
+    small = {"horizon_length": 4, "minibatch_size": 16, "mini_epochs": 1, "normalize_input": False}
+    settings = rl_games.settings("Camera", 4, 1, str(tmp_path), **small)
+    convolution = {"filters": 4, "kernel_size": 8, "strides": 4, "padding": 0}
+    plain = {"activation": "relu", "initializer": {"name": "default"}, "regularizer": {"name": "None"}}
+    network = {"type": "conv2d", "permute_input": True, "convs": [convolution]}
+    settings["params"]["network"]["cnn"] = network | plain
+    runner = Runner()
+    runner.load(settings)
+    agent = runner.algo_factory.create("a2c_continuous", base_name="run", params=runner.params)
+    agent.train()
+    assert agent.epoch_num == 1
