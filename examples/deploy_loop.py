@@ -1,7 +1,7 @@
 """Run an exported policy at its control rate on a stand-in for a robot, with safety stops, and write its logs.
 
 python -m bayessim_mjx.play --task Pendulum --checkpoint best --export policy.onnx
-python examples/deploy_loop.py --policy policy.onnx --seconds 20 --out logs/robot
+python examples/deploy_loop.py --policy policy.onnx --seconds 20 --spread 3 --noise 0.001 --out logs/robot
 python -m bayessim_mjx.diagnose --task Pendulum --data logs/robot
 
 The policy needs numpy and onnxruntime alone. The stand-in is MuJoCo on the CPU: for your own robot replace `Robot`.
@@ -74,19 +74,24 @@ def _value(text: str) -> Any:
 class Robot:
     """MuJoCo in the place of a robot: joints and actuators by name, in whatever order it has them."""
 
-    def __init__(self, model: Any, joints: list[str], actuators: list[str], seed: int) -> None:
+    def __init__(
+        self, model: Any, joints: list[str], actuators: list[str], seed: int, spread: float = 0.1, noise: float = 0.0
+    ) -> None:
         import mujoco
+
+        self.random, self.noise = np.random.default_rng(seed), noise
 
         self.mujoco, self.model, self.data, self.joints = mujoco, model, mujoco.MjData(model), joints
         self.position = [int(model.joint(name).qposadr[0]) for name in joints]
         self.speed = [int(model.joint(name).dofadr[0]) for name in joints]
         self.drives = [model.actuator(name).id for name in actuators]
-        self.data.qpos[self.position] += np.random.default_rng(seed).uniform(-0.1, 0.1, len(joints))
+        self.data.qpos[self.position] += self.random.uniform(-spread, spread, len(joints))
         mujoco.mj_forward(model, self.data)
 
     def read(self) -> tuple[dict[str, float], dict[str, float]]:
-        """Positions (rad, m) and speeds by joint."""
+        """Positions (rad, m), as the encoders have them, and speeds by joint."""
         q, w = self.data.qpos[self.position], self.data.qvel[self.speed]
+        q = q + self.noise * self.random.normal(size=len(q))
         return dict(zip(self.joints, map(float, q), strict=True)), dict(zip(self.joints, map(float, w), strict=True))
 
     def write(self, command: np.ndarray) -> None:
@@ -190,14 +195,17 @@ def main() -> int:
     parser.add_argument("--max_effort", type=float, default=np.inf, help="N or N m of any actuator")
     parser.add_argument("--watchdog", type=int, default=3, help="late steps in a row that stop it")
     parser.add_argument("--fast", action="store_true", help="do not wait for the clock")
-    parser.add_argument("--seed", type=int, default=0, help="of the first state")
+    parser.add_argument("--spread", type=float, default=0.1, help="how far from 0 it may begin, rad or m")
+    parser.add_argument("--noise", type=float, default=0.0, help="standard deviation of its encoders, rad or m")
+    parser.add_argument("--seed", type=int, default=0, help="of the first state and the noise")
     parser.add_argument("--out", type=Path, default=Path("logs/robot"))
     args = parser.parse_args()
     policy = Policy(args.policy)
     difference = policy.check()
     if difference > 1e-4:
         raise SystemExit(f"{args.policy}: this machine's actions differ by {difference:.2g} from the trainer's")
-    robot = Robot(_model(args.model, policy), policy.facts["joint_names"], policy.actuators, args.seed)
+    model, joints = _model(args.model, policy), policy.facts["joint_names"]
+    robot = Robot(model, joints, policy.actuators, args.seed, args.spread, args.noise)
     safety = Safety(robot.ranges(), args.max_speed, args.max_effort, args.watchdog)
     rows, latency, reason = loop(policy, robot, safety, args.seconds, args.fast)
     path = write(args.out, rows, robot, policy, reason)

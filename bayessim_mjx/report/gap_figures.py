@@ -26,6 +26,7 @@ PARTS = {
 }
 FLOORS = {"repeats": "differs between repeats", "start": "uncertain start"}  # what lies between floor and noise
 TICKS = [0.0, 0.2, 0.4, 0.6, 0.8, 1.0]
+HIGHEST = 1.6  # of the largest squared gap: where the picture ends, intervals with it
 STEPS = ("nominal", "calibrated", "with_effects")
 
 
@@ -71,7 +72,7 @@ def waterfall(
     columns += [_drop(s, level, stages.get("floor", "")) for s in ("reducible_floor", "noise_floor") if s in level]
     columns += [_total("measurement noise", "noise_floor", stages, level, ci)] if "noise_floor" in level else []
     xs = list(range(len(columns)))
-    tops = [c["base"] + c["height"] + c["error"][1] for c in columns]
+    tops = [min(c["base"] + c["height"] + c["error"][1], HIGHEST) for c in columns]
     marks = [
         note(c["label"], k, t, xref="x", yref="y", yanchor="bottom", yshift=3, font={"size": 13 if c["total"] else 12})
         for k, (c, t) in enumerate(zip(columns, tops, strict=True))
@@ -165,9 +166,9 @@ def _total(words: str, stage: str, stages: Mapping[str, Any], level: Mapping[str
         "total": True,
         "colour": STAGE[stage],
         "hatch": "",
-        "label": f"<b>{number(stages[stage])}</b>",
+        "label": f"<b>{number(stages[stage])}</b>{'' if ends[1] <= HIGHEST else between}",
         "hover": f"{words}: {number(stages[stage])}{between}",
-        "error": (max(level[stage] - ends[0], 0.0), max(ends[1] - level[stage], 0.0)),
+        "error": (max(level[stage] - ends[0], 0.0), max(min(ends[1], HIGHEST) - level[stage], 0.0)),
     }
 
 

@@ -27,6 +27,7 @@ HATCH = {"nominal": "", "calibrated": "", "with_effects": "", "reducible_floor":
 OVER = {"fillmode": "overlay", "fgcolor": "white", "size": 6}  # hatching over the colour
 FONT = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', Arial, sans-serif"
 WIDTH = 960  # of the page's column on a wide screen and on paper, px
+COLUMN = WIDTH // 2 - 20  # of one of two columns side by side, px
 LEAST = 560  # px, of most figures on a narrow one
 
 

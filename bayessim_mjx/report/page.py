@@ -8,7 +8,7 @@ from markupsafe import Markup
 
 from bayessim_mjx.diagnosis.result import Diagnosis
 from bayessim_mjx.report import evidence, sections
-from bayessim_mjx.report.look import STAGE, WIDTH
+from bayessim_mjx.report.look import COLUMN, STAGE, WIDTH
 from bayessim_mjx.report.words import STAGES, not_fitted
 
 TEMPLATE = "template.html.j2"
@@ -39,6 +39,7 @@ def render(d: Diagnosis, missed: Any = None) -> str:
     return environment.get_template(TEMPLATE).render(
         plotly=Markup(get_plotlyjs()),
         width=WIDTH,
+        column=COLUMN,
         stage_names=STAGES,
         stage_colours=STAGE,
         verdict=d.verdict,

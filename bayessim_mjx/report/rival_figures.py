@@ -5,6 +5,7 @@ from typing import Any
 
 from bayessim_mjx.monitor.style import SKY
 from bayessim_mjx.report.look import (
+    COLUMN,
     FAINT,
     INK,
     OVER,
@@ -190,7 +191,7 @@ def importance(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     }
     return figure(
         [bars],
-        560,
+        COLUMN,
         62 + 24 * len(ranked),
         margin={"l": 130, "r": 12, "t": 8, "b": 44},
         xaxis=axis("importance", rangemode="tozero"),

@@ -19,13 +19,13 @@ from bayessim_mjx.report.words import (
     finite,
     gap_closed,
     headline,
-    known_span,
     label_title,
     length,
     number,
     percent,
     quantity,
     repeated,
+    spanned,
     stages_of,
     stages_told,
     verdict_of,
@@ -124,8 +124,7 @@ def _stages_row(row: Mapping[str, Any], joints: int) -> dict[str, Any]:
     own: Mapping[str, Any] = next(iter((row.get("physical") or {}).values()), {}) if joints == 1 else {}
     shares, cells = row.get("shares") or {}, {}
     for stage in STAGES:
-        span = known_span((row.get("ci") or {}).get(stage))
-        noises = number(row.get(stage)) + (f" ({number(span[0])} – {number(span[1])})" if span else "")
+        noises = number(row.get(stage)) + spanned((row.get("ci") or {}).get(stage))
         value = length(own.get(stage), own.get("unit", "")) if own else percent(shares.get(stage))
         known = value != MISSING
         cells[stage] = {"value": value, "between": f"{noises} sd"} if known else {"value": noises, "between": ""}

@@ -12,6 +12,7 @@ from bayessim_mjx.effects.support.words import words
 from bayessim_mjx.quantities import finite, typeset, unit
 
 MISSING = quantities.MISSING  # where there is no number
+WIDE = 1000  # an interval of a gap whose ends differ by more is not told in numbers
 
 # quantities that are easier to read as their reciprocal
 RECIPROCALS = {
@@ -129,6 +130,15 @@ def closure(share: Any) -> str:
 def known_span(span: Any) -> tuple[float, float] | None:
     """Both ends of an interval, or None where one is not known."""
     return (span[0], span[1]) if span is not None and all(map(finite, span)) else None
+
+
+def spanned(span: Any) -> str:
+    """The ends of an interval of a gap in brackets; of one that says nothing, that it is wide."""
+    span = known_span(span)
+    if span is None:
+        return ""
+    wide = span[1] > WIDE * max(span[0], 0.0)
+    return f" (interval wider than a factor of {WIDE})" if wide else f" ({number(span[0])} – {number(span[1])})"
 
 
 def number(value: Any, digits: int = 3) -> str:

@@ -82,3 +82,17 @@ def test_gap_closed_by_hand():
 
 def test_every_verdict_has_words():
     assert set(words.VERDICTS) == set(VERDICTS)
+
+
+@pytest.mark.parametrize(
+    ("span", "said"),
+    [
+        ((2.0, 3.5), " (2.00 – 3.50)"),
+        (None, ""),
+        ((1.0, float("nan")), ""),
+        ((4.7e-95, 7.7e99), " (interval wider than a factor of 1000)"),
+        ((0.0, 5.0), " (interval wider than a factor of 1000)"),
+    ],
+)
+def test_an_interval_that_says_nothing_is_not_told_in_numbers(span, said):
+    assert words.spanned(span) == said
