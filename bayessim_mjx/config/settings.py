@@ -298,6 +298,13 @@ class BayesSimConfig(Section):
         choices=("auto", "off", "likelihood"),
         spell=lambda value: "off" if value is False else value,  # YAML reads a plain off so
     )
+    sets: str = setting(
+        "product",
+        "posterior of several trajectories, where refine does not sharpen it: product (of the posteriors of each), "
+        "embedding (a second network that sees them together, trained on sets simulated around the product), or auto "
+        "(that of both which does better on simulated sets)",
+        choices=("product", "embedding", "auto"),
+    )
     noiseDraws: int = setting(
         16,
         "draws of each simulated trajectory's measurement noise, of which training sees another one in every epoch; "

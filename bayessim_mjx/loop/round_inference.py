@@ -22,7 +22,7 @@ from bayessim_mjx.errors import UserError
 from bayessim_mjx.inference import calibration, checks, misspecification, rounds
 from bayessim_mjx.inference.temperature import tempered
 from bayessim_mjx.keys import branch
-from bayessim_mjx.loop import ranges, refining, set_checks
+from bayessim_mjx.loop import ranges, refining, set_checks, set_posterior
 from bayessim_mjx.loop.factors import conditioned, kept
 from bayessim_mjx.loop.inference_state import new_network
 from bayessim_mjx.loop.simulations import at, noise_draws, proposal_of, simulated
@@ -64,6 +64,9 @@ def infer(loop: Loop, state: LoopState, policy: Policy, info: RoundInfo) -> Loop
     if loop.refines:
         state, posterior = refining.refined(loop, state, real, posterior, info)
     by_replays = info.refinement is not None and info.refinement.used
+    if not by_replays:
+        posterior = set_posterior.chosen(loop, state, policy, posterior, info)
+    replaced = by_replays or (info.set_posterior is not None and info.set_posterior.used)
     info.warnings += _complaints(posterior.names, info.fit, known_before, by_replays)
     info.posterior, info.real = posterior, jax.tree.map(np.asarray, real)
     info.scores |= score(posterior, source.truth)
@@ -72,12 +75,12 @@ def infer(loop: Loop, state: LoopState, policy: Policy, info: RoundInfo) -> Loop
     if verdict is not None:
         info.checks = checks.conclude(*verdict, posterior, b.distrust, info.moves or None)
         told = posterior.names if round_ else _unknown(posterior.names, info.fit)
-        info.warnings += info.checks.warnings(told, by_replays)
+        info.warnings += info.checks.warnings(told, replaced)
         domain = checks.guarded(domain, info.checks.prior_share)
     else:
         info.warnings += [pile.sentence() for pile in info.moves]
     info.predictive = _predict(loop, posterior, seen, real, loop.key(round_, "predict"))
-    others = info.seconds.get("check", 0.0) + info.seconds.get("refine", 0.0)
+    others = sum(info.seconds.get(name, 0.0) for name in ("check", "refine", "sets"))
     info.seconds["condition"] = time.perf_counter() - clock - others
     return dataclasses.replace(state, domain=domain, proposal=following)
 

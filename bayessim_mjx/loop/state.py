@@ -75,6 +75,7 @@ class RoundInfo:
     checks: checks.Checks | None = None  # calibration, misfit, ends of ranges; None: none asked for
     sets: Any = None  # how products of several posteriors did on simulated sets, see inference/sets.py
     refinement: Any = None  # what bayessim.refine made of the posterior, see loop/refinement.py
+    set_posterior: Any = None  # how a network of sets did beside the product, see loop/set_posterior.py
     moves: tuple[Pile, ...] = ()  # ends of ranges at which the posterior piles up, and where they are in the next round
 
 

@@ -150,6 +150,9 @@ class Session:
         if info.refinement is not None:
             self.console.say(f"posterior: {info.refinement.sentence()}")
             self.inference.text("BayesSim/refinement", info.refinement.sentence(), step)
+        if info.set_posterior is not None:
+            self.console.say(f"posterior: {info.set_posterior.sentence()}")
+            self.inference.text("BayesSim/set_posterior", info.set_posterior.sentence(), step)
         for text in info.warnings:
             self.console.warning(text)
         if info.moves:
@@ -202,6 +205,8 @@ class Session:
             row["checks"] = info.checks.to_dict()
         if info.refinement is not None:
             row["refinement"] = info.refinement.to_dict()
+        if info.set_posterior is not None:
+            row["set_posterior"] = info.set_posterior.to_dict()
         if info.moves:
             row["range_ends"] = [pile.to_dict() for pile in info.moves]
         with open(self.path / ROUNDS, "a", encoding="utf-8") as file:

@@ -79,7 +79,7 @@ def measure(problem: Problem, seed: int, simulations: int, samples: int, model: 
         row["log q"] = round(float(density.mean()), 3)
         row["coverage 50/80/95"] = [round(float(np.mean(level <= p)), 3) for p in (0.5, 0.8, 0.95)]
         row["pairs"] = len(level)
-    if samples:
+    if samples and problem.exact is not None:
         _, observed = problem.pairs(jax.random.PRNGKey(7), OBSERVATIONS)
         rng = np.random.default_rng(seed)
         values = [c2st(problem.exact(rng, x_o, samples), sample(x_o, samples), seed) for x_o in np.asarray(observed)]

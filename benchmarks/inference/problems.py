@@ -1,4 +1,4 @@
-"""Inference problems whose exact posterior is known (gaussian_linear and two_moons are sbibm's definitions)."""
+"""Inference problems: gaussian_linear and two_moons are sbibm's; all but `bounces` have exact posteriors."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from scipy.stats import multivariate_t
 
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.parameters import Parameter, ParameterSpace
@@ -21,9 +22,10 @@ class Problem:
     name: str
     space: ParameterSpace
     simulate: Callable[[Array, Array], Array]  # key, theta [n, d] -> x [n, D]
-    exact: Callable[[np.random.Generator, np.ndarray, int], np.ndarray]  # rng, x [D], n -> theta [n, d]
+    exact: Callable[[np.random.Generator, np.ndarray, int], np.ndarray] | None  # rng, x [D], n -> theta [n, d]
     settings: dict  # what suits the problem: Gaussian priors are exact in probit coordinates
     measured: bool = False  # whether all that `simulate` draws is measurement noise, added to one motion of theta
+    gain: Callable[[np.ndarray, np.ndarray], float] | None = None  # x [n, D], theta [d] -> of the exact posterior, nats
 
     def pairs(self, key: Array, n: int) -> tuple[Array, Array]:
         """theta [n, d] from the prior, x [n, D]."""
@@ -43,7 +45,12 @@ def gaussian_linear() -> Problem:
     def exact(rng: np.random.Generator, x: np.ndarray, n: int) -> np.ndarray:
         return x / 2 + 0.05**0.5 * rng.normal(size=(n, 10))
 
-    return Problem("gaussian_linear", space, simulate, exact, {"coordinates": "probit", "components": 1})
+    def gain(x: np.ndarray, theta: np.ndarray) -> float:
+        variance = 0.1 / (len(x) + 1)
+        away = (theta - x.sum(0) / (len(x) + 1)) ** 2 / variance - theta**2 / 0.1
+        return float(np.sum(-0.5 * away) + 5 * np.log(len(x) + 1))
+
+    return Problem("gaussian_linear", space, simulate, exact, {"coordinates": "probit", "components": 1}, gain=gain)
 
 
 def two_moons() -> Problem:
@@ -112,7 +119,72 @@ def pendulum() -> Problem:
     def _log_likelihood(y: np.ndarray, x: np.ndarray) -> np.ndarray:
         return -0.5 * np.sum(((y - x) / noise) ** 2, axis=1, dtype=np.float64)
 
-    return Problem("pendulum", space, simulate, exact, {"coordinates": "plain", "components": 8, "ensemble": 5}, True)
+    def gain(x: np.ndarray, theta: np.ndarray) -> float:
+        """By importance sampling: the evidence of the mean of x, which is all that x tell."""
+
+        def log_likelihood(at: np.ndarray) -> np.ndarray:
+            motion = np.asarray(clean(jnp.asarray(at, jnp.float32)), np.float64)
+            return -0.5 * len(x) * np.sum(((motion - x.mean(0)) / noise) ** 2, axis=1)
+
+        step = 1e-3 * np.diag(space.high - space.low)
+        motion = np.asarray(clean(jnp.asarray(np.concatenate([theta + step, theta - step]), jnp.float32)))
+        slope = np.linalg.solve(2 * step, (motion[:3] - motion[3:]) / noise)
+        proposal = multivariate_t(theta, 2 * np.linalg.inv(len(x) * slope @ slope.T + 1e-6 * np.eye(3)), df=5)
+        rng, evidence = np.random.default_rng(0), 0.0
+        for _ in range(4):
+            draws = np.atleast_2d(proposal.rvs(20_000, random_state=rng))
+            inside = np.all((draws >= space.low) & (draws <= space.high), axis=1)
+            log_weights = np.where(inside, log_likelihood(draws) - proposal.logpdf(draws), -np.inf)
+            top = log_weights.max()
+            weights = np.exp(log_weights - top)
+            evidence = top + np.log(weights.mean())
+            weights /= weights.sum()
+            centre = weights @ draws
+            spread = ((draws - centre) * weights[:, None]).T @ (draws - centre)
+            proposal = multivariate_t(centre, 1.5 * spread + 1e-12 * np.eye(3), df=5)
+        return float(log_likelihood(theta[None])[0] - evidence + np.log(space.high - space.low).sum())
+
+    settings = {"coordinates": "plain", "components": 8, "ensemble": 5}
+    return Problem("pendulum", space, simulate, exact, settings, True, gain)
+
+
+def bounces() -> Problem:
+    """A ball thrown on a floor whose slope at each contact is N(0, 0.15^2) rad: restitution, friction and drag.
+
+    30 noisy (x, z) in 1.5 s. The slopes are not observed and every one changes all that follows: the likelihood is an
+    integral over all of them, and a replay has none.
+    """
+    ranges = (("restitution", 0.3, 0.95), ("friction", 0.0, 0.6), ("drag", 0.0, 1.0))
+    space = ParameterSpace([Parameter(n, (lo + hi) / 2, lo, hi) for n, lo, hi in ranges])
+    dt, steps = 0.01, 150
+
+    def one(key: Array, theta: Array) -> Array:
+        restitution, friction, drag = theta
+        k_start, k_slope, k_noise = jax.random.split(key, 3)
+        height, across, up = jax.random.uniform(k_start, (3,))
+
+        def step(state: tuple[Array, Array], slope: Array) -> tuple[tuple[Array, Array], Array]:
+            at, v = state
+            v = v - dt * (drag * v + jnp.asarray([0.0, 9.81]))
+            normal = jnp.stack([-jnp.sin(slope), jnp.cos(slope)])
+            along = jnp.stack([normal[1], -normal[0]])
+            into, past = v @ normal, v @ along
+            bounced = -restitution * into * normal + (1 - friction) * past * along
+            v = jnp.where((at[1] < 0) & (into < 0), bounced, v)
+            at = at + dt * v
+            return (at, v), at
+
+        start = jnp.stack([jnp.zeros(()), 0.5 + height]), jnp.stack([0.5 + 1.5 * across, 2 * up - 1])
+        _, path = jax.lax.scan(step, start, 0.15 * jax.random.normal(k_slope, (steps,)))
+        seen = path[4::5]
+        return (seen + 0.02 * jax.random.normal(k_noise, seen.shape)).reshape(-1)
+
+    thrown = jax.jit(jax.vmap(one))
+
+    def simulate(key: Array, theta: Array) -> Array:
+        return thrown(jax.random.split(key, theta.shape[0]), theta)
+
+    return Problem("bounces", space, simulate, None, {"coordinates": "plain"})
 
 
 def _resample(rng: np.random.Generator, log_weights: np.ndarray, n: int) -> np.ndarray:
@@ -120,4 +192,4 @@ def _resample(rng: np.random.Generator, log_weights: np.ndarray, n: int) -> np.n
     return rng.choice(len(weights), n, p=weights / weights.sum())
 
 
-PROBLEMS = {make.__name__: make for make in (gaussian_linear, two_moons, pendulum)}
+PROBLEMS = {make.__name__: make for make in (gaussian_linear, two_moons, pendulum, bounces)}

@@ -1,0 +1,151 @@
+"""`bayessim.sets`: the posterior of all real trajectories by a network that sees them together (set_network.py).
+
+Where replays have no likelihood, the product of the trajectories' posteriors is all that there is. The network of sets
+is trained on sets simulated around that product. Both are judged on further sets that neither has seen.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from bayessim_mjx import inference
+from bayessim_mjx.distributions import Distribution
+from bayessim_mjx.errors import UserError
+from bayessim_mjx.inference import restore_prior, set_network, sets
+from bayessim_mjx.inference.rounds import REGION
+from bayessim_mjx.inference.sets import Count
+from bayessim_mjx.inference.temperature import tempered
+from bayessim_mjx.keys import branch
+from bayessim_mjx.loop.factors import conditioned, kept
+from bayessim_mjx.loop.simulations import features
+from bayessim_mjx.loop.state import Loop, LoopState, RoundInfo
+from bayessim_mjx.quantities import fixed
+from bayessim_mjx.rl import Policy
+
+FITTED = 2000  # sets that the network is fitted on
+JUDGED = 64  # sets that it and the product are judged on
+
+
+@dataclass(frozen=True)
+class SetPosterior:
+    """How the network of sets did on sets that it was not fitted on, and the product on the same.
+
+    Attributes:
+        network: of sets, so widened; see `sets.Count`.
+        product: of single posteriors, as it would be used.
+        used: whether the posterior is that of the network.
+    """
+
+    network: Count
+    product: Count
+    used: bool
+
+    def sentence(self) -> str:
+        """One line: which of both, and why."""
+        ours, theirs = fixed(self.network.gain, 1), fixed(self.product.gain, 1)
+        which = "by a network of the whole set" if self.used else "by the product of single trajectories' posteriors"
+        return f"{which}: on simulated sets {ours} nats over the prior by the network, {theirs} by the product"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain numbers, for JSON."""
+        return {"used": self.used, "sentence": self.sentence(), **self.scores}
+
+    @property
+    def scores(self) -> dict[str, float]:
+        """Numbers for curves."""
+        told = {"used": float(self.used), "gain": self.network.gain, "product": self.product.gain}
+        told |= {"widening": self.network.widening}
+        return told | {f"coverage_{100 * level:.0f}": self.network.coverage(level) for level in sets.LEVELS}
+
+
+def chosen(loop: Loop, state: LoopState, policy: Policy, product: Distribution, info: RoundInfo) -> Distribution:
+    """The product, or the posterior of a network of sets where `bayessim.sets` asks for it; what was found in `info`.
+
+    product: of all real trajectories' posteriors, as wide as simulated sets ask for.
+    """
+    b, known = loop.settings, (int(state.round) + 1) * loop.settings.realTrajs
+    if b.sets == "product" or known < 2:
+        return product
+    clock = time.perf_counter()
+    try:
+        info.set_posterior, posterior = _learnt(loop, state, policy, product, info)
+    except UserError as error:
+        info.warnings.append(f"bayessim.sets={b.sets}: the product of the posteriors is kept: {error}")
+        return product
+    finally:
+        info.seconds["sets"] = time.perf_counter() - clock
+    info.scores |= {f"set_network/{name}": value for name, value in info.set_posterior.scores.items()}
+    return posterior if info.set_posterior.used else product
+
+
+def _learnt(
+    loop: Loop, state: LoopState, policy: Policy, product: Distribution, info: RoundInfo
+) -> tuple[SetPosterior, Distribution]:
+    """What was found, and the posterior of the real trajectories by the network of sets."""
+    b, source, real = loop.settings, loop.source, _usable(loop, state, product)
+    k_learn, k_theta, *keys = jax.random.split(branch(loop.key(int(state.round), "fit"), 5), 2 + len(real))
+
+    def simulate(key: Array, thetas: Array) -> Array:
+        return features(source, key, thetas[None], policy)  # type: ignore[arg-type]
+
+    network = set_network.learn(k_learn, state.fit, product, simulate, len(real), FITTED)
+
+    def posteriors(columns: list[Array]) -> list[Distribution]:
+        found = jax.vmap(restore_prior, in_axes=(0, None))(network.posteriors(columns), state.fit.identified)
+        share = jnp.full_like(found.prior_weight, b.priorShare)
+        return jax.tree.map(np.asarray, dataclasses.replace(found, prior_weight=share)).split()
+
+    thetas = dataclasses.replace(product, prior_weight=jnp.float32(0)).sample(k_theta, JUDGED)
+    columns = [simulate(k, thetas) for k in keys]
+    widening = info.sets.at(len(real)).widening if info.sets is not None else 1.0
+    pairs = list(zip(posteriors(columns), _products(loop, state, columns, widening), strict=True))
+    good = [i for i, (whole, other) in enumerate(pairs) if other is not None and whole.sound]
+    (own,) = posteriors([x[None] for x in real])
+    if len(good) < JUDGED // 2 or not own.sound:
+        raise UserError("too many simulated trajectories are not finite")
+    at = np.asarray(thetas)[good]
+    ours = sets.judge([[pairs[i][0]] for i in good], at, b.components).counts[0]
+    theirs = sets.judge([[pairs[i][1]] for i in good], at, b.components, widened_by=lambda n: 1.0).counts[0]
+    posterior = tempered(inference.combine([own], b.components), ours.widening)
+    return SetPosterior(ours, theirs, b.sets == "embedding" or ours.gain > theirs.gain), posterior
+
+
+def _usable(loop: Loop, state: LoopState, product: Distribution) -> Array:
+    """The real summaries [n, D] that a network of sets can be asked about."""
+    b, round_ = loop.settings, int(state.round)
+    if b.proposal == "division":
+        raise UserError("bayessim.proposal=division has no posterior to simulate sets around")
+    if round_ and loop.source.policy_dependent:  # type: ignore[union-attr]
+        raise UserError(
+            "earlier trajectories were made by other policies, which sets cannot be simulated with any more"
+        )
+    if float(product.prior_weight) >= REGION:
+        raise UserError("they have told nothing yet")
+    real = state.real_features[: (round_ + 1) * b.realTrajs]
+    return real[np.isfinite(np.asarray(real)).all(axis=1)]
+
+
+def _products(loop: Loop, state: LoopState, columns: list[Array], widening: float) -> list[Distribution | None]:
+    """Of each set, given as columns of summaries [m, D], the product as it is used; None where it is no density."""
+    b, each = loop.settings, []
+    for x in columns:
+        factors = kept(conditioned(state.fit, x, state.temperature), state.fit.identified, b.priorShare)
+        each.append(jax.tree.map(np.asarray, factors).split())
+    rows = zip(*each, strict=True)
+    return [
+        tempered(inference.combine(row, b.components).rechart(loop.chart), widening)
+        if all(q.sound for q in row)
+        else None
+        for row in rows
+    ]
+
+
+__all__ = ["SetPosterior", "chosen"]
