@@ -106,14 +106,14 @@ def _learnt(
     thetas = dataclasses.replace(product, prior_weight=jnp.float32(0)).sample(k_theta, JUDGED)
     columns = [simulate(k, thetas) for k in keys]
     widening = info.sets.at(len(real)).widening if info.sets is not None else 1.0
-    pairs = list(zip(posteriors(columns), _products(loop, state, columns, widening), strict=True))
-    good = [i for i, (whole, other) in enumerate(pairs) if other is not None and whole.sound]
+    each = zip(np.asarray(thetas), posteriors(columns), _products(loop, state, columns, widening), strict=True)
+    rows = [(at, whole, other) for at, whole, other in each if other is not None and whole.sound]
     (own,) = posteriors([x[None] for x in real])
-    if len(good) < JUDGED // 2 or not own.sound:
+    if len(rows) < JUDGED // 2 or not own.sound:
         raise UserError("too many simulated trajectories are not finite")
-    at = np.asarray(thetas)[good]
-    ours = sets.judge([[pairs[i][0]] for i in good], at, b.components).counts[0]
-    theirs = sets.judge([[pairs[i][1]] for i in good], at, b.components, widened_by=lambda n: 1.0).counts[0]
+    at, wholes, products = zip(*rows, strict=True)
+    ours = sets.judge([[q] for q in wholes], np.stack(at), b.components).counts[0]
+    theirs = sets.judge([[q] for q in products], np.stack(at), b.components, widened_by=lambda n: 1.0).counts[0]
     posterior = tempered(inference.combine([own], b.components), ours.widening)
     return SetPosterior(ours, theirs, b.sets == "embedding" or ours.gain > theirs.gain), posterior
 
@@ -130,7 +130,10 @@ def _usable(loop: Loop, state: LoopState, product: Distribution) -> Array:
     if float(product.prior_weight) >= REGION:
         raise UserError("they have told nothing yet")
     real = state.real_features[: (round_ + 1) * b.realTrajs]
-    return real[np.isfinite(np.asarray(real)).all(axis=1)]
+    real = real[np.isfinite(np.asarray(real)).all(axis=1)]
+    if not len(real):
+        raise UserError("none of their summaries is finite")
+    return real
 
 
 def _products(loop: Loop, state: LoopState, columns: list[Array], widening: float) -> list[Distribution | None]:

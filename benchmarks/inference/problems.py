@@ -120,32 +120,40 @@ def pendulum() -> Problem:
         return -0.5 * np.sum(((y - x) / noise) ** 2, axis=1, dtype=np.float64)
 
     def gain(x: np.ndarray, theta: np.ndarray) -> float:
-        """By importance sampling: the evidence of the mean of x, which is all that x tell."""
-
-        def log_likelihood(at: np.ndarray) -> np.ndarray:
-            motion = np.asarray(clean(jnp.asarray(at, jnp.float32)), np.float64)
-            return -0.5 * len(x) * np.sum(((motion - x.mean(0)) / noise) ** 2, axis=1)
-
-        step = 1e-3 * np.diag(space.high - space.low)
-        motion = np.asarray(clean(jnp.asarray(np.concatenate([theta + step, theta - step]), jnp.float32)))
-        slope = np.linalg.solve(2 * step, (motion[:3] - motion[3:]) / noise)
-        proposal = multivariate_t(theta, 2 * np.linalg.inv(len(x) * slope @ slope.T + 1e-6 * np.eye(3)), df=5)
-        rng, evidence = np.random.default_rng(0), 0.0
-        for _ in range(4):
-            draws = np.atleast_2d(proposal.rvs(20_000, random_state=rng))
-            inside = np.all((draws >= space.low) & (draws <= space.high), axis=1)
-            log_weights = np.where(inside, log_likelihood(draws) - proposal.logpdf(draws), -np.inf)
-            top = log_weights.max()
-            weights = np.exp(log_weights - top)
-            evidence = top + np.log(weights.mean())
-            weights /= weights.sum()
-            centre = weights @ draws
-            spread = ((draws - centre) * weights[:, None]).T @ (draws - centre)
-            proposal = multivariate_t(centre, 1.5 * spread + 1e-12 * np.eye(3), df=5)
-        return float(log_likelihood(theta[None])[0] - evidence + np.log(space.high - space.low).sum())
+        # the mean of x is all that they tell
+        return _gain(
+            lambda at: np.asarray(clean(jnp.asarray(at, jnp.float32))) / noise, x.mean(0) / noise, len(x), theta, space
+        )
 
     settings = {"coordinates": "plain", "components": 8, "ensemble": 5}
     return Problem("pendulum", space, simulate, exact, settings, True, gain)
+
+
+def _gain(
+    motion: Callable[[np.ndarray], np.ndarray], mean: np.ndarray, n: int, theta: np.ndarray, space: ParameterSpace
+) -> float:
+    """Gain at theta [d], nats, of the posterior of n records of unit noise and this mean [D], by importance sampling.
+
+    motion: theta [N, d] -> [N, D] without noise.
+    """
+
+    def log_likelihood(at: np.ndarray) -> np.ndarray:
+        return -0.5 * n * np.sum((motion(at).astype(np.float64) - mean) ** 2, axis=1)
+
+    d, step = len(theta), 1e-3 * np.diag(space.high - space.low)
+    slope = np.linalg.solve(2 * step, motion(theta + step) - motion(theta - step))
+    proposal = multivariate_t(theta, 2 * np.linalg.inv(n * slope @ slope.T + 1e-6 * np.eye(d)), df=5)
+    rng, evidence = np.random.default_rng(0), 0.0
+    for _ in range(4):
+        draws = np.atleast_2d(proposal.rvs(20_000, random_state=rng))
+        inside = np.all((draws >= space.low) & (draws <= space.high), axis=1)
+        log_weights = np.where(inside, log_likelihood(draws) - proposal.logpdf(draws), -np.inf)
+        weights = np.exp(log_weights - log_weights.max())
+        evidence = log_weights.max() + np.log(weights.mean())
+        weights /= weights.sum()
+        away = draws - weights @ draws
+        proposal = multivariate_t(weights @ draws, 1.5 * (away * weights[:, None]).T @ away + 1e-12 * np.eye(d), df=5)
+    return float(log_likelihood(theta[None])[0] - evidence + np.log(space.high - space.low).sum())
 
 
 def bounces() -> Problem:
