@@ -21,7 +21,8 @@ def filled(
     Velocities count as not measured only where some others were; without any they are derived from the positions.
 
     Raises:
-        UserError: nothing was measured, a joint that the model lacks, or only a part of a joint with several numbers.
+        UserError: nothing was measured, a joint that the model lacks, only a part of a joint with several numbers, or
+            no position of a free or ball joint.
     """
     absent = [f"qpos:{n}" for n in channels.qpos if f"qpos:{n}" not in columns]
     slow = [f"qvel:{n}" for n in channels.qvel if f"qvel:{n}" not in columns]
@@ -54,11 +55,13 @@ def _known(table: Table, channels: Channels) -> None:
 
 
 def _whole_joints(table: Table, absent: list[str], channels: Channels) -> None:
-    """Several numbers of one joint (a quaternion) are measured together or not at all."""
-    for joint in channels.joints:
+    """Several numbers of one joint (a quaternion) are measured together, and its position is measured."""
+    for joint, kind in zip(channels.joints, channels.kinds, strict=True):
         for stream in ("qpos", "qvel"):
             own = [f"{stream}:{n}" for n in channels.of_joint(joint, stream)]
             lost = [name for name in own if name in absent]
-            if lost and len(lost) < len(own):
+            needed = kind in ("free", "ball") and stream == "qpos"  # no such motion is estimated
+            if lost and (needed or len(lost) < len(own)):
                 text = f"{table.path}: missing column(s) {', '.join(lost)}"
-                raise UserError(f"{text}; allowed: all {len(own)} of joint {joint!r}, or none")
+                none = " (only hinges and slides may be without)" if needed else ", or none"
+                raise UserError(f"{text}; allowed: all {len(own)} of joint {joint!r}{none}")

@@ -165,6 +165,11 @@ class Log:
         return np.array(out, bool)
 
     @property
+    def lost(self) -> tuple[str, ...]:
+        """Positions that were not measured, and with them the motion; a velocity alone follows from its position."""
+        return tuple(name for name in self.absent if name.startswith("qpos:"))
+
+    @property
     def seen_speeds(self) -> NDArray[np.bool_]:
         """[nv]: whether the velocity was measured."""
         return np.array([self.has_qvel and f"qvel:{n}" not in self.absent for n in self.channels.qvel], bool)

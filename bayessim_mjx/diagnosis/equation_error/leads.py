@@ -61,7 +61,7 @@ def checked(
 
 def looked(logs: Sequence[Log], robot: Robot, told: list[str]) -> Look:
     """The look before any simulation; a failure costs the race its leads, not the diagnosis, and is `told`."""
-    lost = sorted({name for log in logs for name in log.absent})
+    lost = sorted({name for log in logs for name in log.lost})
     if lost:
         need = f"they need the motion of all joints, and {', '.join(lost)} was not measured"
         text = f"checks and proposals before any simulation are left out: {need}"

@@ -47,7 +47,7 @@ class Link:
 
 def links(log: Log, mj_model: mujoco.MjModel) -> list[Link]:
     """All links of one log, in the order of the chain."""
-    if log.absent:
+    if log.lost:
         return []  # what a joint needs is known only with the motion of all
     return [*_controllers(log, mj_model), *_drives(log, mj_model), *_sensors(log)]
 

@@ -168,7 +168,7 @@ def _report(log: Log, mj_model: mujoco.MjModel, dt: float) -> Report:
     own = _alone(log, dt)
     if any(f.kind == "refused" for f in own):
         return Report(log, own)  # nothing further can be computed from it
-    related = () if log.absent else tuple(relations(log, mj_model))  # forces on a joint need the motion of all
+    related = () if log.lost else tuple(relations(log, mj_model))  # forces on a joint need the motion of all
     seen = tuple(single_log.velocities(log))
     step = max(dt, log.period)
     targets = _targets(log, mj_model)

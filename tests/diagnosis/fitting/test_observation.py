@@ -9,7 +9,7 @@ import pytest
 from bayessim_mjx.diagnosis.equation_error import leads
 from bayessim_mjx.diagnosis.fitting import observation
 from bayessim_mjx.diagnosis.fitting.robot import robot_of
-from bayessim_mjx.diagnosis.logcheck import gate
+from bayessim_mjx.diagnosis.logcheck import channels, gate
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs import Log, read_logs, write_log
 from tests.diagnosis.recordings import ARM, record, sines
@@ -20,6 +20,10 @@ APART = """<mujoco><option timestep="0.005"/><worldbody>
   <body pos="1 0 0"><joint name="elbow" axis="0 1 0"/><geom size=".05" pos="0 0 -.4" contype="0"/></body>
 </worldbody><actuator><motor name="m_shoulder" joint="shoulder"/><motor name="m_elbow" joint="elbow"/></actuator>
 </mujoco>"""
+LEG = """<mujoco><option timestep="0.005"/><worldbody>
+  <body><joint name="hip" type="{}"/><geom size=".05" pos="0 0 -.4" contype="0"/>
+    <body pos="0 0 -.4"><joint name="knee" axis="0 1 0"/><geom size=".05" pos="0 0 -.3" contype="0"/></body></body>
+</worldbody><actuator><motor name="m_knee" joint="knee"/></actuator></mujoco>"""
 
 
 def recorded(xml: str = COARSE, qvel: bool = False) -> Log:
@@ -68,6 +72,46 @@ def test_checks_that_need_the_motion_of_all_joints_are_said_to_be_left_out(arm):
     for _ in range(2):
         assert not leads.looked([log], robot_of(arm), told).proposals
     assert len(told) == 1 and "left out: they need the motion of all joints, and qpos:elbow was not" in told[0]
+
+
+def test_checks_go_on_without_the_velocity_of_a_joint_whose_position_was_measured(tmp_path, arm):
+    """They differentiate positions: a velocity column more or less changes what they say of no joint."""
+    log = record(COARSE, sines((4.0, 1.5)), seconds=3.0, period=0.02, qvel=True)
+    told = []
+    for name, absent in (("whole", ()), ("part", ("qvel:elbow",))):
+        write_log(tmp_path / name / "run.csv", dataclasses.replace(log, absent=absent))
+    (whole,), (part,) = (read_logs(tmp_path / name, arm, partial=True) for name in ("whole", "part"))
+    assert part.absent == ("qvel:elbow",) and observation.completed([part], arm)[0] is part
+    looks = [leads.looked([one], robot_of(arm), told) for one in (whole, part)]
+    assert not told and [j.name for j in looks[1].joints] == ["shoulder", "elbow"]
+    for before, after in zip(looks[0].joints, looks[1].joints, strict=True):
+        assert after.needs == pytest.approx(before.needs, rel=0.01) == pytest.approx(1.0, abs=0.1)
+    assert [r.joint for r in gate.check([part], arm, 0.02).reports[0].relations] == ["shoulder", "elbow"]
+    assert {link.where for link in channels.links(part, arm)} >= {"shoulder", "elbow"}
+
+
+@pytest.mark.parametrize(("kind", "last"), [("ball", 3), ("free", 6)])
+def test_a_ball_or_free_joint_has_to_be_measured(tmp_path, kind, last):
+    xml = LEG.format(kind)
+    model = mujoco.MjModel.from_xml_string(xml)
+    part = unseen_hip(record(xml, sines((2.0,)), seconds=0.4, period=0.02, name="run.csv"), model)
+    with pytest.raises(
+        UserError, match=rf"run\.csv: {kind} joint 'hip' was not measured; allowed: all of qpos:hip\[0\]"
+    ):
+        observation.completed([part], model)
+    write_log(tmp_path / "run.csv", part)
+    with pytest.raises(
+        UserError, match=rf"run\.csv: missing.* qpos:hip\[{last}\]; allowed: all {last + 1} of .*'hip' \(only"
+    ):
+        read_logs(tmp_path, model, partial=True)
+
+
+def unseen_hip(log: Log, model: mujoco.MjModel) -> Log:
+    own, fast = (log.channels.columns("hip", kind) for kind in ("qpos", "qvel"))
+    qpos, qvel = log.qpos.copy(), log.qvel.copy()
+    qpos[:, own], qvel[:, fast] = model.qpos0[own], 0.0
+    absent = tuple(f"qpos:{name}" for name in log.channels.of_joint("hip"))
+    return dataclasses.replace(log, qpos=qpos, qvel=qvel, absent=absent)
 
 
 def test_what_the_logs_cannot_tell_is_refused_by_name():
