@@ -100,8 +100,11 @@ def _can_be_repeated(log: Log) -> bool:
 def _take(log: Log) -> Take:
     metadata = {k: v for k, v in log.metadata.items() if k not in OWN}
     metadata.setdefault("condition", log.name)
+    late = max(log.late, 0.0)  # commands that act early would have to be known before they are sent
+    if "commands_late" in metadata:
+        metadata["commands_late"] = late
     stem = Path(log.name.replace("#", "_")).stem
-    return Take(stem, metadata, log.time, log.ctrl, log.qpos, log.qvel, False, max(log.late, 0.0), log.linear)
+    return Take(stem, metadata, log.time, log.ctrl, log.qpos, log.qvel, False, late, log.linear)
 
 
 def _base(model: mujoco.MjModel) -> str:

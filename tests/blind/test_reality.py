@@ -63,6 +63,40 @@ def test_without_causes_it_is_the_model_at_a_finer_step(rig):
     np.testing.assert_allclose(moved(rig), native(rig), atol=1e-9)
 
 
+LATE = 0.013  # s, no multiple of a row's 20 ms
+
+
+def _retimed(rig, how: str):
+    """The rig with logs whose commands act otherwise than from row to row of a regular clock."""
+    jitter = np.r_[0, np.random.default_rng(0).uniform(-0.004, 0.004, len(rig.takes[0].time) - 2), 0]
+    changes = {"late": {"late": LATE}, "linear": {"linear": True}, "both": {"late": LATE, "linear": True}}
+    own = [dataclasses.replace(t, **changes.get(how, {"time": t.time + jitter})) for t in rig.takes]
+    return dataclasses.replace(rig, takes=tuple(own))
+
+
+@pytest.mark.parametrize("how", ["late", "linear", "both", "jitter"])
+def test_a_run_without_causes_has_no_strength_however_its_commands_act(rig, how):
+    base = dict.fromkeys(base_names(rig.load().compile()), 1.0)
+    ruler = Ruler(_retimed(rig, how), base, 0.15, 0)
+    assert max(ruler.measure(ruler.runs)) < 1e-6
+
+
+@pytest.mark.parametrize("how", ["late", "linear", "both"])
+def test_commands_act_when_the_log_says(rig, how):
+    model, take = mujoco.MjModel.from_xml_string(PENDULUM), _retimed(rig, how).takes[0]
+    model.opt.timestep /= FINER
+    data, h = mujoco.MjData(model), model.opt.timestep
+    data.qpos[:], data.qvel[:] = take.qpos[0], take.qvel[0]
+    rows = round(rig.period / h)
+    for k in range(rows * (len(take.time) - 1)):
+        t = (k + 0.5) * h - take.late
+        held = take.ctrl[max(int(t // rig.period), 0), 0]
+        data.ctrl[:] = np.interp(t, take.time, take.ctrl[:, 0]) if take.linear else held
+        mujoco.mj_step(model, data)
+    run = _retimed(rig, how).record(Plant(rig, {}), 0, 0, noise=False)
+    assert run.clean[-1, 0] == pytest.approx(data.qpos[0], abs=1e-9)
+
+
 def _damped(model):
     model.dof_damping[0] += 0.05
 

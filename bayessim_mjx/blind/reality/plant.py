@@ -50,12 +50,15 @@ class Rig(Protocol):
     def record(self, plant: "Plant", index: int, seed: int, noise: bool = True) -> "Run":
         """Run `index` on a plant of this rig."""
 
+    def repeat(self, plant: "Plant", run: "Run", row: int) -> None:
+        """From a row of a run to the next, under the commands that acted there."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Run:
     """time [T], ctrl [T, nu] in force from each row on, qpos, qvel [T, n] with and without noise, peak force by joint.
 
-    pull: [T, nu] the actuators' mean force in the period before each row, zeros in the first.
+    pull: [T, nu] the actuators' mean force in the period before each row, zeros in the first. index: in its rig.
     """
 
     time: np.ndarray
@@ -66,6 +69,7 @@ class Run:
     clean_v: np.ndarray
     effort: np.ndarray
     pull: np.ndarray | None = None
+    index: int = 0
 
 
 class Plant:

@@ -23,7 +23,7 @@ class Take:
         name: of the file, without its ending; metadata: its side YAML, `condition` among it.
         time: [T] s; ctrl: [T, nu]; qpos, qvel: [T, n] as logged, where the motion begins and is led to.
         led: whether a weak controller around the joints' drives adds to the commands.
-        late: s by which commands act later than their rows say; linear: they run straight from row to row.
+        late: s by which commands act later than their rows say, at least 0; linear: they run straight from row to row.
     """
 
     name: str
@@ -83,8 +83,6 @@ class Replay:
     def record(self, plant: Plant, index: int, seed: int, noise: bool = True) -> Run:
         """The log's commands again; where the plant would leave the log, a weak controller adds to them."""
         take, rng = self.takes[index], np.random.default_rng((seed, index))
-        h = plant.timestep
-        at = np.round((take.time - take.time[0]) / h).astype(int)
         kp, kd, driven = _lead(plant)
         driven = driven if take.led else []
         low, high = _limits(plant.model)
@@ -100,20 +98,14 @@ class Replay:
             u = np.clip(u, low, high)
             for key, value in zip(rows, (u, q, v, clean, clean_v, pull), strict=True):
                 rows[key].append(value)
-            if row + 1 < len(at):
-                self._advance(plant, take, rows["ctrl"], row, at[row + 1] - at[row])
+            if row + 1 < len(take.time):
+                _advance(plant, take, rows["ctrl"], row)
                 effort, pull = np.maximum(effort, plant.force()), plant.data.actuator_force.copy()
-        return Run(time=take.time, **{k: np.array(v) for k, v in rows.items()}, effort=effort)
+        return Run(time=take.time, **{k: np.array(v) for k, v in rows.items()}, effort=effort, index=index)
 
-    def _advance(self, plant: Plant, take: Take, sent: list[np.ndarray], row: int, steps: int) -> None:
-        acting = int(np.searchsorted(take.time, take.time[row] - take.late + 1e-9)) - 1 if take.late > 0 else row
-        u = sent[max(acting, 0)]
-        if not take.linear:
-            plant.advance(u, steps)
-            return
-        target = take.ctrl[row + 1] if row + 1 < len(take.ctrl) else u
-        for k in range(steps):
-            plant.advance(u + (target - u) * (k + 0.5) / steps, 1)
+    def repeat(self, plant: Plant, run: Run, row: int) -> None:
+        """From a row of a run to the next."""
+        _advance(plant, self.takes[run.index], run.ctrl, row)
 
     def _sensed(self, q: np.ndarray, v: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """With noise and steps of the encoders; the steps' own noise is a part of sigma."""
@@ -122,6 +114,24 @@ class Replay:
         seen = q + white * rng.normal(size=len(q))
         seen = np.where(quantum > 0, quantum * np.round(seen / np.where(quantum > 0, quantum, 1.0)), seen)
         return seen, v + np.asarray(self.speed_sigma) * rng.normal(size=len(v))
+
+
+def _advance(plant: Plant, take: Take, sent: Sequence[np.ndarray], row: int) -> None:
+    """From a row of a log to the next under the commands sent up to it, which act as late as the log says."""
+    h, time = plant.timestep, take.time
+    first, last = (round(float(time[k] - time[0]) / h) for k in (row, row + 1))
+    if not (take.linear or take.late):
+        plant.advance(sent[row], last - first)
+        return
+    middle = (np.arange(first, last) + 0.5) * h - take.late
+    acting = np.clip(np.searchsorted(time[: row + 1] - time[0], middle + 1e-9) - 1, 0, row)
+    for t, k in zip(middle, acting, strict=True):
+        u = sent[k]
+        if take.linear:
+            ahead = sent[k + 1] if k < row else take.ctrl[row + 1]
+            part = (t - (time[k] - time[0])) / (time[k + 1] - time[k])
+            u = u + (ahead - u) * min(max(part, 0.0), 1.0)
+        plant.advance(u, 1)
 
 
 def _limits(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:

@@ -57,7 +57,7 @@ class Ruler:
         for r, start in starts[::thin][::every]:
             plant.reset(r.clean[start] + dq, r.clean_v[start] + dv, r.ctrl[start])
             for k in range(start, start + self.rows):
-                plant.advance(r.ctrl[k])
+                self.system.repeat(plant, r, k)
                 out.append(plant.measure()[0] - r.clean[k + 1])
         return np.array(out).reshape(-1, self.rows, len(self.system.sigma)) / np.asarray(self.system.sigma)
 

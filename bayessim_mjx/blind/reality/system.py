@@ -82,7 +82,11 @@ class System:
             plant.advance(u)
             effort, pull = np.maximum(effort, plant.force()), plant.data.actuator_force.copy()
         stacked = {k: np.array(v) for k, v in record.items()}
-        return Run(time=np.arange(rows) * self.period, **stacked, effort=effort)
+        return Run(time=np.arange(rows) * self.period, **stacked, effort=effort, index=index)
+
+    def repeat(self, plant: Plant, run: Run, row: int) -> None:
+        """From a row of a run to the next."""
+        plant.advance(run.ctrl[row])
 
     def _plan(self, plant: Plant, index: int, seed: int) -> tuple[Callable[..., np.ndarray], np.ndarray, np.ndarray]:
         """(controller of time, position and velocity; start state) of a run."""
