@@ -173,8 +173,9 @@ def test_unnamed_elements_and_floating_bases_are_taken(tmp_path):
 def test_masses_are_scaled_however_the_model_states_them():
     inertial = '<inertial pos="0 0 0" mass="2" diaginertia=".1 .1 .1"/><geom size=".1"/>'
     bodies = [inertial, '<geom size=".1"/>', '<geom size=".1" mass="2"/>']
-    for body in bodies:
-        text = f'<mujoco><worldbody><body name="b"><joint/>{body}</body></worldbody></mujoco>'
+    geoms_alone = '<compiler inertiafromgeom="true"/>'
+    for compiler, body in [*(("", own) for own in bodies), (geoms_alone, inertial)]:
+        text = f'<mujoco>{compiler}<worldbody><body name="b"><joint/>{body}</body></worldbody></mujoco>'
         plain, spec = mujoco.MjModel.from_xml_string(text), mujoco.MjSpec.from_string(text)
         scale_base(spec, {"b.mass": 1.3})
         scaled = spec.compile()

@@ -162,25 +162,32 @@ class SpeedTorqueLimit(ActuatorCause):
         return {"inverse_stall": 1 / self.stall, "inverse_speed": 1 / self.free_speed}
 
 
-class EffortLoss(ActuatorCause):
-    """Sag behind a source resistance: u / (1 + c |u|); in a servo of its effort, by its gains."""
+class ChangingGain(ActuatorCause):
+    """Gives a share of its effort, another one in every sub-step."""
 
-    name = "effort_loss"
     stepped = True
-    largest = 1.5
 
     def reset(self, plant: Simulated, command: np.ndarray) -> None:
         super().reset(plant, command)
-        self.gain = plant.model.actuator_gainprm[self.id, 0].copy()
+        self.gain = plant.model.actuator_gainprm[self.id].copy()
         self.bias = plant.model.actuator_biasprm[self.id].copy()
+
+    def scale(self, plant: Simulated, share: float) -> None:
+        plant.model.actuator_gainprm[self.id] = self.gain * share
+        plant.model.actuator_biasprm[self.id] = self.bias * share
+
+
+class EffortLoss(ChangingGain):
+    """Sag behind a source resistance: u / (1 + c |u|); in a servo of its effort, by its gains."""
+
+    name = "effort_loss"
+    largest = 1.5
 
     def command(self, plant: Simulated, u: np.ndarray) -> None:
         w = self.gear * float(plant.data.qvel[plant.dof(self.joint)])
         q = self.gear * plant.position(self.joint)
-        tau = self.gain * u[self.id] + self.bias @ (1, q, w, *[0] * (len(self.bias) - 3))
-        part = 1 / (1 + self.size * abs(tau) / self.scales.effort[self.where])
-        plant.model.actuator_gainprm[self.id, 0] = self.gain * part
-        plant.model.actuator_biasprm[self.id] = self.bias * part
+        tau = self.gain[0] * u[self.id] + self.bias @ (1, q, w, *[0] * (len(self.bias) - 3))
+        self.scale(plant, 1 / (1 + self.size * abs(tau) / self.scales.effort[self.where]))
 
     def parameters(self) -> dict[str, float]:
         return {"loss": self.size / self.scales.effort[self.where]}

@@ -201,17 +201,12 @@ def scale_base(spec: mujoco.MjSpec, base: dict[str, float]) -> None:
 
 
 def _scale_mass(body: mujoco.MjsBody, factor: float) -> None:
-    if body.explicitinertial:
-        body.mass *= factor
-        body.inertia = body.inertia * factor
-        if np.isfinite(body.fullinertia).all():
-            body.fullinertia = body.fullinertia * factor
-        return
+    """Of what is stated and of the geoms: the compiler takes one of both, by its `inertiafromgeom` too."""
+    for attribute in ("mass", "inertia", "fullinertia"):  # the last is NaN where it is not used
+        setattr(body, attribute, getattr(body, attribute) * factor)
     for geom in body.geoms:
-        if np.isfinite(geom.mass):
-            geom.mass *= factor
-        else:
-            geom.density *= factor
+        attribute = "density" if np.isnan(geom.mass) else "mass"
+        setattr(geom, attribute, getattr(geom, attribute) * factor)
 
 
 def base_names(model: mujoco.MjModel) -> list[str]:

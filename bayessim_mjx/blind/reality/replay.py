@@ -116,7 +116,7 @@ class Replay:
         return seen, v + np.asarray(self.speed_sigma) * rng.normal(size=len(v))
 
 
-def _advance(plant: Plant, take: Take, sent: Sequence[np.ndarray], row: int) -> None:
+def _advance(plant: Plant, take: Take, sent: Sequence[np.ndarray] | np.ndarray, row: int) -> None:
     """From a row of a log to the next under the commands sent up to it, which act as late as the log says."""
     h, time = plant.timestep, take.time
     first, last = (round(float(time[k] - time[0]) / h) for k in (row, row + 1))

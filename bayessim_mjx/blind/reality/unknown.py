@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from bayessim_mjx.blind.reality.actuators import ActuatorCause
+from bayessim_mjx.blind.reality.actuators import ActuatorCause, ChangingGain
 from bayessim_mjx.blind.reality.cause import Cause, Simulated
 from bayessim_mjx.blind.reality.joints import Friction
 
@@ -38,25 +38,17 @@ class CrossCoupling(ActuatorCause):
         plant.data.qfrc_applied[plant.dof(self.other)] += self.size * effort
 
 
-class VaryingGain(ActuatorCause):
+class VaryingGain(ChangingGain):
     """The gain wanders with time."""
 
     name = "unknown_varying_gain"
     largest = 0.9
-    stepped = True
 
     def draw(self, rng: np.random.Generator) -> None:
         self.rate, self.phase = rng.uniform(0.25, 0.6), rng.uniform(0, 2 * np.pi)
 
-    def reset(self, plant: Simulated, command: np.ndarray) -> None:
-        super().reset(plant, command)
-        self.gain = plant.model.actuator_gainprm[self.id].copy()
-        self.bias = plant.model.actuator_biasprm[self.id].copy()
-
     def command(self, plant: Simulated, u: np.ndarray) -> None:
-        g = 1 + self.size * math.sin(2 * math.pi * self.rate * plant.data.time + self.phase)
-        plant.model.actuator_gainprm[self.id] = self.gain * g
-        plant.model.actuator_biasprm[self.id] = self.bias * g
+        self.scale(plant, 1 + self.size * math.sin(2 * math.pi * self.rate * plant.data.time + self.phase))
 
 
 class Pushes(Cause):
