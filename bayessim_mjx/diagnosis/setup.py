@@ -167,7 +167,7 @@ def _settings(robot: Robot, quick: bool = False) -> Settings:
     if quick:
         return QUICK
     big = robot.mj_model.nv > CUTTING.many
-    return Settings(singles=24, screened=24, starts=16) if big else Settings()
+    return Settings(singles=16, screened=24, starts=8) if big else Settings()
 
 
 def _noise(logs: Sequence[Log]) -> Array:

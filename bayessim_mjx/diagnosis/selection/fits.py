@@ -87,7 +87,9 @@ class Fits:
         if key not in self._screened:
             model = self.pool.models[key]
             others = [c for c in self.pool.candidates if all(compatible(c, e) for e in model.effects)]
-            self._screened[key] = screen(self.pool.fitter, model.fit, others, self.pool.settings.screened, self.say)
+            pool = self.pool
+            found = screen(pool.fitter, model.fit, others, pool.settings.screened, self.say, pool.secants)
+            self._screened[key] = found
         return [s.candidate.label for s in self._screened[key] if s.gain > 0]
 
     def together(self, most: int, count: int) -> list[Key]:

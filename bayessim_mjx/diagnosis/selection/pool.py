@@ -17,7 +17,7 @@ from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 from bayessim_mjx.diagnosis.selection import shortlist
 from bayessim_mjx.diagnosis.selection.criteria import Criteria
 from bayessim_mjx.diagnosis.selection.models import Model, scored
-from bayessim_mjx.diagnosis.selection.screen import Screened
+from bayessim_mjx.diagnosis.selection.screen import Screened, Secants
 from bayessim_mjx.diagnosis.selection.tried import Settings, Tried
 from bayessim_mjx.effects import load, names
 
@@ -33,6 +33,7 @@ class Rules:
     rounds: int = 5
     steps: int = 4
     falls: float = 0.99
+    near: float = 1.3  # times the best one's cost: as near as a fit has to be able to come
     astray: float = 10.0  # noises that a fit leaves: from there on nothing is as it was a step before
 
 
@@ -59,6 +60,7 @@ class Pool(Tried):
     cut_short: set[str] = field(default_factory=set)
     skipped: dict[str, int] = field(default_factory=dict)
     keep: Callable[[Pool], None] = lambda pool: None
+    secants: Secants = field(default_factory=Secants)
 
     @property
     def rough(self) -> bool:
@@ -257,14 +259,24 @@ def polish(pool: Pool, models: Sequence[Model], say: Progress = lambda text, don
 
 
 def _to_the_end(pool: Pool, fits: Sequence[Fit], told: Callable[[Fit], Fit]) -> list[Fit]:
-    """Fits with all columns anew every few steps, as long as that lowers their cost."""
+    """Fits with all columns anew every few steps, as long as that lowers their cost.
+
+    One that could not come near the best, did each round to come bring as much as the last, is left where it is.
+    """
     fits, running = list(fits), list(range(len(fits)))
-    for _ in range(RULES.rounds):
+    for made in range(RULES.rounds):
         start = [replace(fits[i], **AFRESH) for i in running]
         moved = pool.fitter.iterate(start, RULES.steps, lambda f: fresh(pool, f))
         for i, fit in zip(running, moved, strict=True):
             fits[i] = told(pool.fitter.refresh(fit))
-        running = [i for i, before in zip(running, start, strict=True) if fits[i].cost < RULES.falls * before.cost]
+        fell = {i: before.cost - fits[i].cost for i, before in zip(running, start, strict=True)}
+        least, left = min(fit.cost for fit in fits), RULES.rounds - 1 - made
+        running = [
+            i
+            for i in running
+            if fell[i] > (1 - RULES.falls) * (fits[i].cost + fell[i])
+            and fits[i].cost - left * fell[i] <= RULES.near * least
+        ]
         if not running:
             break
     return fits

@@ -11,10 +11,14 @@ from bayessim_mjx.diagnosis.selection.bounds import widen_leading
 from bayessim_mjx.diagnosis.selection.criteria import Criteria
 from bayessim_mjx.diagnosis.selection.models import scored
 from bayessim_mjx.diagnosis.selection.pool import AFRESH, Pool, Progress, fit_models, polish
-from bayessim_mjx.diagnosis.selection.screen import SIZES, screen
+from bayessim_mjx.diagnosis.selection.screen import SIZES, Screened, screen
 from bayessim_mjx.diagnosis.selection.tried import Settings
 
 FEW = 4  # single effects that are fitted, for the table, where nothing is to be explained
+LEAST = (
+    8  # single effects that are fitted whatever their screening promises: true ones were among the first three of it
+)
+WORTH = 0.02  # of what the best candidate promises: those that promise less are not fitted alone
 
 
 def begin(
@@ -42,17 +46,23 @@ def begin(
         fit = pool.base.fit
     pool.models[frozenset()] = pool.base
     keep(pool)
-    pool.screened = screen(fitter, fit, candidates, settings.screened, say)
+    pool.screened = screen(fitter, fit, candidates, settings.screened, say, pool.secants)
     if not pool.above_noise(pool.base):
         fit_models(pool, [(pool.base, s) for s in pool.screened[:FEW]], "single effects", say)
         return pool
-    led = [s for s in pool.screened if s.candidate.label in settings.first]
-    others = [s for s in pool.screened if s.gain > 0 and s.candidate.label not in settings.first]
-    promising = [*led, *others][: max(settings.singles, len(led))]
-    fit_models(pool, [(pool.base, s) for s in promising], "single effects", say)
+    fit_models(pool, [(pool.base, s) for s in promising(pool.screened, settings)], "single effects", say)
     widen_leading(pool, say)
     keep(pool)
     return pool
+
+
+def promising(screened: Sequence[Screened], settings: Settings) -> list[Screened]:
+    """Candidates that are fitted alone: those that come first whatever they promise, then the best of the screening."""
+    led = [s for s in screened if s.candidate.label in settings.first]
+    others = [s for s in screened if s.gain > 0 and s.candidate.label not in settings.first]
+    best = max((s.gain for s in others), default=0.0)
+    kept = [s for i, s in enumerate(others) if i < LEAST or s.gain > WORTH * best]
+    return [*led, *kept][: max(settings.singles, len(led))]
 
 
 def _affordable(fitter: Fitter, candidates: Sequence[Candidate], settings: Settings, seconds: float) -> Settings:

@@ -28,9 +28,9 @@ class Settings:
         believed: share of the noise (rms) that is the sensors'; the rest is what the time step may be worth at most.
     """
 
-    singles: int = 48
+    singles: int = 24
     screened: int = 96
-    starts: int = 20
+    starts: int = 12
     iterations: int = 12
     tolerance: float = 5e-3
     fresh: int = 6
@@ -38,7 +38,7 @@ class Settings:
     first: tuple[str, ...] = ()
     together: tuple[str, ...] = ()
     budget: Budget = Budget()
-    shortlisted: bool = False
+    shortlisted: bool = True
 
 
 class Tried:

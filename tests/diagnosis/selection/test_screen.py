@@ -105,3 +105,23 @@ def test_a_first_look_at_few_windows_keeps_what_matters(screened, monkeypatch):
     assert found[0].candidate.effect == truth
     np.testing.assert_allclose(found[0].gain, whole[0].gain)
     np.testing.assert_allclose(found[0].start, whole[0].start)
+
+
+def test_what_was_simulated_on_one_fit_is_projected_on_another_and_only_the_best_are_looked_at_again(screened):
+    """On the fit that it was simulated on it tells the same; the best are then simulated on all windows."""
+    truth, setup, fitter, fit, whole = screened
+    module = importlib.import_module("bayessim_mjx.diagnosis.selection.screen")
+    secants = module.Secants()
+    first = screen(fitter, fit, setup.candidates, 96, secants=secants)
+    assert [s.candidate.label for s in first] == [s.candidate.label for s in whole]
+    assert {label: len(pairs) for label, pairs in secants.columns.items()} == {
+        c.label: len(c.probes) for c in setup.candidates
+    }
+    before = fitter.simulator.rollouts
+    found = screen(fitter, fit, setup.candidates, 24, secants=secants)
+    assert 0 < fitter.simulator.rollouts - before <= 24 * module.SIZES.anew * module.SIZES.points
+    assert {s.candidate.label for s in found} == {c.label for c in setup.candidates}
+    assert found[0].candidate.effect == truth
+    rest = {s.candidate.label: s.gain for s in whole}
+    for s in found[module.SIZES.anew :]:
+        assert s.gain == pytest.approx(rest[s.candidate.label], rel=1e-6, abs=1e-9)

@@ -73,3 +73,12 @@ def test_where_nothing_is_wrong_only_a_few_single_effects_are_fitted_for_the_tab
     pool = singles.begin(fitter, [], Settings(), Criteria(), keep=lambda pool: seen.append(len(pool.screened)))
     assert len(plans) == fitted and all(model is base for model, _ in plans)
     assert seen[0] == 0 and pool.models == {frozenset(): base}
+
+
+def test_candidates_that_promise_next_to_nothing_beside_the_best_are_not_fitted_alone():
+    gains = [100.0, 50.0, 3.0, *[1.9] * 20]
+    screened = [SimpleNamespace(gain=g, candidate=SimpleNamespace(label=str(i))) for i, g in enumerate(gains)]
+    labels = [s.candidate.label for s in singles.promising(screened, Settings(first=("20",)))]
+    assert labels == ["20", *map(str, range(singles.LEAST))]
+    all_alike = [SimpleNamespace(gain=5.0, candidate=s.candidate) for s in screened]
+    assert len(singles.promising(all_alike, Settings(singles=12))) == 12
