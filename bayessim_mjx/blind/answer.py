@@ -22,7 +22,7 @@ from bayessim_mjx.quantities import count
 from bayessim_mjx.versions import versions
 
 __all__ = ["FILE", "about", "answer", "lookalikes"]
-PAIRS = 6  # looked at: each is simulated in every motion of the menu
+PAIRS = 6  # looked at, for the time: each is simulated in every motion of the menu
 Say = Callable[[str, int, int], None]
 Pair = tuple[str, str, str, str]  # hidden effect and place, said effect and place
 

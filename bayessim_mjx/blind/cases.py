@@ -19,8 +19,9 @@ from bayessim_mjx.blind.reality.replay import Replay
 from bayessim_mjx.blind.reality.strength import HIDDEN, resize
 from bayessim_mjx.logs import Channels
 
+# choices, by no measurement
 GIVE_UP = 4  # times that an effect is halved because the motion does not stay finite
-EFFORT_NOISE = 0.01  # of its root mean square
+EFFORT_NOISE = 0.01  # of its root mean square (told in docs/blind.md)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -13,7 +13,8 @@ from bayessim_mjx.blind.curves import Curves
 from bayessim_mjx.blind.outcome import VERDICTS, Outcome, alarm, covered, label, rate
 from bayessim_mjx.blind.runner import trials
 
-STEEP = (0.3, 2.0)  # how an amount may grow with strength: its power
+# rules of thumb, not measured
+STEEP = (0.3, 2.0)  # how an amount may grow with strength: its power, 1 where effects act in proportion
 SHARP = 15.0  # largest strength over smallest of an interval that is worth a sentence
 PLOTTED = np.geomspace(1.0, 300.0, 41)
 Found = dict[str, Any]

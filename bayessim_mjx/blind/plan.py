@@ -11,11 +11,12 @@ import numpy as np
 from bayessim_mjx.blind.cases import Item
 from bayessim_mjx.blind.curves import Curves, Group, Trial
 
+# Which cases are made is a choice, told in docs/blind.md; it makes intervals wider or narrower, not wrong.
 KINDS = "SSSNSSSSUN"  # single, null, unknown cause; over and over
 FIRST, ROUND = 16, 8  # cases of the first round, whose strengths are spread widely, and of the others
 SPREAD = (2.0, 40.0)  # encoder noises, of the first round
 SHARES = (0.5, 0.9)  # how often later strengths are expected to be found
-RANGE = (0.5, 500.0)
+RANGE = (0.5, 500.0)  # encoder noises, of all rounds
 
 
 def rounds(cases: int) -> list[range]:

@@ -15,7 +15,8 @@ from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs import Log, read_logs
 from bayessim_mjx.logs.signals import quantum
 
-SIGMA = 4e-4  # rad or m, encoder noise where no log shows one
+# stand-ins where there are no logs to take them from: choices, by no measurement
+SIGMA = 4e-4  # rad or m, encoder noise where no log shows one: a step of 14 bits in a turn
 PERIOD = 0.01  # s, of logs where there are none
 LEAST = 1e-5  # of a joint's range of motion: no encoder is finer
 SWING, REACH = 0.35, 0.7  # share of a joint's range that the menu moves through; rad, where it has none

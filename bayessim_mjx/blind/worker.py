@@ -25,7 +25,7 @@ from bayessim_mjx.blind.reality.twin import base_of, closed, twins
 from bayessim_mjx.errors import UserError
 
 STOPPED = (130, -signal.SIGINT, -signal.SIGTERM)  # by somebody: to be run again
-TIMEOUT = 3600.0  # s per diagnosis
+TIMEOUT = 3600.0  # s per diagnosis, against one that hangs
 QUIET = {name: "1" for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")}
 KEPT = ("diagnosis.json", "answer.json")
 EXIT = "exit.json"

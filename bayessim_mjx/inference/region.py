@@ -16,6 +16,7 @@ from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.distributions.charts import EDGE, from_chart, to_chart
 from bayessim_mjx.linalg import inverse_lower, product
 
+# choices; other values were not measured
 MASS = 1e-3  # of a Gaussian that an ellipsoid leaves outside, before it is made wider
 WIDER = 2.0  # standard deviations, times: with the posterior itself as region, its ends would look like knowledge
 POOL = 4096  # draws behind its mean and covariance

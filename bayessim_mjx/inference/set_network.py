@@ -24,8 +24,8 @@ from bayessim_mjx.inference.fit import FitInfo, FitState, condition, fit, init
 from bayessim_mjx.linalg import inverse_lower, lower_factor, product
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 
-LONGEST = 512  # features of a summary up to which they are pooled too
-AT_ONCE = 1024  # trajectories embedded at once
+LONGEST = 512  # features of a summary up to which they are pooled too: a choice, others were not measured
+AT_ONCE = 1024  # trajectories embedded at once, for the memory
 
 Simulate = Callable[[Array, Array], Array]  # key, theta [m, d] -> summaries [m, D]
 

@@ -30,8 +30,8 @@ from bayessim_mjx.loop.state import Loop, LoopState, RoundInfo
 from bayessim_mjx.quantities import fixed
 from bayessim_mjx.rl import Policy
 
-FITTED = 2000  # sets that the network is fitted on
-JUDGED = 64  # sets that it and the product are judged on
+FITTED = 2000  # sets that the network is fitted on; other numbers were not measured
+JUDGED = 64  # sets that it and the product are judged on, as many as `sets` judges products on
 
 
 @dataclass(frozen=True)

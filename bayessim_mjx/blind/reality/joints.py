@@ -7,7 +7,7 @@ import numpy as np
 
 from bayessim_mjx.blind.reality.cause import Cause, Simulated
 
-PRESLIDING = 2e-4  # rad or m, bend of the bristles at the friction level
+PRESLIDING = 2e-4  # rad or m, bend of the bristles at the friction level: a choice, below the encoders' noise
 
 
 class Bristle:

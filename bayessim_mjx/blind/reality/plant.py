@@ -12,7 +12,7 @@ import numpy as np
 
 from bayessim_mjx.blind.reality.cause import Cause, Scales
 
-FINER = 10
+FINER = 10  # times, of the steps in reality, so that its own error of integration is small beside the nominal one
 WIDTHS = {0: (7, 6), 1: (4, 3), 2: (1, 1), 3: (1, 1)}  # of free, ball, slide and hinge joints in qpos and qvel
 AXIAL = (int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE))
 

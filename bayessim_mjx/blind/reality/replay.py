@@ -9,6 +9,7 @@ import numpy as np
 
 from bayessim_mjx.blind.reality.plant import Plant, Run
 
+# choices, by no measurement
 STRAY = 0.25  # of a joint's range of motion in the logs: a robot that leaves its log by more is led back
 LEAD = 2 * np.pi * 1.5  # rad/s, of the weak controller that leads it back, with a damping ratio of 0.7
 SHORT = 6.0  # s, of the runs that measure strength

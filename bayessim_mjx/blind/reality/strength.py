@@ -8,11 +8,12 @@ from scipy.optimize import lsq_linear
 from bayessim_mjx.blind.reality.cause import Cause
 from bayessim_mjx.blind.reality.plant import Plant, Rig, Run
 
+# WINDOW and HIDDEN define the unit of strength (docs/blind.md): detection curves are in it, whatever they are.
 WINDOW = 0.5  # s, over which a cause is compared with the noise
 HIDDEN = 3.0  # a cause counts as no more than this many times what a refit leaves of it
-TRIALS = 14
+TRIALS = 14  # of a size, until its strength is within 10 % of the goal
 MOST = 64  # windows, about
-_NUDGE = 0.02
+_NUDGE = 0.02  # of a base parameter, for its tangent
 
 
 class Ruler:

@@ -25,15 +25,26 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Rules:
-    """What is believed before anything is measured, and what counts as told."""
+    """What is believed before anything is measured, and what counts as told. Rules of thumb.
 
-    angle: float = 0.5  # rad or m, of a position at a log's first row
-    speed: float = 2.0  # rad/s or m/s, of a velocity there
-    shares: tuple[float, ...] = (0.003, 0.03, 0.3)  # of typical accelerations, that the model may lack
-    passes: int = 2  # smoothed start states are filtered from again
-    second: float = 0.5  # s, in which a start state has to show
-    told: float = 0.5  # of its standard deviation that may be left after that
-    least: float = 1e-6  # rad, rad/s: as precise as the model is taken to be
+    How often their starts and standard deviations are right was not counted; one arm with friction at a joint without
+    an encoder is (tests/diagnosis/test_partial.py).
+
+    Attributes:
+        angle: rad or m, standard deviation of a position at a log's first row; speed: rad/s or m/s, of a velocity.
+        shares: of typical accelerations, that the model may lack; the most likely one of each log is taken.
+        passes: smoothed start states are filtered from again.
+        second: s, in which a start state has to show; told: of its standard deviation that may be left after that.
+        least: rad, rad/s, as precise as the model is taken to be.
+    """
+
+    angle: float = 0.5
+    speed: float = 2.0
+    shares: tuple[float, ...] = (0.003, 0.03, 0.3)
+    passes: int = 2
+    second: float = 0.5
+    told: float = 0.5
+    least: float = 1e-6
 
 
 RULES = Rules()

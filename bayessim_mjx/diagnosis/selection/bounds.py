@@ -21,11 +21,12 @@ from bayessim_mjx.physics import Physics
 class Widening:
     """How ranges grow, and when an estimate is at the end of one."""
 
+    # rules of thumb, none counted alone; error rates with them are those of d462f0c in benchmarks/results.md
     near: float = 0.001  # of a range: at its end
     # a range grows by this factor, up to so many times what it was at first
     twice: float = 2.0
     farthest: float = 64.0
-    nats: float = 2.0  # of held-out evidence that a wider range has to bring
+    nats: float = 2.0  # of held-out evidence that a wider range has to bring: odds of 7 to 1
     most: int = 6  # single effects whose ranges grow before further ones are added
     close: float = 4.0  # times the best one's cost: as near as a wider range has to promise to bring them
     steps: int = 8  # of a fit in a wider range

@@ -6,7 +6,8 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-# share of the time at which a part ends, so that those after it have theirs; what follows the search has the rest
+# Share of the time at which a part ends, so that those after it have theirs; what follows the search has the rest.
+# A choice: what a search that was cut misses was not counted.
 ENDS = {"screening": 0.25, "single effects": 0.5, "effects together": 0.7, "finalists": 0.85}
 
 

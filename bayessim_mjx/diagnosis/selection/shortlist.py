@@ -22,6 +22,9 @@ Array = NDArray[np.float64]
 class Sizes:
     """How many windows candidates are ranked on, and who goes on with all of them.
 
+    Rules of thumb: on one case they cost half the simulations and name the same (benchmarks/results.md, "Diagnosis:
+    seconds"); error rates were not counted, and only searches with a limit of time rank so.
+
     Attributes:
         windows: ranked on; least: windows from which on some of them are enough.
         close: times the best candidate's cost on these windows; others make one step on all windows, for the table.

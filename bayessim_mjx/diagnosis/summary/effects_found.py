@@ -14,7 +14,9 @@ from bayessim_mjx.diagnosis.selection import bounds, heldout, predicted_gain, un
 from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.setup import Setup
 
-LEAST = 3  # operating conditions, from which on closure is quoted of those that had no part in the choice
+# operating conditions, from which on closure is quoted of those that had no part in the choice: without one of two, a
+# single one is left to choose by, which tells no standard error over conditions
+LEAST = 3
 
 
 def effects_of(found: Findings, sd: np.ndarray, closed: dict[str, Any]) -> list[FoundEffect]:

@@ -11,7 +11,8 @@ from bayessim_mjx.inference.densities.density import Density, Drop, Params, regi
 from bayessim_mjx.inference.settings import InferenceSettings
 
 GOLDEN = np.uint32(2654435769)  # 2^32 / golden ratio
-DEEPER = np.uint32(0x85EBCA6B)  # between the keys of layers: those of points of the curve are GOLDEN apart (train.py)
+# between the keys of layers: those of points of the curve are GOLDEN apart (train.py); a constant of MurmurHash3
+DEEPER = np.uint32(0x85EBCA6B)
 
 
 def _start(key: Array, settings: InferenceSettings, dim_x: int) -> tuple[Params, tuple[int, ...]]:
