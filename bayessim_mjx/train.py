@@ -16,7 +16,6 @@ from bayessim_mjx import cli
 from bayessim_mjx.config import Config, to_yaml
 from bayessim_mjx.config.settings import AGENTS
 from bayessim_mjx.device import mesh, setup_jax
-from bayessim_mjx.errors import UserError
 from bayessim_mjx.quantities import estimate
 
 DESCRIPTION = "Train a policy with PPO alone, on nominal physics or on physics drawn from the prior."
@@ -192,8 +191,6 @@ class AgentTraining(Training):
         from bayessim_mjx.monitor.wall import marked
         from bayessim_mjx.wrappers import agents
 
-        if self.config.bayessim.policyCheckpt is not None:
-            raise UserError(f"--checkpoint: --agent {self.config.agent} begins with a policy of its own; leave it out")
         agent = agents.make(self.config, self.env, self.domain)
         if not (resume and self.run.checkpoints):
             return agent, -1 if resume else None
@@ -246,6 +243,10 @@ def _run(config: Config, run: Any, command: Sequence[str], headless: bool) -> in
     mesh(config)  # refuse before there is a run folder
     with cli.first_writes(config, run) as (config, run), Console(headless=headless) as console, cli.graceful() as stop:
         env = registry.make(config.task, config=config)
+        if config.agent != "own":
+            from bayessim_mjx.wrappers import agents
+
+            agents.check(config, env)
         console.start(opening(config, env, device, infers=False))
         resume = run is not None
         if run is None:

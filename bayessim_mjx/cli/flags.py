@@ -163,7 +163,8 @@ class Parser(PlainParser):
         self.add_argument("--list_tasks", action="store_true", help="print the names of the tasks and stop")
         if resume:
             self.add_argument("--resume", metavar="RUN", help="continue an interrupted run")
-        self.epilog = "section.key=value changes any setting, for example bayessim.components=5 (see cfg/*.yaml)"
+        example = "ppo.gamma=0.95" if "bayessim" in unused else "bayessim.components=5"
+        self.epilog = f"section.key=value changes any setting, for example {example} (see cfg/*.yaml)"
 
     def parse(self, argv: Sequence[str] | None) -> argparse.Namespace:
         """Namespace with the flags, `overrides`, and `given` (flags that were used)."""

@@ -28,7 +28,7 @@ class WandbWriter:
         name: of the axis, e.g. "rl"; "": the only one.
 
     Raises:
-        UserError: wandb is not installed.
+        UserError: wandb is not installed, or refuses the run: nobody logged in, say.
     """
 
     def __init__(self, folder: Path, name: str = "") -> None:
@@ -97,7 +97,12 @@ def _taken(folder: Path) -> Any:
     kept = folder / ID
     known = kept.read_text().strip() if kept.is_file() else None
     project = os.environ.get("WANDB_PROJECT", PROJECT)
-    run = wandb.init(project=project, name=folder.name, id=known, resume="allow", dir=str(folder))
+    try:
+        run = wandb.init(project=project, name=folder.name, id=known, resume="allow", dir=str(folder))
+    except wandb.Error as error:  # nobody logged in, no connection
+        raise UserError(
+            f"monitor.writers: wandb: {error}; WANDB_MODE=offline keeps the run in its folder until `wandb sync`"
+        ) from error
     kept.write_text(run.id + "\n")
     _open[folder] = run, 1
     return run

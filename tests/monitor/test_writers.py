@@ -70,6 +70,8 @@ def test_tensorboard_stands_beside_them(tmp_path):
 class Fake(types.ModuleType):
     """What of wandb is used; remembers."""
 
+    Error = RuntimeError
+
     def __init__(self):
         super().__init__("wandb")
         self.begun, self.logged, self.finished, self.config = [], [], 0, types.SimpleNamespace(update=self.configured)
@@ -131,6 +133,43 @@ def test_wandb_that_is_not_there_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "wandb", None)
     with pytest.raises(UserError, match=r"pip install 'bayessim-mjx\[wandb\]'"):
         opened(tmp_path, more=("wandb",))
+
+
+def test_wandb_without_a_login_is_told_in_one_line(tmp_path, monkeypatch):
+    fake = Fake()
+    monkeypatch.setitem(sys.modules, "wandb", fake)
+
+    def init(**_):
+        raise fake.Error("No API key configured")
+
+    fake.init = init
+    with pytest.raises(UserError, match="wandb: No API key configured; WANDB_MODE=offline"):
+        opened(tmp_path, more=("wandb",))
+
+
+def test_the_real_wandb_goes_on_with_its_run(tmp_path, monkeypatch):
+    """Offline: two sessions of one run, with all kinds of things to show."""
+    pytest.importorskip("wandb")
+    from matplotlib.figure import Figure
+
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    monkeypatch.setenv("WANDB_SILENT", "true")
+    known = []
+    for session in range(2):
+        writer = opened(tmp_path / "rl", more=("wandb",), run=tmp_path)
+        writer.text("cfg", "seed: 3", code=True)
+        writer.scalars(session, {"Train/a": 1.5, "none": None})
+        writer.figure("posterior", Figure(figsize=(1, 1)), session)
+        writer.video("video", np.zeros((4, 24, 32, 3), np.uint8), 25, session)
+        writer.close()
+        known.append((tmp_path / "wandb_id.txt").read_text().strip())
+    assert known[0] == known[1]
+    sessions = list((tmp_path / "wandb").glob(f"offline-run-*-{known[0]}/run-{known[0]}.wandb"))
+    assert len(sessions) == 2
+    for file in sessions:
+        held = file.read_bytes()
+        assert all(word in held for word in (b"rl/Train/a", b"rl/posterior", b"rl/video", b"seed"))
+        assert {p.suffix for p in file.parent.rglob("rl/*")} >= {".png", ".mp4"}
 
 
 def test_a_kind_that_there_is_not_is_refused():

@@ -1,5 +1,7 @@
 """Other libraries' PPO as agents of `train`: their networks as our policies, saved and taken up again."""
 
+import dataclasses
+import importlib.util
 import sys
 from pathlib import Path
 
@@ -10,8 +12,11 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parent))
 from toys import Counter  # noqa: E402
 
-from bayessim_mjx.config import load, replace  # noqa: E402
+from bayessim_mjx import play, registry, train  # noqa: E402
+from bayessim_mjx.config import PPOConfig, load, replace  # noqa: E402
 from bayessim_mjx.errors import UserError  # noqa: E402
+from bayessim_mjx.monitor.writers import read  # noqa: E402
+from bayessim_mjx.runs import Run, latest_run  # noqa: E402
 from bayessim_mjx.wrappers import agents  # noqa: E402
 from bayessim_mjx.wrappers.agents import networks  # noqa: E402
 
@@ -51,6 +56,7 @@ def test_a_policy_of_ours_acts_as_the_librarys_network(name, tmp_path):
     found = agent.learn(2)
     assert agent.iteration == 2 and found["Train/mean_episode_length"] == 5.0
     assert found["Train/mean_reward"] == pytest.approx(5.0, abs=2.5)  # 1 + the action in each of 5 steps
+    assert found["Loss/value"] > 0 and np.isfinite(found["Loss/surrogate"])
     x = (np.array([2.0, 0.5, 9.0]) + np.random.default_rng(0).normal(size=(64, 3)) * [1, 0.2, 0]).astype(np.float32)
     ours = agent.policy()
     np.testing.assert_allclose(ours.act(None, jnp.asarray(x)), actions(agent, x), atol=2e-5)
@@ -82,13 +88,26 @@ def test_a_network_by_hand():
         ("sb3", (), "ppo.memory=4", r"ppo.memory = 4: --agent sb3 has no such thing; allowed is 0"),
         ("skrl", (), "ppo.rnd={weight: 0.5}", r"ppo.rnd = .*: --agent skrl has no such thing; allowed is None"),
         ("rsl_rl", ("rnd", "symmetry"), "ppo.action_bound=tanh", "ppo.action_bound = 'tanh'.*allowed is 'clip'"),
+        ("skrl", (), "ppo.weight_init=lecun_uniform", "ppo.weight_init = .lecun_uniform.*is .orthogonal."),
         ("sb3", (), "devices=2", "devices = '2': --agent sb3 trains on one device"),
+        ("skrl", (), "ppo.activation=gelu", "ppo.activation = 'gelu': --agent skrl takes elu, relu, tanh"),
+        ("sb3", (), "bayessim.policyCheckpt=logs", "--checkpoint: --agent sb3 begins with a policy of its own"),
     ],
 )
 def test_what_a_library_has_not_is_refused_by_name(agent, takes, override, words):
+    activations = ("elu", "relu", "tanh")
     with pytest.raises(UserError, match=words):
-        agents.refuse(settings(agent, override), takes)
-    agents.refuse(settings(agent), takes)
+        agents.refuse(settings(agent, override), takes, activations)
+    agents.refuse(settings(agent), takes, activations)
+
+
+def test_every_setting_of_ppo_is_taken_over_or_refused():
+    """By name in each library's file; the others are read elsewhere, or mean nothing without a setting refused here."""
+    elsewhere = {"num_envs", "reward_scale", "max_iterations", "log_interval", "save_interval", "eval_episodes"}
+    fields = {field.name for field in dataclasses.fields(PPOConfig)} - elsewhere - {"memory_cell", "distil_loss"}
+    for name in NEEDED:
+        text = (Path(agents.__file__).parent / f"{name}.py").read_text()
+        assert {field for field in fields if f"ppo.{field}" not in text} <= set(agents.OURS), name
 
 
 def test_main_trains_with_our_own_ppo_alone(capsys):
@@ -101,3 +120,65 @@ def test_main_trains_with_our_own_ppo_alone(capsys):
 def test_an_agent_that_is_not_there_is_named():
     with pytest.raises(UserError, match="own, sb3, rsl_rl, skrl"):
         replace(settings("sb3"), agent="rllib")
+
+
+@pytest.fixture
+def counters(monkeypatch, tmp_path):
+    """Every task is the counter; runs lie in a folder of their own."""
+    monkeypatch.setenv("BAYESSIM_MJX_CACHE", "off")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(registry, "make", lambda name, **_: ENV)
+
+
+SHORT = ["--headless", "--max_iterations", "4", "ppo.save_interval=2", "ppo.log_interval=1", "ppo.eval_episodes=4"]
+
+
+@pytest.mark.parametrize("name", NEEDED)
+def test_a_stopped_run_of_train_goes_on_with_the_same_networks(name, counters, monkeypatch, capsys):
+    """The second half is trained from the first half's networks, optimizer and scales; `play` knows the result."""
+    pytest.importorskip(NEEDED[name])
+    argv = ["--task", "Cartpole", "--agent", name, "--logger", "csv", *SHORT, *TINY[:-1], "env.realParams=null"]
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        evaluate = train.AgentTraining.evaluate
+
+        def killed(self, state):
+            if state.iteration == 4:
+                raise KeyboardInterrupt
+            return evaluate(self, state)
+
+        patch.setattr(train.AgentTraining, "evaluate", killed)
+        train._train(argv)  # as `main`, but for the exit code
+    run = latest_run("logs", "Cartpole")
+    assert run.manifest["latest"] == 2 and [p.name for p in (run.path / "agent").iterdir()] == ["2"]
+    loaded = []
+    with monkeypatch.context() as patch:
+        made = agents.make
+
+        def watched(*given):
+            agent = made(*given)
+            load = agent.load
+            agent.load = lambda folder: (load(folder), loaded.append(agent.policy()))
+            return agent
+
+        patch.setattr(agents, "make", watched)
+        assert train.main(["--resume", str(run.path), "--headless"]) == 0
+    x = jnp.array([[2.0, 0.5, 9.0]])
+    before = run.restore(2, {"policy": loaded[0]})[0]["policy"]
+    np.testing.assert_array_equal(loaded[0].act(None, x), before.act(None, x))
+    resumed = Run.open(run.path)
+    assert resumed.manifest["status"] == "finished" and [c["step"] for c in resumed.checkpoints] == [2, 4]
+    assert resumed.restore(4, {"policy": before})[0]["policy"].act(None, x) != before.act(None, x)
+    steps = [row["step"] for row in read(run.path / "scalars.csv") if row["tag"] == "Train/mean_reward"]
+    assert steps == [1, 2, 3, 4]
+    assert play.main(["--checkpoint", str(run.path), "--episodes", "4", "--physics", "nominal", "--headless"]) == 0
+    assert "return" in capsys.readouterr().out
+
+
+def test_what_cannot_train_leaves_no_run_folder(counters, monkeypatch, capsys):
+    """A library that is not installed, and a setting that it has not."""
+    monkeypatch.setitem(sys.modules, "bayessim_mjx.wrappers.agents.sb3", None)
+    assert train.main(["--task", "Cartpole", "--agent", "sb3", "--headless"]) != 0
+    if importlib.util.find_spec("skrl"):
+        assert train.main(["--task", "Cartpole", "--agent", "skrl", "ppo.memory=4", "--headless"]) == 2
+        assert "ppo.memory = 4: --agent skrl has no such thing" in capsys.readouterr().err
+    assert not Path("logs").exists()

@@ -7,7 +7,7 @@ by the setting's name.
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -26,6 +26,7 @@ OURS: dict[str, tuple[Any, ...]] = {
     "distribution": ("gaussian",), "std_type": ("log",), "std_range": ((), []),
     "state_dependent_std": (False,), "teacher": (None,), "extensions": ((), []), "action_bound": ("clip",),
     "action_clip": (1.0,), "symmetry": (None,), "rnd": (None,),
+    "weight_init": ("orthogonal",), "normalize_advantage_per_minibatch": (False,),
 }  # fmt: skip
 
 
@@ -51,17 +52,29 @@ def make(config: Config, env: Any, domain: Any) -> Agent:
     """The agent that `config.agent` names, with the settings of `ppo:` in its library's terms.
 
     Raises:
-        UserError: the library is not installed; a setting that its PPO has not; observations that are no vectors.
+        UserError: as `check`.
     """
-    module = importlib.import_module(f"bayessim_mjx.wrappers.agents.{config.agent}")
-    refuse(config, module.TAKES)
-    size_of(env, "policy")
+    module = check(config, env)
     scale = config.ppo.reward_scale
     return module.make(config, Worlds(env, domain, config.ppo.num_envs, config.seed, reward_scale=scale))
 
 
-def refuse(config: Config, takes: Sequence[str]) -> None:
+def check(config: Config, env: Any) -> Any:
+    """The module of `config.agent`, where it can train on `env`; nothing is made yet.
+
+    Raises:
+        UserError: the library is not installed; a setting that its PPO has not; observations that are no vectors.
+    """
+    module = importlib.import_module(f"bayessim_mjx.wrappers.agents.{config.agent}")
+    refuse(config, module.TAKES, module.ACTIVATIONS)
+    size_of(env, "policy")
+    return module
+
+
+def refuse(config: Config, takes: Sequence[str], activations: Collection[str]) -> None:
     """UserError for the first setting that asks for what `config.agent` has not."""
+    if config.bayessim.policyCheckpt is not None:
+        raise UserError(f"--checkpoint: --agent {config.agent} begins with a policy of its own; leave it out")
     if config.devices != "1":
         raise UserError(f"devices = {config.devices!r}: --agent {config.agent} trains on one device; leave it out")
     for name, neutral in OURS.items():
@@ -72,3 +85,6 @@ def refuse(config: Config, takes: Sequence[str]) -> None:
                 f"ppo.{name} = {value!r}: --agent {config.agent} has no such thing; allowed is {allowed!r}, or train "
                 "with our own PPO (leave --agent out)"
             )
+    if config.ppo.activation not in activations:
+        allowed = ", ".join(activations)
+        raise UserError(f"ppo.activation = {config.ppo.activation!r}: --agent {config.agent} takes {allowed}")

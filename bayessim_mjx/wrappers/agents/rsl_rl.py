@@ -8,17 +8,17 @@ from pathlib import Path
 from typing import Any
 
 from bayessim_mjx.config import Config
-from bayessim_mjx.errors import UserError
 from bayessim_mjx.rl import Policy
 from bayessim_mjx.wrappers import rsl_rl
 from bayessim_mjx.wrappers.agents import networks
 from bayessim_mjx.wrappers.agents.episodes import Recent
 from bayessim_mjx.wrappers.worlds import Worlds
 
-TAKES = ("rnd", "symmetry")
+TAKES = ("rnd", "symmetry", "normalize_advantage_per_minibatch")
 # that both know, and theirs of them; its gelu is another function
 ACTIVATIONS = {name: name for name in ("elu", "relu", "selu", "tanh", "swish", "mish", "lrelu", "softplus", "sigmoid")}
 ACTIVATIONS |= {"celu": "crelu"}
+LOSSES = ("value", "surrogate", "entropy", "rnd", "symmetry")  # that both log, under the same names
 
 
 def make(config: Config, worlds: Worlds) -> RslRlAgent:
@@ -32,15 +32,14 @@ class RslRlAgent:
         import torch
         from rsl_rl.runners import OnPolicyRunner
 
-        if config.ppo.activation not in ACTIVATIONS:
-            allowed = ", ".join(ACTIVATIONS)
-            raise UserError(f"ppo.activation = {config.ppo.activation!r}: --agent rsl_rl takes {allowed}")
         self.config, self.iteration = config, 0
         torch.manual_seed(config.seed)
         self.recent = Recent(worlds)
         env = rsl_rl.RslRlVecEnv(worlds)
         with contextlib.redirect_stdout(io.StringIO()):  # it prints its networks
             self.runner = OnPolicyRunner(env, self._settings(env), log_dir=None, device=env.device)
+        self.losses: dict[str, float] = {}  # of the last iteration
+        self._update, self.runner.alg.update = self.runner.alg.update, self._updated
 
     def _settings(self, env: Any) -> dict[str, Any]:
         ppo = self.config.ppo
@@ -60,13 +59,19 @@ class RslRlAgent:
         }  # fmt: skip
         return settings | {"num_steps_per_env": ppo.num_steps}
 
+    def _updated(self) -> dict[str, float]:
+        """Its update, which tells the losses to its own log alone."""
+        found = self._update()
+        self.losses = {f"Loss/{name}": float(found[name]) for name in LOSSES if name in found}
+        return found
+
     def learn(self, iterations: int) -> dict[str, float]:
         first = self.iteration == 0
         with contextlib.redirect_stdout(io.StringIO()):
             self.runner.current_learning_iteration = self.iteration
             self.runner.learn(iterations, init_at_random_ep_len=first)
         self.iteration += iterations
-        return self.recent.metrics() | {"Loss/learning_rate": float(self.runner.alg.learning_rate)}
+        return self.recent.metrics() | self.losses | {"Loss/learning_rate": float(self.runner.alg.learning_rate)}
 
     def policy(self) -> Policy:
         actor = self.runner.alg.get_policy()

@@ -14,8 +14,16 @@ from bayessim_mjx.wrappers.agents.episodes import Recent
 from bayessim_mjx.wrappers.sb3 import SB3VecEnv
 from bayessim_mjx.wrappers.worlds import Worlds
 
-TAKES = ()  # of the settings that only our own PPO has
-TAGS = {"train/value_loss": "Loss/value", "train/approx_kl": "Loss/kl", "train/learning_rate": "Loss/learning_rate"}
+TAKES = ("normalize_advantage_per_minibatch",)  # it always does
+ACTIVATIONS = {
+    "elu": "ELU", "relu": "ReLU", "selu": "SELU", "tanh": "Tanh", "swish": "SiLU", "gelu": "GELU", "celu": "CELU",
+    "lrelu": "LeakyReLU", "mish": "Mish", "softplus": "Softplus", "sigmoid": "Sigmoid",
+}  # fmt: skip
+TAGS = {
+    "train/value_loss": "Loss/value", "train/policy_gradient_loss": "Loss/surrogate", "train/approx_kl": "Loss/kl",
+    "train/clip_fraction": "Loss/clip_fraction", "train/explained_variance": "Loss/explained_variance",
+    "train/learning_rate": "Loss/learning_rate",
+}  # fmt: skip
 CLIP = 10.0  # of normalised observations, as ours
 
 
@@ -47,12 +55,8 @@ class SB3Agent:
         import torch
 
         ppo = self.config.ppo
-        names = {
-            "elu": "ELU", "relu": "ReLU", "selu": "SELU", "tanh": "Tanh", "swish": "SiLU", "gelu": "GELU",
-            "celu": "CELU", "lrelu": "LeakyReLU", "mish": "Mish", "softplus": "Softplus", "sigmoid": "Sigmoid",
-        }  # fmt: skip
         widths = {"pi": list(ppo.hidden_actor), "vf": list(ppo.hidden_critic)}
-        activation = getattr(torch.nn, names[ppo.activation])
+        activation = getattr(torch.nn, ACTIVATIONS[ppo.activation])
         return {"net_arch": widths, "activation_fn": activation, "log_std_init": float(np.log(ppo.init_std))}
 
     def learn(self, iterations: int) -> dict[str, float]:

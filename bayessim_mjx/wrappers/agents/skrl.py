@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import io
+import logging
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +13,6 @@ import jax
 import numpy as np
 
 from bayessim_mjx.config import Config
-from bayessim_mjx.errors import UserError
 from bayessim_mjx.rl import Policy
 from bayessim_mjx.wrappers import skrl
 from bayessim_mjx.wrappers.agents import networks
@@ -21,7 +22,20 @@ from bayessim_mjx.wrappers.worlds import Worlds
 TAKES = ()
 ACTIVATIONS = ("elu", "relu", "selu", "tanh")  # that both know
 SCALERS = ("observation_preprocessor", "value_preprocessor")
+TAGS = {"Loss / Value loss": "Loss/value", "Loss / Policy loss": "Loss/surrogate"}
 MOMENTS = ("running_mean", "running_variance", "current_count")
+
+
+@contextlib.contextmanager
+def _without_warnings() -> Iterator[None]:
+    """Without skrl's words about seeds, and about the GPU that it looks for on every machine."""
+    logger = logging.getLogger("skrl")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
 
 
 def make(config: Config, worlds: Worlds) -> SkrlAgent:
@@ -34,11 +48,8 @@ class SkrlAgent:
     def __init__(self, config: Config, worlds: Worlds) -> None:
         from skrl.utils.runner.jax import Runner
 
-        if config.ppo.activation not in ACTIVATIONS:
-            allowed = ", ".join(ACTIVATIONS)
-            raise UserError(f"ppo.activation = {config.ppo.activation!r}: --agent skrl takes {allowed}")
         self.config, self.iteration, self.env = config, 0, skrl.wrapped(worlds)
-        with contextlib.redirect_stdout(io.StringIO()):
+        with contextlib.redirect_stdout(io.StringIO()), _without_warnings():
             self.runner = Runner(self.env, self._settings())
         self.agent = self.runner.agent
         self.recent = Recent(worlds)
@@ -80,7 +91,16 @@ class SkrlAgent:
             agent.post_interaction(timestep=step, timesteps=steps)
             obs, state = after, env.state()
         self.iteration += iterations
-        return self.recent.metrics() | {"Loss/learning_rate": float(agent.policy_learning_rate)}
+        return self.recent.metrics() | self._losses() | {"Loss/learning_rate": float(agent.policy_learning_rate)}
+
+    def _losses(self) -> dict[str, float]:
+        """Those that it gathers for its own log; that grew for ever if nobody took them."""
+        kept = self.agent.tracking_data
+        found = {tag: float(np.mean(kept[name])) for name, tag in TAGS.items() if kept.get(name)}
+        kept.clear()
+        if "Loss/value" in found:
+            found["Loss/value"] /= self.config.ppo.value_loss_coef or 1.0  # its own is times that
+        return found
 
     def policy(self) -> Policy:
         params = self.agent.policy.state_dict.params["params"]
