@@ -104,8 +104,8 @@ def test_a_run_killed_after_a_move_goes_on_bit_for_bit(beyond, tmp_path):
 @pytest.mark.ci
 @pytest.mark.parametrize("proposal", ["apt", "truncated", "division"])
 def test_posteriors_as_proposals_reach_it_too(proposal):
-    parts, state = made(*MOVING, f"bayessim.proposal={proposal}", mass=2.5)
-    for _ in range(4):
+    parts, state = made(*MOVING, f"bayessim.proposal={proposal}", "bayessim.trainTrajs=1000", mass=2.5)
+    for _ in range(3):  # after one of them its range holds it
         state, info = infer(parts, state)
     low, high = interval(info.posterior)
     assert low < 2.5 < high and high - low < 1.0
