@@ -16,6 +16,7 @@ from .pendulums import FEW, nominal, recorded
 pytestmark = [pytest.mark.slow, pytest.mark.ci]  # whole diagnoses and fits
 
 WRONG = (1.15, 0.88, 1.1)
+ENOUGH = {"count": 6, "seconds": 2.5}  # logs
 KEYS = {"schema", "verdict", "effects", "where", "gap", "parameters", "candidates", "warnings"}
 KEYS |= {"next_experiment", "versions"}
 EFFECT = {"name", "where", "parameters", "weight_among_rivals", "gap_closed", "gap_closed_ci", "equivalent_to"}
@@ -40,7 +41,7 @@ def place(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def rubbing(place):
-    return diagnosed(place, recorded(friction=0.04, scale=(0.9, 1.1, 0.95)))
+    return diagnosed(place, recorded(friction=0.04, scale=(0.9, 1.1, 0.95), **ENOUGH))
 
 
 def test_dry_friction_is_named_with_its_level(rubbing):
@@ -158,7 +159,7 @@ def test_a_file_of_before_is_read_and_its_probability_told_as_a_weight(rubbing, 
 @pytest.mark.slow
 @pytest.mark.ci
 def test_wrong_known_parameters_are_no_effect(tmp_path):
-    _, diagnosis = diagnosed(tmp_path, recorded(scale=WRONG, seed=1))
+    _, diagnosis = diagnosed(tmp_path, recorded(scale=WRONG, seed=1, **ENOUGH))
     assert diagnosis.verdict == "parameters" and diagnosis.effects == []
     assert diagnosis.gap.nominal > 1.5 * diagnosis.gap.calibrated
     for name, true in zip(("damping", "armature", "mass"), WRONG, strict=True):
@@ -170,14 +171,14 @@ def test_wrong_known_parameters_are_no_effect(tmp_path):
 @pytest.mark.slow
 @pytest.mark.ci
 def test_nothing_wrong_is_no_gap(tmp_path):
-    _, diagnosis = diagnosed(tmp_path, recorded(seed=2))
+    _, diagnosis = diagnosed(tmp_path, recorded(seed=2, **ENOUGH))
     assert diagnosis.verdict == "no_gap" and diagnosis.effects == []
     assert diagnosis.gap.with_effects == pytest.approx(1.0, abs=0.25)
 
 
 @pytest.mark.slow
 def test_an_effect_that_is_not_on_offer_is_unexplained(tmp_path):
-    logs = recorded(friction=0.08, scale=(1.1, 0.92, 1.05), seed=4)
+    logs = recorded(friction=0.08, scale=(1.1, 0.92, 1.05), seed=4, **ENOUGH)
     _, diagnosis = diagnosed(tmp_path, logs, ("actuator_delay", "payload"))
     assert diagnosis.verdict == "unexplained"
     assert np.isfinite(diagnosis.gap.with_effects) and diagnosis.gap.with_effects > 1.5
