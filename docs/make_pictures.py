@@ -192,6 +192,9 @@ def diagnosis_pictures(work: Path, out: Path) -> None:
     flags = ["--headless=new", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", f"--window-size={WINDOW}"]
     command = [browser, *flags, "--virtual-time-budget=5000", f"--screenshot={picture}", page.as_uri()]
     subprocess.run(command, check=True, capture_output=True)
+    from PIL import Image
+
+    Image.open(picture).convert("RGB").quantize(128).save(picture, optimize=True)  # text and bars: few colours
 
 
 PICTURES = {"loop": loop_pictures, "diagnosis": diagnosis_pictures}

@@ -62,7 +62,7 @@ def located_in_words(found: Located) -> list[str]:
     for spot in found.spots:
         for leaf in spot.leaves:
             force = phrases.missing_force(leaf.mean, spot.unit, spot.along)
-            text.append(f"{spot.joint}, {phrases.region(leaf.where, spot.units)}: {force}")
+            text.append(f"missing at {spot.joint}, {phrases.region(leaf.where, spot.units)}: {force}")
         if spot.looked and not spot.leaves:
             text.append(phrases.placeless_force(spot.joint, spot.size, spot.unit))
     return text + [told for f in found.prints if (told := _signature(f))]
