@@ -1,5 +1,6 @@
 """examples/deploy_loop.py: an exported policy on MuJoCo C, its log as the library reads it, and what stops it."""
 
+import copy
 import importlib.util
 import sys
 import types
@@ -18,6 +19,7 @@ from bayessim_mjx.rl.networks import Policy
 pytest.importorskip("onnxruntime")
 FILE = Path(__file__).parents[2] / "examples" / "deploy_loop.py"
 ENV = registry.make("Pendulum")
+FRICTION = 0.15  # N m
 
 
 @pytest.fixture(scope="module")
@@ -102,3 +104,23 @@ def test_robots_may_order_their_joints_otherwise(deploy):
     assert robot.data.ctrl.tolist() == [7.0, 3.0]
     robot.data.qpos[:] = [0.2, 0.1]
     assert robot.read()[0] == {"a": 0.1, "b": 0.2}
+
+
+@pytest.mark.slow
+def test_what_a_sticking_robot_lacks_is_found_from_the_loops_logs(deploy, tmp_path, monkeypatch):
+    """The loop closes: a policy that comes with the package, on a robot with friction that its simulator has not."""
+    import bayessim_mjx as bm
+
+    export.write(tmp_path / "policy.onnx", bm.pretrained("Pendulum"), ENV, {})
+    robot = copy.deepcopy(ENV.mj_model)
+    robot.dof_frictionloss[:] = FRICTION
+    robot.opt.disableflags = 0  # the simulator has no constraints, and so no friction
+    robot.opt.timestep /= 10
+    monkeypatch.setattr(deploy, "_model", lambda *_: robot)
+    for seed in range(5):
+        options = ("--seed", seed, "--spread", 3, "--noise", 0.001, "--seconds", 6, "--fast", "--watchdog", 999)
+        assert run(deploy, monkeypatch, "--policy", tmp_path / "policy.onnx", *options, "--out", tmp_path / "logs") == 0
+    found = bm.diagnose("Pendulum", str(tmp_path / "logs"), effects=["coulomb_friction", "viscous_friction"])
+    assert "coulomb_friction" in [effect.name for effect in found.effects]
+    [level] = [e.parameters["level"] for e in found.effects if e.name == "coulomb_friction"]
+    assert abs(level.mean - FRICTION) < 0.1 * FRICTION + 3 * level.sd
