@@ -32,11 +32,11 @@ def columns(r, laws, samples=ROWS, group=None):
     )
 
 
-def planted(rng, memory=0.0, size=1.0, smooth=False):
+def planted(rng, memory=0.0, size=1.0, smooth=False, windows=WINDOWS):
     """(residuals with an autocorrelation, candidates)."""
-    white = rng.normal(size=(WINDOWS, ROWS + 50))
+    white = rng.normal(size=(windows, ROWS + 50))
     r = lfilter([np.sqrt(1 - memory**2)], [1, -memory], white, axis=1)[:, 50:] * size
-    laws = rng.normal(size=(WINDOWS, ROWS, CANDIDATES))
+    laws = rng.normal(size=(windows, ROWS, CANDIDATES))
     laws = np.cumsum(laws, 1) if smooth else laws
     return r, laws - laws.mean(1, keepdims=True)
 
@@ -55,7 +55,7 @@ def test_the_family_wise_error_is_what_was_asked_for_whatever_the_colour_and_siz
     """Fresh null residuals, each with a bootstrap of its own: the best of all candidates passes 10 % in about 10 %."""
     rng, alarms = np.random.default_rng(1), []
     for _ in range(100):
-        r, laws = planted(rng, memory, size=rng.uniform(1, 5), smooth=True)
+        r, laws = planted(rng, memory, size=rng.uniform(1, 5), smooth=True, windows=48)
         null = columns(r, laws, samples=ROWS / (1 + 2 * memory / (1 - memory)))
         seen = chance.gains(null, r[None]).max()
         alarms.append(chance.probability(chance.best_gains(null, rng, 40), seen) < 0.1)
