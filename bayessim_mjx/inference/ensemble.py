@@ -22,14 +22,20 @@ SCORED = 256  # validation rows for which the truncated density is reported
 SHARPNESS = np.geomspace(0.35, 4.0, 21).astype(np.float32)  # of the parts, tried on the held-out rows
 WORTH = 2.0  # nats, over all held-out rows, that another choice of a part has to gain: with few rows the best is luck
 CLIMBS, SWEEPS = 50, 2  # steps towards the parts' weights; rounds of choosing them
+BEYOND = -1e4  # log mass inside the box from which on float32 no longer tells a density to a thousandth
 
 
 def posteriors(state: FitState, z: Array) -> Distribution:
-    """The network's inputs [n, D] -> batched Distribution, a trace of the prior mixed in."""
+    """The network's inputs [n, D] -> batched Distribution, a trace of the prior mixed in.
+
+    Far from what it was trained on a network may leave the box altogether: what is then inside is the rounding of huge
+    numbers, which tells nothing. The prior stays.
+    """
     build = partial(
         Distribution.from_unit, state.space, prior_weight=state.settings.defensive, chart=state.settings.chart
     )
-    return jax.vmap(build)(*mixtures(state, z))
+    found = jax.vmap(build)(*mixtures(state, z))
+    return replace(found, prior_weight=jnp.where(found.log_inside < BEYOND, 1.0, found.prior_weight))
 
 
 def mixtures(state: FitState, z: Array) -> mdn.Heads:

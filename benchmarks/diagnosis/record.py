@@ -136,7 +136,7 @@ def redecided(case: Path, given: list[str]) -> dict[str, Any]:
     known, seen, criteria = table.read(record["searched"]), table.read(record["finalists"]), Criteria().changed(given)
     less = decide.order(known.laws)
     found = decide.decide(known, less, criteria)
-    if set(beam.finalists(found, criteria)) <= seen.rows.keys():
+    if set(beam.finalists(found, criteria.finalists)) <= seen.rows.keys():
         found = decide.decide(seen, less, criteria)
     laws = [known.laws[label] for label in sorted(found.answer)]
     rivals = [{"effects": sorted(r.key - found.answer)} for r in found.rivals]

@@ -90,6 +90,23 @@ def test_posteriors_stay_in_the_box_even_far_off_the_data(trained):
     assert np.all(np.isfinite(jax.vmap(lambda q, t: q.log_prob(t))(batch, jnp.asarray(draws))))
 
 
+def test_a_posterior_that_leaves_the_box_by_far_tells_nothing_and_cannot_veto_the_others(trained):
+    """float32 tells nothing of a density whose mass inside the box is exp(-1e10): as a factor it used to win."""
+    state, _ = trained
+    _, x = linear_gaussian(1, 5, THETA)
+    outer = state.params["layers"][-1]
+    k, d = state.settings.components, 2
+    far = {**outer, "b": outer["b"].at[..., k : k + k * d].add(1e6)}
+    lost = dataclasses.replace(state, params={**state.params, "layers": [*state.params["layers"][:-1], far]})
+    wild, good = condition(lost, x), condition(state, x)
+    assert float(wild.log_inside[0]) < -1e8
+    thetas = jnp.asarray([THETA, [0.6, 2.5]], jnp.float32)
+    np.testing.assert_allclose(wild.split()[0].log_gain(thetas), 0.0, atol=1e-5)  # the prior
+    both, alone = combine([*good.split(), *wild.split()]), good.split()[0]
+    np.testing.assert_allclose(both.log_gain(thetas[:1]), alone.log_gain(thetas[:1]), atol=0.05)
+    np.testing.assert_allclose(both.sd(), alone.sd(), rtol=0.05)
+
+
 def test_a_constant_column_is_dropped_and_cannot_speak_later(trained):
     state, _ = trained
     assert float(state.x_rate[3]) == 0.0

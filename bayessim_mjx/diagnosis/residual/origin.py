@@ -20,8 +20,7 @@ Array = NDArray[np.float64]
 class Rules:
     """What is tried, and how much is looked at.
 
-    Error rates were not counted: in four development cases with a force, forces were told by 249 nats and more, and of
-    null logs with coloured noise one was diagnosed, rightly (benchmarks/results.md, "What remains").
+    Error rates: benchmarks/results.md, "What remains".
 
     Attributes:
         memories: of a window's length; amounts: of the white part's variance; a grid each.
@@ -57,14 +56,17 @@ class Origin:
         return self.force < self.sensor + RULES.told
 
 
-def origin(r: Array, B: Array, D: Array, nodes: int, channels: int, weight: Array) -> Origin:
+def origin(r: Array, B: Array, D: Array, sizes: Array, channels: int, weight: Array) -> Origin:
     """Where residuals come from.
 
     Args:
         r: `[W, n]`, whitened, in the order of time, then of channels; B: `[W, n, s]`, columns of the start states.
-        D: `[W, n, nv nodes]`, columns of forces of one size each, in the order of degrees of freedom.
-        nodes: of the forces in a window; channels: measured ones; weight: `[W]`.
+        D: `[W, n, nv nodes]`, columns of forces of size 1, in the order of degrees of freedom.
+        sizes: `[nv]`, standard deviations of the forces, as large beside each other as these residuals make likely.
+        channels: measured ones; weight: `[W]`.
     """
+    nodes = D.shape[2] // len(sizes)
+    D = D * np.repeat(sizes, nodes)  # a force of 1 N m is much for a wrist and little for a shoulder
     steps = r.shape[1] // channels
     white = np.tile(_white(r.reshape(len(r), steps, channels)), steps)
     own = _some(weight, r.shape[1])
@@ -73,7 +75,7 @@ def origin(r: Array, B: Array, D: Array, nodes: int, channels: int, weight: Arra
     nats: dict[str, list[float]] = {"sensor": [], "force": []}
     for memory in RULES.memories:
         alike = np.kron(_memory(steps, memory), np.diag(size / np.mean(size)) ** 2)
-        pushed = np.kron(np.eye(D.shape[2] // nodes), _memory(nodes, memory))
+        pushed = np.kron(np.eye(len(sizes)), _memory(nodes, memory))
         nats["sensor"].append(_best([_spectrum(r[w], B[w], alike, white) for w in own], weight[own]))
         each = (_spectrum(r[w], B[w], D[w] @ pushed @ D[w].T / scale**2, white) for w in own)
         nats["force"].append(_best(list(each), weight[own]))

@@ -113,7 +113,7 @@ def sensors_noise(found: Findings) -> Origin | None:
         return None
     fit = found.model.fit
     channels = int(found.selection.fitter.used.sum())
-    where = origin(fit.r, fit.B, missing.linear.D, missing.linear.nodes, channels, fit.weight)
+    where = origin(fit.r, fit.B, missing.linear.D, missing.amplitude, channels, fit.weight)
     return where if where.of_sensors else None
 
 

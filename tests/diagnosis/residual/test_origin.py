@@ -27,7 +27,7 @@ def test_larger_and_coloured_noise_of_sensors(size, memory):
     """60 ms of memory at 80 Hz are .8 a row."""
     rng, (B, D) = np.random.default_rng(0), columns()
     r = rng.normal(size=(WINDOWS, STEPS)) + size * coloured(rng, memory)
-    found = origin(r, B, D, STEPS, 1, np.ones(WINDOWS))
+    found = origin(r, B, D, np.ones(1), 1, np.ones(WINDOWS))
     assert found.of_sensors and (found.memory > 0) == (memory > 0)
 
 
@@ -37,5 +37,21 @@ def test_forces(memory):
     force = coloured(rng, memory)
     moved = np.einsum("wnd,wd->wn", D, force)
     r = rng.normal(size=(WINDOWS, STEPS)) + 4 * moved / np.sqrt(np.mean(moved**2))
-    found = origin(r, B, D, STEPS, 1, np.ones(WINDOWS))
+    found = origin(r, B, D, np.ones(1), 1, np.ones(WINDOWS))
     assert not found.of_sensors
+
+
+def test_a_force_on_a_heavy_mass_beside_a_light_one_that_would_move_a_hundred_times_as_far():
+    """Forces of one size on both would leave their trace on the light one alone."""
+    rng, (B, D) = np.random.default_rng(2), columns()
+    W, n, s = B.shape
+    two = np.zeros((W, n, 2, 2 * s))
+    two[:, :, 0, :s], two[:, :, 1, s:] = B, B
+    pushed = np.zeros((W, n, 2, 2 * n))
+    pushed[:, :, 0, :n], pushed[:, :, 1, n:] = D, 100 * D
+    moved = np.einsum("wnd,wd->wn", D, coloured(rng, 0.95))
+    r = rng.normal(size=(W, n, 2))
+    r[:, :, 0] += 4 * moved / np.sqrt(np.mean(moved**2))
+    parts = (r.reshape(W, -1), two.reshape(W, 2 * n, -1), pushed.reshape(W, 2 * n, -1))
+    assert not origin(*parts, np.array([1.0, 1e-4]), 2, np.ones(W)).of_sensors
+    assert origin(*parts, np.array([1.0, 1e-4]), 2, np.ones(W)).force > origin(*parts, np.ones(2), 2, np.ones(W)).force
