@@ -11,7 +11,7 @@ Importance sampling is in probit coordinates z, in which the prior is N(0, I), m
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax.numpy as jnp
@@ -21,6 +21,7 @@ from scipy.stats import multivariate_t
 
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.distributions.charts import EDGE, to_chart
+from bayessim_mjx.inference.independent import independent, worth
 from bayessim_mjx.inference.moves import KEPT, Population, begun, moved, powered, tempering
 from bayessim_mjx.inference.pareto import normalised
 from bayessim_mjx.inference.weighted import Mixture, fitted, fitted_to_islands, uncut
@@ -129,6 +130,36 @@ def tempered(
     return _answer(rng, proposal, at, components, enough, found.simulations - found.population.simulations, power)
 
 
+def sharpened(
+    found: Refined, proposal: Distribution, log_likelihood: LogLikelihood,
+    *, draws: int = 1024, components: int = 8, power: float = 1.0, seed: int = 0,
+) -> Refined:  # fmt: skip
+    """`found` with Gaussians fitted to independent draws of the same posterior, where these are worth more.
+
+    Args:
+        found: as `refine` (power 1) or `tempered` left it.
+        proposal, log_likelihood, draws, components: as in `refine`.
+        power: of the likelihood.
+        seed: of the draws.
+    """
+    if found.reason or found.population is None:
+        return found
+    rng, space = np.random.default_rng(seed), proposal.space
+    q = fitted_to_islands(rng, found.population.islands, components)
+    drawn = independent(rng, q, lambda u: power * np.asarray(log_likelihood(thetas(space, u)), np.float64), draws)
+    if drawn is None or worth(drawn) <= found.effective:
+        return found
+    u, weights = drawn
+    chart = "plain" if proposal.chart == "plain" else "probit"
+    z = np.asarray(to_chart(jnp.asarray(u), chart), np.float64)
+    q = fitted(rng, z, weights, components)
+    if chart == "plain":
+        q = uncut(rng, q, z[rng.choice(len(z), len(z), p=weights)])
+    fit = Distribution.from_unit(space, np.log(q.weights), q.means, np.linalg.cholesky(q.covariances), chart=chart)
+    simulations = found.simulations + len(u)
+    return replace(found, posterior=fit, fitted=fit, effective=worth(drawn), simulations=simulations)
+
+
 def _near(
     rng: np.random.Generator, proposal: Distribution, log_likelihood: LogLikelihood, draws: int, rounds: int,
     also: tuple[np.ndarray, np.ndarray] | None,
@@ -235,4 +266,4 @@ def thetas(space: Any, u: np.ndarray) -> np.ndarray:
     return np.asarray(space.from_unit(jnp.asarray(np.clip(u, EDGE, 1 - EDGE), jnp.float32)))
 
 
-__all__ = ["Refined", "refine", "tempered", "thetas"]
+__all__ = ["Refined", "refine", "sharpened", "tempered", "thetas"]

@@ -11,6 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.special import gammainc, gammaln
 
 from bayessim_mjx.distributions.charts import from_chart, to_chart
 from bayessim_mjx.kalman import Force, Gains, innovations, riccati
@@ -220,10 +221,27 @@ class Likelihood:
         each = [errors(self.physics, thetas, _rows(self.record, part), _rows(self.gains, part)) for part in self.parts]
         return np.concatenate([np.asarray(x, np.float64) for x in each], axis=1)
 
+    @property
+    def least(self) -> float:
+        """The least factor on the variance of the noise as it was estimated: sensors are no better than was told."""
+        return float(np.min((self.floor[self.seen] / self.noise.sensor[self.seen]) ** 2))
+
     def log_likelihood(self, squares: np.ndarray) -> np.ndarray:
-        """[M] of `squares`, the common factor on all noise marginalised with a prior of one number's worth at 1."""
+        """[M] of `squares`, the common factor on all noise marginalised with a prior of one number's worth at 1.
+
+        It is no less than `least`: prediction errors that are small by chance make nothing sharper.
+        """
         total = squares.sum((1, 2))
-        return -0.5 * (self.count + 1) * np.log1p(total)
+        shape = 0.5 * (self.count + 1)
+        return -shape * np.log1p(total) + _log_gammainc(shape, 0.5 * (1 + total) / self.least)
+
+
+def _log_gammainc(shape: float, x: np.ndarray) -> np.ndarray:
+    """Log of the regularised lower incomplete gamma function [M] at x [M], also where that is no number of float64."""
+    found = gammainc(shape, x)
+    with np.errstate(divide="ignore", invalid="ignore"):  # x is infinite where a simulation diverged: 0 is right there
+        first = shape * np.log(x) - x - gammaln(shape + 1) - np.log1p(-np.minimum(x / (shape + 1), 0.999))
+        return np.where(found > 1e-200, np.log(found), first)
 
 
 def _travel(record: Record, physics: Physics) -> np.ndarray:

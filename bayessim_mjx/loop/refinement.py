@@ -89,6 +89,7 @@ def refine(
     assert found is not None
     found, widening = replace(found, simulations=simulations), 1.0
     if not found.reason:
+        found = importance.sharpened(found, proposal, log_likelihood, draws=draws, components=components, seed=seed)
         found, widening = _adjusted(found, proposal, likelihood, log_likelihood, components, seed)
     return Refinement(replace(found, posterior=proposal) if found.reason else found, likelihood.noise, widening)
 
@@ -106,7 +107,7 @@ def _spread(draws: np.ndarray, squares: np.ndarray, likelihood: Likelihood) -> t
     """
     use = np.isfinite(squares).all((1, 2))  # what diverged tells no slope
     draws, squares = draws[use], squares[use]
-    unit = float(squares.sum((1, 2)).mean()) / likelihood.count
+    unit = max(float(squares.sum((1, 2)).mean()) / likelihood.count, likelihood.least)
     gap = draws - draws.mean(0)
     lower = np.linalg.cholesky(gap.T @ gap / len(gap))
     parts = -0.5 * squares.reshape(len(squares), -1) / unit
@@ -156,6 +157,9 @@ def _adjusted(
     if found.fitted.components > 1 or found.fitted.chart != "plain":
         power, wider = 1 / float(values.mean()), float(np.sqrt(values.mean()))
         again = importance.tempered(found, proposal, log_likelihood, power, components=components, seed=seed)
+        again = importance.sharpened(
+            again, proposal, log_likelihood, draws=len(u), components=components, power=power, seed=seed
+        )
         return again, wider
     by = lower @ (axes * np.sqrt(values)) @ axes.T @ np.linalg.inv(lower)
     q = found.fitted

@@ -6,7 +6,7 @@ import pytest
 from scipy.stats import genpareto, norm
 
 from bayessim_mjx.distributions import Distribution
-from bayessim_mjx.inference.importance import refine
+from bayessim_mjx.inference.importance import refine, sharpened
 from bayessim_mjx.inference.pareto import effective, generalised_pareto, smoothed
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 
@@ -148,3 +148,35 @@ def test_a_narrow_posterior_at_a_thousandth_of_its_range():
     np.testing.assert_allclose(
         2 * np.sqrt(np.diag(found.posterior.scales[0] @ found.posterior.scales[0].T)), sd, rtol=0.2
     )
+
+
+def valley(rng, seen, sd, count):
+    """Exact draws of three parameters of which two ratios are known: theta = t (r s, s, 1), of volume t^2 s."""
+    r = seen + sd * rng.normal(size=(20 * count, 2))
+    shape = np.stack([r[:, 0] * r[:, 1], r[:, 1], np.ones(len(r))], axis=1)
+    low, high = (0.5 / shape).max(1), (2 / shape).min(1)
+    mass = np.maximum(high**3 - low**3, 0) * r[:, 1]
+    chosen = rng.choice(len(r), count, p=mass / mass.sum())
+    low, high = low[chosen] ** 3, high[chosen] ** 3
+    return ((low + rng.random(count) * (high - low)) ** (1 / 3))[:, None] * shape[chosen]
+
+
+@pytest.mark.slow
+def test_independent_draws_bring_the_regions_nearer_to_what_they_say():
+    space, rng, gained, held = several(3), np.random.default_rng(0), [], []
+    for seed in range(4):
+        truth = rng.uniform(0.6, 1.9, 3)
+        seen = truth[:2] / truth[1:] + 0.005 * rng.normal(size=2)
+
+        def like(t, seen=seen):
+            return -0.5 * ((t[:, :2] / t[:, 1:] - seen) ** 2).sum(1) / 0.005**2
+
+        prior = Distribution.prior(space)
+        found = refine(prior, like, draws=512, seed=seed)
+        better = sharpened(found, prior, like, draws=512, seed=seed)
+        assert better.effective > 2000 > found.effective
+        draws = jnp.asarray(valley(rng, seen, 0.005, 2000), jnp.float32)
+        gained.append(float(jnp.mean(better.posterior.log_prob(draws) - found.posterior.log_prob(draws))))
+        held.append([float(np.mean(better.posterior.credible_level(draws) < p)) for p in (0.5, 0.8, 0.95)])
+    assert np.mean(gained) > 0.01
+    np.testing.assert_allclose(np.mean(held, axis=0), [0.5, 0.8, 0.95], atol=0.03)

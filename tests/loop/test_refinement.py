@@ -104,7 +104,16 @@ def test_a_likelihood_that_is_a_lottery_keeps_the_proposal():
 def test_simulations_that_diverge_count_for_nothing(impossible):
     rng = np.random.default_rng(0)
     z, squares = rng.normal(size=(50, 2)), rng.chisquare(6, (50, 3, 4))
-    likelihood = SimpleNamespace(count=72.0)
+    likelihood = SimpleNamespace(count=72.0, least=0.0)
     without, _ = _spread(z, squares, likelihood)
     diverged = np.concatenate([squares, np.full((1, 3, 4), impossible)])
     np.testing.assert_allclose(_spread(np.concatenate([z, np.ones((1, 2))]), diverged, likelihood)[0], without)
+
+
+def test_prediction_errors_that_are_small_by_chance_make_nothing_sharper():
+    """The slope in the sum of squares is -1/2 over the variance of the noise, which sensors' own is the least of."""
+    for count in (120.0, 480.0, 20_000.0):
+        for total, variance in ((0.7 * count, 1.0), (0.05 * count, 1.0), (3 * count, 3.0)):
+            squares = np.array([total - 1, total + 1])[:, None, None]
+            value = Likelihood.log_likelihood(SimpleNamespace(count=count, least=1.0), squares)
+            assert (value[1] - value[0]) / 2 == pytest.approx(-0.5 / variance, rel=0.05)
