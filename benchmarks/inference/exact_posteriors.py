@@ -54,16 +54,43 @@ class Recorded:
         volume = np.prod(high - low)
         if not self.ratios:
             return np.all((r >= low) & (r <= high), axis=1) / volume
-        positive = np.maximum(r, 1e-9)
-        first, last = (
-            np.maximum((low[1:] / positive).max(1), low[0]), np.minimum((high[1:] / positive).min(1), high[0]),
-        )  # fmt: skip
+        first, last = self.ends(r)
         power = r.shape[1] + 1  # theta[1:] = m r: d theta = m^k dm dr
         return np.where(np.all(r > 0, axis=1), np.maximum(last**power - first**power, 0) / power, 0) / volume
 
+    def ends(self, r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The least and the largest first parameter [M] that ratios [M, k] leave in the box."""
+        low, high, positive = self.physics.space.low, self.physics.space.high, np.maximum(r, 1e-9)
+        return np.maximum((low[1:] / positive).max(1), low[0]), np.minimum((high[1:] / positive).min(1), high[0])
 
-def exact(at: Recorded, theta: np.ndarray) -> tuple[float, float]:
-    """(gain in nats over the prior, level of the smallest region that holds it) of theta [d] in the exact posterior.
+    def drawn(self, rng: np.random.Generator, r: np.ndarray) -> np.ndarray:
+        """theta [M, d] at r [M, k], what is not identified drawn from the prior."""
+        if not self.ratios:
+            return r
+        first, last = (x ** (r.shape[1] + 1) for x in self.ends(r))
+        m = (first + rng.random(len(r)) * (last - first)) ** (1 / (r.shape[1] + 1))
+        return m[:, None] * np.concatenate([np.ones((len(r), 1)), r], axis=1)
+
+
+@dataclass(frozen=True)
+class Exact:
+    """What the exact posterior says.
+
+    Attributes:
+        gain: of the truth over the prior, nats.
+        level: of the smallest region that holds the truth.
+        draws: [DRAWS, d] of it.
+        gains: [DRAWS] of these draws over the prior, nats.
+    """
+
+    gain: float
+    level: float
+    draws: np.ndarray
+    gains: np.ndarray
+
+
+def exact(at: Recorded, theta: np.ndarray) -> Exact:
+    """The exact posterior, and what it says of theta [d].
 
     Args:
         at: what was recorded.
@@ -80,13 +107,18 @@ def exact(at: Recorded, theta: np.ndarray) -> tuple[float, float]:
 
     precision = sum(s.T @ own @ s for s, own in zip(slopes, rest, strict=True))
     proposal = multivariate_t(r, np.linalg.inv(precision) * WIDER**2, df=FREEDOM)
-    draws = proposal.rvs(DRAWS, random_state=np.random.default_rng(0))
+    rng = np.random.default_rng(0)
+    draws = proposal.rvs(DRAWS, random_state=rng)
     value = log_likelihood(np.concatenate([truth[None], draws]))
     with np.errstate(divide="ignore"):
         logs = value[1:] + np.log(at.prior(draws)) - proposal.logpdf(draws)
     weights = np.exp(logs - logs.max())
-    gain = value[0] - logs.max() - np.log(weights.mean())
-    return float(gain), float(weights @ (value[1:] > value[0]) / weights.sum())
+    evidence = logs.max() + np.log(weights.mean())
+    level, chosen = (
+        weights @ (value[1:] > value[0]) / weights.sum(),
+        rng.choice(DRAWS, DRAWS, p=weights / weights.sum()),
+    )
+    return Exact(value[0] - evidence, float(level), at.drawn(rng, draws[chosen]), value[1:][chosen] - evidence)
 
 
 def _likeliest(
@@ -128,4 +160,4 @@ def _linear(at: Recorded, r: np.ndarray, starts: np.ndarray) -> tuple[np.ndarray
     return found[0], slopes[..., :k], slopes[..., k:]
 
 
-__all__ = ["Recorded", "exact"]
+__all__ = ["Exact", "Recorded", "exact"]

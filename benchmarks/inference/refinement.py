@@ -8,7 +8,9 @@ the 50, 80 and 95 % regions hold the truth, with binomial standard errors, the m
 many posteriors were not refined (they are out of the coverage and in the gain). Systems: `linear` is a cart under two
 motors of unknown strength; `damped` a pendulum of unknown mass, damping and motor; `Pendulum` (BayesSimIG's) and
 `Cartpole` are the library's tasks. Of the first two the exact posterior is known (`exact_posteriors.py`), and the same
-truths are counted in it: what it misses too is chance. `--wrong` adds to reality what the simulator lacks.
+truths are counted in it: what it misses too is chance. Chance in the truths apart, `holds of the exact` are the shares
+of the exact posterior in the refined one's regions, and `divergence` the nats that it loses on the mean (Kullback and
+Leibler). `--wrong` adds to reality what the simulator lacks.
 """
 
 from __future__ import annotations
@@ -20,6 +22,7 @@ import time
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
 import mujoco
@@ -104,12 +107,18 @@ def recorded(at: System, seed: int, wrong: str) -> tuple[np.ndarray, Record, np.
     return theta, Record(*(jnp.asarray(x, jnp.float32) for x in (*seen, command))), sd
 
 
-def known(at: System, theta: np.ndarray, rows: Record, wrong: str) -> dict[str, float]:
-    """What the exact posterior is worth, where it is known."""
+def known(at: System, theta: np.ndarray, rows: Record, wrong: str, q: Distribution | None = None) -> dict[str, Any]:
+    """What the exact posterior is worth, where it is known, and how much of it is where q says."""
     if at.ratios is None or wrong != "none":
         return {}
-    gain, level = exact(Recorded(at.physics, rows, at.sd, at.ratios), theta)
-    return {"exact": gain, "exact level": level}
+    found = exact(Recorded(at.physics, rows, at.sd, at.ratios), theta)
+    out: dict[str, Any] = {"exact": found.gain, "exact level": found.level}
+    if q is not None:
+        draws = jnp.asarray(found.draws, jnp.float32)
+        levels = np.asarray(q.credible_level(draws))
+        out["held"] = [float(np.mean(levels <= p)) for p in LEVELS]
+        out["divergence"] = float(np.mean(found.gains - np.asarray(q.log_gain(draws))))
+    return out
 
 
 def only_exact(at: System, name: str, seed: int, n: int) -> dict:
@@ -144,7 +153,7 @@ def judged(
         "sensor": found.noise.sensor.tolist(), "process": found.noise.process.tolist(), "lasting": found.noise.lasting,
         "z": z.tolist(),
     }  # fmt: skip
-    out |= known(at, theta, rows, wrong)
+    out |= known(at, theta, rows, wrong, posterior)
     return out | {"seconds": time.perf_counter() - clock, "cpu": time.process_time() - began}
 
 
@@ -168,6 +177,9 @@ def line(rows: list[dict]) -> str:
     text += gained([r["gain"] for r in refined])
     text += covered([r["exact level"] for r in rows if "exact level" in r])
     text += gained([r["exact"] for r in rows if "exact" in r])
+    both = [r for r in used if "held" in r]
+    held = " ".join(f"{x:.3f}" for x in np.mean([r["held"] for r in both], axis=0)) if both else ""
+    text += f"| {held} " + gained([r["divergence"] for r in both])
     wide = f"{np.median([r['widening'] for r in refined]):.2f}" if refined else ""
     return text + f"| {wide} | {len(rows)} | {len(refined) - len(used)} |"
 
@@ -200,6 +212,7 @@ def main() -> None:
                 a.out.write_text(json.dumps(rows))
     parts = [f"{p:.0%}" for p in LEVELS]
     heads = ["system", "wrong", "n", *parts, "gain, nats", *(f"exact {p}" for p in parts), "exact gain"]
+    heads += ["holds of the exact", "divergence"]
     print(f"| {' | '.join([*heads, 'widening', 'truths', 'not refined'])} |\n{'|---' * (len(heads) + 3)}|")
     for key in sorted({(r["system"], r["wrong"], r["n"]) for r in rows}):
         print(line([r for r in rows if (r["system"], r["wrong"], r["n"]) == key]))
