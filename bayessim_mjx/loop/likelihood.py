@@ -223,8 +223,12 @@ class Likelihood:
 
     @property
     def least(self) -> float:
-        """The least factor on the variance of the noise as it was estimated: sensors are no better than was told."""
-        return float(np.min((self.floor[self.seen] / self.noise.sensor[self.seen]) ** 2))
+        """The least factor on the variance of the noise as it was estimated: sensors are no better than was told.
+
+        Velocity's noise may be any ratio of position's (RATIOS), so positions tell, where they are measured.
+        """
+        use = self.seen & (np.arange(2 * self.nv) < self.nv) if self.seen[: self.nv].any() else self.seen
+        return float(np.min((self.floor[use] / self.noise.sensor[use]) ** 2))
 
     def log_likelihood(self, squares: np.ndarray) -> np.ndarray:
         """[M] of `squares`, the common factor on all noise marginalised with a prior of one number's worth at 1.
