@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 import bayessim_mjx
-from bayessim_mjx import main, registry
+from bayessim_mjx import main, registry, rl
 from bayessim_mjx.cli import ancestors
 from bayessim_mjx.config import settings
 
@@ -177,7 +177,12 @@ def test_code_is_python(page):
 @pytest.mark.ci
 @pytest.mark.parametrize("name", ["own_effect", "own_task", "own_walker"])
 def test_code_of_a_how_to_runs(name, tmp_path, monkeypatch):
+    """Where it trains, shortly: other tests are about learning."""
     monkeypatch.chdir(tmp_path)
+    train = rl.train
+    monkeypatch.setattr(
+        rl, "train", lambda env, ppo, *more: train(env, dataclasses.replace(ppo, max_iterations=3), *more)
+    )
     run(code_of(ROOT / "docs" / f"{name}.md"), name, monkeypatch)
 
 
