@@ -8,81 +8,22 @@ is far off everywhere are weighted down.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.fitting import quadratic
 from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
-from bayessim_mjx.diagnosis.fitting.quadratic import (
-    Quadratic,
-    Rest,
-    Starts,
-    blocks,
-    eliminate,
-    held_out,
-    solve,
-    weights,
-)
+from bayessim_mjx.diagnosis.fitting.fit import Fit, broyden, settled
+from bayessim_mjx.diagnosis.fitting.quadratic import Rest, blocks, held_out, solve, weights
 from bayessim_mjx.diagnosis.fitting.simulator import Simulator
 
+__all__ = ["Fit", "Fitter", "weights"]
 Array = NDArray[np.float64]
 START_STEP = 0.2  # of the spread of the start states, for their finite differences
 NUMBERS = 2  # independent ones that one channel of one window holds: a missing force shows as a smooth curve
-
-
-@dataclass(frozen=True, eq=False)
-class Fit:
-    """A model fitted so far.
-
-    Attributes:
-        coordinates: free ones; values: `[k]`; offsets: `[W, s]` of the start states.
-        r: whitened residuals `[W, n]`; A: `[W, n, k]`, minus their derivatives; B: `[W, n, s]` by the start states.
-        weight: `[W]`; cost: weighted, priors included; damping: Levenberg's, of the next step.
-        promise: by how much the next step would lower the cost if the model were linear; history: costs, step by step.
-        doubt: squared misfit per independent number in the data, by which priors of stated parameters are multiplied.
-        reach: `[W]`, share of their own steps that the start states make: less after one that did a window harm.
-    """
-
-    coordinates: tuple[Coordinate, ...]
-    values: Array
-    offsets: Array
-    r: Array
-    A: Array
-    B: Array
-    weight: Array
-    cost: float
-    damping: float = 1e-3
-    promise: float = np.inf
-    history: tuple[float, ...] = ()
-    doubt: float = 1.0
-    reach: Array = field(default_factory=lambda: np.ones(1))
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return tuple(c.name for c in self.coordinates)
-
-    def prior(self) -> tuple[Array, Array, Array, Array]:
-        """(precision, pull, room below, room above), `[k]` each, in units of the cost."""
-        precision = np.array([c.precision * (self.doubt if c.stated else 1.0) for c in self.coordinates])
-        neutral = np.array([c.neutral for c in self.coordinates])
-        low = np.array([c.low for c in self.coordinates]) - self.values
-        high = np.array([c.high for c in self.coordinates]) - self.values
-        return precision, precision * (neutral - self.values), low, high
-
-    def belief(self) -> Array:
-        """Precision of the priors `[k]` in units of the parameters, for use beside a curvature in nats."""
-        return np.array([c.precision for c in self.coordinates])
-
-    def penalty(self, values: Array, stated: bool = False) -> float:
-        """Of the priors, as they are: of parameters that are stated, or of the others."""
-        pairs = zip(self.coordinates, values, strict=True)
-        return float(sum(c.precision * (v - c.neutral) ** 2 for c, v in pairs if c.stated == stated))
-
-    def quadratic(self, spread: Array) -> tuple[Quadratic, Starts]:
-        return eliminate(self.r, self.A, self.B, self.offsets, spread)
 
 
 class Fitter:
@@ -209,36 +150,66 @@ class Fitter:
         for made in range(iterations + 1):
             if not running:
                 return now
-            plans, thetas, offsets = [], [], []
-            for i in running:
-                values, x = trial[i]
-                which = list(fresh(now[i]))
-                shifted, steps = self._differences(now[i].coordinates, values, which)
-                plans.append((i, which, steps))
-                thetas += [self.vector(now[i].coordinates, values), *shifted]
-                offsets += [x] * (1 + len(shifted))
-            r = self.whiten(self.simulator.run(np.stack(thetas), np.stack(offsets)))
-            at = 0
-            for i, which, steps in plans:
-                own = r[at : at + 1 + len(which)]
-                at += 1 + len(which)
-                now[i] = self._stepped(now[i], *trial[i], own, which, steps)
+            asked = {i: list(fresh(now[i])) for i in running}
+            for i, (own, steps) in self._tried(now, trial, asked).items():
+                now[i] = self._stepped(now[i], *trial[i], own, asked[i], steps)
                 now[i], trial[i] = self._propose(now[i])
-            running = [i for i in running if not _settled(now[i], tolerance)]
+            running = [i for i in running if not settled(now[i], tolerance)]
             running = running if keep is None else keep(made, now, running)
             if progress is not None:
                 progress(len(running))
         return now
 
+    def _tried(
+        self, fits: Sequence[Fit], trial: Sequence[tuple[Array, Array]], asked: Mapping[int, Sequence[int]]
+    ) -> dict[int, tuple[Array, list[float]]]:
+        """{fit: (residuals at its trial point and at those shifted for the columns asked for, the shifts)}.
+
+        Where each world costs as much in a small call as in a large one, shifted ones are simulated after the others,
+        of points that are better alone.
+        """
+        apart = getattr(self.simulator, "apart", False)
+        first: dict[int, Sequence[int]] = {i: () for i in asked} if apart else dict(asked)
+        found = self._shifted(fits, trial, first)
+        if apart:
+            better = {i: asked[i] for i, (r, _) in found.items() if self._better(fits[i], r[0], *trial[i])}
+            more = self._shifted(fits, trial, better, alone=True)
+            found |= {i: (np.concatenate([found[i][0], r]), steps) for i, (r, steps) in more.items()}
+        return found
+
+    def _shifted(
+        self,
+        fits: Sequence[Fit],
+        trial: Sequence[tuple[Array, Array]],
+        asked: Mapping[int, Sequence[int]],
+        alone: bool = False,
+    ) -> dict[int, tuple[Array, list[float]]]:
+        """`_tried` in one call; alone: without the trial points themselves."""
+        thetas, offsets, sizes, steps = [], [], [], {}
+        for i, which in asked.items():
+            values, x = trial[i]
+            shifted, steps[i] = self._differences(fits[i].coordinates, values, which)
+            own = shifted if alone else [self.vector(fits[i].coordinates, values), *shifted]
+            thetas += own
+            offsets += [x] * len(own)
+            sizes.append(len(own))
+        if not thetas:
+            return {}
+        r = self.whiten(self.simulator.run(np.stack(thetas), np.stack(offsets)))
+        parts = np.split(r, np.cumsum(sizes)[:-1])
+        return {i: (part, steps[i]) for i, part in zip(asked, parts, strict=True)}
+
+    def _better(self, fit: Fit, r: Array, values: Array, x: Array) -> bool:
+        return not np.isfinite(fit.cost) or self.cost(fit, r, x, values) < fit.cost
+
     def _stepped(
         self, fit: Fit, values: Array, x: Array, r: Array, which: Sequence[int], steps: Sequence[float]
     ) -> Fit:
         """The fit at a trial point where that is better, else more damped where it was."""
-        cost = self.cost(fit, r[0], x, values)
-        if cost < fit.cost or not np.isfinite(fit.cost):
-            A = fit.A.copy()
+        if self._better(fit, r[0], values, x):
+            cost, A = self.cost(fit, r[0], x, values), fit.A.copy()
             if np.isfinite(fit.cost) and len(which) < len(fit.coordinates):
-                _broyden(A, fit, values, x, r[0], which)
+                broyden(A, fit, values, x, r[0], which)
             A[:, :, which] = quadratic.columns(r[0], r[1:], steps)
             doubt = self._doubt(self._data(fit, r[0], x))
             fit = replace(fit, values=values, offsets=x, r=r[0], A=A, cost=cost, doubt=doubt)
@@ -276,24 +247,3 @@ class Fitter:
         tells = Rest(q, fit.weight, *fit.prior()).told_by(np.arange(len(self.base), len(fit.coordinates)))
         group = self.simulator.windows.group
         return [tells(group == name) for name in np.unique(group)]
-
-
-def _broyden(A: Array, fit: Fit, values: Array, x: Array, r: Array, which: Sequence[int]) -> None:
-    """Rank-one correction, in place, of the columns A not differenced anew, so that they explain the step just made."""
-    dp = values - fit.values
-    kept = [i for i in range(len(dp)) if i not in set(which)]
-    if not kept or not np.any(dp[kept]):
-        return
-    missed = (fit.r - r) - fit.A @ dp - np.einsum("wns,ws->wn", fit.B, x - fit.offsets)
-    scaled = dp[kept] / np.array([fit.coordinates[i].high - fit.coordinates[i].low for i in kept]) ** 2
-    weight = scaled / max(float(scaled @ dp[kept]), 1e-300)
-    share = float(scaled @ dp[kept]) / max(float(np.sum((dp / [c.high - c.low for c in fit.coordinates]) ** 2)), 1e-300)
-    A[:, :, kept] += share * missed[:, :, None] * weight[None, None, :]
-
-
-def _settled(fit: Fit, tolerance: float) -> bool:
-    """No step is promising, or those that were accepted gain little; refused ones are no sign of convergence."""
-    if fit.promise < tolerance * abs(fit.cost) / 3 or fit.damping > 1e6:
-        return True
-    last = list(dict.fromkeys(fit.history))[-4:]  # accepted costs
-    return len(last) == 4 and np.isfinite(last[0]) and last[0] - last[-1] < tolerance * abs(last[-1])

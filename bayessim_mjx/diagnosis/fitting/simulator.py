@@ -44,13 +44,14 @@ class Simulator:
     Attributes:
         traces: number of times the program was traced (1, whatever is asked).
         rollouts: windows simulated so far.
+        apart: whether a world costs as much in a small call as in a large one: on a CPU, not on an accelerator.
     """
 
     def __init__(self, physics: Physics, windows: Windows, lanes: int | None = None) -> None:
         self.physics, self.windows = physics, windows
         on_cpu = jax.default_backend() == "cpu"
         self.lanes = lanes or (CALL.cpu_lanes if on_cpu else CALL.lanes)
-        self.workers = cores() if on_cpu else 1
+        self.workers, self.apart = cores() if on_cpu else 1, on_cpu
         self.nv = int(physics.mj_model.nv)
         self.channels = 2 * self.nv
         self.traces = self.rollouts = 0

@@ -9,13 +9,13 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate, Coordinate
 from bayessim_mjx.diagnosis.fitting.discretisation import contacts
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 from bayessim_mjx.diagnosis.selection import shortlist
 from bayessim_mjx.diagnosis.selection.criteria import Criteria
+from bayessim_mjx.diagnosis.selection.heats import Heats
 from bayessim_mjx.diagnosis.selection.models import Model, scored
 from bayessim_mjx.diagnosis.selection.screen import Screened, Secants
 from bayessim_mjx.diagnosis.selection.tried import Settings, Tried
@@ -102,7 +102,8 @@ def fit_entries(pool: Pool, entries: Entries, label: str, say: Progress, part: s
     Args:
         part: of the budget, by whose end the rest is left out; "": all are fitted.
     """
-    heats, total, done = _Heats(pool, part), sum(len(several) for several, _ in entries.values()), 0
+    heats = Heats(lambda: bool(part) and pool.settings.budget.over(part))
+    total, done = sum(len(several) for several, _ in entries.values()), 0
     every = list(entries.items())
     for first in range(0, len(every), RULES.batch):
         some = dict(every[first : first + RULES.batch])
@@ -118,7 +119,7 @@ def _say_left(say: Progress, label: str, done: int, total: int, left: int) -> No
     say(label, done - left, total)
 
 
-def _fit_batch(pool: Pool, entries: Entries, heats: _Heats, progress: Callable[[int], None]) -> None:
+def _fit_batch(pool: Pool, entries: Entries, heats: Heats, progress: Callable[[int], None]) -> None:
     """All starts on some windows, where there are many; the best start of each model then on all of them."""
     rules = pool.settings.iterations, lambda f: fresh(pool, f), pool.settings.tolerance
     every = [several for several, _ in entries.values()]
@@ -127,11 +128,13 @@ def _fit_batch(pool: Pool, entries: Entries, heats: _Heats, progress: Callable[[
         fits = pool.fitter.iterate(
             [f for fs in every for f in fs], *rules, progress, heats.among(list(map(len, every)))
         )
+        heats.learn(fits)
         best = [min(some, key=lambda fit: fit.cost) for some in _in_turn(fits, every)]
     else:
         starts = [shortlist.cut(f, own) for fs in every for f in fs]
         part = shortlist.on(pool.fitter, own)
         fits = part.iterate(starts, *rules, progress, heats.among(list(map(len, every))))
+        heats.learn(fits)
         first = [
             min(zip(some, fs, strict=True), key=lambda pair: pair[0].cost)
             for some, fs in zip(_in_turn(fits, every), every, strict=True)
@@ -155,48 +158,6 @@ def _left_out(pool: Pool, models: Sequence[Sequence[Candidate]], label: str) -> 
     """Remembers what there was no time for."""
     pool.cut_short.update(effects[0].label for effects in models if len(effects) == 1)
     pool.skipped[label] = pool.skipped.get(label, 0) + len(models)
-
-
-class _Heats:
-    """Successive halving: which fits go on. Starts far behind their candidate's best stop first, then candidates that
-    are far behind the best candidate (they keep the cost they reached, and their place far down the table). What still
-    falls fast goes on, and what was refused a step that would have brought much."""
-
-    STARTS = {1: 4.0, 2: 2.0, 3: 1.3, 5: 1.03}  # steps made -> cost over the best start's
-    CANDIDATES = {2: 8.0, 3: 5.0, 5: 3.0}  # and over the best candidate's
-    FAST = 0.7  # cost after over cost before a step
-
-    def __init__(self, pool: Pool, part: str = "") -> None:
-        self.pool, self.part = pool, part
-        self.pace: dict[int, float] = {}  # steps made -> cost of the best candidate, of all batches
-        self.least = np.inf  # cost of the best candidate in the end
-
-    def among(self, starts: Sequence[int]) -> Callable[[int, Sequence[Fit], Sequence[int]], list[int]]:
-        """Which fits of a batch go on, of candidates with so many starts each."""
-        owner = np.repeat(np.arange(len(starts)), starts)
-
-        def going(made: int, fits: Sequence[Fit], running: Sequence[int]) -> list[int]:
-            if self.part and self.pool.settings.budget.over(self.part):
-                return []
-            cost = np.array([fit.cost for fit in fits])
-            best = np.array([float(np.min(cost[owner == i])) for i in range(len(starts))])
-            self.pace[made] = min(self.pace.get(made, np.inf), float(best.min()))
-            limits = self.STARTS.get(made, np.inf) * best
-            if made in self.CANDIDATES:
-                limits[best > self.CANDIDATES[made] * self.pace[made]] = 0.0
-            return [i for i in running if cost[i] <= limits[owner[i]] or self._falls(fits[i])]
-
-        return going
-
-    def finals(self, made: int, running: Sequence[int], close: NDArray[np.bool_]) -> list[int]:
-        """Which fits go on with all windows: one step tells their place in the table, those that are close go on."""
-        over = self.part and self.pool.settings.budget.over(self.part)
-        return [] if over else [i for i in running if made < 1 or close[i]]
-
-    def _falls(self, fit: Fit) -> bool:
-        refused = len(fit.history) > 1 and fit.history[-1] == fit.history[-2]
-        fell = len(fit.history) > 1 and fit.history[-1] < self.FAST * fit.history[-2]
-        return fell or (refused and fit.promise > (1 - self.FAST) * fit.cost)
 
 
 def starts(pool: Pool, model: Model, extra: Screened, rank: int) -> list[Fit]:

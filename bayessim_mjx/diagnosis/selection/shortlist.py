@@ -43,6 +43,7 @@ class Some:
 
     def __init__(self, simulator: Any, own: NDArray[np.int64]) -> None:
         self.simulator, self.own, self.physics = simulator, own, simulator.physics
+        self.apart = getattr(simulator, "apart", False)
         all_of_it = simulator.windows  # its batch stays whole: the simulator has it
         parts = {name: getattr(all_of_it, name)[own] for name in ("log", "start", "group")}
         self.windows = replace(all_of_it, **parts)

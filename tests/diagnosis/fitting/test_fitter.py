@@ -85,3 +85,20 @@ def test_windows_far_worse_than_the_rest_count_less(rubbing):
     r[3] *= 40.0
     found = weights(r)
     assert found[3] == pytest.approx(0.1, rel=1e-6) and np.delete(found, 3) == pytest.approx(np.ones(len(r) - 1))
+
+
+def test_columns_of_steps_that_are_refused_are_not_simulated_on_a_cpu(rubbing, monkeypatch):
+    """An accelerator simulates them in one call with the trial; the fits are the same."""
+    fitter, base, _, candidate = rubbing
+    start = fitter.derive(base, candidate.coordinates, np.array([0.4]))
+    fits, spent = [], []
+    for apart in (False, True):
+        monkeypatch.setattr(fitter.simulator, "apart", apart)
+        before = fitter.simulator.rollouts
+        fits += fitter.iterate([start], 12, lambda f: [len(f.coordinates) - 1])
+        spent.append(fitter.simulator.rollouts - before)
+    together, one_by_one = fits
+    assert one_by_one.history == together.history and len(set(together.history)) < len(together.history)  # some refused
+    np.testing.assert_array_equal(one_by_one.values, together.values)
+    np.testing.assert_array_equal(one_by_one.A, together.A)
+    assert spent[1] < spent[0]

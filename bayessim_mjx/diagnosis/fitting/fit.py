@@ -1,0 +1,87 @@
+"""A model fitted so far, as a value; how its columns are corrected without a simulation, and when it rests."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
+from bayessim_mjx.diagnosis.fitting.quadratic import Quadratic, Starts, eliminate
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A model fitted so far.
+
+    Attributes:
+        coordinates: free ones; values: `[k]`; offsets: `[W, s]` of the start states.
+        r: whitened residuals `[W, n]`; A: `[W, n, k]`, minus their derivatives; B: `[W, n, s]` by the start states.
+        weight: `[W]`; cost: weighted, priors included; damping: Levenberg's, of the next step.
+        promise: by how much the next step would lower the cost if the model were linear; history: costs, step by step.
+        doubt: squared misfit per independent number in the data, by which priors of stated parameters are multiplied.
+        reach: `[W]`, share of their own steps that the start states make: less after one that did a window harm.
+    """
+
+    coordinates: tuple[Coordinate, ...]
+    values: Array
+    offsets: Array
+    r: Array
+    A: Array
+    B: Array
+    weight: Array
+    cost: float
+    damping: float = 1e-3
+    promise: float = np.inf
+    history: tuple[float, ...] = ()
+    doubt: float = 1.0
+    reach: Array = field(default_factory=lambda: np.ones(1))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(c.name for c in self.coordinates)
+
+    def prior(self) -> tuple[Array, Array, Array, Array]:
+        """(precision, pull, room below, room above), `[k]` each, in units of the cost."""
+        precision = np.array([c.precision * (self.doubt if c.stated else 1.0) for c in self.coordinates])
+        neutral = np.array([c.neutral for c in self.coordinates])
+        low = np.array([c.low for c in self.coordinates]) - self.values
+        high = np.array([c.high for c in self.coordinates]) - self.values
+        return precision, precision * (neutral - self.values), low, high
+
+    def belief(self) -> Array:
+        """Precision of the priors `[k]` in units of the parameters, for use beside a curvature in nats."""
+        return np.array([c.precision for c in self.coordinates])
+
+    def penalty(self, values: Array, stated: bool = False) -> float:
+        """Of the priors, as they are: of parameters that are stated, or of the others."""
+        pairs = zip(self.coordinates, values, strict=True)
+        return float(sum(c.precision * (v - c.neutral) ** 2 for c, v in pairs if c.stated == stated))
+
+    def quadratic(self, spread: Array) -> tuple[Quadratic, Starts]:
+        return eliminate(self.r, self.A, self.B, self.offsets, spread)
+
+
+def broyden(A: Array, fit: Fit, values: Array, x: Array, r: Array, which: Sequence[int]) -> None:
+    """Rank-one correction, in place, of the columns A not differenced anew, so that they explain the step just made."""
+    dp = values - fit.values
+    kept = [i for i in range(len(dp)) if i not in set(which)]
+    if not kept or not np.any(dp[kept]):
+        return
+    missed = (fit.r - r) - fit.A @ dp - np.einsum("wns,ws->wn", fit.B, x - fit.offsets)
+    scaled = dp[kept] / np.array([fit.coordinates[i].high - fit.coordinates[i].low for i in kept]) ** 2
+    weight = scaled / max(float(scaled @ dp[kept]), 1e-300)
+    share = float(scaled @ dp[kept]) / max(float(np.sum((dp / [c.high - c.low for c in fit.coordinates]) ** 2)), 1e-300)
+    A[:, :, kept] += share * missed[:, :, None] * weight[None, None, :]
+
+
+def settled(fit: Fit, tolerance: float) -> bool:
+    """No step is promising, or those that were accepted gain little; refused ones are no sign of convergence."""
+    if fit.promise < tolerance * abs(fit.cost) / 3 or fit.damping > 1e6:
+        return True
+    last = list(dict.fromkeys(fit.history))[-4:]  # accepted costs
+    return len(last) == 4 and np.isfinite(last[0]) and last[0] - last[-1] < tolerance * abs(last[-1])
