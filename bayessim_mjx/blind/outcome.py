@@ -42,8 +42,10 @@ class Outcome:
         return any(self.same(f["name"], str(f["where"]), effect) for f in self.named())
 
     def inside(self, effect: Mapping[str, Any]) -> bool:
-        """Named, or in the set of what cannot be told from what is named."""
+        """Named, or in the set of what cannot be told from what is named, or told as hidden beside it."""
         rivals = [label for f in self.named() for entry in f.get("equivalent_to", ()) for label in labels_of(entry)]
+        if self.named() and self.said:
+            rivals += [label for entry in self.said.get("hidden", ()) for label in labels_of(entry)]
         return self.right(effect) or any(self.same(*label, effect) for label in rivals)
 
 

@@ -78,6 +78,7 @@ class Diagnosis:
         about: {"robot", "data": [paths], "logs", "seconds", "conditions", "date", "seed"}, what was diagnosed, or {}.
         chance: {"probability", "each": {label: p}, "nats", "level", "draws", "candidates"}, how often the best
             candidate gains as much where nothing is missing (`selection.chance`), or {}.
+        hidden: effects ("name@place") that would not show beside those that are named, whose parameters do the same.
         next_experiment: {"name", "why", "evidence", "file", "table": [...]} or {}.
         details: numbers for pictures (see `report`); not part of diagnosis.json but saved beside it.
     """
@@ -97,6 +98,7 @@ class Diagnosis:
     about: dict[str, Any] = field(default_factory=dict)
     not_fitted: dict[str, list[str]] = field(default_factory=dict)
     chance: dict[str, Any] = field(default_factory=dict)
+    hidden: list[str] = field(default_factory=list)
     schema: int = SCHEMA
 
     def to_dict(self) -> dict[str, Any]:

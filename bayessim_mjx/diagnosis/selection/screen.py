@@ -128,7 +128,7 @@ def screen(
     again = bool(secants.columns)
     if not again:
         _fill(secants, fitter, fit, candidates, limit if count <= SIZES.many else max(limit // 3, SIZES.fewest), say)
-    coarse = _projected(fitter, fit, candidates, secants)
+    coarse = projected(fitter, fit, candidates, secants)
     if not again and count <= SIZES.many:
         return _ordered(coarse)
     order = sorted(coarse, key=lambda i: -max(s.gain for s, _ in coarse[i]))
@@ -136,8 +136,7 @@ def screen(
     plans = [(i, p) for i in order for _, p in sorted(coarse[i], key=lambda f: -f[0].gain)[: SIZES.points]]
     own = looked_at(fit, limit)
     told = functools.partial(_second, say)
-    simulated = _simulated(fitter, fit, candidates, plans, own, told)
-    fine = _judged(fitter, fit, candidates, simulated, own)
+    fine = judged(fitter, fit, candidates, simulated(fitter, fit, candidates, plans, own, told), own)
     return _ordered(fine) + _ordered({i: found for i, found in coarse.items() if i not in fine})
 
 
@@ -150,18 +149,18 @@ def _fill(
 ) -> None:
     secants.own = looked_at(fit, windows)
     plans = [(i, point) for i, candidate in enumerate(candidates) for point in candidate.probes]
-    for i, point, column in _simulated(fitter, fit, candidates, plans, secants.own, say):
+    for i, point, column in simulated(fitter, fit, candidates, plans, secants.own, say):
         secants.columns.setdefault(candidates[i].label, []).append((point, column))
 
 
-def _projected(
+def projected(
     fitter: Fitter, fit: Fit, candidates: Sequence[Candidate], secants: Secants
 ) -> dict[int, list[tuple[Screened, Array]]]:
     known = ((i, *pair) for i, c in enumerate(candidates) for pair in secants.columns.get(c.label, ()))
-    return _judged(fitter, fit, candidates, known, secants.own)
+    return judged(fitter, fit, candidates, known, secants.own)
 
 
-def _simulated(
+def simulated(
     fitter: Fitter,
     fit: Fit,
     candidates: Sequence[Candidate],
@@ -184,7 +183,7 @@ def _simulated(
         yield from ((i, point, column) for (i, point), column in zip(some, columns, strict=True))
 
 
-def _judged(
+def judged(
     fitter: Fitter,
     fit: Fit,
     candidates: Sequence[Candidate],

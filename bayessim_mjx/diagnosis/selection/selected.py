@@ -11,7 +11,7 @@ from typing import Any
 from bayessim_mjx.diagnosis import phrases
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
-from bayessim_mjx.diagnosis.selection import beam, heldout, predicted_gain, singles, weak_directions
+from bayessim_mjx.diagnosis.selection import beam, heldout, hidden, predicted_gain, singles, weak_directions
 from bayessim_mjx.diagnosis.selection.criteria import Criteria
 from bayessim_mjx.diagnosis.selection.decide import Alternative, Decision, chosen_elsewhere, closed_elsewhere, order
 from bayessim_mjx.diagnosis.selection.fits import Fits
@@ -58,6 +58,7 @@ class Selection(Tried):
         along: what was simulated along its weak directions.
         chosen: {operating condition: effects that are named without it}.
         elsewhere: share of the gap closed on operating conditions that had no part in the choice; NaN of one condition.
+        hidden: labels of effects that would not show beside those of the answer (`selection.hidden`).
     """
 
     fitter: Fitter
@@ -78,6 +79,7 @@ class Selection(Tried):
     along: Ridges | None = None
     chosen: Mapping[int, Key] = field(default_factory=dict)
     elsewhere: float = float("nan")
+    hidden: tuple[str, ...] = ()
     cut_short: frozenset[str] = frozenset()
     skipped: Mapping[str, int] = field(default_factory=dict)
 
@@ -131,6 +133,7 @@ def concluded(pool: Pool, decision: Decision, say: Progress) -> Selection:
         along=along,
         chosen=chosen,
         elsewhere=closed_elsewhere(searched, chosen),
+        hidden=hidden.beside(pool, answer, say),
     )
 
 

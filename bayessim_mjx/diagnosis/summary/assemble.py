@@ -70,6 +70,7 @@ def diagnosis_of(found: Findings, about: Mapping[str, Any] | None = None, file: 
         not_fitted=left_out.not_fitted(selection),
         about={**about, "conditions": len(setup.fitter.simulator.windows.groups)} if about else {},
         chance=odds,
+        hidden=list(selection.hidden),
     )
 
 

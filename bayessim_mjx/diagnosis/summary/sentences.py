@@ -66,6 +66,10 @@ BY_CHANCE = (
     "The best of {candidates} candidates gains as much in {chance} of logs in which nothing is missing (drawn from the "
     "recalibrated simulator with noise as it is in these logs)."
 )
+HIDDEN = (
+    "Beside {them} these logs would not show {hidden}: parameters of what is named do the same, and stand for both "
+    "where both are there."
+)
 OF_SENSORS = "What remains has the covariance of noise of the sensors, {colour}."
 CHANCE = (
     "What remains, {calibrated}, no candidate and no flexible force predicts on held-out conditions: process noise, an "
@@ -87,6 +91,7 @@ def sentences(
     told += [_by_chance(odds)]
     if found.selection.ambiguous:
         told += [_instead(e, found.selection.rivals.get(f"{e.name}@{e.where}", ())) for e in effects]
+    told += [_hidden(found.selection.hidden, len(effects))]
     if verdict.noise is not None and (name == "noise" or far.beyond):
         told.append(_of_sensors(verdict.noise.memory * cut.steps * cut.dt))
     elif not effects and verdict.remains == 0.0 and found.selection.above_noise(found.selection.base):
@@ -98,6 +103,14 @@ def sentences(
     told += [f"{k} {v['structural']}." for k, v in parameters.items() if v["structural"]]
     told += [f"{k} {v['data_sheet']}." for k, v in parameters.items() if v.get("data_sheet")]
     return [text for text in told if text]
+
+
+def _hidden(labels: Sequence[str], effects: int) -> str:
+    if not labels:
+        return ""
+    parts = [missing(*label.split("@", 1)) for label in labels[: LIMITS.told]]
+    parts += [f"{len(labels) - len(parts)} more"] if len(labels) > len(parts) else []
+    return HIDDEN.format(them="it" if effects == 1 else "them", hidden=listed(parts, "or"))
 
 
 def _by_chance(odds: Mapping[str, Any]) -> str:
