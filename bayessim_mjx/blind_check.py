@@ -3,6 +3,7 @@
 import argparse
 import json
 import os
+import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -81,6 +82,10 @@ def _checked(args: argparse.Namespace) -> None:
         raise UserError("give one of --task NAME and --model FILE")
     if args.command and "{out}" not in args.command:
         raise UserError(f"--command {args.command!r}: it has to hold {{out}}, and {{data}} and {{model}} where needed")
+    try:
+        shlex.split(args.command)
+    except ValueError as error:
+        raise UserError(f"--command {args.command!r}: {error}; allowed: words as a shell takes them") from None
     if args.command and args.more:
         raise UserError("--more: these are flags of our own diagnosis; put those of another one into --command")
     if Path(args.out).exists() and not Path(args.out).is_dir():

@@ -32,10 +32,12 @@ EXIT = "exit.json"
 
 
 def command(check: Check, data: Path, out: Path) -> list[str]:
-    """The command of an entry: `{model}`, `{data}` and `{out}` in it are replaced, or ours without one."""
+    """The command of an entry: `{model}`, `{data}` and `{out}` in it are replaced and nothing else, or ours."""
     model = str(Path(check.model).resolve()) if check.model else str(data.parent / "model.xml")
     if check.command:
-        words = [w.format(model=model, data=data, out=out) for w in shlex.split(check.command)]
+        words = shlex.split(check.command)
+        for name, path in (("{model}", model), ("{data}", str(data)), ("{out}", str(out))):
+            words = [w.replace(name, path) for w in words]
         return [str(Path(w).resolve()) if Path(w).is_file() else w for w in words]  # it runs in another folder
     robot = ["--task", check.task] if check.task else ["--model", model]
     accuracy = ["--accuracy", f"{100 * check.accuracy:g}%"] if not check.task else []

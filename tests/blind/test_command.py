@@ -4,11 +4,13 @@ import json
 import shutil
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from recorded import pendulum
 
 from bayessim_mjx import blind_check
+from bayessim_mjx.blind import worker
 
 ENTRY = Path(__file__).with_name("entry.py")
 
@@ -24,6 +26,10 @@ def call(*words: object) -> int:
         (("--model", "none.xml"), "none.xml: no such file"),
         (("--model", "m.xml", "--command", "mine {data}"), "has to hold {out}"),
         (("--model", "m.xml", "--command", "mine {out}", "--more", "--quick"), "--more"),
+        (
+            ("--model", "m.xml", "--command", "mine '{out}"),
+            "No closing quotation; allowed: words as a shell takes them",
+        ),
         (("--model", "m.xml", "--effects", "backslash"), "backlash"),
         (("--model", "m.xml", "--accuracy", "5"), "allowed: per cent"),
         (("--model", "m.xml", "--minutes", "-1"), "allowed: minutes"),
@@ -35,6 +41,13 @@ def test_what_is_wrong_is_told_in_one_line(words, said, tmp_path, monkeypatch, c
     # --headless first: --more takes the rest
     assert blind_check.main(["--headless", *words]) == 2
     assert said in capsys.readouterr().err
+
+
+def test_only_the_three_words_of_a_command_are_replaced(tmp_path):
+    """Braces of another tool stay as they are."""
+    check = SimpleNamespace(command="awk '{print $1}' {data} {out}/{x} {model}", model="", task="")
+    words = worker.command(check, tmp_path / "logs", tmp_path / "out")
+    assert words == ["awk", "{print $1}", f"{tmp_path}/logs", f"{tmp_path}/out/{{x}}", f"{tmp_path}/model.xml"]
 
 
 def run(folder: Path, out: Path, *more: object) -> int:
