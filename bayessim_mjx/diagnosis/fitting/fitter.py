@@ -172,7 +172,7 @@ class Fitter:
         first: dict[int, Sequence[int]] = {i: () for i in asked} if apart else dict(asked)
         found = self._shifted(fits, trial, first)
         if apart:
-            better = {i: asked[i] for i, (r, _) in found.items() if self._better(fits[i], r[0], *trial[i])}
+            better = {i: asked[i] for i, (r, _) in found.items() if self._better(fits[i], r[0], *trial[i])[0]}
             more = self._shifted(fits, trial, better, alone=True)
             found |= {i: (np.concatenate([found[i][0], r]), steps) for i, (r, steps) in more.items()}
         return found
@@ -199,15 +199,18 @@ class Fitter:
         parts = np.split(r, np.cumsum(sizes)[:-1])
         return {i: (part, steps[i]) for i, part in zip(asked, parts, strict=True)}
 
-    def _better(self, fit: Fit, r: Array, values: Array, x: Array) -> bool:
-        return not np.isfinite(fit.cost) or self.cost(fit, r, x, values) < fit.cost
+    def _better(self, fit: Fit, r: Array, values: Array, x: Array) -> tuple[bool, float]:
+        """Whether a trial point is better than where the fit is, and its cost."""
+        cost = self.cost(fit, r, x, values)
+        return cost < fit.cost or not np.isfinite(fit.cost), cost
 
     def _stepped(
         self, fit: Fit, values: Array, x: Array, r: Array, which: Sequence[int], steps: Sequence[float]
     ) -> Fit:
         """The fit at a trial point where that is better, else more damped where it was."""
-        if self._better(fit, r[0], values, x):
-            cost, A = self.cost(fit, r[0], x, values), fit.A.copy()
+        better, cost = self._better(fit, r[0], values, x)
+        if better:
+            A = fit.A.copy()
             if np.isfinite(fit.cost) and len(which) < len(fit.coordinates):
                 broyden(A, fit, values, x, r[0], which)
             A[:, :, which] = quadratic.columns(r[0], r[1:], steps)

@@ -33,7 +33,9 @@ class Rules:
     rounds: int = 5
     steps: int = 4
     falls: float = 0.99
-    near: float = 1.3  # times the best one's cost: as near as a fit has to be able to come
+    near: float = (
+        1.3  # times the best one's cost, as near as a fit has to be able to come: a rule of thumb, not counted
+    )
     astray: float = 10.0  # noises that a fit leaves: from there on nothing is as it was a step before
 
 
