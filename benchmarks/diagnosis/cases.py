@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -19,6 +20,7 @@ __all__ = ["CAUSES", "KNOWN", "STRENGTHS", "SYSTEMS", "UNKNOWN", "Case", "draw_c
 
 STRENGTHS = {"weak": 3.0, "medium": 10.0, "strong": 30.0, "severe": 100.0}
 SPREAD = 0.2
+ACCURACY = f"{100 * SPREAD / math.sqrt(3):.1f}%"  # what a data sheet says whose values are uniform within the spread
 
 
 @dataclasses.dataclass(frozen=True)

@@ -22,7 +22,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from cases import KNOWN
+from cases import ACCURACY, KNOWN
 from families import without
 
 RECORD = "record"
@@ -57,6 +57,7 @@ def work(case: Path, arguments: list[str]) -> None:
     out = case / RECORD
     out.mkdir(exist_ok=True)
     given = ["--model", case / "model.xml", "--data", case / "logs", "--out", out, "--seed", "0", "--headless"]
+    given += ["--accuracy", ACCURACY]
     code = command.main([str(a) for a in [*given, *arguments]])
     run.investigate = original
     if "found" in kept:

@@ -100,7 +100,10 @@ def _write(path: Path, content: Any) -> None:
 
 def work(case: Path, out: Path, baselines: bool, arguments: list[str]) -> int:
     """Run one case; the exit code."""
+    from cases import ACCURACY
+
     given = ["--model", case / "model.xml", "--data", case / "logs", "--out", out, "--seed", "0", "--headless"]
+    given += ["--accuracy", ACCURACY]
     code, ended, found = diagnose([str(a) for a in [*given, *arguments]])
     if found is not None:
         started = time.perf_counter()

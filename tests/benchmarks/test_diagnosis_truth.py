@@ -107,6 +107,17 @@ def test_a_lag_loses_its_time_constant_of_impulse():
     assert plant.link()[1][0] == pytest.approx((0.5 - 0.02) / inertia(plant), rel=3e-3)
 
 
+def test_a_limited_rate_loses_half_of_its_ramp():
+    ramp = cause("rate_limit", 1.0)
+    plant = weightless(ramp)
+    ramp.size = ramp.limit * 0.02  # so that 1 is reached in 0.02 s
+    plant.reset(np.zeros(1), np.zeros(1), np.zeros(1))
+    for _ in range(5):
+        plant.advance(np.ones(1))
+    # had each step the command of its end, the impulse would be half a step (0.3 %) too large
+    assert plant.link()[1][0] == pytest.approx((0.1 - 0.01) / inertia(plant), rel=1e-3)
+
+
 def test_a_held_load_winds_up_an_elastic_joint_by_its_compliance():
     plant = truth.Plant(PENDULUM, {}, [cause("joint_elasticity", 0.05)])
     plant.model.dof_damping[:] = 1.0  # come to rest soon

@@ -223,9 +223,9 @@ class RateLimit(ActuatorCause):
         return self.scales.rate[self.where] / max(self.size, self.smallest)
 
     def command(self, plant: Simulated, u: np.ndarray) -> None:
-        reach = self.limit * plant.timestep
-        self.value += min(max(float(u[self.id]) - self.value, -reach), reach)
-        u[self.id] = self.value
+        reach, before = self.limit * plant.timestep, self.value
+        self.value += min(max(float(u[self.id]) - before, -reach), reach)
+        u[self.id] = 0.5 * (before + self.value)  # its mean over the step: its end would be half a step early
 
     def parameters(self) -> dict[str, float]:
         return {"slowness": 1 / self.limit}
