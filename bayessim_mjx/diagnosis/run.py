@@ -163,8 +163,7 @@ def _in_time(stage: Stage, found: Findings, say: Progress, time_left: budget.Bud
 
 
 def _within(setup: Setup, time_left: budget.Budget) -> Setup:
-    limits: dict[str, Any] = {"budget": time_left, "shortlisted": time_left.limited or setup.settings.shortlisted}
-    return replace(setup, settings=replace(setup.settings, **limits))
+    return replace(setup, settings=replace(setup.settings, budget=time_left))
 
 
 def _smaller(criteria: Criteria) -> Criteria:
