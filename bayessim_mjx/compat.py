@@ -54,7 +54,7 @@ def compiler_options() -> dict[str, Any]:
     if jax.default_backend() != "cpu":
         return {}
     try:
-        jax.jit(lambda x: x + 1, compiler_options=options)(0.0)
+        jax.jit(lambda x: x + 1).lower(0.0).compile(options)  # unlike a call, also while jax traces another program
     except jax.errors.JaxRuntimeError:
         return {}
     return options

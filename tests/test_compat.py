@@ -33,3 +33,10 @@ def test_only_arms_and_hands_are_compiled_otherwise():
     if compat.compiler_options():  # on a CPU
         assert not isinstance(compat.program(doubled, ARM), plain)
         assert not isinstance(compat.program(doubled, HAND), plain)
+
+
+def test_whether_the_compiler_knows_the_options_is_found_out_also_inside_of_another_program():
+    """As where a policy is loaded before anything else was compiled: its shapes are those of a traced beginning."""
+    compat.compiler_options.cache_clear()
+    jax.eval_shape(lambda x: compat.program(doubled, ARM)(x), jnp.ones(()))
+    assert jax.default_backend() != "cpu" or "xla_cpu_use_fusion_emitters" in compat.compiler_options()
