@@ -15,13 +15,14 @@ NAMES = (
     *(f"angular_velocity_{i}" for i in "xyz"),
 )
 TURNED = ("to_target_y", "quaternion_x", "quaternion_z", "velocity_y", "angular_velocity_x", "angular_velocity_z")
+WAY = 3.0  # m, the unit of the way to the target
 MAX_SPIN = 4 * np.pi  # rad/s, of the body (each of its axes): `max_angular_velocity` of the assets
 
 
 def flight(target: jax.Array | np.ndarray, qpos: jax.Array, qvel: jax.Array) -> jax.Array:
     """`[13]`, world axes: way to the target / 3 m, quaternion (x, y, z, w), velocity / 2 m/s, turning / pi rad/s."""
     spin = rotation(qpos[3:7]) @ qvel[3:6]  # MuJoCo's is in the body frame
-    return jnp.concatenate([(target - qpos[:3]) / 3, xyzw(qpos[3:7]), qvel[:3] / 2, spin / jnp.pi])
+    return jnp.concatenate([(target - qpos[:3]) / WAY, xyzw(qpos[3:7]), qvel[:3] / 2, spin / jnp.pi])
 
 
 def hovering(

@@ -18,7 +18,7 @@ import numpy as np
 
 from bayessim_mjx.env import Observations, Task
 from bayessim_mjx.physics import World, mjx
-from bayessim_mjx.tasks._flight import MAX_SPIN, NAMES, flight, hovering, left_right
+from bayessim_mjx.tasks._flight import MAX_SPIN, NAMES, WAY, flight, hovering, left_right
 from bayessim_mjx.tasks._scene import FLOOR, scene
 
 ROTORS = (0, 1)
@@ -73,6 +73,9 @@ XML = f"""
       <geom name="mast" type="capsule" fromto="0 0 0.06 0 0 0.2" size="0.008" mass="0" rgba="0.25 0.25 0.27 1"/>
       <geom name="panel" type="box" size="0.08 0.055 0.003" pos="0 0 0.205" mass="0" rgba="0.12 0.16 0.30 1"/>
       {"".join(map(_leg, range(4)))}{"".join(map(_rotor, ROTORS))}
+    </body>
+    <body name="target" mocap="true" pos="0 0 1.5">
+      <geom name="target" type="sphere" size="0.06" mass="0" rgba="0.20 0.60 0.35 0.7"/>
     </body>
   </worldbody>
   <actuator>
@@ -130,6 +133,11 @@ class Ingenuity(Task):
 
     def actuate(self, world: World, action: jax.Array) -> tuple[World, jax.Array]:
         return world, jnp.where(world.task["steps"] == 0, 0.0, self.command(action))
+
+    def marks(self, qpos: np.ndarray, observation: np.ndarray) -> np.ndarray:
+        """The target of each row, from where it is seen."""
+        place = qpos[:, :3] + WAY * observation[:, :3]
+        return np.concatenate([place, np.tile([1.0, 0, 0, 0], (len(qpos), 1))], axis=1)[:, None]
 
     def observe(self, world: World, data: mjx.Data, action: jax.Array) -> Observations:
         return {"policy": flight(self._target(world), world.measurement["qpos"], world.measurement["qvel"])}

@@ -37,12 +37,12 @@ def of_actor(model: mujoco.MjModel, actor: str, actors: Sequence[str], where: st
 
 
 def of_bodies(model: mujoco.MjModel, bodies: Sequence[int], kind: str) -> list[Element]:
-    """Elements of a kind that belong to the bodies, in MuJoCo's order."""
+    """Elements of a kind that belong to the bodies, in MuJoCo's order, but mocap bodies: their mass does nothing."""
     if kind == "option":
         return [Element("", "option", "option")]
     have = attributes.names(model, kind)
     if kind == "body":
-        return [Element(_plain(have[b], "body"), kind, have[b]) for b in bodies]
+        return [Element(_plain(have[b], "body"), kind, have[b]) for b in bodies if model.body_mocapid[b] < 0]
     if kind == "geom":
         return _shapes(model, bodies, have)
     ids = [i for i in range(len(have)) if _owners(model, kind, i) & set(bodies)]

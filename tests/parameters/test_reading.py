@@ -49,6 +49,16 @@ def test_actors_are_subtrees_and_further_shapes_are_numbered():
     assert names[0] == "block_scale_mult" and "block_mass_mult" not in names and "torso_mass_mult" in names
 
 
+def test_marks_of_pictures_have_no_mass():
+    marked = PENDULUM.replace(
+        "</worldbody>",
+        '<body name="goal" mocap="true"><geom size="0.1" contype="0" conaffinity="0"/></body></worldbody>',
+    )
+    for name in ("pendulum", "robot"):
+        section = actor(name, rigid_body_properties={"mass": scaling(0.1, 2)})
+        assert read(marked, section).names == ("pendulum_mass_mult",)
+
+
 def test_free_joints_are_no_dofs_and_tendons_are_interleaved():
     space = read(
         WALKER,

@@ -109,6 +109,15 @@ def test_a_new_target_every_500_steps():
         np.testing.assert_array_equal(env._target(now), targets[:, which])
 
 
+def test_pictures_show_the_target():
+    env, place, target = registry.make("Ingenuity"), np.float32([0.3, -0.6, 1.9]), np.float32([4.0, -2.0, 1.2])
+    qpos, observation = np.zeros((2, 11), np.float32), np.zeros((2, 13), np.float32)
+    qpos[1, :3], observation[1, :3] = place, (target - place) / 3
+    marks = env.marks(qpos, observation)
+    assert marks.shape == (2, env.mj_model.nmocap, 7)
+    np.testing.assert_allclose(marks[1, 0], [*target, 1, 0, 0, 0], atol=1e-6)
+
+
 @pytest.mark.parametrize(("variant", "reach"), [("isaacgymenvs", 5.0), ("bayessim2021", 1.0)])
 def test_resets_and_targets(variant, reach):
     env, keys = registry.make("Ingenuity", variant=variant), jax.random.split(jax.random.PRNGKey(0), 1500)
