@@ -13,6 +13,8 @@ import json
 import re
 import subprocess
 import sys
+import tempfile
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +23,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from PIL import Image
 
 from bayessim_mjx import cli, registry
 from bayessim_mjx.config import load
@@ -32,10 +35,11 @@ from bayessim_mjx.rl import pretrained
 FOLDER = Path(__file__).parent / "pictures" / "tasks"
 PAGE = Path(__file__).with_name("tasks.md")
 LARGEST, SECONDS, WIDTH, HEIGHT, FPS = 200_000, 5.0, 280, 210, 15
+LENGTHS = ((SECONDS, FPS), (SECONDS, 12.5), (3.5, 12.5), (3.0, 12.5), (3.0, 10))  # s and frames/s, tried in turn
 SWAY, PERIOD = 0.15, 2.0  # share of a range by which a command moves to and fro; s
 FALLEN = 0.4  # by which share of its height a robot falls or rises until its film begins anew
-COLOURS = (64, 40, 24, 16)  # tried until the film is small enough
-FILTER = "fps={fps},split[a][b];[a]palettegen=max_colors={colours}[p];[b][p]paletteuse=dither=none:diff_mode=rectangle"
+COLOURS = (64, 40, 24)  # tried with each of these until the film is small enough
+FILTER = "[0:v]fps={fps}[a];[a][1:v]paletteuse=dither=none:diff_mode=rectangle"
 
 
 class Swaying(film.Motion):
@@ -43,6 +47,16 @@ class Swaying(film.Motion):
 
     def captions(self) -> list[str]:
         return [f"{self.dt * k:.2f} s" for k in range(len(self.qpos))]
+
+
+@dataclass(frozen=True)
+class Episodes(film.Motion):
+    """Several episodes, one after the other."""
+
+    lines: tuple[str, ...] = ()
+
+    def captions(self) -> list[str]:
+        return list(self.lines)
 
 
 def of_run(task: str, folder: Path) -> tuple[film.Motion, Any, str]:
@@ -61,8 +75,16 @@ def of_package(task: str) -> tuple[film.Motion, Any, str]:
 
 
 def _acting(env: Any, policy: Any) -> film.Motion:
-    theta = jnp.asarray(env.space.nominal, jnp.float32)
-    return film.motion(env, policy, jax.random.PRNGKey(0), theta, round(SECONDS / env.dt))
+    """An episode, or as many as fill the film."""
+    theta, shown, steps = jnp.asarray(env.space.nominal, jnp.float32), [], round(SECONDS / env.dt)
+    while sum(len(one.total) for one in shown) < steps:
+        key = jax.random.PRNGKey(len(shown))
+        shown.append(film.motion(env, policy, key, theta, min(steps, env.episode_length)))
+    if len(shown) == 1:
+        return shown[0]
+    qpos, total = (np.concatenate([getattr(one, name) for one in shown]) for name in ("qpos", "total"))
+    marks = None if shown[0].mocap is None else np.concatenate([one.mocap for one in shown])
+    return Episodes(qpos, total, shown[0].dt, mocap=marks, lines=tuple(x for one in shown for x in one.captions()))
 
 
 def swaying(task: str) -> tuple[film.Motion, Any, str]:
@@ -103,15 +125,43 @@ def motion_of(task: str, runs: Path | None) -> tuple[film.Motion, Any, str]:
     return of_package(task) if task in pretrained.names() else swaying(task)
 
 
+def palette(frames: np.ndarray, count: int) -> np.ndarray:
+    """The colours [count, 3] of a film, by k-means over the square roots of how often each is there.
+
+    Going by the pixels alone, the tones of the ground would leave nothing for a small ball or the robot's body.
+    """
+    sample = frames[:: max(1, len(frames) // 12), ::2, ::2].reshape(-1, 3)
+    _, which, often = np.unique(sample // 8 @ [1024, 32, 1], return_inverse=True, return_counts=True)
+    colours = np.stack([np.bincount(which, channel) for channel in sample.T], axis=1) / often[:, None]
+    weight = np.sqrt(often)
+    chosen = colours[[weight.argmax()]]
+    for _ in range(count - 1):  # each begins where most is far from all before
+        far = ((colours[:, None] - chosen) ** 2).sum(-1).min(1)
+        chosen = np.vstack([chosen, colours[(weight * far).argmax()]])
+    for _ in range(20):
+        nearest = ((colours[:, None] - chosen) ** 2).sum(-1).argmin(1)
+        for k in np.unique(nearest):
+            chosen[k] = np.average(colours[nearest == k], axis=0, weights=weight[nearest == k])
+    return chosen.round().astype(np.uint8)
+
+
 def gif(frames: np.ndarray, path: Path) -> int:
-    """Write frames [T, H, W, 3] at 25 frames a second with as many colours as fit; bytes of the file."""
+    """Write frames [T, H, W, 3] at 25 frames a second with as many colours as fit; bytes of the file.
+
+    Where the camera moves along, all of the picture changes: such films are rather shorter than a row of stills.
+    """
     source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{WIDTH}x{HEIGHT}", "-r", f"{film.FPS}", "-i", "-"]
-    for fps, colours in itertools.product((FPS, 10, 7), COLOURS):
-        words = ["-filter_complex", FILTER.format(fps=fps, colours=colours), "-loop", "0", str(path)]
-        command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error", *source, *words]
-        subprocess.run(command, input=frames.tobytes(), check=True, capture_output=True)
-        if path.stat().st_size <= LARGEST:
-            break
+    with tempfile.TemporaryDirectory() as folder:
+        colours = Path(folder) / "colours.png"
+        for (seconds, fps), count in itertools.product(LENGTHS, COLOURS):
+            shown = frames[: round(seconds * film.FPS)]
+            few = palette(shown, count)
+            Image.fromarray(few[np.arange(256) % count].reshape(16, 16, 3)).save(colours)
+            words = ["-i", str(colours), "-filter_complex", FILTER.format(fps=fps), "-loop", "0", str(path)]
+            command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error", *source, *words]
+            subprocess.run(command, input=shown.tobytes(), check=True, capture_output=True)
+            if path.stat().st_size <= LARGEST:
+                break
     return path.stat().st_size
 
 
@@ -122,7 +172,7 @@ def make(task: str, runs: Path | None) -> str | None:
     if frames is None:
         return None
     path = FOLDER / f"{_snake(task)}.gif"
-    print(f"{path}: {gif(frames, path) / 1000:.0f} kB, {(len(shown.qpos) - 1) * shown.dt:.1f} s, {words}")
+    print(f"{path}: {gif(frames, path) / 1000:.0f} kB, {words}")
     return words
 
 
