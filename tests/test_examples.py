@@ -74,15 +74,25 @@ def test_hidden_reward(run: Run) -> None:
 
 @pytest.mark.slow
 @pytest.mark.ci
-def test_a_servo_is_converted_and_adapted_to(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """On two logs in the form of Rhoban's, of a servo in MuJoCo."""
+def test_logs_of_a_servo_are_converted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two logs in the form of Rhoban's, of a servo in MuJoCo."""
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    import convert_xl330
+
+    logs = convert_xl330.convert(tmp_path / "csv", _recorded(tmp_path / "raw"))
+    first = np.genfromtxt(logs[0], delimiter=",", names=True)
+    assert len(logs) == 2 and first["ctrlmotor"][1] == pytest.approx(-100 / 885 * 7.4)  # a register without sign
+    sys.modules.pop("convert_xl330")
+
+
+# not in CI: a loop on its logs is that of tests/loop/test_recorded.py, replays of this servo those of
+# tasks/test_servo_pendulum.py, the picture that of monitor/test_plots.py
+@pytest.mark.slow
+def test_a_servo_is_adapted_to(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     raw = _recorded(tmp_path / "raw")
     monkeypatch.syspath_prepend(str(EXAMPLES))
     import convert_xl330
 
-    (log, *_) = convert_xl330.convert(tmp_path / "csv", raw)
-    first = np.genfromtxt(log, delimiter=",", names=True)
-    assert first["ctrlmotor"][1] == pytest.approx(-100 / 885 * 7.4)  # a register without sign
     monkeypatch.setattr(convert_xl330, "RAW", raw)
     monkeypatch.setattr(convert_xl330, "convert", functools.partial(convert_xl330.convert, raw=raw))
     out = run("adapt_servo", "--out", tmp_path, "ppo.max_iterations=0")  # other tests train

@@ -13,7 +13,7 @@ from bayessim_mjx.diagnosis.summary import assemble, preliminary
 
 from .pendulums import FEW, nominal, recorded
 
-pytestmark = [pytest.mark.slow, pytest.mark.ci]  # whole diagnoses and fits
+pytestmark = pytest.mark.slow  # whole diagnoses and fits
 
 WRONG = (1.15, 0.88, 1.1)
 ENOUGH = {"count": 6, "seconds": 2.5}  # logs
@@ -44,6 +44,7 @@ def rubbing(place):
     return diagnosed(place, recorded(friction=0.04, scale=(0.9, 1.1, 0.95), **ENOUGH))
 
 
+@pytest.mark.ci
 def test_dry_friction_is_named_with_its_level(rubbing):
     found, diagnosis = rubbing
     assert diagnosis.verdict == "effects"
@@ -64,6 +65,7 @@ def test_dry_friction_is_named_with_its_level(rubbing):
     assert found.setup.fitter.simulator.traces == 1
 
 
+@pytest.mark.ci
 def test_what_the_answer_rests_on_comes_with_it(rubbing):
     """Finalists, the known parameters among them, refitted without each condition and simulated; all others beside."""
     found, diagnosis = rubbing
@@ -80,6 +82,7 @@ def test_what_the_answer_rests_on_comes_with_it(rubbing):
     assert any("chosen anew" in text for text in diagnosis.sentences)
 
 
+@pytest.mark.ci
 def test_what_is_known_is_on_disk_before_the_search_ends(rubbing, place):
     first, base, singles, pairs = (json.loads((place / "so_far" / f"{k}.json").read_text()) for k in range(4))
     assert first["warnings"][0] == "a note" and first["windows"] > 6 and "gap" not in first
@@ -88,6 +91,7 @@ def test_what_is_known_is_on_disk_before_the_search_ends(rubbing, place):
     assert best["label"] == "coulomb_friction@hinge" and best["gap_closed"] > 0.8 and pairs["verdict"] is None
 
 
+@pytest.mark.ci
 def test_the_gap_shrinks_from_stage_to_stage(rubbing):
     gap = rubbing[1].gap
     assert gap.noise_floor == 1.0
@@ -100,6 +104,7 @@ def test_the_gap_shrinks_from_stage_to_stage(rubbing):
             assert low <= row[stage] * 1.01 and row[stage] <= high * 1.01
 
 
+@pytest.mark.ci
 def test_candidates_are_ranked_the_winner_first(rubbing):
     candidates = rubbing[1].candidates
     assert "coulomb_friction@hinge" in candidates[0]["effects"]
@@ -109,6 +114,7 @@ def test_candidates_are_ranked_the_winner_first(rubbing):
     assert alone["score"] > 0.9 * candidates[0]["score"] and alone["se"] > 0 and 0 <= alone["absorbed"] <= 1
 
 
+@pytest.mark.ci
 def test_known_parameters_come_with_it(rubbing):
     parameters = rubbing[1].parameters
     assert len(parameters) == 3
@@ -116,6 +122,7 @@ def test_known_parameters_come_with_it(rubbing):
     assert abs(mass["mean"] - 0.95) < max(0.02, 4 * mass["sd"]) and mass["low"] == 0.8 and mass["high"] == 1.2
 
 
+@pytest.mark.ci
 def test_the_file_has_every_key_and_no_nan(rubbing, tmp_path):
     _, diagnosis = rubbing
     text = diagnosis.save(tmp_path).read_text()
@@ -134,6 +141,7 @@ def test_the_file_has_every_key_and_no_nan(rubbing, tmp_path):
     json.loads((tmp_path / "details.json").read_text(), parse_constant=refuse)
 
 
+@pytest.mark.ci
 def test_what_was_saved_is_what_is_loaded(rubbing, tmp_path):
     _, diagnosis = rubbing
     diagnosis.save(tmp_path / "a")
@@ -145,6 +153,7 @@ def test_what_was_saved_is_what_is_loaded(rubbing, tmp_path):
         assert (tmp_path / "a" / name).read_text() == (tmp_path / "b" / name).read_text()
 
 
+@pytest.mark.ci
 def test_a_file_of_before_is_read_and_its_probability_told_as_a_weight(rubbing, tmp_path):
     path = rubbing[1].save(tmp_path)
     raw = json.loads(path.read_text())
@@ -156,8 +165,7 @@ def test_a_file_of_before_is_read_and_its_probability_told_as_a_weight(rubbing, 
         np.testing.assert_equal(result.load(tmp_path).effects[0].weight_among_rivals, expected)
 
 
-@pytest.mark.slow
-@pytest.mark.ci
+# not in CI: this verdict and parameters are found in test_fast_logs.py
 def test_wrong_known_parameters_are_no_effect(tmp_path):
     _, diagnosis = diagnosed(tmp_path, recorded(scale=WRONG, seed=1, **ENOUGH))
     assert diagnosis.verdict == "parameters" and diagnosis.effects == []
@@ -168,15 +176,14 @@ def test_wrong_known_parameters_are_no_effect(tmp_path):
         assert not found["structural"], name
 
 
-@pytest.mark.slow
-@pytest.mark.ci
+# not in CI: this verdict is given in test_one_call.py::test_logs_in_memory_and_a_compiled_model_leave_no_files
 def test_nothing_wrong_is_no_gap(tmp_path):
     _, diagnosis = diagnosed(tmp_path, recorded(seed=2, **ENOUGH))
     assert diagnosis.verdict == "no_gap" and diagnosis.effects == []
     assert diagnosis.gap.with_effects == pytest.approx(1.0, abs=0.25)
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_an_effect_that_is_not_on_offer_is_unexplained(tmp_path):
     logs = recorded(friction=0.08, scale=(1.1, 0.92, 1.05), seed=4, **ENOUGH)
     _, diagnosis = diagnosed(tmp_path, logs, ("actuator_delay", "payload"))
@@ -184,6 +191,7 @@ def test_an_effect_that_is_not_on_offer_is_unexplained(tmp_path):
     assert np.isfinite(diagnosis.gap.with_effects) and diagnosis.gap.with_effects > 1.5
 
 
+@pytest.mark.ci
 def test_too_little_data_is_said(tmp_path):
     with pytest.raises(TooLittleData, match="windows|control steps"):
         run.investigate(nominal(tmp_path), recorded(count=1, seconds=2.0), ("actuator_delay",))

@@ -116,8 +116,9 @@ def test_checkpoint_steps_grow_and_rounds_are_evaluated(finished):
     assert [value for _, value in evaluated] == [pytest.approx(info.returns.mean()) for info in rounds]
 
 
+# not in CI: that nothing is compiled again is told of inference by test_ranges.py::test_another_move_compiles_nothing,
+# of training by rl/test_train.py::test_one_program_for_every_seed_domain_and_number_of_iterations
 @pytest.mark.slow
-@pytest.mark.ci
 def test_later_rounds_compile_nothing(env):
     """Prior or posterior, more data, more real trajectories: the same programs."""
     parts = loop.make(settings("bayessim.realIters=3"), env)
