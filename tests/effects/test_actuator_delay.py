@@ -1,5 +1,7 @@
 """A delayed staircase, by hand: a free mass integrates the force, so its speed is the impulse."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -23,16 +25,22 @@ XML = """
 DT = 0.02
 
 
-def speeds(effects, theta, commands):
-    """Speeds `[T, 2]` of the two masses after each control step."""
+@functools.cache
+def simulation(*places, **longest):
+    """(theta, commands) -> speeds of delays at these places, compiled once for all tests that ask for it."""
+    effects = [make("actuator_delay", where=where, **longest) for where in places]
     p = Physics(mujoco.MjModel.from_xml_string(XML), DT, ParameterSpace(), effects)
 
     def body(world, command):
         world, _ = control_step(p, world, command)
         return world, world.qvel
 
-    world = p.world(jnp.asarray(theta, jnp.float32))
-    return np.asarray(jax.jit(lambda w, c: jax.lax.scan(body, w, c)[1])(world, jnp.asarray(commands, jnp.float32)))
+    return jax.jit(lambda theta, commands: jax.lax.scan(body, p.world(theta), commands)[1])
+
+
+def speeds(run, theta, commands):
+    """Speeds `[T, 2]` of the two masses after each control step."""
+    return np.asarray(run(np.float32(theta), np.float32(commands)))
 
 
 def delayed_impulse(commands, delay):
@@ -46,22 +54,21 @@ def delayed_impulse(commands, delay):
 @pytest.mark.parametrize("delay", [0.0, 0.005, 0.0123, 0.02, 0.0311, 0.1])
 def test_impulse_is_exact_for_any_delay(delay):
     commands = np.array([0.5, 1.0, -2.0, 3.0, 0.0, 0.0, 1.0, -1.0, 2.0, 0.3])
-    v = speeds([make("actuator_delay", where="all")], [delay], np.c_[commands, 2 * commands])
+    v = speeds(simulation("all"), [delay], np.c_[commands, 2 * commands])
     want = delayed_impulse(commands, delay)
     np.testing.assert_allclose(v, np.c_[want, 2 * want], atol=1e-5)
 
 
 def test_one_actuator_alone():
     commands = np.array([0.0, 1.0, 1.0, 1.0])
-    v = speeds([make("actuator_delay", where="b", high=0.05)], [0.04], np.c_[commands, commands])
+    v = speeds(simulation("b", high=0.05), [0.04], np.c_[commands, commands])
     np.testing.assert_allclose(v[:, 0], delayed_impulse(commands, 0.0), atol=1e-6)
     np.testing.assert_allclose(v[:, 1], delayed_impulse(commands, 0.04), atol=1e-6)
 
 
 def test_delays_add():
     commands = np.array([0.0, 1.0, -1.0, 2.0, 0.0, 1.0])
-    two = [make("actuator_delay", where="a"), make("actuator_delay", where="all")]
-    v = speeds(two, [0.015, 0.025], np.c_[commands, commands])
+    v = speeds(simulation("a", "all"), [0.015, 0.025], np.c_[commands, commands])
     np.testing.assert_allclose(v[:, 0], delayed_impulse(commands, 0.04), atol=1e-5)
     np.testing.assert_allclose(v[:, 1], delayed_impulse(commands, 0.025), atol=1e-5)
 
@@ -83,7 +90,7 @@ def test_the_gradient_exists():
 
 def test_refusals():
     with pytest.raises(ValueError, match="no actuator 'c'.*a, b"):
-        speeds([make("actuator_delay", where="c")], [0.0], np.zeros((1, 2)))
+        simulation("c")
     with pytest.raises(ValueError, match="high = 0"):
         make("actuator_delay", where="a", high=0.0)
     with pytest.raises(ValueError, match="did you mean actuator_delay"):
