@@ -94,7 +94,7 @@ def init(key: Array, settings: InferenceSettings, dim_x: int, d: int, count: Arr
     several = (count > 1).astype(jnp.float32)
     biases = layers[-1]["b"].at[k : k + k * d].set(0.7 * several * spread)
     layers[-1] = {"w": layers[-1]["w"] * several, "b": biases}
-    more["used"] = jnp.where(jnp.arange(k, dtype=jnp.int32) < count, 0.0, UNUSED)
+    more["used"] = jnp.where(jnp.arange(k, dtype=jnp.int32) < count, np.float32(0), np.float32(UNUSED))
     # set by held-out rows: factor on all precisions' square roots, log weight in the ensemble, whose network it is
     share = jnp.asarray(-np.log(settings.ensemble), jnp.float32)
     more = {**more, "sharpness": jnp.ones(()), "share": share, "member": jnp.asarray(0, jnp.int32)}

@@ -147,6 +147,12 @@ def test_a_resumed_run_is_the_unkilled_run_bit_for_bit(finished, parts, stop):
     np.testing.assert_array_equal(later[-1].returns, rounds[-1].returns)
 
 
+def test_a_state_comes_back_from_disk_as_it_was(finished):
+    """A weak type is lost there, and a run that goes on would compile its fit again."""
+    leaves = jax.tree_util.tree_leaves_with_path(finished[0])
+    assert [jax.tree_util.keystr(path) for path, x in leaves if getattr(x, "weak_type", False)] == []
+
+
 def test_another_seed_draws_other_trajectories(env, finished):
     other = loop.make(settings("seed=1"), env)
     draws = other.source.real(other.key(0, "real"), 0, 2, rl.policy_of(finished[0].train))[0]
