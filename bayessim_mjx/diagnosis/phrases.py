@@ -137,6 +137,14 @@ def far_from_data_sheet(value: float, away: float) -> str:
     return f"is {value:.4g}, {away:.1f} sd from the data sheet"
 
 
+def less_accurate(assumed: float, found: float) -> str:
+    """Of all known parameters whose accuracy nobody stated."""
+    return (
+        f"known parameters lie farther from the model than the {assumed:.0%} that a data sheet is taken to be accurate "
+        f"to, and were left as free as {found:.0%} would leave them; --accuracy states how accurate they are"
+    )
+
+
 def moves(spread: float, groups: int) -> str:
     """Of a known parameter that differs between operating conditions."""
     return f"moves between operating conditions (sd {spread:.3g} over {groups}): structure is missing"

@@ -150,7 +150,7 @@ def prepare(
     physics = physics_of(robot, dt, stack)
     most = _limit(physics, step.errors.cut.steps if step.errors else cuts(1).steps, quick)
     cut = step.noisier(cuts(step.factor, limit=most, centred=False, late=lead))
-    base = candidates.base_coordinates(robot.space, robot.accuracy)
+    base = candidates.base_coordinates(robot.space, robot.accuracy, robot.assumed)
     fitter = Fitter(Simulator(physics, cut), base, physics.space.nominal)
     led = leads.lead(candidates.enumerate_candidates(physics), before)
     settings = dataclasses.replace(settings or _settings(robot, quick), believed=step.believed, **led.order)

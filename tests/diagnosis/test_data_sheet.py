@@ -1,6 +1,7 @@
 """What a data sheet states, as it is typed; and how such a prior weighs in a fit."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import mujoco
 import numpy as np
@@ -9,7 +10,9 @@ import pytest
 from bayessim_mjx.diagnosis import data_sheet
 from bayessim_mjx.diagnosis.fitting import robot
 from bayessim_mjx.diagnosis.fitting.candidates import Coordinate, base_coordinates
+from bayessim_mjx.diagnosis.fitting.fit import SURE
 from bayessim_mjx.diagnosis.fitting.fitter import Fit
+from bayessim_mjx.diagnosis.summary import assemble
 from bayessim_mjx.errors import UserError
 
 ARM = """<mujoco><worldbody><body name="upper"><joint name="shoulder" damping="1"/><geom size=".1" mass="2"/>
@@ -72,3 +75,49 @@ def test_stated_priors_weigh_as_the_misfit_says():
     assert wrong.prior()[0] == pytest.approx([3600.0, 400.0]) and wrong.belief() == pytest.approx([400.0, 400.0])
     assert wrong.prior()[1] == pytest.approx([-180.0, -20.0])
     assert fit.penalty(fit.values, stated=True) == pytest.approx(1.0) == fit.penalty(fit.values)
+
+
+def assumed_fit(off, own=3, accuracy=0.05):
+    """Known parameters of assumed accuracy, each so far off its value of 1, and one that is stated and far off."""
+    every = [
+        Coordinate(str(i), (i,), 1.0, 0.5, 1.5, accuracy**-2, stated=True, assumed=i < own) for i in range(own + 1)
+    ]
+    values = np.array([1.0 + off] * own + [1.3])
+    blank = np.zeros((1, 1, own + 1))
+    return Fit(tuple(every), values, blank[0], blank[0], blank, blank[:, :, :1], np.ones(1), 0.0)
+
+
+def test_an_assumed_accuracy_gives_way_where_parameters_lie_farther_off_together():
+    near, far = assumed_fit(0.05), assumed_fit(0.2)
+    assert near.trust() == pytest.approx(1.0) and near.penalty(near.values, stated=True) == pytest.approx(3 + 36)
+    share = (SURE + 3) / (SURE + 48)
+    assert far.trust() == pytest.approx(share)
+    assert far.belief() == pytest.approx([400 * share] * 3 + [400])  # what is stated stays as it is
+    assert far.penalty(far.values, stated=True) == pytest.approx(3 - (SURE + 3) * np.log(share) + 36)
+
+
+@pytest.mark.parametrize("off", [0.02, 0.0501, 0.1, 0.25])
+def test_the_pull_of_a_prior_is_the_slope_of_its_penalty(off):
+    fit, h = assumed_fit(off), 1e-6
+    for i in range(4):
+        step = np.eye(4)[i] * h
+        sides = [fit.penalty(fit.values + sign * step, stated=True) for sign in (1, -1)]
+        assert fit.prior()[1][i] == pytest.approx(-0.5 * (sides[0] - sides[1]) / (2 * h), rel=1e-4)
+
+
+def test_an_accuracy_is_assumed_where_nobody_states_one(arm, tmp_path):
+    assert arm.assumed == set(arm.space.names)
+    masses = {p.name for p in arm.space.parameters if p.attribute == "mass"}
+    assert arm.stated(("mass=2%",)).assumed == arm.assumed - masses
+    assert not arm.stated(("10%",)).assumed
+    own = {c.name for c in base_coordinates(arm.space, arm.accuracy, arm.assumed) if c.assumed}
+    assert own == arm.assumed and not any(c.assumed for c in base_coordinates(arm.space, arm.accuracy))
+
+
+def test_a_result_warns_where_the_assumed_accuracy_gave_way():
+    def of(fit):
+        return assemble._less_accurate(SimpleNamespace(fit=fit))
+
+    assert of(assumed_fit(0.05)) == []
+    (text,) = of(assumed_fit(0.2))  # as free as 5 % * ((4 + 48) / (4 + 3)) ** .5 would leave them
+    assert "5%" in text and "14%" in text and "--accuracy" in text

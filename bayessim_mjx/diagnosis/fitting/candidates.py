@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import mujoco
@@ -31,6 +31,8 @@ class Coordinate:
         precision: of a Gaussian prior around neutral, 1/unit^2 (0: flat between the bounds).
         stated: the prior is what a data sheet states. It then weighs as much as the misfit says that the data know:
             while an effect is missing, no parameter takes its place because the noise alone is small.
+        assumed: nobody stated how accurate it is: where known parameters lie farther off together than that, their
+            priors give way (`Fit.trust`).
         unit: for people.
     """
 
@@ -42,6 +44,7 @@ class Coordinate:
     precision: float = 0.0
     unit: str = ""
     stated: bool = False
+    assumed: bool = False
 
     @property
     def step(self) -> float:
@@ -72,17 +75,23 @@ class Candidate:
         return f"{self.effect}@{self.where}"
 
 
-def base_coordinates(space: ParameterSpace, accuracy: Mapping[str, float] | None = None) -> tuple[Coordinate, ...]:
+def base_coordinates(
+    space: ParameterSpace, accuracy: Mapping[str, float] | None = None, assumed: Collection[str] = ()
+) -> tuple[Coordinate, ...]:
     """The parameters that the simulator already has, Gaussian where a data sheet states them, else nearly flat.
 
     Args:
-        accuracy: {name: standard deviation as a share of the nominal value}, of those that are stated.
+        accuracy: {name: standard deviation as a share of the nominal value}, of those that a data sheet states.
+        assumed: names of those of which nobody said how accurate they are.
     """
-    stated = accuracy or {}
-    return tuple(
-        Coordinate(p.name, (i,), p.nominal, p.low, p.high, _precision(p, stated.get(p.name)), p.unit, p.name in stated)
-        for i, p in enumerate(space.parameters)
-    )
+    known = accuracy or {}
+
+    def coordinate(i: int, p: Parameter) -> Coordinate:
+        precision = _precision(p, known.get(p.name))
+        own = Coordinate(p.name, (i,), p.nominal, p.low, p.high, precision, p.unit)
+        return replace(own, stated=p.name in known, assumed=p.name in assumed)
+
+    return tuple(coordinate(i, p) for i, p in enumerate(space.parameters))
 
 
 def _precision(p: Parameter, accuracy: float | None) -> float:

@@ -12,6 +12,8 @@ from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
 from bayessim_mjx.diagnosis.fitting.quadratic import Quadratic, Starts, eliminate
 
 Array = NDArray[np.float64]
+# How sure it is what nobody stated: the accuracy that is assumed of a data sheet is worth so many known parameters.
+SURE = 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,9 +47,22 @@ class Fit:
     def names(self) -> tuple[str, ...]:
         return tuple(c.name for c in self.coordinates)
 
+    def trust(self) -> float:
+        """By which precisions of assumed accuracy are multiplied: 1, and less where known parameters lie farther off.
+
+        The prior of all of them together is a Student t's in its tails: their common standard deviation is not known.
+        """
+        off, n = self._off(self.values)
+        return min(1.0, (SURE + n) / (SURE + off))
+
+    def _off(self, values: Array) -> tuple[float, int]:
+        """Squared standard deviations by which all parameters of assumed accuracy are off, and how many those are."""
+        own = [(c, v) for c, v in zip(self.coordinates, values, strict=True) if c.assumed]
+        return float(sum(c.precision * (v - c.neutral) ** 2 for c, v in own)), len(own)
+
     def prior(self) -> tuple[Array, Array, Array, Array]:
         """(precision, pull, room below, room above), `[k]` each, in units of the cost."""
-        precision = np.array([c.precision * (self.doubt if c.stated else 1.0) for c in self.coordinates])
+        precision = self.belief() * np.array([self.doubt if c.stated else 1.0 for c in self.coordinates])
         neutral = np.array([c.neutral for c in self.coordinates])
         low = np.array([c.low for c in self.coordinates]) - self.values
         high = np.array([c.high for c in self.coordinates]) - self.values
@@ -55,12 +70,16 @@ class Fit:
 
     def belief(self) -> Array:
         """Precision of the priors `[k]` in units of the parameters, for use beside a curvature in nats."""
-        return np.array([c.precision for c in self.coordinates])
+        trust = self.trust()
+        return np.array([c.precision * (trust if c.assumed else 1.0) for c in self.coordinates])
 
     def penalty(self, values: Array, stated: bool = False) -> float:
-        """Of the priors, as they are: of parameters that are stated, or of the others."""
+        """Of the priors, as they are: of parameters that are stated (of assumed accuracy too), or of the others."""
         pairs = zip(self.coordinates, values, strict=True)
-        return float(sum(c.precision * (v - c.neutral) ** 2 for c, v in pairs if c.stated == stated))
+        surely = sum(c.precision * (v - c.neutral) ** 2 for c, v in pairs if c.stated == stated and not c.assumed)
+        off, n = self._off(values) if stated else (0.0, 0)
+        tail = (SURE + n) * np.log((SURE + max(off, n)) / (SURE + n))  # its derivative is `trust`
+        return float(surely + min(off, n) + tail)
 
     def quadratic(self, spread: Array) -> tuple[Quadratic, Starts]:
         return eliminate(self.r, self.A, self.B, self.offsets, spread)

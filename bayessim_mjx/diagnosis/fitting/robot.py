@@ -41,6 +41,7 @@ class Robot:
         name: the task's, or the file's without its ending.
         max_qvel: the task's limit of simulated speeds, see `Physics`.
         accuracy: {parameter: standard deviation as a share}, of what a data sheet states; rating: {body: kg carried}.
+        assumed: those of them whose accuracy nobody stated.
     """
 
     mj_model: mujoco.MjModel
@@ -51,17 +52,19 @@ class Robot:
     max_qvel: float | Sequence[float] | None = None
     accuracy: Mapping[str, float] = dataclasses.field(default_factory=dict)
     rating: Mapping[int, float] = dataclasses.field(default_factory=dict)
+    assumed: frozenset[str] = frozenset()
 
     def stated(self, accuracy: Sequence[str] = (), payload: Sequence[str] = ()) -> "Robot":
         """With what was said of its data sheet, as `--accuracy` and `--payload` (`data_sheet`)."""
         shares = data_sheet.accuracies(accuracy, self.space, None)
         rated = data_sheet.rating(payload, self.mj_model)
-        return dataclasses.replace(self, accuracy={**self.accuracy, **shares}, rating={**self.rating, **rated})
+        own = dataclasses.replace(self, accuracy={**self.accuracy, **shares}, assumed=self.assumed - shares.keys())
+        return dataclasses.replace(own, rating={**self.rating, **rated})
 
     def _from_data_sheet(self, own: bool) -> "Robot":
         """A model's own numbers are taken for a data sheet's; ranges of a file say themselves what is known."""
         accuracy = data_sheet.accuracies((), self.space, data_sheet.ACCURACY) if own else {}
-        return dataclasses.replace(self, accuracy=accuracy)
+        return dataclasses.replace(self, accuracy=accuracy, assumed=frozenset(accuracy))
 
     def physics(
         self, control_dt: float, effects: Sequence[Effect] = (), space: ParameterSpace | None = None
@@ -84,8 +87,10 @@ def robot_of(source: Source, parameters: str | Path | None = None) -> Robot:
         UserError: see `of_file`.
     """
     if isinstance(source, Robot):
-        space = source.space if parameters is None else read_params(parameters, source.mj_model)
-        return dataclasses.replace(source, space=space, accuracy=source.accuracy if parameters is None else {})
+        if parameters is None:
+            return source
+        space = read_params(parameters, source.mj_model)
+        return dataclasses.replace(source, space=space, accuracy={}, assumed=frozenset())
     if isinstance(source, mujoco.MjModel):
         name = bytes(source.names).split(b"\0")[0].decode() or "model"
         _check(source, name)
@@ -122,9 +127,8 @@ def of_file(path: str | Path, parameters: str | Path | None = None) -> Robot:
 
 def _of_spec(spec: mujoco.MjSpec, source: str, name: str, parameters: str | Path | None) -> Robot:
     if int(spec.option.integrator) == _IMPLICIT:
-        warnings.warn(
-            f"{source}: MJX has no integrator implicit; implicitfast is used (no Coriolis terms)", stacklevel=3
-        )
+        text = f"{source}: MJX has no integrator implicit; implicitfast is used (no Coriolis terms)"
+        warnings.warn(text, stacklevel=3)
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     model = _compiled(spec, source)
     _check(model, source)
@@ -169,9 +173,8 @@ def _check(model: mujoco.MjModel, source: str) -> None:
         raise UserError(f"{source}: MJX cannot simulate this model: it has plugins")
     ignored = [what for field, what in _IGNORED.items() if np.any(getattr(model, field, 0.0))]
     if ignored:
-        warnings.warn(
-            f"{source}: MJX leaves out {', '.join(ignored)}: effects may be found in their place", stacklevel=3
-        )
+        text = f"{source}: MJX leaves out {', '.join(ignored)}: effects may be found in their place"
+        warnings.warn(text, stacklevel=3)
     try:
         mjx.make_data(mjx.put_model(model, impl="jax"))
     except (NotImplementedError, ValueError, TypeError) as error:
@@ -195,10 +198,7 @@ _IGNORED = {  # in the model but not in MJX's equations
 
 def _remedy(message: str) -> str:
     """What to change in the MJCF."""
-    for word, remedy in _REMEDIES.items():
-        if word in message:
-            return f" ({remedy})"
-    return ""
+    return next((f" ({remedy})" for word, remedy in _REMEDIES.items() if word in message), "")
 
 
 _REMEDIES = {

@@ -64,7 +64,7 @@ def _linear(tried: Tried, effects: Sequence[Candidate]) -> tuple[Quadratic, Arra
     moved = fitter.whiten(fitter.simulator.run(np.stack(thetas), np.repeat(fit.offsets[None], len(thetas), 0)))
     A = np.concatenate([fit.A, np.moveaxis(fit.r[None] - moved, 0, -1)], axis=2)
     q, _ = eliminate(fit.r, A, fit.B, fit.offsets, fitter.spread)
-    known = [c.precision for c in fit.coordinates]
+    known = fit.belief()
     return q, np.array([*known, *(_precision(e, s) for e, s in pairs)]), np.array([_furthest(e, s) for e, s in pairs])
 
 

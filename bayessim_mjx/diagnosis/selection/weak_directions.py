@@ -68,7 +68,7 @@ def scales(fit: Fit) -> Array:
 
 def beliefs(fit: Fit, base: int) -> Array:
     """Precisions `[k]` of what was believed beforehand: the first `base` parameters at least as a uniform one."""
-    precision = np.array([c.precision for c in fit.coordinates])
+    precision = fit.belief()
     precision[:base] = np.maximum(precision[:base], 1.0 / scales(fit)[:base] ** 2)
     return precision
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from bayessim_mjx import versions
-from bayessim_mjx.diagnosis import phrases, statistics
+from bayessim_mjx.diagnosis import data_sheet, phrases, statistics
 from bayessim_mjx.diagnosis.experiment.propose import Experiment
 from bayessim_mjx.diagnosis.findings import Findings, Where
 from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
@@ -27,6 +27,7 @@ from bayessim_mjx.logs.log import Channels
 # standard deviations from what a data sheet states, from where on that is told: by chance of one normal value in 22.
 # How often it is told wrongly of fitted values was not counted.
 FAR = 2.0
+WORSE = 1.5  # times the accuracy assumed of a data sheet, from where on known parameters are told to ask for another
 PACKAGES = ("bayessim-mjx", "mujoco", "mujoco-mjx", "jax", "numpy")  # what the result depends on
 
 
@@ -62,7 +63,7 @@ def diagnosis_of(found: Findings, about: Mapping[str, Any] | None = None, file: 
         gap=far,
         parameters=parameters,
         candidates=ranking(selection),
-        warnings=[*notes, *found.warnings],
+        warnings=[*notes, *_less_accurate(model), *found.warnings],
         next_experiment=proposal.to_dict(file) if proposal else {},
         versions=versions.of(PACKAGES),
         details=details(found, effects, closed) | more | ({"experiments": proposal.details()} if proposal else {}),
@@ -102,6 +103,12 @@ def _against_data_sheet(c: Coordinate, value: float) -> str:
     """How far a known parameter is from what was stated of it, where that is far."""
     away = abs(value - c.neutral) * c.precision**0.5
     return phrases.far_from_data_sheet(value, away) if c.stated and away > FAR else ""
+
+
+def _less_accurate(model: Model) -> list[str]:
+    """That known parameters lie farther off than was assumed of their data sheet, where they do."""
+    worse = model.fit.trust() ** -0.5
+    return [phrases.less_accurate(data_sheet.ACCURACY, worse * data_sheet.ACCURACY)] if worse > WORSE else []
 
 
 def ranking(tried: Tried) -> list[dict[str, Any]]:
