@@ -85,9 +85,8 @@ def test_logs_of_a_servo_are_converted(tmp_path: Path, monkeypatch: pytest.Monke
     sys.modules.pop("convert_xl330")
 
 
-# not in CI: a loop on its logs is that of tests/loop/test_recorded.py, replays of this servo those of
-# tasks/test_servo_pendulum.py, the picture that of monitor/test_plots.py
 @pytest.mark.slow
+@pytest.mark.ci
 def test_a_servo_is_adapted_to(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     raw = _recorded(tmp_path / "raw")
     monkeypatch.syspath_prepend(str(EXAMPLES))

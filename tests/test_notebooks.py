@@ -18,13 +18,9 @@ def test_a_notebook_is_kept_without_outputs(path):
         compile("".join(cell["source"]), path.name, "exec")
 
 
-# not in CI: the loop of this one is that of test_examples.py::test_quickstart, its policy that of rl/test_pretrained.py
-LONG = {"adaptive_randomisation"}
-RUN = [pytest.param(p, marks=[] if p.stem in LONG else [pytest.mark.ci], id=p.stem) for p in NOTEBOOKS]
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("path", RUN)
+@pytest.mark.ci
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_a_notebook_runs(path, tmp_path, monkeypatch):
     nbclient, nbformat = pytest.importorskip("nbclient"), pytest.importorskip("nbformat")
     pytest.importorskip("ipykernel")

@@ -45,9 +45,8 @@ def test_the_balancer_rolls_and_falls_as_it_should(example):
     assert after(0.01, 0.01, 3.0).xmat[1, 8] < 0.7  # cosine of the trunk's tilt
 
 
-# not in CI: a task of one's own trains in test_docs.py::test_code_of_a_how_to_runs[own_task], a script with the whole
-# loop is test_examples.py::test_quickstart
 @pytest.mark.slow
+@pytest.mark.ci
 def test_the_example_runs(example, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", [str(FILE), *SHORT])
     example.main()
