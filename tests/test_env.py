@@ -16,9 +16,15 @@ def cartpole():
     return registry.make("Cartpole", episodeLength=20)
 
 
-def test_state_of_reset_and_step(cartpole):
-    state = cartpole.reset(jax.random.PRNGKey(0))
-    after = jax.jit(cartpole.step)(state, jnp.zeros(1))
+@pytest.fixture(scope="module")
+def compiled(cartpole):
+    """(reset_to, step): traced once for all tests of this file."""
+    return jax.jit(cartpole.reset_to), jax.jit(cartpole.step)
+
+
+def test_state_of_reset_and_step(cartpole, compiled):
+    state = jax.jit(cartpole.reset)(jax.random.PRNGKey(0))
+    after = compiled[1](state, jnp.zeros(1))
     for s, steps in ((state, 0), (after, 1)):
         assert {"terminated", "truncated", "final_observation", "steps"} <= set(s.info)
         assert s.reward.dtype == s.done.dtype == s.info["truncated"].dtype == jnp.float32
@@ -28,29 +34,29 @@ def test_state_of_reset_and_step(cartpole):
     assert jax.tree.structure(state) == jax.tree.structure(after)
 
 
-def test_reset_to_is_exact(cartpole):
+def test_reset_to_is_exact(compiled):
     qpos, qvel = np.float32([0.3, -0.2]), np.float32([1.0, 2.0])
-    state = cartpole.reset_to(qpos, qvel)
+    state = compiled[0](qpos, qvel)
     np.testing.assert_array_equal(state.obs["policy"], np.float32([0.3, 1.0, -0.2, 2.0]))
     assert state.info["steps"] == 0
 
 
-def test_truncation_comes_at_the_episode_length_and_termination_at_the_fall(cartpole):
-    step = jax.jit(cartpole.step)
+def test_truncation_comes_at_the_episode_length_and_termination_at_the_fall(compiled):
+    reset_to, step = compiled
     upright = np.zeros(2, np.float32)
-    state = cartpole.reset_to(upright, upright)
+    state = reset_to(upright, upright)
     for i in range(1, 21):
         state = step(state, jnp.zeros(1))
         assert (state.done, state.info["truncated"]) == (0, float(i == 20))
-    state = step(cartpole.reset_to(np.float32([0, 1.6]), upright), jnp.zeros(1))
+    state = step(reset_to(np.float32([0, 1.6]), upright), jnp.zeros(1))
     assert (state.done, state.info["terminated"], state.info["truncated"]) == (1, 1, 0)
 
 
-def test_a_world_that_runs_away_ends_its_episode_with_finite_observations(cartpole):
+def test_a_world_that_runs_away_ends_its_episode_with_finite_observations(cartpole, compiled):
     """Reaching the speed limit counts as diverged, as a number that is not finite does."""
-    step, still = jax.jit(cartpole.step), np.zeros(2, np.float32)
+    (reset_to, step), still = compiled, np.zeros(2, np.float32)
     for speed in (2e5, np.inf, np.nan):
-        after = step(cartpole.reset_to(still, np.float32([speed, 0.0])), jnp.zeros(1))
+        after = step(reset_to(still, np.float32([speed, 0.0])), jnp.zeros(1))
         assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((after.obs, after.reward, after.metrics)))
         assert (after.done, after.info["terminated"], after.info["truncated"]) == (1, 1, 0)
         assert after.reward == cartpole.diverged_reward
@@ -61,7 +67,7 @@ def test_a_world_is_held_in_its_last_sound_state():
         speed_limit, diverged_reward = 2.0, -7.0
 
     env = Slow(effects=[effects.make("actuator_delay", where="all")])  # it remembers commands
-    step, before = jax.jit(env.step), env.reset_to(np.zeros(2, np.float32), np.float32([1.5, 0.0]))
+    step, before = jax.jit(env.step), jax.jit(env.reset_to)(np.zeros(2, np.float32), np.float32([1.5, 0.0]))
     after, sound = step(before, jnp.ones(1)), step(before, 0.01 * jnp.ones(1))  # 400 N and 4 N on the cart
     assert (after.done, after.reward, sound.done) == (1, -7, 0)
     np.testing.assert_array_equal(after.obs["policy"], before.obs["policy"])
@@ -73,13 +79,15 @@ def test_a_world_is_held_in_its_last_sound_state():
 def test_without_randomisation_the_space_is_empty_and_the_domain_none():
     env = registry.make("Cartpole", config=config.load("Cartpole", overrides=["task.randomize=False"]))
     assert len(env.space) == 0 and domain_or_prior(env.space, 3) is None
-    assert jax.jit(env.step)(env.reset(jax.random.PRNGKey(0)), jnp.zeros(1)).pipeline_state.fields == {}
+    after = jax.jit(lambda key: env.step(env.reset(key), jnp.zeros(1)))(jax.random.PRNGKey(0))
+    assert after.pipeline_state.fields == {}
 
 
 def test_bayessim_variant_clips_observations():
     far = np.float32([500.0, 0.0]), np.zeros(2, np.float32)
-    assert registry.make("Cartpole").reset_to(*far).obs["policy"][0] == 500
-    assert registry.make("Cartpole", variant="bayessim2021").reset_to(*far).obs["policy"][0] == 100
+    envs = registry.make("Cartpole"), registry.make("Cartpole", variant="bayessim2021")
+    shown = jax.jit(lambda qpos, qvel: [env.reset_to(qpos, qvel).obs["policy"][0] for env in envs])(*far)
+    assert shown == [500, 100]
 
 
 def test_under_braxs_training_wrapper(cartpole):
