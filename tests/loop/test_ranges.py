@@ -35,6 +35,8 @@ def beyond():
     return parts, rounds
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_a_truth_beyond_the_range_is_reached_and_the_interval_covers_it(beyond):
     _, rounds = beyond
     ends = [(float(s.moving.space.low[0]), float(s.moving.space.high[0])) for s, _ in rounds]
@@ -51,6 +53,8 @@ def test_a_truth_beyond_the_range_is_reached_and_the_interval_covers_it(beyond):
     assert float(q.sd()[0]) < 3 * NOISE / np.sqrt(6)
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_the_next_domain_lies_over_the_wider_range_on_both_sides_of_the_wall(beyond):
     _, rounds = beyond
     state, info = rounds[0]
@@ -60,6 +64,8 @@ def test_the_next_domain_lies_over_the_wider_range_on_both_sides_of_the_wall(bey
     assert drawn[:, 1].std() == pytest.approx(2 / 12**0.5, rel=0.05)  # what is not identified keeps its prior
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_simulations_kept_and_new_ones_are_draws_of_the_wider_prior(beyond):
     """U[-1, 1] and then, over [-1, 3], as many outside as there are inside."""
     _, rounds = beyond
@@ -72,6 +78,8 @@ def test_simulations_kept_and_new_ones_are_draws_of_the_wider_prior(beyond):
     assert all(abs(np.mean(half < 1) - 0.5) < 0.05 for half in halves)
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_another_move_compiles_nothing(beyond):
     """The ranges are arrays: the third round runs the programs of the second."""
     parts, rounds = beyond
@@ -85,6 +93,8 @@ def test_another_move_compiles_nothing(beyond):
     assert "/jax/core/compile/backend_compile_duration" not in compiled
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_a_run_killed_after_a_move_goes_on_bit_for_bit(beyond, tmp_path):
     from bayessim_mjx.runs import checkpoints
 

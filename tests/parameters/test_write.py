@@ -63,7 +63,12 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("case", CASES)
+LONG = ("walker: lengths", "walker: scales", "walker: absolute and additive")  # "every number" stays
+
+
+@pytest.mark.parametrize(
+    "case", [pytest.param(c, marks=[pytest.mark.slow, pytest.mark.ci] if c in LONG else []) for c in CASES]
+)
 def test_write_equals_recompiling_the_edited_mjcf(case):
     xml, section = CASES[case]
     spec = spec_of(xml)

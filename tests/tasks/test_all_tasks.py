@@ -8,7 +8,7 @@ import pytest
 
 from bayessim_mjx import registry
 
-FAST = {"Pendulum", "Cartpole", "Ant"}  # one of each kind; the others compile for up to half a minute
+FAST = {"Pendulum", "Cartpole"}  # the others compile for up to half a minute
 LONG = {"FrankaCabinet", "Humanoid", "Ingenuity", "ShadowHand"}  # compile for a minute or more: not in CI either
 NAMES = [
     pytest.param(name, marks=[] if name in FAST else [pytest.mark.slow] + [pytest.mark.ci] * (name not in LONG))
