@@ -50,7 +50,7 @@ def compiler_options() -> dict[str, Any]:
     XLA's fusion on CPU may compute shared subexpressions anew in every consumer: for a chain of six joints MJX's
     kinematics then cost 150 times what they should (jaxlib 0.10).
     """
-    options = {"xla_cpu_use_fusion_emitters": False}
+    options: dict[str, str | bool] = {"xla_cpu_use_fusion_emitters": False}
     if jax.default_backend() != "cpu":
         return {}
     try:
