@@ -1,7 +1,8 @@
 """A compiled model with its parameters and effects, and the state of one world of it."""
 
-from collections.abc import Sequence
-from typing import Any
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +18,17 @@ from bayessim_mjx.parameters import ParameterSpace
 from bayessim_mjx.physics.warp import Warp
 
 EULER, RK4, IMPLICITFAST = (int(getattr(mujoco.mjtIntegrator, f"mjINT_{n}")) for n in ("EULER", "RK4", "IMPLICITFAST"))
+
+T = TypeVar("T")
+
+
+def gated(active: jax.Array | None, index: int, hook: Callable[[], T], otherwise: T) -> T:
+    """What the hook of effect `index` returns; `otherwise`, its inputs, where the effect is not active.
+
+    At neutral numbers both are the same. `active` `[effects]` is one for all worlds of a call: under `vmap` the branch
+    stays a branch, and effects that no world has cost nothing. None: all of them are computed.
+    """
+    return hook() if active is None else jax.lax.cond(active[index], hook, lambda: otherwise)
 
 
 class World(struct.PyTreeNode):
@@ -116,6 +128,12 @@ class Physics:
         """theta `[d]` with all effects off, the model's parameters nominal."""
         return np.asarray([value for block in self.blocks for value in block.neutral], np.float32)
 
+    def acting(self, thetas: np.ndarray) -> np.ndarray:
+        """`[n, effects]`, whether an effect has a number that is not neutral (or none at all), of thetas `[n, d]`."""
+        moved = np.asarray(thetas, np.float32) != self.neutral
+        each = [moved[:, own].any(1) if moved[:, own].size else np.ones(len(moved), bool) for own in self._slices]
+        return np.stack(each, 1) if each else moved[:, :0]
+
     def world(self, theta: jax.Array, qpos: jax.Array | None = None, qvel: jax.Array | None = None) -> World:
         """A world at the start of an episode, as the sensors show it at rest; writes `theta` into the model once.
 
@@ -161,20 +179,25 @@ class Physics:
             measurement={"qpos": qpos, "qvel": qvel},
         )
 
-    def sense(self, thetas: tuple, memory: Sequence[Any], true: Measurement) -> tuple[tuple, Measurement]:
+    def sense(
+        self, thetas: tuple, memory: Sequence[Any], true: Measurement, active: jax.Array | None = None
+    ) -> tuple[tuple, Measurement]:
         """(effects' memories, what the sensors show) of the true {"qpos", "qvel"}; thetas: one slice per effect."""
         remembered, shown = list(memory), true
         for i, (effect, at, theta) in enumerate(zip(self.effects, self.sites, thetas, strict=True)):
             if overrides(effect, "on_measurement"):
-                remembered[i], shown = effect.on_measurement(at, remembered[i], shown, theta)
+                hook = functools.partial(effect.on_measurement, at, remembered[i], shown, theta)
+                remembered[i], shown = gated(active, i, hook, (remembered[i], shown))
         return tuple(remembered), shown
 
-    def encoders(self, thetas: tuple, qpos: jax.Array, qvel: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def encoders(
+        self, thetas: tuple, qpos: jax.Array, qvel: jax.Array, active: jax.Array | None = None
+    ) -> tuple[jax.Array, jax.Array]:
         """(qpos, qvel) as the joints' own encoders show them to their drives: with the sensors' static errors.
 
         Delays and filters lie between the drive and whoever records; without a past they show what is.
         """
-        shown = self.sense(thetas, self._memory, {"qpos": qpos, "qvel": qvel})[1]
+        shown = self.sense(thetas, self._memory, {"qpos": qpos, "qvel": qvel}, active)[1]
         return shown["qpos"], shown["qvel"]
 
     def model_of(self, world: World) -> mjx.Model:

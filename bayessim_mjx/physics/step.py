@@ -3,14 +3,17 @@
 Its sub-steps are those of `timestep`: MJX's, where no effect, drive or limit says otherwise.
 """
 
+import functools
+
 import jax
 import jax.numpy as jnp
 
 from bayessim_mjx.compat import mjx
+from bayessim_mjx.effects.effect import overrides
 from bayessim_mjx.effects.support.motion import Motion
 from bayessim_mjx.effects.support.site import under_tendon_limit
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.physics.model import Physics, World
+from bayessim_mjx.physics.model import Physics, World, gated
 from bayessim_mjx.physics.timestep import Drive, substep
 
 
@@ -44,7 +47,9 @@ def _control_step(physics: Physics, world: World, command: jax.Array, drive: Dri
     memory = list(world.memory)
     commands = jnp.broadcast_to(command, (physics.substeps, physics.mj_model.nu))
     for i, (effect, at) in enumerate(zip(physics.effects, physics.sites, strict=True)):
-        memory[i], commands = effect.on_command(at, memory[i], commands, thetas[i])
+        if overrides(effect, "on_command"):
+            hook = functools.partial(effect.on_command, at, memory[i], commands, thetas[i])
+            memory[i], commands = gated(drive.active, i, hook, (memory[i], commands))
 
     def body(carry: tuple, ctrl: jax.Array) -> tuple[tuple, None]:
         data, remembered = carry
@@ -53,7 +58,7 @@ def _control_step(physics: Physics, world: World, command: jax.Array, drive: Dri
     start = (physics.data_of(world, None if warp is None else warp.data), (tuple(memory), world.forces))
     end, _ = body(start, commands[0]) if physics.substeps == 1 else jax.lax.scan(body, start, commands)
     data, (final, forces) = end
-    remembered, measurement = physics.sense(thetas, final, {"qpos": data.qpos, "qvel": data.qvel})
+    remembered, measurement = physics.sense(thetas, final, {"qpos": data.qpos, "qvel": data.qvel}, drive.active)
     world = world.replace(
         qpos=data.qpos,
         qvel=data.qvel,
@@ -82,11 +87,11 @@ def _refuse(physics: Physics, drive: Drive) -> None:
         )
 
 
-def begin(physics: Physics, theta: jax.Array, motion: Motion) -> World:
+def begin(physics: Physics, theta: jax.Array, motion: Motion, active: jax.Array | None = None) -> World:
     """A world in the middle of a log: effects' memories filled by the recorded past, sensors' effects undone.
 
     Args:
-        theta: `[d]`; motion: measured, around the start, with the commands before it.
+        theta: `[d]`; motion: measured, around the start, with the commands before it; active: see `Drive`.
     """
     world = physics.unseen(theta, motion.qpos[motion.start], motion.qvel[motion.start])  # shown is what was measured
     thetas, memory = physics.split(world.theta)[1], list(world.memory)
@@ -96,7 +101,9 @@ def begin(physics: Physics, theta: jax.Array, motion: Motion) -> World:
     def past(memory: tuple, commands: jax.Array) -> tuple[tuple, None]:
         remembered = list(memory)
         for i, (effect, at) in enumerate(zip(physics.effects, physics.sites, strict=True)):
-            remembered[i], commands = effect.on_command(at, remembered[i], commands, thetas[i])
+            if overrides(effect, "on_command"):
+                hook = functools.partial(effect.on_command, at, remembered[i], commands, thetas[i])
+                remembered[i], commands = gated(active, i, hook, (remembered[i], commands))
         return tuple(remembered), None
 
     filled, _ = jax.lax.scan(past, tuple(memory), motion.command[: motion.start])

@@ -5,6 +5,7 @@ then drives that are off, then gravity compensation and the joint's limit (`actu
 """
 
 import dataclasses
+import functools
 from typing import Any
 
 import jax
@@ -18,7 +19,7 @@ from bayessim_mjx.effects.effect import overrides
 from bayessim_mjx.effects.support.site import joint_dofs, ranges
 from bayessim_mjx.effects.support.substep import SubStep
 from bayessim_mjx.physics.controllers import Law
-from bayessim_mjx.physics.model import EULER, IMPLICITFAST, RK4, Physics
+from bayessim_mjx.physics.model import EULER, IMPLICITFAST, RK4, Physics, gated
 
 STAGES = ((0.5, 1 / 3), (0.5, 1 / 3), (1.0, 1 / 6))  # of RK4 after the first: (how far from the start, weight)
 _NO_DAMPING = int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
@@ -42,11 +43,14 @@ class Drive(struct.PyTreeNode):
         enabled: `[nu]`, 1 where the drive is on; 0: the actuator exerts no force at all (open leads), and a joint whose
             actuators are all off has no gravity compensation from them either (`actuatorgravcomp`).
         law: a controller between the command and the actuators; what it asks for is held over a timestep.
+        active: `[effects]`, False where an effect is neutral in every world of the call, so that its hooks need not be
+            computed (`physics.model.gated`).
     """
 
     force: jax.Array | None = None
     enabled: jax.Array | None = None
     law: Law | None = None
+    active: jax.Array | None = None
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -124,7 +128,8 @@ def forward(own: Timestep, data: mjx.Data, carry: Memory) -> tuple[mjx.Data, Mem
     data = mjx.fwd_velocity(model, data)
     data = mjx.sensor_vel(model, data) if sensors else data
     if own.drive.law is not None:
-        data = data.replace(ctrl=own.drive.law(data.ctrl, *physics.encoders(own.thetas, data.qpos, data.qvel)))
+        seen = physics.encoders(own.thetas, data.qpos, data.qvel, own.drive.active)
+        data = data.replace(ctrl=own.drive.law(data.ctrl, *seen))
     data, memory, step = _actuated(own, data, carry[0])
     data, carry = _pushed(own, data, (memory, carry[1]), step)
     data = _accelerated(model, data)
@@ -160,9 +165,10 @@ def _within_range(own: Timestep, ctrl: jax.Array) -> jax.Array:
 
 def _acting(own: Timestep, step: SubStep, memory: tuple, force: jax.Array) -> tuple[tuple, jax.Array]:
     """(memory, forces `[nu]`) behind all effects on actuators, and where the drive is on."""
-    remembered = list(memory)
+    remembered, step = list(memory), step if own.drive.active is None else step.ready("asked")
     for i, effect, at, theta in own.having("on_actuator"):
-        remembered[i], force = effect.on_actuator(at, remembered[i], step, force, theta)
+        hook = functools.partial(effect.on_actuator, at, remembered[i], step, force, theta)
+        remembered[i], force = gated(own.drive.active, i, hook, (remembered[i], force))
     return tuple(remembered), force if own.drive.enabled is None else force * own.drive.enabled
 
 
@@ -232,12 +238,17 @@ def _pushed(own: Timestep, data: mjx.Data, carry: Memory, step: SubStep) -> tupl
     if not own.physics.effects and drive.force is None:
         return data, carry
     memory, forces = list(carry[0]), carry[1]
+    step = step if drive.active is None else step.ready("asked", "response", "inverse")
     known = data.qfrc_passive - data.qfrc_bias + data.qfrc_actuator
     outside = jnp.zeros_like(data.qfrc_applied) if drive.force is None else drive.force
     for i, effect, at, theta in own.having("on_force"):
-        others = known + outside + jnp.sum(forces.at[i].set(0.0), axis=0)
-        memory[i], force = effect.on_force(at, memory[i], step.seen_by(others, forces[i]), theta)
-        forces = forces.at[i].set(force)
+
+        def hook(i: int = i, effect: Any = effect, at: Any = at, theta: Any = theta, forces: Any = forces) -> Any:
+            others = known + outside + jnp.sum(forces.at[i].set(0.0), axis=0)
+            remembered, force = effect.on_force(at, memory[i], step.seen_by(others, forces[i]), theta)
+            return remembered, forces.at[i].set(force)
+
+        memory[i], forces = gated(drive.active, i, hook, (memory[i], forces))
     return data.replace(qfrc_applied=jnp.sum(forces, axis=0) + outside), (tuple(memory), forces)
 
 

@@ -55,12 +55,18 @@ class Simulator:
         self.nv = int(physics.mj_model.nv)
         self.channels = 2 * self.nv
         self.traces = self.rollouts = 0
-        self._run = jax.jit(jax.vmap(self._one, in_axes=(None, 0, 0, 0, 0)), compiler_options=compiler_options())
+        self._run = jax.jit(jax.vmap(self._one, in_axes=(None, 0, 0, 0, 0, None)), compiler_options=compiler_options())
         self._no_offset = np.zeros((self.lanes, 2 * self.nv), np.float32)
         self._no_force = jnp.zeros((self.lanes, windows.steps, self.nv))
 
     def _one(
-        self, batch: Batch, index: jax.Array, theta: jax.Array, offset: jax.Array, force: jax.Array
+        self,
+        batch: Batch,
+        index: jax.Array,
+        theta: jax.Array,
+        offset: jax.Array,
+        force: jax.Array,
+        active: jax.Array | None,
     ) -> tuple[jax.Array, Any]:
         """Errors `[H, 2 nv]` of one window (positions, velocities) and the actuators' forces `[H, nu]`."""
         self.traces += 1
@@ -68,12 +74,12 @@ class Simulator:
         # s, by which the integrator's velocities lie before its positions
         early = 0.5 * float(model.opt.timestep) if staggered(model) else 0.0
         own = jax.tree.map(lambda x: x[index], batch)
-        world = begin(self.physics, theta, own.around)
+        world = begin(self.physics, theta, own.around, active)
         world = world.replace(qpos=integrate(model, world.qpos, offset[: self.nv]), qvel=world.qvel + offset[self.nv :])
 
         def step(world: Any, row: tuple) -> tuple[Any, tuple]:
             command, extra, enabled = row
-            world, data = control_step(self.physics, world, command, Drive(extra, enabled, own.law))
+            world, data = control_step(self.physics, world, command, Drive(extra, enabled, own.law, active))
             late = world.measurement["qvel"] + early * data.qacc
             return world, (world.measurement["qpos"], late, data.actuator_force)
 
@@ -103,6 +109,7 @@ class Simulator:
         n, w = len(thetas), len(chosen)
         flat_offsets = None if offsets is None else np.asarray(offsets, np.float32).reshape(n * w, -1)
         flat_force = None if force is None else np.asarray(force, np.float32).reshape(n * w, *force.shape[2:])
+        acting = self.physics.acting(thetas)
         thetas, of_theta, of_window = np.asarray(thetas, np.float32), np.repeat(np.arange(n), w), np.tile(chosen, n)
 
         def part(first: int) -> NDArray[np.float32]:
@@ -110,7 +117,8 @@ class Simulator:
             own = first + np.minimum(np.arange(self.lanes), count - 1)
             offset = self._no_offset if flat_offsets is None else flat_offsets[own]
             extra = self._no_force if flat_force is None else flat_force[own]
-            errors, _ = self._run(self.windows.batch, of_window[own], thetas[of_theta[own]], offset, extra)
+            active = acting[of_theta[own]].any(0) if self.apart else None
+            errors, _ = self._run(self.windows.batch, of_window[own], thetas[of_theta[own]], offset, extra, active)
             return np.asarray(errors)[:count]
 
         firsts = list(range(0, n * w, self.lanes))

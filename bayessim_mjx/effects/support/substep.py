@@ -54,6 +54,12 @@ class SubStep:
         other.force, other.last = force, last
         return other
 
+    def ready(self, *names: str) -> "SubStep":
+        """Itself, with these derived values computed: before a branch, which could not share what it computes."""
+        for name in names:
+            getattr(self, name)
+        return self
+
     def _once(self, name: str, compute: "Callable[[], Any]") -> Any:
         if name not in self._cache:
             self._cache[name] = compute()
