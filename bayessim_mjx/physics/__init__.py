@@ -1,8 +1,9 @@
 """The one control step, its controllers and integrators, and what episodes draw at random beside their parameters."""
 
 from bayessim_mjx.compat import mjx
+from bayessim_mjx.physics.drive import Drive
 from bayessim_mjx.physics.model import Physics, World
 from bayessim_mjx.physics.step import begin, control_step
-from bayessim_mjx.physics.timestep import Drive, staggered, substep
+from bayessim_mjx.physics.timestep import staggered, substep
 
 __all__ = ["Drive", "Physics", "World", "begin", "control_step", "mjx", "staggered", "substep"]

@@ -13,8 +13,9 @@ from bayessim_mjx.effects.effect import overrides
 from bayessim_mjx.effects.support.motion import Motion
 from bayessim_mjx.effects.support.site import under_tendon_limit
 from bayessim_mjx.errors import UserError
+from bayessim_mjx.physics.drive import Drive
 from bayessim_mjx.physics.model import Physics, World, gated
-from bayessim_mjx.physics.timestep import Drive, substep
+from bayessim_mjx.physics.timestep import substep
 
 
 def control_step(

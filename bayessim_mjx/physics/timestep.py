@@ -12,13 +12,12 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from flax import struct
 
 from bayessim_mjx.compat import mjx
 from bayessim_mjx.effects.effect import overrides
 from bayessim_mjx.effects.support.site import joint_dofs, ranges
 from bayessim_mjx.effects.support.substep import SubStep
-from bayessim_mjx.physics.controllers import Law
+from bayessim_mjx.physics.drive import Drive
 from bayessim_mjx.physics.model import EULER, IMPLICITFAST, RK4, Physics, gated
 
 STAGES = ((0.5, 1 / 3), (0.5, 1 / 3), (1.0, 1 / 6))  # of RK4 after the first: (how far from the start, weight)
@@ -33,24 +32,6 @@ def staggered(model: mujoco.MjModel) -> bool:
     So it is where positions move with the new velocities (Euler, implicitfast); RK4 has all of them at one time.
     """
     return int(model.opt.integrator) != RK4
-
-
-class Drive(struct.PyTreeNode):
-    """What acts on a world besides its command, all optional.
-
-    Attributes:
-        force: `[nv]`, a generalised force of unknown origin.
-        enabled: `[nu]`, 1 where the drive is on; 0: the actuator exerts no force at all (open leads), and a joint whose
-            actuators are all off has no gravity compensation from them either (`actuatorgravcomp`).
-        law: a controller between the command and the actuators; what it asks for is held over a timestep.
-        active: `[effects]`, False where an effect is neutral in every world of the call, so that its hooks need not be
-            computed (`physics.model.gated`).
-    """
-
-    force: jax.Array | None = None
-    enabled: jax.Array | None = None
-    law: Law | None = None
-    active: jax.Array | None = None
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
