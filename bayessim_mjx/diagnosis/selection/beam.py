@@ -1,7 +1,7 @@
 """One search over sets of effects: a beam over neighbours, beside a dense start, with a table of what was visited.
 
-Neighbours of a model: one effect added, dropped, exchanged for another one, or replaced by its special cases. What is
-fitted is asked of `Fitting`, so that the search can be tried on planted tables.
+Neighbours of a model: one effect added, dropped, exchanged for another one, replaced by its special cases, or spread
+over all joints (`everywhere`). What is fitted is asked of `Fitting`, so that the search can be tried on planted tables.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from typing import Protocol
 
 from bayessim_mjx.diagnosis.selection.criteria import Criteria
 from bayessim_mjx.diagnosis.selection.decide import Decision, admissible, decide, order, same, settled, value
+from bayessim_mjx.diagnosis.selection.everywhere import laws, needed, spread
 from bayessim_mjx.diagnosis.selection.table import BASE, Key, Table
 
 ROUNDS = 4  # of growing and looking around, at most
@@ -42,6 +43,9 @@ class Fitting(Protocol):
 
     def additions(self, key: Key) -> list[str]:
         """Effects that may bring something on top of a fitted model, the most promising first."""
+
+    def promises(self, key: Key) -> dict[str, float]:
+        """{effect: predicted drop of the cost} of them."""
 
     def together(self, most: int, count: int) -> list[Key]:
         """Sets of up to so many effects that promise most when all amplitudes are free at once."""
@@ -104,11 +108,16 @@ def _grow(fits: Fitting, criteria: Criteria) -> Key:
     for size in range(1, criteria.most):
         if settled(fits.table, best, criteria) or fits.over(TOGETHER):
             break
-        beam = [k for k in leading(fits.table, criteria)[: criteria.beam] if len(k) < criteria.most]
+        table = fits.table
+        beam = [k for k in leading(table, criteria)[: criteria.beam] if laws(table, k) < criteria.most]
         plans = [p for k in beam for p in _added(fits, k, criteria.width - 2 * (k != best))]
         if size == 1:
             plans += [Plan(k) for k in fits.together(min(3, criteria.most), criteria.beam)]
-        fits.fit(plans, f"{len(best) + 1} effects")
+            plans += _everywhere(fits, BASE, criteria)
+        every = [p for k in beam for p in _everywhere(fits, k, criteria)]
+        fits.fit([*plans, *every], f"{len(best) + 1} effects")
+        untold = needed(fits.table, [p.key for p in every], criteria)
+        fits.fit([Plan(*pair) for pair in untold], "dropping")
         before, best = best, _best(fits, criteria, criteria.beam)
         if best == before or same(fits.table, before, best, criteria):
             break
@@ -117,6 +126,11 @@ def _grow(fits: Fitting, criteria: Criteria) -> Key:
 
 def _added(fits: Fitting, key: Key, count: int) -> list[Plan]:
     return [Plan(key | {label}, key) for label in fits.additions(key)[: max(count, 1)]]
+
+
+def _everywhere(fits: Fitting, key: Key, criteria: Criteria) -> list[Plan]:
+    table = fits.table
+    return [Plan(*p) for p in spread(table, key, fits.promises(key)) if laws(table, p[0]) <= criteria.most]
 
 
 def _around(fits: Fitting, best: Key, criteria: Criteria) -> Key:
@@ -129,7 +143,7 @@ def _around(fits: Fitting, best: Key, criteria: Criteria) -> Key:
         rest = best - {label}
         plans += _added(fits, rest, criteria.width) if rest else []
         plans += [Plan(rest | own, rest) for own in specialised(fits.table, best, label)]
-    fits.fit([p for p in plans if len(p.key) <= criteria.most], "exchanges")
+    fits.fit([p for p in plans if laws(fits.table, p.key) <= criteria.most], "exchanges")
     table = fits.table
     ahead = leading(table, criteria)[: 2 * criteria.beam]  # simpler ones may not have come to their end
     fits.polish([key for key in ahead if table.rows[key].size < table.rows[best].size])

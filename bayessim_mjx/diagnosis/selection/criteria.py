@@ -32,7 +32,8 @@ class Criteria:
         floor: a model within this factor of the noise (rms) is not improved further.
         far: standard deviations by which an amplitude of a named effect is away from neutral. With 2 one of 24 single
             effects of recorded tables is told only as a rival.
-        beam: models that the search goes on from; width: additions tried to each; most: effects in one model.
+        beam: models that the search goes on from; width: additions tried to each; most: laws in one model (at
+            several joints it is one).
         finalists: rivals that are fitted to their end, and simulated held out, before the answer is chosen.
     """
 

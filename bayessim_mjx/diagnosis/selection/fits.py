@@ -84,13 +84,17 @@ class Fits:
 
     def additions(self, key: Key) -> list[str]:
         """Candidates that may bring something on top of a model, the most promising first."""
+        return list(self.promises(key))
+
+    def promises(self, key: Key) -> dict[str, float]:
+        """{label: predicted drop of the cost} of candidates on top of a model, the most promising first."""
         if key not in self._screened:
             model = self.pool.models[key]
             others = [c for c in self.pool.candidates if all(compatible(c, e) for e in model.effects)]
             pool = self.pool
             found = screen(pool.fitter, model.fit, others, pool.settings.screened, self.say, pool.secants)
             self._screened[key] = found
-        return [s.candidate.label for s in self._screened[key] if s.gain > 0]
+        return {s.candidate.label: s.gain for s in self._screened[key] if s.gain > 0}
 
     def together(self, most: int, count: int) -> list[Key]:
         """Sets of effects that promise most when all amplitudes are free at once (`dense`), and what was proposed."""
@@ -179,7 +183,8 @@ def law_of(candidate: Candidate) -> Law:
     """What a decision knows of a candidate."""
     index = frozenset(i for c in candidate.coordinates for i in c.index)
     special = special_cases(candidate)
-    return Law(candidate.label, candidate.effect, candidate.where, len(candidate.coordinates), index, special)
+    own = candidate
+    return Law(own.label, own.effect, own.where, len(own.coordinates), index, special, own.kind)
 
 
 def distances(pool: Pool, model: Model) -> dict[str, float]:

@@ -20,6 +20,7 @@ class Law:
 
     Attributes:
         label: effect@where; numbers: free ones; index: entries of theta that it sets; special: effects it contains.
+        kind: of its places: actuator, joint, body, geom or world.
     """
 
     label: str
@@ -28,6 +29,7 @@ class Law:
     numbers: int
     index: frozenset[int] = frozenset()
     special: tuple[str, ...] = ()
+    kind: str = ""
 
     def beside(self, other: Law) -> bool:
         """Whether both can be in one model: not the same numbers twice."""
@@ -98,6 +100,7 @@ class Table:
             "laws": [
                 {"effect": c.effect, "where": c.where, "numbers": c.numbers, "index": sorted(c.index)}
                 | ({"special": list(c.special)} if c.special else {})
+                | ({"kind": c.kind} if c.kind else {})
                 for c in self.laws.values()
             ],
             "group": self.group.tolist(),
@@ -128,6 +131,7 @@ def read(raw: Mapping[str, Any]) -> Table:
             c["numbers"],
             frozenset(c["index"]),
             tuple(c.get("special", ())),
+            c.get("kind", ""),
         )
         for c in raw["laws"]
     ]

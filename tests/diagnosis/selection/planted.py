@@ -8,10 +8,10 @@ from bayessim_mjx.diagnosis.selection.table import BASE, Law, Row, Table
 CONDITIONS, WINDOWS, ROWS = 5, 8, 40
 
 
-def law(effect, where="hinge", numbers=1, places=None, special=()):
+def law(effect, where="hinge", numbers=1, places=None, special=(), kind=""):
     """A candidate; laws of one effect at the same place have the same numbers."""
     index = frozenset(f"{effect}@{place}" for place in places or (where,))
-    return Law(f"{effect}@{where}", effect, where, numbers, index, special)
+    return Law(f"{effect}@{where}", effect, where, numbers, index, special, kind)
 
 
 def table(errors, noise=50.0, believed=1.0, group=None, samples=1e4):
@@ -32,9 +32,10 @@ class Linear:
 
     Args:
         columns: {label: `[CONDITIONS * WINDOWS * ROWS]`}; amounts: {label: what is planted}.
+        kind: of all places; places: those that "all" ties together.
     """
 
-    def __init__(self, columns, amounts, seed=0):
+    def __init__(self, columns, amounts, seed=0, kind="", places=()):
         rng = np.random.default_rng(1000 + seed)
         self.names = list(columns)
         self.X = np.stack([columns[name] for name in self.names], 1)
@@ -42,7 +43,7 @@ class Linear:
         self.laws = {}
         for name in self.names:
             effect, _, where = name.partition("@")
-            self.laws[name] = law(effect, where)
+            self.laws[name] = law(effect, where, places=places if where == "all" else None, kind=kind)
         self.group = np.repeat(np.arange(CONDITIONS), WINDOWS)
         self.rows = {}
         self.fitted = 0
@@ -77,14 +78,20 @@ class Linear:
         out = lambda a: a - fixed @ np.linalg.lstsq(fixed, a, rcond=None)[0] if own else a  # noqa: E731
         return out(self.X), out(self.y)
 
-    def additions(self, key):
+    def promises(self, key):
         X, y = self._moments(key)
         gain = (X.T @ y) ** 2 / np.maximum(np.sum(X**2, 0), 1e-9)
-        return [self.names[i] for i in np.argsort(-gain) if self.names[i] not in key]
+        order = [self.names[i] for i in np.argsort(-gain)]
+        fits_in = [n for n in order if all(self.laws[n].beside(self.laws[k]) for k in key)]
+        return {n: gain[self.names.index(n)] for n in fits_in}
+
+    def additions(self, key):
+        return list(self.promises(key))
 
     def together(self, most, count):
         bound = np.full(len(self.names), 1e3)
-        blocked = np.zeros((len(bound), len(bound)), bool)
+        laws = [self.laws[n] for n in self.names]
+        blocked = np.array([[a is not b and not a.beside(b) for a in laws] for b in laws])
         found = dense.best_sets(self.X.T @ self.X, self.X.T @ self.y, -bound, bound, blocked, most, count)
         return [frozenset(self.names[i] for i in own) for own, _ in found]
 

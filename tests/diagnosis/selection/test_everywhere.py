@@ -1,0 +1,81 @@
+"""One law at all joints with numbers of its own at each, on planted sums: found as one step, pruned where it is not."""
+
+import numpy as np
+import pytest
+
+from bayessim_mjx.diagnosis.selection import beam, everywhere
+from bayessim_mjx.diagnosis.selection.criteria import Criteria
+from tests.diagnosis.selection.planted import Linear, columns, law, table
+
+JOINTS = [f"j{i}" for i in range(6)]
+FRICTION = [f"friction@{j}" for j in JOINTS]
+
+
+def joints(seed=0, others=6):
+    """Columns of two laws at six joints and tied over them, and of unrelated effects."""
+    drawn = list(columns(12 + others, seed).values())
+    laws = {f"friction@{j}": drawn[i] for i, j in enumerate(JOINTS)}
+    laws |= {f"damping@{j}": drawn[6 + i] for i, j in enumerate(JOINTS)}
+    for name in ("friction", "damping"):
+        laws[f"{name}@all"] = sum(laws[f"{name}@{j}"] for j in JOINTS)
+    return laws | {f"{chr(97 + i)}@j0": drawn[12 + i] for i in range(others)}
+
+
+def found(laws, amounts, seed=0, **criteria):
+    fits = Linear(laws, amounts, seed, kind="joint", places=JOINTS)
+    return beam.search(fits, Criteria(**criteria)), fits
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_friction_of_another_size_in_each_of_six_joints(seed):
+    amounts = dict(zip(FRICTION, (3.0, 1.0, 2.0, 1.2, 1.5, 1.1), strict=True))
+    selection, fits = found(joints(seed), amounts, seed)
+    assert set(selection.answer) == set(FRICTION)
+    assert fits.fitted < 200
+
+
+def test_two_laws_in_every_joint():
+    amounts = {f"{name}@{j}": 1.0 + 0.4 * i for i, j in enumerate(JOINTS) for name in ("friction", "damping")}
+    selection, _ = found(joints(), amounts)
+    assert set(selection.answer) == set(amounts)
+
+
+def test_joints_that_have_none_are_not_named():
+    """Of six joints three have friction: the spread model is cut back to them."""
+    amounts = dict.fromkeys(FRICTION[:3], 2.0)
+    assert set(found(joints(), amounts)[0].answer) == set(amounts)
+
+
+def test_the_same_everywhere_is_one_effect_still():
+    assert set(found(joints(), {"friction@all": 2.0})[0].answer) == {"friction@all"}
+
+
+def test_one_joint_is_one_effect_still():
+    assert set(found(joints(), {"friction@j2": 3.0})[0].answer) == {"friction@j2"}
+
+
+def test_at_several_joints_a_law_counts_once():
+    amounts = {label: 2.0 + 0.3 * i for i, label in enumerate(FRICTION)}
+    assert set(found(joints(), amounts, most=2)[0].answer) == set(FRICTION)
+    both = table({(): 9.0, (law("friction", "j0"), law("friction", "j1"), law("damping", "j1")): 2.0})
+    assert everywhere.laws(both, frozenset(both.laws)) == 2
+
+
+def test_what_is_not_in_every_joint_is_not_spread():
+    bodies = [law("payload", b, kind="body") for b in ("hand", "arm")]
+    alone = law("coulomb_friction", "hinge", kind="joint")
+    rows = {(): 9.0, (bodies[0],): 4.0, (bodies[1],): 5.0, (alone,): 6.0}
+    made, gains = table(rows), dict.fromkeys(("payload@hand", "payload@arm", "coulomb_friction@hinge"), 1.0)
+    assert everywhere.spread(made, frozenset(), gains) == []
+
+
+def test_a_spread_model_begins_at_what_is_fitted():
+    laws = [law("friction", j, kind="joint") for j in ("j0", "j1")]
+    tied, other = law("friction", "all", places=("j0", "j1"), kind="joint"), law("delay", "s", kind="actuator")
+    known = table({(): 9.0, (laws[0],): 4.0, (laws[1],): 5.0, (tied,): 3.0, (tied, other): 2.0, (other,): 8.0})
+    every = frozenset(c.label for c in laws)
+    one = everywhere.spread(known, frozenset([laws[0].label]), {})
+    assert one == [(every, frozenset([laws[0].label]))]
+    pair = everywhere.spread(known, frozenset([tied.label, other.label]), {})
+    assert pair == [(every | {other.label}, frozenset([other.label]))]
+    assert np.isfinite(known.excess(frozenset()))
