@@ -14,7 +14,7 @@ from bayessim_mjx.diagnosis.selection.selected import Rival
 from bayessim_mjx.diagnosis.summary import first_look
 from bayessim_mjx.diagnosis.summary.left_in_words import flexible_in_words
 from bayessim_mjx.diagnosis.summary.verdict import Verdict
-from bayessim_mjx.diagnosis.vocabulary import listed, missing
+from bayessim_mjx.diagnosis.vocabulary import by_law, listed, missing
 from bayessim_mjx.quantities import extent, percent
 
 
@@ -108,8 +108,9 @@ def sentences(
 def _hidden(labels: Sequence[str], effects: int) -> str:
     if not labels:
         return ""
-    parts = [missing(*label.split("@", 1)) for label in labels[: LIMITS.told]]
-    parts += [f"{len(labels) - len(parts)} more"] if len(labels) > len(parts) else []
+    every = by_law([label.split("@", 1) for label in labels])
+    parts = every[: LIMITS.told]
+    parts += [f"{len(every) - len(parts)} more"] if len(every) > len(parts) else []
     return HIDDEN.format(them="it" if effects == 1 else "them", hidden=listed(parts, "or"))
 
 
@@ -138,7 +139,7 @@ def verdict_in_words(
     promised, went = (sum(getattr(e, k) for e in effects) for k in ("predicted_gap_closed", "gap_closed"))
     one = len(effects) == 1
     fill = {s: stage_in_words(far, s) for s in ("nominal", "calibrated", "with_effects")} | {
-        "named": listed([missing(e.name, e.where) for e in effects]),
+        "named": listed(by_law([(e.name, e.where) for e in effects])),
         "them": "it" if one else "them",
         "they": "it was" if one else "they were",
         "come": "comes" if one else "come",
@@ -231,7 +232,7 @@ def number(value: float) -> str:
 
 def _instead(effect: FoundEffect, rivals: Sequence[Rival]) -> str:
     """What else it could be."""
-    others = [listed([missing(c.effect, c.where) for c in r.effects]) for r in rivals if not r.contains][:4]
+    others = [listed(by_law([(c.effect, c.where) for c in r.effects])) for r in rivals if not r.contains][:4]
     return f"Instead of {missing(effect.name, effect.where)} it could be {listed(others, 'or')}." if others else ""
 
 
