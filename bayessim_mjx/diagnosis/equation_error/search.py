@@ -25,7 +25,7 @@ class Criteria:
         nats: held-out log density that an effect has to bring, beside the logarithm of the number of effects tried.
         least: share of a joint's effort (rms) that an effect has to be; above: and of what stays unexplained there.
         looked: effects that are held out in each round, the best of all in sample.
-        most: effects proposed at most.
+        most: effects proposed at most; at several joints an effect is one.
         same: nats by which another effect may be behind to be told as well, and its share of the effect's own gain.
     """
 
@@ -39,6 +39,10 @@ class Criteria:
 
 
 CRITERIA = Criteria()
+ALONE = ("payload",)  # effects of bodies: a robot carries one load
+
+
+Move = tuple[Term, ...]  # what is added in one step: a term, or one effect at all of its places
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,44 +76,58 @@ class Found:
 
 
 def search(sums: Sums, known: Sequence[Term], terms: Sequence[Term]) -> Found:
-    """Forward selection with a look back; what is scaled or added twice is not tried."""
+    """Forward selection with a look back; what is scaled or added twice is not tried.
+
+    A step adds one term, or one effect at every joint with a number of its own at each, as real robots have friction
+    in all of them; each further term has to bring the threshold.
+    """
     base = fitting.fit(sums, known)
     threshold = CRITERIA.nats + math.log(max(len(terms), 1))
     chosen: list[tuple[Term, tuple[str, ...]]] = []
     now, density = base, fitting.score(sums, known)
     before = density
-    while len(chosen) < CRITERIA.most:
+    while len({t.effect for t, _ in chosen}) < CRITERIA.most:
         own = [t for t, _ in chosen]
-        tried = _tried(sums, [*known, *own], [t for t in terms if _apart(t, own)], now)
+        tried = _tried(sums, [*known, *own], _moves(terms, own), now, threshold)
         if not tried:
             break
         (best, score), *others = tried
         gain = float(score.sum() - density.sum())
-        if gain < threshold or not _everywhere(score - density):
+        if gain < threshold * len(best) or not _everywhere(score - density):
             break
-        after = fitting.fit(sums, [*known, *own, best])
-        if not _matters(sums, after, best):
+        after = fitting.fit(sums, [*known, *own, *best])
+        if not any(_matters(sums, after, t) for t in best):
             break
         near = max(CRITERIA.same, CRITERIA.share * gain)
-        same = tuple(t.label for t, s in others if score.sum() - s.sum() < near)
-        chosen.append((best, same))
+        same = tuple(m[0].label for m, s in others if len(m) == 1 and score.sum() - s.sum() < near)
+        chosen += [(t, same if len(best) == 1 else ()) for t in best]
         now, density = after, score
-        chosen = _back(sums, known, chosen, density, threshold)
+        while len(fewer := _back(sums, known, chosen, density, threshold)) < len(chosen):
+            chosen, density = fewer, fitting.score(sums, [*known, *(t for t, _ in fewer)])
     own = [t for t, _ in chosen]
     now = fitting.fit(sums, [*known, *own])
     density = fitting.score(sums, [*known, *own])
     return Found(base, now, _proposals(sums, known, chosen, now, density), (before.sum(), density.sum()))
 
 
-def _tried(sums: Sums, kept: Sequence[Term], terms: Sequence[Term], now: Fit) -> list[tuple[Term, Array]]:
-    """Terms with their held-out densities, best first, of those that are best in sample."""
-    fits = [(t, fitting.fit(sums, [*kept, t], start=now.variance)) for t in terms]
+def _moves(terms: Sequence[Term], own: Sequence[Term]) -> list[Move]:
+    """What may be added to the terms chosen."""
+    left = [t for t in terms if _apart(t, own)]
+    each = {t.effect: tuple(o for o in left if o.effect == t.effect and o.where != "all") for t in left}
+    return [*((t,) for t in left), *(m for e, m in each.items() if len(m) > 1 and e not in ALONE)]
+
+
+def _tried(
+    sums: Sums, kept: Sequence[Term], moves: Sequence[Move], now: Fit, threshold: float
+) -> list[tuple[Move, Array]]:
+    """Moves with their held-out densities, best first, of those that are best in sample."""
+    fits = [(m, fitting.fit(sums, [*kept, *m], start=now.variance)) for m in moves]
     good = sorted(
-        ((t, fitting.evidence(sums, f)) for t, f in fits if f.feasible and np.isfinite(f.values).all()),
+        ((m, fitting.evidence(sums, f)) for m, f in fits if f.feasible and np.isfinite(f.values).all()),
         key=lambda p: -p[1],
     )
-    held = [(t, fitting.score(sums, [*kept, t], start=now.variance)) for t, _ in good[: CRITERIA.looked]]
-    return sorted(held, key=lambda p: -(p[1].sum() - 0.5 * p[0].count))
+    held = [(m, fitting.score(sums, [*kept, *m], start=now.variance)) for m, _ in good[: CRITERIA.looked]]
+    return sorted(held, key=lambda p: -(p[1].sum() - 0.5 * sum(t.count for t in p[0]) - threshold * (len(p[0]) - 1)))
 
 
 def _everywhere(gains: Array) -> bool:

@@ -14,6 +14,7 @@ from bayessim_mjx.diagnosis.fitting.fitter import Fit
 from bayessim_mjx.diagnosis.selection import chance, dense, heldout
 from bayessim_mjx.diagnosis.selection.beam import Plan
 from bayessim_mjx.diagnosis.selection.bounds import widened
+from bayessim_mjx.diagnosis.selection.everywhere import laws
 from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.selection.pool import (
     Pool,
@@ -107,7 +108,8 @@ class Fits:
         known = [c for c in self.pool.screened if c.candidate.label in self.pool.settings.together]
         own = [s.candidate for s in known]
         apart = all(compatible(a, b) for i, a in enumerate(own) for b in own[:i])
-        return [frozenset(c.label for c in own)] if 1 < len(own) <= most and apart else []
+        key = frozenset(c.label for c in own)
+        return [key] if len(own) > 1 and laws(self.table, key) <= most and apart else []
 
     def over(self, part: str) -> bool:
         """Whether a part of the search has had its time."""
