@@ -22,7 +22,7 @@ from rigs import Rig, draw, record
 SYSTEMS = ("pendulum", "cartpole", "two_link", "leg", "arm_torque", "arm_servo")
 EFFECTS = (
     "", "payload", "actuator_gain", "gain_everywhere", "coulomb_friction", "friction_everywhere", "viscous_friction",
-    "actuator_bias", "actuator_saturation",
+    "actuator_bias", "actuator_saturation", "friction_in_each",
 )  # fmt: skip
 PERIODS = (0.01, 0.005, 0.002, 0.001)
 VALUES = {"payload": "mass", "actuator_gain": "gain", "coulomb_friction": "level", "viscous_friction": "damping"}
@@ -63,6 +63,8 @@ def judged(rig: Rig) -> dict[str, Any]:
     place = logs[0].joints[0] if "friction" in true else logs[0].actuators[0]
     same = f"{rig.truth.effect}@{place}" if len(every) == 1 and true.endswith("@all") else true
     found = next((n for n in (true, same, *(every if tied else ())) if n in starts), "")
+    if rig.truth.where == "each":
+        return _each(rig, model, seen, starts) | {"seconds": took}
     rivals = [r for p in seen.proposals for r in p.rivals]
     error, deviations = _error(rig, starts.get(found), next((p for p in seen.proposals if p.label == found), None))
     return {
@@ -70,6 +72,22 @@ def judged(rig: Rig) -> dict[str, Any]:
         "sigma": rig.sigma, "quantum": rig.quantum, "seconds": took, "proposed": list(starts), "found": bool(found),
         "only": bool(found) and (len(starts) == 1 or tied), "told": bool(found) or true in rivals or same in rivals,
         "error": error, "deviations": deviations, "vetoed": true in seen.vetoes, "vetoes": sorted(seen.vetoes),
+        "nominal": max((j.nominal for j in seen.joints), default=0.0),
+        "left": max((j.left for j in seen.joints), default=1.0),
+    }  # fmt: skip
+
+
+def _each(rig: Rig, model: Any, seen: Any, starts: dict[str, Any]) -> dict[str, Any]:
+    """The row of friction of another size in every joint: named where it is named at each of them."""
+    joints = [model.joint(int(i)).name for i in model.actuator_trnid[:, 0]]
+    levels = [starts.get(f"coulomb_friction@{j}", {}).get("level", 0.0) for j in joints]
+    found = all(level > 0 for level in levels)
+    errors = [abs(level / true - 1) for level, true in zip(levels, rig.truth.values, strict=True)]
+    return {
+        "system": rig.system, "truth": "coulomb_friction@each", "values": rig.truth.values, "period": rig.period,
+        "effort": rig.effort, "sigma": rig.sigma, "quantum": rig.quantum, "proposed": list(starts), "found": found,
+        "only": found and len(starts) == len(joints), "told": found, "vetoed": False, "vetoes": sorted(seen.vetoes),
+        "error": float(np.median(errors)) if found else float("nan"), "deviations": float("nan"),
         "nominal": max((j.nominal for j in seen.joints), default=0.0),
         "left": max((j.left for j in seen.joints), default=1.0),
     }  # fmt: skip
@@ -136,7 +154,7 @@ def _vetoes(rows: Sequence[dict[str, Any]], named: Sequence[dict[str, Any]]) -> 
 
 def _kind(row: dict[str, Any]) -> str:
     effect, _, where = row["truth"].partition("@")
-    return f"{effect} everywhere" if where == "all" else effect
+    return f"{effect} everywhere" if where == "all" else f"{effect} in each" if where == "each" else effect
 
 
 def published(data: Path) -> None:

@@ -89,6 +89,9 @@ def draw(system: str, effect: str, rng: np.random.Generator) -> Truth:
         return Truth("actuator_gain", "all", (float(rng.choice([1 - share, 1 + share])),))
     if effect == "friction_everywhere":
         return Truth("coulomb_friction", "all", (share * float(size["effort"].min()),))
+    if effect == "friction_in_each":  # of another size in every joint
+        own = np.exp(rng.uniform(np.log(0.1), np.log(0.4), model.nu)) * size["effort"]
+        return Truth("coulomb_friction", "each", tuple(map(float, own)))
     if effect == "actuator_bias":
         return Truth(effect, name, (float(rng.choice([-1, 1])) * share * effort,))
     if effect == "viscous_friction":
@@ -100,21 +103,23 @@ def draw(system: str, effect: str, rng: np.random.Generator) -> Truth:
 
 def _built(rig: Rig, rng: np.random.Generator) -> mujoco.MjModel:
     system, truth = SYSTEMS[rig.system], rig.truth
-    spec = mujoco.MjSpec.from_string(system.xml)
+    spec, nominal = mujoco.MjSpec.from_string(system.xml), mujoco.MjModel.from_xml_string(system.xml)
     off = lambda: float(np.clip(1 + rig.spread * rng.normal(), 0.8, 1.2))  # noqa: E731
     for body in spec.bodies[1:]:
         factor = off()
         for geom in body.geoms:
             geom.mass *= factor
+    driven = [nominal.joint(int(i)).name for i in nominal.actuator_trnid[:, 0]]
     for joint in spec.joints:
         joint.armature *= off()
+        if truth.where == "each" and joint.name in driven:
+            joint.frictionloss = truth.values[driven.index(joint.name)]
         joint.damping[0] *= off()
         if truth.where in (joint.name, "all") and truth.effect == "coulomb_friction":
             joint.frictionloss = truth.values[0]
         if truth.where == joint.name and truth.effect == "viscous_friction":
             joint.damping[0] += truth.values[0]
     if truth.effect == "payload":
-        nominal = mujoco.MjModel.from_xml_string(system.xml)
         load = spec.body(truth.where).add_body(name="load")
         load.pos = nominal.body(truth.where).ipos + np.array(truth.values[1:])
         load.mass, load.inertia, load.ipos, load.explicitinertial = truth.values[0], np.full(3, 1e-9), np.zeros(3), True

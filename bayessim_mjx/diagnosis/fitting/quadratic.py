@@ -46,8 +46,8 @@ class Quadratic:
     def at(self, p: Array) -> Array:
         """Costs `[W]` at p `[K]`, or at one p per window `[W, K]`."""
         if p.ndim == 1:
-            return self.c - 2 * self.g @ p + np.einsum("i,wij,j->w", p, self.S, p)
-        return self.c - 2 * np.einsum("wi,wi->w", self.g, p) + np.einsum("wi,wij,wj->w", p, self.S, p)
+            return self.c - 2 * self.g @ p + _dot(p, self.S @ p)
+        return self.c - 2 * _dot(self.g, p) + _dot(p, times(self.S, p))
 
     def of(self, w: int) -> tuple[Array, Array]:
         """g and S of one window."""
@@ -55,7 +55,7 @@ class Quadratic:
 
     def weighted(self, w: Array) -> tuple[Array, Array]:
         """(sum of g, sum of S) with window weights `[W]`."""
-        return w @ self.g, np.einsum("w,wij->ij", w, self.S)
+        return w @ self.g, np.tensordot(w, self.S, 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,19 +68,28 @@ class Starts:
 
     def step(self, A: Array, p: Array) -> Array:
         """dx `[W, s]` for a step p `[K]` with columns A `[W, n, K]`."""
-        along = np.einsum("wns,wn->ws", self.B, A @ p)
-        return np.einsum("wst,wt->ws", self.M, self.b - along)
+        along = times(self.B.mT, A @ p)
+        return times(self.M, self.b - along)
+
+
+def times(M: Array, v: Array) -> Array:
+    """Matrices `[..., i, j]` times vectors `[..., j]`."""
+    return np.asarray((M @ v[..., None])[..., 0])
+
+
+def _dot(a: Array, b: Array) -> Array:
+    return np.asarray(np.sum(a * b, -1))
 
 
 def eliminate(r: Array, A: Array, B: Array, x: Array, spread: Array) -> tuple[Quadratic, Starts]:
     """(quadratic in the parameters, starts) for r `[W, n]`, A `[W, n, K]`, B `[W, n, s]`, x `[W, s]`, spread `[s]`."""
-    M = np.linalg.inv(np.einsum("wns,wnt->wst", B, B) + np.diag(1 / spread**2))
-    b = np.einsum("wns,wn->ws", B, r) - x / spread**2
-    BA = np.einsum("wns,wnk->wsk", B, A)
-    MBA = np.einsum("wst,wtk->wsk", M, BA)
-    c = np.sum(r**2, 1) + np.sum((x / spread) ** 2, 1) - np.einsum("ws,wst,wt->w", b, M, b)
-    g = np.einsum("wnk,wn->wk", A, r) - np.einsum("wsk,ws->wk", MBA, b)
-    S = np.einsum("wnk,wnl->wkl", A, A, optimize=True) - np.einsum("wsk,wsl->wkl", BA, MBA, optimize=True)
+    M = np.asarray(np.linalg.inv(B.mT @ B + np.diag(1 / spread**2)), np.float64)
+    b = times(B.mT, r) - x / spread**2
+    BA = B.mT @ A  # products of matrices throughout: einsum takes several times as long
+    MBA = M @ BA
+    c = np.sum(r**2, 1) + np.sum((x / spread) ** 2, 1) - _dot(b, times(M, b))
+    g = times(A.mT, r) - times(MBA.mT, b)
+    S = A.mT @ A - BA.mT @ MBA
     return Quadratic(c, g, S), Starts(B, M, b)
 
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
+from bayessim_mjx.diagnosis.fitting.quadratic import times
 
 Array = NDArray[np.float64]
 
@@ -255,23 +256,21 @@ class _Projection:
         self.inverse = np.linalg.pinv(H) if len(self.free) else H
         self.slope = slope[self.free]
         self.A = fit.A[:, :, self.free]
-        self.BA = np.einsum("wns,wnk->wsk", starts.B, self.A)
+        self.Bt, self.BA = starts.B.mT, starts.B.mT @ self.A
+        # columns by the parameters as one matrix, weighted, and less what the start states take
+        self.away = (self.A - starts.B @ (starts.M @ self.BA)).reshape(-1, len(self.free))
+        self.weighted = np.repeat(fit.weight, self.A.shape[1])[:, None] * self.away
 
     def moments(self, a: Array) -> tuple[float, float, float, Array]:
         """(s, g, full norm, projected column) of a column `[W, n]`."""
         w, starts = self.fit.weight, self.starts
-        Ba = np.einsum("wns,wn->ws", starts.B, a)
-        MBa = np.einsum("wst,wt->ws", starts.M, Ba)
+        Ba = times(self.Bt, a)
+        MBa = times(starts.M, Ba)
         s_aa = float(w @ (np.sum(a * a, 1) - np.sum(Ba * MBa, 1)))
         g_a = float(w @ (np.sum(a * self.fit.r, 1) - np.sum(MBa * starts.b, 1)))
-        s_ab = np.einsum("w,wnk,wn->k", w, self.A, a) - np.einsum("w,wsk,ws->k", w, self.BA, MBa)
+        s_ab = self.weighted.T @ a.ravel()
         along = self.inverse @ s_ab
-        projected = a - np.einsum("wns,ws->wn", starts.B, MBa)
-        projected = (
-            projected
-            - self.A @ along
-            + np.einsum("wns,wst,wtk,k->wn", starts.B, starts.M, self.BA, along, optimize=True)
-        )
+        projected = a - times(starts.B, MBa) - (self.away @ along).reshape(a.shape)
         return s_aa - float(s_ab @ along), g_a - float(s_ab @ (self.inverse @ self.slope)), s_aa, projected * self.root
 
 
