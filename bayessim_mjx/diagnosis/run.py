@@ -12,6 +12,7 @@ from types import MappingProxyType
 from typing import Any
 
 import mujoco
+from threadpoolctl import threadpool_limits
 
 from bayessim_mjx.diagnosis import resumed
 from bayessim_mjx.diagnosis.experiment import propose
@@ -96,6 +97,8 @@ STAGES = (
 )
 
 
+# its matrices are small: BLAS's threads take longer than one, and many times that where other processes want the cores
+@threadpool_limits.wrap(limits=1, user_api="blas")
 def investigate(
     robot: Robot,
     logs: Sequence[Log],

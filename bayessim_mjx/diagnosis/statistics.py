@@ -122,3 +122,8 @@ def _normal_quantile(log_beyond: float) -> float:
     from scipy.special import ndtri_exp
 
     return float(-ndtri_exp(min(log_beyond, np.log(0.5))))
+
+
+def times(M: Array, v: Array) -> Array:
+    """Matrices `[..., i, j]` times vectors `[..., j]`; as a product of matrices, several times as fast as einsum."""
+    return np.asarray((M @ v[..., None])[..., 0])

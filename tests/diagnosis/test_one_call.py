@@ -9,12 +9,14 @@ from types import MappingProxyType, SimpleNamespace
 import mujoco
 import numpy as np
 import pytest
+import threadpoolctl
 
 import bayessim_mjx
 from bayessim_mjx import diagnosis
 from bayessim_mjx.diagnosis import run
 from bayessim_mjx.diagnosis.findings import Findings, Where
 from bayessim_mjx.diagnosis.residual.where import Located
+from bayessim_mjx.diagnosis.setup import TooLittleData
 from bayessim_mjx.errors import UserError
 from tests.diagnosis.pendulums import MODEL, nominal, recorded, saved
 
@@ -132,3 +134,17 @@ def test_logs_in_memory_and_a_compiled_model_leave_no_files(tmp_path, monkeypatc
     assert result.save(tmp_path / "kept").is_file()
     short = diagnosis.diagnose(model, recorded(count=1, seconds=2.0)[0], effects=["coulomb_friction"])
     assert short.verdict == "insufficient_data" and short.about["logs"] == 1
+
+
+def test_blas_has_one_thread_while_a_diagnosis_runs(monkeypatch):
+    """Its threads wait for each other where other processes have the cores: six times the seconds were measured."""
+    seen = []
+
+    def prepare(*args, **named):
+        seen.extend(pool["num_threads"] for pool in threadpoolctl.threadpool_info() if pool["user_api"] == "blas")
+        raise TooLittleData("enough seen")
+
+    monkeypatch.setattr(run, "prepare", prepare)
+    with threadpoolctl.threadpool_limits(2, user_api="blas"), pytest.raises(TooLittleData):
+        run.investigate(None, [])
+    assert seen and set(seen) == {1}

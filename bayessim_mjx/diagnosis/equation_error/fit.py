@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.equation_error.sums import BUDGET, Sums
+from bayessim_mjx.diagnosis.statistics import times
 
 Array = NDArray[np.float64]
 
@@ -115,7 +116,7 @@ def left(sums: Sums, gram: Array, model: Array) -> Array:
     """`[nv]`, sums of squares of what a model leaves."""
     rest = -model
     rest[:, sums.layout.effort] += 1.0
-    return np.maximum(np.einsum("vp,vpq,vq->v", rest, gram, rest), 0.0)
+    return np.asarray(np.maximum(np.sum(rest * times(gram, rest), -1), 0.0))
 
 
 def fit(sums: Sums, terms: Sequence[Term], without: int | None = None, start: Array | None = None) -> Fit:
@@ -138,11 +139,12 @@ def fit(sums: Sums, terms: Sequence[Term], without: int | None = None, start: Ar
     for _ in range(RULES.rounds):
         design, target = _linearised(lay.effort, terms, spans, values, model, nominal)
         weight = np.where(on, 1.0 / variance, 0.0)
-        H = np.einsum("v,vpk,vpq,vql->kl", weight, design, gram, design, optimize=True)
-        g = np.einsum("v,vpk,vpq,vq->k", weight, design, gram, target, optimize=True)
+        weighed = (weight[:, None, None] * design).reshape(-1, size).T
+        H = weighed @ (gram @ design).reshape(-1, size)
+        g = weighed @ times(gram, target).ravel()
         precision = _precision(np.diag(H), terms, spans, values)
         H, g = H + np.diag(precision), g + neutral * precision
-        covariance = np.linalg.inv(H)
+        covariance = np.asarray(np.linalg.inv(H), np.float64)
         values = covariance @ g
         model = _model(terms, spans, values, nominal)
         variance = left(sums, gram, model) / rows + floor
@@ -204,7 +206,7 @@ def contribution(sums: Sums, found: Fit, term: Term) -> Array:
     nominal = np.zeros_like(found.model)
     nominal[:, sums.layout.known] = 1.0
     away = found.model - _model(found.terms, _spans(found.terms), values, nominal)
-    power = np.einsum("vp,vpq,vq->v", away, sums.whole, away) / np.maximum(sums.rows.sum(0), 1e-9)
+    power = np.sum(away * times(sums.whole, away), -1) / np.maximum(sums.rows.sum(0), 1e-9)
     return np.where(used(sums), np.sqrt(np.maximum(power, 0.0)) / np.maximum(size_of(sums), 1e-300), 0.0)
 
 

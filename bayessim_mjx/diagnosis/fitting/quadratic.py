@@ -14,6 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bayessim_mjx.diagnosis.statistics import times
+
 Array = NDArray[np.float64]
 
 
@@ -70,11 +72,6 @@ class Starts:
         """dx `[W, s]` for a step p `[K]` with columns A `[W, n, K]`."""
         along = times(self.B.mT, A @ p)
         return times(self.M, self.b - along)
-
-
-def times(M: Array, v: Array) -> Array:
-    """Matrices `[..., i, j]` times vectors `[..., j]`."""
-    return np.asarray((M @ v[..., None])[..., 0])
 
 
 def _dot(a: Array, b: Array) -> Array:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
-from bayessim_mjx.diagnosis.fitting.quadratic import times
+from bayessim_mjx.diagnosis.statistics import times
 
 Array = NDArray[np.float64]
 
