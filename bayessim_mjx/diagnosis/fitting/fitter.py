@@ -48,8 +48,8 @@ class Fitter:
 
     def whiten(self, errors: Array) -> Array:
         """`[..., W, H, channels]` -> `[..., W, n]`."""
-        r = errors[..., self.used] / self.sigma
-        return np.clip(r, -1e6, 1e6).reshape(*errors.shape[:-2], -1)
+        r = (errors if self.used.all() else errors[..., self.used]) / self.sigma
+        return np.clip(r, -1e6, 1e6, out=r).reshape(*errors.shape[:-2], -1)
 
     def vector(self, coordinates: Sequence[Coordinate], values: Array) -> Array:
         """theta `[P]`."""

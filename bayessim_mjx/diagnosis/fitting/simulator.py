@@ -31,6 +31,7 @@ class Call:
 
 
 CALL = Call()
+FAR = 1e3  # rad or m, rad/s or m/s: the error of a simulation that diverged
 
 
 class Simulator:
@@ -85,7 +86,8 @@ class Simulator:
 
         _, (qpos, qvel, effort) = jax.lax.scan(step, world, (own.command, force, own.enabled))
         error = jax.vmap(lambda a, b: difference(model, a, b))(own.qpos, qpos)
-        return jnp.concatenate([error, own.qvel - qvel], axis=1), effort
+        errors = jnp.concatenate([error, own.qvel - qvel], axis=1)
+        return jnp.nan_to_num(errors, nan=FAR, posinf=FAR, neginf=-FAR), effort
 
     def run(
         self,
@@ -128,4 +130,4 @@ class Simulator:
             done += pool.map(part, firsts[len(alone) :])
         self.rollouts += n * w
         result = np.concatenate(done).astype(np.float64)
-        return np.nan_to_num(result, nan=1e3, posinf=1e3, neginf=-1e3).reshape(n, w, *result.shape[1:])
+        return result.reshape(n, w, *result.shape[1:])

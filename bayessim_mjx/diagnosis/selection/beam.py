@@ -114,7 +114,7 @@ def _grow(fits: Fitting, criteria: Criteria) -> Key:
         if size == 1:
             plans += [Plan(k) for k in fits.together(min(3, criteria.most), criteria.beam)]
             plans += _everywhere(fits, BASE, criteria)
-        every = [p for k in beam for p in _everywhere(fits, k, criteria)]
+        every = _everywhere(fits, best, criteria)
         fits.fit([*plans, *every], f"{len(best) + 1} effects")
         untold = needed(fits.table, [p.key for p in every], criteria)
         fits.fit([Plan(*pair) for pair in untold], "dropping")

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.fitting.fitter import Fit
+from bayessim_mjx.diagnosis.selection.pool import beside
 from bayessim_mjx.diagnosis.selection.screen import Screened, residual
 
 Array = NDArray[np.float64]
@@ -134,6 +135,5 @@ def supports(fit: Fit, screened: Sequence[Screened], limit: int, most: int, coun
 
 
 def _clash(a: Screened, b: Screened) -> bool:
-    """Whether two candidates set the same numbers."""
-    first, second = ({i for c in s.candidate.coordinates for i in c.index} for s in (a, b))
-    return bool(first & second)
+    """Whether two candidates cannot be in one model."""
+    return not beside(a.candidate, b.candidate)

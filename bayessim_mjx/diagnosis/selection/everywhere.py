@@ -32,6 +32,8 @@ def laws(table: Table, key: Key) -> int:
 def spread(table: Table, key: Key, promises: Mapping[str, float]) -> list[tuple[Key, Key]]:
     """(model, fitted model to start from) for one more law, or one of the model's own, at all of its joints.
 
+    It stands in the place of its special cases: beside them its numbers would be there twice.
+
     Args:
         key: a fitted model; promises: {label: predicted drop of the cost} of what may be added to it.
     """
@@ -43,7 +45,8 @@ def spread(table: Table, key: Key, promises: Mapping[str, float]) -> list[tuple[
     found = []
     for effect in [*(e for e in own if places(table, e)), *more]:
         every = places(table, effect)
-        rest = frozenset(label for label in key if table.laws[label].effect != effect)
+        instead = {effect, *(s for label in every for s in table.laws[label].special)}
+        rest = frozenset(label for label in key if table.laws[label].effect not in instead)
         if every <= key or not _together(table, every | rest):
             continue
         starts = [k for k in (key, rest, BASE) if k in table.rows and k <= every | rest]

@@ -19,7 +19,7 @@ from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.selection.pool import (
     Pool,
     Progress,
-    compatible,
+    beside,
     fit_entries,
     polish,
     special_cases,
@@ -91,7 +91,7 @@ class Fits:
         """{label: predicted drop of the cost} of candidates on top of a model, the most promising first."""
         if key not in self._screened:
             model = self.pool.models[key]
-            others = [c for c in self.pool.candidates if all(compatible(c, e) for e in model.effects)]
+            others = [c for c in self.pool.candidates if all(beside(c, e) for e in model.effects)]
             pool = self.pool
             found = screen(pool.fitter, model.fit, others, pool.settings.screened, self.say, pool.secants)
             self._screened[key] = found
@@ -107,7 +107,7 @@ class Fits:
         """The set of effects that was proposed before the search, from where each one's own screening starts it."""
         known = [c for c in self.pool.screened if c.candidate.label in self.pool.settings.together]
         own = [s.candidate for s in known]
-        apart = all(compatible(a, b) for i, a in enumerate(own) for b in own[:i])
+        apart = all(beside(a, b) for i, a in enumerate(own) for b in own[:i])
         key = frozenset(c.label for c in own)
         return [key] if len(own) > 1 and laws(self.table, key) <= most and apart else []
 

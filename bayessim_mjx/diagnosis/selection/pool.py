@@ -197,6 +197,12 @@ def compatible(a: Candidate, b: Candidate) -> bool:
     return not {i for c in a.coordinates for i in c.index} & {i for c in b.coordinates for i in c.index}
 
 
+def beside(a: Candidate, b: Candidate) -> bool:
+    """Whether both may be in one model: not the same numbers twice, nor a law beside its special case at its place."""
+    within = a.effect in special_cases(b) or b.effect in special_cases(a)
+    return compatible(a, b) and not (within and a.where == b.where)
+
+
 def start_of(pool: Pool, candidate: Candidate) -> Screened:
     """The candidate with its values from its single fit as the start."""
     single = pool.models.get(frozenset([candidate.label]))

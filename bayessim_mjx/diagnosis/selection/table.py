@@ -32,8 +32,11 @@ class Law:
     kind: str = ""
 
     def beside(self, other: Law) -> bool:
-        """Whether both can be in one model: not the same numbers twice."""
-        return self.label != other.label and not (self.index & other.index)
+        """Whether both can be in one model: not the same numbers twice, nor a law beside its special case."""
+        within = self.effect in other.special or other.effect in self.special
+        return (
+            self.label != other.label and not (self.index & other.index) and not (within and self.where == other.where)
+        )
 
 
 @dataclass(frozen=True, eq=False)

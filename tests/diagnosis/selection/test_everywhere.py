@@ -79,3 +79,19 @@ def test_a_spread_model_begins_at_what_is_fitted():
     pair = everywhere.spread(known, frozenset([tied.label, other.label]), {})
     assert pair == [(every | {other.label}, frozenset([other.label]))]
     assert np.isfinite(known.excess(frozenset()))
+
+
+def test_a_law_stands_in_the_place_of_its_special_cases():
+    joints = ("j0", "j1")
+    dry = [law("coulomb_friction", j, kind="joint") for j in joints]
+    viscous = law("viscous_friction", "all", places=joints, kind="joint")
+    special = ("coulomb_friction", "viscous_friction")
+    both = [law("asymmetric_friction", j, 4, special=special, kind="joint") for j in joints]
+    known = table({(): 9.0, (*dry, viscous): 3.0, (both[0],): 4.0, (both[1],): 5.0})
+    key = frozenset([*(c.label for c in dry), viscous.label])
+    found = everywhere.spread(known, key, {c.label: 1.0 for c in both})
+    assert (frozenset(c.label for c in both), frozenset()) in found
+    assert not any(
+        len({known.laws[x].effect for x in model} & {"asymmetric_friction", *special}) == 3 for model, _ in found
+    )
+    assert not both[0].beside(dry[0]) and both[0].beside(dry[1]) and dry[0].beside(viscous)
