@@ -101,7 +101,7 @@ class Fits:
         """Sets of effects that promise most when all amplitudes are free at once (`dense`), and what was proposed."""
         found = dense.supports(self.pool.base.fit, self.pool.screened, self.pool.settings.screened, most, count)
         self._amounts = {frozenset(s.candidate.label for s in starts): tuple(starts) for starts in found}
-        return list(dict.fromkeys([*self._amounts, *self._proposed(most)]))
+        return list(dict.fromkeys([*self._amounts, *self._proposed(self.pool.criteria.most)]))
 
     def _proposed(self, most: int) -> list[Key]:
         """The set of effects that was proposed before the search, from where each one's own screening starts it."""

@@ -33,10 +33,8 @@ class Law:
 
     def beside(self, other: Law) -> bool:
         """Whether both can be in one model: not the same numbers twice, nor a law beside its special case."""
-        within = self.effect in other.special or other.effect in self.special
-        return (
-            self.label != other.label and not (self.index & other.index) and not (within and self.where == other.where)
-        )
+        within = self.where == other.where and (self.effect in other.special or other.effect in self.special)
+        return self.label != other.label and not self.index & other.index and not within
 
 
 @dataclass(frozen=True, eq=False)
