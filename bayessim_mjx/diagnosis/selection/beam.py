@@ -12,7 +12,7 @@ from typing import Protocol
 
 from bayessim_mjx.diagnosis.selection.criteria import Criteria
 from bayessim_mjx.diagnosis.selection.decide import Decision, admissible, decide, order, same, settled, value
-from bayessim_mjx.diagnosis.selection.everywhere import laws, needed, spread
+from bayessim_mjx.diagnosis.selection.everywhere import by_law, laws, needed, spread
 from bayessim_mjx.diagnosis.selection.table import BASE, Key, Table
 
 ROUNDS = 4  # of growing and looking around, at most
@@ -49,6 +49,9 @@ class Fitting(Protocol):
 
     def together(self, most: int, count: int) -> list[Key]:
         """Sets of up to so many effects that promise most when all amplitudes are free at once."""
+
+    def proposed(self, most: int) -> list[Key]:
+        """The set of up to so many laws that was proposed before the search, where there is one."""
 
     def over(self, part: str) -> bool:
         """Whether a part of the search has had its time."""
@@ -104,16 +107,19 @@ def _best(fits: Fitting, criteria: Criteria, most: int) -> Key:
 
 def _grow(fits: Fitting, criteria: Criteria) -> Key:
     """Add to the models of the beam as long as that brings something worth naming, and the best is above the noise."""
-    best = BASE if settled(fits.table, BASE, criteria) else _best(fits, criteria, criteria.finalists)
+    best = BASE
+    if not settled(fits.table, BASE, criteria):
+        fits.fit([Plan(k) for k in fits.proposed(criteria.most)], "proposed together")
+        best = _best(fits, criteria, criteria.finalists)
     for size in range(1, criteria.most):
         if settled(fits.table, best, criteria) or fits.over(TOGETHER):
             break
         table = fits.table
-        beam = [k for k in leading(table, criteria)[: criteria.beam] if laws(table, k) < criteria.most]
+        beam = _going_on(table, best, criteria)
         plans = [p for k in beam for p in _added(fits, k, criteria.width - 2 * (k != best))]
         if size == 1:
             plans += [Plan(k) for k in fits.together(min(3, criteria.most), criteria.beam)]
-            plans += _everywhere(fits, BASE, criteria)
+            plans += _everywhere(fits, BASE, criteria) if laws(table, best) < 2 else []
         every = _everywhere(fits, best, criteria)
         fits.fit([*plans, *every], f"{len(best) + 1} effects")
         untold = needed(fits.table, [p.key for p in every], criteria)
@@ -122,6 +128,13 @@ def _grow(fits: Fitting, criteria: Criteria) -> Key:
         if best == before or same(fits.table, before, best, criteria):
             break
     return best
+
+
+def _going_on(table: Table, best: Key, criteria: Criteria) -> list[Key]:
+    """Models that may have one law more: the leading ones, but for smaller ones that the best has left far behind."""
+    near = CLOSE * table.rows[best].total
+    beam = [k for k in leading(table, criteria)[: criteria.beam] if laws(table, k) < criteria.most]
+    return [k for k in beam if laws(table, k) >= laws(table, best) or table.rows[k].total < near]
 
 
 def _added(fits: Fitting, key: Key, count: int) -> list[Plan]:
@@ -137,12 +150,15 @@ def _around(fits: Fitting, best: Key, criteria: Criteria) -> Key:
     """The best of a model's neighbours: an effect dropped, exchanged, or in its place special cases or one place."""
     if fits.over(TOGETHER):
         return best
-    fits.fit([Plan(best - {label}, best) for label in best], "dropping", needed=True)
+    whole = by_law(fits.table, best)
+    fewer = dict.fromkeys([*(best - {label} for label in sorted(best)), *(best - own for own in whole)])
+    fits.fit([Plan(key, best) for key in fewer], "dropping", needed=True)
     plans = []
-    for label in sorted(best):
-        rest = best - {label}
+    for own in whole:  # a law at several joints is exchanged as one
+        rest = best - own
         plans += _added(fits, rest, criteria.width) if rest else []
-        plans += [Plan(rest | own, rest) for own in specialised(fits.table, best, label)]
+        for label in own if len(own) == 1 else ():
+            plans += [Plan(rest | other, rest) for other in specialised(fits.table, best, label)]
     fits.fit([p for p in plans if laws(fits.table, p.key) <= criteria.most], "exchanges")
     table = fits.table
     ahead = leading(table, criteria)[: 2 * criteria.beam]  # simpler ones may not have come to their end

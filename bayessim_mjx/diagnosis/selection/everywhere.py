@@ -29,6 +29,12 @@ def laws(table: Table, key: Key) -> int:
     return len({table.laws[label].effect for label in key})
 
 
+def by_law(table: Table, key: Key) -> list[Key]:
+    """The labels of a model, those of one law together."""
+    effects = sorted({table.laws[label].effect for label in key})
+    return [frozenset(label for label in key if table.laws[label].effect == e) for e in effects]
+
+
 def spread(table: Table, key: Key, promises: Mapping[str, float]) -> list[tuple[Key, Key]]:
     """(model, fitted model to start from) for one more law, or one of the model's own, at all of its joints.
 

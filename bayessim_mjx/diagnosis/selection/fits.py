@@ -101,9 +101,9 @@ class Fits:
         """Sets of effects that promise most when all amplitudes are free at once (`dense`), and what was proposed."""
         found = dense.supports(self.pool.base.fit, self.pool.screened, self.pool.settings.screened, most, count)
         self._amounts = {frozenset(s.candidate.label for s in starts): tuple(starts) for starts in found}
-        return list(dict.fromkeys([*self._amounts, *self._proposed(self.pool.criteria.most)]))
+        return list(self._amounts)
 
-    def _proposed(self, most: int) -> list[Key]:
+    def proposed(self, most: int) -> list[Key]:
         """The set of effects that was proposed before the search, from where each one's own screening starts it."""
         known = [c for c in self.pool.screened if c.candidate.label in self.pool.settings.together]
         own = [s.candidate for s in known]

@@ -95,3 +95,26 @@ def test_a_law_stands_in_the_place_of_its_special_cases():
         len({known.laws[x].effect for x in model} & {"asymmetric_friction", *special}) == 3 for model, _ in found
     )
     assert not both[0].beside(dry[0]) and both[0].beside(dry[1]) and dry[0].beside(viscous)
+
+
+def test_what_was_proposed_together_is_fitted_first_and_nothing_far_behind_it_goes_on():
+    amounts = {f"{name}@{j}": 2.0 + 0.3 * i for i, j in enumerate(JOINTS) for name in ("friction", "damping")}
+
+    class Proposing(Linear):
+        def proposed(self, most):
+            return [frozenset(amounts)]
+
+    fits = Proposing(joints(), amounts, kind="joint", places=JOINTS)
+    assert set(beam.search(fits, Criteria()).answer) == set(amounts)
+    other = Linear(joints(), amounts, kind="joint", places=JOINTS)
+    beam.search(other, Criteria())
+    assert fits.fitted < other.fitted
+
+
+def test_a_proposal_that_does_not_explain_does_not_win():
+    class Misled(Linear):
+        def proposed(self, most):
+            return [frozenset(["a@j0", "b@j0"])]
+
+    fits = Misled(joints(), {"friction@j2": 3.0, "c@j0": 3.0}, kind="joint", places=JOINTS)
+    assert set(beam.search(fits, Criteria()).answer) == {"friction@j2", "c@j0"}
