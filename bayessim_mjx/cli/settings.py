@@ -62,6 +62,7 @@ def task_name(name: str) -> str:
     """The task's proper name; UserError with the close ones where there is none."""
     from bayessim_mjx import registry
 
+    registry.no_file(name, "--task")
     if ":" in name:
         return name
     known = {title.lower(): title for title in registry.names()}

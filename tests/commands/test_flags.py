@@ -20,6 +20,7 @@ from bayessim_mjx.errors import UserError
 @pytest.mark.parametrize(
     ("argv", "words"),
     [
+        (["--task", "robot.xml"], ["'robot.xml': a model's file is no task", "diagnose --model robot.xml"]),
         (["--task", "Pendulm"], ["'Pendulm'", "Did you mean Pendulum", "Allowed: Ant, "]),
         (["--tsk", "Pendulum"], ["'--tsk'", "Did you mean --task"]),
         (["--task", "Pendulum", "--num_envs", "many"], ["--num_envs", "'many'"]),
