@@ -47,6 +47,8 @@ announce()  # bayessim_mjx/<Task>-v0 in Gymnasium
 def __getattr__(name: str) -> Any:
     if name == "diagnose":  # the command's module, which can be called
         return import_module("bayessim_mjx.diagnose")
+    if name == "__version__":
+        return import_module("bayessim_mjx.versions").of(["bayessim-mjx"])["bayessim-mjx"]
     if name in _WHERE:
         return getattr(import_module(f"bayessim_mjx.{_WHERE[name]}"), name)
     raise AttributeError(f"module 'bayessim_mjx' has no attribute {name!r}; it has {', '.join(__all__)}")

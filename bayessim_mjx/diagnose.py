@@ -174,21 +174,28 @@ def _diagnose(argv: Sequence[str] | None) -> int:
     from bayessim_mjx.monitor.stages import stages
 
     began = time.monotonic()
+
+    def early(lines: Sequence[str]) -> None:
+        _told(f"Before any simulation ({time.monotonic() - began:.1f} s):", lines, args.headless)
+
     with warnings.catch_warnings(record=True), stages(args.headless) as say:  # what matters is told with the result
-        result = _diagnosis(args, say, lambda lines: _told(lines, time.monotonic() - began))
+        result = _diagnosis(args, say, early)
         say("writing the report", 0, 1)
         report.write(result, Path(args.out), missed)
         report.tensorboard(result, Path(args.out))
     report.console(result, Path(args.out))
     if missed:
-        print(f"On this robot and these logs ({missed.page}):", *(f"  {line}" for line in missed.sentences), sep="\n")
+        _told(f"On this robot and these logs ({missed.page}):", missed.sentences, args.headless)
     print(f"{duration(time.monotonic() - began)}; open {Path(args.out) / 'report.html'}")
     return 0
 
 
-def _told(lines: Sequence[str], seconds: float) -> None:
-    """What the logs tell before anything is simulated, as soon as it is known."""
-    print(f"Before any simulation ({seconds:.1f} s):", *(f"  {line}" for line in lines), sep="\n", flush=True)
+def _told(title: str, lines: Sequence[str], headless: bool) -> None:
+    """A list that is told as soon as it is known: what the logs say before anything is simulated, for one."""
+    from bayessim_mjx.monitor.output import Output
+
+    out = Output(headless, sys.stdout)
+    print(title, *(part for line in lines for part in out.broken(f"  {line}", 4)), sep="\n", flush=True)
 
 
 main = cli.command(_diagnose)

@@ -4,6 +4,7 @@ import difflib
 import importlib
 import warnings
 from collections.abc import Sequence
+from pathlib import PurePath
 from typing import TYPE_CHECKING, Any
 
 from bayessim_mjx.effects.support import reading, storage
@@ -60,6 +61,7 @@ def _listed(config: "Config") -> "tuple[Effect, ...]":
 
 
 def _task(name: str) -> Any:
+    no_file(name, "task")
     known = {title.lower(): title for title in names()}
     title = known.get(name.lower().replace("_", ""))
     if title is None:
@@ -69,3 +71,12 @@ def _task(name: str) -> Any:
         raise UserError(f"task {name!r}: {hint}there are: {', '.join(names())}, {external}")
     snake = "".join(f"_{c.lower()}" if c.isupper() else c for c in title).lstrip("_")
     return getattr(importlib.import_module(f"bayessim_mjx.tasks.{snake}"), title)
+
+
+def no_file(name: str, what: str) -> None:
+    """UserError where the file of a model is given for the name of a task; `what` says where it was given."""
+    if PurePath(name).suffix.lower() in (".xml", ".mjcf", ".urdf"):
+        raise UserError(
+            f"{what} {name!r}: a model's file is no task, which has rewards and resets too. "
+            f"`bayessim-mjx diagnose --model {name}` compares it with logs; docs/own_task.md makes a task of it"
+        )

@@ -135,6 +135,7 @@ def terminal_picture(text: str, title: str, out: Path) -> None:
     console = Console(record=True, width=COLUMNS, file=io.StringIO())
     for line in screen.texts():
         console.print(line, soft_wrap=True)
+    console.print()  # the picture ends within its last line
     svg = console.export_svg(title=f"python -m bayessim_mjx.{title}", theme=THEME, unique_id=out.stem)
     out.write_text(re.sub(r"@font-face {.*?}\s*", "", svg, flags=re.DOTALL))
 

@@ -7,6 +7,7 @@ python examples/sb3_under_posterior.py --task Cartpole --out logs/sb3/cartpole -
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 parser.add_argument("--task", default="Cartpole", help="a task, or the folder of a run")
@@ -46,16 +47,18 @@ mean, spread = evaluate_policy(model, env, n_eval_episodes=args.num_envs)
 print(f"return of {args.num_envs} episodes: {mean:.1f}, standard deviation {spread:.1f}")
 
 if args.video:
-    import imageio.v3 as imageio
+    import numpy as np
+
+    from bayessim_mjx.monitor import video
 
     one = VecNormalize.load(str(scales), sb3.make(args.task, 1, domain))
     one.training = False
-    obs, frames = one.reset(), []
-    for _ in range(300):
-        obs, _, done, _ = one.step(model.predict(obs, deterministic=True)[0])
+    obs: Any = one.reset()
+    frames: list[Any] = []
+    for _step in range(300):
+        obs, _reward, done, _infos = one.step(model.predict(obs, deterministic=True)[0])
         frames += one.get_images()
         if done[0]:
             break
-    if frames and frames[0] is not None:
-        imageio.imwrite(args.out / "episode.mp4", frames, fps=round(1 / one.get_attr("env")[0].dt))
+    if frames[0] is not None and video.save(np.stack(frames), args.out / "episode.mp4", 1 / one.get_attr("dt")[0]):
         print(f"video: {args.out / 'episode.mp4'}")

@@ -10,10 +10,11 @@ import sys
 import types
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import bayessim_mjx
-from bayessim_mjx import main, registry, rl
+from bayessim_mjx import diagnosis, main, registry, rl
 from bayessim_mjx.cli import ancestors
 from bayessim_mjx.config import settings
 
@@ -193,7 +194,15 @@ def test_the_how_to_of_an_own_robot_finds_its_hidden_friction(tmp_path, monkeypa
     page = run(code_of(ROOT / "docs" / "own_robot.md"), "own_robot", monkeypatch)
     [effect] = page.diagnosis.effects
     assert (effect.name, effect.where) == ("coulomb_friction", "elbow")
-    assert 0.10 < effect.parameters["level"].mean < 0.14  # 0.12 N m; masses are free within 20 %
+    level = effect.parameters["level"].mean
+    assert 0.10 < level < 0.14  # 0.12 N m; masses are free within 20 %
+    corrected = page.corrected.space
+    assert corrected.nominal[corrected.index("elbow.coulomb_friction.level")] == pytest.approx(level, rel=1e-5)
+    assert page.domain.space.names == corrected.names and np.isfinite(page.domain.mean()).all()
+    assert diagnosis.load(tmp_path / "found").to_dict() == page.diagnosis.to_dict()
+    written = {path.name for path in (tmp_path / "found").iterdir()}
+    assert {"diagnosis.json", "details.json", "effects.yaml", "model_with_effects.xml"} <= written
+    assert "preliminary.json" not in written
 
 
 @pytest.mark.slow

@@ -121,10 +121,10 @@ def _recorded(folder: Path) -> Path:
 def test_sb3_under_posterior(run: Run, tmp_path: Path) -> None:
     """Trained, saved, loaded, evaluated, filmed."""
     pytest.importorskip("stable_baselines3")
-    given = ("--task", "Cartpole", "--num_envs", 8, "--out", tmp_path / "sb3", "--video")
+    given = ("--task", "Cartpole", "--num_envs", 8, "--out", tmp_path / "sb3")
     out = run("sb3_under_posterior", *given, "--domain", "prior", "--timesteps", 1024)
     assert "return of 8 episodes" in out and (tmp_path / "sb3" / "model.zip").is_file()
-    played = run("sb3_under_posterior", *given, "--play")
+    played = run("sb3_under_posterior", *given, "--play", "--video")
     assert "return of 8 episodes" in played
 
 

@@ -54,6 +54,7 @@ FLAGS: dict[str, tuple[str, Any, str]] = {
     "--devices": ("devices", str, "number of devices that share the worlds, or all"),
     "--cache_dir": ("cache_dir", str, "folder of compiled programs, or off (default: $BAYESSIM_MJX_CACHE)"),
 }
+ALSO_KEYS = {key for key, _, _ in FLAGS.values()} | {"agent"}  # flags that are settings of the same name, too
 CHECKPOINTS = {
     "play": "policy to play (default: best)",
     "gap_loop": "policies to evaluate in place of training new ones on the simulator as it was",
@@ -198,6 +199,19 @@ class Parser(PlainParser):
             raise unknown("flag", flag, sorted(self._option_string_actions))
         if "=" not in text:
             raise UserError(f"{text!r} is neither a flag nor an override section.key=value")
+        self._refuse_flag_as_key(text)
+
+    def _refuse_flag_as_key(self, text: str) -> None:
+        """UserError for a flag in Hydra's form, as IsaacGymEnvs has it: task=Ant, headless=True, test=True."""
+        key, _, value = text.partition("=")
+        if key in ALSO_KEYS:
+            return
+        said = ancestors.word(f"--{key}")
+        if said is None and f"--{key}" in self._option_string_actions:
+            switch = self._option_string_actions[f"--{key}"].nargs == 0
+            said = f"this is a flag: --{key}" + ("" if switch else f" {value}")
+        if said is not None and not value.startswith("{"):
+            raise UserError(f"override {text!r}: {said}")
 
     def _has_no_use_for(self, key: str) -> bool:
         return key.split(".")[0] in self.unused and key not in self.but

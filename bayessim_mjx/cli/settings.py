@@ -62,10 +62,13 @@ def task_name(name: str) -> str:
     """The task's proper name; UserError with the close ones where there is none."""
     from bayessim_mjx import registry
 
+    registry.no_file(name, "--task")
     if ":" in name:
         return name
     known = {title.lower(): title for title in registry.names()}
     if name.lower().replace("_", "") not in known:
+        if meant := [title for low, title in known.items() if f"-{low}-" in f"-{name.lower().replace('/', '-')}-"]:
+            raise UserError(f"--task {name!r} is unknown. Here it is called {meant[0]}")
         raise unknown("--task", name, [*known.values(), *(f"{prefix}:<env>" for prefix in registry.EXTERNAL)])
     return known[name.lower().replace("_", "")]
 

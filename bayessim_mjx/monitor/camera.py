@@ -22,6 +22,28 @@ def view_of(model: Any, data: Any, qpos: np.ndarray, camera: str | int | None, a
     return view
 
 
+def reach(model: Any) -> np.ndarray:
+    """Poses [21, nq] over the ranges of all joints, so that a camera fitted to them sees whatever comes.
+
+    Hinges without limits turn once. Slides without limits and free roots stay where they are.
+    """
+    import mujoco
+
+    rng, count = np.random.default_rng(0), 21  # steps of 18 degrees: a turn's four extremes are among them
+    poses = np.tile(model.qpos0, (count, 1))
+    for joint in range(model.njnt):
+        kind, address = model.jnt_type[joint], model.jnt_qposadr[joint]
+        hinge, slide = kind == mujoco.mjtJoint.mjJNT_HINGE, kind == mujoco.mjtJoint.mjJNT_SLIDE
+        limited = bool(model.jnt_limited[joint])
+        if hinge or (slide and limited):
+            low, high = model.jnt_range[joint] if limited else (-np.pi, np.pi)
+            poses[:, address] = rng.permutation(np.linspace(low, high, count))  # each range is covered evenly
+        elif kind == mujoco.mjtJoint.mjJNT_BALL:
+            turns = rng.normal(size=(count, 4))
+            poses[:, address : address + 4] = turns / np.linalg.norm(turns, axis=1, keepdims=True)
+    return poses
+
+
 def _number(model: Any, camera: str | int) -> int:
     names = [model.camera(i).name for i in range(model.ncam)]
     if isinstance(camera, str) and camera in names:

@@ -4,8 +4,7 @@ import copy
 import os
 import platform
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
+import weakref
 from typing import Any
 
 import numpy as np
@@ -35,27 +34,20 @@ def backends() -> list[str]:
     return ["cgl", "glfw"] if platform.system() == "Darwin" else ["glfw"]
 
 
-@contextmanager
-def _context(width: int, height: int) -> Iterator[Any]:
-    """A current OpenGL context, or None.
+def _open(width: int, height: int) -> Any:
+    """A current OpenGL context, or None with one warning.
 
     MuJoCo fixes its backend when it is first imported, long before anybody asks for a video; so the context is made
     here from the backend's own module and works whatever was imported before.
     """
-    context, failures = None, []
+    failures = []
     for name in backends():
         try:
-            context = _make_context(name, width, height)
-            break
+            return _make_context(name, width, height)
         except Exception as error:
             failures.append(f"{name}: {error}")
-    if context is None:
-        warn_once("no video: " + ("; ".join(failures) or "rendering is switched off by MUJOCO_GL"))
-    try:
-        yield context
-    finally:
-        if context is not None:
-            context.free()
+    warn_once("no video: " + ("; ".join(failures) or "rendering is switched off by MUJOCO_GL"))
+    return None
 
 
 def _make_context(name: str, width: int, height: int) -> Any:
@@ -95,40 +87,76 @@ def render(
         camera: name or number, see `camera.view_of`.
         mocap: poses [T, nmocap, 7] (m, quaternion) of the mocap bodies of each; None: where the model has them.
     """
-    import mujoco
+    renderer = Renderer.of(model, width, height)
+    if renderer is None:
+        return None
+    length = max(map(len, worlds))
+    try:
+        tiles = []
+        for world, marks in zip(worlds, mocap or [None] * len(worlds), strict=True):
+            frames = renderer.frames(world, renderer.view(world, camera), marks)
+            tiles.append(np.stack(frames + [frames[-1]] * (length - len(frames))))
+    finally:
+        renderer.close()
+    return tiles
 
-    model = copy.copy(model)  # the buffer and the lights are set for the video only
+
+class Renderer:
+    """Pictures of one model, on an OpenGL context of its own that lasts until `close` or until nobody has it any more.
+
+    The context takes several times as long to make as a picture, so who asks for single pictures keeps it.
+    """
+
+    @classmethod
+    def of(cls, model: Any, width: int, height: int) -> "Renderer | None":
+        """Of `mujoco.MjModel`, which stays as it is, in pixels; None, with one warning, where no OpenGL works."""
+        context = _open(width, height)
+        return None if context is None else cls(model, context, width, height)
+
+    def __init__(self, model: Any, context: Any, width: int, height: int) -> None:
+        import mujoco
+
+        self.model, self._context, self.aspect = _lit(model, width, height), context, width / height
+        self.data = mujoco.MjData(self.model)
+        try:
+            self._picture = _Picture(self.model, width, height)
+        except Exception:
+            context.free()
+            raise
+        self.close = weakref.finalize(self, _freed, self._picture, context)
+        self.close.atexit = False  # EGL has gone by then, and all that it held
+
+    def view(self, seen: np.ndarray, camera: str | int | None = None) -> Any:
+        """`mujoco.MjvCamera`, fitted to poses `seen` [T, nq] where the model has none, see `camera.view_of`."""
+        return view_of(self.model, self.data, seen, camera, self.aspect)
+
+    def frames(self, world: np.ndarray, view: Any, marks: np.ndarray | None = None) -> list[np.ndarray]:
+        """A picture of every row of qpos [T, nq]; rows that repeat the one before are not drawn again."""
+        self._context.make_current()  # others may have been opened since
+        out: list[np.ndarray] = []
+        for k, pose in enumerate(world):
+            same = k > 0 and np.array_equal(pose, world[k - 1])
+            if marks is not None:
+                same = same and np.array_equal(marks[k], marks[k - 1])
+                self.data.mocap_pos[:], self.data.mocap_quat[:] = marks[k, :, :3], marks[k, :, 3:]
+            out.append(out[-1] if same else self._picture.take(self.data, pose, view))
+        return out
+
+
+def _freed(picture: "_Picture", context: Any) -> None:
+    context.make_current()
+    picture.free()
+    context.free()
+
+
+def _lit(model: Any, width: int, height: int) -> Any:
+    """A copy with a buffer for pictures of this size, and with light where the model has none."""
+    model = copy.copy(model)
     model.vis.global_.offwidth, model.vis.global_.offheight = 2 * width, 2 * height
     model.vis.quality.offsamples = 0
     if model.nlight == 0:
         model.vis.headlight.ambient[:], model.vis.headlight.diffuse[:] = 0.45, 0.55
-    data = mujoco.MjData(model)
-    length = max(map(len, worlds))
-    with _context(width, height) as context:
-        if context is None:
-            return None
-        picture = _Picture(model, width, height)
-        try:
-            tiles = []
-            for world, marks in zip(worlds, mocap or [None] * len(worlds), strict=True):
-                view = view_of(model, data, world, camera, width / height)
-                frames = _frames(picture, data, world, marks, view)
-                tiles.append(np.stack(frames + [frames[-1]] * (length - len(frames))))
-        finally:
-            picture.free()
-    return tiles
-
-
-def _frames(picture: "_Picture", data: Any, world: np.ndarray, marks: np.ndarray | None, view: Any) -> list[np.ndarray]:
-    """A picture of every row; rows that repeat the one before are not drawn again."""
-    out: list[np.ndarray] = []
-    for k, pose in enumerate(world):
-        same = k > 0 and np.array_equal(pose, world[k - 1])
-        if marks is not None:
-            same = same and np.array_equal(marks[k], marks[k - 1])
-            data.mocap_pos[:], data.mocap_quat[:] = marks[k, :, :3], marks[k, :, 3:]
-        out.append(out[-1] if same else picture.take(data, pose, view))
-    return out
+    return model
 
 
 class _Picture:

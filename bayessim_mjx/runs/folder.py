@@ -216,7 +216,10 @@ def latest_run(logdir: str | Path, task: str, with_checkpoint: bool = True) -> R
     """The newest run of a task (that has a checkpoint)."""
     runs = [run for run in find_runs(logdir, task) if run.checkpoints or not with_checkpoint]
     if not runs:
-        raise UserError(f"no run of {task!r} with a checkpoint under {Path(logdir) / _folder_name(task)}")
+        raise UserError(
+            f"no run of {task!r} with a checkpoint under {Path(logdir) / _folder_name(task)}: give its folder by "
+            f"--checkpoint RUN, or train first, `bayessim-mjx train --task {task}`"
+        )
     return runs[-1]
 
 

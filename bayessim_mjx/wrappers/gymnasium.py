@@ -18,13 +18,12 @@ from bayessim_mjx import registry
 from bayessim_mjx.compat import program
 from bayessim_mjx.env import Env
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.monitor import video
 from bayessim_mjx.rollout import next_episodes, select
+from bayessim_mjx.wrappers.pictures import Camera
 from bayessim_mjx.wrappers.spaces import boxes
 from bayessim_mjx.wrappers.worlds import domain_of
 
 RENDER_MODES = ("rgb_array",)
-WIDTH, HEIGHT = 480, 360  # pixels of a picture
 SAME, NEXT, DISABLED = AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED
 
 
@@ -94,22 +93,6 @@ def _options(options: Mapping[str, Any] | None, allowed: tuple[str, ...]) -> dic
         if key not in allowed:
             raise UserError(f"options[{key!r}]: unknown; allowed: {', '.join(allowed)}")
     return given
-
-
-class Camera:
-    """Pictures of worlds, each with its own parameters; compiled models are kept while theta stays."""
-
-    def __init__(self, env: Env) -> None:
-        self.env, self._models = env, {}  # type: ignore[var-annotated]
-
-    def __call__(self, qpos: np.ndarray, theta: np.ndarray, observation: np.ndarray | None = None) -> np.ndarray | None:
-        """`[HEIGHT, WIDTH, 3]` uint8; None, with a warning, where no OpenGL works."""
-        key = theta.tobytes()
-        if key not in self._models:
-            self._models = {**dict(list(self._models.items())[-63:]), key: video.model_at(self.env, theta)}
-        marks = None if observation is None else self.env.marks(qpos[None], observation[None])
-        frames = video.record(self._models[key], qpos[None], width=WIDTH, height=HEIGHT, mocap=marks)
-        return None if frames is None else frames[0]
 
 
 class GymnasiumEnv(gymnasium.Env):

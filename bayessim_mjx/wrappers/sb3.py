@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from bayessim_mjx.errors import UserError
+from bayessim_mjx.wrappers.pictures import Camera
 from bayessim_mjx.wrappers.spaces import boxes
 from bayessim_mjx.wrappers.worlds import Worlds, worlds
 
@@ -40,6 +41,7 @@ class SB3VecEnv(VecEnv):
         self.metadata = {"render_modes": ["rgb_array"]}
         super().__init__(worlds.num_envs, *boxes(worlds.env))
         self._actions: Any = None
+        self._camera = Camera(worlds.env)
 
     def seed(self, seed: int | None = None) -> Sequence[None | int]:
         if seed is not None:
@@ -76,12 +78,9 @@ class SB3VecEnv(VecEnv):
         pass
 
     def get_images(self) -> Sequence[np.ndarray | None]:
-        """A picture `[height, width, 3]` of each world."""
-        from bayessim_mjx.wrappers.gymnasium import Camera
-
-        camera = Camera(self.worlds.env)
-        pairs = zip(np.asarray(self.worlds.qpos), np.asarray(self.worlds.theta), strict=True)
-        return [camera(qpos, theta) for qpos, theta in pairs]
+        """A picture `[height, width, 3]` of each world; None where no OpenGL works."""
+        shown = self.worlds.qpos, self.worlds.theta, self.worlds.obs["policy"]
+        return [self._camera(*world) for world in zip(*map(np.asarray, shown), strict=True)]
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
         rows = list(self._get_indices(indices))

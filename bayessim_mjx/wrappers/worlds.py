@@ -34,7 +34,8 @@ class Batch(NamedTuple):
     Attributes:
         obs: groups `[N, ...]`, of the new episode where the old one ended.
         reward: `[N]` float32, times the worlds' `reward_scale`.
-        terminated: `[N]` bool, the episode ended for good; truncated: `[N]` bool, by its time limit alone.
+        terminated: `[N]` bool, the episode ended for good.
+        truncated: `[N]` bool, it ended by its time limit alone.
         final: groups `[N, ...]`, the observations that the step itself led to: the last ones of ended episodes.
         returns: `[N]` float32, sum of the episode's rewards as the task gives them, this one included.
         lengths: `[N]` int32, its steps so far.

@@ -17,7 +17,8 @@ THEIRS = (
     " --use_pretrained_checkpoint --use_last_checkpoint --headless --task --seed --num_envs --max_iterations --logdir"
     " --cfg_env --cfg_train --video --video_length --video_interval --rl_library --viz --frontend --train_env_cfg"
     " --ray-proc-id --set --xr --experience --rendering_mode --kit_args --livestream --cpu --multi_gpu --deterministic"
-    " --device --compute_device_id --use_gpu --use_gpu_pipeline --nographics"
+    " --device --compute_device_id --use_gpu --use_gpu_pipeline --nographics --force_render --wandb_activate --keyboard"
+    " --capture_video"
 )
 
 
@@ -55,6 +56,10 @@ def test_what_means_the_same_is_taken() -> None:
         (["--test"], ["bayessim-mjx play --checkpoint RUN"]),
         (["--distributed"], ["--devices all"]),
         (["--load_run", "x"], ["--resume RUN", "--checkpoint RUN"]),
+        (["task=Ant"], ["override 'task=Ant': this is a flag: --task Ant"]),  # as IsaacGymEnvs has them
+        (["headless=True"], ["this is a flag: --headless"]),
+        (["test=True"], ["bayessim-mjx play --checkpoint RUN"]),
+        (["--task", "Isaac-Ant-Direct-v0"], ["'Isaac-Ant-Direct-v0' is unknown. Here it is called Ant"]),
         (["--wandb-entity=me"], ["--wandb-entity: use --logger wandb"]),
     ],
 )

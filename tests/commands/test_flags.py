@@ -13,6 +13,7 @@ import mujoco
 import pytest
 from toy_runs import SMALL, error_of
 
+import bayessim_mjx
 from bayessim_mjx import cli, diagnose, main, play, train
 from bayessim_mjx.errors import UserError
 
@@ -20,6 +21,7 @@ from bayessim_mjx.errors import UserError
 @pytest.mark.parametrize(
     ("argv", "words"),
     [
+        (["--task", "robot.xml"], ["'robot.xml': a model's file is no task", "diagnose --model robot.xml"]),
         (["--task", "Pendulm"], ["'Pendulm'", "Did you mean Pendulum", "Allowed: Ant, "]),
         (["--tsk", "Pendulum"], ["'--tsk'", "Did you mean --task"]),
         (["--task", "Pendulum", "--num_envs", "many"], ["--num_envs", "'many'"]),
@@ -109,7 +111,9 @@ def test_a_command_that_does_not_exist_is_one_line(capsys: pytest.CaptureFixture
 def test_version(capsys: pytest.CaptureFixture) -> None:
     for command in (main.main, play.main, diagnose.main):
         assert command(["--version"]) == 0
-        assert f"jax {jax.__version__}, mujoco {mujoco.__version__})" in capsys.readouterr().out
+        said = capsys.readouterr().out
+        assert said.startswith(f"bayessim-mjx {bayessim_mjx.__version__} (python ")
+        assert f"jax {jax.__version__}, mujoco {mujoco.__version__})" in said
 
 
 def test_flags_are_read_before_jax_is_imported() -> None:

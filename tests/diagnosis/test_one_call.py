@@ -94,8 +94,8 @@ def test_a_robot_comes_from_a_file_a_specification_a_model_or_itself(tmp_path):
         diagnosis.robot(mujoco.MjModel.from_xml_string(bare))
 
 
+# not in CI: tests/test_docs.py::test_the_how_to_of_an_own_robot_finds_its_hidden_friction makes the same call
 @pytest.mark.slow
-@pytest.mark.ci
 def test_one_call_finds_the_friction_and_gives_a_corrected_simulator(tmp_path):
     nominal(tmp_path)
     (tmp_path / "logs").mkdir()

@@ -183,7 +183,7 @@ def test_nothing_wrong_is_no_gap(tmp_path):
     assert diagnosis.gap.with_effects == pytest.approx(1.0, abs=0.25)
 
 
-@pytest.mark.ci
+# not in CI: what no effect on offer explains is found in residual/test_flexible.py, its verdict is in test_tolerance.py
 def test_an_effect_that_is_not_on_offer_is_unexplained(tmp_path):
     logs = recorded(friction=0.08, scale=(1.1, 0.92, 1.05), seed=4, **ENOUGH)
     _, diagnosis = diagnosed(tmp_path, logs, ("actuator_delay", "payload"))

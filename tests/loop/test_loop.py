@@ -204,7 +204,7 @@ def test_without_a_model_the_domain_stays_the_prior(env):
 @pytest.mark.slow
 @pytest.mark.ci
 def test_a_new_policy_each_round_where_asked_for(env):
-    fresh = loop.make(settings("bayessim.ftuneRL=False"), env)
+    fresh = loop.make(settings("bayessim.ftuneRL=False", "bayessim.modelClass=None"), env)  # no inference
     state, _ = loop.run(fresh, loop.init(fresh))
     assert int(state.train.iteration) == 3  # the last round's own iterations
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from bayessim_mjx.monitor import lettering, rendering, video
-from bayessim_mjx.monitor.camera import view_of
+from bayessim_mjx.monitor.camera import reach, view_of
 
 PENDULUM = """<mujoco><worldbody><body name="pole"><joint type="hinge" axis="0 1 0"/>
 <geom type="capsule" size=".05" fromto="0 0 0 0 0 1" rgba=".9 .1 .1 1"/></body></worldbody></mujoco>"""
@@ -85,6 +85,31 @@ def test_larger_than_the_models_buffer_and_the_model_is_left_alone():
     before = pendulum.vis.global_.offwidth, float(pendulum.vis.headlight.ambient[0])
     assert rendered(pendulum, np.zeros((1, 1)), width=700, height=20).shape == (1, 20, 700, 3)
     assert (pendulum.vis.global_.offwidth, float(pendulum.vis.headlight.ambient[0])) == before
+
+
+def test_single_pictures_have_one_point_of_view_and_others_may_be_made_between_them():
+    """Asked for one by one, the pole turns about the middle of the picture, as in a film of all poses."""
+    rendered(model(PENDULUM), np.zeros((1, 1)), width=16, height=12)  # skipped where no OpenGL works
+    renderer = rendering.Renderer.of(model(PENDULUM), 160, 120)
+    view, seen = renderer.view(reach(renderer.model)), []
+    for angle in (0.0, np.pi / 2, np.pi, -np.pi / 2):
+        seen.append(red(renderer.frames(np.array([[angle]]), view)[0]))
+        rendered(model(FLOATING), np.tile(model(FLOATING).qpos0, (1, 1)), width=16, height=12)
+    (x0, y0, _), (x1, y1, _), (x2, y2, _), (x3, y3, _) = seen
+    np.testing.assert_allclose([x0, x2, y1, y3, x1 + x3], 0, atol=1.5)
+    np.testing.assert_allclose([y0, -y2], x1, atol=6)  # the camera looks down on it a little
+    assert x1 > 15
+    assert renderer.close.alive
+    renderer.close()
+
+
+def test_poses_that_a_camera_is_fitted_to_reach_every_limit():
+    limited = "<mujoco><worldbody><body><joint type='slide' range='-1 2' limited='true'/><geom size='.1'/></body>"
+    poses = reach(model(limited + "</worldbody></mujoco>"))
+    assert poses.shape == (21, 1) and (poses.min(), poses.max()) == (-1, 2)
+    assert np.isin([-np.pi, -np.pi / 2, 0, np.pi / 2, np.pi], reach(model(PENDULUM))).all()
+    free = model(FLOATING)
+    np.testing.assert_array_equal(reach(free), np.tile(free.qpos0, (21, 1)))
 
 
 @pytest.mark.parametrize("off", ["disable", "off"])

@@ -97,3 +97,17 @@ def test_no_line_is_wider_than_the_terminal_and_no_number_parts_from_its_unit(mo
         assert any("0.0312 ± 0.0021 N m" in line for line in lines)
         said = set(" ".join(lines).replace("│", " ").split())
         assert {word for text in (*fake.full().sentences, *fake.full().warnings) for word in text.split()} <= said
+
+
+def test_what_is_told_before_the_search_fits_the_terminal(monkeypatch, capsys):
+    """As many columns as there are; a second line of an item is indented."""
+    from bayessim_mjx.diagnose import _told
+
+    monkeypatch.setenv("COLUMNS", "40")
+    _told("Before any simulation (1.0 s):", ["effort that the model does not explain: hinge 25 %", "short"], True)
+    assert capsys.readouterr().out.splitlines() == [
+        "Before any simulation (1.0 s):",
+        "  effort that the model does not",
+        "    explain: hinge 25 %",
+        "  short",
+    ]

@@ -278,14 +278,9 @@ NOVELTY = RNDConfig(
 )  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    "novelty, low, high",
-    [
-        pytest.param(NOVELTY, 50, 100, marks=[pytest.mark.slow, pytest.mark.ci]),
-        pytest.param(None, -5, 0, marks=[pytest.mark.slow, pytest.mark.ci]),
-    ],
-    ids=["novelty", "alone"],
-)
+# not in CI: rsl_rl's golden numbers above hold each part, and tests/test_examples.py::test_hidden_reward trains with it
+@pytest.mark.slow
+@pytest.mark.parametrize("novelty, low, high", [(NOVELTY, 50, 100), (None, -5, 0)], ids=["novelty", "alone"])
 def test_a_hidden_prize_is_found_by_novelty_and_not_without_it(novelty, low, high):
     """The mountain car: not to move costs nothing, and the top pays 100."""
     env, setting = probes.Valley(), PPOConfig(

@@ -1,6 +1,7 @@
 """Observations that are pictures: what each library gets, that convolutions train on them, and who refuses them."""
 
 import sys
+from collections import OrderedDict
 from pathlib import Path
 
 import jax
@@ -14,6 +15,7 @@ from toys import Camera, Counter  # noqa: E402
 from bayessim_mjx import rl  # noqa: E402
 from bayessim_mjx.config import PPOConfig  # noqa: E402
 from bayessim_mjx.errors import UserError  # noqa: E402
+from bayessim_mjx.wrappers import pictures  # noqa: E402
 from bayessim_mjx.wrappers.gymnasium import GymnasiumEnv  # noqa: E402
 from bayessim_mjx.wrappers.spaces import boxes  # noqa: E402
 from bayessim_mjx.wrappers.worlds import Worlds  # noqa: E402
@@ -133,3 +135,14 @@ def test_rl_games_convolutions_train(tmp_path):
     agent = runner.algo_factory.create("a2c_continuous", base_name="run", params=runner.params)
     agent.train()
     assert agent.epoch_num == 1
+
+
+def test_cameras_keep_what_was_asked_for_last():
+    """Models and renderers are dear to make, and renderers dear to keep."""
+    store, made = OrderedDict(), []
+
+    def ask(key):
+        return pictures._kept(store, key, 2, lambda: made.append(key) or key.upper())
+
+    assert [ask(key) for key in (b"a", b"b", b"a", b"c", b"a", b"b")] == [b"A", b"B", b"A", b"C", b"A", b"B"]
+    assert made == [b"a", b"b", b"c", b"b"] and list(store) == [b"a", b"b"]

@@ -69,7 +69,7 @@ class SB3Agent:
         return found | self.recent.metrics()
 
     def policy(self) -> Policy:
-        net = self.model.policy
+        net: Any = self.model.policy
         linear = [m for m in net.mlp_extractor.policy_net if hasattr(m, "weight")] + [net.action_net]
         layers = [(m.weight.detach().cpu().numpy().T, m.bias.detach().cpu().numpy()) for m in linear]
         log_std = net.log_std.detach().cpu().numpy()
