@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from bayessim_mjx import effects as library
 from bayessim_mjx.diagnosis import phrases
 from bayessim_mjx.diagnosis.residual import fingerprints
 from bayessim_mjx.diagnosis.residual.fingerprints import Fingerprint
@@ -14,6 +15,8 @@ from bayessim_mjx.diagnosis.residual.flexible import Flexible
 from bayessim_mjx.diagnosis.residual.frequency import Heard
 from bayessim_mjx.diagnosis.residual.where import Located
 from bayessim_mjx.diagnosis.result import Place
+from bayessim_mjx.diagnosis.vocabulary import listed
+from bayessim_mjx.effects.support.words import words
 from bayessim_mjx.quantities import percent
 
 
@@ -44,6 +47,15 @@ def flexible_in_words(found: Flexible) -> list[str]:
     inputs = [d["input"] for d in found.depends_on if d["importance"] > least][:4]
     depends = f"depends on {', '.join(inputs)}" if inputs else "depends on nothing that was measured: it is constant"
     return [*text, f"what is missing acts at {', '.join(joints)} and {depends}"]
+
+
+def not_on_offer(tried: Iterable[str]) -> str:
+    """Effects that are tried only where they are named, in words; "" where all were. tried: names of effects."""
+    names = [name for name in library.names() if not library.load(name).offered and name not in set(tried)]
+    if not names:
+        return ""
+    nouns = listed([words(name).noun for name in names])
+    return f"Not tried, as they were not named: {nouns} (--effects all,{','.join(names)})."
 
 
 def places_of(found: Located) -> list[Place]:
