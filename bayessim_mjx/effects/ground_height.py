@@ -35,6 +35,8 @@ class GroundHeight(Effect):
     noun: ClassVar[str] = "ground at another height"
     lacks: ClassVar[str] = "the true height of the ground"
     separates: ClassVar[str] = "touching the ground slowly at several places, with the height of the robot measured"
+    # how often contacts that are softer or heavier loaded are taken for it has not been counted
+    offered: ClassVar[bool] = False
     quantities: ClassVar[tuple[Quantity, ...]] = (
         Quantity("height", 0.0, -0.05, 0.05, unit="m", grid=(0.02, 0.1, 0.4)),
     )

@@ -7,7 +7,7 @@ from bayessim_mjx.diagnosis.fitting.candidates import kinds_of
 from bayessim_mjx.diagnosis.summary.left_in_words import not_on_offer
 from bayessim_mjx.errors import UserError
 
-ON_REQUEST = {"cable_tension", "lugre_friction"}
+ON_REQUEST = {"cable_tension", "ground_height", "lugre_friction"}
 
 
 def names(asked):
@@ -26,6 +26,7 @@ def test_others_may_be_named_beside_all_and_nothing_is_tried_twice():
 
 
 def test_what_was_not_on_offer_is_told():
-    told = "Not tried, as they were not named: cable tension and friction with presliding (LuGre) "
-    assert not_on_offer(["backlash"]) == f"{told}(--effects all,cable_tension,lugre_friction)."
-    assert not_on_offer(["cable_tension", "lugre_friction"]) == ""
+    nouns = "cable tension, ground at another height and friction with presliding (LuGre)"
+    told = f"Not tried, as they were not named: {nouns}"
+    assert not_on_offer(["backlash"]) == f"{told} (--effects all,cable_tension,ground_height,lugre_friction)."
+    assert not_on_offer(ON_REQUEST) == ""
