@@ -42,7 +42,8 @@ def _parser() -> cli.PlainParser:
         "--effects",
         metavar="LIST",
         default="all",
-        help="effects to try, separated by commas: names or path.py:Class (default: all)",
+        help="effects to try, separated by commas: names, path.py:Class, or all that are on offer (default: all; "
+        "docs/effects.md says which ones are tried only where named)",
     )
     parser.add_argument(
         "--tolerance",

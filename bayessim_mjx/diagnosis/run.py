@@ -19,7 +19,7 @@ from bayessim_mjx.diagnosis.experiment import propose
 from bayessim_mjx.diagnosis.findings import Findings, Progress, Where
 from bayessim_mjx.diagnosis.fitting.robot import Robot, Source, robot_of
 from bayessim_mjx.diagnosis.logcheck import channels
-from bayessim_mjx.diagnosis.residual import frequency, where
+from bayessim_mjx.diagnosis.residual import black_boxes, frequency, where
 from bayessim_mjx.diagnosis.residual.disturbance import Disturbance, estimate
 from bayessim_mjx.diagnosis.residual.flexible import Flexible, flexible
 from bayessim_mjx.diagnosis.result import Diagnosis
@@ -88,11 +88,21 @@ def where_it_lies(found: Findings, say: Progress) -> Findings:
     return found.having(Where(located, frequency.analyse(fitter, fit, found.disturbance)))
 
 
+def rivals_without_physics(found: Findings, say: Progress) -> Findings:
+    """With what a network and a formula close of the gap, beside the named effects."""
+    if found.disturbance is None:
+        return found
+    selection, named = found.selection, found.model.fit if found.model.effects else None
+    boxes = black_boxes.race(found.setup.fitter, selection.base.fit, named, found.disturbance, selection.noise)
+    return found if boxes is None else found.having(boxes)
+
+
 STAGES = (
     Stage("how far", how_far),
     Stage("none of these?", none_of_these),
     Stage("whole logs", whole_logs.stage),
     Stage("where", where_it_lies, optional=True),
+    Stage("black boxes", rivals_without_physics, optional=True),
     Stage("next experiment", propose.stage, optional=True),
 )
 

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bayessim_mjx import effects as library
 from bayessim_mjx.diagnosis import tolerance
 from bayessim_mjx.diagnosis.equation_error import leads
 from bayessim_mjx.diagnosis.equation_error.look import Look
@@ -134,7 +133,7 @@ def prepare(
     usable = seen.usable
     told += [*seen.warnings, *(f"{text} (found, not assumed)" for text in seen.findings)]
     floors = noise.floors(usable)
-    kinds = [library.load(n) if isinstance(n, str) else n for n in (library.names() if effects == "all" else effects)]
+    kinds = candidates.kinds_of(effects)
     size = scales.measure(robot.mj_model, [resample(log, dt) for log in usable], robot.rating)
     stack, left_out = candidates.stack(kinds, size)
     limit = tolerance.judge(robot.mj_model, 2 * size.travel, _noise(usable), asked).limit

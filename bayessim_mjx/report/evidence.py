@@ -7,7 +7,7 @@ from bayessim_mjx.diagnosis.result import Diagnosis
 from bayessim_mjx.report import marks, motion_figures, rival_figures
 from bayessim_mjx.report.choice import choice
 from bayessim_mjx.report.look import STAGE
-from bayessim_mjx.report.words import estimate, finite, known_span, label_title, number, unit
+from bayessim_mjx.report.words import estimate, finite, known_span, label_title, number, percent, unit
 
 OVERLAY_NUMBERS = 90_000  # in all overlays together, so that the page stays a few MB
 FEWEST_POINTS = 200
@@ -99,6 +99,15 @@ def flexible(d: Diagnosis) -> dict[str, Any]:
         "where": found.get("where") or [],
         "figure": rival_figures.importance(depends) if depends else None,
     }
+
+
+def black_boxes(d: Diagnosis) -> dict[str, Any]:
+    """What a network and a formula close of the gap, beside the named effects."""
+    found = d.details.get("black_boxes") or {}
+    names = {"named_effects": "the named effects", "network": "a small network", "formula": "a sparse formula"}
+    shares = [(text, found.get(key)) for key, text in names.items()]
+    rows = [{"name": text, "share": percent(min(max(v, 0.0), 1.0))} for text, v in shares if finite(v)]
+    return {"rows": rows, "formula": found.get("formula_in_words") or []} if rows else {}
 
 
 def experiment(d: Diagnosis) -> dict[str, Any]:

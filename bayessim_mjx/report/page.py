@@ -54,6 +54,7 @@ def render(d: Diagnosis, missed: Any = None) -> str:
         parameters=evidence.parameters(d),
         isolability=evidence.isolability(d),
         flexible=evidence.flexible(d),
+        black_boxes=evidence.black_boxes(d),
         experiment=evidence.experiment(d),
         data=evidence.data(d),
         warnings=d.warnings,

@@ -3,17 +3,18 @@
 from collections.abc import Iterable
 
 FAMILIES = (
-    ("coulomb_friction", "stribeck_friction", "load_friction", "asymmetric_friction", "actuator_deadband"),
+    ("coulomb_friction", "stribeck_friction", "load_friction", "asymmetric_friction", "actuator_deadband",
+     "lugre_friction"),
     ("viscous_friction", "quadratic_drag", "asymmetric_friction"),
     ("actuator_delay", "actuator_lag", "rate_limit", "acceleration_limit", "sensor_delay", "sensor_filter"),
     ("backlash", "joint_elasticity", "base_flexibility", "actuator_deadband", "sensor_delay", "actuator_delay",
-     "actuator_lag"),
+     "actuator_lag", "lugre_friction"),
     # a sine of the angle at order 1 is what gravity does to one joint
     ("payload", "gravity_tilt", "external_force", "joint_spring", "joint_offset", "actuator_bias", "cogging",
-     "gravity_compensation"),
+     "gravity_compensation", "cable_tension"),
     ("actuator_gain", "sensor_gain", "armature", "payload", "actuator_saturation", "effort_loss", "speed_torque_limit",
      "gain_drift"),
-    ("contact_friction", "contact_compliance"),
+    ("contact_friction", "contact_compliance", "ground_height"),
 )  # fmt: skip
 
 

@@ -135,6 +135,14 @@ def details(seed=0):
             {"effects": [LABELS[4]], "predicted": 0.31, "realised": 0.27},
             {"effects": [LABELS[0], LABELS[4]], "predicted": 0.97, "realised": 0.955},
         ],
+        "black_boxes": {
+            "network": 0.87,
+            "formula": -0.2,
+            "named_effects": 0.93,
+            "folds": 4,
+            "terms": [{"joint": "hinge", "term": "sign w", "force": -0.06}],
+            "formula_in_words": ["hinge: -0.06 sign w"],
+        },
         "flexible": {
             "depends_on": [
                 {"input": "speed", "importance": 0.51},

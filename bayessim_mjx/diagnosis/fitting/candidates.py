@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from bayessim_mjx import effects as library
 from bayessim_mjx.diagnosis.fitting.scales import Scales, ranges
 from bayessim_mjx.effects.effect import Block, Effect, Quantity
 from bayessim_mjx.effects.support.site import element_names, places
@@ -100,6 +101,21 @@ def _precision(p: Parameter, accuracy: float | None) -> float:
     if p.prior == "gaussian" and p.sd:
         return 1.0 / p.sd**2
     return 1.0 / (0.58 * (p.high - p.low)) ** 2  # sd of a uniform prior, doubled: between the bounds nearly flat
+
+
+def kinds_of(effects: str | Sequence[str | type[Effect]]) -> list[type[Effect]]:
+    """The effects that are tried; "all", alone or among others: those of the library that are on offer (`offered`).
+
+    Raises:
+        UserError: an unknown effect.
+    """
+    asked = [effects] if isinstance(effects, str) else effects
+    found: list[type[Effect]] = []
+    for name in asked:
+        kinds = map(library.load, library.names()) if name == "all" else ()
+        found += [kind for kind in kinds if kind.offered]
+        found += [] if name == "all" else [library.load(name) if isinstance(name, str) else name]
+    return list(dict.fromkeys(found))
 
 
 def stack(kinds: Sequence[type[Effect]], scales: Scales) -> tuple[tuple[Effect, ...], list[str]]:

@@ -34,6 +34,22 @@ class Regression:
         """Held-out costs `[W]` of the fit itself."""
         return self.fitter.scores(self.fit, fold)[0]
 
+    def q_of(self, rows: NDArray[np.bool_]) -> Quadratic:
+        """The quadratic of some windows."""
+        return Quadratic(self.q.c[rows], self.q.g[rows], self.q.S[rows])
+
+    def together(self, sums: Sums, ridge: Array | float) -> tuple[Array, Array]:
+        """(parameter step `[k]`, beta in units of the force scale); ridge: added to the curvature of each feature."""
+        S = sums.S.copy()
+        S[np.diag_indices(len(S))] += ridge
+        right = np.concatenate([sums.g[:, None], sums.C.T], 1)
+        both = cho_solve(cho_factor(S), right) if len(S) else right
+        step = np.zeros(0)
+        if self.k:
+            left = sums.Spp - sums.C @ both[:, 1:] + np.diag(self.precision + RULES.trust * np.diag(sums.Spp))
+            step = solve(left, sums.gp + self.pull - sums.C @ both[:, 0], self.low, self.high)
+        return step, both[:, 0] - both[:, 1:] @ step
+
 
 @dataclass(frozen=True, eq=False)
 class Sums:
@@ -55,14 +71,11 @@ class Sums:
         return self.S, self.C, self.g, self.Spp, self.gp
 
 
-class Seeded:
-    """The regression with one draw of random features."""
+class OnFeatures:
+    """The regression on given features phi `[W, m, nv, F]`."""
 
-    def __init__(self, problem: Regression, seed: int) -> None:
-        self.problem, self.seed = problem, seed
-        self.mapping = Mapping.draw(problem.inputs, seed)
-        self.features = self.mapping(problem.inputs, problem.average)
-        self.each = self.features.phi.shape[3]
+    def __init__(self, problem: Regression, phi: Array) -> None:
+        self.problem, self.phi, self.each = problem, phi, phi.shape[3]
 
     def sums(self, fold: NDArray[np.int64]) -> list[Sums]:
         """Of the windows of each fold."""
@@ -72,7 +85,7 @@ class Seeded:
         problem, weight = self.problem, self.problem.fit.weight[rows]
         k, nv, m, W = problem.k, problem.nv, problem.m, len(rows)
         q, size = problem.q, nv * self.each
-        scaled = self.features.phi[rows] * problem.scale[:, None]
+        scaled = self.phi[rows] * problem.scale[:, None]
         weighted = scaled * weight[:, None, None, None]
         dd = q.S[rows][:, k:, k:].reshape(W, nv, m, nv, m)
         half = np.einsum("wimjn,wnjg->iwmjg", dd, scaled, optimize=True)
@@ -84,15 +97,9 @@ class Seeded:
 
     def solve(self, sums: Sums, ridge: float) -> tuple[Array, Array]:
         """(parameter step `[k]`, beta `[nv F]` in units of force)."""
-        problem, S = self.problem, sums.S.copy()
-        curvature = np.diag(S).reshape(problem.nv, -1).mean(1)
-        S[np.diag_indices(len(S))] += ridge * np.repeat(curvature, self.each) + 1e-9 * curvature.max() + 1e-300
-        both = cho_solve(cho_factor(S), np.concatenate([sums.g[:, None], sums.C.T], 1))
-        step = np.zeros(0)
-        if problem.k:
-            left = sums.Spp - sums.C @ both[:, 1:] + np.diag(problem.precision + RULES.trust * np.diag(sums.Spp))
-            step = solve(left, sums.gp + problem.pull - sums.C @ both[:, 0], problem.low, problem.high)
-        beta = both[:, 0] - both[:, 1:] @ step
+        problem = self.problem
+        curvature = np.diag(sums.S).reshape(problem.nv, -1).mean(1)
+        step, beta = problem.together(sums, ridge * np.repeat(curvature, self.each) + 1e-9 * curvature.max() + 1e-300)
         return step, beta * np.repeat(problem.scale, self.each)
 
     def without(self, fold: NDArray[np.int64], ridges: Sequence[float]) -> list[list[tuple[Array, Array]]]:
@@ -105,7 +112,7 @@ class Seeded:
     def whole(self, ridge: float) -> Array:
         """Force `[W, m, nv]` of the fit to all windows."""
         beta = self.solve(self._sums(np.arange(len(self.problem.q.c))), ridge)[1]
-        return np.einsum("wmvf,vf->wmv", self.features.phi, beta.reshape(self.problem.nv, -1))
+        return np.einsum("wmvf,vf->wmv", self.phi, beta.reshape(self.problem.nv, -1))
 
     def costs(self, fold: NDArray[np.int64], fits: list[tuple[Array, Array]], phi: Array) -> Array:
         """Costs `[W]` of windows under the fits without their fold, with features phi."""
@@ -113,3 +120,12 @@ class Seeded:
         beta = np.stack([b for _, b in fits])[fold].reshape(len(fold), self.problem.nv, -1)
         force = np.einsum("wmvf,wvf->wvm", phi, beta, optimize=True).reshape(len(fold), -1)
         return self.problem.q.at(np.concatenate([step, force], 1))
+
+
+class Seeded(OnFeatures):
+    """The regression with one draw of random features."""
+
+    def __init__(self, problem: Regression, seed: int) -> None:
+        self.seed, self.mapping = seed, Mapping.draw(problem.inputs, seed)
+        self.features = self.mapping(problem.inputs, problem.average)
+        super().__init__(problem, self.features.phi)

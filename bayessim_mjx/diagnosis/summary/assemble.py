@@ -12,13 +12,20 @@ from bayessim_mjx.diagnosis import data_sheet, phrases, statistics
 from bayessim_mjx.diagnosis.experiment.propose import Experiment
 from bayessim_mjx.diagnosis.findings import Findings, Where
 from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
+from bayessim_mjx.diagnosis.residual.black_boxes import BlackBoxes
 from bayessim_mjx.diagnosis.result import Diagnosis, Gap, Place
 from bayessim_mjx.diagnosis.selection import bounds, conditions, left_out, uncertainty
 from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.selection.tried import Tried, ranked
 from bayessim_mjx.diagnosis.summary import effects_found, how_far
 from bayessim_mjx.diagnosis.summary.details import details
-from bayessim_mjx.diagnosis.summary.left_in_words import located_in_words, places_of, spectra_in_words
+from bayessim_mjx.diagnosis.summary.left_in_words import (
+    black_boxes_in_words,
+    located_in_words,
+    not_on_offer,
+    places_of,
+    spectra_in_words,
+)
 from bayessim_mjx.diagnosis.summary.sentences import horizon_warning, sentences
 from bayessim_mjx.diagnosis.summary.verdict import by_chance, verdict_of
 from bayessim_mjx.diagnosis.summary.whole_logs import Whole
@@ -52,12 +59,14 @@ def diagnosis_of(found: Findings, about: Mapping[str, Any] | None = None, file: 
     far = how_far.with_whole(far, over, setup.tolerance) if over else far
     odds = by_chance(found)
     told = sentences(verdict, effects, parameters, found, far, odds)
+    told += [not_on_offer(e.name for e in setup.physics.effects)] if verdict.name == "unexplained" else []
     notes = [*setup.warnings, *(over.notes if over else ()), *(horizon_warning(far) if effects else [])]
     more = {"maps": where.found.maps, "frequency": [heard.details() for heard in where.spectra]} if where else {}
     lies = [*located_in_words(where.found), *spectra_in_words(where.spectra)] if where else []
+    rivals = black_boxes_in_words(found.part(BlackBoxes))
     return Diagnosis(
         verdict=verdict.name,
-        sentences=[*told, *filter(None, [left_out.not_tried(selection)]), *lies],
+        sentences=[*filter(None, [*told, left_out.not_tried(selection)]), *rivals, *lies],
         effects=effects,
         where=places_of(where.found) if where and where.found.spots else _where(found),
         gap=far,

@@ -7,11 +7,12 @@ from typing import Any
 import numpy as np
 
 from bayessim_mjx.diagnosis.findings import Findings
+from bayessim_mjx.diagnosis.residual.black_boxes import BlackBoxes
 from bayessim_mjx.diagnosis.result import FoundEffect
 from bayessim_mjx.diagnosis.selection import conditions
 from bayessim_mjx.diagnosis.selection.tried import Tried
 from bayessim_mjx.diagnosis.summary import first_look
-from bayessim_mjx.diagnosis.summary.left_in_words import flexible_in_words
+from bayessim_mjx.diagnosis.summary.left_in_words import flexible_in_words, formula_in_words
 from bayessim_mjx.diagnosis.tolerance import length_unit
 from bayessim_mjx.effects import spec_of
 from bayessim_mjx.logs.log import Channels
@@ -31,6 +32,7 @@ def details(found: Findings, effects: list[FoundEffect], closed: dict[str, Any])
         "closure": _closure(effects, closed),
         "shapley": [{"effect": f"{e.name}@{e.where}", "share": e.share} for e in effects if e.share == e.share],
         "flexible": _flexible(found),
+        "black_boxes": _black_boxes(found.part(BlackBoxes)),
         "groups": {
             "names": list(cut.groups),
             "parameters": {n: {"mean": each[:, i], "sd": deviation[:, i]} for i, n in enumerate(names)},
@@ -78,6 +80,15 @@ def _flexible(found: Findings) -> dict[str, Any]:
         "rms_on_base": levels[0],
         "rms_on_winner": levels[1],
     }
+
+
+def _black_boxes(found: BlackBoxes | None) -> dict[str, Any]:
+    """Shares of the squared gap above the noise that are closed on conditions held out, and the formula."""
+    if found is None:
+        return {}
+    terms = [{"joint": t.joint, "term": t.what, "force": t.force} for t in found.terms]
+    shares = {"network": found.network, "formula": found.formula, "named_effects": found.named}
+    return shares | {"terms": terms, "formula_in_words": formula_in_words(found), "folds": found.folds}
 
 
 def _overlays(found: Findings) -> list[dict[str, Any]]:

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from bayessim_mjx import effects as library
 from bayessim_mjx.diagnosis import phrases
 from bayessim_mjx.diagnosis.residual import fingerprints
+from bayessim_mjx.diagnosis.residual.black_boxes import BlackBoxes
 from bayessim_mjx.diagnosis.residual.fingerprints import Fingerprint
 from bayessim_mjx.diagnosis.residual.flexible import Flexible
 from bayessim_mjx.diagnosis.residual.frequency import Heard
 from bayessim_mjx.diagnosis.residual.where import Located
 from bayessim_mjx.diagnosis.result import Place
+from bayessim_mjx.diagnosis.vocabulary import listed
+from bayessim_mjx.effects.support.words import words
 from bayessim_mjx.quantities import percent
 
 
@@ -44,6 +48,42 @@ def flexible_in_words(found: Flexible) -> list[str]:
     inputs = [d["input"] for d in found.depends_on if d["importance"] > least][:4]
     depends = f"depends on {', '.join(inputs)}" if inputs else "depends on nothing that was measured: it is constant"
     return [*text, f"what is missing acts at {', '.join(joints)} and {depends}"]
+
+
+def not_on_offer(tried: Iterable[str]) -> str:
+    """Effects that are tried only where they are named, in words; "" where all were. tried: names of effects."""
+    names = [name for name in library.names() if not library.load(name).offered and name not in set(tried)]
+    if not names:
+        return ""
+    nouns = listed([words(name).noun for name in names])
+    return f"Not tried, as they were not named: {nouns} (--effects all,{','.join(names)})."
+
+
+def black_boxes_in_words(found: BlackBoxes | None) -> list[str]:
+    """What black boxes close of the gap beside the named effects; nothing where they were not tried."""
+    if found is None:
+        return []
+    text = f"On conditions held out a small network that knows nothing of physics closes {_closes(found.network)} of"
+    text += f" the squared gap, {_formula(found)} {_closes(found.formula)}"
+    return [f"{text}, the named effects {_closes(found.named)}." if found.named == found.named else f"{text}."]
+
+
+def _closes(share: float) -> str:
+    return percent(min(share, 1.0)) if share > 0 else "nothing"
+
+
+def _formula(found: BlackBoxes) -> str:
+    return f"a formula of {len(found.terms)} term{'' if len(found.terms) == 1 else 's'}"
+
+
+def formula_in_words(found: BlackBoxes) -> list[str]:
+    """`shoulder: -0.061 sign w + 0.3 q`, joint by joint; q, w, u: position, speed, effort in SI units."""
+    each: dict[str, list[str]] = {}
+    for term in found.terms:
+        text = f"{term.force:+.3g} {term.what}".removesuffix(" 1")
+        each.setdefault(term.joint, []).append(f"{text[0]} {text[1:]}")
+    told = {joint: " ".join(terms).removeprefix("+ ") for joint, terms in each.items()}
+    return [f"{joint}: {'-' if text.startswith('- ') else ''}{text.removeprefix('- ')}" for joint, text in told.items()]
 
 
 def places_of(found: Located) -> list[Place]:

@@ -1,0 +1,32 @@
+"""Which effects are tried: all that are on offer, those that are named, and what is told of the others."""
+
+import pytest
+
+from bayessim_mjx import effects
+from bayessim_mjx.diagnosis.fitting.candidates import kinds_of
+from bayessim_mjx.diagnosis.summary.left_in_words import not_on_offer
+from bayessim_mjx.errors import UserError
+
+ON_REQUEST = {"cable_tension", "ground_height", "lugre_friction"}
+
+
+def names(asked):
+    return [kind.name for kind in kinds_of(asked)]
+
+
+def test_all_are_those_on_offer():
+    assert set(names("all")) == set(effects.names()) - ON_REQUEST
+
+
+def test_others_may_be_named_beside_all_and_nothing_is_tried_twice():
+    assert names(["all", "lugre_friction", "backlash"]) == [*names("all"), "lugre_friction"]
+    assert names(["lugre_friction", effects.load("backlash")]) == ["lugre_friction", "backlash"]
+    with pytest.raises(UserError, match="no effect 'lugre'"):
+        kinds_of(["all", "lugre"])
+
+
+def test_what_was_not_on_offer_is_told():
+    nouns = "cable tension, ground at another height and friction with presliding (LuGre)"
+    told = f"Not tried, as they were not named: {nouns}"
+    assert not_on_offer(["backlash"]) == f"{told} (--effects all,cable_tension,ground_height,lugre_friction)."
+    assert not_on_offer(ON_REQUEST) == ""

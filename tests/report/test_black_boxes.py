@@ -1,0 +1,39 @@
+"""Named effects stand beside black boxes on the page, in one sentence, and nowhere where they were not tried."""
+
+import dataclasses
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+import fake  # noqa: E402
+
+from bayessim_mjx.diagnosis.residual.black_boxes import BlackBoxes
+from bayessim_mjx.diagnosis.residual.formula import Term
+from bayessim_mjx.diagnosis.summary.left_in_words import black_boxes_in_words, formula_in_words
+from bayessim_mjx.report import evidence
+
+TERMS = (Term("elbow", "sign w", -0.0613), Term("elbow", "1", 0.2), Term("wrist", "u of elbow", 0.5))
+
+
+def test_the_table_has_shares_and_the_formula():
+    d = fake.full()
+    shown = evidence.black_boxes(d)
+    assert [row["name"] for row in shown["rows"]] == ["the named effects", "a small network", "a sparse formula"]
+    assert [row["share"] for row in shown["rows"]] == ["93 %", "87 %", "0 %"]  # worse than nothing is nothing
+    assert shown["formula"] == ["hinge: -0.06 sign w"]
+    assert evidence.black_boxes(dataclasses.replace(d, details={})) == {}
+
+
+@pytest.mark.parametrize(("named", "end"), [(0.931, ", the named effects 93 %."), (float("nan"), ".")])
+def test_one_sentence(named, end):
+    (told,) = black_boxes_in_words(BlackBoxes(0.874, -0.1, named, TERMS[:1], 4))
+    head = "On conditions held out a small network that knows nothing of physics closes 87 % of the squared gap"
+    assert told == f"{head}, a formula of 1 term nothing{end}"
+    assert black_boxes_in_words(None) == []
+
+
+def test_the_formula_in_words():
+    words = formula_in_words(BlackBoxes(0.0, 0.0, 0.0, TERMS, 4))
+    assert words == ["elbow: -0.0613 sign w + 0.2", "wrist: 0.5 u of elbow"]
