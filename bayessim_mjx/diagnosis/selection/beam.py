@@ -20,6 +20,7 @@ TOGETHER, FINALISTS = "effects together", "finalists"  # parts of the budget
 # times the leading model's cost: from where polishing has brought others ahead of it. What is missed farther away was
 # not counted; error rates with it are those of d462f0c in benchmarks/results.md.
 CLOSE = 4.0
+ATONCE = 3  # laws that are begun with at once: as many as sets of candidates were counted with
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,7 @@ class Fitting(Protocol):
         """Sets of up to so many effects that promise most when all amplitudes are free at once."""
 
     def proposed(self, most: int) -> list[Key]:
-        """The set of up to so many laws that was proposed before the search, where there is one."""
+        """What was proposed together before the search, where there is such a set: up to so many laws of it."""
 
     def over(self, part: str) -> bool:
         """Whether a part of the search has had its time."""
@@ -109,7 +110,7 @@ def _grow(fits: Fitting, criteria: Criteria) -> Key:
     """Add to the models of the beam as long as that brings something worth naming, and the best is above the noise."""
     best = BASE
     if not settled(fits.table, BASE, criteria):
-        fits.fit([Plan(k) for k in fits.proposed(criteria.most)], "proposed together")
+        fits.fit([Plan(k) for k in fits.proposed(min(ATONCE, criteria.most))], "proposed together")
         best = _best(fits, criteria, criteria.finalists)
     for size in range(1, criteria.most):
         if settled(fits.table, best, criteria) or fits.over(TOGETHER):
@@ -118,7 +119,7 @@ def _grow(fits: Fitting, criteria: Criteria) -> Key:
         beam = _going_on(table, best, criteria)
         plans = [p for k in beam for p in _added(fits, k, criteria.width - 2 * (k != best))]
         if size == 1:
-            plans += [Plan(k) for k in fits.together(min(3, criteria.most), criteria.beam)]
+            plans += [Plan(k) for k in fits.together(min(ATONCE, criteria.most), criteria.beam)]
             plans += _everywhere(fits, BASE, criteria) if laws(table, best) < 2 else []
         every = _everywhere(fits, best, criteria)
         fits.fit([*plans, *every], f"{len(best) + 1} effects")

@@ -14,7 +14,6 @@ from bayessim_mjx.diagnosis.fitting.fitter import Fit
 from bayessim_mjx.diagnosis.selection import chance, dense, heldout
 from bayessim_mjx.diagnosis.selection.beam import Plan
 from bayessim_mjx.diagnosis.selection.bounds import widened
-from bayessim_mjx.diagnosis.selection.everywhere import laws
 from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.selection.pool import (
     Pool,
@@ -104,12 +103,13 @@ class Fits:
         return list(self._amounts)
 
     def proposed(self, most: int) -> list[Key]:
-        """The set of effects that was proposed before the search, from where each one's own screening starts it."""
+        """The effects that were proposed before the search, the first laws of them, each from its own screening."""
         known = [c for c in self.pool.screened if c.candidate.label in self.pool.settings.together]
-        own = [s.candidate for s in known]
+        effects = [label.split("@", 1)[0] for label in self.pool.settings.together]  # the best told first
+        first = list(dict.fromkeys(effects))[:most]
+        own = [s.candidate for s in known if s.candidate.effect in first]
         apart = all(beside(a, b) for i, a in enumerate(own) for b in own[:i])
-        key = frozenset(c.label for c in own)
-        return [key] if len(own) > 1 and laws(self.table, key) <= most and apart else []
+        return [frozenset(c.label for c in own)] if len(own) > 1 and apart else []
 
     def over(self, part: str) -> bool:
         """Whether a part of the search has had its time."""
