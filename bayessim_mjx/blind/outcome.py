@@ -14,13 +14,17 @@ VERDICTS = ("no_gap", "parameters", "noise", "unexplained", "insufficient_data",
 
 @dataclass(frozen=True)
 class Outcome:
-    """One case: its truth, its diagnosis (None where there is none), and which joint each actuator drives."""
+    """One case: its truth, its diagnosis (None where there is none), and which joint each actuator drives.
+
+    seconds: that the diagnosis took by the clock; cpu: s of CPU, nan where it is not known.
+    """
 
     folder: Path
     truth: dict[str, Any]
     said: dict[str, Any] | None
     joint_of: Mapping[str, str]
     seconds: float
+    cpu: float = math.nan
 
     @property
     def kind(self) -> str:

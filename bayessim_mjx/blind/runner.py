@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 import os
 import queue
 import subprocess
@@ -171,7 +172,8 @@ def outcomes(check: Check, indices: range, own: Bench) -> list[Outcome]:
         answer = next((p for p in (check.answer(index) / n for n in KEPT) if p.exists()), None)
         said = json.loads(answer.read_text()) if answer and told["code"] == 0 else None
         truth["closed"] = told.get("closed")
-        found.append(Outcome(check.given(index), truth, said, own.scales.drives, told["seconds"]))
+        cpu = told.get("cpu", math.nan)
+        found.append(Outcome(check.given(index), truth, said, own.scales.drives, told["seconds"], cpu))
     return found
 
 
