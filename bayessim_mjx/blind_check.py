@@ -1,7 +1,6 @@
 """Which missing effects a diagnosis would find on your robot and logs: bayessim-mjx blind --model FILE --data LOGS."""
 
 import argparse
-import json
 import os
 import shlex
 import sys
@@ -114,11 +113,10 @@ def _blind(argv: Sequence[str] | None) -> int:
     from bayessim_mjx.blind import answer, show
 
     with stages(args.headless) as say:
-        outcomes = run(check, limits, say)
+        outcomes = run(check, limits, say, lambda so_far: answer.write(check, answer.answer(check, so_far)))
         found = answer.answer(check, outcomes, say)
     with Console(headless=args.headless) as console:
-        (check.folder / answer.FILE).write_text(json.dumps(found, indent=1, default=float), encoding="utf-8")
-        show.page(found, answer.about(check, found), check.folder)
+        answer.write(check, found)
         show.tensorboard(found, check.folder)
         show.console(found, check.folder, console)
     return 0

@@ -69,7 +69,7 @@ def wilson(hits: int, n: int, z: float = Z95) -> tuple[float, float]:
         return 0.0, 1.0
     p, z2 = hits / n, z * z
     middle, half = p + z2 / (2 * n), z * math.sqrt(p * (1 - p) / n + z2 / (4 * n * n))
-    return (middle - half) / (1 + z2 / n), (middle + half) / (1 + z2 / n)
+    return max((middle - half) / (1 + z2 / n), 0.0), min((middle + half) / (1 + z2 / n), 1.0)
 
 
 def covered(outcome: Outcome) -> list[bool]:

@@ -23,6 +23,7 @@ from bayessim_mjx.blind.worker import EXIT, KEPT, asked
 from bayessim_mjx.errors import UserError
 
 Say = Callable[[str, int, int], None]
+Between = Callable[[list[Outcome]], None]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,8 +35,10 @@ class Limits:
     workers: int = 1
 
 
-def run(check: Check, limits: Limits, say: Say) -> list[Outcome]:
+def run(check: Check, limits: Limits, say: Say, between: Between = lambda outcomes: None) -> list[Outcome]:
     """Make and diagnose cases up to a number or for a time; the outcomes of all that are finished.
+
+    `between` gets the outcomes so far after every round but the last.
 
     Raises:
         UserError: what is wrong with model, logs or effects; a seal that is broken.
@@ -47,10 +50,13 @@ def run(check: Check, limits: Limits, say: Say) -> list[Outcome]:
     crew = _Crew(check, limits)
     try:
         for indices in rounds(limits.cases):
-            before = trials(outcomes(check, range(indices.start), own))
+            so_far = outcomes(check, range(indices.start), own)
+            before = trials(so_far)
             items = plan(indices, groups, unknown, before, check.seed)
             todo = [i for i in items if not (check.answer(i.index) / EXIT).exists()]
             told = partial(_told, say, indices.stop - len(todo), limits.cases)
+            if todo and so_far:
+                between(so_far)
             if todo and not crew.work_off(todo, told):
                 break
     finally:

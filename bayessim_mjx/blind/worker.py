@@ -71,7 +71,9 @@ def diagnose(check: Check, index: int) -> str:
 
 
 def really_closed(check: Check, index: int) -> float | None:
-    """What a diagnosis closes of the gap in the finer reality; None where it names nothing that can be put there."""
+    """What a diagnosis closes of the gap in the finer reality; None where it names nothing that can be put there, or
+    tells none of the known parameters.
+    """
     answer = next((p for p in (check.answer(index) / n for n in KEPT) if p.exists()), None)
     said = json.loads(answer.read_text()) if answer else {}
     truth, own = json.loads(check.secret(index).read_text()), bench(check)
@@ -81,6 +83,8 @@ def really_closed(check: Check, index: int) -> float | None:
     if not causes:
         return None
     rig, base = own.ruler.system, base_of(said.get("parameters", {}), list(truth["base"]))
+    if not base:
+        return None
     hidden = [again(check, own, Item(**{k: truth[k] for k in ITEM}), e["size"]) for e in truth["effects"]]
     return closed(own.ruler, Plant(rig, truth["base"], hidden), Plant(rig, base, causes))
 

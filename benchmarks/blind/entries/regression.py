@@ -27,7 +27,10 @@ EFFECTS = {
 
 @dataclasses.dataclass(frozen=True)
 class Problem:
-    """One joint: y [T] effort that is not explained, X [T, k] terms, nuisance [T, m] (data-sheet values, 5 % of each), group [T] of its log."""
+    """One joint: y [T] effort that is not explained, X [T, k] terms, nuisance [T, m], group [T] of its log.
+
+    nuisance: what 5 % more of each data-sheet value does.
+    """
 
     joint: str
     actuator: str
