@@ -1,7 +1,6 @@
 """Which missing effects a diagnosis would find on your robot and logs: bayessim-mjx blind --model FILE --data LOGS."""
 
 import argparse
-import json
 import os
 import shlex
 import sys
@@ -70,6 +69,10 @@ def _parser() -> cli.PlainParser:
         "--command", metavar="WORDS", default="",
         help="another diagnosis: a command with {data} and {out}, and {model}, that writes {out}/diagnosis.json",
     )  # fmt: skip
+    parser.add_argument(
+        "--no_sandbox", action="store_true",
+        help="let the diagnosis read the whole disk, the truths too (default: it cannot, where Linux has Landlock)",
+    )  # fmt: skip
     parser.add_argument("--headless", action="store_true", help="plain lines instead of progress bars")
     parser.add_argument(
         "--more", nargs=argparse.REMAINDER, default=[], metavar="FLAG", help="further flags of diagnose; comes last"
@@ -103,18 +106,17 @@ def _blind(argv: Sequence[str] | None) -> int:
     names = () if args.effects == "all" else tuple(n.strip() for n in args.effects.split(",") if n.strip())
     check = Check(
         args.out, args.model or "", args.task or "", tuple(args.data), args.map, names, args.accuracy, args.seed,
-        args.command, tuple(args.more),
+        args.command, tuple(args.more), not args.no_sandbox,
     )  # fmt: skip
     seconds = None if args.minutes is None else 60 * args.minutes
     limits = Limits(args.cases, seconds, args.workers or os.cpu_count() or 1)
     from bayessim_mjx.blind import answer, show
 
     with stages(args.headless) as say:
-        outcomes = run(check, limits, say)
+        outcomes = run(check, limits, say, lambda so_far: answer.write(check, answer.answer(check, so_far)))
         found = answer.answer(check, outcomes, say)
     with Console(headless=args.headless) as console:
-        (check.folder / answer.FILE).write_text(json.dumps(found, indent=1, default=float), encoding="utf-8")
-        show.page(found, answer.about(check, found), check.folder)
+        answer.write(check, found)
         show.tensorboard(found, check.folder)
         show.console(found, check.folder, console)
     return 0

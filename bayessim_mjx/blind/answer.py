@@ -1,16 +1,19 @@
 """The whole answer of a check: its findings, look-alikes among its mistakes, and what it was made with."""
 
 import dataclasses
+import json
 from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
+from bayessim_mjx.blind import seal, show
 from bayessim_mjx.blind.cases import ITEM, Item, again
 from bayessim_mjx.blind.check import WIDEST, Bench, Check, bench
 from bayessim_mjx.blind.findings import Found, findings
 from bayessim_mjx.blind.outcome import Outcome
+from bayessim_mjx.blind.process import apart as apart_here
 from bayessim_mjx.blind.reality.lookalikes import APART, apart
 from bayessim_mjx.blind.reality.menu import KNOWN, places
 from bayessim_mjx.blind.reality.plant import Rig
@@ -21,26 +24,41 @@ from bayessim_mjx.errors import UserError
 from bayessim_mjx.quantities import count
 from bayessim_mjx.versions import versions
 
-__all__ = ["FILE", "about", "answer", "lookalikes"]
+__all__ = ["FILE", "about", "answer", "lookalikes", "write"]
 PAIRS = 6  # looked at, for the time: each is simulated in every motion of the menu
 Say = Callable[[str, int, int], None]
 Pair = tuple[str, str, str, str]  # hidden effect and place, said effect and place
 
 
-def answer(check: Check, outcomes: Sequence[Outcome], say: Say) -> Found:
-    """What is written to blind.json."""
+def answer(check: Check, outcomes: Sequence[Outcome], say: Say | None = None) -> Found:
+    """What is written to blind.json; without `say`, and so before the end, without look-alikes: they take long."""
     own = bench(check)
     found = findings(outcomes, own, check.effects)
-    found["lookalikes"] = lookalikes(check, own, outcomes, say)
+    found["lookalikes"] = lookalikes(check, own, outcomes, say) if say else []
     settings = {k: v for k, v in dataclasses.asdict(check).items() if k != "out"}
-    return found | {"versions": versions(), "settings": settings}
+    return found | {"looked": say is not None, "versions": versions(), "settings": settings}
+
+
+def write(check: Check, found: Found) -> None:
+    """blind.json and the page."""
+    seal.write(check.folder / FILE, json.dumps(found, indent=1, default=float))
+    show.page(found, about(check, found), check.folder)
 
 
 def about(check: Check, found: Found) -> list[str]:
     """Robot, logs, seed and entry, for the head of the page."""
     source = count(len(check.data), "log path") if check.data else "a menu of motions"
     entry = [f"entry: {check.command}"] if check.command else []
-    return [check.name, source, f"data-sheet values within {100 * check.accuracy:g} %", f"seed {check.seed}", *entry]
+    by = "Landlock" if check.sandbox and apart_here() else "its folder alone"
+    kept = f"the diagnosis is kept from the truths by {by}"
+    return [
+        check.name,
+        source,
+        f"data-sheet values within {100 * check.accuracy:g} %",
+        f"seed {check.seed}",
+        kept,
+        *entry,
+    ]
 
 
 def lookalikes(check: Check, own: Bench, outcomes: Sequence[Outcome], say: Say) -> list[dict[str, Any]]:

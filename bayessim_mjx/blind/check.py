@@ -26,7 +26,8 @@ class Check:
     Attributes:
         model: path of an MJCF file, or task: name of a task; data: files or folders of logs, () for a menu of motions.
         effects: names of the effects that are hidden, () for all; accuracy: of data-sheet values (standard deviation).
-        seed: of everything; command: an entry (see `runner.command`), "" for `diagnose`; more: further arguments of it.
+        seed: of everything; command: an entry (see `worker.command`), "" for `diagnose`; more: further arguments of it.
+        sandbox: whether an entry is kept from reading the truths, where the system can do that.
     """
 
     out: str
@@ -39,6 +40,7 @@ class Check:
     seed: int = 0
     command: str = ""
     more: tuple[str, ...] = ()
+    sandbox: bool = True
 
     def __post_init__(self) -> None:
         for name in self.effects:
@@ -60,8 +62,13 @@ class Check:
     def answer(self, index: int) -> Path:
         return self.folder / "cases" / f"{index:04d}" / "answer"
 
+    @property
+    def sealed(self) -> Path:
+        """The folder of the truths."""
+        return self.folder / "sealed"
+
     def secret(self, index: int) -> Path:
-        return self.folder / "sealed" / f"{index:04d}.json"
+        return self.sealed / f"{index:04d}.json"
 
     def seal(self, index: int) -> Path:
         return self.folder / "cases" / f"{index:04d}" / seal.SEAL
@@ -79,7 +86,7 @@ class Check:
             seal.write(path, json.dumps(own, indent=1))
             return
         before = json.loads(path.read_text())
-        other = [k for k in own if own[k] != before.get(k)]
+        other = [k for k in own if own[k] != before.get(k, own[k])]  # an earlier version had fewer
         if other:
             told = ", ".join(f"{k} = {before.get(k)!r}, not {own[k]!r}" for k in other)
             raise UserError(f"--out {self.out}: a check with {told} lies there; give another folder, or the same flags")

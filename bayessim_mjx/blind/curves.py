@@ -2,7 +2,7 @@
 
 A logistic curve in the logarithm of strength with a small lapse rate. The strengths at which effects are found half the
 time are drawn from a population, those of an effect's places from the effect's own (a hierarchical model), so that few
-cases of each suffice. All is integrated on grids: there is nothing to converge.
+cases of each suffice; so are slopes. All is integrated on grids: there is nothing to converge.
 """
 
 import dataclasses
@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 
 # What is believed before any case, by choice. That intervals hold as often as they say was counted on simulated checks
-# alone (90 % of 600 thresholds, docs/blind.md and tests/blind/test_curves.py).
+# alone (benchmarks/blind/calibration.py, benchmarks/results.md).
 LAPSE = 0.02  # of what is easily seen, missed for other reasons: within the 0 to 6 % of Wichmann and Hill (2001)
 WANTED = 0.9  # how often the strength is found that is told
 LEVEL = 0.9  # of intervals
@@ -21,6 +21,7 @@ THRESHOLD = np.linspace(
     np.log(0.3), np.log(3000.0), 185
 )  # log strength, in encoder noises, that is found half the time
 SLOPE = np.array([1.0, 1.6, 2.5, 4.0, 7.0, 14.0, 40.0])  # of the curve's logit, per unit of log strength
+AMONG_SLOPES = np.array([0.1, 0.7])  # standard deviations of effects' log slopes: alike, or within a factor of two
 AMONG_PLACES = np.array([0.08, 0.25, 0.6])  # standard deviations of thresholds, of an effect's places
 AMONG_EFFECTS = np.array([0.15, 0.4, 0.8, 1.3])  # and of effects
 CENTRE = np.linspace(np.log(1.0), np.log(300.0), 24)  # of the population, log strength
@@ -88,6 +89,9 @@ def _bell(x: np.ndarray, middle: np.ndarray, sd: np.ndarray) -> np.ndarray:
     return density / density.sum(-1, keepdims=True)
 
 
+_SLOPES = np.concatenate(
+    [_bell(np.log(SLOPE), np.log(SLOPE), np.full(1, sd)) for sd in AMONG_SLOPES]
+)  # [populations, slopes]
 _PLACE = _bell(THRESHOLD, THRESHOLD[None, :].repeat(len(AMONG_PLACES), 0), AMONG_PLACES[:, None])  # [P, T, T']
 _EFFECT = _bell(
     THRESHOLD, CENTRE[:, None] + 0 * AMONG_EFFECTS, AMONG_EFFECTS[None, :] + 0 * CENTRE[:, None]
@@ -133,19 +137,19 @@ class Curves:
 
     @cached_property
     def _population(self) -> np.ndarray:
-        """Log weights `[slopes, P, U, V]` of populations, by all effects."""
-        log = np.zeros((len(SLOPE), len(AMONG_PLACES), len(CENTRE), len(AMONG_EFFECTS)))
+        """Log weights `[populations of slopes, P, U, V]` of populations, by all effects."""
+        log = np.zeros((len(_SLOPES), len(AMONG_PLACES), len(CENTRE), len(AMONG_EFFECTS)))
         for z in self._evidence.values():
-            log = log + np.log(np.maximum(z, 1e-290))
+            log = log + np.log(np.maximum(np.tensordot(_SLOPES, z, 1), 1e-290))
         return log
 
     def of(self, effect: str, where: str) -> Belief:
         """What is known of one effect at one place, also where it was never tried."""
         log = self._population
         if effect in self._evidence:
-            log = log - np.log(np.maximum(self._evidence[effect], 1e-290))
+            log = log - np.log(np.maximum(np.tensordot(_SLOPES, self._evidence[effect], 1), 1e-290))
         weight = np.exp(log - log.max())
-        others = np.tensordot(weight, _EFFECT, ([2, 3], [0, 1]))
+        others = np.tensordot(_SLOPES.T, np.tensordot(weight, _EFFECT, ([2, 3], [0, 1])), 1)
         for (e, w), said in self._place.items():
             if e == effect and w != where:
                 others = others * said / said.max()

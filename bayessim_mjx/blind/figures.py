@@ -43,7 +43,8 @@ def overview(found: Mapping[str, Any]) -> Any:
     for t in found["trials"]:
         y = place[t["effect"], t["where"]]
         face, edge = (BLUE, BLUE) if t["found"] else ("white", MISSED)
-        axes.scatter(t["strength"], y, s=30, facecolor=face, edgecolor=edge, linewidth=1.4, zorder=3, clip_on=False)
+        x = float(np.clip(t["strength"], *RANGE))  # weaker and stronger ones at the edge
+        axes.scatter(x, y, s=30, facecolor=face, edgecolor=edge, linewidth=1.4, zorder=3, clip_on=False)
     axes.set_yticks(at, [f"{title(r['effect'], r['where'])}   {r['told']}" for r in rows])
     _strengths(axes)
     axes.set_ylim(-0.7, len(rows) - 0.3)

@@ -31,6 +31,7 @@ def findings(outcomes: Sequence[Outcome], own: Bench, effects: tuple[str, ...]) 
         "cases": len(outcomes),
         "failed": sum(o.said is None for o in outcomes),
         "seconds": float(np.median([o.seconds for o in outcomes])) if outcomes else math.nan,
+        "cpu": float(np.mean([o.cpu for o in outcomes])) if outcomes else math.nan,
         "thresholds": rows,
         "curves": _curves(curves, effects or tuple(dict.fromkeys(e for e, _ in own.groups(effects)))),
         "trials": [vars(t) for t in trials(outcomes)],
@@ -67,7 +68,7 @@ def _threshold(group: tuple[str, str], curves: Curves, singles: Sequence[Outcome
         words = [amounts.told(effect, a, slide) for a in at]
         sign = "<" if amounts.AMOUNTS.get(effect, amounts.OTHER).inverse else ">"
         found["told"] = f"{sign} {words[3]}" if found["beyond"] else words[0]
-        found["interval"] = f"{words[1]} to {words[2]}"
+        found["interval"] = f"from {words[1]} on" if found["beyond"] else f"{words[1]} to {words[2]}"
     return found
 
 
@@ -143,14 +144,16 @@ def sentences(found: Found, most: int = 6) -> list[str]:
     rows = [r for r in found["thresholds"] if r["amount"] and r["tried"]]
     rows.sort(key=lambda r: math.log(r["strength"][2] / r["strength"][1]))
     sharp = [r for r in rows[:most] if r["strength"][2] < SHARP * r["strength"][1]]
-    return [_sentence(r) for r in sharp] or ["too few cases to say what would be missed: go on with more of them"]
+    return [sentence(r) for r in sharp] or ["too few cases to say what would be missed: go on with more of them"]
 
 
-def _sentence(r: Mapping[str, Any]) -> str:
+def sentence(r: Mapping[str, Any]) -> str:
     amount = amounts.AMOUNTS.get(r["effect"], amounts.OTHER)
-    place = "" if r["where"] in ("world", "") else f" at {r['where']}"
+    name = amounts.spoken(r["effect"]) + ("" if r["where"] in ("world", "") else f" at {r['where']}")
     side, bound = "above" if amount.inverse else "under", r["told"].lstrip("<> ")
+    if r["beyond"]:
+        return f"{name}: even {bound} ({amount.what}), the strongest that was tried, was not seen"
     return (
-        f"{amounts.spoken(r['effect'])}{place}: {amount.what} {side} {bound} may be missed "
-        f"(found 9 times of 10 from there on; 90 % interval {r['interval']})"
+        f"{name} {side} {bound} ({amount.what}) would not have been seen reliably: it is found 9 times of 10 from "
+        f"there on (90 % interval {r['interval']})"
     )

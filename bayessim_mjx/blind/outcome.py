@@ -14,13 +14,17 @@ VERDICTS = ("no_gap", "parameters", "noise", "unexplained", "insufficient_data",
 
 @dataclass(frozen=True)
 class Outcome:
-    """One case: its truth, its diagnosis (None where there is none), and which joint each actuator drives."""
+    """One case: its truth, its diagnosis (None where there is none), and which joint each actuator drives.
+
+    seconds: that the diagnosis took by the clock; cpu: s of CPU, nan where it is not known.
+    """
 
     folder: Path
     truth: dict[str, Any]
     said: dict[str, Any] | None
     joint_of: Mapping[str, str]
     seconds: float
+    cpu: float = math.nan
 
     @property
     def kind(self) -> str:
@@ -65,7 +69,7 @@ def wilson(hits: int, n: int, z: float = Z95) -> tuple[float, float]:
         return 0.0, 1.0
     p, z2 = hits / n, z * z
     middle, half = p + z2 / (2 * n), z * math.sqrt(p * (1 - p) / n + z2 / (4 * n * n))
-    return (middle - half) / (1 + z2 / n), (middle + half) / (1 + z2 / n)
+    return max((middle - half) / (1 + z2 / n), 0.0), min((middle + half) / (1 + z2 / n), 1.0)
 
 
 def covered(outcome: Outcome) -> list[bool]:

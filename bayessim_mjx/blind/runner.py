@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 import os
 import queue
 import subprocess
@@ -22,6 +23,7 @@ from bayessim_mjx.blind.worker import EXIT, KEPT, asked
 from bayessim_mjx.errors import UserError
 
 Say = Callable[[str, int, int], None]
+Between = Callable[[list[Outcome]], None]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,8 +35,10 @@ class Limits:
     workers: int = 1
 
 
-def run(check: Check, limits: Limits, say: Say) -> list[Outcome]:
+def run(check: Check, limits: Limits, say: Say, between: Between = lambda outcomes: None) -> list[Outcome]:
     """Make and diagnose cases up to a number or for a time; the outcomes of all that are finished.
+
+    `between` gets the outcomes so far after every round but the last.
 
     Raises:
         UserError: what is wrong with model, logs or effects; a seal that is broken.
@@ -46,10 +50,13 @@ def run(check: Check, limits: Limits, say: Say) -> list[Outcome]:
     crew = _Crew(check, limits)
     try:
         for indices in rounds(limits.cases):
-            before = trials(outcomes(check, range(indices.start), own))
+            so_far = outcomes(check, range(indices.start), own)
+            before = trials(so_far)
             items = plan(indices, groups, unknown, before, check.seed)
             todo = [i for i in items if not (check.answer(i.index) / EXIT).exists()]
             told = partial(_told, say, indices.stop - len(todo), limits.cases)
+            if todo and so_far:
+                between(so_far)
             if todo and not crew.work_off(todo, told):
                 break
     finally:
@@ -171,7 +178,8 @@ def outcomes(check: Check, indices: range, own: Bench) -> list[Outcome]:
         answer = next((p for p in (check.answer(index) / n for n in KEPT) if p.exists()), None)
         said = json.loads(answer.read_text()) if answer and told["code"] == 0 else None
         truth["closed"] = told.get("closed")
-        found.append(Outcome(check.given(index), truth, said, own.scales.drives, told["seconds"]))
+        cpu = told.get("cpu", math.nan)
+        found.append(Outcome(check.given(index), truth, said, own.scales.drives, told["seconds"], cpu))
     return found
 
 

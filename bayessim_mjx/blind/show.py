@@ -119,7 +119,8 @@ def page(found: Found, about: Sequence[str], folder: Path) -> Path:
     )  # fmt: skip
     text = environment.get_template(TEMPLATE).render(
         headline=headline(found), about=about, sentences=found["sentences"], thresholds=thresholds(found),
-        rates=rates(found), lookalikes=lookalikes(found), versions=found.get("versions", {}),
+        looked=found.get("looked", True), rates=rates(found), lookalikes=lookalikes(found),
+        versions=found.get("versions", {}),
         pictures={tag: Markup(svg(figure)) for tag, figure in pictures(found).items()},
         untried=[title(r["effect"], r["where"]) for r in found["thresholds"] if not r["tried"]],
     )  # fmt: skip

@@ -9,7 +9,6 @@ import os
 import shlex
 import shutil
 import signal
-import subprocess
 import sys
 import tempfile
 import time
@@ -19,14 +18,13 @@ from typing import Any
 from bayessim_mjx.blind import seal
 from bayessim_mjx.blind.cases import ITEM, Item, again, make
 from bayessim_mjx.blind.check import Check, bench, loader
+from bayessim_mjx.blind.process import STOPPED, run
 from bayessim_mjx.blind.reality.menu import KNOWN
 from bayessim_mjx.blind.reality.plant import Plant
 from bayessim_mjx.blind.reality.twin import base_of, closed, twins
 from bayessim_mjx.errors import UserError
 
-STOPPED = (130, -signal.SIGINT, -signal.SIGTERM)  # by somebody: to be run again
 TIMEOUT = 3600.0  # s per diagnosis, against one that hangs
-QUIET = {name: "1" for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")}
 KEPT = ("diagnosis.json", "answer.json")
 EXIT = "exit.json"
 
@@ -56,23 +54,26 @@ def diagnose(check: Check, index: int) -> str:
         shutil.copytree(check.given(index) / "logs", work / "logs")
         if check.command and check.task:
             (work / "model.xml").write_text(loader(check)().to_xml())
-        out, started = work / "out", time.perf_counter()
+        out, words = work / "out", command(check, work / "logs", work / "out")
+        if not shutil.which(words[0]):
+            raise UserError(f"--command {words[0]}: there is no such program")
         with (answer / "output.txt").open("w") as text:
-            code = _run(command(check, work / "logs", out), work, text)
-        seconds = time.perf_counter() - started
+            ended = run(words, work, text, TIMEOUT, check.sealed if check.sandbox else None)
         for name in KEPT:
             if (out / name).exists():
                 shutil.copy(out / name, answer / name)
-    if code in STOPPED:
+    if ended.code in STOPPED:
         raise KeyboardInterrupt
-    told: dict[str, Any] = {"code": code, "seconds": seconds, "seal": check.seal(index).read_text()}
-    told["closed"] = really_closed(check, index) if code == 0 else None
+    told: dict[str, Any] = dataclasses.asdict(ended) | {"seal": check.seal(index).read_text()}
+    told["closed"] = really_closed(check, index) if ended.code == 0 else None
     seal.write(answer / EXIT, json.dumps(told))
-    return f"exit {code}"
+    return f"exit {ended.code}"
 
 
 def really_closed(check: Check, index: int) -> float | None:
-    """What a diagnosis closes of the gap in the finer reality; None where it names nothing that can be put there."""
+    """What a diagnosis closes of the gap in the finer reality; None where it names nothing that can be put there, or
+    tells none of the known parameters.
+    """
     answer = next((p for p in (check.answer(index) / n for n in KEPT) if p.exists()), None)
     said = json.loads(answer.read_text()) if answer else {}
     truth, own = json.loads(check.secret(index).read_text()), bench(check)
@@ -82,21 +83,10 @@ def really_closed(check: Check, index: int) -> float | None:
     if not causes:
         return None
     rig, base = own.ruler.system, base_of(said.get("parameters", {}), list(truth["base"]))
+    if not base:
+        return None
     hidden = [again(check, own, Item(**{k: truth[k] for k in ITEM}), e["size"]) for e in truth["effects"]]
     return closed(own.ruler, Plant(rig, truth["base"], hidden), Plant(rig, base, causes))
-
-
-def _run(words: list[str], work: Path, text: Any) -> int:
-    try:
-        done = subprocess.run(
-            words, cwd=work, stdout=text, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL, timeout=TIMEOUT,
-            env=os.environ | QUIET,
-        )  # fmt: skip
-    except subprocess.TimeoutExpired:
-        return 124
-    except OSError as error:
-        raise UserError(f"--command {words[0]}: {error.strerror}") from None
-    return done.returncode
 
 
 def work(check: Check, item: Item) -> dict[str, Any]:

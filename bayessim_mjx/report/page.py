@@ -1,8 +1,10 @@
 """report.html: one self-contained page, plotly.js inside, nothing loaded from anywhere."""
 
 import json
+import os
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from markupsafe import Markup
 
@@ -19,12 +21,13 @@ def write(diagnosis: Diagnosis, folder: str | Path, missed: Any = None) -> Path:
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / "report.html"
-    path.write_text(render(diagnosis, missed), encoding="utf-8")
+    link = Path(os.path.relpath(missed.page, folder.resolve())).as_posix() if missed else ""
+    path.write_text(render(diagnosis, missed, link), encoding="utf-8")
     return path
 
 
-def render(d: Diagnosis, missed: Any = None) -> str:
-    """The page as text."""
+def render(d: Diagnosis, missed: Any = None, link: str = "") -> str:
+    """The page as text; `link`: to the page of the blind check, from where this one lies."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
     from plotly.offline import get_plotlyjs
 
@@ -59,6 +62,7 @@ def render(d: Diagnosis, missed: Any = None) -> str:
         data=evidence.data(d),
         warnings=d.warnings,
         missed=missed,
+        missed_link=quote(link) if link else missed and missed.page.as_uri(),
         versions=d.versions,
     )
 

@@ -14,7 +14,7 @@ import sys
 from pathlib import Path
 
 from kinds import KINDS, VERSION
-from suite import COUNTED, ENTRIES, enter, generate, table
+from suite import COUNTED, ENTRIES, enter, generate, table, unfinished
 from systems import SYSTEMS
 
 from bayessim_mjx.versions import versions
@@ -42,6 +42,17 @@ def refused(seeds: range, counted: list[dict]) -> str:
     return ""
 
 
+def lacking() -> str:
+    """What an entry lacks on this machine, or "": it would count as one that never answers."""
+    from mujoco import sysid
+
+    if not hasattr(sysid, "optimize"):
+        return 'the parameter refit lacks its package: pip install "mujoco[sysid]"'
+    if not (HERE / "entries" / "classifier.npz").exists():
+        return "the classifier is not trained: entries/classifier.py --train SUITE, on development seeds"
+    return ""
+
+
 def written(page: str, text: str) -> str:
     """The page with another text between its marks."""
     before, _, rest = page.partition(BEGIN)
@@ -57,12 +68,14 @@ def main() -> None:
     args = parser.parse_args()
     first, last = (int(n) for n in args.seeds.split(":"))
     counted = json.loads(RECORD.read_text()) if RECORD.exists() else []
-    if why := refused(range(first, last), counted):
+    if why := refused(range(first, last), counted) or lacking():
         sys.exit(why)
     systems = args.systems.split(",")
     generate(args.out, range(first, last), systems, list(KINDS))
     for name, command in ENTRIES.items():
         enter(args.out, name, command, args.workers, 3600.0)
+    if left := sum(len(unfinished(args.out, name)) for name in ENTRIES):
+        sys.exit(f"{left} answers are missing, as they were stopped: start it again")
     text, figures = table(args.out)
     release = {"suite": VERSION, "commit": git("rev-parse", "HEAD"), "seeds": [first, last], "systems": systems}
     counted = [c for c in counted if c["commit"] != release["commit"]]

@@ -13,7 +13,6 @@ import json
 import os
 import shlex
 import shutil
-import subprocess
 import sys
 import tempfile
 import time
@@ -23,12 +22,13 @@ from pathlib import Path
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE.parent / "diagnosis"))
 import mujoco  # noqa: E402
+import numpy as np  # noqa: E402
 from kinds import KINDS, VERSION, make  # noqa: E402
 from systems import SYSTEMS  # noqa: E402
 
-from bayessim_mjx.blind import seal  # noqa: E402
+from bayessim_mjx.blind import process, seal  # noqa: E402
 from bayessim_mjx.blind.outcome import Outcome, alarm, covered, label, rate  # noqa: E402
-from bayessim_mjx.blind.worker import QUIET, STOPPED  # noqa: E402
+from bayessim_mjx.blind.worker import EXIT  # noqa: E402
 
 COUNTED = 2000  # seeds from here on count
 ENTRIES = {
@@ -64,7 +64,7 @@ def cases(suite: Path) -> list[Path]:
 
 def enter(suite: Path, name: str, command: str, workers: int, timeout: float) -> None:
     """Have every case diagnosed that this entry has not finished."""
-    todo = [c for c in cases(suite) if not (suite / "entries" / name / c.name / "exit.json").exists()]
+    todo = unfinished(suite, name)
     with ThreadPoolExecutor(workers) as pool:
         for line in pool.map(lambda case: _one(suite, case, name, command, timeout), todo):
             print(line, flush=True)
@@ -77,22 +77,19 @@ def _one(suite: Path, case: Path, name: str, command: str, timeout: float) -> st
         shutil.copytree(case / "given", work, dirs_exist_ok=True)
         where = {"model": work / "model.xml", "data": work / "logs", "out": work / "out"}
         words = [w.format(python=sys.executable, here=HERE.resolve(), **where) for w in shlex.split(command)]
-        started = time.perf_counter()
         with (answer / "output.txt").open("w") as text:
-            try:
-                code = subprocess.run(
-                    words, cwd=work, stdout=text, stderr=subprocess.STDOUT, timeout=timeout, env=os.environ | QUIET
-                ).returncode
-            except subprocess.TimeoutExpired:
-                code = 124
-        seconds = time.perf_counter() - started
+            ended = process.run(words, work, text, timeout, suite / "sealed")
         if (said := work / "out" / "diagnosis.json").exists():
             shutil.copy(said, answer / "diagnosis.json")
-    if code in STOPPED:
+    if ended.code in process.STOPPED:
         return f"{case.name}: stopped"
-    told = {"code": code, "seconds": seconds, "seal": (case / "seal.txt").read_text()}
-    seal.write(answer / "exit.json", json.dumps(told))
-    return f"{name}, {case.name}: exit {code}, {seconds:.0f} s"
+    seal.write(answer / EXIT, json.dumps(vars(ended) | {"seal": (case / "seal.txt").read_text()}))
+    return f"{name}, {case.name}: exit {ended.code}, {ended.cpu:.0f} s of CPU, {ended.seconds:.0f} s"
+
+
+def unfinished(suite: Path, name: str) -> list[Path]:
+    """Cases that an entry has not finished."""
+    return [c for c in cases(suite) if not (suite / "entries" / name / c.name / EXIT).exists()]
 
 
 def outcomes(suite: Path, name: str) -> list[Outcome]:
@@ -100,17 +97,16 @@ def outcomes(suite: Path, name: str) -> list[Outcome]:
     found = []
     for case in cases(suite):
         answer = suite / "entries" / name / case.name
-        if not (answer / "exit.json").exists():
+        if not (answer / EXIT).exists():
             continue
-        ended = json.loads((answer / "exit.json").read_text())
-        seals = {str(case / "seal.txt"): (case / "seal.txt").read_text(), str(answer / "exit.json"): ended["seal"]}
+        ended = json.loads((answer / EXIT).read_text())
+        seals = {str(case / "seal.txt"): (case / "seal.txt").read_text(), str(answer / EXIT): ended["seal"]}
         truth = seal.opened(case / "given", suite / "sealed" / f"{case.name}.json", seals)
         model = mujoco.MjModel.from_xml_path(str(case / "given" / "model.xml"))
         drives = {model.actuator(i).name: model.joint(model.actuator_trnid[i, 0]).name for i in range(model.nu)}
         said = answer / "diagnosis.json"
-        found.append(
-            Outcome(case, truth, json.loads(said.read_text()) if said.exists() else None, drives, ended["seconds"])
-        )
+        told = json.loads(said.read_text()) if said.exists() else None
+        found.append(Outcome(case, truth, told, drives, ended["seconds"], ended.get("cpu", np.nan)))
     return found
 
 
@@ -131,19 +127,25 @@ def measures(found: list[Outcome]) -> dict[str, dict[str, float]]:
     }
 
 
+def cost(found: list[Outcome]) -> dict[str, float]:
+    """{robot: mean s of CPU of a case}."""
+    robots = sorted({str(o.truth["robot"]) for o in found})
+    return {r: float(np.mean([o.cpu for o in found if o.truth["robot"] == r])) for r in robots}
+
+
 def table(suite: Path) -> tuple[str, dict]:
-    """(Markdown, {entry: {measure: rate, "cases", "seconds"}}) of all entries, the best at singles first."""
+    """(Markdown, {entry: {measure: rate, "cases", "cpu": {robot: s}}}) of all entries, the best at singles first."""
     names = sorted(p.name for p in (suite / "entries").glob("*") if p.is_dir())
     figures: dict[str, dict] = {}
     for name in names:
         if found := outcomes(suite, name):
-            seconds = sorted(o.seconds for o in found)[len(found) // 2]
-            figures[name] = measures(found) | {"cases": len(found), "seconds": seconds}
+            figures[name] = measures(found) | {"cases": len(found), "cpu": cost(found)}
     share = lambda m: m["hits"] / m["n"] if m["n"] else -1.0  # noqa: E731
-    rows = ["| entry | " + " | ".join(MEASURES) + " | cases | s |", "|---" * (len(MEASURES) + 3) + "|"]
+    rows = ["| entry | " + " | ".join(MEASURES) + " | cases | CPU s |", "|---" * (len(MEASURES) + 3) + "|"]
     for name, own in sorted(figures.items(), key=lambda f: -share(f[1]["single"])):
         told = [f"{own[m]['hits']}/{own[m]['n']}" if own[m]["n"] else "-" for m in MEASURES]
-        rows.append(f"| {name} | " + " | ".join(told) + f" | {own['cases']} | {own['seconds']:.0f} |")
+        cpu = np.mean(list(own["cpu"].values()))
+        rows.append(f"| {name} | " + " | ".join(told) + f" | {own['cases']} | {cpu:.0f} |")
     return "\n".join(rows), figures
 
 

@@ -15,6 +15,7 @@ for folder in ("diagnosis", "blind", "blind/entries"):
     sys.path.insert(0, str(ROOT / "benchmarks" / folder))
 pytest.importorskip("systems")
 import bic  # noqa: E402
+import calibration  # noqa: E402
 import kinds  # noqa: E402
 import regression  # noqa: E402
 import release  # noqa: E402
@@ -23,6 +24,7 @@ import sindy  # noqa: E402
 import suite  # noqa: E402
 from systems import SYSTEMS  # noqa: E402
 
+from bayessim_mjx.blind.plan import KINDS  # noqa: E402
 from bayessim_mjx.blind.reality.plant import Plant  # noqa: E402
 
 PENDULUM = SYSTEMS["pendulum"]
@@ -93,3 +95,28 @@ def test_the_table_goes_between_its_marks():
     new = release.written(page, "| a |")
     assert "| a |" in new and new.count(release.BEGIN) == new.count(release.END) == 1
     assert release.written(new, "| b |") == release.written(page, "| b |")
+
+
+def test_the_strength_that_is_wanted_is_found_9_times_of_10():
+    for truth in calibration.SETTINGS.values():
+        curve = calibration.Curve(2.0, truth.slopes[0], truth)
+        assert curve.chance(curve.wanted()) == pytest.approx(0.9, abs=1e-6)
+    logistic = calibration.Curve(np.log(10), 2.0, calibration.Truth(lapse=0.0))
+    assert logistic.wanted() == pytest.approx(10 * 9**0.5)  # logit(0.9) = log 9 over a slope of 2
+
+
+def test_a_check_of_known_curves_follows_from_its_seed_and_its_plan():
+    curves = calibration.drawn(calibration.Truth(effects=3), np.random.default_rng(0))
+    trials = calibration.check(curves, 24, 0)
+    assert trials == calibration.check(curves, 24, 0) and {t.effect for t in trials} == {"e0", "e1", "e2"}
+    assert len(trials) == sum(KINDS[i % len(KINDS)] == "S" for i in range(24))
+
+
+@pytest.mark.slow
+@pytest.mark.ci
+@pytest.mark.parametrize("name", ["as assumed", "steps"])
+def test_told_strengths_hold_as_often_as_they_say(name):
+    """90 % intervals, within what is asked of them and the error of 20 checks."""
+    inside = [np.mean([x[0] for x in calibration.judged(name, seed)]) for seed in range(20)]
+    error = np.std(inside, ddof=1) / np.sqrt(len(inside))
+    assert 0.85 - 2 * error < np.mean(inside) < 0.97 + 2 * error

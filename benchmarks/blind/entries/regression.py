@@ -27,7 +27,10 @@ EFFECTS = {
 
 @dataclasses.dataclass(frozen=True)
 class Problem:
-    """One joint: y [T] effort that is not explained, X [T, k] terms, nuisance [T, m] (masses), group [T] of its log."""
+    """One joint: y [T] effort that is not explained, X [T, k] terms, nuisance [T, m], group [T] of its log.
+
+    nuisance: what 5 % more of each data-sheet value does.
+    """
 
     joint: str
     actuator: str
@@ -47,7 +50,7 @@ def problems(model_path: str, data: str) -> list[Problem]:
         joint = int(model.actuator_trnid[i, 0])
         dof, qadr = int(model.jnt_dofadr[joint]), int(model.jnt_qposadr[joint])
         columns = [_terms(p, i, dof, qadr) for p in parts]
-        scale = SHEET * np.concatenate([p["masses"][:, :, dof] for p in parts])
+        sheet = np.concatenate([_known(model, p, dof) for p in parts])
         out.append(
             Problem(
                 model.joint(joint).name,
@@ -55,7 +58,7 @@ def problems(model_path: str, data: str) -> list[Problem]:
                 model.body(model.jnt_bodyid[joint]).name,
                 np.concatenate([p["y"][:, dof] for p in parts]),
                 np.concatenate(columns),
-                scale,
+                SHEET * sheet,
                 np.concatenate([np.full(len(p["y"]), k) for k, p in enumerate(parts)]),
             )  # fmt: skip
         )
@@ -65,12 +68,20 @@ def problems(model_path: str, data: str) -> list[Problem]:
 def _signals(model: mujoco.MjModel, log: Log) -> dict[str, np.ndarray]:
     window = max(5, int(SMOOTH / log.period) // 2 * 2 + 1)
     q, v, a = (savgol_filter(log.qpos, window, 4, deriv=d, delta=log.period, axis=0) for d in range(3))
-    y = _missing(model, q, v, a, log.ctrl)
+    held = 0.5 * (log.ctrl + np.concatenate([log.ctrl[:1], log.ctrl[:-1]]))  # a row's command acts from the row on
+    u = savgol_filter(held, window, 4, axis=0)  # as smooth as the motion: an equation holds for what is filtered alike
+    y = _missing(model, q, v, a, u)
     moving = [body for body in range(1, model.nbody) if model.body_weldid[body]]
-    masses = [_missing(_heavier(model, body), q, v, a, log.ctrl) - y for body in moving]
+    masses = [_missing(_heavier(model, body), q, v, a, u) - y for body in moving]
     cut = slice(EDGE, -EDGE)
-    found = {"q": q, "v": v, "a": a, "u": log.ctrl, "du": np.gradient(log.ctrl, log.period, axis=0), "y": y}
+    found = {"q": q, "v": v, "a": a, "u": u, "du": np.gradient(u, log.period, axis=0), "y": y}
     return {k: x[cut] for k, x in found.items()} | {"masses": np.stack(masses, 1)[cut]}
+
+
+def _known(model: mujoco.MjModel, p: dict[str, np.ndarray], dof: int) -> np.ndarray:
+    """[T, m] what masses, damping and rotor inertia of the data sheet do at a joint."""
+    own = [model.dof_damping[dof] * p["v"][:, dof], model.dof_armature[dof] * p["a"][:, dof]]
+    return np.column_stack([p["masses"][:, :, dof], *own])
 
 
 def _heavier(model: mujoco.MjModel, body: int) -> Any:
@@ -100,7 +111,7 @@ def _terms(p: dict[str, np.ndarray], i: int, dof: int, qadr: int) -> np.ndarray:
 
 
 def least_squares(p: Problem, terms: list[int], shrink: float = 0.0) -> tuple[np.ndarray, np.ndarray, float]:
-    """(coefficients, errors as if residuals were independent, rss), masses as their data sheet has them.
+    """(coefficients, errors as if residuals were independent, rss), data-sheet values as accurate as they are.
 
     shrink: ridge of the terms, as a share of their squares: some depend on each other.
     """

@@ -1,0 +1,88 @@
+"""Start a program that can read no file below a folder: python -I confine.py FOLDER PROGRAM [ARGUMENT ...].
+
+Landlock (Linux 5.13 and newer) keeps a process and all that it starts from reading, and cannot be undone by them. It
+only allows, so everything beside the folder, and beside each folder above it, is allowed. What is new beside them later
+cannot be read either: temporary files belong into a folder that is there before.
+
+It stands alone: it runs before anything of the library is imported.
+"""
+
+import ctypes
+import os
+import sys
+from pathlib import Path
+
+# the same numbers on all machines since Linux 5.1 (include/uapi/asm-generic/unistd.h)
+CREATE_RULESET, ADD_RULE, RESTRICT_SELF = 444, 445, 446
+VERSION, PATH_BENEATH = 1, 1  # include/uapi/linux/landlock.h, as those of the next line
+READ_FILE, REFER = 1 << 2, 1 << 13  # REFER: files may move between folders; without it no folder allows that
+NO_NEW_PRIVS = 38  # include/uapi/linux/prctl.h
+
+
+class _Ruleset(ctypes.Structure):
+    _fields_ = (("handled", ctypes.c_uint64),)
+
+
+class _Beneath(ctypes.Structure):
+    _pack_ = 1
+    _layout_ = "ms"  # Python 3.14 asks for it where a structure is packed
+    _fields_ = (("allowed", ctypes.c_uint64), ("folder", ctypes.c_int32))
+
+
+def _call(*words: object) -> int:
+    """A system call's answer.
+
+    Raises:
+        OSError: it failed.
+    """
+    answer = ctypes.CDLL(None, use_errno=True).syscall(*words)
+    if answer < 0:
+        raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
+    return answer
+
+
+def version() -> int:
+    """Of Landlock, from 1 on; 0 where this system has none."""
+    if not sys.platform.startswith("linux"):
+        return 0
+    try:
+        return _call(CREATE_RULESET, None, 0, VERSION)
+    except OSError:
+        return 0
+
+
+def beside(folder: Path) -> list[Path]:
+    """Everything beside a folder and beside each folder above it."""
+    above = [folder, *folder.parents]
+    return [p for inner, outer in zip(above, above[1:], strict=False) for p in outer.iterdir() if p != inner]
+
+
+def hide(folder: Path) -> None:
+    """From now on this process, and all that it starts, can read no file below `folder`.
+
+    Raises:
+        OSError: the system cannot do it.
+    """
+    every = READ_FILE | REFER if version() > 1 else READ_FILE
+    ruleset = _Ruleset(every)
+    rules = _call(CREATE_RULESET, ctypes.byref(ruleset), ctypes.sizeof(ruleset), 0)
+    for path in beside(folder.resolve()):
+        if path.is_symlink():  # it leads to what has a rule of its own, or to the folder
+            continue
+        try:
+            at = os.open(path, os.O_PATH | os.O_CLOEXEC)
+        except FileNotFoundError:  # gone in between
+            continue
+        rule = _Beneath(every if path.is_dir() else READ_FILE, at)
+        _call(ADD_RULE, rules, PATH_BENEATH, ctypes.byref(rule), 0)
+        os.close(at)
+    ctypes.CDLL(None).prctl(NO_NEW_PRIVS, 1, 0, 0, 0)
+    _call(RESTRICT_SELF, rules, 0)
+
+
+if __name__ == "__main__":
+    hide(Path(sys.argv[1]))
+    try:
+        os.execvp(sys.argv[2], sys.argv[2:])
+    except OSError as error:
+        sys.exit(f"{sys.argv[2]}: {error.strerror}")
