@@ -51,8 +51,8 @@ def read(folder: Path, results: str = "diagnosis", baseline: str | None = None) 
     seconds = ended.get("seconds", math.nan) if baseline is None else (said or {}).get("seconds", math.nan)
     return Outcome(
         folder, truth, said, joints, seconds,
-        ended.get("compile_seconds", math.nan), oracle.get("closure"),
-        None if rivals is None else isolable(rivals, truth["effects"][0]["left"]),
+        compile_seconds=ended.get("compile_seconds", math.nan), true_closure=oracle.get("closure"),
+        isolable=None if rivals is None else isolable(rivals, truth["effects"][0]["left"]),
     )  # fmt: skip
 
 
