@@ -139,8 +139,9 @@ def fit(sums: Sums, terms: Sequence[Term], without: int | None = None, start: Ar
     for _ in range(RULES.rounds):
         design, target = _linearised(lay.effort, terms, spans, values, model, nominal)
         weight = np.where(on, 1.0 / variance, 0.0)
-        weighed = (weight[:, None, None] * design).reshape(-1, size).T
-        H = weighed @ (gram @ design).reshape(-1, size)
+        rows_of = (lay.nv * lay.size, size)
+        weighed = (weight[:, None, None] * design).reshape(rows_of).T
+        H = weighed @ (gram @ design).reshape(rows_of)
         g = weighed @ times(gram, target).ravel()
         precision = _precision(np.diag(H), terms, spans, values)
         H, g = H + np.diag(precision), g + neutral * precision

@@ -258,7 +258,8 @@ class _Projection:
         self.A = fit.A[:, :, self.free]
         self.Bt, self.BA = starts.B.mT, starts.B.mT @ self.A
         # columns by the parameters as one matrix, weighted, and less what the start states take
-        self.away = (self.A - starts.B @ (starts.M @ self.BA)).reshape(-1, len(self.free))
+        rows = self.A.shape[0] * self.A.shape[1]  # there may be no parameter that is free
+        self.away = (self.A - starts.B @ (starts.M @ self.BA)).reshape(rows, len(self.free))
         self.weighted = np.repeat(fit.weight, self.A.shape[1])[:, None] * self.away
 
     def moments(self, a: Array) -> tuple[float, float, float, Array]:
