@@ -20,7 +20,9 @@ TOGETHER, FINALISTS = "effects together", "finalists"  # parts of the budget
 # times the leading model's cost: from where polishing has brought others ahead of it. What is missed farther away was
 # not counted; error rates with it are those of d462f0c in benchmarks/results.md.
 CLOSE = 4.0
-ATONCE = 3  # laws that are begun with at once: as many as sets of candidates were counted with
+ATONCE = (
+    3  # laws that are begun with at once: as many as sets of candidates were counted with; of proposals not counted
+)
 
 
 @dataclass(frozen=True)
@@ -46,7 +48,7 @@ class Fitting(Protocol):
         """Effects that may bring something on top of a fitted model, the most promising first."""
 
     def promises(self, key: Key) -> dict[str, float]:
-        """{effect: predicted drop of the cost} of them."""
+        """{label: predicted drop of the cost} of them."""
 
     def together(self, most: int, count: int) -> list[Key]:
         """Sets of up to so many effects that promise most when all amplitudes are free at once."""

@@ -97,7 +97,7 @@ class Fits:
         return {s.candidate.label: s.gain for s in self._screened[key] if s.gain > 0}
 
     def together(self, most: int, count: int) -> list[Key]:
-        """Sets of effects that promise most when all amplitudes are free at once (`dense`), and what was proposed."""
+        """Sets of effects that promise most when all amplitudes are free at once (`dense`)."""
         found = dense.supports(self.pool.base.fit, self.pool.screened, self.pool.settings.screened, most, count)
         self._amounts = {frozenset(s.candidate.label for s in starts): tuple(starts) for starts in found}
         return list(self._amounts)
@@ -184,9 +184,8 @@ class Fits:
 def law_of(candidate: Candidate) -> Law:
     """What a decision knows of a candidate."""
     index = frozenset(i for c in candidate.coordinates for i in c.index)
-    special = special_cases(candidate)
-    own = candidate
-    return Law(own.label, own.effect, own.where, len(own.coordinates), index, special, own.kind)
+    names = candidate.label, candidate.effect, candidate.where
+    return Law(*names, len(candidate.coordinates), index, special_cases(candidate), candidate.kind)
 
 
 def distances(pool: Pool, model: Model) -> dict[str, float]:
