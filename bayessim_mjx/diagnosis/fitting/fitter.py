@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from bayessim_mjx.diagnosis.fitting import quadratic
 from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
 from bayessim_mjx.diagnosis.fitting.fit import Fit, broyden, settled
-from bayessim_mjx.diagnosis.fitting.quadratic import Rest, blocks, held_out, solve, weights
+from bayessim_mjx.diagnosis.fitting.quadratic import Quadratic, Rest, blocks, held_out, predictive, solve, weights
 from bayessim_mjx.diagnosis.fitting.simulator import Simulator
 
 __all__ = ["Fit", "Fitter", "weights"]
@@ -243,6 +243,25 @@ class Fitter:
         watched = np.arange(len(self.base), len(fit.coordinates))
         split = functools.partial(blocks, q, starts, fit.r, fit.A)
         return held_out(q, group, fit.weight, precision, pull, low, high, watched, split)
+
+    def innovations(self, fit: Fit, q: Quadratic, moves: Array, estimates: Array, plain: Array) -> Array:
+        """Held-out costs `[W]` with the uncertainty of the estimates that they were predicted with.
+
+        Conditions that alone tell a parameter count as they were predicted: without them nothing is known of it.
+
+        Args:
+            q: costs about points of the parameters; moves: `[G, k]`, from there to the estimates without a condition.
+            estimates: `[G, k]`; plain: `[W]`, costs of the predictions themselves.
+        """
+        precision, pull, low, high = fit.prior()
+        rest = Rest(fit.quadratic(self.spread)[0], fit.weight, precision, pull, low, high)
+        alone, costs, group = self.told_alone(fit), plain.copy(), self.simulator.windows.group
+        for name, move, estimate, told in zip(np.unique(group), moves, estimates, alone, strict=True):
+            if not told:
+                own, point = group == name, estimate - move - fit.values
+                H = rest.curvature(own)[1]
+                costs[own] = predictive(q, own, fit.weight, move, H, low - point, high - point)
+        return costs
 
     def told_alone(self, fit: Fit) -> list[bool]:
         """Of each condition, whether it alone tells a parameter of an effect (a limit that is reached there only)."""

@@ -193,6 +193,27 @@ def held_out(
     return costs, np.array(moves)
 
 
+def predictive(
+    q: Quadratic, out: NDArray[np.bool_], weight: Array, p: Array, curvature: Array, low: Array, high: Array
+) -> Array:
+    """Costs of some windows together under an estimate p of the others and what that leaves open, shared out evenly.
+
+    With r = A p + e, e of unit variance and p known to N(p_, H^-1), -2 log density of r is, but for its determinant,
+    r'(I + A H^-1 A')^-1 r = min_d |r - A (p_ + d)|^2 + d'H d: the innovation of a Kalman filter (Bar-Shalom, Li and
+    Kirubarajan, 2001, sec. 5.2). A parameter that the others hardly tell may then move; one that they tell may not.
+
+    Args:
+        q, weight, p: as in `held_out`; out: `[W]`, the windows; curvature: H `[K, K]`, of the others and the prior.
+        low, high: `[K]`, bounds of p.
+
+    Returns:
+        Costs of the windows `out`.
+    """
+    g, S = q.weighted(weight * out)
+    d = solve(curvature + S, g - S @ p, low - p, high - p)
+    return np.asarray(q.at(p + d)[out] + d @ curvature @ d / np.count_nonzero(out))
+
+
 @dataclass(frozen=True, eq=False)
 class Rest:
     """Newton steps from a fit to what is left without some windows, or without blocks of them."""

@@ -5,8 +5,10 @@
 2. Same: the better of two models is not better by `errors` standard errors and `nats` plus the logarithm of the number
    of candidates, or what it closes of what the other leaves is not worth naming (`same`).
 3. Answer: of the models that are the same as the best, the least: a special case before its general law, one place
-   before all of them, fewer numbers. The others that are least in their own right are its rivals. Nothing is named only
-   where no model at all is better than the known parameters.
+   before all of them, fewer numbers. What is the same as that one, and no larger, stands beside it, and the least of
+   these is the answer: the best may have an effect more that is not worth naming, which its like lacks. The others that
+   are least in their own right are its rivals. Nothing is named only where no model at all is better than the known
+   parameters.
 """
 
 from __future__ import annotations
@@ -130,9 +132,12 @@ def same(table: Table, worse: Key, better: Key, criteria: Criteria) -> bool:
     Effects beside the same others have to close enough of what is left; in the place of others, predict as well.
     """
     if not worse < better:
-        ratio = (1.0 + table.excess(worse)) / max(1.0 + table.excess(better), 1e-9)
-        return ratio < 1.0 + criteria.same or not real(table, worse, better, criteria)
+        return _as_good(table, worse, better, criteria) or not real(table, worse, better, criteria)
     return not (relevant(table, worse, better, criteria, criteria.same) and real(table, worse, better, criteria))
+
+
+def _as_good(table: Table, worse: Key, better: Key, criteria: Criteria) -> bool:
+    return (1.0 + table.excess(worse)) / max(1.0 + table.excess(better), 1e-9) < 1.0 + criteria.same
 
 
 def order(laws: Mapping[str, Law]) -> Order:
@@ -178,8 +183,15 @@ def decide(table: Table, less: Order, criteria: Criteria) -> Decision:
         alike = [k for k in alike if k in shown] if shown & rows.keys() else alike
     equal = [k for k in alike if k in rows] or [best]
     answer = least(table, equal, less)
+    alike = [*alike, *(k for k in table.rows if k not in alike and _beside(table, k, answer, criteria))]
+    answer = least(table, [answer, *(k for k in alike if k in rows and k not in equal)], less)
     trace.append(f"the same as the best: {len(equal)}; least: {_told(answer)}, leaves {table.excess(answer):.3g}")
     return Decision(answer, best, rivals(table, alike, answer, less), table, tuple(trace))
+
+
+def _beside(table: Table, key: Key, answer: Key, criteria: Criteria) -> bool:
+    """Whether a model no larger than the answer, and no part of it, predicts as well as the answer does."""
+    return bool(key) and len(key) <= len(answer) and not key <= answer and _as_good(table, key, answer, criteria)
 
 
 def least(table: Table, equal: Iterable[Key], less: Order) -> Key:

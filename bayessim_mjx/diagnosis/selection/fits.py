@@ -169,14 +169,13 @@ class Fits:
         todo = [k for k in keys if self._folds.get(k, (None, None))[0] is not models[k]]
         if todo:
             self.say("held out", 0, len(todo))
-        steps = fitter.simulator.windows.steps
         refitted = heldout.refitted(fitter, [models[k] for k in todo])
         for done, (key, model) in enumerate(zip(todo, refitted, strict=True)):
             self.say("held out", done, len(todo))
             models[key] = model
             seen = heldout.predict(fitter, model)
             # start states count as in the search, or all models would come nearer to the noise than they did there
-            cost = seen.cost(steps) * self.pool.noise + np.sum((seen.offsets / fitter.spread) ** 2, axis=1)
+            cost = heldout.costs(fitter, model, seen)
             self._folds[key] = (model, replace(self._row(key, model, True), cost=cost, simulated=True))
         return replace(known, rows={key: self._folds[key][1] for key in keys})
 

@@ -58,6 +58,14 @@ def predict(fitter: Fitter, model: Model) -> Prediction:
     return Prediction(error, offsets)
 
 
+def costs(fitter: Fitter, model: Model, seen: Prediction) -> Array:
+    """Costs `[W]` of a prediction with the uncertainty of what it was made with, in the units of `Model.cost`."""
+    fit, steps = model.fit, fitter.simulator.windows.steps
+    plain = seen.cost(steps) * fitter.size + np.sum((seen.offsets / fitter.spread) ** 2, axis=1)
+    q, _ = eliminate(seen.error.reshape(len(plain), -1), fit.A, fit.B, seen.offsets, fitter.spread)
+    return fitter.innovations(fit, q, np.zeros_like(model.estimates), model.estimates, plain)
+
+
 def refitted(fitter: Fitter, models: Sequence[Model]) -> list[Model]:
     """The models with estimates without each condition that come of fits without it, all in lockstep.
 

@@ -21,7 +21,8 @@ class Model:
 
     Attributes:
         effects: its candidates; fit: of its parameters.
-        cost: `[W]`, held-out cost of each window (leave one operating condition out), starts re-estimated.
+        cost: `[W]`, held-out cost of each window (leave one operating condition out), starts re-estimated, with the
+            uncertainty of the parameters (`Fitter.innovations`); plain: without it.
         estimates: `[G, k]`, parameters without each condition.
         samples: effective number of independent residuals.
     """
@@ -29,6 +30,7 @@ class Model:
     effects: tuple[Candidate, ...]
     fit: Fit
     cost: Array
+    plain: Array
     estimates: Array
     samples: float
 
@@ -52,8 +54,10 @@ class Model:
 
 def scored(fitter: Fitter, fit: Fit, effects: Sequence[Candidate]) -> Model:
     """The held-out score of a fit."""
-    cost, moves = fitter.scores(fit)
-    return Model(tuple(effects), fit, np.maximum(cost, 1e-9), fit.values + moves, effective_samples(fit, fitter))
+    plain, moves = fitter.scores(fit)
+    cost = fitter.innovations(fit, fit.quadratic(fitter.spread)[0], moves, fit.values + moves, plain)
+    costs = np.maximum(cost, 1e-9), np.maximum(plain, 1e-9)
+    return Model(tuple(effects), fit, *costs, fit.values + moves, effective_samples(fit, fitter))
 
 
 def effective_samples(fit: Fit, fitter: Fitter) -> float:

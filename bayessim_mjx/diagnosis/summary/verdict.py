@@ -85,8 +85,9 @@ def remains(found: Findings) -> float:
     flex, base, model = found.flexible_winner, found.selection.base, found.model
     if flex is None or not flex.condition.significant:
         return 0.0
-    top = model.total - min(float(flex.condition.cost.sum()), model.total)
-    return statistics.share_of_gap(top, base.total, found.selection.noise * len(base.cost))
+    cost = float(model.plain.sum())  # as the force's is: of predictions, with nothing open
+    top = cost - min(float(flex.condition.cost.sum()), cost)
+    return statistics.share_of_gap(top, float(base.plain.sum()), found.selection.noise * len(base.cost))
 
 
 def beaten(found: Findings) -> bool:
@@ -97,9 +98,10 @@ def beaten(found: Findings) -> bool:
     tried, base, model = found.selection, found.flexible_base, found.model
     if base is None or not base.condition.significant:
         return False
-    better = model.total - float(base.condition.cost.sum())
-    share = statistics.share_of_gap(better, tried.base.total, tried.noise * len(tried.base.cost))
-    return better > LIMITS.beaten * model.total and share > LIMITS.relevant
+    cost = float(model.plain.sum())
+    better = cost - float(base.condition.cost.sum())
+    share = statistics.share_of_gap(better, float(tried.base.plain.sum()), tried.noise * len(tried.base.cost))
+    return better > LIMITS.beaten * cost and share > LIMITS.relevant
 
 
 def sensors_noise(found: Findings) -> Origin | None:

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 from scipy.optimize import lsq_linear
 
 from bayessim_mjx.diagnosis.fitting import quadratic
@@ -106,6 +107,36 @@ def test_held_out_costs_are_those_of_refitting_without_the_condition(monkeypatch
         np.testing.assert_allclose(moves[name], p, rtol=1e-6, atol=1e-9)
         own = [dense(r[w], A[w], B[w], x[w], spread, p)[0] for w in np.flatnonzero(group == name)]
         np.testing.assert_allclose(cost[group == name], own, rtol=1e-6)
+
+
+def test_predictions_with_uncertain_parameters_cost_what_their_innovations_do():
+    """-2 log N(r; A p + B dx, 1 + A H^-1 A' + B D^2 B') of all windows together, but for its determinant."""
+    r, A, B, x, spread = problem(3)
+    q, _ = quadratic.eliminate(r, A, B, 0 * x, spread)
+    rng = np.random.default_rng(4)
+    p, root, out = rng.normal(size=K), rng.normal(size=(K, K)), np.arange(W) >= 3
+    H, wide = root @ root.T + 0.1 * np.eye(K), np.full(K, 1e6)
+    cost = quadratic.predictive(q, out, np.ones(W), p, H, -wide, wide)
+    rows = np.concatenate([A[w] for w in np.flatnonzero(out)])
+    own = [np.eye(N) + B[w] @ np.diag(spread**2) @ B[w].T for w in np.flatnonzero(out)]
+    covariance = rows @ np.linalg.inv(H) @ rows.T + block_diag(*own)
+    error = r[out].ravel() - rows @ p
+    assert cost.shape == (3,) and cost.sum() == pytest.approx(error @ np.linalg.solve(covariance, error), rel=1e-8)
+    sure = quadratic.predictive(q, out, np.ones(W), p, 1e12 * np.eye(K), -wide, wide)
+    np.testing.assert_allclose(sure, q.at(p)[out], rtol=1e-6)
+
+
+def test_predictions_in_turn_cost_what_all_data_leave():
+    """The chain rule: what the first windows leave and the innovations of the others is what all leave together."""
+    r, A, B, x, spread = problem(9)
+    q, _ = quadratic.eliminate(r, A, B, x, spread)
+    out, wide = np.arange(W) >= 4, np.full(K, 1e6)
+    g, H = q.weighted(1.0 * ~out)
+    p = np.linalg.solve(H, g)
+    all_g, all_H = q.weighted(np.ones(W))
+    innovations = quadratic.predictive(q, out, np.ones(W), p, H, -wide, wide)
+    together = q.at(np.linalg.solve(all_H, all_g)).sum()
+    assert q.at(p)[~out].sum() + innovations.sum() == pytest.approx(together, rel=1e-9)
 
 
 def test_held_out_estimates_stay_within_their_bounds():

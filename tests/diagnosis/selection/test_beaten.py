@@ -17,11 +17,11 @@ def found(base: float, named: float, flexible: float, significant: bool = True):
         return level * NOISE * WINDOWS
 
     selection = SimpleNamespace(
-        base=SimpleNamespace(total=total(base), cost=np.full(WINDOWS, total(base) / WINDOWS)),
+        base=SimpleNamespace(plain=np.full(WINDOWS, total(base) / WINDOWS), cost=np.zeros(WINDOWS)),
         noise=NOISE,
     )
     condition = SimpleNamespace(significant=significant, cost=np.full(WINDOWS, total(flexible) / WINDOWS))
-    model = SimpleNamespace(total=total(named))
+    model = SimpleNamespace(plain=np.full(WINDOWS, total(named) / WINDOWS))
     return SimpleNamespace(selection=selection, model=model, flexible_base=SimpleNamespace(condition=condition))
 
 

@@ -67,6 +67,16 @@ def test_a_doubtful_effect_on_top_of_a_sure_one_leaves_the_sure_one_named():
     assert found.answer == labels(A) and not found.rivals  # what shows nothing is no rival
 
 
+def test_what_does_as_well_as_the_answer_stands_beside_it_where_the_best_has_an_effect_more():
+    """A further effect is not worth naming, but counts against what lacks it: the like of the answer is no worse."""
+    few, many = law("a", numbers=1), law("b", numbers=3)
+    errors = {(): 100.0, (many,): 1.25, (many, C): 1.0, (few,): 1.25}
+    found = decided(errors)
+    assert found.best == labels(many, C) and found.answer == labels(few)
+    assert [r.key for r in found.rivals] == [labels(many)]
+    assert decided(errors | {(few,): 1.6}).answer == labels(many)
+
+
 def test_the_standard_error_is_that_of_conditions_not_of_windows():
     """Windows of a condition err alike: gains in all conditions are evidence, the same gains within one are not."""
     mixed = np.where(np.arange(20) % 4 == 0, 5.0, 55.0)

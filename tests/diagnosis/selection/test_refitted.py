@@ -101,3 +101,14 @@ def test_a_condition_that_alone_tells_the_parameter_keeps_its_linear_steps():
     (new,) = heldout.refitted(fitter, [model])
     assert new.estimates[3] == model.estimates[3]
     assert new.estimates[:3, 0] == pytest.approx(model.fit.values[0], abs=0.01)
+
+
+def test_what_the_other_conditions_hardly_tell_is_not_held_against_a_model():
+    """Three quiet conditions tell the parameter to .16 and the fourth shows it: the model is right, and costs noise."""
+    fitter, model = fitted(Bent((0.5, 0.5, 0.5, 0.5), felt=(0.03, 0.03, 0.03, 0.08), bend=0.0))
+    assert fitter.told_alone(model.fit) == [False] * 4
+    last = GROUP == 3
+    off = model.estimates[3, 0] - model.fit.values[0]
+    assert model.plain[last].sum() > model.cost[last].sum()
+    fitted_alone = np.sum(model.fit.r[last] ** 2)
+    assert model.cost[last].sum() >= fitted_alone - 1e-6 and abs(off) > 0

@@ -40,7 +40,7 @@ def test_effects_are_added_until_the_sensors_noise_is_reached(rms, believed, goe
 def test_what_is_closed_is_counted_from_the_noise_not_from_the_best_model_tried():
     fitter = SimpleNamespace(size=50.0)
     base, best, lucky, half = (
-        Model((), SimpleNamespace(coordinates=()), np.full(8, 50.0 * t), np.zeros((8, 0)), 1e4) for t in (5, 1, 0.8, 3)
+        Model((), SimpleNamespace(coordinates=()), np.full(8, 50.0 * t), np.full(8, 50.0 * t), np.zeros((8, 0)), 1e4) for t in (5, 1, 0.8, 3)
     )
     pool = Pool(fitter, [], Settings(), Criteria(), None, base)
     assert pool.closure(best) == pool.closure(lucky) == 1.0 and pool.closure(base) == 0.0
@@ -52,7 +52,7 @@ def test_what_is_closed_is_counted_from_the_noise_not_from_the_best_model_tried(
 def test_where_nothing_is_wrong_only_a_few_single_effects_are_fitted_for_the_table(monkeypatch, level, fitted):
     """Of ten candidates seven promise something."""
     point = SimpleNamespace(A=np.zeros(0), coordinates=())
-    base = Model((), point, np.full(8, 50.0 * level), np.zeros((8, 0)), 1e4)
+    base = Model((), point, np.full(8, 50.0 * level), np.full(8, 50.0 * level), np.zeros((8, 0)), 1e4)
     contact = SimpleNamespace(dist=np.zeros(0))
     physics = SimpleNamespace(template=SimpleNamespace(_impl=SimpleNamespace(contact=contact)))
     fitter = SimpleNamespace(
