@@ -40,7 +40,8 @@ def test_effects_are_added_until_the_sensors_noise_is_reached(rms, believed, goe
 def test_what_is_closed_is_counted_from_the_noise_not_from_the_best_model_tried():
     fitter = SimpleNamespace(size=50.0)
     base, best, lucky, half = (
-        Model((), SimpleNamespace(coordinates=()), np.full(8, 50.0 * t), np.full(8, 50.0 * t), np.zeros((8, 0)), 1e4) for t in (5, 1, 0.8, 3)
+        Model((), SimpleNamespace(coordinates=()), np.full(8, 50.0 * t), np.full(8, 50.0 * t), np.zeros((8, 0)), 1e4)
+        for t in (5, 1, 0.8, 3)
     )
     pool = Pool(fitter, [], Settings(), Criteria(), None, base)
     assert pool.closure(best) == pool.closure(lucky) == 1.0 and pool.closure(base) == 0.0
