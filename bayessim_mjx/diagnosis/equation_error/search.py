@@ -40,6 +40,10 @@ class Criteria:
 
 CRITERIA = Criteria()
 ALONE = ("payload",)  # effects of bodies: a robot carries one load
+GAIN = "actuator_gain"
+# What drives have that models leave out or guess: where inertia, damping and friction are all larger than modelled,
+# one number of a gain takes their place, and one by one none of them does.
+DRIVES = ("coulomb_friction", "viscous_friction", "armature")
 
 
 Move = tuple[Term, ...]  # what is added in one step: a term, or one effect at all of its places
@@ -79,14 +83,42 @@ def search(sums: Sums, known: Sequence[Term], terms: Sequence[Term]) -> Found:
     """Forward selection with a look back; what is scaled or added twice is not tried.
 
     A step adds one term, or one effect at every joint with a number of its own at each, as real robots have friction
-    in all of them; each further term has to bring the threshold.
+    in all of them; each further term has to bring the threshold. Where a gain is found, what drives have that models
+    leave out (`DRIVES`) is tried in its place at all joints at once, and goes before it where it does as well.
     """
+    found = _forward(sums, known, terms, ())
+    if not any(p.term.effect == GAIN for p in found.proposals):
+        return found
+    others = [t for t in terms if t.effect != GAIN]
+    start = _drives(sums, known, others)
+    again = _forward(sums, known, others, start) if start else found
+    return again if again.density[1] > found.density[1] - CRITERIA.same else found
+
+
+def _drives(sums: Sums, known: Sequence[Term], terms: Sequence[Term]) -> tuple[Term, ...]:
+    """Friction and rotor inertia of every joint, as far as they come out above nothing together."""
+    own = [t for t in terms if t.effect in DRIVES and t.where != "all"]
+    while own:
+        now = fitting.fit(sums, [*known, *own])
+        if now.feasible:
+            break
+        lowest = min(own, key=lambda t: float(np.min((now.of(t) - t.low) / now.deviation(t))))
+        own.remove(lowest)
+    return tuple(own)
+
+
+def _forward(sums: Sums, known: Sequence[Term], terms: Sequence[Term], start: Sequence[Term]) -> Found:
+    """The selection, from a set of effects on; those of it that do not bring the threshold go first."""
     base = fitting.fit(sums, known)
     threshold = CRITERIA.nats + math.log(max(len(terms), 1))
-    chosen: list[tuple[Term, tuple[str, ...]]] = []
-    now, density = base, fitting.score(sums, known)
-    before = density
-    while len({t.effect for t, _ in chosen}) < CRITERIA.most:
+    chosen: list[tuple[Term, tuple[str, ...]]] = [(t, ()) for t in start]
+    before = fitting.score(sums, known)
+    density = fitting.score(sums, [*known, *start])
+    while len(fewer := _back(sums, known, chosen, density, threshold, spared=0)) < len(chosen):
+        chosen, density = fewer, fitting.score(sums, [*known, *(t for t, _ in fewer)])
+    now = fitting.fit(sums, [*known, *(t for t, _ in chosen)])
+    given = {t.effect for t in start}  # what drives have counts as one
+    while len({t.effect for t, _ in chosen} - given) + bool(given) < CRITERIA.most:
         own = [t for t, _ in chosen]
         tried = _tried(sums, [*known, *own], _moves(terms, own), now, threshold)
         if not tried:
@@ -149,10 +181,15 @@ def _apart(term: Term, chosen: Sequence[Term]) -> bool:
 
 
 def _back(
-    sums: Sums, known: Sequence[Term], chosen: list[tuple[Term, tuple[str, ...]]], density: Array, threshold: float
+    sums: Sums,
+    known: Sequence[Term],
+    chosen: list[tuple[Term, tuple[str, ...]]],
+    density: Array,
+    threshold: float,
+    spared: int = 1,
 ) -> list[tuple[Term, tuple[str, ...]]]:
-    """Without what a later effect made superfluous."""
-    for pair in chosen[:-1]:
+    """Without what a later effect made superfluous; spared: so many of the last stay."""
+    for pair in chosen[: len(chosen) - spared]:
         rest = [t for t, _ in chosen if t is not pair[0]]
         if density.sum() - fitting.score(sums, [*known, *rest]).sum() < threshold:
             return [p for p in chosen if p is not pair]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
@@ -23,9 +23,15 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Ranges:
-    """What is taken for possible."""
+    """What is taken for possible, and how well drives and mountings are known before anything is logged.
+
+    Torque constants and current loops to a fifth, zeros of joints and the upright of a base to three degrees (rules of
+    thumb): a gain of .4 or a zero that is 7 degrees off has to show more than rotor inertia that a model leaves out.
+    """
 
     gain: tuple[float, float] = (0.2, 3.0)
+    sure: float = 0.2  # standard deviation of a gain's inverse
+    zero: float = 0.05  # rad, standard deviation of a joint's zero and of a base's tilt
     share: float = 1.0  # of the load that dry friction may be
     tilt: float = 0.3  # rad
     late: float = 3.0  # periods: standard deviation of how late efforts are
@@ -90,31 +96,40 @@ def effects(model: mujoco.MjModel, layout: Layout, source: Sequence[str], carrie
         out.append(_wide("joint_spring", joint_of(model, v), spring, *bounds, _spring))
         if np.any(model.jnt_type == 3):
             zero = _everywhere(layout, layout.zero(v))
-            out.append(_fixed("joint_offset", joint_of(model, v), zero, read=_reader("offset", sign=-1.0)))
+            read = _reader("offset", sign=-1.0)
+            out.append(_fixed("joint_offset", joint_of(model, v), zero, sd=RANGES.zero, read=read))
     out += _on_actuators(model, layout, driven)
     tilt = np.stack([_everywhere(layout, c) for c in range(layout.tilt.start, layout.tilt.stop)], -1)
     if np.any(model.opt.gravity):
-        out.append(_wide("gravity_tilt", "world", tilt, -RANGES.tilt, RANGES.tilt, _reader("roll", "pitch")))
+        term = _wide("gravity_tilt", "world", tilt, -RANGES.tilt, RANGES.tilt, _reader("roll", "pitch"))
+        out.append(replace(term, sd=lambda c: np.full(len(c), RANGES.zero)))
     return [*out, *payloads(model, layout, carried)]
 
 
 def _on_actuators(model: mujoco.MjModel, layout: Layout, driven: Sequence[tuple[int, int]]) -> list[Term]:
     out, title = [], element_names(model, "actuator")
     for i, v in driven:
-        out.append(scale("actuator_gain", title[i], np.arange(layout.nv) == v))
+        out.append(scale("actuator_gain", title[i], np.arange(layout.nv) == v, RANGES.sure))
         gear = float(model.actuator_gear[i, 0]) or 1.0
         bias = _one(layout, v, layout.own("one"))
         out.append(_fixed("actuator_bias", title[i], bias, read=_reader("bias", sign=-1.0 / gear)))
     if len(driven) > 1:
-        out.append(scale("actuator_gain", "all", np.isin(np.arange(layout.nv), [v for _, v in driven])))
+        on = np.isin(np.arange(layout.nv), [v for _, v in driven])
+        out.append(scale("actuator_gain", "all", on, RANGES.sure))
     return out
 
 
-def scale(effect: str, where: str, on: NDArray[np.bool_]) -> Term:
-    """The effort that was logged times `gain` is what acts, so the logged one is the needed one over `gain`."""
+def scale(effect: str, where: str, on: NDArray[np.bool_], sd: float = np.inf) -> Term:
+    """The effort that was logged times `gain` is what acts, so the logged one is the needed one over `gain`.
+
+    Args:
+        sd: of 1 / gain about 1, as far as that is known beforehand.
+    """
     low, high = 1.0 / RANGES.gain[1], 1.0 / RANGES.gain[0]
     read: Callable[[Array], Mapping[str, float]] = lambda c: {"gain": 1.0 / float(c[0])}  # noqa: E731
-    return Term(effect, where, None, scaled=on, low=np.array([low]), high=np.array([high]), read=read)
+    believed = np.array([sd])
+    ends = {"low": np.array([low]), "high": np.array([high])}
+    return Term(effect, where, None, scaled=on, sd=lambda c: believed, read=read, **ends)
 
 
 def payloads(model: mujoco.MjModel, layout: Layout, carried: Array) -> list[Term]:

@@ -1,5 +1,6 @@
 """What logs of an arm from MuJoCo C say before any simulation: the load, the weak motor, what each contradicts."""
 
+import copy
 import dataclasses
 import sys
 from pathlib import Path
@@ -104,3 +105,19 @@ def test_nothing_to_look_at_is_no_error(loaded):
     still = dataclasses.replace(logs[0], qpos=0 * logs[0].qpos, qvel=0 * logs[0].qvel)
     assert look([still], model).joints == ()
     assert "no joint" in first_look.lines(look([still], model))[0]
+
+
+def test_a_drive_that_is_heavier_and_stiffer_than_modelled_is_no_weak_motor():
+    """Rotor inertia, damping and friction that a model leaves out look like a gain: one number for three."""
+    truth = rigs.Truth("coulomb_friction", "each", (0.6, 0.3))
+    model, logs = recorded(truth, system="two_link", effort=False, runs=6)
+    guessed = copy.copy(model)
+    guessed.dof_armature[:] = model.dof_armature / 4
+    guessed.dof_damping[:] = model.dof_damping / 3
+    seen = look(logs, guessed)
+    found = proposed(seen)
+    assert not any(label.startswith("actuator_gain") for label in found)
+    for v, joint in enumerate(("shoulder", "elbow")):
+        assert found[f"coulomb_friction@{joint}"]["level"] == pytest.approx(truth.values[v], rel=0.1)
+        added = 0.75 * model.dof_armature[v]
+        assert found[f"armature@{joint}"]["inertia"] == pytest.approx(added, rel=0.25)
