@@ -25,8 +25,8 @@ Array = NDArray[np.float64]
 class Ranges:
     """What is taken for possible, and how well drives and mountings are known before anything is logged.
 
-    Torque constants and current loops to a fifth, zeros of joints and the upright of a base to three degrees (rules of
-    thumb): a gain of .4 or a zero that is 7 degrees off has to show more than rotor inertia that a model leaves out.
+    Torque constants and current loops to a fifth, zeros of joints and the upright of a base to three degrees (rules
+    of thumb): a gain of .4 or a zero that is 7 degrees off has to show more than rotor inertia that a model leaves out.
     """
 
     gain: tuple[float, float] = (0.2, 3.0)
