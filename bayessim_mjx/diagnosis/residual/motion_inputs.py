@@ -203,7 +203,5 @@ def _control(log: Log, windows: Windows, index: int) -> Array:
     if law is None or index not in windows.log:
         return log.ctrl
     own = jax.tree.map(lambda x: x[int(np.argmax(windows.log == index))], law)
-    out = jax.vmap(lambda c, q, w: own(c, q, w, {}))(
-        jnp.asarray(log.ctrl), jnp.asarray(log.qpos), jnp.asarray(log.qvel)
-    )
+    out = jax.vmap(own)(jnp.asarray(log.ctrl), jnp.asarray(log.qpos), jnp.asarray(log.qvel))
     return np.asarray(out, np.float64)
