@@ -7,7 +7,6 @@ import numpy as np
 
 from bayessim_mjx.diagnosis.residual import motion_inputs
 from bayessim_mjx.physics import controllers
-
 from tests.diagnosis.recordings import ARM, record, sines
 
 KP, KD = np.array([20.0, 8.0]), np.array([1.0, 0.3])
