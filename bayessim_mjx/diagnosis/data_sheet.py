@@ -17,6 +17,9 @@ from bayessim_mjx.parameters.attributes import suggest
 
 Array = NDArray[np.float64]
 ACCURACY = 0.05  # standard deviation of what a data sheet says, as a share of it
+# What drives have that models leave out or guess: where inertia, damping and friction are all larger than modelled,
+# one number of a gain takes their place, and one by one none of them does.
+DRIVES = ("coulomb_friction", "viscous_friction", "armature")
 
 
 def accuracies(texts: Sequence[str], space: ParameterSpace, default: float | None) -> dict[str, float]:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bayessim_mjx.diagnosis.data_sheet import DRIVES
 from bayessim_mjx.diagnosis.equation_error import fit as fitting
 from bayessim_mjx.diagnosis.equation_error.fit import Fit, Term
 from bayessim_mjx.diagnosis.equation_error.sums import Sums
@@ -41,9 +42,6 @@ class Criteria:
 CRITERIA = Criteria()
 ALONE = ("payload",)  # effects of bodies: a robot carries one load
 GAIN = "actuator_gain"
-# What drives have that models leave out or guess: where inertia, damping and friction are all larger than modelled,
-# one number of a gain takes their place, and one by one none of them does.
-DRIVES = ("coulomb_friction", "viscous_friction", "armature")
 
 
 Move = tuple[Term, ...]  # what is added in one step: a term, or one effect at all of its places

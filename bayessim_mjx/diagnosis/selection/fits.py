@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from bayessim_mjx.diagnosis.data_sheet import DRIVES
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fitter import Fit
 from bayessim_mjx.diagnosis.selection import chance, dense, heldout
@@ -103,10 +104,15 @@ class Fits:
         return list(self._amounts)
 
     def proposed(self, most: int) -> list[Key]:
-        """The effects that were proposed before the search, the first laws of them, each from its own screening."""
+        """The effects that were proposed before the search, the first laws of them, each from its own screening.
+
+        What drives have that models leave out counts as one law.
+        """
         known = [c for c in self.pool.screened if c.candidate.label in self.pool.settings.together]
         effects = [label.split("@", 1)[0] for label in self.pool.settings.together]  # the best told first
-        first = list(dict.fromkeys(effects))[:most]
+        drives = [e for e in dict.fromkeys(effects) if e in DRIVES]
+        others = [e for e in dict.fromkeys(effects) if e not in DRIVES]
+        first = [*drives, *others[: most - 1]] if len(drives) > 1 else list(dict.fromkeys(effects))[:most]
         own = [s.candidate for s in known if s.candidate.effect in first]
         apart = all(beside(a, b) for i, a in enumerate(own) for b in own[:i])
         return [frozenset(c.label for c in own)] if len(own) > 1 and apart else []
