@@ -8,7 +8,7 @@ after how many trajectories another one no longer helps.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
@@ -23,6 +23,8 @@ FACTORS = np.geomspace(1.0, 12.0, 31)  # on standard deviations
 DOUBT = 0.3  # standard deviation of the factor's log before anything is seen: a few sets are off by chance
 LEVELS = (0.5, 0.8, 0.95)  # regions that are told
 SURE = 2.58  # standard errors that chance exceeds once in a hundred times
+TURNS = 3  # times that sets are drawn from the posterior, at most
+SAME = 1.05  # factor between widenings that is no difference: half of one between neighbours of FACTORS
 HALVES = 2  # the factor is fitted on one part of the sets and judged on the other, in turn
 
 
@@ -52,9 +54,15 @@ class Count:
 
 @dataclass(frozen=True)
 class Sets:
-    """The result for n = 1, 2, 4 ... trajectories."""
+    """The result for n = 1, 2, 4 ... trajectories.
+
+    Attributes:
+        counts: on sets at draws of the prior, or of what the round was simulated from.
+        near: on sets of the last of these numbers at draws of the posterior itself, in the order of `settled`.
+    """
 
     counts: tuple[Count, ...]
+    near: tuple[Count, ...] = ()
 
     @property
     def carried(self) -> int:
@@ -69,26 +77,29 @@ class Sets:
         """The row of so many trajectories, or of the next smaller number that was judged."""
         return max((c for c in self.counts if c.trajectories <= trajectories), key=lambda c: c.trajectories)
 
+    def widening(self, trajectories: int) -> float:
+        """Factor on standard deviations that a posterior of so many trajectories is used with."""
+        one = self.at(trajectories)
+        return max([one.widening, *(c.widening for c in self.near if c.trajectories == one.trajectories)])
+
     @property
     def off(self) -> list[tuple[float, float, float]]:
-        """(region, share of truths in it, its standard error) where the last count's regions hold too few, at 1 %."""
-        last, found = self.counts[-1], []
-        for level in LEVELS:
-            error = float(np.sqrt(level * (1 - level) / len(last.levels)))
-            if last.coverage(level) < level - SURE * error:
-                found.append((level, last.coverage(level), error))
-        return found
+        """(region, share of truths in it, its standard error) where the last count's regions hold too few, at 1 %.
+
+        Where its posterior lies, or else on average over the prior.
+        """
+        for one in (*self.near[-1:], self.counts[-1]):
+            errors = [float(np.sqrt(level * (1 - level) / len(one.levels))) for level in LEVELS]
+            told = [(level, one.coverage(level), error) for level, error in zip(LEVELS, errors, strict=True)]
+            if found := [row for row in told if row[1] < row[0] - SURE * row[2]]:
+                return found
+        return []
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers, for JSON."""
-        rows = [
-            {
-                "trajectories": c.trajectories, "widening": c.widening, "gain": c.gain, "se": c.error,
-                "coverage": {f"{level:g}": c.coverage(level) for level in LEVELS},
-            }
-            for c in self.counts
-        ]  # fmt: skip
-        return {"carried": self.carried, "sets": len(self.counts[-1].levels), "counts": rows}
+        rows = [_plain(c) for c in self.counts]
+        told = {"carried": self.carried, "sets": len(self.counts[-1].levels), "counts": rows}
+        return {**told, "near": [_plain(c) for c in self.near]}
 
     @property
     def told(self) -> str:
@@ -101,10 +112,19 @@ class Sets:
     def sentence(self) -> str:
         """One line for a person."""
         last = self.counts[-1]
-        told = f"with {last.trajectories} trajectories standard deviations are widened {last.widening:.2f} times"
+        widening = self.widening(last.trajectories)
+        told = f"with {last.trajectories} trajectories standard deviations are widened {widening:.2f} times"
+        if widening > last.widening:
+            told += f" ({last.widening:.2f} on average over the prior, more where the posterior lies)"
         if self.carried < last.trajectories:
             told += f"; the network carries {self.carried}, more do not sharpen the posterior"
         return told
+
+
+def _plain(c: Count) -> dict[str, Any]:
+    coverage = {f"{level:g}": c.coverage(level) for level in LEVELS}
+    numbers = {"trajectories": c.trajectories, "widening": c.widening, "gain": c.gain, "se": c.error}
+    return {**numbers, "coverage": coverage}
 
 
 def counts_to(trajectories: int) -> list[int]:
@@ -135,6 +155,46 @@ def judge(
         given = None if widened_by is None else widened_by(n)
         rows.append(_count(n, _stacked(products), np.asarray(thetas), given))
     return Sets(tuple(rows))
+
+
+def settled(
+    found: Sets,
+    product: Distribution,
+    drawn: Callable[[Distribution, int], tuple[Sequence[Sequence[Distribution]], np.ndarray] | None],
+    components: int,
+) -> Sets:
+    """`found`, with what sets at draws of the posterior ask for.
+
+    A network that is right on average over the prior may be wrong where this truth is, and alike in all trajectories
+    there: in a corner of the ranges it leans towards the middle. Sets are therefore also simulated at draws of the
+    product, so widened. Where they ask for more, the wider posterior reaches farther, and the next sets are at its
+    draws, until they ask for no more.
+
+    Args:
+        found: by `judge`.
+        product: of the real trajectories, as many as the last of found.counts, not widened.
+        drawn: (posterior, turn) -> factors and thetas of sets at its draws, as `judge` takes them; None: none.
+        components: of the products.
+    """
+    n = found.counts[-1].trajectories
+    for turn in range(TURNS):
+        widening = found.widening(n)
+        simulated = drawn(tempered(product, widening), turn)
+        if simulated is None:
+            break
+        one = last(*simulated, components)
+        found = replace(found, near=(*found.near, one))
+        if one.widening <= widening * SAME:
+            break
+    return found
+
+
+def last(
+    factors: Sequence[Sequence[Distribution]], thetas: np.ndarray, components: int, widening: float | None = None
+) -> Count:
+    """Products of all factors of each set alone; arguments as of `judge`, and the widening that they are used with."""
+    products = [combine(list(each), components) for each in factors]
+    return _count(len(factors[0]), _stacked(products), np.asarray(thetas), widening)
 
 
 def _stacked(items: Sequence[Distribution]) -> Distribution:
@@ -177,4 +237,4 @@ def _count(n: int, products: Distribution, thetas: np.ndarray, given: float | No
     return Count(n, float(FACTORS[best]), float(own.mean()), error, float(gains[0].mean()), levels)
 
 
-__all__ = ["Count", "Sets", "counts_to", "judge"]
+__all__ = ["Count", "Sets", "counts_to", "judge", "last", "settled"]

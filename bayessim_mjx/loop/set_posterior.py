@@ -105,7 +105,7 @@ def _learnt(
 
     thetas = dataclasses.replace(product, prior_weight=jnp.float32(0)).sample(k_theta, JUDGED)
     columns = [simulate(k, thetas) for k in keys]
-    widening = info.sets.at(len(real)).widening if info.sets is not None else 1.0
+    widening = info.sets.widening(len(real)) if info.sets is not None else 1.0
     each = zip(np.asarray(thetas), posteriors(columns), _products(loop, state, columns, widening), strict=True)
     rows = [(at, whole, other) for at, whole, other in each if other is not None and whole.sound]
     (own,) = posteriors([x[None] for x in real])

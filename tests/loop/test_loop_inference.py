@@ -120,14 +120,16 @@ def test_products_of_several_trajectories_are_judged_and_widened():
     state, info = infer(parts, state)
     assert [c.trajectories for c in info.sets.counts] == [1, 2, 4, 8]
     last = info.sets.at(8)
-    assert info.scores["sets/widening"] == last.widening >= 1
+    assert info.scores["sets/widening"] == info.sets.widening(8) >= last.widening >= 1
     for level in (0.5, 0.8, 0.95):
         assert info.scores[f"sets/coverage_{100 * level:.0f}"] == pytest.approx(level, abs=0.2)
     assert last.gain >= last.plain - 0.1
     assert float(state.domain.sd()[0]) > 0.9 * NOISE / 8**0.5  # never surer than the exact posterior
     again = loop.reexamine(parts, state, None, 1000)  # as the command `calibrate` asks for it
     assert [c.trajectories for c in again.sets.counts] == [1, 2, 4, 8]
-    assert [c.widening for c in again.sets.counts] == [c.widening for c in info.sets.counts]  # as the round used it
+    # as the round used it
+    assert [c.widening for c in again.sets.counts] == [info.sets.widening(c.trajectories) for c in info.sets.counts]
+    assert info.sets.near and again.sets.near[0].widening == info.sets.widening(8)  # there too
     assert len(again.sets.at(8).levels) == 128 and not again.sets.off
     assert not np.array_equal(again.sets.at(8).levels[:64], last.levels)  # on sets that the round did not see
     assert again.to_dict()["sets"]["sets"] == 128 and again.scalars["sets/carried"] == again.sets.carried
