@@ -8,7 +8,7 @@ after how many trajectories another one no longer helps.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -17,14 +17,13 @@ import numpy as np
 
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.inference.posterior import combine
-from bayessim_mjx.inference.temperature import tempered, widened
+from bayessim_mjx.inference.temperature import gain_at, tempered
 
 FACTORS = np.geomspace(1.0, 12.0, 31)  # on standard deviations
 DOUBT = 0.3  # standard deviation of the factor's log before anything is seen: a few sets are off by chance
+BEYOND = -30.0  # log mass of a Gaussian in the box below which its density there is rounding
 LEVELS = (0.5, 0.8, 0.95)  # regions that are told
 SURE = 2.58  # standard errors that chance exceeds once in a hundred times
-TURNS = 3  # times that sets are drawn from the posterior, at most
-SAME = 1.05  # factor between widenings that is no difference: half of one between neighbours of FACTORS
 HALVES = 2  # the factor is fitted on one part of the sets and judged on the other, in turn
 
 
@@ -58,11 +57,13 @@ class Sets:
 
     Attributes:
         counts: on sets at draws of the prior, or of what the round was simulated from.
-        near: on sets of the last of these numbers at draws of the posterior itself, in the order of `settled`.
+        near: on sets of the last of these numbers at draws of the posterior itself, one row a turn of `near.settled`.
+        move: [d] by which products there are moved, in the coordinates of their chart; None: not at all.
     """
 
     counts: tuple[Count, ...]
     near: tuple[Count, ...] = ()
+    move: np.ndarray | None = None
 
     @property
     def carried(self) -> int:
@@ -80,7 +81,13 @@ class Sets:
     def widening(self, trajectories: int) -> float:
         """Factor on standard deviations that a posterior of so many trajectories is used with."""
         one = self.at(trajectories)
-        return max([one.widening, *(c.widening for c in self.near if c.trajectories == one.trajectories)])
+        return max([one.widening, *(c.widening for c in self.near[-1:] if c.trajectories == one.trajectories)])
+
+    def used(self, product: Distribution, trajectories: int) -> Distribution:
+        """The posterior of so many trajectories as it is used, of their product: moved and widened."""
+        last = self.counts[-1].trajectories
+        here = moved(product, self.move) if self.at(trajectories).trajectories == last else product
+        return tempered(here, self.widening(trajectories))
 
     @property
     def off(self) -> list[tuple[float, float, float]]:
@@ -99,7 +106,8 @@ class Sets:
         """Plain numbers, for JSON."""
         rows = [_plain(c) for c in self.counts]
         told = {"carried": self.carried, "sets": len(self.counts[-1].levels), "counts": rows}
-        return {**told, "near": [_plain(c) for c in self.near]}
+        told |= {"near": [_plain(c) for c in self.near]}
+        return {**told, "move": None if self.move is None else [float(x) for x in self.move]}
 
     @property
     def told(self) -> str:
@@ -116,6 +124,8 @@ class Sets:
         told = f"with {last.trajectories} trajectories standard deviations are widened {widening:.2f} times"
         if widening > last.widening:
             told += f" ({last.widening:.2f} on average over the prior, more where the posterior lies)"
+        if self.move is not None:
+            told += "; where the posterior lies the network leans to one side, by which it is moved back"
         if self.carried < last.trajectories:
             told += f"; the network carries {self.carried}, more do not sharpen the posterior"
         return told
@@ -153,51 +163,19 @@ def judge(
     for n in counts_to(len(factors[0])):
         products = [used(combine(list(each[:n]), components)) for each in factors]
         given = None if widened_by is None else widened_by(n)
-        rows.append(_count(n, _stacked(products), np.asarray(thetas), given))
+        rows.append(counted(n, stacked(products), np.asarray(thetas), given))
     return Sets(tuple(rows))
 
 
-def settled(
-    found: Sets,
-    product: Distribution,
-    drawn: Callable[[Distribution, int], tuple[Sequence[Sequence[Distribution]], np.ndarray] | None],
-    components: int,
-) -> Sets:
-    """`found`, with what sets at draws of the posterior ask for.
-
-    A network that is right on average over the prior may be wrong where this truth is, and alike in all trajectories
-    there: in a corner of the ranges it leans towards the middle. Sets are therefore also simulated at draws of the
-    product, so widened. Where they ask for more, the wider posterior reaches farther, and the next sets are at its
-    draws, until they ask for no more.
-
-    Args:
-        found: by `judge`.
-        product: of the real trajectories, as many as the last of found.counts, not widened.
-        drawn: (posterior, turn) -> factors and thetas of sets at its draws, as `judge` takes them; None: none.
-        components: of the products.
-    """
-    n = found.counts[-1].trajectories
-    for turn in range(TURNS):
-        widening = found.widening(n)
-        simulated = drawn(tempered(product, widening), turn)
-        if simulated is None:
-            break
-        one = last(*simulated, components)
-        found = replace(found, near=(*found.near, one))
-        if one.widening <= widening * SAME:
-            break
-    return found
+def moved(q: Distribution, move: np.ndarray | None) -> Distribution:
+    """Every Gaussian moved by [d] in the coordinates of the chart; as it is where nothing would be left in the box."""
+    if move is None:
+        return q
+    there = Distribution.from_unit(q.space, q.logits, q.means + jnp.asarray(move), q.scales, q.prior_weight, q.chart)
+    return there if float(there.log_inside) > BEYOND else q
 
 
-def last(
-    factors: Sequence[Sequence[Distribution]], thetas: np.ndarray, components: int, widening: float | None = None
-) -> Count:
-    """Products of all factors of each set alone; arguments as of `judge`, and the widening that they are used with."""
-    products = [combine(list(each), components) for each in factors]
-    return _count(len(factors[0]), _stacked(products), np.asarray(thetas), widening)
-
-
-def _stacked(items: Sequence[Distribution]) -> Distribution:
+def stacked(items: Sequence[Distribution]) -> Distribution:
     return jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(x) for x in leaves]), *items)
 
 
@@ -206,7 +184,7 @@ def _gains(q: Distribution, thetas: jax.Array) -> jax.Array:
     """Log gain [factors, m] of batched posteriors at thetas [m, d], widened by each of FACTORS."""
 
     def at(factor: jax.Array) -> jax.Array:
-        return jax.vmap(lambda q, t: q.log_gain(t))(widened(q, factor), thetas)
+        return jax.vmap(gain_at, in_axes=(0, 0, None))(q, thetas, factor)
 
     return jax.lax.map(at, jnp.asarray(FACTORS, jnp.float32))
 
@@ -221,7 +199,8 @@ def _best(gains: np.ndarray) -> int:
     return int(np.argmax(gains.sum(1) - 0.5 * (np.log(FACTORS) / DOUBT) ** 2))
 
 
-def _count(n: int, products: Distribution, thetas: np.ndarray, given: float | None = None) -> Count:
+def counted(n: int, products: Distribution, thetas: np.ndarray, given: float | None = None) -> Count:
+    """How batched products of n did at thetas [m, d], widened by `given` or else by what the other half asks for."""
     at = jnp.asarray(thetas, jnp.float32)
     gains = np.nan_to_num(np.asarray(_gains(products, at), float), nan=-100.0, neginf=-100.0)
     part = np.arange(len(thetas)) % HALVES
@@ -237,4 +216,4 @@ def _count(n: int, products: Distribution, thetas: np.ndarray, given: float | No
     return Count(n, float(FACTORS[best]), float(own.mean()), error, float(gains[0].mean()), levels)
 
 
-__all__ = ["Count", "Sets", "counts_to", "judge", "last", "settled"]
+__all__ = ["Count", "Sets", "counted", "counts_to", "judge", "moved", "stacked"]

@@ -20,7 +20,6 @@ from bayessim_mjx import inference
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.inference import calibration, checks, misspecification, rounds
-from bayessim_mjx.inference.temperature import tempered
 from bayessim_mjx.keys import branch
 from bayessim_mjx.loop import ranges, refining, set_checks, set_posterior
 from bayessim_mjx.loop.factors import conditioned, kept, multiplied
@@ -194,7 +193,7 @@ def _posterior(loop: Loop, state: LoopState, info: RoundInfo) -> Distribution:
 
 
 def _widened(loop: Loop, state: LoopState, policy: Policy, posterior: Distribution, info: RoundInfo) -> Distribution:
-    """The product, wider by what simulated sets of as many trajectories ask for."""
+    """The product, moved and widened as simulated sets of as many trajectories ask for."""
     clock, known = time.perf_counter(), (int(state.round) + 1) * loop.settings.realTrajs
     found = None if loop.settings.temperature else set_checks.judge(loop, state, policy, known)
     found = set_checks.settled(loop, state, policy, known, posterior, found)
@@ -203,7 +202,7 @@ def _widened(loop: Loop, state: LoopState, policy: Policy, posterior: Distributi
     info.sets = found
     info.scores |= set_checks.scores(found, known)
     info.seconds["check"] = info.seconds.get("check", 0.0) + time.perf_counter() - clock
-    return tempered(posterior, found.widening(known))
+    return found.used(posterior, known)
 
 
 def _complaints(names: tuple[str, ...], fit: dict[str, Any], known_before: np.ndarray, by_replays: bool) -> list[str]:

@@ -9,9 +9,8 @@ import numpy as np
 from jax import Array
 
 from bayessim_mjx.distributions import Distribution
-from bayessim_mjx.inference import rounds, sets
+from bayessim_mjx.inference import near, rounds, sets
 from bayessim_mjx.inference.sets import Sets
-from bayessim_mjx.inference.temperature import tempered
 from bayessim_mjx.keys import branch
 from bayessim_mjx.loop.factors import conditioned, kept, multiplied
 from bayessim_mjx.loop.simulations import features, proposal_of
@@ -46,47 +45,46 @@ def settled(
     def drawn(posterior: Distribution, turn: int) -> tuple[list[list[Distribution]], np.ndarray] | None:
         return _simulated(loop, state, policy, known, jax.random.fold_in(key, turn), posterior)
 
-    return sets.settled(found, product, drawn, loop.settings.components)
+    return near.settled(found, product, drawn, loop.settings.components)
 
 
 def rejudge(loop: Loop, state: LoopState, policy: Policy, known: int, key: Array, more: int = 1) -> Sets | None:
-    """Products as the round used them, with its widening, judged on `more` times as many sets that it did not see.
+    """Products as the round used them, as it widened and moved them, judged on `more` times as many sets, unseen by it.
 
     `state` is that of the round, with its network, temperature, proposal and real trajectories' posteriors.
     """
-    product, used = multiplied(loop, state, known)[0], None
+    product, used, k = multiplied(loop, state, known)[0], None, loop.settings.components
     if not loop.settings.temperature:
         used = settled(loop, state, policy, known, product, judge(loop, state, policy, known))
-    factor = (lambda n: 1.0) if used is None else used.widening
-    around = None if used is None or not used.near else tempered(product, factor(known))
 
-    def again(first: int, near: Distribution | None) -> tuple[list[list[Distribution]], np.ndarray] | None:
-        lots = [_simulated(loop, state, policy, known, jax.random.fold_in(key, first + i), near) for i in range(more)]
+    def again(first: int, around: Distribution | None) -> tuple[list[list[Distribution]], np.ndarray] | None:
+        lots = [_simulated(loop, state, policy, known, jax.random.fold_in(key, first + i), around) for i in range(more)]
         good = [lot for lot in lots if lot is not None]
         return ([row for lot in good for row in lot[0]], np.concatenate([lot[1] for lot in good])) if good else None
 
     if (found := again(0, None)) is None:
         return None
-    judged = sets.judge(*found, loop.settings.components, widened_by=factor)
-    if around is None or (found := again(more, around)) is None:
+    judged = sets.judge(*found, k, widened_by=(lambda n: 1.0) if used is None else used.widening)
+    if used is None or not used.near or (found := again(more, used.used(product, known))) is None:
         return judged
-    return replace(judged, near=(sets.last(*found, loop.settings.components, factor(known)),))
+    row = near.count(*found, k, used.move, used.widening(known))
+    return replace(judged, near=(row,), move=used.move)
 
 
 def _simulated(
-    loop: Loop, state: LoopState, policy: Policy, known: int, key: Array, near: Distribution | None = None
+    loop: Loop, state: LoopState, policy: Policy, known: int, key: Array, around: Distribution | None = None
 ) -> tuple[list[list[Distribution]], np.ndarray] | None:
     """Sets of factors and the thetas [m, d] that they were simulated at; None where hardly any is a density.
 
-    near: what thetas are drawn from; None: what the round is simulated from.
+    around: what thetas are drawn from; None: what the round is simulated from.
     """
     b, source = loop.settings, loop.source
     if known < 2 or b.proposal == "division" or source is None:
         return None
     k_theta, *keys = jax.random.split(key, 1 + min(known, MOST))
     thetas = (
-        near.sample(k_theta, SETS)
-        if near is not None
+        around.sample(k_theta, SETS)
+        if around is not None
         else rounds.draw(k_theta, proposal_of(loop, state), b.proposal, SETS)
     )
     columns = []
@@ -105,6 +103,7 @@ def scores(found: Sets, known: int) -> dict[str, float]:
     """Numbers for curves, of the posterior of `known` trajectories."""
     one = found.at(known)
     told = {"widening": found.widening(known), "gain": one.gain, "carried": float(found.carried)}
+    told |= {"moved": float(found.move is not None)}
     told |= {f"coverage_{100 * level:.0f}": one.coverage(level) for level in sets.LEVELS}
     return {f"sets/{name}": float(value) for name, value in told.items()}
 

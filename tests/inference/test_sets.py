@@ -1,13 +1,11 @@
 """Products of several factors, judged on sets: what is exact stays as it is, what shares an error is widened."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.inference import sets
-from bayessim_mjx.inference.temperature import tempered
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 
 SPACE = ParameterSpace([Parameter(name, 0.0, -1.0, 1.0) for name in "ab"])
@@ -77,44 +75,3 @@ def test_a_truth_outside_of_a_product_does_not_spoil_the_mean():
     rows, thetas = made(0.0)
     found = sets.judge(rows, np.asarray(thetas) * 0 + 0.99, components=1)
     assert np.isfinite([c.gain for c in found.counts]).all() and jnp.isfinite(found.at(1).widening)
-
-
-CORNER, LEANS = 0.7, 1.5  # beyond it, the network's means are so many SD too low in the first parameter
-
-
-def leaning(thetas, seed):
-    """Factors of sets at `thetas` [m, 2], by a network that is exact but beyond CORNER."""
-    rng = np.random.default_rng(seed)
-    off = np.where(thetas[:, :1] > CORNER, [[-LEANS * SD, 0.0]], 0.0)
-    means = (thetas + off)[:, None] + SD * rng.normal(size=(len(thetas), COUNT, 2))
-    scale = np.eye(2)[None] * SD / 2
-    return [[Distribution.from_unit(SPACE, np.zeros(1), (m[None] + 1) / 2, scale) for m in each] for each in means]
-
-
-@pytest.mark.parametrize("truth", [0.95, -0.5])
-def test_sets_at_draws_of_the_posterior_widen_it_where_the_network_is_wrong(truth):
-    """In a corner that hardly any draw of the prior reaches, products are sqrt(8) LEANS = 4.2 of their SD too low."""
-    everywhere = np.random.default_rng(0).uniform(-1, 1, (MANY, 2))
-    found = sets.Sets((sets.last(leaning(everywhere, 1), everywhere, components=1),))
-    at = jnp.asarray([truth, 0.0])
-    mean = np.array([truth - LEANS * SD * (truth > CORNER), 0.0])
-    product = Distribution.from_unit(SPACE, np.zeros(1), (mean[None] + 1) / 2, np.eye(2)[None] * SD / 2 / COUNT**0.5)
-    level = lambda widening: float(tempered(product, widening).credible_level(at))  # noqa: E731
-
-    def drawn(posterior, turn):
-        thetas = np.asarray(posterior.sample(jax.random.PRNGKey(turn), MANY))
-        return leaning(thetas, 2 + turn), thetas
-
-    near = sets.settled(found, product, drawn, components=1)
-    first, used = found.at(8).widening, near.widening(8)
-    assert near.counts == found.counts
-    if truth > CORNER:
-        # each of the two parameters' mean square is 1, and one has 8 LEANS^2 more
-        assert used == pytest.approx(np.sqrt(1 + COUNT * LEANS**2 / 2), rel=0.25)
-        assert level(first) > 0.95 > 0.85 > level(used) and "where the posterior lies" in near.sentence()
-    else:
-        assert used == first and len(near.near) == 1 and near.near[0].widening < 1.3
-    again = sets.last(*drawn(tempered(product, used), 9), components=1, widening=used)
-    for region in (0.8, 0.95):  # sets that did not choose it
-        assert again.coverage(region) > region - 0.2
-    assert sets.settled(found, product, lambda posterior, turn: None, components=1) == found
