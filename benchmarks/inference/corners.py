@@ -1,12 +1,13 @@
 """Posteriors of several trajectories where the truth lies in a corner of the ranges, as an ant's hidden masses do.
 
     python benchmarks/inference/corners.py --problem linear --truths 24 --n 2 4 8
-    python benchmarks/inference/corners.py --problem Cartpole --truths 12 --n 2 4 bayessim.components=5
+    python benchmarks/inference/corners.py bayessim.components=5 --problem Cartpole --truths 12 --n 2 4
 
 Every parameter of a truth lies --beside of its range from one of its ends. `linear` has an exact posterior: --dim
 parameters, uniform in [-1, 1], each measured with noise of .5. A task's trajectories are under random commands. One
 JSON row for each number of trajectories: mean gain over the prior and shares of truths in the 50, 80 and 95 % regions
-of the product as it is, as wide as sets at draws of the prior ask for, and as sets at its own draws do.
+of the product as it is, as wide as sets at draws of the prior ask for (`prior`), and moved and as wide as sets at its
+own draws do (`here`). Without --middle, truths lie where hardly any draw of the prior does.
 """
 
 from __future__ import annotations
@@ -81,10 +82,74 @@ def summed(gains: list[float], levels: list[float]) -> dict[str, Any]:
     }  # fmt: skip
 
 
+@dataclass(frozen=True)
+class Fitted:
+    """A network of single trajectories, and how products of its posteriors are on average over the prior."""
+
+    study: Study
+    state: Any
+    components: int
+    everywhere: sets.Sets
+
+    def drawn(self, key: jax.Array, thetas: jax.Array, n: int) -> tuple[list[list[Distribution]], np.ndarray]:
+        """Factors of sets of n trajectories at thetas [m, d], and the thetas of those that have any."""
+        return drawn(self.study, self.state, key, thetas, n)
+
+
+def drawn(
+    study: Study, state: Any, key: jax.Array, thetas: jax.Array, n: int
+) -> tuple[list[list[Distribution]], np.ndarray]:
+    columns = [study.simulate(one, thetas) for one in jax.random.split(key, n)]
+    rows, good = factors_of(state, columns, study.share)
+    return rows, np.asarray(thetas)[good]
+
+
+def fitted(study: Study, components: int, simulations: int, most: int, seed: int) -> Fitted:
+    keys = jax.random.split(jax.random.PRNGKey(seed), 6)
+    prior = Distribution.prior(study.space)
+    thetas = prior.sample(keys[0], simulations)
+    x = study.simulate(keys[1], thetas)
+    state, info = fit(keys[3], init(keys[2], study.settings, study.space, x.shape[1]), thetas, x)
+    print(json.dumps({"held out": round(float(info.log_q), 3)}), flush=True)
+    found = sets.judge(*drawn(study, state, keys[5], prior.sample(keys[5], SETS), most), components)
+    return Fitted(study, state, components, found)
+
+
+def measured(one: Fitted, truths: jax.Array, n: int, key: jax.Array) -> dict[str, Any]:
+    """The row of n trajectories."""
+    k, study = one.components, one.study
+    found = replace(one.everywhere, counts=tuple(c for c in one.everywhere.counts if c.trajectories <= n))
+    columns = [study.simulate(each, truths) for each in jax.random.split(key, n)]
+    rows, good = factors_of(one.state, columns, study.share)
+    kinds: dict[str, tuple[list[float], list[float]]] = {}
+    settled, exact, clock = [], [], 0.0
+    for i, row in zip(good, rows, strict=True):
+        product, at, began = combine(row, k), truths[i], time.perf_counter()
+
+        def around(posterior: Distribution, turn: int, i: int = i) -> Any:
+            own = jax.random.fold_in(jax.random.fold_in(key, i), 10 * n + turn)
+            return one.drawn(own, posterior.sample(own, SETS), n)
+
+        settled.append(near.settled(found, product, around, k))
+        clock += time.perf_counter() - began
+        wide = tempered(product, found.widening(n))
+        for kind, q in {"as it is": product, "prior": wide, "here": settled[-1].used(product, n)}.items():
+            gains, levels = kinds.setdefault(kind, ([], []))
+            gains.append(max(float(q.log_gain(at)), -100.0))
+            levels.append(float(q.credible_level(at)))
+        if study.exact is not None:
+            exact.append(study.exact(np.stack([np.asarray(c[i]) for c in columns]), np.asarray(at)))
+    told = {"n": n, "truths": len(good), "exact": round(float(np.mean(exact)), 2) if exact else None}
+    told |= {"widening at the prior's draws": round(found.widening(n), 2)}
+    told |= {"widening here": round(float(np.median([s.widening(n) for s in settled])), 2)}
+    told |= {"turns": round(float(np.mean([len(s.near) for s in settled])), 1), "s": round(clock / len(good), 1)}
+    return told | {kind: summed(*each) for kind, each in kinds.items()}
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--problem", default="linear", help="linear, or a task")
-    parser.add_argument("--dim", type=int, default=10)
+    parser.add_argument("--dim", type=int, default=6, help="of linear")
     parser.add_argument("--simulations", type=int, default=10_000)
     parser.add_argument("--truths", type=int, default=24)
     parser.add_argument("--beside", type=float, default=0.02)
@@ -95,61 +160,18 @@ def main() -> None:
     args, more = parser.parse_known_args()
     if args.still:
         near.CHANCE = 0.0
-    plain = args.problem == "linear"
+    own = args.problem == "linear"
     fixed = ["bayessim.collectPolicy=policy_random", "bayessim.refine=off", *more]
-    settings = config.load("Pendulum" if plain else args.problem, overrides=fixed)
-    study = linear(args.dim, settings) if plain else task(args.problem, settings)
-    keys = jax.random.split(jax.random.PRNGKey(args.seed), 6)
-    thetas = Distribution.prior(study.space).sample(keys[0], args.simulations)
-    x = study.simulate(keys[1], thetas)
-    state, info = fit(keys[3], init(keys[2], study.settings, study.space, x.shape[1]), thetas, x)
-    print(json.dumps({"problem": args.problem, "held out": round(float(info.log_q), 3)}), flush=True)
-    k = settings.bayessim.components
-
-    def drawn(key: jax.Array, where: jax.Array, n: int) -> tuple[list[list[Distribution]], np.ndarray]:
-        columns = [study.simulate(one, where) for one in jax.random.split(key, n)]
-        rows, good = factors_of(state, columns, study.share)
-        return rows, np.asarray(where)[good]
-
-    ends = jax.random.bernoulli(keys[4], shape=(args.truths, len(study.space)))
+    settings = config.load("Pendulum" if own else args.problem, overrides=fixed)
+    study = linear(args.dim, settings) if own else task(args.problem, settings)
+    one = fitted(study, settings.bayessim.components, args.simulations, max(args.n), args.seed)
+    k_truth, k_set = jax.random.split(jax.random.PRNGKey(100 + args.seed))
+    ends = jax.random.bernoulli(k_truth, shape=(args.truths, len(study.space)))
     unit = jnp.where(ends, 1 - args.beside, args.beside)
-    unit = jax.random.uniform(keys[4], unit.shape) if args.middle else unit
+    unit = jax.random.uniform(k_truth, unit.shape) if args.middle else unit
     truths = jax.vmap(study.space.from_unit)(unit)
-    everywhere = sets.judge(*drawn(keys[5], Distribution.prior(study.space).sample(keys[5], SETS), max(args.n)), k)
     for n in args.n:
-        found = replace(everywhere, counts=tuple(c for c in everywhere.counts if c.trajectories <= n))
-        columns = [study.simulate(one, truths) for one in jax.random.split(keys[4], n)]
-        rows, good = factors_of(state, columns, study.share)
-        kinds: dict[str, tuple[list[float], list[float]]] = {}
-        factors, turns, seconds, exact = [], [], 0.0, []
-        for i, row in zip(good, rows, strict=True):
-            product, at = combine(row, k), truths[i]
-            clock = time.perf_counter()
-
-            def around(posterior: Distribution, turn: int, i: int = i, n: int = n) -> Any:
-                key = jax.random.fold_in(jax.random.fold_in(keys[5], i), 10 * n + turn)
-                return drawn(key, posterior.sample(key, SETS), n)
-
-            settled = near.settled(found, product, around, k)
-            seconds += time.perf_counter() - clock
-            factors.append(settled.widening(n))
-            turns.append(len(settled.near))
-            ways = {
-                "as it is": product,
-                "prior": tempered(product, found.widening(n)),
-                "here": settled.used(product, n),
-            }
-            for kind, q in ways.items():
-                gains, levels = kinds.setdefault(kind, ([], []))
-                gains.append(max(float(q.log_gain(at)), -100.0))
-                levels.append(float(q.credible_level(at)))
-            if study.exact is not None:
-                exact.append(study.exact(np.stack([np.asarray(c[i]) for c in columns]), np.asarray(at)))
-        row = {"n": n, "truths": len(good), "exact": round(float(np.mean(exact)), 2) if exact else None}
-        row |= {"widening at the prior's draws": round(found.widening(n), 2)}
-        row |= {"widening here": round(float(np.median(factors)), 2), "turns": round(float(np.mean(turns)), 1)}
-        row |= {"s": round(seconds / len(good), 1)}
-        print(json.dumps(row | {kind: summed(*each) for kind, each in kinds.items()}), flush=True)
+        print(json.dumps({"problem": args.problem, **measured(one, truths, n, k_set)}), flush=True)
 
 
 if __name__ == "__main__":
