@@ -19,8 +19,7 @@ from scipy.stats import f
 
 from bayessim_mjx.distributions import Distribution, box
 from bayessim_mjx.distributions.charts import EDGE, to_chart
-from bayessim_mjx.inference.posterior import combine
-from bayessim_mjx.inference.sets import Count, Sets, counted, moved, stacked
+from bayessim_mjx.inference.sets import Count, Sets, counted, moved, multiplied, stacked
 from bayessim_mjx.inference.temperature import FEW
 
 TURNS = 4  # times that sets are drawn from the posterior, at most
@@ -65,7 +64,7 @@ def judged(
 
     The change, against the move `before`, is a mean over the axes, squared, in standard deviations of the errors.
     """
-    products = stacked([combine(list(each), components) for each in factors])
+    products = stacked(multiplied(factors, components, [len(factors[0])])[0])
     off = np.asarray(_errors(products, jnp.asarray(thetas, jnp.float32)), float)
     off = np.clip(off, -FAR[products.chart], FAR[products.chart])
     move, cov = mean_error(off)
@@ -78,7 +77,7 @@ def count(
     factors: Factors, thetas: np.ndarray, components: int, move: np.ndarray | None, widening: float | None = None
 ) -> Count:
     """How products of all factors of each set do with this move [d] and this widening (None: the best)."""
-    products = stacked([combine(list(each), components) for each in factors])
+    products = stacked(multiplied(factors, components, [len(factors[0])])[0])
     return counted(len(factors[0]), shifted(products, move), thetas, widening)
 
 

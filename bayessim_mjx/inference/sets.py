@@ -159,12 +159,24 @@ def judge(
         used: what else is done to a product before it is used.
         widened_by: the factor that products of n are used with; None: the best is found, by sets it is not judged on.
     """
-    rows = []
-    for n in counts_to(len(factors[0])):
-        products = [used(combine(list(each[:n]), components)) for each in factors]
+    rows, counts = [], counts_to(len(factors[0]))
+    for n, products in zip(counts, multiplied(factors, components, counts), strict=True):
         given = None if widened_by is None else widened_by(n)
-        rows.append(counted(n, stacked(products), np.asarray(thetas), given))
+        rows.append(counted(n, stacked([used(q) for q in products]), np.asarray(thetas), given))
     return Sets(tuple(rows))
+
+
+def multiplied(
+    factors: Sequence[Sequence[Distribution]], components: int, counts: Sequence[int]
+) -> list[list[Distribution]]:
+    """For each n of `counts`, which rise, the products of the first n factors of each set."""
+
+    def one(each: Sequence[Distribution]) -> list[Distribution]:
+        alone = [combine([each[0]], components)] if counts[0] == 1 else []
+        return alone + (each[0].products(*each[1:], components=components, counts=more) if more else [])
+
+    more = [n for n in counts if n > 1]
+    return [list(column) for column in zip(*map(one, factors), strict=True)]
 
 
 def moved(q: Distribution, move: np.ndarray | None) -> Distribution:
@@ -216,4 +228,4 @@ def counted(n: int, products: Distribution, thetas: np.ndarray, given: float | N
     return Count(n, float(FACTORS[best]), float(own.mean()), error, float(gains[0].mean()), levels)
 
 
-__all__ = ["Count", "Sets", "counted", "counts_to", "judge", "moved", "stacked"]
+__all__ = ["Count", "Sets", "counted", "counts_to", "judge", "moved", "multiplied", "stacked"]
