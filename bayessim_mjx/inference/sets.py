@@ -21,7 +21,7 @@ from bayessim_mjx.inference.temperature import gain_at, tempered
 
 FACTORS = np.geomspace(1.0, 12.0, 31)  # on standard deviations
 DOUBT = 0.3  # standard deviation of the factor's log before anything is seen: a few sets are off by chance
-BEYOND = -30.0  # log mass of a Gaussian in the box below which its density there is rounding
+BEYOND = -30.0  # log mass in the box that no move may take: what is left is rounding
 LEVELS = (0.5, 0.8, 0.95)  # regions that are told
 SURE = 2.58  # standard errors that chance exceeds once in a hundred times
 HALVES = 2  # the factor is fitted on one part of the sets and judged on the other, in turn
@@ -184,7 +184,7 @@ def moved(q: Distribution, move: np.ndarray | None) -> Distribution:
     if move is None:
         return q
     there = Distribution.from_unit(q.space, q.logits, q.means + jnp.asarray(move), q.scales, q.prior_weight, q.chart)
-    return there if float(there.log_inside) > BEYOND else q
+    return there if float(there.log_inside - q.log_inside) > BEYOND else q
 
 
 def stacked(items: Sequence[Distribution]) -> Distribution:

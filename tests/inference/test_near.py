@@ -68,3 +68,12 @@ def test_nothing_is_moved_out_of_the_box():
     q = Distribution.from_unit(SPACE, np.zeros(1), np.full((1, 2), 0.5), np.eye(2)[None] * 0.05)
     assert sets.moved(q, np.array([5.0, 0.0])) is q
     np.testing.assert_allclose(sets.moved(q, np.array([0.2, 0.0])).means, [[0.7, 0.5]], rtol=1e-6)
+
+
+def test_parameters_that_are_not_identified_keep_no_other_from_being_moved():
+    """Their Gaussians, 20 ranges wide, have all but no mass in the box: log mass -47 for twelve of them."""
+    space = ParameterSpace([Parameter(f"t{i}", 0.0, -1.0, 1.0) for i in range(13)])
+    scale = np.diag([0.05] + [20.0] * 12)[None]
+    q = Distribution.from_unit(space, np.zeros(1), np.full((1, 13), 0.5), scale)
+    assert float(q.log_inside) < 1.3 * sets.BEYOND
+    np.testing.assert_allclose(sets.moved(q, np.array([0.2] + [0.0] * 12)).means[0, :2], [0.7, 0.5], rtol=1e-6)
