@@ -22,9 +22,9 @@ from bayessim_mjx.distributions.charts import EDGE, to_chart
 from bayessim_mjx.inference.sets import Count, Sets, counted, moved, multiplied, stacked
 from bayessim_mjx.inference.temperature import FEW
 
-TURNS = 4  # times that sets are drawn from the posterior, at most
+TURNS = 6  # times that sets are drawn from the posterior, at most
 SAME = 1.05  # factor between widenings that is no difference: half of one between neighbours of sets.FACTORS
-STILL = 0.1  # mean squared move, in standard deviations of the errors, that is none
+STILL = 0.25  # squared change of a move, in standard deviations of the errors, that is none, beyond what chance makes
 CHANCE = 0.01  # of a move where products are off by chance alone
 FAR = {"plain": 1.0, "probit": 4.0}  # by which one product may count as off: a wild one decides nothing
 
@@ -62,14 +62,15 @@ def judged(
 ) -> tuple[Count, np.ndarray | None, float]:
     """Products of all factors of each set, moved and widened as they ask for: how they did, the move [d], its change.
 
-    The change, against the move `before`, is a mean over the axes, squared, in standard deviations of the errors.
+    The change, against the move `before`, is squared, in standard deviations of the errors, less what chance makes of
+    it where both are means of as many errors.
     """
     products = stacked(multiplied(factors, components, [len(factors[0])])[0])
     off = np.asarray(_errors(products, jnp.asarray(thetas, jnp.float32)), float)
     off = np.clip(off, -FAR[products.chart], FAR[products.chart])
     move, cov = mean_error(off)
     change = (0.0 if move is None else move) - (0.0 if before is None else before) + np.zeros(off.shape[1])
-    step = float(change @ np.linalg.solve(cov, change)) / len(change)
+    step = float(change @ np.linalg.solve(cov, change)) - 2 * len(change) / len(off)
     return counted(len(factors[0]), shifted(products, move), thetas), move, step
 
 
