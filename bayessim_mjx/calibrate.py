@@ -105,9 +105,10 @@ def show(console: Any, found: Any) -> None:
 def set_rows(sets: Any) -> list[list[str]]:
     """The table of inference.sets.Sets: each number of trajectories, and the share of truths in its regions."""
     rows = []
-    for c in sets.counts:
+    for near, c in [(False, c) for c in sets.counts] + [(True, c) for c in sets.near]:
         shares = [percent_estimate(c.coverage(a), (a * (1 - a) / len(c.levels)) ** 0.5) for a in LEVELS]
-        rows.append([str(c.trajectories), f"{c.widening:.2f} x", estimate(c.gain, c.error), *shares])
+        where = f"{c.trajectories}, where the posterior lies" if near else str(c.trajectories)
+        rows.append([where, f"{c.widening:.2f} x", estimate(c.gain, c.error), *shares])
     return rows
 
 

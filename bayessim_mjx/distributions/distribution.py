@@ -188,14 +188,23 @@ class Distribution:
         Logit distributions, whose prior is no Gaussian, are carried over to the probit chart first (see `rechart`).
         ValueError where one of them is no density (see `sound`).
         """
+        return self.products(*others, components=components, counts=(1 + len(others),))[0]
+
+    def products(
+        self, *others: Distribution, components: int | None = None, counts: Sequence[int]
+    ) -> list[Distribution]:
+        """`product` of the first n of this one and the others, for each n of `counts`, which rise."""
         k = components or self.components
         chart = "probit" if self.chart == "logit" else self.chart
-        result = convert.to_mixture(self.rechart(chart))
-        for other in others:
-            convert.check_same_space(self.space, other.space)
-            factor = convert.to_mixture(other.rechart(chart))
-            result = algebra.reduce(algebra.product(result, factor), max(4 * k, 32))
-        return self._of(self.space, algebra.reduce(result, k), k, chart)
+        result, found = convert.to_mixture(self.rechart(chart)), []
+        for n, other in enumerate((None, *others), 1):
+            if other is not None:
+                convert.check_same_space(self.space, other.space)
+                factor = convert.to_mixture(other.rechart(chart))
+                result = algebra.reduce(algebra.product(result, factor), max(4 * k, 32))
+            if n in counts:
+                found.append(self._of(self.space, algebra.reduce(result, k), k, chart))
+        return found
 
     def divide(self, proposal: Distribution) -> tuple[Distribution, float]:
         """self * prior / proposal, the proposal being one Gaussian; and the share of weight that had to be left out.

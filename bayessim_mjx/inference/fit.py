@@ -188,6 +188,9 @@ def _info(state: FitState, data: Data, gain: Array, curves: Array, told: dict[st
 
 def _bases(state: FitState, data: Data) -> Array:
     """The matrices [M, D, D] that a first fit chooses from; later ones keep its choice."""
-    x = data.x[: len(data.train)]
-    found = whitening.candidates(x, data.train, whitening.count(state.settings, x.shape[1]))
+    x, noise, tried = data.x[: len(data.train)], None, whitening.count(state.settings, data.x.shape[1])
+    if data.own is not None and tried > 1:  # rows measured at least twice
+        again = data.x[len(x) :].reshape(data.draws - 1, -1, x.shape[1])[0][data.own]
+        noise = whitening.noise_of(x, again, data.train & (data.own >= 0))
+    found = whitening.candidates(x, data.train, tried, noise)
     return found if state.basis is None else jnp.where(state.fits == 0, found, state.basis[None])

@@ -17,10 +17,11 @@ import numpy as np
 
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.inference.posterior import combine
-from bayessim_mjx.inference.temperature import tempered, widened
+from bayessim_mjx.inference.temperature import gain_at, tempered
 
 FACTORS = np.geomspace(1.0, 12.0, 31)  # on standard deviations
 DOUBT = 0.3  # standard deviation of the factor's log before anything is seen: a few sets are off by chance
+BEYOND = -30.0  # log mass in the box that no move may take: what is left is rounding
 LEVELS = (0.5, 0.8, 0.95)  # regions that are told
 SURE = 2.58  # standard errors that chance exceeds once in a hundred times
 HALVES = 2  # the factor is fitted on one part of the sets and judged on the other, in turn
@@ -52,9 +53,17 @@ class Count:
 
 @dataclass(frozen=True)
 class Sets:
-    """The result for n = 1, 2, 4 ... trajectories."""
+    """The result for n = 1, 2, 4 ... trajectories.
+
+    Attributes:
+        counts: on sets at draws of the prior, or of what the round was simulated from.
+        near: on sets of the last of these numbers at draws of the posterior itself, one row a turn of `near.settled`.
+        move: [d] by which products there are moved, in the coordinates of their chart; None: not at all.
+    """
 
     counts: tuple[Count, ...]
+    near: tuple[Count, ...] = ()
+    move: np.ndarray | None = None
 
     @property
     def carried(self) -> int:
@@ -69,26 +78,36 @@ class Sets:
         """The row of so many trajectories, or of the next smaller number that was judged."""
         return max((c for c in self.counts if c.trajectories <= trajectories), key=lambda c: c.trajectories)
 
+    def widening(self, trajectories: int) -> float:
+        """Factor on standard deviations that a posterior of so many trajectories is used with."""
+        one = self.at(trajectories)
+        return max([one.widening, *(c.widening for c in self.near[-1:] if c.trajectories == one.trajectories)])
+
+    def used(self, product: Distribution, trajectories: int) -> Distribution:
+        """The posterior of so many trajectories as it is used, of their product: moved and widened."""
+        last = self.counts[-1].trajectories
+        here = moved(product, self.move) if self.at(trajectories).trajectories == last else product
+        return tempered(here, self.widening(trajectories))
+
     @property
     def off(self) -> list[tuple[float, float, float]]:
-        """(region, share of truths in it, its standard error) where the last count's regions hold too few, at 1 %."""
-        last, found = self.counts[-1], []
-        for level in LEVELS:
-            error = float(np.sqrt(level * (1 - level) / len(last.levels)))
-            if last.coverage(level) < level - SURE * error:
-                found.append((level, last.coverage(level), error))
-        return found
+        """(region, share of truths in it, its standard error) where the last count's regions hold too few, at 1 %.
+
+        Where its posterior lies, or else on average over the prior.
+        """
+        for one in (*self.near[-1:], self.counts[-1]):
+            errors = [float(np.sqrt(level * (1 - level) / len(one.levels))) for level in LEVELS]
+            told = [(level, one.coverage(level), error) for level, error in zip(LEVELS, errors, strict=True)]
+            if found := [row for row in told if row[1] < row[0] - SURE * row[2]]:
+                return found
+        return []
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers, for JSON."""
-        rows = [
-            {
-                "trajectories": c.trajectories, "widening": c.widening, "gain": c.gain, "se": c.error,
-                "coverage": {f"{level:g}": c.coverage(level) for level in LEVELS},
-            }
-            for c in self.counts
-        ]  # fmt: skip
-        return {"carried": self.carried, "sets": len(self.counts[-1].levels), "counts": rows}
+        rows = [_plain(c) for c in self.counts]
+        told = {"carried": self.carried, "sets": len(self.counts[-1].levels), "counts": rows}
+        told |= {"near": [_plain(c) for c in self.near]}
+        return {**told, "move": None if self.move is None else [float(x) for x in self.move]}
 
     @property
     def told(self) -> str:
@@ -101,10 +120,21 @@ class Sets:
     def sentence(self) -> str:
         """One line for a person."""
         last = self.counts[-1]
-        told = f"with {last.trajectories} trajectories standard deviations are widened {last.widening:.2f} times"
+        widening = self.widening(last.trajectories)
+        told = f"with {last.trajectories} trajectories standard deviations are widened {widening:.2f} times"
+        if widening > last.widening:
+            told += f" ({last.widening:.2f} on average over the prior, more where the posterior lies)"
+        if self.move is not None:
+            told += "; where the posterior lies the network leans to one side, by which it is moved back"
         if self.carried < last.trajectories:
             told += f"; the network carries {self.carried}, more do not sharpen the posterior"
         return told
+
+
+def _plain(c: Count) -> dict[str, Any]:
+    coverage = {f"{level:g}": c.coverage(level) for level in LEVELS}
+    numbers = {"trajectories": c.trajectories, "widening": c.widening, "gain": c.gain, "se": c.error}
+    return {**numbers, "coverage": coverage}
 
 
 def counts_to(trajectories: int) -> list[int]:
@@ -129,15 +159,35 @@ def judge(
         used: what else is done to a product before it is used.
         widened_by: the factor that products of n are used with; None: the best is found, by sets it is not judged on.
     """
-    rows = []
-    for n in counts_to(len(factors[0])):
-        products = [used(combine(list(each[:n]), components)) for each in factors]
+    rows, counts = [], counts_to(len(factors[0]))
+    for n, products in zip(counts, multiplied(factors, components, counts), strict=True):
         given = None if widened_by is None else widened_by(n)
-        rows.append(_count(n, _stacked(products), np.asarray(thetas), given))
+        rows.append(counted(n, stacked([used(q) for q in products]), np.asarray(thetas), given))
     return Sets(tuple(rows))
 
 
-def _stacked(items: Sequence[Distribution]) -> Distribution:
+def multiplied(
+    factors: Sequence[Sequence[Distribution]], components: int, counts: Sequence[int]
+) -> list[list[Distribution]]:
+    """For each n of `counts`, which rise, the products of the first n factors of each set."""
+
+    def one(each: Sequence[Distribution]) -> list[Distribution]:
+        alone = [combine([each[0]], components)] if counts[0] == 1 else []
+        return alone + (each[0].products(*each[1:], components=components, counts=more) if more else [])
+
+    more = [n for n in counts if n > 1]
+    return [list(column) for column in zip(*map(one, factors), strict=True)]
+
+
+def moved(q: Distribution, move: np.ndarray | None) -> Distribution:
+    """Every Gaussian moved by [d] in the coordinates of the chart; as it is where nothing would be left in the box."""
+    if move is None:
+        return q
+    there = Distribution.from_unit(q.space, q.logits, q.means + jnp.asarray(move), q.scales, q.prior_weight, q.chart)
+    return there if float(there.log_inside - q.log_inside) > BEYOND else q
+
+
+def stacked(items: Sequence[Distribution]) -> Distribution:
     return jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(x) for x in leaves]), *items)
 
 
@@ -146,7 +196,7 @@ def _gains(q: Distribution, thetas: jax.Array) -> jax.Array:
     """Log gain [factors, m] of batched posteriors at thetas [m, d], widened by each of FACTORS."""
 
     def at(factor: jax.Array) -> jax.Array:
-        return jax.vmap(lambda q, t: q.log_gain(t))(widened(q, factor), thetas)
+        return jax.vmap(gain_at, in_axes=(0, 0, None))(q, thetas, factor)
 
     return jax.lax.map(at, jnp.asarray(FACTORS, jnp.float32))
 
@@ -161,7 +211,8 @@ def _best(gains: np.ndarray) -> int:
     return int(np.argmax(gains.sum(1) - 0.5 * (np.log(FACTORS) / DOUBT) ** 2))
 
 
-def _count(n: int, products: Distribution, thetas: np.ndarray, given: float | None = None) -> Count:
+def counted(n: int, products: Distribution, thetas: np.ndarray, given: float | None = None) -> Count:
+    """How batched products of n did at thetas [m, d], widened by `given` or else by what the other half asks for."""
     at = jnp.asarray(thetas, jnp.float32)
     gains = np.nan_to_num(np.asarray(_gains(products, at), float), nan=-100.0, neginf=-100.0)
     part = np.arange(len(thetas)) % HALVES
@@ -177,4 +228,4 @@ def _count(n: int, products: Distribution, thetas: np.ndarray, given: float | No
     return Count(n, float(FACTORS[best]), float(own.mean()), error, float(gains[0].mean()), levels)
 
 
-__all__ = ["Count", "Sets", "counts_to", "judge"]
+__all__ = ["Count", "Sets", "counted", "counts_to", "judge", "moved", "multiplied", "stacked"]

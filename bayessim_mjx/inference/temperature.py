@@ -14,6 +14,7 @@ from bayessim_mjx.distributions import Distribution, box, charts
 from bayessim_mjx.linalg import inverse_lower, lower_factor, product
 
 TEMPERATURES = np.geomspace(1.0, 4.0, 15).astype(np.float32)
+FEW = 64  # points behind the mass of a Gaussian in the box; Distribution.from_unit takes 512
 
 
 def tempered(posterior: Distribution, factor: float | Array) -> Distribution:
@@ -49,17 +50,18 @@ def temperature(posteriors: Distribution, thetas: Array, weights: ArrayLike | No
     return float(TEMPERATURES[int(np.argmax(np.asarray(_scores(posteriors, thetas, weights))))])
 
 
+def gain_at(q: Distribution, theta: Array, factor: Array) -> Array:
+    """log_gain of `tempered(q, factor)` at theta [d], -> []; its mass in the box by FEW points: for many weighings."""
+    means, scales = _spread(q, factor)
+    masses = box.log_masses(means, scales, FEW) if q.chart == "plain" else jnp.zeros_like(q.logits)
+    inside = jax.nn.logsumexp(jax.nn.log_softmax(q.logits) + masses)
+    return replace(q, means=means, scales=scales, log_inside=inside).log_gain(theta)
+
+
 @jax.jit
 def _scores(posteriors: Distribution, thetas: Array, weights: Array) -> Array:
-    def one(q: Distribution, theta: Array, factor: Array) -> Array:
-        means, scales = _spread(q, factor)
-        # fewer points than Distribution.from_unit takes: there are many to weigh
-        masses = box.log_masses(means, scales, 64) if q.chart == "plain" else jnp.zeros_like(q.logits)
-        inside = jax.nn.logsumexp(jax.nn.log_softmax(q.logits) + masses)
-        return replace(q, means=means, scales=scales, log_inside=inside).log_gain(theta)
-
     def at(factor: Array) -> Array:
-        gain = jax.vmap(one, in_axes=(0, 0, None))(posteriors, thetas, factor)
+        gain = jax.vmap(gain_at, in_axes=(0, 0, None))(posteriors, thetas, factor)
         return jnp.mean(jnp.where(jnp.isfinite(gain), gain, 0.0) * weights)
 
     return jax.lax.map(at, jnp.asarray(TEMPERATURES))

@@ -20,10 +20,9 @@ from bayessim_mjx import inference
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.inference import calibration, checks, misspecification, rounds
-from bayessim_mjx.inference.temperature import tempered
 from bayessim_mjx.keys import branch
 from bayessim_mjx.loop import ranges, refining, set_checks, set_posterior
-from bayessim_mjx.loop.factors import conditioned, kept
+from bayessim_mjx.loop.factors import conditioned, kept, multiplied
 from bayessim_mjx.loop.inference_state import new_network
 from bayessim_mjx.loop.simulations import at, noise_draws, proposal_of, simulated
 from bayessim_mjx.loop.state import Loop, LoopState, RoundInfo, slot_of, space_of
@@ -187,28 +186,23 @@ def _factors(loop: Loop, state: LoopState, info: RoundInfo) -> Distribution:
 
 def _posterior(loop: Loop, state: LoopState, info: RoundInfo) -> Distribution:
     """The product of the factors of all real trajectories so far."""
-    b, known = loop.settings, (int(state.round) + 1) * loop.settings.realTrajs
-    rows = jax.tree.map(
-        np.asarray, state.real_posteriors
-    ).split()  # on the host: an index on the device compiles each time
-    usable = [row for row in rows[:known] if row.sound]
-    if len(usable) < known:
-        info.warnings.append(f"{known - len(usable)} real trajectories left out: their posteriors are no densities")
-    if not usable:
-        return Distribution.prior(space_of(loop, state), b.components, loop.chart)
-    return inference.combine(usable, b.components).rechart(loop.chart)
+    posterior, lost = multiplied(loop, state, (int(state.round) + 1) * loop.settings.realTrajs)
+    if lost:
+        info.warnings.append(f"{lost} real trajectories left out: their posteriors are no densities")
+    return posterior
 
 
 def _widened(loop: Loop, state: LoopState, policy: Policy, posterior: Distribution, info: RoundInfo) -> Distribution:
-    """The product, wider by what simulated sets of as many trajectories ask for."""
+    """The product, moved and widened as simulated sets of as many trajectories ask for."""
     clock, known = time.perf_counter(), (int(state.round) + 1) * loop.settings.realTrajs
     found = None if loop.settings.temperature else set_checks.judge(loop, state, policy, known)
+    found = set_checks.settled(loop, state, policy, known, posterior, found)
     if found is None:
         return posterior
     info.sets = found
     info.scores |= set_checks.scores(found, known)
     info.seconds["check"] = info.seconds.get("check", 0.0) + time.perf_counter() - clock
-    return tempered(posterior, found.at(known).widening)
+    return found.used(posterior, known)
 
 
 def _complaints(names: tuple[str, ...], fit: dict[str, Any], known_before: np.ndarray, by_replays: bool) -> list[str]:

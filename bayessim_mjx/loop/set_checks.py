@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import jax
 import numpy as np
 from jax import Array
 
 from bayessim_mjx.distributions import Distribution
-from bayessim_mjx.inference import rounds, sets
+from bayessim_mjx.inference import near, rounds, sets
 from bayessim_mjx.inference.sets import Sets
 from bayessim_mjx.keys import branch
-from bayessim_mjx.loop.factors import conditioned, kept
+from bayessim_mjx.loop.factors import conditioned, kept, multiplied
 from bayessim_mjx.loop.simulations import features, proposal_of
 from bayessim_mjx.loop.state import Loop, LoopState
 from bayessim_mjx.rl import Policy
@@ -32,30 +34,59 @@ def judge(loop: Loop, state: LoopState, policy: Policy, known: int) -> Sets | No
     return None if found is None else sets.judge(*found, loop.settings.components)
 
 
-def rejudge(loop: Loop, state: LoopState, policy: Policy, known: int, key: Array, more: int = 1) -> Sets | None:
-    """Products as the round used them, with its widening, judged on `more` times as many sets that it did not see.
+def settled(
+    loop: Loop, state: LoopState, policy: Policy, known: int, product: Distribution, found: Sets | None
+) -> Sets | None:
+    """`judge`'s answer, with what sets at draws of the posterior of the `known` real trajectories ask for."""
+    if found is None or float(product.prior_weight) >= rounds.REGION:  # else they are those of the prior
+        return found
+    key = branch(loop.key(int(state.round), "fit"), 6)
 
-    `state` is that of the round, with its network, temperature and proposal.
+    def drawn(posterior: Distribution, turn: int) -> tuple[list[list[Distribution]], np.ndarray] | None:
+        return _simulated(loop, state, policy, known, jax.random.fold_in(key, turn), posterior)
+
+    return near.settled(found, product, drawn, loop.settings.components)
+
+
+def rejudge(loop: Loop, state: LoopState, policy: Policy, known: int, key: Array, more: int = 1) -> Sets | None:
+    """Products as the round used them, as it widened and moved them, judged on `more` times as many sets, unseen by it.
+
+    `state` is that of the round, with its network, temperature, proposal and real trajectories' posteriors.
     """
-    used = None if loop.settings.temperature else judge(loop, state, policy, known)
-    parts = [_simulated(loop, state, policy, known, jax.random.fold_in(key, i)) for i in range(more)]
-    good = [part for part in parts if part is not None]
-    if not good:
+    product, used, k = multiplied(loop, state, known)[0], None, loop.settings.components
+    if not loop.settings.temperature:
+        used = settled(loop, state, policy, known, product, judge(loop, state, policy, known))
+
+    def again(first: int, around: Distribution | None) -> tuple[list[list[Distribution]], np.ndarray] | None:
+        lots = [_simulated(loop, state, policy, known, jax.random.fold_in(key, first + i), around) for i in range(more)]
+        good = [lot for lot in lots if lot is not None]
+        return ([row for lot in good for row in lot[0]], np.concatenate([lot[1] for lot in good])) if good else None
+
+    if (found := again(0, None)) is None:
         return None
-    rows, thetas = [row for part in good for row in part[0]], np.concatenate([part[1] for part in good])
-    by = (lambda n: 1.0) if used is None else (lambda n: used.at(n).widening)
-    return sets.judge(rows, thetas, loop.settings.components, widened_by=by)
+    judged = sets.judge(*found, k, widened_by=(lambda n: 1.0) if used is None else used.widening)
+    if used is None or not used.near or (found := again(more, used.used(product, known))) is None:
+        return judged
+    row = near.count(*found, k, used.move, used.widening(known))
+    return replace(judged, near=(row,), move=used.move)
 
 
 def _simulated(
-    loop: Loop, state: LoopState, policy: Policy, known: int, key: Array
+    loop: Loop, state: LoopState, policy: Policy, known: int, key: Array, around: Distribution | None = None
 ) -> tuple[list[list[Distribution]], np.ndarray] | None:
-    """Sets of factors and the thetas [m, d] that they were simulated at; None where hardly any is a density."""
+    """Sets of factors and the thetas [m, d] that they were simulated at; None where hardly any is a density.
+
+    around: what thetas are drawn from; None: what the round is simulated from.
+    """
     b, source = loop.settings, loop.source
     if known < 2 or b.proposal == "division" or source is None:
         return None
     k_theta, *keys = jax.random.split(key, 1 + min(known, MOST))
-    thetas = rounds.draw(k_theta, proposal_of(loop, state), b.proposal, SETS)
+    thetas = (
+        around.sample(k_theta, SETS)
+        if around is not None
+        else rounds.draw(k_theta, proposal_of(loop, state), b.proposal, SETS)
+    )
     columns = []
     for k in keys:  # the same program for any number of trajectories
         x = features(source, k, thetas[None], policy)
@@ -71,9 +102,10 @@ def _simulated(
 def scores(found: Sets, known: int) -> dict[str, float]:
     """Numbers for curves, of the posterior of `known` trajectories."""
     one = found.at(known)
-    told = {"widening": one.widening, "gain": one.gain, "carried": float(found.carried)}
+    told = {"widening": found.widening(known), "gain": one.gain, "carried": float(found.carried)}
+    told |= {"moved": float(found.move is not None)}
     told |= {f"coverage_{100 * level:.0f}": one.coverage(level) for level in sets.LEVELS}
     return {f"sets/{name}": float(value) for name, value in told.items()}
 
 
-__all__ = ["judge", "rejudge", "scores"]
+__all__ = ["judge", "rejudge", "scores", "settled"]

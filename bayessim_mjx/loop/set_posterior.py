@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -105,8 +106,11 @@ def _learnt(
 
     thetas = dataclasses.replace(product, prior_weight=jnp.float32(0)).sample(k_theta, JUDGED)
     columns = [simulate(k, thetas) for k in keys]
-    widening = info.sets.at(len(real)).widening if info.sets is not None else 1.0
-    each = zip(np.asarray(thetas), posteriors(columns), _products(loop, state, columns, widening), strict=True)
+
+    def used(q: Distribution) -> Distribution:
+        return q if info.sets is None else info.sets.used(q, len(real))
+
+    each = zip(np.asarray(thetas), posteriors(columns), _products(loop, state, columns, used), strict=True)
     rows = [(at, whole, other) for at, whole, other in each if other is not None and whole.sound]
     (own,) = posteriors([x[None] for x in real])
     if len(rows) < JUDGED // 2 or not own.sound:
@@ -136,7 +140,9 @@ def _usable(loop: Loop, state: LoopState, product: Distribution) -> Array:
     return real
 
 
-def _products(loop: Loop, state: LoopState, columns: list[Array], widening: float) -> list[Distribution | None]:
+def _products(
+    loop: Loop, state: LoopState, columns: list[Array], used: Callable[[Distribution], Distribution]
+) -> list[Distribution | None]:
     """Of each set, given as columns of summaries [m, D], the product as it is used; None where it is no density."""
     b, each = loop.settings, []
     for x in columns:
@@ -144,9 +150,7 @@ def _products(loop: Loop, state: LoopState, columns: list[Array], widening: floa
         each.append(jax.tree.map(np.asarray, factors).split())
     rows = zip(*each, strict=True)
     return [
-        tempered(inference.combine(row, b.components).rechart(loop.chart), widening)
-        if all(q.sound for q in row)
-        else None
+        used(inference.combine(row, b.components).rechart(loop.chart)) if all(q.sound for q in row) else None
         for row in rows
     ]
 
