@@ -127,9 +127,8 @@ def scale(effect: str, where: str, on: NDArray[np.bool_], sd: float = np.inf) ->
     """
     low, high = 1.0 / RANGES.gain[1], 1.0 / RANGES.gain[0]
     read: Callable[[Array], Mapping[str, float]] = lambda c: {"gain": 1.0 / float(c[0])}  # noqa: E731
-    believed = np.array([sd])
-    ends = {"low": np.array([low]), "high": np.array([high])}
-    return Term(effect, where, None, scaled=on, sd=lambda c: believed, read=read, **ends)
+    believed, lowest, highest = np.array([sd]), np.array([low]), np.array([high])
+    return Term(effect, where, None, scaled=on, sd=lambda c: believed, low=lowest, high=highest, read=read)
 
 
 def payloads(model: mujoco.MjModel, layout: Layout, carried: Array) -> list[Term]:
