@@ -26,7 +26,12 @@ from cases import ACCURACY, KNOWN
 from families import without
 
 RECORD = "record"
-STAGES = ("setup", "base", "singles", "choice")  # what is known so far is kept after each
+STAGES = ("setup", "base", "singles", "choice")
+
+
+def stage(tried: Any) -> str:
+    """How far a search has come that keeps what it knows after every batch of fits; the last of a stage is its end."""
+    return STAGES[0] if tried is None else STAGES[1 + min(max(map(len, tried.models), default=0), 2)]
 
 
 def work(case: Path, arguments: list[str]) -> None:
@@ -48,8 +53,7 @@ def work(case: Path, arguments: list[str]) -> None:
     original = run.investigate
 
     def watched(*args: Any, **options: Any) -> Any:
-        stages = iter(STAGES)
-        keep = lambda setup, tried: mark(next(stages, "more"), tried)  # noqa: E731
+        keep = lambda setup, tried: mark(stage(tried), tried)  # noqa: E731
         kept["found"] = original(*args, **options | {"keep": keep})
         return kept["found"]
 

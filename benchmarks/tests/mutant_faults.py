@@ -168,7 +168,7 @@ FAULTS: tuple[tuple[str, str, str, str, tuple[str, ...]], ...] = (
     ),
     (
         "a law gives way to a special case that closes far less", f"{P}/diagnosis/selection/decide.py",
-        "ratio < 1.0 + criteria.same or", "ratio < 100.0 + criteria.same or", (DECIDE, "-k", "special_case"),
+        "1e-9) < 1.0 + criteria.same", "1e-9) < 100.0 + criteria.same", (DECIDE, "-k", "special_case"),
     ),
     # environment
     (

@@ -41,7 +41,7 @@ def model(r: np.ndarray, own: list[int]) -> Model:
     left = (r.ravel() - design @ x).reshape(r.shape)
     coordinates = tuple(coordinate(f"p{i}", i) for i in own)
     fit = Fit(coordinates, x[:k], x[k:, None], left, A, STARTS, np.ones(WINDOWS), float(np.sum(left**2)))
-    return Model((), fit, np.ones(WINDOWS), np.zeros((2, k)), 1.0)
+    return Model((), fit, np.ones(WINDOWS), np.ones(WINDOWS), np.zeros((2, k)), 1.0)
 
 
 def test_bic_is_schwarz_on_the_least_squares_residual():

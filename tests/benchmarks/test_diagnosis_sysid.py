@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from bayessim_mjx import effects
+from bayessim_mjx.blind.reality import plant
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks" / "diagnosis"
 sys.path.insert(0, str(BENCHMARKS))
@@ -17,7 +18,6 @@ if not hasattr(sysid, "optimize"):  # the package is there without what it needs
 import native  # noqa: E402
 import sysid as comparison  # noqa: E402
 import systems  # noqa: E402
-import truth  # noqa: E402
 
 VALUES = {
     "actuator_bias": (0.3,), "actuator_gain": (1.2,), "actuator_saturation": (2.0,), "armature": (0.02,),
@@ -89,7 +89,7 @@ def test_base_factors_compile_to_the_benchmarks_own(xml):
     params.update_from_vector(np.array(list(factors.values())))
     theirs = sysid.apply_param_modifiers(params, spec)
     expected = mujoco.MjSpec.from_file(xml)
-    truth.scale_base(expected, factors)
+    plant.scale_base(expected, factors)
     model = expected.compile()
     for field in ("body_mass", "body_inertia", "dof_damping", "dof_armature"):
         np.testing.assert_allclose(getattr(theirs, field), getattr(model, field), rtol=1e-12)

@@ -131,9 +131,9 @@ def test_effects_that_leave_a_small_share_are_named_with_what_remains():
 
 
 def test_effects_that_leave_a_large_share_are_no_explanation():
-    """600 of 1000 noises are 36 % of the squared gap."""
-    assert verdict.verdict_of(findings(600.0), gap(0.06)).name == "unexplained"
-    assert verdict.verdict_of(findings(500.0), gap(0.05)).name == "effects"  # 25 %
+    """400 of 1000 noises are 16 % of the squared gap."""
+    assert verdict.verdict_of(findings(400.0), gap(0.04)).name == "unexplained"
+    assert verdict.verdict_of(findings(380.0), gap(0.038)).name == "effects"  # 14 %
 
 
 def test_the_headline_says_partly_explained_and_what_remains_where():
