@@ -192,7 +192,9 @@ def costs(done: Sequence[Path]) -> None:
     took: dict[str, list[list[float]]] = {}
     for f in done:
         at = {m[0]: m for m in recorded(f)["marks"]}
-        if "choice" in at:
+        for before, name in zip(STAGES, STAGES[1:], strict=False):  # a stage that was not needed took nothing
+            at.setdefault(name, at.get(before))
+        if at["choice"] is not None:
             spent = [
                 at[end][i] - at[begin][i] for begin, end in zip(STAGES, STAGES[1:], strict=False) for i in (2, 4, 3)
             ]
