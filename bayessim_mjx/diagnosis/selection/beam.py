@@ -184,6 +184,13 @@ def finalists(found: Decision, most: int) -> list[Key]:
     return list(dict.fromkeys([BASE, found.best, found.answer, *told]))
 
 
+def _without_all(table: Table, key: Key, criteria: Criteria) -> Key:
+    """A model without all effects that each alone could be left out, where they are several: one round in place of one
+    for each; `BASE` where there are none."""
+    spare = frozenset(label for label in key if same(table, key - {label}, key, criteria))
+    return key - spare if len(spare) > 1 else BASE
+
+
 def _final(fits: Fitting, criteria: Criteria) -> Decision:
     """The decision among finalists whose fits came to their end and whose held-out windows are simulated.
 
@@ -207,6 +214,10 @@ def _final(fits: Fitting, criteria: Criteria) -> Decision:
         smaller = [found.answer - {label} for label in found.answer]
         fits.fit([Plan(k, found.answer) for k in smaller], "dropping", needed=True)
         fits.polish(smaller)
+        if rest := _without_all(fits.table, found.answer, criteria):
+            fits.fit([Plan(rest, found.answer)], "dropping", needed=True)
+            fits.polish([rest])
+            smaller.append(rest)
         keys = list(dict.fromkeys([*keys, found.answer, *smaller]))
         found = decide(fits.simulate(keys), less, criteria)
         if all(found.answer - {label} in keys for label in found.answer):

@@ -135,3 +135,13 @@ def test_what_may_stand_in_the_place_of_an_effect():
     assert beam.specialised(known, frozenset([tied.label]), tied.label) == [{one.label}]
     beside = frozenset([both.label, dry.label])  # what is there already cannot come again
     assert beam.specialised(known, beside, both.label) == [{viscous.label}]
+
+
+def test_effects_that_can_each_be_left_out_are_left_out_together():
+    a, b, c, d = (law(n) for n in "abcd")
+    whole = {(): 100.0, (a, b, c, d): 1.0, (b, c, d): 60.0, (a, c, d): 50.0}
+    label = frozenset(x.label for x in (a, b, c, d))
+    both = table(whole | {(a, b, d): 1.01, (a, b, c): 1.02})
+    assert beam._without_all(both, label, Criteria()) == {a.label, b.label}
+    one = table(whole | {(a, b, d): 1.01, (a, b, c): 30.0})
+    assert beam._without_all(one, label, Criteria()) == frozenset()
