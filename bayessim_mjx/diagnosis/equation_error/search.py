@@ -88,8 +88,9 @@ def search(sums: Sums, known: Sequence[Term], terms: Sequence[Term]) -> Found:
     if not any(p.term.effect == GAIN for p in found.proposals):
         return found
     others = [t for t in terms if t.effect != GAIN]
-    start = _drives(sums, known, others)
-    again = _forward(sums, known, others, start) if start else found
+    if not (start := _drives(sums, known, others)):
+        return found
+    again = _forward(sums, known, others, start)
     return again if again.density[1] > found.density[1] - CRITERIA.same else found
 
 
@@ -111,10 +112,10 @@ def _forward(sums: Sums, known: Sequence[Term], terms: Sequence[Term], start: Se
     threshold = CRITERIA.nats + math.log(max(len(terms), 1))
     chosen: list[tuple[Term, tuple[str, ...]]] = [(t, ()) for t in start]
     before = fitting.score(sums, known)
-    density = fitting.score(sums, [*known, *start])
+    density = fitting.score(sums, [*known, *start]) if start else before
     while len(fewer := _back(sums, known, chosen, density, threshold, spared=0)) < len(chosen):
         chosen, density = fewer, fitting.score(sums, [*known, *(t for t, _ in fewer)])
-    now = fitting.fit(sums, [*known, *(t for t, _ in chosen)])
+    now = fitting.fit(sums, [*known, *(t for t, _ in chosen)]) if chosen else base
     given = {t.effect for t in start}  # what drives have counts as one
     while len({t.effect for t, _ in chosen} - given) + bool(given) < CRITERIA.most:
         own = [t for t, _ in chosen]

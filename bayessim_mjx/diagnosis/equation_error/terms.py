@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import mujoco
 import numpy as np
@@ -101,8 +101,8 @@ def effects(model: mujoco.MjModel, layout: Layout, source: Sequence[str], carrie
     out += _on_actuators(model, layout, driven)
     tilt = np.stack([_everywhere(layout, c) for c in range(layout.tilt.start, layout.tilt.stop)], -1)
     if np.any(model.opt.gravity):
-        term = _wide("gravity_tilt", "world", tilt, -RANGES.tilt, RANGES.tilt, _reader("roll", "pitch"))
-        out.append(replace(term, sd=lambda c: np.full(len(c), RANGES.zero)))
+        ends = -RANGES.tilt, RANGES.tilt
+        out.append(_wide("gravity_tilt", "world", tilt, *ends, _reader("roll", "pitch"), sd=RANGES.zero))
     return [*out, *payloads(model, layout, carried)]
 
 
@@ -231,8 +231,11 @@ def _fixed(effect: str, where: str, column: Array, low: float = -np.inf, sd: flo
     return Term(effect, where, lambda c: column[:, :, None], low=np.array([low]), sd=lambda c: believed, **more)  # type: ignore[arg-type]
 
 
-def _wide(effect: str, where: str, maps: Array, low: float | Array, high: float | Array, read: object) -> Term:
+def _wide(
+    effect: str, where: str, maps: Array, low: float | Array, high: float | Array, read: object, sd: float = np.inf
+) -> Term:
     """A term of several coefficients and maps `[nv, P, k]`."""
     k = maps.shape[-1]
     ends = np.broadcast_to(low, (k,)).astype(float), np.broadcast_to(high, (k,)).astype(float)
-    return Term(effect, where, lambda c: maps, k, low=ends[0], high=ends[1], read=read)  # type: ignore[arg-type]
+    believed = np.full(k, sd)
+    return Term(effect, where, lambda c: maps, k, sd=lambda c: believed, low=ends[0], high=ends[1], read=read)  # type: ignore[arg-type]

@@ -244,28 +244,33 @@ class Fitter:
         split = functools.partial(blocks, q, starts, fit.r, fit.A)
         return held_out(q, group, fit.weight, precision, pull, low, high, watched, split)
 
-    def innovations(self, fit: Fit, q: Quadratic, moves: Array, estimates: Array, plain: Array) -> Array:
+    def innovations(self, fit: Fit, moves: Array, estimates: Array, plain: Array, at: Quadratic | None = None) -> Array:
         """Held-out costs `[W]` with the uncertainty of the estimates that they were predicted with.
 
         Conditions that alone tell a parameter count as they were predicted: without them nothing is known of it.
 
         Args:
-            q: costs about points of the parameters; moves: `[G, k]`, from there to the estimates without a condition.
+            moves: `[G, k]`, to the estimates without a condition from where the costs `at` are those of.
             estimates: `[G, k]`; plain: `[W]`, costs of the predictions themselves.
+            at: costs about points of the parameters; None: about the fit.
         """
-        precision, pull, low, high = fit.prior()
-        rest = Rest(fit.quadratic(self.spread)[0], fit.weight, precision, pull, low, high)
-        alone, costs, group = self.told_alone(fit), plain.copy(), self.simulator.windows.group
-        for name, move, estimate, told in zip(np.unique(group), moves, estimates, alone, strict=True):
-            if not told:
-                own, point = group == name, estimate - move - fit.values
+        rest, tells = _rest(fit, self.spread, len(self.base))
+        q, costs, group = rest.q if at is None else at, plain.copy(), self.simulator.windows.group
+        for name, move, estimate in zip(np.unique(group), moves, estimates, strict=True):
+            own, point = group == name, estimate - move - fit.values
+            if not tells(own):
                 H = rest.curvature(own)[1]
-                costs[own] = predictive(q, own, fit.weight, move, H, low - point, high - point)
+                costs[own] = predictive(q, own, fit.weight, move, H, rest.low - point, rest.high - point)
         return costs
 
     def told_alone(self, fit: Fit) -> list[bool]:
         """Of each condition, whether it alone tells a parameter of an effect (a limit that is reached there only)."""
-        q, _ = fit.quadratic(self.spread)
-        tells = Rest(q, fit.weight, *fit.prior()).told_by(np.arange(len(self.base), len(fit.coordinates)))
+        _, tells = _rest(fit, self.spread, len(self.base))
         group = self.simulator.windows.group
         return [tells(group == name) for name in np.unique(group)]
+
+
+def _rest(fit: Fit, spread: Array, base: int) -> tuple[Rest, Callable[[NDArray[np.bool_]], bool]]:
+    """Fits without some windows, and whether some alone tell a parameter of an effect: one behind the first `base`."""
+    rest = Rest(fit.quadratic(spread)[0], fit.weight, *fit.prior())
+    return rest, rest.told_by(np.arange(base, len(fit.coordinates)))

@@ -109,10 +109,11 @@ class Fits:
         What drives have that models leave out counts as one law.
         """
         known = [c for c in self.pool.screened if c.candidate.label in self.pool.settings.together]
-        effects = [label.split("@", 1)[0] for label in self.pool.settings.together]  # the best told first
-        drives = [e for e in dict.fromkeys(effects) if e in DRIVES]
-        others = [e for e in dict.fromkeys(effects) if e not in DRIVES]
-        first = [*drives, *others[: most - 1]] if len(drives) > 1 else list(dict.fromkeys(effects))[:most]
+        together = self.pool.settings.together  # the best told first
+        effects = list(dict.fromkeys(label.split("@", 1)[0] for label in together))
+        drives = [e for e in effects if e in DRIVES]
+        others = [e for e in effects if e not in DRIVES]
+        first = [*drives, *others[: most - 1]] if len(drives) > 1 else effects[:most]
         own = [s.candidate for s in known if s.candidate.effect in first]
         apart = all(beside(a, b) for i, a in enumerate(own) for b in own[:i])
         return [frozenset(c.label for c in own)] if len(own) > 1 and apart else []

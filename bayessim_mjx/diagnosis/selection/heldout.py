@@ -63,7 +63,7 @@ def costs(fitter: Fitter, model: Model, seen: Prediction) -> Array:
     fit, steps = model.fit, fitter.simulator.windows.steps
     plain = seen.cost(steps) * fitter.size + np.sum((seen.offsets / fitter.spread) ** 2, axis=1)
     q, _ = eliminate(seen.error.reshape(len(plain), -1), fit.A, fit.B, seen.offsets, fitter.spread)
-    return fitter.innovations(fit, q, np.zeros_like(model.estimates), model.estimates, plain)
+    return fitter.innovations(fit, np.zeros_like(model.estimates), model.estimates, plain, at=q)
 
 
 def refitted(fitter: Fitter, models: Sequence[Model]) -> list[Model]:

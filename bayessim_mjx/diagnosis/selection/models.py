@@ -55,7 +55,7 @@ class Model:
 def scored(fitter: Fitter, fit: Fit, effects: Sequence[Candidate]) -> Model:
     """The held-out score of a fit."""
     plain, moves = fitter.scores(fit)
-    cost = fitter.innovations(fit, fit.quadratic(fitter.spread)[0], moves, fit.values + moves, plain)
+    cost = fitter.innovations(fit, moves, fit.values + moves, plain)
     costs = np.maximum(cost, 1e-9), np.maximum(plain, 1e-9)
     return Model(tuple(effects), fit, *costs, fit.values + moves, effective_samples(fit, fitter))
 

@@ -43,7 +43,6 @@ def problem(
     )  # fmt: skip
     fitter.scores = lambda fit, group=None: Fitter.scores(fitter, fit, group)
     fitter.innovations = lambda *given: Fitter.innovations(fitter, *given)
-    fitter.told_alone = lambda fit: Fitter.told_alone(fitter, fit)
     fit = Fit(coordinates, np.zeros(2), np.zeros((len(group), 1)), r, A, B, np.ones(len(group)), 0.0)
     q, starts = fit.quadratic(fitter.spread)
     g, S = q.weighted(fit.weight)
