@@ -109,25 +109,37 @@ class Simulator:
         """
         chosen = np.arange(len(self.windows)) if windows is None else np.asarray(windows)
         n, w = len(thetas), len(chosen)
-        flat_offsets = None if offsets is None else np.asarray(offsets, np.float32).reshape(n * w, -1)
+        flat_offsets = None if offsets is None else np.asarray(offsets).reshape(n * w, -1)
         flat_force = None if force is None else np.asarray(force, np.float32).reshape(n * w, *force.shape[2:])
-        acting = self.physics.acting(thetas)
-        thetas, of_theta, of_window = np.asarray(thetas, np.float32), np.repeat(np.arange(n), w), np.tile(chosen, n)
+        result = self.run_each(thetas, np.repeat(np.arange(n), w), np.tile(chosen, n), flat_offsets, flat_force)
+        return result.reshape(n, w, *result.shape[1:])
+
+    def run_each(
+        self,
+        thetas: Array,
+        of_theta: NDArray[np.int64],
+        of_window: NDArray[np.int64],
+        offsets: Array | None = None,
+        force: NDArray[np.float32] | None = None,
+    ) -> Array:
+        """`run` of worlds one by one: `[m, H, 2 nv]` for indices `[m]` of thetas and windows, offsets `[m, 2 nv]`."""
+        count = len(of_theta)
+        moved = None if offsets is None else np.asarray(offsets, np.float32)
+        acting, thetas = self.physics.acting(thetas), np.asarray(thetas, np.float32)
 
         def part(first: int) -> NDArray[np.float32]:
-            count = min(self.lanes, n * w - first)
-            own = first + np.minimum(np.arange(self.lanes), count - 1)
-            offset = self._no_offset if flat_offsets is None else flat_offsets[own]
-            extra = self._no_force if flat_force is None else flat_force[own]
+            size = min(self.lanes, count - first)
+            own = first + np.minimum(np.arange(self.lanes), size - 1)
+            offset = self._no_offset if moved is None else moved[own]
+            extra = self._no_force if force is None else force[own]
             active = acting[of_theta[own]].any(0) if self.apart else None
             errors, _ = self._run(self.windows.batch, of_window[own], thetas[of_theta[own]], offset, extra, active)
-            return np.asarray(errors)[:count]
+            return np.asarray(errors)[:size]
 
-        firsts = list(range(0, n * w, self.lanes))
+        firsts = list(range(0, count, self.lanes))
         alone = firsts[:1] if self.traces == 0 else []  # traced once, not by every thread
         done = [part(first) for first in alone]
         with ThreadPoolExecutor(self.workers) as pool:
             done += pool.map(part, firsts[len(alone) :])
-        self.rollouts += n * w
-        result = np.concatenate(done).astype(np.float64)
-        return result.reshape(n, w, *result.shape[1:])
+        self.rollouts += count
+        return np.concatenate(done).astype(np.float64)

@@ -52,22 +52,24 @@ class Bound:
 def widened(pool: Pool, model: Model, say: Progress) -> Model:
     """The model with ranges as wide as it takes for its effects' parameters to lie within, refitted.
 
-    A range doubles as long as that brings held-out evidence, or a still wider one promises to, up to `farthest` times
-    what it was. It stays where its end means that the effect is off, where physics ends, and where it sizes an effect's
+    A range doubles as long as a still wider one promises held-out evidence, up to `farthest` times what it was; what
+    has brought it is kept. It stays where its end means that the effect is off, where physics ends, and where it sizes an effect's
     memory.
     """
-    last, more = model, True
-    while more and _held(pool, last):
+    last = model
+    while _held(pool, last) and _promised(pool, last):
         say("wider ranges", 0, 1)
         last = _refitted(pool, last, _moved(pool, last, _grown))
-        if more := nats(model, last) >= WIDENING.nats:
+        if nats(model, last) >= WIDENING.nats:
             _adopt(pool, last)
             model = last
-        else:
-            more = (
-                0.5 * last.samples * math.log(last.total / max(last.total - promise(pool, last), 1e-9)) > WIDENING.nats
-            )
     return model
+
+
+def _promised(pool: Pool, model: Model) -> bool:
+    """Whether the held-out evidence that ranges as wide as they may get promise is worth a refit."""
+    left = max(model.total - promise(pool, model), 1e-9)
+    return 0.5 * model.samples * math.log(model.total / left) > WIDENING.nats
 
 
 def widen_leading(pool: Pool, say: Progress) -> None:

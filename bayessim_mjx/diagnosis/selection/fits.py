@@ -177,10 +177,8 @@ class Fits:
         if todo:
             self.say("held out", 0, len(todo))
         refitted = heldout.refitted(fitter, [models[k] for k in todo])
-        for done, (key, model) in enumerate(zip(todo, refitted, strict=True)):
-            self.say("held out", done, len(todo))
+        for key, model, seen in zip(todo, refitted, heldout.predictions(fitter, refitted), strict=True):
             models[key] = model
-            seen = heldout.predict(fitter, model)
             # start states count as in the search, or all models would come nearer to the noise than they did there
             cost = heldout.costs(fitter, model, seen)
             self._folds[key] = (model, replace(self._row(key, model, True), cost=cost, simulated=True))

@@ -22,7 +22,8 @@ Array = NDArray[np.float64]
 class Rules:
     """How a fit without a condition goes on from the common one, and how finely intervals are looked for."""
 
-    steps: int = 3  # of a fit without a condition
+    steps: int = 3  # of a fit without a condition, at most
+    rest: float = 0.005  # nats: what a further step has to promise; not counted
     within: float = 1.02  # of the common fit's cost: the most that such a fit leaves of the same windows
     grid: int = 400  # shares looked at
 
@@ -48,14 +49,14 @@ class Prediction:
 
 def predict(fitter: Fitter, model: Model) -> Prediction:
     """Simulate each condition's windows with the parameters found without it; starts re-estimated on the window."""
-    windows = fitter.simulator.windows
-    names = np.unique(windows.group)
-    error = np.zeros((len(windows), windows.steps, int(fitter.used.sum())))
-    offsets = np.zeros_like(model.fit.offsets)
-    for name, values in zip(names, model.estimates, strict=True):
-        own = np.flatnonzero(windows.group == name)
-        error[own], offsets[own] = _settled(fitter, model.fit, values, own)
-    return Prediction(error, offsets)
+    return predictions(fitter, [model])[0]
+
+
+def predictions(fitter: Fitter, models: Sequence[Model]) -> list[Prediction]:
+    """`predict` of several models, simulated together."""
+    _, fold = np.unique(fitter.simulator.windows.group, return_inverse=True)
+    thetas = [[fitter.vector(m.fit.coordinates, values) for values in m.estimates] for m in models]
+    return _settled(fitter, [m.fit for m in models], np.array(thetas), fold)
 
 
 def costs(fitter: Fitter, model: Model, seen: Prediction) -> Array:
@@ -77,11 +78,13 @@ def refitted(fitter: Fitter, models: Sequence[Model]) -> list[Model]:
     names = np.unique(group)
     alone = [fitter.told_alone(m.fit) for m in models]
     plans = [(i, g) for i in range(len(models)) for g in range(len(names)) if not alone[i][g]]
-    folds = [_Fold(fitter, models[i].fit, group != names[g]) for i, g in plans]
-    for _ in range(RULES.steps if folds else 0):
-        thetas = np.stack([fitter.vector(fold.fit.coordinates, fold.values) for fold in folds])
-        seen = fitter.whiten(fitter.simulator.run(thetas, np.stack([fold.offsets for fold in folds])))
-        for fold, r in zip(folds, seen, strict=True):
+    folds = [_Fold(fitter, models[i], group != names[g]) for i, g in plans]
+    for _ in range(RULES.steps):
+        if not (running := [fold for fold in folds if not fold.rests]):
+            break
+        thetas = np.stack([fitter.vector(fold.fit.coordinates, fold.values) for fold in running])
+        seen = fitter.whiten(fitter.simulator.run(thetas, np.stack([fold.offsets for fold in running])))
+        for fold, r in zip(running, seen, strict=True):
             fold.go_on(r)
     estimates = [m.estimates.copy() for m in models]
     for (i, g), fold in zip(plans, folds, strict=True):
@@ -95,11 +98,14 @@ class _Fold:
     Gauss-Newton steps on the common fit's columns, not descent: at the scale of these steps costs are rough (contacts,
     dry friction, single precision), and a descent would stay where it is. A step that leaves the windows much worse
     off than the common fit is halved. Directions that these windows do not tell stay where the common fit has them.
+    It rests at a step too small to be worth a simulation.
     """
 
-    def __init__(self, fitter: Fitter, fit: Fit, kept: NDArray[np.bool_]) -> None:
+    def __init__(self, fitter: Fitter, model: Model, kept: NDArray[np.bool_]) -> None:
+        fit = model.fit
         self.fitter, self.fit = fitter, replace(fit, weight=fit.weight * kept)
-        self.limit = RULES.within * fitter.cost(self.fit, fit.r, fit.offsets, fit.values)
+        cost = fitter.cost(self.fit, fit.r, fit.offsets, fit.values)
+        self.limit, self.worth = RULES.within * cost, 2 * RULES.rest * cost / (model.samples * kept.mean())
         self.found = fit.values
         self.values, self.offsets = self._step(fit.values, fit.offsets, fit.r)
 
@@ -118,32 +124,43 @@ class _Fold:
         precision, pull, low, high = replace(self.fit, values=values).prior()
         held = HELD_OUT.trust * np.diag(S)
         pull = pull + held * (self.fit.values - values)
-        p = solve(S + np.diag(precision + held), g + pull, low, high)
+        H, slope = S + np.diag(precision + held), g + pull
+        p = solve(H, slope, low, high)
+        self.rests = bool((2 * slope - H @ p) @ p < self.worth)
+        if self.rests:
+            self.found = values + p
         return values + p, offsets + starts.step(self.fit.A, p)
 
 
 def nominal(fitter: Fitter, fit: Fit) -> Prediction:
     """The simulator as delivered, starts estimated."""
-    values = np.array([c.neutral for c in fit.coordinates])
-    return Prediction(*_settled(fitter, fit, values, np.arange(len(fit.r))))
+    theta = fitter.vector(fit.coordinates, np.array([c.neutral for c in fit.coordinates]))
+    return _settled(fitter, [fit], theta[None, None], np.zeros(len(fit.r), int))[0]
 
 
-def _settled(fitter: Fitter, fit: Fit, values: Array, own: NDArray[np.int64]) -> tuple[Array, Array]:
-    """(errors `[w, H, channels]`, starts `[w, s]`) of some windows after two Newton steps of their start states."""
-    theta = fitter.vector(fit.coordinates, values)[None]
-    best_offsets = offsets = fit.offsets[own]
-    B = fit.B[own]
-    best = errors = fitter.simulator.run(theta, offsets[None], own)[0]
+def _settled(fitter: Fitter, fits: Sequence[Fit], thetas: Array, of_theta: NDArray[np.int64]) -> list[Prediction]:
+    """All windows after two Newton steps of their start states.
+
+    thetas: `[fits, g, P]`; of_theta: `[W]`, which of a fit's thetas is a window's.
+    """
+    count, windows = len(fits), len(of_theta)
+    own = (np.arange(count)[:, None] * thetas.shape[1] + of_theta).ravel(), np.tile(np.arange(windows), count)
+    B = np.concatenate([fit.B for fit in fits])
+
+    def simulated(offsets: Array) -> Array:
+        return fitter.whiten(fitter.simulator.run_each(thetas.reshape(-1, thetas.shape[2]), *own, offsets))
+
+    offsets = np.concatenate([fit.offsets for fit in fits])
+    r = simulated(offsets)
+    none = np.zeros((*r.shape, 0))
     for _ in range(2):
-        r = fitter.whiten(errors)
-        _, starts = eliminate(r, np.zeros((*r.shape, 0)), B, offsets, fitter.spread)
-        offsets = offsets + starts.step(np.zeros((*r.shape, 0)), np.zeros(0))
-        errors = fitter.simulator.run(theta, offsets[None], own)[0]
-        better = np.sum(fitter.whiten(errors) ** 2, 1) < np.sum(fitter.whiten(best) ** 2, 1)
-        best = np.where(better[:, None, None], errors, best)
-        best_offsets = np.where(better[:, None], offsets, best_offsets)
-        errors, offsets = best, best_offsets
-    return np.asarray(best[..., fitter.used] / fitter.sigma), best_offsets
+        _, starts = eliminate(r, none, B, offsets, fitter.spread)
+        moved = offsets + starts.step(none, np.zeros(0))
+        new = simulated(moved)
+        better = (np.sum(new**2, 1) < np.sum(r**2, 1))[:, None]
+        r, offsets = np.where(better, new, r), np.where(better, moved, offsets)
+    errors = r.reshape(count, windows, fitter.simulator.windows.steps, -1)
+    return [Prediction(*pair) for pair in zip(errors, np.split(offsets, count), strict=True)]
 
 
 def stages(costs: dict[str, Array], group: NDArray[np.int64]) -> dict[str, Any]:

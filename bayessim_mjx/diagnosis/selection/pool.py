@@ -228,14 +228,14 @@ def polish(pool: Pool, models: Sequence[Model], say: Progress = lambda text, don
 
 
 def _to_the_end(pool: Pool, fits: Sequence[Fit], told: Callable[[Fit], Fit]) -> list[Fit]:
-    """Fits with all columns anew every few steps, as long as that lowers their cost.
+    """Fits with all columns anew every few steps, and corrected by these alone, as long as that lowers their cost.
 
     One that could not come near the best, did each round to come bring as much as the last, is left where it is.
     """
     fits, running = list(fits), list(range(len(fits)))
     for made in range(RULES.rounds):
         start = [replace(fits[i], **AFRESH) for i in running]
-        moved = pool.fitter.iterate(start, RULES.steps, lambda f: fresh(pool, f))
+        moved = pool.fitter.iterate(start, RULES.steps, lambda f: fresh(pool, f) if _astray(pool, f) else ())
         for i, fit in zip(running, moved, strict=True):
             fits[i] = told(pool.fitter.refresh(fit))
         fell = {i: before.cost - fits[i].cost for i, before in zip(running, start, strict=True)}
@@ -263,4 +263,9 @@ def _again(fitter: Fitter, fit: Fit) -> Fit:
 
 def special_cases(effect: Candidate) -> tuple[str, ...]:
     """Names of the effects that it contains, from its class."""
-    return tuple(getattr(load(effect.effect), "contains", ())) if effect.effect in names() else ()
+    return _contained(effect.effect)
+
+
+@functools.cache  # thousands of pairs are compared, and all installed packages are looked through for a name
+def _contained(effect: str) -> tuple[str, ...]:
+    return tuple(getattr(load(effect), "contains", ())) if effect in names() else ()

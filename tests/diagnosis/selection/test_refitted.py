@@ -39,6 +39,10 @@ class Bent:
         error = size[..., None] * MOTION[own] + self.noise[own] + self.start - offsets[..., 0, None]
         return np.stack([error, np.zeros_like(error)], -1)
 
+    def run_each(self, thetas, of_theta, of_window, offsets):
+        each = zip(np.asarray(thetas)[of_theta], of_window, offsets, strict=True)
+        return np.concatenate([self.run(theta[None], x[None, None], [w])[0] for theta, w, x in each])
+
 
 class Windows:
     sigma_q, sigma_v, spread, steps = np.array([0.01]), np.array([np.inf]), np.array([0.03, 0.1]), 20
@@ -66,7 +70,8 @@ def test_fits_without_a_condition_come_to_their_end_where_one_linear_step_does_n
     fitter, model = fitted(Bent((0.2, 0.4, 0.9, 4.0)))
     before = fitter.simulator.rollouts
     (new,) = heldout.refitted(fitter, [model])
-    assert fitter.simulator.rollouts - before == 4 * heldout.RULES.steps  # of all windows
+    made = fitter.simulator.rollouts - before  # of all windows, as long as a step promises something
+    assert 4 < made <= 4 * heldout.RULES.steps
     exact = np.array([alone(fitter, model, g) for g in range(4)])
     linear, again = np.abs(model.estimates[:, 0] - exact), np.abs(new.estimates[:, 0] - exact)
     assert linear.max() > 0.05 and again.max() < linear.max() / 5
