@@ -93,10 +93,23 @@ def test_without_time_the_first_answer_says_what_was_not_tried(setup, monkeypatc
     """The clock strikes whenever it is read: the first effect is fitted, the others have no time."""
     clock = itertools.count()
     monkeypatch.setattr(pool, "RULES", dataclasses.replace(pool.RULES, batch=1))
-    short = searched(setup, seconds=8.0, now=lambda: float(next(clock)))
+    short = searched(setup, seconds=12.0, now=lambda: float(next(clock)))
     assert short.answer.label == SPRING and len(short.cut_short) == 2
     assert not_fitted(short) == {phrases.NO_TIME_LEFT: sorted(short.cut_short, key=labels(setup).index)}
     assert "no time was left for 2 single effects" in not_tried(short)
+
+
+def test_when_the_time_is_over_the_verdict_rests_on_what_is_fitted(setup, counted_whole):
+    """The clock strikes with the first model that is polished: nothing else is fitted, and none simulated held out."""
+    simulator, at = setup.fitter.simulator, {"now": 0.0}
+
+    def say(text, done, total):
+        if text == "polishing" and "rollouts" not in at:
+            at.update(now=1e9, rollouts=simulator.rollouts)
+
+    short = searched(setup, say, seconds=1.0, now=lambda: at["now"])
+    assert short.answer.label == SPRING and not any(row.simulated for row in short.table.rows.values())
+    assert simulator.rollouts - at["rollouts"] < 0.15 * counted_whole[1]
 
 
 def labels(setup):

@@ -60,13 +60,13 @@ class Fitting(Protocol):
         """Whether a part of the search has had its time."""
 
     def fit(self, plans: Sequence[Plan], label: str, needed: bool = False) -> None:
-        """Fit what was not fitted before, as far as the time goes; needed: all."""
+        """Fit what was not fitted before, as far as the time goes; needed: as far as that of leaving out goes."""
 
     def polish(self, keys: Sequence[Key]) -> None:
         """Bring the fits of models to their end."""
 
     def simulate(self, keys: Sequence[Key]) -> Table:
-        """A table of some models, refitted without each condition, whose held-out windows are then simulated."""
+        """A table of some models that are fitted, refitted without each condition, whose windows are then simulated."""
 
 
 def search(fits: Fitting, criteria: Criteria) -> Decision:
@@ -144,6 +144,13 @@ def _added(fits: Fitting, key: Key, count: int) -> list[Plan]:
     return [Plan(key | {label}, key) for label in fits.additions(key)[: max(count, 1)]]
 
 
+def _in_place(fits: Fitting, rest: Key, best: Key, count: int) -> list[Plan]:
+    """Effects on top of what is left of the best model that promise to bring it close to that."""
+    rows, promised = fits.table.rows, fits.promises(rest)
+    near = [k for k, gain in promised.items() if rows[rest].total - gain < CLOSE * rows[best].total]
+    return [Plan(rest | {label}, rest) for label in near[:count]]
+
+
 def _everywhere(fits: Fitting, key: Key, criteria: Criteria) -> list[Plan]:
     table = fits.table
     return [Plan(*p) for p in spread(table, key, fits.promises(key)) if laws(table, p[0]) <= criteria.most]
@@ -159,7 +166,7 @@ def _around(fits: Fitting, best: Key, criteria: Criteria) -> Key:
     plans = []
     for own in whole:  # a law at several joints is exchanged as one
         rest = best - own
-        plans += _added(fits, rest, criteria.width) if rest else []
+        plans += _in_place(fits, rest, best, criteria.width) if rest else []
         for label in own if len(own) == 1 else ():
             plans += [Plan(rest | other, rest) for other in specialised(fits.table, best, label)]
     fits.fit([p for p in plans if laws(fits.table, p.key) <= criteria.most], "exchanges")

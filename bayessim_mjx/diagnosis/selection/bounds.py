@@ -11,6 +11,7 @@ import numpy as np
 from bayessim_mjx.diagnosis import phrases
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate, Coordinate, shrink
 from bayessim_mjx.diagnosis.fitting.quadratic import solve
+from bayessim_mjx.diagnosis.selection.budget import LEAVING_OUT
 from bayessim_mjx.diagnosis.selection.models import Model, nats, scored
 from bayessim_mjx.diagnosis.selection.pool import AFRESH, Pool, Progress, fresh
 from bayessim_mjx.diagnosis.selection.tried import ranked
@@ -57,7 +58,7 @@ def widened(pool: Pool, model: Model, say: Progress) -> Model:
     memory.
     """
     last = model
-    while _held(pool, last) and _promised(pool, last):
+    while not pool.settings.budget.over(LEAVING_OUT) and _held(pool, last) and _promised(pool, last):
         say("wider ranges", 0, 1)
         last = _refitted(pool, last, _moved(pool, last, _grown))
         if nats(model, last) >= WIDENING.nats:

@@ -15,6 +15,7 @@ from bayessim_mjx.diagnosis.fitting.fitter import Fit
 from bayessim_mjx.diagnosis.selection import chance, dense, heldout
 from bayessim_mjx.diagnosis.selection.beam import Plan
 from bayessim_mjx.diagnosis.selection.bounds import widened
+from bayessim_mjx.diagnosis.selection.budget import LEAVING_OUT
 from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.selection.pool import (
     Pool,
@@ -123,12 +124,12 @@ class Fits:
         return self.pool.settings.budget.over(part)
 
     def fit(self, plans: Sequence[Plan], label: str, needed: bool = False) -> None:
-        """Fit what was not fitted before; needed: whatever the time."""
+        """Fit what was not fitted before; needed: also when further effects have had their time."""
         entries: dict[Key, tuple[list[Fit], tuple[Candidate, ...]]] = {}
         for plan in plans:
             if plan.key not in self.pool.models and plan.key not in entries:
                 entries[plan.key] = self._entry(plan, len(entries))
-        fit_entries(self.pool, entries, label, self.say, "" if needed else "effects together")
+        fit_entries(self.pool, entries, label, self.say, LEAVING_OUT if needed else "effects together")
 
     def _entry(self, plan: Plan, rank: int) -> tuple[list[Fit], tuple[Candidate, ...]]:
         model = self.pool.models[plan.parent]
@@ -161,8 +162,8 @@ class Fits:
 
     def polish(self, keys: Sequence[Key]) -> None:
         """All columns anew at the models' fits, and some more steps, in ranges as wide as it takes."""
-        todo = [k for k in keys if k and k not in self._polished]
-        if todo:
+        todo = [k for k in keys if k and k not in self._polished and k in self.pool.models]
+        if todo and not self.over(LEAVING_OUT):
             self._polished.update(todo)
             polished = polish(self.pool, [self.pool.models[k] for k in todo], self.say)
             wider = [widened(self.pool, model, self.say) for model in polished]
@@ -171,18 +172,26 @@ class Fits:
             self.pool.keep(self.pool)
 
     def simulate(self, keys: Sequence[Key]) -> Table:
-        """A table of some models, refitted without each condition, whose windows are then simulated."""
-        fitter, known, models = self.pool.fitter, self.table, self.pool.models
+        """A table of some models, refitted without each condition, whose windows are then simulated.
+
+        Where no time is left for that, they stay as the search scored them.
+        """
+        known, models = self.table, self.pool.models
+        keys = [k for k in keys if k in models]  # there was no time for the others
         todo = [k for k in keys if self._folds.get(k, (None, None))[0] is not models[k]]
-        if todo:
+        if todo and not self.over(LEAVING_OUT):
             self.say("held out", 0, len(todo))
-        refitted = heldout.refitted(fitter, [models[k] for k in todo])
-        for key, model, seen in zip(todo, refitted, heldout.predictions(fitter, refitted), strict=True):
+            self._simulate(todo)
+        return replace(known, rows={k: self._folds[k][1] if k in self._folds else known.rows[k] for k in keys})
+
+    def _simulate(self, keys: Sequence[Key]) -> None:
+        fitter, models = self.pool.fitter, self.pool.models
+        refitted = heldout.refitted(fitter, [models[k] for k in keys])
+        for key, model, seen in zip(keys, refitted, heldout.predictions(fitter, refitted), strict=True):
             models[key] = model
             # start states count as in the search, or all models would come nearer to the noise than they did there
             cost = heldout.costs(fitter, model, seen)
             self._folds[key] = (model, replace(self._row(key, model, True), cost=cost, simulated=True))
-        return replace(known, rows={key: self._folds[key][1] for key in keys})
 
 
 def law_of(candidate: Candidate) -> Law:

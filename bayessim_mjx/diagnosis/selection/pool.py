@@ -14,6 +14,7 @@ from bayessim_mjx.diagnosis.fitting.candidates import Candidate, Coordinate
 from bayessim_mjx.diagnosis.fitting.discretisation import contacts
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 from bayessim_mjx.diagnosis.selection import shortlist
+from bayessim_mjx.diagnosis.selection.budget import LEAVING_OUT
 from bayessim_mjx.diagnosis.selection.criteria import Criteria
 from bayessim_mjx.diagnosis.selection.heats import Heats
 from bayessim_mjx.diagnosis.selection.models import Model, scored
@@ -230,10 +231,12 @@ def polish(pool: Pool, models: Sequence[Model], say: Progress = lambda text, don
 def _to_the_end(pool: Pool, fits: Sequence[Fit], told: Callable[[Fit], Fit]) -> list[Fit]:
     """Fits with all columns anew every few steps, and corrected by these alone, as long as that lowers their cost.
 
-    One that could not come near the best, did each round to come bring as much as the last, is left where it is.
+    None goes on when the time is over. One that could not come near the best, did each round to come bring as much as the last, is left where it is.
     """
     fits, running = list(fits), list(range(len(fits)))
     for made in range(RULES.rounds):
+        if pool.settings.budget.over(LEAVING_OUT):
+            break
         start = [replace(fits[i], **AFRESH) for i in running]
         moved = pool.fitter.iterate(start, RULES.steps, lambda f: fresh(pool, f) if _astray(pool, f) else ())
         for i, fit in zip(running, moved, strict=True):

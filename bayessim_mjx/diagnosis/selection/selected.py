@@ -12,6 +12,7 @@ from bayessim_mjx.diagnosis import phrases
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 from bayessim_mjx.diagnosis.selection import beam, heldout, hidden, predicted_gain, singles, weak_directions
+from bayessim_mjx.diagnosis.selection.budget import LEAVING_OUT
 from bayessim_mjx.diagnosis.selection.criteria import Criteria
 from bayessim_mjx.diagnosis.selection.decide import Alternative, Decision, chosen_elsewhere, closed_elsewhere, order
 from bayessim_mjx.diagnosis.selection.fits import Fits
@@ -111,7 +112,7 @@ def select(
 
 def concluded(pool: Pool, decision: Decision, say: Progress) -> Selection:
     """The answer where data and beliefs together put it, with its rivals and its parts."""
-    fitter, searched = pool.fitter, decision.searched or decision.table
+    fitter, settings, searched = pool.fitter, pool.settings, decision.searched or decision.table
     pool.base = pool.models[frozenset()]
     named = pool.models[decision.answer]
     rivals = {e.label: _rivals(pool, e, named, decision) for e in named.effects}
@@ -121,7 +122,8 @@ def concluded(pool: Pool, decision: Decision, say: Progress) -> Selection:
         answer, along = weak_directions.settled(fitter, answer)
         (answer,) = [answer] if answer is named else heldout.refitted(fitter, [answer])
         pool.models[decision.answer] = answer
-    subsets = _subsets(pool, answer, say) if 1 < len(answer.effects) <= MANY else {}
+    few = 1 < len(answer.effects) <= MANY and not settings.budget.over(LEAVING_OUT)
+    subsets = _subsets(pool, answer, say) if few else {}
     total, each = predicted_gain.promised(pool, answer.effects) if answer.effects else (0.0, {})
     return replace(
         frozen(pool, answer, rivals),
@@ -178,4 +180,5 @@ def _subsets(pool: Pool, answer: Model, say: Progress) -> dict[frozenset[str], M
         some = [frozenset(own) for own in itertools.combinations(sorted(every), size)]
         fits.fit([beam.Plan(own, own | {min(every - own)}) for own in some], "dropping", needed=True)
     known = itertools.chain.from_iterable(itertools.combinations(every, n) for n in range(len(every) + 1))
-    return {frozenset(own): pool.models[frozenset(own)] for own in known}
+    found = {frozenset(own): pool.models.get(frozenset(own)) for own in known}
+    return {own: model for own, model in found.items() if model is not None} if all(found.values()) else {}

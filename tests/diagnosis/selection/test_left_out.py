@@ -38,7 +38,7 @@ def test_what_there_was_no_time_for_is_told_in_words():
 
 
 def test_parts_end_one_after_the_other_and_without_a_limit_never():
-    clock = iter([30.0, 55.0, 80.0])
+    clock = iter([30.0, 55.0, 60.0])
     budget = Budget(100.0, 0.0, lambda: next(clock))
     assert [budget.over(part) for part in ("single effects", "single effects", "finalists")] == [False, True, False]
     assert list(ENDS.values()) == sorted(ENDS.values())
