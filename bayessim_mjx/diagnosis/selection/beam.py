@@ -20,9 +20,8 @@ TOGETHER, FINALISTS = "effects together", "finalists"  # parts of the budget
 # times the leading model's cost: from where polishing has brought others ahead of it. What is missed farther away was
 # not counted; error rates with it are those of d462f0c in benchmarks/results.md.
 CLOSE = 4.0
-ATONCE = (
-    3  # laws that are begun with at once: as many as sets of candidates were counted with; of proposals not counted
-)
+# laws that are begun with at once: as many as sets of candidates were counted with; of proposals not counted
+ATONCE = 3
 
 
 @dataclass(frozen=True)
@@ -81,6 +80,11 @@ def search(fits: Fitting, criteria: Criteria) -> Decision:
     return _final(fits, criteria)
 
 
+def propose(fits: Fitting, criteria: Criteria) -> None:
+    """Fit what was proposed together before the search."""
+    fits.fit([Plan(k) for k in fits.proposed(min(ATONCE, criteria.most))], "proposed together")
+
+
 def leading(table: Table, criteria: Criteria) -> list[Key]:
     """Models in the order in which the search goes on from them: density, less what their effects have to bring."""
     rows = [k for k, r in table.rows.items() if admissible(r, criteria)]
@@ -112,7 +116,7 @@ def _grow(fits: Fitting, criteria: Criteria) -> Key:
     """Add to the models of the beam as long as that brings something worth naming, and the best is above the noise."""
     best = BASE
     if not settled(fits.table, BASE, criteria):
-        fits.fit([Plan(k) for k in fits.proposed(min(ATONCE, criteria.most))], "proposed together")
+        propose(fits, criteria)
         best = _best(fits, criteria, criteria.finalists)
     for size in range(1, criteria.most):
         if settled(fits.table, best, criteria) or fits.over(TOGETHER):
@@ -194,7 +198,8 @@ def finalists(found: Decision, most: int) -> list[Key]:
 def _without_all(table: Table, key: Key, criteria: Criteria) -> Key:
     """A model without all effects that each alone could be left out, where they are several: one round in place of one
     for each; `BASE` where there are none."""
-    spare = frozenset(label for label in key if same(table, key - {label}, key, criteria))
+    fitted = [label for label in key if key - {label} in table.rows]
+    spare = frozenset(label for label in fitted if same(table, key - {label}, key, criteria))
     return key - spare if len(spare) > 1 else BASE
 
 

@@ -54,8 +54,8 @@ def widened(pool: Pool, model: Model, say: Progress) -> Model:
     """The model with ranges as wide as it takes for its effects' parameters to lie within, refitted.
 
     A range doubles as long as a still wider one promises held-out evidence, up to `farthest` times what it was; what
-    has brought it is kept. It stays where its end means that the effect is off, where physics ends, and where it sizes an effect's
-    memory.
+    has brought it is kept. It stays where its end means that the effect is off, where physics ends, and where it sizes
+    an effect's memory.
     """
     last = model
     while not pool.settings.budget.over(LEAVING_OUT) and _held(pool, last) and _promised(pool, last):

@@ -231,7 +231,8 @@ def polish(pool: Pool, models: Sequence[Model], say: Progress = lambda text, don
 def _to_the_end(pool: Pool, fits: Sequence[Fit], told: Callable[[Fit], Fit]) -> list[Fit]:
     """Fits with all columns anew every few steps, and corrected by these alone, as long as that lowers their cost.
 
-    None goes on when the time is over. One that could not come near the best, did each round to come bring as much as the last, is left where it is.
+    None goes on when the time is over. One that could not come near the best, did each round to come bring as much as
+    the last, is left where it is.
     """
     fits, running = list(fits), list(range(len(fits)))
     for made in range(RULES.rounds):

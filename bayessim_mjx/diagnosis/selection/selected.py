@@ -105,6 +105,9 @@ def select(
 ) -> Selection:
     """What the logs on the windows of `fitter` call for; `keep` is called with what was tried so far."""
     pool = singles.begin(fitter, candidates, settings, criteria, say, keep)
+    if pool.above_noise(pool.base):
+        beam.propose(Fits(pool, say), criteria)
+    singles.fit_singles(pool, say)
     decision = beam.search(Fits(pool, say), criteria)
     keep(pool)
     return concluded(pool, decision, say)

@@ -1,4 +1,4 @@
-"""What every search begins with: the known parameters alone, all candidates screened on top, single effects fitted."""
+"""What every search begins with: the known parameters alone, all candidates screened on top; then single effects."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import replace
 
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fitter import Fitter
+from bayessim_mjx.diagnosis.selection.beam import CLOSE
 from bayessim_mjx.diagnosis.selection.bounds import widen_leading
 from bayessim_mjx.diagnosis.selection.criteria import Criteria
 from bayessim_mjx.diagnosis.selection.models import scored
@@ -30,7 +31,7 @@ def begin(
     say: Progress = lambda text, done, total: None,
     keep: Callable[[Pool], None] = lambda pool: None,
 ) -> Pool:
-    """The pool with the single effects; `keep` is called with it after each part, also of what follows."""
+    """The pool with the known parameters; `keep` is called with it after each part, also of what follows."""
     say("compiling the simulator", 0, 1)
     nominal = fitter.begin(fitter.base)
     say("known parameters", 0, 1)
@@ -48,13 +49,19 @@ def begin(
     pool.models[frozenset()] = pool.base
     keep(pool)
     pool.screened = screen(fitter, fit, candidates, settings.screened, say, pool.secants)
+    return pool
+
+
+def fit_singles(pool: Pool, say: Progress = lambda text, done, total: None) -> None:
+    """Single effects in the pool, but those that promise to stay far behind what is fitted already."""
     if not pool.above_noise(pool.base):
         fit_models(pool, [(pool.base, s) for s in pool.screened[:FEW]], "single effects", say)
-        return pool
-    fit_models(pool, [(pool.base, s) for s in promising(pool.screened, settings)], "single effects", say)
+        return
+    near = CLOSE * min(m.total for m in pool.models.values())
+    some = [s for s in promising(pool.screened, pool.settings) if pool.base.total - s.gain < near]
+    fit_models(pool, [(pool.base, s) for s in some], "single effects", say)
     widen_leading(pool, say)
-    keep(pool)
-    return pool
+    pool.keep(pool)
 
 
 def promising(screened: Sequence[Screened], settings: Settings) -> list[Screened]:

@@ -74,7 +74,9 @@ def slow_logs():
 
 def diagnosed(logs):
     setup = prepare(robot(), logs, ["viscous_friction", "quadratic_drag"])
-    return setup, singles.begin(setup.fitter, setup.candidates, setup.settings, Criteria())
+    pool = singles.begin(setup.fitter, setup.candidates, setup.settings, Criteria())
+    singles.fit_singles(pool)
+    return setup, pool
 
 
 @functools.cache

@@ -125,6 +125,27 @@ def test_where_no_time_is_left_nothing_is_added_and_rivals_stay_as_they_were():
     assert told[0] == told[1] != set()
 
 
+def test_what_there_was_no_time_to_leave_out_stays_in_the_answer():
+    class Late(Linear):
+        def proposed(self, most):
+            return [frozenset([A, B, C])]
+
+        def over(self, part):
+            return True
+
+        def fit(self, plans, label, needed=False):
+            super().fit([plan for plan in plans if not needed], label)
+
+        def polish(self, keys):
+            super().polish([key for key in keys if key in self.rows])
+
+        def simulate(self, keys):
+            return super().simulate([key for key in keys if key in self.rows])
+
+    fits = Late(columns(20), {A: 4.0, B: 3.0, C: 2.0})
+    assert set(beam.search(fits, Criteria()).answer) == {A, B, C} and fits.fitted == 1 + 20 + 1
+
+
 def test_what_may_stand_in_the_place_of_an_effect():
     dry, viscous = law("coulomb_friction"), law("viscous_friction")
     both = law("asymmetric_friction", numbers=2, special=("coulomb_friction", "viscous_friction"))
