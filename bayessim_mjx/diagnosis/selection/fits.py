@@ -22,13 +22,13 @@ from bayessim_mjx.diagnosis.selection.pool import (
     Progress,
     beside,
     fit_entries,
+    law_of,
     polish,
-    special_cases,
     start_of,
     starts,
 )
 from bayessim_mjx.diagnosis.selection.screen import Screened, screen
-from bayessim_mjx.diagnosis.selection.table import BASE, Key, Law, Row, Table
+from bayessim_mjx.diagnosis.selection.table import BASE, Key, Row, Table
 from bayessim_mjx.diagnosis.selection.uncertainty import deviations
 
 Array = NDArray[np.float64]
@@ -192,13 +192,6 @@ class Fits:
             # start states count as in the search, or all models would come nearer to the noise than they did there
             cost = heldout.costs(fitter, model, seen)
             self._folds[key] = (model, replace(self._row(key, model, True), cost=cost, simulated=True))
-
-
-def law_of(candidate: Candidate) -> Law:
-    """What a decision knows of a candidate."""
-    index = frozenset(i for c in candidate.coordinates for i in c.index)
-    names = candidate.label, candidate.effect, candidate.where
-    return Law(*names, len(candidate.coordinates), index, special_cases(candidate), candidate.kind)
 
 
 def distances(pool: Pool, model: Model) -> dict[str, float]:

@@ -19,6 +19,7 @@ from bayessim_mjx.diagnosis.selection.criteria import Criteria
 from bayessim_mjx.diagnosis.selection.heats import Heats
 from bayessim_mjx.diagnosis.selection.models import Model, scored
 from bayessim_mjx.diagnosis.selection.screen import Screened, Secants
+from bayessim_mjx.diagnosis.selection.table import Law
 from bayessim_mjx.diagnosis.selection.tried import Settings, Tried
 from bayessim_mjx.effects import load, names
 
@@ -199,9 +200,15 @@ def compatible(a: Candidate, b: Candidate) -> bool:
 
 
 def beside(a: Candidate, b: Candidate) -> bool:
-    """Whether both may be in one model: not the same numbers twice, nor a law beside its special case at its place."""
-    within = a.effect in special_cases(b) or b.effect in special_cases(a)
-    return compatible(a, b) and not (within and a.where == b.where)
+    """Whether both may be in one model (`Law.beside`)."""
+    return law_of(a).beside(law_of(b))
+
+
+def law_of(candidate: Candidate) -> Law:
+    """What a decision knows of a candidate."""
+    index = frozenset(i for c in candidate.coordinates for i in c.index)
+    names = candidate.label, candidate.effect, candidate.where
+    return Law(*names, len(candidate.coordinates), index, special_cases(candidate), candidate.kind)
 
 
 def start_of(pool: Pool, candidate: Candidate) -> Screened:
