@@ -18,6 +18,7 @@ from bayessim_mjx.diagnosis.fitting import (
     candidates,
     command_shift,
     discretisation,
+    lean,
     observation,
     scales,
     stepping,
@@ -131,6 +132,7 @@ def prepare(
     seen, before = leads.checked(logs, robot, dt, told, seen_first)
     seen = seen.of_logs(observation.completed(seen.demand(), robot.mj_model))
     usable = seen.usable
+    robot = lean.lean(robot, usable, dt)
     told += [*seen.warnings, *(f"{text} (found, not assumed)" for text in seen.findings)]
     floors = noise.floors(usable)
     kinds = candidates.kinds_of(effects)

@@ -8,7 +8,7 @@ friction or a wrong damping do not become one. No drive acts before its command,
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.fitting.quadratic import Quadratic, eliminate
-from bayessim_mjx.diagnosis.fitting.substeps import Errors
+from bayessim_mjx.diagnosis.fitting.substeps import Case, Errors
 from bayessim_mjx.diagnosis.fitting.windows import Windows
 
 Array = NDArray[np.float64]
@@ -120,7 +120,8 @@ def estimate(errors: Errors, late: Late, sigma: Array, force: Array, factor: int
     nudges = np.append(RULES.nudge * cut.dt, np.full(model.size - 1, RULES.small))
     x, starts = np.zeros(model.size), np.zeros_like(errors.offsets)
     r = model.residual(x, starts)
-    A = np.stack([(r - model.residual(n, starts)) / n.max() for n in np.diag(nudges)], -1)
+    there = model.residuals(np.diag(nudges), starts)
+    A = np.stack([(r - moved) / n.max() for n, moved in zip(np.diag(nudges), there, strict=True)], -1)
     B = errors.columns(sigma)
     for _ in range(RULES.rounds):
         q, found = eliminate(r, A, B, errors.offsets + starts, cut.spread)
@@ -152,14 +153,21 @@ class _Model:
 
     def residual(self, x: Array, starts: Array) -> Array:
         """starts: `[W, 2 nv]`, further changes of the start states."""
+        return self.residuals([x], starts)[0]
+
+    def residuals(self, several: Iterable[Array], starts: Array) -> Array:
+        """`[m, W, n]`."""
+        error = self.errors.run_each([self._case(x, starts) for x in several], self.factor)
+        return np.asarray(np.clip(error / self.sigma, -1e4, 1e4).reshape(*error.shape[:2], -1))
+
+    def _case(self, x: Array, starts: Array) -> Case:
         shift, p, gains, loads = np.split(x, self.parts)
         theta = np.maximum(self.nominal + p * (self.high - self.low), self.least)  # beyond its range: nothing else may
         cut = self.late(float(shift[0]))
         command = cut.batch.command * (1 + jnp.asarray(gains, jnp.float32))
         cut = dataclasses.replace(cut, batch=cut.batch.replace(command=command))
         force = np.einsum("fv,fwhv->whv", loads.reshape(4, -1), self.forces)
-        error = self.errors.run(cut, self.factor, offsets=starts, theta=theta, force=force)
-        return np.asarray(np.clip(error / self.sigma, -1e4, 1e4).reshape(len(cut), -1))
+        return Case(cut, starts, theta, force)
 
 
 def _shapes(cut: Windows) -> Array:

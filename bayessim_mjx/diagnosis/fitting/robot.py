@@ -42,6 +42,7 @@ class Robot:
         max_qvel: the task's limit of simulated speeds, see `Physics`.
         accuracy: {parameter: standard deviation as a share}, of what a data sheet states; rating: {body: kg carried}.
         assumed: those of them whose accuracy nobody stated.
+        unlimited: joints whose limits its physics leaves out; rounds: iterations of its solver, at most (`lean`).
     """
 
     mj_model: mujoco.MjModel
@@ -53,6 +54,8 @@ class Robot:
     accuracy: Mapping[str, float] = dataclasses.field(default_factory=dict)
     rating: Mapping[int, float] = dataclasses.field(default_factory=dict)
     assumed: frozenset[str] = frozenset()
+    unlimited: tuple[int, ...] = ()
+    rounds: int | None = None
 
     def stated(self, accuracy: Sequence[str] = (), payload: Sequence[str] = ()) -> "Robot":
         """With what was said of its data sheet, as `--accuracy` and `--payload` (`data_sheet`)."""
@@ -71,6 +74,10 @@ class Robot:
     ) -> Physics:
         """The robot at control steps of `control_dt` s, with `space` in the place of its own parameters."""
         model = with_timestep(self.mj_model, control_dt)
+        model.jnt_limited[list(self.unlimited)] = 0
+        if self.rounds is not None:
+            model.opt.iterations = min(self.rounds, model.opt.iterations)
+            model.opt.ls_iterations = min(self.rounds, model.opt.ls_iterations)
         return Physics(model, control_dt, self.space if space is None else space, effects, self.max_qvel)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayessim_mjx.compat import compiler_options
-from bayessim_mjx.device import cores
+from bayessim_mjx.device import on_cores
 from bayessim_mjx.diagnosis.fitting.windows import Batch, Windows
 from bayessim_mjx.physics import Drive, Physics, begin, control_step, staggered
 from bayessim_mjx.physics.tangent import difference, integrate
@@ -52,7 +51,7 @@ class Simulator:
         self.physics, self.windows = physics, windows
         on_cpu = jax.default_backend() == "cpu"
         self.lanes = lanes or (CALL.cpu_lanes if on_cpu else CALL.lanes)
-        self.workers, self.apart = cores() if on_cpu else 1, on_cpu
+        self.apart = on_cpu
         self.nv = int(physics.mj_model.nv)
         self.channels = 2 * self.nv
         self.traces = self.rollouts = 0
@@ -139,7 +138,9 @@ class Simulator:
         firsts = list(range(0, count, self.lanes))
         alone = firsts[:1] if self.traces == 0 else []  # traced once, not by every thread
         done = [part(first) for first in alone]
-        with ThreadPoolExecutor(self.workers) as pool:
-            done += pool.map(part, firsts[len(alone) :])
+        if self.apart:
+            done += on_cores(part, firsts[len(alone) :])
+        else:
+            done += [part(first) for first in firsts[len(alone) :]]
         self.rollouts += count
         return np.concatenate(done).astype(np.float64)

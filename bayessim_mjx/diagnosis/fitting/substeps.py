@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayessim_mjx.compat import compiler_options
+from bayessim_mjx.device import on_cores
 from bayessim_mjx.diagnosis.fitting.quadratic import eliminate
 from bayessim_mjx.diagnosis.fitting.windows import Batch, Windows
 from bayessim_mjx.physics import Drive, Physics, begin, staggered, substep
@@ -25,7 +26,9 @@ Array = NDArray[np.float64]
 class Sizes:
     """How sub-steps are compared."""
 
-    starts: int = 5  # Newton steps of the start states
+    starts: int = 5  # Newton steps of the start states, at most
+    falls: float = 0.99  # of the misfit that a step leaves: with more they are at their end
+    lanes: int = 128  # windows in one call, as a CPU wants them (`simulator.CALL`)
     nudge: float = 0.0001  # rad or rad/s, at least, of the start states for their finite differences
 
 
@@ -40,6 +43,23 @@ def held(cut: Windows) -> Windows:
     return dataclasses.replace(cut, batch=cut.batch.replace(command=command))
 
 
+@dataclass(frozen=True, eq=False)
+class Case:
+    """What windows are simulated with.
+
+    Attributes:
+        cut: the windows, with their commands.
+        offsets: `[W, 2 nv]`, changes of the start states besides those that were fitted.
+        theta: `[P]`, parameters; None: nominal.
+        force: `[W, H, nv]`, generalised force that acts besides.
+    """
+
+    cut: Windows
+    offsets: Array | None = None
+    theta: Array | None = None
+    force: Array | None = None
+
+
 class Errors:
     """Windows without effects at any sub-step, by one compiled program: measured minus simulated, `[W, H, 2 nv]`.
 
@@ -50,38 +70,43 @@ class Errors:
     def __init__(self, physics: Physics, cut: Windows, most: int) -> None:
         self.physics, self.cut, self.most = physics, cut, most * physics.substeps
         self.first = cut.batch.command.shape[2] // physics.substeps
-        self.theta = jnp.asarray(physics.space.nominal, jnp.float32)
+        self.theta = np.asarray(physics.space.nominal, np.float32)
         self.offsets = np.zeros((len(cut), 2 * physics.mj_model.nv))  # of the measured start states
         self._no_force = np.zeros((len(cut), cut.steps, physics.mj_model.nv), np.float32)
-        axes = (0, 0, 0, None, None, None, None)
+        self._at_once = max(1, SIZES.lanes // len(cut))
+        self._windows = jax.tree.map(lambda x: jnp.concatenate([x] * self._at_once), cut.batch)
+        axes = (0, 0, 0, 0, None, None, None)
         self._run = jax.jit(jax.vmap(self._one, in_axes=axes), compiler_options=compiler_options())
 
-    def run(
-        self,
-        cut: Windows,
-        factor: int,
-        corrected: bool = True,
-        offsets: Array | None = None,
-        theta: Array | None = None,
-        force: Array | None = None,
-    ) -> Array:
-        """With the commands of `cut` at the sub-step h / factor.
+    def run(self, cut: Windows, factor: int, corrected: bool = True, offsets: Array | None = None) -> Array:
+        """With the commands of `cut` at the sub-step h / factor; corrected: velocities lie half of that early."""
+        return self.run_each([Case(cut, offsets)], factor, corrected)[0]
 
-        Args:
-            corrected: velocities lie half of the sub-step early.
-            offsets: `[W, 2 nv]`, further changes of the start states.
-            theta: `[P]`, parameters; None: nominal.
-            force: `[W, H, nv]`, generalised force that acts besides.
-        """
-        count = cut.batch.command.shape[2]
-        missing = [(0, 0), (0, 0), (0, self.most - count), (0, 0)]
-        batch = self.cut.batch.replace(command=jnp.pad(cut.batch.command, missing))  # the past keeps its shape
-        offsets = self.offsets if offsets is None else self.offsets + offsets
+    def run_each(self, cases: Sequence[Case], factor: int, corrected: bool = True) -> Array:
+        """Several cases together, `[n, W, H, 2 nv]`: few windows alone do not fill a call."""
         h = np.float32(self.physics.mj_model.opt.timestep / factor)
-        acting = self._no_force if force is None else np.asarray(force, np.float32)
-        values = self.theta if theta is None else jnp.asarray(theta, jnp.float32)
-        error = self._run(batch, np.asarray(offsets, np.float32), acting, values, count, h, np.float32(corrected))
-        return np.nan_to_num(np.asarray(error, np.float64), nan=1e3, posinf=1e3, neginf=-1e3)
+
+        def part(first: int) -> Array:
+            own = list(cases[first : first + self._at_once])
+            count, own = len(own), own + own[-1:] * (self._at_once - len(own))
+            substeps = own[0].cut.batch.command.shape[2]
+            each = zip(*(self._inputs(case) for case in own), strict=True)
+            command, offsets, force, theta = (np.concatenate(several) for several in each)
+            windows = self._windows.replace(command=command)
+            error = self._run(windows, offsets, force, theta, substeps, h, np.float32(corrected))
+            return np.asarray(error, np.float64).reshape(self._at_once, len(self.cut), *error.shape[1:])[:count]
+
+        done = on_cores(part, range(0, len(cases), self._at_once))
+        return np.nan_to_num(np.concatenate(done), nan=1e3, posinf=1e3, neginf=-1e3)
+
+    def _inputs(self, case: Case) -> tuple[NDArray[np.float32], ...]:
+        """Commands (of one shape whatever the sub-steps), start states, forces and parameters of each window."""
+        command = np.asarray(case.cut.batch.command, np.float32)
+        missing = [(0, 0), (0, 0), (0, self.most - command.shape[2]), (0, 0)]
+        offsets = self.offsets if case.offsets is None else self.offsets + case.offsets
+        force = self._no_force if case.force is None else np.asarray(case.force, np.float32)
+        theta = np.asarray(self.theta if case.theta is None else case.theta, np.float32)
+        return np.pad(command, missing), np.asarray(offsets, np.float32), force, np.tile(theta, (len(offsets), 1))
 
     def _one(self, own: Batch, *given: jax.Array) -> jax.Array:
         with jax.default_matmul_precision("highest"):
@@ -118,22 +143,26 @@ class Errors:
         error = jax.vmap(lambda a, b: difference(physics.mj_model, a, b))(own.qpos, qpos)
         return jnp.concatenate([error, own.qvel - qvel], axis=1)
 
-    def columns(self, sigma: Array) -> Array:
-        """`[W, n, 2 nv]`, minus the derivatives of the whitened errors by the start states."""
-        here = self.run(self.cut, self.first)
+    def columns(self, sigma: Array, here: Array | None = None) -> Array:
+        """`[W, n, 2 nv]`, minus the derivatives of the whitened errors by the start states; here: the errors there."""
+        here = self.run(self.cut, self.first) if here is None else here
         nudges = np.diag(np.maximum(0.2 * self.cut.spread, SIZES.nudge))
-        moved = [(here - self.run(self.cut, self.first, offsets=n)) / n.max() / sigma for n in nudges]
+        there = self.run_each([Case(self.cut, np.tile(n, (len(self.cut), 1))) for n in nudges], self.first)
+        moved = [(here - error) / n.max() / sigma for n, error in zip(nudges, there, strict=True)]
         return np.stack([m.reshape(len(m), -1) for m in moved], -1)
 
     def start(self, sigma: Array) -> None:
         """Fit the start states: far from the measured motion the time step is worth something else."""
-        spread = self.cut.spread
+        here = self.run(self.cut, self.first)
         for _ in range(SIZES.starts):
-            before, columns = self.run(self.cut, self.first) / sigma, self.columns(sigma)
-            step = _step(before, columns, self.offsets, spread)
-            after = self.run(self.cut, self.first, offsets=step) / sigma
-            better = np.sum(after**2, (1, 2)) < np.sum(before**2, (1, 2))
+            step = _step(here / sigma, self.columns(sigma, here), self.offsets, self.cut.spread)
+            there = self.run(self.cut, self.first, offsets=step)
+            before, after = (np.sum((error / sigma) ** 2, (1, 2)) for error in (here, there))
+            better = after < before
             self.offsets = self.offsets + np.where(better[:, None], step, 0.0)
+            here = np.where(better[:, None, None], there, here)
+            if np.minimum(before, after).sum() > SIZES.falls * before.sum():
+                break
 
     def settler(self, sigma: Array) -> Callable[[Array], Array]:
         """Errors -> errors that no change of the start states takes away, by linearisation."""
