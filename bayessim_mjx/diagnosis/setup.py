@@ -131,8 +131,7 @@ def prepare(
     told = [*notes]
     seen, before = leads.checked(logs, robot, dt, told, seen_first)
     seen = seen.of_logs(observation.completed(seen.demand(), robot.mj_model))
-    usable = seen.usable
-    robot = lean.lean(robot, usable, dt)
+    usable, robot = seen.usable, lean.lean(robot, seen.usable, dt)
     told += [*seen.warnings, *(f"{text} (found, not assumed)" for text in seen.findings)]
     floors = noise.floors(usable)
     kinds = candidates.kinds_of(effects)

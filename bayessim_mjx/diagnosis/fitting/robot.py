@@ -14,10 +14,11 @@ import numpy as np
 from bayessim_mjx import config
 from bayessim_mjx.config import foreign
 from bayessim_mjx.diagnosis import data_sheet
+from bayessim_mjx.diagnosis.fitting.simulable import check, label, one_line
 from bayessim_mjx.effects.effect import Effect
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.parameters import ParameterSpace, elements
-from bayessim_mjx.physics import Physics, mjx
+from bayessim_mjx.physics import Physics
 
 if TYPE_CHECKING:
     from bayessim_mjx.env import Task
@@ -26,7 +27,6 @@ TRAINING = ("frequency", "observations", "actions", "sim_params")
 WITHIN = (0.8, 1.2)  # the default range of a scale
 _IMPLICIT = int(mujoco.mjtIntegrator.mjINT_IMPLICIT)
 _FREE = int(mujoco.mjtJoint.mjJNT_FREE)
-_AXIAL = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -100,7 +100,7 @@ def robot_of(source: Source, parameters: str | Path | None = None) -> Robot:
         return dataclasses.replace(source, space=space, accuracy={}, assumed=frozenset())
     if isinstance(source, mujoco.MjModel):
         name = bytes(source.names).split(b"\0")[0].decode() or "model"
-        _check(source, name)
+        check(source, name)
         return Robot(source, None, None, _space(source, parameters), name)._from_data_sheet(parameters is None)
     if isinstance(source, mujoco.MjSpec):
         return _of_spec(source.copy(), source.modelname or "model", source.modelname, parameters)
@@ -115,7 +115,7 @@ def of_task(env: "Task", parameters: str | Path | None = None) -> Robot:
     """
     if not hasattr(env, "physics") or not hasattr(env, "spec"):
         raise UserError(f"--task {env.name}: it has no MuJoCo model of ours; give its MJCF with --model")
-    _check(env.mj_model, f"--task {env.name}")
+    check(env.mj_model, f"--task {env.name}")
     space, limit = _space(env.mj_model, parameters), env.physics.max_qvel
     return Robot(env.mj_model, env.spec, env.dt, space, env.name, None if limit is None else limit.tolist())
 
@@ -138,7 +138,7 @@ def _of_spec(spec: mujoco.MjSpec, source: str, name: str, parameters: str | Path
         warnings.warn(text, stacklevel=3)
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     model = _compiled(spec, source)
-    _check(model, source)
+    check(model, source)
     return Robot(model, spec.copy, None, _space(model, parameters), name)._from_data_sheet(parameters is None)
 
 
@@ -146,80 +146,14 @@ def _loaded(path: Path) -> mujoco.MjSpec:
     try:
         return mujoco.MjSpec.from_file(str(path))
     except ValueError as error:
-        raise UserError(f"{path}: MuJoCo cannot load it: {_one_line(error)}") from None
+        raise UserError(f"{path}: MuJoCo cannot load it: {one_line(error)}") from None
 
 
 def _compiled(spec: mujoco.MjSpec, source: str) -> mujoco.MjModel:
     try:
         return spec.compile()
     except ValueError as error:
-        raise UserError(f"{source}: MuJoCo cannot compile it: {_one_line(error)}") from None
-
-
-def _one_line(error: Exception) -> str:
-    return "; ".join(line.strip() for line in str(error).splitlines() if line.strip())
-
-
-def _check(model: mujoco.MjModel, source: str) -> None:
-    """Refuse a model without motion or commands, and what MJX cannot simulate."""
-    if not np.isin(model.jnt_type, _AXIAL).any():
-        raise UserError(f"{source}: the model has no hinge or slide joint, so there is no motion to compare")
-    if not model.nu:
-        raise UserError(f"{source}: the model has no actuator, so the logged commands cannot act on it")
-    step = float(model.opt.timestep)
-    if not (math.isfinite(step) and step > 0):
-        raise UserError(f"{source}: <option timestep> = {step:g}; allowed: seconds > 0")
-    if broken := _not_finite(model):
-        raise UserError(f"{source}: numbers that are not finite in {', '.join(broken)}; allowed: finite numbers")
-    idle = [_label(model, "actuator", i) for i in range(model.nu) if not np.any(model.actuator_gear[i])]
-    if len(idle) == model.nu:
-        raise UserError(f"{source}: gear = 0 of every actuator ({', '.join(idle)}): the logged commands cannot act")
-    if idle:
-        warnings.warn(f"{source}: gear = 0 of {', '.join(idle)}: these commands do nothing", stacklevel=3)
-    if model.nplugin:
-        raise UserError(f"{source}: MJX cannot simulate this model: it has plugins")
-    ignored = [what for field, what in _IGNORED.items() if np.any(getattr(model, field, 0.0))]
-    if ignored:
-        text = f"{source}: MJX leaves out {', '.join(ignored)}: effects may be found in their place"
-        warnings.warn(text, stacklevel=3)
-    try:
-        mjx.make_data(mjx.put_model(model, impl="jax"))
-    except (NotImplementedError, ValueError, TypeError) as error:
-        raise UserError(f"{source}: MJX cannot simulate this model: {_one_line(error)}{_remedy(str(error))}") from None
-
-
-def _not_finite(model: mujoco.MjModel) -> list[str]:
-    """MuJoCo's arrays with a NaN or an infinity in them, by name: a gain, a mass, and what follows from them."""
-    fields = ((name, getattr(model, name, None)) for name in dir(model) if not name.startswith("_"))
-    floats = ((name, x) for name, x in fields if isinstance(x, np.ndarray) and x.dtype.kind == "f")
-    return [name for name, x in floats if not np.isfinite(x).all()]
-
-
-_IGNORED = {  # in the model but not in MJX's equations
-    "actuator_delay": "the actuators' delay",
-    "actuator_damping": "the actuators' damping",
-    "dof_dampingpoly": "nonlinear damping",
-    "jnt_stiffnesspoly": "nonlinear stiffness",
-}
-
-
-def _remedy(message: str) -> str:
-    """What to change in the MJCF."""
-    return next((f" ({remedy})" for word, remedy in _REMEDIES.items() if word in message), "")
-
-
-_REMEDIES = {
-    "mjtIntegrator": "use Euler, implicitfast or RK4 in <option integrator=...>",
-    "mjtSolver": "use CG or Newton in <option solver=...>",
-    "collisions": "switch the contacts of these geoms off by contype and conaffinity, or use other shapes",
-    "margin/gap": "take margin and gap off these geoms",
-    "Flex": "take the flexible bodies out",
-    "mjtEnableBit": "take it out of <option><flag>",
-    "mjGEOM": "use other shapes for these geoms",
-    "fluid": "use the integrator Euler, or density and viscosity 0",
-    "mjtSensor": "take these sensors out: a diagnosis reads joints",
-    "not supported": "MJX has motor, position, velocity and general actuators on joints, tendons and sites",
-}
+        raise UserError(f"{source}: MuJoCo cannot compile it: {one_line(error)}") from None
 
 
 def with_timestep(model: mujoco.MjModel, control_dt: float) -> mujoco.MjModel:
@@ -243,20 +177,16 @@ def default_space(model: mujoco.MjModel) -> ParameterSpace:
     """
     joints = [j for j in range(model.njnt) if model.jnt_type[j] != _FREE]
     dofs = model.jnt_dofadr[joints]
-    damped = [_label(model, "joint", j) for j, d in zip(joints, dofs, strict=True) if model.dof_damping[d] > 0]
-    geared = [_label(model, "joint", j) for j, d in zip(joints, dofs, strict=True) if model.dof_armature[d] > 0]
+    damped = [label(model, "joint", j) for j, d in zip(joints, dofs, strict=True) if model.dof_damping[d] > 0]
+    geared = [label(model, "joint", j) for j, d in zip(joints, dofs, strict=True) if model.dof_armature[d] > 0]
     moving = np.flatnonzero((model.body_weldid != 0) & (model.body_mass > mujoco.mjMINVAL))
-    heavy = [_label(model, "body", int(b)) for b in moving]
+    heavy = [label(model, "body", int(b)) for b in moving]
     groups = {
         "dof_properties": {"damping": damped, "armature": geared},
         "rigid_body_properties": {"mass": heavy},
     }
     section = {g: {a: _scale(found) for a, found in members.items() if found} for g, members in groups.items()}
     return ParameterSpace.from_config({"actor_params": {_whole(model): section}}, model)
-
-
-def _label(model: mujoco.MjModel, kind: str, i: int) -> str:
-    return getattr(model, kind)(i).name or f"{kind}{i}"
 
 
 def _scale(include: Sequence[str]) -> dict[str, Any]:

@@ -1,0 +1,82 @@
+"""Whether MJX can simulate a model that somebody brings, and what to change where it cannot."""
+
+import math
+import warnings
+
+import mujoco
+import numpy as np
+
+from bayessim_mjx.errors import UserError
+from bayessim_mjx.physics import mjx
+
+AXIAL = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+
+
+def one_line(error: Exception) -> str:
+    return "; ".join(line.strip() for line in str(error).splitlines() if line.strip())
+
+
+def check(model: mujoco.MjModel, source: str) -> None:
+    """Refuse a model without motion or commands, and what MJX cannot simulate."""
+    if not np.isin(model.jnt_type, AXIAL).any():
+        raise UserError(f"{source}: the model has no hinge or slide joint, so there is no motion to compare")
+    if not model.nu:
+        raise UserError(f"{source}: the model has no actuator, so the logged commands cannot act on it")
+    step = float(model.opt.timestep)
+    if not (math.isfinite(step) and step > 0):
+        raise UserError(f"{source}: <option timestep> = {step:g}; allowed: seconds > 0")
+    if broken := _not_finite(model):
+        raise UserError(f"{source}: numbers that are not finite in {', '.join(broken)}; allowed: finite numbers")
+    idle = [label(model, "actuator", i) for i in range(model.nu) if not np.any(model.actuator_gear[i])]
+    if len(idle) == model.nu:
+        raise UserError(f"{source}: gear = 0 of every actuator ({', '.join(idle)}): the logged commands cannot act")
+    if idle:
+        warnings.warn(f"{source}: gear = 0 of {', '.join(idle)}: these commands do nothing", stacklevel=3)
+    if model.nplugin:
+        raise UserError(f"{source}: MJX cannot simulate this model: it has plugins")
+    ignored = [what for field, what in _IGNORED.items() if np.any(getattr(model, field, 0.0))]
+    if ignored:
+        text = f"{source}: MJX leaves out {', '.join(ignored)}: effects may be found in their place"
+        warnings.warn(text, stacklevel=3)
+    try:
+        mjx.make_data(mjx.put_model(model, impl="jax"))
+    except (NotImplementedError, ValueError, TypeError) as error:
+        raise UserError(f"{source}: MJX cannot simulate this model: {one_line(error)}{_remedy(str(error))}") from None
+
+
+def _not_finite(model: mujoco.MjModel) -> list[str]:
+    """MuJoCo's arrays with a NaN or an infinity in them, by name: a gain, a mass, and what follows from them."""
+    fields = ((name, getattr(model, name, None)) for name in dir(model) if not name.startswith("_"))
+    floats = ((name, x) for name, x in fields if isinstance(x, np.ndarray) and x.dtype.kind == "f")
+    return [name for name, x in floats if not np.isfinite(x).all()]
+
+
+_IGNORED = {  # in the model but not in MJX's equations
+    "actuator_delay": "the actuators' delay",
+    "actuator_damping": "the actuators' damping",
+    "dof_dampingpoly": "nonlinear damping",
+    "jnt_stiffnesspoly": "nonlinear stiffness",
+}
+
+
+def _remedy(message: str) -> str:
+    """What to change in the MJCF."""
+    return next((f" ({remedy})" for word, remedy in _REMEDIES.items() if word in message), "")
+
+
+_REMEDIES = {
+    "mjtIntegrator": "use Euler, implicitfast or RK4 in <option integrator=...>",
+    "mjtSolver": "use CG or Newton in <option solver=...>",
+    "collisions": "switch the contacts of these geoms off by contype and conaffinity, or use other shapes",
+    "margin/gap": "take margin and gap off these geoms",
+    "Flex": "take the flexible bodies out",
+    "mjtEnableBit": "take it out of <option><flag>",
+    "mjGEOM": "use other shapes for these geoms",
+    "fluid": "use the integrator Euler, or density and viscosity 0",
+    "mjtSensor": "take these sensors out: a diagnosis reads joints",
+    "not supported": "MJX has motor, position, velocity and general actuators on joints, tendons and sites",
+}
+
+
+def label(model: mujoco.MjModel, kind: str, i: int) -> str:
+    return getattr(model, kind)(i).name or f"{kind}{i}"
