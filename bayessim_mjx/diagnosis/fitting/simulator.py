@@ -25,7 +25,7 @@ class Call:
 
     # worlds in one call; fewer are padded, more are cut. A CPU wants them in its cache (a pendulum's: 2.2 times as
     # fast as 1024) and one call on each core, an accelerator as many as it can get
-    cpu_lanes: int = 128
+    cpu_lanes: int = 64
     lanes: int = 4096
 
 

@@ -81,8 +81,8 @@ def search(fits: Fitting, criteria: Criteria) -> Decision:
 
 
 def propose(fits: Fitting, criteria: Criteria) -> None:
-    """Fit what was proposed together before the search."""
-    fits.fit([Plan(k) for k in fits.proposed(min(ATONCE, criteria.most))], "proposed together")
+    """Fit what was proposed together before the search: where time is short it comes before all else."""
+    fits.fit([Plan(k) for k in fits.proposed(min(ATONCE, criteria.most))], "proposed together", needed=True)
 
 
 def leading(table: Table, criteria: Criteria) -> list[Key]:
