@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from bayessim_mjx.diagnosis import tolerance
+from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
 from bayessim_mjx.diagnosis.result import FoundEffect, Gap
 from bayessim_mjx.diagnosis.selection.heldout import Prediction
 from bayessim_mjx.diagnosis.summary import how_far, repeated, sentences, verdict
@@ -103,7 +104,8 @@ def findings(rms, noise=50.0, windows=8):
     def prediction(level):
         return Prediction(np.full((windows, 5, 2), float(level)), np.zeros((windows, 4)))
 
-    winner = SimpleNamespace(effects=(FRICTION,), total=windows * noise * rms**2)
+    fit = SimpleNamespace(coordinates=(), values=())
+    winner = SimpleNamespace(effects=(FRICTION,), total=windows * noise * rms**2, fit=fit)
     selection = SimpleNamespace(
         ambiguous=False,
         rivals={},
@@ -134,6 +136,19 @@ def test_effects_that_leave_a_large_share_are_no_explanation():
     """400 of 1000 noises are 16 % of the squared gap."""
     assert verdict.verdict_of(findings(400.0), gap(0.04)).name == "unexplained"
     assert verdict.verdict_of(findings(380.0), gap(0.038)).name == "effects"  # 14 %
+
+
+@pytest.mark.parametrize(
+    ("off", "stated", "bent"),
+    [([4.0] * 6, True, (6, 6)), ([2.0] * 6, True, (0, 0)), ([4.0] * 6, False, (0, 0)), ([5.0, 5.0, 1.0], True, (2, 3))],
+)
+def test_effects_that_need_another_robot_do_not_explain_it(off, stated, bent):
+    """6 at 4 sd, were these 1.5 times as large: chi2 = 42.7 of 6, 1 in 7 million; at 2 sd 10.7 of 6, one in ten."""
+    known = tuple(Coordinate(f"mass{i}", (i,), 1.0, 0.5, 1.5, precision=400.0, stated=stated) for i in range(len(off)))
+    found = findings(132.0)
+    found.model.fit.coordinates, found.model.fit.values = known, tuple(1.0 + 0.05 * x for x in off)
+    told = verdict.verdict_of(found, gap(0.0132))
+    assert told.bent == bent and told.name == ("unexplained" if any(bent) else "effects")
 
 
 def test_the_headline_says_partly_explained_and_what_remains_where():

@@ -70,6 +70,11 @@ HIDDEN = (
     "Beside {them} these logs would not show {hidden}: parameters of what is named do the same, and stand for both "
     "where both are there."
 )
+BENT = (
+    "This needs {far} of {known} known parameters far from the data sheet, by chance less often than in 1 of 10 000 "
+    "robots even if it is half as inaccurate again as stated: something else may be missing in their place, or the "
+    "data sheet is not this robot's (--accuracy, --parameters)."
+)
 OF_SENSORS = "What remains has the covariance of noise of the sensors, {colour}."
 CHANCE = (
     "What remains, {calibrated}, no candidate and no flexible force predicts on held-out conditions: process noise, an "
@@ -88,6 +93,8 @@ def sentences(
     """The verdict, most important first; `odds`: what is named by chance, see `Diagnosis.chance`."""
     name, cut = verdict.name, found.selection.fitter.simulator.windows
     told = verdict_in_words(name, effects, far, verdict.remains, verdict.beaten)
+    far_off, known = verdict.bent
+    told += [BENT.format(far=far_off, known=known)] if known else []
     told += [_by_chance(odds)]
     if found.selection.ambiguous:
         told += [_instead(e, found.selection.rivals.get(f"{e.name}@{e.where}", ())) for e in effects]
