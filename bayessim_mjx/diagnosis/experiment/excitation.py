@@ -14,7 +14,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from bayessim_mjx.diagnosis.experiment.limits import AXIAL, Limits
+from bayessim_mjx.diagnosis.experiment.limits import Limits
+from bayessim_mjx.diagnosis.fitting.simulable import AXIAL
 from bayessim_mjx.logs.log import Log
 
 Array = NDArray[np.float64]

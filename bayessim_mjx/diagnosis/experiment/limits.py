@@ -10,13 +10,13 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from bayessim_mjx.diagnosis.fitting.simulable import AXIAL
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Channels, Log
 from bayessim_mjx.parameters.attributes import suggest
 
 Array = NDArray[np.float64]
 BEYOND = 1.1  # of what the logs already did, where nothing else is said
-AXIAL = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 _KEYS = {"joints": ("range", "speed"), "actuators": ("command", "effort")}
 
 

@@ -28,7 +28,6 @@ class Sizes:
 
     starts: int = 5  # Newton steps of the start states, at most
     falls: float = 0.99  # of the misfit that a step leaves: with more they are at their end
-    lanes: int = 128  # windows in one call, as a CPU wants them (`simulator.CALL`)
     nudge: float = 0.0001  # rad or rad/s, at least, of the start states for their finite differences
 
 
@@ -73,9 +72,7 @@ class Errors:
         self.theta = np.asarray(physics.space.nominal, np.float32)
         self.offsets = np.zeros((len(cut), 2 * physics.mj_model.nv))  # of the measured start states
         self._no_force = np.zeros((len(cut), cut.steps, physics.mj_model.nv), np.float32)
-        self._at_once = max(1, SIZES.lanes // len(cut))
-        self._windows = jax.tree.map(lambda x: jnp.concatenate([x] * self._at_once), cut.batch)
-        axes = (0, 0, 0, 0, None, None, None)
+        axes = (0, 0, 0, None, None, None, None)
         self._run = jax.jit(jax.vmap(self._one, in_axes=axes), compiler_options=compiler_options())
 
     def run(self, cut: Windows, factor: int, corrected: bool = True, offsets: Array | None = None) -> Array:
@@ -83,30 +80,20 @@ class Errors:
         return self.run_each([Case(cut, offsets)], factor, corrected)[0]
 
     def run_each(self, cases: Sequence[Case], factor: int, corrected: bool = True) -> Array:
-        """Several cases together, `[n, W, H, 2 nv]`: few windows alone do not fill a call."""
+        """Several cases, `[n, W, H, 2 nv]`, one on each core: together a window costs as much as apart."""
         h = np.float32(self.physics.mj_model.opt.timestep / factor)
 
-        def part(first: int) -> Array:
-            own = list(cases[first : first + self._at_once])
-            count, own = len(own), own + own[-1:] * (self._at_once - len(own))
-            substeps = own[0].cut.batch.command.shape[2]
-            each = zip(*(self._inputs(case) for case in own), strict=True)
-            command, offsets, force, theta = (np.concatenate(several) for several in each)
-            windows = self._windows.replace(command=command)
-            error = self._run(windows, offsets, force, theta, substeps, h, np.float32(corrected))
-            return np.asarray(error, np.float64).reshape(self._at_once, len(self.cut), *error.shape[1:])[:count]
+        def one(case: Case) -> Array:
+            count = case.cut.batch.command.shape[2]
+            missing = [(0, 0), (0, 0), (0, self.most - count), (0, 0)]
+            batch = self.cut.batch.replace(command=jnp.pad(case.cut.batch.command, missing))  # the past keeps its shape
+            offsets = self.offsets if case.offsets is None else self.offsets + case.offsets
+            force = self._no_force if case.force is None else np.asarray(case.force, np.float32)
+            theta = np.asarray(self.theta if case.theta is None else case.theta, np.float32)
+            given = np.asarray(offsets, np.float32), force, theta
+            return np.asarray(self._run(batch, *given, count, h, np.float32(corrected)), np.float64)
 
-        done = on_cores(part, range(0, len(cases), self._at_once))
-        return np.nan_to_num(np.concatenate(done), nan=1e3, posinf=1e3, neginf=-1e3)
-
-    def _inputs(self, case: Case) -> tuple[NDArray[np.float32], ...]:
-        """Commands (of one shape whatever the sub-steps), start states, forces and parameters of each window."""
-        command = np.asarray(case.cut.batch.command, np.float32)
-        missing = [(0, 0), (0, 0), (0, self.most - command.shape[2]), (0, 0)]
-        offsets = self.offsets if case.offsets is None else self.offsets + case.offsets
-        force = self._no_force if case.force is None else np.asarray(case.force, np.float32)
-        theta = np.asarray(self.theta if case.theta is None else case.theta, np.float32)
-        return np.pad(command, missing), np.asarray(offsets, np.float32), force, np.tile(theta, (len(offsets), 1))
+        return np.nan_to_num(np.stack(on_cores(one, cases)), nan=1e3, posinf=1e3, neginf=-1e3)
 
     def _one(self, own: Batch, *given: jax.Array) -> jax.Array:
         with jax.default_matmul_precision("highest"):
