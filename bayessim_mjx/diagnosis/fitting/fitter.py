@@ -51,6 +51,14 @@ class Fitter:
         r = (errors if self.used.all() else errors[..., self.used]) / self.sigma
         return np.clip(r, -1e6, 1e6, out=r).reshape(*errors.shape[:-2], -1)
 
+    def rate(self) -> Array:
+        """`[W, n]`, how fast what residuals compare changes by the logs, noise sd a second."""
+        cut = self.simulator.windows
+        rows = cut.start[:, None] + 1 + np.arange(cut.steps)
+        speed = np.stack([cut.logs[log].qvel[own] for log, own in zip(cut.log, rows, strict=True)])
+        both = np.concatenate([speed, np.gradient(speed, cut.dt, axis=1)], 2)
+        return np.asarray((both[..., self.used] / self.sigma).reshape(len(speed), -1))
+
     def vector(self, coordinates: Sequence[Coordinate], values: Array) -> Array:
         """theta `[P]`."""
         theta = self.theta.copy()

@@ -125,11 +125,7 @@ def squares(fitter: Fitter, fit: Fit) -> tuple[Array, Array]:
 
     Start states take a part of either: where a motion turns, something of the noise beside it is left.
     """
-    cut = fitter.simulator.windows
-    rows = cut.start[:, None] + 1 + np.arange(cut.steps)
-    speed = np.stack([cut.logs[log].qvel[own] for log, own in zip(cut.log, rows, strict=True)])
-    both = np.concatenate([speed, np.gradient(speed, cut.dt, axis=1)], 2)
-    rate = (both[..., fitter.used] / fitter.sigma).reshape(len(speed), -1)
+    rate = fitter.rate()
     even, moving = np.empty_like(rate), np.empty_like(rate)
     for w, B in enumerate(fit.B):
         left = np.eye(len(B)) - B @ np.linalg.solve(B.T @ B + np.diag(1 / fitter.spread**2), B.T)

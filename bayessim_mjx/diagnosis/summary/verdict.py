@@ -134,8 +134,9 @@ def sensors_noise(found: Findings) -> Origin | None:
     if flex is None or missing is None or flex.condition.significant or flex.interpolation.significant:
         return None
     fit = found.model.fit
-    channels = int(found.selection.fitter.used.sum())
-    where = origin(fit.r, fit.B, missing.linear.D, missing.amplitude, channels, fit.weight)
+    fitter = found.selection.fitter
+    channels = int(fitter.used.sum())
+    where = origin(fit.r, fit.B, missing.linear.D, missing.amplitude, channels, fit.weight, fitter.rate())
     return where if where.of_sensors else None
 
 

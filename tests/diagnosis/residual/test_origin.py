@@ -55,3 +55,21 @@ def test_a_force_on_a_heavy_mass_beside_a_light_one_that_would_move_a_hundred_ti
     parts = (r.reshape(W, -1), two.reshape(W, 2 * n, -1), pushed.reshape(W, 2 * n, -1))
     assert not origin(*parts, np.array([1.0, 1e-4]), 2, np.ones(W)).of_sensors
     assert origin(*parts, np.array([1.0, 1e-4]), 2, np.ones(W)).force > origin(*parts, np.ones(2), 2, np.ones(W)).force
+
+
+def test_a_clock_that_jitters_is_no_force_though_it_moves_position_and_speed_together():
+    """Position and speed of a mass that swings are read at times that are off by 1.2 ms, and a step comes early once."""
+    rng, (B, D) = np.random.default_rng(3), columns()
+    t = np.arange(STEPS) * DT + rng.uniform(0, 3, (WINDOWS, 1))
+    speed = 3.0 * rng.uniform(0, 2, (WINDOWS, 1)) * np.sin(6 * t)
+    rate = np.stack([speed, np.gradient(speed, DT, axis=1)], 2) / 1e-3
+    shift = lambda a: np.gradient(a, axis=1)  # noqa: E731
+    both = lambda a: np.stack([a, shift(a)], 2)  # noqa: E731
+    B, D = (both(a).reshape(WINDOWS, 2 * STEPS, -1) for a in (B, D))
+    r = rng.normal(size=(WINDOWS, STEPS, 2)) + 1.2e-3 * rng.normal(size=(WINDOWS, STEPS, 1)) * rate
+    r = r.reshape(WINDOWS, -1)
+    r[7] += 6 * D[7, :, 20] / np.sqrt(np.mean(D[7, :, 20] ** 2))
+    found = origin(r, B, D, np.ones(1), 2, np.ones(WINDOWS), rate.reshape(WINDOWS, -1))
+    assert found.of_sensors and found.deviate < 1
+    r += 3 * np.einsum("wnd,wd->wn", D, coloured(rng, 0.95)) / np.sqrt(np.mean(D**2) * STEPS)
+    assert not origin(r, B, D, np.ones(1), 2, np.ones(WINDOWS), rate.reshape(WINDOWS, -1)).of_sensors
