@@ -52,6 +52,7 @@ class Effect(abc.ABC):
         ""  # of one parameter: acceleration, speed, drag or dry (sign of speed), to which it is a force
     )
     joint: ClassVar[bool] = False  # its amplitudes are searched together: one alone may not act at all
+    star: ClassVar[bool] = False  # its shapes are searched one at a time, the others in the middle of their grids
     offered: ClassVar[bool] = True  # among all the effects that a diagnosis tries; else only where it is named
     # for people; where these are empty, `support.words` says something by name and docstring
     noun: ClassVar[str] = ""  # what it is called: "command delay"

@@ -73,11 +73,12 @@ class Payload(Effect):
     noun: ClassVar[str] = "extra payload"
     lacks: ClassVar[str] = "an extra payload"
     separates: ClassVar[str] = "many poses with accelerations; a known payload of a different mass"
+    star: ClassVar[bool] = True  # links carry along their axes, not in the corners of a box
     quantities: ClassVar[tuple[Quantity, ...]] = (
         Quantity("mass", 0.0, 0.0, 1.0, unit="kg", per="carried", reach=(0.0, 1.0), grid=(0.01, 0.05, 0.2, 0.5)),
         *(
             Quantity(
-                f"com_{axis}", 0.0, -0.1, 0.1, unit="m", per="tool", reach=(-1.0, 1.0), grid=(0.3, 0.7), shape=True
+                f"com_{axis}", 0.0, -0.1, 0.1, unit="m", per="tool", reach=(-1.0, 1.0), grid=(0.3, 0.5, 0.7), shape=True
             )
             for axis in "xyz"
         ),

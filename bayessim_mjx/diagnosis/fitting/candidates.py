@@ -182,7 +182,8 @@ def shrink(c: Coordinate) -> float:
 def _probes(effect: Effect, coordinates: Sequence[Coordinate]) -> Array:
     """Starting points `[n, k]`: each amplitude alone at each grid value, shapes over their grids.
 
-    Amplitudes that act together alone (`Effect.joint`) also in all combinations.
+    Amplitudes that act together alone (`Effect.joint`) also in all combinations; shapes of a star (`Effect.star`) only
+    one at a time.
     """
     quantities = effect.quantities
     neutral = [c.neutral for c in coordinates]
@@ -190,7 +191,12 @@ def _probes(effect: Effect, coordinates: Sequence[Coordinate]) -> Array:
     shapes = [v if q.shape else [n] for q, v, n in zip(quantities, values, neutral, strict=True)]
     points: list[tuple[float, ...]] = []
     for j in (j for j, q in enumerate(quantities) if not q.shape):
-        points += itertools.product(*(values[j] if i == j else own for i, own in enumerate(shapes)))
+        every = itertools.product(*(values[j] if i == j else own for i, own in enumerate(shapes)))
+        middle = [own[len(own) // 2] for own in shapes]
+        points += [
+            p for p in every
+            if not effect.star or sum(q.shape and x != m for q, x, m in zip(quantities, p, middle, strict=True)) < 2
+        ]  # fmt: skip
     return np.array(points + (list(itertools.product(*values)) if effect.joint else []))
 
 

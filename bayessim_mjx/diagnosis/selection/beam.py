@@ -6,6 +6,7 @@ over all joints (`everywhere`). What is fitted is asked of `Fitting`, so that th
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
@@ -149,9 +150,14 @@ def _added(fits: Fitting, key: Key, count: int) -> list[Plan]:
 
 
 def _in_place(fits: Fitting, rest: Key, best: Key, count: int) -> list[Plan]:
-    """Effects on top of what is left of the best model that promise to bring it close to that."""
+    """Effects on top of what is left of the best model that promise to come close to it, or to what was left out.
+
+    A promise is linear: of an effect a hundred times the noise a share remains that the fit then takes away. How much,
+    the one tells whose place it is.
+    """
     rows, promised = fits.table.rows, fits.promises(rest)
-    near = [k for k, gain in promised.items() if rows[rest].total - gain < CLOSE * rows[best].total]
+    own = rows[rest].total - max((promised[k] for k in best - rest if k in promised), default=math.inf)
+    near = [k for k, gain in promised.items() if rows[rest].total - gain < CLOSE * max(rows[best].total, own)]
     return [Plan(rest | {label}, rest) for label in near[:count]]
 
 
