@@ -159,7 +159,7 @@ def _spectrum(r: Array, B: Array, K: Array, root: Array) -> tuple[Array, Array]:
 
 
 def _best(windows: list[tuple[Array, Array]], weight: Array) -> tuple[float, Array]:
-    """Largest log likelihood over the amounts, the noise's size at its best, over that of white noise; by window too."""
+    """Largest log likelihood over the amounts, the noise's size at its best, over white noise alone; by window too."""
     count = float(sum(w * len(v) for w, (v, _) in zip(weight, windows, strict=True)))
 
     def likelihood(amount: float) -> Array:

@@ -58,7 +58,7 @@ def test_a_force_on_a_heavy_mass_beside_a_light_one_that_would_move_a_hundred_ti
 
 
 def test_a_clock_that_jitters_is_no_force_though_it_moves_position_and_speed_together():
-    """Position and speed of a mass that swings are read at times that are off by 1.2 ms, and a step comes early once."""
+    """Position and speed of a mass that swings are read at times that are off by 1.2 ms, and one step comes early."""
     rng, (B, D) = np.random.default_rng(3), columns()
     t = np.arange(STEPS) * DT + rng.uniform(0, 3, (WINDOWS, 1))
     speed = 3.0 * rng.uniform(0, 2, (WINDOWS, 1)) * np.sin(6 * t)

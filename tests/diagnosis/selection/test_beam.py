@@ -1,6 +1,7 @@
 """The search on planted sums of effects: two and three of them, hidden behind each other and behind stand-ins."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -166,3 +167,15 @@ def test_effects_that_can_each_be_left_out_are_left_out_together():
     assert beam._without_all(both, label, Criteria()) == {a.label, b.label}
     one = table(whole | {(a, b, d): 1.01, (a, b, c): 30.0})
     assert beam._without_all(one, label, Criteria()) == frozenset()
+
+
+def test_what_stands_in_an_effects_place_is_measured_by_what_that_effect_promised():
+    """Promises of strong effects fall short: here a leaves 200 of 1000 by its promise and 10 as fitted; so may b."""
+    rows = {frozenset(): 1000.0, frozenset([A]): 10.0}
+    rows = {key: SimpleNamespace(total=total) for key, total in rows.items()}
+    fits = SimpleNamespace(table=SimpleNamespace(rows=rows), promises=lambda key: {A: 800.0, B: 700.0, C: 150.0})
+    (plan, other) = beam._in_place(fits, frozenset(), frozenset([A]), 5)
+    assert plan.key == {A} and other.key == {B}
+    rows[frozenset([A])] = SimpleNamespace(total=60.0)
+    fits.promises = lambda key: {A: 990.0, B: 761.0, C: 759.0}
+    assert [p.key for p in beam._in_place(fits, frozenset(), frozenset([A]), 5)] == [{A}, {B}]

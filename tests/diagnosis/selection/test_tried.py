@@ -78,20 +78,20 @@ def test_where_nothing_is_wrong_only_a_few_single_effects_are_fitted_for_the_tab
 
 
 def test_single_effects_far_behind_a_fitted_set_are_not_fitted(monkeypatch):
-    """What they promise leaves more than `CLOSE` times what the set leaves; without a set they are fitted."""
+    """What they promise leaves more than `CLOSE` times what the set leaves, but for the first three; alone they are."""
     plans = []
     monkeypatch.setattr(singles, "fit_models", lambda pool, given, *rest: plans.extend(s.gain for _, s in given))
     monkeypatch.setattr(singles, "widen_leading", lambda *_: None)
-    some = [SimpleNamespace(gain=g, candidate=SimpleNamespace(label=str(g))) for g in (95.0, 70.0, 50.0)]
+    some = [SimpleNamespace(gain=g, candidate=SimpleNamespace(label=str(g))) for g in (95.0, 70.0, 55.0, 61.0, 50.0)]
     base, together = SimpleNamespace(total=100.0), SimpleNamespace(total=10.0)
     pool = SimpleNamespace(base=base, models={1: base}, screened=some, settings=Settings(), keep=lambda pool: None)
     pool.above_noise = lambda model: True
     singles.fit_singles(pool)
-    assert plans == [95.0, 70.0, 50.0]
+    assert plans == [95.0, 70.0, 55.0, 61.0, 50.0]
     plans.clear()
     pool.models[2] = together
     singles.fit_singles(pool)
-    assert plans == [95.0, 70.0]
+    assert plans == [95.0, 70.0, 55.0, 61.0]
 
 
 def test_candidates_that_promise_next_to_nothing_beside_the_best_are_not_fitted_alone():
