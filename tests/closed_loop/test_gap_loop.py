@@ -243,6 +243,7 @@ def test_what_is_recovered_has_no_interval_under_five_seeds():
         assert told in words._recovery(found)
 
 
+@pytest.mark.slow
 def test_intervals_of_what_is_recovered_cover_it():
     """Trainings differ by a tenth of what is lost; share .8; 90 % of 2000 intervals, standard error .7 %."""
     rng = np.random.default_rng(2)

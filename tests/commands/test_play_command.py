@@ -19,6 +19,8 @@ def test_play_neither_shows_nor_takes_flags_of_training(flag: str, capsys: pytes
     assert flag.split("=")[0] not in capsys.readouterr().out
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_play_draws_from_the_posterior_in_the_coordinates_that_it_was_saved_in(tmp_path: Path) -> None:
     """A probit posterior's mean is that of its own draws; read as a plain one it was (1.35, 1.99) for (1.50, 1.90)."""
     from bayessim_mjx.distributions import Distribution
@@ -68,6 +70,7 @@ def test_play_prints_returns_of_latest_best_run_and_path(toy: None, capsys: pyte
 
 
 @pytest.mark.parametrize("where", ["--logdir=elsewhere", "logdir=elsewhere"])
+@pytest.mark.slow
 def test_play_looks_where_logdir_says(toy: None, capsys: pytest.CaptureFixture, where: str) -> None:
     assert train.main(["--task", "Pendulum", *SMALL, where, "--max_iterations=0"]) == 0
     assert play.main(["--task", "Pendulum", "--checkpoint", "latest", "--episodes", "2", where]) == 0

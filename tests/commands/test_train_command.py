@@ -25,6 +25,8 @@ def test_what_the_allocator_refuses_names_the_numbers_to_lower(toy: None, monkey
 
 
 @pytest.mark.parametrize("saves", [0, 1])
+@pytest.mark.slow
+@pytest.mark.ci
 def test_train_killed_and_resumed_equals_unkilled(toy: None, monkeypatch: pytest.MonkeyPatch, saves: int) -> None:
     """Also with a learning rate that falls at every second step, and with networks for novelty."""
     learner = ["ppo.num_epochs=2", "ppo.desired_kl=1e-9", "ppo.rnd.weight=1"]

@@ -113,6 +113,7 @@ def test_the_corrected_simulator_is_nominal_at_what_was_identified(robot, correc
     assert np.abs(swing(corrected, corrected.space.nominal) - swing(plain, plain.space.nominal)).max() > 0.1
 
 
+@pytest.mark.slow
 def test_the_prior_is_that_of_the_corrected_simulator(robot, corrected):
     q = FOUND.prior(robot.physics(robot.control_dt))
     assert q.space == corrected.space == FOUND.prior(robot.space).space

@@ -150,6 +150,8 @@ def reference(name):
 
 
 @EACH
+@pytest.mark.slow
+@pytest.mark.ci
 def test_follows_its_equation(name):
     """To 3e-4 rad and rad/s (rounding), where the effect itself moves by 0.1 at the least."""
     got, plain = with_each_on()[name], motion(physics("together"), [theta(physics("together"))])[0]
@@ -220,6 +222,7 @@ def test_two_places_are_two_effects():
         np.testing.assert_allclose(got, with_each_on()[name], atol=1e-4, err_msg=name)
 
 
+@pytest.mark.slow
 def test_tied_values_hold_everywhere():
     tied, free = physics("tied"), physics("together")
     one = motion(tied, [theta(tied, name, v[0]) for name, v in TRUE.items()])

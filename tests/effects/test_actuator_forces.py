@@ -150,6 +150,8 @@ def agree(got, want, atol=1e-5):
 
 @INTEGRATORS
 @pytest.mark.parametrize("case", ["neutral", *NATIVE])
+@pytest.mark.slow
+@pytest.mark.ci
 def test_an_effect_is_its_own_edit_recompiled_in_mujoco(integrator, case):
     got = motions(integrator)[case]
     agree(got, by_mujoco(integrator, case))

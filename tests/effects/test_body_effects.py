@@ -114,6 +114,8 @@ def test_gravity_tilt_is_a_robot_mounted_askew():
 
 
 @pytest.mark.parametrize("slowness", [0.0, 0.4])
+@pytest.mark.slow
+@pytest.mark.ci
 def test_external_force_is_xfrc_applied(slowness):
     """Constant, and as wind: |F| |e - kappa v| (e - kappa v) with the body's own velocity."""
     force = np.array([3.0, -2.0, 4.0])

@@ -51,6 +51,8 @@ def values_of(cables):
 
 
 @pytest.mark.parametrize("angle", ["radian", "degree"])
+@pytest.mark.slow
+@pytest.mark.ci
 def test_is_a_tendon_with_slack(angle):
     effect = make("cable_tension", where=("a", "b"))
     want = truth(edited(XML.format(angle=angle), effect, CABLES), WAVES, qvel=SPEED)

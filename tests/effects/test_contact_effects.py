@@ -63,6 +63,7 @@ def test_neutral_changes_no_bit_also_beside_another_effect():
     np.testing.assert_array_equal(beside, alone)
 
 
+@pytest.mark.slow
 def test_friction_brakes_by_mu_g():
     """v^2 / 2 mu g to the stop; the pair of b with its own coefficient."""
     scales = ((1.0, 1.0), (1.5, 2.0), (2.5, 3.0))

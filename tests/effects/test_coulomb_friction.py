@@ -88,6 +88,7 @@ def test_never_reverses_the_motion():
         assert v[-1] == pytest.approx(0, abs=1e-7)
 
 
+@pytest.mark.slow
 def test_holds_an_arm_against_gravity_in_both_joints():
     """Shoulder 9.81 N m and elbow 2.45 N m of weight: held by 12 and 4 N m, let go by less. Effects see each other."""
     joints = ("shoulder", "elbow")
@@ -110,6 +111,7 @@ def test_the_derivative_at_neutral_is_that_of_sliding():
     assert jax.jit(jax.grad(speed))(jnp.zeros(1))[0] == pytest.approx(-0.005, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_energy_only_leaves():
     xml = ARM.replace('damping="0.1"', "").replace('timestep="0.002"', 'timestep="0.002" gravity="0 0 0"')
     p = mujoco.MjModel.from_xml_string(xml)

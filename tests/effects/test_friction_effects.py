@@ -149,6 +149,8 @@ NATIVE = [
 
 
 @pytest.mark.parametrize(("name", "values"), NATIVE, ids=[n for n, _ in NATIVE])
+@pytest.mark.slow
+@pytest.mark.ci
 def test_equals_mujoco_with_the_native_element(arm, name, values):
     spec = mujoco.MjSpec.from_string(ARM)
     assert make(name, where=tuple(values)).edit(spec, values) is None
@@ -199,12 +201,15 @@ def test_armature_renews_the_derived_constants(arm):
     assert got.stat.meaninertia == pytest.approx(want.stat.meaninertia, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_drag_of_a_coasting_body_is_exact(lift):
     """1 / w = 1 / w0 + c t / m."""
     w = lift.run({"z.quadratic_drag.coefficient": 0.5}, push(0.0), qvel=-3.0)[1][:, 0]
     np.testing.assert_allclose(w, -1 / (1 / 3 + 0.5 / MASS * DT * np.arange(41)), rtol=1e-4)
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_any_damping_and_drag_is_stable(lift):
     for key in ("z.viscous_friction.damping", "z.quadratic_drag.coefficient"):
         w = lift.run({key: 1e6}, push(0.0), qvel=3.0)[1][:, 0]
@@ -219,6 +224,7 @@ def holds(lift, values, force):
     return np.abs(lift.run(values, push(force))[0]).max() < 1e-6
 
 
+@pytest.mark.slow
 def test_stribeck_holds_up_to_level_and_excess_and_slides_as_its_curve_says(lift):
     own = {"z.stribeck_friction.level": 3.0, "z.stribeck_friction.excess": 2.0, "z.stribeck_friction.speed": 0.5}
     for sign in (-1, 1):
@@ -279,6 +285,7 @@ def test_recovers_hidden_values(lift, name):
     np.testing.assert_allclose(fit.x, truth, rtol=0.02)
 
 
+@pytest.mark.slow
 def test_the_gradient_at_neutral_is_that_of_the_law():
     """dv/dt = -(level + b w) / m while sliding: the tangent in the level is not lost at 0."""
     physics = bench(LIFT.format(integrator="Euler"), ("asymmetric_friction",), "z").physics

@@ -49,6 +49,8 @@ def test_what_is_ground():
     assert [model.geom(i).name for i in ground(model)] == ["floor", "step"]
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_falls_on_the_moved_ground_as_in_mujoco():
     heights = [-0.03, 0.0, 0.04]
     effect = make("ground_height", where="world")

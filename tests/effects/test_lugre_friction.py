@@ -89,6 +89,8 @@ def swept():
     ("world", "timestep"),
     [pytest.param(FINE, 0.005, id="5 ms"), pytest.param(COARSE, CONTROL, id="20 ms", marks=SLOW)],
 )
+@pytest.mark.slow
+@pytest.mark.ci
 def test_is_the_differential_equation_to_the_order_of_the_sub_step(swept, world, timestep):
     """Reversals, breakaway and sliding at 1 m/s; off by no more than the way of a sub-step."""
     (q,) = run([OWN], SWEEP, world)

@@ -130,6 +130,7 @@ def test_an_unknown_place_is_refused_with_the_close_one():
         registry.make("Pendulum", effects=[effects.make("actuator_delay", where="al")])
 
 
+@pytest.mark.slow
 def test_without_randomisation_there_are_neither_parameters_nor_effects():
     assert len(pendulum("task.randomize=False", f"{KEY}.actuator_delay.all={{}}").space) == 0
     with pytest.warns(UserWarning, match="effects: they are off"):

@@ -127,6 +127,7 @@ def test_a_policy_sees_its_first_observation_through_the_sensors():
     np.testing.assert_allclose(*observed(), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_declared_controller_knows_static_errors_and_no_delay(full):
     """A drive has its own encoder: with its offset and scale, without the bus and filters between it and the log.
 

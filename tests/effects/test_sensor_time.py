@@ -45,6 +45,7 @@ def predicted():
 
 
 @pytest.mark.parametrize("delay, constant", [(2.5e-3, 0.0), (0.0, 6e-3)])
+@pytest.mark.slow
 def test_agrees_with_a_sensor_in_fine_time(predicted, delay, constant):
     """The true parameter predicts what a true sensor shows to 0.3 mrad, at 100 to 200 rad/s^2 (an arm has 50)."""
     qpos, qvel, command = sharp_truth()

@@ -159,6 +159,8 @@ def test_position_servos_feel_the_motor(actuator, integrator):
 
 
 @pytest.mark.parametrize("gap", [0.01, 0.03])
+@pytest.mark.slow
+@pytest.mark.ci
 def test_backlash_is_play_between_two_bodies(gap):
     for actuator, integrator, size in ((TORQUE, "Euler", 1.0), (SERVO, "implicitfast", 0.4)):
         real = loose(gap, actuator, integrator, size * PUSHED)
@@ -168,6 +170,7 @@ def test_backlash_is_play_between_two_bodies(gap):
 
 
 @pytest.mark.parametrize("armature", [ARMATURE, 0.0])
+@pytest.mark.slow
 def test_tends_to_the_rigid_joint_and_stays_finite(armature):
     which = (TORQUE, "Euler", armature)
     small = [[1e-9, 0.1, 0], [1e-6, 0.02, 0], [0, 0.1, 1e-7], [1e-8, 0.5, 1e-8]]

@@ -37,6 +37,7 @@ def test_levels_of_exact_posteriors_are_uniform():
     assert np.max(np.abs(np.sort(found) - (np.arange(N) + 0.5) / N)) < 1.63 / N**0.5
 
 
+@pytest.mark.slow
 def test_the_level_of_a_gaussian_is_the_chi_square_probability():
     found = np.asarray(coverage_factor.levels(jax.random.PRNGKey(0), posteriors(1.0), truths(0.05), "plain"))
     distance = np.sum(np.asarray(truths(0.05) - posteriors(1.0)[1][:, 0]) ** 2, axis=1) / 0.05**2

@@ -54,6 +54,8 @@ def trained():
 THETA = np.asarray([1.5, 1.0])
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_the_linear_gaussian_posterior_is_recovered(trained):
     state, info = trained
     _, x = linear_gaussian(20, 5, THETA)
@@ -67,6 +69,7 @@ def test_the_linear_gaussian_posterior_is_recovered(trained):
     assert -0.1 < float(info.log_q) + entropy < 0.25  # walls make the truth a little sharper than the Gaussian
 
 
+@pytest.mark.slow
 def test_several_trajectories_multiply(trained):
     state, _ = trained
     _, x = linear_gaussian(9, 7, THETA)
@@ -131,6 +134,8 @@ def test_a_growing_data_set_does_not_retrace(monkeypatch):
     assert int(state.fits) == 2 and second.train_loss.shape == second.val_loss.shape
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_padding_is_not_seen():
     thetas, x = linear_gaussian(ROWS)
     state = init(key(), QUICK, SPACE, 4)

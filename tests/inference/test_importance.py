@@ -32,6 +32,7 @@ PROPOSALS = {
 
 
 @pytest.mark.parametrize("name", PROPOSALS)
+@pytest.mark.slow
 def test_a_linear_gaussian_posterior_is_found_from_wrong_proposals(name):
     found = refine(PROPOSALS[name], gaussian, seed=3)
     assert found.reason is None and found.effective >= 150
@@ -45,6 +46,7 @@ def test_a_linear_gaussian_posterior_is_found_from_wrong_proposals(name):
     assert found.evidence == pytest.approx(evidence, abs=0.4)
 
 
+@pytest.mark.slow
 def test_two_modes_are_both_kept():
     def mirrored(theta):
         return norm.logpdf(np.abs(theta[:, 0]), 0.5, 0.02) + norm.logpdf(theta[:, 1:], 0.1, 0.05).sum(1)

@@ -209,6 +209,7 @@ def test_a_new_policy_each_round_where_asked_for(env):
     assert int(state.train.iteration) == 3  # the last round's own iterations
 
 
+@pytest.mark.slow
 def test_a_policy_that_goes_on_starts_its_sums_anew_in_new_worlds(env):
     """Curiosity's discounted sums run over worlds: those of worlds that are gone do not go on in their successors."""
     curious = loop.make(settings("bayessim.modelClass=None", "ppo.rnd.weight=1.0"), env)
@@ -271,6 +272,7 @@ def test_logs_give_back_the_parameters_they_were_made_with(env, recorded):
     assert rounds[0].predictive["qpos"].shape == (loop.PREDICTIVE_DRAWS, 21, 1)
 
 
+@pytest.mark.slow
 def test_too_few_segments_are_refused_with_the_numbers(env, recorded):
     with pytest.raises(UserError, match="18 segments.*realIters"):
         loop.make(settings(f"real.logs={recorded[0]}", "bayessim.trainTrajLen=20", "bayessim.realTrajs=10"), env)

@@ -28,6 +28,8 @@ CART = """
 """
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_a_replay_begins_in_the_truth_behind_what_was_measured_and_with_the_past_commands():
     """A mass of 1 kg at rest, control steps of two sub-steps of 10 ms; by hand."""
     effects = [make("joint_offset", where="x"), make("sensor_gain", where="x"), make("actuator_delay", where="push")]
@@ -109,6 +111,7 @@ def write_logs(folder: Path, hidden: Hidden, sigma: dict[str, float] = SIGMA, co
     return folder
 
 
+@pytest.mark.slow
 def test_features_are_those_of_the_controller_that_the_log_declares(tmp_path: Path) -> None:
     """At the nominal parameters a log of targets is its own replay; read as torques it deviated by radians."""
     exact = dict.fromkeys(SIGMA, 0.0)

@@ -104,6 +104,8 @@ def test_samples_stay_inside_the_box():
     assert np.all(samples >= SPACE.low) and np.all(samples <= SPACE.high)
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_a_trajectory_measured_again_has_other_noise_and_nothing_else():
     settings = config.load("Pendulum", overrides=["bayessim.collectPolicy=policy_random", "bayessim.trainTrajLen=5"])
     source = loop.make(settings, make("Pendulum", config=settings)).source

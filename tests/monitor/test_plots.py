@@ -76,6 +76,7 @@ def test_full_corner_has_one_panel_per_pair(d):
 
 
 @pytest.mark.parametrize("d", [17, 40])
+@pytest.mark.slow
 def test_many_parameters_are_all_listed(d):
     c = case(d)
     c["samples"][:, 7] = 2.0 + 0.1 * (c["samples"][:, 7] - 2.0)  # by far the best identified
@@ -87,6 +88,7 @@ def test_many_parameters_are_all_listed(d):
     assert overlaps(figure) == [] and outside(figure) == []
 
 
+@pytest.mark.slow
 def test_a_twelve_parameter_corner_keeps_its_labels_apart():
     figure = plots.corner(**case(12, n=400), units=["kg"] * 12)
     assert len(figure.axes) == 78

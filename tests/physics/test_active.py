@@ -66,6 +66,8 @@ def test_what_acts_is_what_is_not_neutral(physics):
 
 
 @pytest.mark.parametrize("names", [(), *[(name,) for name in ON], ("actuator_delay", "coulomb_friction")])
+@pytest.mark.slow
+@pytest.mark.ci
 def test_the_motion_is_the_same_bit_for_bit(physics, both, names):
     thetas = np.stack([physics.neutral, middle(physics, *names), 0.5 * (physics.neutral + middle(physics, *names))])
     plain, some = both

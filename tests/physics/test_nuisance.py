@@ -126,6 +126,7 @@ def test_observations_are_the_truth_with_white_and_lasting_noise_from_the_reset_
     assert np.array_equal(start.obs["policy"], start.info["final_observation"]["policy"])
 
 
+@pytest.mark.slow
 def test_actions_get_noise_that_is_not_in_the_recorded_command() -> None:
     """u from the motion: w' = w + dt (3 / (2 l) (gx cos q - gz sin q) + 3 u / (m l^2)); u = 2 (.2 + noise)."""
     trajectory, start = run()

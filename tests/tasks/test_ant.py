@@ -47,6 +47,8 @@ def test_golden_numbers_of_the_model():
     assert [model.joint(i).name for i in range(1, 9)] == [f"{j}_{i}" for i in range(1, 5) for j in ("hip", "ankle")]
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_rests_on_its_feet(compiled):
     """Without torque it stands at z = 0.379, and the feet carry its weight of 8.94 N."""
     task = compiled("Ant")

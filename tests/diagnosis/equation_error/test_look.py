@@ -39,6 +39,8 @@ def weak():
     return model, look(logs, model)
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_a_load_is_found_where_it_is(loaded):
     (found,) = loaded.proposals
     assert found.label == "payload@tool" and loaded.explained > 0.95 and loaded.seconds < 30
@@ -58,6 +60,8 @@ def test_motors_that_obey_and_a_heavier_mechanism_are_told_apart(loaded, weak):
     assert any("elbow_motor 0.80 of it" in line for line in first_look.lines(weak[1]))
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_a_weak_motor_is_found_with_and_without_measured_effort(weak):
     _, seen = weak
     assert not seen.proposals and proposed(seen)["actuator_gain@elbow_motor"]["gain"] == pytest.approx(0.8, abs=0.02)
@@ -87,6 +91,7 @@ def places(model, name):
     return tuple(getattr(model, kind)(i).name for i in range(count) if kind != "body" or model.body_weldid[i] == i > 0)
 
 
+@pytest.mark.slow
 def test_efforts_in_a_unit_of_their_own_are_told(loaded):
     model, logs = recorded(rigs.Truth())
     half = [

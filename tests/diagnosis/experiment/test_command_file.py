@@ -77,6 +77,7 @@ def test_models_that_cannot_be_used(place, capsys, tmp_path):
         assert word in refused(capsys, "--model", path, "--data", place / "logs")
 
 
+@pytest.mark.slow
 def test_effects_that_are_not_there(place, capsys, tmp_path):
     base = ("--model", place / "pendulum.xml", "--data", place / "logs", "--out", tmp_path)
     line = refused(capsys, *base, "--effects", "coulomb_fricton")

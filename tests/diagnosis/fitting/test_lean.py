@@ -47,6 +47,7 @@ def test_limits_farther_than_a_quarter_of_the_travel_are_not_reached(a, b, away)
     assert lean.unreached(model, [log(model, a, b, (0, 1)), log(model, (0, 0.1), (0, 0.1), (0, 1))]) == away
 
 
+@pytest.mark.slow
 def test_they_are_left_out_of_the_simulation_alone(tmp_path):
     nominal(tmp_path)
     (path,) = tmp_path.glob("*.xml")

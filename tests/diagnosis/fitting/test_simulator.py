@@ -28,6 +28,7 @@ def simulator(setup):
     return Simulator(setup.physics, setup.fitter.simulator.windows, lanes=32)
 
 
+@pytest.mark.slow
 def test_one_trace_whatever_is_asked(simulator):
     rng = np.random.default_rng(0)
     theta, windows = simulator.physics.space.nominal, len(simulator.windows)
@@ -59,6 +60,8 @@ def test_its_own_motion_has_no_error(simulator):
     assert np.abs(again[0]).max() < 2e-6 < 1e-4 < np.abs(again[1]).max()
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_a_right_simulator_follows_mujoco_at_a_tenth_of_the_step(setup):
     """Errors left are second order in the step, after the start states are estimated."""
     fitter = setup.fitter
