@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
+from scipy.optimize import nnls
 
 Array = NDArray[np.float64]
 
@@ -122,6 +123,23 @@ def _normal_quantile(log_beyond: float) -> float:
     from scipy.special import ndtri_exp
 
     return float(-ndtri_exp(min(log_beyond, np.log(0.5))))
+
+
+def variance_parts(squares: Array, kinds: Array, rounds: int = 4) -> tuple[Array, Array]:
+    """How much of each kind of variance is in Gaussian squares, by least squares reweighted so many times.
+
+    Args:
+        squares: `[n]`; kinds: `[n, k]`, by how much each kind adds to each.
+
+    Returns:
+        (`[k]` parts, none negative; `[n]` variances, no less than a thousandth of their mean).
+    """
+    mean = np.mean(squares)
+    level = np.full(len(squares), mean + 1e-300)
+    for _ in range(rounds):
+        parts, _ = nnls(kinds / level[:, None], squares / level)
+        level = kinds @ parts + 1e-3 * mean + 1e-300
+    return np.asarray(parts), level
 
 
 def times(M: Array, v: Array) -> Array:

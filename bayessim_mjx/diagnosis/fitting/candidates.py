@@ -189,14 +189,16 @@ def _probes(effect: Effect, coordinates: Sequence[Coordinate]) -> Array:
     neutral = [c.neutral for c in coordinates]
     values = [_grid(q, c) for q, c in zip(quantities, coordinates, strict=True)]
     shapes = [v if q.shape else [n] for q, v, n in zip(quantities, values, neutral, strict=True)]
+    middle = [own[len(own) // 2] for own in shapes]
+
+    def tried(point: tuple[float, ...]) -> bool:
+        away = sum(q.shape and x != m for q, x, m in zip(quantities, point, middle, strict=True))
+        return not effect.star or away < 2
+
     points: list[tuple[float, ...]] = []
     for j in (j for j, q in enumerate(quantities) if not q.shape):
         every = itertools.product(*(values[j] if i == j else own for i, own in enumerate(shapes)))
-        middle = [own[len(own) // 2] for own in shapes]
-        points += [
-            p for p in every
-            if not effect.star or sum(q.shape and x != m for q, x, m in zip(quantities, p, middle, strict=True)) < 2
-        ]  # fmt: skip
+        points += filter(tried, every)
     return np.array(points + (list(itertools.product(*values)) if effect.joint else []))
 
 

@@ -15,7 +15,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import eigh, solve_triangular
-from scipy.optimize import nnls
 
 from bayessim_mjx.diagnosis import statistics
 
@@ -31,7 +30,6 @@ class Rules:
     Attributes:
         memories: of a window's length; amounts: of the white part's variance; a grid each.
         least: noise sd, of the white part; rows: residuals in all, at most.
-        rounds: of reweighted least squares, by which the clock's part is told by the rates.
         told: nats from which on one origin is more likely; 3 are odds of 20 to 1.
         errors: standard errors over the windows, by which it is as well.
     """
@@ -40,7 +38,6 @@ class Rules:
     amounts: tuple[float, ...] = (0.0, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0)
     least: float = 0.3
     rows: int = 16000
-    rounds: int = 4
     told: float = 3.0
     errors: float = 1.0
 
@@ -84,51 +81,38 @@ def origin(
     D = D * np.repeat(sizes, nodes)  # a force of 1 N m is much for a wrist and little for a shoulder
     steps = r.shape[1] // channels
     shape = (len(r), steps, channels)
-    even, clock = _white(r.reshape(shape), None if rate is None else rate.reshape(shape))
+    even, clock = _white(r.reshape(shape), (np.zeros_like(r) if rate is None else rate).reshape(shape))
     own = _some(weight, r.shape[1])
     size = np.sqrt(np.mean(r[own] ** 2, 0).reshape(steps, channels).mean(0))
     scale = np.sqrt(np.mean(np.einsum("wnd,wnd->wn", D[own], D[own]))) + 1e-300
-    roots = [_root(np.tile(even, steps), clock[w]) for w in own]
+    seen = [_seen(B[w], _root(np.tile(even, steps), clock[w])) for w in own]
     found: dict[str, list[tuple[float, Array]]] = {"sensor": [], "force": []}
     for memory in RULES.memories:
         alike = np.kron(_memory(steps, memory), np.diag(size / np.mean(size)) ** 2)
         pushed = np.kron(np.eye(len(sizes)), _memory(nodes, memory))
-        each = [_spectrum(r[w], B[w], alike, root) for w, root in zip(own, roots, strict=True)]
-        found["sensor"].append(_best(each, weight[own]))
-        each = [
-            _spectrum(r[w], B[w], D[w] @ pushed @ D[w].T / scale**2, root) for w, root in zip(own, roots, strict=True)
-        ]
-        found["force"].append(_best(each, weight[own]))
+        noise = [_spectrum(r[w], alike, T) for w, T in zip(own, seen, strict=True)]
+        moves = [_spectrum(r[w], D[w] @ pushed @ D[w].T / scale**2, T) for w, T in zip(own, seen, strict=True)]
+        found["sensor"].append(_best(noise, weight[own]))
+        found["force"].append(_best(moves, weight[own]))
     at = {kind: int(np.argmax([nats for nats, _ in of])) for kind, of in found.items()}
     (sensor, by_sensor), (force, by_force) = (found[kind][at[kind]] for kind in ("sensor", "force"))
     deviate = statistics.normal_deviate(by_force - by_sensor, np.arange(len(own)))
     return Origin(sensor, force, deviate, RULES.memories[at["sensor"]] if sensor > RULES.told else 0.0)
 
 
-def _white(r: Array, rate: Array | None) -> tuple[Array, Array]:
+def _white(r: Array, rate: Array) -> tuple[Array, Array]:
     """What differs from row to row, from second differences of residuals `[W, steps, channels]`.
 
     Returns:
         (`[channels]` variances, `[W, steps, channels]` what one standard deviation of the clock moves).
     """
     jumps = np.diff(r, 2, axis=1) ** 2 / 6.0
-    if rate is None:
-        return np.maximum(np.mean(jumps, axis=(0, 1)), RULES.least**2), np.zeros_like(r)
     rate = rate / (np.sqrt(np.mean(rate**2)) + 1e-300)
     around = (rate[:, :-2] ** 2 + 4.0 * rate[:, 1:-1] ** 2 + rate[:, 2:] ** 2) / 6.0
     kinds = np.zeros((*jumps.shape, r.shape[2] + 1))
     kinds[..., :-1], kinds[..., -1] = np.eye(r.shape[2]), around  # one clock for all channels
-    parts = _shares(jumps.ravel(), kinds.reshape(jumps.size, -1))
+    parts, _ = statistics.variance_parts(jumps.ravel(), kinds.reshape(jumps.size, -1))
     return np.maximum(parts[:-1], RULES.least**2), np.sqrt(parts[-1]) * rate
-
-
-def _shares(squares: Array, kinds: Array) -> Array:
-    """How much of each kind of variance, `[n, k]`, is in Gaussian squares `[n]`."""
-    level = np.full(len(squares), np.mean(squares) + 1e-300)
-    for _ in range(RULES.rounds):
-        parts, _ = nnls(kinds / level[:, None], squares / level)
-        level = kinds @ parts + 1e-3 * np.mean(squares) + 1e-300
-    return np.asarray(parts)
 
 
 def _root(even: Array, clock: Array) -> Array:
@@ -150,12 +134,16 @@ def _memory(count: int, memory: float) -> Array:
     return np.asarray(np.exp(-lag / (memory * count)))
 
 
-def _spectrum(r: Array, B: Array, K: Array, root: Array) -> tuple[Array, Array]:
-    """(variances of K in white noise, squares of r along them), `[n - s]`, what start states can do left out."""
-    whiten = lambda a: solve_triangular(root, a, lower=True)  # noqa: E731
-    q = np.linalg.qr(whiten(B), mode="complete")[0][:, B.shape[1] :]
-    values, vectors = eigh(q.T @ whiten(whiten(K).T) @ q)
-    return np.maximum(values, 0.0), (vectors.T @ (q.T @ whiten(r))) ** 2
+def _seen(B: Array, root: Array) -> Array:
+    """`[n - s, n]`, what whitens a window and leaves out what its start states can do."""
+    q = np.linalg.qr(solve_triangular(root, B, lower=True), mode="complete")[0][:, B.shape[1] :]
+    return np.asarray(solve_triangular(root, q, lower=True, trans="T").T)
+
+
+def _spectrum(r: Array, K: Array, seen: Array) -> tuple[Array, Array]:
+    """(variances of K in white noise, squares of r along them), `[n - s]`."""
+    values, vectors = eigh(seen @ K @ seen.T)
+    return np.maximum(values, 0.0), (vectors.T @ (seen @ r)) ** 2
 
 
 def _best(windows: list[tuple[Array, Array]], weight: Array) -> tuple[float, Array]:

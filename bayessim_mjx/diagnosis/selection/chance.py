@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import nnls
 
+from bayessim_mjx.diagnosis import statistics
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 from bayessim_mjx.diagnosis.selection.screen import looked_at
 from bayessim_mjx.diagnosis.selection.tried import Tried
@@ -27,12 +27,10 @@ class Rules:
 
     Attributes:
         draws: null logs; chunk: of them at a time, for the memory.
-        rounds: of reweighted least squares, by which their noise is told by the speed.
     """
 
     draws: int = 500
     chunk: int = 20
-    rounds: int = 4
 
 
 RULES = Rules()
@@ -136,10 +134,7 @@ def squares(fitter: Fitter, fit: Fit) -> tuple[Array, Array]:
 def profile(r: Array, even: Array, moving: Array) -> Array:
     """`[W, n]`, standard deviation of residuals whose variance is a part of each of two, all `[W, n]`."""
     both = np.stack([even.ravel(), moving.ravel() / (np.mean(moving) + 1e-300)], 1)
-    level = np.full(r.size, np.mean(r**2) + 1e-300)
-    for _ in range(RULES.rounds):
-        parts, _ = nnls(both / level[:, None], r.ravel() ** 2 / level)
-        level = both @ parts + 1e-3 * np.mean(r**2) + 1e-300
+    _, level = statistics.variance_parts(r.ravel() ** 2, both)
     return np.asarray(np.sqrt(level).reshape(r.shape))
 
 
