@@ -16,16 +16,16 @@ if TYPE_CHECKING:
     from mujoco import mjx
 
 MARK = 2.0**-40
-ROUNDS = 2  # of finding out which teeth touch
 
 
 @dataclasses.dataclass(frozen=True)
 class Backlash(Effect):
-    """The motor turns freely within +-gap around the link; at its ends the teeth push, never pull, and do not bounce.
+    """The motor turns freely within +-gap around the link; at its ends the teeth push, never pull.
 
     J w_m' = tau - s, link moved by s, |q_m - q| <= gap, s = 0 inside. The motor is that of `joint_elasticity`: its
     inertia J is the joint's armature, or a fifth of what is felt at the joint. The sensors show the link; position
-    servos see the motor. At the start the load has pushed the motor to one end of the gap.
+    servos see the motor. Teeth do not bounce. At the start the load has pushed the motor to one end of the gap; where a recording leads up to the
+    start, the motor is where this brought it.
 
     Parameters: `gap`, half of the play, rad (hinge) or m (slide), neutral 0.
     """
@@ -33,6 +33,7 @@ class Backlash(Effect):
     name: ClassVar[str] = "backlash"
     kind: ClassVar[str] = "joint"
     noun: ClassVar[str] = "backlash"
+    follows: ClassVar[bool] = True
     separates: ClassVar[str] = "slow triangles with and without gravity's pre-load, a link-side encoder"
     witness: ClassVar[tuple[str, str] | None] = ("link", "an encoder on the link side of the gearbox (`link:<joint>`)")
     quantities: ClassVar[tuple[Quantity, ...]] = (
@@ -40,7 +41,7 @@ class Backlash(Effect):
     )
 
     def init(self, at: Site) -> Any:
-        return transmission.start(at) | {"side": jnp.zeros(len(at))}
+        return transmission.start(at)
 
     def on_model(self, at: Site, model: "mjx.Model", theta: jax.Array) -> "mjx.Model":
         return transmission.split(at, model, self._on(at, theta), MARK)
@@ -59,17 +60,11 @@ class Backlash(Effect):
             rest = jnp.where(fresh, 0.0, gap * side)
             return transmission.transmit(both, step.dt, none, none, whole, rest, on & (fresh | (side != 0)))
 
-        side = memory["side"]
-        for _ in range(ROUNDS):
-            passed = solve(side)
-            twist = both.twist + step.dt * passed.slip
-            hit = jnp.where(jnp.abs(twist) > gap, jnp.sign(twist), 0.0)
-            side = jnp.where(side == 0, hit, jnp.where(passed.torque * side > 0, side, 0.0))
-        passed = solve(side)
-        side = jnp.where(fresh, jnp.sign(passed.torque), side)
-        twist = jnp.where(fresh, gap * side, both.twist)
-        rest, force = transmission.finish(at, step, both, passed, twist)
-        return rest | {"side": jnp.where(on, side, 0.0)}, force
+        twist = both.twist + step.dt * solve(none).slip  # if nothing touched
+        side = jnp.where(jnp.abs(twist) > gap, jnp.sign(twist), 0.0)
+        passed = solve(jnp.where(solve(side).torque * side > 0, side, 0.0))
+        twist = jnp.where(fresh, gap * jnp.sign(passed.torque), both.twist)
+        return transmission.finish(at, step, both, passed, twist)
 
     def transmits(self, at: Site, theta: jax.Array) -> jax.Array:
         return at.scatter(jnp.where(self._on(at, theta), 1.0, 0.0)) > 0

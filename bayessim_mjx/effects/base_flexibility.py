@@ -36,6 +36,7 @@ class BaseFlexibility(Effect):
     name: ClassVar[str] = "base_flexibility"
     kind: ClassVar[str] = "world"
     noun: ClassVar[str] = "flexible mount"
+    follows: ClassVar[bool] = True
     lacks: ClassVar[str] = "a flexible mount"
     separates: ClassVar[str] = "one joint moved and the resting ones (or an IMU on the base) watched; the base clamped"
     witness: ClassVar[tuple[str, str] | None] = ("imu", "an IMU on the base (`imu:...`)")

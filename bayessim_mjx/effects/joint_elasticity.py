@@ -34,6 +34,7 @@ class JointElasticity(Effect):
     name: ClassVar[str] = "joint_elasticity"
     kind: ClassVar[str] = "joint"
     noun: ClassVar[str] = "elastic transmission"
+    follows: ClassVar[bool] = True
     lacks: ClassVar[str] = "an elastic transmission"
     separates: ClassVar[str] = "a chirp beyond the suspected resonance; known static loads with the motor held"
     witness: ClassVar[tuple[str, str] | None] = ("link", "an encoder on the link side of the gearbox (`link:<joint>`)")

@@ -4,9 +4,11 @@ Its sub-steps are those of `timestep`: MJX's, where no effect, drive or limit sa
 """
 
 import functools
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from bayessim_mjx.compat import mjx
 from bayessim_mjx.effects.effect import overrides
@@ -91,9 +93,16 @@ def _refuse(physics: Physics, drive: Drive) -> None:
 def begin(physics: Physics, theta: jax.Array, motion: Motion, active: jax.Array | None = None) -> World:
     """A world in the middle of a log: effects' memories filled by the recorded past, sensors' effects undone.
 
+    What follows the motion (`Effect.follows`) has the memory of a robot that was at rest; `retraced` has a better one.
+
     Args:
         theta: `[d]`; motion: measured, around the start, with the commands before it; active: see `Drive`.
     """
+    return _begun(physics, theta, motion, active)[0]
+
+
+def _begun(physics: Physics, theta: jax.Array, motion: Motion, active: jax.Array | None) -> tuple[World, Motion]:
+    """The world that `begin` gives, and the true motion around its start."""
     world = physics.unseen(theta, motion.qpos[motion.start], motion.qvel[motion.start])  # shown is what was measured
     thetas, memory = physics.split(world.theta)[1], list(world.memory)
     for i in reversed(range(len(physics.effects))):  # sensors come last in a step, so they are undone first
@@ -108,4 +117,39 @@ def begin(physics: Physics, theta: jax.Array, motion: Motion, active: jax.Array 
         return tuple(remembered), None
 
     filled, _ = jax.lax.scan(past, tuple(memory), motion.command[: motion.start])
-    return world.replace(qpos=motion.qpos[motion.start], qvel=motion.qvel[motion.start], memory=filled)
+    return world.replace(qpos=motion.qpos[motion.start], qvel=motion.qvel[motion.start], memory=filled), motion
+
+
+class Past(NamedTuple):
+    """Control steps before a start, through which what `Effect.follows` is taken along the recorded motion.
+
+    Attributes:
+        world: at the first of them; motion: the true one; steps: how many, static.
+        wanted: `[]` bool, whether an active effect needs them; None: none ever does.
+    """
+
+    world: World
+    motion: Motion
+    steps: int
+    wanted: jax.Array | None
+
+    def at(self, k: jax.Array, world: World, early: float) -> World:
+        """The world of step k of them, where the recording had it; early: s, velocities before positions."""
+        return world.replace(qpos=self.motion.qpos[k], qvel=self.motion.qvel[k] - early * world.warmstart)
+
+    def arrived(self, physics: Physics, world: World, start: World) -> World:
+        """`start` with the memory of what followed the motion up to it; world: after the last step."""
+        pairs = zip(physics.effects, world.memory, start.memory, strict=True)
+        memory = tuple(jax.tree.map(lambda a, b: jnp.where(self.wanted, a, b), new, old) if e.follows else old for e, new, old in pairs)
+        return start.replace(memory=memory)
+
+
+def past_of(physics: Physics, theta: jax.Array, motion: Motion, active: jax.Array | None = None) -> Past:
+    """What leads up to the start that `begin` gives for the same arguments."""
+    follows = np.array([e.follows for e in physics.effects], bool)
+    if not follows.any():
+        return Past(begin(physics, theta, motion, active), motion, 0, None)
+    steps, time = motion.start, motion.time
+    before = None if time is None else jnp.maximum(time - steps * physics.dt, 0.0)
+    world, motion = _begun(physics, theta, motion.replace(start=0, time=before), active)
+    return Past(world, motion, steps, jnp.array(True) if active is None else jnp.any(active & follows))

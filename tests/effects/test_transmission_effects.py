@@ -16,12 +16,12 @@ from bayessim_mjx.parameters import Parameter, ParameterSpace  # noqa: E402
 from bayessim_mjx.physics import Physics  # noqa: E402
 
 LINK = """
-      <joint name="{0}" axis="0 1 0" damping=".02" armature="{1}"/>
+      <joint name="{0}" axis="0 1 0" damping="{2}" armature="{1}"/>
       <geom type="capsule" fromto="0 0 0 0 0 -.3" size=".02" mass="1" contype="0" conaffinity="0"/>"""
 ONE = f"""
 <mujoco>
   <option timestep="{{dt}}" integrator="{{integrator}}"/>
-  <worldbody><body>{LINK.format("link", "{armature}")}</body></worldbody>
+  <worldbody><body>{LINK.format("link", "{armature}", 0.02)}</body></worldbody>
   <actuator>{{actuator}}</actuator>
 </mujoco>
 """
@@ -29,8 +29,8 @@ TWO = f"""
 <mujoco>
   <option timestep=".0002"/>
   <worldbody>
-    <body>{LINK.format("link", 0)}</body>
-    <body><joint name="motor" axis="0 1 0"/><inertial pos="0 0 0" mass="1" diaginertia="1 .02 1"/></body>
+    <body>{LINK.format("link", 0, 0)}</body>
+    <body><joint name="motor" axis="0 1 0" damping=".02"/><inertial pos="0 0 0" mass="1" diaginertia="1 .02 1"/></body>
   </worldbody>
   <tendon>
     <fixed {{between}}><joint joint="motor" coef="1"/><joint joint="link" coef="-1"/></fixed>
@@ -42,14 +42,14 @@ CHAIN = f"""
 <mujoco>
   <option timestep="{{dt}}"/>
   <worldbody>
-    <body>{LINK.format("a", "{a}")}<body pos="0 0 -.3">{LINK.format("b", "{b}")}</body></body>{{motors}}
+    <body>{LINK.format("a", "{a}", "{d}")}<body pos="0 0 -.3">{LINK.format("b", "{b}", "{d}")}</body></body>{{motors}}
   </worldbody>
   <tendon>{{springs}}</tendon>
   <actuator><motor joint="{{at}}a"/><motor joint="{{at}}b"/></actuator>
 </mujoco>
 """
 ROTOR = """
-    <body><joint name="motor{0}" axis="0 1 0"/><inertial pos="0 0 0" mass="1" diaginertia="1 {1} 1"/></body>"""
+    <body><joint name="motor{0}" axis="0 1 0" damping=".02"/><inertial pos="0 0 0" mass="1" diaginertia="1 {1} 1"/></body>"""
 SPRING = """
     <fixed stiffness="{1}" damping="{2}"><joint joint="motor{0}" coef="1"/><joint joint="{0}" coef="-1"/></fixed>"""
 TORQUE, SERVO = '<motor joint="{0}"/>', '<position joint="{0}" kp="20" kv=".6"/>'
@@ -197,10 +197,10 @@ def test_recovers_what_mujoco_was_given(column, value):
 def chain(dt, springs=None):
     """Two links in a row with armatures .02 and .01, or with motors on springs (stiffness, damping)."""
     if springs is None:
-        return CHAIN.format(dt=dt, a=0.02, b=0.01, motors="", springs="", at="")
+        return CHAIN.format(dt=dt, a=0.02, b=0.01, d=0.02, motors="", springs="", at="")
     motors = ROTOR.format("a", 0.02) + ROTOR.format("b", 0.01)
     between = "".join(SPRING.format(joint, *own) for joint, own in zip("ab", springs, strict=True))
-    return CHAIN.format(dt=dt, a=0, b=0, motors=motors, springs=between, at="motor")
+    return CHAIN.format(dt=dt, a=0, b=0, d=0, motors=motors, springs=between, at="motor")
 
 
 @pytest.mark.slow

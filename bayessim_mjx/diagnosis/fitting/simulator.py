@@ -14,6 +14,7 @@ from bayessim_mjx.compat import compiler_options
 from bayessim_mjx.device import on_cores
 from bayessim_mjx.diagnosis.fitting.windows import Batch, Windows
 from bayessim_mjx.physics import Drive, Physics, begin, control_step, staggered
+from bayessim_mjx.physics.step import past_of
 from bayessim_mjx.physics.tangent import difference, integrate
 
 Array = NDArray[np.float64]
@@ -77,13 +78,27 @@ class Simulator:
         world = begin(self.physics, theta, own.around, active)
         world = world.replace(qpos=integrate(model, world.qpos, offset[: self.nv]), qvel=world.qvel + offset[self.nv :])
 
-        def step(world: Any, row: tuple) -> tuple[Any, tuple]:
-            command, extra, enabled = row
-            world, data = control_step(self.physics, world, command, Drive(extra, enabled, own.law, active))
-            late = world.measurement["qvel"] + early * data.qacc
-            return world, (world.measurement["qpos"], late, data.actuator_force)
+        past = past_of(self.physics, theta, own.around, active)
+        lead, count = past.steps, own.command.shape[0]
+        command = jnp.concatenate([own.around.command[:lead], own.command]) if lead else own.command
 
-        _, (qpos, qvel, effort) = jax.lax.scan(step, world, (own.command, force, own.enabled))
+        def step(k: jax.Array, carry: tuple) -> tuple:
+            now, (qpos, qvel, effort) = carry
+            row = jnp.maximum(k - lead, 0)
+            if lead:
+                now = jax.lax.cond(
+                    k < lead, lambda: past.at(k, now, early), lambda: jax.lax.cond(k == lead, lambda: past.arrived(self.physics, now, world), lambda: now)
+                )
+            extra = jnp.where(k < lead, 0.0, force[row])
+            enabled = None if own.enabled is None else own.enabled[row]
+            now, data = control_step(self.physics, now, command[k], Drive(extra, enabled, own.law, active))
+            late = now.measurement["qvel"] + early * data.qacc
+            shown = (now.measurement["qpos"], late, data.actuator_force)
+            return now, tuple(x.at[row].set(y) for x, y in zip((qpos, qvel, effort), shown, strict=True))
+
+        nothing = tuple(jnp.zeros((count, n), jnp.float32) for n in (model.nq, model.nv, model.nu))
+        first = 0 if past.wanted is None else jnp.where(past.wanted, 0, lead)
+        _, (qpos, qvel, effort) = jax.lax.fori_loop(first, lead + count, step, (past.world if lead else world, nothing))
         error = jax.vmap(lambda a, b: difference(model, a, b))(own.qpos, qpos)
         errors = jnp.concatenate([error, own.qvel - qvel], axis=1)
         return jnp.nan_to_num(errors, nan=FAR, posinf=FAR, neginf=-FAR), effort

@@ -3,7 +3,8 @@
 The joint of the model is the link. The motors of the site's joints live in the effect's memory: `twist`, motor angle
 less link angle, and `speed`, the motors' velocity. Both sides are solved together at the end of the sub-step, so that a
 stiff transmission tends to the rigid joint of the model and no stiffness is unstable. Position servos close their loop
-on the motor's side, where their encoder is.
+on the motor's side, where their encoder is. The joint's damping is the motor's too: bearings and seals that turn
+with the reduction's square count there.
 """
 
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 
 SHARE = 0.2  # of the joint's inertia is the motor's where the model has no armature
 REAL = 2.0**-10  # armature below this part of the joint's inertia counts as none
+_EULER = int(mujoco.mjtIntegrator.mjINT_EULER)
 _IMPLICIT, _RK4 = int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST), int(mujoco.mjtIntegrator.mjINT_RK4)
 
 
@@ -75,22 +77,24 @@ def feedback(at: Site, memory: Any, step: SubStep, force: jax.Array, on: jax.Arr
 class Sides(NamedTuple):
     """Motors and links of a sub-step before anything passes between them, `[n]` each; on: the effect is active there.
 
-    twist, slip: motor less link, angle and velocity; torque: the actuators', on the motor; motor: its inertia; kp, kv:
-    the servos' feedback that follows the motor within the sub-step; inside: what of the matrix that the integrator
-    solves is not the link's (servo damping, the motor's share), kg m^2; servo: the first of these two; series: inertia
-    of motor against link; inertia `[n, n]`: of the links, as felt at the joints, with `inside`; push: impulse of all
-    other forces on the links.
+    twist, slip: motor less link, angle and velocity; torque: the actuators' less the joint's damping, on the motor;
+    lost: the same as a rigid joint's link has it; motor: its inertia; kp, kv: the servos' feedback that follows the
+    motor within the sub-step, and damping; inside: what of the matrix that the integrator solves is not the link's
+    (damping of servos and joint, the motor's share), kg m^2; damped: damping that follows the motor's own velocity, so
+    the link's too; series: inertia of motor against link; inertia `[n, n]`: of the links, as felt at the joints, with
+    `inside`; push: impulse of all other forces on the links.
     """
 
     on: jax.Array
     twist: jax.Array
     slip: jax.Array
     torque: jax.Array
+    lost: jax.Array
     motor: jax.Array
     kp: jax.Array
     kv: jax.Array
     inside: jax.Array
-    servo: jax.Array
+    damped: jax.Array
     series: jax.Array
     inertia: jax.Array
     push: jax.Array
@@ -103,34 +107,42 @@ def sides(at: Site, memory: Any, step: SubStep, on: jax.Array, mark: float) -> S
     kp, kv = _gains(at, step, on)
     mobility = step.inverse[np.ix_(dof, dof)]
     inertia = inverse(mobility)
+    drag = jnp.where(on, model.dof_damping[dof], 0.0)
     servo = dt * kv if int(at.mj_model.opt.integrator) == _IMPLICIT else jnp.zeros(len(at))
-    alone = mobility if not _has_inner_damping(at) else inverse(inertia - jnp.diag(servo))
+    solved = servo + (dt * drag if _solves_damping(at) else 0.0)
+    alone = inverse(inertia - jnp.diag(solved))
     felt = 1.0 / jnp.diagonal(alone)
     part = min(SHARE, 0.8 / len(at))  # trace bound: what the motors leave stays positive definite
     armature = model.dof_armature[dof] / mark
     whole = model.dof_M0[dof]
     own = (armature > REAL * whole) & (armature < whole / REAL)
     motor, link = jnp.where(own, armature, part * felt), jnp.where(own, felt, (1 - part) * felt)
-    free = step.dt * (step.inverse[dof] * (step.force - at.scatter(torque))).sum(-1)
+    lost = torque - drag * step.qvel[dof]
+    free = step.dt * (step.inverse[dof] * (step.force - at.scatter(lost))).sum(-1)
     twist, slip = follow(at, memory, step)
+    slip = jnp.where(on, slip, 0.0)
     return Sides(
         on=on,
         twist=jnp.where(on, twist, 0.0),
-        slip=jnp.where(on, slip, 0.0),
-        torque=torque,
+        slip=slip,
+        torque=lost - drag * slip,
+        lost=lost,
         motor=motor,
         kp=kp,
-        kv=kv,
-        inside=jnp.where(on, servo + jnp.where(own, 0.0, motor), 0.0),
-        servo=servo,
+        kv=kv + drag,
+        inside=jnp.where(on, solved + jnp.where(own, 0.0, motor), 0.0),
+        damped=servo + dt * drag,
         series=motor * link / (motor + link),
         inertia=inertia,
         push=(inertia * free).sum(-1),
     )
 
 
-def _has_inner_damping(at: Site) -> bool:
-    return int(at.mj_model.opt.integrator) == _IMPLICIT and len(servos(at)[0]) > 0
+def _solves_damping(at: Site) -> bool:
+    """Whether the joints' damping is in the matrix that the integrator solves."""
+    option = at.mj_model.opt
+    euler = int(option.integrator) == _EULER and not option.disableflags & int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
+    return bool(euler) or int(option.integrator) == _IMPLICIT
 
 
 def _gains(at: Site, step: SubStep, on: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -161,9 +173,9 @@ def transmit(
     soft s = (twist - rest) + (late + loss) slip', with compliance `soft` 1/k, `loss` d/k (s), `late` theta dt: where in
     the sub-step the spring is looked at (0: its beginning, dt: its end), and slip' at the end of the sub-step.
     """
-    # motor: J (w' - w) = dt (tau - s - kp late slip' - kv (slip' - slip) - servo (v' - v) / dt)
+    # motor: J (w' - w) = dt (tau - s - kp late slip' - kv (slip' - slip) - damped (v' - v) / dt)
     slow = both.motor + dt * late * both.kp + dt * both.kv
-    rigid = both.motor + both.servo
+    rigid = both.motor + both.damped
     drive = dt * both.torque + (both.motor + dt * both.kv) * both.slip
     over = late + loss
     below = jnp.where(held, slow * soft + dt * over, 1.0)
@@ -178,7 +190,7 @@ def transmit(
 
 def finish(at: Site, step: SubStep, both: Sides, passed: Passed, twist: jax.Array) -> tuple[dict, jax.Array]:
     """(memory, generalised force `[nv]`): the link gets what passed instead of what the actuators exert."""
-    own = passed.torque + both.inside * passed.change / step.dt - both.torque
+    own = passed.torque + both.inside * passed.change / step.dt - both.lost
     speed = step.qvel[at.dadr] + passed.change + jnp.where(both.on, passed.slip, 0.0)
     memory = {"twist": jnp.where(both.on, twist, 0.0), "speed": speed, "fresh": jnp.zeros((), bool)}
     return memory, at.scatter(jnp.where(both.on, own, 0.0))
