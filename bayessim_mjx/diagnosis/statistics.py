@@ -145,3 +145,9 @@ def variance_parts(squares: Array, kinds: Array, rounds: int = 4) -> tuple[Array
 def times(M: Array, v: Array) -> Array:
     """Matrices `[..., i, j]` times vectors `[..., j]`; as a product of matrices, several times as fast as einsum."""
     return np.asarray((M @ v[..., None])[..., 0])
+
+
+def root(covariance: Array) -> Array:
+    """`[k, k]`, R with R R^T = covariance, also where it is singular."""
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))

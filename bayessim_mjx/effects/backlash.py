@@ -23,9 +23,9 @@ class Backlash(Effect):
     """The motor turns freely within +-gap around the link; at its ends the teeth push, never pull.
 
     J w_m' = tau - s, link moved by s, |q_m - q| <= gap, s = 0 inside. The motor is that of `joint_elasticity`: its
-    inertia J is the joint's armature, or a fifth of what is felt at the joint. The sensors show the link; position
-    servos see the motor. Teeth do not bounce. At the start the load has pushed the motor to one end of the gap; where a recording leads up to the
-    start, the motor is where this brought it.
+    inertia J is the joint's armature, or a fifth of what is felt at the joint, and has the joint's damping. The sensors
+    show the link; position servos see the motor. Teeth do not bounce. At the start the load has pushed the motor to one
+    end of the gap; where a recording leads up to the start, the motor is where this brought it.
 
     Parameters: `gap`, half of the play, rad (hinge) or m (slide), neutral 0.
     """

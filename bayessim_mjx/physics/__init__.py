@@ -3,7 +3,7 @@
 from bayessim_mjx.compat import mjx
 from bayessim_mjx.physics.drive import Drive
 from bayessim_mjx.physics.model import Physics, World
-from bayessim_mjx.physics.step import begin, control_step
+from bayessim_mjx.physics.step import begin, control_step, past_of, retraced
 from bayessim_mjx.physics.timestep import staggered, substep
 
-__all__ = ["Drive", "Physics", "World", "begin", "control_step", "mjx", "staggered", "substep"]
+__all__ = ["Drive", "Physics", "World", "begin", "control_step", "mjx", "past_of", "retraced", "staggered", "substep"]

@@ -17,7 +17,7 @@ from bayessim_mjx.effects.support.site import under_tendon_limit
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.physics.drive import Drive
 from bayessim_mjx.physics.model import Physics, World, gated
-from bayessim_mjx.physics.timestep import substep
+from bayessim_mjx.physics.timestep import staggered, substep
 
 
 def control_step(
@@ -93,7 +93,7 @@ def _refuse(physics: Physics, drive: Drive) -> None:
 def begin(physics: Physics, theta: jax.Array, motion: Motion, active: jax.Array | None = None) -> World:
     """A world in the middle of a log: effects' memories filled by the recorded past, sensors' effects undone.
 
-    What follows the motion (`Effect.follows`) has the memory of a robot that was at rest; `retraced` has a better one.
+    What follows the motion (`Effect.follows`) remembers nothing here; `retraced` takes it through the past.
 
     Args:
         theta: `[d]`; motion: measured, around the start, with the commands before it; active: see `Drive`.
@@ -133,23 +133,53 @@ class Past(NamedTuple):
     steps: int
     wanted: jax.Array | None
 
-    def at(self, k: jax.Array, world: World, early: float) -> World:
-        """The world of step k of them, where the recording had it; early: s, velocities before positions."""
-        return world.replace(qpos=self.motion.qpos[k], qvel=self.motion.qvel[k] - early * world.warmstart)
+    def led(self, physics: Physics, k: jax.Array, world: World, start: World) -> World:
+        """What control step k begins with; from `steps` on it is simulated freely, from `start`.
+
+        Args:
+            k: one for all worlds of a call, so that under `vmap` a branch stays a branch.
+            world: after step k - 1.
+        """
+        if not self.steps:
+            return world
+
+        def along() -> World:
+            # s, by which the integrator's velocities lie before its positions
+            early = 0.5 * float(physics.mj_model.opt.timestep) if staggered(physics.mj_model) else 0.0
+            return world.replace(qpos=self.motion.qpos[k], qvel=self.motion.qvel[k] - early * world.warmstart)
+
+        arrived = functools.partial(self.arrived, physics, world, start)
+        return jax.lax.cond(k < self.steps, along, lambda: jax.lax.cond(k == self.steps, arrived, lambda: world))
 
     def arrived(self, physics: Physics, world: World, start: World) -> World:
         """`start` with the memory of what followed the motion up to it; world: after the last step."""
-        pairs = zip(physics.effects, world.memory, start.memory, strict=True)
-        memory = tuple(jax.tree.map(lambda a, b: jnp.where(self.wanted, a, b), new, old) if e.follows else old for e, new, old in pairs)
-        return start.replace(memory=memory)
+
+        def kept(new: jax.Array, old: jax.Array) -> jax.Array:
+            return jnp.where(jnp.asarray(self.wanted), new, old)
+
+        each = zip(physics.effects, world.memory, start.memory, strict=True)
+        memory = (jax.tree.map(kept, new, old) if effect.follows else old for effect, new, old in each)
+        return start.replace(memory=tuple(memory))
 
 
 def past_of(physics: Physics, theta: jax.Array, motion: Motion, active: jax.Array | None = None) -> Past:
     """What leads up to the start that `begin` gives for the same arguments."""
-    follows = np.array([e.follows for e in physics.effects], bool)
-    if not follows.any():
+    follows = np.array([effect.follows for effect in physics.effects], bool)
+    if not follows.any() or not motion.start:
         return Past(begin(physics, theta, motion, active), motion, 0, None)
     steps, time = motion.start, motion.time
     before = None if time is None else jnp.maximum(time - steps * physics.dt, 0.0)
     world, motion = _begun(physics, theta, motion.replace(start=0, time=before), active)
     return Past(world, motion, steps, jnp.array(True) if active is None else jnp.any(active & follows))
+
+
+def retraced(physics: Physics, theta: jax.Array, motion: Motion, drive: Drive = Drive()) -> World:  # noqa: B008
+    """`begin`, with the memory of what follows the motion as the recorded past leaves it; drive: what else acted."""
+    start, past = begin(physics, theta, motion), past_of(physics, theta, motion)
+    if not past.steps:
+        return start
+
+    def step(k: jax.Array, world: World) -> World:
+        return control_step(physics, past.led(physics, k, world, start), motion.command[k], drive)[0]
+
+    return past.arrived(physics, jax.lax.fori_loop(0, past.steps, step, past.world), start)

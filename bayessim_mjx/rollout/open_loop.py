@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 from bayessim_mjx.compat import program
 from bayessim_mjx.effects.support.motion import AROUND, Motion
-from bayessim_mjx.physics import Drive, Physics, begin, control_step
+from bayessim_mjx.physics import Drive, Physics, control_step, retraced
 from bayessim_mjx.physics.controllers import Law
 
 
@@ -27,7 +27,8 @@ def replay(
 ) -> dict[str, jax.Array]:
     """Open loop: the commands [N, T, nu] from measured states [N, nq], [N, nv] in the worlds thetas [N, d].
 
-    It begins as `physics.begin`: in the true state behind the measured one, with memories filled by the recorded past.
+    It begins as `physics.retraced`: in the true state behind the measured one, with memories filled by what was
+    recorded before.
 
     Args:
         around: the recording around the starts (leaves [N, rows, ...]), moved as a whole so that it goes through them;
@@ -52,8 +53,8 @@ def _replay(physics: Physics) -> Callable[..., dict[str, jax.Array]]:
     def one(
         qpos: jax.Array, qvel: jax.Array, command: jax.Array, theta: jax.Array, around: Motion | None, law: Law | None
     ) -> dict[str, jax.Array]:
-        world = started(physics, theta, qpos, qvel, command, around)
         drive = Drive(law=law)
+        world = started(physics, theta, qpos, qvel, command, around, drive)
 
         def step(world: Any, command: jax.Array) -> tuple[Any, dict]:
             world, _ = control_step(physics, world, command, drive)
@@ -66,7 +67,13 @@ def _replay(physics: Physics) -> Callable[..., dict[str, jax.Array]]:
 
 
 def started(
-    physics: Physics, theta: jax.Array, qpos: jax.Array, qvel: jax.Array, command: jax.Array, around: Motion | None
+    physics: Physics,
+    theta: jax.Array,
+    qpos: jax.Array,
+    qvel: jax.Array,
+    command: jax.Array,
+    around: Motion | None,
+    drive: Drive = Drive(),  # noqa: B008  # immutable
 ) -> Any:
     """The world theta [d] before the commands [T, nu], in the true state behind the measured qpos [nq], qvel [nv].
 
@@ -75,7 +82,7 @@ def started(
     if around is None:
         around = Motion(qpos[None], qvel[None], _throughout(physics, command[:1]), start=0)
     moved = [x + (own - x[around.start]) for x, own in ((around.qpos, qpos), (around.qvel, qvel))]
-    return begin(physics, theta, around.replace(qpos=moved[0], qvel=moved[1]))
+    return retraced(physics, theta, around.replace(qpos=moved[0], qvel=moved[1]), drive)
 
 
 def _throughout(physics: Physics, command: jax.Array) -> jax.Array:

@@ -49,7 +49,9 @@ CHAIN = f"""
 </mujoco>
 """
 ROTOR = """
-    <body><joint name="motor{0}" axis="0 1 0" damping=".02"/><inertial pos="0 0 0" mass="1" diaginertia="1 {1} 1"/></body>"""
+    <body>
+      <joint name="motor{0}" axis="0 1 0" damping=".02"/><inertial pos="0 0 0" mass="1" diaginertia="1 {1} 1"/>
+    </body>"""
 SPRING = """
     <fixed stiffness="{1}" damping="{2}"><joint joint="motor{0}" coef="1"/><joint joint="{0}" coef="-1"/></fixed>"""
 TORQUE, SERVO = '<motor joint="{0}"/>', '<position joint="{0}" kp="20" kv=".6"/>'

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from bayessim_mjx.compat import compiler_options
 from bayessim_mjx.device import on_cores
 from bayessim_mjx.diagnosis.fitting.windows import Batch, Windows
-from bayessim_mjx.physics import Drive, Physics, begin, control_step, staggered
-from bayessim_mjx.physics.step import past_of
+from bayessim_mjx.physics import Drive, Physics, begin, control_step, past_of, staggered
 from bayessim_mjx.physics.tangent import difference, integrate
 
 Array = NDArray[np.float64]
@@ -79,26 +78,22 @@ class Simulator:
         world = world.replace(qpos=integrate(model, world.qpos, offset[: self.nv]), qvel=world.qvel + offset[self.nv :])
 
         past = past_of(self.physics, theta, own.around, active)
-        lead, count = past.steps, own.command.shape[0]
-        command = jnp.concatenate([own.around.command[:lead], own.command]) if lead else own.command
+        lead, (count, *_) = past.steps, own.command.shape
+        command = jnp.concatenate([own.around.command[:lead], own.command])
 
         def step(k: jax.Array, carry: tuple) -> tuple:
-            now, (qpos, qvel, effort) = carry
+            now, shown = carry
             row = jnp.maximum(k - lead, 0)
-            if lead:
-                now = jax.lax.cond(
-                    k < lead, lambda: past.at(k, now, early), lambda: jax.lax.cond(k == lead, lambda: past.arrived(self.physics, now, world), lambda: now)
-                )
-            extra = jnp.where(k < lead, 0.0, force[row])
-            enabled = None if own.enabled is None else own.enabled[row]
-            now, data = control_step(self.physics, now, command[k], Drive(extra, enabled, own.law, active))
-            late = now.measurement["qvel"] + early * data.qacc
-            shown = (now.measurement["qpos"], late, data.actuator_force)
-            return now, tuple(x.at[row].set(y) for x, y in zip((qpos, qvel, effort), shown, strict=True))
+            extra = force[row] if not lead else jnp.where(k < lead, 0.0, force[row])
+            drive = Drive(extra, None if own.enabled is None else own.enabled[row], own.law, active)
+            now, data = control_step(self.physics, past.led(self.physics, k, now, world), command[k], drive)
+            new = now.measurement["qpos"], now.measurement["qvel"] + early * data.qacc, data.actuator_force
+            return now, tuple(x.at[row].set(y) for x, y in zip(shown, new, strict=True))
 
-        nothing = tuple(jnp.zeros((count, n), jnp.float32) for n in (model.nq, model.nv, model.nu))
+        nothing = tuple(jnp.zeros((count, n)) for n in (model.nq, model.nv, model.nu))
         first = 0 if past.wanted is None else jnp.where(past.wanted, 0, lead)
-        _, (qpos, qvel, effort) = jax.lax.fori_loop(first, lead + count, step, (past.world if lead else world, nothing))
+        begun = past.world if lead else world
+        _, (qpos, qvel, effort) = jax.lax.fori_loop(first, lead + count, step, (begun, nothing))
         error = jax.vmap(lambda a, b: difference(model, a, b))(own.qpos, qpos)
         errors = jnp.concatenate([error, own.qvel - qvel], axis=1)
         return jnp.nan_to_num(errors, nan=FAR, posinf=FAR, neginf=-FAR), effort

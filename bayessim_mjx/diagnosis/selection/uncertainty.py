@@ -45,6 +45,14 @@ def spread(fitter: Fitter, model: Model, along: Ridges | None = None) -> Spread:
     return Spread(np.asarray(covariance), statistics.covariance(model.estimates), statistics.freedom(share))
 
 
+def of_noise(fitter: Fitter, model: Model, along: Ridges | None = None) -> Array:
+    """`[k, k]`, Laplace covariance of the fit if its law were right: of the noise and of what was known before."""
+    q, _ = model.fit.quadratic(fitter.spread)
+    _, S = q.weighted(model.fit.weight)
+    S = S if along is None else along.corrected(S, weak_directions.scales(model.fit))
+    return np.asarray(np.linalg.pinv(S + np.diag(weak_directions.beliefs(model.fit, len(fitter.base)))))
+
+
 @dataclass(frozen=True)
 class Systematic:
     """What simulators differ by, whatever the data."""

@@ -70,6 +70,10 @@ HIDDEN = (
     "Beside {them} these logs would not show {hidden}: parameters of what is named do the same, and stand for both "
     "where both are there."
 )
+BUILDS_UP = (
+    "Over whole logs the error grows to {times} times what noise, start and parameters make likely, though within "
+    "{window} it hardly shows: the law is not quite that of the real system."
+)
 BENT = (
     "This needs {far} of {known} known parameters far from the data sheet, by chance less often than in 1 of 10 000 "
     "robots even if it is half as inaccurate again as stated: something else may be missing in their place, or the "
@@ -95,6 +99,8 @@ def sentences(
     told = verdict_in_words(name, effects, far, verdict.remains, verdict.beaten)
     far_off, known = verdict.bent
     told += [BENT.format(far=far_off, known=known)] if known else []
+    window = f"{cut.steps * cut.dt:.2g} s"
+    told += [BUILDS_UP.format(times=f"{verdict.builds_up:.2g}", window=window)] if verdict.builds_up else []
     told += [_by_chance(odds)]
     if found.selection.ambiguous:
         told += [_instead(e, found.selection.rivals.get(f"{e.name}@{e.where}", ())) for e in effects]

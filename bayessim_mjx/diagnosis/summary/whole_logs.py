@@ -7,10 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bayessim_mjx.diagnosis import statistics
 from bayessim_mjx.diagnosis.findings import Findings, Progress
 from bayessim_mjx.diagnosis.fitting import windows
 from bayessim_mjx.diagnosis.fitting.centred_commands import physics_of
 from bayessim_mjx.diagnosis.fitting.simulator import Simulator
+from bayessim_mjx.diagnosis.selection import uncertainty
 from bayessim_mjx.diagnosis.selection.heldout import Prediction
 from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.setup import Setup
@@ -27,6 +29,7 @@ class Rules:
     logs: int = 8
     seconds: float = 10.0
     draws: int = 4  # of the start state
+    likely: int = 8  # of start state and parameters together
     # noise sd and share of the motion: what a start's uncertainty may grow to
     clear: float = 3.0
     part: float = 0.1
@@ -45,12 +48,14 @@ class Whole:
         cost: {stage: `[L]`}, mean squares in noise variances, of the logs that can be predicted; by_channel: {stage:
             `[L, nv]`}, of positions alone.
         chance: `[L]`, mean squares that come of the uncertain start alone.
+        beyond: `[L]`, mean squares of the last stage over those that start, parameters and noise together make likely.
         group: `[L]`, operating conditions; name, seconds: of the horizon; notes: for the warnings.
     """
 
     cost: dict[str, Array]
     by_channel: dict[str, Array]
     chance: Array
+    beyond: Array
     group: NDArray[np.int64]
     name: str
     seconds: float
@@ -86,14 +91,17 @@ def simulate(found: Findings, say: Progress = lambda text, done, total: None) ->
     starts = [int(cut.start[w]) for w in first]
     most = round(RULES.seconds / cut.dt)
     length = [min(len(cut.logs[r]) - 1 - a, most) for r, a in zip(logs, starts, strict=True)]
-    simulator = _simulator(found, logs, starts, max(length), len(stages) + RULES.draws)
-    errors, spread = [], []
+    simulator = _simulator(found, logs, starts, max(length), len(stages) + RULES.draws + RULES.likely)
+    errors, spread, likely = [], [], []
+    every = len(stages) + RULES.draws
     for i, (w, steps) in enumerate(zip(first, length, strict=True)):
         say("whole logs", i, len(first))
         rows = _one(found, simulator, stages, i, w)[:, :steps]
         errors.append(rows[: len(stages)])
-        spread.append(rows[len(stages) :] - rows[len(stages) - 1])
-    return _judged(setup, list(stages), [cut.logs[r].name for r in logs], cut.group[first], errors, spread)
+        spread.append(rows[len(stages) : every] - rows[len(stages) - 1])
+        likely.append(rows[every:] - rows[len(stages) - 1])
+    names = [cut.logs[r].name for r in logs]
+    return _judged(setup, list(stages), names, cut.group[first], errors, spread, likely)
 
 
 def _simulator(found: Findings, logs: Array, starts: list[int], length: int, lanes: int) -> Simulator:
@@ -110,29 +118,38 @@ def _simulator(found: Findings, logs: Array, starts: list[int], length: int, lan
 
 
 def _one(found: Findings, simulator: Simulator, stages: dict[str, _Stage], i: int, w: int) -> Array:
-    """Whitened errors `[stages + DRAWS, H, channels]` of one log; the draws are of the last stage's start state."""
-    fitter = found.setup.fitter
-    thetas = [_theta(found, simulator, s, w) for s in stages.values()]
+    """Whitened errors `[stages + draws + likely, H, channels]` of one log; the draws are of the last stage."""
+    fitter, last = found.setup.fitter, list(stages.values())[-1]
+    rng = np.random.default_rng(found.setup.seed)
+    values = [_values(found, s, w) for s in stages.values()]
     offsets = [s.prediction.offsets[w] for s in stages.values()]
-    B = list(stages.values())[-1].model.fit.B[w]
+    B = last.model.fit.B[w]
     root = np.linalg.cholesky(np.linalg.inv(B.T @ B + np.diag(1 / fitter.spread**2)))
-    draws = np.random.default_rng(found.setup.seed).normal(size=(RULES.draws, len(root))) @ root.T
-    thetas += [thetas[-1]] * RULES.draws
-    moved = np.stack([*offsets, *(offsets[-1] + draws)])[:, None]
-    raw = simulator.run(np.stack(thetas), moved, np.array([i]))[:, 0]
+    moved = offsets[-1] + rng.normal(size=(RULES.draws + RULES.likely, len(root))) @ root.T
+    away = statistics.root(uncertainty.of_noise(fitter, last.model, found.selection.along))
+    off = values[-1] + rng.normal(size=(RULES.likely, len(away))) @ away.T
+    ends = np.array([(c.low, c.high) for c in last.model.fit.coordinates]).reshape(-1, 2).T
+    drawn = [*[values[-1]] * RULES.draws, *np.clip(off, *ends)]
+    models = [s.model for s in stages.values()] + [last.model] * len(drawn)
+    thetas = np.stack([_theta(found, simulator, m, v) for m, v in zip(models, [*values, *drawn], strict=True)])
+    raw = simulator.run(thetas, np.concatenate([offsets, moved])[:, None], np.array([i]))[:, 0]
     raw[np.abs(raw) >= RULES.lost] = np.nan
     return np.asarray(raw[..., fitter.used] / fitter.sigma)
 
 
-def _theta(found: Findings, simulator: Simulator, stage: _Stage, w: int) -> Array:
-    """theta of the small simulator found without the condition of window w (with all, where the log has several)."""
-    fitter, fit = found.setup.fitter, stage.model.fit
-    cut = fitter.simulator.windows
+def _values(found: Findings, stage: _Stage, w: int) -> Array:
+    """Of a stage's coordinates, found without the condition of window w (with all, where the log has several)."""
+    fit, cut = stage.model.fit, found.setup.fitter.simulator.windows
+    if stage.nominal:
+        return np.array([c.neutral for c in fit.coordinates])
     own = np.unique(cut.group[cut.log == cut.log[w]])
-    values = stage.model.estimates[list(np.unique(cut.group)).index(own[0])] if len(own) == 1 else fit.values
-    values = np.array([c.neutral for c in fit.coordinates]) if stage.nominal else values
+    return stage.model.estimates[list(np.unique(cut.group)).index(own[0])] if len(own) == 1 else fit.values
+
+
+def _theta(found: Findings, simulator: Simulator, model: Model, values: Array) -> Array:
+    """theta of the small simulator."""
     space, small = found.setup.physics.space, simulator.physics.space
-    return fitter.vector(fit.coordinates, values)[[space.index(name) for name in small.names]]
+    return found.setup.fitter.vector(model.fit.coordinates, values)[[space.index(name) for name in small.names]]
 
 
 def _judged(
@@ -142,6 +159,7 @@ def _judged(
     group: NDArray[np.int64],
     errors: list[Array],
     spread: list[Array],
+    likely: list[Array],
 ) -> Whole:
     """Costs of the logs that can be predicted, each as long as it can be, and what is to be said of the others."""
     cut = setup.fitter.simulator.windows
@@ -163,11 +181,19 @@ def _judged(
         cost=cost,
         by_channel=each,
         chance=np.array([np.mean(spread[i][:, : last[i]] ** 2) for i in kept]),
+        beyond=np.array([_beyond(errors[i][-1, : last[i]], likely[i][:, : last[i]]) for i in kept]),
         group=group[kept],
         name="whole log" if whole else f"up to {longest:.2g} s",
         seconds=float(np.median([last[i] for i in kept]) * cut.dt) if kept else 0.0,
         notes=tuple(notes),
     )
+
+
+def _beyond(error: Array, likely: Array) -> float:
+    """Mean square of a log's error over what draws of start and parameters leave of the mean, and noise, have."""
+    with np.errstate(invalid="ignore"):
+        each = np.mean(likely**2, axis=(1, 2))
+    return float(np.mean(error**2) / (1.0 + np.mean(each[np.isfinite(each)]))) if np.isfinite(each).any() else 0.0
 
 
 def _motion(setup: Setup, name: str) -> Array:

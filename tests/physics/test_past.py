@@ -1,0 +1,91 @@
+"""Where a motor behind play or a spring is in the middle of a recording of its link."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from bayessim_mjx.effects import make
+from bayessim_mjx.effects.support.motion import Motion
+from bayessim_mjx.parameters import ParameterSpace
+from bayessim_mjx.physics import Physics, begin, control_step, past_of, retraced
+
+MODEL = """
+<mujoco>
+  <option timestep=".002" integrator="{}"/>
+  <worldbody><body>
+    <joint name="link" axis="0 1 0" damping=".05" armature=".02"/>
+    <geom type="capsule" fromto="0 0 0 0 0 -.3" size=".02" mass="1" contype="0" conaffinity="0"/>
+  </body></worldbody>
+  <actuator><motor joint="link"/></actuator>
+</mujoco>
+"""
+DT, ROWS, BEFORE = 0.02, 100, 5
+TIME = DT * np.arange(ROWS)
+COMMAND = (1.2 * np.sin(2 * np.pi * (1 + TIME) * TIME))[:, None].astype(np.float32)
+
+
+def robot(xml, effect):
+    return Physics(mujoco.MjModel.from_xml_string(xml), DT, ParameterSpace([]), [make(effect, where="link")])
+
+
+@functools.cache
+def recorded(name, value, integrator="Euler"):
+    """(physics, theta, its worlds, `Motion`s around the rows) of a robot with one effect."""
+    physics = robot(MODEL.format(integrator), name)
+    theta = jnp.asarray(value, jnp.float32)
+
+    def step(world, command):
+        after = control_step(physics, world, command)[0]
+        return after, world
+
+    _, worlds = jax.jit(lambda w: jax.lax.scan(step, w, jnp.asarray(COMMAND)))(physics.world(theta))
+    near = np.arange(BEFORE, ROWS - BEFORE)[:, None] + np.arange(-BEFORE, BEFORE + 1)
+    commands = np.repeat(COMMAND[near][:, :, None], physics.substeps, 2)
+    return physics, theta, worlds, Motion(worlds.qpos[near], worlds.qvel[near], jnp.asarray(commands), start=BEFORE)
+
+
+def twists(how, physics, theta, motion):
+    found = jax.jit(jax.vmap(functools.partial(how, physics, theta)))(motion)
+    return np.asarray(found.memory[0]["twist"])[:, 0], found
+
+
+@pytest.mark.parametrize("integrator", ["Euler", "implicitfast"])
+def test_a_motor_is_where_the_recorded_motion_brought_it(integrator):
+    gap = 0.03
+    physics, theta, worlds, motion = recorded("backlash", (gap,), integrator)
+    true = np.asarray(worlds.memory[0]["twist"])[BEFORE : ROWS - BEFORE, 0]
+    assert (np.abs(true) < 0.9 * gap).mean() > 0.1 and true.min() < -0.9 * gap and true.max() > 0.9 * gap
+    off = np.abs(twists(retraced, physics, theta, motion)[0] - true)
+    assert np.mean(off < 0.1 * gap) > 0.8  # in the others the motor has touched neither side for 0.1 s
+    unknown, start = twists(begin, physics, theta, motion)
+    assert np.all(unknown == 0) and np.all(start.memory[0]["fresh"])
+
+
+def test_a_spring_is_wound_up_as_the_recorded_motion_left_it():
+    """Of 4 Hz and lightly damped: in 0.1 s what is not known of its swing decays by a third only."""
+    physics, theta, worlds, motion = recorded("joint_elasticity", (0.1, 0.1))
+    true = np.asarray(worlds.memory[0]["twist"])[BEFORE : ROWS - BEFORE, 0]
+    off = twists(retraced, physics, theta, motion)[0] - true
+    assert np.sqrt(np.mean(off**2)) < 0.65 * np.std(true)
+
+
+def test_a_start_is_as_measured_and_without_such_effects_nothing_is_retraced():
+    physics, theta, worlds, motion = recorded("backlash", (0.03,))
+    one = jax.tree.map(lambda x: x[20], motion)
+    found = retraced(physics, theta, one)
+    np.testing.assert_array_equal(found.qpos, one.qpos[BEFORE])
+    np.testing.assert_array_equal(found.qvel, one.qvel[BEFORE])
+    other = robot(MODEL.format("Euler"), "coulomb_friction")
+    assert past_of(other, jnp.zeros(len(other.space)), one).steps == 0
+    assert past_of(physics, theta, one.replace(start=0)).steps == 0
+
+
+def test_inactive_effects_are_not_taken_along():
+    physics, theta, worlds, motion = recorded("backlash", (0.03,))
+    one = jax.tree.map(lambda x: x[20], motion)
+    assert bool(past_of(physics, theta, one, jnp.array([True])).wanted)
+    assert not bool(past_of(physics, theta, one, jnp.array([False])).wanted)
