@@ -98,8 +98,8 @@ def gap(left, limit=0.02):
     return Gap(1.0, 2000.0, 1000.0, 1e4 * left, 1.0, physical=rows, shares=shares, beyond=beyond)
 
 
-def findings(rms, noise=50.0, windows=8):
-    """A selection that names friction and leaves `rms` noises of a gap of 1000."""
+def findings(rms, noise=50.0, windows=8, beyond=()):
+    """A selection that names friction and leaves `rms` noises of a gap of 1000; beyond: of whole logs."""
 
     def prediction(level):
         return Prediction(np.full((windows, 5, 2), float(level)), np.zeros((windows, 4)))
@@ -116,7 +116,7 @@ def findings(rms, noise=50.0, windows=8):
     cut = SimpleNamespace(windows=SimpleNamespace(steps=5))
     return SimpleNamespace(
         selection=selection, model=winner, flexible_winner=None, disturbance=None,
-        flexible_base=None, setup=SimpleNamespace(fitter=SimpleNamespace(simulator=cut)),
+        flexible_base=None, part=lambda kind: SimpleNamespace(beyond=np.array(beyond)), setup=SimpleNamespace(fitter=SimpleNamespace(simulator=cut)),
         predictions={"nominal": prediction(2000), "calibrated": prediction(1000), "with_effects": prediction(rms)},
     )  # fmt: skip
 
@@ -149,6 +149,16 @@ def test_effects_that_need_another_robot_do_not_explain_it(off, stated, bent):
     found.model.fit.coordinates, found.model.fit.values = known, tuple(1.0 + 0.05 * x for x in off)
     told = verdict.verdict_of(found, gap(0.0132))
     assert told.bent == bent and told.name == ("unexplained" if any(bent) else "effects")
+
+
+@pytest.mark.parametrize(
+    ("rms", "beyond", "times"),
+    [(1.2, (6.0, 8.0, 700.0), 8**0.5), (1.2, (0.1, 4.0, 700.0), 0), (1.2, (), 0), (1.6, (6.0, 8.0, 700.0), 0)],
+)
+def test_what_windows_hide_shows_over_whole_logs(rms, beyond, times):
+    """By the median log, as an unstable one says little; where windows show the rest themselves its share decides."""
+    told = verdict.verdict_of(findings(rms, beyond=beyond), gap(1e-4 * rms))
+    assert told.builds_up == pytest.approx(times) and told.name == ("unexplained" if times else "effects")
 
 
 def test_the_headline_says_partly_explained_and_what_remains_where():

@@ -126,8 +126,7 @@ def _one(found: Findings, simulator: Simulator, stages: dict[str, _Stage], i: in
     B = last.model.fit.B[w]
     root = np.linalg.cholesky(np.linalg.inv(B.T @ B + np.diag(1 / fitter.spread**2)))
     moved = offsets[-1] + rng.normal(size=(RULES.draws + RULES.likely, len(root))) @ root.T
-    away = statistics.root(uncertainty.of_noise(fitter, last.model, found.selection.along))
-    off = values[-1] + rng.normal(size=(RULES.likely, len(away))) @ away.T
+    off = values[-1] + rng.normal(size=(RULES.likely, len(values[-1]))) @ _root(found, last.model).T
     ends = np.array([(c.low, c.high) for c in last.model.fit.coordinates]).reshape(-1, 2).T
     drawn = [*[values[-1]] * RULES.draws, *np.clip(off, *ends)]
     models = [s.model for s in stages.values()] + [last.model] * len(drawn)
@@ -135,6 +134,13 @@ def _one(found: Findings, simulator: Simulator, stages: dict[str, _Stage], i: in
     raw = simulator.run(thetas, np.concatenate([offsets, moved])[:, None], np.array([i]))[:, 0]
     raw[np.abs(raw) >= RULES.lost] = np.nan
     return np.asarray(raw[..., fitter.used] / fitter.sigma)
+
+
+def _root(found: Findings, model: Model) -> Array:
+    """Square root `[k, k]` of the covariance of parameters whose law is right: noise, and what simulators differ by."""
+    setup, selection = found.setup, found.selection
+    own = np.diag(uncertainty.systematic(model, float(setup.physics.mj_model.opt.timestep)) ** 2)
+    return statistics.root(uncertainty.of_noise(setup.fitter, model, selection.along) + own)
 
 
 def _values(found: Findings, stage: _Stage, w: int) -> Array:

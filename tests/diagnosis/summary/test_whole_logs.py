@@ -29,7 +29,11 @@ def test_a_log_begins_as_its_first_window(rubbing):
     }
     first = int(np.flatnonzero(cut.log == 2)[0])
     simulator = whole_logs._simulator(
-        rubbing, np.array([2]), [int(cut.start[first])], 3 * cut.steps, 2 + whole_logs.RULES.draws
+        rubbing,
+        np.array([2]),
+        [int(cut.start[first])],
+        3 * cut.steps,
+        2 + whole_logs.RULES.draws + whole_logs.RULES.likely,
     )
     rows = whole_logs._one(rubbing, simulator, stages, 0, first)
     for row, stage in zip(rows, stages.values(), strict=False):
@@ -40,7 +44,7 @@ def test_a_log_begins_as_its_first_window(rubbing):
 def test_whole_logs_are_the_third_horizon(rubbing):
     diagnosis = assemble.diagnosis_of(rubbing)
     short, window, log = diagnosis.gap.horizons
-    assert short["seconds"] < window["seconds"] == pytest.approx(0.5) and log["seconds"] == pytest.approx(2.4, abs=0.1)
+    assert short["seconds"] < window["seconds"] == pytest.approx(0.5) and log["seconds"] == pytest.approx(2.3, abs=0.1)
     assert log["name"] == "whole log"
     assert log["nominal"] > log["with_effects"] and log["calibrated"] > 2 * log["with_effects"]
     assert log["with_effects"] >= log["reducible_floor"] >= 1.0
@@ -48,6 +52,14 @@ def test_whole_logs_are_the_third_horizon(rubbing):
         for stage, (low, high) in row["ci"].items():
             assert low <= row[stage] * 1.01 and row[stage] <= high * 1.01, (row["name"], stage)
     assert diagnosis.gap.nominal == window["nominal"]
+    assert log["over_likely"] < 1.5  # the law is right
+
+
+def test_what_is_likely_is_noise_and_what_draws_leave_of_the_mean():
+    error, likely = np.full((10, 2), 3.0), np.full((4, 10, 2), 2.0)
+    assert whole_logs._beyond(error, likely) == pytest.approx(9 / (1 + 4))
+    likely[0, 3] = np.nan  # a draw that diverged
+    assert whole_logs._beyond(error, likely) == pytest.approx(9 / (1 + 4))
 
 
 @pytest.mark.slow
