@@ -34,6 +34,8 @@ def blank(loop: Loop) -> dict[str, Any]:
         "temperature": jnp.float32(1.0),
         "moving": ranges.unmoved(space) if isinstance(space, Ranged) else None,
         "motion": refining.no_motion(loop, real_rows) if infers and loop.refines else None,
+        "standing": domain if infers else None,
+        "standing_gain": jnp.float32(-jnp.inf) if infers else None,
     }
 
 

@@ -21,7 +21,7 @@ from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.inference import calibration, checks, misspecification, rounds
 from bayessim_mjx.keys import branch
-from bayessim_mjx.loop import ranges, refining, set_checks, set_posterior
+from bayessim_mjx.loop import ranges, refining, set_checks, set_posterior, standing
 from bayessim_mjx.loop.factors import conditioned, kept, multiplied
 from bayessim_mjx.loop.inference_state import new_network
 from bayessim_mjx.loop.simulations import at, noise_draws, proposal_of, simulated
@@ -56,14 +56,21 @@ def infer(loop: Loop, state: LoopState, policy: Policy, info: RoundInfo) -> Loop
         state, real_features=jax.lax.dynamic_update_slice(state.real_features, real_features, (seen, 0))
     )
     verdict = _examine(loop, state, fitted, held, info)
+    if b.checkTrajs and b.ftune and round_ and standing.lost(verdict and verdict[0], held[1]):
+        info.warnings.append("the network of the last round lost its range under this round's policy: fitted anew")
+        state = _learn(loop, state, fitted, again, info, anew=True)
+        verdict = _examine(loop, state, fitted, held, info)
     widening = b.temperature or (verdict[0].temperature if verdict is not None else None) or 1.0
     state = dataclasses.replace(state, temperature=jnp.float32(widening))
     state = dataclasses.replace(state, real_posteriors=_factors(loop, state, info))
     posterior = _widened(loop, state, policy, _posterior(loop, state, info), info)
+    if verdict is not None and not b.temperature and not loop.sequential:
+        gain = standing.expected(verdict[0], info.sets, seen + b.realTrajs)
+        state, posterior = standing.chosen(state, posterior, gain, info)
     if loop.refines:
         state, posterior = refining.refined(loop, state, real, posterior, info)
     by_replays = info.refinement is not None and info.refinement.used
-    if not by_replays:
+    if not by_replays and "sets/stood" not in info.scores:
         posterior = set_posterior.chosen(loop, state, policy, posterior, info)
     replaced = by_replays or (info.set_posterior is not None and info.set_posterior.used)
     info.warnings += _complaints(posterior.names, info.fit, known_before, by_replays)
@@ -128,11 +135,16 @@ def _again(more: Array, first: int, rows: int) -> inference.Again | None:
 
 
 def _learn(
-    loop: Loop, state: LoopState, fitted: tuple[Array, Array, int], again: inference.Again | None, info: RoundInfo
+    loop: Loop,
+    state: LoopState,
+    fitted: tuple[Array, Array, int],
+    again: inference.Again | None,
+    info: RoundInfo,
+    anew: bool = False,
 ) -> LoopState:
-    """Fit the network, the one so far or a new one."""
+    """Fit the network, the one so far or a new one; anew: a new one in any case."""
     b, round_, (thetas, x, count) = loop.settings, int(state.round), fitted
-    keeps = (b.ftune or round_ == 0) and not ranges.has_moved(state)
+    keeps = (b.ftune or round_ == 0) and not ranges.has_moved(state) and not anew
     network = state.fit if keeps else new_network(loop, round_, space_of(loop, state))
     correction: dict[str, Any] = {"again": again}
     if b.proposal == "apt":

@@ -53,6 +53,8 @@ class LoopState:
     temperature: Array  # [] factor on standard deviations that the last round's posterior was given
     motion: dict[str, Array] | None = None  # measured motion of the real trajectories, where bayessim.refine needs it
     moving: Moving | None = None  # None: all rounds have the ranges of the task
+    standing: Distribution | None = None  # the product used last, and what it gained on simulated sets (standing.py)
+    standing_gain: Array | None = None  # [] nats
 
 
 @dataclasses.dataclass

@@ -1,0 +1,80 @@
+"""A round never makes the posterior worse, by what simulations say; networks that left their range are fitted anew."""
+
+import dataclasses
+from types import SimpleNamespace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from stub_source import SPACE, infer, made
+
+from bayessim_mjx.distributions import Distribution
+from bayessim_mjx.loop import round_inference, standing
+
+
+def told():
+    return SimpleNamespace(warnings=[], scores={})
+
+
+@dataclasses.dataclass
+class State:
+    standing: object
+    standing_gain: object
+
+
+def test_what_gains_more_on_simulated_sets_stands():
+    first, second = Distribution.prior(SPACE, 2), Distribution.prior(SPACE, 2)
+    state, info = State(first, jnp.float32(-np.inf)), told()
+    state, used = standing.chosen(state, second, 5.0, info)
+    assert used is second and state.standing is second and float(state.standing_gain) == 5.0 and not info.warnings
+    third = Distribution.prior(SPACE, 2)
+    after, used = standing.chosen(state, third, 4.0, info)
+    assert used is second and after is state and info.scores == {"sets/stood": 1.0}
+    assert "gains 4.0 nats" in info.warnings[0] and "5.0 nats" in info.warnings[0]
+    _, used = standing.chosen(state, third, -np.inf, info)
+    assert used is second and "gains nothing" in info.warnings[1]
+    after, used = standing.chosen(state, third, 5.5, info)
+    assert used is third and float(after.standing_gain) == 5.5
+
+
+def test_without_a_judged_gain_nothing_stands_for_the_next_round():
+    state = State(Distribution.prior(SPACE, 2), jnp.float32(-np.inf))
+    posterior = Distribution.prior(SPACE, 2)
+    assert standing.chosen(state, posterior, -np.inf, told()) == (state, posterior)
+
+
+def test_what_is_expected():
+    report, counts = SimpleNamespace(gain=3.0), SimpleNamespace(at=lambda n: SimpleNamespace(gain=10.0 * n))
+    assert standing.expected(report, None, 1) == 3.0 and standing.expected(report, counts, 4) == 40.0
+    assert standing.expected(report, None, 2) == -np.inf  # hardly any set was a density
+    assert standing.expected(SimpleNamespace(gain=np.nan), None, 1) == -np.inf
+
+
+@pytest.mark.parametrize(("pairs", "lost"), [(100, False), (95, False), (94, True), (None, True)])
+def test_a_network_is_lost_where_its_posteriors_are_no_densities(pairs, lost):
+    """Simulations that diverged are nobody's fault."""
+    x = jnp.zeros((120, 3)).at[100:].set(jnp.nan)
+    assert standing.lost(None if pairs is None else SimpleNamespace(pairs=pairs), x) == lost
+
+
+@pytest.mark.slow
+@pytest.mark.ci
+def test_a_lost_network_is_fitted_anew(monkeypatch):
+    parts, start = made("bayessim.ftune=True", "bayessim.checkTrajs=100")
+    state, _ = infer(parts, start)
+    assert float(state.standing_gain) > 1.0  # of the first round, on sets of two
+    calls: list[bool] = []
+    learn = round_inference._learn
+
+    def watched(*args, **more):
+        calls.append(more.get("anew", False))
+        return learn(*args, **more)
+
+    monkeypatch.setattr(round_inference, "_learn", watched)
+    infer(parts, state)
+    monkeypatch.setattr(standing, "lost", lambda report, x: len(calls) == 2)
+    after, info = infer(parts, state)
+    assert calls == [False, False, True]
+    assert any("fitted anew" in text for text in info.warnings)
+    x = np.asarray(after.real_features)[:4, 0]
+    assert float(info.posterior.mean()[0]) == pytest.approx(x.mean(), abs=0.1)
