@@ -155,10 +155,10 @@ def test_effects_that_need_another_robot_do_not_explain_it(off, stated, bent):
     ("rms", "beyond", "times"),
     [(1.2, (6.0, 8.0, 700.0), 8**0.5), (1.2, (0.1, 4.0, 700.0), 0), (1.2, (), 0), (1.6, (6.0, 8.0, 700.0), 0)],
 )
-def test_what_windows_hide_shows_over_whole_logs(rms, beyond, times):
-    """By the median log, as an unstable one says little; where windows show the rest themselves its share decides."""
+def test_what_windows_hide_is_told_of_whole_logs(rms, beyond, times):
+    """By the median log, as an unstable one says little; where windows show the rest themselves that is told."""
     told = verdict.verdict_of(findings(rms, beyond=beyond), gap(1e-4 * rms))
-    assert told.builds_up == pytest.approx(times) and told.name == ("unexplained" if times else "effects")
+    assert told.builds_up == pytest.approx(times) and told.name == "effects"
 
 
 def test_the_headline_says_partly_explained_and_what_remains_where():

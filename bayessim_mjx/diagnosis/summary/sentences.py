@@ -72,7 +72,7 @@ HIDDEN = (
 )
 BUILDS_UP = (
     "Over whole logs the error grows to {times} times what noise, start and parameters make likely, though within "
-    "{window} it hardly shows: the law is not quite that of the real system."
+    "{window} it hardly shows: the law, or the simulator's time step, is not quite right."
 )
 BENT = (
     "This needs {far} of {known} known parameters far from the data sheet, by chance less often than in 1 of 10 000 "

@@ -38,12 +38,10 @@ class Limits:
     # were it so many times as inaccurate as stated: below that the effects explain the motion of another robot. In 63
     # simulated cases in which something was named the least was .0016, but for an unknown cause (6e-7)
     doubtful: float = 1e-4
-    # median over whole logs of the squared error over what noise, start and parameters make likely. Windows begin anew
-    # where the robot was measured, and hide what builds up: in 13 cases whose effects were rightly named .1 to 3.3, in
-    # four whose cause the library lacks and whose windows show nothing 8 to 700
-    builds_up: float = 5.0
-    loose: float = 1.5
-    far: float = 2.0  # standard deviations, from which on a known parameter is counted as far off
+    # times that errors over whole logs are larger (rms, median of the logs) than noise, start and parameters make
+    # likely: told from here on, and no reason for a verdict. Of 91 simulated cases with a right law 7 had 2.2 to 4, of
+    # 17 with a wrong one 4: as a verdict it lost more than it found
+    builds_up: float = 2.2
 
 
 LIMITS = Limits()
@@ -58,8 +56,8 @@ class Verdict:
             significant. beaten: whether a flexible force alone does much better than they do.
         noise: where what remains comes from, if nothing predicts it and no force does; else None.
         bent: (known parameters far from the data sheet, of so many), where that is no chance; else (0, 0).
-        builds_up: times what is likely, rms, that the error grows to over whole logs, where that is no chance although
-            windows show little; else 0.
+        builds_up: times what is likely, rms, that the error grows to over whole logs, where windows hardly show it;
+            else 0. It is told, and has no part in the name.
     """
 
     name: str
@@ -75,8 +73,7 @@ def verdict_of(found: Findings, far: Gap) -> Verdict:
     left, alone, noise = remains(found), beaten(found), sensors_noise(found)
     off = bent(found.model.fit) if found.model.effects else (0, 0)
     name = _name(found, far, left, alone, noise)
-    grown = builds_up(found) if found.model.effects and name != "unexplained" else 0.0
-    return Verdict("unexplained" if any(off) or grown else name, left, alone, noise, off, grown)
+    return Verdict("unexplained" if any(off) else name, left, alone, noise, off, builds_up(found))
 
 
 def bent(fit: Fit) -> tuple[int, int]:
@@ -90,15 +87,15 @@ def bent(fit: Fit) -> tuple[int, int]:
 def builds_up(found: Findings) -> float:
     """How many times larger (rms) the error over whole logs is than noise, start and parameters make likely; else 0.
 
-    Only where windows are within a few noises: where they show more, that is what is told, and its share decides. A law
-    that is nearly right may pass for right in windows, as each begins at the measured state.
+    Only where windows are within a few noises, which begin anew at the measured state: where they show more, that is
+    what is told. A law that is not quite right may pass in them, but so may a right one with an integrator's error.
     """
     over = found.part(Whole)
-    if over is None or not len(over.beyond):
+    if over is None or not len(over.beyond) or not found.model.effects:
         return 0.0
     cost = found.predictions["with_effects"].cost(found.setup.fitter.simulator.windows.steps).mean()
-    typical = float(np.median(over.beyond))
-    return float(np.sqrt(typical)) if typical > LIMITS.builds_up and cost <= LIMITS.matters**2 else 0.0
+    times = float(np.sqrt(np.median(over.beyond)))
+    return times if times > LIMITS.builds_up and cost <= LIMITS.matters**2 else 0.0
 
 
 def _name(found: Findings, far: Gap, remaining: float, alone: bool, noise: Origin | None) -> str:
