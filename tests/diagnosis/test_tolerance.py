@@ -114,9 +114,10 @@ def findings(rms, noise=50.0, windows=8, beyond=()):
         base=SimpleNamespace(total=windows * noise * 1e6, cost=np.ones(windows)),
     )
     cut = SimpleNamespace(windows=SimpleNamespace(steps=5))
+    whole = SimpleNamespace(beyond=np.array(beyond))
     return SimpleNamespace(
         selection=selection, model=winner, flexible_winner=None, disturbance=None,
-        flexible_base=None, part=lambda kind: SimpleNamespace(beyond=np.array(beyond)), setup=SimpleNamespace(fitter=SimpleNamespace(simulator=cut)),
+        flexible_base=None, part=lambda kind: whole, setup=SimpleNamespace(fitter=SimpleNamespace(simulator=cut)),
         predictions={"nominal": prediction(2000), "calibrated": prediction(1000), "with_effects": prediction(rms)},
     )  # fmt: skip
 
