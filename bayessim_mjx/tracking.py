@@ -64,8 +64,8 @@ def errors(physics: Physics, thetas: ArrayLike, record: Record, gains: Gains) ->
 @lru_cache(maxsize=16)
 def _errors(physics: Physics) -> Callable[..., Any]:
     def one(theta: Array, record: Record, gains: Gains) -> Array:
-        world = started(physics, theta, record.qpos[0], record.qvel[0], record.command, record.around)
         drive = Drive(law=record.law)
+        world = started(physics, theta, record.qpos[0], record.qvel[0], record.command, record.around, drive)
 
         def step(carry: tuple, row: tuple) -> tuple[tuple, Array]:
             world, force = carry
@@ -114,8 +114,8 @@ def _transitions(physics: Physics) -> Callable[..., Any]:
     nv = physics.mj_model.nv
 
     def one(theta: Array, record: Record, gains: Gains, scale: Array) -> tuple[Array, Array]:
-        world = started(physics, theta, record.qpos[0], record.qvel[0], record.command, record.around)
         drive = Drive(law=record.law)
+        world = started(physics, theta, record.qpos[0], record.qvel[0], record.command, record.around, drive)
 
         def step(carry: tuple, row: tuple) -> tuple[tuple, tuple[Array, Array]]:
             world, force = carry

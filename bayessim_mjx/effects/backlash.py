@@ -22,8 +22,8 @@ MARK = 2.0**-40
 class Backlash(Effect):
     """The motor turns freely within +-gap around the link; at its ends the teeth push, never pull.
 
-    J w_m' = tau - s, link moved by s, |q_m - q| <= gap, s = 0 inside. The motor is that of `joint_elasticity`: its
-    inertia J is the joint's armature, or a fifth of what is felt at the joint, and has the joint's damping. The sensors
+    J w_m' = tau - d w_m - s, link moved by s, |q_m - q| <= gap, s = 0 inside. The motor is that of `joint_elasticity`:
+    its inertia J is the joint's armature, or a fifth of what is felt at the joint, d the joint's damping. The sensors
     show the link; position servos see the motor. Teeth do not bounce. At the start the load has pushed the motor to one
     end of the gap; where a recording leads up to the start, the motor is where this brought it.
 

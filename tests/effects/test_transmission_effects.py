@@ -171,6 +171,26 @@ def test_backlash_is_play_between_two_bodies(gap):
         assert np.abs(q - real).max() < 0.2 * np.abs(without - real).max()
 
 
+@pytest.mark.slow
+@pytest.mark.ci
+@pytest.mark.parametrize("integrator", ["Euler", "implicitfast"])
+def test_a_joints_damping_is_the_motors(integrator):
+    """Strong damping: inside the play the link swings freely and the motor does not."""
+    gap, strong = 0.03, 'damping="0.3"'
+    between = f'limited="true" range="-{gap} {gap}" solreflimit=".001 1"'
+    two = TWO.format(between=between, actuator=TORQUE.format("motor"))
+    motors, links = (
+        two.replace('damping=".02"', strong),
+        two.replace('damping=".02"', "").replace('damping="0"', strong),
+    )
+    ours = model(TORQUE, integrator).replace('damping="0.02"', strong)
+    q, rigid = moved(physics(ours, stack()), [[0, 0.1, gap], *[NEUTRAL] * (ROWS - 1)], 2 * PUSHED)[:2, :, 0]
+    real, other = (
+        truth(mujoco.MjModel.from_xml_string(xml), 2 * PUSHED, qpos=[0, gap])[:, 0] for xml in (motors, links)
+    )
+    assert np.abs(q - real).max() < 0.2 * min(np.abs(rigid - real).max(), np.abs(other - real).max())
+
+
 @pytest.mark.parametrize("armature", [ARMATURE, 0.0])
 @pytest.mark.slow
 def test_tends_to_the_rigid_joint_and_stays_finite(armature):
