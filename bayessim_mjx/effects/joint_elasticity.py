@@ -24,8 +24,8 @@ class JointElasticity(Effect):
 
     The actuators turn the motor, whose inertia J is the joint's armature (taken off the link), or a fifth of what is
     felt at the joint where the model has none; J_s is the inertia of motor against link. The sensors show the link;
-    position servos see the motor. The joint's damping d_j is the motor's; its friction stays with the link. At the start
-    the spring is wound up by the torque that a rigid joint would pass on, or as a recording that leads up to it says.
+    position servos see the motor. The joint's damping d_j is the motor's; its friction stays with the link. At the
+    start the spring is wound up by the torque that a rigid joint would pass on, or as the recording before it says.
 
     Parameters: `compliance` 1/k, rad/(N m) (hinge) or m/N (slide), neutral 0; `damping` zeta, without effect where the
     compliance is 0.
