@@ -47,12 +47,6 @@ def test_few_windows_are_spread_over_all_logs():
     assert list(first.start) == [0, 0, 0] and list(first.log) == [0, 1, 2]
 
 
-def test_a_first_window_begins_when_enough_is_known_of_what_came_before():
-    """0.1 s of it, and overlaps the second window; a log that is hardly longer than a window gives what it can."""
-    assert list(cut(LOGS[:1]).start) == [5, 25, 50, 75]
-    assert list(cut([LOGS[0].cut(0, LENGTH + 1)]).start) == [0] and list(cut([LOGS[0].cut(0, LENGTH + 4)]).start) == [3]
-
-
 def test_logs_that_are_too_short_are_refused():
     with pytest.raises(UserError, match="no log holds 500 control steps.*longest has 100"):
         cut(LOGS, length=500)
@@ -100,7 +94,7 @@ def test_one_log_is_held_out_in_blocks_of_time():
 
 def test_a_step_of_the_command_acts_half_a_substep_before_its_row():
     rows = len(LOGS[0])
-    found = cut([with_command(np.where(np.arange(rows) >= 10, 2.0, 0.0))], starts=[(0, 0)])
+    found = cut([with_command(np.where(np.arange(rows) >= 10, 2.0, 0.0))])
     command = np.asarray(found.batch.command[0, :, :, 0])
     expected = np.zeros((LENGTH, SUBSTEPS))
     expected[10:] = 2.0
@@ -134,9 +128,9 @@ def test_impulses_of_commands_survive_fast_logs():
 
 
 def test_the_past_of_a_first_window_is_the_first_row_held():
-    found = cut(LOGS, starts=[(0, 0), (0, 25), (1, 50)])
+    found = cut(LOGS)
     around, back = found.batch.around, found.batch.around.start
-    assert back == 5 and around.qpos.shape == (3, 2 * back + 1, 1)
+    assert back == 5 and around.qpos.shape == (12, 2 * back + 1, 1) and found.start[0] == 0
     np.testing.assert_allclose(around.qpos[0, : back + 1, 0], LOGS[0].qpos[0, 0], rtol=1e-6)
     np.testing.assert_allclose(around.qpos[0, back:, 0], LOGS[0].qpos[: back + 1, 0], rtol=1e-6)
     inner = int(np.flatnonzero(found.start > 0)[0])
@@ -155,6 +149,6 @@ def test_unmeasured_velocities_are_not_compared_but_start_the_window():
 def test_drives_that_are_off_are_off_in_the_window():
     on = np.ones(len(LOGS[0]))
     on[:8] = 0
-    found = cut([dataclasses.replace(LOGS[0], streams={"enabled:motor": on}), LOGS[1]], starts=[(0, 0), (1, 0)])
+    found = cut([dataclasses.replace(LOGS[0], streams={"enabled:motor": on}), LOGS[1]])
     np.testing.assert_array_equal(np.asarray(found.batch.enabled)[0, :, 0], on[:LENGTH])
     assert np.all(np.asarray(found.batch.enabled)[found.log == 1] == 1)

@@ -44,7 +44,7 @@ def test_a_log_begins_as_its_first_window(rubbing):
 def test_whole_logs_are_the_third_horizon(rubbing):
     diagnosis = assemble.diagnosis_of(rubbing)
     short, window, log = diagnosis.gap.horizons
-    assert short["seconds"] < window["seconds"] == pytest.approx(0.5) and log["seconds"] == pytest.approx(2.3, abs=0.1)
+    assert short["seconds"] < window["seconds"] == pytest.approx(0.5) and log["seconds"] == pytest.approx(2.4, abs=0.1)
     assert log["name"] == "whole log"
     assert log["nominal"] > log["with_effects"] and log["calibrated"] > 2 * log["with_effects"]
     assert log["with_effects"] >= log["reducible_floor"] >= 1.0
