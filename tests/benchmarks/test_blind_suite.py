@@ -113,7 +113,6 @@ def test_a_check_of_known_curves_follows_from_its_seed_and_its_plan():
 
 
 @pytest.mark.slow
-@pytest.mark.ci
 @pytest.mark.parametrize("name", ["as assumed", "steps"])
 def test_told_strengths_hold_as_often_as_they_say(name):
     """90 % intervals, within what is asked of them and the error of 20 checks."""

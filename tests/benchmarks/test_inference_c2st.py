@@ -13,7 +13,6 @@ from c2st import c2st  # noqa: E402
 
 # the best classifier of N(0, I) and N(shift e_1, I) is right in Phi(shift / 2) of cases
 @pytest.mark.slow
-@pytest.mark.ci
 @pytest.mark.parametrize(
     ("d", "shift"), [(2, 0.0), (2, 1.0), *(pytest.param(10, s, marks=pytest.mark.slow) for s in (0.0, 0.5, 1.0))]
 )

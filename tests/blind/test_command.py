@@ -65,7 +65,6 @@ def files(out: Path) -> dict[str, bytes]:
 
 
 @pytest.mark.slow
-@pytest.mark.ci
 def test_a_check_is_a_function_of_its_seed_goes_on_and_notices_a_broken_seal(tmp_path, capsys):
     folder = pendulum(tmp_path / "robot")
     whole, parts = tmp_path / "whole", tmp_path / "parts"

@@ -37,7 +37,6 @@ def test_play_draws_from_the_posterior_in_the_coordinates_that_it_was_saved_in(t
 
 
 @pytest.mark.slow
-@pytest.mark.ci
 def test_play_prints_returns_of_latest_best_run_and_path(toy: None, capsys: pytest.CaptureFixture) -> None:
     assert train.main(["--task", "Pendulum", *SMALL]) == 0
     run = latest_run("logs", "Pendulum")
@@ -79,7 +78,6 @@ def test_play_looks_where_logdir_says(toy: None, capsys: pytest.CaptureFixture, 
 
 
 @pytest.mark.slow
-@pytest.mark.ci
 def test_a_teacher_that_sees_theta_is_imitated_by_a_student_that_does_not(toy: None, capsys: Any) -> None:
     argv = ["--task", "Pendulum", "--randomize", *SMALL]
     assert train.main([*argv, "ppo.policy_theta=True", "--logdir", "teachers"]) == 0

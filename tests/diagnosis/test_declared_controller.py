@@ -12,7 +12,6 @@ SERVO = '<position name="motor" joint="hinge" kp="6" kv="0.4"/>'
 
 
 @pytest.mark.slow
-@pytest.mark.ci
 def test_friction_behind_a_declared_controller_is_named():
     """Every stage: the flexible force, black boxes and whole logs know the controller too."""
     spoken = {"law": "position", "kp": 6.0, "kd": 0.4}

@@ -124,7 +124,6 @@ def test_one_call_finds_the_friction_and_gives_a_corrected_simulator(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.ci
 def test_logs_in_memory_and_a_compiled_model_leave_no_files(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     model = mujoco.MjModel.from_xml_string(XML)

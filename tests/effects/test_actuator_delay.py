@@ -74,7 +74,6 @@ def test_delays_add():
 
 
 @pytest.mark.slow
-@pytest.mark.ci
 def test_the_gradient_exists():
     """d(speed)/d(delay) after a command step of 1 N is -1 N / 1 kg."""
     p = Physics(mujoco.MjModel.from_xml_string(XML), DT, ParameterSpace(), [make("actuator_delay", where="all")])

@@ -151,7 +151,6 @@ def agree(got, want, atol=1e-5):
 @INTEGRATORS
 @pytest.mark.parametrize("case", ["neutral", *NATIVE])
 @pytest.mark.slow
-@pytest.mark.ci
 def test_an_effect_is_its_own_edit_recompiled_in_mujoco(integrator, case):
     got = motions(integrator)[case]
     agree(got, by_mujoco(integrator, case))
@@ -265,7 +264,6 @@ def test_laws_that_mujoco_lacks_follow_their_equations(integrator, case):
 
 
 @pytest.mark.slow
-@pytest.mark.ci
 @INTEGRATORS
 def test_neutral_changes_no_bit(integrator):
     """With all effects in the program and all drives on; behind limits, gears and gravity compensation."""

@@ -69,7 +69,6 @@ def plain():
 
 
 @pytest.mark.slow
-@pytest.mark.ci
 def test_neutral_changes_no_bit_also_beside_another_effect():
     friction = make("coulomb_friction", where="elbow")
     alone = moved(physics(XML, [friction]), [[0.3]], COMMAND)

@@ -91,7 +91,6 @@ def test_compliance_is_that_of_the_edited_model():
 
 
 @pytest.mark.slow
-@pytest.mark.ci
 @pytest.mark.parametrize(("columns", "wanted", "start"), [([0, 1], [1.7, 0.6], SLIDING), ([2, 3], [0.8, 0.5], None)])
 def test_recovers_what_mujoco_was_given(columns, wanted, start):
     name, quantity = (("contact_friction", "scale"), ("contact_compliance", "softness"))[columns[0] == 2]

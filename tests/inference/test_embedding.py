@@ -133,7 +133,6 @@ def test_it_learns_a_gain_that_no_single_step_shows(window):
 
 
 @pytest.mark.slow
-@pytest.mark.ci
 def test_the_fit_trains_it_end_to_end():
     """s' = s + g a + noise: nearly all that twelve steps say, far more than the first alone (a fixed summary)."""
     space = ParameterSpace([Parameter("gain", 0.0, -1.0, 1.0)])

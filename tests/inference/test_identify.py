@@ -24,7 +24,6 @@ def fitted():
 
 
 @pytest.mark.slow
-@pytest.mark.ci
 def test_the_held_out_gain_tells_them_apart(fitted):
     state, info = fitted
     np.testing.assert_array_equal(np.asarray(state.identified), [True, False])

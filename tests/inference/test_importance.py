@@ -108,7 +108,6 @@ def several(d):
 
 
 @pytest.mark.slow
-@pytest.mark.ci
 def test_parameters_times_one_number_leave_a_valley_that_is_followed_to_its_ends():
     """Two ratios of three parameters are known to .5 %, as of mass, damping and motor from motion alone."""
     space, rng, levels = several(3), np.random.default_rng(0), []

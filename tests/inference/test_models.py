@@ -34,7 +34,6 @@ def trained(space: ParameterSpace, **options):
 
 
 @pytest.mark.slow
-@pytest.mark.ci
 @pytest.mark.parametrize(
     "options",
     [

@@ -25,7 +25,6 @@ def leaning(thetas, seed):
 
 @pytest.mark.parametrize("truth", [0.95, -0.5])
 @pytest.mark.slow
-@pytest.mark.ci
 def test_sets_at_draws_of_the_posterior_take_back_what_the_network_leans_by_there(truth):
     """In a corner that hardly any draw of the prior reaches, products are sqrt(8) LEANS = 4.2 of their SD too low."""
     everywhere = np.random.default_rng(0).uniform(-1, CORNER, (MANY, 2))

@@ -32,7 +32,7 @@ def simulate(key: jax.Array, theta: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [pytest.param("summary_start", marks=pytest.mark.ci), "summary_corrdiff"])
+@pytest.mark.parametrize("name", ["summary_start", "summary_corrdiff"])
 def test_length_and_damping_of_a_pendulum_are_found(name):
     summarize = summarizers.get(name)
     observe = jax.jit(jax.vmap(lambda key, theta: summarize(*simulate(key, theta))))

@@ -29,7 +29,6 @@ def simulate(key: jax.Array, thetas: jax.Array) -> jax.Array:
 
 
 @pytest.mark.slow
-@pytest.mark.ci
 @pytest.mark.parametrize(("method", "coordinates", "ftune"), [("apt", "probit", True)])
 def test_every_method_finds_the_analytic_posterior(method, coordinates, ftune):
     """The naive fit to the second round would have the sd of the product of posterior and proposal: 0.71 of it."""

@@ -60,7 +60,6 @@ def test_what_is_pooled_is_the_product_in_any_order():
 
 
 @pytest.mark.slow
-@pytest.mark.ci
 def test_an_error_that_all_trajectories_share_is_learnt_away():
     """x = theta + N(0, .2^2); the network of single trajectories has learnt it with .1 added, and is sure of that."""
     settings = InferenceSettings(hiddenLayers=(16,), ensemble=2, components=1)

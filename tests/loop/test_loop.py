@@ -134,7 +134,7 @@ def test_later_rounds_compile_nothing(env):
     assert counts[2] == counts[1], counts  # the second round still meets a product of several for the first time
 
 
-LONG = [pytest.mark.slow, pytest.mark.ci]
+LONG = [pytest.mark.slow]
 
 
 @pytest.mark.parametrize("stop", [pytest.param(1, marks=LONG), 3, pytest.param(4, marks=LONG)])

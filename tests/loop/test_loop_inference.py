@@ -68,7 +68,6 @@ def usual():
 
 
 @pytest.mark.slow
-@pytest.mark.ci
 def test_nothing_is_said_where_nothing_is_wrong_but_what_is_not_identified(usual):
     state, info = usual
     assert info.checks.prior_share == 0.0 and float(state.temperature) == 1.0
@@ -78,7 +77,6 @@ def test_nothing_is_said_where_nothing_is_wrong_but_what_is_not_identified(usual
 
 
 @pytest.mark.slow
-@pytest.mark.ci
 def test_reality_unlike_simulation_is_told_by_name_and_part_of_the_randomisation_is_the_prior():
     state, info = infer(*made(*TESTED, "bayessim.distrust=0.4", offset=8.0))
     (told,) = [text for text in info.warnings if "unlike anything simulated" in text]

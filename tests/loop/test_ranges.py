@@ -36,7 +36,6 @@ def beyond():
 
 
 @pytest.mark.slow
-@pytest.mark.ci
 def test_a_truth_beyond_the_range_is_reached_and_the_interval_covers_it(beyond):
     _, rounds = beyond
     ends = [(float(s.moving.space.low[0]), float(s.moving.space.high[0])) for s, _ in rounds]
@@ -111,7 +110,6 @@ def test_a_run_killed_after_a_move_goes_on_bit_for_bit(beyond, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.ci
 @pytest.mark.parametrize("proposal", ["apt", "truncated", "division"])
 def test_posteriors_as_proposals_reach_it_too(proposal):
     parts, state = made(*MOVING, f"bayessim.proposal={proposal}", "bayessim.trainTrajs=1000", mass=2.5)

@@ -58,7 +58,6 @@ def test_a_network_is_lost_where_its_posteriors_are_no_densities(pairs, lost):
 
 
 @pytest.mark.slow
-@pytest.mark.ci
 def test_a_lost_network_is_fitted_anew(monkeypatch):
     parts, start = made("bayessim.ftune=True", "bayessim.checkTrajs=100")
     state, _ = infer(parts, start)

@@ -222,7 +222,6 @@ def test_updates_carry_the_clock_on(wrapped: bool) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.ci
 @pytest.mark.parametrize(("frequency", "draws"), [(1, [0, 4, 8, 12, 16, 20]), (8, [0, 8, 16]), (9, [0, 12])])
 def test_new_parameters_come_at_the_first_reset_after_so_many_steps(frequency: int, draws: list[int]) -> None:
     """Episodes of 4 steps; parameters, gravity and lasting noise change together, at these steps only."""

@@ -51,7 +51,6 @@ def assert_same_curve(a, b):
 
 
 @pytest.mark.slow
-@pytest.mark.ci
 def test_curves_do_not_depend_on_the_number_of_devices(runs):
     """Losses, novelty, statistics and returns of six iterations, to float32's rounding."""
     assert_same_curve(runs["curves"]["1"], runs["curves"]["2"])

@@ -62,7 +62,6 @@ def test_the_knee_opens_the_leg_as_its_angle_says():
 
 
 @pytest.mark.slow
-@pytest.mark.ci
 def test_sensors_carry_the_ball(compiled):
     """A ball at rest beside the middle: its weight, and the torques of its lever about the three sensors."""
     task = compiled("BallBalance")

@@ -167,7 +167,6 @@ def at(qpos):
 
 
 @pytest.mark.slow
-@pytest.mark.ci
 def test_observations_and_targets_by_hand(compiled):
     task = compiled("FrankaCabinet")
     model = task.env.mj_model
@@ -187,7 +186,6 @@ def test_observations_and_targets_by_hand(compiled):
 
 
 @pytest.mark.slow
-@pytest.mark.ci
 def test_mjx_agrees_with_mujoco_in_the_air_and_pulling_the_handle(compiled, both_engines):
     """A second of random targets; and a hand that closes around the handle, pulls, and opens the drawer."""
     env, rng = compiled("FrankaCabinet").env, np.random.default_rng(3)

@@ -72,7 +72,6 @@ def test_observations_by_hand(compiled):
 
 
 @pytest.mark.slow
-@pytest.mark.ci
 def test_joint_forces_are_those_of_motors_springs_and_dampers(compiled):
     task = compiled("Humanoid")
     qpos, qvel = upright(2.0)

@@ -105,7 +105,6 @@ def isaac(quat):
     return np.roll(quat if quat[0] >= 0 else -quat, -1)
 
 
-@pytest.mark.ci
 def test_mjx_agrees_with_mujoco_on_a_cube_that_rests_and_one_that_is_held(env, both_engines):
     """A second without action, in which the cube falls on the palm; and hands that close on it and move.
 

@@ -100,7 +100,6 @@ def evidence(tried):
 
 
 @pytest.mark.slow
-@pytest.mark.ci
 def test_fast_motion_is_proposed_where_only_fast_motion_separates():
     setup = contest()[0].setup
     found = proposal()

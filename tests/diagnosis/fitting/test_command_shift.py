@@ -79,7 +79,6 @@ def test_samples_of_a_smooth_command_lead_by_half_a_row_unless_they_are_held_lin
 
 
 @pytest.mark.slow
-@pytest.mark.ci
 def test_a_lead_is_moved_away_and_told_not_explained_by_an_effect(tmp_path):
     """Its truth is known: a simulator without any gap, whose commands were logged 3 ms late."""
     effects = ["actuator_delay", "viscous_friction", "joint_elasticity"]

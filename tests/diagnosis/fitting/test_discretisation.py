@@ -116,7 +116,6 @@ def test_fast_motion_is_simulated_more_finely_until_the_step_does_not_show():
 
 
 @pytest.mark.slow
-@pytest.mark.ci
 def test_the_integrator_that_is_recommended_leaves_nothing():
     """RK4 at the same step: commands act when they are sent, and velocities are those of the positions' time."""
     found, left = measured(ARM.replace("implicitfast", "RK4"), logs(ARM, swing))

@@ -65,7 +65,6 @@ RUBBING = ARM.replace("<joint name", '<joint frictionloss=".4" damping=".1" name
 
 
 @pytest.mark.slow
-@pytest.mark.ci
 @pytest.mark.parametrize("touching", [False, True])
 def test_dry_friction_alone_needs_few_rounds_of_the_solver(touching):
     """The same motion as with all rounds; where something can touch they stay."""

@@ -26,7 +26,6 @@ def rubbed():
 
 
 @pytest.mark.slow
-@pytest.mark.ci
 def test_a_law_of_two_terms_is_written_down(rubbed):
     fitter, fit, missing = rubbed
     found = black_boxes.race(fitter, fit, None, missing, float(fitter.size))
