@@ -36,6 +36,7 @@ def blank(loop: Loop) -> dict[str, Any]:
         "motion": refining.no_motion(loop, real_rows) if infers and loop.refines else None,
         "standing": domain if infers else None,
         "standing_gain": jnp.float32(-jnp.inf) if infers else None,
+        "standing_round": jnp.int32(0) if infers else None,
     }
 
 

@@ -52,7 +52,18 @@ def chosen(state: LoopState, posterior: Distribution, gain: float, info: RoundIn
         return state, last
     if not np.isfinite(gain):
         return state, posterior
-    return dataclasses.replace(state, standing=posterior, standing_gain=jnp.float32(gain)), posterior
+    own = jnp.asarray(state.round, jnp.int32) + 1
+    return dataclasses.replace(
+        state, standing=posterior, standing_gain=jnp.float32(gain), standing_round=own
+    ), posterior
+
+
+def told(state: LoopState) -> str:
+    """What is to be said of a finished round whose posterior is an earlier one's; "" where it is its own."""
+    stands, done = int(state.standing_round or 0), int(state.round)
+    if stands in (0, done):
+        return ""
+    return f"the posterior in use is that of round {stands}: simulated trajectories promise less of round {done}'s"
 
 
 def _moved(last: Distribution, posterior: Distribution) -> bool:
@@ -61,4 +72,4 @@ def _moved(last: Distribution, posterior: Distribution) -> bool:
     return not all(np.array_equal(a, b) for a, b in zip(*ends, strict=True))
 
 
-__all__ = ["chosen", "expected", "lost"]
+__all__ = ["chosen", "expected", "lost", "told"]

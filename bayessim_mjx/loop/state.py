@@ -55,6 +55,7 @@ class LoopState:
     moving: Moving | None = None  # None: all rounds have the ranges of the task
     standing: Distribution | None = None  # the product used last, and what it gained on simulated sets (standing.py)
     standing_gain: Array | None = None  # [] nats
+    standing_round: Array | None = None  # [] int32, the round that it comes from, from 1 on; 0: none was judged
 
 
 @dataclasses.dataclass

@@ -20,6 +20,8 @@ def told():
 class State:
     standing: object
     standing_gain: object
+    standing_round: object = None
+    round: object = 0
 
 
 def test_what_gains_more_on_simulated_sets_stands():
@@ -35,6 +37,16 @@ def test_what_gains_more_on_simulated_sets_stands():
     assert used is second and "gains nothing" in info.warnings[1]
     after, used = standing.chosen(state, third, 5.5, info)
     assert used is third and float(after.standing_gain) == 5.5
+
+
+def test_it_is_told_whose_posterior_stands():
+    first = dataclasses.replace(State(Distribution.prior(SPACE, 2), jnp.float32(-np.inf)), standing_round=jnp.int32(0))
+    state, _ = standing.chosen(first, first.standing, 5.0, told())
+    assert int(state.standing_round) == 1 and standing.told(dataclasses.replace(state, round=1)) == ""
+    after, _ = standing.chosen(dataclasses.replace(state, round=1), first.standing, 4.0, told())
+    text = standing.told(dataclasses.replace(after, round=2))
+    assert text == "the posterior in use is that of round 1: simulated trajectories promise less of round 2's"
+    assert standing.told(dataclasses.replace(first, round=1)) == ""  # nothing was judged
 
 
 def test_without_a_judged_gain_nothing_stands_for_the_next_round():
