@@ -4,6 +4,18 @@ from bayessim_mjx.compat import mjx
 from bayessim_mjx.physics.drive import Drive
 from bayessim_mjx.physics.model import Physics, World
 from bayessim_mjx.physics.step import begin, control_step, past_of, retraced
-from bayessim_mjx.physics.timestep import staggered, substep
+from bayessim_mjx.physics.timestep import early, staggered, substep
 
-__all__ = ["Drive", "Physics", "World", "begin", "control_step", "mjx", "past_of", "retraced", "staggered", "substep"]
+__all__ = [
+    "Drive",
+    "Physics",
+    "World",
+    "begin",
+    "control_step",
+    "early",
+    "mjx",
+    "past_of",
+    "retraced",
+    "staggered",
+    "substep",
+]

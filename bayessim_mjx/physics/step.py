@@ -17,7 +17,7 @@ from bayessim_mjx.effects.support.site import under_tendon_limit
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.physics.drive import Drive
 from bayessim_mjx.physics.model import Physics, World, gated
-from bayessim_mjx.physics.timestep import staggered, substep
+from bayessim_mjx.physics.timestep import early, substep
 
 
 def control_step(
@@ -124,17 +124,25 @@ class Past(NamedTuple):
     """Control steps before a start, through which what `Effect.follows` is taken along the recorded motion.
 
     Attributes:
-        world: at the first of them; motion: the true one; steps: how many, static.
-        wanted: `[]` bool, whether an active effect needs them; None: none ever does.
+        physics: static; start: the world that they lead up to.
+        world: at the first of them, `start` itself where there are none; motion: the true one.
+        steps: how many, static; wanted: `[]` bool, whether an active effect needs them.
     """
 
+    physics: Physics
+    start: World
     world: World
     motion: Motion
     steps: int
-    wanted: jax.Array | None
+    wanted: jax.Array
 
-    def led(self, physics: Physics, k: jax.Array, world: World, start: World) -> World:
-        """What control step k begins with; from `steps` on it is simulated freely, from `start`.
+    @property
+    def first(self) -> int | jax.Array:
+        """The control step to begin with: where none of them is wanted, that of the start."""
+        return jnp.where(self.wanted, 0, self.steps) if self.steps else 0
+
+    def led(self, k: jax.Array, world: World) -> World:
+        """What control step k begins with; from `steps` on it is simulated freely, from the start.
 
         Args:
             k: one for all worlds of a call, so that under `vmap` a branch stays a branch.
@@ -144,42 +152,40 @@ class Past(NamedTuple):
             return world
 
         def along() -> World:
-            # s, by which the integrator's velocities lie before its positions
-            early = 0.5 * float(physics.mj_model.opt.timestep) if staggered(physics.mj_model) else 0.0
-            return world.replace(qpos=self.motion.qpos[k], qvel=self.motion.qvel[k] - early * world.warmstart)
+            before = early(self.physics.mj_model) * world.warmstart
+            return world.replace(qpos=self.motion.qpos[k], qvel=self.motion.qvel[k] - before)
 
-        arrived = functools.partial(self.arrived, physics, world, start)
+        arrived = functools.partial(self.arrived, world)
         return jax.lax.cond(k < self.steps, along, lambda: jax.lax.cond(k == self.steps, arrived, lambda: world))
 
-    def arrived(self, physics: Physics, world: World, start: World) -> World:
-        """`start` with the memory of what followed the motion up to it; world: after the last step."""
+    def arrived(self, world: World) -> World:
+        """The start with the memory of what followed the motion up to it; world: after the last step."""
 
         def kept(new: jax.Array, old: jax.Array) -> jax.Array:
-            return jnp.where(jnp.asarray(self.wanted), new, old)
+            return jnp.where(self.wanted, new, old)
 
-        each = zip(physics.effects, world.memory, start.memory, strict=True)
+        each = zip(self.physics.effects, world.memory, self.start.memory, strict=True)
         memory = (jax.tree.map(kept, new, old) if effect.follows else old for effect, new, old in each)
-        return start.replace(memory=tuple(memory))
+        return self.start.replace(memory=tuple(memory))
 
 
-def past_of(physics: Physics, theta: jax.Array, motion: Motion, active: jax.Array | None = None) -> Past:
-    """What leads up to the start that `begin` gives for the same arguments."""
+def past_of(physics: Physics, start: World, motion: Motion, active: jax.Array | None = None) -> Past:
+    """What leads up to the start that `begin` gives for its theta and the same `motion` and `active`."""
     follows = np.array([effect.follows for effect in physics.effects], bool)
     if not follows.any() or not motion.start:
-        return Past(begin(physics, theta, motion, active), motion, 0, None)
+        return Past(physics, start, start, motion, 0, jnp.array(False))
     steps, time = motion.start, motion.time
     before = None if time is None else jnp.maximum(time - steps * physics.dt, 0.0)
-    world, motion = _begun(physics, theta, motion.replace(start=0, time=before), active)
-    return Past(world, motion, steps, jnp.array(True) if active is None else jnp.any(active & follows))
+    world, motion = _begun(physics, start.theta, motion.replace(start=0, time=before), active)
+    wanted = jnp.array(True) if active is None else jnp.any(active & follows)
+    return Past(physics, start, world, motion, steps, wanted)
 
 
 def retraced(physics: Physics, theta: jax.Array, motion: Motion, drive: Drive = Drive()) -> World:  # noqa: B008
     """`begin`, with the memory of what follows the motion as the recorded past leaves it; drive: what else acted."""
-    start, past = begin(physics, theta, motion), past_of(physics, theta, motion)
-    if not past.steps:
-        return start
+    past = past_of(physics, begin(physics, theta, motion), motion)
 
     def step(k: jax.Array, world: World) -> World:
-        return control_step(physics, past.led(physics, k, world, start), motion.command[k], drive)[0]
+        return control_step(physics, past.led(k, world), motion.command[k], drive)[0]
 
-    return past.arrived(physics, jax.lax.fori_loop(0, past.steps, step, past.world), start)
+    return past.arrived(jax.lax.fori_loop(0, past.steps, step, past.world)) if past.steps else past.start

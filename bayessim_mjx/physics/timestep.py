@@ -34,6 +34,11 @@ def staggered(model: mujoco.MjModel) -> bool:
     return int(model.opt.integrator) != RK4
 
 
+def early(model: mujoco.MjModel) -> float:
+    """s, by which the integrator's velocities lie before its positions, read as a leapfrog."""
+    return 0.5 * float(model.opt.timestep) if staggered(model) else 0.0
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Timestep:
     """What does not change during one timestep of one world.

@@ -12,6 +12,7 @@ from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
 from bayessim_mjx.diagnosis.result import FoundEffect, Gap
 from bayessim_mjx.diagnosis.selection.heldout import Prediction
 from bayessim_mjx.diagnosis.summary import how_far, repeated, sentences, verdict
+from bayessim_mjx.diagnosis.summary.whole_logs import Whole
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs import Channels, Log
 
@@ -114,7 +115,7 @@ def findings(rms, noise=50.0, windows=8, beyond=()):
         base=SimpleNamespace(total=windows * noise * 1e6, cost=np.ones(windows)),
     )
     cut = SimpleNamespace(windows=SimpleNamespace(steps=5))
-    whole = SimpleNamespace(beyond=np.array(beyond))
+    whole = Whole({}, {}, np.zeros(len(beyond)), np.array(beyond), np.zeros(len(beyond), int), "whole log", 4.0, ())
     return SimpleNamespace(
         selection=selection, model=winner, flexible_winner=None, disturbance=None,
         flexible_base=None, part=lambda kind: whole, setup=SimpleNamespace(fitter=SimpleNamespace(simulator=cut)),

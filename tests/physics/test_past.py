@@ -80,12 +80,14 @@ def test_a_start_is_as_measured_and_without_such_effects_nothing_is_retraced():
     np.testing.assert_array_equal(found.qpos, one.qpos[BEFORE])
     np.testing.assert_array_equal(found.qvel, one.qvel[BEFORE])
     other = robot(MODEL.format("Euler"), "coulomb_friction")
-    assert past_of(other, jnp.zeros(len(other.space)), one).steps == 0
-    assert past_of(physics, theta, one.replace(start=0)).steps == 0
+    assert past_of(other, other.world(jnp.zeros(len(other.space))), one).steps == 0
+    assert past_of(physics, found, one.replace(start=0)).steps == 0
 
 
 def test_inactive_effects_are_not_taken_along():
     physics, theta, worlds, motion = recorded("backlash", (0.03,))
     one = jax.tree.map(lambda x: x[20], motion)
-    assert bool(past_of(physics, theta, one, jnp.array([True])).wanted)
-    assert not bool(past_of(physics, theta, one, jnp.array([False])).wanted)
+    start = begin(physics, theta, one)
+    active, inactive = (past_of(physics, start, one, jnp.array([on])) for on in (True, False))
+    assert bool(active.wanted) and active.first == 0
+    assert not bool(inactive.wanted) and inactive.first == BEFORE

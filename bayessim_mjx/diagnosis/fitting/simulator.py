@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from bayessim_mjx.compat import compiler_options
 from bayessim_mjx.device import on_cores
 from bayessim_mjx.diagnosis.fitting.windows import Batch, Windows
-from bayessim_mjx.physics import Drive, Physics, begin, control_step, past_of, staggered
+from bayessim_mjx.physics import Drive, Physics, begin, control_step, early, past_of
 from bayessim_mjx.physics.tangent import difference, integrate
 
 Array = NDArray[np.float64]
@@ -71,29 +71,25 @@ class Simulator:
         """Errors `[H, 2 nv]` of one window (positions, velocities) and the actuators' forces `[H, nu]`."""
         self.traces += 1
         model = self.physics.mj_model
-        # s, by which the integrator's velocities lie before its positions
-        early = 0.5 * float(model.opt.timestep) if staggered(model) else 0.0
         own = jax.tree.map(lambda x: x[index], batch)
         world = begin(self.physics, theta, own.around, active)
         world = world.replace(qpos=integrate(model, world.qpos, offset[: self.nv]), qvel=world.qvel + offset[self.nv :])
 
-        past = past_of(self.physics, theta, own.around, active)
+        past = past_of(self.physics, world, own.around, active)
         lead, (count, *_) = past.steps, own.command.shape
         command = jnp.concatenate([own.around.command[:lead], own.command])
 
         def step(k: jax.Array, carry: tuple) -> tuple:
             now, shown = carry
             row = jnp.maximum(k - lead, 0)
-            extra = force[row] if not lead else jnp.where(k < lead, 0.0, force[row])
+            extra = jnp.where(k < lead, 0.0, force[row])
             drive = Drive(extra, None if own.enabled is None else own.enabled[row], own.law, active)
-            now, data = control_step(self.physics, past.led(self.physics, k, now, world), command[k], drive)
-            new = now.measurement["qpos"], now.measurement["qvel"] + early * data.qacc, data.actuator_force
+            now, data = control_step(self.physics, past.led(k, now), command[k], drive)
+            new = now.measurement["qpos"], now.measurement["qvel"] + early(model) * data.qacc, data.actuator_force
             return now, tuple(x.at[row].set(y) for x, y in zip(shown, new, strict=True))
 
         nothing = tuple(jnp.zeros((count, n)) for n in (model.nq, model.nv, model.nu))
-        first = 0 if past.wanted is None else jnp.where(past.wanted, 0, lead)
-        begun = past.world if lead else world
-        _, (qpos, qvel, effort) = jax.lax.fori_loop(first, lead + count, step, (begun, nothing))
+        _, (qpos, qvel, effort) = jax.lax.fori_loop(past.first, lead + count, step, (past.world, nothing))
         error = jax.vmap(lambda a, b: difference(model, a, b))(own.qpos, qpos)
         errors = jnp.concatenate([error, own.qvel - qvel], axis=1)
         return jnp.nan_to_num(errors, nan=FAR, posinf=FAR, neginf=-FAR), effort

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis import statistics
 from bayessim_mjx.diagnosis.fitting.fitter import Fitter
+from bayessim_mjx.diagnosis.fitting.quadratic import Quadratic
 from bayessim_mjx.diagnosis.selection import weak_directions
 from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.selection.weak_directions import Ridges
@@ -33,12 +34,8 @@ class Spread:
 
 def spread(fitter: Fitter, model: Model, along: Ridges | None = None) -> Spread:
     """The uncertainty of the model's parameters at its fit; `along`: what was simulated along its ridges."""
-    q, _ = model.fit.quadratic(fitter.spread)
-    precision = np.diag(weak_directions.beliefs(model.fit, len(fitter.base)))
-    _, S = q.weighted(model.fit.weight)
-    S = S if along is None else along.corrected(S, weak_directions.scales(model.fit))
-    inflation = weak_directions.inflation(model)
-    covariance = np.linalg.pinv(S / inflation + precision)
+    q, S, precision = _told(fitter, model, along)
+    covariance = np.linalg.pinv(S / weak_directions.inflation(model) + precision)
     group = fitter.simulator.windows.group
     told = [covariance @ q.weighted(model.fit.weight * (group == n))[1] @ covariance for n in np.unique(group)]
     share = np.diagonal(told, axis1=1, axis2=2)  # of the parameter's variance, by the condition it comes from
@@ -47,10 +44,16 @@ def spread(fitter: Fitter, model: Model, along: Ridges | None = None) -> Spread:
 
 def of_noise(fitter: Fitter, model: Model, along: Ridges | None = None) -> Array:
     """`[k, k]`, Laplace covariance of the fit if its law were right: of the noise and of what was known before."""
+    _, S, precision = _told(fitter, model, along)
+    return np.asarray(np.linalg.pinv(S + precision))
+
+
+def _told(fitter: Fitter, model: Model, along: Ridges | None) -> tuple[Quadratic, Array, Array]:
+    """(The fit's quadratic form, what the data tell of the parameters `[k, k]`, what was known before `[k, k]`)."""
     q, _ = model.fit.quadratic(fitter.spread)
     _, S = q.weighted(model.fit.weight)
     S = S if along is None else along.corrected(S, weak_directions.scales(model.fit))
-    return np.asarray(np.linalg.pinv(S + np.diag(weak_directions.beliefs(model.fit, len(fitter.base)))))
+    return q, S, np.diag(weak_directions.beliefs(model.fit, len(fitter.base)))
 
 
 @dataclass(frozen=True)

@@ -62,7 +62,7 @@ def with_whole(far: Gap, over: whole_logs.Whole, allowed: Tolerance) -> Gap:
     row |= _level(level, (level, level), row, "start")
     each = {s: np.sqrt(c.mean(0)) * allowed.noise for s, c in over.by_channel.items()}
     longest = {"name": over.name, "seconds": over.seconds, **row, **_physical(each, allowed)}
-    longest |= {"over_likely": float(np.sqrt(np.median(over.beyond)))}
+    longest |= {"over_likely": over.over_likely}
     return replace(far, horizons=[*far.horizons, longest])
 
 

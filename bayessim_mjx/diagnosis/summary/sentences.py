@@ -99,8 +99,8 @@ def sentences(
     told = verdict_in_words(name, effects, far, verdict.remains, verdict.beaten)
     far_off, known = verdict.bent
     told += [BENT.format(far=far_off, known=known)] if known else []
-    window = f"{cut.steps * cut.dt:.2g} s"
-    told += [BUILDS_UP.format(times=f"{verdict.builds_up:.2g}", window=window)] if verdict.builds_up else []
+    if verdict.builds_up:
+        told.append(BUILDS_UP.format(times=f"{verdict.builds_up:.2g}", window=f"{cut.steps * cut.dt:.2g} s"))
     told += [_by_chance(odds)]
     if found.selection.ambiguous:
         told += [_instead(e, found.selection.rivals.get(f"{e.name}@{e.where}", ())) for e in effects]

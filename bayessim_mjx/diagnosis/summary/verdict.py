@@ -96,7 +96,7 @@ def builds_up(found: Findings) -> float:
     if over is None or not len(over.beyond) or not found.model.effects:
         return 0.0
     cost = found.predictions["with_effects"].cost(found.setup.fitter.simulator.windows.steps).mean()
-    times = float(np.sqrt(np.median(over.beyond)))
+    times = over.over_likely
     return times if times > LIMITS.builds_up and cost <= LIMITS.matters**2 else 0.0
 
 

@@ -61,6 +61,11 @@ class Whole:
     seconds: float
     notes: tuple[str, ...]
 
+    @property
+    def over_likely(self) -> float:
+        """Times that the last stage's error is as large as is likely: rms, the median of the logs."""
+        return float(np.sqrt(np.median(self.beyond)))
+
 
 @dataclass(frozen=True, eq=False)
 class _Stage:
@@ -93,10 +98,11 @@ def simulate(found: Findings, say: Progress = lambda text, done, total: None) ->
     length = [min(len(cut.logs[r]) - 1 - a, most) for r, a in zip(logs, starts, strict=True)]
     simulator = _simulator(found, logs, starts, max(length), len(stages) + RULES.draws + RULES.likely)
     errors, spread, likely = [], [], []
+    root = _root(found, list(stages.values())[-1].model)
     every = len(stages) + RULES.draws
     for i, (w, steps) in enumerate(zip(first, length, strict=True)):
         say("whole logs", i, len(first))
-        rows = _one(found, simulator, stages, i, w)[:, :steps]
+        rows = _one(found, simulator, stages, root, i, w)[:, :steps]
         errors.append(rows[: len(stages)])
         spread.append(rows[len(stages) : every] - rows[len(stages) - 1])
         likely.append(rows[every:] - rows[len(stages) - 1])
@@ -117,8 +123,8 @@ def _simulator(found: Findings, logs: Array, starts: list[int], length: int, lan
     return Simulator(physics, own, lanes)
 
 
-def _one(found: Findings, simulator: Simulator, stages: dict[str, _Stage], i: int, w: int) -> Array:
-    """Whitened errors `[stages + draws + likely, H, channels]` of one log; the draws are of the last stage."""
+def _one(found: Findings, simulator: Simulator, stages: dict[str, _Stage], away: Array, i: int, w: int) -> Array:
+    """Whitened errors `[stages + draws + likely, H, channels]` of one log; `away`: `_root` of the last one."""
     fitter, last = found.setup.fitter, list(stages.values())[-1]
     rng = np.random.default_rng(found.setup.seed)
     values = [_values(found, s, w) for s in stages.values()]
@@ -126,7 +132,7 @@ def _one(found: Findings, simulator: Simulator, stages: dict[str, _Stage], i: in
     B = last.model.fit.B[w]
     root = np.linalg.cholesky(np.linalg.inv(B.T @ B + np.diag(1 / fitter.spread**2)))
     moved = offsets[-1] + rng.normal(size=(RULES.draws + RULES.likely, len(root))) @ root.T
-    off = values[-1] + rng.normal(size=(RULES.likely, len(values[-1]))) @ _root(found, last.model).T
+    off = values[-1] + rng.normal(size=(RULES.likely, len(values[-1]))) @ away.T
     ends = np.array([(c.low, c.high) for c in last.model.fit.coordinates]).reshape(-1, 2).T
     drawn = [*[values[-1]] * RULES.draws, *np.clip(off, *ends)]
     models = [s.model for s in stages.values()] + [last.model] * len(drawn)
