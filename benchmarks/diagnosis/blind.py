@@ -20,7 +20,7 @@ import subprocess
 import sys
 import time
 import zlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 
@@ -30,9 +30,11 @@ from families import without
 from isolable import hidden, rivals
 from tables import score
 
+from bayessim_mjx.blind.reality.joints import TwoBodies
 from bayessim_mjx.blind.reality.plant import Plant, scales_of
 
 KINDS = ("single", "double", "null", "unknown")
+SECOND_BODY = {cause.name for cause in TwoBodies.__subclasses__()}
 WORKER = Path(__file__).with_name("worker.py")
 STOPPED = (130, -signal.SIGINT, -signal.SIGTERM)  # by somebody: to be run again
 Job = tuple[str, str, tuple[str, ...], str, int, Path]
@@ -53,12 +55,19 @@ def jobs(out: Path, seeds: range, kinds: Iterable[str], systems: Iterable[str], 
             strength = str(rng.choice(strengths))
             drawn = {
                 "single": (str(known[seed % len(known)]),),
-                "double": tuple(str(e) for e in rng.choice(known, 2, replace=False)),
+                "double": _pair(rng, known),
                 "null": (),
                 "unknown": (str(unknown[seed % len(unknown)]),),
             }
             found += [(k, system, drawn[k], strength, seed, out / f"{system}_{k}_s{seed}") for k in kinds]
     return found
+
+
+def _pair(rng: np.random.Generator, known: Sequence[str]) -> tuple[str, ...]:
+    """Two effects that a plant can have at one joint: there is one second body behind a rotor."""
+    while {*(drawn := tuple(str(e) for e in rng.choice(known, 2, replace=False)))} == SECOND_BODY:
+        pass
+    return drawn
 
 
 def _make(job: Job) -> str:
