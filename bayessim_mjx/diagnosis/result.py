@@ -46,7 +46,8 @@ class Gap:
     closed: {"predicted", "realised", "ci", "nested", "elsewhere"}, share of the recalibrated simulator's squared gap
     above the noise that all effects close together: as promised before any was fitted, on held-out windows afterwards,
     and on conditions that had no part in the choice of the effects; nested: whether realised and ci are of such
-    conditions too; integrator: what the simulator's own time step is worth (`discretisation.Discretisation.to_dict`).
+    conditions too; integrator: what the simulator's own time step is worth (`discretisation.Discretisation.to_dict`);
+    coasting: the same without any simulator, every joint keeping its speed (`selection.coasting`).
     """
 
     noise_floor: float
@@ -62,6 +63,7 @@ class Gap:
     beyond: list[str] = field(default_factory=list)
     closed: dict[str, Any] = field(default_factory=dict)
     integrator: dict[str, Any] = field(default_factory=dict)
+    coasting: float | None = None
 
 
 @dataclass(frozen=True)

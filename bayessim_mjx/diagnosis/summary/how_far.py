@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from bayessim_mjx.diagnosis.findings import Findings
 from bayessim_mjx.diagnosis.result import Gap
 from bayessim_mjx.diagnosis.selection import heldout
+from bayessim_mjx.diagnosis.selection.coasting import coasting
 from bayessim_mjx.diagnosis.selection.heldout import Prediction
 from bayessim_mjx.diagnosis.summary import repeated, whole_logs
 from bayessim_mjx.diagnosis.tolerance import Tolerance
@@ -24,7 +25,7 @@ def measured(found: Findings, closed: dict[str, Any]) -> Gap:
     setup, predictions = found.setup, found.predictions
     cut, allowed = setup.fitter.simulator.windows, setup.tolerance
     again = repeated.floor(setup.fitter, found.model.fit, setup.logs)
-    short = max(1, min(round(SHORT / cut.dt), cut.steps // 2))
+    short, still = max(1, min(round(SHORT / cut.dt), cut.steps // 2)), coasting(cut, setup.robot.mj_model)
     rows = []
     for steps in (short, cut.steps):
         row = heldout.stages({k: p.cost(steps) for k, p in predictions.items()}, cut.group)
@@ -49,6 +50,7 @@ def measured(found: Findings, closed: dict[str, Any]) -> Gap:
         beyond=[n for n, own in physical.items() if own["beyond"]],
         closed=closed,
         integrator=setup.discretisation.to_dict() if setup.discretisation else {},
+        coasting=heldout.stages({"coasting": still.cost(cut.steps)}, cut.group)["coasting"],
     )
 
 

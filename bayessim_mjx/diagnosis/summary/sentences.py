@@ -85,6 +85,12 @@ CHANCE = (
     "input that was not logged, or noise larger than estimated."
 )
 
+COASTS = (
+    "Joints that just keep their speed in a window, without any simulator, are {coasting} noise sd off, less than the "
+    "recalibrated simulator's {calibrated}{more}: its forces are far off, or hardly show in windows as short as these."
+)
+COASTS_CLOSED = "; of that squared gap the effects close {closed}"
+
 
 def sentences(
     verdict: Verdict,
@@ -101,7 +107,7 @@ def sentences(
     told += [BENT.format(far=far_off, known=known)] if known else []
     if verdict.builds_up:
         told.append(BUILDS_UP.format(times=f"{verdict.builds_up:.2g}", window=f"{cut.steps * cut.dt:.2g} s"))
-    told += [_by_chance(odds)]
+    told += [_coasting(far, bool(effects)), _by_chance(odds)]
     if found.selection.ambiguous:
         told += [_instead(e, found.selection.rivals.get(f"{e.name}@{e.where}", ())) for e in effects]
     told += [_hidden(found.selection.hidden, len(effects))]
@@ -133,6 +139,15 @@ def _by_chance(odds: Mapping[str, Any]) -> str:
     rare = odds["probability"] * (odds["draws"] + 1) < 1.5
     share = f"{'less than ' if rare else ''}{percent(odds['probability'])}"
     return BY_CHANCE.format(candidates=odds["candidates"], chance=share)
+
+
+def _coasting(far: Gap, named: bool) -> str:
+    """Where no simulator at all predicts better than the recalibrated one."""
+    if far.coasting is None or far.coasting >= far.calibrated:
+        return ""
+    closed = 1.0 - max(far.with_effects**2 - 1.0, 0.0) / max(far.coasting**2 - 1.0, 1e-9)
+    more = COASTS_CLOSED.format(closed=percent(max(closed, 0.0))) if named else ""
+    return COASTS.format(coasting=number(far.coasting), calibrated=number(far.calibrated), more=more)
 
 
 def _of_sensors(memory: float) -> str:

@@ -108,7 +108,7 @@ def _name(found: Findings, far: Gap, remaining: float, alone: bool, noise: Origi
         }
         above = cost["with_effects"] - 1.0
         matters = above > LIMITS.matters**2 - 1.0 or bool(far.beyond)
-        little = above <= LIMITS.share * (cost["calibrated"] - 1.0) or noise is not None
+        little = above <= LIMITS.share * (ground(cost["calibrated"], far) - 1.0) or noise is not None
         structured = tried.above_noise(model) and remaining > LIMITS.share
         if (matters and not little) or structured or (found.flexible_winner is not None and alone):
             return "unexplained"
@@ -120,6 +120,15 @@ def _name(found: Findings, far: Gap, remaining: float, alone: bool, noise: Origi
     q, _ = tried.nominal.quadratic(tried.fitter.spread)
     floor = tried.noise * len(tried.base.cost) * tried.criteria.floor**2
     return "parameters" if q.c.sum() > max(1.1 * tried.base.total, floor) else "no_gap"
+
+
+def ground(calibrated: float, far: Gap) -> float:
+    """The mean squared error, in noise variances, of which named effects have to close most.
+
+    The recalibrated simulator's, or that of joints which keep their speed where this is less: beside forces that are
+    far off, whatever hardly accelerates closes almost all of the gap.
+    """
+    return calibrated if far.coasting is None else min(calibrated, far.coasting**2)
 
 
 def remains(found: Findings) -> float:
