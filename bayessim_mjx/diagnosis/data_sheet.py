@@ -25,8 +25,8 @@ DRIVES = ("coulomb_friction", "viscous_friction", "armature")
 def accuracies(texts: Sequence[str], space: ParameterSpace, default: float | None) -> dict[str, float]:
     """{parameter: standard deviation as a share of its nominal value} of `5%`, `mass=2%`, `elbow*=20%`, also in one.
 
-    A name is one of a parameter, of what it changes (mass, damping, armature) or of the element that has it, or a
-    pattern. Later ones go before earlier ones; a parameter whose own prior is Gaussian keeps that.
+    A name is one of a parameter, of what it changes (mass, damping, armature, friction) or of the element that has it,
+    or a pattern. Later ones go before earlier ones; a parameter whose own prior is Gaussian keeps that.
 
     Args:
         default: of what nothing is said of; None: nothing is stated of it.

@@ -75,7 +75,7 @@ def looked(logs: Sequence[Log], robot: Robot, told: list[str]) -> Look:
 
 
 def _deviations(robot: Robot) -> dict[tuple[str, str], float]:
-    """{(mass, armature or damping; element): standard deviation as a share}, of the known parameters."""
+    """{(mass, armature, damping or friction; element): standard deviation as a share}, of the known parameters."""
     base = base_coordinates(robot.space, robot.accuracy)
     pairs = zip(robot.space.parameters, base, strict=True)
     return {(p.attribute, p.target): c.precision**-0.5 / abs(c.neutral) for p, c in pairs if c.neutral and c.precision}

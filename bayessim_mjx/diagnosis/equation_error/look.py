@@ -37,6 +37,7 @@ class Limits:
     places: int = 20  # positions of each log at which drives hold loads
 
 
+KNOWN = ("mass", "armature", "damping", "friction")  # attributes that a data sheet may state
 LIMITS = Limits()
 
 
@@ -118,7 +119,7 @@ def look(
     """All that logs tell without a simulation, in seconds.
 
     Args:
-        accuracy: {(mass, armature or damping; element): standard deviation as a share}; others: as of data sheets.
+        accuracy: {(attribute, one of KNOWN; element): standard deviation as a share}; others: as of data sheets.
         rating: {body: kg} that may be there; of others, what the drives hold.
     """
     began = time.monotonic()
@@ -186,7 +187,7 @@ def _joints(model: mujoco.MjModel, sums: Sums, known: Sequence[Term], found: Fou
 def _shifts(known: Sequence[Term], found: Fit) -> tuple[Shift, ...]:
     """Known parameters farther from the data sheet than it says, the farthest first."""
     out = []
-    for term in (t for t in known if t.effect in ("mass", "armature", "damping")):
+    for term in (t for t in known if t.effect in KNOWN):
         share = float(found.of(term)[0])
         away = share / float(term.sd(found.of(term))[0])
         if abs(away) > LIMITS.far:

@@ -43,10 +43,11 @@ RANGES = Ranges()
 def known(
     model: mujoco.MjModel, layout: Layout, accuracy: Mapping[tuple[str, str], float], period: float
 ) -> list[Term]:
-    """Masses, rotor inertias and damping as accurate as they are known; and how late efforts are.
+    """Masses, rotor inertias, damping and friction as accurate as they are known; and how late efforts are.
 
     Args:
-        accuracy: {(mass, armature or damping; element): standard deviation as a share}; others: as of data sheets.
+        accuracy: {(mass, armature, damping or friction; element): standard deviation as a share}; of others, a
+            data sheet's.
         period: s between the logs' rows.
     """
     nominal = rigid.nominal(model)
@@ -61,6 +62,7 @@ def known(
     for effect, own, size in (
         ("armature", "acceleration", model.dof_armature),
         ("damping", "speed", model.dof_damping),
+        ("friction", "dry", model.dof_frictionloss),
     ):
         for v in map(int, np.flatnonzero(size > 0)):
             one = _one(layout, v, layout.own(own), float(size[v]))

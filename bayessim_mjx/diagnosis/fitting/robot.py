@@ -25,6 +25,9 @@ if TYPE_CHECKING:
 
 TRAINING = ("frequency", "observations", "actions", "sim_params")
 WITHIN = (0.8, 1.2)  # the default range of a scale
+# and of dry friction, which falls by half and more as a drive warms up or wears in: more of it can be an effect
+# (Coulomb friction), less can be nothing else. Not counted
+RUBS = (0.2, 1.2)
 _IMPLICIT = int(mujoco.mjtIntegrator.mjINT_IMPLICIT)
 _FREE = int(mujoco.mjtJoint.mjJNT_FREE)
 
@@ -171,26 +174,31 @@ def _space(model: mujoco.MjModel, parameters: str | Path | None) -> ParameterSpa
 
 
 def default_space(model: mujoco.MjModel) -> ParameterSpace:
-    """Scales of damping, armature and mass, 1 within 20 %, wherever the model has some that can move.
+    """Scales of damping, armature, dry friction and mass, 1 within 20 %, wherever the model has some that can move.
 
-    The mass of a body scales its inertia too. Names are those of the loop: `<joint>_damping_mult` ...
+    Dry friction may also be less, down to a fifth. The mass of a body scales its inertia too. Names are those of the
+    loop: `<joint>_damping_mult` ...
     """
     joints = [j for j in range(model.njnt) if model.jnt_type[j] != _FREE]
     dofs = model.jnt_dofadr[joints]
     damped = [label(model, "joint", j) for j, d in zip(joints, dofs, strict=True) if model.dof_damping[d] > 0]
     geared = [label(model, "joint", j) for j, d in zip(joints, dofs, strict=True) if model.dof_armature[d] > 0]
+    rubbing = [label(model, "joint", j) for j, d in zip(joints, dofs, strict=True) if model.dof_frictionloss[d] > 0]
     moving = np.flatnonzero((model.body_weldid != 0) & (model.body_mass > mujoco.mjMINVAL))
     heavy = [label(model, "body", int(b)) for b in moving]
     groups = {
-        "dof_properties": {"damping": damped, "armature": geared},
+        "dof_properties": {"damping": damped, "armature": geared, "friction": rubbing},
         "rigid_body_properties": {"mass": heavy},
     }
-    section = {g: {a: _scale(found) for a, found in members.items() if found} for g, members in groups.items()}
+    section = {
+        g: {a: _scale(found, RUBS if a == "friction" else WITHIN) for a, found in members.items() if found}
+        for g, members in groups.items()
+    }
     return ParameterSpace.from_config({"actor_params": {_whole(model): section}}, model)
 
 
-def _scale(include: Sequence[str]) -> dict[str, Any]:
-    return {"range": list(WITHIN), "operation": "scaling", "include": [_literal(name) for name in include]}
+def _scale(include: Sequence[str], within: tuple[float, float]) -> dict[str, Any]:
+    return {"range": list(within), "operation": "scaling", "include": [_literal(name) for name in include]}
 
 
 def _literal(name: str) -> str:

@@ -1,0 +1,48 @@
+"""A model with dry friction: too much of it is a known parameter that is off, too little is a missing effect."""
+
+import pytest
+
+from bayessim_mjx.diagnosis import run
+from bayessim_mjx.diagnosis.fitting import robot
+from bayessim_mjx.diagnosis.summary import assemble
+from tests.diagnosis.pendulums import ARMATURE, DAMPING, MASS, MODEL, STEP, recorded
+
+RUBS = ("coulomb_friction", "viscous_friction")
+ENOUGH = {"count": 4, "seconds": 3.0}
+
+
+def rubbing(folder, level: float) -> robot.Robot:
+    (folder / "pendulum.xml").write_text(MODEL % (STEP, "Euler", DAMPING, ARMATURE, level, MASS))
+    return robot.of_file(folder / "pendulum.xml")
+
+
+def test_dry_friction_is_a_known_parameter_that_may_be_much_less(tmp_path):
+    space = rubbing(tmp_path, 0.08).space
+    assert "hinge_friction_mult" in space.names
+    own = dict(zip(space.names, zip(space.low, space.high, strict=True), strict=True))
+    assert own["hinge_friction_mult"] == pytest.approx((0.2, 1.2)) and own["link_mass_mult"] == pytest.approx(
+        (0.8, 1.2)
+    )
+
+
+def diagnosed(folder, model: float, real: float):
+    needed = [s for s in run.STAGES if not s.optional]
+    logs = recorded(friction=real, **ENOUGH)
+    return assemble.diagnosis_of(run.investigate(rubbing(folder, model), logs, RUBS, stages=needed))
+
+
+@pytest.mark.slow
+@pytest.mark.ci
+def test_too_much_of_it_is_recalibrated(tmp_path):
+    found = diagnosed(tmp_path, 0.08, 0.04)
+    assert found.verdict == "parameters" and not found.effects
+    assert found.parameters["hinge_friction_mult"]["mean"] == pytest.approx(0.5, rel=0.05)
+
+
+@pytest.mark.slow
+@pytest.mark.ci
+def test_too_little_of_it_is_a_missing_effect(tmp_path):
+    found = diagnosed(tmp_path, 0.04, 0.08)
+    (effect,) = found.effects
+    both = 0.04 * found.parameters["hinge_friction_mult"]["mean"] + effect.parameters["level"].mean
+    assert effect.name == "coulomb_friction" and both == pytest.approx(0.08, rel=0.05)
