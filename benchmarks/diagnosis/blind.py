@@ -27,13 +27,12 @@ from pathlib import Path
 import numpy as np
 from cases import KNOWN, STRENGTHS, SYSTEMS, UNKNOWN, make_case, places
 from families import without
-from isolable import hidden, rivals
+from isolable import KINDS, looked_at
 from tables import score
 
 from bayessim_mjx.blind.reality.joints import TwoBodies
 from bayessim_mjx.blind.reality.plant import Plant, scales_of
 
-KINDS = ("single", "double", "null", "unknown")
 SECOND_BODY = {cause.name for cause in TwoBodies.__subclasses__()}
 WORKER = Path(__file__).with_name("worker.py")
 STOPPED = (130, -signal.SIGINT, -signal.SIGTERM)  # by somebody: to be run again
@@ -154,16 +153,16 @@ def _diagnose_one(folder: Path, where: str, args: argparse.Namespace, cores: "qu
 
 def _isolate(folder: Path) -> str:
     started = time.perf_counter()
-    found = rivals(*hidden(json.loads((folder / "truth.json").read_text())))
+    found = looked_at(json.loads((folder / "truth.json").read_text()))
     (folder / "isolable.json").write_text(json.dumps(found, indent=1))
-    told = ", ".join(f"{r['name']}@{r['where']} {r['left']:.2f}" for r in found[:2])
+    told = "; ".join(", ".join(f"{r['name']}@{r['where']} {r['left']:.2f}" for r in own[:2]) for own in found)
     return f"{folder.name}: closest {told} ({time.perf_counter() - started:.0f} s)"
 
 
 def isolate(args: argparse.Namespace) -> None:
-    """For every single that was not looked at: which other causes explain its motion nearly as well?"""
+    """For every effect of a case that was not looked at: which other causes explain its motion nearly as well?"""
     kinds = {f: json.loads((f / "truth.json").read_text())["kind"] for f in cases(args.cases)}
-    todo = [f for f, kind in kinds.items() if kind == "single" and not (f / "isolable.json").exists()]
+    todo = [f for f, kind in kinds.items() if kind in args.kinds.split(",") and not (f / "isolable.json").exists()]
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     with multiprocessing.get_context("spawn").Pool(args.workers) as pool:
         for line in pool.imap_unordered(_isolate, todo):
@@ -199,8 +198,9 @@ def main() -> None:
     old.add_argument("--timeout", type=float, default=3600.0, help="s per case")
     old.add_argument("--more", nargs=argparse.REMAINDER, default=[], help="further arguments of the command; last")
     old.set_defaults(does=diagnose)
-    apart = commands.add_parser("isolable", help="which singles other causes explain as well, from the truth alone")
+    apart = commands.add_parser("isolable", help="which effects other causes explain as well, from the truth alone")
     apart.add_argument("cases", type=Path)
+    apart.add_argument("--kinds", default="single", help="single, double or both; of two effects each as if alone")
     apart.add_argument("--workers", type=int, default=os.cpu_count())
     apart.set_defaults(does=isolate)
     told = commands.add_parser("score", help="rates with 95 %% Wilson intervals beside the baselines, confusion matrix")

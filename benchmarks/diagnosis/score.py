@@ -10,7 +10,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from isolable import isolable
+from isolable import each_isolable
 
 from bayessim_mjx.blind import outcome as judged
 from bayessim_mjx.blind.outcome import LOOSE, VERDICTS, covered, label, labels_of, wilson
@@ -52,7 +52,7 @@ def read(folder: Path, results: str = "diagnosis", baseline: str | None = None) 
     return Outcome(
         folder, truth, said, joints, seconds,
         compile_seconds=ended.get("compile_seconds", math.nan), true_closure=oracle.get("closure"),
-        isolable=None if rivals is None else isolable(rivals, truth["effects"][0]["left"]),
+        isolable=None if rivals is None else each_isolable(rivals, truth),
     )  # fmt: skip
 
 
@@ -107,6 +107,7 @@ def rates(outcomes: Sequence[Outcome], left_out: Sequence[Outcome] = ()) -> list
         Rate("single: effect named, any place", [_names(o) for o in single], 0.95),
         Rate("single: truth in the equivalence set", [inside(o) for o in single], 0.98),
         Rate("single: nothing else named", [right(o) and len(o.named()) == 1 for o in single], 0.9),
+        Rate("double, each isolable alone: both named", [right(o) for o in double if o.isolable], 0.85),
         Rate("double: both named", [right(o) for o in double], 0.85),
         Rate("double: both in the equivalence set", [inside(o) for o in double], 0.85),
         Rate(

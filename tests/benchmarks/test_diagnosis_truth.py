@@ -171,13 +171,23 @@ def test_logs_are_read_with_the_right_noise_and_conditions(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.ci
-def test_a_cause_is_drawn_again_from_the_truth_of_its_case(tmp_path):
-    told = cases.make_case("pendulum", ["joint_spring"], "medium", 11, tmp_path).truth
-    cause_again, ruler = isolable.hidden(told)
-    assert cause_again.parameters() == told["effects"][0]["parameters"] and ruler.base == told["base"]
+def test_causes_are_drawn_again_from_the_truth_of_their_case(tmp_path):
+    names = ["joint_spring", "viscous_friction"]
+    told = cases.make_case("pendulum", names, "medium", 1_000_011, tmp_path).truth | {"kind": "double", "seed": 11}
+    again, ruler = isolable.hidden(told)
+    assert [c.name for c in again] == names and ruler.base == told["base"]
+    for cause_again, own in zip(again, told["effects"], strict=True):
+        assert cause_again.parameters() == own["parameters"]
     told["effects"][0]["parameters"]["rest"] += 0.1
     with pytest.raises(ValueError, match="another version"):
         isolable.hidden(told)
+
+
+def test_of_two_causes_each_has_to_be_isolable():
+    far, near = [{"left": 5.0}], [{"left": 0.3}]
+    both = {"effects": [{"left": 9.0}, {"left": 9.0}]}
+    assert isolable.each_isolable([far, far], both) and not isolable.each_isolable([far, near], both)
+    assert isolable.each_isolable(far, {"effects": [{"left": 9.0}]})  # a single's, as older versions wrote it
 
 
 def test_a_cause_in_its_own_place_leaves_nothing_and_others_leave_more():
