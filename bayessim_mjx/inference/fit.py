@@ -42,11 +42,13 @@ def _run(function: Any, *given: Any, static: tuple[int, ...] = ()) -> Any:
 def _blank(key: Array, settings: InferenceSettings, dim_x: int, d: int) -> dict[str, Any]:
     """Weights of the whole ensemble `[E, ...]`, and what a FitState has besides them: one program."""
     counts = jnp.asarray(mdn.counts(settings))
-    params = jax.vmap(lambda k, count: mdn.init(k, settings, dim_x, d, count))(
+    width = whitening.width(settings, dim_x, d)
+    params = jax.vmap(lambda k, count: mdn.init(k, settings, width, d, count))(
         jax.random.split(key, settings.ensemble), counts
     )
     params["member"] = jnp.arange(settings.ensemble, dtype=jnp.int32)
-    basis = jnp.eye(dim_x) if whitening.count(settings, dim_x) > 1 else None
+    square = whitening.count(settings, dim_x) > 1
+    basis = jnp.eye(dim_x) if square else jnp.zeros((dim_x, width)) if width < dim_x else None
     scales = {"x_mean": jnp.zeros(dim_x), "x_rate": jnp.ones(dim_x), "basis": basis}
     return {"params": params, **scales, "fits": jnp.asarray(0, jnp.int32), "identified": jnp.ones(d, bool)}
 
@@ -187,10 +189,18 @@ def _info(state: FitState, data: Data, gain: Array, curves: Array, told: dict[st
 
 
 def _bases(state: FitState, data: Data) -> Array:
-    """The matrices [M, D, D] that a first fit chooses from; later ones keep its choice."""
-    x, noise, tried = data.x[: len(data.train)], None, whitening.count(state.settings, data.x.shape[1])
+    """The matrices [M, D, inputs] that a first fit chooses from; later ones keep its choice.
+
+    Of features that are standardised anew, regressions are made anew too: what their columns mean stays the same.
+    """
+    x, noise, (dim_x, d) = data.x[: len(data.train)], None, (data.x.shape[1], data.y.shape[1])
+    if whitening.width(state.settings, dim_x, d) < dim_x:
+        assert state.basis is not None
+        found = whitening.regressed(x, data.y, data.train)[None]
+        return found if state.settings.restandardise else jnp.where(state.fits == 0, found, state.basis)
+    tried = whitening.count(state.settings, dim_x)
     if data.own is not None and tried > 1:  # rows measured at least twice
-        again = data.x[len(x) :].reshape(data.draws - 1, -1, x.shape[1])[0][data.own]
+        again = data.x[len(x) :].reshape(data.draws - 1, -1, dim_x)[0][data.own]
         noise = whitening.noise_of(x, again, data.train & (data.own >= 0))
     found = whitening.candidates(x, data.train, tried, noise)
     return found if state.basis is None else jnp.where(state.fits == 0, found, state.basis[None])

@@ -20,7 +20,7 @@ class FitState:
     params: Any  # of all members of the ensemble: leaves [E, ...]
     x_mean: Array  # [D]
     x_rate: Array  # [D] 1 / sd of the first fit's data; 0 drops a constant column
-    basis: Array | None  # [D, D] what standardised inputs are multiplied by; None: nothing
+    basis: Array | None  # [D, inputs] what standardised features are multiplied by; None: nothing
     fits: Array  # [] int32, fits done so far
     identified: Array  # [d] bool, parameters whose marginal beats the prior on the last fit's held-out rows
     settings: InferenceSettings = struct.field(pytree_node=False)

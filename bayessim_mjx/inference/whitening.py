@@ -6,13 +6,21 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from bayessim_mjx.inference import ridge
 from bayessim_mjx.inference.densities import density_of
 from bayessim_mjx.inference.settings import InferenceSettings
 from bayessim_mjx.linalg import product
 
-LIMIT = 512  # features up to which their eigenvectors are worth the cost
+LIMIT = 512  # features up to which their eigenvectors are worth the cost; of more of them few tell something each
+MOST = 4096  # features up to which a regression on them is worth its cost
 FLOOR = 1e-3  # added to the noise's variances: rounding is not to be blown up
 EPS = 1e-6  # of a direction that neither parameters nor noise move
+
+
+def width(settings: InferenceSettings, dim_x: int, d: int) -> int:
+    """How many inputs a network of d parameters has: all D features, or two `regressed` ones for each parameter."""
+    regresses = LIMIT < dim_x <= MOST and settings.embedding is None and density_of(settings).whitened
+    return min(2 * d, dim_x) if regresses and d else dim_x
 
 
 def count(settings: InferenceSettings, dim_x: int) -> int:
@@ -24,22 +32,43 @@ def count(settings: InferenceSettings, dim_x: int) -> int:
 def candidates(x: Array, train: Array, tried: int, noise: Array | None = None) -> Array:
     """Matrices [tried, D, D] for standardised summaries x [N, D], of which those with train [N] count.
 
-    As they are, and whitened: best where small differences tell much. Where these are noise, whitening would blow it
-    up: by its covariance `noise` [D, D], if known, each direction gets unit variance of what the parameters do, times
-    the share of that in its variance (Wiener's filter).
+    As they are, and `whitened`.
     """
     as_is = jnp.eye(x.shape[1])
-    if tried == 1:
-        return as_is[None]
+    return as_is[None] if tried == 1 else jnp.stack([as_is, whitened(x, train, noise)])
+
+
+def whitened(x: Array, train: Array, noise: Array | None = None) -> Array:
+    """Directions of unit variance [D, D]: best where small differences tell much.
+
+    Where these are noise, whitening would blow it up: by its covariance `noise` [D, D], if known, each direction gets
+    unit variance of what the parameters do, times the share of that in its variance (Wiener's filter).
+    """
     weights = train.astype(jnp.float32) / jnp.maximum(jnp.sum(train.astype(jnp.float32)), 1.0)
     x = x - (weights @ x)[None, :]
-    noise = jnp.zeros_like(as_is) if noise is None else noise
+    noise = jnp.zeros((x.shape[1],) * 2) if noise is None else noise
     unit = jax.lax.rsqrt(jnp.diagonal(noise) + FLOOR)  # features in units of their noise
     noise, cov = (unit[:, None] * c * unit[None, :] for c in (noise, product((x * weights[:, None]).T, x)))
     values, vectors = jnp.linalg.eigh(cov - noise)
     told, chance = jnp.maximum(values, 0.0), jnp.sum(vectors * product(noise, vectors), axis=0)
     share = (told + EPS) / (told + jnp.maximum(chance, 0.0) + EPS)
-    return jnp.stack([as_is, unit[:, None] * vectors * (share * jax.lax.rsqrt(told + 1.0))[None, :]])
+    return unit[:, None] * vectors * (share * jax.lax.rsqrt(told + 1.0))[None, :]
+
+
+def regressed(x: Array, y: Array, train: Array) -> Array:
+    """What linear regression makes of each parameter and of its square [D, 2 d], with unit variance.
+
+    A network that sees hundreds of features, few of which tell something, learns by heart what the others do in the
+    rows that it is trained on. The posterior's mean is a summary that loses little (Fearnhead and Prangle 2012,
+    https://doi.org/10.1111/j.1467-9868.2011.01010.x); squares add what a line does not see.
+    """
+    weights = train.astype(jnp.float32)
+    n = jnp.maximum(jnp.sum(weights), 1.0)
+    centred = y - (weights @ y / n)[None, :]
+    _, slope = ridge.ridge(x, jnp.concatenate([centred, centred**2], axis=1)[:, : x.shape[1]], weights)
+    shown = product(x, slope)
+    variance = weights @ (shown - (weights @ shown / n)[None, :]) ** 2 / n
+    return slope * jax.lax.rsqrt(variance + EPS)[None, :]
 
 
 def noise_of(first: Array, second: Array, used: Array) -> Array:

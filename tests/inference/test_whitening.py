@@ -4,7 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from bayessim_mjx import inference
 from bayessim_mjx.inference import InferenceSettings, whitening
+from bayessim_mjx.parameters import Parameter, ParameterSpace
 
 
 def test_whitened_rows_have_unit_covariance_and_rows_left_out_do_not_count():
@@ -41,3 +43,42 @@ def test_directions_of_noise_alone_are_turned_down_and_what_parameters_move_has_
     signal = np.linalg.eigvalsh(np.cov((np.asarray(clean) @ basis).T))
     np.testing.assert_allclose(signal, [0, 0, 1, 1], atol=0.06)
     assert np.linalg.eigvalsh(np.cov((np.asarray(first) @ basis).T))[:2].max() < 0.02
+
+
+def test_regressed_columns_say_parameters_and_squares_and_the_others_nothing():
+    """Among 40 features of noise one is a line in the parameter, one its square about its middle."""
+    keys = jax.random.split(jax.random.PRNGKey(0), 2)
+    y = jax.random.uniform(keys[0], (4000, 1))
+    x = jax.random.normal(keys[1], (4000, 42))
+    x = x.at[:, 7].set(2.0 * y[:, 0] + 0.1 * x[:, 7]).at[:, 9].set(5.0 * (y[:, 0] - 0.5) ** 2 + 0.05 * x[:, 9])
+    x = (x - x.mean(0)) / x.std(0)
+    train = jnp.arange(4000) < 3000
+    basis = whitening.regressed(jnp.where(train[:, None], x, 1e3), y, train)
+    assert basis.shape == (42, 2)
+    shown = np.asarray(x[3000:] @ basis)
+    assert np.corrcoef(shown[:, 0], y[3000:, 0])[0, 1] > 0.97
+    assert np.corrcoef(shown[:, 1], (y[3000:, 0] - 0.5) ** 2)[0, 1] > 0.95
+    np.testing.assert_allclose(shown.std(0), 1.0, atol=0.05)
+
+
+def test_very_many_features_are_regressed():
+    settings = InferenceSettings()
+    assert whitening.width(settings, 600, 17) == 34 and whitening.width(settings, 512, 17) == 512
+    assert whitening.width(settings, 5000, 17) == 5000 and whitening.width(settings, 600, 400) == 600
+    assert whitening.width(InferenceSettings(modelClass="MDRFF"), 600, 17) == 600
+    assert whitening.count(settings, 600) == 1
+
+
+def test_a_network_of_very_many_features_finds_the_few_that_tell():
+    """One of 600 features is theta with noise of .05: at best a gain of log(1 / (.05 sqrt(2 pi e))) = 1.58 nats."""
+    keys = jax.random.split(jax.random.PRNGKey(1), 3)
+    space = ParameterSpace([Parameter("theta", 0.5, 0.0, 1.0)])
+    theta = jax.random.uniform(keys[0], (3000, 1))
+    x = jax.random.normal(keys[1], (3000, 600)).at[:, 123].set(theta[:, 0] + 0.05 * jax.random.normal(keys[2], (3000,)))
+    settings = InferenceSettings(ensemble=2, components=2, hiddenLayers=(32,), max_steps=1000, restandardise=True)
+    state = inference.init(keys[0], settings, space, 600)
+    assert state.basis.shape == (600, 2) and inference.condition(state, x[:3]).means.shape == (3, 4, 1)
+    for _ in range(2):  # the second goes on, with a regression of its own
+        state, info = inference.fit(keys[1], state, theta[:2500], x[:2500])
+    gains = jax.vmap(lambda q, t: q.log_gain(t))(inference.condition(state, x[2500:]), theta[2500:])
+    assert 1.2 < float(jnp.mean(gains)) < 1.75
