@@ -108,9 +108,14 @@ def _name(found: Findings, far: Gap, remaining: float, alone: bool, noise: Origi
         }
         above = cost["with_effects"] - 1.0
         matters = above > LIMITS.matters**2 - 1.0 or bool(far.beyond)
-        little = above <= LIMITS.share * (ground(cost["calibrated"], far) - 1.0) or noise is not None
+        little = above <= LIMITS.share * (cost["calibrated"] - 1.0) or noise is not None
+        little = little and not standstill(far, above)
         structured = tried.above_noise(model) and remaining > LIMITS.share
-        if (matters and not little) or structured or (found.flexible_winner is not None and alone):
+        if (
+            (matters and (not little or standstill(far, above)))
+            or structured
+            or (found.flexible_winner is not None and alone)
+        ):
             return "unexplained"
         return "ambiguous" if tried.ambiguous else "effects"
     if np.sqrt(tried.base.total / (tried.noise * len(tried.base.cost))) > LIMITS.matters:
@@ -122,13 +127,18 @@ def _name(found: Findings, far: Gap, remaining: float, alone: bool, noise: Origi
     return "parameters" if q.c.sum() > max(1.1 * tried.base.total, floor) else "no_gap"
 
 
-def ground(calibrated: float, far: Gap) -> float:
-    """The mean squared error, in noise variances, of which named effects have to close most.
+def standstill(far: Gap, above: float) -> bool:
+    """Whether effects hardly do better than joints that keep their speed, in the place of a simulator that does worse.
 
-    The recalibrated simulator's, or that of joints which keep their speed where this is less: beside forces that are
-    far off, whatever hardly accelerates closes almost all of the gap.
+    Beside forces that are far off, whatever hardly accelerates closes almost all of the gap. Noise of the sensors
+    excuses nothing here: it is in both.
+
+    Args:
+        above: noise variances that the effects leave above the noise, mean of the windows.
     """
-    return calibrated if far.coasting is None else min(calibrated, far.coasting**2)
+    if far.coasting is None or far.coasting >= far.calibrated:
+        return False
+    return above > LIMITS.share * (far.coasting**2 - 1.0)
 
 
 def remains(found: Findings) -> float:
