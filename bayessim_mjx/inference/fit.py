@@ -202,5 +202,10 @@ def _bases(state: FitState, data: Data) -> Array:
     if data.own is not None and tried > 1:  # rows measured at least twice
         again = data.x[len(x) :].reshape(data.draws - 1, -1, dim_x)[0][data.own]
         noise = whitening.noise_of(x, again, data.train & (data.own >= 0))
-    found = whitening.candidates(x, data.train, tried, noise)
-    return found if state.basis is None else jnp.where(state.fits == 0, found, state.basis[None])
+    found = whitening.candidates(x, data.y, data.train, tried, noise)
+    if state.basis is None:
+        return found
+    kept = state.basis
+    if tried > 2 and state.settings.restandardise:
+        kept = jnp.where(whitening.is_padded(kept), found[-1], kept)
+    return jnp.where(state.fits == 0, found, kept[None])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from bayessim_mjx.inference import ridge
@@ -12,6 +13,7 @@ from bayessim_mjx.inference.settings import InferenceSettings
 from bayessim_mjx.linalg import product
 
 LIMIT = 512  # features up to which their eigenvectors are worth the cost; of more of them few tell something each
+MANY = 128  # features from which on a regression on the parameters is tried too
 MOST = 4096  # features up to which a regression on them is worth its cost
 FLOOR = 1e-3  # added to the noise's variances: rounding is not to be blown up
 EPS = 1e-6  # of a direction that neither parameters nor noise move
@@ -26,16 +28,29 @@ def width(settings: InferenceSettings, dim_x: int, d: int) -> int:
 def count(settings: InferenceSettings, dim_x: int) -> int:
     """How many bases are tried, each by another member of the ensemble (the last one is linear at first)."""
     whole = settings.embedding is not None or not density_of(settings).whitened or dim_x > LIMIT
-    return 1 if whole or settings.ensemble < 3 else 2
+    return 1 if whole or settings.ensemble < 3 else 2 + (dim_x > MANY)
 
 
-def candidates(x: Array, train: Array, tried: int, noise: Array | None = None) -> Array:
-    """Matrices [tried, D, D] for standardised summaries x [N, D], of which those with train [N] count.
+def candidates(x: Array, y: Array, train: Array, tried: int, noise: Array | None = None) -> Array:
+    """Matrices [tried, D, D] for standardised summaries x [N, D] of parameters y [N, d]; rows with train [N] count.
 
-    As they are, and `whitened`.
+    As they are, `whitened` and `regressed`.
     """
-    as_is = jnp.eye(x.shape[1])
-    return as_is[None] if tried == 1 else jnp.stack([as_is, whitened(x, train, noise)])
+    every = [jnp.eye(x.shape[1])]
+    every += [whitened(x, train, noise)] if tried > 1 else []
+    every += [padded(regressed(x, y, train))] if tried > 2 else []
+    return jnp.stack(every)
+
+
+def padded(basis: Array) -> Array:
+    """A basis [D, few] as [D, D]: the other inputs are 0, and these so large that first weights for D see as much."""
+    dim_x, few = basis.shape
+    return jnp.zeros((dim_x, dim_x)).at[:, :few].set(basis * np.sqrt(dim_x / few))
+
+
+def is_padded(basis: Array) -> Array:
+    """Whether a basis [D, D] is one of `padded`: the others have no column without any weight."""
+    return ~jnp.any(basis[:, -1])
 
 
 def whitened(x: Array, train: Array, noise: Array | None = None) -> Array:

@@ -12,14 +12,14 @@ from bayessim_mjx.parameters import Parameter, ParameterSpace
 def test_whitened_rows_have_unit_covariance_and_rows_left_out_do_not_count():
     x = jax.random.normal(jax.random.PRNGKey(0), (500, 3)) @ jnp.asarray([[3.0, 1, 0], [0, 1, 2], [0, 0, 1]])
     train = jnp.arange(500) < 400
-    as_is, whitened = whitening.candidates(jnp.where(train[:, None], x, 1e3), train, 2)
+    as_is, whitened = whitening.candidates(jnp.where(train[:, None], x, 1e3), x, train, 2)
     np.testing.assert_array_equal(as_is, np.eye(3))
     np.testing.assert_allclose(np.cov((x[:400] @ whitened).T), np.eye(3), atol=0.02)
 
 
 def test_a_column_that_never_varies_stays_finite():
     x = jnp.stack([jnp.linspace(-1.0, 1.0, 50), jnp.zeros(50)], axis=1)
-    assert np.all(np.isfinite(whitening.candidates(x, jnp.ones(50, bool), 2)))
+    assert np.all(np.isfinite(whitening.candidates(x, x, jnp.ones(50, bool), 2)))
 
 
 def test_fourier_features_and_small_ensembles_keep_their_inputs():
@@ -39,7 +39,7 @@ def test_directions_of_noise_alone_are_turned_down_and_what_parameters_move_has_
     spoilt = jnp.where(used[:, None], second, 1e3)  # what is not used does not count
     found = whitening.noise_of(first, spoilt, used)
     np.testing.assert_allclose(found, np.diag(noise**2), atol=0.01)
-    basis = np.asarray(whitening.candidates(first, used, 2, found)[1])
+    basis = np.asarray(whitening.candidates(first, clean, used, 2, found)[1])
     signal = np.linalg.eigvalsh(np.cov((np.asarray(clean) @ basis).T))
     np.testing.assert_allclose(signal, [0, 0, 1, 1], atol=0.06)
     assert np.linalg.eigvalsh(np.cov((np.asarray(first) @ basis).T))[:2].max() < 0.02
@@ -82,3 +82,16 @@ def test_a_network_of_very_many_features_finds_the_few_that_tell():
         state, info = inference.fit(keys[1], state, theta[:2500], x[:2500])
     gains = jax.vmap(lambda q, t: q.log_gain(t))(inference.condition(state, x[2500:]), theta[2500:])
     assert 1.2 < float(jnp.mean(gains)) < 1.75
+
+
+def test_many_features_may_be_regressed_and_then_fill_the_inputs_with_nothing():
+    x, y = jax.random.normal(jax.random.PRNGKey(0), (900, 200)), jax.random.uniform(jax.random.PRNGKey(1), (900, 2))
+    x = x.at[:, 5].set(3.4 * (y[:, 0] - 0.5))
+    assert whitening.count(InferenceSettings(), 200) == 3 and whitening.width(InferenceSettings(), 200, 2) == 200
+    *others, last = whitening.candidates(x, y, jnp.ones(900, bool), 3)
+    assert bool(whitening.is_padded(last)) and not any(bool(whitening.is_padded(basis)) for basis in others)
+    shown = np.asarray(x @ last)
+    assert not shown[:, 4:].any()
+    # four inputs that a layer for 200 sees as much of as of 200 with unit variance
+    np.testing.assert_allclose(np.mean(np.sum(shown**2, axis=1)), 200.0, rtol=0.05)
+    assert np.corrcoef(shown[:, 0], y[:, 0])[0, 1] > 0.99
