@@ -21,14 +21,19 @@ EPS = 1e-6  # of a direction that neither parameters nor noise move
 
 def width(settings: InferenceSettings, dim_x: int, d: int) -> int:
     """How many inputs a network of d parameters has: all D features, or two `regressed` ones for each parameter."""
-    regresses = LIMIT < dim_x <= MOST and settings.embedding is None and density_of(settings).whitened
-    return min(2 * d, dim_x) if regresses and d else dim_x
+    return min(2 * d, dim_x) if LIMIT < dim_x <= MOST and _may_change(settings) and d else dim_x
 
 
 def count(settings: InferenceSettings, dim_x: int) -> int:
     """How many bases are tried, each by another member of the ensemble (the last one is linear at first)."""
-    whole = settings.embedding is not None or not density_of(settings).whitened or dim_x > LIMIT
-    return 1 if whole or settings.ensemble < 3 else 2 + (dim_x > MANY)
+    if not _may_change(settings) or dim_x > LIMIT or settings.ensemble < 3:
+        return 1
+    return 2 + (dim_x > MANY)
+
+
+def _may_change(settings: InferenceSettings) -> bool:
+    """Whether inputs may be other than the features: not of an embedding, nor where distances between them count."""
+    return settings.embedding is None and density_of(settings).whitened
 
 
 def candidates(x: Array, y: Array, train: Array, tried: int, noise: Array | None = None) -> Array:

@@ -27,7 +27,7 @@ from pathlib import Path
 import numpy as np
 from cases import KNOWN, STRENGTHS, SYSTEMS, UNKNOWN, make_case, places
 from families import without
-from isolable import KINDS, looked_at
+from isolable import KINDS, looked_at, seed_of
 from tables import score
 
 from bayessim_mjx.blind.reality.joints import TwoBodies
@@ -74,8 +74,7 @@ def _make(job: Job) -> str:
     if (folder / "truth.json").exists():
         return f"{folder.name}: is there"
     started = time.perf_counter()
-    # each kind has base parameters and motions of its own
-    case = make_case(system, effects, strength, seed + 1_000_000 * KINDS.index(kind), folder)
+    case = make_case(system, effects, strength, seed_of(kind, seed), folder)
     truth = case.truth | {"kind": kind, "seed": seed}
     (folder / "truth.json").write_text(json.dumps(truth, indent=1, default=float))
     told = ", ".join(f"{e['name']}@{e['where']} raw {e['raw']:.1f} left {e['left']:.1f}" for e in truth["effects"])

@@ -10,9 +10,14 @@ from bayessim_mjx.blind.reality.lookalikes import isolable, rivals
 from bayessim_mjx.blind.reality.plant import Plant, base_parameters, scales_of
 from bayessim_mjx.blind.reality.strength import Ruler
 
-__all__ = ["KINDS", "each_isolable", "hidden", "looked_at"]
+__all__ = ["KINDS", "each_isolable", "hidden", "looked_at", "seed_of"]
 
-KINDS = ("single", "double", "null", "unknown")  # each has seeds of its own
+KINDS = ("single", "double", "null", "unknown")
+
+
+def seed_of(kind: str, seed: int) -> int:
+    """Each kind of case has base parameters and motions of its own."""
+    return seed + 1_000_000 * KINDS.index(kind)
 
 
 def hidden(truth: dict[str, Any]) -> tuple[list[Cause], Ruler]:
@@ -21,7 +26,7 @@ def hidden(truth: dict[str, Any]) -> tuple[list[Cause], Ruler]:
     Raises:
         ValueError: the case was written by another version of the generator.
     """
-    robot, seed = SYSTEMS[truth["system"]], truth["seed"] + 1_000_000 * KINDS.index(truth.get("kind", "single"))
+    robot, seed = SYSTEMS[truth["system"]], seed_of(truth.get("kind", "single"), truth["seed"])
     rng = np.random.default_rng((seed, *truth["system"].encode()))
     base = base_parameters(robot, SPREAD, rng)
     rng.uniform()  # whether velocities are logged

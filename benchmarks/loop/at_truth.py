@@ -3,7 +3,8 @@
     python benchmarks/loop/at_truth.py --task Ant --seeds 5 env.numEnvs=4096 ppo.max_iterations=250
 
 Prints, per seed, mean return and its standard error over `bayessim.realEvals` episodes on the surrogate real, as the
-loop evaluates its own policies: the same settings, iterations and start, and physics fixed at `env.realParams`.
+loop evaluates its own policies: the same settings and iterations, another random start, and physics fixed at
+`env.realParams`.
 """
 
 import argparse

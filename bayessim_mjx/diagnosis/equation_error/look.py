@@ -37,7 +37,6 @@ class Limits:
     places: int = 20  # positions of each log at which drives hold loads
 
 
-KNOWN = ("mass", "armature", "damping", "friction")  # attributes that a data sheet may state
 LIMITS = Limits()
 
 
@@ -119,7 +118,7 @@ def look(
     """All that logs tell without a simulation, in seconds.
 
     Args:
-        accuracy: {(attribute, one of KNOWN; element): standard deviation as a share}; others: as of data sheets.
+        accuracy: of known parameters, as for `terms.known`.
         rating: {body: kg} that may be there; of others, what the drives hold.
     """
     began = time.monotonic()
@@ -187,7 +186,7 @@ def _joints(model: mujoco.MjModel, sums: Sums, known: Sequence[Term], found: Fou
 def _shifts(known: Sequence[Term], found: Fit) -> tuple[Shift, ...]:
     """Known parameters farther from the data sheet than it says, the farthest first."""
     out = []
-    for term in (t for t in known if t.effect in KNOWN):
+    for term in (t for t in known if t.effect != "lateness"):
         share = float(found.of(term)[0])
         away = share / float(term.sd(found.of(term))[0])
         if abs(away) > LIMITS.far:

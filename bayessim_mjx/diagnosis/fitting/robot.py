@@ -181,15 +181,14 @@ def default_space(model: mujoco.MjModel) -> ParameterSpace:
     """
     joints = [j for j in range(model.njnt) if model.jnt_type[j] != _FREE]
     dofs = model.jnt_dofadr[joints]
-    damped = [label(model, "joint", j) for j, d in zip(joints, dofs, strict=True) if model.dof_damping[d] > 0]
-    geared = [label(model, "joint", j) for j, d in zip(joints, dofs, strict=True) if model.dof_armature[d] > 0]
-    rubbing = [label(model, "joint", j) for j, d in zip(joints, dofs, strict=True) if model.dof_frictionloss[d] > 0]
+    sizes = {"damping": model.dof_damping, "armature": model.dof_armature, "friction": model.dof_frictionloss}
+    having = {
+        a: [label(model, "joint", j) for j, d in zip(joints, dofs, strict=True) if size[d] > 0]
+        for a, size in sizes.items()
+    }
     moving = np.flatnonzero((model.body_weldid != 0) & (model.body_mass > mujoco.mjMINVAL))
     heavy = [label(model, "body", int(b)) for b in moving]
-    groups = {
-        "dof_properties": {"damping": damped, "armature": geared, "friction": rubbing},
-        "rigid_body_properties": {"mass": heavy},
-    }
+    groups = {"dof_properties": having, "rigid_body_properties": {"mass": heavy}}
     section = {
         g: {a: _scale(found, RUBS if a == "friction" else WITHIN) for a, found in members.items() if found}
         for g, members in groups.items()

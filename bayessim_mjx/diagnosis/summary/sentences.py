@@ -145,7 +145,7 @@ def _coasting(far: Gap, named: bool) -> str:
     """Where no simulator at all predicts better than the recalibrated one."""
     if far.coasting is None or far.coasting >= far.calibrated:
         return ""
-    closed = 1.0 - max(far.with_effects**2 - 1.0, 0.0) / max(far.coasting**2 - 1.0, 1e-9)
+    closed = statistics.share_of_gap(far.coasting**2 - max(far.with_effects, 1.0) ** 2, far.coasting**2)
     more = COASTS_CLOSED.format(closed=percent(max(closed, 0.0))) if named else ""
     return COASTS.format(coasting=number(far.coasting), calibrated=number(far.calibrated), more=more)
 

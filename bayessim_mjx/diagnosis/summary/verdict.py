@@ -111,11 +111,7 @@ def _name(found: Findings, far: Gap, remaining: float, alone: bool, noise: Origi
         little = above <= LIMITS.share * (cost["calibrated"] - 1.0) or noise is not None
         little = little and not standstill(far, above)
         structured = tried.above_noise(model) and remaining > LIMITS.share
-        if (
-            (matters and (not little or standstill(far, above)))
-            or structured
-            or (found.flexible_winner is not None and alone)
-        ):
+        if (matters and not little) or structured or (found.flexible_winner is not None and alone):
             return "unexplained"
         return "ambiguous" if tried.ambiguous else "effects"
     if np.sqrt(tried.base.total / (tried.noise * len(tried.base.cost))) > LIMITS.matters:
@@ -138,7 +134,7 @@ def standstill(far: Gap, above: float) -> bool:
     """
     if far.coasting is None or far.coasting >= far.calibrated:
         return False
-    return above > LIMITS.share * (far.coasting**2 - 1.0)
+    return statistics.share_of_gap(above, far.coasting**2) > LIMITS.share
 
 
 def remains(found: Findings) -> float:
