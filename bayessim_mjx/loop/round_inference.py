@@ -73,7 +73,7 @@ def infer(loop: Loop, state: LoopState, policy: Policy, info: RoundInfo) -> Loop
     if not by_replays and "sets/stood" not in info.scores:
         posterior = set_posterior.chosen(loop, state, policy, posterior, info)
     replaced = by_replays or (info.set_posterior is not None and info.set_posterior.used)
-    info.warnings += _complaints(posterior.names, info.fit, known_before, by_replays)
+    info.warnings += _complaints(posterior.names, info.fit, known_before, by_replays, int(state.fit.fits) == 1)
     info.posterior, info.real = posterior, jax.tree.map(np.asarray, real)
     info.scores |= score(posterior, source.truth)
     state, domain = ranges.move(loop, state, posterior, info)
@@ -217,8 +217,18 @@ def _widened(loop: Loop, state: LoopState, policy: Policy, posterior: Distributi
     return found.used(posterior, known)
 
 
-def _complaints(names: tuple[str, ...], fit: dict[str, Any], known_before: np.ndarray, by_replays: bool) -> list[str]:
-    """What a person should know about this round's fit; by_replays: the posterior is not the network's alone."""
+def _complaints(
+    names: tuple[str, ...], fit: dict[str, Any], known_before: np.ndarray, by_replays: bool, fresh: bool
+) -> list[str]:
+    """What a person should know about this round's fit.
+
+    Args:
+        names: of the parameters.
+        fit: what the fit told.
+        known_before: which parameters were identified [d].
+        by_replays: whether the posterior is not the network's alone.
+        fresh: whether it was the network's first fit.
+    """
     texts, unknown = [], _unknown(names, fit)
     if unknown and not np.array_equal(fit["identified"], known_before):
         what = ", ".join(unknown)
@@ -228,6 +238,9 @@ def _complaints(names: tuple[str, ...], fit: dict[str, Any], known_before: np.nd
         texts.append(f"{percent(fit['clipped'])} of the summaries' entries lie beyond 10 sd and were clipped")
     if fit["n_invalid"] > 0:
         texts.append(f"{int(fit['n_invalid'])} simulated trajectories left out: their summaries are not finite")
+    if fresh and fit["best"] < 0:
+        n = f"{int(fit['steps'])} steps on {int(fit['n_train'])} trajectories"
+        texts.append(f"the network is the linear posterior that training begins at: {n} found none better")
     if fit["skipped"] > 0:
         texts.append(f"{int(fit['skipped'])} steps of the fit skipped: gradient not finite")
     return texts

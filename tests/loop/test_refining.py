@@ -110,8 +110,22 @@ def test_what_replays_tell_is_not_said_to_be_the_prior():
     """A network that identifies nothing: its posterior is the prior, but not the one that replays refined."""
     fit = {"identified": np.array([False, True]), "clipped": 0.0, "n_invalid": 0, "skipped": 0}
     before = np.ones(2, bool)
-    (alone,) = round_inference._complaints(("mass", "length"), fit, before, by_replays=False)
-    (refined,) = round_inference._complaints(("mass", "length"), fit, before, by_replays=True)
+    (alone,) = round_inference._complaints(("mass", "length"), fit, before, by_replays=False, fresh=False)
+    (refined,) = round_inference._complaints(("mass", "length"), fit, before, by_replays=True, fresh=False)
     assert alone == "not identified by these trajectories, kept at the prior: mass"
     assert "prior" not in refined
     assert "mass" in refined and "length" not in refined
+
+
+def test_a_first_training_that_gained_nothing_is_told():
+    """Hundreds of features learnt by heart looked like a network: none of its steps beat the linear start."""
+    fit = {"identified": np.ones(1, bool), "clipped": 0.0, "n_invalid": 0, "skipped": 0}
+    fit |= {"steps": 158, "n_train": 4500}
+    known = np.ones(1, bool)
+
+    def told(best: int, fresh: bool) -> list[str]:
+        return round_inference._complaints(("mass",), fit | {"best": best}, known, by_replays=False, fresh=fresh)
+
+    (text,) = told(-1, True)
+    assert "linear posterior" in text and "158 steps" in text and "4500 trajectories" in text
+    assert told(-1, False) == told(0, True) == []

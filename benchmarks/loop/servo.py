@@ -1,0 +1,202 @@
+"""The loop's posterior of a real servo: what other seeds, other conditions and motion that was kept apart say of it.
+
+    python benchmarks/loop/servo.py --out DIR                  # two seeds on all logs, then each condition left out
+    python benchmarks/loop/servo.py --out DIR --only all:0     # one run; DIR/*.json are taken up
+    python benchmarks/loop/servo.py --out DIR --summary        # the tables of what is there
+
+16 logs of a Dynamixel XL330 with a pendulum (`examples/adapt_servo.py`), four each at the gains 100, 200, 400 and 800.
+Judged are the 90 % intervals of friction and gain: do those of two seeds overlap, and do they hold the least-squares
+refits of the same model to the logs without one gain? Then motion: the posterior and the noise of the logs without one
+gain predict windows of that gain from their measured starts. Intervals are those of replays at draws of the posterior,
+with the forces and the sensors' noise that refinement found; counted is how often 90 % of them hold what was measured.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.optimize import least_squares
+
+from bayessim_mjx import loop, registry
+from bayessim_mjx.config import load
+from bayessim_mjx.kalman import push
+from bayessim_mjx.logs import read_logs, segments
+from bayessim_mjx.loop.likelihood import Noise
+from bayessim_mjx.rollout import replay
+from bayessim_mjx.tracking import Record, close, transitions
+
+ROOT = Path(__file__).resolve().parents[2]
+SETTINGS = ["ppo.max_iterations=2", "bayessim.realEvals=4", "monitor.video=False", "bayessim.realIters=1"]
+WINDOWS = 32  # that the posterior is of
+CONDITIONS = ("kp100", "kp200", "kp400", "kp800")
+DRAWS, EACH = 64, 16  # of the posterior, and of noise for each
+TIMES = (0.1, 0.25, 0.4)  # s after a window's start
+LEVEL = 0.9
+JUDGED = ("friction", "gain")
+
+
+def chosen(folder: Path, out: Path, left_out: str) -> Path:
+    """A folder with links to the logs of all conditions but one."""
+    out.mkdir(parents=True, exist_ok=True)
+    for path in folder.iterdir():
+        if not path.name.startswith(f"{left_out}_") and not (out / path.name).exists():
+            (out / path.name).symlink_to(path)
+    return out
+
+
+def posterior(folder: Path, seed: int, overrides: list[str]) -> dict[str, Any]:
+    """One round of the loop on the logs in `folder`: draws, intervals, noise."""
+    clock, cpu = time.perf_counter(), time.process_time()
+    given = [*SETTINGS, f"bayessim.realTrajs={WINDOWS}", f"real.logs={folder}", *overrides]
+    config = load("ServoPendulum", flags={"--seed": ("seed", seed)}, overrides=given)
+    env = registry.make(config.task, config=config)
+    parts = loop.make(config, env)
+    _, rounds = loop.run(parts, loop.init(parts))
+    info = rounds[-1]
+    assert info.posterior is not None and info.refinement is not None
+    draws = np.asarray(info.posterior.sample(jax.random.key(seed), 4096), float)
+    noise = info.refinement.noise
+    return {
+        "names": list(info.posterior.names), "draws": draws[:DRAWS].tolist(),
+        "mean": draws.mean(0).tolist(), "sd": draws.std(0).tolist(),
+        "interval": np.quantile(draws, [0.5 - LEVEL / 2, 0.5 + LEVEL / 2], axis=0).T.tolist(),
+        "refined": info.refinement.sentence(), "widening": info.refinement.widening,
+        "noise": {"sensor": noise.sensor.tolist(), "process": noise.process.tolist(), "lasting": noise.lasting},
+        "seconds": time.perf_counter() - clock, "cpu": time.process_time() - cpu,
+    }  # fmt: skip
+
+
+def windows(env: Any, folder: Path) -> dict[str, np.ndarray]:
+    return segments(read_logs(folder, env.mj_model), env_steps(env), dt=env.dt)
+
+
+def env_steps(env: Any) -> int:
+    return round(TIMES[-1] / env.dt)
+
+
+def refit(env: Any, folder: Path) -> list[float]:
+    """Least squares of replays from measured starts, all parameters but the weighed mass, which comes first."""
+    data, space = windows(env, folder), env.space
+    start, speed, command = (jnp.asarray(data[k]) for k in ("qpos0", "qvel0", "command"))
+    weighed = float(space.nominal[0])
+
+    def gaps(logs: np.ndarray) -> np.ndarray:
+        theta = jnp.asarray(np.concatenate([[weighed], np.exp(logs)]), jnp.float32)
+        motion = replay(env.physics, start, speed, command, jnp.tile(theta, (len(start), 1)))
+        return (np.asarray(motion["qpos"], float) - data["qpos"]).ravel()
+
+    low, high = np.log(space.low[1:]), np.log(space.high[1:])
+    found = least_squares(gaps, np.log(space.nominal[1:]), bounds=(low, high), diff_step=1e-2, x_scale=0.1)
+    return [weighed, *np.exp(found.x).tolist()]
+
+
+def covered(env: Any, data: dict[str, np.ndarray], found: dict[str, Any], seed: int = 0) -> dict[str, float]:
+    """How often 90 % intervals of predicted positions hold the measured ones, by seconds after a window's start."""
+    rng, nv, steps = np.random.default_rng(seed), env.mj_model.nv, env_steps(env)
+    noise = Noise(*(np.asarray(found["noise"][k]) for k in ("sensor", "process")), found["noise"]["lasting"])
+    thetas = np.asarray(found["draws"])
+    start, speed, command = (jnp.asarray(data[k], jnp.float32) for k in ("qpos0", "qvel0", "command"))
+    record = Record(*(jnp.asarray(data[k], jnp.float32) for k in ("qpos", "qvel", "command")))
+    travel = np.maximum(np.concatenate([np.ptp(data["qpos"], (0, 1)), np.ptp(data["qvel"], (0, 1))]), 1e-6)
+    ways, _ = transitions(env.physics, thetas.mean(0), record, close(record, nv), travel)
+    sd = np.where(np.isfinite(noise.sensor), noise.sensor, 0.0)
+    speed_sd = sd[nv:] if sd[nv:].any() else sd[:nv] / env.dt  # a velocity from positions
+    inside = np.zeros((len(start), steps))
+    shown = np.stack([
+        np.asarray(replay(env.physics, start, speed, command, jnp.tile(jnp.asarray(t, jnp.float32), (len(start), 1)))["qpos"], float)[..., 0]
+        for t in thetas
+    ])  # fmt: skip
+    size = (DRAWS * EACH, len(start), nv)
+    away = np.concatenate([sd[:nv] * rng.normal(size=size), speed_sd * rng.normal(size=size)], axis=-1)
+    force = noise.process * rng.normal(size=size)
+    fresh = noise.process * np.sqrt(1 - noise.lasting**2)
+    for t in range(steps):
+        pushed = force @ push(nv, env.dt).T
+        away = np.einsum("nij,mnj->mni", np.nan_to_num(ways[:, t]), away) + pushed
+        force = noise.lasting * force + fresh * rng.normal(size=size)
+        seen = np.repeat(shown[:, :, t + 1], EACH, axis=0) + away[..., 0] + sd[0] * rng.normal(size=size[:2])
+        low, high = np.quantile(seen, [0.5 - LEVEL / 2, 0.5 + LEVEL / 2], axis=0)
+        measured = data["qpos"][:, t + 1, 0]
+        inside[:, t] = (measured >= low) & (measured <= high)
+    at = {f"{seconds:g} s": float(inside[:, round(seconds / env.dt) - 1].mean()) for seconds in TIMES}
+    return at | {"all": float(inside.mean()), "windows": len(start)}
+
+
+def one(name: str, logs: Path, overrides: list[str]) -> dict[str, Any]:
+    """`all:SEED`: the posterior of all logs; `without:kp100`: that of the others, its refit, what it predicts."""
+    kind, _, which = name.partition(":")
+    if kind == "all":
+        return posterior(logs, int(which), overrides)
+    with tempfile.TemporaryDirectory() as place:
+        others = chosen(logs, Path(place) / "others", which)
+        found = posterior(others, 0, overrides)
+        apart = Path(place) / "apart"
+        apart.mkdir()
+        for path in logs.glob(f"{which}_*"):
+            (apart / path.name).symlink_to(path)
+        env = registry.make("ServoPendulum")
+        found["refit"] = refit(env, others)
+        found["covered"] = covered(env, windows(env, apart), found)
+        found["covered in sample"] = covered(env, windows(env, others), found)
+    return found
+
+
+def summary(out: Path) -> None:
+    """The tables of the runs in `out`."""
+    runs = {path.stem.replace("-", ":"): json.loads(path.read_text()) for path in sorted(out.glob("*.json"))}
+    for name, run in runs.items():
+        cells = [
+            f"{n} {m:.4g} ({a:.4g} to {b:.4g})"
+            for n, m, (a, b) in zip(run["names"], run["mean"], run["interval"], strict=True)
+        ]
+        print(f"{name}: {', '.join(cells)}; widening {run['widening']:.2f}, {run['cpu']:.0f} CPU s")
+    seeds, left = ({k: r for k, r in runs.items() if k.startswith(f"{kind}:")} for kind in ("all", "without"))
+    for name in JUDGED:
+        spans = {}
+        for key, run in seeds.items():
+            place = next(i for i, n in enumerate(run["names"]) if n.endswith(name))
+            spans[key] = run["interval"][place]
+            held = [run["interval"][place][0] <= r["refit"][place] <= run["interval"][place][1] for r in left.values()]
+            print(
+                f"{name}, {key}: holds {sum(held)} of {len(held)} refits {[round(r['refit'][place], 4) for r in left.values()]}"
+            )
+        if len(spans) > 1:
+            print(
+                f"{name}: intervals of seeds overlap: {max(a for a, _ in spans.values()) <= min(b for _, b in spans.values())}"
+            )
+    for key, run in left.items():
+        print(f"{key}: 90 % intervals hold {run['covered']}; in sample {run['covered in sample']}")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--only", nargs="*", default=["all:0", "all:1", *(f"without:{c}" for c in CONDITIONS)])
+    parser.add_argument("--summary", action="store_true")
+    args, overrides = parser.parse_known_args()
+    if not args.summary:
+        sys.path.insert(0, str(ROOT / "examples"))
+        from convert_xl330 import RAW, convert
+
+        if not RAW.is_dir():
+            raise SystemExit(f"skipped: the logs are not there ({RAW})")
+        logs = args.out / "logs"
+        convert(logs)
+        for name in args.only:
+            path = args.out / f"{name.replace(':', '-')}.json"
+            if not path.exists():
+                path.write_text(json.dumps(one(name, logs.resolve(), overrides), indent=1))
+    summary(args.out)
+
+
+if __name__ == "__main__":
+    main()
