@@ -111,10 +111,13 @@ def covered(env: Any, data: dict[str, np.ndarray], found: dict[str, Any], seed: 
     sd = np.where(np.isfinite(noise.sensor), noise.sensor, 0.0)
     speed_sd = sd[nv:] if sd[nv:].any() else sd[:nv] / env.dt  # a velocity from positions
     inside = np.zeros((len(start), steps))
-    shown = np.stack([
-        np.asarray(replay(env.physics, start, speed, command, jnp.tile(jnp.asarray(t, jnp.float32), (len(start), 1)))["qpos"], float)[..., 0]
-        for t in thetas
-    ])  # fmt: skip
+    count = len(start)
+
+    def motion(theta: np.ndarray) -> np.ndarray:
+        every = jnp.tile(jnp.asarray(theta, jnp.float32), (count, 1))
+        return np.asarray(replay(env.physics, start, speed, command, every)["qpos"], float)[..., 0]
+
+    shown = np.stack([motion(theta) for theta in thetas])
     size = (DRAWS * EACH, len(start), nv)
     away = np.concatenate([sd[:nv] * rng.normal(size=size), speed_sd * rng.normal(size=size)], axis=-1)
     force = noise.process * rng.normal(size=size)
@@ -161,18 +164,16 @@ def summary(out: Path) -> None:
         print(f"{name}: {', '.join(cells)}; widening {run['widening']:.2f}, {run['cpu']:.0f} CPU s")
     seeds, left = ({k: r for k, r in runs.items() if k.startswith(f"{kind}:")} for kind in ("all", "without"))
     for name in JUDGED:
-        spans = {}
+        spans = []
         for key, run in seeds.items():
             place = next(i for i, n in enumerate(run["names"]) if n.endswith(name))
-            spans[key] = run["interval"][place]
-            held = [run["interval"][place][0] <= r["refit"][place] <= run["interval"][place][1] for r in left.values()]
-            print(
-                f"{name}, {key}: holds {sum(held)} of {len(held)} refits {[round(r['refit'][place], 4) for r in left.values()]}"
-            )
+            low, high = run["interval"][place]
+            spans.append((low, high))
+            refits = [r["refit"][place] for r in left.values()]
+            held = sum(low <= x <= high for x in refits)
+            print(f"{name}, {key}: holds {held} of {len(refits)} refits: {[round(x, 4) for x in refits]}")
         if len(spans) > 1:
-            print(
-                f"{name}: intervals of seeds overlap: {max(a for a, _ in spans.values()) <= min(b for _, b in spans.values())}"
-            )
+            print(f"{name}: intervals of seeds overlap: {max(a for a, _ in spans) <= min(b for _, b in spans)}")
     for key, run in left.items():
         print(f"{key}: 90 % intervals hold {run['covered']}; in sample {run['covered in sample']}")
 
