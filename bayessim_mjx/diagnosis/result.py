@@ -72,7 +72,8 @@ class Diagnosis:
 
     Attributes:
         verdict: one of VERDICTS; sentences: the verdict in words, most important first.
-        parameters: {name: {"mean", "sd", "nominal", "low", "high", "unit", "structural": sentence or ""}}.
+        parameters: {name: {"mean", "sd", "nominal", "low", "high", "unit", "structural": sentence or "",
+            "data_sheet": sentence or "", "away": sd from the data sheet, where that is far}}.
         candidates: ranked [{"effects": [label ...], "label", "score", "se", "gap_closed", "parameters": {..},
             "absorbed"}].
         covariance: {"names": [...], "matrix": [[...]]} of parameters and effects' parameters together, or {}.

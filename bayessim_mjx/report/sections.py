@@ -32,6 +32,7 @@ from bayessim_mjx.report.words import (
 )
 
 MOST_CANDIDATES = 20
+MOST_SENTENCES = 10  # that are not folded away: the most important come first
 TILES = {
     "nominal": "gap as delivered",
     "calibrated": "after recalibrating",
@@ -42,8 +43,7 @@ TILES = {
 
 def top(d: Diagnosis) -> dict[str, Any]:
     """Verdict, sentences, what to do next and the key numbers."""
-    verdict = verdict_of(d)
-    stages = stages_of(d)
+    verdict, stages, said = verdict_of(d), stages_of(d), d.sentences[1:]
     told = [s for s in TILES if s in stages_told(d) and finite(stages[s])]
     tiles = [{"words": TILES[s], "colour": STAGE[s], **_tile(d, s)} for s in told]
     closed = gap_closed(stages)
@@ -55,7 +55,8 @@ def top(d: Diagnosis) -> dict[str, Any]:
         "badge": verdict.badge,
         "verdict": d.verdict,
         "headline": headline(d),
-        "sentences": d.sentences[1:],
+        "sentences": said[:MOST_SENTENCES],
+        "more": said[MOST_SENTENCES:],
         "advice": verdict.advice,
         "tiles": tiles,
         "found": found,

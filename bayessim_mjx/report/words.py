@@ -184,8 +184,13 @@ def label_title(label: str, short: bool = False) -> str:
 
 
 def candidate_title(candidate: Mapping[str, Any]) -> str:
-    labels = candidate.get("effects") or []
-    return " + ".join(label_title(x, short=True) for x in labels) or str(candidate.get("label") or "no effect")
+    """`Coulomb friction · elbow, wrist + Command delay · motor`: each law once, with its places."""
+    places: dict[str, list[str]] = {}
+    for label in candidate.get("effects") or []:
+        law, _, place = label_title(label, short=True).partition(" · ")
+        places.setdefault(law, []).append(place)
+    titles = [" · ".join(filter(None, (law, ", ".join(filter(None, at))))) for law, at in places.items()]
+    return " + ".join(titles) or str(candidate.get("label") or "no effect")
 
 
 def not_fitted(d: Diagnosis, most: int | None = None) -> list[str]:

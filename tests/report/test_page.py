@@ -237,3 +237,12 @@ def test_what_is_left_beside_effects_is_partly_explained(tmp_path):
 def test_physical_units_come_first(page):
     # 0.041 rad are 2.3 deg; 14.2 noise sd stand below
     assert "2.3 deg14.2 sd" in page.text.replace(" 14.2", "14.2") and "range of motion" in page.text
+
+
+def test_the_most_important_sentences_are_open_and_the_others_folded(tmp_path):
+    many = dataclasses.replace(fake.full(), sentences=["Head.", *(f"Sentence number {k}." for k in range(12))])
+    before, folded = report.write(many, tmp_path).read_text().split('<details class="said">')
+    assert "Sentence number 9." in before and "Sentence number 10." not in before
+    assert "2 more" in folded and "Sentence number 11." in folded.split("</details>")[0]
+    few = dataclasses.replace(many, sentences=many.sentences[:5])
+    assert '<details class="said">' not in report.write(few, tmp_path).read_text()

@@ -62,6 +62,15 @@ def test_effects_in_plain_english():
     assert words.label_title("actuator_delay@m1", short=True) == "Command delay · m1"
 
 
+def test_a_law_at_several_places_is_named_once():
+    labels = ["coulomb_friction@elbow", "coulomb_friction@wrist", "actuator_delay@m1", "cogging@all"]
+    assert (
+        words.candidate_title({"effects": labels})
+        == "Coulomb friction · elbow, wrist + Command delay · m1 + Cogging · all"
+    )
+    assert words.candidate_title({"effects": [], "label": "base"}) == "base"
+
+
 def test_a_reciprocal_is_turned_over_with_its_error():
     # 1 / 0.5 = 2, sd 0.05 / 0.5^2 = 0.2
     assert words.quantity("inverse_limit", Estimate(0.5, 0.05, "1/(N m)")) == ("limit", "2.00 ± 0.20 N m")

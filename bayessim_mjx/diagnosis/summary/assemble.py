@@ -100,18 +100,20 @@ def _parameters(tried: Tried, model: Model, sd: np.ndarray) -> dict[str, dict[st
     remarks = conditions.structural(tried, model)
     return {
         c.name: {
+            **_against_data_sheet(c, float(model.fit.values[i])),
             "mean": float(model.fit.values[i]), "sd": float(sd[i]), "nominal": c.neutral, "low": c.low, "high": c.high,
             "unit": c.unit, "structural": remarks.get(c.name, ""),
-            "data_sheet": _against_data_sheet(c, float(model.fit.values[i])),
         }
         for i, c in enumerate(tried.fitter.base)
     }  # fmt: skip
 
 
-def _against_data_sheet(c: Coordinate, value: float) -> str:
-    """How far a known parameter is from what was stated of it, where that is far."""
+def _against_data_sheet(c: Coordinate, value: float) -> dict[str, Any]:
+    """How far a known parameter is from what was stated of it, where that is far: in words, and in sd."""
     away = abs(value - c.neutral) * c.precision**0.5
-    return phrases.far_from_data_sheet(value, away) if c.stated and away > FAR else ""
+    if not (c.stated and away > FAR):
+        return {"data_sheet": ""}
+    return {"data_sheet": phrases.far_from_data_sheet(value, away), "away": away}
 
 
 def _less_accurate(model: Model) -> list[str]:

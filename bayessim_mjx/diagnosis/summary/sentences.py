@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from bayessim_mjx.diagnosis import statistics
+from bayessim_mjx.diagnosis import phrases, statistics
 from bayessim_mjx.diagnosis.findings import Findings
 from bayessim_mjx.diagnosis.result import FoundEffect, Gap
 from bayessim_mjx.diagnosis.selection.selected import Rival
@@ -90,6 +90,8 @@ COASTS = (
     "recalibrated simulator's {calibrated}{more}: its forces are far off, or hardly show in windows as short as these."
 )
 COASTS_CLOSED = "; of that squared gap the effects close {closed}"
+STUCK = "At a bound, where they stand in for something else or their range is too narrow: {named}."
+FAR = "Far from the data sheet: {named}."
 
 
 def sentences(
@@ -119,9 +121,26 @@ def sentences(
         told += [f"{text[:1].upper()}{text[1:]}." for text in flexible_in_words(found.flexible_winner)]
     told += [first_look.apart(found.setup.look)]
     told += [f"At its bound: {missing(e.name, e.where)}. {e.sentence}" for e in effects if _at_bound(e)]
-    told += [f"{k} {v['structural']}." for k, v in parameters.items() if v["structural"]]
-    told += [f"{k} {v['data_sheet']}." for k, v in parameters.items() if v.get("data_sheet")]
+    told += _remarks(parameters)
     return [text for text in told if text]
+
+
+def _remarks(parameters: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """What is remarked of known parameters: a sentence for each, but one for all at a bound and for all far off."""
+    stuck: dict[str, str] = {}
+    far: dict[str, str] = {}
+    told = []
+    for name, about in parameters.items():
+        value, text, sheet = f"{name} {about['mean']:.4g}", about["structural"], about.get("data_sheet")
+        if text == phrases.stuck(about["mean"]):
+            stuck[value] = f"{name} {text}."
+        elif text:
+            told.append(f"{name} {text}.")
+        if sheet:
+            far[f"{value} ({about['away']:.1f} sd)"] = f"{name} {sheet}."
+    for together, sentence in ((stuck, STUCK), (far, FAR)):
+        told += together.values() if len(together) < 2 else [sentence.format(named=listed(list(together)))]
+    return told
 
 
 def _hidden(labels: Sequence[str], effects: int) -> str:
