@@ -36,7 +36,6 @@ from bayessim_mjx.tracking import Record, close, transitions
 
 ROOT = Path(__file__).resolve().parents[2]
 SETTINGS = ["ppo.max_iterations=2", "bayessim.realEvals=4", "monitor.video=False", "bayessim.realIters=1"]
-WINDOWS = 32  # that the posterior is of
 CONDITIONS = ("kp100", "kp200", "kp400", "kp800")
 DRAWS, EACH = 64, 16  # of the posterior, and of noise for each
 TIMES = (0.1, 0.25, 0.4)  # s after a window's start
@@ -53,10 +52,10 @@ def chosen(folder: Path, out: Path, left_out: str) -> Path:
     return out
 
 
-def posterior(folder: Path, seed: int, overrides: list[str]) -> dict[str, Any]:
-    """One round of the loop on the logs in `folder`: draws, intervals, noise."""
+def posterior(folder: Path, seed: int, count: int, overrides: list[str]) -> dict[str, Any]:
+    """One round of the loop on `count` windows of the logs in `folder`: draws, intervals, noise."""
     clock, cpu = time.perf_counter(), time.process_time()
-    given = [*SETTINGS, f"bayessim.realTrajs={WINDOWS}", f"real.logs={folder}", *overrides]
+    given = [*SETTINGS, f"bayessim.realTrajs={count}", f"real.logs={folder}", *overrides]
     config = load("ServoPendulum", flags={"--seed": ("seed", seed)}, overrides=given)
     env = registry.make(config.task, config=config)
     parts = loop.make(config, env)
@@ -134,14 +133,14 @@ def covered(env: Any, data: dict[str, np.ndarray], found: dict[str, Any], seed: 
     return at | {"all": float(inside.mean()), "windows": len(start)}
 
 
-def one(name: str, logs: Path, overrides: list[str]) -> dict[str, Any]:
+def one(name: str, logs: Path, count: int, overrides: list[str]) -> dict[str, Any]:
     """`all:SEED`: the posterior of all logs; `without:kp100`: that of the others, its refit, what it predicts."""
     kind, _, which = name.partition(":")
     if kind == "all":
-        return posterior(logs, int(which), overrides)
+        return posterior(logs, int(which), count, overrides)
     with tempfile.TemporaryDirectory() as place:
         others = chosen(logs, Path(place) / "others", which)
-        found = posterior(others, 0, overrides)
+        found = posterior(others, 0, count, overrides)
         apart = Path(place) / "apart"
         apart.mkdir()
         for path in logs.glob(f"{which}_*"):
@@ -182,6 +181,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--only", nargs="*", default=["all:0", "all:1", *(f"without:{c}" for c in CONDITIONS)])
+    parser.add_argument("--windows", type=int, default=32, help="of .4 s, that a posterior is of")
     parser.add_argument("--summary", action="store_true")
     args, overrides = parser.parse_known_args()
     if not args.summary:
@@ -195,7 +195,7 @@ def main() -> None:
         for name in args.only:
             path = args.out / f"{name.replace(':', '-')}.json"
             if not path.exists():
-                path.write_text(json.dumps(one(name, logs.resolve(), overrides), indent=1))
+                path.write_text(json.dumps(one(name, logs.resolve(), args.windows, overrides), indent=1))
     summary(args.out)
 
 
