@@ -8,7 +8,8 @@
 Judged are the 90 % intervals of friction and gain: do those of two seeds overlap, and do they hold the least-squares
 refits of the same model to the logs without one gain? Then motion: the posterior and the noise of the logs without one
 gain predict windows of that gain from their measured starts. Intervals are those of replays at draws of the posterior,
-with the forces and the sensors' noise that refinement found; counted is how often 90 % of them hold what was measured.
+with the forces and the sensors' noise that refinement found, or the sensors' alone where it was not used; counted is
+how often 90 % of them hold what was measured.
 """
 
 from __future__ import annotations
@@ -61,14 +62,18 @@ def posterior(folder: Path, seed: int, count: int, overrides: list[str]) -> dict
     parts = loop.make(config, env)
     _, rounds = loop.run(parts, loop.init(parts))
     info = rounds[-1]
-    assert info.posterior is not None and info.refinement is not None
+    assert info.posterior is not None
     draws = np.asarray(info.posterior.sample(jax.random.key(seed), 4096), float)
-    noise = info.refinement.noise
+    refined, nv = info.refinement, env.mj_model.nv
+    if refined is not None and refined.used:
+        noise = refined.noise
+    else:  # what simulated trajectories are measured with
+        noise = Noise(np.append(parts.source.noise["qpos"], np.full(nv, np.inf)), np.zeros(nv))
     return {
         "names": list(info.posterior.names), "draws": draws[:DRAWS].tolist(),
         "mean": draws.mean(0).tolist(), "sd": draws.std(0).tolist(),
         "interval": np.quantile(draws, [0.5 - LEVEL / 2, 0.5 + LEVEL / 2], axis=0).T.tolist(),
-        "refined": info.refinement.sentence(), "widening": info.refinement.widening,
+        "refined": refined.sentence() if refined is not None else "not asked for",
         "noise": {"sensor": noise.sensor.tolist(), "process": noise.process.tolist(), "lasting": noise.lasting},
         "seconds": time.perf_counter() - clock, "cpu": time.process_time() - cpu,
     }  # fmt: skip
@@ -160,7 +165,7 @@ def summary(out: Path) -> None:
             f"{n} {m:.4g} ({a:.4g} to {b:.4g})"
             for n, m, (a, b) in zip(run["names"], run["mean"], run["interval"], strict=True)
         ]
-        print(f"{name}: {', '.join(cells)}; widening {run['widening']:.2f}, {run['cpu']:.0f} CPU s")
+        print(f"{name}: {', '.join(cells)}; {run['refined']}; {run['cpu']:.0f} CPU s")
     seeds, left = ({k: r for k, r in runs.items() if k.startswith(f"{kind}:")} for kind in ("all", "without"))
     for name in JUDGED:
         spans = []
