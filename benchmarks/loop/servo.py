@@ -189,6 +189,8 @@ def main() -> None:
     parser.add_argument("--windows", type=int, default=32, help="of .4 s, that a posterior is of")
     parser.add_argument("--summary", action="store_true")
     args, overrides = parser.parse_known_args()
+    overrides += [text for text in args.only if "=" in text]  # settings behind the names of runs
+    args.only = [text for text in args.only if "=" not in text]
     if not args.summary:
         sys.path.insert(0, str(ROOT / "examples"))
         from convert_xl330 import RAW, convert
