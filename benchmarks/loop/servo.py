@@ -8,8 +8,8 @@
 Judged are the 90 % intervals of friction and gain: do those of two seeds overlap, and do they hold the least-squares
 refits of the same model to the logs without one gain? Then motion: the posterior and the noise of the logs without one
 gain predict windows of that gain from their measured starts. Intervals are those of replays at draws of the posterior,
-with the forces and the sensors' noise that refinement found, or the sensors' alone where it was not used; counted is
-how often 90 % of them hold what was measured.
+with the forces and the sensors' noise that refinement found, or the sensors' alone with `bayessim.refine=off`; counted
+is how often 90 % of them hold what was measured.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def posterior(folder: Path, seed: int, count: int, overrides: list[str]) -> dict
     assert info.posterior is not None
     draws = np.asarray(info.posterior.sample(jax.random.key(seed), 4096), float)
     refined, nv = info.refinement, env.mj_model.nv
-    if refined is not None and refined.used:
+    if refined is not None:  # estimated also where its draws were too few
         noise = refined.noise
     else:  # what simulated trajectories are measured with
         noise = Noise(np.append(parts.source.noise["qpos"], np.full(nv, np.inf)), np.zeros(nv))
