@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from bayessim_mjx.distributions import Distribution
-from bayessim_mjx.inference import importance
+from bayessim_mjx.inference import importance, temperature
 from bayessim_mjx.inference.importance import Refined
 from bayessim_mjx.loop.likelihood import Likelihood, Noise
 
@@ -145,7 +145,8 @@ def _adjusted(
 ) -> tuple[Refined, float]:  # fmt: skip
     """The posterior as wide as the scores say, in no direction narrower; and the largest factor on its sd.
 
-    A posterior of one Gaussian is stretched (open-faced sandwich, Shaby 2014), one of several is tempered.
+    A posterior of one Gaussian is stretched (open-faced sandwich, Shaby 2014), one of several is tempered, or each of
+    its Gaussians stretched where moves do not reach the tempered one.
     """
     assert found.population is not None
     u = found.population.u
@@ -157,6 +158,9 @@ def _adjusted(
     if found.fitted.components > 1 or found.fitted.chart != "plain":
         power, wider = 1 / float(values.mean()), float(np.sqrt(values.mean()))
         again = importance.tempered(found, proposal, log_likelihood, power, components=components, seed=seed)
+        if again.reason:  # the draws before were the posterior's; the proposal saw no replay at all
+            wide = temperature.tempered(found.fitted, wider)
+            return replace(found, posterior=wide, fitted=wide, simulations=again.simulations), wider
         again = importance.sharpened(
             again, proposal, log_likelihood, draws=len(u), components=components, power=power, seed=seed
         )

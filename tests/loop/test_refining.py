@@ -1,15 +1,19 @@
 """`bayessim.refine` in rounds of the loop: the surrogate's truth, what is kept for a resume, what cannot be refined."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import jax
 import numpy as np
 import pytest
 
 from bayessim_mjx import config, loop
+from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.loop import inference_state, round_inference
+from bayessim_mjx.inference.importance import Refined
+from bayessim_mjx.loop import inference_state, refinement, round_inference
 from bayessim_mjx.loop.likelihood import Likelihood
+from bayessim_mjx.parameters import Parameter, ParameterSpace
 from bayessim_mjx.registry import make
 from bayessim_mjx.runs import checkpoints
 
@@ -129,3 +133,21 @@ def test_a_first_training_that_gained_nothing_is_told():
     (text,) = told(-1, True)
     assert "linear posterior" in text and "158 steps" in text and "4500 trajectories" in text
     assert told(-1, False) == told(0, True) == []
+
+
+def test_moves_that_do_not_reach_the_wider_posterior_do_not_throw_the_refined_one_away(monkeypatch):
+    """Real logs of a servo: 1000 draws were the posterior's, those of the tempered one too few after 48 moves."""
+    space = ParameterSpace([Parameter("mass", 1.0, 0.5, 2.0)])
+    two = Distribution.from_unit(
+        space, np.zeros(2), np.array([[0.3], [0.5]]), np.array([[[0.02]], [[0.02]]]), chart="plain"
+    )
+    draws = SimpleNamespace(u=np.zeros((8, 1)))
+    found = Refined(two, two, draws, 400.0, 1000, np.ones(1), None)
+    short = dataclasses.replace(found, reason="the draws are worth 90 independent ones", simulations=50_000)
+    monkeypatch.setattr(refinement.importance, "tempered", lambda *a, **k: short)
+    monkeypatch.setattr(refinement, "_spread", lambda *a: (np.array([[4.0]]), np.eye(1)))
+    likelihood = SimpleNamespace(squares=lambda thetas: thetas)
+    wide, factor = refinement._adjusted(found, Distribution.prior(space), likelihood, lambda t: t, 8, 0)
+    assert factor == pytest.approx(2.0) and wide.reason is None and wide.simulations == 50_000
+    assert np.asarray(wide.posterior.scales)[:, 0, 0] == pytest.approx(0.04)
+    assert np.asarray(wide.posterior.means) == pytest.approx(np.asarray(two.means))
