@@ -44,11 +44,11 @@ LEVEL = 0.9
 JUDGED = ("friction", "gain")
 
 
-def chosen(folder: Path, out: Path, left_out: str) -> Path:
-    """A folder with links to the logs of all conditions but one."""
-    out.mkdir(parents=True, exist_ok=True)
-    for path in folder.iterdir():
-        if not path.name.startswith(f"{left_out}_") and not (out / path.name).exists():
+def linked(logs: Path, out: Path, condition: str, own: bool) -> Path:
+    """A folder with links to the logs of a condition (own), or of all others."""
+    out.mkdir()
+    for path in logs.iterdir():
+        if path.name.startswith(f"{condition}_") == own:
             (out / path.name).symlink_to(path)
     return out
 
@@ -114,15 +114,15 @@ def covered(env: Any, data: dict[str, np.ndarray], found: dict[str, Any], seed: 
     ways, _ = transitions(env.physics, thetas.mean(0), record, close(record, nv), travel)
     sd = np.where(np.isfinite(noise.sensor), noise.sensor, 0.0)
     speed_sd = sd[nv:] if sd[nv:].any() else sd[:nv] / env.dt  # a velocity from positions
-    inside = np.zeros((len(start), steps))
     count = len(start)
+    inside = np.zeros((count, steps))
 
     def motion(theta: np.ndarray) -> np.ndarray:
         every = jnp.tile(jnp.asarray(theta, jnp.float32), (count, 1))
         return np.asarray(replay(env.physics, start, speed, command, every)["qpos"], float)[..., 0]
 
     shown = np.stack([motion(theta) for theta in thetas])
-    size = (DRAWS * EACH, len(start), nv)
+    size = (DRAWS * EACH, count, nv)
     away = np.concatenate([sd[:nv] * rng.normal(size=size), speed_sd * rng.normal(size=size)], axis=-1)
     force = noise.process * rng.normal(size=size)
     fresh = noise.process * np.sqrt(1 - noise.lasting**2)
@@ -135,7 +135,7 @@ def covered(env: Any, data: dict[str, np.ndarray], found: dict[str, Any], seed: 
         measured = data["qpos"][:, t + 1, 0]
         inside[:, t] = (measured >= low) & (measured <= high)
     at = {f"{seconds:g} s": float(inside[:, round(seconds / env.dt) - 1].mean()) for seconds in TIMES}
-    return at | {"all": float(inside.mean()), "windows": len(start)}
+    return at | {"all": float(inside.mean()), "windows": count}
 
 
 def one(name: str, logs: Path, count: int, overrides: list[str]) -> dict[str, Any]:
@@ -144,12 +144,9 @@ def one(name: str, logs: Path, count: int, overrides: list[str]) -> dict[str, An
     if kind == "all":
         return posterior(logs, int(which), count, overrides)
     with tempfile.TemporaryDirectory() as place:
-        others = chosen(logs, Path(place) / "others", which)
+        others = linked(logs, Path(place) / "others", which, own=False)
+        apart = linked(logs, Path(place) / "apart", which, own=True)
         found = posterior(others, 0, count, overrides)
-        apart = Path(place) / "apart"
-        apart.mkdir()
-        for path in logs.glob(f"{which}_*"):
-            (apart / path.name).symlink_to(path)
         env = registry.make("ServoPendulum")
         found["refit"] = refit(env, others)
         found["covered"] = covered(env, windows(env, apart), found)
