@@ -1,11 +1,7 @@
-"""The simulator's own likelihood of recorded trajectories: one-step prediction errors, with noise that is estimated.
-
-Sensor and process noise are estimated near a theta: what the simulator cannot follow counts as noise.
-"""
+"""The simulator's own likelihood of recorded trajectories: one-step prediction errors, with noise that is estimated."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
@@ -14,61 +10,18 @@ import numpy as np
 from scipy.special import gammainc, gammaln
 
 from bayessim_mjx.distributions.charts import from_chart, to_chart
-from bayessim_mjx.kalman import Force, Gains, innovations, riccati
+from bayessim_mjx.kalman import Gains
+from bayessim_mjx.loop.noise import FINEST, Linear, Noise, NoiseModel
 from bayessim_mjx.physics import Physics
 from bayessim_mjx.physics.tangent import addresses
 from bayessim_mjx.tracking import Record, close, errors, transitions
 
-FINEST = 1e-3  # of a channel's range of motion: no sensor is believed to be better
-PROCESS = (1e-3, 1e-2, 0.03, 0.1, 0.3, 1.0, 10.0)  # of unmodelled forces, in the velocity's sensor noise
-LASTING = (0.7, 0.9, 0.97)  # their correlations from step to step
-RATIOS = (0.1, 0.3, 1.0, 3.0, 10.0)  # velocity's sensor noise against position's, times what was given
 SETTLED = 0.1  # relative change of the log likelihood's unit at which noise and posterior agree
-LOOKED = 4  # trajectories at which noise is estimated
+LOOKED = 16  # trajectories at which noise is estimated
+TURNS = 6  # of noise and linear dynamics, at most, before anything is replayed
+NEAR = 0.3  # standard deviations of the posterior: a shorter step to its mean ends these turns
 SLOPE = 0.01  # step of central differences in z
 LEAP = 1.0  # longest step in z that linear dynamics are believed
-
-
-@dataclass(frozen=True)
-class Noise:
-    """What the simulator does not explain.
-
-    Attributes:
-        sensor: `[2 nv]` standard deviations, positions first; inf where nothing is measured.
-        process: `[nv]` standard deviations of the velocity that unmodelled forces give in a control step.
-        lasting: their correlation from one control step to the next.
-    """
-
-    sensor: np.ndarray
-    process: np.ndarray
-    lasting: float = 0.0
-
-
-@dataclass(frozen=True)
-class _Linear:
-    """Dynamics of n records near a theta: `ways`, `gaps`, `path` as in `kalman.innovations`.
-
-    slopes: `[d, n, T, 2 nv]` of the gaps in the probit coordinates z `[d]` of theta; valid: `[n, T]`.
-    """
-
-    ways: np.ndarray
-    gaps: np.ndarray
-    slopes: np.ndarray
-    z: np.ndarray
-    path: Gains
-    valid: np.ndarray
-
-    def whitened(self, gains: Gains, dt: float) -> tuple[np.ndarray, np.ndarray]:
-        """Prediction errors [R] of the filter with those gains, and their slopes [R, d] in z."""
-        rows = [self.gaps, *self.slopes]
-
-        def again(x: Any) -> np.ndarray:
-            return np.concatenate([np.asarray(x, float)] * len(rows))
-
-        path, gains = jax.tree.map(again, self.path), jax.tree.map(again, gains)
-        found = innovations(again(self.ways), np.concatenate(rows), path, gains, dt)
-        found = found.reshape(len(rows), *self.gaps.shape) * self.valid[:, :, None]
-        return found[0].ravel(), found[1:].reshape(len(self.slopes), -1).T
 
 
 class Likelihood:
@@ -80,13 +33,17 @@ class Likelihood:
         valid: `[N, T]` 1 while the episode ran.
         sensor: `[2 nv]` standard deviations of the measurement noise as far as known: inf where nothing is measured.
         together: trajectories in one call, so that more of them need no other program; None: all.
+        groups: `[N]` equal numbers where what differs from trajectory to trajectory is shared, as in one log; None:
+            each is alone.
     """
 
     def __init__(
-        self, physics: Physics, record: Record, valid: np.ndarray, sensor: np.ndarray, together: int | None = None
-    ) -> None:
+        self, physics: Physics, record: Record, valid: np.ndarray, sensor: np.ndarray, together: int | None = None,
+        groups: np.ndarray | None = None,
+    ) -> None:  # fmt: skip
         self.physics, self.record, self.valid = physics, record, np.asarray(valid, float)
         count = len(self.valid)
+        self.groups = np.arange(count) if groups is None else np.asarray(groups)
         each = together if together and count % together == 0 else count
         self.parts = [slice(i, i + each) for i in range(0, count, each)]
         nv = physics.mj_model.nv
@@ -94,6 +51,7 @@ class Likelihood:
         self.scale = size
         self.floor = np.where(np.isfinite(sensor), np.maximum(np.nan_to_num(sensor, posinf=0.0), FINEST * size), np.inf)
         self.seen = np.isfinite(self.floor)
+        self.model = NoiseModel(self.floor, size, physics.dt)
         self.nv = nv
         self.noise = Noise(self.floor, np.zeros(nv))
         self.gains: Gains | None = None
@@ -101,15 +59,48 @@ class Likelihood:
         self.count = float(self.valid.sum() * self.seen.sum())
 
     def settle(self, theta: np.ndarray) -> bool:
-        """Estimate the noise at theta [d]; returns whether it has changed much."""
+        """Estimate the noise near theta [d]; returns whether it has changed much.
+
+        The first time theta follows the linear dynamics to where they lead (Gauss-Newton): far from the likely thetas,
+        what these explain would count as noise.
+        """
         before = self.noise
-        path = self.gains or self._linearised(theta, close(self.record, self.nv))
-        self.gains = self._linearised(theta, path)
+        if self.gains is not None:
+            self.gains = self._linearised(theta, self.gains)
+            return self._moved(before)
+        self.gains = close(self.record, self.nv)
+        for turn in range(TURNS):
+            last = self.noise
+            self.gains = self._linearised(theta, self.gains)
+            if turn == 0:  # along the measurements themselves
+                continue
+            near = self._next(theta)
+            if near is None or (near[1] < NEAR and not self._moved(last)):
+                break
+            theta = near[0]
+        return self._moved(before)
+
+    def _next(self, theta: np.ndarray) -> tuple[np.ndarray, float] | None:
+        """The posterior's mean [d] by linear dynamics around theta, and how many of its sd that is away."""
+        if self.laplace is None:
+            return None
+        mean, covariance = self.laplace
+        step = mean - self._z(theta)
+        away = float(np.sqrt(step @ np.linalg.solve(covariance, step) / len(step)))
+        return self._theta(mean), away
+
+    def _moved(self, before: Noise) -> bool:
         noise, seen = self.noise, self.seen
         moved = np.abs(np.log(noise.sensor[seen] / before.sensor[seen])).max()
         most = max(before.process.max(), noise.process.max(), 1e-30)
         drift = np.abs(noise.process - before.process).max() / most + abs(noise.lasting - before.lasting)
         return bool(moved > SETTLED or drift > SETTLED)
+
+    def _z(self, theta: np.ndarray) -> np.ndarray:
+        return np.asarray(to_chart(self.physics.space.to_unit(jnp.asarray(theta, jnp.float32)), "probit"), float)
+
+    def _theta(self, z: np.ndarray) -> np.ndarray:
+        return np.asarray(self.physics.space.from_unit(from_chart(jnp.asarray(z, jnp.float32), "probit")))
 
     def _linearised(self, theta: np.ndarray, path: Gains) -> Gains:
         """Gains, and the noise behind them, from the dynamics along the filter's path with those gains.
@@ -119,59 +110,24 @@ class Likelihood:
         """
         ways, gaps = self._dynamics(theta, path, self.parts)
         linear = self._linear(theta, path, ways, gaps)
-        self.noise = self._noise(linear)
+        self.noise = self.model.likely(linear, self.noise)
         self.laplace = self._posterior(linear)
-        gains = self._gains(ways, self.noise)
+        gains = self.model.gains(ways, self.noise)
         mask = jnp.asarray(self.valid, jnp.float32)[:, :, None, None]
         return gains.replace(gain=gains.gain * mask, whitener=gains.whitener * mask)
 
-    def _linear(self, theta: np.ndarray, path: Gains, ways: np.ndarray, gaps: np.ndarray) -> _Linear:
+    def _linear(self, theta: np.ndarray, path: Gains, ways: np.ndarray, gaps: np.ndarray) -> Linear:
         few, each = min(LOOKED, len(self.valid)), self.parts[0].stop
         parts = self.parts[: -(-few // each)]
-        space = self.physics.space
-        z = to_chart(space.to_unit(jnp.asarray(theta, jnp.float32)), "probit")
+        z = self._z(theta)
 
-        def moved(k: int, by: float) -> np.ndarray:
-            at = space.from_unit(from_chart(z.at[k].add(by), "probit"))
-            return self._dynamics(np.asarray(at), path, parts)[1][:few]
+        def moved(step: np.ndarray) -> np.ndarray:
+            return self._dynamics(self._theta(z + step), path, parts)[1][:few]
 
-        slopes = np.stack([(moved(k, SLOPE) - moved(k, -SLOPE)) / (2 * SLOPE) for k in range(len(z))])
+        steps = SLOPE * np.eye(len(z))
+        slopes = np.stack([(moved(step) - moved(-step)) / (2 * SLOPE) for step in steps])
         rows = slice(0, few)
-        return _Linear(ways[rows], gaps[rows], slopes, np.asarray(z, float), _rows(path, rows), self.valid[rows])
-
-    def _noise(self, linear: _Linear) -> Noise:
-        """The most likely noise, each number that is not needed left out (BIC): first what acts, then the sensors."""
-        paid = 0.5 * np.log(linear.valid.sum() * self.seen.sum())
-        unit = np.where(self.seen, self.floor, FINEST * self.scale)[self.nv :]
-        still = np.zeros(self.nv)
-        acting = [(0.0, still, 0.0), *((1.0, q * unit, 0.0) for q in PROCESS)]
-        acting += [(2.0, q * unit, lasting) for q in PROCESS for lasting in LASTING]
-        best, noise = -np.inf, self.noise
-
-        def tried(ratio: float, cost: float, force: np.ndarray, lasting: float) -> None:
-            nonlocal best, noise
-            sensor = self.floor * np.concatenate([np.ones(self.nv), np.full(self.nv, ratio)])
-            guess = Noise(sensor, force, lasting)
-            value, size = self._fit(linear, guess)
-            value -= paid * (cost + (ratio != 1.0))
-            if value > best:
-                best, noise = value, replace(guess, sensor=sensor * size, process=force * size)
-
-        for cost, force, lasting in acting:
-            tried(1.0, cost, force, lasting)
-        size = float(np.median(noise.sensor[self.seen] / self.floor[self.seen]))
-        cost = float(noise.process.any()) + float(noise.lasting > 0)
-        for ratio in RATIOS:
-            tried(ratio, cost, noise.process / size, noise.lasting)
-        return noise
-
-    def _gains(self, ways: np.ndarray, noise: Noise) -> Gains:
-        nothing = np.zeros(2 * self.nv)
-        if noise.lasting:
-            force = Force(noise.process, noise.lasting, self.physics.dt)
-            return riccati(ways, noise.sensor, nothing, self._start(noise), force)
-        white = np.concatenate([nothing[self.nv :], noise.process])
-        return riccati(ways, noise.sensor, white, self._start(noise))
+        return Linear(ways[rows], gaps[rows], slopes, z, _rows(path, rows), self.valid[rows])
 
     def _dynamics(self, theta: np.ndarray, path: Gains, parts: list[slice]) -> tuple[np.ndarray, np.ndarray]:
         found = [
@@ -179,47 +135,29 @@ class Likelihood:
         ]
         return np.concatenate([ways for ways, _ in found]), np.concatenate([gaps for _, gaps in found])
 
-    def _start(self, noise: Noise) -> np.ndarray:
-        """Standard deviations of the start state: as measured, or anything where it is not."""
-        return np.where(self.seen, noise.sensor, 0.3 * self.scale)
-
-    def _posterior(self, linear: _Linear) -> tuple[np.ndarray, np.ndarray] | None:
+    def _posterior(self, linear: Linear) -> tuple[np.ndarray, np.ndarray] | None:
         """Mean [d] and covariance [d, d] of z by the linear dynamics of the first trajectories, all they tell.
 
         A step of Gauss-Newton, at most LEAP in any direction: farther away the dynamics are others.
         """
-        error, slope = linear.whitened(self._gains(linear.ways, self.noise), self.physics.dt)
+        error, slope = linear.whitened(self.model.gains(linear.ways, self.noise), self.physics.dt)
         if not (np.isfinite(error).all() and np.isfinite(slope).all()):
             return None
         precision = slope.T @ slope + np.eye(len(linear.z))
         step = -np.linalg.solve(precision, slope.T @ error + linear.z)
         return linear.z + step * min(1.0, LEAP / max(np.abs(step).max(), 1e-30)), np.linalg.inv(precision)
 
-    def _fit(self, linear: _Linear, noise: Noise) -> tuple[float, float]:
-        """(log evidence at the best common factor on the noise, that factor), by linear dynamics.
-
-        Theta is integrated out near where it was: at one theta, what a better one explains would count as noise.
-        """
-        gains = self._gains(linear.ways, noise)
-        error, slope = linear.whitened(gains, self.physics.dt)
-        if not (np.isfinite(error).all() and np.isfinite(slope).all()):
-            return -np.inf, 1.0
-        count, factor = linear.valid.sum() * self.seen.sum(), 1.0
-        for _ in range(2):
-            precision = slope.T @ slope / factor + np.eye(len(linear.z))
-            step = -np.linalg.solve(precision, slope.T @ error / factor + linear.z)
-            squares = float(np.sum((error + slope @ step) ** 2))
-            factor = max(squares / count, 1.0)  # not below the floor
-        sizes = float(np.sum(np.asarray(gains.log_size, float) * linear.valid))
-        value = sizes - 0.5 * count * np.log(factor) - 0.5 * squares / factor
-        value -= 0.5 * float(np.sum((linear.z + step) ** 2)) + 0.5 * float(np.linalg.slogdet(precision)[1])
-        return value, float(np.sqrt(factor))
-
     def squares(self, thetas: np.ndarray) -> np.ndarray:
         """Sums of squared whitened prediction errors [M, N, blocks] at thetas [M, d]."""
         assert self.gains is not None, "settle first"
         each = [errors(self.physics, thetas, _rows(self.record, part), _rows(self.gains, part)) for part in self.parts]
         return np.concatenate([np.asarray(x, np.float64) for x in each], axis=1)
+
+    @property
+    def size(self) -> float:
+        """Log of the density of prediction errors of 0 under this noise, but for a constant: its share of evidence."""
+        assert self.gains is not None, "settle first"
+        return float(np.sum(np.asarray(self.gains.log_size, float) * self.valid))
 
     @property
     def least(self) -> float:
@@ -262,4 +200,4 @@ def _rows(tree: Any, rows: slice) -> Any:
     return jax.tree.map(lambda x: x[rows], tree)
 
 
-__all__ = ["Likelihood", "Noise"]
+__all__ = ["Likelihood"]

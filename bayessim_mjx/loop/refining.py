@@ -39,8 +39,7 @@ def refined(
     """The state with this round's motion, and the posterior of all trajectories so far; what was found in `info`."""
     clock, b, round_ = time.perf_counter(), loop.settings, int(state.round)
     state = _stored(loop, state, real)
-    record, valid, sensor = _record(loop, state, (round_ + 1) * b.realTrajs)
-    likelihood = Likelihood(loop.env.physics, record, valid, sensor, together=b.realTrajs)  # type: ignore[attr-defined]
+    likelihood = _likelihood(loop, state, (round_ + 1) * b.realTrajs)
     seed = int(jax.random.randint(branch(loop.key(round_, "fit"), 3), (), 0, 2**31 - 1))
     found = refine(proposal, likelihood, seed=seed, draws=DRAWS, components=b.components)
     info.refinement = found
@@ -79,20 +78,23 @@ def _stored(loop: Loop, state: LoopState, real: Trajectory) -> LoopState:
     return dataclasses.replace(state, motion=kept)
 
 
-def _record(loop: Loop, state: LoopState, known: int) -> tuple[Record, np.ndarray, np.ndarray]:
-    """(record, valid [N, T], sensor noise [2 nv]) of the first `known` real trajectories."""
-    model, source = loop.env.physics.mj_model, loop.source  # type: ignore[attr-defined]
+def _likelihood(loop: Loop, state: LoopState, known: int) -> Likelihood:
+    """Of the first `known` real trajectories; windows of one log are grouped."""
+    physics, source = loop.env.physics, loop.source  # type: ignore[attr-defined]
+    model, each = physics.mj_model, loop.settings.realTrajs
     if isinstance(source, Recorded):
         index = source.order[np.arange(known) % len(source.order)]
         record = source.records(index)
         speeds = np.asarray(source.noise["qvel"]) if source.with_qvel else np.full(model.nv, np.inf)
         sensor = np.concatenate([in_tangent(model, np.asarray(source.noise["qpos"])), speeds])
-        return record, np.ones(record.command.shape[:2]), sensor
+        valid = np.ones(record.command.shape[:2])
+        return Likelihood(physics, record, valid, sensor, each, groups=source.data["run"][index])
     motion = state.motion
     assert motion is not None
     rows = {name: value[:known] for name, value in motion.items()}
     record = Record(rows["qpos"], rows["qvel"], rows["command"])
-    return record, np.asarray(rows["valid"]), np.full(2 * model.nv, source.noise, float)  # type: ignore[union-attr]
+    sensor = np.full(2 * model.nv, source.noise, float)  # type: ignore[union-attr]
+    return Likelihood(physics, record, np.asarray(rows["valid"]), sensor, each)
 
 
 __all__ = ["no_motion", "refined", "scores"]

@@ -47,8 +47,19 @@ HIDDEN = {
         ],
         "calibrated": [MASS | {"name": "torso_mass_mult", "target": "torso"}],
     },
+    "Anymal": {
+        "effects": [
+            {"effect": "actuator_delay", "where": "all", "parameters": {"delay": {"nominal": 0.01}}},
+            {"effect": "actuator_gain", "where": "all", "parameters": {"gain": {"nominal": 0.6}}},
+            {
+                "effect": "coulomb_friction", "where": "all",
+                "parameters": {"level": {"nominal": 4.0, "range": [0, 8]}},
+            },
+        ],
+        "calibrated": [MASS | {"name": "base_mass_mult", "target": "base"}],
+    },
 }  # fmt: skip
-STEP = {"Cartpole": 1 / 960, "Ant": 0.0025}  # s, of the surrogate's simulation: an eighth and a fourth of the task's
+STEP = {"Cartpole": 1 / 960, "Ant": 0.0025, "Anymal": 0.00125}  # s, of the surrogate's simulation: an eighth, fourths
 RUNS, SECONDS, LEAST = 48, 4.0, 0.6  # logs, their length, and the shortest that is kept, s
 GOES_ON = ("Cartpole",)  # moves on when an episode is over; the model of an ant on its back falls through the floor
 SENSORS = 1e-3  # rad or m, and ten times as much per second

@@ -31,7 +31,7 @@ from bayessim_mjx import loop, registry
 from bayessim_mjx.config import load
 from bayessim_mjx.kalman import push
 from bayessim_mjx.logs import read_logs, segments
-from bayessim_mjx.loop.likelihood import Noise
+from bayessim_mjx.loop.noise import Noise
 from bayessim_mjx.rollout import replay
 from bayessim_mjx.tracking import Record, close, transitions
 
