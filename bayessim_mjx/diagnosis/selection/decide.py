@@ -14,7 +14,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -165,9 +165,13 @@ def admissible(row: Row, criteria: Criteria) -> bool:
 
 
 def value(table: Table, key: Key, criteria: Criteria) -> float:
-    """Nats of log predictive density over the known parameters alone, less the price of the model's effects."""
-    row = table.rows[key]
-    gain = float(log_gain(table.rows[BASE], row, table.noise).sum())
+    """Nats of log predictive density over the known parameters alone, less the price of the model's effects.
+
+    All models have as many independent residuals as the one of least error: by counts of their own, of two that close a
+    large gap the worse may lead.
+    """
+    least = min(table.rows.values(), key=lambda r: r.total)
+    gain = float(log_gain(table.rows[BASE], replace(table.rows[key], samples=least.samples), table.noise).sum())
     return gain - len(key) * (criteria.nats + float(np.log(max(len(table.laws), 2))))
 
 

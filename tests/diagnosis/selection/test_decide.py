@@ -1,5 +1,7 @@
 """What is named and what is told beside it, from a table of scores alone."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -39,8 +41,17 @@ def test_the_best_is_named_where_it_is_better_by_evidence_and_closes_enough():
 def test_a_further_effect_has_to_close_enough_of_what_the_others_leave():
     assert named({(): 100, (A,): 50, (A, B): 44}) == labels(A)
     assert named({(): 100, (A,): 50, (A, B): 30}) == labels(A, B)
-    assert named({(): 1e4, (A,): 20, (A, B): 2}) == labels(A)  # .2 % of the whole gap
-    assert named({(): 1e4, (A,): 60, (A, B): 2}) == labels(A, B)
+    assert named({(): 1e5, (A,): 42, (A, B): 2}) == labels(A)  # .04 % of the whole gap
+    assert named({(): 1e5, (A,): 62, (A, B): 2}) == labels(A, B)
+
+
+def test_of_two_that_close_a_large_gap_the_better_leads_though_its_residuals_are_fewer():
+    """B predicts each window better, so it leads; counts of independent residuals are no evidence between models."""
+    known = table({(): 1e4, (A,): 90, (A, B): 40}, samples=1000)
+    both = frozenset(labels(A, B))
+    known.rows[both] = dataclasses.replace(known.rows[both], samples=700)
+    found = decide(known, order(known.laws), Criteria())
+    assert found.best == found.answer == both
 
 
 def test_a_set_needs_no_member_that_shows_alone():
