@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.scipy.special import log_ndtr, ndtr, ndtri
+from scipy import special
 
 from bayessim_mjx.linalg import product, solve_lower
 
@@ -76,6 +77,20 @@ def separate(mean: Array, scale: Array, w: Array) -> tuple[Array, Array]:
     start = jnp.zeros((n, d), jnp.float32), jnp.zeros((n,), jnp.float32)
     (z, log_weight), _ = jax.lax.scan(coordinate, start, jnp.arange(d))
     return jnp.clip(mean[None, :] + product(z, scale.T), 0.0, 1.0), log_weight
+
+
+def within(mean: np.ndarray, scale: np.ndarray, points: int = 4096) -> tuple[np.ndarray, np.ndarray]:
+    """`separate` on a lattice, in float64 on the host: points [n, d] in the cube and weights [n] that sum to 1."""
+    d = len(mean)
+    w, z, log_weight = lattice(points, d).astype(np.float64), np.zeros((points, d)), np.zeros(points)
+    for i in range(d):
+        centre = mean[i] + z @ scale[i]
+        low, high = (special.ndtr((wall - centre) / scale[i, i]) for wall in (0.0, 1.0))
+        mass = np.maximum(high - low, 1e-300)
+        log_weight += np.log(mass)
+        z[:, i] = special.ndtri(np.clip(low + w[:, i] * mass, 1e-300, 1 - 1e-16))
+    weights = np.exp(log_weight - log_weight.max())
+    return np.clip(mean + z @ scale.T, 0.0, 1.0), weights / weights.sum()
 
 
 def log_masses(means: Array, scales: Array, points: int = MASS_POINTS) -> Array:

@@ -154,7 +154,7 @@ def sharpened(
     z = np.asarray(to_chart(jnp.asarray(u), chart), np.float64)
     q = fitted(rng, z, weights, components)
     if chart == "plain":
-        q = uncut(rng, q, z[rng.choice(len(z), len(z), p=weights)])
+        q = uncut(q, z[rng.choice(len(z), len(z), p=weights)], worth(drawn))
     fit = Distribution.from_unit(space, np.log(q.weights), q.means, np.linalg.cholesky(q.covariances), chart=chart)
     simulations = found.simulations + len(u)
     return replace(found, posterior=fit, fitted=fit, effective=worth(drawn), simulations=simulations)
@@ -189,7 +189,7 @@ def _answer(
     draws = np.asarray(to_chart(jnp.asarray(at.islands), chart), np.float64)
     q = fitted_to_islands(rng, draws, components)
     if chart == "plain":
-        q = uncut(rng, q, draws.reshape(-1, draws.shape[-1]))
+        q = uncut(q, draws.reshape(-1, draws.shape[-1]), max(at.worth, 1.0))
     scales = np.linalg.cholesky(q.covariances)
     fit = Distribution.from_unit(proposal.space, np.log(q.weights), q.means, scales, chart=chart)
     simulations, missing = before + at.simulations, at.missing(enough, power)

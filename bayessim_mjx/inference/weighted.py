@@ -8,9 +8,12 @@ import numpy as np
 from scipy.linalg import eigh
 from scipy.special import logsumexp
 
+from bayessim_mjx.distributions import box
 from bayessim_mjx.inference.pareto import effective
 
 DRAWS = 4096  # at most, that are fitted to
+FLAT = 1.5  # sd, in the width of the cube: over it the density falls by 5 %
+SURE = 3.0  # standard errors, beyond which draws are not uniform by chance
 STRIDE = 1.5  # power of a ratio of variances: what is cut off changes by less than its Gaussian
 
 
@@ -71,26 +74,54 @@ def _count(rng: np.random.Generator, halves: list[tuple[np.ndarray, np.ndarray]]
     return best
 
 
-def uncut(rng: np.random.Generator, q: Mixture, draws: np.ndarray, steps: int = 20) -> Mixture:
-    """Gaussians that have the draws' [N, d] moments once they are cut off at the unit cube (Lee and Scott 2012).
+def uncut(q: Mixture, draws: np.ndarray, worth: float, steps: int = 20) -> Mixture:
+    """Gaussians that have the draws' moments once they are cut off at the unit cube (Lee and Scott 2012).
 
-    Of a parameter of which nothing is known, draws fill the range and so must the Gaussian, cut off at both ends.
+    Of a parameter of which nothing is known, draws fill the range and so must the Gaussian: one whose draws cannot be
+    told from uniform ones that vary alone is FLAT wide. By its moments alone the chance of the draws would make it
+    narrower, in every such direction.
+
+    Args:
+        draws: `[N, d]`; worth: how many independent ones they are worth.
     """
     each = q.each(draws)
     share = np.exp(each - logsumexp(each, axis=1, keepdims=True))
-    normal = rng.standard_normal((1024 * draws.shape[1], draws.shape[1]))
     means, covariances = q.means.copy(), q.covariances.copy()
-    for k, weight in enumerate((share / np.maximum(share.sum(0), 1e-9)).T):
+    for k, part in enumerate(share.T):
+        weight = part / np.maximum(part.sum(), 1e-9)
         mean = weight @ draws
         wanted = (draws - mean).T @ ((draws - mean) * weight[:, None])
-        for _ in range(steps):
-            x = means[k] + normal @ np.linalg.cholesky(covariances[k]).T
-            x = x[np.all((x >= 0) & (x <= 1), axis=1)]
-            if not 20 * draws.shape[1] < len(x) < 0.98 * len(normal):
-                break
-            means[k] = np.clip(means[k] + mean - x.mean(0), -1, 2)
-            covariances[k] = _towards(covariances[k], wanted, np.cov(x.T, ddof=0).reshape(wanted.shape))
+        flat = _flat(mean, wanted, worth * part.mean())
+        own = np.flatnonzero(~flat)
+        means[k][flat], covariances[k] = 0.5, np.diag(np.where(flat, FLAT**2, 0.0))
+        block = np.ix_(own, own)
+        means[k][own], covariances[k][block] = _matched(
+            q.means[k][own], q.covariances[k][block], mean[own], wanted[block], steps
+        )
     return Mixture(q.weights, means, covariances)
+
+
+def _flat(mean: np.ndarray, covariance: np.ndarray, count: float) -> np.ndarray:
+    """[d] whether `count` draws of the cube with these moments may be uniform in a direction and vary there alone."""
+    variance = np.diag(covariance)
+    middle = np.abs(mean - 0.5) < SURE * np.sqrt(1 / 12 / count)
+    wide = np.abs(12 * variance - 1) < SURE * np.sqrt(0.8 / count)  # of a uniform distribution's fourth moment
+    together = np.abs(covariance) / np.sqrt(np.maximum(np.outer(variance, variance), 1e-300)) - np.eye(len(mean))
+    return middle & wide & (together.max(axis=1, initial=0.0) < SURE / np.sqrt(count))
+
+
+def _matched(
+    mean: np.ndarray, covariance: np.ndarray, to: np.ndarray, wanted: np.ndarray, steps: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """(mean [d], covariance [d, d]) that are `to` and `wanted` once cut off, as near as so many steps come."""
+    for _ in range(steps if len(mean) else 0):
+        x, weights = box.within(mean, np.linalg.cholesky(covariance))
+        at = weights @ x
+        mean = np.clip(mean + to - at, -1, 2)
+        covariance = _towards(covariance, wanted, (x - at).T @ ((x - at) * weights[:, None]))
+        narrower = np.minimum(FLAT / np.sqrt(np.diag(covariance)), 1.0)  # as good as flat
+        covariance = covariance * np.outer(narrower, narrower)
+    return mean, covariance
 
 
 def _towards(covariance: np.ndarray, wanted: np.ndarray, cut: np.ndarray) -> np.ndarray:
