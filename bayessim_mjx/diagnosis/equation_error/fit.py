@@ -103,13 +103,7 @@ def _spans(terms: Sequence[Term]) -> list[slice]:
 def used(sums: Sums) -> NDArray[np.bool_]:
     """`[nv]`: joints whose effort is known and that moved."""
     known = np.array([s != "" for s in sums.source])
-    return known & (sums.rows.sum(0) > BUDGET.least) & (size_of(sums) > 0)
-
-
-def size_of(sums: Sums) -> Array:
-    """`[nv]`, root mean square of the effort, measured or needed; where nothing drives a joint, of what acts on it."""
-    lay = sums.layout
-    return np.sqrt(np.max([sums.power(c) for c in (lay.effort, lay.known, lay.own("load"))], axis=0))
+    return known & (sums.rows.sum(0) > BUDGET.least) & (sums.size > 0)
 
 
 def left(sums: Sums, gram: Array, model: Array) -> Array:
@@ -128,7 +122,7 @@ def fit(sums: Sums, terms: Sequence[Term], without: int | None = None, start: Ar
     gram = sums.whole - (0 if without is None else sums.gram[without])
     rows = np.maximum(sums.rows.sum(0) - (0 if without is None else sums.rows[without]), 1e-9)
     on, lay = used(sums), sums.layout
-    floor = (RULES.floor * np.maximum(size_of(sums), 1e-12)) ** 2
+    floor = (RULES.floor * np.maximum(sums.size, 1e-12)) ** 2
     spans, size = _spans(terms), sum(t.count for t in terms)
     values = np.concatenate([np.full(t.count, np.nan if t.scaled is None else 1.0) for t in terms] or [np.zeros(0)])
     nominal = np.zeros((lay.nv, lay.size))
@@ -208,7 +202,7 @@ def contribution(sums: Sums, found: Fit, term: Term) -> Array:
     nominal[:, sums.layout.known] = 1.0
     away = found.model - _model(found.terms, _spans(found.terms), values, nominal)
     power = np.sum(away * times(sums.whole, away), -1) / np.maximum(sums.rows.sum(0), 1e-9)
-    return np.where(used(sums), np.sqrt(np.maximum(power, 0.0)) / np.maximum(size_of(sums), 1e-300), 0.0)
+    return np.where(used(sums), np.sqrt(np.maximum(power, 0.0)) / np.maximum(sums.size, 1e-300), 0.0)
 
 
 def score(sums: Sums, terms: Sequence[Term], start: Array | None = None) -> Array:

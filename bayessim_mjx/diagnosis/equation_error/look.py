@@ -168,7 +168,7 @@ def _searched(sums: Sums, known: Sequence[Term], offered: Sequence[Term], stated
 
 def _joints(model: mujoco.MjModel, sums: Sums, known: Sequence[Term], found: Found) -> tuple[Joint, ...]:
     lay, on = sums.layout, fitting.used(sums)
-    size = fitting.size_of(sums)
+    size = sums.size
     whole, rows = sums.whole, np.maximum(sums.rows.sum(0), 1e-9)
     parts = [
         np.sqrt(fitting.left(sums, whole, m) / rows) / np.maximum(size, 1e-300)
@@ -202,7 +202,7 @@ def _nominal(sums: Sums, known: Sequence[Term]) -> Fit:
 def _explained(sums: Sums, known: Sequence[Term], found: Found) -> float:
     """Share that is explained of the squared effort that the model leaves, each joint in units of its own effort."""
     first = _nominal(sums, known)
-    size, on = fitting.size_of(sums), fitting.used(sums)
+    size, on = sums.size, fitting.used(sums)
     rows = np.maximum(sums.rows.sum(0), 1e-9)
     before, after = (
         float(np.sum((fitting.left(sums, sums.whole, f.model) / rows / size**2)[on])) for f in (first, found.fit)

@@ -168,7 +168,7 @@ def _everywhere(gains: Array) -> bool:
 
 def _matters(sums: Sums, after: Fit, term: Term) -> bool:
     """Whether an effect is worth telling, and more than noise of the motion makes of the known parameters."""
-    left = np.sqrt(after.variance) / np.maximum(fitting.size_of(sums), 1e-300)
+    left = np.sqrt(after.variance) / np.maximum(sums.size, 1e-300)
     limit = np.maximum(CRITERIA.least, CRITERIA.above * left)
     return bool(np.any(fitting.contribution(sums, after, term) > limit))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import mujoco
 import numpy as np
@@ -44,7 +45,7 @@ class Sums:
     source: tuple[str, ...]
     period: float
 
-    @property
+    @cached_property
     def whole(self) -> Array:
         """`[nv, P, P]` of all parts."""
         return np.asarray(self.gram.sum(0))
@@ -52,6 +53,12 @@ class Sums:
     def power(self, column: int) -> Array:
         """`[nv]`, mean square of a column."""
         return np.asarray(self.whole[:, column, column] / np.maximum(self.rows.sum(0), 1e-9))
+
+    @cached_property
+    def size(self) -> Array:
+        """`[nv]`, rms of the effort, measured or needed; where nothing drives a joint, of what acts on it."""
+        lay = self.layout
+        return np.sqrt(np.max([self.power(c) for c in (lay.effort, lay.known, lay.own("load"))], axis=0))
 
 
 def gather(logs: Sequence[Log], model: mujoco.MjModel) -> Sums:
