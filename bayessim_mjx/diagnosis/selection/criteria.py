@@ -30,7 +30,7 @@ class Criteria:
             effects .15 to .5 name the same, .1 one less.
         least: and of the whole gap, that further effects have to close: laws are not exact, and what a named one leaves
             grows with it. Of 0 to .003 all name the same on 652 recorded tables, whose gaps are below 100 noise sd; of
-            248 noise sd .003 is an error of 14, which hid a command delay of 30 ms behind a friction.
+            248 noise sd .003 is an error of 14, which hid a command delay of 30 ms behind a friction. 1e-4 is 1 % in rms.
         floor: a model within this factor of the noise (rms) is not improved further.
         far: standard deviations by which an amplitude of a named effect is away from neutral. With 2 one of 24 single
             effects of recorded tables is told only as a rival.
@@ -45,7 +45,7 @@ class Criteria:
     rare: float = 5.0
     harm: float = 0.1
     same: float = 0.15
-    least: float = 0.0005
+    least: float = 0.0001
     floor: float = 1.3
     far: float = 1.0
     beam: int = 3
