@@ -9,16 +9,16 @@ from bayessim_mjx.diagnosis.residual.origin import origin
 STEPS, WINDOWS, DT = 40, 40, 0.0125
 
 
-def columns():
+def columns(steps=STEPS):
     """(start columns, force columns) of a mass of which the position is measured, in noise sd."""
-    t = np.arange(STEPS) * DT
-    push = np.tril(np.subtract.outer(np.arange(STEPS), np.arange(STEPS)), -1) * DT**2  # position per unit of force
+    t = np.arange(steps) * DT
+    push = np.tril(np.subtract.outer(np.arange(steps), np.arange(steps)), -1) * DT**2  # position per unit of force
     tile = lambda a: np.repeat(a[None], WINDOWS, 0)  # noqa: E731
-    return tile(np.stack([np.ones(STEPS), t], 1)), tile(push / DT**2 / 50)
+    return tile(np.stack([np.ones(steps), t], 1)), tile(push / DT**2 / 50)
 
 
-def coloured(rng, memory):
-    white = rng.normal(size=(WINDOWS, STEPS + 100))
+def coloured(rng, memory, steps=STEPS):
+    white = rng.normal(size=(WINDOWS, steps + 100))
     return lfilter([np.sqrt(1 - memory**2)], [1, -memory], white, axis=1)[:, 100:]
 
 
@@ -39,6 +39,18 @@ def test_forces(memory):
     r = rng.normal(size=(WINDOWS, STEPS)) + 4 * moved / np.sqrt(np.mean(moved**2))
     found = origin(r, B, D, np.ones(1), 1, np.ones(WINDOWS))
     assert not found.of_sensors
+
+
+def test_windows_of_many_rows_are_told_from_some_of_them():
+    """240 rows a window, of which 80 are looked at."""
+    steps = 240
+    rng, (B, D) = np.random.default_rng(3), columns(steps)
+    white = rng.normal(size=(WINDOWS, steps))
+    moved = np.einsum("wnd,wd->wn", D, coloured(rng, 0.95, steps))
+    noisy = origin(white + 3 * coloured(rng, 0.95, steps), B, D, np.ones(1), 1, np.ones(WINDOWS))
+    assert noisy.of_sensors and noisy.memory > 0
+    pushed = origin(white + 4 * moved / np.sqrt(np.mean(moved**2)), B, D, np.ones(1), 1, np.ones(WINDOWS))
+    assert not pushed.of_sensors
 
 
 def test_a_force_on_a_heavy_mass_beside_a_light_one_that_would_move_a_hundred_times_as_far():
