@@ -5,11 +5,11 @@
     python benchmarks/loop/servo.py --out DIR --summary        # the tables of what is there
 
 16 logs of a Dynamixel XL330 with a pendulum (`examples/adapt_servo.py`), four each at the gains 100, 200, 400 and 800.
-Judged are the 90 % intervals of friction and gain: do those of two seeds overlap, and do they hold the least-squares
-refits of the same model to the logs without one gain? Then motion: the posterior and the noise of the logs without one
-gain predict windows of that gain from their measured starts. Intervals are those of replays at draws of the posterior,
-with the forces and the sensors' noise that refinement found, or the sensors' alone with `bayessim.refine=off`; counted
-is how often 90 % of them hold what was measured.
+Judged are the 90 % intervals of friction and gain: do those of two seeds overlap, and do they hold what the logs
+without one gain give, by least squares of free replays and as means of their own posteriors? Then motion: the posterior
+and the noise of the logs without one gain predict windows of that gain from their measured starts. Intervals are those
+of replays at draws of the posterior, with the forces and the sensors' noise that refinement found, or the sensors'
+alone with `bayessim.refine=off`; counted is how often 90 % of them hold what was measured.
 """
 
 from __future__ import annotations
@@ -170,9 +170,10 @@ def summary(out: Path) -> None:
             place = next(i for i, n in enumerate(run["names"]) if n.endswith(name))
             low, high = run["interval"][place]
             spans.append((low, high))
-            refits = [r["refit"][place] for r in left.values()]
-            held = sum(low <= x <= high for x in refits)
-            print(f"{name}, {key}: holds {held} of {len(refits)} refits: {[round(x, 4) for x in refits]}")
+            for kind, each in (("refits", "refit"), ("means of the posteriors", "mean")):
+                found = [r[each][place] for r in left.values()]
+                held = sum(low <= x <= high for x in found)
+                print(f"{name}, {key}: holds {held} of {len(found)} {kind}: {[round(x, 4) for x in found]}")
         if len(spans) > 1:
             print(f"{name}: intervals of seeds overlap: {max(a for a, _ in spans) <= min(b for _, b in spans)}")
     for key, run in left.items():
