@@ -4,11 +4,12 @@
 
 A deterministic evaluation of 128 episodes is made every --every updates; the task is solved at the first one whose mean
 return reaches the line. Compilation and evaluations are counted apart from the seconds of training. A row of JSON for
-each task and seed; the seeds of a task share its programs.
+each task and seed; the seeds of a task share its programs. Settings (`ppo.entropy_coef=.003`) may stand anywhere.
 """
 
 import argparse
 import json
+import sys
 import time
 from dataclasses import replace
 from typing import Any
@@ -81,10 +82,10 @@ def main() -> None:
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
     parser.add_argument("--every", type=int, default=10, help="updates between evaluations")
     parser.add_argument("--seconds", type=float, default=1e9, help="most seconds of a seed")
-    parser.add_argument("overrides", nargs="*")
-    args = parser.parse_args()
+    overrides = [word for word in sys.argv[1:] if "=" in word and not word.startswith("-")]  # key=value, anywhere
+    args = parser.parse_args([word for word in sys.argv[1:] if word not in overrides])
     for task in args.tasks:
-        race = Race(task, args.every, args.overrides)
+        race = Race(task, args.every, overrides)
         for seed in args.seeds:
             told = race.run(seed, args.seconds)
             print(json.dumps({"task": task, "device": jax.devices()[0].device_kind} | told), flush=True)
