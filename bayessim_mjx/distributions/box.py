@@ -80,7 +80,10 @@ def separate(mean: Array, scale: Array, w: Array) -> tuple[Array, Array]:
 
 
 def within(mean: np.ndarray, scale: np.ndarray, points: int = 4096) -> tuple[np.ndarray, np.ndarray]:
-    """`separate` on a lattice, in float64 on the host: points [n, d] in the cube and weights [n] that sum to 1."""
+    """`separate` on a lattice, for many d in turn: points [n, d] in the cube and weights [n] that sum to 1.
+
+    In float64 on the host, where no program is compiled for every d.
+    """
     d = len(mean)
     w, z, log_weight = lattice(points, d).astype(np.float64), np.zeros((points, d)), np.zeros(points)
     for i in range(d):

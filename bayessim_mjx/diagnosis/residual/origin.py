@@ -84,9 +84,10 @@ def origin(
     steps = r.shape[1] // channels
     shape = (len(r), steps, channels)
     even, clock = _white(r.reshape(shape), (np.zeros_like(r) if rate is None else rate).reshape(shape))
-    r, B, D, clock = _thinned(shape, r, B, D, clock.reshape(r.shape))
-    steps = r.shape[1] // channels
-    clock, own = clock.reshape(-1, steps, channels), _some(weight, r.shape[1])
+    kept = np.arange(0, steps, -(-steps // RULES.steps))  # noise of a row is as large there
+    rows = (kept[:, None] * channels + np.arange(channels)).ravel()
+    r, B, D, clock, steps = r[:, rows], B[:, rows], D[:, rows], clock[:, kept], len(kept)
+    own = _some(weight, r.shape[1])
     size = np.sqrt(np.mean(r[own] ** 2, 0).reshape(steps, channels).mean(0))
     scale = np.sqrt(np.mean(np.einsum("wnd,wnd->wn", D[own], D[own]))) + 1e-300
     seen = [_seen(B[w], _root(np.tile(even, steps), clock[w])) for w in own]
@@ -102,14 +103,6 @@ def origin(
     (sensor, by_sensor), (force, by_force) = (found[kind][at[kind]] for kind in ("sensor", "force"))
     deviate = statistics.normal_deviate(by_force - by_sensor, np.arange(len(own)))
     return Origin(sensor, force, deviate, RULES.memories[at["sensor"]] if sensor > RULES.told else 0.0)
-
-
-def _thinned(shape: tuple[int, int, int], *each: Array) -> tuple[Array, ...]:
-    """Arrays `[W, n, ...]` at RULES.steps of a window's steps at most: noise of a row is as large there."""
-    _, steps, channels = shape
-    kept = np.arange(0, steps, -(-steps // RULES.steps))
-    rows = (kept[:, None] * channels + np.arange(channels)).ravel()
-    return tuple(x[:, rows] for x in each)
 
 
 def _white(r: Array, rate: Array) -> tuple[Array, Array]:

@@ -170,8 +170,7 @@ def value(table: Table, key: Key, criteria: Criteria) -> float:
     All models have as many independent residuals as the one of least error: by counts of their own, of two that close a
     large gap the worse may lead.
     """
-    least = min(table.rows.values(), key=lambda r: r.total)
-    gain = float(log_gain(table.rows[BASE], replace(table.rows[key], samples=least.samples), table.noise).sum())
+    gain = float(log_gain(table.rows[BASE], replace(table.rows[key], samples=table.samples), table.noise).sum())
     return gain - len(key) * (criteria.nats + float(np.log(max(len(table.laws), 2))))
 
 

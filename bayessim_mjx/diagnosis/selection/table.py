@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -80,6 +81,11 @@ class Table:
     noise: float
     believed: float = 1.0
     chance: Array = field(default_factory=lambda: np.zeros(0))
+
+    @cached_property
+    def samples(self) -> float:
+        """Independent residuals of the model of least error, which stand for those of all where models are ranked."""
+        return min(self.rows.values(), key=lambda r: r.total).samples
 
     def excess(self, key: Key) -> float:
         """Held-out cost above the noise, as a multiple of the noise: squared gap that the model leaves."""
