@@ -12,8 +12,10 @@ from bayessim_mjx.distributions import box
 from bayessim_mjx.inference.pareto import effective
 
 DRAWS = 4096  # at most, that are fitted to
-FLAT = 1.5  # sd, in the width of the cube: over it the density falls by 5 %
-SURE = 3.0  # standard errors, beyond which draws are not uniform by chance
+FLAT = 1.5  # sd, in the width of the cube: over it the density falls by 5 %, which is as good as flat
+# standard errors, beyond which draws are not uniform by chance: .98 of uniform directions pass, and what is not uniform
+# and passes loses less than its moments' chance would (benchmarks/results.md, refined posteriors)
+SURE = 3.0
 STRIDE = 1.5  # power of a ratio of variances: what is cut off changes by less than its Gaussian
 
 
