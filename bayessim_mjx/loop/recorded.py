@@ -105,6 +105,9 @@ class Recorded:
 
         return jnp.moveaxis(jax.lax.map(again, jnp.arange(draws, dtype=jnp.uint32)), 0, 1)
 
+    def truth_of(self, keys: list[Array], count: int) -> None:
+        """Nobody knows it."""
+
     def real(self, key: Array, first: int, count: int, policy: Policy) -> tuple[Array, Trajectory]:
         """The next `count` segments of the logs and their features."""
         del key, policy

@@ -75,7 +75,8 @@ def infer(loop: Loop, state: LoopState, policy: Policy, info: RoundInfo) -> Loop
     replaced = by_replays or (info.set_posterior is not None and info.set_posterior.used)
     info.warnings += _complaints(posterior.names, info.fit, known_before, by_replays, int(state.fit.fits) == 1)
     info.posterior, info.real = posterior, jax.tree.map(np.asarray, real)
-    info.scores |= score(posterior, source.truth)
+    info.truth = source.truth_of([loop.key(r, "real") for r in range(round_ + 1)], b.realTrajs)
+    info.scores |= score(posterior, info.truth)
     state, domain = ranges.move(loop, state, posterior, info)
     following = rounds.following(domain, b.proposal) if loop.sequential else None
     if verdict is not None:

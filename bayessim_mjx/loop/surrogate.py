@@ -37,8 +37,21 @@ class Surrogate:
 
     @property
     def truth(self) -> np.ndarray:
-        """Mean of the heaviest component [d]: the line in the plots and the point that is scored."""
+        """Mean of the heaviest component [d]."""
         return self.means[int(np.argmax(self.weights))]
+
+    def truth_of(self, keys: list[Array], count: int) -> np.ndarray:
+        """What the trajectories `real(key, .., count, ..)` of these keys can tell [d]: the mean of their theta.
+
+        Parameters vary from trajectory to trajectory (`env.realParams.stds`), by more than a posterior may be wide.
+        Those of the heaviest component count; its mean where it made none.
+        """
+        drawn = [self._drawn(self._keys_of_real(key)[0], count) for key in keys]
+        component, theta = (
+            np.concatenate([np.asarray(part, float) for part in parts]) for parts in zip(*drawn, strict=True)
+        )
+        heaviest = component == np.argmax(self.weights)
+        return theta[heaviest].mean(0).astype(np.float32) if heaviest.any() else self.truth
 
     @property
     def supply(self) -> int | None:
@@ -66,12 +79,16 @@ class Surrogate:
 
     def sample(self, key: Array, count: int) -> Array:
         """theta [count, d] of the surrogate, inside the box, or between `ends`."""
+        return self._drawn(key, count)[1]
+
+    def _drawn(self, key: Array, count: int) -> tuple[Array, Array]:
+        """Components [count] and their theta [count, d]."""
         k_component, k_noise = jax.random.split(key)
         component = jax.random.choice(k_component, len(self.weights), (count,), p=jnp.asarray(self.weights))
         noise_ = jax.random.normal(k_noise, (count, len(self.space)))
         theta = jnp.asarray(self.means)[component] + jnp.asarray(self.sds)[component] * noise_
         low, high = self.ends or (self.space.low, self.space.high)
-        return jnp.clip(theta, low, high).astype(jnp.float32)
+        return component, jnp.clip(theta, low, high).astype(jnp.float32)
 
     def simulate(self, key: Array, thetas: Array, policy: Policy) -> Array:
         """Features [N, D] of simulated trajectories at `thetas`."""
@@ -111,9 +128,15 @@ class Surrogate:
     def real(self, key: Array, first: int, count: int, policy: Policy) -> tuple[Array, Trajectory]:
         """`count` real trajectories and their features [count, D]; `first` of them were asked for before."""
         del first
-        k_theta, k_roll = jax.random.split(key)
+        k_theta, k_roll = self._keys_of_real(key)
         trajectory = self._observe(k_roll, self.sample(k_theta, count), policy)
         return summarise(self.summarizer, trajectory), trajectory
+
+    @staticmethod
+    def _keys_of_real(key: Array) -> tuple[Array, Array]:
+        """Of the parameters, and of the motion."""
+        k_theta, k_roll = jax.random.split(key)
+        return k_theta, k_roll
 
     def repeated(self, first: int, real: Trajectory, thetas: Array) -> dict[str, Array]:
         """The first of the trajectories `real` replayed at thetas [n, d]: its motion, see `rollout.replay`."""

@@ -99,6 +99,26 @@ def test_the_truth_is_the_heaviest_component():
     np.testing.assert_allclose(surrogate().truth, [1.5, 1.0, 0.5])
 
 
+def test_what_is_scored_is_what_the_real_trajectories_were_made_with():
+    """Parameters vary between real trajectories; the posterior of a few can be sharper than that."""
+    keys, one = list(jax.random.split(jax.random.PRNGKey(3), 3)), surrogate(sds=np.full((2, 3), 0.2))
+    made = np.concatenate([np.asarray(one.sample(jax.random.split(key)[0], 8)) for key in keys])
+    heavy = made[made[:, 0] > 1.0]  # the components are five deviations apart there
+    assert 0 < len(heavy) < len(made)
+    np.testing.assert_allclose(one.truth_of(keys, 8), heavy.mean(0), rtol=1e-6)
+    none = next(k for k in jax.random.split(keys[0], 99) if one.sample(jax.random.split(k)[0], 1)[0, 0] < 1)
+    np.testing.assert_allclose(one.truth_of([none], 1), one.truth)
+
+
+def test_the_trajectories_are_made_with_what_is_scored():
+    settings = config.load("Pendulum", overrides=["env.realParams.stds=[[0.1]]"])
+    source = loop.make(settings, make("Pendulum", config=settings)).source
+    keys = list(jax.random.split(jax.random.PRNGKey(3), 2))
+    made = np.concatenate([np.asarray(source.real(key, 0, 2, None)[1].theta) for key in keys])
+    assert made.std(0).min() > 0.01
+    np.testing.assert_allclose(source.truth_of(keys, 2), made.mean(0), rtol=1e-5)
+
+
 def test_samples_stay_inside_the_box():
     samples = np.asarray(surrogate(sds=np.full((2, 3), 5.0)).sample(jax.random.PRNGKey(0), 1000))
     assert np.all(samples >= SPACE.low) and np.all(samples <= SPACE.high)
