@@ -10,7 +10,7 @@ def missing(name: str, where: str) -> str:
     own = words(name)
     if where in ("", "world") or (own.kind == "world" and where == "all"):
         return own.lacks
-    return f"{own.lacks} at all {own.kind or 'place'}s" if where == "all" else f"{own.lacks} at {where}"
+    return f"{own.lacks} at all {_several(own.kind)}" if where == "all" else f"{own.lacks} at {where}"
 
 
 def titled(name: str, where: str) -> str:
@@ -18,7 +18,11 @@ def titled(name: str, where: str) -> str:
     own = words(name)
     if where in ("", "world") or (own.kind == "world" and where == "all"):
         return own.noun
-    return f"{own.noun} at all {own.kind or 'place'}s" if where == "all" else f"{own.noun} at {where}"
+    return f"{own.noun} at all {_several(own.kind)}" if where == "all" else f"{own.noun} at {where}"
+
+
+def _several(kind: str) -> str:
+    return "bodies" if kind == "body" else f"{kind or 'place'}s"
 
 
 def by_law(effects: Iterable[Sequence[str]]) -> list[str]:

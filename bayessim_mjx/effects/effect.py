@@ -53,6 +53,10 @@ class Effect(abc.ABC):
     )
     joint: ClassVar[bool] = False  # its amplitudes are searched together: one alone may not act at all
     star: ClassVar[bool] = False  # its shapes are searched one at a time, the others in the middle of their grids
+    tied: ClassVar[bool] = True  # whether the same values at all places are a candidate
+    each: ClassVar[bool] = (
+        False  # whether a robot has it at every body, with values of its own, as it has a law at every joint
+    )
     offered: ClassVar[bool] = True  # among all the effects that a diagnosis tries; else only where it is named
     # for people; where these are empty, `support.words` says something by name and docstring
     noun: ClassVar[str] = ""  # what it is called: "command delay"

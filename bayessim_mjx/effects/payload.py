@@ -9,9 +9,9 @@ import mujoco
 import numpy as np
 
 from bayessim_mjx.effects.effect import Effect, Quantity
-from bayessim_mjx.effects.support.bodies import native
+from bayessim_mjx.effects.support.bodies import heavier, native
 from bayessim_mjx.effects.support.site import Site, find
-from bayessim_mjx.parameters import attributes, constants, geometry
+from bayessim_mjx.parameters import attributes, geometry
 
 if TYPE_CHECKING:
     from mujoco import mjx
@@ -73,6 +73,7 @@ class Payload(Effect):
     noun: ClassVar[str] = "extra payload"
     lacks: ClassVar[str] = "an extra payload"
     separates: ClassVar[str] = "many poses with accelerations; a known payload of a different mass"
+    tied: ClassVar[bool] = False  # no robot carries the same load on all of its links
     star: ClassVar[bool] = True  # links carry along their axes, not in the corners of a box
     quantities: ClassVar[tuple[Quantity, ...]] = (
         Quantity("mass", 0.0, 0.0, 1.0, unit="kg", per="carried", reach=(0.0, 1.0), grid=(0.01, 0.05, 0.2, 0.5)),
@@ -96,13 +97,7 @@ class Payload(Effect):
         load, arm = at.values(theta)[:, 0], at.values(theta)[:, 1:]
         mass, inertia, ipos, iquat = (getattr(model, field)[at.ids] for field in FIELDS)
         new = jax.vmap(_loaded)(mass, inertia, ipos, iquat, load, arm)
-        changed = model.replace(
-            **{f: getattr(model, f).at[at.ids].set(n) for f, n in zip(FIELDS, new, strict=True)},
-        )
-        derived = constants.derived(changed, set(FIELDS), reference=model)
-        # neutral: the compiler's own numbers, not their recomputation in float32
-        present = jnp.any(load > 0)
-        return changed.tree_replace({k: jnp.where(present, v, _leaf(model, k)) for k, v in derived.items()})
+        return heavier(model, at.ids, dict(zip(FIELDS, new, strict=True)), jnp.any(load > 0))
 
     def edit(self, spec: mujoco.MjSpec, values: dict[str, dict[str, float]]) -> str | None:
         """Native: a body without joints, with that mass and no extent."""
@@ -116,8 +111,3 @@ class Payload(Effect):
             load.mass, load.ipos, load.inertia = own["mass"], np.zeros(3), np.full(3, 1e-12)
             load.explicitinertial = True
         return None
-
-
-def _leaf(model: "mjx.Model", name: str) -> jax.Array:
-    group, _, own = name.rpartition(".")
-    return getattr(getattr(model, group) if group else model, own)

@@ -72,7 +72,7 @@ def _applied(p: Parameter, old: float, value: float, sign: float = 1.0) -> float
 def _edit_field(spec: mujoco.MjSpec, nominal: mujoco.MjModel, p: Parameter, value: float, field: Field) -> None:
     element = _element(spec, nominal, p)
     if field.spec == "ipos":
-        _explicit(spec, element)
+        explicit(spec, element)
     old = np.array(getattr(element, field.spec), np.float64)
     if old.ndim == 0:
         setattr(element, field.spec, _applied(p, float(old), value, field.sign))
@@ -113,11 +113,11 @@ def _multiply_inertia(body: Any, ratio: float) -> None:
 
 def _inertia(spec: mujoco.MjSpec, nominal: mujoco.MjModel, p: Parameter, value: float) -> None:
     body = _element(spec, nominal, p)
-    _explicit(spec, body)
+    explicit(spec, body)
     _multiply_inertia(body, value)
 
 
-def _explicit(spec: mujoco.MjSpec, body: Any) -> None:
+def explicit(spec: mujoco.MjSpec, body: Any) -> None:
     """Give the body the inertial that the compiler finds for it now."""
     if not _from_geoms(spec, body) and np.isnan(body.fullinertia[0]):
         return
@@ -175,7 +175,7 @@ def _length(spec: mujoco.MjSpec, nominal: mujoco.MjModel, p: Parameter, value: f
     parts = [*children, *body.geoms, *body.joints, *body.sites]
     if any(part.frame is not None for part in parts):
         raise UserError(f"{p.name}: body {body.name!r} has <frame>s; edit needs its parts in the body's own frame")
-    _explicit(spec, body)
+    explicit(spec, body)
 
     def move(x: np.ndarray) -> np.ndarray:
         return x + (value - 1) * axis * (axis @ x)

@@ -11,9 +11,9 @@ FAMILIES = (
      "actuator_lag", "lugre_friction"),
     # a sine of the angle at order 1 is what gravity does to one joint
     ("payload", "gravity_tilt", "external_force", "joint_spring", "joint_offset", "actuator_bias", "cogging",
-     "gravity_compensation", "cable_tension"),
+     "gravity_compensation", "cable_tension", "inertial_parameters"),
     ("actuator_gain", "sensor_gain", "armature", "payload", "actuator_saturation", "effort_loss", "speed_torque_limit",
-     "gain_drift"),
+     "gain_drift", "inertial_parameters"),
     ("contact_friction", "contact_compliance", "ground_height"),
 )  # fmt: skip
 

@@ -1,4 +1,4 @@
-"""Payload, tilted gravity, forces from outside and a rocking base, against MuJoCo C with the same in its model."""
+"""Payload, inertials, tilted gravity, forces from outside and a rocking base, against MuJoCo C with the same in it."""
 
 import sys
 from pathlib import Path
@@ -36,9 +36,10 @@ BODIES = ("upper", "fore")
 T = 40
 TIME = 0.02 * np.arange(T)
 COMMAND = np.stack([3 * np.sin(7 * TIME), 2 + 3 * np.sin(11 * TIME + 1)], axis=1)
-NAMES = ("payload", "gravity_tilt", "external_force", "base_flexibility")
+NAMES = ("payload", "inertial_parameters", "gravity_tilt", "external_force", "base_flexibility")
 NEUTRAL = {
     "payload": [0.0] * 8,
+    "inertial_parameters": [0.0, 0.0, 0.0, 1.0] * 2,
     "gravity_tilt": [0.0] * 2,
     "external_force": [0.0] * 8,
     "base_flexibility": [0, 10, 0.1, 0],
@@ -47,7 +48,7 @@ ROWS = 10
 
 
 def stack():
-    places = {"payload": BODIES, "external_force": BODIES}
+    places = {"payload": BODIES, "inertial_parameters": BODIES, "external_force": BODIES}
     return [make(name, where=places.get(name, "world")) for name in NAMES]
 
 
@@ -91,6 +92,30 @@ def test_payload_is_a_point_mass_welded_on():
     assert np.abs(real - plain()).max() > 0.1
     values = {"fore": dict(mass=1.5, com_x=0, com_y=0, com_z=0)}
     np.testing.assert_allclose(q[1], truth(edited(XML, make("payload", where="fore"), values), COMMAND), atol=1e-4)
+
+
+def heavy(own):
+    """The compiled arm with other inertials, written into MuJoCo's own fields."""
+    model = mujoco.MjModel.from_xml_string(XML)
+    for name, (x, y, z, factor) in own.items():
+        body = model.body(name).id
+        model.body_ipos[body] += [x, y, z]
+        model.body_inertia[body] *= factor
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    return model
+
+
+@pytest.mark.slow
+@pytest.mark.ci
+def test_inertial_parameters_are_those_of_the_compiled_body():
+    own = {"upper": [0.02, -0.03, 0.01, 1.3], "fore": [-0.01, 0.02, 0.03, 0.7]}
+    real = truth(heavy(own), COMMAND)
+    (q,) = run(theta(inertial_parameters=np.concatenate([own["upper"], own["fore"]])))
+    np.testing.assert_allclose(q, real, atol=1e-4)
+    assert np.abs(real - plain()).max() > 0.05
+    effect, keys = make("inertial_parameters", where=BODIES), ("com_x", "com_y", "com_z", "inertia")
+    written = edited(XML, effect, {place: dict(zip(keys, row, strict=True)) for place, row in own.items()})
+    np.testing.assert_allclose(truth(written, COMMAND), real, atol=1e-6)
 
 
 @pytest.mark.slow
@@ -191,6 +216,8 @@ def native(name, place, **values):
     [
         ("payload", [0, 0, 0, 0, 0.3, 0.05, 0.0, 0.06], [4, 5, 7],
          lambda: native("payload", "fore", mass=0.3, com_x=0.05, com_y=0.0, com_z=0.06)),
+        ("inertial_parameters", [0, 0, 0, 1, 0.02, 0, 0.03, 1], [4, 6],
+         lambda: truth(heavy({"fore": [0.02, 0, 0.03, 1]}), COMMAND)),
         ("gravity_tilt", [0.03, -0.05], [0, 1], lambda: native("gravity_tilt", "world", roll=0.03, pitch=-0.05)),
         ("external_force", [0, 0, 0, 0, 2.0, -1.0, 1.5, 0.0], [4, 5, 6], lambda: pushed([2.0, -1.0, 1.5])),
         ("base_flexibility", [0.004, 8.0, 0.1, 0.2], [0], lambda: rocking(0.004, 8.0, 0.1, 0.2)),
@@ -223,5 +250,7 @@ def test_refusals():
         physics(lone, [make("base_flexibility", where="world")])
     with pytest.raises(UserError, match="ball.*simple"):
         physics(lone, [make("payload", where="ball")])
+    with pytest.raises(UserError, match="ball.*simple"):
+        physics(lone, [make("inertial_parameters", where="ball")])
     with pytest.raises(UserError, match="'base'"):
         physics(XML, [make("payload", where="base")])

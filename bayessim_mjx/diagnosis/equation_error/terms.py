@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import mujoco
 import numpy as np
@@ -34,6 +35,8 @@ class Ranges:
     zero: float = 0.05  # rad, standard deviation of a joint's zero and of a base's tilt
     share: float = 1.0  # of the load that dry friction may be
     tilt: float = 0.3  # rad
+    centre: float = 0.05  # of a body's size, standard deviation of its centre of mass; inertia: of the inertia about it
+    inertia: float = 0.1
     late: float = 3.0  # periods: standard deviation of how late efforts are
 
 
@@ -105,7 +108,7 @@ def effects(model: mujoco.MjModel, layout: Layout, source: Sequence[str], carrie
     if np.any(model.opt.gravity):
         ends = -RANGES.tilt, RANGES.tilt
         out.append(_wide("gravity_tilt", "world", tilt, *ends, _reader("roll", "pitch"), sd=RANGES.zero))
-    return [*out, *payloads(model, layout, carried)]
+    return [*out, *payloads(model, layout, carried), *links(model, layout)]
 
 
 def _on_actuators(model: mujoco.MjModel, layout: Layout, driven: Sequence[tuple[int, int]]) -> list[Term]:
@@ -154,6 +157,54 @@ def payloads(model: mujoco.MjModel, layout: Layout, carried: Array) -> list[Term
         sd, within = _spread(most, reach), _within(reach)
         out.append(Term("payload", name, shape, 4, sd=sd, low=low, high=high, within=within, read=_payload))
     return out
+
+
+def links(model: mujoco.MjModel, layout: Layout) -> list[Term]:
+    """The centre of mass of each body, and the inertia about it, as accurate as data sheets are (effects)."""
+    bodies, data = rigid.moving_bodies(model), mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    out = []
+    for body in range(1, model.nbody):
+        base, mass = int(model.body_weldid[body]), float(model.body_mass[body])
+        if base == 0 or mass <= 0:
+            continue
+        frame = data.xmat[base].reshape(3, 3)
+        centre = frame.T @ (data.xipos[body] - data.xpos[base])
+        turn = frame.T @ data.xmat[body].reshape(3, 3)
+        axes = frame.T @ data.ximat[body].reshape(3, 3)
+        about = axes @ np.diag(model.body_inertia[body]) @ axes.T
+        shape = np.zeros((layout.nv, layout.size, 4))
+        own, none = layout.body(bodies.index(base)), np.zeros((3, 3))
+        for k, axis in enumerate(turn.T):
+            shape[:, own, k] = (
+                rigid.inertial(mass, centre + axis, none) - rigid.inertial(mass, centre - axis, none)
+            ) / 2
+        shape[:, own, 3] = rigid.inertial(0.0, centre, about)
+        sd = np.array([*3 * [RANGES.centre * loads.size(model, body)], RANGES.inertia])
+        ends, name = np.full(4, np.inf), element_names(model, "body")[body]
+        out.append(
+            Term(
+                "inertial_parameters",
+                name,
+                partial(_same, shape),
+                4,
+                sd=partial(_same, sd),
+                low=-ends,
+                high=ends,
+                read=_link,
+            )
+        )
+    return out
+
+
+def _same(value: Array, last: Array) -> Array:
+    """Whatever the last round found."""
+    return value
+
+
+def _link(c: Array) -> Mapping[str, float]:
+    return {**{f"com_{a}": float(x) for a, x in zip("xyz", c[:3], strict=True)}, "inertia": 1.0 + float(c[3])}
 
 
 def _load(layout: Layout, body: int, centre: Array, turn: Array) -> Callable[[Array], Array]:

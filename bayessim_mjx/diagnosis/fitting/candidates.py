@@ -156,7 +156,7 @@ def enumerate_candidates(physics: Physics) -> list[Candidate]:
     for effect in (e for e in physics.effects if e.quantities):
         blocks = physics.blocks_of(effect)
         out += [_candidate(effect, block.place, [block]) for block in blocks]
-        if len(blocks) > 1 and effect.kind != "geom":
+        if len(blocks) > 1 and effect.kind != "geom" and effect.tied:
             out.append(_candidate(effect, "all", blocks))
     return out
 
@@ -169,9 +169,15 @@ def _candidate(effect: Effect, where: str, blocks: Sequence[Block]) -> Candidate
         index = tuple(block.start + j for block in blocks)
         name = own[0].name if len(own) == 1 else f"all.{effect.name}.{q.name}"
         coordinates.append(Coordinate(name, index, own[0].nominal, low, high, unit=own[0].unit))
-    shown = tuple(replace(c, precision=shrink(c)) for c in coordinates)
+    believed = zip(coordinates, effect.quantities, strict=True)
+    shown = tuple(_stated(c) if q.stated else replace(c, precision=shrink(c)) for c, q in believed)
     shapes = tuple(q.shape for q in effect.quantities)
     return Candidate(effect.name, where, effect.kind, shown, shapes, _probes(effect, shown))
+
+
+def _stated(c: Coordinate) -> Coordinate:
+    """As a data sheet states it: an eighth of the range (`Quantity.stated`)."""
+    return replace(c, precision=(8.0 / (c.high - c.low)) ** 2, stated=True)
 
 
 def shrink(c: Coordinate) -> float:

@@ -174,7 +174,7 @@ def _grown(physics: Physics, c: Coordinate, value: float) -> Coordinate:
     else:
         low = c.low / WIDENING.twice if c.low > 0 else c.neutral + WIDENING.twice * (c.low - c.neutral)
         wider = replace(c, low=max(far, low))
-    return replace(wider, precision=shrink(wider))
+    return wider if c.stated else replace(wider, precision=shrink(wider))
 
 
 def _refitted(pool: Pool, model: Model, effects: Sequence[Candidate]) -> Model:

@@ -64,7 +64,8 @@ class Difference:
     """By how much one model predicts better than another.
 
     Attributes:
-        nats: of held-out log predictive density; deviate: over its clustered standard error, as a normal deviate.
+        nats: of held-out log predictive density, and of what data sheets state; deviate: of the former over its
+            clustered standard error, as a normal deviate.
         closed: share of what the worse leaves of the squared gap; worst: share of its cost that the condition that
             gains least saves.
     """
@@ -81,9 +82,8 @@ def compare(table: Table, worse: Key, better: Key) -> Difference:
     gain = log_gain(old, new, table.noise)
     left, above = table.excess(better), table.excess(worse)
     drop = [_drop(old.cost[table.group == g], new.cost[table.group == g], table.noise) for g in np.unique(table.group)]
-    return Difference(
-        float(gain.sum()), statistics.normal_deviate(gain, table.group), 1.0 - left / max(above, 1e-9), min(drop)
-    )
+    nats = float(gain.sum()) + new.belief - old.belief
+    return Difference(nats, statistics.normal_deviate(gain, table.group), 1.0 - left / max(above, 1e-9), min(drop))
 
 
 def log_gain(old: Row, new: Row, noise: float) -> Array:
@@ -137,7 +137,9 @@ def same(table: Table, worse: Key, better: Key, criteria: Criteria) -> bool:
 
 
 def _as_good(table: Table, worse: Key, better: Key, criteria: Criteria) -> bool:
-    return (1.0 + table.excess(worse)) / max(1.0 + table.excess(better), 1e-9) < 1.0 + criteria.same
+    """By prediction, and by what data sheets state."""
+    believed = table.rows[better].belief - table.rows[worse].belief < criteria.nats
+    return believed and (1.0 + table.excess(worse)) / max(1.0 + table.excess(better), 1e-9) < 1.0 + criteria.same
 
 
 def order(laws: Mapping[str, Law]) -> Order:
@@ -165,13 +167,18 @@ def admissible(row: Row, criteria: Criteria) -> bool:
 
 
 def value(table: Table, key: Key, criteria: Criteria) -> float:
-    """Nats of log predictive density over the known parameters alone, less the price of the model's effects.
+    """Nats of evidence over the known parameters alone, less the price of the model's effects."""
+    return evidence(table, key) - len(key) * (criteria.nats + float(np.log(max(len(table.laws), 2))))
+
+
+def evidence(table: Table, key: Key) -> float:
+    """Nats of log predictive density over the known parameters alone, and of what data sheets state of the effects.
 
     All models have as many independent residuals as the one of least error: by counts of their own, of two that close a
     large gap the worse may lead.
     """
     gain = float(log_gain(table.rows[BASE], replace(table.rows[key], samples=table.samples), table.noise).sum())
-    return gain - len(key) * (criteria.nats + float(np.log(max(len(table.laws), 2))))
+    return gain + table.rows[key].belief
 
 
 def decide(table: Table, less: Order, criteria: Criteria) -> Decision:
@@ -198,10 +205,10 @@ def _beside(table: Table, key: Key, answer: Key, criteria: Criteria) -> bool:
 
 
 def least(table: Table, equal: Iterable[Key], less: Order) -> Key:
-    """Of models that are the same, one that no other is less than: fewest effects, then numbers, then least error."""
+    """Of models that are the same, one that no other is less than: fewest effects, then numbers, then most evidence."""
     equal = list(equal)
     lowest = [k for k in equal if not any(less(other, k) for other in equal)]
-    return min(lowest, key=lambda k: (len(k), table.rows[k].size, table.rows[k].total, sorted(k)))
+    return min(lowest, key=lambda k: (len(k), table.rows[k].size, -evidence(table, k), sorted(k)))
 
 
 def rivals(table: Table, equal: Iterable[Key], answer: Key, less: Order) -> tuple[Alternative, ...]:

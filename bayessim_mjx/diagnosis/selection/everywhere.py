@@ -12,7 +12,6 @@ from bayessim_mjx.diagnosis.selection.criteria import Criteria
 from bayessim_mjx.diagnosis.selection.decide import admissible
 from bayessim_mjx.diagnosis.selection.table import BASE, Key, Table
 
-SPREADS = ("joint", "actuator")  # kinds of places of which a robot has one for each degree of freedom
 # further laws that are spread over the joints beside a model's own, those that promise most at all of them in sum: a
 # bound on the cost, not counted
 LAWS = 3
@@ -20,7 +19,7 @@ LAWS = 3
 
 def places(table: Table, effect: str) -> Key:
     """The labels of a law at all of its joints, one by one; none where it has a single one, or is of another kind."""
-    own = [c for c in table.laws.values() if c.effect == effect and c.kind in SPREADS and c.where != "all"]
+    own = [c for c in table.laws.values() if c.effect == effect and c.spread and c.where != "all"]
     return frozenset(c.label for c in own) if len(own) > 1 else BASE
 
 

@@ -80,7 +80,7 @@ class Fits:
         fitted, row = self._rows.get(key, (None, None))
         if fitted is not model or row is None or (contender and len(row.distance) < len(key)):
             distance = distances(self.pool, model) if contender else {}
-            row = Row(key, model.size, model.cost, model.samples, distance)
+            row = Row(key, model.size, model.cost, model.samples, distance, belief=model.belief)
             self._rows[key] = (model, row)
         return row
 
@@ -138,6 +138,7 @@ class Fits:
         fit = model.fit if len(kept) == len(model.effects) else cut_back(self.pool, model, kept)
         if not new:
             return [fit], kept
+        fit = self.pool.begun(fit)
         given = self._amounts.get(plan.key) if plan.parent == BASE else None
         every = [given or tuple(self._start(plan.parent, c) for c in new)]
         if all(frozenset([c.label]) in self.pool.models for c in new):

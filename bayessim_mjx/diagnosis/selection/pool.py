@@ -19,7 +19,7 @@ from bayessim_mjx.diagnosis.selection.criteria import Criteria
 from bayessim_mjx.diagnosis.selection.heats import Heats
 from bayessim_mjx.diagnosis.selection.models import Model, scored
 from bayessim_mjx.diagnosis.selection.screen import Screened, Secants
-from bayessim_mjx.diagnosis.selection.table import Law
+from bayessim_mjx.diagnosis.selection.table import SPREADS, Law
 from bayessim_mjx.diagnosis.selection.tried import Settings, Tried
 from bayessim_mjx.effects import load, names
 
@@ -38,6 +38,7 @@ class Rules:
     near: float = (
         1.3  # times the best one's cost, as near as a fit has to be able to come: a rule of thumb, not counted
     )
+    left: float = 1.0  # mean square of start states, in their own variances, from which on measured ones are begun at
     astray: float = 10.0  # noises that a fit leaves: from there on nothing is as it was a step before
 
 
@@ -65,11 +66,25 @@ class Pool(Tried):
     skipped: dict[str, int] = field(default_factory=dict)
     keep: Callable[[Pool], None] = lambda pool: None
     secants: Secants = field(default_factory=Secants)
+    _measured: dict[Fit, Fit] = field(default_factory=dict, repr=False)
 
     @property
     def rough(self) -> bool:
         """Whether contacts make what columns tell hold only nearby: fits then need them anew at every step."""
         return contacts(self.fitter.simulator.physics)
+
+    def begun(self, fit: Fit) -> Fit:
+        """The fit that models of more effects begin at: with contacts at the measured start states, if it left them.
+
+        Starts farther off than their noise are those that a fit needs while it lacks an effect. They keep the effect
+        from the logs, as over contacts no step leads back to where they were.
+        """
+        away = float(np.mean((fit.offsets / self.fitter.spread) ** 2))
+        if not self.rough or away < RULES.left:
+            return fit
+        if fit not in self._measured:
+            self._measured[fit] = self.fitter.begin(fit.coordinates, fit.values)
+        return self._measured[fit]
 
 
 def fresh(pool: Pool, fit: Fit) -> list[int]:
@@ -166,13 +181,13 @@ def _left_out(pool: Pool, models: Sequence[Sequence[Candidate]], label: str) -> 
 
 def starts(pool: Pool, model: Model, extra: Screened, rank: int) -> list[Fit]:
     """Jobs from several starting points: costs have several minima (an inertia hides in another, a shape is wrong)."""
-    fitter, coordinates = pool.fitter, extra.candidate.coordinates
-    fits = [fitter.derive(model.fit, coordinates, extra.start)]
+    fitter, coordinates, begun = pool.fitter, extra.candidate.coordinates, pool.begun(model.fit)
+    fits = [fitter.derive(begun, coordinates, extra.start)]
     if rank < pool.settings.starts and extra.others:
         anew = _delivered(pool, model, coordinates, extra)
         # a limit has no derivative below its threshold, so also from the probe itself, not scaled down to its step
-        fits += [anew, fitter.derive(model.fit, coordinates, extra.others[0])]
-        fits += [fitter.derive(model.fit, coordinates, other) for other in extra.others[1:]]
+        fits += [anew, fitter.derive(begun, coordinates, extra.others[0])]
+        fits += [fitter.derive(begun, coordinates, other) for other in extra.others[1:]]
     return fits
 
 
@@ -208,7 +223,8 @@ def law_of(candidate: Candidate) -> Law:
     """What a decision knows of a candidate."""
     index = frozenset(i for c in candidate.coordinates for i in c.index)
     names = candidate.label, candidate.effect, candidate.where
-    return Law(*names, len(candidate.coordinates), index, special_cases(candidate), candidate.kind)
+    spread = candidate.kind in SPREADS or _of_each(candidate.effect)
+    return Law(*names, len(candidate.coordinates), index, special_cases(candidate), candidate.kind, spread)
 
 
 def start_of(pool: Pool, candidate: Candidate) -> Screened:
@@ -229,7 +245,7 @@ def polish(pool: Pool, models: Sequence[Model], say: Progress = lambda text, don
         return fit
 
     fits = [told(fitter.refresh(m.fit)) for m in models]
-    fits = [_again(fitter, fit) for fit in fits] if pool.rough else _to_the_end(pool, fits, told)
+    fits = [_again(pool, fit) for fit in fits] if pool.rough else _to_the_end(pool, fits, told)
     new = [scored(fitter, fit, m.effects) for fit, m in zip(fits, models, strict=True)]
     pool.models.update({frozenset(c.label for c in m.effects): m for m in new})
     return new
@@ -262,7 +278,13 @@ def _to_the_end(pool: Pool, fits: Sequence[Fit], told: Callable[[Fit], Fit]) -> 
     return fits
 
 
-def _again(fitter: Fitter, fit: Fit) -> Fit:
+def _again(pool: Pool, fit: Fit) -> Fit:
+    """A rough fit, from its own start states and from the measured ones."""
+    both = {id(f): f for f in (fit, pool.begun(fit))}
+    return min((_on(pool.fitter, f) for f in both.values()), key=lambda f: f.cost)
+
+
+def _on(fitter: Fitter, fit: Fit) -> Fit:
     for _ in range(RULES.rounds):
         before = fit.cost
         (fit,) = fitter.iterate([replace(fit, history=())], 2, lambda f: range(len(f.coordinates)))
@@ -280,3 +302,9 @@ def special_cases(effect: Candidate) -> tuple[str, ...]:
 @functools.cache  # thousands of pairs are compared, and all installed packages are looked through for a name
 def _contained(effect: str) -> tuple[str, ...]:
     return tuple(getattr(load(effect), "contains", ())) if effect in names() else ()
+
+
+@functools.cache
+def _of_each(effect: str) -> bool:
+    """Whether a robot has it at every body (`Effect.each`)."""
+    return effect in names() and load(effect).each

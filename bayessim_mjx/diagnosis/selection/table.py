@@ -15,13 +15,16 @@ Key = frozenset[str]  # labels of a model's effects
 BASE: Key = frozenset()  # the known parameters alone
 
 
+SPREADS = ("joint", "actuator")  # kinds of places of which a robot has one for each degree of freedom
+
+
 @dataclass(frozen=True)
 class Law:
     """One candidate: an effect at a place (or tied over all of them).
 
     Attributes:
         label: effect@where; numbers: free ones; index: entries of theta that it sets; special: effects it contains.
-        kind: of its places: actuator, joint, body, geom or world.
+        kind: of its places: actuator, joint, body, geom or world; spread: a robot may have it at each of them.
     """
 
     label: str
@@ -31,6 +34,7 @@ class Law:
     index: frozenset[int] = frozenset()
     special: tuple[str, ...] = ()
     kind: str = ""
+    spread: bool = False
 
     def beside(self, other: Law) -> bool:
         """Whether both can be in one model: not the same numbers twice, nor a law beside its special case."""
@@ -48,6 +52,7 @@ class Row:
         samples: effective number of independent residuals, of all windows together.
         distance: {label: standard deviations that its best told amplitude is away from neutral}.
         simulated: whether the cost was simulated fold by fold, not linearised.
+        belief: log prior density, nats below its maximum, of what data sheets state of the effects.
     """
 
     key: Key
@@ -56,6 +61,7 @@ class Row:
     samples: float
     distance: Mapping[str, float] = field(default_factory=dict)
     simulated: bool = False
+    belief: float = 0.0
 
     @property
     def total(self) -> float:
@@ -108,6 +114,7 @@ class Table:
                 {"effect": c.effect, "where": c.where, "numbers": c.numbers, "index": sorted(c.index)}
                 | ({"special": list(c.special)} if c.special else {})
                 | ({"kind": c.kind} if c.kind else {})
+                | ({"spread": True} if c.spread else {})
                 for c in self.laws.values()
             ],
             "group": self.group.tolist(),
@@ -123,6 +130,7 @@ class Table:
                     "distance": {k: float(f"{z:.4g}") for k, z in r.distance.items()},
                     "simulated": r.simulated,
                 }
+                | ({"belief": float(f"{r.belief:.4g}")} if r.belief else {})
                 for r in self.rows.values()
             ],
         }
@@ -139,11 +147,20 @@ def read(raw: Mapping[str, Any]) -> Table:
             frozenset(c["index"]),
             tuple(c.get("special", ())),
             c.get("kind", ""),
+            c.get("spread", c.get("kind") in SPREADS),
         )
         for c in raw["laws"]
     ]
     rows = [
-        Row(frozenset(r["effects"]), r["size"], np.array(r["cost"]), r["samples"], r["distance"], r["simulated"])
+        Row(
+            frozenset(r["effects"]),
+            r["size"],
+            np.array(r["cost"]),
+            r["samples"],
+            r["distance"],
+            r["simulated"],
+            r.get("belief", 0.0),
+        )  # fmt: skip
         for r in raw["rows"]
     ]
     return Table(

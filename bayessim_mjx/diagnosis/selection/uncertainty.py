@@ -121,6 +121,6 @@ def win_share(
     draws = (rng.dirichlet(np.ones(index.max() + 1), size=500) * (index.max() + 1))[:, index]
     totals = np.stack([draws @ m.cost for m in models], 1) + 1e-9  # [draws, models]
     samples = min(*(m.samples for m in models), numbers)
-    score = -0.5 * samples * np.log(totals)
+    score = -0.5 * samples * np.log(totals) + np.array([m.belief for m in models])
     weight = np.exp(score - score.max(1, keepdims=True))
     return np.asarray((weight / weight.sum(1, keepdims=True)).mean(0))

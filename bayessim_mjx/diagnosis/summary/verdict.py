@@ -10,11 +10,11 @@ from scipy.stats import chi2
 
 from bayessim_mjx.diagnosis import statistics
 from bayessim_mjx.diagnosis.findings import Findings
-from bayessim_mjx.diagnosis.fitting.fit import Fit
 from bayessim_mjx.diagnosis.residual.origin import Origin, origin
 from bayessim_mjx.diagnosis.result import Gap
 from bayessim_mjx.diagnosis.selection import chance
 from bayessim_mjx.diagnosis.selection.decide import compare
+from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.selection.table import BASE
 from bayessim_mjx.diagnosis.summary.whole_logs import Whole
 
@@ -73,15 +73,16 @@ class Verdict:
 def verdict_of(found: Findings, far: Gap) -> Verdict:
     """The verdict on what was found; `far`: what remains of the gap."""
     left, alone, noise = remains(found), beaten(found), sensors_noise(found)
-    off = bent(found.model.fit) if found.model.effects else (0, 0)
+    off = bent(found.model) if found.model.effects else (0, 0)
     name = _name(found, far, left, alone, noise)
     return Verdict("unexplained" if any(off) else name, left, alone, noise, off, builds_up(found))
 
 
-def bent(fit: Fit) -> tuple[int, int]:
+def bent(model: Model) -> tuple[int, int]:
     """(Known parameters far from the data sheet, of so many), where that is no chance; else (0, 0)."""
-    pairs = zip(fit.coordinates, fit.values, strict=True)
-    away = np.array([(v - c.neutral) * c.precision**0.5 for c, v in pairs if c.stated])
+    named = {c.name for effect in model.effects for c in effect.coordinates}
+    pairs = zip(model.fit.coordinates, model.fit.values, strict=True)
+    away = np.array([(v - c.neutral) * c.precision**0.5 for c, v in pairs if c.stated and c.name not in named])
     likely = chi2.sf(np.sum((away / LIMITS.loose) ** 2), max(len(away), 1)) > LIMITS.doubtful
     return (0, 0) if likely else (int(np.sum(np.abs(away) > LIMITS.far)), len(away))
 

@@ -7,6 +7,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from bayessim_mjx.parameters import constants
+
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
@@ -36,6 +38,21 @@ def project(model: mujoco.MjModel, data: "mjx.Data", ids: np.ndarray, force: jax
 def _arm(model: mujoco.MjModel, data: "mjx.Data", ids: np.ndarray) -> jax.Array:
     """From the point that MuJoCo's spatial vectors of the tree refer to."""
     return data.xipos[ids] - data.subtree_com[model.body_rootid[ids]]
+
+
+def heavier(model: "mjx.Model", ids: np.ndarray, new: "dict[str, jax.Array]", present: jax.Array) -> "mjx.Model":
+    """With inertial fields `{body_mass, ...: [n, ...]}` of bodies and all that MuJoCo derives from them.
+
+    present: scalar bool; where it is False the compiler's own numbers stay, not their recomputation in float32.
+    """
+    changed = model.replace(**{field: getattr(model, field).at[ids].set(value) for field, value in new.items()})
+    derived = constants.derived(changed, set(new), reference=model)
+    return changed.tree_replace({k: jnp.where(present, v, _leaf(model, k)) for k, v in derived.items()})
+
+
+def _leaf(model: "mjx.Model", name: str) -> jax.Array:
+    group, _, own = name.rpartition(".")
+    return getattr(getattr(model, group) if group else model, own)
 
 
 def native(spec: mujoco.MjSpec, values: dict[str, dict[str, float]]) -> "Iterator[tuple[Any, int, dict[str, float]]]":

@@ -24,6 +24,7 @@ class Quantity:
             effect is off whatever this one is; `grid` is then in fractions of the range from low to high.
         at_least: ends of the range that `reach` gives are raised to `low` and `high` where they are below.
         most: end that physics sets, whatever the range is (friction that outgrows its load).
+        stated: a data sheet states it, within an eighth of the range (standard deviation).
         remembered: the range sizes the effect's memory, so that no fit can go beyond it.
     """
 
@@ -39,6 +40,7 @@ class Quantity:
     shape: bool = False
     at_least: bool = False
     most: float = math.inf
+    stated: bool = False
     remembered: bool = False
 
     def ends(self) -> tuple[float, float]:

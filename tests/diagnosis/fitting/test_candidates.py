@@ -4,7 +4,8 @@ import mujoco
 import numpy as np
 
 from bayessim_mjx.diagnosis.fitting.candidates import enumerate_candidates
-from bayessim_mjx.effects import make
+from bayessim_mjx.diagnosis.fitting.scales import Scales, ranges
+from bayessim_mjx.effects import load, make
 from bayessim_mjx.parameters import ParameterSpace
 from bayessim_mjx.physics import Physics
 
@@ -15,6 +16,37 @@ XML = """
   </worldbody>
 </mujoco>
 """
+
+
+TWO = XML.replace(
+    "</body>",
+    '<body pos="0 0 -.4"><joint axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 -.2" size=".02"/></body></body>',
+)
+
+
+def test_no_two_links_carry_the_same_load_or_are_wrong_alike():
+    model = mujoco.MjModel.from_xml_string(TWO)
+    places = {
+        "payload": ("link", "body2"),
+        "inertial_parameters": ("link", "body2"),
+        "viscous_friction": ("hinge", "joint1"),
+    }
+    physics = Physics(model, 0.02, ParameterSpace(), [make(name, at) for name, at in places.items()])
+    found = {e: {c.where for c in enumerate_candidates(physics) if c.effect == e} for e in places}
+    assert found["payload"] == found["inertial_parameters"] == {"link", "body2"}
+    assert found["viscous_friction"] == {"hinge", "joint1", "all"}
+
+
+def test_what_a_data_sheet_states_of_an_effect_is_gaussian():
+    """5 % of a body's size, and 10 % of its inertia."""
+    model = mujoco.MjModel.from_xml_string(XML)
+    scales = Scales(model, *[np.ones(1)] * 6, np.ones(1, bool), np.ones(2), 0.02)
+    kind = load("inertial_parameters")
+    effect = kind(where="link", parameters=ranges(kind, "link", scales))
+    (found,) = enumerate_candidates(Physics(model, 0.02, ParameterSpace(), [effect]))
+    sd = [c.precision**-0.5 for c in found.coordinates]
+    np.testing.assert_allclose(sd, [*3 * [0.05 * (0.2 + 0.02)], 0.1], rtol=1e-6)
+    assert all(c.stated for c in found.coordinates)
 
 
 def test_a_load_is_tried_at_the_bodys_centre_and_along_each_of_its_axes():

@@ -3,15 +3,16 @@
 import numpy as np
 
 from bayessim_mjx.diagnosis.selection import dense
-from bayessim_mjx.diagnosis.selection.table import BASE, Law, Row, Table
+from bayessim_mjx.diagnosis.selection.table import BASE, SPREADS, Law, Row, Table
 
 CONDITIONS, WINDOWS, ROWS = 5, 8, 40
 
 
-def law(effect, where="hinge", numbers=1, places=None, special=(), kind=""):
+def law(effect, where="hinge", numbers=1, places=None, special=(), kind="", spread=None):
     """A candidate; laws of one effect at the same place have the same numbers."""
     index = frozenset(f"{effect}@{place}" for place in places or (where,))
-    return Law(f"{effect}@{where}", effect, where, numbers, index, special, kind)
+    spread = kind in SPREADS if spread is None else spread
+    return Law(f"{effect}@{where}", effect, where, numbers, index, special, kind, spread)
 
 
 def table(errors, noise=50.0, believed=1.0, group=None, samples=1e4):

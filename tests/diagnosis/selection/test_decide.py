@@ -144,6 +144,19 @@ def test_with_effects_the_sensors_own_noise_is_reached_where_the_time_step_costs
     assert named(errors) == labels(A) and named(errors, believed=0.5) == labels(A, B)
 
 
+def test_of_what_predicts_alike_the_one_that_data_sheets_forbid_is_no_rival():
+    """One is alike by prediction; its centre of mass would be 8 standard deviations off (32 nats)."""
+    known = table({(): 100, (A,): 1.0, (B,): 1.0}, group=GROUP)
+    free = decide(known, order(known.laws), Criteria())
+    assert {*free.answer, *(label for r in free.rivals for label in r.key)} == labels(A, B)
+    key = frozenset(labels(B))
+    rows = known.rows | {key: dataclasses.replace(known.rows[key], belief=-32.0)}
+    far = dataclasses.replace(known, rows=rows)
+    found = decide(far, order(far.laws), Criteria())
+    assert set(found.answer) == labels(A) and not found.rivals
+    assert read(far.to_dict()).rows[key].belief == -32.0
+
+
 def test_the_order_of_the_rows_and_a_round_trip_decide_nothing():
     errors = {(): 100, (A,): 30, (B,): 60, (A, B): 1.0, (B, C): 1.0}  # a tie
     known = table(errors)

@@ -69,6 +69,14 @@ def test_what_is_not_in_every_joint_is_not_spread():
     assert everywhere.spread(made, frozenset(), gains) == []
 
 
+def test_what_every_link_has_is_spread():
+    links = [law("inertial_parameters", b, 4, kind="body", spread=True) for b in ("hand", "arm")]
+    made = table({(): 9.0, (links[0],): 4.0, (links[1],): 5.0})
+    every = frozenset(c.label for c in links)
+    assert [model for model, _ in everywhere.spread(made, frozenset(), dict.fromkeys(every, 1.0))] == [every]
+    assert table({(): 9.0, (links[0],): 4.0}).to_dict()["laws"][0]["spread"]
+
+
 def test_a_spread_model_begins_at_what_is_fitted():
     laws = [law("friction", j, kind="joint") for j in ("j0", "j1")]
     tied, other = law("friction", "all", places=("j0", "j1"), kind="joint"), law("delay", "s", kind="actuator")

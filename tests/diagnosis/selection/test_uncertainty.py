@@ -157,9 +157,12 @@ def test_parts_of_what_is_closed_add_up_and_stay_below_one():
 def test_weights_among_rivals_are_one_together_and_equal_where_the_rivals_are():
     rng = np.random.default_rng(0)
     cost, group = 1.0 + rng.random(24), np.repeat(np.arange(4), 6)
-    model = lambda factor: SimpleNamespace(cost=factor * cost, samples=200.0)  # noqa: E731
+    model = lambda factor, belief=0.0: SimpleNamespace(cost=factor * cost, samples=200.0, belief=belief)  # noqa: E731
     same = uncertainty.win_share([model(1.0), model(1.0)], group, 1.0, rng)
     np.testing.assert_allclose(same, [0.5, 0.5])
+    # what a data sheet states weighs too
+    sheet = uncertainty.win_share([model(1.0), model(1.0, -np.log(3.0))], group, 1.0, rng)
+    np.testing.assert_allclose(sheet, [0.75, 0.25])
     # twice the cost: 100 log 2 nats behind
     assert uncertainty.win_share([model(2.0), model(1.0)], group, 1.0, rng)[0] < 1e-20
     # of which only ten are independent numbers: 5 log 2 nats
