@@ -106,7 +106,7 @@ def findings(rms, noise=50.0, windows=8, beyond=()):
         return Prediction(np.full((windows, 5, 2), float(level)), np.zeros((windows, 4)))
 
     fit = SimpleNamespace(coordinates=(), values=())
-    winner = SimpleNamespace(effects=(FRICTION,), total=windows * noise * rms**2, fit=fit)
+    winner = SimpleNamespace(effects=(SimpleNamespace(coordinates=()),), total=windows * noise * rms**2, fit=fit)
     selection = SimpleNamespace(
         ambiguous=False,
         rivals={},

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.fitting.fitter import Fit
-from bayessim_mjx.diagnosis.selection.pool import beside
+from bayessim_mjx.diagnosis.selection.laws import beside
 from bayessim_mjx.diagnosis.selection.screen import Screened, residual
 
 Array = NDArray[np.float64]

@@ -16,13 +16,12 @@ from bayessim_mjx.diagnosis.selection import chance, dense, heldout
 from bayessim_mjx.diagnosis.selection.beam import Plan
 from bayessim_mjx.diagnosis.selection.bounds import widened
 from bayessim_mjx.diagnosis.selection.budget import LEAVING_OUT
+from bayessim_mjx.diagnosis.selection.laws import beside, law_of
 from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.selection.pool import (
     Pool,
     Progress,
-    beside,
     fit_entries,
-    law_of,
     polish,
     start_of,
     starts,

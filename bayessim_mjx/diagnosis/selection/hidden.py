@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
+from bayessim_mjx.diagnosis.selection.laws import compatible
 from bayessim_mjx.diagnosis.selection.models import Model
-from bayessim_mjx.diagnosis.selection.pool import Pool, compatible
+from bayessim_mjx.diagnosis.selection.pool import Pool
 from bayessim_mjx.diagnosis.selection.screen import Progress, judged, looked_at, projected, simulated
 
 Array = NDArray[np.float64]

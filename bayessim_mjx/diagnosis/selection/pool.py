@@ -19,9 +19,7 @@ from bayessim_mjx.diagnosis.selection.criteria import Criteria
 from bayessim_mjx.diagnosis.selection.heats import Heats
 from bayessim_mjx.diagnosis.selection.models import Model, scored
 from bayessim_mjx.diagnosis.selection.screen import Screened, Secants
-from bayessim_mjx.diagnosis.selection.table import SPREADS, Law
 from bayessim_mjx.diagnosis.selection.tried import Settings, Tried
-from bayessim_mjx.effects import load, names
 
 Progress = Callable[[str, int, int], None]
 
@@ -209,24 +207,6 @@ def _astray(pool: Pool, fit: Fit) -> bool:
     return fit.cost > RULES.astray**2 * pool.noise * len(fit.r)
 
 
-def compatible(a: Candidate, b: Candidate) -> bool:
-    """Not the same numbers twice (an effect at one joint and tied over all)."""
-    return not {i for c in a.coordinates for i in c.index} & {i for c in b.coordinates for i in c.index}
-
-
-def beside(a: Candidate, b: Candidate) -> bool:
-    """Whether both may be in one model (`Law.beside`)."""
-    return law_of(a).beside(law_of(b))
-
-
-def law_of(candidate: Candidate) -> Law:
-    """What a decision knows of a candidate."""
-    index = frozenset(i for c in candidate.coordinates for i in c.index)
-    names = candidate.label, candidate.effect, candidate.where
-    spread = candidate.kind in SPREADS or _of_each(candidate.effect)
-    return Law(*names, len(candidate.coordinates), index, special_cases(candidate), candidate.kind, spread)
-
-
 def start_of(pool: Pool, candidate: Candidate) -> Screened:
     """The candidate with its values from its single fit as the start."""
     single = pool.models.get(frozenset([candidate.label]))
@@ -292,19 +272,3 @@ def _on(fitter: Fitter, fit: Fit) -> Fit:
         if fit.cost > 0.9 * before:
             break
     return fit
-
-
-def special_cases(effect: Candidate) -> tuple[str, ...]:
-    """Names of the effects that it contains, from its class."""
-    return _contained(effect.effect)
-
-
-@functools.cache  # thousands of pairs are compared, and all installed packages are looked through for a name
-def _contained(effect: str) -> tuple[str, ...]:
-    return tuple(getattr(load(effect), "contains", ())) if effect in names() else ()
-
-
-@functools.cache
-def _of_each(effect: str) -> bool:
-    """Whether a robot has it at every body (`Effect.each`)."""
-    return effect in names() and load(effect).each

@@ -16,8 +16,9 @@ from bayessim_mjx.diagnosis.selection.budget import LEAVING_OUT
 from bayessim_mjx.diagnosis.selection.criteria import Criteria
 from bayessim_mjx.diagnosis.selection.decide import Alternative, Decision, chosen_elsewhere, closed_elsewhere, order
 from bayessim_mjx.diagnosis.selection.fits import Fits
+from bayessim_mjx.diagnosis.selection.laws import compatible, special_cases
 from bayessim_mjx.diagnosis.selection.models import Model
-from bayessim_mjx.diagnosis.selection.pool import Pool, Progress, compatible, special_cases
+from bayessim_mjx.diagnosis.selection.pool import Pool, Progress
 from bayessim_mjx.diagnosis.selection.screen import Screened
 from bayessim_mjx.diagnosis.selection.table import Key, Table
 from bayessim_mjx.diagnosis.selection.tried import Settings, Tried
