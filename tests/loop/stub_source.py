@@ -40,6 +40,9 @@ class Stub:
         noise = noise * jnp.where(jnp.arange(len(thetas)) < FITTED, self.quiet, 1.0)[:, None]
         return jnp.stack([thetas[:, 0] + NOISE * noise[:, 0], noise[:, 1]], axis=1)
 
+    def truth_of(self, keys, count):
+        return self.truth
+
     def real(self, key, first, count, policy):
         x = self.simulate(key, jnp.full((count, 2), self.mass), policy)
         return x + jnp.asarray([0.0, self.offset]), jnp.zeros(count)
