@@ -9,9 +9,9 @@ import mujoco
 import numpy as np
 
 from bayessim_mjx.effects.effect import Effect, Quantity
-from bayessim_mjx.effects.support.bodies import heavier, native
-from bayessim_mjx.effects.support.site import Site, find
-from bayessim_mjx.parameters import attributes, editing
+from bayessim_mjx.effects.support.bodies import inertial_site, native, with_inertials
+from bayessim_mjx.effects.support.site import Site
+from bayessim_mjx.parameters import editing
 
 if TYPE_CHECKING:
     from mujoco import mjx
@@ -43,18 +43,14 @@ class InertialParameters(Effect):
     )
 
     def bind(self, mj_model: mujoco.MjModel, timestep: float, substeps: int) -> Site:
-        """The site; refuses bodies whose mass matrix was compiled as diagonal, which an offset centre would fill."""
-        at = find(self, mj_model, timestep, substeps)
-        for name, body in zip(at.names, at.ids, strict=True):
-            if mj_model.body_dofnum[body] > 1 and int(mj_model.body_simple[body]) == 1:
-                attributes.refuse_simple(mj_model, int(body), f"{name}.{self.name}")
-        return at
+        """See `inertial_site`."""
+        return inertial_site(self, mj_model, timestep, substeps)
 
     def on_model(self, at: Site, model: "mjx.Model", theta: jax.Array) -> "mjx.Model":
         values = at.values(theta)
         away, factor = values[:, :3], values[:, 3:]
         new = {"body_ipos": model.body_ipos[at.ids] + away, "body_inertia": model.body_inertia[at.ids] * factor}
-        return heavier(model, at.ids, new, jnp.any(away != 0) | jnp.any(factor != 1))
+        return with_inertials(model, at.ids, new, jnp.any(away != 0) | jnp.any(factor != 1))
 
     def edit(self, spec: mujoco.MjSpec, values: dict[str, dict[str, float]]) -> str | None:
         """Native: an explicit inertial."""

@@ -9,9 +9,9 @@ import mujoco
 import numpy as np
 
 from bayessim_mjx.effects.effect import Effect, Quantity
-from bayessim_mjx.effects.support.bodies import heavier, native
-from bayessim_mjx.effects.support.site import Site, find
-from bayessim_mjx.parameters import attributes, geometry
+from bayessim_mjx.effects.support.bodies import inertial_site, native, with_inertials
+from bayessim_mjx.effects.support.site import Site
+from bayessim_mjx.parameters import geometry
 
 if TYPE_CHECKING:
     from mujoco import mjx
@@ -86,18 +86,14 @@ class Payload(Effect):
     )
 
     def bind(self, mj_model: mujoco.MjModel, timestep: float, substeps: int) -> Site:
-        """The site; refuses bodies whose mass matrix was compiled as diagonal, which an offset mass would fill."""
-        at = find(self, mj_model, timestep, substeps)
-        for name, body in zip(at.names, at.ids, strict=True):
-            if mj_model.body_dofnum[body] > 1 and int(mj_model.body_simple[body]) == 1:
-                attributes.refuse_simple(mj_model, int(body), f"{name}.payload")
-        return at
+        """See `inertial_site`."""
+        return inertial_site(self, mj_model, timestep, substeps)
 
     def on_model(self, at: Site, model: "mjx.Model", theta: jax.Array) -> "mjx.Model":
         load, arm = at.values(theta)[:, 0], at.values(theta)[:, 1:]
         mass, inertia, ipos, iquat = (getattr(model, field)[at.ids] for field in FIELDS)
         new = jax.vmap(_loaded)(mass, inertia, ipos, iquat, load, arm)
-        return heavier(model, at.ids, dict(zip(FIELDS, new, strict=True)), jnp.any(load > 0))
+        return with_inertials(model, at.ids, dict(zip(FIELDS, new, strict=True)), jnp.any(load > 0))
 
     def edit(self, spec: mujoco.MjSpec, values: dict[str, dict[str, float]]) -> str | None:
         """Native: a body without joints, with that mass and no extent."""

@@ -46,7 +46,7 @@ class Surrogate:
         Parameters vary from trajectory to trajectory (`env.realParams.stds`), by more than a posterior may be wide.
         Those of the heaviest component count; its mean where it made none.
         """
-        drawn = [self._drawn(self._keys_of_real(key)[0], count) for key in keys]
+        drawn = [self._drawn(jax.random.split(key)[0], count) for key in keys]
         component, theta = (
             np.concatenate([np.asarray(part, float) for part in parts]) for parts in zip(*drawn, strict=True)
         )
@@ -128,15 +128,9 @@ class Surrogate:
     def real(self, key: Array, first: int, count: int, policy: Policy) -> tuple[Array, Trajectory]:
         """`count` real trajectories and their features [count, D]; `first` of them were asked for before."""
         del first
-        k_theta, k_roll = self._keys_of_real(key)
+        k_theta, k_roll = jax.random.split(key)
         trajectory = self._observe(k_roll, self.sample(k_theta, count), policy)
         return summarise(self.summarizer, trajectory), trajectory
-
-    @staticmethod
-    def _keys_of_real(key: Array) -> tuple[Array, Array]:
-        """Of the parameters, and of the motion."""
-        k_theta, k_roll = jax.random.split(key)
-        return k_theta, k_roll
 
     def repeated(self, first: int, real: Trajectory, thetas: Array) -> dict[str, Array]:
         """The first of the trajectories `real` replayed at thetas [n, d]: its motion, see `rollout.replay`."""

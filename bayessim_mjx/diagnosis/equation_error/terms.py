@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import mujoco
 import numpy as np
@@ -35,8 +34,6 @@ class Ranges:
     zero: float = 0.05  # rad, standard deviation of a joint's zero and of a base's tilt
     share: float = 1.0  # of the load that dry friction may be
     tilt: float = 0.3  # rad
-    centre: float = 0.05  # of a body's size, standard deviation of its centre of mass; inertia: of the inertia about it
-    inertia: float = 0.1
     late: float = 3.0  # periods: standard deviation of how late efforts are
 
 
@@ -138,20 +135,14 @@ def scale(effect: str, where: str, on: NDArray[np.bool_], sd: float = np.inf) ->
 
 def payloads(model: mujoco.MjModel, layout: Layout, carried: Array) -> list[Term]:
     """A point mass on each body: its mass, and its mass times where it sits from the body's own centre of mass."""
-    bodies, data = rigid.moving_bodies(model), mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    mujoco.mj_comPos(model, data)
     out = []
-    for body in range(1, model.nbody):
-        base = int(model.body_weldid[body])
-        if base == 0 or carried[body] <= 0 or (body != base and model.body_mass[body] <= 0):
+    for body, base, centre, turn, _ in _placed(model):
+        bare = model.body_weldid[body] != body and model.body_mass[body] <= 0
+        if carried[body] <= 0 or bare:
             continue
-        frame = data.xmat[base].reshape(3, 3)
-        centre = frame.T @ (data.xipos[body] - data.xpos[base])
-        turn = frame.T @ data.xmat[body].reshape(3, 3)
         reach = loads.reach(model, body)
         most = float(carried[body])
-        shape = _load(layout, bodies.index(base), centre, turn)
+        shape = _load(layout, base, centre, turn)
         low, high = np.array([0.0, *(3 * [-np.inf])]), np.array([most, *(3 * [np.inf])])
         name = element_names(model, "body")[body]
         sd, within = _spread(most, reach), _within(reach)
@@ -161,46 +152,37 @@ def payloads(model: mujoco.MjModel, layout: Layout, carried: Array) -> list[Term
 
 def links(model: mujoco.MjModel, layout: Layout) -> list[Term]:
     """The centre of mass of each body, and the inertia about it, as accurate as data sheets are (effects)."""
-    bodies, data = rigid.moving_bodies(model), mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    mujoco.mj_comPos(model, data)
-    out = []
-    for body in range(1, model.nbody):
-        base, mass = int(model.body_weldid[body]), float(model.body_mass[body])
-        if base == 0 or mass <= 0:
+    out, none = [], np.zeros((3, 3))
+    *places, inertia = library.load("inertial_parameters").quantities
+    for body, base, centre, turn, axes in _placed(model):
+        mass = float(model.body_mass[body])
+        if mass <= 0:
             continue
-        frame = data.xmat[base].reshape(3, 3)
-        centre = frame.T @ (data.xipos[body] - data.xpos[base])
-        turn = frame.T @ data.xmat[body].reshape(3, 3)
-        axes = frame.T @ data.ximat[body].reshape(3, 3)
-        about = axes @ np.diag(model.body_inertia[body]) @ axes.T
-        shape = np.zeros((layout.nv, layout.size, 4))
-        own, none = layout.body(bodies.index(base)), np.zeros((3, 3))
+        shape, own = np.zeros((layout.nv, layout.size, 4)), layout.body(base)
         for k, axis in enumerate(turn.T):
-            shape[:, own, k] = (
-                rigid.inertial(mass, centre + axis, none) - rigid.inertial(mass, centre - axis, none)
-            ) / 2
-        shape[:, own, 3] = rigid.inertial(0.0, centre, about)
-        sd = np.array([*3 * [RANGES.centre * loads.size(model, body)], RANGES.inertia])
-        ends, name = np.full(4, np.inf), element_names(model, "body")[body]
-        out.append(
-            Term(
-                "inertial_parameters",
-                name,
-                partial(_same, shape),
-                4,
-                sd=partial(_same, sd),
-                low=-ends,
-                high=ends,
-                read=_link,
-            )
-        )
+            ends = [rigid.inertial(mass, centre + sign * axis, none) for sign in (1, -1)]
+            shape[:, own, k] = (ends[0] - ends[1]) / 2  # exact: it is quadratic
+        shape[:, own, 3] = rigid.inertial(0.0, centre, axes @ np.diag(model.body_inertia[body]) @ axes.T)
+        sd = np.array([*(q.deviation * loads.size(model, body) for q in places), inertia.deviation])
+        name = element_names(model, "body")[body]
+        out.append(_wide("inertial_parameters", name, shape, -np.inf, np.inf, _link, sd=sd))
     return out
 
 
-def _same(value: Array, last: Array) -> Array:
-    """Whatever the last round found."""
-    return value
+def _placed(model: mujoco.MjModel) -> Iterator[tuple[int, int, Array, Array, Array]]:
+    """All bodies that move: (body, number of the moving body it is or is welded to, centre, axes, axes of inertia).
+
+    Its centre of mass `[3]` and both axes `[3, 3]` are in the axes of that moving body, from its origin.
+    """
+    bodies, data = rigid.moving_bodies(model), mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    for body in range(1, model.nbody):
+        base = int(model.body_weldid[body])
+        if base:
+            frame = data.xmat[base].reshape(3, 3).T
+            turn, axes = (frame @ x[body].reshape(3, 3) for x in (data.xmat, data.ximat))
+            yield body, bodies.index(base), frame @ (data.xipos[body] - data.xpos[base]), turn, axes
 
 
 def _link(c: Array) -> Mapping[str, float]:
@@ -285,10 +267,16 @@ def _fixed(effect: str, where: str, column: Array, low: float = -np.inf, sd: flo
 
 
 def _wide(
-    effect: str, where: str, maps: Array, low: float | Array, high: float | Array, read: object, sd: float = np.inf
+    effect: str,
+    where: str,
+    maps: Array,
+    low: float | Array,
+    high: float | Array,
+    read: object,
+    sd: float | Array = np.inf,
 ) -> Term:
     """A term of several coefficients and maps `[nv, P, k]`."""
     k = maps.shape[-1]
     ends = np.broadcast_to(low, (k,)).astype(float), np.broadcast_to(high, (k,)).astype(float)
-    believed = np.full(k, sd)
+    believed = np.broadcast_to(sd, (k,)).astype(float)
     return Term(effect, where, lambda c: maps, k, sd=lambda c: believed, low=ends[0], high=ends[1], read=read)  # type: ignore[arg-type]

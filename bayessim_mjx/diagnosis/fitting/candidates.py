@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from bayessim_mjx import effects as library
 from bayessim_mjx.diagnosis.fitting.scales import Scales, ranges
 from bayessim_mjx.effects.effect import Block, Effect, Quantity
+from bayessim_mjx.effects.support.quantity import STATED
 from bayessim_mjx.effects.support.site import element_names, places
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.parameters import Parameter, ParameterSpace
@@ -176,8 +177,8 @@ def _candidate(effect: Effect, where: str, blocks: Sequence[Block]) -> Candidate
 
 
 def _stated(c: Coordinate) -> Coordinate:
-    """As a data sheet states it: an eighth of the range (`Quantity.stated`)."""
-    return replace(c, precision=(8.0 / (c.high - c.low)) ** 2, stated=True)
+    """As a data sheet states it (`Quantity.stated`)."""
+    return replace(c, precision=(STATED / (c.high - c.low)) ** 2, stated=True)
 
 
 def shrink(c: Coordinate) -> float:

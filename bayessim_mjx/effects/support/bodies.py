@@ -7,12 +7,15 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from bayessim_mjx.parameters import constants
+from bayessim_mjx.effects.support.site import Site, find
+from bayessim_mjx.parameters import attributes, constants
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from mujoco import mjx
+
+    from bayessim_mjx.effects.effect import Effect
 
 
 def moved(model: mujoco.MjModel) -> np.ndarray:
@@ -40,7 +43,19 @@ def _arm(model: mujoco.MjModel, data: "mjx.Data", ids: np.ndarray) -> jax.Array:
     return data.xipos[ids] - data.subtree_com[model.body_rootid[ids]]
 
 
-def heavier(model: "mjx.Model", ids: np.ndarray, new: "dict[str, jax.Array]", present: jax.Array) -> "mjx.Model":
+def inertial_site(effect: "Effect", model: mujoco.MjModel, timestep: float, substeps: int) -> Site:
+    """The site of bodies whose inertials change.
+
+    It refuses those whose mass matrix was compiled as diagonal, which an offset centre of mass would fill.
+    """
+    at = find(effect, model, timestep, substeps)
+    for name, body in zip(at.names, at.ids, strict=True):
+        if model.body_dofnum[body] > 1 and int(model.body_simple[body]) == 1:
+            attributes.refuse_simple(model, int(body), f"{name}.{effect.name}")
+    return at
+
+
+def with_inertials(model: "mjx.Model", ids: np.ndarray, new: "dict[str, jax.Array]", present: jax.Array) -> "mjx.Model":
     """With inertial fields `{body_mass, ...: [n, ...]}` of bodies and all that MuJoCo derives from them.
 
     present: scalar bool; where it is False the compiler's own numbers stay, not their recomputation in float32.

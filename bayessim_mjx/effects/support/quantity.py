@@ -3,6 +3,8 @@
 import dataclasses
 import math
 
+STATED = 8.0  # standard deviations of what a data sheet states, in the width of its range
+
 
 @dataclasses.dataclass(frozen=True)
 class Quantity:
@@ -24,7 +26,7 @@ class Quantity:
             effect is off whatever this one is; `grid` is then in fractions of the range from low to high.
         at_least: ends of the range that `reach` gives are raised to `low` and `high` where they are below.
         most: end that physics sets, whatever the range is (friction that outgrows its load).
-        stated: a data sheet states it, within an eighth of the range (standard deviation).
+        stated: a data sheet states it: its prior is Gaussian, and STATED of its standard deviations make the range.
         remembered: the range sizes the effect's memory, so that no fit can go beyond it.
     """
 
@@ -42,6 +44,12 @@ class Quantity:
     most: float = math.inf
     stated: bool = False
     remembered: bool = False
+
+    @property
+    def deviation(self) -> float:
+        """Standard deviation of what is `stated`, in multiples of `per`."""
+        low, high = self.reach or (self.low, self.high)
+        return (high - low) / STATED
 
     def ends(self) -> tuple[float, float]:
         """Where physics ends: at neutral, where the range does; at 0 for what is positive; at `most`."""
