@@ -59,7 +59,7 @@ def _parser() -> cli.PlainParser:
         nargs="+",
         default=[],
         help="how accurate known parameters are (standard deviation): 5%%, mass=2%%, elbow*=20%% (default: 5%% of a "
-        "model's own numbers; the ranges of a task or of --parameters)",
+        "model's own numbers; the ranges of --parameters)",
     )
     parser.add_argument(
         "--payload",

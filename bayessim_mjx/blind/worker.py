@@ -38,7 +38,7 @@ def command(check: Check, data: Path, out: Path) -> list[str]:
             words = [w.replace(name, path) for w in words]
         return [str(Path(w).resolve()) if Path(w).is_file() else w for w in words]  # it runs in another folder
     robot = ["--task", check.task] if check.task else ["--model", model]
-    accuracy = ["--accuracy", f"{100 * check.accuracy:g}%"] if not check.task else []
+    accuracy = ["--accuracy", f"{100 * check.accuracy:g}%"]
     own = [sys.executable, "-m", "bayessim_mjx.diagnose", *robot, "--data", str(data), "--out", str(out)]
     return [*own, *accuracy, "--seed", "0", "--headless", *check.more]
 

@@ -180,6 +180,13 @@ class Effect(abc.ABC):
         """
         return memory, measurement
 
+    def echoes(self, at: Site, theta: jax.Array) -> jax.Array:
+        """`[nv]`, control steps after a start in a log for which what is shown is older than the start.
+
+        It can only be read from the recording then, and agrees with it whatever the simulator does.
+        """
+        return jnp.zeros(at.nv)
+
     def edit(self, spec: "mujoco.MjSpec", values: dict[str, dict[str, float]]) -> str | None:
         """Write the effect into `spec` where MuJoCo can express it natively; `values[place][quantity]`.
 

@@ -55,6 +55,9 @@ class SensorDelay(Effect):
         filled = {"history": true[past], "fresh": jnp.zeros((), bool)}
         return filled, motion.replace(**written(at, motion.qpos, motion.qvel, true))
 
+    def echoes(self, at: Site, theta: jax.Array) -> jax.Array:
+        return jnp.zeros(at.nv).at[at.dadr].set(at.values(theta)[:, 0] / jnp.float32(at.dt))
+
     def on_measurement(
         self, at: Site, memory: Any, measurement: Measurement, theta: jax.Array
     ) -> tuple[Any, Measurement]:

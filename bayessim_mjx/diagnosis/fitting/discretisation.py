@@ -90,6 +90,12 @@ class Discretisation:
         known = np.isfinite(self.sigma) & ~np.tile(self.simulated, 2)
         return float(np.clip(np.median(self.sigma[known] / self.floor[known]), RULES.sure, 1.0)) if known.any() else 1.0
 
+    @property
+    def shows(self) -> bool:
+        """Whether what the sub-steps leave shows beside the sensors' noise; logs of a simulation may have this step."""
+        told = np.isfinite(self.sigma) & ~np.tile(self.simulated, 2)
+        return bool((self.left[told] > RULES.enough * self.sigma[told]).any())
+
     def warnings(self) -> list[str]:
         """In words, where the simulator's own time step is worth more than the noise."""
         nv = len(self.channels)

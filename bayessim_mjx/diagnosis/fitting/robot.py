@@ -120,7 +120,8 @@ def of_task(env: "Task", parameters: str | Path | None = None) -> Robot:
         raise UserError(f"--task {env.name}: it has no MuJoCo model of ours; give its MJCF with --model")
     check(env.mj_model, f"--task {env.name}")
     space, limit = _space(env.mj_model, parameters), env.physics.max_qvel
-    return Robot(env.mj_model, env.spec, env.dt, space, env.name, None if limit is None else limit.tolist())
+    robot = Robot(env.mj_model, env.spec, env.dt, space, env.name, None if limit is None else limit.tolist())
+    return robot._from_data_sheet(parameters is None)
 
 
 def of_file(path: str | Path, parameters: str | Path | None = None) -> Robot:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from bayessim_mjx.compat import compiler_options
 from bayessim_mjx.device import on_cores
 from bayessim_mjx.diagnosis.fitting.windows import Batch, Windows
+from bayessim_mjx.effects.effect import overrides
 from bayessim_mjx.physics import Drive, Physics, begin, control_step, early, past_of
 from bayessim_mjx.physics.tangent import difference, integrate
 
@@ -91,8 +92,20 @@ class Simulator:
         nothing = tuple(jnp.zeros((count, n)) for n in (model.nq, model.nv, model.nu))
         _, (qpos, qvel, effort) = jax.lax.fori_loop(past.first, lead + count, step, (past.world, nothing))
         error = jax.vmap(lambda a, b: difference(model, a, b))(own.qpos, qpos)
-        errors = jnp.concatenate([error, own.qvel - qvel], axis=1)
+        errors = self._predicted(jnp.concatenate([error, own.qvel - qvel], axis=1), world.theta)
         return jnp.nan_to_num(errors, nan=FAR, posinf=FAR, neginf=-FAR), effort
+
+    def _predicted(self, errors: jax.Array, theta: jax.Array) -> jax.Array:
+        """Errors `[H, 2 nv]` in which what only echoes the recording counts as the first row that is predicted does."""
+        echoing = [i for i, effect in enumerate(self.physics.effects) if overrides(effect, "echoes")]
+        if not echoing:
+            return errors
+        each, sites = self.physics.split(theta)[1], self.physics.sites
+        steps = sum(self.physics.effects[i].echoes(sites[i], each[i]) for i in echoing)
+        count = len(errors)
+        first = jnp.clip(jnp.ceil(jnp.asarray(steps) - 1e-3).astype(jnp.int32) - 1, 0, count - 1)
+        row = jnp.maximum(jnp.arange(count)[:, None], jnp.tile(first, 2))
+        return jnp.take_along_axis(errors, row, axis=0)
 
     def run(
         self,

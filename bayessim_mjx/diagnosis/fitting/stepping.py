@@ -43,12 +43,18 @@ class Stepping:
 
 
 def stepping(robot: Robot, dt: float, logs: Sequence[Log], measured: Measured) -> Stepping:
-    """The coarsest stable step; where no sub-steps bring it below the tolerance and nothing can touch, RK4."""
+    """The coarsest stable step; where what no sub-steps remove shows, and nothing can touch, RK4.
+
+    It would count as noise else, and in a noise that is larger than the sensors' what two integrators differ by (a
+    fraction of a millisecond, usually) is found as an effect.
+    """
     stable = stability.needed(robot.physics(dt).mj_model, logs)
     robot = stable.robot(robot)
     own = robot.physics(dt)
     plain = Stepping(robot, stable, *measured(own, stable.factor))
-    if not plain.worth.beyond() or contacts(own) or int(own.mj_model.opt.integrator) == stability.RK4:
+    if not (plain.worth.beyond() or plain.worth.shows):
+        return plain
+    if contacts(own) or int(own.mj_model.opt.integrator) == stability.RK4:
         return plain
     model = copy.copy(robot.mj_model)
     model.opt.integrator = stability.RK4
@@ -58,7 +64,7 @@ def stepping(robot: Robot, dt: float, logs: Sequence[Log], measured: Measured) -
     if needs.changed or not needs.reached:
         return plain
     found = measured(physics, needs.factor)
-    if found[1].beyond():
+    if found[1].beyond() or (found[1].shows and not plain.worth.beyond()):
         return plain
     step = 1e3 * found[1].timestep / found[1].factor
     text = f"no sub-steps of the model's integrator are fine enough: the diagnosis simulates by RK4 at {step:.3g} ms"

@@ -210,3 +210,23 @@ def test_runge_and_kutta_step_in_where_sub_steps_do_not_suffice():
     assert tried[-1] == mujoco.mjtIntegrator.mjINT_RK4 and len(tried) == 2
     assert not found.worth.beyond() and "by RK4 at" in found.said()[0]
     assert found.robot.mj_model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
+
+
+@pytest.mark.parametrize(("noise", "by"), [(NOISE, "mjINT_IMPLICITFAST"), (1e-5, "mjINT_RK4")])
+def test_runge_and_kutta_step_in_where_what_sub_steps_leave_shows_beside_the_noise(noise, by):
+    """All of it is far within the tolerance; as noise it would hide what the sensors see."""
+    recorded, limit = logs(ARM, swing, noise=noise), np.full(2, 0.05)
+    found = stepping.stepping(
+        the(ARM), PERIOD, recorded, lambda own, first: _measured(own, recorded, None, False, first, limit)
+    )
+    assert found.robot.mj_model.opt.integrator == getattr(mujoco.mjtIntegrator, by)
+    assert not found.worth.shows and found.worth.believed > 0.9
+
+
+def test_logs_of_a_simulation_keep_its_integrator():
+    """Without noise nobody knows whether their step was this one."""
+    recorded, limit = logs(ARM, swing, finer=1, noise=0.0), np.full(2, 0.05)
+    found = stepping.stepping(
+        the(ARM), PERIOD, recorded, lambda own, first: _measured(own, recorded, None, False, first, limit)
+    )
+    assert found.robot.mj_model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST

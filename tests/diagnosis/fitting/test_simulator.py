@@ -73,6 +73,22 @@ def test_a_right_simulator_follows_mujoco_at_a_tenth_of_the_step(setup):
     assert np.sqrt(np.mean(errors[..., 0] ** 2)) < 0.1 * late * np.sqrt(np.mean(speed**2))
 
 
+def test_what_a_late_sensor_repeats_of_the_recording_is_no_prediction(tmp_path):
+    """Of 2.5 control steps the first two are older than the start: they came from the log and agreed with it."""
+    logs = recorded(count=2, seconds=2.0, sigma=5e-3)
+    ready = prepare(nominal(tmp_path), logs, ["sensor_delay"])
+    simulator = ready.fitter.simulator
+    names = list(simulator.physics.space.names)
+    (late,) = [i for i, name in enumerate(names) if name.endswith("sensor_delay.delay")]
+    theta = np.asarray(simulator.physics.space.nominal, np.float64)
+    thetas = np.stack([theta, theta])
+    thetas[1, late] = 2.5 * simulator.windows.dt
+    at_once, later = simulator.run(thetas)
+    assert np.abs(at_once[:, 0] - at_once[:, 2]).min() > 0
+    np.testing.assert_array_equal(later[:, :2], np.repeat(later[:, 2:3], 2, axis=1))
+    assert np.sqrt(np.mean(later[:, 0, 0] ** 2)) > 2e-3  # half the encoder's noise and more, in place of none
+
+
 def test_a_force_is_the_torque_of_a_motor(simulator):
     theta, cut = simulator.physics.space.nominal, simulator.windows
     force = np.full((1, len(cut), cut.steps, 1), 0.05)
