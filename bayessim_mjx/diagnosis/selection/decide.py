@@ -99,9 +99,10 @@ def _drop(old: Array, new: Array, noise: float) -> float:
 def settled(table: Table, key: Key, criteria: Criteria) -> bool:
     """Whether a model leaves too little to be worth explaining.
 
-    Errors of the time step may be smaller than feared: what has effects has to reach the sensors' noise.
+    Errors of the time step may be smaller than feared: what has effects has to reach the sensors' noise, or, where that
+    is not to be reached either, what another model shows that it can.
     """
-    share = table.believed if key else 1.0
+    share = min(table.believed, table.reached) if key else 1.0
     return table.excess(key) + 1.0 <= (share * criteria.floor) ** 2
 
 

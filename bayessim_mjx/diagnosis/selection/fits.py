@@ -40,6 +40,7 @@ class Limits:
     many: int = 5  # models of one call that are fitted from many starts
     # models within this factor of the least cost are asked whether their effects are there
     contenders: float = 3.0
+    steps: float = 0.1  # of the simulator's time steps: a shorter lag or delay is what integrators differ by
 
 
 LIMITS = Limits()
@@ -93,13 +94,15 @@ class Fits:
             model = self.pool.models[key]
             others = [c for c in self.pool.candidates if all(beside(c, e) for e in model.effects)]
             pool = self.pool
-            found = screen(pool.fitter, model.fit, others, pool.settings.screened, self.say, pool.secants)
+            begun = pool.begun(model.fit)
+            found = screen(pool.fitter, begun, others, pool.settings.screened, self.say, pool.secants)
             self._screened[key] = found
         return {s.candidate.label: s.gain for s in self._screened[key] if s.gain > 0}
 
     def together(self, most: int, count: int) -> list[Key]:
         """Sets of effects that promise most when all amplitudes are free at once (`dense`)."""
-        found = dense.supports(self.pool.base.fit, self.pool.screened, self.pool.settings.screened, most, count)
+        fit = self.pool.begun(self.pool.base.fit)
+        found = dense.supports(fit, self.pool.screened, self.pool.settings.screened, most, count)
         self._amounts = {frozenset(s.candidate.label for s in starts): tuple(starts) for starts in found}
         return list(self._amounts)
 
@@ -195,10 +198,14 @@ class Fits:
 
 
 def distances(pool: Pool, model: Model) -> dict[str, float]:
-    """{effect: standard deviations that its best told amplitude is away from neutral}."""
+    """{effect: standard deviations that its best told amplitude is away from neutral}.
+
+    A time below a share (`steps`) of the simulator's own step is none: two integrators differ by so much.
+    """
     if not model.effects:
         return {}
     sd = deviations(pool.fitter, model)
+    instant = LIMITS.steps * float(pool.fitter.simulator.physics.mj_model.opt.timestep)
     out = {}
     for effect in model.effects:
         own = [
@@ -207,7 +214,9 @@ def distances(pool: Pool, model: Model) -> dict[str, float]:
             if not shape
         ]
         neutral = [c.neutral for c, shape in zip(effect.coordinates, effect.shapes, strict=True) if not shape]
-        off = [abs(model.fit.values[i] - n) / max(sd[i], 1e-300) for i, n in zip(own, neutral, strict=True)]
+        away = {i: abs(model.fit.values[i] - n) for i, n in zip(own, neutral, strict=True)}
+        units = {i: model.fit.coordinates[i].unit for i in own}
+        off = [x / max(sd[i], 1e-300) for i, x in away.items() if units[i] != "s" or x > instant]
         out[effect.label] = float(max(off, default=0.0))
     return out
 

@@ -77,8 +77,7 @@ class Pool(Tried):
         Starts farther off than their noise are those that a fit needs while it lacks an effect. They keep the effect
         from the logs, as over contacts no step leads back to where they were.
         """
-        away = float(np.mean((fit.offsets / self.fitter.spread) ** 2))
-        if not self.rough or away < RULES.left:
+        if not self.rough or np.mean((fit.offsets / self.fitter.spread) ** 2) < RULES.left:
             return fit
         if fit not in self._measured:
             self._measured[fit] = self.fitter.begin(fit.coordinates, fit.values)

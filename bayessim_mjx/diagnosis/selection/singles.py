@@ -51,7 +51,7 @@ def begin(
         fit = pool.base.fit
     pool.models[frozenset()] = pool.base
     keep(pool)
-    pool.screened = screen(fitter, fit, candidates, settings.screened, say, pool.secants)
+    pool.screened = screen(fitter, pool.begun(fit), candidates, settings.screened, say, pool.secants)
     return pool
 
 

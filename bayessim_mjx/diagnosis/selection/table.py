@@ -93,6 +93,11 @@ class Table:
         """Independent residuals of the model of least error, which stand for those of all where models are ranked."""
         return min(self.rows.values(), key=lambda r: r.total).samples
 
+    @cached_property
+    def reached(self) -> float:
+        """Bound of the noise (rms, as a share of what was taken for it): what the best model leaves; 1 at most."""
+        return float(min(1.0, *(np.sqrt(1.0 + self.excess(k)) for k in self.rows)))
+
     def excess(self, key: Key) -> float:
         """Held-out cost above the noise, as a multiple of the noise: squared gap that the model leaves."""
         return self.rows[key].total / (self.noise * len(self.group)) - 1.0

@@ -140,8 +140,13 @@ def test_a_model_of_which_an_effect_is_hardly_there_is_not_named():
 
 
 def test_with_effects_the_sensors_own_noise_is_reached_where_the_time_step_costs_less_than_feared():
-    errors = {(): 100, (A,): 1.5, (A, B): 0.3}
+    errors = {(): 100, (A,): 1.5, (A, B): 1.0}
     assert named(errors) == labels(A) and named(errors, believed=0.5) == labels(A, B)
+
+
+def test_where_a_model_leaves_less_than_the_noise_the_noise_was_taken_too_large():
+    assert named({(): 100, (A,): 1.5, (A, B): 0.3}) == labels(A, B)
+    assert named({(): 100, (A,): 0.4, (A, B): 0.3}) == labels(A)  # 1.15 of the best, rms
 
 
 def test_of_what_predicts_alike_the_one_that_data_sheets_forbid_is_no_rival():

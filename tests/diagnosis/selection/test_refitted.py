@@ -27,7 +27,11 @@ class Bent:
         self.bend, self.start = bend, start
         self.true, self.roughness, self.felt = np.asarray(true)[GROUP], roughness, np.broadcast_to(felt, 4)[GROUP]
         noise = 0.01 * np.random.default_rng(0).normal(size=MOTION.shape)
-        self.noise, self.physics, self.rollouts = noise, SimpleNamespace(), 0
+        self.noise, self.physics, self.rollouts = (
+            noise,
+            SimpleNamespace(mj_model=SimpleNamespace(opt=SimpleNamespace(timestep=0.01))),
+            0,
+        )
         self.windows = Windows()
 
     def run(self, thetas, offsets, own=None):

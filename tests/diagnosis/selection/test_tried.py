@@ -16,14 +16,24 @@ def candidate(effect, where):
     return SimpleNamespace(effect=effect, where=where, label=f"{effect}@{where}", coordinates=())
 
 
-@pytest.mark.parametrize(("value", "far"), [(1.1, 10.0), (0.985, 1.5)])
-def test_an_effect_is_there_by_how_far_its_amplitudes_are_off_neutral(monkeypatch, value, far):
+def fitter_at(step):
+    model = SimpleNamespace(opt=SimpleNamespace(timestep=step))
+    return SimpleNamespace(simulator=SimpleNamespace(physics=SimpleNamespace(mj_model=model)))
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "far"), [(1.1, "", 10.0), (0.985, "", 1.5), (1.00021, "s", 0.021), (1.00019, "s", 0.0)]
+)
+def test_an_effect_is_there_by_how_far_its_amplitudes_are_off_neutral(monkeypatch, value, unit, far):
+    """And a lag or delay from a tenth of the simulator's time step on: two integrators differ by less."""
     monkeypatch.setattr(fits, "deviations", lambda fitter, model: np.array([0.3, 0.01, 1e-9]))
-    gain, speed = SimpleNamespace(name="gain", neutral=1.0), SimpleNamespace(name="speed", neutral=0.0)
+    gain, speed = (SimpleNamespace(name=n, neutral=float(n == "gain")) for n in ("gain", "speed"))
     effect = SimpleNamespace(label="effect", coordinates=[gain, speed], shapes=[False, True])  # a shape says nothing
-    fit = SimpleNamespace(names=["mass", "gain", "speed"], values=np.array([1.0, value, 5.0]))
+    names = ["mass", "gain", "speed"]
+    coordinates = [SimpleNamespace(name=n, unit=u) for n, u in zip(names, ["kg", unit, "rad/s"], strict=True)]
+    fit = SimpleNamespace(names=names, values=np.array([1.0, value, 5.0]), coordinates=coordinates)
     model = SimpleNamespace(fit=fit, effects=(effect,))
-    assert fits.distances(SimpleNamespace(fitter=None), model) == {"effect": pytest.approx(far)}
+    assert fits.distances(SimpleNamespace(fitter=fitter_at(0.002)), model) == {"effect": pytest.approx(far)}
 
 
 @pytest.mark.parametrize(("rms", "believed", "goes_on"), [(1.2, 1.0, False), (1.4, 1.0, True), (1.2, 0.4, True)])
