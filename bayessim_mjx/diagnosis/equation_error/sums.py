@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -19,11 +20,12 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Budget:
-    """How much is looked at, and in how many parts one log is held out."""
+    """How much is looked at, and in how many parts logs are held out."""
 
     rows: int = 12000  # of all logs together, at their own rates
     folds: int = 3  # with fewer logs, each is cut into parts
     parts: int = 4
+    most: int = 12  # parts of all logs together: those of more logs are held out side by side
     least: float = 6.0  # independent rows of a joint in a part
 
 
@@ -32,7 +34,7 @@ BUDGET = Budget()
 
 @dataclass(frozen=True, eq=False)
 class Sums:
-    """Products of the columns, `gram` `[F, nv, P, P]`, each row counted as so many independent ones as it is.
+    """Products of the columns, `gram` `[F, nv, P, P]` by parts, each row counted as so many independent ones.
 
     Attributes:
         rows: `[F, nv]`, independent rows; source: `[nv]`, where the effort comes from (`columns.sources`).
@@ -80,7 +82,14 @@ def gather(logs: Sequence[Log], model: mujoco.MjModel) -> Sums:
                 gram[v], count[v] = own.share * x.T @ x, own.share * len(x)
             grams.append(gram)
             rows.append(count)
-    return Sums(layout, np.array(grams), np.array(rows), source, float(np.median([log.period for log in logs])))
+    period = float(np.median([log.period for log in logs]))
+    return Sums(layout, _in_parts(grams), _in_parts(rows), source, period)
+
+
+def _in_parts(each: Sequence[Array]) -> Array:
+    """Sums of neighbours, at most `BUDGET.most`."""
+    ends = np.linspace(0, len(each), min(len(each), BUDGET.most) + 1).round().astype(int)
+    return np.array([np.sum(each[a:b], 0) for a, b in itertools.pairwise(ends)])
 
 
 def _common(each: Sequence[str]) -> str:

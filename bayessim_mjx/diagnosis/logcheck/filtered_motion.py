@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation
 from scipy.signal import butter, filtfilt, welch
 
 from bayessim_mjx.logs.log import Array, Log
@@ -82,7 +83,9 @@ def motion(log: Log, mj_model: mujoco.MjModel, cutoff: float | None = None) -> M
     edge = (grid > grid[0] + 0.5 / cutoff) & (grid < grid[-1] - 0.5 / cutoff)
     on = np.interp(grid, log.time, lowpass(log.enabled.astype(float), log.period, cutoff)) > 0.99
     out = Motion(grid[rows], qpos[rows], qvel[rows], qacc[rows], (edge & on)[rows], cutoff)
-    return replace(out, free=out.free & ~_constrained(mj_model, out.qpos))
+    near = max(1, round(0.5 / (cutoff * out.step)))  # rows that the filter blends what is free with
+    touched = binary_dilation(_constrained(mj_model, out.qpos), iterations=near)
+    return replace(out, free=out.free & ~touched)
 
 
 def _even(log: Log, arrays: tuple[Array, ...]) -> tuple[Array, list[Array]]:

@@ -125,6 +125,7 @@ def _grow(fits: Fitting, criteria: Criteria) -> Key:
         table = fits.table
         beam = _going_on(table, best, criteria)
         plans = [p for k in beam for p in _added(fits, k, criteria.width - 2 * (k != best))]
+        plans += _added(fits, best, criteria.width, tied=True)
         if size == 1:
             plans += [Plan(k) for k in fits.together(min(ATONCE, criteria.most), criteria.beam)]
             plans += _everywhere(fits, BASE, criteria) if laws(table, best) < 2 else []
@@ -145,8 +146,14 @@ def _going_on(table: Table, best: Key, criteria: Criteria) -> list[Key]:
     return [k for k in beam if laws(table, k) >= laws(table, best) or table.rows[k].total < near]
 
 
-def _added(fits: Fitting, key: Key, count: int) -> list[Plan]:
-    return [Plan(key | {label}, key) for label in fits.additions(key)[: max(count, 1)]]
+def _added(fits: Fitting, key: Key, count: int, tied: bool = False) -> list[Plan]:
+    """The most promising additions; tied: of laws that are the same everywhere.
+
+    These are few, and of many joints each promises more of its own than what all of them have in common.
+    """
+    table = fits.table
+    some = [x for x in fits.additions(key) if not tied or table.laws[x].where == "all"]
+    return [Plan(key | {label}, key) for label in some[: max(count, 1)]]
 
 
 def _in_place(fits: Fitting, rest: Key, best: Key, count: int) -> list[Plan]:
