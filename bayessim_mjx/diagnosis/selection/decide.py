@@ -193,9 +193,9 @@ def decide(table: Table, less: Order, criteria: Criteria) -> Decision:
         shown = {k for k in table.rows if not same(table, BASE, k, criteria)}
         alike = [k for k in alike if k in shown] if shown & rows.keys() else alike
     equal = [k for k in alike if k in rows] or [best]
-    answer = least(table, equal, less)
+    answer = least(table, equal, less, criteria)
     alike = [*alike, *(k for k in table.rows if k not in alike and _beside(table, k, answer, criteria))]
-    answer = least(table, [answer, *(k for k in alike if k in rows and k not in equal)], less)
+    answer = least(table, [answer, *(k for k in alike if k in rows and k not in equal)], less, criteria)
     trace.append(f"the same as the best: {len(equal)}; least: {_told(answer)}, leaves {table.excess(answer):.3g}")
     return Decision(answer, best, rivals(table, alike, answer, less), table, tuple(trace))
 
@@ -205,11 +205,19 @@ def _beside(table: Table, key: Key, answer: Key, criteria: Criteria) -> bool:
     return bool(key) and len(key) <= len(answer) and not key <= answer and _as_good(table, key, answer, criteria)
 
 
-def least(table: Table, equal: Iterable[Key], less: Order) -> Key:
-    """Of models that are the same, one that no other is less than: fewest effects, then numbers, then most evidence."""
+def least(table: Table, equal: Iterable[Key], less: Order, criteria: Criteria) -> Key:
+    """Of models that are the same, one that no other is less than: fewest effects, then numbers, then most evidence.
+
+    Above the noise one with more numbers, but no more effects, goes before it where the evidence tells that it is better
+    (`real`): what it closes more is not worth another effect, but tells which one it is.
+    """
     equal = list(equal)
     lowest = [k for k in equal if not any(less(other, k) for other in equal)]
-    return min(lowest, key=lambda k: (len(k), table.rows[k].size, -evidence(table, k), sorted(k)))
+    first = min(lowest, key=lambda k: (len(k), table.rows[k].size, -evidence(table, k), sorted(k)))
+    if settled(table, first, criteria):
+        return first
+    better = [k for k in lowest if len(k) == len(first) and k != first and real(table, first, k, criteria)]
+    return max([first, *better], key=lambda k: (evidence(table, k), sorted(k)))
 
 
 def rivals(table: Table, equal: Iterable[Key], answer: Key, less: Order) -> tuple[Alternative, ...]:

@@ -133,6 +133,13 @@ def test_of_what_is_alike_the_least_even_if_another_is_better_by_chance():
     assert named({(): 100, (two,): 0.9, (A,): 0.95}) == labels(A)
 
 
+def test_of_what_is_alike_above_the_noise_the_one_that_the_evidence_prefers():
+    """It closes too little more to be worth another effect; with as many it is told apart."""
+    two = law("two", numbers=2)
+    assert named({(): 100, (two,): 20.0, (A,): 22.5}) == labels(two)
+    assert named({(): 100, (two,): 20.0, (A,): 22.5}, samples=40) == labels(A)
+
+
 def test_a_model_of_which_an_effect_is_hardly_there_is_not_named():
     known = table({(): 100, (A,): 2.5, (A, B): 1.0})
     known.rows[frozenset([A.label, B.label])].distance[B.label] = 0.5
