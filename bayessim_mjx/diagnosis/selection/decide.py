@@ -208,8 +208,8 @@ def _beside(table: Table, key: Key, answer: Key, criteria: Criteria) -> bool:
 def least(table: Table, equal: Iterable[Key], less: Order, criteria: Criteria) -> Key:
     """Of models that are the same, one that no other is less than: fewest effects, then numbers, then most evidence.
 
-    Above the noise one with more numbers, but no more effects, goes before it where the evidence tells that it is better
-    (`real`): what it closes more is not worth another effect, but tells which one it is.
+    Above the noise one with more numbers, but no more effects, goes before it where the evidence tells that it is
+    better (`real`): what it closes more is not worth another effect, but tells which one it is.
     """
     equal = list(equal)
     lowest = [k for k in equal if not any(less(other, k) for other in equal)]
