@@ -28,6 +28,13 @@ def _parser() -> cli.Parser:
     parser = cli.Parser("gap_loop", DESCRIPTION, without=WITHOUT, unused=("bayessim", "real", "monitor"))
     parser.add_argument("--diagnosis", metavar="DIR", help="folder that bayessim_mjx.diagnose wrote")
     parser.add_argument(
+        "--timestep",
+        type=float,
+        metavar="S",
+        help="time step of the corrected simulator in seconds (default: that of the task; the diagnosis warns where "
+        "that is a gap of its own, and says at which one it simulated)",
+    )
+    parser.add_argument(
         "--surrogate",
         metavar="FILE",
         help="effects.yaml with the hidden truth of a simulated stand-in for the real system",

@@ -53,7 +53,8 @@ class Keeper:
         # what is not drawn matters by its value alone
         theta = repr(physics.space.parameters) if domain is not None else physics.space.nominal.tolist()
         where = [(e.name, e.where) for e in physics.effects]
-        return hashlib.sha256(repr([fixed, theta, where]).encode()).hexdigest()[:16]
+        step = float(physics.mj_model.opt.timestep)
+        return hashlib.sha256(repr([fixed, theta, where, step]).encode()).hexdigest()[:16]
 
     def _kept(self, folder: Path, fingerprint: str) -> Policies | None:
         ppo, env = self.config.ppo, self.simulators.nominal

@@ -63,10 +63,13 @@ def _on(config: Config, physics: Physics) -> Any:
     return env
 
 
-def _refined(body: robot.Robot, timestep: float) -> robot.Robot:
+def _refined(body: robot.Robot, timestep: float | None, flag: str) -> robot.Robot:
+    """The robot at another time step, s; None: at its own."""
     most = float(body.mj_model.opt.timestep)
+    if timestep is None:
+        return body
     if not 0 < timestep <= most:
-        raise UserError(f"--surrogate_timestep {timestep:g}: must be positive and at most the task's own, {most:g} s")
+        raise UserError(f"{flag} {timestep:g}: must be positive and at most the task's own, {most:g} s")
     return discretisation.refined(body, timestep)
 
 
@@ -88,9 +91,7 @@ def surrogate(config: Config, file: str | Path, body: robot.Robot | None = None,
     Raises:
         UserError: the file is wrong or does not fit the task.
     """
-    body = body or robot.of_task(nominal_task(config))
-    if timestep is not None:
-        body = _refined(body, timestep)
+    body = _refined(body or robot.of_task(nominal_task(config)), timestep, "--surrogate_timestep")
     physics = _corrected(body, float(body.control_dt or 0.0), storage.read(file), f"--surrogate {file}")
     return _on(config, physics)
 
@@ -217,7 +218,8 @@ def make(args: argparse.Namespace, config: Config) -> Study:
     folder = Path(args.diagnosis)
     body = robot.of_task(nominal_task(config), args.parameters)
     dt = float(body.control_dt or 0.0)
-    physics = _corrected(body, dt, correction(folder, body.space), f"--diagnosis {folder}")
+    finer = _refined(body, args.timestep, "--timestep")
+    physics = _corrected(finer, dt, correction(folder, body.space), f"--diagnosis {folder}")
     nominal = _on(config, body.physics(dt, (), judge.wide(body.space)))
     real = logs = None
     if args.surrogate:

@@ -127,6 +127,7 @@ def main() -> None:
     parser.add_argument("--iterations", type=int, default=250, help="PPO iterations of every policy")
     parser.add_argument("--seeds", type=int, default=2)
     parser.add_argument("--effects", default="all", help="on offer in the diagnosis")
+    parser.add_argument("--timestep", type=float, help="s, of the corrected simulator (default: the task's)")
     parser.add_argument("more", nargs="*", help="after --: further arguments of the task's configuration")
     args = parser.parse_args()
     config = cli.config_of(cli.Parser("closed_loop", "").parse(["--task", args.task, *args.more]))
@@ -139,7 +140,7 @@ def main() -> None:
             "diagnose", "--task", args.task, "--data", logs, "--out", found, "--headless", "--effects", args.effects
         )
     given = ["--task", args.task, "--diagnosis", found, "--surrogate", surrogate, "--seeds", args.seeds, "--headless"]
-    given += ["--surrogate_timestep", STEP[args.task]]
+    given += ["--surrogate_timestep", STEP[args.task], *(["--timestep", args.timestep] if args.timestep else [])]
     row["gap_loop s"] = command("gap_loop", *given, "--iterations", args.iterations, *args.more)
     print(json.dumps(row | summary(found), default=float))
 
