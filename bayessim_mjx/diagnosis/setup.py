@@ -153,8 +153,8 @@ def prepare(
     base = candidates.base_coordinates(robot.space, robot.accuracy, robot.assumed)
     fitter = Fitter(Simulator(physics, cut), base, physics.space.nominal)
     led = leads.lead(candidates.enumerate_candidates(physics), before)
-    settings = dataclasses.replace(settings or _settings(robot, quick), believed=step.believed, **led.order)
     allowed = tolerance.judge(robot.mj_model, 2 * size.travel, cut.sigma_q, asked)
+    settings = dataclasses.replace(settings or _settings(robot, quick), **_known(step, allowed, fitter), **led.order)
     said = [*steps.said(), *_faster(seen.usable, delivered, dt)]
     said += [] if shift is None else shift.told(float(np.median([log.period for log in logs])))
     told += [*said, *floors.warnings, *steps.warnings(), *(f"not tried: {text}" for text in left_out)]
@@ -169,6 +169,11 @@ def _settings(robot: Robot, quick: bool = False) -> Settings:
         return QUICK
     big = robot.mj_model.nv > CUTTING.many
     return Settings(singles=16, screened=24, starts=8) if big else Settings()
+
+
+def _known(step: discretisation.Discretisation, allowed: tolerance.Tolerance, fitter: Fitter) -> dict[str, Any]:
+    """What a decision has to know of the noise and of the tolerance."""
+    return {"believed": step.believed, "tolerated": allowed.surely(len(fitter.sigma))}
 
 
 def _noise(logs: Sequence[Log]) -> Array:

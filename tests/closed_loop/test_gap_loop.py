@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bayessim_mjx import gap_loop, registry, rl
-from bayessim_mjx.closed_loop import judge, measures, study, words
+from bayessim_mjx.closed_loop import judge, measures, words
 from bayessim_mjx.diagnosis import correction
 from bayessim_mjx.diagnosis.fitting.robot import of_task
 from bayessim_mjx.monitor.writer import event_files, records
@@ -173,27 +173,6 @@ def test_bad_input_is_one_line(folder, change, words, capsys):
     error = capsys.readouterr().err
     assert error.startswith("error: ") and error.count("\n") == 1
     assert all(word in error for word in words), error
-
-
-def test_the_corrected_simulator_and_the_surrogate_have_time_steps_of_their_own(folder, tmp_path, robot):
-    """And policies that were trained at another one are not taken up."""
-
-    def made(*more):
-        given = ["--task", "Pendulum", "--diagnosis", str(folder / "truth"), "--out", str(tmp_path / "out"), *more]
-        args = gap_loop._parser().parse([*given, "--surrogate", str(folder / "truth" / "effects.yaml"), *SMALL])
-        return study.make(args, gap_loop._config(args))
-
-    own = float(robot.mj_model.opt.timestep)
-    plain, other = made(), made("--timestep", str(own / 2), "--surrogate_timestep", str(own / 5))
-    steps = [
-        [float(env.physics.mj_model.opt.timestep) for env in (s.nominal, s.corrected, s.real)]
-        for s in (plain.simulators, other.simulators)
-    ]
-    np.testing.assert_allclose(steps, [[own, own, own], [own, own / 2, own / 5]], rtol=1e-6)
-    same = {
-        role: plain.keeper.fingerprint(role, 0) == other.keeper.fingerprint(role, 0) for role in plain.simulators.roles
-    }
-    assert same == {"nominal": True, "corrected": False, "wide": True, "oracle": False}
 
 
 @pytest.mark.parametrize("written", ["diagnosis.json alone", "effects.yaml"])

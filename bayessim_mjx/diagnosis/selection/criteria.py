@@ -31,6 +31,8 @@ class Criteria:
         least: and of the whole gap, that further effects have to close (1e-4 is 1 % in rms): laws are not exact, and
             what a named one leaves grows with it. Of 0 to .003 all name the same on 649 recorded tables, whose gaps go
             to 76 noise sd; at one of 248 sd .003 is an error of 14, which hid a command delay behind a friction.
+        within: the same, where what the model leaves is within the tolerance at every joint: no more is asked for then,
+            and of a gap of thousands of noise sd a fourth law takes what three right ones are not exact in.
         floor: a model within this factor of the noise (rms) is not improved further.
         far: standard deviations by which an amplitude of a named effect is away from neutral. With 2 one of 24 single
             effects of recorded tables is told only as a rival.
@@ -46,6 +48,7 @@ class Criteria:
     harm: float = 0.1
     same: float = 0.15
     least: float = 0.0001
+    within: float = 0.003
     floor: float = 1.3
     far: float = 1.0
     beam: int = 3

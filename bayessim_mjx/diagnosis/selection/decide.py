@@ -124,7 +124,8 @@ def relevant(table: Table, worse: Key, better: Key, criteria: Criteria, share: f
     left, above = table.excess(better), table.excess(worse)
     if settled(table, worse, criteria):
         return False
-    return above - left > share * above and above - left > criteria.least * table.excess(BASE)
+    least = criteria.least if above > table.tolerated else criteria.within
+    return above - left > share * above and above - left > least * table.excess(BASE)
 
 
 def same(table: Table, worse: Key, better: Key, criteria: Criteria) -> bool:

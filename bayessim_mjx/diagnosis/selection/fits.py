@@ -74,7 +74,8 @@ class Fits:
         least = min(m.total for m in pool.models.values())
         rows = {key: self._row(key, m, m.total < LIMITS.contenders * least) for key, m in pool.models.items()}
         group = pool.fitter.simulator.windows.group
-        return Table(rows, self.laws, group, pool.noise, pool.settings.believed, self._chance)
+        settings = pool.settings
+        return Table(rows, self.laws, group, pool.noise, settings.believed, self._chance, settings.tolerated)
 
     def _row(self, key: Key, model: Model, contender: bool) -> Row:
         fitted, row = self._rows.get(key, (None, None))

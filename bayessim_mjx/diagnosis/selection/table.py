@@ -79,6 +79,7 @@ class Table:
         noise: expected cost of a window under a perfect model.
         believed: share of the noise (rms) that is the sensors'; the rest is what the time step may be worth at most.
         chance: `[draws]` nats that the best candidate gains in null logs (see `chance`), ascending.
+        tolerated: `excess` up to which what is left is within the tolerance, at whatever joint it is.
     """
 
     rows: Mapping[Key, Row]
@@ -87,6 +88,7 @@ class Table:
     noise: float
     believed: float = 1.0
     chance: Array = field(default_factory=lambda: np.zeros(0))
+    tolerated: float = 0.0
 
     @cached_property
     def samples(self) -> float:
@@ -125,6 +127,7 @@ class Table:
             "group": self.group.tolist(),
             "noise": self.noise,
             "believed": self.believed,
+            "tolerated": float(f"{self.tolerated:.4g}"),
             "chance": [float(f"{c:.4g}") for c in self.chance],
             "rows": [
                 {
@@ -175,4 +178,5 @@ def read(raw: Mapping[str, Any]) -> Table:
         raw["noise"],
         raw["believed"],
         np.array(raw.get("chance", ())),
+        raw.get("tolerated", 0.0),
     )

@@ -26,6 +26,7 @@ class Settings:
         budget: time that the search may take.
         shortlisted: whether candidates are ranked on some of the windows first: faster, and their order is rougher.
         believed: share of the noise (rms) that is the sensors'; the rest is what the time step may be worth at most.
+        tolerated: squared gap, as a multiple of the noise's square, that is within the tolerance at whatever joint.
     """
 
     singles: int = 24
@@ -35,6 +36,7 @@ class Settings:
     tolerance: float = 5e-3
     fresh: int = 6
     believed: float = 1.0
+    tolerated: float = 0.0
     first: tuple[str, ...] = ()
     together: tuple[str, ...] = ()
     budget: Budget = Budget()

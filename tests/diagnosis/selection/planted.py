@@ -15,7 +15,7 @@ def law(effect, where="hinge", numbers=1, places=None, special=(), kind="", spre
     return Law(f"{effect}@{where}", effect, where, numbers, index, special, kind, spread)
 
 
-def table(errors, noise=50.0, believed=1.0, group=None, samples=1e4):
+def table(errors, noise=50.0, believed=1.0, group=None, samples=1e4, tolerated=0.0):
     """A table of {laws: squared error in noises, or one for each window}."""
     group = np.arange(8) if group is None else group
     laws = {c.label: c for key in errors for c in key}
@@ -25,7 +25,7 @@ def table(errors, noise=50.0, believed=1.0, group=None, samples=1e4):
         labels = frozenset(c.label for c in key)
         distance = dict.fromkeys(labels, 100.0)
         rows[labels] = Row(labels, 3 + sum(c.numbers for c in key), cost, samples, distance)
-    return Table(rows, laws, group, noise, believed)
+    return Table(rows, laws, group, noise, believed, tolerated=tolerated)
 
 
 class Linear:
