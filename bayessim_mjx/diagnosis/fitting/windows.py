@@ -145,7 +145,7 @@ def cut(
     even, centred = [resample(log, dt) for log in logs], centred and staggered(model)
     fine = [_fine_commands(log, e, dt, substeps, centred) for log, e in zip(logs, even, strict=True)]
     group_of, names = groups_of(logs, group)
-    starts = _starts(even, length, limit, first_only) if starts is None else starts
+    starts = _starts(even, length, limit, None if first_only else _past(dt)) if starts is None else starts
     if not starts:
         longest = max(len(e) - 1 for e in even)
         raise UserError(
@@ -181,7 +181,7 @@ def _batch(
     law: controllers.Law | None,
 ) -> Batch:
     """The windows of `length` rows at `starts`, for the simulator."""
-    around = max(2, int(np.ceil(AROUND / dt)))
+    around = _past(dt)
     pick = np.asarray([r for r, _ in starts])
     return Batch(
         command=_stack([fine[r][_rows(even[r], a, length)] for r, a in starts]),
@@ -193,13 +193,23 @@ def _batch(
     )
 
 
-def _starts(logs: Sequence[Log], length: int, limit: int, first_only: bool) -> list[tuple[int, int]]:
+def _past(dt: float) -> int:
+    """Rows around a start that effects with memory look at."""
+    return max(2, int(np.ceil(AROUND / dt)))
+
+
+def _starts(logs: Sequence[Log], length: int, limit: int, past: int | None) -> list[tuple[int, int]]:
+    """(log, row); None: one per log, at its beginning.
+
+    Of others the first has up to `past` rows before it, as far as that costs no window: which commands acted before a
+    log began is not known, and what remembers them would be judged by a guess.
+    """
     every = []
     for r, log in enumerate(logs):
         last = len(log) - 1 - length
         if last < 0:
             continue
-        every += [(r, 0)] if first_only else [(r, a) for a in range(0, last + 1, length)]
+        every += [(r, 0)] if past is None else [(r, a) for a in range(min(past, last % length), last + 1, length)]
     if len(every) <= limit:
         return every
     keep = np.unique(np.linspace(0, len(every) - 1, limit).round().astype(int))

@@ -139,9 +139,11 @@ def same(table: Table, worse: Key, better: Key, criteria: Criteria) -> bool:
 
 
 def _as_good(table: Table, worse: Key, better: Key, criteria: Criteria) -> bool:
-    """By prediction, and by what data sheets state."""
+    """By prediction, or within the tolerance by what it leaves of the whole gap; and by what data sheets state."""
     believed = table.rows[better].belief - table.rows[worse].belief < criteria.nats
-    return believed and (1.0 + table.excess(worse)) / max(1.0 + table.excess(better), 1e-9) < 1.0 + criteria.same
+    left, above = table.excess(better), table.excess(worse)
+    enough = above <= table.tolerated and above - left <= criteria.within * table.excess(BASE)
+    return believed and (enough or (1.0 + above) / max(1.0 + left, 1e-9) < 1.0 + criteria.same)
 
 
 def order(laws: Mapping[str, Law]) -> Order:

@@ -45,6 +45,8 @@ def test_a_further_effect_has_to_close_enough_of_what_the_others_leave():
     assert named({(): 1e6, (A,): 122, (A, B): 2}) == labels(A, B)
     assert named({(): 1e6, (A,): 122, (A, B): 2}, tolerated=150.0) == labels(A)  # no more is asked for
     assert named({(): 1e6, (A,): 4000, (A, B): 2}, tolerated=5000.0) == labels(A, B)
+    assert named({(): 1e6, (A,): 122, (B, C): 2}, tolerated=150.0) == labels(A)
+    assert named({(): 1e6, (A,): 122, (B, C): 2}) == labels(B, C)
 
 
 def test_of_two_that_close_a_large_gap_the_better_leads_though_its_residuals_are_fewer():
