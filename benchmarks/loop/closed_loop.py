@@ -140,7 +140,8 @@ def main() -> None:
             "diagnose", "--task", args.task, "--data", logs, "--out", found, "--headless", "--effects", args.effects
         )
     given = ["--task", args.task, "--diagnosis", found, "--surrogate", surrogate, "--seeds", args.seeds, "--headless"]
-    given += ["--surrogate_timestep", STEP[args.task], *(["--timestep", args.timestep] if args.timestep else [])]
+    given += ["--surrogate_timestep", STEP[args.task]]
+    given += [] if args.timestep is None else ["--timestep", args.timestep]
     row["gap_loop s"] = command("gap_loop", *given, "--iterations", args.iterations, *args.more)
     print(json.dumps(row | summary(found), default=float))
 

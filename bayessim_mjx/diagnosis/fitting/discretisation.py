@@ -85,16 +85,21 @@ class Discretisation:
         return dataclasses.replace(cut, sigma_q=self.floor[:nv], sigma_v=self.floor[nv:], spread=spread)
 
     @property
+    def sensed(self) -> NDArray[np.bool_]:
+        """`[2 nv]`, channels with noise of a sensor's."""
+        return np.asarray(np.isfinite(self.sigma) & ~np.tile(self.simulated, 2))
+
+    @property
     def believed(self) -> float:
         """Share of what is taken for noise that is the sensors' (median over channels), at least SURE."""
-        known = np.isfinite(self.sigma) & ~np.tile(self.simulated, 2)
-        return float(np.clip(np.median(self.sigma[known] / self.floor[known]), RULES.sure, 1.0)) if known.any() else 1.0
+        own = self.sensed
+        return float(np.clip(np.median(self.sigma[own] / self.floor[own]), RULES.sure, 1.0)) if own.any() else 1.0
 
     @property
     def shows(self) -> bool:
         """Whether what the sub-steps leave shows beside the sensors' noise; logs of a simulation may have this step."""
-        told = np.isfinite(self.sigma) & ~np.tile(self.simulated, 2)
-        return bool((self.left[told] > RULES.enough * self.sigma[told]).any())
+        own = self.sensed
+        return bool((self.left[own] > RULES.enough * self.sigma[own]).any())
 
     def warnings(self) -> list[str]:
         """In words, where the simulator's own time step is worth more than the noise."""

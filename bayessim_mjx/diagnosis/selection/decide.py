@@ -124,8 +124,13 @@ def relevant(table: Table, worse: Key, better: Key, criteria: Criteria, share: f
     left, above = table.excess(better), table.excess(worse)
     if settled(table, worse, criteria):
         return False
-    least = criteria.least if above > table.tolerated else criteria.within
-    return above - left > share * above and above - left > least * table.excess(BASE)
+    return above - left > share * above and above - left > _asked(table, worse, criteria)
+
+
+def _asked(table: Table, worse: Key, criteria: Criteria) -> float:
+    """Squared gap that a better model has to close more than this one: more of the whole within the tolerance."""
+    least = criteria.least if table.excess(worse) > table.tolerated else criteria.within
+    return least * table.excess(BASE)
 
 
 def same(table: Table, worse: Key, better: Key, criteria: Criteria) -> bool:
@@ -142,7 +147,7 @@ def _as_good(table: Table, worse: Key, better: Key, criteria: Criteria) -> bool:
     """By prediction, or within the tolerance by what it leaves of the whole gap; and by what data sheets state."""
     believed = table.rows[better].belief - table.rows[worse].belief < criteria.nats
     left, above = table.excess(better), table.excess(worse)
-    enough = above <= table.tolerated and above - left <= criteria.within * table.excess(BASE)
+    enough = above <= table.tolerated and above - left <= _asked(table, worse, criteria)
     return believed and (enough or (1.0 + above) / max(1.0 + left, 1e-9) < 1.0 + criteria.same)
 
 
