@@ -31,8 +31,8 @@ def _parser() -> cli.Parser:
         "--timestep",
         type=float,
         metavar="S",
-        help="time step of the corrected simulator in seconds (default: that of the task; the diagnosis warns where "
-        "that is a gap of its own, and says at which one it simulated)",
+        help="time step of the corrected simulator in seconds (default: that of the task, or the one of the diagnosis "
+        "where it found the task's own to err by more than is tolerated at a joint)",
     )
     parser.add_argument(
         "--surrogate",

@@ -33,16 +33,20 @@ SCHEMA = 1
 EFFECTS = "effects.yaml"
 
 
-def correction(folder: Path, known: ParameterSpace) -> storage.Correction:
+def loaded(folder: Path) -> result.Diagnosis:
+    """The diagnosis of a folder; a damaged one is a UserError."""
+    try:
+        return result.load(folder)
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise UserError(f"--diagnosis {folder}: damaged diagnosis.json: {type(error).__name__}: {error}") from None
+
+
+def correction(diagnosis: result.Diagnosis, folder: Path, known: ParameterSpace) -> storage.Correction:
     """What a diagnosis found: its effects.yaml, or else its diagnosis.json on these known parameters.
 
     Raises:
         UserError: a file is damaged, or nothing was found.
     """
-    try:
-        diagnosis = result.load(folder)
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise UserError(f"--diagnosis {folder}: damaged diagnosis.json: {type(error).__name__}: {error}") from None
     file = folder / EFFECTS
     found = storage.read(file) if file.is_file() else correction_of(diagnosis, known)
     if not found.effects and not found.calibrated:
@@ -71,6 +75,17 @@ def _refined(body: robot.Robot, timestep: float | None, flag: str) -> robot.Robo
     if not 0 < timestep <= most:
         raise UserError(f"{flag} {timestep:g}: must be positive and at most the task's own, {most:g} s")
     return discretisation.refined(body, timestep)
+
+
+def diagnosed_timestep(diagnosis: result.Diagnosis) -> float | None:
+    """s, at which a diagnosis simulated, where the model's own time step errs by more than is tolerated at a joint.
+
+    Policies trained at that step would meet a gap which no effect closes; None: they may have the task's own.
+    """
+    step, joints = diagnosis.gap.integrator, diagnosis.gap.physical
+    errors = step.get("physical", {})
+    beyond = [j for j, found in joints.items() if errors.get(j, 0.0) > found.get("tolerance", np.inf)]
+    return float(step["substep"]) if beyond else None
 
 
 def _corrected(body: robot.Robot, dt: float, found: storage.Correction, source: str) -> Physics:
@@ -125,10 +140,17 @@ class Study:
         return {
             "task": self.config.task,
             "correction": found + [p.name for p in s.corrected.physics.model_space.parameters],
+            "time step": self._steps(),
             "real side": self.sources["real"],
             "policies": f"{', '.join(roles)}; {each}",
             "results": str(self.out),
         }
+
+    def _steps(self) -> str:
+        """Of the corrected simulator, where it is not the task's."""
+        s = self.simulators
+        own, other = (1e3 * float(env.physics.mj_model.opt.timestep) for env in (s.nominal, s.corrected))
+        return f"{other:.3g} ms" + ("" if other == own else f" where corrected; the task's own is {own:.3g} ms")
 
     def all_policies(self, console: Any) -> dict[str, list[Policies]]:
         """By role and seed; the user's own stands for pi_0."""
@@ -218,8 +240,10 @@ def make(args: argparse.Namespace, config: Config) -> Study:
     folder = Path(args.diagnosis)
     body = robot.of_task(nominal_task(config), args.parameters)
     dt = float(body.control_dt or 0.0)
-    finer = _refined(body, args.timestep, "--timestep")
-    physics = _corrected(finer, dt, correction(folder, body.space), f"--diagnosis {folder}")
+    diagnosis = loaded(folder)
+    own = diagnosed_timestep(diagnosis) if args.timestep is None else args.timestep
+    finer = _refined(body, own, "--timestep")
+    physics = _corrected(finer, dt, correction(diagnosis, folder, body.space), f"--diagnosis {folder}")
     nominal = _on(config, body.physics(dt, (), judge.wide(body.space)))
     real = logs = None
     if args.surrogate:

@@ -127,7 +127,7 @@ def main() -> None:
     parser.add_argument("--iterations", type=int, default=250, help="PPO iterations of every policy")
     parser.add_argument("--seeds", type=int, default=2)
     parser.add_argument("--effects", default="all", help="on offer in the diagnosis")
-    parser.add_argument("--timestep", type=float, help="s, of the corrected simulator (default: the task's)")
+    parser.add_argument("--timestep", type=float, help="s, of the corrected simulator (default: gap_loop's)")
     parser.add_argument("more", nargs="*", help="after --: further arguments of the task's configuration")
     args = parser.parse_args()
     config = cli.config_of(cli.Parser("closed_loop", "").parse(["--task", args.task, *args.more]))

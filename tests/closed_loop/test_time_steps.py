@@ -1,6 +1,9 @@
 """The simulators of a closed-loop study have time steps of their own, which their policies depend on."""
 
+import dataclasses
+
 import numpy as np
+import pytest
 
 from bayessim_mjx import gap_loop, registry
 from bayessim_mjx.closed_loop import study
@@ -32,3 +35,11 @@ def test_the_corrected_simulator_and_the_surrogate_have_time_steps_of_their_own(
     prints = [{role: s.keeper.fingerprint(role, 0) for role in s.simulators.roles} for s in (plain, other)]
     same = {role: prints[0][role] == prints[1][role] for role in prints[0]}
     assert same == {"nominal": True, "corrected": False, "wide": True, "oracle": False}
+
+
+@pytest.mark.parametrize(("error", "expected"), [(0.01, None), (0.03, 0.002)])
+def test_a_step_that_errs_by_more_than_is_tolerated_is_replaced_by_the_diagnosis_own(error, expected):
+    step = {"timestep": 0.008, "substep": 0.002, "physical": {"hinge": error, "other": 0.0}}
+    found = diagnosis([("actuator_gain", "torque", {"gain": (0.6, 0.03)})])
+    gap = dataclasses.replace(found.gap, integrator=step, physical={"hinge": {"tolerance": 0.02}})
+    assert study.diagnosed_timestep(dataclasses.replace(found, gap=gap)) == expected
