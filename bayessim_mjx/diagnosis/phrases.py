@@ -197,6 +197,11 @@ def sharpens(action: str, parameter: str, before: float, after: float, unit: str
     return f"{action}: sharpens {parameter}, standard deviation from {before:.2g} to {after:.2g} {unit}".rstrip()
 
 
+def sharpens_little(text: str) -> str:
+    """`sharpens`, where that is not worth an experiment."""
+    return f"none that would tell much more: the best, {text.removeprefix('run ')}"
+
+
 def separates_nobody(labels: Sequence[str], best: str, evidence: float, help: str) -> str:
     """Why an experiment does not help, of models' titles, its name and the nats that it would give."""
     most = f"the best, {best}, is expected to give {nats(evidence)} nats"

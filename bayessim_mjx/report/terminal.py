@@ -61,7 +61,8 @@ def console(
             out.say(f"not fitted, {line}")
         if plan := diagnosis.next_experiment:
             name, why = plan.get("name", MISSING), plan.get("why", "")
-            out.say(f"next experiment: {why if name in why else f'{name}: {why}'} ({plan.get('file', '')})")
+            text = why if name in why or name == "none" else f"{name}: {why}"
+            out.say(f"next experiment: {text}" + (f" ({plan['file']})" if plan.get("file") else ""))
         for warning in diagnosis.warnings:
             out.warning(warning)
         for path in (Path(folder) / name for name in FILES) if folder is not None else ():
