@@ -24,7 +24,7 @@ from bayessim_mjx.distributions.charts import EDGE, to_chart
 from bayessim_mjx.inference.independent import independent, worth
 from bayessim_mjx.inference.moves import KEPT, Population, begun, moved, powered, tempering
 from bayessim_mjx.inference.pareto import normalised
-from bayessim_mjx.inference.weighted import Mixture, fitted, fitted_to_islands, uncut
+from bayessim_mjx.inference.weighted import Mixture, fitted, fitted_to_islands, in_cube
 
 LogLikelihood = Callable[[np.ndarray], np.ndarray]  # theta [N, d] -> [N]; not finite: impossible
 
@@ -152,9 +152,11 @@ def sharpened(
     u, weights = drawn
     chart = "plain" if proposal.chart == "plain" else "probit"
     z = np.asarray(to_chart(jnp.asarray(u), chart), np.float64)
-    q = fitted(rng, z, weights, components)
     if chart == "plain":
-        q = uncut(q, z[rng.choice(len(z), len(z), p=weights)], worth(drawn))
+        again = z[rng.choice(len(z), len(z), p=weights)]
+        q = in_cube(lambda own: fitted(rng, z[:, own], weights, components), again, worth(drawn))
+    else:
+        q = fitted(rng, z, weights, components)
     fit = Distribution.from_unit(space, np.log(q.weights), q.means, np.linalg.cholesky(q.covariances), chart=chart)
     simulations = found.simulations + len(u)
     return replace(found, posterior=fit, fitted=fit, effective=worth(drawn), simulations=simulations)
@@ -187,9 +189,11 @@ def _answer(
     """What the population says, if its islands agree."""
     chart = "plain" if proposal.chart == "plain" else "probit"
     draws = np.asarray(to_chart(jnp.asarray(at.islands), chart), np.float64)
-    q = fitted_to_islands(rng, draws, components)
     if chart == "plain":
-        q = uncut(q, draws.reshape(-1, draws.shape[-1]), max(at.worth, 1.0))
+        every = draws.reshape(-1, draws.shape[-1])
+        q = in_cube(lambda own: fitted_to_islands(rng, draws[..., own], components), every, max(at.worth, 1.0))
+    else:
+        q = fitted_to_islands(rng, draws, components)
     scales = np.linalg.cholesky(q.covariances)
     fit = Distribution.from_unit(proposal.space, np.log(q.weights), q.means, scales, chart=chart)
     simulations, missing = before + at.simulations, at.missing(enough, power)

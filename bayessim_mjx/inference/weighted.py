@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +17,7 @@ FLAT = 1.5  # sd, in the width of the cube: over it the density falls by 5 %, wh
 # standard errors, beyond which draws are not uniform by chance: .98 of uniform directions pass, and what is not uniform
 # and passes loses less than its moments' chance would (benchmarks/results.md, refined posteriors)
 SURE = 3.0
+FEWEST = 3  # independent draws in each direction, behind every Gaussian
 STRIDE = 1.5  # power of a ratio of variances: what is cut off changes by less than its Gaussian
 
 
@@ -48,7 +50,7 @@ def fitted(rng: np.random.Generator, z: np.ndarray, weights: np.ndarray, most: i
     z, weights = z[keep], weights[keep] / weights[keep].sum()
     fold = rng.permutation(len(z)) % 2
     halves = [(z[fold == part], weights[fold == part]) for part in (0, 1)]
-    return em(rng, z, weights, _count(rng, halves, most))
+    return supported(rng, z, weights, _count(rng, halves, most))
 
 
 def fitted_to_islands(rng: np.random.Generator, islands: np.ndarray, most: int) -> Mixture:
@@ -57,7 +59,19 @@ def fitted_to_islands(rng: np.random.Generator, islands: np.ndarray, most: int) 
     islands = islands[:, :: -(-count * each // DRAWS)]
     halves = [(half, np.full(len(half), 1 / len(half))) for half in (islands[k::2].reshape(-1, d) for k in (0, 1))]
     draws = islands.reshape(-1, d)
-    return em(rng, draws, np.full(len(draws), 1 / len(draws)), _count(rng, halves, most))
+    return supported(rng, draws, np.full(len(draws), 1 / len(draws)), _count(rng, halves, most))
+
+
+def supported(rng: np.random.Generator, z: np.ndarray, weights: np.ndarray, k: int) -> Mixture:
+    """`em` with k Gaussians, or half as many and so on where one would stand on fewer than FEWEST draws a direction.
+
+    A few draws of much weight span a plane, and a Gaussian fitted to them is a spike beside everything else.
+    """
+    q = em(rng, z, weights, k)
+    each = q.each(z)
+    share = np.exp(each - logsumexp(each, axis=1, keepdims=True)) * weights[:, None]
+    fewest = min(effective(own / own.sum()) if own.sum() > 0 else 0.0 for own in share.T)
+    return q if k == 1 or fewest >= FEWEST * z.shape[1] else supported(rng, z, weights, k // 2)
 
 
 def _count(rng: np.random.Generator, halves: list[tuple[np.ndarray, np.ndarray]], most: int) -> int:
@@ -67,13 +81,35 @@ def _count(rng: np.random.Generator, halves: list[tuple[np.ndarray, np.ndarray]]
         held = 0.0
         for (z, weights), (others, theirs) in (halves, halves[::-1]):
             own = weights / weights.sum()
-            if effective(own) < 3 * z.shape[1] * k:
+            if effective(own) < FEWEST * z.shape[1] * k:
                 held = -np.inf
                 break
             held += float(theirs @ em(rng, z, own, k).log_density(others))
         if held > score + 1e-3:
             best, score = k, held
     return best
+
+
+def in_cube(fit: Callable[[np.ndarray], Mixture], draws: np.ndarray, worth: float) -> Mixture:
+    """`uncut` Gaussians for draws in the unit cube, in the coordinates that are told; the others are flat.
+
+    In those alone draws are enough for more Gaussians, and a curved valley needs them.
+
+    Args:
+        fit: Gaussians for the coordinates (`[d]`, bool) that are asked for.
+        draws: `[N, d]`; worth: how many independent ones they are worth.
+    """
+    d = draws.shape[1]
+    flat = _flat(draws.mean(0), np.cov(draws.T, bias=True).reshape(d, d), worth)
+    own = np.flatnonzero(~flat)
+    q = (
+        uncut(fit(~flat), draws[:, own], worth)
+        if len(own)
+        else Mixture(np.ones(1), np.zeros((1, 0)), np.ones((1, 0, 0)))
+    )
+    means, covariances = np.full((len(q.weights), d), 0.5), np.tile(FLAT**2 * np.eye(d), (len(q.weights), 1, 1))
+    means[:, own], covariances[:, own[:, None], own] = q.means, q.covariances
+    return Mixture(q.weights, means, covariances)
 
 
 def uncut(q: Mixture, draws: np.ndarray, worth: float, steps: int = 20) -> Mixture:

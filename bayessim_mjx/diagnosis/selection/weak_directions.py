@@ -34,7 +34,8 @@ class Rules:
     rounds: int = 2
     steps: int = 2
     shares: tuple[float, ...] = (1.0, 0.5, 0.25)  # of the step along the ridges, tried in turn
-    reach: float = 1.5  # in units of `uniform`: how far along a direction is simulated
+    reach: float = 1.5  # in units of `uniform`: how far along a direction is simulated, and nearer by,
+    shows: float = 9.0  # where the columns promise so many times the rise that says nothing
     nats: float = 2.0  # of log-likelihood, and
     # of the cost: a smaller rise is no knowledge (single precision alone brings as much)
     rounding: float = 0.005
@@ -106,33 +107,46 @@ class _Profile:
         self.every = scale[:, None] * V
         self.ways, self.columns = self.every[:, weak], self.fit.A @ self.every
         self.less = inflation(model)
-        self.slopes, simulated = self._along()
-        self.ridges = Ridges(self.ways, np.maximum(curvature[weak], 0.0), simulated)
+        differenced = np.maximum(curvature[weak], 0.0)
+        self.slopes, simulated = self._along(self._reaches(differenced, float(self.fit.weight @ q.c)))
+        self.ridges = Ridges(self.ways, differenced, simulated)
 
-    def _along(self) -> tuple[Array, Array]:
-        """Slopes and curvatures `[m]` of the cost: a parabola through two more places along each way."""
-        along = [self._places(way) for way in self.ways.T]
-        slopes, curvature = np.zeros(len(along)), np.zeros(len(along))
-        if not along:
+    def _reaches(self, curvature: Array, cost: float) -> list[tuple[float, ...]]:
+        """How far along each way is simulated.
+
+        Far away a law may have lost all it does (a joint that does not move any more), and costs rise no longer; what
+        the columns promise nearer by has to be there.
+        """
+        near = np.sqrt(RULES.shows * self.allowed(cost) / np.maximum(curvature, 1e-300))
+        return [(float(n), RULES.reach) if n < RULES.reach else (RULES.reach,) for n in near]
+
+    def _along(self, reaches: Sequence[tuple[float, ...]]) -> tuple[Array, Array]:
+        """Slopes and curvatures `[m]` of the cost: a parabola through two more places, where it rises most."""
+        slopes, curvature = np.zeros(len(reaches)), np.zeros(len(reaches))
+        if not len(reaches):
             return slopes, curvature
-        points = [self.fit.values + t * w for ts, w in zip(along, self.ways.T, strict=True) for t in ts]
-        costs, _ = self.costs([self.fit.values, *points], [self.weak, *([i] for i in np.repeat(self.weak, 2))])
-        for k, (s, t) in enumerate(along):
-            rise = costs[1 + 2 * k : 3 + 2 * k] - costs[0]  # = slope t + curvature t^2
+        along = [(k, self._places(self.ways[:, k], reach)) for k, own in enumerate(reaches) for reach in own]
+        points = [self.fit.values + t * self.ways[:, k] for k, ts in along for t in ts]
+        fixed = [[self.weak[k]] for k, ts in along for _ in ts]
+        costs, _ = self.costs([self.fit.values, *points], [self.weak, *fixed])
+        for (k, (s, t)), found in zip(along, costs[1:].reshape(-1, 2), strict=True):
+            rise = found - costs[0]  # = slope t + curvature t^2
             rise = np.sign(rise) * np.maximum(np.abs(rise) - self.allowed(costs[0]), 0.0)
-            slopes[k], curvature[k] = np.linalg.solve([[s, s * s], [t, t * t]], rise)
-        return slopes, np.maximum(curvature, 0.0)
+            slope, bend = np.linalg.solve([[s, s * s], [t, t * t]], rise)
+            if bend >= curvature[k]:
+                slopes[k], curvature[k] = slope, bend
+        return slopes, curvature
 
     def allowed(self, cost: float) -> float:
         """A rise of the cost that says nothing."""
         return float(max(2 * RULES.nats * self.less, RULES.rounding * cost))
 
-    def _places(self, way: Array) -> tuple[float, float]:
+    def _places(self, way: Array, reach: float) -> tuple[float, float]:
         """Two places along a way, one on either side where there is room."""
         behind, ahead = self._room(way)
-        if min(-behind, ahead) > 0.1 * RULES.reach:
-            return max(behind, -RULES.reach), min(ahead, RULES.reach)
-        end = min(ahead, RULES.reach) if ahead > -behind else max(behind, -RULES.reach)
+        if min(-behind, ahead) > 0.1 * reach:
+            return max(behind, -reach), min(ahead, reach)
+        end = min(ahead, reach) if ahead > -behind else max(behind, -reach)
         end = end if abs(end) > 1e-6 else 1e-6  # a corner: nowhere to go
         return end / 2, end
 
