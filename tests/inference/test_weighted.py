@@ -6,7 +6,8 @@ import numpy as np
 
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.distributions.box import within
-from bayessim_mjx.inference.weighted import em, uncut
+from bayessim_mjx.inference.weighted import em, in_cube, supported, uncut
+from bayessim_mjx.inference.weighted import fitted as gaussians
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 
 SPACE = ParameterSpace([Parameter(f"p{i}", 0.5, 0.0, 1.0) for i in range(10)])
@@ -53,3 +54,33 @@ def test_points_within_the_cube_have_the_truncated_gaussians_moments():
     at = weights @ x
     np.testing.assert_allclose(at, z.mean(0), atol=4e-3)
     np.testing.assert_allclose((x - at).T @ ((x - at) * weights[:, None]), np.cov(z.T), atol=2e-3)
+
+
+def test_no_gaussian_stands_on_a_few_draws_of_much_weight():
+    """Four of 400 draws hold a tenth of the weight, in one place: two Gaussians would be a whole and a spike."""
+    rng = np.random.default_rng(4)
+    z = rng.normal(size=(400, 6))
+    z[:4] = 4.0 + 1e-3 * rng.normal(size=(4, 6))
+    weights = np.where(np.arange(400) < 4, 0.1 / 4, 0.9 / 396)
+    assert em(rng, z, weights, 2).covariances[:, 0, 0].min() < 0.02
+    assert len(supported(rng, z, weights, 2).weights) == 1
+
+
+def test_where_most_parameters_are_not_told_a_curved_valley_has_the_gaussians_that_it_needs():
+    """A parabola in two of ten parameters: in all ten, draws are too few for more than two Gaussians."""
+    rng = np.random.default_rng(5)
+
+    def valley(count):
+        u = rng.uniform(size=(count, 10))
+        u[:, 8] = 0.2 + 0.6 * u[:, 8]
+        u[:, 9] = 0.2 + 1.5 * (u[:, 8] - 0.5) ** 2 + 0.01 * rng.normal(size=count)
+        return u
+
+    draws, fresh = valley(256), jnp.asarray(valley(1000), jnp.float32)
+    equal = np.full(256, 1 / 256)
+    q = in_cube(lambda own: gaussians(rng, draws[:, own], equal, 8), draws, 256)
+    assert len(q.weights) > 2
+    np.testing.assert_array_equal(q.means[:, :8], 0.5)
+    found = Distribution.from_unit(SPACE, np.log(q.weights), q.means, np.linalg.cholesky(q.covariances))
+    whole = fitted(draws, 256)
+    assert float(np.mean(found.log_gain(fresh))) > float(np.mean(whole.log_gain(fresh))) + 0.5

@@ -3,6 +3,7 @@
 Logs come from MuJoCo C: by Runge-Kutta at a tenth of the step (the continuous truth), or by the very same step.
 """
 
+import itertools
 from types import SimpleNamespace
 
 import mujoco
@@ -230,3 +231,20 @@ def test_logs_of_a_simulation_keep_its_integrator():
         the(ARM), PERIOD, recorded, lambda own, first: _measured(own, recorded, None, False, first, limit)
     )
     assert found.robot.mj_model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+
+
+def test_errors_of_when_something_touches_add_up_as_squares_do():
+    """A velocity that jumps by 1 at a random time, on grids of h and h/2 and so on; the root mean square in 1 s."""
+    rng, steps = np.random.default_rng(0), [2.0**-k for k in range(3, 16)]
+    at = rng.uniform(0.2, 0.8, 4000)
+    late = [np.ceil(at / h) * h for h in steps]  # each grid jumps at its first point behind the true time
+    between = [np.sqrt(np.mean(np.abs(a - b))) for a, b in itertools.pairwise(late)]
+    gain, error = between[0] / between[1], np.sqrt(np.mean(late[0] - at))
+    np.testing.assert_allclose(gain, 2**0.5, rtol=0.05)
+    np.testing.assert_allclose(between[0] * discretisation._all(gain, touching=True), error, rtol=0.05)
+    assert between[0] * discretisation._all(gain, touching=False) > 2 * error
+
+
+def test_errors_of_a_smooth_motion_add_up_one_to_one():
+    """x(h) = 1 + h: halving changes h / 2, all halvings h."""
+    np.testing.assert_allclose(discretisation._all(2.0, touching=False) * 0.5, 1.0)

@@ -1,6 +1,7 @@
 """Along directions that motion cannot tell, beliefs decide and intervals are wide; what motion tells stays put."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -59,3 +60,20 @@ def test_what_motion_tells_stays_where_it_is(setup):
     assert sd[level] < 0.03 * FRICTION
     damping, extra = 0, new.fit.names.index("hinge.viscous_friction.damping")
     np.testing.assert_allclose(0.02 * new.fit.values[damping] + new.fit.values[extra], 0.02 * SCALE[0], rtol=0.03)
+
+
+def test_a_law_that_does_no_more_far_away_is_told_nearer_by():
+    """Friction that holds a joint still: the cost rises beside the fit and stays there, bounded below by 0 friction."""
+
+    def cost(values):
+        return 1e4 * (1.0 + np.tanh((values[0] / 0.05) ** 2))
+
+    it = object.__new__(weak_directions._Profile)
+    it.ways, it.weak, it.less, it.fit = np.ones((1, 1)), np.array([0]), 1.0, SimpleNamespace(values=np.zeros(1))
+    it._room = lambda way: (-0.1, 3.0)
+    it.costs = lambda points, fixed: (np.array([cost(p) for p in points]), points)
+    curvature = np.array([1e4 / 0.05**2])
+    assert it._along([(weak_directions.RULES.reach,)])[1][0] == 0.0
+    (reaches,) = it._reaches(curvature, cost(np.zeros(1)))
+    assert 0.01 < reaches[0] < 0.05
+    np.testing.assert_allclose(it._along([reaches])[1], curvature, rtol=0.2)
