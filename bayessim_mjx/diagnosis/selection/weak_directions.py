@@ -122,7 +122,7 @@ class _Profile:
 
     def _along(self, reaches: Sequence[tuple[float, ...]]) -> tuple[Array, Array]:
         """Slopes and curvatures `[m]` of the cost: a parabola through two more places, where it rises most."""
-        slopes, curvature = np.zeros(len(reaches)), np.zeros(len(reaches))
+        slopes, curvature = np.zeros(len(reaches)), np.full(len(reaches), -np.inf)
         if not len(reaches):
             return slopes, curvature
         along = [(k, self._places(self.ways[:, k], reach)) for k, own in enumerate(reaches) for reach in own]
@@ -133,9 +133,9 @@ class _Profile:
             rise = found - costs[0]  # = slope t + curvature t^2
             rise = np.sign(rise) * np.maximum(np.abs(rise) - self.allowed(costs[0]), 0.0)
             slope, bend = np.linalg.solve([[s, s * s], [t, t * t]], rise)
-            if bend >= curvature[k]:
+            if bend > curvature[k]:
                 slopes[k], curvature[k] = slope, bend
-        return slopes, curvature
+        return slopes, np.maximum(curvature, 0.0)
 
     def allowed(self, cost: float) -> float:
         """A rise of the cost that says nothing."""
