@@ -241,8 +241,10 @@ def make(args: argparse.Namespace, config: Config) -> Study:
     body = robot.of_task(nominal_task(config), args.parameters)
     dt = float(body.control_dt or 0.0)
     diagnosis = loaded(folder)
-    own = diagnosed_timestep(diagnosis) if args.timestep is None else args.timestep
-    finer = _refined(body, own, "--timestep")
+    step = args.timestep
+    if step is None and (found := diagnosed_timestep(diagnosis)) is not None:
+        step = min(found, float(body.mj_model.opt.timestep))
+    finer = _refined(body, step, "--timestep")
     physics = _corrected(finer, dt, correction(diagnosis, folder, body.space), f"--diagnosis {folder}")
     nominal = _on(config, body.physics(dt, (), judge.wide(body.space)))
     real = logs = None

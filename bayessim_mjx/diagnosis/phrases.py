@@ -197,9 +197,9 @@ def sharpens(action: str, parameter: str, before: float, after: float, unit: str
     return f"{action}: sharpens {parameter}, standard deviation from {before:.2g} to {after:.2g} {unit}".rstrip()
 
 
-def sharpens_little(text: str) -> str:
-    """`sharpens`, where that is not worth an experiment."""
-    return f"none that would tell much more: the best, {text.removeprefix('run ')}"
+def sharpens_little(best: str, parameter: str, before: float, after: float, unit: str) -> str:
+    """Why an experiment does not help, of its name and what it would do to the standard deviation of a parameter."""
+    return f"none would tell much more; the best, {sharpens(best, parameter, before, after, unit)}"
 
 
 def separates_nobody(labels: Sequence[str], best: str, evidence: float, help: str) -> str:

@@ -152,12 +152,8 @@ def sharpened(
     u, weights = drawn
     chart = "plain" if proposal.chart == "plain" else "probit"
     z = np.asarray(to_chart(jnp.asarray(u), chart), np.float64)
-    if chart == "plain":
-        again = z[rng.choice(len(z), len(z), p=weights)]
-        q = in_cube(lambda own: fitted(rng, z[:, own], weights, components), again, worth(drawn))
-    else:
-        q = fitted(rng, z, weights, components)
-    fit = Distribution.from_unit(space, np.log(q.weights), q.means, np.linalg.cholesky(q.covariances), chart=chart)
+    again = z[rng.choice(len(z), len(z), p=weights)] if chart == "plain" else z
+    fit = _mixture(space, chart, lambda own: fitted(rng, z[:, own], weights, components), again, worth(drawn))
     simulations = found.simulations + len(u)
     return replace(found, posterior=fit, fitted=fit, effective=worth(drawn), simulations=simulations)
 
@@ -189,17 +185,20 @@ def _answer(
     """What the population says, if its islands agree."""
     chart = "plain" if proposal.chart == "plain" else "probit"
     draws = np.asarray(to_chart(jnp.asarray(at.islands), chart), np.float64)
-    if chart == "plain":
-        every = draws.reshape(-1, draws.shape[-1])
-        q = in_cube(lambda own: fitted_to_islands(rng, draws[..., own], components), every, max(at.worth, 1.0))
-    else:
-        q = fitted_to_islands(rng, draws, components)
-    scales = np.linalg.cholesky(q.covariances)
-    fit = Distribution.from_unit(proposal.space, np.log(q.weights), q.means, scales, chart=chart)
+    every, count = draws.reshape(-1, draws.shape[-1]), max(at.worth, 1.0)
+    fit = _mixture(proposal.space, chart, lambda own: fitted_to_islands(rng, draws[..., own], components), every, count)
     simulations, missing = before + at.simulations, at.missing(enough, power)
     reason = missing and f"{missing}, after {simulations} simulations"
     best = thetas(proposal.space, at.u[np.argmax(at.like)][None])[0]
     return Refined(proposal if reason else fit, fit, at, at.worth, simulations, best, reason)
+
+
+def _mixture(
+    space: Any, chart: str, fit: Callable[[np.ndarray], Mixture], draws: np.ndarray, count: float
+) -> Distribution:
+    """Gaussians that `fit` finds in the coordinates (`[d]`, bool) it is asked for, in the chart of draws [N, d]."""
+    q = in_cube(fit, draws, count) if chart == "plain" else fit(np.ones(draws.shape[1], bool))
+    return Distribution.from_unit(space, np.log(q.weights), q.means, np.linalg.cholesky(q.covariances), chart=chart)
 
 
 def _begin(proposal: Distribution) -> Mixture:

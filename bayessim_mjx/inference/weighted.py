@@ -43,6 +43,11 @@ class Mixture:
             rows.append(np.log(np.maximum(w, 1e-300)) - 0.5 * (away**2).sum(0) - size)
         return np.stack(rows, axis=1)
 
+    def shares(self, z: np.ndarray) -> np.ndarray:
+        """[N, K] of each z that each Gaussian accounts for; they sum to 1."""
+        each = self.each(z)
+        return np.asarray(np.exp(each - logsumexp(each, axis=1, keepdims=True)))
+
 
 def fitted(rng: np.random.Generator, z: np.ndarray, weights: np.ndarray, most: int) -> Mixture:
     """Gaussians fitted to weighted draws: as many, of 1, 2, 4 ... `most`, as explain draws that were held out best."""
@@ -68,8 +73,7 @@ def supported(rng: np.random.Generator, z: np.ndarray, weights: np.ndarray, k: i
     A few draws of much weight span a plane, and a Gaussian fitted to them is a spike beside everything else.
     """
     q = em(rng, z, weights, k)
-    each = q.each(z)
-    share = np.exp(each - logsumexp(each, axis=1, keepdims=True)) * weights[:, None]
+    share = q.shares(z) * weights[:, None]
     fewest = min(effective(own / own.sum()) if own.sum() > 0 else 0.0 for own in share.T)
     return q if k == 1 or fewest >= FEWEST * z.shape[1] else supported(rng, z, weights, k // 2)
 
@@ -102,11 +106,8 @@ def in_cube(fit: Callable[[np.ndarray], Mixture], draws: np.ndarray, worth: floa
     d = draws.shape[1]
     flat = _flat(draws.mean(0), np.cov(draws.T, bias=True).reshape(d, d), worth)
     own = np.flatnonzero(~flat)
-    q = (
-        uncut(fit(~flat), draws[:, own], worth)
-        if len(own)
-        else Mixture(np.ones(1), np.zeros((1, 0)), np.ones((1, 0, 0)))
-    )
+    nothing = Mixture(np.ones(1), np.zeros((1, 0)), np.ones((1, 0, 0)))
+    q = uncut(fit(~flat), draws[:, own], worth) if len(own) else nothing
     means, covariances = np.full((len(q.weights), d), 0.5), np.tile(FLAT**2 * np.eye(d), (len(q.weights), 1, 1))
     means[:, own], covariances[:, own[:, None], own] = q.means, q.covariances
     return Mixture(q.weights, means, covariances)
@@ -122,8 +123,7 @@ def uncut(q: Mixture, draws: np.ndarray, worth: float, steps: int = 20) -> Mixtu
     Args:
         draws: `[N, d]`; worth: how many independent ones they are worth.
     """
-    each = q.each(draws)
-    share = np.exp(each - logsumexp(each, axis=1, keepdims=True))
+    share = q.shares(draws)
     means, covariances = q.means.copy(), q.covariances.copy()
     for k, part in enumerate(share.T):
         weight = part / np.maximum(part.sum(), 1e-9)
@@ -186,8 +186,7 @@ def em(rng: np.random.Generator, z: np.ndarray, weights: np.ndarray, k: int, ste
         centres.append(rng.choice(len(z), p=far / far.sum()) if far.sum() > 0 else int(rng.integers(len(z))))
     q = Mixture(np.full(k, 1 / k), z[centres], np.repeat(whole[None] / k ** (2 / z.shape[1]), k, axis=0))
     for _ in range(steps):
-        each = q.each(z)
-        share = np.exp(each - logsumexp(each, axis=1, keepdims=True)) * weights[:, None]
+        share = q.shares(z) * weights[:, None]
         mass = np.maximum(share.sum(0), 1e-9)
         means = share.T @ z / mass[:, None]
         gap = z[None] - means[:, None]

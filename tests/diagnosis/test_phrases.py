@@ -43,6 +43,9 @@ def test_why_an_experiment_is_proposed():
         phrases.sharpens(action, "mass", 0.2, 0.05, "")
         == f"{action}: sharpens mass, standard deviation from 0.2 to 0.05"
     )
+    assert phrases.sharpens_little("release", "mass", 0.2, 0.19, "kg") == (
+        "none would tell much more; the best, release: sharpens mass, standard deviation from 0.2 to 0.19 kg"
+    )
     assert phrases.separating(["unheard_of"]) == "a known payload, two mount orientations, or a measured effort"
 
 

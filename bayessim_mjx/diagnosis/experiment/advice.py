@@ -82,8 +82,8 @@ def reason(scorer: Scorer, chosen: Scored | None, labels: Sequence[str], contest
     if len(labels) == 1:
         index, variance = scorer.loosest(0)
         c, before = scorer.models[0].fit.coordinates[index], math.sqrt(variance)
-        text = phrases.sharpens(action, c.name, before, before * math.exp(-chosen.evidence), c.unit)
-        return text if useful else phrases.sharpens_little(text)
+        told = c.name, before, before * math.exp(-chosen.evidence), c.unit
+        return phrases.sharpens(action, *told) if useful else phrases.sharpens_little(chosen.name, *told)
     if not useful:
         return phrases.separates_nobody(labels, chosen.name, chosen.evidence, instead(scorer.models))
     return phrases.tells_apart(action, labels, chosen.evidence, contested)

@@ -32,7 +32,7 @@ class Rules:
 
     factors: tuple[int, ...] = (1, 2, 4, 8)
     more: tuple[int, ...] = (16, 32)  # beyond the budget, where the step is worth more than the tolerance
-    contacts: int = 4  # the finest with contacts: what is left there is chaos, which no step removes
+    contacts: int = 4  # the finest with contacts: what is left falls with the root of the step at best
     enough: float = 0.6  # noises: an error of the time step that does not show
     shorter: int = 5  # halvings of the time step that can be recommended
     worth: float = 1.0  # noises: from here on the user is told
