@@ -17,7 +17,9 @@ FLAT = 1.5  # sd, in the width of the cube: over it the density falls by 5 %, wh
 # standard errors, beyond which draws are not uniform by chance: .98 of uniform directions pass, and what is not uniform
 # and passes loses less than its moments' chance would (benchmarks/results.md, refined posteriors)
 SURE = 3.0
-FEWEST = 3  # independent draws in each direction, behind every Gaussian
+# draws in each direction, behind every Gaussian: fewer than one span a plane and have no Gaussian; where that does not
+# happen 0 to 6 make no difference (benchmarks/inference/few_draws.py)
+FEWEST = 3
 STRIDE = 1.5  # power of a ratio of variances: what is cut off changes by less than its Gaussian
 
 
