@@ -12,6 +12,7 @@ from scipy.special import gammainc, gammaln
 from bayessim_mjx.distributions.charts import from_chart, to_chart
 from bayessim_mjx.kalman import Gains
 from bayessim_mjx.loop.noise import FINEST, Linear, Noise, NoiseModel
+from bayessim_mjx.loop.starts import Starts
 from bayessim_mjx.physics import Physics
 from bayessim_mjx.physics.tangent import addresses
 from bayessim_mjx.tracking import Record, close, errors, transitions
@@ -51,7 +52,9 @@ class Likelihood:
         self.scale = size
         self.floor = np.where(np.isfinite(sensor), np.maximum(np.nan_to_num(sensor, posinf=0.0), FINEST * size), np.inf)
         self.seen = np.isfinite(self.floor)
-        self.model = NoiseModel(self.floor, size, physics.dt)
+        self.starts = Starts(record, physics.mj_model)
+        self.begun = record  # from the most likely starts
+        self.model = NoiseModel(self.floor, size, physics.dt, self.starts)
         self.nv = nv
         self.noise = Noise(self.floor, np.zeros(nv))
         self.gains: Gains | None = None
@@ -111,6 +114,7 @@ class Likelihood:
         ways, gaps = self._dynamics(theta, path, self.parts)
         linear = self._linear(theta, path, ways, gaps)
         self.noise = self.model.likely(linear, self.noise)
+        self.begun = self.starts.begun(self.noise.sensor)
         self.laplace = self._posterior(linear)
         gains = self.model.gains(ways, self.noise)
         mask = jnp.asarray(self.valid, jnp.float32)[:, :, None, None]
@@ -131,7 +135,7 @@ class Likelihood:
 
     def _dynamics(self, theta: np.ndarray, path: Gains, parts: list[slice]) -> tuple[np.ndarray, np.ndarray]:
         found = [
-            transitions(self.physics, theta, _rows(self.record, part), _rows(path, part), self.scale) for part in parts
+            transitions(self.physics, theta, _rows(self.begun, part), _rows(path, part), self.scale) for part in parts
         ]
         return np.concatenate([ways for ways, _ in found]), np.concatenate([gaps for _, gaps in found])
 
@@ -150,7 +154,7 @@ class Likelihood:
     def squares(self, thetas: np.ndarray) -> np.ndarray:
         """Sums of squared whitened prediction errors [M, N, blocks] at thetas [M, d]."""
         assert self.gains is not None, "settle first"
-        each = [errors(self.physics, thetas, _rows(self.record, part), _rows(self.gains, part)) for part in self.parts]
+        each = [errors(self.physics, thetas, _rows(self.begun, part), _rows(self.gains, part)) for part in self.parts]
         return np.concatenate([np.asarray(x, np.float64) for x in each], axis=1)
 
     @property

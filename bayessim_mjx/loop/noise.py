@@ -12,6 +12,7 @@ import jax
 import numpy as np
 
 from bayessim_mjx.kalman import Force, Gains, innovations, riccati
+from bayessim_mjx.loop.starts import Starts
 
 FINEST = 1e-3  # of a channel's range of motion: no sensor is believed to be better
 PROCESS = (1e-3, 1e-2, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0)  # of unmodelled forces, in the velocity's sensor noise
@@ -70,11 +71,13 @@ class NoiseModel:
         floor: `[2 nv]` standard deviations of the sensors at least; inf where nothing is measured.
         scale: `[2 nv]` range of motion.
         dt: control step, s.
+        starts: as measured.
     """
 
     floor: np.ndarray
     scale: np.ndarray
     dt: float
+    starts: Starts
 
     @property
     def nv(self) -> int:
@@ -128,7 +131,7 @@ class NoiseModel:
 
     def _start(self, noise: Noise) -> np.ndarray:
         """Standard deviations of the start state: as measured, or anything where it is not."""
-        return np.where(self.seen, noise.sensor, 0.3 * self.scale)
+        return np.where(self.seen, self.starts.sd(noise.sensor), 0.3 * self.scale)
 
     def fit(self, linear: Linear, noise: Noise) -> tuple[float, float]:
         """(log evidence at the best common factor on the noise, that factor), by linear dynamics.

@@ -104,7 +104,7 @@ def test_a_likelihood_that_is_a_lottery_keeps_the_proposal():
 def test_simulations_that_diverge_count_for_nothing(impossible):
     rng = np.random.default_rng(0)
     z, squares = rng.normal(size=(50, 2)), rng.chisquare(6, (50, 3, 4))
-    likelihood = SimpleNamespace(count=72.0, least=0.0)
+    likelihood = SimpleNamespace(count=72.0, least=0.0, groups=np.arange(3))
     without, _ = _spread(z, squares, likelihood)
     diverged = np.concatenate([squares, np.full((1, 3, 4), impossible)])
     np.testing.assert_allclose(_spread(np.concatenate([z, np.ones((1, 2))]), diverged, likelihood)[0], without)
