@@ -97,6 +97,11 @@ def _search_options(parser: cli.PlainParser) -> None:
     )
     parser.add_argument("--quick", action="store_true", help="a first answer: fewer windows and effects, no maps")
     parser.add_argument(
+        "--verdict_only",
+        action="store_true",
+        help="the whole search, but no report, maps, black boxes or next experiment: diagnosis.json and effects.yaml",
+    )
+    parser.add_argument(
         "--criteria",
         metavar="KEY=VALUE",
         nargs="*",
@@ -156,6 +161,7 @@ def _diagnosis(args: argparse.Namespace, say: Any, early: Callable[[Sequence[str
         payload=args.payload,
         minutes=args.minutes,
         quick=args.quick,
+        verdict_only=args.verdict_only,
         criteria=Criteria().changed(args.criteria),
         seed=args.seed,
         out=args.out,
@@ -181,13 +187,17 @@ def _diagnose(argv: Sequence[str] | None) -> int:
 
     with warnings.catch_warnings(record=True), stages(args.headless) as say:  # what matters is told with the result
         result = _diagnosis(args, say, early)
-        say("writing the report", 0, 1)
-        report.write(result, Path(args.out), missed)
-        report.tensorboard(result, Path(args.out))
+        if args.verdict_only:
+            (Path(args.out) / "report.html").unlink(missing_ok=True)  # of an earlier answer
+        else:
+            say("writing the report", 0, 1)
+            report.write(result, Path(args.out), missed)
+            report.tensorboard(result, Path(args.out))
     report.console(result, Path(args.out))
     if missed:
         _told(f"On this robot and these logs ({missed.page}):", missed.sentences, args.headless)
-    print(f"{duration(time.monotonic() - began)}; open {Path(args.out) / 'report.html'}")
+    best = Path(args.out) / ("diagnosis.json" if args.verdict_only else "report.html")
+    print(f"{duration(time.monotonic() - began)}; open {best}")
     return 0
 
 

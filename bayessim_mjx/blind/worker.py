@@ -40,7 +40,7 @@ def command(check: Check, data: Path, out: Path) -> list[str]:
     robot = ["--task", check.task] if check.task else ["--model", model]
     accuracy = ["--accuracy", f"{100 * check.accuracy:g}%"]
     own = [sys.executable, "-m", "bayessim_mjx.diagnose", *robot, "--data", str(data), "--out", str(out)]
-    return [*own, *accuracy, "--seed", "0", "--headless", *check.more]
+    return [*own, *accuracy, "--seed", "0", "--headless", "--verdict_only", *check.more]
 
 
 def diagnose(check: Check, index: int) -> str:

@@ -119,6 +119,7 @@ def investigate(
     settings: Settings | None = None,
     minutes: float | None = None,
     quick: bool = False,
+    verdict_only: bool = False,
     remember: Path | None = None,
     tolerated: Sequence[str] = (),
     criteria: Criteria | None = None,
@@ -134,7 +135,7 @@ def investigate(
     Args:
         robot: the model with the parameters that it may recalibrate.
         logs, effects, group, minutes, quick, seed, criteria, progress: see `diagnose`; tolerated: its `tolerance`.
-        settings: budgets of the search; None: by the robot's size.
+        settings: budgets of the search; None: by the robot's size. verdict_only: without the optional stages.
         remember: folder for the fits of the search, so that a killed one goes on where it was.
         notes: what was noticed while model and logs were read, for the warnings.
         stages: after the selection, optional ones last; None: `STAGES`.
@@ -159,7 +160,7 @@ def investigate(
     found = Findings(setup, selected.select(*given, say, lambda tried: known(setup, tried)))
     resumed.ended(setup)
     stages = STAGES if stages is None else stages
-    stages = [stage for stage in stages if not (stage.optional and quick)]
+    stages = [stage for stage in stages if not (stage.optional and (quick or verdict_only))]
     for stage in stages:
         found = found if stage.optional else _after(stage, found, say)
     if verdict is not None:
@@ -211,6 +212,7 @@ def diagnose(
     payload: str | Sequence[str] = (),
     minutes: float | None = None,
     quick: bool = False,
+    verdict_only: bool = False,
     seed: int = 0,
     out: str | Path | None = None,
     progress: Progress | None = None,
@@ -231,6 +233,7 @@ def diagnose(
         tolerance: what may stay unexplained, as `--tolerance`: "0.5deg", "elbow=2mm", "3%".
         accuracy, payload: of a data sheet, as the flags: "5%", "mass=2%"; "12kg", "tool=12".
         minutes: that it may take; what there was no time for is told. quick: a first answer, from few windows.
+        verdict_only: the whole search, but no maps, black boxes or next experiment.
         criteria: when one model is better than another and which is named; None: as measured in benchmarks/results.md.
         seed: of all random numbers; out: folder for what the command writes, but for the report; None: nothing.
         progress: called with (what is being done, done, total); early: with what logs tell at once, in lines.
@@ -250,7 +253,7 @@ def diagnose(
     files = Files(None if out is None else Path(out), told)
     asked: Any = {"group": group, "seed": seed, "notes": noticed, "progress": progress, "criteria": criteria}
     asked |= {"tolerated": _several(tolerance), "early": early, "minutes": minutes, "quick": quick}
-    asked |= {"remember": files.search}
+    asked |= {"remember": files.search, "verdict_only": verdict_only}
     try:
         found = investigate(robot, recorded, effects, **asked, keep=files.so_far, verdict=files.verdict)
     except TooLittleData as reason:

@@ -32,7 +32,8 @@ from bayessim_mjx.blind.worker import EXIT  # noqa: E402
 
 COUNTED = 2000  # seeds from here on count
 ENTRIES = {
-    "ours": "{python} -m bayessim_mjx.diagnose --model {model} --data {data} --out {out} --accuracy 5% --headless",
+    "ours": "{python} -m bayessim_mjx.diagnose --model {model} --data {data} --out {out} --accuracy 5% --headless "
+    "--verdict_only",
     "parameter refit (mujoco.sysid)": "{python} {here}/entries/refit.py {model} {data} {out}",
     "naive BIC": "{python} {here}/entries/bic.py {model} {data} {out}",
     "sparse regression (SINDy)": "{python} {here}/entries/sindy.py {model} {data} {out}",

@@ -19,6 +19,7 @@ from bayessim_mjx.diagnosis.residual.where import Located
 from bayessim_mjx.diagnosis.setup import TooLittleData
 from bayessim_mjx.errors import UserError
 from tests.diagnosis.pendulums import MODEL, nominal, recorded, saved
+from tests.report import fake
 
 FRICTION = 0.04
 XML = MODEL % (0.002, "Euler", 0.02, 0.005, 0.0, 0.5)
@@ -147,3 +148,34 @@ def test_blas_has_one_thread_while_a_diagnosis_runs(monkeypatch):
     with threadpoolctl.threadpool_limits(2, user_api="blas"), pytest.raises(TooLittleData):
         run.investigate(None, [])
     assert seen and set(seen) == {1}
+
+
+@pytest.mark.parametrize("left_out", [{"quick": True}, {"verdict_only": True}, {}])
+def test_the_verdict_alone_has_no_optional_stages(monkeypatch, left_out):
+    setup = SimpleNamespace(said=(), fitter=None, candidates=None, settings=None)
+    monkeypatch.setattr(run, "prepare", lambda *a, **k: setup)
+    monkeypatch.setattr(run, "_within", lambda setup, time_left: setup)
+    monkeypatch.setattr(run.resumed, "remembering", lambda setup, *a: setup)
+    monkeypatch.setattr(run.resumed, "ended", lambda setup: None)
+    monkeypatch.setattr(run.selected, "select", lambda *a: SimpleNamespace(answer="a model"))
+    ran = []
+
+    def stage(name, optional):
+        return run.Stage(name, lambda findings, say: ran.append(name) or findings, optional=optional)
+
+    stages = [stage("how far", False), stage("maps", True)]
+    run.investigate(None, [], stages=stages, **left_out)
+    assert ran == (["how far"] if left_out else ["how far", "maps"])
+
+
+def test_the_verdict_alone_writes_no_page_and_leaves_none_of_an_earlier_answer(tmp_path, monkeypatch, capsys):
+    asked = {}
+    monkeypatch.setattr(run, "diagnose", lambda *a, **k: asked.update(k) or fake.full())
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "report.html").write_text("of an earlier answer")
+    nominal(tmp_path)
+    words = ["--model", str(tmp_path / "pendulum.xml"), "--data", str(tmp_path), "--out", str(tmp_path / "out")]
+    assert bayessim_mjx.diagnose.main([*words, "--headless", "--verdict_only"]) == 0
+    assert asked["verdict_only"] and list((tmp_path / "out").iterdir()) == []
+    told = capsys.readouterr().out
+    assert "report.html" not in told and told.rstrip().endswith("diagnosis.json")
