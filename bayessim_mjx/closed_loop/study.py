@@ -160,18 +160,20 @@ class Study:
             out[role] = [own] if own else [self.keeper.policies(role, seed, console) for seed in range(self.seeds)]
         return out
 
-    def chosen(self, role: str, policies: Policies) -> int:
-        """The iteration whose policy is best where it was trained: nothing of the real system decides."""
-        score = dict(zip(policies, self.judge.at_home(role, list(policies.values())), strict=True))
-        return max(score, key=lambda mark: score[mark])
+    def chosen(self, role: str, trainings: list[Policies]) -> list[int]:
+        """Of each training the iteration of the policy that is best where it was trained: nothing real decides."""
+        score = iter(self.judge.at_home(role, [p for policies in trainings for p in policies.values()]))
+        scores = [{mark: next(score) for mark in policies} for policies in trainings]
+        return [max(each, key=lambda mark: each[mark]) for each in scores]
 
     # ---- results
 
     def run(self, console: Any) -> dict[str, Any]:
         """The contents of gap_loop.json."""
         policies = self.all_policies(console)
-        console.say(f"evaluating, {self.judge.episodes} episodes of every policy on every simulator ...")
-        best = {role: [self.chosen(role, p) for p in each] for role, each in policies.items()}
+        console.say(f"the best policy of each training, {self.judge.episodes} episodes where it was trained ...")
+        best = {role: self.chosen(role, each) for role, each in policies.items()}
+        console.say("these policies on every simulator ...")
         judged = iter(
             self.judge.everywhere([p[at] for r, each in policies.items() for p, at in zip(each, best[r], strict=True)])
         )
@@ -181,6 +183,7 @@ class Study:
         out["policies"] = {role: _table(best[role], each) for role, each in rows.items()}
         out["gap"] = out["ranking"] = out["recovery"] = out["replay"] = None
         if self.simulators.real is not None:
+            console.say("and those that were kept on the way, for the ranking ...")
             every = self.judge.everywhere([p for each in policies["nominal"] for p in each.values()])
             out["gap"] = {"policy": measures.gap(rows["nominal"]), "training": measures.gap(every)}
             out["ranking"] = measures.ranking(every)
@@ -188,6 +191,7 @@ class Study:
             out["recovery"] = measures.recovery(real)
         else:
             out["replay"] = judge.replay(self.logs, self.simulators.nominal.physics, self.simulators.corrected.physics)
+        console.say("what each effect changes ...")
         out["effects"] = self._relevance(policies, best, rows)
         out["sentences"] = words.sentences(out)
         out["versions"] = versions()
