@@ -152,8 +152,7 @@ def sharpened(
     u, weights = drawn
     chart = "plain" if proposal.chart == "plain" else "probit"
     z = np.asarray(to_chart(jnp.asarray(u), chart), np.float64)
-    again = z[rng.choice(len(z), len(z), p=weights)] if chart == "plain" else z
-    fit = _mixture(space, chart, lambda own: fitted(rng, z[:, own], weights, components), again, worth(drawn))
+    fit = _mixture(space, chart, lambda own: fitted(rng, z[:, own], weights, components), z, worth(drawn), weights)
     simulations = found.simulations + len(u)
     return replace(found, posterior=fit, fitted=fit, effective=worth(drawn), simulations=simulations)
 
@@ -194,10 +193,11 @@ def _answer(
 
 
 def _mixture(
-    space: Any, chart: str, fit: Callable[[np.ndarray], Mixture], draws: np.ndarray, count: float
-) -> Distribution:
+    space: Any, chart: str, fit: Callable[[np.ndarray], Mixture], draws: np.ndarray, count: float,
+    weights: np.ndarray | None = None,
+) -> Distribution:  # fmt: skip
     """Gaussians that `fit` finds in the coordinates (`[d]`, bool) it is asked for, in the chart of draws [N, d]."""
-    q = in_cube(fit, draws, count) if chart == "plain" else fit(np.ones(draws.shape[1], bool))
+    q = in_cube(fit, draws, count, weights) if chart == "plain" else fit(np.ones(draws.shape[1], bool))
     return Distribution.from_unit(space, np.log(q.weights), q.means, np.linalg.cholesky(q.covariances), chart=chart)
 
 

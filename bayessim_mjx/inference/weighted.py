@@ -96,26 +96,38 @@ def _count(rng: np.random.Generator, halves: list[tuple[np.ndarray, np.ndarray]]
     return best
 
 
-def in_cube(fit: Callable[[np.ndarray], Mixture], draws: np.ndarray, worth: float) -> Mixture:
+def in_cube(
+    fit: Callable[[np.ndarray], Mixture], draws: np.ndarray, worth: float, weights: np.ndarray | None = None
+) -> Mixture:
     """`uncut` Gaussians for draws in the unit cube, in the coordinates that are told; the others are flat.
 
     In those alone draws are enough for more Gaussians, and a curved valley needs them.
 
     Args:
         fit: Gaussians for the coordinates (`[d]`, bool) that are asked for.
-        draws: `[N, d]`; worth: how many independent ones they are worth.
+        draws, worth, weights: as for `uncut`.
     """
-    d = draws.shape[1]
-    flat = _flat(draws.mean(0), np.cov(draws.T, bias=True).reshape(d, d), worth)
+    weights, d = _equal(draws) if weights is None else weights, draws.shape[1]
+    flat = _flat(*_moments(draws, weights), worth)
     own = np.flatnonzero(~flat)
     nothing = Mixture(np.ones(1), np.zeros((1, 0)), np.ones((1, 0, 0)))
-    q = uncut(fit(~flat), draws[:, own], worth) if len(own) else nothing
+    q = uncut(fit(~flat), draws[:, own], worth, weights) if len(own) else nothing
     means, covariances = np.full((len(q.weights), d), 0.5), np.tile(FLAT**2 * np.eye(d), (len(q.weights), 1, 1))
     means[:, own], covariances[:, own[:, None], own] = q.means, q.covariances
     return Mixture(q.weights, means, covariances)
 
 
-def uncut(q: Mixture, draws: np.ndarray, worth: float, steps: int = 20) -> Mixture:
+def _equal(draws: np.ndarray) -> np.ndarray:
+    return np.full(len(draws), 1 / len(draws))
+
+
+def _moments(draws: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mean [d] and covariance [d, d] of draws [N, d] with weights [N] that sum to 1."""
+    mean = weights @ draws
+    return mean, (draws - mean).T @ ((draws - mean) * weights[:, None])
+
+
+def uncut(q: Mixture, draws: np.ndarray, worth: float, weights: np.ndarray | None = None, steps: int = 20) -> Mixture:
     """Gaussians that have the draws' moments once they are cut off at the unit cube (Lee and Scott 2012).
 
     Of a parameter of which nothing is known, draws fill the range and so must the Gaussian: one whose draws cannot be
@@ -124,14 +136,13 @@ def uncut(q: Mixture, draws: np.ndarray, worth: float, steps: int = 20) -> Mixtu
 
     Args:
         draws: `[N, d]`; worth: how many independent ones they are worth.
+        weights: `[N]` that sum to 1; None: equal ones.
     """
-    share = q.shares(draws)
+    share = q.shares(draws) * (_equal(draws) if weights is None else weights)[:, None]
     means, covariances = q.means.copy(), q.covariances.copy()
     for k, part in enumerate(share.T):
-        weight = part / np.maximum(part.sum(), 1e-9)
-        mean = weight @ draws
-        wanted = (draws - mean).T @ ((draws - mean) * weight[:, None])
-        flat = _flat(mean, wanted, worth * part.mean())
+        mean, wanted = _moments(draws, part / np.maximum(part.sum(), 1e-9))
+        flat = _flat(mean, wanted, worth * part.sum())
         own = np.flatnonzero(~flat)
         means[k][flat], covariances[k] = 0.5, np.diag(np.where(flat, FLAT**2, 0.0))
         block = np.ix_(own, own)
@@ -174,8 +185,7 @@ def _towards(covariance: np.ndarray, wanted: np.ndarray, cut: np.ndarray) -> np.
 
 def em(rng: np.random.Generator, z: np.ndarray, weights: np.ndarray, k: int, steps: int = 60) -> Mixture:
     """Expectation maximisation on weighted draws, begun at k-means++ centres; variances are at least 1e-3 of all."""
-    mean = weights @ z
-    whole = (z - mean).T @ ((z - mean) * weights[:, None])
+    mean, whole = _moments(z, weights)
     # a few draws span a plane only: densities need every direction, well above rounding
     whole += np.diag(1e-8 * np.diag(whole) + 1e-20)
     if k == 1:

@@ -83,6 +83,10 @@ class Likelihood:
             theta = near[0]
         return self._moved(before)
 
+    def back_to(self, noise: Noise, gains: Gains | None) -> None:
+        """Return to a noise that was settled on before, and to its gains."""
+        self.noise, self.gains, self.begun = noise, gains, self.starts.begun(noise.sensor)
+
     def _next(self, theta: np.ndarray) -> tuple[np.ndarray, float] | None:
         """The posterior's mean [d] by linear dynamics around theta, and how many of its sd that is away."""
         if self.laplace is None:

@@ -89,10 +89,11 @@ def refine(
             break
         rank = found.reason is None, found.evidence + likelihood.size
         if kept is None or rank > kept[0]:  # noise and posterior need not settle: the likeliest noise counts
-            kept = rank, found, likelihood.noise, likelihood.gains
+            kept = rank, found, (likelihood.noise, likelihood.gains)
         theta, current = found.theta, found.fitted
     if kept is not None:
-        _, found, likelihood.noise, likelihood.gains = kept
+        _, found, settled = kept
+        likelihood.back_to(*settled)
     assert found is not None
     found, widening = replace(found, simulations=simulations), 1.0
     if not found.reason:

@@ -61,8 +61,7 @@ def judged(kind: str, seed: int, count: int) -> tuple[float, list[tuple[int, flo
     judges, found = jnp.asarray(drawn(kind, rng, JUDGES).clip(0, 1), jnp.float32), []
     for limit in LIMITS:
         own = np.random.default_rng([seed, 1])
-        again = u[own.choice(len(u), len(u), p=w)]
-        q = weighted.in_cube(lambda at, own=own, limit=limit: fitted(own, u[:, at], w, limit), again, effective(w))
+        q = weighted.in_cube(lambda at, own=own, limit=limit: fitted(own, u[:, at], w, limit), u, effective(w), w)
         fit = Distribution.from_unit(SPACE, np.log(q.weights), q.means, np.linalg.cholesky(q.covariances))
         levels = np.asarray(fit.credible_level(judges))
         found.append(

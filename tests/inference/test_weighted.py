@@ -84,3 +84,18 @@ def test_where_most_parameters_are_not_told_a_curved_valley_has_the_gaussians_th
     found = Distribution.from_unit(SPACE, np.log(q.weights), q.means, np.linalg.cholesky(q.covariances))
     whole = fitted(draws, 256)
     assert float(np.mean(found.log_gain(fresh))) > float(np.mean(whole.log_gain(fresh))) + 0.5
+
+
+def test_weighted_draws_are_fitted_as_they_are_and_not_by_a_draw_of_them():
+    """Draws of one posterior, weighted to be those of another: cut off at the walls they have its moments."""
+    rng = np.random.default_rng(6)
+    u = rng.uniform(size=(4000, 3))
+    weights = np.exp(-0.5 * (((u - [0.02, 0.5, 0.4]) / [0.2, 0.1, 5.0]) ** 2).sum(1))
+    weights /= weights.sum()
+    worth = 1 / np.sum(weights**2)
+    q = in_cube(lambda own: gaussians(rng, u[:, own], weights, 1), u, worth, weights)
+    np.testing.assert_array_equal(q.means[:, 2], 0.5)  # flat
+    x, within_ = within(q.means[0], np.linalg.cholesky(q.covariances[0]))
+    np.testing.assert_allclose((within_ @ x)[:2], (weights @ u)[:2], atol=2e-3)
+    variances = weights @ (u - weights @ u) ** 2
+    np.testing.assert_allclose((within_ @ (x - within_ @ x) ** 2)[:2], variances[:2], rtol=0.02)
