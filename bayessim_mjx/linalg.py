@@ -1,12 +1,17 @@
 """Triangular algebra on batches of small matrices, in plain array operations.
 
+Up to UNROLLED rows they are written out: LAPACK takes as long for one such matrix as a core for the numbers of a dozen.
 LAPACK's batched triangular solves share XLA's CPU thread pool: two of them at once can wait for each other for ever
 (seen with jaxlib 0.10.2 on 2 cores). For matrices of at most some dozens of rows loops over rows are as fast.
 """
 
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
 from jax import Array
+
+UNROLLED = 8  # rows
 
 
 def product(a: Array, b: Array) -> Array:
@@ -27,8 +32,48 @@ def solve_lower(lower: Array, right: Array) -> Array:
     return jax.lax.fori_loop(0, lower.shape[-1], row, jnp.zeros_like(right))
 
 
+def cholesky(a: Array) -> Array:
+    """L [..., d, d], lower triangular, with L L^T = a [..., d, d], of which the lower triangle counts."""
+    d = a.shape[-1]
+    if d > UNROLLED:
+        return jax.lax.linalg.cholesky(a, symmetrize_input=False)
+    rows: list[list[Array]] = [[] for _ in range(d)]
+    for i, row in enumerate(rows):
+        for j in range(i):
+            row.append((a[..., i, j] - _dot(row, rows[j][:j])) / rows[j][j])
+        row.append(jnp.sqrt(a[..., i, i] - _dot(row, row)))
+    return _lower(rows)
+
+
+def cholesky_solve(lower: Array, right: Array) -> Array:
+    """x [..., d] with L L^T x = right [..., d], for L [..., d, d] of at most UNROLLED rows."""
+    d, x = right.shape[-1], [right[..., i] for i in range(right.shape[-1])]
+    for i in range(d):
+        x[i] = (x[i] - _dot([lower[..., i, j] for j in range(i)], x)) / lower[..., i, i]
+    for i in reversed(range(d)):
+        x[i] = (x[i] - _dot([lower[..., j, i] for j in range(i + 1, d)], x[i + 1 :])) / lower[..., i, i]
+    return jnp.stack(x, axis=-1)
+
+
+def _dot(a: Sequence[Array], b: Sequence[Array]) -> Array | float:
+    return sum((x * y for x, y in zip(a, b, strict=False)), start=0.0)
+
+
+def _lower(rows: list[list[Array]]) -> Array:
+    zero = jnp.zeros_like(rows[0][0])
+    return jnp.stack([jnp.stack([*row, *[zero] * (len(rows) - len(row))], axis=-1) for row in rows], axis=-2)
+
+
 def inverse_lower(lower: Array) -> Array:
     """Inverse of lower triangular matrices [..., d, d]."""
+    d = lower.shape[-1]
+    if d <= UNROLLED:
+        rows: list[list[Array]] = []
+        for i in range(d):
+            own, pivot = [lower[..., i, j] for j in range(i)], 1 / lower[..., i, i]
+            column = [_dot(own[j:], [rows[k][j] for k in range(j, i)]) for j in range(i)]
+            rows.append([*(-x * pivot for x in column), pivot])
+        return _lower(rows)
     return solve_lower(lower, jnp.broadcast_to(jnp.eye(lower.shape[-1], dtype=lower.dtype), lower.shape))
 
 

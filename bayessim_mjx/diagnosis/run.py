@@ -232,8 +232,7 @@ def diagnose(
         group: metadata key of the operating conditions that are held out in turn.
         tolerance: what may stay unexplained, as `--tolerance`: "0.5deg", "elbow=2mm", "3%".
         accuracy, payload: of a data sheet, as the flags: "5%", "mass=2%"; "12kg", "tool=12".
-        minutes: that it may take; what there was no time for is told. quick: a first answer, from few windows.
-        verdict_only: the whole search, but no maps, black boxes or next experiment.
+        minutes: that it may take; what was left out is told. quick: from few windows. verdict_only: no maps and such.
         criteria: when one model is better than another and which is named; None: as measured in benchmarks/results.md.
         seed: of all random numbers; out: folder for what the command writes, but for the report; None: nothing.
         progress: called with (what is being done, done, total); early: with what logs tell at once, in lines.

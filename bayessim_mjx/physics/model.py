@@ -1,8 +1,7 @@
 """A compiled model with its parameters and effects, and the state of one world of it."""
 
-import functools
-from collections.abc import Callable, Sequence
-from typing import Any, TypeVar
+from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,20 +14,10 @@ from bayessim_mjx.effects.effect import Block, Effect, Measurement, Quantity, la
 from bayessim_mjx.effects.support import contract
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.parameters import ParameterSpace
+from bayessim_mjx.physics.gates import chained_in
 from bayessim_mjx.physics.warp import Warp
 
 EULER, RK4, IMPLICITFAST = (int(getattr(mujoco.mjtIntegrator, f"mjINT_{n}")) for n in ("EULER", "RK4", "IMPLICITFAST"))
-
-T = TypeVar("T")
-
-
-def gated(active: jax.Array | None, index: int, hook: Callable[[], T], otherwise: T) -> T:
-    """What the hook of effect `index` returns; `otherwise`, its inputs, where the effect is not active.
-
-    At neutral numbers both are the same. `active` `[effects]` is one for all worlds of a call: under `vmap` the branch
-    stays a branch, and effects that no world has cost nothing. None: all of them are computed.
-    """
-    return hook() if active is None else jax.lax.cond(active[index], hook, lambda: otherwise)
 
 
 class World(struct.PyTreeNode):
@@ -183,12 +172,15 @@ class Physics:
         self, thetas: tuple, memory: Sequence[Any], true: Measurement, active: jax.Array | None = None
     ) -> tuple[tuple, Measurement]:
         """(effects' memories, what the sensors show) of the true {"qpos", "qvel"}; thetas: one slice per effect."""
-        remembered, shown = list(memory), true
-        for i, (effect, at, theta) in enumerate(zip(self.effects, self.sites, thetas, strict=True)):
-            if overrides(effect, "on_measurement"):
-                hook = functools.partial(effect.on_measurement, at, remembered[i], shown, theta)
-                remembered[i], shown = gated(active, i, hook, (remembered[i], shown))
-        return tuple(remembered), shown
+
+        def hook(i: int, remembered: Any, shown: Measurement) -> tuple[Any, Measurement]:
+            return self.effects[i].on_measurement(self.sites[i], remembered, shown, thetas[i])
+
+        return chained_in(active, self.having("on_measurement"), hook, memory, true)
+
+    def having(self, hook: str) -> list[int]:
+        """Indices of the effects that have this hook."""
+        return [i for i, effect in enumerate(self.effects) if overrides(effect, hook)]
 
     def encoders(
         self, thetas: tuple, qpos: jax.Array, qvel: jax.Array, active: jax.Array | None = None

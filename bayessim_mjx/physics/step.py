@@ -4,19 +4,19 @@ Its sub-steps are those of `timestep`: MJX's, where no effect, drive or limit sa
 """
 
 import functools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from bayessim_mjx.compat import mjx
-from bayessim_mjx.effects.effect import overrides
 from bayessim_mjx.effects.support.motion import Motion
 from bayessim_mjx.effects.support.site import under_tendon_limit
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.physics.drive import Drive
-from bayessim_mjx.physics.model import Physics, World, gated
+from bayessim_mjx.physics.gates import chained_in
+from bayessim_mjx.physics.model import Physics, World
 from bayessim_mjx.physics.timestep import early, substep
 
 
@@ -47,18 +47,14 @@ def _control_step(physics: Physics, world: World, command: jax.Array, drive: Dri
     _refuse(physics, drive)
     warp, thetas = physics.warp, physics.split(world.theta)[1]
     model = physics.model_of(world) if warp is None else warp.model_of(world.fields)
-    memory = list(world.memory)
     commands = jnp.broadcast_to(command, (physics.substeps, physics.mj_model.nu))
-    for i, (effect, at) in enumerate(zip(physics.effects, physics.sites, strict=True)):
-        if overrides(effect, "on_command"):
-            hook = functools.partial(effect.on_command, at, memory[i], commands, thetas[i])
-            memory[i], commands = gated(drive.active, i, hook, (memory[i], commands))
+    memory, commands = _commanded(physics, thetas, world.memory, commands, drive.active)
 
     def body(carry: tuple, ctrl: jax.Array) -> tuple[tuple, None]:
         data, remembered = carry
         return substep(physics, model, data.replace(ctrl=ctrl), remembered, thetas, world.measurement, drive), None
 
-    start = (physics.data_of(world, None if warp is None else warp.data), (tuple(memory), world.forces))
+    start = (physics.data_of(world, None if warp is None else warp.data), (memory, world.forces))
     end, _ = body(start, commands[0]) if physics.substeps == 1 else jax.lax.scan(body, start, commands)
     data, (final, forces) = end
     remembered, measurement = physics.sense(thetas, final, {"qpos": data.qpos, "qvel": data.qvel}, drive.active)
@@ -73,6 +69,17 @@ def _control_step(physics: Physics, world: World, command: jax.Array, drive: Dri
         measurement=measurement,
     )
     return world, data
+
+
+def _commanded(
+    physics: Physics, thetas: tuple, memory: tuple, commands: jax.Array, active: jax.Array | None
+) -> tuple[tuple, jax.Array]:
+    """(memory, commands `[substeps, nu]`) behind all effects on commands."""
+
+    def hook(i: int, remembered: Any, commands: jax.Array) -> tuple[Any, jax.Array]:
+        return physics.effects[i].on_command(physics.sites[i], remembered, commands, thetas[i])
+
+    return chained_in(active, physics.having("on_command"), hook, memory, commands)
 
 
 def _refuse(physics: Physics, drive: Drive) -> None:
@@ -109,12 +116,7 @@ def _begun(physics: Physics, theta: jax.Array, motion: Motion, active: jax.Array
         memory[i], motion = physics.effects[i].on_start(physics.sites[i], memory[i], motion, thetas[i])
 
     def past(memory: tuple, commands: jax.Array) -> tuple[tuple, None]:
-        remembered = list(memory)
-        for i, (effect, at) in enumerate(zip(physics.effects, physics.sites, strict=True)):
-            if overrides(effect, "on_command"):
-                hook = functools.partial(effect.on_command, at, remembered[i], commands, thetas[i])
-                remembered[i], commands = gated(active, i, hook, (remembered[i], commands))
-        return tuple(remembered), None
+        return _commanded(physics, thetas, memory, commands, active)[0], None
 
     filled, _ = jax.lax.scan(past, tuple(memory), motion.command[: motion.start])
     return world.replace(qpos=motion.qpos[motion.start], qvel=motion.qvel[motion.start], memory=filled), motion

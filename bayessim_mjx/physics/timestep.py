@@ -5,7 +5,6 @@ then drives that are off, then gravity compensation and the joint's limit (`actu
 """
 
 import dataclasses
-import functools
 from typing import Any
 
 import jax
@@ -18,12 +17,12 @@ from bayessim_mjx.effects.effect import overrides
 from bayessim_mjx.effects.support.site import joint_dofs, ranges
 from bayessim_mjx.effects.support.substep import SubStep
 from bayessim_mjx.physics.drive import Drive
-from bayessim_mjx.physics.model import EULER, IMPLICITFAST, RK4, Physics, gated
+from bayessim_mjx.physics.gates import chained_in
+from bayessim_mjx.physics.model import EULER, IMPLICITFAST, RK4, Physics
+from bayessim_mjx.physics.pushed import Memory, pushed
 
 STAGES = ((0.5, 1 / 3), (0.5, 1 / 3), (1.0, 1 / 6))  # of RK4 after the first: (how far from the start, weight)
 _NO_DAMPING = int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
-
-Memory = tuple[tuple, jax.Array]  # (memories of the effects, their last forces [effects, nv])
 
 
 def staggered(model: mujoco.MjModel) -> bool:
@@ -117,7 +116,7 @@ def forward(own: Timestep, data: mjx.Data, carry: Memory) -> tuple[mjx.Data, Mem
         seen = physics.encoders(own.thetas, data.qpos, data.qvel, own.drive.active)
         data = data.replace(ctrl=own.drive.law(data.ctrl, *seen))
     data, memory, step = _actuated(own, data, carry[0])
-    data, carry = _pushed(own, data, (memory, carry[1]), step)
+    data, carry = pushed(physics, own.thetas, own.drive, data, (memory, carry[1]), step)
     data = _accelerated(model, data)
     return (mjx.sensor_acc(model, data) if sensors and data._impl.efc_J.size else data), carry, step
 
@@ -151,11 +150,13 @@ def _within_range(own: Timestep, ctrl: jax.Array) -> jax.Array:
 
 def _acting(own: Timestep, step: SubStep, memory: tuple, force: jax.Array) -> tuple[tuple, jax.Array]:
     """(memory, forces `[nu]`) behind all effects on actuators, and where the drive is on."""
-    remembered, step = list(memory), step if own.drive.active is None else step.ready("asked")
-    for i, effect, at, theta in own.having("on_actuator"):
-        hook = functools.partial(effect.on_actuator, at, remembered[i], step, force, theta)
-        remembered[i], force = gated(own.drive.active, i, hook, (remembered[i], force))
-    return tuple(remembered), force if own.drive.enabled is None else force * own.drive.enabled
+    physics, step = own.physics, step if own.drive.active is None else step.ready("asked")
+
+    def hook(i: int, remembered: Any, force: jax.Array) -> tuple[Any, jax.Array]:
+        return physics.effects[i].on_actuator(physics.sites[i], remembered, step, force, own.thetas[i])
+
+    memory, force = chained_in(own.drive.active, physics.having("on_actuator"), hook, memory, force)
+    return memory, force if own.drive.enabled is None else force * own.drive.enabled
 
 
 def _torque(own: Timestep, plain: mjx.Data, acting: jax.Array) -> jax.Array:
@@ -212,30 +213,6 @@ def _response(own: Timestep, plain: mjx.Data, acting: jax.Array, memory: tuple) 
     low, high = _joint_ranges(model)
     torque, dof = _unclipped(own, plain, acting), joint_dofs(nominal)
     return response * jnp.where(dof >= 0, ((torque > low) & (torque < high))[dof], True)
-
-
-def _pushed(own: Timestep, data: mjx.Data, carry: Memory, step: SubStep) -> tuple[mjx.Data, Memory]:
-    """The sum of the effects' own forces in qfrc_applied.
-
-    Each effect sees the newest forces of the others (Gauss-Seidel). They start from those of the last sub-step, so that
-    dry friction in several coupled joints settles to sticking.
-    """
-    drive = own.drive
-    if not own.physics.effects and drive.force is None:
-        return data, carry
-    memory, forces = list(carry[0]), carry[1]
-    step = step if drive.active is None else step.ready("asked", "response", "inverse")
-    known = data.qfrc_passive - data.qfrc_bias + data.qfrc_actuator
-    outside = jnp.zeros_like(data.qfrc_applied) if drive.force is None else drive.force
-    for i, effect, at, theta in own.having("on_force"):
-
-        def hook(i: int = i, effect: Any = effect, at: Any = at, theta: Any = theta, forces: Any = forces) -> Any:
-            others = known + outside + jnp.sum(forces.at[i].set(0.0), axis=0)
-            remembered, force = effect.on_force(at, memory[i], step.seen_by(others, forces[i]), theta)
-            return remembered, forces.at[i].set(force)
-
-        memory[i], forces = gated(drive.active, i, hook, (memory[i], forces))
-    return data.replace(qfrc_applied=jnp.sum(forces, axis=0) + outside), (tuple(memory), forces)
 
 
 def _integrated(own: Timestep, data: mjx.Data, memory: tuple, step: SubStep) -> mjx.Data:

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from bayessim_mjx.effects.support.site import ranges
-from bayessim_mjx.linalg import inverse_lower, product
+from bayessim_mjx.linalg import cholesky, inverse_lower, product
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -59,6 +59,12 @@ class SubStep:
         for name in names:
             getattr(self, name)
         return self
+
+    def within_a_branch(self) -> "SubStep":
+        """The same sub-step, whose derived values stay in the branch: those known already are shared."""
+        other = copy.copy(self)
+        other._cache = dict(self._cache)
+        return other
 
     def _once(self, name: str, compute: "Callable[[], Any]") -> Any:
         if name not in self._cache:
@@ -128,7 +134,7 @@ class SubStep:
         """`[nv, nv]`, inverse of the matrix that the integrator solves: M plus the implicit damping."""
 
         def compute() -> jax.Array:
-            factor = inverse_lower(jnp.linalg.cholesky(self._inertia()))
+            factor = inverse_lower(cholesky(self._inertia()))
             return product(factor.T, factor)
 
         return self._once("inverse", compute)
