@@ -37,8 +37,8 @@ class _Instead(types.ModuleType):
 
 
 def _cho_factor(a: jax.Array, *args: Any, **named: Any) -> tuple[jax.Array, bool]:
-    """`jax.scipy.linalg.cho_factor`; of small matrices on a CPU by what `linalg` writes out."""
-    if args or named or a.shape[-1] > linalg.UNROLLED or jax.default_backend() != "cpu":
+    """`jax.scipy.linalg.cho_factor`; of small matrices by what `linalg` writes out."""
+    if args or named or a.shape[-1] > linalg.UNROLLED:
         return jax.scipy.linalg.cho_factor(a, *args, **named)  # type: ignore[return-value]
     return jnp.swapaxes(linalg.cholesky(a), -1, -2), False
 
@@ -46,16 +46,18 @@ def _cho_factor(a: jax.Array, *args: Any, **named: Any) -> tuple[jax.Array, bool
 def _cho_solve(factor: tuple[jax.Array, bool], b: jax.Array, **named: Any) -> jax.Array:
     """`jax.scipy.linalg.cho_solve`, likewise."""
     own, lower = factor
-    if named or lower or b.ndim != 1 or len(b) > linalg.UNROLLED or jax.default_backend() != "cpu":
+    if named or lower or b.ndim != 1 or len(b) > linalg.UNROLLED:
         return jax.scipy.linalg.cho_solve(factor, b, **named)
     return linalg.cholesky_solve(jnp.swapaxes(own, -1, -2), b)
 
 
 def _write_out_small_factors() -> None:
-    """Give MJX's dense factorisations `linalg`'s: LAPACK's make a third of a small robot's step on a CPU.
+    """Give MJX's dense factorisations `linalg`'s: a library's make up to a third of a small robot's step.
 
     A pendulum of two links without friction: 541 ns for a step of one world, 387 with these; a six-joint arm 2386 and
-    2117, with dry friction 6993 and 5686 (64 worlds, one core). An MJX that has no such modules keeps its own.
+    2117, with dry friction 6993 and 5686 (64 worlds, one core). On an H200 a step of 4096 worlds takes 71 us in place
+    of 102, and 161 of 195; with friction 738 of 1000, and 965 of 1213. Fourteen joints gain 3 % and are left alone.
+    An MJX that has no such modules keeps its own.
     """
     with contextlib.suppress(ImportError):
         from mujoco.mjx._src import forward, smooth, solver
