@@ -35,8 +35,8 @@ Array = NDArray[np.float64]
 WIDE = 0.5  # of the nominal value, either way
 CHECKPOINTS = 8  # policies of one training that are kept and ranked, besides the untrained one
 REPLAYED = 4.0  # s of each log
-TOGETHER = {"cpu": CHECKPOINTS + 1}  # policies evaluated in one program, by backend
-ON_ACCELERATORS = 48  # where a step takes as long for a few of them
+TOGETHER = CHECKPOINTS + 1  # policies evaluated in one program on a CPU
+ON_ACCELERATORS = 48  # and where a step takes as long for a few of them
 DRAWN = "drawn"
 Plan = tuple[Policy, Any]  # a policy and the theta it plays on (None: nominal, DRAWN: the environment's priors)
 
@@ -120,7 +120,7 @@ class Judge:
     def returns(self, env: Task, plans: Sequence[Plan]) -> list[Array]:
         """Returns `[episodes]` of each plan: many in one program, which is compiled once for an environment."""
         out: dict[int, Array] = {}
-        most = TOGETHER.get(jax.default_backend(), ON_ACCELERATORS)
+        most = TOGETHER if jax.default_backend() == "cpu" else ON_ACCELERATORS
         for alike in _alike(plans):
             for some in (alike[k : k + most] for k in range(0, len(alike), most)):
                 full = [plans[i] for i in some] + [plans[some[-1]]] * (most - len(some))

@@ -16,7 +16,8 @@ import numpy as np
 from bayessim_mjx.physics.tangent import difference, integrate
 from bayessim_mjx.tracking import Record
 
-FEWEST = 3  # starts whose spread tells nothing of theirs without noise
+# degrees of freedom, no choice: 1 / chi^2 of the N - 1 that an estimated mean leaves has the mean 1 / (N - 3) (Stein)
+LOST = 3
 
 
 class Starts:
@@ -36,7 +37,7 @@ class Starts:
 
     def share(self, sensor: np.ndarray) -> np.ndarray:
         """[2 nv] of the measured spread that is noise of these standard deviations; 0 where nothing is measured."""
-        seen, freedom = np.isfinite(sensor), self.count - FEWEST
+        seen, freedom = np.isfinite(sensor), self.count - LOST
         noise = freedom * np.where(seen, sensor, 0.0) ** 2
         if freedom <= 0:
             return np.zeros(len(sensor))
@@ -44,7 +45,7 @@ class Starts:
 
     def sd(self, sensor: np.ndarray) -> np.ndarray:
         """[2 nv] standard deviations of what is left unknown of a start, over all of them."""
-        return sensor * np.sqrt(1 - self.share(sensor) * (1 - FEWEST / self.count) if self.count > FEWEST else 1.0)
+        return sensor * np.sqrt(1 - self.share(sensor) * (1 - LOST / self.count) if self.count > LOST else 1.0)
 
     def begun(self, sensor: np.ndarray) -> Record:
         """The records, from their most likely starts under that noise of the sensors [2 nv]."""

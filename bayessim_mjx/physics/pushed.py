@@ -26,8 +26,8 @@ def pushed(
     if not physics.effects and drive.force is None:
         return data, carry
     memory, forces = carry
-    known = data.qfrc_passive - data.qfrc_bias + data.qfrc_actuator
-    known = known if drive.force is None else known + drive.force
+    outside = jnp.zeros_like(data.qfrc_applied) if drive.force is None else drive.force
+    known = data.qfrc_passive - data.qfrc_bias + data.qfrc_actuator + outside
     forcing = physics.having("on_force")
 
     def hook(step: SubStep, i: int, of_effect: tuple, total: jax.Array) -> tuple[tuple, jax.Array]:
@@ -43,14 +43,13 @@ def pushed(
         each, total = chained(None, forcing, functools.partial(hook, step), each, total)
     elif forcing:
         if int(physics.mj_model.opt.integrator) == IMPLICITFAST:
-            _ = step.solved  # the integrator asks for it in any case
+            step.ready("solved")  # the integrator asks for it in any case
 
         def acting() -> tuple[tuple, jax.Array]:
             inside = step.within_a_branch().ready("asked", "response", "inverse")
             return chained(drive.active, forcing, functools.partial(hook, inside), each, total)
 
         each, total = jax.lax.cond(jnp.any(drive.active[np.asarray(forcing)]), acting, lambda: (each, total))
-    outside = jnp.zeros_like(data.qfrc_applied) if drive.force is None else drive.force
     after = dict(zip(forcing, each, strict=True))
     remembered = tuple(after[i][0] if i in after else own for i, own in enumerate(memory))
     if forcing:

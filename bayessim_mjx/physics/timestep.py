@@ -13,7 +13,6 @@ import mujoco
 import numpy as np
 
 from bayessim_mjx.compat import mjx
-from bayessim_mjx.effects.effect import overrides
 from bayessim_mjx.effects.support.site import joint_dofs, ranges
 from bayessim_mjx.effects.support.substep import SubStep
 from bayessim_mjx.physics.drive import Drive
@@ -58,8 +57,8 @@ class Timestep:
 
     def having(self, hook: str) -> list[tuple]:
         """(index, effect, site, slice of theta) of the effects that have this hook."""
-        each = zip(self.physics.effects, self.physics.sites, self.thetas, strict=True)
-        return [(i, *one) for i, one in enumerate(each) if overrides(one[0], hook)]
+        physics = self.physics
+        return [(i, physics.effects[i], physics.sites[i], self.thetas[i]) for i in physics.having(hook)]
 
     def view(self, data: mjx.Data, **known: Any) -> SubStep:
         """The timestep as effects see it."""

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from bayessim_mjx.compat import compiler_options
 from bayessim_mjx.device import on_cores
 from bayessim_mjx.diagnosis.fitting.windows import Batch, Windows
-from bayessim_mjx.effects.effect import overrides
 from bayessim_mjx.physics import Drive, Physics, begin, control_step, early, past_of
 from bayessim_mjx.physics.tangent import difference, integrate
 
@@ -97,7 +96,7 @@ class Simulator:
 
     def _predicted(self, errors: jax.Array, theta: jax.Array) -> jax.Array:
         """Errors `[H, 2 nv]` in which what only echoes the recording counts as the first row that is predicted does."""
-        echoing = [i for i, effect in enumerate(self.physics.effects) if overrides(effect, "echoes")]
+        echoing = self.physics.having("echoes")
         if not echoing:
             return errors
         each, sites = self.physics.split(theta)[1], self.physics.sites

@@ -44,6 +44,8 @@ def test_shifts_of_either_sign_are_found_and_nothing_else_is_one(tmp_path):
         assert late is None or (found.late == pytest.approx(late, abs=1.5e-4) and found.error < 1e-4)
         assert not found.likely
     # friction takes part in it; with .1 N m the error, .4 to .7 ms as sums round, is near the limit of a sixth of it
+    much = estimated(robot, logged_late(recorded(count=4, friction=0.1, delay=0.017)))
+    assert not much.certain and much.late == pytest.approx(-0.003, abs=1.5e-4)
     beside = estimated(robot, logged_late(recorded(count=4, friction=0.05, delay=0.017)))
     assert beside.likely and not beside.certain and "`commands_late: -0.003" in beside.hint()
 
