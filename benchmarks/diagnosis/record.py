@@ -238,7 +238,8 @@ def main() -> None:
         score(args)
         return
     if args.core is not None and hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, {args.core})  # before JAX counts the cores
+        allowed = sorted(os.sched_getaffinity(0))
+        os.sched_setaffinity(0, {allowed[args.core % len(allowed)]})  # before JAX counts the cores
     work(args.case, args.more)
 
 

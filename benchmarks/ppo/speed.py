@@ -13,12 +13,13 @@ training, which lag by an episode. `steps_per_s` is of training alone: the media
 the first. Ours ends once five intervals were over the goal in training: single ones are, by chance, before the policy
 is. "wide" is ours with four times the worlds and a quarter of the steps: the same samples per update; "wider" with
 eight times. Ours has Brax's segments and first weights (`ppo.segment`, `ppo.weight_init`), too. Where Brax restarts all
-worlds before every update (CartpoleBalance), ours has training episodes of an update's length; goals are those of
-whole episodes. A function that JAX no longer has is put back for Brax.
+worlds before every update (CartpoleBalance), ours has training episodes of an update's length (Go1's: of 14); goals are
+those of whole episodes. A function that JAX no longer has is put back for Brax.
 """
 
 import argparse
 import contextlib
+import functools
 import json
 import os
 import statistics
@@ -46,7 +47,16 @@ PUBLISHED = {
         "num_timesteps": 60_000_000, "num_evals": 10, "unroll_length": 30, "num_updates_per_batch": 16,
         "discounting": 0.995, "learning_rate": 1e-3, "num_envs": 2048, "batch_size": 1024, "num_resets_per_eval": 10,
     },
+    "playground:Go1JoystickFlatTerrain": SHARED | {
+        "reward_scaling": 1.0, "num_timesteps": 200_000_000, "num_evals": 10, "unroll_length": 20,
+        "num_updates_per_batch": 4, "discounting": 0.97, "learning_rate": 3e-4, "num_envs": 8192, "batch_size": 256,
+        "num_resets_per_eval": 10, "max_grad_norm": 1.0, "network_factory": {
+            "policy_hidden_layer_sizes": (512, 256, 128), "value_hidden_layer_sizes": (512, 256, 128),
+            "policy_obs_key": "state", "value_obs_key": "privileged_state",
+        },
+    },
 }  # fmt: skip
+# returns; Playground has none for its joystick, whose races end after --steps or --seconds
 SOLVED = {"brax:ant": 3000.0, "brax:inverted_pendulum": 990.0, "playground:CartpoleBalance": 950.0}
 WAYS = {"ours": 1, "wide": 4, "wider": 8, "brax": 1}  # and what the number of worlds is multiplied by
 
@@ -62,6 +72,7 @@ def ppo_config(published: dict, widening: int):
 
     worlds = published["num_envs"] * widening
     samples = published["batch_size"] * published["num_minibatches"] * published["unroll_length"]
+    networks = published.get("network_factory", {})
     return PPOConfig(
         num_envs=worlds,
         num_steps=max(1, samples // worlds),
@@ -73,10 +84,21 @@ def ppo_config(published: dict, widening: int):
         reward_scale=published["reward_scaling"],
         # Brax's defaults
         gae_lambda=0.95, clip_param=0.3, value_loss_coef=0.25, use_clipped_value_loss=False, schedule="fixed",
-        max_grad_norm=1e9, normalize_advantage_per_minibatch=True, hidden_actor=(32,) * 4, hidden_critic=(256,) * 5,
+        max_grad_norm=published.get("max_grad_norm", 1e9), normalize_advantage_per_minibatch=True,
+        hidden_actor=networks.get("policy_hidden_layer_sizes", (32,) * 4),
+        hidden_critic=networks.get("value_hidden_layer_sizes", (256,) * 5),
         activation="swish", state_dependent_std=True, action_bound="tanh", init_std=0.7, weight_init="lecun_uniform",
         segment=published["unroll_length"],
     )  # fmt: skip
+
+
+def between_restarts(published: dict) -> float:
+    """Updates after which Brax restarts all worlds, whatever their episodes are at."""
+    if "num_resets_per_eval" not in published:
+        return float("inf")
+    times = (published["num_evals"] - 1) * published["num_resets_per_eval"]
+    update = published["batch_size"] * published["num_minibatches"] * published["unroll_length"]
+    return -(-published["num_timesteps"] // (times * update))
 
 
 class Race:
@@ -127,7 +149,7 @@ def run_ours(name: str, published: dict, widening: int, seed: int, race: Race, w
     race.mark("imports")
     config = ppo_config(published, widening)
     whole_env = registry.make(name, episodeLength=published["episode_length"])
-    length = config.num_steps if "num_resets_per_eval" in published else published["episode_length"]
+    length = min(published["episode_length"], between_restarts(published) * config.num_steps)
     env, share = registry.make(name, episodeLength=length), length / published["episode_length"]
     total = max(1, round(published["num_timesteps"] / (config.num_envs * config.num_steps)))
     config = replace(config, log_interval=max(1, total // 50))
@@ -170,10 +192,13 @@ def run_brax(name: str, published: dict, seed: int, race: Race, whole: bool) -> 
     """Brax's trainer as published, on its own environment."""
     race.mark("python")
     from brax.training.agents.ppo import train
+    from brax.training.agents.ppo.networks import make_ppo_networks
 
     from bayessim_mjx import registry
 
     options, speeds = dict(published), []
+    if networks := options.pop("network_factory", None):
+        options["network_factory"] = functools.partial(make_ppo_networks, **networks)
     if name.startswith("playground:"):
         from mujoco_playground import wrapper
 
@@ -205,7 +230,7 @@ def work(task: dict) -> None:
     import jax
 
     name, published = task["env"], PUBLISHED[task["env"]] | task["changes"]
-    race = Race(task["started"], SOLVED[name], task["limit"])
+    race = Race(task["started"], SOLVED.get(name, float("inf")), task["limit"])
     if task["who"] == "brax":
         row = run_brax(name, published, task["seed"], race, task["whole"])
     else:
