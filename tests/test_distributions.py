@@ -148,6 +148,14 @@ def test_credible_level_of_a_gaussian():
     np.testing.assert_allclose(q.credible_level(z), [0.0, 0.5, 0.9, 0.95, 1.0], atol=0.01)
 
 
+def test_regions_of_a_flat_density_hold_their_share_of_it():
+    """Not all of it or nothing, as rounding has it."""
+    q = Distribution.prior(ParameterSpace([MASS, LENGTH]), 3)
+    levels = np.asarray(q.credible_level(q.sample(key(), 4000)))
+    for share in (0.5, 0.8, 0.95):
+        np.testing.assert_allclose(np.mean(levels < share), share, atol=0.03)
+
+
 def test_a_marginal_is_the_integral_over_the_others():
     space = ParameterSpace([MASS, LENGTH])
     scales = np.asarray([np.diag([0.1, 0.3]), np.diag([0.2, 0.05])])

@@ -16,6 +16,7 @@ from bayessim_mjx.distributions import box, charts
 from bayessim_mjx.distributions.parts import Parts
 from bayessim_mjx.linalg import lower_factor, product, solve_lower
 
+LEVEL_OUT = 0.01  # nats between the ends of the range, by which regions of a flat density are chosen
 POINTS = 1024  # quadrature points per component behind mean, cov, mode, credible_level
 TRIES, SPARE = 50, 32  # rejection rounds of sample, and points per row that is then still outside
 
@@ -50,13 +51,16 @@ def log_unit(q: Parts, u: Array) -> Array:
     return jnp.logaddexp(jnp.log(q.prior_weight), jnp.log1p(-q.prior_weight) + mog)
 
 
+def placed(q: Parts, rows: Array) -> tuple[Array, Array]:
+    """Whether thetas [n, d] lie in the box [n], and their unit coordinates [n, d]; of the others any."""
+    inside = jax.vmap(q.space.contains)(rows)
+    safe = jnp.where(inside[:, None], rows, jnp.asarray(q.space.nominal)[None, :])
+    return inside, jnp.clip(rowwise(q.space.to_unit, safe), 0, 1)
+
+
 @jax.jit
 def log_gain(q: Parts, theta: Array) -> Array:
-    rows = as_rows(theta)
-    inside = jax.vmap(q.space.contains)(rows)
-    u = jnp.clip(
-        rowwise(q.space.to_unit, jnp.where(inside[:, None], rows, jnp.asarray(q.space.nominal)[None, :])), 0, 1
-    )
+    inside, u = placed(q, as_rows(theta))
     return jnp.where(inside, log_unit(q, u), -jnp.inf).reshape(theta.shape[:-1])
 
 
@@ -114,10 +118,20 @@ def mode(q: Parts) -> Array:
     return candidates[jnp.argmax(log_gain(q, candidates))]
 
 
+def _ranked(q: Parts, rows: Array) -> Array:
+    """Log density of thetas [n, d] by which regions are chosen.
+
+    Where it is flat one part of the range is as good a region as another, and rounding would choose point by point: a
+    slope that changes densities by less than LEVEL_OUT chooses the same part for all of them.
+    """
+    inside, u = placed(q, rows)
+    return jnp.where(inside, log_unit(q, u) - LEVEL_OUT * jnp.mean(u, axis=-1), -jnp.inf)
+
+
 @jax.jit
 def credible_level(q: Parts, theta: Array) -> Array:
     points, weights = quadrature(q, POINTS)
-    here, there = log_gain(q, as_rows(theta)), log_gain(q, points)
+    here, there = _ranked(q, as_rows(theta)), _ranked(q, points)
     level = (there[None, :] > here[:, None]).astype(jnp.float32) @ weights
     return level.reshape(theta.shape[:-1])
 

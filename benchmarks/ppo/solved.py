@@ -39,7 +39,7 @@ class Race:
 
     def __init__(self, task: str, every: int, overrides: list[str]) -> None:
         worlds, self.line, _ = LINES[task]
-        settings = config.load(task, overrides=[f"env.numEnvs={worlds}", *overrides])
+        settings = config.load(task, overrides=[f"env.numEnvs={worlds}", "task.randomize=False", *overrides])
         self.env, self.ppo = registry.make(task, config=settings), replace(settings.ppo, log_interval=every)
         self.every, self.most = every, settings.ppo.max_iterations
         self.thetas = jnp.tile(jnp.asarray(self.env.space.nominal, jnp.float32), (EPISODES, 1))
