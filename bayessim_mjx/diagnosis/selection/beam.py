@@ -105,12 +105,27 @@ def close(table: Table, criteria: Criteria, most: int) -> list[Key]:
 
 def _best(fits: Fitting, criteria: Criteria, most: int) -> Key:
     """The leading model, and those close to it, with their fits brought to their end before they are ranked."""
+    fits.fit(_told(fits.table, criteria), "dropping")
     for _ in range(criteria.beam):
         keys = close(fits.table, criteria, most)
         fits.polish(keys)
         if leading(fits.table, criteria)[0] in keys:
             break
     return leading(fits.table, criteria)[0]
+
+
+def _told(table: Table, criteria: Criteria) -> list[Plan]:
+    """What is left of models that would lead but for effects that are off in them.
+
+    What shows in few windows alone (a limit) may promise nothing by itself and is fitted beside another effect only.
+    """
+    plans = {}
+    best = value(table, leading(table, criteria)[0], criteria)
+    for key, row in table.rows.items():
+        told = frozenset(label for label in key if row.distance.get(label, math.inf) > criteria.far)
+        if told and told < key and told not in table.rows and value(table, key, criteria) > best:
+            plans[told] = Plan(told, key)
+    return list(plans.values())
 
 
 def _grow(fits: Fitting, criteria: Criteria) -> Key:

@@ -111,6 +111,31 @@ def test_a_rival_that_only_polishing_brings_ahead_is_named():
     assert set(selection.answer) == {A} and frozenset([C]) in fits.polished
 
 
+def test_what_was_only_tried_beside_an_effect_that_is_off_is_fitted_by_itself():
+    """The truth, a, promises nothing by itself; beside b it is found, and b is off there."""
+
+    class Shy(Linear):
+        def __init__(self, *args):
+            super().__init__(*args)
+            del self.rows[frozenset([A])]
+
+        def _fit(self, key):
+            super()._fit(key)
+            if key == {A, B}:
+                row = self.rows[key]
+                self.rows[key] = dataclasses.replace(row, distance={**row.distance, B: 0.2})
+
+        def additions(self, key):
+            return [B] if key == {A} else [A] if key == {B} else []
+
+        def together(self, most, count):
+            return [frozenset([A, B])]
+
+    fits = Shy(columns(6), {A: 3.0})
+    assert set(beam.search(fits, Criteria()).answer) == {A}
+    assert not beam._told(fits.table, Criteria())
+
+
 def test_where_no_time_is_left_nothing_is_added_and_rivals_stay_as_they_were():
     class Late(Linear):
         def over(self, part):
