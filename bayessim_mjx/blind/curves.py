@@ -156,3 +156,29 @@ class Curves:
         own = self._own.get((effect, where), np.ones((len(SLOPE), len(THRESHOLD))))
         found = np.tensordot(others, _PLACE, ([1, 2], [0, 1])) * own
         return Belief(found / found.sum())
+
+    def numbers(self, fresh: Iterable[Trial], draws: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
+        """{effect: `[draws]`, how many of its fresh trials are found}: population, effect, place, then trials."""
+        groups: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
+        for t in fresh:
+            groups[t.effect][t.where].append(np.log(t.strength))
+        out = {effect: np.zeros(draws) for effect in groups}
+        weight, untried = np.exp(self._population - self._population.max()), np.ones((len(SLOPE), len(THRESHOLD)))
+        for i in range(draws):
+            spread, places, centre, among = np.unravel_index(_one(weight, rng), weight.shape)
+            for effect, own in groups.items():
+                said = self._effects[effect][:, places] if effect in self._effects else untried
+                joint = _SLOPES[spread][:, None] * said * _EFFECT[centre, among][None]
+                slope, middle = np.unravel_index(_one(joint, rng), joint.shape)
+                for where, strengths in own.items():
+                    likely = self._own.get((effect, where), untried)[slope]
+                    threshold = THRESHOLD[_one(_PLACE[places, middle] * likely, rng)]
+                    found = rng.uniform(size=len(strengths)) < chance(np.array(strengths), threshold, SLOPE[slope])
+                    out[effect][i] += found.sum()
+        return out
+
+
+def _one(weight: np.ndarray, rng: np.random.Generator) -> int:
+    """Flat index of a draw by weights."""
+    sums = np.cumsum(weight)
+    return int(np.searchsorted(sums, rng.uniform(0, sums[-1])))

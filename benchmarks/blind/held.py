@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bayessim_mjx.blind.curves import _EFFECT, _PLACE, _SLOPES, SLOPE, THRESHOLD, Curves, Group, Trial, chance
+from bayessim_mjx.blind.curves import Curves, Group, Trial
 
 DRAWS, LEVEL = 4000, 0.9
 BINS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)  # of chances
@@ -35,32 +35,6 @@ def alike(first: Path, second: Path) -> None:
             raise SystemExit(f"{key}: {of[0].get(key)} in {first}, {of[1].get(key)} in {second}")
 
 
-def numbers(curves: Curves, groups: dict[Group, list[Trial]], rng: np.random.Generator) -> dict[str, np.ndarray]:
-    """{effect: draws of how many of its fresh cases are found}: population, effect, place, then cases."""
-    log = curves._population
-    weight = np.exp(log - log.max()).ravel()
-    drawn = np.unravel_index(rng.choice(weight.size, DRAWS, p=weight / weight.sum()), log.shape)
-    out = {e: np.zeros(DRAWS) for e, _ in groups}
-    unknown = np.ones((len(SLOPE), log.shape[1], len(THRESHOLD)))
-    for i, (spread, places, centre, among) in enumerate(np.transpose(drawn)):
-        for effect in out:
-            said = curves._effects.get(effect, unknown)[:, places]
-            joint = _SLOPES[spread][:, None] * said * _EFFECT[centre, among][None]
-            slope, middle = divmod(_one(joint, rng), len(THRESHOLD))
-            for (e, where), own in groups.items():
-                if e == effect:
-                    likely = curves._own[e, where][slope] if (e, where) in curves._own else 1.0
-                    threshold = THRESHOLD[_one(_PLACE[places, middle] * likely, rng)]
-                    p = chance(np.log([t.strength for t in own]), threshold, SLOPE[slope])
-                    out[effect][i] += (rng.uniform(size=len(own)) < p).sum()
-    return out
-
-
-def _one(weight: np.ndarray, rng: np.random.Generator) -> int:
-    sums = np.cumsum(weight)
-    return int(np.searchsorted(sums, rng.uniform(0, sums[-1])))
-
-
 def inside(draws: np.ndarray, found: float) -> tuple[float, float]:
     """(whether a number lies in the central interval of its draws, how often a draw does)."""
     low, high = np.quantile(draws, ((1 - LEVEL) / 2, (1 + LEVEL) / 2), method="inverted_cdf")
@@ -77,7 +51,7 @@ def main() -> None:
     groups: dict[Group, list[Trial]] = defaultdict(list)
     for t in fresh:
         groups[t.effect, t.where].append(t)
-    draws = numbers(curves, groups, rng)
+    draws = curves.numbers(fresh, DRAWS, rng)
     held = [inside(d, sum(t.found for t in fresh if t.effect == e)) for e, d in draws.items()]
     told = []
     for group, own in groups.items():

@@ -55,6 +55,18 @@ def test_intervals_hold_as_often_as_they_say():
     assert 0.82 < np.mean(inside) < 0.98
 
 
+def test_drawn_numbers_have_the_chances_of_their_curves():
+    """Drawn one after the other from population, effect and place: on average what the curves of single places say."""
+    curves = Curves(step(10.0, count=12))
+    fresh = [Trial(e, w, s, False) for e, w in (("e0", "p0"), ("e0", "never"), ("new", "p")) for s in (5.0, 12.0)]
+    numbers = curves.numbers(fresh, 2000, np.random.default_rng(0))
+    for effect, draws in numbers.items():
+        own = [t for t in fresh if t.effect == effect]
+        due = sum(float(curves.of(t.effect, t.where).curve(np.array([t.strength]))[0][0]) for t in own)
+        assert len(draws) == 2000 and draws.mean() == pytest.approx(due, abs=4 * draws.std() / 2000**0.5)
+    assert set(numbers) == {"e0", "new"}
+
+
 def test_later_strengths_are_drawn_where_an_effect_begins_to_be_found():
     groups = [(f"e{i}", "p0") for i in range(4)]
     items = plan.plan(range(32, 72), groups, [("unknown", "x")], step(10.0), seed=0)

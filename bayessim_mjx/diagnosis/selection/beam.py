@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 from bayessim_mjx.diagnosis.selection.criteria import Criteria
-from bayessim_mjx.diagnosis.selection.decide import Decision, admissible, decide, order, same, settled, value
+from bayessim_mjx.diagnosis.selection.decide import Decision, admissible, decide, off, order, same, settled, value
 from bayessim_mjx.diagnosis.selection.everywhere import by_law, laws, needed, spread
 from bayessim_mjx.diagnosis.selection.table import BASE, Key, Table
 
@@ -105,7 +105,7 @@ def close(table: Table, criteria: Criteria, most: int) -> list[Key]:
 
 def _best(fits: Fitting, criteria: Criteria, most: int) -> Key:
     """The leading model, and those close to it, with their fits brought to their end before they are ranked."""
-    fits.fit(_told(fits.table, criteria), "dropping")
+    fits.fit(_without_off(fits.table, criteria), "dropping")
     for _ in range(criteria.beam):
         keys = close(fits.table, criteria, most)
         fits.polish(keys)
@@ -114,7 +114,7 @@ def _best(fits: Fitting, criteria: Criteria, most: int) -> Key:
     return leading(fits.table, criteria)[0]
 
 
-def _told(table: Table, criteria: Criteria) -> list[Plan]:
+def _without_off(table: Table, criteria: Criteria) -> list[Plan]:
     """What is left of models that would lead but for effects that are off in them.
 
     What shows in few windows alone (a limit) may promise nothing by itself and is fitted beside another effect only.
@@ -122,9 +122,9 @@ def _told(table: Table, criteria: Criteria) -> list[Plan]:
     plans = {}
     best = value(table, leading(table, criteria)[0], criteria)
     for key, row in table.rows.items():
-        told = frozenset(label for label in key if row.distance.get(label, math.inf) > criteria.far)
-        if told and told < key and told not in table.rows and value(table, key, criteria) > best:
-            plans[told] = Plan(told, key)
+        rest = key - off(row, criteria)
+        if rest and rest not in table.rows and value(table, key, criteria) > best:
+            plans[rest] = Plan(rest, key)
     return list(plans.values())
 
 

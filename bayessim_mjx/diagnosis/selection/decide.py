@@ -170,9 +170,14 @@ def order(laws: Mapping[str, Law]) -> Order:
     return less
 
 
+def off(row: Row, criteria: Criteria) -> Key:
+    """Effects of a model that hardly are there."""
+    return frozenset(label for label, z in row.distance.items() if not z > criteria.far)
+
+
 def admissible(row: Row, criteria: Criteria) -> bool:
     """Whether all effects of a model are there: by one that hardly is a fit may only have come further."""
-    return all(z > criteria.far for z in row.distance.values())
+    return not off(row, criteria)
 
 
 def value(table: Table, key: Key, criteria: Criteria) -> float:

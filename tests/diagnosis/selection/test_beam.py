@@ -133,7 +133,7 @@ def test_what_was_only_tried_beside_an_effect_that_is_off_is_fitted_by_itself():
 
     fits = Shy(columns(6), {A: 3.0})
     assert set(beam.search(fits, Criteria()).answer) == {A}
-    assert not beam._told(fits.table, Criteria())
+    assert not beam._without_off(fits.table, Criteria())
 
 
 def test_where_no_time_is_left_nothing_is_added_and_rivals_stay_as_they_were():
