@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from bayessim_mjx.distributions import Distribution, Gaussian, GaussianMixture, Uniform
+from bayessim_mjx.distributions import Distribution, Gaussian, GaussianMixture, Uniform, evaluate
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 
 pytestmark = pytest.mark.usefixtures("strict")
@@ -105,6 +105,25 @@ def test_draws_from_a_far_tail_have_the_right_mean():
     assert float(q.log_inside) == pytest.approx(np.log(stats.norm.sf(5.0)), abs=0.02)
     assert float(q.mean()[0]) == pytest.approx(truth.mean(), rel=0.05)
     assert np.asarray(q.sample(key(), 4000)).mean() == pytest.approx(truth.mean(), rel=0.05)
+
+
+def test_candidates_of_a_flat_gaussian_are_draws_nearly_all_and_of_a_leaking_mixture_follow_it():
+    space = ParameterSpace([Parameter(f"p{i}", 0.5, 0.0, 1.0) for i in range(30)])
+    flat = Distribution.from_unit(space, jnp.zeros(1), jnp.full((1, 30), 0.5), 3.0 * jnp.eye(30)[None])
+    u, drawn = (np.asarray(x) for x in evaluate.candidates(flat, key(), 2000))
+    assert drawn.mean() > 0.75 and u[drawn].std(0) == pytest.approx(np.full(30, 12**-0.5), rel=0.08)
+    # a Gaussian is in the box with (2 Phi(1 / 6) - 1)^30 = 1e-27
+    assert float(flat.log_inside) == pytest.approx(30 * np.log(2 * stats.norm.cdf(1 / 6) - 1), rel=1e-3)
+
+    q = leaking(ParameterSpace([MASS, LENGTH]), 0.3)
+    u, drawn = (np.asarray(x) for x in evaluate.candidates(q, key(1), 40_000))
+    points, cell = grid(q.space, 300)
+    density = np.exp(np.asarray(q.log_prob(points))) * cell
+    mean = density @ points
+    theta = np.asarray(jax.vmap(q.space.from_unit)(jnp.asarray(u[drawn])))
+    assert drawn.mean() > 0.2
+    np.testing.assert_allclose(theta.mean(0), mean, atol=4 * theta.std(0).max() / drawn.sum() ** 0.5)
+    np.testing.assert_allclose(np.cov(theta.T), (points - mean).T @ ((points - mean) * density[:, None]), atol=0.012)
 
 
 def test_prior_and_posterior_share_one_compiled_program():

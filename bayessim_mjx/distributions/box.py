@@ -63,20 +63,36 @@ def separate(mean: Array, scale: Array, w: Array) -> tuple[Array, Array]:
 
     Returns points [n, d] and log weights [n]; the mean of exp(log weights) is the Gaussian's mass in the cube.
     """
+    return forced(mean[None], scale[None], jnp.zeros(len(w), jnp.int32), w)
+
+
+def forced(means: Array, scales: Array, k: Array, w: Array) -> tuple[Array, Array]:
+    """`separate`, each point of a Gaussian of its own: means [K, d], scales [K, d, d], k [n] which, w [n, d]."""
     n, d = w.shape
     if d == 0:
         return w, jnp.zeros(n)
+    means, scales = (means, scales) if len(means) > 1 else (means[0], scales[0])
+    own = k if means.ndim > 1 else ()
 
-    def coordinate(carry: tuple[Array, Array], i: Array) -> tuple[tuple[Array, Array], None]:
-        z, log_weight = carry
-        centre = mean[i] + product(z, scale[i])  # the columns from i on are still zero
-        a, b = -centre / scale[i, i], (1 - centre) / scale[i, i]
-        z = z.at[:, i].set(truncated_normal(a, b, w[:, i]))
-        return (z, log_weight + log_interval(a, b)), None
+    def coordinate(carry: tuple[Array, Array, Array], i: Array) -> tuple[tuple[Array, Array, Array], None]:
+        z, u, log_weight = carry
+        row = scales[..., i, :][own]  # the columns of z from i on are still zero
+        centre = means[..., i][own] + (jnp.sum(z * row, axis=1) if row.ndim > 1 else product(z, row))
+        width = row[..., i]
+        a, b = -centre / width, (1 - centre) / width
+        new = truncated_normal(a, b, w[:, i])
+        u = u.at[:, i].set(centre + width * new)
+        return (z.at[:, i].set(new), u, log_weight + log_interval(a, b)), None
 
-    start = jnp.zeros((n, d), jnp.float32), jnp.zeros((n,), jnp.float32)
-    (z, log_weight), _ = jax.lax.scan(coordinate, start, jnp.arange(d))
-    return jnp.clip(mean[None, :] + product(z, scale.T), 0.0, 1.0), log_weight
+    start = jnp.zeros((n, d), jnp.float32), jnp.zeros((n, d), jnp.float32), jnp.zeros((n,), jnp.float32)
+    (_, u, log_weight), _ = jax.lax.scan(coordinate, start, jnp.arange(d))
+    return jnp.clip(u, 0.0, 1.0), log_weight
+
+
+def log_bounds(scales: Array) -> Array:
+    """What no point of `forced` weighs more than: scales [K, d, d] -> [K]. Every interval is widest in the middle."""
+    half = 0.5 / jnp.diagonal(scales, axis1=-2, axis2=-1)
+    return jnp.sum(log_interval(-half, half), axis=-1)
 
 
 def within(mean: np.ndarray, scale: np.ndarray, points: int = 4096) -> tuple[np.ndarray, np.ndarray]:
@@ -129,12 +145,27 @@ def choose(w: Array, logits: Array) -> Array:
     return jnp.sum(w[:, None] * edges[-1] >= edges[None, :-1], axis=1)
 
 
+def candidates(key: Array, logits: Array, means: Array, scales: Array, n: int) -> tuple[Array, Array]:
+    """n points [n, d] in the cube and which of them [n] are draws of the mixture truncated to it.
+
+    Exact rejection. Points are forced into the cube coordinate by coordinate, so one that a Gaussian far wider than the
+    cube has is as good as any, however many coordinates are so; what a point weighs less than it could is its chance to
+    be no draw.
+    """
+    # one call for all random numbers: several of them, batched, take seconds to compile
+    w = jax.random.uniform(key, (n, 2 + means.shape[-1]), minval=1e-7)
+    bounds = log_bounds(scales)
+    k = choose(w[:, 0], jax.nn.log_softmax(logits) + bounds)
+    points, weights = forced(means, scales, k, w[:, 2:])
+    return points, jnp.log(w[:, 1]) < weights - bounds[k]
+
+
 def draw(
     key: Array, logits: Array, means: Array, scales: Array, done: Array, u: Array, tries: int, spare: int
 ) -> Array:
     """Fill the rows of u [n, d] that are not `done` [n] with draws of the mixture truncated to the cube.
 
-    Exact rejection for `tries` rounds; rows still missing (little mass inside) are picked from `spare` points of
+    Exact rejection for `tries` rounds; rows still missing (all Gaussians far outside) are picked from `spare` points of
     `separate` by their weights, so that every row is inside the cube whatever the mixture.
     """
     key_loop, key_spare = jax.random.split(key)
@@ -142,10 +173,8 @@ def draw(
 
     def attempt(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         i, done, u = carry
-        new = propose(jax.random.fold_in(key_loop, i), logits, means, scales, n)
-        inside = jnp.all((new >= 0) & (new <= 1), axis=-1)
-        take = inside & ~done
-        return i + 1, done | inside, jnp.where(take[:, None], new, u)
+        new, drawn = candidates(jax.random.fold_in(key_loop, i), logits, means, scales, n)
+        return i + 1, done | drawn, jnp.where((drawn & ~done)[:, None], new, u)
 
     _, done, u = jax.lax.while_loop(
         lambda c: (c[0] < tries) & ~jnp.all(c[1]), attempt, (jnp.asarray(0, jnp.int32), done, u)

@@ -17,7 +17,8 @@ import numpy as np
 from jax import Array
 from scipy.special import ndtr
 
-from bayessim_mjx.distributions import Distribution, box, charts
+from bayessim_mjx.distributions import Distribution, box
+from bayessim_mjx.distributions.evaluate import candidates
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.inference.temperature import TEMPERATURES, temperature, widened
 from bayessim_mjx.keys import branch
@@ -53,7 +54,9 @@ def ranks(
 
     def one(key: Array, q: Distribution, theta: Array, u: Array, reference: Array) -> Ranks:
         k_draw, k_tilt, *keys = jax.random.split(key, 5)
-        v, kept = _draws(k_draw, q, draws)
+        # ranks among a random number of draws are as uniform as among a fixed one
+        v, drawn = candidates(q, k_draw, draws)
+        kept = drawn.astype(jnp.float32)
         sample = jax.vmap(space.from_unit)(v)
         points = jnp.concatenate([theta[None], sample])
         gain = q.log_gain(points)
@@ -71,21 +74,6 @@ def ranks(
 
     # the point that distances are taken to: the truth of another pair, which x says nothing about
     return jax.vmap(one)(jax.random.split(key, u.shape[0]), posteriors, thetas, u, jnp.roll(u, 1, axis=0))
-
-
-def _draws(key: Array, q: Distribution, n: int) -> tuple[Array, Array]:
-    """n proposals [n, d] in unit coordinates and which of them [n] are draws of q: those that fell into the box.
-
-    Ranks among a random number of draws are as uniform as among a fixed one, so nothing needs to be drawn again.
-    """
-    k_flat, k_mog = jax.random.split(key)
-    mog = charts.from_chart(box.propose(k_mog, q.logits, q.means, q.scales, n), q.chart)
-    inside = jnp.all((mog >= 0) & (mog <= 1), axis=-1)
-    # the prior's share has to lose as many draws as the mixture does
-    w = jax.random.uniform(k_flat, (n, 2 + mog.shape[1]))
-    thinned, flat = w[:, 0] < jnp.exp(q.log_inside), w[:, 1] < q.prior_weight
-    v = jnp.where(flat[:, None], w[:, 2:], jnp.clip(mog, 0, 1))
-    return v, jnp.where(flat, thinned, inside).astype(jnp.float32)
 
 
 def _rank(key: Array, draws: Array, value: Array, kept: Array) -> Array:

@@ -24,12 +24,12 @@ REGIONS = np.asarray(LEVELS, np.float32)  # that should hold as many truths as t
 DOUBT = 0.15  # standard deviation of the factor's log before anything is seen: a few rows are off by chance
 
 
-def levels(key: Array, mixtures: Mixtures, z: Array, chart: str) -> Array:
+def levels(key: Array, mixtures: Mixtures, z: Array, keep: Array, chart: str) -> Array:
     """Mass of a posterior that is denser than the truth z [n, d], by its rank among draws, [n].
 
     Ranks are spread at random between their neighbours and ties broken at random, so that of exact posteriors a share
-    of exactly p has levels up to p. The mixtures are those in the chart; draws outside the box of the plain chart are
-    none of the posterior's.
+    of exactly p has levels up to p. The mixtures are those in the chart, the parameters not to keep [d] independent of
+    the others and left out; draws outside the box of the plain chart are none of the posterior's.
     """
 
     n, d = z.shape
@@ -44,11 +44,14 @@ def levels(key: Array, mixtures: Mixtures, z: Array, chart: str) -> Array:
         draws = means[part] + jnp.sum(scales[part] * noise[:, None, :], axis=-1)
         points = jnp.concatenate([z[None], draws])
         gap = points[:, None, None, :] - means[None, :, None, :]
-        away = jnp.sum(inverse_lower(scales)[None] * gap, axis=-1)  # [1 + DRAWS, K, d]
+        away = jnp.where(
+            keep[None, None, :], jnp.sum(inverse_lower(scales)[None] * gap, axis=-1), 0.0
+        )  # [1 + DRAWS, K, d]
         size = jnp.sum(jnp.log(jnp.diagonal(scales, axis1=-2, axis2=-1)), axis=-1)
         density = jax.nn.logsumexp((logits - size)[None] - 0.5 * jnp.sum(away * away, axis=-1), axis=-1)
-        density = density + charts.log_slope(points, chart)
-        inside = jnp.all((draws >= 0) & (draws <= 1), axis=-1) | (chart != "plain")
+        density = density + charts.log_slope(jnp.where(keep[None, :], points, charts.NEUTRAL[chart][0]), chart)
+        # a Gaussian as flat as a prior is hardly ever inside: with all coordinates no draw might be left
+        inside = jnp.all((draws >= 0) & (draws <= 1) | ~keep[None, :], axis=-1) | (chart != "plain")
         which = jnp.stack([density[1:] > density[0], density[1:] == density[0], jnp.ones(DRAWS, bool)])
         denser, equal, whole = jnp.sum(inside[None] & which, axis=-1, dtype=jnp.float32)
         return (denser + (equal + 1.0) * rank) / (whole + 1.0)
@@ -56,17 +59,17 @@ def levels(key: Array, mixtures: Mixtures, z: Array, chart: str) -> Array:
     return jax.lax.map(one, (uniforms, *mixtures, z), batch_size=TOGETHER)
 
 
-def factor(key: Array, at: Callable[[Array], Mixtures], z: Array, mask: Array, chart: str) -> Array:
+def factor(key: Array, at: Callable[[Array], Mixtures], z: Array, mask: Array, keep: Array, chart: str) -> Array:
     """The factor on sharpness, of FACTORS, at which REGIONS hold truths z [n, d] (with mask [n] 1) as they should.
 
-    at(factor) gives the mixtures. A region of p holds p of n truths to within sqrt(p (1 - p) / n), and the log of the
-    factor is held to be within DOUBT of 0 beforehand.
+    at(factor) gives the mixtures; keep [d] as in `levels`. A region of p holds p of n truths to within
+    sqrt(p (1 - p) / n), and the log of the factor is held to be within DOUBT of 0 beforehand.
     """
     count = jnp.maximum(jnp.sum(mask), 1.0)
 
     def against(factor: Array) -> Array:
         # the same draws for every factor
-        level = levels(key, at(factor), z, chart)
+        level = levels(key, at(factor), z, keep, chart)
         held = mask @ (level[:, None] <= REGIONS[None, :]).astype(jnp.float32) / count
         off = jnp.where(jnp.sum(mask) > 0, count * (held - REGIONS) ** 2 / (REGIONS * (1 - REGIONS)), 0.0)
         return jnp.mean(off) + (jnp.log(factor) / DOUBT) ** 2

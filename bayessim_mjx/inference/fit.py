@@ -158,13 +158,15 @@ def _fit(
     state = replace(state, basis=None if state.basis is None else matrices[basis[0]])
     members = ensemble.heads(params, data, settings)
     state = replace(state, params=ensemble.weigh(params, data, settings, members), fits=state.fits + 1)
-    if proposals is None:  # else held-out truths are not from the prior, and lie elsewhere in their posteriors
-        state = ensemble.as_deep(state, data, members)
     own = ensemble.parts_of(members, state.params)
     mixture = ensemble.joined(mdn.converted(own, settings), state.params["share"])
     marginals = ensemble.marginal_gain(mixture, data.y[data.held], settings)
     parameter_gain, identified = identify.identified(marginals, data.mask)
     state = replace(state, identified=identified)
+    if proposals is None:  # else held-out truths are not from the prior, and lie elsewhere in their posteriors
+        state = ensemble.as_deep(state, data, members)
+        own = ensemble.parts_of(members, state.params)
+        mixture = ensemble.joined(mdn.converted(own, settings), state.params["share"])
     told = {"parameter_gain": parameter_gain, "clipped": clipped, "n_invalid": n_invalid}
     told |= {"steps": steps[0], "best": jnp.max(best), "skipped": jnp.sum(skipped)}
     told |= ensemble.truncated_scores(state, data, thetas, own, mixture)

@@ -51,19 +51,25 @@ def identified(gain: Array, mask: Array) -> tuple[Array, Array]:
 @jax.jit
 def restore_prior(posterior: Distribution, keep: Array) -> Distribution:
     """The posterior over the parameters to keep [d], the prior over the others, independent of them."""
-    q, keep, (centre, sd) = posterior, jnp.asarray(keep), charts.NEUTRAL[posterior.chart]
+    q, keep = posterior, jnp.asarray(keep)
     means, scales = q.means, q.scales
     if q.chart == "plain":  # the others are cut off at their ranges, which moves what is correlated with them
         cut = jax.vmap(_beside_cut, in_axes=(0, 0, None))(means, scales, keep)
         means, scales = (jnp.where(jnp.all(keep), *pair) for pair in zip((means, scales), cut, strict=True))
-    means = jnp.where(keep[None, :], means, centre)
-    # a factor of (S S^T on the kept rows) + sd^2 on the others; forming S S^T would lose thin components
-    kept = jnp.where(keep[None, :, None], scales, 0.0)
-    flat = jnp.broadcast_to(jnp.diag(jnp.where(keep, 0.0, sd)), kept.shape)
-    scales, logits = lower_factor(jnp.concatenate([kept, flat], axis=-1)), jax.nn.log_softmax(q.logits)
+    logits, means, scales = beside_prior(jax.nn.log_softmax(q.logits), means, scales, keep, q.chart)
     if q.chart == "plain":  # each component keeps its mass inside the cube
         logits = logits + box.log_masses(q.means, q.scales) - box.log_masses(means, scales)
     return Distribution.from_unit(q.space, logits, means, scales, q.prior_weight, q.chart)
+
+
+def beside_prior(logits: Array, means: Array, scales: Array, keep: Array, chart: str) -> tuple[Array, Array, Array]:
+    """Mixtures [..., K] in a chart: the parameters to keep [d] as they are, Gaussians as the prior for the others."""
+    centre, sd = charts.NEUTRAL[chart]
+    # a factor of (S S^T on the kept rows) + sd^2 on the others; forming S S^T would lose thin components
+    own = jnp.broadcast_to(keep, means.shape)
+    kept = jnp.where(own[..., None], scales, 0.0)
+    flat = jnp.broadcast_to(jnp.diag(jnp.where(keep, 0.0, sd)), kept.shape)
+    return logits, jnp.where(own, means, centre), lower_factor(jnp.concatenate([kept, flat], axis=-1))
 
 
 def _beside_cut(mean: Array, scale: Array, keep: Array) -> tuple[Array, Array]:

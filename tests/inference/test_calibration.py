@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import kstest
 
 from bayessim_mjx.distributions import Distribution
-from bayessim_mjx.inference import calibration
+from bayessim_mjx.inference import calibration, restore_prior
 from bayessim_mjx.inference.temperature import tempered
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 
@@ -61,6 +61,32 @@ def test_wrong_posteriors_are_caught(change, verdict):
     assert all(r.verdict == verdict for r in reports), [r.words for r in reports]
     if verdict == calibration.BIASED:
         assert all("b (the truth is below)" in r.words and "a (" not in r.words for r in reports)
+
+
+@pytest.mark.parametrize(
+    ("scale", "verdict"), [(1.0, calibration.CALIBRATED), (0.6, calibration.OVER), (1.8, calibration.UNDER)]
+)
+def test_parameters_at_the_prior_do_not_hide_what_is_wrong_with_the_others(scale, verdict):
+    """Twelve of fourteen are at the prior: of the Gaussians that stand for it hardly any draw is in the box."""
+    space = ParameterSpace([*SPACE.parameters, *(Parameter(f"none{i}", 0.5, 0.0, 1.0) for i in range(12))])
+    q, theta = posteriors(4, scale)
+
+    def beside(q):
+        means, scales = (
+            jnp.pad(q.means, ((0, 0), (0, 12)), constant_values=0.5),
+            jnp.pad(q.scales, ((0, 0), (0, 12), (0, 12))),
+        )
+        wide = Distribution.from_unit(
+            space, q.logits, means, scales + jnp.diag(jnp.where(jnp.arange(14) < 2, 0.0, 0.3))
+        )
+        return restore_prior(wide, jnp.arange(14) < 2)
+
+    more = jax.random.uniform(jax.random.PRNGKey(8), (PAIRS, 12))
+    found = calibration.check(jax.random.PRNGKey(1), jax.vmap(beside)(q), jnp.concatenate([theta, more], axis=1))
+    assert found.verdict == verdict, found.words
+    exact = calibration.check(jax.random.PRNGKey(1), q, theta)
+    for level in calibration.LEVELS:
+        assert found.coverage[level][0] == pytest.approx(exact.coverage[level][0], abs=3 * exact.coverage[level][1])
 
 
 def test_p_values_are_uniform_where_nothing_is_wrong(exact):

@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 from scipy.special import ndtri
 
+from bayessim_mjx.distributions import charts
 from bayessim_mjx.inference import coverage_factor
 
 N, D = 400, 2
 MASK = jnp.ones(N)
+EVERY = jnp.ones(D, bool)
 
 
 def posteriors(factor, spread=0.05):
@@ -21,7 +23,7 @@ def posteriors(factor, spread=0.05):
 
 @jax.jit
 def found_factor(z, mask):
-    return coverage_factor.factor(jax.random.PRNGKey(0), posteriors, z, mask, "plain")
+    return coverage_factor.factor(jax.random.PRNGKey(0), posteriors, z, mask, EVERY, "plain")
 
 
 def truths(spread):
@@ -32,14 +34,14 @@ def truths(spread):
 @pytest.mark.slow
 @pytest.mark.ci
 def test_levels_of_exact_posteriors_are_uniform():
-    found = np.asarray(coverage_factor.levels(jax.random.PRNGKey(0), posteriors(1.0), truths(0.05), "plain"))
+    found = np.asarray(coverage_factor.levels(jax.random.PRNGKey(0), posteriors(1.0), truths(0.05), EVERY, "plain"))
     # Kolmogorov-Smirnov: 1.63 / sqrt(n) is exceeded by chance in 1 %
     assert np.max(np.abs(np.sort(found) - (np.arange(N) + 0.5) / N)) < 1.63 / N**0.5
 
 
 @pytest.mark.slow
 def test_the_level_of_a_gaussian_is_the_chi_square_probability():
-    found = np.asarray(coverage_factor.levels(jax.random.PRNGKey(0), posteriors(1.0), truths(0.05), "plain"))
+    found = np.asarray(coverage_factor.levels(jax.random.PRNGKey(0), posteriors(1.0), truths(0.05), EVERY, "plain"))
     distance = np.sum(np.asarray(truths(0.05) - posteriors(1.0)[1][:, 0]) ** 2, axis=1) / 0.05**2
     expected = 1 - np.exp(-distance / 2)  # chi-square with two degrees of freedom
     assert np.mean(np.abs(found - expected)) < 0.05  # 64 draws: .04 on average
@@ -51,7 +53,7 @@ def test_a_region_of_half_the_mass_holds_half_the_truths():
     z = 0.5 + 0.05 * jnp.asarray(ndtri((np.arange(n) + 0.5) / n), jnp.float32)
     mixtures = jnp.zeros((n, 1)), jnp.full((n, 1, 1), 0.5), jnp.full((n, 1, 1, 1), 0.05)
     found = np.asarray(
-        jax.jit(lambda k: coverage_factor.levels(k, mixtures, z[:, None], "plain"))(jax.random.PRNGKey(3))
+        jax.jit(lambda k: coverage_factor.levels(k, mixtures, z[:, None], EVERY[:1], "plain"))(jax.random.PRNGKey(3))
     )
     for region in (0.2, 0.5, 0.8):  # standard error below .002, the truths being even
         assert np.mean(found <= region) == pytest.approx(region, abs=0.005)
@@ -64,7 +66,7 @@ def test_draws_outside_the_box_are_not_the_posteriors():
     z = z[np.all((z > 0) & (z < 1), axis=1)][:N]
     scales = jnp.broadcast_to(0.7 * jnp.eye(D), (N, 1, D, D))
     mixtures = jnp.zeros((N, 1)), jnp.full((N, 1, D), 0.5), scales
-    found = coverage_factor.levels(jax.random.PRNGKey(0), mixtures, jnp.asarray(z, jnp.float32), "plain")
+    found = coverage_factor.levels(jax.random.PRNGKey(0), mixtures, jnp.asarray(z, jnp.float32), EVERY, "plain")
     assert abs(float(jnp.mean(found)) - 0.5) < 0.05  # 3 / sqrt(12 N) = .043, and draws
 
 
@@ -82,3 +84,22 @@ def test_a_few_rows_are_hardly_believed():
     # ten truths alone would have the factor off by 20 %
     assert np.sqrt(np.mean(np.log([of(first) for first in range(8)]) ** 2)) < 0.1
     assert of(N) == 1.0  # nobody
+
+
+def test_parameters_at_the_prior_do_not_hide_what_is_too_wide():
+    """Two parameters beside eight that are at the prior, as Gaussians hardly any draw of which is in the box."""
+    wide, others = 1.25, 8
+    keep, more = (
+        jnp.arange(D + others) < D,
+        jnp.asarray(np.random.default_rng(4).uniform(size=(N, others)), jnp.float32),
+    )
+
+    def beside(factor):
+        logits, means, scales = posteriors(factor)
+        scales = jnp.pad(scales, ((0, 0), (0, 0), (0, others), (0, others)))
+        flat = jnp.diag(jnp.where(keep, 0.0, charts.NEUTRAL["plain"][1]))
+        return logits, jnp.pad(means, ((0, 0), (0, 0), (0, others)), constant_values=0.5), scales + flat
+
+    z = jnp.concatenate([truths(0.05 / wide), more], axis=1)
+    found = coverage_factor.factor(jax.random.PRNGKey(0), beside, z, MASK, keep, "plain")
+    assert float(found) == pytest.approx(wide, rel=0.1)
