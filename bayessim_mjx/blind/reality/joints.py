@@ -96,12 +96,29 @@ class LugreFriction(StribeckFriction):
         super().draw(rng)
         low, high = self.scales.travel[self.where]
         self.ratio = rng.uniform(1.0, 2.0)
-        self.bend = (high - low) * math.exp(rng.uniform(math.log(0.005), math.log(0.1)))
+        # farther bent, the bristles' damping outweighs a weak level
+        self.bend = (high - low) * math.exp(rng.uniform(math.log(0.002), math.log(0.03)))
+
+    def reset(self, plant: Simulated, command: np.ndarray) -> None:
+        super().reset(plant, command)
+        self.fresh = True
+
+    def command(self, plant: Simulated, u: np.ndarray) -> None:
+        """Where nothing was seen before, bristles are bent as they are long after: sliding, or holding the load."""
+        if not self.fresh:
+            return
+        self.fresh, data = False, plant.data
+        data.ctrl[:] = u
+        mujoco.mj_forward(plant.model, data)
+        w, acceleration = float(data.qvel[self.dof]), float(data.qacc[self.dof])
+        load = self.scales.inertia[self.where] * (w / plant.timestep + acceleration)
+        most = self.level(plant, w)
+        self.bristle.z = min(max(load, -most), most) / max(self.bristle.s0, 1e-300)
 
     def resume(self, plant: Simulated, past: Past) -> None:
         """Bristles as the motion has bent them; exact where speeds are constant between rows."""
-        column = plant.column(self.where)
-        for way, time in zip(np.diff(past.q[:, column]), np.diff(past.time), strict=True):
+        self.fresh, at = len(past.q) < 2, past.q[:, plant.column(self.where)]
+        for way, time in zip(np.diff(at), np.diff(past.time), strict=True):
             steady = self.level(plant, float(way / time)) / max(self.bristle.s0, 1e-300)
             keep = math.exp(-abs(float(way)) / max(steady, 1e-300))
             self.bristle.z = keep * self.bristle.z + (1 - keep) * math.copysign(steady, way)
