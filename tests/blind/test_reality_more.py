@@ -21,7 +21,7 @@ def still(plant: Plant, q: float, u: float = 0.0) -> float:
 
 
 def test_bristles_slide_by_their_steady_law_and_bend_before():
-    cause = hidden(arm(), "lugre_friction", 0.05, ratio=1.6, speed=0.4, bend=0.02)
+    cause = hidden(arm(), "lugre_friction", 0.05, ratio=1.6, speed=0.4, stiffness=0.08 / 0.02)
     plant = Plant(arm(), {}, [cause])
     told = cause.parameters()
     assert told == pytest.approx({"level": 0.05, "excess": 0.03, "speed": 0.4, "bend": 0.02})
@@ -39,7 +39,7 @@ def test_bristles_slide_by_their_steady_law_and_bend_before():
 
 def test_bristles_are_bent_by_the_motion_before_a_window():
     rig = arm()
-    cause = hidden(rig, "lugre_friction", 0.05, bend=0.05)
+    cause = hidden(rig, "lugre_friction", 0.05, stiffness=1.5)
     plant = Plant(rig, {}, [cause])
     run = rig.record(plant, 0, 0, noise=False)
     bent, bristle = cause.bristle.z, cause.bristle
@@ -52,7 +52,7 @@ def test_bristles_are_bent_by_the_motion_before_a_window():
 
 def test_bristles_hold_a_load_that_rests_on_them_from_the_start():
     rig = arm()
-    cause = hidden(rig, "lugre_friction", 0.4, ratio=1.0, bend=0.1)
+    cause = hidden(rig, "lugre_friction", 0.4, ratio=1.0, stiffness=4.0)
     plant = Plant(rig, {}, [cause])
     plant.reset(np.array([0.2]), np.zeros(1), np.zeros(1))
     for _ in range(25):

@@ -5,7 +5,7 @@ import math
 import mujoco
 import numpy as np
 
-from bayessim_mjx.blind.reality.cause import Cause, Past, Simulated
+from bayessim_mjx.blind.reality.cause import Cause, Simulated
 
 PRESLIDING = 2e-4  # rad or m, bend of the bristles at the friction level: a choice, below the encoders' noise
 STIFF = 0.03  # of inertia / step^2: at most what the sub-step can integrate
@@ -38,7 +38,7 @@ class Friction(Cause):
     """Bristles under a level that the subclass gives."""
 
     stepped = True
-    bend, tame = PRESLIDING, True
+    tame = True
 
     def draw(self, rng: np.random.Generator) -> None:
         self.largest = 0.6 * self.scales.force[self.where]
@@ -46,13 +46,17 @@ class Friction(Cause):
     def highest(self) -> float:
         return self.size
 
+    def bend(self) -> float:
+        """Of the bristles under the highest level."""
+        return PRESLIDING
+
     def level(self, plant: Simulated, w: float) -> float:
         return self.size
 
     def reset(self, plant: Simulated, command: np.ndarray) -> None:
         self.dof = plant.dof(self.where)
         inertia = self.scales.inertia[self.where]
-        self.bristle = Bristle(self.highest(), inertia, plant.timestep, self.bend, self.tame)
+        self.bristle = Bristle(self.highest(), inertia, plant.timestep, self.bend(), self.tame)
 
     def force(self, plant: Simulated) -> None:
         w = float(plant.data.qvel[self.dof])
@@ -84,48 +88,6 @@ class StribeckFriction(Friction):
 
     def parameters(self) -> dict[str, float]:
         return {"level": self.size, "excess": (self.ratio - 1) * self.size, "speed": self.speed}
-
-
-class LugreFriction(StribeckFriction):
-    """Bristles that bend so far that it shows, as Canudas de Wit has them: their damping is the same at any speed."""
-
-    name = "lugre_friction"
-    tame = False
-
-    def draw(self, rng: np.random.Generator) -> None:
-        super().draw(rng)
-        low, high = self.scales.travel[self.where]
-        self.ratio = rng.uniform(1.0, 2.0)
-        # farther bent, the bristles' damping outweighs a weak level
-        self.bend = (high - low) * math.exp(rng.uniform(math.log(0.002), math.log(0.03)))
-
-    def reset(self, plant: Simulated, command: np.ndarray) -> None:
-        super().reset(plant, command)
-        self.fresh = True
-
-    def command(self, plant: Simulated, u: np.ndarray) -> None:
-        """Where nothing was seen before, bristles are bent as they are long after: sliding, or holding the load."""
-        if not self.fresh:
-            return
-        self.fresh, data = False, plant.data
-        data.ctrl[:] = u
-        mujoco.mj_forward(plant.model, data)
-        w, acceleration = float(data.qvel[self.dof]), float(data.qacc[self.dof])
-        load = self.scales.inertia[self.where] * (w / plant.timestep + acceleration)
-        most = self.level(plant, w)
-        self.bristle.z = min(max(load, -most), most) / max(self.bristle.s0, 1e-300)
-
-    def resume(self, plant: Simulated, past: Past) -> None:
-        """Bristles as the motion has bent them; exact where speeds are constant between rows."""
-        self.fresh, at = len(past.q) < 2, past.q[:, plant.column(self.where)]
-        for way, time in zip(np.diff(at), np.diff(past.time), strict=True):
-            steady = self.level(plant, float(way / time)) / max(self.bristle.s0, 1e-300)
-            keep = math.exp(-abs(float(way)) / max(steady, 1e-300))
-            self.bristle.z = keep * self.bristle.z + (1 - keep) * math.copysign(steady, way)
-
-    def parameters(self) -> dict[str, float]:
-        stiffest = STIFF * self.scales.inertia[self.where] / self.scales.timestep**2
-        return super().parameters() | {"bend": max(self.bend, self.highest() / stiffest)}
 
 
 class LoadFriction(Friction):

@@ -35,7 +35,7 @@ def _stribeck(cause: Any, p: Parameters) -> None:
 
 def _lugre(cause: Any, p: Parameters) -> None:
     _stribeck(cause, p)
-    cause.bend = max(p["bend"], 1e-9)
+    cause.stiffness = cause.highest() / max(p["bend"], 1e-9)
 
 
 def _asymmetric(cause: Any, p: Parameters) -> None:
