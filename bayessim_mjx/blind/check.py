@@ -20,6 +20,18 @@ SETTINGS = "check.json"
 OURS = "bayessim-mjx diagnose"  # the entry that is checked where none is named
 
 
+def unasked() -> tuple[str, ...]:
+    """What `diagnose` tries unasked: what is never tried is never found, and nothing is learnt from hiding it."""
+    return tuple(e for e in KNOWN if library.load(e).offered)
+
+
+def effects_of(text: str) -> tuple[str, ...]:
+    """`all,lugre_friction` -> names; () where it is `all` alone."""
+    names = [n.strip() for n in text.split(",") if n.strip()]
+    every = (own for n in names for own in (unasked() if n == "all" else (n,)))
+    return () if names == ["all"] else tuple(dict.fromkeys(every))
+
+
 @dataclasses.dataclass(frozen=True)
 class Check:
     """What was asked for.
@@ -118,9 +130,7 @@ class Bench:
 
     def groups(self, effects: tuple[str, ...]) -> list[tuple[str, str]]:
         """(effect, place) of all that can be hidden here."""
-        # what is never tried is never found: nothing is learnt from hiding it
-        every = effects or tuple(e for e in KNOWN if library.load(e).offered)
-        return [(e, w) for e in every for w in places(self.rig, e, self.scales)]
+        return [(e, w) for e in (effects or unasked()) for w in places(self.rig, e, self.scales)]
 
     def unknown(self) -> list[tuple[str, str]]:
         return [(e, w) for e in UNKNOWN for w in places(self.rig, e, self.scales)]

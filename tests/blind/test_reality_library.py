@@ -10,7 +10,7 @@ import pytest
 from arms import FALL, MOTOR, SERVO, arm, hidden, sole
 
 from bayessim_mjx import effects
-from bayessim_mjx.blind.check import Check
+from bayessim_mjx.blind.check import Check, effects_of, unasked
 from bayessim_mjx.blind.reality import twin
 from bayessim_mjx.blind.reality.ground import ground
 from bayessim_mjx.blind.reality.menu import KNOWN
@@ -112,8 +112,9 @@ def test_a_twin_of_the_true_parameters_is_the_cause_and_closes_the_gap(name):
 
 
 def test_what_a_diagnosis_tries_only_where_it_is_named_is_hidden_only_then(tmp_path):
-    unasked = {"lugre_friction", "cable_tension", "ground_height"}
-    assert {e for e in KNOWN if not effects.load(e).offered} == unasked
+    assert set(KNOWN) - set(unasked()) == {"lugre_friction", "cable_tension", "ground_height"}
+    assert effects_of("all") == () and effects_of("backlash, armature") == ("backlash", "armature")
+    assert effects_of("all,lugre_friction,backlash") == (*unasked(), "lugre_friction")
     named = Check("out", model="robot.xml", effects=("lugre_friction", "backlash"))
     words = command(named, tmp_path / "logs", tmp_path / "out")
     assert words[words.index("--effects") + 1] == "all,lugre_friction"
