@@ -51,7 +51,10 @@ def _parser() -> cli.PlainParser:
         "menu of motions within the model's limits)",
     )  # fmt: skip
     parser.add_argument("--map", metavar="FILE", default="", help="YAML file that maps the columns of the logs")
-    parser.add_argument("--effects", metavar="LIST", default="all", help="effects to hide, separated by commas")
+    parser.add_argument(
+        "--effects", metavar="LIST", default="all",
+        help="effects to hide, separated by commas (default: all that a diagnosis tries unasked)",
+    )  # fmt: skip
     parser.add_argument(
         "--cases", metavar="N", type=cli.whole(1, MOST), default=CASES, help=f"cases in all (default: {CASES})"
     )
@@ -98,12 +101,12 @@ def _checked(args: argparse.Namespace) -> None:
 def _blind(argv: Sequence[str] | None) -> int:
     args = _parser().parse_args(argv)
     _checked(args)
-    from bayessim_mjx.blind.check import Check
+    from bayessim_mjx.blind.check import Check, effects_of
     from bayessim_mjx.blind.runner import Limits, run
     from bayessim_mjx.monitor.console import Console
     from bayessim_mjx.monitor.stages import stages
 
-    names = () if args.effects == "all" else tuple(n.strip() for n in args.effects.split(",") if n.strip())
+    names = effects_of(args.effects)
     check = Check(
         args.out, args.model or "", args.task or "", tuple(args.data), args.map, names, args.accuracy, args.seed,
         args.command, tuple(args.more), not args.no_sandbox,

@@ -6,6 +6,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+from bayessim_mjx import effects as library
 from bayessim_mjx.blind import seal
 from bayessim_mjx.blind.reality.cause import Scales
 from bayessim_mjx.blind.reality.menu import CAUSES, KNOWN, UNKNOWN, places
@@ -19,13 +20,26 @@ SETTINGS = "check.json"
 OURS = "bayessim-mjx diagnose"  # the entry that is checked where none is named
 
 
+def unasked() -> tuple[str, ...]:
+    """What `diagnose` tries unasked: what is never tried is never found, and nothing is learnt from hiding it."""
+    return tuple(e for e in KNOWN if library.load(e).offered)
+
+
+def effects_of(text: str) -> tuple[str, ...]:
+    """`all,lugre_friction` -> names; () where it is `all` alone."""
+    names = [n.strip() for n in text.split(",") if n.strip()]
+    every = (own for n in names for own in (unasked() if n == "all" else (n,)))
+    return () if names == ["all"] else tuple(dict.fromkeys(every))
+
+
 @dataclasses.dataclass(frozen=True)
 class Check:
     """What was asked for.
 
     Attributes:
         model: path of an MJCF file, or task: name of a task; data: files or folders of logs, () for a menu of motions.
-        effects: names of the effects that are hidden, () for all; accuracy: of data-sheet values (standard deviation).
+        effects: names of the effects that are hidden, () for all that `diagnose` tries unasked.
+        accuracy: of data-sheet values (standard deviation).
         seed: of everything; command: an entry (see `worker.command`), "" for `diagnose`; more: further arguments of it.
         sandbox: whether an entry is kept from reading the truths, where the system can do that.
     """
@@ -46,6 +60,11 @@ class Check:
         for name in self.effects:
             if name not in KNOWN:
                 raise unknown("effect", name, sorted(KNOWN))
+
+    @property
+    def asked(self) -> tuple[str, ...]:
+        """Those of its effects that `diagnose` only tries where they are named."""
+        return tuple(e for e in self.effects if not library.load(e).offered)
 
     @property
     def folder(self) -> Path:
@@ -111,7 +130,7 @@ class Bench:
 
     def groups(self, effects: tuple[str, ...]) -> list[tuple[str, str]]:
         """(effect, place) of all that can be hidden here."""
-        return [(e, w) for e in (effects or tuple(KNOWN)) for w in places(self.rig, e, self.scales)]
+        return [(e, w) for e in (effects or unasked()) for w in places(self.rig, e, self.scales)]
 
     def unknown(self) -> list[tuple[str, str]]:
         return [(e, w) for e in UNKNOWN for w in places(self.rig, e, self.scales)]

@@ -40,7 +40,8 @@ def command(check: Check, data: Path, out: Path) -> list[str]:
     robot = ["--task", check.task] if check.task else ["--model", model]
     accuracy = ["--accuracy", f"{100 * check.accuracy:g}%"]
     own = [sys.executable, "-m", "bayessim_mjx.diagnose", *robot, "--data", str(data), "--out", str(out)]
-    return [*own, *accuracy, "--seed", "0", "--headless", "--verdict_only", *check.more]
+    named = ["--effects", ",".join(("all", *check.asked))] if check.asked else []
+    return [*own, *accuracy, "--seed", "0", "--headless", "--verdict_only", *named, *check.more]
 
 
 def diagnose(check: Check, index: int) -> str:

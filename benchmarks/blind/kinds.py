@@ -10,11 +10,13 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "diagnosis"))
 
+from drawn import DRAWN
+
 from bayessim_mjx.blind import seal
 from bayessim_mjx.blind.cases import data_sheet, hidden, write_logs
 from bayessim_mjx.blind.check import WIDEST
 from bayessim_mjx.blind.reality.cause import Cause
-from bayessim_mjx.blind.reality.menu import KNOWN, UNKNOWN, draw_cause, places
+from bayessim_mjx.blind.reality.menu import UNKNOWN, draw_cause, places
 from bayessim_mjx.blind.reality.plant import Plant, Run, scales_of
 from bayessim_mjx.blind.reality.strength import HIDDEN, Ruler, resize
 from bayessim_mjx.blind.reality.system import System
@@ -65,7 +67,7 @@ def _causes(
         return [], []
     ruler = Ruler(robot, base, WIDEST * ACCURACY, seed)
     scales = scales_of(ruler.plain, ruler.runs)
-    able = [e for e in (UNKNOWN if unknown else KNOWN) if places(robot, e, scales)]
+    able = [e for e in (UNKNOWN if unknown else DRAWN) if places(robot, e, scales)]
     turn = list(np.random.default_rng(zlib.crc32(robot.name.encode())).permutation(able))
     names = [turn[(seed + k * (1 + seed % (len(turn) - 1))) % len(turn)] for k in range(count)]
     causes: list[Cause] = []

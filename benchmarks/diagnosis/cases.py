@@ -7,10 +7,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from drawn import DRAWN as KNOWN
 from systems import SYSTEMS
 
 from bayessim_mjx.blind.reality.cause import Cause
-from bayessim_mjx.blind.reality.menu import CAUSES, KNOWN, UNKNOWN, draw_cause, places
+from bayessim_mjx.blind.reality.menu import CAUSES, UNKNOWN, draw_cause, places
 from bayessim_mjx.blind.reality.motion import RUNS
 from bayessim_mjx.blind.reality.plant import Plant, Run, base_parameters, scales_of
 from bayessim_mjx.blind.reality.strength import Ruler, resize

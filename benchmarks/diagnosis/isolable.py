@@ -3,7 +3,7 @@
 from typing import Any
 
 import numpy as np
-from cases import SPREAD, SYSTEMS, draw_cause
+from cases import KNOWN, SPREAD, SYSTEMS, draw_cause
 
 from bayessim_mjx.blind.reality.cause import Cause
 from bayessim_mjx.blind.reality.lookalikes import isolable, rivals
@@ -46,7 +46,7 @@ def hidden(truth: dict[str, Any]) -> tuple[list[Cause], Ruler]:
 def looked_at(truth: dict[str, Any]) -> list[list[dict[str, Any]]]:
     """The rivals of every hidden cause, each as if it were there alone."""
     causes, ruler = hidden(truth)
-    return [rivals(cause, ruler) for cause in causes]
+    return [rivals(cause, ruler, KNOWN) for cause in causes]
 
 
 def each_isolable(found: list[Any], truth: dict[str, Any]) -> bool:

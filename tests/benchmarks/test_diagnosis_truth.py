@@ -14,6 +14,7 @@ from bayessim_mjx.logs import read_logs
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks" / "diagnosis"
 sys.path.insert(0, str(BENCHMARKS))
 cases = pytest.importorskip("cases")
+import blind  # noqa: E402
 import isolable  # noqa: E402
 
 from bayessim_mjx.blind.reality import lookalikes, strength  # noqa: E402
@@ -53,8 +54,24 @@ def inertia(plant: truth.Plant) -> float:
     return 1 / float(plant.model.dof_invweight0[0])
 
 
+def test_cases_of_a_seed_hide_what_they_hid_before_there_were_more_causes():
+    drawn = blind.jobs(Path(), range(1000, 1004), ["single", "double"], ["pendulum"], ["medium", "strong"])
+    assert [job[2] for job in drawn] == [
+        ("sensor_filter",),
+        ("armature", "actuator_bias"),
+        ("coulomb_friction",),
+        ("actuator_gain", "actuator_lag"),
+        ("actuator_lag",),
+        ("gravity_tilt", "actuator_bias"),
+        ("rate_limit",),
+        ("viscous_friction", "joint_offset"),
+    ]
+
+
 def test_nothing_of_the_library_is_used():
-    truths = [BENCHMARKS / f"{name}.py" for name in ("cases", "isolable", "score", "sysid", "systems", "tables")]
+    truths = [
+        BENCHMARKS / f"{name}.py" for name in ("cases", "drawn", "isolable", "score", "sysid", "systems", "tables")
+    ]
     for file in (*Path(truth.__file__).parent.glob("*.py"), *truths):
         used = re.findall(r"^\s*(?:from|import) (bayessim_mjx[\w.]*|mujoco\.mjx|jax)", file.read_text(), re.MULTILINE)
         assert all(name.startswith("bayessim_mjx.blind") for name in used), file.name

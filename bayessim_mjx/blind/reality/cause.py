@@ -35,6 +35,16 @@ class Simulated(Protocol):
 
 
 @dataclasses.dataclass(frozen=True)
+class Past:
+    """A run up to a row: time [T] s since it began, positions q and velocities v [T, n], commands u [T, nu]."""
+
+    time: np.ndarray
+    q: np.ndarray
+    v: np.ndarray
+    u: np.ndarray
+
+
+@dataclasses.dataclass(frozen=True)
 class Scales:
     """What the robot does without causes: largest force, speed, ... by joint, mass by body, command by actuator.
 
@@ -42,7 +52,9 @@ class Scales:
         effort: largest force over the gear, by actuator; drives: {actuator: its joint}.
         servo: actuators that take positions; base: the body that stands on the ground, "" where the robot has none.
         ends: bodies at the ends of chains and those before them; rotors: driven joints that are alone in their body;
-        direct: actuators without a filter of their own.
+        direct: actuators without a filter of their own; led: those that follow positions or velocities.
+        length: m, of the rod that turns as hard, by body that turns; axis: of its own hinge, [3] in its frame, zeros of
+            a body that has another number of them. ground: whether there is any that can be touched.
     """
 
     force: dict[str, float]
@@ -60,6 +72,10 @@ class Scales:
     ends: tuple[str, ...]
     rotors: tuple[str, ...]
     direct: frozenset[str]
+    led: frozenset[str]
+    length: dict[str, float]
+    axis: dict[str, np.ndarray]
+    ground: bool
 
 
 class Cause:
@@ -86,6 +102,9 @@ class Cause:
 
     def reset(self, plant: Simulated, command: np.ndarray) -> None:
         """Clear the memory at the start of a run, `command` being the first one."""
+
+    def resume(self, plant: Simulated, past: Past) -> None:
+        """Remember the motion before, after `reset` at a row of a run that is not its first."""
 
     def command(self, plant: Simulated, u: np.ndarray) -> None:
         """Change the command `[nu]` of this sub-step in place."""

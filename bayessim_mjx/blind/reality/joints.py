@@ -8,16 +8,18 @@ import numpy as np
 from bayessim_mjx.blind.reality.cause import Cause, Simulated
 
 PRESLIDING = 2e-4  # rad or m, bend of the bristles at the friction level: a choice, below the encoders' noise
+STIFF = 0.03  # of inertia / step^2: at most what the sub-step can integrate
 
 
 class Bristle:
     """LuGre: w = dq/dt, z' = w - s0 |w| z / g, F = -(s0 z + s1 z')."""
 
-    def __init__(self, level: float, inertia: float, timestep: float) -> None:
-        # at most what the sub-step can integrate
-        self.s0 = min(level / PRESLIDING, 0.03 * inertia / timestep**2)
+    def __init__(
+        self, level: float, inertia: float, timestep: float, bend: float = PRESLIDING, tame: bool = True
+    ) -> None:
+        self.s0 = min(level / bend, STIFF * inertia / timestep**2)
         self.s1 = 1.4 * math.sqrt(self.s0 * inertia)
-        self.timestep, self.z = timestep, 0.0
+        self.timestep, self.tame, self.z = timestep, tame, 0.0
 
     def step(self, w: float, level: float) -> float:
         """Friction force at speed w where the steady one is `level`; exact in z for constant w."""
@@ -28,7 +30,7 @@ class Bristle:
         before = self.z
         self.z = before * decay + (w * (1 - decay) / rate if rate > 1e-9 else w * self.timestep)
         # the bristles' own damping must not brake a fast joint: no more than the level, so that LuGre stays passive
-        damping = min(self.s1, level / abs(w)) if w else self.s1
+        damping = min(self.s1, level / abs(w)) if w and self.tame else self.s1
         return -(self.s0 * self.z + damping * (self.z - before) / self.timestep)
 
 
@@ -36,6 +38,7 @@ class Friction(Cause):
     """Bristles under a level that the subclass gives."""
 
     stepped = True
+    tame = True
 
     def draw(self, rng: np.random.Generator) -> None:
         self.largest = 0.6 * self.scales.force[self.where]
@@ -43,12 +46,17 @@ class Friction(Cause):
     def highest(self) -> float:
         return self.size
 
+    def bend(self) -> float:
+        """Of the bristles under the highest level."""
+        return PRESLIDING
+
     def level(self, plant: Simulated, w: float) -> float:
         return self.size
 
     def reset(self, plant: Simulated, command: np.ndarray) -> None:
         self.dof = plant.dof(self.where)
-        self.bristle = Bristle(self.highest(), self.scales.inertia[self.where], plant.timestep)
+        inertia = self.scales.inertia[self.where]
+        self.bristle = Bristle(self.highest(), inertia, plant.timestep, self.bend(), self.tame)
 
     def force(self, plant: Simulated) -> None:
         w = float(plant.data.qvel[self.dof])
@@ -175,6 +183,32 @@ class JointSpring(Cause):
 
     def parameters(self) -> dict[str, float]:
         return {"cubic" if self.order else "stiffness": self.size, "rest": self.rest}
+
+
+class CableTension(Cause):
+    """A cable beside the joint, MuJoCo's tendon: slack up to an angle; one in three has a softer one against it."""
+
+    name = "cable_tension"
+
+    def draw(self, rng: np.random.Generator) -> None:
+        low, high = self.scales.travel[self.where]
+        self.taut = rng.uniform(low + 0.2 * (high - low), high - 0.2 * (high - low))
+        self.side = float(rng.choice([-1, 1]))
+        self.other = rng.uniform(0.1, 0.5) if rng.uniform() < 1 / 3 else 0.0
+        self.largest = 3 * self.scales.force[self.where] / (high - low)
+
+    def edit(self, spec: mujoco.MjSpec) -> None:
+        far = 1e6  # m or rad: never reached
+        forward, backward, taut = self.parameters().values()
+        for k, stiffness, slack in ((0, forward, (-far, taut)), (1, backward, (taut, far))):
+            if stiffness:
+                cable = spec.add_tendon(name=f"{self.where}/cable{k}", springlength=slack)
+                cable.wrap_joint(self.where, 1.0)
+                cable.stiffness[0] = stiffness
+
+    def parameters(self) -> dict[str, float]:
+        forward, backward = (self.size, self.other * self.size)[:: int(self.side)]
+        return {"forward": forward, "backward": backward, "taut": self.taut}
 
 
 class TwoBodies(Cause):

@@ -5,6 +5,7 @@ parameters within their spread and the start states free; what is left of the ga
 apart. Draws of shapes are few, so that a rival may be better than found: then a case counts that should not.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,7 @@ EVERY = 2  # windows are thinned by this: a rival costs several simulations
 # is what gravity does
 SHAPES: dict[str, tuple[dict[str, Any], ...]] = {
     "cogging": ({"count": 1, "phase": 0.0}, {"count": 1, "phase": np.pi / 2}),
+    "inertial_parameters": tuple({"direction": e, "swell": 0.0} for e in np.eye(3)),
     "external_force": ({"direction": np.eye(3)[0], "gusts": 0.0}, {"direction": np.eye(3)[2], "gusts": 0.0}),
 }
 _FIRST = 0.1  # of the largest size
@@ -38,14 +40,14 @@ def isolable(found: list[dict[str, Any]], left: float) -> bool:
     return all(r["left"] >= max(APART, SHARE * left) for r in found)
 
 
-def rivals(cause: Cause, ruler: Ruler) -> list[dict[str, Any]]:
-    """[{"name", "where", "left"}], the closest first: left in encoder noises."""
+def rivals(cause: Cause, ruler: Ruler, names: Sequence[str] = tuple(KNOWN)) -> list[dict[str, Any]]:
+    """[{"name", "where", "left"}] among causes of these names, the closest first: left in encoder noises."""
     scales = cause.scales
     runs = record(cause, ruler)
     gap = ruler.windows(ruler.plain, runs, every=EVERY)
     near = _joint(cause, ruler, gap)
     found: list[dict[str, Any]] = []
-    for name, where in _others(cause, ruler, scales, near):
+    for name, where in _others(cause, ruler, names, near):
         found.append({"name": name, "where": where, "left": _best(name, where, scales, ruler, runs, gap)})
     return sorted(found, key=lambda r: r["left"])[:TOLD]
 
@@ -74,10 +76,10 @@ def _joint(cause: Cause, ruler: Ruler, gap: np.ndarray) -> str:
     return ruler.plain.joints[int(np.argmax(np.mean(gap**2, axis=(0, 1))))]
 
 
-def _others(cause: Cause, ruler: Ruler, scales: Scales, near: str) -> list[tuple[str, str]]:
+def _others(cause: Cause, ruler: Ruler, names: Sequence[str], near: str) -> list[tuple[str, str]]:
     """What else may be wrong at this joint, its actuator, at bodies, the world and contacts."""
-    out = []
-    for name in KNOWN:
+    out, scales = [], cause.scales
+    for name in names:
         for where in places(ruler.system, name, scales):
             here = CAUSES[name].kind not in ("joint", "actuator") or scales.drives.get(where, where) == near
             if here and name != cause.name:

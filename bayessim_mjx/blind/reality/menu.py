@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from bayessim_mjx.blind.reality import actuators, joints, others, unknown
+from bayessim_mjx.blind.reality import actuators, bodies, drives, joints, others, presliding, unknown
 from bayessim_mjx.blind.reality.cause import Cause, Scales
 from bayessim_mjx.blind.reality.plant import Rig
 
@@ -16,7 +16,7 @@ def _causes(*rooms: object) -> dict[str, type[Cause]]:
     return {c.name: c for c in every if "name" in vars(c)}
 
 
-KNOWN = _causes(joints, actuators, others)
+KNOWN = _causes(joints, actuators, others, presliding, drives, bodies)
 UNKNOWN = _causes(unknown)  # no library has them
 CAUSES = KNOWN | UNKNOWN
 
@@ -26,14 +26,17 @@ def places(system: Rig, effect: str, scales: Scales) -> list[str]:
     kind = CAUSES[effect].kind
     if kind == "actuator":
         alone = effect == "unknown_cross_coupling" and len(scales.force) < 2
-        return [] if alone else [a for a in scales.drives if effect != "actuator_lag" or a in scales.direct]
+        able = {"actuator_lag": scales.direct, "acceleration_limit": scales.led}.get(effect, scales.drives)
+        return [] if alone else [a for a in scales.drives if a in able]
+    if effect == "ground_height":
+        return ["world"] if system.touching and scales.ground else []
     if kind == "world":
         standing = effect != "base_flexibility" or scales.base
         return ["world"] if system.tilts and standing else []
     if kind == "geom":
         return list(system.touching)
-    if kind == "body":
-        return list(scales.ends)  # what is carried is carried at the end
+    if kind == "body":  # what is carried is carried at the end
+        return list(scales.length if effect == "inertial_parameters" else scales.ends)
     return list(scales.rotors) if effect in _ROTOR else list(scales.force)
 
 

@@ -10,7 +10,9 @@ from typing import Protocol
 import mujoco
 import numpy as np
 
-from bayessim_mjx.blind.reality.cause import Cause, Scales
+from bayessim_mjx.blind.reality.cause import Cause, Past, Scales
+from bayessim_mjx.blind.reality.ground import ground
+from bayessim_mjx.blind.reality.links import axis, length, turns
 
 FINER = 10  # times, of the steps in reality, so that its own error of integration is small beside the nominal one
 WIDTHS = {0: (7, 6), 1: (4, 3), 2: (1, 1), 3: (1, 1)}  # of free, ball, slide and hinge joints in qpos and qvel
@@ -155,6 +157,13 @@ class Plant:
             cause.watch(self, q, v)
         mujoco.mj_forward(self.model, self.data)
 
+    def resume(self, run: Run, row: int) -> None:
+        """After `reset` at a row of a run: what its causes would remember there."""
+        upto = slice(0, row + 1)
+        past = Past(run.time[upto] - run.time[0], run.clean[upto], run.clean_v[upto], run.ctrl[upto])
+        for cause in self.causes:
+            cause.resume(self, past)
+
     def advance(self, command: np.ndarray, steps: int | None = None) -> None:
         """One period (or so many of its steps) under a held command."""
         count = self.steps if steps is None else steps
@@ -242,6 +251,9 @@ def scales_of(plant: Plant, runs: Sequence[Run]) -> Scales:
     drives = {a: j for a, j in drives.items() if j in plant.joints}
     gear = dict(zip(actuators, np.abs(model.actuator_gear[:, 0]).tolist(), strict=True))
     bodies = [i for i in range(model.nbody) if model.body_weldid[i] != 0]
+    positions, speeds = model.actuator_biasprm[:, 1], model.actuator_biasprm[:, 2]
+    led = (positions != 0) | ((speeds != 0) & (speeds == -model.actuator_gainprm[:, 0]))
+    turned = [i for i in bodies if turns(model, i)]
     return Scales(
         force=force,
         speed={j: float(np.abs(v[:, plant.speed_column(j)]).max()) for j in plant.joints},
@@ -258,6 +270,10 @@ def scales_of(plant: Plant, runs: Sequence[Run]) -> Scales:
         ends=_ends(model),
         rotors=tuple(j for j in drives.values() if model.body_jntnum[model.jnt_bodyid[model.joint(j).id]] == 1),
         direct=frozenset(a for i, a in enumerate(actuators) if model.actuator_dyntype[i] == 0),
+        led=frozenset(a for i, a in enumerate(actuators) if led[i]),
+        length={model.body(i).name: length(model, i) for i in turned},
+        axis={model.body(i).name: axis(model, i) for i in turned},
+        ground=bool(ground(plant.system.spec())),
     )
 
 

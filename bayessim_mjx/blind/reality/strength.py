@@ -57,6 +57,7 @@ class Ruler:
         thin = max(1, len(starts) // MOST)
         for r, start in starts[::thin][::every]:
             plant.reset(r.clean[start] + dq, r.clean_v[start] + dv, r.ctrl[start])
+            plant.resume(r, start)
             for k in range(start, start + self.rows):
                 self.system.repeat(plant, r, k)
                 out.append(plant.measure()[0] - r.clean[k + 1])

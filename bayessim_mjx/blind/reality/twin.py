@@ -33,6 +33,11 @@ def _stribeck(cause: Any, p: Parameters) -> None:
     cause.ratio = 1 + p["excess"] / cause.size
 
 
+def _lugre(cause: Any, p: Parameters) -> None:
+    _stribeck(cause, p)
+    cause.stiffness = cause.highest() / max(p["bend"], 1e-9)
+
+
 def _asymmetric(cause: Any, p: Parameters) -> None:
     ahead, back = max(p["level_forward"], 0.0), max(p["level_backward"], 0.0)
     cause.size, cause.side = max(ahead, back), 1.0 if ahead >= back else -1.0
@@ -44,6 +49,25 @@ def _spring(cause: Any, p: Parameters) -> None:
     linear, cubic = p.get("stiffness", 0.0), p.get("cubic", 0.0)
     cause.order = 2 if abs(cubic) * (high - low) ** 2 > abs(linear) else 0
     cause.size, cause.rest = cubic if cause.order else linear, p["rest"]
+
+
+def _cable(cause: Any, p: Parameters) -> None:
+    ahead, back = max(p["forward"], 0.0), max(p["backward"], 0.0)
+    cause.size, cause.side, cause.taut = max(ahead, back), 1.0 if ahead >= back else -1.0, p["taut"]
+    cause.other = min(ahead, back) / max(cause.size, 1e-12)
+
+
+def _profile(cause: Any, p: Parameters) -> None:
+    most = cause.scales.command[cause.where]
+    cause.size = max(p["inertness"] * most, cause.smallest)
+    cause.slow = max(p["slowness"], 0.0) * most / math.sqrt(cause.size)
+
+
+def _inertial(cause: Any, p: Parameters) -> None:
+    shift = np.array([p[f"com_{a}"] for a in "xyz"])
+    cause.size = max(float(np.linalg.norm(shift)), 1e-9)
+    cause.direction, cause.sign = shift / cause.size, 1.0
+    cause.swell = (p["inertia"] - 1) * cause.largest / cause.size
 
 
 def _saturation(cause: Any, p: Parameters) -> None:
@@ -73,7 +97,9 @@ WRITTEN: dict[str, Callable[[Any, Parameters], None]] = {
     "actuator_bias": _signed("bias"), "actuator_deadband": _size("half_width"), "actuator_saturation": _saturation,
     "speed_torque_limit": _speed_torque, "cogging": _cogging, "gravity_tilt": _tilt,
     "joint_offset": _signed("offset"), "sensor_delay": _size("delay"), "sensor_filter": _size("time_constant"),
-    "sensor_gain": _signed("gain", 1.0),
+    "sensor_gain": _signed("gain", 1.0), "lugre_friction": _lugre, "cable_tension": _cable,
+    "gain_drift": _signed("drift"), "acceleration_limit": _profile, "inertial_parameters": _inertial,
+    "gravity_compensation": _signed("share"), "ground_height": _signed("height"),
     "effort_loss": lambda c, p: setattr(c, "size", max(p["loss"] * c.scales.effort[c.where], 0.0)),
     "rate_limit": lambda c, p: setattr(c, "size", max(p["slowness"] * c.scales.rate[c.where], 0.0)),
 }  # fmt: skip
@@ -90,6 +116,8 @@ def twins(rig: Rig, scales: Scales, named: Sequence[Mapping[str, Any]]) -> list[
             w for w in places(rig, effect["name"], scales)
             if effect["where"] in ("all", w) or scales.drives.get(w, w) in joints
         ]  # fmt: skip
+        if not spots:
+            return None
         values = {k: float(v["mean"]) for k, v in effect["parameters"].items()}
         for where in spots:
             cause = KNOWN[effect["name"]](where, scales, np.random.default_rng(0))

@@ -1,0 +1,121 @@
+"""What the finer reality hides and what the library has: the same effects, parameters and motion."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from arms import FALL, MOTOR, SERVO, arm, hidden, sole
+
+from bayessim_mjx import effects
+from bayessim_mjx.blind.check import Check, effects_of, unasked
+from bayessim_mjx.blind.reality import twin
+from bayessim_mjx.blind.reality.ground import ground
+from bayessim_mjx.blind.reality.menu import KNOWN
+from bayessim_mjx.blind.reality.plant import Plant
+from bayessim_mjx.blind.reality.strength import Ruler, resize
+from bayessim_mjx.blind.worker import command
+from bayessim_mjx.effects import make
+from bayessim_mjx.effects.ground_height import ground as ground_of_the_library
+from bayessim_mjx.parameters import ParameterSpace
+from bayessim_mjx.physics import Physics, control_step
+
+PLACES = {
+    "lugre_friction": "hinge", "cable_tension": "hinge", "gravity_compensation": "world", "inertial_parameters": "link",
+    "gain_drift": "drive", "acceleration_limit": "drive",
+}  # fmt: skip
+BASE = {"hinge.damping": 1.0, "link.mass": 1.0}
+
+
+def test_every_effect_of_the_library_can_be_hidden():
+    assert set(KNOWN) == set(effects.names())
+
+
+@functools.cache
+def library(xml: str, period: float, places: tuple[tuple[str, str], ...]):
+    """(physics with effects, the motion in it [T] under parameters, a start and commands)."""
+    model = mujoco.MjModel.from_xml_string(xml)
+    model.opt.timestep /= 5  # near the finer reality's
+    physics = Physics(model, period, ParameterSpace(), [make(name, where=where) for name, where in places])
+
+    def moved(theta: jax.Array, q: jax.Array, v: jax.Array, ctrl: jax.Array) -> jax.Array:
+        def step(world, row):
+            world, _ = control_step(physics, world, row)
+            return world, world.measurement["qpos"][0]
+
+        return jax.lax.scan(step, physics.world(theta, q, v), ctrl)[1]
+
+    return physics, jax.jit(moved)
+
+
+def simulated(rig, run, places: dict[str, str], name: str, told: dict[str, float]) -> np.ndarray:
+    """A run again in the library's physics, with one effect on."""
+    physics, moved = library(rig.xml, rig.period, tuple(places.items()))
+    theta = np.concatenate([b.neutral for b in physics.blocks if b.effect])
+    (own,) = (b for b in physics.blocks if b.effect and b.effect.name == name)
+    assert not told or {q.name for q in own.quantities} == set(told)
+    theta[own.slice] = [told.get(q.name, q.neutral) for q in own.quantities]
+    return np.asarray(moved(*map(jnp.float32, (theta, run.clean[0], run.clean_v[0], run.ctrl[:-1]))))
+
+
+@pytest.mark.parametrize("name", list(PLACES))
+def test_the_librarys_effect_with_the_true_parameters_moves_as_the_cause_does(name):
+    rig = arm(SERVO)
+    cause = hidden(rig, name, seed=1)
+    assert cause.where == PLACES[name]
+    cause.size = (1.0 if name == "gain_drift" else 0.2) * cause.largest
+    run, plain = (rig.record(Plant(rig, {}, own), 2, 0, noise=False) for own in ([cause], []))
+    assert np.array_equal(run.ctrl, plain.ctrl)
+    # what the effect changes: the rest is what the coarser step loses
+    change = run.clean[1:, 0] - plain.clean[1:, 0]
+    own = simulated(rig, run, PLACES, name, cause.parameters()) - simulated(rig, run, PLACES, name, {})
+    assert np.abs(own - change).max() < 0.05 * np.abs(change).max()
+
+
+def test_the_ground_of_the_library_is_that_of_the_cause():
+    rig = sole(-0.35)
+    cause = hidden(rig, "ground_height", 0.02, sign=1.0)
+    run = rig.record(Plant(rig, {}, [cause]), 2, 0, noise=False)
+    of = {"ground_height": "world"}
+    off = [simulated(rig, run, of, "ground_height", told) - run.clean[1:, 0] for told in (cause.parameters(), {})]
+    assert np.abs(off[0]).max() < 0.1 * np.abs(off[1]).max()
+    spec = mujoco.MjSpec.from_string(FALL)
+    model = spec.compile()
+    assert [g.name for g in ground(spec)] == [model.geom(i).name for i in ground_of_the_library(model)] == ["step"]
+
+
+def rig_of(name: str):
+    return arm(SERVO if name == "acceleration_limit" else MOTOR)
+
+
+@pytest.mark.parametrize("name", list(PLACES))
+def test_a_cause_has_the_strength_that_is_asked_for(name):
+    ruler, cause, goal = Ruler(rig_of(name), BASE, 0.15, 0), hidden(rig_of(name), name, seed=1), 4.0
+    raw, left = resize(cause, ruler, goal)
+    assert 0.85 * goal < min(raw, 3 * left) < 1.15 * goal and cause.size < cause.largest
+
+
+@pytest.mark.parametrize("name", [*PLACES, "ground_height"])
+def test_a_twin_of_the_true_parameters_is_the_cause_and_closes_the_gap(name):
+    rig = sole(-0.35) if name == "ground_height" else rig_of(name)
+    base = {} if name == "ground_height" else BASE
+    ruler, cause = Ruler(rig, base or {"sole.mass": 1.0}, 0.15, 0), hidden(rig, name, seed=2)
+    cause.size = 0.1 * cause.largest
+    numbers = {k: {"mean": v} for k, v in cause.parameters().items()}
+    (again,) = twin.twins(rig, cause.scales, [{"name": name, "where": cause.where, "parameters": numbers}]) or []
+    assert again.parameters() == pytest.approx(cause.parameters())
+    truth = Plant(rig, base, [cause])
+    assert twin.closed(ruler, truth, Plant(rig, base, [again])) == pytest.approx(1.0, abs=2e-3)
+    assert twin.closed(ruler, truth, Plant(rig, base)) < 0.5
+
+
+def test_what_a_diagnosis_tries_only_where_it_is_named_is_hidden_only_then(tmp_path):
+    assert set(KNOWN) - set(unasked()) == {"lugre_friction", "cable_tension", "ground_height"}
+    assert effects_of("all") == () and effects_of("backlash, armature") == ("backlash", "armature")
+    assert effects_of("all,lugre_friction,backlash") == (*unasked(), "lugre_friction")
+    named = Check("out", model="robot.xml", effects=("lugre_friction", "backlash"))
+    words = command(named, tmp_path / "logs", tmp_path / "out")
+    assert words[words.index("--effects") + 1] == "all,lugre_friction"
+    assert "--effects" not in command(Check("out", model="robot.xml"), tmp_path / "logs", tmp_path / "out")
