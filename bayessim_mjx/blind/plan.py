@@ -1,7 +1,8 @@
 """Which effect is hidden where, and how strong: rounds of cases, near where an effect begins to be found.
 
-A round's strengths follow from the outcomes of all cases before it, whatever ran at the same time; so a check is a
-function of its seed, and a longer one begins with the cases of a shorter one.
+A round's strengths follow from the outcomes of the cases some rounds before it, whatever ran at the same time; so a
+check is a function of its seed, a longer one begins with the cases of a shorter one, and cores need not wait for the
+slowest case of a round.
 """
 
 from collections.abc import Sequence
@@ -13,8 +14,9 @@ from bayessim_mjx.blind.curves import Curves, Group, Trial
 
 # Which cases are made is a choice, told in docs/blind.md; it makes intervals wider or narrower, not wrong.
 KINDS = "SSSNSSSSUN"  # single, null, unknown cause; over and over
-FIRST, ROUND = 16, 8  # cases of the first round, whose strengths are spread widely, and of the others
-SPREAD = (2.0, 40.0)  # encoder noises, of the first round
+FIRST, ROUND = 16, 8  # cases of the first round and of the others
+BEHIND = 3  # rounds after which a round's outcomes count: the strengths of the first ones are spread widely
+SPREAD = (2.0, 40.0)  # encoder noises, of the first rounds
 SHARES = (0.5, 0.9)  # how often later strengths are expected to be found
 RANGE = (0.5, 500.0)  # encoder noises, of all rounds
 
@@ -25,6 +27,12 @@ def rounds(cases: int) -> list[range]:
     return [range(a, min(b, cases)) for a, b in zip(starts, [*starts[1:], cases], strict=True)]
 
 
+def known(own: range) -> int:
+    """How many cases have to be finished before those of a round are planned: the first ones of all."""
+    turns = rounds(own.start)
+    return turns[-BEHIND].stop if len(turns) >= BEHIND else 0
+
+
 def plan(
     own: range, groups: Sequence[Group], unknown: Sequence[Group], trials: Sequence[Trial], seed: int
 ) -> list[Item]:
@@ -32,7 +40,7 @@ def plan(
 
     Args:
         own: indices of its cases; groups, unknown: (effect, place) of what may be hidden, and of what no library has.
-        trials: outcomes of the rounds before; seed: of the check.
+        trials: outcomes of the `known` cases; seed: of the check.
     """
     curves = Curves(trials) if trials else None
     out = []

@@ -9,7 +9,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from typing import Any
 
@@ -18,7 +18,7 @@ from bayessim_mjx.blind.cases import Item
 from bayessim_mjx.blind.check import Bench, Check, bench
 from bayessim_mjx.blind.curves import Trial
 from bayessim_mjx.blind.outcome import Outcome
-from bayessim_mjx.blind.plan import plan, rounds
+from bayessim_mjx.blind.plan import known, plan, rounds
 from bayessim_mjx.blind.worker import EXIT, KEPT, asked
 from bayessim_mjx.errors import UserError
 
@@ -38,7 +38,7 @@ class Limits:
 def run(check: Check, limits: Limits, say: Say, between: Between = lambda outcomes: None) -> list[Outcome]:
     """Make and diagnose cases up to a number or for a time; the outcomes of all that are finished.
 
-    `between` gets the outcomes so far after every round but the last.
+    `between` gets the outcomes so far when a round of cases has been begun.
 
     Raises:
         UserError: what is wrong with model, logs or effects; a seal that is broken.
@@ -47,64 +47,71 @@ def run(check: Check, limits: Limits, say: Say, between: Between = lambda outcom
     say("measuring what the robot does", 0, 1)
     own = bench(check)
     groups, unknown = own.groups(check.effects), own.unknown()
-    crew = _Crew(check, limits)
+    done = {i for i in range(limits.cases) if (check.answer(i) / EXIT).exists()}
+    crew = _Crew(check, limits, done, partial(_told, say, limits.cases))
     try:
         for indices in rounds(limits.cases):
-            so_far = outcomes(check, range(indices.start), own)
-            before = trials(so_far)
-            items = plan(indices, groups, unknown, before, check.seed)
-            todo = [i for i in items if not (check.answer(i.index) / EXIT).exists()]
-            told = partial(_told, say, indices.stop - len(todo), limits.cases)
-            if todo and so_far:
-                between(so_far)
-            if todo and not crew.work_off(todo, told):
+            if not crew.until(range(known(indices))):
                 break
+            before = trials(outcomes(check, range(known(indices)), own))
+            crew.begin(i for i in plan(indices, groups, unknown, before, check.seed) if i.index not in done)
+            if done and before:
+                between(outcomes(check, range(indices.start), own))
+        crew.until(range(limits.cases))
     finally:
         crew.stop()
     return outcomes(check, range(limits.cases), own)
 
 
-def _told(say: Say, before: int, total: int, done: int) -> None:
-    say("cases", before + done, total)
+def _told(say: Say, total: int, done: int) -> None:
+    say("cases", done, total)
 
 
 class _Crew:
-    """Workers that stay from round to round; none is started before there is something to do."""
+    """Workers that take cases as they are given; none is started before there is something to do.
 
-    def __init__(self, check: Check, limits: Limits) -> None:
-        self.check, self.workers = check, list[_Worker]()
+    done: indices of the cases that are finished; it grows.
+    """
+
+    def __init__(self, check: Check, limits: Limits, done: set[int], say: Callable[[int], None]) -> None:
+        self.check, self.workers, self.done, self.say = check, list[_Worker](), done, say
         self.end = None if limits.seconds is None else time.monotonic() + limits.seconds
         cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
         pinned = 1 < limits.workers <= len(cores)
         self.cores = [cores[k] if pinned else None for k in range(limits.workers)]
+        self.todo: queue.SimpleQueue[Item | None] = queue.SimpleQueue()
+        self.answers: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
+        self.given, self.idle = 0, 0
 
-    def work_off(self, items: Sequence[Item], say: Callable[[int], None]) -> bool:
-        """Whether all items were finished before the time was over.
+    def begin(self, items: Iterable[Item]) -> None:
+        """Have these done, in their order."""
+        for item in items:
+            self.todo.put(item)
+            self.given += 1
+        for k in range(len(self.workers), min(len(self.cores), self.given)):
+            self.workers.append(_Worker(self.check, k, self.cores[k], self.end))
+            threading.Thread(target=self.workers[k].feed, args=(self.todo, self.answers), daemon=True).start()
+        self.say(len(self.done))
+
+    def until(self, indices: range) -> bool:
+        """Whether these cases, of those that were given, were finished before the time was over.
 
         Raises:
             UserError: what is wrong with the robot or the entry, or where a worker says why it died.
         """
-        todo: queue.SimpleQueue[Item] = queue.SimpleQueue()
-        for item in items:
-            todo.put(item)
-        answers: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
-        count = min(len(self.cores), len(items))
-        for k in range(len(self.workers), count):
-            self.workers.append(_Worker(self.check, k, self.cores[k], self.end))
-        for worker in self.workers[:count]:
-            threading.Thread(target=worker.feed, args=(todo, answers), daemon=True).start()
-        finished, idle = 0, 0
-        say(0)
-        while idle < count:
-            answer = answers.get()
+        while not self.done.issuperset(indices) and self.idle < len(self.workers):
+            answer = self.answers.get()
             if "error" in answer:
                 raise UserError(answer["error"])
-            idle += "idle" in answer
-            finished += "index" in answer
-            say(finished)
-        return finished == len(items)
+            self.idle += "idle" in answer
+            if "index" in answer:
+                self.done.add(answer["index"])
+                self.say(len(self.done))
+        return self.done.issuperset(indices)
 
     def stop(self) -> None:
+        for _ in self.workers:
+            self.todo.put(None)
         for worker in self.workers:
             worker.stop()
 
@@ -127,12 +134,11 @@ class _Worker:
         print(line, file=self.process.stdin, flush=True)
 
     def feed(self, todo: Any, answers: Any) -> None:
-        """Give it one item after the other, until there is none or no time; all that it answers goes to `answers`."""
+        """Give it one item after the other, until None or for lack of time; all that it answers goes to `answers`."""
         assert self.process.stdout
-        while self.end is None or time.monotonic() + self.last < self.end:
-            try:
-                item = todo.get_nowait()
-            except queue.Empty:
+        while (item := todo.get()) is not None:
+            if self.end is not None and time.monotonic() + self.last >= self.end:
+                todo.put(item)  # whoever waits for one is to see that there is no time
                 break
             try:
                 self._write(json.dumps(dataclasses.asdict(item)))

@@ -20,7 +20,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 from bayessim_mjx.blind.curves import WANTED, Curves, Group, Trial
-from bayessim_mjx.blind.plan import plan, rounds
+from bayessim_mjx.blind.plan import known, plan, rounds
 
 Law = Callable[[float], float]  # log strength less log threshold, over the curve's width -> share found, without lapses
 
@@ -112,13 +112,14 @@ def drawn(truth: Truth, rng: np.random.Generator) -> dict[Group, Curve]:
 
 def check(curves: dict[Group, Curve], cases: int, seed: int) -> list[Trial]:
     """The outcomes of a check, planned round by round."""
-    rng, trials = np.random.default_rng((seed, 3)), list[Trial]()
+    rng, trials = np.random.default_rng((seed, 3)), dict[int, Trial]()
     for indices in rounds(cases):
-        for item in plan(indices, list(curves), [("unknown", "x")], list(trials), seed):
+        before = [t for i, t in trials.items() if i < known(indices)]
+        for item in plan(indices, list(curves), [("unknown", "x")], before, seed):
             if item.kind == "single":
                 found = rng.uniform() < curves[item.effect, item.where].chance(item.strength)
-                trials.append(Trial(item.effect, item.where, item.strength, bool(found)))
-    return trials
+                trials[item.index] = Trial(item.effect, item.where, item.strength, bool(found))
+    return list(trials.values())
 
 
 def judged(name: str, seed: int) -> list[tuple[bool, float, float, float]]:
