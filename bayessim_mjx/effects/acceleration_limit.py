@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from bayessim_mjx.effects.effect import Effect, Quantity
+from bayessim_mjx.effects.support.profile import trapezoid
 from bayessim_mjx.effects.support.site import Site
 
 
@@ -18,8 +19,8 @@ from bayessim_mjx.effects.support.site import Site
 class AccelerationLimit(Effect):
     """|u'| <= 1 / slowness and |u''| <= 1 / inertness: u goes to the command c in the least time, and brakes for it.
 
-    In sub-steps of length 1, with w the way that is left: the speed is at most w, 1 / slowness and the one from which
-    it can still brake, v (v b + 1) / 2 <= w, and changes by at most 1 / b (b: inertness).
+    Exact for the command that is held over a sub-step, planned anew in each: it may speed up, cruise, brake and arrive
+    within one. The actuator obeys the mean of u over the sub-step. A command nearer than u can stop is passed.
 
     Parameters: `slowness`, s per unit of the command, and `inertness`, s^2 per unit of the command; neutral 0.
     """
@@ -50,22 +51,11 @@ class AccelerationLimit(Effect):
         own = command[:, at.ids]
         h = jnp.float32(at.timestep)
         slowness, inertness = at.values(theta)[:, 0] / h, at.values(theta)[:, 1] / h**2
-        limited = inertness > 0
-        stiff = jnp.where(limited, inertness, 1.0)
-        change = jnp.where(limited, 1.0 / stiff, jnp.inf)
 
         def advance(state: tuple, c: jax.Array) -> tuple[tuple, jax.Array]:
             u, rate = state
-            way = c - u
-            far = jnp.abs(way)
-            brake = 4.0 * far / (1.0 + jnp.sqrt(1.0 + 8.0 * inertness * far))
-            fastest = jnp.minimum(jnp.minimum(far, brake), 1.0 / jnp.maximum(slowness, 1e-9))
-            wanted = jnp.sign(way) * fastest
-            now = jnp.where(limited, rate + jnp.clip(wanted - rate, -change, change), wanted)
-            # of the sub-step it takes, half is missing from the mean; nothing where it jumps
-            root = jnp.where(limited & (far > 0), jnp.sqrt(jnp.where(far > 0, stiff * far, 1.0)), 0.0)
-            missing = 0.5 * now * jnp.minimum(slowness * far + 2.0 * root, 1.0)
-            return (c - (way - now), now), c - (way - now) - missing
+            left, rate, mean = trapezoid(c - u, rate, slowness, inertness)
+            return (c - left, rate), c - mean
 
         start = jnp.where(memory["fresh"], own[0], memory["state"])
         (state, rate), means = jax.lax.scan(advance, (start, jnp.where(memory["fresh"], 0.0, memory["rate"])), own)
