@@ -12,6 +12,7 @@ from arms import FALL, MOTOR, SERVO, arm, hidden, sole
 from bayessim_mjx import effects
 from bayessim_mjx.blind.check import Check, effects_of, unasked
 from bayessim_mjx.blind.reality import twin
+from bayessim_mjx.blind.reality.drives import quickest
 from bayessim_mjx.blind.reality.ground import ground
 from bayessim_mjx.blind.reality.menu import KNOWN
 from bayessim_mjx.blind.reality.plant import Plant
@@ -60,18 +61,44 @@ def simulated(rig, run, places: dict[str, str], name: str, told: dict[str, float
     return np.asarray(moved(*map(jnp.float32, (theta, run.clean[0], run.clean_v[0], run.ctrl[:-1]))))
 
 
+# of the largest size; and what may differ, of what the effect changes
+SIZES = {"gain_drift": 1.0, "acceleration_limit": 0.002}
+CLOSE = {"acceleration_limit": 0.003}
+
+
 @pytest.mark.parametrize("name", list(PLACES))
 def test_the_librarys_effect_with_the_true_parameters_moves_as_the_cause_does(name):
     rig = arm(SERVO)
     cause = hidden(rig, name, seed=1)
     assert cause.where == PLACES[name]
-    cause.size = (1.0 if name == "gain_drift" else 0.2) * cause.largest
+    cause.size = SIZES.get(name, 0.2) * cause.largest
     run, plain = (rig.record(Plant(rig, {}, own), 2, 0, noise=False) for own in ([cause], []))
     assert np.array_equal(run.ctrl, plain.ctrl)
     # what the effect changes: the rest is what the coarser step loses
     change = run.clean[1:, 0] - plain.clean[1:, 0]
     own = simulated(rig, run, PLACES, name, cause.parameters()) - simulated(rig, run, PLACES, name, {})
-    assert np.abs(own - change).max() < 0.05 * np.abs(change).max()
+    assert np.abs(own - change).max() < CLOSE.get(name, 0.05) * np.abs(change).max()
+
+
+@pytest.mark.parametrize("timestep", [0.0005, 0.005])
+@pytest.mark.parametrize(("slowness", "inertness"), [(0.0, 0.00013), (0.068, 0.00084), (0.0, 0.02), (0.3, 0.02)])
+def test_the_librarys_profile_is_that_of_the_cause_at_any_time_step(timestep, slowness, inertness):
+    t, rows = 0.01 * np.arange(400), round(0.01 / timestep)
+    command = (1.2 * np.sin(np.pi * t) + 0.3 * np.sin(2.6 * np.pi * t + 1)).astype(np.float32).repeat(rows)
+    effect = make("acceleration_limit", where="drive")
+    at = effect.bind(mujoco.MjModel.from_xml_string(arm(SERVO).xml), timestep, len(command))
+    run = jax.jit(lambda *given: effect.on_command(at, effect.init(at), *given)[1])
+    got = run(jnp.asarray(command)[:, None], jnp.array([slowness, inertness], jnp.float32))[:, 0]
+    (u, v), expected = (float(command[0]), 0.0), []
+    for c in command.astype(float):
+        mean = 0.0
+        for _ in range(10):  # of the set-point over a sub-step
+            way, v = quickest(c - u, v, 1 / slowness if slowness else np.inf, 1 / inertness, timestep / 10)
+            mean, u = mean + (u + 0.5 * way) / 10, u + way
+        expected.append(mean)
+    assert np.abs(np.array(expected) - command).max() > 0.015  # the profile changes it
+    smooth = inertness > 0.001 or timestep < 0.001  # trapezium rule over the tenths
+    np.testing.assert_allclose(got, expected, atol=2e-5 if smooth else 2e-4)
 
 
 def test_the_ground_of_the_library_is_that_of_the_cause():
