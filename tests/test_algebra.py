@@ -2,8 +2,10 @@
 
 import dataclasses
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy import stats
 from scipy.linalg import solve_triangular
 from scipy.special import logsumexp
 
@@ -178,3 +180,37 @@ def test_what_is_no_density_is_not_sound():
         assert not broken.sound, change
         with pytest.raises(ValueError, match="no density"):
             q.product(broken)
+
+
+def test_posteriors_that_lie_outside_in_several_directions_and_contradict_each_other_do_not_end_as_the_prior():
+    """Each is a sliver in the corner of three parameters; in the fourth they are 40 standard deviations apart.
+
+    All together they hardly have any mass: what is left are the single ones, each of which is (1 - w) w^2, and w^3.
+    """
+    space = ParameterSpace([Parameter(f"p{i}", 0.5, 0.0, 1.0) for i in range(4)])
+    sd, w = jnp.diag(jnp.array([0.02, 0.02, 0.02, 0.005])), 0.05
+
+    def factor(at: float) -> Distribution:
+        return Distribution.from_unit(space, jnp.zeros(1), jnp.array([[-0.5, -0.5, -0.5, at]]), sd[None], w)
+
+    found = factor(0.3).product(factor(0.5), factor(0.7), components=4)
+    assert float(found.prior_weight) == pytest.approx(w / (w + 3 * (1 - w)), rel=0.02)
+    for at in (0.3, 0.5, 0.7):  # density of each, and of a third of their sum
+        theta = jnp.array([0.001, 0.001, 0.001, at])
+        assert float(found.log_gain(theta)) == pytest.approx(float(factor(at).log_gain(theta)) - np.log(3), abs=0.1)
+
+
+def test_masses_in_the_cube_are_those_of_independent_coordinates_also_far_outside():
+    means, sds = np.array([[0.5, 0.2], [-0.5, 1.4], [1.02, 0.5]]), np.array([[0.3, 0.1], [0.02, 0.03], [0.01, 2.0]])
+    far = stats.norm.logsf(25)  # of a mean half a range outside, at .02; the other wall adds nothing
+    inside = np.log(np.diff(stats.norm.cdf([-5 / 3, 5 / 3]))[0]), np.log(np.diff(stats.norm.cdf([-2.0, 8.0]))[0])
+    flat = np.log(np.diff(stats.norm.cdf([-0.25, 0.25]))[0])
+    want = [sum(inside), far + stats.norm.logsf(0.4 / 0.03), stats.norm.logsf(2) + flat]
+    found = algebra.log_masses(means, np.stack([np.diag(s) for s in sds]))
+    np.testing.assert_allclose(found, want, rtol=1e-6)
+    # correlated: the exact mass of N((1/2, 1/2), sd 1/2, correlation .8) by scipy
+    cov = 0.25 * np.array([[1, 0.8], [0.8, 1]])
+    exact = stats.multivariate_normal([0.5, 0.5], cov).cdf([1, 1], lower_limit=[0, 0])
+    assert algebra.log_masses(np.full((1, 2), 0.5), np.linalg.cholesky(cov)[None])[0] == pytest.approx(
+        np.log(exact), abs=0.03
+    )

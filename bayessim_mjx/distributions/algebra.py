@@ -11,10 +11,13 @@ So everything stays positive definite, and twice as many digits are kept.
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import log_ndtr
+from scipy.special import log_ndtr, ndtri_exp
+
+from bayessim_mjx.distributions.box import lattice
 
 NEGLIGIBLE = 1e-8  # relative mass below which a component is dropped
 FAINT = 1e-12  # the same of a factor: where all others contradict, a faint component may decide
+MASS_POINTS = 64  # behind the mass of a component in the cube, by which some are dropped and pairs merged
 CROWD = 96  # components kept before merging (bounds the pairwise work)
 # standard deviations in coordinates of the chart: what is broader is flat over the unit cube to 1e-8, what is thinner
 # a point in float32; a network may put out both in one component
@@ -124,9 +127,17 @@ def divide(mixture: Mixture, mean: np.ndarray, scale: np.ndarray) -> tuple[Mixtu
 
 
 def reduce(mixture: Mixture, components: int) -> Mixture:
-    """Drop negligible components, then merge the pair that costs least (Runnalls 2007, eq. 16) until K are left."""
+    """Drop negligible components, then merge the pair that costs least (Runnalls 2007, eq. 16) until K are left.
+
+    Of Gaussians that are cut off to the unit cube the masses inside are what they weigh, and what is kept of a pair.
+    """
     mixture = prune(mixture)
-    weights, means, scales = np.exp(np.maximum(mixture.log_weights, -600.0)), mixture.means, mixture.scales
+    inside = np.zeros(len(mixture.means)) if mixture.prior else log_masses(mixture.means, mixture.scales)
+    weights, means, scales = (
+        np.exp(np.maximum(_top(mixture.log_weights + inside), -600.0)),
+        mixture.means,
+        mixture.scales,
+    )
     if (left := len(weights)) <= components:
         return mixture
     weights, means, scales, alive = weights.copy(), means.copy(), scales.copy(), np.ones(left, bool)
@@ -143,14 +154,15 @@ def reduce(mixture: Mixture, components: int) -> Mixture:
         others = np.flatnonzero(alive & (np.arange(left) != i))
         row = _costs(weights, means, scales, covs, log_dets, np.full(len(others), i), others)
         cost[i, others] = cost[others, i] = row
-    return Mixture(mixture.flat, np.log(weights[alive]), means[alive], scales[alive], mixture.prior)
+    logs, means, scales = np.log(weights[alive]), means[alive], scales[alive]
+    logs = logs + float(np.max(mixture.log_weights + inside))
+    logs = logs if mixture.prior else logs - log_masses(means, scales)
+    return Mixture(mixture.flat, logs, means, scales, mixture.prior)
 
 
 def prune(mixture: Mixture, negligible: float = NEGLIGIBLE) -> Mixture:
     """Drop components whose mass inside the cube is negligible, and all but the CROWD heaviest; the heaviest stays."""
-    scores = mixture.log_weights
-    if mixture.prior == 0:  # the others are not cut off
-        scores = scores + log_mass_bound(mixture.means, mixture.scales)
+    scores = mixture.log_weights if mixture.prior else _masses_worth(mixture, np.log(negligible))
     scores = np.where(np.isnan(scores), -np.inf, scores)
     keep = scores > max(scores.max(), mixture.flat) + np.log(negligible)
     keep &= scores >= np.sort(scores)[-min(CROWD, len(scores))]
@@ -159,10 +171,47 @@ def prune(mixture: Mixture, negligible: float = NEGLIGIBLE) -> Mixture:
     return _rescaled(Mixture(mixture.flat, *kept, mixture.prior))
 
 
+def _masses_worth(mixture: Mixture, negligible: float) -> np.ndarray:
+    """Log mass of each component inside the cube [K]; -inf where it is less than `negligible` of the largest.
+
+    By the bound alone where all means are inside. Far outside it may be hundreds of nats too high, and a component that
+    hardly has any mass would stand in the place of all others.
+    """
+    weights, means, scales = mixture.log_weights, mixture.means, mixture.scales
+    most = weights + log_mass_bound(means, scales)
+    if not np.any((means < 0) | (means > 1)):
+        return most
+    order, found = np.argsort(np.where(np.isnan(most), -np.inf, most))[::-1], np.full(len(most), -np.inf)
+    for start in range(0, len(order), CROWD):
+        some = order[start : start + CROWD]
+        if most[some[0]] < max(found.max(), mixture.flat) + negligible:
+            break
+        found[some] = weights[some] + log_masses(means[some], scales[some])
+    return found
+
+
+def log_masses(means: np.ndarray, scales: np.ndarray) -> np.ndarray:
+    """Log mass of each Gaussian inside the cube [K], by the separation of variables (see `box`), in float64."""
+    (k, d), w = means.shape, lattice(MASS_POINTS, means.shape[1]).astype(np.float64)
+    z, logs = np.zeros((k, len(w), d)), np.zeros((k, len(w)))
+    for i in range(d):
+        here, width = means[:, i, None] + np.einsum("kni,ki->kn", z[..., :i], scales[:, i, :i]), scales[:, i, i]
+        low, high = -here / width[:, None], (1 - here) / width[:, None]
+        flip = low + high > 0  # to the side where logarithms tell Phi from 1
+        low, high = log_ndtr(np.where(flip, -high, low)), log_ndtr(np.where(flip, -low, high))
+        logs += high + np.log(np.maximum(-np.expm1(low - high), 1e-300))
+        z[..., i] = ndtri_exp(np.logaddexp(low + np.log1p(-w[:, i]), high + np.log(w[:, i]))) * np.where(flip, -1, 1)
+    return np.asarray(np.logaddexp.reduce(logs, axis=1) - np.log(len(w)))
+
+
 def log_mass_bound(means: np.ndarray, scales: np.ndarray) -> np.ndarray:
     """Each Gaussian's log mass beyond the nearest wall of the cube (log 1/2 for a mean inside), [K]: a cheap bound."""
     sd = np.maximum(np.sqrt(np.sum(scales**2, axis=-1)), THINNEST)
     return np.min(log_ndtr(np.minimum(np.minimum(means, 1 - means) / sd, 0)), axis=1, initial=0.0)
+
+
+def _top(logs: np.ndarray) -> np.ndarray:
+    return logs - logs.max()
 
 
 def _rescaled(mixture: Mixture) -> Mixture:

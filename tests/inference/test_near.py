@@ -45,9 +45,9 @@ def test_sets_at_draws_of_the_posterior_take_back_what_the_network_leans_by_ther
         # SD 0.1 and its eighth of a variance, in unit coordinates
         np.testing.assert_allclose(here.move, [LEANS * SD / 2, 0.0], atol=3 * SD / 2 / (COUNT * MANY) ** 0.5)
         assert before > 0.999 and after < 0.5 and "moved back" in here.sentence()
-        again = near.count(*drawn(used, 9), components=1, move=here.move, widening=here.widening(COUNT))
-        for level in (0.5, 0.8, 0.95):  # sets that did not choose it
-            assert again.coverage(level) == pytest.approx(level, abs=0.2)
+        again = [near.count(*drawn(used, t), 1, here.move, here.widening(COUNT)) for t in (9, 10, 11)]
+        for level in (0.5, 0.8, 0.95):  # sets that did not choose it; standard errors up to .04
+            assert np.mean([a.coverage(level) for a in again]) == pytest.approx(level, abs=0.13)
     else:
         assert here.move is None and len(here.near) == 1 and after == pytest.approx(before, abs=0.2)
     assert near.settled(found, product, lambda posterior, turn: None, components=1) == found
