@@ -31,6 +31,7 @@ COMMANDS = {  # all of them, and what each is for
     "blind": "which missing effects a diagnosis would find on your robot",
     "gap_loop": "what a diagnosis is worth in return",
     "logs": "logs of MCAP, ROS bags, LeRobot and HDF5, for a diagnosis",
+    "implementations": "which implementation of MuJoCo is faster here, for env.impl=auto",
     "completion": "a script by which bash, zsh or fish completes commands and flags",
 }
 COMPLETION = (
