@@ -1,4 +1,4 @@
-"""`bayessim-mjx implementations --task T --num_envs N`: whether MJX's JAX or its Warp is faster here, for env.impl=auto."""
+"""`bayessim-mjx implementations --task T --num_envs N`: which implementation of MuJoCo is faster here, for auto."""
 
 import argparse
 import sys
@@ -125,21 +125,25 @@ def _speed(config: "Config", impl: str, worlds: int, seconds: float) -> "Speed |
 def _told(impl: str, found: "Speed | str") -> str:
     if isinstance(found, str):
         return f"{NAMES[impl]}: {found}"
-    return f"{NAMES[impl]} {_rates(found)} steps/s, compiled in {duration(found.compiling)}"
+    return f"{NAMES[impl]} {_rates(found)} steps/s, compiled or loaded in {duration(found.compiling)}"
 
 
 def _rates(found: "Speed | str") -> str:
     """`4.8M (4.7M to 4.9M)`: median and range."""
     if isinstance(found, str):
         return found if found == NO_ROOM else "-"
-    low, high = (compact(rate, 3) for rate in (min(found.rates), max(found.rates)))
-    return compact(found.median, 3) + (f" ({low} to {high})" if len(found.rates) > 1 else "")
+    low, high = _rate(min(found.rates)), _rate(max(found.rates))
+    return _rate(found.median) + (f" ({low} to {high})" if len(found.rates) > 1 else "")
+
+
+def _rate(value: float) -> str:
+    return compact(value, 3 if value >= 1e4 else 4)
 
 
 def _measure(
     config: "Config", numbers: Sequence[int], impls: Sequence[str], seconds: float, console: "Console"
 ) -> list[dict[str, Any]]:
-    """{"worlds", implementation: its speed or why there is none} for each number of worlds; kept as soon as known."""
+    """{"worlds", implementation: its speed or why there is none, "kept"} for each number; written as soon as known."""
     rows: list[dict[str, Any]] = []
     share = seconds / len(numbers) / len(impls)
     for worlds in numbers:
@@ -148,28 +152,27 @@ def _measure(
             console.phase(f"{count(worlds, 'world')}, {NAMES[impl]}")
             row[impl] = _speed(config, impl, worlds, share)
             console.say(f"{count(worlds, 'world')}: {_told(impl, row[impl])}")
-        rows.append(row)
-        _keep(config.task, row)
+        rows.append({**row, "kept": _keep(config.task, row)})
     return rows
 
 
-def _keep(task: str, row: dict[str, Any]) -> None:
-    """Write what auto can go by: two speeds, or one where the memory was too small for the other implementation."""
+def _keep(task: str, row: dict[str, Any]) -> bool:
+    """Whether there was anything that auto can go by: two speeds, or one where the other had not the memory."""
     from bayessim_mjx.physics import implementation, measured
     from bayessim_mjx.versions import of
 
     file, found = measured.path(), [row.get(impl, "") for impl in NAMES]
     rates = [None if isinstance(f, str) else f.median for f in found]
     if file is None or any(isinstance(f, str) and f != NO_ROOM for f in found) or not any(rates):
-        return
+        return False
     new = measured.Measurement(task, implementation.kind(), row["worlds"], rates[0], rates[1], of(measured.VERSIONS))
     _write(file, measured.with_new(measured.read(file), new))
+    return True
 
 
 def _table(rows: Sequence[dict[str, Any]], impls: Sequence[str]) -> tuple[list[str], list[list[str]]]:
     header = ["worlds", *(f"{NAMES[impl]} [steps/s]" for impl in impls)]
     header += ["Warp / JAX"] if len(impls) > 1 else []
-    header += [f"{NAMES[impl]} compiled in" for impl in impls]
     cells = []
     for row in rows:
         found = [row[impl] for impl in impls]
@@ -177,11 +180,22 @@ def _table(rows: Sequence[dict[str, Any]], impls: Sequence[str]) -> tuple[list[s
         if len(impls) > 1:
             both = not any(isinstance(f, str) for f in found)
             line.append(compact(found[1].median / found[0].median, 3) if both else "-")
-        cells.append(line + ["-" if isinstance(f, str) else duration(f.compiling) for f in found])
-    return header, cells
+        cells.append([*line, ", ".join("-" if isinstance(f, str) else duration(f.compiling) for f in found)])
+    return [*header, "compiled in"], cells
 
 
-def _conclusion(config: "Config", console: "Console") -> None:
+def _quiet() -> None:
+    """Warp tells of every kernel that it compiles, by the dozen."""
+    import warp
+
+    settings: Any = warp.config
+    if hasattr(settings, "log_level"):
+        settings.log_level = warp.LOG_WARNING
+    else:  # as older ones call it
+        settings.quiet = True
+
+
+def _conclusion(config: "Config", console: "Console", kept: bool) -> None:
     """What auto takes from now on, where that stands, and what else changes with it."""
     from bayessim_mjx import registry
     from bayessim_mjx.physics import implementation, measured
@@ -192,8 +206,7 @@ def _conclusion(config: "Config", console: "Console") -> None:
     steps = implementation.steps(config.task, env.physics.effects)
     (_, first), *later = steps
     taken = ", ".join([first.impl, *(f"{choice.impl} from {count(worlds, 'world')} on" for worlds, choice in later)])
-    why = "" if later else f" ({first.why})"
-    console.say(f"env.impl=auto takes for {config.task} on {device}: {taken}{why}")
+    console.say(f"env.impl=auto takes for {config.task} on {device}: {taken}")
     allowed = min(env.mj_model.opt.iterations, env.mj_model.opt.ls_iterations)
     if allowed < LEAST_ITERATIONS and any(choice.impl == "warp" for _, choice in steps):
         console.say(
@@ -202,7 +215,7 @@ def _conclusion(config: "Config", console: "Console") -> None:
         )
     if file is None:
         console.warning("nothing is kept, as $BAYESSIM_MJX_CACHE is off: env.impl=auto does not know of it")
-    else:
+    elif kept:
         console.say(f"kept in {file}; --forget removes it")
 
 
@@ -216,19 +229,21 @@ def _implementations(argv: Sequence[str] | None) -> int:
         if args.forget:
             return _forget(config.task, console)
         device = setup_jax(config)
-        from bayessim_mjx.physics import measured
+        from bayessim_mjx.physics import implementation, measured
 
         measured.read(measured.path())  # refuse a damaged file before, not after a minute
         numbers = sorted(set(args.num_envs or [config.env.numEnvs]))
+        if implementation.installed():
+            _quiet()
         refused = _refused(config)
         impls = ["jax"] if refused else list(NAMES)
         console.start({"task": config.task, "device": f"{device} ({device.device_kind})"})
         if refused:
             console.warning(f"Warp is left out, so nothing is kept for env.impl=auto: {refused}")
         rows = _measure(config, numbers, impls, args.seconds, console)
-        header, cells = _table(rows, impls)
-        console.grid(header, cells)
-        _conclusion(config, console)
+        console.close()
+        console.grid(*_table(rows, impls))
+        _conclusion(config, console, any(row["kept"] for row in rows))
     return 0
 
 

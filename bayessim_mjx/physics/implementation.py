@@ -48,9 +48,8 @@ def choose(task: str, worlds: int | None, effects: Sequence[Effect] = (), device
     if least is not None:
         where = f"{least} worlds" + (f", here are {worlds}" if worlds < least else "")
         return Choice("warp" if worlds >= least else "jax", f"Warp was faster on {device} from {where}")
-    return Choice(
-        "jax", f"{task} was not measured on {device} with so few worlds; bayessim-mjx implementations does it"
-    )
+    so_many = f"{worlds} worlds or fewer" if worlds else "few worlds"
+    return Choice("jax", f"{task} was not measured on {device} with {so_many}; bayessim-mjx implementations does it")
 
 
 def steps(task: str, effects: Sequence[Effect] = (), device: str | None = None) -> list[tuple[int, Choice]]:
@@ -68,7 +67,7 @@ def installed() -> bool:
 
 def kind() -> str:
     """The kind of the default device, as JAX calls it."""
-    chosen = jax.config.jax_default_device  # a device, the name of a platform, or None
+    chosen = getattr(jax.config, "jax_default_device", None)  # a device, the name of a platform, or None
     return chosen.device_kind if isinstance(chosen, jax.Device) else jax.devices(chosen)[0].device_kind
 
 

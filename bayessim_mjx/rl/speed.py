@@ -66,7 +66,8 @@ def measure(
     compiling = max(first - second, 0.0)
     if second >= seconds:
         return Speed((worlds * steps / second,), compiling)
-    count, rates = max(1, min(1000, round(seconds / REPETITIONS / second))), []
+    count = max(1, min(1000, round(seconds / REPETITIONS / second)))
+    rates: list[float] = []
     left = seconds
     while len(rates) < REPETITIONS and left > 0:
         states, took = again(states, count)
