@@ -39,7 +39,7 @@ def _parser() -> cli.PlainParser:
         prog=cli.prog_of("implementations"),
         description="Measure whether MJX's JAX implementation or MuJoCo Warp simulates a task faster on this device. "
         "env.impl=auto goes by it from then on.",
-        usage="%(prog)s --task NAME [--num_envs N [N ...]] [options]",
+        usage="%(prog)s --task NAME [options]",
     )
     parser.add_argument("--task", metavar="NAME", required=True, help="a task of this library (main --list_tasks)")
     parser.add_argument(
@@ -60,7 +60,9 @@ def _parser() -> cli.PlainParser:
 def _task(given: str) -> str:
     name = cli.task_name(given)
     if ":" in name:
-        raise UserError(f"--task {name}: it is not simulated here and chooses its implementation itself; give our own")
+        raise UserError(
+            f"--task {name}: it is not simulated here and chooses its implementation itself; give a task of this library"
+        )
     return name
 
 
@@ -181,7 +183,7 @@ def _table(rows: Sequence[dict[str, Any]], impls: Sequence[str]) -> tuple[list[s
             both = not any(isinstance(f, str) for f in found)
             line.append(compact(found[1].median / found[0].median, 3) if both else "-")
         cells.append([*line, ", ".join("-" if isinstance(f, str) else duration(f.compiling) for f in found)])
-    return [*header, "compiled in"], cells
+    return [*header, "compiled in" + (" (JAX, Warp)" if len(impls) > 1 else "")], cells
 
 
 def _quiet() -> None:

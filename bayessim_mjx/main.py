@@ -32,7 +32,7 @@ COMMANDS = {  # all of them, and what each is for
     "gap_loop": "what a diagnosis is worth in return",
     "logs": "logs of MCAP, ROS bags, LeRobot and HDF5, for a diagnosis",
     "implementations": "whether MJX or MuJoCo Warp is faster here, for env.impl=auto",
-    "completion": "a script by which bash, zsh or fish completes commands and flags",
+    "completion": "a script by which bash, zsh or fish completes commands",
 }
 COMPLETION = (
     'Print a script of completions. bash: eval "$(bayessim-mjx completion bash)" in ~/.bashrc; '
