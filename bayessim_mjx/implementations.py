@@ -61,7 +61,7 @@ def _task(given: str) -> str:
     name = cli.task_name(given)
     if ":" in name:
         raise UserError(
-            f"--task {name}: it is not simulated here and chooses its implementation itself; give a task of this library"
+            f"--task {name}: it is not simulated here and chooses its implementation itself; give one of our tasks"
         )
     return name
 
@@ -134,12 +134,10 @@ def _rates(found: "Speed | str") -> str:
     """`4.8M (4.7M to 4.9M)`: median and range."""
     if isinstance(found, str):
         return found if found == NO_ROOM else "-"
-    low, high = _rate(min(found.rates)), _rate(max(found.rates))
-    return _rate(found.median) + (f" ({low} to {high})" if len(found.rates) > 1 else "")
+    from bayessim_mjx.physics.measured import rate
 
-
-def _rate(value: float) -> str:
-    return compact(value, 3 if value >= 1e4 else 4)
+    low, high = rate(min(found.rates)), rate(max(found.rates))
+    return rate(found.median) + (f" ({low} to {high})" if len(found.rates) > 1 else "")
 
 
 def _measure(

@@ -11,7 +11,6 @@ from bayessim_mjx.effects.effect import Effect, overrides
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.physics import measured
 from bayessim_mjx.physics.warp import INSIDE
-from bayessim_mjx.quantities import compact
 
 # (task, kind of device) -> fewest worlds at which Warp was measured to be faster (docs/devices.md has the figures)
 FASTER_FROM: Mapping[tuple[str, str], int] = {("Cartpole", "NVIDIA H200"): 16384, ("Ant", "NVIDIA H200"): 16384}
@@ -81,6 +80,6 @@ def _kept() -> tuple[measured.Measurement, ...]:
 
 
 def _rates(m: measured.Measurement) -> str:
-    told = [name if rate is None else f"{name} {compact(rate, 2)}" for name, rate in (("JAX", m.jax), ("Warp", m.warp))]
-    failed = [name for name, rate in zip(told, (m.jax, m.warp), strict=True) if rate is None]
-    return f"{failed[0]} did not run" if failed else f"{', '.join(told)} steps/s"
+    if m.jax is None or m.warp is None:
+        return f"{'JAX' if m.jax is None else 'Warp'} did not run"
+    return f"JAX {measured.rate(m.jax)}, Warp {measured.rate(m.warp)} steps/s"

@@ -9,6 +9,7 @@ from typing import Any
 
 from bayessim_mjx.config import cache
 from bayessim_mjx.errors import UserError
+from bayessim_mjx.quantities import compact
 from bayessim_mjx.versions import of
 
 FILE = "implementations.json"
@@ -41,6 +42,11 @@ class Measurement:
         return "warp" if (self.warp or 0.0) > (self.jax or 0.0) else "jax"
 
 
+def rate(value: float) -> str:
+    """Steps per second in few characters: `3848`, `655k`, `4.82M`."""
+    return compact(value, 3 if value >= 1e4 else 4)
+
+
 def path() -> Path | None:
     """Where measurements are kept; None: they are not."""
     folder = cache.folder()
@@ -67,7 +73,7 @@ def read(file: Path | None) -> tuple[Measurement, ...]:
 
 
 def _checked(m: Measurement) -> Measurement:
-    rates = [rate for rate in (m.jax, m.warp) if rate is not None]
+    rates = [r for r in (m.jax, m.warp) if r is not None]
     if not (isinstance(m.worlds, int) and m.worlds > 0 and all(math.isfinite(r) and r > 0 for r in rates)):
         raise ValueError(f"{m.task} with {m.worlds} worlds: {m.jax}, {m.warp}")
     return dataclasses.replace(m, versions=dict(m.versions))
