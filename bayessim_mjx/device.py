@@ -8,13 +8,13 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, TypeVar
 
+from bayessim_mjx.config import cache
 from bayessim_mjx.config.settings import Config
 from bayessim_mjx.errors import UserError
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 WORLDS = "worlds"  # the only axis of a mesh of devices
-CACHE_VARIABLE = "BAYESSIM_MJX_CACHE"
 PROCESSES = ("JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID")  # host:port, how many, which of them
 
 
@@ -99,8 +99,8 @@ def mesh_of(devices: Sequence[Any]) -> Any:
 
 def _cache(jax: Any, folder: str | None) -> None:
     """Compiled programs survive the process: a second start skips most of the compilation."""
-    chosen = folder or os.environ.get(CACHE_VARIABLE)
-    if chosen == "off":
+    chosen = folder or os.environ.get(cache.VARIABLE)
+    if chosen == cache.OFF:
         return
     path = Path(chosen or "~/.cache/bayessim_mjx/jax").expanduser()
     try:

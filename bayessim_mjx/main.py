@@ -31,7 +31,8 @@ COMMANDS = {  # all of them, and what each is for
     "blind": "which missing effects a diagnosis would find on your robot",
     "gap_loop": "what a diagnosis is worth in return",
     "logs": "logs of MCAP, ROS bags, LeRobot and HDF5, for a diagnosis",
-    "completion": "a script by which bash, zsh or fish completes commands and flags",
+    "implementations": "whether MJX or MuJoCo Warp is faster here, for env.impl=auto",
+    "completion": "a script by which bash, zsh or fish completes commands",
 }
 COMPLETION = (
     'Print a script of completions. bash: eval "$(bayessim-mjx completion bash)" in ~/.bashrc; '
@@ -78,7 +79,7 @@ class Watched:
 
 def _parser() -> cli.Parser:
     parser = cli.Parser("main", DESCRIPTION, resume=True)
-    others = "\n".join(f"{name.replace('_', '-'):12}{text}" for name, text in COMMANDS.items())
+    others = "\n".join(f"{name.replace('_', '-'):16}{text}" for name, text in COMMANDS.items())
     parser.add_argument_group(f"commands of {cli.SCRIPT}", others)
     return parser
 

@@ -19,17 +19,17 @@ from bayessim_mjx.cli import ancestors
 from bayessim_mjx.config import settings
 
 ROOT = Path(__file__).parents[1]
-COMMANDS = ("main", "train", "play", "calibrate", "diagnose", "blind", "gap_loop", "logs")
+COMMANDS = ("main", "train", "play", "calibrate", "diagnose", "blind", "gap_loop", "logs", "implementations")
 FORMATS = ("from-mcap", "from-rosbag", "from-lerobot", "from-hdf5")  # of `logs`, each with flags of its own
 FOLDERS = ("docs", "benchmarks")
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(p for f in FOLDERS for p in sorted((ROOT / f).rglob("*.md")))]
 PYTHON = {"env.reset", "env.step", "env.dt", "env.mj_model", "env.space", "ppo.train"}  # in Python, not settings
 COMMAND = re.compile(
     r"(?:python -m bayessim_mjx\.(\w+)"
-    r"|bayessim-mjx ((?:main|train|play|calibrate|diagnose|blind|gap-loop|logs)?)"
+    r"|bayessim-mjx ((?:main|train|play|calibrate|diagnose|blind|gap-loop|logs|implementations)?)"
     r"|python ((?:benchmarks|examples|docs)/[\w/]+\.py))([^`\n#&]*)"
 )
-PROSE = re.compile(r"`(main|train|play|calibrate|diagnose|blind|gap_loop) (--[^`\n]*)`")
+PROSE = re.compile(r"`(main|train|play|calibrate|diagnose|blind|gap_loop|implementations) (--[^`\n]*)`")
 
 CODE = re.compile(r"```python\n(.*?)```", re.DOTALL)
 API = re.compile(r"^::: .*$", re.MULTILINE)  # a name in Python, whose docstring the site shows

@@ -20,7 +20,7 @@ from bayessim_mjx.errors import UserError
 from bayessim_mjx.mirrors import Mirror, resolve
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 from bayessim_mjx.physics import Physics, World, control_step, mjx
-from bayessim_mjx.physics.implementation import choose
+from bayessim_mjx.physics.implementation import Choice, choose
 from bayessim_mjx.physics.nuisance import Course, Drawn
 from bayessim_mjx.physics.nuisance import read as read_nuisance
 
@@ -78,8 +78,8 @@ class Task(Env):
             self.spec = spec.copy  # type: ignore[method-assign]  # of the corrected model
         impl, worlds = self.settings["impl"], (config or {}).get("numEnvs")
         every = stack(section, effects)
-        if impl == "auto":
-            impl = choose(self.name, worlds, every)
+        self.chosen: Choice | None = choose(self.name, worlds, every) if impl == "auto" else None
+        impl = impl if self.chosen is None else self.chosen.impl
         self.physics = Physics(mj_model, self.control_dt, space, every, self.max_qvel, impl, worlds)
         self.joint_names = _names(mj_model, mujoco.mjtObj.mjOBJ_JOINT, mj_model.njnt)
         self.actuator_names = _names(mj_model, mujoco.mjtObj.mjOBJ_ACTUATOR, mj_model.nu)

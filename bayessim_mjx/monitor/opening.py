@@ -9,6 +9,8 @@ from bayessim_mjx.quantities import compact
 
 COMPILES = "the first start compiles its programs (about a minute on a CPU), later starts load them from the cache"
 
+NAMES = {"jax": "MJX's JAX implementation", "warp": "MuJoCo Warp"}
+
 
 def opening(config: Config, env: Any, device: Any, infers: bool = True) -> dict[str, Any]:
     """{what: value} for `Console.start`; `infers`: the outer loop, else PPO alone."""
@@ -21,7 +23,10 @@ def opening(config: Config, env: Any, device: Any, infers: bool = True) -> dict[
     lines["budget"] = _budget(config, infers)
     if infers and config.bayessim.modelClass is not None:
         lines["inference"] = _inference(config.bayessim)
-    lines |= {"device": str(device), "seed": config.seed, "note": COMPILES}
+    lines["device"] = str(device)
+    if (chosen := getattr(env, "chosen", None)) is not None:
+        lines["physics"] = f"{NAMES[chosen.impl]}, taken by env.impl=auto: {chosen.why}"
+    lines |= {"seed": config.seed, "note": COMPILES}
     return lines
 
 

@@ -124,10 +124,10 @@ def test_flags_are_read_before_jax_is_imported() -> None:
 
 
 def test_help_fits_into_80_columns(monkeypatch: Any, capsys: pytest.CaptureFixture) -> None:
-    from bayessim_mjx import calibrate, diagnose, gap_loop, import_logs
+    from bayessim_mjx import calibrate, diagnose, gap_loop, implementations, import_logs
 
     monkeypatch.setenv("COLUMNS", "80")
-    for command in (main, train, play, calibrate, diagnose, gap_loop, import_logs):
+    for command in (main, train, play, calibrate, diagnose, gap_loop, import_logs, implementations):
         assert command.main(["--help"]) == 0
         usage, *lines = capsys.readouterr().out.splitlines()
         assert usage.startswith(f"usage: python -m {command.__name__} ") and max(map(len, [usage, *lines])) <= 80

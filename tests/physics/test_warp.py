@@ -13,7 +13,6 @@ from bayessim_mjx.effects import make
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.parameters import ParameterSpace
 from bayessim_mjx.physics import Physics, control_step
-from bayessim_mjx.physics.implementation import choose
 from bayessim_mjx.physics.warp import wrenches
 
 INSTALLED = importlib.util.find_spec("warp") is not None
@@ -37,20 +36,10 @@ def test_effects_inside_the_timestep_are_refused():
         registry.make("Pendulum", impl="warp", effects=[make("coulomb_friction", where="all")])
 
 
-def test_auto_takes_warp_where_it_was_faster_and_can_simulate_what_acts(monkeypatch):
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: name == "warp")
-    friction, delay = make("coulomb_friction", where="all"), make("actuator_delay", where="all")
-    assert choose("Ant", 16384, [delay], "NVIDIA H200") == choose("Cartpole", 40000, [], "NVIDIA H200") == "warp"
-    assert choose("Ant", 16383, [], "NVIDIA H200") == choose("Ant", None, [], "NVIDIA H200") == "jax"
-    assert choose("Ant", 16384, [friction], "NVIDIA H200") == choose("Humanoid", 16384, [], "NVIDIA H200") == "jax"
-    assert choose("Ant", 16384, [], "cpu") == "jax"  # not measured
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    assert choose("Ant", 16384, [], "NVIDIA H200") == "jax"
-
-
 def test_auto_is_a_setting_of_every_task():
     env = registry.make("Pendulum", impl="auto")
-    assert env.settings["impl"] == "auto" and env.physics.warp is None
+    assert env.settings["impl"] == "auto" and env.physics.warp is None and env.chosen.impl == "jax"
+    assert registry.make("Pendulum").chosen is None
     assert config.load("Ant", overrides=["env.impl=auto"]).env.impl == "auto"
 
 
