@@ -133,11 +133,8 @@ def reduce(mixture: Mixture, components: int) -> Mixture:
     """
     mixture = prune(mixture)
     inside = np.zeros(len(mixture.means)) if mixture.prior else log_masses(mixture.means, mixture.scales)
-    weights, means, scales = (
-        np.exp(np.maximum(_top(mixture.log_weights + inside), -600.0)),
-        mixture.means,
-        mixture.scales,
-    )
+    worth, means, scales = mixture.log_weights + inside, mixture.means, mixture.scales
+    weights = np.exp(np.maximum(worth - worth.max(), -600.0))
     if (left := len(weights)) <= components:
         return mixture
     weights, means, scales, alive = weights.copy(), means.copy(), scales.copy(), np.ones(left, bool)
@@ -154,8 +151,7 @@ def reduce(mixture: Mixture, components: int) -> Mixture:
         others = np.flatnonzero(alive & (np.arange(left) != i))
         row = _costs(weights, means, scales, covs, log_dets, np.full(len(others), i), others)
         cost[i, others] = cost[others, i] = row
-    logs, means, scales = np.log(weights[alive]), means[alive], scales[alive]
-    logs = logs + float(np.max(mixture.log_weights + inside))
+    logs, means, scales = np.log(weights[alive]) + worth.max(), means[alive], scales[alive]
     logs = logs if mixture.prior else logs - log_masses(means, scales)
     return Mixture(mixture.flat, logs, means, scales, mixture.prior)
 
@@ -208,10 +204,6 @@ def log_mass_bound(means: np.ndarray, scales: np.ndarray) -> np.ndarray:
     """Each Gaussian's log mass beyond the nearest wall of the cube (log 1/2 for a mean inside), [K]: a cheap bound."""
     sd = np.maximum(np.sqrt(np.sum(scales**2, axis=-1)), THINNEST)
     return np.min(log_ndtr(np.minimum(np.minimum(means, 1 - means) / sd, 0)), axis=1, initial=0.0)
-
-
-def _top(logs: np.ndarray) -> np.ndarray:
-    return logs - logs.max()
 
 
 def _rescaled(mixture: Mixture) -> Mixture:

@@ -132,13 +132,13 @@ def as_deep(state: FitState, data: Data, members: mdn.Heads) -> FitState:
     most, settings, share, keep = coverage_factor.MOST, state.settings, state.params["share"], state.identified
     centre, sd = (np.float32(v) for v in charts.SCORE[settings.chart])
     own = parts_of(jax.tree.map(lambda leaf: leaf[:, :most], members), state.params)
-    known = identify.beside_prior(*joined(mdn.converted(own, settings), share), keep, settings.chart)
+    logits, means, scales = joined(mdn.converted(own, settings), share)
+    means, scales = identify.beside_prior(means, scales, keep, settings.chart)
 
     def at(factor: Array) -> mdn.Heads:
         if mdn.bounded(settings):
-            found = joined(mdn.converted(mdn.sharper(own, factor), settings), share)
-            return identify.beside_prior(*found, keep, settings.chart)
-        logits, means, scales = known
+            weights, centres, widths = joined(mdn.converted(mdn.sharper(own, factor), settings), share)
+            return weights, *identify.beside_prior(centres, widths, keep, settings.chart)
         return logits, means, scales / jnp.where(keep, factor, 1.0)[None, None, :, None]
 
     mask, truth = data.mask[:most], data.y[data.held[:most]] * sd + centre

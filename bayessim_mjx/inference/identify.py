@@ -56,20 +56,21 @@ def restore_prior(posterior: Distribution, keep: Array) -> Distribution:
     if q.chart == "plain":  # the others are cut off at their ranges, which moves what is correlated with them
         cut = jax.vmap(_beside_cut, in_axes=(0, 0, None))(means, scales, keep)
         means, scales = (jnp.where(jnp.all(keep), *pair) for pair in zip((means, scales), cut, strict=True))
-    logits, means, scales = beside_prior(jax.nn.log_softmax(q.logits), means, scales, keep, q.chart)
+    means, scales = beside_prior(means, scales, keep, q.chart)
+    logits = jax.nn.log_softmax(q.logits)
     if q.chart == "plain":  # each component keeps its mass inside the cube
         logits = logits + box.log_masses(q.means, q.scales) - box.log_masses(means, scales)
     return Distribution.from_unit(q.space, logits, means, scales, q.prior_weight, q.chart)
 
 
-def beside_prior(logits: Array, means: Array, scales: Array, keep: Array, chart: str) -> tuple[Array, Array, Array]:
-    """Mixtures [..., K] in a chart: the parameters to keep [d] as they are, Gaussians as the prior for the others."""
+def beside_prior(means: Array, scales: Array, keep: Array, chart: str) -> tuple[Array, Array]:
+    """Gaussians [..., d] in a chart as they are in the parameters to keep [d], and as the prior in the others."""
     centre, sd = charts.NEUTRAL[chart]
     # a factor of (S S^T on the kept rows) + sd^2 on the others; forming S S^T would lose thin components
     own = jnp.broadcast_to(keep, means.shape)
     kept = jnp.where(own[..., None], scales, 0.0)
     flat = jnp.broadcast_to(jnp.diag(jnp.where(keep, 0.0, sd)), kept.shape)
-    return logits, jnp.where(own, means, centre), lower_factor(jnp.concatenate([kept, flat], axis=-1))
+    return jnp.where(own, means, centre), lower_factor(jnp.concatenate([kept, flat], axis=-1))
 
 
 def _beside_cut(mean: Array, scale: Array, keep: Array) -> tuple[Array, Array]:
