@@ -17,7 +17,10 @@ from bayessim_mjx.distributions.box import lattice
 
 NEGLIGIBLE = 1e-8  # relative mass below which a component is dropped
 FAINT = 1e-12  # the same of a factor: where all others contradict, a faint component may decide
-MASS_POINTS = 64  # behind the mass of a component in the cube, by which some are dropped and pairs merged
+MASS_POINTS, FEW_POINTS = (
+    64,
+    16,
+)  # behind the mass of a component in the cube: where pairs are merged, where some are dropped
 CROWD = 96  # components kept before merging (bounds the pairwise work)
 # standard deviations in coordinates of the chart: what is broader is flat over the unit cube to 1e-8, what is thinner
 # a point in float32; a network may put out both in one component
@@ -168,7 +171,7 @@ def prune(mixture: Mixture, negligible: float = NEGLIGIBLE) -> Mixture:
 
 
 def _masses_worth(mixture: Mixture, negligible: float) -> np.ndarray:
-    """Log mass of each component inside the cube [K]; -inf where it is less than `negligible` of the largest.
+    """Log mass of each component inside the cube [K]; -inf where it is `negligible` of the largest, or crowded out.
 
     By the bound alone where all means are inside. Far outside it may be hundreds of nats too high, and a component that
     hardly has any mass would stand in the place of all others.
@@ -180,15 +183,18 @@ def _masses_worth(mixture: Mixture, negligible: float) -> np.ndarray:
     order, found = np.argsort(np.where(np.isnan(most), -np.inf, most))[::-1], np.full(len(most), -np.inf)
     for start in range(0, len(order), CROWD):
         some = order[start : start + CROWD]
-        if most[some[0]] < max(found.max(), mixture.flat) + negligible:
+        least = max(found.max(), mixture.flat) + negligible
+        if start >= CROWD:  # no more than so many are kept
+            least = max(least, np.partition(found, -CROWD)[-CROWD])
+        if most[some[0]] < least:
             break
-        found[some] = weights[some] + log_masses(means[some], scales[some])
+        found[some] = weights[some] + log_masses(means[some], scales[some], FEW_POINTS)
     return found
 
 
-def log_masses(means: np.ndarray, scales: np.ndarray) -> np.ndarray:
+def log_masses(means: np.ndarray, scales: np.ndarray, points: int = MASS_POINTS) -> np.ndarray:
     """Log mass of each Gaussian inside the cube [K], by the separation of variables (see `box`), in float64."""
-    (k, d), w = means.shape, lattice(MASS_POINTS, means.shape[1]).astype(np.float64)
+    (k, d), w = means.shape, lattice(points, means.shape[1]).astype(np.float64)
     z, logs = np.zeros((k, len(w), d)), np.zeros((k, len(w)))
     for i in range(d):
         here, width = means[:, i, None] + np.einsum("kni,ki->kn", z[..., :i], scales[:, i, :i]), scales[:, i, i]
