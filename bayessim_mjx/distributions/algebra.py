@@ -11,9 +11,9 @@ So everything stays positive definite, and twice as many digits are kept.
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import log_ndtr, ndtri_exp
+from scipy.special import log_ndtr
 
-from bayessim_mjx.distributions.box import lattice
+from bayessim_mjx.distributions.box import separated
 
 NEGLIGIBLE = 1e-8  # relative mass below which a component is dropped
 FAINT = 1e-12  # the same of a factor: where all others contradict, a faint component may decide
@@ -194,16 +194,8 @@ def _masses_worth(mixture: Mixture, negligible: float) -> np.ndarray:
 
 def log_masses(means: np.ndarray, scales: np.ndarray, points: int = MASS_POINTS) -> np.ndarray:
     """Log mass of each Gaussian inside the cube [K], by the separation of variables (see `box`), in float64."""
-    (k, d), w = means.shape, lattice(points, means.shape[1]).astype(np.float64)
-    z, logs = np.zeros((k, len(w), d)), np.zeros((k, len(w)))
-    for i in range(d):
-        here, width = means[:, i, None] + np.einsum("kni,ki->kn", z[..., :i], scales[:, i, :i]), scales[:, i, i]
-        low, high = -here / width[:, None], (1 - here) / width[:, None]
-        flip = low + high > 0  # to the side where logarithms tell Phi from 1
-        low, high = log_ndtr(np.where(flip, -high, low)), log_ndtr(np.where(flip, -low, high))
-        logs += high + np.log(np.maximum(-np.expm1(low - high), 1e-300))
-        z[..., i] = ndtri_exp(np.logaddexp(low + np.log1p(-w[:, i]), high + np.log(w[:, i]))) * np.where(flip, -1, 1)
-    return np.asarray(np.logaddexp.reduce(logs, axis=1) - np.log(len(w)))
+    logs = separated(means, scales, points)[1]
+    return np.asarray(np.logaddexp.reduce(logs, axis=1) - np.log(points))
 
 
 def log_mass_bound(means: np.ndarray, scales: np.ndarray) -> np.ndarray:

@@ -100,16 +100,27 @@ def within(mean: np.ndarray, scale: np.ndarray, points: int = 4096) -> tuple[np.
 
     In float64 on the host, where no program is compiled for every d.
     """
-    d = len(mean)
-    w, z, log_weight = lattice(points, d).astype(np.float64), np.zeros((points, d)), np.zeros(points)
+    z, logs = separated(mean[None], scale[None], points)
+    weights = np.exp(logs[0] - logs.max())
+    return np.clip(mean + z[0] @ scale.T, 0.0, 1.0), weights / weights.sum()
+
+
+def separated(means: np.ndarray, scales: np.ndarray, points: int) -> tuple[np.ndarray, np.ndarray]:
+    """Standard normals [K, n, d] whose points `separate` keeps in the cube, on a lattice, and log weights [K, n].
+
+    In float64 on the host. Means [K, d], scales [K, d, d]; also far outside.
+    """
+    (k, d), w = means.shape, lattice(points, means.shape[1]).astype(np.float64)
+    z, logs = np.zeros((k, points, d)), np.zeros((k, points))
     for i in range(d):
-        centre = mean[i] + z @ scale[i]
-        low, high = (special.ndtr((wall - centre) / scale[i, i]) for wall in (0.0, 1.0))
-        mass = np.maximum(high - low, 1e-300)
-        log_weight += np.log(mass)
-        z[:, i] = special.ndtri(np.clip(low + w[:, i] * mass, 1e-300, 1 - 1e-16))
-    weights = np.exp(log_weight - log_weight.max())
-    return np.clip(mean + z @ scale.T, 0.0, 1.0), weights / weights.sum()
+        here, width = means[:, i, None] + np.einsum("kni,ki->kn", z[..., :i], scales[:, i, :i]), scales[:, i, i]
+        low, high = -here / width[:, None], (1 - here) / width[:, None]
+        flip = low + high > 0  # to the side where logarithms tell Phi from 1
+        low, high = (special.log_ndtr(np.where(flip, -x, y)) for x, y in ((high, low), (low, high)))
+        logs += high + np.log(np.maximum(-np.expm1(low - high), 1e-300))
+        new = special.ndtri_exp(np.logaddexp(low + np.log1p(-w[:, i]), high + np.log(w[:, i])))
+        z[..., i] = np.where(flip, -new, new)
+    return z, logs
 
 
 def log_masses(means: Array, scales: Array, points: int = MASS_POINTS) -> Array:
