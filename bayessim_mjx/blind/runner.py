@@ -53,10 +53,12 @@ def run(check: Check, limits: Limits, say: Say, between: Between = lambda outcom
         for indices in rounds(limits.cases):
             if not crew.until(range(known(indices))):
                 break
-            before = trials(outcomes(check, range(known(indices)), own))
-            crew.begin(i for i in plan(indices, groups, unknown, before, check.seed) if i.index not in done)
-            if done and before:
-                between(outcomes(check, range(indices.start), own))
+            so_far = outcomes(check, range(indices.start), own)
+            before = trials([o for o in so_far if o.truth["index"] < known(indices)])
+            todo = [i for i in plan(indices, groups, unknown, before, check.seed) if i.index not in done]
+            crew.begin(todo)
+            if todo and before:
+                between(so_far)
         crew.until(range(limits.cases))
     finally:
         crew.stop()
