@@ -26,16 +26,6 @@ def _share(text: str) -> float:
     return value
 
 
-def _minutes(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
-    if not 0 < value < 1e5:
-        raise argparse.ArgumentTypeError(f"{text!r}: allowed: minutes, more than 0")
-    return value
-
-
 def _parser() -> cli.PlainParser:
     parser = cli.PlainParser(
         prog=cli.prog_of("blind").replace("bayessim_mjx.blind", "bayessim_mjx.blind_check"),
@@ -59,7 +49,10 @@ def _parser() -> cli.PlainParser:
         "--cases", metavar="N", type=cli.whole(1, MOST), default=CASES, help=f"cases in all (default: {CASES})"
     )
     parser.add_argument(
-        "--minutes", metavar="M", type=_minutes, help="begin no further case after this time; the next start goes on"
+        "--minutes",
+        metavar="M",
+        type=cli.positive("minutes"),
+        help="begin no further case after this time; the next start goes on",
     )
     parser.add_argument(
         "--accuracy", metavar="SHARE", type=_share, default=0.05,

@@ -102,7 +102,7 @@ def _cache(jax: Any, folder: str | None) -> None:
     chosen = folder or os.environ.get(cache.VARIABLE)
     if chosen == cache.OFF:
         return
-    path = Path(chosen or "~/.cache/bayessim_mjx/jax").expanduser()
+    path = Path(chosen or f"{cache.DEFAULT}/jax").expanduser()
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:

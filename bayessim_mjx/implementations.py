@@ -24,16 +24,6 @@ NO_ROOM = "out of memory"
 ACTUAL = (UserError, NotImplementedError)  # how a model is refused, by us or by MJX
 
 
-def _seconds(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
-    if not 0 < value < 1e5:
-        raise argparse.ArgumentTypeError(f"{text!r}: allowed: seconds, more than 0")
-    return value
-
-
 def _parser() -> cli.PlainParser:
     parser = cli.PlainParser(
         prog=cli.prog_of("implementations"),
@@ -47,7 +37,7 @@ def _parser() -> cli.PlainParser:
         help="numbers of worlds to measure with (default: the task's own)",
     )  # fmt: skip
     parser.add_argument(
-        "--seconds", metavar="S", type=_seconds, default=SECONDS,
+        "--seconds", metavar="S", type=cli.positive("seconds"), default=SECONDS,
         help=f"for all rollouts together, without compiling (default: {SECONDS:.0f})",
     )  # fmt: skip
     parser.add_argument("--forget", action="store_true", help="remove what was measured for the task, and stop")

@@ -28,6 +28,21 @@ def whole(low: int, high: int) -> Callable[[str], int]:
     return number
 
 
+def positive(unit: str) -> Callable[[str], float]:
+    """The type of a flag that takes a number of `unit` (a plural), more than 0 and below 1e5."""
+
+    def number(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = 0.0
+        if not 0 < value < 1e5:
+            raise argparse.ArgumentTypeError(f"{text!r}: allowed: {unit}, more than 0")
+        return value
+
+    return number
+
+
 integer = whole(-(10**25), 10**25)  # where the settings know the limits
 
 

@@ -5,9 +5,10 @@ from pathlib import Path
 
 VARIABLE = "BAYESSIM_MJX_CACHE"
 OFF = "off"
+DEFAULT = "~/.cache/bayessim_mjx"
 
 
 def folder() -> Path | None:
     """$BAYESSIM_MJX_CACHE, or ~/.cache/bayessim_mjx; None where the variable says off."""
     chosen = os.environ.get(VARIABLE)
-    return None if chosen == OFF else Path(chosen or "~/.cache/bayessim_mjx").expanduser()
+    return None if chosen == OFF else Path(chosen or DEFAULT).expanduser()
