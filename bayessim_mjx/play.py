@@ -69,15 +69,19 @@ def _settings(args: argparse.Namespace) -> tuple[Config, Path, Any]:
     return cli.config_of(args), path, run
 
 
-def _physics(config: Config, env: Any, checkpoint: Path, key: Any, count: int) -> dict[str, Any]:
-    """theta [count, d] of every kind of physics that there is."""
+def _nominal(env: Any, count: int) -> Any:
     import jax.numpy as jnp
 
+    return jnp.tile(jnp.asarray(env.space.nominal, jnp.float32), (count, 1))
+
+
+def _physics(config: Config, env: Any, checkpoint: Path, key: Any, count: int) -> dict[str, Any]:
+    """theta [count, d] of every kind of physics that there is."""
     from bayessim_mjx.distributions import Distribution
     from bayessim_mjx.loop.posterior import restored
     from bayessim_mjx.loop.sources import make_source
 
-    kinds = {"nominal": jnp.tile(jnp.asarray(env.space.nominal, jnp.float32), (count, 1))}
+    kinds = {"nominal": _nominal(env, count)}
     if not len(env.space):
         return kinds
     prior = Distribution.prior(env.space, config.bayessim.components)
@@ -147,17 +151,27 @@ def _play(argv: Sequence[str] | None) -> int:
         return _show(args, config, path, run, count, console)
 
 
+def _randomized(config: Config, randomize: bool) -> Config:
+    return dataclasses.replace(config, randomization=freeze({**config.randomization, "randomize": randomize}))
+
+
+def _acted_in(config: Config) -> Any:
+    """The environment as its policy sees it."""
+    from bayessim_mjx import registry
+
+    return cli.privileged(replace(config, ppo={"teacher": None}), registry.make(config.task, config=config))[0]
+
+
 def _show(args: argparse.Namespace, config: Config, path: Path, run: Any, count: int, console: Any) -> int:
     """The table of returns, and the video."""
     setup_jax(config)
     import jax
 
-    from bayessim_mjx import registry, rl
+    from bayessim_mjx import rl
 
     # also a policy trained on nominal physics can be tried on the prior and on the surrogate real
-    config = dataclasses.replace(config, randomization=freeze({**config.randomization, "randomize": True}))
-    env = registry.make(config.task, config=config)
-    env, _ = cli.privileged(replace(config, ppo={"teacher": None}), env)
+    trained, config = config, _randomized(config, True)
+    env = _acted_in(config)
     policy, key = cli.load_policy(path, env, config), jax.random.PRNGKey(config.seed)
     if args.export is not None:
         console.say(_export(env, policy, path, run, args.export))
@@ -169,7 +183,11 @@ def _show(args: argparse.Namespace, config: Config, path: Path, run: Any, count:
     chosen, rows = {args.physics: kinds[args.physics]} if args.physics else kinds, []
     returns = {}
     for name, thetas in chosen.items():
-        result = rl.evaluate(env, policy, jax.random.fold_in(key, 1), thetas)
+        own = env
+        if name == "nominal" and trained.randomization.get("randomize") is False and getattr(env, "nuisance", None):
+            own = _acted_in(_randomized(config, False))  # without the noise that comes with randomisation
+            thetas = _nominal(own, count)
+        result = rl.evaluate(own, policy, jax.random.fold_in(key, 1), thetas)
         r, length = result["return"], result["length"]
         returns[name] = r
         rows.append([name, estimate(r.mean(), r.std()), *map(compact, (r.min(), r.max(), length.mean()))])

@@ -23,6 +23,7 @@ PROPOSALS = ("prior", "apt", "truncated", "division")
 UNCORRECTED = (("apt", "truncated"), ("apt", "logit"), ("division", "logit"))  # (proposal, coordinates)
 MEMORIES = {"gru": 1, "lstm": 2}  # recurrent layers, and how many numbers each unit remembers
 IMPLEMENTATIONS = ("jax", "warp", "auto")  # of MJX
+PRECISIONS = ("float32", "bfloat16")
 WRITERS = ("jsonl", "csv", "wandb")  # beside TensorBoard
 AGENTS = ("own", "sb3", "rsl_rl", "skrl")  # own: bayessim_mjx.rl
 ACTIVATIONS = (
@@ -213,6 +214,7 @@ class EnvConfig(Section):
     impl: str = setting(
         "jax", "what computes the physics: jax, warp (needs warp-lang), or auto", choices=IMPLEMENTATIONS
     )
+    unroll: bool = setting(False, "a control step's timesteps in a row in place of a loop: faster, compiles for longer")
     options: Frozen = field(default_factory=Frozen, metadata={"doc": "settings of this task alone"})
 
     def to_dict(self) -> dict[str, Any]:
@@ -229,7 +231,7 @@ class EnvConfig(Section):
         return default if value is None else value
 
     def keys(self) -> list[str]:
-        return ["numEnvs", "episodeLength", "realParams", "impl", *self.options]
+        return ["numEnvs", "episodeLength", "realParams", "impl", "unroll", *self.options]
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.keys())
@@ -444,6 +446,10 @@ class PPOConfig(Section):
     hidden_actor: tuple[int, ...] = setting((64, 64), "widths of the actor", low=1, high=WIDTH)
     hidden_critic: tuple[int, ...] = setting((64, 64), "widths of the critic", low=1, high=WIDTH)
     activation: str = setting("elu", "activation of both networks", choices=ACTIVATIONS)
+    precision: str = setting(
+        "float32", "numbers between the layers of both networks: float32 or bfloat16 (weights stay float32)",
+        choices=PRECISIONS,
+    )  # fmt: skip
     init_std: float = setting(1.0, "initial standard deviation of actions", above=0)
     std_type: str = setting(
         "log", "what is learnt: the logarithm of the standard deviation or itself", choices=("log", "scalar")

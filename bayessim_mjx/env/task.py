@@ -80,7 +80,9 @@ class Task(Env):
         every = stack(section, effects)
         self.chosen: Choice | None = choose(self.name, worlds, every) if impl == "auto" else None
         impl = impl if self.chosen is None else self.chosen.impl
-        self.physics = Physics(mj_model, self.control_dt, space, every, self.max_qvel, impl, worlds)
+        self.physics = Physics(
+            mj_model, self.control_dt, space, every, self.max_qvel, impl, worlds, self.settings["unroll"]
+        )
         self.joint_names = _names(mj_model, mujoco.mjtObj.mjOBJ_JOINT, mj_model.njnt)
         self.actuator_names = _names(mj_model, mujoco.mjtObj.mjOBJ_ACTUATOR, mj_model.nu)
         self.nuisance = read_nuisance(section, self.physics.space)
@@ -92,6 +94,7 @@ class Task(Env):
             "episodeLength": self.default_episode_length,
             "variant": VARIANTS[0],
             "impl": IMPLEMENTATIONS[0],
+            "unroll": False,
             **self.options,
         }
         ignored = {"numEnvs", "realParams", "options"}

@@ -64,6 +64,7 @@ class Physics:
             with the unclipped one). None: no clipping.
         impl: what computes a timestep: MJX's stages in "jax", or all of it in "warp"; see `warp.Warp`.
         worlds: how many are simulated together, for "warp".
+        unroll: a control step's timesteps stand in a row in the program, in place of a loop.
 
     Raises:
         ValueError: if control_dt is no multiple of the timestep, the integrator is unknown to MJX, or an effect's
@@ -79,6 +80,7 @@ class Physics:
         max_qvel: float | Sequence[float] | None = None,
         impl: str = "jax",
         worlds: int | None = None,
+        unroll: bool = False,
     ) -> None:
         self.mj_model = mj_model
         self.effects = tuple(effects)
@@ -87,6 +89,7 @@ class Physics:
         self.space = ParameterSpace(p for block in self.blocks for p in block.parameters)
         self._slices = tuple(slice(own[0].start, own[-1].stop) for own in map(self.blocks_of, self.effects))
         self.substeps = _substeps(control_dt, mj_model.opt.timestep)
+        self.unroll = unroll
         self.dt = float(self.substeps * mj_model.opt.timestep)
         if int(mj_model.opt.integrator) not in (EULER, RK4, IMPLICITFAST):
             raise UserError(f"integrator {mj_model.opt.integrator}: MJX has Euler, RK4 and implicitfast")

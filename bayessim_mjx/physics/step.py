@@ -55,7 +55,11 @@ def _control_step(physics: Physics, world: World, command: jax.Array, drive: Dri
         return substep(physics, model, data.replace(ctrl=ctrl), remembered, thetas, world.measurement, drive), None
 
     start = (physics.data_of(world, None if warp is None else warp.data), (memory, world.forces))
-    end, _ = body(start, commands[0]) if physics.substeps == 1 else jax.lax.scan(body, start, commands)
+    end, _ = (
+        body(start, commands[0])
+        if physics.substeps == 1
+        else jax.lax.scan(body, start, commands, unroll=physics.unroll)
+    )
     data, (final, forces) = end
     remembered, measurement = physics.sense(thetas, final, {"qpos": data.qpos, "qvel": data.qvel}, drive.active)
     world = world.replace(

@@ -58,6 +58,7 @@ class Form:
     activation: str = "elu"
     std_range: tuple[float, ...] = ()
     beta: bool = False
+    half: bool = False
 
     def __call__(self, x: jax.Array) -> jax.Array:
         return activation(self.activation)(x)
@@ -65,7 +66,7 @@ class Form:
 
 def form(config: PPOConfig) -> Form:
     """That of the networks that the settings ask for."""
-    return Form(config.activation, config.std_range, config.distribution == "beta")
+    return Form(config.activation, config.std_range, config.distribution == "beta", config.precision == "bfloat16")
 
 
 def mlp_init(key: jax.Array, sizes: Sequence[int], last_gain: float, kind: str = "orthogonal") -> list[Params]:
@@ -86,10 +87,16 @@ def mlp_init(key: jax.Array, sizes: Sequence[int], last_gain: float, kind: str =
 
 
 def mlp(layers: list[Params], x: jax.Array, act: Callable[[jax.Array], jax.Array]) -> jax.Array:
-    """The perceptron at x [..., in] -> [..., out]; the last layer is linear."""
+    """The perceptron at x [..., in] -> [..., out]; the last layer is linear.
+
+    Of a `Form` of half precision, what a layer is given and what hidden ones give is bfloat16; the result is float32.
+    """
+    kind = jnp.bfloat16 if getattr(act, "half", False) else x.dtype
+    x = x.astype(kind)
     for layer in layers[:-1]:
-        x = act(x @ layer["w"] + layer["b"])
-    return x @ layers[-1]["w"] + layers[-1]["b"]
+        x = act(x @ layer["w"].astype(kind) + layer["b"].astype(kind))
+    last = layers[-1]
+    return jnp.matmul(x, last["w"].astype(kind), preferred_element_type=last["w"].dtype) + last["b"]
 
 
 @dataclass(frozen=True)
@@ -207,6 +214,7 @@ class Policy:
     squash: bool = struct.field(pytree_node=False, default=False)
     std_range: tuple[float, ...] = struct.field(pytree_node=False, default=())
     beta: bool = struct.field(pytree_node=False, default=False)
+    half: bool = struct.field(pytree_node=False, default=False)
 
     @property
     def law(self) -> actions.Law:
@@ -227,7 +235,7 @@ class Policy:
 
         Of a Beta both concentrations.
         """
-        return distribution(self.actor, self._seen(obs), Form(self.activation, self.std_range, self.beta))
+        return distribution(self.actor, self._seen(obs), Form(self.activation, self.std_range, self.beta, self.half))
 
     def carried(self, obs: Mapping[str, jax.Array] | jax.Array, action: jax.Array) -> jax.Array:
         """The action for the environment: with the memory after `obs` behind it, where there is one."""

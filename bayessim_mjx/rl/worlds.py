@@ -114,4 +114,5 @@ def gather(
     noise = sharding.pinned(law.noise(noise_key, *shape), mesh, SECOND)
     pool = reset(env, pool_key, domain, config.num_envs, mesh, clock(env, state.env_states))
     run = sharding.local(run, mesh, (EVERYWHERE, SECOND, FIRST, FIRST), (FIRST, SECOND))
-    return run(policy_of(state), noise, state.env_states, pool)
+    half = config.precision == "bfloat16"  # as the losses see it, or ratios would begin beside 1
+    return run(dataclasses.replace(policy_of(state), half=half), noise, state.env_states, pool)

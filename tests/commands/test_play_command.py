@@ -6,9 +6,10 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
-from toy_runs import SMALL, error_of
+from toy_runs import SMALL, TOY, Toy, error_of
 
 from bayessim_mjx import config, play, registry, train
+from bayessim_mjx.env import State
 from bayessim_mjx.runs import checkpoints, latest_run
 
 
@@ -66,6 +67,38 @@ def test_play_prints_returns_of_latest_best_run_and_path(toy: None, capsys: pyte
     )
     both = ("--checkpoint", str(run.path), "--hub", "other", "--export")
     assert "--hub and --export: give one of them" in error_of(capsys, play.main, *both)
+
+
+class Noisy(Toy):
+    """The toy as randomisation leaves it: with noise, for which a step costs a thousand here."""
+
+    nuisance = "noise"
+
+    def reset(self, key: jax.Array, theta: jax.Array | None = None, course: Any = None) -> State:
+        return super().reset(key, theta)
+
+    def _state(self, x: jax.Array, mass: jax.Array, steps: jax.Array, reward: jax.Array) -> State:
+        return super()._state(x, mass, steps, reward - 1000.0 * (steps > 0))
+
+
+@pytest.mark.slow
+@pytest.mark.ci
+def test_nominal_physics_is_without_noise_where_the_policy_was_trained_so(
+    toy: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    assert train.main(["--task", "Pendulum", *SMALL, "--max_iterations=0", "task.randomize=False"]) == 0
+    noisy = Noisy()
+
+    def make(name: str, config: config.Config, **_: Any) -> Toy:
+        return TOY if config.randomization.get("randomize") is False else noisy
+
+    monkeypatch.setattr(registry, "make", make)
+    for more, without in (([], True), (["task.randomize=True"], False)):
+        capsys.readouterr()
+        assert play.main(["--task", "Pendulum", "--checkpoint", "latest", "--episodes", "3", *more]) == 0
+        told = [line.split() for line in capsys.readouterr().out.splitlines() if line]
+        rows = {words[0]: words[1] for words in told if words[0] in ("nominal", "prior")}
+        assert float(rows["prior"]) < -7000 and (float(rows["nominal"]) > -1000) is without
 
 
 @pytest.mark.parametrize("where", ["--logdir=elsewhere", "logdir=elsewhere"])

@@ -10,6 +10,7 @@ from bayessim_mjx.effects import make
 from bayessim_mjx.effects.support.motion import Motion
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 from bayessim_mjx.physics import Physics, begin, control_step, mjx
+from bayessim_mjx.registry import make as env_make
 
 BALL = '<body pos="1 0 .12"><freejoint/><geom type="sphere" size=".1" mass="1"/></body>'
 XML = """
@@ -42,6 +43,24 @@ def model_of(integrator="Euler", contact=False):
 def physics(integrator="Euler", space=None, contact=False, **kwargs):
     model = model_of(integrator, contact)
     return Physics(model, 0.02, ParameterSpace() if space is None else space, **kwargs)
+
+
+def test_timesteps_in_a_row_are_those_of_a_loop():
+    """The same motion to rounding, and no loop over timesteps in the program."""
+    loop, row = (
+        physics(effects=[make("viscous_friction", where="hinge")]),
+        physics(effects=[make("viscous_friction", where="hinge")], unroll=True),
+    )
+    ends, loops = [], []
+    for p in (loop, row):
+        step = lambda w, p=p: control_step(p, w, jnp.array([0.4]))[0]  # noqa: E731
+        world = p.world(jnp.array([0.02]))
+        loops.append(str(jax.make_jaxpr(step)(world)).count("length=4"))
+        ends.append(jax.lax.fori_loop(0, 20, lambda _, w, step=step: step(w), world))
+    assert loops == [1, 0]
+    np.testing.assert_allclose(ends[0].qpos, ends[1].qpos, rtol=1e-5)
+    assert abs(float(ends[0].qpos[0])) > 0.1
+    assert env_make("Pendulum", unroll=True).physics.unroll and not env_make("Pendulum").physics.unroll
 
 
 @pytest.mark.slow

@@ -51,6 +51,21 @@ def test_seeds_reproduce_bit_for_bit_and_differ_from_each_other():
     assert any((x != y).any() for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(c), strict=True))
 
 
+def test_in_half_precision_the_policy_that_acts_is_the_one_that_learns():
+    """Else ratios of probabilities would not begin at 1, nor its KL at 0; with the same statistics, one minibatch."""
+    config = dataclasses.replace(
+        CONFIG, precision="bfloat16", num_epochs=1, num_minibatches=1, normalize_observations=False, schedule="fixed"
+    )
+    state = rl.init(WALK, config, key(0))
+    moved = state.replace(params=jax.tree.map(lambda x: x + 0.3 * jax.random.normal(key(1), x.shape), state.params))
+    after, metrics = rl.run(WALK, config, moved, iterations=1)
+    assert abs(metrics["Loss/kl"]) < 1e-6 and metrics["Loss/clip_fraction"] == 0
+    assert {x.dtype for x in jax.tree.leaves(after.params)} == {jnp.dtype("float32")}
+    whole = dataclasses.replace(config, precision="float32")
+    _, others = rl.run(WALK, whole, dataclasses.replace(moved, config=whole), iterations=1)
+    assert 1e-6 < abs(others["Loss/value"] / metrics["Loss/value"] - 1) < 0.02
+
+
 def test_training_in_two_halves_is_training_at_once():
     """The state goes through numpy in between, as through a checkpoint."""
     start = rl.init(WALK, CONFIG, key(0))

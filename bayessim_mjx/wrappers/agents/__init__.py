@@ -26,7 +26,7 @@ OURS: dict[str, tuple[Any, ...]] = {
     "distribution": ("gaussian",), "std_type": ("log",), "std_range": ((), []),
     "state_dependent_std": (False,), "teacher": (None,), "extensions": ((), []), "action_bound": ("clip",),
     "action_clip": (1.0,), "symmetry": (None,), "rnd": (None,),
-    "weight_init": ("orthogonal",), "normalize_advantage_per_minibatch": (False,),
+    "precision": ("float32",), "weight_init": ("orthogonal",), "normalize_advantage_per_minibatch": (False,),
 }  # fmt: skip
 
 
