@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import jax
 import jax.numpy as jnp
 
-from bayessim_mjx.effects.effect import Effect, Quantity
+from bayessim_mjx.effects.effect import Effect, Measurement, Quantity
 from bayessim_mjx.effects.support import transmission
 from bayessim_mjx.effects.support.site import Site
 from bayessim_mjx.effects.support.substep import SubStep
@@ -65,6 +65,9 @@ class Backlash(Effect):
         passed = solve(jnp.where(solve(side).torque * side > 0, side, 0.0))
         twist = jnp.where(fresh, gap * jnp.sign(passed.torque), both.twist)
         return transmission.finish(at, step, both, passed, twist)
+
+    def on_record(self, at: Site, memory: Any, before: Measurement, after: Measurement, theta: jax.Array) -> Any:
+        return transmission.recorded(at, memory, before, after, self._on(at, theta))
 
     def transmits(self, at: Site, theta: jax.Array) -> jax.Array:
         return at.scatter(jnp.where(self._on(at, theta), 1.0, 0.0)) > 0

@@ -142,6 +142,13 @@ class Effect(abc.ABC):
         """
         return memory, motion
 
+    def on_record(self, at: Site, memory: Any, before: "Measurement", after: "Measurement", theta: jax.Array) -> Any:
+        """The memory where a recorded state, `after`, takes the place of the simulated one, `before`, at the same time.
+
+        Only called along the recorded past of what `follows` the motion.
+        """
+        return memory
+
     def on_command(self, at: Site, memory: Any, command: jax.Array, theta: jax.Array) -> tuple[Any, jax.Array]:
         """Change the command of one control step, `[substeps, nu]`: one row per sub-step."""
         return memory, command

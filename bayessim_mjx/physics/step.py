@@ -159,7 +159,7 @@ class Past(NamedTuple):
 
         def along() -> World:
             before = early(self.physics.mj_model) * world.warmstart
-            return world.replace(qpos=self.motion.qpos[k], qvel=self.motion.qvel[k] - before)
+            return self._recorded(world, world.replace(qpos=self.motion.qpos[k], qvel=self.motion.qvel[k] - before))
 
         arrived = functools.partial(self.arrived, world)
         return jax.lax.cond(k < self.steps, along, lambda: jax.lax.cond(k == self.steps, arrived, lambda: world))
@@ -170,9 +170,17 @@ class Past(NamedTuple):
         def kept(new: jax.Array, old: jax.Array) -> jax.Array:
             return jnp.where(self.wanted, new, old)
 
-        each = zip(self.physics.effects, world.memory, self.start.memory, strict=True)
+        own = self._recorded(world, self.start.replace(memory=world.memory)).memory
+        each = zip(self.physics.effects, own, self.start.memory, strict=True)
         memory = (jax.tree.map(kept, new, old) if effect.follows else old for effect, new, old in each)
         return self.start.replace(memory=tuple(memory))
+
+    def _recorded(self, before: World, after: World) -> World:
+        """`after`, a recorded state with the memories of `before`, as what follows the motion takes it."""
+        old, new = ({"qpos": world.qpos, "qvel": world.qvel} for world in (before, after))
+        thetas = self.physics.split(before.theta)[1]
+        each = zip(self.physics.effects, self.physics.sites, after.memory, thetas, strict=True)
+        return after.replace(memory=tuple(e.on_record(at, own, old, new, theta) for e, at, own, theta in each))
 
 
 def past_of(physics: Physics, start: World, motion: Motion, active: jax.Array | None = None) -> Past:

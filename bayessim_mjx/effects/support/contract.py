@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from bayessim_mjx.effects.effect import Effect
 
 LIBRARY = __name__.split(".")[0]
-HOOKS = ("on_model", "on_start", "on_command", "on_actuator", "on_force", "on_measurement")
+HOOKS = ("on_model", "on_start", "on_record", "on_command", "on_actuator", "on_force", "on_measurement")
 ROWS = 3  # of the recording that `on_start` is tried on
 _tried: set[tuple] = set()
 
@@ -103,7 +103,8 @@ def _inputs(at: Site, mj_model: mujoco.MjModel) -> dict[str, Any]:
 def _called(effect: "Effect", at: Site, model: "mjx.Model", hook: str, theta: jax.Array, given: dict) -> tuple:
     """(what the hook leaves as it is when it is off, what it gives for it)."""
     data, memory = given["data"], effect.init(at)
-    step = SubStep(model, data, given["measurement"], at.timestep)
+    shown = given["measurement"]
+    step = SubStep(model, data, shown, at.timestep)
 
     def actuator() -> Any:  # with its derivative, which implicit integrators take
         def own(force: jax.Array) -> Any:
@@ -114,13 +115,12 @@ def _called(effect: "Effect", at: Site, model: "mjx.Model", hook: str, theta: ja
     before, call = {
         "on_model": (model, lambda: (memory, effect.on_model(at, model, theta))),
         "on_start": (given["motion"], lambda: effect.on_start(at, memory, given["motion"], theta)),
+        "on_record": (shown, lambda: (effect.on_record(at, memory, shown, shown, theta), shown)),
         "on_command": (given["command"], lambda: effect.on_command(at, memory, given["command"], theta)),
         "on_actuator": (given["force"], actuator),
         "on_force": (jnp.zeros(at.nv), lambda: effect.on_force(at, memory, step, theta)),
-        "on_measurement": (
-            given["measurement"], lambda: effect.on_measurement(at, memory, given["measurement"], theta),
-        ),
-    }[hook]  # fmt: skip
+        "on_measurement": (shown, lambda: effect.on_measurement(at, memory, shown, theta)),
+    }[hook]
     result = call()
     if not (isinstance(result, tuple) and len(result) == 2):
         raise UserError(f"effect {effect.name}: {hook} returns {_kind(result)}; expected (memory, {_kind(before)})")

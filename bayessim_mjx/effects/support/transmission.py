@@ -7,6 +7,7 @@ on the motor's side, where their encoder is. The joint's damping is the motor's 
 with the reduction's square count there.
 """
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
@@ -155,6 +156,18 @@ def _gains(at: Site, step: SubStep, on: jax.Array) -> tuple[jax.Array, jax.Array
     gains = (-own * step.model.actuator_biasprm[ids, k] for k in (1, 2))
     kp, kv = (jnp.where(on, jnp.maximum(none.at[places].add(g), 0.0), 0.0) for g in gains)
     return kp, kv
+
+
+def recorded(
+    at: Site, memory: Any, before: Mapping[str, jax.Array], after: Mapping[str, jax.Array], on: jax.Array
+) -> dict[str, jax.Array]:
+    """The memory where the links are set to where they were recorded: the motors are moved along with them.
+
+    So a recording gives the motion of both, with its noise, and simulation the one of motors against links.
+    """
+    along = after["qvel"][at.dadr] - before["qvel"][at.dadr]
+    speed = jnp.where(memory["fresh"] | ~on, memory["speed"], memory["speed"] + along)
+    return {**memory, "speed": speed}
 
 
 class Passed(NamedTuple):
