@@ -1,7 +1,6 @@
 """Which missing effects a diagnosis would find on your robot and logs: bayessim-mjx blind --model FILE --data LOGS."""
 
 import argparse
-import os
 import shlex
 import sys
 from collections.abc import Sequence
@@ -59,7 +58,12 @@ def _parser() -> cli.PlainParser:
         help="how accurate data-sheet values are (standard deviation; default: 5%%)",
     )  # fmt: skip
     parser.add_argument("--seed", metavar="N", type=cli.whole(0, SEEDS), default=0, help="random seed (default: 0)")
-    parser.add_argument("--workers", metavar="N", type=cli.whole(1, 1024), help="cases at a time (default: all cores)")
+    parser.add_argument(
+        "--workers",
+        metavar="N",
+        type=cli.whole(1, 1024),
+        help="cases at a time, which share the cores out (default: as many as cores, up to 32)",
+    )
     parser.add_argument("--out", metavar="DIR", default="blind", help="folder of the check (default: blind)")
     parser.add_argument(
         "--command", metavar="WORDS", default="",
@@ -105,7 +109,7 @@ def _blind(argv: Sequence[str] | None) -> int:
         args.command, tuple(args.more), not args.no_sandbox,
     )  # fmt: skip
     seconds = None if args.minutes is None else 60 * args.minutes
-    limits = Limits(args.cases, seconds, args.workers or os.cpu_count() or 1)
+    limits = Limits(args.cases, seconds, args.workers)
     from bayessim_mjx.blind import answer, show
 
     with stages(args.headless) as say:

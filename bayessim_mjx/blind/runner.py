@@ -1,6 +1,7 @@
 """Runs a blind check: rounds of cases over the cores, each in processes of their own; what was finished stays."""
 
 import dataclasses
+import itertools
 import json
 import math
 import os
@@ -18,7 +19,7 @@ from bayessim_mjx.blind.cases import Item
 from bayessim_mjx.blind.check import Bench, Check, bench
 from bayessim_mjx.blind.curves import Trial
 from bayessim_mjx.blind.outcome import Outcome
-from bayessim_mjx.blind.plan import known, plan, rounds
+from bayessim_mjx.blind.plan import AT_ONCE, known, plan, rounds
 from bayessim_mjx.blind.worker import EXIT, KEPT, asked
 from bayessim_mjx.errors import UserError
 
@@ -28,11 +29,14 @@ Between = Callable[[list[Outcome]], None]
 
 @dataclasses.dataclass(frozen=True)
 class Limits:
-    """cases: in all; seconds: until no further case is begun, None without end; workers: cases at a time."""
+    """cases: in all; seconds: until no further case is begun, None without end.
+
+    workers: cases at a time; None: as many as cores, up to those that need not wait for others.
+    """
 
     cases: int
     seconds: float | None = None
-    workers: int = 1
+    workers: int | None = 1
 
 
 def run(check: Check, limits: Limits, say: Say, between: Between = lambda outcomes: None) -> list[Outcome]:
@@ -69,6 +73,14 @@ def _told(say: Say, total: int, done: int) -> None:
     say("cases", done, total)
 
 
+def shares(cores: Sequence[int], workers: int) -> list[list[int]]:
+    """The cores that each worker stays on; none where there is one worker, or fewer cores than workers: on all."""
+    if not 1 < workers <= len(cores):
+        return [[] for _ in range(workers)]
+    ends = [k * len(cores) // workers for k in range(workers + 1)]
+    return [list(cores[a:b]) for a, b in itertools.pairwise(ends)]
+
+
 class _Crew:
     """Workers that take cases as they are given; none is started before there is something to do.
 
@@ -79,8 +91,7 @@ class _Crew:
         self.check, self.workers, self.done, self.say = check, list[_Worker](), done, say
         self.end = None if limits.seconds is None else time.monotonic() + limits.seconds
         cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
-        pinned = 1 < limits.workers <= len(cores)
-        self.cores = [cores[k] if pinned else None for k in range(limits.workers)]
+        self.cores = shares(cores, limits.workers or min(len(cores) or os.cpu_count() or 1, AT_ONCE))
         self.todo: queue.SimpleQueue[Item | None] = queue.SimpleQueue()
         self.answers: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
         self.given, self.idle = 0, 0
@@ -121,7 +132,7 @@ class _Crew:
 class _Worker:
     """A process that makes and diagnoses cases, see `worker`; `last`: s that its last case took."""
 
-    def __init__(self, check: Check, number: int, core: int | None, end: float | None) -> None:
+    def __init__(self, check: Check, number: int, cores: Sequence[int], end: float | None) -> None:
         self.end, self.last = end, 0.0
         self.path = check.folder / f"worker_{number}.txt"
         self.errors = self.path.open("w")
@@ -129,7 +140,7 @@ class _Worker:
             [sys.executable, "-m", "bayessim_mjx.blind.worker"], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
             stderr=self.errors, text=True,
         )  # fmt: skip
-        self._write(asked(check, core))
+        self._write(asked(check, cores))
 
     def _write(self, line: str) -> None:
         assert self.process.stdin

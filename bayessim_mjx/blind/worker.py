@@ -12,6 +12,7 @@ import signal
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -102,11 +103,11 @@ def work(check: Check, item: Item) -> dict[str, Any]:
 
 
 def main() -> int:
-    """First line: the check and the core to stay on; then one item a line, answered by a line each."""
+    """First line: the check and the cores to stay on; then one item a line, answered by a line each."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that the diagnosis ends with its worker
     first = json.loads(sys.stdin.readline())
-    if first["core"] is not None and hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, {first["core"]})  # before JAX counts the cores
+    if first["cores"] and hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, first["cores"])  # before JAX counts the cores
     given: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in first["check"].items()}
     check, answers = Check(**given), os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)  # whatever prints must not answer
@@ -119,9 +120,9 @@ def main() -> int:
     return 0
 
 
-def asked(check: Check, core: int | None) -> str:
-    """The first line for a worker."""
-    return json.dumps({"check": dataclasses.asdict(check), "core": core})
+def asked(check: Check, cores: Sequence[int]) -> str:
+    """The first line for a worker; no cores: it stays on none."""
+    return json.dumps({"check": dataclasses.asdict(check), "cores": list(cores)})
 
 
 if __name__ == "__main__":

@@ -91,3 +91,31 @@ def test_inactive_effects_are_not_taken_along():
     active, inactive = (past_of(physics, start, one, jnp.array([on])) for on in (True, False))
     assert bool(active.wanted) and active.first == 0
     assert not bool(inactive.wanted) and inactive.first == BEFORE
+
+
+def test_noise_of_the_recorded_link_is_not_taken_for_slip_of_a_heavy_motor():
+    """The link is a hundredth of its motor and lies on the teeth: what is left of their slip is what they really do.
+
+    A motor that kept its own speed against the noise of each recorded one was off by about that noise.
+    """
+    xml = MODEL.format("implicitfast").replace('mass="1"', 'mass=".01"')
+    physics, theta = robot(xml, "backlash"), jnp.array([0.01])
+    gravity = 0.05 * np.ones_like(COMMAND)  # a constant push beside, which keeps the link on one side for long
+
+    def step(world, command):
+        after = control_step(physics, world, command)[0]
+        return after, world
+
+    command = jnp.asarray(0.1 * COMMAND + gravity)
+    _, worlds = jax.jit(lambda w: jax.lax.scan(step, w, command))(physics.world(theta))
+    noise, rng = 0.02, np.random.default_rng(0)
+    near = np.arange(BEFORE, ROWS - BEFORE)[:, None] + np.arange(-BEFORE, BEFORE + 1)
+    qvel = np.asarray(worlds.qvel) + noise * rng.normal(size=worlds.qvel.shape)
+    commands = np.repeat(np.asarray(command)[near][:, :, None], physics.substeps, 2)
+    motion = Motion(worlds.qpos[near], jnp.asarray(qvel[near], jnp.float32), jnp.asarray(commands), start=BEFORE)
+    rows = slice(BEFORE, ROWS - BEFORE)
+    true = np.asarray(worlds.memory[0]["speed"] - worlds.qvel)[rows, 0]
+    found = twists(retraced, physics, theta, motion)[1]
+    slip = np.asarray(found.memory[0]["speed"] - found.qvel)[:, 0]
+    assert np.median(np.abs(true)) < 1e-3  # they move together nearly always
+    assert np.median(np.abs(slip - true)) < 0.1 * noise
