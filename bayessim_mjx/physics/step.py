@@ -179,8 +179,10 @@ class Past(NamedTuple):
         """`after`, a recorded state with the memories of `before`, as what follows the motion takes it."""
         old, new = ({"qpos": world.qpos, "qvel": world.qvel} for world in (before, after))
         thetas = self.physics.split(before.theta)[1]
-        each = zip(self.physics.effects, self.physics.sites, after.memory, thetas, strict=True)
-        return after.replace(memory=tuple(e.on_record(at, own, old, new, theta) for e, at, own, theta in each))
+        memory = list(after.memory)
+        for i in self.physics.having("on_record"):
+            memory[i] = self.physics.effects[i].on_record(self.physics.sites[i], memory[i], old, new, thetas[i])
+        return after.replace(memory=tuple(memory))
 
 
 def past_of(physics: Physics, start: World, motion: Motion, active: jax.Array | None = None) -> Past:
