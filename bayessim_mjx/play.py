@@ -151,10 +151,6 @@ def _play(argv: Sequence[str] | None) -> int:
         return _show(args, config, path, run, count, console)
 
 
-def _randomized(config: Config, randomize: bool) -> Config:
-    return dataclasses.replace(config, randomization=freeze({**config.randomization, "randomize": randomize}))
-
-
 def _acted_in(config: Config) -> Any:
     """The environment as its policy sees it."""
     from bayessim_mjx import registry
@@ -170,24 +166,24 @@ def _show(args: argparse.Namespace, config: Config, path: Path, run: Any, count:
     from bayessim_mjx import rl
 
     # also a policy trained on nominal physics can be tried on the prior and on the surrogate real
-    trained, config = config, _randomized(config, True)
-    env = _acted_in(config)
+    trained = config
+    config = dataclasses.replace(config, randomization=freeze({**config.randomization, "randomize": True}))
+    env = plain = _acted_in(config)
     policy, key = cli.load_policy(path, env, config), jax.random.PRNGKey(config.seed)
     if args.export is not None:
         console.say(_export(env, policy, path, run, args.export))
         return 0
     kinds = _physics(config, env, path, key, count)
+    if trained.randomization.get("randomize") is False and getattr(env, "nuisance", None):
+        plain = _acted_in(trained)  # nominal physics is then without the noise that comes with randomisation
+        kinds["nominal"] = _nominal(plain, count)
     if args.physics and args.physics not in kinds:
         raise UserError(f"--physics {args.physics}: this checkpoint and task have {', '.join(kinds)}")
     console.say(f"{config.task}, {count} episodes each, checkpoint {path}")
     chosen, rows = {args.physics: kinds[args.physics]} if args.physics else kinds, []
     returns = {}
     for name, thetas in chosen.items():
-        own = env
-        if name == "nominal" and trained.randomization.get("randomize") is False and getattr(env, "nuisance", None):
-            own = _acted_in(_randomized(config, False))  # without the noise that comes with randomisation
-            thetas = _nominal(own, count)
-        result = rl.evaluate(own, policy, jax.random.fold_in(key, 1), thetas)
+        result = rl.evaluate(plain if name == "nominal" else env, policy, jax.random.fold_in(key, 1), thetas)
         r, length = result["return"], result["length"]
         returns[name] = r
         rows.append([name, estimate(r.mean(), r.std()), *map(compact, (r.min(), r.max(), length.mean()))])
@@ -197,7 +193,8 @@ def _show(args: argparse.Namespace, config: Config, path: Path, run: Any, count:
     if config.monitor.video:
         name = next(n for n in ("real", "posterior", "prior", "nominal") if n in chosen)
         folder = (run.path if run is not None else path.parent) / "videos" / "play"
-        console.say(_video(config, env, policy, (name, chosen[name][0]), key, folder / f"{path.name}_{name}.mp4"))
+        shown = plain if name == "nominal" else env
+        console.say(_video(config, shown, policy, (name, chosen[name][0]), key, folder / f"{path.name}_{name}.mp4"))
     return 0
 
 

@@ -13,7 +13,7 @@ from jax.sharding import Mesh
 from bayessim_mjx.physics.nuisance import starting
 from bayessim_mjx.rl import actions, sharding
 from bayessim_mjx.rl.extension import Learner
-from bayessim_mjx.rl.networks import Policy
+from bayessim_mjx.rl.networks import Policy, form
 from bayessim_mjx.rl.sharding import EVERYWHERE, FIRST, SECOND
 from bayessim_mjx.rl.state import TrainState, policy_of
 from bayessim_mjx.rollout import collect, traced
@@ -114,5 +114,6 @@ def gather(
     noise = sharding.pinned(law.noise(noise_key, *shape), mesh, SECOND)
     pool = reset(env, pool_key, domain, config.num_envs, mesh, clock(env, state.env_states))
     run = sharding.local(run, mesh, (EVERYWHERE, SECOND, FIRST, FIRST), (FIRST, SECOND))
-    half = config.precision == "bfloat16"  # as the losses see it, or ratios would begin beside 1
-    return run(dataclasses.replace(policy_of(state), half=half), noise, state.env_states, pool)
+    # rounded as in the losses, or ratios would begin beside 1
+    policy = dataclasses.replace(policy_of(state), half=form(config).half)
+    return run(policy, noise, state.env_states, pool)

@@ -22,6 +22,7 @@ from bayessim_mjx.rl.train import LATEST
 from bayessim_mjx.rl.worlds import gather
 from bayessim_mjx.rl.worlds import reset as reset_worlds
 
+STATE = ("qpos", "qvel", "act", "qacc_warmstart")  # what the next timestep needs of mjx.Data
 HUMANOID = (400, 200, 100)  # widths of Isaac Gym's Humanoid
 PEAK = {"NVIDIA H200": (494e12, 67e12, 4.8e12)}  # dense TF32 and float32 FLOP/s, bytes/s, as the data sheet says
 Say = Callable[[dict], None]
@@ -69,7 +70,7 @@ def bare(env: Any, worlds: int, steps: int, lean: bool) -> Callable[[], Any]:
     model = mjx.put_model(env.mj_model, impl="jax")
     start = mjx.make_data(env.mj_model, impl="jax")
     precision = "highest" if isinstance(env, Task) else "default"  # as the environment has it
-    names = ("qpos", "qvel", "act", "qacc_warmstart") if lean else None
+    names = STATE if lean else None
     keys = jax.random.split(jax.random.PRNGKey(0), worlds)
     nudged = jax.vmap(lambda k: start.replace(qpos=start.qpos + 0.01 * jax.random.normal(k, start.qpos.shape)))(keys)
 
@@ -87,25 +88,36 @@ def bare(env: Any, worlds: int, steps: int, lean: bool) -> Callable[[], Any]:
     return lambda: run(given)
 
 
-def bare_own(env: Task, state: Any, steps: int) -> Callable[[], Any]:
-    """The same, lean, each world with a model of its own: parameters differ from world to world."""
-    names = ("qpos", "qvel", "act", "qacc_warmstart")
-    start = mjx.make_data(env.mj_model, impl="jax")
+def bare_own(
+    env: Task,
+    state: Any,
+    steps: int,
+    model_of: Callable[[Any], mjx.Model] | None = None,
+    template: mjx.Data | None = None,
+    lean: bool = True,
+) -> Callable[[], Any]:
+    """The same, each world with a model of its own: parameters differ from world to world.
+
+    model_of: the model of a world, by default the environment's; template: what a lean state is completed by.
+    """
+    own, start = model_of or env.physics.model_of, template or env.physics.template
 
     @jax.jit
-    def run(worlds: Any) -> Any:
+    def run(worlds: Any, part: Any) -> Any:
         def one(world: Any, part: Any) -> Any:
-            data = mjx.step(env.physics.model_of(world), start.replace(**part))
-            return {name: getattr(data, name) for name in names}
+            data = mjx.step(own(world), start.replace(**part) if lean else part)
+            return {name: getattr(data, name) for name in STATE} if lean else data
 
         def step(part: Any, _: None) -> tuple[Any, None]:
             return jax.vmap(one)(worlds, part), None
 
-        part = {"qpos": worlds.qpos, "qvel": worlds.qvel, "act": worlds.act, "qacc_warmstart": worlds.warmstart}
         with jax.default_matmul_precision("highest"):
             return jax.lax.scan(step, part, None, length=steps)[0]
 
-    return lambda: run(state.env_states.pipeline_state)
+    worlds = state.env_states.pipeline_state
+    part = {"qpos": worlds.qpos, "qvel": worlds.qvel, "act": worlds.act, "qacc_warmstart": worlds.warmstart}
+    part = part if lean else jax.vmap(lambda given: start.replace(**given))(part)
+    return lambda: run(worlds, part)
 
 
 def built(function: Callable[..., Any], *given: Any) -> tuple[Any, dict[str, float]]:

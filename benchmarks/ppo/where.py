@@ -34,12 +34,11 @@ from bayessim_mjx.rl.catalogue import learner
 from bayessim_mjx.rl.worlds import gather
 
 sys.path.insert(0, str(Path(__file__).parent))
-from limits import built, memory, seconds
+from limits import bare_own, built, memory, seconds
 
 TASKS = {
     "Ant": 4096, "Humanoid": 4096, "Anymal": 4096, "BallBalance": 4096, "FrankaCabinet": 4096, "ShadowHand": 16384,
 }  # fmt: skip
-STATE = ("qpos", "qvel", "act", "qacc_warmstart")
 FINER = (2, 4, 16)  # times as many minibatches
 LOOKS = 10  # updates after which contacts are counted, one after the other
 
@@ -53,7 +52,7 @@ def ms(run: Callable[[], Any]) -> float:
 
 
 class Setting:
-    """A task at nominal physics' settings, with each world's own parameters, and a state after some updates."""
+    """A task with its own settings, the compiled update, and a state, at first before any update."""
 
     def __init__(self, task: str, worlds: int, overrides: list[str]) -> None:
         self.settings = config.load(task, overrides=[f"env.numEnvs={worlds}", *overrides])
@@ -73,38 +72,21 @@ class Setting:
         say({"row": name} | self.named | row)
 
 
-def physics(setting: Setting, model_of: Callable[[Any], mjx.Model], template: mjx.Data, lean: bool = True) -> float:
-    """Milliseconds of an update's timesteps; model_of: the model of a world."""
-    worlds = setting.state.env_states.pipeline_state
-
-    def state(data: mjx.Data) -> Any:
-        return {name: getattr(data, name) for name in STATE} if lean else data
-
-    def one(world: Any, part: Any) -> Any:
-        return state(mjx.step(model_of(world), template.replace(**part) if lean else part))
-
-    @jax.jit
-    def run(worlds: Any, part: Any) -> Any:
-        with jax.default_matmul_precision("highest"):  # as the environment has it
-            return jax.lax.scan(lambda part, _: (jax.vmap(one)(worlds, part), None), part, length=setting.timesteps)[0]
-
-    part = {"qpos": worlds.qpos, "qvel": worlds.qvel, "act": worlds.act, "qacc_warmstart": worlds.warmstart}
-    part = part if lean else jax.vmap(lambda own: template.replace(**own))(part)
-    return ms(lambda: run(worlds, part))
+def physics(setting: Setting, *given: Any, lean: bool = True) -> float:
+    """Milliseconds of an update's timesteps; given: as for `limits.bare_own`."""
+    return ms(bare_own(setting.env, setting.state, setting.timesteps, *given, lean=lean))
 
 
-def without(setting: Setting, *flags: str) -> float:
-    """Physics with these parts of it switched off."""
-    own = setting.env.physics
+def without(setting: Setting, flag: str) -> float:
+    """Physics with this part of it switched off."""
 
     def model_of(world: Any) -> mjx.Model:
-        model = own.model_of(world)
-        off = model.opt.disableflags
-        for flag in flags:
-            off = off | int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{flag}"))
-        return model.tree_replace({"opt.disableflags": type(model.opt.disableflags)(off)})
+        model = setting.env.physics.model_of(world)
+        own = model.opt.disableflags
+        off = type(own)(own | int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{flag}")))
+        return model.tree_replace({"opt.disableflags": off})
 
-    return physics(setting, model_of, own.template)
+    return physics(setting, model_of)
 
 
 def touching(setting: Setting) -> list[int]:
@@ -135,19 +117,18 @@ def parts_of_physics(setting: Setting, margin: float) -> None:
     setting.say(
         "rows", {"contacts": room, "active": most, "rows": rows, "iterations": [opt.iterations, opt.ls_iterations]}
     )
-    lean = physics(setting, own.model_of, own.template)
-    setting.say("physics", {"ms": lean})
+    setting.say("physics", {"ms": physics(setting)})
     setting.say("physics", {"without": "contacts", "ms": without(setting, "CONTACT")})
     setting.say("physics", {"without": "constraints", "ms": without(setting, "CONSTRAINT")})
-    setting.say("physics", {"carried": "all", "ms": physics(setting, own.model_of, own.template, lean=False)})
+    setting.say("physics", {"carried": "all", "ms": physics(setting, lean=False)})
     budget = int(np.ceil(margin * max(most)))
     if 0 < budget < room:
         spec = setting.env.spec()
         for old in [n for n in spec.numerics if n.name == "max_contact_points"]:
             spec.delete(old)
         spec.add_numeric(name="max_contact_points", data=[budget], size=1)
-        model = mjx.put_model(spec.compile(), impl="jax")
-        fewer = mjx.make_data(spec.compile(), impl="jax")
+        compiled = spec.compile()
+        model, fewer = mjx.put_model(compiled, impl="jax"), mjx.make_data(compiled, impl="jax")
         found = physics(setting, lambda world: model.tree_replace(world.fields), fewer)
         setting.say("physics", {"room": budget, "ms": found})
 

@@ -93,12 +93,13 @@ def test_inactive_effects_are_not_taken_along():
     assert not bool(inactive.wanted) and inactive.first == BEFORE
 
 
-def test_noise_of_the_recorded_link_is_not_taken_for_slip_of_a_heavy_motor():
+@pytest.mark.parametrize("integrator", ["Euler", "implicitfast", "RK4"])
+def test_noise_of_the_recorded_link_is_not_taken_for_slip_of_a_heavy_motor(integrator):
     """The link is a hundredth of its motor and lies on the teeth: what is left of their slip is what they really do.
 
     A motor that kept its own speed against the noise of each recorded one was off by about that noise.
     """
-    xml = MODEL.format("implicitfast").replace('mass="1"', 'mass=".01"')
+    xml = MODEL.format(integrator).replace('mass="1"', 'mass=".01"')
     physics, theta = robot(xml, "backlash"), jnp.array([0.01])
     gravity = 0.05 * np.ones_like(COMMAND)  # a constant push beside, which keeps the link on one side for long
 
