@@ -15,7 +15,7 @@ from bayessim_mjx.blind.curves import Curves, Group, Trial
 # Which cases are made is a choice, told in docs/blind.md; it makes intervals wider or narrower, not wrong.
 KINDS = "SSSNSSSSUN"  # single, null, unknown cause; over and over
 FIRST, ROUND = 16, 8  # cases of the first round and of the others
-BEHIND = 3  # rounds after which a round's outcomes count: the strengths of the first ones are spread widely
+BEHIND = 4  # rounds after which a round's outcomes count: the strengths of the first ones are spread widely
 AT_ONCE = FIRST + (BEHIND - 1) * ROUND  # cases that need not wait for any other
 SPREAD = (2.0, 40.0)  # encoder noises, of the first rounds
 SHARES = (0.5, 0.9)  # how often later strengths are expected to be found

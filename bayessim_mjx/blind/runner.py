@@ -1,7 +1,6 @@
 """Runs a blind check: rounds of cases over the cores, each in processes of their own; what was finished stays."""
 
 import dataclasses
-import itertools
 import json
 import math
 import os
@@ -17,6 +16,7 @@ from typing import Any
 from bayessim_mjx.blind import seal
 from bayessim_mjx.blind.cases import Item
 from bayessim_mjx.blind.check import Bench, Check, bench
+from bayessim_mjx.blind.cores import Cores, allowed, shares
 from bayessim_mjx.blind.curves import Trial
 from bayessim_mjx.blind.outcome import Outcome
 from bayessim_mjx.blind.plan import AT_ONCE, known, plan, rounds
@@ -73,14 +73,6 @@ def _told(say: Say, total: int, done: int) -> None:
     say("cases", done, total)
 
 
-def shares(cores: Sequence[int], workers: int) -> list[list[int]]:
-    """The cores that each worker stays on; none where there is one worker, or fewer cores than workers: on all."""
-    if not 1 < workers <= len(cores):
-        return [[] for _ in range(workers)]
-    ends = [k * len(cores) // workers for k in range(workers + 1)]
-    return [list(cores[a:b]) for a, b in itertools.pairwise(ends)]
-
-
 class _Crew:
     """Workers that take cases as they are given; none is started before there is something to do.
 
@@ -90,8 +82,8 @@ class _Crew:
     def __init__(self, check: Check, limits: Limits, done: set[int], say: Callable[[int], None]) -> None:
         self.check, self.workers, self.done, self.say = check, list[_Worker](), done, say
         self.end = None if limits.seconds is None else time.monotonic() + limits.seconds
-        cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
-        self.cores = shares(cores, limits.workers or min(len(cores) or os.cpu_count() or 1, AT_ONCE))
+        own = allowed()
+        self.cores = Cores(shares(own, limits.workers or min(len(own) or os.cpu_count() or 1, AT_ONCE)))
         self.todo: queue.SimpleQueue[Item | None] = queue.SimpleQueue()
         self.answers: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
         self.given, self.idle = 0, 0
@@ -101,8 +93,8 @@ class _Crew:
         for item in items:
             self.todo.put(item)
             self.given += 1
-        for k in range(len(self.workers), min(len(self.cores), self.given)):
-            self.workers.append(_Worker(self.check, k, self.cores[k], self.end))
+        for k in range(len(self.workers), min(len(self.cores.own), self.given)):
+            self.workers.append(_Worker(self.check, k, self.cores, self.end))
             threading.Thread(target=self.workers[k].feed, args=(self.todo, self.answers), daemon=True).start()
         self.say(len(self.done))
 
@@ -132,15 +124,15 @@ class _Crew:
 class _Worker:
     """A process that makes and diagnoses cases, see `worker`; `last`: s that its last case took."""
 
-    def __init__(self, check: Check, number: int, cores: Sequence[int], end: float | None) -> None:
-        self.end, self.last = end, 0.0
+    def __init__(self, check: Check, number: int, cores: Cores, end: float | None) -> None:
+        self.end, self.last, self.number, self.cores = end, 0.0, number, cores
         self.path = check.folder / f"worker_{number}.txt"
         self.errors = self.path.open("w")
         self.process = subprocess.Popen(
             [sys.executable, "-m", "bayessim_mjx.blind.worker"], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-            stderr=self.errors, text=True,
+            stderr=self.errors, text=True, env=os.environ | cores.environment(),
         )  # fmt: skip
-        self._write(asked(check, cores))
+        self._write(asked(check))
 
     def _write(self, line: str) -> None:
         assert self.process.stdin
@@ -149,7 +141,7 @@ class _Worker:
     def feed(self, todo: Any, answers: Any) -> None:
         """Give it one item after the other, until None or for lack of time; all that it answers goes to `answers`."""
         assert self.process.stdout
-        while (item := todo.get()) is not None:
+        while (item := self._next(todo)) is not None:
             if self.end is not None and time.monotonic() + self.last >= self.end:
                 todo.put(item)  # whoever waits for one is to see that there is no time
                 break
@@ -164,7 +156,16 @@ class _Worker:
             answer = json.loads(line)
             self.last = answer.get("seconds", 0.0)
             answers.put(answer)
+        self.cores.working(self.number, None)
         answers.put({"idle": True})
+
+    def _next(self, todo: Any) -> Any:
+        """What is to be done next; while there is nothing, its cores go to those that have something."""
+        if todo.empty():
+            self.cores.working(self.number, None)
+        item = todo.get()
+        self.cores.working(self.number, self.process.pid)
+        return item
 
     def stop(self) -> None:
         """Let the process end: at once where it waits, else it is ended."""

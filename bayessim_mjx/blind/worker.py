@@ -12,7 +12,6 @@ import signal
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -103,12 +102,10 @@ def work(check: Check, item: Item) -> dict[str, Any]:
 
 
 def main() -> int:
-    """First line: the check and the cores to stay on; then one item a line, answered by a line each."""
+    """First line: the check; then one item a line, answered by a line each."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that the diagnosis ends with its worker
     first = json.loads(sys.stdin.readline())
-    if first["cores"] and hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, first["cores"])  # before JAX counts the cores
-    given: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in first["check"].items()}
+    given: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in first.items()}
     check, answers = Check(**given), os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)  # whatever prints must not answer
     for line in sys.stdin:
@@ -120,9 +117,9 @@ def main() -> int:
     return 0
 
 
-def asked(check: Check, cores: Sequence[int]) -> str:
-    """The first line for a worker; no cores: it stays on none."""
-    return json.dumps({"check": dataclasses.asdict(check), "cores": list(cores)})
+def asked(check: Check) -> str:
+    """The first line for a worker."""
+    return json.dumps(dataclasses.asdict(check))
 
 
 if __name__ == "__main__":

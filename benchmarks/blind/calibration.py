@@ -66,6 +66,7 @@ class Truth:
 SETTINGS = {
     "as assumed": Truth(),
     "as assumed, 40 cases": Truth(cases=40),
+    "as assumed, 60 cases": Truth(cases=60),
     "as assumed, 30 effects and places each": Truth(effects=30),
     "as assumed, 2 effects": Truth(effects=2),
     "steps": Truth(slopes=(1000.0,)),

@@ -2,11 +2,13 @@
 
 import itertools
 import os
+import subprocess
+import sys
 
 import pytest
 
+from bayessim_mjx.blind.cores import Cores, lent, move, shares
 from bayessim_mjx.blind.plan import AT_ONCE, known, rounds
-from bayessim_mjx.blind.runner import shares
 
 
 @pytest.mark.parametrize(("cores", "workers"), [(64, 32), (64, 30), (16, 3), (2, 2)])
@@ -27,19 +29,67 @@ def test_so_many_cases_need_not_wait_for_any_other() -> None:
     assert waiting[0].start == AT_ONCE
 
 
-@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="this system pins no process to cores")
-def test_a_worker_stays_on_its_cores(tmp_path) -> None:
-    """It says so itself, as its diagnoses would."""
-    import json
-    import subprocess
-    import sys
+def test_cores_of_who_waits_go_to_who_works() -> None:
+    own = shares(range(12), 4)
+    assert lent(own, range(4)) == dict(enumerate(own))
+    assert lent(own, [1, 3]) == {1: [3, 4, 5, 0, 1, 2], 3: [9, 10, 11, 6, 7, 8]}
+    assert lent(own, [2]) == {2: [6, 7, 8, 0, 1, 2, 3, 4, 5, 9, 10, 11]}
+    assert lent(own, []) == {}
 
-    from bayessim_mjx.blind.check import Check
-    from bayessim_mjx.blind.worker import asked
 
-    core = min(os.sched_getaffinity(0))
-    code = "import os, runpy, sys\ntry: runpy.run_module('bayessim_mjx.blind.worker', run_name='__main__')\n"
-    code += "except SystemExit: print(sorted(os.sched_getaffinity(0)), file=sys.stderr)"
-    words = asked(Check(str(tmp_path), task="Pendulum"), [core])
-    ended = subprocess.run([sys.executable, "-c", code], input=words + "\n", capture_output=True, text=True, check=True)
-    assert json.loads(ended.stderr.splitlines()[-1]) == [core]
+def test_a_single_core_goes_to_one_of_those_who_work() -> None:
+    given = lent([[0], [1], [2], [3]], [0, 1, 2])
+    assert sorted(itertools.chain(*given.values())) == [0, 1, 2, 3]
+
+
+moves = pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="this system pins no process to cores")
+STARTS = """
+import subprocess, sys, threading
+child = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
+thread = threading.Thread(target=child.wait)
+thread.start()
+print(child.pid, thread.native_id, flush=True)
+input()
+child.communicate(b"\\n")
+"""
+
+
+@moves
+def test_processes_are_moved_with_all_that_they_started() -> None:
+    before = os.sched_getaffinity(0)
+    core = max(before)
+    process = subprocess.Popen([sys.executable, "-c", STARTS], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    assert process.stdout
+    tasks = [process.pid, *map(int, process.stdout.readline().split())]
+    move(process.pid, [core])
+    found = [os.sched_getaffinity(task) for task in tasks]
+    process.communicate("\n")
+    assert found == [{core}] * 3
+    assert os.sched_getaffinity(0) == before
+
+
+@moves
+def test_a_process_that_ended_is_no_error() -> None:
+    process = subprocess.Popen([sys.executable, "-c", ""])
+    process.wait()
+    move(process.pid, [0])
+
+
+@moves
+def test_who_begins_to_work_gets_its_own_cores_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    moved = list[tuple[int, list[int]]]()
+    monkeypatch.setattr("bayessim_mjx.blind.cores.move", lambda process, cores: moved.append((process, list(cores))))
+    cores = Cores([[0, 1], [2, 3]])
+    cores.working(0, 70)
+    cores.working(1, 71)
+    cores.working(1, None)
+    cores.working(0, None)
+    assert moved == [(70, [0, 1, 2, 3]), (70, [0, 1]), (71, [2, 3]), (70, [0, 1, 2, 3])]
+    assert cores.environment() == {"NPROC": "4"}
+
+
+def test_workers_without_cores_of_their_own_stay_where_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("bayessim_mjx.blind.cores.move", lambda process, cores: pytest.fail("moved"))
+    cores = Cores(shares(range(2), 3))
+    cores.working(0, 70)
+    assert cores.environment() == {}
