@@ -21,11 +21,10 @@ from bayessim_mjx.mirrors import Mirror, resolve
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 from bayessim_mjx.physics import Physics, World, control_step, mjx
 from bayessim_mjx.physics.implementation import Choice, choose
-from bayessim_mjx.physics.nuisance import Course, Drawn
+from bayessim_mjx.physics.nuisance import GRAVITY, Course, Drawn
 from bayessim_mjx.physics.nuisance import read as read_nuisance
 
 VARIANTS = ("isaacgymenvs", "bayessim2021")
-GRAVITY = "opt.gravity"  # leaf of the model
 
 
 class Task(Env):

@@ -22,6 +22,7 @@ from bayessim_mjx.parameters.schedule import OVER, Schedule
 DISTRIBUTIONS = ("gaussian", "uniform", "loguniform")
 OPERATIONS = ("additive", "scaling")
 KEYS = ("range", "range_correlated", "operation", "distribution", "schedule", "schedule_steps")
+GRAVITY = "opt.gravity"  # leaf of the model
 FOREVER = OVER  # `frequency` of parameters that are drawn once
 
 
@@ -100,6 +101,11 @@ class Nuisance:
     actions: Noise | None = None
     gravity: Noise | None = None
     frequency: int = 1
+
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """Arrays of the model that do not follow from the parameters alone."""
+        return (GRAVITY,) if self.gravity is not None else ()
 
     def begin(self, key: jax.Array, course: Course | None, actions: int) -> Drawn:
         """At a reset: new draws where these are due (`course` None: they are, and all schedules are over)."""

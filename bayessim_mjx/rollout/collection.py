@@ -100,8 +100,16 @@ def next_episodes(env: Env, ended: jax.Array, after: State, fresh: State) -> Sta
     course = after.info["nuisance"].course
     if random.frequency > 1:
         keeps, fresh = ended & (course.age < random.frequency), strong(fresh)
-        keys, theta = fresh.info["nuisance"].key, after.pipeline_state.theta
-        again = lambda: strong(select(keeps, jax.vmap(traced(env.reset))(keys, theta, course), fresh))  # noqa: E731
+        keys, before = fresh.info["nuisance"].key, after.pipeline_state
+
+        def again() -> State:
+            state = jax.vmap(traced(env.reset))(keys, before.theta, course)
+            # what follows from theta is there: nobody reads it of `state`, so that XLA leaves out its derivation
+            same = {name: x for name, x in before.fields.items() if name not in random.fields}
+            world = state.pipeline_state
+            world = world.replace(fields={**world.fields, **same})
+            return strong(select(keeps, state.replace(pipeline_state=world), fresh))
+
         fresh = jax.lax.cond(keeps.any(), again, lambda: fresh)
     drawn = fresh.info["nuisance"]
     drawn = drawn.replace(course=drawn.course.replace(clock=course.clock))
