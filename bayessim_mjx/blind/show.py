@@ -95,6 +95,14 @@ def lookalikes(found: Found) -> tuple[list[str], list[list[str]]]:
     return ["hidden", "explained as well by", "noises between them", "told apart by"], rows
 
 
+def untried(found: Found) -> list[str]:
+    """`coulomb friction: waist, shoulder`: where each effect was not hidden yet."""
+    rows = [r for r in found["thresholds"] if not r["tried"]]
+    effects = dict.fromkeys(r["effect"] for r in rows)
+    places = {e: [r["where"] for r in rows if r["effect"] == e and r["where"] not in ("", "world")] for e in effects}
+    return [f"{spoken(e)}: {', '.join(where)}" if where else spoken(e) for e, where in places.items()]
+
+
 def tensorboard(found: Found, folder: Path) -> None:
     """Scalars, pictures and the answer as text, as event files in `folder`; step: the number of cases."""
     step = int(found["cases"])
@@ -122,7 +130,7 @@ def page(found: Found, about: Sequence[str], folder: Path) -> Path:
         looked=found.get("looked", True), rates=rates(found), lookalikes=lookalikes(found),
         versions=found.get("versions", {}),
         pictures={tag: Markup(svg(figure)) for tag, figure in pictures(found).items()},
-        untried=[title(r["effect"], r["where"]) for r in found["thresholds"] if not r["tried"]],
+        untried=untried(found),
     )  # fmt: skip
     path = folder / PAGE
     path.write_text(text, encoding="utf-8")

@@ -13,7 +13,9 @@ from bayessim_mjx.physics import measured
 from bayessim_mjx.physics.warp import INSIDE
 
 # (task, kind of device) -> fewest worlds at which Warp was measured to be faster (docs/devices.md has the figures)
-FASTER_FROM: Mapping[tuple[str, str], int] = {("Cartpole", "NVIDIA H200"): 16384, ("Ant", "NVIDIA H200"): 16384}
+FASTER_FROM: Mapping[tuple[str, str], int] = {
+    ("Humanoid", "NVIDIA H200"): 4096, ("FrankaCabinet", "NVIDIA H200"): 4096, ("ShadowHand", "NVIDIA H200"): 16384,
+}  # fmt: skip
 
 
 class Choice(NamedTuple):

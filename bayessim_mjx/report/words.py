@@ -47,9 +47,9 @@ VERDICTS = {
     ),
     "parameters": Verdict(
         "Parameters only",
-        "Recalibrating what the simulator already has closes the gap; nothing is missing.",
+        "Recalibrating what the simulator already has closes the gap, as far as these logs tell.",
         "Take over the recalibrated parameters listed below: pass effects=effects.yaml, which holds them, to main, "
-        "train or play. No effect needs to be added.",
+        "train or play. These logs ask for no effect.",
     ),
     "noise": Verdict(
         "Noise larger than estimated",

@@ -10,7 +10,7 @@ import pytest
 from recorded import pendulum
 
 from bayessim_mjx import blind_check
-from bayessim_mjx.blind import worker
+from bayessim_mjx.blind import show, worker
 
 ENTRY = Path(__file__).with_name("entry.py")
 
@@ -48,6 +48,12 @@ def test_only_the_three_words_of_a_command_are_replaced(tmp_path):
     check = SimpleNamespace(command="awk '{print $1}' {data} {out}/{x} {model}", model="", task="")
     words = worker.command(check, tmp_path / "logs", tmp_path / "out")
     assert words == ["awk", "{print $1}", f"{tmp_path}/logs", f"{tmp_path}/out/{{x}}", f"{tmp_path}/model.xml"]
+
+
+def test_places_that_were_not_tried_are_told_by_effect():
+    rows = [("backlash", "hip", 0), ("backlash", "knee", 1), ("backlash", "ankle", 0), ("gravity_tilt", "world", 0)]
+    found = {"thresholds": [{"effect": e, "where": w, "tried": n} for e, w, n in rows]}
+    assert show.untried(found) == ["backlash: hip, ankle", "gravity tilt"]
 
 
 def run(folder: Path, out: Path, *more: object) -> int:

@@ -34,18 +34,18 @@ def write(file: Path, *kept: measured.Measurement) -> None:
 
 
 def test_the_table_is_for_what_was_not_measured_here(monkeypatch):
-    for task, worlds in (("Ant", 16384), ("Cartpole", 40000)):
+    for task, worlds in (("Humanoid", 4096), ("ShadowHand", 40000)):
         assert choose(task, worlds, [DELAY], H200).impl == "warp"
-    for task, worlds in (("Ant", 16383), ("Ant", None), ("Humanoid", 16384)):
+    for task, worlds in (("Humanoid", 4095), ("Humanoid", None), ("Ant", 16384)):
         assert choose(task, worlds, [], H200).impl == "jax"
-    assert choose("Ant", 16384, [], "cpu") == (
-        "jax", "Ant was not measured on cpu with 16384 worlds or fewer; bayessim-mjx implementations does it",
+    assert choose("Humanoid", 4096, [], "cpu") == (
+        "jax", "Humanoid was not measured on cpu with 4096 worlds or fewer; bayessim-mjx implementations does it",
     )  # fmt: skip
-    assert choose("Ant", 16384, [FRICTION], H200) == (
+    assert choose("Humanoid", 4096, [FRICTION], H200) == (
         "jax", "coulomb_friction acts inside the timestep, which Warp computes as a whole",
     )  # fmt: skip
     monkeypatch.setattr(implementation, "installed", lambda: False)
-    assert choose("Ant", 16384, [], H200) == ("jax", "warp-lang is not installed")
+    assert choose("Humanoid", 4096, [], H200) == ("jax", "warp-lang is not installed")
 
 
 def test_the_nearest_measured_number_at_or_below_decides(file):
@@ -57,7 +57,7 @@ def test_the_nearest_measured_number_at_or_below_decides(file):
     assert choose("Ant", 9000, [], H200).why == "JAX 3M, Warp 2M steps/s with 8192 worlds, measured here"
     assert choose("Ant", 2000, [FRICTION], H200).impl == "jax"
     assert choose("Ant", 2000, [], "cpu").impl == choose("Humanoid", 2000, [], H200).impl == "jax"
-    assert choose("Cartpole", 16384, [], H200).impl == "warp"  # as the table has it
+    assert choose("ShadowHand", 16384, [], H200).impl == "warp"  # as the table has it
     assert [(n, c.impl) for n, c in steps("Ant", (), H200)] == [
         (1, "jax"),
         (1024, "warp"),

@@ -1,4 +1,4 @@
-"""Known parameters that move between operating conditions, or sit at a bound: structure is missing."""
+"""Known parameters that move between operating conditions, or sit at a bound: something may be missing."""
 
 from __future__ import annotations
 
