@@ -92,7 +92,7 @@ def _search_options(parser: cli.PlainParser) -> None:
     parser.add_argument(
         "--minutes",
         metavar="M",
-        type=_minutes,
+        type=cli.positive("minutes"),
         help="time that it may take: the search is cut down to it, and what was not tried is told (default: no limit)",
     )
     parser.add_argument("--quick", action="store_true", help="a first answer: fewer windows and effects, no maps")
@@ -108,16 +108,6 @@ def _search_options(parser: cli.PlainParser) -> None:
         default=[],
         help="change numbers by which models are compared and one is named, as same=.3 (docs/diagnosis.md)",
     )
-
-
-def _minutes(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
-    if not 0.0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text}: allowed is a number of minutes above 0")
-    return value
 
 
 def _checked(args: argparse.Namespace) -> None:

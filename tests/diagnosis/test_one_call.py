@@ -56,7 +56,7 @@ def test_findings_are_values():
 @pytest.mark.parametrize("minutes", ["0", "-2", "soon", "inf"])
 def test_a_limit_of_time_is_a_number_of_minutes(minutes, capsys):
     assert bayessim_mjx.diagnose.main(["--minutes", minutes]) == 2
-    assert f"{minutes}: allowed is a number of minutes above 0" in capsys.readouterr().err
+    assert f"'{minutes}': allowed: minutes, more than 0" in capsys.readouterr().err
 
 
 BOTH = "assert callable(b.diagnose) and b.diagnose.main(['--headless']) == 2"
