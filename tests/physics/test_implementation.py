@@ -89,7 +89,7 @@ def test_measurements_with_other_versions_say_nothing(file, package, valid):
 def test_a_damaged_file_is_named_and_left_aside(file, text):
     file.write_bytes(text.encode("latin-1"))
     with pytest.warns(UserWarning, match=f"env.impl = 'auto' goes without measurements: {file}: not a file of measure"):
-        assert choose("Ant", 16384, [], H200).impl == "warp"
+        assert choose("Humanoid", 4096, [], H200).impl == "warp"
     with pytest.raises(UserError, match="delete it and measure anew"):
         measured.read(file)
 
