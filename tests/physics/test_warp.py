@@ -1,5 +1,6 @@
 """`env.impl=warp`: refused in words where it cannot work; where warp-lang is installed, the motion is that of MJX."""
 
+import copy
 import importlib.util
 
 import jax
@@ -68,6 +69,35 @@ def test_the_motion_is_that_of_the_other_implementation(name):
     expected = motions(ours, thetas)
     np.testing.assert_allclose(motions(warp, thetas), expected, rtol=1e-4, atol=1e-4)
     assert np.ptp(expected[:, -1], axis=0).max() > 0.1  # worlds differ
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not INSTALLED, reason="warp-lang is not installed")
+def test_a_humanoid_moves_as_in_mujoco_once_its_solver_has_converged():
+    """Four iterations, as the task allows, end elsewhere in MuJoCo too; Warp's go on until they have converged."""
+    worlds, steps = 4, 10
+    env = registry.make("Humanoid", impl="warp", numEnvs=worlds)
+    qpos, qvel = jax.vmap(env.initial)(jax.random.split(jax.random.PRNGKey(0), worlds))
+
+    def speeds(model):
+        found = []
+        for world in range(worlds):
+            data = mujoco.MjData(model)
+            data.qpos[:], data.qvel[:] = qpos[world], qvel[world]
+            mujoco.mj_step(model, data, steps * env.physics.substeps)
+            found.append(data.qvel.copy())
+        return np.array(found)
+
+    def warp(qpos, qvel):
+        world = env.physics.world(jnp.asarray(env.space.nominal, jnp.float32), qpos, qvel)
+        held = jnp.zeros((steps, env.mj_model.nu))
+        return jax.lax.scan(lambda w, u: (control_step(env.physics, w, u)[0], None), world, held)[0].qvel
+
+    converged = copy.copy(env.mj_model)
+    converged.opt.iterations, converged.opt.ls_iterations, converged.opt.tolerance = 200, 100, 1e-12
+    exact = speeds(converged)
+    few, many = (np.abs(x - exact).max(1) for x in (speeds(env.mj_model), jax.jit(jax.vmap(warp))(qpos, qvel)))
+    assert np.median(many) < 1e-3 < np.median(few) and np.all(many < 0.5 * few)
 
 
 BALL = """
