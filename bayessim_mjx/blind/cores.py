@@ -36,7 +36,7 @@ def move(process: int, cores: Collection[int]) -> None:
     children = dict[int, list[int]]()
     for status in Path("/proc").glob("[0-9]*/stat"):
         try:
-            parent = int(status.read_text().rpartition(")")[2].split()[1])
+            parent = int(status.read_bytes().rpartition(b")")[2].split()[1])  # after the name, which may be anything
         except OSError:
             continue
         children.setdefault(parent, []).append(int(status.parent.name))

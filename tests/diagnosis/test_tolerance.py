@@ -1,5 +1,6 @@
 """What may remain unexplained: how it is typed, what it is by default, and what verdict and words make of it."""
 
+import dataclasses
 import math
 from types import SimpleNamespace
 
@@ -180,6 +181,14 @@ def test_what_no_effect_explains_is_told_against_the_tolerance_too():
     told = sentences.verdict_in_words("unexplained", [], gap(0.0349))[1]
     assert told.startswith("What remains after recalibration: elbow: 2.0 deg rms, 6.0 deg at most")
     assert told.endswith("and shoulder: 0.057 deg rms, 0.17 deg at most (0.10 % of its motion; tolerance 1.1 deg).")
+
+
+@pytest.mark.parametrize(("calibrated", "only"), [(1.1, True), (1.3, False)])
+def test_nobody_says_that_only_parameters_are_off_where_more_than_the_noise_remains(calibrated, only):
+    far = dataclasses.replace(gap(0.0), calibrated=calibrated, with_effects=calibrated)
+    head = sentences.verdict_in_words("parameters", [], far)[0]
+    assert head.startswith("Only parameters are off, as far as these logs tell") == only
+    assert ("more than the noise" in head) != only
 
 
 def test_physical_units_and_shares_come_before_the_noise():
