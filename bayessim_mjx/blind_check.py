@@ -62,7 +62,7 @@ def _parser() -> cli.PlainParser:
         "--workers",
         metavar="N",
         type=cli.whole(1, 1024),
-        help="cases at a time, which share the cores out (default: as many as cores, up to 32)",
+        help="cases at a time, which share the cores out (default: as many as cores, and as need not wait for others)",
     )
     parser.add_argument("--out", metavar="DIR", default="blind", help="folder of the check (default: blind)")
     parser.add_argument(

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from typing import Any
 
+from bayessim_mjx import device
 from bayessim_mjx.blind import seal
 from bayessim_mjx.blind.cases import Item
 from bayessim_mjx.blind.check import Bench, Check, bench
@@ -82,8 +83,7 @@ class _Crew:
     def __init__(self, check: Check, limits: Limits, done: set[int], say: Callable[[int], None]) -> None:
         self.check, self.workers, self.done, self.say = check, list[_Worker](), done, say
         self.end = None if limits.seconds is None else time.monotonic() + limits.seconds
-        own = allowed()
-        self.cores = Cores(shares(own, limits.workers or min(len(own) or os.cpu_count() or 1, AT_ONCE)))
+        self.cores = Cores(shares(allowed(), limits.workers or min(device.cores(), AT_ONCE)))
         self.todo: queue.SimpleQueue[Item | None] = queue.SimpleQueue()
         self.answers: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
         self.given, self.idle = 0, 0

@@ -79,7 +79,7 @@ def measure(task: str, worlds: int, steps: Sequence[int], seed: int) -> None:
         away = np.abs(values - exact)
         row = {"task": task, "who": who, "iterations": [opt.iterations, opt.ls_iterations]}
         for step in steps:
-            speed, place = (np.median(x.max(-1)) for x in np.split(away[step - 1], [nq], axis=-1)[::-1])
+            place, speed = (np.median(x.max(-1)) for x in np.split(away[step - 1], [nq], axis=-1))
             row[f"after {step}"] = {"speed": float(f"{speed:.2g}"), "place": float(f"{place:.2g}")}
         print(json.dumps(row), flush=True)
 
