@@ -97,6 +97,8 @@ def _prepare(args: argparse.Namespace) -> tuple[Config, Any]:
         raise UserError(
             f"ppo.teacher = {config.ppo.teacher!r}: main has no use for it; bayessim_mjx.train --distil has"
         )
+    if config.domain is not None:
+        raise UserError(f"domain = {config.domain!r}: main draws from its own posterior; train --domain has this")
     if config.agent != "own":
         raise UserError(f"agent = {config.agent!r}: main has our own PPO alone; train --agent has others")
     return config, None

@@ -80,6 +80,7 @@ def _physics(config: Config, env: Any, checkpoint: Path, key: Any, count: int) -
     from bayessim_mjx.distributions import Distribution
     from bayessim_mjx.loop.posterior import restored
     from bayessim_mjx.loop.sources import make_source
+    from bayessim_mjx.wrappers.worlds import domain_of
 
     kinds = {"nominal": _nominal(env, count)}
     if not len(env.space):
@@ -88,7 +89,10 @@ def _physics(config: Config, env: Any, checkpoint: Path, key: Any, count: int) -
     kinds["prior"] = prior.sample(key, count)
     if config.env.realParams is not None and not config.real.logs:
         kinds["real"] = make_source(config, env).sample(key, count)  # type: ignore[union-attr]
-    if (domain := restored(checkpoint, env, config)) is not None:
+    domain = restored(checkpoint, env, config)
+    if domain is None and config.domain is not None:  # PPO alone, on another run's posterior
+        domain = domain_of(env, config.domain)
+    if domain is not None:
         kinds["posterior"] = domain.sample(key, count)
     return kinds
 

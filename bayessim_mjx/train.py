@@ -1,4 +1,4 @@
-"""`python -m bayessim_mjx.train --task Ant`: PPO alone, on nominal physics or (`--randomize`) on the prior.
+"""`python -m bayessim_mjx.train --task Ant`: PPO alone, on nominal physics, the prior or (`--domain RUN`) a posterior.
 
 `--distil RUN` trains a student of that run's policy instead.
 """
@@ -18,7 +18,7 @@ from bayessim_mjx.config.settings import AGENTS
 from bayessim_mjx.device import mesh, setup_jax
 from bayessim_mjx.quantities import estimate
 
-DESCRIPTION = "Train a policy with PPO alone, on nominal physics or on physics drawn from the prior."
+DESCRIPTION = "Train a policy with PPO alone, on nominal physics or on physics drawn from the prior or a posterior."
 
 SPEED, WORTH_SAYING = "Perf/total_fps", 0.5  # seconds of compilation
 PLAY = "python -m bayessim_mjx.play"
@@ -36,11 +36,10 @@ SHOWN = (
 def _parser() -> cli.Parser:
     parser = cli.Parser("train", DESCRIPTION, resume=True, unused=("bayessim", "real"), but=("bayessim.policyCheckpt",))
     parser.add_argument("--randomize", action="store_true", help="draw the physics of each episode from the prior")
-    parser.add_argument(
-        "--distil",
-        metavar="RUN",
-        help="train a student that imitates the policy of this run or checkpoint, instead of PPO",
-    )
+    told = "draw it from the posterior of this run, with its settings; or nominal, prior, a file of Distribution.save"
+    parser.add_argument("--domain", metavar="RUN", help=told)
+    told = "train a student that imitates the policy of this run or checkpoint, instead of PPO"
+    parser.add_argument("--distil", metavar="RUN", help=told)
     parser.add_argument("--agent", choices=AGENTS, help="whose PPO trains (default: own; docs/trainers.md)")
     return parser
 
@@ -54,14 +53,14 @@ class Training:
     def __init__(self, config: Config, env: Any, run: Any, console: Any, stop: cli.Stop):
         import jax
 
-        from bayessim_mjx.distributions import Distribution
         from bayessim_mjx.monitor.compile_clock import CompileClock
         from bayessim_mjx.monitor.film import film
+        from bayessim_mjx.wrappers.worlds import domain_of
 
         self.env, self.teacher = cli.privileged(config, env)
         self.config, self.run, self.console, self.stop = config, run, console, stop
-        randomized = bool(config.randomization.get("randomize")) and len(env.space) > 0
-        self.domain = Distribution.prior(env.space, 1) if randomized else None
+        prior = "prior" if config.randomization.get("randomize") else None
+        self.domain = domain_of(env, prior if config.domain is None else config.domain)
         self.key, self.evaluation_key = jax.random.split(jax.random.PRNGKey(config.seed))
         self.compiling, self.filmed = CompileClock(), 0
         self.film = film(self.env, config)  # None: no videos
@@ -284,7 +283,7 @@ def _train(argv: Sequence[str] | None) -> int:
     if args.resume:
         run = Run.open(args.resume)
         return _run(cli.resumed_config(args, run.config), run, command, args.headless)
-    more: dict[str, tuple[str, Any]] = {"--randomize": ("task.randomize", args.randomize)}
+    more = cli.physics_settings(args)
     if args.agent:
         more["--agent"] = ("agent", args.agent)
     if args.distil:

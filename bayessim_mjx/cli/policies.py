@@ -1,5 +1,6 @@
 """Checkpoints by name, and the policies in them."""
 
+import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -36,6 +37,36 @@ def pin_policy(config: Config) -> Config:
         return config
     path, _ = find_checkpoint(config.bayessim.policyCheckpt, config.task, config.logdir)
     return replace(config, bayessim={"policyCheckpt": str(path.absolute())})
+
+
+def physics_settings(args: argparse.Namespace) -> dict[str, tuple[str, Any]]:
+    """Settings behind `--randomize` and `--domain`; those of a run that is its domain hold where no others are given.
+
+    Raises:
+        UserError: both flags; a domain that is neither nominal or prior nor a folder or file there is.
+    """
+    from bayessim_mjx.runs import MANIFEST, Run
+
+    where = args.domain or ("prior" if args.randomize else "nominal")
+    if args.domain and args.randomize:
+        raise UserError(f"--randomize and --domain {where}: give one of them; --randomize is --domain prior")
+    given = {"--randomize": ("task.randomize", where != "nominal")}
+    if where in ("nominal", "prior"):
+        return given
+    path = Path(where).absolute()
+    folder = path if (path / MANIFEST).is_file() else path.parents[1]
+    if (folder / MANIFEST).is_file() and path.is_dir():
+        run = Run.open(folder)
+        args.task = args.task or run.manifest["task"]
+        args.cfg_env = args.cfg_env or folder / "params" / "env.yaml"
+        args.cfg_train = args.cfg_train or folder / "params" / "train.yaml"
+        path = run.checkpoint("latest") if path == folder else path
+    elif not path.is_file():
+        raise UserError(
+            f"--domain {where}: allowed are nominal, prior, the folder of a run or of one of its checkpoints, and a "
+            "file that Distribution.save wrote"
+        )
+    return {**given, "--domain": ("domain", str(path))}
 
 
 def load_policy(path: Path, env: Any, config: Config) -> Any:

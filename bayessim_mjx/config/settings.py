@@ -630,6 +630,11 @@ class Config(Section):
     name: str = setting("", "last part of the run folder's name")
     logdir: str = setting("logs", "root of the run folders")
     agent: str = setting("own", "whose PPO trains (train alone)", choices=AGENTS)
+    domain: str | None = setting(
+        None,
+        "physics of the episodes (train alone): a run's checkpoint, whose posterior it is, or a file of "
+        "Distribution.save; null: the prior if task.randomize",
+    )
     device: str = setting("auto", "auto, cpu, gpu, gpu:1, cuda:0")
     devices: str = setting("1", "how many share the worlds of PPO: a number, or all", spell=_counted)
     cache_dir: str | None = setting(None, "compilation cache; null: $BAYESSIM_MJX_CACHE or ~/.cache/bayessim_mjx/jax")

@@ -17,6 +17,8 @@ def opening(config: Config, env: Any, device: Any, infers: bool = True) -> dict[
     lines: dict[str, Any] = {"task": f"{config.task}, {'adaptive domain randomisation' if infers else 'PPO alone'}"}
     if infers or config.randomization.get("randomize"):
         lines["parameters"] = [_range(p) for p in env.space.parameters] or "none"
+    if config.domain is not None:
+        lines["drawn from"] = config.domain
     if infers:
         logs = ", ".join([config.real.logs] if isinstance(config.real.logs, str) else map(str, config.real.logs or ()))
         lines["real side"] = f"recorded motion in {logs}" if logs else "surrogate: the simulator at hidden parameters"

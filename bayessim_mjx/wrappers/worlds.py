@@ -271,6 +271,8 @@ def domain_of(env: Env, source: Any) -> Distribution | None:
 
     config, checkpoint = _run(path)
     found = restored(checkpoint, env, config)
+    if found is None and config.domain is not None:
+        return domain_of(env, config.domain)  # PPO alone, on another run's posterior
     if found is None and config.randomization.get("randomize") and len(env.space):
         return Distribution.prior(env.space, 1)  # PPO alone, on the prior
     return found
