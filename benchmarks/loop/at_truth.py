@@ -5,7 +5,7 @@
 
 Prints, per seed, mean return and its standard error over `bayessim.realEvals` episodes on the surrogate real, as the
 loop evaluates its own policies: the same settings and iterations, another random start, and physics fixed at
-`env.realParams`. With `--runs` one policy for each of these runs, on its last posterior, as `train --domain RUN` has it.
+`env.realParams`. With `--runs` one policy for each of these runs, on its last posterior, as in `train --domain`.
 """
 
 import argparse
