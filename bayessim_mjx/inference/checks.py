@@ -18,7 +18,7 @@ from bayessim_mjx.inference.fit import condition
 from bayessim_mjx.inference.identify import flat_sentences, restore_prior
 from bayessim_mjx.inference.misspecification import Misfit
 from bayessim_mjx.inference.range_ends import Pile, piles
-from bayessim_mjx.inference.sets import LEVELS, Sets
+from bayessim_mjx.inference.sets import Sets
 from bayessim_mjx.inference.temperature import widened
 from bayessim_mjx.quantities import percent, percent_estimate
 
@@ -44,10 +44,6 @@ class Checks:
         found |= {f"calibration_p/{name}": p for name, p in report.p.items()}
         found |= {f"expected_contraction/{n}": float(c) for n, c in zip(names, report.contraction, strict=True)}
         found |= {"temperature": report.temperature or 1.0, "misfit_p": self.misfit.joint}
-        if self.sets is not None:
-            last = self.sets.counts[-1]
-            found |= {"sets/carried": float(self.sets.carried), "sets/gain": last.gain, "sets/widening": last.widening}
-            found |= {f"sets/coverage_{100 * level:.0f}": last.coverage(level) for level in LEVELS}
         return found | {"misfit_prior_share": self.prior_share}
 
     def sentence(self) -> str:

@@ -80,7 +80,8 @@ def infer(loop: Loop, state: LoopState, policy: Policy, info: RoundInfo) -> Loop
     state, domain = ranges.move(loop, state, posterior, info)
     following = rounds.following(domain, b.proposal) if loop.sequential else None
     if verdict is not None:
-        info.checks = checks.conclude(*verdict, posterior, b.distrust, info.moves or None)
+        found = checks.conclude(*verdict, posterior, b.distrust, info.moves or None)
+        info.checks = dataclasses.replace(found, sets=info.sets)
         told = posterior.names if round_ else _unknown(posterior.names, info.fit)
         info.warnings += info.checks.warnings(told, replaced)
         domain = checks.guarded(domain, info.checks.prior_share)

@@ -147,6 +147,8 @@ class Session:
         self.console.round_line(**round_line(info))
         if info.checks is not None:
             self.console.say(info.checks.sentence())
+        if info.sets is not None:
+            self.console.say(f"product of posteriors: {info.sets.sentence()}")
         if info.refinement is not None:
             self.console.say(f"posterior: {info.refinement.sentence()}")
             self.inference.text("BayesSim/refinement", info.refinement.sentence(), step)

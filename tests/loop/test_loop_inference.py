@@ -119,6 +119,7 @@ def test_products_of_several_trajectories_are_judged_and_widened():
     state, info = infer(parts, state)
     assert [c.trajectories for c in info.sets.counts] == [1, 2, 4]
     last = info.sets.at(4)
+    assert info.checks.sets is info.sets and not any("as used" in text for text in info.warnings)
     assert info.scores["sets/widening"] == info.sets.widening(4) >= last.widening >= 1
     for level in (0.5, 0.8, 0.95):
         assert info.scores[f"sets/coverage_{100 * level:.0f}"] == pytest.approx(level, abs=0.2)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from bayessim_mjx import config, loop
+from bayessim_mjx.inference.sets import Count, Sets
 from bayessim_mjx.monitor import session, video
 from bayessim_mjx.monitor.console import Console
 from bayessim_mjx.monitor.film import Motion
@@ -62,6 +63,19 @@ def test_videos_show_the_truth_where_it_is_known(tmp_path, filmed):
     s.round(info(0, truth=np.array([1.5]), mean=0.75), None)
     s.close()
     assert filmed == [1.5, 1.5]
+
+
+def test_a_round_says_what_simulated_sets_asked_of_the_product(tmp_path, filmed):
+    """How wide it had to be made, and how many trajectories the network can carry."""
+    s, said = watch(tmp_path, filmed), info(0, mean=0.75)
+    s.console = Console(file=(shown := io.StringIO()))
+    few, none = (Count(n, w, 1.0, 0.1, 0.5, np.full(64, 0.5)) for n, w in ((1, 1.0), (2, 1.4)))
+    said.sets = Sets((few, none))
+    s.round(said, None)
+    s.close()
+    text = " ".join(shown.getvalue().split())
+    assert "product of posteriors: with 2 trajectories standard deviations are widened 1.40 times" in text
+    assert "the network carries 1, more do not sharpen the posterior" in text
 
 
 def test_videos_under_logs_show_the_newest_posterior(tmp_path, filmed):
