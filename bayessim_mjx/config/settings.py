@@ -18,9 +18,14 @@ from bayessim_mjx.config.names import model_of, summary_name, summary_of
 from bayessim_mjx.errors import UserError
 
 COLLECT_POLICIES = ("policy_random", "policy_ones", "policy_rl", "policy_rl_randomized", "policy_replay")
-COORDINATES = ("plain", "truncated", "probit", "logit", "auto")
+COORDINATES = ("plain", "matched", "truncated", "probit", "logit", "auto")
 PROPOSALS = ("prior", "apt", "truncated", "division")
-UNCORRECTED = (("apt", "truncated"), ("apt", "logit"), ("division", "logit"))  # (proposal, coordinates)
+UNCORRECTED = (
+    ("apt", "matched"),
+    ("apt", "truncated"),
+    ("apt", "logit"),
+    ("division", "logit"),
+)  # (proposal, coordinates)
 MEMORIES = {"gru": 1, "lstm": 2}  # recurrent layers, and how many numbers each unit remembers
 IMPLEMENTATIONS = ("jax", "warp", "auto")  # of MJX
 PRECISIONS = ("float32", "bfloat16")
@@ -272,9 +277,9 @@ class BayesSimConfig(Section):
     )
     coordinates: str = setting(
         "auto",
-        "in which the posterior is a Gaussian mixture: plain (in the range, cut off at its ends), truncated (cut off "
-        "in training too), probit (the prior is a Gaussian), logit, or auto: probit where every prior is Gaussian, "
-        "otherwise plain",
+        "in which the posterior is a Gaussian mixture: plain (in the range, cut off at its ends), matched (so cut off "
+        "that the part in the range has the moments that were learnt), truncated (cut off in training too), probit "
+        "(the prior is a Gaussian), logit, or auto: probit where every prior is Gaussian, otherwise plain",
         choices=COORDINATES,
     )
     proposal: str = setting(

@@ -12,7 +12,7 @@ import numpy as np
 from jax import Array
 
 from bayessim_mjx.distributions import Distribution, charts, evaluate
-from bayessim_mjx.inference import coverage_factor, identify, mdn
+from bayessim_mjx.inference import coverage_factor, identify, mdn, uncut
 from bayessim_mjx.inference.data import Data
 from bayessim_mjx.inference.settings import InferenceSettings
 from bayessim_mjx.inference.state import FitState
@@ -42,7 +42,8 @@ def mixtures(state: FitState, z: Array) -> mdn.Heads:
     """Log weights [n, E K], means and factors of the ensemble's mixture."""
     d, settings = len(state.space), state.settings
     each = jax.vmap(lambda params: mdn.mixture(params, z, d, settings))(parts(state.params))
-    return joined(each, state.params["share"])
+    found = joined(each, state.params["share"])
+    return uncut.weighed(*found)[:3] if settings.coordinates == "matched" else found
 
 
 def parts(params: Any) -> Any:
@@ -133,17 +134,23 @@ def as_deep(state: FitState, data: Data, members: mdn.Heads) -> FitState:
     centre, sd = (np.float32(v) for v in charts.SCORE[settings.chart])
     own = parts_of(jax.tree.map(lambda leaf: leaf[:, :most], members), state.params)
     logits, means, scales = joined(mdn.converted(own, settings), share)
+    inside = None
+    if settings.coordinates == "matched":  # masses are long to compute: those of other factors are taken to be the same
+        logits, _, _, inside = uncut.weighed(logits, means, scales)
     means, scales = identify.beside_prior(means, scales, keep, settings.chart)
 
     def at(factor: Array) -> mdn.Heads:
         if mdn.bounded(settings):
             weights, centres, widths = joined(mdn.converted(mdn.sharper(own, factor), settings), share)
             return weights, *identify.beside_prior(centres, widths, keep, settings.chart)
+        if inside is not None:
+            _, centres, widths = joined(mdn.converted(mdn.sharper(own, factor), settings), share)
+            return logits, *identify.beside_prior(*uncut.shapes(centres, widths), keep, settings.chart)
         return logits, means, scales / jnp.where(keep, factor, 1.0)[None, None, :, None]
 
     mask, truth = data.mask[:most], data.y[data.held[:most]] * sd + centre
     # the same draws in every fit: weights that are kept keep their factor
-    factor = coverage_factor.factor(jax.random.PRNGKey(0), at, truth, mask, keep, settings.chart)
+    factor = coverage_factor.factor(jax.random.PRNGKey(0), at, truth, mask, keep, settings.chart, inside)
     return replace(state, params={**state.params, "sharpness": state.params["sharpness"] * factor})
 
 

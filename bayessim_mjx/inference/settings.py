@@ -83,7 +83,7 @@ class InferenceSettings(Section):
     @property
     def chart(self) -> str:
         """Chart of the posterior distributions (distributions/charts.py)."""
-        return "plain" if self.coordinates in ("truncated", "auto") else self.coordinates
+        return "plain" if self.coordinates in ("matched", "truncated", "auto") else self.coordinates
 
     def at(self, space: Any) -> InferenceSettings:
         """These settings with the coordinates that suit the priors of `space`, where they are `auto`."""

@@ -71,7 +71,7 @@ BAD = {
     "bayessim.modelClass=MDN": r"bayessim\.modelClass = 'MDN': allowed are MDNN.*None, plain uniform randomisation$",
     "bayessim.modelClass=MDNN_x": r"bayessim\.modelClass = 'MDNN_x': allowed are MDNN, MDRFF",
     "bayessim.modelClass=MDRFF_Cosine": r"bayessim\.modelClass = .MDRFF_Cosine.: allowed are MDNN, MDRFF",
-    "bayessim.coordinates=cosine": r"coordinates = 'cosine' .*allowed are plain, truncated, probit, logit",
+    "bayessim.coordinates=cosine": r"coordinates = 'cosine' .*allowed are plain, matched, truncated, probit, logit",
     "bayessim.proposal=snpe": r"proposal = 'snpe' .*allowed are prior, apt, truncated, division",
     "bayessim={proposal: apt, coordinates: logit}": r"'apt': no correction in bayessim\.coordinates = 'logit'; take",
     "bayessim.ensemble=0": r"ensemble = 0 .*at least 1",
