@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from scipy.stats import multivariate_t
+from scipy.stats import multivariate_t, truncnorm
 
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.parameters import Parameter, ParameterSpace
@@ -51,6 +51,24 @@ def gaussian_linear() -> Problem:
         return float(np.sum(-0.5 * away) + 5 * np.log(len(x) + 1))
 
     return Problem("gaussian_linear", space, simulate, exact, {"coordinates": "probit", "components": 1}, gain=gain)
+
+
+def told_weakly() -> Problem:
+    """theta ~ U[0, 1]^8, each measured with noise of its own, from .03 to .8: posteriors are Gaussians cut off."""
+    sds = np.geomspace(0.03, 0.8, 8)
+    space = ParameterSpace([Parameter(f"t{i}", 0.5, 0.0, 1.0) for i in range(8)])
+
+    def simulate(key: Array, theta: Array) -> Array:
+        return theta + jnp.asarray(sds, jnp.float32)[None] * jax.random.normal(key, theta.shape)
+
+    def exact(rng: np.random.Generator, x: np.ndarray, n: int) -> np.ndarray:
+        return truncnorm((0 - x) / sds, (1 - x) / sds, x, sds).rvs((n, 8), random_state=rng)
+
+    def gain(x: np.ndarray, theta: np.ndarray) -> float:
+        mean, sd = x.mean(0), sds / len(x) ** 0.5
+        return float(truncnorm((0 - mean) / sd, (1 - mean) / sd, mean, sd).logpdf(theta).sum())
+
+    return Problem("told_weakly", space, simulate, exact, {}, gain=gain)
 
 
 def two_moons() -> Problem:
@@ -200,4 +218,4 @@ def _resample(rng: np.random.Generator, log_weights: np.ndarray, n: int) -> np.n
     return rng.choice(len(weights), n, p=weights / weights.sum())
 
 
-PROBLEMS = {make.__name__: make for make in (gaussian_linear, two_moons, pendulum, bounces)}
+PROBLEMS = {make.__name__: make for make in (gaussian_linear, told_weakly, two_moons, pendulum, bounces)}

@@ -58,7 +58,7 @@ def test_names_of_models():
     for name in ("MDRFF_RBF_0", "MDRFF_RBF_1e999", "MDRFF_Cosine", "MDRFF_RBF_1.2.3", "MDNN_RBF", None):
         with pytest.raises(ValueError, match="modelClass = .*(allowed are MDNN, MDRFF|no positive finite)"):
             InferenceSettings(modelClass=name)
-    with pytest.raises(ValueError, match="plain, truncated, probit, logit"):
+    with pytest.raises(ValueError, match="plain, matched, truncated, probit, logit"):
         InferenceSettings(coordinates="polar")
     with pytest.raises(ValueError, match="RBF, Laplace"):
         features.frequencies("Cosine", 2, 8)
