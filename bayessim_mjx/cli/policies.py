@@ -54,7 +54,7 @@ def physics_settings(args: argparse.Namespace) -> dict[str, tuple[str, Any]]:
     if where in ("nominal", "prior"):
         return given
     path = Path(where).absolute()
-    folder = path if (path / MANIFEST).is_file() else path.parents[1]
+    folder = path if (path / MANIFEST).is_file() else path.parent.parent
     if (folder / MANIFEST).is_file() and path.is_dir():
         run = Run.open(folder)
         args.task = args.task or run.manifest["task"]

@@ -86,6 +86,7 @@ def test_a_resumed_run_keeps_its_domain(evaluated: list, tmp_path: Path, monkeyp
 def test_what_is_no_domain_is_refused_with_what_is_allowed(toy: None, capsys: Any) -> None:
     line = error_of(capsys, train.main, *ARGV, "--domain", "nowhere")
     assert "--domain nowhere: allowed are nominal, prior, the folder of a run" in line
+    assert "--domain /nowhere: allowed are" in error_of(capsys, train.main, *ARGV, "--domain", "/nowhere")
     line = error_of(capsys, train.main, *ARGV, "--domain", "nominal", "--randomize")
     assert "--randomize and --domain nominal: give one of them" in line
     Path("domain.yaml").write_text("domain: somewhere.npz")
