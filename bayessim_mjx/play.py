@@ -78,9 +78,8 @@ def _nominal(env: Any, count: int) -> Any:
 def _physics(config: Config, env: Any, checkpoint: Path, key: Any, count: int) -> dict[str, Any]:
     """theta [count, d] of every kind of physics that there is."""
     from bayessim_mjx.distributions import Distribution
-    from bayessim_mjx.loop.posterior import restored
     from bayessim_mjx.loop.sources import make_source
-    from bayessim_mjx.wrappers.worlds import domain_of
+    from bayessim_mjx.wrappers.worlds import posterior_of
 
     kinds = {"nominal": _nominal(env, count)}
     if not len(env.space):
@@ -89,10 +88,7 @@ def _physics(config: Config, env: Any, checkpoint: Path, key: Any, count: int) -
     kinds["prior"] = prior.sample(key, count)
     if config.env.realParams is not None and not config.real.logs:
         kinds["real"] = make_source(config, env).sample(key, count)  # type: ignore[union-attr]
-    domain = restored(checkpoint, env, config)
-    if domain is None and config.domain is not None:  # PPO alone, on another run's posterior
-        domain = domain_of(env, config.domain)
-    if domain is not None:
+    if (domain := posterior_of(env, checkpoint, config)) is not None:
         kinds["posterior"] = domain.sample(key, count)
     return kinds
 

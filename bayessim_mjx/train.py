@@ -60,7 +60,7 @@ class Training:
         self.env, self.teacher = cli.privileged(config, env)
         self.config, self.run, self.console, self.stop = config, run, console, stop
         prior = "prior" if config.randomization.get("randomize") else None
-        self.domain = domain_of(env, prior if config.domain is None else config.domain)
+        self.domain = domain_of(env, config.domain or prior)
         self.key, self.evaluation_key = jax.random.split(jax.random.PRNGKey(config.seed))
         self.compiling, self.filmed = CompileClock(), 0
         self.film = film(self.env, config)  # None: no videos

@@ -45,8 +45,6 @@ def physics_settings(args: argparse.Namespace) -> dict[str, tuple[str, Any]]:
     Raises:
         UserError: both flags; a domain that is neither nominal or prior nor a folder or file there is.
     """
-    from bayessim_mjx.runs import MANIFEST, Run
-
     where = args.domain or ("prior" if args.randomize else "nominal")
     if args.domain and args.randomize:
         raise UserError(f"--randomize and --domain {where}: give one of them; --randomize is --domain prior")
@@ -54,13 +52,13 @@ def physics_settings(args: argparse.Namespace) -> dict[str, tuple[str, Any]]:
     if where in ("nominal", "prior"):
         return given
     path = Path(where).absolute()
-    folder = path if (path / MANIFEST).is_file() else path.parent.parent
-    if (folder / MANIFEST).is_file() and path.is_dir():
-        run = Run.open(folder)
-        args.task = args.task or run.manifest["task"]
-        args.cfg_env = args.cfg_env or folder / "params" / "env.yaml"
-        args.cfg_train = args.cfg_train or folder / "params" / "train.yaml"
-        path = run.checkpoint("latest") if path == folder else path
+    if path.is_dir():
+        from bayessim_mjx.wrappers.worlds import run_of
+
+        config, path = run_of(path)
+        params = path.parents[1] / "params"
+        args.task = args.task or config.task
+        args.cfg_env, args.cfg_train = args.cfg_env or params / "env.yaml", args.cfg_train or params / "train.yaml"
     elif not path.is_file():
         raise UserError(
             f"--domain {where}: allowed are nominal, prior, the folder of a run or of one of its checkpoints, and a "

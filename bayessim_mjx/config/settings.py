@@ -20,12 +20,8 @@ from bayessim_mjx.errors import UserError
 COLLECT_POLICIES = ("policy_random", "policy_ones", "policy_rl", "policy_rl_randomized", "policy_replay")
 COORDINATES = ("plain", "matched", "truncated", "probit", "logit", "auto")
 PROPOSALS = ("prior", "apt", "truncated", "division")
-UNCORRECTED = (
-    ("apt", "matched"),
-    ("apt", "truncated"),
-    ("apt", "logit"),
-    ("division", "logit"),
-)  # (proposal, coordinates)
+# (proposal, coordinates)
+UNCORRECTED = (("apt", "matched"), ("apt", "truncated"), ("apt", "logit"), ("division", "logit"))
 MEMORIES = {"gru": 1, "lstm": 2}  # recurrent layers, and how many numbers each unit remembers
 IMPLEMENTATIONS = ("jax", "warp", "auto")  # of MJX
 PRECISIONS = ("float32", "bfloat16")

@@ -47,7 +47,8 @@ def levels(key: Array, mixtures: Mixtures, z: Array, keep: Array, chart: str, in
             draws = means[part] + jnp.sum(scales[part] * noise[:, None, :], axis=-1)
         else:
             draws, logs = box.forced(means, scales, part, chance[:, 1:])
-            worth = jnp.exp(logs - mass[part] - jnp.max(logs - mass[part]))
+            logs = logs - mass[part]
+            worth = jnp.exp(logs - jnp.max(logs))
         points = jnp.concatenate([z[None], draws])
         gap = points[:, None, None, :] - means[None, :, None, :]
         away = jnp.where(

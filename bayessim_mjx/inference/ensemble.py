@@ -134,7 +134,7 @@ def as_deep(state: FitState, data: Data, members: mdn.Heads) -> FitState:
     centre, sd = (np.float32(v) for v in charts.SCORE[settings.chart])
     own = parts_of(jax.tree.map(lambda leaf: leaf[:, :most], members), state.params)
     logits, means, scales = joined(mdn.converted(own, settings), share)
-    inside = None
+    inside, learnt = None, (means, scales)
     if settings.coordinates == "matched":  # masses are long to compute: those of other factors are taken to be the same
         logits, _, _, inside = uncut.weighed(logits, means, scales)
     means, scales = identify.beside_prior(means, scales, keep, settings.chart)
@@ -144,8 +144,8 @@ def as_deep(state: FitState, data: Data, members: mdn.Heads) -> FitState:
             weights, centres, widths = joined(mdn.converted(mdn.sharper(own, factor), settings), share)
             return weights, *identify.beside_prior(centres, widths, keep, settings.chart)
         if inside is not None:
-            _, centres, widths = joined(mdn.converted(mdn.sharper(own, factor), settings), share)
-            return logits, *identify.beside_prior(*uncut.shapes(centres, widths), keep, settings.chart)
+            before_cut = uncut.shapes(learnt[0], learnt[1] / factor)
+            return logits, *identify.beside_prior(*before_cut, keep, settings.chart)
         return logits, means, scales / jnp.where(keep, factor, 1.0)[None, None, :, None]
 
     mask, truth = data.mask[:most], data.y[data.held[:most]] * sd + centre

@@ -239,7 +239,7 @@ def environment(
     """(environment, distribution over its theta) that `worlds` is asked for."""
     settings = dict(env_settings or {})
     if isinstance(task, Path) or (isinstance(task, str) and Path(task).is_dir()):
-        config, checkpoint = _run(task)
+        config, checkpoint = run_of(task)
         env = registry.make(config.task, config=config, **settings)
         return env, domain_of(env, checkpoint if domain is None else domain)
     if isinstance(task, str):
@@ -267,18 +267,22 @@ def domain_of(env: Env, source: Any) -> Distribution | None:
             f"domain = {str(source)!r}: allowed are nominal, prior, a Distribution, the folder of a run or checkpoint, "
             "and a file that Distribution.save wrote"
         )
-    from bayessim_mjx.loop.posterior import restored
-
-    config, checkpoint = _run(path)
-    found = restored(checkpoint, env, config)
-    if found is None and config.domain is not None:
-        return domain_of(env, config.domain)  # PPO alone, on another run's posterior
+    config, checkpoint = run_of(path)
+    found = posterior_of(env, checkpoint, config)
     if found is None and config.randomization.get("randomize") and len(env.space):
         return Distribution.prior(env.space, 1)  # PPO alone, on the prior
     return found
 
 
-def _run(path: str | Path) -> tuple[Any, Path]:
+def posterior_of(env: Env, checkpoint: Path, config: Any) -> Distribution | None:
+    """The posterior of a checkpoint of the loop, or that which PPO alone was trained on; None: neither."""
+    from bayessim_mjx.loop.posterior import restored
+
+    found = restored(checkpoint, env, config)
+    return domain_of(env, config.domain) if found is None and config.domain is not None else found
+
+
+def run_of(path: str | Path) -> tuple[Any, Path]:
     """(settings, checkpoint with the last state) of a run or of one of its checkpoints."""
     from bayessim_mjx.runs import MANIFEST, Run
 
@@ -286,6 +290,6 @@ def _run(path: str | Path) -> tuple[Any, Path]:
     if (folder / MANIFEST).is_file():
         run = Run.open(folder)
         return run.config, run.checkpoint("latest")
-    if (folder.parents[1] / MANIFEST).is_file():
-        return Run.open(folder.parents[1]).config, folder
+    if (folder.parent.parent / MANIFEST).is_file():
+        return Run.open(folder.parent.parent).config, folder
     raise UserError(f"{path}: neither a run nor a checkpoint of one (there is no {MANIFEST})")

@@ -87,6 +87,7 @@ def test_what_is_no_domain_is_refused_with_what_is_allowed(toy: None, capsys: An
     line = error_of(capsys, train.main, *ARGV, "--domain", "nowhere")
     assert "--domain nowhere: allowed are nominal, prior, the folder of a run" in line
     assert "--domain /nowhere: allowed are" in error_of(capsys, train.main, *ARGV, "--domain", "/nowhere")
+    assert "/: neither a run nor a checkpoint of one" in error_of(capsys, train.main, *ARGV, "--domain", "/")
     line = error_of(capsys, train.main, *ARGV, "--domain", "nominal", "--randomize")
     assert "--randomize and --domain nominal: give one of them" in line
     Path("domain.yaml").write_text("domain: somewhere.npz")
