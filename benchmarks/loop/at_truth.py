@@ -49,6 +49,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--task", default="Ant")
     parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--first", type=int, default=0, help="the first seed")
     parser.add_argument(
         "--runs", nargs="+", default=[], help="of the loop: train on the posterior of each, with its seed"
     )
@@ -58,7 +59,7 @@ def main() -> None:
     args.runs = [text for text in args.runs if "=" not in text]
     for run in args.runs:
         print(json.dumps(one(args.task, Run.open(run).config.seed, args.overrides, run)), flush=True)
-    for seed in () if args.runs else range(args.seeds):
+    for seed in () if args.runs else range(args.first, args.first + args.seeds):
         print(json.dumps(one(args.task, seed, args.overrides)), flush=True)
 
 

@@ -3,7 +3,8 @@
     python benchmarks/ppo/ant.py --iterations 500 --num_envs 4096 --brax_steps 10000000
 
 Compilation is counted apart. Brax trains the same environment object through Brax's own protocol, with its published
-Ant hyperparameters; its returns are of its own evaluation episodes. One removed JAX function is put back for it.
+Ant hyperparameters; its returns are of its own evaluation episodes. One removed JAX function is put back for it. With
+`env.impl=warp --brax_impl jax` ours has its physics by MuJoCo Warp and Brax the JAX implementation that it comes with.
 """
 
 import argparse
@@ -76,6 +77,9 @@ def main() -> None:
     parser.add_argument("--iterations", type=int, default=500)
     parser.add_argument("--num_envs", type=int, default=4096)
     parser.add_argument("--brax_steps", type=int, default=0, help="0: leave Brax out")
+    parser.add_argument(
+        "--brax_impl", choices=("same", "jax", "warp"), default="same", help="the physics of Brax's worlds"
+    )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("overrides", nargs="*")
     args = parser.parse_args()
@@ -84,6 +88,9 @@ def main() -> None:
     print(jax.devices(), settings.ppo, flush=True)
     ours(env, settings, args.iterations, args.seed)
     if args.brax_steps:
+        if args.brax_impl != "same":
+            overrides = [f"env.numEnvs={args.num_envs}", *args.overrides, f"env.impl={args.brax_impl}"]
+            env = registry.make(args.task, config=config.load(args.task, overrides=overrides))
         brax(env, args.brax_steps, args.num_envs, args.seed)
 
 
