@@ -98,14 +98,18 @@ def bare_own(
 ) -> Callable[[], Any]:
     """The same, each world with a model of its own: parameters differ from world to world.
 
-    model_of: the model of a world, by default the environment's; template: what a lean state is completed by.
+    model_of: the model of a world, by default the environment's; template: what a lean state is completed by. Both are
+    Warp's own where the environment's physics is.
     """
-    own, start = model_of or env.physics.model_of, template or env.physics.template
+    warp = env.physics.warp
+    own, start, timestep = model_of or env.physics.model_of, template or env.physics.template, mjx.step
+    if warp is not None:
+        own, start, timestep = (lambda world: warp.model_of(world.fields)), warp.data, warp.step
 
     @jax.jit
     def run(worlds: Any, part: Any) -> Any:
         def one(world: Any, part: Any) -> Any:
-            data = mjx.step(own(world), start.replace(**part) if lean else part)
+            data = timestep(own(world), start.replace(**part) if lean else part)
             return {name: getattr(data, name) for name in STATE} if lean else data
 
         def step(part: Any, _: None) -> tuple[Any, None]:

@@ -11,6 +11,8 @@ has a process of its own. Lines of JSON, as they come:
   had), if there were any.
 - *policy*, *sgd*: networks of float32 and of bfloat16 (`ppo.precision`); epochs of more, smaller minibatches.
 - *unroll*: a rollout, timesteps in a loop and in a row (`env.unroll`), with the seconds of its compilation.
+
+With `env.impl=warp`: the update, a rollout and Warp's timesteps alone.
 """
 
 import argparse
@@ -166,9 +168,9 @@ def networks_alone(setting: Setting) -> None:
         setting.say("sgd", {"precision": precision, "minibatches": changed.num_minibatches, "ms": taken})
 
 
-def unrolled(setting: Setting) -> None:
-    """A rollout with timesteps in a loop and in a row."""
-    for unroll in (False, True):
+def unrolled(setting: Setting, *ways: bool) -> None:
+    """A rollout with timesteps in a loop (False) and in a row."""
+    for unroll in ways:
         env = registry.make(setting.named["task"], config=setting.settings, unroll=unroll)
         own = learner(env, setting.ppo)
         collect, compiling = built(lambda state, own=own: gather(own, state, None, state.key), setting.state)
@@ -177,7 +179,11 @@ def unrolled(setting: Setting) -> None:
 
 def measure(task: str, worlds: int, overrides: list[str], margin: float) -> None:
     setting = Setting(task, worlds, overrides)
-    unrolled(setting)
+    if setting.env.physics.warp is not None:  # computes timesteps as a whole: there are no parts to leave out
+        unrolled(setting, False)
+        setting.say("physics", {"impl": "warp", "ms": physics(setting)})
+        return
+    unrolled(setting, False, True)
     networks_alone(setting)
     parts_of_physics(setting, margin)
 
