@@ -53,7 +53,8 @@ class Warp:
             raise UserError(
                 "env.impl = 'warp' needs the package warp-lang: pip install \"bayessim-mjx[warp]\", or set it to jax"
             ) from None
-        self.model = model.tree_replace({"opt._impl.run_rne_postconstraint": True})  # forces on bodies, as tasks want
+        wanted = {"opt._impl.run_rne_postconstraint": True}  # forces on bodies, as tasks want
+        self.model = model.tree_replace(wanted | _quieter(model))
         leaves, _ = jax.tree_util.tree_flatten_with_path(self.model)
         self._shapes = {jax.tree_util.keystr(path, simple=True, separator="."): x.shape for path, x in leaves}
         self.room = max(1, template._impl.contact.dist.shape[0] * max(LEAST_WORLDS, worlds or 0))
@@ -75,6 +76,16 @@ class Warp:
         found = jnp.maximum(after._impl.nacon, after._impl.ncollision)  # contacts, and pairs that might be in contact
         fits = jnp.all(found <= self.room)
         return after.replace(qpos=jnp.where(fits, after.qpos, jnp.nan))
+
+
+def _quieter(model: mjx.Model) -> dict[str, int]:
+    """No line is printed where a solver ends at its limit, for a world and timestep each; MuJoCo tells none either."""
+    try:
+        from mujoco.mjx.third_party.mujoco_warp import OverflowType
+    except ImportError:  # of a version that prints none
+        return {}
+    off = OverflowType.ITERATIONS | OverflowType.LS_ITERATIONS
+    return {"opt._impl.warn_overflow": int(model.opt._impl.warn_overflow) & ~int(off)}
 
 
 def wrenches(model: mjx.Model, data: mjx.Data) -> jax.Array:

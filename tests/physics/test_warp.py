@@ -100,6 +100,17 @@ def test_a_humanoid_moves_as_in_mujoco_once_its_solver_has_converged():
     assert np.median(many) < 1e-3 < np.median(few) and np.all(many < 0.5 * few)
 
 
+@pytest.mark.slow
+@pytest.mark.skipif(not INSTALLED, reason="warp-lang is not installed")
+def test_solvers_that_end_at_their_limit_print_nothing(capfd):
+    """One line for a world and timestep each would be 180 000 of them in a training of Humanoid."""
+    env = registry.make("Humanoid", impl="warp", numEnvs=8)
+    motion = motions(env, jnp.tile(jnp.asarray(env.space.nominal, jnp.float32), (8, 1)), steps=60)
+    jax.block_until_ready(motion)
+    assert jnp.isfinite(motion).all()
+    assert "limit reached" not in "".join(capfd.readouterr())
+
+
 BALL = """
 <mujoco><option timestep="0.002"/><worldbody>
   <geom type="plane" size="5 5 1"/>
