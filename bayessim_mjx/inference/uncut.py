@@ -18,13 +18,13 @@ from jax import Array
 from scipy.special import log_ndtr
 
 from bayessim_mjx.distributions import box
+from bayessim_mjx.inference.temperature import FEW
 from bayessim_mjx.linalg import cholesky, inverse_lower, lower_factor, product
 
 NEAREST, FARTHEST = 0.4, 5.0  # standard deviations from a mean to an end of its range; nearer ones are left alone
 # times its standard deviation that a Gaussian may become: one as wide as the prior is then all but flat
 WIDEST = 3.0
 GRID, STEPS = 93, 24  # of the table: its entries, and steps of Newton and of bisection (off by 1e-7)
-POINTS = 64  # behind a Gaussian's mass inside the cube
 OUTSIDE, FAR = -2.0, -20.0  # log mass inside before and after, below which a Gaussian stays as it is
 
 
@@ -105,7 +105,7 @@ def weighed(logits: Array, means: Array, scales: Array) -> tuple[Array, Array, A
     """
     wide = shapes(means, scales)
     both = (jnp.concatenate(pair, axis=1) for pair in zip((means, scales), wide, strict=True))  # compiled once
-    masses = jax.lax.map(lambda row: box.log_masses(row[0], row[1], POINTS), tuple(both), batch_size=64)
+    masses = jax.lax.map(lambda row: box.log_masses(row[0], row[1], FEW), tuple(both), batch_size=64)
     before, after = jnp.split(masses, 2, axis=1)
     use = (before > OUTSIDE) & (after > FAR) & jnp.all(jnp.isfinite(wide[1]), axis=(-1, -2))
     inside = jnp.where(use, after, before)

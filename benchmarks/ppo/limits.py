@@ -98,13 +98,14 @@ def bare_own(
 ) -> Callable[[], Any]:
     """The same, each world with a model of its own: parameters differ from world to world.
 
-    model_of: the model of a world, by default the environment's; template: what a lean state is completed by. Both are
-    Warp's own where the environment's physics is.
+    model_of: the model of a world; template: what a lean state is completed by. By default both are those that the
+    environment steps, Warp's where its physics is.
     """
     warp = env.physics.warp
-    own, start, timestep = model_of or env.physics.model_of, template or env.physics.template, mjx.step
+    own, start, timestep = env.physics.model_of, env.physics.template, mjx.step
     if warp is not None:
         own, start, timestep = (lambda world: warp.model_of(world.fields)), warp.data, warp.step
+    own, start = model_of or own, template or start
 
     @jax.jit
     def run(worlds: Any, part: Any) -> Any:
