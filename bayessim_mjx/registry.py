@@ -38,8 +38,6 @@ def make(name: str, *, config: "Config | None" = None, effects: "Sequence[Effect
     if name.split(":")[0] in EXTERNAL and ":" in name:
         if config is not None and (config.effects or config.calibrated):
             raise UserError(f"effects: {name} is not simulated here, so it cannot take any; leave them out")
-        if config is not None and config.env.impl == "warp":
-            raise UserError(f"env.impl = {config.env.impl!r}: {name} is not simulated here; leave it out")
         wrapper = importlib.import_module("bayessim_mjx.wrappers.brax")
         return wrapper.make(name, config=config, **env_overrides)
     kind = _task(name)

@@ -54,7 +54,7 @@ class Warp:
                 "env.impl = 'warp' needs the package warp-lang: pip install \"bayessim-mjx[warp]\", or set it to jax"
             ) from None
         wanted = {"opt._impl.run_rne_postconstraint": True}  # forces on bodies, as tasks want
-        self.model = model.tree_replace(wanted | _quieter(model))
+        self.model = model.tree_replace(wanted | quieter(model))
         leaves, _ = jax.tree_util.tree_flatten_with_path(self.model)
         self._shapes = {jax.tree_util.keystr(path, simple=True, separator="."): x.shape for path, x in leaves}
         self.room = max(1, template._impl.contact.dist.shape[0] * max(LEAST_WORLDS, worlds or 0))
@@ -78,7 +78,7 @@ class Warp:
         return after.replace(qpos=jnp.where(fits, after.qpos, jnp.nan))
 
 
-def _quieter(model: mjx.Model) -> dict[str, int]:
+def quieter(model: mjx.Model) -> dict[str, int]:
     """No line is printed where a solver ends at its limit, for a world and timestep each; MuJoCo tells none either."""
     try:
         from mujoco.mjx.third_party.mujoco_warp import OverflowType

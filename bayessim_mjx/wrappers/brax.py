@@ -17,6 +17,7 @@ import mujoco
 from bayessim_mjx.env import Env, Observations, State
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.parameters import ParameterSpace
+from bayessim_mjx.physics.warp import quieter
 from bayessim_mjx.wrappers.under import Under
 
 if TYPE_CHECKING:
@@ -33,14 +34,22 @@ class BraxEnv(Env):
         self._space = ParameterSpace(())
 
     def reset(self, key: jax.Array, theta: jax.Array | None = None) -> State:
-        inner = self.env.reset(key)
+        inner = self._after(self.env.reset(key))
         reward, done, metrics = jax.tree.map(_real, (inner.reward, inner.done, dict(inner.metrics)))
         return self._state(inner.replace(reward=reward, done=done, metrics=metrics), jnp.zeros((), jnp.int32))
 
     def step(self, state: State, action: jax.Array) -> State:
-        inner = self.env.step(state.pipeline_state, jnp.clip(action, -1.0, 1.0))
+        inner = self._after(self.env.step(self._before(state.pipeline_state), jnp.clip(action, -1.0, 1.0)))
         after = self._state(_like(inner, state.pipeline_state), state.info["steps"] + 1)
         return dataclasses.replace(after, info={**state.info, **after.info})
+
+    def _before(self, inner: Any) -> Any:
+        """Its state as its `step` takes it, from what is carried on."""
+        return inner
+
+    def _after(self, inner: Any) -> Any:
+        """What is carried on of its state."""
+        return inner
 
     def _state(self, inner: Any, steps: jax.Array) -> State:
         obs, done = _groups(inner.obs), inner.done
@@ -69,6 +78,25 @@ class BraxEnv(Env):
         return self.env.sys.mj_model if hasattr(self.env, "sys") else self.env.mj_model
 
 
+class WarpEnv(BraxEnv):
+    """One of Playground's whose physics is MuJoCo Warp's.
+
+    Warp's own part of a world's data is scratch, laid out for all worlds together: it is not carried from step to step,
+    where worlds begin anew one by one.
+    """
+
+    def __init__(self, env: Any, name: str, episode_length: int) -> None:
+        super().__init__(env, name, episode_length)
+        env._mjx_model = env.mjx_model.tree_replace(quieter(env.mjx_model))
+        self._scratch = jax.jit(env.reset)(jax.random.PRNGKey(0)).data._impl
+
+    def _before(self, inner: Any) -> Any:
+        return inner.replace(data=inner.data.replace(_impl=self._scratch))
+
+    def _after(self, inner: Any) -> Any:
+        return inner.replace(data=inner.data.replace(_impl=None))
+
+
 def _real(x: Any) -> jax.Array:
     return jnp.asarray(x, jnp.float32)
 
@@ -87,12 +115,20 @@ def _groups(obs: Any) -> Observations:
 
 
 def make(name: str, *, config: "Config | None" = None, **overrides: Any) -> BraxEnv:
-    """`brax:<name>` or `playground:<name>`; env.episodeLength (or the override) sets the episode's length."""
+    """`brax:<name>` or `playground:<name>`; env.episodeLength (or the override) sets the episode's length.
+
+    With `env.impl=warp` Playground's have their physics by MuJoCo Warp, which is these environments' own choice.
+    """
     library, _, rest = name.partition(":")
     length = overrides.pop("episodeLength", None if config is None else config.env.episodeLength)
+    warp = overrides.pop("impl", None if config is None else config.env.impl) == "warp"
     if overrides:
-        raise UserError(f"env.{next(iter(overrides))}: {name} has no such setting (it has: episodeLength)")
-    return {"brax": make_brax, "playground": make_playground}[library](rest, length)
+        raise UserError(f"env.{next(iter(overrides))}: {name} has no such setting (it has: episodeLength, impl)")
+    if library == "playground":
+        return make_playground(rest, length, warp)
+    if warp:
+        raise UserError(f"env.impl = 'warp': {name} is not simulated here; leave it out")
+    return make_brax(rest, length)
 
 
 def make_brax(name: str, episode_length: int | None = None) -> BraxEnv:
@@ -103,8 +139,8 @@ def make_brax(name: str, episode_length: int | None = None) -> BraxEnv:
     return BraxEnv(envs.get_environment(name, backend="mjx"), f"brax:{name}", episode_length or 1000)
 
 
-def make_playground(name: str, episode_length: int | None = None) -> BraxEnv:
-    """The Playground environment `name` with its default settings, on MJX's JAX implementation."""
+def make_playground(name: str, episode_length: int | None = None, warp: bool = False) -> BraxEnv:
+    """The Playground environment `name` with its default settings, on MJX's JAX implementation or MuJoCo Warp."""
     try:
         from mujoco_playground import registry
     except ImportError as error:
@@ -113,7 +149,8 @@ def make_playground(name: str, episode_length: int | None = None) -> BraxEnv:
         ) from error
     _known(name, list(registry.ALL_ENVS), "playground")
     length = episode_length or registry.get_default_config(name).episode_length
-    return BraxEnv(registry.load(name, config_overrides={"impl": "jax"}), f"playground:{name}", length)
+    env = registry.load(name, config_overrides={"impl": "warp" if warp else "jax"})
+    return (WarpEnv if warp else BraxEnv)(env, f"playground:{name}", length)
 
 
 def _known(name: str, names: list[str], library: str) -> None:

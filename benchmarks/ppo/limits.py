@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from mujoco import mjx
+from published import PUBLISHED, ppo_config
 
 from bayessim_mjx import config, device, registry, rl
 from bayessim_mjx.env import Task
@@ -44,12 +45,10 @@ VARIANTS: dict[str, dict[str, Any]] = {  # ways to compile the update
 def setting(task: str, worlds: int, **changes: Any) -> tuple[Any, Any]:
     """(environment, PPO settings) of a task of ours; of `brax:...` and `playground:...` as in the race."""
     if ":" in task:
-        import ppo as race
-
-        published = race.PUBLISHED[task]
+        published = PUBLISHED[task]
         widening = max(1, (worlds or published["num_envs"]) // published["num_envs"])
         env = registry.make(task, episodeLength=published["episode_length"])
-        return env, replace(race.ppo_config(published, widening), **changes)
+        return env, ppo_config(published, widening, **changes)
     settings = config.load(task, overrides=[f"env.numEnvs={worlds}"])
     return registry.make(task, config=settings), replace(settings.ppo, **changes)
 

@@ -29,76 +29,14 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-# Brax's published settings (its training notebook; Playground's brax_ppo_config), with its names
-SHARED = {
-    "reward_scaling": 10, "normalize_observations": True, "num_minibatches": 32, "entropy_cost": 1e-2,
-    "episode_length": 1000,
-}  # fmt: skip
-PUBLISHED = {
-    "brax:ant": SHARED | {
-        "num_timesteps": 50_000_000, "num_evals": 10, "unroll_length": 5, "num_updates_per_batch": 4,
-        "discounting": 0.97, "learning_rate": 3e-4, "num_envs": 4096, "batch_size": 2048,
-    },
-    "brax:inverted_pendulum": SHARED | {
-        "num_timesteps": 2_000_000, "num_evals": 20, "unroll_length": 5, "num_updates_per_batch": 4,
-        "discounting": 0.97, "learning_rate": 3e-4, "num_envs": 2048, "batch_size": 1024,
-    },
-    "playground:CartpoleBalance": SHARED | {
-        "num_timesteps": 60_000_000, "num_evals": 10, "unroll_length": 30, "num_updates_per_batch": 16,
-        "discounting": 0.995, "learning_rate": 1e-3, "num_envs": 2048, "batch_size": 1024, "num_resets_per_eval": 10,
-    },
-    "playground:Go1JoystickFlatTerrain": SHARED | {
-        "reward_scaling": 1.0, "num_timesteps": 200_000_000, "num_evals": 10, "unroll_length": 20,
-        "num_updates_per_batch": 4, "discounting": 0.97, "learning_rate": 3e-4, "num_envs": 8192, "batch_size": 256,
-        "num_resets_per_eval": 10, "max_grad_norm": 1.0, "network_factory": {
-            "policy_hidden_layer_sizes": (512, 256, 128), "value_hidden_layer_sizes": (512, 256, 128),
-            "policy_obs_key": "state", "value_obs_key": "privileged_state",
-        },
-    },
-}  # fmt: skip
-# returns; Playground has none for its joystick, whose races end after --steps or --seconds
-SOLVED = {"brax:ant": 3000.0, "brax:inverted_pendulum": 990.0, "playground:CartpoleBalance": 950.0}
+from published import PUBLISHED, SOLVED, between_restarts, ppo_config
+
 WAYS = {"ours": 1, "wide": 4, "wider": 8, "brax": 1}  # and what the number of worlds is multiplied by
 
 
 def say(row: dict) -> None:
     """A row as a line of JSON."""
     print(json.dumps(row), flush=True)
-
-
-def ppo_config(published: dict, widening: int):
-    """The same settings in our words: samples and minibatches per update, networks, losses."""
-    from bayessim_mjx.config import PPOConfig
-
-    worlds = published["num_envs"] * widening
-    samples = published["batch_size"] * published["num_minibatches"] * published["unroll_length"]
-    networks = published.get("network_factory", {})
-    return PPOConfig(
-        num_envs=worlds,
-        num_steps=max(1, samples // worlds),
-        num_epochs=published["num_updates_per_batch"],
-        num_minibatches=published["num_minibatches"],
-        gamma=published["discounting"],
-        learning_rate=published["learning_rate"],
-        entropy_coef=published["entropy_cost"],
-        reward_scale=published["reward_scaling"],
-        # Brax's defaults
-        gae_lambda=0.95, clip_param=0.3, value_loss_coef=0.25, use_clipped_value_loss=False, schedule="fixed",
-        max_grad_norm=published.get("max_grad_norm", 1e9), normalize_advantage_per_minibatch=True,
-        hidden_actor=networks.get("policy_hidden_layer_sizes", (32,) * 4),
-        hidden_critic=networks.get("value_hidden_layer_sizes", (256,) * 5),
-        activation="swish", state_dependent_std=True, action_bound="tanh", init_std=0.7, weight_init="lecun_uniform",
-        segment=published["unroll_length"],
-    )  # fmt: skip
-
-
-def between_restarts(published: dict) -> float:
-    """Updates after which Brax restarts all worlds, whatever their episodes are at."""
-    if "num_resets_per_eval" not in published:
-        return float("inf")
-    times = (published["num_evals"] - 1) * published["num_resets_per_eval"]
-    update = published["batch_size"] * published["num_minibatches"] * published["unroll_length"]
-    return -(-published["num_timesteps"] // (times * update))
 
 
 class Race:
@@ -139,18 +77,25 @@ class Over(Exception):
     """The race is."""
 
 
-def run_ours(name: str, published: dict, widening: int, seed: int, race: Race, whole: bool) -> dict:
+def made(name: str, impl: str, **settings):
+    """The environment, with MuJoCo Warp's physics where that was asked for."""
+    from bayessim_mjx import registry
+
+    return registry.make(name, **({"impl": impl} if impl == "warp" else {}), **settings)
+
+
+def run_ours(name: str, published: dict, seed: int, race: Race, task: dict) -> dict:
     """Until the goal, or four times the steps; `whole`: all steps, however early the goal is reached."""
     race.mark("python")
     import jax
 
-    from bayessim_mjx import registry, rl
+    from bayessim_mjx import rl
 
     race.mark("imports")
-    config = ppo_config(published, widening)
-    whole_env = registry.make(name, episodeLength=published["episode_length"])
+    config, whole = ppo_config(published, WAYS[task["who"]], **task["ours"]), task["whole"]
+    whole_env = made(name, task["impl"], episodeLength=published["episode_length"])
     length = min(published["episode_length"], between_restarts(published) * config.num_steps)
-    env, share = registry.make(name, episodeLength=length), length / published["episode_length"]
+    env, share = made(name, task["impl"], episodeLength=length), length / published["episode_length"]
     total = max(1, round(published["num_timesteps"] / (config.num_envs * config.num_steps)))
     config = replace(config, log_interval=max(1, total // 50))
     row: dict = {"worlds": config.num_envs, "training": []}
@@ -188,15 +133,13 @@ def judged(env, policies: list) -> list[float]:
     return [round(float(x), 1) for x in found["return"].mean(1)]
 
 
-def run_brax(name: str, published: dict, seed: int, race: Race, whole: bool) -> dict:
+def run_brax(name: str, published: dict, seed: int, race: Race, task: dict) -> dict:
     """Brax's trainer as published, on its own environment."""
     race.mark("python")
     from brax.training.agents.ppo import train
     from brax.training.agents.ppo.networks import make_ppo_networks
 
-    from bayessim_mjx import registry
-
-    options, speeds = dict(published), []
+    options, speeds, whole = dict(published), [], task["whole"]
     if networks := options.pop("network_factory", None):
         options["network_factory"] = functools.partial(make_ppo_networks, **networks)
     if name.startswith("playground:"):
@@ -218,7 +161,7 @@ def run_brax(name: str, published: dict, seed: int, race: Race, whole: bool) -> 
 
     race.mark("imports")
     with contextlib.suppress(Over):
-        train.train(environment=registry.make(name).env, seed=seed, progress_fn=progress, **options)
+        train.train(environment=made(name, task["impl"]).env, seed=seed, progress_fn=progress, **options)
     row = race.row(speeds) | {"reward": race.curve[-1][2], "steps": race.curve[-1][0], "worlds": options["num_envs"]}
     if row["seconds_to_reward"] is not None and not whole:
         row["seconds_without_evals"] = round(row["seconds_to_reward"] - evaluations[0], 2)
@@ -232,11 +175,11 @@ def work(task: dict) -> None:
     name, published = task["env"], PUBLISHED[task["env"]] | task["changes"]
     race = Race(task["started"], SOLVED.get(name, float("inf")), task["limit"])
     if task["who"] == "brax":
-        row = run_brax(name, published, task["seed"], race, task["whole"])
+        row = run_brax(name, published, task["seed"], race, task)
     else:
-        row = run_ours(name, published, WAYS[task["who"]], task["seed"], race, task["whole"])
-    device = jax.devices()[0].device_kind
-    say({"who": task["who"], "env": name, "seed": task["seed"], "device": device, "jax": jax.__version__} | row)
+        row = run_ours(name, published, task["seed"], race, task) | {"ours": task["ours"]}
+    about = {"who": task["who"], "env": name, "impl": task["impl"], "seed": task["seed"]}
+    say(about | {"device": jax.devices()[0].device_kind, "jax": jax.__version__} | row)
 
 
 def race(args: argparse.Namespace) -> None:
@@ -256,6 +199,8 @@ def race(args: argparse.Namespace) -> None:
                     "changes": changes,
                     "whole": whole,
                     "limit": args.seconds,
+                    "impl": args.impl,
+                    "ours": json.loads(args.ours),
                 }
                 words = json.dumps(task | {"started": time.time()})
                 try:
@@ -275,6 +220,8 @@ def main() -> None:
     parser.add_argument("--steps", type=float, default=0, help="environment steps of all; 0: as published")
     parser.add_argument("--whole", action="store_true", help="ours goes on after the goal, too")
     parser.add_argument("--changes", default="{}", help="of the published settings, JSON")
+    parser.add_argument("--ours", default="{}", help='of our PPO settings in the race, JSON: {"precision": "bfloat16"}')
+    parser.add_argument("--impl", choices=("jax", "warp"), default="jax", help="physics of Playground's environments")
     parser.add_argument("--seconds", type=float, default=None, help="after which a race ends with what it has")
     parser.add_argument("--timeout", type=float, default=None, help="seconds after which a race is given up")
     parser.add_argument("--limit", action="store_true")

@@ -70,6 +70,11 @@ def test_settings_of_our_tasks_are_refused():
         make("brax:ant", resetDist=2.0)
 
 
+def test_braxs_own_environments_have_no_warp():
+    with pytest.raises(ValueError, match="env.impl = 'warp': brax:ant is not simulated here"):
+        make("brax:ant", impl="warp")
+
+
 def test_playground_that_is_not_installed_says_how_to_get_it():
     try:
         import mujoco_playground  # noqa: F401
@@ -96,6 +101,24 @@ def test_our_trainer_trains_a_playground_environment():
     env = make("playground:CartpoleBalance")
     _, metrics = rl.train(env, CONFIG, jax.random.PRNGKey(0), iterations=2)
     assert np.isfinite(metrics["Loss/value"])
+
+
+@pytest.mark.slow
+def test_playgrounds_physics_may_be_warps():
+    """The same motion, whatever computes it; episodes begin anew one by one though Warp's scratch is shared."""
+    pytest.importorskip("mujoco_playground")
+    pytest.importorskip("warp")
+    keys, reached = jax.random.split(jax.random.PRNGKey(0), 8), []
+    for impl in ("jax", "warp"):
+        env = make("playground:CartpoleBalance", impl=impl, episodeLength=5)
+        states, step = jax.vmap(env.reset)(keys), jax.jit(jax.vmap(env.step))
+        for _ in range(5):
+            states = step(states, jnp.full((8, 1), 0.5))
+        reached.append(np.asarray(states.obs["policy"]))
+        _, metrics = rl.train(env, CONFIG, jax.random.PRNGKey(0), iterations=2)
+        assert np.isfinite(metrics["Loss/value"])
+    np.testing.assert_allclose(*reached, atol=1e-4)
+    assert np.abs(reached[0] - np.asarray(jax.vmap(env.reset)(keys).obs["policy"])).max() > 0.1
 
 
 def test_what_braxs_trainers_ask_of_jax_is_there():
