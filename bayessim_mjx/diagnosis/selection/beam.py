@@ -105,7 +105,7 @@ def close(table: Table, criteria: Criteria, most: int) -> list[Key]:
 
 def _best(fits: Fitting, criteria: Criteria, most: int) -> Key:
     """The leading model, and those close to it, with their fits brought to their end before they are ranked."""
-    fits.fit(_without_off(fits.table, criteria), "dropping")
+    fits.fit(_without_off(fits.table, criteria), "dropping", needed=True)
     for _ in range(criteria.beam):
         keys = close(fits.table, criteria, most)
         fits.polish(keys)

@@ -23,8 +23,10 @@ class Criteria:
             one error rate for any number of candidates). 5 nats are odds of 150 to 1.
         chance: family-wise error: an effect is named only if it gains more nats than the best candidate does in all but
             this share of null logs (`chance`). Counted: 0.4 to 1.2 % pass (240 logs of each noise).
-        rare: so many times these nats tell where not all conditions gain, if none loses more than the share `harm`
-            (limits that act in few windows were missed by a standard error alone).
+        rare: so many times these nats tell where not all conditions gain, if none loses more than the share `harm` of
+            what all gain (limits that act in few windows, and laws that conditions show unequally, were missed by a
+            standard error alone). Of 573 recorded cases no rate differs from that by a tenth of the condition's cost,
+            which one window far off decides; of real logs it names both frictions of a double pendulum, that one.
         same: the region of practical equivalence: share of what a model leaves of the squared gap that further effects
             have to close, and by which two models' costs (noise included) may differ. On 39 recorded tables with hidden
             effects .15 to .5 name the same, .1 one less.

@@ -66,8 +66,8 @@ class Difference:
     Attributes:
         nats: of held-out log predictive density, and of what data sheets state; deviate: of the former over its
             clustered standard error, as a normal deviate.
-        closed: share of what the worse leaves of the squared gap; worst: share of its cost that the condition that
-            gains least saves.
+        closed: share of what the worse leaves of the squared gap; worst: nats of the condition that gains least, as a
+            share of those of all (negative: it loses).
     """
 
     nats: float
@@ -81,19 +81,16 @@ def compare(table: Table, worse: Key, better: Key) -> Difference:
     old, new = table.rows[worse], table.rows[better]
     gain = log_gain(old, new, table.noise)
     left, above = table.excess(better), table.excess(worse)
-    drop = [_drop(old.cost[table.group == g], new.cost[table.group == g], table.noise) for g in np.unique(table.group)]
+    least = min(float(gain[table.group == g].sum()) for g in np.unique(table.group))
     nats = float(gain.sum()) + new.belief - old.belief
-    return Difference(nats, statistics.normal_deviate(gain, table.group), 1.0 - left / max(above, 1e-9), min(drop))
+    deviate, worst = statistics.normal_deviate(gain, table.group), least / max(abs(float(gain.sum())), 1e-9)
+    return Difference(nats, deviate, 1.0 - left / max(above, 1e-9), worst)
 
 
 def log_gain(old: Row, new: Row, noise: float) -> Array:
     """`[W]` nats of log predictive density that `new` has more: n log(1 + cost / n), in independent residuals."""
     each = new.samples / len(new.cost)
     return np.asarray(each * (np.log(old.cost + noise) - np.log(new.cost + noise)))
-
-
-def _drop(old: Array, new: Array, noise: float) -> float:
-    return float((old.sum() - new.sum()) / (old.sum() + noise * len(old)))
 
 
 def settled(table: Table, key: Key, criteria: Criteria) -> bool:

@@ -73,10 +73,20 @@ def test_what_helps_one_condition_only_is_chance_unless_it_helps_much_and_harms_
     assert named({(): bare, (A,): harmed}, group=GROUP) == set()
 
 
+def test_what_conditions_show_very_unequally_is_told_though_one_loses_a_little():
+    """Friction in a slow and in fast motions: the standard error of unequal gains is large, though all but one gain."""
+    unequal = np.array([900.0, 100.0, 10.0, 2.0, 1.0])[GROUP]
+    harmed = np.where(GROUP == 4, 1.4, 1.0)
+    found = compare(table({(): unequal, (A,): harmed}, group=GROUP), BASE, frozenset([A.label]))
+    assert found.deviate < 2 and -0.1 < found.worst < 0
+    assert named({(): unequal, (A,): harmed}, group=GROUP) == labels(A)
+    assert named({(): unequal, (A,): np.where(GROUP == 4, 90.0, 1.0)}, group=GROUP) == set()
+
+
 def test_a_doubtful_effect_on_top_of_a_sure_one_leaves_the_sure_one_named():
     """Both together are the best, but not in all conditions: alone they would not tell that anything is missing."""
     bare, one = np.where(GROUP == 3, 400.0, 50.0), np.where(GROUP == 3, 1.0, 50.0)
-    both = np.select([GROUP == 0, GROUP == 1], [30.0, 60.0], one)
+    both = np.select([GROUP == 0, GROUP == 1], [30.0, 100.0], one)
     assert named({(): bare, (A, B): both}, group=GROUP) == set()
     found = decided({(): bare, (A,): one, (B,): bare, (C,): 0.9 * bare, (A, B): both}, group=GROUP)
     assert found.answer == labels(A) and not found.rivals  # what shows nothing is no rival
