@@ -14,9 +14,10 @@ from bayessim_mjx.blind.check import Check, effects_of, unasked
 from bayessim_mjx.blind.reality import twin
 from bayessim_mjx.blind.reality.drives import quickest
 from bayessim_mjx.blind.reality.ground import ground
-from bayessim_mjx.blind.reality.menu import KNOWN
-from bayessim_mjx.blind.reality.plant import Plant
+from bayessim_mjx.blind.reality.menu import CAUSES, KNOWN
+from bayessim_mjx.blind.reality.plant import Plant, scales_of
 from bayessim_mjx.blind.reality.strength import Ruler, resize
+from bayessim_mjx.blind.robot import Motion
 from bayessim_mjx.blind.worker import command
 from bayessim_mjx.effects import make
 from bayessim_mjx.effects.ground_height import ground as ground_of_the_library
@@ -78,6 +79,43 @@ def test_the_librarys_effect_with_the_true_parameters_moves_as_the_cause_does(na
     change = run.clean[1:, 0] - plain.clean[1:, 0]
     own = simulated(rig, run, PLACES, name, cause.parameters()) - simulated(rig, run, PLACES, name, {})
     assert np.abs(own - change).max() < CLOSE.get(name, 0.05) * np.abs(change).max()
+
+
+TWO = """<mujoco><option timestep=".005" integrator="implicitfast"/>
+<default><geom type="capsule" contype="0" conaffinity="0" size=".03"/>
+<joint axis="0 1 0" damping=".08" armature=".01"/></default>
+<worldbody><body name="base"><geom type="sphere" size=".05" mass="3"/>
+<body name="upper"><joint name="shoulder"/><geom fromto="0 0 0 0 0 -.3" mass=".8"/>
+<body name="lower" pos="0 0 -.3"><joint name="elbow"/><geom fromto="0 0 0 0 0 -.25" mass=".5"/></body></body></body>
+</worldbody><actuator><motor name="one" joint="shoulder" ctrlrange="-9 9"/>
+<motor name="two" joint="elbow" ctrlrange="-4 4"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize(("where", "told"), [("one", "to_next"), ("two", "to_previous")])
+def test_the_librarys_coupling_moves_as_the_cause_does(where, told):
+    rig = Motion("two", TWO, 0.01, False, (9.0, 4.0), (0.9, 0.3), (0.4, 0.3), (0.5, 0.5), 0.5, (4e-4, 4e-4), only=2)
+    plant = Plant(rig, {})
+    scales = scales_of(plant, [rig.record(plant, 2, 0, noise=False)])
+    assert scales.chain == {"shoulder": ("", "elbow"), "elbow": ("shoulder", "")}
+    cause = CAUSES["effort_coupling"](where, scales, np.random.default_rng(0), 0.1)
+    found = {k: v for k, v in cause.parameters().items() if v}
+    assert list(found) == [told] and abs(found[told]) == pytest.approx(0.1)
+    run, plain = (rig.record(Plant(rig, {}, own), 2, 0, noise=False) for own in ([cause], []))
+    names = {"effort_coupling": where}
+
+    def own(log, parameters):
+        return simulated(rig, log, names, "effort_coupling", parameters)
+
+    # commands are those of a controller outside, so each run is compared with its own
+    apart = [np.abs(own(r, p) - r.clean[1:, 0]).max() for r, p in ((run, cause.parameters()), (run, {}), (plain, {}))]
+    assert apart[0] < 0.1 * apart[1] and apart[0] < 3 * apart[2] + 1e-3
+    (again,) = twin.twins(rig, scales, [{"name": "effort_coupling", "where": where, "parameters": told_as(cause)}])
+    assert again.parameters() == pytest.approx(cause.parameters()) and again.other == cause.other
+
+
+def told_as(cause):
+    """A cause's parameters as a diagnosis.json has them."""
+    return {name: {"mean": value} for name, value in cause.parameters().items()}
 
 
 @pytest.mark.parametrize("timestep", [0.0005, 0.005])

@@ -55,6 +55,7 @@ class Scales:
         direct: actuators without a filter of their own; led: those that follow positions or velocities.
         length: m, of the rod that turns as hard, by body that turns; axis: of its own hinge, [3] in its frame, zeros of
             a body that has another number of them. ground: whether there is any that can be touched.
+        chain: (joint before, first joint behind) of each joint, "" where there is none.
     """
 
     force: dict[str, float]
@@ -76,6 +77,7 @@ class Scales:
     length: dict[str, float]
     axis: dict[str, np.ndarray]
     ground: bool
+    chain: dict[str, tuple[str, str]]
 
 
 class Cause:

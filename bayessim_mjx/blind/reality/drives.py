@@ -37,6 +37,27 @@ class GainDrift(ChangingGain):
         return {"drift": self.sign * self.size}
 
 
+class EffortCoupling(ActuatorCause):
+    """Part of this actuator's effort arrives at the joint before or behind its own (a differential, a taut cable)."""
+
+    name = "effort_coupling"
+    stepped = True
+
+    def draw(self, rng: np.random.Generator) -> None:
+        self.sign = float(rng.choice([-1, 1]))
+        before, behind = self.scales.chain[self.joint]
+        self.other = str(rng.choice([j for j in (before, behind) if j]))
+
+    def force(self, plant: Simulated) -> None:
+        effort = plant.data.qfrc_actuator[plant.dof(self.joint)]
+        plant.data.qfrc_applied[plant.dof(self.other)] += self.sign * self.size * effort
+
+    def parameters(self) -> dict[str, float]:
+        behind = self.other == self.scales.chain[self.joint][1]
+        share = self.sign * self.size
+        return {"to_next": share if behind else 0.0, "to_previous": 0.0 if behind else share}
+
+
 class AccelerationLimit(ActuatorCause):
     """The quickest way to the command within a speed and an acceleration, planned anew in every sub-step.
 

@@ -1,5 +1,7 @@
 """Links of a compiled model: whether they turn, how long they are, about which axis."""
 
+from collections.abc import Sequence
+
 import mujoco
 import numpy as np
 
@@ -27,3 +29,19 @@ def axis(model: mujoco.MjModel, body: int) -> np.ndarray:
     own = range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body])
     hinges = [i for i in own if int(model.jnt_type[i]) == int(mujoco.mjtJoint.mjJNT_HINGE)]
     return model.jnt_axis[hinges[0]].copy() if len(hinges) == 1 else np.zeros(3)
+
+
+def chain(model: mujoco.MjModel, joints: Sequence[str]) -> dict[str, tuple[str, str]]:
+    """(joint before, first joint behind) of each; a joint of another kind in between parts them."""
+    before: dict[str, str] = {}
+    for name in joints:
+        at = model.joint(name).id
+        body = int(model.jnt_bodyid[at])
+        way = [i for i in range(model.body_jntadr[body], at)]  # those of its own body that come first
+        while not way and body:
+            body = int(model.body_parentid[body])
+            way = list(range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body]))
+        last = model.joint(way[-1]).name if way else ""
+        before[name] = last if last in joints else ""
+    behind = {other: name for name, other in reversed(before.items()) if other}
+    return {name: (before[name], behind.get(name, "")) for name in joints}

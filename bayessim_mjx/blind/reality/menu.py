@@ -25,8 +25,10 @@ def places(system: Rig, effect: str, scales: Scales) -> list[str]:
     """Where the effect makes sense on this robot."""
     kind = CAUSES[effect].kind
     if kind == "actuator":
-        alone = effect == "unknown_cross_coupling" and len(scales.force) < 2
-        able = {"actuator_lag": scales.direct, "acceleration_limit": scales.led}.get(effect, scales.drives)
+        alone = effect == "unknown_cross_spring" and len(scales.force) < 2
+        linked = [a for a, joint in scales.drives.items() if any(scales.chain[joint])]
+        some = {"actuator_lag": scales.direct, "acceleration_limit": scales.led, "effort_coupling": linked}
+        able = some.get(effect, scales.drives)
         return [] if alone else [a for a in scales.drives if a in able]
     if effect == "ground_height":
         return ["world"] if system.touching and scales.ground else []

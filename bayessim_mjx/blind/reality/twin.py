@@ -84,6 +84,13 @@ def _cogging(cause: Any, p: Parameters) -> None:
     cause.count = p["order"]
 
 
+def _coupling(cause: Any, p: Parameters) -> None:
+    ahead = abs(p["to_next"]) >= abs(p["to_previous"])
+    share = p["to_next"] if ahead else p["to_previous"]
+    cause.size, cause.sign = abs(share), math.copysign(1.0, share)
+    cause.other = cause.scales.chain[cause.joint][1 if ahead else 0] or cause.other
+
+
 def _tilt(cause: Any, p: Parameters) -> None:
     along, aside = math.sin(p["pitch"]), -math.sin(p["roll"]) * math.cos(p["pitch"])
     cause.size, cause.heading = math.asin(min(math.hypot(along, aside), 1.0)), math.atan2(aside, along)
@@ -98,7 +105,8 @@ WRITTEN: dict[str, Callable[[Any, Parameters], None]] = {
     "speed_torque_limit": _speed_torque, "cogging": _cogging, "gravity_tilt": _tilt,
     "joint_offset": _signed("offset"), "sensor_delay": _size("delay"), "sensor_filter": _size("time_constant"),
     "sensor_gain": _signed("gain", 1.0), "lugre_friction": _lugre, "cable_tension": _cable,
-    "gain_drift": _signed("drift"), "acceleration_limit": _profile, "inertial_parameters": _inertial,
+    "gain_drift": _signed("drift"), "effort_coupling": _coupling, "acceleration_limit": _profile,
+    "inertial_parameters": _inertial,
     "gravity_compensation": _signed("share"), "ground_height": _signed("height"),
     "effort_loss": lambda c, p: setattr(c, "size", max(p["loss"] * c.scales.effort[c.where], 0.0)),
     "rate_limit": lambda c, p: setattr(c, "size", max(p["slowness"] * c.scales.rate[c.where], 0.0)),

@@ -24,18 +24,21 @@ class PositionHysteresis(Friction):
         return self.size * max(math.sin(self.wave * q + self.phase), 1e-3)
 
 
-class CrossCoupling(ActuatorCause):
-    """Part of this actuator's effort arrives at another joint (a differential, a taut cable)."""
+class CrossSpring(ActuatorCause):
+    """A hose or cable over two joints: a torque at this actuator's joint that depends on another one's position."""
 
-    name = "unknown_cross_coupling"
+    name = "unknown_cross_spring"
     stepped = True
 
     def draw(self, rng: np.random.Generator) -> None:
         self.other = str(rng.choice([j for j in self.scales.force if j != self.joint]))
+        low, high = self.scales.travel[self.other]
+        self.wave, self.middle = rng.uniform(1.0, 2.5) * np.pi / (high - low), rng.uniform(low, high)
+        self.largest = 3 * self.scales.force[self.joint]
 
     def force(self, plant: Simulated) -> None:
-        effort = plant.data.qfrc_actuator[plant.dof(self.joint)]
-        plant.data.qfrc_applied[plant.dof(self.other)] += self.size * effort
+        way = float(plant.data.qpos[plant.address(self.other)]) - self.middle
+        plant.data.qfrc_applied[plant.dof(self.joint)] += self.size * math.sin(self.wave * way)
 
 
 class VaryingGain(ChangingGain):
