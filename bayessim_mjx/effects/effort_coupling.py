@@ -31,7 +31,8 @@ class EffortCoupling(Effect):
 
     name: ClassVar[str] = "effort_coupling"
     kind: ClassVar[str] = "actuator"
-    noun: ClassVar[str] = "effort that arrives at a neighbouring joint"
+    noun: ClassVar[str] = "coupling to a neighbouring joint"
+    lacks: ClassVar[str] = "a coupling to a neighbouring joint"
     separates: ClassVar[str] = "one drive at work while its neighbour holds, then is off"
     witness: ClassVar[tuple[str, str] | None] = ("effort", "torque sensors on the link side of both joints")
     tied: ClassVar[bool] = False

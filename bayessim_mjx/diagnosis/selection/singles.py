@@ -6,9 +6,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
-from bayessim_mjx.diagnosis.fitting.fitter import Fitter
+from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 from bayessim_mjx.diagnosis.selection.beam import CLOSE
 from bayessim_mjx.diagnosis.selection.bounds import widen_leading
+from bayessim_mjx.diagnosis.selection.budget import KNOWN
 from bayessim_mjx.diagnosis.selection.criteria import Criteria
 from bayessim_mjx.diagnosis.selection.models import scored
 from bayessim_mjx.diagnosis.selection.pool import AFRESH, Pool, Progress, fit_models, polish
@@ -35,16 +36,23 @@ def begin(
     keep: Callable[[Pool], None] = lambda pool: None,
 ) -> Pool:
     """The pool with the known parameters; `keep` is called with it after each part, also of what follows."""
+
+    def in_time(made: int, fits: Sequence[Fit], running: Sequence[int]) -> Sequence[int]:
+        return () if made > 1 and settings.budget.over(KNOWN) else running
+
     say("compiling the simulator", 0, 1)
     nominal = fitter.begin(fitter.base)
     say("known parameters", 0, 1)
-    began = settings.budget.now()
+    began, before = settings.budget.now(), fitter.simulator.rollouts
     fit = nominal
     for _ in range(2):  # the second time from start states' columns of its own
-        (fit,) = fitter.iterate([replace(fit, **AFRESH)], 10, lambda f: range(len(f.coordinates)))
+        (fit,) = fitter.iterate([replace(fit, **AFRESH)], 10, lambda f: range(len(f.coordinates)), keep=in_time)
         fit = fitter.refresh(fit)
+        if settings.budget.over(KNOWN):
+            break
     base = scored(fitter, fit, ())
-    settings = _affordable(fitter, candidates, settings, settings.budget.now() - began)
+    each = (settings.budget.now() - began) / max(fitter.simulator.rollouts - before, 1)
+    settings = _affordable(candidates, settings, each)
     pool = Pool(fitter, candidates, settings, criteria, nominal, base, keep=keep)
     if pool.rough:
         (pool.base,) = polish(pool, [base])
@@ -77,11 +85,10 @@ def promising(screened: Sequence[Screened], settings: Settings) -> list[Screened
     return [*led, *kept][: max(settings.singles, len(led))]
 
 
-def _affordable(fitter: Fitter, candidates: Sequence[Candidate], settings: Settings, seconds: float) -> Settings:
-    """Fewer windows to screen on where time is limited, by the seconds that the fit of the known parameters took."""
+def _affordable(candidates: Sequence[Candidate], settings: Settings, seconds: float) -> Settings:
+    """Fewer windows to screen on where time is limited, by the seconds that one of them took in a fit."""
     if not settings.budget.limited:
         return settings
-    worlds = len(fitter.simulator.windows) * 10 * (1 + len(fitter.base))  # of that fit, about
     points = max(sum(len(c.probes) for c in candidates), 1)
-    windows = settings.budget.left("screening") * worlds / max(seconds, 1e-3) / points
+    windows = settings.budget.left("screening") / max(seconds, 1e-9) / points
     return replace(settings, screened=int(min(max(windows, SIZES.fewest), settings.screened)))

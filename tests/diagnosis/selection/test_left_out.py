@@ -1,11 +1,15 @@
 """What a search did not fit is listed with the reason; a limit of time is told."""
 
+import dataclasses
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from bayessim_mjx.diagnosis import phrases
+from bayessim_mjx.diagnosis.selection import singles
 from bayessim_mjx.diagnosis.selection.budget import ENDS, Budget, begun
+from bayessim_mjx.diagnosis.selection.criteria import Criteria
 from bayessim_mjx.diagnosis.selection.left_out import not_fitted, not_tried
 from bayessim_mjx.diagnosis.selection.tried import Settings
 
@@ -44,3 +48,59 @@ def test_parts_end_one_after_the_other_and_without_a_limit_never():
     assert list(ENDS.values()) == sorted(ENDS.values())
     assert not begun(None).over("screening") and not begun(None).limited
     assert begun(2.0).left("single effects") == pytest.approx(120 * ENDS["single effects"], abs=1.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class Rough:
+    """A fit that says how many steps were made in all."""
+
+    steps: int = 0
+    coordinates: tuple = ()
+    history: tuple = ()
+    damping: float = 0.0
+    reach: float = 1.0
+
+
+class Slow:
+    """Each step of a fit takes ten seconds."""
+
+    base = ()
+
+    def __init__(self):
+        self.seconds, self.refreshed, self.simulator = 0.0, 0, SimpleNamespace(rollouts=0)
+
+    def begin(self, coordinates):
+        return Rough()
+
+    def refresh(self, fit):
+        self.refreshed += 1
+        return fit
+
+    def iterate(self, fits, iterations, fresh, keep):
+        (fit,) = fits
+        for made in range(iterations):
+            if not list(keep(made, [fit], range(1))):
+                break
+            fit = dataclasses.replace(fit, steps=fit.steps + 1)
+            self.seconds, self.simulator.rollouts = self.seconds + 10, self.simulator.rollouts + 100
+        return [fit]
+
+
+@pytest.mark.parametrize(("limit", "steps", "refreshed", "windows"), [(400.0, 6, 1, 8), (1e9, 20, 2, 20)])
+def test_the_fit_of_the_known_parameters_ends_with_its_share_of_the_time(monkeypatch, limit, steps, refreshed, windows):
+    """Ten steps twice where there is time for them; .15 of 400 s are six. Windows are then screened as time allows."""
+    fitter, seen = Slow(), {}
+    settings = Settings(budget=Budget(limit, 0.0, lambda: fitter.seconds), screened=20)
+    candidates = [SimpleNamespace(probes=np.zeros((40, 1)))] * 2
+
+    def screen(fitter, fit, candidates, screened, say, secants):
+        seen.update(steps=fit.steps, screened=screened)
+        return []
+
+    monkeypatch.setattr(singles, "scored", lambda fitter, fit, effects: SimpleNamespace(fit=fit))
+    monkeypatch.setattr(singles, "screen", screen)
+    monkeypatch.setattr(singles.Pool, "rough", False)
+    monkeypatch.setattr(singles.Pool, "begun", lambda pool, fit: fit)
+    singles.begin(fitter, candidates, settings, Criteria())
+    assert (seen["steps"], fitter.refreshed) == (steps, refreshed)
+    assert seen["screened"] == windows  # 20 s for 80 points at .1 s a window are 2, but never fewer than 8
