@@ -67,8 +67,8 @@ def test_where_nothing_is_wrong_only_a_few_single_effects_are_fitted_for_the_tab
     contact = SimpleNamespace(dist=np.zeros(0))
     physics = SimpleNamespace(template=SimpleNamespace(_impl=SimpleNamespace(contact=contact)))
     fitter = SimpleNamespace(
-        base=(), size=50.0, simulator=SimpleNamespace(physics=physics), begin=lambda base: point,
-        iterate=lambda fits, *rest: fits, refresh=lambda fit: fit,
+        base=(), size=50.0, simulator=SimpleNamespace(physics=physics, rollouts=0), begin=lambda base: point,
+        iterate=lambda fits, *rest, keep: fits, refresh=lambda fit: fit,
     )  # fmt: skip
     plans = []
     monkeypatch.setattr(singles, "replace", lambda fit, **changes: fit)
