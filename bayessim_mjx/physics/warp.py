@@ -48,11 +48,7 @@ class Warp:
         try:
             model = mjx.put_model(mj_model, impl="warp")
         except RuntimeError as error:
-            if "warp-lang" not in str(error):
-                raise
-            raise UserError(
-                "env.impl = 'warp' needs the package warp-lang: pip install \"bayessim-mjx[warp]\", or set it to jax"
-            ) from None
+            raise without_warp(error) from None
         wanted = {"opt._impl.run_rne_postconstraint": True}  # forces on bodies, as tasks want
         self.model = model.tree_replace(wanted | quieter(model))
         leaves, _ = jax.tree_util.tree_flatten_with_path(self.model)
@@ -76,6 +72,15 @@ class Warp:
         found = jnp.maximum(after._impl.nacon, after._impl.ncollision)  # contacts, and pairs that might be in contact
         fits = jnp.all(found <= self.room)
         return after.replace(qpos=jnp.where(fits, after.qpos, jnp.nan))
+
+
+def without_warp(error: RuntimeError) -> Exception:
+    """What to raise where MJX could not make a model for Warp: how to get Warp where that is missing, else the same."""
+    if "warp-lang" not in str(error):
+        return error
+    return UserError(
+        "env.impl = 'warp' needs the package warp-lang: pip install \"bayessim-mjx[warp]\", or set it to jax"
+    )
 
 
 def quieter(model: mjx.Model) -> dict[str, int]:

@@ -14,10 +14,11 @@ import jax
 import jax.numpy as jnp
 import mujoco
 
+from bayessim_mjx.config.settings import IMPLEMENTATIONS
 from bayessim_mjx.env import Env, Observations, State
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.parameters import ParameterSpace
-from bayessim_mjx.physics.warp import quieter
+from bayessim_mjx.physics.warp import quieter, without_warp
 from bayessim_mjx.wrappers.under import Under
 
 if TYPE_CHECKING:
@@ -121,12 +122,14 @@ def make(name: str, *, config: "Config | None" = None, **overrides: Any) -> Brax
     """
     library, _, rest = name.partition(":")
     length = overrides.pop("episodeLength", None if config is None else config.env.episodeLength)
-    warp = overrides.pop("impl", None if config is None else config.env.impl) == "warp"
+    impl = overrides.pop("impl", "jax" if config is None else config.env.impl)
+    if impl not in IMPLEMENTATIONS:
+        raise UserError(f"env.impl = {impl!r}: allowed are {', '.join(IMPLEMENTATIONS)}")
     if overrides:
         raise UserError(f"env.{next(iter(overrides))}: {name} has no such setting (it has: episodeLength, impl)")
     if library == "playground":
-        return make_playground(rest, length, warp)
-    if warp:
+        return make_playground(rest, length, impl == "warp")
+    if impl == "warp":
         raise UserError(f"env.impl = 'warp': {name} is not simulated here; leave it out")
     return make_brax(rest, length)
 
@@ -149,8 +152,12 @@ def make_playground(name: str, episode_length: int | None = None, warp: bool = F
         ) from error
     _known(name, list(registry.ALL_ENVS), "playground")
     length = episode_length or registry.get_default_config(name).episode_length
-    env = registry.load(name, config_overrides={"impl": "warp" if warp else "jax"})
-    return (WarpEnv if warp else BraxEnv)(env, f"playground:{name}", length)
+    if not warp:
+        return BraxEnv(registry.load(name, config_overrides={"impl": "jax"}), f"playground:{name}", length)
+    try:
+        return WarpEnv(registry.load(name, config_overrides={"impl": "warp"}), f"playground:{name}", length)
+    except RuntimeError as error:
+        raise without_warp(error) from None
 
 
 def _known(name: str, names: list[str], library: str) -> None:

@@ -73,6 +73,8 @@ def test_settings_of_our_tasks_are_refused():
 def test_braxs_own_environments_have_no_warp():
     with pytest.raises(ValueError, match="env.impl = 'warp': brax:ant is not simulated here"):
         make("brax:ant", impl="warp")
+    with pytest.raises(ValueError, match="env.impl = 'cpp': allowed are jax, warp, auto"):
+        make("playground:CartpoleBalance", impl="cpp")
 
 
 def test_playground_that_is_not_installed_says_how_to_get_it():
