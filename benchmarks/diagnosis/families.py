@@ -13,7 +13,7 @@ FAMILIES = (
     ("payload", "gravity_tilt", "external_force", "joint_spring", "joint_offset", "actuator_bias", "cogging",
      "gravity_compensation", "cable_tension", "inertial_parameters"),
     ("actuator_gain", "sensor_gain", "armature", "payload", "actuator_saturation", "effort_loss", "speed_torque_limit",
-     "gain_drift", "inertial_parameters"),
+     "gain_drift", "inertial_parameters", "effort_coupling"),
     ("contact_friction", "contact_compliance", "ground_height"),
 )  # fmt: skip
 
