@@ -93,7 +93,7 @@ def test_without_time_the_first_answer_says_what_was_not_tried(setup, monkeypatc
     """The clock strikes whenever it is read: the first effect is fitted, the others have no time."""
     clock = itertools.count()
     monkeypatch.setattr(pool, "RULES", dataclasses.replace(pool.RULES, batch=1))
-    short = searched(setup, seconds=12.0, now=lambda: float(next(clock)))
+    short = searched(setup, seconds=36.0, now=lambda: float(next(clock)))
     assert short.answer.label == SPRING and len(short.cut_short) == 2
     assert not_fitted(short) == {phrases.NO_TIME_LEFT: sorted(short.cut_short, key=labels(setup).index)}
     assert "no time was left for 2 single effects" in not_tried(short)
