@@ -204,6 +204,13 @@ def check_limits(value: Any, limits: Mapping[str, Any], path: str, source: str =
             raise UserError(f"{path} = {item!r}{where}: must be greater than {limits['above']}")
 
 
+def implementation(name: str) -> str:
+    """`name`, where it is one of MJX's; UserError else."""
+    if name not in IMPLEMENTATIONS:
+        raise UserError(f"env.impl = {name!r}: allowed are {', '.join(IMPLEMENTATIONS)}")
+    return name
+
+
 @dataclass(frozen=True)
 class EnvConfig(Section):
     """`env:`. Keys of one task only (`options`) are those its cfg/<task>.yaml lists; read like a mapping too."""

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import mujoco
 
 from bayessim_mjx.config.of_file import OfFile
-from bayessim_mjx.config.settings import IMPLEMENTATIONS
+from bayessim_mjx.config.settings import IMPLEMENTATIONS, implementation
 from bayessim_mjx.effects.effect import Effect
 from bayessim_mjx.effects.support.reading import stack
 from bayessim_mjx.effects.support.storage import corrected
@@ -104,8 +104,7 @@ class Task(Env):
                 hint = f"; did you mean {close[0]}?" if close else ""
                 raise UserError(f"env.{key}: {self.name} has no such setting{hint} (it has: {', '.join(known)})")
         settings = {**known, **values}
-        if settings["impl"] not in IMPLEMENTATIONS:
-            raise UserError(f"env.impl = {settings['impl']!r}: allowed are {', '.join(IMPLEMENTATIONS)}")
+        implementation(settings["impl"])
         if settings["variant"] not in VARIANTS:
             raise UserError(f"env.variant = {settings['variant']!r}: allowed are {', '.join(VARIANTS)}")
         return settings

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 
-from bayessim_mjx.config.settings import IMPLEMENTATIONS
+from bayessim_mjx.config.settings import implementation
 from bayessim_mjx.env import Env, Observations, State
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.parameters import ParameterSpace
@@ -122,9 +122,7 @@ def make(name: str, *, config: "Config | None" = None, **overrides: Any) -> Brax
     """
     library, _, rest = name.partition(":")
     length = overrides.pop("episodeLength", None if config is None else config.env.episodeLength)
-    impl = overrides.pop("impl", "jax" if config is None else config.env.impl)
-    if impl not in IMPLEMENTATIONS:
-        raise UserError(f"env.impl = {impl!r}: allowed are {', '.join(IMPLEMENTATIONS)}")
+    impl = implementation(overrides.pop("impl", "jax" if config is None else config.env.impl))
     if overrides:
         raise UserError(f"env.{next(iter(overrides))}: {name} has no such setting (it has: episodeLength, impl)")
     if library == "playground":

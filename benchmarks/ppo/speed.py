@@ -77,25 +77,18 @@ class Over(Exception):
     """The race is."""
 
 
-def made(name: str, impl: str, **settings):
-    """The environment, with MuJoCo Warp's physics where that was asked for."""
-    from bayessim_mjx import registry
-
-    return registry.make(name, **({"impl": impl} if impl == "warp" else {}), **settings)
-
-
 def run_ours(name: str, published: dict, seed: int, race: Race, task: dict) -> dict:
     """Until the goal, or four times the steps; `whole`: all steps, however early the goal is reached."""
     race.mark("python")
     import jax
 
-    from bayessim_mjx import rl
+    from bayessim_mjx import registry, rl
 
     race.mark("imports")
     config, whole = ppo_config(published, WAYS[task["who"]], **task["ours"]), task["whole"]
-    whole_env = made(name, task["impl"], episodeLength=published["episode_length"])
+    whole_env = registry.make(name, impl=task["impl"], episodeLength=published["episode_length"])
     length = min(published["episode_length"], between_restarts(published) * config.num_steps)
-    env, share = made(name, task["impl"], episodeLength=length), length / published["episode_length"]
+    env, share = registry.make(name, impl=task["impl"], episodeLength=length), length / published["episode_length"]
     total = max(1, round(published["num_timesteps"] / (config.num_envs * config.num_steps)))
     config = replace(config, log_interval=max(1, total // 50))
     row: dict = {"worlds": config.num_envs, "training": []}
@@ -139,6 +132,8 @@ def run_brax(name: str, published: dict, seed: int, race: Race, task: dict) -> d
     from brax.training.agents.ppo import train
     from brax.training.agents.ppo.networks import make_ppo_networks
 
+    from bayessim_mjx import registry
+
     options, speeds, whole = dict(published), [], task["whole"]
     if networks := options.pop("network_factory", None):
         options["network_factory"] = functools.partial(make_ppo_networks, **networks)
@@ -161,7 +156,7 @@ def run_brax(name: str, published: dict, seed: int, race: Race, task: dict) -> d
 
     race.mark("imports")
     with contextlib.suppress(Over):
-        train.train(environment=made(name, task["impl"]).env, seed=seed, progress_fn=progress, **options)
+        train.train(environment=registry.make(name, impl=task["impl"]).env, seed=seed, progress_fn=progress, **options)
     row = race.row(speeds) | {"reward": race.curve[-1][2], "steps": race.curve[-1][0], "worlds": options["num_envs"]}
     if row["seconds_to_reward"] is not None and not whole:
         row["seconds_without_evals"] = round(row["seconds_to_reward"] - evaluations[0], 2)

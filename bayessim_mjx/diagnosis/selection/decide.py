@@ -81,10 +81,10 @@ def compare(table: Table, worse: Key, better: Key) -> Difference:
     old, new = table.rows[worse], table.rows[better]
     gain = log_gain(old, new, table.noise)
     left, above = table.excess(better), table.excess(worse)
-    least = min(float(gain[table.group == g].sum()) for g in np.unique(table.group))
-    nats = float(gain.sum()) + new.belief - old.belief
-    deviate, worst = statistics.normal_deviate(gain, table.group), least / max(abs(float(gain.sum())), 1e-9)
-    return Difference(nats, deviate, 1.0 - left / max(above, 1e-9), worst)
+    total = float(gain.sum())
+    worst = min(float(gain[table.group == g].sum()) for g in np.unique(table.group)) / max(abs(total), 1e-9)
+    deviate = statistics.normal_deviate(gain, table.group)
+    return Difference(total + new.belief - old.belief, deviate, 1.0 - left / max(above, 1e-9), worst)
 
 
 def log_gain(old: Row, new: Row, noise: float) -> Array:
