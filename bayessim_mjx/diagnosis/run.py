@@ -17,6 +17,7 @@ from threadpoolctl import threadpool_limits
 from bayessim_mjx.diagnosis import resumed
 from bayessim_mjx.diagnosis.experiment import propose
 from bayessim_mjx.diagnosis.findings import Findings, Progress, Where
+from bayessim_mjx.diagnosis.fitting.cutting import TooLittleData
 from bayessim_mjx.diagnosis.fitting.robot import Robot, Source, robot_of
 from bayessim_mjx.diagnosis.logcheck import channels
 from bayessim_mjx.diagnosis.residual import black_boxes, frequency, where
@@ -27,7 +28,7 @@ from bayessim_mjx.diagnosis.selection import budget, heldout, selected
 from bayessim_mjx.diagnosis.selection.criteria import Criteria
 from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.selection.tried import Settings, Tried
-from bayessim_mjx.diagnosis.setup import Setup, TooLittleData, prepare
+from bayessim_mjx.diagnosis.setup import Setup, prepare
 from bayessim_mjx.diagnosis.summary import assemble, first_look, whole_logs
 from bayessim_mjx.diagnosis.summary.files import Files
 from bayessim_mjx.effects.effect import Effect
@@ -151,6 +152,7 @@ def investigate(
     say("looking at the logs", 0, 1)
     time_left, criteria = budget.begun(minutes), _smaller(criteria or Criteria()) if quick else criteria or Criteria()
     asked: dict[str, Any] = {"group": group, "seed": seed, "settings": settings, "tolerated": tolerated, "notes": notes}
+    asked |= {"budget": time_left}
     setup = prepare(robot, logs, effects, quick=quick, **asked, seen_first=lambda seen: tell(first_look.lines(seen)))
     setup = resumed.remembering(_within(setup, time_left), criteria, remember)
     for text in setup.said:
@@ -171,7 +173,7 @@ def investigate(
 
 
 def _in_time(stage: Stage, found: Findings, say: Progress, time_left: budget.Budget) -> Findings:
-    if time_left.now() - time_left.began <= time_left.seconds:
+    if time_left.spent <= time_left.seconds:
         return _after(stage, found, say)
     return replace(found, warnings=(*found.warnings, f"{stage.name}: left out, the time was over"))
 

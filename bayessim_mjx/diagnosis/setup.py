@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -25,10 +24,13 @@ from bayessim_mjx.diagnosis.fitting import (
     windows,
 )
 from bayessim_mjx.diagnosis.fitting.centred_commands import physics_of
+from bayessim_mjx.diagnosis.fitting.cutting import CUTTING, finest, most_windows, windows_of
 from bayessim_mjx.diagnosis.fitting.fitter import Fitter
 from bayessim_mjx.diagnosis.fitting.robot import Robot
 from bayessim_mjx.diagnosis.fitting.simulator import Simulator
+from bayessim_mjx.diagnosis.fitting.substeps import Errors
 from bayessim_mjx.diagnosis.logcheck import gate, noise
+from bayessim_mjx.diagnosis.selection.budget import Budget
 from bayessim_mjx.diagnosis.selection.tried import Settings
 from bayessim_mjx.effects.effect import Effect
 from bayessim_mjx.logs.log import Log
@@ -38,35 +40,9 @@ from bayessim_mjx.physics import Physics
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Cutting:
-    """How logs are cut into windows, and how many are simulated."""
-
-    window: float = 0.5  # s
-    # of it, tried in turn while the time step with contacts is worth more than `lottery` noises
-    shorter: tuple[float, ...] = (1.0, 0.5, 0.25)
-    lottery: float = 5.0
-    shortest_window: int = 8  # control steps
-    longest_window: int = 100  # control steps, or as many as `long` s hold
-    long: float = 0.4  # s
-    shortest: float = 0.0005  # s, control period of the diagnosis; faster logs are resampled
-    limits: tuple[tuple[int, int], ...] = ((1, 160), (3, 96), (7, 64), (100, 48))  # (up to so many dofs, windows)
-    # sub-steps of one simulation of all windows; half of it for robots of more than `many` dofs
-    budget: int = 24000
-    many: int = 3
-    dearest: float = 4.0  # budgets, where the time step is worth more than the tolerance
-    fewest: int = 24  # windows that are simulated whatever the budget
-    least: int = 6  # windows: with fewer nothing can be held out
-
-
-CUTTING = Cutting()
 # of a first answer, for any robot; how often it differs from the whole search's was not counted
 QUICK = Settings(singles=12, screened=12, starts=4, iterations=8)
 SHIFT_FACTOR = 4  # times the coarsest sub-steps, the finest by which a shift of commands is looked for
-
-
-class TooLittleData(Exception):
-    """There is something to look at, but not enough to hold anything out; the text says what is missing."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,6 +88,7 @@ def prepare(
     quick: bool = False,
     tolerated: Sequence[str] = (),
     notes: Sequence[str] = (),
+    budget: Budget = Budget(),  # noqa: B008  # immutable
     seen_first: Callable[[Look], None] = lambda seen: None,
 ) -> Setup:
     """Everything up to the first simulation.
@@ -120,6 +97,7 @@ def prepare(
         robot, logs, effects, group, seed, tolerated: see `run.diagnose`.
         settings: budgets of the search; None: by the robot's size; quick: as small as is sensible, few windows.
         notes: what was noticed before, first among the warnings.
+        budget: the time that a search may take.
         seen_first: called with what the logs tell before any simulation.
 
     Raises:
@@ -140,7 +118,11 @@ def prepare(
     limit = tolerance.judge(robot.mj_model, 2 * size.travel, _noise(usable), asked).limit
     delivered = float(robot.mj_model.opt.timestep)
     steps = stepping.stepping(
-        robot, dt, usable, lambda own, first: _measured(own, usable, group, seen.use_qvel, first, limit)
+        robot,
+        dt,
+        usable,
+        lambda own, *rest: _measured(own, usable, group, seen.use_qvel, limit, *rest),
+        lambda seconds: CUTTING.simulations * seconds < budget.seconds - budget.spent,
     )
     cuts, step = steps.cuts, steps.worth
     shift = _shift(cuts, step, size)
@@ -148,7 +130,7 @@ def prepare(
     seen = seen.shifted(lead) if lead else seen
     robot = step.robot(steps.robot)
     physics = physics_of(robot, dt, stack)
-    most = _limit(physics, step.errors.cut.steps if step.errors else cuts(1).steps, quick)
+    most = most_windows(physics, step.errors.cut.steps if step.errors else cuts(1).steps, quick)
     cut = step.noisier(cuts(step.factor, limit=most, centred=False, late=lead))
     base = candidates.base_coordinates(robot.space, robot.accuracy, robot.assumed)
     fitter = Fitter(Simulator(physics, cut), base, physics.space.nominal)
@@ -186,21 +168,24 @@ def _measured(
     usable: Sequence[Log],
     group: str | None,
     use_qvel: bool,
-    first: int = 1,
     limit: Array | None = None,
+    first: int = 1,
+    cheaper: Errors | None = None,
 ) -> tuple[Callable[..., windows.Windows], discretisation.Discretisation]:
     """The windows, and what the time step is worth in them; shorter ones where contacts make longer ones a lottery.
 
     Args:
-        first: the coarsest factor on the sub-steps that is stable: as many windows fewer are looked at.
         limit: `[nv]`, the tolerance: steps are made finer than the budget allows until they are worth less; None: they
             are not, and `first` is 1.
+        first: the coarsest factor on the sub-steps that is stable: as many windows fewer are looked at.
+        cheaper: see `Errors`.
     """
     for share in CUTTING.shorter:
-        cuts = _windows(own, usable, group, use_qvel, share * CUTTING.window, first)
-        finest = [_finest(own, len(cuts(1)), cuts(1).steps, budget) for budget in (1.0, CUTTING.dearest)]
-        more: dict[str, Any] = {} if limit is None else {"first": first, "limit": limit, "utmost": finest[1]}
-        step = discretisation.measure(own, cuts, usable, finest[0], **more)
+        cuts = windows_of(own, usable, group, use_qvel, share * CUTTING.window, first)
+        factors = [finest(own, len(cuts(1)), cuts(1).steps, budget) for budget in (1.0, CUTTING.dearest)]
+        asked = {"first": first, "limit": limit, "utmost": factors[1], "cheaper": cheaper}
+        more: dict[str, Any] = {} if limit is None else asked
+        step = discretisation.measure(own, cuts, usable, factors[0], **more)
         known = np.isfinite(step.sigma)
         worth = float(np.median(step.floor[known] / step.sigma[known]))
         if worth < CUTTING.lottery or not discretisation.contacts(own) or cuts(1).steps <= CUTTING.shortest_window:
@@ -218,63 +203,6 @@ def _shift(
     return command_shift.estimate(
         step.errors, lambda late: cuts(factor, late=round(late, 9)), step.floor, size.force, factor
     )
-
-
-def _windows(
-    physics: Physics,
-    logs: Sequence[Log],
-    group: str | None,
-    use_qvel: bool,
-    seconds: float = CUTTING.window,
-    first: int = 1,
-) -> Callable[..., windows.Windows]:
-    """(factor, limit) -> the windows with that many times the sub-steps of `physics`, by default the same ones.
-
-    first: the coarsest factor that will be asked for, for which the number of windows is chosen.
-    """
-    dt = physics.dt
-    longest = max(int(log.duration / dt) for log in logs)
-    longest_window = max(CUTTING.longest_window, round(CUTTING.long / dt))
-    length = int(np.clip(round(seconds / dt), CUTTING.shortest_window, longest_window))
-    if longest < length:
-        raise TooLittleData(f"the longest log has {longest} control steps of {dt:.3g} s, one window needs {length}")
-    own = max(min(CUTTING.fewest, _limit(physics, length)), _limit(physics, length) // first)
-
-    @functools.cache
-    def cuts(factor: int, limit: int = own, centred: bool = True, late: float = 0.0) -> windows.Windows:
-        return windows.cut(
-            [log.shifted(late) for log in logs] if late else logs,
-            physics.mj_model,
-            dt,
-            physics.substeps * factor,
-            length,
-            limit=limit,
-            group=group,
-            use_qvel=use_qvel,
-            centred=centred,
-        )
-
-    if len(cuts(1)) < CUTTING.least:
-        raise TooLittleData(
-            f"{len(cuts(1))} windows of {length * dt:.2g} s; holding conditions out needs {CUTTING.least}"
-        )
-    return cuts
-
-
-def _limit(physics: Physics, length: int, quick: bool = False) -> int:
-    """Most windows of so many control steps that are simulated at once."""
-    if quick:
-        return CUTTING.fewest
-    nv = physics.mj_model.nv
-    budget = CUTTING.budget if nv <= CUTTING.many else CUTTING.budget // 2
-    limit = next(n for dofs, n in CUTTING.limits if nv <= dofs)
-    return min(limit, max(CUTTING.fewest, budget // (length * physics.substeps)))
-
-
-def _finest(physics: Physics, count: int, length: int, share: float = 1.0) -> int:
-    """How many times the sub-steps `share` budgets allow when at most half of `count` windows are given up for it."""
-    budget = int(share * (CUTTING.budget if physics.mj_model.nv <= CUTTING.many else CUTTING.budget // 2))
-    return max(1, budget // (length * physics.substeps * max(CUTTING.fewest, (count + 1) // 2)))
 
 
 def _faster(logs: Sequence[Log], timestep: float, dt: float) -> list[str]:

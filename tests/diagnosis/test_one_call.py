@@ -15,8 +15,8 @@ import bayessim_mjx
 from bayessim_mjx import diagnosis
 from bayessim_mjx.diagnosis import run
 from bayessim_mjx.diagnosis.findings import Findings, Where
+from bayessim_mjx.diagnosis.fitting.cutting import TooLittleData
 from bayessim_mjx.diagnosis.residual.where import Located
-from bayessim_mjx.diagnosis.setup import TooLittleData
 from bayessim_mjx.errors import UserError
 from tests.diagnosis.pendulums import MODEL, nominal, recorded, saved
 from tests.report import fake

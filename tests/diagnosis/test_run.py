@@ -8,7 +8,7 @@ import pytest
 
 from bayessim_mjx.diagnosis import result, run
 from bayessim_mjx.diagnosis.findings import Findings
-from bayessim_mjx.diagnosis.setup import TooLittleData
+from bayessim_mjx.diagnosis.fitting.cutting import TooLittleData
 from bayessim_mjx.diagnosis.summary import assemble, preliminary
 
 from .pendulums import FEW, nominal, recorded

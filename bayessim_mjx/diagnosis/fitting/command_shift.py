@@ -120,8 +120,7 @@ def estimate(errors: Errors, late: Late, sigma: Array, force: Array, factor: int
     nudges = np.append(RULES.nudge * cut.dt, np.full(model.size - 1, RULES.small))
     x, starts = np.zeros(model.size), np.zeros_like(errors.offsets)
     r = model.residual(x, starts)
-    there = model.residuals(np.diag(nudges), starts)
-    A = np.stack([(r - moved) / n.max() for n, moved in zip(np.diag(nudges), there, strict=True)], -1)
+    A = model.columns(nudges)
     B = errors.columns(sigma)
     for _ in range(RULES.rounds):
         q, found = eliminate(r, A, B, errors.offsets + starts, cut.spread)
@@ -151,16 +150,22 @@ class _Model:
         self.parts = np.cumsum([1, len(self.low), errors.physics.mj_model.nu])
         self.size = int(self.parts[-1]) + 4 * len(force)
 
+    def columns(self, nudges: Array) -> Array:
+        """`[W, n, size]`, minus the derivatives of the residuals, by differences of `nudges`."""
+        here = np.zeros((1, self.size))
+        first, *there = self._residuals(self.errors.differences(self.factor), [*here, *np.diag(nudges)])
+        return np.stack([(first - moved) / n for n, moved in zip(nudges, there, strict=True)], -1)
+
     def residual(self, x: Array, starts: Array) -> Array:
         """starts: `[W, 2 nv]`, further changes of the start states."""
-        return self.residuals([x], starts)[0]
+        return np.asarray(self._residuals(self.errors, [x], starts)[0])
 
-    def residuals(self, several: Iterable[Array], starts: Array) -> Array:
+    def _residuals(self, errors: Errors, several: Iterable[Array], starts: Array | None = None) -> Array:
         """`[m, W, n]`."""
-        error = self.errors.run_each([self._case(x, starts) for x in several], self.factor)
+        error = errors.run_each([self._case(x, starts) for x in several], self.factor)
         return np.asarray(np.clip(error / self.sigma, -1e4, 1e4).reshape(*error.shape[:2], -1))
 
-    def _case(self, x: Array, starts: Array) -> Case:
+    def _case(self, x: Array, starts: Array | None) -> Case:
         shift, p, gains, loads = np.split(x, self.parts)
         theta = np.maximum(self.nominal + p * (self.high - self.low), self.least)  # beyond its range: nothing else may
         cut = self.late(float(shift[0]))

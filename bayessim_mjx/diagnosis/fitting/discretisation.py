@@ -181,6 +181,7 @@ def measure(
     first: int = 1,
     limit: Array | None = None,
     utmost: int | None = None,
+    cheaper: Errors | None = None,
 ) -> Discretisation:
     """The errors of `physics` (without effects) in the windows, and the sub-steps that the diagnosis should take.
 
@@ -190,11 +191,13 @@ def measure(
         most: the finest factor that can be afforded.
         first: the coarsest factor that is stable.
         limit: `[nv]`, the tolerance, rad or m. utmost: the finest factor where the step is worth more than that.
+        cheaper: see `Errors`; left alone where its windows are others.
     """
     start = cuts(first)
     touching = contacts(physics)
     sigma = np.concatenate([start.sigma_q, start.sigma_v])
-    errors = Errors(physics, start, 4 * first)
+    like = cheaper is not None and cheaper.cut.alike(start)
+    errors = Errors(physics, start, 4 * first, cheaper if like else None)
     errors.start(sigma)
     coarse, mid, fine = (errors.run(cuts(first * f), first * f) for f in (1, 2, 4))
     plain = errors.run(held(start), first, corrected=False)

@@ -10,11 +10,18 @@ from typing import Any
 from bayessim_mjx.diagnosis.fitting import stability
 from bayessim_mjx.diagnosis.fitting.discretisation import Discretisation, contacts
 from bayessim_mjx.diagnosis.fitting.robot import Robot
+from bayessim_mjx.diagnosis.fitting.substeps import Errors
 from bayessim_mjx.logs.log import Log
 from bayessim_mjx.physics import Physics
 
-# (robot's physics, coarsest stable factor) -> (the windows, what the time step is worth in them)
-Measured = Callable[[Physics, int], tuple[Any, Discretisation]]
+# (robot's physics, coarsest stable factor, by a cheaper integrator) -> (the windows, what the time step is worth there)
+Measured = Callable[[Physics, int, Errors | None], tuple[Any, Discretisation]]
+STAGES = 4  # of Runge and Kutta's method, each as dear as a step
+TOO_LONG = "the model's time step shows beside the noise, and in the time given nothing finer can be searched with"
+
+
+def _always(seconds: float) -> bool:
+    return True
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,20 +49,27 @@ class Stepping:
         return self.worth.warnings() if self.stable.factor == 1 else []
 
 
-def stepping(robot: Robot, dt: float, logs: Sequence[Log], measured: Measured) -> Stepping:
+def stepping(
+    robot: Robot, dt: float, logs: Sequence[Log], measured: Measured, affordable: Callable[[float], bool] = _always
+) -> Stepping:
     """The coarsest stable step; where what no sub-steps remove shows, and nothing can touch, RK4.
 
     It would count as noise else, and in a noise that is larger than the sensors' what two integrators differ by (a
     fraction of a millisecond, usually) is found as an effect.
+
+    Args:
+        affordable: whether there is time for simulations of all windows that take so many seconds each.
     """
     stable = stability.needed(robot.physics(dt).mj_model, logs)
     robot = stable.robot(robot)
     own = robot.physics(dt)
-    plain = Stepping(robot, stable, *measured(own, stable.factor))
+    plain = Stepping(robot, stable, *measured(own, stable.factor, None))
     if not (plain.worth.beyond() or plain.worth.shows):
         return plain
     if contacts(own) or int(own.mj_model.opt.integrator) == stability.RK4:
         return plain
+    if not affordable(STAGES * plain.worth.errors.seconds if plain.worth.errors else 0.0):
+        return dataclasses.replace(plain, better=(TOO_LONG,))
     model = copy.copy(robot.mj_model)
     model.opt.integrator = stability.RK4
     other = dataclasses.replace(robot, mj_model=model)
@@ -63,7 +77,7 @@ def stepping(robot: Robot, dt: float, logs: Sequence[Log], measured: Measured) -
     needs = stability.needed(physics.mj_model, logs)
     if needs.changed or not needs.reached:
         return plain
-    found = measured(physics, needs.factor)
+    found = measured(physics, needs.factor, plain.worth.errors)
     if found[1].beyond() or (found[1].shows and not plain.worth.beyond()):
         return plain
     step = 1e3 * found[1].timestep / found[1].factor

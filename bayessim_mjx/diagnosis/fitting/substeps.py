@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -64,13 +65,18 @@ class Errors:
 
     Args:
         cut: the windows, with commands for the coarsest sub-steps that are asked for; most: the finest factor.
+        cheaper: the same windows by an integrator that costs less, with their start states fitted: derivatives are
+            taken there, and start states begin there.
     """
 
-    def __init__(self, physics: Physics, cut: Windows, most: int) -> None:
-        self.physics, self.cut, self.most = physics, cut, most * physics.substeps
+    def __init__(self, physics: Physics, cut: Windows, most: int, cheaper: Errors | None = None) -> None:
+        self.physics, self.cut, self.most, self.cheaper = physics, cut, most * physics.substeps, cheaper
         self.first = cut.batch.command.shape[2] // physics.substeps
         self.theta = np.asarray(physics.space.nominal, np.float32)
-        self.offsets = np.zeros((len(cut), 2 * physics.mj_model.nv))  # of the measured start states
+        nothing = np.zeros((len(cut), 2 * physics.mj_model.nv))
+        self.offsets: Array = nothing if cheaper is None else cheaper.offsets  # of the measured start states
+        self.seconds = 0.0  # that a case took of those simulated last
+        self._moved: tuple[Array, Array] | None = None  # start states, and the derivatives there
         self._no_force = np.zeros((len(cut), cut.steps, physics.mj_model.nv), np.float32)
         axes = (0, 0, 0, None, None, None, None)
         self._run = jax.jit(jax.vmap(self._one, in_axes=axes), compiler_options=compiler_options())
@@ -93,7 +99,10 @@ class Errors:
             given = np.asarray(offsets, np.float32), force, theta
             return np.asarray(self._run(batch, *given, count, h, np.float32(corrected)), np.float64)
 
-        return np.nan_to_num(np.stack(on_cores(one, cases)), nan=1e3, posinf=1e3, neginf=-1e3)
+        began = time.monotonic()
+        found = np.stack(on_cores(one, cases))
+        self.seconds = (time.monotonic() - began) / len(cases)
+        return np.nan_to_num(found, nan=1e3, posinf=1e3, neginf=-1e3)
 
     def _one(self, own: Batch, *given: jax.Array) -> jax.Array:
         with jax.default_matmul_precision("highest"):
@@ -132,11 +141,21 @@ class Errors:
 
     def columns(self, sigma: Array, here: Array | None = None) -> Array:
         """`[W, n, 2 nv]`, minus the derivatives of the whitened errors by the start states; here: the errors there."""
-        here = self.run(self.cut, self.first) if here is None else here
-        nudges = np.diag(np.maximum(0.2 * self.cut.spread, SIZES.nudge))
-        there = self.run_each([Case(self.cut, np.tile(n, (len(self.cut), 1))) for n in nudges], self.first)
-        moved = [(here - error) / n.max() / sigma for n, error in zip(nudges, there, strict=True)]
-        return np.stack([m.reshape(len(m), -1) for m in moved], -1)
+        if self.cheaper is not None:
+            return self.cheaper.columns(sigma)
+        if self._moved is None or self._moved[0] is not self.offsets:
+            here = self.run(self.cut, self.first) if here is None else here
+            nudges = np.diag(np.maximum(0.2 * self.cut.spread, SIZES.nudge))
+            there = self.run_each([Case(self.cut, np.tile(n, (len(self.cut), 1))) for n in nudges], self.first)
+            each = [(here - error) / n.max() for n, error in zip(nudges, there, strict=True)]
+            self._moved = self.offsets, np.stack(each, -1)
+        moved = self._moved[1] / sigma[:, None]
+        return np.asarray(moved.reshape(len(moved), -1, moved.shape[-1]))
+
+    def differences(self, factor: int) -> Errors:
+        """Where differences at the sub-step h / factor are taken: they need no better integrator than this one."""
+        other = self.cheaper
+        return self if other is None or not other.first <= factor <= other.most // other.physics.substeps else other
 
     def start(self, sigma: Array) -> None:
         """Fit the start states: far from the measured motion the time step is worth something else."""
@@ -146,7 +165,8 @@ class Errors:
             there = self.run(self.cut, self.first, offsets=step)
             before, after = (np.sum((error / sigma) ** 2, (1, 2)) for error in (here, there))
             better = after < before
-            self.offsets = self.offsets + np.where(better[:, None], step, 0.0)
+            if better.any():
+                self.offsets = self.offsets + np.where(better[:, None], step, 0.0)
             here = np.where(better[:, None, None], there, here)
             if np.minimum(before, after).sum() > SIZES.falls * before.sum():
                 break

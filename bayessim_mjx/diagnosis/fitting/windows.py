@@ -76,6 +76,11 @@ class Windows:
     def steps(self) -> int:
         return int(self.batch.command.shape[1])
 
+    def alike(self, other: Windows) -> bool:
+        """Whether these are the same parts of the logs."""
+        parts = [(own.log.tolist(), own.start.tolist(), own.steps) for own in (self, other)]
+        return parts[0] == parts[1]
+
 
 def groups_of(logs: Sequence[Log], key: str | None = None) -> tuple[list[int], tuple[str, ...]]:
     """Operating condition of each log: metadata `key`, else `condition` or `operating_condition`, else one per log.

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 # Share of the time at which a part ends, so that those after it have theirs; what follows the search has the rest.
+# Of the time that is there once the simulator is compiled: nothing cuts what comes before.
 # A choice: what a search that was cut misses was not counted.
 KNOWN = "known parameters"  # their fit ends there, wherever it came to: on a stiff arm it alone took longer than all
+SCREENING = "screening"
 LEAVING_OUT = "leaving out"  # the last part: what is named with each effect left out, simulated held out
 ENDS = {
-    KNOWN: 0.15, "screening": 0.2, "single effects": 0.35, "effects together": 0.6, "finalists": 0.7, LEAVING_OUT: 0.88,
+    KNOWN: 0.15, SCREENING: 0.2, "single effects": 0.35, "effects together": 0.6, "finalists": 0.7, LEAVING_OUT: 0.88,
 }  # fmt: skip
 
 
@@ -22,19 +24,32 @@ class Budget:
     Attributes:
         seconds: for the whole diagnosis; infinite: as long as it takes.
         began: reading of `now` when it began; now: clock in seconds.
+        fixed: s that passed until the search could begin.
     """
 
     seconds: float = float("inf")
     began: float = 0.0
     now: Callable[[], float] = time.monotonic
+    fixed: float = 0.0
 
     @property
     def limited(self) -> bool:
         return self.seconds < float("inf")
 
+    @property
+    def spent(self) -> float:
+        """Seconds since it began."""
+        return self.now() - self.began
+
+    def searching(self) -> Budget:
+        """The same for a search that begins now."""
+        return replace(self, fixed=min(self.spent, self.seconds)) if self.limited else self
+
     def left(self, part: str) -> float:
         """Seconds until a part has to end; infinite where there is no limit."""
-        return self.seconds * ENDS[part] - (self.now() - self.began) if self.limited else self.seconds
+        if not self.limited:
+            return self.seconds
+        return self.fixed + (self.seconds - self.fixed) * ENDS[part] - self.spent
 
     def over(self, part: str) -> bool:
         """Whether a part has had its time."""

@@ -6,6 +6,7 @@ from bayessim_mjx.diagnosis import phrases
 from bayessim_mjx.diagnosis.selection.tried import Tried
 
 SINGLES = "single effects"
+TOLD = 0.25  # of the time, from which on it is told that this was gone before the search
 
 
 def not_fitted(tried: Tried) -> dict[str, list[str]]:
@@ -25,8 +26,10 @@ def not_tried(tried: Tried) -> str:
         parts.insert(0, f"{len(tried.cut_short)} single effects")
     if not parts:
         return ""
-    minutes = tried.settings.budget.seconds / 60
-    return f"In {minutes:.3g} minutes not everything was tried: no time was left for {' and '.join(parts)}."
+    budget = tried.settings.budget
+    text = f"In {budget.seconds / 60:.3g} minutes not everything was tried: no time was left for {' and '.join(parts)}."
+    first = f" Before the search, looking at the logs and compiling took {budget.fixed / 60:.2g} of them."
+    return text + first * (budget.fixed > TOLD * budget.seconds)
 
 
 def _reason(tried: Tried, label: str, gains: dict[str, float]) -> str:

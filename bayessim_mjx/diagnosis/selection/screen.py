@@ -6,6 +6,7 @@ Tangents at neutral mislead where laws have kinks (dry friction, play): the colu
 from __future__ import annotations
 
 import functools
+import itertools
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
-from bayessim_mjx.diagnosis.statistics import times
+from bayessim_mjx.diagnosis.selection.projection import Projection
 
 Array = NDArray[np.float64]
 
@@ -29,7 +30,8 @@ class Sizes:
     anew: int = 16
     points: int = 4
     fewest: int = 8
-    worlds: int = 8192  # simulated between two signs of life: whole calls, even of an accelerator
+    worlds: int = 8192  # simulated between two signs of life, at most: whole calls, even of an accelerator
+    calls: int = 16  # and so many calls, at most
 
 
 SIZES = Sizes()
@@ -90,6 +92,7 @@ def residual(fit: Fit, limit: int) -> Array:
 
 
 Progress = Callable[[str, int, int], None]
+Plan = tuple[int, Array]  # candidate, starting point
 
 
 @dataclass(eq=False)
@@ -115,6 +118,7 @@ def screen(
     limit: int = 96,
     say: Progress = lambda text, done, total: None,
     secants: Secants | None = None,
+    over: Callable[[], bool] | None = None,
 ) -> list[Screened]:
     """All candidates on top of `fit`, best first, on at most `limit` windows.
 
@@ -123,14 +127,16 @@ def screen(
 
     Args:
         secants: what was simulated before, which takes the place of the first look; if empty, it is filled.
+        over: whether the time is; None: there is no limit. What was not simulated by then is not among them.
     """
     secants = Secants() if secants is None else secants
     count = sum(len(candidate.probes) for candidate in candidates)
     again = bool(secants.columns)
     if not again:
-        _fill(secants, fitter, fit, candidates, limit if count <= SIZES.many else max(limit // 3, SIZES.fewest), say)
+        some = limit if count <= SIZES.many else max(limit // 3, SIZES.fewest)
+        _fill(secants, fitter, fit, candidates, some, say, over)
     coarse = projected(fitter, fit, candidates, secants)
-    if not again and count <= SIZES.many:
+    if not again and (count <= SIZES.many or (over is not None and over())):
         return _ordered(coarse)
     order = sorted(coarse, key=lambda i: -max(s.gain for s, _ in coarse[i]))
     order = order[: SIZES.anew if again else SIZES.candidates]
@@ -146,12 +152,35 @@ def _second(say: Progress, _: str, done: int, total: int) -> None:
 
 
 def _fill(
-    secants: Secants, fitter: Fitter, fit: Fit, candidates: Sequence[Candidate], windows: int, say: Progress
+    secants: Secants,
+    fitter: Fitter,
+    fit: Fit,
+    candidates: Sequence[Candidate],
+    windows: int,
+    say: Progress,
+    over: Callable[[], bool] | None,
 ) -> None:
     secants.own = looked_at(fit, windows)
     plans = [(i, point) for i, candidate in enumerate(candidates) for point in candidate.probes]
-    for i, point, column in simulated(fitter, fit, candidates, plans, secants.own, say):
+    if over is not None:
+        plans = [plan for turn in itertools.zip_longest(*map(_spread, _each(plans))) for plan in turn if plan]
+    for i, point, column in simulated(fitter, fit, candidates, plans, secants.own, say, over):
         secants.columns.setdefault(candidates[i].label, []).append((point, column))
+
+
+def _each(plans: Sequence[Plan]) -> list[list[Plan]]:
+    """Those of each candidate."""
+    return [list(own) for _, own in itertools.groupby(plans, lambda plan: plan[0])]
+
+
+def _spread(plans: Sequence[Plan]) -> list[Plan]:
+    """The middle one first, then those halfway between, and so on: however many are simulated, they lie apart."""
+    bits = len(plans).bit_length()
+
+    def place(i: int) -> int:
+        return int(f"{(i - len(plans) // 2) % len(plans):0{bits}b}"[::-1], 2)
+
+    return [plans[i] for i in sorted(range(len(plans)), key=place)]
 
 
 def projected(
@@ -165,14 +194,17 @@ def simulated(
     fitter: Fitter,
     fit: Fit,
     candidates: Sequence[Candidate],
-    plans: Sequence[tuple[int, Array]],
+    plans: Sequence[Plan],
     own: NDArray[np.int64],
     say: Progress,
+    over: Callable[[], bool] | None = None,
 ) -> Iterator[tuple[int, Array, Array]]:
     """(candidate, starting point, what it changes of the residual `[w, n]`) for plans of (candidate, point)."""
     part = _part(fit, own)
-    at_once = max(SIZES.worlds // len(own), 1)
+    at_once = max(min(SIZES.worlds, SIZES.calls * fitter.simulator.lanes) // len(own), 1)
     for first in range(0, len(plans), at_once):
+        if first and over is not None and over():
+            return
         say("screening", first, len(plans))
         some = plans[first : first + at_once]
         thetas = [
@@ -192,7 +224,7 @@ def judged(
     own: NDArray[np.int64],
 ) -> dict[int, list[tuple[Screened, Array]]]:
     """{candidate: [(what its starting point gains, the point)]} for (candidate, point, column)."""
-    project, share = _Projection(fitter, _part(fit, own)), len(fit.r) / max(len(own), 1)
+    project, share = Projection(fitter, _part(fit, own)), len(fit.r) / max(len(own), 1)
     each: dict[int, list[tuple[Screened, Array]]] = {}
     for i, point, column in columns:
         one = _one(project, candidates[i], point, column)
@@ -241,41 +273,7 @@ def _part(fit: Fit, own: NDArray[np.int64]) -> Fit:
     return replace(fit, offsets=fit.offsets[own], r=fit.r[own], A=fit.A[own], B=fit.B[own], weight=fit.weight[own])
 
 
-class _Projection:
-    """The fit's own parameters and start states, projected out of columns and residuals."""
-
-    def __init__(self, fitter: Fitter, fit: Fit) -> None:
-        precision, pull, low, high = fit.prior()
-        q, starts = fit.quadratic(fitter.spread)
-        g, S = q.weighted(fit.weight)
-        slope = g + pull
-        pinned = ((low >= -1e-12) & (slope < 0)) | ((high <= 1e-12) & (slope > 0))
-        self.free = np.flatnonzero(~pinned)
-        self.fit, self.starts, self.root = fit, starts, np.sqrt(fit.weight)[:, None]
-        H = (S + np.diag(precision))[np.ix_(self.free, self.free)]
-        self.inverse = np.linalg.pinv(H) if len(self.free) else H
-        self.slope = slope[self.free]
-        self.A = fit.A[:, :, self.free]
-        self.Bt, self.BA = starts.B.mT, starts.B.mT @ self.A
-        # columns by the parameters as one matrix, weighted, and less what the start states take
-        rows = self.A.shape[0] * self.A.shape[1]  # there may be no parameter that is free
-        self.away = (self.A - starts.B @ (starts.M @ self.BA)).reshape(rows, len(self.free))
-        self.weighted = np.repeat(fit.weight, self.A.shape[1])[:, None] * self.away
-
-    def moments(self, a: Array) -> tuple[float, float, float, Array]:
-        """(s, g, full norm, projected column) of a column `[W, n]`."""
-        w, starts = self.fit.weight, self.starts
-        Ba = times(self.Bt, a)
-        MBa = times(starts.M, Ba)
-        s_aa = float(w @ (np.sum(a * a, 1) - np.sum(Ba * MBa, 1)))
-        g_a = float(w @ (np.sum(a * self.fit.r, 1) - np.sum(MBa * starts.b, 1)))
-        s_ab = self.weighted.T @ a.ravel()
-        along = self.inverse @ s_ab
-        projected = a - times(starts.B, MBa) - (self.away @ along).reshape(a.shape)
-        return s_aa - float(s_ab @ along), g_a - float(s_ab @ (self.inverse @ self.slope)), s_aa, projected * self.root
-
-
-def _one(project: _Projection, candidate: Candidate, point: Array, column: Array) -> Screened:
+def _one(project: Projection, candidate: Candidate, point: Array, column: Array) -> Screened:
     s, g, norm, projected = project.moments(column)
     neutral = np.array([c.neutral for c in candidate.coordinates])
     low, high = (np.array([getattr(c, e) for c in candidate.coordinates]) for e in ("low", "high"))

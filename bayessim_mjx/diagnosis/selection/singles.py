@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -9,7 +10,7 @@ from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 from bayessim_mjx.diagnosis.selection.beam import CLOSE
 from bayessim_mjx.diagnosis.selection.bounds import widen_leading
-from bayessim_mjx.diagnosis.selection.budget import KNOWN
+from bayessim_mjx.diagnosis.selection.budget import KNOWN, SCREENING
 from bayessim_mjx.diagnosis.selection.criteria import Criteria
 from bayessim_mjx.diagnosis.selection.models import scored
 from bayessim_mjx.diagnosis.selection.pool import AFRESH, Pool, Progress, fit_models, polish
@@ -42,6 +43,7 @@ def begin(
 
     say("compiling the simulator", 0, 1)
     nominal = fitter.begin(fitter.base)
+    settings = replace(settings, budget=settings.budget.searching())
     say("known parameters", 0, 1)
     began, before = settings.budget.now(), fitter.simulator.rollouts
     fit = nominal
@@ -59,7 +61,8 @@ def begin(
         fit = pool.base.fit
     pool.models[frozenset()] = pool.base
     keep(pool)
-    pool.screened = screen(fitter, pool.begun(fit), candidates, settings.screened, say, pool.secants)
+    over = functools.partial(settings.budget.over, SCREENING) if settings.budget.limited else None
+    pool.screened = screen(fitter, pool.begun(fit), candidates, settings.screened, say, pool.secants, over)
     return pool
 
 
@@ -90,5 +93,5 @@ def _affordable(candidates: Sequence[Candidate], settings: Settings, seconds: fl
     if not settings.budget.limited:
         return settings
     points = max(sum(len(c.probes) for c in candidates), 1)
-    windows = settings.budget.left("screening") / max(seconds, 1e-9) / points
+    windows = settings.budget.left(SCREENING) / max(seconds, 1e-9) / points
     return replace(settings, screened=int(min(max(windows, SIZES.fewest), settings.screened)))

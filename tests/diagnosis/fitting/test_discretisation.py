@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 
 from bayessim_mjx.diagnosis.fitting import discretisation, robot, stepping
+from bayessim_mjx.diagnosis.fitting.cutting import windows_of
 from bayessim_mjx.diagnosis.fitting.quadratic import eliminate
 from bayessim_mjx.diagnosis.fitting.substeps import Errors
-from bayessim_mjx.diagnosis.setup import _measured, _windows
+from bayessim_mjx.diagnosis.setup import _measured
 from bayessim_mjx.logs import Channels, Log, estimate_velocity
 
 pytestmark = [pytest.mark.slow, pytest.mark.ci]  # whole diagnoses and fits
@@ -70,7 +71,7 @@ def swing(i, time, qpos, qvel):
 def measured(xml, recorded):
     """(discretisation, rms of measured minus simulated positions by factor, start states fitted)."""
     physics = the(xml).physics(PERIOD)
-    cuts = _windows(physics, recorded, None, False)
+    cuts = windows_of(physics, recorded, None, False)
     found = discretisation.measure(physics, cuts, recorded, 4)
     errors = Errors(physics, cuts(1), 4)
     columns, spread, nv = errors.columns(found.sigma), cuts(1).spread, physics.mj_model.nv
@@ -203,9 +204,9 @@ def test_runge_and_kutta_step_in_where_sub_steps_do_not_suffice():
     """A tolerance of a fiftieth of the noise: 3e-6 rad of a swing of two radians."""
     recorded, limit, tried = logs(ARM, swing), np.full(2, 6e-6), []
 
-    def measured_by(own, first):
+    def measured_by(own, *rest):
         tried.append(int(own.mj_model.opt.integrator))
-        return _measured(own, recorded, None, False, first, limit)
+        return _measured(own, recorded, None, False, limit, *rest)
 
     found = stepping.stepping(the(ARM), PERIOD, recorded, measured_by)
     assert tried[-1] == mujoco.mjtIntegrator.mjINT_RK4 and len(tried) == 2
@@ -218,17 +219,48 @@ def test_runge_and_kutta_step_in_where_what_sub_steps_leave_shows_beside_the_noi
     """All of it is far within the tolerance; as noise it would hide what the sensors see."""
     recorded, limit = logs(ARM, swing, noise=noise), np.full(2, 0.05)
     found = stepping.stepping(
-        the(ARM), PERIOD, recorded, lambda own, first: _measured(own, recorded, None, False, first, limit)
+        the(ARM), PERIOD, recorded, lambda own, *rest: _measured(own, recorded, None, False, limit, *rest)
     )
     assert found.robot.mj_model.opt.integrator == getattr(mujoco.mjtIntegrator, by)
     assert not found.worth.shows and found.worth.believed > 0.9
+
+
+def test_the_better_integrator_takes_derivatives_from_the_cheaper_one_and_finds_what_it_finds_alone():
+    recorded, limit = logs(ARM, swing, noise=1e-5), np.full(2, 0.05)
+    found = stepping.stepping(
+        the(ARM), PERIOD, recorded, lambda own, *rest: _measured(own, recorded, None, False, limit, *rest)
+    )
+    errors = found.worth.errors
+    assert errors.cheaper is not None and errors.differences(1) is errors.cheaper
+    assert errors.differences(64) is errors  # finer than the other goes
+    _, alone = _measured(found.robot.physics(PERIOD), recorded, None, False, limit, found.worth.errors.first)
+    assert alone.errors.cheaper is None
+    np.testing.assert_allclose(found.worth.errors.offsets, alone.errors.offsets, atol=2e-5)
+    assert found.worth.factor == alone.factor
+    np.testing.assert_allclose(found.worth.left, alone.left, rtol=0.2)
+
+
+def test_where_time_is_limited_the_integrator_stays_unless_a_search_by_the_better_one_fits():
+    recorded, limit, asked = logs(ARM, swing, noise=1e-5), np.full(2, 0.05), []
+
+    def affordable(seconds):
+        asked.append(seconds)
+        return False
+
+    found = stepping.stepping(
+        the(ARM), PERIOD, recorded, lambda own, *rest: _measured(own, recorded, None, False, limit, *rest), affordable
+    )
+    assert found.robot.mj_model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    assert stepping.TOO_LONG in found.said()
+    (seconds,) = asked
+    assert seconds == stepping.STAGES * found.worth.errors.seconds > 0
 
 
 def test_logs_of_a_simulation_keep_its_integrator():
     """Without noise nobody knows whether their step was this one."""
     recorded, limit = logs(ARM, swing, finer=1, noise=0.0), np.full(2, 0.05)
     found = stepping.stepping(
-        the(ARM), PERIOD, recorded, lambda own, first: _measured(own, recorded, None, False, first, limit)
+        the(ARM), PERIOD, recorded, lambda own, *rest: _measured(own, recorded, None, False, limit, *rest)
     )
     assert found.robot.mj_model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
 

@@ -97,6 +97,6 @@ def test_a_loop_that_the_simulators_step_cannot_hold_is_simulated_to_within_the_
     step = stability.needed(own, logs)
     assert step.factor > 1 and step.reached
     robot = dataclasses.replace(robots.robot_of(own), control_dt=period)
-    _, found = _measured(robot.physics(period), logs, None, False, step.factor, np.full(1, 3 * noise))
+    _, found = _measured(robot.physics(period), logs, None, False, np.full(1, 3 * noise), step.factor)
     assert found.factor >= step.factor and not found.beyond()
     assert found.left[0] < noise and found.floor[0] < 1.5 * noise

@@ -50,6 +50,20 @@ def test_parts_end_one_after_the_other_and_without_a_limit_never():
     assert begun(2.0).left("single effects") == pytest.approx(120 * ENDS["single effects"], abs=1.0)
 
 
+def test_parts_share_what_is_left_once_the_simulator_is_compiled():
+    """Of 100 s 40 are gone: single effects end 60 * .35 s after them, and with all of it gone nothing has time."""
+    now = {"s": 40.0}
+    budget = Budget(100.0, 0.0, lambda: now["s"]).searching()
+    assert budget.left("single effects") == pytest.approx(60 * ENDS["single effects"])
+    now["s"] = 40 + 60 * ENDS["single effects"] + 1
+    assert budget.over("single effects") and not budget.over("effects together")
+    late = Budget(100.0, 0.0, lambda: 130.0).searching()
+    assert late.fixed == 100 and all(late.over(part) for part in ENDS)
+    assert begun(None).searching() == begun(None)
+    told = not_tried(tried({}, [], ["a@h"], {}, budget=budget))
+    assert told.endswith("Before the search, looking at the logs and compiling took 0.67 of them.")
+
+
 @dataclasses.dataclass(frozen=True)
 class Rough:
     """A fit that says how many steps were made in all."""
@@ -93,7 +107,7 @@ def test_the_fit_of_the_known_parameters_ends_with_its_share_of_the_time(monkeyp
     settings = Settings(budget=Budget(limit, 0.0, lambda: fitter.seconds), screened=20)
     candidates = [SimpleNamespace(probes=np.zeros((40, 1)))] * 2
 
-    def screen(fitter, fit, candidates, screened, say, secants):
+    def screen(fitter, fit, candidates, screened, say, secants, over):
         seen.update(steps=fit.steps, screened=screened)
         return []
 

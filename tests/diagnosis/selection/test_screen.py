@@ -107,6 +107,29 @@ def test_a_first_look_at_few_windows_keeps_what_matters(screened, monkeypatch):
     np.testing.assert_allclose(found[0].start, whole[0].start)
 
 
+def test_where_time_ends_first_every_candidate_was_looked_at_before_any_a_second_time(screened, monkeypatch):
+    """The middle of each grid comes first, then points far from it; with time for all the result is the same."""
+    truth, setup, fitter, fit, whole = screened
+    module = importlib.import_module("bayessim_mjx.diagnosis.selection.screen")
+    monkeypatch.setattr(module, "SIZES", replace(module.SIZES, worlds=fitter.simulator.lanes))
+    each = max(fitter.simulator.lanes // len(fit.r), 1)
+    count = len(setup.candidates)
+    looks = -(-count // each) + 1  # parts, of which the last ones begin the second round
+    for wanted in (looks, None):
+        secants, left = module.Secants(), iter(range(wanted or 10**6))
+        found = screen(fitter, fit, setup.candidates, secants=secants, over=lambda left=left: next(left, None) is None)
+        sizes = [len(secants.columns[c.label]) for c in setup.candidates]
+        if wanted is None:
+            assert sizes == [len(c.probes) for c in setup.candidates]
+            assert [s.candidate.label for s in found] == [s.candidate.label for s in whole]
+            assert found[0].gain == pytest.approx(whole[0].gain)
+            continue
+        assert min(sizes) == 1 and max(sizes) == 2 and len(found) == count
+        for candidate in setup.candidates:
+            first = secants.columns[candidate.label][0][0]
+            np.testing.assert_array_equal(first, candidate.probes[len(candidate.probes) // 2])
+
+
 def test_what_was_simulated_on_one_fit_is_projected_on_another_and_only_the_best_are_looked_at_again(screened):
     """On the fit that it was simulated on it tells the same; the best are then simulated on all windows."""
     truth, setup, fitter, fit, whole = screened

@@ -1,0 +1,100 @@
+"""How logs are cut into windows: how long, how many, and how finely these may be simulated."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from bayessim_mjx.diagnosis.fitting import windows
+from bayessim_mjx.logs.log import Log
+from bayessim_mjx.physics import Physics
+
+
+@dataclass(frozen=True)
+class Cutting:
+    """How logs are cut into windows, and how many are simulated."""
+
+    window: float = 0.5  # s
+    # of it, tried in turn while the time step with contacts is worth more than `lottery` noises
+    shorter: tuple[float, ...] = (1.0, 0.5, 0.25)
+    lottery: float = 5.0
+    shortest_window: int = 8  # control steps
+    longest_window: int = 100  # control steps, or as many as `long` s hold
+    long: float = 0.4  # s
+    shortest: float = 0.0005  # s, control period of the diagnosis; faster logs are resampled
+    limits: tuple[tuple[int, int], ...] = ((1, 160), (3, 96), (7, 64), (100, 48))  # (up to so many dofs, windows)
+    # sub-steps of one simulation of all windows; half of it for robots of more than `many` dofs
+    budget: int = 24000
+    many: int = 3
+    dearest: float = 4.0  # budgets, where the time step is worth more than the tolerance
+    # of all windows, that a whole search takes: where time is limited no finer integrator makes it take longer
+    simulations: int = 2500
+    fewest: int = 24  # windows that are simulated whatever the budget
+    least: int = 6  # windows: with fewer nothing can be held out
+
+
+CUTTING = Cutting()
+
+
+class TooLittleData(Exception):
+    """There is something to look at, but not enough to hold anything out; the text says what is missing."""
+
+
+def windows_of(
+    physics: Physics,
+    logs: Sequence[Log],
+    group: str | None,
+    use_qvel: bool,
+    seconds: float = CUTTING.window,
+    first: int = 1,
+) -> Callable[..., windows.Windows]:
+    """(factor, limit) -> the windows with that many times the sub-steps of `physics`, by default the same ones.
+
+    first: the coarsest factor that will be asked for, for which the number of windows is chosen.
+    """
+    dt = physics.dt
+    longest = max(int(log.duration / dt) for log in logs)
+    longest_window = max(CUTTING.longest_window, round(CUTTING.long / dt))
+    length = int(np.clip(round(seconds / dt), CUTTING.shortest_window, longest_window))
+    if longest < length:
+        raise TooLittleData(f"the longest log has {longest} control steps of {dt:.3g} s, one window needs {length}")
+    own = max(min(CUTTING.fewest, most_windows(physics, length)), most_windows(physics, length) // first)
+
+    @functools.cache
+    def cuts(factor: int, limit: int = own, centred: bool = True, late: float = 0.0) -> windows.Windows:
+        return windows.cut(
+            [log.shifted(late) for log in logs] if late else logs,
+            physics.mj_model,
+            dt,
+            physics.substeps * factor,
+            length,
+            limit=limit,
+            group=group,
+            use_qvel=use_qvel,
+            centred=centred,
+        )
+
+    if len(cuts(1)) < CUTTING.least:
+        raise TooLittleData(
+            f"{len(cuts(1))} windows of {length * dt:.2g} s; holding conditions out needs {CUTTING.least}"
+        )
+    return cuts
+
+
+def most_windows(physics: Physics, length: int, quick: bool = False) -> int:
+    """Most windows of so many control steps that are simulated at once."""
+    if quick:
+        return CUTTING.fewest
+    nv = physics.mj_model.nv
+    budget = CUTTING.budget if nv <= CUTTING.many else CUTTING.budget // 2
+    limit = next(n for dofs, n in CUTTING.limits if nv <= dofs)
+    return min(limit, max(CUTTING.fewest, budget // (length * physics.substeps)))
+
+
+def finest(physics: Physics, count: int, length: int, share: float = 1.0) -> int:
+    """How many times the sub-steps `share` budgets allow when at most half of `count` windows are given up for it."""
+    budget = int(share * (CUTTING.budget if physics.mj_model.nv <= CUTTING.many else CUTTING.budget // 2))
+    return max(1, budget // (length * physics.substeps * max(CUTTING.fewest, (count + 1) // 2)))
