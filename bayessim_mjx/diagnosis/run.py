@@ -42,12 +42,13 @@ Effects = str | Sequence[str | type[Effect]]
 class Stage:
     """One stage: its name, told while it runs; `run(findings, say) -> findings`.
 
-    optional: its failure becomes a warning, as the verdict stands without it.
+    optional: its failure becomes a warning, as the verdict stands without it; patient: left out once the time is over.
     """
 
     name: str
     run: Callable[[Findings, Progress], Findings]
     optional: bool = False
+    patient: bool = False
 
 
 def how_far(found: Findings, say: Progress) -> Findings:
@@ -101,7 +102,7 @@ def rivals_without_physics(found: Findings, say: Progress) -> Findings:
 STAGES = (
     Stage("how far", how_far),
     Stage("none of these?", none_of_these),
-    Stage("whole logs", whole_logs.stage),
+    Stage("whole logs", whole_logs.stage, patient=True),
     Stage("where", where_it_lies, optional=True),
     Stage("black boxes", rivals_without_physics, optional=True),
     Stage("next experiment", propose.stage, optional=True),
@@ -163,8 +164,8 @@ def investigate(
     resumed.ended(setup)
     stages = STAGES if stages is None else stages
     stages = [stage for stage in stages if not (stage.optional and (quick or verdict_only))]
-    for stage in stages:
-        found = found if stage.optional else _after(stage, found, say)
+    for stage in (stage for stage in stages if not stage.optional):
+        found = (_in_time if stage.patient else _after)(stage, found, say, time_left)
     if verdict is not None:
         verdict(found)
     for stage in (stage for stage in stages if stage.optional):
@@ -174,7 +175,7 @@ def investigate(
 
 def _in_time(stage: Stage, found: Findings, say: Progress, time_left: budget.Budget) -> Findings:
     if time_left.spent <= time_left.seconds:
-        return _after(stage, found, say)
+        return _after(stage, found, say, time_left)
     return replace(found, warnings=(*found.warnings, f"{stage.name}: left out, the time was over"))
 
 
@@ -188,7 +189,7 @@ def _smaller(criteria: Criteria) -> Criteria:
     return replace(criteria, **{name: min(limit, getattr(criteria, name)) for name, limit in most.items()})
 
 
-def _after(stage: Stage, found: Findings, say: Progress) -> Findings:
+def _after(stage: Stage, found: Findings, say: Progress, time_left: budget.Budget) -> Findings:
     say(stage.name, 0, 1)
     try:
         return stage.run(found, say)

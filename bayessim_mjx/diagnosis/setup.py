@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -111,19 +112,13 @@ def prepare(
     seen = seen.of_logs(observation.completed(seen.demand(), robot.mj_model))
     usable, robot = seen.usable, lean.lean(robot, seen.usable, dt)
     told += [*seen.warnings, *(f"{text} (found, not assumed)" for text in seen.findings)]
-    floors = noise.floors(usable)
-    kinds = candidates.kinds_of(effects)
+    floors, kinds = noise.floors(usable), candidates.kinds_of(effects)
     size = scales.measure(robot.mj_model, [resample(log, dt) for log in usable], robot.rating)
     stack, left_out = candidates.stack(kinds, size)
     limit = tolerance.judge(robot.mj_model, 2 * size.travel, _noise(usable), asked).limit
     delivered = float(robot.mj_model.opt.timestep)
-    steps = stepping.stepping(
-        robot,
-        dt,
-        usable,
-        lambda own, *rest: _measured(own, usable, group, seen.use_qvel, limit, *rest),
-        lambda seconds: CUTTING.simulations * seconds < budget.seconds - budget.spent,
-    )
+    look_at = functools.partial(_measured, usable=usable, group=group, use_qvel=seen.use_qvel, limit=limit)
+    steps = stepping.stepping(robot, dt, usable, look_at, functools.partial(_affordable, budget))
     cuts, step = steps.cuts, steps.worth
     shift = _shift(cuts, step, size)
     lead = 0.0 if shift is None else shift.lead
@@ -143,6 +138,11 @@ def prepare(
     told += [*_few_conditions(cut), *allowed.warnings(), *led.sentences()]
     fixed = (robot, physics, seen, floors, fitter, led.candidates, size, settings, seed, allowed)
     return Setup(*fixed, tuple(told), tuple(said), step, before)
+
+
+def _affordable(budget: Budget, seconds: float) -> bool:
+    """Whether a search whose simulations of all windows take so many seconds each would end in time."""
+    return CUTTING.simulations * seconds < budget.seconds - budget.spent
 
 
 def _settings(robot: Robot, quick: bool = False) -> Settings:

@@ -2,7 +2,9 @@
 
 Every other cause of the generator is put in the place of the hidden one, sized as well as it can be, with the base
 parameters within their spread and the start states free; what is left of the gap, without noise, is how far the two are
-apart. Draws of shapes are few, so that a rival may be better than found: then a case counts that should not.
+apart. All of them are sized by linearising the base parameters; the closest are then refitted, simulated at every step,
+as what a gap of many noises leaves after a linear refit is mostly the linearisation's own error. Draws of shapes are
+few, so that a rival may be better than found: then a case counts that should not.
 """
 
 from collections.abc import Sequence
@@ -22,6 +24,7 @@ APART = 1.0  # encoder noises (rms over time, largest over joints): below, a riv
 SHARE = 0.2  # and of what the known parameters leave: less is lost in the simulator's own step and in linearising
 DRAWS = 2  # of a rival's sign and shape
 STEPS = 3  # secant steps to its size
+REFITS = 6  # Gauss-Newton steps of the closest, with the tangents of the motion without causes
 TOLD = 5  # rivals kept
 EVERY = 2  # windows are thinned by this: a rival costs several simulations
 # what the laws can be besides what the generator draws: to a single joint a sine of its angle, or a force straight up,
@@ -46,21 +49,26 @@ def rivals(cause: Cause, ruler: Ruler, names: Sequence[str] = tuple(KNOWN)) -> l
     runs = record(cause, ruler)
     gap = ruler.windows(ruler.plain, runs, every=EVERY)
     near = _joint(cause, ruler, gap)
+    every = [(*_best(*other, scales, ruler, runs, gap), *other) for other in _others(cause, ruler, names, near)]
     found: list[dict[str, Any]] = []
-    for name, where in _others(cause, ruler, names, near):
-        found.append({"name": name, "where": where, "left": _best(name, where, scales, ruler, runs, gap)})
-    return sorted(found, key=lambda r: r["left"])[:TOLD]
+    for left, rival, name, where in sorted(every, key=lambda r: r[0])[:TOLD]:
+        found.append({"name": name, "where": where, "left": min(left, _refitted(rival, ruler, runs, gap))})
+    return sorted(found, key=lambda r: r["left"])
 
 
 def apart(cause: Cause, name: str, where: str, ruler: Ruler) -> float:
     """Encoder noises that the best cause of that name and place leaves of the motion with another one."""
     runs = record(cause, ruler)
-    return _best(name, where, cause.scales, ruler, runs, ruler.windows(ruler.plain, runs, every=EVERY))
+    gap = ruler.windows(ruler.plain, runs, every=EVERY)
+    left, rival = _best(name, where, cause.scales, ruler, runs, gap)
+    return min(left, _refitted(rival, ruler, runs, gap))
 
 
-def _best(name: str, where: str, scales: Scales, ruler: Ruler, runs: list[Run], gap: np.ndarray) -> float:
+def _best(name: str, where: str, scales: Scales, ruler: Ruler, runs: list[Run], gap: np.ndarray) -> tuple[float, Cause]:
+    """(what it leaves, the closest draw)."""
     rng = np.random.default_rng((ruler.seed, *name.encode()))
-    return min(_closest(rival, ruler, runs, gap) for rival in _drawn(name, where, scales, rng))
+    each = [(_closest(rival, ruler, runs, gap), rival) for rival in _drawn(name, where, scales, rng)]
+    return min(each, key=lambda r: r[0])
 
 
 def record(cause: Cause, ruler: Ruler) -> list[Run]:
@@ -77,12 +85,12 @@ def _joint(cause: Cause, ruler: Ruler, gap: np.ndarray) -> str:
 
 
 def _others(cause: Cause, ruler: Ruler, names: Sequence[str], near: str) -> list[tuple[str, str]]:
-    """What else may be wrong at this joint, its actuator, at bodies, the world and contacts."""
+    """What else may be wrong at this joint, its actuator, at bodies, the world and contacts; the same law elsewhere."""
     out, scales = [], cause.scales
     for name in names:
         for where in places(ruler.system, name, scales):
             here = CAUSES[name].kind not in ("joint", "actuator") or scales.drives.get(where, where) == near
-            if here and name != cause.name:
+            if where != cause.where if name == cause.name else here:
                 out.append((name, where))
     return out
 
@@ -126,3 +134,28 @@ def _scaled(ruler: Ruler, gap: np.ndarray, other: np.ndarray, either: bool) -> t
     fit = lsq_linear(A, -target, bounds=(low, high))
     left = (target + A @ fit.x).reshape(gap.shape)
     return float(fit.x[-1] / size), float(np.sqrt(np.mean(left**2, axis=(0, 1))).max())
+
+
+def _refitted(rival: Cause, ruler: Ruler, runs: list[Run], gap: np.ndarray) -> float:
+    """What a rival leaves, in noises, once its size and the base parameters are refitted by simulation."""
+    names, shift, best = list(ruler.base), np.zeros(len(ruler.base)), np.inf
+    tangents, (low, high) = ruler.outside(ruler.tangents[::EVERY], EVERY), ruler.bounds
+    smallest = max(rival.smallest, 1e-4 * rival.largest)
+    for _ in range(REFITS):
+        base = {name: ruler.base[name] + float(own) for name, own in zip(names, shift, strict=True)}
+        now, without = (ruler.windows(Plant(ruler.system, base, causes), runs, every=EVERY) for causes in ([rival], []))
+        if not (np.isfinite(now).all() and np.isfinite(without).all()):
+            break
+        target, column = ruler.outside(now, EVERY)[:, 0], ruler.outside(now - without, EVERY)[:, 0]
+        left = float(np.sqrt(np.mean(target.reshape(gap.shape) ** 2, axis=(0, 1))).max())
+        if left > 0.99 * best or left < APART / 2:
+            return min(best, left)
+        best = left
+        size = max(float(np.abs(column).max()), 1e-12)
+        room = size * (np.array([smallest, rival.largest]) / rival.size - 1)
+        ends = np.append(low - shift, min(room[0], -1e-9)), np.append(high - shift, max(room[1], 1e-9))
+        ends = np.minimum(ends[0], -1e-9), np.maximum(ends[1], 1e-9)
+        step = lsq_linear(np.column_stack([tangents, column / size]), -target, bounds=ends).x
+        shift = np.clip(shift + step[:-1], low, high)
+        rival.size = float(np.clip(rival.size * (1 + step[-1] / size), smallest, rival.largest))
+    return best

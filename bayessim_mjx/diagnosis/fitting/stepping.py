@@ -10,12 +10,10 @@ from typing import Any
 from bayessim_mjx.diagnosis.fitting import stability
 from bayessim_mjx.diagnosis.fitting.discretisation import Discretisation, contacts
 from bayessim_mjx.diagnosis.fitting.robot import Robot
-from bayessim_mjx.diagnosis.fitting.substeps import Errors
 from bayessim_mjx.logs.log import Log
-from bayessim_mjx.physics import Physics
 
-# (robot's physics, coarsest stable factor, by a cheaper integrator) -> (the windows, what the time step is worth there)
-Measured = Callable[[Physics, int, Errors | None], tuple[Any, Discretisation]]
+# (robot's physics, first=coarsest stable factor, cheaper=see `Errors`) -> (the windows, what the time step is worth)
+Measured = Callable[..., tuple[Any, Discretisation]]
 STAGES = 4  # of Runge and Kutta's method, each as dear as a step
 TOO_LONG = "the model's time step shows beside the noise, and in the time given nothing finer can be searched with"
 
@@ -63,7 +61,7 @@ def stepping(
     stable = stability.needed(robot.physics(dt).mj_model, logs)
     robot = stable.robot(robot)
     own = robot.physics(dt)
-    plain = Stepping(robot, stable, *measured(own, stable.factor, None))
+    plain = Stepping(robot, stable, *measured(own, first=stable.factor))
     if not (plain.worth.beyond() or plain.worth.shows):
         return plain
     if contacts(own) or int(own.mj_model.opt.integrator) == stability.RK4:
@@ -77,7 +75,7 @@ def stepping(
     needs = stability.needed(physics.mj_model, logs)
     if needs.changed or not needs.reached:
         return plain
-    found = measured(physics, needs.factor, plain.worth.errors)
+    found = measured(physics, first=needs.factor, cheaper=plain.worth.errors)
     if found[1].beyond() or (found[1].shows and not plain.worth.beyond()):
         return plain
     step = 1e3 * found[1].timestep / found[1].factor

@@ -11,13 +11,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
+from bayessim_mjx.diagnosis.selection.budget import FINALISTS, TOGETHER
 from bayessim_mjx.diagnosis.selection.criteria import Criteria
 from bayessim_mjx.diagnosis.selection.decide import Decision, admissible, decide, off, order, same, settled, value
 from bayessim_mjx.diagnosis.selection.everywhere import by_law, laws, needed, spread
 from bayessim_mjx.diagnosis.selection.table import BASE, Key, Table
 
 ROUNDS = 4  # of growing and looking around, at most
-TOGETHER, FINALISTS = "effects together", "finalists"  # parts of the budget
 # times the leading model's cost: from where polishing has brought others ahead of it. What is missed farther away was
 # not counted; error rates with it are those of d462f0c in benchmarks/results.md.
 CLOSE = 4.0

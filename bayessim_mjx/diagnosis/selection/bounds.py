@@ -11,7 +11,7 @@ import numpy as np
 from bayessim_mjx.diagnosis import phrases
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate, Coordinate, shrink
 from bayessim_mjx.diagnosis.fitting.quadratic import solve
-from bayessim_mjx.diagnosis.selection.budget import LEAVING_OUT
+from bayessim_mjx.diagnosis.selection.budget import LEAVING_OUT, TOGETHER
 from bayessim_mjx.diagnosis.selection.models import Model, nats, scored
 from bayessim_mjx.diagnosis.selection.pool import AFRESH, Pool, Progress, fresh
 from bayessim_mjx.diagnosis.selection.tried import ranked
@@ -50,15 +50,15 @@ class Bound:
     why: str
 
 
-def widened(pool: Pool, model: Model, say: Progress) -> Model:
+def widened(pool: Pool, model: Model, say: Progress, part: str = LEAVING_OUT) -> Model:
     """The model with ranges as wide as it takes for its effects' parameters to lie within, refitted.
 
     A range doubles as long as a still wider one promises held-out evidence, up to `farthest` times what it was; what
     has brought it is kept. It stays where its end means that the effect is off, where physics ends, and where it sizes
-    an effect's memory.
+    an effect's memory. part: of the budget, after whose end it stays too.
     """
     last = model
-    while not pool.settings.budget.over(LEAVING_OUT) and _held(pool, last) and _promised(pool, last):
+    while not pool.settings.budget.over(part) and _held(pool, last) and _promised(pool, last):
         say("wider ranges", 0, 1)
         last = _refitted(pool, last, _moved(pool, last, _grown))
         if nats(model, last) >= WIDENING.nats:
@@ -83,7 +83,7 @@ def widen_leading(pool: Pool, say: Progress) -> None:
     held = sorted(((m.total - promise(pool, m), m) for m in singles), key=lambda h: h[0])
     held = [(total, m) for total, m in held if total < limit and _held(pool, m)]
     for _, model in held[: WIDENING.most]:
-        widened(pool, model, say)
+        widened(pool, model, say, TOGETHER)
 
 
 def promise(pool: Pool, model: Model) -> float:

@@ -15,7 +15,7 @@ from bayessim_mjx.diagnosis.fitting.fitter import Fit
 from bayessim_mjx.diagnosis.selection import chance, dense, heldout
 from bayessim_mjx.diagnosis.selection.beam import Plan
 from bayessim_mjx.diagnosis.selection.bounds import widened
-from bayessim_mjx.diagnosis.selection.budget import LEAVING_OUT
+from bayessim_mjx.diagnosis.selection.budget import LEAVING_OUT, TOGETHER
 from bayessim_mjx.diagnosis.selection.laws import beside, law_of
 from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.selection.pool import (
@@ -132,7 +132,7 @@ class Fits:
         for plan in plans:
             if plan.key not in self.pool.models and plan.key not in entries:
                 entries[plan.key] = self._entry(plan, len(entries))
-        fit_entries(self.pool, entries, label, self.say, LEAVING_OUT if needed else "effects together")
+        fit_entries(self.pool, entries, label, self.say, LEAVING_OUT if needed else TOGETHER)
 
     def _entry(self, plan: Plan, rank: int) -> tuple[list[Fit], tuple[Candidate, ...]]:
         model = self.pool.models[plan.parent]
@@ -168,8 +168,8 @@ class Fits:
         """All columns anew at the models' fits, and some more steps, in ranges as wide as it takes."""
         todo = [k for k in keys if k and k not in self._polished and k in self.pool.models]
         if todo and not self.over(LEAVING_OUT):
-            self._polished.update(todo)
             polished = polish(self.pool, [self.pool.models[k] for k in todo], self.say)
+            self._polished.update(todo[: len(polished)])
             wider = [widened(self.pool, model, self.say) for model in polished]
             if moved := [new for new, old in zip(wider, polished, strict=True) if new is not old]:
                 polish(self.pool, moved, self.say)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from bayessim_mjx.diagnosis import phrases
+from bayessim_mjx.diagnosis.selection.budget import SINGLES
 from bayessim_mjx.diagnosis.selection.tried import Tried
 
-SINGLES = "single effects"
 TOLD = 0.25  # of the time, from which on it is told that this was gone before the search
 
 

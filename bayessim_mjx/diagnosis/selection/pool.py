@@ -14,7 +14,7 @@ from bayessim_mjx.diagnosis.fitting.candidates import Candidate, Coordinate
 from bayessim_mjx.diagnosis.fitting.discretisation import contacts
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 from bayessim_mjx.diagnosis.selection import shortlist
-from bayessim_mjx.diagnosis.selection.budget import LEAVING_OUT
+from bayessim_mjx.diagnosis.selection.budget import LEAVING_OUT, SINGLES
 from bayessim_mjx.diagnosis.selection.criteria import Criteria
 from bayessim_mjx.diagnosis.selection.heats import Heats
 from bayessim_mjx.diagnosis.selection.models import Model, scored
@@ -33,6 +33,7 @@ class Rules:
     rounds: int = 5
     steps: int = 4
     falls: float = 0.99
+    refreshed: float = 0.3  # of the time left, for the first columns of all that are polished
     near: float = (
         1.3  # times the best one's cost, as near as a fit has to be able to come: a rule of thumb, not counted
     )
@@ -41,6 +42,7 @@ class Rules:
 
 
 RULES = Rules()
+POLISHING = "polishing"
 # of a fit that goes on with new columns: steps that were refused on old ones would hold it, and its start states, back
 AFRESH: dict[str, Any] = {"history": (), "damping": 1e-3, "reach": np.ones(1)}
 
@@ -104,7 +106,7 @@ def fit_models(pool: Pool, plans: Sequence[tuple[Model, Screened]], label: str, 
         key = frozenset([*(c.label for c in model.effects), extra.candidate.label])
         if key not in pool.models and key not in todo:
             todo[key] = (starts(pool, model, extra, len(todo)), (*model.effects, extra.candidate))
-    fit_entries(pool, todo, label, say, "single effects")
+    fit_entries(pool, todo, label, say, SINGLES)
     keys = [frozenset([*(c.label for c in m.effects), e.candidate.label]) for m, e in plans]
     return [pool.models[k] for k in keys if k in pool.models]
 
@@ -123,7 +125,7 @@ def fit_entries(pool: Pool, entries: Entries, label: str, say: Progress, part: s
     every = list(entries.items())
     for first in range(0, len(every), RULES.batch):
         some = dict(every[first : first + RULES.batch])
-        if part and pool.settings.budget.over(part) and (first or part != "single effects"):
+        if part and pool.settings.budget.over(part) and (first or part != SINGLES):
             _left_out(pool, [effects for _, (_, effects) in every[first:]], label)
             return
         done += sum(len(several) for several, _ in some.values())
@@ -216,14 +218,26 @@ def start_of(pool: Pool, candidate: Candidate) -> Screened:
 
 
 def polish(pool: Pool, models: Sequence[Model], say: Progress = lambda text, done, total: None) -> list[Model]:
-    """All columns anew at the fits, and more steps, again and again as long as it helps."""
-    fitter, count = pool.fitter, itertools.count()
+    """All columns anew at the fits, and more steps, again and again as long as it helps; returns the models that were.
+
+    Where time is limited these are the first ones, as many as it is enough for: none is ranked before it came as far
+    as the others.
+    """
+    fitter, count, budget = pool.fitter, itertools.count(), pool.settings.budget
+    began, left = budget.spent, budget.left(LEAVING_OUT)
 
     def told(fit: Fit) -> Fit:
-        say("polishing", min(next(count), 2 * len(models) - 1), 2 * len(models))
+        say(POLISHING, min(next(count), 2 * len(models) - 1), 2 * len(models))
         return fit
 
-    fits = [told(fitter.refresh(m.fit)) for m in models]
+    fits: list[Fit] = []
+    for model in models:
+        if fits and budget.spent - began > RULES.refreshed * left:
+            break
+        fits.append(told(fitter.refresh(model.fit)))
+    if later := models[len(fits) :]:
+        pool.skipped[POLISHING] = pool.skipped.get(POLISHING, 0) + len(later)
+    models = models[: len(fits)]
     fits = [_again(pool, fit) for fit in fits] if pool.rough else _to_the_end(pool, fits, told)
     new = [scored(fitter, fit, m.effects) for fit, m in zip(fits, models, strict=True)]
     pool.models.update({frozenset(c.label for c in m.effects): m for m in new})
@@ -243,7 +257,8 @@ def _to_the_end(pool: Pool, fits: Sequence[Fit], told: Callable[[Fit], Fit]) -> 
         start = [replace(fits[i], **AFRESH) for i in running]
         moved = pool.fitter.iterate(start, RULES.steps, lambda f: fresh(pool, f) if _astray(pool, f) else ())
         for i, fit in zip(running, moved, strict=True):
-            fits[i] = told(pool.fitter.refresh(fit))
+            late = pool.settings.budget.over(LEAVING_OUT)
+            fits[i] = fit if late else told(pool.fitter.refresh(fit))
         fell = {i: before.cost - fits[i].cost for i, before in zip(running, start, strict=True)}
         least, left = min(fit.cost for fit in fits), RULES.rounds - 1 - made
         running = [

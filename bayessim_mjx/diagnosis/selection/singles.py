@@ -10,7 +10,7 @@ from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 from bayessim_mjx.diagnosis.selection.beam import CLOSE
 from bayessim_mjx.diagnosis.selection.bounds import widen_leading
-from bayessim_mjx.diagnosis.selection.budget import KNOWN, SCREENING
+from bayessim_mjx.diagnosis.selection.budget import KNOWN, SCREENING, SINGLES
 from bayessim_mjx.diagnosis.selection.criteria import Criteria
 from bayessim_mjx.diagnosis.selection.models import scored
 from bayessim_mjx.diagnosis.selection.pool import AFRESH, Pool, Progress, fit_models, polish
@@ -26,6 +26,8 @@ WORTH = 0.02
 # and so many of them however little they promise beside what was proposed: a promise is linear, and of an effect a
 # hundred times the noise a share remains (of those 26 cases the true one was among the first three)
 SURE = 3
+# What a fit of a single effect from one start takes of simulations of all windows, about; further starts of an effect.
+SIMULATIONS, OTHERS = 40, 3
 
 
 def begin(
@@ -54,7 +56,7 @@ def begin(
             break
     base = scored(fitter, fit, ())
     each = (settings.budget.now() - began) / max(fitter.simulator.rollouts - before, 1)
-    settings = _affordable(candidates, settings, each)
+    settings = _affordable(candidates, settings, each, fit)
     pool = Pool(fitter, candidates, settings, criteria, nominal, base, keep=keep)
     if pool.rough:
         (pool.base,) = polish(pool, [base])
@@ -69,12 +71,12 @@ def begin(
 def fit_singles(pool: Pool, say: Progress = lambda text, done, total: None) -> None:
     """Single effects in the pool: the first ones, and those that promise to come near what is fitted already."""
     if not pool.above_noise(pool.base):
-        fit_models(pool, [(pool.base, s) for s in pool.screened[:FEW]], "single effects", say)
+        fit_models(pool, [(pool.base, s) for s in pool.screened[:FEW]], SINGLES, say)
         return
     near = CLOSE * min(m.total for m in pool.models.values())
     ranked = promising(pool.screened, pool.settings)
     some = [s for i, s in enumerate(ranked) if i < SURE or pool.base.total - s.gain < near]
-    fit_models(pool, [(pool.base, s) for s in some], "single effects", say)
+    fit_models(pool, [(pool.base, s) for s in some], SINGLES, say)
     widen_leading(pool, say)
     pool.keep(pool)
 
@@ -88,10 +90,22 @@ def promising(screened: Sequence[Screened], settings: Settings) -> list[Screened
     return [*led, *kept][: max(settings.singles, len(led))]
 
 
-def _affordable(candidates: Sequence[Candidate], settings: Settings, seconds: float) -> Settings:
-    """Fewer windows to screen on where time is limited, by the seconds that one of them took in a fit."""
-    if not settings.budget.limited:
+def _affordable(candidates: Sequence[Candidate], settings: Settings, seconds: float, fit: Fit) -> Settings:
+    """Fewer windows to screen on, and fewer single effects and starts of each, where time is limited.
+
+    Args:
+        seconds: that a simulation of a window took in this fit.
+    """
+    budget = settings.budget
+    if not budget.limited:
         return settings
+    seconds = max(seconds, 1e-9)
     points = max(sum(len(c.probes) for c in candidates), 1)
-    windows = settings.budget.left(SCREENING) / max(seconds, 1e-9) / points
-    return replace(settings, screened=int(min(max(windows, SIZES.fewest), settings.screened)))
+    windows = budget.left(SCREENING) / seconds / points
+    starts = int((budget.left(SINGLES) - max(budget.left(SCREENING), 0.0)) / (SIMULATIONS * len(fit.r) * seconds))
+    return replace(
+        settings,
+        screened=int(min(max(windows, SIZES.fewest), settings.screened)),
+        singles=min(max(starts, SURE), settings.singles),
+        starts=min(max(starts - settings.singles, 0) // OTHERS, settings.starts),
+    )

@@ -204,9 +204,9 @@ def test_runge_and_kutta_step_in_where_sub_steps_do_not_suffice():
     """A tolerance of a fiftieth of the noise: 3e-6 rad of a swing of two radians."""
     recorded, limit, tried = logs(ARM, swing), np.full(2, 6e-6), []
 
-    def measured_by(own, *rest):
+    def measured_by(own, **rest):
         tried.append(int(own.mj_model.opt.integrator))
-        return _measured(own, recorded, None, False, limit, *rest)
+        return _measured(own, recorded, None, False, limit, **rest)
 
     found = stepping.stepping(the(ARM), PERIOD, recorded, measured_by)
     assert tried[-1] == mujoco.mjtIntegrator.mjINT_RK4 and len(tried) == 2
@@ -219,7 +219,7 @@ def test_runge_and_kutta_step_in_where_what_sub_steps_leave_shows_beside_the_noi
     """All of it is far within the tolerance; as noise it would hide what the sensors see."""
     recorded, limit = logs(ARM, swing, noise=noise), np.full(2, 0.05)
     found = stepping.stepping(
-        the(ARM), PERIOD, recorded, lambda own, *rest: _measured(own, recorded, None, False, limit, *rest)
+        the(ARM), PERIOD, recorded, lambda own, **rest: _measured(own, recorded, None, False, limit, **rest)
     )
     assert found.robot.mj_model.opt.integrator == getattr(mujoco.mjtIntegrator, by)
     assert not found.worth.shows and found.worth.believed > 0.9
@@ -228,7 +228,7 @@ def test_runge_and_kutta_step_in_where_what_sub_steps_leave_shows_beside_the_noi
 def test_the_better_integrator_takes_derivatives_from_the_cheaper_one_and_finds_what_it_finds_alone():
     recorded, limit = logs(ARM, swing, noise=1e-5), np.full(2, 0.05)
     found = stepping.stepping(
-        the(ARM), PERIOD, recorded, lambda own, *rest: _measured(own, recorded, None, False, limit, *rest)
+        the(ARM), PERIOD, recorded, lambda own, **rest: _measured(own, recorded, None, False, limit, **rest)
     )
     errors = found.worth.errors
     assert errors.cheaper is not None and errors.differences(1) is errors.cheaper
@@ -248,7 +248,7 @@ def test_where_time_is_limited_the_integrator_stays_unless_a_search_by_the_bette
         return False
 
     found = stepping.stepping(
-        the(ARM), PERIOD, recorded, lambda own, *rest: _measured(own, recorded, None, False, limit, *rest), affordable
+        the(ARM), PERIOD, recorded, lambda own, **rest: _measured(own, recorded, None, False, limit, **rest), affordable
     )
     assert found.robot.mj_model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     assert stepping.TOO_LONG in found.said()
@@ -260,7 +260,7 @@ def test_logs_of_a_simulation_keep_its_integrator():
     """Without noise nobody knows whether their step was this one."""
     recorded, limit = logs(ARM, swing, finer=1, noise=0.0), np.full(2, 0.05)
     found = stepping.stepping(
-        the(ARM), PERIOD, recorded, lambda own, *rest: _measured(own, recorded, None, False, limit, *rest)
+        the(ARM), PERIOD, recorded, lambda own, **rest: _measured(own, recorded, None, False, limit, **rest)
     )
     assert found.robot.mj_model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
 
