@@ -29,7 +29,7 @@ from bayessim_mjx.diagnosis.selection.criteria import Criteria
 from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.selection.tried import Settings, Tried
 from bayessim_mjx.diagnosis.setup import Setup, prepare
-from bayessim_mjx.diagnosis.summary import assemble, first_look, whole_logs
+from bayessim_mjx.diagnosis.summary import assemble, finer_steps, first_look, whole_logs
 from bayessim_mjx.diagnosis.summary.files import Files
 from bayessim_mjx.effects.effect import Effect
 from bayessim_mjx.logs import read_logs
@@ -99,9 +99,11 @@ def rivals_without_physics(found: Findings, say: Progress) -> Findings:
     return found if boxes is None else found.having(boxes)
 
 
+ROOM = 0.9  # of the time, after which no stage is begun that the verdict can do without: it compiles programs of its own
 STAGES = (
     Stage("how far", how_far),
     Stage("none of these?", none_of_these),
+    Stage("finer steps", finer_steps.stage, patient=True),
     Stage("whole logs", whole_logs.stage, patient=True),
     Stage("where", where_it_lies, optional=True),
     Stage("black boxes", rivals_without_physics, optional=True),
@@ -174,7 +176,7 @@ def investigate(
 
 
 def _in_time(stage: Stage, found: Findings, say: Progress, time_left: budget.Budget) -> Findings:
-    if time_left.spent <= time_left.seconds:
+    if time_left.spent <= ROOM * time_left.seconds:
         return _after(stage, found, say, time_left)
     return replace(found, warnings=(*found.warnings, f"{stage.name}: left out, the time was over"))
 

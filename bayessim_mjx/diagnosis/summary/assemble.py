@@ -19,6 +19,7 @@ from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.selection.tried import Tried, ranked
 from bayessim_mjx.diagnosis.summary import effects_found, how_far
 from bayessim_mjx.diagnosis.summary.details import details
+from bayessim_mjx.diagnosis.summary.finer_steps import AtFinerSteps
 from bayessim_mjx.diagnosis.summary.left_in_words import (
     black_boxes_in_words,
     located_in_words,
@@ -48,7 +49,9 @@ def diagnosis_of(found: Findings, about: Mapping[str, Any] | None = None, file: 
     timestep = float(setup.robot.mj_model.opt.timestep) * (setup.discretisation.factor if setup.discretisation else 1)
     together = uncertainty.covariance(setup.fitter, model, selection.along)
     together = together + np.diag(uncertainty.systematic(model, timestep, selection.left(model)) ** 2)
-    together = _told(found, together)
+    finer = found.part(AtFinerSteps)
+    steps = finer.notes(found, together) if finer else []
+    together = _told(found, together + finer.covariance if finer else together)
     sd = np.sqrt(np.diag(together))
     closed = effects_found.closed_by(found)
     effects = effects_found.effects_of(found, sd, closed)
@@ -60,7 +63,7 @@ def diagnosis_of(found: Findings, about: Mapping[str, Any] | None = None, file: 
     odds = by_chance(found)
     told = sentences(verdict, effects, parameters, found, far, odds)
     told += [not_on_offer(e.name for e in setup.physics.effects)] if verdict.name == "unexplained" else []
-    notes = [*setup.warnings, *(over.notes if over else ()), *(horizon_warning(far) if effects else [])]
+    notes = [*setup.warnings, *steps, *(over.notes if over else ()), *(horizon_warning(far) if effects else [])]
     more = {"maps": where.found.maps, "frequency": [heard.details() for heard in where.spectra]} if where else {}
     lies = [*located_in_words(where.found), *spectra_in_words(where.spectra)] if where else []
     rivals = black_boxes_in_words(found.part(BlackBoxes))

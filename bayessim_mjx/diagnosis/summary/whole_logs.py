@@ -136,7 +136,7 @@ def _one(found: Findings, simulator: Simulator, stages: dict[str, _Stage], away:
     ends = np.array([(c.low, c.high) for c in last.model.fit.coordinates]).reshape(-1, 2).T
     drawn = [*[values[-1]] * RULES.draws, *np.clip(off, *ends)]
     models = [s.model for s in stages.values()] + [last.model] * len(drawn)
-    thetas = np.stack([_theta(found, simulator, m, v) for m, v in zip(models, [*values, *drawn], strict=True)])
+    thetas = np.stack([theta_of(found, simulator, m, v) for m, v in zip(models, [*values, *drawn], strict=True)])
     raw = simulator.run(thetas, np.concatenate([offsets, moved])[:, None], np.array([i]))[:, 0]
     raw[np.abs(raw) >= RULES.lost] = np.nan
     return np.asarray(raw[..., fitter.used] / fitter.sigma)
@@ -158,7 +158,7 @@ def _values(found: Findings, stage: _Stage, w: int) -> Array:
     return stage.model.estimates[list(np.unique(cut.group)).index(own[0])] if len(own) == 1 else fit.values
 
 
-def _theta(found: Findings, simulator: Simulator, model: Model, values: Array) -> Array:
+def theta_of(found: Findings, simulator: Simulator, model: Model, values: Array) -> Array:
     """theta of the small simulator."""
     space, small = found.setup.physics.space, simulator.physics.space
     return found.setup.fitter.vector(model.fit.coordinates, values)[[space.index(name) for name in small.names]]

@@ -42,7 +42,7 @@ def test_what_there_was_no_time_for_is_told_in_words():
 
 
 def test_parts_end_one_after_the_other_and_without_a_limit_never():
-    clock = iter([30.0, 55.0, 59.0])
+    clock = iter([29.0, 40.0, 54.0])
     budget = Budget(100.0, 0.0, lambda: next(clock))
     assert [budget.over(part) for part in ("single effects", "single effects", "finalists")] == [False, True, False]
     assert list(ENDS.values()) == sorted(ENDS.values())
@@ -103,13 +103,13 @@ class Slow:
 
 @pytest.mark.parametrize(
     ("limit", "steps", "refreshed", "windows", "alone", "starts"),
-    [(500.0, 6, 1, 8, 7, 0), (1e9, 20, 2, 20, 24, 12), (4000.0, 20, 2, 20, 24, 12)],
+    [(600.0, 6, 1, 8, 9, 0), (1e9, 20, 2, 20, 24, 12), (4000.0, 20, 2, 20, 24, 12)],
 )
 def test_the_fit_of_the_known_parameters_ends_with_its_share_of_the_time(
     monkeypatch, limit, steps, refreshed, windows, alone, starts
 ):
-    """Ten steps twice where there is time for them; .12 of 500 s are six. Windows are then screened as time allows, and
-    single effects fitted: .12 of 500 s are seven of 40 simulations of two windows each."""
+    """Ten steps twice where there is time for them; .1 of 600 s are six. Windows are then screened as time allows, and
+    single effects fitted: .12 of 600 s are nine of 40 simulations of two windows each."""
     fitter, seen = Slow(), {}
     settings = Settings(budget=Budget(limit, 0.0, lambda: fitter.seconds), screened=20)
     candidates = [SimpleNamespace(probes=np.zeros((40, 1)))] * 2
@@ -125,4 +125,4 @@ def test_the_fit_of_the_known_parameters_ends_with_its_share_of_the_time(
     pool = singles.begin(fitter, candidates, settings, Criteria())
     assert (seen["steps"], fitter.refreshed) == (steps, refreshed)
     assert (pool.settings.singles, pool.settings.starts) == (alone, starts)
-    assert seen["screened"] == windows  # 40 s for 80 points at .1 s a window are 2, but never fewer than 8
+    assert seen["screened"] == windows  # 48 s for 80 points at .1 s a window are 6, but never fewer than 8

@@ -1,0 +1,93 @@
+"""What the simulator's time step is worth in the parameters: where they would go at finer steps.
+
+A fit takes part of the integrator's error into its parameters. One Gauss-Newton step from it, on the same windows
+simulated at a quarter of the step, tells how much: of an error that is proportional to the step three quarters.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayessim_mjx.diagnosis.findings import Findings, Progress
+from bayessim_mjx.diagnosis.fitting import windows
+from bayessim_mjx.diagnosis.fitting.centred_commands import physics_of
+from bayessim_mjx.diagnosis.fitting.discretisation import contacts, refined
+from bayessim_mjx.diagnosis.fitting.fitter import Fit
+from bayessim_mjx.diagnosis.fitting.quadratic import solve
+from bayessim_mjx.diagnosis.fitting.simulator import FAR, Simulator
+from bayessim_mjx.diagnosis.summary.whole_logs import theta_of
+from bayessim_mjx.physics import staggered
+
+Array = NDArray[np.float64]
+FINER = 4  # times
+TOLD = 2.0  # standard deviations without it, from where on a parameter's shift is told
+
+
+@dataclass(frozen=True, eq=False)
+class AtFinerSteps:
+    """`shift`: `[k]`, what the values of the model's coordinates would change by at ever finer steps."""
+
+    shift: Array
+
+    @property
+    def covariance(self) -> Array:
+        """`[k, k]`, of parameters that are off by the shift, all together, one way or the other."""
+        return np.outer(self.shift, self.shift)
+
+    def notes(self, found: Findings, together: Array) -> list[str]:
+        """For the warnings; together: `[k, k]`, covariance without it."""
+        fit, own = found.model.fit, {c.name for effect in found.model.effects for c in effect.coordinates}
+        each = zip(fit.coordinates, fit.values, self.shift, np.sqrt(np.diag(together)), strict=True)
+        told = [
+            f"{c.name} {value + shift:.3g} in place of {value:.3g} {c.unit}".rstrip()
+            for c, value, shift, sd in each
+            if c.name in own and abs(shift) > TOLD * sd
+        ]
+        text = "the time step is in the parameters: at ever finer steps they would be"
+        return [f"{text} {', '.join(told)} (counted in their intervals)"] if told else []
+
+
+def stage(found: Findings, say: Progress) -> Findings:
+    """With what finer steps change; nothing where something can touch, or by an integrator of higher order."""
+    robot = found.setup.robot
+    if not staggered(robot.mj_model) or contacts(found.setup.physics):
+        return found
+    shift = _shift(found)
+    return found if shift is None else found.having(AtFinerSteps(shift))
+
+
+def _shift(found: Findings) -> Array | None:
+    """Of the coordinates; None where finer steps cannot be simulated."""
+    setup, fit, fitter = found.setup, found.model.fit, found.setup.fitter
+    simulator = _simulator(found)
+    theta = theta_of(found, simulator, found.model, fit.values)
+    errors = simulator.run(theta[None], fit.offsets[None])
+    if np.abs(errors).max() >= FAR:
+        return None
+    finer = replace(fit, r=fitter.whiten(errors)[0])
+    ends = [_step(f, setup.fitter.spread) for f in (fit, finer)]
+    return np.asarray((ends[1] - ends[0]) * FINER / (FINER - 1), np.float64)
+
+
+def _step(fit: Fit, spread: Array) -> Array:
+    """`[k]`, the step to the minimum of the quadratic form at a fit."""
+    q, _ = fit.quadratic(spread)
+    g, S = q.weighted(fit.weight)
+    precision, pull, low, high = fit.prior()
+    return solve(S + np.diag(precision), g + pull, low, high)
+
+
+def _simulator(found: Findings) -> Simulator:
+    """The windows at finer steps, with the named effects only: a small program."""
+    setup, named = found.setup, {e.effect for e in found.model.effects}
+    cut, step = setup.fitter.simulator.windows, float(setup.robot.mj_model.opt.timestep)
+    effects = [e for e in setup.physics.effects if e.name in named]
+    physics = physics_of(refined(setup.robot, step / FINER), cut.dt, effects)
+    starts = list(zip(cut.log.tolist(), cut.start.tolist(), strict=True))
+    own = windows.cut(
+        setup.logs, physics.mj_model, cut.dt, physics.substeps, cut.steps, limit=len(cut), starts=starts, centred=False
+    )
+    return Simulator(physics, own)

@@ -1,0 +1,56 @@
+"""What a coarse time step puts into the parameters: told, and right."""
+
+from types import SimpleNamespace
+
+import mujoco
+import numpy as np
+import pytest
+
+from bayessim_mjx.diagnosis.fitting import robot
+from bayessim_mjx.diagnosis.setup import prepare
+from bayessim_mjx.diagnosis.summary import finer_steps
+from bayessim_mjx.diagnosis.summary.finer_steps import AtFinerSteps
+from tests.diagnosis.pendulums import ARMATURE, DAMPING, FEW, MASS, MODEL, fitted, recorded
+
+SCALE = (1.1, 1.15, 0.95)
+COARSE = 0.02  # s, a hundred times the step of the logs
+
+
+def found_at(fit, **setup):
+    return SimpleNamespace(setup=SimpleNamespace(**setup), model=SimpleNamespace(fit=fit, effects=()))
+
+
+@pytest.mark.slow
+@pytest.mark.ci
+def test_where_parameters_would_go_at_finer_steps_is_where_the_truth_is(tmp_path):
+    """Ten milliseconds put 1.6 % into the rotor inertia; the other two parameters hardly change."""
+    path = tmp_path / "pendulum.xml"
+    path.write_text(MODEL % (COARSE, "Euler", DAMPING, ARMATURE, 0.0, MASS))
+    setup = prepare(robot.of_file(path), recorded(scale=SCALE, sigma=1e-3), FEW)
+    fitter, fit = fitted(setup)
+    shift = finer_steps._shift(SimpleNamespace(setup=setup, model=SimpleNamespace(fit=fit, effects=())))
+    damping, armature, mass = np.abs(fit.values - SCALE)
+    assert armature > 0.01
+    assert abs(fit.values[1] + shift[1] - SCALE[1]) < armature / 4
+    assert abs(shift[0]) < 0.005 and abs(shift[2]) < 0.001
+    assert np.sqrt(AtFinerSteps(shift).covariance[1, 1]) == pytest.approx(abs(shift[1]))
+
+
+def test_shifts_are_told_of_effects_where_they_are_more_than_two_standard_deviations():
+    coordinates = [SimpleNamespace(name=n, unit=u) for n, u in (("mass", "kg"), ("stall", "N m"), ("speed", "rad/s"))]
+    fit = SimpleNamespace(coordinates=coordinates, values=np.array([1.0, 3.5, 20.0]))
+    effect = SimpleNamespace(coordinates=coordinates[1:])
+    found = SimpleNamespace(model=SimpleNamespace(fit=fit, effects=(effect,)))
+    together = np.diag([1e-6, 1e-4, 1.0])
+    (told,) = AtFinerSteps(np.array([0.5, 0.1, 1.9])).notes(found, together)
+    assert "stall 3.6 in place of 3.5 N m (counted in their intervals)" in told
+    assert "mass" not in told and "speed" not in told
+    assert AtFinerSteps(np.array([0.5, 0.01, 1.9])).notes(found, together) == []
+
+
+@pytest.mark.parametrize(("integrator", "touching"), [("RK4", False), ("Euler", True)])
+def test_nothing_is_simulated_where_it_would_say_nothing(monkeypatch, integrator, touching):
+    model = mujoco.MjModel.from_xml_string(MODEL % (COARSE, integrator, DAMPING, ARMATURE, 0.0, MASS))
+    found = found_at(None, robot=SimpleNamespace(mj_model=model), physics=None)
+    monkeypatch.setattr(finer_steps, "contacts", lambda physics: touching)
+    assert finer_steps.stage(found, lambda text, done, total: None) is found
