@@ -99,7 +99,9 @@ def rivals_without_physics(found: Findings, say: Progress) -> Findings:
     return found if boxes is None else found.having(boxes)
 
 
-ROOM = 0.9  # of the time, after which no stage is begun that the verdict can do without: it compiles programs of its own
+ROOM = (
+    0.9  # of the time, after which no stage is begun that the verdict can do without: it compiles programs of its own
+)
 STAGES = (
     Stage("how far", how_far),
     Stage("none of these?", none_of_these),
@@ -157,7 +159,8 @@ def investigate(
     asked: dict[str, Any] = {"group": group, "seed": seed, "settings": settings, "tolerated": tolerated, "notes": notes}
     asked |= {"budget": time_left}
     setup = prepare(robot, logs, effects, quick=quick, **asked, seen_first=lambda seen: tell(first_look.lines(seen)))
-    setup = resumed.remembering(_within(setup, time_left), criteria, remember)
+    setup = replace(setup, settings=replace(setup.settings, budget=time_left))
+    setup = resumed.remembering(setup, criteria, remember)
     for text in setup.said:
         say(text, 0, 1)
     known(setup, None)
@@ -179,10 +182,6 @@ def _in_time(stage: Stage, found: Findings, say: Progress, time_left: budget.Bud
     if time_left.spent <= ROOM * time_left.seconds:
         return _after(stage, found, say, time_left)
     return replace(found, warnings=(*found.warnings, f"{stage.name}: left out, the time was over"))
-
-
-def _within(setup: Setup, time_left: budget.Budget) -> Setup:
-    return replace(setup, settings=replace(setup.settings, budget=time_left))
 
 
 def _smaller(criteria: Criteria) -> Criteria:

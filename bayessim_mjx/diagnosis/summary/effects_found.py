@@ -17,6 +17,8 @@ from bayessim_mjx.diagnosis.setup import Setup
 # operating conditions, from which on closure is quoted of those that had no part in the choice: without one of two, a
 # single one is left to choose by, which tells no standard error over conditions
 LEAST = 3
+UNKNOWN = 0.5  # of its range, a standard deviation from which on logs tell nothing of a parameter
+UNTOLD = "is told by nothing in these logs"
 
 
 def effects_of(found: Findings, sd: np.ndarray, closed: dict[str, Any]) -> list[FoundEffect]:
@@ -99,7 +101,8 @@ def _effect(found: Findings, effect: Candidate, sd: np.ndarray, part: _Part) -> 
         bound = bounds.of(setup.physics, c, value)
         deviation = float(sd[i]) if bound is None or bound.kind == "off" else float("nan")
         numbers[word] = Estimate(value, deviation, _unit(setup, effect, c.unit), bound.kind if bound else "")
-        ends += [f"{word.replace('_', ' ')} {bound.why}"] if bound else []
+        clause = bound.why if bound else UNTOLD if deviation > UNKNOWN * (c.high - c.low) else ""
+        ends += [f"{word.replace('_', ' ')} {clause}"] if clause else []
     return FoundEffect(
         name=effect.effect,
         where=effect.where,

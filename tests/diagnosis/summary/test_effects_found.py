@@ -1,0 +1,29 @@
+"""What is said of a named effect's parameters besides their numbers."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from bayessim_mjx.diagnosis.summary import effects_found
+
+
+@pytest.mark.parametrize(
+    ("deviation", "sentence"), [(2.0, "To previous is told by nothing in these logs."), (0.9, ""), (0.001, "")]
+)
+def test_a_share_that_reaches_no_joint_is_said_to_be_told_by_nothing(monkeypatch, deviation, sentence):
+    """A drive at the end of a chain has one neighbour; ranges are from -1 to 1."""
+    names = ("waist.effort_coupling.to_next", "waist.effort_coupling.to_previous")
+    coordinates = [SimpleNamespace(name=n, low=-1.0, high=1.0, unit="") for n in names]
+    effect = SimpleNamespace(effect="effort_coupling", where="waist", coordinates=coordinates, label="x")
+    fit = SimpleNamespace(names=list(names), values=np.array([-0.027, 0.0]))
+    model = SimpleNamespace(fit=fit, effects=(effect,))
+    found = SimpleNamespace(
+        setup=SimpleNamespace(physics=None), model=model, selection=SimpleNamespace(rivals={}, noise=1.0)
+    )
+    monkeypatch.setattr(effects_found.bounds, "of", lambda physics, coordinate, value: None)
+    monkeypatch.setattr(effects_found, "_unit", lambda setup, effect, unit: unit)
+    part = effects_found._Part(1.0, 1.0, (0.9, 1.0), 1.0)
+    told = effects_found._effect(found, effect, np.array([0.003, deviation]), part)
+    assert told.sentence == sentence
+    assert told.parameters["to_previous"].sd == deviation
