@@ -159,18 +159,16 @@ def investigate(
     asked: dict[str, Any] = {"group": group, "seed": seed, "settings": settings, "tolerated": tolerated, "notes": notes}
     asked |= {"budget": time_left}
     setup = prepare(robot, logs, effects, quick=quick, **asked, seen_first=lambda seen: tell(first_look.lines(seen)))
-    setup = replace(setup, settings=replace(setup.settings, budget=time_left))
-    setup = resumed.remembering(setup, criteria, remember)
+    setup = resumed.remembering(_within(setup, time_left), criteria, remember)
     for text in setup.said:
         say(text, 0, 1)
     known(setup, None)
     given = setup.fitter, setup.candidates, setup.settings, criteria
     found = Findings(setup, selected.select(*given, say, lambda tried: known(setup, tried)))
     resumed.ended(setup)
-    stages = STAGES if stages is None else stages
-    stages = [stage for stage in stages if not (stage.optional and (quick or verdict_only))]
+    stages = [s for s in (STAGES if stages is None else stages) if not (s.optional and (quick or verdict_only))]
     for stage in (stage for stage in stages if not stage.optional):
-        found = (_in_time if stage.patient else _after)(stage, found, say, time_left)
+        found = _in_time(stage, found, say, time_left) if stage.patient else _after(stage, found, say)
     if verdict is not None:
         verdict(found)
     for stage in (stage for stage in stages if stage.optional):
@@ -179,9 +177,12 @@ def investigate(
 
 
 def _in_time(stage: Stage, found: Findings, say: Progress, time_left: budget.Budget) -> Findings:
-    if time_left.spent <= ROOM * time_left.seconds:
-        return _after(stage, found, say, time_left)
-    return replace(found, warnings=(*found.warnings, f"{stage.name}: left out, the time was over"))
+    without = replace(found, warnings=(*found.warnings, f"{stage.name}: left out, the time was over"))
+    return without if time_left.late else _after(stage, found, say)
+
+
+def _within(setup: Setup, time_left: budget.Budget) -> Setup:
+    return replace(setup, settings=replace(setup.settings, budget=time_left))
 
 
 def _smaller(criteria: Criteria) -> Criteria:
@@ -190,7 +191,7 @@ def _smaller(criteria: Criteria) -> Criteria:
     return replace(criteria, **{name: min(limit, getattr(criteria, name)) for name, limit in most.items()})
 
 
-def _after(stage: Stage, found: Findings, say: Progress, time_left: budget.Budget) -> Findings:
+def _after(stage: Stage, found: Findings, say: Progress) -> Findings:
     say(stage.name, 0, 1)
     try:
         return stage.run(found, say)

@@ -16,6 +16,8 @@ ENDS = {
     KNOWN: 0.1, SCREENING: 0.18, SINGLES: 0.3, TOGETHER: 0.45, FINALISTS: 0.55, LEAVING_OUT: 0.68,
 }  # fmt: skip
 
+ROOM = 0.9  # of the time, after which no part is begun that can be left out
+
 
 @dataclass(frozen=True)
 class Budget:
@@ -40,6 +42,11 @@ class Budget:
     def spent(self) -> float:
         """Seconds since it began."""
         return self.now() - self.began
+
+    @property
+    def late(self) -> bool:
+        """Whether nothing should begin that a verdict can do without: it compiles programs of its own."""
+        return self.spent > ROOM * self.seconds
 
     def searching(self) -> Budget:
         """The same for a search that begins now."""
