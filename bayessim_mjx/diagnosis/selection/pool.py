@@ -220,8 +220,7 @@ def start_of(pool: Pool, candidate: Candidate) -> Screened:
 def polish(pool: Pool, models: Sequence[Model], say: Progress = lambda text, done, total: None) -> list[Model]:
     """All columns anew at the fits, and more steps, again and again as long as it helps; returns the models that were.
 
-    Where time is limited these are the first ones, as many as it is enough for: none is ranked before it came as far
-    as the others.
+    Where time is limited these are the first ones, as many as it is enough for; others stay as the search left them.
     """
     fitter, count, budget = pool.fitter, itertools.count(), pool.settings.budget
     began, left = budget.spent, budget.left(LEAVING_OUT)
