@@ -16,7 +16,7 @@ ENDS = {
     KNOWN: 0.1, SCREENING: 0.18, SINGLES: 0.3, TOGETHER: 0.45, FINALISTS: 0.55, LEAVING_OUT: 0.68,
 }  # fmt: skip
 
-ROOM = 0.8  # of the time, after which no part is begun that can be left out: whole logs of a stiff arm took a fifth of it
+ROOM = 0.8  # of the time, after which nothing is begun that can be left out: whole logs of a stiff arm took a fifth
 
 
 @dataclass(frozen=True)
