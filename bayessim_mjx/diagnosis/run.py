@@ -99,9 +99,6 @@ def rivals_without_physics(found: Findings, say: Progress) -> Findings:
     return found if boxes is None else found.having(boxes)
 
 
-ROOM = (
-    0.9  # of the time, after which no stage is begun that the verdict can do without: it compiles programs of its own
-)
 STAGES = (
     Stage("how far", how_far),
     Stage("none of these?", none_of_these),

@@ -16,7 +16,7 @@ from scipy.optimize import lsq_linear
 from bayessim_mjx.blind.reality.cause import Cause, Scales
 from bayessim_mjx.blind.reality.menu import CAUSES, KNOWN, places
 from bayessim_mjx.blind.reality.plant import Plant, Run
-from bayessim_mjx.blind.reality.strength import Ruler
+from bayessim_mjx.blind.reality.strength import Ruler, largest_rms
 
 # The first two say what counts as one motion. How often pairs that count as apart are told apart is measured as
 # "isolable" in benchmarks/results.md. The others are what the time allows.
@@ -133,7 +133,7 @@ def _scaled(ruler: Ruler, gap: np.ndarray, other: np.ndarray, either: bool) -> t
     low, high = np.append(ruler.bounds[0], -most if either else 0.0), np.append(ruler.bounds[1], most)
     fit = lsq_linear(A, -target, bounds=(low, high))
     left = (target + A @ fit.x).reshape(gap.shape)
-    return float(fit.x[-1] / size), float(np.sqrt(np.mean(left**2, axis=(0, 1))).max())
+    return float(fit.x[-1] / size), largest_rms(left)
 
 
 def _refitted(rival: Cause, ruler: Ruler, runs: list[Run], gap: np.ndarray) -> float:
@@ -147,13 +147,13 @@ def _refitted(rival: Cause, ruler: Ruler, runs: list[Run], gap: np.ndarray) -> f
         if not (np.isfinite(now).all() and np.isfinite(without).all()):
             break
         target, column = ruler.outside(now, EVERY)[:, 0], ruler.outside(now - without, EVERY)[:, 0]
-        left = float(np.sqrt(np.mean(target.reshape(gap.shape) ** 2, axis=(0, 1))).max())
+        left = largest_rms(target.reshape(gap.shape))
         if left > 0.99 * best or left < APART / 2:
             return min(best, left)
         best = left
         size = max(float(np.abs(column).max()), 1e-12)
         room = size * (np.array([smallest, rival.largest]) / rival.size - 1)
-        ends = np.append(low - shift, min(room[0], -1e-9)), np.append(high - shift, max(room[1], 1e-9))
+        ends = np.append(low - shift, room[0]), np.append(high - shift, room[1])
         ends = np.minimum(ends[0], -1e-9), np.maximum(ends[1], 1e-9)
         step = lsq_linear(np.column_stack([tangents, column / size]), -target, bounds=ends).x
         shift = np.clip(shift + step[:-1], low, high)

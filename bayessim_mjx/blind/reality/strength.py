@@ -71,15 +71,15 @@ class Ruler:
     def measure(self, runs: Sequence[Run]) -> tuple[float, float]:
         """(raw, left) of runs with causes."""
         gap = self.windows(self.plain, runs)
-        raw = _size(gap)
+        raw = largest_rms(gap)
         if not np.isfinite(raw):
             return np.inf, np.inf
         tangents, target = self.outside(self.tangents), self.outside(gap)[:, 0]
         fit = lsq_linear(tangents, -target, bounds=self.bounds)
-        return raw, _size((target + tangents @ fit.x).reshape(gap.shape))
+        return raw, largest_rms((target + tangents @ fit.x).reshape(gap.shape))
 
 
-def _size(gap: np.ndarray) -> float:
+def largest_rms(gap: np.ndarray) -> float:
     return float(np.sqrt(np.mean(gap**2, axis=(0, 1))).max())
 
 

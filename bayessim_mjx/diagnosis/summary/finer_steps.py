@@ -22,7 +22,7 @@ from bayessim_mjx.diagnosis.summary.whole_logs import theta_of
 from bayessim_mjx.physics import staggered
 
 Array = NDArray[np.float64]
-FINER = 4  # times
+FINER = 4  # times as many steps as the fit took: a quarter of an error of first order is left, and extrapolated
 TOLD = 2.0  # standard deviations without it, from where on a parameter's shift is told
 
 
