@@ -4,12 +4,10 @@ import dataclasses
 from typing import TYPE_CHECKING, ClassVar
 
 import jax
-import jax.numpy as jnp
 
 from bayessim_mjx.effects.effect import Effect, Quantity
 from bayessim_mjx.effects.support.friction import add, native
 from bayessim_mjx.effects.support.site import Site
-from bayessim_mjx.parameters import constants
 
 if TYPE_CHECKING:
     import mujoco
@@ -30,6 +28,7 @@ class Armature(Effect):
     name: ClassVar[str] = "armature"
     kind: ClassVar[str] = "joint"
     effort: ClassVar[str] = "acceleration"
+    inertial: ClassVar[bool] = True
     noun: ClassVar[str] = "added rotor inertia"
     lacks: ClassVar[str] = "rotor inertia"
     separates: ClassVar[str] = (
@@ -40,20 +39,9 @@ class Armature(Effect):
     )
 
     def on_model(self, at: Site, model: "mjx.Model", theta: jax.Array) -> "mjx.Model":
-        added = at.values(theta)[:, 0]
-        changed = model.replace(dof_armature=model.dof_armature.at[at.dadr].add(added))
-        derived = constants.derived(changed, {"dof_armature"}, reference=model)
-        # neutral: the compiler's own numbers, not their recomputation in float32
-        present = jnp.any(added > 0)
-        kept = {name: jnp.where(present, new, _leaf(model, name)) for name, new in derived.items()}
-        return changed.tree_replace(kept)
+        return model.replace(dof_armature=model.dof_armature.at[at.dadr].add(at.values(theta)[:, 0]))
 
     def edit(self, spec: "mujoco.MjSpec", values: dict[str, dict[str, float]]) -> str | None:
         for joint, own in native(spec, values):
             add(joint, "armature", own["inertia"])
         return None
-
-
-def _leaf(model: "mjx.Model", name: str) -> jax.Array:
-    group, _, own = name.rpartition(".")
-    return getattr(getattr(model, group) if group else model, own)

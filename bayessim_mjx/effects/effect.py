@@ -57,6 +57,9 @@ class Effect(abc.ABC):
     each: ClassVar[bool] = (
         False  # whether a robot has it at every body, with values of its own, as it has a law at every joint
     )
+    # whether its on_model changes masses or inertias: what MuJoCo derives from them is computed after all of these, and
+    # only then the other effects change the model
+    inertial: ClassVar[bool] = False
     offered: ClassVar[bool] = True  # among all the effects that a diagnosis tries; else only where it is named
     # for people; where these are empty, `support.words` says something by name and docstring
     noun: ClassVar[str] = ""  # what it is called: "command delay"
@@ -132,7 +135,11 @@ class Effect(abc.ABC):
         return ()
 
     def on_model(self, at: Site, model: "mjx.Model", theta: jax.Array) -> "mjx.Model":
-        """Change the model; called once per episode. Leave untouched leaves the identical objects."""
+        """Change the model; called once per episode. Leave untouched leaves the identical objects.
+
+        What MuJoCo derives from the leaves (`dof_M0`, `body_invweight0`, ...) is renewed behind effects that are
+        `inertial`; others that change what it comes from do so themselves (`parameters.set_const`).
+        """
         return model
 
     def on_start(self, at: Site, memory: Any, motion: Motion, theta: jax.Array) -> tuple[Any, Motion]:

@@ -4,7 +4,6 @@ import dataclasses
 from typing import TYPE_CHECKING, ClassVar
 
 import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 
@@ -32,6 +31,7 @@ class InertialParameters(Effect):
     noun: ClassVar[str] = "wrong centre of mass and inertia"
     lacks: ClassVar[str] = "the true centre of mass and inertia"
     separates: ClassVar[str] = "many poses at rest, then the same poses with fast reversals"
+    inertial: ClassVar[bool] = True
     tied: ClassVar[bool] = False
     each: ClassVar[bool] = True
     quantities: ClassVar[tuple[Quantity, ...]] = (
@@ -50,7 +50,7 @@ class InertialParameters(Effect):
         values = at.values(theta)
         away, factor = values[:, :3], values[:, 3:]
         new = {"body_ipos": model.body_ipos[at.ids] + away, "body_inertia": model.body_inertia[at.ids] * factor}
-        return with_inertials(model, at.ids, new, jnp.any(away != 0) | jnp.any(factor != 1))
+        return with_inertials(model, at.ids, new)
 
     def edit(self, spec: mujoco.MjSpec, values: dict[str, dict[str, float]]) -> str | None:
         """Native: an explicit inertial."""

@@ -24,27 +24,32 @@ FIELDS = ("body_mass", "body_inertia", "body_ipos", "body_iquat")
 def principal(inertia: jax.Array, quat: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Principal moments `[3]` and frame `[4]` of a symmetric matrix `[3, 3]` given in the frame `quat`.
 
-    Jacobi's rotations instead of eigh: no LAPACK under vmap, and a diagonal matrix stays as it is, bit for bit.
+    Jacobi's rotations instead of eigh: no LAPACK under vmap, and a diagonal matrix stays as it is, bit for bit. A loop:
+    written out they are a fourth of the program around a pendulum's timestep.
     """
-    for p, q, axis in PAIRS * SWEEPS:
+
+    def rotate(carry: tuple[jax.Array, jax.Array], axes: jax.Array) -> tuple[tuple[jax.Array, jax.Array], None]:
+        inertia, quat = carry
+        one, two, about = axes
         scale = jnp.trace(inertia)
-        off, apart = inertia[p, q] / scale, (inertia[q, q] - inertia[p, p]) / scale
+        off, apart = one @ inertia @ two / scale, (two @ inertia @ two - one @ inertia @ one) / scale
         # tan(angle) = 2 a_pq sgn(d) / (|d| + sqrt(d^2 + 4 a_pq^2)), d = a_qq - a_pp; 0 where a_pq = d = 0
         square = apart**2 + 4 * off**2
         below = jnp.abs(apart) + jnp.sqrt(jnp.where(square > 0, square, 1.0))
         angle = jnp.arctan(jnp.where(apart < 0, -2.0, 2.0) * off / below)
-        cos, sin = jnp.cos(angle), jnp.sin(angle)
-        turn = jnp.eye(3).at[p, p].set(cos).at[q, q].set(cos).at[p, q].set(sin).at[q, p].set(-sin)
-        inertia = turn.T @ inertia @ turn
-        quat = _turned(quat, axis, -angle)
+        plane, across = jnp.outer(one, one) + jnp.outer(two, two), jnp.outer(one, two) - jnp.outer(two, one)
+        turn = jnp.outer(about, about) + jnp.cos(angle) * plane + jnp.sin(angle) * across
+        return (turn.T @ inertia @ turn, _turned(quat, about, -angle)), None
+
+    (inertia, quat), _ = jax.lax.scan(rotate, (inertia, quat), jnp.tile(jnp.eye(3)[np.array(PAIRS)], (SWEEPS, 1, 1)))
     return jnp.diagonal(inertia), quat
 
 
-def _turned(quat: jax.Array, axis: int, angle: jax.Array) -> jax.Array:
-    """quat * (rotation about an axis of its own frame)."""
-    w, v, unit = quat[0], quat[1:], jnp.eye(3)[axis]
+def _turned(quat: jax.Array, axis: jax.Array, angle: jax.Array) -> jax.Array:
+    """quat * (rotation about a unit vector `[3]` in its own frame)."""
+    w, v = quat[0], quat[1:]
     c, s = jnp.cos(angle / 2), jnp.sin(angle / 2)
-    return jnp.concatenate([(c * w - s * v[axis])[None], c * v + s * (w * unit + jnp.cross(v, unit))])
+    return jnp.concatenate([(c * w - s * (v @ axis))[None], c * v + s * (w * axis + jnp.cross(v, axis))])
 
 
 def _loaded(
@@ -74,6 +79,7 @@ class Payload(Effect):
     lacks: ClassVar[str] = "an extra payload"
     separates: ClassVar[str] = "many poses with accelerations; a known payload of a different mass"
     tied: ClassVar[bool] = False  # no robot carries the same load on all of its links
+    inertial: ClassVar[bool] = True
     star: ClassVar[bool] = True  # links carry along their axes, not in the corners of a box
     quantities: ClassVar[tuple[Quantity, ...]] = (
         Quantity("mass", 0.0, 0.0, 1.0, unit="kg", per="carried", reach=(0.0, 1.0), grid=(0.01, 0.05, 0.2, 0.5)),
@@ -93,7 +99,7 @@ class Payload(Effect):
         load, arm = at.values(theta)[:, 0], at.values(theta)[:, 1:]
         mass, inertia, ipos, iquat = (getattr(model, field)[at.ids] for field in FIELDS)
         new = jax.vmap(_loaded)(mass, inertia, ipos, iquat, load, arm)
-        return with_inertials(model, at.ids, dict(zip(FIELDS, new, strict=True)), jnp.any(load > 0))
+        return with_inertials(model, at.ids, dict(zip(FIELDS, new, strict=True)))
 
     def edit(self, spec: mujoco.MjSpec, values: dict[str, dict[str, float]]) -> str | None:
         """Native: a body without joints, with that mass and no extent."""

@@ -3,7 +3,9 @@
 The equations are those of `mj_setConst` (MuJoCo, engine_setconst.c), at qpos0.
 """
 
+import functools
 from collections.abc import Collection
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +21,7 @@ _SHAPE = {"geom_size", "geom_rbound"}
 _POSE = {"qpos0", "body_pos", "body_quat", "body_ipos", "jnt_pos", "jnt_axis", "geom_pos", "geom_quat", "site_pos"}
 _POSE |= {"site_quat", "eq_data"}
 _INERTIA = _MASS | {"body_inertia", "body_iquat", "dof_armature", "tendon_armature", "actuator_gear"}
+_PRIMARY = _SHAPE | _POSE | _INERTIA  # from which others are derived
 _PLANE, _HFIELD = int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_HFIELD)
 
 
@@ -34,8 +37,32 @@ def set_const(model: mjx.Model) -> mjx.Model:
     return model.tree_replace(derived(model))
 
 
+def renewed(nominal: mjx.Model, leaves: dict[str, jax.Array]) -> dict[str, jax.Array]:
+    """What a timestep reads of what MuJoCo derives from these leaves, by dotted name.
+
+    Where none of them differs from the nominal model's the compiler's own numbers stay, not their recomputation in
+    float32. What only cameras are placed by is left out.
+    """
+    primary = {name: leaf for name, leaf in leaves.items() if name in _PRIMARY}
+    return _renewed(nominal, leaves, tuple(sorted(primary))) if primary else {}
+
+
+@functools.partial(jax.jit, static_argnums=2)  # compiled once also when called op by op
+def _renewed(nominal: mjx.Model, leaves: dict[str, jax.Array], primary: tuple[str, ...]) -> dict[str, jax.Array]:
+    present = functools.reduce(jnp.logical_or, (jnp.any(leaves[name] != _leaf(nominal, name)) for name in primary))
+    new = derived(nominal.tree_replace(leaves), primary, reference=nominal, pictures=False)
+    return {name: jnp.where(present, leaf, _leaf(nominal, name)) for name, leaf in new.items()}
+
+
+def _leaf(model: mjx.Model, name: str) -> Any:
+    return functools.reduce(getattr, name.split("."), model)
+
+
 def derived(
-    model: mjx.Model, changed: Collection[str] | None = None, reference: mjx.Model | None = None
+    model: mjx.Model,
+    changed: Collection[str] | None = None,
+    reference: mjx.Model | None = None,
+    pictures: bool = True,
 ) -> dict[str, jax.Array]:
     """Derived leaves by dotted name.
 
@@ -44,6 +71,7 @@ def derived(
         changed: names of the changed leaves; only what depends on them is computed. None: everything.
         reference: the model as compiled. A statistic that its MJCF overrides (`<statistic extent=...>`) keeps its
             number: recognised because the reference's own fields do not give it.
+        pictures: whether sizes that no timestep reads (stat.center, extent, meansize) are computed as well.
     """
     names = None if changed is None else set(changed)
     pose = names is None or bool(names & _POSE)
@@ -61,7 +89,8 @@ def derived(
             new.update(_inertias(model, data))
         if pose:
             new.update(_lengths(model, data))
-        new.update(_statistics(model, data, reference, new, names))
+        sized = pictures and (pose or bool((names or set()) & _SHAPE))
+        new.update(_statistics(model, data, reference, new, sized, names is None or bool(names & _MASS)))
     return new
 
 
@@ -159,13 +188,14 @@ def _statistics(
     data: mjx.Data,
     reference: mjx.Model | None,
     new: dict[str, jax.Array],
-    names: set[str] | None,
+    sized: bool,
+    heavier: bool,
 ) -> dict[str, jax.Array]:
-    """stat.*: what changed, unless the MJCF overrides it."""
+    """stat.*: what changed (sizes, masses), unless the MJCF overrides it."""
     found: dict[str, jax.Array] = {}
-    if model.nbody > 1 and (names is None or names & _MASS):
+    if model.nbody > 1 and heavier:
         found["stat.meanmass"] = jnp.mean(model.body_mass[1:])
-    if names is None or names & (_POSE | _SHAPE):
+    if sized:
         found.update(_sizes(model, data))
     if "stat.meaninertia" in new:
         found["stat.meaninertia"] = new["stat.meaninertia"]

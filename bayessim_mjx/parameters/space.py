@@ -126,15 +126,17 @@ class ParameterSpace:
         theta = jnp.asarray(theta, jnp.float32)
         return jnp.where(self.contains(theta), jnp.sum(priors.log_density(self, theta), axis=-1), -jnp.inf)
 
-    def write(self, model: "mjx.Model", theta: Any) -> "mjx.Model":
+    def write(self, model: "mjx.Model", theta: Any, derived: bool = True) -> "mjx.Model":
         """The nominal `model` with theta `[d]` written into it, derived constants recomputed. Pure; use under `vmap`.
 
         Changes are relative to `model`, so always pass the nominal one. Leaves that no parameter concerns stay the
         identical objects. Parameters of kind "effect" are ignored.
+
+        Args: derived: whether those constants are; False where more changes follow before they are needed.
         """
         from bayessim_mjx.parameters import writing
 
-        return writing.write(self.parameters, model, theta)
+        return writing.write(self.parameters, model, theta, derived)
 
     def edit(self, spec: "mujoco.MjSpec", theta: Any) -> "mujoco.MjSpec":
         """A copy of the nominal `spec` with the same change made in the MJCF; it compiles to what `write` makes."""

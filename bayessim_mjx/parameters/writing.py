@@ -22,17 +22,19 @@ if TYPE_CHECKING:
 MIN_RATIO = 0.05  # damping ratio of contacts at restitution 1: undamped contacts never settle
 
 
-def write(parameters: Sequence[Parameter], model: "mjx.Model", theta: Any) -> "mjx.Model":
+def write(parameters: Sequence[Parameter], model: "mjx.Model", theta: Any, derived: bool = True) -> "mjx.Model":
     """See `ParameterSpace.write`."""
     theta = jnp.asarray(theta, jnp.float32)
     if theta.shape != (len(parameters),):
         raise UserError(f"theta has shape {theta.shape}, the space {len(parameters)} parameters; write many under vmap")
     physical = tuple((i, _with_axis(p, model)) for i, p in enumerate(parameters) if p.kind != "effect")
-    return model.tree_replace(_changes(physical, model, theta)) if physical else model
+    return model.tree_replace(_changes(physical, derived, model, theta)) if physical else model
 
 
-@functools.partial(jax.jit, static_argnums=0)  # compiled once also when called op by op
-def _changes(physical: tuple[tuple[int, Parameter], ...], model: "mjx.Model", theta: jax.Array) -> dict[str, jax.Array]:
+@functools.partial(jax.jit, static_argnums=(0, 1))  # compiled once also when called op by op
+def _changes(
+    physical: tuple[tuple[int, Parameter], ...], derived: bool, model: "mjx.Model", theta: jax.Array
+) -> dict[str, jax.Array]:
     """The leaves that differ from `model`'s, by dotted name."""
     draft = Draft(model)
     for (kind, attribute), members in _groups(physical).items():
@@ -46,6 +48,8 @@ def _changes(physical: tuple[tuple[int, Parameter], ...], model: "mjx.Model", th
     follow_geoms(draft)
     if draft.resized:
         draft.leaves.update(constants.bounds(model, draft["geom_size"], draft.resized))
+    if not derived:
+        return draft.leaves
     changed = model.tree_replace(draft.leaves)
     return draft.leaves | constants.derived(changed, set(draft.leaves), reference=model)
 

@@ -3,11 +3,12 @@
 from bayessim_mjx.compat import mjx
 from bayessim_mjx.physics.drive import Drive
 from bayessim_mjx.physics.model import Physics, World
-from bayessim_mjx.physics.step import begin, control_step, past_of, retraced
+from bayessim_mjx.physics.step import Past, begin, control_step, past_of, retraced
 from bayessim_mjx.physics.timestep import early, staggered, substep
 
 __all__ = [
     "Drive",
+    "Past",
     "Physics",
     "World",
     "begin",

@@ -13,7 +13,7 @@ from bayessim_mjx.compat import mjx
 from bayessim_mjx.effects.effect import Block, Effect, Measurement, Quantity, layout, overrides
 from bayessim_mjx.effects.support import contract
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.parameters import ParameterSpace
+from bayessim_mjx.parameters import ParameterSpace, constants
 from bayessim_mjx.physics.gates import chained_in
 from bayessim_mjx.physics.warp import Warp
 
@@ -142,8 +142,14 @@ class Physics:
             memory, shown = self.sense(self.split(world.theta)[1], world.memory, world.measurement)
             return world.replace(memory=memory, measurement=shown)
 
-    def unseen(self, theta: jax.Array, qpos: jax.Array | None, qvel: jax.Array | None) -> World:
-        """`world` without sensors: they have not measured yet."""
+    def unseen(
+        self,
+        theta: jax.Array,
+        qpos: jax.Array | None,
+        qvel: jax.Array | None,
+        fields: dict[str, jax.Array] | None = None,
+    ) -> World:
+        """`world` without sensors: they have not measured yet; fields: those of theta, where they are known."""
         theta = jnp.asarray(theta, jnp.float32)
         qpos = jnp.asarray(self.mj_model.qpos0 if qpos is None else qpos, jnp.float32)
         qvel = jnp.zeros(self.mj_model.nv) if qvel is None else jnp.asarray(qvel, jnp.float32)
@@ -154,10 +160,6 @@ class Physics:
         ):
             if value.shape != (size,):
                 raise ValueError(f"{label} has shape {value.shape}, expected ({size},)")
-        own, slices = self.split(theta)
-        model = self.model_space.write(self.model, own)
-        for effect, at, part in zip(self.effects, self.sites, slices, strict=True):
-            model = effect.on_model(at, model, part)
         return World(
             qpos=qpos,
             qvel=qvel,
@@ -165,11 +167,22 @@ class Physics:
             warmstart=jnp.zeros(self.mj_model.nv),
             time=jnp.zeros(()),
             theta=theta,
-            fields=_changed(self.model, model),
+            fields=self._fields(*self.split(theta)) if fields is None else fields,
             memory=self._memory,
             forces=jnp.zeros((len(self.effects), self.mj_model.nv)),
             measurement={"qpos": qpos, "qvel": qvel},
         )
+
+    def _fields(self, own: jax.Array, slices: tuple[jax.Array, ...]) -> dict[str, jax.Array]:
+        """Model arrays that differ from the nominal ones, with the model's parameters and every effect's written."""
+        model = self.model_space.write(self.model, own, derived=False)
+        each = list(zip(self.effects, self.sites, slices, strict=True))
+        for effect, at, part in (one for one in each if one[0].inertial):
+            model = effect.on_model(at, model, part)
+        model = model.tree_replace(constants.renewed(self.model, _changed(self.model, model)))
+        for effect, at, part in (one for one in each if not one[0].inertial):
+            model = effect.on_model(at, model, part)
+        return _changed(self.model, model)
 
     def sense(
         self, thetas: tuple, memory: Sequence[Any], true: Measurement, active: jax.Array | None = None

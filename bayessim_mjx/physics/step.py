@@ -4,11 +4,12 @@ Its sub-steps are those of `timestep`: MJX's, where no effect, drive or limit sa
 """
 
 import functools
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from flax import struct
 
 from bayessim_mjx.compat import mjx
 from bayessim_mjx.effects.support.motion import Motion
@@ -112,9 +113,12 @@ def begin(physics: Physics, theta: jax.Array, motion: Motion, active: jax.Array 
     return _begun(physics, theta, motion, active)[0]
 
 
-def _begun(physics: Physics, theta: jax.Array, motion: Motion, active: jax.Array | None) -> tuple[World, Motion]:
-    """The world that `begin` gives, and the true motion around its start."""
-    world = physics.unseen(theta, motion.qpos[motion.start], motion.qvel[motion.start])  # shown is what was measured
+def _begun(
+    physics: Physics, theta: jax.Array, motion: Motion, active: jax.Array | None, fields: dict | None = None
+) -> tuple[World, Motion]:
+    """The world that `begin` gives, and the true motion around its start; fields: the world's, where they are known."""
+    shown = motion.qpos[motion.start], motion.qvel[motion.start]  # what was measured
+    world = physics.unseen(theta, *shown, fields)
     thetas, memory = physics.split(world.theta)[1], list(world.memory)
     for i in reversed(range(len(physics.effects))):  # sensors come last in a step, so they are undone first
         memory[i], motion = physics.effects[i].on_start(physics.sites[i], memory[i], motion, thetas[i])
@@ -122,11 +126,13 @@ def _begun(physics: Physics, theta: jax.Array, motion: Motion, active: jax.Array
     def past(memory: tuple, commands: jax.Array) -> tuple[tuple, None]:
         return _commanded(physics, thetas, memory, commands, active)[0], None
 
-    filled, _ = jax.lax.scan(past, tuple(memory), motion.command[: motion.start])
+    filled = tuple(memory)
+    if motion.start:
+        filled, _ = jax.lax.scan(past, filled, motion.command[: motion.start])
     return world.replace(qpos=motion.qpos[motion.start], qvel=motion.qvel[motion.start], memory=filled), motion
 
 
-class Past(NamedTuple):
+class Past(struct.PyTreeNode):
     """Control steps before a start, through which what `Effect.follows` is taken along the recorded motion.
 
     Attributes:
@@ -135,11 +141,11 @@ class Past(NamedTuple):
         steps: how many, static; wanted: `[]` bool, whether an active effect needs them.
     """
 
-    physics: Physics
+    physics: Physics = struct.field(pytree_node=False)
     start: World
     world: World
     motion: Motion
-    steps: int
+    steps: int = struct.field(pytree_node=False)
     wanted: jax.Array
 
     @property
@@ -192,7 +198,7 @@ def past_of(physics: Physics, start: World, motion: Motion, active: jax.Array | 
         return Past(physics, start, start, motion, 0, jnp.array(False))
     steps, time = motion.start, motion.time
     before = None if time is None else jnp.maximum(time - steps * physics.dt, 0.0)
-    world, motion = _begun(physics, start.theta, motion.replace(start=0, time=before), active)
+    world, motion = _begun(physics, start.theta, motion.replace(start=0, time=before), active, start.fields)
     wanted = jnp.array(True) if active is None else jnp.any(active & follows)
     return Past(physics, start, world, motion, steps, wanted)
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,10 +13,12 @@ from numpy.typing import NDArray
 from bayessim_mjx.compat import compiler_options
 from bayessim_mjx.device import on_cores
 from bayessim_mjx.diagnosis.fitting.windows import Batch, Windows
-from bayessim_mjx.physics import Drive, Physics, begin, control_step, early, past_of
+from bayessim_mjx.physics import Drive, Past, Physics, World, begin, control_step, early, past_of
 from bayessim_mjx.physics.tangent import difference, integrate
 
 Array = NDArray[np.float64]
+
+FAR = 1e3  # rad or m, rad/s or m/s: the error of a simulation that diverged
 
 
 @dataclass(frozen=True)
@@ -30,7 +32,6 @@ class Call:
 
 
 CALL = Call()
-FAR = 1e3  # rad or m, rad/s or m/s: the error of a simulation that diverged
 
 
 class Simulator:
@@ -55,44 +56,62 @@ class Simulator:
         self.nv = int(physics.mj_model.nv)
         self.channels = 2 * self.nv
         self.traces = self.rollouts = 0
-        self._run = jax.jit(jax.vmap(self._one, in_axes=(None, 0, 0, 0, 0, None)), compiler_options=compiler_options())
+        self._run = jax.jit(self._many, compiler_options=compiler_options())
         self._no_offset = np.zeros((self.lanes, 2 * self.nv), np.float32)
         self._no_force = jnp.zeros((self.lanes, windows.steps, self.nv))
 
-    def _one(
+    def _many(
         self,
         batch: Batch,
         index: jax.Array,
-        theta: jax.Array,
-        offset: jax.Array,
-        force: jax.Array,
+        thetas: jax.Array,
+        offsets: jax.Array,
+        forces: jax.Array,
         active: jax.Array | None,
-    ) -> tuple[jax.Array, Any]:
-        """Errors `[H, 2 nv]` of one window (positions, velocities) and the actuators' forces `[H, nu]`."""
-        self.traces += 1
-        model = self.physics.mj_model
-        own = jax.tree.map(lambda x: x[index], batch)
-        world = begin(self.physics, theta, own.around, active)
-        world = world.replace(qpos=integrate(model, world.qpos, offset[: self.nv]), qvel=world.qvel + offset[self.nv :])
+    ) -> tuple[jax.Array, jax.Array]:
+        """Errors `[n, H, 2 nv]` of windows (positions, velocities) and the actuators' forces `[n, H, nu]`.
 
-        past = past_of(self.physics, world, own.around, active)
-        lead, (count, *_) = past.steps, own.command.shape
-        command = jnp.concatenate([own.around.command[:lead], own.command])
+        Worlds are side by side inside the loop: `vmap` of a loop would trace its body several times over.
+        """
+        self.traces += 1
+        begun = functools.partial(self._begun, batch, active)
+        own, past, first = jax.vmap(begun, out_axes=(0, 0, None))(index, thetas, offsets)
+        model, lead, (n, count, *_) = self.physics.mj_model, past.steps, own.command.shape
+        command = jnp.concatenate([own.around.command[:, :lead], own.command], axis=1)
 
         def step(k: jax.Array, carry: tuple) -> tuple:
             now, shown = carry
             row = jnp.maximum(k - lead, 0)
-            extra = jnp.where(k < lead, 0.0, force[row])
-            drive = Drive(extra, None if own.enabled is None else own.enabled[row], own.law, active)
-            now, data = control_step(self.physics, past.led(k, now), command[k], drive)
-            new = now.measurement["qpos"], now.measurement["qvel"] + early(model) * data.qacc, data.actuator_force
-            return now, tuple(x.at[row].set(y) for x, y in zip(shown, new, strict=True))
 
-        nothing = tuple(jnp.zeros((count, n)) for n in (model.nq, model.nv, model.nu))
-        _, (qpos, qvel, effort) = jax.lax.fori_loop(past.first, lead + count, step, (past.world, nothing))
-        error = jax.vmap(lambda a, b: difference(model, a, b))(own.qpos, qpos)
-        errors = self._predicted(jnp.concatenate([error, own.qvel - qvel], axis=1), world.theta)
-        return jnp.nan_to_num(errors, nan=FAR, posinf=FAR, neginf=-FAR), effort
+            def one(past: Past, own: Batch, command: jax.Array, force: jax.Array, now: World) -> tuple:
+                extra = jnp.where(k < lead, 0.0, force[row])
+                drive = Drive(extra, None if own.enabled is None else own.enabled[row], own.law, active)
+                now, data = control_step(self.physics, past.led(k, now), command[k], drive)
+                velocity = now.measurement["qvel"] + early(model) * data.qacc
+                return now, (now.measurement["qpos"], velocity, data.actuator_force)
+
+            now, new = jax.vmap(one)(past, own, command, forces, now)
+            return now, tuple(x.at[:, row].set(y) for x, y in zip(shown, new, strict=True))
+
+        nothing = tuple(jnp.zeros((n, count, size)) for size in (model.nq, model.nv, model.nu))
+        _, (qpos, qvel, effort) = jax.lax.fori_loop(first, lead + count, step, (past.world, nothing))
+        return jax.vmap(self._errors)(own, qpos, qvel, past.start.theta), effort
+
+    def _begun(
+        self, batch: Batch, active: jax.Array | None, index: jax.Array, theta: jax.Array, offset: jax.Array
+    ) -> tuple[Batch, Past, int | jax.Array]:
+        """(one window, what leads up to its start, the control step to begin with)."""
+        own = jax.tree.map(lambda x: x[index], batch)
+        world = begin(self.physics, theta, own.around, active)
+        qpos = integrate(self.physics.mj_model, world.qpos, offset[: self.nv])
+        past = past_of(self.physics, world.replace(qpos=qpos, qvel=world.qvel + offset[self.nv :]), own.around, active)
+        return own, past, past.first
+
+    def _errors(self, own: Batch, qpos: jax.Array, qvel: jax.Array, theta: jax.Array) -> jax.Array:
+        """`[H, 2 nv]`, of one window; not finite ones are FAR."""
+        error = jax.vmap(functools.partial(difference, self.physics.mj_model))(own.qpos, qpos)
+        errors = self._predicted(jnp.concatenate([error, own.qvel - qvel], axis=1), theta)
+        return jnp.nan_to_num(errors, nan=FAR, posinf=FAR, neginf=-FAR)
 
     def _predicted(self, errors: jax.Array, theta: jax.Array) -> jax.Array:
         """Errors `[H, 2 nv]` in which what only echoes the recording counts as the first row that is predicted does."""

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from bayessim_mjx.effects.support.site import Site, find
-from bayessim_mjx.parameters import attributes, constants
+from bayessim_mjx.parameters import attributes
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -55,19 +55,9 @@ def inertial_site(effect: "Effect", model: mujoco.MjModel, timestep: float, subs
     return at
 
 
-def with_inertials(model: "mjx.Model", ids: np.ndarray, new: "dict[str, jax.Array]", present: jax.Array) -> "mjx.Model":
-    """With inertial fields `{body_mass, ...: [n, ...]}` of bodies and all that MuJoCo derives from them.
-
-    present: scalar bool; where it is False the compiler's own numbers stay, not their recomputation in float32.
-    """
-    changed = model.replace(**{field: getattr(model, field).at[ids].set(value) for field, value in new.items()})
-    derived = constants.derived(changed, set(new), reference=model)
-    return changed.tree_replace({k: jnp.where(present, v, _leaf(model, k)) for k, v in derived.items()})
-
-
-def _leaf(model: "mjx.Model", name: str) -> jax.Array:
-    group, _, own = name.rpartition(".")
-    return getattr(getattr(model, group) if group else model, own)
+def with_inertials(model: "mjx.Model", ids: np.ndarray, new: "dict[str, jax.Array]") -> "mjx.Model":
+    """With inertial fields `{body_mass, ...: [n, ...]}` of bodies; for effects that are `inertial`."""
+    return model.replace(**{field: getattr(model, field).at[ids].set(value) for field, value in new.items()})
 
 
 def native(spec: mujoco.MjSpec, values: dict[str, dict[str, float]]) -> "Iterator[tuple[Any, int, dict[str, float]]]":
