@@ -6,7 +6,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -29,6 +29,7 @@ from bayessim_mjx.diagnosis.selection.criteria import Criteria
 from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.selection.tried import Settings, Tried
 from bayessim_mjx.diagnosis.setup import Setup, prepare
+from bayessim_mjx.diagnosis.stages import Stage, carry_out
 from bayessim_mjx.diagnosis.summary import assemble, finer_steps, first_look, whole_logs
 from bayessim_mjx.diagnosis.summary.files import Files
 from bayessim_mjx.effects.effect import Effect
@@ -36,19 +37,6 @@ from bayessim_mjx.logs import read_logs
 from bayessim_mjx.logs.log import Log
 
 Effects = str | Sequence[str | type[Effect]]
-
-
-@dataclass(frozen=True)
-class Stage:
-    """One stage: its name, told while it runs; `run(findings, say) -> findings`.
-
-    optional: its failure becomes a warning, as the verdict stands without it; patient: left out once the time is over.
-    """
-
-    name: str
-    run: Callable[[Findings, Progress], Findings]
-    optional: bool = False
-    patient: bool = False
 
 
 def how_far(found: Findings, say: Progress) -> Findings:
@@ -102,11 +90,11 @@ def rivals_without_physics(found: Findings, say: Progress) -> Findings:
 STAGES = (
     Stage("how far", how_far),
     Stage("none of these?", none_of_these),
-    Stage("finer steps", finer_steps.stage, patient=True),
-    Stage("whole logs", whole_logs.stage, patient=True),
-    Stage("where", where_it_lies, optional=True),
-    Stage("black boxes", rivals_without_physics, optional=True),
-    Stage("next experiment", propose.stage, optional=True),
+    Stage("finer steps", finer_steps.stage, patient=True, beside=True),
+    Stage("whole logs", whole_logs.stage, patient=True, beside=True),
+    Stage("where", where_it_lies, optional=True, beside=True),
+    Stage("black boxes", rivals_without_physics, optional=True, beside=True),
+    Stage("next experiment", propose.stage, optional=True, beside=True),
 )
 
 
@@ -164,18 +152,7 @@ def investigate(
     found = Findings(setup, selected.select(*given, say, lambda tried: known(setup, tried)))
     resumed.ended(setup)
     stages = [s for s in (STAGES if stages is None else stages) if not (s.optional and (quick or verdict_only))]
-    for stage in (stage for stage in stages if not stage.optional):
-        found = _in_time(stage, found, say, time_left) if stage.patient else _after(stage, found, say)
-    if verdict is not None:
-        verdict(found)
-    for stage in (stage for stage in stages if stage.optional):
-        found = _in_time(stage, found, say, time_left)
-    return found
-
-
-def _in_time(stage: Stage, found: Findings, say: Progress, time_left: budget.Budget) -> Findings:
-    without = replace(found, warnings=(*found.warnings, f"{stage.name}: left out, the time was over"))
-    return without if time_left.late else _after(stage, found, say)
+    return carry_out(stages, found, say, time_left, verdict)
 
 
 def _within(setup: Setup, time_left: budget.Budget) -> Setup:
@@ -186,18 +163,6 @@ def _smaller(criteria: Criteria) -> Criteria:
     """A smaller search, by the same rule."""
     most = {"beam": 1, "width": 3, "most": 2, "finalists": 3}
     return replace(criteria, **{name: min(limit, getattr(criteria, name)) for name, limit in most.items()})
-
-
-def _after(stage: Stage, found: Findings, say: Progress) -> Findings:
-    say(stage.name, 0, 1)
-    try:
-        return stage.run(found, say)
-    except Exception as error:
-        if not stage.optional:
-            raise
-        # the verdict is there: a picture or proposal less must not lose it
-        lost = f"{stage.name}: not available ({type(error).__name__}: {error})"
-        return replace(found, warnings=(*found.warnings, lost))
 
 
 def diagnose(

@@ -17,6 +17,8 @@ from bayessim_mjx.diagnosis import run
 from bayessim_mjx.diagnosis.findings import Findings, Where
 from bayessim_mjx.diagnosis.fitting.cutting import TooLittleData
 from bayessim_mjx.diagnosis.residual.where import Located
+from bayessim_mjx.diagnosis.selection.budget import Budget
+from bayessim_mjx.diagnosis.stages import carry_out
 from bayessim_mjx.errors import UserError
 from tests.diagnosis.pendulums import MODEL, nominal, recorded, saved
 from tests.report import fake
@@ -35,11 +37,11 @@ def broken(findings, say):
 
 def test_an_optional_stage_that_fails_is_a_warning_and_any_other_an_error():
     start, said = found(), []
-    after = run._after(run.Stage("maps", broken, optional=True), start, lambda *told: said.append(told))
+    after = carry_out([run.Stage("maps", broken, optional=True)], start, lambda *told: said.append(told), Budget())
     assert after.warnings == ("maps: not available (ValueError: no map)",) and said == [("maps", 0, 1)]
     assert start.warnings == () and after.model == "a model"
     with pytest.raises(ValueError, match="no map"):
-        run._after(run.Stage("maps", broken), start, lambda *told: None)
+        carry_out([run.Stage("maps", broken)], start, lambda *told: None, Budget())
 
 
 def test_findings_are_values():
