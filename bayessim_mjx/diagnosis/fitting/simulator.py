@@ -163,21 +163,19 @@ class Simulator:
         moved = None if offsets is None else np.asarray(offsets, np.float32)
         acting, thetas = self.physics.acting(thetas), np.asarray(thetas, np.float32)
 
-        def part(first: int) -> NDArray[np.float32]:
-            size = min(self.lanes, count - first)
-            own = first + np.minimum(np.arange(self.lanes), size - 1)
+        def given(first: int) -> tuple:
+            own = first + np.minimum(np.arange(self.lanes), min(self.lanes, count - first) - 1)
             offset = self._no_offset if moved is None else moved[own]
             extra = self._no_force if force is None else force[own]
             active = acting[of_theta[own]].any(0) if self.apart else None
-            errors, _ = self._run(self.windows.batch, of_window[own], thetas[of_theta[own]], offset, extra, active)
-            return np.asarray(errors)[:size]
+            return self.windows.batch, of_window[own], thetas[of_theta[own]], offset, extra, active
+
+        def part(first: int) -> NDArray[np.float32]:
+            return np.asarray(self._run(*given(first))[0])[: count - first]
 
         firsts = list(range(0, count, self.lanes))
-        alone = firsts[:1] if self.traces == 0 else []  # traced once, not by every thread
-        done = [part(first) for first in alone]
-        if self.apart:
-            done += on_cores(part, firsts[len(alone) :])
-        else:
-            done += [part(first) for first in firsts[len(alone) :]]
+        if self.apart and self.traces == 0:
+            self._run.lower(*given(0)).compile()  # once, not by every thread
+        done = on_cores(part, firsts) if self.apart else [part(first) for first in firsts]
         self.rollouts += count
         return np.concatenate(done).astype(np.float64)

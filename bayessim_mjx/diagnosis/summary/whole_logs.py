@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import jax
 import numpy as np
 from numpy.typing import NDArray
 
+from bayessim_mjx.device import cores
 from bayessim_mjx.diagnosis import statistics
 from bayessim_mjx.diagnosis.findings import Findings, Progress
 from bayessim_mjx.diagnosis.fitting import windows
@@ -30,6 +33,7 @@ class Rules:
     seconds: float = 10.0
     draws: int = 4  # of the start state
     likely: int = 8  # of start state and parameters together
+    lanes: int = 128  # worlds in one call
     # noise sd and share of the motion: what a start's uncertainty may grow to
     clear: float = 3.0
     part: float = 0.1
@@ -96,13 +100,14 @@ def simulate(found: Findings, say: Progress = lambda text, done, total: None) ->
     starts = [int(cut.start[w]) for w in first]
     most = round(RULES.seconds / cut.dt)
     length = [min(len(cut.logs[r]) - 1 - a, most) for r, a in zip(logs, starts, strict=True)]
-    simulator = _simulator(found, logs, starts, max(length), len(stages) + RULES.draws + RULES.likely)
+    worlds = len(first) * (len(stages) + RULES.draws + RULES.likely)
+    lanes = min(-(-worlds // (cores() if jax.default_backend() == "cpu" else 1)), RULES.lanes)
+    simulator = _simulator(found, logs, starts, max(length), lanes)
     errors, spread, likely = [], [], []
     root = _root(found, list(stages.values())[-1].model)
     every = len(stages) + RULES.draws
-    for i, (w, steps) in enumerate(zip(first, length, strict=True)):
-        say("whole logs", i, len(first))
-        rows = _one(found, simulator, stages, root, i, w)[:, :steps]
+    for whole, steps in zip(_simulated(found, simulator, stages, root, first), length, strict=True):
+        rows = whole[:, :steps]
         errors.append(rows[: len(stages)])
         spread.append(rows[len(stages) : every] - rows[len(stages) - 1])
         likely.append(rows[every:] - rows[len(stages) - 1])
@@ -123,8 +128,27 @@ def _simulator(found: Findings, logs: Array, starts: list[int], length: int, lan
     return Simulator(physics, own, lanes)
 
 
-def _one(found: Findings, simulator: Simulator, stages: dict[str, _Stage], away: Array, i: int, w: int) -> Array:
-    """Whitened errors `[stages + draws + likely, H, channels]` of one log; `away`: `_root` of the last one."""
+def _simulated(
+    found: Findings, simulator: Simulator, stages: dict[str, _Stage], away: Array, first: Sequence[int]
+) -> Array:
+    """Whitened errors `[L, stages + draws + likely, H, channels]`, of all logs; `away`: `_root` of the last.
+
+    A step of few worlds takes as long as one of many: most of it is spent on starting the program's parts.
+    """
+    fitter = found.setup.fitter
+    drawn = [_drawn(found, simulator, stages, away, w) for w in first]
+    thetas, offsets = (np.concatenate(each) for each in zip(*drawn, strict=True))
+    each = len(thetas) // len(first)
+    raw = simulator.run_each(thetas, np.arange(len(thetas)), np.repeat(np.arange(len(first)), each), offsets)
+    raw[np.abs(raw) >= RULES.lost] = np.nan
+    raw = raw.reshape(len(first), each, *raw.shape[1:])
+    return np.asarray(raw[..., fitter.used] / fitter.sigma)
+
+
+def _drawn(
+    found: Findings, simulator: Simulator, stages: dict[str, _Stage], away: Array, w: int
+) -> tuple[Array, Array]:
+    """Thetas `[stages + draws + likely, P]` and changes of the start state `[.., 2 nv]` of the log of window w."""
     fitter, last = found.setup.fitter, list(stages.values())[-1]
     rng = np.random.default_rng(found.setup.seed)
     values = [_values(found, s, w) for s in stages.values()]
@@ -137,9 +161,7 @@ def _one(found: Findings, simulator: Simulator, stages: dict[str, _Stage], away:
     drawn = [*[values[-1]] * RULES.draws, *np.clip(off, *ends)]
     models = [s.model for s in stages.values()] + [last.model] * len(drawn)
     thetas = np.stack([theta_of(found, simulator, m, v) for m, v in zip(models, [*values, *drawn], strict=True)])
-    raw = simulator.run(thetas, np.concatenate([offsets, moved])[:, None], np.array([i]))[:, 0]
-    raw[np.abs(raw) >= RULES.lost] = np.nan
-    return np.asarray(raw[..., fitter.used] / fitter.sigma)
+    return thetas, np.concatenate([offsets, moved])
 
 
 def _root(found: Findings, model: Model) -> Array:

@@ -35,7 +35,7 @@ def test_a_log_begins_as_its_first_window(rubbing):
         3 * cut.steps,
         2 + whole_logs.RULES.draws + whole_logs.RULES.likely,
     )
-    rows = whole_logs._one(rubbing, simulator, stages, whole_logs._root(rubbing, rubbing.model), 0, first)
+    (rows,) = whole_logs._simulated(rubbing, simulator, stages, whole_logs._root(rubbing, rubbing.model), [first])
     for row, stage in zip(rows, stages.values(), strict=False):
         np.testing.assert_allclose(row[: cut.steps], stage.prediction.error[first], atol=0.05)
 
