@@ -181,6 +181,6 @@ def _chunks(cut: windows.Windows, like: windows.Windows) -> list[windows.Windows
         batch = batch.replace(enabled=np.ones((len(cut), cut.steps, batch.command.shape[-1]), np.float32))
     for a in range(0, len(cut), size):
         index = np.minimum(np.arange(a, a + size), len(cut) - 1)
-        own = jax.tree.map(lambda x: jax.numpy.asarray(x)[index], batch)  # noqa: B023  # used at once
+        own = jax.tree.map(lambda x: jax.numpy.asarray(np.asarray(x)[index]), batch)  # noqa: B023  # used at once
         out.append(replace(cut, batch=own, log=cut.log[index], start=cut.start[index], group=cut.group[index]))
     return out

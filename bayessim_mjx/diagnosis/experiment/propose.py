@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 from numpy.typing import NDArray
 
@@ -184,7 +184,7 @@ def _with_help(scorer: Scorer, stand: Rehearsal, scored: list[Scored], model: An
     out = []
     top = [s.played.excitation for s in scored[:2]]
     for own in advice.helps(scorer.setup) if top else []:
-        gravity = np.asarray(tilted(jnp.asarray(model.opt.gravity), *(jnp.asarray(a) for a in own.tilt)))
+        gravity = np.asarray(jax.jit(tilted)(model.opt.gravity, *own.tilt))
         played = [p for p in stand.play(top, _thetas(scorer, own.shift), gravity) if p.safe]
         full = len(stand.time) // scorer.fitter.simulator.windows.steps
         if played:

@@ -171,7 +171,7 @@ class Rehearsal:
             ),
         )
         arrays = (ref, speed[:, d.v], feed, e.live[:, d.v], self.start)
-        return Plan(*(jnp.asarray(x, jnp.float32) for x in arrays))
+        return Plan(*(jnp.asarray(np.asarray(x, np.float32)) for x in arrays))
 
     def _turn(self, offset: Array, i: int) -> float:
         """s, time in which actuator i can turn the motion round with half of its effort."""

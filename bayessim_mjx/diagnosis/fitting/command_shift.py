@@ -11,7 +11,6 @@ import dataclasses
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
@@ -169,7 +168,7 @@ class _Model:
         shift, p, gains, loads = np.split(x, self.parts)
         theta = np.maximum(self.nominal + p * (self.high - self.low), self.least)  # beyond its range: nothing else may
         cut = self.late(float(shift[0]))
-        command = cut.batch.command * (1 + jnp.asarray(gains, jnp.float32))
+        command = np.asarray(cut.batch.command) * (1 + np.asarray(gains, np.float32))
         cut = dataclasses.replace(cut, batch=cut.batch.replace(command=command))
         force = np.einsum("fv,fwhv->whv", loads.reshape(4, -1), self.forces)
         return Case(cut, starts, theta, force)

@@ -58,7 +58,7 @@ class Simulator:
         self.traces = self.rollouts = 0
         self._run = jax.jit(self._many, compiler_options=compiler_options())
         self._no_offset = np.zeros((self.lanes, 2 * self.nv), np.float32)
-        self._no_force = jnp.zeros((self.lanes, windows.steps, self.nv))
+        self._no_force = jnp.asarray(np.zeros((self.lanes, windows.steps, self.nv), np.float32))
 
     def _many(
         self,

@@ -292,4 +292,4 @@ def _noise(logs: Sequence[Log], model: mujoco.MjModel, use_qvel: bool) -> tuple[
 
 
 def _stack(parts: list) -> jax.Array:
-    return jnp.asarray(np.stack(parts), jnp.float32)
+    return jnp.asarray(np.stack(parts).astype(np.float32))  # by numpy: each cast of a new shape is a program

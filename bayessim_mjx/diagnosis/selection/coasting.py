@@ -43,7 +43,7 @@ def coasting(windows: Windows, model: mujoco.MjModel) -> Prediction:
 def _displacements(windows: Windows, model: mujoco.MjModel) -> tuple[Array, Array]:
     """(`[W, H, nv]` from each window's measured start, in its tangent; `[W, nv]`, measured speeds there)."""
     around = windows.batch.around
-    begins, qpos = (np.asarray(x, np.float64) for x in (around.qpos[:, around.start], windows.batch.qpos))
+    begins, qpos = (np.asarray(x, np.float64) for x in (np.asarray(around.qpos)[:, around.start], windows.batch.qpos))
     out = np.zeros((*qpos.shape[:2], model.nv))
     for row, begin, there in zip(out, begins, qpos, strict=True):
         for one, position in zip(row, there, strict=True):
