@@ -38,7 +38,7 @@ def pushed(
         return (remembered, force), others + force
 
     # a branch copies what it returns: only what may change goes through it
-    each, total = tuple((memory[i], forces[i]) for i in forcing), jnp.sum(forces, axis=0)
+    each, total = tuple((memory[i], forces[i]) for i in forcing), sum((forces[i] for i in forcing), jnp.zeros_like(known))
     if drive.active is None:
         each, total = chained(None, forcing, functools.partial(hook, step), each, total)
     elif forcing:
@@ -52,8 +52,8 @@ def pushed(
         each, total = jax.lax.cond(jnp.any(drive.active[np.asarray(forcing)]), acting, lambda: (each, total))
     after = dict(zip(forcing, each, strict=True))
     remembered = tuple(after[i][0] if i in after else own for i, own in enumerate(memory))
-    if forcing:
-        forces = forces.at[np.asarray(forcing)].set(jnp.stack([force for _, force in each]))
+    if forcing:  # row by row: a scatter is a loop over the effects on a CPU, a third of a small robot's step
+        forces = jnp.stack([after[i][1] if i in after else own for i, own in enumerate(forces)])
     return data.replace(qfrc_applied=total + outside), (remembered, forces)
 
 
