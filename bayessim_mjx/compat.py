@@ -71,6 +71,24 @@ def _write_out_small_factors() -> None:
 _write_out_small_factors()
 
 
+def _axis_angle_to_quat(axis: jax.Array, angle: jax.Array) -> jax.Array:
+    """MJX's function of this name, to the bit."""
+    half = angle * 0.5
+    return jnp.concatenate([jnp.cos(half)[None], axis * jnp.sin(half)])
+
+
+def _join_quaternions() -> None:
+    """Spare MJX the insertion of a number into an array: a scatter, which on a CPU is a loop in every timestep."""
+    with contextlib.suppress(ImportError):
+        from mujoco.mjx._src import math
+
+        if hasattr(math, "axis_angle_to_quat"):
+            math.axis_angle_to_quat = _axis_angle_to_quat
+
+
+_join_quaternions()
+
+
 def put_replicated(tree: Any, devices: Sequence[jax.Device]) -> Any:
     """Every leaf once per device, along a new leading axis that is spread over them.
 

@@ -4,7 +4,9 @@ from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
+from mujoco.mjx._src import math
 
 from bayessim_mjx import compat
 
@@ -40,3 +42,11 @@ def test_whether_the_compiler_knows_the_options_is_found_out_also_inside_of_anot
     compat.compiler_options.cache_clear()
     jax.eval_shape(lambda x: compat.program(doubled, ARM)(x), jnp.ones(()))
     assert jax.default_backend() != "cpu" or "xla_cpu_use_fusion_emitters" in compat.compiler_options()
+
+
+def test_a_rotation_is_mjx_s_to_the_bit():
+    rng = np.random.default_rng(0)
+    axes, angles = rng.normal(size=(50, 3)).astype(np.float32), rng.uniform(-7, 7, 50).astype(np.float32)
+    inserted = jax.vmap(lambda axis, angle: jnp.insert(axis * jnp.sin(angle * 0.5), 0, jnp.cos(angle * 0.5)))
+    assert math.axis_angle_to_quat is compat._axis_angle_to_quat  # what MJX calls
+    np.testing.assert_array_equal(jax.vmap(math.axis_angle_to_quat)(axes, angles), inserted(axes, angles))

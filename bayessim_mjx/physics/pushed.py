@@ -12,7 +12,23 @@ from bayessim_mjx.physics.drive import Drive
 from bayessim_mjx.physics.gates import chained
 from bayessim_mjx.physics.model import IMPLICITFAST, Physics
 
-Memory = tuple[tuple, jax.Array]  # (memories of the effects, their last forces [effects, nv])
+Memory = tuple[tuple, tuple]  # (memories of the effects, last forces [nv] of those that exert any)
+
+
+def apart(physics: Physics, forces: jax.Array) -> tuple[jax.Array, ...]:
+    """`[effects, nv]` -> `[nv]` of each effect that exerts a force, as a control step's timesteps carry them.
+
+    Together they would be taken apart in each timestep: a third of a small robot's on a CPU.
+    """
+    return tuple(forces[i] for i in physics.having("on_force"))
+
+
+def together(physics: Physics, rows: tuple[jax.Array, ...]) -> jax.Array:
+    """The inverse of `apart`."""
+    nothing = jnp.zeros(physics.mj_model.nv)
+    each = dict(zip(physics.having("on_force"), rows, strict=True))
+    every = [each.get(i, nothing) for i in range(len(physics.effects))]
+    return jnp.stack(every) if every else jnp.zeros((0, physics.mj_model.nv))
 
 
 def pushed(
@@ -25,7 +41,7 @@ def pushed(
     """
     if not physics.effects and drive.force is None:
         return data, carry
-    memory, forces = carry
+    memory, last = carry
     outside = jnp.zeros_like(data.qfrc_applied) if drive.force is None else drive.force
     known = data.qfrc_passive - data.qfrc_bias + data.qfrc_actuator + outside
     forcing = physics.having("on_force")
@@ -38,7 +54,7 @@ def pushed(
         return (remembered, force), others + force
 
     # a branch copies what it returns: only what may change goes through it
-    each, total = tuple((memory[i], forces[i]) for i in forcing), sum((forces[i] for i in forcing), jnp.zeros_like(known))
+    each, total = tuple(zip((memory[i] for i in forcing), last, strict=True)), sum(last, jnp.zeros_like(known))
     if drive.active is None:
         each, total = chained(None, forcing, functools.partial(hook, step), each, total)
     elif forcing:
@@ -52,9 +68,7 @@ def pushed(
         each, total = jax.lax.cond(jnp.any(drive.active[np.asarray(forcing)]), acting, lambda: (each, total))
     after = dict(zip(forcing, each, strict=True))
     remembered = tuple(after[i][0] if i in after else own for i, own in enumerate(memory))
-    if forcing:  # row by row: a scatter is a loop over the effects on a CPU, a third of a small robot's step
-        forces = jnp.stack([after[i][1] if i in after else own for i, own in enumerate(forces)])
-    return data.replace(qfrc_applied=total + outside), (remembered, forces)
+    return data.replace(qfrc_applied=total + outside), (remembered, tuple(force for _, force in each))
 
 
-__all__ = ["Memory", "pushed"]
+__all__ = ["Memory", "apart", "pushed", "together"]

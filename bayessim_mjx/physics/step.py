@@ -18,6 +18,7 @@ from bayessim_mjx.errors import UserError
 from bayessim_mjx.physics.drive import Drive
 from bayessim_mjx.physics.gates import chained_in
 from bayessim_mjx.physics.model import Physics, World
+from bayessim_mjx.physics.pushed import apart, together
 from bayessim_mjx.physics.timestep import early, substep
 
 
@@ -55,13 +56,13 @@ def _control_step(physics: Physics, world: World, command: jax.Array, drive: Dri
         data, remembered = carry
         return substep(physics, model, data.replace(ctrl=ctrl), remembered, thetas, world.measurement, drive), None
 
-    start = (physics.data_of(world, None if warp is None else warp.data), (memory, world.forces))
+    start = (physics.data_of(world, None if warp is None else warp.data), (memory, apart(physics, world.forces)))
     end, _ = (
         body(start, commands[0])
         if physics.substeps == 1
         else jax.lax.scan(body, start, commands, unroll=physics.unroll)
     )
-    data, (final, forces) = end
+    data, (final, rows) = end
     remembered, measurement = physics.sense(thetas, final, {"qpos": data.qpos, "qvel": data.qvel}, drive.active)
     world = world.replace(
         qpos=data.qpos,
@@ -70,7 +71,7 @@ def _control_step(physics: Physics, world: World, command: jax.Array, drive: Dri
         warmstart=data.qacc_warmstart,
         time=data.time,
         memory=remembered,
-        forces=forces,
+        forces=together(physics, rows),
         measurement=measurement,
     )
     return world, data

@@ -87,7 +87,7 @@ def substep(
         physics: static.
         model: with the world's parameters.
         data: the state, and ctrl `[nu]`.
-        carry: the effects' memories, and their forces of the last timestep `[effects, nv]`.
+        carry: the effects' memories, and the last timestep's forces `[nv]` of those that exert any (`pushed.apart`).
         thetas: one slice per effect.
         seen: what the sensors showed after the last control step, {"qpos", "qvel"}.
         drive: what else acts.

@@ -10,6 +10,7 @@ from bayessim_mjx.diagnosis.fitting.centred_commands import Centred
 from bayessim_mjx.effects import load
 from bayessim_mjx.parameters import ParameterSpace
 from bayessim_mjx.physics import Drive, Physics, control_step
+from bayessim_mjx.physics.pushed import apart, together
 
 ARM = """<mujoco><option timestep="0.005" integrator="implicitfast"/>
   <default><geom type="capsule" size=".03" contype="0" conaffinity="0"/></default><worldbody>
@@ -88,3 +89,35 @@ def test_a_branch_stays_a_branch_for_many_worlds(physics):
     run = jax.vmap(lambda theta, on: motion(physics, theta, on), in_axes=(0, None))
     program = str(jax.make_jaxpr(run)(np.stack([physics.neutral] * 2), active))
     assert program.count(" cond[") >= len(ON)
+
+
+def test_the_forces_of_a_timestep_are_put_together_and_taken_apart_again(physics):
+    names = [effect.name for effect in physics.effects]
+    pushing = [names.index("coulomb_friction"), names.index("backlash")]
+    rows = np.zeros((len(names), 2), np.float32)
+    rows[pushing] = [[1.0, 2.0], [3.0, 4.0]]
+    each = apart(physics, jnp.asarray(rows))
+    assert [row.tolist() for row in each if np.any(row)] == [[1.0, 2.0], [3.0, 4.0]] and len(each) < len(names)
+    np.testing.assert_array_equal(together(physics, each), rows)
+
+
+def test_what_follows_from_inertias_is_renewed_once_behind_all_that_change_them():
+    """In whatever order they stand; a transmission, which hides the armature, comes after it."""
+    stack = [load(n)(w) for n, w in (("backlash", ("elbow",)), ("armature", ("elbow",)), ("payload", ("fore",)))]
+    xml = ARM.replace('<body pos=".3 0 0">', '<body name="fore" pos=".3 0 0">')
+    physics = Physics(mujoco.MjModel.from_xml_string(xml), 0.02, ParameterSpace(), stack)
+    theta = np.array(physics.neutral)
+    names = list(physics.space.names)
+    theta[names.index("elbow.armature.inertia")], theta[names.index("fore.payload.mass")] = 0.3, 0.5
+    theta[names.index("elbow.backlash.gap")] = 0.02
+    got = physics.model_of(jax.jit(physics.world)(jnp.asarray(theta)))
+    spec = mujoco.MjSpec.from_string(xml)
+    spec.joint("elbow").armature = 0.3
+    load("payload")(("fore",)).edit(spec, {"fore": {"mass": 0.5, "com_x": 0.0, "com_y": 0.0, "com_z": 0.0}})
+    want = spec.compile()
+    for name in ("dof_M0", "dof_invweight0", "actuator_acc0"):
+        np.testing.assert_allclose(getattr(got, name), getattr(want, name), rtol=1e-4, err_msg=name)
+    assert got.body_subtreemass[0] == pytest.approx(want.body_subtreemass[0], rel=1e-5)
+    still = physics.model_of(jax.jit(physics.world)(jnp.asarray(physics.neutral)))
+    for name in ("dof_M0", "body_invweight0", "body_subtreemass"):  # the compiler's own numbers, to the bit
+        np.testing.assert_array_equal(getattr(still, name), getattr(physics.model, name), err_msg=name)

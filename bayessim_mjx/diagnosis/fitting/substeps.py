@@ -132,7 +132,7 @@ class Errors:
             drive = Drive(extra, enabled, own.law)
 
             def sub(k: jax.Array, data: Any) -> Any:
-                return substep(physics, model, data.replace(ctrl=command[k]), ((), world.forces), (), seen, drive)[0]
+                return substep(physics, model, data.replace(ctrl=command[k]), ((), ()), (), seen, drive)[0]
 
             data = jax.lax.fori_loop(0, count, sub, data)
             return data, (data.qpos, data.qvel + early * data.qacc)
