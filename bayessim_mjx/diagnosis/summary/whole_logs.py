@@ -82,10 +82,10 @@ class _Stage:
 
 def stage(found: Findings, say: Progress) -> Findings:
     """With what every stage of the gap is over whole logs."""
-    return found.having(simulate(found, say))
+    return found.having(simulate(found))
 
 
-def simulate(found: Findings, say: Progress = lambda text, done, total: None) -> Whole:
+def simulate(found: Findings) -> Whole:
     """Every stage on at most LOGS logs; parameters are those found without the log's condition, where it has one."""
     setup, cut = found.setup, found.setup.fitter.simulator.windows
     stages = {
