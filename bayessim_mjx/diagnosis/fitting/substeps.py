@@ -92,9 +92,8 @@ class Errors:
         def one(case: Case) -> Array:
             count = case.cut.batch.command.shape[2]
             missing = [(0, 0), (0, 0), (0, self.most - count), (0, 0)]
-            batch = self.cut.batch.replace(
-                command=np.pad(np.asarray(case.cut.batch.command), missing)
-            )  # the past keeps its shape
+            command = np.pad(np.asarray(case.cut.batch.command), missing)  # the past keeps its shape
+            batch = self.cut.batch.replace(command=command)
             offsets = self.offsets if case.offsets is None else self.offsets + case.offsets
             force = self._no_force if case.force is None else np.asarray(case.force, np.float32)
             theta = np.asarray(self.theta if case.theta is None else case.theta, np.float32)
