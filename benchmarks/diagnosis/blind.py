@@ -39,7 +39,9 @@ STOPPED = (130, -signal.SIGINT, -signal.SIGTERM)  # by somebody: to be run again
 Job = tuple[str, str, tuple[str, ...], str, int, Path]
 
 
-def jobs(out: Path, seeds: range, kinds: Iterable[str], systems: Iterable[str], strengths: list[str]) -> list[Job]:
+def jobs(
+    out: Path, seeds: Iterable[int], kinds: Iterable[str], systems: Iterable[str], strengths: list[str]
+) -> list[Job]:
     """(kind, system, effects, strength, seed, folder); effects take turns, so that all come up equally often."""
     found = []
     for system in systems:

@@ -76,11 +76,12 @@ def make_case(
     runs = [robot.record(plant, i, seed, noise) for i in range(len(RUNS))]
     logged = drawn if velocity is None else velocity
     truth = {"system": system, "seed": seed, "strength": strength, "velocity": logged, "base": base, "effects": truths}
-    _write(out, robot, runs, truth)
+    write(out, robot, runs, truth)
     return Case(out, truth)
 
 
-def _write(out: Path, robot: System, runs: Sequence[Run], truth: dict) -> None:
+def write(out: Path, robot: System, runs: Sequence[Run], truth: dict) -> None:
+    """The nominal model, a log of each run and the truth."""
     logs = out / "logs"
     logs.mkdir(parents=True, exist_ok=True)
     (out / "model.xml").write_text(robot.xml)
@@ -88,12 +89,12 @@ def _write(out: Path, robot: System, runs: Sequence[Run], truth: dict) -> None:
     actuators = [plant.model.actuator(i).name for i in range(plant.model.nu)]
     header = ["time", *(f"ctrl:{a}" for a in actuators), *(f"qpos:{j}" for j in plant.joints)]
     header += [f"qvel:{j}" for j in plant.joints] if truth["velocity"] else []
-    for i, r in enumerate(runs):
+    for r in runs:
         columns = [r.time[:, None], r.ctrl, r.qpos] + ([r.qvel] if truth["velocity"] else [])
-        stem = logs / f"{i:02d}_{RUNS[i][0]}"
+        label = RUNS[r.index][0]
+        stem = logs / f"{r.index:02d}_{label}"
         table = np.concatenate(columns, 1)
         np.savetxt(stem.with_suffix(".csv"), table, fmt="%.9g", delimiter=",", header=",".join(header), comments="")
         law = "" if robot.servo else "controller: {law: torque}\n"
-        label = RUNS[i][0]
         stem.with_suffix(".yaml").write_text(f"condition: {label}\noperating_condition: {label}\n{law}")
     (out / "truth.json").write_text(json.dumps(truth, indent=1, default=float))

@@ -18,10 +18,16 @@ COMPILING = "/jax/core/compile/"  # JAX's events: tracing, lowering, compiling (
 
 
 def diagnose(arguments: list[str]) -> tuple[int, dict[str, float], Any]:
-    """(exit code, seconds in all and of compilation, findings or None) of the diagnosis's own command."""
-    started = time.perf_counter()
+    """`watched`, with the findings open again for further fits."""
+    code, times, found = watched(arguments)
     from baselines import Reopened
 
+    return code, times, Reopened(found) if found else None
+
+
+def watched(arguments: list[str]) -> tuple[int, dict[str, float], Any]:
+    """(exit code, seconds in all and of compilation, findings or None) of the diagnosis's own command."""
+    started = time.perf_counter()
     from bayessim_mjx import diagnose as command
     from bayessim_mjx.diagnosis import run
     from bayessim_mjx.diagnosis.findings import Findings
@@ -37,7 +43,8 @@ def diagnose(arguments: list[str]) -> tuple[int, dict[str, float], Any]:
     run.investigate = keep
     code = command.main(arguments)
     times = {"seconds": time.perf_counter() - started, "compile_seconds": covered(compiling)}
-    return code, times, Reopened(kept[0]) if kept else None
+    run.investigate = original
+    return code, times, kept[0] if kept else None
 
 
 def compilations() -> list[tuple[float, float]]:

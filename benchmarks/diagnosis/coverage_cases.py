@@ -1,0 +1,214 @@
+"""The cases of `coverage.py`, fixed before any was looked at: data sheets of any accuracy, and few or poor logs.
+
+**Data sheets** (150 cases): seeds 9300 to 9314 of the pendulum, the cart-pole and the two-link arm, 9300 to 9309 of
+both six-joint arms and the leg; a single and a double of each. Effects take turns as in `blind.py`, medium and strong.
+Each mass, damping and armature of the real robot (all that these models' data sheets list) is 1 + scale N(0, 1) times
+the nominal one, and no less than a tenth of it. The scale of a case is drawn log-uniformly from 2 to 30 %.
+
+**Logs** (60 cases, 10 of each kind of POOR): singles, medium and strong, scale 5 %, seeds 9400 to 9459. Robots take
+turns: pendulum, cart-pole, two-link arm and leg twice, the arms once; a joint is held on the two-link arm and the leg
+four times each, and on the torque arm twice.
+
+- held joint: a stiff servo (of the model too) holds one joint; its encoder of 12 bits shows one number throughout. The
+  hidden effect is elsewhere.
+- one log, two logs: of the runs 2 to 6 one, or two in different conditions.
+- position-only: all runs, no velocities.
+- quantised: steps of encoders of four standard deviations of their noise, stated nowhere.
+- late velocities: measured velocities are those of 20 ms before.
+
+Velocities are logged in half of the others.
+"""
+
+import dataclasses
+import functools
+import itertools
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from blind import jobs
+from cases import STRENGTHS, SYSTEMS, draw_cause, places, write
+from isolable import KINDS, seed_of
+
+from bayessim_mjx.blind.reality.cause import Cause
+from bayessim_mjx.blind.reality.motion import RUNS
+from bayessim_mjx.blind.reality.plant import Plant, Run, base_names, scales_of
+from bayessim_mjx.blind.reality.strength import Ruler, resize
+from bayessim_mjx.blind.reality.system import System
+
+SMALL, LARGE = ("pendulum", "cartpole", "two_link"), ("leg", "arm_servo", "arm_torque")
+SEEDS = {**dict.fromkeys(SMALL, range(9300, 9315)), **dict.fromkeys(LARGE, range(9300, 9310))}
+SCALES = 0.02, 0.30  # ends of the scale of parameter errors
+STATED = 0.05  # the scale of the cases of poor logs: what the diagnosis assumes
+LEAST = 0.1  # of a nominal value: the smallest that a real one is
+WIDEST = 3.0  # scales, within which a refit may move known parameters when an effect's strength is measured
+
+POOR = ("held joint", "one log", "two logs", "position-only", "quantised", "late velocities")
+POOR_SEED = 9400
+TURNS = ("pendulum", "cartpole", "two_link", "leg") * 2 + ("arm_servo", "arm_torque")
+HELD_TURNS = ("two_link", "leg") * 4 + ("arm_torque",) * 2
+HELD = {"two_link": ("elbow", 4000, 40), "leg": ("knee", 4000, 40), "arm_torque": ("flange", 2000, 20)}  # joint, kp, kv
+COUNT = 2 * np.pi / 4096  # rad, of the held joint's encoder
+CHOSEN = range(2, 7)  # runs of which few are logged: none is slow or without a controller
+STEPS = 4.0  # standard deviations of noise, of quantised encoders
+LATE = 0.02  # s
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """One case before anything of it is simulated; logs: "all", or one of POOR; scale: of its parameters' errors."""
+
+    name: str
+    logs: str
+    kind: str
+    system: str
+    effects: tuple[str, ...]
+    strength: str
+    seed: int
+    scale: float
+
+
+@functools.cache
+def plans() -> tuple[Plan, ...]:
+    """All cases, those of data sheets first."""
+    found = []
+    for system, seeds in SEEDS.items():
+        for kind, _, effects, strength, seed, _ in jobs(Path(), seeds, KINDS[:2], [system], [*STRENGTHS][1:3]):
+            low, high = map(math.log, SCALES)
+            scale = math.exp(np.random.default_rng((seed, KINDS.index(kind), *system.encode())).uniform(low, high))
+            found.append(Plan(f"{system}_{kind}_s{seed}", "all", kind, system, effects, strength, seed, scale))
+    for system in SEEDS:
+        own = {}
+        for (i, logs), (j, turn) in itertools.product(enumerate(POOR), enumerate(TURNS)):
+            if (HELD_TURNS[j] if logs == "held joint" else turn) == system:
+                own[POOR_SEED + len(TURNS) * i + j] = logs
+        for kind, _, effects, strength, seed, _ in jobs(Path(), own, KINDS[:1], [system], [*STRENGTHS][1:3]):
+            name = f"{system}_{own[seed].replace(' ', '_')}_s{seed}"
+            found.append(Plan(name, own[seed], kind, system, effects, strength, seed, STATED))
+    return tuple(found)
+
+
+@dataclasses.dataclass(frozen=True)
+class Held(System):
+    """A robot one of whose joints a stiff servo of its own holds at a count of its encoder.
+
+    held: index of the joint and of its actuator.
+    """
+
+    held: int = 0
+
+    @property
+    def angle(self) -> float:
+        return float(COUNT * round(self.centre[self.held] / COUNT))
+
+    def _plan(self, plant: Plant, index: int, seed: int) -> tuple[Callable[..., np.ndarray], np.ndarray, np.ndarray]:
+        control, start, speed = super()._plan(plant, index, seed)
+        start[self.held], speed[self.held] = self.angle, 0.0
+
+        def holding(*seen: Any) -> np.ndarray:
+            u = control(*seen)
+            u[self.held] = self.angle
+            return u
+
+        return holding, start, speed
+
+
+def robot_of(plan: Plan) -> System:
+    """The case's robot as modelled."""
+    robot = SYSTEMS[plan.system]
+    if plan.logs != "held joint":
+        return robot
+    joint, kp, kv = HELD[plan.system]
+    spec = robot.spec()
+    held = [j.name for j in spec.joints].index(joint)
+    old = next(line for line in robot.xml.splitlines() if f'name="{joint}_motor"' in line)
+    xml = robot.xml.replace(old, f'    <position name="{joint}_motor" joint="{joint}" kp="{kp}" kv="{kv}"/>')
+    swing = tuple(0.0 if i == held else s for i, s in enumerate(robot.swing))
+    own = {f.name: getattr(robot, f.name) for f in dataclasses.fields(System)}
+    return Held(**own | {"xml": xml, "swing": swing}, held=held)
+
+
+@dataclasses.dataclass(frozen=True)
+class Drawn:
+    """A case's robot, real parameters and causes (without their sizes), the ruler of strengths, what is drawn next."""
+
+    robot: System
+    base: dict[str, float]
+    causes: list[Cause]
+    ruler: Ruler
+    rng: np.random.Generator
+
+    def plant(self) -> Plant:
+        return Plant(self.robot, self.base, self.causes)
+
+
+def errors(plan: Plan, names: Sequence[str], rng: np.random.Generator) -> dict[str, float]:
+    """Real values of known parameters, in nominal ones."""
+    return {n: max(1 + plan.scale * float(rng.normal()), LEAST) for n in names}
+
+
+def drawn(plan: Plan) -> Drawn:
+    robot, seed = robot_of(plan), seed_of(plan.kind, plan.seed)
+    rng = np.random.default_rng((seed, *plan.system.encode()))
+    base = errors(plan, base_names(robot.spec().compile()), rng)
+    ruler = Ruler(robot, base, WIDEST * plan.scale, seed)
+    scales, causes = scales_of(ruler.plain, ruler.runs), list[Cause]()
+    still = HELD[plan.system][0] if isinstance(robot, Held) else ""
+    for name in plan.effects:
+        open_to = [w for w in places(robot, name, scales) if scales.drives.get(w, w) != still]
+        effect = (name, str(rng.choice(open_to))) if still else name
+        causes.append(draw_cause(effect, robot, scales, causes, rng))
+    return Drawn(robot, base, causes, ruler, rng)
+
+
+def make(plan: Plan, out: Path) -> dict[str, Any]:
+    """Write model, logs and truth of a case; the truth."""
+    case = drawn(plan)
+    truths = []
+    for cause in case.causes:
+        raw, left = resize(cause, case.ruler, STRENGTHS[plan.strength])
+        own = {"name": cause.name, "where": cause.where, "parameters": cause.parameters(), "size": cause.size}
+        truths.append(own | {"raw": raw, "left": left})
+    velocity = plan.logs == "late velocities" or bool(case.rng.uniform() < 0.5 and plan.logs != "position-only")
+    truth = dataclasses.asdict(plan) | {"velocity": velocity, "base": case.base, "effects": truths}
+    plant = case.plant()
+    runs = [case.robot.record(plant, i, seed_of(plan.kind, plan.seed)) for i in range(len(RUNS))]
+    if not all(np.isfinite(r.clean).all() for r in runs):
+        raise RuntimeError(f"{plan.name}: the motion does not stay finite")
+    write(out, case.robot, logged(plan, case.robot, runs, case.rng), truth)
+    if isinstance(case.robot, Held):  # one of the actuators is a servo: commands go to them as they are
+        for told in (out / "logs").glob("*.yaml"):
+            told.write_text("\n".join(line for line in told.read_text().splitlines() if "law" not in line) + "\n")
+    return truth
+
+
+def again(plan: Plan, truth: dict[str, Any]) -> Drawn:
+    """A written case with its causes of the sizes that they have there."""
+    case = drawn(plan)
+    for cause, told in zip(case.causes, truth["effects"], strict=True):
+        cause.size = told["size"]
+    return case
+
+
+def logged(plan: Plan, robot: System, runs: Sequence[Run], rng: np.random.Generator) -> list[Run]:
+    """What of the runs stands in the logs."""
+    out = list(runs)
+    if plan.logs == "one log":
+        return [out[int(rng.choice(CHOSEN))]]
+    if plan.logs == "two logs":
+        one, two = 0, 0
+        while RUNS[one][0] == RUNS[two][0]:
+            one, two = sorted(int(i) for i in rng.choice(CHOSEN, 2, replace=False))
+        return [out[one], out[two]]
+    if plan.logs == "quantised":
+        step = STEPS * np.asarray(robot.sigma)
+        return [dataclasses.replace(r, qpos=step * np.round(r.qpos / step)) for r in out]
+    if plan.logs == "late velocities":
+        rows = round(LATE / robot.period)
+        return [dataclasses.replace(r, qvel=np.concatenate([r.qvel[:1]] * rows + [r.qvel[:-rows]])) for r in out]
+    if isinstance(robot, Held):
+        for r in out:
+            r.qpos[:, robot.held] = COUNT * np.round(r.clean[:, robot.held] / COUNT)
+    return out

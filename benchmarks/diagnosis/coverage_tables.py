@@ -1,0 +1,166 @@
+"""The tables of `coverage.py score`: rates by kind of case, by robot and by the true error of the data sheet."""
+
+import json
+import math
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from coverage_cases import POOR, SEEDS, Plan, plans
+from score import Outcome, label, mcnemar
+
+from bayessim_mjx.blind.outcome import LOOSE, covered, holds, wilson
+
+ERRORS = (0.02, 0.05, 0.10, 0.20, 0.30)  # a case belongs to the nearest of these scales, by ratio
+NAMES, HOLDS = ("right", "exact", "inside", "false names"), ("strengths", "known", "known, other answers", "closed")
+SUFFIX = "_mult"  # of a known parameter in a diagnosis, a factor of the nominal value
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What one case adds to the tables; of one that did not end, nothing.
+
+    rates: {measure: answers}; size: of the set, nan where nothing is named; untold: why something was not counted.
+    """
+
+    plan: Plan
+    state: str
+    rates: dict[str, list[bool]]
+    size: float = math.nan
+    untold: tuple[str, ...] = ()
+    cpu: float = math.nan
+    said: str = ""
+
+
+def answers(out: Path) -> list[Answer]:
+    """Of all cases, in their order."""
+    return [answer(plan, out / plan.name) for plan in plans()]
+
+
+def answer(plan: Plan, folder: Path) -> Answer:
+    path = folder / "result.json"
+    if not path.exists():
+        return Answer(plan, "unfinished" if (folder / "output.txt").exists() else "not begun", {})
+    result = json.loads(path.read_text())
+    if "truth" not in result:
+        return Answer(plan, "not made", {})
+    said = result.get("said")
+    o = Outcome(folder, result["truth"], said, result.get("joints", {}), result.get("seconds", math.nan))
+    rates, untold = _names(o) if o.strong_enough else {}, [] if o.strong_enough else ["weaker than asked for"]
+    rates["strengths"] = covered(o)
+    right = all(o.right(e) for e in o.truth["effects"])
+    rates["known" if right and not _false(o) else "known, other answers"], missing = known(o)
+    rates["closed"], more = closed(said or {}, result)
+    untold += missing + more + [f"loose: {e['name']}" for e in o.truth["effects"] if e["name"] in LOOSE]
+    state = "no result" if said is None else "ended"
+    members = len(o.members()) if o.named() else math.nan
+    return Answer(plan, state, rates, members, tuple(untold), result.get("cpu", math.nan), label(o))
+
+
+def _false(o: Outcome) -> list[str]:
+    """Names that are not hidden."""
+    named = [(f["name"], str(f["where"])) for f in o.named()]
+    return [name for name, where in named if not any(o.same(name, where, e) for e in o.truth["effects"])]
+
+
+def _names(o: Outcome) -> dict[str, list[bool]]:
+    right, inside = (all(getattr(o, what)(e) for e in o.truth["effects"]) for what in ("right", "inside"))
+    wrong = _false(o)
+    return {"right": [right], "exact": [right and not wrong], "inside": [inside], "false names": [bool(wrong)]}
+
+
+def known(o: Outcome) -> tuple[list[bool], list[str]]:
+    """(whether what is said of each mass, damping and armature holds, a word for each of which nothing is said)."""
+    told = (o.said or {}).get("parameters", {})
+    of = {name: told.get(name.replace(".", "_") + SUFFIX) for name in o.truth["base"]}
+    held = [holds(given, o.truth["base"][name] * (given.get("nominal") or 1.0)) for name, given in of.items() if given]
+    return held, ["known parameters not told"] * (len(of) - len(held))
+
+
+def closed(said: dict[str, Any], result: dict[str, Any]) -> tuple[list[bool], list[str]]:
+    """(whether the interval of the closed share holds, why it was not asked)."""
+    if not said.get("effects"):
+        return [], []
+    ends = said.get("gap", {}).get("closed", {}).get("ci") or (None, None)
+    if None in ends:
+        return [], ["no interval of the closed share"]
+    if result.get("closed") is None:
+        return [], ["no truth of the closed share"]
+    return [bool(ends[0] <= result["closed"] <= ends[1])], []
+
+
+def nearest(scale: float) -> float:
+    return min(ERRORS, key=lambda e: abs(math.log(e / scale)))
+
+
+Group = tuple[str, Callable[[Answer], bool]]
+
+
+def tables(out: Path, before: Path | None = None) -> str:
+    """All tables as text."""
+    every = answers(out)
+    sheets, logs = ([a for a in every if (a.plan.logs == "all") == own] for own in (True, False))
+    by_error: list[Group] = [(f"{100 * e:g} %", lambda a, e=e: nearest(a.plan.scale) == e) for e in ERRORS]
+    by_kind: list[Group] = [(k, lambda a, k=k: a.plan.kind == k) for k in ("single", "double")]
+    by_system: list[Group] = [(s, lambda a, s=s: a.plan.system == s) for s in SEEDS]
+    by_logs: list[Group] = [(k, lambda a, k=k: a.plan.logs == k) for k in POOR]
+    text = [
+        f"Data sheets of any accuracy\n\n{_table(sheets, [*by_kind, *by_system])}",
+        f"By the scale of the true errors\n\n{_table(sheets, by_error)}",
+        f"Few and poor logs\n\n{_table(logs, by_logs)}",
+        _left_out(every),
+    ]
+    if before is not None:
+        text.append(_compared(answers(before), every))
+    return "\n\n".join(text)
+
+
+def _table(some: Sequence[Answer], groups: Iterable[Group]) -> str:
+    header = ["", "ended", *NAMES, "mean set", *HOLDS, "CPU s"]
+    rows = [_row("all", some)] + [_row(name, [a for a in some if own(a)]) for name, own in groups]
+    lines = [header, ["---"] * len(header), *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def _row(name: str, some: Sequence[Answer]) -> list[str]:
+    ended = sum(a.state in ("ended", "no result") for a in some)
+    sizes = [a.size for a in some if math.isfinite(a.size)]
+    spent = [a.cpu for a in some if math.isfinite(a.cpu)]
+    size = f"{np.mean(sizes):.1f}" if sizes else "-"
+    seconds = f"{np.median(spent):.0f} (max {max(spent):.0f})" if spent else "-"
+    cells = {what: _rate([x for a in some for x in a.rates.get(what, [])]) for what in (*NAMES, *HOLDS)}
+    names, held = [cells[w] for w in NAMES], [cells[w] for w in HOLDS]
+    return [name, f"{ended} of {len(some)}", *names, size, *held, seconds]
+
+
+def _rate(given: Sequence[bool]) -> str:
+    if not given:
+        return "-"
+    low, high = wilson(sum(given), len(given))
+    share = 100 * sum(given) / len(given)
+    return f"{sum(given)} of {len(given)}, {share:.0f} % ({100 * low:.0f} to {100 * high:.0f})"
+
+
+def _left_out(every: Sequence[Answer]) -> str:
+    states = Counter(a.state for a in every)
+    why = Counter(text for a in every for text in a.untold)
+    told = "; ".join(f"{name}: {n}" for name, n in [*states.items(), *sorted(why.items())])
+    return f"Of {len(every)} cases {told}. Rates with 95 % Wilson intervals."
+
+
+def _compared(before: Sequence[Answer], after: Sequence[Answer]) -> str:
+    """Cases that ended with both commits: measures of each, and cases that one alone has right."""
+    pairs = [(a, b) for a, b in zip(before, after, strict=True) if a.said and b.said]
+    lines = [f"Cases that ended with both: {len(pairs)}; before, now"]
+    for what in (*NAMES, *HOLDS):
+        both = [_rate([x for pair in pairs for x in pair[i].rates.get(what, [])]) for i in (0, 1)]
+        line = f"{what}: {both[0]}; {both[1]}"
+        if what in NAMES:
+            each = [(a.rates[what][0], b.rates[what][0]) for a, b in pairs if what in a.rates and what in b.rates]
+            only = [sum(x > y for x, y in each), sum(x < y for x, y in each)]
+            line += f"; one alone: {only[0]}, {only[1]} (p {mcnemar(*only):.2f})"
+        lines.append(line)
+    return "\n".join(lines)

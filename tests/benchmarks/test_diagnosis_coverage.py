@@ -1,0 +1,147 @@
+"""The count of intervals on wrong data sheets and poor logs: what its cases are, and what its tables count."""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks" / "diagnosis"))
+coverage = pytest.importorskip("coverage_cases")
+import coverage as command  # noqa: E402
+import coverage_tables as tables  # noqa: E402
+
+from bayessim_mjx.blind.reality.motion import RUNS  # noqa: E402
+from bayessim_mjx.blind.reality.plant import Plant, Run  # noqa: E402
+
+
+@pytest.fixture(scope="module")
+def plans() -> list:
+    return coverage.plans()
+
+
+def of(plans: list, logs: str, system: str) -> coverage.Plan:
+    return next(p for p in plans if p.logs == logs and p.system == system)
+
+
+def test_there_are_as_many_cases_of_each_kind_as_was_said_beforehand(plans):
+    assert len({p.name for p in plans}) == 210 and min(p.seed for p in plans) >= 9300
+    sheets = [p for p in plans if p.logs == "all"]
+    assert Counter(p.logs for p in plans if p.logs != "all") == dict.fromkeys(coverage.POOR, 10)
+    assert Counter(p.kind for p in sheets) == {"single": 75, "double": 75}
+    assert set(Counter(p.system for p in sheets).values()) == {20, 30}
+    # log-uniform from 2 to 30 %: half of the cases lie below the geometric mean, 7.7 % (75 +- 6 of 150)
+    assert 57 <= sum(p.scale < 0.0775 for p in sheets) <= 93
+    assert all(0.02 <= p.scale <= 0.3 for p in sheets) and {p.scale for p in plans if p.logs != "all"} == {0.05}
+
+
+def test_parameter_errors_have_the_scale_of_their_case(plans):
+    z, names = [], [f"p{i}" for i in range(20)]
+    for i, plan in enumerate(p for p in plans if p.scale < 0.25):
+        drawn = coverage.errors(plan, names, np.random.default_rng(i))
+        z += [(v - 1) / plan.scale for v in drawn.values()]
+    assert np.mean(z) == pytest.approx(0.0, abs=0.06) and np.std(z) == pytest.approx(1.0, abs=0.05)
+    wild = coverage.errors(coverage.dataclasses.replace(plans[0], scale=5.0), names, np.random.default_rng(0))
+    assert min(wild.values()) == coverage.LEAST
+
+
+def runs(joints: int, rows: int = 101) -> list[Run]:
+    """A ramp in every position and a count of rows in every velocity."""
+    t = 0.01 * np.arange(rows)
+    q, v = np.tile(0.0123 * t[:, None], joints), np.tile(np.arange(rows)[:, None] * 1.0, joints)
+    one = {"time": t, "ctrl": q, "qpos": q, "qvel": v, "clean": q, "clean_v": v, "effort": q[0]}
+    return [Run(**one, index=i) for i in range(len(RUNS))]
+
+
+def test_what_stands_in_poor_logs(plans):
+    rng, robot = np.random.default_rng(0), coverage.SYSTEMS["two_link"]
+    kept = {
+        k: coverage.logged(of(plans, k, "two_link"), robot, runs(2), rng)
+        for k in ("one log", "two logs", "quantised", "late velocities", "position-only")
+    }
+    assert [len(kept[k]) for k in kept] == [1, 2, 8, 8, 8]
+    assert len({RUNS[r.index][0] for r in kept["two logs"]}) == 2
+    counts = kept["quantised"][0].qpos / (4 * np.array(robot.sigma))
+    np.testing.assert_allclose(counts, np.round(counts), atol=1e-9)
+    late = kept["late velocities"][0].qvel[:, 0]  # 20 ms are two rows of 10 ms
+    np.testing.assert_array_equal(late[:5], [0, 0, 0, 1, 2])
+
+
+@pytest.mark.parametrize("system", ["two_link", "leg", "arm_torque"])
+def test_a_held_joint_shows_one_number_and_the_others_move(plans, system):
+    plan = of(plans, "held joint", system)
+    robot = coverage.robot_of(plan)
+    run = robot.record(Plant(robot, {}), 2, 0)
+    (logged,) = coverage.logged(plan, robot, [run], np.random.default_rng(0))
+    travel = np.ptp(logged.qpos, axis=0)
+    assert travel[robot.held] == 0 and np.delete(travel, robot.held).min() > 0.05
+    assert np.ptp(run.clean[:, robot.held]) < coverage.COUNT
+
+
+def result(folder: Path, plan: coverage.Plan, effects: list, closed: float | None, **parameters: dict) -> None:
+    """What `one` writes of a pendulum whose link is 10 % too heavy, with viscous friction of 0.1."""
+    hidden = {"name": "viscous_friction", "where": "hinge", "parameters": {"damping": 0.1}, "raw": 99.0, "left": 99.0}
+    truth = {"system": "pendulum", "kind": plan.kind, "strength": plan.strength, "effects": [hidden]}
+    said = {"verdict": "effects" if effects else "parameters", "effects": effects, "parameters": parameters}
+    said["gap"] = {"closed": {"ci": [0.9, 0.99]} if effects else {}}
+    told = {"truth": truth | {"base": {"link.mass": 1.1, "hinge.damping": 1.0}}, "said": said, "closed": closed}
+    (folder / plan.name).mkdir()
+    (folder / plan.name / "result.json").write_text(json.dumps(told | {"joints": {"hinge_motor": "hinge"}, "cpu": 50}))
+
+
+def named(name: str, mean: float) -> dict:
+    number = {"damping": {"mean": mean, "sd": 0.01, "bound": ""}}
+    return {"name": name, "where": "hinge", "parameters": number, "equivalent_to": [{"effects": ["backlash@hinge"]}]}
+
+
+def test_tables_count_what_holds_what_misses_and_what_did_not_end(plans, tmp_path):
+    own = [p for p in plans if p.system == "pendulum" and p.kind == "single" and p.logs == "all"][:4]
+    mass = {"link_mass_mult": {"mean": 1.0, "sd": 0.05, "nominal": 1.0}}  # 2 sd off
+    result(tmp_path, own[0], [named("viscous_friction", 0.11)], 0.95, **mass)
+    result(tmp_path, own[1], [named("viscous_friction", 0.2), named("armature", 1.0)], 0.8, **mass)
+    result(tmp_path, own[2], [], None, hinge_damping_mult={"mean": 1.0, "sd": 0.05, "nominal": 1.0})
+    (tmp_path / own[3].name).mkdir()
+    (tmp_path / own[3].name / "output.txt").write_text("killed")
+    found = {a.plan.name: a for a in tables.answers(tmp_path)}
+    first, second, third, killed = (found[p.name] for p in own)
+    assert first.rates == {
+        "right": [True], "exact": [True], "inside": [True], "false names": [False],
+        "strengths": [True], "known": [False], "closed": [True],
+    }  # fmt: skip
+    assert first.size == 2 and first.untold == ("known parameters not told",)
+    assert second.rates["right"] == [True] and second.rates["exact"] == [False] == second.rates["strengths"]
+    assert second.rates["false names"] == [True] and second.rates["known, other answers"] == [False]
+    assert second.rates["closed"] == [False]
+    assert third.rates["right"] == [False] and third.rates["known, other answers"] == [True]
+    assert killed.state == "unfinished" and not killed.rates and len(found) == 210
+    text = tables.tables(tmp_path)
+    assert "| pendulum | 3 of 30 | 2 of 3" in text and "unfinished: 1" in text and "not begun: 206" in text
+    assert "one alone: 0, 0" in tables.tables(tmp_path, tmp_path)
+
+
+def test_errors_belong_to_the_nearest_scale_by_ratio():
+    assert [tables.nearest(s) for s in (0.03, 0.033, 0.07, 0.072, 0.24, 0.25)] == [0.02, 0.05, 0.05, 0.1, 0.2, 0.3]
+
+
+def test_cases_that_run_when_the_time_is_over_are_killed_and_begun_again(tmp_path, monkeypatch, capsys):
+    begun: list = []
+
+    def sleep(folder: Path, core: int) -> subprocess.Popen:
+        begun.append(subprocess.Popen(["sleep", "60"], start_new_session=True))
+        return begun[-1]
+
+    monkeypatch.setattr(command, "_begin", sleep)
+    args = argparse.Namespace(out=tmp_path, jobs=1, minutes=0.01, only="sheets", systems="leg", shard="1/10")
+    for _ in range(2):
+        command.run(args)
+    assert [p.wait(5) for p in begun] == [-9, -9]
+    assert capsys.readouterr().out.count("1 killed, 1 not begun") == 2
+    first = sorted(tmp_path.iterdir())[0]
+    (first / "result.json").write_text("{}")
+    command.run(args)
+    assert "1 cases" in capsys.readouterr().out and os.path.exists(first / "plan.json")
