@@ -9,6 +9,7 @@ from typing import Any
 Z90, Z95 = 1.645, 1.960
 # parameters that do not mean the same in the finer reality and in the library (another pivot, gusts, signed loads)
 LOOSE = ("base_flexibility", "external_force", "load_friction")
+ONE_SIDED = {"at least": 1.0, "at most": -1.0}  # ends of ranges beyond which nothing was tried
 VERDICTS = ("no_gap", "parameters", "noise", "unexplained", "insufficient_data", "no result")
 
 
@@ -47,10 +48,15 @@ class Outcome:
 
     def inside(self, effect: Mapping[str, Any]) -> bool:
         """Named, or in the set of what cannot be told from what is named, or told as hidden beside it."""
-        rivals = [label for f in self.named() for entry in f.get("equivalent_to", ()) for label in labels_of(entry)]
+        return any(self.same(*label, effect) for label in self.members())
+
+    def members(self) -> list[tuple[str, str]]:
+        """(effect, place) of the answer as a set: what is named, what equals it, what hides beside it. Each once."""
+        found = [(f["name"], str(f["where"])) for f in self.named()]
+        found += [label for f in self.named() for entry in f.get("equivalent_to", ()) for label in labels_of(entry)]
         if self.named() and self.said:
-            rivals += [label for entry in self.said.get("hidden", ()) for label in labels_of(entry)]
-        return self.right(effect) or any(self.same(*label, effect) for label in rivals)
+            found += [label for entry in self.said.get("hidden", ()) for label in labels_of(entry)]
+        return list(dict.fromkeys(found))
 
 
 def labels_of(entry: Any) -> list[tuple[str, str]]:
@@ -72,17 +78,25 @@ def wilson(hits: int, n: int, z: float = Z95) -> tuple[float, float]:
     return max((middle - half) / (1 + z2 / n), 0.0), min((middle + half) / (1 + z2 / n), 1.0)
 
 
+def holds(given: Mapping[str, Any], truth: float) -> bool:
+    """Whether what is said of a number holds: its 90 % interval, or "at least" and "at most" where a range ends.
+
+    A number without a standard deviation that is no such limit holds nothing.
+    """
+    if side := ONE_SIDED.get(given.get("bound", "")):
+        return side * (truth - given["mean"]) >= 0
+    return bool(given["sd"]) and abs(given["mean"] - truth) <= Z90 * given["sd"]
+
+
 def covered(outcome: Outcome) -> list[bool]:
-    """Of the rightly named effects: whether each parameter with the same meaning lies in its 90 % interval."""
+    """Of the rightly named effects: whether what is said of each parameter with the same meaning holds."""
     found = []
     for effect in outcome.truth["effects"]:
         for f in outcome.named():
             if effect["name"] in LOOSE or not outcome.same(f["name"], str(f["where"]), effect):
                 continue
-            for name, value in effect["parameters"].items():
-                given = f.get("parameters", {}).get(name)
-                if given and given["sd"]:
-                    found.append(abs(given["mean"] - value) <= Z90 * given["sd"])
+            given = f.get("parameters", {})
+            found += [holds(given[name], value) for name, value in effect["parameters"].items() if name in given]
     return found
 
 

@@ -173,9 +173,9 @@ def score(args: argparse.Namespace) -> None:
         told[name] = rates(*([dataclasses.replace(outcome_of(f, RECORD), said=said(f)) for f in some] for some in done))
         print(name)
         for rate in told[name]:
-            if rate.answers:
-                low, high = wilson(sum(rate.answers), len(rate.answers))
-                print(f"  {rate.what}: {sum(rate.answers)} of {len(rate.answers)} ({low:.2f} to {high:.2f})")
+            low, high = wilson(sum(rate.answers), len(rate.answers))
+            counted = f"{sum(rate.answers)} of {len(rate.answers)} ({low:.2f} to {high:.2f})"
+            print(f"  {rate.told}: {counted if rate.answers else 'not counted'}")
     print("right by one of the two alone: as diagnosed, again, p of McNemar's exact test")
     for a, b in zip(*told.values(), strict=True):
         if a.answers and len(a.answers) == len(b.answers):

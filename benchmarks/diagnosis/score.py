@@ -13,9 +13,9 @@ import numpy as np
 from isolable import each_isolable
 
 from bayessim_mjx.blind import outcome as judged
-from bayessim_mjx.blind.outcome import LOOSE, VERDICTS, covered, label, labels_of, wilson
+from bayessim_mjx.blind.outcome import LOOSE, VERDICTS, covered, holds, label, labels_of, wilson
 
-__all__ = ["LOOSE", "Outcome", "confusion", "label", "labels_of", "rates", "read", "wilson"]
+__all__ = ["LOOSE", "Outcome", "confusion", "holds", "label", "labels_of", "rates", "read", "wilson"]
 
 GOALS = {"weak": 3.0, "medium": 10.0, "strong": 30.0, "severe": 100.0}
 REACHED = 0.8  # of the strength that was asked for, or the case does not count
@@ -74,17 +74,27 @@ def closure_errors(outcomes: Sequence[Outcome]) -> list[float]:
 
 @dataclass(frozen=True)
 class Rate:
-    """What is asked, the answer of every case that counts, and the goal: at least, or (`most`) at most."""
+    """What is asked, the answer of every case that counts, and the goal: at least, or (`most`) at most.
+
+    size: mean number of effect@place in the sets that were asked whether the truth is in them; nan of no sets.
+    """
 
     what: str
     answers: list[bool]
     goal: float
     most: bool = False
+    size: float = math.nan
 
     def to_dict(self) -> dict[str, Any]:
         low, high = wilson(sum(self.answers), len(self.answers))
         hits, n = sum(self.answers), len(self.answers)
-        return {"hits": hits, "n": n, "low": low, "high": high, "goal": self.goal, "at_most": self.most}
+        told = {"hits": hits, "n": n, "low": low, "high": high, "goal": self.goal, "at_most": self.most}
+        return told | ({"set_size": self.size} if math.isfinite(self.size) else {})
+
+    @property
+    def told(self) -> str:
+        """What is asked, and of sets of which size."""
+        return f"{self.what}, sets of {self.size:.1f}" if math.isfinite(self.size) else self.what
 
     @property
     def text(self) -> str:
@@ -105,11 +115,11 @@ def rates(outcomes: Sequence[Outcome], left_out: Sequence[Outcome] = ()) -> list
         Rate("single, isolable: effect and place named", [right(o) for o in single if o.isolable], 0.95),
         Rate("single, all: effect and place named", [right(o) for o in single], 0.95),
         Rate("single: effect named, any place", [_names(o) for o in single], 0.95),
-        Rate("single: truth in the equivalence set", [inside(o) for o in single], 0.98),
+        Rate("single: truth in the equivalence set", [inside(o) for o in single], 0.98, size=set_size(single)),
         Rate("single: nothing else named", [right(o) and len(o.named()) == 1 for o in single], 0.9),
         Rate("double, each isolable alone: both named", [right(o) for o in double if o.isolable], 0.85),
         Rate("double: both named", [right(o) for o in double], 0.85),
-        Rate("double: both in the equivalence set", [inside(o) for o in double], 0.85),
+        Rate("double: both in the equivalence set", [inside(o) for o in double], 0.85, size=set_size(double)),
         Rate(
             "nothing wrong: false alarm",
             [label(o) not in ("no_gap", "parameters", "noise") for o in null],
@@ -118,9 +128,16 @@ def rates(outcomes: Sequence[Outcome], left_out: Sequence[Outcome] = ()) -> list
         ),
         Rate("unknown cause: unexplained", [_unexplained(o) for o in unknown], 0.9),
         Rate("family left out: unexplained", [_unexplained(o) for o in left_out], 0.9),
+        Rate("unknown cause or family left out: unexplained", [_unexplained(o) for o in (*unknown, *left_out)], 0.9),
         Rate("closure within 5 points of the truth's", [e <= 0.05 for e in errors], 0.9),
         Rate("90 % intervals that cover", [c for o in (*single, *double) for c in covered(o)], 0.9),
     ]
+
+
+def set_size(outcomes: Sequence[Outcome]) -> float:
+    """Mean number of effect@place in an answer, of those that name something: the price of a truth that is inside."""
+    sizes = [len(o.members()) for o in outcomes if o.named()]
+    return float(np.mean(sizes)) if sizes else math.nan
 
 
 def _unexplained(outcome: Outcome) -> bool:

@@ -26,7 +26,8 @@ def score(folders: Sequence[Path], out: Path) -> str:
     left_out = [read(f, "left_out") for f in folders if (f / "left_out" / "exit.json").exists()]
     told = {name: rates(run if name == OWN else o, left_out if name == OWN else ()) for name, o in every.items()}
     tables = [_measures(told), _systems(run), _effects(run), rival_weights.table(run)]
-    text = "\n\n".join([*(markdown(t) for t in tables), _footer(every[OWN], run)])
+    footer = _footer(every[OWN], run, len(left_out))
+    text = "\n\n".join([*(markdown(t) for t in tables), footer])
     out.mkdir(parents=True, exist_ok=True)
     numbers = {name: {r.what: r.to_dict() for r in found} for name, found in told.items()}
     numbers[OWN]["seconds"] = _seconds(run)
@@ -38,9 +39,9 @@ def score(folders: Sequence[Path], out: Path) -> str:
     (out / "score.md").write_text(text + "\n")
     matrices = {name: confusion(run if name == OWN else o) for name, o in every.items()}
     _files(matrices[OWN], out)
-    (out / "score.html").write_text(page(tables, matrices, _footer(every[OWN], run)))
+    (out / "score.html").write_text(page(tables, matrices, footer))
     _print(tables)
-    return _footer(every[OWN], run)
+    return footer
 
 
 def _baselines(folders: Sequence[Path]) -> list[str]:
@@ -62,7 +63,7 @@ def _measures(told: dict[str, list[Rate]]) -> Table:
         goal = (
             f"{'<=' if rate.most else '>='} {100 * rate.goal:.0f} %" if "intervals" not in rate.what else "85 to 95 %"
         )
-        rows.append([rate.what, rate.text, interval, str(n), goal, *(told[name][i].text for name in others)])
+        rows.append([rate.told, rate.text, interval, str(n), goal, *(told[name][i].text for name in others)])
     return "Measures", ["measure", OWN, "95 % interval", "n", "goal", *others], rows
 
 
@@ -110,13 +111,14 @@ def _seconds(outcomes: Sequence[Outcome]) -> dict[str, float]:
     return found
 
 
-def _footer(every: Sequence[Outcome], outcomes: Sequence[Outcome]) -> str:
+def _footer(every: Sequence[Outcome], outcomes: Sequence[Outcome], left_out: int) -> str:
     weak = sum(not o.strong_enough for o in outcomes)
     failed = sum(o.said is None for o in outcomes)
     blind = sum(o.kind == "single" and o.isolable is None for o in outcomes)
     return (
         f"{len(outcomes)} of {len(every)} cases run; {failed} without a result; {weak} not counted because the effect "
-        f"cannot be as strong as asked on that robot; {blind} singles not looked at for rivals (command isolable). "
+        f"cannot be as strong as asked on that robot; {blind} singles not looked at for rivals (command isolable); "
+        f"{left_out} run with their effect's family left out. "
         f"Seconds: median (largest), compilation contained and told apart. Rates with 95 % Wilson intervals."
     )
 

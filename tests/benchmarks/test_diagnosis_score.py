@@ -171,3 +171,36 @@ def test_mcnemars_exact_p_of_pairs_that_differ():
 def test_wilson_interval_of_nine_in_ten():
     # (p + z^2/2n -+ z sqrt(p q / n + z^2 / 4n^2)) / (1 + z^2/n) with z = 1.96: Wilson (1927), 0.596 to 0.982
     assert score.wilson(9, 10) == pytest.approx((0.596, 0.982), abs=1e-3)
+
+
+def test_a_limit_holds_on_its_side_and_a_number_without_interval_holds_nothing():
+    at = {"mean": 2.0, "sd": None}
+    assert score.holds(at | {"bound": "at least"}, 3.0) and not score.holds(at | {"bound": "at least"}, 1.0)
+    assert score.holds(at | {"bound": "at most"}, 1.0) and not score.holds(at | {"bound": "at most"}, 3.0)
+    assert not any(score.holds(at | {"bound": bound}, 2.0) for bound in ("end", "off", ""))
+    assert score.holds({"mean": 2.0, "sd": 0.1}, 2.16) and not score.holds({"mean": 2.0, "sd": 0.1}, 2.17)
+
+
+def test_a_parameter_at_a_bound_is_asked_for_too(tmp_path):
+    ended = said(RIGHT)
+    ended["effects"][0]["parameters"] = {"level": {"mean": 0.2, "sd": None, "bound": "end"}}
+    assert score.covered(score.read(case(tmp_path / "a", [ELBOW], ended))) == [False]
+
+
+def test_a_truth_in_a_set_has_the_set_as_its_price(tmp_path):
+    """Named, an equal pair of which one is named already, and one hidden: three places."""
+    rivals = [{"effects": ["coulomb_friction@elbow", "backlash@elbow"]}, "stribeck_friction@elbow"]
+    wide = said(("stribeck_friction", "elbow"), rivals=rivals) | {"hidden": ["backlash@elbow"]}
+    found = rates(case(tmp_path / "a", [ELBOW], wide), case(tmp_path / "b", [ELBOW], said()))
+    told = found["single: truth in the equivalence set"]
+    assert told.answers == [True, False] and told.size == 3.0  # the answer that names nothing has no set
+    assert told.to_dict()["set_size"] == 3.0 and told.told.endswith("sets of 3.0")
+
+
+def test_families_left_out_count_with_unknown_causes(tmp_path):
+    folder = case(tmp_path / "a", [ELBOW], said(RIGHT))
+    (folder / "left_out").mkdir()
+    (folder / "left_out" / "diagnosis.json").write_text(json.dumps(said(RIGHT)))
+    other = case(tmp_path / "b", [ELBOW | {"name": "unknown_pushes"}], said(verdict="unexplained"), kind="unknown")
+    found = {r.what: r for r in score.rates([score.read(other)], [score.read(folder, "left_out")])}
+    assert found["unknown cause or family left out: unexplained"].answers == [True, False]
