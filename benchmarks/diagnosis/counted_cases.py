@@ -1,4 +1,4 @@
-"""The cases of `coverage.py`, fixed before any was looked at: data sheets of any accuracy, and few or poor logs.
+"""The cases of `count_intervals.py`, fixed before any was looked at: data sheets of any accuracy, and few or poor logs.
 
 **Data sheets** (150 cases): seeds 9300 to 9314 of the pendulum, the cart-pole and the two-link arm, 9300 to 9309 of
 both six-joint arms and the leg; a single and a double of each. Effects take turns as in `blind.py`, medium and strong.

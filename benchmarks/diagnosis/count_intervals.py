@@ -1,9 +1,9 @@
 """Do 90 % intervals hold where a data sheet is less accurate than assumed, and on few or poor logs?
 
-    python benchmarks/diagnosis/coverage.py run OUT --jobs 64 --minutes 9 [--only sheets] [--shard 0/2]
-    python benchmarks/diagnosis/coverage.py score OUT [--before OTHER]
+    python benchmarks/diagnosis/count_intervals.py run OUT --jobs 64 --minutes 9 [--only sheets] [--shard 0/2]
+    python benchmarks/diagnosis/count_intervals.py score OUT [--before OTHER]
 
-`coverage_cases.py` fixes the cases: 150 of data sheets, 60 of poor logs. Rules, fixed before any case was diagnosed:
+`counted_cases.py` fixes the cases: 150 of data sheets, 60 of poor logs. Rules, fixed before any case was diagnosed:
 
 - **Command.** `diagnose --model --data --seed 0 --verdict_only`: nothing is said of the data sheet's accuracy, all
   effects are on offer, no time limit of the search. Another commit is measured with PYTHONPATH set to its checkout.
@@ -48,7 +48,7 @@ ALONE = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
 def one(folder: Path) -> None:
     """Make a case unless it is there, diagnose it, write its result."""
     import worker
-    from coverage_cases import Plan, again, make, seed_of
+    from counted_cases import Plan, again, make, seed_of
 
     worker.without_pictures()
     given = json.loads((folder / PLAN).read_text())
@@ -111,7 +111,7 @@ def run(args: argparse.Namespace) -> None:
 
 
 def _waiting(args: argparse.Namespace) -> list[Path]:
-    from coverage_cases import plans
+    from counted_cases import plans
 
     index, count = (int(n) for n in args.shard.split("/"))
     chosen = [p for p in plans() if args.only in ("all", "sheets" if p.logs == "all" else "logs")]
@@ -166,7 +166,7 @@ def main() -> None:
     if args.does == "run":
         run(args)
     elif args.does == "score":
-        from coverage_tables import tables
+        from counted_tables import tables
 
         print(tables(args.out, args.before))
     else:

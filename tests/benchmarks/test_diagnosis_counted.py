@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks" / "diagnosis"))
-coverage = pytest.importorskip("coverage_cases")
-import coverage as command  # noqa: E402
-import coverage_tables as tables  # noqa: E402
+counted = pytest.importorskip("counted_cases")
+import count_intervals as command  # noqa: E402
+import counted_tables as tables  # noqa: E402
 
 from bayessim_mjx.blind.reality.motion import RUNS  # noqa: E402
 from bayessim_mjx.blind.reality.plant import Plant, Run  # noqa: E402
@@ -22,17 +22,17 @@ from bayessim_mjx.blind.reality.plant import Plant, Run  # noqa: E402
 
 @pytest.fixture(scope="module")
 def plans() -> list:
-    return coverage.plans()
+    return counted.plans()
 
 
-def of(plans: list, logs: str, system: str) -> coverage.Plan:
+def of(plans: list, logs: str, system: str) -> counted.Plan:
     return next(p for p in plans if p.logs == logs and p.system == system)
 
 
 def test_there_are_as_many_cases_of_each_kind_as_was_said_beforehand(plans):
     assert len({p.name for p in plans}) == 210 and min(p.seed for p in plans) >= 9300
     sheets = [p for p in plans if p.logs == "all"]
-    assert Counter(p.logs for p in plans if p.logs != "all") == dict.fromkeys(coverage.POOR, 10)
+    assert Counter(p.logs for p in plans if p.logs != "all") == dict.fromkeys(counted.POOR, 10)
     assert Counter(p.kind for p in sheets) == {"single": 75, "double": 75}
     assert set(Counter(p.system for p in sheets).values()) == {20, 30}
     # log-uniform from 2 to 30 %: half of the cases lie below the geometric mean, 7.7 % (75 +- 6 of 150)
@@ -43,11 +43,11 @@ def test_there_are_as_many_cases_of_each_kind_as_was_said_beforehand(plans):
 def test_parameter_errors_have_the_scale_of_their_case(plans):
     z, names = [], [f"p{i}" for i in range(20)]
     for i, plan in enumerate(p for p in plans if p.scale < 0.25):
-        drawn = coverage.errors(plan, names, np.random.default_rng(i))
+        drawn = counted.errors(plan, names, np.random.default_rng(i))
         z += [(v - 1) / plan.scale for v in drawn.values()]
     assert np.mean(z) == pytest.approx(0.0, abs=0.06) and np.std(z) == pytest.approx(1.0, abs=0.05)
-    wild = coverage.errors(coverage.dataclasses.replace(plans[0], scale=5.0), names, np.random.default_rng(0))
-    assert min(wild.values()) == coverage.LEAST
+    wild = counted.errors(counted.dataclasses.replace(plans[0], scale=5.0), names, np.random.default_rng(0))
+    assert min(wild.values()) == counted.LEAST
 
 
 def runs(joints: int, rows: int = 101) -> list[Run]:
@@ -59,9 +59,9 @@ def runs(joints: int, rows: int = 101) -> list[Run]:
 
 
 def test_what_stands_in_poor_logs(plans):
-    rng, robot = np.random.default_rng(0), coverage.SYSTEMS["two_link"]
+    rng, robot = np.random.default_rng(0), counted.SYSTEMS["two_link"]
     kept = {
-        k: coverage.logged(of(plans, k, "two_link"), robot, runs(2), rng)
+        k: counted.logged(of(plans, k, "two_link"), robot, runs(2), rng)
         for k in ("one log", "two logs", "quantised", "late velocities", "position-only")
     }
     assert [len(kept[k]) for k in kept] == [1, 2, 8, 8, 8]
@@ -75,15 +75,15 @@ def test_what_stands_in_poor_logs(plans):
 @pytest.mark.parametrize("system", ["two_link", "leg", "arm_torque"])
 def test_a_held_joint_shows_one_number_and_the_others_move(plans, system):
     plan = of(plans, "held joint", system)
-    robot = coverage.robot_of(plan)
+    robot = counted.robot_of(plan)
     run = robot.record(Plant(robot, {}), 2, 0)
-    (logged,) = coverage.logged(plan, robot, [run], np.random.default_rng(0))
+    (logged,) = counted.logged(plan, robot, [run], np.random.default_rng(0))
     travel = np.ptp(logged.qpos, axis=0)
     assert travel[robot.held] == 0 and np.delete(travel, robot.held).min() > 0.05
-    assert np.ptp(run.clean[:, robot.held]) < coverage.COUNT
+    assert np.ptp(run.clean[:, robot.held]) < counted.COUNT
 
 
-def result(folder: Path, plan: coverage.Plan, effects: list, closed: float | None, **parameters: dict) -> None:
+def result(folder: Path, plan: counted.Plan, effects: list, closed: float | None, **parameters: dict) -> None:
     """What `one` writes of a pendulum whose link is 10 % too heavy, with viscous friction of 0.1."""
     hidden = {"name": "viscous_friction", "where": "hinge", "parameters": {"damping": 0.1}, "raw": 99.0, "left": 99.0}
     truth = {"system": "pendulum", "kind": plan.kind, "strength": plan.strength, "effects": [hidden]}

@@ -1,4 +1,4 @@
-"""The tables of `coverage.py score`: rates by kind of case, by robot and by the true error of the data sheet."""
+"""The tables of `count_intervals.py score`: rates by kind of case, by robot and by the true error of the data sheet."""
 
 import json
 import math
@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from coverage_cases import POOR, SEEDS, Plan, plans
+from counted_cases import POOR, SEEDS, Plan, plans
 from score import Outcome, label, mcnemar
 
 from bayessim_mjx.blind.outcome import LOOSE, covered, holds, wilson
