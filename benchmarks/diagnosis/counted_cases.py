@@ -28,9 +28,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from blind import jobs
 from cases import STRENGTHS, SYSTEMS, draw_cause, places, write
 from isolable import KINDS, seed_of
+from turns import jobs
 
 from bayessim_mjx.blind.reality.cause import Cause
 from bayessim_mjx.blind.reality.motion import RUNS
