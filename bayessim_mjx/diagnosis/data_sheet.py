@@ -16,10 +16,10 @@ from bayessim_mjx.parameters import ParameterSpace
 from bayessim_mjx.parameters.attributes import suggest
 
 Array = NDArray[np.float64]
-# Of numbers whose accuracy nobody states it is inferred, one for each kind (masses, armatures, dampings, frictions). Its
-# prior: squared, a scaled inverse chi-squared of SURE degrees of freedom around ACCURACY, so that a number's own error
-# is a Student t. Both are chosen so that the t has the median and the 90 % and 95 % ranges of normal errors whose
-# standard deviation is somewhere from 2 to 30 % (log-uniform): .054, .20, .30 beside .046, .21, .29.
+# The accuracy of numbers for which nobody states one is inferred, one for each kind (masses, armatures, dampings,
+# frictions). Prior of its square: scaled inverse chi-squared, SURE degrees of freedom around ACCURACY. The error of one
+# number is then a Student t. Its median, 90 % and 95 % ranges (.057, .20, .30) are close to those of normal errors with
+# a standard deviation from 2 to 30 %, log-uniform (.046, .21, .29).
 ACCURACY = 0.07  # share of the stated value
 SURE = 2.0
 WORST = 0.3  # a data sheet that is less accurate than this is another robot's

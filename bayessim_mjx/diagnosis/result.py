@@ -82,8 +82,8 @@ class Diagnosis:
         chance: {"probability", "each": {label: p}, "nats", "level", "draws", "candidates"}, how often the best
             candidate gains as much where nothing is missing (`selection.chance`), or {}.
         hidden: effects ("name@place") that would not show beside those that are named, whose parameters do the same.
-        accuracy: {kind of parameter: {"median", "low", "high", "parameters"}}, how accurate the model's numbers seem, as
-            a share, with a 90 % interval, of how many; of kinds whose accuracy nobody stated.
+        accuracy: {kind of parameter: {"median", "low", "high", "parameters"}}: the inferred accuracy of the model's
+            numbers as a share, its 90 % interval, and how many numbers; of kinds whose accuracy nobody stated.
         next_experiment: {"name", "why", "evidence", "file", "table": [...]} or {}.
         details: numbers for pictures (see `report`); not part of diagnosis.json but saved beside it.
     """

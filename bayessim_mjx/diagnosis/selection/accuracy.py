@@ -1,16 +1,16 @@
 """How accurate a data sheet is, inferred from the logs: one number for each kind of parameter that it lists.
 
 Parameters p of kind k are N(nominal, s_k^2), with s_k^2 ~ scaled inverse chi-squared (`data_sheet`). About a fit the
-data are Gaussian in all parameters, so given the s_k the posterior is Gaussian and its evidence is known (Gelman et al.,
-Bayesian Data Analysis, 2013, ch. 5 and 15; the s_k are summed over a grid). What is not known of the s_k is then in
-every mean and interval.
+data are Gaussian in all parameters, so given the s_k the posterior is Gaussian and its evidence is known (Gelman et
+al., Bayesian Data Analysis, 2013, ch. 5 and 15). The s_k are summed over a grid, so their uncertainty is in every
+interval.
 """
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray

@@ -41,7 +41,8 @@ class Limits:
     relevant: float = 0.05
     # chance that known parameters of a robot lie together as far from their data sheet as the named effects leave them,
     # were it so many times as inaccurate as stated (or as the least accurate ones, `data_sheet.WORST`, where nobody
-    # stated it): below that the effects explain the motion of another robot. In 63 simulated cases in which something was named the least was .0016, but for an unknown cause (6e-7)
+    # stated it): below that the effects explain the motion of another robot. In 63 simulated
+    # cases in which something was named the least was .0016, but for an unknown cause (6e-7)
     doubtful: float = 1e-4
     loose: float = 1.5
     far: float = 2.0  # standard deviations, from which on a known parameter is counted as far off
