@@ -137,11 +137,12 @@ def far_from_data_sheet(value: float, away: float) -> str:
     return f"is {value:.4g}, {away:.1f} sd from the data sheet"
 
 
-def less_accurate(assumed: float, found: float) -> str:
-    """Of all known parameters whose accuracy nobody stated."""
+def less_accurate(found: Mapping[str, tuple[float, float, float]]) -> str:
+    """Of kinds of known parameters, {kind: (median, low, high)}, whose accuracy nobody stated."""
+    each = [f"{kind} about {m:.0%} (90 %: {low:.0%} to {high:.0%})" for kind, (m, low, high) in found.items()]
     return (
-        f"known parameters lie farther from the model than the {assumed:.0%} that a data sheet is taken to be accurate "
-        f"to, and were left as free as {found:.0%} would leave them; --accuracy states how accurate they are"
+        f"the model's numbers seem less accurate than usual: {', '.join(each)}; the intervals allow for it; "
+        "--accuracy fixes it"
     )
 
 

@@ -82,6 +82,8 @@ class Diagnosis:
         chance: {"probability", "each": {label: p}, "nats", "level", "draws", "candidates"}, how often the best
             candidate gains as much where nothing is missing (`selection.chance`), or {}.
         hidden: effects ("name@place") that would not show beside those that are named, whose parameters do the same.
+        accuracy: {kind of parameter: {"median", "low", "high", "parameters"}}: the inferred accuracy of the model's
+            numbers as a share, its 90 % interval, and how many numbers; of kinds whose accuracy nobody stated.
         next_experiment: {"name", "why", "evidence", "file", "table": [...]} or {}.
         details: numbers for pictures (see `report`); not part of diagnosis.json but saved beside it.
     """
@@ -102,6 +104,7 @@ class Diagnosis:
     not_fitted: dict[str, list[str]] = field(default_factory=dict)
     chance: dict[str, Any] = field(default_factory=dict)
     hidden: list[str] = field(default_factory=list)
+    accuracy: dict[str, dict[str, float]] = field(default_factory=dict)
     schema: int = SCHEMA
 
     def to_dict(self) -> dict[str, Any]:

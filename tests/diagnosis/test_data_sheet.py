@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from bayessim_mjx.diagnosis import data_sheet
+from bayessim_mjx.diagnosis.data_sheet import SURE
 from bayessim_mjx.diagnosis.fitting import robot
 from bayessim_mjx.diagnosis.fitting.candidates import Coordinate, base_coordinates
-from bayessim_mjx.diagnosis.fitting.fit import SURE
 from bayessim_mjx.diagnosis.fitting.fitter import Fit
+from bayessim_mjx.diagnosis.selection import accuracy
 from bayessim_mjx.diagnosis.summary import assemble
 from bayessim_mjx.errors import UserError
 
@@ -30,13 +31,18 @@ def of(arm, *texts):
     return {names[n]: s for n, s in data_sheet.accuracies(texts, arm.space, 0.05).items()}
 
 
-def test_a_models_own_numbers_are_known_to_five_percent(arm):
+def test_a_models_own_numbers_count_as_a_data_sheets(arm):
     every = arm.accuracy
-    assert len(every) == len(arm.space) and set(every.values()) == {0.05}
+    assert len(every) == len(arm.space) and set(every.values()) == {data_sheet.ACCURACY}
     for c in base_coordinates(arm.space, every):
-        assert c.stated and c.precision == pytest.approx(400.0) and c.neutral == 1.0
+        assert c.stated and c.precision == pytest.approx(data_sheet.ACCURACY**-2) and c.neutral == 1.0
     (loose, *_) = base_coordinates(arm.space)
-    assert not loose.stated and loose.precision == pytest.approx(1 / (0.58 * 0.4) ** 2)
+    assert not loose.stated and loose.precision == pytest.approx(1 / (0.58 * (loose.high - loose.low)) ** 2)
+
+
+def test_ranges_hold_the_errors_of_the_least_accurate_data_sheet(arm):
+    for c in base_coordinates(arm.space):
+        assert c.low <= 1 - 2.33 * data_sheet.WORST and c.high >= 1 + 2.33 * data_sheet.WORST
 
 
 def test_accuracies_by_what_and_by_whose_and_later_ones_win(arm):
@@ -77,30 +83,30 @@ def test_stated_priors_weigh_as_the_misfit_says():
     assert fit.penalty(fit.values, stated=True) == pytest.approx(1.0) == fit.penalty(fit.values)
 
 
-def assumed_fit(off, own=3, accuracy=0.05):
-    """Known parameters of assumed accuracy, each so far off its value of 1, and one that is stated and far off."""
-    every = [
-        Coordinate(str(i), (i,), 1.0, 0.5, 1.5, accuracy**-2, stated=True, assumed=i < own) for i in range(own + 1)
-    ]
-    values = np.array([1.0 + off] * own + [1.3])
-    blank = np.zeros((1, 1, own + 1))
+def assumed_fit(off, own=3, stated=1.3):
+    """Parameters of a kind, each so far off its value of 1; one of another kind; one that is stated and far off."""
+    kinds = ["mass"] * own + ["damping", ""]
+    every = [Coordinate(str(i), (i,), 1.0, 0.3, 2.0, 400.0, stated=True, kind=k) for i, k in enumerate(kinds)]
+    values = np.array([1.0 + off] * own + [1.02, stated])
+    blank = np.zeros((1, 1, own + 2))
     return Fit(tuple(every), values, blank[0], blank[0], blank, blank[:, :, :1], np.ones(1), 0.0)
 
 
-def test_an_assumed_accuracy_gives_way_where_parameters_lie_farther_off_together():
+def test_an_assumed_accuracy_gives_way_where_parameters_of_a_kind_lie_farther_off_together():
     near, far = assumed_fit(0.05), assumed_fit(0.2)
-    assert near.trust() == pytest.approx(1.0) and near.penalty(near.values, stated=True) == pytest.approx(3 + 36)
+    assert near.trust() == pytest.approx(np.ones(5))
+    assert near.penalty(near.values, stated=True) == pytest.approx(3 + 0.16 + 36)
     share = (SURE + 3) / (SURE + 48)
-    assert far.trust() == pytest.approx(share)
-    assert far.belief() == pytest.approx([400 * share] * 3 + [400])  # what is stated stays as it is
-    assert far.penalty(far.values, stated=True) == pytest.approx(3 - (SURE + 3) * np.log(share) + 36)
+    assert far.trust() == pytest.approx([share] * 3 + [1.0, 1.0])  # of one kind alone
+    assert far.belief() == pytest.approx([400 * share] * 3 + [400, 400])  # what is stated stays as it is
+    assert far.penalty(far.values, stated=True) == pytest.approx(3 - (SURE + 3) * np.log(share) + 0.16 + 36)
 
 
 @pytest.mark.parametrize("off", [0.02, 0.0501, 0.1, 0.25])
 def test_the_pull_of_a_prior_is_the_slope_of_its_penalty(off):
     fit, h = assumed_fit(off), 1e-6
-    for i in range(4):
-        step = np.eye(4)[i] * h
+    for i in range(5):
+        step = np.eye(5)[i] * h
         sides = [fit.penalty(fit.values + sign * step, stated=True) for sign in (1, -1)]
         assert fit.prior()[1][i] == pytest.approx(-0.5 * (sides[0] - sides[1]) / (2 * h), rel=1e-4)
 
@@ -110,14 +116,21 @@ def test_an_accuracy_is_assumed_where_nobody_states_one(arm, tmp_path):
     masses = {p.name for p in arm.space.parameters if p.attribute == "mass"}
     assert arm.stated(("mass=2%",)).assumed == arm.assumed - masses
     assert not arm.stated(("10%",)).assumed
-    own = {c.name for c in base_coordinates(arm.space, arm.accuracy, arm.assumed) if c.assumed}
-    assert own == arm.assumed and not any(c.assumed for c in base_coordinates(arm.space, arm.accuracy))
+    own = {c.name: c.kind for c in base_coordinates(arm.space, arm.accuracy, arm.assumed) if c.kind}
+    assert own == {p.name: p.attribute for p in arm.space.parameters}
+    assert not any(c.kind for c in base_coordinates(arm.space, arm.accuracy))
 
 
-def test_a_result_warns_where_the_assumed_accuracy_gave_way():
-    def of(fit):
-        return assemble._less_accurate(SimpleNamespace(fit=fit))
+def test_a_result_warns_where_the_model_is_less_accurate_than_usual():
+    def of(off):
+        fit = assumed_fit(off)
+        sheet = accuracy.posterior(fit, 1e6 * np.eye(5))
+        model = SimpleNamespace(fit=fit)
+        return assemble._accuracy(model, sheet), assemble._less_accurate(model, sheet)
 
-    assert of(assumed_fit(0.05)) == []
-    (text,) = of(assumed_fit(0.2))  # as free as 5 % * ((4 + 48) / (4 + 3)) ** .5 would leave them
-    assert "5%" in text and "14%" in text and "--accuracy" in text
+    numbers, said = of(0.02)
+    assert said == [] and numbers["mass"]["parameters"] == 3 and numbers["mass"]["high"] < numbers["damping"]["high"]
+    numbers, (text,) = of(0.3)
+    assert numbers["mass"]["low"] < 0.3 < numbers["mass"]["high"]
+    assert "mass about" in text and "damping" not in text and "--accuracy" in text
+    assert assemble._accuracy(SimpleNamespace(fit=assumed_fit(0.1)), None) == {}

@@ -33,8 +33,8 @@ class Coordinate:
         precision: of a Gaussian prior around neutral, 1/unit^2 (0: flat between the bounds).
         stated: the prior is what a data sheet states. It then weighs as much as the misfit says that the data know:
             while an effect is missing, no parameter takes its place because the noise alone is small.
-        assumed: nobody stated how accurate it is: where known parameters lie farther off together than that, their
-            priors give way (`Fit.trust`).
+        kind: of a data sheet's number (mass, damping ...) whose accuracy nobody stated: it is common to all of that
+            kind, and inferred from the logs (`Fit.trust`, `selection.accuracy`). "": it is not inferred.
         unit: for people.
     """
 
@@ -46,7 +46,7 @@ class Coordinate:
     precision: float = 0.0
     unit: str = ""
     stated: bool = False
-    assumed: bool = False
+    kind: str = ""
 
     @property
     def step(self) -> float:
@@ -84,14 +84,14 @@ def base_coordinates(
 
     Args:
         accuracy: {name: standard deviation as a share of the nominal value}, of those that a data sheet states.
-        assumed: names of those of which nobody said how accurate they are.
+        assumed: names of those whose accuracy nobody stated.
     """
     known = accuracy or {}
 
     def coordinate(i: int, p: Parameter) -> Coordinate:
         precision = _precision(p, known.get(p.name))
         own = Coordinate(p.name, (i,), p.nominal, p.low, p.high, precision, p.unit)
-        return replace(own, stated=p.name in known, assumed=p.name in assumed)
+        return replace(own, stated=p.name in known, kind=p.attribute if p.name in assumed else "")
 
     return tuple(coordinate(i, p) for i, p in enumerate(space.parameters))
 

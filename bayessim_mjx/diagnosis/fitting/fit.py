@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bayessim_mjx.diagnosis.data_sheet import SURE
 from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
 from bayessim_mjx.diagnosis.fitting.quadratic import Quadratic, Starts, eliminate
 
 Array = NDArray[np.float64]
-# How sure it is what nobody stated: the accuracy that is assumed of a data sheet is worth so many known parameters.
-SURE = 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +26,7 @@ class Fit:
         promise: by how much the next step would lower the cost if the model were linear; history: costs, step by step.
         doubt: squared misfit per independent number in the data, by which priors of stated parameters are multiplied.
         reach: `[W]`, share of their own steps that the start states make: less after one that did a window harm.
+        inferred: {kind: factor of its priors' precision} where the data sheet's accuracy was inferred (`accuracy`).
     """
 
     coordinates: tuple[Coordinate, ...]
@@ -42,23 +42,31 @@ class Fit:
     history: tuple[float, ...] = ()
     doubt: float = 1.0
     reach: Array = field(default_factory=lambda: np.ones(1))
+    inferred: Mapping[str, float] | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
         return tuple(c.name for c in self.coordinates)
 
-    def trust(self) -> float:
-        """By which precisions of assumed accuracy are multiplied: 1, and less where known parameters lie farther off.
+    def trust(self) -> Array:
+        """Factors `[k]` of the priors' precisions: 1, but where an accuracy is inferred (`Coordinate.kind`).
 
-        The prior of all of them together is a Student t's in its tails: their common standard deviation is not known.
+        The prior of all parameters of a kind is a multivariate Student t: their common variance has a scaled inverse
+        chi-squared prior (`data_sheet.SURE`), and its precision's mean given n parameters is (SURE + n) / (SURE + off).
+        It is never above 1: parameters that no data move would otherwise vouch for each other's accuracy.
         """
-        off, n = self._off(self.values)
-        return min(1.0, (SURE + n) / (SURE + off))
+        off = self._off(self.values)
+        factor = self.inferred or {kind: min(1.0, (SURE + n) / (SURE + far)) for kind, (far, n) in off.items()}
+        return np.array([factor.get(c.kind, 1.0) for c in self.coordinates])
 
-    def _off(self, values: Array) -> tuple[float, int]:
-        """Squared standard deviations by which all parameters of assumed accuracy are off, and how many those are."""
-        own = [(c, v) for c, v in zip(self.coordinates, values, strict=True) if c.assumed]
-        return float(sum(c.precision * (v - c.neutral) ** 2 for c, v in own)), len(own)
+    def _off(self, values: Array) -> dict[str, tuple[float, int]]:
+        """{kind: (squared standard deviations by which its parameters are off, in sum; how many those are)}."""
+        out: dict[str, tuple[float, int]] = {}
+        for c, v in zip(self.coordinates, values, strict=True):
+            if c.kind:
+                far, n = out.get(c.kind, (0.0, 0))
+                out[c.kind] = far + float(c.precision * (v - c.neutral) ** 2), n + 1
+        return out
 
     def prior(self) -> tuple[Array, Array, Array, Array]:
         """(precision, pull, room below, room above), `[k]` each, in units of the cost."""
@@ -70,16 +78,16 @@ class Fit:
 
     def belief(self) -> Array:
         """Precision of the priors `[k]` in units of the parameters, for use beside a curvature in nats."""
-        trust = self.trust()
-        return np.array([c.precision * (trust if c.assumed else 1.0) for c in self.coordinates])
+        return np.array([c.precision for c in self.coordinates]) * self.trust()
 
     def penalty(self, values: Array, stated: bool = False) -> float:
-        """Of the priors, as they are: of parameters that are stated (of assumed accuracy too), or of the others."""
+        """-2 log of the priors, up to a constant: of parameters that are stated (or of a kind), or of the others."""
         pairs = zip(self.coordinates, values, strict=True)
-        surely = sum(c.precision * (v - c.neutral) ** 2 for c, v in pairs if c.stated == stated and not c.assumed)
-        off, n = self._off(values) if stated else (0.0, 0)
-        tail = (SURE + n) * np.log((SURE + max(off, n)) / (SURE + n))  # its derivative is `trust`
-        return float(surely + min(off, n) + tail)
+        out = float(sum(c.precision * (v - c.neutral) ** 2 for c, v in pairs if c.stated == stated and not c.kind))
+        for kind, (far, n) in self._off(values).items() if stated else ():
+            tail = (SURE + n) * float(np.log((SURE + max(far, n)) / (SURE + n)))  # its derivative is `trust`
+            out += min(far, n) + tail if self.inferred is None else self.inferred[kind] * far
+        return out
 
     def quadratic(self, spread: Array) -> tuple[Quadratic, Starts]:
         return eliminate(self.r, self.A, self.B, self.offsets, spread)

@@ -15,6 +15,7 @@ from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
 from bayessim_mjx.diagnosis.residual.black_boxes import BlackBoxes
 from bayessim_mjx.diagnosis.result import Diagnosis, Gap, Place
 from bayessim_mjx.diagnosis.selection import bounds, conditions, left_out, uncertainty
+from bayessim_mjx.diagnosis.selection.accuracy import Posterior
 from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.selection.tried import Tried, ranked
 from bayessim_mjx.diagnosis.summary import effects_found, how_far
@@ -35,7 +36,6 @@ from bayessim_mjx.logs.log import Channels
 # standard deviations from what a data sheet states, from where on that is told: by chance of one normal value in 22.
 # How often it is told wrongly of fitted values was not counted.
 FAR = 2.0
-WORSE = 1.5  # times the accuracy assumed of a data sheet, from where on known parameters are told to ask for another
 PACKAGES = ("bayessim-mjx", "mujoco", "mujoco-mjx", "jax", "numpy")  # what the result depends on
 
 
@@ -58,6 +58,7 @@ def diagnosis_of(found: Findings, about: Mapping[str, Any] | None = None, file: 
     far = how_far.measured(found, {k: v for k, v in closed.items() if k != "each"})
     verdict = verdict_of(found, far)
     parameters = _parameters(selection, model, sd)
+    sheet = uncertainty.accuracies(setup.fitter, model, selection.along)
     over, where, proposal = found.part(Whole), found.part(Where), found.part(Experiment)
     far = how_far.with_whole(far, over, setup.tolerance) if over else far
     odds = by_chance(found)
@@ -75,7 +76,7 @@ def diagnosis_of(found: Findings, about: Mapping[str, Any] | None = None, file: 
         gap=far,
         parameters=parameters,
         candidates=ranking(selection),
-        warnings=[*notes, *_less_accurate(model), *found.warnings],
+        warnings=[*notes, *_less_accurate(model, sheet), *found.warnings],
         next_experiment=proposal.to_dict(file) if proposal else {},
         versions=versions.of(PACKAGES),
         details=details(found, effects, closed) | more | ({"experiments": proposal.details()} if proposal else {}),
@@ -84,6 +85,7 @@ def diagnosis_of(found: Findings, about: Mapping[str, Any] | None = None, file: 
         about={**about, "conditions": len(setup.fitter.simulator.windows.groups)} if about else {},
         chance=odds,
         hidden=list(selection.hidden),
+        accuracy=_accuracy(model, sheet),
     )
 
 
@@ -103,7 +105,7 @@ def _parameters(tried: Tried, model: Model, sd: np.ndarray) -> dict[str, dict[st
     remarks = conditions.structural(tried, model)
     return {
         c.name: {
-            **_against_data_sheet(c, float(model.fit.values[i])),
+            **_against_data_sheet(c, float(model.fit.values[i]), float(model.fit.belief()[i])),
             "mean": float(model.fit.values[i]), "sd": float(sd[i]), "nominal": c.neutral, "low": c.low, "high": c.high,
             "unit": c.unit, "structural": remarks.get(c.name, ""),
         }
@@ -111,18 +113,32 @@ def _parameters(tried: Tried, model: Model, sd: np.ndarray) -> dict[str, dict[st
     }  # fmt: skip
 
 
-def _against_data_sheet(c: Coordinate, value: float) -> dict[str, Any]:
+def _against_data_sheet(c: Coordinate, value: float, precision: float) -> dict[str, Any]:
     """How far a known parameter is from what was stated of it, where that is far: in words, and in sd."""
-    away = abs(value - c.neutral) * c.precision**0.5
+    away = abs(value - c.neutral) * precision**0.5
     if not (c.stated and away > FAR):
         return {"data_sheet": ""}
     return {"data_sheet": phrases.far_from_data_sheet(value, away), "away": away}
 
 
-def _less_accurate(model: Model) -> list[str]:
-    """That known parameters lie farther off than was assumed of their data sheet, where they do."""
-    worse = model.fit.trust() ** -0.5
-    return [phrases.less_accurate(data_sheet.ACCURACY, worse * data_sheet.ACCURACY)] if worse > WORSE else []
+def _accuracy(model: Model, sheet: Posterior | None) -> dict[str, dict[str, float]]:
+    """Of each kind of parameter whose accuracy nobody stated."""
+    every = [c.kind for c in model.fit.coordinates]
+    ends = {kind: sheet.accuracy(kind) for kind in sheet.kinds} if sheet else {}
+    return {
+        kind: {"median": middle, "low": low, "high": high, "parameters": every.count(kind)}
+        for kind, (low, middle, high) in ends.items()
+    }
+
+
+def _less_accurate(model: Model, sheet: Posterior | None) -> list[str]:
+    """Kinds of parameters that lie farther from their data sheet than half of all do, 9 to 1 or surer."""
+    found = {kind: own for kind, own in _accuracy(model, sheet).items() if own["low"] > data_sheet.ACCURACY}
+    return (
+        [phrases.less_accurate({kind: (own["median"], own["low"], own["high"]) for kind, own in found.items()})]
+        if found
+        else []
+    )
 
 
 def ranking(tried: Tried) -> list[dict[str, Any]]:

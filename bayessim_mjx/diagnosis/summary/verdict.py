@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2
 
-from bayessim_mjx.diagnosis import statistics
+from bayessim_mjx.diagnosis import data_sheet, statistics
 from bayessim_mjx.diagnosis.findings import Findings
+from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
 from bayessim_mjx.diagnosis.residual.origin import Origin, origin
 from bayessim_mjx.diagnosis.result import Gap
 from bayessim_mjx.diagnosis.selection import chance
@@ -39,8 +40,9 @@ class Limits:
     beaten: float = 0.4
     relevant: float = 0.05
     # chance that known parameters of a robot lie together as far from their data sheet as the named effects leave them,
-    # were it so many times as inaccurate as stated: below that the effects explain the motion of another robot. In 63
-    # simulated cases in which something was named the least was .0016, but for an unknown cause (6e-7)
+    # were it so many times as inaccurate as stated (or as the least accurate ones, `data_sheet.WORST`, where nobody
+    # stated it): below that the effects explain the motion of another robot. In 63 simulated
+    # cases in which something was named the least was .0016, but for an unknown cause (6e-7)
     doubtful: float = 1e-4
     loose: float = 1.5
     far: float = 2.0  # standard deviations, from which on a known parameter is counted as far off
@@ -86,9 +88,14 @@ def bent(model: Model) -> tuple[int, int]:
     """(Known parameters far from the data sheet, of so many), where that is no chance; else (0, 0)."""
     named = {c.name for effect in model.effects for c in effect.coordinates}
     pairs = zip(model.fit.coordinates, model.fit.values, strict=True)
-    away = np.array([(v - c.neutral) * c.precision**0.5 for c, v in pairs if c.stated and c.name not in named])
+    away = np.array([(v - c.neutral) * _precise(c) for c, v in pairs if c.stated and c.name not in named])
     likely = chi2.sf(np.sum((away / LIMITS.loose) ** 2), max(len(away), 1)) > LIMITS.doubtful
     return (0, 0) if likely else (int(np.sum(np.abs(away) > LIMITS.far)), len(away))
+
+
+def _precise(c: Coordinate) -> float:
+    """1 / standard deviation, as stated; of what nobody stated, that of the least accurate data sheet."""
+    return c.precision**0.5 * (data_sheet.ACCURACY / data_sheet.WORST if c.kind else 1.0)
 
 
 def builds_up(found: Findings) -> float:
