@@ -21,6 +21,7 @@ from bayessim_mjx.diagnosis.fitting import (
     lean,
     observation,
     scales,
+    sensors,
     stepping,
     windows,
 )
@@ -115,7 +116,7 @@ def prepare(
     floors, kinds = noise.floors(usable), candidates.kinds_of(effects)
     size = scales.measure(robot.mj_model, [resample(log, dt) for log in usable], robot.rating)
     stack, left_out = candidates.stack(kinds, size)
-    limit = tolerance.judge(robot.mj_model, 2 * size.travel, _noise(usable), asked).limit
+    limit = tolerance.judge(robot.mj_model, 2 * size.travel, sensors.noise_of_positions(usable), asked).limit
     delivered = float(robot.mj_model.opt.timestep)
     look_at = functools.partial(_measured, usable=usable, group=group, use_qvel=seen.use_qvel, limit=limit)
     steps = stepping.stepping(robot, dt, usable, look_at, functools.partial(_affordable, budget))
@@ -135,7 +136,7 @@ def prepare(
     said = [*steps.said(), *_faster(seen.usable, delivered, dt)]
     said += [] if shift is None else shift.told(float(np.median([log.period for log in logs])))
     told += [*said, *floors.warnings, *steps.warnings(), *(f"not tried: {text}" for text in left_out)]
-    told += [*_few_conditions(cut), *allowed.warnings(), *led.sentences()]
+    told += [*_few_conditions(cut), *sensors.not_compared(usable), *allowed.warnings(), *led.sentences()]
     fixed = (robot, physics, seen, floors, fitter, led.candidates, size, settings, seed, allowed)
     return Setup(*fixed, tuple(told), tuple(said), step, before)
 
@@ -156,11 +157,6 @@ def _settings(robot: Robot, quick: bool = False) -> Settings:
 def _known(step: discretisation.Discretisation, allowed: tolerance.Tolerance, fitter: Fitter) -> dict[str, Any]:
     """What a decision has to know of the noise and of the tolerance."""
     return {"believed": step.believed, "tolerated": allowed.surely(len(fitter.sigma))}
-
-
-def _noise(logs: Sequence[Log]) -> Array:
-    """Noise of positions `[nv]`, pooled over logs."""
-    return np.asarray(np.sqrt(np.mean([log.sigma_dofs**2 for log in logs], axis=0)))
 
 
 def _measured(

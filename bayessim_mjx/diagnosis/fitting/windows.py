@@ -12,6 +12,7 @@ import numpy as np
 from flax import struct
 from numpy.typing import NDArray
 
+from bayessim_mjx.diagnosis.fitting.sensors import noise_of
 from bayessim_mjx.effects.support.motion import AROUND, Motion
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.commands import means
@@ -160,7 +161,7 @@ def cut(
         names, group_of_window = _blocks(starts, even)
     else:
         group_of_window = [group_of[r] for r, _ in starts]
-    sigma_q, sigma_v, spread = _noise(even, model, use_qvel and all(log.has_qvel for log in logs))
+    sigma_q, sigma_v, spread = noise_of(even, logs, use_qvel and all(log.has_qvel for log in logs))
     return Windows(
         batch=_batch(even, fine, starts, length, dt, model, controllers.of_logs(logs, model)),
         log=np.asarray([r for r, _ in starts]),
@@ -271,24 +272,6 @@ def _enabled(even: Sequence[Log], starts: list[tuple[int, int]], length: int, mo
                 rows[:, even[r].actuators.index(name.split(":", 1)[1])] = on
         out.append(rows)
     return _stack(out)
-
-
-def _noise(logs: Sequence[Log], model: mujoco.MjModel, use_qvel: bool) -> tuple[Array, Array, Array]:
-    """(sigma_q [nv], sigma_v [nv], spread of the start [2 nv]), pooled over logs."""
-    dofs = np.sqrt(np.mean([log.sigma_dofs**2 for log in logs], axis=0))
-    motion = np.sqrt(np.mean([np.mean(log.qvel**2, axis=0) for log in logs], axis=0))
-    travel = np.maximum(motion * 0.05, 1e-9)
-    sigma_q = np.maximum(dofs, 1e-5 * travel)  # data without noise: the simulator's own precision
-    rate = np.sqrt(np.mean([log.sigma_qvel**2 for log in logs], axis=0))
-    sigma_v = np.maximum(rate, 1e-3 * motion) if use_qvel else np.full(model.nv, np.inf)
-    start_v = np.maximum(3 * rate, 0.1 * motion + 10 * sigma_q)
-    if not any(log.absent for log in logs):
-        return sigma_q, sigma_v, np.concatenate([3 * sigma_q, start_v])
-    seen, fast = (np.all([getattr(log, k) for log in logs], axis=0) for k in ("seen_dofs", "seen_speeds"))
-    kept = fast & (use_qvel | ~seen)  # the only measurement of a joint is compared in any case
-    sigma_v = np.where(kept, np.maximum(rate, 1e-3 * motion), np.inf)
-    start_v = np.where(seen, start_v, 3 * rate + 0.1 * motion)  # what is guessed is not tied to its position's guess
-    return np.where(seen, sigma_q, np.inf), sigma_v, np.concatenate([3 * sigma_q, start_v])
 
 
 def _stack(parts: list) -> jax.Array:
