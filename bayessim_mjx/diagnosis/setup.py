@@ -214,7 +214,7 @@ def _faster(logs: Sequence[Log], timestep: float, dt: float) -> list[str]:
 
 def _few_conditions(cut: windows.Windows) -> list[str]:
     count = len(cut.groups)
-    if cut.groups[0].startswith("part 1 of"):
-        blocks = "one operating condition only: blocks in time are held out, which tells little about other conditions"
-        return [*cut.notes, blocks]
+    if cut.blocks:
+        text = "one log is one operating condition: blocks of it in time are held out, so all numbers are in sample"
+        return [*cut.notes, f"{text}, and no interval between conditions is given"]
     return [*cut.notes, *([f"{count} operating conditions: intervals are rough"] if count < 4 else [])]

@@ -86,6 +86,7 @@ def about(d: Diagnosis) -> list[str]:
     logs = count(a["logs"], "log") if a.get("logs") else "logs"
     size = [f"{number(a['seconds'])} s"] if finite(a.get("seconds")) else []
     size += [f"{a['conditions']} operating conditions"] if (a.get("conditions") or 0) > 1 else []
+    size += ["one operating condition: in sample"] if a.get("conditions") == 1 else []
     return [
         text for text in (a.get("robot"), f"{logs}{where_}" if data else "", ", ".join(size), a.get("date")) if text
     ]

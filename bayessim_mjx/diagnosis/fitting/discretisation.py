@@ -289,7 +289,7 @@ def _smooth(x: Array) -> float | None:
     """Level of the eighth differences of x [T] in that of the fourth ones, where x moves; None: it hardly does."""
     if len(x) <= RULES.moving + 8:
         return None
-    changing = np.lib.stride_tricks.sliding_window_view(np.diff(x) != 0, 8).any(1)
+    changing = np.asarray(np.lib.stride_tricks.sliding_window_view(np.diff(x) != 0, 8).any(1))
     if changing.sum() < RULES.moving:
         return None
     return _level(x, 8, changing) / max(_level(x, 4, changing), 1e-300)

@@ -61,9 +61,5 @@ def not_compared(logs: Sequence[Log]) -> list[str]:
     names = [f"qpos:{n}" for n, off in zip(logs[0].channels.qvel, unknown, strict=True) if off]
     if not names:
         return []
-    several = len(names) > 1
-    return [
-        f"{', '.join(names)}: fewer than {LEVELS} values in every log tell no noise, so {'they are' if several else 'it is'}"
-        f" not compared with the simulator; `quantum` or `sigma` in the logs' side YAML "
-        f"{'compare them' if several else 'compares it'}"
-    ]
+    text = f"{', '.join(names)}: fewer than {LEVELS} values in every log tell no noise, so nothing is compared there"
+    return [f"{text}; `quantum` or `sigma` in the logs' side YAML would tell it"]

@@ -56,6 +56,7 @@ class Windows:
         logs: the resampled logs.
         dt: control period, s.
         notes: what else is held out than was asked for.
+        blocks: whether there is one operating condition only, and `group` is blocks of it in time.
     """
 
     batch: Batch
@@ -69,6 +70,7 @@ class Windows:
     logs: tuple[Log, ...]
     dt: float
     notes: tuple[str, ...] = ()
+    blocks: bool = False
 
     def __len__(self) -> int:
         return len(self.log)
@@ -76,6 +78,16 @@ class Windows:
     @property
     def steps(self) -> int:
         return int(self.batch.command.shape[1])
+
+    @property
+    def conditions(self) -> int:
+        """How many operating conditions there are: one log is one, in however many blocks it is held out."""
+        return 1 if self.blocks else len(self.groups)
+
+    @property
+    def condition(self) -> NDArray[np.int64]:
+        """`[W]`, operating condition, for what is said of conditions; `group` is what is held out together."""
+        return np.zeros_like(self.group) if self.blocks else self.group
 
     def alike(self, other: Windows) -> bool:
         """Whether these are the same parts of the logs."""
@@ -86,6 +98,8 @@ class Windows:
 def groups_of(logs: Sequence[Log], key: str | None = None) -> tuple[list[int], tuple[str, ...]]:
     """Operating condition of each log: metadata `key`, else `condition` or `operating_condition`, else one per log.
 
+    Pieces of one file that was cut at its gaps are one log.
+
     Raises:
         UserError: the key that was asked for is in no log's metadata.
     """
@@ -94,9 +108,16 @@ def groups_of(logs: Sequence[Log], key: str | None = None) -> tuple[list[int], t
         have = ", ".join(sorted({k for log in logs for k in log.metadata})) or "no keys"
         raise UserError(f"--group {key}: no log's metadata has this key; there are: {have}")
     told = len(set(labels)) > 1  # the same condition everywhere cannot be held out
-    labels = [label if label and told else log.name for label, log in zip(labels, logs, strict=True)]
+    labels = [label if label and told else file for label, file in zip(labels, _files(logs), strict=True)]
     names = tuple(dict.fromkeys(labels))
     return [names.index(label) for label in labels], names
+
+
+def _files(logs: Sequence[Log]) -> list[str]:
+    """Each log's name; of pieces of one file that of the file."""
+    sources = [str(log.metadata.get("source", log.name)) for log in logs]
+    names = [(log.name.rpartition("#")[0], log.name) for log in logs]
+    return [file if file and sources.count(of) > 1 else log for (file, log), of in zip(names, sources, strict=True)]
 
 
 def _labels(logs: Sequence[Log], key: str | None) -> list[str]:
@@ -118,7 +139,7 @@ def group_notes(logs: Sequence[Log], key: str | None) -> tuple[str, ...]:
         return (f"--group {key}: {', '.join(without)} without this key: each is held out as a condition of its own",)
     if len(set(labels)) > 1:
         return ()
-    instead = "single logs" if len(logs) > 1 else "blocks of the only log in time"
+    instead = "single logs" if len(set(_files(logs))) > 1 else "blocks of the only log in time"
     return (f"--group {key}: {labels[0]!r} in all logs, so nothing can be held out by it; {instead} are held out",)
 
 
@@ -157,7 +178,7 @@ def cut(
         raise UserError(
             f"no log holds {length} control steps of {dt:.4g} s; the longest has {longest}; allowed: longer logs"
         )
-    if len(names) == 1:  # one condition only: blocks in time stand in for conditions
+    if blocks := len(names) == 1:  # one condition only: blocks in time are held out
         names, group_of_window = _blocks(starts, even)
     else:
         group_of_window = [group_of[r] for r, _ in starts]
@@ -174,6 +195,7 @@ def cut(
         logs=tuple(even),
         dt=dt,
         notes=group_notes(logs, group),
+        blocks=blocks,
     )
 
 

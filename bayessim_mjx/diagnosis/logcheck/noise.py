@@ -108,11 +108,10 @@ def told(log: Log, stream: str = "qpos") -> NDArray[np.bool_]:
     if stream == "qvel" and not log.has_qvel:
         return np.ones(len(log.channels.qvel), bool)
     given = {**(log.metadata.get("sigma") or {}), **(log.metadata.get("quantum") or {})}
-    names, values, sigma = (getattr(of, k) for of, k in ((log.channels, stream), (log, stream), (log, f"sigma_{stream}")))
-    own = [
-        f"{stream}:{n}" in given or (stream == "qpos" and n in given) or _levels(x) >= LEVELS or s > 1.01 * noise_level(x)
-        for n, x, s in zip(names, values.T, sigma, strict=True)
-    ]  # fmt: skip
+    names, sigma = getattr(log.channels, stream), getattr(log, f"sigma_{stream}")
+    stated = [f"{stream}:{n}" in given or (stream == "qpos" and n in given) for n in names]
+    rows = zip(stated, getattr(log, stream).T, sigma, strict=True)
+    own = [known or _levels(x) >= LEVELS or s > 1.01 * noise_level(x) for known, x, s in rows]
     if stream == "qvel":
         return np.array(own, bool)
     out: list[bool] = []

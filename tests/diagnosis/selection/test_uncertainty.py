@@ -39,7 +39,7 @@ def problem(
     coordinates = tuple(Coordinate(n, (i,), 0.0, -2.0, 2.0, 1 / 16) for i, n in enumerate(NAMES))
     fitter = SimpleNamespace(
         spread=np.array([0.5]), used=np.ones(1, bool), base=coordinates[:1],
-        simulator=SimpleNamespace(windows=SimpleNamespace(group=group)),
+        simulator=SimpleNamespace(windows=SimpleNamespace(group=group, blocks=False)),
     )  # fmt: skip
     fitter.scores = lambda fit, group=None: Fitter.scores(fitter, fit, group)
     fitter.innovations = lambda *given: Fitter.innovations(fitter, *given)
