@@ -39,7 +39,7 @@ class Term:
         effect, where: of the library, or a known parameter (`mass`, `armature`, `damping`).
         shape: its maps into the columns; a scale has none.
         scaled: `[nv]`, joints whose whole effort it scales (neutral 1); None: it adds (neutral 0).
-        rest: `[nv, P]`, effort at these joints that it does not scale: y = rest + k (needed - rest); None: there is none.
+        rest: `[nv, P]`, effort at these joints that it does not scale, y = rest + k (needed - rest); or None.
         sd: coefficients of the last round (NaN: none yet) -> `[k]` of the priors; inf: none.
         low, high: `[k]`, allowed coefficients; within: further limits.
         read: coefficients -> parameters of the effect.
