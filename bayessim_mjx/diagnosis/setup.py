@@ -26,7 +26,7 @@ from bayessim_mjx.diagnosis.fitting import (
     windows,
 )
 from bayessim_mjx.diagnosis.fitting.centred_commands import physics_of
-from bayessim_mjx.diagnosis.fitting.cutting import CUTTING, finest, most_windows, windows_of
+from bayessim_mjx.diagnosis.fitting.cutting import CUTTING, finest, most_windows, seconds_of, windows_of
 from bayessim_mjx.diagnosis.fitting.fitter import Fitter
 from bayessim_mjx.diagnosis.fitting.robot import Robot
 from bayessim_mjx.diagnosis.fitting.simulator import Simulator
@@ -110,9 +110,10 @@ def prepare(
     dt = control_period(robot, logs)
     told = [*notes]
     seen, before = leads.checked(logs, robot, dt, told, seen_first)
-    seen = seen.of_logs(observation.completed(seen.demand(), robot.mj_model))
+    beginnings, shorter = observation.shortened(seen.demand(), seconds_of(robot.mj_model.nv, quick))
+    seen = seen.of_logs(observation.completed(beginnings, robot.mj_model))
     usable, robot = seen.usable, lean.lean(robot, seen.usable, dt)
-    told += [*seen.warnings, *(f"{text} (found, not assumed)" for text in seen.findings)]
+    told += [*seen.warnings, *shorter, *(f"{text} (found, not assumed)" for text in seen.findings)]
     floors, kinds = noise.floors(usable), candidates.kinds_of(effects)
     size = scales.measure(robot.mj_model, [resample(log, dt) for log in usable], robot.rating)
     stack, left_out = candidates.stack(kinds, size)
