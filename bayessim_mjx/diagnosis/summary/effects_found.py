@@ -1,4 +1,4 @@
-"""Numbers of the named effects: estimates, weight among rivals, what each closes, as promised and as realised."""
+"""Numbers of the named effects: estimates, relative scores among rivals, what each closes, as promised and as realised."""
 
 from __future__ import annotations
 
@@ -127,7 +127,7 @@ def _sentence(clauses: list[str]) -> str:
 
 
 def _weights(found: Findings, models: list[Model]) -> list[float]:
-    """Weights of a model and its rivals; NaN of one that has none."""
+    """Relative scores of a model and its rivals, no probabilities of being right; NaN of one that has none."""
     if len(models) < 2:
         return [float("nan")]
     group, rng = found.setup.fitter.simulator.windows.group, np.random.default_rng(found.setup.seed)
