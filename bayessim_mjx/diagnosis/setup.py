@@ -123,8 +123,7 @@ def prepare(
     steps = stepping.stepping(robot, dt, usable, look_at, functools.partial(_affordable, budget))
     cuts, step = steps.cuts, steps.worth
     shift = _shift(cuts, step, size)
-    lead = 0.0 if shift is None else shift.lead
-    seen = seen.shifted(lead) if lead else seen
+    seen = seen.shifted(lead) if (lead := 0.0 if shift is None else shift.lead) else seen
     robot = step.robot(steps.robot)
     physics = physics_of(robot, dt, stack)
     most = most_windows(physics, step.errors.cut.steps if step.errors else cuts(1).steps, quick)
@@ -134,8 +133,8 @@ def prepare(
     led = leads.lead(candidates.enumerate_candidates(physics), before)
     allowed = tolerance.judge(robot.mj_model, 2 * size.travel, cut.sigma_q, asked)
     settings = dataclasses.replace(settings or _settings(robot, quick), **_known(step, allowed, fitter), **led.order)
-    said = [*steps.said(), *_faster(seen.usable, delivered, dt)]
-    said += [] if shift is None else shift.told(float(np.median([log.period for log in logs])))
+    late = [] if shift is None else shift.told(float(np.median([log.period for log in logs])))
+    said = [*steps.said(), *_faster(seen.usable, delivered, dt), *late]
     told += [*said, *floors.warnings, *steps.warnings(), *(f"not tried: {text}" for text in left_out)]
     told += [*_few_conditions(cut), *sensors.not_compared(usable), *allowed.warnings(), *led.sentences()]
     fixed = (robot, physics, seen, floors, fitter, led.candidates, size, settings, seed, allowed)

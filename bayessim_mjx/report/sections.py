@@ -4,13 +4,14 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from bayessim_mjx.diagnosis.result import Diagnosis, FoundEffect
-from bayessim_mjx.quantities import count, fixed, power
+from bayessim_mjx.quantities import count
 from bayessim_mjx.report import gap_figures, marks, place_figures
 from bayessim_mjx.report.choice import choice
 from bayessim_mjx.report.look import STAGE
 from bayessim_mjx.report.words import (
     MISSING,
     STAGES,
+    between,
     candidate_title,
     closure,
     effect_line,
@@ -181,16 +182,6 @@ def _closure(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         }
         for r in rows
     ]
-
-
-def between(low: Any, high: Any) -> str:
-    """`96 % – 99.9 %`: the ends of an interval of shares; with more digits where they would look the same."""
-    if not (finite(low) and finite(high)):
-        return ""
-    ends = [percent(low), percent(high)]
-    if ends[0] == ends[1] and low < high:
-        ends = [f"{fixed(100 * end, 1 - power(100 * (high - low)))} %" for end in (low, high)]
-    return " – ".join(ends)
 
 
 def effects(d: Diagnosis) -> list[dict[str, Any]]:

@@ -6,9 +6,9 @@ from typing import TextIO
 from bayessim_mjx.diagnosis.result import Diagnosis, FoundEffect
 from bayessim_mjx.monitor.console import Console
 from bayessim_mjx.monitor.tables import TIE
-from bayessim_mjx.report.sections import between
 from bayessim_mjx.report.words import (
     MISSING,
+    between,
     candidate_title,
     closure,
     effect_title,

@@ -5,7 +5,7 @@ import math
 import pytest
 
 from bayessim_mjx.diagnosis.result import VERDICTS, Estimate, FoundEffect
-from bayessim_mjx.report import sections, words
+from bayessim_mjx.report import words
 
 
 @pytest.mark.parametrize(
@@ -108,6 +108,6 @@ def test_an_interval_that_says_nothing_is_not_told_in_numbers(span, said):
 
 
 def test_the_ends_of_an_interval_of_shares_never_look_the_same():
-    assert sections.between(0.96, 0.999) == "96 % – 99.9 %"
-    assert sections.between(0.99963, 1.0) == "99.963 % – 100.000 %"
-    assert sections.between(float("nan"), 1.0) == ""
+    assert words.between(0.96, 0.999) == "96 % – 99.9 %"
+    assert words.between(0.99963, 1.0) == "99.963 % – 100.000 %"
+    assert words.between(float("nan"), 1.0) == ""

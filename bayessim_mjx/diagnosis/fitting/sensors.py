@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.logcheck.noise import LEVELS, told
+from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Log
 
 Array = NDArray[np.float64]
@@ -18,6 +19,9 @@ def noise_of(logs: Sequence[Log], raw: Sequence[Log], use_qvel: bool) -> tuple[A
     """(sigma_q [nv], sigma_v [nv], spread of the start [2 nv]), pooled over logs; inf where nothing tells a noise.
 
     raw: the logs before they were resampled: a spline shows values that no sensor did.
+
+    Raises:
+        UserError: no channel's noise is told.
     """
     dofs = noise_of_positions(raw)
     rate, moved = _pooled([log.sigma_qvel for log in logs], [told(log, "qvel") for log in raw])
@@ -28,6 +32,9 @@ def noise_of(logs: Sequence[Log], raw: Sequence[Log], use_qvel: bool) -> tuple[A
     # where nothing tells the noise, a start is as uncertain as the usual sensor of this robot leaves it
     start_q = np.where(known, sigma_q, np.median(sigma_q[known]) if known.any() else 1.0)
     start_v = np.maximum(3 * rate, 0.1 * motion + 10 * start_q)
+    if not (np.isfinite(sigma_q) | np.isfinite(sigma_v)).any():
+        text = f"{raw[0].name}: no position shows {LEVELS} values in any log, so nothing tells the noise of the sensors"
+        raise UserError(f"{text}; allowed: `quantum` or `sigma` in the logs' side YAML, or logs that move")
     if not any(log.absent for log in logs):
         return sigma_q, sigma_v, np.concatenate([3 * start_q, start_v])
     seen, fast = (np.all([getattr(log, k) for log in logs], axis=0) for k in ("seen_dofs", "seen_speeds"))

@@ -123,8 +123,8 @@ def told(log: Log, stream: str = "qpos") -> NDArray[np.bool_]:
 
 
 def _levels(x: Array) -> int:
-    """Different values in x [T], up to the single precision in which they are simulated."""
-    span, grain = float(np.ptp(x)), float(np.finfo(np.float32).eps) * max(1.0, float(np.abs(x).max()))
+    """Different values in x [T], up to ten roundings of the single precision in which they are simulated."""
+    span, grain = float(np.ptp(x)), 10.0 * float(np.finfo(np.float32).eps) * max(1.0, float(np.abs(x).max()))
     return len(np.unique(np.round((x - x.min()) / max(1e-9 * span, grain))))
 
 

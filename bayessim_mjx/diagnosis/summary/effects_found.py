@@ -1,4 +1,4 @@
-"""Numbers of the named effects: estimates, relative scores among rivals, what each closes, as promised and as realised."""
+"""Numbers of the named effects: estimates, scores among rivals, what each closes, as promised and as realised."""
 
 from __future__ import annotations
 
