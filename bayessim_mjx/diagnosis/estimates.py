@@ -29,13 +29,14 @@ class FoundEffect:
     Attributes:
         name, where: of the library, of the model.
         parameters: {parameter: Estimate}.
-        weight_among_rivals: of this effect against `equivalent_to`, 1 together: how often and how clearly its model
-            predicts held-out conditions better (pseudo-BMA+). It is no probability that the effect is there: what is
-            there may be none of them. NaN where there is no rival to be weighed against.
+        weight_among_rivals: relative score of this effect against `equivalent_to`, 1 together: how often and how
+            clearly its model predicts held-out conditions better (a pseudo-BMA+ weight). It is no probability of being
+            right: what is there may be none of them. NaN where there is no rival to be scored against.
         gap_closed, gap_closed_ci: its part of what all effects close, as a share of the recalibrated simulator's
             squared gap above the noise, on held-out windows, with a 90 % interval (NaN of one condition).
-        equivalent_to: [{"effects": ["payload@link", ...], "gap_closed": ..., "why": sentence, "weight": among the
-            rivals}], which these logs cannot tell from it; of an effect that contains it as a special case, no weight.
+        equivalent_to: [{"effects": ["payload@link", ...], "gap_closed": ..., "why": sentence, "weight": relative score
+            among the rivals}], which these logs cannot tell from it; of an effect that contains it as a special case,
+            no weight.
         sentence: for people; predicted_gap_closed: the same share as promised before any effect was fitted.
         share: of the gap closed by all effects together (Shapley).
     """

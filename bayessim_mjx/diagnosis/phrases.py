@@ -146,9 +146,10 @@ def less_accurate(found: Mapping[str, tuple[float, float, float]]) -> str:
     )
 
 
-def moves(spread: float, groups: int) -> str:
+def moves(spread: float, groups: int, blocks: bool = False) -> str:
     """Of a known parameter that differs between operating conditions; said in 3 % of checks with nothing hidden."""
-    return f"moves between operating conditions (sd {spread:.3g} over {groups}): something may be missing"
+    where = "parts of the log" if blocks else "operating conditions"
+    return f"moves between {where} (sd {spread:.3g} over {groups}): something may be missing"
 
 
 def model_title(effects: Sequence[tuple[str, str]]) -> str:

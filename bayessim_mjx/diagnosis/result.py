@@ -45,9 +45,11 @@ class Gap:
     joints where more than tolerated remains;
     closed: {"predicted", "realised", "ci", "nested", "elsewhere"}, share of the recalibrated simulator's squared gap
     above the noise that all effects close together: as promised before any was fitted, on held-out windows afterwards,
-    and on conditions that had no part in the choice of the effects; nested: whether realised and ci are of such
-    conditions too; integrator: what the simulator's own time step is worth (`discretisation.Discretisation.to_dict`);
-    coasting: the same without any simulator, every joint keeping its speed (`selection.coasting`).
+    and on conditions that the choice of the effects was made without (the costs behind it were not); nested: whether
+    realised and ci are of such conditions too; integrator: what the simulator's own time step is worth
+    (`discretisation.Discretisation.to_dict`); coasting: the same without any simulator, every joint keeping its speed
+    (`selection.coasting`); in_sample: whether there is one log, of which parts are held out; of the horizon of whole
+    logs `in_sample` counts the logs that are simulated with parameters that were fitted to them.
     """
 
     noise_floor: float
@@ -64,6 +66,7 @@ class Gap:
     closed: dict[str, Any] = field(default_factory=dict)
     integrator: dict[str, Any] = field(default_factory=dict)
     coasting: float | None = None
+    in_sample: bool = False
 
 
 @dataclass(frozen=True)

@@ -21,11 +21,12 @@ from bayessim_mjx.diagnosis.fitting import (
     lean,
     observation,
     scales,
+    sensors,
     stepping,
     windows,
 )
 from bayessim_mjx.diagnosis.fitting.centred_commands import physics_of
-from bayessim_mjx.diagnosis.fitting.cutting import CUTTING, finest, most_windows, windows_of
+from bayessim_mjx.diagnosis.fitting.cutting import CUTTING, finest, most_windows, seconds_of, windows_of
 from bayessim_mjx.diagnosis.fitting.fitter import Fitter
 from bayessim_mjx.diagnosis.fitting.robot import Robot
 from bayessim_mjx.diagnosis.fitting.simulator import Simulator
@@ -109,20 +110,20 @@ def prepare(
     dt = control_period(robot, logs)
     told = [*notes]
     seen, before = leads.checked(logs, robot, dt, told, seen_first)
-    seen = seen.of_logs(observation.completed(seen.demand(), robot.mj_model))
+    beginnings, shorter = observation.shortened(seen.demand(), seconds_of(robot.mj_model.nv, quick))
+    seen = seen.of_logs(observation.completed(beginnings, robot.mj_model))
     usable, robot = seen.usable, lean.lean(robot, seen.usable, dt)
-    told += [*seen.warnings, *(f"{text} (found, not assumed)" for text in seen.findings)]
+    told += [*seen.warnings, *shorter, *(f"{text} (found, not assumed)" for text in seen.findings)]
     floors, kinds = noise.floors(usable), candidates.kinds_of(effects)
     size = scales.measure(robot.mj_model, [resample(log, dt) for log in usable], robot.rating)
     stack, left_out = candidates.stack(kinds, size)
-    limit = tolerance.judge(robot.mj_model, 2 * size.travel, _noise(usable), asked).limit
+    limit = tolerance.judge(robot.mj_model, 2 * size.travel, sensors.noise_of_positions(usable), asked).limit
     delivered = float(robot.mj_model.opt.timestep)
     look_at = functools.partial(_measured, usable=usable, group=group, use_qvel=seen.use_qvel, limit=limit)
     steps = stepping.stepping(robot, dt, usable, look_at, functools.partial(_affordable, budget))
     cuts, step = steps.cuts, steps.worth
     shift = _shift(cuts, step, size)
-    lead = 0.0 if shift is None else shift.lead
-    seen = seen.shifted(lead) if lead else seen
+    seen = seen.shifted(lead) if (lead := 0.0 if shift is None else shift.lead) else seen
     robot = step.robot(steps.robot)
     physics = physics_of(robot, dt, stack)
     most = most_windows(physics, step.errors.cut.steps if step.errors else cuts(1).steps, quick)
@@ -132,10 +133,10 @@ def prepare(
     led = leads.lead(candidates.enumerate_candidates(physics), before)
     allowed = tolerance.judge(robot.mj_model, 2 * size.travel, cut.sigma_q, asked)
     settings = dataclasses.replace(settings or _settings(robot, quick), **_known(step, allowed, fitter), **led.order)
-    said = [*steps.said(), *_faster(seen.usable, delivered, dt)]
-    said += [] if shift is None else shift.told(float(np.median([log.period for log in logs])))
+    late = [] if shift is None else shift.told(float(np.median([log.period for log in logs])))
+    said = [*steps.said(), *_faster(seen.usable, delivered, dt), *late]
     told += [*said, *floors.warnings, *steps.warnings(), *(f"not tried: {text}" for text in left_out)]
-    told += [*_few_conditions(cut), *allowed.warnings(), *led.sentences()]
+    told += [*_few_conditions(cut), *sensors.not_compared(usable), *allowed.warnings(), *led.sentences()]
     fixed = (robot, physics, seen, floors, fitter, led.candidates, size, settings, seed, allowed)
     return Setup(*fixed, tuple(told), tuple(said), step, before)
 
@@ -156,11 +157,6 @@ def _settings(robot: Robot, quick: bool = False) -> Settings:
 def _known(step: discretisation.Discretisation, allowed: tolerance.Tolerance, fitter: Fitter) -> dict[str, Any]:
     """What a decision has to know of the noise and of the tolerance."""
     return {"believed": step.believed, "tolerated": allowed.surely(len(fitter.sigma))}
-
-
-def _noise(logs: Sequence[Log]) -> Array:
-    """Noise of positions `[nv]`, pooled over logs."""
-    return np.asarray(np.sqrt(np.mean([log.sigma_dofs**2 for log in logs], axis=0)))
 
 
 def _measured(
@@ -218,7 +214,7 @@ def _faster(logs: Sequence[Log], timestep: float, dt: float) -> list[str]:
 
 def _few_conditions(cut: windows.Windows) -> list[str]:
     count = len(cut.groups)
-    if cut.groups[0].startswith("part 1 of"):
-        blocks = "one operating condition only: blocks in time are held out, which tells little about other conditions"
-        return [*cut.notes, blocks]
+    if cut.blocks:
+        text = "one log is one operating condition: blocks of it in time are held out, so all numbers are in sample"
+        return [*cut.notes, f"{text}, and no interval between conditions is given"]
     return [*cut.notes, *([f"{count} operating conditions: intervals are rough"] if count < 4 else [])]

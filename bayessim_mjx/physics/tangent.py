@@ -9,6 +9,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+SMALL = 1e-6  # squared tangent, below which series are exact in single precision
+
 
 def difference(model: mujoco.MjModel, measured: jax.Array, simulated: jax.Array) -> jax.Array:
     """qpos minus qpos in the tangent space `[nv]`: rotation vectors where there are quaternions."""
@@ -41,10 +43,15 @@ def _parts(model: mujoco.MjModel) -> Iterator[tuple[slice, slice, bool]]:
 
 
 def _rotation(a: jax.Array, b: jax.Array) -> jax.Array:
-    """Rotation vector of conj(b) a, small-angle safe (2 Im, exact to third order at the errors of a window)."""
+    """Rotation vector of conj(b) a, the shorter way round: the logarithm of a quaternion, 2 v / |v| atan2(|v|, w)."""
     w = a[0] * b[0] + jnp.dot(a[1:], b[1:])
     v = b[0] * a[1:] - a[0] * b[1:] - jnp.cross(b[1:], a[1:])
-    return 2.0 * v * jnp.sign(w)
+    v, w = jnp.where(w < 0, -v, v), jnp.abs(w)
+    square = jnp.dot(v, v)
+    small = square < SMALL * w * w
+    size = jnp.sqrt(jnp.where(small, 1.0, square))  # where it is 0, neither value nor derivative exists
+    near = 1.0 / jnp.where(small, w, 1.0)
+    return 2.0 * v * jnp.where(small, near * (1.0 - square * near * near / 3.0), jnp.arctan2(size, w) / size)
 
 
 def integrate(model: mujoco.MjModel, qpos: jax.Array, step: jax.Array) -> jax.Array:
@@ -56,7 +63,11 @@ def integrate(model: mujoco.MjModel, qpos: jax.Array, step: jax.Array) -> jax.Ar
 
 
 def _turned(quat: jax.Array, by: jax.Array) -> jax.Array:
-    r = jnp.concatenate([jnp.sqrt(jnp.maximum(0.0, 1.0 - jnp.sum(by * by) / 4))[None], by / 2])
+    square = jnp.dot(by, by) / 4
+    small = square < SMALL
+    half = jnp.sqrt(jnp.where(small, 1.0, square))
+    share = jnp.where(small, 1.0 - square / 6, jnp.sin(half) / half)
+    r = jnp.concatenate([jnp.where(small, 1.0 - square / 2, jnp.cos(half))[None], share * by / 2])
     w = quat[0] * r[0] - jnp.dot(quat[1:], r[1:])
     v = quat[0] * r[1:] + r[0] * quat[1:] + jnp.cross(quat[1:], r[1:])
     new = jnp.concatenate([w[None], v])

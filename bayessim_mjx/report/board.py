@@ -41,7 +41,7 @@ def tensorboard(diagnosis: Diagnosis, folder: str | Path) -> Path:
 
 
 def scalars(d: Diagnosis) -> dict[str, float]:
-    """{tag: number}: gap by stage, by horizon and by channel; closures, shares and weights among rivals."""
+    """{tag: number}: gap by stage, by horizon and by channel; closures, shares and relative scores among rivals."""
     out = {f"Gap/{s}": v for s, v in stages_of(d).items()} | {"Gap/closed": gap_closed(stages_of(d))}
     for row in d.gap.horizons:
         out |= {f"Gap {row['name']}/{s}": row[s] for s in STAGES if finite(row.get(s))}
@@ -49,7 +49,7 @@ def scalars(d: Diagnosis) -> dict[str, float]:
         out |= {f"Gap of {channel}/{s}": row[s] for s in STAGES if finite(row.get(s))}
     for e in d.effects:
         label = f"{e.name}@{e.where}"
-        out |= {f"Closed/{label}": e.gap_closed, f"Weight among rivals/{label}": e.weight_among_rivals}
+        out |= {f"Closed/{label}": e.gap_closed, f"Score among rivals/{label}": e.weight_among_rivals}
     return {k: v for k, v in out.items() if finite(v)}
 
 

@@ -11,6 +11,7 @@ from bayessim_mjx.report.look import STAGE
 from bayessim_mjx.report.words import (
     MISSING,
     STAGES,
+    between,
     candidate_title,
     closure,
     effect_line,
@@ -86,6 +87,7 @@ def about(d: Diagnosis) -> list[str]:
     logs = count(a["logs"], "log") if a.get("logs") else "logs"
     size = [f"{number(a['seconds'])} s"] if finite(a.get("seconds")) else []
     size += [f"{a['conditions']} operating conditions"] if (a.get("conditions") or 0) > 1 else []
+    size += ["one operating condition: in sample"] if a.get("conditions") == 1 else []
     return [
         text for text in (a.get("robot"), f"{logs}{where_}" if data else "", ", ".join(size), a.get("date")) if text
     ]
@@ -180,10 +182,6 @@ def _closure(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         }
         for r in rows
     ]
-
-
-def between(low: Any, high: Any) -> str:
-    return f"{percent(low)} – {percent(high)}" if finite(low) and finite(high) else ""
 
 
 def effects(d: Diagnosis) -> list[dict[str, Any]]:

@@ -6,9 +6,9 @@ from typing import TextIO
 from bayessim_mjx.diagnosis.result import Diagnosis, FoundEffect
 from bayessim_mjx.monitor.console import Console
 from bayessim_mjx.monitor.tables import TIE
-from bayessim_mjx.report.sections import between
 from bayessim_mjx.report.words import (
     MISSING,
+    between,
     candidate_title,
     closure,
     effect_title,
@@ -90,7 +90,7 @@ def _longest(d: Diagnosis) -> list[str]:
 
 
 def _effects(d: Diagnosis) -> Table:
-    header = ["effect", "parameters", "gap closed", "90 %", "predicted", "weight among rivals"]
+    header = ["effect", "parameters", "gap closed", "90 %", "predicted", "score among rivals"]
     rows = []
     for e in d.effects:
         found = [quantity(k, v) for k, v in e.parameters.items()]
@@ -110,7 +110,7 @@ def _effects(d: Diagnosis) -> Table:
 
 
 def _rivals(e: FoundEffect) -> str:
-    """The effect's weight and then its rivals with theirs, where they have one; nothing where there is no rival."""
+    """The effect's relative score and then its rivals with theirs, where they have one; nothing where there is none."""
     told = [percent(e.weight_among_rivals)] if finite(e.weight_among_rivals) else []
     rivals = [(candidate_title(r), r.get("weight")) for r in e.equivalent_to]
     return "; ".join([*told, *(f"{name} {percent(weight)}" if finite(weight) else name for name, weight in rivals)])

@@ -246,3 +246,14 @@ def gap_closed(stages: Mapping[str, Any]) -> float:
 
 def stages_of(d: Diagnosis) -> dict[str, float]:
     return {s: getattr(d.gap, s) for s in STAGES}
+
+
+def between(low: Any, high: Any) -> str:
+    """`96 % – 99.9 %`: the ends of an interval of shares; with more digits where they would look the same."""
+    if not (finite(low) and finite(high)):
+        return ""
+    ends = [percent(low), percent(high)]
+    if ends[0] == ends[1] and low < high:
+        places = 1 - quantities.power(100 * (high - low))
+        ends = [f"{quantities.fixed(100 * end, places)} %" for end in (low, high)]
+    return " – ".join(ends)

@@ -98,7 +98,8 @@ def test_every_effect_its_numbers_and_all_warnings_are_there(page):
 
 
 def test_a_weight_among_rivals_is_told_only_where_there_are_rivals(page):
-    assert page.text.count("weight among rivals") == 1 and "probability" not in page.text.lower()
+    assert page.text.count("relative score among rivals") == 1
+    assert page.text.lower().count("probability") == page.text.count("no probability")
 
 
 def test_hostile_names_stay_text(page):

@@ -36,14 +36,18 @@ LIMITS = Limits()
 
 @dataclass(frozen=True)
 class Layout:
-    """Where the columns stand: ten of each body, the joint's own (OWN), zeros [nv], tilt, late, known, effort."""
+    """Where the columns stand: ten of each body, the joint's own (OWN), zeros [nv], drives, tilt, late, known, effort.
+
+    shared: actuators that drive a joint together with others; each has a column of its own effort.
+    """
 
     bodies: int
     nv: int
+    shared: tuple[int, ...] = ()
 
     @property
     def size(self) -> int:
-        return rigid.INERTIAL * self.bodies + len(OWN) + self.nv + 5
+        return rigid.INERTIAL * self.bodies + len(OWN) + self.nv + len(self.shared) + 5
 
     def body(self, i: int) -> slice:
         return slice(rigid.INERTIAL * i, rigid.INERTIAL * (i + 1))
@@ -53,6 +57,10 @@ class Layout:
 
     def zero(self, dof: int) -> int:
         return rigid.INERTIAL * self.bodies + len(OWN) + dof
+
+    def drive(self, actuator: int) -> int:
+        """Of one of the actuators `shared`."""
+        return rigid.INERTIAL * self.bodies + len(OWN) + self.nv + self.shared.index(actuator)
 
     @property
     def tilt(self) -> slice:
@@ -123,14 +131,26 @@ def asked_of(log: Log, model: mujoco.MjModel) -> Array:
     return channels.forces(own, model)
 
 
+def layout_of(model: mujoco.MjModel) -> Layout:
+    """The columns of a model."""
+    dofs = [dof_of(model, i) for i in range(model.nu)]
+    shared = tuple(i for i, dof in enumerate(dofs) if dof is not None and dofs.count(dof) > 1)
+    return Layout(len(rigid.moving_bodies(model)), model.nv, shared)
+
+
 def measured(log: Log, model: mujoco.MjModel) -> Array:
     """`[T, nv]`, generalised force as the drives measured it; 0 where they did not."""
+    return _on_dofs(measured_of(log, model), model)
+
+
+def measured_of(log: Log, model: mujoco.MjModel) -> Array:
+    """`[T, nu]`, forces of the actuators as they were measured; 0 where they were not."""
     out = np.zeros((len(log), model.nu))
     for i, name in enumerate(log.actuators):
         stream = log.streams.get(f"effort:{name}")
         if stream is not None and np.isfinite(stream).all():
             out[:, i] = stream
-    return _on_dofs(out, model)
+    return out
 
 
 def _on_dofs(force: Array, model: mujoco.MjModel) -> Array:
@@ -150,7 +170,7 @@ def columns(log: Log, model: mujoco.MjModel, source: tuple[str, ...], slow: Arra
     """
     moved = motion(log, model, bandwidth(log))
     frames = rigid.Frames.of(model, moved)
-    layout = Layout(len(frames.bodies), model.nv)
+    layout = layout_of(model)
     x = np.zeros((len(moved.time), model.nv, layout.size))
     body = frames.columns()
     for i in range(layout.bodies):
@@ -169,6 +189,13 @@ def columns(log: Log, model: mujoco.MjModel, source: tuple[str, ...], slow: Arra
         _zeros(x, layout, model, moved)
     x = lowpass(x, moved.step, moved.cutoff)
     x[:, :, layout.effort] = y  # filtered before
+    forces = {"effort": measured_of, "ctrl": lambda log, model: asked_of(centred(log), model)} if layout.shared else {}
+    of = {name: force(log, model) for name, force in forces.items()}
+    for i in layout.shared:
+        v = dof_of(model, i)
+        if v is not None and source[v] in of:
+            own = model.actuator_gear[i, 0] * of[source[v]][:, i]
+            x[:, v, layout.drive(i)] = filtered(own, log, moved)
     x[:, :, layout.late] = np.gradient(y, moved.step, axis=0)
     rows = np.stack([moved.moving(v) & (source[v] != "") for v in range(model.nv)])
     return Columns(x, rows, min(1.0, 2.0 * moved.cutoff * moved.step))

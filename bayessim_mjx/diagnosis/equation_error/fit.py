@@ -39,6 +39,7 @@ class Term:
         effect, where: of the library, or a known parameter (`mass`, `armature`, `damping`).
         shape: its maps into the columns; a scale has none.
         scaled: `[nv]`, joints whose whole effort it scales (neutral 1); None: it adds (neutral 0).
+        rest: `[nv, P]`, effort at these joints that it does not scale, y = rest + k (needed - rest); or None.
         sd: coefficients of the last round (NaN: none yet) -> `[k]` of the priors; inf: none.
         low, high: `[k]`, allowed coefficients; within: further limits.
         read: coefficients -> parameters of the effect.
@@ -54,6 +55,7 @@ class Term:
     high: Array = field(default_factory=lambda: np.array([np.inf]))
     within: Callable[[Array], bool] = lambda c: True
     read: Callable[[Array], Mapping[str, float]] = lambda c: {}
+    rest: Array | None = None
 
     @property
     def label(self) -> str:
@@ -165,24 +167,35 @@ def _model(terms: Sequence[Term], spans: Sequence[slice], values: Array, nominal
     for term, own in zip(terms, spans, strict=True):
         if term.shape is not None:
             inner += term.shape(values[own]) @ values[own]
-    return inner * _scales(terms, spans, values, len(nominal))[:, None]
+    scale = _scales(terms, spans, values, len(nominal))[:, None]
+    return inner * scale + _rest(terms, spans, values, nominal)
+
+
+def _rest(terms: Sequence[Term], spans: Sequence[slice], values: Array, nominal: Array) -> Array:
+    """`[nv, P]`, what of the effort at the same joints comes beside what is scaled."""
+    out = np.zeros_like(nominal)
+    for term, own in zip(terms, spans, strict=True):
+        if term.rest is not None:
+            out += (1.0 - values[own][0]) * term.rest
+    return out
 
 
 def _linearised(
     effort: int, terms: Sequence[Term], spans: Sequence[slice], values: Array, model: Array, nominal: Array
 ) -> tuple[Array, Array]:
     """(columns `[nv, P, K]`, target `[nv, P]`) near the last round's values: scale times sum is not linear."""
-    scale = _scales(terms, spans, values, len(nominal))
+    scale, rest = _scales(terms, spans, values, len(nominal)), _rest(terms, spans, values, nominal)
     design = np.zeros((*nominal.shape, len(values)))
-    target = -nominal * scale[:, None]
+    target = -nominal * scale[:, None] - rest
     target[:, effort] += 1.0
     for term, own in zip(terms, spans, strict=True):
         if term.shape is not None:
             design[:, :, own] = term.shape(values[own]) * scale[:, None, None]
         elif term.scaled is not None:
             # y = k m(p): y - k0 nominal + (k0 m0) = k0 M p + (k / k0) (k0 m0), of the part that this scale acts on
-            design[term.scaled, :, own.start] = model[term.scaled] / values[own][0]
-            target[term.scaled] += model[term.scaled]
+            design[term.scaled, :, own.start] = (model - rest)[term.scaled] / values[own][0]
+            design[:, :, own.start] -= 0.0 if term.rest is None else term.rest
+            target += values[own][0] * design[:, :, own.start]
     return design, target
 
 

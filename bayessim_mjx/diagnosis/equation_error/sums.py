@@ -11,8 +11,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from bayessim_mjx.diagnosis.equation_error.columns import LIMITS, Layout, columns, sources
-from bayessim_mjx.diagnosis.equation_error.rigid import moving_bodies
+from bayessim_mjx.diagnosis.equation_error.columns import LIMITS, Layout, columns, layout_of, sources
 from bayessim_mjx.logs.log import Log
 
 Array = NDArray[np.float64]
@@ -67,7 +66,7 @@ def gather(logs: Sequence[Log], model: mujoco.MjModel) -> Sums:
     """The sums of logs that move; joints whose effort is not known in all of them are left out."""
     each = [sources(log, model) for log in logs]
     source = tuple(_common(s) for s in zip(*each, strict=True))
-    layout = Layout(len(moving_bodies(model)), model.nv)
+    layout = layout_of(model)
     short = _shortened(logs)
     top = np.max([np.percentile(np.abs(log.qvel), 95, axis=0) for log in short], axis=0)
     grams, rows = [], []

@@ -111,7 +111,9 @@ def effects(model: mujoco.MjModel, layout: Layout, source: Sequence[str], carrie
 def _on_actuators(model: mujoco.MjModel, layout: Layout, driven: Sequence[tuple[int, int]]) -> list[Term]:
     out, title = [], element_names(model, "actuator")
     for i, v in driven:
-        out.append(scale("actuator_gain", title[i], np.arange(layout.nv) == v, RANGES.sure))
+        beside = [_one(layout, v, layout.drive(j)) for j, w in driven if w == v and j != i]
+        rest = np.sum(beside, axis=0) if beside else None
+        out.append(scale("actuator_gain", title[i], np.arange(layout.nv) == v, RANGES.sure, rest))
         gear = float(model.actuator_gear[i, 0]) or 1.0
         bias = _one(layout, v, layout.own("one"))
         out.append(_fixed("actuator_bias", title[i], bias, read=_reader("bias", sign=-1.0 / gear)))
@@ -121,16 +123,17 @@ def _on_actuators(model: mujoco.MjModel, layout: Layout, driven: Sequence[tuple[
     return out
 
 
-def scale(effect: str, where: str, on: NDArray[np.bool_], sd: float = np.inf) -> Term:
+def scale(effect: str, where: str, on: NDArray[np.bool_], sd: float = np.inf, rest: Array | None = None) -> Term:
     """The effort that was logged times `gain` is what acts, so the logged one is the needed one over `gain`.
 
     Args:
         sd: of 1 / gain about 1, as far as that is known beforehand.
+        rest: `[nv, P]`, the effort of other drives at the same joint, which acts as it was logged; None: there is none.
     """
     low, high = 1.0 / RANGES.gain[1], 1.0 / RANGES.gain[0]
     read: Callable[[Array], Mapping[str, float]] = lambda c: {"gain": 1.0 / float(c[0])}  # noqa: E731
     believed, lowest, highest = np.array([sd]), np.array([low]), np.array([high])
-    return Term(effect, where, None, scaled=on, sd=lambda c: believed, low=lowest, high=highest, read=read)
+    return Term(effect, where, None, scaled=on, sd=lambda c: believed, low=lowest, high=highest, read=read, rest=rest)
 
 
 def payloads(model: mujoco.MjModel, layout: Layout, carried: Array) -> list[Term]:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bayessim_mjx.diagnosis.fitting import windows
+from bayessim_mjx.effects.support.motion import AROUND
 from bayessim_mjx.logs.log import Log
 from bayessim_mjx.physics import Physics
 
@@ -86,12 +87,19 @@ def windows_of(
 
 def most_windows(physics: Physics, length: int, quick: bool = False) -> int:
     """Most windows of so many control steps that are simulated at once."""
-    if quick:
-        return CUTTING.fewest
     nv = physics.mj_model.nv
     budget = CUTTING.budget if nv <= CUTTING.many else CUTTING.budget // 2
-    limit = next(n for dofs, n in CUTTING.limits if nv <= dofs)
-    return min(limit, max(CUTTING.fewest, budget // (length * physics.substeps)))
+    return min(at_most(nv, quick), max(CUTTING.fewest, budget // (length * physics.substeps)))
+
+
+def at_most(nv: int, quick: bool = False) -> int:
+    """Windows of a robot of so many degrees of freedom, whatever its time step."""
+    return CUTTING.fewest if quick else next(n for dofs, n in CUTTING.limits if nv <= dofs)
+
+
+def seconds_of(nv: int, quick: bool = False) -> float:
+    """s that all windows of such a robot hold together, with what effects remember before each."""
+    return at_most(nv, quick) * (CUTTING.window + AROUND)
 
 
 def finest(physics: Physics, count: int, length: int, share: float = 1.0) -> int:

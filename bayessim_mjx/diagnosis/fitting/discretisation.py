@@ -39,6 +39,7 @@ class Rules:
     # errors that shrink by less from one sub-step to its half are not worth finer ones
     converging: float = 1.3
     sure: float = 0.4  # of what is taken for noise: below, the estimates themselves are too coarse
+    moving: int = 20  # rows in which a position changes, with fewer nothing tells whether it shows noise
     far: float = 4.0  # medians: windows with larger errors are no measure, as in the fit
 
 
@@ -276,11 +277,24 @@ def contacts(physics: Physics) -> bool:
 
 
 def noise_free(logs: Sequence[Log], column: int) -> bool:
-    """Whether a position shows no noise: of white noise all differences have the same level, smooth motion has none."""
-    shares = [_level(log.qpos[:, column], 8) / max(_level(log.qpos[:, column], 4), 1e-300) for log in logs]
-    return bool(np.median(shares) < 0.1)
+    """Whether a position shows no noise: of white noise all differences have the same level, smooth motion has none.
+
+    Rows of rest say nothing: an encoder without dither shows one value there, and so does a simulation.
+    """
+    shares = [s for log in logs if (s := _smooth(log.qpos[:, column])) is not None]
+    return bool(shares) and bool(np.median(shares) < 0.1)
 
 
-def _level(x: Array, order: int) -> float:
+def _smooth(x: Array) -> float | None:
+    """Level of the eighth differences of x [T] in that of the fourth ones, where x moves; None: it hardly does."""
+    if len(x) <= RULES.moving + 8:
+        return None
+    changing = np.asarray(np.lib.stride_tricks.sliding_window_view(np.diff(x) != 0, 8).any(1))
+    if changing.sum() < RULES.moving:
+        return None
+    return _level(x, 8, changing) / max(_level(x, 4, changing), 1e-300)
+
+
+def _level(x: Array, order: int, rows: NDArray[np.bool_]) -> float:
     """Standard deviation of white noise in x [T] by differences of an order: Var = binomial(2 n, n) sigma^2."""
-    return float(np.median(np.abs(np.diff(x, order))) / np.sqrt(comb(2 * order, order))) if len(x) > order else 0.0
+    return float(np.median(np.abs(np.diff(x, order)[: len(rows)][rows])) / np.sqrt(comb(2 * order, order)))

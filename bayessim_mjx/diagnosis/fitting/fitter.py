@@ -42,6 +42,7 @@ class Fitter:
         self.used = np.isfinite(sigma)
         self.sigma = sigma[self.used]
         self.spread = windows.spread
+        self.measured = windows.measured / windows.measured.mean()  # by which windows weigh, one on average
         self.size = windows.steps * int(self.used.sum())
         joints = int((np.isfinite(windows.sigma_q) | np.isfinite(windows.sigma_v)).sum())
         self.numbers = float(NUMBERS * len(windows) * joints)
@@ -105,7 +106,7 @@ class Fitter:
         offsets = np.repeat(fit.offsets[None], 1 + len(thetas), 0)
         r = self.whiten(self.simulator.run(np.stack([theta, *thetas]), offsets))
         B = self.start_columns(theta, fit.offsets, r[0])
-        new = replace(fit, r=r[0], A=quadratic.columns(r[0], r[1:], steps), B=B, weight=weights(r[0]))
+        new = replace(fit, r=r[0], A=quadratic.columns(r[0], r[1:], steps), B=B, weight=weights(r[0]) * self.measured)
         new = replace(new, doubt=self._doubt(self._data(new, new.r, new.offsets)))
         return replace(new, cost=self.cost(new, new.r, new.offsets, new.values))
 

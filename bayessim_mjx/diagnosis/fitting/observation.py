@@ -35,6 +35,7 @@ class Rules:
         shares: of typical accelerations, that the model may lack; the most likely one of each log is taken.
         passes: smoothed start states are filtered from again.
         second: s, in which a start state has to show; told: of its standard deviation that may be left after that.
+        most: share of the logs, from which on all of them is filtered.
         least: rad, rad/s, as precise as the model is taken to be.
     """
 
@@ -44,10 +45,31 @@ class Rules:
     passes: int = 2
     second: float = 0.5
     told: float = 0.5
+    most: float = 0.8
     least: float = 1e-6
 
 
 RULES = Rules()
+
+
+def shortened(logs: Sequence[Log], seconds: float) -> tuple[tuple[Log, ...], list[str]]:
+    """Logs that lack a joint's motion, cut to the beginnings that hold so many seconds together; and what that leaves.
+
+    To find that motion takes milliseconds a row, and it is tracked from a log's first row on: where a joint is amid a
+    log nothing tells. So of long logs their beginnings are filtered, each of its share.
+    """
+    share = seconds / max(sum(log.duration for log in logs), 1e-9)
+    out, left = [], []
+    for log in logs:
+        stop = int(np.searchsorted(log.time, log.time[0] + share * log.duration, side="right"))
+        short = share < RULES.most and bool(log.lost)
+        out.append(log.cut(0, stop) if short else log)
+        left += [f"{log.name} the first {out[-1].duration:.3g} of {log.duration:.3g} s"] if short else []
+    if not left:
+        return tuple(out), []
+    more = f" and of {len(left) - 3} more logs their beginnings" if len(left) > 3 else ""
+    text = f"not every joint was measured: of {', of '.join(left[:3])}{more} are used, which hold all windows"
+    return tuple(out), [text]
 
 
 def completed(logs: Sequence[Log], model: mujoco.MjModel) -> tuple[Log, ...]:

@@ -12,6 +12,8 @@ import numpy as np
 from flax import struct
 from numpy.typing import NDArray
 
+from bayessim_mjx.diagnosis.fitting.operating import group_notes, groups_of
+from bayessim_mjx.diagnosis.fitting.sensors import noise_of
 from bayessim_mjx.effects.support.motion import AROUND, Motion
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.commands import means
@@ -54,7 +56,9 @@ class Windows:
         spread: `[2 nv]`, standard deviation of the measured start state.
         logs: the resampled logs.
         dt: control period, s.
+        periods: s between the rows of each log as it was recorded.
         notes: what else is held out than was asked for.
+        blocks: whether there is one operating condition only, and `group` is blocks of it in time.
     """
 
     batch: Batch
@@ -67,7 +71,9 @@ class Windows:
     spread: Array
     logs: tuple[Log, ...]
     dt: float
+    periods: tuple[float, ...] = ()
     notes: tuple[str, ...] = ()
+    blocks: bool = False
 
     def __len__(self) -> int:
         return len(self.log)
@@ -76,49 +82,25 @@ class Windows:
     def steps(self) -> int:
         return int(self.batch.command.shape[1])
 
+    @property
+    def conditions(self) -> int:
+        """How many operating conditions there are: one log is one, in however many blocks it is held out."""
+        return 1 if self.blocks else len(self.groups)
+
+    @property
+    def condition(self) -> NDArray[np.int64]:
+        """`[W]`, operating condition, for what is said of conditions; `group` is what is held out together."""
+        return np.zeros_like(self.group) if self.blocks else self.group
+
+    @property
+    def measured(self) -> Array:
+        """`[W]`, share of the rows compared that were measured; what lies between two rows of a log tells no more."""
+        return np.minimum(1.0, self.dt / np.array(self.periods)[self.log])
+
     def alike(self, other: Windows) -> bool:
         """Whether these are the same parts of the logs."""
         parts = [(own.log.tolist(), own.start.tolist(), own.steps) for own in (self, other)]
         return parts[0] == parts[1]
-
-
-def groups_of(logs: Sequence[Log], key: str | None = None) -> tuple[list[int], tuple[str, ...]]:
-    """Operating condition of each log: metadata `key`, else `condition` or `operating_condition`, else one per log.
-
-    Raises:
-        UserError: the key that was asked for is in no log's metadata.
-    """
-    labels = _labels(logs, key)
-    if key and not any(labels):
-        have = ", ".join(sorted({k for log in logs for k in log.metadata})) or "no keys"
-        raise UserError(f"--group {key}: no log's metadata has this key; there are: {have}")
-    told = len(set(labels)) > 1  # the same condition everywhere cannot be held out
-    labels = [label if label and told else log.name for label, log in zip(labels, logs, strict=True)]
-    names = tuple(dict.fromkeys(labels))
-    return [names.index(label) for label in labels], names
-
-
-def _labels(logs: Sequence[Log], key: str | None) -> list[str]:
-    """Each log's condition, "" where its metadata do not tell."""
-    found = [
-        log.metadata.get(key) if key else log.metadata.get("condition", log.metadata.get("operating_condition"))
-        for log in logs
-    ]
-    return ["" if value is None else str(value) for value in found]
-
-
-def group_notes(logs: Sequence[Log], key: str | None) -> tuple[str, ...]:
-    """What is held out in place of the conditions that were asked for, where these cannot be."""
-    labels = _labels(logs, key)
-    if not key or not any(labels):
-        return ()
-    without = [log.name for log, label in zip(logs, labels, strict=True) if not label]
-    if without:
-        return (f"--group {key}: {', '.join(without)} without this key: each is held out as a condition of its own",)
-    if len(set(labels)) > 1:
-        return ()
-    instead = "single logs" if len(logs) > 1 else "blocks of the only log in time"
-    return (f"--group {key}: {labels[0]!r} in all logs, so nothing can be held out by it; {instead} are held out",)
 
 
 def cut(
@@ -156,11 +138,11 @@ def cut(
         raise UserError(
             f"no log holds {length} control steps of {dt:.4g} s; the longest has {longest}; allowed: longer logs"
         )
-    if len(names) == 1:  # one condition only: blocks in time stand in for conditions
+    if blocks := len(names) == 1:  # one condition only: blocks in time are held out
         names, group_of_window = _blocks(starts, even)
     else:
         group_of_window = [group_of[r] for r, _ in starts]
-    sigma_q, sigma_v, spread = _noise(even, model, use_qvel and all(log.has_qvel for log in logs))
+    sigma_q, sigma_v, spread = noise_of(even, logs, use_qvel and all(log.has_qvel for log in logs))
     return Windows(
         batch=_batch(even, fine, starts, length, dt, model, controllers.of_logs(logs, model)),
         log=np.asarray([r for r, _ in starts]),
@@ -172,7 +154,9 @@ def cut(
         spread=spread,
         logs=tuple(even),
         dt=dt,
+        periods=tuple(log.period for log in logs),
         notes=group_notes(logs, group),
+        blocks=blocks,
     )
 
 
@@ -271,24 +255,6 @@ def _enabled(even: Sequence[Log], starts: list[tuple[int, int]], length: int, mo
                 rows[:, even[r].actuators.index(name.split(":", 1)[1])] = on
         out.append(rows)
     return _stack(out)
-
-
-def _noise(logs: Sequence[Log], model: mujoco.MjModel, use_qvel: bool) -> tuple[Array, Array, Array]:
-    """(sigma_q [nv], sigma_v [nv], spread of the start [2 nv]), pooled over logs."""
-    dofs = np.sqrt(np.mean([log.sigma_dofs**2 for log in logs], axis=0))
-    motion = np.sqrt(np.mean([np.mean(log.qvel**2, axis=0) for log in logs], axis=0))
-    travel = np.maximum(motion * 0.05, 1e-9)
-    sigma_q = np.maximum(dofs, 1e-5 * travel)  # data without noise: the simulator's own precision
-    rate = np.sqrt(np.mean([log.sigma_qvel**2 for log in logs], axis=0))
-    sigma_v = np.maximum(rate, 1e-3 * motion) if use_qvel else np.full(model.nv, np.inf)
-    start_v = np.maximum(3 * rate, 0.1 * motion + 10 * sigma_q)
-    if not any(log.absent for log in logs):
-        return sigma_q, sigma_v, np.concatenate([3 * sigma_q, start_v])
-    seen, fast = (np.all([getattr(log, k) for log in logs], axis=0) for k in ("seen_dofs", "seen_speeds"))
-    kept = fast & (use_qvel | ~seen)  # the only measurement of a joint is compared in any case
-    sigma_v = np.where(kept, np.maximum(rate, 1e-3 * motion), np.inf)
-    start_v = np.where(seen, start_v, 3 * rate + 0.1 * motion)  # what is guessed is not tied to its position's guess
-    return np.where(seen, sigma_q, np.inf), sigma_v, np.concatenate([3 * sigma_q, start_v])
 
 
 def _stack(parts: list) -> jax.Array:

@@ -8,13 +8,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 from scipy.optimize import nnls
 
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Array, Log
 from bayessim_mjx.logs.resample import resample
+from bayessim_mjx.logs.signals import noise_level
 
+# values that a channel has to show before its noise can be told: of two, nothing says whether they are one count apart
+LEVELS = 3
 _REST = 25  # rows of a window that is looked at for rest
 _PROCESS, _BIAS = (1.0, 3.0), (2.0, 4.0)  # powers of the horizon: a random walk and its integral; a rate and a force
 
@@ -92,6 +96,36 @@ def _sensor(log: Log, stream: str) -> Array:
         return own
     rest = [rest_spread(x) for x in values.T]
     return np.where(known, own, np.maximum(own, rest))
+
+
+def told(log: Log, stream: str = "qpos") -> NDArray[np.bool_]:
+    """`[nv]`: whether a log tells the noise of its positions, or of its velocities (`stream` qvel).
+
+    A channel that shows fewer than `LEVELS` values tells none: it may have any resolution. What is stated wins: `sigma`
+    or `quantum` of the metadata, or a standard deviation above what the values themselves show. Of several columns
+    (an orientation) one is enough. A velocity that was not measured is not judged.
+    """
+    if stream == "qvel" and not log.has_qvel:
+        return np.ones(len(log.channels.qvel), bool)
+    given = {**(log.metadata.get("sigma") or {}), **(log.metadata.get("quantum") or {})}
+    names, sigma = getattr(log.channels, stream), getattr(log, f"sigma_{stream}")
+    stated = [f"{stream}:{n}" in given or (stream == "qpos" and n in given) for n in names]
+    rows = zip(stated, getattr(log, stream).T, sigma, strict=True)
+    own = [known or _levels(x) >= LEVELS or s > 1.01 * noise_level(x) for known, x, s in rows]
+    if stream == "qvel":
+        return np.array(own, bool)
+    out: list[bool] = []
+    for joint, kind in zip(log.joints, log.channels.kinds, strict=True):
+        of = own[log.channels.columns(joint)]
+        moved = of[: {"free": 3, "ball": 0}.get(kind, 1)]
+        out += [*moved, *[any(of[-4:])] * (3 if kind in ("free", "ball") else 0)]
+    return np.array(out, bool)
+
+
+def _levels(x: Array) -> int:
+    """Different values in x [T], up to ten roundings of the single precision in which they are simulated."""
+    span, grain = float(np.ptp(x)), 10.0 * float(np.finfo(np.float32).eps) * max(1.0, float(np.abs(x).max()))
+    return len(np.unique(np.round((x - x.min()) / max(1e-9 * span, grain))))
 
 
 def rest_spread(x: Array) -> float:

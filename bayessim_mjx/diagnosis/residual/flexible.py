@@ -41,8 +41,9 @@ class Held:
     """Held-out costs under one way of splitting.
 
     Attributes:
-        cost: `[W]`, of the median seed with the best ridge, unweighted; base: `[W]`, of the model without the force.
-        totals: `[seeds, ridges]`; ridge, seed: the one in `cost`.
+        cost: `[W]`, of the median seed, unweighted, each fold's with the ridge that is best on the others; base: `[W]`,
+            of the model without the force.
+        totals: `[seeds, ridges]`; ridge: best on all folds; seed: the one in `cost`.
         gain, se: how much cheaper all windows together are, and its standard error over folds.
         t: of the windows' log gain above the noise by folds, as a normal deviate; unlike the gain itself
             it is not ruled by the conditions with the largest errors.
@@ -133,13 +134,23 @@ def _held(problem: Regression, runs: dict[int, Seeded], fold: NDArray[np.int64],
     median = np.median(totals, 0)
     at = int(np.argmin(median))
     seed = int(np.argsort(totals[:, at])[(len(runs) - 1) // 2])
-    base, cost = problem.base(fold), costs[seed, at]
+    base, cost = problem.base(fold), _chosen_without(costs, seed, fold)
     plain = float(ridges[_widest(median, base.sum())])
     by_fold = np.array([np.sum((base - cost)[fold == name]) for name in np.unique(fold)])
     se = float(np.sqrt(len(by_fold)) * np.std(by_fold, ddof=1)) if len(by_fold) > 1 else np.inf
     size = problem.fitter.size
     t = normal_deviate(np.log(np.maximum(base, 0) + size) - np.log(np.maximum(cost, 0) + size), fold)
     return Held(cost, base, totals, float(ridges[at]), list(runs)[seed], plain, float(by_fold.sum()), se, t)
+
+
+def _chosen_without(costs: Array, seed: int, fold: NDArray[np.int64]) -> Array:
+    """Costs `[W]` of one seed, those of each fold with the ridge that is best on all others."""
+    out = np.empty(len(fold))
+    for name in np.unique(fold):
+        own = fold == name
+        rest = ~own if not own.all() else own
+        out[own] = costs[seed, int(np.argmin(np.median(costs[:, :, rest].sum(2), 0))), own]
+    return out
 
 
 def _widest(totals: Array, base: float) -> int:

@@ -33,7 +33,7 @@ def structural(tried: Tried, model: Model) -> dict[str, str]:
         p = float(stats.chi2.sf(z2, groups - 1)) * base
         spread = float(np.std(each[:, i]))
         if p < 1e-3 and spread > 0.05 * (c.high - c.low) and c.name not in out:
-            out[c.name] = phrases.moves(spread, groups)
+            out[c.name] = phrases.moves(spread, groups, tried.fitter.simulator.windows.blocks)
     return out
 
 

@@ -252,9 +252,10 @@ def chosen_elsewhere(table: Table, less: Order, criteria: Criteria) -> dict[int,
 
 
 def closed_elsewhere(table: Table, chosen: Mapping[int, Key]) -> float:
-    """Share of the squared gap closed on operating conditions that had no part in the decision, at most 1.
+    """Share of the squared gap closed on operating conditions that the decision was made without, at most 1.
 
-    What the other conditions choose (`chosen_elsewhere`) is scored on each. A share much below that of the answer means
+    What the other conditions choose (`chosen_elsewhere`) is scored on each; the costs that they choose by are of fits
+    that had seen it, so the share is a little too high. A share much below that of the answer means
     that the answer was chosen for what it does by chance. NaN of one condition, and where there is no gap.
     """
     above = table.rows[BASE].total - table.noise * len(table.group)

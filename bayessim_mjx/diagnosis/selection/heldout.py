@@ -26,6 +26,7 @@ class Rules:
     rest: float = 0.005  # nats: what a further step has to promise; not counted
     within: float = 1.02  # of the common fit's cost: the most that such a fit leaves of the same windows
     grid: int = 400  # shares looked at
+    finest: float = 0.01  # of the noise: what a share may leave of the gap where it is looked at most finely
 
 
 RULES = Rules()
@@ -212,22 +213,29 @@ class Closed:
 
         A share s is kept where what is left, E1, could be what it says, (1 - s) E0 + s: where the logarithm of their
         ratio is no more standard errors off 0 than Student's t allows. That holds near the noise, where E1 - 1 has no
-        logarithm, and near 0 alike. As many conditions count as rule the one or the other, whichever are fewer.
+        logarithm, and near 0 alike. As many conditions count as rule the one or the other, whichever are fewer. What
+        undercuts the noise shows by how much the noise was taken for too large: that error of the floor counts too.
         """
         rows = statistics.leave_one_out(self.group)
         if len(rows) < 2:
             return statistics.NOTHING
-        shares = np.concatenate([1.0 - np.geomspace(2.0, 1e-4, RULES.grid), [1.0]])[:, None]
+        every, value = np.ones((1, len(self.before))), self.value
+        before, _, noise = (float(x[0]) for x in self._sums(every))
+        finest = min(1e-4, RULES.finest * noise / max(before, noise))
+        far_off, near = np.geomspace(2.0, finest, RULES.grid), np.geomspace(1e-9, 0.1, RULES.grid // 2)
+        near = (1.0 - value) * (1.0 + np.concatenate([-near, near]))  # where errors are small
+        shares = np.clip(1.0 - np.sort(np.concatenate([far_off, near, [0.0]]))[::-1], -1.0, 1.0)[:, None]
+        off = max(1.0 - float(self.after.sum()) / noise, 0.0)  # of the floor
 
         def both(rows: Array) -> tuple[Array, Array]:
             before, left, noise = self._sums(rows)
             return np.maximum(left, 1e-9), np.maximum((1 - shares) * before + shares * noise, 1e-9)
 
-        (left, said), (left_without, said_without) = both(np.ones((1, len(self.before)))), both(rows)
+        (left, said), (left_without, said_without) = both(every), both(rows)
         counting = [np.maximum(left - left_without, 0.0)[:, None], np.maximum(said - said_without, 0.0).T]
         freedom = np.minimum(*(statistics.freedom(own, statistics.LEVELS.ruled) for own in counting))
-        allowed = statistics.quantile(freedom) * statistics.error(np.log(left_without / said_without).T)
+        error = statistics.error(np.log(left_without / said_without).T)
+        allowed = statistics.quantile(freedom) * np.hypot(error, off * shares[:, 0] * noise / said[:, 0])
         far = np.log(left / said)
         kept = shares[:, 0][np.abs(far[:, 0]) <= allowed]
-        value = self.value
         return float(min([*kept[:1], value])), float(max([*kept[-1:], value]))

@@ -59,7 +59,7 @@ class Selection(Tried):
         promised: share of the base model's gap that its effects promised to close before any was fitted, {label: part}.
         along: what was simulated along its weak directions.
         chosen: {operating condition: effects that are named without it}.
-        elsewhere: share of the gap closed on operating conditions that had no part in the choice; NaN of one condition.
+        elsewhere: share of the gap closed on conditions that the choice was made without; NaN of one condition.
         hidden: labels of effects that would not show beside those of the answer (`selection.hidden`).
     """
 

@@ -25,7 +25,7 @@ class Spread:
     Attributes:
         formal: `[k, k]`, inflated by the misfit and by the residuals' correlation, with what is not known of the data
             sheet's accuracy: where no accuracy is inferred, the Laplace covariance.
-        between: `[k, k]`, jackknife over operating conditions.
+        between: `[k, k]`, jackknife over operating conditions; of one log's blocks, of a single one of them.
         freedom: `[k]`, degrees of freedom of `between`: conditions that tell the parameter, less one.
     """
 
@@ -43,7 +43,11 @@ def spread(fitter: Fitter, model: Model, along: Ridges | None = None) -> Spread:
     group = fitter.simulator.windows.group
     told = [covariance @ q.weighted(model.fit.weight * (group == n))[1] @ covariance for n in np.unique(group)]
     share = np.diagonal(told, axis1=1, axis2=2)  # of the parameter's variance, by the condition it comes from
-    return Spread(np.asarray(formal), statistics.covariance(model.estimates), statistics.freedom(share))
+    between, freedom = statistics.covariance(model.estimates), statistics.freedom(share)
+    if fitter.simulator.windows.blocks:  # blocks of one log err alike: they are no more than one block tells
+        alike = np.sqrt(freedom + 1.0)
+        between = between * alike[:, None] * alike
+    return Spread(np.asarray(formal), between, freedom)
 
 
 def accuracies(fitter: Fitter, model: Model, along: Ridges | None = None) -> accuracy.Posterior | None:

@@ -67,7 +67,7 @@ def diagnosis_of(found: Findings, about: Mapping[str, Any] | None = None, file: 
     notes = [*setup.warnings, *steps, *(over.notes if over else ()), *(horizon_warning(far) if effects else [])]
     more = {"maps": where.found.maps, "frequency": [heard.details() for heard in where.spectra]} if where else {}
     lies = [*located_in_words(where.found), *spectra_in_words(where.spectra)] if where else []
-    rivals = black_boxes_in_words(found.part(BlackBoxes))
+    rivals = black_boxes_in_words(found.part(BlackBoxes), setup.fitter.simulator.windows.blocks)
     return Diagnosis(
         verdict=verdict.name,
         sentences=[*filter(None, [*told, left_out.not_tried(selection)]), *rivals, *lies],
@@ -82,7 +82,7 @@ def diagnosis_of(found: Findings, about: Mapping[str, Any] | None = None, file: 
         details=details(found, effects, closed) | more | ({"experiments": proposal.details()} if proposal else {}),
         covariance={"names": list(model.fit.names), "matrix": together},
         not_fitted=left_out.not_fitted(selection),
-        about={**about, "conditions": len(setup.fitter.simulator.windows.groups)} if about else {},
+        about={**about, "conditions": setup.fitter.simulator.windows.conditions} if about else {},
         chance=odds,
         hidden=list(selection.hidden),
         accuracy=_accuracy(model, sheet),
@@ -143,7 +143,7 @@ def _less_accurate(model: Model, sheet: Posterior | None) -> list[str]:
 
 def ranking(tried: Tried) -> list[dict[str, Any]]:
     """Models tried, best first: held-out score, nats over the known parameters alone, and its standard error."""
-    rows = statistics.leave_one_out(tried.fitter.simulator.windows.group)
+    rows = statistics.leave_one_out(tried.fitter.simulator.windows.condition)
     absorbed = {s.candidate.label: s.absorbed for s in tried.screened}
     out: list[dict[str, Any]] = []
     rows_of = ranked(tried)[:60]
@@ -177,7 +177,7 @@ def _where(found: Findings) -> list[Place]:
     total = costs.sum()
     if total <= 0.1 * costs.size:
         return []
-    ends = statistics.interval_of_shares(costs, cut.group)
+    ends = statistics.interval_of_shares(costs, cut.condition)
     out = [Place(n, float(costs[:, i].sum() / total), ends[i], "") for i, n in enumerate(names)]
     return sorted(out, key=lambda p: -p.share)
 

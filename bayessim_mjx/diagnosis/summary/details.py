@@ -75,7 +75,7 @@ def _flexible(found: Findings) -> dict[str, Any]:
     seeds = np.sqrt(np.maximum(shown.condition.totals.min(1), 0.0) / shown.force.shape[0])
     return {
         "depends_on": [{"input": d["input"], "importance": d["importance"]} for d in shown.depends_on],
-        "where": flexible_in_words(shown),
+        "where": flexible_in_words(shown, found.setup.fitter.simulator.windows.blocks),
         "seeds": [s / np.sqrt(size) for s in seeds.tolist()],
         "rms_on_base": levels[0],
         "rms_on_winner": levels[1],
@@ -135,7 +135,10 @@ def _episodes(found: Findings) -> list[dict[str, Any]]:
     for r, log in enumerate(cut.logs):
         own = cut.log == r
         if own.any():
-            row: dict[str, Any] = {"log": log.name, "condition": cut.groups[int(cut.group[own][0])]}
+            row: dict[str, Any] = {
+                "log": log.name,
+                "condition": log.name if cut.blocks else cut.groups[int(cut.group[own][0])],
+            }
             row |= {k: float(np.sqrt(p.cost(cut.steps)[own].mean())) for k, p in found.predictions.items()}
             out.append(row)
     return out

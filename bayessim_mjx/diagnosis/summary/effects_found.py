@@ -1,4 +1,4 @@
-"""Numbers of the named effects: estimates, weight among rivals, what each closes, as promised and as realised."""
+"""Numbers of the named effects: estimates, scores among rivals, what each closes, as promised and as realised."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from bayessim_mjx.diagnosis.selection import bounds, heldout, predicted_gain, un
 from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.setup import Setup
 
-# operating conditions, from which on closure is quoted of those that had no part in the choice: without one of two, a
-# single one is left to choose by, which tells no standard error over conditions
+# operating conditions, from which on closure is quoted of conditions that the choice was made without: without one of
+# two, a single one is left to choose by, which tells no standard error over conditions
 LEAST = 3
 UNKNOWN = 0.5  # of its range, a standard deviation from which on logs tell nothing of a parameter
 UNTOLD = "is told by nothing in these logs"
@@ -65,11 +65,12 @@ def closed_by(found: Findings) -> dict[str, Any]:
         return {}
     closed, (total, each) = _closed(found), found.selection.promised
     own = {"predicted": total, "realised": closed.value, "ci": closed.interval(), "each": each}
-    return own | {"elsewhere": found.selection.elsewhere, "nested": nested(found)}
+    elsewhere = found.selection.elsewhere if nested(found) else float("nan")
+    return own | {"elsewhere": elsewhere, "nested": nested(found)}
 
 
 def _closed(found: Findings) -> heldout.Closed:
-    """On conditions that had no part in the fit; of three and more (`nested`) none in the choice of effects either.
+    """On conditions that had no part in the fit; of three and more (`nested`) the choice was made without them too.
 
     Where the other conditions choose something else, that is what counts of a condition, as the search scored it.
     """
@@ -80,12 +81,15 @@ def _closed(found: Findings) -> heldout.Closed:
         if chosen != answer and selection.searched is not None:
             own, rows = cut.group == condition, selection.searched.rows
             after[own] = before[own] * rows[chosen].cost[own] / rows[frozenset()].cost[own]
-    return heldout.Closed(before, after, cut.group)
+    return heldout.Closed(before, after, cut.condition)
 
 
 def nested(found: Findings) -> bool:
-    """Whether there are conditions enough to choose without one: of two, the other alone tells no standard error."""
-    return len(found.selection.chosen) >= LEAST
+    """Whether there are conditions enough to choose without one: of two, the other alone tells no standard error.
+
+    The costs behind such a choice are of fits that had seen the condition: it is not free of it altogether.
+    """
+    return min(len(found.selection.chosen), found.setup.fitter.simulator.windows.conditions) >= LEAST
 
 
 def _effect(found: Findings, effect: Candidate, sd: np.ndarray, part: _Part) -> FoundEffect:
@@ -123,7 +127,7 @@ def _sentence(clauses: list[str]) -> str:
 
 
 def _weights(found: Findings, models: list[Model]) -> list[float]:
-    """Weights of a model and its rivals; NaN of one that has none."""
+    """Relative scores of a model and its rivals, no probabilities of being right; NaN of one that has none."""
     if len(models) < 2:
         return [float("nan")]
     group, rng = found.setup.fitter.simulator.windows.group, np.random.default_rng(found.setup.seed)

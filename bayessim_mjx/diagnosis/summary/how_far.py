@@ -28,7 +28,7 @@ def measured(found: Findings, closed: dict[str, Any]) -> Gap:
     short, still = max(1, min(round(SHORT / cut.dt), cut.steps // 2)), coasting(cut, setup.robot.mj_model)
     rows = []
     for steps in (short, cut.steps):
-        row = heldout.stages({k: p.cost(steps) for k, p in predictions.items()}, cut.group)
+        row = heldout.stages({k: p.cost(steps) for k, p in predictions.items()}, cut.condition)
         row |= _floor(again, steps, row)
         each = {s: by_joint(p, steps, allowed) for s, p in predictions.items()}
         seconds = steps * cut.dt
@@ -50,7 +50,8 @@ def measured(found: Findings, closed: dict[str, Any]) -> Gap:
         beyond=[n for n, own in physical.items() if own["beyond"]],
         closed=closed,
         integrator=setup.discretisation.to_dict() if setup.discretisation else {},
-        coasting=heldout.stages({"coasting": still.cost(cut.steps)}, cut.group)["coasting"],
+        coasting=heldout.stages({"coasting": still.cost(cut.steps)}, cut.condition)["coasting"],
+        in_sample=cut.blocks,
     )
 
 
@@ -64,7 +65,7 @@ def with_whole(far: Gap, over: whole_logs.Whole, allowed: Tolerance) -> Gap:
     row |= _level(level, (level, level), row, "start")
     each = {s: np.sqrt(c.mean(0)) * allowed.noise for s, c in over.by_channel.items()}
     longest = {"name": over.name, "seconds": over.seconds, **row, **_physical(each, allowed)}
-    longest |= {"over_likely": over.over_likely}
+    longest |= {"over_likely": over.over_likely, "in_sample": over.in_sample}
     return replace(far, horizons=[*far.horizons, longest])
 
 

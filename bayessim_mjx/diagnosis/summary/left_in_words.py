@@ -32,9 +32,11 @@ class Rules:
 RULES = Rules()
 
 
-def flexible_in_words(found: Flexible) -> list[str]:
+def flexible_in_words(found: Flexible, one_log: bool = False) -> list[str]:
     """How much of what is left a flexible force removes, where it acts, and what it depends on."""
-    held = {"other operating conditions": found.condition, "the same conditions at other times": found.interpolation}
+    others = ("other parts of the log", "the same parts at other times")
+    names = others if one_log else ("other operating conditions", "the same conditions at other times")
+    held = dict(zip(names, (found.condition, found.interpolation), strict=True))
     if not any(h.significant for h in held.values()):
         return ["a flexible force finds nothing more that would hold on data not used for fitting"]
     if all(float(h.base.mean()) < RULES.quiet * found.samples for h in held.values()):
@@ -59,11 +61,14 @@ def not_on_offer(tried: Iterable[str]) -> str:
     return f"Not tried, as they were not named: {nouns} (--effects all,{','.join(names)})."
 
 
-def black_boxes_in_words(found: BlackBoxes | None) -> list[str]:
+def black_boxes_in_words(found: BlackBoxes | None, one_log: bool = False) -> list[str]:
     """What black boxes close of the gap beside the named effects; nothing where they were not tried."""
     if found is None:
         return []
-    text = f"On conditions held out a small network that knows nothing of physics closes {_closes(found.network)} of"
+    text = (
+        f"On {'parts of the log' if one_log else 'conditions'} held out a small network that knows nothing of physics"
+    )
+    text += f" closes {_closes(found.network)} of"
     text += f" the squared gap, {_formula(found)} {_closes(found.formula)}"
     return [f"{text}, the named effects {_closes(found.named)}." if found.named == found.named else f"{text}."]
 

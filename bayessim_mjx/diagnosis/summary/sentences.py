@@ -13,6 +13,30 @@ from bayessim_mjx.diagnosis.result import FoundEffect, Gap
 from bayessim_mjx.diagnosis.selection.selected import Rival
 from bayessim_mjx.diagnosis.summary import first_look
 from bayessim_mjx.diagnosis.summary.left_in_words import flexible_in_words
+from bayessim_mjx.diagnosis.summary.texts import (
+    BEATEN,
+    BENT,
+    BUILDS_UP,
+    BY_CHANCE,
+    CHANCE,
+    COASTS,
+    COASTS_CLOSED,
+    ELSEWHERE,
+    FALLS,
+    FAR,
+    HEADS,
+    HIDDEN,
+    IMPERFECT,
+    IN_SAMPLE,
+    NEAREST,
+    NESTED,
+    OF_SENSORS,
+    ON_TOP,
+    PARTLY,
+    REST,
+    STUCK,
+    WITHIN,
+)
 from bayessim_mjx.diagnosis.summary.verdict import Verdict
 from bayessim_mjx.diagnosis.vocabulary import by_law, listed, missing
 from bayessim_mjx.quantities import extent, percent
@@ -28,73 +52,6 @@ class Limits:
 
 
 LIMITS = Limits()
-HEADS = {
-    "no_gap": "No gap above the noise: the logs differ from the simulator by {nominal}.",
-    "parameters": "Only parameters are off, as far as these logs tell: recalibrated, the gap falls from {nominal} to "
-    "{calibrated}.",
-    "more": "The parameters are off: recalibrated, the gap falls from {nominal} to {calibrated}. That is more than the "
-    "noise, but too little for these logs to tell what is missing.",
-    "noise": "The noise is larger than estimated: what the recalibrated simulator leaves, {calibrated}, nothing "
-    "predicts, and no force leaves such a trace.",
-    "effects": "The simulator lacks {named}.",
-    "ambiguous": "The simulator lacks something like {named}, but these logs fit other explanations as well.",
-    "unexplained": "Something is missing that no effect of the library explains.",
-}
-PARTLY = (
-    "Partly explained: {named} {close} {realised} of the squared gap above the noise, but more than the tolerance "
-    "remains at {beyond}."
-)
-REST = {
-    "effects": "The simulator lacks {named}, and more than the tolerance remains at {beyond}.",
-    "ambiguous": "The simulator lacks something like {named}, but these logs fit other explanations as well, and more "
-    "than the tolerance remains at {beyond}.",
-}
-IMPERFECT = (
-    "No candidate closes what remains, {remains_of} of the squared gap: the law is not quite that of the real system."
-)
-NEAREST = "Of the library, {named} {come} nearest"
-BEATEN = "; a flexible force alone predicts held-out conditions far better"
-ON_TOP = "; a flexible force on top of {them} still closes {remains} of the gap"
-FALLS = (
-    "With {them} the recalibrated simulator's gap falls from {calibrated} to {with_effects} on held-out conditions. "
-    "Before {they} fitted, {predicted} of the squared gap above the noise was predicted to close; {realised} did."
-)
-ELSEWHERE = (
-    "Where the effects are chosen anew without each operating condition in turn, they close {elsewhere} of the gap of "
-    "the condition that was left out."
-)
-NESTED = "These shares are of operating conditions that had no part in the choice of the effects nor in their fit."
-WITHIN = "What remains is within the tolerance at every joint: {within}."
-BY_CHANCE = (
-    "The best of {candidates} candidates gains as much in {chance} of logs in which nothing is missing (drawn from the "
-    "recalibrated simulator with noise as it is in these logs)."
-)
-HIDDEN = (
-    "Beside {them} these logs would not show {hidden}: parameters of what is named do the same, and stand for both "
-    "where both are there."
-)
-BUILDS_UP = (
-    "Over whole logs the error grows to {times} times what noise, start and parameters make likely, though within "
-    "{window} it hardly shows: the law, or the simulator's time step, is not quite right."
-)
-BENT = (
-    "This needs {far} of {known} known parameters far from the data sheet, by chance less often than in 1 of 10 000 "
-    "robots even if it is half as inaccurate again as stated: something else may be missing in their place, or the "
-    "data sheet is not this robot's (--accuracy, --parameters)."
-)
-OF_SENSORS = "What remains has the covariance of noise of the sensors, {colour}."
-CHANCE = (
-    "What remains, {calibrated}, no candidate and no flexible force predicts on held-out conditions: process noise, an "
-    "input that was not logged, or noise larger than estimated."
-)
-
-COASTS = (
-    "Joints that just keep their speed in a window, without any simulator, are {coasting} noise sd off, less than the "
-    "recalibrated simulator's {calibrated}{more}: its forces are far off, or hardly show in windows as short as these."
-)
-COASTS_CLOSED = "; of that squared gap the effects close {closed}"
-STUCK = "At a bound, where they stand in for something else or their range is too narrow: {named}."
-FAR = "Far from the data sheet: {named}."
 
 
 def sentences(
@@ -119,9 +76,9 @@ def sentences(
     if verdict.noise is not None and (name == "noise" or far.beyond):
         told.append(_of_sensors(verdict.noise.memory * cut.steps * cut.dt))
     elif not effects and verdict.remains == 0.0 and found.selection.above_noise(found.selection.base):
-        told.append(CHANCE.format(calibrated=stage_in_words(far, "calibrated")))
+        told.append(CHANCE.format(calibrated=stage_in_words(far, "calibrated"), held=_held(far)))
     if name == "unexplained" and found.flexible_winner is not None:
-        told += [f"{text[:1].upper()}{text[1:]}." for text in flexible_in_words(found.flexible_winner)]
+        told += [f"{text[:1].upper()}{text[1:]}." for text in flexible_in_words(found.flexible_winner, cut.blocks)]
     told += [first_look.apart(found.setup.look)]
     told += [f"At its bound: {missing(e.name, e.where)}. {e.sentence}" for e in effects if _at_bound(e)]
     told += _remarks(parameters)
@@ -201,6 +158,7 @@ def verdict_in_words(
         "remains_of": percent(1.0 - went),
         "beyond": listed([_left(n, far.physical[n]) for n in _worst(far) if n in far.beyond][:3]),
         "within": _within(far),
+        "held": _held(far),
     }
     partly = name == "unexplained" and effects and far.beyond
     both = bool(effects and far.beyond) and name in REST
@@ -213,6 +171,7 @@ def verdict_in_words(
         out += [IMPERFECT] if both and went < 1.0 else []
         out += [NESTED if far.closed.get("nested") else ""]
         out += [ELSEWHERE] if math.isfinite(far.closed.get("elsewhere", math.nan)) else []
+    out += [IN_SAMPLE] if far.in_sample else []
     if name == "unexplained" and not effects:
         rest = [_left(n, far.physical[n]) for n in _worst(far) if "largest" in far.physical[n]]
         out += [f"What remains after recalibration: {listed(rest[:3])}."] if rest else []
@@ -222,6 +181,11 @@ def verdict_in_words(
     if effects and _within(far) and not far.beyond:
         out.append(WITHIN)
     return [text.format(**fill) for text in out if text]
+
+
+def _held(far: Gap) -> str:
+    """What was held out."""
+    return "parts of the log" if far.in_sample else "conditions"
 
 
 def _at_bound(effect: FoundEffect) -> bool:

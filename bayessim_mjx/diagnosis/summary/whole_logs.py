@@ -42,11 +42,15 @@ class Rules:
 
 
 RULES = Rules()
+IN_SAMPLE = (
+    "over whole logs, {seen} of {logs} are simulated with parameters that were fitted to them too: these errors are in "
+    "sample"
+)
 
 
 @dataclass(frozen=True, eq=False)
 class Whole:
-    """Held-out errors over whole logs.
+    """Errors over whole logs, held out but for `in_sample`.
 
     Attributes:
         cost: {stage: `[L]`}, mean squares in noise variances, of the logs that can be predicted; by_channel: {stage:
@@ -54,6 +58,7 @@ class Whole:
         chance: `[L]`, mean squares that come of the uncertain start alone.
         beyond: `[L]`, mean squares of the last stage over those that start, parameters and noise together make likely.
         group: `[L]`, operating conditions; name, seconds: of the horizon; notes: for the warnings.
+        in_sample: logs that are simulated with parameters that were fitted to them too.
     """
 
     cost: dict[str, Array]
@@ -64,6 +69,7 @@ class Whole:
     name: str
     seconds: float
     notes: tuple[str, ...]
+    in_sample: int = 0
 
     @property
     def over_likely(self) -> float:
@@ -112,7 +118,8 @@ def simulate(found: Findings) -> Whole:
         spread.append(rows[len(stages) : every] - rows[len(stages) - 1])
         likely.append(rows[every:] - rows[len(stages) - 1])
     names = [cut.logs[r].name for r in logs]
-    return _judged(setup, list(stages), names, cut.group[first], errors, spread, likely)
+    seen = sum(_own_fold(cut, w) is None for w in first)
+    return _judged(setup, list(stages), names, cut.condition[first], errors, spread, likely, seen)
 
 
 def _simulator(found: Findings, logs: Array, starts: list[int], length: int, lanes: int) -> Simulator:
@@ -150,7 +157,8 @@ def _drawn(
 ) -> tuple[Array, Array]:
     """Thetas `[stages + draws + likely, P]` and changes of the start state `[.., 2 nv]` of the log of window w."""
     fitter, last = found.setup.fitter, list(stages.values())[-1]
-    rng = np.random.default_rng(found.setup.seed)
+    # a key of each log's own: with common draws of the parameters one direction would rule all logs alike
+    rng = np.random.default_rng((found.setup.seed, int(found.setup.fitter.simulator.windows.log[w])))
     values = [_values(found, s, w) for s in stages.values()]
     offsets = [s.prediction.offsets[w] for s in stages.values()]
     B = last.model.fit.B[w]
@@ -172,12 +180,18 @@ def _root(found: Findings, model: Model) -> Array:
 
 
 def _values(found: Findings, stage: _Stage, w: int) -> Array:
-    """Of a stage's coordinates, found without the condition of window w (with all, where the log has several)."""
-    fit, cut = stage.model.fit, found.setup.fitter.simulator.windows
+    """Of a stage's coordinates, found without the condition of window w; with all, where the log has several parts."""
+    fit = stage.model.fit
     if stage.nominal:
         return np.array([c.neutral for c in fit.coordinates])
+    fold = _own_fold(found.setup.fitter.simulator.windows, w)
+    return fit.values if fold is None else stage.model.estimates[fold]
+
+
+def _own_fold(cut: windows.Windows, w: int) -> int | None:
+    """Which fold holds all of window w's log out; None where none does, and the log is simulated in sample."""
     own = np.unique(cut.group[cut.log == cut.log[w]])
-    return stage.model.estimates[list(np.unique(cut.group)).index(own[0])] if len(own) == 1 else fit.values
+    return None if cut.blocks or len(own) > 1 else int(np.searchsorted(np.unique(cut.group), own[0]))
 
 
 def theta_of(found: Findings, simulator: Simulator, model: Model, values: Array) -> Array:
@@ -194,6 +208,7 @@ def _judged(
     errors: list[Array],
     spread: list[Array],
     likely: list[Array],
+    seen: int,
 ) -> Whole:
     """Costs of the logs that can be predicted, each as long as it can be, and what is to be said of the others."""
     cut = setup.fitter.simulator.windows
@@ -219,7 +234,8 @@ def _judged(
         group=group[kept],
         name="whole log" if whole else f"up to {longest:.2g} s",
         seconds=float(np.median([last[i] for i in kept]) * cut.dt) if kept else 0.0,
-        notes=tuple(notes),
+        notes=(*notes, *([IN_SAMPLE.format(seen=seen, logs=len(names))] if seen else [])),
+        in_sample=seen,
     )
 
 

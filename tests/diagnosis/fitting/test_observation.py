@@ -135,3 +135,21 @@ def test_files_may_lack_columns_where_that_is_asked_for(tmp_path, arm):
     )
     with pytest.raises(UserError, match="no column qpos:<joint> or qvel:<joint>, so there is no motion"):
         read_logs(tmp_path, arm, partial=True)
+
+
+def test_of_long_logs_only_as_much_is_filtered_as_the_windows_hold(arm):
+    """Twelve seconds, whatever the logs' length; each log gives its share, and the elbow is found as in short ones."""
+    long = [
+        without(record(COARSE, sines((4.0, 1.5)), seconds=s, period=0.02, name=f"{s}.csv"), "qpos:elbow")
+        for s in (20.0, 40.0)
+    ]
+    short, (text,) = observation.shortened(long, 12.0)
+    assert [log.duration for log in short] == pytest.approx([4.0, 8.0], abs=0.05)
+    assert "of 20.0.csv the first 3.98 of 20 s, of 40.0.csv the first 8 of 40 s are used" in text
+    whole = record(COARSE, sines((4.0, 1.5)), seconds=20.0, period=0.02)
+    assert observation.shortened([whole], 12.0) == ((whole,), [])  # all joints were measured
+    assert observation.shortened(short, 12.0) == (short, [])  # nothing is gained
+    found = observation.completed(short, arm)
+    assert [len(log) for log in found] == [len(log) for log in short]
+    error = found[0].qpos[:, 1] - whole.qpos[: len(found[0]), 1]
+    assert np.sqrt(np.mean(error**2)) < min(0.02, found[0].sigma_qpos[1])

@@ -90,6 +90,20 @@ def test_one_log_is_held_out_in_blocks_of_time():
     found = cut(recorded(count=1, seconds=5.0))
     assert found.groups == tuple(f"part {i} of 5" for i in range(1, 6))
     assert np.all(np.diff(found.group) >= 0) and set(found.group) == set(range(5))
+    assert found.blocks and found.conditions == 1 and not found.condition.any()
+    several = cut(LOGS)
+    assert not several.blocks and several.conditions == 3 and (several.condition == several.group).all()
+
+
+def test_pieces_of_one_file_are_one_log():
+    """A file that was cut at a gap is no second operating condition."""
+    one, two, other = (
+        dataclasses.replace(log, name=name, metadata={"source": f"logs/{name.partition('#')[0]}"})
+        for log, name in zip(LOGS, ("a.csv#0", "a.csv#1", "b.csv"), strict=True)
+    )
+    assert windows.groups_of([one, two, other]) == ([0, 0, 1], ("a.csv", "b.csv"))
+    alone = cut([one, two])
+    assert alone.blocks and alone.conditions == 1 and alone.groups[0].startswith("part 1 of")
 
 
 def test_a_step_of_the_command_acts_half_a_substep_before_its_row():

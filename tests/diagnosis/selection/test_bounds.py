@@ -45,6 +45,7 @@ class Windows:
     group: np.ndarray = dataclasses.field(default_factory=lambda: np.repeat(np.arange(4), 2))
 
     sigma_q, sigma_v, spread, steps = np.array([0.01]), np.array([np.inf]), np.array([0.03, 0.1]), 20
+    measured, blocks = np.ones(1), False
 
     def __len__(self):
         return len(self.log)

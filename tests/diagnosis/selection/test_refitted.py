@@ -50,6 +50,7 @@ class Bent:
 
 class Windows:
     sigma_q, sigma_v, spread, steps = np.array([0.01]), np.array([np.inf]), np.array([0.03, 0.1]), 20
+    measured, blocks = np.ones(1), False
     group = GROUP
 
     def __len__(self):

@@ -39,7 +39,7 @@ def problem(
     coordinates = tuple(Coordinate(n, (i,), 0.0, -2.0, 2.0, 1 / 16) for i, n in enumerate(NAMES))
     fitter = SimpleNamespace(
         spread=np.array([0.5]), used=np.ones(1, bool), base=coordinates[:1],
-        simulator=SimpleNamespace(windows=SimpleNamespace(group=group)),
+        simulator=SimpleNamespace(windows=SimpleNamespace(group=group, blocks=False)),
     )  # fmt: skip
     fitter.scores = lambda fit, group=None: Fitter.scores(fitter, fit, group)
     fitter.innovations = lambda *given: Fitter.innovations(fitter, *given)
@@ -117,6 +117,19 @@ def test_one_condition_says_nothing_of_others():
     assert np.isnan(ends).all()
 
 
+def test_parts_of_one_log_are_not_conditions_and_tell_its_numbers_no_better_than_one_of_them():
+    """Laws are nearly right: a log's blocks share its error, here as large as the blocks differ by."""
+    rng, hits = np.random.default_rng(1), {True: [], False: []}
+    for _ in range(300):
+        fitter, model = problem(5, rng, 0.6)
+        shared = 0.6 * rng.normal(size=2)  # what a further log would differ by
+        for blocks, into in hits.items():
+            fitter.simulator.windows.blocks = blocks
+            sd = np.sqrt(np.diag(uncertainty.covariance(fitter, model)))
+            into.append(np.abs(model.fit.values - TRUTH - shared) < 1.645 * sd)
+    assert np.mean(hits[False]) < 0.75 < 0.85 < np.mean(hits[True])
+
+
 def test_conditions_that_count():
     assert statistics.freedom(np.ones((5, 1))) == pytest.approx(4.0)
     assert statistics.freedom(np.array([[1.0], [1.0], [2.0]])) == pytest.approx(16 / 6 - 1)
@@ -154,6 +167,22 @@ def test_parts_of_what_is_closed_add_up_and_stay_below_one():
     assert sum(heldout.Closed(before, lucky, group, o, own.sum(0)).value for o in own) == pytest.approx(1.0)
     at_noise = heldout.Closed(before, np.full_like(before, 0.9), group)
     assert at_noise.value == 1.0 and at_noise.interval()[1] == 1.0
+
+
+@pytest.mark.parametrize("left", [0.77, 0.9, 1.0, 1.3, 4.0])
+@pytest.mark.parametrize("gap", [5.0, 300.0, 1e6])
+def test_no_interval_of_a_share_has_zero_width(left, gap):
+    """Six conditions that hardly differ; a left-over below 1 says by how much the noise was taken for too large."""
+    rng, group = np.random.default_rng(0), np.repeat(np.arange(6), 5)
+    before, after = (size * (1 + 1e-3 * rng.normal(size=30)) for size in (gap, left))
+    part = 0.7 + 1e-3 * rng.normal(size=30)
+    every = [heldout.Closed(before, after, group), heldout.Closed(before, after, group, part, np.ones(30))]
+    for closed in every:
+        low, high = closed.interval()
+        assert low < high <= 1.0 and low <= closed.value <= high
+    low, _ = every[0].interval()
+    if left < 1.0:  # the floor may be off by about as much as is left below it
+        assert 1.0 - low >= 0.5 * (1.0 - left) / gap
 
 
 def test_weights_among_rivals_are_one_together_and_equal_where_the_rivals_are():

@@ -27,3 +27,14 @@ def test_a_share_that_reaches_no_joint_is_said_to_be_told_by_nothing(monkeypatch
     told = effects_found._effect(found, effect, np.array([0.003, deviation]), part)
     assert told.sentence == sentence
     assert told.parameters["to_previous"].sd == deviation
+
+
+@pytest.mark.parametrize(("conditions", "chosen", "nested"), [(1, 5, False), (2, 2, False), (3, 3, True)])
+def test_a_choice_is_nested_from_three_conditions_on_and_never_within_one_log(conditions, chosen, nested):
+    """Of one log five blocks are held out, which are no conditions."""
+    cut = SimpleNamespace(conditions=conditions)
+    found = SimpleNamespace(
+        selection=SimpleNamespace(chosen=dict.fromkeys(range(chosen), frozenset()), elsewhere=0.9),
+        setup=SimpleNamespace(fitter=SimpleNamespace(simulator=SimpleNamespace(windows=cut))),
+    )
+    assert effects_found.nested(found) == nested

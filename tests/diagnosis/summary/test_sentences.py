@@ -42,6 +42,20 @@ def test_what_conditions_without_a_part_in_the_choice_say():
     assert told not in sentences.verdict_in_words("effects", [FRICTION], LEVEL)
 
 
+def test_of_one_log_all_numbers_are_called_in_sample():
+    one = dataclasses.replace(LEVEL, in_sample=True)
+    _, falls, said, *_ = sentences.verdict_in_words("effects", [FRICTION], one)
+    assert "on held-out parts of the log." in falls and "condition" not in falls
+    assert said.startswith("These numbers are in sample: one log is one operating condition")
+    assert not any("in sample" in text for text in sentences.verdict_in_words("effects", [FRICTION], LEVEL))
+
+
+def test_a_choice_without_a_condition_is_said_to_rest_on_costs_that_saw_it():
+    nested = dataclasses.replace(LEVEL, closed={"nested": True, "elsewhere": 0.6})
+    text = " ".join(sentences.verdict_in_words("effects", [FRICTION], nested))
+    assert "chosen and fitted without it; the costs behind the choice were not" in text
+
+
 def test_several_effects():
     head, falls, _ = sentences.verdict_in_words("effects", [FRICTION, GAIN], LEVEL)
     assert head == "The simulator lacks Coulomb friction at hinge and the true actuator gain at torque."

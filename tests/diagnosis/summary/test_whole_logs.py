@@ -55,6 +55,19 @@ def test_whole_logs_are_the_third_horizon(rubbing):
     assert log["over_likely"] < 1.5  # the law is right
 
 
+@pytest.mark.ci
+def test_each_log_has_draws_of_its_own(rubbing):
+    """Common draws of the parameters would let one of them stand for all logs."""
+    cut, root = rubbing.setup.fitter.simulator.windows, whole_logs._root(rubbing, rubbing.model)
+    stages = {"with_effects": whole_logs._Stage(rubbing.model, rubbing.predictions["with_effects"], False)}
+    away = []
+    for w in (int(np.flatnonzero(cut.log == log)[0]) for log in range(3)):
+        thetas, _ = whole_logs._drawn(rubbing, rubbing.setup.fitter.simulator, stages, root, w)
+        away.append(thetas[-whole_logs.RULES.likely :] - thetas[0])
+    assert np.ptp(away[0], axis=0).max() > 0
+    assert not np.allclose(away[0], away[1], rtol=0.01) and not np.allclose(away[1], away[2], rtol=0.01)
+
+
 def test_what_is_likely_is_noise_and_what_draws_leave_of_the_mean():
     error, likely = np.full((10, 2), 3.0), np.full((4, 10, 2), 2.0)
     assert whole_logs._beyond(error, likely) == pytest.approx(9 / (1 + 4))
