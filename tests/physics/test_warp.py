@@ -124,8 +124,8 @@ BALL = """
 def test_contacts_of_many_worlds_and_what_they_carry():
     """A ball of 2 kg is carried by 2 g; pushed sidewise it rolls as in the other implementation, in every world."""
     model = mujoco.MjModel.from_xml_string(BALL)
-    ours, warp = (Physics(model, 0.02, ParameterSpace(), impl=impl, worlds=4) for impl in ("jax", "warp"))
-    assert warp.warp.room == 256  # one contact for each of the least number of worlds
+    ours, warp = (Physics(model, 0.02, ParameterSpace(), impl=impl) for impl in ("jax", "warp"))
+    assert warp.warp.room(4) == 256  # one contact for each of the least number of worlds
 
     def roll(physics, speed):
         def step(world, _):
@@ -142,17 +142,41 @@ def test_contacts_of_many_worlds_and_what_they_carry():
     assert qpos[2, -1, 0] > 0.2
 
 
-@pytest.mark.slow
-@pytest.mark.skipif(not INSTALLED, reason="warp-lang is not installed")
-def test_where_contacts_have_no_room_worlds_diverge():
-    model = mujoco.MjModel.from_xml_string(BALL)
-    physics = Physics(model, 0.002, ParameterSpace(), impl="warp", worlds=1)
-    nominal = jnp.asarray(model.qpos0, jnp.float32)
-
-    def height(start):
-        world = physics.world(jnp.zeros(0), nominal.at[2].set(start))
+def height(physics):
+    def fall(start):
+        world = physics.world(jnp.zeros(0), jnp.asarray(physics.mj_model.qpos0, jnp.float32).at[2].set(start))
         return control_step(physics, world, jnp.zeros(0))[0].qpos[2]
 
-    step = jax.jit(jax.vmap(height))
-    assert np.isfinite(step(jnp.linspace(0.09, 0.095, 256))).all()
-    assert np.isnan(step(jnp.linspace(0.09, 0.095, 300))).all()
+    return fall
+
+
+@pytest.mark.slow
+@pytest.mark.ci
+@pytest.mark.skipif(not INSTALLED, reason="warp-lang is not installed")
+def test_as_many_worlds_have_room_as_vmap_makes_of_one():
+    """Nobody says how many: 300 on the ground, 2 by 200, and one; all touch it, and what carries them is found."""
+    physics = Physics(mujoco.MjModel.from_xml_string(BALL), 0.002, ParameterSpace(), impl="warp")
+    fall, one = height(physics), jnp.linspace(0.09, 0.095, 300)
+    many = jax.jit(jax.vmap(fall))(one)
+    assert np.isfinite(many).all() and np.ptp(many) > 0.004
+    grid = jax.vmap(jax.jit(jax.vmap(fall)))(jnp.stack([one[:200], one[100:]]))
+    np.testing.assert_allclose(grid, np.stack([many[:200], many[100:]]), atol=1e-6)
+    np.testing.assert_allclose(fall(one[7]), many[7], atol=1e-6)
+    shared = jax.vmap(lambda _: fall(one[7]))(jnp.arange(300))  # what is the same in all of them
+    np.testing.assert_allclose(shared, many[7], atol=1e-6)
+
+
+# two balls touch the ground, and the model has room for one contact
+CROWD = BALL.replace("<option", '<custom><numeric name="max_contact_points" data="1"/></custom><option').replace(
+    "</worldbody>", '<body pos="1 0 0.09"><freejoint/><geom type="sphere" size="0.1" mass="2"/></body></worldbody>'
+)
+
+
+@pytest.mark.slow
+@pytest.mark.ci
+@pytest.mark.skipif(not INSTALLED, reason="warp-lang is not installed")
+def test_where_contacts_have_no_room_worlds_diverge():
+    physics = Physics(mujoco.MjModel.from_xml_string(CROWD), 0.002, ParameterSpace(), impl="warp")
+    step = jax.jit(jax.vmap(height(physics)))
+    assert np.isfinite(step(jnp.full(128, 0.095))).all()
+    assert np.isnan(step(jnp.full(129, 0.095))).all()
