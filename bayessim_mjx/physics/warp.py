@@ -141,20 +141,19 @@ def overflowed(data: mjx.Data) -> jax.Array:
     return jnp.isnan(data.time).astype(jnp.float32)
 
 
-def refuse_overflow(share: Any, where: str) -> None:
+def refuse_overflow(share: Any, of: str) -> None:
     """UserError where contacts had no room.
 
     Args:
         share: the metric `OVERFLOW`, or any mean of it; 0: all had room.
-        where: what was simulated, for the message.
+        of: what it is a share of, for the message.
     """
-    if not (share := float(share)) > 0:
-        return
-    raise UserError(
-        f"env.impl = 'warp': contacts had no room in {share:.2g} of the control steps of {where}, and all worlds "
-        "diverged there: the model makes more contacts than MJX counts for it; set env.impl to jax, or give the model "
-        "a larger custom number max_contact_points where it has one"
-    )
+    if (share := float(share)) > 0:
+        raise UserError(
+            f"env.impl = 'warp': contacts had no room in {share:.2g} of {of}, and all worlds diverged there: the model "
+            "makes more contacts than MJX counts for it; set env.impl to jax, or raise the model's custom number "
+            "max_contact_points where it has one"
+        )
 
 
 def without_warp(error: RuntimeError) -> Exception:

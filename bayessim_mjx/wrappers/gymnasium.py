@@ -18,6 +18,7 @@ from bayessim_mjx import registry
 from bayessim_mjx.compat import program
 from bayessim_mjx.env import Env
 from bayessim_mjx.errors import UserError
+from bayessim_mjx.physics.warp import OVERFLOW, refuse_overflow
 from bayessim_mjx.rollout import next_episodes, select
 from bayessim_mjx.wrappers.pictures import Camera
 from bayessim_mjx.wrappers.spaces import boxes
@@ -38,7 +39,7 @@ def make(
         domain: as for `make_vec`.
         env_settings: settings of `env:`, e.g. `episodeLength=100`.
     """
-    env = registry.make(task, **env_settings)
+    env = registry.make(task, numEnvs=1, **env_settings)
     return GymnasiumEnv(env, theta, render_mode, domain_of(env, domain))
 
 
@@ -60,7 +61,7 @@ def make_vec(
         autoreset_mode, render_mode: see `GymnasiumVectorEnv`.
         env_settings: settings of `env:`, e.g. `episodeLength=100`.
     """
-    env = registry.make(task, **env_settings)
+    env = registry.make(task, numEnvs=num_envs, **env_settings)
     return GymnasiumVectorEnv(env, num_envs, domain_of(env, domain), autoreset_mode, render_mode)
 
 
@@ -252,6 +253,7 @@ class GymnasiumVectorEnv(VectorEnv):
         old, acted = (self._state, self._thetas), jnp.asarray(actions, jnp.float32)
         after, (self._state, self._thetas) = self._step(key, old, self._ended, acted, self._domain, self._given)
         terminated, truncated = (np.asarray(after.info[name]) > 0 for name in ("terminated", "truncated"))
+        refuse_overflow(np.mean(after.metrics.get(OVERFLOW, 0.0)), "the worlds in this step")
         reward = np.array(after.reward)
         if self.mode is NEXT:
             reward[self._ended] = 0.0
