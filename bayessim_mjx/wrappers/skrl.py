@@ -1,8 +1,8 @@
 """Our worlds as environments of skrl, for its JAX agents (`make`) and its PyTorch ones (`make(..., library="torch")`).
 
-The group "policy" is the observation; the group "critic", where a task has one, is the state. What a step itself led to
-are `info["final_observation"]` and `info["final_state"]`. skrl's trainers take an episode's next observation for it, which
-where a time limit ended the last episode is the first one of the next: `told_true_ends(runner.agent)` corrects that.
+The group "policy" is the observation; the group "critic", where a task has one, is the state. What the step itself led
+to are `info["final_observation"]` and `info["final_state"]`. skrl's trainers take the next observation for that, which
+is the first one of a new episode where an episode ended: `told_true_ends(runner.agent)` corrects it.
 """
 
 from typing import Any
@@ -145,8 +145,8 @@ def _torch_env() -> type:
 def told_true_ends(agent: Any) -> Any:
     """The agent of skrl, which learns of what each step led to in place of a new episode's first observation.
 
-    Its PPO adds the value of that observation where a time limit ended an episode (`time_limit_bootstrap`). Nothing else
-    changes: after an end no value of the next observation is used.
+    Its PPO adds the value of that observation where a time limit ended an episode (`time_limit_bootstrap`). Nothing
+    else changes: after an end no value of the next observation is used.
     """
     record = agent.record_transition
 

@@ -25,7 +25,7 @@ from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.env import Env, Observations
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.physics.warp import OVERFLOW, refuse_overflow
-from bayessim_mjx.rl.worlds import aged, clock, drawn, reset_at
+from bayessim_mjx.rl.worlds import aged, clock, drawn, held, reset_at
 from bayessim_mjx.rollout import next_episodes, select, traced
 
 
@@ -175,7 +175,8 @@ class _Steps:
     def episodes(self, key: jax.Array, domain: Any, fixed: jax.Array | None, now: Any = 0) -> tuple[Any, jax.Array]:
         theta_key, reset_key = jax.random.split(key)
         theta = drawn(self.env, theta_key, domain, self.num_envs) if fixed is None else fixed
-        return reset_at(self.env, reset_key, theta, None, now), theta
+        state = reset_at(self.env, reset_key, theta, None, now)
+        return state, held(self.env, state, theta)
 
     def began(self, key: jax.Array, domain: Any, fixed: jax.Array | None) -> _Running:
         first, later = (self.episodes(k, domain, fixed) for k in jax.random.split(key))
@@ -198,9 +199,7 @@ class _Steps:
         store = jax.lax.cond(empty, lambda: _as(renew(), old.store), lambda: old.store)
         fresh, theta = store
         fresh = next_episodes(self.env, ended, after, fresh)
-        if getattr(self.env, "nuisance", None) is not None:  # where parameters last, these are the old ones
-            theta = fresh.pipeline_state.theta
-        state, theta = select(ended, (fresh, theta), (after, old.theta))
+        state, theta = select(ended, (fresh, held(self.env, fresh, theta)), (after, old.theta))
         reward, metrics = self.reward_scale * after.reward, dict(after.metrics)
         batch = Batch(state.obs, reward, terminated, truncated, after.obs, returns, lengths, metrics, theta)
         returns, lengths = jnp.where(ended, 0.0, returns), jnp.where(ended, 0, lengths)

@@ -1,6 +1,8 @@
 """Other libraries' PPO as agents of `train`: their networks as our policies, saved and taken up again."""
 
 import importlib.util
+import os
+import signal
 import sys
 from pathlib import Path
 
@@ -174,3 +176,74 @@ def test_what_cannot_train_leaves_no_run_folder(counters, monkeypatch, capsys):
         assert train.main(["--task", "Cartpole", "--agent", "skrl", "ppo.memory=4", "--headless"]) == 2
         assert "ppo.memory = 4: --agent skrl has no such thing" in capsys.readouterr().err
     assert not Path("logs").exists()
+
+
+class Steady:
+    """An agent without a library: its policy always gives 0, and its file says how often it was saved."""
+
+    def __init__(self, at=None):
+        self.iteration, self.saves, self.loaded, self.at = 0, 0, None, at or {}
+
+    def learn(self, iterations):
+        self.iteration += iterations
+        self.at.get(self.iteration, lambda: None)()
+        return {"Train/mean_reward": 5.0, "Train/mean_episode_length": 5.0, "Loss/value": 1.0}
+
+    def policy(self):
+        layers = [(np.zeros((3, 2)), np.zeros(2)), (np.zeros((2, 1)), np.zeros(1))]
+        return networks.policy(layers, np.zeros(1), settings("sb3").ppo)
+
+    def save(self, folder):
+        self.saves += 1
+        (folder / "first").write_text(str(self.saves))
+        self.at.get(f"save {self.saves}", lambda: None)()
+        (folder / "second").write_text(str(self.saves))
+
+    def load(self, folder):
+        self.loaded = [(folder / name).read_text() for name in ("first", "second")]
+
+
+def steady(monkeypatch, agent):
+    monkeypatch.setattr(agents, "check", lambda config, env: None)
+    monkeypatch.setattr(agents, "make", lambda config, env, domain: agent)
+    return agent
+
+
+STEADY = ["--task", "Cartpole", "--agent", "sb3", "--logger", "csv", *SHORT, *TINY[:-1], "env.realParams=null"]
+
+
+def test_a_checkpoint_of_ctrl_c_is_evaluated_when_the_run_goes_on(counters, monkeypatch):
+    """It lies where one is due: without an evaluation it could never become the best."""
+    steady(monkeypatch, Steady({2: lambda: os.kill(os.getpid(), signal.SIGINT)}))
+    assert train.main(STEADY) == 130
+    run = latest_run("logs", "Cartpole")
+    assert [(c["step"], c["kind"]) for c in run.checkpoints] == [(2, "periodic")]
+    agent = steady(monkeypatch, Steady())
+    assert train.main(["--resume", str(run.path), "--headless"]) == 0
+    assert agent.loaded is not None
+    found = {(c["step"], c["kind"]) for c in Run.open(run.path).checkpoints}
+    assert {(2, "evaluated"), (4, "evaluated")} <= found
+
+
+def gone():
+    raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("moment", ["while files are written", "between two versions"])
+def test_a_kill_at_any_moment_leaves_a_whole_checkpoint(moment, counters, monkeypatch):
+    """The same step is saved twice, by Ctrl-C and after its evaluation; the second time ends in a kill."""
+    steady(monkeypatch, Steady({2: lambda: os.kill(os.getpid(), signal.SIGINT)}))
+    assert train.main(STEADY) == 130
+    run = latest_run("logs", "Cartpole")
+    with monkeypatch.context() as patch:
+        if moment == "between two versions":
+            rename = Path.rename
+            patch.setattr(Path, "rename", lambda own, to: gone() if own.suffix == ".new" else rename(own, to))
+            steady(monkeypatch, Steady())
+        else:
+            steady(monkeypatch, Steady({"save 1": gone}))
+        assert train.main(["--resume", str(run.path), "--headless"]) == 130
+    agent = steady(monkeypatch, Steady())
+    assert train.main(["--resume", str(run.path), "--headless"]) == 0
+    assert agent.loaded == ["1", "1"]
+    assert sorted(p.name for p in (run.path / "agent").iterdir()) == ["2", "4"]

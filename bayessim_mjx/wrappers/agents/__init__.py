@@ -1,7 +1,7 @@
 """Other libraries' PPO in our commands: `train --agent sb3`. Their networks become policies of ours at checkpoints.
 
-So `play`, videos, ONNX and `main --checkpoint` work with them as with ours. Every setting of `ppo:` reaches the library or
-is refused by its name: those that none of them has are in `OURS`, those of one library in its `refuse`.
+So `play`, videos, ONNX and `main --checkpoint` work with them as with ours. Every setting of `ppo:` reaches the library
+or is refused by its name: those that none of them has are in `OURS`, those of one library in its `refuse`.
 """
 
 from __future__ import annotations

@@ -43,8 +43,8 @@ def refuse(config: Config, env: Any) -> None:
     size, left = divmod(ppo.num_envs * ppo.num_steps, ppo.num_minibatches)
     if left or size < 2:
         raise UserError(
-            f"ppo.num_minibatches = {ppo.num_minibatches}: --agent sb3 takes a divisor of ppo.num_envs * ppo.num_steps = "
-            f"{ppo.num_envs * ppo.num_steps} that leaves at least two samples"
+            f"ppo.num_minibatches = {ppo.num_minibatches}: --agent sb3 takes a divisor of ppo.num_envs * ppo.num_steps "
+            f"= {ppo.num_envs * ppo.num_steps} that leaves at least two samples"
         )
 
 

@@ -68,7 +68,8 @@ class SkrlAgent:
             discount_factor=ppo.gamma, gae_lambda=ppo.gae_lambda, learning_rate=ppo.learning_rate,
             learning_rate_scheduler="KLAdaptiveLR" if by_kl else None,
             learning_rate_scheduler_kwargs={"kl_threshold": ppo.desired_kl} if by_kl else {},
-            observation_preprocessor=scaler, state_preprocessor=scaler if self.env.state_space else None, grad_norm_clip=ppo.max_grad_norm, ratio_clip=ppo.clip_param,
+            observation_preprocessor=scaler, state_preprocessor=scaler if self.env.state_space else None,
+            grad_norm_clip=ppo.max_grad_norm, ratio_clip=ppo.clip_param,
             value_clip=ppo.clip_param if ppo.use_clipped_value_loss else 0.0, entropy_loss_scale=ppo.entropy_coef,
             value_loss_scale=ppo.value_loss_coef,
         )  # fmt: skip
