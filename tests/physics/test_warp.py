@@ -19,6 +19,13 @@ from bayessim_mjx.physics.warp import wrenches
 INSTALLED = importlib.util.find_spec("warp") is not None
 
 
+def warp(test):
+    """Of those that simulate by Warp on the CPU: their seconds are those of compiling its kernels."""
+    return pytest.mark.slow(
+        pytest.mark.ci(pytest.mark.skipif(not INSTALLED, reason="warp-lang is not installed")(test))
+    )
+
+
 @pytest.mark.skipif(INSTALLED, reason="warp-lang is installed")
 def test_without_the_package_the_extra_is_named():
     with pytest.raises(UserError, match=r"env.impl = 'warp'.*bayessim-mjx\[warp\]"):
@@ -57,8 +64,7 @@ def motions(env, thetas, steps=5):
     return jax.jit(jax.vmap(one))(thetas, jax.random.split(jax.random.PRNGKey(0), len(thetas)))
 
 
-@pytest.mark.slow
-@pytest.mark.skipif(not INSTALLED, reason="warp-lang is not installed")
+@warp
 @pytest.mark.parametrize("name", ["Pendulum", "Cartpole"])
 def test_the_motion_is_that_of_the_other_implementation(name):
     """In every world that of its own parameters, and a delay on the way to the actuators acts as well."""
@@ -71,8 +77,7 @@ def test_the_motion_is_that_of_the_other_implementation(name):
     assert np.ptp(expected[:, -1], axis=0).max() > 0.1  # worlds differ
 
 
-@pytest.mark.slow
-@pytest.mark.skipif(not INSTALLED, reason="warp-lang is not installed")
+@warp
 def test_a_humanoid_moves_as_in_mujoco_once_its_solver_has_converged():
     """Four iterations, as the task allows, end elsewhere in MuJoCo too; Warp's go on until they have converged."""
     worlds, steps = 4, 10
@@ -100,8 +105,7 @@ def test_a_humanoid_moves_as_in_mujoco_once_its_solver_has_converged():
     assert np.median(many) < 1e-3 < np.median(few) and np.all(many < 0.5 * few)
 
 
-@pytest.mark.slow
-@pytest.mark.skipif(not INSTALLED, reason="warp-lang is not installed")
+@warp
 def test_solvers_that_end_at_their_limit_print_nothing(capfd):
     """One line for a world and timestep each would be 180 000 of them in a training of Humanoid."""
     env = registry.make("Humanoid", impl="warp", numEnvs=8)
@@ -119,8 +123,7 @@ BALL = """
 """
 
 
-@pytest.mark.slow
-@pytest.mark.skipif(not INSTALLED, reason="warp-lang is not installed")
+@warp
 def test_contacts_of_many_worlds_and_what_they_carry():
     """A ball of 2 kg is carried by 2 g; pushed sidewise it rolls as in the other implementation, in every world."""
     model = mujoco.MjModel.from_xml_string(BALL)
@@ -150,9 +153,7 @@ def height(physics):
     return fall
 
 
-@pytest.mark.slow
-@pytest.mark.ci
-@pytest.mark.skipif(not INSTALLED, reason="warp-lang is not installed")
+@warp
 def test_as_many_worlds_have_room_as_vmap_makes_of_one():
     """Nobody says how many: 300 on the ground, 2 by 200, and one; all touch it, and what carries them is found."""
     physics = Physics(mujoco.MjModel.from_xml_string(BALL), 0.002, ParameterSpace(), impl="warp")
@@ -172,9 +173,7 @@ CROWD = BALL.replace("<option", '<custom><numeric name="max_contact_points" data
 )
 
 
-@pytest.mark.slow
-@pytest.mark.ci
-@pytest.mark.skipif(not INSTALLED, reason="warp-lang is not installed")
+@warp
 def test_where_contacts_have_no_room_worlds_diverge():
     physics = Physics(mujoco.MjModel.from_xml_string(CROWD), 0.002, ParameterSpace(), impl="warp")
     step = jax.jit(jax.vmap(height(physics)))

@@ -55,7 +55,8 @@ def _normalised_once() -> Any:
     class Normalised(RolloutBuffer):
         def compute_returns_and_advantage(self, *args: Any, **kwargs: Any) -> None:
             super().compute_returns_and_advantage(*args, **kwargs)
-            self.advantages = (self.advantages - self.advantages.mean()) / (self.advantages.std() + 1e-8)
+            raw: np.ndarray = self.advantages  # type: ignore[has-type]
+            self.advantages = (raw - raw.mean()) / (raw.std() + 1e-8)
 
     return Normalised
 
