@@ -30,7 +30,8 @@ def make(name: str, *, config: "Config | None" = None, effects: "Sequence[Effect
             used; `task.randomize = False` gives the nominal task, with an empty parameter space. What a diagnosis
             identified (`effects=effects.yaml`) belongs to nominal physics.
         effects: further effects, after those of the config.
-        env_overrides: `env:` settings that win over the config's, e.g. `episodeLength=100`.
+        env_overrides: `env:` settings that win over the config's, e.g. `episodeLength=100`; `numEnvs`, how many worlds
+            step together, is what `impl=auto` goes by.
 
     Raises:
         UserError: on an unknown name or setting.
@@ -38,6 +39,7 @@ def make(name: str, *, config: "Config | None" = None, effects: "Sequence[Effect
     if name.split(":")[0] in EXTERNAL and ":" in name:
         if config is not None and (config.effects or config.calibrated):
             raise UserError(f"effects: {name} is not simulated here, so it cannot take any; leave them out")
+        env_overrides.pop("numEnvs", None)  # these choose their implementation themselves
         wrapper = importlib.import_module("bayessim_mjx.wrappers.brax")
         return wrapper.make(name, config=config, **env_overrides)
     kind = _task(name)

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import shutil
 import sys
 import time
 from collections.abc import Sequence
@@ -189,12 +188,13 @@ class AgentTraining(Training):
     def state(self, resume: bool) -> tuple[Any, int | None]:
         from bayessim_mjx.monitor.wall import marked
         from bayessim_mjx.wrappers import agents
+        from bayessim_mjx.wrappers.agents import folders
 
         agent = agents.make(self.config, self.env, self.domain)
         if not (resume and self.run.checkpoints):
             return agent, -1 if resume else None
         _, meta = self.run.restore("latest", {"policy": agent.policy()}, fall_back=True)
-        agent.load(self._folder(meta["iteration"]))
+        agent.load(folders.kept(self._folder(meta["iteration"])))
         agent.iteration = meta["iteration"]
         return agent, marked(meta)
 
@@ -209,18 +209,17 @@ class AgentTraining(Training):
 
     def save(self, state: Any, evaluation: float | None = None) -> None:
         """A checkpoint, after the agent's own files; older ones go."""
+        from bayessim_mjx.wrappers.agents import folders
+
         folder = self._folder(state.iteration)
-        shutil.rmtree(folder, ignore_errors=True)
-        folder.mkdir(parents=True)
-        state.save(folder)
+        folders.write(folder, state.save)
         super().save(state, evaluation)
-        kept = {str(c["step"]) for c in self.run.checkpoints}
-        for old in folder.parent.iterdir():
-            if old.name not in kept:
-                shutil.rmtree(old, ignore_errors=True)
+        folders.clear(folder.parent, {str(c["step"]) for c in self.run.checkpoints})
 
     def train(self, state: Any) -> Any:
         ppo = self.config.ppo
+        if self.owes_evaluation(state.iteration):
+            self.save(state, self.evaluate(state))
         while (done := state.iteration) < ppo.max_iterations:
             self.stop.check()
             due = min(ppo.save_interval - done % ppo.save_interval, ppo.max_iterations - done)

@@ -23,6 +23,7 @@ from bayessim_mjx.physics import Physics, World, control_step, mjx
 from bayessim_mjx.physics.implementation import Choice, choose
 from bayessim_mjx.physics.nuisance import GRAVITY, Course, Drawn
 from bayessim_mjx.physics.nuisance import read as read_nuisance
+from bayessim_mjx.physics.warp import OVERFLOW, overflowed
 
 VARIANTS = ("isaacgymenvs", "bayessim2021")
 
@@ -79,9 +80,7 @@ class Task(Env):
         every = stack(section, effects)
         self.chosen: Choice | None = choose(self.name, worlds, every) if impl == "auto" else None
         impl = impl if self.chosen is None else self.chosen.impl
-        self.physics = Physics(
-            mj_model, self.control_dt, space, every, self.max_qvel, impl, worlds, self.settings["unroll"]
-        )
+        self.physics = Physics(mj_model, self.control_dt, space, every, self.max_qvel, impl, self.settings["unroll"])
         self.joint_names = _names(mj_model, mujoco.mjtObj.mjOBJ_JOINT, mj_model.njnt)
         self.actuator_names = _names(mj_model, mujoco.mjtObj.mjOBJ_ACTUATOR, mj_model.nu)
         self.nuisance = read_nuisance(section, self.physics.space)
@@ -180,7 +179,7 @@ class Task(Env):
         world = self._under_gravity(self.physics.world(theta, qpos, qvel), drawn)
         world = world.replace(task={"steps": jnp.zeros((), jnp.int32)} | self.start(key, world))
         data, action = self.physics.kinematics(world), jnp.zeros(self.action_size)
-        metrics = jax.eval_shape(lambda: self.reward(world, world, data, action)[2])
+        metrics = [*jax.eval_shape(lambda: self.reward(world, world, data, action)[2]), *self._counted(data)]
         (drawn, obs), zero = self._observe(world, data, action, drawn), jnp.zeros(())
         return State(
             pipeline_state=world,
@@ -207,6 +206,7 @@ class Task(Env):
         action = jnp.clip(action, -1.0, 1.0)
         before, command = self.actuate(before, action)
         after, data = control_step(self.physics, before, command)
+        counted = self._counted(data)
         after, sound = _hold_if_diverged(before, after, self.speed_limit)
         steps = before.task["steps"] + 1
         after = after.replace(task=after.task | {"steps": steps})
@@ -228,9 +228,14 @@ class Task(Env):
             obs=obs,
             reward=_finite(jnp.where(sound, reward, self.diverged_reward)),
             done=done,
-            metrics=state.metrics | {name: _finite(value) for name, value in metrics.items()},  # Brax adds its own
+            # Brax adds its own
+            metrics=state.metrics | {name: _finite(value) for name, value in metrics.items()} | counted,
             info=info,
         )
+
+    def _counted(self, data: mjx.Data) -> dict[str, jax.Array]:
+        """What the physics could not simulate of a control step, as metrics."""
+        return {} if self.physics.warp is None else {OVERFLOW: overflowed(data)}
 
     def _observe(
         self, world: World, data: mjx.Data, action: jax.Array, drawn: Drawn | None
@@ -275,7 +280,7 @@ def _hold_if_diverged(before: World, after: World, speed_limit: float) -> tuple[
     parts = (after.qpos, after.qvel, after.act)
     sound = functools.reduce(jnp.logical_and, [jnp.all(jnp.isfinite(x)) for x in parts])
     sound &= jnp.all(jnp.abs(after.qvel) < speed_limit)
-    keep = ("qpos", "qvel", "act", "warmstart", "memory", "forces", "measurement")
+    keep = ("qpos", "qvel", "act", "warmstart", "time", "memory", "forces", "measurement")
     held = {
         name: jax.tree.map(lambda new, old: jnp.where(sound, new, old), getattr(after, name), getattr(before, name))
         for name in keep

@@ -6,6 +6,7 @@ import functools
 from collections.abc import Callable
 
 import jax
+import jax.numpy as jnp
 from jax import Array
 
 from bayessim_mjx.compat import program
@@ -13,6 +14,7 @@ from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.inference import rounds
 from bayessim_mjx.loop.sources import Source
 from bayessim_mjx.loop.state import Loop, LoopState, space_of
+from bayessim_mjx.physics.warp import refuse_overflow
 from bayessim_mjx.rl import Policy
 
 CHUNK = 2500  # trajectories simulated at once while collecting
@@ -41,18 +43,31 @@ def simulated(
         count: how many.
         chosen: the thetas that are simulated in the place of those drawn, as many.
         draws: how often each trajectory is measured.
+
+    Raises:
+        UserError: contacts had no room (`physics.warp`).
     """
     chunks = -(-count // CHUNK)
     k_theta, k_roll = jax.random.split(key)
     thetas = rounds.draw(k_theta, proposal, method, -(-count // chunks) * chunks)
     thetas = chosen(thetas)
     x, again = _features(source, draws)(k_roll, thetas.reshape(chunks, -1, thetas.shape[-1]), policy)
+    _refuse_overflow(source, x, chunks)
     return thetas[:count], x[:count], again[:count]
 
 
 def features(source: Source, key: Array, thetas: Array, policy: Policy) -> Array:
     """Features [chunks * n, D] of trajectories at thetas [chunks, n, d]."""
-    return _features(source, 1)(key, thetas, policy)[0]
+    x = _features(source, 1)(key, thetas, policy)[0]
+    _refuse_overflow(source, x, len(thetas))
+    return x
+
+
+def _refuse_overflow(source: Source, x: Array, chunks: int) -> None:
+    """UserError where all trajectories of a chunk [chunks * n, D] are lost: Warp's contacts had no room."""
+    if getattr(getattr(source.env, "physics", None), "warp", None) is not None:
+        lost = jnp.isnan(x).any(-1).reshape(chunks, -1).all(-1)
+        refuse_overflow(lost.mean(), f"the trajectories, simulated {len(x) // chunks} at once")
 
 
 def noise_draws(loop: Loop) -> int:

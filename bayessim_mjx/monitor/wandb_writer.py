@@ -70,8 +70,8 @@ class WandbWriter:
 
         path = self.folder / "videos" / f".wandb_{tag.replace('/', '_')}.mp4"
         path.parent.mkdir(parents=True, exist_ok=True)
-        video.save(frames, path, fps)
-        self._log(step, {tag: wandb.Video(str(path), format="mp4")})
+        if video.save(frames, path, fps):  # else there is no file, or that of an earlier video
+            self._log(step, {tag: wandb.Video(str(path), format="mp4")})
 
     def flush(self) -> None:
         """wandb sends by itself."""

@@ -63,7 +63,6 @@ class Physics:
         max_qvel: `[nv]` or scalar; velocities are clipped to +-max_qvel after each sub-step (the position has moved
             with the unclipped one). None: no clipping.
         impl: what computes a timestep: MJX's stages in "jax", or all of it in "warp"; see `warp.Warp`.
-        worlds: how many are simulated together, for "warp".
         unroll: a control step's timesteps stand in a row in the program, in place of a loop.
 
     Raises:
@@ -79,7 +78,6 @@ class Physics:
         effects: Sequence[Effect] = (),
         max_qvel: float | Sequence[float] | None = None,
         impl: str = "jax",
-        worlds: int | None = None,
         unroll: bool = False,
     ) -> None:
         self.mj_model = mj_model
@@ -96,7 +94,7 @@ class Physics:
         self.max_qvel = None if max_qvel is None else np.broadcast_to(np.asarray(max_qvel, np.float32), (mj_model.nv,))
         self.model = mjx.put_model(mj_model, impl="jax")
         self.template = mjx.make_data(mj_model, impl="jax")
-        self.warp = Warp(mj_model, self.template, self.effects, worlds) if impl == "warp" else None
+        self.warp = Warp(mj_model, self.template, self.effects) if impl == "warp" else None
         timestep = float(mj_model.opt.timestep)
         for effect in filter(contract.brought, self.effects):
             contract.check(effect, mj_model, self.model, self.substeps)
@@ -212,15 +210,19 @@ class Physics:
         """The model with this world's parameters."""
         return self.model.tree_replace(world.fields) if world.fields else self.model
 
-    def data_of(self, world: World, template: mjx.Data | None = None) -> mjx.Data:
+    def data_of(self, world: World) -> mjx.Data:
         """`mjx.Data` in this world's state; everything derived from the state is the template's (not this state's)."""
-        return (self.template if template is None else template).replace(
-            qpos=world.qpos, qvel=world.qvel, act=world.act, qacc_warmstart=world.warmstart, time=world.time
-        )
+        return self.template.replace(**state_of(world))
 
     def kinematics(self, world: World) -> mjx.Data:
         """`mjx.Data` with the poses and velocities of all bodies in this world's state; no contacts, no forces."""
         return _poses(self.model_of(world), self.data_of(world))
+
+
+def state_of(world: World) -> dict[str, jax.Array]:
+    """MuJoCo's state, by the names of `mjx.Data`."""
+    own = {"qpos": world.qpos, "qvel": world.qvel, "act": world.act, "time": world.time}
+    return own | {"qacc_warmstart": world.warmstart}
 
 
 @jax.jit  # a reset outside of any program would compile hundreds

@@ -17,8 +17,8 @@ from bayessim_mjx.effects.support.site import under_tendon_limit
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.physics.drive import Drive
 from bayessim_mjx.physics.gates import chained_in
-from bayessim_mjx.physics.model import Physics, World
-from bayessim_mjx.physics.pushed import apart, together
+from bayessim_mjx.physics.model import Physics, World, state_of
+from bayessim_mjx.physics.pushed import Memory, apart, together
 from bayessim_mjx.physics.timestep import early, substep
 
 
@@ -47,22 +47,16 @@ def control_step(
 
 def _control_step(physics: Physics, world: World, command: jax.Array, drive: Drive) -> tuple[World, mjx.Data]:
     _refuse(physics, drive)
-    warp, thetas = physics.warp, physics.split(world.theta)[1]
-    model = physics.model_of(world) if warp is None else warp.model_of(world.fields)
+    thetas = physics.split(world.theta)[1]
     commands = jnp.broadcast_to(command, (physics.substeps, physics.mj_model.nu))
     memory, commands = _commanded(physics, thetas, world.memory, commands, drive.active)
-
-    def body(carry: tuple, ctrl: jax.Array) -> tuple[tuple, None]:
-        data, remembered = carry
-        return substep(physics, model, data.replace(ctrl=ctrl), remembered, thetas, world.measurement, drive), None
-
-    start = (physics.data_of(world, None if warp is None else warp.data), (memory, apart(physics, world.forces)))
-    end, _ = (
-        body(start, commands[0])
-        if physics.substeps == 1
-        else jax.lax.scan(body, start, commands, unroll=physics.unroll)
-    )
-    data, (final, rows) = end
+    carry = memory, apart(physics, world.forces)
+    if physics.warp is None:
+        model, start = physics.model_of(world), physics.data_of(world)
+        data, (final, rows) = _timesteps(physics, model, start, commands, carry, thetas, world.measurement, drive)
+    else:
+        data = physics.warp.together(functools.partial(_by_warp, physics), world.fields, state_of(world), commands)
+        final, rows = carry  # no effect acts inside
     remembered, measurement = physics.sense(thetas, final, {"qpos": data.qpos, "qvel": data.qvel}, drive.active)
     world = world.replace(
         qpos=data.qpos,
@@ -75,6 +69,26 @@ def _control_step(physics: Physics, world: World, command: jax.Array, drive: Dri
         measurement=measurement,
     )
     return world, data
+
+
+def _timesteps(
+    physics: Physics, model: mjx.Model, start: mjx.Data, commands: jax.Array, carry: Memory, *given: Any
+) -> tuple[mjx.Data, Memory]:
+    """(data, (memories, forces)) after a timestep for each row of commands; given: the rest of what `substep` takes."""
+
+    def body(carry: tuple, ctrl: jax.Array) -> tuple[tuple, None]:
+        data, own = carry
+        return substep(physics, model, data.replace(ctrl=ctrl), own, *given), None
+
+    if physics.substeps == 1:
+        return body((start, carry), commands[0])[0]
+    return jax.lax.scan(body, (start, carry), commands, unroll=physics.unroll)[0]
+
+
+def _by_warp(physics: Physics, scratch: mjx.Data, fields: dict, state: dict, commands: jax.Array) -> mjx.Data:
+    """`_timesteps` of Warp, from MuJoCo's state in the data `scratch`."""
+    model = physics.warp.model_of(fields)  # type: ignore[union-attr]  # there is one, or nobody asks for this
+    return _timesteps(physics, model, scratch.replace(**state), commands, ((), ()), (), {})[0]
 
 
 def _commanded(

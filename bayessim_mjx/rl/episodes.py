@@ -7,8 +7,9 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from bayessim_mjx.physics.warp import OVERFLOW
 from bayessim_mjx.rl.sharding import FIRST
-from bayessim_mjx.rollout.collection import TERM
+from bayessim_mjx.rollout.collection import TERM, kept
 
 WINDOW = 100
 
@@ -72,10 +73,14 @@ def metrics(episodes: Episodes) -> dict[str, jax.Array]:
 
 
 def tags_of_terms(metrics: dict[str, Any]) -> dict[str, str]:
-    """{tag: metric} of the parts of the reward among a task's metrics."""
-    return {f"Reward/{name.removeprefix(TERM)}": name for name in metrics if name.startswith(TERM)}
+    """{tag: metric} of those of a task's metrics that collection keeps."""
+    return {_tag(name): name for name in metrics if kept(name)}
+
+
+def _tag(name: str) -> str:
+    return f"Train/{name}" if name == OVERFLOW else f"Reward/{name.removeprefix(TERM)}"
 
 
 def terms(data: dict[str, Any]) -> dict[str, jax.Array]:
-    """Mean per step of each part of the reward that the task tells of, of what was collected."""
+    """Mean per step of each of these metrics, of what was collected."""
     return {tag: data["terms"][name].mean() for tag, name in tags_of_terms(data["terms"]).items()}

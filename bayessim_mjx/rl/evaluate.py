@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from bayessim_mjx.compat import program
+from bayessim_mjx.physics.warp import OVERFLOW, refuse_overflow
 from bayessim_mjx.rl.networks import Policy
 from bayessim_mjx.rollout import traced
 
@@ -32,11 +33,12 @@ def evaluate(
 
     Raises:
         ValueError: thetas' shape.
+        UserError: contacts had no room (`physics.warp`).
     """
     thetas = jnp.asarray(thetas, jnp.float32)
     if thetas.ndim != 2:
         raise ValueError(f"thetas has shape {thetas.shape}: expected [episodes, parameters]")
-    return _evaluate(env)(dataclasses.replace(policy, deterministic=deterministic), key, thetas)
+    return _sound(_evaluate(env)(dataclasses.replace(policy, deterministic=deterministic), key, thetas))
 
 
 def evaluate_together(
@@ -53,12 +55,20 @@ def evaluate_together(
 
     Raises:
         ValueError: the policies' networks differ, or thetas' shape.
+        UserError: as `evaluate`.
     """
     thetas = jnp.asarray(thetas, jnp.float32)
     if thetas.ndim != 3 or len(thetas) != len(policies):
         raise ValueError(f"thetas has shape {thetas.shape}: expected [{len(policies)} policies, episodes, parameters]")
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *policies)
-    return _evaluate_together(env)(dataclasses.replace(stacked, deterministic=deterministic), key, thetas)
+    return _sound(_evaluate_together(env)(dataclasses.replace(stacked, deterministic=deterministic), key, thetas))
+
+
+def _sound(found: dict[str, jax.Array]) -> dict[str, jax.Array]:
+    """What was found, where all contacts had room."""
+    if (lost := found.pop(OVERFLOW, None)) is not None:
+        refuse_overflow(lost.mean(), "the episodes that were evaluated")
+    return found
 
 
 @lru_cache(maxsize=32)
@@ -81,14 +91,16 @@ def _episodes(env: Env) -> Callable[..., dict[str, jax.Array]]:
             return (carry[0] < env.episode_length) & carry[2].any()
 
         def step(carry: tuple) -> Any:
-            t, state, alive, total, length = carry
+            t, state, alive, total, length, lost = carry
             state = jax.vmap(traced(env.step))(state, policy(jax.random.fold_in(key, t), state.obs))
             total, length = total + jnp.where(alive, state.reward, 0.0), length + alive
             ended = state.info["terminated"] + state.info["truncated"] > 0
-            return t + 1, state, alive & ~ended, total, length
+            lost = {name: jnp.maximum(most, state.metrics[name]) for name, most in lost.items()}
+            return t + 1, state, alive & ~ended, total, length, lost
 
-        carry = (jnp.int32(0), state, jnp.ones(count, bool), jnp.zeros(count), jnp.zeros(count, jnp.int32))
-        _, _, _, total, length = jax.lax.while_loop(going, step, carry)
-        return {"return": total, "length": length}
+        lost = {OVERFLOW: jnp.zeros(count)} if OVERFLOW in getattr(state, "metrics", {}) else {}
+        carry = (jnp.int32(0), state, jnp.ones(count, bool), jnp.zeros(count), jnp.zeros(count, jnp.int32), lost)
+        _, _, _, total, length, lost = jax.lax.while_loop(going, step, carry)
+        return {"return": total, "length": length} | lost
 
     return run

@@ -17,6 +17,7 @@ from bayessim_mjx.compat import program
 from bayessim_mjx.config import PPOConfig
 from bayessim_mjx.device import cores
 from bayessim_mjx.errors import DivergedError, UserError
+from bayessim_mjx.physics.warp import OVERFLOW, refuse_overflow
 from bayessim_mjx.rl import catalogue, checks, distil, episodes, ppo, sharding
 from bayessim_mjx.rl.networks import Policy
 from bayessim_mjx.rl.state import TrainState, policy_of
@@ -136,6 +137,7 @@ def run(
 
     Raises:
         DivergedError: the loss is no longer finite.
+        UserError: contacts had no room (`physics.warp`).
     """
     total = config.max_iterations if iterations is None else iterations
     state = sharding.put(state, state.mesh, ppo.layout(state))  # the caller's state stays valid
@@ -153,6 +155,7 @@ def run(
                 f"the loss is not finite after iteration {int(state.iteration)} ({metrics}): check that the task's "
                 "observations and rewards stay finite over the whole domain, and lower ppo.learning_rate"
             )
+        refuse_overflow(metrics.get(f"Train/{OVERFLOW}", 0.0), f"the steps before iteration {int(state.iteration)}")
         metrics["Perf/total_fps"] = count * config.num_envs * config.num_steps / seconds
         metrics["Perf/iteration_time"] = seconds / count
         if progress is not None:

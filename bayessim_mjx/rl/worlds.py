@@ -56,6 +56,11 @@ def reset_at(env: Env, key: jax.Array, thetas: jax.Array, mesh: Mesh | None = No
     return sharding.local(jax.vmap(traced(env.reset)), mesh, (FIRST,) * len(given), FIRST)(*given)
 
 
+def held(env: Env, state: State, thetas: jax.Array) -> jax.Array:
+    """Parameters `[N, d]` of worlds whose `thetas` were drawn: schedules, and those that last, make them others."""
+    return thetas if getattr(env, "nuisance", None) is None else state.pipeline_state.theta
+
+
 def clock(env: Env, env_states: State) -> jax.Array:
     """Control steps of each world since training began; 0 where nothing goes by them."""
     if getattr(env, "nuisance", None) is None:

@@ -11,12 +11,18 @@ import jax
 import jax.numpy as jnp
 from jax.interpreters import partial_eval
 
+from bayessim_mjx.physics.warp import OVERFLOW
 from bayessim_mjx.rollout.episodes import PolicyFn, select, traced
 
 if TYPE_CHECKING:
     from bayessim_mjx.env import Env, State
 
 TERM = "reward_"  # how metrics are called that are parts of the reward
+
+
+def kept(name: str) -> bool:
+    """Whether collection keeps the metric: parts of the reward, and what the physics could not simulate."""
+    return name.startswith(TERM) or name == OVERFLOW
 
 
 def collect(
@@ -41,8 +47,8 @@ def collect(
 
     Returns:
         (the last states, time-major arrays [T, N, ...]): observation and final_observation (the next one, before any
-        reset) by group, reward, terminated, truncated, extras, and terms (metrics that are parts of the reward). What
-        later steps do not depend on is not carried on: it stays in the states as it was.
+        reset) by group, reward, terminated, truncated, extras, and terms (metrics that are `kept`). What later steps do
+        not depend on is not carried on: it stays in the states as it was.
     """
     worlds = env_states.reward.shape[0]
     size, lasting = ring(worlds), _lasting(env, env_states, tuple(groups))
@@ -62,7 +68,7 @@ def collect(
             "terminated": terminated,
             "truncated": truncated,
             "extras": extras,
-            "terms": {name: x for name, x in getattr(after, "metrics", {}).items() if name.startswith(TERM)},
+            "terms": {name: x for name, x in getattr(after, "metrics", {}).items() if kept(name)},
         }
         following = first + (index - first + stride) % size
         fresh = jax.tree.map(lambda lasts, new: new[index] if lasts else new, lasting, pool)

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from bayessim_mjx.compat import program
+from bayessim_mjx.physics.warp import OVERFLOW
 
 if TYPE_CHECKING:
     from bayessim_mjx.env import Env, State
@@ -60,7 +61,8 @@ def traced(function: Callable[..., Any]) -> Callable[..., Any]:
 def rollout(env: Env, policy_fn: PolicyFn, key: jax.Array, thetas: jax.Array, length: int) -> Trajectory:
     """One episode of at most `length` steps in each of N worlds; all fields with a leading N.
 
-    Compiled once per (env, function, length, N): another key, theta or policy of its kind reuses it.
+    Compiled once per (env, function, length, N): another key, theta or policy of its kind reuses it. Where contacts had
+    no room (`physics.warp`), no observation is a number: all worlds stood still from there on.
 
     Args:
         env: any environment.
@@ -101,15 +103,19 @@ def _rollout(env: Env, length: int) -> Callable[..., Trajectory]:
                 alive.astype(jnp.float32),
                 _command(env, state, action),
             )
-            return (after, alive & (terminated + truncated == 0), action), (row, _seen(after))
+            counted = getattr(after, "metrics", {}).get(OVERFLOW)
+            lost = None if counted is None else counted.max()
+            return (after, alive & (terminated + truncated == 0), action), (row, _seen(after), lost)
 
         keys = jax.vmap(lambda k: jax.random.split(k, worlds))(jax.random.split(key, length))
         carry = (state, jnp.ones(worlds, bool), jnp.zeros((worlds, env.action_size)))
-        _, (rows, seen) = jax.lax.scan(step, carry, keys)
+        _, (rows, seen, lost) = jax.lax.scan(step, carry, keys)
         seen = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), _seen(state), seen)
         (action, reward, terminated, truncated, valid, command), (observation, qpos, qvel) = jax.tree.map(
             lambda x: jnp.moveaxis(x, 0, 1), (rows, seen)
         )
+        if lost is not None:
+            observation = jnp.where(jnp.max(lost) > 0, jnp.nan, observation)
         return Trajectory(observation, action, reward, terminated, truncated, valid, thetas, qpos, qvel, command)
 
     return program(run, env)

@@ -175,7 +175,8 @@ def ours(task: Any, domain: Any = None, **env_settings: Any) -> Under:
 def train(task: Any, domain: Any = None, **settings: Any) -> tuple[Any, Any, dict]:
     """Brax's PPO on `ours(task, domain)`: (function that makes a policy of parameters, parameters, metrics).
 
-    Every episode begins anew, with its own physics. `settings` are those of `brax.training.agents.ppo.train.train`;
+    Every episode begins anew, with its own physics. Schedules begin with training; in evaluations they are over.
+    `settings` are those of `brax.training.agents.ppo.train.train`;
     `episode_length` is the task's own unless given.
     """
     from brax.training.agents.ppo import train as ppo
@@ -183,4 +184,6 @@ def train(task: Any, domain: Any = None, **settings: Any) -> tuple[Any, Any, dic
     from bayessim_mjx.wrappers.fresh import wrap
 
     env = task if isinstance(task, Env) and domain is None else ours(task, domain)
-    return ppo.train(environment=env, wrap_env_fn=wrap, **({"episode_length": env.episode_length} | settings))
+    judged = Under(env.env, env.domain, True) if isinstance(env, Under) else Under(env, None, True)
+    own = {"episode_length": env.episode_length, "eval_env": judged}
+    return ppo.train(environment=env, wrap_env_fn=wrap, **(own | settings))

@@ -15,6 +15,7 @@ from flax import struct
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.env import Env, State
 from bayessim_mjx.errors import UserError
+from bayessim_mjx.parameters.schedule import OVER
 from bayessim_mjx.rl.worlds import clock, drawn, reset_at
 from bayessim_mjx.rollout import next_episodes, select
 from bayessim_mjx.wrappers.under import Under
@@ -70,6 +71,7 @@ class FreshEpisodes(Wrapper):
         super().__init__(env)
         self._source: Env = source.env if isinstance(source, Under) else source
         self._domain: Distribution | None = source.domain if isinstance(source, Under) else None
+        self._begins = OVER if isinstance(source, Under) and source.schedules_over else 0  # the clock of schedules
 
     def _drawn(self, key: jax.Array, count: int, now: Any = 0) -> State:
         theta_key, reset_key = jax.random.split(key)
@@ -78,7 +80,12 @@ class FreshEpisodes(Wrapper):
     def reset(self, rng: jax.Array) -> Any:
         state: Any = self.env.reset(rng)
         key, first = jax.random.split(jax.random.fold_in(rng[0], 1))
-        later = self._drawn(first, rng.shape[0])
+        if getattr(self._source, "nuisance", None) is not None:  # by the clock, which a reset alone does not know
+            key, own = jax.random.split(key)
+            begun = self._drawn(own, rng.shape[0], self._begins)
+            seen = {"pipeline_state": begun.pipeline_state, "obs": begun.obs}
+            state = state.replace(**seen, info={**state.info, OURS: begun.info})
+        later = self._drawn(first, rng.shape[0], self._begins)
         store = Store(key, later, jnp.zeros(rng.shape[0], bool))
         return state.replace(info={**state.info, STORE: store})
 

@@ -18,6 +18,8 @@ from bayessim_mjx import registry
 from bayessim_mjx.compat import program
 from bayessim_mjx.env import Env
 from bayessim_mjx.errors import UserError
+from bayessim_mjx.physics.warp import OVERFLOW, refuse_overflow
+from bayessim_mjx.rl.worlds import clock, held, reset_at
 from bayessim_mjx.rollout import next_episodes, select
 from bayessim_mjx.wrappers.pictures import Camera
 from bayessim_mjx.wrappers.spaces import boxes
@@ -38,7 +40,7 @@ def make(
         domain: as for `make_vec`.
         env_settings: settings of `env:`, e.g. `episodeLength=100`.
     """
-    env = registry.make(task, **env_settings)
+    env = registry.make(task, numEnvs=1, **env_settings)
     return GymnasiumEnv(env, theta, render_mode, domain_of(env, domain))
 
 
@@ -60,7 +62,7 @@ def make_vec(
         autoreset_mode, render_mode: see `GymnasiumVectorEnv`.
         env_settings: settings of `env:`, e.g. `episodeLength=100`.
     """
-    env = registry.make(task, **env_settings)
+    env = registry.make(task, numEnvs=num_envs, **env_settings)
     return GymnasiumVectorEnv(env, num_envs, domain_of(env, domain), autoreset_mode, render_mode)
 
 
@@ -87,6 +89,11 @@ def _theta(env: Env, theta: Any, rows: tuple[int, ...] = ()) -> np.ndarray:
     return value
 
 
+def _now(env: Env, state: Any) -> jax.Array:
+    """Control steps since the first reset, which schedules go by."""
+    return jnp.int32(0) if state is None else clock(env, state)
+
+
 def _options(options: Mapping[str, Any] | None, allowed: tuple[str, ...]) -> dict[str, Any]:
     given = dict(options or {})
     for key in given:
@@ -109,8 +116,14 @@ class GymnasiumEnv(gymnasium.Env):
         self.metadata = _metadata(env, render_mode)
         self.observation_space, self.action_space = boxes(env)
         self._theta = _theta(env, env.space.nominal if theta is None else theta)
-        self._reset, self._step, self._camera = program(env.reset, env), program(env.step, env), Camera(env)
+        self._reset, self._step, self._camera = program(self._begun, env), program(env.step, env), Camera(env)
         self._state: Any = None
+
+    def _begun(self, key: jax.Array, theta: jax.Array, now: Any) -> Any:
+        """A new episode; schedules go by the steps `now` of all episodes before it."""
+        if getattr(self.env, "nuisance", None) is None:
+            return self.env.reset(key, theta)
+        return jax.tree.map(lambda x: x[0], reset_at(self.env, key, theta[None], None, now))
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
         super().reset(seed=seed)
@@ -121,7 +134,7 @@ class GymnasiumEnv(gymnasium.Env):
         if self._domain is not None:
             key, theta_key = jax.random.split(key)
             self._theta = np.asarray(self._domain.sample(theta_key, 1)[0], np.float32)
-        self._state = self._reset(key, self._theta)
+        self._state = self._reset(key, self._theta, _now(self.env, self._state))
         return np.array(self._state.obs["policy"]), {"theta": np.array(self._theta)}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
@@ -187,18 +200,19 @@ class GymnasiumVectorEnv(VectorEnv):
         self._given = np.zeros((self.num_envs, len(env.space.nominal)), np.float32), np.zeros(self.num_envs, bool)
         self._thetas = self._given[0]
 
-    def _fresh(self, key: jax.Array, domain: Any, given: tuple) -> tuple[Any, jax.Array]:
+    def _fresh(self, key: jax.Array, domain: Any, given: tuple, now: Any) -> tuple[Any, jax.Array]:
         theta_key, reset_key = jax.random.split(key)
         nominal = jnp.asarray(self.env.space.nominal, jnp.float32)
         thetas = jnp.tile(nominal, (self.num_envs, 1)) if domain is None else domain.sample(theta_key, self.num_envs)
         thetas = jnp.where(given[1][:, None], given[0], thetas)
-        return jax.vmap(self.env.reset)(jax.random.split(reset_key, self.num_envs), thetas), thetas
+        state = reset_at(self.env, reset_key, thetas, None, now)
+        return state, held(self.env, state, thetas)
 
     def _restarted(
-        self, key: jax.Array, old: tuple | None, mask: jax.Array, domain: Any, given: tuple
+        self, key: jax.Array, old: tuple | None, mask: jax.Array, domain: Any, given: tuple, now: Any
     ) -> tuple[Any, jax.Array]:
-        """(state, thetas) with the worlds in `mask` begun anew."""
-        fresh = self._fresh(key, domain, given)
+        """(state, thetas) with the worlds in `mask` begun anew, `now` control steps after the first reset."""
+        fresh = self._fresh(key, domain, given, now)
         return fresh if old is None else select(mask, fresh, old)
 
     def _advanced(
@@ -210,11 +224,9 @@ class GymnasiumVectorEnv(VectorEnv):
         if self.mode is DISABLED:
             return after, (after, thetas)
         again = ended if self.mode is NEXT else after.info["terminated"] + after.info["truncated"] > 0
-        fresh, drawn = self._fresh(key, domain, given)
+        fresh, drawn = self._fresh(key, domain, given, clock(self.env, state))
         fresh = next_episodes(self.env, again, after, fresh)
-        if getattr(self.env, "nuisance", None) is not None:  # where parameters last, these are the old ones
-            drawn = fresh.pipeline_state.theta
-        begun = select(again, (fresh, drawn), (after, thetas))
+        begun = select(again, (fresh, held(self.env, fresh, drawn)), (after, thetas))
         return (begun[0] if self.mode is NEXT else after), begun
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
@@ -229,7 +241,8 @@ class GymnasiumVectorEnv(VectorEnv):
             self._key = jax.random.PRNGKey(int(self.np_random.integers(2**31)))
         self._key, key = jax.random.split(self._key)
         before = None if mask.all() else (self._state, self._thetas)
-        self._state, self._thetas = self._reset(key, before, mask, self._domain, self._given)
+        now = _now(self.env, self._state)
+        self._state, self._thetas = self._reset(key, before, mask, self._domain, self._given, now)
         self._ended = self._ended & ~mask
         return np.array(self._state.obs["policy"]), {"theta": np.array(self._thetas), "_theta": mask}
 
@@ -252,6 +265,7 @@ class GymnasiumVectorEnv(VectorEnv):
         old, acted = (self._state, self._thetas), jnp.asarray(actions, jnp.float32)
         after, (self._state, self._thetas) = self._step(key, old, self._ended, acted, self._domain, self._given)
         terminated, truncated = (np.asarray(after.info[name]) > 0 for name in ("terminated", "truncated"))
+        refuse_overflow(np.mean(after.metrics.get(OVERFLOW, 0.0)), "the worlds in this step")
         reward = np.array(after.reward)
         if self.mode is NEXT:
             reward[self._ended] = 0.0

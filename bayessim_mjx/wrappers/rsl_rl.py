@@ -96,8 +96,10 @@ class PPO(algorithms.PPO):
     def process_env_step(self, obs: Any, rewards: Any, dones: Any, extras: dict[str, Any]) -> None:
         late, last = extras.get("time_outs"), extras.get("final_observations")
         if late is not None and last is not None and bool(late.any()):
+            memory = self.critic.get_hidden_state()  # of all worlds; what follows is a look ahead
             with torch().no_grad():
                 values = self.critic(last.to(self.device)) - self.transition.values  # what rsl_rl adds is in the second
+            self.critic.reset(hidden_state=memory)
             rewards = rewards + self.gamma * values.squeeze(1) * late.to(self.device)
         super().process_env_step(obs, rewards, dones, extras)
 

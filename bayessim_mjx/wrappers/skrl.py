@@ -1,7 +1,8 @@
 """Our worlds as environments of skrl, for its JAX agents (`make`) and its PyTorch ones (`make(..., library="torch")`).
 
-The group "policy" is the observation; the group "critic", where a task has one, is the state. The last observations of
-ended episodes are `info["final_observation"]`.
+The group "policy" is the observation; the group "critic", where a task has one, is the state. What the step itself led
+to are `info["final_observation"]` and `info["final_state"]`. skrl's trainers take the next observation for that, which
+is the first one of a new episode where an episode ended: `told_true_ends(runner.agent)` corrects it.
 """
 
 from typing import Any
@@ -87,6 +88,8 @@ class _Env:
         self._obs = batch.obs
         columns = (self._out(x.reshape(-1, 1)) for x in (batch.reward, batch.terminated, batch.truncated))
         info = {"final_observation": self._flat(batch.final["policy"])}
+        if "critic" in batch.final:
+            info["final_state"] = self._flat(batch.final["critic"])
         return self._flat(batch.obs["policy"]), *columns, info
 
     def state(self) -> Any:
@@ -137,6 +140,22 @@ def _torch_env() -> type:
             return to_jax(x, self._obs["policy"].devices().pop())
 
     return TorchEnv
+
+
+def told_true_ends(agent: Any) -> Any:
+    """The agent of skrl, which learns of what each step led to in place of a new episode's first observation.
+
+    Its PPO adds the value of that observation where a time limit ended an episode (`time_limit_bootstrap`). Nothing
+    else changes: after an end no value of the next observation is used.
+    """
+    record = agent.record_transition
+
+    def recorded(*, infos: dict, next_observations: Any, next_states: Any, **given: Any) -> None:
+        true = infos["final_observation"], infos.get("final_state", next_states)
+        record(infos=infos, next_observations=true[0], next_states=true[1], **given)
+
+    agent.record_transition = recorded
+    return agent
 
 
 def settings(timesteps: int, folder: str = "logs/skrl", **changes: Any) -> dict[str, Any]:

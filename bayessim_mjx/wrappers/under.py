@@ -11,10 +11,14 @@ from bayessim_mjx.parameters import ParameterSpace
 
 
 class Under(Env):
-    """`env` under `domain`: a reset without theta draws it (domain None: the nominal one)."""
+    """`env` under `domain`: a reset without theta draws it (domain None: the nominal one).
 
-    def __init__(self, env: Env, domain: Distribution | None) -> None:
-        self.env, self.domain = env, domain
+    In its own resets all schedules are over. `wrappers.fresh.wrap` begins them at its first reset, but where
+    `schedules_over`, as evaluations want it.
+    """
+
+    def __init__(self, env: Env, domain: Distribution | None, schedules_over: bool = False) -> None:
+        self.env, self.domain, self.schedules_over = env, domain, schedules_over
         self.name, self.episode_length = env.name, env.episode_length
         self.mirrors, self.nuisance = env.mirrors, env.nuisance
 

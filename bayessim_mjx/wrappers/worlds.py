@@ -24,7 +24,8 @@ from bayessim_mjx.compat import program
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.env import Env, Observations
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.rl.worlds import aged, clock, drawn, reset_at
+from bayessim_mjx.physics.warp import OVERFLOW, refuse_overflow
+from bayessim_mjx.rl.worlds import aged, clock, drawn, held, reset_at
 from bayessim_mjx.rollout import next_episodes, select, traced
 
 
@@ -76,7 +77,8 @@ class Worlds:
         reward_scale: factor on the rewards that a learner sees.
 
     Raises:
-        UserError: `num_envs` below 1; a step before the first reset; actions or theta of another shape.
+        UserError: `num_envs` below 1; a step before the first reset, or after one without room for contacts; actions or
+            theta of another shape.
     """
 
     def __init__(
@@ -89,6 +91,7 @@ class Worlds:
         self._begin, self._advance = _programs(env, self.num_envs, self.reward_scale)
         self._running: _Running | None = None
         self.watch: Callable[[Batch], None] | None = None  # is shown every batch
+        self._lost: Any = 0.0  # metric of the last step; looked at before the next one, as the host would wait now
         self._fixed: jax.Array | None = None  # theta [N, d] that `set_theta` gave
 
     def seed(self, seed: int) -> None:
@@ -127,9 +130,11 @@ class Worlds:
         """One control step with `action` `[N, A]` in [-1, 1]."""
         if self._running is None:
             raise UserError("step before reset: call reset() first")
+        refuse_overflow(self._lost, "the worlds in the step before")
         if tuple(action.shape) != (expected := (self.num_envs, self.env.action_size)):
             raise UserError(f"actions have shape {list(action.shape)}; expected {list(expected)}")
         batch, self._running, self._key = self._advance(self._key, self._running, action, self.domain, self._fixed)
+        self._lost = batch.metrics[OVERFLOW].mean() if OVERFLOW in batch.metrics else 0.0
         if self.watch is not None:
             self.watch(batch)
         return batch
@@ -170,7 +175,8 @@ class _Steps:
     def episodes(self, key: jax.Array, domain: Any, fixed: jax.Array | None, now: Any = 0) -> tuple[Any, jax.Array]:
         theta_key, reset_key = jax.random.split(key)
         theta = drawn(self.env, theta_key, domain, self.num_envs) if fixed is None else fixed
-        return reset_at(self.env, reset_key, theta, None, now), theta
+        state = reset_at(self.env, reset_key, theta, None, now)
+        return state, held(self.env, state, theta)
 
     def began(self, key: jax.Array, domain: Any, fixed: jax.Array | None) -> _Running:
         first, later = (self.episodes(k, domain, fixed) for k in jax.random.split(key))
@@ -193,9 +199,7 @@ class _Steps:
         store = jax.lax.cond(empty, lambda: _as(renew(), old.store), lambda: old.store)
         fresh, theta = store
         fresh = next_episodes(self.env, ended, after, fresh)
-        if getattr(self.env, "nuisance", None) is not None:  # where parameters last, these are the old ones
-            theta = fresh.pipeline_state.theta
-        state, theta = select(ended, (fresh, theta), (after, old.theta))
+        state, theta = select(ended, (fresh, held(self.env, fresh, theta)), (after, old.theta))
         reward, metrics = self.reward_scale * after.reward, dict(after.metrics)
         batch = Batch(state.obs, reward, terminated, truncated, after.obs, returns, lengths, metrics, theta)
         returns, lengths = jnp.where(ended, 0.0, returns), jnp.where(ended, 0, lengths)
@@ -230,20 +234,20 @@ def worlds(task: Any, num_envs: int = 64, domain: Any = None, seed: int = 0, **e
     Raises:
         UserError: a task, run or file that there is not; a distribution over other parameters.
     """
-    return Worlds(*environment(task, domain, env_settings), num_envs=num_envs, seed=seed)
+    return Worlds(*environment(task, domain, env_settings, num_envs), num_envs=num_envs, seed=seed)
 
 
 def environment(
-    task: Any, domain: Any = None, env_settings: Mapping[str, Any] | None = None
+    task: Any, domain: Any = None, env_settings: Mapping[str, Any] | None = None, num_envs: int | None = None
 ) -> tuple[Env, Distribution | None]:
-    """(environment, distribution over its theta) that `worlds` is asked for."""
-    settings = dict(env_settings or {})
+    """(environment, distribution over its theta) that `worlds` is asked for; num_envs: what `impl="auto"` goes by."""
+    settings, together = dict(env_settings or {}), {} if num_envs is None else {"numEnvs": num_envs}
     if isinstance(task, Path) or (isinstance(task, str) and Path(task).is_dir()):
         config, checkpoint = run_of(task)
-        env = registry.make(config.task, config=config, **settings)
+        env = registry.make(config.task, config=config, **settings | together)
         return env, domain_of(env, checkpoint if domain is None else domain)
     if isinstance(task, str):
-        env = registry.make(task, **settings)
+        env = registry.make(task, **settings | together)
     elif settings:
         raise UserError(f"{next(iter(settings))}: settings go with a task's name, not with an environment")
     else:

@@ -129,6 +129,22 @@ def test_wandb_gets_pictures_and_videos(tmp_path, monkeypatch):
     ]
 
 
+def test_a_video_that_could_not_be_saved_is_not_logged(tmp_path, monkeypatch):
+    """Neither as a file that is missing nor as the one before it."""
+    from bayessim_mjx.monitor import video
+
+    fake, saved = Fake(), []
+    monkeypatch.setitem(sys.modules, "wandb", fake)
+    writer = opened(tmp_path / "rl", more=("wandb",), run=tmp_path)
+    save = video.save
+    monkeypatch.setattr(video, "save", lambda *given: save(*given) if saved.append(given) or len(saved) == 1 else False)
+    for step in (1, 2):
+        writer.video("Train/video", np.zeros((4, 24, 32, 3), np.uint8), 25, step)
+    writer.close()
+    steps = [row["rl/step"] for row in fake.logged]
+    assert steps == [1] and any(given[1].name.startswith(".wandb") for given in saved)
+
+
 def test_wandb_that_is_not_there_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "wandb", None)
     with pytest.raises(UserError, match=r"pip install 'bayessim-mjx\[wandb\]'"):

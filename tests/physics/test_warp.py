@@ -19,6 +19,13 @@ from bayessim_mjx.physics.warp import wrenches
 INSTALLED = importlib.util.find_spec("warp") is not None
 
 
+def warp(test):
+    """Of those that simulate by Warp on the CPU: their seconds are those of compiling its kernels."""
+    return pytest.mark.slow(
+        pytest.mark.ci(pytest.mark.skipif(not INSTALLED, reason="warp-lang is not installed")(test))
+    )
+
+
 @pytest.mark.skipif(INSTALLED, reason="warp-lang is installed")
 def test_without_the_package_the_extra_is_named():
     with pytest.raises(UserError, match=r"env.impl = 'warp'.*bayessim-mjx\[warp\]"):
@@ -57,8 +64,7 @@ def motions(env, thetas, steps=5):
     return jax.jit(jax.vmap(one))(thetas, jax.random.split(jax.random.PRNGKey(0), len(thetas)))
 
 
-@pytest.mark.slow
-@pytest.mark.skipif(not INSTALLED, reason="warp-lang is not installed")
+@warp
 @pytest.mark.parametrize("name", ["Pendulum", "Cartpole"])
 def test_the_motion_is_that_of_the_other_implementation(name):
     """In every world that of its own parameters, and a delay on the way to the actuators acts as well."""
@@ -71,8 +77,7 @@ def test_the_motion_is_that_of_the_other_implementation(name):
     assert np.ptp(expected[:, -1], axis=0).max() > 0.1  # worlds differ
 
 
-@pytest.mark.slow
-@pytest.mark.skipif(not INSTALLED, reason="warp-lang is not installed")
+@warp
 def test_a_humanoid_moves_as_in_mujoco_once_its_solver_has_converged():
     """Four iterations, as the task allows, end elsewhere in MuJoCo too; Warp's go on until they have converged."""
     worlds, steps = 4, 10
@@ -100,8 +105,7 @@ def test_a_humanoid_moves_as_in_mujoco_once_its_solver_has_converged():
     assert np.median(many) < 1e-3 < np.median(few) and np.all(many < 0.5 * few)
 
 
-@pytest.mark.slow
-@pytest.mark.skipif(not INSTALLED, reason="warp-lang is not installed")
+@warp
 def test_solvers_that_end_at_their_limit_print_nothing(capfd):
     """One line for a world and timestep each would be 180 000 of them in a training of Humanoid."""
     env = registry.make("Humanoid", impl="warp", numEnvs=8)
@@ -119,13 +123,12 @@ BALL = """
 """
 
 
-@pytest.mark.slow
-@pytest.mark.skipif(not INSTALLED, reason="warp-lang is not installed")
+@warp
 def test_contacts_of_many_worlds_and_what_they_carry():
     """A ball of 2 kg is carried by 2 g; pushed sidewise it rolls as in the other implementation, in every world."""
     model = mujoco.MjModel.from_xml_string(BALL)
-    ours, warp = (Physics(model, 0.02, ParameterSpace(), impl=impl, worlds=4) for impl in ("jax", "warp"))
-    assert warp.warp.room == 256  # one contact for each of the least number of worlds
+    ours, warp = (Physics(model, 0.02, ParameterSpace(), impl=impl) for impl in ("jax", "warp"))
+    assert warp.warp.room(4) == 256  # one contact for each of the least number of worlds
 
     def roll(physics, speed):
         def step(world, _):
@@ -142,17 +145,37 @@ def test_contacts_of_many_worlds_and_what_they_carry():
     assert qpos[2, -1, 0] > 0.2
 
 
-@pytest.mark.slow
-@pytest.mark.skipif(not INSTALLED, reason="warp-lang is not installed")
-def test_where_contacts_have_no_room_worlds_diverge():
-    model = mujoco.MjModel.from_xml_string(BALL)
-    physics = Physics(model, 0.002, ParameterSpace(), impl="warp", worlds=1)
-    nominal = jnp.asarray(model.qpos0, jnp.float32)
-
-    def height(start):
-        world = physics.world(jnp.zeros(0), nominal.at[2].set(start))
+def height(physics):
+    def fall(start):
+        world = physics.world(jnp.zeros(0), jnp.asarray(physics.mj_model.qpos0, jnp.float32).at[2].set(start))
         return control_step(physics, world, jnp.zeros(0))[0].qpos[2]
 
-    step = jax.jit(jax.vmap(height))
-    assert np.isfinite(step(jnp.linspace(0.09, 0.095, 256))).all()
-    assert np.isnan(step(jnp.linspace(0.09, 0.095, 300))).all()
+    return fall
+
+
+@warp
+def test_as_many_worlds_have_room_as_vmap_makes_of_one():
+    """Nobody says how many: 300 on the ground, 2 by 200, and one; all touch it, and what carries them is found."""
+    physics = Physics(mujoco.MjModel.from_xml_string(BALL), 0.002, ParameterSpace(), impl="warp")
+    fall, one = height(physics), jnp.linspace(0.09, 0.095, 300)
+    many = jax.jit(jax.vmap(fall))(one)
+    assert np.isfinite(many).all() and np.ptp(many) > 0.004
+    grid = jax.vmap(jax.jit(jax.vmap(fall)))(jnp.stack([one[:200], one[100:]]))
+    np.testing.assert_allclose(grid, np.stack([many[:200], many[100:]]), atol=1e-6)
+    np.testing.assert_allclose(fall(one[7]), many[7], atol=1e-6)
+    shared = jax.vmap(lambda _: fall(one[7]))(jnp.arange(300))  # what is the same in all of them
+    np.testing.assert_allclose(shared, many[7], atol=1e-6)
+
+
+# two balls touch the ground, and the model has room for one contact
+CROWD = BALL.replace("<option", '<custom><numeric name="max_contact_points" data="1"/></custom><option').replace(
+    "</worldbody>", '<body pos="1 0 0.09"><freejoint/><geom type="sphere" size="0.1" mass="2"/></body></worldbody>'
+)
+
+
+@warp
+def test_where_contacts_have_no_room_worlds_diverge():
+    physics = Physics(mujoco.MjModel.from_xml_string(CROWD), 0.002, ParameterSpace(), impl="warp")
+    step = jax.jit(jax.vmap(height(physics)))
+    assert np.isfinite(step(jnp.full(128, 0.095))).all()
+    assert np.isnan(step(jnp.full(129, 0.095))).all()

@@ -1,7 +1,8 @@
 """Other libraries' PPO as agents of `train`: their networks as our policies, saved and taken up again."""
 
-import dataclasses
 import importlib.util
+import os
+import signal
 import sys
 from pathlib import Path
 
@@ -10,17 +11,17 @@ import numpy as np
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))
-from toys import Counter  # noqa: E402
+from toys import Counter, Plain  # noqa: E402
 
 from bayessim_mjx import play, registry, train  # noqa: E402
-from bayessim_mjx.config import PPOConfig, load, replace  # noqa: E402
+from bayessim_mjx.config import load, replace  # noqa: E402
 from bayessim_mjx.errors import UserError  # noqa: E402
 from bayessim_mjx.monitor.writers import read  # noqa: E402
 from bayessim_mjx.runs import Run, latest_run  # noqa: E402
 from bayessim_mjx.wrappers import agents  # noqa: E402
 from bayessim_mjx.wrappers.agents import networks  # noqa: E402
 
-ENV = Counter()
+ENVS = {"sb3": Plain(), "rsl_rl": Counter(), "skrl": Counter()}  # both networks of SB3 see the same
 NEEDED = {"sb3": "stable_baselines3", "rsl_rl": "rsl_rl", "skrl": "skrl"}
 TINY = [
     "env.numEnvs=8", "ppo.num_envs=8", "ppo.num_steps=8", "ppo.num_minibatches=2", "ppo.num_epochs=2",
@@ -35,7 +36,8 @@ def settings(agent, *more):
 def actions(agent, x):
     """What the library itself does at observations x, without noise."""
     if agent.__class__.__name__ == "SB3Agent":
-        return agent.model.predict(agent.env.normalize_obs(x), deterministic=True)[0]
+        seen = agent.env.normalize_obs(x) if hasattr(agent.env, "obs_rms") else x
+        return agent.model.predict(seen, deterministic=True)[0]
     if agent.__class__.__name__ == "RslRlAgent":
         import torch
         from tensordict import TensorDict
@@ -46,13 +48,14 @@ def actions(agent, x):
             seen = TensorDict({"policy": torch.from_numpy(x), "critic": torch.zeros(len(x), 6)}, batch_size=len(x))
             return runner.alg.get_policy()(seen).clamp(-1, 1).numpy()
     agent.agent.enable_training_mode(False)
-    return np.clip(agent.agent.act(jnp.asarray(x), None, timestep=0, timesteps=1)[1]["mean_actions"], -1, 1)
+    states = jnp.zeros((len(x), 6)) if agent.env.state_space else None
+    return np.clip(agent.agent.act(jnp.asarray(x), states, timestep=0, timesteps=1)[1]["mean_actions"], -1, 1)
 
 
 @pytest.mark.parametrize("name", NEEDED)
 def test_a_policy_of_ours_acts_as_the_librarys_network(name, tmp_path):
     pytest.importorskip(NEEDED[name])
-    agent = agents.make(settings(name), ENV, None)
+    agent = agents.make(settings(name), ENVS[name], None)
     found = agent.learn(2)
     assert agent.iteration == 2 and found["Train/mean_episode_length"] == 5.0
     assert found["Train/mean_reward"] == pytest.approx(5.0, abs=2.5)  # 1 + the action in each of 5 steps
@@ -61,7 +64,7 @@ def test_a_policy_of_ours_acts_as_the_librarys_network(name, tmp_path):
     ours = agent.policy()
     np.testing.assert_allclose(ours.act(None, jnp.asarray(x)), actions(agent, x), atol=2e-5)
     assert ours.actor["log_std"].shape == (1,) and abs(float(ours.actor["log_std"][0]) - np.log(0.5)) < 0.1
-    again = agents.make(settings(name, "seed=7"), ENV, None)
+    again = agents.make(settings(name, "seed=7"), ENVS[name], None)
     before = np.asarray(again.policy().act(None, jnp.asarray(x)))
     agent.save(tmp_path)
     again.load(tmp_path)
@@ -101,15 +104,6 @@ def test_what_a_library_has_not_is_refused_by_name(agent, takes, override, words
     agents.refuse(settings(agent), takes, activations)
 
 
-def test_every_setting_of_ppo_is_taken_over_or_refused():
-    """By name in each library's file; the others are read elsewhere, or mean nothing without a setting refused here."""
-    elsewhere = {"num_envs", "reward_scale", "max_iterations", "log_interval", "save_interval", "eval_episodes"}
-    fields = {field.name for field in dataclasses.fields(PPOConfig)} - elsewhere - {"memory_cell", "distil_loss"}
-    for name in NEEDED:
-        text = (Path(agents.__file__).parent / f"{name}.py").read_text()
-        assert {field for field in fields if f"ppo.{field}" not in text} <= set(agents.OURS), name
-
-
 def test_main_trains_with_our_own_ppo_alone(capsys):
     from bayessim_mjx.main import main
 
@@ -124,10 +118,10 @@ def test_an_agent_that_is_not_there_is_named():
 
 @pytest.fixture
 def counters(monkeypatch, tmp_path):
-    """Every task is the counter; runs lie in a folder of their own."""
+    """Every task is the counter without a critic's group; runs lie in a folder of their own."""
     monkeypatch.setenv("BAYESSIM_MJX_CACHE", "off")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(registry, "make", lambda name, **_: ENV)
+    monkeypatch.setattr(registry, "make", lambda name, **_: ENVS["sb3"])
 
 
 SHORT = ["--headless", "--max_iterations", "4", "ppo.save_interval=2", "ppo.log_interval=1", "ppo.eval_episodes=4"]
@@ -182,3 +176,74 @@ def test_what_cannot_train_leaves_no_run_folder(counters, monkeypatch, capsys):
         assert train.main(["--task", "Cartpole", "--agent", "skrl", "ppo.memory=4", "--headless"]) == 2
         assert "ppo.memory = 4: --agent skrl has no such thing" in capsys.readouterr().err
     assert not Path("logs").exists()
+
+
+class Steady:
+    """An agent without a library: its policy always gives 0, and its file says how often it was saved."""
+
+    def __init__(self, at=None):
+        self.iteration, self.saves, self.loaded, self.at = 0, 0, None, at or {}
+
+    def learn(self, iterations):
+        self.iteration += iterations
+        self.at.get(self.iteration, lambda: None)()
+        return {"Train/mean_reward": 5.0, "Train/mean_episode_length": 5.0, "Loss/value": 1.0}
+
+    def policy(self):
+        layers = [(np.zeros((3, 2)), np.zeros(2)), (np.zeros((2, 1)), np.zeros(1))]
+        return networks.policy(layers, np.zeros(1), settings("sb3").ppo)
+
+    def save(self, folder):
+        self.saves += 1
+        (folder / "first").write_text(str(self.saves))
+        self.at.get(f"save {self.saves}", lambda: None)()
+        (folder / "second").write_text(str(self.saves))
+
+    def load(self, folder):
+        self.loaded = [(folder / name).read_text() for name in ("first", "second")]
+
+
+def steady(monkeypatch, agent):
+    monkeypatch.setattr(agents, "check", lambda config, env: None)
+    monkeypatch.setattr(agents, "make", lambda config, env, domain: agent)
+    return agent
+
+
+STEADY = ["--task", "Cartpole", "--agent", "sb3", "--logger", "csv", *SHORT, *TINY[:-1], "env.realParams=null"]
+
+
+def test_a_checkpoint_of_ctrl_c_is_evaluated_when_the_run_goes_on(counters, monkeypatch):
+    """It lies where one is due: without an evaluation it could never become the best."""
+    steady(monkeypatch, Steady({2: lambda: os.kill(os.getpid(), signal.SIGINT)}))
+    assert train.main(STEADY) == 130
+    run = latest_run("logs", "Cartpole")
+    assert [(c["step"], c["kind"]) for c in run.checkpoints] == [(2, "periodic")]
+    agent = steady(monkeypatch, Steady())
+    assert train.main(["--resume", str(run.path), "--headless"]) == 0
+    assert agent.loaded is not None
+    found = {(c["step"], c["kind"]) for c in Run.open(run.path).checkpoints}
+    assert {(2, "evaluated"), (4, "evaluated")} <= found
+
+
+def gone():
+    raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("moment", ["while files are written", "between two versions"])
+def test_a_kill_at_any_moment_leaves_a_whole_checkpoint(moment, counters, monkeypatch):
+    """The same step is saved twice, by Ctrl-C and after its evaluation; the second time ends in a kill."""
+    steady(monkeypatch, Steady({2: lambda: os.kill(os.getpid(), signal.SIGINT)}))
+    assert train.main(STEADY) == 130
+    run = latest_run("logs", "Cartpole")
+    with monkeypatch.context() as patch:
+        if moment == "between two versions":
+            rename = Path.rename
+            patch.setattr(Path, "rename", lambda own, to: gone() if own.suffix == ".new" else rename(own, to))
+            steady(monkeypatch, Steady())
+        else:
+            steady(monkeypatch, Steady({"save 1": gone}))
+        assert train.main(["--resume", str(run.path), "--headless"]) == 130
+    agent = steady(monkeypatch, Steady())
+    assert train.main(["--resume", str(run.path), "--headless"]) == 0
+    assert agent.loaded == ["1", "1"]
+    assert sorted(p.name for p in (run.path / "agent").iterdir()) == ["2", "4"]

@@ -3,8 +3,10 @@
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 
 from bayessim_mjx.env import Env, State
+from bayessim_mjx.mirrors import MirrorMap
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 
 
@@ -50,3 +52,24 @@ class Camera(Counter):
         picture = jnp.full((36, 36, 1), 40 * state.obs["policy"][0]).astype(jnp.uint8)
         groups = {"policy": picture, "numbers": state.obs["policy"]}
         return state.replace(obs=groups, info={**state.info, "final_observation": groups})
+
+
+class Plain(Counter):
+    """The counter without observations of the critic's own."""
+
+    def _state(self, obs, reward, terminated, truncated, steps):
+        state = super()._state(obs, reward, terminated, truncated, steps)
+        seen = {"policy": obs}
+        return state.replace(obs=seen, info={**state.info, "final_observation": seen})
+
+
+class Mirrored(Counter):
+    """The counter with a mirror image: all its numbers with the other sign."""
+
+    name = "Mirrored"
+    mirrors = (
+        MirrorMap(
+            observation={"policy": (np.arange(3), -np.ones(3)), "critic": (np.arange(6), -np.ones(6))},
+            action=(np.arange(1), -np.ones(1)),
+        ),
+    )

@@ -1,7 +1,7 @@
 """Other libraries' PPO in our commands: `train --agent sb3`. Their networks become policies of ours at checkpoints.
 
-So `play`, videos, ONNX and `main --checkpoint` work with them as with ours. What a library's PPO cannot do is refused
-by the setting's name.
+So `play`, videos, ONNX and `main --checkpoint` work with them as with ours. Every setting of `ppo:` reaches the library
+or is refused by its name: those that none of them has are in `OURS`, those of one library in its `refuse`.
 """
 
 from __future__ import annotations
@@ -68,6 +68,9 @@ def check(config: Config, env: Any) -> Any:
     module = importlib.import_module(f"bayessim_mjx.wrappers.agents.{config.agent}")
     refuse(config, module.TAKES, module.ACTIVATIONS)
     size_of(env, "policy")
+    if "critic" in env.observation_size:
+        size_of(env, "critic")
+    module.refuse(config, env)
     return module
 
 

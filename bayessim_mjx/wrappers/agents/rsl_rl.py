@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import io
 from pathlib import Path
 from typing import Any
 
-from bayessim_mjx.config import Config
-from bayessim_mjx.rl import Policy
+from bayessim_mjx.config import Config, RNDConfig
+from bayessim_mjx.errors import UserError
+from bayessim_mjx.rl import Policy, rnd, symmetry
 from bayessim_mjx.wrappers import rsl_rl
 from bayessim_mjx.wrappers.agents import networks
 from bayessim_mjx.wrappers.agents.episodes import Recent
@@ -18,11 +20,48 @@ TAKES = ("rnd", "symmetry", "normalize_advantage_per_minibatch")
 # that both know, and theirs of them; its gelu is another function
 ACTIVATIONS = {name: name for name in ("elu", "relu", "selu", "tanh", "swish", "mish", "lrelu", "softplus", "sigmoid")}
 ACTIVATIONS |= {"celu": "crelu"}
+RND_WIDTHS = ("predictor_hidden_dims", "target_hidden_dims")
 LOSSES = ("value", "surrogate", "entropy", "rnd", "symmetry")  # that both log, under the same names
 
 
 def make(config: Config, worlds: Worlds) -> RslRlAgent:
     return RslRlAgent(config, worlds)
+
+
+def refuse(config: Config, env: Any) -> None:
+    """UserError for what rsl_rl cannot do with these settings on `env`."""
+    ppo = config.ppo
+    widths = {"hidden_actor": ppo.hidden_actor, "hidden_critic": ppo.hidden_critic}
+    if ppo.rnd is not None:
+        if ppo.rnd.activation not in ACTIVATIONS:
+            allowed = ", ".join(ACTIVATIONS)
+            raise UserError(f"ppo.rnd.activation = {ppo.rnd.activation!r}: --agent rsl_rl takes {allowed}")
+        rnd.groups(env.observation_size, ppo.rnd)
+        widths |= {f"rnd.{name}": getattr(ppo.rnd, name) for name in RND_WIDTHS}
+    for name, given in widths.items():
+        if not given:
+            raise UserError(f"ppo.{name} = []: --agent rsl_rl needs a hidden layer, e.g. [64]")
+    if ppo.symmetry is not None:
+        symmetry.mirrors(env, {"policy", _critic_group(env)})
+
+
+def _critic_group(env: Any) -> str:
+    return "critic" if "critic" in env.observation_size else "policy"
+
+
+def _fields(section: Any) -> dict[str, Any]:
+    """All settings of a section, which has rsl_rl's names: one that rsl_rl has not would be refused by it."""
+    return {field.name: getattr(section, field.name) for field in dataclasses.fields(section)}
+
+
+def _novelty(settings: RNDConfig, dt: float) -> dict[str, Any]:
+    """`ppo.rnd` as its `rnd_cfg`; it takes the first weight times the control step itself, but not the last one."""
+    found = _fields(settings) | {"activation": ACTIVATIONS[settings.activation]}
+    found |= {name: list(getattr(settings, name)) for name in RND_WIDTHS}
+    del found["obs_groups"]  # those of the runner
+    if (schedule := settings.weight_schedule) is not None:
+        found["weight_schedule"] = _fields(schedule) | {"final_value": (schedule.final_value or 0.0) * dt}
+    return found
 
 
 class RslRlAgent:
@@ -38,18 +77,19 @@ class RslRlAgent:
         env = rsl_rl.RslRlVecEnv(worlds)
         with contextlib.redirect_stdout(io.StringIO()):  # it prints its networks
             self.runner = OnPolicyRunner(env, self._settings(env), log_dir=None, device=env.device)
+        if config.ppo.rnd is not None and config.ppo.rnd.reward_normalization:
+            self.runner.alg.rnd.reward_normalizer.disc_avg.gamma = config.ppo.gamma  # its own is .99, whatever PPO's is
         self.losses: dict[str, float] = {}  # of the last iteration
         self._update, self.runner.alg.update = self.runner.alg.update, self._updated
 
     def _settings(self, env: Any) -> dict[str, Any]:
         ppo = self.config.ppo
-        settings = rsl_rl.settings(symmetry=ppo.symmetry is not None, rnd=ppo.rnd.weight if ppo.rnd else 0.0)
+        settings = rsl_rl.settings()
         net = {"activation": ACTIVATIONS[ppo.activation], "obs_normalization": ppo.normalize_observations}
         settings["actor"] |= net | {"hidden_dims": list(ppo.hidden_actor)}
         settings["actor"]["distribution_cfg"] |= {"init_std": ppo.init_std}
         settings["critic"] |= net | {"hidden_dims": list(ppo.hidden_critic)}
-        if "critic" in env.env.observation_size:
-            settings["obs_groups"]["critic"] = ["critic"]
+        settings["obs_groups"]["critic"] = [_critic_group(env.env)]
         settings["algorithm"] |= {
             "value_loss_coef": ppo.value_loss_coef, "use_clipped_value_loss": ppo.use_clipped_value_loss,
             "clip_param": ppo.clip_param, "entropy_coef": ppo.entropy_coef, "num_learning_epochs": ppo.num_epochs,
@@ -57,6 +97,11 @@ class RslRlAgent:
             "gamma": ppo.gamma, "lam": ppo.gae_lambda, "desired_kl": ppo.desired_kl, "max_grad_norm": ppo.max_grad_norm,
             "normalize_advantage_per_mini_batch": ppo.normalize_advantage_per_minibatch,
         }  # fmt: skip
+        if ppo.rnd is not None:
+            settings["obs_groups"]["rnd_state"] = list(rnd.groups(env.env.observation_size, ppo.rnd))
+            settings["algorithm"]["rnd_cfg"] = _novelty(ppo.rnd, env.step_dt)
+        if ppo.symmetry is not None:
+            settings["algorithm"]["symmetry_cfg"] = _fields(ppo.symmetry) | {"data_augmentation_func": rsl_rl.mirrored}
         return settings | {"num_steps_per_env": ppo.num_steps}
 
     def _updated(self) -> dict[str, float]:
@@ -93,4 +138,7 @@ class RslRlAgent:
         import torch
 
         device = self.runner.env.device
-        self.runner.alg.load(torch.load(folder / "model.pt", weights_only=True, map_location=device), None, True)
+        kept = torch.load(folder / "model.pt", weights_only=True, map_location=device)
+        self.runner.alg.load(kept, None, True)
+        if self.runner.alg.rnd is not None:  # the clock of the weight's schedule, which it does not keep
+            self.runner.alg.rnd.update_counter = kept["iter"] * self.config.ppo.num_steps

@@ -8,17 +8,18 @@ from typing import Any, cast
 import numpy as np
 
 from bayessim_mjx.config import Config
+from bayessim_mjx.errors import UserError
 from bayessim_mjx.rl import Policy
 from bayessim_mjx.wrappers.agents import networks
 from bayessim_mjx.wrappers.agents.episodes import Recent
 from bayessim_mjx.wrappers.sb3 import SB3VecEnv
 from bayessim_mjx.wrappers.worlds import Worlds
 
-TAKES = ("normalize_advantage_per_minibatch",)  # it always does
+TAKES = ("normalize_advantage_per_minibatch",)
 ACTIVATIONS = {
-    "elu": "ELU", "relu": "ReLU", "selu": "SELU", "tanh": "Tanh", "swish": "SiLU", "gelu": "GELU", "celu": "CELU",
+    "elu": "ELU", "relu": "ReLU", "selu": "SELU", "tanh": "Tanh", "swish": "SiLU", "celu": "CELU",
     "lrelu": "LeakyReLU", "mish": "Mish", "softplus": "Softplus", "sigmoid": "Sigmoid",
-}  # fmt: skip
+}  # fmt: skip  # its gelu is another function
 TAGS = {
     "train/value_loss": "Loss/value", "train/policy_gradient_loss": "Loss/surrogate", "train/approx_kl": "Loss/kl",
     "train/clip_fraction": "Loss/clip_fraction", "train/explained_variance": "Loss/explained_variance",
@@ -29,6 +30,35 @@ CLIP = 10.0  # of normalised observations, as ours
 
 def make(config: Config, worlds: Worlds) -> SB3Agent:
     return SB3Agent(config, worlds)
+
+
+def refuse(config: Config, env: Any) -> None:
+    """UserError for what SB3 cannot do with these settings on `env`."""
+    ppo = config.ppo
+    if "critic" in env.observation_size:
+        raise UserError(
+            f"--agent sb3: {env.name} has observations of its own for the critic, and both networks of SB3 see the "
+            "policy's; allowed are rsl_rl, skrl and our own PPO (leave --agent out)"
+        )
+    size, left = divmod(ppo.num_envs * ppo.num_steps, ppo.num_minibatches)
+    if left or size < 2:
+        raise UserError(
+            f"ppo.num_minibatches = {ppo.num_minibatches}: --agent sb3 takes a divisor of ppo.num_envs * ppo.num_steps "
+            f"= {ppo.num_envs * ppo.num_steps} that leaves at least two samples"
+        )
+
+
+def _normalised_once() -> Any:
+    """Its buffer with advantages normalised over all samples of a batch, as it does in each minibatch alone."""
+    from stable_baselines3.common.buffers import RolloutBuffer
+
+    class Normalised(RolloutBuffer):
+        def compute_returns_and_advantage(self, *args: Any, **kwargs: Any) -> None:
+            super().compute_returns_and_advantage(*args, **kwargs)
+            raw: np.ndarray = self.advantages  # type: ignore[has-type]
+            self.advantages = (raw - raw.mean()) / (raw.std() + 1e-8)
+
+    return Normalised
 
 
 class SB3Agent:
@@ -42,12 +72,14 @@ class SB3Agent:
         self.env, self.recent = cast(Any, SB3VecEnv(worlds)), Recent(worlds)
         if ppo.normalize_observations:
             self.env = VecNormalize(self.env, norm_reward=False, clip_obs=CLIP)
+        by_minibatch = ppo.normalize_advantage_per_minibatch
         self.model = PPO(
             "MlpPolicy", self.env, learning_rate=ppo.learning_rate, n_steps=ppo.num_steps,
-            batch_size=max(2, ppo.num_envs * ppo.num_steps // ppo.num_minibatches), n_epochs=ppo.num_epochs,
+            batch_size=ppo.num_envs * ppo.num_steps // ppo.num_minibatches, n_epochs=ppo.num_epochs,
+            normalize_advantage=by_minibatch, rollout_buffer_class=None if by_minibatch else _normalised_once(),
             gamma=ppo.gamma, gae_lambda=ppo.gae_lambda, clip_range=ppo.clip_param,
             clip_range_vf=ppo.clip_param if ppo.use_clipped_value_loss else None, ent_coef=ppo.entropy_coef,
-            vf_coef=ppo.value_loss_coef / 2, max_grad_norm=ppo.max_grad_norm, seed=config.seed, device=_device(),
+            vf_coef=ppo.value_loss_coef, max_grad_norm=ppo.max_grad_norm, seed=config.seed, device=_device(),
             target_kl=ppo.desired_kl if ppo.schedule == "adaptive" else None, policy_kwargs=self._networks(),
         )  # fmt: skip
 

@@ -21,7 +21,7 @@ from bayessim_mjx.wrappers.worlds import Worlds
 
 TAKES = ()
 ACTIVATIONS = ("elu", "relu", "selu", "tanh")  # that both know
-SCALERS = ("observation_preprocessor", "value_preprocessor")
+SCALERS = ("observation_preprocessor", "state_preprocessor", "value_preprocessor")
 TAGS = {"Loss / Value loss": "Loss/value", "Loss / Policy loss": "Loss/surrogate"}
 MOMENTS = ("running_mean", "running_variance", "current_count")
 
@@ -42,6 +42,11 @@ def make(config: Config, worlds: Worlds) -> SkrlAgent:
     return SkrlAgent(config, worlds)
 
 
+def refuse(config: Config, env: Any) -> None:
+    """UserError for what skrl cannot do with these settings on `env`: nothing beyond what none of them can."""
+    del config, env
+
+
 class SkrlAgent:
     """skrl's `Runner` with a `SequentialTrainer`, without its own log."""
 
@@ -51,7 +56,7 @@ class SkrlAgent:
         self.config, self.iteration, self.env = config, 0, skrl.wrapped(worlds)
         with contextlib.redirect_stdout(io.StringIO()), _without_warnings():
             self.runner = Runner(self.env, self._settings())
-        self.agent = self.runner.agent
+        self.agent = skrl.told_true_ends(self.runner.agent)
         self.recent = Recent(worlds)
 
     def _settings(self) -> dict[str, Any]:
@@ -63,14 +68,17 @@ class SkrlAgent:
             discount_factor=ppo.gamma, gae_lambda=ppo.gae_lambda, learning_rate=ppo.learning_rate,
             learning_rate_scheduler="KLAdaptiveLR" if by_kl else None,
             learning_rate_scheduler_kwargs={"kl_threshold": ppo.desired_kl} if by_kl else {},
-            observation_preprocessor=scaler, grad_norm_clip=ppo.max_grad_norm, ratio_clip=ppo.clip_param,
+            observation_preprocessor=scaler, state_preprocessor=scaler if self.env.state_space else None,
+            grad_norm_clip=ppo.max_grad_norm, ratio_clip=ppo.clip_param,
             value_clip=ppo.clip_param if ppo.use_clipped_value_loss else 0.0, entropy_loss_scale=ppo.entropy_coef,
             value_loss_scale=ppo.value_loss_coef,
         )  # fmt: skip
+        sees = {"policy": "OBSERVATIONS", "value": "STATES" if self.env.state_space else "OBSERVATIONS"}
         for name, widths in (("policy", ppo.hidden_actor), ("value", ppo.hidden_critic)):
-            net = {"name": "net", "input": "OBSERVATIONS", "layers": list(widths), "activations": ppo.activation}
+            net = {"name": "net", "input": sees[name], "layers": list(widths), "activations": ppo.activation}
             found["models"][name]["network"] = [net]
-        found["models"]["policy"]["initial_log_std"] = float(np.log(ppo.init_std))
+        # without its limits of the spread, as ours has none
+        found["models"]["policy"] |= {"initial_log_std": float(np.log(ppo.init_std)), "clip_log_std": False}
         found["seed"] = self.config.seed
         return found
 
