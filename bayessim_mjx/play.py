@@ -164,6 +164,7 @@ def _show(args: argparse.Namespace, config: Config, path: Path, run: Any, count:
     import jax
 
     from bayessim_mjx import rl
+    from bayessim_mjx.keys import branch
 
     # also a policy trained on nominal physics can be tried on the prior and on the surrogate real
     trained = config
@@ -183,7 +184,7 @@ def _show(args: argparse.Namespace, config: Config, path: Path, run: Any, count:
     chosen, rows = {args.physics: kinds[args.physics]} if args.physics else kinds, []
     returns = {}
     for name, thetas in chosen.items():
-        result = rl.evaluate(plain if name == "nominal" else env, policy, jax.random.fold_in(key, 1), thetas)
+        result = rl.evaluate(plain if name == "nominal" else env, policy, branch(key, 1), thetas)
         r, length = result["return"], result["length"]
         returns[name] = r
         rows.append([name, estimate(r.mean(), r.std()), *map(compact, (r.min(), r.max(), length.mean()))])

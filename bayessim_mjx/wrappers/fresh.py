@@ -15,6 +15,7 @@ from flax import struct
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.env import Env, State
 from bayessim_mjx.errors import UserError
+from bayessim_mjx.keys import branch
 from bayessim_mjx.rl.worlds import clock, drawn, reset_at
 from bayessim_mjx.rollout import next_episodes, select
 from bayessim_mjx.wrappers.under import Under
@@ -77,7 +78,7 @@ class FreshEpisodes(Wrapper):
 
     def reset(self, rng: jax.Array) -> Any:
         state: Any = self.env.reset(rng)
-        key, first = jax.random.split(jax.random.fold_in(rng[0], 1))
+        key, first = jax.random.split(branch(rng[0], 1))
         later = self._drawn(first, rng.shape[0])
         store = Store(key, later, jnp.zeros(rng.shape[0], bool))
         return state.replace(info={**state.info, STORE: store})
