@@ -74,7 +74,7 @@ class Training:
         if resume and self.run.checkpoints:
             tree, meta = self.run.restore("latest", self.tree(state), fall_back=True)
             return tree["state"], marked(meta)
-        return cli.warm_start(state, self.config, self.env), -1 if resume else None
+        return cli.warm_start(state, self.config, self.env, self.console.say), -1 if resume else None
 
     def open(self, iteration: int, resumed_at: int | None) -> None:
         """Begin to write; on resume what lies after the checkpoint goes, as it is written again."""
