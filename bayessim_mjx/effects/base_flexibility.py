@@ -26,8 +26,8 @@ class BaseFlexibility(Effect):
     p: tilt of the base about the world's x and y axes, small. They run `depth` below the origin of the robot's first
     body: a table rocks about its feet and carries the robot to and fro. Robot and base are solved together: gravity
     tilts in the robot's frame, p' and p'' act on all bodies. Left out: what constraints (contacts, joint limits) do to
-    the base. At the start the base has settled under the robot's weight. Robots with a fixed base only. Of several trees
-    of bodies on the world the robot is the one of the first actuator at a joint (without one, the first that moves); the
+    the base. At the start the base has settled under the robot's weight. Robots with a fixed base only. Of several
+    trees of bodies the robot is the one of the first actuator at a joint (without one, the first that moves); the
     others stand beside the mount. Two arms on one table are one tree where one body carries both.
 
     Parameters: `compliance` 1/k, rad/(N m), neutral 0; `frequency` f, Hz, of the base without the robot; `damping`
