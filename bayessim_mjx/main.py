@@ -112,7 +112,7 @@ def _run(config: Config, run: Any, device: Any, command: Sequence[str], console:
     console.start(opening(config, env, device))
     console.phase("setting up")
     parts = loop.make(config, env)
-    state, resumed_at = _state(parts, run)
+    state, resumed_at = _state(parts, run, console)
     if run is None:
         run = runs.Run.create(config.logdir, config.task, config.name, config, command)
     else:
@@ -130,7 +130,7 @@ def _run(config: Config, run: Any, device: Any, command: Sequence[str], console:
     return 0
 
 
-def _state(parts: Any, run: Any) -> tuple[Any, int | None]:
+def _state(parts: Any, run: Any, console: Any) -> tuple[Any, int | None]:
     """(state to begin with, second of the run's clock that its checkpoint lies at: -1 none yet, None a new run)."""
     from bayessim_mjx import loop
     from bayessim_mjx.monitor.wall import marked
@@ -139,7 +139,7 @@ def _state(parts: Any, run: Any) -> tuple[Any, int | None]:
     if run is not None and run.checkpoints:
         tree, meta = run.restore("latest", loop.tree_of(parts, state), fall_back=True)
         return tree["state"], marked(meta)
-    train = cli.warm_start(state.train, parts.config, parts.env)
+    train = cli.warm_start(state.train, parts.config, parts.env, console.say)
     return dataclasses.replace(state, train=train), None if run is None else -1
 
 

@@ -151,11 +151,11 @@ def _play(argv: Sequence[str] | None) -> int:
         return _show(args, config, path, run, count, console)
 
 
-def _acted_in(config: Config) -> Any:
-    """The environment as its policy sees it."""
+def _acted_in(config: Config, run: Any) -> Any:
+    """The environment as the policy of `run` sees it."""
     from bayessim_mjx import registry
 
-    return cli.privileged(replace(config, ppo={"teacher": None}), registry.make(config.task, config=config))[0]
+    return cli.privileged(replace(config, ppo={"teacher": None}), registry.make(config.task, config=config), run)[0]
 
 
 def _show(args: argparse.Namespace, config: Config, path: Path, run: Any, count: int, console: Any) -> int:
@@ -164,18 +164,19 @@ def _show(args: argparse.Namespace, config: Config, path: Path, run: Any, count:
     import jax
 
     from bayessim_mjx import rl
+    from bayessim_mjx.keys import branch
 
     # also a policy trained on nominal physics can be tried on the prior and on the surrogate real
     trained = config
     config = dataclasses.replace(config, randomization=freeze({**config.randomization, "randomize": True}))
-    env = plain = _acted_in(config)
+    env = plain = _acted_in(config, run)
     policy, key = cli.load_policy(path, env, config), jax.random.PRNGKey(config.seed)
     if args.export is not None:
         console.say(_export(env, policy, path, run, args.export))
         return 0
     kinds = _physics(config, env, path, key, count)
     if trained.randomization.get("randomize") is False and getattr(env, "nuisance", None):
-        plain = _acted_in(trained)  # nominal physics is then without the noise that comes with randomisation
+        plain = _acted_in(trained, run)  # nominal physics is then without the noise that comes with randomisation
         kinds["nominal"] = _nominal(plain, count)
     if args.physics and args.physics not in kinds:
         raise UserError(f"--physics {args.physics}: this checkpoint and task have {', '.join(kinds)}")
@@ -183,7 +184,7 @@ def _show(args: argparse.Namespace, config: Config, path: Path, run: Any, count:
     chosen, rows = {args.physics: kinds[args.physics]} if args.physics else kinds, []
     returns = {}
     for name, thetas in chosen.items():
-        result = rl.evaluate(plain if name == "nominal" else env, policy, jax.random.fold_in(key, 1), thetas)
+        result = rl.evaluate(plain if name == "nominal" else env, policy, branch(key, 1), thetas)
         r, length = result["return"], result["length"]
         returns[name] = r
         rows.append([name, estimate(r.mean(), r.std()), *map(compact, (r.min(), r.max(), length.mean()))])

@@ -73,7 +73,7 @@ class Training:
         if resume and self.run.checkpoints:
             tree, meta = self.run.restore("latest", self.tree(state), fall_back=True)
             return tree["state"], marked(meta)
-        return cli.warm_start(state, self.config, self.env), -1 if resume else None
+        return cli.warm_start(state, self.config, self.env, self.console.say), -1 if resume else None
 
     def open(self, iteration: int, resumed_at: int | None) -> None:
         """Begin to write; on resume what lies after the checkpoint goes, as it is written again."""
@@ -140,15 +140,15 @@ class Training:
 
     def evaluate(self, state: Any) -> float:
         """Mean return of deterministic episodes, the same worlds at every evaluation; logged."""
-        import jax
         import jax.numpy as jnp
 
         from bayessim_mjx import rl
+        from bayessim_mjx.keys import branch
 
         key, count = self.evaluation_key, self.config.ppo.eval_episodes
         nominal = jnp.tile(jnp.asarray(self.env.space.nominal, jnp.float32), (count, 1))
         thetas = nominal if self.domain is None else self.domain.sample(key, count)
-        result = rl.evaluate(self.env, self.policy(state), jax.random.fold_in(key, 1), thetas)
+        result = rl.evaluate(self.env, self.policy(state), branch(key, 1), thetas)
         score = float(result["return"].mean())
         figures = {"Eval/mean_reward": score, "Eval/mean_episode_length": float(result["length"].mean())}
         self.writer.scalars(int(state.iteration), figures)

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 
+from bayessim_mjx.keys import branch
 from bayessim_mjx.physics import World, mjx
 from bayessim_mjx.tasks.locomotion import Locomotion
 
@@ -67,7 +68,7 @@ class Anymal(Locomotion):
     def initial(self, key: jax.Array) -> tuple[jax.Array, jax.Array]:
         """As the base has it, but with joints at 0.5 to 1.5 times home."""
         qpos, qvel = super().initial(key)
-        share = jax.random.uniform(jax.random.fold_in(key, 2), (12,), minval=0.5, maxval=1.5)
+        share = jax.random.uniform(branch(key, 2), (12,), minval=0.5, maxval=1.5)
         return qpos.at[7:].multiply(share), qvel
 
     def reward(

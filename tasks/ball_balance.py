@@ -5,6 +5,7 @@ The knees are driven, hips and pinned feet turn freely; the tray can rise and ti
 0.05 kg m^2. The ball touches a square of 1 m instead of the disc in it, as MJX meets a ball and a box exactly. Feet are
 held by constraints instead of springs. Isaac's joint friction is a share of the joint's load, MuJoCo's a torque: one
 unit of BayesSimIG's range is 0.01 N m here. The damping that Isaac gives assets without one is unknown: there is none.
+The first action of an episode counts; the original's targets are 0 in that step.
 
 The drives are integrated explicitly: only so do the feet's constraints see their damping (feet slip 5 mm instead of 9
 under random targets), and implicitfast would factor two matrices at once, which can wait for each other for ever in

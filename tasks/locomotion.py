@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 
 from bayessim_mjx.env import Observations
@@ -18,6 +19,7 @@ from bayessim_mjx.mirrors import Mirror, joints_by_side
 from bayessim_mjx.physics import World, mjx
 from bayessim_mjx.tasks._parts import Parts, View
 from bayessim_mjx.tasks._running import HEADING, LOADS, mirrored_loads
+from bayessim_mjx.tasks._servos import resting, servos
 
 __all__ = ["Locomotion", "View"]
 
@@ -50,7 +52,7 @@ class Locomotion(Parts):
         home: places of joints at reset (rad or m) by name; the others' is 0, or the nearest that their limits allow.
         spread, speed_spread: at reset, joints are within +- this of home (rad or m), and as fast (per second).
         reach: the command at the action 1, for all actuators or each: of a motor its control; of a position drive how
-            far the target is from home.
+            far the target is from home (with a gear: gear times how far, as in MuJoCo's commands).
         lowest: height of the base (m), least_upright: cosine of its tilt, below which the robot has fallen.
         guards: geoms (spheres) of which none is in the ground z = 0 unless the robot has fallen; they need not collide.
         feet: bodies whose loads are observed.
@@ -59,7 +61,8 @@ class Locomotion(Parts):
         own_turned: which of these change their sign in the mirror.
 
     Raises:
-        UserError: where the first joint does not float freely, or no such joint, geom, block or part exists.
+        UserError: where the first joint does not float freely, no such joint, geom, block or part exists, or the
+            command of a drive that pulls to a place is none (`<intvelocity>`).
     """
 
     observations: ClassVar[Mapping[str, float | Sequence[float]]]
@@ -117,10 +120,14 @@ class Locomotion(Parts):
         return (Mirror(joints_by_side(self.mj_model, self.sides), images, normal="y", task=commands),)
 
     def _targets_at_home(self) -> np.ndarray | None:
-        """Commands `[nu]` at the action 0 where an actuator is a position drive."""
-        model, home = self.mj_model, np.concatenate([self.mj_model.qpos0[:7].astype(np.float32), self.home_joints])
-        places, drives = home[model.jnt_qposadr[model.actuator_trnid[:, 0]]], model.actuator_biasprm[:, 1] != 0
-        return np.where(drives, places, np.float32(0)) if drives.any() else None
+        """Commands `[nu]` at the action 0 where an actuator is a position drive: those that hold it at home."""
+        model, drives = self.mj_model, servos(self.mj_model, self.name)
+        if not drives.any():
+            return None
+        data = mujoco.MjData(model)
+        data.qpos[:] = np.concatenate([model.qpos0[:7], self.home_joints])
+        mujoco.mj_fwdPosition(model, data)
+        return np.where(drives, resting(model, data.actuator_length), 0).astype(np.float32)
 
     def initial(self, key: jax.Array) -> tuple[jax.Array, jax.Array]:
         """The base where the model has it and at rest, joints near home."""

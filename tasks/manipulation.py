@@ -14,6 +14,7 @@ import numpy as np
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.physics import World, mjx
 from bayessim_mjx.tasks._rate_control import RateControlled
+from bayessim_mjx.tasks._servos import resting, servos
 
 
 class Pose(NamedTuple):
@@ -30,11 +31,12 @@ class Manipulation(RateControlled):
         home: the place of each joint at reset (rad or m), by name; joints that are left out start at qpos0.
         spread: at reset, joints with a drive start within +-spread of home (rad or m), inside their limits.
         rates: of each drive's target at the action 1, per second: targets move by dt * rate * action. None: an action
-            is a place in the drive's range, from -1 (its lower end) to 1.
+            is a place in the drive's range, from -1 (its lower end) to 1. Targets are MuJoCo's commands: with a gear,
+            gear times the joint's place.
         smoothing: share of what is asked for in the new target, where actions are places; 1: all of it.
 
     Raises:
-        UserError: where an actuator is no drive of a hinge or slide, or home names no such joint.
+        UserError: where an actuator is no position drive of a hinge or slide, or home names no such joint.
     """
 
     home: ClassVar[Mapping[str, float]] = {}
@@ -59,8 +61,8 @@ class Manipulation(RateControlled):
         return jnp.asarray(self._home).at[self.driven].set(jnp.clip(home + noise, low, high))
 
     def at_rest(self, qpos: jax.Array) -> jax.Array:
-        """Targets at the start of an episode: where the joints are."""
-        return qpos[self.driven]
+        """Targets at the start of an episode: those at which the drives rest where the joints are."""
+        return resting(self.mj_model, self.mj_model.actuator_gear[:, 0].astype(np.float32) * qpos[self.driven])
 
     def actuate(self, world: World, action: jax.Array) -> tuple[World, jax.Array]:
         if self.rates is not None:
@@ -120,10 +122,13 @@ def _driven(model: mujoco.MjModel, task: str) -> np.ndarray:
     """Places in qpos `[nu]` of the joints with a drive."""
     kinds = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
     joint = int(mujoco.mjtTrn.mjTRN_JOINT)
+    drives = servos(model, task)
     for i in range(model.nu):
+        name = model.actuator(i).name or f"#{i}"
         if model.actuator_trntype[i] != joint or model.jnt_type[model.actuator_trnid[i, 0]] not in kinds:
-            name = model.actuator(i).name or f"#{i}"
             raise UserError(f"{task}: actuator {name} has to drive a hinge or a slide by name: <position joint=...>")
+        if not drives[i]:
+            raise UserError(f"{task}: actuator {name} pulls to no place; it has to be a position drive: <position>")
     return np.asarray(model.jnt_qposadr[model.actuator_trnid[:, 0]])
 
 

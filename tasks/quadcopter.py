@@ -3,8 +3,9 @@
 Every rotor's mount turns about two axes, so that thrust points where the servos turn it; there is no drag, and rotors
 exert no torque. Unlike the original: its drives (kp 1000 N m/rad, integrated implicitly) would explode in MuJoCo, so
 kp is 5 N m/rad with kv 0.1 N m s/rad and an armature of 5e-4 kg m^2; joints have no limits of their own, as their
-targets have; and the largest angular velocity of 4 pi rad/s holds for each axis of the chassis. BayesSimIG's true
-masses are too heavy to fly with: 18 N against 8 N of thrust.
+targets have; the largest angular velocity of 4 pi rad/s holds for each axis of the chassis; and the first action of
+an episode counts, where the original's rotors are off and its joints held in that step. BayesSimIG's true masses are
+too heavy to fly with: 18 N against 8 N of thrust.
 
 The drives are integrated explicitly. They are stable at any mass (kv h / armature = 1), and implicitfast would factor
 two matrices at once, which can wait for each other for ever in jaxlib's thread pool (see `linalg`).

@@ -21,6 +21,12 @@ LONG_FUNCTIONS = (
     "tests/report/fake.py:full",
 )
 CIRCLES: tuple[set[str], ...] = ()
+# fold_in(key, i) is a member of split(key, n), so elsewhere a purpose of its own takes its key from keys.branch.
+FOLDED = {
+    "bayessim_mjx/keys.py": 1,
+    "bayessim_mjx/distributions/box.py": 1,  # of a key that nothing splits
+    "bayessim_mjx/inference/mdn.py": 1,  # of a key that nothing splits
+}
 
 
 @functools.cache
@@ -66,6 +72,19 @@ def imports(texts: Mapping[str, str]) -> dict[str, set[str]]:
     return {names[path]: set(named(path)) & known - {names[path]} for path in texts}
 
 
+def folded(texts: Mapping[str, str]) -> dict[str, int]:
+    """{path: how often `jax.random.fold_in` is named in its code}, under whatever name it is imported."""
+    found: dict[str, int] = {}
+    for path, text in texts.items():
+        for node in ast.walk(ast.parse(text)):
+            named = isinstance(node, ast.Attribute) and node.attr == "fold_in"
+            named |= isinstance(node, ast.alias) and node.name.endswith("fold_in")
+            named |= isinstance(node, ast.Constant) and node.value == "fold_in"
+            if named:
+                found[path] = found.get(path, 0) + 1
+    return found
+
+
 def circles(graph: Mapping[str, set[str]]) -> set[frozenset[str]]:
     """Groups of modules that reach each other (Tarjan's strongly connected components of two or more)."""
     index: dict[str, int] = {}
@@ -99,6 +118,23 @@ def test_files_are_short() -> None:
 
 def test_functions_are_short() -> None:
     assert {f: n for f, n in long_functions(sources(ROOT, TREES)).items() if f not in LONG_FUNCTIONS} == {}
+
+
+def test_keys_for_a_purpose_of_its_own_are_those_that_no_split_gives() -> None:
+    assert folded(sources(ROOT, ("bayessim_mjx", "tasks", "examples"))) == FOLDED
+
+
+@pytest.mark.parametrize(
+    "use",
+    [
+        "import jax\njax.random.fold_in(key, 1)\n",
+        "from jax import random\nnew = random.fold_in\n",
+        "from jax.random import fold_in as other\n",
+        "import jax\ngetattr(jax.random, 'fold_in')(key, 1)\n",
+    ],
+)
+def test_a_folded_key_is_found_however_it_is_named(use: str) -> None:
+    assert folded({"a.py": use, "b.py": '"""As fold_in does."""\n# fold_in\n'}) == {"a.py": 1}
 
 
 def test_no_circle_of_imports() -> None:

@@ -1,6 +1,7 @@
 """Checkpoints by name, and the policies in them."""
 
 import argparse
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -78,8 +79,26 @@ def load_policy(path: Path, env: Any, config: Config) -> Any:
     return checkpoints.restore(path, {"policy": jax.eval_shape(make, jax.random.PRNGKey(0))})[0]["policy"]
 
 
-def privileged(config: Config, env: Any) -> tuple[Any, Any]:
-    """(`env` as the policy of `config` is trained in it, the teacher of ppo.teacher or None)."""
+def space_seen(run: "Run | None") -> Any:
+    """The parameters that the policy of a run sees, with the ranges in whose units it does; None: it sees none."""
+    from bayessim_mjx import registry
+
+    if run is None or not run.config.ppo.policy_theta:
+        return None
+    return registry.make(run.config.task, config=run.config).space
+
+
+def _ranges(space: Any) -> str:
+    return ", ".join(
+        f"{n} {low:g} to {high:g}" for n, low, high in zip(space.names, space.low, space.high, strict=True)
+    )
+
+
+def privileged(config: Config, env: Any, run: "Run | None" = None) -> tuple[Any, Any]:
+    """(`env` as the policy of `config` is trained in it, the teacher of ppo.teacher or None).
+
+    run: that of the policy, where it is trained already.
+    """
     from bayessim_mjx.rl import groups, recurrent
     from bayessim_mjx.rl import privileged as shown
 
@@ -88,7 +107,7 @@ def privileged(config: Config, env: Any) -> tuple[Any, Any]:
         env, teacher = _taught(config.ppo.teacher, config, env)
     env = groups.for_policy(env, config.ppo.actor_groups)
     if config.ppo.policy_theta:
-        env = shown.for_policy(env)
+        env = shown.for_policy(env, space_seen(run))
     return recurrent.remembering(env, config.ppo.memory_size) if config.ppo.memory else env, teacher
 
 
@@ -103,23 +122,41 @@ def _taught(which: str, config: Config, env: Any) -> tuple[Any, Any]:
     theirs = settings.ppo
     if theirs.memory:
         raise UserError(f"ppo.teacher = {which!r}: it has a memory, ppo.memory = {theirs.memory}; give one without")
-    seen = groups.for_policy(env, theirs.actor_groups)
-    teacher = load_policy(path, shown.for_policy(seen) if theirs.policy_theta else seen, settings)
+    seen, space = groups.for_policy(env, theirs.actor_groups), space_seen(run)
+    teacher = load_policy(path, shown.for_policy(seen, space) if theirs.policy_theta else seen, settings)
     if theirs.actor_groups or config.ppo.actor_groups:
         env = groups.shown(env, "teacher", theirs.actor_groups or ("policy",))
-        return shown.teacher_knowing(env) if theirs.policy_theta else env, teacher
-    return shown.for_teacher(env) if theirs.policy_theta else env, teacher
+        return shown.teacher_knowing(env, space) if theirs.policy_theta else env, teacher
+    return shown.for_teacher(env, space) if theirs.policy_theta else env, teacher
 
 
-def warm_start(train: Any, config: Config, env: Any) -> Any:
+def warm_start(train: Any, config: Config, env: Any, say: Callable[[str], None] = lambda _: None) -> Any:
     """The training state with actor and normaliser of `bayessim.policyCheckpt`, if that is set; the critic is new.
 
     `main` and `train` call it for the state that a run begins with, not when they resume one. `loop.init` does not read
     files: a program of your own that is to start from a policy calls this on `loop.init(parts).train`. With
     `bayessim.ftuneRL=False` only round 0 starts from the policy, as later rounds train new ones.
+
+    Args:
+        say: what it gets is one line that says what is taken over and what is new.
+
+    Raises:
+        UserError: the policy sees theta in units of other ranges than those of `env`.
     """
     if config.bayessim.policyCheckpt is None:
         return train
-    policy = load_policy(Path(config.bayessim.policyCheckpt), env, config)
+    path = Path(config.bayessim.policyCheckpt)
+    policy = load_policy(path, env, config)
+    if config.ppo.policy_theta:
+        seen = space_seen(find_checkpoint(str(path), None, "")[1])
+        if seen is not None and _ranges(seen) != _ranges(env.space):
+            raise UserError(
+                f"bayessim.policyCheckpt = {str(path)!r}: the policy sees the parameters in units of {_ranges(seen)}, "
+                f"but here the ranges are {_ranges(env.space)}; give those of its run (params/env.yaml by --cfg_env)"
+            )
+    say(
+        f"from {path}: the policy and the statistics of what it observes; critic, state of Adam and learning rate "
+        f"({float(train.learning_rate):g}) are new"
+    )
     normalizer = {**train.normalizer, "policy": policy.normalizer}
     return train.replace(params={**train.params, "actor": policy.actor}, normalizer=normalizer)

@@ -23,6 +23,7 @@ from bayessim_mjx.diagnosis.fitting import windows
 from bayessim_mjx.diagnosis.fitting.simulator import Simulator
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.errors import UserError
+from bayessim_mjx.keys import branch
 from bayessim_mjx.logs.log import Channels, Log
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 from bayessim_mjx.physics import Physics, controllers
@@ -132,7 +133,7 @@ class Judge:
     def _thetas(self, env: Task, theta: Any) -> jax.Array:
         """`[episodes, d]`: nominal (None), drawn from the environment's priors ("drawn"), or one theta for all."""
         if isinstance(theta, str):
-            return Distribution.prior(env.space).sample(jax.random.fold_in(self.key, 1), self.episodes)
+            return Distribution.prior(env.space).sample(branch(self.key, 1), self.episodes)
         theta = env.space.nominal if theta is None else theta
         return jnp.tile(jnp.asarray(theta, jnp.float32), (self.episodes, 1))
 
@@ -150,7 +151,7 @@ class Judge:
     def at_home(self, role: str, policies: Sequence[Policy]) -> list[float]:
         """Mean returns where policies of this role are trained, with other random numbers than the reported ones."""
         env, domain = self.simulators.training(role)
-        other = replace(self, key=jax.random.fold_in(self.key, 2))
+        other = replace(self, key=branch(self.key, 2))
         plans: list[Plan] = [(p, None if domain is None else DRAWN) for p in policies]
         return [float(x.mean()) for x in other.returns(env, plans)]
 

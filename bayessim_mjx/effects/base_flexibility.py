@@ -11,7 +11,7 @@ import numpy as np
 from bayessim_mjx.effects.effect import Effect, Quantity
 from bayessim_mjx.effects.support.bodies import moved, tilted
 from bayessim_mjx.effects.support.motion import Motion
-from bayessim_mjx.effects.support.site import Site, find
+from bayessim_mjx.effects.support.site import Site, find, joint_dofs
 from bayessim_mjx.effects.support.substep import SubStep
 from bayessim_mjx.errors import UserError
 
@@ -26,7 +26,9 @@ class BaseFlexibility(Effect):
     p: tilt of the base about the world's x and y axes, small. They run `depth` below the origin of the robot's first
     body: a table rocks about its feet and carries the robot to and fro. Robot and base are solved together: gravity
     tilts in the robot's frame, p' and p'' act on all bodies. Left out: what constraints (contacts, joint limits) do to
-    the base. At the start the base has settled under the robot's weight. Robots with a fixed base only.
+    the base. At the start the base has settled under the robot's weight. Robots with a fixed base only. Of several
+    trees of bodies the robot is the one of the first actuator at a joint (without one, the first that moves); the
+    others stand beside the mount. Two arms on one table are one tree where one body carries both.
 
     Parameters: `compliance` 1/k, rad/(N m), neutral 0; `frequency` f, Hz, of the base without the robot; `damping`
     zeta, likewise; `depth`, m; the latter three without effect where the compliance is 0.
@@ -118,33 +120,39 @@ class _Robot:
 
 def _robot(at: Site, step: SubStep, rate: jax.Array, depth: jax.Array) -> _Robot:
     model, data = at.mj_model, step.data
-    bodies = np.flatnonzero(np.isin(model.body_rootid, model.body_rootid[model.dof_bodyid]))
-    roots = np.unique(model.body_rootid[bodies])
-    base = jnp.asarray(model.body_pos[roots[0]], jnp.float32) - depth * jnp.array([0.0, 0.0, 1.0])
+    root, trees = _root(model), np.asarray(model.body_rootid)
+    bodies, carried = np.flatnonzero(trees == root), trees[model.dof_bodyid] == root
+    base = jnp.asarray(model.body_pos[root], jnp.float32) - depth * jnp.array([0.0, 0.0, 1.0])
     # MuJoCo's spatial vectors (angular, linear) refer to the centre of mass of their tree
-    momentum = _times(data._impl.crb[model.dof_bodyid], data.cdof)
-    arm = data.subtree_com[model.body_rootid] - base
-    axes = jnp.broadcast_to(jnp.eye(3)[:2], (len(roots), 2, 3))
-    rocking = jnp.concatenate([axes, jnp.cross(axes, arm[roots, None])], axis=-1)  # [trees, 2, 6]
+    momentum = jnp.where(carried[:, None], _times(data._impl.crb[model.dof_bodyid], data.cdof), 0.0)
+    arm, axes = data.subtree_com[root] - base, jnp.eye(3)[:2]
+    rocking = jnp.concatenate([axes, jnp.cross(axes, arm[None])], axis=-1)  # [2, 6]
     # forces on the bodies at no acceleration of joints and base: I a + v x I v, and what the base's velocity u adds
     inertia, speed = data._impl.cinert[bodies], data.cvel[bodies]
     below = moved(model)[bodies]
     still = _times(inertia, below @ (data.cdof_dot * data.qvel[:, None])) + _across(speed, _times(inertia, speed))
-    sway = (rate @ rocking)[np.searchsorted(roots, model.body_rootid[bodies])]
+    sway = jnp.broadcast_to(rate @ rocking, speed.shape)
     extra = _times(inertia, _turned(sway, speed)) + _across(sway, _times(inertia, speed))
     extra = extra + _across(speed + sway, _times(inertia, sway))
-    coupling = _moments(momentum, arm[model.dof_bodyid]).T
+    coupling = _moments(momentum, arm).T
     disabled = int(model.opt.disableflags) & int(mujoco.mjtDisableBit.mjDSBL_GRAVITY)
     return _Robot(
         momentum=momentum,
         coupling=coupling,
-        inertia=jnp.einsum("rai,rbi->ab", rocking, _times(data._impl.crb[roots, None], rocking)),
+        inertia=rocking @ _times(data._impl.crb[root], rocking).T,
         shed=coupling @ step.inverse,
-        bias=jnp.sum(_moments(still + extra, arm[bodies]), axis=0),
+        bias=jnp.sum(_moments(still + extra, arm), axis=0),
         coriolis=-jnp.sum(data.cdof * (below.T @ extra), axis=1),
         lever=step.model.body_mass[bodies] @ (data.xipos[bodies] - base),
         gravity=jnp.zeros(3) if disabled else step.model.opt.gravity,
     )
+
+
+def _root(model: mujoco.MjModel) -> int:
+    """The body of the robot that the world carries."""
+    driven = joint_dofs(model)
+    first = driven[driven >= 0][0] if (driven >= 0).any() else 0
+    return int(model.body_rootid[model.dof_bodyid[first]])
 
 
 def _times(inertia: jax.Array, motion: jax.Array) -> jax.Array:
@@ -169,7 +177,7 @@ def _turned(motion: jax.Array, other: jax.Array) -> jax.Array:
 
 
 def _moments(force: jax.Array, arm: jax.Array) -> jax.Array:
-    """Moments `[n, 2]` about x and y at the base of spatial forces `[n, 6]` that refer to `arm` `[n, 3]` from it."""
+    """Moments `[n, 2]` about x and y at the base of spatial forces `[n, 6]` that refer to `arm` `[3]` from it."""
     return (force[:, :3] + jnp.cross(arm, force[:, 3:]))[:, :2]
 
 

@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 
 from bayessim_mjx.effects.effect import Effect, Quantity
-from bayessim_mjx.effects.support.site import Site
+from bayessim_mjx.effects.support.site import Site, ranges
 from bayessim_mjx.effects.support.substep import SubStep
 
 _HINGE, _SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
@@ -24,7 +24,8 @@ class EffortCoupling(Effect):
     """F_next = to_next tau, F_previous = to_previous tau; tau is what the actuator exerts on its own joint.
 
     Neighbours are the nearest hinge or slide towards the base (previous) and the first one behind the joint (next);
-    where there is none, nothing arrives. tau comes after the effects on actuators and the joint's limit of force.
+    where there is none, nothing arrives. tau comes after the effects on actuators. Where the joint's limit of force
+    cuts the sum of what acts there, each actuator loses in proportion. Gravity compensation is the joint's, not tau's.
 
     Parameters: `to_next`, `to_previous`, N m/(N m) (from a slide to a hinge N m/N), neutral 0.
     """
@@ -42,9 +43,10 @@ class EffortCoupling(Effect):
     )
 
     def on_force(self, at: Site, memory: Any, step: SubStep, theta: jax.Array) -> tuple[Any, jax.Array]:
-        driven = at.dadr >= 0
-        tau = jnp.where(driven, step.data.qfrc_actuator[np.maximum(at.dadr, 0)], 0.0)
-        near = neighbours(at.mj_model)[np.maximum(at.dadr, 0)]
+        driven, column = at.dadr >= 0, np.maximum(at.dadr, 0)
+        own = step.actuator_force[at.ids] * step.data._impl.actuator_moment[at.ids, column]
+        tau = jnp.where(driven, own * _passed(at.mj_model, step)[column], 0.0)
+        near = neighbours(at.mj_model)[column]
         force = jnp.zeros_like(step.force)
         for side, share in zip(near.T, at.values(theta).T, strict=True):
             reached = jnp.asarray((side >= 0) & driven)
@@ -53,6 +55,20 @@ class EffortCoupling(Effect):
 
     def edit(self, spec: mujoco.MjSpec, values: dict[str, dict[str, float]]) -> str | None:
         return "MuJoCo's actuators at a joint act on that joint alone; use effects.yaml"
+
+
+def _passed(model: mujoco.MjModel, step: SubStep) -> jax.Array:
+    """`[nv]`, the share of what acts at a joint (actuators, gravity compensation) that its limit of force lets pass."""
+    data = step.data
+    if not np.any(model.jnt_actfrclimited):
+        return jnp.ones(model.nv)
+    acting = step.actuator_force @ data._impl.actuator_moment
+    if step.model.flg_gravcomp:
+        acting = acting + data.qfrc_gravcomp * model.jnt_actgravcomp[model.dof_jntid]
+    low, high = ranges(step.model.jnt_actfrclimited, step.model.jnt_actfrcrange)
+    low, high = low[model.dof_jntid], high[model.dof_jntid]
+    cut = ((acting < low) | (acting > high)) & (acting != 0)
+    return jnp.where(cut, jnp.clip(acting, low, high) / jnp.where(cut, acting, 1.0), 1.0)
 
 
 def neighbours(model: mujoco.MjModel) -> np.ndarray:

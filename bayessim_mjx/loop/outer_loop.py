@@ -12,7 +12,6 @@ import time
 from collections.abc import Callable
 from typing import Any, Protocol
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -22,6 +21,7 @@ from bayessim_mjx.device import mesh
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.env import Env
 from bayessim_mjx.errors import UserError
+from bayessim_mjx.keys import branch
 from bayessim_mjx.loop.inference_state import blank
 from bayessim_mjx.loop.reexamination import reexamine
 from bayessim_mjx.loop.round_inference import PREDICTIVE_DRAWS, infer, score
@@ -160,7 +160,7 @@ def _evaluate(loop: Loop, state: LoopState, policy: Policy) -> tuple[np.ndarray,
         thetas = jnp.zeros((n, 0)) if state.domain is None else state.domain.sample(key, n)
     else:
         thetas = loop.source.sample(key, n)
-    result = rl.evaluate(loop.env, policy, jax.random.fold_in(key, 1), thetas)
+    result = rl.evaluate(loop.env, policy, branch(key, 1), thetas)
     return np.asarray(result["return"]), np.asarray(result["length"])
 
 

@@ -29,7 +29,7 @@ def reexamine(loop: Loop, state: LoopState, policy: Policy, pairs: int, seed: in
     b, source, done = loop.settings, loop.source, int(state.round)
     domain = state.domain
     assert source is not None and domain is not None
-    key = jax.random.fold_in(jax.random.fold_in(jax.random.PRNGKey(seed), 0xCA11), done)  # seen by no fit
+    key = branch(branch(jax.random.PRNGKey(seed), 0xCA11), done)  # seen by no fit
     known = min(b.trainTrajs, REFERENCE)
     used = None if state.proposals is None else at(state.proposals, slot_of(loop, state, done))
     state, temperature = ranges.as_fitted(dataclasses.replace(state, proposal=used)), float(state.temperature)

@@ -43,7 +43,7 @@ def settled(
     key = branch(loop.key(int(state.round), "fit"), 6)
 
     def drawn(posterior: Distribution, turn: int) -> tuple[list[list[Distribution]], np.ndarray] | None:
-        return _simulated(loop, state, policy, known, jax.random.fold_in(key, turn), posterior)
+        return _simulated(loop, state, policy, known, branch(key, turn), posterior)
 
     return near.settled(found, product, drawn, loop.settings.components)
 
@@ -58,7 +58,7 @@ def rejudge(loop: Loop, state: LoopState, policy: Policy, known: int, key: Array
         used = settled(loop, state, policy, known, product, judge(loop, state, policy, known))
 
     def again(first: int, around: Distribution | None) -> tuple[list[list[Distribution]], np.ndarray] | None:
-        lots = [_simulated(loop, state, policy, known, jax.random.fold_in(key, first + i), around) for i in range(more)]
+        lots = [_simulated(loop, state, policy, known, branch(key, first + i), around) for i in range(more)]
         good = [lot for lot in lots if lot is not None]
         return ([row for lot in good for row in lot[0]], np.concatenate([lot[1] for lot in good])) if good else None
 

@@ -15,6 +15,7 @@ from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.env import Env
 from bayessim_mjx.inference import InferenceSettings, checks, rounds
 from bayessim_mjx.inference.range_ends import Pile
+from bayessim_mjx.keys import branch
 from bayessim_mjx.loop.sources import Source
 from bayessim_mjx.parameters import ParameterSpace
 from bayessim_mjx.parameters.ranged import Ranged
@@ -141,9 +142,7 @@ class Loop:
     def key(self, round_: int, purpose: str) -> Array:
         """Every random draw has its own key, a function of the seed alone: a resumed run draws the same."""
         purposes = ("init", "train", "evaluate", "simulate", "fit", "real", "predict")
-        return jax.random.fold_in(
-            jax.random.PRNGKey(self.config.seed), round_ * len(purposes) + purposes.index(purpose)
-        )
+        return branch(jax.random.PRNGKey(self.config.seed), round_ * len(purposes) + purposes.index(purpose))
 
 
 def space_of(loop: Loop, state: LoopState) -> ParameterSpace:

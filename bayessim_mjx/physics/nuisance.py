@@ -15,6 +15,7 @@ from flax import struct
 
 from bayessim_mjx.config.foreign import SIM_PARAMS
 from bayessim_mjx.errors import UserError
+from bayessim_mjx.keys import branch
 from bayessim_mjx.parameters import ParameterSpace, checks
 from bayessim_mjx.parameters.reading import PATH
 from bayessim_mjx.parameters.schedule import OVER, Schedule
@@ -127,7 +128,7 @@ class Nuisance:
         return drawn.replace(observation=self.observations.bias(self._key(drawn.course, 0), (size,)))
 
     def _key(self, course: Course, purpose: int) -> jax.Array:
-        return jax.random.fold_in(course.source, purpose)
+        return branch(course.source, purpose)
 
     def gravity_of(self, drawn: Drawn, gravity: jax.Array) -> jax.Array:
         """Gravity `[3]` of this episode; Isaac Gym draws each axis by itself."""

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from bayessim_mjx.compat import program
+from bayessim_mjx.keys import branch
 from bayessim_mjx.physics.warp import OVERFLOW, refuse_overflow
 from bayessim_mjx.rl.networks import Policy
 from bayessim_mjx.rollout import traced
@@ -92,7 +93,7 @@ def _episodes(env: Env) -> Callable[..., dict[str, jax.Array]]:
 
         def step(carry: tuple) -> Any:
             t, state, alive, total, length, lost = carry
-            state = jax.vmap(traced(env.step))(state, policy(jax.random.fold_in(key, t), state.obs))
+            state = jax.vmap(traced(env.step))(state, policy(branch(key, t), state.obs))
             total, length = total + jnp.where(alive, state.reward, 0.0), length + alive
             ended = state.info["terminated"] + state.info["truncated"] > 0
             lost = {name: jnp.maximum(most, state.metrics[name]) for name, most in lost.items()}

@@ -16,6 +16,7 @@ from flax import struct
 
 from bayessim_mjx.config import PPOConfig
 from bayessim_mjx.errors import UserError
+from bayessim_mjx.keys import branch
 from bayessim_mjx.rl import actions, normalise, recurrent
 from bayessim_mjx.rl.actions import bounded, entropy, kl, log_prob, log_slope, squashed_entropy
 from bayessim_mjx.rl.normalise import Moments
@@ -130,11 +131,11 @@ def _actor(key: jax.Array, sizes: Sizes, config: PPOConfig) -> Params:
         actor = {"layers": layers, "std": jnp.full(sizes.action, config.init_std)}
     if config.state_dependent_std or config.distribution == "beta":
         new = _spread if config.state_dependent_std else _second
-        spread = new(jax.random.fold_in(key, 2), layers[-1]["w"], config)
+        spread = new(branch(key, 2), layers[-1]["w"], config)
         joined = jax.tree.map(lambda mean, log_std: jnp.concatenate([mean, log_std], -1), layers[-1], spread)
         actor = {"layers": [*layers[:-1], joined]}
     if config.memory:
-        memory_key = jax.random.fold_in(key, 1)
+        memory_key = branch(key, 1)
         cell, count = config.memory_cell, config.memory_layers
         actor |= recurrent.stacked(memory_key, sizes.policy, config.memory, cell, count)
     return actor

@@ -17,11 +17,12 @@ from bayessim_mjx.rl.groups import size_of
 
 if TYPE_CHECKING:
     from bayessim_mjx.env import Env, State
+    from bayessim_mjx.parameters import ParameterSpace
 
 
 @lru_cache(maxsize=32)
-def _knowing(env: Env, source: str, target: str, setting: str) -> Any:
-    return ThetaSeen(env, source, target, setting)
+def _knowing(env: Env, source: str, target: str, setting: str, space: ParameterSpace | None = None) -> Any:
+    return ThetaSeen(env, source, target, setting, space)
 
 
 def for_critic(env: Env) -> Any:
@@ -29,19 +30,19 @@ def for_critic(env: Env) -> Any:
     return _knowing(env, "critic" if "critic" in env.observation_size else "policy", "critic", "ppo.critic_theta")
 
 
-def for_policy(env: Env) -> Any:
-    """`env` whose group "policy" ends with theta."""
-    return _knowing(env, "policy", "policy", "ppo.policy_theta")
+def for_policy(env: Env, space: ParameterSpace | None = None) -> Any:
+    """`env` whose group "policy" ends with theta; space: that which the policy was trained with (None: `env`'s)."""
+    return _knowing(env, "policy", "policy", "ppo.policy_theta", space)
 
 
-def for_teacher(env: Env) -> Any:
-    """`env` with a group "teacher": its "policy" with theta at the end."""
-    return _knowing(env, "policy", "teacher", "ppo.teacher")
+def for_teacher(env: Env, space: ParameterSpace | None = None) -> Any:
+    """`env` with a group "teacher": its "policy" with theta at the end; space: the teacher's (None: `env`'s)."""
+    return _knowing(env, "policy", "teacher", "ppo.teacher", space)
 
 
-def teacher_knowing(env: Env) -> Any:
-    """`env` whose group "teacher" ends with theta."""
-    return _knowing(env, "teacher", "teacher", "ppo.teacher")
+def teacher_knowing(env: Env, space: ParameterSpace | None = None) -> Any:
+    """`env` whose group "teacher" ends with theta; space: the teacher's (None: `env`'s)."""
+    return _knowing(env, "teacher", "teacher", "ppo.teacher", space)
 
 
 @dataclass(frozen=True)
@@ -59,21 +60,32 @@ class CriticTheta(Extension):
 
 
 class ThetaSeen:
-    """An environment whose observation group `target` is its group `source` and theta, in [-1, 1] over its range.
+    """An environment whose observation group `target` is its group `source` and theta.
 
-    theta is kept in info["theta"]; all else is the environment's.
+    The parameters are in the order of `space`, each in [-1, 1] over its range there. A policy that was trained with
+    other ranges than `env`'s so sees a mass of 1 kg as it has learnt to. theta is kept in info["theta"]; all else is
+    the environment's.
 
     Raises:
-        UserError: naming `setting`, where there are no parameters.
+        UserError: naming `setting`, where there are no parameters, or `space` (None: `env`'s) has others than `env`.
     """
 
-    def __init__(self, env: Env, source: str, target: str, setting: str) -> None:
+    def __init__(self, env: Env, source: str, target: str, setting: str, space: ParameterSpace | None = None) -> None:
         if not len(env.space):
             raise UserError(
                 f"{setting}: there are no parameters to show; randomise some (task.randomization_params, --randomize)"
             )
         self.env, self.source, self.target = env, source, target
-        low, high = (np.asarray(x, np.float32) for x in (env.space.low, env.space.high))
+        self.space_seen, self.order = space or env.space, np.arange(len(env.space))
+        if space is not None:
+            if set(space.names) != set(env.space.names):
+                theirs, ours = (", ".join(names) for names in (space.names, env.space.names))
+                raise UserError(
+                    f"{setting}: the policy was trained to see the parameters {theirs}, but here {ours} are "
+                    "randomised; randomise the same (task.randomization_params, effects)"
+                )
+            self.order = np.array([env.space.index(name) for name in space.names])
+        low, high = (np.asarray(x, np.float32) for x in (self.space_seen.low, self.space_seen.high))
         self.middle = (low + high) / 2
         self.half = np.where(high > low, (high - low) / 2, 1).astype(np.float32)
         size = size_of(env, source) + len(env.space)
@@ -85,7 +97,10 @@ class ThetaSeen:
     @property
     def observation_names(self) -> tuple[str, ...]:
         """Of the group "policy"."""
-        return (*getattr(self.env, "observation_names", ()), *(self.env.space.names if self.target == "policy" else ()))
+        return (
+            *getattr(self.env, "observation_names", ()),
+            *(self.space_seen.names if self.target == "policy" else ()),
+        )
 
     def reset(self, key: jax.Array, theta: jax.Array | None = None, *course: Any) -> State:
         theta = jnp.asarray(self.env.space.nominal, jnp.float32) if theta is None else theta
@@ -100,7 +115,8 @@ class ThetaSeen:
 
     def _show(self, state: State, theta: jax.Array) -> State:
         def see(obs: dict[str, jax.Array]) -> dict[str, jax.Array]:
-            return {**obs, self.target: jnp.concatenate([obs[self.source], (theta - self.middle) / self.half])}
+            shown = (theta[self.order] - self.middle) / self.half
+            return {**obs, self.target: jnp.concatenate([obs[self.source], shown])}
 
         info = {**state.info, "theta": theta, "final_observation": see(state.info["final_observation"])}
         return state.replace(obs=see(state.obs), info=info)

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from bayessim_mjx.config.settings import MEMORIES
+from bayessim_mjx.keys import branch
 
 if TYPE_CHECKING:
     from bayessim_mjx.env import Env, State
@@ -56,7 +57,7 @@ def init(key: jax.Array, size: int, units: int, cell: str = "gru") -> Params:
 
 def stacked(key: jax.Array, size: int, units: int, cell: str, count: int) -> dict[str, Params]:
     """Parameters of `count` layers of `units`, one on the other, by their keys in an actor: gru, gru_1 ..."""
-    keys = [key, *(jax.random.fold_in(key, i) for i in range(1, count))]
+    keys = [key, *(branch(key, i) for i in range(1, count))]
     return {_key(cell, i): init(k, units if i else size, units, cell) for i, k in enumerate(keys)}
 
 

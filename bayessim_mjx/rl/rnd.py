@@ -16,6 +16,7 @@ from jax.sharding import Mesh
 
 from bayessim_mjx.config import PPOConfig, RNDConfig
 from bayessim_mjx.errors import UserError
+from bayessim_mjx.keys import branch
 from bayessim_mjx.rl import episodes, losses, networks, normalise, sharding
 from bayessim_mjx.rl.extension import Extension, Figures, Learner, Sizes
 from bayessim_mjx.rl.sharding import FIRST
@@ -216,7 +217,7 @@ class Novelty(Extension):
 
     def init(self, key: jax.Array, sizes: Sizes, config: PPOConfig) -> RND:
         size = sum(sizes.observation[group][0] for group in self.groups(sizes.observation))
-        return init(jax.random.fold_in(key, 1), size, sizes.partial, self.settings)
+        return init(branch(key, 1), size, sizes.partial, self.settings)
 
     def reward(self, own: RND, data: dict, key: jax.Array, learner: Learner) -> tuple[RND, jax.Array, Figures]:
         """The reward is for the novelty before the predictor learns what was collected."""

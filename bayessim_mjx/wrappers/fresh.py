@@ -15,6 +15,7 @@ from flax import struct
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.env import Env, State
 from bayessim_mjx.errors import UserError
+from bayessim_mjx.keys import branch
 from bayessim_mjx.parameters.schedule import OVER
 from bayessim_mjx.rl.worlds import clock, drawn, reset_at
 from bayessim_mjx.rollout import next_episodes, select
@@ -79,7 +80,7 @@ class FreshEpisodes(Wrapper):
 
     def reset(self, rng: jax.Array) -> Any:
         state: Any = self.env.reset(rng)
-        key, first = jax.random.split(jax.random.fold_in(rng[0], 1))
+        key, first = jax.random.split(branch(rng[0], 1))
         if getattr(self._source, "nuisance", None) is not None:  # by the clock, which a reset alone does not know
             key, own = jax.random.split(key)
             begun = self._drawn(own, rng.shape[0], self._begins)

@@ -1,6 +1,7 @@
 """What the finer reality hides and what the library has: the same effects, parameters and motion."""
 
 import functools
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -111,6 +112,25 @@ def test_the_librarys_coupling_moves_as_the_cause_does(where, told):
     assert apart[0] < 0.1 * apart[1] and apart[0] < 3 * apart[2] + 1e-3
     (again,) = twin.twins(rig, scales, [{"name": "effort_coupling", "where": where, "parameters": told_as(cause)}])
     assert again.parameters() == pytest.approx(cause.parameters()) and again.other == cause.other
+
+
+def test_a_coupled_drive_gives_its_own_effort_where_another_one_is_beside_it():
+    """Its gear times its force, as much less as the joint's limit takes from both: -2 of 6 N m arrive as -1 of 3."""
+    text = TWO.replace('name="shoulder"', 'name="shoulder" actuatorfrcrange="-3 3"').replace(
+        "</actuator>", '<motor name="beside" joint="shoulder" gear="-2" ctrlrange="-9 9"/></actuator>'
+    )
+    rig = Motion("two", text, 0.01, False, (9.0, 4.0), (0.9, 0.3), (0.4, 0.3), (0.5, 0.5), 0.5, (4e-4, 4e-4), only=2)
+    plant = Plant(rig, {})
+    model, data = plant.model, plant.data
+    scales = SimpleNamespace(chain={"shoulder": ("", "elbow")}, drives={"one": "shoulder", "beside": "shoulder"})
+    for name, ctrl, effort in (("beside", [8, 0, 1], -1.0), ("one", [8, 0, 1], 4.0), ("one", [1, 0, 0.5], 1.0)):
+        cause = CAUSES["effort_coupling"](name, scales, np.random.default_rng(0), 0.5)
+        data.ctrl[:] = ctrl
+        mujoco.mj_forward(model, data)
+        cause.reset(plant, data.ctrl)
+        data.qfrc_applied[:] = 0
+        cause.force(plant)
+        assert cause.sign * data.qfrc_applied[plant.dof("elbow")] == pytest.approx(0.5 * effort)
 
 
 def told_as(cause):

@@ -1,15 +1,20 @@
 """Saved policies: found by name, played on every kind of physics, imitated."""
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from toy_runs import SMALL, TOY, Toy, error_of
 
 from bayessim_mjx import config, play, registry, train
+from bayessim_mjx.cli import policies
 from bayessim_mjx.env import State
+from bayessim_mjx.errors import UserError
+from bayessim_mjx.parameters import Parameter, ParameterSpace
 from bayessim_mjx.runs import checkpoints, latest_run
 
 
@@ -108,6 +113,28 @@ def test_play_looks_where_logdir_says(toy: None, capsys: pytest.CaptureFixture, 
     assert play.main(["--task", "Pendulum", "--checkpoint", "latest", "--episodes", "2", where]) == 0
     assert "checkpoint elsewhere" in capsys.readouterr().out
     assert "no run of 'Pendulum'" in error_of(capsys, play.main, "--task", "Pendulum", "--checkpoint", "latest")
+
+
+def test_policies_of_a_run_see_theta_in_the_runs_units(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A mass of 2 of 1 to 5 kg is -0.5 to a policy that was trained there, whatever the range here."""
+
+    class Wide(Toy):
+        space = ParameterSpace([Parameter("mass", 1.0, 1.0, 5.0)])
+
+    run = SimpleNamespace(config=config.load("Pendulum", overrides=["ppo.policy_theta=True", "name=theirs"]))
+    monkeypatch.setattr(registry, "make", lambda name, config: Wide() if config.name == "theirs" else TOY)
+    here, seen = config.load("Pendulum", overrides=["ppo.policy_theta=True"]), {}
+    monkeypatch.setattr(policies, "find_checkpoint", lambda *_: (Path("there"), run))
+    monkeypatch.setattr(policies, "load_policy", lambda path, env, config: seen.update(env=env))
+    own = policies.privileged(here, TOY, run)[0]
+    student = policies.privileged(config.replace(here, ppo={"policy_theta": False, "teacher": "there"}), TOY)[0]
+    for env, group in ((own, "policy"), (student, "teacher"), (seen["env"], "policy")):
+        assert env.reset(jax.random.PRNGKey(0), jnp.array([2.0])).obs[group][-1] == pytest.approx(-0.5)
+    fresh = policies.privileged(here, TOY)[0]
+    assert fresh.reset(jax.random.PRNGKey(0), jnp.array([2.0])).obs["policy"][-1] == 1.0
+    begun = config.replace(here, bayessim={"policyCheckpt": "there"})
+    with pytest.raises(UserError, match="in units of mass 1 to 5, but here the ranges are mass 0.5 to 2; give"):
+        policies.warm_start(None, begun, fresh)
 
 
 @pytest.mark.slow

@@ -162,9 +162,15 @@ def test_corrupted_checkpoints_of_a_run_to_resume(toy: None, capsys: pytest.Capt
     assert "damaged manifest" in error_of(capsys, train.main, "--resume", str(run.path))
 
 
-def test_training_goes_on_from_a_policy(toy: None) -> None:
+def test_training_goes_on_from_a_policy(toy: None, capsys: pytest.CaptureFixture) -> None:
     assert train.main(["--task", "Pendulum", *SMALL]) == 0
+    assert "are new" not in capsys.readouterr().out
     run = latest_run("logs", "Pendulum")
     assert train.main(["--task", "Pendulum", *SMALL, "--checkpoint", "best", "--max_iterations", "0"]) == 0
     again = latest_run("logs", "Pendulum", with_checkpoint=False)
     assert again.path != run.path and again.config.bayessim.policyCheckpt == str(run.checkpoint("best").absolute())
+    said = " ".join(capsys.readouterr().out.split())
+    assert (
+        "checkpoints/" in said
+        and f"critic, state of Adam and learning rate ({again.config.ppo.learning_rate:g}) are new" in said
+    )

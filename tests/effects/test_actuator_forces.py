@@ -44,6 +44,8 @@ def mechanisms():
         alone = [KINDS[kind].format('joint="{0}" gear="-1.1"')]
         yield 'gravcomp="1"', COMPENSATED, alone
         yield 'gravcomp="1"', f'{COMPENSATED} actuatorfrcrange="-12 11"', alone
+    yield 'gravcomp="1"', COMPENSATED, two
+    yield 'gravcomp="1"', COMPENSATED, two[::-1]
     yield (
         "",
         "",
@@ -150,7 +152,6 @@ def agree(got, want, atol=1e-5):
 
 @INTEGRATORS
 @pytest.mark.parametrize("case", ["neutral", *NATIVE])
-@pytest.mark.slow
 def test_an_effect_is_its_own_edit_recompiled_in_mujoco(integrator, case):
     got = motions(integrator)[case]
     agree(got, by_mujoco(integrator, case))
@@ -252,6 +253,12 @@ class Reference:
                 state = self.step(integrator, state, command)
             rows.append(state[:2])
         return tuple(np.array(x) for x in zip(*rows, strict=True))
+
+
+def test_some_joint_is_compensated_by_one_of_two_drives_that_is_off():
+    compensated = MODEL.jnt_actgravcomp[MODEL.actuator_trnid[:, 0]] > 0
+    drives = np.bincount(MODEL.actuator_trnid[compensated, 0], SOME[compensated], MODEL.nv)
+    assert set(drives[np.bincount(MODEL.actuator_trnid[compensated, 0], minlength=MODEL.nv) == 2]) == {1.0}
 
 
 @INTEGRATORS

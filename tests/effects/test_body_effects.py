@@ -186,6 +186,21 @@ def test_base_flexibility_is_two_more_hinges(base):
     assert np.abs(q - real).max() < 0.05 * effect + 5e-4
 
 
+DOOR = """<body name="cabinet" pos="1 .3 .4"><geom size=".1" contype="0" conaffinity="0"/><body name="leaf">
+<joint name="door" axis="0 1 0" damping=".3"/><geom pos=".2 0 .1" size=".1" mass="2" contype="0" conaffinity="0"/>
+</body></body>"""
+
+
+def test_what_stands_beside_the_robot_does_not_rock_with_it():
+    """The arm moves as it does alone, and a door on a hinge as it does in MuJoCo C, where nothing rocks it."""
+    beside = XML.replace("<worldbody>", f"<worldbody>{DOOR}")
+    (q,) = moved(physics(beside, [make("base_flexibility", where="world")]), [[0.004, 8.0, 0.1, 0.3]], COMMAND)
+    still = truth(mujoco.MjModel.from_xml_string(beside), COMMAND)
+    np.testing.assert_allclose(q[:, 0], still[:, 0], atol=1e-4)
+    real = rocking(0.004, 8.0, 0.1, 0.3)
+    assert np.ptp(still[:, 0]) > 0.5 and np.abs(q[:, 1:] - real).max() < 0.05 * np.abs(real - plain()).max() + 5e-4
+
+
 def test_stays_finite_and_tends_to_neutral():
     edges = [
         theta(payload=[10.0, 0.1, 0.1, 0.1, 10.0, -0.1, 0.1, -0.1]),

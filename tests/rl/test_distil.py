@@ -12,7 +12,7 @@ from test_privileged import DOMAIN, Luck
 from bayessim_mjx import rl
 from bayessim_mjx.config import PPOConfig
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.rl import distil, normalise, privileged
+from bayessim_mjx.rl import catalogue, distil, normalise, privileged, worlds
 from bayessim_mjx.rl.networks import Policy
 
 CONFIG = PPOConfig(
@@ -49,6 +49,25 @@ def test_what_the_student_does_not_see_it_averages():
     state, metrics = student(env, linear([0.0, 0.5], 0.25), DOMAIN)
     assert rl.policy_of(state).act(None, jnp.zeros(1))[0] == pytest.approx(0.25, abs=0.06)
     assert metrics["Loss/behavior"] == pytest.approx(1 / 12, rel=0.1)
+
+
+def test_a_student_learns_with_the_statistics_that_it_will_act_with(monkeypatch):
+    """Of the first update, whose observations are far from the statistics that it begins with."""
+    env, batches = probes.Clock(), []
+
+    def learnt(key, params, opt_state, rate, batch, *_):
+        batches.append(batch)
+        return params, opt_state, rate, {"Loss/behavior": jnp.zeros(1)}
+
+    monkeypatch.setattr(distil.losses, "descend", learnt)
+    state, teacher = rl.init(env, CONFIG, jax.random.PRNGKey(0)), linear([0.2], 0.1)
+    after, _ = distil.update(env, CONFIG, state, None, teacher)
+    _, data = worlds.gather(catalogue.learner(env, CONFIG), state, None, jax.random.split(state.key, 3)[1])
+    observation, (seen, target) = data["observation"]["policy"], batches[0]
+    will_see = normalise.normalise(after.normalizer["policy"], observation)
+    np.testing.assert_allclose(seen, will_see.reshape(seen.shape), atol=1e-6)
+    np.testing.assert_allclose(target, teacher.act(None, observation).reshape(target.shape), atol=1e-6)
+    assert float(jnp.abs(after.normalizer["policy"].mean).max()) > 0.1  # or they could not have told
 
 
 def test_the_loss_by_hand():

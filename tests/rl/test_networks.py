@@ -27,6 +27,23 @@ def test_weights_are_orthogonal_and_the_first_policy_is_nearly_its_noise():
     assert params["critic"]["layers"][0]["w"].shape == (7, 8)
 
 
+SPREADS = (
+    {"state_dependent_std": True, "weight_init": "lecun_uniform"},
+    {"distribution": "beta"},
+    {"distribution": "beta", "weight_init": "lecun_uniform"},
+    {"memory": 6, "memory_layers": 3, "weight_init": "lecun_uniform"},
+)
+
+
+@pytest.mark.parametrize("hidden", [(16,), (16, 16), (16, 16, 16)])
+@pytest.mark.parametrize("changes", SPREADS)
+def test_no_two_first_weights_are_drawn_alike(changes, hidden):
+    """Random numbers are the same only where two draws have one key; a row has several, which chance repeats never."""
+    params = made(6, 7, 6, hidden, hidden, 0.5, **changes)
+    columns = [tuple(c) for w in jax.tree.leaves(params) if w.ndim == 2 for c in np.round(np.float64(w.T), 6) if any(c)]
+    assert len(set(columns)) == len(columns) > 12
+
+
 def test_log_prob_and_entropy_equal_scipys():
     mean, std, x = np.array([0.3, -1.0]), np.array([0.5, 2.0]), np.array([1.0, 0.0])
     normal = stats.norm(mean, std)

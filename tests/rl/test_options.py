@@ -14,6 +14,7 @@ from bayessim_mjx import rl
 from bayessim_mjx.config import PPOConfig
 from bayessim_mjx.env import State
 from bayessim_mjx.errors import UserError
+from bayessim_mjx.keys import branch
 from bayessim_mjx.rl import actions, distil, groups, networks, recurrent
 from bayessim_mjx.rl.extension import Learner
 
@@ -121,7 +122,7 @@ def test_two_recurrent_layers_are_one_after_the_other(cell):
 
 def test_one_recurrent_layer_is_as_it_was():
     one = networks.init(jax.random.PRNGKey(0), networks.Sizes(3, 3, 1), change(memory=4))["actor"]
-    alone = recurrent.init(jax.random.fold_in(jax.random.split(jax.random.PRNGKey(0))[0], 1), 3, 4)
+    alone = recurrent.init(branch(jax.random.split(jax.random.PRNGKey(0))[0], 1), 3, 4)
     assert set(one) == {"layers", "log_std", "gru"}
     jax.tree.map(np.testing.assert_array_equal, one["gru"], alone)
 

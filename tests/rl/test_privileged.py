@@ -11,6 +11,7 @@ import pytest
 from bayessim_mjx import rl
 from bayessim_mjx.config import PPOConfig
 from bayessim_mjx.errors import UserError
+from bayessim_mjx.parameters import Parameter, ParameterSpace
 from bayessim_mjx.rl import networks, normalise, privileged
 
 CONFIG = PPOConfig(
@@ -49,6 +50,31 @@ def test_theta_follows_the_observation_within_minus_one_and_one():
     np.testing.assert_array_equal(env.reset(jax.random.PRNGKey(0)).obs["critic"], [0.0, 0.0])  # nominal
     assert env.observation_size == {"policy": (1,), "critic": (2,)}
     assert (env.action_size, env.episode_length) == (1, 10)
+
+
+def known_by(low, high, names=("mass", "length")):
+    """A walk of two parameters, with these ranges."""
+    env = probes.Walk()
+    env.space = ParameterSpace([Parameter(*row) for row in zip(names, (1.0, 1.0), low, high, strict=True)])
+    return env
+
+
+def shown(env, policy, theta):
+    state = env.step(env.reset(jax.random.PRNGKey(0), jnp.array(theta)), jnp.zeros(1))
+    return state.obs[policy][-2:]
+
+
+@pytest.mark.parametrize(("made", "group"), [(privileged.for_teacher, "teacher"), (privileged.for_policy, "policy")])
+def test_a_policy_sees_theta_as_it_has_learnt_to(made, group):
+    """A mass of 1.5 kg on the way from 0.01 to 2 kg is (1.5 - 1.005) / 0.995; parameters are found by their names."""
+    here, theirs = known_by((0.5, 0.1), (1.5, 2.1)), known_by((0.01, 0.0), (2.0, 4.0)).space
+    own, its = [0.5 / 0.5, -0.6 / 1.0], [0.495 / 0.995, -1.5 / 2.0]
+    np.testing.assert_allclose(shown(made(here), group, [1.5, 0.5]), own, rtol=1e-6)
+    np.testing.assert_allclose(shown(made(here, theirs), group, [1.5, 0.5]), its, rtol=1e-6)
+    turned = theirs.subset(("length", "mass"))
+    np.testing.assert_allclose(shown(made(here, turned), group, [1.5, 0.5]), its[::-1], rtol=1e-6)
+    with pytest.raises(UserError, match="to see the parameters mass, gear, but here mass, length are randomised"):
+        made(here, known_by((0, 0), (2, 2), ("mass", "gear")).space)
 
 
 def test_the_value_follows_theta_and_the_policy_does_not_see_it():

@@ -214,8 +214,8 @@ def test_copies_are_seen_and_rated_as_the_collecting_policy_would():
     actor = {**state.params["actor"], "layers": jax.tree.map(lambda x: x + 0.3, state.params["actor"]["layers"])}
     params = {**state.params, "actor": actor}
     state = state.replace(normalizer={"policy": moments}, params=params)
-    raw = {"policy": jnp.array([[[1.0], [-2.0]]])}
-    action = jnp.array([[[0.3], [1.7]]])
+    raw = {"policy": jnp.array([[[1.0], [-2.0], [1.0]]])}
+    action = jnp.array([[[0.3], [1.7], [-1.7]]])  # of the last one the copy is likelier than itself
     data = {"observation": raw, "extras": {"action": action}}
     later = {"policy": normalise.Moments(jnp.array([0.6]), jnp.array([3.0]), jnp.float32(20))}
     policy = rl.policy_of(state)
@@ -224,7 +224,7 @@ def test_copies_are_seen_and_rated_as_the_collecting_policy_would():
     seen = normalise.normalise(later["policy"], -raw["policy"][0])
     np.testing.assert_allclose(copies.observation[0, :, 0], seen, rtol=1e-6)
     np.testing.assert_allclose(copies.weight[..., 0], np.minimum(1, np.exp(copies.log_prob[..., 0] - own)), rtol=1e-5)
-    assert copies.weight.min() < 0.9
+    assert copies.weight.min() < 0.9 and copies.weight.max() == 1 and (copies.log_prob[..., 0] - own).max() > 0.1
     np.testing.assert_array_equal(copies.action[0, :, 0], -action[0])
     np.testing.assert_allclose(copies.log_prob[0, :, 0], policy.log_prob(-raw["policy"][0], -action[0]), rtol=1e-5)
     value = networks.value(state.params, copies.observation, networks.activation(cfg.activation))

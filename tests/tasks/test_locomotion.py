@@ -22,6 +22,8 @@ ROBOT = """<mujoco model="robot"><compiler angle="radian" autolimits="true"/><op
 </body></worldbody><actuator><position name="right_leg" joint="right_leg"/><position name="left_leg" joint="left_leg"/>
 <motor name="tail" joint="tail" ctrlrange="-3 3"/></actuator></mujoco>"""
 HALF = 0.5**0.5
+RATE = '<intvelocity name="left_leg" kp="3" actrange="-1 1"'
+STUCK = '<general gainprm="0" biastype="affine" biasprm="0 -3" name="tail"'
 
 
 class Robot(Locomotion):
@@ -78,6 +80,40 @@ def test_starts_are_near_home_and_inside_the_limits(robot):
 
 def test_drives_are_commanded_from_home_and_motors_from_nothing(robot):
     np.testing.assert_allclose(robot.command(jnp.array([1.0, -1.0, 0.5])), [0.2 + 0.5, -0.3 - 0.5, 1.5], atol=1e-6)
+
+
+DRIVES = {
+    "gear": '<position name="d" joint="{}" gear="2"/>',
+    "gear that turns round": '<position name="d" joint="{}" gear="-1.5"/>',
+    "spring weaker than its gain": '<general name="d" joint="{}" gainprm="30" biastype="affine" biasprm="2 -20 -1"/>',
+    "gain that grows": '<general name="d" joint="{}" gear="1.3" gaintype="affine" gainprm="9 4" biastype="affine"'
+    ' biasprm="1 -20"/>',
+    "lag": '<position name="d" joint="{}" gear="2" timeconst=".1"/>',
+    "tendon": '<position name="d" tendon="both" gear="1.4"/>',
+    "site": '<position name="d" site="tip" refsite="middle" gear="1 0 2 0 0.5 0"/>',
+}
+
+
+@pytest.mark.parametrize("drive", DRIVES)
+def test_a_drive_rests_at_home(drive):
+    """MuJoCo's own force of the command at the action 0 is none at home, and some a little beside it."""
+    tip = '<geom pos="0 0 -0.2"/><site name="tip" pos=".05 0 -.2"/></body>\n<body name="tail"'
+    text = ROBOT.replace('<geom pos="0 0 -0.2"/></body>\n<body name="tail"', tip)
+    text = text.replace('<geom name="belly"', '<site name="middle" pos=".1 0 0"/><geom name="belly"')
+    tendon = '<tendon><fixed name="both"><joint joint="right_leg" coef="2"/><joint joint="left_leg" coef="-3"/></fixed>'
+    own = DRIVES[drive].format("left_leg")
+    text = text.replace("<actuator>", f"{tendon}</tendon><actuator>{own}")
+    robot = type("Robot", (Robot,), {"xml": text, "sides": None, "reach": 1.0})()
+    model, data = robot.mj_model, mujoco.MjData(robot.mj_model)
+    data.ctrl[:] = np.asarray(robot.command(jnp.zeros(4)))
+    data.act[:] = data.ctrl[: model.na]
+    forces = []
+    for away in (0.0, 0.1):
+        data.qpos[:] = [0, 0, 0.4, 1, 0, 0, 0, 0.2, -0.3 + away, 0, 0.1]
+        mujoco.mj_forward(model, data)
+        forces.append(data.actuator_force.copy())
+    np.testing.assert_allclose(forces[0], 0, atol=2e-5)
+    assert abs(forces[1][0]) > 0.1 and data.ctrl[3] == 0
 
 
 def judged(robot, after, belly=0.4, action=(0.1, 0.2, 0.2)):
@@ -154,6 +190,14 @@ def test_without_sides_there_is_no_mirror_and_odd_axes_are_refused():
         ({"commands": {"command_z": 1.0}}, "commands names 'command_z'; there are: command_x, command_y, command_yaw"),
         ({"guards": ("nose",)}, "guards names 'nose'; there are: belly$"),
         ({"home": {"knee": 1.0}}, "home names the joint 'knee'; there are: right_leg, left_leg, tail, waist"),
+        (
+            {"sides": None, "xml": ROBOT.replace('<position name="left_leg"', RATE)},
+            "the command of actuator left_leg is a rate; allowed: <position> and <motor>",
+        ),
+        (
+            {"xml": ROBOT.replace('<motor name="tail"', STUCK)},
+            "actuator tail pulls to a place whatever its command",
+        ),
         ({"xml": ROBOT.replace("<freejoint", '<joint type="ball"')}, "the first joint has to be a <freejoint>"),
     ],
 )

@@ -59,6 +59,24 @@ def test_targets_move_at_a_rate_or_are_places():
     np.testing.assert_allclose(Arm().at_rest(qpos), [-0.4, 0.3], rtol=1e-6)
 
 
+def test_targets_at_the_start_are_those_at_which_the_drives_rest():
+    """Behind gears and with a spring unlike the gain; by MuJoCo's own forces."""
+
+    class Geared(Arm):
+        spring = '<general name="elbow" joint="elbow" gainprm="40" biastype="affine" biasprm="3 -50 -5"/>'
+        xml = ARM.replace('<position name="elbow" joint="elbow"/>', spring).replace(
+            'joint="shoulder"/></a', 'joint="shoulder" gear="-2" ctrlrange="-6 6"/></a'
+        )
+
+    arm = Geared()
+    data = mujoco.MjData(arm.mj_model)
+    data.qpos[:] = [0.7, -0.4, 1, 0, 0, 1, 0, 0, 0]
+    data.ctrl[:] = np.asarray(arm.at_rest(jnp.asarray(data.qpos)))
+    mujoco.mj_forward(arm.mj_model, data)
+    np.testing.assert_allclose(data.actuator_force, 0, atol=2e-5)
+    np.testing.assert_allclose(data.ctrl, [(-3 + 50 * -0.4) / 40, -1.4], rtol=1e-6)
+
+
 def test_frames_are_those_of_the_state_or_of_the_sensors():
     arm = Arm()
     world = arm.physics.world(arm.space.nominal, jnp.array([0.5, 1.0, 1, 0, 0, 1, 0, 0, 0]))
@@ -95,6 +113,11 @@ def test_bad_names_and_actuators_are_refused():
     class Pushed(Arm):
         xml = ARM.replace("</actuator>", '<motor name="push" joint="cube"/></actuator>')
 
+    class Motor(Arm):
+        xml = ARM.replace('<position name="elbow"', '<motor name="elbow"')
+
+    with pytest.raises(UserError, match="Motor: actuator elbow pulls to no place; it has to be a position drive"):
+        Motor()
     with pytest.raises(UserError, match="Lost: home names the joint 'wrist'; there are: shoulder, elbow, cube"):
         Lost()
     with pytest.raises(UserError, match="Pushed: actuator push has to drive a hinge or a slide"):

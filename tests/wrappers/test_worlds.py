@@ -47,6 +47,17 @@ def test_no_episode_begins_as_an_earlier_one():
     assert len(np.unique(starts)) == starts.size
 
 
+def test_episodes_in_store_are_drawn_anew_when_a_world_needs_its_second_and_not_sooner():
+    """Three worlds whose episodes of five steps end one after the other: a store lasts for five steps."""
+    some, stores = Worlds(ENV, None, 3, seed=1), []
+    some.set_lengths(jnp.array([4, 3, 2]))
+    for _ in range(16):
+        some.step(jnp.zeros((3, 1)))
+        stores.append(tuple(np.asarray(some._running.store[0].obs["policy"][:, 1])))
+    drawn = [i + 1 for i in range(1, 16) if stores[i] != stores[i - 1]]
+    assert drawn == [6, 11, 16] and len(set(stores)) == 4
+
+
 def test_theta_is_drawn_anew_in_each_episode():
     many = Worlds(ENV, Distribution.prior(ENV.space, 1), 64, seed=0)
     many.reset()

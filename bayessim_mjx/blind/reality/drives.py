@@ -48,8 +48,18 @@ class EffortCoupling(ActuatorCause):
         before, behind = self.scales.chain[self.joint]
         self.other = str(rng.choice([j for j in (before, behind) if j]))
 
+    def reset(self, plant: Simulated, command: np.ndarray) -> None:
+        super().reset(plant, command)
+        model, self.at = plant.model, plant.model.joint(self.joint).id
+        here = (model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT) & (model.actuator_trnid[:, 0] == self.at)
+        self.gears = np.where(here, model.actuator_gear[:, 0], 0.0)
+
     def force(self, plant: Simulated) -> None:
-        effort = plant.data.qfrc_actuator[plant.dof(self.joint)]
+        model, data = plant.model, plant.data
+        effort, asked = self.gear * data.actuator_force[self.id], self.gears @ data.actuator_force
+        asked += model.jnt_actgravcomp[self.at] * data.qfrc_gravcomp[plant.dof(self.joint)]
+        if model.jnt_actfrclimited[self.at] and asked:
+            effort *= np.clip(asked, *model.jnt_actfrcrange[self.at]) / asked
         plant.data.qfrc_applied[plant.dof(self.other)] += self.sign * self.size * effort
 
     def parameters(self) -> dict[str, float]:
