@@ -16,6 +16,11 @@ RAMP = "ppo.rnd.weight_schedule={mode: linear, initial_step: 0, final_step: 20, 
 ARGV = ["--task", "Pendulum", "--randomize", *SMALL, *LEARNER]
 
 
+def changed(run: Run) -> list[str]:
+    """Which settings are not those of the manifest; the code's commit is another matter."""
+    return [text for text in run.changes() if not text.startswith(("git ", "version "))]
+
+
 def values(run: Run, tag: str) -> dict[int, float]:
     """{step: value} of a tag in the run's scalars.jsonl."""
     rows = map(json.loads, (run.path / "scalars.jsonl").read_text().splitlines())
@@ -36,7 +41,7 @@ def test_four_iterations_resumed_to_eight_are_eight(toy: None, capsys: pytest.Ca
     assert checkpoint_of(whole, 8) == checkpoint_of(run, 8)  # all arrays: optimiser, critic, normalisers, rate, clocks
 
     assert run.config == config.replace(given, ppo={"max_iterations": 8})
-    assert run.manifest["settings"] == run.config.to_dict() and not run.changes()
+    assert run.manifest["settings"] == run.config.to_dict() and not changed(run)
     assert {k: run.manifest[k] for k in ("status", "latest")} == {"status": "finished", "latest": 8}
     assert [{k: e[k] for k in ("step", "from", "to")} for e in run.manifest["prolonged"]] == [
         {"step": 4, "from": 4, "to": 8}
@@ -64,7 +69,7 @@ def test_a_prolonged_run_that_is_killed_remembers_how_far_it_was_to_go(toy: None
     assert Run.open(run.path).manifest["latest"] == 6
     assert train.main(["--resume", str(run.path)]) == 0
     again = Run.open(run.path)
-    assert again.manifest["latest"] == 8 and again.config.ppo.max_iterations == 8 and not again.changes()
+    assert again.manifest["latest"] == 8 and again.config.ppo.max_iterations == 8 and not changed(again)
     assert not repeated_events(again)
 
 
