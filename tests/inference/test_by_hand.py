@@ -29,7 +29,9 @@ def test_a_set_is_judged_with_the_widening_that_the_other_half_asks_for() -> Non
     # even sets with the factor 1 of the odd ones: 1 - exp(-4^2 / 2) of a Gaussian in two dimensions
     np.testing.assert_allclose(found.levels[::2], 1 - np.exp(-8.0), atol=2e-3)
     assert found.levels[1::2].max() < 0.01
-    assert found.gain < np.log(1 / (2 * np.pi * SD**2)) - 3.5  # half of the sets are 8 nats worse, less the widened half
+    assert (
+        found.gain < np.log(1 / (2 * np.pi * SD**2)) - 3.5
+    )  # half of the sets are 8 nats worse, less the widened half
 
 
 def test_one_factor_on_standard_deviations() -> None:

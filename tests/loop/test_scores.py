@@ -25,7 +25,9 @@ def scores_of(scores: np.ndarray) -> np.ndarray:
     z = np.tile([-1.0, 1.0], 50)[:, None]
     # a square's slope in z is -2 score; their mean is 1, as is the variance of z
     squares = 1.0 - 2.0 * z[:, :, None] * scores
-    found, lower = _spread(z, squares, SimpleNamespace(count=float(scores.size), least=0.0, groups=np.zeros(len(scores))))
+    found, lower = _spread(
+        z, squares, SimpleNamespace(count=float(scores.size), least=0.0, groups=np.zeros(len(scores)))
+    )
     np.testing.assert_allclose(lower, [[1.0]])
     return found
 
