@@ -90,6 +90,12 @@ def _prepare(args: argparse.Namespace) -> tuple[Config, Any]:
 
     if args.resume:
         run = Run.open(args.resume)
+        if args.max_iterations is not None:
+            raise UserError(
+                "--max_iterations: all rounds of a run have the same number, also those that are done; to train longer "
+                f"under its posterior: bayessim-mjx train --domain {run.path} --checkpoint {run.path} "
+                f"--max_iterations {args.max_iterations}"
+            )
         return cli.resumed_config(args, run.config), run
     more = {"--checkpoint": ("bayessim.policyCheckpt", args.checkpoint)} if args.checkpoint else {}
     config = cli.pin_policy(cli.config_of(args, more))

@@ -29,13 +29,20 @@ KINDS = {
 
 
 def _parser() -> cli.Parser:
-    without = ("--max_iterations", "--video_interval", "--logger", "--name", "--resume")
+    without = ("--num_envs", "--max_iterations", "--video_interval", "--logger", "--name", "--resume")
     parser = cli.Parser("play", DESCRIPTION, without=without)
     parser.add_argument(
         "--episodes",
         metavar="N",
-        type=cli.whole(-COUNT, COUNT),
+        type=cli.whole(1, COUNT),
         help="episodes for each kind of physics (default: --num_envs, else bayessim.realEvals)",
+    )
+    # Isaac Lab's; not the setting env.numEnvs, which training's batches are limited by
+    parser.add_argument("--num_envs", metavar="N", type=cli.whole(0, COUNT), dest="worlds", help="same as --episodes")
+    parser.add_argument(
+        "--use_pretrained_checkpoint",
+        action="store_true",
+        help="play the policy of the task that comes with the package (docs/pretrained.md)",
     )
     parser.add_argument("--physics", choices=KINDS, help="evaluate on this kind of physics only")
     parser.add_argument(
@@ -57,6 +64,8 @@ def _settings(args: argparse.Namespace) -> tuple[Config, Path, Any]:
     """(settings of the run that the checkpoint belongs to with flags on top, checkpoint folder, run or None)."""
     if args.task:
         args.task = cli.task_name(args.task)
+    if args.use_pretrained_checkpoint:
+        return _pretrained_settings(args)
     which = args.checkpoint or "best"
     # of a task's newest run, which lies where flags, files and overrides say
     logdir = cli.config_of(args).logdir if args.task and which in ("best", "latest") else ""
@@ -69,14 +78,35 @@ def _settings(args: argparse.Namespace) -> tuple[Config, Path, Any]:
     return cli.config_of(args), path, run
 
 
+def _pretrained_settings(args: argparse.Namespace) -> tuple[Config, Path, None]:
+    """The same for the policy that comes with the package; the folder is where its videos and exports go beside."""
+    from bayessim_mjx.rl import pretrained
+
+    flag, have = "--use_pretrained_checkpoint", ", ".join(pretrained.names())
+    if args.checkpoint:
+        raise UserError(f"{flag} and --checkpoint {args.checkpoint}: give one of them")
+    if not args.task:
+        raise UserError(f"{flag}: give --task NAME; policies come for {have}")
+    if args.task not in pretrained.names():
+        raise UserError(
+            f"{flag}: none comes for {args.task}; policies come for {have}. bayessim-mjx train --task {args.task} "
+            "makes one, and --checkpoint best plays it"
+        )
+    for given in [*(["--cfg_train"] if args.cfg_train else []), *args.overrides]:
+        if given.startswith(("ppo.", "--cfg_train")):
+            raise UserError(f"{given}: the policy that comes with the package has settings of its own; leave it out")
+    config = cli.config_of(args)
+    return config, Path(config.logdir) / config.task / "pretrained", None
+
+
 def _nominal(env: Any, count: int) -> Any:
     import jax.numpy as jnp
 
     return jnp.tile(jnp.asarray(env.space.nominal, jnp.float32), (count, 1))
 
 
-def _physics(config: Config, env: Any, checkpoint: Path, key: Any, count: int) -> dict[str, Any]:
-    """theta [count, d] of every kind of physics that there is."""
+def _physics(config: Config, env: Any, checkpoint: Path | None, key: Any, count: int) -> dict[str, Any]:
+    """theta [count, d] of every kind of physics that there is; a posterior comes with a `checkpoint`."""
     from bayessim_mjx.distributions import Distribution
     from bayessim_mjx.loop.sources import make_source
     from bayessim_mjx.wrappers.worlds import posterior_of
@@ -88,7 +118,7 @@ def _physics(config: Config, env: Any, checkpoint: Path, key: Any, count: int) -
     kinds["prior"] = prior.sample(key, count)
     if config.env.realParams is not None and not config.real.logs:
         kinds["real"] = make_source(config, env).sample(key, count)  # type: ignore[union-attr]
-    if (domain := posterior_of(env, checkpoint, config)) is not None:
+    if checkpoint is not None and (domain := posterior_of(env, checkpoint, config)) is not None:
         kinds["posterior"] = domain.sample(key, count)
     return kinds
 
@@ -127,10 +157,12 @@ def _export(env: Any, policy: Any, checkpoint: Path, run: Any, target: str) -> s
 
 def _hub(args: argparse.Namespace, env: Any, policy: Any, config: Config, run: Any, returns: dict[str, Any]) -> str:
     """Write the folder for a model hub; what to say of it."""
-    from bayessim_mjx.rl import hub
+    from bayessim_mjx.rl import hub, pretrained
 
     trained = config if run is None else run.config
     command = "" if run is None else run.manifest["command"]
+    if args.use_pretrained_checkpoint:
+        command = pretrained.about(config.task)["command"]
     hub.write(Path(args.hub), policy, env, trained, {KINDS[kind]: r for kind, r in returns.items()}, command)
     return f"for a model hub: {args.hub} ({', '.join(hub.OWN)})"
 
@@ -142,9 +174,7 @@ def _play(argv: Sequence[str] | None) -> int:
     if args.hub and args.export is not None:
         raise UserError("--hub and --export: give one of them; --hub writes the ONNX file too")
     config, path, run = _settings(args)
-    count = args.episodes if args.episodes is not None else args.num_envs or config.bayessim.realEvals
-    if count < 1:
-        raise UserError(f"--episodes {count}: must be at least 1")
+    count = args.episodes or args.worlds or config.bayessim.realEvals
     from bayessim_mjx.monitor.console import Console
 
     with Console(headless=True) as console:
@@ -156,6 +186,21 @@ def _acted_in(config: Config, run: Any) -> Any:
     from bayessim_mjx import registry
 
     return cli.privileged(replace(config, ppo={"teacher": None}), registry.make(config.task, config=config), run)[0]
+
+
+def _policy(args: argparse.Namespace, config: Config, path: Path, env: Any) -> Any:
+    """The policy of the checkpoint, or that which comes with the package."""
+    if not args.use_pretrained_checkpoint:
+        return cli.load_policy(path, env, config)
+    from bayessim_mjx.rl import groups, pretrained
+
+    policy, shown = pretrained.pretrained(config.task), groups.size_of(env, "policy")
+    if (sees := policy.normalizer.mean.size) != shown:
+        raise UserError(
+            f"--use_pretrained_checkpoint: the policy observes {sees} numbers, and {config.task} under these settings "
+            f"shows {shown}; leave the settings out"
+        )
+    return policy
 
 
 def _show(args: argparse.Namespace, config: Config, path: Path, run: Any, count: int, console: Any) -> int:
@@ -170,17 +215,18 @@ def _show(args: argparse.Namespace, config: Config, path: Path, run: Any, count:
     trained = config
     config = dataclasses.replace(config, randomization=freeze({**config.randomization, "randomize": True}))
     env = plain = _acted_in(config, run)
-    policy, key = cli.load_policy(path, env, config), jax.random.PRNGKey(config.seed)
+    policy, key = _policy(args, config, path, env), jax.random.PRNGKey(config.seed)
     if args.export is not None:
         console.say(_export(env, policy, path, run, args.export))
         return 0
-    kinds = _physics(config, env, path, key, count)
+    kinds = _physics(config, env, None if args.use_pretrained_checkpoint else path, key, count)
     if trained.randomization.get("randomize") is False and getattr(env, "nuisance", None):
         plain = _acted_in(trained, run)  # nominal physics is then without the noise that comes with randomisation
         kinds["nominal"] = _nominal(plain, count)
     if args.physics and args.physics not in kinds:
         raise UserError(f"--physics {args.physics}: this checkpoint and task have {', '.join(kinds)}")
-    console.say(f"{config.task}, {count} episodes each, checkpoint {path}")
+    whose = "the policy that comes with the package" if args.use_pretrained_checkpoint else f"checkpoint {path}"
+    console.say(f"{config.task}, {count} episodes each, {whose}")
     chosen, rows = {args.physics: kinds[args.physics]} if args.physics else kinds, []
     returns = {}
     for name, thetas in chosen.items():

@@ -251,13 +251,14 @@ def _run(config: Config, run: Any, command: Sequence[str], headless: bool) -> in
             run = runs.Run.create(config.logdir, config.task, config.name, config, command)
         else:
             cli.say_changes(run, console)
+            run.prolong(config.ppo.max_iterations)
         console.say(f"run folder {run.path}")
         with cli.running(run, console.say):
             training = (Training if config.agent == "own" else AgentTraining)(config, env, run, console, stop)
             state, resumed_at = training.state(resume)
             done = int(state.iteration)
             if done >= config.ppo.max_iterations and not training.owes_evaluation(done):
-                console.say("this run had finished; there is nothing to go on with")
+                console.say("this run had finished; --max_iterations N goes on with it, to N iterations in all")
             else:
                 training.open(done, resumed_at)
                 console.phase("training", config.ppo.max_iterations, done)
@@ -281,7 +282,7 @@ def _train(argv: Sequence[str] | None) -> int:
     command = ["python", "-m", "bayessim_mjx.train", *argv]
     if args.resume:
         run = Run.open(args.resume)
-        return _run(cli.resumed_config(args, run.config), run, command, args.headless)
+        return _run(cli.prolonged_config(args, run), run, command, args.headless)
     more = cli.physics_settings(args)
     if args.agent:
         more["--agent"] = ("agent", args.agent)

@@ -120,6 +120,7 @@ class ShadowHand(Manipulation):
     }
     observation_clip: ClassVar[dict[str, float | None]] = {"isaacgymenvs": 5.0, "bayessim2021": 100.0}
     observation_names: ClassVar[tuple[str, ...]] = _names("full_state")
+    zeros: ClassVar[dict[str, float]] = {"stiffness": 0.1}  # N m/rad, as in BayesSimIG (ig_env_wrappers.py)
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)

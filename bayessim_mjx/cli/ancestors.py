@@ -20,8 +20,7 @@ INSTEAD = {
     "--experiment": "use --name NAME for a run's name, --logdir DIR for another folder",
     "--metadata": "run.json and params/ of the run folder hold it in any case",
     "--load_run": "use --resume RUN to go on with a run, --checkpoint RUN to start from its policy or to play it",
-    "--use_pretrained_checkpoint": "use --checkpoint with the path of a run or checkpoint; in Python,"
-    " bayessim_mjx.pretrained(TASK) is the policy of a task that comes with the package",
+    "--use_pretrained_checkpoint": "play has it; use --checkpoint with the path of a run or checkpoint",
     "--export_io_descriptors": "play --export writes them into the ONNX file",
     "--real_time": _LOOK,
     "--viz": _LOOK,

@@ -55,10 +55,10 @@ def _writers(text: str) -> tuple[str, ...]:
 
 # flag -> (dotted key, type, help); None as type: a switch
 FLAGS: dict[str, tuple[str, Any, str]] = {
-    "--num_envs": ("env.numEnvs", integer, "number of simulated worlds in parallel"),
+    "--num_envs": ("env.numEnvs", integer, "number of simulated worlds in parallel; 0: the settings'"),
     "--episode_length": ("env.episodeLength", integer, "control steps of an episode; 0: the task's own"),
     "--seed": ("seed", integer, "random seed; -1 draws one"),
-    "--max_iterations": ("ppo.max_iterations", integer, "PPO iterations; in main the number per round"),
+    "--max_iterations": ("ppo.max_iterations", integer, "PPO iterations in all; in main the number per round"),
     "--video": ("monitor.video", None, "record videos"),
     "--video_length": ("monitor.video_length", integer, "length of a video in control steps"),
     "--video_interval": ("monitor.video_interval", integer, "control steps of each world from one video to the next"),
@@ -82,6 +82,7 @@ METAVARS = {str: "TEXT", integer: "N"} | {
     "--device": "NAME",
     "--cache_dir": "DIR",
 }
+ZERO_IS_NONE = ("--num_envs", "--episode_length")  # 0 is BayesSimIG's default: the number that the settings have
 RESUMABLE = (
     "--device", "--devices", "--cache_dir", "--video", "--video_length", "--video_interval", "--headless", "--resume",
     trust.FLAG,
@@ -178,7 +179,8 @@ class Parser(PlainParser):
         self.add_argument("--headless", action="store_true", help="plain lines instead of progress bars")
         self.add_argument("--list_tasks", action="store_true", help="print the names of the tasks and stop")
         if resume:
-            self.add_argument("--resume", metavar="RUN", help="continue an interrupted run")
+            more = "; with --max_iterations also a finished one" if prog == "train" else ""
+            self.add_argument("--resume", metavar="RUN", help=f"continue an interrupted run{more}")
         example = "ppo.gamma=0.95" if "bayessim" in unused else "bayessim.components=5"
         self.epilog = f"section.key=value changes any setting, for example {example} (see cfg/*.yaml)"
 

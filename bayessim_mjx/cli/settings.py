@@ -4,11 +4,11 @@ import argparse
 import dataclasses
 import sys
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from bayessim_mjx.cli.flags import FLAGS, RESUMABLE
-from bayessim_mjx.config import Config, load
+from bayessim_mjx.cli.flags import FLAGS, RESUMABLE, ZERO_IS_NONE
+from bayessim_mjx.config import Config, load, replace
 from bayessim_mjx.errors import UserError, unknown
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ def config_of(args: argparse.Namespace, more: Mapping[str, tuple[str, Any]] | No
     flags = dict(more or {})
     for flag, (key, _, _) in FLAGS.items():
         value = getattr(args, flag[2:], None)  # not every command has every flag
-        if value is not None and not (flag == "--episode_length" and value == 0):
+        if value is not None and not (flag in ZERO_IS_NONE and value == 0):
             flags[flag] = (key, _drawn() if flag == "--seed" and value == -1 else value)
     task = args.task and task_name(args.task)
     with warnings.catch_warnings(record=True) as caught:
@@ -41,15 +41,35 @@ def _drawn() -> int:
     return random.SystemRandom().randrange(10_000)
 
 
-def resumed_config(args: argparse.Namespace, config: Config) -> Config:
-    """The settings of the run to resume, with what may change: devices, cache and videos. Anything else is refused."""
-    fixed = [flag for flag in args.given if flag not in RESUMABLE] + list(args.overrides)
+def resumed_config(args: argparse.Namespace, config: Config, also: Sequence[str] = ()) -> Config:
+    """The settings of the run to resume, with what may change: devices, cache and videos. Anything else is refused.
+
+    also: further flags that the command takes; it sees to what they set.
+    """
+    fixed = [flag for flag in args.given if flag not in (*RESUMABLE, *also)] + list(args.overrides)
     if fixed:
         raise UserError(f"--resume goes on with the run's own settings, which {fixed[0]} would change; start a new run")
     video = {k: getattr(args, k) for k in ("video_length", "video_interval", "video") if getattr(args, k) is not None}
     top = {k: getattr(args, k) for k in ("device", "devices", "cache_dir") if getattr(args, k) is not None}
     monitor = dataclasses.replace(config.monitor, **video)
     return dataclasses.replace(config, monitor=monitor, **top)
+
+
+def prolonged_config(args: argparse.Namespace, run: "Run") -> Config:
+    """The settings of the run of PPO alone to resume, with `--max_iterations` in all; the run may be finished.
+
+    Raises:
+        UserError: the run has done as many iterations already.
+    """
+    config, total = resumed_config(args, run.config, ("--max_iterations",)), args.max_iterations
+    if total is None:
+        return config
+    done = run.manifest["latest"] or 0
+    if total <= done:
+        raise UserError(
+            f"--max_iterations {total}: the run has done {done} PPO iterations already; give more, the number in all"
+        )
+    return replace(config, ppo={"max_iterations": total})
 
 
 def say_changes(run: "Run", console: Any) -> None:

@@ -13,7 +13,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from bayessim_mjx.config import foreign
+from bayessim_mjx.config import foreign, rlpt
 from bayessim_mjx.config.layers import SECTIONS, Layer, merge
 from bayessim_mjx.config.settings import Config, EnvConfig, Frozen, Section, freeze
 from bayessim_mjx.config.yaml_text import DEPTH, read_value, read_yaml
@@ -82,8 +82,10 @@ def replace(config: Config, **sections: Any) -> Config:
 
 
 def _train_layer(path: str | Path) -> dict[str, Any]:
-    """A --cfg_train file: a `ppo:` section alone, or its keys bare."""
+    """A --cfg_train file: a `ppo:` section alone, its keys bare, or `policy:` and `learn:` as BayesSimIG's."""
     raw = read_yaml(path)
+    if rlpt.is_one(raw):
+        return rlpt.read(raw, str(path))
     if "ppo" not in raw:
         return {"ppo": raw}
     if len(raw) > 1:

@@ -11,7 +11,7 @@ PARAMS = "task.randomization_params"
 NEW_GROUPS = ("option", "effects")  # which an override may add; what is in `effects` is for the effects to check
 RANDOMIZED_KEYS = (
     "range", "operation", "distribution", "mean", "sd", "nominal", "include", "exclude", "factor", "unit", "schedule",
-    "schedule_steps", "num_buckets", "setup_only",
+    "schedule_steps", "num_buckets", "setup_only", "zero",
 )  # fmt: skip
 NUISANCE_KEYS = ("observations", "actions", "sim_params")  # noise: two numbers of their own meaning, nothing inferred
 OPERATIONS = ("scaling", "additive", "absolute")

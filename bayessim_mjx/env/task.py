@@ -19,6 +19,7 @@ from bayessim_mjx.env.protocol import Env, Observations, State
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.mirrors import Mirror, resolve
 from bayessim_mjx.parameters import Parameter, ParameterSpace
+from bayessim_mjx.parameters.zeros import with_zeros
 from bayessim_mjx.physics import Physics, World, control_step, mjx
 from bayessim_mjx.physics.implementation import Choice, choose
 from bayessim_mjx.physics.nuisance import GRAVITY, Course, Drawn
@@ -54,6 +55,7 @@ class Task(Env):
     randomization: ClassVar[Any] = OfFile("task")
     real_parameters: ClassVar[Any] = OfFile("env", "realParams", "means", 0)
     observation_names: ClassVar[tuple[str, ...]]
+    zeros: ClassVar[dict[str, float]] = {}  # see `parameters.zeros`
     mirror: ClassVar[tuple[Mirror, ...]] = ()  # symmetries of the robot by name; resolved in `mirrors`
     observation_clip: ClassVar[dict[str, float | None]] = {"isaacgymenvs": None, "bayessim2021": 100.0}
     max_qvel: ClassVar[float | Sequence[float] | None] = None  # `[nv]`, or one for all
@@ -73,6 +75,7 @@ class Task(Env):
         self.episode_length = int(self.settings["episodeLength"])
         randomization = randomization or getattr(self, "randomization", {})
         section = {} if randomization.get("randomize") is False else randomization.get("randomization_params", {})
+        section = with_zeros(section, self.zeros)
         spec, mj_model, space = corrected(self.spec(), section, calibrated)
         if calibrated:
             self.spec = spec.copy  # type: ignore[method-assign]  # of the corrected model

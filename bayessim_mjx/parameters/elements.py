@@ -58,7 +58,7 @@ def _plain(name: str, kind: str) -> str:
 def _shapes(model: mujoco.MjModel, bodies: Sequence[int], have: Sequence[str]) -> list[Element]:
     """Geoms, unnamed ones called like their body (further ones `_1`, `_2`); bodies without geoms as themselves."""
     body_names, shapes = attributes.names(model, "body"), []
-    used: set[str] = set()
+    used = {name for name in have if not name.startswith("#")}
     for body in bodies:
         geoms = np.flatnonzero(model.geom_bodyid == body)
         base = _plain(body_names[body], "body")

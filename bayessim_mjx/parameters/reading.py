@@ -33,7 +33,9 @@ GROUPS: dict[str, tuple[str, tuple[str, ...]]] = {
 PATH = "task.randomization_params"
 OTHER_GROUPS = ("scale", "color", "effects")
 ACCEPTED = ("schedule", "schedule_steps", "num_buckets", "setup_only")  # the last two mean nothing here: see foreign.py
-SETTINGS = ("range", "operation", "distribution", "mean", "sd", "include", "exclude", "factor", "unit", "nominal")
+SETTINGS = (
+    "range", "operation", "distribution", "mean", "sd", "include", "exclude", "factor", "unit", "nominal", "zero",
+)  # fmt: skip
 EFFECT_SETTINGS = ("range", "operation", "distribution", "mean", "sd", "unit", "nominal")
 DISTRIBUTIONS = {"uniform": "uniform", "loguniform": "loguniform", "log_uniform": "loguniform", "gaussian": "gaussian"}
 
@@ -172,14 +174,17 @@ def _parameter(
     else:
         target = e.target
     kind, attribute, target = _driven(model, kind, attribute, target, operation)
-    _check_default(model, kind, attribute, target, operation, f"{where}, {e.label or kind}")
     factor = checks.number(setting.get("factor", 1.0), f"{where}.factor")
+    unit = "" if operation == "scaling" else str(setting.get("unit", _unit(model, kind, attribute, target)))
+    if operation == "scaling" and "zero" in setting and own_value(model, kind, attribute, target) == 0:
+        operation, factor = "absolute", checks.number(setting["zero"], f"{where}.zero")
+    _check_default(model, kind, attribute, target, operation, f"{where}, {e.label or kind}")
     return _build(
         setting,
         where,
         name,
         _own(model, kind, attribute, target, operation, factor),
-        unit="" if operation == "scaling" else str(setting.get("unit", _unit(model, kind, attribute, target))),
+        unit=unit,
         operation=operation,
         attribute=attribute,
         target=target,
@@ -257,7 +262,8 @@ def _check_default(model: mujoco.MjModel, kind: str, attribute: str, target: str
     if attribute.startswith("com_"):
         attributes.refuse_simple(model, attributes.element(model, kind, target), where)
     if operation == "scaling" and default == 0:
-        raise UserError(f"{where}: scaling a number that is 0 in the model does nothing; use additive, or exclude it")
+        advice = "use additive, exclude it, or give what stands for it: `zero: NUMBER`"
+        raise UserError(f"{where}: scaling a number that is 0 in the model does nothing; {advice}")
     if (kind, attribute) in (("joint", "friction"), ("tendon", "friction")) and default <= 0:
         raise UserError(f"{where}: MJX ignores friction that is 0 in the MJCF; give frictionloss a small value there")
     if attribute in ("gain", "kp", "mass") and default == 0:

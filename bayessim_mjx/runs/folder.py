@@ -118,6 +118,22 @@ class Run:
         self._write()
         return found
 
+    def prolong(self, iterations: int) -> None:
+        """Make `iterations` the run's ppo.max_iterations, if it is another; the manifest's `prolonged` keeps each."""
+        file = self.path / "params" / "train.yaml"
+        train = config.read_yaml(file)
+        ppo = train.get("ppo", train)
+        before = ppo.get("max_iterations")
+        if before == iterations:
+            return
+        ppo["max_iterations"] = iterations
+        checkpoints.write_text(file, config.to_yaml(train))
+        if "settings" in self.manifest:  # earlier versions did not write them
+            self.manifest["settings"]["ppo"]["max_iterations"] = iterations
+        entry = {"at": _now(), "step": self.manifest["latest"], "from": before, "to": iterations}
+        self.manifest["prolonged"] = [*self.manifest.get("prolonged", ()), entry]
+        self._write()
+
     def save(
         self,
         step: int,

@@ -1,16 +1,19 @@
 """One-line faults, put into the code one at a time: do the fast tests notice?
 
     python benchmarks/tests/mutants.py [--only 6 7 ...] [--json FILE]
+    python benchmarks/tests/mutants.py --check    # does every edit still apply?
 
 The first 31 are those of a PPO with which rsl_rl 5.4.2's own suite was tried (it notices 5), at the places where our
-code does the same; the others (`mutant_faults.py`) are spread over all that is not PPO. Each is an edit of one copy of
-the checkout; then the tests that can see it run until the first one fails. An edit that does not apply exactly once is
-an error, and so are tests that cannot run, or fail without any fault.
+code does the same; the others are spread over all that is not PPO (`mutant_faults.py`) and over what fails without a
+word (`mutant_faults_silent.py`). Each is an edit of one copy of the checkout; then the tests that can see it run until
+the first one fails. An edit that does not apply exactly once is an error, and so are tests that cannot run, that are
+all skipped, or that fail without any fault.
 """
 
 import argparse
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -21,6 +24,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mutant_faults import FAULTS
+from mutant_faults_silent import SILENT
 
 ROOT = Path(__file__).resolve().parents[2]
 COPIED = ("bayessim_mjx", "tasks", "cfg", "tests", "pyproject.toml")
@@ -174,7 +178,7 @@ PPO_MUTANTS = (
         "(EVERYWHERE, SECOND, FIRST, EVERYWHERE)", (f"{T}devices.py", "-m", "ci", "-k", "curves"),
     ),
 )  # fmt: skip
-MUTANTS = (*PPO_MUTANTS, *(Mutant(n, *row) for n, row in enumerate(FAULTS, len(PPO_MUTANTS) + 1)))
+MUTANTS = (*PPO_MUTANTS, *(Mutant(n, *row) for n, row in enumerate(FAULTS + SILENT, len(PPO_MUTANTS) + 1)))
 
 
 def mutated(text: str, mutant: Mutant) -> str:
@@ -182,6 +186,17 @@ def mutated(text: str, mutant: Mutant) -> str:
     if (count := text.count(mutant.old)) != 1:
         raise Stale(f"{mutant.number} ({mutant.fault}): {mutant.old!r} stands {count} times in {mutant.file}")
     return text.replace(mutant.old, mutant.new)
+
+
+def stale(mutants: Sequence[Mutant]) -> list[str]:
+    """What is to be said of each edit that does not apply exactly once."""
+    found = []
+    for mutant in mutants:
+        try:
+            mutated((ROOT / mutant.file).read_text(), mutant)
+        except (Stale, OSError) as error:
+            found.append(str(error))
+    return found
 
 
 def copy_of_checkout(folder: Path) -> Path:
@@ -197,11 +212,10 @@ def run_tests(copy: Path, arguments: Sequence[str]) -> tuple[int, str]:
     """(exit code of pytest in the copy, the last lines it printed); compiled programs are kept between calls."""
     environment = {
         "JAX_PLATFORMS": "cpu",
-        "XLA_FLAGS": "--xla_cpu_use_fusion_emitters=false",
+        "JAX_COMPILATION_CACHE_DIR": str(copy / "compiled"),
         **os.environ,
         "PYTHONPATH": os.pathsep.join(filter(None, [str(copy), os.environ.get("PYTHONPATH")])),
         "PYTHONDONTWRITEBYTECODE": "1",
-        "JAX_COMPILATION_CACHE_DIR": str(copy / "compiled"),
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
     }
     command = [sys.executable, "-m", "pytest", "-q", "-x", "--tb=line", "-p", "no:cacheprovider", *arguments]
@@ -217,8 +231,13 @@ def sound(copy: Path, mutants: Sequence[Mutant]) -> None:
         raise SystemExit(f"the copy {copy} is not what is imported: {where.stdout or where.stderr}")
     for tests in dict.fromkeys(m.tests for m in mutants):
         code, end = run_tests(copy, tests)
-        if code:
+        if code or not ran(end):
             raise SystemExit(f"without a fault, {' '.join(tests)} ends with {code}:\n{end}")
+
+
+def ran(end: str) -> bool:
+    """Whether a test ran and passed, by pytest's last lines: where all are skipped it ends with 0 too."""
+    return re.search(r"\b[1-9]\d* passed\b", end) is not None
 
 
 def outcomes(copy: Path, mutants: Sequence[Mutant]) -> Iterator[dict]:
@@ -247,11 +266,16 @@ def main() -> int:
     """Print the table; 1 where a fault survives or an edit or a test run fails."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--only", type=int, nargs="+", metavar="N", help="numbers of faults")
+    parser.add_argument("--check", action="store_true", help="only look whether every edit still applies")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the table there too")
     args = parser.parse_args()
     mutants = [m for m in MUTANTS if not args.only or m.number in args.only]
-    for mutant in mutants:
-        mutated((ROOT / mutant.file).read_text(), mutant)  # all of them apply, before the first minute is spent
+    if lines := stale(mutants):  # before the first minute is spent
+        print(*lines, f"{len(lines)} of {len(mutants)} edits do not apply", sep="\n", file=sys.stderr)
+        return 1
+    if args.check:
+        print(f"all {len(mutants)} edits apply")
+        return 0
     with tempfile.TemporaryDirectory(prefix="mutants_") as folder:
         copy = copy_of_checkout(Path(folder))
         sound(copy, mutants)

@@ -25,7 +25,7 @@ from bayessim_mjx.errors import UserError
         (["--task", "Pendulm"], ["'Pendulm'", "Did you mean Pendulum", "Allowed: Ant, "]),
         (["--tsk", "Pendulum"], ["'--tsk'", "Did you mean --task"]),
         (["--task", "Pendulum", "--num_envs", "many"], ["--num_envs", "'many'"]),
-        (["--task", "Pendulum", "--num_envs", "0"], ["env.numEnvs = 0", "--num_envs", "at least 1"]),
+        (["--task", "Pendulum", "--num_envs", "-1"], ["env.numEnvs = -1", "--num_envs", "at least 1"]),
         (["--task", "Pendulum", "--task"], ["--task", "expected one argument"]),
         (["--task", "Pendulum", "word"], ["'word'", "section.key=value"]),
         (["--task", "Pendulum", "bayessim.component=5"], ["bayessim.component", "Did you mean bayessim.components"]),

@@ -4,6 +4,7 @@ import warnings
 from pathlib import Path
 
 import mujoco
+import numpy as np
 import pytest
 
 from bayessim_mjx import registry
@@ -129,6 +130,35 @@ LEFT_OUT = {
 }
 
 
+MORE = """
+env: {numEnvs: 10000, maxEpisodeLength: 600, realParams: {weights: [1.0], means: [[1.8]], stds: [[0.001]]}}
+bayessim: {trainTrajs: 20000, summarizerFxn: summary_corrdiff, trainTrajLen: 50, fullCovariance: False}
+task:
+  randomize: True
+  randomization_params:
+    frequency: 720
+    actor_params:
+      hand:
+        color: True
+        tendon_properties:
+          damping: {range: [0.3, 3.0], operation: scaling, distribution: uniform, schedule: constant}
+          stiffness: {range: [0, 200], operation: additive, distribution: uniform, schedule: constant}
+        dof_properties:
+          damping: {range: [0.3, 3.0], operation: scaling, distribution: uniform, schedule: constant}
+          stiffness: {range: [0.1, 5.0], operation: scaling, distribution: uniform, schedule: constant}
+        rigid_body_properties:
+          mass: {range: [0.1, 10], operation: scaling, distribution: uniform, schedule: constant, schedule_steps: 0}
+        rigid_shape_properties:
+          friction: {num_buckets: 250, range: [0.01, 10], operation: scaling, distribution: uniform}
+      object:
+        scale: {range: [0.5, 2.0], operation: scaling, distribution: uniform, setup_only: True}
+        rigid_body_properties:
+          mass: {range: [0.1, 10], operation: scaling, distribution: uniform, setup_only: True}
+        rigid_shape_properties:
+          friction: {num_buckets: 250, range: [0.01, 10], operation: scaling, distribution: uniform}
+"""  # as BayesSimIG's file with more than 100 parameters is made
+
+
 BODY = """<mujoco model="hand"><worldbody><body name="torso"><freejoint/><geom name="palm" size=".1"/><body name="arm">
 <joint name="elbow" axis="0 1 0"/><geom size=".05" pos=".1 0 0"/></body></body></worldbody></mujoco>"""
 
@@ -176,3 +206,38 @@ def test_names_of_one_length_agree_and_slips_are_still_refused(tmp_path: Path) -
         with pytest.raises(UserError, match=f"key '{word}' is unknown"):
             load("Pendulum", cfg_env=tmp_path / "f.yaml")
     assert load("Cartpole", overrides=["env.resetDist=2"]).env["resetDist"] == 2.0  # the task has it
+
+
+def test_the_hand_with_more_parameters_loads(tmp_path: Path) -> None:
+    """A factor on a joint's stiffness that is 0 is one on 0.1 N m/rad, to which BayesSimIG sets such joints."""
+    (tmp_path / "f.yaml").write_text(MORE)
+    with pytest.warns(UserWarning, match="left out, as they mean nothing here: color, num_buckets, setup_only"):
+        loaded = load("ShadowHand", cfg_env=tmp_path / "f.yaml")
+    env = registry.make("ShadowHand", config=loaded)
+    assert len(env.space) > 100 and len(set(env.space.names)) == len(env.space)
+    before = env.spec().compile()
+    after = env.space.edit(env.spec(), np.full(len(env.space), 1.8)).compile()
+    drive, joint = before.actuator("FFJ1").id, before.joint("FFJ0").id
+    assert (before.jnt_stiffness == 0).all() and before.joint("FFJ0").id not in before.actuator_trnid[:, 0]
+    held = {before.joint(j).name: s for j, s in enumerate(after.jnt_stiffness) if s}
+    assert held == pytest.approx({"FFJ0": 0.18, "MFJ0": 0.18, "RFJ0": 0.18, "LFJ0": 0.18}, rel=1e-6)
+    assert after.actuator_gainprm[drive, 0] == pytest.approx(1.8 * before.actuator_gainprm[drive, 0])  # a drive's own
+    dof = before.jnt_dofadr[joint]
+    assert after.dof_damping[dof] == pytest.approx(1.8 * before.dof_damping[dof])
+    assert after.tendon_damping == pytest.approx(1.8 * before.tendon_damping)
+    assert after.tendon_stiffness == pytest.approx(before.tendon_stiffness + 1.8)
+    own = dict(zip(env.space.names, env.space.parameters, strict=True))
+    assert own["FFJ0_stiffness_mult"].nominal == 0.1  # 0.01 N m/rad: what is nearest to none
+
+
+def test_what_stands_for_a_number_that_is_0_can_be_said_of_any_attribute() -> None:
+    joints = {"stiffness": {"range": [0.5, 2], "operation": "scaling"}}
+    section = {"actor_params": {"hand": {"dof_properties": joints}}}
+    model = mujoco.MjModel.from_xml_string(BODY)
+    with pytest.raises(UserError, match="elbow: scaling a number that is 0 .* or give what stands for it: `zero: NUM"):
+        ParameterSpace.from_config(section, model)
+    joints["stiffness"]["zero"] = 3.0
+    space = ParameterSpace.from_config(section, model)
+    assert space.names == ("elbow_stiffness_mult",)
+    edited = space.edit(mujoco.MjSpec.from_string(BODY), [1.5]).compile()
+    assert edited.joint("elbow").stiffness[0] == pytest.approx(4.5)

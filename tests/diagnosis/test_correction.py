@@ -225,3 +225,12 @@ def test_meshes_are_found_from_the_new_place(tmp_path):
     )
     model = mujoco.MjModel.from_xml_path(str(out / "model_with_effects.xml"))
     assert model.nmesh == 1 and model.dof_frictionloss[0] == pytest.approx(0.3)
+
+
+def test_a_value_without_an_interval_is_as_wide_as_its_range(robot):
+    """A uniform distribution's standard deviation is its range over the root of twelve."""
+    (own,) = [p for p in robot.space.parameters if p.name == MASS]
+    found = diagnosis([], {MASS: (1.1, np.nan)})
+    (known,) = [p for p in correction.calibrated_of(found, robot.space).parameters if p.name == MASS]
+    assert known.nominal == known.mean == 1.1 and known.prior == "gaussian"
+    assert known.sd == pytest.approx((own.high - own.low) / 12**0.5)

@@ -8,6 +8,8 @@ import pytest
 from log_files import FREE, GOOD_MAP, refused, rows, write
 
 from bayessim_mjx.logs import Channels, Log, read_logs, resample, segments
+from bayessim_mjx.logs.mapping import Source
+from bayessim_mjx.logs.table import read_csv
 
 WHOLE = {"ctrl": {"m_shoulder": 1, "m_elbow": 2}, "qpos": {"shoulder": 3, "elbow": 4}}
 
@@ -134,3 +136,11 @@ def test_foreign_logs_of_the_dfki_pendulum_by_map() -> None:
     (log,) = read_logs(DFKI, mujoco.MjModel.from_xml_string(xml), log_map)
     assert isinstance(log, Log) and log.has_qvel and 1e-3 < log.period < 6e-3 and log.duration > 5
     assert segments(log, 50, dt=0.005)["qpos"].shape[1:] == (51, 1)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_an_offset_is_in_the_models_unit_whatever_the_sign(sign: int, tmp_path: Path) -> None:
+    """value = sign * scale * raw + offset."""
+    np.savetxt(tmp_path / "t.csv", [[1.0], [2.0]], header="deg", comments="")
+    found = Source("deg", sign=sign, scale=10.0, offset=3.0).read(read_csv(tmp_path / "t.csv"), "here")
+    np.testing.assert_allclose(found, [3.0 + sign * 10.0, 3.0 + sign * 20.0])

@@ -118,3 +118,16 @@ def test_noise_pools_logs(tmp_path: Path, arm: mujoco.MjModel) -> None:
     level = noise(read_logs(tmp_path, arm))
     np.testing.assert_allclose(level["qpos"], np.sqrt(5) * 1e-3, rtol=0.1)
     assert level["qvel"].shape == (2,)
+
+
+def test_shifts_of_commands_add_up(tmp_path: Path, arm: mujoco.MjModel) -> None:
+    """A step at 0.1 s that acts 0.02 s late, and 0.03 s later still."""
+    table = rows()
+    table[:, 1] = table[:, 0] > 0.0999
+    write(tmp_path, table)
+    (log,) = read_logs(tmp_path, arm)
+    twice = log.shifted(0.02).shifted(0.03)
+    assert twice.late == pytest.approx(0.05) and twice.shifted(-0.05).late == pytest.approx(0.0)
+    late = resample(twice, 0.01)
+    assert late.late == 0.0  # done with
+    np.testing.assert_allclose(late.ctrl[:, 0], late.time > 0.1499, atol=1e-9)

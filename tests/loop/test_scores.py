@@ -1,0 +1,51 @@
+"""What the likelihood makes of prediction errors, and their scores, by hand: no simulation."""
+
+from types import SimpleNamespace
+
+import jax
+import numpy as np
+import pytest
+
+from bayessim_mjx import config
+from bayessim_mjx.loop import outer_loop
+from bayessim_mjx.loop.likelihood import Likelihood
+from bayessim_mjx.loop.refinement import _spread
+
+
+@pytest.mark.parametrize(("total", "variance"), [(84.0, 1.0), (6.0, 1.0), (360.0, 3.0)])
+def test_a_square_costs_half_of_itself_over_the_noises_variance(total: float, variance: float) -> None:
+    """Of 120 errors; the variance that they show, but no less than what the sensors were told to have."""
+    squares = np.array([total - 1, total + 1])[:, None, None]
+    value = Likelihood.log_likelihood(SimpleNamespace(count=120.0, least=1.0), squares)
+    assert (value[1] - value[0]) / 2 == pytest.approx(-0.5 / variance, rel=0.05)
+
+
+def scores_of(scores: np.ndarray) -> np.ndarray:
+    """Variance of the sum of scores [N, B] of one parameter, by `_spread`, over that which the likelihood promises."""
+    z = np.tile([-1.0, 1.0], 50)[:, None]
+    # a square's slope in z is -2 score; their mean is 1, as is the variance of z
+    squares = 1.0 - 2.0 * z[:, :, None] * scores
+    found, lower = _spread(
+        z, squares, SimpleNamespace(count=float(scores.size), least=0.0, groups=np.zeros(len(scores)))
+    )
+    np.testing.assert_allclose(lower, [[1.0]])
+    return found
+
+
+def test_scores_of_neighbouring_stretches_add_up_on_both_sides() -> None:
+    """Newey and West (1987) with lags up to 4 of 8 stretches: 1 + 2 (.8 * 7 + .6 * 6 + .4 * 5 + .2 * 4) / 8 = 4."""
+    rng = np.random.default_rng(0)
+    each = rng.normal(size=(4000, 1)) * np.ones(8)
+    each = (each - each.mean()) / np.sqrt(np.sum((each - each.mean()) ** 2))
+    np.testing.assert_allclose(scores_of(each), [[4.0]], rtol=0.01)
+    alone = rng.normal(size=(4000, 8))
+    alone = (alone - alone.mean()) / np.sqrt(np.sum((alone - alone.mean()) ** 2))
+    np.testing.assert_allclose(scores_of(alone), [[1.0]], atol=0.05)
+
+
+def test_schedules_of_randomisation_go_on_from_round_to_round() -> None:
+    """A world has gone 7 iterations of 5 control steps in each of the three rounds before."""
+    settings = config.load("Pendulum", overrides=["ppo.max_iterations=7", "ppo.num_steps=5"])
+    parts = SimpleNamespace(env=None, config=settings, key=lambda *_: jax.random.PRNGKey(0))
+    begun = outer_loop._new_policy(parts, 3, None, begin=lambda *_, clock: clock)
+    assert begun == 3 * 7 * 5
