@@ -20,6 +20,7 @@ from bayessim_mjx.loop.seen import Seen, tiled
 from bayessim_mjx.parameters import ParameterSpace
 from bayessim_mjx.physics import controllers
 from bayessim_mjx.physics.controllers import Law
+from bayessim_mjx.physics.tangent import in_tangent, noisy
 from bayessim_mjx.rl import Policy
 from bayessim_mjx.rollout import Trajectory, recording, remembered, replay
 from bayessim_mjx.tracking import Record
@@ -93,13 +94,15 @@ class Recorded:
         index = jnp.asarray(self.order)[jax.random.randint(k_segment, (thetas.shape[0],), 0, len(self.order))]
         qpos0, qvel0 = self._of("qpos0", "qvel0", index=index)
         speed_error = self.noise["qvel"] * (1.0 if self.with_qvel else ESTIMATED_SPEED)
-        start = qpos0 + self.noise["qpos"] * jax.random.normal(keys[0], qpos0.shape)
+        model = self.env.mj_model
+        sd = in_tangent(model, np.asarray(self.noise["qpos"]))
+        start = noisy(model, keys[0], qpos0, sd)
         speed = qvel0 + speed_error * jax.random.normal(keys[1], qvel0.shape)
         motion = self._replayed(index, start, speed, thetas)
 
         def again(draw: Array) -> Array:
             k_qpos, k_qvel = (jnp.where(draw > 0, branch(k, draw), k) for k in keys[2:])
-            qpos = motion["qpos"] + self.noise["qpos"] * jax.random.normal(k_qpos, motion["qpos"].shape)
+            qpos = noisy(model, k_qpos, motion["qpos"], sd)
             qvel = motion["qvel"] + self.noise["qvel"] * jax.random.normal(k_qvel, motion["qvel"].shape)
             return self.features(index, qpos.at[:, 0].set(qpos0), qvel.at[:, 0].set(qvel0))
 

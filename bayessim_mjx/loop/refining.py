@@ -16,7 +16,7 @@ from bayessim_mjx.loop.likelihood import Likelihood
 from bayessim_mjx.loop.recorded import Recorded
 from bayessim_mjx.loop.refinement import Refinement, refine
 from bayessim_mjx.loop.state import Loop, LoopState, RoundInfo
-from bayessim_mjx.physics.tangent import in_tangent
+from bayessim_mjx.physics.tangent import in_tangent, noisy
 from bayessim_mjx.rollout import Trajectory
 from bayessim_mjx.tracking import Record
 
@@ -67,10 +67,11 @@ def _stored(loop: Loop, state: LoopState, real: Trajectory) -> LoopState:
     if state.motion is None:
         return state
     first, source = int(state.round) * loop.settings.realTrajs, loop.source
-    keys = jax.random.split(branch(loop.key(int(state.round), "real"), 7))
+    k_qpos, k_qvel = jax.random.split(branch(loop.key(int(state.round), "real"), 7))
     rows = {name: jnp.asarray(getattr(real, name)) for name in state.motion}
-    for key, name in zip(keys, ("qpos", "qvel"), strict=True):
-        rows[name] = rows[name] + source.noise * jax.random.normal(key, rows[name].shape)  # type: ignore[union-attr,operator]
+    model, noise = loop.env.physics.mj_model, source.noise  # type: ignore[union-attr,attr-defined]
+    rows["qpos"] = noisy(model, k_qpos, rows["qpos"], noise)  # type: ignore[arg-type]
+    rows["qvel"] = rows["qvel"] + noise * jax.random.normal(k_qvel, rows["qvel"].shape)  # type: ignore[operator]
     kept = {
         name: jax.lax.dynamic_update_slice(old, rows[name], (first, *[0] * (old.ndim - 1)))
         for name, old in state.motion.items()
