@@ -12,7 +12,9 @@ SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 PLAIN_DIGITS = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789")
 DIGITS = 2  # of an uncertainty: more are never known (GUM, JCGM 100:2008, 7.2.6)
 PLAIN = range(-4, 6)  # powers of ten that are written without an exponent
-GAUSSIAN = 0.2  # by which both halves of a 68 % interval and the sd differ at most, of the least: a Gaussian's are equal
+GAUSSIAN = (
+    0.2  # by which both halves of a 68 % interval and the sd differ at most, of the least: a Gaussian's are equal
+)
 EXACT = 1e-6  # an uncertainty below this share of the value is not shown
 
 

@@ -7,11 +7,13 @@ import time
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 from jax import Array
 
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.keys import branch
+from bayessim_mjx.logs import Channels
 from bayessim_mjx.loop.likelihood import Likelihood
 from bayessim_mjx.loop.recorded import Recorded
 from bayessim_mjx.loop.refinement import Refinement, refine
@@ -40,17 +42,31 @@ def refined(
     clock, b, round_ = time.perf_counter(), loop.settings, int(state.round)
     state = _stored(loop, state, real)
     likelihood = _likelihood(loop, state, (round_ + 1) * b.realTrajs)
+    if likelihood.silent.any() and not round_:
+        info.warnings.append(f"bayessim.refine: {_without_noise(likelihood.silent, loop.env.physics.mj_model)}")  # type: ignore[attr-defined]
+    if not likelihood.seen.any():
+        return state, proposal
     seed = int(jax.random.randint(branch(loop.key(round_, "fit"), 3), (), 0, 2**31 - 1))
     found = refine(proposal, likelihood, seed=seed, draws=DRAWS, components=b.components)
     info.refinement = found
     info.seconds["refine"] = time.perf_counter() - clock
     info.scores |= scores(found)
+    info.warnings += [text for text in [found.warning()] if text]
     if not found.used:
         if b.refine == "likelihood":
             info.warnings.append(f"bayessim.refine: {found.sentence()}")
         return state, proposal
     posterior = found.posterior.reduce(b.components).rechart(loop.chart)
     return state, dataclasses.replace(posterior, prior_weight=jnp.float32(min(b.priorShare, SHARE)))
+
+
+def _without_noise(silent: np.ndarray, model: mujoco.MjModel) -> str:
+    names = [f"{stream}:{name}" for stream in ("qpos", "qvel") for name in Channels.of(model).qvel]
+    left_out = ", ".join(name for name, there in zip(names, silent, strict=True) if there)
+    return (
+        f"{left_out}: too few different values to see how noisy they are, so they have no part in the likelihood; "
+        "a `sigma` beside the logs (real.noise of a surrogate) gives them one"
+    )
 
 
 def scores(found: Refinement) -> dict[str, float]:
@@ -86,8 +102,8 @@ def _likelihood(loop: Loop, state: LoopState, known: int) -> Likelihood:
     if isinstance(source, Recorded):
         index = source.order[np.arange(known) % len(source.order)]
         record = source.records(index)
-        speeds = np.asarray(source.noise["qvel"]) if source.with_qvel else np.full(model.nv, np.inf)
-        sensor = np.concatenate([in_tangent(model, np.asarray(source.noise["qpos"])), speeds])
+        known = {name: np.where(source.seen[name], source.noise[name], np.inf) for name in ("qpos", "qvel")}
+        sensor = np.concatenate([in_tangent(model, known["qpos"]), known["qvel"]])
         valid = np.ones(record.command.shape[:2])
         return Likelihood(physics, record, valid, sensor, each, groups=source.data["run"][index])
     motion = state.motion

@@ -173,9 +173,7 @@ class Console:
             done, total = self._rounds.done, self._rounds.total
             self._bars.move("round", done, "", eta, f"round {min(done + 1, total)}/{total}")
 
-    def table(
-        self, parameters: Sequence[Mapping[str, Any]], title: str = "parameters", beside: str = ""
-    ) -> None:
+    def table(self, parameters: Sequence[Mapping[str, Any]], title: str = "parameters", beside: str = "") -> None:
         """Closing table, best identified first, of {name, unit, low, high, median, q16, q84, sd, width, truth or None}.
 
         Args:

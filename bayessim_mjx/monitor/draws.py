@@ -41,7 +41,6 @@ class Draws:
         return None if theta is None else _logged(np.asarray(theta, float), self.log)
 
 
-
 def draws_of(
     posterior: Any,
     names: Sequence[str] | None = None,

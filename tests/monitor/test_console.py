@@ -34,7 +34,9 @@ def tell(file, **options):
         console.warning("no video [egl]")
         rows = [
             dict(name="length", low=0.01, high=2, median=0.5, q16=0.25, q84=0.75, sd=0.25, truth=None, width=0.95),
-            dict(name="mass", unit="kg", low=0.01, high=2, median=1.02, q16=0.92, q84=1.12, sd=0.1, truth=1.0, width=0.17),
+            dict(
+                name="mass", unit="kg", low=0.01, high=2, median=1.02, q16=0.92, q84=1.12, sd=0.1, truth=1.0, width=0.17
+            ),
         ]
         console.table(rows)
     return file.getvalue()
