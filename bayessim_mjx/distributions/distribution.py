@@ -139,7 +139,7 @@ class Distribution:
         return evaluate.mode(self)
 
     def contraction(self) -> Array:
-        """1 - var_posterior / var_prior per parameter [d], the prior's share included: 0 learnt nothing, 1 known exactly."""
+        """1 - var_posterior / var_prior per parameter [d], the prior's share included: 0 nothing learnt, 1 exact."""
         return 1.0 - jnp.diagonal(self.cov()) / jnp.var(evaluate.prior_points(self.space), axis=0)
 
     def credible_level(self, theta: Array) -> Array:

@@ -73,10 +73,11 @@ def judged(
     off = np.asarray(_errors(products, jnp.asarray(thetas, jnp.float32)), float)
     off = np.clip(off, -FAR[products.chart], FAR[products.chart])
     move, cov = mean_error(off)
-    change = (0.0 if move is None else move) - (0.0 if before is None else before) + np.zeros(off.shape[1])
-    step = float(change @ np.linalg.solve(cov, change)) - 2 * len(change) / len(off)
     fold = np.arange(len(off)) % FOLDS
     moves = [mean_error(off[fold != k])[0] for k in range(FOLDS)]
+    move = None if all(each is None for each in moves) else move  # as none of them is judged with one
+    change = (0.0 if move is None else move) - (0.0 if before is None else before) + np.zeros(off.shape[1])
+    step = float(change @ np.linalg.solve(cov, change)) - 2 * len(change) / len(off)
     apart = stacked([moved(q, moves[k]) for q, k in zip(products.split(), fold, strict=True)])
     return counted(len(factors[0]), apart, thetas), move, step
 

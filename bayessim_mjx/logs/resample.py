@@ -173,7 +173,7 @@ def _starts(log: Log, length: int, stride: int) -> list[int]:
 def noise(logs: Log | Sequence[Log]) -> dict[str, Array]:
     """Measurement noise of every channel: {"qpos": [nq], "qvel": [nv]} standard deviations.
 
-    Pooled (rms) over the logs that show any: one in which a channel stands still tells nothing of its noise. 0: none does.
+    Pooled (rms) over the logs that show any: one in which a channel stands still tells none. 0: no log does.
     """
     runs = [logs] if isinstance(logs, Log) else list(logs)
     if not runs:

@@ -44,7 +44,7 @@ class Noise:
 
 @dataclass
 class _Best:
-    """The likeliest noise so far, less what its numbers cost: as it was tried, and with the factor that it asked for."""
+    """The likeliest noise so far, less what its numbers cost: as it was tried, and with the factor it asked for."""
 
     value: float
     noise: Noise

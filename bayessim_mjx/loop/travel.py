@@ -15,7 +15,7 @@ LEVELS = 3  # different values below which a channel shows no resolution: betwee
 
 
 def travel(record: Record, model: mujoco.MjModel) -> np.ndarray:
-    """Range of motion [2 nv] of positions (angles at most pi) and velocities; of what stays, a little of the largest."""
+    """Range of motion [2 nv] of positions (angles at most pi) and velocities; of what rests, a share of the largest."""
     qpos, qvel = (np.asarray(x, float).reshape(-1, x.shape[-1]) for x in (record.qpos, record.qvel))
     places = addresses(model)
     moved = np.array([min(np.ptp(qpos[:, q]), np.pi) if q is not None else 1.0 for q in places])

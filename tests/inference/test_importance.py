@@ -190,7 +190,7 @@ def test_independent_draws_bring_the_regions_nearer_to_what_they_say():
 
 @pytest.mark.parametrize(("wide", "fits"), [(1.0, True), (6.0, False)])
 def test_the_tail_of_the_weights_is_kept_and_warned_of(wide, fits):
-    """Draws from Gaussians as wide as the posterior, and from ones a sixth of it: few draws then have all the weight."""
+    """Draws from Gaussians as wide as the posterior, and a sixth of it: then few draws have all the weight."""
     own = Mixture(np.ones(1), np.full((1, 2), 0.5), (0.02 * np.eye(2))[None] ** 2)
     found = independent(np.random.default_rng(0), own, lambda u: -0.5 * (((u - 0.5) / (0.02 * wide)) ** 2).sum(1), 256)
     assert (found.shape < UNRELIABLE) is fits
