@@ -45,8 +45,9 @@ class Recorded:
     order: np.ndarray  # [N] the order in which segments are real trajectories: no two of them share a time
     pool: np.ndarray  # [M] the order of all segments, that simulations begin in
     noise: dict[str, np.ndarray]  # standard deviation of the measurement noise: qpos [nq], qvel [nv]
-    # what was measured, qpos [nq] and qvel [nv]; the rest is no feature: simulation has nothing like its errors
-    seen: dict[str, np.ndarray]
+    # [nv] velocities that were measured and agree with the positions; others are no features: simulation has nothing
+    # like their errors
+    fast: np.ndarray
     summarizer: Summarizer
     truth: None = None
     policy_dependent: bool = False  # the logged commands act, whatever bayessim.collectPolicy says
@@ -60,8 +61,8 @@ class Recorded:
         """What the summarizer sees: deviations from the nominal replay, and commands; then come the first states."""
         named = Channels.of(self.env.mj_model)
         speeds = [f"{name} speed" for name in named.qvel]
-        seen = np.concatenate([self.seen["qpos"], self.seen["qvel"]])
-        states = [f"deviation of {n}" for n, there in zip((*named.qpos, *speeds), seen, strict=True) if there]
+        shown = [name for name, there in zip(speeds, self.fast, strict=True) if there]
+        states = [f"deviation of {name}" for name in (*named.qpos, *shown)]
         first = tuple(f"first {name}" for name in (*named.qpos, *speeds))
         return Seen(self.data["command"].shape[1], tuple(states), named.actuators, first)
 
@@ -71,8 +72,9 @@ class Recorded:
         Both are deviations from the nominal replay of the segment, from its logged start.
         """
         expected_qpos, expected_qvel, command = self._of("expected_qpos", "expected_qvel", "command", index=index)
-        away = ((qpos - expected_qpos, self.seen["qpos"]), (qvel - expected_qvel, self.seen["qvel"]))
-        states = jnp.concatenate([x if seen.all() else x[..., np.flatnonzero(seen)] for x, seen in away], axis=-1)
+        away = qvel - expected_qvel
+        away = away if self.fast.all() else away[..., np.flatnonzero(self.fast)]
+        states = jnp.concatenate([qpos - expected_qpos, away], axis=-1)
         summaries = jax.vmap(self.summarizer)(states, command)
         return jnp.concatenate([summaries, qpos[:, 0], qvel[:, 0]], axis=-1)
 
@@ -94,7 +96,7 @@ class Recorded:
         k_segment, *keys = jax.random.split(key, 5)
         index = jnp.asarray(self.pool)[jax.random.randint(k_segment, (thetas.shape[0],), 0, len(self.pool))]
         qpos0, qvel0 = self._of("qpos0", "qvel0", index=index)
-        speed_error = self.noise["qvel"] * np.where(self.seen["qvel"], 1.0, ESTIMATED_SPEED)
+        speed_error = self.noise["qvel"] * np.where(self.fast, 1.0, ESTIMATED_SPEED)
         model = self.env.mj_model
         sd = in_tangent(model, np.asarray(self.noise["qpos"]))
         start = noisy(model, keys[0], qpos0, sd)
@@ -182,10 +184,9 @@ def recorded(config: Config, env: Any, summarizer: Summarizer) -> Recorded:
         policy = config.bayessim.collectPolicy
         warnings.warn(f"real.logs: the logged commands act, bayessim.collectPolicy={policy} does not", stacklevel=2)
     fast = np.all([log.seen_speeds for log in logs], axis=0)
-    seen = {"qpos": np.array([f"qpos:{name}" not in _lost(logs) for name in logs[0].channels.qpos]), "qvel": fast}
     law = controllers.of_logs(logs, env.mj_model)
     law = None if law is None else jax.tree.map(lambda x: x[data["run"]], law)
-    source = Recorded(env, env.space, data, law, order, pool, noise(logs), seen, summarizer)
+    source = Recorded(env, env.space, data, law, order, pool, noise(logs), fast, summarizer)
     return dataclasses.replace(source, data=data | _expected(source))
 
 
@@ -199,10 +200,6 @@ def apart(run: np.ndarray, start: np.ndarray, length: int) -> np.ndarray:
         if start[k] >= free[int(run[k])]:
             out[k], free[int(run[k])] = True, start[k] + length
     return out
-
-
-def _lost(logs: list[Log]) -> set[str]:
-    return {name for log in logs for name in log.lost}
 
 
 def _expected(source: Recorded) -> dict[str, np.ndarray]:

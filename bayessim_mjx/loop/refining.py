@@ -102,8 +102,8 @@ def _likelihood(loop: Loop, state: LoopState, known: int) -> Likelihood:
     if isinstance(source, Recorded):
         index = source.order[np.arange(known) % len(source.order)]
         record = source.records(index)
-        known = {name: np.where(source.seen[name], source.noise[name], np.inf) for name in ("qpos", "qvel")}
-        sensor = np.concatenate([in_tangent(model, known["qpos"]), known["qvel"]])
+        speeds = np.where(source.fast, source.noise["qvel"], np.inf)
+        sensor = np.concatenate([in_tangent(model, np.asarray(source.noise["qpos"])), speeds])
         valid = np.ones(record.command.shape[:2])
         return Likelihood(physics, record, valid, sensor, each, groups=source.data["run"][index])
     motion = state.motion
