@@ -93,6 +93,49 @@ def riccati(
     return Gains(*arrays)
 
 
+def measured_noise(
+    ways: np.ndarray, gains: Gains, white: np.ndarray, dt: float, valid: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Sums [2 nv] over all rows of u^2 and of its variance D, where the sensors' noise is R (u, diag(R - R D R)).
+
+    The smoothed measurement noise, by a backward pass over innovations: Koopman (1993), Biometrika 80, 117. Each number
+    of R then has the EM step R + R^2 (mean u^2 - mean D).
+
+    Args:
+        ways: `[N, T, 2 nv, 2 nv]`, see `transitions`.
+        gains: of the filter.
+        white: `[N, T, 2 nv]` its whitened innovations.
+        dt: control step, s.
+        valid: `[N, T]` 1 where a row counts.
+    """
+    n, steps, size, _ = ways.shape
+    nv = size // 2
+    known = np.asarray(valid, float)[:, :, None, None]
+    gain, whitener = np.asarray(gains.gain, float) * known, np.asarray(gains.whitener, float) * known
+    lasting = np.asarray(gains.lasting, float)
+    way = np.zeros((n, size + nv, size + nv))
+    way[:, :size, size:] = push(nv, dt)
+    way[:, size:, size:] = lasting[:, None, None] * np.eye(nv)
+    after, spread = np.zeros((n, size + nv)), np.zeros((n, size + nv, size + nv))  # r and N behind the next row's step
+    squares, variances = np.zeros(size), np.zeros(size)
+    for t in range(steps - 1, -1, -1):
+        k, w = gain[:, t], whitener[:, t]
+        inverse = np.swapaxes(w, -1, -2) @ w
+        u = np.einsum("nji,nj->ni", w, white[:, t]) - np.einsum("nji,nj->ni", k, after)
+        d = inverse + np.swapaxes(k, -1, -2) @ spread @ k
+        squares += (u**2 * known[:, t, :, 0]).sum(0)
+        variances += (np.diagonal(d, axis1=1, axis2=2) * known[:, t, :, 0]).sum(0)
+        keep = np.eye(size + nv) - np.concatenate([k, np.zeros((n, size + nv, nv))], axis=-1)
+        here = np.einsum("nji,nj->ni", keep, after)
+        here[:, :size] += np.einsum("nji,nj->ni", w, white[:, t])
+        about = np.swapaxes(keep, -1, -2) @ spread @ keep
+        about[:, :size, :size] += inverse
+        way[:, :size, :size] = np.nan_to_num(ways[:, t])
+        after = np.einsum("nji,nj->ni", way, here)
+        spread = np.swapaxes(way, -1, -2) @ about @ way
+    return squares, variances
+
+
 def innovations(ways: np.ndarray, gaps: np.ndarray, path: Gains, gains: Gains, dt: float) -> np.ndarray:
     """Whitened prediction errors [N, T, 2 nv] of a filter, by linear error dynamics along the path of another.
 

@@ -174,18 +174,15 @@ def _report(console: Any, parts: Any, state: Any) -> None:
     if parts.settings.modelClass is None:
         return
     posterior, space, truth = state.domain, state.domain.space, parts.source.truth
-    low, high = np.asarray(space.low), np.asarray(space.high)
-    mean, sd = np.asarray(posterior.mean()), np.asarray(posterior.sd())
-    contraction = np.asarray(posterior.contraction())
-    console.table(
-        [
-            {
-                "name": name, "unit": space.units[i], "low": low[i], "high": high[i], "mean": mean[i],
-                "sd": sd[i], "truth": None if truth is None else truth[i], "contraction": contraction[i],
-            }
-            for i, name in enumerate(space.names)
-        ]
-    )  # fmt: skip
+    numbers = posterior.estimates()
+    truths = [None] * len(space.names) if truth is None else np.asarray(truth)
+    rows = [
+        row | {"name": name, "unit": unit, "truth": true, "width": wide}
+        for (name, row), unit, true, wide in zip(
+            posterior.describe().items(), space.units, truths, numbers.width, strict=True
+        )
+    ]
+    console.table(rows, beside=numbers.sentence())
 
 
 def _adapt(argv: Sequence[str] | None) -> int:

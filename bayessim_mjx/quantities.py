@@ -12,6 +12,9 @@ SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 PLAIN_DIGITS = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789")
 DIGITS = 2  # of an uncertainty: more are never known (GUM, JCGM 100:2008, 7.2.6)
 PLAIN = range(-4, 6)  # powers of ten that are written without an exponent
+GAUSSIAN = (
+    0.2  # by which both halves of a 68 % interval and the sd differ at most, of the least: a Gaussian's are equal
+)
 EXACT = 1e-6  # an uncertainty below this share of the value is not shown
 
 
@@ -90,6 +93,21 @@ def estimate(value: Any, uncertainty: Any = math.nan, digits: int = DIGITS) -> s
         return f"({estimate(value / 10**largest, uncertainty / 10**largest, digits)}){exponent(largest)}"
     places = digits - 1 - power(uncertainty)
     return f"{fixed(value, places)} ± {fixed(uncertainty, places)}"
+
+
+def spread(median: float, low: float, high: float, sd: float) -> str:
+    """`1.04 ± 0.06`, or `1.04 +0.09/-0.05`, where a standard deviation does not say where 68 % lie: low to high."""
+    above, below = float(high) - float(median), float(median) - float(low)
+    if not all(map(finite, (above, below, float(sd)))) or max(above, below) <= EXACT * abs(float(median)):
+        return number(float(median))
+    if max(above, below, float(sd)) <= (1 + GAUSSIAN) * min(above, below, float(sd)):
+        return estimate(median, 0.5 * (above + below))
+    p = max(power(float(median)), power(max(above, below)))
+    if p not in PLAIN:
+        scaled = (float(v) / 10**p for v in (median, low, high, sd))
+        return f"({spread(*scaled)}){exponent(p)}"
+    places = DIGITS - 1 - power(max(min(above, below), 0.1 * max(above, below)))  # of the smaller, if it is not tiny
+    return f"{fixed(float(median), places)} +{fixed(above, places)}/-{fixed(below, places)}"
 
 
 def percent_estimate(share: Any, uncertainty: Any, digits: int = DIGITS) -> str:

@@ -21,7 +21,7 @@ from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.env import Task
 from bayessim_mjx.logs import Log, read_logs, segments
 from bayessim_mjx.monitor.console import Console
-from bayessim_mjx.quantities import estimate, number
+from bayessim_mjx.quantities import number, spread
 from bayessim_mjx.rollout import replay
 
 # load mass, damping = kt^2/R + viscous, Coulomb friction, armature, gain = kt/R
@@ -56,15 +56,15 @@ def adapt(folder: Path, overrides: list[str], seed: int = 0) -> tuple[Task, Dist
 
 def show(env: Task, logs: list[Log], posterior: Distribution) -> None:
     """Two tables: parameters (posterior against published values) and gaps."""
-    mean, sd = np.asarray(posterior.mean()), np.asarray(posterior.sd())
+    numbers = posterior.estimates()
     with Console() as console:
-        found = [estimate(m, s) for m, s in zip(mean, sd, strict=True)]
+        found = [spread(*row) for row in zip(numbers.median, numbers.low, numbers.high, numbers.sd, strict=True)]
         published = [[number(row[k]) for row in PUBLISHED.values()] for k in range(len(found))]
         rows = [[name, *known, own] for name, known, own in zip(env.space.names, published, found, strict=True)]
         console.grid(["parameter", *PUBLISHED, "posterior"], rows)
         gaps = [
             [label, *(number(1e3 * gap(env, logs, values, s)) for s in WINDOWS)]
-            for label, values in {**PUBLISHED, "posterior mean": mean}.items()
+            for label, values in {**PUBLISHED, "posterior mean": numbers.mean}.items()
         ]
         console.grid(["gap, RMS in mrad", *(f"after {s:g} s" for s in WINDOWS)], gaps)
 

@@ -14,7 +14,8 @@ from flax import struct
 from jax import Array
 from jax.typing import ArrayLike
 
-from bayessim_mjx.distributions import algebra, box, charts, convert, evaluate, storage
+from bayessim_mjx.distributions import algebra, charts, convert, evaluate, storage
+from bayessim_mjx.distributions.estimates import PRIOR_ITSELF, Estimates, estimates
 
 if TYPE_CHECKING:
     from bayessim_mjx.parameters import ParameterSpace
@@ -122,7 +123,7 @@ class Distribution:
         return evaluate.quadrature(self, points)
 
     def mean(self) -> Array:
-        """Mean in theta units [d], truncation included."""
+        """Mean in theta units [d], truncation and the prior's share included."""
         return evaluate.moments(self)[0]
 
     def cov(self) -> Array:
@@ -130,7 +131,7 @@ class Distribution:
         return evaluate.moments(self)[1]
 
     def sd(self) -> Array:
-        """Standard deviations in theta units [d]."""
+        """Standard deviations in theta units [d], of all draws: a person wants those of `estimates`."""
         return jnp.sqrt(jnp.diagonal(self.cov()))
 
     def mode(self) -> Array:
@@ -138,9 +139,8 @@ class Distribution:
         return evaluate.mode(self)
 
     def contraction(self) -> Array:
-        """1 - var_posterior / var_prior per parameter [d]: 0 learnt nothing, 1 known exactly."""
-        prior = evaluate.rowwise(self.space.from_unit, jnp.asarray(box.lattice(evaluate.POINTS, len(self.space))))
-        return 1.0 - jnp.diagonal(self.cov()) / jnp.var(prior, axis=0)
+        """1 - var_posterior / var_prior per parameter [d], the prior's share included: 0 nothing learnt, 1 exact."""
+        return 1.0 - jnp.diagonal(self.cov()) / jnp.var(evaluate.prior_points(self.space), axis=0)
 
     def credible_level(self, theta: Array) -> Array:
         """Mass of the region denser than theta: theta [..., d] -> [...]; within the 95 % HPD region where <= 0.95."""
@@ -271,10 +271,28 @@ class Distribution:
         arrays, chart, space = storage.read(path, space)
         return cls(**{k: jnp.asarray(v) for k, v in arrays.items()}, space=space, chart=chart)
 
+    # ---- what it says to a person (on the host) -----------------------------------------------------------------
+    @property
+    def inferred(self) -> Distribution:
+        """The Gaussians without the share of the prior that is kept; the prior where that is most. To be shown."""
+        if float(self.prior_weight) >= PRIOR_ITSELF:
+            return self
+        return replace(self, prior_weight=jnp.zeros_like(self.prior_weight))
+
+    def estimates(self) -> Estimates:
+        """Median, 68 % interval, mean, sd and correlation of what was inferred, in theta units."""
+        points, weights = (np.asarray(v) for v in self.inferred.quadrature())
+        prior_sd = np.asarray(evaluate.prior_points(self.space), np.float64).std(0)
+        return estimates(points, prior_sd, weights, float(self.prior_weight))
+
     def describe(self) -> dict[str, dict[str, float]]:
-        """Per parameter name: mean, sd, contraction, and the box."""
-        rows = [np.asarray(v) for v in (self.mean(), self.sd(), self.contraction(), self.space.low, self.space.high)]
-        keys = ("mean", "sd", "contraction", "low", "high")
+        """Per parameter name: median, q16 and q84 (ends of the 68 % interval), mean, sd, contraction, and the box.
+
+        Of what was inferred, see `estimates`; the share of the prior that is kept beside is `prior_weight`.
+        """
+        e = self.estimates()
+        rows = e.median, e.low, e.high, e.mean, e.sd, e.contraction, self.space.low, self.space.high
+        keys = ("median", "q16", "q84", "mean", "sd", "contraction", "low", "high")
         return {
             name: {key: float(row[i]) for key, row in zip(keys, rows, strict=True)} for i, name in enumerate(self.names)
         }

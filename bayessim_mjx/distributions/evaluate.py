@@ -106,6 +106,11 @@ def component_points(q: Parts, points: int) -> tuple[Array, Array]:
     return charts.from_chart(z, q.chart), jnp.zeros((q.components, points), jnp.float32)
 
 
+def prior_points(space: Any) -> Array:
+    """Points of the prior, spread evenly: theta [POINTS, d]."""
+    return rowwise(space.from_unit, jnp.asarray(box.lattice(POINTS, len(space))))
+
+
 @partial(jax.jit, static_argnames="points")
 def quadrature(q: Parts, points: int) -> tuple[Array, Array]:
     u, log_weight = component_points(q, points)

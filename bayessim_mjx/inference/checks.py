@@ -122,7 +122,7 @@ def conclude(
     report: Report, misfit: Misfit, posterior: Distribution, distrust: float, at_ends: Sequence[Pile] | None = None
 ) -> Checks:
     """The checks' result for the posterior given all real trajectories; at_ends: its `piles`, as far as known."""
-    flat = flat_sentences(posterior.names, report.contraction, np.asarray(posterior.contraction()))
+    flat = flat_sentences(posterior.names, report.contraction, posterior.estimates().contraction)
     share = misspecification.prior_share(misfit.joint, distrust)
     return Checks(report, misfit, tuple(piles(posterior) if at_ends is None else at_ends), tuple(flat), share)
 

@@ -21,7 +21,7 @@ from scipy.stats import multivariate_t
 
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.distributions.charts import EDGE, to_chart
-from bayessim_mjx.inference.independent import independent, worth
+from bayessim_mjx.inference.independent import independent
 from bayessim_mjx.inference.moves import KEPT, Population, begun, moved, powered, tempering
 from bayessim_mjx.inference.pareto import normalised
 from bayessim_mjx.inference.weighted import Mixture, fitted, fitted_to_islands, in_cube
@@ -45,6 +45,7 @@ class Refined:
         simulations: how many thetas were simulated.
         theta: the most likely theta that was simulated [d].
         reason: why the proposal was kept, or None.
+        shape: k of the weights' tail where the posterior is fitted to independent draws; None: to moved ones.
     """
 
     posterior: Distribution
@@ -54,6 +55,7 @@ class Refined:
     simulations: int
     theta: np.ndarray
     reason: str | None
+    shape: float | None = None
 
     @property
     def evidence(self) -> float:
@@ -147,14 +149,14 @@ def sharpened(
     rng, space = np.random.default_rng(seed), proposal.space
     q = fitted_to_islands(rng, found.population.islands, components)
     drawn = independent(rng, q, lambda u: power * np.asarray(log_likelihood(thetas(space, u)), np.float64), draws)
-    if drawn is None or worth(drawn) <= found.effective:
+    if drawn is None or drawn.worth <= found.effective:
         return found
-    u, weights = drawn
+    u, weights, count = drawn.u, drawn.weights, drawn.worth
     chart = "plain" if proposal.chart == "plain" else "probit"
     z = np.asarray(to_chart(jnp.asarray(u), chart), np.float64)
-    fit = _mixture(space, chart, lambda own: fitted(rng, z[:, own], weights, components), z, worth(drawn), weights)
+    fit = _mixture(space, chart, lambda own: fitted(rng, z[:, own], weights, components), z, count, weights)
     simulations = found.simulations + len(u)
-    return replace(found, posterior=fit, fitted=fit, effective=worth(drawn), simulations=simulations)
+    return replace(found, posterior=fit, fitted=fit, effective=count, simulations=simulations, shape=drawn.shape)
 
 
 def _near(

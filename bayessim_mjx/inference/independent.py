@@ -7,6 +7,7 @@ regions hold less of the posterior than they say. Where Gaussians fit, almost ev
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import logsumexp
@@ -21,10 +22,30 @@ WIDER = 1.2  # standard deviations, times
 TRIED = 64  # draws for each that is asked for, at most: the others lie beyond the unit cube
 
 
+@dataclass(frozen=True, eq=False)
+class Weighted:
+    """Independent draws.
+
+    Attributes:
+        u: `[N, d]` in the unit cube.
+        weights: `[N]`, their sum is 1.
+        shape: k of the Pareto tail of the weights, before they were smoothed; see `pareto.UNRELIABLE`.
+    """
+
+    u: np.ndarray
+    weights: np.ndarray
+    shape: float
+
+    @property
+    def worth(self) -> float:
+        """How many draws of the posterior itself they are worth."""
+        return effective(self.weights)
+
+
 def independent(
     rng: np.random.Generator, q: Mixture, log_posterior: Callable[[np.ndarray], np.ndarray], each: int
-) -> tuple[np.ndarray, np.ndarray] | None:
-    """Draws u [N, d] and weights [N] that sum to 1; None where the unit cube holds too little of the Gaussians.
+) -> Weighted | None:
+    """Weighted draws of the posterior; None where the unit cube holds too little of the Gaussians.
 
     Args:
         rng: randomness.
@@ -51,12 +72,7 @@ def independent(
     value = np.concatenate([np.asarray(log_posterior(x), np.float64) for x in u.reshape(-1, each, u.shape[1])])
     density = logsumexp([np.log(w) + part.logpdf(u) for w, part in zip(q.weights, parts, strict=True)], axis=0)
     logs = np.where(np.isfinite(value), value - density, -np.inf)
-    return (u, smoothed(logs)[0]) if np.isfinite(logs).any() else None
+    return Weighted(u, *smoothed(logs)) if np.isfinite(logs).any() else None
 
 
-def worth(found: tuple[np.ndarray, np.ndarray] | None) -> float:
-    """How many draws of the posterior itself they are worth."""
-    return effective(found[1]) if found else 0.0
-
-
-__all__ = ["independent", "worth"]
+__all__ = ["Weighted", "independent"]

@@ -26,6 +26,7 @@ TURNS = 6  # times that sets are drawn from the posterior, at most
 SAME = 1.05  # factor between widenings that is no difference: half of one between neighbours of sets.FACTORS
 STILL = 0.25  # squared change of a move, in standard deviations of the errors, that is none, beyond what chance makes
 CHANCE = 0.01  # of a move where products are off by chance alone
+FOLDS = 8  # of the sets: each is judged with the move that the others ask for
 FAR = {"plain": 1.0, "probit": 4.0}  # by which one product may count as off: a wild one decides nothing
 
 Factors = Sequence[Sequence[Distribution]]
@@ -40,11 +41,11 @@ def settled(found: Sets, product: Distribution, drawn: Drawn, components: int) -
 
     Args:
         found: by `sets.judge`.
-        product: of the real trajectories, as many as the last of found.counts, neither moved nor widened.
+        product: of the found.multiplied real trajectories, neither moved nor widened.
         drawn: (posterior, turn) -> factors and thetas of sets at its draws, as `sets.judge` takes them; None: none.
         components: of the products.
     """
-    n, product = found.counts[-1].trajectories, replace(product, prior_weight=jnp.zeros_like(product.prior_weight))
+    n, product = found.multiplied, replace(product, prior_weight=jnp.zeros_like(product.prior_weight))
     for turn in range(TURNS):
         widening, before = found.widening(n), found.move
         simulated = drawn(found.used(product, n), turn)
@@ -54,6 +55,8 @@ def settled(found: Sets, product: Distribution, drawn: Drawn, components: int) -
         found = replace(found, near=(*found.near, one), move=move)
         if step < STILL and found.widening(n) <= widening * SAME:
             break
+    else:
+        return replace(found, settled=False)
     return found
 
 
@@ -62,6 +65,7 @@ def judged(
 ) -> tuple[Count, np.ndarray | None, float]:
     """Products of all factors of each set, moved and widened as they ask for: how they did, the move [d], its change.
 
+    How they did is with the moves that the other sets ask for: a move that the same sets have chosen fits their chance.
     The change, against the move `before`, is squared, in standard deviations of the errors, less what chance makes of
     it where both are means of as many errors.
     """
@@ -69,9 +73,13 @@ def judged(
     off = np.asarray(_errors(products, jnp.asarray(thetas, jnp.float32)), float)
     off = np.clip(off, -FAR[products.chart], FAR[products.chart])
     move, cov = mean_error(off)
+    fold = np.arange(len(off)) % FOLDS
+    moves = [mean_error(off[fold != k])[0] for k in range(FOLDS)]
+    move = None if all(each is None for each in moves) else move  # as none of them is judged with one
     change = (0.0 if move is None else move) - (0.0 if before is None else before) + np.zeros(off.shape[1])
     step = float(change @ np.linalg.solve(cov, change)) - 2 * len(change) / len(off)
-    return counted(len(factors[0]), shifted(products, move), thetas), move, step
+    apart = stacked([moved(q, moves[k]) for q, k in zip(products.split(), fold, strict=True)])
+    return counted(len(factors[0]), apart, thetas), move, step
 
 
 def count(

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import logsumexp
 
+UNRELIABLE = 0.7  # k from which on smoothed weights may be far off (Vehtari et al. 2024, section 3.2.4)
+
 
 def normalised(log_weights: np.ndarray) -> np.ndarray:
     """Weights [N] that sum to 1."""

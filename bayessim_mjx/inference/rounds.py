@@ -14,9 +14,8 @@ import numpy as np
 from jax import Array
 
 from bayessim_mjx.distributions import Distribution
+from bayessim_mjx.distributions.estimates import PRIOR_ITSELF as REGION  # from there on `truncated` keeps no region
 from bayessim_mjx.inference.proposal import GAUSSIANS, draw_truncated, proposal_of
-
-REGION = 0.5  # prior in a posterior from which on `truncated` has no region to keep to
 
 
 def chart_of(chart: str) -> str:

@@ -59,11 +59,15 @@ class Sets:
         counts: on sets at draws of the prior, or of what the round was simulated from.
         near: on sets of the last of these numbers at draws of the posterior itself, one row a turn of `near.settled`.
         move: [d] by which products there are moved, in the coordinates of their chart; None: not at all.
+        known: real trajectories that are multiplied, where they are more than those of a set.
+        settled: whether the last sets at the posterior's draws asked for no more.
     """
 
     counts: tuple[Count, ...]
     near: tuple[Count, ...] = ()
     move: np.ndarray | None = None
+    known: int = 0
+    settled: bool = True
 
     @property
     def carried(self) -> int:
@@ -79,9 +83,17 @@ class Sets:
         return max((c for c in self.counts if c.trajectories <= trajectories), key=lambda c: c.trajectories)
 
     def widening(self, trajectories: int) -> float:
-        """Factor on standard deviations that a posterior of so many trajectories is used with."""
+        """Factor on standard deviations that a posterior of so many trajectories is used with.
+
+        Beyond the number that was judged the error that trajectories share stays, while their product narrows: b^2 of
+        w^2 = 1 + n b^2 is that of the last number, and at least what no sets can tell from nothing, a step of FACTORS.
+        """
         one = self.at(trajectories)
-        return max([one.widening, *(c.widening for c in self.near[-1:] if c.trajectories == one.trajectories)])
+        judged = max([one.widening, *(c.widening for c in self.near[-1:] if c.trajectories == one.trajectories)])
+        more = trajectories / one.trajectories
+        if more <= 1:
+            return judged
+        return float(np.sqrt(1 + (max(judged, float(FACTORS[1])) ** 2 - 1) * more))
 
     def used(self, product: Distribution, trajectories: int) -> Distribution:
         """The posterior of so many trajectories as it is used, of their product: moved and widened."""
@@ -107,7 +119,13 @@ class Sets:
         rows = [_plain(c) for c in self.counts]
         told = {"carried": self.carried, "sets": len(self.counts[-1].levels), "counts": rows}
         told |= {"near": [_plain(c) for c in self.near]}
+        told |= {"known": self.multiplied, "widening": self.widening(self.multiplied), "settled": self.settled}
         return {**told, "move": None if self.move is None else [float(x) for x in self.move]}
+
+    @property
+    def multiplied(self) -> int:
+        """How many real trajectories' posteriors are multiplied."""
+        return max(self.known, self.counts[-1].trajectories)
 
     @property
     def told(self) -> str:
@@ -119,13 +137,20 @@ class Sets:
 
     def sentence(self) -> str:
         """One line for a person."""
-        last = self.counts[-1]
-        widening = self.widening(last.trajectories)
-        told = f"with {last.trajectories} trajectories standard deviations are widened {widening:.2f} times"
-        if widening > last.widening:
+        last, many = self.counts[-1], self.multiplied
+        widening = self.widening(many)
+        told = f"with {many} trajectories standard deviations are widened {widening:.2f} times"
+        if many > last.trajectories:
+            judged = self.widening(last.trajectories)
+            told += (
+                f" (sets of {last.trajectories} were simulated, which ask for {judged:.2f}: an error that all share)"
+            )
+        elif widening > last.widening:
             told += f" ({last.widening:.2f} on average over the prior, more where the posterior lies)"
         if self.move is not None:
             told += "; where the posterior lies the network leans to one side, by which it is moved back"
+        if not self.settled:
+            told += "; the last sets still asked for more: take it for too narrow"
         if self.carried < last.trajectories:
             told += f"; the network carries {self.carried}, more do not sharpen the posterior"
         return told

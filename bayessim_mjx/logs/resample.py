@@ -171,11 +171,16 @@ def _starts(log: Log, length: int, stride: int) -> list[int]:
 
 
 def noise(logs: Log | Sequence[Log]) -> dict[str, Array]:
-    """Measurement noise of every channel, pooled over logs (rms): {"qpos": [nq], "qvel": [nv]} standard deviations."""
+    """Measurement noise of every channel: {"qpos": [nq], "qvel": [nv]} standard deviations.
+
+    Pooled (rms) over the logs that show any: one in which a channel stands still tells none. 0: no log does.
+    """
     runs = [logs] if isinstance(logs, Log) else list(logs)
     if not runs:
         raise UserError("noise: no logs; allowed: at least one")
-    return {
-        "qpos": np.sqrt(np.mean([log.sigma_qpos**2 for log in runs], axis=0)),
-        "qvel": np.sqrt(np.mean([log.sigma_qvel**2 for log in runs], axis=0)),
-    }
+
+    def pooled(sigmas: list[Array]) -> Array:
+        square = np.square(sigmas)
+        return np.sqrt(square.sum(0) / np.maximum((square > 0).sum(0), 1))
+
+    return {"qpos": pooled([log.sigma_qpos for log in runs]), "qvel": pooled([log.sigma_qvel for log in runs])}

@@ -13,8 +13,8 @@ from bayessim_mjx.distributions.charts import from_chart, to_chart
 from bayessim_mjx.kalman import Gains
 from bayessim_mjx.loop.noise import FINEST, Linear, Noise, NoiseModel
 from bayessim_mjx.loop.starts import Starts
+from bayessim_mjx.loop.travel import silent, travel
 from bayessim_mjx.physics import Physics
-from bayessim_mjx.physics.tangent import addresses
 from bayessim_mjx.tracking import Record, close, errors, transitions
 
 SETTLED = 0.1  # relative change of the log likelihood's unit at which noise and posterior agree
@@ -32,7 +32,8 @@ class Likelihood:
         physics: the simulator.
         record: what was measured, N trajectories of T steps.
         valid: `[N, T]` 1 while the episode ran.
-        sensor: `[2 nv]` standard deviations of the measurement noise as far as known: inf where nothing is measured.
+        sensor: `[2 nv]` standard deviations of the measurement noise: inf where nothing is measured, 0 where it is not
+            known.
         together: trajectories in one call, so that more of them need no other program; None: all.
         groups: `[N]` equal numbers where what differs from trajectory to trajectory is shared, as in one log; None:
             each is alone.
@@ -48,9 +49,10 @@ class Likelihood:
         each = together if together and count % together == 0 else count
         self.parts = [slice(i, i + each) for i in range(0, count, each)]
         nv = physics.mj_model.nv
-        size = _travel(record, physics)
-        self.scale = size
-        self.floor = np.where(np.isfinite(sensor), np.maximum(np.nan_to_num(sensor, posinf=0.0), FINEST * size), np.inf)
+        self.silent = silent(record, physics.mj_model, sensor)
+        self.scale = size = travel(record, physics.mj_model)
+        known = np.isfinite(sensor) & ~self.silent
+        self.floor = np.where(known, np.maximum(np.nan_to_num(sensor, posinf=0.0), FINEST * size), np.inf)
         self.seen = np.isfinite(self.floor)
         self.starts = Starts(record, physics.mj_model)
         self.begun = record  # from the most likely starts
@@ -85,7 +87,7 @@ class Likelihood:
 
     def back_to(self, noise: Noise, gains: Gains | None) -> None:
         """Return to a noise that was settled on before, and to its gains."""
-        self.noise, self.gains, self.begun = noise, gains, self.starts.begun(noise.sensor)
+        self.noise, self.gains = noise, gains
 
     def _next(self, theta: np.ndarray) -> tuple[np.ndarray, float] | None:
         """The posterior's mean [d] by linear dynamics around theta, and how many of its sd that is away."""
@@ -118,7 +120,7 @@ class Likelihood:
         ways, gaps = self._dynamics(theta, path, self.parts)
         linear = self._linear(theta, path, ways, gaps)
         self.noise = self.model.likely(linear, self.noise)
-        self.begun = self.starts.begun(self.noise.sensor)
+        self.begun = self.starts.begun(self.floor)  # by the told noise: what else sensors show is no error of starts
         self.laplace = self._posterior(linear)
         gains = self.model.gains(ways, self.noise)
         mask = jnp.asarray(self.valid, jnp.float32)[:, :, None, None]
@@ -169,12 +171,12 @@ class Likelihood:
 
     @property
     def least(self) -> float:
-        """The least factor on the variance of the noise as it was estimated: sensors are no better than was told.
+        """The least factor on the variance of the noise as it was estimated: no sensor is better than was told.
 
         Velocity's noise may be any ratio of position's (RATIOS), so positions tell, where they are measured.
         """
         use = self.seen & (np.arange(2 * self.nv) < self.nv) if self.seen[: self.nv].any() else self.seen
-        return float(np.min((self.floor[use] / self.noise.sensor[use]) ** 2))
+        return float(np.max((self.floor[use] / self.noise.sensor[use]) ** 2))
 
     def log_likelihood(self, squares: np.ndarray) -> np.ndarray:
         """[M] of `squares`, the common factor on all noise marginalised with a prior of one number's worth at 1.
@@ -192,16 +194,6 @@ def _log_gammainc(shape: float, x: np.ndarray) -> np.ndarray:
     with np.errstate(divide="ignore", invalid="ignore"):  # x is infinite where a simulation diverged: 0 is right there
         first = shape * np.log(x) - x - gammaln(shape + 1) - np.log1p(-np.minimum(x / (shape + 1), 0.999))
         return np.where(found > 1e-200, np.log(found), first)
-
-
-def _travel(record: Record, physics: Physics) -> np.ndarray:
-    """Range of motion [2 nv] of positions (angles at most pi) and velocities."""
-    nv = physics.mj_model.nv
-    speed = np.asarray(record.qvel, float).reshape(-1, nv)
-    span = np.ptp(speed, axis=0)
-    qpos = np.asarray(record.qpos, float).reshape(-1, physics.mj_model.nq)
-    travel = np.array([min(np.ptp(qpos[:, q]), np.pi) if q is not None else 1.0 for q in addresses(physics.mj_model)])
-    return np.maximum(np.concatenate([travel, span]), 1e-6)
 
 
 def _rows(tree: Any, rows: slice) -> Any:

@@ -5,20 +5,21 @@ Estimated near a theta, by the linear dynamics there: what the simulator cannot 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
 import numpy as np
 
-from bayessim_mjx.kalman import Force, Gains, innovations, riccati
+from bayessim_mjx.kalman import Force, Gains, innovations, measured_noise, riccati
 from bayessim_mjx.loop.starts import Starts
 
 FINEST = 1e-3  # of a channel's range of motion: no sensor is believed to be better
 PROCESS = (1e-3, 1e-2, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0)  # of unmodelled forces, in the velocity's sensor noise
 FINER = (3.0**0.5, 3.0**0.25)  # what the most likely of them is multiplied and divided by after that
 LASTING = (0.7, 0.9, 0.97)  # their correlations from step to step
-RATIOS = (0.1, 0.3, 1.0, 3.0, 10.0)  # velocity's sensor noise against position's, times what was given
+RATIOS = (0.1, 0.3)  # velocity's sensor noise against position's, times what was given: less of it than was given
+TURNS, ALIKE = 6, 0.05  # steps of EM for the noise of single channels; relative change of a variance that is none
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,20 @@ class Noise:
     sensor: np.ndarray
     process: np.ndarray
     lasting: float = 0.0
+
+    @property
+    def numbers(self) -> float:
+        """How many it has beside those of the sensors."""
+        return float(self.process.any()) + float(self.lasting > 0)
+
+
+@dataclass
+class _Best:
+    """The likeliest noise so far, less what its numbers cost: as it was tried, and with the factor it asked for."""
+
+    value: float
+    noise: Noise
+    guess: Noise
 
 
 @dataclass(frozen=True)
@@ -91,33 +106,59 @@ class NoiseModel:
     def likely(self, linear: Linear, otherwise: Noise) -> Noise:
         """The most likely noise, each number that is not needed left out (BIC): first what acts, then the sensors.
 
+        Sensors have one factor in common, or one each where that pays: one joint with a noise that nobody told, or
+        with a friction that the simulator lacks, is no reason to believe the others less.
+
         `otherwise` where the dynamics are finite under none.
         """
         paid = 0.5 * np.log(linear.valid.sum() * self.seen.sum())
         unit = np.where(self.seen, self.floor, FINEST * self.scale)[self.nv :]
-        still = np.zeros(self.nv)
-        acting = [(0.0, still, 0.0), *((1.0, q * unit, 0.0) for q in PROCESS)]
-        acting += [(2.0, q * unit, lasting) for q in PROCESS for lasting in LASTING]
-        best, noise, force = -np.inf, otherwise, still
+        still, channels = np.zeros(self.nv), float(self.seen.sum() - 1)  # numbers more than a common factor
+        best = _Best(-np.inf, otherwise, Noise(self.floor, still))
 
-        def tried(ratio: float, cost: float, guessed: np.ndarray, lasting: float) -> None:
-            nonlocal best, noise, force
-            sensor = self.floor * np.concatenate([np.ones(self.nv), np.full(self.nv, ratio)])
-            value, size = self.fit(linear, Noise(sensor, guessed, lasting))
-            value -= paid * (cost + (ratio != 1.0))
-            if value > best:
-                best, force = value, guessed
-                noise = Noise(sensor * size, guessed * size, lasting)
+        def tried(guess: Noise, cost: float) -> None:
+            value, size = self.fit(linear, guess)
+            if value - paid * (cost + guess.numbers) > best.value:
+                best.value, best.guess = value - paid * (cost + guess.numbers), guess
+                best.noise = Noise(guess.sensor * size, guess.process * size, guess.lasting)
 
-        for cost, guess, lasting in acting:
-            tried(1.0, cost, guess, lasting)
-        cost = float(noise.process.any()) + float(noise.lasting > 0)
-        for factor in FINER if cost else ():
-            for guess in (force * factor, force / factor):
-                tried(1.0, cost, guess, noise.lasting)
-        at, lasting = force, noise.lasting
+        def acting(sensor: np.ndarray, cost: float) -> None:
+            tried(Noise(sensor, still), cost)
+            for lasting in (0.0, *LASTING):
+                for q in PROCESS:
+                    tried(Noise(sensor, q * unit, lasting), cost)
+            force, lasting = best.guess.process, best.guess.lasting
+            for factor in FINER if force.any() else ():
+                for process in (force * factor, force / factor):
+                    tried(Noise(sensor, process, lasting), cost)
+
+        acting(self.floor, 0.0)
+        force, lasting = best.guess.process, best.guess.lasting
         for ratio in RATIOS:
-            tried(ratio, cost, at, lasting)
+            tried(Noise(self.floor * np.repeat([1.0, ratio], self.nv), force, lasting), 1.0)
+        common = best.guess
+        for begin, least in ((Noise(self.floor, still), self.floor), (best.noise, common.sensor)):
+            tried(self.parted(linear, begin, least), channels)
+        if best.guess is not common:  # what acts was found with one channel's noise in it
+            acting(best.guess.sensor, channels)
+        return best.noise
+
+    def parted(self, linear: Linear, noise: Noise, least: np.ndarray) -> Noise:
+        """`noise` with its sensors' [2 nv] standard deviations each by itself: steps of EM, none below `least`."""
+        rows = linear.valid.sum()
+        for _ in range(TURNS):
+            gains = self.gains(linear.ways, noise)
+            error, slope = linear.whitened(gains, self.dt)
+            if not (np.isfinite(error).all() and np.isfinite(slope).all()):
+                return noise
+            step = -np.linalg.solve(slope.T @ slope + np.eye(len(linear.z)), slope.T @ error + linear.z)
+            white = (error + slope @ step).reshape(linear.gaps.shape)
+            squares, spread = measured_noise(linear.ways, gains, white, self.dt, linear.valid)
+            before = np.where(self.seen, noise.sensor, 1.0) ** 2
+            after = np.maximum(before + before**2 * (squares - spread) / rows, np.where(self.seen, least, 1.0) ** 2)
+            noise = replace(noise, sensor=np.where(self.seen, np.sqrt(after), np.inf))
+            if np.abs(np.log(after / before)).max() < ALIKE:
+                break
         return noise
 
     def gains(self, ways: np.ndarray, noise: Noise) -> Gains:
@@ -131,7 +172,8 @@ class NoiseModel:
 
     def _start(self, noise: Noise) -> np.ndarray:
         """Standard deviations of the start state: as measured, or anything where it is not."""
-        return np.where(self.seen, self.starts.sd(noise.sensor), 0.3 * self.scale)
+        known = np.where(self.seen, noise.sensor, 1.0) / np.where(self.seen, self.floor, 1.0)
+        return np.where(self.seen, known * self.starts.sd(self.floor), 0.3 * self.scale)
 
     def fit(self, linear: Linear, noise: Noise) -> tuple[float, float]:
         """(log evidence at the best common factor on the noise, that factor), by linear dynamics.

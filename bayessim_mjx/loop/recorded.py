@@ -16,10 +16,12 @@ from bayessim_mjx.errors import UserError
 from bayessim_mjx.inference.summaries import Summarizer
 from bayessim_mjx.keys import branch
 from bayessim_mjx.logs import Channels, Log, noise, read_logs, segments
+from bayessim_mjx.logs.velocities import trusted
 from bayessim_mjx.loop.seen import Seen, tiled
 from bayessim_mjx.parameters import ParameterSpace
 from bayessim_mjx.physics import controllers
 from bayessim_mjx.physics.controllers import Law
+from bayessim_mjx.physics.tangent import in_tangent, noisy
 from bayessim_mjx.rl import Policy
 from bayessim_mjx.rollout import Trajectory, recording, remembered, replay
 from bayessim_mjx.tracking import Record
@@ -40,11 +42,12 @@ class Recorded:
     space: ParameterSpace
     data: dict[str, np.ndarray]  # of `logs.segments`, M of them; expected_qpos, expected_qvel: of the nominal replay
     law: Law | None  # the controllers that the logs declare, leaves [M, nu]; None: commands go to the actuators
-    order: np.ndarray  # [M] the order in which segments are used
+    order: np.ndarray  # [N] the order in which segments are real trajectories: no two of them share a time
+    pool: np.ndarray  # [M] the order of all segments, that simulations begin in
     noise: dict[str, np.ndarray]  # standard deviation of the measurement noise: qpos [nq], qvel [nv]
-    with_qvel: (
-        bool  # velocities were measured; estimated ones are no features, simulation has nothing like their errors
-    )
+    # [nv] velocities that were measured and agree with the positions; others are no features: simulation has nothing
+    # like their errors
+    fast: np.ndarray
     summarizer: Summarizer
     truth: None = None
     policy_dependent: bool = False  # the logged commands act, whatever bayessim.collectPolicy says
@@ -58,7 +61,8 @@ class Recorded:
         """What the summarizer sees: deviations from the nominal replay, and commands; then come the first states."""
         named = Channels.of(self.env.mj_model)
         speeds = [f"{name} speed" for name in named.qvel]
-        states = [f"deviation of {name}" for name in (*named.qpos, *(speeds if self.with_qvel else ()))]
+        shown = [name for name, there in zip(speeds, self.fast, strict=True) if there]
+        states = [f"deviation of {name}" for name in (*named.qpos, *shown)]
         first = tuple(f"first {name}" for name in (*named.qpos, *speeds))
         return Seen(self.data["command"].shape[1], tuple(states), named.actuators, first)
 
@@ -68,9 +72,9 @@ class Recorded:
         Both are deviations from the nominal replay of the segment, from its logged start.
         """
         expected_qpos, expected_qvel, command = self._of("expected_qpos", "expected_qvel", "command", index=index)
-        states = qpos - expected_qpos
-        if self.with_qvel:
-            states = jnp.concatenate([states, qvel - expected_qvel], axis=-1)
+        away = qvel - expected_qvel
+        away = away if self.fast.all() else away[..., np.flatnonzero(self.fast)]
+        states = jnp.concatenate([qpos - expected_qpos, away], axis=-1)
         summaries = jax.vmap(self.summarizer)(states, command)
         return jnp.concatenate([summaries, qpos[:, 0], qvel[:, 0]], axis=-1)
 
@@ -90,16 +94,18 @@ class Recorded:
         """Features [N, draws, D] of replays as of `simulate`, each measured so often."""
         del policy  # the logged commands act
         k_segment, *keys = jax.random.split(key, 5)
-        index = jnp.asarray(self.order)[jax.random.randint(k_segment, (thetas.shape[0],), 0, len(self.order))]
+        index = jnp.asarray(self.pool)[jax.random.randint(k_segment, (thetas.shape[0],), 0, len(self.pool))]
         qpos0, qvel0 = self._of("qpos0", "qvel0", index=index)
-        speed_error = self.noise["qvel"] * (1.0 if self.with_qvel else ESTIMATED_SPEED)
-        start = qpos0 + self.noise["qpos"] * jax.random.normal(keys[0], qpos0.shape)
+        speed_error = self.noise["qvel"] * np.where(self.fast, 1.0, ESTIMATED_SPEED)
+        model = self.env.mj_model
+        sd = in_tangent(model, np.asarray(self.noise["qpos"]))
+        start = noisy(model, keys[0], qpos0, sd)
         speed = qvel0 + speed_error * jax.random.normal(keys[1], qvel0.shape)
         motion = self._replayed(index, start, speed, thetas)
 
         def again(draw: Array) -> Array:
             k_qpos, k_qvel = (jnp.where(draw > 0, branch(k, draw), k) for k in keys[2:])
-            qpos = motion["qpos"] + self.noise["qpos"] * jax.random.normal(k_qpos, motion["qpos"].shape)
+            qpos = noisy(model, k_qpos, motion["qpos"], sd)
             qvel = motion["qvel"] + self.noise["qvel"] * jax.random.normal(k_qvel, motion["qvel"].shape)
             return self.features(index, qpos.at[:, 0].set(qpos0), qvel.at[:, 0].set(qvel0))
 
@@ -157,28 +163,48 @@ def recorded(config: Config, env: Any, summarizer: Summarizer) -> Recorded:
     logs: list[Log] = read_logs(config.real.logs, env.mj_model, config.real.map)
     length = config.real.segment_length or config.bayessim.trainTrajLen
     stride = config.real.segment_stride or length
+    logs, notes = trusted(logs, max(env.mj_model.opt.timestep, *(log.period for log in logs)))
     data = segments(logs, length, dt=env.dt, stride=stride, rows=remembered(env.physics))
-    count = len(data["qpos0"])
+    pool = np.random.default_rng(config.seed).permutation(len(data["qpos0"]))
+    order = pool[apart(data["run"], data["start"], length)[pool]]
     needed = config.bayessim.realTrajs
-    if count < needed:
+    if len(order) < needed:
         raise UserError(
-            f"real.logs: the logs hold {count} segments of {length} steps ({length * env.dt:.3g} s), "
-            f"bayessim.realTrajs={needed} are asked for; shorten bayessim.trainTrajLen or record more"
+            f"real.logs: the logs hold {len(order)} segments of {length} steps ({length * env.dt:.3g} s) that share no "
+            f"time, bayessim.realTrajs={needed} are asked for; shorten bayessim.trainTrajLen or record more"
         )
+    if len(order) < len(pool):
+        notes.append(
+            f"segments overlap (real.segment_stride={stride} of {length} steps): all {len(pool)} are simulated, the "
+            f"{len(order)} that share no time are real trajectories, as the same rows count once"
+        )
+    for note in notes:
+        warnings.warn(f"real.logs: {note}", stacklevel=2)
     if config.bayessim.collectPolicy != "policy_replay":
         policy = config.bayessim.collectPolicy
         warnings.warn(f"real.logs: the logged commands act, bayessim.collectPolicy={policy} does not", stacklevel=2)
-    order = np.random.default_rng(config.seed).permutation(count)
-    measured = all(log.has_qvel for log in logs)
+    fast = np.all([log.seen_speeds for log in logs], axis=0)
     law = controllers.of_logs(logs, env.mj_model)
     law = None if law is None else jax.tree.map(lambda x: x[data["run"]], law)
-    source = Recorded(env, env.space, data, law, order, noise(logs), measured, summarizer)
+    source = Recorded(env, env.space, data, law, order, pool, noise(logs), fast, summarizer)
     return dataclasses.replace(source, data=data | _expected(source))
+
+
+def apart(run: np.ndarray, start: np.ndarray, length: int) -> np.ndarray:
+    """[M] whether a segment of `length` steps is one of those, from the first on, that share no time with another.
+
+    Likelihoods and posteriors of segments are multiplied. Rows that two of them share would count twice.
+    """
+    free, out = dict.fromkeys(np.unique(run).tolist(), -np.inf), np.zeros(len(run), bool)
+    for k in np.lexsort((start, run)):
+        if start[k] >= free[int(run[k])]:
+            out[k], free[int(run[k])] = True, start[k] + length
+    return out
 
 
 def _expected(source: Recorded) -> dict[str, np.ndarray]:
     """What the logs would show at nominal parameters: expected_qpos [M, T+1, nq], expected_qvel [M, T+1, nv]."""
-    count = len(source.order)
+    count = len(source.pool)
     size = min(count, REPLAYED)
     thetas, found = tiled(jnp.asarray(source.space.nominal, jnp.float32), size), []
     for first in range(0, count, size):

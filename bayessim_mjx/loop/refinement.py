@@ -16,6 +16,7 @@ import numpy as np
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.inference import importance, temperature
 from bayessim_mjx.inference.importance import Refined
+from bayessim_mjx.inference.pareto import UNRELIABLE
 from bayessim_mjx.loop.likelihood import Likelihood
 from bayessim_mjx.loop.noise import Noise
 
@@ -58,7 +59,25 @@ class Refinement:
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers, for JSON."""
         told = {"used": self.used, "sentence": self.sentence(), "simulations": self.refined.simulations}
-        return told | {"effective": self.refined.effective, "widening": self.widening}
+        return told | {
+            "effective": self.refined.effective,
+            "widening": self.widening,
+            "pareto_k": _finite(self.refined.shape),
+        }
+
+    def warning(self) -> str | None:
+        """What to be wary of."""
+        k = self.refined.shape
+        if not self.used or k is None or k <= UNRELIABLE:
+            return None
+        return (
+            f"the refined posterior rests on draws with heavy-tailed weights (k = {k:.2g}; above {UNRELIABLE} a few of "
+            "them decide): its width may be off, more rounds or bayessim.components may help"
+        )
+
+
+def _finite(value: float | None) -> float | None:
+    return value if value is not None and np.isfinite(value) else None
 
 
 def refine(

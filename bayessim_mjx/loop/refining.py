@@ -7,16 +7,18 @@ import time
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 from jax import Array
 
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.keys import branch
+from bayessim_mjx.logs import Channels
 from bayessim_mjx.loop.likelihood import Likelihood
 from bayessim_mjx.loop.recorded import Recorded
 from bayessim_mjx.loop.refinement import Refinement, refine
 from bayessim_mjx.loop.state import Loop, LoopState, RoundInfo
-from bayessim_mjx.physics.tangent import in_tangent
+from bayessim_mjx.physics.tangent import in_tangent, noisy
 from bayessim_mjx.rollout import Trajectory
 from bayessim_mjx.tracking import Record
 
@@ -40,17 +42,31 @@ def refined(
     clock, b, round_ = time.perf_counter(), loop.settings, int(state.round)
     state = _stored(loop, state, real)
     likelihood = _likelihood(loop, state, (round_ + 1) * b.realTrajs)
+    if likelihood.silent.any() and not round_:
+        info.warnings.append(f"bayessim.refine: {_without_noise(likelihood.silent, loop.env.physics.mj_model)}")  # type: ignore[attr-defined]
+    if not likelihood.seen.any():
+        return state, proposal
     seed = int(jax.random.randint(branch(loop.key(round_, "fit"), 3), (), 0, 2**31 - 1))
     found = refine(proposal, likelihood, seed=seed, draws=DRAWS, components=b.components)
     info.refinement = found
     info.seconds["refine"] = time.perf_counter() - clock
     info.scores |= scores(found)
+    info.warnings += [text for text in [found.warning()] if text]
     if not found.used:
         if b.refine == "likelihood":
             info.warnings.append(f"bayessim.refine: {found.sentence()}")
         return state, proposal
     posterior = found.posterior.reduce(b.components).rechart(loop.chart)
     return state, dataclasses.replace(posterior, prior_weight=jnp.float32(min(b.priorShare, SHARE)))
+
+
+def _without_noise(silent: np.ndarray, model: mujoco.MjModel) -> str:
+    names = [f"{stream}:{name}" for stream in ("qpos", "qvel") for name in Channels.of(model).qvel]
+    left_out = ", ".join(name for name, there in zip(names, silent, strict=True) if there)
+    return (
+        f"{left_out}: too few different values to see how noisy they are, so they have no part in the likelihood; "
+        "a `sigma` beside the logs (real.noise of a surrogate) gives them one"
+    )
 
 
 def scores(found: Refinement) -> dict[str, float]:
@@ -67,10 +83,11 @@ def _stored(loop: Loop, state: LoopState, real: Trajectory) -> LoopState:
     if state.motion is None:
         return state
     first, source = int(state.round) * loop.settings.realTrajs, loop.source
-    keys = jax.random.split(branch(loop.key(int(state.round), "real"), 7))
+    k_qpos, k_qvel = jax.random.split(branch(loop.key(int(state.round), "real"), 7))
     rows = {name: jnp.asarray(getattr(real, name)) for name in state.motion}
-    for key, name in zip(keys, ("qpos", "qvel"), strict=True):
-        rows[name] = rows[name] + source.noise * jax.random.normal(key, rows[name].shape)  # type: ignore[union-attr,operator]
+    model, noise = loop.env.physics.mj_model, source.noise  # type: ignore[union-attr,attr-defined]
+    rows["qpos"] = noisy(model, k_qpos, rows["qpos"], noise)  # type: ignore[arg-type]
+    rows["qvel"] = rows["qvel"] + noise * jax.random.normal(k_qvel, rows["qvel"].shape)  # type: ignore[operator]
     kept = {
         name: jax.lax.dynamic_update_slice(old, rows[name], (first, *[0] * (old.ndim - 1)))
         for name, old in state.motion.items()
@@ -85,7 +102,7 @@ def _likelihood(loop: Loop, state: LoopState, known: int) -> Likelihood:
     if isinstance(source, Recorded):
         index = source.order[np.arange(known) % len(source.order)]
         record = source.records(index)
-        speeds = np.asarray(source.noise["qvel"]) if source.with_qvel else np.full(model.nv, np.inf)
+        speeds = np.where(source.fast, source.noise["qvel"], np.inf)
         sensor = np.concatenate([in_tangent(model, np.asarray(source.noise["qpos"])), speeds])
         valid = np.ones(record.command.shape[:2])
         return Likelihood(physics, record, valid, sensor, each, groups=source.data["run"][index])

@@ -256,9 +256,11 @@ def _unknown(names: tuple[str, ...], fit: dict[str, Any]) -> tuple[str, ...]:
 
 
 def score(domain: Distribution, truth: np.ndarray | None) -> dict[str, float]:
-    """Log density of the truth where it is known, and per-parameter contraction against the prior."""
-    contraction = np.asarray(domain.contraction())
-    scores = {f"contraction/{name}": float(c) for name, c in zip(domain.space.names, contraction, strict=True)}
+    """Log density of the truth where it is known, and per-parameter contraction and sd against the prior."""
+    found = domain.estimates()
+    scores = {f"contraction/{name}": float(c) for name, c in zip(domain.space.names, found.contraction, strict=True)}
+    scores |= {f"width/{name}": float(w) for name, w in zip(domain.space.names, found.width, strict=True)}
+    scores["prior_share"] = found.prior_share
     if truth is not None:
         if np.isfinite(gain := float(domain.log_gain(jnp.asarray(truth)))):  # a truth beyond the range has no density
             scores["log_p_truth"] = float(domain.log_prob(jnp.asarray(truth)))

@@ -18,7 +18,9 @@ from bayessim_mjx.loop.state import Loop, LoopState
 from bayessim_mjx.rl import Policy
 
 SETS = 64  # thetas at which sets are simulated
-MOST = 32  # trajectories in one, at most: beyond that the widening of the last is taken
+MOST = (
+    32  # trajectories in one, at most: beyond that the error that all of them share is taken to stay (`Sets.widening`)
+)
 
 
 def judge(loop: Loop, state: LoopState, policy: Policy, known: int) -> Sets | None:
@@ -31,7 +33,7 @@ def judge(loop: Loop, state: LoopState, policy: Policy, known: int) -> Sets | No
         return None
     key = branch(loop.key(int(state.round), "fit"), 4)
     found = _simulated(loop, state, policy, known, key)
-    return None if found is None else sets.judge(*found, loop.settings.components)
+    return None if found is None else replace(sets.judge(*found, loop.settings.components), known=known)
 
 
 def settled(

@@ -16,7 +16,7 @@ from bayessim_mjx.monitor.clock import Clock
 from bayessim_mjx.monitor.names import named, shorten, spoken, without_prefix
 from bayessim_mjx.monitor.output import Output
 from bayessim_mjx.monitor.tables import TIE, fit
-from bayessim_mjx.quantities import compact, duration, estimate, is_number
+from bayessim_mjx.quantities import compact, duration, estimate, is_number, spread
 
 WIDTHS = "posterior/prior sd"
 
@@ -173,18 +173,26 @@ class Console:
             done, total = self._rounds.done, self._rounds.total
             self._bars.move("round", done, "", eta, f"round {min(done + 1, total)}/{total}")
 
-    def table(self, parameters: Sequence[Mapping[str, Any]], title: str = "parameters") -> None:
-        """Closing table, best identified first, of {name, unit, low, high, mean, sd, truth or None, contraction}."""
-        ordered = sorted(parameters, key=lambda row: -float(row.get("contraction") or 0.0))
+    def table(self, parameters: Sequence[Mapping[str, Any]], title: str = "parameters", beside: str = "") -> None:
+        """Closing table, best identified first, of {name, unit, low, high, median, q16, q84, sd, width, truth or None}.
+
+        Args:
+            parameters: q16 to q84 is the 68 % interval, width the posterior's sd over the prior's.
+            title: of the table.
+            beside: what else belongs to the posterior, for the line below.
+        """
+        ordered = sorted(parameters, key=lambda row: float(row["width"]))
         known = any(is_number(row.get("truth")) for row in ordered)
         rows = []
         for row in ordered:
             unit = f" [{row['unit']}]" if row.get("unit") else ""
             cells = [f"{row['name']}{unit}", f"{compact(row['low'])} to {compact(row['high'])}"]
-            cells.append(estimate(row["mean"], row["sd"]))
+            cells.append(spread(row["median"], row["q16"], row["q84"], row["sd"]))
             cells += [compact(row["truth"]) if is_number(row.get("truth")) else "-"] if known else []
-            rows.append([*cells, f"{float(row['contraction']):.2f}" if is_number(row.get("contraction")) else "-"])
-        self.grid(["parameter", "prior range", "posterior", *(["truth"] if known else []), "contraction"], rows, title)
+            rows.append([*cells, f"{float(row['width']):.2g}"])
+        self.grid(["parameter", "prior range", "median, 68 %", *(["truth"] if known else []), WIDTHS], rows, title)
+        if beside:
+            self.say(beside)
 
     def grid(
         self,

@@ -6,12 +6,15 @@ from typing import Any
 
 import numpy as np
 
+from bayessim_mjx.distributions.estimates import PRIOR_ITSELF, Estimates, estimates
+
 
 @dataclass(frozen=True)
 class Draws:
-    """Draws from a posterior in plotting coordinates: parameters with a log-uniform prior are kept as log10."""
+    """Draws of what was inferred in plotting coordinates: parameters with a log-uniform prior are kept as log10."""
 
     values: np.ndarray  # [n, d]
+    numbers: Estimates  # what titles and tables say, in the parameters' own units
     names: tuple[str, ...]
     units: tuple[str, ...]
     low: np.ndarray  # [d]
@@ -30,20 +33,12 @@ class Draws:
         names, units = tuple(self.names[j] for j in i), tuple(self.units[j] for j in i)
         prior = None if self.prior is None else self.prior[:, i]
         means = None if self.means is None else self.means[:, i]
-        return Draws(self.values[:, i], names, units, self.low[i], self.high[i], self.log[i], prior, means)
+        numbers = self.numbers.pick(i)
+        return Draws(self.values[:, i], numbers, names, units, self.low[i], self.high[i], self.log[i], prior, means)
 
     def coordinate(self, theta: Any) -> np.ndarray | None:
         """theta [..., d] in the parameters' own units -> plotting coordinates."""
         return None if theta is None else _logged(np.asarray(theta, float), self.log)
-
-    def contraction(self) -> np.ndarray:
-        """1 - var(posterior) / var(prior) of each parameter [d]: 0 nothing learned, 1 known exactly."""
-        prior = np.linspace(self.low, self.high, 2001) if self.prior is None else self.prior
-        return 1.0 - self.natural(self.values).var(0) / self.natural(prior).var(0)
-
-    def natural(self, values: np.ndarray) -> np.ndarray:
-        """Plotting coordinates [..., d] -> the parameters' own units."""
-        return np.where(self.log, 10.0 ** np.where(self.log, values, 0.0), values)
 
 
 def draws_of(
@@ -59,6 +54,8 @@ def draws_of(
 ) -> Draws:
     """`Draws` of a Distribution (which knows its names, ranges and prior) or of an array of samples [n, d].
 
+    Of a Distribution they are those of what was inferred, without the share of the prior that is kept.
+
     Args:
         names, low, high: [d]; defaults: the distribution's own, else numbers and the range of the samples.
         prior: Distribution or samples [m, d]; None: the distribution's own, else uniform over [low, high].
@@ -67,7 +64,8 @@ def draws_of(
     Raises:
         ValueError: no finite sample, or names and ranges that do not match the samples' width.
     """
-    space = getattr(posterior, "space", None)
+    space, known = getattr(posterior, "space", None), getattr(posterior, "estimates", None)
+    posterior = getattr(posterior, "inferred", posterior)
     if space is not None:
         names, low, high = names or space.names, space.low if low is None else low, space.high if high is None else high
         units = units or space.units
@@ -89,7 +87,18 @@ def draws_of(
     back = None if prior is None else _logged(_finite(_sample(prior, count)), log)
     means = None if means is None else _logged(np.asarray(means, float).reshape(-1, d), log)
     units = tuple(units) if units else ("",) * d
-    return Draws(_logged(values, log), names, units, _logged(low, log), _logged(high, log), log, back, means)
+    low, high = _logged(low, log), _logged(high, log)
+    numbers = known() if known else estimates(values, natural(_even(low, high) if back is None else back, log).std(0))
+    return Draws(_logged(values, log), numbers, names, units, low, high, log, back, means)
+
+
+def natural(values: np.ndarray, log: np.ndarray) -> np.ndarray:
+    """Plotting coordinates [..., d] -> the parameters' own units."""
+    return np.where(log, 10.0 ** np.where(log, values, 0.0), values)
+
+
+def _even(low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    return np.linspace(low, high, 2001)
 
 
 def _sample(distribution: Any, count: int) -> np.ndarray:
@@ -114,7 +123,7 @@ def _logged(values: np.ndarray, log: np.ndarray) -> np.ndarray:
 
 def _component_means(distribution: Any) -> np.ndarray | None:
     """Means [k, d] of the components that carry weight; none for a bare prior. Means outside the box are held at it."""
-    if float(getattr(distribution, "prior_weight", 1.0)) > 0.5 or not hasattr(distribution, "means"):
+    if float(getattr(distribution, "prior_weight", 1.0)) >= PRIOR_ITSELF or not hasattr(distribution, "means"):
         return None
     logits = np.asarray(distribution.logits, float)
     weights = np.exp(logits - logits.max())
@@ -166,15 +175,6 @@ def _bandwidth(values: np.ndarray, d: int) -> float:
 def _correlation(x: np.ndarray, y: np.ndarray) -> float:
     sx, sy = x.std(), y.std()
     return float(((x - x.mean()) * (y - y.mean())).mean() / (sx * sy)) if sx > 0 and sy > 0 else 0.0
-
-
-def correlations(values: np.ndarray) -> np.ndarray:
-    """Correlation matrix [d, d] of values [n, d]; 0 where a parameter does not vary."""
-    centred = values - values.mean(0)
-    scale = np.where(values.std(0) > 0, values.std(0), np.inf)
-    matrix = centred.T @ centred / len(values) / np.outer(scale, scale)
-    np.fill_diagonal(matrix, 1.0)
-    return matrix
 
 
 # ---- names that fit

@@ -4,10 +4,10 @@ from typing import Any
 
 import numpy as np
 
-from bayessim_mjx.monitor.draws import Draws, correlations, density, density2, levels
+from bayessim_mjx.monitor.draws import Draws, density, density2, levels
 from bayessim_mjx.monitor.names import shorten
 from bayessim_mjx.monitor.style import BLUE, DASHED, GREEN, GREY, NAVY, RED, YELLOW, blues, size_of
-from bayessim_mjx.quantities import compact, estimate, fixed
+from bayessim_mjx.quantities import compact, spread
 
 Limits = tuple[float, float]
 NARROWEST = 1e-4  # of the prior range: no axis is narrower, as its ticks would have too many digits
@@ -32,7 +32,7 @@ def triangle(figure: Any, draws: Draws, true: np.ndarray | None, top: float = 0.
                 continue
             if column == row:
                 marginal(axes, draws, row, true, limits[row])
-                axes.set_title(mean_and_sd(draws, row), fontsize=size, pad=3)
+                axes.set_title(told(draws, row), fontsize=size, pad=3)
             else:
                 joint(axes, draws, (column, row), true, (*limits[column], *limits[row]))
             axes.tick_params(labelsize=size - 0.5, length=2, pad=1.5)
@@ -107,14 +107,14 @@ def joint(axes: Any, draws: Draws, ij: tuple[int, int], true: np.ndarray | None,
 
 
 def intervals(axes: Any, draws: Draws, true: np.ndarray | None, room: int = 46) -> None:
-    """50 and 95 % intervals as fractions of the prior range; the best identified on top, contraction at the right."""
-    gain, order = draws.contraction(), best_first(draws)
+    """50 and 95 % intervals as fractions of the prior range; the best identified on top, their widths at the right."""
+    width, order = draws.numbers.width, best_first(draws)
     unit = (np.percentile(draws.values, [2.5, 25, 50, 75, 97.5], axis=0) - draws.low) / (draws.high - draws.low)
     for place, k in enumerate(order):
         axes.plot(unit[[0, 4], k], [place, place], color=BLUE, lw=1.4, alpha=0.55, solid_capstyle="butt")
         axes.plot(unit[[1, 3], k], [place, place], color=BLUE, lw=5.0, solid_capstyle="butt")
         axes.plot(unit[2, k], place, "|", color="white", ms=6, mew=1.4)
-        axes.text(1.03, place, fixed(gain[k], 2), va="center", fontsize=7, color=GREY)
+        axes.text(1.03, place, f"{width[k]:.2g}", va="center", fontsize=7, color=GREY)
     if true is not None:
         at = (true - draws.low) / (draws.high - draws.low)
         axes.plot(np.clip(at[order], 0, 1), np.arange(draws.d), "d", color=RED, ms=4.5, clip_on=False, zorder=5)
@@ -123,7 +123,7 @@ def intervals(axes: Any, draws: Draws, true: np.ndarray | None, room: int = 46) 
     axes.set_xlim(0, 1)
     axes.set_xticks([0, 0.25, 0.5, 0.75, 1], ["low", "25 %", "50 %", "75 %", "high"], fontsize=7.5)
     axes.set_xlabel("place in the prior range", fontsize=8)
-    axes.text(1.03, -0.75, "contraction", fontsize=7, color=GREY, va="bottom", ha="left")
+    axes.text(1.03, -0.75, "posterior /\nprior sd", fontsize=7, color=GREY, va="bottom", ha="left")
     axes.set_title("50 % and 95 % intervals, best identified first", fontsize=9, loc="left")
     axes.grid(axis="x", color="#E5E5E5", lw=0.7)
     axes.set_axisbelow(True)
@@ -137,7 +137,7 @@ def correlation(figure: Any, draws: Draws) -> None:
     width, height = size_of(figure)
     side = min(height - 1.05, width - 3.5)
     axes = figure.add_axes((2.3 / width, 0.7 / height, side / width, side / height))
-    picture = axes.imshow(correlations(ranked.values), vmin=-1, vmax=1, cmap="RdBu_r", interpolation="nearest")
+    picture = axes.imshow(ranked.numbers.correlation, vmin=-1, vmax=1, cmap="RdBu_r", interpolation="nearest")
     step = max(1, int(np.ceil(ranked.d * 6.5 / (side * 72))))
     ticks, short = range(0, ranked.d, step), shorten(ranked.names, 30)
     size = float(np.clip(side * 72 / ranked.d * 0.85 * step, 4.5, 7))
@@ -150,8 +150,8 @@ def correlation(figure: Any, draws: Draws) -> None:
 
 
 def best_first(draws: Draws) -> np.ndarray:
-    """Parameters [d] by contraction, best identified first."""
-    return np.argsort(-draws.contraction(), kind="stable")
+    """Parameters [d] by sd over that of the prior, best identified first."""
+    return np.argsort(draws.numbers.width, kind="stable")
 
 
 def limits_of(draws: Draws, k: int, true: np.ndarray | None) -> Limits:
@@ -194,10 +194,10 @@ def prior_range(draws: Draws, k: int) -> str:
     return " to ".join(compact(natural(draws, k, end[k]), 3) for end in (draws.low, draws.high))
 
 
-def mean_and_sd(draws: Draws, k: int) -> str:
-    """`1.04 ± 0.06`, in the parameter's own unit."""
-    values = natural(draws, k, draws.values[:, k])
-    return estimate(values.mean(), values.std())
+def told(draws: Draws, k: int) -> str:
+    """`1.04 ± 0.06`, or median and 68 % interval, in the parameter's own unit."""
+    n = draws.numbers
+    return spread(n.median[k], n.low[k], n.high[k], n.sd[k])
 
 
 def natural(draws: Draws, k: int, value: Any) -> Any:

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from bayessim_mjx.monitor.draws import Draws, correlations, draws_of
+from bayessim_mjx.monitor.draws import Draws, draws_of
 from bayessim_mjx.monitor.names import shorten
 from bayessim_mjx.monitor.panels import (
     best_first,
@@ -16,9 +16,9 @@ from bayessim_mjx.monitor.panels import (
     label,
     limits_of,
     marginal,
-    mean_and_sd,
     natural,
     prior_range,
+    told,
     triangle,
     zoomed,
 )
@@ -158,12 +158,12 @@ def pair(
 
 def _facts(draws: Draws, true: np.ndarray | None, log_gain: float | None) -> str:
     lines = []
-    for k, gain in enumerate(draws.contraction()):
+    for k, width in enumerate(draws.numbers.width):
         unit = f" {draws.units[k]}" if draws.units[k] else ""
-        lines += [shorten(draws.names, 44)[k], f"    mean ± sd   {mean_and_sd(draws, k)}{unit}"]
+        lines += [shorten(draws.names, 44)[k], f"    median, 68 %   {told(draws, k)}{unit}"]
         lines += [f"    truth   {compact(natural(draws, k, true[k]))}{unit}"] if true is not None else []
-        lines += [f"    contraction   {fixed(gain, 2)}", ""]
-    lines += [f"correlation   {fixed(correlations(draws.values)[0, 1], 2)}"]
+        lines += [f"    posterior/prior sd   {width:.2g}", ""]
+    lines += [f"correlation   {fixed(draws.numbers.correlation[0, 1], 2)}"]
     lines += [f"log gain at the truth   {log_gain:+.2f} nats"] if log_gain is not None else []
     return "\n".join(lines)
 

@@ -203,6 +203,7 @@ class Session:
         }
         if info.posterior is not None:
             row["posterior"] = info.posterior.describe()
+            row["prior_share"] = float(info.posterior.prior_weight)  # kept beside what `posterior` describes
         if info.checks is not None:
             row["checks"] = info.checks.to_dict()
         if info.refinement is not None:
@@ -280,7 +281,7 @@ def round_line(info: RoundInfo) -> dict[str, Any]:
     """The numbers of the console's line for a round; a width is posterior sd / prior sd, narrowest first."""
     widths = {}
     if info.posterior is not None:
-        relative = np.sqrt(np.maximum(0.0, 1.0 - np.asarray(info.posterior.contraction())))
+        relative = info.posterior.estimates().width
         widths = dict(sorted(zip(info.posterior.space.names, relative.tolist(), strict=True), key=lambda item: item[1]))
     return {
         "round": info.round,

@@ -62,6 +62,13 @@ def integrate(model: mujoco.MjModel, qpos: jax.Array, step: jax.Array) -> jax.Ar
     return out
 
 
+def noisy(model: mujoco.MjModel, key: jax.Array, qpos: jax.Array, sd: jax.Array | np.ndarray | float) -> jax.Array:
+    """qpos [..., nq] with Gaussian noise of standard deviations sd ([nv], or one) in the tangent: unit quaternions."""
+    steps = sd * jax.random.normal(key, (*qpos.shape[:-1], model.nv))
+    rows = jax.vmap(lambda q, by: integrate(model, q, by))(qpos.reshape(-1, model.nq), steps.reshape(-1, model.nv))
+    return rows.reshape(qpos.shape)
+
+
 def _turned(quat: jax.Array, by: jax.Array) -> jax.Array:
     square = jnp.dot(by, by) / 4
     small = square < SMALL

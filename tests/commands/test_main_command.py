@@ -56,7 +56,7 @@ def test_main_killed_and_resumed_equals_unkilled(toy: None, monkeypatch: Any, ca
     capsys.readouterr()
     assert main.main(["--resume", str(whole.path), "--headless"]) == 0
     out = capsys.readouterr().out
-    assert "this run had finished" in out and "contraction" in out  # and the table of parameters
+    assert "this run had finished" in out and "posterior/prior sd" in out  # and the table of parameters
     assert play.main(["--checkpoint", str(whole.path), "--episodes", "3"]) == 0
     assert "posterior" in capsys.readouterr().out
 

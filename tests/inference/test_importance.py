@@ -1,13 +1,18 @@
 """Refinement by importance sampling and moves against posteriors that are known, from proposals that are wrong."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.stats import genpareto, norm
 
 from bayessim_mjx.distributions import Distribution
-from bayessim_mjx.inference.importance import refine, sharpened
-from bayessim_mjx.inference.pareto import effective, generalised_pareto, smoothed
+from bayessim_mjx.inference.importance import Refined, refine, sharpened
+from bayessim_mjx.inference.independent import independent
+from bayessim_mjx.inference.pareto import UNRELIABLE, effective, generalised_pareto, smoothed
+from bayessim_mjx.inference.weighted import Mixture
+from bayessim_mjx.loop.refinement import Refinement
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 
 SPACE = ParameterSpace([Parameter(name, 0.0, -1.0, 1.0) for name in "abc"])
@@ -181,3 +186,16 @@ def test_independent_draws_bring_the_regions_nearer_to_what_they_say():
         held.append([float(np.mean(better.posterior.credible_level(draws) < p)) for p in (0.5, 0.8, 0.95)])
     assert np.mean(gained) > 0.01
     np.testing.assert_allclose(np.mean(held, axis=0), [0.5, 0.8, 0.95], atol=0.03)
+
+
+@pytest.mark.parametrize(("wide", "fits"), [(1.0, True), (6.0, False)])
+def test_the_tail_of_the_weights_is_kept_and_warned_of(wide, fits):
+    """Draws from Gaussians as wide as the posterior, and a sixth of it: then few draws have all the weight."""
+    own = Mixture(np.ones(1), np.full((1, 2), 0.5), (0.02 * np.eye(2))[None] ** 2)
+    found = independent(np.random.default_rng(0), own, lambda u: -0.5 * (((u - 0.5) / (0.02 * wide)) ** 2).sum(1), 256)
+    assert (found.shape < UNRELIABLE) is fits
+    refined = Refined(None, None, None, found.worth, 4096, np.zeros(2), None, found.shape)
+    refinement = Refinement(refined, None, 1.0)
+    assert (refinement.warning() is None) is fits and refinement.to_dict()["pareto_k"] == found.shape
+    assert fits or f"k = {found.shape:.2g}" in refinement.warning()
+    assert Refinement(dataclasses.replace(refined, shape=None), None, 1.0).warning() is None

@@ -1,5 +1,7 @@
 """Products of several factors where they lie: what all lean by is found and taken back, what is exact stays."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -78,3 +80,35 @@ def test_parameters_that_are_not_identified_keep_no_other_from_being_moved():
     q = Distribution.from_unit(space, np.zeros(1), np.full((1, 13), 0.5), scale)
     assert float(q.log_inside) < 1.3 * sets.BEYOND
     np.testing.assert_allclose(sets.moved(q, np.array([0.2] + [0.0] * 12)).means[0, :2], [0.7, 0.5], rtol=1e-6)
+
+
+def test_sets_are_judged_by_moves_that_they_had_no_part_in():
+    """24 sets in 8 dimensions, exact but for a common shift of 5 SD. Moved back by the mean of 24 errors their squares
+    are 1 - 1/24 where they chose it, and 1 + 1/21 where 21 others did: 8/2 times the difference is .36 nats.
+    """
+    space = ParameterSpace([Parameter(f"p{k}", 0.0, -1.0, 1.0) for k in range(8)])
+    rng, sd, plain = np.random.default_rng(0), 0.02, []
+    for _ in range(30):
+        thetas = rng.uniform(-0.3, 0.3, (24, 8))
+        means = 0.5 * (thetas + 1) + 5 * sd + sd * rng.normal(size=thetas.shape)
+        rows = [[Distribution.from_unit(space, np.zeros(1), m[None], sd * np.eye(8)[None])] for m in means]
+        count, move, _ = near.judged(rows, thetas, 1, None)
+        np.testing.assert_allclose(move, -5 * sd, atol=4 * sd / 24**0.5)
+        plain.append(count.plain)
+    at_the_truth = -8 * np.log(np.sqrt(2 * np.pi) * sd)
+    held_out = at_the_truth - 4 * (1 + 1 / 21)
+    assert np.mean(plain) == pytest.approx(held_out, abs=0.25)  # standard error .08
+    assert np.mean(plain) < at_the_truth - 4 * (1 - 1 / 24) - 0.15
+
+
+def test_turns_that_end_without_an_answer_say_so(monkeypatch):
+    found = sets.Sets((sets.Count(2, 1.0, 1.0, 0.1, 1.0, np.linspace(0, 1, 8)),))
+    product = Distribution.from_unit(SPACE, np.zeros(1), np.full((1, 2), 0.5), 0.05 * np.eye(2)[None])
+    never = [replace(found.counts[0], widening=2.0 + k) for k in range(near.TURNS)]
+    turns = iter(never)
+    monkeypatch.setattr(near, "judged", lambda *a: (next(turns), None, 0.0))
+    here = near.settled(found, product, lambda posterior, turn: ([], np.zeros((0, 2))), components=1)
+    assert not here.settled and "still asked for more" in here.sentence() and here.to_dict()["settled"] is False
+    assert here.widening(2) == near.TURNS + 1
+    monkeypatch.setattr(near, "judged", lambda *a: (found.counts[0], None, 0.0))
+    assert near.settled(found, product, lambda posterior, turn: ([], np.zeros((0, 2))), components=1).settled

@@ -1,5 +1,7 @@
 """Products of several factors, judged on sets: what is exact stays as it is, what shares an error is widened."""
 
+from dataclasses import replace
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -75,3 +77,30 @@ def test_a_truth_outside_of_a_product_does_not_spoil_the_mean():
     rows, thetas = made(0.0)
     found = sets.judge(rows, np.asarray(thetas) * 0 + 0.99, components=1)
     assert np.isfinite([c.gain for c in found.counts]).all() and jnp.isfinite(found.at(1).widening)
+
+
+@pytest.mark.parametrize("bias", [0.2, 0.5])
+def test_beyond_the_sets_that_were_judged_the_shared_error_stays(bias):
+    """b^2 of what all trajectories share and s^2 / n of what they do not: the claim s / sqrt(n) is w^2 = 1 + n b^2 off.
+
+    Judged on sets of 8, used for 100 trajectories. The widening of 8 would claim 3.5 times too little at b = .5.
+    """
+    found = sets.judge(*made(bias, 2), components=1)
+    right = np.sqrt(1 + 100 * bias**2)
+    assert 0.8 * right < found.widening(100) < 1.35 * right
+    at = replace(found, known=100)
+    assert f"widened {at.widening(100):.2f} times" in at.sentence() and "sets of 8 were simulated" in at.sentence()
+    assert at.to_dict()["widening"] == at.widening(100) and at.to_dict()["known"] == 100
+
+
+def test_what_sets_cannot_tell_from_no_error_is_reckoned_with_beyond_them():
+    """A widening of 1 may hide one below the next factor that is tried, and that grows with the trajectories."""
+    one = sets.Count(32, 1.0, 5.0, 0.1, 5.0, np.linspace(0, 1, 64))
+    found = sets.Sets((one,))
+    step = sets.FACTORS[1]
+    assert found.widening(32) == 1.0
+    assert found.widening(3200) == pytest.approx(np.sqrt(1 + (step**2 - 1) * 100))
+    widths = [found.widening(n) / np.sqrt(n) for n in (40, 100, 400, 10_000)]
+    assert widths == sorted(widths, reverse=True) and widths[-1] > 0.9 * np.sqrt(
+        (step**2 - 1) / 32
+    )  # it stops narrowing

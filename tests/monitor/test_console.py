@@ -33,8 +33,10 @@ def tell(file, **options):
         console.round_line(round=1, reward=-400.0, gain=None)
         console.warning("no video [egl]")
         rows = [
-            dict(name="length", low=0.01, high=2, mean=0.5, sd=0.25, truth=None, contraction=0.1),
-            dict(name="mass", unit="kg", low=0.01, high=2, mean=1.02, sd=0.1, truth=1.0, contraction=0.9),
+            dict(name="length", low=0.01, high=2, median=0.5, q16=0.25, q84=0.75, sd=0.25, truth=None, width=0.95),
+            dict(
+                name="mass", unit="kg", low=0.01, high=2, median=1.02, q16=0.92, q84=1.12, sd=0.1, truth=1.0, width=0.17
+            ),
         ]
         console.table(rows)
     return file.getvalue()
@@ -55,7 +57,7 @@ def test_plain_output_has_the_numbers_and_no_control_characters():
     assert next(line for line in lines if line.startswith("round 2/3 ")).startswith("round 2/3   real return -400")
     assert "warning: no video [egl]" in lines
     mass, length = (next(i for i, x in enumerate(lines) if n in x and " to " in x) for n in ("mass [kg]", "length"))
-    assert mass < length and "1.02 ± 0.10" in lines[mass] and "0.90" in lines[mass]
+    assert mass < length and "1.02 ± 0.10" in lines[mass] and "0.17" in lines[mass]
 
 
 def test_headless_is_plain_on_a_terminal_too():
@@ -98,7 +100,8 @@ def test_no_word_is_broken_at_the_terminals_width(monkeypatch, width):
         console.start({"parameters": [f"{name} 0.5 to 1.5" for name in names * 9], "note": WORDS})
         console.say(WORDS)
         console.round_line(round=3, rounds=10, reward=(-1.0, 2.0), gain=1.0, widths=dict.fromkeys(names, 0.5))
-        rows = [dict(name=n, unit="N m", low=0, high=2, mean=1.04, sd=0.064, truth=1.0, contraction=0.9) for n in names]
+        numbers = dict(median=1.04, q16=0.976, q84=1.104, sd=0.064, truth=1.0, width=0.3)
+        rows = [dict(name=n, unit="N m", low=0, high=2, **numbers) for n in names]
         console.table(rows)
         console.grid(["effect", "where", "gap closed"], [[WORDS, "left hind knee", "12.3 ± 1.2"]], left=(0, 1))
         console.panel("Unexplained", [(WORDS, "bold")], "red")

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from bayessim_mjx.monitor.draws import correlations, density, density2, levels
+from bayessim_mjx.distributions.estimates import estimates
+from bayessim_mjx.monitor.draws import density, density2, levels
 from bayessim_mjx.monitor.names import shorten
 
 LONG = ["hand_robot0_forearm_joint_stiffness_mult", "index_finger_proximal_damping", "slider_mass_mult"]
@@ -29,7 +30,7 @@ def test_levels_hold_the_mass_they_say():
 
 def test_correlations_of_known_vectors():
     x = np.random.default_rng(0).normal(size=1000)
-    matrix = correlations(np.stack([x, -2 * x, np.ones(1000)], 1))
+    matrix = estimates(np.stack([x, -2 * x, np.ones(1000)], 1), np.ones(3)).correlation
     np.testing.assert_allclose(matrix, [[1, -1, 0], [-1, 1, 0], [0, 0, 1]], atol=1e-9)
 
 

@@ -12,8 +12,8 @@ from bayessim_mjx.diagnosis.logcheck.drives import dof_of
 from bayessim_mjx.diagnosis.logcheck.effort import efforts
 from bayessim_mjx.diagnosis.logcheck.filtered_motion import Mask, filtered, motion
 from bayessim_mjx.diagnosis.logcheck.inverse_dynamics import Dynamics
-from bayessim_mjx.diagnosis.logcheck.single_log import velocities
 from bayessim_mjx.logs.log import Array, Log
+from bayessim_mjx.logs.velocities import velocities
 from bayessim_mjx.physics import controllers
 from bayessim_mjx.quantities import percent
 

@@ -8,9 +8,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
-from scipy.signal import butter, filtfilt, welch
 
 from bayessim_mjx.logs.log import Array, Log
+from bayessim_mjx.logs.velocities import bandwidth, lowpass
 
 Mask = NDArray[np.bool_]
 
@@ -41,28 +41,6 @@ class Motion:
         """[T]: free, and faster than a twentieth of the top speed of this degree of freedom."""
         speed = np.abs(self.qvel[:, dof])
         return self.free & (speed > 0.05 * np.percentile(speed, 99))
-
-
-def lowpass(x: Array, step: float, cutoff: float) -> Array:
-    """Zero-phase Butterworth filter of x [T, ...] sampled every `step` s; x itself where the rate is too low for it."""
-    if 2.0 * cutoff * step > 0.9:
-        return x
-    b, a = butter(2, 2.0 * cutoff * step)
-    return np.asarray(filtfilt(b, a, x, axis=0, padlen=min(len(x) - 1, int(1.0 / (cutoff * step)))))
-
-
-def bandwidth(log: Log) -> float:
-    """Cutoff [Hz]: twice the frequency below which 95 % of the velocities' power lies; 3 to 12 Hz, a fifth of the rate.
-
-    Only where the positions' spectrum stands ten times above its own floor: differentiated noise is no motion.
-    """
-    top = min(12.0, 0.2 / log.period)
-    frequency, power = welch(log.qpos, 1.0 / log.period, nperseg=min(len(log), 1024), axis=0)
-    floor = np.median(power[len(power) // 2 :], axis=0)
-    speed = np.where(power > 10.0 * floor, power, 0.0) * frequency[:, None] ** 2
-    share = np.cumsum(speed, axis=0) / np.maximum(np.sum(speed, axis=0), 1e-300)
-    reached = [float(frequency[np.searchsorted(s, 0.95)]) for s in share.T if s[-1] > 0.5]
-    return float(min(max(3.0, 2.0 * max(reached, default=0.0)), top))
 
 
 def motion(log: Log, mj_model: mujoco.MjModel, cutoff: float | None = None) -> Motion:

@@ -12,9 +12,10 @@ from bayessim_mjx.diagnosis.logcheck import single_log
 from bayessim_mjx.diagnosis.logcheck.drives import dof_of, is_effort
 from bayessim_mjx.diagnosis.logcheck.effort import LIMITS as OF_EFFORT
 from bayessim_mjx.diagnosis.logcheck.effort import Relation, closed, relations
-from bayessim_mjx.diagnosis.logcheck.single_log import Finding, Velocity, refuse, warn
+from bayessim_mjx.diagnosis.logcheck.single_log import Finding, refuse, warn
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Array, Log
+from bayessim_mjx.logs.velocities import Velocity, agreeing, velocities
 from bayessim_mjx.quantities import percent
 
 
@@ -149,10 +150,7 @@ def check(logs: Sequence[Log], mj_model: mujoco.MjModel, dt: float) -> Gate:
     reports = tuple(_report(log, mj_model, dt) for log in logs)
     seen = [v for r in reports if r.usable for v in r.velocities]
     step = max([dt, *(r.log.period for r in reports if r.usable)])
-    channels = dict.fromkeys(v.channel for v in seen)
-    # most logs have to agree: a joint that hardly moves in one of them proves nothing
-    qvel = {c: bool(np.median([v.usable(step) for v in seen if v.channel == c]) > 0.5) for c in channels}
-    return Gate(reports, qvel)
+    return Gate(reports, agreeing(seen, step))
 
 
 def unusable(log: Log, dt: float) -> bool:
@@ -169,7 +167,7 @@ def _report(log: Log, mj_model: mujoco.MjModel, dt: float) -> Report:
     if any(f.kind == "refused" for f in own):
         return Report(log, own)  # nothing further can be computed from it
     related = () if log.lost else tuple(relations(log, mj_model))  # forces on a joint need the motion of all
-    seen = tuple(single_log.velocities(log))
+    seen = tuple(velocities(log))
     step = max(dt, log.period)
     targets = _targets(log, mj_model)
     own += (*single_log.clipped(log, targets), *single_log.units(log, _vouched(log, mj_model, related, targets)))
@@ -202,14 +200,7 @@ def _vouched(log: Log, mj_model: mujoco.MjModel, related: Sequence[Relation], ta
 
 
 def _of_velocity(seen: Sequence[Velocity], step: float) -> list[Finding]:
-    return [
-        warn(
-            f"qvel:{v.channel} is {v.slope:.3g} times the derivative of its position, {v.lag * 1e3:+.0f} ms late "
-            f"(correlation {v.correlation:.3f}): positions are used instead"
-        )
-        for v in seen
-        if not v.usable(step)
-    ]
+    return [warn(v.sentence()) for v in seen if not v.usable(step)]
 
 
 def _of_effort(related: Sequence[Relation]) -> list[Finding]:

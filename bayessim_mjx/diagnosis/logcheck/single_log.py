@@ -9,9 +9,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from bayessim_mjx.diagnosis.logcheck.filtered_motion import bandwidth, lowpass
 from bayessim_mjx.logs.log import Array, Log
-from bayessim_mjx.logs.signals import estimate_velocity, quantum
+from bayessim_mjx.logs.signals import quantum
 from bayessim_mjx.quantities import percent
 
 
@@ -184,59 +183,6 @@ def _speed(log: Log, column: int) -> Array:
     return np.asarray(
         np.abs((log.qpos[each:, column] - log.qpos[:-each, column]) / (log.time[each:] - log.time[:-each]))
     )
-
-
-@dataclass(frozen=True)
-class Velocity:
-    """A measured velocity against the derivative of its position: v(t) ~ slope dq/dt(t - lag)."""
-
-    channel: str
-    slope: float
-    lag: float  # s by which the measured velocity is late
-    correlation: float
-
-    def usable(self, step: float) -> bool:
-        """Within 10 % and late by no more than half a step [s]."""
-        return abs(self.slope - 1.0) < 0.1 and abs(self.lag) <= 0.6 * step and self.correlation > 0.95
-
-
-def velocities(log: Log) -> list[Velocity]:
-    """One comparison per measured velocity whose joint moves well above the noise, in logs long enough."""
-    if not log.has_qvel:
-        return []
-    cutoff = bandwidth(log)
-    rows = slice(None, None, max(1, int(1.0 / (20.0 * cutoff * log.period))))
-    time = log.time[rows]
-    rates, spread = estimate_velocity(time, log.qpos[rows], log.channels, log.sigma_qpos)
-    grid = np.linspace(time[0], time[-1], len(time))
-    step = float(grid[1] - grid[0])
-    if grid[-1] - grid[0] < 2.0 / cutoff:
-        return []  # all of it is edge
-    out = []
-    both = log.seen_dofs & log.seen_speeds
-    for i in np.flatnonzero(both):
-        name, v, w, noise = log.channels.qvel[i], log.qvel[rows, i], rates[:, i], spread[i]
-        even = [lowpass(np.interp(grid, time, x), step, cutoff) for x in (v, w)]
-        if float(np.std(even[1])) > 2.0 * float(noise) and np.ptp(v) > 0:
-            out.append(_compare(name, grid, even[0], even[1], 0.5 / cutoff))
-    return out
-
-
-def _compare(name: str, grid: Array, v: Array, w: Array, edge: float) -> Velocity:
-    jerk = np.abs(np.gradient(w))
-    # samples on either side of an impact say nothing about the velocity between them
-    rows = (grid > grid[0] + edge) & (grid < grid[-1] - edge) & (jerk <= np.percentile(jerk, 90))
-    # odd count: a lag of exactly 0 is among them
-    lags = np.linspace(-0.1, 0.1, 201) if grid[-1] - grid[0] > 1.0 else np.zeros(1)
-    late = [np.interp(grid - lag, grid, w)[rows] for lag in lags]
-    v = v[rows]
-    errors = [float(np.sum((v - (v @ x) / (x @ x) * x) ** 2)) for x in late]
-    best, now = int(np.argmin(errors)), len(lags) // 2
-    if errors[best] > 0.5 * errors[now] or best in (0, len(lags) - 1):
-        best = now  # a lag has to explain something
-    x = late[best]
-    correlation = float(v @ x) / float(np.linalg.norm(v) * np.linalg.norm(x))
-    return Velocity(name, float(v @ x) / float(x @ x), float(lags[best]), correlation)
 
 
 CHECKS = (size, jitter, constant, wrapped)
