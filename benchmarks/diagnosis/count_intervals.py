@@ -39,8 +39,9 @@ from pathlib import Path
 from typing import Any
 
 RESULT, PLAN = "result.json", "plan.json"
-# CPU seconds of a single on the author's machine, for the order alone; a double takes about twice as long
-SECONDS = {"pendulum": 60, "cartpole": 120, "two_link": 150, "leg": 400, "arm_servo": 500, "arm_torque": 450}
+# CPU seconds of one single with an empty compilation cache (machine C; the servo arm's was not ended), for the order
+# alone; a double is taken to last twice as long
+SECONDS = {"pendulum": 67, "cartpole": 109, "two_link": 141, "leg": 187, "arm_servo": 450, "arm_torque": 282}
 THREADS = {name: "1" for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")}
 ALONE = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
 
