@@ -133,6 +133,17 @@ class _Fold:
         return values + p, offsets + starts.step(self.fit.A, p)
 
 
+def noise_floor(fitter: Fitter, fit: Fit) -> Array:
+    """`[W]`, mean square of white noise alone after start states were fitted to it: tr (I - P)^2 / n, P their hat matrix.
+
+    Start states take a share of the noise with them, 2 of 25 numbers of a joint whose position is measured in 25 rows.
+    """
+    _, starts = fit.quadratic(fitter.spread)
+    hat = starts.M @ (starts.B.mT @ starts.B)
+    n = starts.B.shape[1]
+    return np.asarray(1.0 - (2 * np.trace(hat, axis1=1, axis2=2) - np.sum(hat * hat.mT, axis=(1, 2))) / n)
+
+
 def nominal(fitter: Fitter, fit: Fit) -> Prediction:
     """The simulator as delivered, starts estimated."""
     theta = fitter.vector(fit.coordinates, np.array([c.neutral for c in fit.coordinates]))
@@ -179,10 +190,11 @@ def stages(costs: dict[str, Array], group: NDArray[np.int64]) -> dict[str, Any]:
 
 @dataclass(frozen=True, eq=False)
 class Closed:
-    """Share of the squared gap above the noise that goes from one simulator to a better one: (E0 - E1) / (E0 - 1).
+    """Share of the squared gap above the noise that goes from one simulator to a better one: (E0 - E1) / (E0 - N).
 
     Attributes:
         before, after: `[W]` mean squares of windows in units of the noise; group: `[W]`, their conditions.
+        floor: `[W]`, what noise alone leaves (`noise_floor`); None: 1.
         own, every: `[W]`, what one of several effects closes of what all do, where the share is of that one alone. Then
             what undercuts the noise is nobody's, so that parts add up to the whole.
     """
@@ -190,12 +202,14 @@ class Closed:
     before: Array
     after: Array
     group: NDArray[np.int64]
+    floor: Array | None = None
     own: Array | None = None
     every: Array | None = None
 
     def _sums(self, rows: Array) -> tuple[Array, Array, Array]:
         """Sums of what there was, what is left and of the noise, over windows with weights `[..., W]`."""
-        before, after, noise = rows @ self.before, rows @ self.after, rows.sum(-1)
+        before, after = rows @ self.before, rows @ self.after
+        noise = rows.sum(-1) if self.floor is None else rows @ self.floor
         if self.own is None or self.every is None:
             return before, after, noise
         own, every = (rows @ (x * np.ones_like(self.before)) for x in (self.own, self.every))

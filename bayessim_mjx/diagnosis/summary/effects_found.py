@@ -81,7 +81,8 @@ def _closed(found: Findings) -> heldout.Closed:
         if chosen != answer and selection.searched is not None:
             own, rows = cut.group == condition, selection.searched.rows
             after[own] = before[own] * rows[chosen].cost[own] / rows[frozenset()].cost[own]
-    return heldout.Closed(before, after, cut.condition)
+    floor = heldout.noise_floor(found.setup.fitter, found.model.fit)
+    return heldout.Closed(before, after, cut.condition, floor)
 
 
 def nested(found: Findings) -> bool:

@@ -158,13 +158,13 @@ def test_parts_of_what_is_closed_add_up_and_stay_below_one():
     whole = heldout.Closed(before, after, group)
     assert whole.value == pytest.approx((before - after).sum() / (before - 1).sum())
     own = np.stack([0.7 * (before - after), 0.3 * (before - after)])
-    parts = [heldout.Closed(before, after, group, o, own.sum(0)) for o in own]
+    parts = [heldout.Closed(before, after, group, own=o, every=own.sum(0)) for o in own]
     assert [p.value for p in parts] == pytest.approx([0.7 * whole.value, 0.3 * whole.value])
     for part in (whole, *parts):
         low, high = part.interval()
         assert low < part.value < high <= 1.0
     lucky = np.full_like(before, 0.9)  # below the noise: all is closed, and no more
-    assert sum(heldout.Closed(before, lucky, group, o, own.sum(0)).value for o in own) == pytest.approx(1.0)
+    assert sum(heldout.Closed(before, lucky, group, own=o, every=own.sum(0)).value for o in own) == pytest.approx(1.0)
     at_noise = heldout.Closed(before, np.full_like(before, 0.9), group)
     assert at_noise.value == 1.0 and at_noise.interval()[1] == 1.0
 
@@ -176,7 +176,7 @@ def test_no_interval_of_a_share_has_zero_width(left, gap):
     rng, group = np.random.default_rng(0), np.repeat(np.arange(6), 5)
     before, after = (size * (1 + 1e-3 * rng.normal(size=30)) for size in (gap, left))
     part = 0.7 + 1e-3 * rng.normal(size=30)
-    every = [heldout.Closed(before, after, group), heldout.Closed(before, after, group, part, np.ones(30))]
+    every = [heldout.Closed(before, after, group), heldout.Closed(before, after, group, own=part, every=np.ones(30))]
     for closed in every:
         low, high = closed.interval()
         assert low < high <= 1.0 and low <= closed.value <= high
@@ -203,3 +203,18 @@ def test_weights_among_rivals_are_one_together_and_equal_where_the_rivals_are():
     better = np.where(group < 2, 0.5, 2.0)
     split = uncertainty.win_share([model(better), model(1 / better)], group, 1.0, rng)
     assert split.sum() == pytest.approx(1.0) and 0.2 < split[0] < 0.8
+
+
+@pytest.mark.parametrize("spread", [0.1, 30.0])
+def test_the_noise_floor_is_what_noise_leaves_after_start_states_were_fitted_to_it(spread):
+    """By simulation: white noise on 12 numbers of a window, and a start state of two numbers."""
+    rng = np.random.default_rng(1)
+    B = np.repeat(rng.normal(size=(1, 12, 2)), 4000, 0)
+    r = rng.normal(size=(4000, 12))
+    fitter = SimpleNamespace(spread=np.full(2, spread))
+    fit = Fit((), np.zeros(0), np.zeros((4000, 2)), r, np.zeros((4000, 12, 0)), B, np.ones(4000), 0.0)
+    _, starts = fit.quadratic(fitter.spread)
+    left = r - np.einsum("wns,ws->wn", B, starts.step(fit.A, np.zeros(0)))
+    floor = heldout.noise_floor(fitter, fit)
+    assert floor == pytest.approx(np.mean(left**2), abs=0.02)
+    assert floor[0] == pytest.approx(10 / 12, abs=1e-3) if spread > 1 else floor[0] > 0.87
