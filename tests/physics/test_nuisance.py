@@ -143,6 +143,7 @@ def test_observations_are_the_truth_with_white_and_lasting_noise_from_the_reset_
 
 
 @pytest.mark.slow
+@pytest.mark.ci
 def test_actions_get_noise_that_is_not_in_the_recorded_command() -> None:
     """u from the motion: w' = w + dt (3 / (2 l) (gx cos q - gz sin q) + 3 u / (m l^2)); u = 2 (.2 + noise)."""
     trajectory, start = run()
@@ -238,6 +239,7 @@ def test_updates_carry_the_clock_on(wrapped: bool) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.ci
 @pytest.mark.parametrize(("frequency", "draws"), [(1, [0, 4, 8, 12, 16, 20]), (8, [0, 8, 16]), (9, [0, 12])])
 def test_new_parameters_come_at_the_first_reset_after_so_many_steps(frequency: int, draws: list[int]) -> None:
     """Episodes of 4 steps; parameters, gravity and lasting noise change together, at these steps only."""
