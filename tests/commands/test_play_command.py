@@ -138,6 +138,7 @@ def test_policies_of_a_run_see_theta_in_the_runs_units(monkeypatch: pytest.Monke
 
 
 @pytest.mark.slow
+@pytest.mark.ci
 def test_a_teacher_that_sees_theta_is_imitated_by_a_student_that_does_not(toy: None, capsys: Any) -> None:
     argv = ["--task", "Pendulum", "--randomize", *SMALL]
     assert train.main([*argv, "ppo.policy_theta=True", "--logdir", "teachers"]) == 0

@@ -9,9 +9,7 @@ import numpy as np
 import pytest
 
 from bayessim_mjx import config, loop, memory, registry, rl
-from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.loop import outer_loop
 from bayessim_mjx.rollout import replay
 
 TINY = [
@@ -209,17 +207,6 @@ def test_a_new_policy_each_round_where_asked_for(env):
     fresh = loop.make(settings("bayessim.ftuneRL=False", "bayessim.modelClass=None"), env)  # no inference
     state, _ = loop.run(fresh, loop.init(fresh))
     assert int(state.train.iteration) == 3  # the last round's own iterations
-
-
-def test_schedules_of_randomisation_go_on_from_round_to_round():
-    """Their clock is the control steps that each world has trained for: 3 iterations of 4 steps in a round."""
-    mass = "task.randomization_params.actor_params.pendulum.rigid_body_properties.mass"
-    ramped = settings(f"{mass}.schedule=linear", f"{mass}.schedule_steps=100", "ppo.num_steps=4")
-    parts = loop.make(ramped, registry.make("Pendulum", config=ramped))
-    first, later = (outer_loop._new_policy(parts, i, Distribution.prior(parts.env.space)) for i in (0, 2))
-    kept = rl.ppo.in_worlds_of(first, later)  # the policy of before, in new worlds
-    for state, steps in ((first, 0), (later, 24), (kept, 24)):
-        assert np.array_equal(state.env_states.info["nuisance"].course.clock, np.full(8, steps))
 
 
 @pytest.mark.slow

@@ -89,22 +89,6 @@ def test_distributions_have_the_moments_that_their_numbers_say() -> None:
             assert y.min() >= 2.0 and y.max() <= 2.0 + 2 + 3  # white in [-1, 2], lasting in [1, 3]
 
 
-def test_lasting_noise_of_a_world_is_drawn_apart_for_observations_actions_and_gravity() -> None:
-    """Of one kind and size each, they are uncorrelated: 2000 worlds tell 0.1."""
-    alike = noise([0.0, 0.0], [0.0, 1.0])
-    found = nuisance.read(
-        {"observations": alike, "actions": alike, "sim_params": {"gravity": noise([0.0, 1.0])}}, ParameterSpace()
-    )
-    assert found is not None
-
-    def one(key: jax.Array) -> jax.Array:
-        drawn = found.seen(found.begin(key, None, 3), 3)
-        return jnp.stack([drawn.observation, drawn.action, found.gravity_of(drawn, jnp.zeros(3))])
-
-    drawn = np.asarray(jax.vmap(one)(jax.random.split(jax.random.PRNGKey(0), WORLDS))).reshape(WORLDS, 9)
-    np.testing.assert_allclose(np.corrcoef(drawn.T), np.eye(9), atol=0.1)
-
-
 @functools.cache
 def noisy() -> Any:
     return pendulum(
@@ -143,6 +127,7 @@ def test_observations_are_the_truth_with_white_and_lasting_noise_from_the_reset_
 
 
 @pytest.mark.slow
+@pytest.mark.ci
 def test_actions_get_noise_that_is_not_in_the_recorded_command() -> None:
     """u from the motion: w' = w + dt (3 / (2 l) (gx cos q - gz sin q) + 3 u / (m l^2)); u = 2 (.2 + noise)."""
     trajectory, start = run()
@@ -238,6 +223,7 @@ def test_updates_carry_the_clock_on(wrapped: bool) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.ci
 @pytest.mark.parametrize(("frequency", "draws"), [(1, [0, 4, 8, 12, 16, 20]), (8, [0, 8, 16]), (9, [0, 12])])
 def test_new_parameters_come_at_the_first_reset_after_so_many_steps(frequency: int, draws: list[int]) -> None:
     """Episodes of 4 steps; parameters, gravity and lasting noise change together, at these steps only."""

@@ -189,6 +189,7 @@ def test_it_stands_without_an_action(env):
 
 
 @pytest.mark.slow
+@pytest.mark.ci
 def test_mjx_agrees_with_mujoco_and_stands_too(both_engines):
     """Ten seconds without an action; then random targets from standing, until the first small contact is another."""
     env, rng = registry.make("Anymal"), np.random.default_rng(3)

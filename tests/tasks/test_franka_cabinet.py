@@ -152,6 +152,7 @@ def test_bad_settings():
 
 
 @pytest.mark.slow
+@pytest.mark.ci
 def test_the_point_of_isaac_gives_the_golden_rewards_at_reset():
     env = registry.make("FrankaCabinet", graspPoint="isaac")
     world = env.physics.world(env.space.nominal, jnp.append(HOME, 0.0))
@@ -167,6 +168,7 @@ def at(qpos):
 
 
 @pytest.mark.slow
+@pytest.mark.ci
 def test_observations_and_targets_by_hand(compiled):
     task = compiled("FrankaCabinet")
     model = task.env.mj_model
