@@ -144,3 +144,18 @@ def test_a_run_names_its_task_its_settings_and_its_posterior(tmp_path):
     np.testing.assert_allclose(worlds("Pendulum", 5, domain=run.path).domain.mean(), domain.mean(), rtol=1e-5)
     key = jax.random.PRNGKey(0)
     np.testing.assert_allclose(found.domain.sample(key, 9).mean(0), domain.mean(), atol=5e-3 * (high - low).max())
+
+
+def test_auto_goes_by_the_number_of_worlds_that_step_together(monkeypatch):
+    """Whoever makes them: `auto` takes what was faster for so many, and a run's own number counts no more."""
+    from bayessim_mjx.env import task
+    from bayessim_mjx.wrappers import brax, gymnasium
+
+    seen = []
+    chosen = task.choose("Pendulum", 1)
+    monkeypatch.setattr(task, "choose", lambda name, number, effects: seen.append(number) or chosen)
+    worlds("Pendulum", 4096, impl="auto")
+    gymnasium.make_vec("Pendulum", 2048, impl="auto")
+    gymnasium.make("Pendulum", impl="auto")
+    brax.ours("Pendulum", impl="auto")
+    assert seen == [4096, 2048, 1, None]
