@@ -171,7 +171,7 @@ class Parser(PlainParser):
                 self.add_argument(flag, help=argparse.SUPPRESS)
         self.trusting()
         self.add_argument("--cfg_env", metavar="FILE", help="YAML file with settings, read after cfg/<task>.yaml")
-        self.add_argument("--cfg_train", metavar="FILE", help="YAML file with PPO settings")
+        self.add_argument("--cfg_train", metavar="FILE", help="YAML file with PPO settings, ours or rl-pytorch's")
         self.add_argument(
             "--checkpoint", metavar="PATH|latest|best", help=CHECKPOINTS.get(prog, "policy to start from")
         )

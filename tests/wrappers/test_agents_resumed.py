@@ -9,7 +9,9 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parent))
 from toys import Counter  # noqa: E402
 
+from bayessim_mjx import registry, train  # noqa: E402
 from bayessim_mjx.config import load  # noqa: E402
+from bayessim_mjx.runs import Run, latest_run  # noqa: E402
 from bayessim_mjx.wrappers import agents  # noqa: E402
 
 NEEDED = {"sb3": "stable_baselines3", "rsl_rl": "rsl_rl", "skrl": "skrl"}
@@ -22,10 +24,22 @@ SEEN = {  # (observations that the scale of the policy has seen, their mean)
 }
 
 
+SMALL = ["env.numEnvs=8", "ppo.num_steps=8", "ppo.num_minibatches=2", "ppo.num_epochs=2", "ppo.symmetry=null"]
+SMALL += ["ppo.hidden_actor=[8]", "ppo.hidden_critic=[5]"]
+
+
+class Alone(Counter):
+    """The counter without observations of the critic's own, which not every library takes."""
+
+    def _state(self, *given):
+        state = super()._state(*given)
+        seen = {"policy": state.obs["policy"]}
+        return state.replace(obs=seen, info={**state.info, "final_observation": seen})
+
+
 def made(name: str, seed: int):
-    overrides = ["env.numEnvs=8", "ppo.num_steps=8", "ppo.num_minibatches=2", "ppo.num_epochs=2", f"seed={seed}"]
-    overrides += ["ppo.hidden_actor=[8]", "ppo.hidden_critic=[5]", "ppo.symmetry=null"]
-    return agents.make(load("Cartpole", flags={"--agent": ("agent", name)}, overrides=overrides), Counter(), None)
+    settings = load("Cartpole", flags={"--agent": ("agent", name)}, overrides=[*SMALL, f"seed={seed}"])
+    return agents.make(settings, Alone(), None)
 
 
 @pytest.mark.parametrize("name", NEEDED)
@@ -40,3 +54,33 @@ def test_a_resumed_agents_scale_has_seen_what_it_had_seen(name, tmp_path):
     (count, mean), (kept, centre) = SEEN[name](agent), SEEN[name](again)
     assert np.max(kept) == np.max(count) >= 2 * 8 * 8  # two iterations of 8 steps of 8 worlds
     np.testing.assert_array_equal(np.asarray(centre), np.asarray(mean))
+
+
+@pytest.mark.slow
+@pytest.mark.ci
+@pytest.mark.parametrize("name", ["sb3", "skrl"])
+def test_a_finished_run_of_an_agent_goes_on(name, monkeypatch, tmp_path):
+    """`train --resume RUN --max_iterations N`: from the networks and scales that it had finished with."""
+    pytest.importorskip(NEEDED[name])
+    monkeypatch.setenv("BAYESSIM_MJX_CACHE", "off")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(registry, "make", lambda name, **_: Alone())
+    argv = ["--task", "Cartpole", "--agent", name, "--headless", "--max_iterations", "2", "ppo.save_interval=2"]
+    argv += ["ppo.log_interval=1", "ppo.eval_episodes=4", "env.realParams=null", *SMALL]
+    assert train.main(argv) == 0
+    run = latest_run("logs", "Cartpole")
+    loaded = []
+    made = agents.make
+
+    def watched(*given):
+        agent = made(*given)
+        load = agent.load
+        agent.load = lambda folder: (load(folder), loaded.append((folder.name, np.max(SEEN[name](agent)[0]))))
+        return agent
+
+    monkeypatch.setattr(agents, "make", watched)
+    assert train.main(["--resume", str(run.path), "--max_iterations", "3", "--headless"]) == 0
+    [(folder, seen)] = loaded
+    assert folder == "2" and seen >= 2 * 8 * 8
+    again = Run.open(run.path)
+    assert [c["step"] for c in again.checkpoints] == [2, 3] and again.config.ppo.max_iterations == 3
