@@ -127,8 +127,8 @@ class NoiseModel:
             for lasting in (0.0, *LASTING):
                 for q in PROCESS:
                     tried(Noise(sensor, q * unit, lasting), cost)
-            force, lasting = best.guess.process, best.guess.lasting
-            for factor in FINER if force.any() else ():
+            for factor in FINER if best.guess.process.any() else ():
+                force, lasting = best.guess.process, best.guess.lasting
                 for process in (force * factor, force / factor):
                     tried(Noise(sensor, process, lasting), cost)
 
