@@ -602,11 +602,7 @@ class RealConfig(Section):
         None, "control steps per segment; null: bayessim.trainTrajLen", low=1, high=COUNT
     )
     segment_stride: int | None = setting(
-        None,
-        "control steps between segment starts; null: no overlap. Overlapping segments are all simulated; those that "
-        "share no time are real trajectories",
-        low=1,
-        high=COUNT,
+        None, "control steps between segment starts; null: no overlap (what overlaps counts once)", low=1, high=COUNT
     )
     noise: float = setting(
         0.0, "sd of the noise on the surrogate's observations; without effect where real.logs is given", low=0

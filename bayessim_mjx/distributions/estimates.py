@@ -53,8 +53,9 @@ class Estimates:
     def pick(self, index: Sequence[int] | np.ndarray) -> Estimates:
         """Those of some parameters, in the order of `index`."""
         i = np.asarray(index, int)
-        rows = (self.median, self.low, self.high, self.mean, self.sd)
-        return Estimates(*(x[i] for x in rows), self.correlation[np.ix_(i, i)], self.width[i], self.prior_share)
+        both = self.correlation[np.ix_(i, i)]
+        numbers = self.median[i], self.low[i], self.high[i], self.mean[i], self.sd[i]
+        return Estimates(*numbers, both, self.width[i], self.prior_share)
 
 
 def estimates(

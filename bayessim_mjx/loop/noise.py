@@ -127,8 +127,8 @@ class NoiseModel:
             for lasting in (0.0, *LASTING):
                 for q in PROCESS:
                     tried(Noise(sensor, q * unit, lasting), cost)
-            force, lasting = best.guess.process, best.guess.lasting
-            for factor in FINER if force.any() else ():
+            for factor in FINER if best.guess.process.any() else ():
+                force, lasting = best.guess.process, best.guess.lasting
                 for process in (force * factor, force / factor):
                     tried(Noise(sensor, process, lasting), cost)
 
@@ -137,7 +137,8 @@ class NoiseModel:
         for ratio in RATIOS:
             tried(Noise(self.floor * np.repeat([1.0, ratio], self.nv), force, lasting), 1.0)
         common = best.guess
-        for begin, least in ((Noise(self.floor, still), self.floor), (best.noise, common.sensor)):
+        alone = ((Noise(self.floor, still), self.floor), (best.noise, common.sensor))
+        for begin, least in alone if channels else ():
             tried(self.parted(linear, begin, least), channels)
         if best.guess is not common:  # what acts was found with one channel's noise in it
             acting(best.guess.sensor, channels)

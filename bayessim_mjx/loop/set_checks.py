@@ -69,7 +69,7 @@ def rejudge(loop: Loop, state: LoopState, policy: Policy, known: int, key: Array
     judged = sets.judge(*found, k, widened_by=(lambda n: 1.0) if used is None else used.widening)
     if used is None or not used.near or (found := again(more, used.used(product, known))) is None:
         return judged
-    row = near.count(*found, k, used.move, used.widening(known))
+    row = near.count(*found, k, used.move, used.widening(used.counts[-1].trajectories))
     return replace(judged, near=(row,), move=used.move)
 
 

@@ -11,7 +11,7 @@ motors of unknown strength; `damped` a pendulum of unknown mass, damping and mot
 truths are counted in it: what it misses too is chance. Chance in the truths apart, `holds of the exact` are the shares
 of the exact posterior in the refined one's regions, and `divergence` the nats that it loses on the mean (Kullback and
 Leibler). `--wrong` adds to reality what the simulator lacks. `--sensors` are those of logs: `white` noise whose size
-is told; `positions` alone; positions in `counts` of an encoder; `late` velocities, of the control step before. The noise
+is told; `positions` alone; positions in `counts` of an encoder; `late` velocities, a control step old. The noise
 of the last three is estimated, and velocities pass the gate, as with `real.logs` (`--ungated`: they are all believed).
 """
 
