@@ -21,7 +21,7 @@ def test_dry_friction_is_a_known_parameter_that_may_be_much_less(tmp_path):
     assert "hinge_friction_mult" in space.names
     own = dict(zip(space.names, zip(space.low, space.high, strict=True), strict=True))
     assert own["hinge_friction_mult"] == pytest.approx((0.2, 1.2)) and own["link_mass_mult"] == pytest.approx(
-        (0.8, 1.2)
+        (0.3, 2.0)
     )
 
 

@@ -39,7 +39,7 @@ def test_a_file_gives_a_robot_with_the_default_space(tmp_path):
     assert (found.name, found.control_dt) == ("arm", None)
     assert found.space.names == ("shoulder_damping_mult", "joint1_armature_mult", "upper_mass_mult", "body2_mass_mult")
     np.testing.assert_allclose(
-        [found.space.low, found.space.nominal, found.space.high], [[0.8] * 4, [1] * 4, [1.2] * 4]
+        [found.space.low, found.space.nominal, found.space.high], [[0.3] * 4, [1] * 4, [2.0] * 4]
     )
     edited = found.space.edit(found.spec(), [1.1, 1.2, 0.9, 0.8]).compile()
     assert edited.dof_damping[0] == pytest.approx(0.11) and edited.dof_armature[1] == pytest.approx(0.012)
