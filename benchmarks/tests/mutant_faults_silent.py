@@ -62,7 +62,7 @@ SILENT: tuple[tuple[str, str, str, str, tuple[str, ...]], ...] = (
     (
         "the first of a round's real trajectories keeps the last round's posterior", f"{LOOP}/round_inference.py",
         "jnp.arange(factors.logits.shape[0]) >= seen", "jnp.arange(factors.logits.shape[0]) > seen",
-        _tests("loop/test_loop", k="from_their_time"),
+        SCORES,
     ),
     (
         "standard deviations of the surrogate's parameters are squared", f"{LOOP}/surrogate.py",

@@ -7,9 +7,12 @@ import numpy as np
 import pytest
 
 from bayessim_mjx import config
-from bayessim_mjx.loop import outer_loop
+from bayessim_mjx.distributions import Distribution
+from bayessim_mjx.inference.sets import stacked
+from bayessim_mjx.loop import outer_loop, round_inference
 from bayessim_mjx.loop.likelihood import Likelihood
 from bayessim_mjx.loop.refinement import _spread
+from bayessim_mjx.parameters import Parameter, ParameterSpace
 
 
 @pytest.mark.parametrize(("total", "variance"), [(84.0, 1.0), (6.0, 1.0), (360.0, 3.0)])
@@ -49,3 +52,20 @@ def test_schedules_of_randomisation_go_on_from_round_to_round() -> None:
     parts = SimpleNamespace(env=None, config=settings, key=lambda *_: jax.random.PRNGKey(0))
     begun = outer_loop._new_policy(parts, 3, None, begin=lambda *_, clock: clock)
     assert begun == 3 * 7 * 5
+
+
+def test_a_rounds_own_trajectories_are_judged_by_its_own_network(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where policies make the trajectories: the two of the round before keep theirs, the two of this one do not."""
+    space = ParameterSpace([Parameter("mass", 1.0, 0.0, 2.0)])
+
+    def four(middle: float) -> Distribution:
+        return stacked([Distribution.from_unit(space, np.zeros(1), [[middle]], [[[0.05]]])] * 4)
+
+    monkeypatch.setattr(round_inference, "conditioned", lambda *_: four(0.6))
+    monkeypatch.setattr(round_inference, "kept", lambda factors, *_: factors)
+    settings = config.load("Pendulum", overrides=["bayessim.realTrajs=2"]).bayessim
+    parts = SimpleNamespace(settings=settings, source=SimpleNamespace(policy_dependent=True))
+    fit = SimpleNamespace(identified=None)
+    state = SimpleNamespace(round=1, fit=fit, real_features=None, temperature=1.0, real_posteriors=four(0.3))
+    found = round_inference._factors(parts, state, SimpleNamespace(warnings=[]))
+    np.testing.assert_allclose(found.means[:, 0, 0], [0.3, 0.3, 0.6, 0.6], rtol=1e-6)
