@@ -11,13 +11,16 @@ from bayessim_mjx.logs.log import Array, Channels
 
 MAX_WINDOW = 0.25  # s, the longest smoothing window
 _POLYNOMIAL = 3
+# Values that a channel has to show before its noise can be estimated: of two, nothing says whether they are one count
+# apart, so the noise may be anything.
+LEVELS = 3
 
 
 def quantum(x: Array) -> float:
     """Step of which all values of x [T] are multiples (encoder resolution); 0 where there is none to be seen."""
     scale = max(float(np.ptp(x)), 1e-300)
     levels = np.unique(np.round((x - x.min()) / scale, 9)) * scale
-    if len(levels) < 3:
+    if len(levels) < LEVELS:
         return float(np.ptp(x)) if len(levels) == 2 else 0.0
     steps = np.diff(levels)
     step = float(steps.min())
@@ -25,6 +28,12 @@ def quantum(x: Array) -> float:
     multiples = steps[steps < 40 * step] / step
     regular = np.mean(np.abs(multiples - np.round(multiples)) < 0.1) > 0.95
     return step if regular and len(multiples) > 0.5 * len(steps) else 0.0
+
+
+def values_shown(x: Array) -> int:
+    """Different values in x [T], up to ten roundings of the single precision in which they are simulated."""
+    span, grain = float(np.ptp(x)), 10.0 * float(np.finfo(np.float32).eps) * max(1.0, float(np.abs(x).max()))
+    return len(np.unique(np.round((x - x.min()) / max(1e-9 * span, grain))))
 
 
 def noise_level(x: Array, grain: float | None = None) -> float:

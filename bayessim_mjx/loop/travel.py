@@ -6,12 +6,12 @@ import jax
 import mujoco
 import numpy as np
 
+from bayessim_mjx.logs.signals import LEVELS, values_shown
 from bayessim_mjx.loop.noise import FINEST
 from bayessim_mjx.physics.tangent import addresses, difference
 from bayessim_mjx.tracking import Record
 
 STILL = 1e-6  # rad, m, rad/s, m/s: what float32 and a simulator's rounding make of a joint that does not move
-LEVELS = 3  # different values below which a channel shows no resolution: between two the noise may be anything
 
 
 def travel(record: Record, model: mujoco.MjModel) -> np.ndarray:
@@ -31,7 +31,7 @@ def silent(record: Record, model: mujoco.MjModel, sensor: np.ndarray) -> np.ndar
     first = record.qpos[0, 0]
     away = jax.vmap(jax.vmap(lambda q: difference(model, q, first)))(record.qpos)
     channels = np.concatenate([np.asarray(x, float).reshape(-1, model.nv) for x in (away, record.qvel)], axis=1)
-    shown = [len(np.unique(np.round(column / STILL))) for column in channels.T]
+    shown = [values_shown(column) for column in channels.T]
     return np.isfinite(sensor) & ~(np.asarray(sensor) > 0) & (np.array(shown) < LEVELS)
 
 

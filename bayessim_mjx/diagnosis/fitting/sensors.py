@@ -7,9 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from bayessim_mjx.diagnosis.logcheck.noise import LEVELS, told
+from bayessim_mjx.diagnosis.logcheck.noise import told
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Log
+from bayessim_mjx.logs.signals import LEVELS
 
 Array = NDArray[np.float64]
 PRECISE = 5e-7  # s: times a joint's speed, as precise as positions are taken to be that show no noise (a simulation's)

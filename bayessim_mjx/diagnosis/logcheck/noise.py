@@ -15,10 +15,8 @@ from scipy.optimize import nnls
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Array, Log
 from bayessim_mjx.logs.resample import resample
-from bayessim_mjx.logs.signals import noise_level
+from bayessim_mjx.logs.signals import LEVELS, noise_level, values_shown
 
-# values that a channel has to show before its noise can be told: of two, nothing says whether they are one count apart
-LEVELS = 3
 _REST = 25  # rows of a window that is looked at for rest
 _PROCESS, _BIAS = (1.0, 3.0), (2.0, 4.0)  # powers of the horizon: a random walk and its integral; a rate and a force
 
@@ -111,7 +109,7 @@ def told(log: Log, stream: str = "qpos") -> NDArray[np.bool_]:
     names, sigma = getattr(log.channels, stream), getattr(log, f"sigma_{stream}")
     stated = [f"{stream}:{n}" in given or (stream == "qpos" and n in given) for n in names]
     rows = zip(stated, getattr(log, stream).T, sigma, strict=True)
-    own = [known or _levels(x) >= LEVELS or s > 1.01 * noise_level(x) for known, x, s in rows]
+    own = [known or values_shown(x) >= LEVELS or s > 1.01 * noise_level(x) for known, x, s in rows]
     if stream == "qvel":
         return np.array(own, bool)
     out: list[bool] = []
@@ -120,12 +118,6 @@ def told(log: Log, stream: str = "qpos") -> NDArray[np.bool_]:
         moved = of[: {"free": 3, "ball": 0}.get(kind, 1)]
         out += [*moved, *[any(of[-4:])] * (3 if kind in ("free", "ball") else 0)]
     return np.array(out, bool)
-
-
-def _levels(x: Array) -> int:
-    """Different values in x [T], up to ten roundings of the single precision in which they are simulated."""
-    span, grain = float(np.ptp(x)), 10.0 * float(np.finfo(np.float32).eps) * max(1.0, float(np.abs(x).max()))
-    return len(np.unique(np.round((x - x.min()) / max(1e-9 * span, grain))))
 
 
 def rest_spread(x: Array) -> float:

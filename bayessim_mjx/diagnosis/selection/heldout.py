@@ -134,7 +134,7 @@ class _Fold:
 
 
 def noise_floor(fitter: Fitter, fit: Fit) -> Array:
-    """`[W]`, mean square of white noise alone after start states were fitted to it: tr (I - P)^2 / n, P their hat matrix.
+    """`[W]`, mean square of white noise after start states were fitted to it: tr (I - P)^2 / n, P their hat matrix.
 
     Start states take a share of the noise with them, 2 of 25 numbers of a joint whose position is measured in 25 rows.
     """
