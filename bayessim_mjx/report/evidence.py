@@ -7,7 +7,7 @@ from bayessim_mjx.diagnosis.result import Diagnosis
 from bayessim_mjx.report import marks, motion_figures, rival_figures
 from bayessim_mjx.report.choice import choice
 from bayessim_mjx.report.look import STAGE
-from bayessim_mjx.report.words import estimate, finite, known_span, label_title, number, percent, unit
+from bayessim_mjx.report.words import accuracy, estimate, finite, known_span, label_title, number, percent, unit
 
 OVERLAY_NUMBERS = 90_000  # in all overlays together, so that the page stays a few MB
 FEWEST_POINTS = 200
@@ -67,7 +67,8 @@ def parameters(d: Diagnosis) -> dict[str, Any]:
     figure = rival_figures.groups(found["names"], {k: estimates[k] for k in moves}, d.parameters) if moves else None
     names = found.get("names") or []
     numbered = [] if rival_figures.fits(names) else names
-    return {"rows": rows, "groups": figure, "numbered": numbered, "left": max(len(moves) - 12, 0)}
+    left = max(len(moves) - 12, 0)
+    return {"rows": rows, "accuracy": accuracy(d), "groups": figure, "numbered": numbered, "left": left}
 
 
 def isolability(d: Diagnosis) -> dict[str, Any]:

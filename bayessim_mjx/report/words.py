@@ -232,6 +232,12 @@ def effect_line(effect: FoundEffect) -> str:
     return effect_title(effect.name, effect.where) + (": " + ", ".join(values) if values else "")
 
 
+def accuracy(d: Diagnosis) -> str:
+    """`mass 4.9 % (90 %: 2.1 % – 12 %), damping ...`: inferred accuracy of the model's numbers; "" where it was stated."""
+    each = [f"{k} {percent(own['median'])} (90 %: {between(own['low'], own['high'])})" for k, own in d.accuracy.items()]
+    return ", ".join(each)
+
+
 def headline(diagnosis: Diagnosis) -> str:
     return diagnosis.sentences[0] if diagnosis.sentences else verdict_of(diagnosis).headline
 

@@ -247,3 +247,10 @@ def test_the_most_important_sentences_are_open_and_the_others_folded(tmp_path):
     assert "2 more" in folded and "Sentence number 11." in folded.split("</details>")[0]
     few = dataclasses.replace(many, sentences=many.sentences[:5])
     assert '<details class="said">' not in report.write(few, tmp_path).read_text()
+
+
+def test_the_accuracy_of_the_models_numbers_stands_with_them(tmp_path):
+    own = {"mass": {"median": 0.12, "low": 0.06, "high": 0.31, "parameters": 3}}
+    page = rendered(dataclasses.replace(fake.full(), accuracy=own), tmp_path / "a")
+    assert "inferred from the logs, as a share: mass 12 % (90 %: 6.0 % – 31 %)." in page.text
+    assert "inferred from the logs, as a share" not in rendered(fake.full(), tmp_path / "b").text
