@@ -233,7 +233,7 @@ def effect_line(effect: FoundEffect) -> str:
 
 
 def accuracy(d: Diagnosis) -> str:
-    """`mass 4.9 % (90 %: 2.1 % – 12 %), damping ...`: inferred accuracy of the model's numbers; "" where it was stated."""
+    """`mass 4.9 % (90 %: 2.1 % – 12 %), damping ...`: inferred accuracies of the model's numbers; "" if stated."""
     each = [f"{k} {percent(own['median'])} (90 %: {between(own['low'], own['high'])})" for k, own in d.accuracy.items()]
     return ", ".join(each)
 
