@@ -58,8 +58,8 @@ def _parser() -> cli.PlainParser:
         metavar="SHARE",
         nargs="+",
         default=[],
-        help="how accurate known parameters are (standard deviation): 5%%, mass=2%%, elbow*=20%% (default: 5%% of a "
-        "model's own numbers; the ranges of --parameters)",
+        help="how accurate known parameters are (standard deviation): 5%%, mass=2%%, elbow*=20%% (default: inferred "
+        "from the logs, one for each kind of the model's own numbers; the ranges of --parameters)",
     )
     parser.add_argument(
         "--payload",
