@@ -196,7 +196,8 @@ def _judged(q: Quadratic, x: Array, precision: Array, cut: Windows, count: int) 
     seen = float(x[0] ** 2 / inverse[0, 0])
     left = max(float(q.c.sum()) - (count - len(x)), 0.0)
     error = float(np.sqrt(max(robust[0, 0], inverse[0, 0])))
-    return Shift(float(x[0]), error, seen / (seen + left), _apart(q, x, precision, cut), seen / count, cut.dt)
+    explains = seen / (seen + left) if seen > 0 else 0.0  # of logs without a gap, nothing
+    return Shift(float(x[0]), error, explains, _apart(q, x, precision, cut), seen / count, cut.dt)
 
 
 def _apart(q: Quadratic, x: Array, precision: Array, cut: Windows) -> float:
