@@ -21,6 +21,8 @@ from bayessim_mjx.physics import Physics
 
 Array = NDArray[np.float64]
 STEP = 0.005  # of the range: finite differences
+# of its value, how far a number is taken to be off at most where a scale for it is asked for: its range may be wide
+SPAN = 0.4
 
 
 @dataclass(frozen=True)
@@ -50,7 +52,8 @@ class Coordinate:
 
     @property
     def step(self) -> float:
-        return STEP * (self.high - self.low)
+        span = self.high - self.low
+        return STEP * (min(span, SPAN * abs(self.neutral)) if self.stated and self.neutral else span)
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bayessim_mjx.diagnosis.fitting.candidates import SPAN
 from bayessim_mjx.diagnosis.fitting.quadratic import Quadratic, eliminate
 from bayessim_mjx.diagnosis.fitting.substeps import Case, Errors
 from bayessim_mjx.diagnosis.fitting.windows import Windows
@@ -30,7 +31,8 @@ class Rules:
     nudge: float = 0.1  # control steps, of the shift for its finite difference
     shares: tuple[float, ...] = (1.0, 0.5, 0.2)  # of a step, until the error falls
     small: float = 0.02  # of scales, of the other columns' finite differences
-    prior: float = 0.3  # standard deviation of parameters (of their range), gains and forces (of their scale)
+    # standard deviation of parameters (of their range, or of `SPAN` of their value), gains and forces (of their scale)
+    prior: float = 0.3
     least: float = 0.2  # of the lower end of a range, of a positive parameter
     furthest: float = 0.02  # s, or three control steps
     direction: float = 0.1  # of the typical speed, at which friction has turned round
@@ -144,6 +146,8 @@ class _Model:
         space = errors.physics.space
         self.low, self.high = (np.array([getattr(p, end) for p in space.parameters]) for end in ("low", "high"))
         self.nominal = np.asarray(space.nominal, float)
+        span = self.high - self.low
+        self.span = np.where(self.nominal != 0, np.minimum(span, SPAN * np.abs(self.nominal)), span)
         self.least = np.where(self.low > 0, RULES.least * self.low, -np.inf)
         self.forces = _shapes(errors.cut) * force  # [4, W, H, nv]
         self.parts = np.cumsum([1, len(self.low), errors.physics.mj_model.nu])
@@ -166,7 +170,7 @@ class _Model:
 
     def _case(self, x: Array, starts: Array | None) -> Case:
         shift, p, gains, loads = np.split(x, self.parts)
-        theta = np.maximum(self.nominal + p * (self.high - self.low), self.least)  # beyond its range: nothing else may
+        theta = np.maximum(self.nominal + p * self.span, self.least)  # beyond its range: nothing else may
         cut = self.late(float(shift[0]))
         command = np.asarray(cut.batch.command) * (1 + np.asarray(gains, np.float32))
         cut = dataclasses.replace(cut, batch=cut.batch.replace(command=command))
