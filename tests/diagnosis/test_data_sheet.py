@@ -40,6 +40,14 @@ def test_a_models_own_numbers_count_as_a_data_sheets(arm):
     assert not loose.stated and loose.precision == pytest.approx(1 / (0.58 * (loose.high - loose.low)) ** 2)
 
 
+def test_a_stated_number_stays_within_four_standard_deviations(arm):
+    shares = data_sheet.accuracies(("5%, lower=30%",), arm.space, None)
+    for c, p in zip(base_coordinates(arm.space, shares), arm.space.parameters, strict=True):
+        assert (c.low, c.high) == pytest.approx((0.3, 2.0) if p.target == "lower" else (0.8, 1.2))
+    wide = base_coordinates(arm.space, arm.accuracy, arm.assumed)
+    assert all((c.low, c.high) == pytest.approx((0.3, 2.0)) for c in wide)  # nobody stated it
+
+
 def test_ranges_hold_the_errors_of_the_least_accurate_data_sheet(arm):
     for c in base_coordinates(arm.space):
         assert c.low <= 1 - 2.33 * data_sheet.WORST and c.high >= 1 + 2.33 * data_sheet.WORST
