@@ -20,7 +20,7 @@ FRICTION = 0.03
 @pytest.fixture(scope="module")
 def setup(tmp_path_factory):
     logs = recorded(scale=SCALE, friction=FRICTION)
-    return prepare(nominal(tmp_path_factory.mktemp("ridges")), logs, FEW)
+    return prepare(nominal(tmp_path_factory.mktemp("ridges")).stated(("5%",)), logs, FEW)
 
 
 def model_of(setup, values, *labels):
