@@ -149,7 +149,13 @@ def investigate(
         say(text, 0, 1)
     known(setup, None)
     given = setup.fitter, setup.candidates, setup.settings, criteria
-    found = Findings(setup, selected.select(*given, say, lambda tried: known(setup, tried)))
+    import os
+
+    if os.environ.get("BY_EVIDENCE"):
+        from bayessim_mjx.diagnosis.evidence.selecting import select
+    else:
+        select = selected.select
+    found = Findings(setup, select(*given, say, lambda tried: known(setup, tried)))
     resumed.ended(setup)
     stages = [s for s in (STAGES if stages is None else stages) if not (s.optional and (quick or verdict_only))]
     return carry_out(stages, found, say, time_left, verdict)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtr
+from scipy.special import logsumexp, ndtr
 
 from bayessim_mjx.diagnosis.data_sheet import ACCURACY, SURE
 from bayessim_mjx.diagnosis.fitting.fit import Fit
@@ -33,6 +33,7 @@ class Posterior:
     Attributes:
         kinds: K of them; shares: `[M, K]`, accuracies; weight: `[M]`.
         mean: `[M, k]`; covariance: `[M, k, k]`.
+        evidence: log of what likelihood and priors integrate to, relative to the likelihood at the fit.
     """
 
     kinds: tuple[str, ...]
@@ -40,6 +41,7 @@ class Posterior:
     weight: Array
     mean: Array
     covariance: Array
+    evidence: float
 
     @property
     def middle(self) -> Array:
@@ -90,11 +92,12 @@ def kinds(fit: Fit) -> tuple[str, ...]:
     return tuple(sorted({c.kind for c in fit.coordinates if c.kind}))
 
 
-def posterior(fit: Fit, curvature: Array) -> Posterior:
-    """Of a fit's parameters and of the accuracies behind them, about a fit that is the posterior's mode.
+def posterior(fit: Fit, curvature: Array, pull: Array | None = None) -> Posterior:
+    """Of a fit's parameters and of the accuracies behind them.
 
     Args:
         curvature: `[k, k]` of the data's negative log-likelihood at the fit, in nats, start states eliminated.
+        pull: `[k]`, gradient of their log-likelihood there; None: the fit is the posterior's mode.
     """
     coordinates = fit.coordinates
     found = kinds(fit)
@@ -105,15 +108,17 @@ def posterior(fit: Fit, curvature: Array) -> Posterior:
     factor = (ACCURACY / shares) ** 2  # [M, K], of precisions
     precision = stated * np.where(own.any(0), factor @ own, 1.0)  # [M, k]
     H = curvature + precision[:, :, None] * np.eye(len(stated))
-    slope = (precision - fit.belief()) * away  # at a mode the data pull as hard as its prior does
+    pull = -fit.belief() * away if pull is None else pull  # at a mode the data pull as hard as its prior does
+    slope = precision * away + pull
     scale = 1 / np.sqrt(np.maximum(np.diagonal(H, axis1=1, axis2=2), 1e-300))
     units = H * scale[:, :, None] * scale[:, None, :] + 1e-12 * np.eye(len(stated))
     covariance = np.linalg.inv(units) * scale[:, :, None] * scale[:, None, :]
     move = np.einsum("mij,mj->mi", covariance, slope)
     evidence = 0.5 * np.einsum("mi,mi->m", slope, move) - 0.5 * np.sum(precision * away**2, 1)
-    evidence += 0.5 * np.log(factor) @ own.sum(1) + np.sum(np.log(scale), 1) - 0.5 * np.linalg.slogdet(units)[1]
+    evidence += 0.5 * np.sum(np.log(precision), 1) + np.sum(np.log(scale), 1) - 0.5 * np.linalg.slogdet(units)[1]
     prior = (
         0.5 * SURE * np.sum(np.log(factor) - factor, 1)
     )  # of factors, a gamma density on the grid of their logarithms
     weight = np.exp(evidence + prior - np.max(evidence + prior))
-    return Posterior(found, shares, weight / weight.sum(), fit.values + move, covariance)
+    whole = float(logsumexp(evidence + prior) - logsumexp(prior))
+    return Posterior(found, shares, weight / weight.sum(), fit.values + move, covariance, whole)

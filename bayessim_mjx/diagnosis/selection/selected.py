@@ -82,6 +82,7 @@ class Selection(Tried):
     chosen: Mapping[int, Key] = field(default_factory=dict)
     elsewhere: float = float("nan")
     hidden: tuple[str, ...] = ()
+    weighed: Any = None
     cut_short: frozenset[str] = frozenset()
     skipped: Mapping[str, int] = field(default_factory=dict)
 

@@ -1,0 +1,239 @@
+"""A model's windows as one Gaussian, and its log marginal likelihood (docs/evidence.md has the equations).
+
+About a fit the residual of a window is  r = A p + B x + D d + e:  p the parameters' step, x the start state, d the
+force that is missing at nodes in time, e the noise. x, d and e are Gaussian and are integrated out in closed form, so
+a window's residual is N(A p, C). The force's amplitude at each joint, its memory and the noise of each channel are at
+their best for each model (type II maximum likelihood; MacKay, Neural Computation 4, 1992), with weak priors.
+
+The missing force is what no law of the model explains (Kennedy and O'Hagan, J. R. Stat. Soc. B 63, 2001): a law that is
+nearly right leaves a small force, not hundreds of noise standard deviations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from bayessim_mjx.diagnosis.fitting.quadratic import solve
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Priors:
+    """What is believed of the force and the noise before any data are seen.
+
+    Attributes:
+        least: amplitude, as a share of the robot's force scale, below which no simulator is right: two integrators of
+            the same robot differ by as much.
+        usual, spread: median of the amplitude (share of the force scale) and standard deviation of its logarithm: 95 %
+            between .0001 and 1.
+        memories: node spacings over which the force stays alike: from white to the length of a window.
+        noise: standard deviation of the logarithm of the sensors' noise about its estimate from the logs.
+    """
+
+    least: float = 3e-4
+    usual: float = 0.01
+    spread: float = 2.3
+    memories: tuple[float, ...] = (1.0, 4.0, 16.0)
+    noise: float = 0.2
+
+
+PRIORS = Priors()
+STEPS = 25  # of the search for the best hyperparameters
+FIRST = 3e-3  # amplitude that it begins at, share of the force scale
+
+
+@dataclass(frozen=True)
+class Hyper:
+    """Amplitude of the missing force `[nv]` (shares of the force scale), its memory (node spacings), and the noise's
+    factor on what was estimated from the logs `[C]`."""
+
+    amplitude: Array
+    memory: float
+    noise: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Windows:
+    """Inner products over the rows of each channel, all that the evidence needs of a model's windows.
+
+    Attributes:
+        gram: `[W, C, M, M]` of the columns (r, A, D in units of the force scale, B in units of the starts' spread).
+        parameters, joints, nodes: k, nv and m, so M = 1 + k + nv m + s; rows: of each channel in a window.
+    """
+
+    gram: Array
+    parameters: int
+    joints: int
+    nodes: int
+    rows: int
+
+    @property
+    def forces(self) -> int:
+        return self.joints * self.nodes
+
+    def some(self, rows: NDArray[np.bool_]) -> Windows:
+        """Some of the windows."""
+        return replace(self, gram=self.gram[rows])
+
+
+def windows_of(
+    r: Array, A: Array, B: Array, D: Array, offsets: Array, spread: Array, scale: Array, channels: int
+) -> Windows:
+    """The inner products of a fit.
+
+    Args:
+        r, A, B: `[W, n]`, `[W, n, k]`, `[W, n, s]`, whitened, rows in the order of time, channels side by side.
+        D: `[W, n, nv m]`, per N m or N. offsets: `[W, s]`, of the start states; spread: `[s]`, their prior.
+        scale: `[nv]`, the robot's force scale.
+    """
+    count, n = r.shape
+    nodes = D.shape[2] // len(scale)
+    start = r + np.einsum("wns,ws->wn", B, offsets)  # with the start state as measured
+    X = np.concatenate([start[..., None], A, D * np.repeat(scale, nodes), B * spread], 2)
+    X = X.reshape(count, n // channels, channels, -1).transpose(0, 2, 3, 1)
+    return Windows(X @ X.mT, A.shape[2], len(scale), nodes, n // channels)
+
+
+@dataclass(frozen=True, eq=False)
+class Marginal:
+    """Windows with force and start state integrated out.
+
+    Attributes:
+        Q: `[W, 1 + k, 1 + k]`, products of (r, A) weighted by the inverse covariance of a window's residual.
+        logdet: `[W]`, its log determinant.
+        root, cov, mean: of force and start in units of their priors: roots of the prior covariance `[M', M']`,
+            posterior covariance `[W, M', M']`, and what the mean is per (r, A) `[W, M', 1 + k]`.
+    """
+
+    Q: Array
+    logdet: Array
+    root: Array
+    cov: Array
+    mean: Array
+
+
+def correlation(nodes: int, memory: float) -> Array:
+    """Root of an Ornstein-Uhlenbeck process's correlation at nodes."""
+    lag = np.abs(np.subtract.outer(np.arange(nodes), np.arange(nodes)))
+    return np.linalg.cholesky(np.exp(-lag / memory) + 1e-9 * np.eye(nodes))
+
+
+def marginal(windows: Windows, hyper: Hyper) -> Marginal:
+    """The windows under some hyperparameters (Woodbury's identity: the size is that of the force, not of the rows)."""
+    own, forces = 1 + windows.parameters, windows.forces
+    gram = np.tensordot(1 / hyper.noise**2, windows.gram, axes=(0, 1))
+    size = gram.shape[1] - own
+    root = np.eye(size)
+    root[:forces, :forces] = np.kron(np.diag(hyper.amplitude), correlation(windows.nodes, hyper.memory))
+    VY = root.T @ gram[:, own:, :own]
+    inner = root.T @ gram[:, own:, own:] @ root + np.eye(size)
+    cov = np.linalg.inv(inner)
+    mean = cov @ VY
+    logdet = np.linalg.slogdet(inner)[1] + 2 * windows.rows * float(np.sum(np.log(hyper.noise)))
+    return Marginal(gram[:, :own, :own] - VY.mT @ mean, logdet, root, cov, mean)
+
+
+@dataclass(frozen=True, eq=False)
+class Belief:
+    """Gaussian prior of the parameters' step: precision and mean `[k]`, within bounds `[k]`."""
+
+    precision: Array
+    mean: Array
+    low: Array
+    high: Array
+
+    def best(self, Q: Array) -> Array:
+        """The most probable step `[k]`; Q `[1 + k, 1 + k]`, summed over windows."""
+        if not len(self.mean):
+            return self.mean
+        S, g = Q[1:, 1:], Q[1:, 0]
+        return solve(S + np.diag(self.precision), g + self.precision * self.mean, self.low, self.high)
+
+    def cost(self, Q: Array, p: Array) -> float:
+        """-2 log of likelihood and prior at a step, up to constants."""
+        return float(Q[0, 0] - 2 * Q[1:, 0] @ p + p @ Q[1:, 1:] @ p + self.precision @ (p - self.mean) ** 2)
+
+
+@dataclass(frozen=True, eq=False)
+class Learnt:
+    """The best hyperparameters of a model.
+
+    Attributes:
+        hyper; step: `[k]`, the most probable parameters' step; marginal: there.
+        penalty: log prior of the hyperparameters, up to a constant that all models have.
+    """
+
+    hyper: Hyper
+    step: Array
+    marginal: Marginal
+    penalty: float
+
+    @property
+    def Q(self) -> Array:
+        return np.asarray(self.marginal.Q.sum(0))
+
+    @property
+    def without_parameters(self) -> float:
+        """Log density of the windows at Q = 0, but for the constant of all models, with the hyperparameters' prior."""
+        return self.penalty - 0.5 * float(self.marginal.logdet.sum())
+
+
+def learn(windows: Windows, belief: Belief, like: Hyper | None = None) -> Learnt:
+    """The best hyperparameters, by quasi-Newton steps (exact gradients by Fisher's identity) for each memory.
+
+    like: of a model like this one, where the search begins, and whose memory stays; None: all memories are tried.
+    """
+    nv, channels = windows.joints, windows.gram.shape[1]
+    start = np.concatenate([np.full(nv, np.log(FIRST)), np.zeros(channels)])
+    memories: Sequence[float] = PRIORS.memories
+    if like is not None:
+        start, memories = np.log(np.concatenate([like.amplitude, like.noise])), (like.memory,)
+    ends = [(np.log(PRIORS.least), np.log(10.0))] * nv + [(-2.0, 7.0)] * channels
+    best: Any = None
+    for memory in memories:
+        found = minimize(
+            _slope, start, (windows, belief, memory), "L-BFGS-B", jac=True, bounds=ends, options={"maxiter": STEPS}
+        )
+        if best is None or found.fun < best[0].fun:
+            best = found, memory
+        start = found.x
+    hyper = _hyper(best[0].x, nv, best[1])
+    there = marginal(windows, hyper)
+    return Learnt(hyper, belief.best(there.Q.sum(0)), there, _penalty(best[0].x, nv))
+
+
+def _hyper(x: Array, nv: int, memory: float) -> Hyper:
+    return Hyper(np.exp(x[:nv]), memory, np.exp(x[nv:]))
+
+
+def _penalty(x: Array, nv: int) -> float:
+    amplitude = (x[:nv] - np.log(PRIORS.usual)) / PRIORS.spread
+    return -0.5 * float(np.sum(amplitude**2) + np.sum((x[nv:] / PRIORS.noise) ** 2))
+
+
+def _slope(x: Array, windows: Windows, belief: Belief, memory: float) -> tuple[float, Array]:
+    """Minus log density of data, parameters and hyperparameters, and its gradient in the latter's logarithms."""
+    nv, own, forces = windows.joints, 1 + windows.parameters, windows.forces
+    hyper = _hyper(x, nv, memory)
+    there = marginal(windows, hyper)
+    Q = there.Q.sum(0)
+    p = belief.best(Q)
+    value = -0.5 * belief.cost(Q, p) - 0.5 * float(there.logdet.sum()) + _penalty(x, nv)
+    z = there.mean @ np.concatenate([[1.0], -p])
+    spread = np.diagonal(there.cov, axis1=1, axis2=2)
+    slope = np.empty_like(x)
+    slope[:nv] = np.sum((z**2 + spread)[:, :forces].reshape(-1, nv, windows.nodes) - 1.0, axis=(0, 2))
+    slope[:nv] -= (x[:nv] - np.log(PRIORS.usual)) / PRIORS.spread**2
+    along = np.concatenate([np.tile(np.concatenate([[1.0], -p]), (len(z), 1)), -z @ there.root.T], 1)
+    outer = along[:, :, None] * along[:, None, :]
+    outer[:, own:, own:] += there.root @ there.cov @ there.root.T
+    left = np.einsum("wcij,wij->c", windows.gram, outer)  # squared noise of each channel, what is open included
+    slope[nv:] = left / hyper.noise**2 - windows.rows * len(z) - x[nv:] / PRIORS.noise**2
+    return -value, -slope

@@ -1,0 +1,93 @@
+"""The integral over a model's parameters against quadrature: accuracies, bounds, and the price of what does nothing."""
+
+import numpy as np
+import pytest
+from scipy import integrate, stats
+
+from bayessim_mjx.diagnosis.data_sheet import ACCURACY, SURE
+from bayessim_mjx.diagnosis.evidence.gaussian import Hyper, Learnt, learn, marginal
+from bayessim_mjx.diagnosis.evidence.parameters import belief_of, integrated
+from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
+from bayessim_mjx.diagnosis.fitting.fit import Fit
+from tests.diagnosis.evidence.linear import draw
+
+HYPER = Hyper(np.array([0.02]), 4.0, np.array([1.0, 1.2]))
+
+
+def fitted(coordinates, values):
+    return Fit(tuple(coordinates), np.asarray(values, float), *(np.zeros(1),) * 5, 0.0)
+
+
+def evidence(case, fit, columns=slice(None)):
+    there = marginal(case.windows(columns), HYPER)
+    learnt = Learnt(HYPER, belief_of(fit).best(there.Q.sum(0)), there, 0.0)
+    return integrated(fit, learnt), there
+
+
+def likelihood(there, p):
+    """-2 log of it, relative to what all models have in common."""
+    Q = there.Q.sum(0)
+    p = np.atleast_1d(p)
+    return -0.5 * (Q[0, 0] - 2 * Q[1:, 0] @ p + p @ Q[1:, 1:] @ p) - 0.5 * there.logdet.sum()
+
+
+def test_a_gaussian_prior_in_closed_form():
+    """Two parameters N(0, 1): the residuals' joint density, written out."""
+    case = draw(0, p=[0.3, -0.2])
+    fit = fitted([Coordinate(str(i), (i,), 0.0, -50.0, 50.0, 1.0) for i in range(2)], [0.0, 0.0])
+    found, there = evidence(case, fit)
+    Q = there.Q.sum(0)
+    H = Q[1:, 1:] + np.eye(2)
+    exact = -0.5 * (Q[0, 0] - Q[1:, 0] @ np.linalg.solve(H, Q[1:, 0]) + np.linalg.slogdet(H)[1] + there.logdet.sum())
+    assert found.nats == pytest.approx(exact, rel=1e-9)
+    assert found.posterior.middle == pytest.approx(np.linalg.solve(H, Q[1:, 0]), rel=1e-6)
+
+
+def test_about_another_fit_the_evidence_is_the_same():
+    """Residuals about other values are the same data, where the model is linear."""
+    case = draw(1, p=[1.3, 0.8])
+    ends = [Coordinate(str(i), (i,), 1.0, -50.0, 50.0, 4.0) for i in range(2)]
+    one, _ = evidence(case, fitted(ends, [0.0, 0.0]))
+    case.r = case.r - case.A @ np.array([1.1, 0.7])
+    two, _ = evidence(case, fitted(ends, [1.1, 0.7]))
+    assert one.nats == pytest.approx(two.nats, rel=1e-9)
+
+
+@pytest.mark.parametrize("truth", [0.02, 0.25])
+def test_the_accuracy_of_a_data_sheet_is_integrated_out(truth):
+    """One number of a kind: its prior is a Student t."""
+    case = draw(2, k=1, p=[truth])
+    known = Coordinate("mass", (0,), 1.0, -20.0, 20.0, ACCURACY**-2, stated=True, kind="mass")
+    found, there = evidence(case, fitted([known], [1.0]))
+    prior = stats.t(SURE, scale=ACCURACY)
+    top = max(likelihood(there, p) for p in np.linspace(-1, 1, 401))
+    whole = integrate.quad(lambda p: prior.pdf(p) * np.exp(likelihood(there, p) - top), -2, 2, limit=400, points=[0, truth])[0]
+    assert found.nats == pytest.approx(top + np.log(whole), abs=0.1)
+
+
+@pytest.mark.parametrize("truth", [-1.0, -0.1, 0.0, 0.6])
+def test_a_bound_against_quadrature(truth):
+    """A friction from 0 to 2 with a half-normal prior; where the data ask for less than 0, it ends at the bound."""
+    case = draw(3, count=6, k=1, p=[truth])
+    rubs = Coordinate("f", (0,), 0.0, 0.0, 2.0, 0.25)
+    found, there = evidence(case, fitted([rubs], [0.0]))
+    prior = stats.truncnorm(0.0, 1.0, scale=2.0)
+    top = max(likelihood(there, p) for p in np.linspace(0, 2, 2001))
+    whole = integrate.quad(lambda p: prior.pdf(p) * np.exp(likelihood(there, p) - top), 0, 2, limit=400)[0]
+    assert found.nats == pytest.approx(top + np.log(whole), abs=0.7 if truth == 0.0 else 0.3)
+
+
+@pytest.mark.parametrize("numbers", [1, 4])
+def test_an_effect_that_does_nothing_costs_evidence(numbers):
+    """Of pure noise and force, an effect of one or four useless numbers gains two nats hardly ever."""
+    gains = []
+    for seed in range(120):
+        case = draw(5000 + seed, count=24, k=1 + numbers, p=np.zeros(1 + numbers))
+        coordinates = [Coordinate(str(i), (i,), 0.0, -1.0, 1.0, 0.25) for i in range(1 + numbers)]
+        with_it = fitted(coordinates, np.zeros(1 + numbers))
+        without = fitted(coordinates[:1], [0.0])
+        one = learn(case.windows(), belief_of(with_it))
+        two = learn(case.windows(slice(0, 1)), belief_of(without), one.hyper)
+        gains.append(integrated(with_it, one).nats - integrated(without, two).nats)
+    assert np.mean(gains) < -1.0 * numbers
+    assert np.mean(np.array(gains) > 2.0) <= 0.017  # of 120: two at most

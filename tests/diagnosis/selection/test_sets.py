@@ -1,0 +1,39 @@
+"""The posterior over sets of effects, from planted evidence."""
+
+import numpy as np
+import pytest
+
+from bayessim_mjx.diagnosis.selection.sets import RELEVANCE, core, log_prior, weighed
+
+A, B, AB, NONE = frozenset("a"), frozenset("b"), frozenset("ab"), frozenset()
+
+
+def test_the_prior_expects_one_effect():
+    """Over all sets of 30 candidates its mean number is one, and none is about as likely as one."""
+    n = 30
+    odds = np.exp(log_prior(A, n))
+    assert n * odds / (1 + odds) == pytest.approx(1.0)
+
+
+def test_weights_are_posterior_probabilities():
+    excess = {NONE: 100.0, A: 0.0, B: 0.02}
+    found = weighed({NONE: 0.0, A: 10.0, B: 9.0}, excess, 30)
+    prior = np.exp(log_prior(A, 30))
+    each = np.array([1.0, prior * np.exp(10.0), prior * np.exp(9.0)])
+    assert [found.weight[k] for k in (NONE, A, B)] == pytest.approx(each / each.sum())
+    assert found.answer == A and list(found.weight)[1] == B
+    assert found.nats[A] - found.nats[B] == pytest.approx(1.0)
+
+
+def test_an_effect_that_does_not_matter_makes_no_explanation_of_its_own():
+    """However sure it is: 50 nats for a thousandth of the gap."""
+    excess = {NONE: 100.0, A: 0.1, AB: 0.0}
+    assert core(AB, excess) == A
+    assert AB not in weighed({NONE: 0.0, A: 500.0, AB: 550.0}, excess, 30).weight
+    excess[A] = RELEVANCE.noise + RELEVANCE.share * 100.0 + 0.01
+    assert core(AB, excess) == AB
+    assert weighed({NONE: 0.0, A: 500.0, AB: 550.0}, excess, 30).answer == AB
+
+
+def test_a_gap_within_the_noise_needs_no_effect():
+    assert weighed({NONE: 0.0, A: 30.0}, {NONE: 0.08, A: 0.0}, 30).answer == NONE
