@@ -102,6 +102,13 @@ def _search_options(parser: cli.PlainParser) -> None:
         help="the whole search, but no report, maps, black boxes or next experiment: diagnosis.json and effects.yaml",
     )
     parser.add_argument(
+        "--decide",
+        choices=("prediction", "evidence"),
+        default="prediction",
+        help="by what effects are chosen: the prediction of held-out logs, or the evidence of each set with a missing "
+        "force beside it, which gives probabilities (docs/evidence.md; default: prediction)",
+    )
+    parser.add_argument(
         "--criteria",
         metavar="KEY=VALUE",
         nargs="*",
@@ -153,6 +160,7 @@ def _diagnosis(args: argparse.Namespace, say: Any, early: Callable[[Sequence[str
         quick=args.quick,
         verdict_only=args.verdict_only,
         criteria=Criteria().changed(args.criteria),
+        decide=args.decide,
         seed=args.seed,
         out=args.out,
         progress=say,

@@ -87,6 +87,8 @@ class Diagnosis:
         hidden: effects ("name@place") that would not show beside those that are named, whose parameters do the same.
         accuracy: {kind of parameter: {"median", "low", "high", "parameters"}}: the inferred accuracy of the model's
             numbers as a share, its 90 % interval, and how many numbers; of kinds whose accuracy nobody stated.
+        evidence: where it decided, sets of effects, most likely first: [{"effects": [label ...], "probability", "nats"
+            of evidence and prior over the known parameters alone}]; else [].
         next_experiment: {"name", "why", "evidence", "file", "table": [...]} or {}.
         details: numbers for pictures (see `report`); not part of diagnosis.json but saved beside it.
     """
@@ -108,6 +110,7 @@ class Diagnosis:
     chance: dict[str, Any] = field(default_factory=dict)
     hidden: list[str] = field(default_factory=list)
     accuracy: dict[str, dict[str, float]] = field(default_factory=dict)
+    evidence: list[dict[str, Any]] = field(default_factory=list)
     schema: int = SCHEMA
 
     def to_dict(self) -> dict[str, Any]:

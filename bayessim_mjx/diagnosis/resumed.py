@@ -12,15 +12,17 @@ import numpy as np
 from bayessim_mjx import versions
 from bayessim_mjx.diagnosis.fitting.journal import Journal, Remembering, digest
 from bayessim_mjx.diagnosis.selection.budget import Budget
-from bayessim_mjx.diagnosis.selection.criteria import Criteria
 from bayessim_mjx.diagnosis.setup import Setup
 
 
-def remembering(setup: Setup, criteria: Criteria, folder: Path | None) -> Setup:
-    """The setup with a fitter that finds in the folder what it fitted there before, and writes what it fits."""
+def remembering(setup: Setup, rules: object, folder: Path | None) -> Setup:
+    """The setup with a fitter that finds in the folder what it fitted there before, and writes what it fits.
+
+    rules: by which the search decides.
+    """
     if folder is None:
         return setup
-    return replace(setup, fitter=Remembering(setup.fitter, Journal(folder, _question(setup, criteria))))
+    return replace(setup, fitter=Remembering(setup.fitter, Journal(folder, _question(setup, rules))))
 
 
 def ended(setup: Setup) -> None:
@@ -29,7 +31,7 @@ def ended(setup: Setup) -> None:
         setup.fitter.journal = None
 
 
-def _question(setup: Setup, criteria: Criteria) -> str:
+def _question(setup: Setup, rules: object) -> str:
     """A digest of all that the fits depend on but the time that they may take."""
     fitter, model = setup.fitter, setup.physics.mj_model
     simulator = fitter.simulator
@@ -39,5 +41,5 @@ def _question(setup: Setup, criteria: Criteria) -> str:
     arrays = [np.asarray(leaf) for leaf in jax.tree.leaves(windows.batch)]
     arrays += [windows.group, windows.sigma_q, windows.sigma_v, windows.spread, fitter.theta, raw]
     each = [(c.label, c.coordinates, c.shapes, c.probes.tobytes()) for c in setup.candidates]
-    rules = replace(setup.settings, budget=Budget()), criteria
-    return digest(*arrays, fitter.base, each, rules, simulator.lanes, jax.default_backend(), versions.versions())
+    every = replace(setup.settings, budget=Budget()), rules
+    return digest(*arrays, fitter.base, each, every, simulator.lanes, jax.default_backend(), versions.versions())

@@ -15,6 +15,7 @@ import mujoco
 from threadpoolctl import threadpool_limits
 
 from bayessim_mjx.diagnosis import resumed
+from bayessim_mjx.diagnosis.evidence import selecting
 from bayessim_mjx.diagnosis.experiment import propose
 from bayessim_mjx.diagnosis.findings import Findings, Progress, Where
 from bayessim_mjx.diagnosis.fitting.cutting import TooLittleData
@@ -33,10 +34,12 @@ from bayessim_mjx.diagnosis.stages import Stage, carry_out
 from bayessim_mjx.diagnosis.summary import assemble, finer_steps, first_look, whole_logs
 from bayessim_mjx.diagnosis.summary.files import Files
 from bayessim_mjx.effects.effect import Effect
+from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs import read_logs
 from bayessim_mjx.logs.log import Log
 
 Effects = str | Sequence[str | type[Effect]]
+PREDICTION, EVIDENCE = DECIDES = "prediction", "evidence"  # by what a set of effects is chosen
 
 
 def how_far(found: Findings, say: Progress) -> Findings:
@@ -114,6 +117,7 @@ def investigate(
     remember: Path | None = None,
     tolerated: Sequence[str] = (),
     criteria: Criteria | None = None,
+    decide: str = PREDICTION,
     notes: Sequence[str] = (),
     stages: Sequence[Stage] | None = None,
     progress: Progress | None = None,
@@ -125,7 +129,8 @@ def investigate(
 
     Args:
         robot: the model with the parameters that it may recalibrate.
-        logs, effects, group, minutes, quick, seed, criteria, progress: see `diagnose`; tolerated: its `tolerance`.
+        logs, effects, group, minutes, quick, seed, criteria, decide, progress: see `diagnose`; tolerated: its
+            `tolerance`.
         settings: budgets of the search; None: by the robot's size. verdict_only: without the optional stages.
         remember: folder for the fits of the search, so that a killed one goes on where it was.
         notes: what was noticed while model and logs were read, for the warnings.
@@ -144,17 +149,12 @@ def investigate(
     asked: dict[str, Any] = {"group": group, "seed": seed, "settings": settings, "tolerated": tolerated, "notes": notes}
     asked |= {"budget": time_left}
     setup = prepare(robot, logs, effects, quick=quick, **asked, seen_first=lambda seen: tell(first_look.lines(seen)))
-    setup = resumed.remembering(_within(setup, time_left), criteria, remember)
+    setup = resumed.remembering(_within(setup, time_left), (criteria, decide), remember)
     for text in setup.said:
         say(text, 0, 1)
     known(setup, None)
     given = setup.fitter, setup.candidates, setup.settings, criteria
-    import os
-
-    if os.environ.get("BY_EVIDENCE"):
-        from bayessim_mjx.diagnosis.evidence.selecting import select
-    else:
-        select = selected.select
+    select = selecting.select if decide == EVIDENCE else selected.select
     found = Findings(setup, select(*given, say, lambda tried: known(setup, tried)))
     resumed.ended(setup)
     stages = [s for s in (STAGES if stages is None else stages) if not (s.optional and (quick or verdict_only))]
@@ -181,6 +181,7 @@ def diagnose(
     group: str | None = None,
     tolerance: str | Sequence[str] = (),
     criteria: Criteria | None = None,
+    decide: str = PREDICTION,
     accuracy: str | Sequence[str] = (),
     payload: str | Sequence[str] = (),
     minutes: float | None = None,
@@ -207,6 +208,7 @@ def diagnose(
         accuracy, payload: of a data sheet, as the flags: "5%", "mass=2%"; "12kg", "tool=12".
         minutes: that it may take; what was left out is told. quick: from few windows. verdict_only: no maps and such.
         criteria: when one model is better than another and which is named; None: as measured in benchmarks/results.md.
+        decide: by what effects are chosen: "prediction" of held-out logs, or "evidence" (docs/evidence.md).
         seed: of all random numbers; out: folder for what the command writes, but for the report; None: nothing.
         progress: called with (what is being done, done, total); early: with what logs tell at once, in lines.
         notes: first among the warnings; about: entries of the report's header.
@@ -224,6 +226,7 @@ def diagnose(
     told = _told(robot, model, logs, recorded) | {"seed": seed} | dict(about or {})
     files = Files(None if out is None else Path(out), told)
     asked: Any = {"group": group, "seed": seed, "notes": noticed, "progress": progress, "criteria": criteria}
+    asked |= {"decide": _known_rule(decide)}
     asked |= {"tolerated": _several(tolerance), "early": early, "minutes": minutes, "quick": quick}
     asked |= {"remember": files.search, "verdict_only": verdict_only}
     try:
@@ -257,6 +260,12 @@ def _logs(logs: Any, model: mujoco.MjModel, map: str | Path | None) -> list[Log]
     if all(isinstance(log, Log) for log in each):
         return each
     return read_logs(each if len(each) > 1 else each[0], model, map, partial=True)
+
+
+def _known_rule(decide: str) -> str:
+    if decide not in DECIDES:
+        raise UserError(f"decide={decide!r}: allowed are {' and '.join(DECIDES)}")
+    return decide
 
 
 def _several(texts: str | Sequence[str]) -> Sequence[str]:

@@ -6,7 +6,8 @@
 `counted_cases.py` fixes the cases: 150 of data sheets, 60 of poor logs. Rules, fixed before any case was diagnosed:
 
 - **Command.** `diagnose --model --data --seed 0 --verdict_only`: nothing is said of the data sheet's accuracy, all
-  effects are on offer, no time limit of the search. Another commit is measured with PYTHONPATH set to its checkout.
+  effects are on offer, no time limit of the search. Another commit is measured with PYTHONPATH set to its checkout,
+  another rule with `--more`.
 - **Running.** A process on one core for each case; it makes the case, diagnoses it and writes OUT/CASE/result.json.
   Those that are likely to take longest begin first. When the minutes are over, running ones are killed. A case without
   result counts as unfinished. The next `run` begins it again; its logs and the fits of its search stay.
@@ -46,7 +47,7 @@ THREADS = {name: "1" for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MK
 ALONE = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
 
 
-def one(folder: Path) -> None:
+def one(folder: Path, more: list[str]) -> None:
     """Make a case unless it is there, diagnose it, write its result."""
     import worker
     from counted_cases import Plan, again, make, seed_of
@@ -63,7 +64,7 @@ def one(folder: Path) -> None:
         result["making"] = time.process_time()
         out = folder / "diagnosis"
         words = ["--model", folder / "model.xml", "--data", folder / "logs", "--out", out, "--seed", "0", "--headless"]
-        result["code"], seconds, found = worker.watched([*map(str, words), "--verdict_only"])
+        result["code"], seconds, found = worker.watched([*map(str, words), "--verdict_only", *more])
         result |= seconds | {"cpu": time.process_time() - result["making"]}
         if (out / "diagnosis.json").exists():
             result["said"] = json.loads((out / "diagnosis.json").read_text())
@@ -98,7 +99,7 @@ def run(args: argparse.Namespace) -> None:
         while (waiting or running) and time.monotonic() < until:
             while waiting and free:
                 core, folder = free.pop(), waiting.pop(0)
-                running[core] = (_begin(folder, core), folder, time.monotonic())
+                running[core] = (_begin(folder, core, args.more), folder, time.monotonic())
             for core, (process, folder, begun) in list(running.items()):
                 if process.poll() is not None:
                     del running[core]
@@ -127,9 +128,9 @@ def _waiting(args: argparse.Namespace) -> list[Path]:
     return folders
 
 
-def _begin(folder: Path, core: int) -> "subprocess.Popen[bytes]":
+def _begin(folder: Path, core: int, more: str) -> "subprocess.Popen[bytes]":
     alone = {"JAX_PLATFORMS": "cpu", "XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {ALONE}".strip()} | THREADS
-    command = [sys.executable, __file__, "one", str(folder), "--core", str(core)]
+    command = [sys.executable, __file__, "one", str(folder), "--core", str(core), f"--more={more}"]
     with (folder / "output.txt").open("w") as text:
         return subprocess.Popen(
             command, stdout=text, stderr=subprocess.STDOUT, env=os.environ | alone, start_new_session=True
@@ -160,6 +161,8 @@ def main() -> None:
     single = commands.add_parser("one", help="one case in this process")
     single.add_argument("folder", type=Path)
     single.add_argument("--core", type=int)
+    for command in (several, single):
+        command.add_argument("--more", default="", help="further options of the command, as --more='--decide evidence'")
     told = commands.add_parser("score", help="tables of what came of all cases")
     told.add_argument("out", type=Path)
     told.add_argument("--before", type=Path, help="the same cases by another commit")
@@ -173,7 +176,7 @@ def main() -> None:
     else:
         if args.core is not None and hasattr(os, "sched_setaffinity"):
             os.sched_setaffinity(0, {args.core})  # before JAX counts the cores
-        one(args.folder)
+        one(args.folder, args.more.split())
 
 
 if __name__ == "__main__":

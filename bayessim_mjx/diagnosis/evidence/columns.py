@@ -101,6 +101,11 @@ class Promises:
         best = np.argsort(-gain, axis=None)[:count]
         return self.of([divmod(int(i), len(gain)) for i in best if np.isfinite(gain.flat[i])])
 
+    def whole(self) -> Array:
+        """`[P]`: log likelihood that each column gains at its point itself: of a limit a smaller part shows nothing."""
+        level = self.levels[0]
+        return level.g - 0.5 * np.diag(level.S)
+
     def of(self, sets: Sequence[tuple[int, ...]]) -> list[Promise]:
         return self._best([[level.of(own) for own in sets] for level in self.levels])
 
@@ -149,32 +154,77 @@ class _Level:
         return np.where(determinant > 1e-6 * np.outer(d, d), found, -np.inf)
 
 
-def _level(part: Part, belief: Belief, hyper: Hyper, columns: Sequence[Column]) -> _Level:
-    k, nodes = part.A.shape[2], part.D.shape[2] // len(part.scale)
-    root = np.kron(np.diag(hyper.amplitude * part.scale), correlation(nodes, hyper.memory))
-    noise = np.tile(hyper.noise**2, part.r.shape[1] // part.channels)
-    Q, logdet = np.zeros((1 + k + len(columns),) * 2), 0.0
-    for w in range(len(part.r)):
-        B = part.B[w] * part.spread
-        V = np.concatenate([part.D[w] @ root, B], 1)
-        L = np.linalg.cholesky(V @ V.T + np.diag(noise))
-        start = part.r[w] + part.B[w] @ part.offsets[w]
-        Y = np.concatenate([start[:, None], part.A[w], np.stack([c.change[w] for c in columns], 1)], 1)
-        Z = np.linalg.solve(L, Y)
-        Q += Z.T @ Z
-        logdet += 2 * float(np.sum(np.log(np.diag(L))))
-    Q, logdet = Q * part.share, logdet * part.share
-    p = belief.best(Q[: 1 + k, : 1 + k])
-    free = np.flatnonzero((p > belief.low) & (p < belief.high))
-    own = 1 + np.arange(k)
-    H = Q[np.ix_(own[free], own[free])] + np.diag(belief.precision[free])
-    take = np.linalg.solve(H, Q[np.ix_(own[free], np.arange(1 + k, len(Q)))]) if len(free) else np.zeros((0, len(columns)))
-    S = Q[1 + k :, 1 + k :] - Q[np.ix_(np.arange(1 + k, len(Q)), own[free])] @ take
-    g = Q[1 + k :, 0] - Q[1 + k :, own] @ p
-    base = -0.5 * belief.cost(Q[: 1 + k, : 1 + k], p) - 0.5 * logdet
-    if len(free):
-        base -= 0.5 * float(np.linalg.slogdet(H)[1])
-    amplitude = (np.log(hyper.amplitude) - np.log(PRIORS.usual)) / PRIORS.spread
-    base -= 0.5 * float(np.sum(amplitude**2))
+def leading(
+    part: Part, belief: Belief, hyper: Hyper, columns: Sequence[Column], points: int, most: int
+) -> list[Column]:
+    """The columns that promise most by themselves, so many of each candidate and in all; few inner products tell."""
+    rest = _Rest(part, belief, _scaled(hyper, SHARES[-2]))
+    few, squares = rest.products(columns, diagonal=True)
+    g, s = rest.projected(few, squares)
     precision = np.maximum([c.precision for c in columns], 1e-12)
-    return _Level(S, g, precision, np.array([c.room for c in columns]), base)
+    t = np.clip(g / (s + precision), *np.array([c.room for c in columns]).T)
+    nats = g * t - 0.5 * t**2 * (s + precision) + 0.5 * np.log(precision / (s + precision))
+    count: dict[str, int] = {}
+    out = []
+    for j in np.argsort(-nats):
+        label = columns[j].candidate.label
+        count[label] = count.get(label, 0) + 1
+        out += [columns[j]] if count[label] <= points else []
+    return out[:most]
+
+
+class _Rest:
+    """All but the columns: a fit's residual, its parameters, force and start states, in some windows."""
+
+    def __init__(self, part: Part, belief: Belief, hyper: Hyper) -> None:
+        self.part, self.hyper = part, hyper
+        nodes = part.D.shape[2] // len(part.scale)
+        self.root = np.kron(np.diag(hyper.amplitude * part.scale), correlation(nodes, hyper.memory))
+        self.noise = np.tile(hyper.noise, part.r.shape[1] // part.channels)
+        self.own = 1 + part.A.shape[2]
+        few, _ = self.products((), diagonal=False)
+        self.p = belief.best(few)
+        self.free = np.flatnonzero((self.p > belief.low) & (self.p < belief.high))
+        self.H = few[1:, 1:][np.ix_(self.free, self.free)] + np.diag(belief.precision[self.free])
+        amplitude = (np.log(hyper.amplitude) - np.log(PRIORS.usual)) / PRIORS.spread
+        self.base = -0.5 * (belief.cost(few, self.p) + self.logdet + float(np.sum(amplitude**2)))
+        self.base -= 0.5 * float(np.linalg.slogdet(self.H)[1]) if len(self.free) else 0.0
+
+    def products(self, columns: Sequence[Column], diagonal: bool) -> tuple[Array, Array]:
+        """Inner products with force and start states integrated out, summed over the windows.
+
+        Returns:
+            Of (residual, parameters) with (residual, parameters, columns) `[1 + k, 1 + k + P]`, and of the columns with
+            each other `[P, P]`, or with themselves `[P]`.
+        """
+        part, own, logdet = self.part, self.own, 0.0
+        few = np.zeros((own, own + len(columns)))
+        among = np.zeros(len(columns) if diagonal else (len(columns), len(columns)))
+        for w in range(len(part.r)):
+            V = np.concatenate([part.D[w] @ self.root, part.B[w] * part.spread], 1) / self.noise[:, None]
+            L = np.linalg.cholesky(V.T @ V + np.eye(V.shape[1]))
+            start = part.r[w] + part.B[w] @ part.offsets[w]
+            Y = np.stack([start, *part.A[w].T, *(c.change[w] for c in columns)], 1) / self.noise[:, None]
+            T = np.linalg.solve(L, V.T @ Y)
+            few += Y[:, :own].T @ Y - T[:, :own].T @ T
+            Y, T = Y[:, own:], T[:, own:]
+            among += np.sum(Y**2, 0) - np.sum(T**2, 0) if diagonal else Y.T @ Y - T.T @ T
+            logdet += 2 * float(np.sum(np.log(np.diag(L))) + np.sum(np.log(self.noise)))
+        self.logdet = logdet * part.share
+        return few * part.share, among * part.share
+
+    def projected(self, few: Array, among: Array) -> tuple[Array, Array]:
+        """(gradients `[P]`, products `[P, P]` or `[P]`) with the parameters at their best for each amount."""
+        own = self.own
+        across = few[1:, own:][self.free]
+        take = np.linalg.solve(self.H, across) if len(self.free) else across
+        g = few[0, own:] - self.p @ few[1:, own:]
+        less = np.sum(across * take, 0) if among.ndim == 1 else across.T @ take
+        return g, among - less
+
+
+def _level(part: Part, belief: Belief, hyper: Hyper, columns: Sequence[Column]) -> _Level:
+    rest = _Rest(part, belief, hyper)
+    g, S = rest.projected(*rest.products(columns, diagonal=False))
+    precision = np.maximum([c.precision for c in columns], 1e-12)
+    return _Level(S, g, precision, np.array([c.room for c in columns]), rest.base)

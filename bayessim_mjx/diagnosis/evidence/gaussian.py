@@ -122,7 +122,7 @@ class Marginal:
 def correlation(nodes: int, memory: float) -> Array:
     """Root of an Ornstein-Uhlenbeck process's correlation at nodes."""
     lag = np.abs(np.subtract.outer(np.arange(nodes), np.arange(nodes)))
-    return np.linalg.cholesky(np.exp(-lag / memory) + 1e-9 * np.eye(nodes))
+    return np.asarray(np.linalg.cholesky(np.exp(-lag / memory) + 1e-9 * np.eye(nodes)), np.float64)
 
 
 def marginal(windows: Windows, hyper: Hyper) -> Marginal:
@@ -134,7 +134,7 @@ def marginal(windows: Windows, hyper: Hyper) -> Marginal:
     root[:forces, :forces] = np.kron(np.diag(hyper.amplitude), correlation(windows.nodes, hyper.memory))
     VY = root.T @ gram[:, own:, :own]
     inner = root.T @ gram[:, own:, own:] @ root + np.eye(size)
-    cov = np.linalg.inv(inner)
+    cov = np.asarray(np.linalg.inv(inner), np.float64)
     mean = cov @ VY
     logdet = np.linalg.slogdet(inner)[1] + 2 * windows.rows * float(np.sum(np.log(hyper.noise)))
     return Marginal(gram[:, :own, :own] - VY.mT @ mean, logdet, root, cov, mean)

@@ -20,6 +20,7 @@ from bayessim_mjx.diagnosis.selection.laws import compatible, special_cases
 from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.selection.pool import Pool, Progress
 from bayessim_mjx.diagnosis.selection.screen import Screened
+from bayessim_mjx.diagnosis.selection.sets import Weighed
 from bayessim_mjx.diagnosis.selection.table import Key, Table
 from bayessim_mjx.diagnosis.selection.tried import Settings, Tried
 from bayessim_mjx.diagnosis.selection.weak_directions import Ridges
@@ -61,6 +62,7 @@ class Selection(Tried):
         chosen: {operating condition: effects that are named without it}.
         elsewhere: share of the gap closed on conditions that the choice was made without; NaN of one condition.
         hidden: labels of effects that would not show beside those of the answer (`selection.hidden`).
+        weighed: probabilities of sets, where the evidence decided.
     """
 
     fitter: Fitter
@@ -82,7 +84,7 @@ class Selection(Tried):
     chosen: Mapping[int, Key] = field(default_factory=dict)
     elsewhere: float = float("nan")
     hidden: tuple[str, ...] = ()
-    weighed: Any = None
+    weighed: Weighed | None = None
     cut_short: frozenset[str] = frozenset()
     skipped: Mapping[str, int] = field(default_factory=dict)
 

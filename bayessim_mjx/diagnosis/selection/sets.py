@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-Key = frozenset[str]
-EXPECTED = 1.0  # effects that a simulator lacks, before any log is seen; the known parameters alone are as likely as one
+Key = frozenset[str]  # labels of a model's effects
+BASE: Key = frozenset()  # the known parameters alone
+EXPECTED = (
+    1.0  # effects that a simulator lacks, before any log is seen; the known parameters alone are as likely as one
+)
 
 
 def log_prior(key: Key, candidates: int) -> float:
@@ -34,6 +38,22 @@ RELEVANCE = Relevance()
 
 
 @dataclass(frozen=True)
+class Odds:
+    """Odds between two explanations (Kass and Raftery, J. Am. Stat. Assoc. 90, 1995, sec. 3.2).
+
+    Attributes:
+        mention: below it the difference is not worth more than a bare mention: the simpler one is named.
+        strong: below it the evidence is not "strong": both stand.
+    """
+
+    mention: float = 3.0
+    strong: float = 20.0
+
+
+ODDS = Odds()
+
+
+@dataclass(frozen=True)
 class Weighed:
     """Posterior probabilities of the sets that were fitted, most likely first.
 
@@ -41,14 +61,34 @@ class Weighed:
 
     Attributes:
         weight: {set: probability}; nats: {set: log of evidence and prior over those of the known parameters alone}.
+        numbers: {set: free numbers of its effects}.
     """
 
     weight: Mapping[Key, float]
     nats: Mapping[Key, float]
+    numbers: Mapping[Key, int]
 
     @property
     def answer(self) -> Key:
-        return next(iter(self.weight))
+        """Of the sets that are as likely as the most likely one (`Odds.mention`), that with the fewest numbers."""
+        return min(self._within(ODDS.mention), key=lambda k: (len(k), self.numbers[k], -self.weight[k], sorted(k)))
+
+    @property
+    def beside(self) -> list[Key]:
+        """The other sets that the evidence does not speak strongly against, most likely first."""
+        return [k for k in self._within(ODDS.strong) if k != self.answer]
+
+    def told(self) -> list[dict[str, Any]]:
+        """The sets that hold all but a thousandth of the probability, and the known parameters alone, for JSON."""
+        kept, whole = [], 0.0
+        for key, weight in self.weight.items():
+            kept += [key] if whole < 0.999 or key == BASE else []
+            whole += weight
+        return [{"effects": sorted(k), "probability": self.weight[k], "nats": self.nats[k]} for k in kept]
+
+    def _within(self, odds: float) -> list[Key]:
+        best = max(self.weight.values())
+        return [k for k, w in self.weight.items() if w * odds >= best]
 
 
 def core(key: Key, excess: Mapping[Key, float]) -> Key:
@@ -57,17 +97,19 @@ def core(key: Key, excess: Mapping[Key, float]) -> Key:
     Args:
         excess: {set: held-out squared error above the noise, in noise variances}, of all sets that were fitted.
     """
-    limit = excess[key] + RELEVANCE.noise + RELEVANCE.share * max(excess[frozenset()], 0.0)
+    limit = excess[key] + RELEVANCE.noise + RELEVANCE.share * max(excess[BASE], 0.0)
     enough = [k for k in excess if k <= key and excess[k] <= limit]
     return min(enough, key=lambda k: (len(k), excess[k], sorted(k)))
 
 
-def weighed(evidence: Mapping[Key, float], excess: Mapping[Key, float], candidates: int) -> Weighed:
+def weighed(
+    evidence: Mapping[Key, float], excess: Mapping[Key, float], numbers: Mapping[Key, int], candidates: int
+) -> Weighed:
     """The posterior; `evidence` and `excess` (see `core`) have the empty set, the known parameters alone."""
     own = {k: excess[k] for k in evidence}
     total = {k: e + log_prior(k, candidates) for k, e in evidence.items() if core(k, own) == k}
-    base, best = total[frozenset()], max(total.values())
+    base, best = total[BASE], max(total.values())
     each = {k: float(np.exp(t - best)) for k, t in total.items()}
     whole = sum(each.values())
     order = sorted(total, key=lambda k: (-total[k], len(k), sorted(k)))
-    return Weighed({k: each[k] / whole for k in order}, {k: total[k] - base for k in order})
+    return Weighed({k: each[k] / whole for k in order}, {k: total[k] - base for k in order}, numbers)

@@ -86,6 +86,7 @@ def diagnosis_of(found: Findings, about: Mapping[str, Any] | None = None, file: 
         chance=odds,
         hidden=list(selection.hidden),
         accuracy=_accuracy(model, sheet),
+        evidence=[] if selection.weighed is None else selection.weighed.told(),
     )
 
 

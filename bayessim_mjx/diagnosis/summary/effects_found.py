@@ -131,6 +131,9 @@ def _weights(found: Findings, models: list[Model]) -> list[float]:
     """Relative scores of a model and its rivals, no probabilities of being right; NaN of one that has none."""
     if len(models) < 2:
         return [float("nan")]
+    if (weighed := found.selection.weighed) is not None:
+        each = np.array([weighed.weight.get(frozenset(e.label for e in m.effects), 0.0) for m in models])
+        return (each / max(each.sum(), 1e-300)).tolist()
     group, rng = found.setup.fitter.simulator.windows.group, np.random.default_rng(found.setup.seed)
     return uncertainty.win_share(models, group, found.selection.noise, rng, found.setup.fitter.numbers).tolist()
 

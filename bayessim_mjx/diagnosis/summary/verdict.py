@@ -194,6 +194,8 @@ def by_chance(found: Findings) -> dict[str, Any]:
 
     {"probability" of the answer, "each": {label: of what it brings beside the others}, "nats", "draws", "candidates"}
     """
+    if found.selection.weighed is not None:  # it has a probability of its own (`Diagnosis.evidence`)
+        return {}
     selection, table = found.selection, found.selection.table
     key = frozenset(e.label for e in found.model.effects)
     if not key or table is None or not len(table.chance) or key not in table.rows:

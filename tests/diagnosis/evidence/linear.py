@@ -40,10 +40,12 @@ def draw(seed, count=40, k=2, amplitude=0.02, memory=4.0, noise=(1.0, 1.2), p=No
     A, B = rng.normal(size=(count, n, k)), rng.normal(size=(count, n, STARTS))
     D = gain / scale * np.cumsum(rng.normal(size=(count, n, NODES)), 1) / n
     p = rng.normal(size=k) if p is None else np.asarray(p, float)
-    r = np.stack([
-        rng.multivariate_normal(a @ p, covariance(amplitude, memory, noise, b, d, scale))
-        for a, b, d in zip(A, B, D, strict=True)
-    ])
+    r = np.stack(
+        [
+            rng.multivariate_normal(a @ p, covariance(amplitude, memory, noise, b, d, scale))
+            for a, b, d in zip(A, B, D, strict=True)
+        ]
+    )
     return Drawn(r, A, B, D, p, scale)
 
 

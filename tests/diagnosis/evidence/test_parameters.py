@@ -61,7 +61,9 @@ def test_the_accuracy_of_a_data_sheet_is_integrated_out(truth):
     found, there = evidence(case, fitted([known], [1.0]))
     prior = stats.t(SURE, scale=ACCURACY)
     top = max(likelihood(there, p) for p in np.linspace(-1, 1, 401))
-    whole = integrate.quad(lambda p: prior.pdf(p) * np.exp(likelihood(there, p) - top), -2, 2, limit=400, points=[0, truth])[0]
+    whole = integrate.quad(
+        lambda p: prior.pdf(p) * np.exp(likelihood(there, p) - top), -2, 2, limit=400, points=[0, truth]
+    )[0]
     assert found.nats == pytest.approx(top + np.log(whole), abs=0.1)
 
 

@@ -1,0 +1,99 @@
+"""The evidence of the models of a pool: each by its own fit, with the missing force learnt anew."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayessim_mjx.diagnosis.evidence.gaussian import Hyper, Learnt, learn, windows_of
+from bayessim_mjx.diagnosis.evidence.parameters import Integrated, belief_of, integrated, timed
+from bayessim_mjx.diagnosis.fitting.fit import Fit
+from bayessim_mjx.diagnosis.residual import forcing
+from bayessim_mjx.diagnosis.selection.models import Model
+from bayessim_mjx.diagnosis.selection.pool import Pool
+from bayessim_mjx.diagnosis.selection.sets import BASE, RELEVANCE, Key, Weighed, log_prior, weighed
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Scored:
+    """A fitted model with its evidence; fit: its own, with the lag of rows (`parameters.timed`)."""
+
+    model: Model
+    fit: Fit
+    learnt: Learnt
+    found: Integrated
+
+
+class Weighing:
+    """What was weighed so far.
+
+    Attributes:
+        scored: by their sets; D: `[W, n, nv m]`, what forces do to the windows, of the fit of the known parameters.
+    """
+
+    def __init__(self, pool: Pool) -> None:
+        fitter = pool.fitter
+        self.pool = pool
+        self.scale = forcing.force_scale(fitter)
+        self.D = forcing.columns(fitter, pool.base.fit, forcing.default_nodes(fitter), self.scale)
+        self.channels = int(fitter.used.sum())
+        self.scored: dict[Key, Scored] = {}
+        self._rate, self._period = fitter.rate(), float(fitter.simulator.windows.dt)
+        self.score([BASE])
+
+    def timed(self, fit: Fit) -> Fit:
+        return timed(fit, self._rate, self._period)
+
+    @property
+    def hyper(self) -> Hyper:
+        """Of the known parameters alone."""
+        return self.scored[BASE].learnt.hyper
+
+    def score(self, keys: Iterable[Key]) -> None:
+        """The evidence of models that are fitted, anew where the fit is another."""
+        for key in keys:
+            model, old = self.pool.models.get(key), self.scored.get(key)
+            if model is not None and (old is None or old.model is not model):
+                fit, spread = self.timed(model.fit), self.pool.fitter.spread
+                own = windows_of(fit.r, fit.A, fit.B, self.D, fit.offsets, spread, self.scale, self.channels)
+                learnt = learn(own, belief_of(fit), self.hyper if BASE in self.scored else None)
+                self.scored[key] = Scored(model, fit, learnt, integrated(fit, learnt))
+
+    def excess(self, key: Key) -> float:
+        """Held-out squared error above the noise, in noise variances, mean of the windows."""
+        model = self.scored[key].model
+        return model.total / (self.pool.noise * len(model.cost)) - 1.0
+
+    def settled(self, key: Key) -> bool:
+        """Whether a set of effects leaves nothing that matters."""
+        return bool(key) and self.excess(key) <= RELEVANCE.noise + RELEVANCE.share * max(self.excess(BASE), 0.0)
+
+    def total(self, key: Key) -> float:
+        """Log of evidence and prior over those of the known parameters alone."""
+        more = log_prior(key, len(self.pool.candidates))
+        return self.scored[key].found.nats + more - self.scored[BASE].found.nats
+
+    def weighed(self) -> Weighed:
+        """The posterior over what was weighed."""
+        return self._weighed({k: s.found.nats for k, s in self.scored.items()})
+
+    def without(self, condition: int) -> Weighed:
+        """The posterior given all windows but those of one operating condition, with the same hyperparameters."""
+        kept = self.pool.fitter.simulator.windows.group != condition
+        return self._weighed({k: integrated(s.fit, _some(s, kept)).nats for k, s in self.scored.items()})
+
+    def _weighed(self, nats: dict[Key, float]) -> Weighed:
+        excess = {k: self.excess(k) for k in self.scored}
+        numbers = {k: sum(len(e.coordinates) for e in s.model.effects) for k, s in self.scored.items()}
+        return weighed(nats, excess, numbers, len(self.pool.candidates))
+
+
+def _some(of: Scored, kept: NDArray[np.bool_]) -> Learnt:
+    there = of.learnt.marginal
+    part = replace(there, Q=there.Q[kept], logdet=there.logdet[kept], cov=there.cov[kept], mean=there.mean[kept])
+    return replace(of.learnt, marginal=part, step=belief_of(of.fit).best(part.Q.sum(0)))
