@@ -64,10 +64,8 @@ class Search:
         self._leading()
         for made in range(EFFORT.rounds):
             best = self._order()[0]
-            if self.weighing.settled(best) or self.pool.settings.budget.over(TOGETHER):
-                break
-            todo = self._worth([p for key in self._near(best) for p in self._around(key)], 0)
-            if not todo:
+            todo = self._worth([p for key in self._near(best) for p in self._around(key) if self._open(p, best)], 0)
+            if not todo or self.pool.settings.budget.over(TOGETHER):
                 break
             self._fit(todo, f"round {made + 1}", TOGETHER)
             self._leading()
@@ -87,6 +85,10 @@ class Search:
         return list(
             dict.fromkeys([best, *(best - {x} for x in sorted(best) if best - {x} in self.weighing.scored), BASE])
         )
+
+    def _open(self, plan: Plan, best: Key) -> bool:
+        """Whether a set could tell more: of one that leaves nothing relevant only others of its size can stand beside."""
+        return len(plan.key) == len(best) if self.weighing.settled(best) else True
 
     def _around(self, key: Key) -> list[Plan]:
         if key not in self._plans:

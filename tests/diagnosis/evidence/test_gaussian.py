@@ -48,7 +48,7 @@ def test_a_start_as_measured_counts_whatever_start_the_fit_has():
     case, moved = draw(2), np.random.default_rng(3).normal(size=(40, 2))
     there = case.r - np.einsum("wns,ws->wn", case.B, moved)
     again = windows_of(there, case.A, case.B, case.D, moved, np.full(2, SPREAD), case.scale, CHANNELS)
-    assert marginal(again, HYPER).Q == pytest.approx(marginal(case.windows(), HYPER).Q, rel=1e-9)
+    assert pytest.approx(marginal(case.windows(), HYPER).Q, rel=1e-9) == marginal(again, HYPER).Q
 
 
 @pytest.mark.parametrize("memory", PRIORS.memories)
