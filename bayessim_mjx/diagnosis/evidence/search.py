@@ -87,7 +87,7 @@ class Search:
         )
 
     def _open(self, plan: Plan, best: Key) -> bool:
-        """Whether a set could tell more: of one that leaves nothing relevant only others of its size can stand beside."""
+        """Whether a set could tell more: beside one that leaves nothing relevant only others of its size can stand."""
         return len(plan.key) == len(best) if self.weighing.settled(best) else True
 
     def _around(self, key: Key) -> list[Plan]:

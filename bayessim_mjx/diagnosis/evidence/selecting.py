@@ -7,10 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from bayessim_mjx.diagnosis.evidence.estimates import at_its_mean, estimated
 from bayessim_mjx.diagnosis.evidence.search import Search
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fitter import Fitter
-from bayessim_mjx.diagnosis.selection import heldout, singles
+from bayessim_mjx.diagnosis.selection import singles
 from bayessim_mjx.diagnosis.selection.criteria import Criteria
 from bayessim_mjx.diagnosis.selection.decide import Alternative, Decision, closed_elsewhere
 from bayessim_mjx.diagnosis.selection.fits import Fits
@@ -33,13 +34,14 @@ def select(
     search = Search(pool, say)
     found = search.run()
     keep(pool)
-    if found.answer:
-        (pool.models[found.answer],) = heldout.refitted(fitter, [pool.models[found.answer]])
+    at_its_mean(search.weighing, found.answer)
     decision = decided(pool, found, say)
     names = np.unique(fitter.simulator.windows.group)
     chosen = {int(g): search.weighing.without(int(g)).answer for g in names} if len(names) > 1 and found.answer else {}
     elsewhere = closed_elsewhere(decision.table, chosen)
-    return replace(concluded(pool, decision, say), weighed=found, chosen=chosen, elsewhere=elsewhere)
+    whole = concluded(pool, decision, say, along_ridges=False)
+    own = estimated(search.weighing, found)
+    return replace(whole, weighed=found, estimated=own, chosen=chosen, elsewhere=elsewhere)
 
 
 def decided(pool: Pool, found: Weighed, say: Progress) -> Decision:

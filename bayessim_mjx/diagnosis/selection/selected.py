@@ -20,7 +20,7 @@ from bayessim_mjx.diagnosis.selection.laws import compatible, special_cases
 from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.selection.pool import Pool, Progress
 from bayessim_mjx.diagnosis.selection.screen import Screened
-from bayessim_mjx.diagnosis.selection.sets import Weighed
+from bayessim_mjx.diagnosis.selection.sets import Estimated, Weighed
 from bayessim_mjx.diagnosis.selection.table import Key, Table
 from bayessim_mjx.diagnosis.selection.tried import Settings, Tried
 from bayessim_mjx.diagnosis.selection.weak_directions import Ridges
@@ -62,7 +62,7 @@ class Selection(Tried):
         chosen: {operating condition: effects that are named without it}.
         elsewhere: share of the gap closed on conditions that the choice was made without; NaN of one condition.
         hidden: labels of effects that would not show beside those of the answer (`selection.hidden`).
-        weighed: probabilities of sets, where the evidence decided.
+        weighed, estimated: probabilities of sets and the answer's posterior, where the evidence decided.
     """
 
     fitter: Fitter
@@ -85,6 +85,7 @@ class Selection(Tried):
     elsewhere: float = float("nan")
     hidden: tuple[str, ...] = ()
     weighed: Weighed | None = None
+    estimated: Estimated | None = None
     cut_short: frozenset[str] = frozenset()
     skipped: Mapping[str, int] = field(default_factory=dict)
 
@@ -117,15 +118,18 @@ def select(
     return concluded(pool, decision, say)
 
 
-def concluded(pool: Pool, decision: Decision, say: Progress) -> Selection:
-    """The answer where data and beliefs together put it, with its rivals and its parts."""
+def concluded(pool: Pool, decision: Decision, say: Progress, along_ridges: bool = True) -> Selection:
+    """The answer where data and beliefs together put it, with its rivals and its parts.
+
+    along_ridges: whether it still has to move along directions that the data hardly tell.
+    """
     fitter, settings, searched = pool.fitter, pool.settings, decision.searched or decision.table
     pool.base = pool.models[frozenset()]
     named = pool.models[decision.answer]
     rivals = {e.label: _rivals(pool, e, named, decision) for e in named.effects}
     chosen = chosen_elsewhere(searched, order(searched.laws), pool.criteria) if named.effects else {}
     answer, along = named, None
-    if answer.effects:
+    if answer.effects and along_ridges:
         answer, along = weak_directions.settled(fitter, answer)
         (answer,) = [answer] if answer is named else heldout.refitted(fitter, [answer])
         pool.models[decision.answer] = answer

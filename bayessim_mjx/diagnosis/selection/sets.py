@@ -7,6 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+
+from bayessim_mjx.diagnosis.selection.accuracy import Posterior
 
 Key = frozenset[str]  # labels of a model's effects
 BASE: Key = frozenset()  # the known parameters alone
@@ -89,6 +92,14 @@ class Weighed:
     def _within(self, odds: float) -> list[Key]:
         best = max(self.weight.values())
         return [k for k, w in self.weight.items() if w * odds >= best]
+
+
+@dataclass(frozen=True, eq=False)
+class Estimated:
+    """Posterior of the answer's numbers: covariance `[k, k]`, and the data sheet's accuracies behind it."""
+
+    covariance: NDArray[np.float64]
+    sheet: Posterior
 
 
 def core(key: Key, excess: Mapping[Key, float]) -> Key:

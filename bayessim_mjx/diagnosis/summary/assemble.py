@@ -47,7 +47,8 @@ def diagnosis_of(found: Findings, about: Mapping[str, Any] | None = None, file: 
     """
     setup, selection, model = found.setup, found.selection, found.model
     timestep = float(setup.robot.mj_model.opt.timestep) * (setup.discretisation.factor if setup.discretisation else 1)
-    together = uncertainty.covariance(setup.fitter, model, selection.along)
+    own = selection.estimated
+    together = uncertainty.covariance(setup.fitter, model, selection.along) if own is None else own.covariance
     together = together + np.diag(uncertainty.systematic(model, timestep, selection.left(model)) ** 2)
     finer = found.part(AtFinerSteps)
     steps = finer.notes(found, together) if finer else []
@@ -58,7 +59,7 @@ def diagnosis_of(found: Findings, about: Mapping[str, Any] | None = None, file: 
     far = how_far.measured(found, {k: v for k, v in closed.items() if k != "each"})
     verdict = verdict_of(found, far)
     parameters = _parameters(selection, model, sd)
-    sheet = uncertainty.accuracies(setup.fitter, model, selection.along)
+    sheet = uncertainty.accuracies(setup.fitter, model, selection.along) if own is None else own.sheet
     over, where, proposal = found.part(Whole), found.part(Where), found.part(Experiment)
     far = how_far.with_whole(far, over, setup.tolerance) if over else far
     odds = by_chance(found)

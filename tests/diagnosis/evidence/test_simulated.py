@@ -41,8 +41,8 @@ def test_what_is_missing_is_named_and_what_is_not_is_not(found):
 def test_the_evidence_is_that_of_the_simulator(found, key, within):
     """Unbiased estimate: draws around the fit, each simulated, force and start state integrated out exactly.
 
-    A set that lacks an effect leaves a large force, beside which the model is less linear: hundreds of nats behind, it is
-    off by a few.
+    A set that lacks an effect leaves a large force, beside which the model is less linear: hundreds of nats behind, it
+    is off by a few.
     """
     search, _ = found
     weighing, scored = search.weighing, search.weighing.scored[key]

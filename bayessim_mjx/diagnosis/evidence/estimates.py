@@ -1,0 +1,67 @@
+"""Numbers of the answer by its posterior: their means and covariance, with what the sets beside it say of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayessim_mjx.diagnosis.evidence.weighing import Scored, Weighing
+from bayessim_mjx.diagnosis.selection import heldout
+from bayessim_mjx.diagnosis.selection.models import Model, scored
+from bayessim_mjx.diagnosis.selection.sets import Estimated, Key, Weighed
+
+Array = NDArray[np.float64]
+Say = Callable[[str, int, int], None]
+MOVED = 0.1  # standard deviations by which a number moves at least: less is not worth a simulation
+WORSE = 1.0  # nats that a move may cost: it is the step of a linear model
+
+
+def at_its_mean(weighing: Weighing, key: Key) -> Model:
+    """The model at its posterior mean, held-out estimates refitted; where it was if that is no better place."""
+    fitter, pool, old = weighing.pool.fitter, weighing.pool, weighing.scored[key]
+    fit = old.model.fit
+    low, high = (np.array([getattr(c, end) for c in fit.coordinates]) for end in ("low", "high"))
+    mean = np.clip(_whole(old)[0][:-1], low, high)
+    sd = np.sqrt(np.maximum(np.diag(_whole(old)[1])[:-1], 1e-300))
+    if np.any(np.abs(mean - fit.values) > MOVED * sd):
+        before = old.found.nats
+        moved = fitter.refresh(replace(fit, values=mean, history=()))
+        pool.models[key] = scored(fitter, moved, old.model.effects)
+        weighing.score([key])
+        if weighing.scored[key].found.nats < before - WORSE:
+            pool.models[key], weighing.scored[key] = old.model, old
+    (model,) = heldout.refitted(fitter, [pool.models[key]])
+    pool.models[key] = model
+    weighing.scored[key] = replace(weighing.scored[key], model=model)
+    return model
+
+
+def estimated(weighing: Weighing, found: Weighed) -> Estimated:
+    """Of the answer's numbers; known parameters with the sets beside it, by their probabilities."""
+    answer, base = weighing.scored[found.answer], len(weighing.pool.fitter.base)
+    mean, covariance = _whole(answer)
+    covariance = covariance[:-1, :-1].copy()
+    keys = [found.answer, *found.beside]
+    share = np.array([found.weight[k] for k in keys])
+    share /= share.sum()
+    known = np.zeros((base, base))
+    for key, weight in zip(keys, share, strict=True):
+        own_mean, own = _whole(weighing.scored[key])
+        away = own_mean[:base] - mean[:base]
+        known += weight * (own[:base, :base] + np.outer(away, away))
+    sd = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+    wider = np.ones(len(sd))
+    wider[:base] = np.sqrt(np.maximum(np.diag(known), sd[:base] ** 2)) / sd[:base]
+    return Estimated(covariance * wider[:, None] * wider, answer.found.posterior)
+
+
+def _whole(of: Scored) -> tuple[Array, Array]:
+    """(mean `[k + 1]`, covariance) of the fit's numbers and the lag of rows; of those at a bound no spread."""
+    posterior, free = of.found.posterior, np.flatnonzero(of.found.free)
+    mean, covariance = np.asarray(of.fit.values + of.learnt.step), np.zeros((len(of.fit.values),) * 2)
+    mean[free] = posterior.middle
+    covariance[np.ix_(free, free)] = posterior.together()
+    return mean, covariance
