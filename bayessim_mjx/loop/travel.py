@@ -12,8 +12,8 @@ from bayessim_mjx.physics.tangent import addresses, difference
 from bayessim_mjx.tracking import Record
 
 STILL = 1e-6  # rad, m, rad/s, m/s: what float32 and a simulator's rounding make of a joint that does not move
-# Rows of one value that tell as much as if their errors were independent. By the posteriors of a cart in closed form,
-# with encoders of 2 to 58 rows a count: root mean squares of z are .85 to 1.02 with it, and up to 3.6 without.
+# Rows of one value that tell as much as if their errors were independent: with it root mean squares of z are .92 to .99
+# where encoders show 2 to 52 rows a count, up to 3.5 without (benchmarks/inference/counts.py).
 ROWS = 4
 SAME = 0.1  # standard deviations of the sensor: what resampling between two equal rows makes of them is less
 
