@@ -13,7 +13,7 @@ from bayessim_mjx.distributions.charts import from_chart, to_chart
 from bayessim_mjx.kalman import Gains
 from bayessim_mjx.loop.noise import FINEST, Linear, Noise, NoiseModel
 from bayessim_mjx.loop.starts import Starts
-from bayessim_mjx.loop.travel import silent, travel
+from bayessim_mjx.loop.travel import repeated, silent, travel
 from bayessim_mjx.physics import Physics
 from bayessim_mjx.tracking import Record, close, errors, transitions
 
@@ -52,7 +52,10 @@ class Likelihood:
         self.silent = silent(record, physics.mj_model, sensor)
         self.scale = size = travel(record, physics.mj_model)
         known = np.isfinite(sensor) & ~self.silent
-        self.floor = np.where(known, np.maximum(np.nan_to_num(sensor, posinf=0.0), FINEST * size), np.inf)
+        told = np.where(known, sensor, 0.0)
+        self.told = np.where(known, np.maximum(told, FINEST * size), np.inf)  # of one row, as of a start
+        more = repeated(record, physics.mj_model, told, self.valid)
+        self.floor = np.where(known, np.maximum(told * more, FINEST * size), np.inf)
         self.seen = np.isfinite(self.floor)
         self.starts = Starts(record, physics.mj_model)
         self.begun = record  # from the most likely starts
@@ -120,7 +123,7 @@ class Likelihood:
         ways, gaps = self._dynamics(theta, path, self.parts)
         linear = self._linear(theta, path, ways, gaps)
         self.noise = self.model.likely(linear, self.noise)
-        self.begun = self.starts.begun(self.floor)  # by the told noise: what else sensors show is no error of starts
+        self.begun = self.starts.begun(self.told)  # by the told noise: what else sensors show is no error of starts
         self.laplace = self._posterior(linear)
         gains = self.model.gains(ways, self.noise)
         mask = jnp.asarray(self.valid, jnp.float32)[:, :, None, None]

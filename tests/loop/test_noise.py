@@ -13,7 +13,7 @@ from bayessim_mjx.kalman import innovations, measured_noise, riccati
 from bayessim_mjx.loop import refining
 from bayessim_mjx.loop.likelihood import Likelihood
 from bayessim_mjx.loop.state import LoopState
-from bayessim_mjx.loop.travel import silent
+from bayessim_mjx.loop.travel import repeated, silent
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 from bayessim_mjx.physics import Physics
 from bayessim_mjx.physics.tangent import difference, noisy
@@ -112,12 +112,27 @@ def test_a_joint_that_shows_one_value_has_no_say_unless_its_noise_is_told(physic
     assert found.silent.tolist() == [False, True, False, True] and found.seen.tolist() == [True, False, True, False]
     assert found.scale.min() > 1e-4  # states that are not seen are varied by numbers that float32 can tell apart
     known = Likelihood(physics, held, np.ones((COUNT, STEPS)), np.array([0.02, 0.001, 0.05, 0.01]))
-    assert known.seen.all() and known.floor[1] == pytest.approx(0.001)
+    assert known.seen.all() and known.told[1] == pytest.approx(0.001)
 
 
 def test_a_sensor_without_noise_that_moves_keeps_its_say(physics):
     record = recorded(physics, np.zeros(4))
     assert not silent(record, physics.mj_model, np.zeros(4)).any()
+
+
+def test_rows_of_one_count_tell_as_much_as_four_and_noise_tells_in_every_row(physics):
+    told = np.array([0.01, 0.01, 0.02, np.inf])
+    record, valid = recorded(physics, (0.01, 0.01, 0.02, 0.02)), np.ones((COUNT, STEPS))
+    np.testing.assert_array_equal(repeated(record, physics.mj_model, told, valid), np.ones(4))
+    count = np.arange(STEPS + 1) // 17 * 0.1  # three counts of 17 rows; between some, resampling leaves a trace
+    count = count + 0.0005 * (np.arange(STEPS + 1) % 2)
+    held = record.replace(qpos=jnp.asarray(record.qpos).at[:, :, 0].set(jnp.asarray(count, jnp.float32)))
+    found = repeated(held, physics.mj_model, told, valid)
+    np.testing.assert_allclose(found, [np.sqrt(17 / 4), 1, 1, 1], rtol=1e-6)
+    ended = np.where(np.arange(STEPS) < 3, 1.0, 0.0) * valid  # what follows an episode's end repeats, and says nothing
+    np.testing.assert_array_equal(repeated(held, physics.mj_model, told, ended), np.ones(4))
+    floors = [Likelihood(physics, r, valid, told).floor[0] for r in (record, held)]
+    assert floors[1] / floors[0] == pytest.approx(np.sqrt(17 / 4), rel=1e-6)
 
 
 def test_a_surrogates_orientations_are_as_noisy_as_is_said_and_of_norm_one():

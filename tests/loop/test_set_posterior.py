@@ -4,33 +4,28 @@ import dataclasses
 
 import numpy as np
 import pytest
-from stub_source import infer, made
+from stub_source import NOISE, infer, made
 
 from bayessim_mjx.loop import set_posterior
 
 
-# not in CI: since keys changed its network's sd is .098 beside .064, more than the 35 % below; why is not known yet
 @pytest.mark.slow
+@pytest.mark.ci
 def test_a_network_of_sets_is_the_posterior_where_it_is_asked_for(monkeypatch):
     monkeypatch.setattr(set_posterior, "FITTED", 1000)
-    choose, products = set_posterior.chosen, []
-
-    def chosen(loop, state, policy, product, info):
-        products.append(product)
-        return choose(loop, state, policy, product, info)
-
-    monkeypatch.setattr(set_posterior, "chosen", chosen)
-    _, info = infer(*made("bayessim.sets=embedding"))
+    state, info = infer(*made("bayessim.sets=embedding"))
     found = info.set_posterior
     assert found.used and info.seconds["sets"] > 0 and info.scores["set_network/gain"] == found.network.gain
-    # an exact posterior of mass: N(mean of two x, .1^2 / 2); of the other number nothing is known
-    ours, (product,) = info.posterior, products
-    assert abs(float(ours.mean()[0] - product.mean()[0])) < 0.05
-    assert float(ours.sd()[0]) == pytest.approx(float(product.sd()[0]), rel=0.35)
-    assert float(ours.contraction()[1]) < 0.1 and np.isclose(float(ours.prior_weight), 0.01)
+    # the exact posterior of mass is N(mean of two x, .1^2 / 2); of the other number nothing is known. Both are compared
+    # without the share of the prior that is kept: it alone makes the sd .096 where it is .0707. Over seeds 0 to 19 the
+    # sd is 1.02 +- .08 times the exact one (.83 to 1.22), the mean is off by .008 (.018 at most)
+    told, exact = info.posterior.estimates(), NOISE / np.sqrt(2)
+    assert abs(told.mean[0] - np.mean(state.real_features[:2, 0])) < 0.03
+    assert told.sd[0] == pytest.approx(exact, rel=0.3)  # a single trajectory's would be 1.41 times as wide
+    assert told.contraction[1] < 0.1 and np.isclose(told.prior_share, 0.01)
     assert found.network.gain == pytest.approx(found.product.gain, abs=0.3)
-    told = found.to_dict()
-    assert told["used"] and "by a network of the whole set" in told["sentence"]
+    words = found.to_dict()
+    assert words["used"] and "by a network of the whole set" in words["sentence"]
 
 
 def test_where_sets_cannot_be_simulated_the_product_is_kept_and_the_reason_told():
