@@ -129,8 +129,7 @@ def investigate(
 
     Args:
         robot: the model with the parameters that it may recalibrate.
-        logs, effects, group, minutes, quick, seed, criteria, decide, progress: see `diagnose`; tolerated: its
-            `tolerance`.
+        logs, effects, group, minutes, quick, seed, criteria, decide, progress: see `diagnose`; tolerated: tolerance.
         settings: budgets of the search; None: by the robot's size. verdict_only: without the optional stages.
         remember: folder for the fits of the search, so that a killed one goes on where it was.
         notes: what was noticed while model and logs were read, for the warnings.
@@ -142,6 +141,8 @@ def investigate(
     Raises:
         UserError: nothing usable. TooLittleData: nothing could be held out.
     """
+    if decide not in DECIDES:
+        raise UserError(f"decide={decide!r}: allowed are {' and '.join(DECIDES)}")
     say = progress or (lambda text, done, total: None)
     known, tell = keep or (lambda setup, tried: None), early or (lambda lines: None)
     say("looking at the logs", 0, 1)
@@ -202,37 +203,34 @@ def diagnose(
         logs: recorded motion: a folder, files (docs/logs.md), or `Log`s.
         effects: "all", or names (also of one's own, `path.py:Class`) or classes.
         parameters: YAML file with the parameters that may be recalibrated; None: damping, armature and mass.
-        map: YAML file that maps the columns of the logs to the model.
-        group: metadata key of the operating conditions that are held out in turn.
-        tolerance: what may stay unexplained, as `--tolerance`: "0.5deg", "elbow=2mm", "3%".
+        map: YAML file that maps the logs' columns to the model; group: metadata key of operating conditions.
+        tolerance: what may stay unexplained, as the flag: "0.5deg", "elbow=2mm", "3%".
         accuracy, payload: of a data sheet, as the flags: "5%", "mass=2%"; "12kg", "tool=12".
         minutes: that it may take; what was left out is told. quick: from few windows. verdict_only: no maps and such.
-        criteria: when one model is better than another and which is named; None: as measured in benchmarks/results.md.
-        decide: by what effects are chosen: "prediction" of held-out logs, or "evidence" (docs/evidence.md).
+        criteria: when one model is better than another; None: as measured in benchmarks/results.md.
+        decide: effects by the "prediction" of held-out logs, or by "evidence" (docs/evidence.md).
         seed: of all random numbers; out: folder for what the command writes, but for the report; None: nothing.
-        progress: called with (what is being done, done, total); early: with what logs tell at once, in lines.
+        progress, early: called with (what is being done, done, total), and with what logs tell at once, in lines.
         notes: first among the warnings; about: entries of the report's header.
 
     Returns:
         The result; too little data is a verdict, not an error.
 
     Raises:
-        UserError: model, logs, effects or tolerance are not usable.
+        UserError: model, logs, effects, tolerance or rule are not usable.
     """
     with noting() as noticed:
         robot = robot_of(model, parameters).stated(_several(accuracy), _several(payload))
         recorded = _logs(logs, robot.mj_model, map)
-    noticed = [*notes, *noticed]
     told = _told(robot, model, logs, recorded) | {"seed": seed} | dict(about or {})
-    files = Files(None if out is None else Path(out), told)
-    asked: Any = {"group": group, "seed": seed, "notes": noticed, "progress": progress, "criteria": criteria}
-    asked |= {"decide": _known_rule(decide)}
-    asked |= {"tolerated": _several(tolerance), "early": early, "minutes": minutes, "quick": quick}
-    asked |= {"remember": files.search, "verdict_only": verdict_only}
+    files = Files(Path(out) if out else None, told)
+    asked: Any = {"group": group, "seed": seed, "notes": [*notes, *noticed], "progress": progress, "criteria": criteria}
+    asked |= {"tolerated": _several(tolerance), "early": early, "minutes": minutes, "quick": quick, "decide": decide}
+    asked |= {"remember": files.search, "verdict_only": verdict_only, "keep": files.so_far, "verdict": files.verdict}
     try:
-        found = investigate(robot, recorded, effects, **asked, keep=files.so_far, verdict=files.verdict)
+        found = investigate(robot, recorded, effects, **asked)
     except TooLittleData as reason:
-        return files.whole(assemble.insufficient(str(reason), noticed, told), robot)
+        return files.whole(assemble.insufficient(str(reason), asked["notes"], told), robot)
     return files.whole(files.result(found), robot)
 
 
@@ -260,12 +258,6 @@ def _logs(logs: Any, model: mujoco.MjModel, map: str | Path | None) -> list[Log]
     if all(isinstance(log, Log) for log in each):
         return each
     return read_logs(each if len(each) > 1 else each[0], model, map, partial=True)
-
-
-def _known_rule(decide: str) -> str:
-    if decide not in DECIDES:
-        raise UserError(f"decide={decide!r}: allowed are {' and '.join(DECIDES)}")
-    return decide
 
 
 def _several(texts: str | Sequence[str]) -> Sequence[str]:

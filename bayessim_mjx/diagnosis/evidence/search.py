@@ -32,7 +32,8 @@ class Effort:
 
     Attributes:
         rounds: of looking around the leading set, at most.
-        sizes: sets of one, two and more further effects that are fitted in a round.
+        sizes: sets of one, two and more further effects that are fitted in a round, on top of the leading set.
+        instead: likewise in the place of each of its effects; base: on the known parameters.
         least: single effects that are fitted however little they promise: promises are linear.
         margin: nats below the leading set, within which a promise is worth a fit.
         leading: sets whose ranges may grow; finalists: whose fits are brought to their end.
@@ -40,6 +41,8 @@ class Effort:
 
     rounds: int = 5
     sizes: tuple[int, ...] = (6, 4, 2)
+    instead: tuple[int, ...] = (6, 0, 0)
+    base: tuple[int, ...] = (2, 4, 2)
     least: int = 4
     margin: float = 30.0
     leading: int = 3
@@ -60,11 +63,11 @@ class Search:
 
     def run(self) -> Weighed:
         """All rounds; the posterior over what was fitted."""
-        self._fit(self._worth([p for p in self._around(BASE) if len(p.key) == 1], EFFORT.least), SINGLES, SINGLES)
+        self._fit(self._worth(self._around(BASE), (EFFORT.sizes[0], 0, 0), EFFORT.least), SINGLES, SINGLES)
         self._leading()
         for made in range(EFFORT.rounds):
             best = self._order()[0]
-            todo = self._worth([p for key in self._near(best) for p in self._around(key) if self._open(p, best)], 0)
+            todo = self._todo(best)
             if not todo or self.pool.settings.budget.over(TOGETHER):
                 break
             self._fit(todo, f"round {made + 1}", TOGETHER)
@@ -80,30 +83,29 @@ class Search:
     def _order(self) -> list[Key]:
         return list(self.weighing.weighed().weight)
 
-    def _near(self, best: Key) -> list[Key]:
-        """The leading set, it without each of its effects where that is fitted, and the known parameters."""
-        return list(
-            dict.fromkeys([best, *(best - {x} for x in sorted(best) if best - {x} in self.weighing.scored), BASE])
-        )
-
-    def _open(self, plan: Plan, best: Key) -> bool:
-        """Whether a set could tell more: beside one that leaves nothing relevant only others of its size can stand."""
-        return len(plan.key) == len(best) if self.weighing.settled(best) else True
+    def _todo(self, best: Key) -> list[Plan]:
+        """What to fit around the leading set. Beside one that leaves nothing relevant only others of its size stand."""
+        smaller = [k for k in (best - {x} for x in sorted(best)) if k and k in self.weighing.scored]
+        plans = [p for k in smaller for p in self._worth(self._around(k), EFFORT.instead)]
+        if not self.weighing.settled(best):
+            plans += self._worth(self._around(best), EFFORT.sizes)
+            plans += self._worth(self._around(BASE), EFFORT.base) if best else []
+        return list({p.key: p for p in plans}.values())
 
     def _around(self, key: Key) -> list[Plan]:
         if key not in self._plans:
             self._plans[key] = around(self.weighing, key, self.say)
         return self._plans[key]
 
-    def _worth(self, plans: Sequence[Plan], least: int) -> list[Plan]:
+    def _worth(self, plans: Sequence[Plan], sizes: Sequence[int], least: int = 0) -> list[Plan]:
         """The best of the new ones, so many of each size: a larger set also mends what is not linear."""
         top = max(self.weighing.weighed().nats.values())
         out: dict[Key, Plan] = {}
-        count = [0] * len(EFFORT.sizes)
+        count = [0] * len(sizes)
         for plan in sorted(plans, key=lambda p: -p.nats):
-            size = min(len(plan.columns), len(EFFORT.sizes)) - 1
+            size = min(len(plan.columns), len(sizes)) - 1
             told = plan.nats > top - EFFORT.margin or count[size] < least
-            if told and count[size] < EFFORT.sizes[size] and plan.key not in self.pool.models and plan.key not in out:
+            if told and count[size] < sizes[size] and plan.key not in self.pool.models and plan.key not in out:
                 out[plan.key] = plan
                 count[size] += 1
         return list(out.values())
