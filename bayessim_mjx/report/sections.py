@@ -185,7 +185,8 @@ def _closure(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 
 def effects(d: Diagnosis) -> list[dict[str, Any]]:
-    return [_effect(e) for e in d.effects]
+    score = "probability among rivals" if d.evidence else "relative score among rivals (pseudo-BMA, no probability)"
+    return [_effect(e) | {"score": score} for e in d.effects]
 
 
 def _effect(e: FoundEffect) -> dict[str, Any]:

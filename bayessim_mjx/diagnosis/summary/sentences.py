@@ -11,6 +11,7 @@ from bayessim_mjx.diagnosis import phrases, statistics
 from bayessim_mjx.diagnosis.findings import Findings
 from bayessim_mjx.diagnosis.result import FoundEffect, Gap
 from bayessim_mjx.diagnosis.selection.selected import Rival
+from bayessim_mjx.diagnosis.selection.sets import BASE, Weighed
 from bayessim_mjx.diagnosis.summary import first_look
 from bayessim_mjx.diagnosis.summary.left_in_words import flexible_in_words
 from bayessim_mjx.diagnosis.summary.texts import (
@@ -33,6 +34,7 @@ from bayessim_mjx.diagnosis.summary.texts import (
     OF_SENSORS,
     ON_TOP,
     PARTLY,
+    PROBABLE,
     REST,
     STUCK,
     WITHIN,
@@ -52,6 +54,7 @@ class Limits:
 
 
 LIMITS = Limits()
+SELDOM = 1e-6  # a smaller probability has no number
 
 
 def sentences(
@@ -69,7 +72,7 @@ def sentences(
     told += [BENT.format(far=far_off, known=known)] if known else []
     if verdict.builds_up:
         told.append(BUILDS_UP.format(times=f"{verdict.builds_up:.2g}", window=f"{cut.steps * cut.dt:.2g} s"))
-    told += [_coasting(far, bool(effects)), _by_chance(odds)]
+    told += [_coasting(far, bool(effects)), _by_chance(odds), _probable(found.selection.weighed)]
     if found.selection.ambiguous:
         told += [_instead(e, found.selection.rivals.get(f"{e.name}@{e.where}", ())) for e in effects]
     told += [_hidden(found.selection.hidden, len(effects))]
@@ -118,6 +121,15 @@ def _by_chance(odds: Mapping[str, Any]) -> str:
     rare = odds["probability"] * (odds["draws"] + 1) < 1.5
     share = f"{'less than ' if rare else ''}{percent(odds['probability'])}"
     return BY_CHANCE.format(candidates=odds["candidates"], chance=share)
+
+
+def _probable(weighed: Weighed | None) -> str:
+    """Of what is named, where the evidence decided."""
+    if weighed is None or not weighed.answer:
+        return ""
+    others, nothing = sum(weighed.weight[k] for k in weighed.beside), weighed.weight[BASE]
+    told = percent(nothing) if nothing > SELDOM else "less than one in a million"
+    return PROBABLE.format(share=percent(weighed.weight[weighed.answer]), others=percent(others), nothing=told)
 
 
 def _coasting(far: Gap, named: bool) -> str:

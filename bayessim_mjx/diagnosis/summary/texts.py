@@ -48,6 +48,10 @@ BY_CHANCE = (
     "The best of {candidates} candidates gains as much in {chance} of logs in which nothing is missing (drawn from the "
     "recalibrated simulator with noise as it is in these logs)."
 )
+PROBABLE = (
+    "Probability of this explanation among all that were fitted: {share}; of the others that stand beside it: "
+    "{others}; of the known parameters alone: {nothing}."
+)
 HIDDEN = (
     "Beside {them} these logs would not show {hidden}: parameters of what is named do the same, and stand for both "
     "where both are there."
