@@ -103,17 +103,17 @@ def _search_options(parser: cli.PlainParser) -> None:
     )
     parser.add_argument(
         "--decide",
-        choices=("prediction", "evidence"),
-        default="prediction",
-        help="by what effects are chosen: the prediction of held-out logs, or the evidence of each set with a missing "
-        "force beside it, which gives probabilities (docs/evidence.md; default: prediction)",
+        choices=("evidence", "prediction"),
+        help="by what effects are chosen: the evidence of each set with a missing force beside it, which gives "
+        "probabilities (docs/evidence.md), or the prediction of held-out logs (default: evidence; with --criteria "
+        "prediction)",
     )
     parser.add_argument(
         "--criteria",
         metavar="KEY=VALUE",
         nargs="*",
         default=[],
-        help="change numbers by which models are compared and one is named, as same=.3 (docs/diagnosis.md)",
+        help="change numbers by which predictions are compared and one is named, as same=.3 (docs/how_it_decides.md)",
     )
 
 
@@ -159,7 +159,7 @@ def _diagnosis(args: argparse.Namespace, say: Any, early: Callable[[Sequence[str
         minutes=args.minutes,
         quick=args.quick,
         verdict_only=args.verdict_only,
-        criteria=Criteria().changed(args.criteria),
+        criteria=Criteria().changed(args.criteria) if args.criteria else None,
         decide=args.decide,
         seed=args.seed,
         out=args.out,
