@@ -103,10 +103,10 @@ def _search_options(parser: cli.PlainParser) -> None:
     )
     parser.add_argument(
         "--decide",
-        choices=("evidence", "prediction"),
-        help="by what effects are chosen: the evidence of each set with a missing force beside it, which gives "
-        "probabilities (docs/evidence.md), or the prediction of held-out logs (default: evidence; with --criteria "
-        "prediction)",
+        choices=("prediction", "evidence"),
+        default="prediction",
+        help="by what effects are chosen: the prediction of held-out logs, or the evidence of each set with a missing "
+        "force beside it, which gives probabilities (docs/evidence.md; default: prediction)",
     )
     parser.add_argument(
         "--criteria",

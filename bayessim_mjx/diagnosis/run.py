@@ -39,7 +39,7 @@ from bayessim_mjx.logs import read_logs
 from bayessim_mjx.logs.log import Log
 
 Effects = str | Sequence[str | type[Effect]]
-EVIDENCE, PREDICTION = DECIDES = "evidence", "prediction"  # by what a set of effects is chosen
+PREDICTION, EVIDENCE = DECIDES = "prediction", "evidence"  # by what a set of effects is chosen
 
 
 def how_far(found: Findings, say: Progress) -> Findings:
@@ -117,7 +117,7 @@ def investigate(
     remember: Path | None = None,
     tolerated: Sequence[str] = (),
     criteria: Criteria | None = None,
-    decide: str | None = None,
+    decide: str = PREDICTION,
     notes: Sequence[str] = (),
     stages: Sequence[Stage] | None = None,
     progress: Progress | None = None,
@@ -141,9 +141,10 @@ def investigate(
     Raises:
         UserError: nothing usable. TooLittleData: nothing could be held out.
     """
-    decide = decide or (EVIDENCE if criteria is None else PREDICTION)
     if decide not in DECIDES:
         raise UserError(f"decide={decide!r}: allowed are {' and '.join(DECIDES)}")
+    if decide == EVIDENCE and criteria is not None:
+        raise UserError("criteria change how predictions are compared: leave them out, or decide by prediction")
     say = progress or (lambda text, done, total: None)
     known, tell = keep or (lambda setup, tried: None), early or (lambda lines: None)
     say("looking at the logs", 0, 1)
@@ -183,7 +184,7 @@ def diagnose(
     group: str | None = None,
     tolerance: str | Sequence[str] = (),
     criteria: Criteria | None = None,
-    decide: str | None = None,
+    decide: str = PREDICTION,
     accuracy: str | Sequence[str] = (),
     payload: str | Sequence[str] = (),
     minutes: float | None = None,
@@ -208,8 +209,8 @@ def diagnose(
         tolerance: what may stay unexplained, as the flag: "0.5deg", "elbow=2mm", "3%".
         accuracy, payload: of a data sheet, as the flags: "5%", "mass=2%"; "12kg", "tool=12".
         minutes: that it may take; what was left out is told. quick: from few windows. verdict_only: no maps and such.
-        decide: effects by "evidence" (docs/evidence.md) or the "prediction" of held-out logs; None: evidence, or where
-            criteria are given prediction. criteria: when one model predicts better than another.
+        decide: effects by the "prediction" of held-out logs, or by "evidence" (docs/evidence.md); criteria: when one
+            model predicts better than another; None: as measured in benchmarks/results.md.
         seed: of all random numbers; out: folder for what the command writes, but for the report; None: nothing.
         progress, early: called with (what is being done, done, total), and with what logs tell at once, in lines.
         notes: first among the warnings; about: entries of the report's header.

@@ -14,7 +14,8 @@ from bayessim_mjx.diagnosis.selection.criteria import Criteria
 from bayessim_mjx.diagnosis.selection.sets import BASE
 from tests.diagnosis import pendulums
 
-FRICTION, DAMPING = 0.06, frozenset(["viscous_friction@hinge"])
+pytestmark = [pytest.mark.slow, pytest.mark.ci]  # whole searches
+FRICTION = 0.06
 DRY = frozenset(["coulomb_friction@hinge"])
 
 
