@@ -24,8 +24,8 @@ def at_its_mean(weighing: Weighing, key: Key) -> Model:
     fitter, pool, old = weighing.pool.fitter, weighing.pool, weighing.scored[key]
     fit = old.model.fit
     low, high = (np.array([getattr(c, end) for c in fit.coordinates]) for end in ("low", "high"))
-    mean = np.clip(_whole(old)[0][:-1], low, high)
-    sd = np.sqrt(np.maximum(np.diag(_whole(old)[1])[:-1], 1e-300))
+    mean, covariance = _own(old)
+    mean, sd = np.clip(mean, low, high), np.sqrt(np.maximum(np.diag(covariance), 1e-300))
     if np.any(np.abs(mean - fit.values) > MOVED * sd):
         before = old.found.nats
         moved = fitter.refresh(replace(fit, values=mean, history=()))
@@ -42,14 +42,13 @@ def at_its_mean(weighing: Weighing, key: Key) -> Model:
 def estimated(weighing: Weighing, found: Weighed) -> Estimated:
     """Of the answer's numbers; known parameters with the sets beside it, by their probabilities."""
     answer, base = weighing.scored[found.answer], len(weighing.pool.fitter.base)
-    mean, covariance = _whole(answer)
-    covariance = covariance[:-1, :-1].copy()
+    mean, covariance = _own(answer)
     keys = [found.answer, *found.beside]
     share = np.array([found.weight[k] for k in keys])
     share /= share.sum()
     known = np.zeros((base, base))
     for key, weight in zip(keys, share, strict=True):
-        own_mean, own = _whole(weighing.scored[key])
+        own_mean, own = _own(weighing.scored[key])
         away = own_mean[:base] - mean[:base]
         known += weight * (own[:base, :base] + np.outer(away, away))
     sd = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
@@ -58,10 +57,11 @@ def estimated(weighing: Weighing, found: Weighed) -> Estimated:
     return Estimated(covariance * wider[:, None] * wider, answer.found.posterior)
 
 
-def _whole(of: Scored) -> tuple[Array, Array]:
-    """(mean `[k + 1]`, covariance) of the fit's numbers and the lag of rows; of those at a bound no spread."""
+def _own(of: Scored) -> tuple[Array, Array]:
+    """(mean `[k]`, covariance) of the model's numbers; of those at a bound no spread."""
     posterior, free = of.found.posterior, np.flatnonzero(of.found.free)
     mean, covariance = np.asarray(of.fit.values + of.learnt.step), np.zeros((len(of.fit.values),) * 2)
     mean[free] = posterior.middle
     covariance[np.ix_(free, free)] = posterior.together()
-    return mean, covariance
+    k = len(of.model.fit.values)
+    return mean[:k], covariance[:k, :k]

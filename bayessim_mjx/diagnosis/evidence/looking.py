@@ -87,7 +87,7 @@ def around(weighing: Weighing, key: Key, say: Progress) -> list[Plan]:
 
 def _part(weighing: Weighing, fit: Fit, own: NDArray[np.int64]) -> tuple[Part, Belief]:
     """Some windows of a fit, and the prior of its parameters."""
-    fit = weighing.timed(fit)
+    fit = weighing.doubted(fit)
     arrays = fit.r[own], fit.A[own], weighing.D[own], fit.B[own], fit.offsets[own]
     part = Part(*arrays, weighing.pool.fitter.spread, weighing.scale, weighing.channels, len(fit.r) / len(own))
     return part, belief_of(fit)

@@ -35,26 +35,6 @@ class Integrated:
     free: NDArray[np.bool_]
 
 
-# of the period between rows: as exactly as logs' rows and commands lie in time, and as two integrators agree on times
-# (.07 of a time step of half a period, measured on single effects in MuJoCo C at a tenth of the step)
-TIMING = 0.03
-FREE = 100.0  # standard deviations, as good as no bound
-
-
-def timed(fit: Fit, rate: Array, period: float) -> Fit:
-    """The fit with one more number: by how much rows lie later than commands, in units of its prior.
-
-    A part of a millisecond is a damping of the drive's stiffness times it: without this number a stiff servo would tell
-    its joint's damping to a percent, and the smallest lag would explain how two simulators differ.
-
-    Args:
-        rate: `[W, n]`, how fast what residuals compare changes, noise sd a second; period: s between rows.
-    """
-    number = Coordinate("timing", (), 0.0, -FREE, FREE, 1.0, "", stated=True)
-    A = np.concatenate([fit.A, TIMING * period * rate[..., None]], 2)
-    return replace(fit, coordinates=(*fit.coordinates, number), values=np.append(fit.values, 0.0), A=A)
-
-
 def belief_of(fit: Fit) -> Belief:
     """The prior of a fit's step, with the data sheet's accuracies as the fit believes them."""
     neutral = np.array([c.neutral for c in fit.coordinates])

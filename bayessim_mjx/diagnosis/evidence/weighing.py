@@ -8,8 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from bayessim_mjx.diagnosis.evidence import doubts
 from bayessim_mjx.diagnosis.evidence.gaussian import Hyper, Learnt, learn, windows_of
-from bayessim_mjx.diagnosis.evidence.parameters import Integrated, belief_of, integrated, timed
+from bayessim_mjx.diagnosis.evidence.parameters import Integrated, belief_of, integrated
 from bayessim_mjx.diagnosis.fitting.fit import Fit
 from bayessim_mjx.diagnosis.residual import forcing
 from bayessim_mjx.diagnosis.selection.models import Model
@@ -21,7 +22,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Scored:
-    """A fitted model with its evidence; fit: its own, with the lag of rows (`parameters.timed`)."""
+    """A fitted model with its evidence; fit: its own, with what simulators differ by (`doubts`)."""
 
     model: Model
     fit: Fit
@@ -43,11 +44,12 @@ class Weighing:
         self.D = forcing.columns(fitter, pool.base.fit, forcing.default_nodes(fitter), self.scale)
         self.channels = int(fitter.used.sum())
         self.scored: dict[Key, Scored] = {}
-        self._rate, self._period = fitter.rate(), float(fitter.simulator.windows.dt)
+        self._doubts = doubts.columns(fitter, self.D)
         self.score([BASE])
 
-    def timed(self, fit: Fit) -> Fit:
-        return timed(fit, self._rate, self._period)
+    def doubted(self, fit: Fit) -> Fit:
+        """With what simulators differ by as further numbers."""
+        return doubts.doubted(fit, self._doubts)
 
     @property
     def hyper(self) -> Hyper:
@@ -59,7 +61,7 @@ class Weighing:
         for key in keys:
             model, old = self.pool.models.get(key), self.scored.get(key)
             if model is not None and (old is None or old.model is not model):
-                fit, spread = self.timed(model.fit), self.pool.fitter.spread
+                fit, spread = self.doubted(model.fit), self.pool.fitter.spread
                 own = windows_of(fit.r, fit.A, fit.B, self.D, fit.offsets, spread, self.scale, self.channels)
                 learnt = learn(own, belief_of(fit), self.hyper if BASE in self.scored else None)
                 self.scored[key] = Scored(model, fit, learnt, integrated(fit, learnt))

@@ -111,8 +111,8 @@ def covariance(fitter: Fitter, model: Model, along: Ridges | None = None) -> Arr
     return np.asarray(both * scale[:, None] * scale[None, :])
 
 
-def systematic(model: Model, timestep: float, left: float = 0.0) -> Array:
-    """Standard deviations `[k]` of what simulators differ by, whatever the data.
+def systematic(model: Model, timestep: float, left: float = 0.0, known: float = SYSTEMATIC.known) -> Array:
+    """Standard deviations `[k]` of what simulators differ by, whatever the data; `known`: of known parameters, a share.
 
     Two simulators with the same effect agree on its times (delays, time constants) to a part of a time step, on its
     other numbers to about a percent; to less where the law leaves a share `left` of the squared gap unexplained. On
@@ -123,7 +123,7 @@ def systematic(model: Model, timestep: float, left: float = 0.0) -> Array:
 
     def one(c: Coordinate, value: float) -> float:
         if c.name not in own:
-            return SYSTEMATIC.known * abs(value)
+            return known * abs(value)
         return SYSTEMATIC.times * timestep if c.unit == "s" else laws * abs(value - c.neutral)
 
     return np.array([one(c, value) for c, value in zip(model.fit.coordinates, model.fit.values, strict=True)])

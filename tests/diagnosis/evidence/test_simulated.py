@@ -38,35 +38,40 @@ def test_what_is_missing_is_named_and_what_is_not_is_not(found):
     assert model.fit.values[-1] == pytest.approx(FRICTION, rel=0.05)
 
 
-@pytest.mark.parametrize(("key", "within"), [(DRY, 0.6), (BASE, 4.0)], ids=["friction", "known parameters"])
-def test_the_evidence_is_that_of_the_simulator(found, key, within):
-    """Unbiased estimate: draws around the fit, each simulated, force and start state integrated out exactly.
+def test_the_evidence_is_that_of_the_simulator(found):
+    """Each within 5 nats, and the difference of two sets, some 500, within 2: the model is not quite linear."""
+    off = [_sampled(found, key) for key in (DRY, BASE)]
+    assert np.abs(off) == pytest.approx(0.0, abs=5.0)
+    assert off[0] - off[1] == pytest.approx(0.0, abs=2.0)
 
-    A set that lacks an effect leaves a large force, beside which the model is less linear: hundreds of nats behind, it
-    is off by a few.
-    """
+
+def _sampled(found, key):
+    """Evidence less an unbiased estimate of it: draws around the fit, each simulated; all else is integrated out."""
     search, _ = found
     weighing, scored = search.weighing, search.weighing.scored[key]
     fit, learnt, fitter = scored.fit, scored.learnt, search.pool.fitter
     fixed = scored.model.fit
     precision = fit.belief()
     neutral = np.array([c.neutral for c in fit.coordinates]) - fit.values
-    H = learnt.Q[1:, 1:] + np.diag(precision)
+    own = len(fixed.values)
+    precision, neutral = precision[:own], neutral[:own]
+    covariance = np.linalg.inv(learnt.Q[1:, 1:] + np.diag(fit.belief()))[:own, :own]
     rng, draws = np.random.default_rng(0), 400
-    proposal = multivariate_normal(learnt.step, 1.2 * np.linalg.inv(H))
-    steps = np.atleast_2d(proposal.rvs(draws, random_state=rng))
+    proposal = multivariate_normal(learnt.step[:own], 1.2 * covariance)
     logs = []
-    for p in steps:
-        theta = fitter.vector(fixed.coordinates, fixed.values + p[:-1])
-        r = fitter.whiten(fitter.simulator.run(theta[None], fixed.offsets[None]))[0] - fit.A[:, :, -1] * p[-1]
-        none = np.zeros((*r.shape, 0))
-        own = windows_of(r, none, fit.B, weighing.D, fit.offsets, fitter.spread, weighing.scale, weighing.channels)
-        there = marginal(own, learnt.hyper)
-        likelihood = -0.5 * float(there.Q.sum() + there.logdet.sum())
+    for p in np.atleast_2d(proposal.rvs(draws, random_state=rng)):
+        theta = fitter.vector(fixed.coordinates, fixed.values + p)
+        r = fitter.whiten(fitter.simulator.run(theta[None], fixed.offsets[None]))[0]
+        sizes = fitter.spread, weighing.scale, weighing.channels
+        there = marginal(windows_of(r, fit.A[:, :, own:], fit.B, weighing.D, fit.offsets, *sizes), learnt.hyper)
+        Q = there.Q.sum(0)  # of the residual and what simulators differ by, whose priors are standard normal
+        whole = Q[1:, 1:] + np.eye(len(Q) - 1)
+        cost = Q[0, 0] - Q[1:, 0] @ np.linalg.solve(whole, Q[1:, 0]) + np.linalg.slogdet(whole)[1]
         prior = 0.5 * np.sum(np.log(precision)) - 0.5 * np.sum(precision * (p - neutral) ** 2)
-        logs.append(likelihood + prior - 0.5 * len(p) * np.log(2 * np.pi) - proposal.logpdf(p))
+        likelihood = -0.5 * float(cost + there.logdet.sum())
+        logs.append(likelihood + prior - 0.5 * own * np.log(2 * np.pi) - proposal.logpdf(p))
     sampled = logsumexp(logs) - np.log(draws) + learnt.penalty
     # both without the constant (2 pi) of the residuals; accuracies are stated, no number is at a bound
     weights = np.exp(np.array(logs) - logsumexp(logs))
-    assert 1 / np.sum(weights**2) > 40  # draws that count
-    assert scored.found.nats + _truncated(fit.coordinates) == pytest.approx(sampled, abs=within)
+    assert 1 / np.sum(weights**2) > 5  # draws that count
+    return scored.found.nats + _truncated(fit.coordinates) - sampled
