@@ -225,7 +225,7 @@ def diagnose(
         robot = robot_of(model, parameters).stated(_several(accuracy), _several(payload))
         recorded = _logs(logs, robot.mj_model, map)
     told = _told(robot, model, logs, recorded) | {"seed": seed} | dict(about or {})
-    files = Files(Path(out) if out else None, told)
+    files = Files(None if out is None else Path(out), told)
     asked: Any = {"group": group, "seed": seed, "notes": [*notes, *noticed], "progress": progress, "criteria": criteria}
     asked |= {"tolerated": _several(tolerance), "early": early, "minutes": minutes, "quick": quick, "decide": decide}
     asked |= {"remember": files.search, "verdict_only": verdict_only, "keep": files.so_far, "verdict": files.verdict}

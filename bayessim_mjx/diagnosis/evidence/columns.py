@@ -90,9 +90,6 @@ class Promises:
         self.levels = [_level(part, belief, _scaled(hyper, f), self.columns) for f in SHARES]
         self.base = max(level.base for level in self.levels)
 
-    def singles(self) -> list[Promise]:
-        return self._best([level.singles() for level in self.levels])
-
     def pairs(self, blocked: NDArray[np.bool_], count: int) -> list[Promise]:
         """The best pairs of columns that may be together."""
         gain = np.max([level.base + level.pairs() for level in self.levels], 0) - self.base
@@ -132,9 +129,6 @@ class _Level:
     precision: Array
     room: Array
     base: float
-
-    def singles(self) -> list[Promise]:
-        return [self.of((j,)) for j in range(len(self.g))]
 
     def of(self, own: tuple[int, ...]) -> Promise:
         i = np.asarray(own)

@@ -15,7 +15,7 @@ from bayessim_mjx.diagnosis.selection.sets import Estimated, Key, Weighed
 
 Array = NDArray[np.float64]
 Say = Callable[[str, int, int], None]
-MOVED = 0.1  # standard deviations by which a number moves at least: less is not worth a simulation
+MOVED = 0.1  # standard deviations by which a number moves at least: a smaller move is not simulated
 WORSE = 1.0  # nats that a move may cost: it is the step of a linear model
 
 

@@ -35,7 +35,7 @@ class Effort:
         sizes: sets of one, two and more further effects that are fitted in a round, on top of the leading set.
         instead: likewise in the place of each of its effects; base: on the known parameters.
         least: single effects that are fitted however little they promise: promises are linear.
-        margin: nats below the leading set, within which a promise is worth a fit.
+        margin: nats below the leading set, within which a promised set is fitted.
         leading: sets whose ranges may grow; finalists: whose fits are brought to their end.
     """
 
