@@ -152,9 +152,7 @@ def leading(
     part: Part, belief: Belief, hyper: Hyper, columns: Sequence[Column], points: int, most: int
 ) -> list[Column]:
     """The columns that promise most by themselves, so many of each candidate and in all; few inner products tell."""
-    rest = _Rest(part, belief, _scaled(hyper, SHARES[-2]))
-    few, squares = rest.products(columns, diagonal=True)
-    g, s = rest.projected(few, squares)
+    g, s = _Rest(part, belief, _scaled(hyper, SHARES[-2]), columns, diagonal=True).projected()
     precision = np.maximum([c.precision for c in columns], 1e-12)
     t = np.clip(g / (s + precision), *np.array([c.room for c in columns]).T)
     nats = g * t - 0.5 * t**2 * (s + precision) + 0.5 * np.log(precision / (s + precision))
@@ -168,15 +166,18 @@ def leading(
 
 
 class _Rest:
-    """All but the columns: a fit's residual, its parameters, force and start states, in some windows."""
+    """Columns with all else integrated out: a fit's parameters, force and start states, in some windows."""
 
-    def __init__(self, part: Part, belief: Belief, hyper: Hyper) -> None:
-        self.part, self.hyper = part, hyper
+    def __init__(
+        self, part: Part, belief: Belief, hyper: Hyper, columns: Sequence[Column], diagonal: bool = False
+    ) -> None:
+        self.part = part
         nodes = part.D.shape[2] // len(part.scale)
         self.root = np.kron(np.diag(hyper.amplitude * part.scale), correlation(nodes, hyper.memory))
         self.noise = np.tile(hyper.noise, part.r.shape[1] // part.channels)
         self.own = 1 + part.A.shape[2]
-        few, _ = self.products((), diagonal=False)
+        self.few, self.among = self.products(columns, diagonal)
+        few = self.few[:, : self.own]
         self.p = belief.best(few)
         self.free = np.flatnonzero((self.p > belief.low) & (self.p < belief.high))
         self.H = few[1:, 1:][np.ix_(self.free, self.free)] + np.diag(belief.precision[self.free])
@@ -207,9 +208,9 @@ class _Rest:
         self.logdet = logdet * part.share
         return few * part.share, among * part.share
 
-    def projected(self, few: Array, among: Array) -> tuple[Array, Array]:
+    def projected(self) -> tuple[Array, Array]:
         """(gradients `[P]`, products `[P, P]` or `[P]`) with the parameters at their best for each amount."""
-        own = self.own
+        own, few, among = self.own, self.few, self.among
         across = few[1:, own:][self.free]
         take = np.linalg.solve(self.H, across) if len(self.free) else across
         g = few[0, own:] - self.p @ few[1:, own:]
@@ -218,7 +219,7 @@ class _Rest:
 
 
 def _level(part: Part, belief: Belief, hyper: Hyper, columns: Sequence[Column]) -> _Level:
-    rest = _Rest(part, belief, hyper)
-    g, S = rest.projected(*rest.products(columns, diagonal=False))
+    rest = _Rest(part, belief, hyper, columns)
+    g, S = rest.projected()
     precision = np.maximum([c.precision for c in columns], 1e-12)
     return _Level(S, g, precision, np.array([c.room for c in columns]), rest.base)
