@@ -14,11 +14,12 @@ from cases import SYSTEMS
 from counted_cases import POOR, SEEDS, Plan, plans
 from score import Outcome, label, mcnemar
 
-from bayessim_mjx.blind.outcome import LOOSE, covered, holds, wilson
+from bayessim_mjx.blind.outcome import LOOSE, alarm, covered, holds, wilson
 from bayessim_mjx.blind.reality.plant import FINER
 
 ERRORS = (0.02, 0.05, 0.10, 0.20, 0.30)  # a case belongs to the nearest of these scales, by ratio
 NAMES, HOLDS = ("right", "exact", "inside", "false names"), ("strengths", "known", "known, other answers", "closed")
+BINS = (0.0, 0.2, 0.4, 0.6, 0.8)  # lower ends, of stated probabilities
 SUFFIX = "_mult"  # of a known parameter in a diagnosis, a factor of the nominal value
 
 
@@ -27,6 +28,7 @@ class Answer:
     """What one case adds to the tables; of one that did not end, nothing.
 
     rates: {measure: answers}; size: of the set, nan where nothing is named; untold: why something was not counted.
+    stated: (probability of the answer, whether it is exactly what is hidden).
     """
 
     plan: Plan
@@ -36,6 +38,7 @@ class Answer:
     untold: tuple[str, ...] = ()
     cpu: float = math.nan
     said: str = ""
+    stated: tuple[float, bool] | None = None
 
 
 def answers(out: Path) -> list[Answer]:
@@ -52,7 +55,13 @@ def answer(plan: Plan, folder: Path) -> Answer:
         return Answer(plan, "not made", {})
     said = result.get("said")
     o = Outcome(folder, result["truth"], said, result.get("joints", {}), result.get("seconds", math.nan))
+    if plan.group == "outside" and plan.kind == "unknown":
+        own = {"unexplained": [label(o) == "unexplained"]} if o.strong_enough else {}
+        state = "no result" if said is None else "ended"
+        return Answer(plan, state, own, cpu=result.get("cpu", math.nan), said=label(o))
     rates, untold = _names(o) if o.strong_enough else {}, [] if o.strong_enough else ["weaker than asked for"]
+    if plan.kind == "null":
+        rates = {"alarm": [alarm(o)]} if said else {}
     rates["strengths"] = covered(o)
     right = all(o.right(e) for e in o.truth["effects"])
     rates["known" if right and not _false(o) else "known, other answers"], missing = known(o)
@@ -60,7 +69,17 @@ def answer(plan: Plan, folder: Path) -> Answer:
     untold += missing + more + [f"loose: {e['name']}" for e in o.truth["effects"] if e["name"] in LOOSE]
     state = "no result" if said is None else "ended"
     members = len(o.members()) if o.named() else math.nan
-    return Answer(plan, state, rates, members, tuple(untold), result.get("cpu", math.nan), label(o))
+    return Answer(plan, state, rates, members, tuple(untold), result.get("cpu", math.nan), label(o), stated(o))
+
+
+def stated(o: Outcome) -> tuple[float, bool] | None:
+    """(probability of the answer, whether it is exactly what is hidden); None of a verdict that is none of the sets."""
+    sets = {frozenset(x["effects"]): float(x["probability"]) for x in (o.said or {}).get("evidence", ())}
+    if not o.strong_enough or not (o.named() or label(o) in ("no_gap", "parameters", "noise")):
+        return None
+    own = sets.get(frozenset(f"{f['name']}@{f['where']}" for f in o.named()))
+    right = all(o.right(e) for e in o.truth["effects"]) and not _false(o)
+    return None if own is None else (own, right)
 
 
 def _false(o: Outcome) -> list[str]:
@@ -124,7 +143,7 @@ Group = tuple[str, Callable[[Answer], bool]]
 def tables(out: Path, before: Path | None = None) -> str:
     """All tables as text."""
     every = answers(out)
-    sheets, logs = ([a for a in every if (a.plan.logs == "all") == own] for own in (True, False))
+    sheets, logs, outside = ([a for a in every if a.plan.group == own] for own in ("sheets", "logs", "outside"))
     by_error: list[Group] = [(f"{100 * e:g} %", lambda a, e=e: nearest(a.plan.scale) == e) for e in ERRORS]
     by_kind: list[Group] = [(k, lambda a, k=k: a.plan.kind == k) for k in ("single", "double")]
     by_system: list[Group] = [(s, lambda a, s=s: a.plan.system == s) for s in SEEDS]
@@ -133,6 +152,8 @@ def tables(out: Path, before: Path | None = None) -> str:
         f"Data sheets of any accuracy\n\n{_table(sheets, [*by_kind, *by_system])}",
         f"By the scale of the true errors\n\n{_table(sheets, by_error)}",
         f"Few and poor logs\n\n{_table(logs, by_logs)}",
+        f"Nothing of the library\n\n{_outside(outside)}",
+        f"Stated probabilities\n\n{_stated(every)}",
         _left_out(every),
     ]
     if before is not None:
@@ -156,6 +177,29 @@ def _row(name: str, some: Sequence[Answer]) -> list[str]:
     cells = {what: _rate([x for a in some for x in a.rates.get(what, [])]) for what in (*NAMES, *HOLDS)}
     names, held = [cells[w] for w in NAMES], [cells[w] for w in HOLDS]
     return [name, f"{ended} of {len(some)}", *names, size, *held, seconds]
+
+
+def _outside(some: Sequence[Answer]) -> str:
+    lines = ["| | nothing hidden: alarm | cause outside the library: unexplained | CPU s |", "|---|---|---|---|"]
+    groups: list[Group] = [("all", lambda _: True)] + [(s, lambda a, s=s: a.plan.system == s) for s in SEEDS]
+    for name, own in groups:
+        those = [a for a in some if own(a)]
+        cells = [_rate([x for a in those for x in a.rates.get(what, [])]) for what in ("alarm", "unexplained")]
+        spent = [a.cpu for a in those if math.isfinite(a.cpu)]
+        lines.append(f"| {name} | {' | '.join(cells)} | {f'{np.median(spent):.0f}' if spent else '-'} |")
+    return "\n".join(lines)
+
+
+def _stated(every: Sequence[Answer]) -> str:
+    said = [a.stated for a in every if a.stated is not None]
+    if not said:
+        return "none"
+    lines = ["| stated | right |", "|---|---|"]
+    for low in BINS:
+        own = [x for x in said if low <= x[0] < low + 0.2 or x[0] == low + 0.2 == 1.0]
+        lines += [f"| {np.mean([p for p, _ in own]):.2f} | {_rate([r for _, r in own])} |"] if own else []
+    brier = np.mean([(p - r) ** 2 for p, r in said])
+    return "\n".join([*lines, "", f"Brier score {brier:.3f} of {len(said)} answers"])
 
 
 def _rate(given: Sequence[bool]) -> str:

@@ -30,8 +30,11 @@ def of(plans: list, logs: str, system: str) -> counted.Plan:
 
 
 def test_there_are_as_many_cases_of_each_kind_as_was_said_beforehand(plans):
-    assert len({p.name for p in plans}) == 210 and min(p.seed for p in plans) >= 9300
-    sheets = [p for p in plans if p.logs == "all"]
+    assert len({p.name for p in plans}) == 300 and min(p.seed for p in plans) >= 9300
+    sheets = [p for p in plans if p.group == "sheets"]
+    assert Counter((p.kind, p.system) for p in plans if p.group == "outside") == {
+        (kind, system): n for kind, n in (("null", 10), ("unknown", 5)) for system in counted.SEEDS
+    }
     assert Counter(p.logs for p in plans if p.logs != "all") == dict.fromkeys(counted.POOR, 10)
     assert Counter(p.kind for p in sheets) == {"single": 75, "double": 75}
     assert set(Counter(p.system for p in sheets).values()) == {20, 30}
@@ -118,10 +121,35 @@ def test_tables_count_what_holds_what_misses_and_what_did_not_end(plans, tmp_pat
     assert second.rates["false names"] == [True] and second.rates["known, other answers"] == [False]
     assert second.rates["closed"] == [False]
     assert third.rates["right"] == [False] and third.rates["known, other answers"] == [True]
-    assert killed.state == "unfinished" and not killed.rates and len(found) == 210
+    assert killed.state == "unfinished" and not killed.rates and len(found) == 300
     text = tables.tables(tmp_path)
-    assert "| pendulum | 3 of 30 | 2 of 3" in text and "unfinished: 1" in text and "not begun: 206" in text
+    assert "| pendulum | 3 of 30 | 2 of 3" in text and "unfinished: 1" in text and "not begun: 296" in text
     assert "one alone: 0, 0" in tables.tables(tmp_path, tmp_path)
+
+
+def test_tables_of_alarms_unknown_causes_and_stated_probabilities(plans, tmp_path):
+    null, other = (next(p for p in plans if p.system == "pendulum" and p.kind == k) for k in ("null", "unknown"))
+    single = next(p for p in plans if p.system == "pendulum" and p.kind == "single" and p.group == "sheets")
+    result(tmp_path, null, [named("backlash", 0.1)], None)
+    result(tmp_path, other, [], None)
+    result(tmp_path, single, [named("viscous_friction", 0.11)], None)
+    for plan, hidden, sets in (
+        (null, False, [(["backlash@hinge"], 0.7), ([], 0.3)]),
+        (other, True, []),
+        (single, True, [(["viscous_friction@hinge"], 0.9), ([], 0.1)]),
+    ):
+        path = tmp_path / plan.name / "result.json"
+        told = json.loads(path.read_text())
+        told["truth"]["effects"] *= hidden
+        told["said"]["evidence"] = [{"effects": e, "probability": p, "nats": 0.0} for e, p in sets]
+        path.write_text(json.dumps(told))
+    found = {a.plan.name: a for a in tables.answers(tmp_path)}
+    assert found[null.name].rates["alarm"] == [True] and found[null.name].stated == (0.7, False)
+    assert found[other.name].rates == {"unexplained": [False]} and found[other.name].stated is None
+    assert found[single.name].stated == (0.9, True)
+    text = tables.tables(tmp_path)
+    assert "| pendulum | 1 of 1, 100 % (21 to 100) | 0 of 1, 0 % (0 to 79) | 50 |" in text
+    assert "Brier score 0.250 of 2 answers" in text  # (.7^2 + .1^2) / 2
 
 
 def test_errors_belong_to_the_nearest_scale_by_ratio():
