@@ -88,7 +88,7 @@ def _parser() -> cli.PlainParser:
 
 
 def _search_options(parser: cli.PlainParser) -> None:
-    """How long the search may take, and by what rule it decides."""
+    """How long the search may take."""
     parser.add_argument(
         "--minutes",
         metavar="M",
@@ -100,20 +100,6 @@ def _search_options(parser: cli.PlainParser) -> None:
         "--verdict_only",
         action="store_true",
         help="the whole search, but no report, maps, black boxes or next experiment: diagnosis.json and effects.yaml",
-    )
-    parser.add_argument(
-        "--decide",
-        choices=("prediction", "evidence"),
-        default="prediction",
-        help="by what effects are chosen: the prediction of held-out logs, or the evidence of each set with a missing "
-        "force beside it, which gives probabilities (docs/evidence.md; default: prediction)",
-    )
-    parser.add_argument(
-        "--criteria",
-        metavar="KEY=VALUE",
-        nargs="*",
-        default=[],
-        help="change numbers by which predictions are compared and one is named, as same=.3 (docs/how_it_decides.md)",
     )
 
 
@@ -142,7 +128,6 @@ def _robot(task: str, model: str | None, parameters: str | None) -> "Robot":
 
 def _diagnosis(args: argparse.Namespace, say: Any, early: Callable[[Sequence[str]], None]) -> "Diagnosis":
     from bayessim_mjx.diagnosis import run
-    from bayessim_mjx.diagnosis.selection.criteria import Criteria
 
     names = "all" if args.effects == "all" else [n.strip() for n in args.effects.split(",") if n.strip()]
     with run.noting() as notes:
@@ -159,8 +144,6 @@ def _diagnosis(args: argparse.Namespace, say: Any, early: Callable[[Sequence[str
         minutes=args.minutes,
         quick=args.quick,
         verdict_only=args.verdict_only,
-        criteria=Criteria().changed(args.criteria) if args.criteria else None,
-        decide=args.decide,
         seed=args.seed,
         out=args.out,
         progress=say,

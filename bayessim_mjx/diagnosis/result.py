@@ -82,13 +82,11 @@ class Diagnosis:
         covariance: {"names": [...], "matrix": [[...]]} of parameters and effects' parameters together, or {}.
         not_fitted: {reason: effects ("name@place") that were not fitted, and so not ruled out}.
         about: {"robot", "data": [paths], "logs", "seconds", "conditions", "date", "seed"}, what was diagnosed, or {}.
-        chance: {"probability", "each": {label: p}, "nats", "level", "draws", "candidates"}, how often the best
-            candidate gains as much where nothing is missing (`selection.chance`), or {}.
         hidden: effects ("name@place") that would not show beside those that are named, whose parameters do the same.
         accuracy: {kind of parameter: {"median", "low", "high", "parameters"}}: the inferred accuracy of the model's
             numbers as a share, its 90 % interval, and how many numbers; of kinds whose accuracy nobody stated.
-        evidence: where it decided, sets of effects, most likely first: [{"effects": [label ...], "probability", "nats"
-            of evidence and prior over the known parameters alone}]; else [].
+        evidence: sets of effects, most likely first: [{"effects": [label ...], "probability", "nats" of evidence and
+            prior over the known parameters alone}].
         next_experiment: {"name", "why", "evidence", "file", "table": [...]} or {}.
         details: numbers for pictures (see `report`); not part of diagnosis.json but saved beside it.
     """
@@ -107,7 +105,6 @@ class Diagnosis:
     covariance: dict[str, Any] = field(default_factory=dict)
     about: dict[str, Any] = field(default_factory=dict)
     not_fitted: dict[str, list[str]] = field(default_factory=dict)
-    chance: dict[str, Any] = field(default_factory=dict)
     hidden: list[str] = field(default_factory=list)
     accuracy: dict[str, dict[str, float]] = field(default_factory=dict)
     evidence: list[dict[str, Any]] = field(default_factory=list)

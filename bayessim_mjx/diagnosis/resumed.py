@@ -15,14 +15,11 @@ from bayessim_mjx.diagnosis.selection.budget import Budget
 from bayessim_mjx.diagnosis.setup import Setup
 
 
-def remembering(setup: Setup, rules: object, folder: Path | None) -> Setup:
-    """The setup with a fitter that finds in the folder what it fitted there before, and writes what it fits.
-
-    rules: by which the search decides.
-    """
+def remembering(setup: Setup, folder: Path | None) -> Setup:
+    """The setup with a fitter that finds in the folder what it fitted there before, and writes what it fits."""
     if folder is None:
         return setup
-    return replace(setup, fitter=Remembering(setup.fitter, Journal(folder, _question(setup, rules))))
+    return replace(setup, fitter=Remembering(setup.fitter, Journal(folder, _question(setup))))
 
 
 def ended(setup: Setup) -> None:
@@ -31,7 +28,7 @@ def ended(setup: Setup) -> None:
         setup.fitter.journal = None
 
 
-def _question(setup: Setup, rules: object) -> str:
+def _question(setup: Setup) -> str:
     """A digest of all that the fits depend on but the time that they may take."""
     fitter, model = setup.fitter, setup.physics.mj_model
     simulator = fitter.simulator
@@ -41,5 +38,5 @@ def _question(setup: Setup, rules: object) -> str:
     arrays = [np.asarray(leaf) for leaf in jax.tree.leaves(windows.batch)]
     arrays += [windows.group, windows.sigma_q, windows.sigma_v, windows.spread, fitter.theta, raw]
     each = [(c.label, c.coordinates, c.shapes, c.probes.tobytes()) for c in setup.candidates]
-    every = replace(setup.settings, budget=Budget()), rules
+    every = replace(setup.settings, budget=Budget())
     return digest(*arrays, fitter.base, each, every, simulator.lanes, jax.default_backend(), versions.versions())

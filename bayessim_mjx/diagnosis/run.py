@@ -25,8 +25,7 @@ from bayessim_mjx.diagnosis.residual import black_boxes, frequency, where
 from bayessim_mjx.diagnosis.residual.disturbance import Disturbance, estimate
 from bayessim_mjx.diagnosis.residual.flexible import Flexible, flexible
 from bayessim_mjx.diagnosis.result import Diagnosis
-from bayessim_mjx.diagnosis.selection import budget, heldout, selected
-from bayessim_mjx.diagnosis.selection.criteria import Criteria
+from bayessim_mjx.diagnosis.selection import budget, heldout
 from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.selection.tried import Settings, Tried
 from bayessim_mjx.diagnosis.setup import Setup, prepare
@@ -34,12 +33,10 @@ from bayessim_mjx.diagnosis.stages import Stage, carry_out
 from bayessim_mjx.diagnosis.summary import assemble, finer_steps, first_look, whole_logs
 from bayessim_mjx.diagnosis.summary.files import Files
 from bayessim_mjx.effects.effect import Effect
-from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs import read_logs
 from bayessim_mjx.logs.log import Log
 
 Effects = str | Sequence[str | type[Effect]]
-PREDICTION, EVIDENCE = DECIDES = "prediction", "evidence"  # by what a set of effects is chosen
 
 
 def how_far(found: Findings, say: Progress) -> Findings:
@@ -116,8 +113,6 @@ def investigate(
     verdict_only: bool = False,
     remember: Path | None = None,
     tolerated: Sequence[str] = (),
-    criteria: Criteria | None = None,
-    decide: str = PREDICTION,
     notes: Sequence[str] = (),
     stages: Sequence[Stage] | None = None,
     progress: Progress | None = None,
@@ -129,7 +124,7 @@ def investigate(
 
     Args:
         robot: the model with the parameters that it may recalibrate.
-        logs, effects, group, minutes, quick, seed, criteria, decide, progress: see `diagnose`; tolerated: tolerance.
+        logs, effects, group, minutes, quick, seed, progress: see `diagnose`; tolerated: tolerance.
         settings: budgets of the search; None: by the robot's size. verdict_only: without the optional stages.
         remember: folder for the fits of the search, so that a killed one goes on where it was.
         notes: what was noticed while model and logs were read, for the warnings.
@@ -141,24 +136,19 @@ def investigate(
     Raises:
         UserError: nothing usable. TooLittleData: nothing could be held out.
     """
-    if decide not in DECIDES:
-        raise UserError(f"decide={decide!r}: allowed are {' and '.join(DECIDES)}")
-    if decide == EVIDENCE and criteria is not None:
-        raise UserError("criteria change how predictions are compared: leave them out, or decide by prediction")
     say = progress or (lambda text, done, total: None)
     known, tell = keep or (lambda setup, tried: None), early or (lambda lines: None)
     say("looking at the logs", 0, 1)
-    time_left, criteria = budget.begun(minutes), _smaller(criteria or Criteria()) if quick else criteria or Criteria()
+    time_left = budget.begun(minutes)
     asked: dict[str, Any] = {"group": group, "seed": seed, "settings": settings, "tolerated": tolerated, "notes": notes}
     asked |= {"budget": time_left}
     setup = prepare(robot, logs, effects, quick=quick, **asked, seen_first=lambda seen: tell(first_look.lines(seen)))
-    setup = resumed.remembering(_within(setup, time_left), (criteria, decide), remember)
+    setup = resumed.remembering(_within(setup, time_left), remember)
     for text in setup.said:
         say(text, 0, 1)
     known(setup, None)
-    given = setup.fitter, setup.candidates, setup.settings, criteria
-    select = selecting.select if decide == EVIDENCE else selected.select
-    found = Findings(setup, select(*given, say, lambda tried: known(setup, tried)))
+    given = setup.fitter, setup.candidates, setup.settings
+    found = Findings(setup, selecting.select(*given, say, lambda tried: known(setup, tried)))
     resumed.ended(setup)
     stages = [s for s in (STAGES if stages is None else stages) if not (s.optional and (quick or verdict_only))]
     return carry_out(stages, found, say, time_left, verdict)
@@ -166,12 +156,6 @@ def investigate(
 
 def _within(setup: Setup, time_left: budget.Budget) -> Setup:
     return replace(setup, settings=replace(setup.settings, budget=time_left))
-
-
-def _smaller(criteria: Criteria) -> Criteria:
-    """A smaller search, by the same rule."""
-    most = {"beam": 1, "width": 3, "most": 2, "finalists": 3}
-    return replace(criteria, **{name: min(limit, getattr(criteria, name)) for name, limit in most.items()})
 
 
 def diagnose(
@@ -183,8 +167,6 @@ def diagnose(
     map: str | Path | None = None,
     group: str | None = None,
     tolerance: str | Sequence[str] = (),
-    criteria: Criteria | None = None,
-    decide: str = PREDICTION,
     accuracy: str | Sequence[str] = (),
     payload: str | Sequence[str] = (),
     minutes: float | None = None,
@@ -209,8 +191,6 @@ def diagnose(
         tolerance: what may stay unexplained, as the flag: "0.5deg", "elbow=2mm", "3%".
         accuracy, payload: of a data sheet, as the flags: "5%", "mass=2%"; "12kg", "tool=12".
         minutes: that it may take; what was left out is told. quick: from few windows. verdict_only: no maps and such.
-        decide: effects by the "prediction" of held-out logs, or by "evidence" (docs/evidence.md); criteria: when one
-            model predicts better than another; None: as measured in benchmarks/results.md.
         seed: of all random numbers; out: folder for what the command writes, but for the report; None: nothing.
         progress, early: called with (what is being done, done, total), and with what logs tell at once, in lines.
         notes: first among the warnings; about: entries of the report's header.
@@ -219,15 +199,15 @@ def diagnose(
         The result; too little data is a verdict, not an error.
 
     Raises:
-        UserError: model, logs, effects, tolerance or rule are not usable.
+        UserError: model, logs, effects or tolerance are not usable.
     """
     with noting() as noticed:
         robot = robot_of(model, parameters).stated(_several(accuracy), _several(payload))
         recorded = _logs(logs, robot.mj_model, map)
     told = _told(robot, model, logs, recorded) | {"seed": seed} | dict(about or {})
     files = Files(None if out is None else Path(out), told)
-    asked: Any = {"group": group, "seed": seed, "notes": [*notes, *noticed], "progress": progress, "criteria": criteria}
-    asked |= {"tolerated": _several(tolerance), "early": early, "minutes": minutes, "quick": quick, "decide": decide}
+    asked: Any = {"group": group, "seed": seed, "notes": [*notes, *noticed], "progress": progress}
+    asked |= {"tolerated": _several(tolerance), "early": early, "minutes": minutes, "quick": quick}
     asked |= {"remember": files.search, "verdict_only": verdict_only, "keep": files.so_far, "verdict": files.verdict}
     try:
         found = investigate(robot, recorded, effects, **asked)

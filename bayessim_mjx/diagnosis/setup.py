@@ -43,7 +43,7 @@ Array = NDArray[np.float64]
 
 
 # of a first answer, for any robot; how often it differs from the whole search's was not counted
-QUICK = Settings(singles=12, screened=12, starts=4, iterations=8)
+QUICK = Settings(screened=12, iterations=8)
 SHIFT_FACTOR = 4  # times the coarsest sub-steps, the finest by which a shift of commands is looked for
 
 
@@ -132,7 +132,7 @@ def prepare(
     fitter = Fitter(Simulator(physics, cut), base, physics.space.nominal)
     led = leads.lead(candidates.enumerate_candidates(physics), before)
     allowed = tolerance.judge(robot.mj_model, 2 * size.travel, cut.sigma_q, asked)
-    settings = dataclasses.replace(settings or _settings(robot, quick), **_known(step, allowed, fitter), **led.order)
+    settings = dataclasses.replace(settings or _settings(robot, quick), believed=step.believed)
     late = [] if shift is None else shift.told(float(np.median([log.period for log in logs])))
     said = [*steps.said(), *_faster(seen.usable, delivered, dt), *late]
     told += [*said, *floors.warnings, *steps.warnings(), *(f"not tried: {text}" for text in left_out)]
@@ -147,16 +147,11 @@ def _affordable(budget: Budget, seconds: float) -> bool:
 
 
 def _settings(robot: Robot, quick: bool = False) -> Settings:
-    """Budgets for the robot's size; criteria are the same for all."""
+    """Budgets for the robot's size."""
     if quick:
         return QUICK
     big = robot.mj_model.nv > CUTTING.many
-    return Settings(singles=16, screened=24, starts=8) if big else Settings()
-
-
-def _known(step: discretisation.Discretisation, allowed: tolerance.Tolerance, fitter: Fitter) -> dict[str, Any]:
-    """What a decision has to know of the noise and of the tolerance."""
-    return {"believed": step.believed, "tolerated": allowed.surely(len(fitter.sigma))}
+    return Settings(screened=24) if big else Settings()
 
 
 def _measured(

@@ -81,11 +81,6 @@ class Tolerance:
         out[..., seen] = channels[..., : int(seen.sum())]
         return out
 
-    def surely(self, channels: int) -> float:
-        """Squared error, in noise variances and as a mean over `channels`, that no joint's tolerance lies below."""
-        own = [(max(self.limit[i], self.noise[i]) / self.noise[i]) ** 2 for i, _ in self.measured()]
-        return min(own, default=0.0) / max(channels, 1)
-
     def exceeded(self, rms: Array) -> NDArray[np.bool_]:
         """`[nv]`, where a root mean square error `[nv]` (rad or m) leaves more than tolerated above the noise."""
         above = np.sqrt(np.maximum(np.square(rms) - self.noise**2, 0.0))

@@ -1,10 +1,9 @@
-"""What the look before any simulation means for the race: what is left out, what comes first, where it starts."""
+"""What the look before any simulation means for the search: what is left out, and where effects start."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -21,19 +20,11 @@ class Led:
 
     Attributes:
         candidates: without those that are contradicted; proposals also start where the efforts put them.
-        together: labels of effects that were proposed together; first: these and what would do in their place.
         vetoed: {label: why} of those left out.
     """
 
     candidates: tuple[Candidate, ...]
-    together: tuple[str, ...]
-    first: tuple[str, ...]
     vetoed: Mapping[str, str]
-
-    @property
-    def order(self) -> dict[str, Any]:
-        """For the settings of the search."""
-        return {"first": self.first, "together": self.together}
 
     def sentences(self) -> list[str]:
         """One for all that one reason contradicts."""
@@ -82,15 +73,13 @@ def _deviations(robot: Robot) -> dict[tuple[str, str], float]:
 
 
 def lead(candidates: Iterable[Candidate], look: Look) -> Led:
-    """Vetoes, starts and order; an effect that is itself proposed is never left out."""
+    """Vetoes and starts; an effect that is itself proposed, or that would do in its place, is never left out."""
     every = tuple(candidates)
     starts = proposed(look)
-    named = {c.label for c in every}
-    together = tuple(label for label in starts if label in named)
-    first = dict.fromkeys([*together, *(r for p in look.proposals for r in p.rivals if r in named)])
+    first = {*starts, *(r for p in look.proposals for r in p.rivals)}
     vetoed = {c.label: look.vetoes[c.label] for c in every if c.label in look.vetoes and c.label not in first}
     kept = tuple(_started(c, starts.get(c.label)) for c in every if c.label not in vetoed)
-    return Led(kept, together, tuple(first), vetoed)
+    return Led(kept, vetoed)
 
 
 def proposed(look: Look) -> dict[str, dict[str, float]]:

@@ -19,8 +19,7 @@ from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fit import Fit
 from bayessim_mjx.diagnosis.selection.bounds import widened
 from bayessim_mjx.diagnosis.selection.budget import LEAVING_OUT, SINGLES, TOGETHER
-from bayessim_mjx.diagnosis.selection.fits import cut_back
-from bayessim_mjx.diagnosis.selection.pool import Entries, Pool, fit_entries, polish
+from bayessim_mjx.diagnosis.selection.pool import Entries, Pool, cut_back, fit_entries, polish
 from bayessim_mjx.diagnosis.selection.sets import BASE, Key, Weighed
 
 Array = NDArray[np.float64]

@@ -2,55 +2,103 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+import itertools
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
+from bayessim_mjx.diagnosis import phrases
 from bayessim_mjx.diagnosis.evidence.estimates import at_its_mean, estimated
 from bayessim_mjx.diagnosis.evidence.search import Search
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fitter import Fitter
-from bayessim_mjx.diagnosis.selection import singles
-from bayessim_mjx.diagnosis.selection.criteria import Criteria
-from bayessim_mjx.diagnosis.selection.decide import Alternative, Decision, closed_elsewhere
-from bayessim_mjx.diagnosis.selection.fits import Fits
-from bayessim_mjx.diagnosis.selection.pool import Pool, Progress
-from bayessim_mjx.diagnosis.selection.selected import Selection, concluded
-from bayessim_mjx.diagnosis.selection.sets import Key, Weighed
+from bayessim_mjx.diagnosis.selection import hidden, predicted_gain
+from bayessim_mjx.diagnosis.selection.begin import begin
+from bayessim_mjx.diagnosis.selection.budget import LEAVING_OUT
+from bayessim_mjx.diagnosis.selection.laws import compatible, special_cases
+from bayessim_mjx.diagnosis.selection.models import Model
+from bayessim_mjx.diagnosis.selection.pool import Entries, Pool, Progress, cut_back, fit_entries
+from bayessim_mjx.diagnosis.selection.selected import Rival, Selection, selection_of
+from bayessim_mjx.diagnosis.selection.sets import BASE, Key, Weighed
 from bayessim_mjx.diagnosis.selection.tried import Settings, Tried
+
+MANY = 4  # effects, up to which every subset is fitted
 
 
 def select(
     fitter: Fitter,
     candidates: Sequence[Candidate],
     settings: Settings,
-    criteria: Criteria,
     say: Progress,
     keep: Callable[[Tried], None] = lambda tried: None,
 ) -> Selection:
     """What the logs on the windows of `fitter` call for; `keep` is called with what was tried so far."""
-    pool = singles.begin(fitter, candidates, settings, criteria, say, keep)
+    pool = begin(fitter, candidates, settings, say, keep)
     search = Search(pool, say)
     found = search.run()
     keep(pool)
     at_its_mean(search.weighing, found.answer)
-    decision = decided(pool, found, say)
+    pool.base = pool.models[BASE]
     names = np.unique(fitter.simulator.windows.group)
     chosen = {int(g): search.weighing.without(int(g)).answer for g in names} if len(names) > 1 and found.answer else {}
-    elsewhere = closed_elsewhere(decision.table, chosen)
-    whole = concluded(pool, decision, say, along_ridges=False)
-    own = estimated(search.weighing, found)
-    return replace(whole, weighed=found, estimated=own, chosen=chosen, elsewhere=elsewhere)
+    answer = pool.models[found.answer]
+    few = 1 < len(answer.effects) <= MANY and not settings.budget.over(LEAVING_OUT)
+    return selection_of(
+        pool,
+        answer,
+        rivals={e.label: tuple(_rivals(pool, e, found)) for e in answer.effects},
+        subsets=_subsets(pool, answer, say) if few else {},
+        promised=predicted_gain.promised(pool, answer.effects) if answer.effects else (0.0, {}),
+        chosen=chosen,
+        elsewhere=_elsewhere(pool, chosen),
+        hidden=hidden.beside(pool, answer, say),
+        weighed=found,
+        estimated=estimated(search.weighing, found),
+    )
 
 
-def decided(pool: Pool, found: Weighed, say: Progress) -> Decision:
-    """The most likely set, and the others that the evidence does not speak strongly against, as a decision."""
-    table = Fits(pool, say).table
+def _rivals(pool: Pool, effect: Candidate, found: Weighed) -> list[Rival]:
+    """What may stand in an effect's place, most likely first: sets without strong evidence against them."""
     others = [k for k in found.beside if k and not found.answer < k]
-    rivals = tuple(_alternative(k, found, table.closed(k)) for k in others)
-    return Decision(found.answer, found.answer, rivals, table)
+    return [_rival(pool, effect, k, found) for k in others if effect.label not in k and k - found.answer]
 
 
-def _alternative(key: Key, found: Weighed, closed: float) -> Alternative:
-    return Alternative(key, found.nats[found.answer] - found.nats[key], closed)
+def _rival(pool: Pool, effect: Candidate, key: Key, found: Weighed) -> Rival:
+    model, answer = pool.models[key], pool.models[found.answer]
+    others = tuple(e for e in model.effects if e.label not in found.answer)
+    contains = any(effect.effect in special_cases(o) and o.where == effect.where for o in others)
+    same = any(o.effect == effect.effect and not compatible(o, effect) for o in others)
+    behind = max(pool.closure(answer) - pool.closure(model), 0.0)
+    nats = found.nats[found.answer] - found.nats[key]
+    why = phrases.CONTAINS if contains else phrases.close_by(nats, behind)
+    return Rival(others, model, pool.closure(model), why, contains or same)
+
+
+def _subsets(pool: Pool, answer: Model, say: Progress) -> dict[Key, Model]:
+    """{labels: the model with these of the answer's effects}, each fitted from one with one effect more."""
+    every = frozenset(e.label for e in answer.effects)
+    for size in range(len(every) - 1, 0, -1):
+        entries: Entries = {}
+        for own in map(frozenset, itertools.combinations(sorted(every), size)):
+            parent = pool.models.get(own | {min(every - own)})
+            if own not in pool.models and parent is not None:
+                kept = tuple(e for e in parent.effects if e.label in own)
+                entries[own] = ([cut_back(pool, parent, kept)], kept)
+        fit_entries(pool, entries, "dropping", say, LEAVING_OUT)
+    known = itertools.chain.from_iterable(itertools.combinations(every, n) for n in range(len(every) + 1))
+    found = {frozenset(own): pool.models.get(frozenset(own)) for own in known}
+    return {own: model for own, model in found.items() if model is not None} if all(found.values()) else {}
+
+
+def _elsewhere(pool: Pool, chosen: Mapping[int, Key]) -> float:
+    """Share of the squared gap closed on operating conditions that the choice was made without, at most 1.
+
+    The fits behind the choice had seen the condition, so the share is a little too high. A share much below that of the
+    answer means that the answer was chosen for what it does by chance. NaN of one condition, and where there is no gap.
+    """
+    group, base = pool.fitter.simulator.windows.group, pool.models[BASE]
+    above = base.total - pool.noise * len(group)
+    if not chosen or above <= 0:
+        return float("nan")
+    drop = sum(float(np.sum((base.cost - pool.models[k].cost)[group == g])) for g, k in chosen.items())
+    return min(drop / above, 1.0)

@@ -19,7 +19,6 @@ from bayessim_mjx.diagnosis.findings import Findings, Progress
 from bayessim_mjx.diagnosis.selection.models import Model, nats
 from bayessim_mjx.diagnosis.selection.selected import Selection
 from bayessim_mjx.diagnosis.selection.tried import ranked
-from bayessim_mjx.diagnosis.selection.uncertainty import win_share
 from bayessim_mjx.effects.support.bodies import tilted
 
 Array = NDArray[np.float64]
@@ -103,9 +102,9 @@ def propose(
     setup, seed = found.setup, found.setup.seed
     cut, model = setup.fitter.simulator.windows, setup.physics.mj_model
     models, contested = _contenders(found.selection, rivals_models)
-    weights = np.maximum(
-        win_share(models, cut.group, found.selection.noise, np.random.default_rng(seed)), BUDGET.weight
-    )
+    known = found.selection.weighed.weight
+    weights = np.array([known.get(frozenset(c.label for c in m.effects), 0.0) for m in models])
+    weights = np.maximum(weights / max(weights.sum(), 1e-300), BUDGET.weight)
     scorer = Scorer(setup, models, weights, seed)
     allowed = limits_of(model, cut.logs, limits)
     rows = max(cut.steps, int(round(BUDGET.seconds / cut.dt)) // cut.steps * cut.steps)

@@ -11,10 +11,9 @@ import numpy as np
 from bayessim_mjx.diagnosis import phrases
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate, Coordinate, shrink
 from bayessim_mjx.diagnosis.fitting.quadratic import solve
-from bayessim_mjx.diagnosis.selection.budget import LEAVING_OUT, TOGETHER
+from bayessim_mjx.diagnosis.selection.budget import LEAVING_OUT
 from bayessim_mjx.diagnosis.selection.models import Model, nats, scored
 from bayessim_mjx.diagnosis.selection.pool import AFRESH, Pool, Progress, fresh
-from bayessim_mjx.diagnosis.selection.tried import ranked
 from bayessim_mjx.physics import Physics
 
 
@@ -28,8 +27,6 @@ class Widening:
     twice: float = 2.0
     farthest: float = 64.0
     nats: float = 2.0  # of held-out evidence that a wider range has to bring: odds of 7 to 1
-    most: int = 6  # single effects whose ranges grow before further ones are added
-    close: float = 4.0  # times the best one's cost: as near as a wider range has to promise to bring them
     steps: int = 8  # of a fit in a wider range
 
 
@@ -50,15 +47,15 @@ class Bound:
     why: str
 
 
-def widened(pool: Pool, model: Model, say: Progress, part: str = LEAVING_OUT) -> Model:
+def widened(pool: Pool, model: Model, say: Progress) -> Model:
     """The model with ranges as wide as it takes for its effects' parameters to lie within, refitted.
 
     A range doubles as long as a still wider one promises held-out evidence, up to `farthest` times what it was; what
     has brought it is kept. It stays where its end means that the effect is off, where physics ends, and where it sizes
-    an effect's memory. part: of the budget, after whose end it stays too.
+    an effect's memory.
     """
     last = model
-    while not pool.settings.budget.over(part) and _held(pool, last) and _promised(pool, last):
+    while not pool.settings.budget.over(LEAVING_OUT) and _held(pool, last) and _promised(pool, last):
         say("wider ranges", 0, 1)
         last = _refitted(pool, last, _moved(pool, last, _grown))
         if nats(model, last) >= WIDENING.nats:
@@ -71,19 +68,6 @@ def _promised(pool: Pool, model: Model) -> bool:
     """Whether the held-out evidence that ranges as wide as they may get promise is worth a refit."""
     left = max(model.total - promise(pool, model), 1e-9)
     return 0.5 * model.samples * math.log(model.total / left) > WIDENING.nats
-
-
-def widen_leading(pool: Pool, say: Progress) -> None:
-    """Wider ranges for single effects that may lead with them: one that is held back at a bound must not lose for that.
-
-    What a range as wide as it may get promises is linear: finding those that are held back costs no simulation.
-    """
-    singles = ranked(pool, 1)
-    limit = WIDENING.close * min((m.total for m in singles), default=0.0)
-    held = sorted(((m.total - promise(pool, m), m) for m in singles), key=lambda h: h[0])
-    held = [(total, m) for total, m in held if total < limit and _held(pool, m)]
-    for _, model in held[: WIDENING.most]:
-        widened(pool, model, say, TOGETHER)
 
 
 def promise(pool: Pool, model: Model) -> float:

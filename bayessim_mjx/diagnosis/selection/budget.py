@@ -10,10 +10,10 @@ from dataclasses import dataclass, replace
 # Of the time that is there once the simulator is compiled: nothing cuts what comes before.
 # A choice: what a search that was cut misses was not counted.
 KNOWN = "known parameters"  # their fit ends there, wherever it came to: on a stiff arm it alone took longer than all
-SCREENING, SINGLES, TOGETHER, FINALISTS = "screening", "single effects", "effects together", "finalists"
+SCREENING, SINGLES, TOGETHER = "screening", "single effects", "effects together"
 LEAVING_OUT = "leaving out"  # the last part: what is named with each effect left out, simulated held out
 ENDS = {
-    KNOWN: 0.1, SCREENING: 0.18, SINGLES: 0.3, TOGETHER: 0.45, FINALISTS: 0.55, LEAVING_OUT: 0.68,
+    KNOWN: 0.1, SCREENING: 0.18, SINGLES: 0.3, TOGETHER: 0.45, LEAVING_OUT: 0.68,
 }  # fmt: skip
 
 ROOM = 0.8  # of the time, after which nothing is begun that can be left out: whole logs of a stiff arm took a fifth

@@ -1,11 +1,10 @@
-"""Candidates as a decision sees them: which are special cases of others, and which may be in one model."""
+"""Which candidates may be in one model, and which are special cases of others."""
 
 from __future__ import annotations
 
 import functools
 
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
-from bayessim_mjx.diagnosis.selection.table import SPREADS, Law
 from bayessim_mjx.effects import load, names
 
 
@@ -15,16 +14,9 @@ def compatible(a: Candidate, b: Candidate) -> bool:
 
 
 def beside(a: Candidate, b: Candidate) -> bool:
-    """Whether both may be in one model (`Law.beside`)."""
-    return law_of(a).beside(law_of(b))
-
-
-def law_of(candidate: Candidate) -> Law:
-    """What a decision knows of a candidate."""
-    index = frozenset(i for c in candidate.coordinates for i in c.index)
-    names = candidate.label, candidate.effect, candidate.where
-    spread = candidate.kind in SPREADS or _of_each(candidate.effect)
-    return Law(*names, len(candidate.coordinates), index, special_cases(candidate), candidate.kind, spread)
+    """Whether both may be in one model: not the same numbers twice, nor a law beside its special case."""
+    within = a.where == b.where and (a.effect in special_cases(b) or b.effect in special_cases(a))
+    return a.label != b.label and compatible(a, b) and not within
 
 
 def special_cases(effect: Candidate) -> tuple[str, ...]:
@@ -35,9 +27,3 @@ def special_cases(effect: Candidate) -> tuple[str, ...]:
 @functools.cache  # thousands of pairs are compared, and all installed packages are looked through for a name
 def _contained(effect: str) -> tuple[str, ...]:
     return tuple(getattr(load(effect), "contains", ())) if effect in names() else ()
-
-
-@functools.cache
-def _of_each(effect: str) -> bool:
-    """Whether a robot has it at every body (`Effect.each`)."""
-    return effect in names() and load(effect).each

@@ -10,12 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from bayessim_mjx.diagnosis.fitting.candidates import Candidate, Coordinate
+from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.discretisation import contacts
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 from bayessim_mjx.diagnosis.selection import shortlist
 from bayessim_mjx.diagnosis.selection.budget import LEAVING_OUT, SINGLES
-from bayessim_mjx.diagnosis.selection.criteria import Criteria
 from bayessim_mjx.diagnosis.selection.heats import Heats
 from bayessim_mjx.diagnosis.selection.models import Model, scored
 from bayessim_mjx.diagnosis.selection.screen import Screened, Secants
@@ -57,7 +56,6 @@ class Pool(Tried):
     fitter: Fitter
     candidates: Sequence[Candidate]
     settings: Settings
-    criteria: Criteria
     nominal: Fit
     base: Model
     models: dict[frozenset[str], Model] = field(default_factory=dict)
@@ -94,21 +92,6 @@ def fresh(pool: Pool, fit: Fit) -> list[int]:
     base = len(pool.fitter.base)
     turn = base <= pool.settings.fresh and (_astray(pool, fit) or len(fit.history) % 3 == 0)
     return list(range(0 if turn else base, len(fit.coordinates)))
-
-
-def fit_models(pool: Pool, plans: Sequence[tuple[Model, Screened]], label: str, say: Progress) -> list[Model]:
-    """Models of the plans' effects plus one more each, fitted together; what was fitted before is looked up.
-
-    Those for which no time is left are not among them.
-    """
-    todo: Entries = {}
-    for model, extra in plans:
-        key = frozenset([*(c.label for c in model.effects), extra.candidate.label])
-        if key not in pool.models and key not in todo:
-            todo[key] = (starts(pool, model, extra, len(todo)), (*model.effects, extra.candidate))
-    fit_entries(pool, todo, label, say, SINGLES)
-    keys = [frozenset([*(c.label for c in m.effects), e.candidate.label]) for m, e in plans]
-    return [pool.models[k] for k in keys if k in pool.models]
 
 
 Entries = dict[frozenset[str], tuple[list[Fit], tuple[Candidate, ...]]]  # {labels: (a fit per start, effects)}
@@ -178,43 +161,9 @@ def _left_out(pool: Pool, models: Sequence[Sequence[Candidate]], label: str) -> 
     pool.skipped[label] = pool.skipped.get(label, 0) + len(models)
 
 
-def starts(pool: Pool, model: Model, extra: Screened, rank: int) -> list[Fit]:
-    """Jobs from several starting points: costs have several minima (an inertia hides in another, a shape is wrong)."""
-    fitter, coordinates, begun = pool.fitter, extra.candidate.coordinates, pool.begun(model.fit)
-    fits = [fitter.derive(begun, coordinates, extra.start)]
-    if rank < pool.settings.starts and extra.others:
-        anew = _delivered(pool, model, coordinates, extra)
-        # a limit has no derivative below its threshold, so also from the probe itself, not scaled down to its step
-        fits += [anew, fitter.derive(begun, coordinates, extra.others[0])]
-        fits += [fitter.derive(begun, coordinates, other) for other in extra.others[1:]]
-    return fits
-
-
-def _delivered(pool: Pool, model: Model, coordinates: Sequence[Coordinate], extra: Screened) -> Fit:
-    """A fit from the known parameters as they were delivered, not from where they went without the effect.
-
-    Far from the logs the start states went astray as well, and what they do depends on the effect.
-    """
-    fitter, base = pool.fitter, len(pool.fitter.base)
-    known = np.concatenate([[c.neutral for c in fitter.base], model.fit.values[base:]])
-    if _astray(pool, model.fit):
-        return fitter.begin((*model.fit.coordinates, *coordinates), np.concatenate([known, extra.start]))
-    anew = fitter.derive(model.fit, coordinates, extra.others[0])
-    return replace(anew, values=np.concatenate([known, anew.values[len(known) :]]))
-
-
 def _astray(pool: Pool, fit: Fit) -> bool:
     """Whether a fit is so far from the logs that its derivatives hold nowhere else."""
     return fit.cost > RULES.astray**2 * pool.noise * len(fit.r)
-
-
-def start_of(pool: Pool, candidate: Candidate) -> Screened:
-    """The candidate with its values from its single fit as the start."""
-    single = pool.models.get(frozenset([candidate.label]))
-    found = next(s for s in pool.screened if s.candidate.label == candidate.label)
-    if single is None:
-        return found
-    return Screened(candidate, single.values_of(candidate), found.gain, found.absorbed, found.column)
 
 
 def polish(pool: Pool, models: Sequence[Model], say: Progress = lambda text, done, total: None) -> list[Model]:
@@ -285,3 +234,13 @@ def _on(fitter: Fitter, fit: Fit) -> Fit:
         if fit.cost > 0.9 * before:
             break
     return fit
+
+
+def cut_back(pool: Pool, model: Model, kept: Sequence[Candidate]) -> Fit:
+    """A fit of some of a model's effects, from where the model is; its first residuals come with the first step."""
+    fit, base = model.fit, len(pool.fitter.base)
+    names = {c.name for e in kept for c in e.coordinates}
+    own = [i for i, c in enumerate(fit.coordinates) if i < base or c.name in names]
+    coordinates = tuple(fit.coordinates[i] for i in own)
+    columns = fit.A[:, :, own]
+    return Fit(coordinates, fit.values[own], fit.offsets, fit.r, columns, fit.B, fit.weight, np.inf, doubt=fit.doubt)

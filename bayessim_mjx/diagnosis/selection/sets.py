@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.selection.accuracy import Posterior
-from bayessim_mjx.diagnosis.selection.table import BASE, Key
 
-__all__ = ["BASE", "ODDS", "RELEVANCE", "Estimated", "Key", "Weighed", "core", "log_prior", "weighed"]
+Key = frozenset[str]  # labels of a model's effects
+BASE: Key = frozenset()  # the known parameters alone
 EXPECTED = (
     1.0  # effects that a simulator lacks, before any log is seen; the known parameters alone are as likely as one
 )

@@ -9,9 +9,10 @@ from bayessim_mjx.diagnosis import statistics
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 from bayessim_mjx.diagnosis.selection.budget import Budget
-from bayessim_mjx.diagnosis.selection.criteria import Criteria
 from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.selection.screen import Screened
+
+FLOOR = 1.3  # times the noise (rms): an error within it is not worth explaining
 
 
 @dataclass(frozen=True)
@@ -19,26 +20,18 @@ class Settings:
     """Budgets of the search, by the robot's size.
 
     Attributes:
-        singles: how many single effects are fitted; screened: windows looked at in screening.
-        starts: of these fitted from several starts; iterations, tolerance: of a fit.
+        screened: windows looked at in screening; iterations, tolerance: of a fit.
         fresh: base columns are differenced anew if there are at most so many.
-        first: labels of candidates that are fitted whatever the screening says; together: of a set of them that is.
         budget: time that the search may take.
         shortlisted: whether candidates are ranked on some of the windows first: faster, and their order is rougher.
         believed: share of the noise (rms) that is the sensors'; the rest is what the time step may be worth at most.
-        tolerated: squared gap, as a multiple of the noise's square, that is within the tolerance at whatever joint.
     """
 
-    singles: int = 24
     screened: int = 96
-    starts: int = 12
     iterations: int = 12
     tolerance: float = 5e-3
     fresh: int = 6
     believed: float = 1.0
-    tolerated: float = 0.0
-    first: tuple[str, ...] = ()
-    together: tuple[str, ...] = ()
     budget: Budget = Budget()
     shortlisted: bool = True
 
@@ -55,7 +48,6 @@ class Tried:
     fitter: Fitter
     candidates: Sequence[Candidate]
     settings: Settings
-    criteria: Criteria
     nominal: Fit
     base: Model
     models: Mapping[frozenset[str], Model]
@@ -74,7 +66,7 @@ class Tried:
         Errors of the time step may be smaller than feared: what has effects already has to reach the sensors' noise.
         """
         share = self.settings.believed if model.effects else 1.0
-        return model.total > (share * self.criteria.floor) ** 2 * self.noise * len(model.cost)
+        return model.total > (share * FLOOR) ** 2 * self.noise * len(model.cost)
 
     def closure(self, model: Model) -> float:
         """Share of the base model's squared gap above the noise that `model` closes, held out; at most 1.

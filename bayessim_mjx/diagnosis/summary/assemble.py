@@ -29,7 +29,7 @@ from bayessim_mjx.diagnosis.summary.left_in_words import (
     spectra_in_words,
 )
 from bayessim_mjx.diagnosis.summary.sentences import horizon_warning, sentences
-from bayessim_mjx.diagnosis.summary.verdict import by_chance, verdict_of
+from bayessim_mjx.diagnosis.summary.verdict import verdict_of
 from bayessim_mjx.diagnosis.summary.whole_logs import Whole
 from bayessim_mjx.logs.log import Channels
 
@@ -48,9 +48,7 @@ def diagnosis_of(found: Findings, about: Mapping[str, Any] | None = None, file: 
     setup, selection, model = found.setup, found.selection, found.model
     timestep = float(setup.robot.mj_model.opt.timestep) * (setup.discretisation.factor if setup.discretisation else 1)
     own = selection.estimated
-    together = uncertainty.covariance(setup.fitter, model, selection.along) if own is None else own.covariance
-    known = uncertainty.SYSTEMATIC.known if own is None else 0.0  # the evidence has it in the posterior (`doubts`)
-    together = together + np.diag(uncertainty.systematic(model, timestep, selection.left(model), known) ** 2)
+    together = own.covariance + np.diag(uncertainty.systematic(model, timestep, selection.left(model)) ** 2)
     finer = found.part(AtFinerSteps)
     steps = finer.notes(found, together) if finer else []
     together = _told(found, together + finer.covariance if finer else together)
@@ -60,11 +58,9 @@ def diagnosis_of(found: Findings, about: Mapping[str, Any] | None = None, file: 
     far = how_far.measured(found, {k: v for k, v in closed.items() if k != "each"})
     verdict = verdict_of(found, far)
     parameters = _parameters(selection, model, sd)
-    sheet = uncertainty.accuracies(setup.fitter, model, selection.along) if own is None else own.sheet
     over, where, proposal = found.part(Whole), found.part(Where), found.part(Experiment)
     far = how_far.with_whole(far, over, setup.tolerance) if over else far
-    odds = by_chance(found)
-    told = sentences(verdict, effects, parameters, found, far, odds)
+    told = sentences(verdict, effects, parameters, found, far)
     told += [not_on_offer(e.name for e in setup.physics.effects)] if verdict.name == "unexplained" else []
     notes = [*setup.warnings, *steps, *(over.notes if over else ()), *(horizon_warning(far) if effects else [])]
     more = {"maps": where.found.maps, "frequency": [heard.details() for heard in where.spectra]} if where else {}
@@ -78,17 +74,16 @@ def diagnosis_of(found: Findings, about: Mapping[str, Any] | None = None, file: 
         gap=far,
         parameters=parameters,
         candidates=ranking(selection),
-        warnings=[*notes, *_less_accurate(model, sheet), *found.warnings],
+        warnings=[*notes, *_less_accurate(model, own.sheet), *found.warnings],
         next_experiment=proposal.to_dict(file) if proposal else {},
         versions=versions.of(PACKAGES),
         details=details(found, effects, closed) | more | ({"experiments": proposal.details()} if proposal else {}),
         covariance={"names": list(model.fit.names), "matrix": together},
         not_fitted=left_out.not_fitted(selection),
         about={**about, "conditions": setup.fitter.simulator.windows.conditions} if about else {},
-        chance=odds,
         hidden=list(selection.hidden),
-        accuracy=_accuracy(model, sheet),
-        evidence=[] if selection.weighed is None else selection.weighed.told(),
+        accuracy=_accuracy(model, own.sheet),
+        evidence=selection.weighed.told(),
     )
 
 
@@ -124,17 +119,17 @@ def _against_data_sheet(c: Coordinate, value: float, precision: float) -> dict[s
     return {"data_sheet": phrases.far_from_data_sheet(value, away), "away": away}
 
 
-def _accuracy(model: Model, sheet: Posterior | None) -> dict[str, dict[str, float]]:
+def _accuracy(model: Model, sheet: Posterior) -> dict[str, dict[str, float]]:
     """Of each kind of parameter whose accuracy nobody stated."""
     every = [c.kind for c in model.fit.coordinates]
-    ends = {kind: sheet.accuracy(kind) for kind in sheet.kinds} if sheet else {}
+    ends = {kind: sheet.accuracy(kind) for kind in sheet.kinds}
     return {
         kind: {"median": middle, "low": low, "high": high, "parameters": every.count(kind)}
         for kind, (low, middle, high) in ends.items()
     }
 
 
-def _less_accurate(model: Model, sheet: Posterior | None) -> list[str]:
+def _less_accurate(model: Model, sheet: Posterior) -> list[str]:
     """Kinds of parameters that lie farther from their data sheet than half of all do, 9 to 1 or surer."""
     found = {kind: own for kind, own in _accuracy(model, sheet).items() if own["low"] > data_sheet.ACCURACY}
     return (

@@ -10,7 +10,7 @@ import numpy as np
 from bayessim_mjx.diagnosis.findings import Findings
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.result import Estimate, FoundEffect
-from bayessim_mjx.diagnosis.selection import bounds, heldout, predicted_gain, uncertainty
+from bayessim_mjx.diagnosis.selection import bounds, heldout, predicted_gain
 from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.setup import Setup
 
@@ -78,9 +78,9 @@ def _closed(found: Findings) -> heldout.Closed:
     before, after = (found.predictions[k].cost(cut.steps) for k in ("calibrated", "with_effects"))
     answer = frozenset(e.label for e in found.model.effects)
     for condition, chosen in selection.chosen.items() if nested(found) else ():
-        if chosen != answer and selection.searched is not None:
-            own, rows = cut.group == condition, selection.searched.rows
-            after[own] = before[own] * rows[chosen].cost[own] / rows[frozenset()].cost[own]
+        if chosen != answer:
+            own, models = cut.group == condition, selection.models
+            after[own] = before[own] * models[chosen].cost[own] / models[frozenset()].cost[own]
     floor = heldout.noise_floor(found.setup.fitter, found.model.fit)
     return heldout.Closed(before, after, cut.condition, floor)
 
@@ -128,14 +128,12 @@ def _sentence(clauses: list[str]) -> str:
 
 
 def _weights(found: Findings, models: list[Model]) -> list[float]:
-    """Relative scores of a model and its rivals, no probabilities of being right; NaN of one that has none."""
+    """Probabilities of a model and its rivals beside each other; NaN of one that has none."""
     if len(models) < 2:
         return [float("nan")]
-    if (weighed := found.selection.weighed) is not None:
-        each = np.array([weighed.weight.get(frozenset(e.label for e in m.effects), 0.0) for m in models])
-        return (each / max(each.sum(), 1e-300)).tolist()
-    group, rng = found.setup.fitter.simulator.windows.group, np.random.default_rng(found.setup.seed)
-    return uncertainty.win_share(models, group, found.selection.noise, rng, found.setup.fitter.numbers).tolist()
+    weight = found.selection.weighed.weight
+    each = np.array([weight.get(frozenset(e.label for e in m.effects), 0.0) for m in models])
+    return (each / max(each.sum(), 1e-300)).tolist()
 
 
 def _unit(setup: Setup, effect: Candidate, unit: str) -> str:

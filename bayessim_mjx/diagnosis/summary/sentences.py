@@ -18,7 +18,6 @@ from bayessim_mjx.diagnosis.summary.texts import (
     BEATEN,
     BENT,
     BUILDS_UP,
-    BY_CHANCE,
     CHANCE,
     COASTS,
     COASTS_CLOSED,
@@ -63,16 +62,15 @@ def sentences(
     parameters: dict[str, dict[str, Any]],
     found: Findings,
     far: Gap,
-    odds: Mapping[str, Any],
 ) -> list[str]:
-    """The verdict, most important first; `odds`: what is named by chance, see `Diagnosis.chance`."""
+    """The verdict, most important first."""
     name, cut = verdict.name, found.selection.fitter.simulator.windows
     told = verdict_in_words(name, effects, far, verdict.remains, verdict.beaten)
     far_off, known = verdict.bent
     told += [BENT.format(far=far_off, known=known)] if known else []
     if verdict.builds_up:
         told.append(BUILDS_UP.format(times=f"{verdict.builds_up:.2g}", window=f"{cut.steps * cut.dt:.2g} s"))
-    told += [_coasting(far, bool(effects)), _by_chance(odds), _probable(found.selection.weighed)]
+    told += [_coasting(far, bool(effects)), _probable(found.selection.weighed)]
     if found.selection.ambiguous:
         told += [_instead(e, found.selection.rivals.get(f"{e.name}@{e.where}", ())) for e in effects]
     told += [_hidden(found.selection.hidden, len(effects))]
@@ -115,17 +113,9 @@ def _hidden(labels: Sequence[str], effects: int) -> str:
     return HIDDEN.format(them="it" if effects == 1 else "them", hidden=listed(parts, "or"))
 
 
-def _by_chance(odds: Mapping[str, Any]) -> str:
-    if not odds:
-        return ""
-    rare = odds["probability"] * (odds["draws"] + 1) < 1.5
-    share = f"{'less than ' if rare else ''}{percent(odds['probability'])}"
-    return BY_CHANCE.format(candidates=odds["candidates"], chance=share)
-
-
-def _probable(weighed: Weighed | None) -> str:
-    """Of what is named, where the evidence decided."""
-    if weighed is None or not weighed.answer:
+def _probable(weighed: Weighed) -> str:
+    """Of what is named."""
+    if not weighed.answer:
         return ""
     others, nothing = sum(weighed.weight[k] for k in weighed.beside), weighed.weight[BASE]
     told = percent(nothing) if nothing > SELDOM else "less than one in a million"

@@ -44,10 +44,6 @@ IN_SAMPLE = (
     "they hold in another condition."
 )
 WITHIN = "What remains is within the tolerance at every joint: {within}."
-BY_CHANCE = (
-    "The best of {candidates} candidates gains as much in {chance} of logs in which nothing is missing (drawn from the "
-    "recalibrated simulator with noise as it is in these logs)."
-)
 PROBABLE = (
     "Probability of this explanation among all that were fitted: {share}; of the others that stand beside it: "
     "{others}; of the known parameters alone: {nothing}."

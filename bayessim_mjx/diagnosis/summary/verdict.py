@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from scipy.stats import chi2
@@ -13,10 +12,8 @@ from bayessim_mjx.diagnosis.findings import Findings
 from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
 from bayessim_mjx.diagnosis.residual.origin import Origin, origin
 from bayessim_mjx.diagnosis.result import Gap
-from bayessim_mjx.diagnosis.selection import chance
-from bayessim_mjx.diagnosis.selection.decide import compare
 from bayessim_mjx.diagnosis.selection.models import Model
-from bayessim_mjx.diagnosis.selection.table import BASE
+from bayessim_mjx.diagnosis.selection.tried import FLOOR
 from bayessim_mjx.diagnosis.summary.whole_logs import Whole
 
 
@@ -131,7 +128,7 @@ def _name(found: Findings, far: Gap, remaining: float, alone: bool, noise: Origi
     if tried.above_noise(tried.base) and remaining > LIMITS.share:
         return "unexplained"
     q, _ = tried.nominal.quadratic(tried.fitter.spread)
-    floor = tried.noise * len(tried.base.cost) * tried.criteria.floor**2
+    floor = tried.noise * len(tried.base.cost) * FLOOR**2
     return "parameters" if q.c.sum() > max(1.1 * tried.base.total, floor) else "no_gap"
 
 
@@ -187,22 +184,3 @@ def sensors_noise(found: Findings) -> Origin | None:
     channels = int(fitter.used.sum())
     where = origin(fit.r, fit.B, missing.linear.D, missing.amplitude, channels, fit.weight, fitter.rate())
     return where if where.of_sensors else None
-
-
-def by_chance(found: Findings) -> dict[str, Any]:
-    """How often the best candidate gains as much in logs without a missing effect; {} where nothing is named.
-
-    {"probability" of the answer, "each": {label: of what it brings beside the others}, "nats", "draws", "candidates"}
-    """
-    if found.selection.weighed is not None:  # it has a probability of its own (`Diagnosis.evidence`)
-        return {}
-    selection, table = found.selection, found.selection.table
-    key = frozenset(e.label for e in found.model.effects)
-    if not key or table is None or not len(table.chance) or key not in table.rows:
-        return {}
-    nats = compare(table, BASE, key).nats
-    less = {label: key - {label} for label in sorted(key) if key - {label} in table.rows}
-    each = {k: chance.probability(table.chance, compare(table, rest, key).nats) for k, rest in less.items()}
-    own = chance.probability(table.chance, nats)
-    level = {"level": selection.criteria.chance, "draws": len(table.chance), "candidates": len(table.laws)}
-    return {"probability": own, "each": each, "nats": nats} | level

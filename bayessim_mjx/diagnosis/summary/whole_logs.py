@@ -174,9 +174,9 @@ def _drawn(
 
 def _root(found: Findings, model: Model) -> Array:
     """Square root `[k, k]` of the covariance of parameters whose law is right: noise, and what simulators differ by."""
-    setup, selection = found.setup, found.selection
-    own = np.diag(uncertainty.systematic(model, float(setup.physics.mj_model.opt.timestep)) ** 2)
-    return statistics.root(uncertainty.of_noise(setup.fitter, model, selection.along) + own)
+    setup, known = found.setup, uncertainty.KNOWN
+    own = uncertainty.systematic(model, float(setup.physics.mj_model.opt.timestep), known=known)
+    return statistics.root(uncertainty.of_noise(setup.fitter, model) + np.diag(own**2))
 
 
 def _values(found: Findings, stage: _Stage, w: int) -> Array:
