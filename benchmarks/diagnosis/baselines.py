@@ -15,8 +15,10 @@ from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.quadratic import RULES, solve
 from bayessim_mjx.diagnosis.selection import heldout, uncertainty
 from bayessim_mjx.diagnosis.selection.models import Model
-from bayessim_mjx.diagnosis.selection.pool import Pool, fit_models, start_of
+from bayessim_mjx.diagnosis.selection.pool import Pool, fit_entries
+from bayessim_mjx.diagnosis.selection.screen import Screened
 
+SINGLES = 24  # effects that are fitted alone
 TESTED = 0.3  # share of the operating conditions in the one test set of the single fold
 # what the flexible force depends on most -> the effect that a reader would name; not here: nothing that can be named
 MEANS = {
@@ -36,7 +38,9 @@ class Reopened:
 
     def __init__(self, found: Findings) -> None:
         self.setup, self.predictions, self.flexible_base = found.setup, found.predictions, found.flexible_base
-        self.pool = found.selection.reopened()
+        of = found.selection
+        fitted = dict(of.models), list(of.screened), set(of.cut_short), dict(of.skipped)
+        self.pool = Pool(of.fitter, of.candidates, of.settings, of.nominal, of.base, *fitted)
 
 
 def candidate_of(pool: Pool, name: str, where: str, joint_of: dict[str, str]) -> Candidate | None:
@@ -48,16 +52,27 @@ def candidate_of(pool: Pool, name: str, where: str, joint_of: dict[str, str]) ->
 
 def fitted(pool: Pool, effects: Sequence[Candidate]) -> Model:
     """The model of these effects, fitted one after the other, as the pool does it."""
+    screened = {s.candidate.label: s for s in pool.screened}
     model = pool.base
     for effect in effects:
-        (model,) = fit_models(pool, [(model, start_of(pool, effect))], "", _quiet)
+        model = _with(pool, model, [screened[effect.label]])[0]
     return model
+
+
+def _with(pool: Pool, model: Model, more: Sequence[Screened]) -> list[Model]:
+    """The model with each of some further effects, from its screened start and where it was looked at."""
+    entries = {}
+    for s in more:
+        key = frozenset([*(e.label for e in model.effects), s.candidate.label])
+        starts = [pool.fitter.derive(pool.begun(model.fit), s.candidate.coordinates, x) for x in (s.start, *s.others)]
+        entries[key] = (starts, (*model.effects, s.candidate))
+    fit_entries(pool, {key: entry for key, entry in entries.items() if key not in pool.models}, "", _quiet)
+    return [pool.models[key] for key in entries]
 
 
 def singles(pool: Pool) -> list[Model]:
     """Every effect at every place that screening gave a chance, also where the pool saw nothing to explain."""
-    chosen = [s for s in pool.screened if s.gain > 0][: pool.settings.singles]
-    return fit_models(pool, [(pool.base, s) for s in chosen], "", _quiet)
+    return _with(pool, pool.base, [s for s in pool.screened if s.gain > 0][:SINGLES])
 
 
 def closure(found: Reopened, model: Model) -> float:
@@ -73,7 +88,7 @@ def told(found: Reopened, model: Model) -> Said:
     """A model as a verdict: each of its effects is named, with intervals."""
     if not model.effects:
         return {"verdict": "parameters", "effects": []}
-    sd = uncertainty.deviations(found.setup.fitter, model)
+    sd = np.sqrt(np.diag(uncertainty.of_noise(found.setup.fitter, model)))
     closed = closure(found, model)
     effects = []
     for effect in model.effects:

@@ -26,8 +26,8 @@ any case was diagnosed:
   Answers that name effects but state no interval (one condition) are counted apart.
 - **Outside.** Of a null an alarm is an effect that is named, or "unexplained"; a cause that the library does not have
   is found if the verdict is "unexplained".
-- **Stated probabilities** (`--decide evidence`). That of the answer, against whether it is exactly the hidden set
-  (nothing, of a null); unknown causes left out. Brier score, and bins of a fifth.
+- **Stated probabilities.** That of the answer (`evidence` of diagnosis.json), against whether it is exactly the hidden
+  set (nothing, of a null); unknown causes left out. Brier score, and bins of a fifth.
 - **Goal.** 86 to 94 % of each; intervals beside the rates are 95 % Wilson intervals. Parameters of one case are not
   independent of each other: those of strengths and known parameters are too narrow.
 """
@@ -167,7 +167,7 @@ def main() -> None:
     single.add_argument("folder", type=Path)
     single.add_argument("--core", type=int)
     for command in (several, single):
-        command.add_argument("--more", default="", help="further options of the command, as --more='--decide evidence'")
+        command.add_argument("--more", default="", help="further options of the command, as --more='--accuracy 5%%'")
     told = commands.add_parser("score", help="tables of what came of all cases")
     told.add_argument("out", type=Path)
     told.add_argument("--before", type=Path, help="the same cases by another commit")

@@ -1,6 +1,5 @@
 """The library's side of the comparison with mujoco.sysid: its parameter fit and its single effects, timed in parts."""
 
-import dataclasses
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -9,9 +8,8 @@ from typing import Any
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fitter import Fitter
 from bayessim_mjx.diagnosis.fitting.robot import of_file
-from bayessim_mjx.diagnosis.selection.criteria import Criteria
 from bayessim_mjx.diagnosis.selection.models import scored
-from bayessim_mjx.diagnosis.selection.pool import Pool, fit_models
+from bayessim_mjx.diagnosis.selection.pool import Pool, fit_entries
 from bayessim_mjx.diagnosis.selection.screen import screen
 from bayessim_mjx.diagnosis.selection.tried import ranked
 from bayessim_mjx.diagnosis.setup import Setup
@@ -58,10 +56,10 @@ def fit(folder: Path, without: str) -> dict:
 def fit_all(folder: Path) -> tuple[dict, list[Candidate]]:
     """Screening of all candidates and the fits of all singles that could gain, each in its share of the whole."""
     reading, compiling, setup = prepare(folder, "all", None)
-    fitter, settings = setup.fitter, dataclasses.replace(setup.settings, singles=len(setup.candidates))
+    fitter, settings = setup.fitter, setup.settings
     known, fit = timed(lambda: fit_base(fitter))
     model = scored(fitter, fit, ())
-    tried = Pool(fitter, setup.candidates, settings, Criteria(), fit, model)
+    tried = Pool(fitter, setup.candidates, settings, fit, model)
     screening, tried.screened = timed(lambda: screen(fitter, fit, setup.candidates, settings.screened))
     singles, models = timed(lambda: _singles(tried))
     assert fitter.simulator.traces == 1
@@ -71,5 +69,10 @@ def fit_all(folder: Path) -> tuple[dict, list[Candidate]]:
 
 
 def _singles(tried: Pool) -> list:
-    plans = [(tried.base, s) for s in tried.screened if s.gain > 0]
-    return fit_models(tried, plans, "single effects", lambda text, done, total: None)
+    entries = {}
+    for s in tried.screened:
+        if s.gain > 0:
+            starts = [tried.fitter.derive(tried.base.fit, s.candidate.coordinates, x) for x in (s.start, *s.others)]
+            entries[frozenset([s.candidate.label])] = (starts, (s.candidate,))
+    fit_entries(tried, entries, "single effects", lambda text, done, total: None)
+    return list(entries)

@@ -17,7 +17,7 @@ RECORDED = "tests/loop/test_recorded.py"
 ALGEBRA = "tests/test_algebra.py"
 MANIFEST = "tests/runs"
 LOG = "tests/logs/test_resample.py"
-DECIDE = "tests/diagnosis/selection/test_decide.py"
+SETS = "tests/diagnosis/selection/test_sets.py"
 
 FAULTS: tuple[tuple[str, str, str, str, tuple[str, ...]], ...] = (
     # physics
@@ -158,8 +158,8 @@ FAULTS: tuple[tuple[str, str, str, str, tuple[str, ...]], ...] = (
     ),
     # diagnosis
     (
-        "superfluous effects stay in the answer", f"{P}/diagnosis/selection/decide.py",
-        "criteria.same) and real(", "0.0) and real(", (DECIDE, "-k", "further_effect"),
+        "superfluous effects stay in the answer", f"{P}/diagnosis/selection/sets.py",
+        "limit = excess[key] +", "limit = 0.0 * excess[key] - 1.0 +", (SETS,),
     ),
     (
         "noise is not taken out before the tolerance", f"{P}/diagnosis/tolerance.py",
@@ -167,8 +167,8 @@ FAULTS: tuple[tuple[str, str, str, str, tuple[str, ...]], ...] = (
         ("tests/diagnosis/test_tolerance.py", "-k", "taken_out"),
     ),
     (
-        "a law gives way to a special case that closes far less", f"{P}/diagnosis/selection/decide.py",
-        "1e-9) < 1.0 + criteria.same", "1e-9) < 100.0 + criteria.same", (DECIDE, "-k", "special_case"),
+        "a set costs nothing more than a smaller one", f"{P}/diagnosis/selection/sets.py",
+        "return len(key) * float(np.log(odds))", "return 0.0", (SETS,),
     ),
     # environment
     (

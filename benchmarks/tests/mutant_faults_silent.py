@@ -150,10 +150,6 @@ SILENT: tuple[tuple[str, str, str, str, tuple[str, ...]], ...] = (
         "c + (q.c[w] - c.sum()) / count,", "c + (q.c[w] - c.sum()),", _tests("diagnosis/fitting/test_quadratic"),
     ),
     (
-        "null logs are scored by fits that saw them", f"{DIAGNOSIS}/selection/chance.py", "(total - member @ v for",
-        "(total - 0 * (member @ v) for", _tests("diagnosis/selection/test_chance"),
-    ),
-    (
         "what was not calibrated gets a twelfth of its range as width", f"{DIAGNOSIS}/correction.py",
         "(p.high - p.low) / math.sqrt(12) if", "(p.high - p.low) / 12 if",
         _tests("diagnosis/test_correction", k="as_wide"),

@@ -172,13 +172,13 @@ def test_cases_that_run_when_the_time_is_over_are_killed_and_begun_again(tmp_pat
     begun: list = []
 
     def sleep(folder: Path, core: int, more: str) -> subprocess.Popen:
-        assert more == "--decide evidence"
+        assert more == "--accuracy 5%"
         begun.append(subprocess.Popen(["sleep", "60"], start_new_session=True))
         return begun[-1]
 
     monkeypatch.setattr(command, "_begin", sleep)
     args = argparse.Namespace(
-        out=tmp_path, jobs=1, minutes=0.01, only="sheets", systems="leg", shard="1/10", more="--decide evidence"
+        out=tmp_path, jobs=1, minutes=0.01, only="sheets", systems="leg", shard="1/10", more="--accuracy 5%"
     )
     for _ in range(2):
         command.run(args)

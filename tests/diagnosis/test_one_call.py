@@ -159,7 +159,7 @@ def test_the_verdict_alone_has_no_optional_stages(monkeypatch, left_out):
     monkeypatch.setattr(run, "_within", lambda setup, time_left: setup)
     monkeypatch.setattr(run.resumed, "remembering", lambda setup, *a: setup)
     monkeypatch.setattr(run.resumed, "ended", lambda setup: None)
-    monkeypatch.setattr(run.selected, "select", lambda *a: SimpleNamespace(answer="a model"))
+    monkeypatch.setattr(run.selecting, "select", lambda *a: SimpleNamespace(answer="a model"))
     ran = []
 
     def stage(name, optional):

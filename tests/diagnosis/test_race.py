@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from bayessim_mjx.diagnosis import phrases, resumed
-from bayessim_mjx.diagnosis.selection import pool, selected
+from bayessim_mjx.diagnosis.evidence import selecting
+from bayessim_mjx.diagnosis.selection import pool
 from bayessim_mjx.diagnosis.selection.budget import Budget
-from bayessim_mjx.diagnosis.selection.criteria import Criteria
 from bayessim_mjx.diagnosis.selection.left_out import not_fitted, not_tried
 from bayessim_mjx.diagnosis.setup import prepare
 
@@ -40,8 +40,7 @@ def narrowed(candidate):
 
 def searched(setup, say=lambda *told: None, **budget):
     settings = dataclasses.replace(setup.settings, budget=Budget(**budget))
-    given = setup.fitter, setup.candidates, settings, Criteria()
-    return selected.select(*given, say)
+    return selecting.select(setup.fitter, setup.candidates, settings, say)
 
 
 @pytest.fixture(scope="module")
@@ -79,8 +78,8 @@ def test_a_killed_search_goes_on_and_comes_to_the_same(setup, counted_whole, tmp
 
     simulator = setup.fitter.simulator
     with pytest.raises(Killed):
-        searched(resumed.remembering(setup, Criteria(), tmp_path), say)
-    before, again = simulator.rollouts, resumed.remembering(setup, Criteria(), tmp_path)
+        searched(resumed.remembering(setup, tmp_path), say)
+    before, again = simulator.rollouts, resumed.remembering(setup, tmp_path)
     rest = searched(again)
     there = again.fitter.journal.found
     assert there > 3 and rest.answer.label == whole.answer.label

@@ -4,8 +4,6 @@ import numpy as np
 import pytest
 
 from bayessim_mjx.diagnosis import run
-from bayessim_mjx.diagnosis.selection.criteria import Criteria
-from bayessim_mjx.errors import UserError
 from tests.diagnosis import pendulums
 
 FRICTION, SCALE = 0.06, (1.05, 0.97, 1.03)
@@ -16,7 +14,7 @@ def diagnosed(tmp_path_factory):
     """Of logs with dry friction and other known parameters; five effects are on offer."""
     robot = pendulums.nominal(tmp_path_factory.mktemp("model"))
     logs = pendulums.recorded(friction=FRICTION, scale=SCALE, count=6)
-    return run.diagnose(robot, logs, effects=list(pendulums.FEW), decide="evidence", verdict_only=True)
+    return run.diagnose(robot, logs, effects=list(pendulums.FEW), verdict_only=True)
 
 
 @pytest.mark.slow
@@ -29,7 +27,6 @@ def test_probabilities_come_with_the_answer(diagnosed):
     assert told[frozenset()]["nats"] == 0 and told[frozenset()]["probability"] < 1e-6
     assert sum(e["probability"] for e in diagnosed.evidence) == pytest.approx(1.0, abs=2e-3)
     assert any("Probability of this explanation" in text and "one in a million" in text for text in diagnosed.sentences)
-    assert diagnosed.chance == {}
 
 
 @pytest.mark.slow
@@ -43,11 +40,3 @@ def test_intervals_hold_what_was_simulated_with(diagnosed):
     covariance = np.array(diagnosed.covariance["matrix"])
     assert np.linalg.eigvalsh(covariance).min() > -1e-12 and len(covariance) == len(diagnosed.covariance["names"])
     assert 0.95 < diagnosed.gap.closed["realised"] <= 1.0 and diagnosed.gap.closed["nested"]
-
-
-def test_what_cannot_decide_is_refused(tmp_path):
-    robot, logs = pendulums.nominal(tmp_path), pendulums.recorded(count=2, seconds=2.0)
-    with pytest.raises(UserError, match="decide='chance': allowed are prediction and evidence"):
-        run.diagnose(robot, logs, decide="chance")
-    with pytest.raises(UserError, match="criteria change how predictions are compared"):
-        run.diagnose(robot, logs, decide="evidence", criteria=Criteria())

@@ -12,15 +12,15 @@ from bayessim_mjx.diagnosis.experiment.limits import limits_of
 from bayessim_mjx.diagnosis.experiment.propose import propose
 from bayessim_mjx.diagnosis.findings import Findings
 from bayessim_mjx.diagnosis.fitting.robot import Robot, default_space
-from bayessim_mjx.diagnosis.selection import singles
-from bayessim_mjx.diagnosis.selection.criteria import Criteria
 from bayessim_mjx.diagnosis.selection.models import nats, scored
-from bayessim_mjx.diagnosis.selection.selected import frozen
+from bayessim_mjx.diagnosis.selection.selected import selection_of
+from bayessim_mjx.diagnosis.selection.sets import Weighed
 from bayessim_mjx.diagnosis.selection.tried import ranked
 from bayessim_mjx.diagnosis.setup import prepare
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Channels, Log
 from bayessim_mjx.logs.signals import estimate_velocity
+from tests.diagnosis import singles
 
 pytestmark = [pytest.mark.slow, pytest.mark.ci]  # whole diagnoses and fits
 
@@ -74,9 +74,7 @@ def slow_logs():
 
 def diagnosed(logs):
     setup = prepare(robot(), logs, ["viscous_friction", "quadratic_drag"])
-    pool = singles.begin(setup.fitter, setup.candidates, setup.settings, Criteria())
-    singles.fit_singles(pool)
-    return setup, pool
+    return setup, singles.fitted(setup)
 
 
 @functools.cache
@@ -84,7 +82,14 @@ def contest():
     """(findings, both models) after slow logs."""
     setup, pool = diagnosed(slow_logs())
     models = {m.effects[0].effect: m for m in ranked(pool, 1)}
-    return Findings(setup, frozen(pool, models["quadratic_drag"], {})), models
+    return Findings(setup, concluded(pool, models["quadratic_drag"])), models
+
+
+def concluded(pool, answer):
+    """A selection that names the answer, and holds all that were fitted for equally likely."""
+    weighed = Weighed(dict.fromkeys(pool.models, 1 / len(pool.models)), dict.fromkeys(pool.models, 0.0), {})
+    nothing = {"subsets": {}, "promised": (0.0, {}), "chosen": {}, "elsewhere": float("nan"), "hidden": ()}
+    return selection_of(pool, answer, rivals={}, weighed=weighed, estimated=None, **nothing)
 
 
 @functools.cache

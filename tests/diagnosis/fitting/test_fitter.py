@@ -5,7 +5,7 @@ import pytest
 
 from bayessim_mjx.diagnosis.fitting.fitter import weights
 from bayessim_mjx.diagnosis.selection.models import scored
-from bayessim_mjx.diagnosis.selection.uncertainty import deviations
+from bayessim_mjx.diagnosis.selection.uncertainty import of_noise
 from bayessim_mjx.diagnosis.setup import prepare
 from tests.diagnosis.pendulums import NAMES, fitted, nominal, recorded
 
@@ -75,7 +75,7 @@ def test_a_level_of_dry_friction_is_recovered(rubbing):
     assert fit.cost < 0.5 * base.cost
     model = scored(fitter, fit, (candidate,))
     assert model.total < 0.5 * scored(fitter, base, ()).total
-    assert abs(fit.values[-1] - FRICTION) < 4 * deviations(fitter, model)[-1] + 0.02 * FRICTION
+    assert abs(fit.values[-1] - FRICTION) < 4 * of_noise(fitter, model)[-1, -1] ** 0.5 + 0.02 * FRICTION
     assert model.values_of(candidate) == pytest.approx([fit.values[-1]])
 
 

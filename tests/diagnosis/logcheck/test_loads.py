@@ -7,11 +7,10 @@ import pytest
 from bayessim_mjx import effects
 from bayessim_mjx.diagnosis.fitting import robot, scales
 from bayessim_mjx.diagnosis.logcheck import loads
-from bayessim_mjx.diagnosis.selection import singles
-from bayessim_mjx.diagnosis.selection.criteria import Criteria
-from bayessim_mjx.diagnosis.selection.tried import Settings, ranked
+from bayessim_mjx.diagnosis.selection.tried import ranked
 from bayessim_mjx.diagnosis.setup import prepare
 from bayessim_mjx.logs import Channels, Log, estimate_velocity
+from tests.diagnosis import singles
 
 ARM = """<mujoco><option timestep="%g" integrator="%s"/><worldbody><body name="upper" pos="0 0 1">
   <joint name="shoulder" axis="0 1 0" damping="1" %s/>
@@ -90,11 +89,8 @@ def test_a_load_fifteen_times_its_flange_is_found_again(tmp_path):
     path = tmp_path / "arm.xml"
     path.write_text(ARM % (0.002, "Euler", *LIMITS, ""))
     setup = prepare(robot.of_file(path), [follow(truth, i, 2.0) for i in range(3)], ("payload",))
-    settings = Settings(singles=1, starts=1)
     candidates = [c for c in setup.candidates if c.where == "flange"]  # the same rigid body as the lower arm
-    pool = singles.begin(setup.fitter, candidates, settings, Criteria())
-    singles.fit_singles(pool)
-    found = ranked(pool)[0]
+    found = ranked(singles.fitted(setup, candidates))[0]
     assert [c.label for c in found.effects] == ["payload@flange"]
     mass, x, _, z = found.values_of(found.effects[0])
     assert mass == pytest.approx(3.0, rel=0.03) and x == pytest.approx(0.2, abs=0.02)

@@ -10,7 +10,6 @@ from bayessim_mjx.diagnosis.fitting.candidates import Candidate, Coordinate, shr
 from bayessim_mjx.diagnosis.fitting.fitter import Fitter
 from bayessim_mjx.diagnosis.result import Estimate
 from bayessim_mjx.diagnosis.selection import bounds
-from bayessim_mjx.diagnosis.selection.criteria import Criteria
 from bayessim_mjx.diagnosis.selection.models import scored
 from bayessim_mjx.diagnosis.selection.pool import Pool
 from bayessim_mjx.diagnosis.selection.tried import Settings
@@ -62,7 +61,7 @@ def pool_of(true, quantity=None, low=0.0, high=1.0, neutral=0.0, start=0.5):
     fit = fitter.begin((coordinate,), np.array([start]))
     (fit,) = fitter.iterate([fit], 10, lambda f: [0])
     model = scored(fitter, fitter.refresh(fit), (candidate,))
-    pool = Pool(fitter, [candidate], Settings(), Criteria(), empty.fit, empty)
+    pool = Pool(fitter, [candidate], Settings(), empty.fit, empty)
     pool.models[frozenset([candidate.label])] = model
     return pool, model
 

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from bayessim_mjx.diagnosis.selection import hidden
-from bayessim_mjx.diagnosis.selection.criteria import Criteria
 from bayessim_mjx.diagnosis.selection.models import scored
 from bayessim_mjx.diagnosis.selection.pool import Pool
 from bayessim_mjx.diagnosis.selection.screen import screen
@@ -18,7 +17,7 @@ def test_what_a_named_law_can_do_by_itself_is_told_as_hidden_beside_it(tmp_path)
     setup = prepare(nominal(tmp_path), recorded(), ["joint_spring", "actuator_bias", "coulomb_friction"])
     fitter, fit = fitted(setup)
     base = scored(fitter, fit, ())
-    pool = Pool(fitter, setup.candidates, setup.settings, Criteria(), fit, base)
+    pool = Pool(fitter, setup.candidates, setup.settings, fit, base)
     pool.screened = screen(fitter, fit, setup.candidates, setup.settings.screened, secants=pool.secants)
     own = {c.effect: c for c in setup.candidates}
     spring = own["joint_spring"]

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from bayessim_mjx.diagnosis import phrases
-from bayessim_mjx.diagnosis.selection import singles
+from bayessim_mjx.diagnosis.selection import begin as beginning
 from bayessim_mjx.diagnosis.selection.budget import ENDS, Budget, begun
-from bayessim_mjx.diagnosis.selection.criteria import Criteria
 from bayessim_mjx.diagnosis.selection.left_out import not_fitted, not_tried
 from bayessim_mjx.diagnosis.selection.tried import Settings
 
@@ -44,7 +43,7 @@ def test_what_there_was_no_time_for_is_told_in_words():
 def test_parts_end_one_after_the_other_and_without_a_limit_never():
     clock = iter([29.0, 40.0, 54.0])
     budget = Budget(100.0, 0.0, lambda: next(clock))
-    assert [budget.over(part) for part in ("single effects", "single effects", "finalists")] == [False, True, False]
+    assert [budget.over(part) for part in ("single effects", "single effects", "leaving out")] == [False, True, False]
     assert list(ENDS.values()) == sorted(ENDS.values())
     assert not begun(None).over("screening") and not begun(None).limited
     assert begun(2.0).left("single effects") == pytest.approx(120 * ENDS["single effects"], abs=1.0)
@@ -102,14 +101,10 @@ class Slow:
 
 
 @pytest.mark.parametrize(
-    ("limit", "steps", "refreshed", "windows", "alone", "starts"),
-    [(600.0, 6, 1, 8, 9, 0), (1e9, 20, 2, 20, 24, 12), (4000.0, 20, 2, 20, 24, 12)],
+    ("limit", "steps", "refreshed", "windows"), [(600.0, 6, 1, 8), (1e9, 20, 2, 20), (4000.0, 20, 2, 20)]
 )
-def test_the_fit_of_the_known_parameters_ends_with_its_share_of_the_time(
-    monkeypatch, limit, steps, refreshed, windows, alone, starts
-):
-    """Ten steps twice where there is time for them; .1 of 600 s are six. Windows are then screened as time allows, and
-    single effects fitted: .12 of 600 s are nine of 40 simulations of two windows each."""
+def test_the_fit_of_the_known_parameters_ends_with_its_share_of_the_time(monkeypatch, limit, steps, refreshed, windows):
+    """Ten steps twice where there is time for them; .1 of 600 s are six. Windows are then screened as time allows."""
     fitter, seen = Slow(), {}
     settings = Settings(budget=Budget(limit, 0.0, lambda: fitter.seconds), screened=20)
     candidates = [SimpleNamespace(probes=np.zeros((40, 1)))] * 2
@@ -118,11 +113,10 @@ def test_the_fit_of_the_known_parameters_ends_with_its_share_of_the_time(
         seen.update(steps=fit.steps, screened=screened)
         return []
 
-    monkeypatch.setattr(singles, "scored", lambda fitter, fit, effects: SimpleNamespace(fit=fit))
-    monkeypatch.setattr(singles, "screen", screen)
-    monkeypatch.setattr(singles.Pool, "rough", False)
-    monkeypatch.setattr(singles.Pool, "begun", lambda pool, fit: fit)
-    pool = singles.begin(fitter, candidates, settings, Criteria())
+    monkeypatch.setattr(beginning, "scored", lambda fitter, fit, effects: SimpleNamespace(fit=fit))
+    monkeypatch.setattr(beginning, "screen", screen)
+    monkeypatch.setattr(beginning.Pool, "rough", False)
+    monkeypatch.setattr(beginning.Pool, "begun", lambda pool, fit: fit)
+    beginning.begin(fitter, candidates, settings)
     assert (seen["steps"], fitter.refreshed) == (steps, refreshed)
-    assert (pool.settings.singles, pool.settings.starts) == (alone, starts)
     assert seen["screened"] == windows  # 48 s for 80 points at .1 s a window are 6, but never fewer than 8

@@ -9,12 +9,7 @@ import pytest
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate, Coordinate
 from bayessim_mjx.diagnosis.fitting.fitter import Fitter
 from bayessim_mjx.diagnosis.selection import heldout
-from bayessim_mjx.diagnosis.selection.criteria import Criteria
-from bayessim_mjx.diagnosis.selection.fits import Fits
 from bayessim_mjx.diagnosis.selection.models import scored
-from bayessim_mjx.diagnosis.selection.pool import Pool
-from bayessim_mjx.diagnosis.selection.table import BASE
-from bayessim_mjx.diagnosis.selection.tried import Settings
 
 MOTION = np.sin(np.arange(8 * 20) * 0.7).reshape(8, 20)  # of eight windows
 GROUP = np.repeat(np.arange(4), 2)
@@ -90,19 +85,6 @@ def test_on_rough_costs_estimates_differ_between_conditions_as_the_data_do():
     rough, model = fitted(Bent((0.3, 0.5, 0.7, 0.9), roughness=0.003))
     (found,) = heldout.refitted(rough, [replace(model, fit=replace(model.fit, A=smooth.fit.A))])
     np.testing.assert_allclose(found.estimates - found.fit.values, expected.estimates - expected.fit.values, atol=0.01)
-
-
-def test_simulated_costs_are_in_the_unit_of_those_of_the_search():
-    """Start states that are off count in both: without them all models would come nearer to the noise."""
-    fitter, model = fitted(Bent((0.5, 0.5, 0.5, 0.5), bend=0.0, start=0.06))
-    base = scored(fitter, fitter.begin(()), ())
-    key = frozenset(["toy@place"])
-    pool = Pool(fitter, list(model.effects), Settings(), Criteria(), base.fit, base)
-    pool.models.update({BASE: base, key: model})
-    seen = Fits(pool, lambda *_: None).simulate([BASE, key])
-    assert seen.rows[key].total == pytest.approx(model.total, rel=0.02)
-    errors = heldout.predict(fitter, pool.models[key]).cost(20).sum() * pool.noise
-    assert seen.rows[key].total > 1.1 * errors and all(row.simulated for row in seen.rows.values())
 
 
 def test_a_condition_that_alone_tells_the_parameter_keeps_its_linear_steps():

@@ -102,13 +102,6 @@ def test_a_closure_that_depends_on_the_horizon_is_flagged():
     assert not sentences.horizon_warning(Gap(1.0, 4.0, 3.0, 1.1, 1.0, horizons=horizons[:2]))
 
 
-def test_how_often_chance_gains_as_much():
-    odds = {"probability": 1 / 501, "each": {}, "nats": 80.0, "level": 0.01, "draws": 500, "candidates": 44}
-    assert "of 44 candidates gains as much in less than 0.20 % of logs in which nothing" in sentences._by_chance(odds)
-    assert " in 20 % of logs" in sentences._by_chance(odds | {"probability": 0.2})
-    assert sentences._by_chance({}) == ""
-
-
 def test_noise_larger_than_estimated_is_told_with_its_colour():
     (head,) = sentences.verdict_in_words("noise", [], LEVEL)
     assert head.startswith("The noise is larger than estimated: what the recalibrated simulator leaves, 0.15 deg")
