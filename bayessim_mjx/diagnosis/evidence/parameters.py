@@ -6,12 +6,13 @@ at a bound has its probability in a layer beside it, as thick as the density fal
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import log_ndtr, ndtr
+from scipy.special import log_ndtr, logsumexp, ndtr
 
 from bayessim_mjx.diagnosis.evidence.gaussian import Belief, Learnt
 from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
@@ -43,8 +44,11 @@ def belief_of(fit: Fit) -> Belief:
     return Belief(fit.belief(), neutral - fit.values, low, high)
 
 
-def integrated(fit: Fit, learnt: Learnt) -> Integrated:
-    """The evidence of a fit with its best hyperparameters."""
+def integrated(fit: Fit, learnt: Learnt, amplitudes: Sequence[Sequence[int]] = ()) -> Integrated:
+    """The evidence of a fit with its best hyperparameters.
+
+    amplitudes: of each effect, the indices of its numbers that may be neutral (`_without`).
+    """
     Q, p, belief = learnt.Q, learnt.step, belief_of(fit)
     c, g, S = Q[0, 0], Q[1:, 0], Q[1:, 1:]
     slope = g - S @ p + belief.precision * (belief.mean - p)
@@ -55,8 +59,33 @@ def integrated(fit: Fit, learnt: Learnt) -> Integrated:
     reduced = replace(fit, coordinates=some, values=fit.values[free])
     found = posterior(reduced, S[np.ix_(free, free)], g[free])
     nats = learnt.without_parameters - 0.5 * float(c) + found.evidence
-    nats += sum((_layer(belief, i, p[i], slope[i], S[i, i]) for i in np.flatnonzero(at).tolist()), 0.0)
-    return Integrated(nats - _truncated(fit.coordinates), found, free)
+    layers = {i: _layer(belief, i, p[i], slope[i], S[i, i]) for i in np.flatnonzero(at).tolist()}
+    nats += sum(layers.values(), 0.0) - sum(map(_truncated, fit.coordinates))
+    nats += sum(_without(fit, found, free, layers, own) for own in amplitudes if len(own) > 1)
+    return Integrated(nats, found, free)
+
+
+def _without(
+    fit: Fit, found: Posterior, free: NDArray[np.bool_], layers: dict[int, float], own: Sequence[int]
+) -> float:
+    """What the evidence gains where each of an effect's numbers may be neutral, with probability 1/2, but not all.
+
+    Savage and Dickey's ratio (Dickey, Ann. Math. Stat. 42, 1971): the evidence without a number is the posterior over
+    the prior density at its neutral value.
+    """
+    at, middle, covariance = np.flatnonzero(free), found.middle, found.together()
+    neutral = np.array([c.neutral for c in fit.coordinates])
+    usable = [i for i in own if free[i] or fit.values[i] == neutral[i]]
+    terms = [0.0]
+    for some in itertools.chain.from_iterable(itertools.combinations(usable, n) for n in range(1, len(own))):
+        inner = [int(np.searchsorted(at, i)) for i in some if free[i]]
+        delta = sum(_truncated(fit.coordinates[i]) - layers.get(i, 0.0) for i in some)
+        if inner:
+            away, C = neutral[at[inner]] - middle[inner], covariance[np.ix_(inner, inner)]
+            delta -= 0.5 * float(away @ np.linalg.solve(C, away) + np.linalg.slogdet(C)[1])
+            delta -= 0.5 * float(sum(np.log(fit.coordinates[i].precision) for i in some if free[i]))
+        terms.append(delta)
+    return float(logsumexp(terms) - np.log(2 ** len(own) - 1))
 
 
 def _layer(belief: Belief, i: int, p: float, slope: float, curvature: float) -> float:
@@ -68,11 +97,8 @@ def _layer(belief: Belief, i: int, p: float, slope: float, curvature: float) -> 
     return float(density - np.log(bend) + 0.5 * x**2 + log_ndtr(-x))
 
 
-def _truncated(coordinates: Sequence[Coordinate]) -> float:
-    """Log of the prior probability that the bounds leave of the effects' Gaussian priors."""
-    out = 0.0
-    for c in coordinates:
-        root = c.precision**0.5
-        inside = ndtr((c.high - c.neutral) * root) - ndtr((c.low - c.neutral) * root)
-        out += 0.0 if c.stated else float(np.log(max(inside, 1e-300)))
-    return out
+def _truncated(c: Coordinate) -> float:
+    """Log of the prior probability that the bounds leave of an effect's Gaussian prior."""
+    root = c.precision**0.5
+    inside = ndtr((c.high - c.neutral) * root) - ndtr((c.low - c.neutral) * root)
+    return 0.0 if c.stated else float(np.log(max(inside, 1e-300)))

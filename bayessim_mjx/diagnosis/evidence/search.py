@@ -13,12 +13,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bayessim_mjx.diagnosis.evidence.columns import Column
 from bayessim_mjx.diagnosis.evidence.looking import Plan, Progress, around
 from bayessim_mjx.diagnosis.evidence.weighing import Weighing
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fit import Fit
 from bayessim_mjx.diagnosis.selection.bounds import widened
 from bayessim_mjx.diagnosis.selection.budget import LEAVING_OUT, SINGLES, TOGETHER
+from bayessim_mjx.diagnosis.selection.laws import special_cases
 from bayessim_mjx.diagnosis.selection.pool import Entries, Pool, cut_back, fit_entries, polish
 from bayessim_mjx.diagnosis.selection.sets import BASE, Key, Weighed
 
@@ -35,6 +37,7 @@ class Effort:
         instead: likewise in the place of each of its effects; base: on the known parameters.
         least: single effects that are fitted however little they promise: promises are linear.
         margin: nats below the leading set, within which a promised set is fitted.
+        scales: of a special case's point, where its fit begins too.
         leading: sets whose ranges may grow; finalists: whose fits are brought to their end.
     """
 
@@ -44,6 +47,7 @@ class Effort:
     base: tuple[int, ...] = (2, 4, 2)
     least: int = 4
     margin: float = 30.0
+    scales: tuple[float, ...] = (0.3, 0.1, 0.03)
     leading: int = 3
     finalists: int = 6
 
@@ -85,11 +89,30 @@ class Search:
     def _todo(self, best: Key) -> list[Plan]:
         """What to fit around the leading set. Beside one that leaves nothing relevant only others of its size stand."""
         smaller = [k for k in (best - {x} for x in sorted(best)) if k and k in self.weighing.scored]
-        plans = [p for k in smaller for p in self._worth(self._around(k), EFFORT.instead)]
+        plans = [p for k in smaller for p in self._worth(self._around(k), EFFORT.instead)] + self._special(best)
         if not self.weighing.settled(best):
             plans += self._worth(self._around(best), EFFORT.sizes)
             plans += self._worth(self._around(BASE), EFFORT.base) if best else []
         return list({p.key: p for p in plans}.values())
+
+    def _special(self, best: Key) -> list[Plan]:
+        """Each special case of an effect in its place: at its promise's points a law may be past where it is linear."""
+        out = []
+        for effect in self.pool.models[best].effects:
+            rest = best - {effect.label}
+            for c in self.pool.candidates:
+                points = self.pool.secants.columns.get(c.label, ())
+                key = rest | {c.label}
+                if (
+                    c.where == effect.where
+                    and c.effect in special_cases(effect)
+                    and points
+                    and rest in self.pool.models
+                ):
+                    column = Column(c, *points[-1])
+                    starts = tuple(column.at(f) for f in EFFORT.scales)
+                    out += [] if key in self.pool.models else [Plan(key, np.inf, rest, (column,), (1.0,), starts)]
+        return out
 
     def _around(self, key: Key) -> list[Plan]:
         if key not in self._plans:

@@ -64,7 +64,7 @@ class Weighing:
                 fit, spread = self.doubted(model.fit), self.pool.fitter.spread
                 own = windows_of(fit.r, fit.A, fit.B, self.D, fit.offsets, spread, self.scale, self.channels)
                 learnt = learn(own, belief_of(fit), self.hyper if BASE in self.scored else None)
-                self.scored[key] = Scored(model, fit, learnt, integrated(fit, learnt))
+                self.scored[key] = Scored(model, fit, learnt, integrated(fit, learnt, _amplitudes(model)))
 
     def excess(self, key: Key) -> float:
         """Held-out squared error above the noise, in noise variances, mean of the windows."""
@@ -87,7 +87,7 @@ class Weighing:
     def without(self, condition: int) -> Weighed:
         """The posterior given all windows but those of one operating condition, with the same hyperparameters."""
         kept = self.pool.fitter.simulator.windows.group != condition
-        return self._weighed({k: integrated(s.fit, _some(s, kept)).nats for k, s in self.scored.items()})
+        return self._weighed({k: _without(s, kept) for k, s in self.scored.items()})
 
     def _weighed(self, nats: dict[Key, float]) -> Weighed:
         excess = {k: self.excess(k) for k in self.scored}
@@ -95,7 +95,16 @@ class Weighing:
         return weighed(nats, excess, numbers, len(self.pool.candidates))
 
 
-def _some(of: Scored, kept: NDArray[np.bool_]) -> Learnt:
+def _without(of: Scored, kept: NDArray[np.bool_]) -> float:
+    """Evidence given some of the windows alone, with the same hyperparameters."""
     there = of.learnt.marginal
     part = replace(there, Q=there.Q[kept], logdet=there.logdet[kept], cov=there.cov[kept], mean=there.mean[kept])
-    return replace(of.learnt, marginal=part, step=belief_of(of.fit).best(part.Q.sum(0)))
+    learnt = replace(of.learnt, marginal=part, step=belief_of(of.fit).best(part.Q.sum(0)))
+    return integrated(of.fit, learnt, _amplitudes(of.model)).nats
+
+
+def _amplitudes(model: Model) -> list[list[int]]:
+    """Of each effect, the indices of its numbers that are no shapes."""
+    names = model.fit.names
+    pairs = [zip(e.coordinates, e.shapes, strict=True) for e in model.effects]
+    return [[names.index(c.name) for c, shape in each if not shape] for each in pairs]

@@ -1,8 +1,11 @@
 """The integral over a model's parameters against quadrature: accuracies, bounds, and the price of what does nothing."""
 
+import itertools
+
 import numpy as np
 import pytest
 from scipy import integrate, stats
+from scipy.special import logsumexp
 
 from bayessim_mjx.diagnosis.data_sheet import ACCURACY, SURE
 from bayessim_mjx.diagnosis.evidence.gaussian import Hyper, Learnt, learn, marginal
@@ -93,3 +96,22 @@ def test_an_effect_that_does_nothing_costs_evidence(numbers):
         gains.append(integrated(with_it, one).nats - integrated(without, two).nats)
     assert np.mean(gains) < -1.0 * numbers
     assert np.mean(np.array(gains) > 2.0) <= 0.017  # of 120: two at most
+
+
+@pytest.mark.parametrize("truth", [(0.4, 0.0, 0.0), (0.4, 0.3, -0.2)])
+def test_a_number_of_an_effect_may_be_neutral(truth):
+    """The mean of the evidences of all seven models with some of an effect's three numbers, each found by itself."""
+    case = draw(7, k=4, p=[0.1, *truth])
+    numbers = [Coordinate(str(i), (i,), 0.0, -50.0, 50.0, 1.0) for i in range(4)]
+    whole = fitted(numbers, np.zeros(4))
+    there = marginal(case.windows(), HYPER)
+    learnt = Learnt(HYPER, belief_of(whole).best(there.Q.sum(0)), there, 0.0)
+    each = []
+    for n in (1, 2, 3):
+        for some in itertools.combinations((1, 2, 3), n):
+            own = [0, *some]
+            each.append(evidence(case, fitted([numbers[i] for i in own], np.zeros(len(own))), own)[0].nats)
+    found = integrated(whole, learnt, [[0], [1, 2, 3]])
+    assert found.nats == pytest.approx(logsumexp(each) - np.log(7), abs=1e-3)
+    gained = found.nats - integrated(whole, learnt).nats
+    assert gained > 1.0 if truth[1] == 0 else gained < 0.0

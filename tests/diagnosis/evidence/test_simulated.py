@@ -73,4 +73,4 @@ def _sampled(found, key):
     # both without the constant (2 pi) of the residuals; accuracies are stated, no number is at a bound
     weights = np.exp(np.array(logs) - logsumexp(logs))
     assert 1 / np.sum(weights**2) > 5  # draws that count
-    return scored.found.nats + _truncated(fit.coordinates) - sampled
+    return scored.found.nats + sum(map(_truncated, fit.coordinates)) - sampled
