@@ -22,7 +22,7 @@ from bayessim_mjx.diagnosis.selection.bounds import widened
 from bayessim_mjx.diagnosis.selection.budget import LEAVING_OUT, SINGLES, TOGETHER
 from bayessim_mjx.diagnosis.selection.laws import special_cases
 from bayessim_mjx.diagnosis.selection.pool import Entries, Pool, cut_back, fit_entries, polish
-from bayessim_mjx.diagnosis.selection.sets import BASE, Key, Weighed
+from bayessim_mjx.diagnosis.selection.sets import BASE, ODDS, Key, Weighed
 
 Array = NDArray[np.float64]
 
@@ -87,10 +87,13 @@ class Search:
         return list(self.weighing.weighed().weight)
 
     def _todo(self, best: Key) -> list[Plan]:
-        """What to fit around the leading set. Beside one that leaves nothing relevant only others of its size stand."""
+        """What to fit around the leading set: beside one that leaves nothing relevant, what promises to be likelier."""
         smaller = [k for k in (best - {x} for x in sorted(best)) if k and k in self.weighing.scored]
         plans = [p for k in smaller for p in self._worth(self._around(k), EFFORT.instead)] + self._special(best)
-        if not self.weighing.settled(best):
+        if self.weighing.settled(best):
+            likelier = self.weighing.total(best) + np.log(ODDS.mention)
+            plans += [p for p in self._worth(self._around(best), EFFORT.sizes) if p.nats > likelier]
+        else:
             plans += self._worth(self._around(best), EFFORT.sizes)
             plans += self._worth(self._around(BASE), EFFORT.base) if best else []
         return list({p.key: p for p in plans}.values())
