@@ -55,7 +55,8 @@ def test_dry_friction_is_named_with_its_level(rubbing):
     assert level.mean == pytest.approx(0.04, rel=0.05) and level.unit == "N m" and 0 < level.sd < 0.01
     assert effect.gap_closed > 0.8
     before, after = (found.predictions[k].cost(10**6).sum() for k in ("calibrated", "with_effects"))
-    noise = heldout.noise_floor(found.setup.fitter, found.model.fit).sum()
+    learnt = found.selection.estimated.noise
+    noise = heldout.noise_floor(found.setup.fitter, found.model.fit, learnt).sum()
     assert effect.gap_closed == pytest.approx(min((before - after) / (before - noise), 1.0))
     low, high = effect.gap_closed_ci
     assert 0.8 < low < effect.gap_closed <= high <= 1.0

@@ -54,7 +54,7 @@ def estimated(weighing: Weighing, found: Weighed) -> Estimated:
     sd = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
     wider = np.ones(len(sd))
     wider[:base] = np.sqrt(np.maximum(np.diag(known), sd[:base] ** 2)) / sd[:base]
-    return Estimated(covariance * wider[:, None] * wider, answer.found.posterior)
+    return Estimated(covariance * wider[:, None] * wider, answer.found.posterior, answer.learnt.hyper.noise)
 
 
 def _own(of: Scored) -> tuple[Array, Array]:

@@ -67,9 +67,10 @@ class Weighing:
                 self.scored[key] = Scored(model, fit, learnt, integrated(fit, learnt, _amplitudes(model)))
 
     def excess(self, key: Key) -> float:
-        """Held-out squared error above the noise, in noise variances, mean of the windows."""
-        model = self.scored[key].model
-        return model.total / (self.pool.noise * len(model.cost)) - 1.0
+        """Held-out squared error above the likeliest set's noise, in noise variances as estimated from the logs."""
+        model, best = self.scored[key].model, self.scored[max(self.scored, key=self.total)]
+        floor = float(np.mean(best.learnt.hyper.noise**2))
+        return model.total / (self.pool.noise * len(model.cost)) - floor
 
     def settled(self, key: Key) -> bool:
         """Whether a set of effects leaves nothing that matters."""

@@ -133,15 +133,20 @@ class _Fold:
         return values + p, offsets + starts.step(self.fit.A, p)
 
 
-def noise_floor(fitter: Fitter, fit: Fit) -> Array:
-    """`[W]`, mean square of white noise after start states were fitted to it: tr (I - P)^2 / n, P their hat matrix.
+def noise_floor(fitter: Fitter, fit: Fit, noise: Array) -> Array:
+    """`[W]`, mean square of white noise after start states were fitted to it: tr (I - P) S (I - P)' / n, P their hat.
 
     Start states take a share of the noise with them, 2 of 25 numbers of a joint whose position is measured in 25 rows.
+
+    Args:
+        noise: `[C]`, of each channel, in what was estimated from the logs; S has their squares.
     """
     _, starts = fit.quadratic(fitter.spread)
-    hat = starts.M @ (starts.B.mT @ starts.B)
-    n = starts.B.shape[1]
-    return np.asarray(1.0 - (2 * np.trace(hat, axis1=1, axis2=2) - np.sum(hat * hat.mT, axis=(1, 2))) / n)
+    B, M = starts.B, starts.M
+    square = np.tile(noise**2, B.shape[1] // len(noise))
+    inner = np.einsum("wni,n,wnj->wij", B, square, B)
+    twice = 2 * np.einsum("wij,wji->w", M, inner) - np.einsum("wij,wjk,wkl,wli->w", M, inner, M, B.mT @ B)
+    return np.asarray(square.mean() - twice / len(square))
 
 
 def nominal(fitter: Fitter, fit: Fit) -> Prediction:

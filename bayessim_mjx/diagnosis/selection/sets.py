@@ -96,10 +96,16 @@ class Weighed:
 
 @dataclass(frozen=True, eq=False)
 class Estimated:
-    """Posterior of the answer's numbers: covariance `[k, k]`, and the data sheet's accuracies behind it."""
+    """Posterior of the answer's numbers.
+
+    Attributes:
+        covariance: `[k, k]`; sheet: the data sheet's accuracies behind it.
+        noise: `[C]`, most likely noise of each channel, in what was estimated from the logs.
+    """
 
     covariance: NDArray[np.float64]
     sheet: Posterior
+    noise: NDArray[np.float64]
 
 
 def core(key: Key, excess: Mapping[Key, float]) -> Key:

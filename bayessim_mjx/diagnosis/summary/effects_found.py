@@ -81,7 +81,7 @@ def _closed(found: Findings) -> heldout.Closed:
         if chosen != answer:
             own, models = cut.group == condition, selection.models
             after[own] = before[own] * models[chosen].cost[own] / models[frozenset()].cost[own]
-    floor = heldout.noise_floor(found.setup.fitter, found.model.fit)
+    floor = heldout.noise_floor(found.setup.fitter, found.model.fit, selection.estimated.noise)
     return heldout.Closed(before, after, cut.condition, floor)
 
 

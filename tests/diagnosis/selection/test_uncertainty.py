@@ -108,16 +108,18 @@ def test_no_interval_of_a_share_has_zero_width(left, gap):
         assert 1.0 - low >= 0.5 * (1.0 - left) / gap
 
 
+@pytest.mark.parametrize("noise", [(1.0,), (0.6, 1.1)])
 @pytest.mark.parametrize("spread", [0.1, 30.0])
-def test_the_noise_floor_is_what_noise_leaves_after_start_states_were_fitted_to_it(spread):
+def test_the_noise_floor_is_what_noise_leaves_after_start_states_were_fitted_to_it(spread, noise):
     """By simulation: white noise on 12 numbers of a window, and a start state of two numbers."""
     rng = np.random.default_rng(1)
     B = np.repeat(rng.normal(size=(1, 12, 2)), 4000, 0)
-    r = rng.normal(size=(4000, 12))
+    r = rng.normal(size=(4000, 12)) * np.tile(noise, 12 // len(noise))
     fitter = SimpleNamespace(spread=np.full(2, spread))
     fit = Fit((), np.zeros(0), np.zeros((4000, 2)), r, np.zeros((4000, 12, 0)), B, np.ones(4000), 0.0)
     _, starts = fit.quadratic(fitter.spread)
     left = r - np.einsum("wns,ws->wn", B, starts.step(fit.A, np.zeros(0)))
-    floor = heldout.noise_floor(fitter, fit)
+    floor = heldout.noise_floor(fitter, fit, np.array(noise))
     assert floor == pytest.approx(np.mean(left**2), abs=0.02)
-    assert floor[0] == pytest.approx(10 / 12, abs=1e-3) if spread > 1 else floor[0] > 0.87
+    if noise == (1.0,):
+        assert floor[0] == pytest.approx(10 / 12, abs=1e-3) if spread > 1 else floor[0] > 0.87
