@@ -117,7 +117,9 @@ def _gaussian(p: Parameter, mean: float, sd: float) -> Parameter:
 
 
 def calibrated_of(diagnosis: Found, space: ParameterSpace) -> ParameterSpace:
-    """`space` with nominal = identified mean and Gaussian priors; parameters that were not calibrated stay as they are.
+    """`space` with the values that fit at the simulator's time step as nominal, and Gaussian priors about them.
+
+    Parameters that were not calibrated stay as they are.
 
     Raises:
         UserError: the diagnosis calibrated a parameter that `space` has not.
@@ -128,7 +130,8 @@ def calibrated_of(diagnosis: Found, space: ParameterSpace) -> ParameterSpace:
 
 
 def _calibrated(p: Parameter, found: dict | None) -> Parameter:
-    mean, sd = (_number((found or {}).get(key)) for key in ("mean", "sd"))
+    told = found or {}
+    mean, sd = _number(told.get("simulated", told.get("mean"))), _number(told.get("sd"))
     if math.isnan(mean):
         return p
     wide = dataclasses.replace(p, low=min(p.low, mean), high=max(p.high, mean))

@@ -76,7 +76,8 @@ class Diagnosis:
     Attributes:
         verdict: one of VERDICTS; sentences: the verdict in words, most important first.
         parameters: {name: {"mean", "sd", "nominal", "low", "high", "unit", "structural": sentence or "",
-            "data_sheet": sentence or "", "away": sd from the data sheet, where that is far}}.
+            "data_sheet": sentence or "", "away": sd from the data sheet, where that is far,
+            "simulated": value that fits at the simulator's time step; "mean" is the robot's}}.
         candidates: ranked [{"effects": [label ...], "label", "score", "se", "gap_closed", "parameters": {..},
             "absorbed"}].
         covariance: {"names": [...], "matrix": [[...]]} of parameters and effects' parameters together, or {}.

@@ -51,13 +51,14 @@ def diagnosis_of(found: Findings, about: Mapping[str, Any] | None = None, file: 
     together = own.covariance + np.diag(uncertainty.systematic(model, timestep, selection.left(model)) ** 2)
     finer = found.part(AtFinerSteps)
     steps = finer.notes(found, together) if finer else []
-    together = _told(found, together + finer.covariance if finer else together)
+    base = len(setup.fitter.base)
+    together = _told(found, together + finer.covariance(base) if finer else together)
     sd = np.sqrt(np.diag(together))
     closed = effects_found.closed_by(found)
     effects = effects_found.effects_of(found, sd, closed)
     far = how_far.measured(found, {k: v for k, v in closed.items() if k != "each"})
     verdict = verdict_of(found, far)
-    parameters = _parameters(selection, model, sd)
+    parameters = _parameters(selection, model, sd, finer.shift[:base] if finer else np.zeros(base))
     over, where, proposal = found.part(Whole), found.part(Where), found.part(Experiment)
     far = how_far.with_whole(far, over, setup.tolerance) if over else far
     told = sentences(verdict, effects, parameters, found, far)
@@ -99,15 +100,18 @@ def _told(found: Findings, covariance: np.ndarray) -> np.ndarray:
     return bounds.spread_out(covariance, model.fit.values, neutral, at)
 
 
-def _parameters(tried: Tried, model: Model, sd: np.ndarray) -> dict[str, dict[str, Any]]:
+def _parameters(tried: Tried, model: Model, sd: np.ndarray, shift: np.ndarray) -> dict[str, dict[str, Any]]:
+    """Of the robot, and as they are simulated at the time step of the fit; shift: between them."""
     remarks = conditions.structural(tried, model)
+    base, values = tried.fitter.base, model.fit.values
+    real = [float(np.clip(v + d, c.low, c.high)) for c, v, d in zip(base, values, shift, strict=False)]
     return {
         c.name: {
-            **_against_data_sheet(c, float(model.fit.values[i]), float(model.fit.belief()[i])),
-            "mean": float(model.fit.values[i]), "sd": float(sd[i]), "nominal": c.neutral, "low": c.low, "high": c.high,
-            "unit": c.unit, "structural": remarks.get(c.name, ""),
+            **_against_data_sheet(c, real[i], float(model.fit.belief()[i])),
+            "mean": real[i], "simulated": float(values[i]), "sd": float(sd[i]), "nominal": c.neutral,
+            "low": c.low, "high": c.high, "unit": c.unit, "structural": remarks.get(c.name, ""),
         }
-        for i, c in enumerate(tried.fitter.base)
+        for i, c in enumerate(base)
     }  # fmt: skip
 
 

@@ -32,10 +32,13 @@ class AtFinerSteps:
 
     shift: Array
 
-    @property
-    def covariance(self) -> Array:
-        """`[k, k]`, of parameters that are off by the shift, all together, one way or the other."""
-        return np.outer(self.shift, self.shift)
+    def covariance(self, known: int) -> Array:
+        """`[k, k]`, of all parameters together: known ones are moved by the shift, whose last part is extrapolated.
+
+        Effects' numbers stay, as those of a simulator with this step, and are off by it one way or the other.
+        """
+        off = np.where(np.arange(len(self.shift)) < known, self.shift / FINER, self.shift)
+        return np.outer(off, off)
 
     def notes(self, found: Findings, together: Array) -> list[str]:
         """For the warnings; together: `[k, k]`, covariance without it."""

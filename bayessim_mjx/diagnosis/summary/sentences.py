@@ -93,7 +93,7 @@ def _remarks(parameters: Mapping[str, Mapping[str, Any]]) -> list[str]:
     told = []
     for name, about in parameters.items():
         value, text, sheet = f"{name} {about['mean']:.4g}", about["structural"], about.get("data_sheet")
-        if text == phrases.stuck(about["mean"]):
+        if text == phrases.stuck(about.get("simulated", about["mean"])):
             stuck[value] = f"{name} {text}."
         elif text:
             told.append(f"{name} {text}.")
