@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bayessim_mjx.diagnosis.evidence.gaussian import marginal, windows_of
+from bayessim_mjx.diagnosis.evidence.parameters import belief_of
 from bayessim_mjx.diagnosis.evidence.weighing import Scored, Weighing
 from bayessim_mjx.diagnosis.selection import heldout
 from bayessim_mjx.diagnosis.selection.models import Model, scored
@@ -54,7 +57,16 @@ def estimated(weighing: Weighing, found: Weighed) -> Estimated:
     sd = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
     wider = np.ones(len(sd))
     wider[:base] = np.sqrt(np.maximum(np.diag(known), sd[:base] ** 2)) / sd[:base]
-    return Estimated(covariance * wider[:, None] * wider, answer.found.posterior, answer.learnt.hyper.noise)
+    covariance = covariance * wider[:, None] * wider
+    step = functools.partial(_step, weighing, answer)
+    return Estimated(covariance, answer.found.posterior, answer.learnt.hyper.noise, step)
+
+
+def _step(weighing: Weighing, of: Scored, r: Array) -> Array:
+    """The most probable step `[k]` of the model's numbers, of other residuals at their values."""
+    fit, sizes = of.fit, (weighing.pool.fitter.spread, weighing.scale, weighing.channels)
+    there = marginal(windows_of(r, fit.A, fit.B, weighing.D, fit.offsets, *sizes), of.learnt.hyper)
+    return belief_of(fit).best(there.Q.sum(0))[: len(of.model.fit.values)]
 
 
 def _own(of: Scored) -> tuple[Array, Array]:

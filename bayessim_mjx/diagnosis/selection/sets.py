@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -101,11 +101,13 @@ class Estimated:
     Attributes:
         covariance: `[k, k]`; sheet: the data sheet's accuracies behind it.
         noise: `[C]`, most likely noise of each channel, in what was estimated from the logs.
+        step: most probable step `[k]` from the answer's fit, of residuals `[W, n]` at its values.
     """
 
     covariance: NDArray[np.float64]
     sheet: Posterior
     noise: NDArray[np.float64]
+    step: Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 
 def core(key: Key, excess: Mapping[Key, float]) -> Key:

@@ -1,59 +1,66 @@
-"""Terms of force by hand, and what their errors do to residuals against the simulator's own parameters."""
+"""Lags of positions and of velocities: their columns by hand, and as large as they were put into logs."""
 
-import mujoco
+import dataclasses
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from bayessim_mjx.diagnosis import setup as preparing
 from bayessim_mjx.diagnosis.evidence import doubts
-from bayessim_mjx.diagnosis.residual import forcing
+from bayessim_mjx.diagnosis.evidence.weighing import Weighing
+from bayessim_mjx.diagnosis.fitting.fit import Fit
+from bayessim_mjx.diagnosis.selection.begin import begin
+from bayessim_mjx.diagnosis.selection.sets import BASE
 from tests.diagnosis import pendulums
 
-SERVO = """<mujoco><worldbody><body><joint name="hinge" axis="0 1 0" damping=".3" stiffness="2" armature=".05"/>
-  <geom type="capsule" size=".02" fromto="0 0 0 0 0 -.5" mass="1.5"/></body></worldbody>
-  <actuator><position joint="hinge" kp="40" kv="4" gear="2"/></actuator></mujoco>"""
+SECONDS = 4.0
 
 
-def test_terms_of_a_driven_pendulum_by_hand():
-    """Inertia times acceleration; damping and the servo's, through its gear squared; gravity and spring."""
-    model = mujoco.MjModel.from_xml_string(SERVO)
-    data, q, v, a = mujoco.MjData(model), 0.4, -1.3, 7.0
-    inertial, by_speed, by_position = doubts._at(model, data, np.array([q]), np.array([v]), np.array([a]))[:, 0]
-    about_joint = model.body_inertia[1][1] + 1.5 * 0.25**2 + 0.05
-    assert inertial == pytest.approx(about_joint * a)
-    assert by_speed == pytest.approx((0.3 + 4 * 2**2) * v)
-    assert by_position == pytest.approx(1.5 * 9.81 * 0.25 * np.sin(q) + 2 * q)
+def test_each_kind_of_sensor_has_a_lag_of_its_own():
+    """Two joints with positions and velocities, two rows: each sees its own rate of change."""
+    rate = np.arange(1.0, 9.0)[None]  # rows of (q1, q2, v1, v2)
+    windows = SimpleNamespace(dt=0.01)
+    simulator = SimpleNamespace(nv=2, windows=windows)
+    fitter = SimpleNamespace(rate=lambda: rate, used=np.ones(4, bool), simulator=simulator)
+    positions, velocities = np.moveaxis(doubts.columns(fitter)[0], 1, 0) / (doubts.TIMING * 0.01)
+    assert positions == pytest.approx([1, 2, 0, 0, 5, 6, 0, 0])
+    assert velocities == pytest.approx([0, 0, 3, 4, 0, 0, 7, 8])
+    fitter.used, fitter.rate = np.array([True, True, False, False]), lambda: rate[:, :4]
+    assert doubts.columns(fitter).shape == (1, 4, 1)  # no velocities were measured
 
 
-@pytest.fixture(scope="module")
-def fitted(tmp_path_factory):
-    """(fitter, fit of the known parameters) of logs with nothing missing."""
-    robot = pendulums.nominal(tmp_path_factory.mktemp("model"))
-    return pendulums.fitted(preparing.prepare(robot, pendulums.recorded(count=6), ["viscous_friction"]))
-
-
-@pytest.mark.slow
-@pytest.mark.ci
-def test_an_error_of_a_term_is_that_of_the_parameter_which_makes_it(fitted):
-    """Force by speed is the damping's alone, and two of the terms are what mass and armature are together."""
-    fitter, fit = fitted
-    D = forcing.columns(fitter, fit, forcing.default_nodes(fitter))
-    found = doubts.columns(fitter, D)
-    assert found.shape[2] == 4  # inertia, speed, position, and the lag of rows
-    inertial, speed, position = (found[:, :, i] for i in range(3))
-    damping, armature, mass = (fit.A[:, :, fit.names.index(n)] * doubts.TERMS for n in pendulums.NAMES)
-    scale = fit.values[fit.names.index(pendulums.NAMES[0])]
-    assert np.linalg.norm(speed + damping * scale) < 0.06 * np.linalg.norm(speed)
-    whole = armature + mass  # all of the inertia, and gravity
-    assert np.linalg.norm(inertial + position + whole) < 0.06 * np.linalg.norm(whole)
+def test_numbers_behind_a_fits_own_change_nothing_of_it():
+    fit = Fit((), np.zeros(0), *(np.zeros(1),) * 5, 0.0)
+    fit = dataclasses.replace(fit, A=np.zeros((3, 8, 0)))
+    more = doubts.doubted(fit, np.ones((3, 8, 2)))
+    assert more.A.shape == (3, 8, 2) and not more.values.any() and np.all(more.belief() == 1.0)
 
 
 @pytest.mark.slow
 @pytest.mark.ci
-def test_numbers_behind_a_fits_own_change_nothing_of_it(fitted):
-    fitter, fit = fitted
-    columns = doubts.columns(fitter, forcing.columns(fitter, fit, 6))
-    more = doubts.doubted(fit, columns)
-    assert more.A[:, :, : len(fit.values)] is not fit.A and np.array_equal(more.A[:, :, : len(fit.values)], fit.A)
-    assert np.array_equal(more.values[: len(fit.values)], fit.values) and not more.values[len(fit.values) :].any()
-    assert np.all(more.belief()[len(fit.values) :] == 1.0)
+def test_a_lag_of_velocities_is_found_and_moves_no_parameter(tmp_path):
+    """Velocities .5 ms (2.5 % of the period) late: the lag by hand, and parameters within their intervals."""
+    late, scale, sigma = 5e-4, (1.05, 0.97, 1.03), 4e-4
+    logs = []
+    for i, log in enumerate(pendulums.recorded(scale=scale, count=6, seconds=SECONDS, sigma=0.0)):
+        rng, speed = np.random.default_rng(i), np.gradient(log.qpos, pendulums.PERIOD, axis=0)
+        speed = np.gradient(log.qpos[:, 0], pendulums.PERIOD, edge_order=2)[:, None]
+        slope = np.gradient(speed, pendulums.PERIOD, axis=0)
+        noise = [sigma * rng.normal(size=log.qpos.shape), 4 * sigma * rng.normal(size=log.qpos.shape)]
+        known = {"noise_qpos": np.array([sigma]), "noise_qvel": np.array([4 * sigma])}
+        logs.append(_with(log, log.qpos + noise[0], speed - late * slope + noise[1], known))
+    setup = preparing.prepare(pendulums.nominal(tmp_path), logs, ["viscous_friction"])
+    pool = begin(setup.fitter, setup.candidates, setup.settings)
+    scored = Weighing(pool).scored[BASE]
+    step = scored.learnt.step[len(pool.base.fit.values) :]
+    assert len(step) == 2
+    found = (step[1] - step[0]) * doubts.TIMING * float(setup.fitter.simulator.windows.dt)
+    assert found == pytest.approx(late, rel=0.25)
+
+
+def _with(log, qpos, qvel, noise):
+    names = {f.name for f in dataclasses.fields(log)}
+    change = {"qpos": qpos, "qvel": qvel}
+    change |= {"qvel_measured": True} if "qvel_measured" in names else {}
+    return dataclasses.replace(log, **change, **{k: v for k, v in noise.items() if k in names})
