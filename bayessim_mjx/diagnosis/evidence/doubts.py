@@ -24,11 +24,11 @@ FREE = 100.0  # standard deviations, as good as no bound
 
 
 def columns(fitter: Fitter) -> Array:
-    """`[W, n, T]`, what one prior standard deviation does to the residuals: a lag of positions, and of velocities."""
+    """`[W, n, T]`, what one prior standard deviation does to what is measured: a lag of positions, and of velocities."""
     rate, nv = fitter.rate(), fitter.simulator.nv
     channels = np.arange(rate.shape[1]) % int(fitter.used.sum())
     positions = channels < int(fitter.used[:nv].sum())
-    lag = TIMING * float(fitter.simulator.windows.dt) * rate
+    lag = -TIMING * float(fitter.simulator.windows.dt) * rate
     every = np.stack([lag * positions, lag * ~positions], 2)
     return every[:, :, np.abs(every).max((0, 1)) > 0]
 

@@ -15,8 +15,6 @@ from bayessim_mjx.diagnosis.findings import Findings, Progress
 from bayessim_mjx.diagnosis.fitting import windows
 from bayessim_mjx.diagnosis.fitting.centred_commands import physics_of
 from bayessim_mjx.diagnosis.fitting.discretisation import contacts, refined
-from bayessim_mjx.diagnosis.fitting.fitter import Fit
-from bayessim_mjx.diagnosis.fitting.quadratic import solve
 from bayessim_mjx.diagnosis.fitting.simulator import FAR, Simulator
 from bayessim_mjx.diagnosis.summary.whole_logs import theta_of
 from bayessim_mjx.physics import staggered
@@ -64,7 +62,7 @@ def stage(found: Findings, say: Progress) -> Findings:
 
 def _shift(found: Findings) -> Array | None:
     """Of the coordinates; None where finer steps cannot be simulated."""
-    setup, fit, fitter = found.setup, found.model.fit, found.setup.fitter
+    fit, fitter = found.model.fit, found.setup.fitter
     simulator = _simulator(found)
     theta = theta_of(found, simulator, found.model, fit.values)
     errors = simulator.run(theta[None], fit.offsets[None])

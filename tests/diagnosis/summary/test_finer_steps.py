@@ -1,5 +1,6 @@
 """What a coarse time step puts into the parameters: told, and right."""
 
+import dataclasses
 from types import SimpleNamespace
 
 import mujoco
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 
 from bayessim_mjx.diagnosis.fitting import robot
+from bayessim_mjx.diagnosis.fitting.quadratic import solve
 from bayessim_mjx.diagnosis.setup import prepare
 from bayessim_mjx.diagnosis.summary import finer_steps
 from bayessim_mjx.diagnosis.summary.finer_steps import AtFinerSteps
@@ -28,7 +30,11 @@ def test_where_parameters_would_go_at_finer_steps_is_where_the_truth_is(tmp_path
     path.write_text(MODEL % (COARSE, "Euler", DAMPING, ARMATURE, 0.0, MASS))
     setup = prepare(robot.of_file(path), recorded(scale=SCALE, sigma=1e-3), FEW)
     fitter, fit = fitted(setup)
-    shift = finer_steps._shift(SimpleNamespace(setup=setup, model=SimpleNamespace(fit=fit, effects=())))
+    selection = SimpleNamespace(
+        estimated=SimpleNamespace(step=lambda r: likeliest(dataclasses.replace(fit, r=r), fitter))
+    )
+    found = SimpleNamespace(setup=setup, model=SimpleNamespace(fit=fit, effects=()), selection=selection)
+    shift = finer_steps._shift(found)
     damping, armature, mass = np.abs(fit.values - SCALE)
     assert armature > 0.01
     _, S = fit.quadratic(fitter.spread)[0].weighted(fit.weight)
@@ -36,7 +42,19 @@ def test_where_parameters_would_go_at_finer_steps_is_where_the_truth_is(tmp_path
     assert noise < armature / 4
     assert abs(fit.values[1] + shift[1] - SCALE[1]) < armature / 4 + noise
     assert abs(shift[0]) < 0.005 and abs(shift[2]) < 0.001
-    assert np.sqrt(AtFinerSteps(shift).covariance[1, 1]) == pytest.approx(abs(shift[1]))
+
+
+def likeliest(fit, fitter):
+    """The step beside white noise alone."""
+    g, S = fit.quadratic(fitter.spread)[0].weighted(fit.weight)
+    precision, pull, low, high = fit.prior()
+    return solve(S + np.diag(precision), g + pull, low, high)
+
+
+def test_known_parameters_are_moved_and_keep_what_is_extrapolated_of_that():
+    """A quarter of the step was simulated: a quarter of the shift is extrapolated. An effect's number stays."""
+    off = np.sqrt(np.diag(AtFinerSteps(np.array([0.04, -0.3])).covariance(1)))
+    assert off == pytest.approx([0.01, 0.3])
 
 
 def test_shifts_are_told_of_effects_where_they_are_more_than_two_standard_deviations():
