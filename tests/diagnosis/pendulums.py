@@ -42,6 +42,7 @@ def recorded(
     seconds: float = 4.0,
     sigma: float = 4e-4,
     seed: int = 0,
+    late_velocity: float | None = None,
     **metadata: object,
 ) -> list[Log]:
     """`count` logs under a PD law that follows sines, slow to fast.
@@ -49,12 +50,14 @@ def recorded(
     Args:
         friction: N m; delay: s; cubic: N m/rad^3, of a spring that is relaxed at 0.
         scale: of damping, armature and mass; sigma: rad.
+        late_velocity: s, by which velocities are measured late, to 4 sigma a second; None: they are not measured.
     """
     each = 10 * round(PERIOD / STEP)
     damping, armature, mass = np.multiply((DAMPING, ARMATURE, MASS), scale)
     model = mujoco.MjModel.from_xml_string(MODEL % (PERIOD / each, "RK4", damping, armature, friction, mass))
     rng = np.random.default_rng(seed)
-    return [_one(model, i, round(seconds / PERIOD), each, delay, cubic, sigma, rng, metadata) for i in range(count)]
+    more = (delay, cubic, sigma, rng, late_velocity, metadata)
+    return [_one(model, i, round(seconds / PERIOD), each, *more) for i in range(count)]
 
 
 def _one(
@@ -66,27 +69,33 @@ def _one(
     cubic: float,
     sigma: float,
     rng: np.random.Generator,
+    late_velocity: float | None,
     metadata: dict[str, object],
 ) -> Log:
     data, late = mujoco.MjData(model), round(delay / model.opt.timestep)
     data.qpos[0] = 0.3 * rng.normal()
     rate, size = 0.4 + 0.2 * i, 0.3 + 0.1 * i
-    table, held = [], []
+    table, held, speeds = [], [], [0.0]
     for k in range(rows + 1):
         t = k * PERIOD
         target = size * np.sin(2 * np.pi * rate * t + i) + 0.2 * np.sin(3.1 * rate * t)
         command = 6.0 * (target - data.qpos[0]) - 0.6 * data.qvel[0]
-        table.append((t, command, data.qpos[0]))
+        behind = round((late_velocity or 0.0) / model.opt.timestep)
+        table.append((t, command, data.qpos[0], speeds[max(0, len(speeds) - 1 - behind)]))
         for _ in range(each):
             held.append(command)
             data.ctrl[0] = held[max(0, len(held) - 1 - late)]
             data.qfrc_applied[0] = -cubic * data.qpos[0] ** 3
             mujoco.mj_step(model, data)
-    time, ctrl, qpos = (np.array(c) for c in zip(*table, strict=True))
+            speeds.append(float(data.qvel[0]))
+    time, ctrl, qpos, speed = (np.array(c) for c in zip(*table, strict=True))
     qpos = (qpos + sigma * rng.normal(size=len(qpos)))[:, None]
     channels, noise = Channels.of(model), np.array([max(sigma, 1e-7)])
     qvel, spread = estimate_velocity(time, qpos, channels, noise)
-    return Log(f"log{i}", time, ctrl[:, None], qpos, qvel, False, channels, noise, spread, metadata=metadata)
+    if late_velocity is not None:
+        qvel, spread = (speed + 4 * sigma * rng.normal(size=len(speed)))[:, None], 4 * noise
+    told = late_velocity is not None, channels, noise, spread
+    return Log(f"log{i}", time, ctrl[:, None], qpos, qvel, *told, metadata=metadata)
 
 
 def fitted(setup: Setup) -> tuple[Fitter, Fit]:

@@ -38,10 +38,10 @@ def test_what_is_missing_is_named_and_what_is_not_is_not(found):
 
 
 def test_the_evidence_is_that_of_the_simulator(found):
-    """Each within 5 nats, and the difference of two sets, some 500, within 2: the model is not quite linear."""
+    """Each within 5 nats, and the difference of two sets, some 500, within 3: the model is not quite linear."""
     off = [_sampled(found, key) for key in (DRY, BASE)]
     assert np.abs(off) == pytest.approx(0.0, abs=5.0)
-    assert off[0] - off[1] == pytest.approx(0.0, abs=2.0)
+    assert off[0] - off[1] == pytest.approx(0.0, abs=3.0)
 
 
 def _sampled(found, key):
