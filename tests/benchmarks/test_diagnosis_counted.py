@@ -89,7 +89,7 @@ def test_a_held_joint_shows_one_number_and_the_others_move(plans, system):
 def result(folder: Path, plan: counted.Plan, effects: list, closed: float | None, **parameters: dict) -> None:
     """What `one` writes of a pendulum whose link is 10 % too heavy, with viscous friction of 0.1."""
     hidden = {"name": "viscous_friction", "where": "hinge", "parameters": {"damping": 0.1}, "raw": 99.0, "left": 99.0}
-    truth = {"system": "pendulum", "kind": plan.kind, "strength": plan.strength, "effects": [hidden]}
+    truth = {"system": "pendulum", "kind": plan.kind, "strength": plan.strength, "effects": [hidden], "velocity": True}
     said = {"verdict": "effects" if effects else "parameters", "effects": effects, "parameters": parameters}
     said["gap"] = {"closed": {"ci": [0.9, 0.99]} if effects else {}}
     told = {"truth": truth | {"base": {"link.mass": 1.1, "hinge.damping": 1.0}}, "said": said, "closed": closed}
@@ -160,12 +160,13 @@ def test_a_servos_joint_is_damped_as_its_reality_moves():
     """Positions lag by half of a step of .5 ms: stiffness times .25 ms, by hand; nothing else is another."""
     joints = {"waist": (400, 0.5), "elbow": (250, 0.3), "flange": (25, 0.03)}
     base = {f"{j}.damping": 1.1 for j in joints} | {"waist.armature": 0.9, "tool.mass": 1.2}
-    found = tables.in_motion({"system": "arm_servo", "base": base})
+    found = tables.in_motion({"system": "arm_servo", "base": base, "velocity": False})
     for joint, (stiffness, damping) in joints.items():
         assert found[f"{joint}.damping"] == pytest.approx(1.1 - stiffness * 0.00025 / damping)
     assert found["waist.armature"] == 0.9 and found["tool.mass"] == 1.2
     torques = {"shoulder.damping": 1.1, "elbow.damping": 0.8}
-    assert tables.in_motion({"system": "two_link", "base": torques}) == torques
+    assert tables.in_motion({"system": "two_link", "base": torques, "velocity": False}) == torques
+    assert tables.in_motion({"system": "arm_servo", "base": base, "velocity": True}) == base  # velocities tell the lag
 
 
 def test_cases_that_run_when_the_time_is_over_are_killed_and_begun_again(tmp_path, monkeypatch, capsys):

@@ -3,7 +3,7 @@
 Positions and velocities are rows of two sensors. Each lies in time as exactly as its sensor reads, and a robot's clock
 is not the simulator's: half a sub-step lies between the positions and the velocities of one semi-implicit step. Without
 these lags known parameters would take such errors, and pretend to know them. A stiff servo that sees its joint late
-damps it less, by the stiffness times the lag, which is as much as a joint's own damping.
+damps it less, by the stiffness times the lag, which is as much as a joint's own damping; its damping moves the inertia.
 """
 
 from __future__ import annotations
@@ -25,31 +25,45 @@ TIMING = 0.03
 FREE = 100.0  # standard deviations, as good as no bound
 
 
-def columns(fitter: Fitter, D: Array) -> Array:
-    """`[W, n, T]`, what one prior standard deviation of each does to the residuals; D: as in `forcing.columns`.
+def columns(fitter: Fitter, D: Array, B: Array) -> Array:
+    """`[W, n, T]`, what one prior standard deviation of each does to the residuals.
 
-    A lag of measured positions, of measured velocities, and of what servos see of their joints.
+    Lags of measured positions, of measured velocities, of positions and of velocities that servos are fed back. A late
+    start moves all of a window's motion.
+
+    Args:
+        D: as in `forcing.columns`; B: `[W, n, s]`, of the start states (positions, then velocities).
     """
-    rate, nv = fitter.rate(), fitter.simulator.nv
+    windows, nv = fitter.simulator.windows, fitter.simulator.nv
+    rate, measured = fitter.rate(), fitter.used[nv:].any()
     channels = np.arange(rate.shape[1]) % int(fitter.used.sum())
     positions = channels < int(fitter.used[:nv].sum())
-    lag = TIMING * float(fitter.simulator.windows.dt)
-    servos = lag * np.einsum("wnf,wf->wn", D, _pulled(fitter, D.shape[2] // nv))
-    every = np.stack([-lag * rate * positions, -lag * rate * ~positions, servos], 2)
+    speeds = [windows.logs[log].qvel for log in windows.log]
+    start = np.stack([v[at] for v, at in zip(speeds, windows.start, strict=True)])
+    pull = np.stack([np.gradient(v, windows.dt, axis=0)[at] for v, at in zip(speeds, windows.start, strict=True)])
+    from_start = [np.einsum("wns,ws->wn", b, x) for b, x in ((B[:, :, :nv], start), (B[:, :, nv : 2 * nv], pull))]
+    late_q = from_start[0] - rate * positions + (0.0 if measured else from_start[1])
+    late_v = (from_start[1] - rate * ~positions) * measured
+    servos = [np.einsum("wnf,wf->wn", D, force) for force in _pulled(fitter, D.shape[2] // nv)]
+    every = TIMING * float(windows.dt) * np.stack([late_q, late_v, *servos], 2)
     return every[:, :, np.abs(every).max((0, 1)) > 0]
 
 
-def _pulled(fitter: Fitter, nodes: int) -> Array:
-    """`[W, nv m]`, N m/s or N/s, by how much the force of servos on their joints changes with the logged motion."""
+def _pulled(fitter: Fitter, nodes: int) -> tuple[Array, Array]:
+    """`[W, nv m]` each, N m/s or N/s: how fast servos' forces on joints change, by position and by speed as logged."""
     windows, model = fitter.simulator.windows, fitter.simulator.physics.mj_model
     data, moment = mujoco.MjData(model), np.zeros((model.nu, model.nv))
     mujoco.mj_forward(model, data)
     mujoco.mju_sparse2dense(moment, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind)
     affine = model.actuator_biastype == int(mujoco.mjtBias.mjBIAS_AFFINE)
-    stiffness = moment.T @ (np.where(affine, -model.actuator_biasprm[:, 1], 0.0)[:, None] * moment)
+    gains = np.where(affine[:, None], -model.actuator_biasprm[:, 1:3], 0.0)
     rows = windows.start[:, None] + ((np.arange(nodes) + 0.5) * windows.steps / nodes).round().astype(int)
-    speed = np.stack([windows.logs[log].qvel[own] for log, own in zip(windows.log, rows, strict=True)])
-    return np.nan_to_num(np.moveaxis(speed @ stiffness, 1, 2).reshape(len(speed), -1))
+    speeds = [windows.logs[log].qvel for log in windows.log]
+    slopes = [np.gradient(v, windows.dt, axis=0) for v in speeds]
+    rates = [np.stack([x[own] for x, own in zip(each, rows, strict=True)]) for each in (speeds, slopes)]
+    forces = [rate @ (moment.T @ (gain[:, None] * moment)) for rate, gain in zip(rates, gains.T, strict=True)]
+    by_position, by_speed = (np.nan_to_num(np.moveaxis(f, 1, 2).reshape(len(f), -1)) for f in forces)
+    return by_position, by_speed
 
 
 def doubted(fit: Fit, columns: Array) -> Fit:
