@@ -5,7 +5,6 @@ Tangents at neutral mislead where laws have kinks (dry friction, play): the colu
 
 from __future__ import annotations
 
-import functools
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -22,14 +21,10 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Sizes:
-    """When and how candidates are screened in two stages."""
+    """How much is simulated."""
 
-    many: int = 400  # starting points, from which on they are screened in two stages
-    # looked at again (on the known parameters, on top of effects), starting points of each, windows of the first look
-    candidates: int = 32
-    anew: int = 16
-    points: int = 4
-    fewest: int = 8
+    many: int = 400  # starting points, from which on a third of the windows has to do
+    fewest: int = 8  # of them, at least
     worlds: int = 8192  # simulated between two signs of life, at most: whole calls, even of an accelerator
     calls: int = 16  # and so many calls, at most
 
@@ -56,24 +51,6 @@ class Screened:
     column: Array
     others: tuple[Array, ...] = ()
     whole: float = 0.0
-
-    @property
-    def way(self) -> Array:
-        """`[k]` from neutral to the point whose column it is; 0 for shapes."""
-        neutral = np.array([c.neutral for c in self.candidate.coordinates])
-        return np.where(self.candidate.shapes, 0.0, (self.others[0] if self.others else self.start) - neutral)
-
-    @property
-    def room(self) -> tuple[float, float]:
-        """(least, largest) multiple of the way that stays within the ranges."""
-        return _room(self.candidate, self.way)
-
-    def at(self, amount: float) -> Screened:
-        """The same with a start at so many times the way, but not at neutral, where many laws have no slope."""
-        neutral = np.array([c.neutral for c in self.candidate.coordinates])
-        amount = amount if abs(amount) > 0.02 else 0.02
-        shapes = np.array(self.candidate.shapes)
-        return replace(self, start=np.where(shapes, self.start, neutral + amount * self.way))
 
 
 def _room(candidate: Candidate, way: Array) -> tuple[float, float]:
@@ -122,33 +99,19 @@ def screen(
 ) -> list[Screened]:
     """All candidates on top of `fit`, best first, on at most `limit` windows.
 
-    Where there are many starting points, a third of the windows tells which are worth a second look on all of them.
-    Gains are scaled to all windows as if those looked at were typical: good for ranking, too high as an estimate.
+    Where there are many starting points, a third of the windows has to do. Gains are scaled to all windows as if those
+    looked at were typical: good for ranking, too high as an estimate.
 
     Args:
-        secants: what was simulated before, which takes the place of the first look; if empty, it is filled.
+        secants: what was simulated before; if empty, it is filled.
         over: whether the time is; None: there is no limit. What was not simulated by then is not among them.
     """
     secants = Secants() if secants is None else secants
-    count = sum(len(candidate.probes) for candidate in candidates)
-    again = bool(secants.columns)
-    if not again:
+    if not secants.columns:
+        count = sum(len(candidate.probes) for candidate in candidates)
         some = limit if count <= SIZES.many else max(limit // 3, SIZES.fewest)
         _fill(secants, fitter, fit, candidates, some, say, over)
-    coarse = projected(fitter, fit, candidates, secants)
-    if not again and (count <= SIZES.many or (over is not None and over())):
-        return _ordered(coarse)
-    order = sorted(coarse, key=lambda i: -max(s.gain for s, _ in coarse[i]))
-    order = order[: SIZES.anew if again else SIZES.candidates]
-    plans = [(i, p) for i in order for _, p in sorted(coarse[i], key=lambda f: -f[0].gain)[: SIZES.points]]
-    own = looked_at(fit, limit)
-    told = functools.partial(_second, say)
-    fine = judged(fitter, fit, candidates, simulated(fitter, fit, candidates, plans, own, told), own)
-    return _ordered(fine) + _ordered({i: found for i, found in coarse.items() if i not in fine})
-
-
-def _second(say: Progress, _: str, done: int, total: int) -> None:
-    say("second look", done, total)
+    return _ordered(projected(fitter, fit, candidates, secants))
 
 
 def _fill(
