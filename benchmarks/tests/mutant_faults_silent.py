@@ -132,9 +132,14 @@ SILENT: tuple[tuple[str, str, str, str, tuple[str, ...]], ...] = (
     ),
     # diagnosis
     (
-        "the jackknife's covariance is that of plain samples", f"{DIAGNOSIS}/statistics.py",
-        "(g - 1) / g * moves.T @ moves", "1 / (g - 1) * moves.T @ moves",
-        _tests("diagnosis/selection/test_uncertainty", k="intervals_cover"),
+        "what servos are fed back of velocities is never late", f"{DIAGNOSIS}/evidence/doubts.py",
+        "-model.actuator_biasprm[:, 1:3], 0.0)", "-model.actuator_biasprm[:, 1:3] * [1.0, 0.0], 0.0)",
+        _tests("diagnosis/evidence/test_doubts", k="servos"),
+    ),
+    (
+        "no number of an effect may be neutral", f"{DIAGNOSIS}/evidence/parameters.py",
+        "return float(logsumexp(terms)", "return 0.0 * float(logsumexp(terms)",
+        _tests("diagnosis/evidence/test_parameters", k="may_be_neutral"),
     ),
     (
         "as many degrees of freedom as conditions", f"{DIAGNOSIS}/statistics.py", "np.maximum(count - 1.0, least)",

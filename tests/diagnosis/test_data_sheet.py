@@ -141,4 +141,3 @@ def test_a_result_warns_where_the_model_is_less_accurate_than_usual():
     numbers, (text,) = of(0.3)
     assert numbers["mass"]["low"] < 0.3 < numbers["mass"]["high"]
     assert "mass about" in text and "damping" not in text and "--accuracy" in text
-    assert assemble._accuracy(SimpleNamespace(fit=assumed_fit(0.1)), None) == {}

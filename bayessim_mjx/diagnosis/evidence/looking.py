@@ -26,13 +26,15 @@ class Breadth:
     """How far one look goes; more of each finds the same sets, later.
 
     Attributes:
-        pairs: of columns that promise most; seeds: sets that larger ones grow from; most: effects in a set.
+        pairs: of columns that promise most; seeds: sets that larger ones grow from.
+        most: effects in a set; more: effects that one look adds (each is then left out in turn).
         points: of a candidate that are looked at in sets; anew: candidates that are simulated on a model with effects.
     """
 
     pairs: int = 24
     seeds: int = 4
     most: int = 8
+    more: int = 3
     points: int = 3
     anew: int = 16
     columns: int = 120
@@ -99,7 +101,7 @@ def _plans(weighing: Weighing, key: Key, promises: Promises) -> list[Plan]:
     ranked = sorted(zip(gains, columns, strict=True), key=lambda pair: pair[0])
     whole = {c.candidate.label: c.point for _, c in ranked}
     out, total = [], weighing.total(key)
-    for p in _sets(promises, price, BREADTH.most - len(key)):
+    for p in _sets(promises, price, min(BREADTH.most - len(key), BREADTH.more)):
         some = [columns[j] for j in p.own]
         own = key | {c.candidate.label for c in some}
         points = (some[0].point, whole[some[0].candidate.label]) if len(some) == 1 else ()
