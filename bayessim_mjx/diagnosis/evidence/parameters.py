@@ -7,7 +7,7 @@ at a bound has its probability in a layer beside it, as thick as the density fal
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -44,10 +44,10 @@ def belief_of(fit: Fit) -> Belief:
     return Belief(fit.belief(), neutral - fit.values, low, high)
 
 
-def integrated(fit: Fit, learnt: Learnt, amplitudes: Sequence[Sequence[int]] = ()) -> Integrated:
+def integrated(fit: Fit, learnt: Learnt, effects: Sequence[Mapping[int, bool]] = ()) -> Integrated:
     """The evidence of a fit with its best hyperparameters.
 
-    amplitudes: of each effect, the indices of its numbers that may be neutral (`_without`).
+    effects: of each {index of its number: whether it is a shape}; numbers may be neutral (`_without`).
     """
     Q, p, belief = learnt.Q, learnt.step, belief_of(fit)
     c, g, S = Q[0, 0], Q[1:, 0], Q[1:, 1:]
@@ -61,14 +61,16 @@ def integrated(fit: Fit, learnt: Learnt, amplitudes: Sequence[Sequence[int]] = (
     nats = learnt.without_parameters - 0.5 * float(c) + found.evidence
     layers = {i: _layer(belief, i, p[i], slope[i], S[i, i]) for i in np.flatnonzero(at).tolist()}
     nats += sum(layers.values(), 0.0) - sum(map(_truncated, fit.coordinates))
-    nats += sum(_without(fit, found, free, layers, own) for own in amplitudes if len(own) > 1)
+    nats += sum(_without(fit, found, free, layers, own) for own in effects if len(own) > 1 and not all(own.values()))
     return Integrated(nats, found, free)
 
 
 def _without(
-    fit: Fit, found: Posterior, free: NDArray[np.bool_], layers: dict[int, float], own: Sequence[int]
+    fit: Fit, found: Posterior, free: NDArray[np.bool_], layers: dict[int, float], own: Mapping[int, bool]
 ) -> float:
-    """What the evidence gains where each of an effect's numbers may be neutral, with probability 1/2, but not all.
+    """What the evidence gains where each of an effect's numbers may be neutral, with probability 1/2.
+
+    Not all that are no shapes: that would be the model without the effect.
 
     Savage and Dickey's ratio (Dickey, Ann. Math. Stat. 42, 1971): the evidence without a number is the posterior over
     the prior density at its neutral value.
@@ -76,8 +78,11 @@ def _without(
     at, middle, covariance = np.flatnonzero(free), found.middle, found.together()
     neutral = np.array([c.neutral for c in fit.coordinates])
     usable = [i for i in own if free[i] or fit.values[i] == neutral[i]]
+    amplitudes = {i for i, shape in own.items() if not shape}
     terms = [0.0]
     for some in itertools.chain.from_iterable(itertools.combinations(usable, n) for n in range(1, len(own))):
+        if amplitudes <= {*some}:
+            continue
         inner = [int(np.searchsorted(at, i)) for i in some if free[i]]
         delta = sum(_truncated(fit.coordinates[i]) - layers.get(i, 0.0) for i in some)
         if inner:
@@ -85,7 +90,8 @@ def _without(
             delta -= 0.5 * float(away @ np.linalg.solve(C, away) + np.linalg.slogdet(C)[1])
             delta -= 0.5 * float(sum(np.log(fit.coordinates[i].precision) for i in some if free[i]))
         terms.append(delta)
-    return float(logsumexp(terms) - np.log(2 ** len(own) - 1))
+    cases = (2 ** len(amplitudes) - 1) * 2 ** (len(own) - len(amplitudes))
+    return float(logsumexp(terms) - np.log(cases))
 
 
 def _layer(belief: Belief, i: int, p: float, slope: float, curvature: float) -> float:

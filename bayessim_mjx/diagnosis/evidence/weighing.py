@@ -64,7 +64,7 @@ class Weighing:
                 fit, spread = self.doubted(model.fit), self.pool.fitter.spread
                 own = windows_of(fit.r, fit.A, fit.B, self.D, fit.offsets, spread, self.scale, self.channels)
                 learnt = learn(own, belief_of(fit), self.hyper if BASE in self.scored else None)
-                self.scored[key] = Scored(model, fit, learnt, integrated(fit, learnt, _amplitudes(model)))
+                self.scored[key] = Scored(model, fit, learnt, integrated(fit, learnt, _numbers(model)))
 
     def excess(self, key: Key) -> float:
         """Held-out squared error above the likeliest set's noise, in noise variances as estimated from the logs."""
@@ -101,11 +101,11 @@ def _without(of: Scored, kept: NDArray[np.bool_]) -> float:
     there = of.learnt.marginal
     part = replace(there, Q=there.Q[kept], logdet=there.logdet[kept], cov=there.cov[kept], mean=there.mean[kept])
     learnt = replace(of.learnt, marginal=part, step=belief_of(of.fit).best(part.Q.sum(0)))
-    return integrated(of.fit, learnt, _amplitudes(of.model)).nats
+    return integrated(of.fit, learnt, _numbers(of.model)).nats
 
 
-def _amplitudes(model: Model) -> list[list[int]]:
-    """Of each effect, the indices of its numbers that are no shapes."""
+def _numbers(model: Model) -> list[dict[int, bool]]:
+    """Of each effect, {index of its number in the fit: whether it is a shape}."""
     names = model.fit.names
     pairs = [zip(e.coordinates, e.shapes, strict=True) for e in model.effects]
-    return [[names.index(c.name) for c, shape in each if not shape] for each in pairs]
+    return [{names.index(c.name): shape for c, shape in each} for each in pairs]
