@@ -58,8 +58,12 @@ def estimated(weighing: Weighing, found: Weighed) -> Estimated:
     wider = np.ones(len(sd))
     wider[:base] = np.sqrt(np.maximum(np.diag(known), sd[:base] ** 2)) / sd[:base]
     covariance = covariance * wider[:, None] * wider
+    away = np.where(
+        np.arange(len(sd)) < base, 0.0, mean - answer.model.fit.values
+    )  # effects' numbers are those of the fit
+    covariance = covariance + np.diag(away**2)
     step = functools.partial(_step, weighing, answer)
-    return Estimated(covariance, answer.found.posterior, answer.learnt.hyper.noise, step)
+    return Estimated(mean, covariance, answer.found.posterior, answer.learnt.hyper.noise, step)
 
 
 def _step(weighing: Weighing, of: Scored, r: Array) -> Array:

@@ -99,11 +99,13 @@ class Estimated:
     """Posterior of the answer's numbers.
 
     Attributes:
-        covariance: `[k, k]`; sheet: the data sheet's accuracies behind it.
+        mean: `[k]`, where the fit could not be moved there not its values; covariance: `[k, k]`.
+        sheet: the data sheet's accuracies behind it.
         noise: `[C]`, most likely noise of each channel, in what was estimated from the logs.
         step: most probable step `[k]` from the answer's fit, of residuals `[W, n]` at its values.
     """
 
+    mean: NDArray[np.float64]
     covariance: NDArray[np.float64]
     sheet: Posterior
     noise: NDArray[np.float64]

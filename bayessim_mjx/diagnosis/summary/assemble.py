@@ -58,7 +58,8 @@ def diagnosis_of(found: Findings, about: Mapping[str, Any] | None = None, file: 
     effects = effects_found.effects_of(found, sd, closed)
     far = how_far.measured(found, {k: v for k, v in closed.items() if k != "each"})
     verdict = verdict_of(found, far)
-    parameters = _parameters(selection, model, sd, finer.shift[:base] if finer else np.zeros(base))
+    known = own.mean[:base] + (finer.shift[:base] if finer else 0.0)
+    parameters = _parameters(selection, model, sd, known)
     over, where, proposal = found.part(Whole), found.part(Where), found.part(Experiment)
     far = how_far.with_whole(far, over, setup.tolerance) if over else far
     told = sentences(verdict, effects, parameters, found, far)
@@ -100,11 +101,11 @@ def _told(found: Findings, covariance: np.ndarray) -> np.ndarray:
     return bounds.spread_out(covariance, model.fit.values, neutral, at)
 
 
-def _parameters(tried: Tried, model: Model, sd: np.ndarray, shift: np.ndarray) -> dict[str, dict[str, Any]]:
-    """Of the robot, and as they are simulated at the time step of the fit; shift: between them."""
+def _parameters(tried: Tried, model: Model, sd: np.ndarray, mean: np.ndarray) -> dict[str, dict[str, Any]]:
+    """Of the robot (their mean), and as they are simulated at the time step of the fit."""
     remarks = conditions.structural(tried, model)
     base, values = tried.fitter.base, model.fit.values
-    real = [float(np.clip(v + d, c.low, c.high)) for c, v, d in zip(base, values, shift, strict=False)]
+    real = [float(np.clip(v, c.low, c.high)) for c, v in zip(base, mean, strict=True)]
     return {
         c.name: {
             **_against_data_sheet(c, real[i], float(model.fit.belief()[i])),
