@@ -18,23 +18,29 @@ from bayessim_mjx.diagnosis.selection.sets import Estimated, Key, Weighed
 
 Array = NDArray[np.float64]
 Say = Callable[[str, int, int], None]
+MOVES = 4  # of a model to its mean
 MOVED = 0.1  # standard deviations by which a number moves at least: a smaller move is not simulated
-WORSE = 1.0  # nats that a move may cost: it is the step of a linear model
+WORSE = 1.0  # nats that moves which do not come to an end may cost
 
 
 def at_its_mean(weighing: Weighing, key: Key) -> Model:
-    """The model at its posterior mean, held-out estimates refitted; where it was if that is no better place."""
+    """The model at its posterior mean, held-out estimates refitted; where it was if that is no better place.
+
+    A mean far from the fit is the step of a linear model: from there it is looked for again.
+    """
     fitter, pool, old = weighing.pool.fitter, weighing.pool, weighing.scored[key]
-    fit = old.model.fit
-    low, high = (np.array([getattr(c, end) for c in fit.coordinates]) for end in ("low", "high"))
-    mean, covariance = _own(old)
-    mean, sd = np.clip(mean, low, high), np.sqrt(np.maximum(np.diag(covariance), 1e-300))
-    if np.any(np.abs(mean - fit.values) > MOVED * sd):
-        before = old.found.nats
-        moved = fitter.refresh(replace(fit, values=mean, history=()))
+    low, high = (np.array([getattr(c, end) for c in old.model.fit.coordinates]) for end in ("low", "high"))
+    for _ in range(MOVES):
+        here = weighing.scored[key]
+        mean, covariance = _own(here)
+        mean, sd = np.clip(mean, low, high), np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+        if np.all(np.abs(mean - here.model.fit.values) <= MOVED * sd):
+            break
+        moved = fitter.refresh(replace(here.model.fit, values=mean, history=()))
         pool.models[key] = scored(fitter, moved, old.model.effects)
         weighing.score([key])
-        if weighing.scored[key].found.nats < before - WORSE:
+    else:
+        if weighing.scored[key].found.nats < old.found.nats - WORSE:
             pool.models[key], weighing.scored[key] = old.model, old
     (model,) = heldout.refitted(fitter, [pool.models[key]])
     pool.models[key] = model
