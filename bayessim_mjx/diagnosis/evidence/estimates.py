@@ -18,7 +18,7 @@ from bayessim_mjx.diagnosis.selection.sets import Estimated, Key, Weighed
 
 Array = NDArray[np.float64]
 Say = Callable[[str, int, int], None]
-MOVES = 4  # of a model to its mean
+MOVES = 3  # of a model to its mean
 MOVED = 0.1  # standard deviations by which a number moves at least: a smaller move is not simulated
 WORSE = 1.0  # nats that moves which do not come to an end may cost
 
