@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from bayessim_mjx.diagnosis.evidence import terms
 from bayessim_mjx.diagnosis.evidence.gaussian import marginal, windows_of
 from bayessim_mjx.diagnosis.evidence.parameters import belief_of
 from bayessim_mjx.diagnosis.evidence.weighing import Scored, Weighing
@@ -69,6 +70,8 @@ def estimated(weighing: Weighing, found: Weighed) -> Estimated:
     )  # effects' numbers are those of the fit
     covariance = covariance + np.diag(away**2)
     step = functools.partial(_step, weighing, answer)
+    size = weighing.scale * answer.learnt.hyper.amplitude
+    covariance = covariance + terms.covariance(weighing.pool.fitter, weighing.D, size, step, answer.fit.r)
     return Estimated(mean, covariance, answer.found.posterior, answer.learnt.hyper.noise, step)
 
 
