@@ -69,17 +69,14 @@ def test_dry_friction_is_named_with_its_level(rubbing):
 
 @pytest.mark.ci
 def test_what_the_answer_rests_on_comes_with_it(rubbing):
-    """Finalists, the known parameters among them, refitted without each condition and simulated; all others beside."""
+    """Probabilities of the sets, the known parameters alone among them; its estimates without each condition."""
     found, diagnosis = rubbing
     selection = found.selection
     named = frozenset(["coulomb_friction@hinge"])
-    assert {frozenset(), named} <= selection.table.rows.keys() < selection.searched.rows.keys()
-    assert all(row.simulated for row in selection.table.rows.values())
-    row = selection.table.rows[named]
-    assert row.distance["coulomb_friction@hinge"] > 10
-    for key in (frozenset(), named):  # one unit: start states count in both
-        assert selection.table.rows[key].total == pytest.approx(selection.searched.rows[key].total, rel=0.05)
-    assert [step for step in selection.trace if "coulomb_friction@hinge" in step][-1].startswith("simulated: ")
+    assert {frozenset(), named} <= selection.weighed.weight.keys() <= selection.models.keys()
+    assert selection.weighed.answer == named and selection.weighed.nats[named] > 50
+    assert len(selection.estimated.mean) == len(selection.answer.fit.values) == len(selection.estimated.covariance)
+    assert set(selection.chosen.values()) == {named}
     assert diagnosis.gap.closed["elsewhere"] == pytest.approx(diagnosis.gap.closed["realised"], abs=0.05)
     assert any("chosen anew" in text for text in diagnosis.sentences)
 
