@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.evidence import terms
-from bayessim_mjx.diagnosis.evidence.gaussian import marginal, windows_of
+from bayessim_mjx.diagnosis.evidence.gaussian import PRIORS, marginal, windows_of
 from bayessim_mjx.diagnosis.evidence.parameters import belief_of
 from bayessim_mjx.diagnosis.evidence.weighing import Scored, Weighing
 from bayessim_mjx.diagnosis.selection import heldout
@@ -70,7 +70,8 @@ def estimated(weighing: Weighing, found: Weighed) -> Estimated:
     )  # effects' numbers are those of the fit
     covariance = covariance + np.diag(away**2)
     step = functools.partial(_step, weighing, answer)
-    size = weighing.scale * answer.learnt.hyper.amplitude
+    above = np.maximum(answer.learnt.hyper.amplitude**2 - PRIORS.least**2, 0.0)  # less is there for any law
+    size = weighing.scale * np.sqrt(above)
     covariance = covariance + terms.covariance(weighing.pool.fitter, weighing.D, size, step, answer.fit.r)
     return Estimated(mean, covariance, answer.found.posterior, answer.learnt.hyper.noise, step)
 
