@@ -54,9 +54,6 @@ class Effect(abc.ABC):
     joint: ClassVar[bool] = False  # its amplitudes are searched together: one alone may not act at all
     star: ClassVar[bool] = False  # its shapes are searched one at a time, the others in the middle of their grids
     tied: ClassVar[bool] = True  # whether the same values at all places are a candidate
-    each: ClassVar[bool] = (
-        False  # whether a robot has it at every body, with values of its own, as it has a law at every joint
-    )
     # whether its on_model changes masses or inertias: what MuJoCo derives from them is computed after all of these, and
     # only then the other effects change the model
     inertial: ClassVar[bool] = False

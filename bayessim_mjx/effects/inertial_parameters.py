@@ -33,7 +33,6 @@ class InertialParameters(Effect):
     separates: ClassVar[str] = "many poses at rest, then the same poses with fast reversals"
     inertial: ClassVar[bool] = True
     tied: ClassVar[bool] = False
-    each: ClassVar[bool] = True
     quantities: ClassVar[tuple[Quantity, ...]] = (
         *(
             Quantity(f"com_{a}", 0.0, -0.01, 0.01, unit="m", per="size", reach=(-0.2, 0.2), grid=(0.25,), stated=True)

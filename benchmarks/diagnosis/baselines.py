@@ -55,11 +55,11 @@ def fitted(pool: Pool, effects: Sequence[Candidate]) -> Model:
     screened = {s.candidate.label: s for s in pool.screened}
     model = pool.base
     for effect in effects:
-        model = _with(pool, model, [screened[effect.label]])[0]
+        model = extended(pool, model, [screened[effect.label]])[0]
     return model
 
 
-def _with(pool: Pool, model: Model, more: Sequence[Screened]) -> list[Model]:
+def extended(pool: Pool, model: Model, more: Sequence[Screened]) -> list[Model]:
     """The model with each of some further effects, from its screened start and where it was looked at."""
     entries = {}
     for s in more:
@@ -72,7 +72,7 @@ def _with(pool: Pool, model: Model, more: Sequence[Screened]) -> list[Model]:
 
 def singles(pool: Pool) -> list[Model]:
     """Every effect at every place that screening gave a chance, also where the pool saw nothing to explain."""
-    return _with(pool, pool.base, [s for s in pool.screened if s.gain > 0][:SINGLES])
+    return extended(pool, pool.base, [s for s in pool.screened if s.gain > 0][:SINGLES])
 
 
 def closure(found: Reopened, model: Model) -> float:

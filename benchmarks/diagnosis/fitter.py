@@ -5,11 +5,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from baselines import extended
+
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fitter import Fitter
 from bayessim_mjx.diagnosis.fitting.robot import of_file
 from bayessim_mjx.diagnosis.selection.models import scored
-from bayessim_mjx.diagnosis.selection.pool import Pool, fit_entries
+from bayessim_mjx.diagnosis.selection.pool import Pool
 from bayessim_mjx.diagnosis.selection.screen import screen
 from bayessim_mjx.diagnosis.selection.tried import ranked
 from bayessim_mjx.diagnosis.setup import Setup
@@ -61,18 +63,8 @@ def fit_all(folder: Path) -> tuple[dict, list[Candidate]]:
     model = scored(fitter, fit, ())
     tried = Pool(fitter, setup.candidates, settings, fit, model)
     screening, tried.screened = timed(lambda: screen(fitter, fit, setup.candidates, settings.screened))
-    singles, models = timed(lambda: _singles(tried))
+    singles, models = timed(lambda: extended(tried, model, [s for s in tried.screened if s.gain > 0]))
     assert fitter.simulator.traces == 1
     out = {"candidates": len(setup.candidates), "fitted": len(models), "prepare": reading, "compile": compiling}
     out |= {"known": known, "screening": screening, "singles": singles}
     return out | {"seconds": known + screening + singles, "best": ranked(tried, 1)[0].label}, setup.candidates
-
-
-def _singles(tried: Pool) -> list:
-    entries = {}
-    for s in tried.screened:
-        if s.gain > 0:
-            starts = [tried.fitter.derive(tried.base.fit, s.candidate.coordinates, x) for x in (s.start, *s.others)]
-            entries[frozenset([s.candidate.label])] = (starts, (s.candidate,))
-    fit_entries(tried, entries, "single effects", lambda text, done, total: None)
-    return list(entries)

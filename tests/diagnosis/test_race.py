@@ -99,7 +99,7 @@ def test_without_time_the_first_answer_says_what_was_not_tried(setup, monkeypatc
 
 
 def test_when_the_time_is_over_the_verdict_rests_on_what_is_fitted(setup, counted_whole):
-    """The clock strikes with the first model that is polished: nothing else is fitted, and what is left is short."""
+    """The clock strikes with the first model that is polished: nothing else is fitted, and the rest is short."""
     simulator, at = setup.fitter.simulator, {"now": 0.0}
 
     def say(text, done, total):

@@ -1,4 +1,4 @@
-"""What the look before any simulation means for the search: what is left out, and where effects start."""
+"""What the look before any simulation means for the search: vetoes, and where effects start."""
 
 from __future__ import annotations
 

@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from bayessim_mjx.diagnosis.evidence.terms import moments
 from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
 from bayessim_mjx.diagnosis.fitting.fit import Fit
 from bayessim_mjx.diagnosis.fitting.fitter import Fitter
@@ -38,9 +39,7 @@ def columns(fitter: Fitter, D: Array, B: Array) -> Array:
     rate, measured = fitter.rate(), fitter.used[nv:].any()
     channels = np.arange(rate.shape[1]) % int(fitter.used.sum())
     positions = channels < int(fitter.used[:nv].sum())
-    speeds = [windows.logs[log].qvel for log in windows.log]
-    start = np.stack([v[at] for v, at in zip(speeds, windows.start, strict=True)])
-    pull = np.stack([np.gradient(v, windows.dt, axis=0)[at] for v, at in zip(speeds, windows.start, strict=True)])
+    start, pull = (x[:, 0] for x in _rates(fitter, np.asarray(windows.start)[:, None]))
     from_start = [np.einsum("wns,ws->wn", b, x) for b, x in ((B[:, :, :nv], start), (B[:, :, nv : 2 * nv], pull))]
     late_q = from_start[0] - rate * positions + (0.0 if measured else from_start[1])
     late_v = (from_start[1] - rate * ~positions) * measured
@@ -52,18 +51,26 @@ def columns(fitter: Fitter, D: Array, B: Array) -> Array:
 def _pulled(fitter: Fitter, nodes: int) -> tuple[Array, Array]:
     """`[W, nv m]` each, N m/s or N/s: how fast servos' forces on joints change, by position and by speed as logged."""
     windows, model = fitter.simulator.windows, fitter.simulator.physics.mj_model
-    data, moment = mujoco.MjData(model), np.zeros((model.nu, model.nv))
+    data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    mujoco.mju_sparse2dense(moment, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind)
+    moment = moments(model, data)
     affine = model.actuator_biastype == int(mujoco.mjtBias.mjBIAS_AFFINE)
     gains = np.where(affine[:, None], -model.actuator_biasprm[:, 1:3], 0.0)
     rows = windows.start[:, None] + ((np.arange(nodes) + 0.5) * windows.steps / nodes).round().astype(int)
-    speeds = [windows.logs[log].qvel for log in windows.log]
-    slopes = [np.gradient(v, windows.dt, axis=0) for v in speeds]
-    rates = [np.stack([x[own] for x, own in zip(each, rows, strict=True)]) for each in (speeds, slopes)]
-    forces = [rate @ (moment.T @ (gain[:, None] * moment)) for rate, gain in zip(rates, gains.T, strict=True)]
+    forces = [
+        rate @ (moment.T @ (gain[:, None] * moment)) for rate, gain in zip(_rates(fitter, rows), gains.T, strict=True)
+    ]
     by_position, by_speed = (np.nan_to_num(np.moveaxis(f, 1, 2).reshape(len(f), -1)) for f in forces)
     return by_position, by_speed
+
+
+def _rates(fitter: Fitter, rows: NDArray[np.int64]) -> tuple[Array, Array]:
+    """Speeds and their slopes `[W, m, nv]` at rows `[W, m]` of each window's log."""
+    windows = fitter.simulator.windows
+    speeds = [log.qvel for log in windows.logs]
+    slopes = [np.gradient(v, windows.dt, axis=0) for v in speeds]
+    at = list(zip(windows.log, rows, strict=True))
+    return np.stack([speeds[log][own] for log, own in at]), np.stack([slopes[log][own] for log, own in at])
 
 
 def doubted(fit: Fit, columns: Array) -> Fit:

@@ -24,14 +24,15 @@ def covariance(fitter: Fitter, D: Array, size: Array, step: Callable[[Array], Ar
         D: as in `forcing.columns`; size: `[nv]`, rms of the missing force, N m or N.
         step: most probable step of the numbers of residuals `[W, n]`; r: those of the fit.
     """
-    nv = len(size)
-    nodes = D.shape[2] // nv
+    here, nv = step(r), len(size)
+    if not size.any():
+        return np.zeros((len(here), len(here)))
+    nodes, out = D.shape[2] // nv, []
     forces = of_motion(fitter, nodes)
     rms = np.sqrt(np.mean(forces**2, axis=(0, 3), keepdims=True))
     forces = forces / np.where(rms > 0, rms, np.inf) * size[:, None]
-    here, out = step(r), []
     for kind in range(forces.shape[1]):
-        for joint in range(nv):
+        for joint in np.flatnonzero(size):
             own = D[:, :, joint * nodes : (joint + 1) * nodes] @ forces[:, kind, joint, :, None]
             out.append(step(r + own[..., 0]) - here)
     moves = np.array(out)
@@ -66,6 +67,11 @@ def _at(model: mujoco.MjModel, data: mujoco.MjData, qpos: Array, qvel: Array, qa
     by_speed = data.qfrc_bias - data.qfrc_passive - by_position
     affine = model.actuator_biastype == int(mujoco.mjtBias.mjBIAS_AFFINE)
     drives = np.where(affine, model.actuator_biasprm[:, 2], 0.0) * data.actuator_velocity
-    moment = np.zeros((model.nu, model.nv))
-    mujoco.mju_sparse2dense(moment, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind)
-    return np.stack([inertial, by_speed - drives @ moment, by_position])
+    return np.stack([inertial, by_speed - drives @ moments(model, data), by_position])
+
+
+def moments(model: mujoco.MjModel, data: mujoco.MjData) -> Array:
+    """`[nu, nv]`, the force on joints of one unit of each actuator's force."""
+    out = np.zeros((model.nu, model.nv))
+    mujoco.mju_sparse2dense(out, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind)
+    return out

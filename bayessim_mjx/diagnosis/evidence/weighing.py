@@ -68,9 +68,15 @@ class Weighing:
 
     def excess(self, key: Key) -> float:
         """Held-out squared error above the likeliest set's noise, in noise variances as estimated from the logs."""
-        model, best = self.scored[key].model, self.scored[max(self.scored, key=self.total)]
-        floor = float(np.mean(best.learnt.hyper.noise**2))
-        return model.total / (self.pool.noise * len(model.cost)) - floor
+        return self._error(key) - self._floor()
+
+    def _error(self, key: Key) -> float:
+        model = self.scored[key].model
+        return model.total / (self.pool.noise * len(model.cost))
+
+    def _floor(self) -> float:
+        best = self.scored[max(self.scored, key=self.total)]
+        return float(np.mean(best.learnt.hyper.noise**2))
 
     def settled(self, key: Key) -> bool:
         """Whether a set of effects leaves nothing that matters."""
@@ -91,7 +97,8 @@ class Weighing:
         return self._weighed({k: _without(s, kept) for k, s in self.scored.items()})
 
     def _weighed(self, nats: dict[Key, float]) -> Weighed:
-        excess = {k: self.excess(k) for k in self.scored}
+        floor = self._floor()
+        excess = {k: self._error(k) - floor for k in self.scored}
         numbers = {k: sum(len(e.coordinates) for e in s.model.effects) for k, s in self.scored.items()}
         return weighed(nats, excess, numbers, len(self.pool.candidates))
 

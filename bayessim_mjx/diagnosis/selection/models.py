@@ -46,13 +46,6 @@ class Model:
     def size(self) -> int:
         return len(self.fit.coordinates)
 
-    @property
-    def belief(self) -> float:
-        """Log prior density, nats below its maximum, of what data sheets state of the effects (`Quantity.stated`)."""
-        own = {c.name for e in self.effects for c in e.coordinates if c.stated}
-        pairs = zip(self.fit.coordinates, self.fit.values, strict=True)
-        return -0.5 * float(sum(c.precision * (v - c.neutral) ** 2 for c, v in pairs if c.name in own))
-
     def values_of(self, candidate: Candidate) -> Array:
         """The candidate's parameters in this model, `[k]`."""
         own = [self.fit.names.index(c.name) for c in candidate.coordinates]

@@ -62,12 +62,6 @@ def _room(candidate: Candidate, way: Array) -> tuple[float, float]:
     return -float(np.min(behind)), float(np.min(ahead))
 
 
-def residual(fit: Fit, limit: int) -> Array:
-    """`[w, n]` residuals of the windows that were looked at, weighted as the columns are."""
-    own = looked_at(fit, limit)
-    return np.asarray(fit.r[own] * np.sqrt(fit.weight[own])[:, None])
-
-
 Progress = Callable[[str, int, int], None]
 Plan = tuple[int, Array]  # candidate, starting point
 
@@ -76,9 +70,9 @@ Plan = tuple[int, Array]  # candidate, starting point
 class Secants:
     """What each candidate's starting points do to some windows, as it was simulated on one fit.
 
-    On another fit they are projected anew, without a simulation: rough where effects change what others do, so the best
-    are looked at again there. Of 26 recorded cases with one effect it led the screening in 22, and was among the first
-    three in all; each of two effects was among the first eight.
+    On another fit they are projected anew, without a simulation: rough where effects change what others do, so the
+    evidence simulates the best there. Of 26 recorded cases with one effect it led the screening in 22, and was among
+    the first three in all; each of two effects was among the first eight.
 
     Attributes:
         own: `[w]` the windows; columns: {candidate's label: [(point `[k]`, change of the residual `[w, n]`)]}.
