@@ -47,15 +47,17 @@ class Outcome:
         return any(self.same(f["name"], str(f["where"]), effect) for f in self.named())
 
     def inside(self, effect: Mapping[str, Any]) -> bool:
-        """Named, or in the set of what cannot be told from what is named, or told as hidden beside it."""
+        """Named, or in the set of what cannot be told from what is named or from known parameters that are far off."""
         return any(self.same(*label, effect) for label in self.members())
 
     def members(self) -> list[tuple[str, str]]:
-        """(effect, place) of the answer as a set: what is named, what equals it, what hides beside it. Each once."""
+        """(effect, place) of the answer as a set: named, equal to it, hidden beside it, done by known parameters."""
         found = [(f["name"], str(f["where"])) for f in self.named()]
         found += [label for f in self.named() for entry in f.get("equivalent_to", ()) for label in labels_of(entry)]
-        if self.named() and self.said:
-            found += [label for entry in self.said.get("hidden", ()) for label in labels_of(entry)]
+        if self.said and (self.named() or self.said["verdict"] == "parameters"):
+            others = [*self.said.get("hidden", ())]
+            others += [x for p in self.said.get("parameters", {}).values() for x in p.get("same_as", ())]
+            found += [label for entry in others for label in labels_of(entry)]
         return list(dict.fromkeys(found))
 
 

@@ -77,7 +77,8 @@ class Diagnosis:
         verdict: one of VERDICTS; sentences: the verdict in words, most important first.
         parameters: {name: {"mean", "sd", "nominal", "low", "high", "unit", "structural": sentence or "",
             "data_sheet": sentence or "", "away": sd from the data sheet, where that is far,
-            "simulated": value that fits at the simulator's time step; "mean" is the robot's}}.
+            "simulated": value that fits at the simulator's time step; "mean" is the robot's,
+            "same_as": effects ("name@place") that its deviation from the data sheet may stand for}}.
         candidates: ranked [{"effects": [label ...], "label", "score", "se", "gap_closed", "parameters": {..},
             "absorbed"}].
         covariance: {"names": [...], "matrix": [[...]]} of parameters and effects' parameters together, or {}.

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.evidence.gaussian import PRIORS, Belief, Hyper, correlation
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
-from bayessim_mjx.diagnosis.selection.screen import _room
+from bayessim_mjx.diagnosis.selection.screen import room
 
 Array = NDArray[np.float64]
 SHARES = (1.0, 0.3, 0.1, 0.03)  # of the amplitude on the fit itself, that a set may leave
@@ -42,7 +42,7 @@ class Column:
 
     @property
     def room(self) -> tuple[float, float]:
-        return _room(self.candidate, self.way)
+        return room(self.candidate, self.way)
 
     @property
     def precision(self) -> float:

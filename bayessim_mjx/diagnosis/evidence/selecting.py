@@ -12,7 +12,7 @@ from bayessim_mjx.diagnosis.evidence.estimates import at_its_mean, estimated
 from bayessim_mjx.diagnosis.evidence.search import Search
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fitter import Fitter
-from bayessim_mjx.diagnosis.selection import hidden, predicted_gain
+from bayessim_mjx.diagnosis.selection import hidden, predicted_gain, stand_ins
 from bayessim_mjx.diagnosis.selection.begin import begin
 from bayessim_mjx.diagnosis.selection.budget import LEAVING_OUT
 from bayessim_mjx.diagnosis.selection.laws import compatible, special_cases
@@ -52,6 +52,7 @@ def select(
         chosen=chosen,
         elsewhere=_elsewhere(pool, chosen),
         hidden=hidden.beside(pool, answer, say),
+        stand_ins=stand_ins.of_parameters(pool, answer),
         weighed=found,
         estimated=estimated(search.weighing, found),
     )

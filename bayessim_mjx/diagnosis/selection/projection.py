@@ -43,3 +43,16 @@ class Projection:
         along = self.inverse @ s_ab
         projected = a - times(starts.B, MBa) - (self.away @ along).reshape(a.shape)
         return s_aa - float(s_ab @ along), g_a - float(s_ab @ (self.inverse @ self.slope)), s_aa, projected * self.root
+
+    def taken(self, a: Array, share: float) -> Array | None:
+        """Steps `[k]` of the fit's numbers that do the work of a column `[W, n]`; None where they do less of it."""
+        w = self.fit.weight
+        MBa = times(self.starts.M, times(self.Bt, a))
+        s_ab = self.weighted.T @ a.ravel()
+        along = self.inverse @ s_ab
+        s_aa = float(w @ (np.sum(a * a, 1) - np.sum(times(self.Bt, a) * MBa, 1)))
+        if s_aa <= 0 or float(s_ab @ along) <= share * s_aa:
+            return None
+        steps = np.zeros(self.fit.A.shape[2])
+        steps[self.free] = along
+        return steps

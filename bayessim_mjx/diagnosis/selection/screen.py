@@ -53,7 +53,7 @@ class Screened:
     whole: float = 0.0
 
 
-def _room(candidate: Candidate, way: Array) -> tuple[float, float]:
+def room(candidate: Candidate, way: Array) -> tuple[float, float]:
     neutral = np.array([c.neutral for c in candidate.coordinates])
     low, high = (np.array([getattr(c, e) for c in candidate.coordinates]) for e in ("low", "high"))
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -157,20 +157,20 @@ def simulated(
     over: Callable[[], bool] | None = None,
 ) -> Iterator[tuple[int, Array, Array]]:
     """(candidate, starting point, what it changes of the residual `[w, n]`) for plans of (candidate, point)."""
-    part = _part(fit, own)
+    some = part(fit, own)
     at_once = max(min(SIZES.worlds, SIZES.calls * fitter.simulator.lanes) // len(own), 1)
     for first in range(0, len(plans), at_once):
         if first and over is not None and over():
             return
         say("screening", first, len(plans))
-        some = plans[first : first + at_once]
+        now = plans[first : first + at_once]
         thetas = [
             fitter.vector((*fit.coordinates, *candidates[i].coordinates), np.concatenate([fit.values, point]))
-            for i, point in some
+            for i, point in now
         ]
-        shifted = fitter.simulator.run(np.stack(thetas), np.repeat(part.offsets[None], len(thetas), 0), own)
-        columns = part.r[None] - fitter.whiten(shifted)
-        yield from ((i, point, column) for (i, point), column in zip(some, columns, strict=True))
+        shifted = fitter.simulator.run(np.stack(thetas), np.repeat(some.offsets[None], len(thetas), 0), own)
+        columns = some.r[None] - fitter.whiten(shifted)
+        yield from ((i, point, column) for (i, point), column in zip(now, columns, strict=True))
 
 
 def judged(
@@ -181,7 +181,7 @@ def judged(
     own: NDArray[np.int64],
 ) -> dict[int, list[tuple[Screened, Array]]]:
     """{candidate: [(what its starting point gains, the point)]} for (candidate, point, column)."""
-    project, share = Projection(fitter, _part(fit, own)), len(fit.r) / max(len(own), 1)
+    project, share = Projection(fitter, part(fit, own)), len(fit.r) / max(len(own), 1)
     each: dict[int, list[tuple[Screened, Array]]] = {}
     for i, point, column in columns:
         one = _one(project, candidates[i], point, column)
@@ -225,7 +225,7 @@ def _with_others(found: list[tuple[Screened, Array]]) -> Screened:
     return replace(first, others=(point, *others, *levels, *whole))
 
 
-def _part(fit: Fit, own: NDArray[np.int64]) -> Fit:
+def part(fit: Fit, own: NDArray[np.int64]) -> Fit:
     """The fit on some of its windows."""
     return replace(fit, offsets=fit.offsets[own], r=fit.r[own], A=fit.A[own], B=fit.B[own], weight=fit.weight[own])
 
@@ -237,7 +237,7 @@ def _one(project: Projection, candidate: Candidate, point: Array, column: Array)
     if norm < 1e-9 or s <= 1e-9 * norm:
         return Screened(candidate, point, 0.0, 1.0, projected)
     way = np.where(candidate.shapes, 0.0, point - neutral)
-    t = float(np.clip(g / s, *_room(candidate, way)))
+    t = float(np.clip(g / s, *room(candidate, way)))
     gain = 2 * t * g - t * t * s
     start = np.where(candidate.shapes, point, neutral + (t if abs(t) > 0.02 else 0.02) * (point - neutral))
     return Screened(candidate, np.clip(start, low, high), max(gain, 0.0), 1.0 - s / norm, projected, whole=2 * g - s)

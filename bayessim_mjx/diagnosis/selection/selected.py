@@ -48,6 +48,7 @@ class Selection(Tried):
         chosen: {operating condition: effects that are named without it}.
         elsewhere: share of the gap closed on conditions that the choice was made without; NaN of one condition.
         hidden: labels of effects that would not show beside those of the answer (`selection.hidden`).
+        stand_ins: {known parameter: labels of effects that it may stand for} (`selection.stand_ins`).
         weighed: probabilities of the sets that were fitted; estimated: posterior of the answer's numbers.
     """
 
@@ -67,6 +68,7 @@ class Selection(Tried):
     chosen: Mapping[int, Key]
     elsewhere: float
     hidden: tuple[str, ...]
+    stand_ins: Mapping[str, tuple[str, ...]]
     weighed: Weighed
     estimated: Estimated
 

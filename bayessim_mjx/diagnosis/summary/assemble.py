@@ -17,6 +17,7 @@ from bayessim_mjx.diagnosis.result import Diagnosis, Gap, Place
 from bayessim_mjx.diagnosis.selection import bounds, conditions, left_out, uncertainty
 from bayessim_mjx.diagnosis.selection.accuracy import Posterior
 from bayessim_mjx.diagnosis.selection.models import Model
+from bayessim_mjx.diagnosis.selection.selected import Selection
 from bayessim_mjx.diagnosis.selection.tried import Tried, ranked
 from bayessim_mjx.diagnosis.summary import effects_found, how_far
 from bayessim_mjx.diagnosis.summary.details import details
@@ -101,16 +102,17 @@ def _told(found: Findings, covariance: np.ndarray) -> np.ndarray:
     return bounds.spread_out(covariance, model.fit.values, neutral, at)
 
 
-def _parameters(tried: Tried, model: Model, sd: np.ndarray, mean: np.ndarray) -> dict[str, dict[str, Any]]:
+def _parameters(selection: Selection, model: Model, sd: np.ndarray, mean: np.ndarray) -> dict[str, dict[str, Any]]:
     """Of the robot (their mean), and as they are simulated at the time step of the fit."""
-    remarks = conditions.structural(tried, model)
-    base, values = tried.fitter.base, model.fit.values
+    remarks = conditions.structural(selection, model)
+    base, values = selection.fitter.base, model.fit.values
     real = [float(np.clip(v, c.low, c.high)) for c, v in zip(base, mean, strict=True)]
     return {
         c.name: {
             **_against_data_sheet(c, real[i], float(model.fit.belief()[i])),
             "mean": real[i], "simulated": float(values[i]), "sd": float(sd[i]), "nominal": c.neutral,
             "low": c.low, "high": c.high, "unit": c.unit, "structural": remarks.get(c.name, ""),
+            "same_as": list(selection.stand_ins.get(c.name, ())),
         }
         for i, c in enumerate(base)
     }  # fmt: skip

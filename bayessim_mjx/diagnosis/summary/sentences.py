@@ -35,6 +35,7 @@ from bayessim_mjx.diagnosis.summary.texts import (
     PARTLY,
     PROBABLE,
     REST,
+    STANDS_FOR,
     STUCK,
     WITHIN,
 )
@@ -101,16 +102,22 @@ def _remarks(parameters: Mapping[str, Mapping[str, Any]]) -> list[str]:
             far[f"{value} ({about['away']:.1f} sd)"] = f"{name} {sheet}."
     for together, sentence in ((stuck, STUCK), (far, FAR)):
         told += together.values() if len(together) < 2 else [sentence.format(named=listed(list(together)))]
+    same = {name: about["same_as"] for name, about in parameters.items() if about.get("same_as")}
+    labels = [label for each in same.values() for label in each]
+    told += [STANDS_FOR.format(parameters=listed(list(same)), effects=_any_of(labels))] if same else []
     return told
 
 
 def _hidden(labels: Sequence[str], effects: int) -> str:
-    if not labels:
-        return ""
+    return HIDDEN.format(them="it" if effects == 1 else "them", hidden=_any_of(labels)) if labels else ""
+
+
+def _any_of(labels: Sequence[str]) -> str:
+    """Effects in words, not too many."""
     every = by_law([label.split("@", 1) for label in labels])
     parts = every[: LIMITS.told]
     parts += [f"{len(every) - len(parts)} more"] if len(every) > len(parts) else []
-    return HIDDEN.format(them="it" if effects == 1 else "them", hidden=listed(parts, "or"))
+    return listed(parts, "or")
 
 
 def _probable(weighed: Weighed) -> str:

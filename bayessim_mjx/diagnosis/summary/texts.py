@@ -52,6 +52,10 @@ HIDDEN = (
     "Beside {them} these logs would not show {hidden}: parameters of what is named do the same, and stand for both "
     "where both are there."
 )
+STANDS_FOR = (
+    "The data sheet may be wrong at {parameters}, or the simulator lacks {effects}: both move the robot alike. "
+    "--accuracy weighs the two."
+)
 BUILDS_UP = (
     "Over whole logs the error grows to {times} times what noise, start and parameters make likely, though within "
     "{window} it hardly shows: the law, or the simulator's time step, is not quite right."
