@@ -7,6 +7,7 @@ robot's inertia, damping and friction together. The prior tells whether a data s
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,59 +32,81 @@ def of_parameters(pool: Pool, answer: Model) -> dict[str, tuple[str, ...]]:
 
     An effect stands beside a parameter's deviation where known parameters do all its work (`hidden.LIMITS.hidden`), and
     where the data sheet speaks for it: without the effect's part the parameters are so much likelier that the odds
-    against the effect, one of all candidates and in its best size, are below `ODDS.mention`.
+    against the effect, one of all candidates and in its best size, are below `ODDS.strong`. Beside the best one stand
+    those that the data sheet does not speak strongly against; then what it leaves is looked at in the same way.
     """
-    known = pool.secants.columns
-    others = [c for c in pool.candidates if known.get(c.label) and all(compatible(c, e) for e in answer.effects)]
-    if not others:
-        return {}
-    fit = part(answer.fit, pool.secants.own)
-    project, least = (
-        Projection(pool.fitter, fit),
-        -log_prior(frozenset("x"), len(pool.candidates)) - np.log(ODDS.strong),
-    )
+    fit = part(answer.fit, pool.secants.own) if pool.secants.columns else answer.fit
+    every = _works(pool, answer, fit)
+    least = -log_prior(frozenset("x"), len(pool.candidates)) - np.log(ODDS.strong)
+    away = fit.values - np.array([c.neutral for c in fit.coordinates])
     out: dict[str, list[str]] = {}
-    for c in others:
-        neutral = np.array([x.neutral for x in c.coordinates])
-        found = []
-        for point, column in known[c.label]:
-            way = np.where(c.shapes, 0.0, point - neutral)
-            steps = project.taken(column, LIMITS.hidden)
-            if steps is not None and way.any():
-                found.append(_gain(fit, steps, room(c, way)))
-        gain, parameter = max(found, default=(0.0, -1))
-        if gain > least:
-            out.setdefault(fit.names[parameter], []).append(c.label)
+    while every:
+        gains = {label: max(_gain(fit, away, own) for own in works) for label, works in every.items()}
+        best = max(gains.values())
+        if best.nats <= least:
+            break
+        for label, gain in gains.items():
+            if gain.nats > max(least, best.nats - np.log(ODDS.strong)):
+                out.setdefault(fit.names[gain.parameter], []).append(label)
+                del every[label]
+        away = away - best.steps
     return {name: tuple(labels) for name, labels in out.items()}
 
 
-def _gain(fit: Fit, steps: Array, ends: tuple[float, float]) -> tuple[float, int]:
-    """(Nats by which the data sheet is likelier with an effect in its best amount; the parameter that gains most).
+@dataclass(frozen=True, eq=False)
+class _Work:
+    """Of an effect at one point: the steps `[k]` of the fit's numbers that do it, and what its range allows of it."""
 
-    Args:
-        steps: `[k]`, of the numbers, that one of it takes; ends: amounts of it that its range allows.
-    """
-    amounts = np.concatenate([end * AMOUNTS for end in ends if np.isfinite(end) and end])
-    away = fit.values - np.array([c.neutral for c in fit.coordinates])
+    steps: Array
+    room: tuple[float, float]
+
+
+@dataclass(frozen=True, order=True)
+class _Gain:
+    """Nats by which the data sheet is likelier, the parameter that gains most, and the steps taken back `[k]`."""
+
+    nats: float
+    parameter: int
+    steps: Array = field(compare=False)
+
+
+def _works(pool: Pool, answer: Model, fit: Fit) -> dict[str, list[_Work]]:
+    """Of each effect whose work the fit's numbers can do."""
+    known = pool.secants.columns
+    out: dict[str, list[_Work]] = {}
+    others = [c for c in pool.candidates if known.get(c.label) and all(compatible(c, e) for e in answer.effects)]
+    project = Projection(pool.fitter, fit) if others else None
+    for c in others:
+        neutral, found = np.array([x.neutral for x in c.coordinates]), []
+        for point, column in known[c.label]:
+            way = np.where(c.shapes, 0.0, point - neutral)
+            steps = project.taken(column, LIMITS.hidden) if project and way.any() else None
+            found += [] if steps is None else [_Work(steps, room(c, way))]
+        out |= {c.label: found} if found else {}
+    return out
+
+
+def _gain(fit: Fit, away: Array, of: _Work) -> _Gain:
+    """In its best amount, of parameters so far from the data sheet `[k]`."""
     before = _far(fit.coordinates, away)
-    gains = [before.sum() - _far(fit.coordinates, away - t * steps).sum() for t in amounts]
-    if not len(amounts) or max(gains) <= 0:
-        return 0.0, -1
-    after = away - amounts[int(np.argmax(gains))] * steps
+    amounts = [float(end * share) for end in of.room if np.isfinite(end) and end for share in AMOUNTS]
+    gains = [before - _far(fit.coordinates, away - t * of.steps) for t in amounts]
+    if not gains or max(gains) <= 0:
+        return _Gain(0.0, -1, np.zeros_like(away))
+    steps = amounts[int(np.argmax(gains))] * of.steps
     precision = np.array([c.precision if c.stated or c.kind else 0.0 for c in fit.coordinates])
-    return float(max(gains)), int(np.argmax(precision * (away**2 - after**2)))
+    return _Gain(max(gains), int(np.argmax(precision * (away**2 - (away - steps) ** 2))), steps)
 
 
-def _far(coordinates: Sequence[Coordinate], away: Array) -> Array:
-    """Minus the log prior density of each kind of known parameter, so far from the data sheet, up to a constant.
+def _far(coordinates: Sequence[Coordinate], away: Array) -> float:
+    """Minus the log prior density of known parameters so far from the data sheet, up to a constant.
 
     Of a kind whose accuracy nobody stated a multivariate Student t (`accuracy`), of stated ones a Gaussian.
     """
     squares = np.array([c.precision for c in coordinates]) * away**2
     kinds = np.array([c.kind for c in coordinates])
-    stated = np.array([c.stated and not c.kind for c in coordinates])
-    each = [0.5 * float(squares[stated].sum())]
-    for kind in sorted({k for k in kinds if k}):
+    total = 0.5 * float(squares[[c.stated and not c.kind for c in coordinates]].sum())
+    for kind in {k for k in kinds if k}:
         own = squares[kinds == kind]
-        each.append(0.5 * (SURE + len(own)) * float(np.log1p(own.sum() / SURE)))
-    return np.array(each)
+        total += 0.5 * (SURE + len(own)) * float(np.log1p(own.sum() / SURE))
+    return total
