@@ -32,12 +32,13 @@ def of_parameters(pool: Pool, answer: Model) -> dict[str, tuple[str, ...]]:
 
     An effect stands beside a parameter's deviation where known parameters do all its work (`hidden.LIMITS.hidden`), and
     where the data sheet speaks for it: without the effect's part the parameters are so much likelier that the odds
-    against the effect, one of all candidates and in its best size, are below `ODDS.strong`. Beside the best one stand
-    those that the data sheet does not speak strongly against; then what it leaves is looked at in the same way.
+    against the effect, one of all candidates and in its best size, are below `ODDS.strong`, and by `ODDS.mention` at
+    least. Beside the best one stand those that the data sheet does not speak strongly against; then what it leaves is
+    looked at in the same way.
     """
     fit = part(answer.fit, pool.secants.own) if pool.secants.columns else answer.fit
     every = _works(pool, answer, fit)
-    least = -log_prior(frozenset("x"), len(pool.candidates)) - np.log(ODDS.strong)
+    least = max(-log_prior(frozenset("x"), len(pool.candidates)) - np.log(ODDS.strong), np.log(ODDS.mention))
     away = fit.values - np.array([c.neutral for c in fit.coordinates])
     out: dict[str, list[str]] = {}
     while every:
