@@ -13,7 +13,8 @@ any case was diagnosed:
   Those that are likely to take longest begin first. When the minutes are over, running ones are killed. A case without
   result counts as unfinished. The next `run` begins it again; its logs and the fits of its search stay.
 - **Names.** A single is right if its effect is named at its place; exactly, if nothing else is. It is inside if the
-  effect is in the answer as a set: named, told as equivalent, or told as hidden beside it. Of a double both have to be.
+  effect is in the answer as a set: named, told as equivalent, as hidden beside it, or as the work of a known parameter
+  that is far from the data sheet (`same_as`; since 965c005). Of a double both have to be.
   A false name is one that is not hidden. A verdict that names nothing, or a command that fails, names nothing.
   Cases in which a hidden effect is weaker than 80 % of what was asked for are left out of these rates, and counted.
   The size of a set is the number of its effect@place, mean over the answers that name something.
@@ -26,8 +27,9 @@ any case was diagnosed:
   Answers that name effects but state no interval (one condition) are counted apart.
 - **Outside.** Of a null an alarm is an effect that is named, or "unexplained"; a cause that the library does not have
   is found if the verdict is "unexplained".
-- **Stated probabilities.** That of the answer (`evidence` of diagnosis.json), against whether it is exactly the hidden
-  set (nothing, of a null); unknown causes left out. Brier score, and bins of a fifth.
+- **Stated probabilities.** That of the answer (`evidence` of diagnosis.json), against whether it is the hidden set
+  (nothing, of a null), what is one with it (`hidden`, `same_as`) included; unknown causes left out. Brier score, and
+  bins of a fifth.
 - **Goal.** 86 to 94 % of each; intervals beside the rates are 95 % Wilson intervals. Parameters of one case are not
   independent of each other: those of strengths and known parameters are too narrow.
 """

@@ -14,7 +14,7 @@ from cases import SYSTEMS
 from counted_cases import POOR, SEEDS, Plan, plans
 from score import Outcome, label, mcnemar
 
-from bayessim_mjx.blind.outcome import LOOSE, alarm, covered, holds, wilson
+from bayessim_mjx.blind.outcome import LOOSE, alarm, covered, holds, labels_of, wilson
 from bayessim_mjx.blind.reality.plant import FINER
 
 ERRORS = (0.02, 0.05, 0.10, 0.20, 0.30)  # a case belongs to the nearest of these scales, by ratio
@@ -28,7 +28,7 @@ class Answer:
     """What one case adds to the tables; of one that did not end, nothing.
 
     rates: {measure: answers}; size: of the set, nan where nothing is named; untold: why something was not counted.
-    stated: (probability of the answer, whether it is exactly what is hidden).
+    stated: (probability of the answer, whether it is what is hidden, and no more).
     """
 
     plan: Plan
@@ -73,13 +73,20 @@ def answer(plan: Plan, folder: Path) -> Answer:
 
 
 def stated(o: Outcome) -> tuple[float, bool] | None:
-    """(probability of the answer, whether it is exactly what is hidden); None of a verdict that is none of the sets."""
+    """(probability of the answer, whether it is what is hidden); None of a verdict that is none of the sets."""
     sets = {frozenset(x["effects"]): float(x["probability"]) for x in (o.said or {}).get("evidence", ())}
     if not o.strong_enough or not (o.named() or label(o) in ("no_gap", "parameters", "noise")):
         return None
     own = sets.get(frozenset(f"{f['name']}@{f['where']}" for f in o.named()))
-    right = all(o.right(e) for e in o.truth["effects"]) and not _false(o)
+    right = all(o.right(e) or _same(o, e) for e in o.truth["effects"]) and not _false(o)
     return None if own is None else (own, right)
+
+
+def _same(o: Outcome, effect: dict[str, Any]) -> bool:
+    """Whether an effect is told as one with the answer: its work is done by known parameters or by what is named."""
+    said = o.said or {}
+    labels = [*said.get("hidden", ()), *(x for p in said.get("parameters", {}).values() for x in p.get("same_as", ()))]
+    return any(o.same(*label, effect) for entry in labels for label in labels_of(entry))
 
 
 def _false(o: Outcome) -> list[str]:
