@@ -46,6 +46,8 @@ class Priors:
 
 PRIORS = Priors()
 STEPS = 25  # of the search for the best hyperparameters
+FLAT = 1e-6  # share of the log density by which a step gains at least: a tenth of a nat of most logs
+OPEN = 0.2  # of the force's nodes, that windows tell of
 FIRST = 3e-3  # amplitude that it begins at, share of the force scale
 
 
@@ -195,18 +197,33 @@ def learn(windows: Windows, belief: Belief, like: Hyper | None = None) -> Learnt
     memories: Sequence[float] = PRIORS.memories
     if like is not None:
         start, memories = np.log(np.concatenate([like.amplitude, like.noise])), (like.memory,)
-    ends = [(np.log(PRIORS.least), np.log(10.0))] * nv + [(-2.0, 7.0)] * channels
+    ends: Array = np.array([(np.log(PRIORS.least), np.log(10.0))] * nv + [(-2.0, 7.0)] * channels)
+    unit = _precision(windows) ** -0.5
     best: Any = None
     for memory in memories:
         found = minimize(
-            _slope, start, (windows, belief, memory), "L-BFGS-B", jac=True, bounds=ends, options={"maxiter": STEPS}
-        )
-        if best is None or found.fun < best[0].fun:
-            best = found, memory
-        start = found.x
-    hyper = _hyper(best[0].x, nv, best[1])
+            _scaled, start / unit, (unit, windows, belief, memory), "L-BFGS-B", jac=True, bounds=ends / unit[:, None],
+            options={"maxiter": STEPS, "ftol": FLAT},
+        )  # fmt: skip
+        start = found.x * unit
+        if best is None or found.fun < best[0]:
+            best = found.fun, memory, start
+    hyper = _hyper(best[2], nv, best[1])
     there = marginal(windows, hyper)
-    return Learnt(hyper, belief.best(there.Q.sum(0)), there, _penalty(best[0].x, nv))
+    return Learnt(hyper, belief.best(there.Q.sum(0)), there, _penalty(best[2], nv))
+
+
+def _precision(windows: Windows) -> Array:
+    """About what windows and priors tell of each logarithm (Fisher's information), so that steps are alike in all."""
+    count = len(windows.gram)
+    force = 2 * OPEN * windows.nodes * count + PRIORS.spread**-2
+    noise = 2 * windows.rows * count + PRIORS.noise**-2
+    return np.concatenate([np.full(windows.joints, force), np.full(windows.gram.shape[1], noise)])
+
+
+def _scaled(x: Array, unit: Array, windows: Windows, belief: Belief, memory: float) -> tuple[float, Array]:
+    value, slope = _slope(x * unit, windows, belief, memory)
+    return value, slope * unit
 
 
 def _hyper(x: Array, nv: int, memory: float) -> Hyper:
