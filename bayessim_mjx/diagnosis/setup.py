@@ -54,7 +54,6 @@ class Setup:
     robot: Robot
     physics: Physics
     gate: gate.Gate
-    floors: noise.Floors
     fitter: Fitter
     candidates: tuple[candidates.Candidate, ...]
     scales: scales.Scales
@@ -114,9 +113,9 @@ def prepare(
     seen = seen.of_logs(observation.completed(beginnings, robot.mj_model))
     usable, robot = seen.usable, lean.lean(robot, seen.usable, dt)
     told += [*seen.warnings, *shorter, *(f"{text} (found, not assumed)" for text in seen.findings)]
-    floors, kinds = noise.floors(usable), candidates.kinds_of(effects)
+    told += [] if noise.repeats(usable) else [noise.ONCE]
     size = scales.measure(robot.mj_model, [resample(log, dt) for log in usable], robot.rating)
-    stack, left_out = candidates.stack(kinds, size)
+    stack, left_out = candidates.stack(candidates.kinds_of(effects), size)
     limit = tolerance.judge(robot.mj_model, 2 * size.travel, sensors.noise_of_positions(usable), asked).limit
     delivered = float(robot.mj_model.opt.timestep)
     look_at = functools.partial(_measured, usable=usable, group=group, use_qvel=seen.use_qvel, limit=limit)
@@ -135,9 +134,9 @@ def prepare(
     settings = dataclasses.replace(settings or _settings(robot, quick), believed=step.believed)
     late = [] if shift is None else shift.told(float(np.median([log.period for log in logs])))
     said = [*steps.said(), *_faster(seen.usable, delivered, dt), *late]
-    told += [*said, *floors.warnings, *steps.warnings(), *(f"not tried: {text}" for text in left_out)]
+    told += [*said, *steps.warnings(), *(f"not tried: {text}" for text in left_out)]
     told += [*_few_conditions(cut), *sensors.not_compared(usable), *allowed.warnings(), *led.sentences()]
-    fixed = (robot, physics, seen, floors, fitter, led.candidates, size, settings, seed, allowed)
+    fixed = (robot, physics, seen, fitter, led.candidates, size, settings, seed, allowed)
     return Setup(*fixed, tuple(told), tuple(said), step, before)
 
 

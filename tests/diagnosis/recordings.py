@@ -1,4 +1,4 @@
-"""Logs made with MuJoCo C, for the tests of the data gate, the noise floors and the channel split."""
+"""Logs made with MuJoCo C, for the tests of the data gate and the channel split."""
 
 from collections.abc import Callable
 

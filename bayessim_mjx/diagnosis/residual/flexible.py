@@ -83,10 +83,6 @@ class Flexible:
     force: Array = field(repr=False)
     samples: int
 
-    @property
-    def cost_by_window(self) -> Array:
-        return self.condition.cost
-
 
 def flexible(
     fitter: Fitter,

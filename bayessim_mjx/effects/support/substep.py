@@ -151,8 +151,3 @@ class SubStep:
         implicit = integrator == int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
         derivative = mjx.deriv_smooth_vel(self.solved, self.data) if implicit else None
         return inertia if derivative is None else inertia - model.opt.timestep * derivative
-
-    @property
-    def next_qvel(self) -> jax.Array:
-        """`[nv]`, the velocities at the end of the sub-step under the forces known so far."""
-        return self.qvel + self.dt * product(self.inverse, self.force[:, None])[:, 0]
