@@ -79,8 +79,11 @@ class Search:
             before = self._order()[0]
             self._finish()
             self._leading()
-            if self._order()[0] == before:
+            best = self._order()[0]
+            if best == before:
                 break
+            self._fit(self._todo(best), "around the new leading set", TOGETHER)  # it led in none of the rounds
+            self._leading()
         return self.weighing.weighed()
 
     def _order(self) -> list[Key]:
