@@ -26,16 +26,16 @@ TIMING = 0.03
 FREE = 100.0  # standard deviations, as good as no bound
 
 
-def columns(fitter: Fitter, D: Array, B: Array) -> Array:
+def columns(fitter: Fitter, D: Array, fit: Fit) -> Array:
     """`[W, n, T]`, what one prior standard deviation of each does to the residuals.
 
     Lags of measured positions, of measured velocities, of positions and of velocities that servos are fed back. A late
     start moves all of a window's motion.
 
     Args:
-        D: as in `forcing.columns`; B: `[W, n, s]`, of the start states (positions, then velocities).
+        D: as in `forcing.columns`; fit: of the known parameters alone.
     """
-    windows, nv = fitter.simulator.windows, fitter.simulator.nv
+    windows, nv, B = fitter.simulator.windows, fitter.simulator.nv, fit.B
     rate, measured = fitter.rate(), fitter.used[nv:].any()
     channels = np.arange(rate.shape[1]) % int(fitter.used.sum())
     positions = channels < int(fitter.used[:nv].sum())
@@ -43,23 +43,49 @@ def columns(fitter: Fitter, D: Array, B: Array) -> Array:
     from_start = [np.einsum("wns,ws->wn", b, x) for b, x in ((B[:, :, :nv], start), (B[:, :, nv : 2 * nv], pull))]
     late_q = from_start[0] - rate * positions + (0.0 if measured else from_start[1])
     late_v = (from_start[1] - rate * ~positions) * measured
-    servos = [np.einsum("wnf,wf->wn", D, force) for force in _pulled(fitter, D.shape[2] // nv)]
-    every = TIMING * float(windows.dt) * np.stack([late_q, late_v, *servos], 2)
+    every = TIMING * float(windows.dt) * np.stack([late_q, late_v, *_servos(fitter, D, fit)], 2)
     return every[:, :, np.abs(every).max((0, 1)) > 0]
 
 
-def _pulled(fitter: Fitter, nodes: int) -> tuple[Array, Array]:
-    """`[W, nv m]` each, N m/s or N/s: how fast servos' forces on joints change, by position and by speed as logged."""
-    windows, model = fitter.simulator.windows, fitter.simulator.physics.mj_model
+def _servos(fitter: Fitter, D: Array, fit: Fit) -> list[Array]:
+    """`[W, n]` each, per s of lag: of the positions, and of the velocities, that servos are fed back.
+
+    A late position is less damping of the joint, a late velocity less armature. Where these are known parameters the
+    columns are theirs: forces at nodes lack what accelerations do between them, and would trade it for a parameter.
+    """
+    model, nv = fitter.simulator.physics.mj_model, fitter.simulator.nv
+    gains, names = _pulls(model), [c.name for c in fitter.base]
+    parameters = {(p.attribute, p.target): p for p in fitter.simulator.physics.space.parameters if p.name in names}
+    forces, out = _pulled(fitter, D.shape[2] // nv), []
+    for gain, force, attribute, own in zip(
+        gains, forces, ("damping", "armature"), (model.dof_damping, model.dof_armature), strict=True
+    ):
+        column, by_joint = np.zeros(fit.r.shape), force.reshape(len(force), nv, -1).copy()
+        for dof in np.flatnonzero(np.diag(gain)):
+            p = parameters.get((attribute, model.joint(int(model.dof_jntid[dof])).name))
+            if p is not None and p.operation == "scaling" and own[dof] > 0:
+                column -= fit.A[:, :, names.index(p.name)] * gain[dof, dof] / own[dof]
+                by_joint[:, dof] = 0.0
+        out.append(column + np.einsum("wnf,wf->wn", D, by_joint.reshape(force.shape)))
+    return out
+
+
+def _pulls(model: mujoco.MjModel) -> tuple[Array, Array]:
+    """`[nv, nv]` each, N m/rad and N m s/rad, or N/m and N s/m: servos' pull on joints by position and by speed."""
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     moment = moments(model, data)
     affine = model.actuator_biastype == int(mujoco.mjtBias.mjBIAS_AFFINE)
     gains = np.where(affine[:, None], -model.actuator_biasprm[:, 1:3], 0.0)
+    by_position, by_speed = (moment.T @ (gain[:, None] * moment) for gain in gains.T)
+    return by_position, by_speed
+
+
+def _pulled(fitter: Fitter, nodes: int) -> tuple[Array, Array]:
+    """`[W, nv m]` each, N m/s or N/s: how fast servos' forces on joints change, by position and by speed as logged."""
+    windows, model = fitter.simulator.windows, fitter.simulator.physics.mj_model
     rows = windows.start[:, None] + ((np.arange(nodes) + 0.5) * windows.steps / nodes).round().astype(int)
-    forces = [
-        rate @ (moment.T @ (gain[:, None] * moment)) for rate, gain in zip(_rates(fitter, rows), gains.T, strict=True)
-    ]
+    forces = [rate @ pull for rate, pull in zip(_rates(fitter, rows), _pulls(model), strict=True)]
     by_position, by_speed = (np.nan_to_num(np.moveaxis(f, 1, 2).reshape(len(f), -1)) for f in forces)
     return by_position, by_speed
 

@@ -14,6 +14,7 @@ from bayessim_mjx.diagnosis.fitting import robot
 from bayessim_mjx.diagnosis.fitting.fit import Fit
 from bayessim_mjx.diagnosis.selection.begin import begin
 from bayessim_mjx.diagnosis.selection.sets import BASE
+from bayessim_mjx.parameters.parameter import Parameter
 from tests.diagnosis import pendulums
 
 SERVO = """<mujoco><worldbody><body><joint name="hinge" axis="0 1 0" damping=".3" armature=".05"/>
@@ -23,7 +24,7 @@ SERVO = """<mujoco><worldbody><body><joint name="hinge" axis="0 1 0" damping=".3
 
 def test_each_kind_of_sensor_has_a_lag_of_its_own(monkeypatch):
     """One joint, three rows of (q, v): each sees its own rate of change, and what the late start does to all rows."""
-    monkeypatch.setattr(doubts, "_pulled", lambda fitter, nodes: 2 * [np.zeros((1, nodes))])
+    monkeypatch.setattr(doubts, "_servos", lambda fitter, D, fit: [])
     speed = np.array([[2.0], [3.0], [5.0], [9.0]])  # rad/s; its slope at the start is 100 rad/s^2
     windows = SimpleNamespace(dt=0.01, log=[0], start=[0], logs=[SimpleNamespace(qvel=speed)])
     rate = np.array([[3.0, 150.0, 5.0, 300.0, 9.0, 400.0]])
@@ -32,11 +33,15 @@ def test_each_kind_of_sensor_has_a_lag_of_its_own(monkeypatch):
     fitter = SimpleNamespace(
         rate=lambda: rate, used=np.ones(2, bool), simulator=SimpleNamespace(nv=1, windows=windows)
     )  # fmt: skip
-    positions, velocities = np.moveaxis(doubts.columns(fitter, D, B)[0], 1, 0) / (doubts.TIMING * 0.01)
+    positions, velocities = np.moveaxis(doubts.columns(fitter, D, SimpleNamespace(B=B))[0], 1, 0) / (
+        doubts.TIMING * 0.01
+    )
     assert positions == pytest.approx([2 - 3, 0, 2 - 5, 0, 2 - 9, 0])
     assert velocities == pytest.approx([1.0, -150, 2.0, -300, 3.0, -400])
     fitter.used, fitter.rate = np.array([True, False]), lambda: rate[:, ::2]  # speeds are those of the positions
-    (both,) = np.moveaxis(doubts.columns(fitter, D[:, ::2], B[:, ::2])[0], 1, 0) / (doubts.TIMING * 0.01)
+    (both,) = np.moveaxis(doubts.columns(fitter, D[:, ::2], SimpleNamespace(B=B[:, ::2]))[0], 1, 0) / (
+        doubts.TIMING * 0.01
+    )
     assert both == pytest.approx([2 - 3 + 1, 2 - 5 + 2, 2 - 9 + 3])
 
 
@@ -49,6 +54,25 @@ def test_a_servos_force_changes_by_its_gains_through_its_gear():
     by_position, by_speed = doubts._pulled(SimpleNamespace(simulator=simulator), 2)
     assert by_position == pytest.approx(160 * np.array([[16.0, 36.0]]))
     assert by_speed == pytest.approx(16 * np.array([[80.0, 120.0]]))
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_late_feedback_of_a_servo_is_less_damping_and_less_armature(known):
+    """Per s: 160 N m/rad over a damping of .3, 16 N m s/rad over an armature of .05, where these are parameters."""
+    model = mujoco.MjModel.from_xml_string(SERVO)
+    log = SimpleNamespace(qvel=np.arange(12.0)[:, None] ** 2)
+    windows = SimpleNamespace(start=np.array([3]), steps=4, log=np.array([0]), logs=[log], dt=0.1)
+    parameters = [Parameter(f"hinge_{a}", 1.0, 0.3, 2.0, attribute=a, target="hinge") for a in ("damping", "armature")]
+    physics = SimpleNamespace(mj_model=model, space=SimpleNamespace(parameters=parameters))
+    base = parameters if known else []
+    fitter = SimpleNamespace(simulator=SimpleNamespace(windows=windows, physics=physics, nv=1), base=base)
+    fit = SimpleNamespace(r=np.zeros((1, 4)), A=np.array([[[1.0, 2.0], [0.0, 1.0], [3.0, 0.0], [0.0, 5.0]]]))
+    D = np.ones((1, 4, 2))
+    late_q, late_v = doubts._servos(fitter, D, fit)
+    by_force = np.full((1, 4), 160 * (16.0 + 36.0)), np.full((1, 4), 16 * (80.0 + 120.0))
+    by_parameter = -fit.A[:, :, 0] * 160 / 0.3, -fit.A[:, :, 1] * 16 / 0.05
+    expected = by_parameter if known else by_force
+    assert late_q == pytest.approx(expected[0]) and late_v == pytest.approx(expected[1])
 
 
 def test_numbers_behind_a_fits_own_change_nothing_of_it():
