@@ -8,7 +8,7 @@ damps it less, by the stiffness times the lag, which is as much as a joint's own
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
@@ -26,16 +26,31 @@ TIMING = 0.03
 FREE = 100.0  # standard deviations, as good as no bound
 
 
-def columns(fitter: Fitter, D: Array, fit: Fit) -> Array:
-    """`[W, n, T]`, what one prior standard deviation of each does to the residuals.
+@dataclass(frozen=True, eq=False)
+class Doubts:
+    """What one prior standard deviation of each does to the residuals: of its own, and as known parameters do.
 
-    Lags of measured positions, of measured velocities, of positions and of velocities that servos are fed back. A late
-    start moves all of a window's motion.
+    Attributes:
+        columns: `[W, n, T]`; as_known: `[k, T]`, steps of the known parameters.
+    """
+
+    columns: Array
+    as_known: Array
+
+    def of(self, fit: Fit) -> Array:
+        """`[W, n, T]`, beside the numbers of a fit."""
+        return np.asarray(self.columns + fit.A[:, :, : len(self.as_known)] @ self.as_known)
+
+
+def found(fitter: Fitter, D: Array, B: Array) -> Doubts:
+    """Lags of measured positions, of measured velocities, of positions and of velocities that servos are fed back.
+
+    A late start moves all of a window's motion.
 
     Args:
-        D: as in `forcing.columns`; fit: of the known parameters alone.
+        D: as in `forcing.columns`; B: `[W, n, s]`, of the start states (positions, then velocities).
     """
-    windows, nv, B = fitter.simulator.windows, fitter.simulator.nv, fit.B
+    windows, nv = fitter.simulator.windows, fitter.simulator.nv
     rate, measured = fitter.rate(), fitter.used[nv:].any()
     channels = np.arange(rate.shape[1]) % int(fitter.used.sum())
     positions = channels < int(fitter.used[:nv].sum())
@@ -43,31 +58,34 @@ def columns(fitter: Fitter, D: Array, fit: Fit) -> Array:
     from_start = [np.einsum("wns,ws->wn", b, x) for b, x in ((B[:, :, :nv], start), (B[:, :, nv : 2 * nv], pull))]
     late_q = from_start[0] - rate * positions + (0.0 if measured else from_start[1])
     late_v = (from_start[1] - rate * ~positions) * measured
-    every = TIMING * float(windows.dt) * np.stack([late_q, late_v, *_servos(fitter, D, fit)], 2)
-    return every[:, :, np.abs(every).max((0, 1)) > 0]
+    servos, as_known = _servos(fitter, D)
+    every = np.stack([late_q, late_v, *servos], 2)
+    known = np.concatenate([np.zeros((len(as_known), 2)), as_known], 1)
+    kept = (np.abs(every).max((0, 1)) > 0) | np.any(known != 0, 0)
+    return Doubts(TIMING * float(windows.dt) * every[:, :, kept], TIMING * float(windows.dt) * known[:, kept])
 
 
-def _servos(fitter: Fitter, D: Array, fit: Fit) -> list[Array]:
-    """`[W, n]` each, per s of lag: of the positions, and of the velocities, that servos are fed back.
+def _servos(fitter: Fitter, D: Array) -> tuple[list[Array], Array]:
+    """(`[W, n]` each, `[k, 2]`), per s of lag of the positions, and of the velocities, that servos are fed back.
 
     A late position is less damping of the joint, a late velocity less armature. Where these are known parameters the
     columns are theirs: forces at nodes lack what accelerations do between them, and would trade it for a parameter.
     """
     model, nv = fitter.simulator.physics.mj_model, fitter.simulator.nv
-    gains, names = _pulls(model), [c.name for c in fitter.base]
+    names = [c.name for c in fitter.base]
     parameters = {(p.attribute, p.target): p for p in fitter.simulator.physics.space.parameters if p.name in names}
-    forces, out = _pulled(fitter, D.shape[2] // nv), []
-    for gain, force, attribute, own in zip(
-        gains, forces, ("damping", "armature"), (model.dof_damping, model.dof_armature), strict=True
-    ):
-        column, by_joint = np.zeros(fit.r.shape), force.reshape(len(force), nv, -1).copy()
+    kinds = (("damping", model.dof_damping), ("armature", model.dof_armature))
+    columns, as_known = [], np.zeros((len(names), 2))
+    for i, (gain, force) in enumerate(zip(_pulls(model), _pulled(fitter, D.shape[2] // nv), strict=True)):
+        attribute, own = kinds[i]
+        by_joint = force.reshape(len(force), nv, -1).copy()
         for dof in np.flatnonzero(np.diag(gain)):
             p = parameters.get((attribute, model.joint(int(model.dof_jntid[dof])).name))
             if p is not None and p.operation == "scaling" and own[dof] > 0:
-                column -= fit.A[:, :, names.index(p.name)] * gain[dof, dof] / own[dof]
+                as_known[names.index(p.name), i] = -gain[dof, dof] / own[dof]
                 by_joint[:, dof] = 0.0
-        out.append(column + np.einsum("wnf,wf->wn", D, by_joint.reshape(force.shape)))
-    return out
+        columns.append(np.einsum("wnf,wf->wn", D, by_joint.reshape(force.shape)))
+    return columns, as_known
 
 
 def _pulls(model: mujoco.MjModel) -> tuple[Array, Array]:
@@ -99,8 +117,9 @@ def _rates(fitter: Fitter, rows: NDArray[np.int64]) -> tuple[Array, Array]:
     return np.stack([speeds[log][own] for log, own in at]), np.stack([slopes[log][own] for log, own in at])
 
 
-def doubted(fit: Fit, columns: Array) -> Fit:
+def doubted(fit: Fit, doubts: Doubts) -> Fit:
     """The fit with these numbers behind its own, in units of their priors."""
-    more = tuple(Coordinate(f"doubt{i}", (), 0.0, -FREE, FREE, 1.0, "", stated=True) for i in range(columns.shape[2]))
+    own = doubts.of(fit)
+    more = tuple(Coordinate(f"doubt{i}", (), 0.0, -FREE, FREE, 1.0, "", stated=True) for i in range(own.shape[2]))
     values = np.concatenate([fit.values, np.zeros(len(more))])
-    return replace(fit, coordinates=(*fit.coordinates, *more), values=values, A=np.concatenate([fit.A, columns], 2))
+    return replace(fit, coordinates=(*fit.coordinates, *more), values=values, A=np.concatenate([fit.A, own], 2))

@@ -44,7 +44,7 @@ class Weighing:
         self.D = forcing.columns(fitter, pool.base.fit, forcing.default_nodes(fitter), self.scale)
         self.channels = int(fitter.used.sum())
         self.scored: dict[Key, Scored] = {}
-        self._doubts = doubts.columns(fitter, self.D, pool.base.fit)
+        self._doubts = doubts.found(fitter, self.D, pool.base.fit.B)
         self.score([BASE])
 
     def doubted(self, fit: Fit) -> Fit:

@@ -11,6 +11,7 @@ from bayessim_mjx.diagnosis import setup as preparing
 from bayessim_mjx.diagnosis.evidence import doubts
 from bayessim_mjx.diagnosis.evidence.weighing import Weighing
 from bayessim_mjx.diagnosis.fitting import robot
+from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
 from bayessim_mjx.diagnosis.fitting.fit import Fit
 from bayessim_mjx.diagnosis.selection.begin import begin
 from bayessim_mjx.diagnosis.selection.sets import BASE
@@ -24,7 +25,7 @@ SERVO = """<mujoco><worldbody><body><joint name="hinge" axis="0 1 0" damping=".3
 
 def test_each_kind_of_sensor_has_a_lag_of_its_own(monkeypatch):
     """One joint, three rows of (q, v): each sees its own rate of change, and what the late start does to all rows."""
-    monkeypatch.setattr(doubts, "_servos", lambda fitter, D, fit: [])
+    monkeypatch.setattr(doubts, "_servos", lambda fitter, D: ([], np.zeros((0, 0))))
     speed = np.array([[2.0], [3.0], [5.0], [9.0]])  # rad/s; its slope at the start is 100 rad/s^2
     windows = SimpleNamespace(dt=0.01, log=[0], start=[0], logs=[SimpleNamespace(qvel=speed)])
     rate = np.array([[3.0, 150.0, 5.0, 300.0, 9.0, 400.0]])
@@ -33,15 +34,12 @@ def test_each_kind_of_sensor_has_a_lag_of_its_own(monkeypatch):
     fitter = SimpleNamespace(
         rate=lambda: rate, used=np.ones(2, bool), simulator=SimpleNamespace(nv=1, windows=windows)
     )  # fmt: skip
-    positions, velocities = np.moveaxis(doubts.columns(fitter, D, SimpleNamespace(B=B))[0], 1, 0) / (
-        doubts.TIMING * 0.01
-    )
+    unit = doubts.TIMING * 0.01
+    positions, velocities = np.moveaxis(doubts.found(fitter, D, B).columns[0], 1, 0) / unit
     assert positions == pytest.approx([2 - 3, 0, 2 - 5, 0, 2 - 9, 0])
     assert velocities == pytest.approx([1.0, -150, 2.0, -300, 3.0, -400])
     fitter.used, fitter.rate = np.array([True, False]), lambda: rate[:, ::2]  # speeds are those of the positions
-    (both,) = np.moveaxis(doubts.columns(fitter, D[:, ::2], SimpleNamespace(B=B[:, ::2]))[0], 1, 0) / (
-        doubts.TIMING * 0.01
-    )
+    (both,) = np.moveaxis(doubts.found(fitter, D[:, ::2], B[:, ::2]).columns[0], 1, 0) / unit
     assert both == pytest.approx([2 - 3 + 1, 2 - 5 + 2, 2 - 9 + 3])
 
 
@@ -66,20 +64,24 @@ def test_late_feedback_of_a_servo_is_less_damping_and_less_armature(known):
     physics = SimpleNamespace(mj_model=model, space=SimpleNamespace(parameters=parameters))
     base = parameters if known else []
     fitter = SimpleNamespace(simulator=SimpleNamespace(windows=windows, physics=physics, nv=1), base=base)
-    fit = SimpleNamespace(r=np.zeros((1, 4)), A=np.array([[[1.0, 2.0], [0.0, 1.0], [3.0, 0.0], [0.0, 5.0]]]))
-    D = np.ones((1, 4, 2))
-    late_q, late_v = doubts._servos(fitter, D, fit)
-    by_force = np.full((1, 4), 160 * (16.0 + 36.0)), np.full((1, 4), 16 * (80.0 + 120.0))
-    by_parameter = -fit.A[:, :, 0] * 160 / 0.3, -fit.A[:, :, 1] * 16 / 0.05
-    expected = by_parameter if known else by_force
-    assert late_q == pytest.approx(expected[0]) and late_v == pytest.approx(expected[1])
+    (late_q, late_v), as_known = doubts._servos(fitter, np.ones((1, 4, 2)))
+    if known:
+        assert not late_q.any() and not late_v.any()
+        assert as_known == pytest.approx(np.array([[-160 / 0.3, 0.0], [0.0, -16 / 0.05]]))
+    else:
+        assert not as_known.size
+        assert late_q == pytest.approx(np.full((1, 4), 160 * (16.0 + 36.0)))
+        assert late_v == pytest.approx(np.full((1, 4), 16 * (80.0 + 120.0)))
 
 
 def test_numbers_behind_a_fits_own_change_nothing_of_it():
-    fit = Fit((), np.zeros(0), *(np.zeros(1),) * 5, 0.0)
-    fit = dataclasses.replace(fit, A=np.zeros((3, 8, 0)))
-    more = doubts.doubted(fit, np.ones((3, 8, 2)))
-    assert more.A.shape == (3, 8, 2) and not more.values.any() and np.all(more.belief() == 1.0)
+    known = Coordinate("known", (0,), 1.0, 0.5, 2.0, 1.0, "")
+    fit = Fit((known,), np.zeros(1), *(np.zeros(1),) * 5, 0.0)
+    fit = dataclasses.replace(fit, A=np.full((3, 8, 1), 2.0))
+    own = doubts.Doubts(np.ones((3, 8, 2)), np.array([[0.0, -3.0]]))
+    more = doubts.doubted(fit, own)
+    assert more.A[0, 0] == pytest.approx([2.0, 1.0, 1.0 - 3.0 * 2.0])
+    assert more.A.shape == (3, 8, 3) and not more.values.any() and np.all(more.belief() == 1.0)
 
 
 @pytest.mark.slow
