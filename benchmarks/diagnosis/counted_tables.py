@@ -8,14 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import mujoco
 import numpy as np
-from cases import SYSTEMS
 from counted_cases import POOR, SEEDS, Plan, plans
 from score import Outcome, label, mcnemar
 
 from bayessim_mjx.blind.outcome import LOOSE, alarm, covered, holds, labels_of, wilson
-from bayessim_mjx.blind.reality.plant import FINER
 
 ERRORS = (0.02, 0.05, 0.10, 0.20, 0.30)  # a case belongs to the nearest of these scales, by ratio
 NAMES, HOLDS = ("right", "exact", "inside", "false names"), ("strengths", "known", "known, other answers", "closed")
@@ -103,28 +100,10 @@ def _names(o: Outcome) -> dict[str, list[bool]]:
 
 def known(o: Outcome) -> tuple[list[bool], list[str]]:
     """(whether what is said of each mass, damping and armature holds, a word for each of which nothing is said)."""
-    told, true = (o.said or {}).get("parameters", {}), in_motion(o.truth)
+    told, true = (o.said or {}).get("parameters", {}), o.truth["base"]
     of = {name: told.get(name.replace(".", "_") + SUFFIX) for name in true}
     held = [holds(given, true[name] * (given.get("nominal") or 1.0)) for name, given in of.items() if given]
     return held, ["known parameters not told"] * (len(of) - len(held))
-
-
-def in_motion(truth: dict[str, Any]) -> dict[str, float]:
-    """Known parameters as the reality's motion shows them, in nominal values.
-
-    Reality takes Euler steps of h, a tenth of the model's. Its positions lie h / 2 ahead of its velocities. Where these
-    are logged they tell so. Where they are not, commands seem to act h / 2 early, and a servo of stiffness kp damps
-    its joint by kp h / 2 less: .2 to .25 of the servo arm's nominal damping. The rule came after the first 58 cases.
-    """
-    model = SYSTEMS[truth["system"]].spec().compile()
-    less = dict.fromkeys(truth["base"], 0.0)
-    for i in np.flatnonzero(model.actuator_biastype == int(mujoco.mjtBias.mjBIAS_AFFINE)):
-        joint = int(model.actuator_trnid[i, 0])
-        damping = model.dof_damping[model.jnt_dofadr[joint]]
-        name = f"{model.joint(joint).name}.damping"
-        if name in less and damping > 0 and not truth["velocity"]:
-            less[name] = -model.actuator_biasprm[i, 1] * model.opt.timestep / FINER / 2 / float(damping)
-    return {name: value - float(less[name]) for name, value in truth["base"].items()}
 
 
 def closed(said: dict[str, Any], result: dict[str, Any]) -> tuple[list[bool], list[str]]:

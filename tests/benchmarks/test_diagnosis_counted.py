@@ -156,19 +156,6 @@ def test_errors_belong_to_the_nearest_scale_by_ratio():
     assert [tables.nearest(s) for s in (0.03, 0.033, 0.07, 0.072, 0.24, 0.25)] == [0.02, 0.05, 0.05, 0.1, 0.2, 0.3]
 
 
-def test_a_servos_joint_is_damped_as_its_reality_moves():
-    """Positions lag by half of a step of .5 ms: stiffness times .25 ms, by hand; nothing else is another."""
-    joints = {"waist": (400, 0.5), "elbow": (250, 0.3), "flange": (25, 0.03)}
-    base = {f"{j}.damping": 1.1 for j in joints} | {"waist.armature": 0.9, "tool.mass": 1.2}
-    found = tables.in_motion({"system": "arm_servo", "base": base, "velocity": False})
-    for joint, (stiffness, damping) in joints.items():
-        assert found[f"{joint}.damping"] == pytest.approx(1.1 - stiffness * 0.00025 / damping)
-    assert found["waist.armature"] == 0.9 and found["tool.mass"] == 1.2
-    torques = {"shoulder.damping": 1.1, "elbow.damping": 0.8}
-    assert tables.in_motion({"system": "two_link", "base": torques, "velocity": False}) == torques
-    assert tables.in_motion({"system": "arm_servo", "base": base, "velocity": True}) == base  # velocities tell the lag
-
-
 def test_cases_that_run_when_the_time_is_over_are_killed_and_begun_again(tmp_path, monkeypatch, capsys):
     begun: list = []
 
