@@ -36,7 +36,7 @@ def covariance(fitter: Fitter, D: Array, size: Array, step: Callable[[Array], Ar
             own = D[:, :, joint * nodes : (joint + 1) * nodes] @ forces[:, kind, joint, :, None]
             out.append(step(r + own[..., 0]) - here)
     moves = np.array(out)
-    return np.asarray(moves.T @ moves) / forces.shape[1]  # together they are as large as the missing force
+    return np.asarray(moves.T @ moves)
 
 
 def of_motion(fitter: Fitter, nodes: int) -> Array:
