@@ -88,8 +88,9 @@ def contest():
 def concluded(pool, answer):
     """A selection that names the answer, and holds all that were fitted for equally likely."""
     weighed = Weighed(dict.fromkeys(pool.models, 1 / len(pool.models)), dict.fromkeys(pool.models, 0.0), {})
-    nothing = {"subsets": {}, "promised": (0.0, {}), "chosen": {}, "elsewhere": float("nan"), "hidden": ()}
-    return selection_of(pool, answer, rivals={}, weighed=weighed, estimated=None, **nothing)
+    shares = {"subsets": {}, "promised": (0.0, {}), "chosen": {}, "elsewhere": float("nan")}
+    nothing = {"hidden": (), "stand_ins": {}, "rivals": {}, "estimated": None}
+    return selection_of(pool, answer, weighed=weighed, **shares, **nothing)
 
 
 @functools.cache
