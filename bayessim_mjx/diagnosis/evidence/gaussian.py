@@ -66,7 +66,7 @@ class Windows:
     """Inner products over the rows of each channel, all that the evidence needs of a model's windows.
 
     Attributes:
-        gram: `[W, C, M, M]` of the columns (r, A, D in units of the force scale, B in units of the starts' spread).
+        gram: `[C, W, M, M]` of the columns (r, A, D in units of the force scale, B in units of the starts' spread).
         parameters, joints, nodes: k, nv and m, so M = 1 + k + nv m + s; rows: of each channel in a window.
     """
 
@@ -82,7 +82,7 @@ class Windows:
 
     def some(self, rows: NDArray[np.bool_]) -> Windows:
         """Some of the windows."""
-        return replace(self, gram=self.gram[rows])
+        return replace(self, gram=self.gram[:, rows])
 
 
 def windows_of(
@@ -99,7 +99,7 @@ def windows_of(
     nodes = D.shape[2] // len(scale)
     start = r + np.einsum("wns,ws->wn", B, offsets)  # with the start state as measured
     X = np.concatenate([start[..., None], A, D * np.repeat(scale, nodes), B * spread], 2)
-    X = X.reshape(count, n // channels, channels, -1).transpose(0, 2, 3, 1)
+    X = X.reshape(count, n // channels, channels, -1).transpose(2, 0, 3, 1)
     return Windows(X @ X.mT, A.shape[2], len(scale), nodes, n // channels)
 
 
@@ -130,7 +130,7 @@ def correlation(nodes: int, memory: float) -> Array:
 def marginal(windows: Windows, hyper: Hyper) -> Marginal:
     """The windows under some hyperparameters (Woodbury's identity: the size is that of the force, not of the rows)."""
     own, forces = 1 + windows.parameters, windows.forces
-    gram = np.tensordot(1 / hyper.noise**2, windows.gram, axes=(0, 1))
+    gram = np.tensordot(1 / hyper.noise**2, windows.gram, 1)
     size = gram.shape[1] - own
     root = np.eye(size)
     root[:forces, :forces] = np.kron(np.diag(hyper.amplitude), correlation(windows.nodes, hyper.memory))
@@ -187,16 +187,18 @@ class Learnt:
         return self.penalty - 0.5 * float(self.marginal.logdet.sum())
 
 
-def learn(windows: Windows, belief: Belief, like: Hyper | None = None) -> Learnt:
+def learn(windows: Windows, belief: Belief, like: Sequence[Hyper] = ()) -> Learnt:
     """The best hyperparameters, by quasi-Newton steps (exact gradients by Fisher's identity) for each memory.
 
-    like: of a model like this one, where the search begins, and whose memory stays; None: all memories are tried.
+    like: of models of the same windows with one memory, which stays; the search begins at the best of them. None: all
+    memories are tried.
     """
-    nv, channels = windows.joints, windows.gram.shape[1]
-    start = np.concatenate([np.full(nv, np.log(FIRST)), np.zeros(channels)])
+    nv, channels = windows.joints, len(windows.gram)
+    starts = [np.concatenate([np.full(nv, np.log(FIRST)), np.zeros(channels)])]
     memories: Sequence[float] = PRIORS.memories
-    if like is not None:
-        start, memories = np.log(np.concatenate([like.amplitude, like.noise])), (like.memory,)
+    if like:
+        starts, memories = [np.log(np.concatenate([h.amplitude, h.noise])) for h in like], (like[0].memory,)
+    start = min(starts, key=lambda x: _slope(x, windows, belief, memories[0])[0]) if len(starts) > 1 else starts[0]
     ends: Array = np.array([(np.log(PRIORS.least), np.log(10.0))] * nv + [(-2.0, 7.0)] * channels)
     unit = _precision(windows) ** -0.5
     best: Any = None
@@ -215,10 +217,10 @@ def learn(windows: Windows, belief: Belief, like: Hyper | None = None) -> Learnt
 
 def _precision(windows: Windows) -> Array:
     """About what windows and priors tell of each logarithm (Fisher's information), so that steps are alike in all."""
-    count = len(windows.gram)
+    channels, count = windows.gram.shape[:2]
     force = 2 * OPEN * windows.nodes * count + PRIORS.spread**-2
     noise = 2 * windows.rows * count + PRIORS.noise**-2
-    return np.concatenate([np.full(windows.joints, force), np.full(windows.gram.shape[1], noise)])
+    return np.concatenate([np.full(windows.joints, force), np.full(channels, noise)])
 
 
 def _scaled(x: Array, unit: Array, windows: Windows, belief: Belief, memory: float) -> tuple[float, Array]:
@@ -251,6 +253,6 @@ def _slope(x: Array, windows: Windows, belief: Belief, memory: float) -> tuple[f
     along = np.concatenate([np.tile(np.concatenate([[1.0], -p]), (len(z), 1)), -z @ there.root.T], 1)
     outer = along[:, :, None] * along[:, None, :]
     outer[:, own:, own:] += there.root @ there.cov @ there.root.T
-    left = np.einsum("wcij,wij->c", windows.gram, outer)  # squared noise of each channel, what is open included
+    left = windows.gram.reshape(len(hyper.noise), -1) @ outer.ravel()  # squared noise, what is open included
     slope[nv:] = left / hyper.noise**2 - windows.rows * len(z) - x[nv:] / PRIORS.noise**2
     return -value, -slope

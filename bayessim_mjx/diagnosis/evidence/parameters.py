@@ -75,7 +75,7 @@ def _without(
     Savage and Dickey's ratio (Dickey, Ann. Math. Stat. 42, 1971): the evidence without a number is the posterior over
     the prior density at its neutral value.
     """
-    at, middle, covariance = np.flatnonzero(free), found.middle, found.together()
+    at, middle, covariance = np.flatnonzero(free), found.middle, found.moments()
     neutral = np.array([c.neutral for c in fit.coordinates])
     usable = [i for i in own if free[i] or fit.values[i] == neutral[i]]
     amplitudes = {i for i, shape in own.items() if not shape}

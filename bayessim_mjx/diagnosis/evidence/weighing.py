@@ -51,11 +51,6 @@ class Weighing:
         """With what simulators differ by as further numbers."""
         return doubts.doubted(fit, self._doubts)
 
-    @property
-    def hyper(self) -> Hyper:
-        """Of the known parameters alone."""
-        return self.scored[BASE].learnt.hyper
-
     def score(self, keys: Iterable[Key]) -> None:
         """The evidence of models that are fitted, anew where the fit is another."""
         for key in keys:
@@ -63,8 +58,13 @@ class Weighing:
             if model is not None and (old is None or old.model is not model):
                 fit, spread = self.doubted(model.fit), self.pool.fitter.spread
                 own = windows_of(fit.r, fit.A, fit.B, self.D, fit.offsets, spread, self.scale, self.channels)
-                learnt = learn(own, belief_of(fit), self.hyper if BASE in self.scored else None)
+                learnt = learn(own, belief_of(fit), self._alike())
                 self.scored[key] = Scored(model, fit, learnt, integrated(fit, learnt, _numbers(model)))
+
+    def _alike(self) -> list[Hyper]:
+        """Hyperparameters to begin at: of the known parameters alone, and of the likeliest set."""
+        some = {BASE: 0, self._best(): 0} if self.scored else {}
+        return [self.scored[k].learnt.hyper for k in some]
 
     def excess(self, key: Key) -> float:
         """Held-out squared error above the likeliest set's noise, in noise variances as estimated from the logs."""
@@ -75,8 +75,10 @@ class Weighing:
         return model.total / (self.pool.noise * len(model.cost))
 
     def _floor(self) -> float:
-        best = self.scored[max(self.scored, key=self.total)]
-        return float(np.mean(best.learnt.hyper.noise**2))
+        return float(np.mean(self.scored[self._best()].learnt.hyper.noise ** 2))
+
+    def _best(self) -> Key:
+        return max(self.scored, key=self.total)
 
     def settled(self, key: Key) -> bool:
         """Whether a set of effects leaves nothing that matters."""

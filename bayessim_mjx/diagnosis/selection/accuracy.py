@@ -48,12 +48,14 @@ class Posterior:
         """Posterior mean `[k]`."""
         return np.asarray(self.weight @ self.mean)
 
+    def moments(self) -> Array:
+        """`[k, k]`, covariance of the mixture."""
+        away = self.mean - self.middle
+        return np.asarray(np.tensordot(self.weight, self.covariance, 1) + (self.weight * away.T) @ away)
+
     def together(self) -> Array:
         """`[k, k]`: a Gaussian's covariance with the mixture's 90 % intervals and its correlations."""
-        away = self.mean - self.middle
-        moments = np.einsum("m,mij->ij", self.weight, self.covariance) + np.einsum(
-            "m,mi,mj->ij", self.weight, away, away
-        )
+        moments = self.moments()
         low, _, high = self.quantiles()
         scale = (high - low) / (2 * 1.645) / np.sqrt(np.maximum(np.diag(moments), 1e-300))
         return np.asarray(moments * scale[:, None] * scale)

@@ -77,7 +77,7 @@ def test_hyperparameters_are_found():
 def test_no_force_is_found_where_there_is_none():
     found = learn(draw(20, count=200, amplitude=0.0).windows(), wide(2))
     windows = draw(20, count=200, amplitude=0.0).windows()
-    motion = np.sqrt(np.mean(np.einsum("wcii->wci", windows.gram)[..., 3 : 3 + NODES]) / ROWS)
+    motion = np.sqrt(np.mean(np.einsum("cwii->cwi", windows.gram)[..., 3 : 3 + NODES]) / ROWS)
     assert found.hyper.amplitude[0] * motion < 0.15  # of the noise
     assert found.hyper.noise == pytest.approx([1.0, 1.2], rel=0.05)
 

@@ -92,7 +92,7 @@ def test_an_effect_that_does_nothing_costs_evidence(numbers):
         with_it = fitted(coordinates, np.zeros(1 + numbers))
         without = fitted(coordinates[:1], [0.0])
         one = learn(case.windows(), belief_of(with_it))
-        two = learn(case.windows(slice(0, 1)), belief_of(without), one.hyper)
+        two = learn(case.windows(slice(0, 1)), belief_of(without), [one.hyper])
         gains.append(integrated(with_it, one).nats - integrated(without, two).nats)
     assert np.mean(gains) < -1.0 * numbers
     assert np.mean(np.array(gains) > 2.0) <= 0.017  # of 120: two at most
