@@ -106,7 +106,7 @@ def run(args: argparse.Namespace) -> None:
         while (waiting or running) and time.monotonic() < until:
             while waiting and free:
                 core, folder = free.pop(), waiting.pop(0)
-                running[core] = (_begin(folder, core, args.more), folder, time.monotonic())
+                running[core] = (_begin(folder, core, args), folder, time.monotonic())
             for core, (process, folder, begun) in list(running.items()):
                 if process.poll() is not None:
                     del running[core]
@@ -135,9 +135,10 @@ def _waiting(args: argparse.Namespace) -> list[Path]:
     return folders
 
 
-def _begin(folder: Path, core: int, more: str) -> "subprocess.Popen[bytes]":
-    alone = {"JAX_PLATFORMS": "cpu", "XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {ALONE}".strip()} | THREADS
-    command = [sys.executable, __file__, "one", str(folder), "--core", str(core), f"--more={more}"]
+def _begin(folder: Path, core: int, args: argparse.Namespace) -> "subprocess.Popen[bytes]":
+    flags = f"{os.environ.get('XLA_FLAGS', '')} {ALONE}".strip()
+    alone = {"JAX_PLATFORMS": args.platforms, "XLA_FLAGS": flags, "XLA_PYTHON_CLIENT_PREALLOCATE": "false"} | THREADS
+    command = [sys.executable, __file__, "one", str(folder), "--core", str(core), f"--more={args.more}"]
     with (folder / "output.txt").open("w") as text:
         return subprocess.Popen(
             command, stdout=text, stderr=subprocess.STDOUT, env=os.environ | alone, start_new_session=True
@@ -164,6 +165,7 @@ def main() -> None:
     several.add_argument("--minutes", type=float, default=1e6, help="when they are over, running cases are killed")
     several.add_argument("--only", choices=("all", "sheets", "logs", "outside"), default="all")
     several.add_argument("--systems", default="", help="some robots, separated by commas; default all")
+    several.add_argument("--platforms", default="cpu", help="JAX's; 'cuda,cpu': all cases share a GPU")
     several.add_argument("--shard", default="0/1", help="i/n: every n-th case, from the i-th")
     single = commands.add_parser("one", help="one case in this process")
     single.add_argument("folder", type=Path)

@@ -117,8 +117,11 @@ class Search:
                 ):
                     column = Column(c, *points[-1])
                     starts = tuple(column.at(f) for f in EFFORT.scales)
-                    out += [] if key in self.pool.models else [Plan(key, np.inf, rest, (column,), (1.0,), starts)]
+                    out += [Plan(key, np.inf, rest, (column,), (1.0,), starts)] if self._new(key) else []
         return out
+
+    def _new(self, key: Key) -> bool:
+        return key not in self.pool.models and key not in self.pool.vain
 
     def _around(self, key: Key) -> list[Plan]:
         if key not in self._plans:
@@ -133,7 +136,7 @@ class Search:
         for plan in sorted(plans, key=lambda p: -p.nats):
             size = min(len(plan.columns), len(sizes)) - 1
             told = plan.nats > top - EFFORT.margin or count[size] < least
-            if told and count[size] < sizes[size] and plan.key not in self.pool.models and plan.key not in out:
+            if told and self._new(plan.key) and plan.key not in out and count[size] < sizes[size]:
                 out[plan.key] = plan
                 count[size] += 1
         return list(out.values())
@@ -161,7 +164,8 @@ class Search:
 
     def _fit(self, plans: Sequence[Plan], label: str, part: str) -> None:
         entries: Entries = {plan.key: self._entry(plan) for plan in plans}
-        fit_entries(self.pool, entries, label, self.say, part)
+        parents = {p.key: self.pool.models[p.parent] for p in plans if p.columns}
+        fit_entries(self.pool, entries, label, self.say, part, parents)
         self.weighing.score([p.key for p in plans])
 
     def _entry(self, plan: Plan) -> tuple[list[Fit], tuple[Candidate, ...]]:

@@ -238,7 +238,7 @@ class Fitter:
         g, S = q.weighted(fit.weight)
         precision, pull, low, high = fit.prior()
         S = S + np.diag(precision)
-        p = solve(S + fit.damping * np.diag(np.diag(S)), g + pull, low, high)
+        p = solve(S + fit.damping * np.diag(_scale(fit, S)), g + pull, low, high)
         by_starts = self._data(fit, fit.r, fit.offsets) - float(fit.weight @ q.c)
         promise = by_starts + float(2 * (g + pull) @ p - p @ S @ p)
         moved = fit.offsets + np.reshape(fit.reach, (-1, 1)) * starts.step(fit.A, p)
@@ -277,6 +277,17 @@ class Fitter:
         _, tells = _rest(fit, self.spread, len(self.base))
         group = self.simulator.windows.group
         return [tells(group == name) for name in np.unique(group)]
+
+
+def _scale(fit: Fit, S: Array) -> Array:
+    """`[k]`, what a unit of damping adds to the curvatures: their own, and the largest one in units of their ranges.
+
+    Their own alone (Marquardt, J. SIAM 11, 1963) leaves undamped what hardly moves the residual, such as where across
+    its plane a payload sits: it jumps from bound to bound, and its step's second order spoils all others' steps.
+    """
+    own = np.diag(S)
+    width = np.array([c.high - c.low for c in fit.coordinates])
+    return np.asarray(own + np.max(own * width**2, initial=0.0) / width**2)
 
 
 def _rest(fit: Fit, spread: Array, base: int) -> tuple[Rest, Callable[[NDArray[np.bool_]], bool]]:

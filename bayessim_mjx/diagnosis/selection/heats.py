@@ -49,9 +49,13 @@ class Heats:
             costs = [fit.history[min(made, len(fit.history) - 1)] for fit in fits if fit.history]
             self.pace[made] = min([self.pace.get(made, np.inf), *costs])
 
-    def finals(self, made: int, running: Sequence[int], close: NDArray[np.bool_]) -> list[int]:
+    def finals(self, close: NDArray[np.bool_]) -> Callable[[int, Sequence[Fit], Sequence[int]], list[int]]:
         """Which fits go on with all windows: one step tells their place in the table, those that are close go on."""
-        return [] if self.over() else [i for i in running if made < 1 or close[i]]
+
+        def going(made: int, fits: Sequence[Fit], running: Sequence[int]) -> list[int]:
+            return [] if self.over() else [i for i in running if made < 1 or close[i]]
+
+        return going
 
     def _falls(self, fit: Fit) -> bool:
         refused = len(fit.history) > 1 and fit.history[-1] == fit.history[-2]

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import functools
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.discretisation import contacts
@@ -18,8 +20,10 @@ from bayessim_mjx.diagnosis.selection.budget import LEAVING_OUT, SINGLES
 from bayessim_mjx.diagnosis.selection.heats import Heats
 from bayessim_mjx.diagnosis.selection.models import Model, scored
 from bayessim_mjx.diagnosis.selection.screen import Screened, Secants
+from bayessim_mjx.diagnosis.selection.sets import Key, log_prior
 from bayessim_mjx.diagnosis.selection.tried import Settings, Tried
 
+Array = NDArray[np.float64]
 Progress = Callable[[str, int, int], None]
 
 
@@ -50,7 +54,9 @@ AFRESH: dict[str, Any] = {"history": (), "damping": 1e-3, "reach": np.ones(1)}
 class Pool(Tried):
     """What was fitted so far, and goes on. `models` maps the labels of a model's effects to it.
 
-    `keep` is called with the pool after each batch of fits.
+    Attributes:
+        vain: sets that gained too little on some windows to be fitted on all.
+        keep: called with the pool after each batch of fits.
     """
 
     fitter: Fitter
@@ -62,6 +68,7 @@ class Pool(Tried):
     screened: list[Screened] = field(default_factory=list)
     cut_short: set[str] = field(default_factory=set)
     skipped: dict[str, int] = field(default_factory=dict)
+    vain: set[Key] = field(default_factory=set)
     keep: Callable[[Pool], None] = lambda pool: None
     secants: Secants = field(default_factory=Secants)
     _measured: dict[Fit, Fit] = field(default_factory=dict, repr=False)
@@ -94,25 +101,32 @@ def fresh(pool: Pool, fit: Fit) -> list[int]:
     return list(range(0 if turn else base, len(fit.coordinates)))
 
 
-Entries = dict[frozenset[str], tuple[list[Fit], tuple[Candidate, ...]]]  # {labels: (a fit per start, effects)}
+Entries = dict[Key, tuple[list[Fit], tuple[Candidate, ...]]]  # {labels: (a fit per start, effects)}
+Parents = Mapping[Key, Model]  # {labels: the fitted model that they extend}
 
 
-def fit_entries(pool: Pool, entries: Entries, label: str, say: Progress, part: str = "") -> None:
+def fit_entries(
+    pool: Pool, entries: Entries, label: str, say: Progress, part: str = "", parents: Parents = MappingProxyType({})
+) -> None:
     """Fit models in lockstep, each from all of its starts, and keep the best of each.
 
     Args:
         part: of the budget, by whose end the rest is left out; "": all are fitted.
+        parents: of those that extend a fitted model. Where they gain less on some windows than so many effects have to
+            (`log_prior`), they are `pool.vain` and are no models.
     """
     heats = Heats(lambda: bool(part) and pool.settings.budget.over(part))
     total, done = sum(len(several) for several, _ in entries.values()), 0
     every = list(entries.items())
+    leading = min((model.fit for model in parents.values()), key=lambda fit: fit.cost, default=pool.base.fit)
+    own = shortlist.windows_of(leading)
     for first in range(0, len(every), RULES.batch):
         some = dict(every[first : first + RULES.batch])
         if part and pool.settings.budget.over(part) and (first or part != SINGLES):
             _left_out(pool, [effects for _, (_, effects) in every[first:]], label)
             return
         done += sum(len(several) for several, _ in some.values())
-        _fit_batch(pool, some, heats, functools.partial(_say_left, say, label, done, total))
+        _fit_batch(pool, some, parents, own, heats, functools.partial(_say_left, say, label, done, total))
         pool.keep(pool)
 
 
@@ -120,20 +134,28 @@ def _say_left(say: Progress, label: str, done: int, total: int, left: int) -> No
     say(label, done - left, total)
 
 
-def _fit_batch(pool: Pool, entries: Entries, heats: Heats, progress: Callable[[int], None]) -> None:
+def _fit_batch(
+    pool: Pool,
+    entries: Entries,
+    parents: Parents,
+    own: NDArray[np.int64] | None,
+    heats: Heats,
+    progress: Callable[[int], None],
+) -> None:
     """All starts on some windows, where there are many; the best start of each model then on all of them."""
     rules = pool.settings.iterations, lambda f: fresh(pool, f), pool.settings.tolerance
     every = [several for several, _ in entries.values()]
-    own = shortlist.windows_of(pool.base.fit) if pool.settings.shortlisted else None
     if own is None:
-        fits = pool.fitter.iterate(
-            [f for fs in every for f in fs], *rules, progress, heats.among(list(map(len, every)))
-        )
+        going = heats.among(list(map(len, every)))
+        fits = pool.fitter.iterate([f for fs in every for f in fs], *rules, progress, going)
         heats.learn(fits)
         best = [min(some, key=lambda fit: fit.cost) for some in _in_turn(fits, every)]
+        kept = list(entries)
     else:
-        starts = [shortlist.cut(f, own) for fs in every for f in fs]
         part = shortlist.on(pool.fitter, own)
+        smaller = [parents.get(key) for key in entries]
+        there = np.array([np.inf if model is None else shortlist.cost(part, model.fit, own) for model in smaller])
+        starts = [shortlist.cut(f, own) for fs in every for f in fs]
         fits = part.iterate(starts, *rules, progress, heats.among(list(map(len, every))))
         heats.learn(fits)
         first = [
@@ -142,11 +164,22 @@ def _fit_batch(pool: Pool, entries: Entries, heats: Heats, progress: Callable[[i
         ]
         cost = np.array([ranked.cost for ranked, _ in first])
         heats.least = min(heats.least, float(cost.min()))
-        going = shortlist.close(cost, heats.least)
-        again = [shortlist.back(fit, ranked, own) for ranked, fit in first]
-        best = pool.fitter.iterate(again, *rules, None, lambda made, fits, running: heats.finals(made, running, going))
-    for key, fit in zip(entries, best, strict=True):
+        share = len(own) / len(pool.base.fit.r)
+        least = [_least_gain(pool, key, model) for key, model in zip(entries, smaller, strict=True)]
+        gains = there - cost > share * np.array(least)
+        kept = [key for key, gained in zip(entries, gains, strict=True) if gained]
+        pool.vain |= set(entries) - set(kept)
+        again = [shortlist.back(fit, ranked, own) for (ranked, fit), gained in zip(first, gains, strict=True) if gained]
+        close = shortlist.close(cost[gains], heats.least)
+        best = pool.fitter.iterate(again, *rules, None, heats.finals(close)) if again else []
+    for key, fit in zip(kept, best, strict=True):
         pool.models[key] = scored(pool.fitter, fit, entries[key][1])
+
+
+def _least_gain(pool: Pool, key: Key, parent: Model | None) -> float:
+    """What the cost has to fall by, so that the likelihood outweighs the prior odds of so many effects more."""
+    more = key - {e.label for e in parent.effects} if parent else frozenset()
+    return -2.0 * log_prior(more, len(pool.candidates))
 
 
 def _in_turn(fits: Sequence[Fit], like: Sequence[Sequence[Fit]]) -> Iterator[Sequence[Fit]]:

@@ -23,7 +23,7 @@ class Sizes:
     """How many windows candidates are ranked on, and who goes on with all of them.
 
     Rules of thumb: on one case they cost half the simulations and name the same (benchmarks/results.md, "Diagnosis:
-    seconds"); error rates were not counted, and only searches with a limit of time rank so.
+    seconds"); error rates were not counted.
 
     Attributes:
         windows: ranked on; least: windows from which on some of them are enough.
@@ -70,6 +70,12 @@ def cut(fit: Fit, own: NDArray[np.int64]) -> Fit:
     """A fit on some of its windows, to be fitted there."""
     parts = {name: getattr(fit, name)[own] for name in ("offsets", "r", "A", "B", "weight")}
     return replace(fit, **parts, cost=np.inf, history=(), reach=np.ones(1))
+
+
+def cost(part: Fitter, fit: Fit, own: NDArray[np.int64]) -> float:
+    """Of a fit on all windows, on some of them."""
+    some = cut(fit, own)
+    return part.cost(some, some.r, some.offsets, some.values)
 
 
 def back(fit: Fit, ranked: Fit, own: NDArray[np.int64]) -> Fit:

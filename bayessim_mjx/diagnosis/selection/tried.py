@@ -23,7 +23,6 @@ class Settings:
         screened: windows looked at in screening; iterations, tolerance: of a fit.
         fresh: base columns are differenced anew if there are at most so many.
         budget: time that the search may take.
-        shortlisted: whether candidates are ranked on some of the windows first: faster, and their order is rougher.
         believed: share of the noise (rms) that is the sensors'; the rest is what the time step may be worth at most.
     """
 
@@ -33,7 +32,6 @@ class Settings:
     fresh: int = 6
     believed: float = 1.0
     budget: Budget = Budget()
-    shortlisted: bool = True
 
 
 class Tried:
