@@ -159,8 +159,8 @@ def test_errors_belong_to_the_nearest_scale_by_ratio():
 def test_cases_that_run_when_the_time_is_over_are_killed_and_begun_again(tmp_path, monkeypatch, capsys):
     begun: list = []
 
-    def sleep(folder: Path, core: int, more: str) -> subprocess.Popen:
-        assert more == "--accuracy 5%"
+    def sleep(folder: Path, core: int, args: argparse.Namespace) -> subprocess.Popen:
+        assert args.more == "--accuracy 5%"
         begun.append(subprocess.Popen(["sleep", "60"], start_new_session=True))
         return begun[-1]
 
