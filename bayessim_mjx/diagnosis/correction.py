@@ -74,7 +74,8 @@ def effects_of(diagnosis: Found) -> tuple[Effect, ...]:
     order = library.names()
     keys = sorted(places, key=lambda key: order.index(key[0]) if key[0] in order else len(order))
     own = diagnosis.details.get(OWN_EFFECTS, {})
-    return tuple(_effect(library.recorded(own.get(key[0], key[0])), places[key]) for key in keys)
+    kinds = [(library.recorded(own.get(key[0], key[0])), key) for key in keys]
+    return tuple(_effect(kind, places[key]) for kind, key in sorted(kinds, key=lambda pair: pair[0].last))
 
 
 def _effect(kind: type[Effect], found: list[FoundEffect]) -> Effect:

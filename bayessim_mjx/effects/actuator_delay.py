@@ -35,6 +35,7 @@ class ActuatorDelay(Effect):
     high: float = 0.1
     name: ClassVar[str] = "actuator_delay"
     kind: ClassVar[str] = "actuator"
+    last: ClassVar[bool] = True
     noun: ClassVar[str] = "command delay"
     lacks: ClassVar[str] = "a command delay"
     separates: ClassVar[str] = "a wide-band chirp with the drive's measured effort in the log; the onset time of a step"

@@ -96,3 +96,23 @@ def test_refusals():
         make("actuator_dely", where="a")
     with pytest.raises(ValueError, match="no setting .*hihg"):
         make("actuator_delay", where="a", hihg=1.0)
+
+
+def test_behind_a_rate_limit_part_of_a_sub_step_delays_the_ramp():
+    """Before it, it is lost: the command between two others, in the sub-step where they meet, begins the ramp early."""
+    commands, delay, slowness, fine = np.array([0.0, 0.0, 1.0, 1.0, 1.0]), 0.0025, 0.015, 1e-6
+    true = np.repeat(commands, round(DT / fine))
+    ramp = np.concatenate([np.zeros(round(delay / fine)), true])[: len(true)]
+    u = np.minimum(np.cumsum(ramp) * fine / slowness, 1.0)  # a single step upwards
+    want = np.cumsum(u)[round(DT / fine) - 1 :: round(DT / fine)] * fine
+    error = {}
+    for names in (("rate_limit", "actuator_delay"), ("actuator_delay", "rate_limit")):
+        p = Physics(mujoco.MjModel.from_xml_string(XML), DT, ParameterSpace(), [make(n, where="a") for n in names])
+        theta = {"rate_limit": slowness, "actuator_delay": delay}
+        world, speed = p.world(np.float32([theta[n] for n in names])), []
+        for c in commands:
+            world, _ = control_step(p, world, np.float32([c, 0.0]))
+            speed.append(float(world.qvel[0]))
+        error[names] = np.abs(np.array(speed) - want).max()
+    last, first = error.values()
+    assert last < 1e-5 and first == pytest.approx(delay, rel=0.01)

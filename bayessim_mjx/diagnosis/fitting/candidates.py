@@ -116,7 +116,9 @@ def _precision(p: Parameter, accuracy: float | None) -> float:
 
 
 def kinds_of(effects: str | Sequence[str | type[Effect]]) -> list[type[Effect]]:
-    """The effects that are tried; "all", alone or among others: those of the library that are on offer (`offered`).
+    """The effects that are tried, those that act behind the others (`last`) at the end.
+
+    "all", alone or among others: those of the library that are on offer (`offered`).
 
     Raises:
         UserError: an unknown effect.
@@ -127,7 +129,7 @@ def kinds_of(effects: str | Sequence[str | type[Effect]]) -> list[type[Effect]]:
         kinds = map(library.load, library.names()) if name == "all" else ()
         found += [kind for kind in kinds if kind.offered]
         found += [] if name == "all" else [library.load(name) if isinstance(name, str) else name]
-    return list(dict.fromkeys(found))
+    return sorted(dict.fromkeys(found), key=lambda kind: kind.last)
 
 
 def stack(kinds: Sequence[type[Effect]], scales: Scales) -> tuple[tuple[Effect, ...], list[str]]:

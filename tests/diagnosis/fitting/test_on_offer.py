@@ -19,10 +19,14 @@ def test_all_are_those_on_offer():
 
 
 def test_others_may_be_named_beside_all_and_nothing_is_tried_twice():
-    assert names(["all", "lugre_friction", "backlash"]) == [*names("all"), "lugre_friction"]
+    assert names(["all", "lugre_friction", "backlash"]) == [*names("all")[:-1], "lugre_friction", "actuator_delay"]
     assert names(["lugre_friction", effects.load("backlash")]) == ["lugre_friction", "backlash"]
     with pytest.raises(UserError, match="no effect 'lugre'"):
         kinds_of(["all", "lugre"])
+
+
+def test_a_pure_delay_acts_on_commands_behind_all_others():
+    assert names("all")[-1] == names(["actuator_delay", "rate_limit"])[-1] == "actuator_delay"
 
 
 def test_what_was_not_on_offer_is_told():
