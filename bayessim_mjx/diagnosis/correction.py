@@ -63,7 +63,7 @@ def effects_of(diagnosis: Found) -> tuple[Effect, ...]:
     """The effects found, with nominal = identified mean and prior Gaussian(mean, sd) truncated to a sensible range.
 
     One effect at several places is one `Effect` with values of its own at each; "all" is tied. Their order is the
-    library's, as in the diagnosis.
+    library's, pure delays last (`Effect.last`), as in the diagnosis.
 
     Raises:
         UserError: an unknown effect, or an estimate that is missing or no number.

@@ -190,7 +190,7 @@ class Learnt:
 def learn(windows: Windows, belief: Belief, like: Sequence[Hyper] = ()) -> Learnt:
     """The best hyperparameters, by quasi-Newton steps (exact gradients by Fisher's identity) for each memory.
 
-    like: of models of the same windows with one memory, which stays; the search begins at the best of them. None: all
+    like: of models of the same windows with one memory, which stays; the search begins at the best of them. Empty: all
     memories are tried.
     """
     nv, channels = windows.joints, len(windows.gram)
