@@ -120,10 +120,10 @@ def run(args: argparse.Namespace) -> None:
 
 
 def _waiting(args: argparse.Namespace) -> list[Path]:
-    from counted_cases import plans
+    from counted_cases import frozen, plans
 
     index, count = (int(n) for n in args.shard.split("/"))
-    chosen = [p for p in plans() if args.only in ("all", p.group)]
+    chosen = [*frozen()] if args.only == "frozen" else [p for p in plans() if args.only in ("all", p.group)]
     chosen = [p for p in chosen if p.system in args.systems.split(",")] if args.systems else chosen
     chosen = sorted(chosen, key=lambda p: (-SECONDS[p.system] * max(len(p.effects), 1), p.seed, p.name))[index::count]
     folders = []
@@ -163,7 +163,7 @@ def main() -> None:
     several.add_argument("out", type=Path)
     several.add_argument("--jobs", type=int, default=os.cpu_count(), help="cases at once, one core each")
     several.add_argument("--minutes", type=float, default=1e6, help="when they are over, running cases are killed")
-    several.add_argument("--only", choices=("all", "sheets", "logs", "outside"), default="all")
+    several.add_argument("--only", choices=("all", "sheets", "logs", "outside", "frozen"), default="all")
     several.add_argument("--systems", default="", help="some robots, separated by commas; default all")
     several.add_argument("--platforms", default="cpu", help="JAX's; 'cuda,cpu': all cases share a GPU")
     several.add_argument("--shard", default="0/1", help="i/n: every n-th case, from the i-th")
