@@ -29,14 +29,15 @@ class FoundEffect:
     Attributes:
         name, where: of the library, of the model.
         parameters: {parameter: Estimate}.
-        weight_among_rivals: relative score of this effect against `equivalent_to`, 1 together: how often and how
-            clearly its model predicts held-out conditions better (a pseudo-BMA+ weight). It is no probability of being
-            right: what is there may be none of them. NaN where there is no rival to be scored against.
+        weight_among_rivals: probability of this effect beside `equivalent_to`, 1 together. What is there may be none
+            of them. NaN where there is no rival.
         gap_closed, gap_closed_ci: its part of what all effects close, as a share of the recalibrated simulator's
             squared gap above the noise, on held-out windows, with a 90 % interval (NaN of one condition).
-        equivalent_to: [{"effects": ["payload@link", ...], "gap_closed": ..., "why": sentence, "weight": relative score
+        equivalent_to: [{"effects": ["payload@link", ...], "gap_closed": ..., "why": sentence, "weight": probability
             among the rivals}], which these logs cannot tell from it; of an effect that contains it as a special case,
             no weight.
+        shared: {"effects": labels, "mean", "low", "high", "unit", "quantities"}: how large it is, whichever of these
+            effects it is (mixture of their posteriors by probability, 90 % interval); {} where they share no unit.
         sentence: for people; predicted_gap_closed: the same share as promised before any effect was fitted.
         share: of the gap closed by all effects together (Shapley).
     """
@@ -51,3 +52,4 @@ class FoundEffect:
     sentence: str = ""
     predicted_gap_closed: float = math.nan
     share: float = math.nan
+    shared: dict[str, Any] = field(default_factory=dict)

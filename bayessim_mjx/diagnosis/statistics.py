@@ -11,7 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
-from scipy.optimize import nnls
+from scipy.optimize import brentq, nnls
+from scipy.special import ndtr
 
 Array = NDArray[np.float64]
 
@@ -78,6 +79,17 @@ def interval(value: float, replicates: Array) -> tuple[float, float]:
         return NOTHING
     half = float(quantile(len(replicates) - 1.0) * error(replicates))
     return value - half, value + half
+
+
+def mixture_interval(weight: Array, mean: Array, sd: Array, inside: float = 0.9) -> tuple[float, float]:
+    """Central interval of a mixture of Gaussians; weight, mean, sd: `[n]`, weights add up to 1."""
+    sd = np.maximum(sd, 1e-12 * np.abs(mean) + 1e-300)
+    ends = float(np.min(mean - 9 * sd)), float(np.max(mean + 9 * sd))
+
+    def end(below: float) -> float:
+        return float(brentq(lambda x: float(weight @ ndtr((x - mean) / sd)) - below, *ends))
+
+    return end((1 - inside) / 2), end((1 + inside) / 2)
 
 
 def interval_of_rms(cost: Array, group: NDArray[np.int64]) -> tuple[float, float]:

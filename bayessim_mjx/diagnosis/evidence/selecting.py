@@ -8,8 +8,9 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from bayessim_mjx.diagnosis import phrases
-from bayessim_mjx.diagnosis.evidence.estimates import at_its_mean, estimated
+from bayessim_mjx.diagnosis.evidence.estimates import at_its_mean, estimated, size_of
 from bayessim_mjx.diagnosis.evidence.search import Search
+from bayessim_mjx.diagnosis.evidence.weighing import Weighing
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fitter import Fitter
 from bayessim_mjx.diagnosis.selection import hidden, predicted_gain, stand_ins
@@ -46,7 +47,7 @@ def select(
     return selection_of(
         pool,
         answer,
-        rivals={e.label: tuple(_rivals(pool, e, found)) for e in answer.effects},
+        rivals={e.label: tuple(_rivals(search.weighing, e, found)) for e in answer.effects},
         subsets=_subsets(pool, answer, say) if few else {},
         promised=predicted_gain.promised(pool, answer.effects) if answer.effects else (0.0, {}),
         chosen=chosen,
@@ -58,13 +59,14 @@ def select(
     )
 
 
-def _rivals(pool: Pool, effect: Candidate, found: Weighed) -> list[Rival]:
+def _rivals(weighing: Weighing, effect: Candidate, found: Weighed) -> list[Rival]:
     """What may stand in an effect's place, most likely first: sets without strong evidence against them."""
     others = [k for k in found.beside if k and not found.answer < k]
-    return [_rival(pool, effect, k, found) for k in others if effect.label not in k and k - found.answer]
+    return [_rival(weighing, effect, k, found) for k in others if effect.label not in k and k - found.answer]
 
 
-def _rival(pool: Pool, effect: Candidate, key: Key, found: Weighed) -> Rival:
+def _rival(weighing: Weighing, effect: Candidate, key: Key, found: Weighed) -> Rival:
+    pool = weighing.pool
     model, answer = pool.models[key], pool.models[found.answer]
     others = tuple(e for e in model.effects if e.label not in found.answer)
     contains = any(effect.effect in special_cases(o) and o.where == effect.where for o in others)
@@ -72,7 +74,8 @@ def _rival(pool: Pool, effect: Candidate, key: Key, found: Weighed) -> Rival:
     behind = max(pool.closure(answer) - pool.closure(model), 0.0)
     nats = found.nats[found.answer] - found.nats[key]
     why = phrases.CONTAINS if contains else phrases.close_by(nats, behind)
-    return Rival(others, model, pool.closure(model), why, contains or same)
+    size = size_of(weighing.scored[key], others[0]) if len(others) == 1 else None
+    return Rival(others, model, pool.closure(model), why, contains or same, size)
 
 
 def _subsets(pool: Pool, answer: Model, say: Progress) -> dict[Key, Model]:

@@ -16,6 +16,20 @@ from bayessim_mjx.diagnosis.selection.sets import Estimated, Key, Weighed
 from bayessim_mjx.diagnosis.selection.tried import Settings, Tried
 
 
+@dataclass(frozen=True)
+class Size:
+    """How large an effect is: the parameter that lies most standard deviations from neutral, and by how much.
+
+    Attributes:
+        quantity: the parameter's name; mean, sd: of its distance from neutral, in its unit.
+    """
+
+    quantity: str
+    mean: float
+    sd: float
+    unit: str
+
+
 @dataclass(frozen=True, eq=False)
 class Rival:
     """Another explanation that these logs cannot tell from (a part of) the answer.
@@ -24,6 +38,7 @@ class Rival:
         effects: those that the answer does not have; model: with the answer's other ones.
         closure: share of the gap that the model closes; why: in words.
         contains: whether it is the effect and more: no other explanation.
+        size: of its effect, where it is a single one.
     """
 
     effects: tuple[Candidate, ...]
@@ -31,6 +46,7 @@ class Rival:
     closure: float
     why: str
     contains: bool = False
+    size: Size | None = None
 
     def to_dict(self) -> dict[str, Any]:
         return {"effects": [c.label for c in self.effects], "gap_closed": self.closure, "why": self.why}

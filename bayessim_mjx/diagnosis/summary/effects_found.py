@@ -7,11 +7,13 @@ from typing import Any
 
 import numpy as np
 
+from bayessim_mjx.diagnosis import statistics
 from bayessim_mjx.diagnosis.findings import Findings
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.result import Estimate, FoundEffect
 from bayessim_mjx.diagnosis.selection import bounds, heldout, predicted_gain
 from bayessim_mjx.diagnosis.selection.models import Model
+from bayessim_mjx.diagnosis.selection.selected import Rival, Size
 from bayessim_mjx.diagnosis.setup import Setup
 
 # operating conditions, from which on closure is quoted of conditions that the choice was made without: without one of
@@ -97,29 +99,58 @@ def _effect(found: Findings, effect: Candidate, sd: np.ndarray, part: _Part) -> 
     setup, model = found.setup, found.model
     rivals = found.selection.rivals.get(effect.label, ())
     weighed = [r for r in rivals if not r.contains]
-    own_weight, *others = _weights(found, [model, *(r.model for r in weighed)])
-    weight_of = dict(zip(map(id, weighed), others, strict=True))
+    weights = _weights(found, [model, *(r.model for r in weighed)])
+    weight_of = dict(zip(map(id, weighed), weights[1:], strict=True))
     own = [model.fit.names.index(c.name) for c in effect.coordinates]
-    numbers, ends = {}, []
+    numbers, ends, sizes = {}, [], []
     for i, c in zip(own, effect.coordinates, strict=True):
         value, word = float(model.fit.values[i]), c.name.rsplit(".", 1)[1]
         bound = bounds.of(setup.physics, c, value)
         deviation = float(sd[i]) if bound is None or bound.kind == "off" else float("nan")
         numbers[word] = Estimate(value, deviation, _unit(setup, effect, c.unit), bound.kind if bound else "")
+        sizes.append(Size(word, abs(value - c.neutral), float(sd[i]), c.unit))
         clause = bound.why if bound else UNTOLD if deviation > UNKNOWN * (c.high - c.low) else ""
         ends += [f"{word.replace('_', ' ')} {clause}"] if clause else []
     return FoundEffect(
         name=effect.effect,
         where=effect.where,
         parameters=numbers,
-        weight_among_rivals=own_weight,
+        weight_among_rivals=weights[0],
         gap_closed=part.closed,
         gap_closed_ci=part.ci,
         equivalent_to=[r.to_dict() | ({"weight": weight_of[id(r)]} if id(r) in weight_of else {}) for r in rivals],
         sentence=_sentence(ends),
         predicted_gap_closed=part.promised,
         share=part.share if len(model.effects) > 1 else float("nan"),
+        shared=_shared(setup, effect, sizes, weighed, weights),
     )
+
+
+def _shared(
+    setup: Setup, effect: Candidate, sizes: list[Size], rivals: list[Rival], weights: list[float]
+) -> dict[str, Any]:
+    """How large it is, whichever of the rivals it is: of those whose sizes have its unit.
+
+    Args:
+        sizes: of the effect's parameters; weights: of the effect, then of the rivals.
+    """
+    amplitudes = [s for s, shape in zip(sizes, effect.shapes, strict=True) if not shape]
+    own = max(amplitudes, key=lambda s: s.mean / max(s.sd, 1e-12))
+    alike = [(r, w) for r, w in zip(rivals, weights[1:], strict=True) if r.size and r.size.unit == own.unit]
+    if not alike or not own.unit:
+        return {}
+    every = [own, *(r.size for r, _ in alike if r.size)]
+    weight = np.array([weights[0], *(w for _, w in alike)])
+    mean, sd = (np.array([getattr(s, k) for s in every]) for k in ("mean", "sd"))
+    low, high = statistics.mixture_interval(weight / weight.sum(), mean, sd)
+    return {
+        "effects": [effect.label, *(r.effects[0].label for r, _ in alike)],
+        "mean": float(weight @ mean / weight.sum()),
+        "low": max(low, 0.0),
+        "high": high,
+        "unit": _unit(setup, effect, own.unit),
+        "quantities": list(dict.fromkeys(s.quantity for s in every)),
+    }
 
 
 def _sentence(clauses: list[str]) -> str:

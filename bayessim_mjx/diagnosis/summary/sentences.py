@@ -255,9 +255,17 @@ def number(value: float) -> str:
 
 
 def _instead(effect: FoundEffect, rivals: Sequence[Rival]) -> str:
-    """What else it could be."""
+    """What else it could be, and how large it is whichever it is."""
     others = [listed(by_law([(c.effect, c.where) for c in r.effects])) for r in rivals if not r.contains][:4]
-    return f"Instead of {missing(effect.name, effect.where)} it could be {listed(others, 'or')}." if others else ""
+    if not others:
+        return ""
+    text = f"Instead of {missing(effect.name, effect.where)} it could be {listed(others, 'or')}."
+    shared = effect.shared
+    if not shared:
+        return text
+    size, low, high = (f"{shared[k]:.3g}" for k in ("mean", "low", "high"))
+    which = "whichever it is" if len(shared["effects"]) == len(others) + 1 else f"as {_any_of(shared['effects'])}"
+    return f"{text} Its size, {which}: {size} {shared['unit']} (90 %: {low} to {high})."
 
 
 def horizon_warning(gap: Gap) -> list[str]:
