@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from bayessim_mjx.compat import compiler_options
 from bayessim_mjx.device import on_cores
 from bayessim_mjx.diagnosis.fitting.windows import Batch, Windows
+from bayessim_mjx.effects.support.motion import Motion
 from bayessim_mjx.physics import Drive, Past, Physics, World, begin, control_step, early, past_of
 from bayessim_mjx.physics.tangent import difference, integrate
 
@@ -102,10 +103,21 @@ class Simulator:
     ) -> tuple[Batch, Past, int | jax.Array]:
         """(one window, what leads up to its start, the control step to begin with)."""
         own = jax.tree.map(lambda x: x[index], batch)
-        world = begin(self.physics, theta, own.around, active)
-        qpos = integrate(self.physics.mj_model, world.qpos, offset[: self.nv])
-        past = past_of(self.physics, world.replace(qpos=qpos, qvel=world.qvel + offset[self.nv :]), own.around, active)
+        world = begin(self.physics, theta, self._moved(own.around, offset), active)
+        past = past_of(self.physics, world, own.around, active)
         return own, past, past.first
+
+    def _moved(self, motion: Motion, offset: jax.Array) -> Motion:
+        """The recorded motion with another state at its start, and moved as that is around it.
+
+        What sensors remember begins there too: with the recorded start, rows that late sensors show of it would keep
+        its noise, which no change of the start state takes away.
+        """
+        speed = offset[self.nv :]
+        ahead = (jnp.arange(len(motion.qpos)) - motion.start) * jnp.float32(self.physics.dt)
+        away = offset[: self.nv] + ahead[:, None] * speed
+        qpos = jax.vmap(functools.partial(integrate, self.physics.mj_model))(motion.qpos, away)
+        return motion.replace(qpos=qpos, qvel=motion.qvel + speed)
 
     def _errors(self, own: Batch, qpos: jax.Array, qvel: jax.Array, theta: jax.Array) -> jax.Array:
         """`[H, 2 nv]`, of one window; not finite ones are FAR."""

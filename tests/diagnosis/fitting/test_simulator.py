@@ -60,6 +60,22 @@ def test_its_own_motion_has_no_error(simulator):
     assert np.abs(again[0]).max() < 2e-6 < 1e-4 < np.abs(again[1]).max()
 
 
+def test_rows_that_late_sensors_show_of_the_start_move_with_it(tmp_path):
+    """Of a delay of .4 rows the first row is .4 start and .6 of the next state: both move by a change of the start.
+
+    Where what sensors remember stays as recorded, the row keeps .4 of the recorded start's noise, and moves by .6.
+    """
+    logs = recorded(count=2, seconds=2.0, sigma=0.0)
+    physics = prepare(nominal(tmp_path), logs, ["sensor_delay"])
+    own = physics.fitter.simulator
+    theta = own.physics.space.nominal.copy()
+    theta[[i for i, p in enumerate(own.physics.space.parameters) if "sensor_delay" in p.name]] = 0.4 * own.physics.dt
+    offset = np.zeros((1, len(own.windows), 2))
+    offset[..., 0] = 1e-3
+    moved = own.run(theta[None])[0] - own.run(theta[None], offset)[0]
+    np.testing.assert_allclose(moved[:, 0, 0], 1e-3, rtol=0.02)
+
+
 @pytest.mark.slow
 @pytest.mark.ci
 def test_a_right_simulator_follows_mujoco_at_a_tenth_of_the_step(setup):
