@@ -18,6 +18,7 @@ from bayessim_mjx.physics.gates import chained_in
 from bayessim_mjx.physics.warp import Warp
 
 EULER, RK4, IMPLICITFAST = (int(getattr(mujoco.mjtIntegrator, f"mjINT_{n}")) for n in ("EULER", "RK4", "IMPLICITFAST"))
+PARTS = 4  # of a timestep by RK4, in which commands may differ behind effects
 
 
 class World(struct.PyTreeNode):
@@ -98,7 +99,10 @@ class Physics:
         timestep = float(mj_model.opt.timestep)
         for effect in filter(contract.brought, self.effects):
             contract.check(effect, mj_model, self.model, self.substeps)
-        self.sites = tuple(effect.bind(mj_model, timestep, self.substeps) for effect in self.effects)
+        halved = int(mj_model.opt.integrator) == RK4 and self.having("on_command")
+        self.rows = PARTS if halved else 1  # of commands in a timestep, as effects see them
+        between = timestep / self.rows, self.substeps * self.rows
+        self.sites = tuple(effect.bind(mj_model, *between) for effect in self.effects)
         self._memory = tuple(effect.init(at) for effect, at in zip(self.effects, self.sites, strict=True))
 
     def split(self, theta: jax.Array) -> tuple[jax.Array, tuple[jax.Array, ...]]:

@@ -17,7 +17,7 @@ from bayessim_mjx.effects.support.site import under_tendon_limit
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.physics.drive import Drive
 from bayessim_mjx.physics.gates import chained_in
-from bayessim_mjx.physics.model import Physics, World, state_of
+from bayessim_mjx.physics.model import PARTS, Physics, World, state_of
 from bayessim_mjx.physics.pushed import Memory, apart, together
 from bayessim_mjx.physics.timestep import early, substep
 
@@ -50,10 +50,15 @@ def _control_step(physics: Physics, world: World, command: jax.Array, drive: Dri
     thetas = physics.split(world.theta)[1]
     commands = jnp.broadcast_to(command, (physics.substeps, physics.mj_model.nu))
     memory, commands = _commanded(physics, thetas, world.memory, commands, drive.active)
+    slopes = None
+    if physics.rows > 1:
+        commands, slopes = _moments(physics, commands, drive)
     carry = memory, apart(physics, world.forces)
     if physics.warp is None:
         model, start = physics.model_of(world), physics.data_of(world)
-        data, (final, rows) = _timesteps(physics, model, start, commands, carry, thetas, world.measurement, drive)
+        data, (final, rows) = _timesteps(
+            physics, model, start, commands, slopes, carry, thetas, world.measurement, drive
+        )
     else:
         data = physics.warp.together(functools.partial(_by_warp, physics), world.fields, state_of(world), commands)
         final, rows = carry  # no effect acts inside
@@ -71,30 +76,50 @@ def _control_step(physics: Physics, world: World, command: jax.Array, drive: Dri
     return world, data
 
 
-def _timesteps(
-    physics: Physics, model: mjx.Model, start: mjx.Data, commands: jax.Array, carry: Memory, *given: Any
-) -> tuple[mjx.Data, Memory]:
-    """(data, (memories, forces)) after a timestep for each row of commands; given: the rest of what `substep` takes."""
+def _moments(physics: Physics, commands: jax.Array, drive: Drive) -> tuple[jax.Array, jax.Array | None]:
+    """Mean of the commands `[substeps PARTS, nu]` over each timestep, and their slope, `[substeps, nu]` each.
 
-    def body(carry: tuple, ctrl: jax.Array) -> tuple[tuple, None]:
+    The slope is that of the line that moves velocities and positions as far as the parts do: of the same first moment.
+    A law is held over the timestep.
+    """
+    each = commands.reshape(physics.substeps, PARTS, -1)
+    from_middle = (jnp.arange(PARTS) + 0.5) / PARTS - 0.5
+    return each.mean(1), None if drive.law is not None else jnp.einsum("p,spu->su", 12 / PARTS * from_middle, each)
+
+
+def _timesteps(
+    physics: Physics,
+    model: mjx.Model,
+    start: mjx.Data,
+    commands: jax.Array,
+    slopes: jax.Array | None,
+    carry: Memory,
+    thetas: tuple,
+    seen: dict[str, jax.Array],
+    drive: Drive,
+) -> tuple[mjx.Data, Memory]:
+    """(data, (memories, forces)) after a timestep for each row of commands; see `substep`."""
+
+    def body(carry: tuple, row: tuple) -> tuple[tuple, None]:
         data, own = carry
-        return substep(physics, model, data.replace(ctrl=ctrl), own, *given), None
+        return substep(physics, model, data.replace(ctrl=row[0]), own, thetas, seen, drive, row[1]), None
 
     if physics.substeps == 1:
-        return body((start, carry), commands[0])[0]
-    return jax.lax.scan(body, (start, carry), commands, unroll=physics.unroll)[0]
+        return body((start, carry), (commands[0], None if slopes is None else slopes[0]))[0]
+    return jax.lax.scan(body, (start, carry), (commands, slopes), unroll=physics.unroll)[0]
 
 
 def _by_warp(physics: Physics, scratch: mjx.Data, fields: dict, state: dict, commands: jax.Array) -> mjx.Data:
     """`_timesteps` of Warp, from MuJoCo's state in the data `scratch`."""
     model = physics.warp.model_of(fields)  # type: ignore[union-attr]  # there is one, or nobody asks for this
-    return _timesteps(physics, model, scratch.replace(**state), commands, ((), ()), (), {})[0]
+    return _timesteps(physics, model, scratch.replace(**state), commands, None, ((), ()), (), {}, Drive())[0]
 
 
 def _commanded(
     physics: Physics, thetas: tuple, memory: tuple, commands: jax.Array, active: jax.Array | None
 ) -> tuple[tuple, jax.Array]:
-    """(memory, commands `[substeps, nu]`) behind all effects on commands."""
+    """(memory, commands `[substeps rows, nu]`) behind all effects on commands; commands: `[substeps, nu]`."""
+    commands = jnp.repeat(commands, physics.rows, axis=0)
 
     def hook(i: int, remembered: Any, commands: jax.Array) -> tuple[Any, jax.Array]:
         return physics.effects[i].on_command(physics.sites[i], remembered, commands, thetas[i])

@@ -20,7 +20,9 @@ from bayessim_mjx.physics.gates import chained_in
 from bayessim_mjx.physics.model import EULER, IMPLICITFAST, RK4, Physics
 from bayessim_mjx.physics.pushed import Memory, pushed
 
-STAGES = ((0.5, 1 / 3), (0.5, 1 / 3), (1.0, 1 / 6))  # of RK4 after the first: (how far from the start, weight)
+# of RK4 after the first: how far from the start, weight, and by what share of a command's slope over the timestep its
+# command is another than the mean: so positions and velocities move as by the slope, and the first stage has the mean
+STAGES = ((0.5, 1 / 3, -0.25), (0.5, 1 / 3, -0.25), (1.0, 1 / 6, 1.0))
 _NO_DAMPING = int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
 
 
@@ -47,6 +49,7 @@ class Timestep:
         thetas: one slice per effect.
         seen: what the sensors showed after the last control step, {"qpos", "qvel"}.
         drive: what else acts.
+        slope: `[nu]`, by how much ctrl changes over the timestep, linear about its mean; None: not at all.
     """
 
     physics: Physics
@@ -54,6 +57,7 @@ class Timestep:
     thetas: tuple[jax.Array, ...]
     seen: dict[str, jax.Array]
     drive: Drive
+    slope: jax.Array | None = None
 
     def having(self, hook: str) -> list[tuple]:
         """(index, effect, site, slice of theta) of the effects that have this hook."""
@@ -78,6 +82,7 @@ def substep(
     thetas: tuple[jax.Array, ...],
     seen: dict[str, jax.Array],
     drive: Drive = Drive(),  # noqa: B008  # immutable
+    slope: jax.Array | None = None,
 ) -> tuple[mjx.Data, Memory]:
     """One timestep from the state and ctrl in `data`. Returns (data, (memory, forces)).
 
@@ -90,12 +95,12 @@ def substep(
         carry: the effects' memories, and the last timestep's forces `[nv]` of those that exert any (`pushed.apart`).
         thetas: one slice per effect.
         seen: what the sensors showed after the last control step, {"qpos", "qvel"}.
-        drive: what else acts.
+        drive: what else acts; slope: see `Timestep`.
     """
     if physics.warp is not None:
         data = physics.warp.step(model, data)
     else:
-        own, memory = Timestep(physics, model, thetas, seen, drive), carry[0]
+        own, memory = Timestep(physics, model, thetas, seen, drive, slope), carry[0]
         data, carry, step = forward(own, data, carry)
         data = _integrated(own, data, memory, step)
     if physics.max_qvel is not None:
@@ -233,14 +238,22 @@ def _in_turn(data: mjx.Data) -> mjx.Data:
     return data.tree_replace({"_impl.M": inertia + 0.0 * data.qacc[0]}) if known else data
 
 
+def _inside(own: Timestep, ctrl: jax.Array, slope: jax.Array) -> jax.Array:
+    """The slope, no steeper than stages inside ctrlrange allow: what MuJoCo clips there would be lost to the mean."""
+    low, high = ranges(own.model.actuator_ctrllimited, own.model.actuator_ctrlrange)
+    up, down = jnp.maximum(high - ctrl, 0.0), jnp.minimum(low - ctrl, 0.0)
+    return jnp.clip(slope, jnp.maximum(down, -4 * up), jnp.minimum(up, -4 * down))
+
+
 def _rk4(own: Timestep, first: mjx.Data, memory: tuple) -> mjx.Data:
     """The classical Runge-Kutta method of fourth order, from its first stage.
 
     Actuators' forces are corrected in every stage, from the same memory: what effects remember is of the first one.
-    Held over the timestep are the controller's output, the effects' own forces (their friction is that of its end
-    already) and the torque of actuators that act through an effect (`Effect.transmits`).
+    Held over the timestep are the controller's output (but for the slope of commands), the effects' own forces (their
+    friction is that of its end already) and the torque of actuators that act through an effect (`Effect.transmits`).
     """
     model, dt = own.model, own.model.opt.timestep
+    slope_of_ctrl = None if own.slope is None else _inside(own, first.ctrl, own.slope)
     flags = mjx.DisableBit(int(model.opt.disableflags) | _NO_DAMPING)
 
     def moved(slope: tuple[jax.Array, ...], time: jax.Array) -> mjx.Data:
@@ -256,6 +269,8 @@ def _rk4(own: Timestep, first: mjx.Data, memory: tuple) -> mjx.Data:
         time = row[0] * dt
         act, qvel = first.act + time * slope[2], first.qvel + time * slope[1]
         data = first.replace(qpos=moved(slope, time).qpos, qvel=qvel, act=act, time=first.time + time)
+        if slope_of_ctrl is not None:
+            data = data.replace(ctrl=first.ctrl + row[2] * slope_of_ctrl)
         data = mjx.fwd_velocity(model, mjx.fwd_position(model, data))
         data, _, _ = _actuated(own, data, memory)
         for _, effect, at, theta in own.having("transmits"):

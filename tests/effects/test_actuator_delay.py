@@ -59,6 +59,37 @@ def test_impulse_is_exact_for_any_delay(delay):
     np.testing.assert_allclose(v, np.c_[want, 2 * want], atol=1e-5)
 
 
+@pytest.mark.parametrize("share", [0.25, 0.5, 0.6])
+def test_a_step_by_runge_kutta_moves_positions_as_the_delayed_staircase_does(share):
+    """A free mass after a unit step. A mean over each timestep would add h^2 share (1 - share) / 2."""
+    h, delay = 0.005, share * 0.005
+    model = mujoco.MjModel.from_xml_string(XML.replace('timestep="0.005"', 'timestep="0.005" integrator="RK4"'))
+    p = Physics(model, DT, ParameterSpace(), [make("actuator_delay", where="all")])
+    world = p.world(jnp.float32([delay]))
+    commands = np.array([0.0, 1.0, 1.0])
+    step = jax.jit(lambda world, u: control_step(p, world, jnp.full(2, u))[0])
+    for u in commands:
+        world = step(world, u)
+    late = 2 * DT - delay
+    assert float(world.qvel[0]) == pytest.approx(late, rel=1e-5)
+    by_means = h**2 * share * (1 - share) / 2
+    tolerance = 1e-3 * by_means if share in (0.25, 0.5) else by_means / 12  # edges of the parts are exact
+    assert float(world.qpos[0]) - late**2 / 2 == pytest.approx(0.0, abs=tolerance + 1e-9)
+
+
+def test_a_step_to_the_end_of_the_range_keeps_its_impulse():
+    """By Runge and Kutta's method a stage beyond ctrlrange would be clipped, and what it carries lost."""
+    xml = XML.replace('timestep="0.005"', 'timestep="0.005" integrator="RK4"')
+    xml = xml.replace('<motor name="a" joint="a"/>', '<motor name="a" joint="a" ctrlrange="-1 1" ctrllimited="true"/>')
+    p = Physics(mujoco.MjModel.from_xml_string(xml), DT, ParameterSpace(), [make("actuator_delay", where="all")])
+    world = p.world(jnp.float32([0.002]))
+    step = jax.jit(lambda world, u: control_step(p, world, jnp.full(2, u))[0])
+    for u in (-1.0, 1.0, 1.0):
+        world = step(world, u)
+    want = delayed_impulse(np.array([-1.0, 1.0, 1.0]), 0.002)[-1]
+    np.testing.assert_allclose(world.qvel, [want, want], atol=1e-6)
+
+
 def test_one_actuator_alone():
     commands = np.array([0.0, 1.0, 1.0, 1.0])
     v = speeds(simulation("b", high=0.05), [0.04], np.c_[commands, commands])
