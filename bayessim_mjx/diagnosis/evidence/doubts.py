@@ -3,7 +3,9 @@
 Positions and velocities are rows of two sensors. Each lies in time as exactly as its sensor reads, and a robot's clock
 is not the simulator's: half a sub-step lies between the positions and the velocities of one semi-implicit step. Without
 these lags known parameters would take such errors, and pretend to know them. A stiff servo that sees its joint late
-damps it less, by the stiffness times the lag, which is as much as a joint's own damping; its damping moves the inertia.
+damps it less, by the stiffness times the lag, which is as much as a joint's own damping. Damping that acts late, of a
+servo or of the joint, moves the inertia: through a motor's inductance, or in a simulator that takes it from the speed
+before the step.
 """
 
 from __future__ import annotations
@@ -43,7 +45,7 @@ class Doubts:
 
 
 def found(fitter: Fitter, D: Array, B: Array) -> Doubts:
-    """Lags of measured positions, of measured velocities, of positions and of velocities that servos are fed back.
+    """Lags of measured positions, of measured velocities, of positions that servos are fed back, of all damping.
 
     A late start moves all of a window's motion.
 
@@ -66,7 +68,7 @@ def found(fitter: Fitter, D: Array, B: Array) -> Doubts:
 
 
 def _servos(fitter: Fitter, D: Array) -> tuple[list[Array], Array]:
-    """(`[W, n]` each, `[k, 2]`), per s of lag of the positions, and of the velocities, that servos are fed back.
+    """(`[W, n]` each, `[k, 2]`), per s of lag of the positions that servos are fed back, and of what damps joints.
 
     A late position is less damping of the joint, a late velocity less armature. Where these are known parameters the
     columns are theirs: forces at nodes lack what accelerations do between them, and would trade it for a parameter.
@@ -89,14 +91,14 @@ def _servos(fitter: Fitter, D: Array) -> tuple[list[Array], Array]:
 
 
 def _pulls(model: mujoco.MjModel) -> tuple[Array, Array]:
-    """`[nv, nv]` each, N m/rad and N m s/rad, or N/m and N s/m: servos' pull on joints by position and by speed."""
+    """`[nv, nv]` each, N m/rad and N m s/rad, or N/m and N s/m: servos' pull on joints by position, all by speed."""
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     moment = moments(model, data)
     affine = model.actuator_biastype == int(mujoco.mjtBias.mjBIAS_AFFINE)
     gains = np.where(affine[:, None], -model.actuator_biasprm[:, 1:3], 0.0)
     by_position, by_speed = (moment.T @ (gain[:, None] * moment) for gain in gains.T)
-    return by_position, by_speed
+    return by_position, by_speed + np.diag(model.dof_damping)
 
 
 def _pulled(fitter: Fitter, nodes: int) -> tuple[Array, Array]:

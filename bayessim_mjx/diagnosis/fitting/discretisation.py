@@ -33,7 +33,8 @@ class Rules:
     factors: tuple[int, ...] = (1, 2, 4, 8)
     more: tuple[int, ...] = (16, 32)  # beyond the budget, where the step is worth more than the tolerance
     contacts: int = 4  # the finest with contacts: what is left falls with the root of the step at best
-    enough: float = 0.6  # noises: an error of the time step that does not show
+    enough: float = 0.6  # noises: an error of the time step that is worth no finer sub-steps
+    nats: float = 1.0  # by which it may move the evidence: half of the sum of its squares, in noises, over all rows
     shorter: int = 5  # halvings of the time step that can be recommended
     worth: float = 1.0  # noises: from here on the user is told
     # errors that shrink by less from one sub-step to its half are not worth finer ones
@@ -59,7 +60,7 @@ class Discretisation:
         simulated: `[nv]`, channels that show no noise at all: logs of a simulation.
         channels: names `[nv]`.
         errors: the windows simulated without effects, for what else is asked of them.
-        limit: `[nv]`, the tolerance, rad or m; None: none is known.
+        rows: of all windows; limit: `[nv]`, the tolerance, rad or m; None: none is known.
     """
 
     timestep: float
@@ -74,6 +75,7 @@ class Discretisation:
     channels: tuple[str, ...]
     errors: Errors | None = None
     limit: Array | None = None
+    rows: int = 0
 
     def robot(self, robot: Robot) -> Robot:
         """The robot at the sub-steps of the diagnosis."""
@@ -100,9 +102,17 @@ class Discretisation:
 
     @property
     def shows(self) -> bool:
-        """Whether what the sub-steps leave shows beside the sensors' noise; logs of a simulation may have this step."""
+        """Whether what the sub-steps leave moves the evidence of effects, such as a delay and a lag of the same time.
+
+        It is less than the noise in each row and adds up over rows. Logs of a simulation may have this step.
+        """
+        return self.nats > RULES.nats
+
+    @property
+    def nats(self) -> float:
+        """By which what the sub-steps leave may move the log likelihood of all windows."""
         own = self.sensed
-        return bool((self.left[own] > RULES.enough * self.sigma[own]).any())
+        return 0.5 * self.rows * float(np.sum((self.left[own] / self.sigma[own]) ** 2))
 
     def warnings(self) -> list[str]:
         """In words, where the simulator's own time step is worth more than the noise."""
@@ -229,6 +239,7 @@ def measure(
         channels=Channels.of(physics.mj_model).qvel,
         errors=errors,
         limit=limit,
+        rows=one.shape[0] * one.shape[1],
     )
 
 
