@@ -157,7 +157,7 @@ class Effect(abc.ABC):
         return memory
 
     def on_command(self, at: Site, memory: Any, command: jax.Array, theta: jax.Array) -> tuple[Any, jax.Array]:
-        """Change the command of one control step, `[substeps, nu]`: one row per sub-step."""
+        """Change the command of one control step, `[substeps, nu]`: one row per sub-step (four of them by RK4)."""
         return memory, command
 
     def on_actuator(
