@@ -20,6 +20,7 @@ from bayessim_mjx.diagnosis.fitting.fit import Fit
 from bayessim_mjx.diagnosis.selection.accuracy import Posterior, posterior
 
 Array = NDArray[np.float64]
+SIZES = (1.0, 0.1, 0.01)  # of an effect's range
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,12 +62,66 @@ def integrated(fit: Fit, learnt: Learnt, effects: Sequence[Mapping[int, bool]] =
     nats = learnt.without_parameters - 0.5 * float(c) + found.evidence
     layers = {i: _layer(belief, i, p[i], slope[i], S[i, i]) for i in np.flatnonzero(at).tolist()}
     nats += sum(layers.values(), 0.0) - sum(map(_truncated, fit.coordinates))
-    nats += sum(_without(fit, found, free, layers, own) for own in effects if len(own) > 1 and not all(own.values()))
+    nats += sum(_sized(fit, found, free, layers, own) for own in effects)
     return Integrated(nats, found, free)
 
 
-def _without(
+@dataclass(frozen=True, eq=False)
+class _Numbers:
+    """Posterior of the free numbers of a fit under one size of an effect.
+
+    Attributes:
+        middle, covariance: `[f]`, `[f, f]`; at: `[f]`, which numbers of the fit these are.
+        precision, inside: `[k]`, of all numbers' Gaussian priors; log probability that the bounds leave of it.
+    """
+
+    middle: Array
+    covariance: Array
+    at: NDArray[np.int64]
+    precision: Array
+    inside: Array
+
+    def smaller(self, some: Sequence[int], neutral: Array, fit: Fit, scale: float) -> tuple[_Numbers, float]:
+        """(these where the priors of some numbers are narrower by `scale`, log of the evidence's ratio)."""
+        if scale == 1.0 or not some:
+            return self, 0.0
+        inner = np.searchsorted(self.at, some)
+        more = (scale**-2.0 - 1.0) * self.precision[list(some)]
+        away = self.middle[inner] - neutral[list(some)]
+        together = self.covariance[np.ix_(inner, inner)] + np.diag(1 / more)
+        gain = np.linalg.solve(together, self.covariance[inner]).T
+        precision, inside = self.precision.copy(), self.inside.copy()
+        precision[list(some)] *= scale**-2.0
+        for i in some:
+            inside[i] = _truncated(fit.coordinates[i], scale)
+        ratio = -len(some) * np.log(scale) - 0.5 * float(np.linalg.slogdet(together)[1] + np.sum(np.log(more)))
+        ratio -= 0.5 * float(away @ np.linalg.solve(together, away)) + float(np.sum(inside - self.inside))
+        middle, covariance = self.middle - gain @ away, self.covariance - gain @ self.covariance[inner]
+        return _Numbers(middle, covariance, self.at, precision, inside), float(ratio)
+
+
+def _sized(
     fit: Fit, found: Posterior, free: NDArray[np.bool_], layers: dict[int, float], own: Mapping[int, bool]
+) -> float:
+    """What the evidence gains where an effect may be small: its range, a tenth and a hundredth of it as likely.
+
+    Nobody knows the size of what is missing: a prior as wide as the range alone would hold a small payload for less
+    likely than a small error of a data sheet that does the same (Jeffreys, Theory of Probability, 1961, sec. 3.1).
+    """
+    neutral = np.array([c.neutral for c in fit.coordinates])
+    precision, inside = (np.array([of(c) for c in fit.coordinates]) for of in (lambda c: c.precision, _truncated))
+    numbers = _Numbers(found.middle, found.moments(), np.flatnonzero(free), precision, inside)
+    some = [i for i, shape in own.items() if free[i] and not shape and not fit.coordinates[i].stated]
+    terms = []
+    for scale in SIZES if some else SIZES[:1]:
+        there, ratio = numbers.smaller(some, neutral, fit, scale)
+        several = len(own) > 1 and not all(own.values())
+        terms.append(ratio + (_without(fit, there, free, layers, own) if several else 0.0))
+    return float(logsumexp(terms) - np.log(len(terms)))
+
+
+def _without(
+    fit: Fit, found: _Numbers, free: NDArray[np.bool_], layers: dict[int, float], own: Mapping[int, bool]
 ) -> float:
     """What the evidence gains where each of an effect's numbers may be neutral, with probability 1/2.
 
@@ -75,7 +130,6 @@ def _without(
     Savage and Dickey's ratio (Dickey, Ann. Math. Stat. 42, 1971): the evidence without a number is the posterior over
     the prior density at its neutral value.
     """
-    at, middle, covariance = np.flatnonzero(free), found.middle, found.moments()
     neutral = np.array([c.neutral for c in fit.coordinates])
     usable = [i for i in own if free[i] or fit.values[i] == neutral[i]]
     amplitudes = {i for i, shape in own.items() if not shape}
@@ -83,12 +137,12 @@ def _without(
     for some in itertools.chain.from_iterable(itertools.combinations(usable, n) for n in range(1, len(own))):
         if amplitudes <= {*some}:
             continue
-        inner = [int(np.searchsorted(at, i)) for i in some if free[i]]
-        delta = sum(_truncated(fit.coordinates[i]) - layers.get(i, 0.0) for i in some)
+        inner = [int(np.searchsorted(found.at, i)) for i in some if free[i]]
+        delta = sum(found.inside[i] - layers.get(i, 0.0) for i in some)
         if inner:
-            away, C = neutral[at[inner]] - middle[inner], covariance[np.ix_(inner, inner)]
+            away, C = neutral[found.at[inner]] - found.middle[inner], found.covariance[np.ix_(inner, inner)]
             delta -= 0.5 * float(away @ np.linalg.solve(C, away) + np.linalg.slogdet(C)[1])
-            delta -= 0.5 * float(sum(np.log(fit.coordinates[i].precision) for i in some if free[i]))
+            delta -= 0.5 * float(sum(np.log(found.precision[i]) for i in some if free[i]))
         terms.append(delta)
     cases = (2 ** len(amplitudes) - 1) * 2 ** (len(own) - len(amplitudes))
     return float(logsumexp(terms) - np.log(cases))
@@ -103,8 +157,8 @@ def _layer(belief: Belief, i: int, p: float, slope: float, curvature: float) -> 
     return float(density - np.log(bend) + 0.5 * x**2 + log_ndtr(-x))
 
 
-def _truncated(c: Coordinate) -> float:
-    """Log of the prior probability that the bounds leave of an effect's Gaussian prior."""
-    root = c.precision**0.5
+def _truncated(c: Coordinate, scale: float = 1.0) -> float:
+    """Log of the prior probability that the bounds leave of an effect's Gaussian prior, narrower by `scale`."""
+    root = c.precision**0.5 / scale
     inside = ndtr((c.high - c.neutral) * root) - ndtr((c.low - c.neutral) * root)
     return 0.0 if c.stated else float(np.log(max(inside, 1e-300)))

@@ -11,7 +11,6 @@ import copy
 import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from math import comb
 from typing import Any
 
 import numpy as np
@@ -20,6 +19,7 @@ from numpy.typing import NDArray
 from bayessim_mjx.diagnosis.fitting.robot import Robot
 from bayessim_mjx.diagnosis.fitting.substeps import Errors, held
 from bayessim_mjx.diagnosis.fitting.windows import Windows
+from bayessim_mjx.diagnosis.logcheck.noise import noise_free
 from bayessim_mjx.logs.log import Channels, Log
 from bayessim_mjx.physics import Physics
 
@@ -40,7 +40,6 @@ class Rules:
     # errors that shrink by less from one sub-step to its half are not worth finer ones
     converging: float = 1.3
     sure: float = 0.4  # of what is taken for noise: below, the estimates themselves are too coarse
-    moving: int = 20  # rows in which a position changes, with fewer nothing tells whether it shows noise
     far: float = 4.0  # medians: windows with larger errors are no measure, as in the fit
 
 
@@ -102,15 +101,12 @@ class Discretisation:
 
     @property
     def shows(self) -> bool:
-        """Whether what the sub-steps leave moves the evidence of effects, such as a delay and a lag of the same time.
-
-        It is less than the noise in each row and adds up over rows. Logs of a simulation may have this step.
-        """
+        """Whether what the sub-steps leave moves the evidence; logs of a simulation may have this step."""
         return self.nats > RULES.nats
 
     @property
     def nats(self) -> float:
-        """By which what the sub-steps leave may move the log likelihood of all windows."""
+        """By which what the sub-steps leave may move the log likelihood: less than noise in a row, it adds up."""
         own = self.sensed
         return 0.5 * self.rows * float(np.sum((self.left[own] / self.sigma[own]) ** 2))
 
@@ -285,27 +281,3 @@ def _size(error: Array, touching: bool) -> Array:
 def contacts(physics: Physics) -> bool:
     """Whether anything can touch."""
     return bool(physics.template._impl.contact.dist.shape[0])
-
-
-def noise_free(logs: Sequence[Log], column: int) -> bool:
-    """Whether a position shows no noise: of white noise all differences have the same level, smooth motion has none.
-
-    Rows of rest say nothing: an encoder without dither shows one value there, and so does a simulation.
-    """
-    shares = [s for log in logs if (s := _smooth(log.qpos[:, column])) is not None]
-    return bool(shares) and bool(np.median(shares) < 0.1)
-
-
-def _smooth(x: Array) -> float | None:
-    """Level of the eighth differences of x [T] in that of the fourth ones, where x moves; None: it hardly does."""
-    if len(x) <= RULES.moving + 8:
-        return None
-    changing = np.asarray(np.lib.stride_tricks.sliding_window_view(np.diff(x) != 0, 8).any(1))
-    if changing.sum() < RULES.moving:
-        return None
-    return _level(x, 8, changing) / max(_level(x, 4, changing), 1e-300)
-
-
-def _level(x: Array, order: int, rows: NDArray[np.bool_]) -> float:
-    """Standard deviation of white noise in x [T] by differences of an order: Var = binomial(2 n, n) sigma^2."""
-    return float(np.median(np.abs(np.diff(x, order)[: len(rows)][rows])) / np.sqrt(comb(2 * order, order)))

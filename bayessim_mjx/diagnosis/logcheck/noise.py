@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import warnings
 from collections.abc import Sequence
+from math import comb
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Log
 from bayessim_mjx.logs.signals import LEVELS, noise_level, values_shown
 
+MOVING = 20  # rows in which a position changes: with fewer nothing tells whether it shows noise
 ONCE = "no run was repeated: these logs do not separate chance from an error of the model"
 
 
@@ -86,3 +88,27 @@ def _same(a: Log, b: Log) -> bool:
         return False
     near = 6.0 * a.sigma_qpos + 0.01 * np.ptp(a.qpos, axis=0)
     return bool((np.abs(a.qpos[0] - b.qpos[0]) <= near).all())
+
+
+def noise_free(logs: Sequence[Log], column: int) -> bool:
+    """Whether a position shows no noise: of white noise all differences have the same level, smooth motion has none.
+
+    Rows of rest say nothing: an encoder without dither shows one value there, and so does a simulation.
+    """
+    shares = [s for log in logs if (s := _smooth(log.qpos[:, column])) is not None]
+    return bool(shares) and bool(np.median(shares) < 0.1)
+
+
+def _smooth(x: NDArray[np.float64]) -> float | None:
+    """Level of the eighth differences of x [T] in that of the fourth ones, where x moves; None: it hardly does."""
+    if len(x) <= MOVING + 8:
+        return None
+    changing = np.asarray(np.lib.stride_tricks.sliding_window_view(np.diff(x) != 0, 8).any(1))
+    if changing.sum() < MOVING:
+        return None
+    return _level(x, 8, changing) / max(_level(x, 4, changing), 1e-300)
+
+
+def _level(x: NDArray[np.float64], order: int, rows: NDArray[np.bool_]) -> float:
+    """Standard deviation of white noise in x [T] by differences of an order: Var = binomial(2 n, n) sigma^2."""
+    return float(np.median(np.abs(np.diff(x, order)[: len(rows)][rows])) / np.sqrt(comb(2 * order, order)))

@@ -111,6 +111,7 @@ def _effect(found: Findings, effect: Candidate, sd: np.ndarray, part: _Part) -> 
         sizes.append(Size(word, abs(value - c.neutral), float(sd[i]), c.unit))
         clause = bound.why if bound else UNTOLD if deviation > UNKNOWN * (c.high - c.low) else ""
         ends += [f"{word.replace('_', ' ')} {clause}"] if clause else []
+    shared = _shared(effect, sizes, weighed, weights)
     return FoundEffect(
         name=effect.effect,
         where=effect.where,
@@ -122,13 +123,11 @@ def _effect(found: Findings, effect: Candidate, sd: np.ndarray, part: _Part) -> 
         sentence=_sentence(ends),
         predicted_gap_closed=part.promised,
         share=part.share if len(model.effects) > 1 else float("nan"),
-        shared=_shared(setup, effect, sizes, weighed, weights),
+        shared=shared | ({"unit": _unit(setup, effect, shared["unit"])} if shared else {}),
     )
 
 
-def _shared(
-    setup: Setup, effect: Candidate, sizes: list[Size], rivals: list[Rival], weights: list[float]
-) -> dict[str, Any]:
+def _shared(effect: Candidate, sizes: list[Size], rivals: list[Rival], weights: list[float]) -> dict[str, Any]:
     """How large it is, whichever of the rivals it is: of those whose sizes have its unit.
 
     Args:
@@ -148,7 +147,7 @@ def _shared(
         "mean": float(weight @ mean / weight.sum()),
         "low": max(low, 0.0),
         "high": high,
-        "unit": _unit(setup, effect, own.unit),
+        "unit": own.unit,
         "quantities": list(dict.fromkeys(s.quantity for s in every)),
     }
 

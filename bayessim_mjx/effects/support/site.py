@@ -40,8 +40,8 @@ class Site:
         quantities: number of parameters of one place.
         qadr, dadr: `[n]`, columns in qpos and qvel of the joint (of the joint an actuator drives; -1: no such joint).
         slide: `[n]` bool, the joint is a slide.
-        timestep: s, between two rows of commands: a sub-step, by RK4 a fourth of one (`PARTS`); substeps: of these rows per
-            control step; nq, nv, nu: sizes.
+        timestep: s, between rows of commands: a sub-step, by RK4 a fourth of one; substeps: rows in a control step;
+            nq, nv, nu: sizes.
         mj_model: the nominal model.
     """
 

@@ -44,19 +44,19 @@ def test_each_kind_of_sensor_has_a_lag_of_its_own(monkeypatch):
 
 
 def test_a_servos_force_changes_by_its_gains_through_its_gear():
-    """k = 40, kv = 4 at a gear of 2: 160 N m/rad times the speed, 16 N m s/rad times its slope, in each half window."""
+    """k = 40, kv = 4 at a gear of 2: 160 N m/rad times the speed, 16 N m s/rad and the joint's .3 times its slope."""
     model = mujoco.MjModel.from_xml_string(SERVO)
     log = SimpleNamespace(qvel=np.arange(12.0)[:, None] ** 2)
     windows = SimpleNamespace(start=np.array([3]), steps=4, log=np.array([0]), logs=[log], dt=0.1)
     simulator = SimpleNamespace(windows=windows, physics=SimpleNamespace(mj_model=model))
     by_position, by_speed = doubts._pulled(SimpleNamespace(simulator=simulator), 2)
     assert by_position == pytest.approx(160 * np.array([[16.0, 36.0]]))
-    assert by_speed == pytest.approx(16 * np.array([[80.0, 120.0]]))
+    assert by_speed == pytest.approx(16.3 * np.array([[80.0, 120.0]]))
 
 
 @pytest.mark.parametrize("known", [True, False])
 def test_late_feedback_of_a_servo_is_less_damping_and_less_armature(known):
-    """Per s: 160 N m/rad over a damping of .3, 16 N m s/rad over an armature of .05, where these are parameters."""
+    """Per s: 160 N m/rad over a damping of .3, 16.3 N m s/rad over an armature of .05, where these are parameters."""
     model = mujoco.MjModel.from_xml_string(SERVO)
     log = SimpleNamespace(qvel=np.arange(12.0)[:, None] ** 2)
     windows = SimpleNamespace(start=np.array([3]), steps=4, log=np.array([0]), logs=[log], dt=0.1)
@@ -67,11 +67,11 @@ def test_late_feedback_of_a_servo_is_less_damping_and_less_armature(known):
     (late_q, late_v), as_known = doubts._servos(fitter, np.ones((1, 4, 2)))
     if known:
         assert not late_q.any() and not late_v.any()
-        assert as_known == pytest.approx(np.array([[-160 / 0.3, 0.0], [0.0, -16 / 0.05]]))
+        assert as_known == pytest.approx(np.array([[-160 / 0.3, 0.0], [0.0, -16.3 / 0.05]]))
     else:
         assert not as_known.size
         assert late_q == pytest.approx(np.full((1, 4), 160 * (16.0 + 36.0)))
-        assert late_v == pytest.approx(np.full((1, 4), 16 * (80.0 + 120.0)))
+        assert late_v == pytest.approx(np.full((1, 4), 16.3 * (80.0 + 120.0)))
 
 
 def test_numbers_behind_a_fits_own_change_nothing_of_it():

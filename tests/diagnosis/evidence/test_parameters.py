@@ -1,6 +1,7 @@
 """The integral over a model's parameters against quadrature: accuracies, bounds, and the price of what does nothing."""
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from scipy.special import logsumexp
 
 from bayessim_mjx.diagnosis.data_sheet import ACCURACY, SURE
 from bayessim_mjx.diagnosis.evidence.gaussian import Hyper, Learnt, learn, marginal
-from bayessim_mjx.diagnosis.evidence.parameters import belief_of, integrated
+from bayessim_mjx.diagnosis.evidence.parameters import SIZES, belief_of, integrated
 from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
 from bayessim_mjx.diagnosis.fitting.fit import Fit
 from tests.diagnosis.evidence.linear import draw
@@ -93,15 +94,35 @@ def test_an_effect_that_does_nothing_costs_evidence(numbers):
         without = fitted(coordinates[:1], [0.0])
         one = learn(case.windows(), belief_of(with_it))
         two = learn(case.windows(slice(0, 1)), belief_of(without), [one.hyper])
-        gains.append(integrated(with_it, one).nats - integrated(without, two).nats)
-    assert np.mean(gains) < -1.0 * numbers
+        own = [dict.fromkeys(range(1, 1 + numbers), False)]
+        gains.append(integrated(with_it, one, own).nats - integrated(without, two).nats)
+    assert np.mean(gains) < -0.5
     assert np.mean(np.array(gains) > 2.0) <= 0.017  # of 120: two at most
+
+
+@pytest.mark.parametrize("truth", [0.1, 0.3])
+def test_an_effect_of_any_size_against_quadrature(truth):
+    """A friction from 0 to 20 with half-normal priors of 20, 2 and .2, each as likely."""
+    case = draw(11, count=6, k=1, p=[truth])
+    rubs = Coordinate("f", (0,), 0.0, 0.0, 20.0, 0.0025)
+    fit = fitted([rubs], [0.0])
+    there = marginal(case.windows(), HYPER)
+    learnt = Learnt(HYPER, belief_of(fit).best(there.Q.sum(0)), there, 0.0)
+    top = max(likelihood(there, p) for p in np.linspace(0, 2, 2001))
+
+    def density(p):
+        return np.mean([stats.truncnorm(0.0, 1.0 / size, scale=20.0 * size).pdf(p) for size in SIZES])
+
+    whole = integrate.quad(lambda p: density(p) * np.exp(likelihood(there, p) - top), 0, 2, limit=400)[0]
+    found = integrated(fit, learnt, [{0: False}])
+    assert found.nats == pytest.approx(top + np.log(whole), abs=0.1)
+    assert found.nats > integrated(fit, learnt).nats + 1.0
 
 
 @pytest.mark.parametrize("shapes", [(), (3,), (2, 3)])
 @pytest.mark.parametrize("truth", [(0.4, 0.0, 0.0), (0.4, 0.3, -0.2)])
 def test_a_number_of_an_effect_may_be_neutral(truth, shapes):
-    """The mean of the evidences of all models with some of an effect's three numbers, each found by itself.
+    """The mean of the evidences of all models with some of an effect's three numbers, in each size, found by itself.
 
     Shapes alone are no effect: of three amplitudes seven models, of two amplitudes and a shape six, of one four.
     """
@@ -111,13 +132,14 @@ def test_a_number_of_an_effect_may_be_neutral(truth, shapes):
     there = marginal(case.windows(), HYPER)
     learnt = Learnt(HYPER, belief_of(whole).best(there.Q.sum(0)), there, 0.0)
     each = []
-    for n in (1, 2, 3):
+    for n, size in itertools.product((1, 2, 3), SIZES):
+        sized = [c if i in (0, *shapes) else replace(c, precision=size**-2) for i, c in enumerate(numbers)]
         for some in itertools.combinations((1, 2, 3), n):
             if not {*some} <= {*shapes}:
                 own = [0, *some]
-                each.append(evidence(case, fitted([numbers[i] for i in own], np.zeros(len(own))), own)[0].nats)
-    found = integrated(whole, learnt, [{0: False}, {i: i in shapes for i in (1, 2, 3)}])
-    assert len(each) == {0: 7, 1: 6, 2: 4}[len(shapes)]
+                each.append(evidence(case, fitted([sized[i] for i in own], np.zeros(len(own))), own)[0].nats)
+    found = integrated(whole, learnt, [{i: i in shapes for i in (1, 2, 3)}])
+    assert len(each) == len(SIZES) * {0: 7, 1: 6, 2: 4}[len(shapes)]
     assert found.nats == pytest.approx(logsumexp(each) - np.log(len(each)), abs=1e-3)
     gained = found.nats - integrated(whole, learnt).nats
     assert gained > 1.0 if truth[1] == 0 else gained < 0.0

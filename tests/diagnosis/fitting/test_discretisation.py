@@ -14,6 +14,7 @@ from bayessim_mjx.diagnosis.fitting import discretisation, robot, stepping
 from bayessim_mjx.diagnosis.fitting.cutting import windows_of
 from bayessim_mjx.diagnosis.fitting.quadratic import eliminate
 from bayessim_mjx.diagnosis.fitting.substeps import Errors
+from bayessim_mjx.diagnosis.logcheck.noise import noise_free
 from bayessim_mjx.diagnosis.setup import _measured
 from bayessim_mjx.logs import Channels, Log, estimate_velocity
 
@@ -142,9 +143,9 @@ def test_noise_is_seen_whatever_the_motion():
 
     smooth = np.sin(9 * 0.02 * np.arange(300)) + 0.3 * np.sin(17 * 0.02 * np.arange(300))
     rng = np.random.default_rng(0)
-    assert discretisation.noise_free([log(smooth)], 0)
-    assert not discretisation.noise_free([log(smooth + 1e-3 * rng.normal(size=300))], 0)
-    assert not discretisation.noise_free([log(np.round(smooth, 3))], 0)
+    assert noise_free([log(smooth)], 0)
+    assert not noise_free([log(smooth + 1e-3 * rng.normal(size=300))], 0)
+    assert not noise_free([log(np.round(smooth, 3))], 0)
 
 
 def test_the_coarsest_that_is_fine_enough_is_chosen():

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from bayessim_mjx.diagnosis import tolerance
-from bayessim_mjx.diagnosis.fitting import discretisation, sensors, windows
-from bayessim_mjx.diagnosis.logcheck.noise import told
+from bayessim_mjx.diagnosis.fitting import sensors, windows
+from bayessim_mjx.diagnosis.logcheck.noise import noise_free, told
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs import Log
 from tests.diagnosis.recordings import ARM, make
@@ -50,7 +50,7 @@ def test_fewer_than_three_values_in_every_log_tell_no_noise(arm, elbows):
     assert np.isfinite(found.spread).all() and (found.spread > 1e-6).all()
     (text,) = sensors.not_compared(logs)
     assert text.startswith("qpos:elbow: fewer than 3 values") and "quantum" in text
-    assert not discretisation.noise_free(logs, 1)  # or the time step's own error would be its noise
+    assert not noise_free(logs, 1)  # or the time step's own error would be its noise
     limit = tolerance.judge(arm, np.array([2.0, 0.0]), sensors.noise_of_positions(logs), {}).limit
     assert np.isfinite(limit[0]) and np.isinf(limit[1])  # no step is too coarse for it
 
@@ -97,7 +97,7 @@ def test_rest_is_neither_noise_nor_its_absence(arm, grain, free):
     moved = np.sin(6 * np.clip(time - 2.6, 0.0, None))  # at rest for two thirds
     shown = np.round(moved / grain) * grain if grain else moved
     assert np.mean(np.diff(shown, 8) == 0) > 0.5
-    assert discretisation.noise_free([swung(arm, shown)], 1) == free
+    assert noise_free([swung(arm, shown)], 1) == free
 
 
 def test_windows_tell_what_share_of_their_rows_was_measured(arm):

@@ -4,7 +4,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 
+from bayessim_mjx.diagnosis.selection.selected import Size
 from bayessim_mjx.diagnosis.summary import effects_found
 
 
@@ -14,8 +16,9 @@ from bayessim_mjx.diagnosis.summary import effects_found
 def test_a_share_that_reaches_no_joint_is_said_to_be_told_by_nothing(monkeypatch, deviation, sentence):
     """A drive at the end of a chain has one neighbour; ranges are from -1 to 1."""
     names = ("waist.effort_coupling.to_next", "waist.effort_coupling.to_previous")
-    coordinates = [SimpleNamespace(name=n, low=-1.0, high=1.0, unit="") for n in names]
-    effect = SimpleNamespace(effect="effort_coupling", where="waist", coordinates=coordinates, label="x")
+    coordinates = [SimpleNamespace(name=n, low=-1.0, high=1.0, unit="", neutral=0.0) for n in names]
+    shapes = np.zeros(2, bool)
+    effect = SimpleNamespace(effect="effort_coupling", where="waist", coordinates=coordinates, label="x", shapes=shapes)
     fit = SimpleNamespace(names=list(names), values=np.array([-0.027, 0.0]))
     model = SimpleNamespace(fit=fit, effects=(effect,))
     found = SimpleNamespace(
@@ -27,6 +30,28 @@ def test_a_share_that_reaches_no_joint_is_said_to_be_told_by_nothing(monkeypatch
     told = effects_found._effect(found, effect, np.array([0.003, deviation]), part)
     assert told.sentence == sentence
     assert told.parameters["to_previous"].sd == deviation
+
+
+def test_rivals_of_one_unit_share_a_size():
+    """A delay of 10 +- 1 ms, of two thirds, and a filter of 13 +- 1 ms: the mixture's mean and 90 % interval."""
+    effect = SimpleNamespace(label="delay@motor", shapes=np.zeros(1, bool))
+    own = [Size("delay", 0.010, 0.001, "s")]
+
+    def rival(label, size):
+        return SimpleNamespace(effects=[SimpleNamespace(label=label)], size=size)
+
+    rivals = [
+        rival("filter@hinge", Size("time_constant", 0.013, 0.001, "s")),
+        rival("bias@motor", Size("bias", 1, 1, "N m")),
+    ]
+    shared = effects_found._shared(effect, own, rivals, [0.5, 0.25, 0.25])
+    assert shared["effects"] == ["delay@motor", "filter@hinge"] and shared["unit"] == "s"
+    assert shared["mean"] == pytest.approx(0.011)
+    below = [
+        2 / 3 * norm.cdf(x, 0.010, 0.001) + 1 / 3 * norm.cdf(x, 0.013, 0.001) for x in (shared["low"], shared["high"])
+    ]
+    assert below == pytest.approx([0.05, 0.95], abs=1e-6)
+    assert effects_found._shared(effect, own, rivals[1:], [0.7, 0.3]) == {}
 
 
 @pytest.mark.parametrize(("conditions", "chosen", "nested"), [(1, 5, False), (2, 2, False), (3, 3, True)])
