@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from bayessim_mjx.compat import compiler_options
+from bayessim_mjx import programs
 from bayessim_mjx.device import on_cores
 from bayessim_mjx.diagnosis.fitting.windows import Batch, Windows
 from bayessim_mjx.effects.support.motion import Motion
@@ -57,7 +57,7 @@ class Simulator:
         self.nv = int(physics.mj_model.nv)
         self.channels = 2 * self.nv
         self.traces = self.rollouts = 0
-        self._run = jax.jit(self._many, compiler_options=compiler_options())
+        self._run = programs.Kept(self._many, programs.traced_from(physics, "windows"))
         self._no_offset = np.zeros((self.lanes, 2 * self.nv), np.float32)
         self._no_force = jnp.asarray(np.zeros((self.lanes, windows.steps, self.nv), np.float32))
 
@@ -186,8 +186,8 @@ class Simulator:
             return np.asarray(self._run(*given(first))[0])[: count - first]
 
         firsts = list(range(0, count, self.lanes))
-        if self.apart and self.traces == 0:
-            self._run.lower(*given(0)).compile()  # once, not by every thread
+        if self.apart and not self.rollouts:
+            self._run.ready(*given(0))  # once, not by every thread
         done = on_cores(part, firsts) if self.apart else [part(first) for first in firsts]
         self.rollouts += count
         return np.concatenate(done).astype(np.float64)

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from bayessim_mjx.compat import compiler_options
+from bayessim_mjx import programs
 from bayessim_mjx.device import on_cores
 from bayessim_mjx.diagnosis.fitting.quadratic import eliminate
 from bayessim_mjx.diagnosis.fitting.windows import Batch, Windows
@@ -79,7 +79,7 @@ class Errors:
         self._moved: tuple[Array, Array] | None = None  # start states, and the derivatives there
         self._no_force = np.zeros((len(cut), cut.steps, physics.mj_model.nv), np.float32)
         axes = (0, 0, 0, None, None, None, None)
-        self._run = jax.jit(jax.vmap(self._one, in_axes=axes), compiler_options=compiler_options())
+        self._run = programs.Kept(jax.vmap(self._one, in_axes=axes), programs.traced_from(physics, "sub-steps"))
 
     def run(self, cut: Windows, factor: int, corrected: bool = True, offsets: Array | None = None) -> Array:
         """With the commands of `cut` at the sub-step h / factor; corrected: velocities lie half of that early."""
