@@ -37,7 +37,6 @@ class Effort:
         instead: likewise in the place of each of its effects; base: on the known parameters.
         least: single effects that are fitted however little they promise: promises are linear.
         margin: nats below the leading set, within which a promised set is fitted.
-        scales: of a special case's point, where its fit begins too.
         leading: sets whose ranges may grow; finalists: whose fits are brought to their end.
     """
 
@@ -47,7 +46,6 @@ class Effort:
     base: tuple[int, ...] = (2, 4, 2)
     least: int = 4
     margin: float = 30.0
-    scales: tuple[float, ...] = (0.3, 0.1, 0.03)
     leading: int = 3
     finalists: int = 6
 
@@ -102,22 +100,16 @@ class Search:
         return list({p.key: p for p in plans}.values())
 
     def _special(self, best: Key) -> list[Plan]:
-        """Each special case of an effect in its place: at its promise's points a law may be past where it is linear."""
-        out = []
-        for effect in self.pool.models[best].effects:
+        """Each special case of an effect in its place, begun as large as it is in the effect and at its promise."""
+        out, model = [], self.pool.models[best]
+        for effect in model.effects:
             rest = best - {effect.label}
-            for c in self.pool.candidates:
+            some = [c for c in self.pool.candidates if c.where == effect.where and c.effect in special_cases(effect)]
+            for c in some if rest in self.pool.models else []:
                 points = self.pool.secants.columns.get(c.label, ())
-                key = rest | {c.label}
-                if (
-                    c.where == effect.where
-                    and c.effect in special_cases(effect)
-                    and points
-                    and rest in self.pool.models
-                ):
-                    column = Column(c, *points[-1])
-                    starts = tuple(column.at(f) for f in EFFORT.scales)
-                    out += [Plan(key, np.inf, rest, (column,), (1.0,), starts)] if self._new(key) else []
+                if points and self._new(rest | {c.label}):
+                    starts = _as_large(c, effect, model.values_of(effect))
+                    out.append(Plan(rest | {c.label}, np.inf, rest, (Column(c, *points[-1]),), (1.0,), starts))
         return out
 
     def _new(self, key: Key) -> bool:
@@ -180,3 +172,15 @@ class Search:
         starts = [np.concatenate([c.at(t) for c, t in zip(plan.columns, plan.amounts, strict=True)])]
         starts += [p for i, p in enumerate(plan.points) if not any(np.array_equal(p, q) for q in plan.points[:i])]
         return [pool.fitter.derive(pool.begun(fit), coordinates, s) for s in starts], (*kept, *new)
+
+
+def _as_large(special: Candidate, effect: Candidate, values: Array) -> tuple[Array, ...]:
+    """A special case's numbers by those of the effect that have the same units; () where one has none."""
+    there, found = list(zip(effect.coordinates, values.tolist(), strict=True)), []
+    for c in special.coordinates:
+        same = next((pair for pair in there if pair[0].unit == c.unit), None)
+        if same is None:
+            return ()
+        there.remove(same)
+        found.append(float(np.clip(same[1], c.low, c.high)))
+    return (np.array(found),)

@@ -1,0 +1,32 @@
+"""A special case begins as large as it is in the effect that contains it."""
+
+import numpy as np
+import pytest
+
+from bayessim_mjx.diagnosis.evidence.search import _as_large
+from bayessim_mjx.diagnosis.fitting.candidates import Candidate, Coordinate
+
+
+def candidate(effect, *numbers):
+    coordinates = tuple(
+        Coordinate(f"place.{effect}.{name}", (i,), 0.0, 0.0, high, unit=unit)
+        for i, (name, high, unit) in enumerate(numbers)
+    )
+    return Candidate(effect, "place", "joint", coordinates, np.zeros(len(numbers), bool), np.zeros((1, len(numbers))))
+
+
+STRIBECK = candidate("stribeck_friction", ("level", 2.0, "N m"), ("excess", 2.0, "N m"), ("speed", 1.0, "rad/s"))
+
+
+@pytest.mark.parametrize(("high", "start"), [(2.0, 0.7), (0.5, 0.5)])
+def test_by_units_in_their_order_and_within_the_range(high, start):
+    coulomb = candidate("coulomb_friction", ("level", high, "N m"))
+    (found,) = _as_large(coulomb, STRIBECK, np.array([0.7, 0.2, 0.1]))
+    assert found == pytest.approx([start])
+
+
+def test_two_numbers_of_one_unit_take_one_each_and_none_is_made_up():
+    both = candidate("asymmetric_friction", ("forward", 2.0, "N m"), ("backward", 2.0, "N m"))
+    (found,) = _as_large(both, STRIBECK, np.array([0.7, 0.2, 0.1]))
+    assert found == pytest.approx([0.7, 0.2])
+    assert _as_large(candidate("quadratic_drag", ("coefficient", 1.0, "N m s^2/rad^2")), STRIBECK, np.zeros(3)) == ()
