@@ -20,7 +20,7 @@ from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fit import Fit
 from bayessim_mjx.diagnosis.selection.bounds import widened
 from bayessim_mjx.diagnosis.selection.budget import LEAVING_OUT, SINGLES, TOGETHER
-from bayessim_mjx.diagnosis.selection.laws import special_cases
+from bayessim_mjx.diagnosis.selection.laws import special_case
 from bayessim_mjx.diagnosis.selection.pool import Entries, Pool, cut_back, fit_entries, polish
 from bayessim_mjx.diagnosis.selection.sets import BASE, ODDS, Key, Weighed
 
@@ -91,12 +91,12 @@ class Search:
         """What to fit around the leading set: beside one that leaves nothing relevant, what promises to be likelier."""
         smaller = [k for k in (best - {x} for x in sorted(best)) if k and k in self.weighing.scored]
         plans = [p for k in smaller for p in self._worth(self._around(k), EFFORT.instead)] + self._special(best)
+        more = self._worth(self._around(best), EFFORT.sizes)
+        more += self._worth(self._around(BASE), EFFORT.base) if best else []
         if self.weighing.settled(best):
             likelier = self.weighing.total(best) + np.log(ODDS.mention)
-            plans += [p for p in self._worth(self._around(best), EFFORT.sizes) if p.nats > likelier]
-        else:
-            plans += self._worth(self._around(best), EFFORT.sizes)
-            plans += self._worth(self._around(BASE), EFFORT.base) if best else []
+            more = [p for p in more if p.nats > likelier]
+        plans += more
         return list({p.key: p for p in plans}.values())
 
     def _special(self, best: Key) -> list[Plan]:
@@ -104,7 +104,7 @@ class Search:
         out, model = [], self.pool.models[best]
         for effect in model.effects:
             rest = best - {effect.label}
-            some = [c for c in self.pool.candidates if c.where == effect.where and c.effect in special_cases(effect)]
+            some = [c for c in self.pool.candidates if special_case(c, effect)]
             for c in some if rest in self.pool.models else []:
                 points = self.pool.secants.columns.get(c.label, ())
                 if points and self._new(rest | {c.label}):

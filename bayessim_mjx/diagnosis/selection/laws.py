@@ -19,6 +19,13 @@ def beside(a: Candidate, b: Candidate) -> bool:
     return a.label != b.label and compatible(a, b) and not within
 
 
+def special_case(one: Candidate, of: Candidate) -> bool:
+    """Whether it is a special case of a law at its place, or of a law that is tied over all places at one of them."""
+    at_one = of.where == "all" != one.where and one.kind == of.kind
+    contained = one.effect in special_cases(of)
+    return contained and (at_one or one.where == of.where) or at_one and one.effect == of.effect
+
+
 def special_cases(effect: Candidate) -> tuple[str, ...]:
     """Names of the effects that it contains, from its class."""
     return _contained(effect.effect)

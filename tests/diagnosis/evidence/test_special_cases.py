@@ -5,14 +5,15 @@ import pytest
 
 from bayessim_mjx.diagnosis.evidence.search import _as_large
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate, Coordinate
+from bayessim_mjx.diagnosis.selection.laws import special_case
 
 
-def candidate(effect, *numbers):
+def candidate(effect, *numbers, where="place"):
     coordinates = tuple(
         Coordinate(f"place.{effect}.{name}", (i,), 0.0, 0.0, high, unit=unit)
         for i, (name, high, unit) in enumerate(numbers)
     )
-    return Candidate(effect, "place", "joint", coordinates, np.zeros(len(numbers), bool), np.zeros((1, len(numbers))))
+    return Candidate(effect, where, "joint", coordinates, np.zeros(len(numbers), bool), np.zeros((1, len(numbers))))
 
 
 STRIBECK = candidate("stribeck_friction", ("level", 2.0, "N m"), ("excess", 2.0, "N m"), ("speed", 1.0, "rad/s"))
@@ -30,3 +31,13 @@ def test_two_numbers_of_one_unit_take_one_each_and_none_is_made_up():
     (found,) = _as_large(both, STRIBECK, np.array([0.7, 0.2, 0.1]))
     assert found == pytest.approx([0.7, 0.2])
     assert _as_large(candidate("quadratic_drag", ("coefficient", 1.0, "N m s^2/rad^2")), STRIBECK, np.zeros(3)) == ()
+
+
+def test_a_tied_law_has_each_place_as_a_special_case():
+    """A limit of all motors that one of them reaches is that one's."""
+    tied, one = (candidate("stribeck_friction", where=where) for where in ("all", "elbow"))
+    coulomb = candidate("coulomb_friction", where="elbow")
+    assert special_case(one, tied) and special_case(coulomb, tied) and special_case(coulomb, one)
+    assert not special_case(tied, one) and not special_case(tied, tied) and not special_case(one, one)
+    assert not special_case(candidate("coulomb_friction", where="wrist"), one)
+    assert not special_case(candidate("quadratic_drag", where="elbow"), tied)
