@@ -28,6 +28,7 @@ class SpeedTorqueLimit(Effect):
 
     name: ClassVar[str] = "speed_torque_limit"
     kind: ClassVar[str] = "actuator"
+    contains: ClassVar[tuple[str, ...]] = ("actuator_saturation",)
     noun: ClassVar[str] = "speed-torque limit"
     lacks: ClassVar[str] = "a speed-torque limit"
     separates: ClassVar[str] = "fast driving and braking"
