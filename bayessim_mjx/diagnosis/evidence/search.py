@@ -90,7 +90,7 @@ class Search:
     def _todo(self, best: Key) -> list[Plan]:
         """What to fit around the leading set: beside one that leaves nothing relevant, what promises to be likelier."""
         smaller = [k for k in (best - {x} for x in sorted(best)) if k and k in self.weighing.scored]
-        plans = [p for k in smaller for p in self._worth(self._around(k), EFFORT.instead)] + self._special(best)
+        plans = [p for k in smaller for p in self._worth(self._around(k), EFFORT.instead)] + self._related(best)
         more = self._worth(self._around(best), EFFORT.sizes)
         more += self._worth(self._around(BASE), EFFORT.base) if best else []
         if self.weighing.settled(best):
@@ -99,15 +99,18 @@ class Search:
         plans += more
         return list({p.key: p for p in plans}.values())
 
-    def _special(self, best: Key) -> list[Plan]:
-        """Each special case of an effect in its place, begun as large as it is in the effect and at its promise."""
+    def _related(self, best: Key) -> list[Plan]:
+        """In the place of an effect its special cases, and laws that contain it; as large as it is, and as promised.
+
+        A promise is one direction: friction that differs by direction, or falls with speed, is none of them.
+        """
         out, model = [], self.pool.models[best]
         for effect in model.effects:
             rest = best - {effect.label}
-            some = [c for c in self.pool.candidates if special_case(c, effect)]
-            for c in some if rest in self.pool.models else []:
+            for c in self.pool.candidates if rest in self.pool.models else []:
                 points = self.pool.secants.columns.get(c.label, ())
-                if points and self._new(rest | {c.label}):
+                related = special_case(c, effect) or (special_case(effect, c) and c.where == effect.where)
+                if points and related and self._new(rest | {c.label}):
                     starts = _as_large(c, effect, model.values_of(effect))
                     out.append(Plan(rest | {c.label}, np.inf, rest, (Column(c, *points[-1]),), (1.0,), starts))
         return out
@@ -134,17 +137,21 @@ class Search:
         return list(out.values())
 
     def _leading(self) -> None:
-        """Wider ranges for what leads, and what leads without each of its effects, as long as one of these leads."""
+        """Wider ranges for what leads, and this without each of its effects, as long as that is new.
+
+        Near the leading set too: a law that is not quite right has others beside it, which the right one needs no more.
+        """
         while True:
             some = [k for k in self._order()[: EFFORT.leading] if k]
             for key in some:
                 widened(self.pool, self.pool.models[key], self.say)
             self.weighing.score(some)
-            best = self._order()[0]
-            fewer = [best - {x} for x in sorted(best) if best - {x} not in self.weighing.scored]
+            nats = self.weighing.weighed().nats
+            near = [k for k in some if nats[k] > max(nats.values()) - EFFORT.margin]
+            fewer = {k - {x}: k for k in near[::-1] for x in sorted(k) if k - {x} not in self.weighing.scored}
             if not fewer or self.pool.settings.budget.over(LEAVING_OUT):
                 return
-            self._fit([Plan(key, np.inf, best) for key in fewer], "dropping", LEAVING_OUT)
+            self._fit([Plan(key, np.inf, parent) for key, parent in fewer.items()], "dropping", LEAVING_OUT)
 
     def _finish(self) -> None:
         """The fits of the finalists brought to their end."""
@@ -174,13 +181,18 @@ class Search:
         return [pool.fitter.derive(pool.begun(fit), coordinates, s) for s in starts], (*kept, *new)
 
 
-def _as_large(special: Candidate, effect: Candidate, values: Array) -> tuple[Array, ...]:
-    """A special case's numbers by those of the effect that have the same units; () where one has none."""
-    there, found = list(zip(effect.coordinates, values.tolist(), strict=True)), []
-    for c in special.coordinates:
-        same = next((pair for pair in there if pair[0].unit == c.unit), None)
-        if same is None:
-            return ()
-        there.remove(same)
-        found.append(float(np.clip(same[1], c.low, c.high)))
-    return (np.array(found),)
+def _as_large(one: Candidate, other: Candidate, values: Array) -> tuple[Array, ...]:
+    """A law's numbers by those of another that have the same units, the last of them for any more; else neutral.
+
+    () where none has the same unit.
+    """
+    found = []
+    there = {
+        c.unit: [v for o, v in zip(other.coordinates, values.tolist(), strict=True) if o.unit == c.unit]
+        for c in one.coordinates
+    }
+    for c in one.coordinates:
+        same = there[c.unit]
+        value = c.neutral if not same else same.pop(0) if len(same) > 1 else same[0]
+        found.append(float(np.clip(value, c.low, c.high)))
+    return (np.array(found),) if any(there.values()) else ()

@@ -26,10 +26,14 @@ def test_by_units_in_their_order_and_within_the_range(high, start):
     assert found == pytest.approx([start])
 
 
-def test_two_numbers_of_one_unit_take_one_each_and_none_is_made_up():
-    both = candidate("asymmetric_friction", ("forward", 2.0, "N m"), ("backward", 2.0, "N m"))
-    (found,) = _as_large(both, STRIBECK, np.array([0.7, 0.2, 0.1]))
-    assert found == pytest.approx([0.7, 0.2])
+def test_a_law_that_contains_another_begins_as_that_one():
+    """Friction by direction begins with the level of Coulomb's in both; what has no partner is neutral."""
+    coulomb = candidate("coulomb_friction", ("level", 2.0, "N m"))
+    numbers = [("forward", 2.0, "N m"), ("backward", 2.0, "N m"), ("viscous", 1.0, "N m s/rad")]
+    (found,) = _as_large(candidate("asymmetric_friction", *numbers), coulomb, np.array([0.7]))
+    assert found == pytest.approx([0.7, 0.7, 0.0])
+    (found,) = _as_large(candidate("asymmetric_friction", *numbers), STRIBECK, np.array([0.7, 0.2, 0.1]))
+    assert found == pytest.approx([0.7, 0.2, 0.0])
     assert _as_large(candidate("quadratic_drag", ("coefficient", 1.0, "N m s^2/rad^2")), STRIBECK, np.zeros(3)) == ()
 
 
