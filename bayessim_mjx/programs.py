@@ -38,23 +38,37 @@ class Kept:
     def __init__(self, function: Callable[..., Any], traced_from: str | None) -> None:
         self.function, self.traced_from = function, traced_from
         self._known: dict[Any, Callable[..., Any]] = {}
-        self._plain = jax.jit(function, compiler_options=compiler_options())
+
+    @property
+    def count(self) -> int:
+        """Programs that were asked for, one for each set of shapes."""
+        return len(self._known)
 
     def __call__(self, *args: Any) -> Any:
         leaves, tree = jax.tree.flatten(args)
-        return self._program(leaves, tree)(*leaves) if self.traced_from else self._plain(*args)
+        return self._program(leaves, tree)(*leaves)
 
     def ready(self, *args: Any) -> None:
         """Compile for these arguments, without a call."""
         leaves, tree = jax.tree.flatten(args)
-        (self._program(leaves, tree).lower(*leaves) if self.traced_from else self._plain.lower(*args)).compile()
+        self._program(leaves, tree).lower(*leaves).compile()
 
     def _program(self, leaves: list[Any], tree: Any) -> Any:
         shapes = tuple((np.shape(x), str(jax.dtypes.canonicalize_dtype(np.result_type(x)))) for x in leaves)
         if (tree, shapes) not in self._known:
-            own = self.traced_from or "", str(tree), str(shapes), jax.default_backend(), _versions(), _sources()
-            self._known[tree, shapes] = self._from_disk(_digest(own), leaves, tree)
+            if self.traced_from is None:
+                found = self._flat(tree)
+            else:
+                own = self.traced_from, str(tree), str(shapes), jax.default_backend(), _versions(), _sources()
+                found = self._from_disk(_digest(own), leaves, tree)
+            self._known[tree, shapes] = found
         return self._known[tree, shapes]
+
+    def _flat(self, tree: Any) -> Any:
+        def flat(*leaves: Any) -> Any:
+            return self.function(*jax.tree.unflatten(tree, leaves))
+
+        return jax.jit(flat, compiler_options=compiler_options())
 
     def _from_disk(self, name: str, leaves: list[Any], tree: Any) -> Any:
         folder = cache.folder()
@@ -64,11 +78,7 @@ class Kept:
         except Exception:  # none, half a file, or of a JAX that wrote another format
             exported = None
         if exported is None:
-
-            def flat(*leaves: Any) -> Any:
-                return self.function(*jax.tree.unflatten(tree, leaves))
-
-            own = jax.jit(flat, compiler_options=compiler_options())
+            own = self._flat(tree)
             try:
                 exported = export.export(own)(*leaves)
                 _write(path, bytes(exported.serialize()))

@@ -44,7 +44,7 @@ def test_a_second_process_need_not_trace(own_cache):
     kept = programs.Kept(second, "key")
     kept.ready(*GIVEN)
     assert kept(*GIVEN)["y"] == pytest.approx([6.0, 24.0]) and kept(*GIVEN)["z"] is None
-    assert not again
+    assert not again and kept.count == 1
 
 
 @pytest.mark.parametrize("other", ["key", "shape", "type"])

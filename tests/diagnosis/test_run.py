@@ -64,7 +64,7 @@ def test_dry_friction_is_named_with_its_level(rubbing):
     weighed = [r["weight"] for r in effect.equivalent_to if "weight" in r]
     expected = 1.0 - sum(weighed) if weighed else np.nan  # nothing to be weighed against is no certainty
     np.testing.assert_allclose(effect.weight_among_rivals, expected, atol=1e-9)
-    assert found.setup.fitter.simulator.traces == 1
+    assert found.setup.fitter.simulator.programs == 1
 
 
 @pytest.mark.ci

@@ -44,7 +44,6 @@ class Simulator:
         lanes: worlds per call.
 
     Attributes:
-        traces: number of times the program was traced (1, whatever is asked).
         rollouts: windows simulated so far.
         apart: whether a world costs as much in a small call as in a large one: on a CPU, not on an accelerator.
     """
@@ -56,10 +55,15 @@ class Simulator:
         self.apart = on_cpu
         self.nv = int(physics.mj_model.nv)
         self.channels = 2 * self.nv
-        self.traces = self.rollouts = 0
+        self.rollouts = 0
         self._run = programs.Kept(self._many, programs.traced_from(physics, "windows"))
         self._no_offset = np.zeros((self.lanes, 2 * self.nv), np.float32)
         self._no_force = jnp.asarray(np.zeros((self.lanes, windows.steps, self.nv), np.float32))
+
+    @property
+    def programs(self) -> int:
+        """Programs so far: 1, whatever is asked."""
+        return self._run.count
 
     def _many(
         self,
@@ -74,7 +78,6 @@ class Simulator:
 
         Worlds are side by side inside the loop: `vmap` of a loop would trace its body several times over.
         """
-        self.traces += 1
         begun = functools.partial(self._begun, batch, active)
         own, past, first = jax.vmap(begun, out_axes=(0, 0, None))(index, thetas, offsets)
         model, lead, (n, count, *_) = self.physics.mj_model, past.steps, own.command.shape

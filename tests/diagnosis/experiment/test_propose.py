@@ -120,7 +120,7 @@ def test_fast_motion_is_proposed_where_only_fast_motion_separates():
 def test_the_program_of_the_diagnosis_is_used_as_it_is():
     setup = contest()[0].setup
     proposal()
-    assert setup.fitter.simulator.traces == 1
+    assert setup.fitter.simulator.programs == 1
 
 
 def test_limits_hold_in_everything_that_is_proposed():

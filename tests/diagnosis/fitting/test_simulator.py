@@ -39,7 +39,7 @@ def test_one_trace_whatever_is_asked(simulator):
     moved = simulator.run(theta[None], 0.01 * rng.normal(size=(1, windows, 2)))
     pushed = simulator.run(theta[None], force=np.full((1, windows, simulator.windows.steps, 1), 0.1))
     some = simulator.run(theta[None], windows=np.array([2, 0]))
-    assert simulator.traces == 1
+    assert simulator.programs == 1
     assert simulator.rollouts - before == (1 + 7 + 1 + 1) * windows + 2
     assert still.shape == (1, windows, simulator.windows.steps, 2) and many.shape[0] == 7
     np.testing.assert_allclose(some[0], still[0, [2, 0]], atol=1e-6)

@@ -58,7 +58,7 @@ def test_what_the_known_parameters_already_do_is_absorbed(setup):
     found = {s.candidate.effect: s for s in screen(fitter, fit, setup.candidates)}
     assert found["viscous_friction"].absorbed > 0.95  # the same column as damping
     assert found["viscous_friction"].absorbed > found["coulomb_friction"].absorbed
-    assert fitter.simulator.traces == 1
+    assert fitter.simulator.programs == 1
 
 
 def test_the_point_that_explains_most_as_simulated_is_among_the_starts(screened):
