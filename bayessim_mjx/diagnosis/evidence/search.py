@@ -20,7 +20,7 @@ from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fit import Fit
 from bayessim_mjx.diagnosis.selection.bounds import widened
 from bayessim_mjx.diagnosis.selection.budget import LEAVING_OUT, SINGLES, TOGETHER
-from bayessim_mjx.diagnosis.selection.laws import special_case
+from bayessim_mjx.diagnosis.selection.laws import related
 from bayessim_mjx.diagnosis.selection.pool import Entries, Pool, cut_back, fit_entries, polish
 from bayessim_mjx.diagnosis.selection.sets import BASE, ODDS, Key, Weighed
 
@@ -100,7 +100,7 @@ class Search:
         return list({p.key: p for p in plans}.values())
 
     def _related(self, best: Key) -> list[Plan]:
-        """In the place of an effect its special cases, and laws that contain it; as large as it is, and as promised.
+        """In the place of an effect what may stand for it (`laws.related`), as large as it is, and as promised.
 
         A promise is one direction: friction that differs by direction, or falls with speed, is none of them.
         """
@@ -109,8 +109,7 @@ class Search:
             rest = best - {effect.label}
             for c in self.pool.candidates if rest in self.pool.models else []:
                 points = self.pool.secants.columns.get(c.label, ())
-                related = special_case(c, effect) or (special_case(effect, c) and c.where == effect.where)
-                if points and related and self._new(rest | {c.label}):
+                if points and related(c, effect) and self._new(rest | {c.label}):
                     starts = _as_large(c, effect, model.values_of(effect))
                     out.append(Plan(rest | {c.label}, np.inf, rest, (Column(c, *points[-1]),), (1.0,), starts))
         return out

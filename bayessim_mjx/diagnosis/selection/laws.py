@@ -26,6 +26,13 @@ def special_case(one: Candidate, of: Candidate) -> bool:
     return contained and (at_one or one.where == of.where) or at_one and one.effect == of.effect
 
 
+def related(one: Candidate, other: Candidate) -> bool:
+    """Whether the one may stand for the other: a special case, a law that contains it, or other inertia of its body."""
+    here = one.where == other.where and one.effect != other.effect
+    inertia = here and _inertial(one.effect) and _inertial(other.effect)
+    return special_case(one, other) or (here and special_case(other, one)) or inertia
+
+
 def special_cases(effect: Candidate) -> tuple[str, ...]:
     """Names of the effects that it contains, from its class."""
     return _contained(effect.effect)
@@ -34,3 +41,8 @@ def special_cases(effect: Candidate) -> tuple[str, ...]:
 @functools.cache  # thousands of pairs are compared, and all installed packages are looked through for a name
 def _contained(effect: str) -> tuple[str, ...]:
     return tuple(getattr(load(effect), "contains", ())) if effect in names() else ()
+
+
+@functools.cache
+def _inertial(effect: str) -> bool:
+    return effect in names() and bool(load(effect).inertial)

@@ -5,7 +5,7 @@ import pytest
 
 from bayessim_mjx.diagnosis.evidence.search import _as_large
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate, Coordinate
-from bayessim_mjx.diagnosis.selection.laws import special_case
+from bayessim_mjx.diagnosis.selection.laws import related, special_case
 
 
 def candidate(effect, *numbers, where="place"):
@@ -45,3 +45,11 @@ def test_a_tied_law_has_each_place_as_a_special_case():
     assert not special_case(tied, one) and not special_case(tied, tied) and not special_case(one, one)
     assert not special_case(candidate("coulomb_friction", where="wrist"), one)
     assert not special_case(candidate("quadratic_drag", where="elbow"), tied)
+
+
+def test_a_payload_and_a_wrong_inertia_of_one_body_are_tried_in_each_others_place():
+    payload, inertia = (candidate(n, where="lower") for n in ("payload", "inertial_parameters"))
+    assert related(payload, inertia) and related(inertia, payload)
+    assert not related(payload, candidate("inertial_parameters", where="upper")) and not related(payload, payload)
+    stribeck, coulomb = (candidate(f"{n}_friction", where="lower") for n in ("stribeck", "coulomb"))
+    assert related(coulomb, stribeck) and related(stribeck, coulomb) and not related(coulomb, payload)
