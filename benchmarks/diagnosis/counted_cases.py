@@ -22,7 +22,7 @@ does not have (`KINDS`' unknown), seeds 9600 to 9604; the scale is drawn as abov
 Velocities are logged in half of the others.
 
 **Frozen** (60 of these cases): of each robot the first three singles and doubles of data sheets, two poor logs, one
-null and one unknown cause. `frozen.json` has what a commit said of them (`frozen.py`).
+null and one unknown cause. `frozen.json` has what a commit said of those that ended (`frozen.py`).
 """
 
 import dataclasses
