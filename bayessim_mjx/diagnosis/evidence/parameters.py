@@ -63,7 +63,8 @@ def integrated(fit: Fit, learnt: Learnt, effects: Sequence[Mapping[int, bool]] =
     layers = {i: _layer(belief, i, p[i], slope[i], S[i, i]) for i in np.flatnonzero(at).tolist()}
     nats += sum(layers.values(), 0.0) - sum(map(_truncated, fit.coordinates))
     nats += sum(_sized(fit, found, free, layers, own) for own in effects)
-    return Integrated(nats, found, free)
+    # of a model so far off that rounding of its products leaves no covariance, nothing is known: it explains nothing
+    return Integrated(nats if np.isfinite(nats) else -np.inf, found, free)
 
 
 @dataclass(frozen=True, eq=False)
