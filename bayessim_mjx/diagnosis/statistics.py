@@ -6,12 +6,13 @@ they are; of one condition alone nothing can be said. Coverage of the intervals:
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
-from scipy.optimize import brentq, nnls
+from scipy.optimize import nnls
 from scipy.special import ndtr
 
 Array = NDArray[np.float64]
@@ -81,15 +82,20 @@ def interval(value: float, replicates: Array) -> tuple[float, float]:
     return value - half, value + half
 
 
-def mixture_interval(weight: Array, mean: Array, sd: Array, inside: float = 0.9) -> tuple[float, float]:
-    """Central interval of a mixture of Gaussians; weight, mean, sd: `[n]`, weights add up to 1."""
-    sd = np.maximum(sd, 1e-12 * np.abs(mean) + 1e-300)
-    ends = float(np.min(mean - 9 * sd)), float(np.max(mean + 9 * sd))
+def mixture_quantiles(weight: Array, mean: Array, sd: Array, ends: Sequence[float]) -> Array:
+    """`[ends, k]`, of mixtures of Gaussians, by bisection of their distribution functions.
 
-    def end(below: float) -> float:
-        return float(brentq(lambda x: float(weight @ ndtr((x - mean) / sd)) - below, *ends))
-
-    return end((1 - inside) / 2), end((1 + inside) / 2)
+    Args:
+        weight: `[m]`, adding up to 1; mean, sd: `[m, k]`; ends: probabilities below.
+    """
+    low = np.tile(np.min(mean - 10 * sd, 0), (len(ends), 1))
+    high = np.tile(np.max(mean + 10 * sd, 0), (len(ends), 1))
+    for _ in range(60):
+        middle = (low + high) / 2
+        below = np.einsum("m,mek->ek", weight, ndtr((middle - mean[:, None]) / sd[:, None]))
+        under = below < np.asarray(ends)[:, None]
+        low, high = np.where(under, middle, low), np.where(under, high, middle)
+    return np.asarray((low + high) / 2)
 
 
 def interval_of_rms(cost: Array, group: NDArray[np.int64]) -> tuple[float, float]:

@@ -99,8 +99,8 @@ class Physics:
         timestep = float(mj_model.opt.timestep)
         for effect in filter(contract.brought, self.effects):
             contract.check(effect, mj_model, self.model, self.substeps)
-        halved = int(mj_model.opt.integrator) == RK4 and self.having("on_command")
-        self.rows = PARTS if halved else 1  # of commands in a timestep, as effects see them
+        divided = int(mj_model.opt.integrator) == RK4 and self.having("on_command")
+        self.rows = PARTS if divided else 1  # of commands in a timestep, as effects see them
         between = timestep / self.rows, self.substeps * self.rows
         self.sites = tuple(effect.bind(mj_model, *between) for effect in self.effects)
         self._memory = tuple(effect.init(at) for effect, at in zip(self.effects, self.sites, strict=True))

@@ -16,7 +16,7 @@ from bayessim_mjx.diagnosis.evidence.weighing import Scored, Weighing
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.selection import heldout
 from bayessim_mjx.diagnosis.selection.models import Model, scored
-from bayessim_mjx.diagnosis.selection.selected import Size
+from bayessim_mjx.diagnosis.selection.selected import Size, size_of
 from bayessim_mjx.diagnosis.selection.sets import Estimated, Key, Weighed
 
 Array = NDArray[np.float64]
@@ -78,17 +78,11 @@ def estimated(weighing: Weighing, found: Weighed) -> Estimated:
     return Estimated(mean, covariance, answer.found.posterior, answer.learnt.hyper.noise, step)
 
 
-def size_of(of: Scored, effect: Candidate) -> Size:
+def size_in(of: Scored, effect: Candidate) -> Size:
     """How large one of the model's effects is."""
     mean, covariance = _own(of)
-    own = [
-        (of.model.fit.names.index(c.name), c) for c, s in zip(effect.coordinates, effect.shapes, strict=True) if not s
-    ]
-    sizes = [
-        Size(c.name.rsplit(".", 1)[1], abs(float(mean[i]) - c.neutral), float(np.sqrt(covariance[i, i])), c.unit)
-        for i, c in own
-    ]
-    return max(sizes, key=lambda size: size.mean / max(size.sd, 1e-12))
+    own = [of.model.fit.names.index(c.name) for c in effect.coordinates]
+    return size_of(effect, mean[own], np.sqrt(np.diag(covariance)[own]))
 
 
 def _step(weighing: Weighing, of: Scored, r: Array) -> Array:

@@ -107,7 +107,9 @@ class Search:
         out, model = [], self.pool.models[best]
         for effect in model.effects:
             rest = best - {effect.label}
-            for c in self.pool.candidates if rest in self.pool.models else []:
+            if rest not in self.pool.models:
+                continue
+            for c in self.pool.candidates:
                 points = self.pool.secants.columns.get(c.label, ())
                 if points and related(c, effect) and self._new(rest | {c.label}):
                     starts = _as_large(c, effect, model.values_of(effect))

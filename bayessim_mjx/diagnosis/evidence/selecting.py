@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from bayessim_mjx.diagnosis import phrases
-from bayessim_mjx.diagnosis.evidence.estimates import at_its_mean, estimated, size_of
+from bayessim_mjx.diagnosis.evidence.estimates import at_its_mean, estimated, size_in
 from bayessim_mjx.diagnosis.evidence.search import Search
 from bayessim_mjx.diagnosis.evidence.weighing import Weighing
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
@@ -74,7 +74,7 @@ def _rival(weighing: Weighing, effect: Candidate, key: Key, found: Weighed) -> R
     behind = max(pool.closure(answer) - pool.closure(model), 0.0)
     nats = found.nats[found.answer] - found.nats[key]
     why = phrases.CONTAINS if contains else phrases.close_by(nats, behind)
-    size = size_of(weighing.scored[key], others[0]) if len(others) == 1 else None
+    size = size_in(weighing.scored[key], others[0]) if len(others) == 1 else None
     return Rival(others, model, pool.closure(model), why, contains or same, size)
 
 

@@ -33,7 +33,7 @@ class Rules:
     factors: tuple[int, ...] = (1, 2, 4, 8)
     more: tuple[int, ...] = (16, 32)  # beyond the budget, where the step is worth more than the tolerance
     contacts: int = 4  # the finest with contacts: what is left falls with the root of the step at best
-    enough: float = 0.6  # noises: an error of the time step that is worth no finer sub-steps
+    enough: float = 0.6  # noises: an error of the time step that needs no finer sub-steps
     nats: float = 1.0  # by which it may move the evidence: half of the sum of its squares, in noises, over all rows
     shorter: int = 5  # halvings of the time step that can be recommended
     worth: float = 1.0  # noises: from here on the user is told

@@ -14,10 +14,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import logsumexp, ndtr
+from scipy.special import logsumexp
 
 from bayessim_mjx.diagnosis.data_sheet import ACCURACY, SURE
 from bayessim_mjx.diagnosis.fitting.fit import Fit
+from bayessim_mjx.diagnosis.statistics import mixture_quantiles
 
 Array = NDArray[np.float64]
 # Shares of the nominal value that are summed over: from a seventh of the prior's accuracy to 100 %; 13 of them change
@@ -61,16 +62,9 @@ class Posterior:
         return np.asarray(moments * scale[:, None] * scale)
 
     def quantiles(self, ends: Sequence[float] = ENDS) -> Array:
-        """`[ends, k]`, of each parameter, by bisection of the mixture's distribution function."""
+        """`[ends, k]`, of each parameter."""
         sd = np.sqrt(np.maximum(np.diagonal(self.covariance, axis1=1, axis2=2), 1e-300))
-        low = np.tile(np.min(self.mean - 10 * sd, 0), (len(ends), 1))
-        high = np.tile(np.max(self.mean + 10 * sd, 0), (len(ends), 1))
-        for _ in range(60):
-            middle = (low + high) / 2
-            below = np.einsum("m,mek->ek", self.weight, ndtr((middle - self.mean[:, None]) / sd[:, None]))
-            under = below < np.asarray(ends)[:, None]
-            low, high = np.where(under, middle, low), np.where(under, high, middle)
-        return (low + high) / 2
+        return mixture_quantiles(self.weight, self.mean, sd, ends)
 
     def accuracy(self, kind: str) -> tuple[float, float, float]:
         """5, 50 and 95 % quantiles of a kind's accuracy, as a share."""

@@ -7,6 +7,9 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 from bayessim_mjx.diagnosis.selection.models import Model
@@ -14,6 +17,8 @@ from bayessim_mjx.diagnosis.selection.pool import Pool
 from bayessim_mjx.diagnosis.selection.screen import Screened
 from bayessim_mjx.diagnosis.selection.sets import Estimated, Key, Weighed
 from bayessim_mjx.diagnosis.selection.tried import Settings, Tried
+
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -28,6 +33,17 @@ class Size:
     mean: float
     sd: float
     unit: str
+
+
+def size_of(effect: Candidate, values: Array, sd: Array) -> Size:
+    """How large an effect with these numbers `[k]` and standard deviations `[k]` is; shapes are no sizes."""
+    each = zip(effect.coordinates, effect.shapes, values, sd, strict=True)
+    sizes = [
+        Size(c.name.rsplit(".", 1)[1], abs(float(v - c.neutral)), float(s), c.unit)
+        for c, shape, v, s in each
+        if not shape
+    ]
+    return max(sizes, key=lambda size: size.mean / max(size.sd, 1e-12))
 
 
 @dataclass(frozen=True, eq=False)

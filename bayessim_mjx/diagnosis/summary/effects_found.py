@@ -13,7 +13,7 @@ from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.result import Estimate, FoundEffect
 from bayessim_mjx.diagnosis.selection import bounds, heldout, predicted_gain
 from bayessim_mjx.diagnosis.selection.models import Model
-from bayessim_mjx.diagnosis.selection.selected import Rival, Size
+from bayessim_mjx.diagnosis.selection.selected import Rival, Size, size_of
 from bayessim_mjx.diagnosis.setup import Setup
 
 # operating conditions, from which on closure is quoted of conditions that the choice was made without: without one of
@@ -102,16 +102,15 @@ def _effect(found: Findings, effect: Candidate, sd: np.ndarray, part: _Part) -> 
     weights = _weights(found, [model, *(r.model for r in weighed)])
     weight_of = dict(zip(map(id, weighed), weights[1:], strict=True))
     own = [model.fit.names.index(c.name) for c in effect.coordinates]
-    numbers, ends, sizes = {}, [], []
+    numbers, ends = {}, []
     for i, c in zip(own, effect.coordinates, strict=True):
         value, word = float(model.fit.values[i]), c.name.rsplit(".", 1)[1]
         bound = bounds.of(setup.physics, c, value)
         deviation = float(sd[i]) if bound is None or bound.kind == "off" else float("nan")
         numbers[word] = Estimate(value, deviation, _unit(setup, effect, c.unit), bound.kind if bound else "")
-        sizes.append(Size(word, abs(value - c.neutral), float(sd[i]), c.unit))
         clause = bound.why if bound else UNTOLD if deviation > UNKNOWN * (c.high - c.low) else ""
         ends += [f"{word.replace('_', ' ')} {clause}"] if clause else []
-    shared = _shared(effect, sizes, weighed, weights)
+    shared = _shared(effect, size_of(effect, model.fit.values[own], sd[own]), weighed, weights)
     return FoundEffect(
         name=effect.effect,
         where=effect.where,
@@ -127,24 +126,23 @@ def _effect(found: Findings, effect: Candidate, sd: np.ndarray, part: _Part) -> 
     )
 
 
-def _shared(effect: Candidate, sizes: list[Size], rivals: list[Rival], weights: list[float]) -> dict[str, Any]:
+def _shared(effect: Candidate, own: Size, rivals: list[Rival], weights: list[float]) -> dict[str, Any]:
     """How large it is, whichever of the rivals it is: of those whose sizes have its unit.
 
     Args:
-        sizes: of the effect's parameters; weights: of the effect, then of the rivals.
+        own: the effect's size; weights: of the effect, then of the rivals.
     """
-    amplitudes = [s for s, shape in zip(sizes, effect.shapes, strict=True) if not shape]
-    own = max(amplitudes, key=lambda s: s.mean / max(s.sd, 1e-12))
     alike = [(r, w) for r, w in zip(rivals, weights[1:], strict=True) if r.size and r.size.unit == own.unit]
     if not alike or not own.unit:
         return {}
     every = [own, *(r.size for r, _ in alike if r.size)]
     weight = np.array([weights[0], *(w for _, w in alike)])
-    mean, sd = (np.array([getattr(s, k) for s in every]) for k in ("mean", "sd"))
-    low, high = statistics.mixture_interval(weight / weight.sum(), mean, sd)
+    mean, sd = (np.array([[getattr(s, k)] for s in every]) for k in ("mean", "sd"))
+    weight = weight / weight.sum()
+    low, high = statistics.mixture_quantiles(weight, mean, np.maximum(sd, 1e-300), (0.05, 0.95))[:, 0].tolist()
     return {
         "effects": [effect.label, *(r.effects[0].label for r, _ in alike)],
-        "mean": float(weight @ mean / weight.sum()),
+        "mean": float(weight @ mean[:, 0]),
         "low": max(low, 0.0),
         "high": high,
         "unit": own.unit,

@@ -35,7 +35,7 @@ def test_a_share_that_reaches_no_joint_is_said_to_be_told_by_nothing(monkeypatch
 def test_rivals_of_one_unit_share_a_size():
     """A delay of 10 +- 1 ms, of two thirds, and a filter of 13 +- 1 ms: the mixture's mean and 90 % interval."""
     effect = SimpleNamespace(label="delay@motor", shapes=np.zeros(1, bool))
-    own = [Size("delay", 0.010, 0.001, "s")]
+    own = Size("delay", 0.010, 0.001, "s")
 
     def rival(label, size):
         return SimpleNamespace(effects=[SimpleNamespace(label=label)], size=size)
