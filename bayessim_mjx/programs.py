@@ -96,7 +96,7 @@ def traced_from(physics: Physics, *more: Any) -> str | None:
     if None in sources:
         return None
     own = physics.effects, physics.model_space.parameters, physics.substeps, physics.max_qvel, physics.unroll
-    return _digest([hashlib.sha256(model).hexdigest(), *sorted(map(str, sources)), repr(own), repr(more)])
+    return _digest([hashlib.sha256(model.tobytes()).hexdigest(), *sorted(map(str, sources)), repr(own), repr(more)])
 
 
 def _source(of: type) -> str | None:
