@@ -136,10 +136,13 @@ def marginal(windows: Windows, hyper: Hyper) -> Marginal:
     root[:forces, :forces] = np.kron(np.diag(hyper.amplitude), correlation(windows.nodes, hyper.memory))
     VY = root.T @ gram[:, own:, :own]
     inner = root.T @ gram[:, own:, own:] @ root + np.eye(size)
-    cov = np.asarray(np.linalg.inv(inner), np.float64)
-    mean = cov @ VY
-    logdet = np.linalg.slogdet(inner)[1] + 2 * windows.rows * float(np.sum(np.log(hyper.noise)))
-    return Marginal(gram[:, :own, :own] - VY.mT @ mean, logdet, root, cov, mean)
+    rounding = np.finfo(np.float64).eps * np.diagonal(inner, axis1=1, axis2=2)[..., None]
+    lower = np.linalg.cholesky(inner + rounding * np.eye(size))
+    back = np.asarray(np.linalg.inv(lower), np.float64)
+    half = back @ VY  # squared it is subtracted: an inverse of `inner` there would lose all digits of large residuals
+    logdet = 2 * np.sum(np.log(np.diagonal(lower, axis1=1, axis2=2)), 1)
+    logdet += 2 * windows.rows * float(np.sum(np.log(hyper.noise)))
+    return Marginal(gram[:, :own, :own] - half.mT @ half, logdet, root, back.mT @ back, back.mT @ half)
 
 
 @dataclass(frozen=True, eq=False)

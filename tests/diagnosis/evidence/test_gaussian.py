@@ -28,6 +28,22 @@ def test_force_and_start_are_integrated_out():
         assert log_density(found.Q, found.logdet, p) == pytest.approx(np.array(exact), rel=1e-8)
 
 
+def test_products_keep_their_digits_where_residuals_are_many_thousand_noises():
+    """Against least squares of the stacked columns; a linear drive's log leaves thousands of noises unexplained."""
+    case = draw(5, gain=7e7)
+    found = marginal(case.windows(), HYPER)
+    size = found.root.shape[0]
+    noise = np.tile(HYPER.noise, ROWS)[:, None]
+    for r, A, B, D, Q, logdet in zip(case.r, case.A, case.B, case.D, found.Q, found.logdet, strict=True):
+        explained = np.concatenate([D * case.scale[0], B * SPREAD], 1) / noise @ found.root
+        rest = np.concatenate([r[:, None], A], 1) / noise
+        stacked = np.block([[explained, rest], [np.eye(size), np.zeros((size, 3))]])
+        R = np.linalg.qr(stacked, mode="r")
+        assert pytest.approx(R[size:, size:].T @ R[size:, size:], rel=1e-3, abs=1e-3) == Q
+        exact = 2 * np.sum(np.log(np.abs(np.diag(R)[:size]))) + 2 * ROWS * np.sum(np.log(HYPER.noise))
+        assert logdet == pytest.approx(exact, abs=1e-3)
+
+
 def test_the_force_is_its_posterior_mean():
     """Against conditioning of the joint Gaussian of force and residual."""
     case = draw(1)
