@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -112,23 +112,20 @@ class Estimated:
     step: Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 
-def core(key: Key, excess: Mapping[Key, float]) -> Key:
-    """The least subset of a set that leaves no relevant part of the gap more.
+def relevant(sizes: Iterable[float], gap: float) -> bool:
+    """Whether every effect of a set matters; where the known parameters alone leave no more than noise, none does.
 
     Args:
-        excess: {set: held-out squared error above the noise, in noise variances}, of all sets that were fitted.
+        sizes: by how much each changes the motion, mean square in noise variances.
+        gap: squared error that the known parameters leave above the noise, in noise variances.
     """
-    limit = excess[key] + RELEVANCE.noise + RELEVANCE.share * max(excess[BASE], 0.0)
-    enough = [k for k in excess if k <= key and excess[k] <= limit]
-    return min(enough, key=lambda k: (len(k), excess[k], sorted(k)))
+    least = RELEVANCE.noise + RELEVANCE.share * gap if gap > RELEVANCE.noise else np.inf
+    return all(size > least for size in sizes)
 
 
-def weighed(
-    evidence: Mapping[Key, float], excess: Mapping[Key, float], numbers: Mapping[Key, int], candidates: int
-) -> Weighed:
-    """The posterior; `evidence` and `excess` (see `core`) have the empty set, the known parameters alone."""
-    own = {k: excess[k] for k in evidence}
-    total = {k: e + log_prior(k, candidates) for k, e in evidence.items() if core(k, own) == k}
+def weighed(evidence: Mapping[Key, float], numbers: Mapping[Key, int], candidates: int) -> Weighed:
+    """The posterior; `evidence` has the empty set, the known parameters alone."""
+    total = {k: e + log_prior(k, candidates) for k, e in evidence.items()}
     base, best = total[BASE], max(total.values())
     each = {k: float(np.exp(t - best)) for k, t in total.items()}
     whole = sum(each.values())
