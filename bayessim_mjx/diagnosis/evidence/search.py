@@ -148,7 +148,7 @@ class Search:
                 widened(self.pool, self.pool.models[key], self.say)
             self.weighing.score(some)
             nats = self.weighing.weighed().nats
-            near = [k for k in some if nats[k] > max(nats.values()) - EFFORT.margin]
+            near = [k for k in some if nats.get(k, -np.inf) > max(nats.values()) - EFFORT.margin]
             fewer = {k - {x}: k for k in near[::-1] for x in sorted(k) if k - {x} not in self.weighing.scored}
             if not fewer or self.pool.settings.budget.over(LEAVING_OUT):
                 return

@@ -13,6 +13,8 @@ from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
 from bayessim_mjx.diagnosis.fitting.quadratic import Quadratic, Starts, eliminate
 
 Array = NDArray[np.float64]
+CHANGE = 0.3  # noise sd: rms by which a finite difference changes the residuals, far above rounding
+REACH = 16.0  # by which its step may be longer or shorter than that of a column of which nothing is known
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +49,23 @@ class Fit:
     @property
     def names(self) -> tuple[str, ...]:
         return tuple(c.name for c in self.coordinates)
+
+    @property
+    def usual(self) -> Array:
+        """Steps `[k]` of finite differences where nothing is known of the columns."""
+        return np.array([c.step for c in self.coordinates])
+
+    def steps(self) -> Array:
+        """Of the columns' finite differences `[k]`: as long as changes the motion by `CHANGE`, going by the last ones.
+
+        Numbers that do the same to the motion then have the same columns, but for a factor. A secant's own error (its
+        second order, where friction sticks) would else tell them apart.
+        """
+        own = self.usual
+        if self.A.shape != (*self.r.shape, len(own)):
+            return own
+        size = np.sqrt(np.mean(self.A**2, axis=(0, 1)))
+        return np.clip(np.divide(CHANGE, size, where=size > 0, out=own.copy()), own / REACH, own * REACH)
 
     def trust(self) -> Array:
         """Factors `[k]` of the priors' precisions: 1, but where an accuracy is inferred (`Coordinate.kind`).

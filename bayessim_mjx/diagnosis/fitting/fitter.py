@@ -71,18 +71,16 @@ class Fitter:
         return theta
 
     def _differences(
-        self, coordinates: Sequence[Coordinate], values: Array, which: Sequence[int]
+        self, fit: Fit, values: Array, which: Sequence[int], steps: Array
     ) -> tuple[list[Array], list[float]]:
         """Shifted thetas for the columns `which`, and the shifts."""
-        thetas, steps = [], []
+        thetas, signed = [], []
         for i in which:
-            c = coordinates[i]
-            step = c.step if values[i] + c.step <= c.high else -c.step
-            shifted = values.copy()
-            shifted[i] += step
-            thetas.append(self.vector(coordinates, shifted))
-            steps.append(step)
-        return thetas, steps
+            shifted, step = values.copy(), float(steps[i])
+            signed.append(step if values[i] + step <= fit.coordinates[i].high else -step)
+            shifted[i] += signed[-1]
+            thetas.append(self.vector(fit.coordinates, shifted))
+        return thetas, signed
 
     def start_columns(self, theta: Array, offsets: Array, r: Array) -> Array:
         """B `[W, n, s]` at theta."""
@@ -105,7 +103,7 @@ class Fitter:
     def refresh(self, fit: Fit) -> Fit:
         """Residuals and all columns anew at the fit's point."""
         theta = self.vector(fit.coordinates, fit.values)
-        thetas, steps = self._differences(fit.coordinates, fit.values, range(len(fit.coordinates)))
+        thetas, steps = self._differences(fit, fit.values, range(len(fit.coordinates)), fit.steps())
         offsets = np.repeat(fit.offsets[None], 1 + len(thetas), 0)
         r = self.whiten(self.simulator.run(np.stack([theta, *thetas]), offsets))
         B = self.start_columns(theta, fit.offsets, r[0])
@@ -200,7 +198,7 @@ class Fitter:
         thetas, offsets, sizes, steps = [], [], [], {}
         for i, which in asked.items():
             values, x = trial[i]
-            shifted, steps[i] = self._differences(fits[i].coordinates, values, which)
+            shifted, steps[i] = self._differences(fits[i], values, which, fits[i].usual)
             own = shifted if alone else [self.vector(fits[i].coordinates, values), *shifted]
             thetas += own
             offsets += [x] * len(own)

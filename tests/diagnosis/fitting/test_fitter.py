@@ -102,3 +102,21 @@ def test_columns_of_steps_that_are_refused_are_not_simulated_on_a_cpu(rubbing, m
     np.testing.assert_array_equal(one_by_one.values, together.values)
     np.testing.assert_array_equal(one_by_one.A, together.A)
     assert spent[1] < spent[0]
+
+
+def test_numbers_that_do_the_same_have_the_same_column(tmp_path):
+    """A joint's damping and viscous friction, near friction that sticks: steps of the same change tell nothing apart."""
+    effects = ["coulomb_friction", "viscous_friction"]
+    setup = prepare(nominal(tmp_path), recorded(friction=FRICTION, count=4), effects)
+    fitter, fit = fitted(setup)
+    for candidate, value in zip(setup.candidates, (FRICTION, 0.01), strict=True):
+        fit = fitter.derive(fit, candidate.coordinates, np.full(len(candidate.coordinates), value))
+    first = fitter.refresh(fit)  # at steps by their ranges
+    again = fitter.refresh(first)
+    own, other = next(i for i, n in enumerate(fit.names) if n.endswith(NAMES[0])), len(fit.names) - 1
+
+    def apart(A):
+        a, b = A[..., own].ravel(), A[..., other].ravel()
+        return float(np.linalg.norm(a - b * (a @ b) / (b @ b)) / np.linalg.norm(a))
+
+    assert apart(again.A) < min(5e-3, apart(first.A) / 3)
