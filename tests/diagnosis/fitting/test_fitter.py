@@ -105,7 +105,7 @@ def test_columns_of_steps_that_are_refused_are_not_simulated_on_a_cpu(rubbing, m
 
 
 def test_numbers_that_do_the_same_have_the_same_column(tmp_path):
-    """A joint's damping and viscous friction, near friction that sticks: steps of the same change tell nothing apart."""
+    """A joint's damping and viscous friction, near friction that sticks: steps of one change tell nothing apart."""
     effects = ["coulomb_friction", "viscous_friction"]
     setup = prepare(nominal(tmp_path), recorded(friction=FRICTION, count=4), effects)
     fitter, fit = fitted(setup)
