@@ -13,7 +13,8 @@ from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
 from bayessim_mjx.diagnosis.fitting.quadratic import Quadratic, Starts, eliminate
 
 Array = NDArray[np.float64]
-CHANGE = 0.3  # noise sd: rms by which a finite difference changes the residuals, far above rounding
+# noise sd, rms by which a finite difference changes the residuals: rounding is 2e-4 to 6e-4, a second order a hundredth
+CHANGE = 1.0
 REACH = 16.0  # by which its step may be longer or shorter than that of a column of which nothing is known
 
 
@@ -66,6 +67,10 @@ class Fit:
             return own
         size = np.sqrt(np.mean(self.A**2, axis=(0, 1)))
         return np.clip(np.divide(CHANGE, size, where=size > 0, out=own.copy()), own / REACH, own * REACH)
+
+    def inward(self, values: Array, steps: Array) -> Array:
+        """Steps down where ranges end above."""
+        return np.where(values + steps <= [c.high for c in self.coordinates], steps, -steps)
 
     def trust(self) -> Array:
         """Factors `[k]` of the priors' precisions: 1, but where an accuracy is inferred (`Coordinate.kind`).

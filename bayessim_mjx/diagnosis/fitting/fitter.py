@@ -70,17 +70,9 @@ class Fitter:
             theta[list(c.index)] = v
         return theta
 
-    def _differences(
-        self, fit: Fit, values: Array, which: Sequence[int], steps: Array
-    ) -> tuple[list[Array], list[float]]:
-        """Shifted thetas for the columns `which`, and the shifts."""
-        thetas, signed = [], []
-        for i in which:
-            shifted, step = values.copy(), float(steps[i])
-            signed.append(step if values[i] + step <= fit.coordinates[i].high else -step)
-            shifted[i] += signed[-1]
-            thetas.append(self.vector(fit.coordinates, shifted))
-        return thetas, signed
+    def _shifts(self, fit: Fit, values: Array, which: Sequence[int], steps: Array) -> list[Array]:
+        """Thetas with one number moved by its step each."""
+        return [self.vector(fit.coordinates, values + np.where(np.arange(len(values)) == i, steps, 0.0)) for i in which]
 
     def start_columns(self, theta: Array, offsets: Array, r: Array) -> Array:
         """B `[W, n, s]` at theta."""
@@ -101,13 +93,16 @@ class Fitter:
         return self.refresh(fit)
 
     def refresh(self, fit: Fit) -> Fit:
-        """Residuals and all columns anew at the fit's point."""
-        theta = self.vector(fit.coordinates, fit.values)
-        thetas, steps = self._differences(fit, fit.values, range(len(fit.coordinates)), fit.steps())
-        offsets = np.repeat(fit.offsets[None], 1 + len(thetas), 0)
-        r = self.whiten(self.simulator.run(np.stack([theta, *thetas]), offsets))
+        """Residuals and all columns anew at the fit's point: central differences where ranges have room."""
+        theta, every = self.vector(fit.coordinates, fit.values), range(len(fit.values))
+        steps = fit.inward(fit.values, fit.steps())
+        both = [i for i in every if fit.coordinates[i].low <= fit.values[i] - steps[i] <= fit.coordinates[i].high]
+        thetas = [theta, *self._shifts(fit, fit.values, every, steps), *self._shifts(fit, fit.values, both, -steps)]
+        r = self.whiten(self.simulator.run(np.stack(thetas), np.repeat(fit.offsets[None], len(thetas), 0)))
+        A = quadratic.columns(r[0], r[1 : 1 + len(every)], steps)
+        A[:, :, both] = (A[:, :, both] + quadratic.columns(r[0], r[1 + len(every) :], -steps[both])) / 2
         B = self.start_columns(theta, fit.offsets, r[0])
-        new = replace(fit, r=r[0], A=quadratic.columns(r[0], r[1:], steps), B=B, weight=weights(r[0]) * self.measured)
+        new = replace(fit, r=r[0], A=A, B=B, weight=weights(r[0]) * self.measured)
         new = replace(new, doubt=self._doubt(self._data(new, new.r, new.offsets)))
         return replace(new, cost=self.cost(new, new.r, new.offsets, new.values))
 
@@ -172,7 +167,7 @@ class Fitter:
 
     def _tried(
         self, fits: Sequence[Fit], trial: Sequence[tuple[Array, Array]], asked: Mapping[int, Sequence[int]]
-    ) -> dict[int, tuple[Array, list[float]]]:
+    ) -> dict[int, tuple[Array, Array]]:
         """{fit: (residuals at its trial point and at those shifted for the columns asked for, the shifts)}.
 
         Where each world costs as much in a small call as in a large one, shifted ones are simulated after the others,
@@ -193,12 +188,13 @@ class Fitter:
         trial: Sequence[tuple[Array, Array]],
         asked: Mapping[int, Sequence[int]],
         alone: bool = False,
-    ) -> dict[int, tuple[Array, list[float]]]:
+    ) -> dict[int, tuple[Array, Array]]:
         """`_tried` in one call; alone: without the trial points themselves."""
         thetas, offsets, sizes, steps = [], [], [], {}
         for i, which in asked.items():
             values, x = trial[i]
-            shifted, steps[i] = self._differences(fits[i], values, which, fits[i].usual)
+            moves = fits[i].inward(values, fits[i].usual)
+            shifted, steps[i] = self._shifts(fits[i], values, which, moves), moves[list(which)]
             own = shifted if alone else [self.vector(fits[i].coordinates, values), *shifted]
             thetas += own
             offsets += [x] * len(own)
@@ -214,9 +210,7 @@ class Fitter:
         cost = self.cost(fit, r, x, values)
         return cost < fit.cost or not np.isfinite(fit.cost), cost
 
-    def _stepped(
-        self, fit: Fit, values: Array, x: Array, r: Array, which: Sequence[int], steps: Sequence[float]
-    ) -> Fit:
+    def _stepped(self, fit: Fit, values: Array, x: Array, r: Array, which: Sequence[int], steps: Array) -> Fit:
         """The fit at a trial point where that is better, else more damped where it was."""
         better, cost = self._better(fit, r[0], values, x)
         if better:

@@ -270,7 +270,7 @@ def weights(r: Array) -> Array:
     return np.minimum(1.0, limit / np.maximum(each, 1e-300))
 
 
-def columns(r: Array, shifted: Array, steps: Sequence[float]) -> Array:
+def columns(r: Array, shifted: Array, steps: Array) -> Array:
     """A `[W, n, k]`: minus the derivative of the residual."""
     if not len(steps):
         return np.zeros((*r.shape, 0))
