@@ -48,8 +48,9 @@ class Plan:
     """A set that promises something, and how to begin its fit.
 
     Attributes:
-        key: its effects; nats: of evidence and prior over the known parameters; parent: the fitted model to start from.
+        key: its effects; nats: of evidence and prior over the known parameters; parent: the fitted model it extends.
         columns, amounts: of the effects that it has more; points: further starting points of a single one.
+        origin: the fitted model whose known parameters it begins at; None: its parent's.
     """
 
     key: Key
@@ -58,6 +59,7 @@ class Plan:
     columns: tuple[Column, ...] = ()
     amounts: tuple[float, ...] = ()
     points: tuple[Array, ...] = ()
+    origin: Key | None = None
 
 
 def around(weighing: Weighing, key: Key, say: Progress) -> list[Plan]:

@@ -102,6 +102,7 @@ class Search:
     def _related(self, best: Key) -> list[Plan]:
         """In the place of an effect what may stand for it (`laws.related`), as large as it is, and as promised.
 
+        All else begins where the effect has it: a law with a neutral number more is the same model, in the same place.
         A promise is one direction: friction that differs by direction, or falls with speed, is none of them.
         """
         out, model = [], self.pool.models[best]
@@ -113,7 +114,7 @@ class Search:
                 points = self.pool.secants.columns.get(c.label, ())
                 if points and related(c, effect) and self._new(rest | {c.label}):
                     starts = _as_large(c, effect, model.values_of(effect))
-                    out.append(Plan(rest | {c.label}, np.inf, rest, (Column(c, *points[-1]),), (1.0,), starts))
+                    out.append(Plan(rest | {c.label}, np.inf, rest, (Column(c, *points[-1]),), (1.0,), starts, best))
         return out
 
     def _new(self, key: Key) -> bool:
@@ -169,7 +170,7 @@ class Search:
         self.weighing.score([p.key for p in plans])
 
     def _entry(self, plan: Plan) -> tuple[list[Fit], tuple[Candidate, ...]]:
-        pool, model = self.pool, self.pool.models[plan.parent]
+        pool, model = self.pool, self.pool.models[plan.parent if plan.origin is None else plan.origin]
         kept = tuple(e for e in model.effects if e.label in plan.key)
         fit = model.fit if len(kept) == len(model.effects) else cut_back(pool, model, kept)
         if not plan.columns:
