@@ -52,11 +52,11 @@ def at_its_mean(weighing: Weighing, key: Key) -> Model:
 
 
 def estimated(weighing: Weighing, found: Weighed) -> Estimated:
-    """Of the answer's numbers; known parameters with the sets beside it, by their probabilities."""
+    """Of the answer's numbers; known parameters with all sets that are possible, by their probabilities."""
     answer, base = weighing.scored[found.answer], len(weighing.pool.fitter.base)
     mean, covariance = _own(answer)
-    keys = [found.answer, *found.beside]
-    share = np.array([found.weight[k] for k in keys])
+    keys = found.possible
+    share = np.array([found.sets[k] for k in keys])
     share /= share.sum()
     known = np.zeros((base, base))
     for key, weight in zip(keys, share, strict=True):

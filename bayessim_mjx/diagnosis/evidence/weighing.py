@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,25 +15,19 @@ from bayessim_mjx.diagnosis.fitting.fit import Fit
 from bayessim_mjx.diagnosis.residual import forcing
 from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.selection.pool import Pool
-from bayessim_mjx.diagnosis.selection.sets import BASE, RELEVANCE, Key, Weighed, log_prior, relevant, weighed
+from bayessim_mjx.diagnosis.selection.sets import BASE, RELEVANCE, Key, Weighed, log_prior, weighed
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class Scored:
-    """A fitted model with its evidence.
-
-    Attributes:
-        fit: its own, with what simulators differ by (`doubts`).
-        alone: of each effect, by how much it changes the motion (`alone`).
-    """
+    """A fitted model with its evidence; fit: its own, with what simulators differ by (`doubts`)."""
 
     model: Model
     fit: Fit
     learnt: Learnt
     found: Integrated
-    alone: Sequence[float]
 
 
 class Weighing:
@@ -65,8 +59,7 @@ class Weighing:
                 fit, spread = self.doubted(model.fit), self.pool.fitter.spread
                 own = windows_of(fit.r, fit.A, fit.B, self.D, fit.offsets, spread, self.scale, self.channels)
                 learnt = learn(own, belief_of(fit), self._alike())
-                found = integrated(fit, learnt, _numbers(model))
-                self.scored[key] = Scored(model, fit, learnt, found, alone(model, spread))
+                self.scored[key] = Scored(model, fit, learnt, integrated(fit, learnt, _numbers(model)))
 
     def _alike(self) -> list[Hyper]:
         """Hyperparameters to begin at: of the known parameters alone, and of the likeliest set."""
@@ -106,10 +99,10 @@ class Weighing:
         return self._weighed({k: _without(s, kept) for k, s in self.scored.items()})
 
     def _weighed(self, nats: dict[Key, float]) -> Weighed:
-        gap = self.excess(BASE)
-        nats = {k: x for k, x in nats.items() if relevant(self.scored[k].alone, gap)}
+        floor = self._floor()
+        excess = {k: self._error(k) - floor for k in self.scored}
         numbers = {k: sum(len(e.coordinates) for e in s.model.effects) for k, s in self.scored.items()}
-        return weighed(nats, numbers, len(self.pool.candidates))
+        return weighed(nats, excess, numbers, len(self.pool.candidates))
 
 
 def _without(of: Scored, kept: NDArray[np.bool_]) -> float:
@@ -118,22 +111,6 @@ def _without(of: Scored, kept: NDArray[np.bool_]) -> float:
     part = replace(there, Q=there.Q[kept], logdet=there.logdet[kept], cov=there.cov[kept], mean=there.mean[kept])
     learnt = replace(of.learnt, marginal=part, step=belief_of(of.fit).best(part.Q.sum(0)))
     return integrated(of.fit, learnt, _numbers(of.model)).nats
-
-
-def alone(model: Model, spread: Array) -> list[float]:
-    """By how much each effect changes the motion: mean square in noise variances, all else held but start states.
-
-    Known parameters that do nearly the same do not make it smaller: whether they are far from the data sheet or the
-    effect is there, the evidence decides. An effect is proportional to those of its numbers that are no shapes.
-    """
-    fit, out = model.fit, []
-    S = fit.quadratic(spread)[0].S.sum(0)
-    for own in _numbers(model):
-        step = np.zeros(len(fit.values))
-        for i in (i for i, shape in own.items() if not shape):
-            step[i] = fit.values[i] - fit.coordinates[i].neutral
-        out.append(float(step @ S @ step) / fit.r.size)
-    return out
 
 
 def _numbers(model: Model) -> list[dict[int, bool]]:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import logsumexp
 
 from bayessim_mjx.diagnosis.selection.accuracy import Posterior
 
@@ -60,16 +61,19 @@ ODDS = Odds()
 class Weighed:
     """Posterior probabilities of the sets that were fitted, most likely first.
 
-    Sets with an effect that does not matter are no explanations of their own: they are left out.
+    A set with effects that do not matter is no explanation of its own: it counts for the one without these (`core`).
+    What known parameters are is another matter: such an effect may be doing their work.
 
     Attributes:
-        weight: {set: probability}; nats: {set: log of evidence and prior over those of the known parameters alone}.
-        numbers: {set: free numbers of its effects}.
+        weight: {explanation: probability}; nats: {explanation: log of evidence and prior over those of the known
+            parameters alone}. numbers: {set: free numbers of its effects}.
+        sets: {set: probability}, every one by itself.
     """
 
     weight: Mapping[Key, float]
     nats: Mapping[Key, float]
     numbers: Mapping[Key, int]
+    sets: Mapping[Key, float]
 
     @property
     def answer(self) -> Key:
@@ -80,6 +84,12 @@ class Weighed:
     def beside(self) -> list[Key]:
         """The other sets that the evidence does not speak strongly against, most likely first."""
         return [k for k in self._within(ODDS.strong) if k != self.answer]
+
+    @property
+    def possible(self) -> list[Key]:
+        """The sets by themselves that the evidence does not speak strongly against, and the answer."""
+        best = max(self.sets.values())
+        return list(dict.fromkeys([self.answer, *(k for k, w in self.sets.items() if w * ODDS.strong >= best)]))
 
     def told(self) -> list[dict[str, Any]]:
         """The sets that hold all but a thousandth of the probability, and the known parameters alone, for JSON."""
@@ -112,22 +122,30 @@ class Estimated:
     step: Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 
-def relevant(sizes: Iterable[float], gap: float) -> bool:
-    """Whether every effect of a set matters; where the known parameters alone leave no more than noise, none does.
+def core(key: Key, excess: Mapping[Key, float]) -> Key:
+    """The least subset of a set that leaves no relevant part of the gap more.
 
     Args:
-        sizes: by how much each changes the motion, mean square in noise variances.
-        gap: squared error that the known parameters leave above the noise, in noise variances.
+        excess: {set: held-out squared error above the noise, in noise variances}, of all sets that were fitted.
     """
-    least = RELEVANCE.noise + RELEVANCE.share * gap if gap > RELEVANCE.noise else np.inf
-    return all(size > least for size in sizes)
+    limit = excess[key] + RELEVANCE.noise + RELEVANCE.share * max(excess[BASE], 0.0)
+    enough = [k for k in excess if k <= key and excess[k] <= limit]
+    return min(enough, key=lambda k: (len(k), excess[k], sorted(k)))
 
 
-def weighed(evidence: Mapping[Key, float], numbers: Mapping[Key, int], candidates: int) -> Weighed:
-    """The posterior; `evidence` has the empty set, the known parameters alone."""
+def weighed(
+    evidence: Mapping[Key, float], excess: Mapping[Key, float], numbers: Mapping[Key, int], candidates: int
+) -> Weighed:
+    """The posterior; `evidence` and `excess` (see `core`) have the empty set, the known parameters alone."""
     total = {k: e + log_prior(k, candidates) for k, e in evidence.items()}
-    base, best = total[BASE], max(total.values())
-    each = {k: float(np.exp(t - best)) for k, t in total.items()}
-    whole = sum(each.values())
-    order = sorted(total, key=lambda k: (-total[k], len(k), sorted(k)))
-    return Weighed({k: each[k] / whole for k in order}, {k: total[k] - base for k in order}, numbers)
+    own, of = {k: excess[k] for k in evidence}, dict[Key, list[float]]()
+    for key, nats in total.items():
+        of.setdefault(core(key, own), []).append(nats - total[BASE])
+    explained = {k: float(logsumexp(each)) for k, each in of.items()}
+    return Weighed(_shares(explained), dict(explained), numbers, _shares(total))
+
+
+def _shares(nats: Mapping[Key, float]) -> dict[Key, float]:
+    """Probabilities by their logs, the greatest first."""
+    whole = logsumexp(list(nats.values()))
+    return {k: float(np.exp(nats[k] - whole)) for k in sorted(nats, key=lambda k: (-nats[k], len(k), sorted(k)))}

@@ -87,7 +87,8 @@ def contest():
 
 def concluded(pool, answer):
     """A selection that names the answer, and holds all that were fitted for equally likely."""
-    weighed = Weighed(dict.fromkeys(pool.models, 1 / len(pool.models)), dict.fromkeys(pool.models, 0.0), {})
+    even = dict.fromkeys(pool.models, 1 / len(pool.models))
+    weighed = Weighed(even, dict.fromkeys(pool.models, 0.0), {}, even)
     shares = {"subsets": {}, "promised": (0.0, {}), "chosen": {}, "elsewhere": float("nan")}
     nothing = {"hidden": (), "stand_ins": {}, "rivals": {}, "estimated": None}
     return selection_of(pool, answer, weighed=weighed, **shares, **nothing)

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from bayessim_mjx.diagnosis.selection import sets
-from bayessim_mjx.diagnosis.selection.sets import RELEVANCE, log_prior, relevant
+from bayessim_mjx.diagnosis.selection.sets import RELEVANCE, core, log_prior
 
 A, B, AB, NONE = frozenset("a"), frozenset("b"), frozenset("ab"), frozenset()
 
 
-def weighed(evidence, numbers=None):
-    return sets.weighed(evidence, numbers or {k: len(k) for k in evidence}, 30)
+def weighed(evidence, excess, numbers=None):
+    return sets.weighed(evidence, excess, numbers or {k: len(k) for k in evidence}, 30)
 
 
 def test_the_prior_expects_one_effect():
@@ -21,7 +21,8 @@ def test_the_prior_expects_one_effect():
 
 
 def test_weights_are_posterior_probabilities():
-    found = weighed({NONE: 0.0, A: 10.0, B: 9.0})
+    excess = {NONE: 100.0, A: 0.0, B: 0.02}
+    found = weighed({NONE: 0.0, A: 10.0, B: 9.0}, excess)
     prior = np.exp(log_prior(A, 30))
     each = np.array([1.0, prior * np.exp(10.0), prior * np.exp(9.0)])
     assert [found.weight[k] for k in (NONE, A, B)] == pytest.approx(each / each.sum())
@@ -29,22 +30,29 @@ def test_weights_are_posterior_probabilities():
     assert found.nats[A] - found.nats[B] == pytest.approx(1.0)
 
 
-def test_an_effect_matters_that_changes_the_motion_by_more_than_noise_and_laws_of_simulators():
-    gap = 100.0
-    least = RELEVANCE.noise + RELEVANCE.share * gap
-    assert relevant([least + 0.01, 90.0], gap) and not relevant([least - 0.01, 90.0], gap)
-    assert relevant([], gap)
+def test_an_effect_that_does_not_matter_makes_no_explanation_of_its_own():
+    """However sure it is: 50 nats for a thousandth of the gap. The set counts for the one without it, and by itself."""
+    excess = {NONE: 100.0, A: 0.1, B: 0.0, AB: 0.0}
+    assert core(AB, excess) == B
+    found = weighed({NONE: 0.0, A: 500.0, AB: 550.0}, {NONE: 100.0, A: 0.1, AB: 0.0})
+    assert found.answer == A and AB not in found.weight and found.weight[A] == pytest.approx(1.0)
+    assert found.nats[A] == pytest.approx(550.0 + log_prior(AB, 30))
+    assert found.sets[AB] == pytest.approx(1.0) and found.possible == [A, AB]
+    excess = {NONE: 100.0, A: RELEVANCE.noise + RELEVANCE.share * 100.0 + 0.01, AB: 0.0}
+    assert core(AB, excess) == AB
+    assert weighed({NONE: 0.0, A: 500.0, AB: 550.0}, excess).answer == AB
 
 
 def test_a_gap_within_the_noise_needs_no_effect():
-    """However large an effect is that known parameters make up for."""
-    assert not relevant([50.0], 0.08) and relevant([], 0.08)
+    """What does the work of known parameters is possible all the same, and so is in their intervals."""
+    found = weighed({NONE: 0.0, A: 4.0}, {NONE: 0.08, A: 0.0})
+    assert found.answer == NONE and found.weight == {NONE: 1.0} and found.possible == [NONE, A]
 
 
 def test_of_explanations_that_are_as_likely_the_simpler_one_is_named():
-    numbers = {NONE: 0, A: 4, B: 1}
-    found = weighed({NONE: 0.0, A: 50.9, B: 50.0}, numbers)  # odds of 2.5
+    excess, numbers = {NONE: 100.0, A: 0.0, B: 0.0}, {NONE: 0, A: 4, B: 1}
+    found = weighed({NONE: 0.0, A: 50.9, B: 50.0}, excess, numbers)  # odds of 2.5
     assert found.answer == B and found.beside == [A]
-    found = weighed({NONE: 0.0, A: 51.4, B: 50.0}, numbers)  # of 4
+    found = weighed({NONE: 0.0, A: 51.4, B: 50.0}, excess, numbers)  # of 4
     assert found.answer == A and found.beside == [B]
-    assert weighed({NONE: 0.0, A: 53.2, B: 50.0}, numbers).beside == []  # of 25
+    assert weighed({NONE: 0.0, A: 53.2, B: 50.0}, excess, numbers).beside == []  # of 25
