@@ -97,7 +97,8 @@ class Weighed:
         for key, weight in self.weight.items():
             kept += [key] if whole < 0.999 or key == BASE else []
             whole += weight
-        return [{"effects": sorted(k), "probability": self.weight[k], "nats": self.nats[k]} for k in kept]
+        base = self.nats[BASE]
+        return [{"effects": sorted(k), "probability": self.weight[k], "nats": self.nats[k] - base} for k in kept]
 
     def _within(self, odds: float) -> list[Key]:
         best = max(self.weight.values())
