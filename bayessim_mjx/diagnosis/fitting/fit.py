@@ -13,8 +13,8 @@ from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
 from bayessim_mjx.diagnosis.fitting.quadratic import Quadratic, Starts, eliminate
 
 Array = NDArray[np.float64]
-# noise sd, rms by which a finite difference changes the residuals: rounding is 2e-4 to 6e-4; one noise was too far where
-# friction of the model's own is fitted beside a law of friction (their sum came 8 % too large)
+# noise sd, rms by which a finite difference changes the residuals: rounding is 2e-4 to 6e-4; one noise was too far
+# where friction of the model's own is fitted beside a law of friction (their sum came 8 % too large)
 CHANGE = 0.3
 REACH = 16.0  # by which its step may be longer or shorter than that of a column of which nothing is known
 
