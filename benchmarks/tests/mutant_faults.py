@@ -159,7 +159,7 @@ FAULTS: tuple[tuple[str, str, str, str, tuple[str, ...]], ...] = (
     # diagnosis
     (
         "superfluous effects stay in the answer", f"{P}/diagnosis/selection/sets.py",
-        "all(size > least for", "all(size > 0.0 * least for", (SETS,),
+        "limit = excess[key] +", "limit = 0.0 * excess[key] - 1.0 +", (SETS,),
     ),
     (
         "noise is not taken out before the tolerance", f"{P}/diagnosis/tolerance.py",
