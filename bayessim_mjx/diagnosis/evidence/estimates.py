@@ -55,6 +55,7 @@ def estimated(weighing: Weighing, found: Weighed) -> Estimated:
     """Of the answer's numbers; known parameters with all sets that are possible, by their probabilities."""
     answer, base = weighing.scored[found.answer], len(weighing.pool.fitter.base)
     mean, covariance = _own(answer)
+    covariance[:base, :base] += _beside(answer, base)
     keys = found.possible
     share = np.array([found.sets[k] for k in keys])
     share /= share.sum()
@@ -62,7 +63,7 @@ def estimated(weighing: Weighing, found: Weighed) -> Estimated:
     for key, weight in zip(keys, share, strict=True):
         own_mean, own = _own(weighing.scored[key])
         away = own_mean[:base] - mean[:base]
-        known += weight * (own[:base, :base] + np.outer(away, away))
+        known += weight * (own[:base, :base] + _beside(weighing.scored[key], base) + np.outer(away, away))
     sd = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
     wider = np.ones(len(sd))
     wider[:base] = np.sqrt(np.maximum(np.diag(known), sd[:base] ** 2)) / sd[:base]
@@ -90,6 +91,11 @@ def _step(weighing: Weighing, of: Scored, r: Array) -> Array:
     fit, sizes = of.fit, (weighing.pool.fitter.spread, weighing.scale, weighing.channels)
     there = marginal(windows_of(r, fit.A, fit.B, weighing.D, fit.offsets, *sizes), of.learnt.hyper)
     return belief_of(fit).best(there.Q.sum(0))[: len(of.model.fit.values)]
+
+
+def _beside(of: Scored, base: int) -> Array:
+    """Covariance `[base, base]` of the known parameters that rest at a bound: none of them is known without error."""
+    return np.diag(of.found.beside[:base] ** 2)
 
 
 def _own(of: Scored) -> tuple[Array, Array]:

@@ -81,6 +81,11 @@ def test_a_bound_against_quadrature(truth):
     top = max(likelihood(there, p) for p in np.linspace(0, 2, 2001))
     whole = integrate.quad(lambda p: prior.pdf(p) * np.exp(likelihood(there, p) - top), 0, 2, limit=400)[0]
     assert found.nats == pytest.approx(top + np.log(whole), abs=0.7 if truth == 0.0 else 0.3)
+    if truth < 0:
+        square = integrate.quad(lambda p: p**2 * prior.pdf(p) * np.exp(likelihood(there, p) - top), 0, 2, limit=400)[0]
+        assert found.beside == pytest.approx(np.sqrt(square / whole), rel=0.05)
+    else:
+        assert truth == 0.0 or found.beside == 0.0
 
 
 @pytest.mark.parametrize("numbers", [1, 4])
