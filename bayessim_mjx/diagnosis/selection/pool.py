@@ -32,10 +32,10 @@ class Rules:
     """How fits far from the logs are brought to their end."""
 
     batch: int = 12  # models fitted in lockstep; after each batch what is known is told
-    # of polishing, as long as a round of so many steps brings the cost down to this share
+    # of polishing, as long as a round of so many steps gains that many nats: evidence is compared to about one
     rounds: int = 5
     steps: int = 4
-    falls: float = 0.99
+    gains: float = 1.0
     refreshed: float = 0.3  # of the time left, for the first columns of all that are polished
     near: float = (
         1.3  # times the best one's cost, as near as a fit has to be able to come: a rule of thumb, not counted
@@ -236,17 +236,15 @@ def _to_the_end(pool: Pool, fits: Sequence[Fit], told: Callable[[Fit], Fit]) -> 
         if pool.settings.budget.over(LEAVING_OUT):
             break
         start = [replace(fits[i], **AFRESH) for i in running]
-        moved = pool.fitter.iterate(start, RULES.steps, lambda f: fresh(pool, f) if _astray(pool, f) else ())
+        tolerance = 2 * RULES.gains / max(fit.cost for fit in start)
+        moved = pool.fitter.iterate(start, RULES.steps, lambda f: fresh(pool, f) if _astray(pool, f) else (), tolerance)
         for i, fit in zip(running, moved, strict=True):
             late = pool.settings.budget.over(LEAVING_OUT)
             fits[i] = fit if late else told(pool.fitter.refresh(fit))
         fell = {i: before.cost - fits[i].cost for i, before in zip(running, start, strict=True)}
         least, left = min(fit.cost for fit in fits), RULES.rounds - 1 - made
         running = [
-            i
-            for i in running
-            if fell[i] > (1 - RULES.falls) * (fits[i].cost + fell[i])
-            and fits[i].cost - left * fell[i] <= RULES.near * least
+            i for i in running if fell[i] > 2 * RULES.gains and fits[i].cost - left * fell[i] <= RULES.near * least
         ]
         if not running:
             break
