@@ -51,6 +51,7 @@ class Plan:
         key: its effects; nats: of evidence and prior over the known parameters; parent: the fitted model it extends.
         columns, amounts: of the effects that it has more; points: further starting points of a single one.
         origin: the fitted model whose known parameters it begins at; None: its parent's.
+        known: other values of these, at each of the `points`; (): the origin's.
     """
 
     key: Key
@@ -60,6 +61,7 @@ class Plan:
     amounts: tuple[float, ...] = ()
     points: tuple[Array, ...] = ()
     origin: Key | None = None
+    known: tuple[Array, ...] = ()
 
 
 def around(weighing: Weighing, key: Key, say: Progress) -> list[Plan]:

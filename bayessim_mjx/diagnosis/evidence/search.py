@@ -8,19 +8,21 @@ likely.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.evidence.columns import Column
+from bayessim_mjx.diagnosis.evidence.inertia import alike
 from bayessim_mjx.diagnosis.evidence.looking import Plan, Progress, around
 from bayessim_mjx.diagnosis.evidence.weighing import Weighing
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fit import Fit
 from bayessim_mjx.diagnosis.selection.bounds import widened
 from bayessim_mjx.diagnosis.selection.budget import LEAVING_OUT, SINGLES, TOGETHER
-from bayessim_mjx.diagnosis.selection.laws import related
+from bayessim_mjx.diagnosis.selection.laws import inertia, related
+from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.selection.pool import Entries, Pool, cut_back, fit_entries, polish
 from bayessim_mjx.diagnosis.selection.sets import BASE, ODDS, Key, Weighed
 
@@ -61,6 +63,7 @@ class Search:
         self.weighing = Weighing(pool)
         self._plans: dict[Key, list[Plan]] = {}
         self._polished: set[Key] = set()
+        self._again: set[tuple[Key, Key]] = set()
 
     def run(self) -> Weighed:
         """All rounds; the posterior over what was fitted."""
@@ -90,7 +93,8 @@ class Search:
     def _todo(self, best: Key) -> list[Plan]:
         """What to fit around the leading set: beside one that leaves nothing relevant, what promises to be likelier."""
         smaller = [k for k in (best - {x} for x in sorted(best)) if k and k in self.weighing.scored]
-        plans = [p for k in smaller for p in self._worth(self._around(k), EFFORT.instead)] + self._related(best)
+        plans = [p for k in smaller for p in self._worth(self._around(k), EFFORT.instead)]
+        plans += [p for k in dict.fromkeys([best, *self.weighing.weighed().beside]) for p in self._related(k)]
         more = self._worth(self._around(best), EFFORT.sizes)
         more += self._worth(self._around(BASE), EFFORT.base) if best else []
         if self.weighing.settled(best):
@@ -112,10 +116,25 @@ class Search:
                 continue
             for c in self.pool.candidates:
                 points = self.pool.secants.columns.get(c.label, ())
-                if points and related(c, effect) and self._new(rest | {c.label}):
-                    starts = _as_large(c, effect, model.values_of(effect))
-                    out.append(Plan(rest | {c.label}, np.inf, rest, (Column(c, *points[-1]),), (1.0,), starts, best))
+                key = rest | {c.label}
+                if points and related(c, effect) and (self._first(best, key) if inertia(c, effect) else self._new(key)):
+                    starts, known = self._begun(model, effect, c)
+                    column = Column(c, *points[-1])
+                    out.append(Plan(key, np.inf, rest, (column,), (1.0,), starts, best, known))
         return out
+
+    def _first(self, best: Key, key: Key) -> bool:
+        """Whether a set was not yet fitted from the inertia of the leading one: from elsewhere it may rest far off."""
+        new = (best, key) not in self._again
+        self._again |= {(best, key)}
+        return new
+
+    def _begun(self, model: Model, effect: Candidate, law: Candidate) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
+        """Where a law begins in the place of an effect: (its numbers, the known parameters beside them)."""
+        if inertia(law, effect):
+            start = alike(self.pool.fitter, model, effect, law)
+            return ((), ()) if start is None else ((start.own,), (start.known,))
+        return _as_large(law, effect, model.values_of(effect)), ()
 
     def _new(self, key: Key) -> bool:
         return key not in self.pool.models and key not in self.pool.vain
@@ -166,8 +185,16 @@ class Search:
     def _fit(self, plans: Sequence[Plan], label: str, part: str) -> None:
         entries: Entries = {plan.key: self._entry(plan) for plan in plans}
         parents = {p.key: self.pool.models[p.parent] for p in plans if p.columns}
+        before = {
+            key: (self.pool.models[key], self.weighing.scored[key]) for key in entries if key in self.weighing.scored
+        }
         fit_entries(self.pool, entries, label, self.say, part, parents)
         self.weighing.score([p.key for p in plans])
+        for key, (model, found) in before.items():
+            if self.weighing.scored[key].found.nats < found.found.nats:
+                self.pool.models[key], self.weighing.scored[key] = model, found
+            else:
+                self._polished.discard(key)
 
     def _entry(self, plan: Plan) -> tuple[list[Fit], tuple[Candidate, ...]]:
         pool, model = self.pool, self.pool.models[plan.parent if plan.origin is None else plan.origin]
@@ -180,7 +207,11 @@ class Search:
         coordinates = [c for e in new for c in e.coordinates]
         starts = [np.concatenate([c.at(t) for c, t in zip(plan.columns, plan.amounts, strict=True)])]
         starts += [p for i, p in enumerate(plan.points) if not any(np.array_equal(p, q) for q in plan.points[:i])]
-        return [pool.fitter.derive(pool.begun(fit), coordinates, s) for s in starts], (*kept, *new)
+        begun = pool.begun(fit)
+        fits = [begun] * len(starts)
+        for i, known in enumerate(plan.known, len(starts) - len(plan.known)):
+            fits[i] = replace(begun, values=np.concatenate([known, begun.values[len(known) :]]))
+        return [pool.fitter.derive(f, coordinates, s) for f, s in zip(fits, starts, strict=True)], (*kept, *new)
 
 
 def _as_large(one: Candidate, other: Candidate, values: Array) -> tuple[Array, ...]:

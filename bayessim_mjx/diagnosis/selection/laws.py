@@ -29,8 +29,13 @@ def special_case(one: Candidate, of: Candidate) -> bool:
 def related(one: Candidate, other: Candidate) -> bool:
     """Whether the one may stand for the other: a special case, a law that contains it, or other inertia of its body."""
     here = one.where == other.where and one.effect != other.effect
-    inertia = here and _inertial(one.effect) and _inertial(other.effect)
-    return special_case(one, other) or (here and special_case(other, one)) or inertia
+    return special_case(one, other) or (here and special_case(other, one)) or inertia(one, other)
+
+
+def inertia(one: Candidate, other: Candidate) -> bool:
+    """Whether both change the inertia of the same body."""
+    here = one.kind == other.kind == "body" and one.where == other.where and one.effect != other.effect
+    return here and _inertial(one.effect) and _inertial(other.effect)
 
 
 def special_cases(effect: Candidate) -> tuple[str, ...]:
