@@ -16,7 +16,7 @@ CONTAINS = "contains it as a special case and explains no more"
 NO_GAIN = "no gain at first order"  # why effects were not fitted
 LESS_PROMISING = "less promising than those that were fitted"
 NO_TIME_LEFT = "no time left"
-NOTHING_LEFT = "the known parameters leave nothing to explain"
+NOTHING_LEFT = "the known parameters leave too little to explain"
 NOT_SCREENED = "no time to look at them"
 OPPOSITES = ("against/with", "more/less")  # of which a number's sign chooses one
 

@@ -115,7 +115,7 @@ class Diagnosis:
     def to_dict(self) -> dict[str, Any]:
         """The contents of diagnosis.json; numbers that are not finite become null."""
         out = {"schema": self.schema} | {
-            f.name: _plain(getattr(self, f.name))
+            f.name: plain(getattr(self, f.name))
             for f in dataclasses.fields(self)
             if f.name not in ("details", "schema")
         }
@@ -135,7 +135,7 @@ class Diagnosis:
         folder.mkdir(parents=True, exist_ok=True)
         path = folder / "diagnosis.json"
         path.write_text(json.dumps(self.to_dict(), indent=1, allow_nan=False) + "\n")
-        (folder / "details.json").write_text(json.dumps(_plain(self.details), allow_nan=False))
+        (folder / "details.json").write_text(json.dumps(plain(self.details), allow_nan=False))
         return path
 
 
@@ -169,18 +169,18 @@ def _numbers(raw: dict[str, Any]) -> dict[str, Any]:
     return {k: math.nan if v is None else v for k, v in raw.items()}
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """Dataclasses, arrays and numpy numbers as JSON values."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+        return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
     if isinstance(value, dict):
-        return {str(k): _plain(v) for k, v in value.items()}
+        return {str(k): plain(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(v) for v in value]
+        return [plain(v) for v in value]
     if isinstance(value, np.ndarray):
-        return _plain(value.tolist())
+        return plain(value.tolist())
     if isinstance(value, np.generic):
-        return _plain(value.item())
+        return plain(value.item())
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value

@@ -23,21 +23,12 @@ class Levels:
     """Of intervals and of what they divide by."""
 
     level: float = 0.9
-    least_gap: float = 1e-12  # keeps shares of no gap finite; where there is a gap, it says nothing
     # degrees of freedom where one condition rules a mean of squares: measured, see above
     ruled: float = 0.5
 
 
 LEVELS = Levels()
 NOTHING = (float("nan"), float("nan"))  # the interval of one condition
-
-
-def share_of_gap(part: float, before: float, noise: float = 1.0) -> float:
-    """A part of the squared gap `before` as a share of what of that is above the noise.
-
-    `share_of_gap(E0 - E1, E0)` is what a model closes, `share_of_gap(E1 - 1, E0)` what it leaves.
-    """
-    return part / max(before - noise, LEVELS.least_gap)
 
 
 def leave_one_out(group: NDArray[np.int64]) -> Array:

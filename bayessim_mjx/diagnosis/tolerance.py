@@ -83,8 +83,12 @@ class Tolerance:
 
     def exceeded(self, rms: Array) -> NDArray[np.bool_]:
         """`[nv]`, where a root mean square error `[nv]` (rad or m) leaves more than tolerated above the noise."""
-        above = np.sqrt(np.maximum(np.square(rms) - self.noise**2, 0.0))
-        return np.asarray(above > np.maximum(self.limit, self.noise))
+        return np.asarray(above_noise(rms, self.noise) > np.maximum(self.limit, self.noise))
+
+
+def above_noise(rms: Array | float, noise: Array | float) -> Array:
+    """Root mean square errors without the noise's part; all in one unit."""
+    return np.asarray(np.sqrt(np.maximum(np.square(rms) - np.square(noise), 0.0)))
 
 
 def length_unit(model: mujoco.MjModel, dof: int) -> str:

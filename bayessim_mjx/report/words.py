@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from bayessim_mjx import quantities
+from bayessim_mjx.diagnosis.gap import of_rms
 from bayessim_mjx.diagnosis.result import Diagnosis, Estimate, FoundEffect
-from bayessim_mjx.diagnosis.statistics import share_of_gap
 from bayessim_mjx.effects.support.words import words
 from bayessim_mjx.quantities import finite, typeset, unit
 
@@ -244,10 +244,8 @@ def headline(diagnosis: Diagnosis) -> str:
 
 def gap_closed(stages: Mapping[str, Any]) -> float:
     """Share of the reducible squared gap closed between delivery and the effects; NaN where unknown."""
-    before, after, floor = (stages.get(k) for k in ("nominal", "with_effects", "reducible_floor"))
-    if not (finite(before) and finite(after) and finite(floor)) or before <= floor:
-        return math.nan
-    return share_of_gap(before**2 - after**2, before**2, floor**2)
+    known = [float(v) for k in ("nominal", "with_effects", "reducible_floor") if finite(v := stages.get(k))]
+    return of_rms(*known).closed if len(known) == 3 else math.nan
 
 
 def stages_of(d: Diagnosis) -> dict[str, float]:

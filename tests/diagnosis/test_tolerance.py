@@ -97,7 +97,8 @@ def gap(left, limit=0.02):
     }  # fmt: skip
     shares = {"nominal": 0.2, "calibrated": 0.1, "with_effects": left}
     beyond = [n for n, r in rows.items() if r["beyond"]]
-    return Gap(1.0, 2000.0, 1000.0, 1e4 * left, 1.0, physical=rows, shares=shares, beyond=beyond)
+    closed = {"predicted": 0.8, "realised": 0.8}
+    return Gap(1.0, 2000.0, 1000.0, 1e4 * left, 1.0, physical=rows, shares=shares, beyond=beyond, closed=closed)
 
 
 def findings(rms, noise=50.0, windows=8, beyond=()):
@@ -183,7 +184,14 @@ def test_what_no_effect_explains_is_told_against_the_tolerance_too():
     assert told.endswith("and shoulder: 0.057 deg rms, 0.17 deg at most (0.10 % of its motion; tolerance 1.1 deg).")
 
 
-@pytest.mark.parametrize(("calibrated", "only"), [(1.1, True), (1.3, False)])
+@pytest.mark.parametrize(("nominal", "none"), [(1.14, True), (1.16, False)])
+def test_nobody_says_that_there_is_no_gap_above_the_noise_where_there_is(nominal, none):
+    far = dataclasses.replace(gap(0.0), nominal=nominal, calibrated=nominal, with_effects=nominal)
+    head = sentences.verdict_in_words("no_gap", [], far)[0]
+    assert head.startswith("No gap above the noise") == none and ("is more than the noise" in head) != none
+
+
+@pytest.mark.parametrize(("calibrated", "only"), [(1.14, True), (1.16, False)])
 def test_nobody_says_that_only_parameters_are_off_where_more_than_the_noise_remains(calibrated, only):
     far = dataclasses.replace(gap(0.0), calibrated=calibrated, with_effects=calibrated)
     head = sentences.verdict_in_words("parameters", [], far)[0]

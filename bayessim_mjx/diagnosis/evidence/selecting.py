@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -71,11 +72,11 @@ def _rival(weighing: Weighing, effect: Candidate, key: Key, found: Weighed) -> R
     others = tuple(e for e in model.effects if e.label not in found.answer)
     contains = any(effect.effect in special_cases(o) and o.where == effect.where for o in others)
     same = any(o.effect == effect.effect and not compatible(o, effect) for o in others)
-    behind = max(pool.closure(answer) - pool.closure(model), 0.0)
+    closed = pool.gap(model).closed
     nats = found.nats[found.answer] - found.nats[key]
-    why = phrases.CONTAINS if contains else phrases.close_by(nats, behind)
+    why = phrases.CONTAINS if contains else phrases.close_by(nats, pool.gap(answer).closed - closed)
     size = size_in(weighing.scored[key], others[0]) if len(others) == 1 else None
-    return Rival(others, model, pool.closure(model), why, contains or same, size)
+    return Rival(others, model, closed, why, contains or same, size)
 
 
 def _subsets(pool: Pool, answer: Model, say: Progress) -> dict[Key, Model]:
@@ -100,9 +101,6 @@ def _elsewhere(pool: Pool, chosen: Mapping[int, Key]) -> float:
     The fits behind the choice had seen the condition, so the share is a little too high. A share much below that of the
     answer means that the answer was chosen for what it does by chance. NaN of one condition, and where there is no gap.
     """
-    group, base = pool.fitter.simulator.windows.group, pool.models[BASE]
-    above = base.total - pool.noise * len(group)
-    if not chosen or above <= 0:
-        return float("nan")
-    drop = sum(float(np.sum((base.cost - pool.models[k].cost)[group == g])) for g, k in chosen.items())
-    return min(drop / above, 1.0)
+    group = pool.fitter.simulator.windows.group
+    after = sum(float(np.sum(pool.models[k].cost[group == g])) for g, k in chosen.items())
+    return replace(pool.gap(pool.models[BASE]), after=after).closed if chosen else float("nan")

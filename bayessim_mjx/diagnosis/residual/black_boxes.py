@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayessim_mjx.diagnosis import statistics
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
+from bayessim_mjx.diagnosis.gap import Gap
 from bayessim_mjx.diagnosis.residual import formula, motion_inputs, network
 from bayessim_mjx.diagnosis.residual.disturbance import Disturbance
 from bayessim_mjx.diagnosis.residual.formula import Term
@@ -57,7 +57,7 @@ def race(fitter: Fitter, base: Fit, named: Fit | None, missing: Disturbance, noi
     before, floor = float(problem.base(fold).sum()), noise * len(fold)
 
     def closed(cost: Array) -> float:
-        return statistics.share_of_gap(before - max(float(cost.sum()), floor), before, floor)
+        return Gap(before, float(cost.sum()), floor).closed
 
     of_formula, terms = formula.held_out(problem, fold)
     of_names = float("nan") if named is None else closed(fitter.scores(named, fold)[0])

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis import statistics
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
+from bayessim_mjx.diagnosis.gap import of_one
 from bayessim_mjx.diagnosis.residual import motion_inputs, regions
 from bayessim_mjx.diagnosis.residual.disturbance import Disturbance, estimate
 from bayessim_mjx.diagnosis.residual.fingerprints import Fingerprint, fingerprints
@@ -22,7 +23,6 @@ Array = NDArray[np.float64]
 class Rules:
     """When a place is worth telling."""
 
-    quiet: float = 1.1  # squared residual per sample that counts as noise alone
     worth: float = 0.1  # share of the gap that makes a joint worth a sentence
     told: float = 0.15  # share of a joint's missing power that a region must explain to be told
 
@@ -68,7 +68,7 @@ class Located:
 
 def locate(fitter: Fitter, fit: Fit, disturbance: Disturbance | None = None, *, seed: int = 0) -> Located:
     """Places of the gap that a fit leaves; `disturbance`: of this fit, None: estimated here."""
-    if float(fit.quadratic(fitter.spread)[0].c.mean()) < RULES.quiet * fitter.size:
+    if of_one(float(fit.quadratic(fitter.spread)[0].c.mean()), fitter.size).at_noise:
         return Located()
     disturbance = estimate(fitter, fit) if disturbance is None else disturbance
     windows, model = fitter.simulator.windows, fitter.simulator.physics.mj_model

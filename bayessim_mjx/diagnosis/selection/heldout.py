@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -13,6 +14,7 @@ from bayessim_mjx.diagnosis import statistics
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 from bayessim_mjx.diagnosis.fitting.quadratic import RULES as HELD_OUT
 from bayessim_mjx.diagnosis.fitting.quadratic import eliminate, solve
+from bayessim_mjx.diagnosis.gap import Gap
 from bayessim_mjx.diagnosis.selection.models import Model
 
 Array = NDArray[np.float64]
@@ -195,7 +197,7 @@ def stages(costs: dict[str, Array], group: NDArray[np.int64]) -> dict[str, Any]:
 
 @dataclass(frozen=True, eq=False)
 class Closed:
-    """Share of the squared gap above the noise that goes from one simulator to a better one: (E0 - E1) / (E0 - N).
+    """Share of the squared gap above the noise that a better simulator closes (`Gap.closed`), with its interval.
 
     Attributes:
         before, after: `[W]` mean squares of windows in units of the noise; group: `[W]`, their conditions.
@@ -223,12 +225,11 @@ class Closed:
 
     @property
     def value(self) -> float:
-        """At most 1: nothing undercuts the noise."""
-        before, left, noise = self._sums(np.ones_like(self.before))
-        return min(statistics.share_of_gap(float(before - left), float(before), float(noise)), 1.0)
+        """`Gap.closed` of all windows."""
+        return Gap(*map(float, self._sums(np.ones_like(self.before)))).closed
 
     def interval(self) -> tuple[float, float]:
-        """90 % interval between -1 and 1, NaN of one condition.
+        """90 % interval between -1 and 1, NaN of one condition and where there is no gap.
 
         A share s is kept where what is left, E1, could be what it says, (1 - s) E0 + s: where the logarithm of their
         ratio is no more standard errors off 0 than Student's t allows. That holds near the noise, where E1 - 1 has no
@@ -236,9 +237,9 @@ class Closed:
         undercuts the noise shows by how much the noise was taken for too large: that error of the floor counts too.
         """
         rows = statistics.leave_one_out(self.group)
-        if len(rows) < 2:
-            return statistics.NOTHING
         every, value = np.ones((1, len(self.before))), self.value
+        if len(rows) < 2 or math.isnan(value):
+            return statistics.NOTHING
         before, _, noise = (float(x[0]) for x in self._sums(every))
         finest = min(1e-4, RULES.finest * noise / max(before, noise))
         far_off, near = np.geomspace(2.0, finest, RULES.grid), np.geomspace(1e-9, 0.1, RULES.grid // 2)

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bayessim_mjx.diagnosis import statistics
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.quadratic import Quadratic, eliminate, solve
+from bayessim_mjx.diagnosis.gap import Gap
 from bayessim_mjx.diagnosis.selection.tried import Tried
 
 Array = NDArray[np.float64]
@@ -44,9 +44,7 @@ def promised(tried: Tried, effects: Sequence[Candidate]) -> tuple[float, dict[st
     every = frozenset(range(len(effects)))
 
     def share(some: frozenset[int]) -> float:
-        return float(
-            np.clip(statistics.share_of_gap(before - left(some), before), 0.0, 1.0)
-        )  # what promises harm is not added
+        return max(Gap(before, left(some)).closed, 0.0)  # what promises harm is not added
 
     each, total = shapley(len(effects), share), share(every)
     return total, {e.label: share for e, share in zip(effects, each, strict=True)}

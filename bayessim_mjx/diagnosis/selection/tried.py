@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
-from bayessim_mjx.diagnosis import statistics
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
+from bayessim_mjx.diagnosis.gap import Gap
 from bayessim_mjx.diagnosis.selection.budget import Budget
 from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.selection.screen import Screened
 
-FLOOR = 1.3  # times the noise (rms): an error within it is not worth explaining
+FLOOR = 1.3  # noise standard deviations (rms): an error within it is not worth explaining; a rule of thumb
 
 
 @dataclass(frozen=True)
@@ -63,20 +63,11 @@ class Tried:
 
         Errors of the time step may be smaller than feared: what has effects already has to reach the sensors' noise.
         """
-        share = self.settings.believed if model.effects else 1.0
-        return model.total > (share * FLOOR) ** 2 * self.noise * len(model.cost)
+        return self.gap(model).rms > FLOOR * (self.settings.believed if model.effects else 1.0)
 
-    def closure(self, model: Model) -> float:
-        """Share of the base model's squared gap above the noise that `model` closes, held out; at most 1.
-
-        The noise alone is the floor: the best of many models tried is below its own expected error by selection.
-        """
-        return 1.0 - self.left(model)
-
-    def left(self, model: Model) -> float:
-        """Share of the base model's squared gap above the noise that `model` leaves."""
-        noise = self.noise * len(model.cost)
-        return statistics.share_of_gap(max(model.total - noise, 0.0), self.base.total, noise)
+    def gap(self, model: Model) -> Gap:
+        """From the base model to `model`, held out."""
+        return Gap(self.base.total, model.total, self.noise * len(model.cost))
 
 
 def ranked(tried: Tried, size: int | None = None) -> list[Model]:

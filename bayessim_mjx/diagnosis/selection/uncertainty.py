@@ -44,9 +44,10 @@ def systematic(model: Model, timestep: float, left: float = 0.0, known: float = 
     """Standard deviations `[k]` of what simulators differ by, whatever the data; `known`: of known parameters, a share.
 
     Two simulators with the same effect agree on its times (delays, time constants) to a part of a time step, on its
-    other numbers to about a percent; to less where the law leaves a share `left` of the squared gap unexplained.
+    other numbers to about a percent; to less where the law leaves a share `left` of the squared gap unexplained (NaN:
+    there is none).
     """
-    laws = SYSTEMATIC.laws + SYSTEMATIC.misfit * float(np.sqrt(np.clip(left, 0.0, 1.0)))
+    laws = SYSTEMATIC.laws + SYSTEMATIC.misfit * float(np.sqrt(np.clip(np.nan_to_num(left), 0.0, 1.0)))
     own = {c.name for effect in model.effects for c in effect.coordinates}
 
     def one(c: Coordinate, value: float) -> float:

@@ -49,7 +49,7 @@ def diagnosis_of(found: Findings, about: Mapping[str, Any] | None = None, file: 
     setup, selection, model = found.setup, found.selection, found.model
     timestep = float(setup.robot.mj_model.opt.timestep) * (setup.discretisation.factor if setup.discretisation else 1)
     own = selection.estimated
-    together = own.covariance + np.diag(uncertainty.systematic(model, timestep, selection.left(model)) ** 2)
+    together = own.covariance + np.diag(uncertainty.systematic(model, timestep, selection.gap(model).left) ** 2)
     finer = found.part(AtFinerSteps)
     steps = finer.notes(found, together) if finer else []
     base = len(setup.fitter.base)
@@ -161,7 +161,7 @@ def ranking(tried: Tried) -> list[dict[str, Any]]:
             "label": model.label,
             "score": 0.5 * samples * float(np.log(tried.base.total / model.total)),
             "se": error,
-            "gap_closed": tried.closure(model),
+            "gap_closed": tried.gap(model).closed,
             "rms": float(np.sqrt(model.total / model.fit.r.size)),
             "parameters": dict(zip(model.fit.names, map(float, model.fit.values), strict=True)),
             "absorbed": absorbed.get(model.effects[0].label) if len(model.effects) == 1 else None,

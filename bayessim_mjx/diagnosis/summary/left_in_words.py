@@ -9,6 +9,7 @@ import numpy as np
 
 from bayessim_mjx import effects as library
 from bayessim_mjx.diagnosis import phrases
+from bayessim_mjx.diagnosis.gap import Gap, of_one
 from bayessim_mjx.diagnosis.residual import fingerprints
 from bayessim_mjx.diagnosis.residual.black_boxes import BlackBoxes
 from bayessim_mjx.diagnosis.residual.fingerprints import Fingerprint
@@ -25,7 +26,6 @@ from bayessim_mjx.quantities import percent
 class Rules:
     """What is worth a word of a flexible force."""
 
-    quiet: float = 1.1  # squared residual per sample that counts as noise alone
     important: float = 0.1  # share of the gain that an input must carry to be named
 
 
@@ -39,12 +39,14 @@ def flexible_in_words(found: Flexible, one_log: bool = False) -> list[str]:
     held = dict(zip(names, (found.condition, found.interpolation), strict=True))
     if not any(h.significant for h in held.values()):
         return ["a flexible force finds nothing more that would hold on data not used for fitting"]
-    if all(float(h.base.mean()) < RULES.quiet * found.samples for h in held.values()):
+    sums = {how: (float(h.base.sum()), found.samples * len(h.base)) for how, h in held.items()}
+    gaps = {how: Gap(cost, cost - held[how].gain, noise) for how, (cost, noise) in sums.items()}
+    if not (loud := {how: gap for how, gap in gaps.items() if not of_one(gap.before, gap.noise).at_noise}):
         return ["what is left lies within the measurement noise; of it a flexible force still finds a part"]
-    text = []
-    for how, h in held.items():
-        share = h.gain / max(float(h.base.sum()), 1e-300)
-        text.append(f"on {how} a flexible force removes {percent(share)} of the squared gap that is left")
+    text = [
+        f"on {how} a flexible force removes {percent(gap.closed)} of the squared gap that is left"
+        for how, gap in loud.items()
+    ]
     least = RULES.important * max(found.depends_on[0]["importance"], 0.5)
     joints = [j for j, share in found.where.items() if share > 0.2 * max(found.where.values())]
     inputs = [d["input"] for d in found.depends_on if d["importance"] > least][:4]

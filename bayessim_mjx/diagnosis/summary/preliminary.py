@@ -8,8 +8,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
+from bayessim_mjx.diagnosis.gap import of_one
+from bayessim_mjx.diagnosis.result import plain
 from bayessim_mjx.diagnosis.selection.tried import Tried
 from bayessim_mjx.diagnosis.setup import Setup
 from bayessim_mjx.diagnosis.summary import first_look
@@ -28,18 +28,18 @@ def write(path: Path, about: Mapping[str, Any], setup: Setup, tried: Tried | Non
     found |= {"warnings": list(setup.warnings)} | ({} if tried is None else _so_far(tried))
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_suffix(".tmp")
-    temporary.write_text(json.dumps(found | {"windows": len(setup.fitter.simulator.windows)}, indent=1) + "\n")
+    every = plain(found | {"windows": len(setup.fitter.simulator.windows)})
+    temporary.write_text(json.dumps(every, indent=1, allow_nan=False) + "\n")
     os.replace(temporary, path)
 
 
 def _so_far(tried: Tried) -> dict[str, Any]:
     """Gaps in noise standard deviations, recalibrated parameters and the best models."""
-    fit, noise = tried.base.fit, tried.noise * len(tried.base.cost)
+    fit, calibrated = tried.base.fit, tried.gap(tried.base)
     nominal, _ = tried.nominal.quadratic(tried.fitter.spread)
-    gap = {"nominal": np.sqrt(nominal.c.sum() / noise), "calibrated": np.sqrt(tried.base.total / noise)}
     best = [{k: row[k] for k in ("label", "score", "se", "gap_closed", "parameters")} for row in ranking(tried)[:BEST]]
     return {
-        "gap": {k: float(v) for k, v in gap.items()},
+        "gap": {"nominal": of_one(float(nominal.c.sum()), calibrated.noise).rms, "calibrated": calibrated.rms},
         "parameters": dict(zip(fit.names, map(float, fit.values), strict=True)),
         "candidates": best,
     }

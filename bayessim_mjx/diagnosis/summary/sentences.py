@@ -7,14 +7,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from bayessim_mjx.diagnosis import phrases, statistics
+from bayessim_mjx.diagnosis import phrases, tolerance
 from bayessim_mjx.diagnosis.findings import Findings
+from bayessim_mjx.diagnosis.gap import of_one, of_rms
 from bayessim_mjx.diagnosis.result import FoundEffect, Gap
 from bayessim_mjx.diagnosis.selection.selected import Rival
 from bayessim_mjx.diagnosis.selection.sets import BASE, Weighed
 from bayessim_mjx.diagnosis.summary import first_look
 from bayessim_mjx.diagnosis.summary.left_in_words import flexible_in_words
 from bayessim_mjx.diagnosis.summary.texts import (
+    ABOVE,
     BEATEN,
     BENT,
     BUILDS_UP,
@@ -48,8 +50,6 @@ from bayessim_mjx.quantities import extent, percent
 class Limits:
     """What is worth a sentence, and how much of it is told."""
 
-    clear: float = 1.2  # noise variances above which a horizon's gap is worth a share
-    left: float = 1.15  # noise sd; 2 of 183 checks with nothing hidden leave more, and 70 of 160 others called so
     told: int = 6  # joints told one by one
 
 
@@ -133,7 +133,7 @@ def _coasting(far: Gap, named: bool) -> str:
     """Where no simulator at all predicts better than the recalibrated one."""
     if far.coasting is None or far.coasting >= far.calibrated:
         return ""
-    closed = statistics.share_of_gap(far.coasting**2 - max(far.with_effects, 1.0) ** 2, far.coasting**2)
+    closed = of_rms(far.coasting, far.with_effects).closed
     more = COASTS_CLOSED.format(closed=percent(max(closed, 0.0))) if named else ""
     return COASTS.format(coasting=number(far.coasting), calibrated=number(far.calibrated), more=more)
 
@@ -152,7 +152,7 @@ def verdict_in_words(
         remains: share of the gap that a flexible force closes on top of the effects; beaten: whether a flexible force
             alone does better than they do.
     """
-    promised, went = (sum(getattr(e, k) for e in effects) for k in ("predicted_gap_closed", "gap_closed"))
+    promised, went = (far.closed.get(k, math.nan) for k in ("predicted", "realised"))
     one = len(effects) == 1
     fill = {s: stage_in_words(far, s) for s in ("nominal", "calibrated", "with_effects")} | {
         "named": listed(by_law([(e.name, e.where) for e in effects])),
@@ -171,8 +171,9 @@ def verdict_in_words(
     }
     partly = name == "unexplained" and effects and far.beyond
     both = bool(effects and far.beyond) and name in REST
-    head = "more" if name == "parameters" and far.calibrated > LIMITS.left else name
-    out = [PARTLY if partly else REST[name] if both else HEADS[head]]
+    quoted = {"no_gap": far.nominal, "parameters": far.calibrated}.get(name, 0.0)
+    heads = HEADS if of_one(quoted**2).at_noise else ABOVE
+    out = [PARTLY if partly else REST[name] if both else heads[name]]
     if effects:
         more = ON_TOP if remains > 0.05 else BEATEN if beaten else ""
         out += [f"{NEAREST}{more}."] if name == "unexplained" and (more or not partly) else []
@@ -235,7 +236,7 @@ def _within(far: Gap) -> str:
         return ""
     row = far.physical[name]
     noise, unit = row.get("noise", 0.0), row["unit"]
-    above = math.sqrt(max(row["with_effects"] ** 2 - noise**2, 0.0))
+    above = float(tolerance.above_noise(row["with_effects"], noise))
     return f"{extent(above, unit)} above the noise, of {extent(max(row['tolerance'], noise), unit)}, at {name}"
 
 
@@ -268,13 +269,10 @@ def _instead(effect: FoundEffect, rivals: Sequence[Rival]) -> str:
     return f"{text} Its size, {which}: {size} {shared['unit']} (90 %: {low} to {high})."
 
 
-def horizon_warning(gap: Gap) -> list[str]:
+def horizon_warning(far: Gap) -> list[str]:
     """A verdict that changes with the horizon is flagged."""
-    closed = {
-        row["name"]: statistics.share_of_gap(row["calibrated"] ** 2 - row["with_effects"] ** 2, row["calibrated"] ** 2)
-        for row in gap.horizons
-        if row["calibrated"] ** 2 > LIMITS.clear
-    }
+    loud = [row for row in far.horizons if not of_one(row["calibrated"] ** 2).at_noise]
+    closed = {row["name"]: of_rms(row["calibrated"], row["with_effects"]).closed for row in loud}
     if len(closed) < 2 or max(closed.values()) - min(closed.values()) < 0.3:
         return []
     shares = ", ".join(f"{percent(share)} ({name})" for name, share in closed.items())

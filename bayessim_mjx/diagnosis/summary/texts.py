@@ -4,13 +4,17 @@ HEADS = {
     "no_gap": "No gap above the noise: the logs differ from the simulator by {nominal}.",
     "parameters": "Only parameters are off, as far as these logs tell: recalibrated, the gap falls from {nominal} to "
     "{calibrated}.",
-    "more": "The parameters are off: recalibrated, the gap falls from {nominal} to {calibrated}. That is more than the "
-    "noise, but too little for these logs to tell what is missing.",
     "noise": "The noise is larger than estimated: what the recalibrated simulator leaves, {calibrated}, nothing "
     "predicts, and no force leaves such a trace.",
     "effects": "The simulator lacks {named}.",
     "ambiguous": "The simulator lacks something like {named}, but these logs fit other explanations as well.",
     "unexplained": "Something is missing that no effect of the library explains.",
+}
+ABOVE = {  # where what is left is more than the noise
+    "no_gap": "The logs differ from the simulator by {nominal}. That is more than the noise, but too little for these "
+    "logs to tell what is missing.",
+    "parameters": "The parameters are off: recalibrated, the gap falls from {nominal} to {calibrated}. That is more "
+    "than the noise, but too little for these logs to tell what is missing.",
 }
 PARTLY = (
     "Partly explained: {named} {close} {realised} of the squared gap above the noise, but more than the tolerance "

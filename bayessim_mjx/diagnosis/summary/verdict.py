@@ -7,9 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import chi2
 
-from bayessim_mjx.diagnosis import data_sheet, statistics
+from bayessim_mjx.diagnosis import data_sheet
 from bayessim_mjx.diagnosis.findings import Findings
 from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
+from bayessim_mjx.diagnosis.gap import of_one, of_rms
 from bayessim_mjx.diagnosis.residual.origin import Origin, origin
 from bayessim_mjx.diagnosis.result import Gap
 from bayessim_mjx.diagnosis.selection.models import Model
@@ -78,7 +79,7 @@ def verdict_of(found: Findings, far: Gap) -> Verdict:
     left, alone, noise = remains(found), beaten(found), sensors_noise(found)
     off = bent(found.model) if found.model.effects else (0, 0)
     name = _name(found, far, left, alone, noise)
-    return Verdict("unexplained" if any(off) else name, left, alone, noise, off, builds_up(found))
+    return Verdict("unexplained" if any(off) else name, left, alone, noise, off, builds_up(found, far))
 
 
 def bent(model: Model) -> tuple[int, int]:
@@ -95,7 +96,7 @@ def _precise(c: Coordinate) -> float:
     return c.precision**0.5 * (data_sheet.ACCURACY / data_sheet.WORST if c.kind else 1.0)
 
 
-def builds_up(found: Findings) -> float:
+def builds_up(found: Findings, far: Gap) -> float:
     """How many times larger (rms) the error over whole logs is than noise, start and parameters make likely; else 0.
 
     Only where windows are within a few noises, which begin anew at the measured state: where they show more, that is
@@ -104,46 +105,39 @@ def builds_up(found: Findings) -> float:
     over = found.part(Whole)
     if over is None or not len(over.beyond) or not found.model.effects:
         return 0.0
-    cost = found.predictions["with_effects"].cost(found.setup.fitter.simulator.windows.steps).mean()
     times = over.over_likely
-    return times if times > LIMITS.builds_up and cost <= LIMITS.matters**2 else 0.0
+    return times if times > LIMITS.builds_up and far.with_effects <= LIMITS.matters else 0.0
 
 
 def _name(found: Findings, far: Gap, remaining: float, alone: bool, noise: Origin | None) -> str:
     tried, model = found.selection, found.model
     if model.effects:
-        cost = {
-            k: float(p.cost(found.setup.fitter.simulator.windows.steps).mean()) for k, p in found.predictions.items()
-        }
-        above = cost["with_effects"] - 1.0
-        matters = above > LIMITS.shows**2 - 1.0 or bool(far.beyond)
-        little = above <= LIMITS.share * (cost["calibrated"] - 1.0) or noise is not None
-        little = little and not standstill(far, above)
-        structured = tried.above_noise(model) and remaining > LIMITS.share
+        matters = far.with_effects > LIMITS.shows or bool(far.beyond)
+        little = of_rms(far.calibrated, far.with_effects).left <= LIMITS.share or noise is not None
+        little = little and not standstill(far)
+        structured = tried.above_noise(model) and not remaining <= LIMITS.share  # NaN: all is on top
         if (matters and not little) or structured or (found.flexible_winner is not None and alone):
             return "unexplained"
         return "ambiguous" if tried.ambiguous else "effects"
-    if np.sqrt(tried.base.total / (tried.noise * len(tried.base.cost))) > LIMITS.matters:
+    calibrated = tried.gap(tried.base)
+    if calibrated.rms > LIMITS.matters:
         return "unexplained" if noise is None or remaining > LIMITS.share else "noise"
     if tried.above_noise(tried.base) and remaining > LIMITS.share:
         return "unexplained"
     q, _ = tried.nominal.quadratic(tried.fitter.spread)
-    floor = tried.noise * len(tried.base.cost) * FLOOR**2
-    return "parameters" if q.c.sum() > max(1.1 * tried.base.total, floor) else "no_gap"
+    nominal = of_one(float(q.c.sum()), calibrated.noise)
+    return "parameters" if nominal.rms > FLOOR and nominal.after > 1.1 * calibrated.after else "no_gap"
 
 
-def standstill(far: Gap, above: float) -> bool:
+def standstill(far: Gap) -> bool:
     """Whether effects hardly do better than joints that keep their speed, in the place of a simulator that does worse.
 
     Beside forces that are far off, whatever hardly accelerates closes almost all of the gap. Noise of the sensors
     excuses nothing here: it is in both.
-
-    Args:
-        above: noise variances that the effects leave above the noise, mean of the windows.
     """
     if far.coasting is None or far.coasting >= far.calibrated:
         return False
-    return statistics.share_of_gap(above, far.coasting**2) > LIMITS.share
+    return not of_rms(far.coasting, far.with_effects).left <= LIMITS.share  # also where they coast within the noise
 
 
 def remains(found: Findings) -> float:
@@ -153,7 +147,7 @@ def remains(found: Findings) -> float:
         return 0.0
     cost = float(model.plain.sum())  # as the force's is: of predictions, with nothing open
     top = cost - min(float(flex.condition.cost.sum()), cost)
-    return statistics.share_of_gap(top, float(base.plain.sum()), found.selection.noise * len(base.cost))
+    return of_one(float(base.plain.sum()), found.selection.noise * len(base.cost)).share(top)
 
 
 def beaten(found: Findings) -> bool:
@@ -166,7 +160,7 @@ def beaten(found: Findings) -> bool:
         return False
     cost = float(model.plain.sum())
     better = cost - float(base.condition.cost.sum())
-    share = statistics.share_of_gap(better, float(tried.base.plain.sum()), tried.noise * len(tried.base.cost))
+    share = of_one(float(tried.base.plain.sum()), tried.noise * len(tried.base.cost)).share(better)
     return better > LIMITS.beaten * cost and share > LIMITS.relevant
 
 

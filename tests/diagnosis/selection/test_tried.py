@@ -7,7 +7,7 @@ import pytest
 
 from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.selection.pool import Pool
-from bayessim_mjx.diagnosis.selection.tried import Settings, Tried
+from bayessim_mjx.diagnosis.selection.tried import Settings
 
 
 def candidate(effect, where):
@@ -17,12 +17,12 @@ def candidate(effect, where):
 @pytest.mark.parametrize(("rms", "believed", "goes_on"), [(1.2, 1.0, False), (1.4, 1.0, True), (1.2, 0.4, True)])
 def test_effects_are_added_until_the_sensors_noise_is_reached(rms, believed, goes_on):
     """Where most of what counts as noise is what the time step may be worth, a model with effects can do better."""
-    tried = SimpleNamespace(settings=Settings(believed=believed), noise=50.0)
     cost = np.full(8, 50.0 * rms**2)
-    model = SimpleNamespace(effects=(candidate("payload", "link"),), cost=cost, total=cost.sum())
-    assert bool(Tried.above_noise(tried, model)) is goes_on
     bare = SimpleNamespace(effects=(), cost=cost, total=cost.sum())
-    assert bool(Tried.above_noise(tried, bare)) is (rms > 1.3)
+    model = SimpleNamespace(effects=(candidate("payload", "link"),), cost=cost, total=cost.sum())
+    tried = Pool(SimpleNamespace(size=50.0), [], Settings(believed=believed), None, bare)
+    assert tried.above_noise(model) is goes_on
+    assert tried.above_noise(bare) is (rms > 1.3)
 
 
 def test_what_is_closed_is_counted_from_the_noise_not_from_the_best_model_tried():
@@ -32,6 +32,5 @@ def test_what_is_closed_is_counted_from_the_noise_not_from_the_best_model_tried(
         for t in (5, 1, 0.8, 3)
     )
     pool = Pool(fitter, [], Settings(), None, base)
-    assert pool.closure(best) == pool.closure(lucky) == 1.0 and pool.closure(base) == 0.0
-    assert pool.closure(half) == pytest.approx(0.5)
-    assert pool.left(half) == pytest.approx(0.5)
+    assert pool.gap(best).closed == pool.gap(lucky).closed == 1.0 and pool.gap(base).closed == 0.0
+    assert pool.gap(half).closed == pool.gap(half).left == pytest.approx(0.5)

@@ -10,7 +10,8 @@ from bayessim_mjx.diagnosis.vocabulary import listed, missing
 
 ROW = {"nominal": 0.02144, "calibrated": 0.0027, "with_effects": 0.000866, "unit": "rad", "tolerance": 0.02}
 SHARES = {"nominal": 0.02144, "calibrated": 0.0027, "with_effects": 0.000866}
-LEVEL = Gap(1.0, 21.44, 2.7, 0.866, 0.866, physical={"hinge": ROW}, shares=SHARES)
+CLOSED = {"predicted": 0.66, "realised": 0.68}
+LEVEL = Gap(1.0, 21.44, 2.7, 0.866, 0.866, physical={"hinge": ROW}, shares=SHARES, closed=CLOSED)
 
 
 def effect(name, where, closed, promised):
@@ -36,7 +37,7 @@ def test_one_effect():
 
 
 def test_what_conditions_without_a_part_in_the_choice_say():
-    known = dataclasses.replace(LEVEL, closed={"predicted": 0.66, "realised": 0.68, "elsewhere": 0.41})
+    known = dataclasses.replace(LEVEL, closed=CLOSED | {"elsewhere": 0.41})
     told = sentences.verdict_in_words("effects", [FRICTION], known)[2]
     assert told.endswith("they close 41 % of the gap of the condition that was left out.")
     assert told not in sentences.verdict_in_words("effects", [FRICTION], LEVEL)
@@ -57,7 +58,8 @@ def test_a_choice_without_a_condition_is_said_to_rest_on_costs_that_saw_it():
 
 
 def test_several_effects():
-    head, falls, _ = sentences.verdict_in_words("effects", [FRICTION, GAIN], LEVEL)
+    both = dataclasses.replace(LEVEL, closed={"predicted": 0.97, "realised": 1.0})
+    head, falls, _ = sentences.verdict_in_words("effects", [FRICTION, GAIN], both)
     assert head == "The simulator lacks Coulomb friction at hinge and the true actuator gain at torque."
     assert falls.startswith("With them the recalibrated")
     assert falls.endswith(

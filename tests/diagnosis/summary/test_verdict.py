@@ -2,7 +2,6 @@
 
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 
 from bayessim_mjx.diagnosis.summary import verdict
@@ -10,15 +9,12 @@ from bayessim_mjx.diagnosis.summary import verdict
 
 def named(left: float, calibrated: float, noise: object = None) -> str:
     """The verdict on effects that leave so many noises (rms) of so many that recalibration leaves."""
-    cost = {"with_effects": left**2, "calibrated": calibrated**2}
     found = SimpleNamespace(
-        predictions={k: SimpleNamespace(cost=lambda steps, c=c: np.full(6, c)) for k, c in cost.items()},
-        setup=SimpleNamespace(fitter=SimpleNamespace(simulator=SimpleNamespace(windows=SimpleNamespace(steps=25)))),
         model=SimpleNamespace(effects=("x",)),
         selection=SimpleNamespace(above_noise=lambda model: False, ambiguous=False),
         flexible_winner=None,
     )
-    far = SimpleNamespace(beyond=(), coasting=None, calibrated=calibrated)
+    far = SimpleNamespace(beyond=(), coasting=None, calibrated=calibrated, with_effects=left)
     return verdict._name(found, far, 0.0, False, noise)
 
 

@@ -1,0 +1,67 @@
+"""The gap by hand: what is closed, what is left, and what counts as noise."""
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from bayessim_mjx.diagnosis.gap import AT_NOISE, Gap, of_one, of_rms
+from bayessim_mjx.diagnosis.summary.left_in_words import flexible_in_words
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "noise", "closed"),
+    [
+        (9.0, 3.0, 1.0, 0.75),  # 6 of 8
+        (90.0, 30.0, 10.0, 0.75),  # the unit does not matter
+        (9.0, 1.0, 1.0, 1.0),
+        (9.0, 0.5, 1.0, 1.0),  # nothing undercuts the noise
+        (9.0, 9.0, 1.0, 0.0),
+        (9.0, 13.0, 1.0, -0.5),  # worse than before
+        (3.0, 2.0, 2.5, 1.0),
+    ],
+)
+def test_shares_of_the_squared_gap_above_the_noise(before, after, noise, closed):
+    gap = Gap(before, after, noise)
+    assert gap.closed == pytest.approx(closed) and gap.left == pytest.approx(1.0 - closed)
+
+
+@pytest.mark.parametrize("after", [0.5, 1.0, 4.0])
+def test_of_no_gap_nobody_closes_a_share(after):
+    for before in (0.8, 1.0):
+        assert math.isnan(Gap(before, after).closed) and math.isnan(Gap(before, after).left)
+
+
+def test_a_part_of_the_gap_as_a_share():
+    assert Gap(9.0, 3.0).share(2.0) == 0.25
+    assert Gap(9.0, 3.0).share(9.0 - 3.0) == Gap(9.0, 3.0).closed
+
+
+def test_from_root_mean_squares():
+    gap = of_rms(10.0, 2.0)
+    assert gap.closed == pytest.approx(96 / 99) and gap.rms == 2.0
+    assert of_rms(10.0, 4.0, 2.0).rms == 2.0  # in noise standard deviations, of a noise of 2
+    assert of_rms(10.0, 4.0, 2.0).closed == pytest.approx(84 / 96)
+
+
+def test_noise_is_told_by_what_is_left_in_noise_standard_deviations():
+    assert of_rms(50.0, AT_NOISE).at_noise and of_rms(50.0, 0.7).at_noise
+    assert not of_rms(50.0, 1.01 * AT_NOISE).at_noise
+    assert of_one(100 * 1.14**2, 100.0).at_noise and not of_one(100 * 1.16**2, 100.0).at_noise  # sums over windows
+
+
+def test_what_a_flexible_force_removes_is_a_share_of_what_is_above_the_noise():
+    """Windows of 50 residuals: 5 noise variances of which 3 go are three quarters of 4; 1.3 of them are the noise."""
+
+    def held(variances, gain):
+        return SimpleNamespace(significant=True, base=np.full(8, 50.0 * variances), gain=8 * 50.0 * gain)
+
+    depends = [{"input": "the speed of elbow", "importance": 1.0}]
+    found = SimpleNamespace(condition=held(5.0, 3.0), samples=50, where={"elbow": 1.0}, depends_on=depends)
+    found.interpolation = held(1.3, 0.2)
+    first, second = flexible_in_words(found)
+    assert first.endswith("other operating conditions a flexible force removes 75 % of the squared gap that is left")
+    assert second == "what is missing acts at elbow and depends on the speed of elbow"
+    found.condition = held(1.3, 0.2)
+    assert flexible_in_words(found)[0].startswith("what is left lies within the measurement noise")
