@@ -10,7 +10,6 @@ from __future__ import annotations
 import functools
 import hashlib
 import inspect
-import os
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
@@ -20,6 +19,7 @@ import mujoco
 import numpy as np
 from jax import export
 
+from bayessim_mjx import atomic
 from bayessim_mjx.compat import compiler_options
 from bayessim_mjx.config import cache
 from bayessim_mjx.physics import Physics
@@ -134,6 +134,4 @@ def _write(path: Path | None, content: bytes) -> None:
     if path is None:
         return
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_suffix(f".{os.getpid()}")  # a killed run leaves no half file
-    part.write_bytes(content)
-    part.replace(path)
+    atomic.write_bytes(path, content)

@@ -10,7 +10,6 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-import os
 import zipfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -18,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from bayessim_mjx import atomic
 from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 
@@ -139,10 +139,8 @@ def _write(path: Path, asked: str, fits: Sequence[Fit]) -> None:
             own[name] = place
         each.append(own)
     text = json.dumps({"asked": asked, "fits": each})
-    temporary = path.with_suffix(".tmp")
-    with temporary.open("wb") as file:
+    with atomic.replacing(path) as file:
         np.savez(file, about=np.array(text), **arrays)
-    os.replace(temporary, path)
 
 
 def _read(path: Path, asked: str) -> list[Fit] | None:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from bayessim_mjx import atomic
 from bayessim_mjx.diagnosis.selection.tried import Tried
 from bayessim_mjx.diagnosis.setup import Setup
 from bayessim_mjx.diagnosis.summary import first_look
@@ -27,9 +27,7 @@ def write(path: Path, about: Mapping[str, Any], setup: Setup, tried: Tried | Non
     found = {"verdict": None, "about": dict(about), "before_simulation": first_look.lines(setup.look)}
     found |= {"warnings": list(setup.warnings)} | ({} if tried is None else _so_far(tried))
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_suffix(".tmp")
-    temporary.write_text(json.dumps(found | {"windows": len(setup.fitter.simulator.windows)}, indent=1) + "\n")
-    os.replace(temporary, path)
+    atomic.write_text(path, json.dumps(found | {"windows": len(setup.fitter.simulator.windows)}, indent=1) + "\n")
 
 
 def _so_far(tried: Tried) -> dict[str, Any]:
