@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import warnings
 import zipfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -33,15 +34,21 @@ class Journal:
     Args:
         folder: made where it is not there; what is in it of another search is removed.
         about: what is searched, a digest.
+        code: what searches, a digest. Fits of other code are never mixed with new ones; a warning says that they go.
     """
 
-    def __init__(self, folder: Path, about: str) -> None:
+    def __init__(self, folder: Path, about: str, code: str) -> None:
         self.folder, self.count, self.found = folder, 0, 0
         folder.mkdir(parents=True, exist_ok=True)
-        path = folder / ABOUT
-        if not path.is_file() or path.read_text() != about:
-            self._forget()
-            path.write_text(about)
+        path, own = folder / ABOUT, f"{about}\n{code}\n"
+        old = path.read_text() if path.is_file() else None
+        if old == own:
+            return
+        if old is not None and old.split("\n")[0] == about and any(folder.glob(FILES)):
+            text = f"{folder}: the fits in it were made by other code than that which runs now; the search begins anew"
+            warnings.warn(text, stacklevel=3)
+        self._forget()
+        atomic.write_text(path, own)
 
     def play(self, asked: str, fit: Callable[[], list[Fit]]) -> list[Fit]:
         """What was asked for: as it is on disk, else as `fit` gives it, which is then on disk."""
