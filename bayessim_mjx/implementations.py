@@ -76,11 +76,11 @@ def _forget(task: str, console: "Console") -> int:
 
 
 def _write(file: Path, kept: Sequence["Measurement"]) -> None:
+    from bayessim_mjx import atomic
     from bayessim_mjx.physics import measured
-    from bayessim_mjx.runs.checkpoints import write_json
 
     file.parent.mkdir(parents=True, exist_ok=True)
-    write_json(file, measured.content(kept))
+    atomic.write_json(file, measured.content(kept))
 
 
 def _refused(config: "Config") -> str | None:

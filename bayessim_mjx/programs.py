@@ -10,7 +10,6 @@ from __future__ import annotations
 import functools
 import hashlib
 import inspect
-import os
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
@@ -20,6 +19,7 @@ import mujoco
 import numpy as np
 from jax import export
 
+from bayessim_mjx import atomic, versions
 from bayessim_mjx.compat import compiler_options
 from bayessim_mjx.config import cache
 from bayessim_mjx.physics import Physics
@@ -59,7 +59,7 @@ class Kept:
             if self.traced_from is None:
                 found = self._flat(tree)
             else:
-                own = self.traced_from, str(tree), str(shapes), jax.default_backend(), _versions(), _sources()
+                own = self.traced_from, str(tree), str(shapes), jax.default_backend(), _versions(), versions.sources()
                 found = self._from_disk(_digest(own), leaves, tree)
             self._known[tree, shapes] = found
         return self._known[tree, shapes]
@@ -92,27 +92,21 @@ def traced_from(physics: Physics, *more: Any) -> str | None:
     size = mujoco.mj_sizeModel(physics.mj_model)
     model = np.empty(size, np.uint8)
     mujoco.mj_saveModel(physics.mj_model, None, model)
-    sources = {_source(type(effect)) for effect in physics.effects}
+    sources = {source_of(type(effect)) for effect in physics.effects}
     if None in sources:
         return None
     own = physics.effects, physics.model_space.parameters, physics.substeps, physics.max_qvel, physics.unroll
     return _digest([hashlib.sha256(model.tobytes()).hexdigest(), *sorted(map(str, sources)), repr(own), repr(more)])
 
 
-def _source(of: type) -> str | None:
-    """Digest of the file that a class comes from; of this package's, nothing (`_sources`)."""
+def source_of(of: type) -> str | None:
+    """Digest of the file that a class comes from; of this package's, nothing (`versions.sources`)."""
     if of.__module__.split(".")[0] == __package__:
         return ""
     try:
         return _digest([Path(inspect.getfile(of)).read_text()])
     except (OSError, TypeError):
         return None
-
-
-@functools.cache
-def _sources() -> str:
-    """Of all modules of this package."""
-    return _digest(path.read_text() for path in sorted(Path(__file__).parent.rglob("*.py")))
 
 
 @functools.cache
@@ -134,6 +128,4 @@ def _write(path: Path | None, content: bytes) -> None:
     if path is None:
         return
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_suffix(f".{os.getpid()}")  # a killed run leaves no half file
-    part.write_bytes(content)
-    part.replace(path)
+    atomic.write_bytes(path, content)

@@ -5,6 +5,7 @@ A value and its uncertainty are rounded together, to the same decimal place.
 
 import math
 import re
+from collections.abc import Sequence
 from typing import Any, TypeGuard
 
 MISSING = "–"
@@ -130,6 +131,13 @@ def duration(seconds: float | None) -> str:
 def count(n: int, thing: str) -> str:
     """`1 log`, `2 logs`."""
     return f"{n} {thing}" if n == 1 else f"{n} {thing}s"
+
+
+def listed(names: Sequence[str], last: str = "and", most: int | None = None) -> str:
+    """`a, b and c`; where there are more than `most`, the first and how many more: `a, b and 5 more`."""
+    some, more = list(names[:most]), len(names) - len(names[:most])
+    some += [f"{more} more"] if more else []
+    return f" {last} ".join([", ".join(some[:-1]), some[-1]]) if len(some) > 1 else "".join(some)
 
 
 def size(count: float) -> str:

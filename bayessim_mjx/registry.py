@@ -39,9 +39,10 @@ def make(name: str, *, config: "Config | None" = None, effects: "Sequence[Effect
     if name.split(":")[0] in EXTERNAL and ":" in name:
         if config is not None and (config.effects or config.calibrated):
             raise UserError(f"effects: {name} is not simulated here, so it cannot take any; leave them out")
+        from bayessim_mjx import external
+
         env_overrides.pop("numEnvs", None)  # these choose their implementation themselves
-        wrapper = importlib.import_module("bayessim_mjx.wrappers.brax")
-        return wrapper.make(name, config=config, **env_overrides)
+        return external.make(name, config=config, **env_overrides)
     kind = _task(name)
     if config is None:
         return kind(env_overrides, None, effects)

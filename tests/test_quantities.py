@@ -13,6 +13,7 @@ from bayessim_mjx.quantities import (
     estimate,
     extent,
     is_number,
+    listed,
     number,
     percent,
     percent_estimate,
@@ -92,6 +93,12 @@ def test_compact_numbers_and_durations():
 def test_counts_and_sizes():
     assert [count(n, "log") for n in (0, 1, 2)] == ["0 logs", "1 log", "2 logs"]
     assert [size(n) for n in (1.25e13, 2e9, 3.456e6, 999.0)] == ["12.5 TB", "2 GB", "3.46 MB", "999 bytes"]
+
+
+def test_names_in_a_sentence():
+    assert listed([]) == "" and listed(["a"]) == "a" and listed(["a", "b", "c"], "or") == "a, b or c"
+    assert listed(["a", "b", "c"], most=3) == "a, b and c"
+    assert listed(["a", "b", "c"], most=1) == "a and 2 more" and listed("abcdef", most=2) == "a, b and 4 more"
 
 
 def test_lengths_and_angles_in_the_units_of_a_workshop():

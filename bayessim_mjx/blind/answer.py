@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from bayessim_mjx.blind import seal, show
+from bayessim_mjx import atomic
+from bayessim_mjx.blind import show
 from bayessim_mjx.blind.cases import ITEM, Item, again
 from bayessim_mjx.blind.check import WIDEST, Bench, Check, bench
 from bayessim_mjx.blind.findings import Found, findings
@@ -41,7 +42,7 @@ def answer(check: Check, outcomes: Sequence[Outcome], say: Say | None = None) ->
 
 def write(check: Check, found: Found) -> None:
     """blind.json and the page."""
-    seal.write(check.folder / FILE, json.dumps(found, indent=1, default=float))
+    atomic.write_text(check.folder / FILE, json.dumps(found, indent=1, default=float))
     show.page(found, about(check, found), check.folder)
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import yaml
 
+from bayessim_mjx import atomic
 from bayessim_mjx.blind import seal
 from bayessim_mjx.blind.amounts import amount_of
 from bayessim_mjx.blind.check import WIDEST, Bench, Check
@@ -61,7 +62,7 @@ def make(check: Check, bench: Bench, item: Item) -> None:
     truth = dataclasses.asdict(item) | {"seed": check.seed, "base": base, "effects": effects}
     salt = seal.digest(rng.bytes(32))
     code = seal.close(truth | {"salt": salt}, given, check.secret(item.index))
-    seal.write(check.seal(item.index), code)
+    atomic.write_text(check.seal(item.index), code)
 
 
 def drawn(check: Check, bench: Bench, item: Item) -> tuple[dict[str, float], list[Cause], np.random.Generator]:

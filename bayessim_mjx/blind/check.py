@@ -6,6 +6,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+from bayessim_mjx import atomic
 from bayessim_mjx import effects as library
 from bayessim_mjx.blind import seal
 from bayessim_mjx.blind.reality.cause import Scales
@@ -102,7 +103,7 @@ class Check:
         own = {k: v for k, v in json.loads(json.dumps(dataclasses.asdict(self))).items() if k != "out"}
         if not path.exists():
             self.folder.mkdir(parents=True, exist_ok=True)
-            seal.write(path, json.dumps(own, indent=1))
+            atomic.write_text(path, json.dumps(own, indent=1))
             return
         before = json.loads(path.read_text())
         other = [k for k in own if own[k] != before.get(k, own[k])]  # an earlier version had fewer

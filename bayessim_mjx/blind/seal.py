@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from bayessim_mjx import atomic
 from bayessim_mjx.errors import UserError
 
 SEAL = "seal.txt"
@@ -25,7 +26,7 @@ def close(truth: Mapping[str, Any], given: Path, secret: Path) -> str:
     """Write a truth, with the hashes of the files in `given`, to `secret`; the seal, which is its SHA-256."""
     text = json.dumps({**truth, "files": files_of(given)}, indent=1, default=float)
     secret.parent.mkdir(parents=True, exist_ok=True)
-    write(secret, text)
+    atomic.write_text(secret, text)
     secret.chmod(0o600)
     return digest(text.encode())
 
@@ -48,10 +49,3 @@ def opened(given: Path, secret: Path, seals: Mapping[str, str]) -> dict[str, Any
     if files_of(given) != truth["files"]:
         raise UserError(f"{given}: these are not the files that were sealed; make the case again")
     return truth
-
-
-def write(path: Path, text: str) -> None:
-    """Write a whole file or none: a killed process leaves no half of it."""
-    part = path.with_name(f".{path.name}.part")
-    part.write_text(text, encoding="utf-8")
-    part.replace(path)

@@ -15,7 +15,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from bayessim_mjx.blind import seal
+from bayessim_mjx import atomic
 from bayessim_mjx.blind.cases import ITEM, Item, again, make
 from bayessim_mjx.blind.check import Check, bench, loader
 from bayessim_mjx.blind.process import STOPPED, run
@@ -67,7 +67,7 @@ def diagnose(check: Check, index: int) -> str:
         raise KeyboardInterrupt
     told: dict[str, Any] = dataclasses.asdict(ended) | {"seal": check.seal(index).read_text()}
     told["closed"] = really_closed(check, index) if ended.code == 0 else None
-    seal.write(answer / EXIT, json.dumps(told))
+    atomic.write_text(answer / EXIT, json.dumps(told))
     return f"exit {ended.code}"
 
 

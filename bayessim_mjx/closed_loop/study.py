@@ -12,7 +12,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from bayessim_mjx import cli, registry
+from bayessim_mjx import atomic, cli, registry
 from bayessim_mjx.closed_loop import judge, measures, words
 from bayessim_mjx.closed_loop.judge import Judge, Simulators
 from bayessim_mjx.closed_loop.policies import Keeper, Policies
@@ -27,7 +27,7 @@ from bayessim_mjx.logs.read import read_logs
 from bayessim_mjx.monitor.writer import TensorBoard
 from bayessim_mjx.parameters import ParameterSpace
 from bayessim_mjx.physics import Physics
-from bayessim_mjx.runs import checkpoints, versions
+from bayessim_mjx.runs import versions
 
 SCHEMA = 1
 EFFECTS = "effects.yaml"
@@ -207,7 +207,7 @@ class Study:
     def write(self, found: dict[str, Any]) -> Path:
         """gap_loop.json and the scalars; returns the former's path."""
         path = self.out / "gap_loop.json"
-        checkpoints.write_text(path, json.dumps(found, indent=1, allow_nan=False) + "\n")
+        atomic.write_text(path, json.dumps(found, indent=1, allow_nan=False) + "\n")
         with TensorBoard(self.out, purge_step=0) as writer:
             writer.scalars(0, _scalars(found))
             writer.text("closed_loop", "\n\n".join(found["sentences"]))

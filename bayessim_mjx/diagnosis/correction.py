@@ -17,7 +17,7 @@ import numpy as np
 from bayessim_mjx import effects as library
 from bayessim_mjx.diagnosis.estimates import Estimate, FoundEffect
 from bayessim_mjx.distributions import Distribution
-from bayessim_mjx.effects.effect import Effect, Quantity, layout
+from bayessim_mjx.effects.effect import Effect, Quantity, in_order, layout
 from bayessim_mjx.effects.support import native, storage
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.parameters import Parameter, ParameterSpace
@@ -63,7 +63,7 @@ def effects_of(diagnosis: Found) -> tuple[Effect, ...]:
     """The effects found, with nominal = identified mean and prior Gaussian(mean, sd) truncated to a sensible range.
 
     One effect at several places is one `Effect` with values of its own at each; "all" is tied. Their order is the
-    library's, pure delays last (`Effect.last`), as in the diagnosis.
+    library's, as in the diagnosis (`in_order`).
 
     Raises:
         UserError: an unknown effect, or an estimate that is missing or no number.
@@ -74,8 +74,7 @@ def effects_of(diagnosis: Found) -> tuple[Effect, ...]:
     order = library.names()
     keys = sorted(places, key=lambda key: order.index(key[0]) if key[0] in order else len(order))
     own = diagnosis.details.get(OWN_EFFECTS, {})
-    kinds = [(library.recorded(own.get(key[0], key[0])), key) for key in keys]
-    return tuple(_effect(kind, places[key]) for kind, key in sorted(kinds, key=lambda pair: pair[0].last))
+    return tuple(in_order(_effect(library.recorded(own.get(key[0], key[0])), places[key]) for key in keys))
 
 
 def _effect(kind: type[Effect], found: list[FoundEffect]) -> Effect:

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from bayessim_mjx.effects.support.words import words
-from bayessim_mjx.quantities import percent
+from bayessim_mjx.quantities import listed, percent
 
 AXES = {
     "position": "position", "speed": "speed", "load": "gravity load", "effort": "effort", "time": "time in the log",
@@ -153,10 +153,8 @@ def moves(spread: float, groups: int, blocks: bool = False) -> str:
 
 
 def model_title(effects: Sequence[tuple[str, str]]) -> str:
-    """`load friction at elbow and actuator delay at elbow_motor`, of (effect, where)."""
-    places = ["everywhere" if where == "all" else f"at {where}" for _, where in effects]
-    named = [f"{name.replace('_', ' ')} {place}" for (name, _), place in zip(effects, places, strict=True)]
-    return " and ".join(named) or "the known parameters alone"
+    """`load friction at elbow and command delay at elbow_motor`, of (effect, where)."""
+    return listed([words(name).at(where) for name, where in effects]) or "the known parameters alone"
 
 
 def known_payload(mass: float, place: str) -> tuple[str, str]:

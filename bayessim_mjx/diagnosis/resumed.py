@@ -9,7 +9,7 @@ import jax
 import mujoco
 import numpy as np
 
-from bayessim_mjx import versions
+from bayessim_mjx import programs, versions
 from bayessim_mjx.diagnosis.fitting.journal import Journal, Remembering, digest
 from bayessim_mjx.diagnosis.selection.budget import Budget
 from bayessim_mjx.diagnosis.setup import Setup
@@ -19,7 +19,7 @@ def remembering(setup: Setup, folder: Path | None) -> Setup:
     """The setup with a fitter that finds in the folder what it fitted there before, and writes what it fits."""
     if folder is None:
         return setup
-    return replace(setup, fitter=Remembering(setup.fitter, Journal(folder, _question(setup))))
+    return replace(setup, fitter=Remembering(setup.fitter, Journal(folder, _question(setup), _code(setup))))
 
 
 def ended(setup: Setup) -> None:
@@ -28,8 +28,13 @@ def ended(setup: Setup) -> None:
         setup.fitter.journal = None
 
 
+def _code(setup: Setup) -> str:
+    """A digest of the code that makes the fits: this package's, and the files of effects from elsewhere."""
+    return digest(versions.sources(), sorted({str(programs.source_of(type(e))) for e in setup.physics.effects}))
+
+
 def _question(setup: Setup) -> str:
-    """A digest of all that the fits depend on but the time that they may take."""
+    """A digest of all that the fits depend on but code and the time that they may take."""
     fitter, model = setup.fitter, setup.physics.mj_model
     simulator = fitter.simulator
     raw = np.empty(mujoco.mj_sizeModel(model), np.uint8)

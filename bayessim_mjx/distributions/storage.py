@@ -1,13 +1,12 @@
 """A distribution on disk: one .npz of plain arrays with a JSON header (no pickle), replaced atomically."""
 
 import json
-import os
-import tempfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from bayessim_mjx import atomic
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.parameters.ranged import Ranged
 
@@ -19,19 +18,11 @@ def write(path: str | Path, arrays: dict[str, np.ndarray], space: Any, chart: st
     """Write arrays and what they mean to `path` (a reader sees the old file or the new one, never half)."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix=".tmp")
-    try:
-        with os.fdopen(descriptor, "wb") as file:
-            header = {"format": FORMAT, "version": VERSION, **coordinates(space, chart)}
-            if isinstance(space, Ranged):
-                header["range"] = _box(space)
-            np.savez(file, **{"header": np.asarray(json.dumps(header)), **arrays})  # type: ignore[arg-type]
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+    header = {"format": FORMAT, "version": VERSION, **coordinates(space, chart)}
+    if isinstance(space, Ranged):
+        header["range"] = _box(space)
+    with atomic.replacing(path) as file:
+        np.savez(file, **{"header": np.asarray(json.dumps(header)), **arrays})  # type: ignore[arg-type]
     return path
 
 

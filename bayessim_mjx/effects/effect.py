@@ -4,7 +4,7 @@ import abc
 import dataclasses
 import math
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -256,6 +256,14 @@ class Block:
     def pairs(self) -> Iterable[tuple[Parameter, Quantity]]:
         """Each parameter with what the effect says of it."""
         return zip(self.parameters, self.quantities, strict=True)
+
+
+Ordered = TypeVar("Ordered", Effect, type[Effect])
+
+
+def in_order(effects: Iterable[Ordered]) -> list[Ordered]:
+    """Effects, or their classes, in the order in which a diagnosis has them act: those that are `last` at the end."""
+    return sorted(effects, key=lambda effect: effect.last)
 
 
 def layout(space: ParameterSpace, effects: Iterable[Effect]) -> tuple[Block, ...]:

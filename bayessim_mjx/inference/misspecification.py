@@ -30,14 +30,13 @@ MOST = 256  # whitened coordinates; a longer summary's residual is projected at 
 NEIGHBOURS, NEAR = 5, 4000  # nearest simulations, among so many
 CLIP = 20.0  # standard deviations
 FLAGGED = 0.05  # p-value below which the posterior is distrusted
-SCORES = ("residual", "smooth residual", "distance to simulations")
 TWO_SIDED = (True, False, False)
 
 
 class Scores(NamedTuple):
     """Scores of n summaries."""
 
-    joint: Array  # [n, 3] in the order of SCORES
+    joint: Array  # [n, 3] residual, smooth residual, distance to simulations
     features: Array  # [n, D] residual of each feature given the others, in its standard deviations
 
 

@@ -26,7 +26,7 @@ from bayessim_mjx.monitor.predictive import predictive
 from bayessim_mjx.monitor.style import handles, head, heading, new_figure, size_of
 from bayessim_mjx.quantities import compact, fixed
 
-__all__ = ["corner", "forest", "pair", "predictive"]
+__all__ = ["corner", "pair", "predictive"]
 
 FULL_CORNER = 12  # up to so many parameters every pair is drawn
 
@@ -81,29 +81,6 @@ def _overview(draws: Draws, true: np.ndarray | None, best: int) -> Any:
     triangle(above, draws.pick(order), None if true is None else true[order], top=0.95)
     above.text(0.6, 1 - 0.62 / size_of(above)[1], f"the {best} best identified", fontsize=9, ha="center", va="top")
     correlation(below, draws)
-    return figure
-
-
-def forest(
-    samples: Any,
-    names: Sequence[str] | None = None,
-    low: Any = None,
-    high: Any = None,
-    truth: Any = None,
-    *,
-    title: str = "posterior",
-    round: int | None = None,
-    truth_label: str = "truth",
-    **more: Any,
-) -> Any:
-    """All parameters as 50 and 95 % intervals over their prior ranges, the best identified on top; see `corner`."""
-    draws = draws_of(samples, names, low, high, **more)
-    height = 1.8 + 0.24 * draws.d
-    figure = new_figure(8.5, height)
-    axes = figure.add_axes((0.36, 0.6 / height, 0.52, 1 - 1.5 / height))
-    true = draws.coordinate(_truth(truth, draws.names))
-    intervals(axes, draws, true)
-    head(figure, heading(title, round), ["posterior"] + ["truth"] * (true is not None), truth_label)
     return figure
 
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from bayessim_mjx import atomic
 from bayessim_mjx.config import Config
 from bayessim_mjx.logs import Channels
 from bayessim_mjx.loop import LoopState, RoundInfo
@@ -20,7 +21,6 @@ from bayessim_mjx.monitor.film import FPS, Motion, frames
 from bayessim_mjx.monitor.wall import Wall
 from bayessim_mjx.monitor.writers import Writer, opened
 from bayessim_mjx.rl import Policy, policy_of
-from bayessim_mjx.runs.checkpoints import write_text
 
 MOST_PAIRS = 10  # BayesSimIG draws one figure per pair; beyond this the corner plot shows them all
 ROUNDS = "rounds.jsonl"
@@ -220,7 +220,7 @@ class Session:
         file = self.path / ROUNDS
         if file.exists():
             rows = [line for line in file.read_text(encoding="utf-8").splitlines() if _round_of(line) < first]
-            write_text(file, "".join(row + "\n" for row in rows))
+            atomic.write_text(file, "".join(row + "\n" for row in rows))
 
     def flush(self) -> None:
         """Bring everything to the disk; before a checkpoint, as what lies before it is not written again."""

@@ -15,6 +15,8 @@ from typing import Any
 
 import numpy as np
 
+from bayessim_mjx import atomic
+
 FLUSH = 10.0  # s
 PurgeStep = int | Mapping[str, int] | None
 
@@ -58,9 +60,7 @@ def purge(folder: str | os.PathLike, step: int | Mapping[str, int]) -> int:
         old = list(records(path))
         kept = [raw for raw, event in old if not _late_event(event, step)]
         if len(kept) < len(old):
-            temporary = path.with_name(f".{path.name}.tmp")
-            temporary.write_bytes(b"".join(kept))
-            os.replace(temporary, path)
+            atomic.write_bytes(path, b"".join(kept))
             dropped += len(old) - len(kept)
     return dropped
 

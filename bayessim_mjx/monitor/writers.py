@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import json
 import math
-import os
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from bayessim_mjx import atomic
 from bayessim_mjx.monitor.writer import PurgeStep, TensorBoard, is_late, number
 
 PLAIN = ("step", "tag", "value", "time")  # columns of a CSV file, keys of a JSONL line
@@ -111,11 +111,8 @@ class Lines:
         path.parent.mkdir(parents=True, exist_ok=True)
         if purge_step is not None and path.exists():
             kept = [row for row in read(path) if not is_late([row["tag"]], int(row["step"]), purge_step)]
-            part = path.with_name(f".{path.name}.tmp")
-            part.unlink(missing_ok=True)
-            with part.open("w", newline="") as file:
+            with atomic.replacing(path, "w", newline="") as file:
                 self._write(file, kept, begin=True)
-            os.replace(part, path)
         new = not path.exists() or not path.stat().st_size
         self.file = path.open("a", newline="")
         self._write(self.file, [], begin=new)

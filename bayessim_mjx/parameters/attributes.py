@@ -17,7 +17,6 @@ OBJECTS = {
     "actuator": Obj.mjOBJ_ACTUATOR,
     "tendon": Obj.mjOBJ_TENDON,
 }
-COUNTS = {"body": "nbody", "geom": "ngeom", "joint": "njnt", "actuator": "nu", "tendon": "ntendon"}
 
 
 @dataclasses.dataclass(frozen=True)

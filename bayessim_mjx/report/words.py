@@ -165,13 +165,8 @@ def effect_noun(name: str) -> str:
 
 def effect_title(name: str, where: str) -> str:
     """`Coulomb friction at joint 'elbow'`."""
-    noun, kind = effect_noun(name), words(name).kind
-    noun = noun[:1].upper() + noun[1:]
-    if where in ("", "world") or (kind == "world" and where == "all"):
-        return noun
-    if where == "all":
-        return f"{noun} at all {kind or 'place'}s"
-    return f"{noun} at {kind} '{where}'" if kind and kind != "world" else f"{noun} at '{where}'"
+    title = words(name).at(where, quoted=True)
+    return title[:1].upper() + title[1:]
 
 
 def label_title(label: str, short: bool = False) -> str:

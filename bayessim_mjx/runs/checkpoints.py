@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from bayessim_mjx import atomic
 from bayessim_mjx.errors import UserError
 
 INDEX = "index.json"
@@ -25,25 +26,6 @@ MARGIN = 1 << 19  # bytes on the disk beside the arrays of a checkpoint
 
 class CorruptedError(UserError):
     """The checkpoint's files are damaged or incomplete."""
-
-
-def write_json(path: Path, content: Any) -> None:
-    """Replace `path` by `content` atomically."""
-    write_text(path, json.dumps(content, indent=1))
-
-
-def write_text(path: Path, text: str) -> None:
-    """Replace `path` by `text` atomically: a reader sees the old file or the new one, also after a kill."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with open(temporary, "w", encoding="utf-8") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except OSError:
-        temporary.unlink(missing_ok=True)
-        raise
 
 
 def save(path: Path, tree: Any, step: int, meta: Mapping[str, Any]) -> None:
@@ -64,7 +46,7 @@ def save(path: Path, tree: Any, step: int, meta: Mapping[str, Any]) -> None:
     leaves = {name: _save_part(temporary / name, part) for name, part in parts.items()}
     index = {"format": FORMAT, "step": int(step), "meta": dict(meta), "coordinates": _coordinates(parts)}
     index["parts"] = leaves
-    write_json(temporary / INDEX, {**index, "sha256": _digest(index)})
+    atomic.write_json(temporary / INDEX, {**index, "sha256": _digest(index)})
     os.rename(temporary, path)
 
 

@@ -17,7 +17,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from bayessim_mjx import config
+from bayessim_mjx import atomic, config
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.runs import checkpoints
 from bayessim_mjx.runs.manifest import FOLDER, MANIFEST, SCHEMA, advice, best_of, differences, read
@@ -127,7 +127,7 @@ class Run:
         if before == iterations:
             return
         ppo["max_iterations"] = iterations
-        checkpoints.write_text(file, config.to_yaml(train))
+        atomic.write_text(file, config.to_yaml(train))
         if "settings" in self.manifest:  # earlier versions did not write them
             self.manifest["settings"]["ppo"]["max_iterations"] = iterations
         entry = {"at": _now(), "step": self.manifest["latest"], "from": before, "to": iterations}
@@ -197,7 +197,7 @@ class Run:
             return self.restore("latest", template, fall_back=True)
 
     def _write(self) -> None:
-        checkpoints.write_json(self.path / MANIFEST, self.manifest)
+        atomic.write_json(self.path / MANIFEST, self.manifest)
 
     def _reserve(self) -> None:
         path = self.path / RESERVE

@@ -1,4 +1,4 @@
-"""Other libraries' environments for our trainer, and ours for other libraries.
+"""Our environments for the trainers of other libraries.
 
 In Gymnasium our tasks are called `bayessim_mjx/<Task>-v0`. `import bayessim_mjx` says so to Gymnasium, at once or when
 Gymnasium is imported; nothing heavy is imported for it.

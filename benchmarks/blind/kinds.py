@@ -12,6 +12,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "diagnosis"))
 
 from drawn import DRAWN
 
+from bayessim_mjx import atomic
 from bayessim_mjx.blind import seal
 from bayessim_mjx.blind.cases import data_sheet, hidden, write_logs
 from bayessim_mjx.blind.check import WIDEST
@@ -55,7 +56,7 @@ def make(robot: System, kind: str, seed: int, out: Path) -> bool:
     (given / "model.xml").write_text(robot.xml)
     truth = {"version": VERSION, "robot": robot.name, "kind": kind, "seed": seed, "base": base, "effects": effects}
     code = seal.close(truth | {"salt": seal.digest(rng.bytes(32))}, given, out / "sealed" / f"{name}.json")
-    seal.write(case / "seal.txt", code)
+    atomic.write_text(case / "seal.txt", code)
     return True
 
 

@@ -26,6 +26,7 @@ import numpy as np  # noqa: E402
 from kinds import KINDS, VERSION, make  # noqa: E402
 from systems import SYSTEMS  # noqa: E402
 
+from bayessim_mjx import atomic  # noqa: E402
 from bayessim_mjx.blind import process, seal  # noqa: E402
 from bayessim_mjx.blind.outcome import Outcome, alarm, covered, label, rate  # noqa: E402
 from bayessim_mjx.blind.worker import EXIT  # noqa: E402
@@ -45,7 +46,7 @@ MEASURES = ("single", "in the set", "weak", "double", "false alarms", "of colour
 
 def generate(out: Path, seeds: range, systems: list[str], kinds: list[str]) -> None:
     """Write cases that are not there yet."""
-    seal.write(_made(out) / "suite.json", json.dumps({"version": VERSION, "seeds": [seeds.start, seeds.stop]}))
+    atomic.write_text(_made(out) / "suite.json", json.dumps({"version": VERSION, "seeds": [seeds.start, seeds.stop]}))
     for seed in seeds:
         for name in systems:
             for kind in kinds:
@@ -84,7 +85,7 @@ def _one(suite: Path, case: Path, name: str, command: str, timeout: float) -> st
             shutil.copy(said, answer / "diagnosis.json")
     if ended.code in process.STOPPED:
         return f"{case.name}: stopped"
-    seal.write(answer / EXIT, json.dumps(vars(ended) | {"seal": (case / "seal.txt").read_text()}))
+    atomic.write_text(answer / EXIT, json.dumps(vars(ended) | {"seal": (case / "seal.txt").read_text()}))
     return f"{name}, {case.name}: exit {ended.code}, {ended.cpu:.0f} s of CPU, {ended.seconds:.0f} s"
 
 

@@ -90,9 +90,9 @@ def _closed(found: Any, case: Any, seed: int) -> float | None:
 
 
 def _write(path: Path, content: Any) -> None:
-    part = path.with_suffix(".part")  # a killed run leaves no half file
-    part.write_text(json.dumps(content, default=float))
-    part.replace(path)
+    from bayessim_mjx import atomic
+
+    atomic.write_text(path, json.dumps(content, default=float))
 
 
 def run(args: argparse.Namespace) -> None:

@@ -100,9 +100,9 @@ def joints_of(folder: Path) -> dict[str, str]:
 
 
 def _write(path: Path, content: Any) -> None:
-    part = path.with_suffix(".part")  # a killed run leaves no half file
-    part.write_text(json.dumps(content, indent=1, default=float))
-    part.replace(path)
+    from bayessim_mjx import atomic
+
+    atomic.write_text(path, json.dumps(content, indent=1, default=float))
 
 
 def work(case: Path, out: Path, baselines: bool, arguments: list[str]) -> int:

@@ -20,11 +20,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from bayessim_mjx import cli, rl
+from bayessim_mjx import atomic, cli, rl
 from bayessim_mjx.closed_loop import study
 from bayessim_mjx.diagnosis.result import load as load_diagnosis
 from bayessim_mjx.logs.log import Channels
-from bayessim_mjx.runs import checkpoints
 
 MASS = {"kind": "body", "attribute": "mass", "mean": 1.1, "sd": 0.01, "low": 0.5, "high": 1.5}
 HIDDEN = {
@@ -69,7 +68,7 @@ def truth(folder: Path, task: str) -> Path:
     """The surrogate as an effects.yaml (JSON is YAML)."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / "truth.yaml"
-    checkpoints.write_text(path, json.dumps({"schema": 1} | HIDDEN[task]))
+    atomic.write_text(path, json.dumps({"schema": 1} | HIDDEN[task]))
     return path
 
 

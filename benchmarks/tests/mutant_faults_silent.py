@@ -55,7 +55,7 @@ SILENT: tuple[tuple[str, str, str, str, tuple[str, ...]], ...] = (
         "bool(truncated[i] | terminated[i])", _tests("wrappers/test_trainers", k="sb3_is_told"),
     ),
     (
-        "Brax: an episode lasts one step longer", f"{P}/wrappers/brax.py", "(steps >= self.episode_length)",
+        "Brax: an episode lasts one step longer", f"{P}/external.py", "(steps >= self.episode_length)",
         "(steps > self.episode_length)", _tests("wrappers/test_brax", k="protocol"),
     ),
     # loop

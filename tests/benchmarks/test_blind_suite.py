@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from bayessim_mjx.blind import seal
+from bayessim_mjx import atomic
 
 ROOT = Path(__file__).resolve().parents[2]
 for folder in ("diagnosis", "blind", "blind/entries"):
@@ -74,7 +74,8 @@ def test_a_case_is_written_once_and_sealed_and_scored(tmp_path):
     answer.mkdir(parents=True)
     said = {"verdict": "effects", "effects": [{"name": "backlash", "where": "hinge", "equivalent_to": []}]}
     (answer / "diagnosis.json").write_text(json.dumps(said))
-    seal.write(answer / "exit.json", json.dumps({"code": 0, "seconds": 1.0, "seal": (case / "seal.txt").read_text()}))
+    ended = {"code": 0, "seconds": 1.0, "seal": (case / "seal.txt").read_text()}
+    atomic.write_json(answer / "exit.json", ended)
     text, figures = suite.table(tmp_path)
     assert figures["says yes"]["false alarms"]["hits"] == 1 and "| says yes |" in text and "1/1" in text
 

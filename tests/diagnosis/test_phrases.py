@@ -26,7 +26,11 @@ def test_a_sign_stands_in_the_words_where_they_have_a_place_for_it():
 
 def test_why_an_experiment_is_proposed():
     titles = [phrases.model_title(own) for own in ([("load_friction", "elbow"), ("payload", "all")], [], [("x", "y")])]
-    assert titles == ["load friction at elbow and payload everywhere", "the known parameters alone", "x at y"]
+    assert titles == [
+        "load-dependent friction at elbow and extra payload at all bodies",
+        "the known parameters alone",
+        "x at y",
+    ]
     action = phrases.run_experiment("chirp on elbow", 9.96)
     assert action == "run a chirp on elbow for 10 s" and phrases.run_experiment("release", 3.0).startswith(
         "run release"

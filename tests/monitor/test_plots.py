@@ -113,7 +113,6 @@ def test_degenerate_samples_are_drawn():
     c = case(2) | {"samples": np.full((50, 2), 2.0)}
     c["samples"][0] = np.nan
     plots.corner(**c)
-    plots.forest(c["samples"], c["names"], c["low"], c["high"])
 
 
 def test_logarithmic_axis():

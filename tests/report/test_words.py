@@ -58,6 +58,7 @@ def test_units_have_superscripts():
 def test_effects_in_plain_english():
     assert words.effect_title("payload", "hand") == "Extra payload at body 'hand'"
     assert words.effect_title("coulomb_friction", "all") == "Coulomb friction at all joints"
+    assert words.effect_title("payload", "all") == "Extra payload at all bodies"
     assert words.effect_title("my_effect", "elbow") == "My effect at 'elbow'"
     assert words.label_title("actuator_delay@m1", short=True) == "Command delay · m1"
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,29 +9,12 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from bayessim_mjx.config import read_yaml
 from bayessim_mjx.errors import UserError
 
 if TYPE_CHECKING:
     from bayessim_mjx.diagnosis.experiment.propose import Experiment
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True, eq=False)
-class Command:
-    """A command file that was read.
-
-    Attributes:
-        time: `[T]`, s; ctrl: {actuator: `[T]`}, held until the next row; ref: {joint: `[T]`}, expected motion;
-        enabled: {actuator: `[T]`}, 0 while its drive is to be off; notes: the YAML beside it.
-    """
-
-    time: Array
-    ctrl: dict[str, Array]
-    ref: dict[str, Array]
-    enabled: dict[str, Array]
-    notes: dict[str, Any]
 
 
 def write_command(path: str | Path, experiment: Experiment, source: str = "") -> Path:
@@ -114,28 +96,3 @@ def _limits(e: Experiment) -> dict[str, Any]:
 
 def _short(*values: float) -> list[float]:
     return [float(f"{v:.6g}") for v in values]
-
-
-def read_command(path: str | Path) -> Command:
-    """Read what `write_command` wrote.
-
-    Raises:
-        UserError: no such file, no time column, columns of another kind.
-    """
-    path = Path(path)
-    if not path.is_file():
-        raise UserError(f"{path}: no such command file")
-    header = path.read_text().split("\n", 1)[0].strip().split(",")
-    values = np.loadtxt(path, delimiter=",", skiprows=1, ndmin=2)
-    if header[0] != "time":
-        raise UserError(f"{path}: the first column is {header[0]!r}; allowed: time")
-    kinds: dict[str, dict[str, Array]] = {"ctrl": {}, "ref": {}, "enabled": {}}
-    for column, own in zip(header[1:], values.T[1:], strict=True):
-        kind, _, name = column.partition(":")
-        if kind not in kinds or not name:
-            raise UserError(
-                f"{path}: column {column!r}; allowed: time, ctrl:<actuator>, ref:<joint>, enabled:<actuator>"
-            )
-        kinds[kind][name] = own
-    side = path.with_suffix(".yaml")
-    return Command(values[:, 0], **kinds, notes=read_yaml(side) if side.is_file() else {})

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from bayessim_mjx import effects as library
 from bayessim_mjx.diagnosis.fitting.scales import Scales, ranges
-from bayessim_mjx.effects.effect import Block, Effect, Quantity
+from bayessim_mjx.effects.effect import Block, Effect, Quantity, in_order
 from bayessim_mjx.effects.support.quantity import STATED
 from bayessim_mjx.effects.support.site import element_names, places
 from bayessim_mjx.errors import UserError
@@ -129,7 +129,7 @@ def kinds_of(effects: str | Sequence[str | type[Effect]]) -> list[type[Effect]]:
         kinds = map(library.load, library.names()) if name == "all" else ()
         found += [kind for kind in kinds if kind.offered]
         found += [] if name == "all" else [library.load(name) if isinstance(name, str) else name]
-    return sorted(dict.fromkeys(found), key=lambda kind: kind.last)
+    return in_order(dict.fromkeys(found))
 
 
 def stack(kinds: Sequence[type[Effect]], scales: Scales) -> tuple[tuple[Effect, ...], list[str]]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-import os
+import warnings
 import zipfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from bayessim_mjx import atomic
 from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 
@@ -33,15 +34,21 @@ class Journal:
     Args:
         folder: made where it is not there; what is in it of another search is removed.
         about: what is searched, a digest.
+        code: what searches, a digest. Fits of other code are never mixed with new ones; a warning says that they go.
     """
 
-    def __init__(self, folder: Path, about: str) -> None:
+    def __init__(self, folder: Path, about: str, code: str) -> None:
         self.folder, self.count, self.found = folder, 0, 0
         folder.mkdir(parents=True, exist_ok=True)
-        path = folder / ABOUT
-        if not path.is_file() or path.read_text() != about:
-            self._forget()
-            path.write_text(about)
+        path, own = folder / ABOUT, f"{about}\n{code}\n"
+        old = path.read_text() if path.is_file() else None
+        if old == own:
+            return
+        if old is not None and old.split("\n")[0] == about and any(folder.glob(FILES)):
+            text = f"{folder}: the fits in it were made by other code than that which runs now; the search begins anew"
+            warnings.warn(text, stacklevel=3)
+        self._forget()
+        atomic.write_text(path, own)
 
     def play(self, asked: str, fit: Callable[[], list[Fit]]) -> list[Fit]:
         """What was asked for: as it is on disk, else as `fit` gives it, which is then on disk."""
@@ -139,10 +146,8 @@ def _write(path: Path, asked: str, fits: Sequence[Fit]) -> None:
             own[name] = place
         each.append(own)
     text = json.dumps({"asked": asked, "fits": each})
-    temporary = path.with_suffix(".tmp")
-    with temporary.open("wb") as file:
+    with atomic.replacing(path) as file:
         np.savez(file, about=np.array(text), **arrays)
-    os.replace(temporary, path)
 
 
 def _read(path: Path, asked: str) -> list[Fit] | None:

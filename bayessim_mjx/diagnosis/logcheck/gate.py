@@ -16,7 +16,9 @@ from bayessim_mjx.diagnosis.logcheck.single_log import Finding, refuse, warn
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Array, Log
 from bayessim_mjx.logs.velocities import Velocity, agreeing, velocities
-from bayessim_mjx.quantities import percent
+from bayessim_mjx.quantities import listed, percent
+
+FEW = 3  # names that a sentence lists
 
 
 @dataclass(frozen=True)
@@ -116,27 +118,20 @@ class Gate:
 
     def _not_compared(self) -> tuple[str, ...]:
         """One sentence per reason: many logs of many joints would bury everything else."""
-        reasons: dict[tuple[str, str], tuple[list[str], list[str]]] = {}
+        reasons: dict[tuple[str, str], tuple[dict[str, None], dict[str, None]]] = {}  # the names each once, in order
         for report in self.reports:
             for r in report.relations:
                 if report.usable and r.text:
-                    logs, joints = reasons.setdefault((r.source, r.text), ([], []))
-                    logs.append(report.log.name)
-                    joints.append(r.joint)
+                    logs, joints = reasons.setdefault((r.source, r.text), ({}, {}))
+                    logs[report.log.name] = joints[r.joint] = None
         return tuple(
-            f"{_listed(logs)}: effort of {_listed(joints)} ({source}) not compared with the motion: {text}"
-            for (source, text), (logs, joints) in reasons.items()
+            f"{listed([*logs], most=FEW)}: effort of {listed([*joints], most=FEW)} ({why[0]}) not compared with the "
+            f"motion: {why[1]}"
+            for why, (logs, joints) in reasons.items()
         )
 
     def _all(self, kind: str) -> tuple[str, ...]:
         return tuple(f"{r.log.name}: {text}" for r in self.reports if r.usable for text in r.of(kind))
-
-
-def _listed(names: Sequence[str]) -> str:
-    """The first three different names, and how many more there are."""
-    names = list(dict.fromkeys(names))
-    more = f" and {len(names) - 3} more" if len(names) > 3 else ""
-    return ", ".join(names[:3]) + more
 
 
 def check(logs: Sequence[Log], mj_model: mujoco.MjModel, dt: float) -> Gate:

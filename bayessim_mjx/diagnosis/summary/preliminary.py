@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from bayessim_mjx import atomic
 from bayessim_mjx.diagnosis.gap import of_one
 from bayessim_mjx.diagnosis.result import plain
 from bayessim_mjx.diagnosis.selection.tried import Tried
@@ -27,10 +27,9 @@ def write(path: Path, about: Mapping[str, Any], setup: Setup, tried: Tried | Non
     found = {"verdict": None, "about": dict(about), "before_simulation": first_look.lines(setup.look)}
     found |= {"warnings": list(setup.warnings)} | ({} if tried is None else _so_far(tried))
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_suffix(".tmp")
     every = plain(found | {"windows": len(setup.fitter.simulator.windows)})
-    temporary.write_text(json.dumps(every, indent=1, allow_nan=False) + "\n")
-    os.replace(temporary, path)
+    atomic.write_text(path, json.dumps(every, indent=1, allow_nan=False) + "
+")
 
 
 def _so_far(tried: Tried) -> dict[str, Any]:

@@ -25,6 +25,21 @@ class Words:
     separates: str = ""
     witness: tuple[str, str] | None = None
 
+    def at(self, where: str, text: str = "", quoted: bool = False) -> str:
+        """`extra payload at tool`, `viscous friction at all joints`; without a place where it has none.
+
+        Args:
+            where: a place of the effect, "all" or "world"; text: in place of the noun.
+            quoted: `extra payload at body 'tool'`.
+        """
+        text = text or self.noun
+        if where in ("", "world") or (self.kind == "world" and where == "all"):
+            return text
+        if where == "all":
+            return f"{text} at all {'bodies' if self.kind == 'body' else (self.kind or 'place') + 's'}"
+        kind = f"{self.kind} " if self.kind not in ("", "world") else ""
+        return f"{text} at {kind}'{where}'" if quoted else f"{text} at {where}"
+
 
 def words(name: str) -> Words:
     """Of the effect called `name`, which may be unknown here: a diagnosis from elsewhere, a file not loaded."""

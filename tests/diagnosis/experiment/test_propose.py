@@ -6,8 +6,9 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 import pytest
+import yaml
 
-from bayessim_mjx.diagnosis.experiment.command_file import read_command, write_command
+from bayessim_mjx.diagnosis.experiment.command_file import write_command
 from bayessim_mjx.diagnosis.experiment.limits import limits_of
 from bayessim_mjx.diagnosis.experiment.propose import propose
 from bayessim_mjx.diagnosis.findings import Findings
@@ -132,16 +133,22 @@ def test_limits_hold_in_everything_that_is_proposed():
         assert np.abs(log.ctrl).max() <= TORQUE * (1 + 1e-6)
 
 
+def read(path):
+    """(columns by their names, notes) of a command file."""
+    columns = np.genfromtxt(path, delimiter=",", names=True, deletechars="")
+    return columns, yaml.safe_load(path.with_suffix(".yaml").read_text())
+
+
 def test_the_promised_evidence_comes_true(tmp_path):
     before = contest()[0].selection
     found = proposal()
-    command = read_command(write_command(tmp_path / "next.csv", found))
-    kp, kd = (command.notes["closed_loop"][k]["motor"] for k in ("kp", "kd"))
-    ref = command.ref["hinge"]
-    speed = np.gradient(ref, command.time)
+    command, notes = read(write_command(tmp_path / "next.csv", found))
+    kp, kd = (notes["closed_loop"][k]["motor"] for k in ("kp", "kd"))
+    ref = command["ref:hinge"]
+    speed = np.gradient(ref, command["time"])
 
     def law(k, q, w):
-        return command.ctrl["motor"][k] + kp * (ref[k] - q) + kd * (speed[k] - w)
+        return command["ctrl:motor"][k] + kp * (ref[k] - q) + kd * (speed[k] - w)
 
     q, u = real(law, len(ref) - 1, start=ref[0])
     assert np.abs(q).max() < RANGE
@@ -153,14 +160,14 @@ def test_the_promised_evidence_comes_true(tmp_path):
     assert ranked(after, 1)[0].effects[0].effect == "quadratic_drag"
 
 
-def test_the_command_file_round_trips(tmp_path):
+def test_the_command_file_holds_commands_expected_motion_and_notes(tmp_path):
     found = proposal()
     log = found.chosen.played.log
-    command = read_command(write_command(tmp_path / "next.csv", found, "logs/"))
-    np.testing.assert_allclose(command.time, log.time, atol=1e-9)
-    np.testing.assert_allclose(command.ctrl["motor"], log.ctrl[:, 0], rtol=1e-7, atol=1e-8)
-    np.testing.assert_allclose(command.ref["hinge"], log.qpos[:, 0], rtol=1e-7, atol=1e-8)
-    notes = command.notes
+    command, notes = read(write_command(tmp_path / "next.csv", found, "logs/"))
+    assert command.dtype.names == ("time", "ctrl:motor", "ref:hinge")
+    np.testing.assert_allclose(command["time"], log.time, atol=1e-9)
+    np.testing.assert_allclose(command["ctrl:motor"], log.ctrl[:, 0], rtol=1e-7, atol=1e-8)
+    np.testing.assert_allclose(command["ref:hinge"], log.qpos[:, 0], rtol=1e-7, atol=1e-8)
     assert notes["limits"]["joints"]["hinge"] == {"range": [-RANGE, RANGE], "speed": SPEED}
     assert notes["source"] == "logs/" and notes["kind"] == {"motor": "torque"}
     assert notes["how_to_log"]["columns"] == ["time", "ctrl:motor", "qpos:hinge"]

@@ -10,10 +10,10 @@ from bayessim_mjx.diagnosis.fitting.journal import ABOUT, Journal, Remembering, 
 from tests.diagnosis.selection.test_bounds import pool_of
 
 
-def fits_of(folder, start=0.5, about="this"):
+def fits_of(folder, start=0.5, about="this", code="code"):
     """(what a toy search comes to, calls of its simulator, fits that were on disk)."""
     pool, model = pool_of(0.4, start=start)
-    journal = Journal(folder, about)
+    journal = Journal(folder, about, code)
     fitter = Remembering(pool.fitter, journal)
     calls, run = [], fitter.simulator.run
     fitter.simulator.run = lambda *args: calls.append(1) or run(*args)
@@ -47,6 +47,13 @@ def test_other_questions_find_nothing(tmp_path):
     assert fits_of(tmp_path, start=0.6)[2] == 0  # other fits are asked for
     assert fits_of(tmp_path, start=0.6, about="other logs")[2] == 0
     assert fits_of(tmp_path, start=0.6, about="other logs")[2] == 3
+
+
+def test_fits_of_other_code_are_not_used(tmp_path):
+    fits_of(tmp_path)
+    with pytest.warns(UserWarning, match="made by other code than that which runs now; the search begins anew"):
+        assert fits_of(tmp_path, code="other code")[2] == 0
+    assert fits_of(tmp_path, code="other code")[2] == 3
 
 
 def test_it_is_removed_and_nothing_else(tmp_path):

@@ -6,7 +6,7 @@ import pytest
 
 from bayessim_mjx.diagnosis.result import VERDICTS, FoundEffect, Gap
 from bayessim_mjx.diagnosis.summary import sentences
-from bayessim_mjx.diagnosis.vocabulary import listed, missing
+from bayessim_mjx.diagnosis.vocabulary import missing
 
 ROW = {"nominal": 0.02144, "calibrated": 0.0027, "with_effects": 0.000866, "unit": "rad", "tolerance": 0.02}
 SHARES = {"nominal": 0.02144, "calibrated": 0.0027, "with_effects": 0.000866}
@@ -88,7 +88,6 @@ def test_names_of_effects_and_places():
     assert missing("viscous_friction", "all") == "viscous friction at all joints"
     assert missing("gravity_tilt", "world") == "the tilt of the base"
     assert missing("my_effect", "elbow") == "my effect at elbow"
-    assert listed(["a"]) == "a" and listed(["a", "b", "c"], "or") == "a, b or c" and listed([]) == ""
 
 
 @pytest.mark.parametrize(("value", "text"), [(0.8661, "0.87"), (2.7, "2.70"), (21.44, "21.4"), (161.6, "162")])
