@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 
 import jax
@@ -14,7 +15,7 @@ from bayessim_mjx.inference.sets import Sets
 from bayessim_mjx.keys import branch
 from bayessim_mjx.loop.factors import conditioned, kept, multiplied
 from bayessim_mjx.loop.simulations import features, proposal_of
-from bayessim_mjx.loop.state import Loop, LoopState
+from bayessim_mjx.loop.state import Answer, Evidence, Loop, LoopState, Round
 from bayessim_mjx.rl import Policy
 
 SETS = 64  # thetas at which sets are simulated
@@ -34,6 +35,19 @@ def judge(loop: Loop, state: LoopState, policy: Policy, known: int) -> Sets | No
     key = branch(loop.key(int(state.round), "fit"), 4)
     found = _simulated(loop, state, policy, known, key)
     return None if found is None else replace(sets.judge(*found, loop.settings.components), known=known)
+
+
+def widened(round_: Round, answer: Answer) -> tuple[Answer, Evidence]:
+    """The product, moved and widened as simulated sets of as many trajectories ask for."""
+    if round_.loop.settings.temperature:
+        return answer, Evidence()
+    clock, known, now = time.perf_counter(), round_.known, (round_.loop, round_.state, round_.policy)
+    found = settled(*now, known, answer.posterior, judge(*now, known))
+    if found is None:
+        return answer, Evidence()
+    seconds = {"check": time.perf_counter() - clock}
+    used = replace(answer, posterior=found.used(answer.posterior, known), sets=found)
+    return used, Evidence({"sets": found}, scores(found, known), seconds=seconds)
 
 
 def settled(
@@ -110,4 +124,4 @@ def scores(found: Sets, known: int) -> dict[str, float]:
     return {f"sets/{name}": float(value) for name, value in told.items()}
 
 
-__all__ = ["judge", "rejudge", "scores", "settled"]
+__all__ = ["judge", "rejudge", "scores", "settled", "widened"]

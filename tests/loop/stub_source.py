@@ -60,5 +60,5 @@ def infer(parts: loop.Loop, state: loop.LoopState) -> tuple[loop.LoopState, loop
         round=int(state.round), rounds=3, domain=state.domain, posterior=None, truth=TRUTH, returns=np.zeros(1),
         lengths=np.zeros(1), real=None, predictive=None, fit={}, scores={}, seconds={}, warnings=[],
     )  # fmt: skip
-    state = round_inference.infer(parts, state, None, info)
-    return dataclasses.replace(state, round=state.round + 1), info
+    state, found = round_inference.infer(parts, state, None)
+    return dataclasses.replace(state, round=state.round + 1), info.with_(found)

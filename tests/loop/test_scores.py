@@ -67,5 +67,6 @@ def test_a_rounds_own_trajectories_are_judged_by_its_own_network(monkeypatch: py
     parts = SimpleNamespace(settings=settings, source=SimpleNamespace(policy_dependent=True))
     fit = SimpleNamespace(identified=None)
     state = SimpleNamespace(round=1, fit=fit, real_features=None, temperature=1.0, real_posteriors=four(0.3))
-    found = round_inference._factors(parts, state, SimpleNamespace(warnings=[]))
+    found, warnings = round_inference._factors(parts, state)
+    assert not warnings
     np.testing.assert_allclose(found.means[:, 0, 0], [0.3, 0.3, 0.6, 0.6], rtol=1e-6)
