@@ -1,4 +1,4 @@
-"""What a person is told of a round's inference: complaints about the fit, scores, and how far it can be trusted."""
+"""Findings of a round's inference for a person: scores, predictions, complaints about the fit and checks."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ PREDICTIVE_DRAWS = 64
 CLIPPED = 0.01  # share of clipped summary entries worth a warning
 
 
-def told(round_: Round, answer: Answer) -> Evidence:
-    """The posterior with its scores, its predictions, and complaints about the fit behind it."""
+def describe(round_: Round, answer: Answer) -> Evidence:
+    """Describe the posterior by scores and predictions, and complain about the fit behind it."""
     loop, learnt, posterior = round_.loop, round_.learnt, answer.posterior
     assert loop.source is not None
     keys = [loop.key(number, "real") for number in range(round_.number + 1)]
@@ -36,8 +36,8 @@ def told(round_: Round, answer: Answer) -> Evidence:
     return Evidence(fields, score(posterior, truth), warnings)
 
 
-def trust(round_: Round, answer: Answer, moves: tuple[Pile, ...]) -> tuple[float, Evidence]:
-    """The share of the prior that misfit asks the randomisation for, and the checks of the posterior behind it."""
+def conclude(round_: Round, answer: Answer, moves: tuple[Pile, ...]) -> tuple[float, Evidence]:
+    """Conclude the checks; return the share of the prior to mix into the randomisation because of misfit."""
     verdict, names = round_.learnt.verdict, answer.posterior.names
     if verdict is None:
         return 0.0, Evidence(warnings=[pile.sentence() for pile in moves])
@@ -51,11 +51,11 @@ def trust(round_: Round, answer: Answer, moves: tuple[Pile, ...]) -> tuple[float
 def complaints(
     names: tuple[str, ...], fit: dict[str, Any], known_before: np.ndarray, by_replays: bool, fresh: bool
 ) -> list[str]:
-    """What a person should know about this round's fit.
+    """List complaints about this round's fit.
 
     Args:
         names: of the parameters.
-        fit: what the fit told.
+        fit: numbers of the fit.
         known_before: which parameters were identified [d].
         by_replays: whether the posterior is not the network's alone.
         fresh: whether it was the network's first fit.

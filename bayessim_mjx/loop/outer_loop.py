@@ -22,10 +22,9 @@ from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.env import Env
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.keys import branch
+from bayessim_mjx.loop.examination import reexamine
 from bayessim_mjx.loop.findings import PREDICTIVE_DRAWS, score
-from bayessim_mjx.loop.inference_state import blank
-from bayessim_mjx.loop.reexamination import reexamine
-from bayessim_mjx.loop.round_inference import infer
+from bayessim_mjx.loop.round_inference import blank, infer
 from bayessim_mjx.loop.sources import Recorded, make_source
 from bayessim_mjx.loop.state import KEPT_ROUNDS, Loop, LoopState, RoundInfo
 from bayessim_mjx.rl import Policy, TrainState

@@ -17,7 +17,7 @@ from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.inference import range_ends
 from bayessim_mjx.inference.range_ends import Pile
 from bayessim_mjx.keys import branch
-from bayessim_mjx.loop.range_limits import limits_of
+from bayessim_mjx.loop.sources import limits_of
 from bayessim_mjx.loop.state import Evidence, Loop, LoopState, Moving
 from bayessim_mjx.parameters.ranged import Ranged
 
@@ -93,7 +93,7 @@ def mixed(loop: Loop, state: LoopState, thetas: Array, x: Array) -> tuple[LoopSt
 
 
 def move(loop: Loop, state: LoopState, posterior: Distribution) -> tuple[Distribution, tuple[Pile, ...], Evidence]:
-    """The posterior over the ranges of the next round, and the ends that it piles up at, as far as ranges may move."""
+    """Move ends at which the posterior piles up; return it over the ranges of the next round, and those ends."""
     last = int(state.round) + 1 >= loop.settings.realIters
     if state.moving is None or last or not (found := range_ends.piles(posterior)):
         return posterior, (), Evidence()

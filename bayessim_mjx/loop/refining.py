@@ -34,8 +34,8 @@ def no_motion(loop: Loop, rows: int) -> dict[str, Array] | None:
     return {name: jnp.zeros((rows, *size)) for name, size in (sizes | {"valid": (length,)}).items()}
 
 
-def refined(round_: Round, answer: Answer) -> tuple[Answer, Evidence]:
-    """The posterior that replays of all trajectories so far decide on, where `bayessim.refine` asks for it."""
+def refine_by_replays(round_: Round, answer: Answer) -> tuple[Answer, Evidence]:
+    """Refine the posterior by replays of all real trajectories so far, where `bayessim.refine` asks for it."""
     if not round_.loop.refines:
         return answer, Evidence()
     clock, loop, b, warnings = time.perf_counter(), round_.loop, round_.loop.settings, []
@@ -112,4 +112,4 @@ def _likelihood(loop: Loop, state: LoopState, known: int) -> Likelihood:
     return Likelihood(physics, record, np.asarray(rows["valid"]), sensor, each)
 
 
-__all__ = ["no_motion", "refined", "scores", "stored"]
+__all__ = ["no_motion", "refine_by_replays", "scores", "stored"]

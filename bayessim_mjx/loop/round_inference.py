@@ -1,8 +1,8 @@
-"""The inference of one round of the outer loop.
+"""The inference of one round of the outer loop, and the state that it starts from.
 
 Simulated trajectories over the prior (or over the last posterior, see inference/rounds.py) train a network of
-q(theta | summary), which is checked; its posteriors of all real trajectories so far are multiplied, and the product is
-corrected by what further simulations and replays say of it.
+q(theta | summary). Fresh simulations check it. Its posteriors of all real trajectories so far are multiplied. Further
+simulations and replays of the real trajectories correct the product.
 """
 
 from __future__ import annotations
@@ -22,33 +22,45 @@ from jax import Array
 from bayessim_mjx import inference
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.inference import calibration, checks, misspecification, rounds
+from bayessim_mjx.inference import InferenceSettings, calibration, checks, misspecification, rounds
 from bayessim_mjx.keys import branch
-from bayessim_mjx.loop import findings, ranges, refining, set_checks, set_posterior, standing
+from bayessim_mjx.loop import examination, findings, ranges, refining, set_posterior, standing
 from bayessim_mjx.loop.factors import conditioned, kept, multiplied
 from bayessim_mjx.loop.findings import score
-from bayessim_mjx.loop.inference_state import new_network
 from bayessim_mjx.loop.simulations import at, noise_draws, proposal_of, simulated
-from bayessim_mjx.loop.state import Answer, Evidence, Learnt, Loop, LoopState, Round, joined, slot_of, space_of
+from bayessim_mjx.loop.state import (
+    Answer,
+    Evidence,
+    Learnt,
+    Loop,
+    LoopState,
+    Round,
+    domain_or_prior,
+    joined,
+    slot_of,
+    space_of,
+)
+from bayessim_mjx.parameters import ParameterSpace
+from bayessim_mjx.parameters.ranged import Ranged
 from bayessim_mjx.quantities import percent
 from bayessim_mjx.rl import Policy
 from bayessim_mjx.rollout import Trajectory, select
 
-__all__ = ["CORRECTIONS", "infer", "score"]
+__all__ = ["CORRECTIONS", "blank", "infer", "score"]
 
 LOST = 0.05  # weight of a posterior that cannot be divided by the proposal worth a warning
 
-# of the product of the posteriors, in this order
+# of the product of the posteriors, in this order: later ones begin with the answer of those before
 CORRECTIONS: tuple[Callable[[Round, Answer], tuple[Answer, Evidence]], ...] = (
-    set_checks.widened,  # as wide as simulated sets ask for
-    standing.chosen,  # the last round's posterior where that promises more
-    refining.refined,  # the simulator's own likelihood, by replays
-    set_posterior.chosen,  # a network that sees all trajectories together
+    examination.widen,  # as far as simulated sets require
+    standing.keep_last,  # where it promises more
+    refining.refine_by_replays,  # the simulator's own likelihood of the real trajectories
+    set_posterior.use_set_network,  # one that sees all trajectories together
 )
 
 
 def infer(loop: Loop, state: LoopState, policy: Policy) -> tuple[LoopState, Evidence]:
-    """Simulate, learn, condition on all real trajectories and correct: the state after it, and what was found."""
+    """Simulate, learn, condition on all real trajectories and correct; return the next state and the evidence."""
     begun = time.perf_counter()
     state, simulations, spent = simulate(loop, state, policy)
     state, real = observe(loop, state, policy)
@@ -59,8 +71,8 @@ def infer(loop: Loop, state: LoopState, policy: Policy) -> tuple[LoopState, Evid
         answer, corrected = correct(round_, answer)
         found.append(corrected)
     posterior, moves, moved = ranges.move(loop, state, answer.posterior)
-    share, judged = findings.trust(round_, answer, moves)
-    evidence = joined([*found, findings.told(round_, answer), moved, judged])
+    share, judged = findings.conclude(round_, answer, moves)
+    evidence = joined([*found, findings.describe(round_, answer), moved, judged])
     domain = checks.guarded(posterior, share)
     proposal = rounds.following(posterior, loop.settings.proposal) if loop.sequential else None
     state = dataclasses.replace(state, **evidence.kept, domain=domain, proposal=proposal)
@@ -70,7 +82,7 @@ def infer(loop: Loop, state: LoopState, policy: Policy) -> tuple[LoopState, Evid
 
 @dataclass(frozen=True)
 class Simulations:
-    """What a network is trained and tested on."""
+    """Training and test data of a round's network."""
 
     fitted: tuple[Array, Array, int]  # thetas, features, valid rows
     held: tuple[Array, Array]  # fresh pairs that no training sees
@@ -162,12 +174,12 @@ def train(
 def check(
     loop: Loop, state: LoopState, simulations: Simulations
 ) -> tuple[tuple[calibration.Report, misspecification.Misfit] | None, Evidence]:
-    """Calibration and misfit, or None where they are switched off or too few fresh simulations are usable."""
+    """Test calibration and misfit; None where tests are switched off or too few fresh simulations are usable."""
     clock, b, round_ = time.perf_counter(), loop.settings, int(state.round)
     if not b.checkTrajs:
         return None, Evidence()
     known = slice(round_ * b.realTrajs if loop.source.policy_dependent else 0, (round_ + 1) * b.realTrajs)  # type: ignore[union-attr]
-    # what the network of this round is tested on comes from what it was simulated from
+    # the fresh pairs that test a network were drawn from the same proposal as its round's simulations
     tilt = state.proposals and at(state.proposals, slot_of(loop, state, round_ + 1)) if b.proposal == "apt" else None
     key, verdict, warnings = branch(loop.key(round_, "fit"), 2), None, []
     try:
@@ -191,7 +203,7 @@ def condition(loop: Loop, state: LoopState) -> tuple[LoopState, Answer, Evidence
 
 
 def _factors(loop: Loop, state: LoopState) -> tuple[Distribution, list[str]]:
-    """q(theta | x) of every real trajectory, leaves [real trajectories, ...], and what is to be said of them."""
+    """q(theta | x) of every real trajectory, leaves [real trajectories, ...], and warnings about them."""
     b, seen, warnings = loop.settings, int(state.round) * loop.settings.realTrajs, []
     factors = conditioned(state.fit, state.real_features, state.temperature)
     if b.proposal == "division":
@@ -207,3 +219,48 @@ def _factors(loop: Loop, state: LoopState) -> tuple[Distribution, list[str]]:
         # an older trajectory was made by an older policy: its posterior stays that of the network of its time
         factors = select(jnp.arange(factors.logits.shape[0]) >= seen, factors, state.real_posteriors)
     return factors, warnings
+
+
+def blank(loop: Loop) -> dict[str, Any]:
+    """The inference's fields of a LoopState before the first round: no data, the prior as domain."""
+    b, space, d = loop.settings, loop.space, len(loop.env.space)
+    domain = domain_or_prior(space, b.components, loop.chart)
+    infers = b.modelClass is not None
+    capacity, real_rows = (loop.capacity, b.realIters * b.realTrajs) if infers else (0, 0)
+    return {
+        "domain": domain,
+        "fit": new_network(loop, 0, space) if infers else None,
+        "thetas": jnp.zeros((capacity, d)),
+        "features": jnp.zeros((capacity, loop.feature_size)),
+        "real_features": jnp.zeros((real_rows, loop.feature_size)),
+        "real_posteriors": _no_factors(loop, real_rows) if infers else None,
+        **_no_proposals(loop),
+        "temperature": jnp.float32(1.0),
+        "moving": ranges.unmoved(space) if isinstance(space, Ranged) else None,
+        "motion": refining.no_motion(loop, real_rows) if infers and loop.refines else None,
+        "standing": domain if infers else None,
+        "standing_gain": jnp.float32(-jnp.inf) if infers else None,
+        "standing_round": jnp.int32(0) if infers else None,
+    }
+
+
+def _no_factors(loop: Loop, rows: int) -> Distribution:
+    settings = InferenceSettings.of(loop.settings).at(loop.env.space)
+    factor = Distribution.prior(loop.space, settings.components * settings.ensemble, settings.chart)
+    return jax.tree.map(lambda leaf: jnp.zeros((rows, *leaf.shape)), factor)
+
+
+def _no_proposals(loop: Loop) -> dict[str, Any]:
+    if not loop.sequential:
+        return {"proposal": None, "proposals": None}
+    b = loop.settings
+    prior = rounds.first(loop.space, b.proposal, b.components, loop.chart)
+    return {"proposal": prior, "proposals": rounds.repeated(prior, max(1, loop.capacity // b.trainTrajs))}
+
+
+def new_network(loop: Loop, round_: int, space: ParameterSpace) -> Any:
+    """A fresh FitState for that round, over its ranges."""
+    changing = loop.source is not None and loop.source.policy_dependent
+    embedding = None if loop.source is None else loop.source.channels.embedding(loop.settings.summarizerFxn)
+    settings = InferenceSettings.of(loop.settings, restandardise=changing, embedding=embedding)
+    return inference.init(branch(loop.key(round_, "fit"), 1), settings, space, loop.feature_size)

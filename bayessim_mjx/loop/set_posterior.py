@@ -67,8 +67,8 @@ class SetPosterior:
         return told | {f"coverage_{100 * level:.0f}": self.network.coverage(level) for level in sets.LEVELS}
 
 
-def chosen(round_: Round, answer: Answer) -> tuple[Answer, Evidence]:
-    """The posterior of a network of sets in the place of the product, where `bayessim.sets` asks for it."""
+def use_set_network(round_: Round, answer: Answer) -> tuple[Answer, Evidence]:
+    """Replace the product by the posterior of a network of sets, where `bayessim.sets` asks for it."""
     b = round_.loop.settings
     if answer.source != "product" or b.sets == "product" or round_.known < 2:
         return answer, Evidence()
@@ -86,7 +86,7 @@ def chosen(round_: Round, answer: Answer) -> tuple[Answer, Evidence]:
 
 
 def _learnt(loop: Loop, state: LoopState, policy: Policy, answer: Answer) -> tuple[SetPosterior, Distribution]:
-    """What was found, and the posterior of the real trajectories by the network of sets."""
+    """Learn from simulated sets; return the comparison and the network's posterior of the real trajectories."""
     b, source, product = loop.settings, loop.source, answer.posterior
     real = _usable(loop, state, product)
     k_learn, k_theta, *keys = jax.random.split(branch(loop.key(int(state.round), "fit"), 5), 2 + len(real))
@@ -152,4 +152,4 @@ def _products(
     ]
 
 
-__all__ = ["SetPosterior", "chosen"]
+__all__ = ["SetPosterior", "use_set_network"]

@@ -39,8 +39,8 @@ def expected(report: Report | None, found: Sets | None, known: int) -> float:
     return float(gain) if np.isfinite(gain) else -np.inf
 
 
-def chosen(round_: Round, answer: Answer) -> tuple[Answer, Evidence]:
-    """The round's posterior, or the last round's where that gained more on simulated trajectories."""
+def keep_last(round_: Round, answer: Answer) -> tuple[Answer, Evidence]:
+    """Keep the last round's posterior where it gained more on simulated trajectories."""
     b, state, verdict = round_.loop.settings, round_.state, round_.learnt.verdict
     if verdict is None or b.temperature or round_.loop.sequential:  # no gain is judged, or rounds cannot be compared
         return answer, Evidence()
@@ -75,4 +75,4 @@ def _moved(last: Distribution, posterior: Distribution) -> bool:
     return not all(np.array_equal(a, b) for a, b in zip(*ends, strict=True))
 
 
-__all__ = ["chosen", "expected", "lost", "told"]
+__all__ = ["expected", "keep_last", "lost", "told"]

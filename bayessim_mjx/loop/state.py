@@ -87,7 +87,7 @@ class RoundInfo:
     moves: tuple[Pile, ...] = ()  # ends of ranges at which the posterior piles up, and where they are in the next round
 
     def with_(self, found: Evidence) -> RoundInfo:
-        """The same with what the round's inference found."""
+        """Add the evidence of the round's inference."""
         return dataclasses.replace(
             self,
             **found.fields,
@@ -99,7 +99,7 @@ class RoundInfo:
 
 @dataclasses.dataclass(frozen=True)
 class Evidence:
-    """What a step of a round's inference found.
+    """Findings of one step of a round's inference.
 
     Attributes:
         fields: of `RoundInfo` that the step fills.
@@ -117,7 +117,7 @@ class Evidence:
 
 
 def joined(found: Sequence[Evidence]) -> Evidence:
-    """The evidence of several steps: of a field the last one counts, seconds add up."""
+    """Join the evidence of several steps: the last value of a field counts, seconds add up."""
     whole = Evidence()
     for one in found:
         seconds = {name: whole.seconds.get(name, 0.0) + spent for name, spent in one.seconds.items()}
@@ -195,16 +195,16 @@ class Loop:
 
 @dataclasses.dataclass(frozen=True)
 class Learnt:
-    """What training and checking the network of a round told."""
+    """Results of training and checking a round's network."""
 
     fit: dict[str, Any]  # numbers of the training
-    known_before: np.ndarray  # [d] which parameters the network before it identified
+    known_before: np.ndarray  # [d] bool, parameters that the last round's network identified
     verdict: tuple[Report, Misfit] | None  # calibration and misfit; None: not tested
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Round:
-    """What a correction of the posterior may look at."""
+    """Inputs of a correction of the posterior."""
 
     loop: Loop
     state: LoopState  # with the round's network, its temperature and all real trajectories so far

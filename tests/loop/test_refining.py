@@ -11,7 +11,7 @@ from bayessim_mjx import config, loop
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.inference.importance import Refined
-from bayessim_mjx.loop import findings, inference_state, refinement, round_inference
+from bayessim_mjx.loop import findings, refinement, round_inference
 from bayessim_mjx.loop.likelihood import Likelihood
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 from bayessim_mjx.registry import make
@@ -27,7 +27,7 @@ SMALL = [
 def begun(*more: str) -> tuple[loop.Loop, loop.LoopState]:
     settings = config.load("Pendulum", overrides=[*SMALL, *more])
     parts = loop.make(settings, make("Pendulum", config=settings))
-    return parts, loop.LoopState(round=jax.numpy.int32(0), train=None, **inference_state.blank(parts))
+    return parts, loop.LoopState(round=jax.numpy.int32(0), train=None, **round_inference.blank(parts))
 
 
 def inferred(parts: loop.Loop, state: loop.LoopState) -> tuple[loop.LoopState, loop.RoundInfo]:

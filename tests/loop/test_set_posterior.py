@@ -36,7 +36,7 @@ def test_where_sets_cannot_be_simulated_the_product_is_kept_and_the_reason_told(
         (dataclasses.replace(state, round=state.round + 1), "made by other policies"),
         (state, "have told nothing yet"),
     ]:
-        answer, found = set_posterior.chosen(Round(parts, state_, None, None, None), Answer(product))
+        answer, found = set_posterior.use_set_network(Round(parts, state_, None, None, None), Answer(product))
         assert answer.posterior is product and answer.source == "product" and not found.fields
         assert why in found.warnings[0] and "bayessim.sets=embedding" in found.warnings[0]
 
@@ -45,5 +45,5 @@ def test_what_the_last_round_or_replays_answered_is_kept():
     parts, state = made("bayessim.sets=embedding")
     for source in ("last round", "replays"):
         answer = Answer(state.domain, source)
-        after, found = set_posterior.chosen(Round(parts, state, None, None, None), answer)
+        after, found = set_posterior.use_set_network(Round(parts, state, None, None, None), answer)
         assert after is answer and found == Evidence()

@@ -27,7 +27,7 @@ def chosen(state: State, posterior: Distribution, gain: float) -> tuple[State, A
     parts = SimpleNamespace(settings=settings, sequential=False)
     learnt = SimpleNamespace(verdict=(SimpleNamespace(gain=gain), None))
     round_ = SimpleNamespace(loop=parts, state=state, learnt=learnt, known=1)
-    answer, found = standing.chosen(round_, Answer(posterior))
+    answer, found = standing.keep_last(round_, Answer(posterior))
     return dataclasses.replace(state, **found.kept), answer, found
 
 
