@@ -41,7 +41,7 @@ def refine_by_replays(round_: Round, answer: Answer) -> tuple[Answer, Evidence]:
     clock, loop, b, warnings = time.perf_counter(), round_.loop, round_.loop.settings, []
     likelihood = _likelihood(loop, round_.state, round_.known)
     if likelihood.silent.any() and not round_.number:
-        warnings.append(f"bayessim.refine: {_without_noise(likelihood.silent, loop.env.physics.mj_model)}")  # type: ignore[attr-defined]
+        warnings.append(f"bayessim.refine: {_without_noise(likelihood.silent, likelihood.physics.mj_model)}")
     if not likelihood.seen.any():
         return answer, Evidence(warnings=warnings)
     seed = int(jax.random.randint(branch(loop.key(round_.number, "fit"), 3), (), 0, 2**31 - 1))

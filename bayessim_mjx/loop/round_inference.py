@@ -178,7 +178,8 @@ def check(
     clock, b, round_ = time.perf_counter(), loop.settings, int(state.round)
     if not b.checkTrajs:
         return None, Evidence()
-    known = slice(round_ * b.realTrajs if loop.source.policy_dependent else 0, (round_ + 1) * b.realTrajs)  # type: ignore[union-attr]
+    assert loop.source is not None
+    known = slice(round_ * b.realTrajs if loop.source.policy_dependent else 0, (round_ + 1) * b.realTrajs)
     # the fresh pairs that test a network were drawn from the same proposal as its round's simulations
     tilt = state.proposals and at(state.proposals, slot_of(loop, state, round_ + 1)) if b.proposal == "apt" else None
     key, verdict, warnings = branch(loop.key(round_, "fit"), 2), None, []
