@@ -1,8 +1,8 @@
 """The outer loop: train, collect, infer, repeat."""
 
+from bayessim_mjx.loop.examination import reexamine
+from bayessim_mjx.loop.findings import PREDICTIVE_DRAWS
 from bayessim_mjx.loop.outer_loop import checkpoint_step, init, make, meta_of, run, step, train, tree_of
-from bayessim_mjx.loop.reexamination import reexamine
-from bayessim_mjx.loop.round_inference import PREDICTIVE_DRAWS
 from bayessim_mjx.loop.state import Loop, LoopState, RoundInfo
 
 __all__ = [

@@ -22,9 +22,9 @@ from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.env import Env
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.keys import branch
-from bayessim_mjx.loop.inference_state import blank
-from bayessim_mjx.loop.reexamination import reexamine
-from bayessim_mjx.loop.round_inference import PREDICTIVE_DRAWS, infer, score
+from bayessim_mjx.loop.examination import reexamine
+from bayessim_mjx.loop.findings import PREDICTIVE_DRAWS, score
+from bayessim_mjx.loop.round_inference import blank, infer
 from bayessim_mjx.loop.sources import Recorded, make_source
 from bayessim_mjx.loop.state import KEPT_ROUNDS, Loop, LoopState, RoundInfo
 from bayessim_mjx.rl import Policy, TrainState
@@ -142,7 +142,8 @@ def step(loop: Loop, state: LoopState) -> tuple[LoopState, RoundInfo]:
         warnings=[],
     )
     if loop.settings.modelClass is not None:
-        state = infer(loop, state, policy, info)
+        state, found = infer(loop, state, policy)
+        info = info.with_(found)
     state = dataclasses.replace(state, round=state.round + 1)
     if round_ + 1 < loop.settings.realIters:
         # new episodes under the new domain also where the policy goes on

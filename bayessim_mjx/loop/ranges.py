@@ -15,9 +15,10 @@ from jax import Array
 
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.inference import range_ends
+from bayessim_mjx.inference.range_ends import Pile
 from bayessim_mjx.keys import branch
-from bayessim_mjx.loop.range_limits import limits_of
-from bayessim_mjx.loop.state import Loop, LoopState, Moving, RoundInfo
+from bayessim_mjx.loop.sources import limits_of
+from bayessim_mjx.loop.state import Evidence, Loop, LoopState, Moving
 from bayessim_mjx.parameters.ranged import Ranged
 
 POOL = 4096  # draws tried at once
@@ -91,23 +92,23 @@ def mixed(loop: Loop, state: LoopState, thetas: Array, x: Array) -> tuple[LoopSt
     return state, thetas[order], x[order]
 
 
-def move(loop: Loop, state: LoopState, posterior: Distribution, info: RoundInfo) -> tuple[LoopState, Distribution]:
-    """The state with the ranges of the next round, and the posterior over them; what moved goes into `info`."""
+def move(loop: Loop, state: LoopState, posterior: Distribution) -> tuple[Distribution, tuple[Pile, ...], Evidence]:
+    """Move ends at which the posterior piles up; return it over the ranges of the next round, and those ends."""
     last = int(state.round) + 1 >= loop.settings.realIters
     if state.moving is None or last or not (found := range_ends.piles(posterior)):
-        return state, posterior
+        return posterior, (), Evidence()
     before = state.moving.space
     space, told = range_ends.moved(before, found, *limits_of(loop.env))
-    info.moves = tuple(told)
+    moves = tuple(told)
     if space.same(before):
-        return state, posterior
-    kept = jnp.int32(_kept(loop, state.moving, range_ends.share(before, space)))
-    moving = state.moving.replace(space=space, covered=before, rows=kept, next=kept)  # type: ignore[attr-defined]
-    state = dataclasses.replace(state, moving=moving)
+        return posterior, moves, Evidence({"moves": moves})
+    rows = jnp.int32(_kept(loop, state.moving, range_ends.share(before, space)))
+    moving = state.moving.replace(space=space, covered=before, rows=rows, next=rows)  # type: ignore[attr-defined]
+    kept, warnings = {"moving": moving}, []
     if loop.source.policy_dependent:  # type: ignore[union-attr]
-        info.warnings.append("ranges have moved: what earlier real trajectories tell is known within the old ones only")
-        state = dataclasses.replace(state, real_posteriors=_forgotten(state.real_posteriors, space))
-    return state, posterior.over(space)
+        warnings.append("ranges have moved: what earlier real trajectories tell is known within the old ones only")
+        kept["real_posteriors"] = _forgotten(state.real_posteriors, space)
+    return posterior.over(space), moves, Evidence({"moves": moves}, warnings=warnings, kept=kept)
 
 
 def _kept(loop: Loop, moving: Moving, share: float) -> int:

@@ -17,7 +17,7 @@ from bayessim_mjx.inference.summaries import Summarizer
 from bayessim_mjx.keys import branch
 from bayessim_mjx.logs import Channels, Log, noise, read_logs, segments
 from bayessim_mjx.logs.velocities import trusted
-from bayessim_mjx.loop.seen import Seen, tiled
+from bayessim_mjx.loop.collection import Seen, tiled
 from bayessim_mjx.parameters import ParameterSpace
 from bayessim_mjx.physics import controllers
 from bayessim_mjx.physics.controllers import Law

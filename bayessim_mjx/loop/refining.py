@@ -11,13 +11,12 @@ import mujoco
 import numpy as np
 from jax import Array
 
-from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.keys import branch
 from bayessim_mjx.logs import Channels
 from bayessim_mjx.loop.likelihood import Likelihood
 from bayessim_mjx.loop.recorded import Recorded
 from bayessim_mjx.loop.refinement import Refinement, refine
-from bayessim_mjx.loop.state import Loop, LoopState, RoundInfo
+from bayessim_mjx.loop.state import Answer, Evidence, Loop, LoopState, Round
 from bayessim_mjx.physics.tangent import in_tangent, noisy
 from bayessim_mjx.rollout import Trajectory
 from bayessim_mjx.tracking import Record
@@ -35,29 +34,28 @@ def no_motion(loop: Loop, rows: int) -> dict[str, Array] | None:
     return {name: jnp.zeros((rows, *size)) for name, size in (sizes | {"valid": (length,)}).items()}
 
 
-def refined(
-    loop: Loop, state: LoopState, real: Trajectory, proposal: Distribution, info: RoundInfo
-) -> tuple[LoopState, Distribution]:
-    """The state with this round's motion, and the posterior of all trajectories so far; what was found in `info`."""
-    clock, b, round_ = time.perf_counter(), loop.settings, int(state.round)
-    state = _stored(loop, state, real)
-    likelihood = _likelihood(loop, state, (round_ + 1) * b.realTrajs)
-    if likelihood.silent.any() and not round_:
-        info.warnings.append(f"bayessim.refine: {_without_noise(likelihood.silent, loop.env.physics.mj_model)}")  # type: ignore[attr-defined]
+def refine_by_replays(round_: Round, answer: Answer) -> tuple[Answer, Evidence]:
+    """Refine the posterior by replays of all real trajectories so far, where `bayessim.refine` asks for it."""
+    if not round_.loop.refines:
+        return answer, Evidence()
+    clock, loop, b, warnings = time.perf_counter(), round_.loop, round_.loop.settings, []
+    likelihood = _likelihood(loop, round_.state, round_.known)
+    if likelihood.silent.any() and not round_.number:
+        warnings.append(f"bayessim.refine: {_without_noise(likelihood.silent, likelihood.physics.mj_model)}")
     if not likelihood.seen.any():
-        return state, proposal
-    seed = int(jax.random.randint(branch(loop.key(round_, "fit"), 3), (), 0, 2**31 - 1))
-    found = refine(proposal, likelihood, seed=seed, draws=DRAWS, components=b.components)
-    info.refinement = found
-    info.seconds["refine"] = time.perf_counter() - clock
-    info.scores |= scores(found)
-    info.warnings += [text for text in [found.warning()] if text]
+        return answer, Evidence(warnings=warnings)
+    seed = int(jax.random.randint(branch(loop.key(round_.number, "fit"), 3), (), 0, 2**31 - 1))
+    found = refine(answer.posterior, likelihood, seed=seed, draws=DRAWS, components=b.components)
+    seconds = {"refine": time.perf_counter() - clock}
+    warnings += [text for text in [found.warning()] if text]
+    if not found.used and b.refine == "likelihood":
+        warnings.append(f"bayessim.refine: {found.sentence()}")
+    evidence = Evidence({"refinement": found}, scores(found), warnings, seconds)
     if not found.used:
-        if b.refine == "likelihood":
-            info.warnings.append(f"bayessim.refine: {found.sentence()}")
-        return state, proposal
+        return answer, evidence
     posterior = found.posterior.reduce(b.components).rechart(loop.chart)
-    return state, dataclasses.replace(posterior, prior_weight=jnp.float32(min(b.priorShare, SHARE)))
+    posterior = dataclasses.replace(posterior, prior_weight=jnp.float32(min(b.priorShare, SHARE)))
+    return dataclasses.replace(answer, posterior=posterior, source="replays"), evidence
 
 
 def _without_noise(silent: np.ndarray, model: mujoco.MjModel) -> str:
@@ -76,7 +74,7 @@ def scores(found: Refinement) -> dict[str, float]:
     return {f"refine/{name}": float(value) for name, value in told.items()}
 
 
-def _stored(loop: Loop, state: LoopState, real: Trajectory) -> LoopState:
+def stored(loop: Loop, state: LoopState, real: Trajectory) -> LoopState:
     """The state with the measured motion of this round's trajectories: a surrogate's sensors are as noisy as its
     observations.
     """
@@ -114,4 +112,4 @@ def _likelihood(loop: Loop, state: LoopState, known: int) -> Likelihood:
     return Likelihood(physics, record, np.asarray(rows["valid"]), sensor, each)
 
 
-__all__ = ["no_motion", "refined", "scores"]
+__all__ = ["no_motion", "refine_by_replays", "scores", "stored"]

@@ -27,7 +27,7 @@ from bayessim_mjx.inference.temperature import tempered
 from bayessim_mjx.keys import branch
 from bayessim_mjx.loop.factors import conditioned, kept
 from bayessim_mjx.loop.simulations import features
-from bayessim_mjx.loop.state import Loop, LoopState, RoundInfo
+from bayessim_mjx.loop.state import Answer, Evidence, Loop, LoopState, Round
 from bayessim_mjx.quantities import fixed
 from bayessim_mjx.rl import Policy
 
@@ -67,31 +67,28 @@ class SetPosterior:
         return told | {f"coverage_{100 * level:.0f}": self.network.coverage(level) for level in sets.LEVELS}
 
 
-def chosen(loop: Loop, state: LoopState, policy: Policy, product: Distribution, info: RoundInfo) -> Distribution:
-    """The product, or the posterior of a network of sets where `bayessim.sets` asks for it; what was found in `info`.
-
-    product: of all real trajectories' posteriors, as wide as simulated sets ask for.
-    """
-    b, known = loop.settings, (int(state.round) + 1) * loop.settings.realTrajs
-    if b.sets == "product" or known < 2:
-        return product
+def use_set_network(round_: Round, answer: Answer) -> tuple[Answer, Evidence]:
+    """Replace the product by the posterior of a network of sets, where `bayessim.sets` asks for it."""
+    b = round_.loop.settings
+    if answer.source != "product" or b.sets == "product" or round_.known < 2:
+        return answer, Evidence()
     clock = time.perf_counter()
     try:
-        info.set_posterior, posterior = _learnt(loop, state, policy, product, info)
+        found, posterior = _learnt(round_.loop, round_.state, round_.policy, answer)
     except UserError as error:
-        info.warnings.append(f"bayessim.sets={b.sets}: the product of the posteriors is kept: {error}")
-        return product
-    finally:
-        info.seconds["sets"] = time.perf_counter() - clock
-    info.scores |= {f"set_network/{name}": value for name, value in info.set_posterior.scores.items()}
-    return posterior if info.set_posterior.used else product
+        kept = f"bayessim.sets={b.sets}: the product of the posteriors is kept: {error}"
+        return answer, Evidence(warnings=[kept], seconds={"sets": time.perf_counter() - clock})
+    scores = {f"set_network/{name}": value for name, value in found.scores.items()}
+    evidence = Evidence({"set_posterior": found}, scores, seconds={"sets": time.perf_counter() - clock})
+    if not found.used:
+        return answer, evidence
+    return dataclasses.replace(answer, posterior=posterior, source="set network"), evidence
 
 
-def _learnt(
-    loop: Loop, state: LoopState, policy: Policy, product: Distribution, info: RoundInfo
-) -> tuple[SetPosterior, Distribution]:
-    """What was found, and the posterior of the real trajectories by the network of sets."""
-    b, source, real = loop.settings, loop.source, _usable(loop, state, product)
+def _learnt(loop: Loop, state: LoopState, policy: Policy, answer: Answer) -> tuple[SetPosterior, Distribution]:
+    """Learn from simulated sets; return the comparison and the network's posterior of the real trajectories."""
+    b, source, product = loop.settings, loop.source, answer.posterior
+    real = _usable(loop, state, product)
     k_learn, k_theta, *keys = jax.random.split(branch(loop.key(int(state.round), "fit"), 5), 2 + len(real))
 
     def simulate(key: Array, thetas: Array) -> Array:
@@ -108,7 +105,7 @@ def _learnt(
     columns = [simulate(k, thetas) for k in keys]
 
     def used(q: Distribution) -> Distribution:
-        return q if info.sets is None else info.sets.used(q, len(real))
+        return q if answer.sets is None else answer.sets.used(q, len(real))
 
     each = zip(np.asarray(thetas), posteriors(columns), _products(loop, state, columns, used), strict=True)
     rows = [(at, whole, other) for at, whole, other in each if other is not None and whole.sound]
@@ -155,4 +152,4 @@ def _products(
     ]
 
 
-__all__ = ["SetPosterior", "chosen"]
+__all__ = ["SetPosterior", "use_set_network"]

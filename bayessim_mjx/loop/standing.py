@@ -15,7 +15,7 @@ from jax import Array
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.inference.calibration import Report
 from bayessim_mjx.inference.sets import Sets
-from bayessim_mjx.loop.state import LoopState, RoundInfo
+from bayessim_mjx.loop.state import Answer, Evidence, LoopState, Round
 from bayessim_mjx.quantities import fixed
 
 # of fresh simulations, on which the posterior has to be a density. Ant's networks that went on from an older policy's
@@ -39,23 +39,26 @@ def expected(report: Report | None, found: Sets | None, known: int) -> float:
     return float(gain) if np.isfinite(gain) else -np.inf
 
 
-def chosen(state: LoopState, posterior: Distribution, gain: float, info: RoundInfo) -> tuple[LoopState, Distribution]:
-    """The round's posterior, or the last round's where that gained more on simulated trajectories."""
+def keep_last(round_: Round, answer: Answer) -> tuple[Answer, Evidence]:
+    """Keep the last round's posterior where it gained more on simulated trajectories."""
+    b, state, verdict = round_.loop.settings, round_.state, round_.learnt.verdict
+    if verdict is None or b.temperature or round_.loop.sequential:  # no gain is judged, or rounds cannot be compared
+        return answer, Evidence()
+    gain = expected(verdict[0], answer.sets, round_.known)
     last, before = state.standing, -np.inf if state.standing_gain is None else float(state.standing_gain)
-    if last is not None and gain < before and not _moved(last, posterior):
+    if last is not None and gain < before and not _moved(last, answer.posterior):
         told = f"{fixed(gain, 1)} nats" if np.isfinite(gain) else "nothing"
-        info.warnings.append(
+        warning = (
             f"this round's posterior gains {told} on simulated trajectories, that of the last round {fixed(before, 1)} "
             "nats: the last one stands"
         )
-        info.scores["sets/stood"] = 1.0
-        return state, last
+        stands = dataclasses.replace(answer, posterior=last, source="last round")
+        return stands, Evidence(scores={"sets/stood": 1.0}, warnings=[warning])
     if not np.isfinite(gain):
-        return state, posterior
+        return answer, Evidence()
     own = jnp.asarray(state.round, jnp.int32) + 1
-    return dataclasses.replace(
-        state, standing=posterior, standing_gain=jnp.float32(gain), standing_round=own
-    ), posterior
+    kept = {"standing": answer.posterior, "standing_gain": jnp.float32(gain), "standing_round": own}
+    return answer, Evidence(kept=kept)
 
 
 def told(state: LoopState) -> str:
@@ -72,4 +75,4 @@ def _moved(last: Distribution, posterior: Distribution) -> bool:
     return not all(np.array_equal(a, b) for a, b in zip(*ends, strict=True))
 
 
-__all__ = ["chosen", "expected", "lost", "told"]
+__all__ = ["expected", "keep_last", "lost", "told"]

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, Literal
 
 import flax.struct
 import jax
@@ -14,13 +15,16 @@ from bayessim_mjx.config import BayesSimConfig, Config
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.env import Env
 from bayessim_mjx.inference import InferenceSettings, checks, rounds
+from bayessim_mjx.inference.calibration import Report
+from bayessim_mjx.inference.misspecification import Misfit
 from bayessim_mjx.inference.range_ends import Pile
+from bayessim_mjx.inference.sets import Sets
 from bayessim_mjx.keys import branch
 from bayessim_mjx.loop.sources import Source
 from bayessim_mjx.parameters import ParameterSpace
 from bayessim_mjx.parameters.ranged import Ranged
 from bayessim_mjx.physics.contact import collides
-from bayessim_mjx.rl import TrainState
+from bayessim_mjx.rl import Policy, TrainState
 from bayessim_mjx.rollout import Trajectory
 
 KEPT_ROUNDS = 4  # rounds of simulated trajectories kept for the fit where the collection policy does not change
@@ -81,6 +85,50 @@ class RoundInfo:
     refinement: Any = None  # what bayessim.refine made of the posterior, see loop/refinement.py
     set_posterior: Any = None  # how a network of sets did beside the product, see loop/set_posterior.py
     moves: tuple[Pile, ...] = ()  # ends of ranges at which the posterior piles up, and where they are in the next round
+
+    def with_(self, found: Evidence) -> RoundInfo:
+        """Add the evidence of the round's inference."""
+        return dataclasses.replace(
+            self,
+            **found.fields,
+            scores=self.scores | found.scores,
+            warnings=[*self.warnings, *found.warnings],
+            seconds=self.seconds | found.seconds,
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class Evidence:
+    """Findings of one step of a round's inference.
+
+    Attributes:
+        fields: of `RoundInfo` that the step fills.
+        scores: of the round, by name.
+        warnings: sentences for a person.
+        seconds: that the step took, by purpose.
+        kept: fields of `LoopState` that the next round starts from.
+    """
+
+    fields: dict[str, Any] = dataclasses.field(default_factory=dict)
+    scores: dict[str, float] = dataclasses.field(default_factory=dict)
+    warnings: list[str] = dataclasses.field(default_factory=list)
+    seconds: dict[str, float] = dataclasses.field(default_factory=dict)
+    kept: dict[str, Any] = dataclasses.field(default_factory=dict)
+
+
+def joined(found: Sequence[Evidence]) -> Evidence:
+    """Join the evidence of several steps: the last value of a field counts, seconds add up."""
+    whole = Evidence()
+    for one in found:
+        seconds = {name: whole.seconds.get(name, 0.0) + spent for name, spent in one.seconds.items()}
+        whole = Evidence(
+            whole.fields | one.fields,
+            whole.scores | one.scores,
+            [*whole.warnings, *one.warnings],
+            whole.seconds | seconds,
+            whole.kept | one.kept,
+        )
+    return whole
 
 
 def chart_of(settings: BayesSimConfig, space: ParameterSpace) -> str:
@@ -143,6 +191,45 @@ class Loop:
         """Every random draw has its own key, a function of the seed alone: a resumed run draws the same."""
         purposes = ("init", "train", "evaluate", "simulate", "fit", "real", "predict")
         return branch(jax.random.PRNGKey(self.config.seed), round_ * len(purposes) + purposes.index(purpose))
+
+
+@dataclasses.dataclass(frozen=True)
+class Learnt:
+    """Results of training and checking a round's network."""
+
+    fit: dict[str, Any]  # numbers of the training
+    known_before: np.ndarray  # [d] bool, parameters that the last round's network identified
+    verdict: tuple[Report, Misfit] | None  # calibration and misfit; None: not tested
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Round:
+    """Inputs of a correction of the posterior."""
+
+    loop: Loop
+    state: LoopState  # with the round's network, its temperature and all real trajectories so far
+    policy: Policy
+    real: Trajectory  # this round's
+    learnt: Learnt
+
+    @property
+    def number(self) -> int:
+        """Rounds before this one."""
+        return int(self.state.round)
+
+    @property
+    def known(self) -> int:
+        """Real trajectories so far, with those of this round."""
+        return (self.number + 1) * self.loop.settings.realTrajs
+
+
+@dataclasses.dataclass(frozen=True)
+class Answer:
+    """A posterior of all real trajectories so far."""
+
+    posterior: Distribution
+    source: Literal["product", "last round", "replays", "set network"] = "product"
+    sets: Sets | None = None  # how products of as many posteriors did on simulated sets; None: not judged
 
 
 def space_of(loop: Loop, state: LoopState) -> ParameterSpace:

@@ -13,8 +13,7 @@ from bayessim_mjx.env import Env
 from bayessim_mjx.inference.summaries import Summarizer
 from bayessim_mjx.keys import branch
 from bayessim_mjx.logs import Channels
-from bayessim_mjx.loop.collection import POLICY_DEPENDENT, policy_function
-from bayessim_mjx.loop.seen import Seen, named, summarise, tiled
+from bayessim_mjx.loop.collection import POLICY_DEPENDENT, Seen, named, policy_function, summarise, tiled
 from bayessim_mjx.parameters import ParameterSpace
 from bayessim_mjx.rl import Policy
 from bayessim_mjx.rollout import Trajectory, replay, rollout

@@ -15,7 +15,7 @@ from bayessim_mjx.errors import UserError
 from bayessim_mjx.inference import InferenceSettings, densities, feature_names, fit, infer, init, mdn, summaries
 from bayessim_mjx.inference.streaming import stream
 from bayessim_mjx.inference.summarizers import get, size
-from bayessim_mjx.loop.seen import Seen
+from bayessim_mjx.loop.collection import Seen
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 
 PAGE = Path(__file__).parents[2] / "docs" / "own_summary.md"

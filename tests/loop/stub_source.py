@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from bayessim_mjx import config, loop
-from bayessim_mjx.loop import inference_state, round_inference, sources
+from bayessim_mjx.loop import round_inference, sources
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 
 SPACE = ParameterSpace([Parameter("mass", 0.0, -1.0, 1.0), Parameter("unseen", 0.0, -1.0, 1.0)])
@@ -52,7 +52,7 @@ def made(*more: str, space: ParameterSpace = SPACE, **source) -> tuple[loop.Loop
     settings = config.load("Pendulum", overrides=[*SMALL, *more])
     names = ("mean of height", "push at step 0")
     parts = loop.Loop(types.SimpleNamespace(space=space), settings, Stub(**source), 2, names)
-    return parts, loop.LoopState(round=jnp.int32(0), train=None, **inference_state.blank(parts))
+    return parts, loop.LoopState(round=jnp.int32(0), train=None, **round_inference.blank(parts))
 
 
 def infer(parts: loop.Loop, state: loop.LoopState) -> tuple[loop.LoopState, loop.RoundInfo]:
@@ -60,5 +60,5 @@ def infer(parts: loop.Loop, state: loop.LoopState) -> tuple[loop.LoopState, loop
         round=int(state.round), rounds=3, domain=state.domain, posterior=None, truth=TRUTH, returns=np.zeros(1),
         lengths=np.zeros(1), real=None, predictive=None, fit={}, scores={}, seconds={}, warnings=[],
     )  # fmt: skip
-    state = round_inference.infer(parts, state, None, info)
-    return dataclasses.replace(state, round=state.round + 1), info
+    state, found = round_inference.infer(parts, state, None)
+    return dataclasses.replace(state, round=state.round + 1), info.with_(found)

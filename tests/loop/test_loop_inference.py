@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from stub_source import FITTED, NOISE, NORMAL, SPACE, infer, made
 
-from bayessim_mjx.loop import set_checks
+from bayessim_mjx.loop import examination
 
 
 def assert_same_structure(a, b):
@@ -125,7 +125,7 @@ def test_products_of_several_trajectories_are_judged_and_widened():
         assert info.scores[f"sets/coverage_{100 * level:.0f}"] == pytest.approx(level, abs=0.2)
     assert last.gain >= last.plain - 0.1 and info.sets.near
     assert float(state.domain.sd()[0]) > 0.9 * NOISE / 4**0.5  # never surer than the exact posterior
-    again = set_checks.rejudge(
+    again = examination.rejudge(
         parts, dataclasses.replace(state, round=state.round - 1), None, 4, jax.random.PRNGKey(1), 2
     )  # as the command `calibrate` asks for it
     # as the round used it
@@ -139,4 +139,4 @@ def test_products_of_several_trajectories_are_judged_and_widened():
 
 def test_a_single_trajectory_needs_no_set():
     parts, state = made("bayessim.checkTrajs=40", "bayessim.realTrajs=1")
-    assert set_checks.judge(parts, state, None, 1) is None
+    assert examination.judge(parts, state, None, 1) is None

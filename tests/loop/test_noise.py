@@ -154,7 +154,7 @@ def test_a_surrogates_orientations_are_as_noisy_as_is_said_and_of_norm_one():
         qpos=qpos, qvel=jnp.zeros((1, rows, 6)), command=jnp.zeros((1, rows - 1, 0)), valid=jnp.ones((1, rows - 1))
     )
     empty = dict.fromkeys(f.name for f in dataclasses.fields(LoopState))
-    kept = refining._stored(loop, LoopState(**empty | {"round": 0, "motion": blank}), real).motion
+    kept = refining.stored(loop, LoopState(**empty | {"round": 0, "motion": blank}), real).motion
     np.testing.assert_allclose(np.linalg.norm(kept["qpos"][0, :, 3:], axis=-1), 1.0, atol=1e-5)
     away = np.asarray(jax.vmap(lambda a, b: difference(FREE, a, b))(kept["qpos"][0], qpos[0]))
     np.testing.assert_allclose(away.std(0), sd, rtol=0.12)  # sd of an sd of 400: 3.5 %

@@ -12,7 +12,7 @@ from bayessim_mjx import registry
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.inference import range_ends
 from bayessim_mjx.inference.range_ends import Pile
-from bayessim_mjx.loop.range_limits import limits_of
+from bayessim_mjx.loop.sources import limits_of
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 from bayessim_mjx.parameters.ranged import Ranged
 

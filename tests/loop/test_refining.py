@@ -11,7 +11,7 @@ from bayessim_mjx import config, loop
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.inference.importance import Refined
-from bayessim_mjx.loop import inference_state, refinement, round_inference
+from bayessim_mjx.loop import findings, refinement, round_inference
 from bayessim_mjx.loop.likelihood import Likelihood
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 from bayessim_mjx.registry import make
@@ -27,7 +27,7 @@ SMALL = [
 def begun(*more: str) -> tuple[loop.Loop, loop.LoopState]:
     settings = config.load("Pendulum", overrides=[*SMALL, *more])
     parts = loop.make(settings, make("Pendulum", config=settings))
-    return parts, loop.LoopState(round=jax.numpy.int32(0), train=None, **inference_state.blank(parts))
+    return parts, loop.LoopState(round=jax.numpy.int32(0), train=None, **round_inference.blank(parts))
 
 
 def inferred(parts: loop.Loop, state: loop.LoopState) -> tuple[loop.LoopState, loop.RoundInfo]:
@@ -36,7 +36,8 @@ def inferred(parts: loop.Loop, state: loop.LoopState) -> tuple[loop.LoopState, l
         returns=np.zeros(1), lengths=np.zeros(1), real=None, predictive=None, fit={}, scores={}, seconds={},
         warnings=[],
     )  # fmt: skip
-    return dataclasses.replace(round_inference.infer(parts, state, None, info), round=state.round + 1), info
+    state, found = round_inference.infer(parts, state, None)
+    return dataclasses.replace(state, round=state.round + 1), info.with_(found)
 
 
 class Killed(Exception):
@@ -114,8 +115,8 @@ def test_what_replays_tell_is_not_said_to_be_the_prior():
     """A network that identifies nothing: its posterior is the prior, but not the one that replays refined."""
     fit = {"identified": np.array([False, True]), "clipped": 0.0, "n_invalid": 0, "skipped": 0}
     before = np.ones(2, bool)
-    (alone,) = round_inference._complaints(("mass", "length"), fit, before, by_replays=False, fresh=False)
-    (refined,) = round_inference._complaints(("mass", "length"), fit, before, by_replays=True, fresh=False)
+    (alone,) = findings.complaints(("mass", "length"), fit, before, by_replays=False, fresh=False)
+    (refined,) = findings.complaints(("mass", "length"), fit, before, by_replays=True, fresh=False)
     assert alone == "not identified by these trajectories, kept at the prior: mass"
     assert "prior" not in refined
     assert "mass" in refined and "length" not in refined
@@ -128,7 +129,7 @@ def test_a_first_training_that_gained_nothing_is_told():
     known = np.ones(1, bool)
 
     def told(best: int, fresh: bool) -> list[str]:
-        return round_inference._complaints(("mass",), fit | {"best": best}, known, by_replays=False, fresh=fresh)
+        return findings.complaints(("mass",), fit | {"best": best}, known, by_replays=False, fresh=fresh)
 
     (text,) = told(-1, True)
     assert "linear posterior" in text and "158 steps" in text and "4500 trajectories" in text

@@ -12,6 +12,7 @@ from bayessim_mjx.inference.sets import stacked
 from bayessim_mjx.loop import outer_loop, round_inference
 from bayessim_mjx.loop.likelihood import Likelihood
 from bayessim_mjx.loop.refinement import _spread
+from bayessim_mjx.loop.state import Evidence, joined
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 
 
@@ -67,5 +68,15 @@ def test_a_rounds_own_trajectories_are_judged_by_its_own_network(monkeypatch: py
     parts = SimpleNamespace(settings=settings, source=SimpleNamespace(policy_dependent=True))
     fit = SimpleNamespace(identified=None)
     state = SimpleNamespace(round=1, fit=fit, real_features=None, temperature=1.0, real_posteriors=four(0.3))
-    found = round_inference._factors(parts, state, SimpleNamespace(warnings=[]))
+    found, warnings = round_inference._factors(parts, state)
+    assert not warnings
     np.testing.assert_allclose(found.means[:, 0, 0], [0.3, 0.3, 0.6, 0.6], rtol=1e-6)
+
+
+def test_evidence_of_steps_adds_up_in_their_order() -> None:
+    """A network that was fitted anew: the later fit counts, the time of both does."""
+    first = Evidence({"fit": 1, "sets": 2}, {"a": 1.0}, ["one"], {"fit": 3.0}, {"standing": 4})
+    second = Evidence({"fit": 5}, {"b": 2.0, "a": 3.0}, ["two"], {"fit": 6.0, "check": 1.0})
+    fields, scores = {"fit": 5, "sets": 2}, {"a": 3.0, "b": 2.0}
+    expected = Evidence(fields, scores, ["one", "two"], {"fit": 9.0, "check": 1.0}, {"standing": 4})
+    assert joined([first, second]) == expected and joined([]) == Evidence()

@@ -7,6 +7,7 @@ import pytest
 from stub_source import NOISE, infer, made
 
 from bayessim_mjx.loop import set_posterior
+from bayessim_mjx.loop.state import Answer, Evidence, Round
 
 
 @pytest.mark.slow
@@ -35,6 +36,14 @@ def test_where_sets_cannot_be_simulated_the_product_is_kept_and_the_reason_told(
         (dataclasses.replace(state, round=state.round + 1), "made by other policies"),
         (state, "have told nothing yet"),
     ]:
-        info = type("Info", (), {"seconds": {}, "warnings": [], "scores": {}})()
-        assert set_posterior.chosen(parts, state_, None, product, info) is product
-        assert why in info.warnings[0] and "bayessim.sets=embedding" in info.warnings[0]
+        answer, found = set_posterior.use_set_network(Round(parts, state_, None, None, None), Answer(product))
+        assert answer.posterior is product and answer.source == "product" and not found.fields
+        assert why in found.warnings[0] and "bayessim.sets=embedding" in found.warnings[0]
+
+
+def test_what_the_last_round_or_replays_answered_is_kept():
+    parts, state = made("bayessim.sets=embedding")
+    for source in ("last round", "replays"):
+        answer = Answer(state.domain, source)
+        after, found = set_posterior.use_set_network(Round(parts, state, None, None, None), answer)
+        assert after is answer and found == Evidence()

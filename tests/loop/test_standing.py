@@ -10,10 +10,7 @@ from stub_source import SPACE, infer, made
 
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.loop import round_inference, standing
-
-
-def told():
-    return SimpleNamespace(warnings=[], scores={})
+from bayessim_mjx.loop.state import Answer, Evidence
 
 
 @dataclasses.dataclass
@@ -24,26 +21,37 @@ class State:
     round: object = 0
 
 
+def chosen(state: State, posterior: Distribution, gain: float) -> tuple[State, Answer, Evidence]:
+    """The state after it, the answer and what was found for a posterior of one trajectory that gains so much."""
+    settings = SimpleNamespace(temperature=None, realTrajs=1)
+    parts = SimpleNamespace(settings=settings, sequential=False)
+    learnt = SimpleNamespace(verdict=(SimpleNamespace(gain=gain), None))
+    round_ = SimpleNamespace(loop=parts, state=state, learnt=learnt, known=1)
+    answer, found = standing.keep_last(round_, Answer(posterior))
+    return dataclasses.replace(state, **found.kept), answer, found
+
+
 def test_what_gains_more_on_simulated_sets_stands():
     first, second = Distribution.prior(SPACE, 2), Distribution.prior(SPACE, 2)
-    state, info = State(first, jnp.float32(-np.inf)), told()
-    state, used = standing.chosen(state, second, 5.0, info)
-    assert used is second and state.standing is second and float(state.standing_gain) == 5.0 and not info.warnings
+    state, used, found = chosen(State(first, jnp.float32(-np.inf)), second, 5.0)
+    assert used.posterior is second and state.standing is second and float(state.standing_gain) == 5.0
+    assert not found.warnings and used.source == "product"
     third = Distribution.prior(SPACE, 2)
-    after, used = standing.chosen(state, third, 4.0, info)
-    assert used is second and after is state and info.scores == {"sets/stood": 1.0}
-    assert "gains 4.0 nats" in info.warnings[0] and "5.0 nats" in info.warnings[0]
-    _, used = standing.chosen(state, third, -np.inf, info)
-    assert used is second and "gains nothing" in info.warnings[1]
-    after, used = standing.chosen(state, third, 5.5, info)
-    assert used is third and float(after.standing_gain) == 5.5
+    _, used, found = chosen(state, third, 4.0)
+    assert used.posterior is second and used.source == "last round"
+    assert not found.kept and found.scores == {"sets/stood": 1.0}
+    assert "gains 4.0 nats" in found.warnings[0] and "5.0 nats" in found.warnings[0]
+    _, used, found = chosen(state, third, -np.inf)
+    assert used.posterior is second and "gains nothing" in found.warnings[0]
+    after, used, _ = chosen(state, third, 5.5)
+    assert used.posterior is third and float(after.standing_gain) == 5.5
 
 
 def test_it_is_told_whose_posterior_stands():
-    first = dataclasses.replace(State(Distribution.prior(SPACE, 2), jnp.float32(-np.inf)), standing_round=jnp.int32(0))
-    state, _ = standing.chosen(first, first.standing, 5.0, told())
+    first = State(Distribution.prior(SPACE, 2), jnp.float32(-np.inf), standing_round=jnp.int32(0))
+    state, *_ = chosen(first, first.standing, 5.0)
     assert int(state.standing_round) == 1 and standing.told(dataclasses.replace(state, round=1)) == ""
-    after, _ = standing.chosen(dataclasses.replace(state, round=1), first.standing, 4.0, told())
+    after, *_ = chosen(dataclasses.replace(state, round=1), first.standing, 4.0)
     text = standing.told(dataclasses.replace(after, round=2))
     assert text == "the posterior in use is that of round 1: simulated trajectories promise less of round 2's"
     assert standing.told(dataclasses.replace(first, round=1)) == ""  # nothing was judged
@@ -51,8 +59,8 @@ def test_it_is_told_whose_posterior_stands():
 
 def test_without_a_judged_gain_nothing_stands_for_the_next_round():
     state = State(Distribution.prior(SPACE, 2), jnp.float32(-np.inf))
-    posterior = Distribution.prior(SPACE, 2)
-    assert standing.chosen(state, posterior, -np.inf, told()) == (state, posterior)
+    _, used, found = chosen(state, state.standing, -np.inf)
+    assert used.posterior is state.standing and found == Evidence()
 
 
 def test_what_is_expected():
@@ -75,13 +83,13 @@ def test_a_lost_network_is_fitted_anew(monkeypatch):
     state, _ = infer(parts, start)
     assert float(state.standing_gain) > 1.0  # of the first round, on sets of two
     calls: list[bool] = []
-    learn = round_inference._learn
+    train = round_inference.train
 
     def watched(*args, **more):
         calls.append(more.get("anew", False))
-        return learn(*args, **more)
+        return train(*args, **more)
 
-    monkeypatch.setattr(round_inference, "_learn", watched)
+    monkeypatch.setattr(round_inference, "train", watched)
     infer(parts, state)
     monkeypatch.setattr(standing, "lost", lambda report, x: len(calls) == 2)
     after, info = infer(parts, state)

@@ -1,26 +1,34 @@
-"""Is the product of several trajectories' posteriors as sure as it may be? Judged on simulated sets of as many."""
+"""Examination of a round's posteriors by further simulations.
+
+Simulated sets of as many trajectories tell whether a product of posteriors is as sure as it may be. The command
+`calibrate` repeats all checks of a finished round.
+"""
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
+from typing import Any
 
 import jax
 import numpy as np
 from jax import Array
 
 from bayessim_mjx.distributions import Distribution
-from bayessim_mjx.inference import near, rounds, sets
+from bayessim_mjx.inference import checks, near, rounds, sets
 from bayessim_mjx.inference.sets import Sets
 from bayessim_mjx.keys import branch
+from bayessim_mjx.loop import ranges
 from bayessim_mjx.loop.factors import conditioned, kept, multiplied
-from bayessim_mjx.loop.simulations import features, proposal_of
-from bayessim_mjx.loop.state import Loop, LoopState
+from bayessim_mjx.loop.simulations import at, features, proposal_of, simulated
+from bayessim_mjx.loop.state import Answer, Evidence, Loop, LoopState, Round, slot_of
 from bayessim_mjx.rl import Policy
 
 SETS = 64  # thetas at which sets are simulated
-MOST = (
-    32  # trajectories in one, at most: beyond that the error that all of them share is taken to stay (`Sets.widening`)
-)
+# trajectories in one, at most: beyond that the error that all of them share is taken to stay (`Sets.widening`)
+MOST = 32
+PAIRS, LOTS = 500, 4  # `reexamine` judges sets in as many lots as there are such parts of the pairs, up to this
+REFERENCE = 10000  # simulations that `reexamine` compares real trajectories with, at most
 
 
 def judge(loop: Loop, state: LoopState, policy: Policy, known: int) -> Sets | None:
@@ -34,6 +42,19 @@ def judge(loop: Loop, state: LoopState, policy: Policy, known: int) -> Sets | No
     key = branch(loop.key(int(state.round), "fit"), 4)
     found = _simulated(loop, state, policy, known, key)
     return None if found is None else replace(sets.judge(*found, loop.settings.components), known=known)
+
+
+def widen(round_: Round, answer: Answer) -> tuple[Answer, Evidence]:
+    """Move and widen the product as simulated sets of as many trajectories require."""
+    if round_.loop.settings.temperature:
+        return answer, Evidence()
+    clock, known, now = time.perf_counter(), round_.known, (round_.loop, round_.state, round_.policy)
+    found = settled(*now, known, answer.posterior, judge(*now, known))
+    if found is None:
+        return answer, Evidence()
+    seconds = {"check": time.perf_counter() - clock}
+    used = replace(answer, posterior=found.used(answer.posterior, known), sets=found)
+    return used, Evidence({"sets": found}, scores(found, known), seconds=seconds)
 
 
 def settled(
@@ -110,4 +131,35 @@ def scores(found: Sets, known: int) -> dict[str, float]:
     return {f"sets/{name}": float(value) for name, value in told.items()}
 
 
-__all__ = ["judge", "rejudge", "scores", "settled"]
+def reexamine(loop: Loop, state: LoopState, policy: Policy, pairs: int, seed: int = 0) -> checks.Checks:
+    """Repeat the checks of a round on `pairs` fresh simulations and with a posterior predictive check.
+
+    `state` is that after the round and `policy` the one that it was evaluated with, as in its checkpoint. The posterior
+    is tested as the round used it: with its temperature, on parameters from what the round was simulated from. So are
+    products of as many trajectories as it had, with the round's widening; where `bayessim.refine` refined it, they are
+    what was refined.
+    """
+    b, source, done = loop.settings, loop.source, int(state.round)
+    domain = state.domain
+    assert source is not None and domain is not None
+    key = branch(branch(jax.random.PRNGKey(seed), 0xCA11), done)  # seen by no fit
+    known = min(b.trainTrajs, REFERENCE)
+    used = None if state.proposals is None else at(state.proposals, slot_of(loop, state, done))
+    state, temperature = ranges.as_fitted(replace(state, proposal=used)), float(state.temperature)
+    thetas, x, _ = simulated(source, branch(key, 1), policy, proposal_of(loop, state), b.proposal, known + pairs)
+    held = thetas[known:], x[known:]
+    rows = slice((done - 1) * b.realTrajs if source.policy_dependent else 0, done * b.realTrajs)
+    judged: dict[str, Any] = {"temperature": temperature, "tilt": used if b.proposal == "apt" else None}
+    verdict = checks.examine(
+        key, state.fit, (thetas[:known], x[:known], known), held, state.real_features, rows,
+        names=loop.feature_names, **judged,
+    )  # fmt: skip
+    again = checks.replicated(branch(key, 2), state.fit, held[1], lambda k, t: source.simulate(k, t, policy), **judged)
+    report = replace(verdict[0], predictive=again)
+    before = replace(state, round=state.round - 1)
+    more = min(max(pairs // PAIRS, 1), LOTS)
+    sets = rejudge(loop, before, policy, done * b.realTrajs, branch(key, 3), more)
+    return replace(checks.conclude(report, verdict[1], domain, b.distrust), sets=sets)
+
+
+__all__ = ["judge", "reexamine", "rejudge", "scores", "settled", "widen"]
