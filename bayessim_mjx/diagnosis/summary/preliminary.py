@@ -28,8 +28,7 @@ def write(path: Path, about: Mapping[str, Any], setup: Setup, tried: Tried | Non
     found |= {"warnings": list(setup.warnings)} | ({} if tried is None else _so_far(tried))
     path.parent.mkdir(parents=True, exist_ok=True)
     every = plain(found | {"windows": len(setup.fitter.simulator.windows)})
-    atomic.write_text(path, json.dumps(every, indent=1, allow_nan=False) + "
-")
+    atomic.write_text(path, json.dumps(every, indent=1, allow_nan=False) + "\n")
 
 
 def _so_far(tried: Tried) -> dict[str, Any]:
