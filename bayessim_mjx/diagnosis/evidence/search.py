@@ -7,7 +7,7 @@ likely.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,8 +21,8 @@ from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fit import Fit
 from bayessim_mjx.diagnosis.selection.bounds import widened
 from bayessim_mjx.diagnosis.selection.budget import LEAVING_OUT, SINGLES, TOGETHER
-from bayessim_mjx.diagnosis.selection.laws import inertia, related
-from bayessim_mjx.diagnosis.selection.models import Model
+from bayessim_mjx.diagnosis.selection.laws import inertia, related, special_case
+from bayessim_mjx.diagnosis.selection.models import Model, scored
 from bayessim_mjx.diagnosis.selection.pool import Entries, Pool, cut_back, fit_entries, polish
 from bayessim_mjx.diagnosis.selection.sets import BASE, ODDS, Key, Weighed
 
@@ -85,6 +85,7 @@ class Search:
                 break
             self._fit(self._todo(best), "around the new leading set", TOGETHER)  # it led in none of the rounds
             self._leading()
+        self._at_one_place()
         return self.weighing.weighed()
 
     def _order(self) -> list[Key]:
@@ -182,19 +183,47 @@ class Search:
             self._polished |= set(some)
             self.weighing.score(some)
 
-    def _fit(self, plans: Sequence[Plan], label: str, part: str) -> None:
-        entries: Entries = {plan.key: self._entry(plan) for plan in plans}
-        parents = {p.key: self.pool.models[p.parent] for p in plans if p.columns}
-        before = {
-            key: (self.pool.models[key], self.weighing.scored[key]) for key in entries if key in self.weighing.scored
-        }
-        fit_entries(self.pool, entries, label, self.say, part, parents)
-        self.weighing.score([p.key for p in plans])
+    def _at_one_place(self) -> None:
+        """Special cases where the laws that contain them came to rest: with the rest neutral both are one model.
+
+        Friction that sticks makes a cost of many small basins, whose evidence differs by up to six nats.
+        """
+        found = self.weighing.weighed()
+        for key in (found.answer, *found.beside):
+            model = self.pool.models[key]
+            for law in model.effects:
+                for c in (c for c in self.pool.candidates if special_case(c, law) and c.where == law.where):
+                    self._placed(model, law, c)
+
+    def _placed(self, model: Model, law: Candidate, case: Candidate) -> None:
+        """A special case in the place of a model's law, as large as it is; kept where it is likelier than it was."""
+        pool, starts = self.pool, _as_large(case, law, model.values_of(law))
+        kept = tuple(e for e in model.effects if e is not law)
+        if not starts or case.label in {e.label for e in kept}:
+            return
+        fit = pool.fitter.refresh(pool.fitter.derive(cut_back(pool, model, kept), case.coordinates, starts[0]))
+        self._likelier({frozenset(e.label for e in (*kept, case)): scored(pool.fitter, fit, (*kept, case))})
+
+    def _likelier(self, models: Mapping[Key, Model]) -> None:
+        """Takes models in the place of those of the same effects, where they are likelier."""
+        before = {k: (self.pool.models[k], self.weighing.scored[k]) for k in models if k in self.weighing.scored}
+        self.pool.models.update(models)
+        self.weighing.score(list(models))
         for key, (model, found) in before.items():
             if self.weighing.scored[key].found.nats < found.found.nats:
                 self.pool.models[key], self.weighing.scored[key] = model, found
             else:
                 self._polished.discard(key)
+
+    def _fit(self, plans: Sequence[Plan], label: str, part: str) -> None:
+        entries: Entries = {plan.key: self._entry(plan) for plan in plans}
+        parents = {p.key: self.pool.models[p.parent] for p in plans if p.columns}
+        old = {key: self.pool.models[key] for key in entries if key in self.weighing.scored}
+        fit_entries(self.pool, entries, label, self.say, part, parents)
+        new = {key: self.pool.models[key] for key in old}
+        self.pool.models.update(old)
+        self._likelier(new)
+        self.weighing.score([p.key for p in plans])
 
     def _entry(self, plan: Plan) -> tuple[list[Fit], tuple[Candidate, ...]]:
         pool, model = self.pool, self.pool.models[plan.parent if plan.origin is None else plan.origin]
