@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from bayessim_mjx import atomic
 from bayessim_mjx.diagnosis import correction
 from bayessim_mjx.diagnosis.estimates import Estimate, FoundEffect
 from bayessim_mjx.distributions import Distribution
@@ -134,8 +135,8 @@ class Diagnosis:
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
         path = folder / "diagnosis.json"
-        path.write_text(json.dumps(self.to_dict(), indent=1, allow_nan=False) + "\n")
-        (folder / "details.json").write_text(json.dumps(plain(self.details), allow_nan=False))
+        atomic.write_text(path, json.dumps(self.to_dict(), indent=1, allow_nan=False) + "\n")
+        atomic.write_text(folder / "details.json", json.dumps(plain(self.details), allow_nan=False))
         return path
 
 
