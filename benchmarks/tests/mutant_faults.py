@@ -163,7 +163,7 @@ FAULTS: tuple[tuple[str, str, str, str, tuple[str, ...]], ...] = (
     ),
     (
         "noise is not taken out before the tolerance", f"{P}/diagnosis/tolerance.py",
-        "np.sqrt(np.maximum(np.square(rms) - self.noise**2, 0.0))", "np.abs(rms)",
+        "np.asarray(np.sqrt(np.maximum(np.square(rms) - np.square(noise), 0.0)))", "np.asarray(np.abs(rms))",
         ("tests/diagnosis/test_tolerance.py", "-k", "taken_out"),
     ),
     (

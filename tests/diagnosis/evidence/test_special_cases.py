@@ -8,12 +8,12 @@ from bayessim_mjx.diagnosis.fitting.candidates import Candidate, Coordinate
 from bayessim_mjx.diagnosis.selection.laws import related, special_case
 
 
-def candidate(effect, *numbers, where="place"):
+def candidate(effect, *numbers, where="place", kind="joint"):
     coordinates = tuple(
         Coordinate(f"place.{effect}.{name}", (i,), 0.0, 0.0, high, unit=unit)
         for i, (name, high, unit) in enumerate(numbers)
     )
-    return Candidate(effect, where, "joint", coordinates, np.zeros(len(numbers), bool), np.zeros((1, len(numbers))))
+    return Candidate(effect, where, kind, coordinates, np.zeros(len(numbers), bool), np.zeros((1, len(numbers))))
 
 
 STRIBECK = candidate("stribeck_friction", ("level", 2.0, "N m"), ("excess", 2.0, "N m"), ("speed", 1.0, "rad/s"))
@@ -48,8 +48,10 @@ def test_a_tied_law_has_each_place_as_a_special_case():
 
 
 def test_a_payload_and_a_wrong_inertia_of_one_body_are_tried_in_each_others_place():
-    payload, inertia = (candidate(n, where="lower") for n in ("payload", "inertial_parameters"))
+    payload, inertia = (candidate(n, where="lower", kind="body") for n in ("payload", "inertial_parameters"))
     assert related(payload, inertia) and related(inertia, payload)
-    assert not related(payload, candidate("inertial_parameters", where="upper")) and not related(payload, payload)
+    upper = candidate("inertial_parameters", where="upper", kind="body")
+    assert not related(payload, upper) and not related(payload, payload)
+    assert not related(payload, candidate("armature", where="lower"))  # of a joint with the body's name
     stribeck, coulomb = (candidate(f"{n}_friction", where="lower") for n in ("stribeck", "coulomb"))
     assert related(coulomb, stribeck) and related(stribeck, coulomb) and not related(coulomb, payload)
