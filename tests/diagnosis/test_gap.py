@@ -1,4 +1,4 @@
-"""The gap by hand: what is closed, what is left, and what counts as noise."""
+"""The gap by hand: the share that is closed, the residual share, and the noise."""
 
 import math
 from types import SimpleNamespace

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from bayessim_mjx.diagnosis.equation_error.rigid import inertial
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fitter import Fitter
 from bayessim_mjx.diagnosis.selection.models import Model
@@ -22,7 +23,6 @@ from bayessim_mjx.parameters import geometry
 from bayessim_mjx.physics import Physics
 
 Array = NDArray[np.float64]
-INSIDE = 1e-6  # of a range: `least_squares` begins within its bounds
 APART = 1e-3  # of a range: finite differences, of inertias in single precision
 # standard deviations of the priors as a share of a body's inertia: they decide what its inertia leaves open
 OPEN = 1e-2
@@ -51,7 +51,8 @@ def alike(fitter: Fitter, model: Model, effect: Candidate, law: Candidate) -> St
     kept = [i for i, c in enumerate(fit.coordinates) if c not in effect.coordinates]
     others = [fit.coordinates[i] for i in kept]
     physics, nominal = fitter.simulator.physics, fitter.theta
-    rest, scale = _inertia(physics, nominal), _scale(physics, nominal)
+    rest = _inertia(physics, nominal)
+    scale = _scale(rest)
     wanted = _inertia(physics, fitter.vector(fit.coordinates, fit.values))
     moving = [i for i in range(base) if _moves(fitter, i, rest)]
     free = [fitter.base[i] for i in moving] + list(law.coordinates)
@@ -63,10 +64,7 @@ def alike(fitter: Fitter, model: Model, effect: Candidate, law: Candidate) -> St
         return np.concatenate([((_inertia(physics, theta) - wanted) / scale).ravel(), sure * (x - neutral)])
 
     begun = np.concatenate([fit.values[moving], law.probes[len(law.probes) // 2]])
-    room = INSIDE * (high - low)
-    found = least_squares(
-        off, np.clip(begun, low + room, high - room), bounds=(low, high), x_scale=high - low, diff_step=APART
-    )
+    found = least_squares(off, np.clip(begun, low, high), bounds=(low, high), x_scale=high - low, diff_step=APART)
     known = fit.values[:base].copy()
     known[moving] = found.x[: len(moving)]
     return Start(known, found.x[len(moving) :])
@@ -79,9 +77,8 @@ def _moves(fitter: Fitter, i: int, rest: Array) -> bool:
     return bool(np.any(_inertia(fitter.simulator.physics, fitter.vector(fitter.base, values)) != rest))
 
 
-def _scale(physics: Physics, theta: Array) -> Array:
+def _scale(inertia: Array) -> Array:
     """`[bodies, 10]`: a body's mass m, m r and m r^2, r its radius of gyration; infinite where it has no mass."""
-    inertia = _inertia(physics, theta)
     mass, second = inertia[:, :1], np.sum(inertia[:, 4:7], 1, keepdims=True)
     radius = np.sqrt(np.divide(second, mass, where=mass > 0, out=np.zeros_like(mass)))
     every = mass * np.concatenate([radius**0, *[radius] * 3, *[radius**2] * 6], axis=1)
@@ -89,21 +86,18 @@ def _scale(physics: Physics, theta: Array) -> Array:
 
 
 def _inertia(physics: Physics, theta: Array) -> Array:
-    """`[bodies, 10]`: mass, first moment, and moments and products of inertia, about the nominal centre of mass."""
-    return np.asarray(_ten(physics, jnp.asarray(theta, jnp.float32)), np.float64)
+    """`[bodies, 10]`, as of `rigid.inertial`, about the nominal centre of mass."""
+    each = (np.asarray(x, np.float64) for x in _parts(physics, jnp.asarray(theta, jnp.float32)))
+    return np.array([inertial(*own) for own in zip(*each, strict=True)])
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _ten(physics: Physics, theta: jax.Array) -> jax.Array:
+def _parts(physics: Physics, theta: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Of the bodies: masses `[b]`, centres from the nominal ones `[b, 3]`, inertias about them `[b, 3, 3]`."""
     fields = physics.unseen(theta, None, None).fields
     mass, place, frame, moments = (
         fields.get(name, getattr(physics.model, name))
         for name in ("body_mass", "body_ipos", "body_iquat", "body_inertia")
     )
-    arm = place - physics.model.body_ipos
     turn = jax.vmap(geometry.rotation)(frame)
-    about = jnp.einsum("bij,bj,bkj->bik", turn, moments, turn)  # the body's own centre of mass, in its frame
-    square = jnp.sum(arm**2, 1)[:, None, None] * jnp.eye(3) - arm[:, :, None] * arm[:, None, :]
-    full = about + mass[:, None, None] * square  # the parallel axis theorem
-    upper = full[:, [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
-    return jnp.concatenate([mass[:, None], mass[:, None] * arm, upper], axis=1)
+    return mass, place - physics.model.body_ipos, jnp.einsum("bij,bj,bkj->bik", turn, moments, turn)

@@ -199,7 +199,7 @@ class Search:
         """A special case in the place of a model's law, as large as it is; kept where it is likelier than it was."""
         pool, starts = self.pool, _as_large(case, law, model.values_of(law))
         kept = tuple(e for e in model.effects if e is not law)
-        if not starts or case.label in {e.label for e in kept}:
+        if not starts:
             return
         fit = pool.fitter.refresh(pool.fitter.derive(cut_back(pool, model, kept), case.coordinates, starts[0]))
         self._likelier({frozenset(e.label for e in (*kept, case)): scored(pool.fitter, fit, (*kept, case))})
@@ -220,7 +220,7 @@ class Search:
         parents = {p.key: self.pool.models[p.parent] for p in plans if p.columns}
         old = {key: self.pool.models[key] for key in entries if key in self.weighing.scored}
         fit_entries(self.pool, entries, label, self.say, part, parents)
-        new = {key: self.pool.models[key] for key in old}
+        new = {key: self.pool.models[key] for key in old if self.pool.models[key] is not old[key]}
         self.pool.models.update(old)
         self._likelier(new)
         self.weighing.score([p.key for p in plans])

@@ -9,7 +9,7 @@ from bayessim_mjx.diagnosis.equation_error.channel import Channel
 from bayessim_mjx.diagnosis.equation_error.look import Joint, Look
 from bayessim_mjx.diagnosis.equation_error.search import Proposal
 from bayessim_mjx.diagnosis.vocabulary import titled
-from bayessim_mjx.quantities import percent
+from bayessim_mjx.quantities import listed, percent
 
 FEW = 4  # places that are listed
 ROUGH = 0.05  # of an effort, rms: more is worth telling
@@ -27,14 +27,14 @@ def lines(look: Look) -> list[str]:
         out.append(f"together they explain {percent(look.explained)} of the squared effort that the model leaves")
     if look.shifts:
         moved = [f"{s.what} of {s.where} {percent(s.share, sign=True)} ({abs(s.away):.1f} sd)" for s in look.shifts]
-        out.append(f"known parameters far from the data sheet: {listed(moved)}")
+        out.append(f"known parameters far from the data sheet: {listed(moved, most=FEW)}")
     if look.unit != 1.0:
         out.append(f"the efforts have a unit of their own: 1 of it is about {look.unit:.3g} of the model's")
     out += [
         f"contradicted: {titled(*label.rsplit('@', 1))}: {why}" for label, why in look.vetoes.items() if _news(label)
     ]
     if look.told and look.told.unknown:
-        names = listed(look.told.unknown)
+        names = listed(look.told.unknown, most=FEW)
         out.append(f"these logs do not tell the mass of {names} better than the data sheet does")
     return out
 
@@ -120,17 +120,10 @@ def _needs(j: Joint) -> str:
 
 def _proposal(p: Proposal) -> str:
     numbers = ", ".join(f"{k.replace('_', ' ')} {_number(v, p.deviations[k])}" for k, v in p.parameters.items() if v)
-    rivals = listed([titled(*r.rsplit("@", 1)) for r in p.rivals], "or")
+    rivals = listed([titled(*r.rsplit("@", 1)) for r in p.rivals], "or", FEW)
     return f"explained by {titled(p.term.effect, p.term.where)}: {numbers}{f'; or by {rivals}' if rivals else ''}"
 
 
 def _number(value: float, deviation: float) -> str:
     digits = max(0, 1 - math.floor(math.log10(deviation))) if 0 < deviation < 1e6 else 3
     return f"{value:.{min(digits, 6)}f} +- {deviation:.{min(digits, 6)}f}"
-
-
-def listed(names: Sequence[str], last: str = "and") -> str:
-    """`a, b and c`; the first few, and how many more there are."""
-    some, more = list(names[:FEW]), len(names) - FEW
-    some += [f"{more} more"] if more > 0 else []
-    return f" {last} ".join([", ".join(some[:-1]), some[-1]]) if len(some) > 1 else "".join(some)

@@ -10,7 +10,7 @@ HEADS = {
     "ambiguous": "The simulator lacks something like {named}, but these logs fit other explanations as well.",
     "unexplained": "Something is missing that no effect of the library explains.",
 }
-ABOVE = {  # where what is left is more than the noise
+ABOVE = {  # where the residual is above the noise
     "no_gap": "The logs differ from the simulator by {nominal}. That is more than the noise, but too little for these "
     "logs to tell what is missing.",
     "parameters": "The parameters are off: recalibrated, the gap falls from {nominal} to {calibrated}. That is more "
