@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any, TypeVar
@@ -15,6 +15,7 @@ from bayessim_mjx.diagnosis.residual.where import Located
 from bayessim_mjx.diagnosis.selection.heldout import Prediction
 from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.selection.selected import Selection
+from bayessim_mjx.diagnosis.selection.tried import Tried
 from bayessim_mjx.diagnosis.setup import Setup
 
 Progress = Callable[[str, int, int], None]  # (what is being done, done, total)
@@ -65,3 +66,19 @@ class Findings:
     def part(self, kind: type[T]) -> T | None:
         """What the stage found whose part is of this class; None where it did not run or found nothing."""
         return self.parts.get(kind)
+
+
+class Observer:
+    """What a diagnosis calls while it runs; every method does nothing unless a subclass overrides it."""
+
+    def progress(self, text: str, done: int, total: int) -> None:
+        """Called when a part begins and while it goes on: what is being done, and how much of it is done."""
+
+    def early(self, lines: Sequence[str]) -> None:
+        """Called with what the logs show before any simulation, in lines."""
+
+    def known(self, setup: Setup, tried: Tried | None) -> None:
+        """Called before the search (None), and after each part of it with what was fitted so far."""
+
+    def verdict(self, found: Findings) -> None:
+        """Called with the findings before the optional stages."""

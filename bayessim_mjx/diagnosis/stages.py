@@ -1,14 +1,23 @@
-"""The stages after the selection: one after the other, and side by side what does not need each other."""
+"""The stages after the selection: one after the other, and side by side where none needs another's result."""
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
-from bayessim_mjx.diagnosis.findings import Findings, Progress
+from bayessim_mjx.diagnosis.experiment import propose
+from bayessim_mjx.diagnosis.findings import Findings, Observer, Progress, Where
+from bayessim_mjx.diagnosis.logcheck import channels
+from bayessim_mjx.diagnosis.residual import black_boxes, frequency, where
+from bayessim_mjx.diagnosis.residual.disturbance import Disturbance, estimate
+from bayessim_mjx.diagnosis.residual.flexible import Flexible, flexible
+from bayessim_mjx.diagnosis.selection import heldout
 from bayessim_mjx.diagnosis.selection.budget import Budget
+from bayessim_mjx.diagnosis.selection.models import Model
+from bayessim_mjx.diagnosis.summary import finer_steps, whole_logs
 
 
 @dataclass(frozen=True)
@@ -29,36 +38,84 @@ class Stage:
     beside: bool = False
 
 
-def carry_out(
-    stages: Sequence[Stage],
-    found: Findings,
-    say: Progress,
-    time_left: Budget,
-    verdict: Callable[[Findings], None] | None = None,
-) -> Findings:
-    """The findings with those of all stages; verdict: called with them once no stage is left that is not optional.
+def how_far(found: Findings, say: Progress) -> Findings:
+    """With the held-out motion of the simulator as delivered, recalibrated and with the effects."""
+    fitter, base, model = found.setup.fitter, found.selection.base, found.model
+    predictions = {
+        "nominal": heldout.nominal(fitter, found.selection.nominal),
+        "calibrated": heldout.predict(fitter, base),
+    }
+    predictions["with_effects"] = heldout.predict(fitter, model) if model.effects else predictions["calibrated"]
+    return replace(found, predictions=MappingProxyType(predictions))
+
+
+def none_of_these(found: Findings, say: Progress) -> Findings:
+    """With the force that is missing, what a flexible force makes of it, and which links of the chain are sound."""
+    base, model, setup = found.selection.base, found.model, found.setup
+    missing = estimate(setup.fitter, base.fit) if found.selection.above_noise(base) else None
+    on_base = _flexible(found, base, missing)
+    on_winner = _flexible(found, model) if model.effects else on_base
+    links = tuple(link for log in setup.logs[:1] for link in channels.links(log, setup.robot.mj_model))
+    return replace(found, disturbance=missing, flexible_base=on_base, flexible_winner=on_winner, links=links)
+
+
+def _flexible(found: Findings, model: Model, missing: Disturbance | None = None) -> Flexible | None:
+    """The flexible force on a model whose gap is above the noise."""
+    if not found.selection.above_noise(model):
+        return None
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return flexible(found.setup.fitter, model.fit, missing)
+
+
+def where_it_lies(found: Findings, say: Progress) -> Findings:
+    """With the places of the recalibrated simulator's gap, maps of the missing force and its spectra."""
+    if found.disturbance is None:
+        return found
+    fitter, fit = found.setup.fitter, found.selection.base.fit
+    located = where.locate(fitter, fit, found.disturbance, seed=found.setup.seed)
+    return found.having(Where(located, frequency.analyse(fitter, fit, found.disturbance)))
+
+
+def rivals_without_physics(found: Findings, say: Progress) -> Findings:
+    """With what a network and a formula close of the gap, beside the named effects."""
+    if found.disturbance is None:
+        return found
+    selection, named = found.selection, found.model.fit if found.model.effects else None
+    boxes = black_boxes.race(found.setup.fitter, selection.base.fit, named, found.disturbance, selection.noise)
+    return found if boxes is None else found.having(boxes)
+
+
+STAGES = (
+    Stage("how far", how_far),
+    Stage("none of these?", none_of_these),
+    Stage("finer steps", finer_steps.stage, patient=True, beside=True),
+    Stage("whole logs", whole_logs.stage, patient=True, beside=True),
+    Stage("where", where_it_lies, optional=True, beside=True),
+    Stage("black boxes", rivals_without_physics, optional=True, beside=True),
+    Stage("next experiment", propose.stage, optional=True, beside=True),
+)
+
+
+def carry_out(stages: Sequence[Stage], found: Findings, time_left: Budget, observer: Observer) -> Findings:
+    """The findings with those of all stages; the observer gets the verdict once all that are not optional have run.
 
     Under a limit of time they go one after the other: each is left out if the time is over when its turn comes.
     """
     beside = [] if time_left.limited else [s for s in stages if s.beside]
     alone = [s for s in stages if s not in beside]
     for stage in (s for s in alone if not s.optional):
-        found = _in_time(stage, found, say, time_left)
-    found = _together(beside, found, say, verdict) if beside else _told(found, verdict)
+        found = _in_time(stage, found, observer.progress, time_left)
+    if beside:
+        found = _together(beside, found, observer)
+    else:
+        observer.verdict(found)
     for stage in (s for s in alone if s.optional):
-        found = _in_time(stage, found, say, time_left)
+        found = _in_time(stage, found, observer.progress, time_left)
     return found
 
 
-def _told(found: Findings, verdict: Callable[[Findings], None] | None) -> Findings:
-    if verdict is not None:
-        verdict(found)
-    return found
-
-
-def _together(
-    stages: Sequence[Stage], found: Findings, say: Progress, verdict: Callable[[Findings], None] | None
-) -> Findings:
+def _together(stages: Sequence[Stage], found: Findings, observer: Observer) -> Findings:
     """Each on a thread: what they compile and simulate is outside of Python's lock."""
     name = ", ".join(s.name for s in stages)
     done: list[Stage] = []
@@ -66,14 +123,14 @@ def _together(
     def one(stage: Stage) -> Findings:
         after = _after(stage, found, lambda text, done, total: None)
         done.append(stage)
-        say(name, len(done), len(stages))
+        observer.progress(name, len(done), len(stages))
         return after
 
-    say(name, 0, len(stages))
+    observer.progress(name, 0, len(stages))
     with ThreadPoolExecutor(len(stages)) as pool:
         running = {stage.name: pool.submit(one, stage) for stage in stages}
         needed = [running[s.name] for s in stages if not s.optional]
-        _told(_joined(found, needed), verdict)
+        observer.verdict(_joined(found, needed))
     return _joined(found, running.values())
 
 

@@ -10,6 +10,7 @@ from baselines import extended
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fitter import Fitter
 from bayessim_mjx.diagnosis.fitting.robot import of_file
+from bayessim_mjx.diagnosis.request import Request
 from bayessim_mjx.diagnosis.selection.models import scored
 from bayessim_mjx.diagnosis.selection.pool import Pool
 from bayessim_mjx.diagnosis.selection.screen import screen
@@ -32,7 +33,7 @@ def prepare(folder: Path, effects: Any, without: str | None) -> tuple[float, flo
     def read() -> Setup:
         robot = of_file(folder / "model.xml")
         logs = read_logs(folder / "logs", robot.mj_model)
-        return prepared(robot, [log for log in logs if log.metadata["condition"] != without], effects)
+        return prepared(robot, [log for log in logs if log.metadata["condition"] != without], Request(effects))
 
     reading, setup = timed(read)
     first, _ = timed(lambda: setup.fitter.simulator.run(setup.fitter.theta[None]))

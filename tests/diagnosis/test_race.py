@@ -6,8 +6,9 @@ import itertools
 import numpy as np
 import pytest
 
-from bayessim_mjx.diagnosis import phrases, resumed
+from bayessim_mjx.diagnosis import phrases, run
 from bayessim_mjx.diagnosis.evidence import selecting
+from bayessim_mjx.diagnosis.request import Request
 from bayessim_mjx.diagnosis.selection import pool
 from bayessim_mjx.diagnosis.selection.budget import Budget
 from bayessim_mjx.diagnosis.selection.left_out import not_fitted, not_tried
@@ -24,8 +25,9 @@ SPRING = "joint_spring@hinge"
 @pytest.fixture(scope="module")
 def setup(tmp_path_factory):
     """Of a pendulum with a cubic spring, whose range ends at a fifth of the truth."""
-    effects = ["joint_spring", "coulomb_friction", "viscous_friction"]
-    found = prepare(nominal(tmp_path_factory.mktemp("spring")), recorded(cubic=CUBIC, count=6, seconds=2.0), effects)
+    request = Request(["joint_spring", "coulomb_friction", "viscous_friction"])
+    logs = recorded(cubic=CUBIC, count=6, seconds=2.0)
+    found = prepare(nominal(tmp_path_factory.mktemp("spring")), logs, request)
     return dataclasses.replace(found, candidates=tuple(map(narrowed, found.candidates)))
 
 
@@ -78,8 +80,8 @@ def test_a_killed_search_goes_on_and_comes_to_the_same(setup, counted_whole, tmp
 
     simulator = setup.fitter.simulator
     with pytest.raises(Killed):
-        searched(resumed.remembering(setup, tmp_path), say)
-    before, again = simulator.rollouts, resumed.remembering(setup, tmp_path)
+        searched(run.remembering(setup, tmp_path), say)
+    before, again = simulator.rollouts, run.remembering(setup, tmp_path)
     rest = searched(again)
     there = again.fitter.journal.found
     assert there > 3 and rest.answer.label == whole.answer.label

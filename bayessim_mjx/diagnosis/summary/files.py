@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,7 +10,7 @@ from typing import Any
 from bayessim_mjx.diagnosis import correction
 from bayessim_mjx.diagnosis.experiment import command_file
 from bayessim_mjx.diagnosis.experiment.propose import Experiment
-from bayessim_mjx.diagnosis.findings import Findings
+from bayessim_mjx.diagnosis.findings import Findings, Observer, Progress
 from bayessim_mjx.diagnosis.fitting import journal
 from bayessim_mjx.diagnosis.fitting.robot import Robot
 from bayessim_mjx.diagnosis.result import Diagnosis, load
@@ -23,22 +23,38 @@ SEARCH = "search_so_far"  # folder of what was fitted
 COMMAND = "next_experiment.csv"
 
 
-class Files:
-    """Writes into a folder, or nowhere where there is none.
+class Files(Observer):
+    """Writes into a folder, or nowhere where there is none, and passes on what a diagnosis reports.
 
     Args:
         folder: made when there is something to write; about: what is diagnosed.
+        progress, early: called as those of `Observer`; None: they are not.
     """
 
-    def __init__(self, folder: Path | None, about: Mapping[str, Any]) -> None:
+    def __init__(
+        self,
+        folder: Path | None,
+        about: Mapping[str, Any],
+        progress: Progress | None = None,
+        early: Callable[[Sequence[str]], None] | None = None,
+    ) -> None:
         self.folder, self.about = folder, about
+        self._progress, self._early = progress, early
+
+    def progress(self, text: str, done: int, total: int) -> None:
+        if self._progress is not None:
+            self._progress(text, done, total)
+
+    def early(self, lines: Sequence[str]) -> None:
+        if self._early is not None:
+            self._early(lines)
 
     @property
     def search(self) -> Path | None:
         """Folder for what is fitted, from which a killed search goes on."""
         return None if self.folder is None else self.folder / SEARCH
 
-    def so_far(self, setup: Setup, tried: Tried | None) -> None:
+    def known(self, setup: Setup, tried: Tried | None) -> None:
         """What is known before there is a verdict: killed there, this stays."""
         if self.folder is not None:
             preliminary.write(self.folder / PRELIMINARY, self.about, setup, tried)

@@ -9,6 +9,7 @@ from bayessim_mjx.diagnosis import setup as preparing
 from bayessim_mjx.diagnosis.evidence.gaussian import marginal, windows_of
 from bayessim_mjx.diagnosis.evidence.parameters import _truncated
 from bayessim_mjx.diagnosis.evidence.search import Search
+from bayessim_mjx.diagnosis.request import Request
 from bayessim_mjx.diagnosis.selection.begin import begin
 from bayessim_mjx.diagnosis.selection.sets import BASE
 from tests.diagnosis import pendulums
@@ -23,7 +24,7 @@ def found(tmp_path_factory):
     """(search, posterior) of logs with dry friction, other masses and noise."""
     robot = pendulums.nominal(tmp_path_factory.mktemp("model")).stated(["5%"], [])
     logs = pendulums.recorded(friction=FRICTION, scale=(1.05, 0.97, 1.03), count=6)
-    setup = preparing.prepare(robot, logs, ["coulomb_friction", "viscous_friction"])
+    setup = preparing.prepare(robot, logs, Request(["coulomb_friction", "viscous_friction"]))
     pool = begin(setup.fitter, setup.candidates, setup.settings)
     search = Search(pool, lambda *_: None)
     return search, search.run()

@@ -13,6 +13,7 @@ from bayessim_mjx.diagnosis.experiment.limits import limits_of
 from bayessim_mjx.diagnosis.experiment.propose import propose
 from bayessim_mjx.diagnosis.findings import Findings
 from bayessim_mjx.diagnosis.fitting.robot import Robot, default_space
+from bayessim_mjx.diagnosis.request import Request
 from bayessim_mjx.diagnosis.selection.models import nats, scored
 from bayessim_mjx.diagnosis.selection.selected import selection_of
 from bayessim_mjx.diagnosis.selection.sets import Weighed
@@ -74,7 +75,7 @@ def slow_logs():
 
 
 def diagnosed(logs):
-    setup = prepare(robot(), logs, ["viscous_friction", "quadratic_drag"])
+    setup = prepare(robot(), logs, Request(["viscous_friction", "quadratic_drag"]))
     return setup, singles.fitted(setup)
 
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from bayessim_mjx.diagnosis.request import Request
 from bayessim_mjx.diagnosis.selection import hidden
 from bayessim_mjx.diagnosis.selection.models import scored
 from bayessim_mjx.diagnosis.selection.pool import Pool
@@ -14,7 +15,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.ci]  # a whole fit
 
 
 def test_what_a_named_law_can_do_by_itself_is_told_as_hidden_beside_it(tmp_path):
-    setup = prepare(nominal(tmp_path), recorded(), ["joint_spring", "actuator_bias", "coulomb_friction"])
+    setup = prepare(nominal(tmp_path), recorded(), Request(["joint_spring", "actuator_bias", "coulomb_friction"]))
     fitter, fit = fitted(setup)
     base = scored(fitter, fit, ())
     pool = Pool(fitter, setup.candidates, setup.settings, fit, base)
