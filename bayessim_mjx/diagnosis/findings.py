@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any, TypeVar
 
+from bayessim_mjx.diagnosis.evidence.selecting import Selection
 from bayessim_mjx.diagnosis.logcheck.channels import Link
 from bayessim_mjx.diagnosis.residual.disturbance import Disturbance
 from bayessim_mjx.diagnosis.residual.flexible import Flexible
@@ -14,11 +15,9 @@ from bayessim_mjx.diagnosis.residual.frequency import Heard
 from bayessim_mjx.diagnosis.residual.where import Located
 from bayessim_mjx.diagnosis.selection.heldout import Prediction
 from bayessim_mjx.diagnosis.selection.models import Model
-from bayessim_mjx.diagnosis.selection.selected import Selection
-from bayessim_mjx.diagnosis.selection.tried import Tried
+from bayessim_mjx.diagnosis.selection.search_state import SearchState
 from bayessim_mjx.diagnosis.setup import Setup
 
-Progress = Callable[[str, int, int], None]  # (what is being done, done, total)
 T = TypeVar("T")
 
 
@@ -77,7 +76,7 @@ class Observer:
     def early(self, lines: Sequence[str]) -> None:
         """Called with what the logs show before any simulation, in lines."""
 
-    def known(self, setup: Setup, tried: Tried | None) -> None:
+    def known(self, setup: Setup, state: SearchState | None) -> None:
         """Called before the search (None), and after each part of it with what was fitted so far."""
 
     def verdict(self, found: Findings) -> None:

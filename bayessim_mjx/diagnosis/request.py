@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from bayessim_mjx.diagnosis.selection.tried import Settings
+from bayessim_mjx.diagnosis.selection.search_state import Settings
 from bayessim_mjx.effects.effect import Effect
 
 Effects = str | Sequence[str | type[Effect]]

@@ -17,13 +17,14 @@ from threadpoolctl import threadpool_limits
 
 from bayessim_mjx import programs, versions
 from bayessim_mjx.diagnosis.evidence import selecting
-from bayessim_mjx.diagnosis.findings import Findings, Observer, Progress
+from bayessim_mjx.diagnosis.findings import Findings, Observer
 from bayessim_mjx.diagnosis.fitting.cutting import TooLittleData
 from bayessim_mjx.diagnosis.fitting.journal import Journal, Remembering, digest
 from bayessim_mjx.diagnosis.fitting.robot import Robot, Source, robot_of
 from bayessim_mjx.diagnosis.request import Effects, Request
 from bayessim_mjx.diagnosis.result import Diagnosis
 from bayessim_mjx.diagnosis.selection import budget
+from bayessim_mjx.diagnosis.selection.budget import Progress
 from bayessim_mjx.diagnosis.setup import Setup, prepare
 from bayessim_mjx.diagnosis.stages import STAGES, Stage, carry_out
 from bayessim_mjx.diagnosis.summary import assemble, first_look
@@ -58,7 +59,7 @@ def investigate(
         observer.progress(text, 0, 1)
     observer.known(setup, None)
     given = setup.fitter, setup.candidates, setup.settings
-    found = selecting.select(*given, observer.progress, lambda tried: observer.known(setup, tried))
+    found = selecting.select(*given, observer.progress, lambda state: observer.known(setup, state))
     ended(setup)
     optional = not (request.quick or request.verdict_only)
     chosen = [s for s in (STAGES if stages is None else stages) if optional or not s.optional]

@@ -34,7 +34,7 @@ from bayessim_mjx.diagnosis.fitting.windows import Windows
 from bayessim_mjx.diagnosis.logcheck import gate, noise
 from bayessim_mjx.diagnosis.request import Request
 from bayessim_mjx.diagnosis.selection.budget import Budget
-from bayessim_mjx.diagnosis.selection.tried import Settings
+from bayessim_mjx.diagnosis.selection.search_state import Settings
 from bayessim_mjx.logs.log import Log
 from bayessim_mjx.logs.resample import resample
 from bayessim_mjx.physics import Physics

@@ -9,13 +9,13 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 from bayessim_mjx.diagnosis.experiment import propose
-from bayessim_mjx.diagnosis.findings import Findings, Observer, Progress, Where
+from bayessim_mjx.diagnosis.findings import Findings, Observer, Where
 from bayessim_mjx.diagnosis.logcheck import channels
 from bayessim_mjx.diagnosis.residual import black_boxes, frequency, where
 from bayessim_mjx.diagnosis.residual.disturbance import Disturbance, estimate
 from bayessim_mjx.diagnosis.residual.flexible import Flexible, flexible
 from bayessim_mjx.diagnosis.selection import heldout
-from bayessim_mjx.diagnosis.selection.budget import Budget
+from bayessim_mjx.diagnosis.selection.budget import Budget, Progress
 from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.summary import finer_steps, whole_logs
 
@@ -40,9 +40,9 @@ class Stage:
 
 def how_far(found: Findings, say: Progress) -> Findings:
     """With the held-out motion of the simulator as delivered, recalibrated and with the effects."""
-    fitter, base, model = found.setup.fitter, found.selection.base, found.model
+    fitter, base, model = found.setup.fitter, found.selection.state.base, found.model
     predictions = {
-        "nominal": heldout.nominal(fitter, found.selection.nominal),
+        "nominal": heldout.nominal(fitter, found.selection.state.nominal),
         "calibrated": heldout.predict(fitter, base),
     }
     predictions["with_effects"] = heldout.predict(fitter, model) if model.effects else predictions["calibrated"]
@@ -51,8 +51,8 @@ def how_far(found: Findings, say: Progress) -> Findings:
 
 def none_of_these(found: Findings, say: Progress) -> Findings:
     """With the force that is missing, what a flexible force makes of it, and which links of the chain are sound."""
-    base, model, setup = found.selection.base, found.model, found.setup
-    missing = estimate(setup.fitter, base.fit) if found.selection.above_noise(base) else None
+    base, model, setup = found.selection.state.base, found.model, found.setup
+    missing = estimate(setup.fitter, base.fit) if found.selection.state.above_noise(base) else None
     on_base = _flexible(found, base, missing)
     on_winner = _flexible(found, model) if model.effects else on_base
     links = tuple(link for log in setup.logs[:1] for link in channels.links(log, setup.robot.mj_model))
@@ -61,7 +61,7 @@ def none_of_these(found: Findings, say: Progress) -> Findings:
 
 def _flexible(found: Findings, model: Model, missing: Disturbance | None = None) -> Flexible | None:
     """The flexible force on a model whose gap is above the noise."""
-    if not found.selection.above_noise(model):
+    if not found.selection.state.above_noise(model):
         return None
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -72,7 +72,7 @@ def where_it_lies(found: Findings, say: Progress) -> Findings:
     """With the places of the recalibrated simulator's gap, maps of the missing force and its spectra."""
     if found.disturbance is None:
         return found
-    fitter, fit = found.setup.fitter, found.selection.base.fit
+    fitter, fit = found.setup.fitter, found.selection.state.base.fit
     located = where.locate(fitter, fit, found.disturbance, seed=found.setup.seed)
     return found.having(Where(located, frequency.analyse(fitter, fit, found.disturbance)))
 
@@ -81,8 +81,8 @@ def rivals_without_physics(found: Findings, say: Progress) -> Findings:
     """With what a network and a formula close of the gap, beside the named effects."""
     if found.disturbance is None:
         return found
-    selection, named = found.selection, found.model.fit if found.model.effects else None
-    boxes = black_boxes.race(found.setup.fitter, selection.base.fit, named, found.disturbance, selection.noise)
+    state, named = found.selection.state, found.model.fit if found.model.effects else None
+    boxes = black_boxes.race(found.setup.fitter, state.base.fit, named, found.disturbance, state.noise)
     return found if boxes is None else found.having(boxes)
 
 

@@ -9,10 +9,10 @@ import pytest
 from bayessim_mjx.diagnosis import phrases, run
 from bayessim_mjx.diagnosis.evidence import selecting
 from bayessim_mjx.diagnosis.request import Request
-from bayessim_mjx.diagnosis.selection import pool
+from bayessim_mjx.diagnosis.selection import successive_halving
 from bayessim_mjx.diagnosis.selection.budget import Budget
-from bayessim_mjx.diagnosis.selection.left_out import not_fitted, not_tried
 from bayessim_mjx.diagnosis.setup import prepare
+from bayessim_mjx.diagnosis.summary.assemble import not_fitted, not_tried
 
 from .pendulums import nominal, recorded
 
@@ -93,7 +93,7 @@ def test_a_killed_search_goes_on_and_comes_to_the_same(setup, counted_whole, tmp
 def test_without_time_the_first_answer_says_what_was_not_tried(setup, monkeypatch):
     """The clock strikes whenever it is read: the first effect is fitted, the others have no time."""
     clock = itertools.count()
-    monkeypatch.setattr(pool, "RULES", dataclasses.replace(pool.RULES, batch=1))
+    monkeypatch.setattr(successive_halving, "BATCH", 1)
     short = searched(setup, seconds=36.0, now=lambda: float(next(clock)))
     assert short.answer.label == SPRING and len(short.cut_short) == 2
     assert not_fitted(short) == {phrases.NO_TIME_LEFT: sorted(short.cut_short, key=labels(setup).index)}

@@ -11,7 +11,7 @@ from bayessim_mjx.diagnosis.findings import Findings, Observer
 from bayessim_mjx.diagnosis.fitting.cutting import TooLittleData
 from bayessim_mjx.diagnosis.request import Request
 from bayessim_mjx.diagnosis.selection import heldout
-from bayessim_mjx.diagnosis.summary import assemble, preliminary
+from bayessim_mjx.diagnosis.summary import assemble, files
 
 from .pendulums import FEW, nominal, recorded
 
@@ -30,7 +30,7 @@ def diagnosed(folder, logs, effects=FEW) -> tuple[Findings, result.Diagnosis]:
 
     class Keeps(Observer):
         def known(self, setup, tried):
-            preliminary.write(folder / "so_far" / f"{next(seen)}.json", {"robot": "pendulum"}, setup, tried)
+            files.write_preliminary(folder / "so_far" / f"{next(seen)}.json", {"robot": "pendulum"}, setup, tried)
 
     needed = [s for s in run.STAGES if not s.optional]
     found = run.investigate(nominal(folder), logs, Request(effects, notes=["a note"]), Keeps(), needed)
@@ -75,7 +75,7 @@ def test_what_the_answer_rests_on_comes_with_it(rubbing):
     found, diagnosis = rubbing
     selection = found.selection
     named = frozenset(["coulomb_friction@hinge"])
-    assert {frozenset(), named} <= selection.weighed.weight.keys() <= selection.models.keys()
+    assert {frozenset(), named} <= selection.weighed.weight.keys() <= selection.state.models.keys()
     assert selection.weighed.answer == named and selection.weighed.nats[named] > 50
     assert len(selection.estimated.mean) == len(selection.answer.fit.values) == len(selection.estimated.covariance)
     assert set(selection.chosen.values()) == {named}

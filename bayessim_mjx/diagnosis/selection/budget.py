@@ -1,10 +1,12 @@
-"""Time that a search may take, and what of it each part may have: the later ones are cut down before the first."""
+"""Time that a search may take: each part has its share, and later parts are cut before earlier ones."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+
+Progress = Callable[[str, int, int], None]  # (what is being done, done, total)
 
 # Share of the time at which a part ends, so that those after it have theirs; what follows the search has the rest.
 # Of the time that is there once the simulator is compiled: nothing cuts what comes before.

@@ -14,8 +14,8 @@ from bayessim_mjx.diagnosis.fitting import robot
 from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
 from bayessim_mjx.diagnosis.fitting.fit import Fit
 from bayessim_mjx.diagnosis.request import Request
-from bayessim_mjx.diagnosis.selection.begin import begin
-from bayessim_mjx.diagnosis.selection.sets import BASE
+from bayessim_mjx.diagnosis.selection.fits import begin
+from bayessim_mjx.diagnosis.selection.models import BASE
 from bayessim_mjx.parameters.parameter import Parameter
 from tests.diagnosis import pendulums
 

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from bayessim_mjx.diagnosis.evidence.inertia import alike
+from bayessim_mjx.diagnosis.evidence.laws import alike
 from bayessim_mjx.diagnosis.fitting import robot
 from bayessim_mjx.diagnosis.fitting.candidates import base_coordinates, enumerate_candidates
 from bayessim_mjx.diagnosis.fitting.fitter import Fitter

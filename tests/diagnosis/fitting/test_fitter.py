@@ -5,8 +5,7 @@ import pytest
 
 from bayessim_mjx.diagnosis.fitting.fitter import weights
 from bayessim_mjx.diagnosis.request import Request
-from bayessim_mjx.diagnosis.selection.models import scored
-from bayessim_mjx.diagnosis.selection.uncertainty import of_noise
+from bayessim_mjx.diagnosis.selection.models import of_noise, scored
 from bayessim_mjx.diagnosis.setup import prepare
 from tests.diagnosis.pendulums import NAMES, fitted, nominal, recorded
 

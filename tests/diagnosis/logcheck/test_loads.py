@@ -8,7 +8,7 @@ from bayessim_mjx import effects
 from bayessim_mjx.diagnosis.fitting import robot, scales
 from bayessim_mjx.diagnosis.logcheck import loads
 from bayessim_mjx.diagnosis.request import Request
-from bayessim_mjx.diagnosis.selection.tried import ranked
+from bayessim_mjx.diagnosis.selection.search_state import ranked
 from bayessim_mjx.diagnosis.setup import prepare
 from bayessim_mjx.logs import Channels, Log, estimate_velocity
 from tests.diagnosis import singles

@@ -25,7 +25,7 @@ def rubbing(tmp_path_factory):
 def test_a_log_begins_as_its_first_window(rubbing):
     cut = rubbing.setup.fitter.simulator.windows
     stages = {
-        "nominal": whole_logs._Stage(rubbing.selection.base, rubbing.predictions["nominal"], True),
+        "nominal": whole_logs._Stage(rubbing.selection.state.base, rubbing.predictions["nominal"], True),
         "with_effects": whole_logs._Stage(rubbing.model, rubbing.predictions["with_effects"], False),
     }
     first = int(np.flatnonzero(cut.log == 2)[0])

@@ -2,27 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import logsumexp
 
-from bayessim_mjx.diagnosis.selection.accuracy import Posterior
-
-Key = frozenset[str]  # labels of a model's effects
-BASE: Key = frozenset()  # the known parameters alone
-EXPECTED = (
-    1.0  # effects that a simulator lacks, before any log is seen; the known parameters alone are as likely as one
-)
-
-
-def log_prior(key: Key, candidates: int) -> float:
-    """Of a set: each of the candidates is missing with the same small probability (so many are expected)."""
-    odds = EXPECTED / max(candidates - EXPECTED, 1.0)
-    return len(key) * float(np.log(odds))
+from bayessim_mjx.diagnosis.selection.models import BASE, Key
+from bayessim_mjx.diagnosis.selection.search_state import log_prior
 
 
 @dataclass(frozen=True)
@@ -103,24 +91,6 @@ class Weighed:
     def _within(self, odds: float) -> list[Key]:
         best = max(self.weight.values())
         return [k for k, w in self.weight.items() if w * odds >= best]
-
-
-@dataclass(frozen=True, eq=False)
-class Estimated:
-    """Posterior of the answer's numbers.
-
-    Attributes:
-        mean: `[k]`, where the fit could not be moved there not its values; covariance: `[k, k]`.
-        sheet: the data sheet's accuracies behind it.
-        noise: `[C]`, most likely noise of each channel, in what was estimated from the logs.
-        step: most probable step `[k]` from the answer's fit, of residuals `[W, n]` at its values.
-    """
-
-    mean: NDArray[np.float64]
-    covariance: NDArray[np.float64]
-    sheet: Posterior
-    noise: NDArray[np.float64]
-    step: Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 
 def core(key: Key, excess: Mapping[Key, float]) -> Key:

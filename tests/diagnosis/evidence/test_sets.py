@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from bayessim_mjx.diagnosis.selection import sets
-from bayessim_mjx.diagnosis.selection.sets import RELEVANCE, core, log_prior
+from bayessim_mjx.diagnosis.evidence import sets
+from bayessim_mjx.diagnosis.evidence.sets import RELEVANCE, core
+from bayessim_mjx.diagnosis.selection.search_state import log_prior
 
 A, B, AB, NONE = frozenset("a"), frozenset("b"), frozenset("ab"), frozenset()
 

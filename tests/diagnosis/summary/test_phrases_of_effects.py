@@ -1,6 +1,6 @@
 """Effects in sentences: a phrase for each law, its places listed."""
 
-from bayessim_mjx.diagnosis.vocabulary import by_law, missing
+from bayessim_mjx.diagnosis.phrases import by_law, missing
 
 
 def test_a_law_at_several_joints_is_one_phrase():

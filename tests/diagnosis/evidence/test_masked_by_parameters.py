@@ -8,9 +8,9 @@ from scipy.stats import multivariate_t
 
 from bayessim_mjx.diagnosis import run
 from bayessim_mjx.diagnosis.data_sheet import ACCURACY, SURE
+from bayessim_mjx.diagnosis.evidence import masked_effects
 from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
 from bayessim_mjx.diagnosis.fitting.fit import Fit
-from bayessim_mjx.diagnosis.selection import stand_ins
 from tests.diagnosis import pendulums
 
 KNOWN = Coordinate("own", (), 1.0, 0.1, 3.0, 1 / ACCURACY**2, "", stated=True)
@@ -27,19 +27,19 @@ def test_a_kind_is_a_multivariate_student_t_and_a_stated_parameter_a_gaussian():
     away = fit.values - 1.0
     t = multivariate_t(np.zeros(2), ACCURACY**2 * np.eye(2), df=SURE)
     expected = t.logpdf([0, 0]) - t.logpdf(away[:2]) + 0.5 * (0.2 / ACCURACY) ** 2
-    assert stand_ins._far(fit.coordinates, away) == pytest.approx(expected)
+    assert masked_effects._far(fit.coordinates, away) == pytest.approx(expected)
 
 
 def test_the_best_amount_takes_the_whole_deviation_back_and_the_range_bounds_it():
     fit = fit_of("ab", [1.0, 1.5])
     away = fit.values - 1.0
-    whole = stand_ins._gain(fit, away, stand_ins._Work(np.array([0.0, 1.0]), (-1.0, 1.0)))
-    assert whole.nats == pytest.approx(stand_ins._far(fit.coordinates, away)) and whole.parameter == 1
+    whole = masked_effects._gain(fit, away, masked_effects._Work(np.array([0.0, 1.0]), (-1.0, 1.0)))
+    assert whole.nats == pytest.approx(masked_effects._far(fit.coordinates, away)) and whole.parameter == 1
     np.testing.assert_allclose(whole.steps, [0.0, 0.5])
-    half = stand_ins._gain(fit, away, stand_ins._Work(np.array([0.0, 1.0]), (-1.0, 0.25)))
+    half = masked_effects._gain(fit, away, masked_effects._Work(np.array([0.0, 1.0]), (-1.0, 0.25)))
     np.testing.assert_allclose(half.steps, [0.0, 0.25])
     assert 0 < half.nats < whole.nats
-    wrong = stand_ins._gain(fit, away, stand_ins._Work(np.array([0.0, 1.0]), (-1.0, 0.0)))
+    wrong = masked_effects._gain(fit, away, masked_effects._Work(np.array([0.0, 1.0]), (-1.0, 0.0)))
     assert wrong.nats == 0.0
 
 

@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from bayessim_mjx.diagnosis.selection.heats import Heats
+from bayessim_mjx.diagnosis.selection.successive_halving import Heats
 
 
 def fit(*history):

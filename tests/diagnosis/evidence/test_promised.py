@@ -5,9 +5,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from bayessim_mjx.diagnosis import statistics
+from bayessim_mjx.diagnosis.evidence import selecting
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate, Coordinate
 from bayessim_mjx.diagnosis.fitting.fitter import Fit
-from bayessim_mjx.diagnosis.selection import predicted_gain
 
 GROUPS, EACH, STEPS = 4, 5, 30
 TRUTH = {"a": 0.5, "b": -0.3}
@@ -15,7 +16,7 @@ TRUTH = {"a": 0.5, "b": -0.3}
 
 def test_shapley_s_shares_by_hand():
     worth = {(): 0.0, (0,): 0.5, (1,): 0.1, (0, 1): 0.8}
-    shares = predicted_gain.shapley(2, lambda some: worth[tuple(sorted(some))])
+    shares = statistics.shapley(2, lambda some: worth[tuple(sorted(some))])
     # (0.5 + 0.8 - 0.1) / 2 and (0.1 + 0.8 - 0.5) / 2
     np.testing.assert_allclose(shares, [0.6, 0.2])
 
@@ -51,7 +52,7 @@ def toy() -> SimpleNamespace:
 def test_on_a_linear_problem_the_promise_is_kept():
     found = toy()
     before, after = (float(np.mean(x**2)) for x in (found.base.fit.r, found.left))
-    total, each = predicted_gain.promised(found, found.effects)
+    total, each = selecting.promised(found, found.effects)
     assert total == pytest.approx((before - after) / (before - 1.0), abs=0.02)
     assert sum(each.values()) == pytest.approx(total, abs=1e-9)
     # columns of the same size, nearly orthogonal: shares as the squared amounts, 25 : 9
@@ -60,5 +61,5 @@ def test_on_a_linear_problem_the_promise_is_kept():
 
 def test_a_secant_is_not_followed_beyond_the_range():
     effect = Candidate("a", "joint", "joint", (Coordinate("a", (0,), 0.0, -1.0, 1.0),), (False,))
-    assert predicted_gain._furthest(effect, np.array([0.8])) == pytest.approx(1.25)
-    assert predicted_gain._furthest(effect, np.array([-0.1])) == predicted_gain.FURTHEST
+    assert selecting._furthest(effect, np.array([0.8])) == pytest.approx(1.25)
+    assert selecting._furthest(effect, np.array([-0.1])) == selecting.FURTHEST

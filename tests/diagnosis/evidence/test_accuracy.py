@@ -7,9 +7,9 @@ import pytest
 from scipy import stats
 
 from bayessim_mjx.diagnosis.data_sheet import ACCURACY, SURE
+from bayessim_mjx.diagnosis.evidence import parameters
 from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
 from bayessim_mjx.diagnosis.fitting.fit import Fit
-from bayessim_mjx.diagnosis.selection import accuracy
 
 PRIOR = stats.t(SURE, scale=ACCURACY)
 
@@ -22,7 +22,7 @@ def fitted(values, kinds, stated=()):
 
 
 def test_without_data_a_number_is_a_student_t_and_what_is_stated_stays():
-    found = accuracy.posterior(fitted([1.0], ["mass"], [1.0]), np.zeros((2, 2)))
+    found = parameters.posterior(fitted([1.0], ["mass"], [1.0]), np.zeros((2, 2)))
     low, middle, high = found.quantiles()
     assert middle == pytest.approx([1.0, 1.0])
     assert high[0] - 1 == pytest.approx(PRIOR.ppf(0.95), rel=0.04) and high[1] - 1 == pytest.approx(
@@ -45,7 +45,7 @@ def test_one_number_against_quadrature(seen, sd):
     fit = fitted([mode], ["mass"])
     fit = SimpleNamespace(coordinates=fit.coordinates, values=fit.values)
     fit.belief = lambda: np.array([(seen - mode) / sd**2 / (mode - 1)])  # at the mode: prior and data in balance
-    found = accuracy.posterior(fit, np.array([[sd**-2]])).quantiles()[:, 0]
+    found = parameters.posterior(fit, np.array([[sd**-2]])).quantiles()[:, 0]
     assert found == pytest.approx(exact, abs=0.06 * (exact[2] - exact[0]))
 
 
@@ -69,7 +69,7 @@ def test_intervals_hold_the_truth_whatever_the_accuracy_was(informed):
     held, fixed = [], []
     for _ in range(150):
         truth, fit, S = linear(rng, kinds, informed)
-        sd = np.sqrt(np.diag(accuracy.posterior(fit, S).together()))
+        sd = np.sqrt(np.diag(parameters.posterior(fit, S).together()))
         held.append(np.abs(fit.values - truth) <= 1.645 * sd)
         covariance = np.linalg.inv(S + np.eye(5) / 0.05**2)
         fixed.append(np.abs(covariance @ (S @ (fit.values - 1)) + 1 - truth) <= 1.645 * np.sqrt(np.diag(covariance)))
@@ -80,8 +80,8 @@ def test_intervals_hold_the_truth_whatever_the_accuracy_was(informed):
 def test_data_on_some_numbers_tell_of_the_accuracy_of_the_others_of_their_kind():
     S = np.diag([1e6, 1e6, 1e6, 0.0, 0.0])
     kinds = ["mass"] * 4 + ["damping"]
-    sharp = accuracy.posterior(fitted([1.01, 0.99, 1.01, 1.0, 1.0], kinds), S)
-    loose = accuracy.posterior(fitted([1.3, 0.7, 1.3, 1.0, 1.0], kinds), S)
+    sharp = parameters.posterior(fitted([1.01, 0.99, 1.01, 1.0, 1.0], kinds), S)
+    loose = parameters.posterior(fitted([1.3, 0.7, 1.3, 1.0, 1.0], kinds), S)
     sds = [np.sqrt(np.diag(p.together())) for p in (sharp, loose)]
     assert sds[0][3] < 0.6 * sds[0][4] and sds[1][3] > 2 * sds[1][4]  # the fourth mass beside a damping
     assert loose.accuracy("mass")[0] > 0.14 > sharp.accuracy("mass")[1]
@@ -90,7 +90,7 @@ def test_data_on_some_numbers_tell_of_the_accuracy_of_the_others_of_their_kind()
 def test_the_grid_of_accuracies_is_fine_enough(monkeypatch):
     S = np.diag([1e4, 1e2, 0.0, 3e2, 0.0])
     fit = fitted([1.2, 0.95, 1.0, 1.1, 1.0], ["mass"] * 3 + ["damping"] * 2)
-    coarse = accuracy.posterior(fit, S).quantiles()
-    monkeypatch.setattr(accuracy, "LEVELS", np.geomspace(0.01, 1.0, 49))
-    fine = accuracy.posterior(fit, S).quantiles()
+    coarse = parameters.posterior(fit, S).quantiles()
+    monkeypatch.setattr(parameters, "LEVELS", np.geomspace(0.01, 1.0, 49))
+    fine = parameters.posterior(fit, S).quantiles()
     assert np.abs(coarse - fine).max() < 0.02 * (fine[2] - fine[0]).max()

@@ -1,4 +1,4 @@
-"""Fits on some of the windows, to choose starts and candidates by; what is chosen goes on with all windows.
+"""Fits on a subset of the windows: starts and candidates are ranked there, and the best continue on all windows.
 
 All windows are needed to say how well a model predicts, fewer to see that it is far behind.
 """
@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 from bayessim_mjx.diagnosis.fitting.journal import Remembering
-from bayessim_mjx.diagnosis.selection.screen import looked_at
 
 Array = NDArray[np.float64]
 
@@ -53,6 +52,22 @@ class Some:
         return np.asarray(self.simulator.run(thetas, offsets, self.own if windows is None else self.own[windows]))
 
 
+def looked_at(fit: Fit, limit: int) -> NDArray[np.int64]:
+    """At most `limit` windows: half of them where most is left to explain (a limit acts in few), the rest spread."""
+    count = len(fit.r)
+    if count <= limit:
+        return np.arange(count)
+    worst = np.argsort(-np.sum(fit.r**2, 1), kind="stable")[: limit // 2]
+    others = np.setdiff1d(np.arange(count), worst)
+    spread = others[np.linspace(0, len(others) - 1, limit - len(worst)).round().astype(int)]
+    return np.sort(np.concatenate([worst, spread]))
+
+
+def part(fit: Fit, own: NDArray[np.int64]) -> Fit:
+    """The fit on some of its windows."""
+    return replace(fit, offsets=fit.offsets[own], r=fit.r[own], A=fit.A[own], B=fit.B[own], weight=fit.weight[own])
+
+
 def windows_of(fit: Fit) -> NDArray[np.int64] | None:
     """The windows that candidates on top of a fit are ranked on; None: there are too few to choose from."""
     return looked_at(fit, SIZES.windows) if len(fit.r) >= SIZES.least else None
@@ -61,15 +76,14 @@ def windows_of(fit: Fit) -> NDArray[np.int64] | None:
 def on(fitter: Fitter, own: NDArray[np.int64]) -> Fitter:
     """The fitter on some of its windows; in the same journal, without the columns that nobody asks for."""
     some: Any = Some(fitter.simulator, own)
-    part = Fitter(some, fitter.base, fitter.theta)
+    plain = Fitter(some, fitter.base, fitter.theta)
     journal = fitter.journal if isinstance(fitter, Remembering) else None
-    return part if journal is None else Remembering(part, journal, bare=True)
+    return plain if journal is None else Remembering(plain, journal, bare=True)
 
 
 def cut(fit: Fit, own: NDArray[np.int64]) -> Fit:
     """A fit on some of its windows, to be fitted there."""
-    parts = {name: getattr(fit, name)[own] for name in ("offsets", "r", "A", "B", "weight")}
-    return replace(fit, **parts, cost=np.inf, history=(), reach=np.ones(1))
+    return replace(part(fit, own), cost=np.inf, history=(), reach=np.ones(1))
 
 
 def cost(part: Fitter, fit: Fit, own: NDArray[np.int64]) -> float:

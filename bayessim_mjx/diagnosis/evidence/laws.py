@@ -1,4 +1,4 @@
-"""Where a model begins that has another law of inertia in place of one of its own: with the same inertia.
+"""Which laws may stand beside each other or in each other's place, and where one begins in the place of another.
 
 A payload, a centre of mass that is off and a link's mass change the same ten numbers of a body. A fit from elsewhere
 comes to rest far from them: a payload's place hardly moves anything as long as its mass is wrong.
@@ -19,6 +19,7 @@ from bayessim_mjx.diagnosis.equation_error.rigid import inertial
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fitter import Fitter
 from bayessim_mjx.diagnosis.selection.models import Model
+from bayessim_mjx.effects import load, names
 from bayessim_mjx.parameters import geometry
 from bayessim_mjx.physics import Physics
 
@@ -26,6 +27,68 @@ Array = NDArray[np.float64]
 APART = 1e-3  # of a range: finite differences, of inertias in single precision
 # standard deviations of the priors as a share of a body's inertia: they decide what its inertia leaves open
 OPEN = 1e-2
+
+
+def compatible(a: Candidate, b: Candidate) -> bool:
+    """Not the same numbers twice (an effect at one joint and tied over all)."""
+    return not {i for c in a.coordinates for i in c.index} & {i for c in b.coordinates for i in c.index}
+
+
+def beside(a: Candidate, b: Candidate) -> bool:
+    """Whether both may be in one model: not the same numbers twice, nor a law beside its special case."""
+    within = a.where == b.where and (a.effect in special_cases(b) or b.effect in special_cases(a))
+    return a.label != b.label and compatible(a, b) and not within
+
+
+def special_case(one: Candidate, of: Candidate) -> bool:
+    """Whether it is a special case of a law at its place, or of a law that is tied over all places at one of them."""
+    at_one = of.where == "all" != one.where and one.kind == of.kind
+    contained = one.effect in special_cases(of)
+    return contained and (at_one or one.where == of.where) or at_one and one.effect == of.effect
+
+
+def related(one: Candidate, other: Candidate) -> bool:
+    """Whether the one may stand for the other: a special case, a law that contains it, or other inertia of its body."""
+    here = one.where == other.where and one.effect != other.effect
+    return special_case(one, other) or (here and special_case(other, one)) or inertia(one, other)
+
+
+def inertia(one: Candidate, other: Candidate) -> bool:
+    """Whether both change the inertia of the same body."""
+    here = one.kind == other.kind == "body" and one.where == other.where and one.effect != other.effect
+    return here and _inertial(one.effect) and _inertial(other.effect)
+
+
+def special_cases(effect: Candidate) -> tuple[str, ...]:
+    """Names of the effects that it contains, from its class."""
+    return _contained(effect.effect)
+
+
+@functools.cache  # thousands of pairs are compared, and all installed packages are looked through for a name
+def _contained(effect: str) -> tuple[str, ...]:
+    return tuple(getattr(load(effect), "contains", ())) if effect in names() else ()
+
+
+@functools.cache
+def _inertial(effect: str) -> bool:
+    return effect in names() and bool(load(effect).inertial)
+
+
+def as_large(one: Candidate, other: Candidate, values: Array) -> tuple[Array, ...]:
+    """A law's numbers by those of another that have the same units, the last of them for any more; else neutral.
+
+    () where none has the same unit.
+    """
+    found = []
+    there = {
+        c.unit: [v for o, v in zip(other.coordinates, values.tolist(), strict=True) if o.unit == c.unit]
+        for c in one.coordinates
+    }
+    for c in one.coordinates:
+        same = there[c.unit]
+        value = c.neutral if not same else same.pop(0) if len(same) > 1 else same[0]
+        found.append(float(np.clip(value, c.low, c.high)))
+    return (np.array(found),) if any(there.values()) else ()
 
 
 @dataclass(frozen=True)

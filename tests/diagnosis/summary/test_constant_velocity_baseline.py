@@ -8,8 +8,8 @@ import pytest
 
 from bayessim_mjx.diagnosis.fitting import windows
 from bayessim_mjx.diagnosis.result import Gap
-from bayessim_mjx.diagnosis.selection.coasting import coasting
 from bayessim_mjx.diagnosis.summary import sentences, verdict
+from bayessim_mjx.diagnosis.summary.how_far import constant_velocity_baseline
 from tests.diagnosis.pendulums import ARMATURE, DAMPING, MASS, MODEL, PERIOD, STEP, recorded
 
 LENGTH = 25
@@ -28,7 +28,7 @@ def moving(qpos, qvel, use_qvel=True):
 
 
 def test_nothing_is_left_of_a_straight_motion():
-    found = coasting(moving(lambda t: 0.3 + 0.7 * t, lambda t: 0.7 + 0 * t), PENDULUM)
+    found = constant_velocity_baseline(moving(lambda t: 0.3 + 0.7 * t, lambda t: 0.7 + 0 * t), PENDULUM)
     np.testing.assert_allclose(found.error, 0, atol=2e-2)  # in noises: positions are kept in float32
     np.testing.assert_allclose(found.offsets, 0, atol=1e-4)
 
@@ -36,7 +36,7 @@ def test_nothing_is_left_of_a_straight_motion():
 @pytest.mark.parametrize("use_qvel", [True, False])
 def test_a_bent_motion_leaves_what_a_weighted_line_leaves(use_qvel):
     cut = moving(lambda t: t**2, lambda t: 2 * t, use_qvel)
-    found = coasting(cut, PENDULUM)
+    found = constant_velocity_baseline(cut, PENDULUM)
     t, nothing = PERIOD * np.arange(1, LENGTH + 1), np.zeros(LENGTH)
     for w, row in enumerate(found.error):
         begin = PERIOD * cut.start[w]
@@ -67,7 +67,7 @@ def test_a_body_that_turns_evenly_coasts():
         qpos=turned[pick], qvel=speeds[pick], around=around.replace(qpos=turned[rows], qvel=speeds[rows])
     )
     six = {"sigma_q": np.full(6, 1e-3), "sigma_v": np.full(6, np.inf), "spread": np.full(12, 1e-2)}
-    found = coasting(dataclasses.replace(cut, batch=batch, **six), FREE)
+    found = constant_velocity_baseline(dataclasses.replace(cut, batch=batch, **six), FREE)
     assert found.error.shape == (4, LENGTH, 6)
     np.testing.assert_allclose(found.error, 0, atol=1e-6)
 
