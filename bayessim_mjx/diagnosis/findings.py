@@ -1,4 +1,4 @@
-"""All that a diagnosis computed, before it is put into words. Frozen: a stage gives new findings with one part more."""
+"""All that a diagnosis computed, before it is put into words, and who is told of it while it runs."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, eq=False)
 class Where:
-    """Where the gap lies: joints, regions of the state, signatures; and what spectra of the missing force show."""
+    """Where the gap lies: joints, regions of the state, signatures, and spectra of the missing force."""
 
     found: Located
     spectra: tuple[Heard, ...]
@@ -31,15 +31,15 @@ class Where:
 
 @dataclass(frozen=True, eq=False)
 class Findings:
-    """What is known so far; `assemble.diagnosis_of` turns it into a Diagnosis.
+    """All results so far; frozen: a stage returns new findings. `assemble.diagnosis_of` makes a Diagnosis of them.
 
     Attributes:
-        setup, selection: what was fixed before any fit, and what the selection came to.
+        setup, selection: everything fixed before any fit, and the result of the search.
         predictions: {"nominal", "calibrated", "with_effects": held-out motion}.
         disturbance: the force that the recalibrated simulator lacks; None where its gap is the noise.
         flexible_base, flexible_winner: a flexible force on the recalibrated simulator, on top of the effects.
         links: of the first log's channels to each other.
-        parts: what further stages found, one frozen object each, by its class.
+        parts: results of further stages, one frozen object each, by its class.
         warnings: of stages that failed.
     """
 
@@ -55,15 +55,15 @@ class Findings:
 
     @property
     def model(self) -> Model:
-        """The model of the verdict: the known parameters with the effects that are named."""
+        """The model of the verdict: the known parameters and the named effects."""
         return self.selection.answer
 
     def having(self, part: Any) -> Findings:
-        """With what one more stage found."""
+        """The findings with the result of one more stage."""
         return replace(self, parts=MappingProxyType({**self.parts, type(part): part}))
 
     def part(self, kind: type[T]) -> T | None:
-        """What the stage found whose part is of this class; None where it did not run or found nothing."""
+        """The result of the stage whose part has this class; None if it did not run or found nothing."""
         return self.parts.get(kind)
 
 

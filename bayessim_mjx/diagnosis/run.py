@@ -42,7 +42,7 @@ def investigate(
     observer: Observer = Observer(),  # noqa: B008  # has no state
     stages: Sequence[Stage] | None = None,
 ) -> Findings:
-    """The whole computation, before anything is put into words or written.
+    """The whole computation, before its results are put into words or written.
 
     Args:
         robot: the model with the parameters that it may recalibrate.
@@ -126,7 +126,7 @@ def diagnose(
 
 
 def remembering(setup: Setup, folder: Path | None) -> Setup:
-    """The setup with a fitter that finds in the folder what it fitted there before, and writes what it fits."""
+    """The setup with a fitter that stores its fits in a folder, and finds there those of an interrupted search."""
     if folder is None:
         return setup
     return replace(setup, fitter=Remembering(setup.fitter, Journal(folder, _question(setup), _code(setup))))
@@ -139,12 +139,12 @@ def ended(setup: Setup) -> None:
 
 
 def _code(setup: Setup) -> str:
-    """A digest of the code that makes the fits: this package's, and the files of effects from elsewhere."""
+    """A digest of the code that makes the fits: this package and the files of the user's own effects."""
     return digest(versions.sources(), sorted({str(programs.source_of(type(e))) for e in setup.physics.effects}))
 
 
 def _question(setup: Setup) -> str:
-    """A digest of all that the fits depend on but code and the time that they may take."""
+    """A digest of everything else that the fits depend on; the time that they may take is no part of it."""
     fitter, model = setup.fitter, setup.physics.mj_model
     simulator = fitter.simulator
     raw = np.empty(mujoco.mj_sizeModel(model), np.uint8)

@@ -1,4 +1,4 @@
-"""What is fixed before any fit: usable logs, the model and its time step, windows, candidates, noise, tolerance."""
+"""Preparation of a diagnosis: usable logs, the model and its time step, windows, candidates, noise, tolerance."""
 
 from __future__ import annotations
 
@@ -42,14 +42,23 @@ from bayessim_mjx.physics import Physics
 Array = NDArray[np.float64]
 
 
-# of a first answer, for any robot; how often it differs from the whole search's was not counted
+# of a first answer, for any robot; how often it differs from the answer of the whole search was not counted
 QUICK = Settings(screened=12, iterations=8)
-SHIFT_FACTOR = 4  # times the coarsest sub-steps, the finest by which a shift of commands is looked for
+SHIFT_FACTOR = 4  # finest sub-steps for the estimate of a command shift, as a factor on the coarsest stable ones
 
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """Everything that is fixed before any fit."""
+    """Everything that is fixed before any fit.
+
+    Attributes:
+        robot: as it is simulated; physics: its compiled model with all effects on offer.
+        gate: the logs after the checks; look: what they show before any simulation.
+        fitter: on the windows that models are fitted to; candidates: effects at their places.
+        scales: sizes of motions, forces and inertias; tolerance: errors that may stay unexplained.
+        discretisation: the error of the time step beside the noise.
+        warnings: for the result; said: those of them that are said before the search.
+    """
 
     robot: Robot
     physics: Physics
@@ -61,7 +70,7 @@ class Setup:
     seed: int
     tolerance: tolerance.Tolerance
     warnings: tuple[str, ...] = ()
-    said: tuple[str, ...] = ()  # of the warnings, what is said before the search
+    said: tuple[str, ...] = ()
     discretisation: discretisation.Discretisation | None = None
     look: Look = Look()
 

@@ -22,13 +22,13 @@ from bayessim_mjx.diagnosis.summary import finer_steps, whole_logs
 
 @dataclass(frozen=True)
 class Stage:
-    """One stage: its name, told while it runs; `run(findings, say) -> findings`.
+    """One stage: its name, which is shown while it runs, and `run(findings, say) -> findings`.
 
     Attributes:
-        optional: its failure becomes a warning, as the verdict stands without it.
-        patient: left out once the time is over.
-        beside: it needs nothing of others that are so, and adds nothing but its part: they go on together, as each
-            compiles a small program of its own, which leaves cores free.
+        optional: the verdict does not need it; its failure becomes a warning.
+        patient: it is left out if the time is over.
+        beside: it needs no result of other such stages, and adds only its own part. Such stages run together, as each
+            compiles a small program, which leaves cores free.
     """
 
     name: str
@@ -39,7 +39,7 @@ class Stage:
 
 
 def how_far(found: Findings, say: Progress) -> Findings:
-    """With the held-out motion of the simulator as delivered, recalibrated and with the effects."""
+    """Add the held-out motion of the simulator as delivered, recalibrated and with the effects."""
     fitter, base, model = found.setup.fitter, found.selection.state.base, found.model
     predictions = {
         "nominal": heldout.nominal(fitter, found.selection.state.nominal),
@@ -50,7 +50,7 @@ def how_far(found: Findings, say: Progress) -> Findings:
 
 
 def none_of_these(found: Findings, say: Progress) -> Findings:
-    """With the force that is missing, what a flexible force makes of it, and which links of the chain are sound."""
+    """Add the missing force, a flexible force fitted to it, and the checks of the links of the actuator chain."""
     base, model, setup = found.selection.state.base, found.model, found.setup
     missing = estimate(setup.fitter, base.fit) if found.selection.state.above_noise(base) else None
     on_base = _flexible(found, base, missing)
@@ -60,7 +60,7 @@ def none_of_these(found: Findings, say: Progress) -> Findings:
 
 
 def _flexible(found: Findings, model: Model, missing: Disturbance | None = None) -> Flexible | None:
-    """The flexible force on a model whose gap is above the noise."""
+    """A flexible force on top of a model; None if the model leaves no more than noise."""
     if not found.selection.state.above_noise(model):
         return None
     with warnings.catch_warnings():
@@ -69,7 +69,7 @@ def _flexible(found: Findings, model: Model, missing: Disturbance | None = None)
 
 
 def where_it_lies(found: Findings, say: Progress) -> Findings:
-    """With the places of the recalibrated simulator's gap, maps of the missing force and its spectra."""
+    """Add the places of the recalibrated simulator's gap, maps of the missing force and its spectra."""
     if found.disturbance is None:
         return found
     fitter, fit = found.setup.fitter, found.selection.state.base.fit
@@ -78,7 +78,7 @@ def where_it_lies(found: Findings, say: Progress) -> Findings:
 
 
 def rivals_without_physics(found: Findings, say: Progress) -> Findings:
-    """With what a network and a formula close of the gap, beside the named effects."""
+    """Add the shares of the gap that a network and a formula close, beside those of the named effects."""
     if found.disturbance is None:
         return found
     state, named = found.selection.state, found.model.fit if found.model.effects else None
@@ -98,9 +98,9 @@ STAGES = (
 
 
 def carry_out(stages: Sequence[Stage], found: Findings, time_left: Budget, observer: Observer) -> Findings:
-    """The findings with those of all stages; the observer gets the verdict once all that are not optional have run.
+    """Run all stages; the observer gets the verdict once all stages that are not optional have run.
 
-    Under a limit of time they go one after the other: each is left out if the time is over when its turn comes.
+    Under a limit of time they run one after the other, and a stage is left out if the time is over at its turn.
     """
     beside = [] if time_left.limited else [s for s in stages if s.beside]
     alone = [s for s in stages if s not in beside]
@@ -116,7 +116,7 @@ def carry_out(stages: Sequence[Stage], found: Findings, time_left: Budget, obser
 
 
 def _together(stages: Sequence[Stage], found: Findings, observer: Observer) -> Findings:
-    """Each on a thread: what they compile and simulate is outside of Python's lock."""
+    """Run each stage on a thread: compilation and simulation release Python's lock."""
     name = ", ".join(s.name for s in stages)
     done: list[Stage] = []
 
@@ -135,7 +135,7 @@ def _together(stages: Sequence[Stage], found: Findings, observer: Observer) -> F
 
 
 def _joined(found: Findings, running: Iterable[Future[Findings]]) -> Findings:
-    """With the parts and warnings of stages that began with `found`."""
+    """The findings with the parts and warnings of stages that began with `found`."""
     each = [future.result() for future in running]
     parts = {kind: part for after in each for kind, part in after.parts.items()}
     warnings = [text for after in each for text in after.warnings[len(found.warnings) :]]
@@ -156,6 +156,6 @@ def _after(stage: Stage, found: Findings, say: Progress) -> Findings:
     except Exception as error:
         if not stage.optional:
             raise
-        # the verdict is there: a picture or proposal less must not lose it
+        # the verdict stands: a missing picture or proposal must not lose it
         lost = f"{stage.name}: not available ({type(error).__name__}: {error})"
         return replace(found, warnings=(*found.warnings, lost))

@@ -1,4 +1,4 @@
-"""Which laws may stand beside each other or in each other's place, and where one begins in the place of another.
+"""Relations between laws: which may be in one model, which may replace another, and where a replacement begins.
 
 A payload, a centre of mass that is off and a link's mass change the same ten numbers of a body. A fit from elsewhere
 comes to rest far from them: a payload's place hardly moves anything as long as its mass is wrong.
@@ -30,25 +30,25 @@ OPEN = 1e-2
 
 
 def compatible(a: Candidate, b: Candidate) -> bool:
-    """Not the same numbers twice (an effect at one joint and tied over all)."""
+    """Whether two effects share no number; one at a joint shares its numbers with the same one tied over all joints."""
     return not {i for c in a.coordinates for i in c.index} & {i for c in b.coordinates for i in c.index}
 
 
 def beside(a: Candidate, b: Candidate) -> bool:
-    """Whether both may be in one model: not the same numbers twice, nor a law beside its special case."""
+    """Whether both may be in one model: they share no number, and none is a special case of the other."""
     within = a.where == b.where and (a.effect in special_cases(b) or b.effect in special_cases(a))
     return a.label != b.label and compatible(a, b) and not within
 
 
 def special_case(one: Candidate, of: Candidate) -> bool:
-    """Whether it is a special case of a law at its place, or of a law that is tied over all places at one of them."""
+    """Whether `one` is a special case of a law at its place, or of a law that is tied over all places."""
     at_one = of.where == "all" != one.where and one.kind == of.kind
     contained = one.effect in special_cases(of)
     return contained and (at_one or one.where == of.where) or at_one and one.effect == of.effect
 
 
 def related(one: Candidate, other: Candidate) -> bool:
-    """Whether the one may stand for the other: a special case, a law that contains it, or other inertia of its body."""
+    """Whether `one` may replace the other: special case, law that contains it, or another inertia of the same body."""
     here = one.where == other.where and one.effect != other.effect
     return special_case(one, other) or (here and special_case(other, one)) or inertia(one, other)
 
@@ -60,7 +60,7 @@ def inertia(one: Candidate, other: Candidate) -> bool:
 
 
 def special_cases(effect: Candidate) -> tuple[str, ...]:
-    """Names of the effects that it contains, from its class."""
+    """Names of the effects that are special cases of it, from its class."""
     return _contained(effect.effect)
 
 
@@ -75,9 +75,9 @@ def _inertial(effect: str) -> bool:
 
 
 def as_large(one: Candidate, other: Candidate, values: Array) -> tuple[Array, ...]:
-    """A law's numbers by those of another that have the same units, the last of them for any more; else neutral.
+    """A law's numbers at the values of another's with the same units, in their order; neutral where there are none.
 
-    () where none has the same unit.
+    The last value serves further numbers of its unit. () if no unit is the same.
     """
     found = []
     there = {
@@ -99,8 +99,8 @@ class Start:
     own: Array
 
 
-def alike(fitter: Fitter, model: Model, effect: Candidate, law: Candidate) -> Start | None:
-    """The law's numbers, and known parameters, that give the bodies most nearly the inertia of a fitted model.
+def with_same_inertia(fitter: Fitter, model: Model, effect: Candidate, law: Candidate) -> Start | None:
+    """The law's numbers, and known parameters, at which the bodies have the inertia of a fitted model, or nearly so.
 
     Args:
         effect: of the model, in whose place the law stands.

@@ -1,11 +1,11 @@
-"""Effects and deviations from the data sheet that do the same work: these logs cannot tell which of them is there.
+"""Masked effects: the parameters of named effects, or known parameters, can reproduce them in these logs.
 
-A bias beside a spring moves the spring's angle of rest; viscous friction beside friction by direction is part of it. No
-logs of this kind tell whether both are there: the law that is named stands for them together (`beside`).
+A bias beside a spring moves the spring's angle of rest; viscous friction beside friction by direction is part of it.
+Such logs do not tell whether both are there: the named law stands for both (`by_effects`).
 
 A joint's viscous friction is its damping, rotor inertia beside a slide is its mass, a drive's gain is all of the
-robot's inertia, damping and friction together. The prior tells whether a data sheet is so wrong, or an effect missing
-(`of_parameters`).
+robot's inertia, damping and friction together. The prior decides whether the data sheet is wrong or an effect is
+missing (`by_parameters`).
 """
 
 from __future__ import annotations
@@ -54,8 +54,8 @@ class Limits:
 LIMITS = Limits()
 
 
-def beside(state: SearchState, answer: Model, say: Progress = lambda text, done, total: None) -> tuple[str, ...]:
-    """Labels of candidates that would not show beside the answer's effects, but do without them."""
+def by_effects(state: SearchState, answer: Model, say: Progress = lambda text, done, total: None) -> tuple[str, ...]:
+    """Labels of candidates that the answer's effects hide, and that show without these effects."""
     if not answer.effects or not state.secants.columns:
         return ()
     others = [c for c in state.candidates if c.label in state.secants.columns]
@@ -77,7 +77,7 @@ def _shown(state: SearchState, model: Model, candidates: Sequence[Candidate]) ->
     return {label: sorted(several, key=lambda pair: pair[0]) for label, several in each.items()}
 
 
-def of_parameters(state: SearchState, answer: Model) -> dict[str, tuple[str, ...]]:
+def by_parameters(state: SearchState, answer: Model) -> dict[str, tuple[str, ...]]:
     """{known parameter: labels of the effects that it may stand for}, without a simulation.
 
     An effect stands beside a parameter's deviation where known parameters do all its work (`LIMITS.hidden`), and

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bayessim_mjx.diagnosis.evidence.laws import alike, as_large, inertia, related, special_case
+from bayessim_mjx.diagnosis.evidence.laws import as_large, inertia, related, special_case, with_same_inertia
 from bayessim_mjx.diagnosis.evidence.promises import Column, Plan, around
 from bayessim_mjx.diagnosis.evidence.sets import ODDS, Weighed
 from bayessim_mjx.diagnosis.evidence.weighing import Weighing
@@ -31,15 +31,15 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Effort:
-    """How much is fitted; more of each finds the same sets, later.
+    """How many sets are fitted. Larger numbers find the same sets, but take longer.
 
     Attributes:
-        rounds: of looking around the leading set, at most.
-        sizes: sets of one, two and more further effects that are fitted in a round, on top of the leading set.
+        rounds: at most so many, each around the leading set.
+        sizes: sets with one, two and more further effects that a round fits on top of the leading set.
         instead: likewise in the place of each of its effects; base: on the known parameters.
-        least: single effects that are fitted however little they promise: promises are linear.
+        least: single effects that are fitted in any case, as promises are linear.
         margin: nats below the leading set, within which a promised set is fitted.
-        leading: sets whose ranges may grow; finalists: whose fits are brought to their end.
+        leading: sets whose ranges may grow; finalists: sets whose fits are brought to convergence.
     """
 
     rounds: int = 5
@@ -56,7 +56,7 @@ EFFORT = Effort()
 
 
 class Search:
-    """The sets fitted so far, their evidence, and what promises more."""
+    """The search: fitted sets, their evidence, and plans for further sets."""
 
     def __init__(self, state: SearchState, say: Progress) -> None:
         self.state, self.say = state, say
@@ -66,7 +66,7 @@ class Search:
         self._again: set[tuple[Key, Key]] = set()
 
     def run(self) -> Weighed:
-        """All rounds; the posterior over what was fitted."""
+        """Run all rounds; returns the posterior over the fitted sets."""
         self._fit(self._worth(self._around(BASE), (EFFORT.sizes[0], 0, 0), EFFORT.least), SINGLES, SINGLES)
         self._leading()
         for made in range(EFFORT.rounds):
@@ -92,7 +92,7 @@ class Search:
         return list(self.weighing.weighed().weight)
 
     def _todo(self, best: Key) -> list[Plan]:
-        """What to fit around the leading set: beside one that leaves nothing relevant, what promises to be likelier."""
+        """Plans around the leading set; if it leaves nothing relevant, larger sets have to promise more than it has."""
         smaller = [k for k in (best - {x} for x in sorted(best)) if k and k in self.weighing.scored]
         plans = [p for k in smaller for p in self._worth(self._around(k), EFFORT.instead)]
         plans += [p for k in dict.fromkeys([best, *self.weighing.weighed().beside]) for p in self._related(k)]
@@ -133,7 +133,7 @@ class Search:
     def _begun(self, model: Model, effect: Candidate, law: Candidate) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
         """Where a law begins in the place of an effect: (its numbers, the known parameters beside them)."""
         if inertia(law, effect):
-            start = alike(self.state.fitter, model, effect, law)
+            start = with_same_inertia(self.state.fitter, model, effect, law)
             return ((), ()) if start is None else ((start.own,), (start.known,))
         return as_large(law, effect, model.values_of(effect)), ()
 

@@ -28,19 +28,19 @@ from bayessim_mjx.diagnosis.selection.successive_halving import Entries, fit_ent
 from bayessim_mjx.diagnosis.statistics import shapley
 
 Array = NDArray[np.float64]
-MANY = 4  # effects, up to which every subset is fitted
-FURTHEST = 2.0  # times the screened start: further a secant is not trusted
+MANY = 4  # effects; of an answer with more not every subset is fitted
+FURTHEST = 2.0  # times the screened start; a secant is not trusted further
 
 
 @dataclass(frozen=True, eq=False)
 class Rival:
-    """Another explanation that these logs cannot tell from (a part of) the answer.
+    """Another explanation that fits these logs as well as the answer, or as a part of it.
 
     Attributes:
-        effects: those that the answer does not have; model: with the answer's other ones.
-        closure: share of the gap that the model closes; why: in words.
-        contains: whether it is the effect and more: no other explanation.
-        size: of its effect, where it is a single one.
+        effects: those that the answer lacks; model: these together with other effects of the answer.
+        closure: share of the gap that the model closes; why: it is a rival, in words.
+        contains: whether it contains the effect as a special case, and so is no other explanation.
+        size: of its effect; None if it has several.
     """
 
     effects: tuple[Candidate, ...]
@@ -56,18 +56,18 @@ class Rival:
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """What the selection came to.
+    """The result of the search.
 
     Attributes:
-        state: all that was fitted.
-        answer: the model that is named (`state.base` where nothing is).
-        rivals: {label of one of its effects: what may stand in its place}.
+        state: all fitted models; it is only read from here on.
+        answer: the named model (`state.base` if no effect is named).
+        rivals: {label of one of its effects: explanations that may take its place}.
         subsets: {labels: the model with these of its effects}, every one refitted; {} of one effect or of too many.
-        promised: share of the base model's gap that its effects promised to close before any was fitted, {label: part}.
+        promised: predicted share of the base model's gap that its effects close, {label: part}.
         chosen: {operating condition: effects that are named without it}.
         elsewhere: share of the gap closed on conditions that the choice was made without; NaN of one condition.
-        hidden: labels of effects that would not show beside those of the answer (`masked_effects.beside`).
-        stand_ins: {known parameter: labels of effects that it may stand for} (`masked_effects.of_parameters`).
+        hidden: labels of effects that would not show beside those of the answer (`masked_effects.by_effects`).
+        stand_ins: {known parameter: labels of effects that it may stand for} (`masked_effects.by_parameters`).
         weighed: probabilities of the sets that were fitted; estimated: posterior of the answer's numbers.
     """
 
@@ -85,7 +85,7 @@ class Selection:
 
     @property
     def ambiguous(self) -> bool:
-        """Whether something else than what contains an effect as a special case would do as well."""
+        """Whether a rival that does not contain the effect as a special case fits as well."""
         return any(not r.contains for rivals in self.rivals.values() for r in rivals)
 
 
@@ -96,7 +96,11 @@ def select(
     say: Progress,
     keep: Callable[[SearchState], None] = lambda state: None,
 ) -> Selection:
-    """What the logs on the windows of `fitter` call for; `keep` is called with what was tried so far."""
+    """Search for the effects that the logs on the windows of `fitter` call for.
+
+    Args:
+        keep: called with the state of the search after each part.
+    """
     state = begin(fitter, candidates, settings, say, keep)
     search = Search(state, say)
     found = search.run()
@@ -115,8 +119,8 @@ def select(
         promised=promised(state, answer.effects) if answer.effects else (0.0, {}),
         chosen=chosen,
         elsewhere=_elsewhere(state, chosen),
-        hidden=masked_effects.beside(state, answer, say),
-        stand_ins=masked_effects.of_parameters(state, answer),
+        hidden=masked_effects.by_effects(state, answer, say),
+        stand_ins=masked_effects.by_parameters(state, answer),
         weighed=found,
         estimated=estimated(search.weighing, found),
     )

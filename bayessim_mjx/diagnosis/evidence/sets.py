@@ -15,11 +15,11 @@ from bayessim_mjx.diagnosis.selection.search_state import log_prior
 
 @dataclass(frozen=True)
 class Relevance:
-    """What an effect has to change to matter, however surely it is there.
+    """How much an effect has to change to be relevant, however significant it is.
 
     Attributes:
-        share: of the gap's square that the known parameters leave: laws of two simulators differ by as much.
-        noise: and so many noise variances: less does not show in the motion.
+        share: of the squared gap that the known parameters leave; laws of two simulators differ by as much.
+        noise: noise variances, which are added; less does not show in the motion.
     """
 
     share: float = 0.003
@@ -49,8 +49,8 @@ ODDS = Odds()
 class Weighed:
     """Posterior probabilities of the sets that were fitted, most likely first.
 
-    A set with effects that do not matter is no explanation of its own: it counts for the one without these (`core`).
-    What known parameters are is another matter: such an effect may be doing their work.
+    A set with irrelevant effects is no explanation of its own: it counts for the set without them (`core`). Known
+    parameters are averaged over the sets as they are, as an irrelevant effect may take a part of their values.
 
     Attributes:
         weight: {explanation: probability}; nats: {explanation: log of evidence and prior over those of the known
@@ -80,7 +80,7 @@ class Weighed:
         return list(dict.fromkeys([self.answer, *(k for k, w in self.sets.items() if w * ODDS.strong >= best)]))
 
     def told(self) -> list[dict[str, Any]]:
-        """The sets that hold all but a thousandth of the probability, and the known parameters alone, for JSON."""
+        """The sets with 99.9 % of the probability, and the known parameters alone, for JSON."""
         kept, whole = [], 0.0
         for key, weight in self.weight.items():
             kept += [key] if whole < 0.999 or key == BASE else []
@@ -94,7 +94,7 @@ class Weighed:
 
 
 def core(key: Key, excess: Mapping[Key, float]) -> Key:
-    """The least subset of a set that leaves no relevant part of the gap more.
+    """The smallest subset of a set that leaves no relevant part of the gap more than the set.
 
     Args:
         excess: {set: held-out squared error above the noise, in noise variances}, of all sets that were fitted.

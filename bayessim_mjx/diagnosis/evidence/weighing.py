@@ -21,14 +21,14 @@ from bayessim_mjx.diagnosis.selection.models import BASE, Key, Model, scored
 from bayessim_mjx.diagnosis.selection.search_state import SearchState
 
 Array = NDArray[np.float64]
-MOVES = 3  # of a model to its mean
-MOVED = 0.1  # standard deviations by which a number moves at least: a smaller move is not simulated
-WORSE = 1.0  # nats that moves which do not come to an end may cost
+MOVES = 3  # moves of a model towards its posterior mean, at most
+MOVED = 0.1  # standard deviations; smaller moves are not simulated
+WORSE = 1.0  # nats that the model may lose by moves that do not converge
 
 
 @dataclass(frozen=True, eq=False)
 class Scored:
-    """A fitted model with its evidence; fit: its own, with what simulators differ by (`doubts`)."""
+    """A fitted model with its evidence; fit: its own with the numbers of `doubts` beside its own numbers."""
 
     model: Model
     fit: Fit
@@ -37,10 +37,11 @@ class Scored:
 
 
 class Weighing:
-    """What was weighed so far.
+    """The evidence of all fitted sets of a search.
 
     Attributes:
-        scored: by their sets; D: `[W, n, nv m]`, what forces do to the windows, of the fit of the known parameters.
+        scored: {set: its model with its evidence}; D: `[W, n, nv m]`, effect of forces on the windows
+            (`disturbance.columns`), at the fit of the known parameters.
     """
 
     def __init__(self, state: SearchState) -> None:
@@ -58,7 +59,7 @@ class Weighing:
         return doubts.doubted(fit, self._doubts)
 
     def score(self, keys: Iterable[Key]) -> None:
-        """The evidence of models that are fitted, anew where the fit is another."""
+        """Compute the evidence of fitted models, again where the fit has changed."""
         for key in keys:
             model, old = self.state.models.get(key), self.scored.get(key)
             if model is not None and (old is None or old.model is not model):

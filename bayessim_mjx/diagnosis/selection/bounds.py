@@ -1,4 +1,4 @@
-"""Effects' parameters that end at a bound: ranges grow as long as the logs ask for it, and what stays there is told."""
+"""Effects' parameters that end at a bound: their ranges grow as long as held-out evidence gains from it."""
 
 from __future__ import annotations
 
@@ -31,6 +31,7 @@ class Widening:
 
 
 WIDENING = Widening()
+Change = Callable[[Physics, Coordinate, float], Coordinate]  # (physics, its range, its value) -> its new range
 
 
 @dataclass(frozen=True)
@@ -46,9 +47,6 @@ class Bound:
     kind: str
     at: float
     physical: bool = False
-
-
-Change = Callable[[Physics, Coordinate, float], Coordinate]
 
 
 def widened(state: SearchState, model: Model, say: Progress) -> Model:
@@ -125,9 +123,7 @@ def _farthest(physics: Physics, coordinate: Coordinate, end: str) -> float:
     return low / WIDENING.farthest if low > 0 else coordinate.neutral + WIDENING.farthest * (low - coordinate.neutral)
 
 
-def _moved(
-    state: SearchState, model: Model, change: Callable[[Physics, Coordinate, float], Coordinate]
-) -> list[Candidate]:
+def _moved(state: SearchState, model: Model, change: Change) -> list[Candidate]:
     """The model's effects with their ranges changed; the same objects where nothing is."""
     physics, out = state.fitter.simulator.physics, []
     for effect in model.effects:

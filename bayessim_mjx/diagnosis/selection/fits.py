@@ -1,4 +1,4 @@
-"""The fits at both ends of a search: the known parameters and the screening on top, and the end of the best fits."""
+"""The first and the last fits of a search: the known parameters before screening, and the best sets to convergence."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Rules:
     steps: int = 4
     gains: float = 1.0
     refreshed: float = 0.3  # of the time left, for the first columns of all that are polished
-    # times the best one's cost, as near as a fit has to be able to come: a rule of thumb, not counted
+    # times the best cost that a fit has to be able to reach; a rule of thumb, not counted
     near: float = 1.3
 
 
@@ -44,7 +44,11 @@ def begin(
     say: Progress = lambda text, done, total: None,
     keep: Callable[[SearchState], None] = lambda state: None,
 ) -> SearchState:
-    """The state with the known parameters; `keep` is called with it after each part, also of what follows."""
+    """Fit the known parameters and screen all candidates; returns the state of the search.
+
+    Args:
+        keep: called with the state after each part of the search, also after those that follow.
+    """
 
     def in_time(made: int, fits: Sequence[Fit], running: Sequence[int]) -> Sequence[int]:
         return () if made > 1 and settings.budget.over(KNOWN) else running
@@ -75,7 +79,7 @@ def begin(
 
 
 def _affordable(candidates: Sequence[Candidate], settings: Settings, seconds: float) -> Settings:
-    """Fewer windows to screen on where time is limited; seconds: that a simulation of a window took."""
+    """Settings with fewer windows for screening if time is limited; seconds: of one simulation of one window."""
     budget = settings.budget
     if not budget.limited:
         return settings
@@ -85,14 +89,14 @@ def _affordable(candidates: Sequence[Candidate], settings: Settings, seconds: fl
 
 
 def polish(state: SearchState, models: Sequence[Model], say: Progress = lambda text, done, total: None) -> list[Model]:
-    """All columns anew at the fits, and more steps, again and again as long as it helps; returns the models that were.
+    """Refresh all columns and make further steps as long as the cost falls; returns the models that were polished.
 
-    Where time is limited these are the first ones, as many as it is enough for; others stay as the search left them.
+    If time is limited, these are the first ones; the others stay as the search left them.
     """
     fitter, count, budget = state.fitter, itertools.count(), state.settings.budget
     began, left = budget.spent, budget.left(LEAVING_OUT)
 
-    def told(fit: Fit) -> Fit:
+    def counted(fit: Fit) -> Fit:
         say(POLISHING, min(next(count), 2 * len(models) - 1), 2 * len(models))
         return fit
 
@@ -100,21 +104,21 @@ def polish(state: SearchState, models: Sequence[Model], say: Progress = lambda t
     for model in models:
         if fits and budget.spent - began > RULES.refreshed * left:
             break
-        fits.append(told(fitter.refresh(model.fit)))
+        fits.append(counted(fitter.refresh(model.fit)))
     if later := models[len(fits) :]:
         state.skipped[POLISHING] = state.skipped.get(POLISHING, 0) + len(later)
     models = models[: len(fits)]
-    fits = [_again(state, fit) for fit in fits] if state.rough else _to_the_end(state, fits, told)
+    fits = [_again(state, fit) for fit in fits] if state.rough else _to_the_end(state, fits, counted)
     new = [scored(fitter, fit, m.effects) for fit, m in zip(fits, models, strict=True)]
     state.models.update({frozenset(c.label for c in m.effects): m for m in new})
     return new
 
 
-def _to_the_end(state: SearchState, fits: Sequence[Fit], told: Callable[[Fit], Fit]) -> list[Fit]:
-    """Fits with all columns anew every few steps, and corrected by these alone, as long as that lowers their cost.
+def _to_the_end(state: SearchState, fits: Sequence[Fit], counted: Callable[[Fit], Fit]) -> list[Fit]:
+    """Fits with new columns every few steps, as long as that lowers their cost.
 
-    None goes on when the time is over. One that could not come near the best, did each round to come bring as much as
-    the last, is left where it is.
+    No fit goes on when the time is over. A fit stops if it could not come near the best one even if each further round
+    gained as much as the last.
     """
     fits, running = list(fits), list(range(len(fits)))
     for made in range(RULES.rounds):
@@ -125,7 +129,7 @@ def _to_the_end(state: SearchState, fits: Sequence[Fit], told: Callable[[Fit], F
         moved = state.fitter.iterate(start, RULES.steps, lambda f: state.fresh(f) if state.astray(f) else (), tolerance)
         for i, fit in zip(running, moved, strict=True):
             late = state.settings.budget.over(LEAVING_OUT)
-            fits[i] = fit if late else told(state.fitter.refresh(fit))
+            fits[i] = fit if late else counted(state.fitter.refresh(fit))
         fell = {i: before.cost - fits[i].cost for i, before in zip(running, start, strict=True)}
         least, left = min(fit.cost for fit in fits), RULES.rounds - 1 - made
         running = [
@@ -137,7 +141,7 @@ def _to_the_end(state: SearchState, fits: Sequence[Fit], told: Callable[[Fit], F
 
 
 def _again(state: SearchState, fit: Fit) -> Fit:
-    """A rough fit, from its own start states and from the measured ones."""
+    """A fit with contacts, from its own start states and from the measured ones; the better of both."""
     both = {id(f): f for f in (fit, state.begun(fit))}
     return min((_on(state.fitter, f) for f in both.values()), key=lambda f: f.cost)
 
@@ -153,7 +157,7 @@ def _on(fitter: Fitter, fit: Fit) -> Fit:
 
 
 def cut_back(state: SearchState, model: Model, kept: Sequence[Candidate]) -> Fit:
-    """A fit of some of a model's effects, from where the model is; its first residuals come with the first step."""
+    """The start of a fit with some of a model's effects, at the model's values; its first step gives its residuals."""
     fit, base = model.fit, len(state.fitter.base)
     names = {c.name for e in kept for c in e.coordinates}
     own = [i for i, c in enumerate(fit.coordinates) if i < base or c.name in names]

@@ -1,4 +1,4 @@
-"""The state of a search: all that was fitted on one set of windows, and how it compares with noise and base model."""
+"""The state of a search: all models fitted to one set of windows, compared with the noise and with the base model."""
 
 from __future__ import annotations
 
@@ -15,11 +15,10 @@ from bayessim_mjx.diagnosis.selection.budget import Budget
 from bayessim_mjx.diagnosis.selection.models import Key, Model
 from bayessim_mjx.diagnosis.selection.screen import Screened, Secants
 
-FLOOR = 1.3  # noise standard deviations (rms): an error within it is not worth explaining; a rule of thumb
-# effects that a simulator lacks, before any log is seen; the known parameters alone are as likely as one
-EXPECTED = 1.0
-LEFT = 1.0  # mean square of start states, in their own variances, from which on measured ones are begun at
-ASTRAY = 10.0  # noises that a fit leaves: from there on nothing is as it was a step before
+FLOOR = 1.3  # noise standard deviations (rms) up to which an error needs no explanation; a rule of thumb
+EXPECTED = 1.0  # prior number of effects that a simulator lacks; no effect is as likely as one
+LEFT = 1.0  # mean square of start states, in their variances, from which fits with contacts begin at measured ones
+ASTRAY = 10.0  # noise standard deviations (rms) from which on a fit's derivatives change at every step
 
 
 @dataclass(frozen=True)
@@ -27,10 +26,10 @@ class Settings:
     """Budgets of the search, by the robot's size.
 
     Attributes:
-        screened: windows looked at in screening; iterations, tolerance: of a fit.
-        fresh: base columns are differenced anew if there are at most so many.
+        screened: windows used in screening; iterations, tolerance: of a fit.
+        fresh: base columns are differenced again during a fit if there are at most so many.
         budget: time that the search may take.
-        believed: share of the noise (rms) that is the sensors'; the rest is what the time step may be worth at most.
+        believed: share of the noise (rms) that is the sensors'; the rest bounds the error of the time step.
     """
 
     screened: int = 96
@@ -74,30 +73,31 @@ class SearchState:
         return float(self.fitter.size)
 
     def above_noise(self, model: Model) -> bool:
-        """Whether the model's held-out error is worth explaining.
+        """Whether the model's held-out error needs an explanation.
 
-        Errors of the time step may be smaller than feared: what has effects already has to reach the sensors' noise.
+        The error of the time step may be smaller than its bound, so a model with effects has to reach the sensors'
+        noise alone.
         """
         return self.gap(model).rms > FLOOR * (self.settings.believed if model.effects else 1.0)
 
     def gap(self, model: Model) -> Gap:
-        """From the base model to `model`, held out."""
+        """The gap between the base model and `model`, on held-out windows."""
         return Gap(self.base.total, model.total, self.noise * len(model.cost))
 
     def log_prior(self, key: Key) -> float:
-        """Of a set of effects, see `log_prior`."""
+        """`log_prior` of a set of effects, with the candidates of this search."""
         return log_prior(key, len(self.candidates))
 
     @property
     def rough(self) -> bool:
-        """Whether contacts make what columns tell hold only nearby: fits then need them anew at every step."""
+        """Whether something can touch: columns then hold only nearby, and fits need new ones at every step."""
         return contacts(self.fitter.simulator.physics)
 
     def begun(self, fit: Fit) -> Fit:
-        """The fit that models of more effects begin at: with contacts at the measured start states, if it left them.
+        """The fit from which models with more effects begin: with contacts at measured start states, if it left them.
 
-        Starts farther off than their noise are those that a fit needs while it lacks an effect. They keep the effect
-        from the logs, as over contacts no step leads back to where they were.
+        A fit that lacks an effect may move its start states farther than their noise. Over contacts no step leads back,
+        and the effect would find nothing to explain.
         """
         if not self.rough or np.mean((fit.offsets / self.fitter.spread) ** 2) < LEFT:
             return fit
@@ -106,26 +106,26 @@ class SearchState:
         return self._measured[fit]
 
     def fresh(self, fit: Fit) -> list[int]:
-        """Columns to be differenced anew: effects' at every step, known parameters' at every third if cheap.
+        """Columns to difference again: effects' at every step, known parameters' at every third if they are few.
 
-        Far from the logs, where they change from step to step, at every one.
+        Far from the logs, where columns change at every step, known parameters' at every step too.
         """
         base = len(self.fitter.base)
         turn = base <= self.settings.fresh and (self.astray(fit) or len(fit.history) % 3 == 0)
         return list(range(0 if turn else base, len(fit.coordinates)))
 
     def astray(self, fit: Fit) -> bool:
-        """Whether a fit is so far from the logs that its derivatives hold nowhere else."""
+        """Whether a fit is so far from the logs that its derivatives hold only where it is."""
         return fit.cost > ASTRAY**2 * self.noise * len(fit.r)
 
 
 def log_prior(key: Key, candidates: int) -> float:
-    """Of a set: each of the candidates is missing with the same small probability (so many are expected)."""
+    """Log prior of a set of effects over no effect: every candidate is missing with the same small probability."""
     odds = EXPECTED / max(candidates - EXPECTED, 1.0)
     return len(key) * float(np.log(odds))
 
 
 def ranked(state: SearchState, size: int | None = None) -> list[Model]:
-    """Models tried, best first; `size`: those of so many effects."""
+    """Fitted models by held-out error, best first; size: only those with so many effects."""
     chosen = [m for m in state.models.values() if size is None or len(m.effects) == size]
     return sorted(chosen, key=lambda m: m.total)

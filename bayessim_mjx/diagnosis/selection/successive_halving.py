@@ -1,4 +1,4 @@
-"""Many fits in lockstep by successive halving: what is far behind stops first, what is close goes on to the end."""
+"""Successive halving: many fits run in lockstep, those far behind stop early, those close to the best go to the end."""
 
 from __future__ import annotations
 
@@ -17,14 +17,17 @@ from bayessim_mjx.diagnosis.selection.budget import SINGLES, Progress
 from bayessim_mjx.diagnosis.selection.models import Key, Model, scored
 from bayessim_mjx.diagnosis.selection.search_state import SearchState
 
-BATCH = 12  # models fitted in lockstep; after each batch the state is kept
+BATCH = 12  # models that are fitted in lockstep; `state.keep` is called after each batch
 
 
-class Heats:
-    """Starts far behind their candidate's best stop first, then candidates that are far behind the best candidate.
+class SuccessiveHalving:
+    """Starts far behind their candidate's best stop first, then candidates far behind the best candidate.
 
-    They keep the cost they reached, and their place far down the table. What still falls fast goes on, and what was
-    refused a step that would have brought much. over: whether the time is.
+    A fit that stops keeps the cost that it reached. A fit goes on if its cost still falls fast, or if a step that
+    promised much was refused.
+
+    Args:
+        over: whether the time is over.
     """
 
     STARTS = {1: 4.0, 2: 2.0, 3: 1.3, 5: 1.03}  # steps made -> cost over the best start's
@@ -54,13 +57,13 @@ class Heats:
         return going
 
     def learn(self, fits: Sequence[Fit]) -> None:
-        """The pace of fits that are made, also of those that a search which goes on has from the disk."""
+        """Take the pace from finished fits. Fits that are read from disk set the same pace as fits that were run."""
         for made in self.CANDIDATES:
             costs = [fit.history[min(made, len(fit.history) - 1)] for fit in fits if fit.history]
             self.pace[made] = min([self.pace.get(made, np.inf), *costs])
 
     def finals(self, close: NDArray[np.bool_]) -> Callable[[int, Sequence[Fit], Sequence[int]], list[int]]:
-        """Which fits go on with all windows: one step tells their place in the table, those that are close go on."""
+        """Which fits go on with all windows: each makes one step, so that it is ranked; only close ones make more."""
 
         def going(made: int, fits: Sequence[Fit], running: Sequence[int]) -> list[int]:
             return [] if self.over() else [i for i in running if made < 1 or close[i]]
@@ -85,14 +88,14 @@ def fit_entries(
     part: str = "",
     parents: Parents = MappingProxyType({}),
 ) -> None:
-    """Fit models in lockstep, each from all of its starts, and keep the best of each.
+    """Fit models in lockstep, each from all of its starts, and keep the best fit of each.
 
     Args:
-        part: of the budget, by whose end the rest is left out; "": all are fitted.
-        parents: of those that extend a fitted model. Where they gain less on some windows than so many effects have to
-            (`log_prior`), they are `state.vain` and are no models.
+        part: of the budget; models that are not begun at its end are left out. "": all are fitted.
+        parents: the fitted models that some entries extend. An entry that gains less on a subset of the windows than
+            its prior odds cost (`log_prior`) becomes no model; `state.vain` holds it.
     """
-    heats = Heats(lambda: bool(part) and state.settings.budget.over(part))
+    halving = SuccessiveHalving(lambda: bool(part) and state.settings.budget.over(part))
     total, done = sum(len(several) for several, _ in entries.values()), 0
     every = list(entries.items())
     leading = min((model.fit for model in parents.values()), key=lambda fit: fit.cost, default=state.base.fit)
@@ -103,7 +106,7 @@ def fit_entries(
             _left_out(state, [effects for _, (_, effects) in every[first:]], label)
             return
         done += sum(len(several) for several, _ in some.values())
-        _fit_batch(state, some, parents, own, heats, functools.partial(_say_left, say, label, done, total))
+        _fit_batch(state, some, parents, own, halving, functools.partial(_say_left, say, label, done, total))
         state.keep(state)
 
 
@@ -116,16 +119,16 @@ def _fit_batch(
     entries: Entries,
     parents: Parents,
     own: NDArray[np.int64] | None,
-    heats: Heats,
+    halving: SuccessiveHalving,
     progress: Callable[[int], None],
 ) -> None:
-    """All starts on some windows, where there are many; the best start of each model then on all of them."""
+    """All starts on a subset of the windows (None: on all); then the best start of each model on all windows."""
     every = [several for several, _ in entries.values()]
     part = state.fitter if own is None else window_subset.on(state.fitter, own)
     starts = [f if own is None else window_subset.cut(f, own) for fs in every for f in fs]
     rules = state.settings.iterations, state.fresh, state.settings.tolerance
-    fits = part.iterate(starts, *rules, progress, heats.among(list(map(len, every))))
-    heats.learn(fits)
+    fits = part.iterate(starts, *rules, progress, halving.among(list(map(len, every))))
+    halving.learn(fits)
     rest = iter(fits)
     pairs = (zip(itertools.islice(rest, len(fs)), fs, strict=True) for fs in every)
     first = dict(zip(entries, (min(some, key=lambda pair: pair[0].cost) for some in pairs), strict=True))
@@ -133,10 +136,10 @@ def _fit_batch(
     if own is not None:
         gaining = _gaining(state, part, own, best, parents)
         state.vain |= set(entries) - set(gaining)
-        heats.least = min(heats.least, *(fit.cost for fit in best.values()))
+        halving.least = min(halving.least, *(fit.cost for fit in best.values()))
         again = [window_subset.back(first[key][1], best[key], own) for key in gaining]
-        close = window_subset.close(np.array([best[key].cost for key in gaining]), heats.least)
-        found = state.fitter.iterate(again, *rules, None, heats.finals(close)) if again else []
+        close = window_subset.close(np.array([best[key].cost for key in gaining]), halving.least)
+        found = state.fitter.iterate(again, *rules, None, halving.finals(close)) if again else []
         best = dict(zip(gaining, found, strict=True))
     for key, fit in best.items():
         state.models[key] = scored(state.fitter, fit, entries[key][1])
@@ -145,7 +148,7 @@ def _fit_batch(
 def _gaining(
     state: SearchState, part: Fitter, own: NDArray[np.int64], fits: Mapping[Key, Fit], parents: Parents
 ) -> list[Key]:
-    """The models that gain on some windows as much as so many effects have to, over the model that they extend."""
+    """The models that gain enough on a subset of the windows over the model that they extend."""
     share, out = len(own) / len(state.base.fit.r), []
     for key, fit in fits.items():
         parent = parents.get(key)
@@ -156,12 +159,12 @@ def _gaining(
 
 
 def _least_gain(state: SearchState, key: Key, parent: Model | None) -> float:
-    """What the cost has to fall by, so that the likelihood outweighs the prior odds of so many effects more."""
+    """The fall of the cost at which the likelihood outweighs the prior odds of the further effects."""
     more = key - {e.label for e in parent.effects} if parent else frozenset()
     return -2.0 * state.log_prior(more)
 
 
 def _left_out(state: SearchState, models: Sequence[Sequence[Candidate]], label: str) -> None:
-    """Remembers what there was no time for."""
+    """Record the models for which no time was left."""
     state.cut_short.update(effects[0].label for effects in models if len(effects) == 1)
     state.skipped[label] = state.skipped.get(label, 0) + len(models)

@@ -19,14 +19,14 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Sizes:
-    """How many windows candidates are ranked on, and who goes on with all of them.
+    """How many windows candidates are ranked on, and which of them go on with all windows.
 
     Rules of thumb: on one case they cost half the simulations and name the same (benchmarks/results.md, "Diagnosis:
     seconds"); error rates were not counted.
 
     Attributes:
-        windows: ranked on; least: windows from which on some of them are enough.
-        close: times the best candidate's cost on these windows; others make one step on all windows, for the table.
+        windows: in the subset; least: number of all windows from which on a subset is used.
+        close: times the best candidate's cost on the subset; others make one step on all windows, for the ranking.
     """
 
     windows: int = 24
@@ -37,8 +37,8 @@ class Sizes:
 SIZES = Sizes()
 
 
-class Some:
-    """Some windows of a simulator, for a fitter: the same program, the windows in the order of `own`."""
+class WindowSubset:
+    """A simulator of the windows `own` of another, for a fitter; both share one compiled program."""
 
     def __init__(self, simulator: Any, own: NDArray[np.int64]) -> None:
         self.simulator, self.own, self.physics = simulator, own, simulator.physics
@@ -48,12 +48,12 @@ class Some:
         self.windows = replace(all_of_it, **parts)
 
     def run(self, thetas: Array, offsets: Array | None = None, windows: NDArray[np.int64] | None = None) -> Array:
-        """As of the simulator."""
+        """As `Simulator.run`."""
         return np.asarray(self.simulator.run(thetas, offsets, self.own if windows is None else self.own[windows]))
 
 
 def looked_at(fit: Fit, limit: int) -> NDArray[np.int64]:
-    """At most `limit` windows: half of them where most is left to explain (a limit acts in few), the rest spread."""
+    """At most `limit` windows: half with the largest residuals (a limit acts in few), the others spread evenly."""
     count = len(fit.r)
     if count <= limit:
         return np.arange(count)
@@ -69,36 +69,36 @@ def part(fit: Fit, own: NDArray[np.int64]) -> Fit:
 
 
 def windows_of(fit: Fit) -> NDArray[np.int64] | None:
-    """The windows that candidates on top of a fit are ranked on; None: there are too few to choose from."""
+    """The windows on which extensions of a fit are ranked; None: all, as there are few."""
     return looked_at(fit, SIZES.windows) if len(fit.r) >= SIZES.least else None
 
 
 def on(fitter: Fitter, own: NDArray[np.int64]) -> Fitter:
-    """The fitter on some of its windows; in the same journal, without the columns that nobody asks for."""
-    some: Any = Some(fitter.simulator, own)
+    """The fitter on some of its windows; it uses the same journal, but stores no columns there."""
+    some: Any = WindowSubset(fitter.simulator, own)
     plain = Fitter(some, fitter.base, fitter.theta)
     journal = fitter.journal if isinstance(fitter, Remembering) else None
     return plain if journal is None else Remembering(plain, journal, bare=True)
 
 
 def cut(fit: Fit, own: NDArray[np.int64]) -> Fit:
-    """A fit on some of its windows, to be fitted there."""
+    """The start of a fit to some of the windows."""
     return replace(part(fit, own), cost=np.inf, history=(), reach=np.ones(1))
 
 
 def cost(part: Fitter, fit: Fit, own: NDArray[np.int64]) -> float:
-    """Of a fit on all windows, on some of them."""
+    """The cost on some windows of a fit to all windows."""
     some = cut(fit, own)
     return part.cost(some, some.r, some.offsets, some.values)
 
 
 def back(fit: Fit, ranked: Fit, own: NDArray[np.int64]) -> Fit:
-    """The fit with what was found on some of its windows; residuals and columns come with its first step."""
+    """The start of a fit to all windows at the values of `ranked`, a fit to some; its first step gives residuals."""
     offsets = fit.offsets.copy()
     offsets[own] = ranked.offsets
     return replace(fit, values=ranked.values, offsets=offsets, cost=np.inf, history=(), reach=np.ones(1))
 
 
 def close(costs: Array, least: float) -> NDArray[np.bool_]:
-    """Which candidates go on, by their costs and that of the best one so far."""
+    """Which candidates go on: those whose cost is close to the least so far."""
     return np.asarray(costs <= SIZES.close * least)
