@@ -110,21 +110,17 @@ class _Timed:
     """The robot with a time step that is fine enough, and when its commands act.
 
     Attributes:
-        cuts: windows by the factor on the sub-steps; shift: of the commands, None: not estimated.
-        notes: what is said before the search; warnings: what is not.
+        gate: with logs whose commands are shifted by `lead`, s; cuts: windows by the factor on the sub-steps.
+        notes: warnings that are said before the search; warnings: others.
     """
 
     robot: Robot
+    gate: gate.Gate
+    lead: float
     cuts: Callable[..., Windows]
     step: discretisation.Discretisation
-    shift: command_shift.Shift | None
     notes: tuple[str, ...]
     warnings: tuple[str, ...]
-
-    @property
-    def lead(self) -> float:
-        """s by which commands act later than the logs say."""
-        return 0.0 if self.shift is None else self.shift.lead
 
     def cut(self, physics: Physics, quick: bool) -> Windows:
         """The windows that models are fitted to."""
@@ -167,7 +163,7 @@ def prepare(
     return Setup(
         robot=timed.robot,
         physics=physics,
-        gate=checked.gate.shifted(timed.lead) if timed.lead else checked.gate,
+        gate=timed.gate,
         fitter=Fitter(Simulator(physics, cut), base, physics.space.nominal),
         candidates=led.candidates,
         scales=size,
@@ -200,9 +196,10 @@ def _timed(checked: _Checked, size: scales.Scales, limit: Array, group: str | No
     steps = stepping.stepping(checked.robot, dt, usable, measured, functools.partial(_affordable, budget))
     cuts, step = steps.cuts, steps.worth
     shift = _shift(cuts, step, size)
-    late = [] if shift is None else shift.told(checked.period)
+    lead, late = (0.0, []) if shift is None else (shift.lead, shift.told(checked.period))
+    shifted = checked.gate.shifted(lead) if lead else checked.gate
     notes = [*steps.said(), *_faster(usable, float(checked.robot.mj_model.opt.timestep), dt), *late]
-    return _Timed(step.robot(steps.robot), cuts, step, shift, tuple(notes), tuple(steps.warnings()))
+    return _Timed(step.robot(steps.robot), shifted, lead, cuts, step, tuple(notes), tuple(steps.warnings()))
 
 
 def _affordable(budget: Budget, seconds: float) -> bool:
