@@ -65,7 +65,7 @@ def test_a_truth_five_times_beyond_its_range_is_found(whole):
     )
     assert values["cubic"] == pytest.approx(CUBIC, rel=0.05)
     cubic = next(c for c in effect.coordinates if c.name.endswith("cubic"))
-    assert CUBIC < cubic.high <= 4 * CUBIC and not whole.above_noise(whole.answer)
+    assert CUBIC < cubic.high <= 4 * CUBIC and not whole.state.above_noise(whole.answer)
 
 
 def test_a_killed_search_goes_on_and_comes_to_the_same(setup, counted_whole, tmp_path):
@@ -86,7 +86,7 @@ def test_a_killed_search_goes_on_and_comes_to_the_same(setup, counted_whole, tmp
     there = again.fitter.journal.found
     assert there > 3 and rest.answer.label == whole.answer.label
     assert np.array_equal(rest.answer.fit.values, whole.answer.fit.values)
-    assert {k: m.total for k, m in rest.models.items()} == {k: m.total for k, m in whole.models.items()}
+    assert {k: m.total for k, m in rest.state.models.items()} == {k: m.total for k, m in whole.state.models.items()}
     assert simulator.rollouts - before < 0.7 * cost
 
 
@@ -95,9 +95,9 @@ def test_without_time_the_first_answer_says_what_was_not_tried(setup, monkeypatc
     clock = itertools.count()
     monkeypatch.setattr(successive_halving, "BATCH", 1)
     short = searched(setup, seconds=36.0, now=lambda: float(next(clock)))
-    assert short.answer.label == SPRING and len(short.cut_short) == 2
-    assert not_fitted(short) == {phrases.NO_TIME_LEFT: sorted(short.cut_short, key=labels(setup).index)}
-    assert "no time was left for 2 single effects" in not_tried(short)
+    assert short.answer.label == SPRING and len(short.state.cut_short) == 2
+    assert not_fitted(short.state) == {phrases.NO_TIME_LEFT: sorted(short.state.cut_short, key=labels(setup).index)}
+    assert "no time was left for 2 single effects" in not_tried(short.state)
 
 
 def test_when_the_time_is_over_the_verdict_rests_on_what_is_fitted(setup, counted_whole):

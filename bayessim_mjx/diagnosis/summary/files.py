@@ -1,4 +1,4 @@
-"""The folder of a diagnosis: what is known so far, the verdict as soon as it stands, and everything at the end."""
+"""The folder of a diagnosis: results so far, the verdict as soon as it stands, at the end the result and its files."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ from bayessim_mjx.diagnosis.setup import Setup
 from bayessim_mjx.diagnosis.summary import assemble, first_look
 from bayessim_mjx.errors import UserError
 
-PRELIMINARY = "preliminary.json"  # what is known while the search goes on
+PRELIMINARY = "preliminary.json"  # results while the search goes on
 BEST = 20  # models listed there
-SEARCH = "search_so_far"  # folder of what was fitted
+SEARCH = "search_so_far"  # folder of the fits
 COMMAND = "next_experiment.csv"
 
 
 class Files(Observer):
-    """Writes into a folder, or nowhere where there is none, and passes on what a diagnosis reports.
+    """Writes results into a folder, and passes progress on to the caller.
 
     Args:
-        folder: made when there is something to write; about: what is diagnosed.
-        progress, early: called as those of `Observer`; None: they are not.
+        folder: it is made at the first file; None: nothing is written. about: entries of the report's header.
+        progress, early: called as the methods of `Observer`; None: not called.
     """
 
     def __init__(
@@ -60,23 +60,23 @@ class Files(Observer):
 
     @property
     def search(self) -> Path | None:
-        """Folder for what is fitted, from which a killed search goes on."""
+        """Folder for the fits, from which an interrupted search continues."""
         return None if self.folder is None else self.folder / SEARCH
 
     def known(self, setup: Setup, state: SearchState | None) -> None:
-        """What is known before there is a verdict: killed there, this stays."""
+        """Write the results so far; they stay if the diagnosis is killed before its verdict."""
         if self.folder is not None:
             write_preliminary(self.folder / PRELIMINARY, self.about, setup, state)
 
     def verdict(self, found: Findings) -> None:
-        """The verdict on its own: maps and the next experiment take time; killed there, it stays."""
+        """Write the verdict; it stays if the diagnosis is killed during maps and the next experiment."""
         if self.folder is not None:
             assemble.diagnosis_of(found, self.about).save(self.folder)
             (self.folder / PRELIMINARY).unlink(missing_ok=True)
             journal.remove(self.folder / SEARCH)
 
     def result(self, found: Findings) -> Diagnosis:
-        """What was found as a Diagnosis, its proposal as a file that can be played."""
+        """The findings as a Diagnosis; writes the proposed experiment as a file that can be played."""
         proposal, name = found.part(Experiment), ""
         if self.folder is not None and proposal is not None and proposal.chosen is not None:
             source = str(self.folder / "diagnosis.json")
@@ -84,7 +84,7 @@ class Files(Observer):
         return assemble.diagnosis_of(found, self.about, name)
 
     def whole(self, result: Diagnosis, robot: Robot) -> Diagnosis:
-        """Write everything but the report; returns what can be loaded again."""
+        """Write everything but the report; returns the result as it is loaded again."""
         if self.folder is None:
             return result
         result.save(self.folder)  # before anything that could fail: nothing computed is lost
@@ -97,10 +97,10 @@ class Files(Observer):
 
 
 def write_preliminary(path: Path, about: Mapping[str, Any], setup: Setup, state: SearchState | None) -> None:
-    """Write what is known so far, whole or not at all; no verdict is among it.
+    """Write the results so far, whole or not at all; there is no verdict among them.
 
     Args:
-        about: what is diagnosed; state: None before the first fit.
+        about: entries of the report's header; state: None before the first fit.
     """
     found = {"verdict": None, "about": dict(about), "before_simulation": first_look.lines(setup.look)}
     found |= {"warnings": list(setup.warnings)} | ({} if state is None else _so_far(state))

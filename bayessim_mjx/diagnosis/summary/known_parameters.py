@@ -15,13 +15,13 @@ from bayessim_mjx.diagnosis.fitting.fitter import Fitter
 from bayessim_mjx.diagnosis.selection.models import Model
 
 Array = NDArray[np.float64]
-# standard deviations from what a data sheet states, from where on that is told: by chance of one normal value in 22.
-# How often it is told wrongly of fitted values was not counted.
+# standard deviations from the data sheet from which on a parameter is reported: one normal value in 22 by chance. False
+# reports of fitted values were not counted.
 FAR = 2.0
 
 
 def parameters(selection: Selection, model: Model, sd: np.ndarray, mean: np.ndarray) -> dict[str, dict[str, Any]]:
-    """Of the robot (their mean), and as they are simulated at the time step of the fit."""
+    """Rows of the result's table: {name: the robot's value (`mean`), its sd, the simulated value, bounds, remarks}."""
     remarks = structural(selection.state.fitter, model)
     base, values = selection.state.fitter.base, model.fit.values
     real = [float(np.clip(v, c.low, c.high)) for c, v in zip(base, mean, strict=True)]
@@ -37,7 +37,7 @@ def parameters(selection: Selection, model: Model, sd: np.ndarray, mean: np.ndar
 
 
 def _against_data_sheet(c: Coordinate, value: float, precision: float) -> dict[str, Any]:
-    """How far a known parameter is from what was stated of it, where that is far: in words, and in sd."""
+    """The distance of a known parameter from its stated value, in words and in sd, if it is larger than `FAR`."""
     away = abs(value - c.neutral) * precision**0.5
     if not (c.stated and away > FAR):
         return {"data_sheet": ""}
@@ -45,7 +45,7 @@ def _against_data_sheet(c: Coordinate, value: float, precision: float) -> dict[s
 
 
 def accuracy(model: Model, sheet: Posterior) -> dict[str, dict[str, float]]:
-    """Of each kind of parameter whose accuracy nobody stated."""
+    """{kind: quantiles of its accuracy, and how many parameters it has}, of kinds whose accuracy was not stated."""
     every = [c.kind for c in model.fit.coordinates]
     ends = {kind: sheet.accuracy(kind) for kind in sheet.kinds}
     return {
@@ -55,17 +55,14 @@ def accuracy(model: Model, sheet: Posterior) -> dict[str, dict[str, float]]:
 
 
 def less_accurate(model: Model, sheet: Posterior) -> list[str]:
-    """Kinds of parameters that lie farther from their data sheet than half of all do, 9 to 1 or surer."""
-    found = {kind: own for kind, own in accuracy(model, sheet).items() if own["low"] > data_sheet.ACCURACY}
-    return (
-        [phrases.less_accurate({kind: (own["median"], own["low"], own["high"]) for kind, own in found.items()})]
-        if found
-        else []
-    )
+    """A remark on kinds of parameters that are farther from their data sheet than usual, with 95 % probability."""
+    every = accuracy(model, sheet).items()
+    found = {k: (own["median"], own["low"], own["high"]) for k, own in every if own["low"] > data_sheet.ACCURACY}
+    return [phrases.less_accurate(found)] if found else []
 
 
 def structural(fitter: Fitter, model: Model) -> dict[str, str]:
-    """Known parameters that sit at a bound or move between operating conditions (Wald test, Bonferroni)."""
+    """{known parameter: remark} where it sits at a bound or moves between conditions (Wald test, Bonferroni)."""
     from scipy import stats  # takes long to import
 
     out = {}
@@ -79,18 +76,17 @@ def structural(fitter: Fitter, model: Model) -> dict[str, str]:
         return out
     each, deviation = per_condition(fitter, model)
     for i, c in enumerate(model.fit.coordinates[:base]):
-        z2 = float(
-            np.sum(((each[:, i] - np.average(each[:, i], weights=1 / deviation[:, i] ** 2)) / deviation[:, i]) ** 2)
-        )
+        own, sd = each[:, i], deviation[:, i]
+        z2 = float(np.sum(((own - np.average(own, weights=1 / sd**2)) / sd) ** 2))
         p = float(stats.chi2.sf(z2, groups - 1)) * base
-        spread = float(np.std(each[:, i]))
+        spread = float(np.std(own))
         if p < 1e-3 and spread > 0.05 * (c.high - c.low) and c.name not in out:
             out[c.name] = phrases.moves(spread, groups, fitter.simulator.windows.blocks)
     return out
 
 
 def per_condition(fitter: Fitter, model: Model) -> tuple[Array, Array]:
-    """Each condition's own estimate and standard deviation, `[G, k]`, one Newton step from the common fit."""
+    """Estimates and standard deviations `[G, k]` of each condition alone, one Newton step from the common fit."""
     q, _ = model.fit.quadratic(fitter.spread)
     _, _, low, high = model.fit.prior()
     precision = model.fit.belief()

@@ -34,7 +34,7 @@ def test_what_is_missing_is_named_and_what_is_not_is_not(found):
     search, weighed = found
     assert weighed.answer == DRY
     assert weighed.weight[DRY] > 0.99
-    model = search.pool.models[DRY]
+    model = search.state.models[DRY]
     assert model.fit.values[-1] == pytest.approx(FRICTION, rel=0.05)
 
 
@@ -49,7 +49,7 @@ def _sampled(found, key):
     """Evidence less an unbiased estimate of it: draws around the fit, each simulated; all else is integrated out."""
     search, _ = found
     weighing, scored = search.weighing, search.weighing.scored[key]
-    fit, learnt, fitter = scored.fit, scored.learnt, search.pool.fitter
+    fit, learnt, fitter = scored.fit, scored.learnt, search.state.fitter
     fixed = scored.model.fit
     precision = fit.belief()
     neutral = np.array([c.neutral for c in fit.coordinates]) - fit.values

@@ -141,7 +141,7 @@ def read(path):
 
 
 def test_the_promised_evidence_comes_true(tmp_path):
-    before = contest()[0].selection
+    before = contest()[0].selection.state
     found = proposal()
     command, notes = read(write_command(tmp_path / "next.csv", found))
     kp, kd = (notes["closed_loop"][k]["motor"] for k in ("kp", "kd"))
@@ -188,7 +188,8 @@ def test_identical_rivals_are_said_to_be_inseparable():
 
 def test_a_single_survivor_is_sharpened():
     contested, _ = contest()
-    lonely = replace(contested, selection=replace(contested.selection, models={}))
+    selection = contested.selection
+    lonely = replace(contested, selection=replace(selection, state=replace(selection.state, models={})))
     found = propose(lonely, [], LIMITS)
     assert "sharpens hinge.quadratic_drag.coefficient" in found.why
     assert found.evidence > 0.3 and found.pairs == []
