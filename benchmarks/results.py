@@ -6,16 +6,16 @@ A record is one file: the section of the page it belongs to, the command and the
 `rows`, a claim each, or a `table` with `columns`, or both. The value or `n` of a row may name a cell of the table of
 its record: `{single[alone]}` is the cell of the row "single" in the column "alone". So each figure is written once.
 
-A row says where it is shown: in the first table of the page ("headline", with its `rank`), in the table of its section
-("section"), or in the record alone ("no"). It says whether the goal is `met`. Where a value is several figures and some
-meet the goal, the others have **no** beside them. A record with `shown_rows` and `shown_columns` shows a part of its
-table in the section `shown_in`.
+A row says where it is shown: in the first table of the page ("headline"), in the table of its section ("section"), or
+in the record alone ("no"). A shown row has a `rank` in its table. A row says whether the goal is `met`. Where a value
+is several figures and some meet the goal, the others have **no** beside them. A record with `shown_rows` and
+`shown_columns` shows a part of its table in the section `shown_in`.
 """
 
 import argparse
 import json
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -74,7 +74,7 @@ def faults(found: Mapping[str, Mapping[str, Any]]) -> list[str]:
             where = f"{name}.{row.get('id')}"
             out += [f"{where}: no {field}" for field in ROW if not isinstance(row.get(field), str)]
             out += [f"{where}: met or shown"] * (row.get("met") not in MET or row.get("shown") not in SHOWN)
-            out += [f"{where}: no rank"] * (row.get("shown") == "headline" and "rank" not in row)
+            out += [f"{where}: no rank"] * (row.get("shown") != "no" and "rank" not in row)
             for claim in (where, row.get("claim", "")):
                 first = claims.setdefault(claim, where)
                 out += [f"{where}: {claim!r} twice, see {first}"] * (first is not where)
@@ -85,21 +85,22 @@ def faults(found: Mapping[str, Mapping[str, Any]]) -> list[str]:
 
 def headline(found: Mapping[str, Mapping[str, Any]]) -> list[list[str]]:
     """Rows of the first table."""
-    ranked = [(row["rank"], _cells(name, row)) for name, row in _rows(found) if row["shown"] == "headline"]
-    return [cells for _, cells in sorted(ranked)]
+    return _ranked(found, lambda record, row: row["shown"] == "headline")
 
 
 def section(found: Mapping[str, Mapping[str, Any]], title: str) -> list[list[str]]:
     """Rows of the table of a section: of claims, or of the part of a record's table that is shown there."""
-    claims = [
-        _cells(name, row) for name, row in _rows(found) if row["shown"] == "section" and found[name]["section"] == title
-    ]
+    out = _ranked(found, lambda record, row: row["shown"] == "section" and record["section"] == title)
     for record in found.values():
         if record.get("shown_in") == title:
             columns = [record["columns"].index(column) for column in record["shown_columns"]]
-            shown = [row for row in record["table"] if row[0] in record["shown_rows"]]
-            claims += [[row[k] for k in columns] for row in shown]
-    return claims
+            out += [[row[k] for k in columns] for row in record["table"] if row[0] in record["shown_rows"]]
+    return out
+
+
+def _ranked(found: Mapping[str, Mapping[str, Any]], shown: Callable[..., bool]) -> list[list[str]]:
+    rows = [(row.get("rank", 0), _cells(name, row)) for name, row in _rows(found) if shown(found[name], row)]
+    return [cells for _, cells in sorted(rows)]
 
 
 def _rows(found: Mapping[str, Mapping[str, Any]]) -> Iterable[tuple[str, Mapping[str, Any]]]:
