@@ -15,7 +15,7 @@ from bayessim_mjx.inference.pareto import effective
 DRAWS = 4096  # at most, that are fitted to
 FLAT = 1.5  # sd, in the width of the cube: over it the density falls by 5 %, which is as good as flat
 # standard errors, beyond which draws are not uniform by chance: .98 of uniform directions pass, and what is not uniform
-# and passes loses less than its moments' chance would (benchmarks/results.md, refined posteriors)
+# and passes loses less than its moments' chance would (benchmarks/records/flat_directions.json)
 SURE = 3.0
 # draws in each direction, behind every Gaussian: fewer than one span a plane and have no Gaussian; where that does not
 # happen 0 to 6 make no difference (benchmarks/inference/few_draws.py)

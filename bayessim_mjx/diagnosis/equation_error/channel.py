@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Limits:
-    """When a drive does what it is told. Error rates: benchmarks/results.md (diagnosis: before any simulation)."""
+    """When a drive does what it is told. Error rates: benchmarks/records/first_look.json."""
 
     scale: float = 0.03
     left: float = 0.02  # of the effort, root mean square

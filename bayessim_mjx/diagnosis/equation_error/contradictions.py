@@ -15,7 +15,7 @@ from bayessim_mjx.quantities import percent
 
 @dataclass(frozen=True)
 class Limits:
-    """When something is contradicted. Error rates: benchmarks/results.md (diagnosis: before any simulation)."""
+    """When something is contradicted. Error rates: benchmarks/records/first_look.json."""
 
     nats: float = 20.0  # of held-out density that one value everywhere loses against values at some places
     apart: float = 0.05  # by which two drives' scales differ

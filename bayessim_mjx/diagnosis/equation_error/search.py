@@ -19,8 +19,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Criteria:
-    """When an effect is proposed. The error rates are those of benchmarks/results.md (diagnosis: before any
-    simulation).
+    """When an effect is proposed. Error rates: benchmarks/records/first_look.json.
 
     Attributes:
         nats: held-out log density that an effect has to bring, beside the logarithm of the number of effects tried.

@@ -21,7 +21,7 @@ from bayessim_mjx.diagnosis.selection.accuracy import Posterior, posterior
 
 Array = NDArray[np.float64]
 # of an effect's range: decades that are as likely (`_sized`). Of 120 logs of noise one useless number gains two nats in
-# one, four numbers in none; no alarm in 12 cases with nothing hidden (benchmarks/results.md)
+# one, four numbers in none; no alarm in 12 cases with nothing hidden (23a3163)
 SIZES = (1.0, 0.1, 0.01)
 FAR = 30.0  # from where on two terms of an asymptotic series hold a second moment to 1e-4 (`_depth`)
 

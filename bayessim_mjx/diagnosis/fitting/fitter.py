@@ -24,7 +24,7 @@ __all__ = ["Fit", "Fitter", "weights"]
 Array = NDArray[np.float64]
 START_STEP = 0.2  # of the spread of the start states, for their finite differences
 # Of the largest curvature by ranges, by which each number is damped. Of 0, .003, .01, .03, .1, .3 and 1, from four far
-# starts of a payload and a bias, 2, 2, 4, 2, 3, 4 and 3 arrive; 1 finds no limit beside play (benchmarks/results.md)
+# starts of a payload and a bias, 2, 2, 4, 2, 3, 4 and 3 arrive; 1 finds no limit beside play (3240de4)
 DAMPED = 0.01
 NUMBERS = 2  # independent ones that one channel of one window holds: a missing force shows as a smooth curve
 
