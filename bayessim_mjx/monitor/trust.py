@@ -48,8 +48,8 @@ def _coverage(axes: Any, report: Any) -> None:
     axes.set_title("coverage: below the band the posterior is too narrow, above too wide", fontsize=9, loc="left")
     axes.legend(loc="upper left", frameon=False, fontsize=8)
     rows = [f"{percent(a)}:  {percent_estimate(c, e, 1)}" for a, (c, e) in report.coverage.items()]
-    told = "\n".join(["observed coverage", *rows])
-    axes.text(0.97, 0.03, told, ha="right", va="bottom", fontsize=8, linespacing=1.4, transform=axes.transAxes)
+    text = "\n".join(["observed coverage", *rows])
+    axes.text(0.97, 0.03, text, ha="right", va="bottom", fontsize=8, linespacing=1.4, transform=axes.transAxes)
 
 
 def _sets(axes: Any, sets: Any) -> None:
