@@ -18,19 +18,17 @@ from bayessim_mjx.diagnosis.fitting import (
     candidates,
     command_shift,
     discretisation,
-    lean,
+    integrator_choice,
     observation,
+    pruned_model,
     scales,
-    sensors,
-    stepping,
     windows,
 )
-from bayessim_mjx.diagnosis.fitting.centred_commands import physics_of
 from bayessim_mjx.diagnosis.fitting.cutting import CUTTING, finest, most_windows, seconds_of, windows_of
 from bayessim_mjx.diagnosis.fitting.fitter import Fitter
 from bayessim_mjx.diagnosis.fitting.robot import Robot
-from bayessim_mjx.diagnosis.fitting.simulator import Simulator
-from bayessim_mjx.diagnosis.fitting.substeps import Errors
+from bayessim_mjx.diagnosis.fitting.simulator import Simulator, physics_of
+from bayessim_mjx.diagnosis.fitting.substep_errors import Errors
 from bayessim_mjx.diagnosis.logcheck import gate, noise
 from bayessim_mjx.diagnosis.selection.budget import Budget
 from bayessim_mjx.diagnosis.selection.tried import Settings
@@ -111,15 +109,15 @@ def prepare(
     seen, before = leads.checked(logs, robot, dt, told, seen_first)
     beginnings, shorter = observation.shortened(seen.demand(), seconds_of(robot.mj_model.nv, quick))
     seen = seen.of_logs(observation.completed(beginnings, robot.mj_model))
-    usable, robot = seen.usable, lean.lean(robot, seen.usable, dt)
+    usable, robot = seen.usable, pruned_model.pruned(robot, seen.usable, dt)
     told += [*seen.warnings, *shorter, *(f"{text} (found, not assumed)" for text in seen.findings)]
     told += [] if noise.repeats(usable) else [noise.ONCE]
     size = scales.measure(robot.mj_model, [resample(log, dt) for log in usable], robot.rating)
     stack, left_out = candidates.stack(candidates.kinds_of(effects), size)
-    limit = tolerance.judge(robot.mj_model, 2 * size.travel, sensors.noise_of_positions(usable), asked).limit
+    limit = tolerance.judge(robot.mj_model, 2 * size.travel, noise.noise_of_positions(usable), asked).limit
     delivered = float(robot.mj_model.opt.timestep)
     look_at = functools.partial(_measured, usable=usable, group=group, use_qvel=seen.use_qvel, limit=limit)
-    steps = stepping.stepping(robot, dt, usable, look_at, functools.partial(_affordable, budget))
+    steps = integrator_choice.choose(robot, dt, usable, look_at, functools.partial(_affordable, budget))
     cuts, step = steps.cuts, steps.worth
     shift = _shift(cuts, step, size)
     seen = seen.shifted(lead) if (lead := 0.0 if shift is None else shift.lead) else seen
@@ -135,7 +133,7 @@ def prepare(
     late = [] if shift is None else shift.told(float(np.median([log.period for log in logs])))
     said = [*steps.said(), *_faster(seen.usable, delivered, dt), *late]
     told += [*said, *steps.warnings(), *(f"not tried: {text}" for text in left_out)]
-    told += [*_few_conditions(cut), *sensors.not_compared(usable), *allowed.warnings(), *led.sentences()]
+    told += [*_few_conditions(cut), *noise.not_compared(usable), *allowed.warnings(), *led.sentences()]
     fixed = (robot, physics, seen, fitter, led.candidates, size, settings, seed, allowed)
     return Setup(*fixed, tuple(told), tuple(said), step, before)
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.fitting.candidates import SPAN
 from bayessim_mjx.diagnosis.fitting.quadratic import Quadratic, eliminate
-from bayessim_mjx.diagnosis.fitting.substeps import Case, Errors
+from bayessim_mjx.diagnosis.fitting.substep_errors import Case, Errors
 from bayessim_mjx.diagnosis.fitting.windows import Windows
 
 Array = NDArray[np.float64]

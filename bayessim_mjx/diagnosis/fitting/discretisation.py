@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.fitting.robot import Robot
-from bayessim_mjx.diagnosis.fitting.substeps import Errors, held
+from bayessim_mjx.diagnosis.fitting.substep_errors import Errors, held
 from bayessim_mjx.diagnosis.fitting.windows import Windows
 from bayessim_mjx.diagnosis.logcheck.noise import noise_free
 from bayessim_mjx.logs.log import Channels, Log
@@ -203,8 +203,8 @@ def measure(
     start = cuts(first)
     touching = contacts(physics)
     sigma = np.concatenate([start.sigma_q, start.sigma_v])
-    like = cheaper is not None and cheaper.cut.alike(start)
-    errors = Errors(physics, start, 4 * first, cheaper if like else None)
+    parts = [(own.log.tolist(), own.start.tolist(), own.steps) for own in (start, cheaper.cut if cheaper else start)]
+    errors = Errors(physics, start, 4 * first, cheaper if parts[0] == parts[1] else None)
     errors.start(sigma)
     coarse, mid, fine = (errors.run(cuts(first * f), first * f) for f in (1, 2, 4))
     plain = errors.run(held(start), first, corrected=False)
