@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from bayessim_mjx.diagnosis.equation_error import rigid
 from bayessim_mjx.diagnosis.equation_error.fit import Fit, Term, used
 from bayessim_mjx.diagnosis.equation_error.sums import Sums
+from bayessim_mjx.diagnosis.logcheck import rigid_body
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Told:
 
 def told_by(model: mujoco.MjModel, sums: Sums, known: Sequence[Term], found: Fit) -> Told:
     """From the products of the columns, and from the fit's covariance."""
-    count = rigid.INERTIAL * sums.layout.bodies
+    count = rigid_body.INERTIAL * sums.layout.bodies
     weight = np.where(used(sums), 1.0 / found.variance, 0.0)
     S = np.einsum("v,vpq->pq", weight, sums.whole[:, :count, :count])
     size = np.sqrt(np.diag(S))

@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 
 from bayessim_mjx import effects as library
 from bayessim_mjx.diagnosis.data_sheet import ACCURACY
-from bayessim_mjx.diagnosis.equation_error import rigid
-from bayessim_mjx.diagnosis.equation_error.columns import Layout
 from bayessim_mjx.diagnosis.equation_error.fit import Term
-from bayessim_mjx.diagnosis.logcheck import loads
+from bayessim_mjx.diagnosis.equation_error.sums import Layout
+from bayessim_mjx.diagnosis.logcheck import loads, rigid_body
 from bayessim_mjx.diagnosis.logcheck.drives import dof_of
 from bayessim_mjx.effects.support.site import element_names
 
@@ -50,9 +49,9 @@ def known(
             data sheet's.
         period: s between the logs' rows.
     """
-    nominal = rigid.nominal(model)
+    nominal = rigid_body.nominal(model)
     out = []
-    for i, body in enumerate(rigid.moving_bodies(model)):
+    for i, body in enumerate(rigid_body.moving_bodies(model)):
         column = np.zeros(layout.size)
         column[layout.body(i)] = nominal[i]
         if nominal[i, 0] > 0:
@@ -163,9 +162,9 @@ def links(model: mujoco.MjModel, layout: Layout) -> list[Term]:
             continue
         shape, own = np.zeros((layout.nv, layout.size, 4)), layout.body(base)
         for k, axis in enumerate(turn.T):
-            ends = [rigid.inertial(mass, centre + sign * axis, none) for sign in (1, -1)]
+            ends = [rigid_body.inertial(mass, centre + sign * axis, none) for sign in (1, -1)]
             shape[:, own, k] = (ends[0] - ends[1]) / 2  # exact: it is quadratic
-        shape[:, own, 3] = rigid.inertial(0.0, centre, axes @ np.diag(model.body_inertia[body]) @ axes.T)
+        shape[:, own, 3] = rigid_body.inertial(0.0, centre, axes @ np.diag(model.body_inertia[body]) @ axes.T)
         sd = np.array([*(q.deviation * loads.size(model, body) for q in places), inertia.deviation])
         name = element_names(model, "body")[body]
         out.append(_wide("inertial_parameters", name, shape, -np.inf, np.inf, _link, sd=sd))
@@ -177,7 +176,7 @@ def _placed(model: mujoco.MjModel) -> Iterator[tuple[int, int, Array, Array, Arr
 
     Its centre of mass `[3]` and both axes `[3, 3]` are in the axes of that moving body, from its origin.
     """
-    bodies, data = rigid.moving_bodies(model), mujoco.MjData(model)
+    bodies, data = rigid_body.moving_bodies(model), mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     mujoco.mj_comPos(model, data)
     for body in range(1, model.nbody):
@@ -200,7 +199,7 @@ def _load(layout: Layout, body: int, centre: Array, turn: Array) -> Callable[[Ar
     steps = np.eye(3)
 
     def point(place: Array) -> Array:
-        return rigid.inertial(1.0, centre + turn @ place, np.zeros((3, 3)))
+        return rigid_body.inertial(1.0, centre + turn @ place, np.zeros((3, 3)))
 
     def shape(last: Array) -> Array:
         place = _place(last)

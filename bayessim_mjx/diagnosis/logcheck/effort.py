@@ -1,19 +1,21 @@
-"""Is a log's effort related to its motion? The best bounded linear model of the inverse dynamics has to explain it."""
+"""Is a log's effort related to its motion? The best bounded linear model of the inverse dynamics has to explain it.
+
+Bounds keep friction from standing in for a robot that is not there.
+"""
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
+from scipy.optimize import lsq_linear
 
-from bayessim_mjx.diagnosis.logcheck.drives import dof_of, is_effort
-from bayessim_mjx.diagnosis.logcheck.filtered_motion import Mask, bandwidth, filtered, motion
-from bayessim_mjx.diagnosis.logcheck.inverse_dynamics import Columns, Dynamics
+from bayessim_mjx.diagnosis.logcheck import loads
+from bayessim_mjx.diagnosis.logcheck.drives import Effort, efforts
+from bayessim_mjx.diagnosis.logcheck.regressor import Mask, Regressor, bandwidth, filtered, motion
+from bayessim_mjx.diagnosis.logcheck.rigid_body import inertial, moving_bodies, nominal
 from bayessim_mjx.logs.log import Array, Log
-from bayessim_mjx.physics import controllers
 from bayessim_mjx.quantities import percent
 
 
@@ -33,17 +35,8 @@ class Limits:
 
 
 LIMITS = Limits()
-
-
-@dataclass(frozen=True, eq=False)
-class Effort:
-    """What drove one joint: signal [T of the log], in the model's unit (N m, N) where `scaled`."""
-
-    joint: str
-    dof: int
-    source: str  # ctrl or effort
-    signal: Array
-    scaled: bool
+FACTOR = 2.0  # a body's inertia and the actuator's gain may be wrong by this factor either way; a rule of thumb
+TILT = 0.3  # rad, by which gravity may be tilted: `equation_error.terms.RANGES`
 
 
 @dataclass(frozen=True)
@@ -75,59 +68,23 @@ class Relation:
         return e is not None and (e < LIMITS.refused or (e < LIMITS.doubtful and vain))
 
 
-def efforts(log: Log, mj_model: mujoco.MjModel) -> Iterator[Effort]:
-    """The efforts of every joint whose drives are all known: from the `effort:` streams, and from ctrl."""
-    dofs = [dof_of(mj_model, i) for i in range(mj_model.nu)]
-    gear = mj_model.actuator_gear[:, 0]
-    for dof in sorted({d for d in dofs if d is not None}):
-        own = [i for i, d in enumerate(dofs) if d == dof]
-        joint = log.joints[int(mj_model.dof_jntid[dof])]
-        streams = [log.streams.get(f"effort:{log.actuators[i]}") for i in own]
-        if all(s is not None and np.isfinite(s).all() for s in streams):
-            yield Effort(joint, dof, "effort", sum(g * s for g, s in zip(gear[own], streams, strict=True)), False)
-        if all(is_effort(mj_model, i) for i in own) and not closed(log):
-            yield Effort(joint, dof, "ctrl", sum(gear[i] * _force(mj_model, i, log.ctrl[:, i]) for i in own), True)
-
-
-def closed(log: Log) -> bool:
-    """Whether a position or velocity loop stands between the logged command and the actuator."""
-    given = log.metadata.get("controller")
-    blocks = [given, *given.values()] if isinstance(given, dict) else []
-    named = [str(b.get("law", "direct")).lower() for b in blocks if isinstance(b, dict)]
-    return any(controllers.ALIASES.get(n, "direct") != "direct" for n in named)
-
-
-def _force(mj_model: mujoco.MjModel, i: int, ctrl: Array) -> Array:
-    if mj_model.actuator_ctrllimited[i]:
-        ctrl = np.clip(ctrl, *mj_model.actuator_ctrlrange[i])
-    force = mj_model.actuator_gainprm[i, 0] * ctrl
-    return np.clip(force, *mj_model.actuator_forcerange[i]) if mj_model.actuator_forcelimited[i] else force
-
-
 def relations(log: Log, mj_model: mujoco.MjModel) -> list[Relation]:
     """One relation per joint and source of effort."""
     found = list(efforts(log, mj_model))
     if not found:
         return []
     top = bandwidth(log)
-    pictures = []
-    for cutoff in sorted({max(3.0, top / 2), top}):  # the slower one is the quieter one
-        moved = motion(log, mj_model, cutoff)
-        pictures.append(Dynamics.of(mj_model, moved))
-    laden = functools.cache(lambda: [p.loaded(mj_model) for p in pictures])
-    return [_relation(log, mj_model, effort, pictures, laden) for effort in found]
+    cutoffs = sorted({max(3.0, top / 2), top})  # the slower one is the quieter one
+    pictures = [_Picture.of(log, mj_model, cutoff) for cutoff in cutoffs]
+    return [_relation(log, mj_model, effort, pictures) for effort in found]
 
 
 def _relation(
-    log: Log,
-    mj_model: mujoco.MjModel,
-    effort: Effort,
-    pictures: list[Dynamics],
-    laden: Callable[[], list[Dynamics]] | None = None,
+    log: Log, mj_model: mujoco.MjModel, effort: Effort, pictures: list[_Picture], laden: bool = False
 ) -> Relation:
-    """laden: the pictures with an unknown load, which is no fault of a log."""
+    """laden: with an unknown load, which is no fault of a log."""
     own = Relation(effort.joint, effort.source, None)
-    tests = [t for t in (_Test.of(log, effort, d) for d in pictures) if t.rows.sum() * t.step * t.cutoff >= 4.0]
+    tests = [t for t in (_Test.of(log, effort, p, laden) for p in pictures) if t.rows.sum() * t.step * t.cutoff >= 4.0]
     if not tests:
         return replace(own, text="too little motion, free of contacts and limits, to compare the effort with")
     if any(t.small for t in tests):
@@ -152,8 +109,8 @@ def _relation(
     share, mend, certain = (
         (best, "", False) if explained >= LIMITS.doubtful else _mend(log, mj_model, relation, curve, test)
     )
-    if laden is not None:
-        other = _relation(log, mj_model, effort, laden())
+    if not laden:
+        other = _relation(log, mj_model, effort, pictures, laden=True)
         told = other.explained or 0.0
         if told >= LIMITS.doubtful and not other.refused and 1.0 - told < LIMITS.loaded * (1.0 - share):
             return other
@@ -176,54 +133,132 @@ def _nearest(lags: Array, curve: Array) -> float:
 
 
 @dataclass(frozen=True, eq=False)
+class _Picture:
+    """The regressor of a log's motion at one cutoff: a column for each body at nominal inertia, and for loads.
+
+    Loads are 1 kg at and around the last links' centres of mass, of which there may be `most` kg `[P]`.
+    """
+
+    own: Regressor
+    bodies: int
+    most: Array
+
+    @classmethod
+    def of(cls, log: Log, model: mujoco.MjModel, cutoff: float) -> _Picture:
+        inertia, moving = nominal(model), moving_bodies(model)
+        sets, most = list(np.eye(len(moving))[:, :, None] * inertia), []
+        for body, place, heaviest in loads.at_the_ends(model):
+            sets.append(np.zeros_like(inertia))
+            sets[-1][moving.index(body)] = inertial(1.0, place, np.zeros((3, 3)))
+            most.append(heaviest)
+        return cls(Regressor.of(model, motion(log, model, cutoff), sets=np.array(sets)), len(moving), np.array(most))
+
+    def bounded(self, dof: int, laden: bool) -> _Bounded:
+        """The linear model of the effort at one degree of freedom.
+
+        Inertias within FACTOR, springs and friction only with the sign of springs and friction, gravity tilted by up to
+        TILT, any offset, and with `laden` loads.
+        """
+        own, shown = self.own, lambda x: np.abs(x).max(axis=0) > 1e-9
+        loose = np.stack([own.own[n][:, dof] for n in ("one", "speed", "dry", "drag", "acceleration")], 1)
+        travel = own.own["position"][:, dof]
+        parts = np.column_stack([own.columns[:, dof, : self.bodies], own.spring[:, dof]])
+        load, tilt = own.columns[:, dof, self.bodies :], own.tilt[:, dof]
+        felt = shown(load) & laden
+        parts, tilt = parts[:, shown(parts)], tilt[:, shown(tilt)]
+        x = np.column_stack([loose, travel - travel.mean(), parts, tilt, load[:, felt]])
+        rigid, turned = np.ones(parts.shape[1]), np.full(tilt.shape[1], TILT)
+        low = np.concatenate([[-np.inf], np.zeros(5), rigid / FACTOR, -turned, np.zeros(felt.sum())])
+        high = np.concatenate([np.full(6, np.inf), rigid * FACTOR, turned, self.most[felt]])
+        return _Bounded(x, low, high, slice(6, 6 + len(rigid)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Bounded:
+    """Linear model of one joint's effort, x [T, K] c with low <= c <= high."""
+
+    x: Array
+    low: Array
+    high: Array
+    rigid: slice  # the model's own bodies and springs, which have a scale
+
+    def friction(self) -> _Bounded:
+        """Offset and friction alone, as if the joint carried nothing."""
+        return _Bounded(self.x[:, :4], self.low[:4], self.high[:4], slice(0, 0))
+
+    def explained(self, efforts: Array, rows: Mask, scaled: bool = True) -> Array:
+        """[L] share of the variance of efforts [L, T] over the rows [T] that the bounded model explains, or below zero.
+
+        scaled: the effort's unit is the model's; otherwise every scale of the effort is tried.
+        """
+        y, x = efforts[:, rows], self.x[rows]
+        size = np.linalg.norm(x, axis=0) + 1e-12
+        # a bounded fit of R c = Q'y is that of X c = y
+        q, r = np.linalg.qr(x / size)
+        bounds = (self.low * size, self.high * size)
+        body = float(np.linalg.norm(x[:, self.rigid].sum(1)))
+
+        def one(signal: Array) -> float:
+            target = q.T @ signal
+            norm = max(float(np.linalg.norm(signal)), 1e-300)
+            tried = np.ones(1) if scaled or body == 0 else body / norm * np.geomspace(0.1, 10.0, 9)
+            fits = [2.0 * lsq_linear(r, s * target, bounds=bounds, method="bvls").cost / s**2 for s in tried]
+            left = norm**2 - float(target @ target) + float(min(fits))
+            return 1.0 - left / max(float(np.sum((signal - signal.mean()) ** 2)), 1e-300)
+
+        return np.array([one(signal) for signal in y])
+
+
+@dataclass(frozen=True, eq=False)
 class _Test:
     """One effort against one picture of the motion."""
 
     log: Log
     effort: Effort
-    picture: Dynamics
-    columns: Columns
+    picture: _Picture
+    model: _Bounded
     rows: Mask
 
     @classmethod
-    def of(cls, log: Log, effort: Effort, picture: Dynamics) -> _Test:
-        return cls(log, effort, picture, picture.columns(effort.dof), picture.moved.moving(effort.dof))
+    def of(cls, log: Log, effort: Effort, picture: _Picture, laden: bool = False) -> _Test:
+        return cls(log, effort, picture, picture.bounded(effort.dof, laden), picture.own.moved.moving(effort.dof))
 
     @property
     def signal(self) -> Array:
-        return filtered(self.effort.signal, self.log, self.picture.moved)
+        return filtered(self.effort.signal, self.log, self.picture.own.moved)
 
     @property
     def step(self) -> float:
-        return self.picture.moved.step
+        return self.picture.own.moved.step
 
     @property
     def cutoff(self) -> float:
-        return self.picture.moved.cutoff
+        return self.picture.own.moved.cutoff
 
     @property
     def small(self) -> bool:
-        y = self.signal[self.rows]
-        force = (self.picture.bodies.sum(0) - self.picture.weight)[self.rows, self.effort.dof]
+        """Whether the effort hardly changes against the forces of inertia."""
+        y, own = self.signal[self.rows], self.picture.own
+        force = (own.columns[..., : self.picture.bodies].sum(-1) - own.weight)[self.rows, self.effort.dof]
         idle = float(y.std()) <= 1e-6 * float(np.abs(y).max()) + 1e-12
         return idle or (self.effort.scaled and float(y.std()) < 0.1 * float(np.sqrt(np.mean(force**2))))
 
     def over(self, lags: Array) -> Array:
         """[L] share explained where the effort is delayed by each lag."""
-        signals = filtered(self.effort.signal, self.log, self.picture.moved, lags)
-        return self.columns.explained(signals, self.rows, self.effort.scaled)
+        signals = filtered(self.effort.signal, self.log, self.picture.own.moved, lags)
+        return self.model.explained(signals, self.rows, self.effort.scaled)
 
     def friction(self) -> float:
-        return float(self.columns.friction().explained(self.signal[None], self.rows)[0])
+        return float(self.model.friction().explained(self.signal[None], self.rows)[0])
 
     def share(self, rows: Mask | None = None, sign: float = 1.0, scaled: bool | None = None) -> float:
         """Explained without a lag, over other rows, with the other sign or at any scale."""
         scaled = self.effort.scaled if scaled is None else scaled
-        return float(self.columns.explained(sign * self.signal[None], self.rows if rows is None else rows, scaled)[0])
+        return float(self.model.explained(sign * self.signal[None], self.rows if rows is None else rows, scaled)[0])
 
     def pieces(self) -> list[tuple[float, float]]:
         """Spans [s since the start] that the model does explain, from windows of a tenth of the log, at least 2 s."""
-        moved = self.picture.moved
+        moved = self.picture.own.moved
         edges = np.arange(moved.time[0], moved.time[-1] + 1e-9, max(2.0, 0.1 * self.log.duration))
         spans: list[tuple[float, float]] = []
         for a, b in zip(edges[:-1], edges[1:], strict=True):
@@ -260,5 +295,4 @@ def _in_radians(log: Log, mj_model: mujoco.MjModel, test: _Test) -> float:
     if np.abs(log.qpos).max() < 6.0:
         return 0.0
     radians = replace(log, qpos=np.radians(log.qpos), qvel=np.radians(log.qvel))
-    picture = Dynamics.of(mj_model, motion(radians, mj_model, test.cutoff))
-    return _Test.of(radians, test.effort, picture).share()
+    return _Test.of(radians, test.effort, _Picture.of(radians, mj_model, test.cutoff)).share()

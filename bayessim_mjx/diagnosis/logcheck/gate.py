@@ -9,9 +9,9 @@ import mujoco
 import numpy as np
 
 from bayessim_mjx.diagnosis.logcheck import single_log
-from bayessim_mjx.diagnosis.logcheck.drives import dof_of, is_effort
+from bayessim_mjx.diagnosis.logcheck.drives import dof_of, is_effort, looped
 from bayessim_mjx.diagnosis.logcheck.effort import LIMITS as OF_EFFORT
-from bayessim_mjx.diagnosis.logcheck.effort import Relation, closed, relations
+from bayessim_mjx.diagnosis.logcheck.effort import Relation, relations
 from bayessim_mjx.diagnosis.logcheck.single_log import Finding, refuse, warn
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Array, Log
@@ -174,7 +174,7 @@ def _targets(log: Log, mj_model: mujoco.MjModel) -> dict[str, Array]:
     out: dict[str, Array] = {}
     dofs = [dof_of(mj_model, i) for i in range(mj_model.nu)]
     for i, dof in enumerate(dofs):
-        if dof is not None and dofs.count(dof) == 1 and (closed(log) or not is_effort(mj_model, i)):
+        if dof is not None and dofs.count(dof) == 1 and (looped(log) or not is_effort(mj_model, i)):
             out[log.joints[int(mj_model.dof_jntid[dof])]] = log.ctrl[:, i]
     return out
 

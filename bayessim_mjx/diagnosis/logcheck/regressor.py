@@ -1,4 +1,8 @@
-"""A log's motion on an even grid, differentiated and filtered without phase: what inverse dynamics needs."""
+"""The regressor of generalised force on a log's motion: rigid bodies, springs, friction, zeros; all filtered alike.
+
+The identification model of Gautier and Khalil (1990, IDIM-LS): positions are differentiated without phase, and effort
+and columns pass the same zero-phase filter, so that a linear relation between them stays what it was.
+"""
 
 from __future__ import annotations
 
@@ -9,10 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 
+from bayessim_mjx.diagnosis.logcheck import rigid_body
 from bayessim_mjx.logs.log import Array, Log
 from bayessim_mjx.logs.velocities import bandwidth, lowpass
 
 Mask = NDArray[np.bool_]
+SLOW = 0.02  # of a joint's top speed, at which dry friction turns over; a rule of thumb, not counted
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +42,10 @@ class Motion:
     @property
     def step(self) -> float:
         return float(self.time[1] - self.time[0])
+
+    def smooth(self, x: Array) -> Array:
+        """x `[T, ...]` on this grid, filtered as efforts are."""
+        return lowpass(x, self.step, self.cutoff)
 
     def moving(self, dof: int) -> Mask:
         """[T]: free, and faster than a twentieth of the top speed of this degree of freedom."""
@@ -88,3 +98,53 @@ def filtered(signal: Array, log: Log, moved: Motion, lags: Array | None = None) 
     smooth = lowpass(even[:, 0], float(grid[1] - grid[0]), moved.cutoff)
     times = moved.time if lags is None else moved.time - lags[:, None]
     return np.interp(times, grid, smooth)
+
+
+@dataclass(frozen=True, eq=False)
+class Regressor:
+    """Generalised forces that a motion needs, by cause, `[T, nv]` or `[T, nv, K]`, filtered as efforts are.
+
+    Attributes:
+        moved: the motion.
+        columns: `[T, nv, K]`, per unit of inertial parameters or sets of them (`rigid_body.rigid`).
+        known: all that the nominal model says, friction included; weight: gravity's part of it; spring: its springs'.
+        tilt: `[T, nv, 2]`, per rad by which the world is turned about its x and y axis.
+        own: {name: `[T, nv]`}, of each joint's own motion: acceleration, speed, dry (direction), drag (speed squared),
+            position (of hinges and slides; of others the integral of speed), one, load (what the joint bears, with the
+            direction).
+        dry: `[T, nv]`, direction of motion, not filtered.
+    """
+
+    moved: Motion
+    columns: Array
+    known: Array
+    weight: Array
+    spring: Array
+    tilt: Array
+    own: dict[str, Array]
+    dry: Array
+
+    @classmethod
+    def of(
+        cls, model: mujoco.MjModel, moved: Motion, slow: Array | None = None, sets: Array | None = None
+    ) -> Regressor:
+        """Args: slow: `[nv]`, speeds at which dry friction turns over; None: by this motion's top speeds.
+
+        sets: see `rigid_body.rigid`.
+        """
+        v = moved.qvel
+        slow = SLOW * np.percentile(np.abs(v), 95, axis=0) + 1e-12 if slow is None else slow
+        dry = np.tanh(v / slow)
+        rigid = rigid_body.rigid(model, moved.qpos, v, moved.qacc, sets)
+        spring = rigid_body.springs(model, moved.qpos)
+        known = rigid.nominal + spring + model.dof_damping * v + model.dof_armature * moved.qacc
+        known += model.dof_frictionloss * dry
+        position = np.zeros_like(v) + np.cumsum(v, 0) * moved.step
+        for joint in np.flatnonzero(model.jnt_type >= int(mujoco.mjtJoint.mjJNT_SLIDE)):
+            position[:, int(model.jnt_dofadr[joint])] = moved.qpos[:, int(model.jnt_qposadr[joint])]
+        own = {
+            "acceleration": moved.qacc, "speed": v, "dry": dry, "drag": v * np.abs(v), "position": position,
+            "one": np.ones_like(v), "load": np.abs(rigid.bias + spring) * dry,
+        }  # fmt: skip
+        parts = (rigid.columns, known, rigid.weight, spring, rigid.tilt)
+        return cls(moved, *map(moved.smooth, parts), {name: moved.smooth(x) for name, x in own.items()}, dry)

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from bayessim_mjx.diagnosis.logcheck.channels import Link, compare, links
+from bayessim_mjx.diagnosis.logcheck.links import Link, compare, links
 from bayessim_mjx.logs import Log, read_logs
 from tests.diagnosis.recordings import ARM, PENDULUM, record, sines
 

@@ -8,10 +8,9 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from bayessim_mjx.diagnosis.logcheck.drives import dof_of
-from bayessim_mjx.diagnosis.logcheck.effort import efforts
-from bayessim_mjx.diagnosis.logcheck.filtered_motion import Mask, filtered, motion
-from bayessim_mjx.diagnosis.logcheck.inverse_dynamics import Dynamics
+from bayessim_mjx.diagnosis.logcheck.drives import commanded, controlled, efforts, measured
+from bayessim_mjx.diagnosis.logcheck.regressor import Mask, Regressor, filtered, motion
+from bayessim_mjx.diagnosis.logcheck.rigid_body import nominal
 from bayessim_mjx.logs.log import Array, Log
 from bayessim_mjx.logs.velocities import velocities
 from bayessim_mjx.physics import controllers
@@ -96,10 +95,11 @@ def compare(predicted: Array, measured: Array, step: float, rows: Mask) -> tuple
 
 def _controllers(log: Log, mj_model: mujoco.MjModel) -> Iterator[Link]:
     name, grid = "command -> effort", np.linspace(log.time[0], log.time[-1], len(log))
-    target = expected(log, mj_model)
+    declared = controllers.declared(log.metadata)  # then the unit of the effort is known
+    target = controlled(log, mj_model) if declared else commanded(log, mj_model)
     for i, actuator in enumerate(log.actuators):
-        stream = log.streams.get(f"effort:{actuator}")
-        if stream is None or not np.isfinite(stream).all():
+        stream = measured(log, i)
+        if stream is None:
             yield _untested(name, actuator, "no complete effort stream was logged")
             continue
         pair = [np.interp(grid, log.time, x) for x in (target[:, i], stream)]
@@ -108,46 +108,7 @@ def _controllers(log: Log, mj_model: mujoco.MjModel) -> Iterator[Link]:
             yield _untested(name, actuator, "command or effort never changes while the drive is on")
             continue
         slope, correlation, lag = compare(pair[0], pair[1], log.period, rows)
-        yield _link(name, actuator, slope, correlation, lag, log.period, declared(log))
-
-
-def declared(log: Log) -> bool:
-    """Whether the unit of the effort is known: a law says what it is."""
-    return controllers.declared(log.metadata)
-
-
-def expected(log: Log, mj_model: mujoco.MjModel) -> Array:
-    """[T, nu] what each drive should have done: the declared law, else the model's own actuator with its servo."""
-    return through_law(log, mj_model) if declared(log) else forces(log, mj_model)
-
-
-def through_law(log: Log, mj_model: mujoco.MjModel) -> Array:
-    """[T, nu] ctrl that the declared law makes of the commands."""
-    law = controllers.read(log.metadata, mj_model, log.actuators, log.name)
-    q, w = log.qpos[:, list(law.qadr)], log.qvel[:, list(law.dadr)]
-    kp, kd, limit, scale = (np.asarray(x, float) for x in (law.kp, law.kd, law.limit, law.scale))
-    closed = np.where(np.asarray(law.on_position) > 0, kp * (log.ctrl - q) - kd * w, kp * (log.ctrl - w))
-    loop = np.asarray(law.on_position) + np.asarray(law.on_velocity) > 0
-    return np.where(loop, np.clip(scale * closed, -limit, limit), scale * log.ctrl)
-
-
-def forces(log: Log, mj_model: mujoco.MjModel) -> Array:
-    """[T, nu] forces of the model's own actuators for the log's ctrl and motion, before the gear."""
-    out = np.zeros_like(log.ctrl)
-    for i in range(mj_model.nu):
-        dof = dof_of(mj_model, i)
-        gear, gain, bias = mj_model.actuator_gear[i, 0], mj_model.actuator_gainprm[i, 0], mj_model.actuator_biasprm[i]
-        limited = mj_model.actuator_ctrllimited[i]
-        ctrl = np.clip(log.ctrl[:, i], *mj_model.actuator_ctrlrange[i]) if limited else log.ctrl[:, i]
-        out[:, i] = gain * ctrl
-        if dof is not None and mj_model.actuator_biastype[i] == int(mujoco.mjtBias.mjBIAS_AFFINE):
-            joint = int(mj_model.dof_jntid[dof])
-            length = gear * log.qpos[:, int(mj_model.jnt_qposadr[joint])]
-            # f = gain u + b0 + b1 l + b2 dl/dt
-            out[:, i] += bias[0] + bias[1] * length + bias[2] * gear * log.qvel[:, dof]
-        if mj_model.actuator_forcelimited[i]:
-            out[:, i] = np.clip(out[:, i], *mj_model.actuator_forcerange[i])
-    return out
+        yield _link(name, actuator, slope, correlation, lag, log.period, declared)
 
 
 # Effort -> motion
@@ -160,7 +121,7 @@ def _drives(log: Log, mj_model: mujoco.MjModel) -> Iterator[Link]:
         yield _untested("effort -> motion", "all joints", "no effort was logged, and the commands are targets")
         return
     moved = motion(log, mj_model)
-    needed = Dynamics.of(mj_model, moved).nominal(mj_model)
+    needed = Regressor.of(mj_model, moved, sets=np.zeros((0, *nominal(mj_model).shape))).known
     for effort in found.values():
         name = "command -> motion" if effort.source == "ctrl" else "effort -> motion"
         rows = moved.moving(effort.dof)
