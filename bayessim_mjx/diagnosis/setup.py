@@ -120,11 +120,11 @@ def prepare(
     steps = integrator_choice.choose(robot, dt, usable, look_at, functools.partial(_affordable, budget))
     cuts, step = steps.cuts, steps.worth
     shift = _shift(cuts, step, size)
-    seen = seen.shifted(lead) if (lead := 0.0 if shift is None else shift.lead) else seen
+    seen = seen if shift is None else seen.clocked(shift.behind, shift.lead)
     robot = step.robot(steps.robot)
     physics = physics_of(robot, dt, stack)
     most = most_windows(physics, step.errors.cut.steps if step.errors else cuts(1).steps, quick)
-    cut = step.noisier(cuts(step.factor, limit=most, centred=False, late=lead))
+    cut = step.noisier(cuts(step.factor, limit=most, centred=False, late=seen.timing.moved))
     base = candidates.base_coordinates(robot.space, robot.accuracy, robot.assumed)
     fitter = Fitter(Simulator(physics, cut), base, physics.space.nominal)
     led = leads.lead(candidates.enumerate_candidates(physics), before)

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from bayessim_mjx.diagnosis.equation_error import fit as fitting
-from bayessim_mjx.diagnosis.equation_error.channel import Channel
 from bayessim_mjx.diagnosis.equation_error.fit import Term
 from bayessim_mjx.diagnosis.equation_error.search import Found
 from bayessim_mjx.diagnosis.equation_error.sums import Sums
+from bayessim_mjx.diagnosis.logcheck.drive_channel import Channel
 from bayessim_mjx.quantities import percent
 
 

@@ -15,13 +15,13 @@ from bayessim_mjx.diagnosis import data_sheet
 from bayessim_mjx.diagnosis.equation_error import fit as fitting
 from bayessim_mjx.diagnosis.equation_error import sums as summing
 from bayessim_mjx.diagnosis.equation_error import terms
-from bayessim_mjx.diagnosis.equation_error.channel import Channel, channels_of
 from bayessim_mjx.diagnosis.equation_error.contradictions import contradicted
 from bayessim_mjx.diagnosis.equation_error.fit import Fit, Term
 from bayessim_mjx.diagnosis.equation_error.identifiable import Told, told_by
 from bayessim_mjx.diagnosis.equation_error.search import Found, Proposal, search
 from bayessim_mjx.diagnosis.equation_error.sums import Sums
 from bayessim_mjx.diagnosis.logcheck import loads
+from bayessim_mjx.diagnosis.logcheck.drive_channel import Channel, channels_of
 from bayessim_mjx.logs.log import Log
 
 Array = NDArray[np.float64]

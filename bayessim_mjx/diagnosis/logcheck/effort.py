@@ -9,12 +9,12 @@ from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
-from scipy.optimize import lsq_linear
 
 from bayessim_mjx.diagnosis.logcheck import loads
 from bayessim_mjx.diagnosis.logcheck.drives import Effort, efforts
-from bayessim_mjx.diagnosis.logcheck.regressor import Mask, Regressor, bandwidth, filtered, motion
+from bayessim_mjx.diagnosis.logcheck.regressor import Bounded, Mask, Regressor, bandwidth, filtered, motion
 from bayessim_mjx.diagnosis.logcheck.rigid_body import inertial, moving_bodies, nominal
+from bayessim_mjx.diagnosis.logcheck.timing import Late
 from bayessim_mjx.logs.log import Array, Log
 from bayessim_mjx.quantities import percent
 
@@ -31,6 +31,7 @@ class Limits:
     loaded: float = 0.5  # of what another remedy leaves unexplained, which a load has to undercut
     # of what the lags of a robot leave unexplained, which those of a clock have to undercut
     far_better: float = 1 / 3
+    gain: float = 0.02  # of the variance, which a lag has to explain
     far: float = 0.5  # s, the largest offset between clocks that is looked for
 
 
@@ -46,7 +47,7 @@ class Relation:
     Attributes:
         explained: share of the variance, at the best lag that physics allows; None: not tested, `text` says why.
         friction: the share that friction and offset explain without any body.
-        lag: s by which the motion follows the effort.
+        late: the motion behind the effort; gain: share of the variance that this lag explains more than none.
         mend: what would mend it, or nothing.
         certain: the mend is a sign or a unit, which no robot has wrong.
     """
@@ -55,10 +56,16 @@ class Relation:
     source: str
     explained: float | None
     friction: float = 0.0
-    lag: float = 0.0
+    late: Late = Late(0.0)
+    gain: float = 0.0
     mend: str = ""
     certain: bool = False
     text: str = ""
+
+    @property
+    def lag(self) -> float:
+        """s by which the motion follows the effort, where that is worth a word; else 0."""
+        return self.late.seconds if self.gain >= LIMITS.gain else 0.0
 
     @property
     def refused(self) -> bool:
@@ -84,7 +91,7 @@ def _relation(
 ) -> Relation:
     """laden: with an unknown load, which is no fault of a log."""
     own = Relation(effort.joint, effort.source, None)
-    tests = [t for t in (_Test.of(log, effort, p, laden) for p in pictures) if t.rows.sum() * t.step * t.cutoff >= 4.0]
+    tests = [t for t in (_Test.of(log, effort, p, laden) for p in pictures) if t.independent >= 8.0]
     if not tests:
         return replace(own, text="too little motion, free of contacts and limits, to compare the effort with")
     if any(t.small for t in tests):
@@ -100,10 +107,10 @@ def _relation(
     physical = (lags >= LIMITS.causal[0]) & (lags <= LIMITS.causal[1])
     explained = max(float(c[physical].max()) for c in curves)
     best = float(curve.max())
-    relation = replace(own, explained=explained, friction=test.friction(), lag=_nearest(lags, curve))
-    if explained >= LIMITS.doubtful and 1.0 - best > LIMITS.far_better * (1.0 - explained):
-        # a periodic motion fits one period later too
-        relation = replace(relation, lag=_nearest(lags[physical], curve[physical]))
+    # a periodic motion fits one period later too
+    far = explained < LIMITS.doubtful or 1.0 - best <= LIMITS.far_better * (1.0 - explained)
+    late, gain = _nearest(lags, curve, physical | far, test.independent)
+    relation = replace(own, explained=explained, friction=test.friction(), late=late, gain=gain)
     if explained >= LIMITS.doubtful and not relation.lag:
         return relation
     share, mend, certain = (
@@ -117,19 +124,23 @@ def _relation(
     return replace(relation, mend=mend, certain=certain)
 
 
-def _nearest(lags: Array, curve: Array) -> float:
-    """The smallest lag about as good as the best, between the grid's; 0 where the best is hardly better than none."""
-    best, now = float(curve.max()), float(np.interp(0.0, lags, curve))
-    if best - now < 0.02:
-        return 0.0
-    good = np.flatnonzero(curve >= best - min(0.002, 0.1 * (best - now)))
+def _nearest(lags: Array, curve: Array, allowed: Mask, count: float) -> tuple[Late, float]:
+    """The smallest lag that is about as good as the best of those allowed, and how much more than none it explains.
+
+    count: independent rows n. Of residuals with the variance s(lag) the likelihood is s^(-n/2), whose curvature at the
+    vertex of a parabola s = s0 + c (lag - lag0)^2 gives the error sqrt(s0 / (n c)).
+    """
+    best, now = float(curve[allowed].max()), float(np.interp(0.0, lags, curve))
+    good = np.flatnonzero(allowed & (curve >= best - min(0.002, 0.1 * (best - now))))
     k = int(good[np.argmin(np.abs(lags[good]))])
     while 0 < k < len(lags) - 1 and max(curve[k - 1], curve[k + 1]) > curve[k]:
         k += 1 if curve[k + 1] > curve[k - 1] else -1  # to the top of its hill
     if k in (0, len(lags) - 1):
-        return float(lags[k])
+        return Late(float(lags[k])), best - now
     left, top, right = curve[k - 1 : k + 2]  # the vertex of the parabola through them
-    return float(lags[k] + 0.5 * (lags[1] - lags[0]) * (left - right) / min(left - 2 * top + right, -1e-12))
+    bend, step = max(2 * top - left - right, 1e-12), float(lags[1] - lags[0])
+    error = step * float(np.sqrt(max(1.0 - top, 0.0) / (0.5 * bend * max(count, 1.0))))
+    return Late(float(lags[k] + 0.5 * step * (right - left) / bend), error), best - now
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,7 +164,7 @@ class _Picture:
             most.append(heaviest)
         return cls(Regressor.of(model, motion(log, model, cutoff), sets=np.array(sets)), len(moving), np.array(most))
 
-    def bounded(self, dof: int, laden: bool) -> _Bounded:
+    def bounded(self, dof: int, laden: bool) -> Bounded:
         """The linear model of the effort at one degree of freedom.
 
         Inertias within FACTOR, springs and friction only with the sign of springs and friction, gravity tilted by up to
@@ -170,43 +181,7 @@ class _Picture:
         rigid, turned = np.ones(parts.shape[1]), np.full(tilt.shape[1], TILT)
         low = np.concatenate([[-np.inf], np.zeros(5), rigid / FACTOR, -turned, np.zeros(felt.sum())])
         high = np.concatenate([np.full(6, np.inf), rigid * FACTOR, turned, self.most[felt]])
-        return _Bounded(x, low, high, slice(6, 6 + len(rigid)))
-
-
-@dataclass(frozen=True, eq=False)
-class _Bounded:
-    """Linear model of one joint's effort, x [T, K] c with low <= c <= high."""
-
-    x: Array
-    low: Array
-    high: Array
-    rigid: slice  # the model's own bodies and springs, which have a scale
-
-    def friction(self) -> _Bounded:
-        """Offset and friction alone, as if the joint carried nothing."""
-        return _Bounded(self.x[:, :4], self.low[:4], self.high[:4], slice(0, 0))
-
-    def explained(self, efforts: Array, rows: Mask, scaled: bool = True) -> Array:
-        """[L] share of the variance of efforts [L, T] over the rows [T] that the bounded model explains, or below zero.
-
-        scaled: the effort's unit is the model's; otherwise every scale of the effort is tried.
-        """
-        y, x = efforts[:, rows], self.x[rows]
-        size = np.linalg.norm(x, axis=0) + 1e-12
-        # a bounded fit of R c = Q'y is that of X c = y
-        q, r = np.linalg.qr(x / size)
-        bounds = (self.low * size, self.high * size)
-        body = float(np.linalg.norm(x[:, self.rigid].sum(1)))
-
-        def one(signal: Array) -> float:
-            target = q.T @ signal
-            norm = max(float(np.linalg.norm(signal)), 1e-300)
-            tried = np.ones(1) if scaled or body == 0 else body / norm * np.geomspace(0.1, 10.0, 9)
-            fits = [2.0 * lsq_linear(r, s * target, bounds=bounds, method="bvls").cost / s**2 for s in tried]
-            left = norm**2 - float(target @ target) + float(min(fits))
-            return 1.0 - left / max(float(np.sum((signal - signal.mean()) ** 2)), 1e-300)
-
-        return np.array([one(signal) for signal in y])
+        return Bounded(x, low, high, slice(6, 6 + len(rigid)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,7 +191,7 @@ class _Test:
     log: Log
     effort: Effort
     picture: _Picture
-    model: _Bounded
+    model: Bounded
     rows: Mask
 
     @classmethod
@@ -234,6 +209,11 @@ class _Test:
     @property
     def cutoff(self) -> float:
         return self.picture.own.moved.cutoff
+
+    @property
+    def independent(self) -> float:
+        """How many independent rows its rows are."""
+        return float(self.rows.sum()) * min(1.0, 2.0 * self.cutoff * self.step)
 
     @property
     def small(self) -> bool:

@@ -13,6 +13,7 @@ from bayessim_mjx.diagnosis.logcheck.drives import dof_of, is_effort, looped
 from bayessim_mjx.diagnosis.logcheck.effort import LIMITS as OF_EFFORT
 from bayessim_mjx.diagnosis.logcheck.effort import Relation, relations
 from bayessim_mjx.diagnosis.logcheck.single_log import Finding, refuse, warn
+from bayessim_mjx.diagnosis.logcheck.timing import Late, Timing, pooled
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Array, Log
 from bayessim_mjx.logs.velocities import Velocity, agreeing, velocities
@@ -62,10 +63,12 @@ class Gate:
 
     Attributes:
         qvel: per measured velocity channel, whether it agrees with its position in most of the usable logs.
+        timing: of the usable logs.
     """
 
     reports: tuple[Report, ...]
     qvel: dict[str, bool]
+    timing: Timing
 
     @property
     def usable(self) -> tuple[Log, ...]:
@@ -111,10 +114,10 @@ class Gate:
         own = iter(logs)
         return replace(self, reports=tuple(replace(r, log=next(own)) if r.usable else r for r in self.reports))
 
-    def shifted(self, late: float) -> Gate:
-        """With logs whose commands act `late` s later than they did."""
-        reports = tuple(replace(r, log=r.log.shifted(late)) for r in self.reports)
-        return replace(self, reports=reports)
+    def clocked(self, commands: Late, moved: float) -> Gate:
+        """With the lateness of the commands, and with logs whose commands act `moved` s later than they did."""
+        reports = tuple(replace(r, log=r.log.shifted(moved)) for r in self.reports) if moved else self.reports
+        return replace(self, reports=reports, timing=self.timing.with_commands(commands, moved))
 
     def _not_compared(self) -> tuple[str, ...]:
         """One sentence per reason: many logs of many joints would bury everything else."""
@@ -143,9 +146,18 @@ def check(logs: Sequence[Log], mj_model: mujoco.MjModel, dt: float) -> Gate:
     if not (np.isfinite(dt) and dt > 0):
         raise UserError(f"gate: dt = {dt!r}; allowed: seconds > 0")
     reports = tuple(_report(log, mj_model, dt) for log in logs)
-    seen = [v for r in reports if r.usable for v in r.velocities]
-    step = max([dt, *(r.log.period for r in reports if r.usable)])
-    return Gate(reports, agreeing(seen, step))
+    usable = [r for r in reports if r.usable]
+    seen = [v for r in usable for v in r.velocities]
+    periods = [r.log.period for r in usable]
+    motion = pooled((e.joint, e.late) for r in usable for e in _first(r.relations))
+    velocities = pooled((v.channel, Late(v.lag)) for v in seen)
+    timing = Timing(float(np.median(periods)) if periods else dt, dt, velocities, motion)
+    return Gate(reports, agreeing(seen, max([dt, *periods])), timing)
+
+
+def _first(related: Sequence[Relation]) -> list[Relation]:
+    """One relation of each joint that was tested: a stream of efforts comes before the command."""
+    return [*{r.joint: r for r in reversed(related) if r.explained is not None}.values()]
 
 
 def unusable(log: Log, dt: float) -> bool:

@@ -11,12 +11,13 @@ import numpy as np
 from bayessim_mjx.diagnosis.logcheck.drives import commanded, controlled, efforts, measured
 from bayessim_mjx.diagnosis.logcheck.regressor import Mask, Regressor, filtered, motion
 from bayessim_mjx.diagnosis.logcheck.rigid_body import nominal
+from bayessim_mjx.diagnosis.logcheck.timing import Timing
 from bayessim_mjx.logs.log import Array, Log
 from bayessim_mjx.logs.velocities import velocities
 from bayessim_mjx.physics import controllers
 from bayessim_mjx.quantities import percent
 
-_LAGS = np.linspace(-0.2, 0.2, 161)  # s
+LAGS = np.linspace(-0.2, 0.2, 161)  # s, odd: none is among them
 
 
 @dataclass(frozen=True)
@@ -28,7 +29,7 @@ class Link:
         where: the actuator, joint or velocity channel.
         tested: whether the log allows the test; otherwise the numbers are NaN and `text` says why.
         slope: output = slope * what the input predicts.
-        correlation: at the best lag.
+        correlation: at the lag.
         lag: s by which the output is late.
         sound: this link does what the model says; the gap is not here.
         text: the verdict in words.
@@ -44,11 +45,11 @@ class Link:
     text: str
 
 
-def links(log: Log, mj_model: mujoco.MjModel) -> list[Link]:
-    """All links of one log, in the order of the chain."""
+def links(log: Log, mj_model: mujoco.MjModel, timing: Timing) -> list[Link]:
+    """All links of one log, in the order of the chain; timing: of all logs (`Gate.timing`)."""
     if log.lost:
         return []  # what a joint needs is known only with the motion of all
-    return [*_controllers(log, mj_model), *_drives(log, mj_model), *_sensors(log)]
+    return [*_controllers(log, mj_model), *_drives(log, mj_model, timing), *_sensors(log)]
 
 
 def _link(name: str, where: str, slope: float, correlation: float, lag: float, step: float, scaled: bool) -> Link:
@@ -71,23 +72,24 @@ def _untested(name: str, where: str, why: str) -> Link:
     return Link(name, where, False, nan, nan, nan, False, f"{name} at {where}: not tested: {why}")
 
 
-def compare(predicted: Array, measured: Array, step: float, rows: Mask) -> tuple[float, float, float]:
-    """Slope, correlation and lag [s] of measured [T] against predicted [T] sampled every `step` s, over rows [T].
-
-    The lag is where the correlation is largest, if that explains half of what is unexplained without a lag; else 0.
-    """
+def compare(predicted: Array, measured: Array, step: float, rows: Mask, lag: float) -> tuple[float, float]:
+    """Slope and correlation of measured [T] and predicted [T] `lag` s before, both every `step` s, over rows [T]."""
     time = step * np.arange(len(predicted))
-    late = [np.interp(time - lag, time, predicted)[rows] for lag in _LAGS]
-    y = measured[rows] - measured[rows].mean()
-    scores = []
-    for x in late:
-        norm = float(np.linalg.norm(x - x.mean()) * np.linalg.norm(y))
-        scores.append(float((x - x.mean()) @ y) / norm if norm > 0 else 0.0)
-    best, now = int(np.argmax(scores)), len(_LAGS) // 2
-    if 1.0 - scores[best] > 0.5 * (1.0 - scores[now]) or best in (0, len(_LAGS) - 1):
-        best = now
-    x = late[best] - late[best].mean()
-    return float(x @ y) / max(float(x @ x), 1e-300), scores[best], float(_LAGS[best])
+    x, y = np.interp(time - lag, time, predicted)[rows], measured[rows] - measured[rows].mean()
+    x = x - x.mean()
+    norm = float(np.linalg.norm(x) * np.linalg.norm(y))
+    return float(x @ y) / max(float(x @ x), 1e-300), float(x @ y) / norm if norm > 0 else 0.0
+
+
+def offset(predicted: Array, measured: Array, step: float, rows: Mask) -> float:
+    """s between the stamps of two columns: where they correlate most, if half of what is unexplained goes; else 0.
+
+    `drive_channel` states when a drive acts on average while a command holds, which is another time by half a row.
+    """
+    scores = [compare(predicted, measured, step, rows, lag)[1] for lag in LAGS]
+    best, now = int(np.argmax(scores)), len(LAGS) // 2
+    clear = 1.0 - scores[best] <= 0.5 * (1.0 - scores[now]) and best not in (0, len(LAGS) - 1)
+    return float(LAGS[best]) if clear else 0.0
 
 
 # Command -> effort
@@ -107,14 +109,15 @@ def _controllers(log: Log, mj_model: mujoco.MjModel) -> Iterator[Link]:
         if rows.sum() < 20:
             yield _untested(name, actuator, "command or effort never changes while the drive is on")
             continue
-        slope, correlation, lag = compare(pair[0], pair[1], log.period, rows)
+        lag = offset(*pair, log.period, rows)
+        slope, correlation = compare(*pair, log.period, rows, lag)
         yield _link(name, actuator, slope, correlation, lag, log.period, declared)
 
 
 # Effort -> motion
 
 
-def _drives(log: Log, mj_model: mujoco.MjModel) -> Iterator[Link]:
+def _drives(log: Log, mj_model: mujoco.MjModel, timing: Timing) -> Iterator[Link]:
     """The measured effort, or the command where it is one, against the nominal inverse dynamics of the motion."""
     found = {e.joint: e for e in reversed(list(efforts(log, mj_model)))}  # a stream comes before the command
     if not found:
@@ -129,7 +132,8 @@ def _drives(log: Log, mj_model: mujoco.MjModel) -> Iterator[Link]:
         if rows.sum() * moved.step * moved.cutoff < 4.0 or np.ptp(signal[rows]) == 0:
             yield _untested(name, effort.joint, "too little motion free of contacts and limits")
             continue
-        slope, correlation, lag = compare(signal, needed[:, effort.dof], moved.step, rows)
+        lag = timing.motion[effort.joint].sure if effort.joint in timing.motion else 0.0
+        slope, correlation = compare(signal, needed[:, effort.dof], moved.step, rows, lag)
         yield _link(name, effort.joint, slope, correlation, lag, log.period, effort.scaled)
 
 

@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
+from scipy.optimize import lsq_linear
 
 from bayessim_mjx.diagnosis.logcheck import rigid_body
 from bayessim_mjx.logs.log import Array, Log
@@ -148,3 +149,39 @@ class Regressor:
         }  # fmt: skip
         parts = (rigid.columns, known, rigid.weight, spring, rigid.tilt)
         return cls(moved, *map(moved.smooth, parts), {name: moved.smooth(x) for name, x in own.items()}, dry)
+
+
+@dataclass(frozen=True, eq=False)
+class Bounded:
+    """Linear model of one joint's effort, x [T, K] c with low <= c <= high."""
+
+    x: Array
+    low: Array
+    high: Array
+    rigid: slice  # the model's own bodies and springs, which have a scale
+
+    def friction(self) -> Bounded:
+        """Offset and friction alone, as if the joint carried nothing."""
+        return Bounded(self.x[:, :4], self.low[:4], self.high[:4], slice(0, 0))
+
+    def explained(self, efforts: Array, rows: Mask, scaled: bool = True) -> Array:
+        """[L] share of the variance of efforts [L, T] over the rows [T] that the bounded model explains, or below zero.
+
+        scaled: the effort's unit is the model's; otherwise every scale of the effort is tried.
+        """
+        y, x = efforts[:, rows], self.x[rows]
+        size = np.linalg.norm(x, axis=0) + 1e-12
+        # a bounded fit of R c = Q'y is that of X c = y
+        q, r = np.linalg.qr(x / size)
+        bounds = (self.low * size, self.high * size)
+        body = float(np.linalg.norm(x[:, self.rigid].sum(1)))
+
+        def one(signal: Array) -> float:
+            target = q.T @ signal
+            norm = max(float(np.linalg.norm(signal)), 1e-300)
+            tried = np.ones(1) if scaled or body == 0 else body / norm * np.geomspace(0.1, 10.0, 9)
+            fits = [2.0 * lsq_linear(r, s * target, bounds=bounds, method="bvls").cost / s**2 for s in tried]
+            left = norm**2 - float(target @ target) + float(min(fits))
+            return 1.0 - left / max(float(np.sum((signal - signal.mean()) ** 2)), 1e-300)
+
+        return np.array([one(signal) for signal in y])

@@ -7,13 +7,10 @@ from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.logcheck.drives import centred, commanded, measured
 from bayessim_mjx.diagnosis.logcheck.regressor import filtered, motion
-from bayessim_mjx.logs.log import Log
-
-Array = NDArray[np.float64]
+from bayessim_mjx.logs.log import Array, Log
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,72 @@
+"""The clock of the logs: what is late, behind what, by how much and how surely.
+
+Each lateness has one estimator, since each is another quantity:
+
+- velocities behind the derivatives of their positions: `logs.velocities`, lags over all measured rows;
+- motion behind the effort: `effort`, where the bounded inverse dynamics of a log explain most;
+- measured efforts behind the commands: `equation_error.channel`, least squares on the commands of the rows before;
+- commands behind (or before) their rows: `fitting.command_shift`, by simulation, beside all that forces can explain.
+
+Two more are no clocks. The term "lateness" of `equation_error.terms` lets all efforts be late by a common time while
+effects are compared; its value is not used. `residual.frequency.delay` is what the model lacks with all effects found.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+SURE = 4.0  # standard errors from which on a lateness is believed; rule of thumb, not counted
+
+
+@dataclass(frozen=True)
+class Late:
+    """A lateness: seconds (negative: early), and its standard error in s (NaN: not known)."""
+
+    seconds: float
+    error: float = float("nan")
+
+    @property
+    def sure(self) -> float:
+        """s; 0 where it lies within SURE standard errors of 0."""
+        return 0.0 if abs(self.seconds) < SURE * self.error else self.seconds
+
+
+@dataclass(frozen=True)
+class Timing:
+    """When what the logs say happened.
+
+    Attributes:
+        period: s between rows, the median of the logs; control: s, the control period.
+        velocities: {velocity channel: behind the derivative of its position}.
+        motion: {joint: behind its effort, the measured one where there is one}; held commands alone make half a row.
+        efforts: {actuator: measured effort behind the command}; empty where none was measured.
+        commands: behind their rows; None: not estimated. moved: s by which the logs' commands were moved since.
+    """
+
+    period: float
+    control: float
+    velocities: Mapping[str, Late] = field(default_factory=dict)
+    motion: Mapping[str, Late] = field(default_factory=dict)
+    efforts: Mapping[str, Late] = field(default_factory=dict)
+    commands: Late | None = None
+    moved: float = 0.0
+
+    def with_efforts(self, each: Mapping[str, Late]) -> Timing:
+        return replace(self, efforts=dict(each))
+
+    def with_commands(self, commands: Late, moved: float) -> Timing:
+        return replace(self, commands=commands, moved=self.moved + moved)
+
+
+def pooled(each: Iterable[tuple[str, Late]]) -> dict[str, Late]:
+    """{name: median over logs}; its error is the median of theirs over the root of their number."""
+    of: dict[str, list[Late]] = {}
+    for name, late in each:
+        of.setdefault(name, []).append(late)
+    medians = {
+        n: [float(np.median([getattr(x, k) for x in own])) for k in ("seconds", "error")] for n, own in of.items()
+    }
+    return {name: Late(late, error / len(of[name]) ** 0.5) for name, (late, error) in medians.items()}
