@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis import tolerance
-from bayessim_mjx.diagnosis.equation_error import leads
-from bayessim_mjx.diagnosis.equation_error.look import Look
+from bayessim_mjx.diagnosis.equation_error import proposals
+from bayessim_mjx.diagnosis.equation_error.inverse_dynamics_check import Look
 from bayessim_mjx.diagnosis.fitting import (
     candidates,
     command_shift,
@@ -106,7 +106,7 @@ def prepare(
     asked = tolerance.read(tolerated, robot.mj_model)
     dt = control_period(robot, logs)
     told = [*notes]
-    seen, before = leads.checked(logs, robot, dt, told, seen_first)
+    seen, before = proposals.checked(logs, robot, dt, told, seen_first)
     beginnings, shorter = observation.shortened(seen.demand(), seconds_of(robot.mj_model.nv, quick))
     seen = seen.of_logs(observation.completed(beginnings, robot.mj_model))
     usable, robot = seen.usable, pruned_model.pruned(robot, seen.usable, dt)
@@ -127,7 +127,7 @@ def prepare(
     cut = step.noisier(cuts(step.factor, limit=most, centred=False, late=seen.timing.moved))
     base = candidates.base_coordinates(robot.space, robot.accuracy, robot.assumed)
     fitter = Fitter(Simulator(physics, cut), base, physics.space.nominal)
-    led = leads.lead(candidates.enumerate_candidates(physics), before)
+    led = proposals.lead(candidates.enumerate_candidates(physics), before)
     allowed = tolerance.judge(robot.mj_model, 2 * size.travel, cut.sigma_q, asked)
     settings = dataclasses.replace(settings or _settings(robot, quick), believed=step.believed)
     late = [] if shift is None else shift.told(float(np.median([log.period for log in logs])))

@@ -22,13 +22,12 @@ SHIFT = 1e-4  # rad or m, for the derivative by a joint's zero: exact to roundin
 
 @dataclass(frozen=True)
 class Budget:
-    """How much is looked at, and in how many parts logs are held out."""
+    """How much is looked at, and in how many parts logs are held out: seconds, not errors. Choices, not counted."""
 
     rows: int = 12000  # of all logs together, at their own rates
     folds: int = 3  # with fewer logs, each is cut into parts
     parts: int = 4
     most: int = 12  # parts of all logs together: those of more logs are held out side by side
-    least: float = 6.0  # independent rows of a joint in a part
     many: int = 16  # dofs, beyond which zeros of joints are not looked at
 
 
@@ -178,7 +177,7 @@ def columns(log: Log, model: mujoco.MjModel, source: tuple[str, ...], slow: Arra
         if v is not None and source[v] in of:
             x[:, v, layout.drive(i)] = filtered(model.actuator_gear[i, 0] * of[source[v]][:, i], log, moved)
     rows = np.stack([moved.moving(v) & (source[v] != "") for v in range(model.nv)])
-    return Columns(x, rows, min(1.0, 2.0 * moved.cutoff * moved.step))
+    return Columns(x, rows, moved.share)
 
 
 def _zeros(model: mujoco.MjModel, moved: Motion) -> dict[int, Array]:

@@ -15,6 +15,7 @@ from bayessim_mjx.diagnosis.equation_error.fit import Term
 from bayessim_mjx.diagnosis.equation_error.sums import Layout
 from bayessim_mjx.diagnosis.logcheck import loads, rigid_body
 from bayessim_mjx.diagnosis.logcheck.drives import dof_of
+from bayessim_mjx.diagnosis.logcheck.regressor import TILT
 from bayessim_mjx.effects.support.site import element_names
 
 Array = NDArray[np.float64]
@@ -32,7 +33,6 @@ class Ranges:
     sure: float = 0.2  # standard deviation of a gain's inverse
     zero: float = 0.05  # rad, standard deviation of a joint's zero and of a base's tilt
     share: float = 1.0  # of the load that dry friction may be
-    tilt: float = 0.3  # rad
     late: float = 3.0  # periods: standard deviation of how late efforts are
 
 
@@ -102,7 +102,7 @@ def effects(model: mujoco.MjModel, layout: Layout, source: Sequence[str], carrie
     out += _on_actuators(model, layout, driven)
     tilt = np.stack([_everywhere(layout, c) for c in range(layout.tilt.start, layout.tilt.stop)], -1)
     if np.any(model.opt.gravity):
-        ends = -RANGES.tilt, RANGES.tilt
+        ends = -TILT, TILT
         out.append(_wide("gravity_tilt", "world", tilt, *ends, _reader("roll", "pitch"), sd=RANGES.zero))
     return [*out, *payloads(model, layout, carried), *links(model, layout)]
 

@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Rules:
-    """How fine a time step is looked for, and when its error is known."""
+    """How fine a time step is looked for, and when its error is known. Rules of thumb, not counted."""
 
     factors: tuple[int, ...] = (1, 2, 4, 8)
     more: tuple[int, ...] = (16, 32)  # beyond the budget, where the step is worth more than the tolerance

@@ -33,7 +33,7 @@ EULER, RK4, IMPLICITFAST = (int(getattr(mujoco.mjtIntegrator, f"mjINT_{n}")) for
 
 @dataclass(frozen=True)
 class Rules:
-    """When a step is stable, and how fine one is looked for."""
+    """When a step is stable, and how fine one is looked for. Rules of thumb, not counted."""
 
     finest: int = 64  # sub-steps per step of the model
     states: int = 8  # of all logs, at which the model is linearised

@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Rules:
-    """How conditions are held out where one alone tells a parameter."""
+    """How conditions are held out where one alone tells a parameter. Rules of thumb, not counted."""
 
     parts: int = 8
     # a parameter whose variance grows by this without a condition is told by that condition alone

@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Sizes:
-    """How sub-steps are compared."""
+    """How sub-steps are compared. Rules of thumb, not counted."""
 
     starts: int = 5  # Newton steps of the start states, at most
     falls: float = 0.99  # of the misfit that a step leaves: with more they are at their end

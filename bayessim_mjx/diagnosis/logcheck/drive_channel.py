@@ -31,7 +31,7 @@ class Limits:
 
 
 LIMITS = Limits()
-ROWS = 4  # of commands that an effort may come from: this one and those before
+ROWS = 4  # of commands that an effort may come from: this one and those before; a choice, not counted
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,6 @@ def _pairs(log: Log, model: mujoco.MjModel, own: Sequence[int]) -> list[_Pair]:
     moved = motion(log, model)
     told, middle, noise = commanded(log, model), commanded(centred(log), model), _noise(log, model)
     still = commanded(replace(log, qvel=0.0 * log.qvel), model)
-    share = min(1.0, 2.0 * moved.cutoff * moved.step)
     out = []
     for i in own:
         effort = measured(log, i)
@@ -137,7 +136,7 @@ def _pairs(log: Log, model: mujoco.MjModel, own: Sequence[int]) -> list[_Pair]:
         smooth = filtered(effort, log, moved)[moved.free]
         noisy = filtered(noise[:, i], log, moved)[moved.free]
         terms = filtered(still[:, i], log, moved)[moved.free]
-        out.append(_Pair(smooth, each[0], each[1], np.stack([told[:, i], effort]), noisy, terms, share))
+        out.append(_Pair(smooth, each[0], each[1], np.stack([told[:, i], effort]), noisy, terms, moved.share))
     return out
 
 

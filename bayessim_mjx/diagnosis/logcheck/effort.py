@@ -12,7 +12,16 @@ import numpy as np
 
 from bayessim_mjx.diagnosis.logcheck import loads
 from bayessim_mjx.diagnosis.logcheck.drives import Effort, efforts
-from bayessim_mjx.diagnosis.logcheck.regressor import Bounded, Mask, Regressor, bandwidth, filtered, motion
+from bayessim_mjx.diagnosis.logcheck.regressor import (
+    FEWEST,
+    TILT,
+    Bounded,
+    Mask,
+    Regressor,
+    bandwidth,
+    filtered,
+    motion,
+)
 from bayessim_mjx.diagnosis.logcheck.rigid_body import inertial, moving_bodies, nominal
 from bayessim_mjx.diagnosis.logcheck.timing import Late
 from bayessim_mjx.logs.log import Array, Log
@@ -21,7 +30,7 @@ from bayessim_mjx.quantities import percent
 
 @dataclass(frozen=True)
 class Limits:
-    """How much of a logged effort the motion has to bear out."""
+    """How much of a logged effort the motion has to bear out. Rules of thumb, not counted."""
 
     # share of the effort's variance explained
     refused: float = 0.3
@@ -37,7 +46,6 @@ class Limits:
 
 LIMITS = Limits()
 FACTOR = 2.0  # a body's inertia and the actuator's gain may be wrong by this factor either way; a rule of thumb
-TILT = 0.3  # rad, by which gravity may be tilted: `equation_error.terms.RANGES`
 
 
 @dataclass(frozen=True)
@@ -91,7 +99,7 @@ def _relation(
 ) -> Relation:
     """laden: with an unknown load, which is no fault of a log."""
     own = Relation(effort.joint, effort.source, None)
-    tests = [t for t in (_Test.of(log, effort, p, laden) for p in pictures) if t.independent >= 8.0]
+    tests = [t for t in (_Test.of(log, effort, p, laden) for p in pictures) if t.independent >= FEWEST]
     if not tests:
         return replace(own, text="too little motion, free of contacts and limits, to compare the effort with")
     if any(t.small for t in tests):
@@ -203,17 +211,13 @@ class _Test:
         return filtered(self.effort.signal, self.log, self.picture.own.moved)
 
     @property
-    def step(self) -> float:
-        return self.picture.own.moved.step
-
-    @property
     def cutoff(self) -> float:
         return self.picture.own.moved.cutoff
 
     @property
     def independent(self) -> float:
         """How many independent rows its rows are."""
-        return float(self.rows.sum()) * min(1.0, 2.0 * self.cutoff * self.step)
+        return float(self.rows.sum()) * self.picture.own.moved.share
 
     @property
     def small(self) -> bool:
@@ -243,8 +247,7 @@ class _Test:
         spans: list[tuple[float, float]] = []
         for a, b in zip(edges[:-1], edges[1:], strict=True):
             rows = self.rows & (moved.time >= a) & (moved.time < b)
-            enough = rows.sum() * moved.step * moved.cutoff >= 3.0
-            if enough and self.share(rows) > 0.9:
+            if rows.sum() * moved.share >= FEWEST and self.share(rows) > 0.9:
                 start = (
                     spans.pop()[0] if spans and abs(spans[-1][1] - (a - moved.time[0])) < 1e-6 else a - moved.time[0]
                 )

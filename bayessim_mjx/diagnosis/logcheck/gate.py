@@ -24,7 +24,7 @@ FEW = 3  # names that a sentence lists
 
 @dataclass(frozen=True)
 class Limits:
-    """When two logs count as the same motion, and when measurements come late."""
+    """When a joint follows its target, and when clocks disagree. Rules of thumb, not counted."""
 
     alike: float = 5.0  # at most so many times a target's range is the range of what follows it
     # s; a larger offset between commands and motion is a fault of the clocks, not of the robot

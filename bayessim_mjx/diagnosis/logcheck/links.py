@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from bayessim_mjx.diagnosis.logcheck.drives import commanded, controlled, efforts, measured
-from bayessim_mjx.diagnosis.logcheck.regressor import Mask, Regressor, filtered, motion
+from bayessim_mjx.diagnosis.logcheck.regressor import FEWEST, Mask, Regressor, filtered, motion
 from bayessim_mjx.diagnosis.logcheck.rigid_body import nominal
 from bayessim_mjx.diagnosis.logcheck.timing import Timing
 from bayessim_mjx.logs.log import Array, Log
@@ -129,7 +129,7 @@ def _drives(log: Log, mj_model: mujoco.MjModel, timing: Timing) -> Iterator[Link
         name = "command -> motion" if effort.source == "ctrl" else "effort -> motion"
         rows = moved.moving(effort.dof)
         signal = filtered(effort.signal, log, moved)
-        if rows.sum() * moved.step * moved.cutoff < 4.0 or np.ptp(signal[rows]) == 0:
+        if rows.sum() * moved.share < FEWEST or np.ptp(signal[rows]) == 0:
             yield _untested(name, effort.joint, "too little motion free of contacts and limits")
             continue
         lag = timing.motion[effort.joint].sure if effort.joint in timing.motion else 0.0

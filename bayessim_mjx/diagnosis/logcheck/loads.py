@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Limits:
-    """When a load beside the model explains more than the model."""
+    """How far out a robot may carry something. Rules of thumb, not counted."""
 
     # reach of a load: of the body's own size, of the robot's length
     beside: float = 1.2

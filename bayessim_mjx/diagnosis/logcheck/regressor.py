@@ -19,7 +19,10 @@ from bayessim_mjx.logs.log import Array, Log
 from bayessim_mjx.logs.velocities import bandwidth, lowpass
 
 Mask = NDArray[np.bool_]
-SLOW = 0.02  # of a joint's top speed, at which dry friction turns over; a rule of thumb, not counted
+# Rules of thumb, not counted.
+SLOW = 0.02  # of a joint's top speed, at which dry friction turns over
+TILT = 0.3  # rad, by which a base may be tilted
+FEWEST = 6.0  # independent rows, below which no effort is compared with a motion
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +46,11 @@ class Motion:
     @property
     def step(self) -> float:
         return float(self.time[1] - self.time[0])
+
+    @property
+    def share(self) -> float:
+        """Independent rows that a row of this grid is, of what passed the filter (two a cycle of the cutoff)."""
+        return min(1.0, 2.0 * self.cutoff * self.step)
 
     def smooth(self, x: Array) -> Array:
         """x `[T, ...]` on this grid, filtered as efforts are."""
