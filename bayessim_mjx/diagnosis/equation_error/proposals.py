@@ -11,7 +11,6 @@ from bayessim_mjx.diagnosis.equation_error.inverse_dynamics_check import Look, c
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate, base_coordinates
 from bayessim_mjx.diagnosis.fitting.robot import Robot
 from bayessim_mjx.diagnosis.logcheck import gate
-from bayessim_mjx.diagnosis.logcheck.timing import Late
 from bayessim_mjx.logs.log import Log
 
 
@@ -48,8 +47,7 @@ def checked(
     if 0 < len(found.usable) < len(sound):
         seen = looked(found.usable, robot, told)
         say(seen)
-    efforts = {c.actuator: Late(c.late) for c in seen.channels if c.told}
-    return replace(found, timing=found.timing.with_efforts(efforts)), seen
+    return found, seen
 
 
 def looked(logs: Sequence[Log], robot: Robot, told: list[str]) -> Look:

@@ -173,9 +173,9 @@ def columns(log: Log, model: mujoco.MjModel, source: tuple[str, ...], slow: Arra
             x[:, :, layout.zero(v)] = moved.smooth(column)
     x[:, :, layout.effort], x[:, :, layout.late] = y, np.gradient(y, moved.step, axis=0)
     for i in layout.shared:
-        v = drives.dof_of(model, i)
-        if v is not None and source[v] in of:
-            x[:, v, layout.drive(i)] = filtered(model.actuator_gear[i, 0] * of[source[v]][:, i], log, moved)
+        dof = drives.dof_of(model, i)
+        if dof is not None and source[dof] in of:
+            x[:, dof, layout.drive(i)] = filtered(model.actuator_gear[i, 0] * of[source[dof]][:, i], log, moved)
     rows = np.stack([moved.moving(v) & (source[v] != "") for v in range(model.nv)])
     return Columns(x, rows, moved.share)
 

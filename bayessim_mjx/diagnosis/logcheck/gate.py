@@ -12,6 +12,7 @@ from bayessim_mjx.diagnosis.logcheck import single_log
 from bayessim_mjx.diagnosis.logcheck.drives import dof_of, is_effort, looped
 from bayessim_mjx.diagnosis.logcheck.effort import LIMITS as OF_EFFORT
 from bayessim_mjx.diagnosis.logcheck.effort import Relation, relations
+from bayessim_mjx.diagnosis.logcheck.links import offsets
 from bayessim_mjx.diagnosis.logcheck.single_log import Finding, refuse, warn
 from bayessim_mjx.diagnosis.logcheck.timing import Late, Timing, pooled
 from bayessim_mjx.errors import UserError
@@ -151,7 +152,8 @@ def check(logs: Sequence[Log], mj_model: mujoco.MjModel, dt: float) -> Gate:
     periods = [r.log.period for r in usable]
     motion = pooled((e.joint, e.late) for r in usable for e in _first(r.relations))
     velocities = pooled((v.channel, Late(v.lag)) for v in seen)
-    timing = Timing(float(np.median(periods)) if periods else dt, dt, velocities, motion)
+    efforts = pooled(own for r in usable if not r.log.lost for own in offsets(r.log, mj_model))
+    timing = Timing(float(np.median(periods)) if periods else dt, dt, velocities, motion, efforts)
     return Gate(reports, agreeing(seen, max([dt, *periods])), timing)
 
 

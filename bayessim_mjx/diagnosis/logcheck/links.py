@@ -11,13 +11,14 @@ import numpy as np
 from bayessim_mjx.diagnosis.logcheck.drives import commanded, controlled, efforts, measured
 from bayessim_mjx.diagnosis.logcheck.regressor import FEWEST, Mask, Regressor, filtered, motion
 from bayessim_mjx.diagnosis.logcheck.rigid_body import nominal
-from bayessim_mjx.diagnosis.logcheck.timing import Timing
+from bayessim_mjx.diagnosis.logcheck.timing import Late, Timing
 from bayessim_mjx.logs.log import Array, Log
 from bayessim_mjx.logs.velocities import velocities
 from bayessim_mjx.physics import controllers
 from bayessim_mjx.quantities import percent
 
 LAGS = np.linspace(-0.2, 0.2, 161)  # s, odd: none is among them
+FEW = 20  # rows, below which two columns are not compared
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,7 @@ def links(log: Log, mj_model: mujoco.MjModel, timing: Timing) -> list[Link]:
     """All links of one log, in the order of the chain; timing: of all logs (`Gate.timing`)."""
     if log.lost:
         return []  # what a joint needs is known only with the motion of all
-    return [*_controllers(log, mj_model), *_drives(log, mj_model, timing), *_sensors(log)]
+    return [*_controllers(log, mj_model, timing), *_drives(log, mj_model, timing), *_sensors(log, timing)]
 
 
 def _link(name: str, where: str, slope: float, correlation: float, lag: float, step: float, scaled: bool) -> Link:
@@ -95,23 +96,41 @@ def offset(predicted: Array, measured: Array, step: float, rows: Mask) -> float:
 # Command -> effort
 
 
-def _controllers(log: Log, mj_model: mujoco.MjModel) -> Iterator[Link]:
-    name, grid = "command -> effort", np.linspace(log.time[0], log.time[-1], len(log))
-    declared = controllers.declared(log.metadata)  # then the unit of the effort is known
-    target = controlled(log, mj_model) if declared else commanded(log, mj_model)
+def _controllers(log: Log, mj_model: mujoco.MjModel, timing: Timing) -> Iterator[Link]:
+    name = "command -> effort"
+    pairs = {actuator: (asked, given, rows) for actuator, asked, given, rows in _pairs(log, mj_model)}
     for i, actuator in enumerate(log.actuators):
-        stream = measured(log, i)
-        if stream is None:
+        if measured(log, i) is None:
             yield _untested(name, actuator, "no complete effort stream was logged")
-            continue
-        pair = [np.interp(grid, log.time, x) for x in (target[:, i], stream)]
-        rows = log.enabled & (np.ptp(pair[0]) > 0) & (np.ptp(pair[1]) > 0)
-        if rows.sum() < 20:
+        elif actuator not in pairs:
             yield _untested(name, actuator, "command or effort never changes while the drive is on")
-            continue
-        lag = offset(*pair, log.period, rows)
-        slope, correlation = compare(*pair, log.period, rows, lag)
-        yield _link(name, actuator, slope, correlation, lag, log.period, declared)
+        else:
+            lag = timing.efforts[actuator].sure
+            asked, given, rows = pairs[actuator]
+            slope, correlation = compare(asked, given, log.period, rows, lag)
+            yield _link(name, actuator, slope, correlation, lag, log.period, controllers.declared(log.metadata))
+
+
+def offsets(log: Log, mj_model: mujoco.MjModel) -> Iterator[tuple[str, Late]]:
+    """(actuator, measured effort behind its command), of one log."""
+    for actuator, asked, given, rows in _pairs(log, mj_model):
+        yield actuator, Late(offset(asked, given, log.period, rows))
+
+
+def _pairs(log: Log, mj_model: mujoco.MjModel) -> Iterator[tuple[str, Array, Array, Mask]]:
+    """(actuator, effort that its command asks for, measured effort, rows), on an even grid, where both change.
+
+    What is asked for is ctrl where a law is declared, whose unit efforts then have; else the model's own force.
+    """
+    streams = {i: stream for i in range(mj_model.nu) if (stream := measured(log, i)) is not None}
+    if not streams:
+        return
+    grid = np.linspace(log.time[0], log.time[-1], len(log))
+    target = controlled(log, mj_model) if controllers.declared(log.metadata) else commanded(log, mj_model)
+    for i, stream in streams.items():
+        if log.enabled.sum() >= FEW and np.ptp(target[:, i]) > 0 and np.ptp(stream) > 0:
+            asked, given = (np.interp(grid, log.time, x) for x in (target[:, i], stream))
+            yield log.actuators[i], asked, given, log.enabled
 
 
 # Effort -> motion
@@ -140,9 +159,10 @@ def _drives(log: Log, mj_model: mujoco.MjModel, timing: Timing) -> Iterator[Link
 # Motion -> measurement
 
 
-def _sensors(log: Log) -> Iterator[Link]:
+def _sensors(log: Log, timing: Timing) -> Iterator[Link]:
     name = "motion -> measurement"
     if not log.has_qvel:
         yield _untested(name, "all joints", "no velocity was measured")
     for v in velocities(log):
-        yield _link(name, v.channel, v.slope, v.correlation, v.lag, log.period, True)
+        lag = timing.velocities[v.channel].sure if v.channel in timing.velocities else v.lag
+        yield _link(name, v.channel, v.slope, v.correlation, lag, log.period, True)

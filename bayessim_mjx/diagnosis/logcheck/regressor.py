@@ -155,8 +155,16 @@ class Regressor:
             "acceleration": moved.qacc, "speed": v, "dry": dry, "drag": v * np.abs(v), "position": position,
             "one": np.ones_like(v), "load": np.abs(rigid.bias + spring) * dry,
         }  # fmt: skip
-        parts = (rigid.columns, known, rigid.weight, spring, rigid.tilt)
-        return cls(moved, *map(moved.smooth, parts), {name: moved.smooth(x) for name, x in own.items()}, dry)
+        return cls(
+            moved,
+            columns=moved.smooth(rigid.columns),
+            known=moved.smooth(known),
+            weight=moved.smooth(rigid.weight),
+            spring=moved.smooth(spring),
+            tilt=moved.smooth(rigid.tilt),
+            own={name: moved.smooth(x) for name, x in own.items()},
+            dry=dry,
+        )
 
 
 @dataclass(frozen=True, eq=False)

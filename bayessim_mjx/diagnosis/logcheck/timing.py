@@ -4,11 +4,13 @@ Each lateness has one estimator, since each is another quantity:
 
 - velocities behind the derivatives of their positions: `logs.velocities`, lags over all measured rows;
 - motion behind the effort: `effort`, where the bounded inverse dynamics of a log explain most;
-- measured efforts behind the commands: `equation_error.channel`, least squares on the commands of the rows before;
+- measured efforts behind the stamps of their commands: `links.offset`, where the two columns correlate most;
 - commands behind (or before) their rows: `fitting.command_shift`, by simulation, beside all that forces can explain.
 
-Two more are no clocks. The term "lateness" of `equation_error.terms` lets all efforts be late by a common time while
-effects are compared; its value is not used. `residual.frequency.delay` is what the model lacks with all effects found.
+Three more are no clocks. `drive_channel.Channel.late` is the mean time by which a drive answers a held command: of its
+own lag as well, and from where the command acts, half a row behind its stamp. The term "lateness" of
+`equation_error.terms` lets all efforts be late by a common time while effects are compared; its value is not used.
+`residual.frequency.delay` is the delay that the recalibrated model lacks.
 """
 
 from __future__ import annotations
@@ -53,9 +55,6 @@ class Timing:
     efforts: Mapping[str, Late] = field(default_factory=dict)
     commands: Late | None = None
     moved: float = 0.0
-
-    def with_efforts(self, each: Mapping[str, Late]) -> Timing:
-        return replace(self, efforts=dict(each))
 
     def with_commands(self, commands: Late, moved: float) -> Timing:
         return replace(self, commands=commands, moved=self.moved + moved)
