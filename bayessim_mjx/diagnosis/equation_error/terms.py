@@ -19,6 +19,7 @@ from bayessim_mjx.diagnosis.logcheck.regressor import TILT
 from bayessim_mjx.effects.support.site import element_names
 
 Array = NDArray[np.float64]
+Reader = Callable[[Array], Mapping[str, float]]  # coefficients -> parameters of the effect
 
 
 @dataclass(frozen=True)
@@ -240,7 +241,7 @@ def _spring(c: Array) -> Mapping[str, float]:
     return {"stiffness": k, "cubic": 0.0, "rest": -float(c[1]) / k}
 
 
-def _reader(*parameters: str, sign: float = 1.0) -> Callable[[Array], Mapping[str, float]]:
+def _reader(*parameters: str, sign: float = 1.0) -> Reader:
     return lambda c: {n: sign * float(x) for n, x in zip(parameters, c, strict=True)}
 
 
@@ -262,10 +263,11 @@ def _everywhere(layout: Layout, column: int) -> Array:
     return out
 
 
-def _fixed(effect: str, where: str, column: Array, low: float = -np.inf, sd: float = np.inf, **more: object) -> Term:
+def _fixed(
+    effect: str, where: str, column: Array, low: float = -np.inf, sd: float = np.inf, read: Reader = lambda c: {}
+) -> Term:
     """A term of one coefficient and one map `[nv, P]`."""
-    believed = np.array([sd])
-    return Term(effect, where, lambda c: column[:, :, None], low=np.array([low]), sd=lambda c: believed, **more)  # type: ignore[arg-type]
+    return _wide(effect, where, column[:, :, None], low, np.inf, read, sd)
 
 
 def _wide(
@@ -274,11 +276,10 @@ def _wide(
     maps: Array,
     low: float | Array,
     high: float | Array,
-    read: object,
+    read: Reader,
     sd: float | Array = np.inf,
 ) -> Term:
     """A term of several coefficients and maps `[nv, P, k]`."""
     k = maps.shape[-1]
-    ends = np.broadcast_to(low, (k,)).astype(float), np.broadcast_to(high, (k,)).astype(float)
-    believed = np.broadcast_to(sd, (k,)).astype(float)
-    return Term(effect, where, lambda c: maps, k, sd=lambda c: believed, low=ends[0], high=ends[1], read=read)  # type: ignore[arg-type]
+    least, most, believed = (np.broadcast_to(x, (k,)).astype(float) for x in (low, high, sd))
+    return Term(effect, where, lambda c: maps, k, sd=lambda c: believed, low=least, high=most, read=read)

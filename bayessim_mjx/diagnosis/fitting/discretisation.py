@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bayessim_mjx.diagnosis.fitting import quadratic
 from bayessim_mjx.diagnosis.fitting.robot import Robot
 from bayessim_mjx.diagnosis.fitting.substep_errors import Errors, held
 from bayessim_mjx.diagnosis.fitting.windows import Windows
@@ -40,7 +41,6 @@ class Rules:
     # errors that shrink by less from one sub-step to its half are not worth finer ones
     converging: float = 1.3
     sure: float = 0.4  # of what is taken for noise: below, the estimates themselves are too coarse
-    far: float = 4.0  # medians: windows with larger errors are no measure, as in the fit
 
 
 RULES = Rules()
@@ -275,7 +275,7 @@ def _size(error: Array, touching: bool) -> Array:
     """Root mean square `[channels]` of errors `[W, H, channels]`; windows far off count less, with contacts hardly."""
     each = np.mean(error**2, axis=1)
     usual = np.median(each, axis=0)
-    return np.asarray(np.sqrt(usual if touching else np.mean(np.minimum(each, RULES.far**2 * usual), axis=0)))
+    return np.asarray(np.sqrt(usual if touching else np.mean(np.minimum(each, quadratic.RULES.far**2 * usual), axis=0)))
 
 
 def contacts(physics: Physics) -> bool:

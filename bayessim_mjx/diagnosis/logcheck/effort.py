@@ -35,7 +35,7 @@ class Limits:
     # share of the effort's variance explained
     refused: float = 0.3
     doubtful: float = 0.7
-    # s by which motion may follow the command for physical reasons: delay, lag, elasticity
+    # s by which motion may follow the command for physical reasons: delay, lag, elasticity; beyond it clocks disagree
     causal: tuple[float, float] = (-0.003, 0.15)
     loaded: float = 0.5  # of what another remedy leaves unexplained, which a load has to undercut
     # of what the lags of a robot leave unexplained, which those of a clock have to undercut
@@ -141,10 +141,11 @@ def _nearest(lags: Array, curve: Array, allowed: Mask, count: float) -> tuple[La
     best, now = float(curve[allowed].max()), float(np.interp(0.0, lags, curve))
     good = np.flatnonzero(allowed & (curve >= best - min(0.002, 0.1 * (best - now))))
     k = int(good[np.argmin(np.abs(lags[good]))])
-    while 0 < k < len(lags) - 1 and max(curve[k - 1], curve[k + 1]) > curve[k]:
+    first, last = np.flatnonzero(allowed)[[0, -1]]
+    while first < k < last and max(curve[k - 1], curve[k + 1]) > curve[k]:
         k += 1 if curve[k + 1] > curve[k - 1] else -1  # to the top of its hill
-    if k in (0, len(lags) - 1):
-        return Late(float(lags[k])), best - now
+    if k in (0, len(lags) - 1) or max(curve[k - 1], curve[k + 1]) > curve[k]:
+        return Late(float(lags[k])), best - now  # no top lies among the lags
     left, top, right = curve[k - 1 : k + 2]  # the vertex of the parabola through them
     bend, step = max(2 * top - left - right, 1e-12), float(lags[1] - lags[0])
     error = step * float(np.sqrt(max(1.0 - top, 0.0) / (0.5 * bend * max(count, 1.0))))

@@ -25,11 +25,9 @@ FEW = 3  # names that a sentence lists
 
 @dataclass(frozen=True)
 class Limits:
-    """When a joint follows its target, and when clocks disagree. Rules of thumb, not counted."""
+    """When a joint follows its target. A rule of thumb, not counted."""
 
     alike: float = 5.0  # at most so many times a target's range is the range of what follows it
-    # s; a larger offset between commands and motion is a fault of the clocks, not of the robot
-    late: float = 0.3
 
 
 LIMITS = Limits()
@@ -229,7 +227,8 @@ def _of_effort(related: Sequence[Relation]) -> list[Finding]:
             out.append(warn(f"{text} ({r.mend})" if r.mend else text))
         if r.lag and r not in bad:
             text = f"{r.joint}: its motion follows the effort ({r.source}) {r.lag * 1e3:+.0f} ms late"
-            out.append(warn(f"{text}: do the clocks agree?") if abs(r.lag) > LIMITS.late else Finding("finding", text))
+            physical = OF_EFFORT.causal[0] <= r.lag <= OF_EFFORT.causal[1]
+            out.append(Finding("finding", text) if physical else warn(f"{text}: do the clocks agree?"))
     return out
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from bayessim_mjx.diagnosis.logcheck.drives import commanded, controlled, efforts, measured
 from bayessim_mjx.diagnosis.logcheck.regressor import FEWEST, Mask, Regressor, filtered, motion
 from bayessim_mjx.diagnosis.logcheck.rigid_body import nominal
+from bayessim_mjx.diagnosis.logcheck.single_log import LIMITS
 from bayessim_mjx.diagnosis.logcheck.timing import Late, Timing
 from bayessim_mjx.logs.log import Array, Log
 from bayessim_mjx.logs.velocities import velocities
@@ -18,7 +19,6 @@ from bayessim_mjx.physics import controllers
 from bayessim_mjx.quantities import percent
 
 LAGS = np.linspace(-0.2, 0.2, 161)  # s, odd: none is among them
-FEW = 20  # rows, below which two columns are not compared
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,7 @@ def _pairs(log: Log, mj_model: mujoco.MjModel) -> Iterator[tuple[str, Array, Arr
     grid = np.linspace(log.time[0], log.time[-1], len(log))
     target = controlled(log, mj_model) if controllers.declared(log.metadata) else commanded(log, mj_model)
     for i, stream in streams.items():
-        if log.enabled.sum() >= FEW and np.ptp(target[:, i]) > 0 and np.ptp(stream) > 0:
+        if log.enabled.sum() >= LIMITS.min_rows and np.ptp(target[:, i]) > 0 and np.ptp(stream) > 0:
             asked, given = (np.interp(grid, log.time, x) for x in (target[:, i], stream))
             yield log.actuators[i], asked, given, log.enabled
 

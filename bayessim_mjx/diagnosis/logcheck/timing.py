@@ -61,11 +61,13 @@ class Timing:
 
 
 def pooled(each: Iterable[tuple[str, Late]]) -> dict[str, Late]:
-    """{name: median over logs}; its error is the median of theirs over the root of their number."""
+    """{name: median over logs}; its error is the median of those that are known over the root of their number."""
     of: dict[str, list[Late]] = {}
     for name, late in each:
         of.setdefault(name, []).append(late)
-    medians = {
-        n: [float(np.median([getattr(x, k) for x in own])) for k in ("seconds", "error")] for n, own in of.items()
-    }
-    return {name: Late(late, error / len(of[name]) ** 0.5) for name, (late, error) in medians.items()}
+    out = {}
+    for name, own in of.items():
+        known = [x.error for x in own if np.isfinite(x.error)]
+        error = float(np.median(known)) / len(known) ** 0.5 if known else float("nan")
+        out[name] = Late(float(np.median([x.seconds for x in own])), error)
+    return out

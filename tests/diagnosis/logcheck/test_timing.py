@@ -35,3 +35,4 @@ def test_a_lateness_within_four_errors_is_none() -> None:
     assert Late(0.003).sure == 0.003  # of unknown error
     each = [("hinge", Late(x, 0.002)) for x in (0.01, 0.03, 0.011, 0.012)]
     assert pooled(each) == {"hinge": Late(pytest.approx(0.0115), pytest.approx(0.001))}
+    assert pooled([*each, ("hinge", Late(0.0115))]) == pooled(each)  # an unknown error says nothing
