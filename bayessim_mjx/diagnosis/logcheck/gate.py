@@ -137,10 +137,10 @@ class Gate:
 
 
 def check(logs: Sequence[Log], mj_model: mujoco.MjModel, dt: float) -> Gate:
-    """Judge every log against the model and the control period dt [s]. Nothing is raised: read the verdict.
+    """Judge every log against the model and the control period dt [s]. No fault of the motion raises: read the verdict.
 
     Raises:
-        UserError: dt is no time.
+        UserError: dt is no time, or a log declares a controller that cannot be read.
     """
     if not (np.isfinite(dt) and dt > 0):
         raise UserError(f"gate: dt = {dt!r}; allowed: seconds > 0")
