@@ -12,25 +12,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis import tolerance
-from bayessim_mjx.diagnosis.equation_error import leads
-from bayessim_mjx.diagnosis.equation_error.look import Look
+from bayessim_mjx.diagnosis.equation_error import proposals
+from bayessim_mjx.diagnosis.equation_error.inverse_dynamics_check import Look
 from bayessim_mjx.diagnosis.fitting import (
     candidates,
     command_shift,
     discretisation,
-    lean,
+    integrator_choice,
     observation,
+    pruned_model,
     scales,
-    sensors,
-    stepping,
     windows,
 )
-from bayessim_mjx.diagnosis.fitting.centred_commands import physics_of
 from bayessim_mjx.diagnosis.fitting.cutting import CUTTING, finest, most_windows, seconds_of, windows_of
 from bayessim_mjx.diagnosis.fitting.fitter import Fitter
 from bayessim_mjx.diagnosis.fitting.robot import Robot
-from bayessim_mjx.diagnosis.fitting.simulator import Simulator
-from bayessim_mjx.diagnosis.fitting.substeps import Errors
+from bayessim_mjx.diagnosis.fitting.simulator import Simulator, physics_of
+from bayessim_mjx.diagnosis.fitting.substep_errors import Errors
 from bayessim_mjx.diagnosis.logcheck import gate, noise
 from bayessim_mjx.diagnosis.selection.budget import Budget
 from bayessim_mjx.diagnosis.selection.tried import Settings
@@ -108,34 +106,34 @@ def prepare(
     asked = tolerance.read(tolerated, robot.mj_model)
     dt = control_period(robot, logs)
     told = [*notes]
-    seen, before = leads.checked(logs, robot, dt, told, seen_first)
+    seen, before = proposals.checked(logs, robot, dt, told, seen_first)
     beginnings, shorter = observation.shortened(seen.demand(), seconds_of(robot.mj_model.nv, quick))
     seen = seen.of_logs(observation.completed(beginnings, robot.mj_model))
-    usable, robot = seen.usable, lean.lean(robot, seen.usable, dt)
+    usable, robot = seen.usable, pruned_model.pruned(robot, seen.usable, dt)
     told += [*seen.warnings, *shorter, *(f"{text} (found, not assumed)" for text in seen.findings)]
     told += [] if noise.repeats(usable) else [noise.ONCE]
     size = scales.measure(robot.mj_model, [resample(log, dt) for log in usable], robot.rating)
     stack, left_out = candidates.stack(candidates.kinds_of(effects), size)
-    limit = tolerance.judge(robot.mj_model, 2 * size.travel, sensors.noise_of_positions(usable), asked).limit
+    limit = tolerance.judge(robot.mj_model, 2 * size.travel, noise.noise_of_positions(usable), asked).limit
     delivered = float(robot.mj_model.opt.timestep)
     look_at = functools.partial(_measured, usable=usable, group=group, use_qvel=seen.use_qvel, limit=limit)
-    steps = stepping.stepping(robot, dt, usable, look_at, functools.partial(_affordable, budget))
+    steps = integrator_choice.choose(robot, dt, usable, look_at, functools.partial(_affordable, budget))
     cuts, step = steps.cuts, steps.worth
     shift = _shift(cuts, step, size)
-    seen = seen.shifted(lead) if (lead := 0.0 if shift is None else shift.lead) else seen
+    seen = seen if shift is None else seen.clocked(shift.behind, shift.lead)
     robot = step.robot(steps.robot)
     physics = physics_of(robot, dt, stack)
     most = most_windows(physics, step.errors.cut.steps if step.errors else cuts(1).steps, quick)
-    cut = step.noisier(cuts(step.factor, limit=most, centred=False, late=lead))
+    cut = step.noisier(cuts(step.factor, limit=most, centred=False, late=seen.timing.moved))
     base = candidates.base_coordinates(robot.space, robot.accuracy, robot.assumed)
     fitter = Fitter(Simulator(physics, cut), base, physics.space.nominal)
-    led = leads.lead(candidates.enumerate_candidates(physics), before)
+    led = proposals.lead(candidates.enumerate_candidates(physics), before)
     allowed = tolerance.judge(robot.mj_model, 2 * size.travel, cut.sigma_q, asked)
     settings = dataclasses.replace(settings or _settings(robot, quick), believed=step.believed)
     late = [] if shift is None else shift.told(float(np.median([log.period for log in logs])))
     said = [*steps.said(), *_faster(seen.usable, delivered, dt), *late]
     told += [*said, *steps.warnings(), *(f"not tried: {text}" for text in left_out)]
-    told += [*_few_conditions(cut), *sensors.not_compared(usable), *allowed.warnings(), *led.sentences()]
+    told += [*_few_conditions(cut), *noise.not_compared(usable), *allowed.warnings(), *led.sentences()]
     fixed = (robot, physics, seen, fitter, led.candidates, size, settings, seed, allowed)
     return Setup(*fixed, tuple(told), tuple(said), step, before)
 

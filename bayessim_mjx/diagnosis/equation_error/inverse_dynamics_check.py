@@ -1,4 +1,4 @@
-"""The look at the logs before any simulation: channels, mechanism, proposals, and what they contradict."""
+"""Efforts against inverse dynamics, before any simulation: drives, mechanism, proposals, contradictions."""
 
 from __future__ import annotations
 
@@ -15,13 +15,11 @@ from bayessim_mjx.diagnosis import data_sheet
 from bayessim_mjx.diagnosis.equation_error import fit as fitting
 from bayessim_mjx.diagnosis.equation_error import sums as summing
 from bayessim_mjx.diagnosis.equation_error import terms
-from bayessim_mjx.diagnosis.equation_error.channel import Channel, channels_of
-from bayessim_mjx.diagnosis.equation_error.contradictions import contradicted
-from bayessim_mjx.diagnosis.equation_error.fit import Fit, Term
-from bayessim_mjx.diagnosis.equation_error.identifiable import Told, told_by
-from bayessim_mjx.diagnosis.equation_error.search import Found, Proposal, search
+from bayessim_mjx.diagnosis.equation_error.fit import Fit, Term, used
+from bayessim_mjx.diagnosis.equation_error.search import Found, Proposal, contradicted, search
 from bayessim_mjx.diagnosis.equation_error.sums import Sums
-from bayessim_mjx.diagnosis.logcheck import loads
+from bayessim_mjx.diagnosis.logcheck import loads, rigid_body
+from bayessim_mjx.diagnosis.logcheck.drive_channel import Channel, channels_of
 from bayessim_mjx.logs.log import Log
 
 Array = NDArray[np.float64]
@@ -30,11 +28,13 @@ UNITS = ("N m", "Nm", "N")  # of efforts, as metadata may state them: those of t
 
 @dataclass(frozen=True)
 class Limits:
-    """What counts as the unit of the model, and as a joint that the model explains."""
+    """What counts as the model's unit, as a shift of a parameter, as identifiable. Rules of thumb, not counted."""
 
     unit: float = 0.15  # efforts that are within this factor of the model's need are in its unit
     far: float = 2.0  # standard deviations of the data sheet's, from where on a known parameter's shift is told
     places: int = 20  # positions of each log at which drives hold loads
+    rank: float = 1e-7  # of the largest singular value squared, columns at unit length
+    shown: float = 0.7  # of what the data sheet leaves open: a mass whose deviation stays above this is not told
 
 
 LIMITS = Limits()
@@ -68,6 +68,21 @@ class Shift:
     where: str
     share: float
     away: float
+
+
+@dataclass(frozen=True)
+class Told:
+    """What the motion shows of the inertial parameters.
+
+    Attributes:
+        parameters: of all moving bodies; combinations: of them that act on the known efforts in these logs (base
+            parameters, Gautier 1991, by eigenvalues of the regressor's products).
+        unknown: bodies whose mass these logs do not tell better than the data sheet.
+    """
+
+    parameters: int
+    combinations: int
+    unknown: tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +124,7 @@ class Look:
         }  # fmt: skip
 
 
-def look(
+def check(
     logs: Sequence[Log],
     model: mujoco.MjModel,
     accuracy: Mapping[tuple[str, str], float] | None = None,
@@ -123,20 +138,22 @@ def look(
     """
     began = time.monotonic()
     sums = summing.gather(logs, model)
-    if not fitting.used(sums).any():
+    if not used(sums).any():
         return Look(seconds=time.monotonic() - began)
     known = terms.known(model, sums.layout, accuracy or {}, sums.period)
     carried = data_sheet.rated(loads.carried(model, _places(logs)), rating or {})
     offered = terms.effects(model, sums.layout, sums.source, carried)
     found, unit = _searched(sums, known, offered, _stated(logs))
+    # the model as it is; how late efforts are logged is no fault of it
+    nominal = fitting.fit(sums, [t for t in known if t.effect == "lateness"])
     channels = channels_of(logs, model, unit == 1.0)
     vetoes = contradicted(sums, known, offered, found, channels) if unit == 1.0 else {}
     return Look(
         channels,
-        _joints(model, sums, known, found),
+        _joints(model, sums, nominal, found),
         unit,
         found.proposals,
-        _explained(sums, known, found),
+        _explained(sums, nominal, found),
         _shifts(known, found.fit),
         vetoes,
         told_by(model, sums, known, found.fit),
@@ -166,13 +183,13 @@ def _searched(sums: Sums, known: Sequence[Term], offered: Sequence[Term], stated
     return found, factor
 
 
-def _joints(model: mujoco.MjModel, sums: Sums, known: Sequence[Term], found: Found) -> tuple[Joint, ...]:
-    lay, on = sums.layout, fitting.used(sums)
+def _joints(model: mujoco.MjModel, sums: Sums, nominal: Fit, found: Found) -> tuple[Joint, ...]:
+    lay, on = sums.layout, used(sums)
     size = sums.size
     whole, rows = sums.whole, np.maximum(sums.rows.sum(0), 1e-9)
     parts = [
         np.sqrt(fitting.left(sums, whole, m) / rows) / np.maximum(size, 1e-300)
-        for m in (_nominal(sums, known).model, found.base.model, found.fit.model)
+        for m in (nominal.model, found.base.model, found.fit.model)
     ]
     out = []
     for v in np.flatnonzero(on):
@@ -194,17 +211,27 @@ def _shifts(known: Sequence[Term], found: Fit) -> tuple[Shift, ...]:
     return tuple(sorted(out, key=lambda s: -abs(s.away)))
 
 
-def _nominal(sums: Sums, known: Sequence[Term]) -> Fit:
-    """The model as it is; how late efforts are logged is no fault of it."""
-    return fitting.fit(sums, [t for t in known if t.effect == "lateness"])
-
-
-def _explained(sums: Sums, known: Sequence[Term], found: Found) -> float:
+def _explained(sums: Sums, nominal: Fit, found: Found) -> float:
     """Share that is explained of the squared effort that the model leaves, each joint in units of its own effort."""
-    first = _nominal(sums, known)
-    size, on = sums.size, fitting.used(sums)
+    size, on = sums.size, used(sums)
     rows = np.maximum(sums.rows.sum(0), 1e-9)
     before, after = (
-        float(np.sum((fitting.left(sums, sums.whole, f.model) / rows / size**2)[on])) for f in (first, found.fit)
+        float(np.sum((fitting.left(sums, sums.whole, f.model) / rows / size**2)[on])) for f in (nominal, found.fit)
     )
     return 1.0 - after / before if before > 0 and found.proposals else float("nan")
+
+
+def told_by(model: mujoco.MjModel, sums: Sums, known: Sequence[Term], found: Fit) -> Told:
+    """From the products of the columns, and from the fit's covariance."""
+    count = rigid_body.INERTIAL * sums.layout.bodies
+    weight = np.where(used(sums), 1.0 / found.variance, 0.0)
+    S = np.einsum("v,vpq->pq", weight, sums.whole[:, :count, :count])
+    size = np.sqrt(np.diag(S))
+    seen = size > 1e-6 * size.max(initial=1e-300)
+    scaled = S[np.ix_(seen, seen)] / np.outer(size[seen], size[seen])
+    values = np.linalg.eigvalsh(scaled) if seen.any() else np.zeros(0)
+    rank = int(np.sum(values > LIMITS.rank * values.max(initial=1e-300)))
+    masses = [t for t in known if t.effect == "mass"]
+    nothing = np.full(1, np.nan)
+    unknown = [t.where for t in masses if found.deviation(t)[0] > LIMITS.shown * t.sd(nothing)[0]]
+    return Told(count, rank, tuple(unknown))

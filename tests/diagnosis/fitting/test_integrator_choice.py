@@ -6,8 +6,8 @@ import mujoco
 import numpy as np
 import pytest
 
+from bayessim_mjx.diagnosis.fitting import integrator_choice
 from bayessim_mjx.diagnosis.fitting import robot as robots
-from bayessim_mjx.diagnosis.fitting import stability
 from bayessim_mjx.diagnosis.setup import _measured
 from bayessim_mjx.logs import Channels, Log, estimate_velocity
 
@@ -27,8 +27,8 @@ def log(own, **metadata) -> Log:
     return Log("log", time, zero, zero, zero, False, Channels.of(own), sigma, sigma, metadata=metadata)
 
 
-def needed(own, **metadata) -> stability.Step:
-    return stability.needed(own, [log(own, **metadata)])
+def needed(own, **metadata) -> integrator_choice.Step:
+    return integrator_choice.coarsest_stable(own, [log(own, **metadata)])
 
 
 @pytest.mark.parametrize("kind", ["Euler", "implicitfast"])
@@ -56,7 +56,7 @@ def test_a_nearly_massless_axis_is_left_to_the_implicit_integrator():
     found = needed(model(0.01, mass=1e-4, actuator=servo))
     assert found.changed and found.factor == 1 and "implicitfast" in found.sentences()[0]
     changed = found.robot(robots.robot_of(model(0.01, mass=1e-4, actuator=servo)))
-    assert changed.mj_model.opt.integrator == stability.IMPLICITFAST
+    assert changed.mj_model.opt.integrator == integrator_choice.IMPLICITFAST
     assert needed(model(0.01, damping=1.0, mass=1e-4)).factor == 1  # a joint's damping is implicit in Euler's method
     found = needed(model(0.01, "RK4", damping=1.0, mass=1e-4))
     assert found.changed and found.factor == 1  # not so in that of Runge and Kutta
@@ -69,7 +69,7 @@ def test_what_falls_over_is_not_unstable():
 
 def test_what_no_step_reaches_is_said():
     found = needed(model(0.01, stiffness=1e10, mass=1e-3))
-    assert not found.reached and found.factor == stability.RULES.finest
+    assert not found.reached and found.factor == integrator_choice.RULES.finest
     assert "for 0.156 ms too" in found.sentences()[0] and "armature" in found.sentences()[0]
 
 
@@ -94,7 +94,7 @@ def test_a_loop_that_the_simulators_step_cannot_hold_is_simulated_to_within_the_
         qvel, spread = estimate_velocity(time, qpos, channels, sigma)
         law = {"controller": {"law": "position", "kp": gain, "kd": rub}}
         logs.append(Log(f"log{i}", time, ctrl, qpos, qvel, False, channels, sigma, spread, metadata=law))
-    step = stability.needed(own, logs)
+    step = integrator_choice.coarsest_stable(own, logs)
     assert step.factor > 1 and step.reached
     robot = dataclasses.replace(robots.robot_of(own), control_dt=period)
     _, found = _measured(robot.physics(period), logs, None, False, np.full(1, 3 * noise), step.factor)

@@ -21,7 +21,7 @@ NEAR_TRAVEL, NEAR_RANGE = 0.25, 0.05
 ROUNDS = 8
 
 
-def lean(robot: Robot, logs: Sequence[Log], dt: float) -> Robot:
+def pruned(robot: Robot, logs: Sequence[Log], dt: float) -> Robot:
     """The robot as it is simulated beside these logs at control steps of `dt` s."""
     robot = dataclasses.replace(robot, unlimited=unreached(robot.mj_model, logs))
     alone = not robot.mj_model.neq and not contacts(robot.physics(dt))

@@ -9,7 +9,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from bayessim_mjx.diagnosis.logcheck.channels import Link, compare, links
+from bayessim_mjx.diagnosis.logcheck.gate import check
+from bayessim_mjx.diagnosis.logcheck.links import Link, compare, links, offset
 from bayessim_mjx.logs import Log, read_logs
 from tests.diagnosis.recordings import ARM, PENDULUM, record, sines
 
@@ -20,7 +21,8 @@ SERVO = PENDULUM.replace("<motor", f'<position kp="{KP}" kv="{KD}"')
 
 
 def split(log: Log, xml: str = PENDULUM) -> dict[tuple[str, str], Link]:
-    return {(x.name, x.where): x for x in links(log, mujoco.MjModel.from_xml_string(xml))}
+    model = mujoco.MjModel.from_xml_string(xml)
+    return {(x.name, x.where): x for x in links(log, model, check([log], model, log.period).timing)}
 
 
 @pytest.fixture(scope="module")
@@ -35,9 +37,10 @@ def servo() -> Log:
 def test_slope_and_lag_are_recovered(slope: float, lag: float) -> None:
     t = 0.01 * np.arange(1000)
     shape = lambda t: np.sin(3 * t) + 0.5 * np.cos(7 * t)  # noqa: E731
-    found = compare(shape(t), slope * shape(t - lag), 0.01, (t > 0.3) & (t < 9.5))
-    assert found == pytest.approx((slope, 1.0, lag), abs=2e-3)
-    assert compare(shape(t), np.random.default_rng(0).standard_normal(1000), 0.01, t > 0)[1] < 0.3
+    pair, rows = (shape(t), slope * shape(t - lag)), (t > 0.3) & (t < 9.5)
+    assert offset(*pair, 0.01, rows) == pytest.approx(lag, abs=2e-3)
+    assert compare(*pair, 0.01, rows, lag) == pytest.approx((slope, 1.0), abs=2e-3)
+    assert compare(shape(t), np.random.default_rng(0).standard_normal(1000), 0.01, t > 0, 0.0)[1] < 0.3
 
 
 def test_a_sound_chain_is_exonerated(servo: Log) -> None:

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from bayessim_mjx.diagnosis.equation_error.leads import lead, proposed
-from bayessim_mjx.diagnosis.equation_error.look import look
+from bayessim_mjx.diagnosis.equation_error.inverse_dynamics_check import check
+from bayessim_mjx.diagnosis.equation_error.proposals import lead, proposed
 from bayessim_mjx.diagnosis.fitting import robot
 from bayessim_mjx.diagnosis.fitting.candidates import enumerate_candidates
 from bayessim_mjx.diagnosis.summary import first_look
@@ -30,13 +30,13 @@ def recorded(truth, system="arm_torque", **how):
 @pytest.fixture(scope="module")
 def loaded():
     model, logs = recorded(LOAD)
-    return look(logs, model)
+    return check(logs, model)
 
 
 @pytest.fixture(scope="module")
 def weak():
     model, logs = recorded(WEAK)
-    return model, look(logs, model)
+    return model, check(logs, model)
 
 
 @pytest.mark.slow
@@ -66,7 +66,7 @@ def test_a_weak_motor_is_found_with_and_without_measured_effort(weak):
     _, seen = weak
     assert not seen.proposals and proposed(seen)["actuator_gain@elbow_motor"]["gain"] == pytest.approx(0.8, abs=0.02)
     model, logs = recorded(WEAK, effort=False)
-    blind = look(logs, model)
+    blind = check(logs, model)
     assert proposed(blind)["actuator_gain@elbow_motor"]["gain"] == pytest.approx(0.8, abs=0.03)
     assert "actuator_gain@all" in blind.vetoes  # the others are not weak
     assert first_look.verdict(blind) == ""
@@ -76,11 +76,11 @@ def test_leads_start_and_veto_candidates(weak, tmp_path):
     model, seen = weak
     physics = robot.robot_of(model).physics(0.01, [effect(n)(where=places(model, n)) for n in FEW])
     every = enumerate_candidates(physics)
-    led = lead(every, seen)
-    left = {c.label for c in led.candidates}
+    found = lead(every, seen)
+    left = {c.label for c in found.candidates}
     assert "actuator_gain@elbow_motor" in left and "actuator_saturation@waist_motor" not in left
-    assert set(led.vetoed) == {c.label for c in every} - left
-    (own,) = [c for c in led.candidates if c.label == "actuator_gain@elbow_motor"]
+    assert set(found.vetoed) == {c.label for c in every} - left
+    (own,) = [c for c in found.candidates if c.label == "actuator_gain@elbow_motor"]
     assert own.probes[-1] == pytest.approx([0.8], abs=0.02)
 
 
@@ -97,18 +97,18 @@ def test_efforts_in_a_unit_of_their_own_are_told(loaded):
         dataclasses.replace(log, streams={k: 0.5 * s for k, s in log.streams.items()}, metadata=log.metadata)
         for log in logs
     ]
-    seen = look(half, model)
+    seen = check(half, model)
     assert seen.unit == pytest.approx(2.0, rel=0.05) and not seen.proposals and not seen.vetoes
     assert all(c.scale == pytest.approx(1.0, abs=0.02) for c in seen.channels)
     stated = [dataclasses.replace(log, metadata={**log.metadata, "effort_unit": "N m"}) for log in half]
-    assert look(stated, model).unit == 1.0
+    assert check(stated, model).unit == 1.0
 
 
 def test_nothing_to_look_at_is_no_error(loaded):
     model, logs = recorded(rigs.Truth(), runs=1, seconds=0.5)
     still = dataclasses.replace(logs[0], qpos=0 * logs[0].qpos, qvel=0 * logs[0].qvel)
-    assert look([still], model).joints == ()
-    assert "no joint" in first_look.lines(look([still], model))[0]
+    assert check([still], model).joints == ()
+    assert "no joint" in first_look.lines(check([still], model))[0]
 
 
 def test_a_drive_that_is_heavier_and_stiffer_than_modelled_is_no_weak_motor():
@@ -118,7 +118,7 @@ def test_a_drive_that_is_heavier_and_stiffer_than_modelled_is_no_weak_motor():
     guessed = copy.copy(model)
     guessed.dof_armature[:] = model.dof_armature / 4
     guessed.dof_damping[:] = model.dof_damping / 3
-    seen = look(logs, guessed)
+    seen = check(logs, guessed)
     found = proposed(seen)
     assert not any(label.startswith("actuator_gain") for label in found)
     for v, joint in enumerate(("shoulder", "elbow")):

@@ -1,14 +1,16 @@
-"""How fine a step the model needs to be stable at all: stiff springs, servo loops, nearly massless axes.
+"""The integrator and the time step of a diagnosis: the coarsest stable step, and RK4 where sub-steps do not suffice.
 
-Linearised by MuJoCo at states of the logs, without contacts and limits: these the solver keeps stable by itself.
+Stability is that of the model linearised by MuJoCo at states of the logs, without contacts and limits: the solver keeps
+those stable by itself. Stiff springs, servo loops and nearly massless axes need fine steps.
 """
 
 from __future__ import annotations
 
 import copy
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,17 +18,22 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from bayessim_mjx.diagnosis.fitting.discretisation import Discretisation, contacts
 from bayessim_mjx.diagnosis.fitting.robot import Robot
 from bayessim_mjx.logs.log import Channels, Log
 from bayessim_mjx.physics import controllers
 
 Array = NDArray[np.float64]
+# (robot's physics, first=coarsest stable factor, cheaper=see `Errors`) -> (the windows, what the time step is worth)
+Measured = Callable[..., tuple[Any, Discretisation]]
+STAGES = 4  # of Runge and Kutta's method, each as dear as a step
+TOO_LONG = "the model's time step shows beside the noise, and in the time given nothing finer can be searched with"
 EULER, RK4, IMPLICITFAST = (int(getattr(mujoco.mjtIntegrator, f"mjINT_{n}")) for n in ("EULER", "RK4", "IMPLICITFAST"))
 
 
 @dataclass(frozen=True)
 class Rules:
-    """When a step is stable, and how fine one is looked for."""
+    """When a step is stable, and how fine one is looked for. Rules of thumb, not counted."""
 
     finest: int = 64  # sub-steps per step of the model
     states: int = 8  # of all logs, at which the model is linearised
@@ -60,9 +67,7 @@ class Step:
         """The robot with the integrator."""
         if not self.changed:
             return robot
-        model = copy.copy(robot.mj_model)
-        model.opt.integrator = self.integrator
-        return dataclasses.replace(robot, mj_model=model)
+        return _integrated(robot, self.integrator)
 
     def sentences(self) -> list[str]:
         """What the user is told before anything is fitted."""
@@ -79,7 +84,7 @@ class Step:
         return [f"{text}; the diagnosis simulates at {finer:.3g} ms or less{how}"]
 
 
-def needed(model: mujoco.MjModel, logs: Sequence[Log]) -> Step:
+def coarsest_stable(model: mujoco.MjModel, logs: Sequence[Log]) -> Step:
     """The coarsest stable step of a model, with its own integrator, or with implicitfast where that may be coarser."""
     own, h = int(model.opt.integrator), float(model.opt.timestep)
     cases = list(_linearised(model, logs))
@@ -89,6 +94,75 @@ def needed(model: mujoco.MjModel, logs: Sequence[Log]) -> Step:
     factor = factors[best]
     joint = "" if factors[own] == 1 else _joint(model, cases, own, h)
     return Step(h, min(factor, RULES.finest), best, best != own, joint, factor <= RULES.finest)
+
+
+@dataclass(frozen=True)
+class Choice:
+    """How the robot is simulated.
+
+    Attributes:
+        robot: with the integrator of the diagnosis; stable: its coarsest stable step.
+        cuts, worth: the windows, and what the time step is worth in them.
+        better: told where the integrator was changed for its accuracy.
+    """
+
+    robot: Robot
+    stable: Step
+    cuts: Any
+    worth: Discretisation
+    better: tuple[str, ...] = ()
+
+    def said(self) -> list[str]:
+        """What the user is told before anything is fitted."""
+        return [*self.stable.sentences(), *self.better, *self.worth.beyond()]
+
+    def warnings(self) -> list[str]:
+        """What the model's own step costs, where it can be simulated at all."""
+        return self.worth.warnings() if self.stable.factor == 1 else []
+
+
+def choose(
+    robot: Robot,
+    dt: float,
+    logs: Sequence[Log],
+    measured: Measured,
+    affordable: Callable[[float], bool] = lambda seconds: True,
+) -> Choice:
+    """The coarsest stable step; where what no sub-steps remove shows, and nothing can touch, RK4.
+
+    It would count as noise else, and in a noise that is larger than the sensors' what two integrators differ by (a
+    fraction of a millisecond, usually) is found as an effect.
+
+    Args:
+        affordable: whether there is time for simulations of all windows that take so many seconds each.
+    """
+    stable = coarsest_stable(robot.physics(dt).mj_model, logs)
+    robot = stable.robot(robot)
+    own = robot.physics(dt)
+    plain = Choice(robot, stable, *measured(own, first=stable.factor))
+    if not (plain.worth.beyond() or plain.worth.shows):
+        return plain
+    if contacts(own) or int(own.mj_model.opt.integrator) == RK4:
+        return plain
+    if not affordable(STAGES * plain.worth.errors.seconds if plain.worth.errors else 0.0):
+        return dataclasses.replace(plain, better=(TOO_LONG,))
+    other = _integrated(robot, RK4)
+    physics = other.physics(dt)
+    needs = coarsest_stable(physics.mj_model, logs)
+    if needs.changed or not needs.reached:
+        return plain
+    found = measured(physics, first=needs.factor, cheaper=plain.worth.errors)
+    if found[1].nats > plain.worth.nats:
+        return plain
+    step = 1e3 * found[1].timestep / found[1].factor
+    text = f"the diagnosis simulates by RK4 at {step:.3g} ms: sub-steps of the model's integrator show in the evidence"
+    return Choice(other, dataclasses.replace(needs, joint=stable.joint), *found, better=(text,))
+
+
+def _integrated(robot: Robot, integrator: int) -> Robot:
+    model = copy.copy(robot.mj_model)
+    model.opt.integrator = integrator
+    return dataclasses.replace(robot, mj_model=model)
 
 
 @dataclass(frozen=True)

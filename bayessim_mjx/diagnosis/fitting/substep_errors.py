@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from bayessim_mjx import programs
 from bayessim_mjx.device import on_cores
-from bayessim_mjx.diagnosis.fitting.quadratic import eliminate
+from bayessim_mjx.diagnosis.fitting.quadratic import START_STEP, eliminate
 from bayessim_mjx.diagnosis.fitting.windows import Batch, Windows
 from bayessim_mjx.physics import Drive, Physics, begin, staggered, substep
 from bayessim_mjx.physics.tangent import difference, integrate
@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Sizes:
-    """How sub-steps are compared."""
+    """How sub-steps are compared. Rules of thumb, not counted."""
 
     starts: int = 5  # Newton steps of the start states, at most
     falls: float = 0.99  # of the misfit that a step leaves: with more they are at their end
@@ -146,7 +146,7 @@ class Errors:
             return self.cheaper.columns(sigma)
         if self._moved is None or self._moved[0] is not self.offsets:
             here = self.run(self.cut, self.first) if here is None else here
-            nudges = np.diag(np.maximum(0.2 * self.cut.spread, SIZES.nudge))
+            nudges = np.diag(np.maximum(START_STEP * self.cut.spread, SIZES.nudge))
             there = self.run_each([Case(self.cut, np.tile(n, (len(self.cut), 1))) for n in nudges], self.first)
             each = [(here - error) / n.max() for n, error in zip(nudges, there, strict=True)]
             self._moved = self.offsets, np.stack(each, -1)

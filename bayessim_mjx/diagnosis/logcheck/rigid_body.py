@@ -12,10 +12,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from bayessim_mjx.diagnosis.logcheck.filtered_motion import Motion
-
 Array = NDArray[np.float64]
 INERTIAL = 10
+BLOCK = 2000  # rows at a time
 _PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
@@ -46,13 +45,14 @@ class Frames:
     bias: Array
 
     @classmethod
-    def of(cls, model: mujoco.MjModel, moved: Motion) -> Frames:
+    def of(cls, model: mujoco.MjModel, qpos: Array, qvel: Array, qacc: Array) -> Frames:
+        """Along a motion `[T, nq]`, `[T, nv]`, `[T, nv]`."""
         bodies, data = moving_bodies(model), mujoco.MjData(model)
-        rows, count, nv = len(moved.time), len(bodies), model.nv
+        rows, count, nv = len(qpos), len(bodies), model.nv
         jp, jr, dp, dr = (np.zeros((rows, count, 3, nv)) for _ in range(4))
         rotation, bias = np.zeros((rows, count, 3, 3)), np.zeros((rows, nv))
         for k in range(rows):
-            data.qpos[:], data.qvel[:] = moved.qpos[k], moved.qvel[k]
+            data.qpos[:], data.qvel[:] = qpos[k], qvel[k]
             mujoco.mj_kinematics(model, data)
             mujoco.mj_comPos(model, data)
             mujoco.mj_comVel(model, data)
@@ -63,13 +63,13 @@ class Frames:
                 mujoco.mj_jacDot(model, data, dp[k, i], dr[k, i], point, body)
                 rotation[k, i] = data.xmat[body].reshape(3, 3)
         gravity = np.where(int(model.opt.disableflags) & int(mujoco.mjtDisableBit.mjDSBL_GRAVITY), 0, model.opt.gravity)
-        origin = _times(jp, moved.qacc) + _times(dp, moved.qvel)
-        turned = _times(jr, moved.qacc) + _times(dr, moved.qvel)
+        origin = _times(jp, qacc) + _times(dp, qvel)
+        turned = _times(jr, qacc) + _times(dr, qvel)
         own = np.swapaxes(rotation, -1, -2)  # world to body
         put = lambda x: np.einsum("tbij,tbj->tbi", own, x)  # noqa: E731
         down = put(np.broadcast_to(gravity, origin.shape))
         return cls(
-            tuple(bodies), own @ jp, own @ jr, put(_times(jr, moved.qvel)), put(turned), put(origin) - down, down,
+            tuple(bodies), own @ jp, own @ jr, put(_times(jr, qvel)), put(turned), put(origin) - down, down,
             rotation, bias,
         )  # fmt: skip
 
@@ -81,6 +81,10 @@ class Frames:
         """`[T, B, nv, 10]` of gravity alone, pointing along a direction `[3]` of the world with its length."""
         own = np.einsum("tbji,j->tbi", self.rotation, direction)
         return self._columns(-own, np.zeros_like(own), np.zeros_like(own))
+
+    def weight(self) -> Array:
+        """`[T, B, nv, 10]` of gravity alone, as it is."""
+        return self._columns(-self.down, np.zeros_like(self.down), np.zeros_like(self.down))
 
     def _columns(self, felt: Array, turning: Array, spin: Array) -> Array:
         skew = _skew(turning) + _skew(spin) @ _skew(spin)
@@ -135,4 +139,64 @@ def nominal(model: mujoco.MjModel) -> Array:
             centre = frame.T @ (data.xipos[part] - data.xpos[body])
             moment = own @ np.diag(model.body_inertia[part]) @ own.T
             out[i] += inertial(float(model.body_mass[part]), centre, moment)
+    return out
+
+
+@dataclass(frozen=True, eq=False)
+class Rigid:
+    """Generalised forces that rigid bodies need for a motion.
+
+    Attributes:
+        columns: `[T, nv, K]`, per unit of each (set of) inertial parameters.
+        nominal: `[T, nv]`, of the model's own; weight: the part of it that is gravity; bias: without acceleration.
+        tilt: `[T, nv, 2]`, per rad by which the world is turned about its x and y axis.
+    """
+
+    columns: Array
+    nominal: Array
+    weight: Array
+    bias: Array
+    tilt: Array
+
+
+def rigid(model: mujoco.MjModel, qpos: Array, qvel: Array, qacc: Array, sets: Array | None = None) -> Rigid:
+    """Of a motion `[T, nq]`, `[T, nv]`, `[T, nv]`.
+
+    Args:
+        sets: `[K, B, 10]`, inertial parameters of which each column is made; None: one column each, of body after body.
+    """
+    own, parts = nominal(model), []
+    falls = [-np.cross(axis, model.opt.gravity) for axis in np.eye(3)[:2]]
+    for a in range(0, len(qpos), BLOCK):  # Jacobians of all rows of a long log would not fit into memory
+        rows = slice(a, a + BLOCK)
+        frames = Frames.of(model, qpos[rows], qvel[rows], qacc[rows])
+        each = frames.columns()
+        columns = np.moveaxis(each, 1, 2) if sets is None else np.einsum("tbvk,cbk->tvc", each, sets)
+        needed = np.einsum("tbvk,bk->tv", each, own)
+        down, *tilt = (np.einsum("tbvk,bk->tv", x, own) for x in (frames.weight(), *map(frames.tilted, falls)))
+        shape = (*needed.shape, -1)
+        parts.append((columns.reshape(shape), needed, down, frames.bias, np.stack(tilt, -1)))
+    return Rigid(*(np.concatenate(x) for x in zip(*parts, strict=True)))
+
+
+def recursive(model: mujoco.MjModel, qpos: Array, qvel: Array, qacc: Array) -> Array:
+    """`Rigid.nominal` alone, by MuJoCo's recursive Newton-Euler."""
+    data, out = mujoco.MjData(model), np.zeros_like(qvel)
+    for k, row in enumerate(out):
+        data.qpos[:], data.qvel[:], data.qacc[:] = qpos[k], qvel[k], qacc[k]
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_comVel(model, data)
+        mujoco.mj_rne(model, data, 1, row)
+    return out
+
+
+def springs(model: mujoco.MjModel, qpos: Array) -> Array:
+    """`[T, nv]`, effort that holds the model's own springs at positions `[T, nq]`."""
+    data, out = mujoco.MjData(model), np.zeros((len(qpos), model.nv))
+    for k, q in enumerate(qpos):
+        data.qpos[:] = q
+        mujoco.mj_fwdPosition(model, data)
+        mujoco.mj_fwdVelocity(model, data)
+        out[k] = -data.qfrc_spring
     return out

@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 
-from bayessim_mjx.diagnosis.logcheck.filtered_motion import motion
+from bayessim_mjx.diagnosis.logcheck.regressor import motion
 from bayessim_mjx.logs import Channels, Log, estimate_velocity
 
 FALLING = """<mujoco><option timestep=".001"/><worldbody><geom type="plane" size="1 1 .1"/>

@@ -1,4 +1,4 @@
-"""What the look before any simulation means for the search: vetoes, and where effects start."""
+"""What the inverse-dynamics check means for the search: which candidates it leaves out, and where others start."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bayessim_mjx.diagnosis.equation_error.look import Look, look
+from bayessim_mjx.diagnosis.equation_error.inverse_dynamics_check import Look, check
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate, base_coordinates
 from bayessim_mjx.diagnosis.fitting.robot import Robot
 from bayessim_mjx.diagnosis.logcheck import gate
@@ -15,7 +15,7 @@ from bayessim_mjx.logs.log import Log
 
 
 @dataclass(frozen=True, eq=False)
-class Led:
+class Proposals:
     """The candidates that race.
 
     Attributes:
@@ -59,7 +59,7 @@ def looked(logs: Sequence[Log], robot: Robot, told: list[str]) -> Look:
         told += [text] if text not in told else []  # the gate may ask for a second look
         return Look()
     try:
-        return look(logs, robot.mj_model, _deviations(robot), robot.rating)
+        return check(logs, robot.mj_model, _deviations(robot), robot.rating)
     except Exception as error:
         told.append(f"equation errors: not available ({type(error).__name__}: {error})")
         return Look()
@@ -72,14 +72,14 @@ def _deviations(robot: Robot) -> dict[tuple[str, str], float]:
     return {(p.attribute, p.target): c.precision**-0.5 / abs(c.neutral) for p, c in pairs if c.neutral and c.precision}
 
 
-def lead(candidates: Iterable[Candidate], look: Look) -> Led:
+def lead(candidates: Iterable[Candidate], look: Look) -> Proposals:
     """Vetoes and starts; an effect that is itself proposed, or that would do in its place, is never left out."""
     every = tuple(candidates)
     starts = proposed(look)
     first = {*starts, *(r for p in look.proposals for r in p.rivals)}
     vetoed = {c.label: look.vetoes[c.label] for c in every if c.label in look.vetoes and c.label not in first}
     kept = tuple(_started(c, starts.get(c.label)) for c in every if c.label not in vetoed)
-    return Led(kept, vetoed)
+    return Proposals(kept, vetoed)
 
 
 def proposed(look: Look) -> dict[str, dict[str, float]]:

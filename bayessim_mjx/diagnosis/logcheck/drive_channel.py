@@ -7,13 +7,10 @@ from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
-from bayessim_mjx.diagnosis.equation_error.columns import asked_of, centred
-from bayessim_mjx.diagnosis.logcheck.filtered_motion import bandwidth, filtered, motion
-from bayessim_mjx.logs.log import Log
-
-Array = NDArray[np.float64]
+from bayessim_mjx.diagnosis.logcheck.drives import centred, commanded, measured
+from bayessim_mjx.diagnosis.logcheck.regressor import filtered, motion
+from bayessim_mjx.logs.log import Array, Log
 
 
 @dataclass(frozen=True)
@@ -34,7 +31,7 @@ class Limits:
 
 
 LIMITS = Limits()
-ROWS = 4  # of commands that an effort may come from: this one and those before
+ROWS = 4  # of commands that an effort may come from: this one and those before; a choice, not counted
 
 
 @dataclass(frozen=True)
@@ -88,7 +85,7 @@ class Channel:
 
 def channels_of(logs: Sequence[Log], model: mujoco.MjModel, unit: bool) -> tuple[Channel, ...]:
     """The drives whose effort was measured in all logs; `unit`: it is the unit of the model's actuators."""
-    own = [i for i in range(model.nu) if logs and all(_measured(log, i) is not None for log in logs)]
+    own = [i for i in range(model.nu) if logs and all(measured(log, i) is not None for log in logs)]
     if not own:
         return ()
     pairs = [_pairs(log, model, own) for log in logs]
@@ -96,11 +93,6 @@ def channels_of(logs: Sequence[Log], model: mujoco.MjModel, unit: bool) -> tuple
     found = [_better(logs[0].actuators[i], [p[k] for p in pairs], period) for k, i in enumerate(own)]
     common = 1.0 if unit else float(np.median([c.scale for c in found])) or 1.0
     return tuple(_judged(c, common, period) for c in found)
-
-
-def _measured(log: Log, i: int) -> Array | None:
-    stream = log.streams.get(f"effort:{log.actuators[i]}")
-    return None if stream is None or not np.isfinite(stream).all() else np.asarray(stream)
 
 
 def _judged(c: Channel, common: float, period: float) -> Channel:
@@ -132,20 +124,19 @@ class _Pair:
 
 
 def _pairs(log: Log, model: mujoco.MjModel, own: Sequence[int]) -> list[_Pair]:
-    moved = motion(log, model, bandwidth(log))
-    told, middle, noise = asked_of(log, model), asked_of(centred(log), model), _noise(log, model)
-    still = asked_of(replace(log, qvel=0.0 * log.qvel), model)
-    share = min(1.0, 2.0 * moved.cutoff * moved.step)
+    moved = motion(log, model)
+    told, middle, noise = commanded(log, model), commanded(centred(log), model), _noise(log, model)
+    still = commanded(replace(log, qvel=0.0 * log.qvel), model)
     out = []
     for i in own:
-        effort = _measured(log, i)
+        effort = measured(log, i)
         assert effort is not None
         rows = [np.maximum(np.arange(len(log)) - k, 0) for k in range(ROWS)]
         each = [np.stack([filtered(x[r, i], log, moved)[moved.free] for r in rows]) for x in (told, middle)]
         smooth = filtered(effort, log, moved)[moved.free]
         noisy = filtered(noise[:, i], log, moved)[moved.free]
         terms = filtered(still[:, i], log, moved)[moved.free]
-        out.append(_Pair(smooth, each[0], each[1], np.stack([told[:, i], effort]), noisy, terms, share))
+        out.append(_Pair(smooth, each[0], each[1], np.stack([told[:, i], effort]), noisy, terms, moved.share))
     return out
 
 
@@ -153,7 +144,7 @@ def _noise(log: Log, model: mujoco.MjModel) -> Array:
     """`[T, nu]`, what a draw of the encoders' noise changes in the forces of servos."""
     rng = np.random.default_rng(0)
     moved = [x + s * rng.normal(size=x.shape) for x, s in ((log.qpos, log.sigma_qpos), (log.qvel, log.sigma_qvel))]
-    return asked_of(replace(log, qpos=moved[0], qvel=moved[1]), model) - asked_of(log, model)
+    return commanded(replace(log, qpos=moved[0], qvel=moved[1]), model) - commanded(log, model)
 
 
 def _better(name: str, pairs: Sequence[_Pair], period: float) -> Channel:

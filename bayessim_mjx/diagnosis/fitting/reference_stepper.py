@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from bayessim_mjx.diagnosis.logcheck.drives import DeclaredLaw
 from bayessim_mjx.logs.log import Log
 from bayessim_mjx.physics import controllers
 
@@ -29,7 +30,7 @@ class Stepper:
         declared = controllers.declared(log.metadata)
         source = str(log.metadata.get("source", log.name))
         law = controllers.read(log.metadata, model, log.actuators, source) if declared else None
-        self.loop = None if law is None else _Loop(law)
+        self.loop = None if law is None else DeclaredLaw(law)
 
     def reset(self) -> None:
         """Actuators without a past."""
@@ -74,20 +75,3 @@ class Stepper:
         mujoco.mj_differentiatePos(self.model, out[: self.nv], 1.0, qpos, to_qpos)
         out[self.nv :] = to_qvel - qvel
         return out
-
-
-class _Loop:
-    """A declared controller on plain arrays."""
-
-    def __init__(self, law: controllers.Law) -> None:
-        self.numbers = tuple(
-            np.asarray(getattr(law, name), float)
-            for name in ("on_position", "on_velocity", "kp", "kd", "limit", "scale")
-        )
-        self.q, self.v = list(law.qadr), list(law.dadr)
-
-    def __call__(self, command: Array, qpos: Array, qvel: Array) -> Array:
-        on_position, on_velocity, kp, kd, limit, scale = self.numbers
-        q, w = qpos[self.q], qvel[self.v]
-        loop = np.where(on_position > 0, kp * (command - q) - kd * w, kp * (command - w)) * scale
-        return np.where(on_position + on_velocity > 0, np.clip(loop, -limit, limit), command * scale)
