@@ -1,12 +1,13 @@
-"""All that a diagnosis computed, before it is put into words. Frozen: a stage gives new findings with one part more."""
+"""All that a diagnosis computed, before it is put into words, and who is told of it while it runs."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any, TypeVar
 
+from bayessim_mjx.diagnosis.evidence.selecting import Selection
 from bayessim_mjx.diagnosis.logcheck.links import Link
 from bayessim_mjx.diagnosis.residual.disturbance import Disturbance
 from bayessim_mjx.diagnosis.residual.flexible import Flexible
@@ -14,16 +15,15 @@ from bayessim_mjx.diagnosis.residual.frequency import Heard
 from bayessim_mjx.diagnosis.residual.where import Located
 from bayessim_mjx.diagnosis.selection.heldout import Prediction
 from bayessim_mjx.diagnosis.selection.models import Model
-from bayessim_mjx.diagnosis.selection.selected import Selection
+from bayessim_mjx.diagnosis.selection.search_state import SearchState
 from bayessim_mjx.diagnosis.setup import Setup
 
-Progress = Callable[[str, int, int], None]  # (what is being done, done, total)
 T = TypeVar("T")
 
 
 @dataclass(frozen=True, eq=False)
 class Where:
-    """Where the gap lies: joints, regions of the state, signatures; and what spectra of the missing force show."""
+    """Where the gap lies: joints, regions of the state, signatures, and spectra of the missing force."""
 
     found: Located
     spectra: tuple[Heard, ...]
@@ -31,15 +31,15 @@ class Where:
 
 @dataclass(frozen=True, eq=False)
 class Findings:
-    """What is known so far; `assemble.diagnosis_of` turns it into a Diagnosis.
+    """All results so far; frozen: a stage returns new findings. `assemble.diagnosis_of` makes a Diagnosis of them.
 
     Attributes:
-        setup, selection: what was fixed before any fit, and what the selection came to.
+        setup, selection: everything fixed before any fit, and the result of the search.
         predictions: {"nominal", "calibrated", "with_effects": held-out motion}.
         disturbance: the force that the recalibrated simulator lacks; None where its gap is the noise.
         flexible_base, flexible_winner: a flexible force on the recalibrated simulator, on top of the effects.
         links: of the first log's channels to each other.
-        parts: what further stages found, one frozen object each, by its class.
+        parts: results of further stages, one frozen object each, by its class.
         warnings: of stages that failed.
     """
 
@@ -55,13 +55,29 @@ class Findings:
 
     @property
     def model(self) -> Model:
-        """The model of the verdict: the known parameters with the effects that are named."""
+        """The model of the verdict: the known parameters and the named effects."""
         return self.selection.answer
 
     def having(self, part: Any) -> Findings:
-        """With what one more stage found."""
+        """The findings with the result of one more stage."""
         return replace(self, parts=MappingProxyType({**self.parts, type(part): part}))
 
     def part(self, kind: type[T]) -> T | None:
-        """What the stage found whose part is of this class; None where it did not run or found nothing."""
+        """The result of the stage whose part has this class; None if it did not run or found nothing."""
         return self.parts.get(kind)
+
+
+class Observer:
+    """What a diagnosis calls while it runs; every method does nothing unless a subclass overrides it."""
+
+    def progress(self, text: str, done: int, total: int) -> None:
+        """Called when a part begins and while it goes on: what is being done, and how much of it is done."""
+
+    def early(self, lines: Sequence[str]) -> None:
+        """Called with what the logs show before any simulation, in lines."""
+
+    def known(self, setup: Setup, state: SearchState | None) -> None:
+        """Called before the search (None), and after each part of it with what was fitted so far."""
+
+    def verdict(self, found: Findings) -> None:
+        """Called with the findings before the optional stages."""

@@ -1,4 +1,4 @@
-"""How facts are put into words: places in the state, missing forces, bounds, rivals, experiments (not effects)."""
+"""How facts are put into words: effects, places in the state, missing forces, bounds, rivals, experiments."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -101,25 +101,16 @@ def signed(value: float, low: float, high: float, unit: str, phrase: str) -> str
     return f"{bracketed(value, low, high, unit)} {phrase}"
 
 
-def off(at: float) -> str:
-    """Of a parameter that takes its effect away."""
-    return f"is {at:.3g}, where it has no part in the effect"
-
-
-def physical_end(at: float, unit: str) -> str:
-    """Of a parameter at a physical limit."""
-    return f"ends at {at:.3g}{unit}, where physics ends"
-
-
-def farthest_tried(at: float, unit: str, kind: str) -> str:
-    """Of a parameter at the end of the widest range, of which no more is known than `kind`: at least, at most."""
+def at_bound(kind: str, at: float, unit: str, physical: bool) -> str:
+    """Of a parameter that ends at a bound, see `bounds.Bound`; a clause, after the parameter's name."""
+    if kind == "off":
+        return f"is {at:.3g}, where it has no part in the effect"
+    value = f"{at:.3g} {unit}" if unit else f"{at:.3g}"
+    if kind == "end":
+        further = f"ends at its bound {value}; a wider range explains no more"
+        return f"ends at {value}, where physics ends" if physical else further
     which = "largest" if kind == "at least" else "smallest"
-    return f"ends at {at:.3g}{unit}, the {which} value tried: {kind} this, or another law is behind it"
-
-
-def bound(at: float, unit: str) -> str:
-    """Of a parameter at a bound beyond which nothing is gained."""
-    return f"ends at its bound {at:.3g}{unit}; a wider range explains no more"
+    return f"ends at {value}, the {which} value tried: {kind} this, or another law is behind it"
 
 
 def close_by(nats: float, behind: float) -> str:
@@ -218,3 +209,29 @@ def tells_apart(action: str, labels: Sequence[str], evidence: float, contested: 
 
 def _apart(labels: Sequence[str], word: str = "from") -> str:
     return f"{labels[0]} {word} {', '.join(labels[1:-1]) + ' and ' if len(labels) > 2 else ''}{labels[-1]}"
+
+
+def missing(name: str, where: str) -> str:
+    """`a command delay at torque`, after "the simulator lacks"."""
+    own = words(name)
+    return own.at(where, own.lacks)
+
+
+def titled(name: str, where: str) -> str:
+    """`extra payload at tool`, on its own."""
+    return words(name).at(where)
+
+
+def by_law(effects: Iterable[Sequence[str]]) -> list[str]:
+    """What is missing, a phrase for each law: `Coulomb friction at shoulder and elbow`.
+
+    Args:
+        effects: (name, place) of each.
+    """
+    places: dict[str, list[str]] = {}
+    for name, where in effects:
+        places.setdefault(name, []).append(where)
+    own = {name: [w for w in where if w not in ("", "world", "all")] for name, where in places.items()}
+    some = {name: [listed(at)] if len(at) > 1 else at for name, at in own.items()}
+    tied = {name: [w for w in where if w in ("", "world", "all")] for name, where in places.items()}
+    return [missing(name, where) for name in places for where in [*some[name], *tied[name]]]

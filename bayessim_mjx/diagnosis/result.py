@@ -13,7 +13,7 @@ import numpy as np
 
 from bayessim_mjx import atomic
 from bayessim_mjx.diagnosis import correction
-from bayessim_mjx.diagnosis.estimates import Estimate, FoundEffect
+from bayessim_mjx.diagnosis.correction import Estimate, FoundEffect
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.parameters import ParameterSpace
 from bayessim_mjx.physics import Physics
@@ -49,8 +49,8 @@ class Gap:
     and on conditions that the choice of the effects was made without (the costs behind it were not); nested: whether
     realised and ci are of such conditions too; integrator: what the simulator's own time step is worth
     (`discretisation.Discretisation.to_dict`); coasting: the same without any simulator, every joint keeping its speed
-    (`selection.coasting`); in_sample: whether there is one log, of which parts are held out; of the horizon of whole
-    logs `in_sample` counts the logs that are simulated with parameters that were fitted to them.
+    (`how_far.constant_velocity_baseline`); in_sample: whether there is one log, of which parts are held out; of the
+    horizon of whole logs `in_sample` counts the logs that are simulated with parameters that were fitted to them.
     """
 
     noise_floor: float

@@ -1,4 +1,4 @@
-"""The diagnosis from logs to result: what was logged, the selection, and the stages after it, one after the other."""
+"""The diagnosis from logs to result: what was logged, the selection, and the stages after it."""
 
 from __future__ import annotations
 
@@ -8,94 +8,29 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
+import jax
 import mujoco
+import numpy as np
 from threadpoolctl import threadpool_limits
 
-from bayessim_mjx.diagnosis import resumed
+from bayessim_mjx import programs, versions
 from bayessim_mjx.diagnosis.evidence import selecting
-from bayessim_mjx.diagnosis.experiment import propose
-from bayessim_mjx.diagnosis.findings import Findings, Progress, Where
+from bayessim_mjx.diagnosis.findings import Findings, Observer
 from bayessim_mjx.diagnosis.fitting.cutting import TooLittleData
+from bayessim_mjx.diagnosis.fitting.journal import Journal, Remembering, digest
 from bayessim_mjx.diagnosis.fitting.robot import Robot, Source, robot_of
-from bayessim_mjx.diagnosis.logcheck.links import links as links_of
-from bayessim_mjx.diagnosis.residual import black_boxes, frequency, where
-from bayessim_mjx.diagnosis.residual.disturbance import Disturbance, estimate
-from bayessim_mjx.diagnosis.residual.flexible import Flexible, flexible
+from bayessim_mjx.diagnosis.request import Effects, Request
 from bayessim_mjx.diagnosis.result import Diagnosis
-from bayessim_mjx.diagnosis.selection import budget, heldout
-from bayessim_mjx.diagnosis.selection.models import Model
-from bayessim_mjx.diagnosis.selection.tried import Settings, Tried
+from bayessim_mjx.diagnosis.selection import budget
+from bayessim_mjx.diagnosis.selection.budget import Progress
 from bayessim_mjx.diagnosis.setup import Setup, prepare
-from bayessim_mjx.diagnosis.stages import Stage, carry_out
-from bayessim_mjx.diagnosis.summary import assemble, finer_steps, first_look, whole_logs
+from bayessim_mjx.diagnosis.stages import STAGES, Stage, carry_out
+from bayessim_mjx.diagnosis.summary import assemble, first_look
 from bayessim_mjx.diagnosis.summary.files import Files
-from bayessim_mjx.effects.effect import Effect
 from bayessim_mjx.logs import read_logs
 from bayessim_mjx.logs.log import Log
-
-Effects = str | Sequence[str | type[Effect]]
-
-
-def how_far(found: Findings, say: Progress) -> Findings:
-    """With the held-out motion of the simulator as delivered, recalibrated and with the effects."""
-    fitter, base, model = found.setup.fitter, found.selection.base, found.model
-    predictions = {
-        "nominal": heldout.nominal(fitter, found.selection.nominal),
-        "calibrated": heldout.predict(fitter, base),
-    }
-    predictions["with_effects"] = heldout.predict(fitter, model) if model.effects else predictions["calibrated"]
-    return replace(found, predictions=MappingProxyType(predictions))
-
-
-def none_of_these(found: Findings, say: Progress) -> Findings:
-    """With the force that is missing, what a flexible force makes of it, and which links of the chain are sound."""
-    base, model, setup = found.selection.base, found.model, found.setup
-    missing = estimate(setup.fitter, base.fit) if found.selection.above_noise(base) else None
-    on_base = _flexible(found, base, missing)
-    on_winner = _flexible(found, model) if model.effects else on_base
-    links = tuple(link for log in setup.logs[:1] for link in links_of(log, setup.robot.mj_model, setup.gate.timing))
-    return replace(found, disturbance=missing, flexible_base=on_base, flexible_winner=on_winner, links=links)
-
-
-def _flexible(found: Findings, model: Model, missing: Disturbance | None = None) -> Flexible | None:
-    """The flexible force on a model whose gap is above the noise."""
-    if not found.selection.above_noise(model):
-        return None
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        return flexible(found.setup.fitter, model.fit, missing)
-
-
-def where_it_lies(found: Findings, say: Progress) -> Findings:
-    """With the places of the recalibrated simulator's gap, maps of the missing force and its spectra."""
-    if found.disturbance is None:
-        return found
-    fitter, fit = found.setup.fitter, found.selection.base.fit
-    located = where.locate(fitter, fit, found.disturbance, seed=found.setup.seed)
-    return found.having(Where(located, frequency.analyse(fitter, fit, found.disturbance)))
-
-
-def rivals_without_physics(found: Findings, say: Progress) -> Findings:
-    """With what a network and a formula close of the gap, beside the named effects."""
-    if found.disturbance is None:
-        return found
-    selection, named = found.selection, found.model.fit if found.model.effects else None
-    boxes = black_boxes.race(found.setup.fitter, selection.base.fit, named, found.disturbance, selection.noise)
-    return found if boxes is None else found.having(boxes)
-
-
-STAGES = (
-    Stage("how far", how_far),
-    Stage("none of these?", none_of_these),
-    Stage("finer steps", finer_steps.stage, patient=True, beside=True),
-    Stage("whole logs", whole_logs.stage, patient=True, beside=True),
-    Stage("where", where_it_lies, optional=True, beside=True),
-    Stage("black boxes", rivals_without_physics, optional=True, beside=True),
-    Stage("next experiment", propose.stage, optional=True, beside=True),
-)
 
 
 # its matrices are small: BLAS's threads take longer than one, and many times that where other processes want the cores
@@ -103,59 +38,32 @@ STAGES = (
 def investigate(
     robot: Robot,
     logs: Sequence[Log],
-    effects: Effects = "all",
-    *,
-    group: str | None = None,
-    seed: int = 0,
-    settings: Settings | None = None,
-    minutes: float | None = None,
-    quick: bool = False,
-    verdict_only: bool = False,
-    remember: Path | None = None,
-    tolerated: Sequence[str] = (),
-    notes: Sequence[str] = (),
+    request: Request = Request(),  # noqa: B008  # immutable
+    observer: Observer = Observer(),  # noqa: B008  # has no state
     stages: Sequence[Stage] | None = None,
-    progress: Progress | None = None,
-    keep: Callable[[Setup, Tried | None], None] | None = None,
-    verdict: Callable[[Findings], None] | None = None,
-    early: Callable[[Sequence[str]], None] | None = None,
 ) -> Findings:
-    """The whole computation, before anything is put into words or written.
+    """The whole computation, before its results are put into words or written.
 
     Args:
         robot: the model with the parameters that it may recalibrate.
-        logs, effects, group, minutes, quick, seed, progress: see `diagnose`; tolerated: tolerance.
-        settings: budgets of the search; None: by the robot's size. verdict_only: without the optional stages.
-        remember: folder for the fits of the search, so that a killed one goes on where it was.
-        notes: what was noticed while model and logs were read, for the warnings.
         stages: after the selection, optional ones last; None: `STAGES`.
-        keep: called with what is known while the search goes on: the setup, and after each part what was tried.
-        verdict: called with the findings before the optional stages.
-        early: called with what the logs tell before any simulation, in lines.
 
     Raises:
         UserError: nothing usable. TooLittleData: nothing could be held out.
     """
-    say = progress or (lambda text, done, total: None)
-    known, tell = keep or (lambda setup, tried: None), early or (lambda lines: None)
-    say("looking at the logs", 0, 1)
-    time_left = budget.begun(minutes)
-    asked: dict[str, Any] = {"group": group, "seed": seed, "settings": settings, "tolerated": tolerated, "notes": notes}
-    asked |= {"budget": time_left}
-    setup = prepare(robot, logs, effects, quick=quick, **asked, seen_first=lambda seen: tell(first_look.lines(seen)))
-    setup = resumed.remembering(_within(setup, time_left), remember)
+    observer.progress("looking at the logs", 0, 1)
+    time_left = budget.begun(request.minutes)
+    setup = prepare(robot, logs, request, time_left, lambda look: observer.early(first_look.lines(look)))
+    setup = remembering(setup, request.remember)
     for text in setup.said:
-        say(text, 0, 1)
-    known(setup, None)
+        observer.progress(text, 0, 1)
+    observer.known(setup, None)
     given = setup.fitter, setup.candidates, setup.settings
-    found = Findings(setup, selecting.select(*given, say, lambda tried: known(setup, tried)))
-    resumed.ended(setup)
-    stages = [s for s in (STAGES if stages is None else stages) if not (s.optional and (quick or verdict_only))]
-    return carry_out(stages, found, say, time_left, verdict)
-
-
-def _within(setup: Setup, time_left: budget.Budget) -> Setup:
-    return replace(setup, settings=replace(setup.settings, budget=time_left))
+    found = selecting.select(*given, observer.progress, lambda state: observer.known(setup, state))
+    ended(setup)
+    optional = not (request.quick or request.verdict_only)
+    chosen = [s for s in (STAGES if stages is None else stages) if optional or not s.optional]
+    return carry_out(chosen, Findings(setup, found), time_left, observer)
 
 
 def diagnose(
@@ -204,19 +112,52 @@ def diagnose(
     with noting() as noticed:
         robot = robot_of(model, parameters).stated(_several(accuracy), _several(payload))
         recorded = _logs(logs, robot.mj_model, map)
-    told = _told(robot, model, logs, recorded) | {"seed": seed} | dict(about or {})
-    files = Files(None if out is None else Path(out), told)
-    asked: Any = {"group": group, "seed": seed, "notes": [*notes, *noticed], "progress": progress}
-    asked |= {"tolerated": _several(tolerance), "early": early, "minutes": minutes, "quick": quick}
-    asked |= {"remember": files.search, "verdict_only": verdict_only, "keep": files.so_far, "verdict": files.verdict}
+    about = _header(robot, model, logs, recorded) | {"seed": seed} | dict(about or {})
+    files = Files(None if out is None else Path(out), about, progress, early)
+    request = Request(
+        effects=effects, group=group, seed=seed, minutes=minutes, quick=quick, verdict_only=verdict_only,
+        tolerances=_several(tolerance), notes=(*notes, *noticed), remember=files.search,
+    )  # fmt: skip
     try:
-        found = investigate(robot, recorded, effects, **asked)
+        found = investigate(robot, recorded, request, files)
     except TooLittleData as reason:
-        return files.whole(assemble.insufficient(str(reason), asked["notes"], told), robot)
+        return files.whole(assemble.insufficient(str(reason), request.notes, about), robot)
     return files.whole(files.result(found), robot)
 
 
-def _told(robot: Robot, model: Source, logs: Any, recorded: Sequence[Log]) -> dict[str, Any]:
+def remembering(setup: Setup, folder: Path | None) -> Setup:
+    """The setup with a fitter that stores its fits in a folder, and finds there those of an interrupted search."""
+    if folder is None:
+        return setup
+    return replace(setup, fitter=Remembering(setup.fitter, Journal(folder, _question(setup), _code(setup))))
+
+
+def ended(setup: Setup) -> None:
+    """The search is over: later fits are not kept."""
+    if isinstance(setup.fitter, Remembering):
+        setup.fitter.journal = None
+
+
+def _code(setup: Setup) -> str:
+    """A digest of the code that makes the fits: this package and the files of the user's own effects."""
+    return digest(versions.sources(), sorted({str(programs.source_of(type(e))) for e in setup.physics.effects}))
+
+
+def _question(setup: Setup) -> str:
+    """A digest of everything else that the fits depend on; the time that they may take is no part of it."""
+    fitter, model = setup.fitter, setup.physics.mj_model
+    simulator = fitter.simulator
+    raw = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, raw)
+    windows = simulator.windows
+    arrays = [np.asarray(leaf) for leaf in jax.tree.leaves(windows.batch)]
+    arrays += [windows.group, windows.sigma_q, windows.sigma_v, windows.spread, fitter.theta, raw]
+    each = [(c.label, c.coordinates, c.shapes, c.probes.tobytes()) for c in setup.candidates]
+    every = replace(setup.settings, budget=budget.Budget())
+    return digest(*arrays, fitter.base, each, every, simulator.lanes, jax.default_backend(), versions.versions())
+
+
+def _header(robot: Robot, model: Source, logs: Any, recorded: Sequence[Log]) -> dict[str, Any]:
     """Entries of the report's header."""
     return {
         "robot": robot.name, "model": str(model) if isinstance(model, str | Path) else robot.name,

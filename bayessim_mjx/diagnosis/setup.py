@@ -1,4 +1,4 @@
-"""What is fixed before any fit: usable logs, the model and its time step, windows, candidates, noise, tolerance."""
+"""Preparation of a diagnosis: usable logs, the model and its time step, windows, candidates, noise, tolerance."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ from bayessim_mjx.diagnosis.fitting import (
     observation,
     pruned_model,
     scales,
-    windows,
 )
 from bayessim_mjx.diagnosis.fitting.cutting import CUTTING, finest, most_windows, seconds_of, windows_of
 from bayessim_mjx.diagnosis.fitting.fitter import Fitter
 from bayessim_mjx.diagnosis.fitting.robot import Robot
 from bayessim_mjx.diagnosis.fitting.simulator import Simulator, physics_of
 from bayessim_mjx.diagnosis.fitting.substep_errors import Errors
+from bayessim_mjx.diagnosis.fitting.windows import Windows
 from bayessim_mjx.diagnosis.logcheck import gate, noise
+from bayessim_mjx.diagnosis.request import Request
 from bayessim_mjx.diagnosis.selection.budget import Budget
-from bayessim_mjx.diagnosis.selection.tried import Settings
-from bayessim_mjx.effects.effect import Effect
+from bayessim_mjx.diagnosis.selection.search_state import Settings
 from bayessim_mjx.logs.log import Log
 from bayessim_mjx.logs.resample import resample
 from bayessim_mjx.physics import Physics
@@ -40,14 +40,23 @@ from bayessim_mjx.physics import Physics
 Array = NDArray[np.float64]
 
 
-# of a first answer, for any robot; how often it differs from the whole search's was not counted
+# of a first answer, for any robot; how often it differs from the answer of the whole search was not counted
 QUICK = Settings(screened=12, iterations=8)
-SHIFT_FACTOR = 4  # times the coarsest sub-steps, the finest by which a shift of commands is looked for
+SHIFT_FACTOR = 4  # finest sub-steps for the estimate of a command shift, as a factor on the coarsest stable ones
 
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """Everything that is fixed before any fit."""
+    """Everything that is fixed before any fit.
+
+    Attributes:
+        robot: as it is simulated; physics: its compiled model with all effects on offer.
+        gate: the logs after the checks; look: what they show before any simulation.
+        fitter: on the windows that models are fitted to; candidates: effects at their places.
+        scales: sizes of motions, forces and inertias; tolerance: errors that may stay unexplained.
+        discretisation: the error of the time step beside the noise.
+        warnings: for the result; said: those of them that are said before the search.
+    """
 
     robot: Robot
     physics: Physics
@@ -59,7 +68,7 @@ class Setup:
     seed: int
     tolerance: tolerance.Tolerance
     warnings: tuple[str, ...] = ()
-    said: tuple[str, ...] = ()  # of the warnings, what is said before the search
+    said: tuple[str, ...] = ()
     discretisation: discretisation.Discretisation | None = None
     look: Look = Look()
 
@@ -76,66 +85,118 @@ def control_period(robot: Robot, logs: Sequence[Log]) -> float:
     return period * max(1, int(np.ceil(CUTTING.shortest / period - 1e-6)))
 
 
+@dataclass(frozen=True, eq=False)
+class _Checked:
+    """Logs that passed the gate, and the robot and the control period that they are compared with.
+
+    Attributes:
+        robot: as it is simulated beside these logs (`pruned_model`); dt: control period, s.
+        period: s between rows, the median of all logs.
+        look: what the logs show before any simulation; notes: warnings so far.
+    """
+
+    robot: Robot
+    dt: float
+    period: float
+    gate: gate.Gate
+    look: Look
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class _Timed:
+    """The robot with a time step that is fine enough, and when its commands act.
+
+    Attributes:
+        gate: with logs whose commands are moved (`Timing.moved`); cuts: windows by the factor on the sub-steps.
+        notes: warnings that are said before the search; warnings: others.
+    """
+
+    robot: Robot
+    gate: gate.Gate
+    cuts: Callable[..., Windows]
+    step: discretisation.Discretisation
+    notes: tuple[str, ...]
+    warnings: tuple[str, ...]
+
+    def cut(self, physics: Physics, quick: bool) -> Windows:
+        """The windows that models are fitted to."""
+        steps = self.step.errors.cut.steps if self.step.errors else self.cuts(1).steps
+        most = most_windows(physics, steps, quick)
+        return self.step.noisier(self.cuts(self.step.factor, limit=most, centred=False, late=self.gate.timing.moved))
+
+
 def prepare(
     robot: Robot,
     logs: Sequence[Log],
-    effects: str | Sequence[str | type[Effect]] = "all",
-    *,
-    group: str | None = None,
-    seed: int = 0,
-    settings: Settings | None = None,
-    quick: bool = False,
-    tolerated: Sequence[str] = (),
-    notes: Sequence[str] = (),
+    request: Request = Request(),  # noqa: B008  # immutable
     budget: Budget = Budget(),  # noqa: B008  # immutable
-    seen_first: Callable[[Look], None] = lambda seen: None,
+    looked: Callable[[Look], None] = lambda look: None,
 ) -> Setup:
-    """Everything up to the first simulation.
+    """Everything up to the first fit.
 
     Args:
-        robot, logs, effects, group, seed, tolerated: see `run.diagnose`.
-        settings: budgets of the search; None: by the robot's size; quick: as small as is sensible, few windows.
-        notes: what was noticed before, first among the warnings.
-        budget: the time that a search may take.
-        seen_first: called with what the logs tell before any simulation.
+        budget: the time that the search may take; looked: called with what the logs show before any simulation.
 
     Raises:
         UserError: unknown effects, no usable log, a tolerance that cannot be read.
         TooLittleData: too few windows.
     """
-    asked = tolerance.read(tolerated, robot.mj_model)
-    dt = control_period(robot, logs)
-    told = [*notes]
-    seen, before = proposals.checked(logs, robot, dt, told, seen_first)
-    beginnings, shorter = observation.shortened(seen.demand(), seconds_of(robot.mj_model.nv, quick))
-    seen = seen.of_logs(observation.completed(beginnings, robot.mj_model))
-    usable, robot = seen.usable, pruned_model.pruned(robot, seen.usable, dt)
-    told += [*seen.warnings, *shorter, *(f"{text} (found, not assumed)" for text in seen.findings)]
-    told += [] if noise.repeats(usable) else [noise.ONCE]
-    size = scales.measure(robot.mj_model, [resample(log, dt) for log in usable], robot.rating)
-    stack, left_out = candidates.stack(candidates.kinds_of(effects), size)
-    limit = tolerance.judge(robot.mj_model, 2 * size.travel, noise.noise_of_positions(usable), asked).limit
-    delivered = float(robot.mj_model.opt.timestep)
-    look_at = functools.partial(_measured, usable=usable, group=group, use_qvel=seen.use_qvel, limit=limit)
-    steps = integrator_choice.choose(robot, dt, usable, look_at, functools.partial(_affordable, budget))
+    tolerated = tolerance.read(request.tolerances, robot.mj_model)
+    checked = _checked(robot, logs, request, looked)
+    usable = checked.gate.usable
+    size = scales.measure(checked.robot.mj_model, [resample(log, checked.dt) for log in usable], robot.rating)
+    stack, left_out = candidates.stack(candidates.kinds_of(request.effects), size)
+    judge = functools.partial(tolerance.judge, checked.robot.mj_model, 2 * size.travel, asked=tolerated)
+    timed = _timed(checked, size, judge(noise.noise_of_positions(usable)).limit, request.group, budget)
+    physics = physics_of(timed.robot, checked.dt, stack)
+    cut = timed.cut(physics, request.quick)
+    base = candidates.base_coordinates(timed.robot.space, timed.robot.accuracy, timed.robot.assumed)
+    led = proposals.lead(candidates.enumerate_candidates(physics), checked.look)
+    allowed = judge(cut.sigma_q)
+    untried = [f"not tried: {text}" for text in left_out]
+    warnings = [*checked.notes, *timed.notes, *timed.warnings, *untried, *_few_conditions(cut)]
+    settings = request.settings or _settings(robot, request.quick)
+    return Setup(
+        robot=timed.robot,
+        physics=physics,
+        gate=timed.gate,
+        fitter=Fitter(Simulator(physics, cut), base, physics.space.nominal),
+        candidates=led.candidates,
+        scales=size,
+        settings=dataclasses.replace(settings, believed=timed.step.believed, budget=budget),
+        seed=request.seed,
+        tolerance=allowed,
+        warnings=(*warnings, *noise.not_compared(usable), *allowed.warnings(), *led.sentences()),
+        said=timed.notes,
+        discretisation=timed.step,
+        look=checked.look,
+    )
+
+
+def _checked(robot: Robot, logs: Sequence[Log], request: Request, looked: Callable[[Look], None]) -> _Checked:
+    """The logs after the gate, cut where they begin to be usable, and their notes."""
+    dt, notes = control_period(robot, logs), [*request.notes]
+    found, look = proposals.checked(logs, robot, dt, notes, looked)
+    beginnings, shorter = observation.shortened(found.demand(), seconds_of(robot.mj_model.nv, request.quick))
+    found = found.of_logs(observation.completed(beginnings, robot.mj_model))
+    notes += [*found.warnings, *shorter, *(f"{text} (found, not assumed)" for text in found.findings)]
+    notes += [] if noise.repeats(found.usable) else [noise.ONCE]
+    period = float(np.median([log.period for log in logs]))
+    return _Checked(pruned_model.pruned(robot, found.usable, dt), dt, period, found, look, tuple(notes))
+
+
+def _timed(checked: _Checked, size: scales.Scales, limit: Array, group: str | None, budget: Budget) -> _Timed:
+    """How finely the simulator has to step, and how far commands are shifted; limit: `[nv]`, the tolerance."""
+    usable, dt = checked.gate.usable, checked.dt
+    measured = functools.partial(_measured, usable=usable, group=group, use_qvel=checked.gate.use_qvel, limit=limit)
+    steps = integrator_choice.choose(checked.robot, dt, usable, measured, functools.partial(_affordable, budget))
     cuts, step = steps.cuts, steps.worth
     shift = _shift(cuts, step, size)
-    seen = seen if shift is None else seen.clocked(shift.behind, shift.lead)
-    robot = step.robot(steps.robot)
-    physics = physics_of(robot, dt, stack)
-    most = most_windows(physics, step.errors.cut.steps if step.errors else cuts(1).steps, quick)
-    cut = step.noisier(cuts(step.factor, limit=most, centred=False, late=seen.timing.moved))
-    base = candidates.base_coordinates(robot.space, robot.accuracy, robot.assumed)
-    fitter = Fitter(Simulator(physics, cut), base, physics.space.nominal)
-    led = proposals.lead(candidates.enumerate_candidates(physics), before)
-    allowed = tolerance.judge(robot.mj_model, 2 * size.travel, cut.sigma_q, asked)
-    settings = dataclasses.replace(settings or _settings(robot, quick), believed=step.believed)
-    late = [] if shift is None else shift.told(float(np.median([log.period for log in logs])))
-    said = [*steps.said(), *_faster(seen.usable, delivered, dt), *late]
-    told += [*said, *steps.warnings(), *(f"not tried: {text}" for text in left_out)]
-    told += [*_few_conditions(cut), *noise.not_compared(usable), *allowed.warnings(), *led.sentences()]
-    fixed = (robot, physics, seen, fitter, led.candidates, size, settings, seed, allowed)
-    return Setup(*fixed, tuple(told), tuple(said), step, before)
+    late = [] if shift is None else shift.told(checked.period)
+    clocked = checked.gate if shift is None else checked.gate.clocked(shift.behind, shift.lead)
+    notes = [*steps.said(), *_faster(usable, float(checked.robot.mj_model.opt.timestep), dt), *late]
+    return _Timed(step.robot(steps.robot), clocked, cuts, step, tuple(notes), tuple(steps.warnings()))
 
 
 def _affordable(budget: Budget, seconds: float) -> bool:
@@ -159,7 +220,7 @@ def _measured(
     limit: Array | None = None,
     first: int = 1,
     cheaper: Errors | None = None,
-) -> tuple[Callable[..., windows.Windows], discretisation.Discretisation]:
+) -> tuple[Callable[..., Windows], discretisation.Discretisation]:
     """The windows, and what the time step is worth in them; shorter ones where contacts make longer ones a lottery.
 
     Args:
@@ -182,7 +243,7 @@ def _measured(
 
 
 def _shift(
-    cuts: Callable[..., windows.Windows], step: discretisation.Discretisation, size: scales.Scales
+    cuts: Callable[..., Windows], step: discretisation.Discretisation, size: scales.Scales
 ) -> command_shift.Shift | None:
     """By how much commands act later or earlier than the logs say."""
     if step.errors is None or not step.errors.physics.mj_model.nu:
@@ -204,7 +265,7 @@ def _faster(logs: Sequence[Log], timestep: float, dt: float) -> list[str]:
     return []
 
 
-def _few_conditions(cut: windows.Windows) -> list[str]:
+def _few_conditions(cut: Windows) -> list[str]:
     count = len(cut.groups)
     if cut.blocks:
         text = "one log is one operating condition: blocks of it in time are held out, so all numbers are in sample"

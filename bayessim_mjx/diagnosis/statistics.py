@@ -6,8 +6,11 @@ they are; of one condition alone nothing can be said. Coverage of the intervals:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -160,3 +163,15 @@ def root(covariance: Array) -> Array:
     """`[k, k]`, R with R R^T = covariance, also where it is singular."""
     values, vectors = np.linalg.eigh(covariance)
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
+
+
+def shapley(count: int, value: Callable[[frozenset[int]], Any]) -> Array:
+    """`[count, ...]`, each one's contribution to `value`, averaged over all orders of adding them."""
+    every = [frozenset(some) for k in range(count + 1) for some in itertools.combinations(range(count), k)]
+    known = {some: np.asarray(value(some), float) for some in every}
+    out = np.zeros((count, *known[frozenset()].shape))
+    for some, worth in known.items():
+        orders = math.factorial(len(some)) * math.factorial(max(count - len(some) - 1, 0)) / math.factorial(count)
+        for i in set(range(count)) - some:
+            out[i] += orders * (known[some | {i}] - worth)
+    return out

@@ -5,6 +5,7 @@ Each returns what a diagnosis says (verdict, effects with place, parameters, equ
 
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,10 +14,11 @@ from families import FAMILIES
 from bayessim_mjx.diagnosis.findings import Findings
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.quadratic import RULES, solve
-from bayessim_mjx.diagnosis.selection import heldout, uncertainty
-from bayessim_mjx.diagnosis.selection.models import Model
-from bayessim_mjx.diagnosis.selection.pool import Pool, fit_entries
+from bayessim_mjx.diagnosis.selection import heldout
+from bayessim_mjx.diagnosis.selection.models import Model, of_noise
 from bayessim_mjx.diagnosis.selection.screen import Screened
+from bayessim_mjx.diagnosis.selection.search_state import SearchState
+from bayessim_mjx.diagnosis.selection.successive_halving import fit_entries
 
 SINGLES = 24  # effects that are fitted alone
 TESTED = 0.3  # share of the operating conditions in the one test set of the single fold
@@ -38,19 +40,18 @@ class Reopened:
 
     def __init__(self, found: Findings) -> None:
         self.setup, self.predictions, self.flexible_base = found.setup, found.predictions, found.flexible_base
-        of = found.selection
-        fitted = dict(of.models), list(of.screened), set(of.cut_short), dict(of.skipped)
-        self.pool = Pool(of.fitter, of.candidates, of.settings, of.nominal, of.base, *fitted)
+        state = found.selection.state
+        self.pool = replace(state, models=dict(state.models), keep=lambda state: None)
 
 
-def candidate_of(pool: Pool, name: str, where: str, joint_of: dict[str, str]) -> Candidate | None:
+def candidate_of(pool: SearchState, name: str, where: str, joint_of: dict[str, str]) -> Candidate | None:
     """The pool's candidate of that name at that place; an actuator and its joint are one place."""
     same = lambda place: joint_of.get(place, place)  # noqa: E731
     found = [c for c in pool.candidates if c.effect == name and same(c.where) == same(where)]
     return found[0] if found else None
 
 
-def fitted(pool: Pool, effects: Sequence[Candidate]) -> Model:
+def fitted(pool: SearchState, effects: Sequence[Candidate]) -> Model:
     """The model of these effects, fitted one after the other, as the pool does it."""
     screened = {s.candidate.label: s for s in pool.screened}
     model = pool.base
@@ -59,7 +60,7 @@ def fitted(pool: Pool, effects: Sequence[Candidate]) -> Model:
     return model
 
 
-def extended(pool: Pool, model: Model, more: Sequence[Screened]) -> list[Model]:
+def extended(pool: SearchState, model: Model, more: Sequence[Screened]) -> list[Model]:
     """The model with each of some further effects, from its screened start and where it was looked at."""
     entries = {}
     for s in more:
@@ -70,7 +71,7 @@ def extended(pool: Pool, model: Model, more: Sequence[Screened]) -> list[Model]:
     return [pool.models[key] for key in entries]
 
 
-def singles(pool: Pool) -> list[Model]:
+def singles(pool: SearchState) -> list[Model]:
     """Every effect at every place that screening gave a chance, also where the pool saw nothing to explain."""
     return extended(pool, pool.base, [s for s in pool.screened if s.gain > 0][:SINGLES])
 
@@ -88,7 +89,7 @@ def told(found: Reopened, model: Model) -> Said:
     """A model as a verdict: each of its effects is named, with intervals."""
     if not model.effects:
         return {"verdict": "parameters", "effects": []}
-    sd = np.sqrt(np.diag(uncertainty.of_noise(found.setup.fitter, model)))
+    sd = np.sqrt(np.diag(of_noise(found.setup.fitter, model)))
     closed = closure(found, model)
     effects = []
     for effect in model.effects:
@@ -121,7 +122,7 @@ def naive_bic(found: Reopened) -> Said:
     return told(found, min(pool.models.values(), key=lambda m: bic(m, pool.fitter.spread)))
 
 
-def fold_error(pool: Pool, model: Model, test: np.ndarray) -> float:
+def fold_error(pool: SearchState, model: Model, test: np.ndarray) -> float:
     """Cost of the windows `test` `[W]` (bool) under the estimates from the others, by one Newton step from the fit."""
     q, _ = model.fit.quadratic(pool.fitter.spread)
     precision, pull, low, high = model.fit.prior()

@@ -10,10 +10,10 @@ from baselines import extended
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fitter import Fitter
 from bayessim_mjx.diagnosis.fitting.robot import of_file
+from bayessim_mjx.diagnosis.request import Request
 from bayessim_mjx.diagnosis.selection.models import scored
-from bayessim_mjx.diagnosis.selection.pool import Pool
 from bayessim_mjx.diagnosis.selection.screen import screen
-from bayessim_mjx.diagnosis.selection.tried import ranked
+from bayessim_mjx.diagnosis.selection.search_state import SearchState, ranked
 from bayessim_mjx.diagnosis.setup import Setup
 from bayessim_mjx.diagnosis.setup import prepare as prepared
 from bayessim_mjx.logs import read_logs
@@ -32,7 +32,7 @@ def prepare(folder: Path, effects: Any, without: str | None) -> tuple[float, flo
     def read() -> Setup:
         robot = of_file(folder / "model.xml")
         logs = read_logs(folder / "logs", robot.mj_model)
-        return prepared(robot, [log for log in logs if log.metadata["condition"] != without], effects)
+        return prepared(robot, [log for log in logs if log.metadata["condition"] != without], Request(effects))
 
     reading, setup = timed(read)
     first, _ = timed(lambda: setup.fitter.simulator.run(setup.fitter.theta[None]))
@@ -61,7 +61,7 @@ def fit_all(folder: Path) -> tuple[dict, list[Candidate]]:
     fitter, settings = setup.fitter, setup.settings
     known, fit = timed(lambda: fit_base(fitter))
     model = scored(fitter, fit, ())
-    tried = Pool(fitter, setup.candidates, settings, fit, model)
+    tried = SearchState(fitter, setup.candidates, settings, fit, model)
     screening, tried.screened = timed(lambda: screen(fitter, fit, setup.candidates, settings.screened))
     singles, models = timed(lambda: extended(tried, model, [s for s in tried.screened if s.gain > 0]))
     assert fitter.simulator.traces == 1

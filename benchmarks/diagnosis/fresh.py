@@ -29,7 +29,7 @@ def closed(found: Findings, robot: System, plant: Plant, seed: int) -> float | N
     left = np.zeros(2)
     for k in range(1, REPEATS + 1):
         fitter = _fitter(found, robot, plant, seed + k * OTHER)
-        for i, model in enumerate((found.selection.base, found.model)):
+        for i, model in enumerate((found.selection.state.base, found.model)):
             left[i] += _predicted(fitter, model)
     return float(1 - left[1] / left[0])
 

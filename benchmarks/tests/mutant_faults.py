@@ -17,7 +17,7 @@ RECORDED = "tests/loop/test_recorded.py"
 ALGEBRA = "tests/test_algebra.py"
 MANIFEST = "tests/runs"
 LOG = "tests/logs/test_resample.py"
-SETS = "tests/diagnosis/selection/test_sets.py"
+SETS = "tests/diagnosis/evidence/test_sets.py"
 
 FAULTS: tuple[tuple[str, str, str, str, tuple[str, ...]], ...] = (
     # physics
@@ -158,7 +158,7 @@ FAULTS: tuple[tuple[str, str, str, str, tuple[str, ...]], ...] = (
     ),
     # diagnosis
     (
-        "superfluous effects stay in the answer", f"{P}/diagnosis/selection/sets.py",
+        "superfluous effects stay in the answer", f"{P}/diagnosis/evidence/sets.py",
         "limit = excess[key] +", "limit = 0.0 * excess[key] - 1.0 +", (SETS,),
     ),
     (
@@ -167,7 +167,7 @@ FAULTS: tuple[tuple[str, str, str, str, tuple[str, ...]], ...] = (
         ("tests/diagnosis/test_tolerance.py", "-k", "taken_out"),
     ),
     (
-        "a set costs nothing more than a smaller one", f"{P}/diagnosis/selection/sets.py",
+        "a set costs nothing more than a smaller one", f"{P}/diagnosis/selection/search_state.py",
         "return len(key) * float(np.log(odds))", "return 0.0", (SETS,),
     ),
     # environment

@@ -1,7 +1,7 @@
 """Every candidate of a setup fitted alone, as a test's beginning."""
 
-from bayessim_mjx.diagnosis.selection.begin import begin
-from bayessim_mjx.diagnosis.selection.pool import fit_entries
+from bayessim_mjx.diagnosis.selection.fits import begin
+from bayessim_mjx.diagnosis.selection.successive_halving import fit_entries
 
 
 def fitted(setup, candidates=None):

@@ -9,11 +9,11 @@ import pytest
 
 from bayessim_mjx.diagnosis import data_sheet
 from bayessim_mjx.diagnosis.data_sheet import SURE
+from bayessim_mjx.diagnosis.evidence import parameters
 from bayessim_mjx.diagnosis.fitting import robot
 from bayessim_mjx.diagnosis.fitting.candidates import Coordinate, base_coordinates
 from bayessim_mjx.diagnosis.fitting.fitter import Fit
-from bayessim_mjx.diagnosis.selection import accuracy
-from bayessim_mjx.diagnosis.summary import assemble
+from bayessim_mjx.diagnosis.summary import known_parameters
 from bayessim_mjx.errors import UserError
 
 ARM = """<mujoco><worldbody><body name="upper"><joint name="shoulder" damping="1"/><geom size=".1" mass="2"/>
@@ -132,9 +132,9 @@ def test_an_accuracy_is_assumed_where_nobody_states_one(arm, tmp_path):
 def test_a_result_warns_where_the_model_is_less_accurate_than_usual():
     def of(off):
         fit = assumed_fit(off)
-        sheet = accuracy.posterior(fit, 1e6 * np.eye(5))
+        sheet = parameters.posterior(fit, 1e6 * np.eye(5))
         model = SimpleNamespace(fit=fit)
-        return assemble._accuracy(model, sheet), assemble._less_accurate(model, sheet)
+        return known_parameters.accuracy(model, sheet), known_parameters.less_accurate(model, sheet)
 
     numbers, said = of(0.02)
     assert said == [] and numbers["mass"]["parameters"] == 3 and numbers["mass"]["high"] < numbers["damping"]["high"]

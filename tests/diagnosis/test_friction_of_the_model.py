@@ -4,6 +4,7 @@ import pytest
 
 from bayessim_mjx.diagnosis import run
 from bayessim_mjx.diagnosis.fitting import robot
+from bayessim_mjx.diagnosis.request import Request
 from bayessim_mjx.diagnosis.summary import assemble
 from tests.diagnosis.pendulums import ARMATURE, DAMPING, MASS, MODEL, STEP, recorded
 
@@ -28,7 +29,7 @@ def test_dry_friction_is_a_known_parameter_that_may_be_much_less(tmp_path):
 def diagnosed(folder, model: float, real: float):
     needed = [s for s in run.STAGES if not s.optional]
     logs = recorded(friction=real, **ENOUGH)
-    return assemble.diagnosis_of(run.investigate(rubbing(folder, model), logs, RUBS, stages=needed))
+    return assemble.diagnosis_of(run.investigate(rubbing(folder, model), logs, Request(RUBS), stages=needed))
 
 
 @pytest.mark.slow

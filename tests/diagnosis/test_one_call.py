@@ -14,8 +14,9 @@ import threadpoolctl
 import bayessim_mjx
 from bayessim_mjx import diagnosis
 from bayessim_mjx.diagnosis import run
-from bayessim_mjx.diagnosis.findings import Findings, Where
+from bayessim_mjx.diagnosis.findings import Findings, Observer, Where
 from bayessim_mjx.diagnosis.fitting.cutting import TooLittleData
+from bayessim_mjx.diagnosis.request import Request
 from bayessim_mjx.diagnosis.residual.where import Located
 from bayessim_mjx.diagnosis.selection.budget import Budget
 from bayessim_mjx.diagnosis.stages import carry_out
@@ -37,11 +38,16 @@ def broken(findings, say):
 
 def test_an_optional_stage_that_fails_is_a_warning_and_any_other_an_error():
     start, said = found(), []
-    after = carry_out([run.Stage("maps", broken, optional=True)], start, lambda *told: said.append(told), Budget())
+
+    class Says(Observer):
+        def progress(self, text, done, total):
+            said.append((text, done, total))
+
+    after = carry_out([run.Stage("maps", broken, optional=True)], start, Budget(), Says())
     assert after.warnings == ("maps: not available (ValueError: no map)",) and said == [("maps", 0, 1)]
     assert start.warnings == () and after.model == "a model"
     with pytest.raises(ValueError, match="no map"):
-        carry_out([run.Stage("maps", broken)], start, lambda *told: None, Budget())
+        carry_out([run.Stage("maps", broken)], start, Budget(), Observer())
 
 
 def test_findings_are_values():
@@ -156,9 +162,6 @@ def test_blas_has_one_thread_while_a_diagnosis_runs(monkeypatch):
 def test_the_verdict_alone_has_no_optional_stages(monkeypatch, left_out):
     setup = SimpleNamespace(said=(), fitter=None, candidates=None, settings=None)
     monkeypatch.setattr(run, "prepare", lambda *a, **k: setup)
-    monkeypatch.setattr(run, "_within", lambda setup, time_left: setup)
-    monkeypatch.setattr(run.resumed, "remembering", lambda setup, *a: setup)
-    monkeypatch.setattr(run.resumed, "ended", lambda setup: None)
     monkeypatch.setattr(run.selecting, "select", lambda *a: SimpleNamespace(answer="a model"))
     ran = []
 
@@ -166,7 +169,7 @@ def test_the_verdict_alone_has_no_optional_stages(monkeypatch, left_out):
         return run.Stage(name, lambda findings, say: ran.append(name) or findings, optional=optional)
 
     stages = [stage("how far", False), stage("maps", True)]
-    run.investigate(None, [], stages=stages, **left_out)
+    run.investigate(None, [], Request(**left_out), stages=stages)
     assert ran == (["how far"] if left_out else ["how far", "maps"])
 
 

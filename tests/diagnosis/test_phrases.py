@@ -55,5 +55,5 @@ def test_why_an_experiment_is_proposed():
 
 def test_why_a_model_is_a_rival_and_a_parameter_at_its_end():
     assert phrases.close_by(3.21, -0.1) == "held-out evidence differs by 3.2 nats, 0 % of the gap"
-    told = phrases.farthest_tried(0.5, " N m", "at most")
+    told = phrases.at_bound("at most", 0.5, "N m", physical=False)
     assert told.startswith("ends at 0.5 N m, the smallest value tried: at most")

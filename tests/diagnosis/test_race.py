@@ -6,12 +6,13 @@ import itertools
 import numpy as np
 import pytest
 
-from bayessim_mjx.diagnosis import phrases, resumed
+from bayessim_mjx.diagnosis import phrases, run
 from bayessim_mjx.diagnosis.evidence import selecting
-from bayessim_mjx.diagnosis.selection import pool
+from bayessim_mjx.diagnosis.request import Request
+from bayessim_mjx.diagnosis.selection import successive_halving
 from bayessim_mjx.diagnosis.selection.budget import Budget
-from bayessim_mjx.diagnosis.selection.left_out import not_fitted, not_tried
 from bayessim_mjx.diagnosis.setup import prepare
+from bayessim_mjx.diagnosis.summary.assemble import not_fitted, not_tried
 
 from .pendulums import nominal, recorded
 
@@ -24,8 +25,9 @@ SPRING = "joint_spring@hinge"
 @pytest.fixture(scope="module")
 def setup(tmp_path_factory):
     """Of a pendulum with a cubic spring, whose range ends at a fifth of the truth."""
-    effects = ["joint_spring", "coulomb_friction", "viscous_friction"]
-    found = prepare(nominal(tmp_path_factory.mktemp("spring")), recorded(cubic=CUBIC, count=6, seconds=2.0), effects)
+    request = Request(["joint_spring", "coulomb_friction", "viscous_friction"])
+    logs = recorded(cubic=CUBIC, count=6, seconds=2.0)
+    found = prepare(nominal(tmp_path_factory.mktemp("spring")), logs, request)
     return dataclasses.replace(found, candidates=tuple(map(narrowed, found.candidates)))
 
 
@@ -63,7 +65,7 @@ def test_a_truth_five_times_beyond_its_range_is_found(whole):
     )
     assert values["cubic"] == pytest.approx(CUBIC, rel=0.05)
     cubic = next(c for c in effect.coordinates if c.name.endswith("cubic"))
-    assert CUBIC < cubic.high <= 4 * CUBIC and not whole.above_noise(whole.answer)
+    assert CUBIC < cubic.high <= 4 * CUBIC and not whole.state.above_noise(whole.answer)
 
 
 def test_a_killed_search_goes_on_and_comes_to_the_same(setup, counted_whole, tmp_path):
@@ -78,24 +80,24 @@ def test_a_killed_search_goes_on_and_comes_to_the_same(setup, counted_whole, tmp
 
     simulator = setup.fitter.simulator
     with pytest.raises(Killed):
-        searched(resumed.remembering(setup, tmp_path), say)
-    before, again = simulator.rollouts, resumed.remembering(setup, tmp_path)
+        searched(run.remembering(setup, tmp_path), say)
+    before, again = simulator.rollouts, run.remembering(setup, tmp_path)
     rest = searched(again)
     there = again.fitter.journal.found
     assert there > 3 and rest.answer.label == whole.answer.label
     assert np.array_equal(rest.answer.fit.values, whole.answer.fit.values)
-    assert {k: m.total for k, m in rest.models.items()} == {k: m.total for k, m in whole.models.items()}
+    assert {k: m.total for k, m in rest.state.models.items()} == {k: m.total for k, m in whole.state.models.items()}
     assert simulator.rollouts - before < 0.7 * cost
 
 
 def test_without_time_the_first_answer_says_what_was_not_tried(setup, monkeypatch):
     """The clock strikes whenever it is read: the first effect is fitted, the others have no time."""
     clock = itertools.count()
-    monkeypatch.setattr(pool, "RULES", dataclasses.replace(pool.RULES, batch=1))
+    monkeypatch.setattr(successive_halving, "BATCH", 1)
     short = searched(setup, seconds=36.0, now=lambda: float(next(clock)))
-    assert short.answer.label == SPRING and len(short.cut_short) == 2
-    assert not_fitted(short) == {phrases.NO_TIME_LEFT: sorted(short.cut_short, key=labels(setup).index)}
-    assert "no time was left for 2 single effects" in not_tried(short)
+    assert short.answer.label == SPRING and len(short.state.cut_short) == 2
+    assert not_fitted(short.state) == {phrases.NO_TIME_LEFT: sorted(short.state.cut_short, key=labels(setup).index)}
+    assert "no time was left for 2 single effects" in not_tried(short.state)
 
 
 def test_when_the_time_is_over_the_verdict_rests_on_what_is_fitted(setup, counted_whole):

@@ -5,6 +5,7 @@ import pytest
 
 from bayessim_mjx.diagnosis import run
 from bayessim_mjx.diagnosis.fitting import robot
+from bayessim_mjx.diagnosis.request import Request
 from bayessim_mjx.diagnosis.summary import assemble
 
 from .missing_forces import STEP, arm, record
@@ -20,7 +21,7 @@ def cable(t, data):
 
 def diagnosed(force, effects):
     needed = [s for s in run.STAGES if not s.optional]
-    found = run.investigate(robot.robot_of(arm(1, STEP)), record(force=force, logs=6), effects, stages=needed)
+    found = run.investigate(robot.robot_of(arm(1, STEP)), record(force=force, logs=6), Request(effects), stages=needed)
     return assemble.diagnosis_of(found)
 
 

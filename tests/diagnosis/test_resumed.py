@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from bayessim_mjx import versions
-from bayessim_mjx.diagnosis import resumed
+from bayessim_mjx.diagnosis import run
+from bayessim_mjx.diagnosis.request import Request
 from bayessim_mjx.diagnosis.setup import prepare
 from tests.diagnosis.pendulums import nominal, recorded
 
@@ -16,13 +17,13 @@ ANEW = "made by other code than that which runs now; the search begins anew"
 
 def found_in(folder, setup):
     """How much is on disk of two that are asked for: a beginning and a fit."""
-    fitter = resumed.remembering(setup, folder).fitter
+    fitter = run.remembering(setup, folder).fitter
     fitter.iterate([fitter.begin((), np.zeros(0))], 1, lambda fit: [])
     return fitter.journal.found
 
 
 def test_fits_of_other_sources_of_the_package_are_made_anew(tmp_path, monkeypatch):
-    setup = prepare(nominal(tmp_path), recorded(count=3, seconds=1.0), ["viscous_friction"])
+    setup = prepare(nominal(tmp_path), recorded(count=3, seconds=1.0), Request(["viscous_friction"]))
     other = dataclasses.replace(setup, settings=dataclasses.replace(setup.settings, iterations=3))
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)

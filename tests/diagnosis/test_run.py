@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 from bayessim_mjx.diagnosis import result, run
-from bayessim_mjx.diagnosis.findings import Findings
+from bayessim_mjx.diagnosis.findings import Findings, Observer
 from bayessim_mjx.diagnosis.fitting.cutting import TooLittleData
+from bayessim_mjx.diagnosis.request import Request
 from bayessim_mjx.diagnosis.selection import heldout
-from bayessim_mjx.diagnosis.summary import assemble, preliminary
+from bayessim_mjx.diagnosis.summary import assemble, files
 
 from .pendulums import FEW, nominal, recorded
 
@@ -27,11 +28,12 @@ GAP = {"noise_floor", "nominal", "calibrated", "with_effects", "reducible_floor"
 def diagnosed(folder, logs, effects=FEW) -> tuple[Findings, result.Diagnosis]:
     seen = itertools.count()
 
-    def keep(setup, tried):
-        preliminary.write(folder / "so_far" / f"{next(seen)}.json", {"robot": "pendulum"}, setup, tried)
+    class Keeps(Observer):
+        def known(self, setup, tried):
+            files.write_preliminary(folder / "so_far" / f"{next(seen)}.json", {"robot": "pendulum"}, setup, tried)
 
     needed = [s for s in run.STAGES if not s.optional]
-    found = run.investigate(nominal(folder), logs, effects, notes=["a note"], stages=needed, keep=keep)
+    found = run.investigate(nominal(folder), logs, Request(effects, notes=["a note"]), Keeps(), needed)
     return found, assemble.diagnosis_of(found)
 
 
@@ -73,7 +75,7 @@ def test_what_the_answer_rests_on_comes_with_it(rubbing):
     found, diagnosis = rubbing
     selection = found.selection
     named = frozenset(["coulomb_friction@hinge"])
-    assert {frozenset(), named} <= selection.weighed.weight.keys() <= selection.models.keys()
+    assert {frozenset(), named} <= selection.weighed.weight.keys() <= selection.state.models.keys()
     assert selection.weighed.answer == named and selection.weighed.nats[named] > 50
     assert len(selection.estimated.mean) == len(selection.answer.fit.values) == len(selection.estimated.covariance)
     assert set(selection.chosen.values()) == {named}
@@ -197,7 +199,7 @@ def test_an_effect_that_is_not_on_offer_is_unexplained(tmp_path):
 @pytest.mark.ci
 def test_too_little_data_is_said(tmp_path):
     with pytest.raises(TooLittleData, match="windows|control steps"):
-        run.investigate(nominal(tmp_path), recorded(count=1, seconds=2.0), ("actuator_delay",))
+        run.investigate(nominal(tmp_path), recorded(count=1, seconds=2.0), Request(("actuator_delay",)))
     empty = assemble.insufficient("too short", ["a note"])
     assert empty.verdict == "insufficient_data" and empty.effects == [] and "a note" in empty.warnings
     empty.save(tmp_path)

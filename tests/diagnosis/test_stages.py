@@ -6,7 +6,7 @@ from types import MappingProxyType
 
 import pytest
 
-from bayessim_mjx.diagnosis.findings import Findings
+from bayessim_mjx.diagnosis.findings import Findings, Observer
 from bayessim_mjx.diagnosis.selection.budget import Budget
 from bayessim_mjx.diagnosis.stages import Stage, carry_out
 
@@ -24,10 +24,6 @@ def found():
     return Findings(None, None, parts=MappingProxyType({str: "before"}), warnings=("before",))
 
 
-def silent(text, done, total):
-    pass
-
-
 def adding(part, meeting=None):
     """A stage's function; meeting: a barrier that both of two stages have to reach."""
 
@@ -42,7 +38,7 @@ def adding(part, meeting=None):
 def test_stages_beside_each_other_go_on_at_once_and_their_parts_are_joined(found):
     meeting = threading.Barrier(2)  # one after the other would wait for ever
     stages = [Stage("a", adding(First(), meeting), beside=True), Stage("b", adding(Second(), meeting), beside=True)]
-    after = carry_out(stages, found, silent, Budget())
+    after = carry_out(stages, found, Budget(), Observer())
     assert set(after.parts) == {str, First, Second} and after.parts[str] == "before"
     assert after.warnings == ("before", "First", "Second")
 
@@ -55,7 +51,7 @@ def test_under_a_limit_they_take_turns_and_are_left_out_once_the_time_is_over(fo
         return found.having(First())
 
     stages = [Stage("a", slow, beside=True, patient=True), Stage("b", adding(Second()), beside=True, patient=True)]
-    after = carry_out(stages, found, silent, Budget(10.0, 0.0, lambda: clock[0]))
+    after = carry_out(stages, found, Budget(10.0, 0.0, lambda: clock[0]), Observer())
     assert First in after.parts and Second not in after.parts
     assert after.warnings == ("before", "b: left out, the time was over")
 
@@ -68,16 +64,17 @@ def test_the_verdict_has_what_is_needed_and_waits_for_nothing_that_is_optional(f
         assert told.wait(timeout=10)
         raise ValueError("a picture less")
 
-    def verdict(findings):
-        seen.append(findings)
-        told.set()
+    class Waits(Observer):
+        def verdict(self, found):
+            seen.append(found)
+            told.set()
 
     stages = [
         Stage("first", adding(First())),
         Stage("second", adding(Second()), beside=True),
         Stage("maps", optional, optional=True, beside=True),
     ]
-    after = carry_out(stages, found, silent, Budget(limit, 0.0, lambda: 0.0), verdict)
+    after = carry_out(stages, found, Budget(limit, 0.0, lambda: 0.0), Waits())
     (one,) = seen
     assert set(one.parts) == {str, First, Second} and one.warnings == ("before", "First", "Second")
     assert after.parts == one.parts
@@ -90,4 +87,6 @@ def test_a_stage_that_is_needed_is_not_lost_in_silence(found, beside):
         raise ValueError("no verdict")
 
     with pytest.raises(ValueError, match="no verdict"):
-        carry_out([Stage("a", fails, beside=beside), Stage("b", adding(First()), beside=True)], found, silent, Budget())
+        carry_out(
+            [Stage("a", fails, beside=beside), Stage("b", adding(First()), beside=True)], found, Budget(), Observer()
+        )

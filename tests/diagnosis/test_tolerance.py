@@ -12,7 +12,7 @@ from bayessim_mjx.diagnosis import tolerance
 from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
 from bayessim_mjx.diagnosis.result import FoundEffect, Gap
 from bayessim_mjx.diagnosis.selection.heldout import Prediction
-from bayessim_mjx.diagnosis.summary import how_far, repeated, sentences, verdict
+from bayessim_mjx.diagnosis.summary import how_far, sentences, verdict
 from bayessim_mjx.diagnosis.summary.whole_logs import Whole
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs import Channels, Log
@@ -112,9 +112,11 @@ def findings(rms, noise=50.0, windows=8, beyond=()):
     selection = SimpleNamespace(
         ambiguous=False,
         rivals={},
-        noise=noise,
-        above_noise=lambda m: True,
-        base=SimpleNamespace(total=windows * noise * 1e6, cost=np.ones(windows)),
+        state=SimpleNamespace(
+            noise=noise,
+            above_noise=lambda m: True,
+            base=SimpleNamespace(total=windows * noise * 1e6, cost=np.ones(windows)),
+        ),
     )
     cut = SimpleNamespace(windows=SimpleNamespace(steps=5))
     whole = Whole({}, {}, np.zeros(len(beyond)), np.array(beyond), np.zeros(len(beyond), int), "whole log", 4.0, ())
@@ -237,13 +239,13 @@ def test_the_floor_is_what_repeats_differ_by(monkeypatch):
         simulator=simulator, used=np.array([True, False]), sigma=np.array([sigma]), spread=np.array([10.0, 10.0])
     )
     fit = SimpleNamespace(B=B, offsets=np.zeros((count, 2)))
-    monkeypatch.setattr(repeated.noise, "repeats", lambda logs: [logs[:2]])
-    prediction, group = repeated.floor(fitter, fit, logs)
+    monkeypatch.setattr(how_far.noise, "repeats", lambda logs: [logs[:2]])
+    prediction, group = how_far.repeats(fitter, fit, logs)
     assert len(group) == count
     # two of ten numbers of a window go into its start state
     assert np.sqrt(prediction.cost(steps).mean() / 0.8) == pytest.approx(np.sqrt(5.0), rel=0.05)
-    monkeypatch.setattr(repeated.noise, "repeats", lambda logs: [])
-    assert repeated.floor(fitter, fit, logs) is None
+    monkeypatch.setattr(how_far.noise, "repeats", lambda logs: [])
+    assert how_far.repeats(fitter, fit, logs) is None
 
 
 def test_without_repeats_the_floor_is_the_noise_whatever_was_tried():

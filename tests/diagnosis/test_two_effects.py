@@ -16,4 +16,4 @@ def test_two_effects_are_both_named(tmp_path):
     assert numbers["actuator_delay"] == pytest.approx(0.008, rel=0.1)
     assert sum(e.share for e in diagnosis.effects) == pytest.approx(1.0)
     assert all(e.share > 0.02 for e in diagnosis.effects)
-    assert len(found.selection.subsets) == 4 and found.selection.subsets[frozenset()] is found.selection.base
+    assert len(found.selection.subsets) == 4 and found.selection.subsets[frozenset()] is found.selection.state.base

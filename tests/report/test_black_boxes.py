@@ -9,8 +9,7 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parent))
 import fake  # noqa: E402
 
-from bayessim_mjx.diagnosis.residual.black_boxes import BlackBoxes
-from bayessim_mjx.diagnosis.residual.formula import Term
+from bayessim_mjx.diagnosis.residual.black_boxes import BlackBoxes, Term
 from bayessim_mjx.diagnosis.summary.left_in_words import black_boxes_in_words, formula_in_words
 from bayessim_mjx.report import evidence
 

@@ -13,33 +13,33 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bayessim_mjx.diagnosis.evidence.columns import Column
-from bayessim_mjx.diagnosis.evidence.inertia import alike
-from bayessim_mjx.diagnosis.evidence.looking import Plan, Progress, around
+from bayessim_mjx.diagnosis.evidence.laws import as_large, inertia, related, special_case, with_same_inertia
+from bayessim_mjx.diagnosis.evidence.promises import Column, Plan, around
+from bayessim_mjx.diagnosis.evidence.sets import ODDS, Weighed
 from bayessim_mjx.diagnosis.evidence.weighing import Weighing
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fit import Fit
 from bayessim_mjx.diagnosis.selection.bounds import widened
-from bayessim_mjx.diagnosis.selection.budget import LEAVING_OUT, SINGLES, TOGETHER
-from bayessim_mjx.diagnosis.selection.laws import inertia, related, special_case
-from bayessim_mjx.diagnosis.selection.models import Model, scored
-from bayessim_mjx.diagnosis.selection.pool import Entries, Pool, cut_back, fit_entries, polish
-from bayessim_mjx.diagnosis.selection.sets import BASE, ODDS, Key, Weighed
+from bayessim_mjx.diagnosis.selection.budget import LEAVING_OUT, SINGLES, TOGETHER, Progress
+from bayessim_mjx.diagnosis.selection.fits import cut_back, polish
+from bayessim_mjx.diagnosis.selection.models import BASE, Key, Model, scored
+from bayessim_mjx.diagnosis.selection.search_state import SearchState
+from bayessim_mjx.diagnosis.selection.successive_halving import Entries, fit_entries
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Effort:
-    """How much is fitted; more of each finds the same sets, later.
+    """How many sets are fitted. Larger numbers find the same sets, but take longer.
 
     Attributes:
-        rounds: of looking around the leading set, at most.
-        sizes: sets of one, two and more further effects that are fitted in a round, on top of the leading set.
+        rounds: at most so many, each around the leading set.
+        sizes: sets with one, two and more further effects that a round fits on top of the leading set.
         instead: likewise in the place of each of its effects; base: on the known parameters.
-        least: single effects that are fitted however little they promise: promises are linear.
+        least: single effects that are fitted in any case, as promises are linear.
         margin: nats below the leading set, within which a promised set is fitted.
-        leading: sets whose ranges may grow; finalists: whose fits are brought to their end.
+        leading: sets whose ranges may grow; finalists: sets whose fits are brought to convergence.
     """
 
     rounds: int = 5
@@ -56,23 +56,23 @@ EFFORT = Effort()
 
 
 class Search:
-    """The sets fitted so far, their evidence, and what promises more."""
+    """The search: fitted sets, their evidence, and plans for further sets."""
 
-    def __init__(self, pool: Pool, say: Progress) -> None:
-        self.pool, self.say = pool, say
-        self.weighing = Weighing(pool)
+    def __init__(self, state: SearchState, say: Progress) -> None:
+        self.state, self.say = state, say
+        self.weighing = Weighing(state)
         self._plans: dict[Key, list[Plan]] = {}
         self._polished: set[Key] = set()
         self._again: set[tuple[Key, Key]] = set()
 
     def run(self) -> Weighed:
-        """All rounds; the posterior over what was fitted."""
+        """Run all rounds; returns the posterior over the fitted sets."""
         self._fit(self._worth(self._around(BASE), (EFFORT.sizes[0], 0, 0), EFFORT.least), SINGLES, SINGLES)
         self._leading()
         for made in range(EFFORT.rounds):
             best = self._order()[0]
             todo = self._todo(best)
-            if not todo or self.pool.settings.budget.over(TOGETHER):
+            if not todo or self.state.settings.budget.over(TOGETHER):
                 break
             self._fit(todo, f"round {made + 1}", TOGETHER)
             self._leading()
@@ -92,7 +92,7 @@ class Search:
         return list(self.weighing.weighed().weight)
 
     def _todo(self, best: Key) -> list[Plan]:
-        """What to fit around the leading set: beside one that leaves nothing relevant, what promises to be likelier."""
+        """Plans around the leading set; if it leaves nothing relevant, larger sets have to promise more than it has."""
         smaller = [k for k in (best - {x} for x in sorted(best)) if k and k in self.weighing.scored]
         plans = [p for k in smaller for p in self._worth(self._around(k), EFFORT.instead)]
         plans += [p for k in dict.fromkeys([best, *self.weighing.weighed().beside]) for p in self._related(k)]
@@ -110,13 +110,13 @@ class Search:
         All else begins where the effect has it: a law with a neutral number more is the same model, in the same place.
         A promise is one direction: friction that differs by direction, or falls with speed, is none of them.
         """
-        out, model = [], self.pool.models[best]
+        out, model = [], self.state.models[best]
         for effect in model.effects:
             rest = best - {effect.label}
-            if rest not in self.pool.models:
+            if rest not in self.state.models:
                 continue
-            for c in self.pool.candidates:
-                points = self.pool.secants.columns.get(c.label, ())
+            for c in self.state.candidates:
+                points = self.state.secants.columns.get(c.label, ())
                 key = rest | {c.label}
                 if points and related(c, effect) and (self._first(best, key) if inertia(c, effect) else self._new(key)):
                     starts, known = self._begun(model, effect, c)
@@ -133,12 +133,12 @@ class Search:
     def _begun(self, model: Model, effect: Candidate, law: Candidate) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
         """Where a law begins in the place of an effect: (its numbers, the known parameters beside them)."""
         if inertia(law, effect):
-            start = alike(self.pool.fitter, model, effect, law)
+            start = with_same_inertia(self.state.fitter, model, effect, law)
             return ((), ()) if start is None else ((start.own,), (start.known,))
-        return _as_large(law, effect, model.values_of(effect)), ()
+        return as_large(law, effect, model.values_of(effect)), ()
 
     def _new(self, key: Key) -> bool:
-        return key not in self.pool.models and key not in self.pool.vain
+        return key not in self.state.models and key not in self.state.vain
 
     def _around(self, key: Key) -> list[Plan]:
         if key not in self._plans:
@@ -166,20 +166,20 @@ class Search:
         while True:
             some = [k for k in self._order()[: EFFORT.leading] if k]
             for key in some:
-                widened(self.pool, self.pool.models[key], self.say)
+                widened(self.state, self.state.models[key], self.say)
             self.weighing.score(some)
             nats = self.weighing.weighed().nats
             near = [k for k in some if nats.get(k, -np.inf) > max(nats.values()) - EFFORT.margin]
             fewer = {k - {x}: k for k in near[::-1] for x in sorted(k) if k - {x} not in self.weighing.scored}
-            if not fewer or self.pool.settings.budget.over(LEAVING_OUT):
+            if not fewer or self.state.settings.budget.over(LEAVING_OUT):
                 return
             self._fit([Plan(key, np.inf, parent) for key, parent in fewer.items()], "dropping", LEAVING_OUT)
 
     def _finish(self) -> None:
         """The fits of the finalists brought to their end."""
         some = [k for k in self._order()[: EFFORT.finalists] if k and k not in self._polished]
-        if some and not self.pool.settings.budget.over(LEAVING_OUT):
-            polish(self.pool, [self.pool.models[k] for k in some], self.say)
+        if some and not self.state.settings.budget.over(LEAVING_OUT):
+            polish(self.state, [self.state.models[k] for k in some], self.say)
             self._polished |= set(some)
             self.weighing.score(some)
 
@@ -190,71 +190,54 @@ class Search:
         """
         found = self.weighing.weighed()
         for key in (found.answer, *found.beside):
-            model = self.pool.models[key]
+            model = self.state.models[key]
             for law in model.effects:
-                for c in (c for c in self.pool.candidates if special_case(c, law) and c.where == law.where):
+                for c in (c for c in self.state.candidates if special_case(c, law) and c.where == law.where):
                     self._placed(model, law, c)
 
     def _placed(self, model: Model, law: Candidate, case: Candidate) -> None:
         """A special case in the place of a model's law, as large as it is; kept where it is likelier than it was."""
-        pool, starts = self.pool, _as_large(case, law, model.values_of(law))
+        state, starts = self.state, as_large(case, law, model.values_of(law))
         kept = tuple(e for e in model.effects if e is not law)
         if not starts:
             return
-        fit = pool.fitter.refresh(pool.fitter.derive(cut_back(pool, model, kept), case.coordinates, starts[0]))
-        self._likelier({frozenset(e.label for e in (*kept, case)): scored(pool.fitter, fit, (*kept, case))})
+        fit = state.fitter.refresh(state.fitter.derive(cut_back(state, model, kept), case.coordinates, starts[0]))
+        self._likelier({frozenset(e.label for e in (*kept, case)): scored(state.fitter, fit, (*kept, case))})
 
     def _likelier(self, models: Mapping[Key, Model]) -> None:
         """Takes models in the place of those of the same effects, where they are likelier."""
-        before = {k: (self.pool.models[k], self.weighing.scored[k]) for k in models if k in self.weighing.scored}
-        self.pool.models.update(models)
+        before = {k: (self.state.models[k], self.weighing.scored[k]) for k in models if k in self.weighing.scored}
+        self.state.models.update(models)
         self.weighing.score(list(models))
         for key, (model, found) in before.items():
             if self.weighing.scored[key].found.nats < found.found.nats:
-                self.pool.models[key], self.weighing.scored[key] = model, found
+                self.state.models[key], self.weighing.scored[key] = model, found
             else:
                 self._polished.discard(key)
 
     def _fit(self, plans: Sequence[Plan], label: str, part: str) -> None:
         entries: Entries = {plan.key: self._entry(plan) for plan in plans}
-        parents = {p.key: self.pool.models[p.parent] for p in plans if p.columns}
-        old = {key: self.pool.models[key] for key in entries if key in self.weighing.scored}
-        fit_entries(self.pool, entries, label, self.say, part, parents)
-        new = {key: self.pool.models[key] for key in old if self.pool.models[key] is not old[key]}
-        self.pool.models.update(old)
+        parents = {p.key: self.state.models[p.parent] for p in plans if p.columns}
+        old = {key: self.state.models[key] for key in entries if key in self.weighing.scored}
+        fit_entries(self.state, entries, label, self.say, part, parents)
+        new = {key: self.state.models[key] for key in old if self.state.models[key] is not old[key]}
+        self.state.models.update(old)
         self._likelier(new)
         self.weighing.score([p.key for p in plans])
 
     def _entry(self, plan: Plan) -> tuple[list[Fit], tuple[Candidate, ...]]:
-        pool, model = self.pool, self.pool.models[plan.parent if plan.origin is None else plan.origin]
+        state, model = self.state, self.state.models[plan.parent if plan.origin is None else plan.origin]
         kept = tuple(e for e in model.effects if e.label in plan.key)
-        fit = model.fit if len(kept) == len(model.effects) else cut_back(pool, model, kept)
+        fit = model.fit if len(kept) == len(model.effects) else cut_back(state, model, kept)
         if not plan.columns:
             return [fit], kept
-        now = {c.label: c for c in pool.candidates}  # in ranges as wide as they are by now
+        now = {c.label: c for c in state.candidates}  # in ranges as wide as they are by now
         new = [now[c.candidate.label] for c in plan.columns]
         coordinates = [c for e in new for c in e.coordinates]
         starts = [np.concatenate([c.at(t) for c, t in zip(plan.columns, plan.amounts, strict=True)])]
         starts += [p for i, p in enumerate(plan.points) if not any(np.array_equal(p, q) for q in plan.points[:i])]
-        begun = pool.begun(fit)
+        begun = state.begun(fit)
         fits = [begun] * len(starts)
         for i, known in enumerate(plan.known, len(starts) - len(plan.known)):
             fits[i] = replace(begun, values=np.concatenate([known, begun.values[len(known) :]]))
-        return [pool.fitter.derive(f, coordinates, s) for f, s in zip(fits, starts, strict=True)], (*kept, *new)
-
-
-def _as_large(one: Candidate, other: Candidate, values: Array) -> tuple[Array, ...]:
-    """A law's numbers by those of another that have the same units, the last of them for any more; else neutral.
-
-    () where none has the same unit.
-    """
-    found = []
-    there = {
-        c.unit: [v for o, v in zip(other.coordinates, values.tolist(), strict=True) if o.unit == c.unit]
-        for c in one.coordinates
-    }
-    for c in one.coordinates:
-        same = there[c.unit]
-        value = c.neutral if not same else same.pop(0) if len(same) > 1 else same[0]
-        found.append(float(np.clip(value, c.low, c.high)))
-    return (np.array(found),) if any(there.values()) else ()
+        return [state.fitter.derive(f, coordinates, s) for f, s in zip(fits, starts, strict=True)], (*kept, *new)

@@ -4,27 +4,89 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis import phrases
-from bayessim_mjx.diagnosis.evidence.estimates import at_its_mean, estimated, size_in
+from bayessim_mjx.diagnosis.evidence import masked_effects
+from bayessim_mjx.diagnosis.evidence.laws import compatible, special_cases
 from bayessim_mjx.diagnosis.evidence.search import Search
-from bayessim_mjx.diagnosis.evidence.weighing import Weighing
+from bayessim_mjx.diagnosis.evidence.sets import Weighed
+from bayessim_mjx.diagnosis.evidence.weighing import Estimated, Size, Weighing, at_its_mean, estimated, size_in
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fitter import Fitter
-from bayessim_mjx.diagnosis.selection import hidden, predicted_gain, stand_ins
-from bayessim_mjx.diagnosis.selection.begin import begin
-from bayessim_mjx.diagnosis.selection.budget import LEAVING_OUT
-from bayessim_mjx.diagnosis.selection.laws import compatible, special_cases
-from bayessim_mjx.diagnosis.selection.models import Model
-from bayessim_mjx.diagnosis.selection.pool import Entries, Pool, Progress, cut_back, fit_entries
-from bayessim_mjx.diagnosis.selection.selected import Rival, Selection, selection_of
-from bayessim_mjx.diagnosis.selection.sets import BASE, Key, Weighed
-from bayessim_mjx.diagnosis.selection.tried import Settings, Tried
+from bayessim_mjx.diagnosis.fitting.quadratic import Quadratic, eliminate, solve
+from bayessim_mjx.diagnosis.gap import Gap
+from bayessim_mjx.diagnosis.selection.budget import LEAVING_OUT, Progress
+from bayessim_mjx.diagnosis.selection.fits import begin, cut_back
+from bayessim_mjx.diagnosis.selection.models import BASE, Key, Model
+from bayessim_mjx.diagnosis.selection.search_state import SearchState, Settings
+from bayessim_mjx.diagnosis.selection.successive_halving import Entries, fit_entries
+from bayessim_mjx.diagnosis.statistics import shapley
 
-MANY = 4  # effects, up to which every subset is fitted
+Array = NDArray[np.float64]
+MANY = 4  # effects; of an answer with more not every subset is fitted
+FURTHEST = 2.0  # times the screened start; a secant is not trusted further
+
+
+@dataclass(frozen=True, eq=False)
+class Rival:
+    """Another explanation that fits these logs as well as the answer, or as a part of it.
+
+    Attributes:
+        effects: those that the answer lacks; model: these together with other effects of the answer.
+        closure: share of the gap that the model closes; why: it is a rival, in words.
+        contains: whether it contains the effect as a special case, and so is no other explanation.
+        size: of its effect; None if it has several.
+    """
+
+    effects: tuple[Candidate, ...]
+    model: Model
+    closure: float
+    why: str
+    contains: bool = False
+    size: Size | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        return {"effects": [c.label for c in self.effects], "gap_closed": self.closure, "why": self.why}
+
+
+@dataclass(frozen=True, eq=False)
+class Selection:
+    """The result of the search.
+
+    Attributes:
+        state: all fitted models; it is only read from here on.
+        answer: the named model (`state.base` if no effect is named).
+        rivals: {label of one of its effects: explanations that may take its place}.
+        subsets: {labels: the model with these of its effects}, every one refitted; {} of one effect or of too many.
+        promised: predicted share of the base model's gap that its effects close, {label: part}.
+        chosen: {operating condition: effects that are named without it}.
+        elsewhere: share of the gap closed on conditions that the choice was made without; NaN of one condition.
+        hidden: labels of effects that would not show beside those of the answer (`masked_effects.by_effects`).
+        stand_ins: {known parameter: labels of effects that it may stand for} (`masked_effects.by_parameters`).
+        weighed: probabilities of the sets that were fitted; estimated: posterior of the answer's numbers.
+    """
+
+    state: SearchState
+    answer: Model
+    rivals: Mapping[str, tuple[Rival, ...]]
+    subsets: Mapping[Key, Model]
+    promised: tuple[float, Mapping[str, float]]
+    chosen: Mapping[int, Key]
+    elsewhere: float
+    hidden: tuple[str, ...]
+    stand_ins: Mapping[str, tuple[str, ...]]
+    weighed: Weighed
+    estimated: Estimated
+
+    @property
+    def ambiguous(self) -> bool:
+        """Whether a rival that does not contain the effect as a special case fits as well."""
+        return any(not r.contains for rivals in self.rivals.values() for r in rivals)
 
 
 def select(
@@ -32,29 +94,33 @@ def select(
     candidates: Sequence[Candidate],
     settings: Settings,
     say: Progress,
-    keep: Callable[[Tried], None] = lambda tried: None,
+    keep: Callable[[SearchState], None] = lambda state: None,
 ) -> Selection:
-    """What the logs on the windows of `fitter` call for; `keep` is called with what was tried so far."""
-    pool = begin(fitter, candidates, settings, say, keep)
-    search = Search(pool, say)
+    """Search for the effects that the logs on the windows of `fitter` call for.
+
+    Args:
+        keep: called with the state of the search after each part.
+    """
+    state = begin(fitter, candidates, settings, say, keep)
+    search = Search(state, say)
     found = search.run()
-    keep(pool)
+    keep(state)
     at_its_mean(search.weighing, found.answer)
-    pool.base = pool.models[BASE]
+    state.base = state.models[BASE]
     names = np.unique(fitter.simulator.windows.group)
     chosen = {int(g): search.weighing.without(int(g)).answer for g in names} if len(names) > 1 and found.answer else {}
-    answer = pool.models[found.answer]
+    answer = state.models[found.answer]
     few = 1 < len(answer.effects) <= MANY and not settings.budget.over(LEAVING_OUT)
-    return selection_of(
-        pool,
-        answer,
+    return Selection(
+        state=state,
+        answer=answer,
         rivals={e.label: tuple(_rivals(search.weighing, e, found)) for e in answer.effects},
-        subsets=_subsets(pool, answer, say) if few else {},
-        promised=predicted_gain.promised(pool, answer.effects) if answer.effects else (0.0, {}),
+        subsets=_subsets(state, answer, say) if few else {},
+        promised=promised(state, answer.effects) if answer.effects else (0.0, {}),
         chosen=chosen,
-        elsewhere=_elsewhere(pool, chosen),
-        hidden=hidden.beside(pool, answer, say),
-        stand_ins=stand_ins.of_parameters(pool, answer),
+        elsewhere=_elsewhere(state, chosen),
+        hidden=masked_effects.by_effects(state, answer, say),
+        stand_ins=masked_effects.by_parameters(state, answer),
         weighed=found,
         estimated=estimated(search.weighing, found),
     )
@@ -67,40 +133,105 @@ def _rivals(weighing: Weighing, effect: Candidate, found: Weighed) -> list[Rival
 
 
 def _rival(weighing: Weighing, effect: Candidate, key: Key, found: Weighed) -> Rival:
-    pool = weighing.pool
-    model, answer = pool.models[key], pool.models[found.answer]
+    state = weighing.state
+    model, answer = state.models[key], state.models[found.answer]
     others = tuple(e for e in model.effects if e.label not in found.answer)
     contains = any(effect.effect in special_cases(o) and o.where == effect.where for o in others)
     same = any(o.effect == effect.effect and not compatible(o, effect) for o in others)
-    closed = pool.gap(model).closed
+    closed = state.gap(model).closed
     nats = found.nats[found.answer] - found.nats[key]
-    why = phrases.CONTAINS if contains else phrases.close_by(nats, pool.gap(answer).closed - closed)
+    why = phrases.CONTAINS if contains else phrases.close_by(nats, state.gap(answer).closed - closed)
     size = size_in(weighing.scored[key], others[0]) if len(others) == 1 else None
     return Rival(others, model, closed, why, contains or same, size)
 
 
-def _subsets(pool: Pool, answer: Model, say: Progress) -> dict[Key, Model]:
+def _subsets(state: SearchState, answer: Model, say: Progress) -> dict[Key, Model]:
     """{labels: the model with these of the answer's effects}, each fitted from one with one effect more."""
     every = frozenset(e.label for e in answer.effects)
     for size in range(len(every) - 1, 0, -1):
         entries: Entries = {}
         for own in map(frozenset, itertools.combinations(sorted(every), size)):
-            parent = pool.models.get(own | {min(every - own)})
-            if own not in pool.models and parent is not None:
+            parent = state.models.get(own | {min(every - own)})
+            if own not in state.models and parent is not None:
                 kept = tuple(e for e in parent.effects if e.label in own)
-                entries[own] = ([cut_back(pool, parent, kept)], kept)
-        fit_entries(pool, entries, "dropping", say, LEAVING_OUT)
+                entries[own] = ([cut_back(state, parent, kept)], kept)
+        fit_entries(state, entries, "dropping", say, LEAVING_OUT)
     known = itertools.chain.from_iterable(itertools.combinations(every, n) for n in range(len(every) + 1))
-    found = {frozenset(own): pool.models.get(frozenset(own)) for own in known}
+    found = {frozenset(own): state.models.get(frozenset(own)) for own in known}
     return {own: model for own, model in found.items() if model is not None} if all(found.values()) else {}
 
 
-def _elsewhere(pool: Pool, chosen: Mapping[int, Key]) -> float:
+def _elsewhere(state: SearchState, chosen: Mapping[int, Key]) -> float:
     """Share of the squared gap closed on operating conditions that the choice was made without, at most 1.
 
     The fits behind the choice had seen the condition, so the share is a little too high. A share much below that of the
     answer means that the answer was chosen for what it does by chance. NaN of one condition, and where there is no gap.
     """
-    group = pool.fitter.simulator.windows.group
-    after = sum(float(np.sum(pool.models[k].cost[group == g])) for g, k in chosen.items())
-    return replace(pool.gap(pool.models[BASE]), after=after).closed if chosen else float("nan")
+    group = state.fitter.simulator.windows.group
+    after = sum(float(np.sum(state.models[k].cost[group == g])) for g, k in chosen.items())
+    return replace(state.gap(state.models[BASE]), after=after).closed if chosen else float("nan")
+
+
+def promised(state: SearchState, effects: Sequence[Candidate]) -> tuple[float, dict[str, float]]:
+    """Shares of the recalibrated simulator's squared gap above the noise that adding effects promises to close.
+
+    Before any is fitted: linear, from one simulation of each, in the unit of what they then close: mean squares of the
+    windows.
+
+    Returns:
+        Of all effects, and of each (Shapley, 1953).
+    """
+    q, precision, high = _linear(state, effects)
+    base = len(state.fitter.base)
+
+    _, pull, low, top = state.base.fit.prior()
+    even = np.ones(len(state.base.fit.r))  # all windows count alike, as in what is realised
+
+    def left(some: frozenset[int]) -> float:
+        """Mean square with some of the effects, the known parameters refitted."""
+        columns = np.array([*range(base), *(base + i for i in sorted(some))], dtype=np.int64)
+        more = np.zeros(len(some))
+        own = q.subset(columns)
+        g, S = own.weighted(even)
+        limits = np.concatenate([low, more]), np.concatenate([top, high[sorted(some)]])
+        p = solve(S + np.diag(precision[columns]), g + np.concatenate([pull, more]), *limits)
+        return float(own.at(p).mean()) / state.noise
+
+    before = left(frozenset())
+    every = frozenset(range(len(effects)))
+
+    def share(some: frozenset[int]) -> float:
+        return max(Gap(before, left(some)).closed, 0.0)  # what promises harm is not added
+
+    each, total = shapley(len(effects), share), share(every)
+    return total, {e.label: share for e, share in zip(effects, each, strict=True)}
+
+
+def _linear(state: SearchState, effects: Sequence[Candidate]) -> tuple[Quadratic, Array, Array]:
+    """(quadratic in the known parameters' steps and the amounts of the effects, precisions, largest amounts).
+
+    An amount of 1 is the start that the screening chose.
+    """
+    fitter, fit = state.fitter, state.base.fit
+    starts = [next(s.start for s in state.screened if s.candidate.label == e.label) for e in effects]
+    pairs = list(zip(effects, starts, strict=True))
+    thetas = [fitter.vector((*fit.coordinates, *e.coordinates), np.concatenate([fit.values, s])) for e, s in pairs]
+    moved = fitter.whiten(fitter.simulator.run(np.stack(thetas), np.repeat(fit.offsets[None], len(thetas), 0)))
+    A = np.concatenate([fit.A, np.moveaxis(fit.r[None] - moved, 0, -1)], axis=2)
+    q, _ = eliminate(fit.r, A, fit.B, fit.offsets, fitter.spread)
+    known = fit.belief()
+    return q, np.array([*known, *(_precision(e, s) for e, s in pairs)]), np.array([_furthest(e, s) for e, s in pairs])
+
+
+def _precision(effect: Candidate, start: Array) -> float:
+    return float(sum(c.precision * (s - c.neutral) ** 2 for c, s in zip(effect.coordinates, start, strict=True)))
+
+
+def _furthest(effect: Candidate, start: Array) -> float:
+    """The amount at which a coordinate reaches its bound."""
+    ends = [FURTHEST]
+    for c, s, shape in zip(effect.coordinates, start, effect.shapes, strict=True):
+        way = s - c.neutral
+        if way and not shape:
+            ends.append(((c.high if way > 0 else c.low) - c.neutral) / way)
+    return max(min(ends), 0.0)

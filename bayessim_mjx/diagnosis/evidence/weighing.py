@@ -1,28 +1,34 @@
-"""The evidence of the models of a pool: each by its own fit, with the missing force learnt anew."""
+"""The evidence of fitted models, each with the missing force learnt anew, and the posterior of the answer's numbers."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import functools
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.evidence import doubts
-from bayessim_mjx.diagnosis.evidence.gaussian import Hyper, Learnt, learn, windows_of
-from bayessim_mjx.diagnosis.evidence.parameters import Integrated, belief_of, integrated
+from bayessim_mjx.diagnosis.evidence.gaussian import PRIORS, Hyper, Learnt, learn, marginal, windows_of
+from bayessim_mjx.diagnosis.evidence.parameters import Integrated, Posterior, belief_of, integrated
+from bayessim_mjx.diagnosis.evidence.sets import RELEVANCE, Weighed, weighed
+from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fit import Fit
-from bayessim_mjx.diagnosis.residual import forcing
-from bayessim_mjx.diagnosis.selection.models import Model
-from bayessim_mjx.diagnosis.selection.pool import Pool
-from bayessim_mjx.diagnosis.selection.sets import BASE, RELEVANCE, Key, Weighed, log_prior, weighed
+from bayessim_mjx.diagnosis.residual import disturbance
+from bayessim_mjx.diagnosis.selection import heldout
+from bayessim_mjx.diagnosis.selection.models import BASE, Key, Model, scored
+from bayessim_mjx.diagnosis.selection.search_state import SearchState
 
 Array = NDArray[np.float64]
+MOVES = 3  # moves of a model towards its posterior mean, at most
+MOVED = 0.1  # standard deviations; smaller moves are not simulated
+WORSE = 1.0  # nats that the model may lose by moves that do not converge
 
 
 @dataclass(frozen=True, eq=False)
 class Scored:
-    """A fitted model with its evidence; fit: its own, with what simulators differ by (`doubts`)."""
+    """A fitted model with its evidence; fit: its own with the numbers of `doubts` beside its own numbers."""
 
     model: Model
     fit: Fit
@@ -31,20 +37,21 @@ class Scored:
 
 
 class Weighing:
-    """What was weighed so far.
+    """The evidence of all fitted sets of a search.
 
     Attributes:
-        scored: by their sets; D: `[W, n, nv m]`, what forces do to the windows, of the fit of the known parameters.
+        scored: {set: its model with its evidence}; D: `[W, n, nv m]`, effect of forces on the windows
+            (`disturbance.columns`), at the fit of the known parameters.
     """
 
-    def __init__(self, pool: Pool) -> None:
-        fitter = pool.fitter
-        self.pool = pool
-        self.scale = forcing.force_scale(fitter)
-        self.D = forcing.columns(fitter, pool.base.fit, forcing.default_nodes(fitter), self.scale)
+    def __init__(self, state: SearchState) -> None:
+        fitter = state.fitter
+        self.state = state
+        self.scale = disturbance.force_scale(fitter)
+        self.D = disturbance.columns(fitter, state.base.fit, disturbance.default_nodes(fitter), self.scale)
         self.channels = int(fitter.used.sum())
         self.scored: dict[Key, Scored] = {}
-        self._doubts = doubts.found(fitter, self.D, pool.base.fit.B)
+        self._doubts = doubts.found(fitter, self.D, state.base.fit.B)
         self.score([BASE])
 
     def doubted(self, fit: Fit) -> Fit:
@@ -52,11 +59,11 @@ class Weighing:
         return doubts.doubted(fit, self._doubts)
 
     def score(self, keys: Iterable[Key]) -> None:
-        """The evidence of models that are fitted, anew where the fit is another."""
+        """Compute the evidence of fitted models, again where the fit has changed."""
         for key in keys:
-            model, old = self.pool.models.get(key), self.scored.get(key)
+            model, old = self.state.models.get(key), self.scored.get(key)
             if model is not None and (old is None or old.model is not model):
-                fit, spread = self.doubted(model.fit), self.pool.fitter.spread
+                fit, spread = self.doubted(model.fit), self.state.fitter.spread
                 own = windows_of(fit.r, fit.A, fit.B, self.D, fit.offsets, spread, self.scale, self.channels)
                 learnt = learn(own, belief_of(fit), self._alike())
                 self.scored[key] = Scored(model, fit, learnt, integrated(fit, learnt, _numbers(model)))
@@ -72,7 +79,7 @@ class Weighing:
 
     def _error(self, key: Key) -> float:
         model = self.scored[key].model
-        return model.total / (self.pool.noise * len(model.cost))
+        return model.total / (self.state.noise * len(model.cost))
 
     def _floor(self) -> float:
         return float(np.mean(self.scored[self._best()].learnt.hyper.noise ** 2))
@@ -86,7 +93,7 @@ class Weighing:
 
     def total(self, key: Key) -> float:
         """Log of evidence and prior over those of the known parameters alone."""
-        more = log_prior(key, len(self.pool.candidates))
+        more = self.state.log_prior(key)
         return self.scored[key].found.nats + more - self.scored[BASE].found.nats
 
     def weighed(self) -> Weighed:
@@ -95,14 +102,14 @@ class Weighing:
 
     def without(self, condition: int) -> Weighed:
         """The posterior given all windows but those of one operating condition, with the same hyperparameters."""
-        kept = self.pool.fitter.simulator.windows.group != condition
+        kept = self.state.fitter.simulator.windows.group != condition
         return self._weighed({k: _without(s, kept) for k, s in self.scored.items()})
 
     def _weighed(self, nats: dict[Key, float]) -> Weighed:
         floor = self._floor()
         excess = {k: self._error(k) - floor for k in self.scored}
         numbers = {k: sum(len(e.coordinates) for e in s.model.effects) for k, s in self.scored.items()}
-        return weighed(nats, excess, numbers, len(self.pool.candidates))
+        return weighed(nats, excess, numbers, len(self.state.candidates))
 
 
 def _without(of: Scored, kept: NDArray[np.bool_]) -> float:
@@ -118,3 +125,128 @@ def _numbers(model: Model) -> list[dict[int, bool]]:
     names = model.fit.names
     pairs = [zip(e.coordinates, e.shapes, strict=True) for e in model.effects]
     return [{names.index(c.name): shape for c, shape in each} for each in pairs]
+
+
+@dataclass(frozen=True, eq=False)
+class Estimated:
+    """Posterior of the answer's numbers.
+
+    Attributes:
+        mean: `[k]`, where the fit could not be moved there not its values; covariance: `[k, k]`.
+        sheet: the data sheet's accuracies behind it.
+        noise: `[C]`, most likely noise of each channel, in what was estimated from the logs.
+        step: most probable step `[k]` from the answer's fit, of residuals `[W, n]` at its values.
+    """
+
+    mean: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    sheet: Posterior
+    noise: NDArray[np.float64]
+    step: Callable[[NDArray[np.float64]], NDArray[np.float64]]
+
+
+@dataclass(frozen=True)
+class Size:
+    """How large an effect is: the parameter that lies most standard deviations from neutral, and by how much.
+
+    Attributes:
+        quantity: the parameter's name; mean, sd: of its distance from neutral, in its unit.
+    """
+
+    quantity: str
+    mean: float
+    sd: float
+    unit: str
+
+
+def size_of(effect: Candidate, values: Array, sd: Array) -> Size:
+    """How large an effect with these numbers `[k]` and standard deviations `[k]` is; shapes are no sizes."""
+    each = zip(effect.coordinates, effect.shapes, values, sd, strict=True)
+    sizes = [
+        Size(c.name.rsplit(".", 1)[1], abs(float(v - c.neutral)), float(s), c.unit)
+        for c, shape, v, s in each
+        if not shape
+    ]
+    return max(sizes, key=lambda size: size.mean / max(size.sd, 1e-12))
+
+
+def at_its_mean(weighing: Weighing, key: Key) -> Model:
+    """The model at its posterior mean, held-out estimates refitted; where it was if that is no better place.
+
+    A mean far from the fit is the step of a linear model: from there it is looked for again.
+    """
+    fitter, state, old = weighing.state.fitter, weighing.state, weighing.scored[key]
+    low, high = (np.array([getattr(c, end) for c in old.model.fit.coordinates]) for end in ("low", "high"))
+    for _ in range(MOVES):
+        here = weighing.scored[key]
+        mean, covariance = _own(here)
+        mean, sd = np.clip(mean, low, high), np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+        if np.all(np.abs(mean - here.model.fit.values) <= MOVED * sd):
+            break
+        moved = fitter.refresh(replace(here.model.fit, values=mean, history=()))
+        state.models[key] = scored(fitter, moved, old.model.effects)
+        weighing.score([key])
+    else:
+        if weighing.scored[key].found.nats < old.found.nats - WORSE:
+            state.models[key], weighing.scored[key] = old.model, old
+    (model,) = heldout.refitted(fitter, [state.models[key]])
+    state.models[key] = model
+    weighing.scored[key] = replace(weighing.scored[key], model=model)
+    return model
+
+
+def estimated(weighing: Weighing, found: Weighed) -> Estimated:
+    """Of the answer's numbers; known parameters with all sets that are possible, by their probabilities."""
+    answer, base = weighing.scored[found.answer], len(weighing.state.fitter.base)
+    mean, covariance = _own(answer)
+    covariance[:base, :base] += _beside(answer, base)
+    keys = found.possible
+    share = np.array([found.sets[k] for k in keys])
+    share /= share.sum()
+    known = np.zeros((base, base))
+    for key, weight in zip(keys, share, strict=True):
+        own_mean, own = _own(weighing.scored[key])
+        away = own_mean[:base] - mean[:base]
+        known += weight * (own[:base, :base] + _beside(weighing.scored[key], base) + np.outer(away, away))
+    sd = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+    wider = np.ones(len(sd))
+    wider[:base] = np.sqrt(np.maximum(np.diag(known), sd[:base] ** 2)) / sd[:base]
+    covariance = covariance * wider[:, None] * wider
+    away = np.where(
+        np.arange(len(sd)) < base, 0.0, mean - answer.model.fit.values
+    )  # effects' numbers are those of the fit
+    covariance = covariance + np.diag(away**2)
+    step = functools.partial(_step, weighing, answer)
+    above = np.maximum(answer.learnt.hyper.amplitude**2 - PRIORS.least**2, 0.0)  # less is there for any law
+    size = weighing.scale * np.sqrt(above)
+    covariance = covariance + doubts.covariance(weighing.state.fitter, weighing.D, size, step, answer.fit.r)
+    return Estimated(mean, covariance, answer.found.posterior, answer.learnt.hyper.noise, step)
+
+
+def size_in(of: Scored, effect: Candidate) -> Size:
+    """How large one of the model's effects is."""
+    mean, covariance = _own(of)
+    own = [of.model.fit.names.index(c.name) for c in effect.coordinates]
+    return size_of(effect, mean[own], np.sqrt(np.diag(covariance)[own]))
+
+
+def _step(weighing: Weighing, of: Scored, r: Array) -> Array:
+    """The most probable step `[k]` of the model's numbers, of other residuals at their values."""
+    fit, sizes = of.fit, (weighing.state.fitter.spread, weighing.scale, weighing.channels)
+    there = marginal(windows_of(r, fit.A, fit.B, weighing.D, fit.offsets, *sizes), of.learnt.hyper)
+    return belief_of(fit).best(there.Q.sum(0))[: len(of.model.fit.values)]
+
+
+def _beside(of: Scored, base: int) -> Array:
+    """Covariance `[base, base]` of the known parameters that rest at a bound: none of them is known without error."""
+    return np.diag(of.found.beside[:base] ** 2)
+
+
+def _own(of: Scored) -> tuple[Array, Array]:
+    """(mean `[k]`, covariance) of the model's numbers; of those at a bound no spread."""
+    posterior, free = of.found.posterior, np.flatnonzero(of.found.free)
+    mean, covariance = np.asarray(of.fit.values + of.learnt.step), np.zeros((len(of.fit.values),) * 2)
+    mean[free] = posterior.middle
+    covariance[np.ix_(free, free)] = posterior.together()
+    k = len(of.model.fit.values)
+    return mean[:k], covariance[:k, :k]

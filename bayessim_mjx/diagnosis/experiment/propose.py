@@ -2,24 +2,29 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import jax
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from bayessim_mjx.diagnosis.experiment import advice
+from bayessim_mjx.diagnosis import phrases
+from bayessim_mjx.diagnosis.evidence.selecting import Selection
 from bayessim_mjx.diagnosis.experiment.design import Scored, Scorer
-from bayessim_mjx.diagnosis.experiment.excitation import Excitation, menu
-from bayessim_mjx.diagnosis.experiment.limits import Limits, limits_of
+from bayessim_mjx.diagnosis.experiment.excitation import Excitation, Limits, limits_of, menu
 from bayessim_mjx.diagnosis.experiment.rehearsal import Drives, Played, Rehearsal
-from bayessim_mjx.diagnosis.findings import Findings, Progress
+from bayessim_mjx.diagnosis.findings import Findings
+from bayessim_mjx.diagnosis.selection.budget import Progress
 from bayessim_mjx.diagnosis.selection.models import Model, nats
-from bayessim_mjx.diagnosis.selection.selected import Selection
-from bayessim_mjx.diagnosis.selection.tried import ranked
+from bayessim_mjx.diagnosis.selection.search_state import ranked
+from bayessim_mjx.diagnosis.setup import Setup
 from bayessim_mjx.effects.support.bodies import tilted
+from bayessim_mjx.effects.support.words import words
+from bayessim_mjx.logs.log import Log
 
 Array = NDArray[np.float64]
 
@@ -86,7 +91,7 @@ class Experiment:
 
 def stage(found: Findings, say: Progress) -> Findings:
     """With a proposal, where there is anything left to tell apart."""
-    wanted = found.model.effects or found.selection.above_noise(found.selection.base)
+    wanted = found.model.effects or found.selection.state.above_noise(found.selection.state.base)
     return found.having(propose(found)) if wanted else found
 
 
@@ -129,7 +134,7 @@ def _contenders(of: Selection, given: Sequence[Model] | None) -> tuple[list[Mode
     if found:
         return [of.answer, *found[: BUDGET.most - 1]], True
     own = {c.effect for c in of.answer.effects}
-    losers = [m for m in ranked(of) if m is not of.answer and not {c.effect for c in m.effects} & own]
+    losers = [m for m in ranked(of.state) if m is not of.answer and not {c.effect for c in m.effects} & own]
     close = [m for m in losers if abs(nats(m, of.answer)) < 3 * BUDGET.mild and (m.effects or own)]
     if not of.answer.effects:  # nothing is wrong as far as these logs can tell: what could still hide?
         close = close[:2]
@@ -173,7 +178,7 @@ def _look(scorer: Scorer, stand: Rehearsal, every: Sequence[Excitation]) -> list
     return sorted((_scored(scorer, p, e) for p, e in zip(played, pairs, strict=True)), key=lambda s: -s.evidence)
 
 
-def _scored(scorer: Scorer, played: Played, pairs: Array, help_: advice.Help | None = None) -> Scored:
+def _scored(scorer: Scorer, played: Played, pairs: Array, help_: Help | None = None) -> Scored:
     name = played.excitation.name + (f", {help_.name}" if help_ else "")
     return Scored(name, played, scorer.mean(pairs), pairs, help_.needs if help_ else "")
 
@@ -182,7 +187,7 @@ def _with_help(scorer: Scorer, stand: Rehearsal, scored: list[Scored], model: An
     """The best two motions again, with a known payload and with the robot mounted on its side."""
     out = []
     top = [s.played.excitation for s in scored[:2]]
-    for own in advice.helps(scorer.setup) if top else []:
+    for own in helps(scorer.setup) if top else []:
         gravity = np.asarray(jax.jit(tilted)(model.opt.gravity, *own.tilt))
         played = [p for p in stand.play(top, _thetas(scorer, own.shift), gravity) if p.safe]
         full = len(stand.time) // scorer.fitter.simulator.windows.steps
@@ -206,7 +211,7 @@ def _in_full(scorer: Scorer, stand: Rehearsal, scored: list[Scored], attended: l
 def _decide(
     scorer: Scorer, stand: Rehearsal, final: list[Scored], scored: list[Scored], attended: list[Scored], contested: bool
 ) -> Experiment:
-    labels = [advice.title(m) for m in scorer.models]
+    labels = [title(m) for m in scorer.models]
     alone = [s for s in final if not s.needs]
     chosen = alone[0] if alone else None
     helped = next((s for s in final if s.needs), None)
@@ -215,8 +220,7 @@ def _decide(
     ):
         chosen = helped
     useful = chosen is not None and (chosen.evidence > BUDGET.nothing or (len(labels) == 1 and chosen.evidence > 0.1))
-    why = advice.reason(scorer, chosen, labels, contested, useful)
-    witnesses = advice.witnesses(scorer.models, scorer.fitter.simulator.windows.logs)
+    why = reason(scorer, chosen, labels, contested, useful)
     kept = {s.name for s in final}
     table = [*final, *(s for s in [*scored, *attended] if s.name not in kept)]
     everything = sorted(table, key=lambda s: -s.evidence)
@@ -226,8 +230,8 @@ def _decide(
         evidence=chosen.evidence if chosen is not None else 0.0,
         pairs=_named(chosen.pairs, labels) if chosen is not None else [],
         table=[{"experiment": s.name, "evidence": round(s.evidence, 2), "needs": s.needs} for s in everything],
-        needs=chosen.needs if chosen is not None and useful else advice.instead(scorer.models),
-        witnesses=witnesses,
+        needs=chosen.needs if chosen is not None and useful else instead(scorer.models),
+        witnesses=missing_streams(scorer.models, scorer.fitter.simulator.windows.logs),
         chosen=chosen if useful else None,
         menu=final,
         drives=stand.drives,
@@ -244,3 +248,73 @@ def _named(pairs: Array, labels: Sequence[str]) -> list[dict[str, Any]]:
         for i in range(n)
         for j in range(i + 1, n)
     ]
+
+
+PAYLOAD_SHARE = 0.5  # of the largest payload that is thought possible at the body
+STANDING = (("turned on its side (90 degrees about the world's x axis)", (math.pi / 2, 0.0)),
+            ("turned forward (90 degrees about the world's y axis)", (0.0, math.pi / 2)))  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Help:
+    """What a person changes: name, instruction, what it adds to theta `[P]`, and the mount's (roll, pitch)."""
+
+    name: str
+    needs: str
+    shift: Array
+    tilt: tuple[float, float] = (0.0, 0.0)
+
+
+def helps(setup: Setup) -> list[Help]:
+    """A known payload on the last body, and two other mounts: where the effects that describe them are in the stack."""
+    physics, out = setup.physics, []
+    for effect in physics.effects:
+        *_, last = physics.blocks_of(effect)
+        if effect.name == "payload":
+            place, own = last.place, last.parameters[0]
+            mass = float(f"{PAYLOAD_SHARE * own.high:.2g}")
+            shift = np.zeros(len(physics.space))
+            shift[last.start] = mass
+            out.append(Help(*phrases.known_payload(mass, place), shift))
+        if effect.name == "gravity_tilt" and not _floats(physics.mj_model):
+            for way, tilt in STANDING:
+                shift = np.zeros(len(physics.space))
+                shift[last.slice] = tilt
+                out.append(Help(*phrases.other_mount(way), shift, tilt))
+    return out
+
+
+def _floats(model: mujoco.MjModel) -> bool:
+    return bool(np.any(model.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)))
+
+
+def title(model: Model) -> str:
+    """Of a model, by its effects."""
+    return phrases.model_title([(c.effect, c.where) for c in model.effects])
+
+
+def missing_streams(models: Sequence[Model], logs: Sequence[Log]) -> list[str]:
+    """Streams that would decide between the models' effects and that the logs do not have."""
+    have = {name.split(":", 1)[0] for log in logs for name in log.streams}
+    wanted = dict(seen for m in models for c in m.effects if (seen := words(c.effect).witness) is not None)
+    return [text for key, text in wanted.items() if key not in have]
+
+
+def instead(models: Sequence[Model]) -> str:
+    """What else would separate the models' effects."""
+    return phrases.separating(c.effect for m in models for c in m.effects)
+
+
+def reason(scorer: Scorer, chosen: Scored | None, labels: Sequence[str], contested: bool, useful: bool) -> str:
+    """One sentence: the motion, the rivals, the expected evidence."""
+    if chosen is None:
+        return phrases.nothing_safe(instead(scorer.models))
+    action = phrases.run_experiment(chosen.name, chosen.played.log.duration)
+    if len(labels) == 1:
+        index, variance = scorer.loosest(0)
+        c, before = scorer.models[0].fit.coordinates[index], math.sqrt(variance)
+        told = c.name, before, before * math.exp(-chosen.evidence), c.unit
+        return phrases.sharpens(action, *told) if useful else phrases.sharpens_little(chosen.name, *told)
+    if not useful:
+        return phrases.separates_nobody(labels, chosen.name, chosen.evidence, instead(scorer.models))
+    return phrases.tells_apart(action, labels, chosen.evidence, contested)

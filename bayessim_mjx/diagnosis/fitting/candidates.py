@@ -39,7 +39,7 @@ class Coordinate:
         stated: the prior is what a data sheet states. It then weighs as much as the misfit says that the data know:
             while an effect is missing, no parameter takes its place because the noise alone is small.
         kind: of a data sheet's number (mass, damping ...) whose accuracy nobody stated: it is common to all of that
-            kind, and inferred from the logs (`Fit.trust`, `selection.accuracy`). "": it is not inferred.
+            kind, and inferred from the logs (`Fit.trust`, `evidence.parameters`). "": it is not inferred.
         unit: for people.
     """
 

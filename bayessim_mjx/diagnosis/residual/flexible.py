@@ -44,7 +44,7 @@ class Held:
         cost: `[W]`, of the median seed, unweighted, each fold's with the ridge that is best on the others; base: `[W]`,
             of the model without the force.
         totals: `[seeds, ridges]`; ridge: best on all folds; seed: the one in `cost`.
-        gain, se: how much cheaper all windows together are, and its standard error over folds.
+        gain: how much cheaper all windows together are.
         t: of the windows' log gain above the noise by folds, as a normal deviate; unlike the gain itself
             it is not ruled by the conditions with the largest errors.
     """
@@ -56,7 +56,6 @@ class Held:
     seed: int
     plain: float
     gain: float
-    se: float
     t: float
 
     @property
@@ -133,10 +132,9 @@ def _held(problem: Regression, runs: dict[int, Seeded], fold: NDArray[np.int64],
     base, cost = problem.base(fold), _chosen_without(costs, seed, fold)
     plain = float(ridges[_widest(median, base.sum())])
     by_fold = np.array([np.sum((base - cost)[fold == name]) for name in np.unique(fold)])
-    se = float(np.sqrt(len(by_fold)) * np.std(by_fold, ddof=1)) if len(by_fold) > 1 else np.inf
     size = problem.fitter.size
     t = normal_deviate(np.log(np.maximum(base, 0) + size) - np.log(np.maximum(cost, 0) + size), fold)
-    return Held(cost, base, totals, float(ridges[at]), list(runs)[seed], plain, float(by_fold.sum()), se, t)
+    return Held(cost, base, totals, float(ridges[at]), list(runs)[seed], plain, float(by_fold.sum()), t)
 
 
 def _chosen_without(costs: Array, seed: int, fold: NDArray[np.int64]) -> Array:

@@ -15,9 +15,9 @@ from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 from bayessim_mjx.diagnosis.fitting.windows import Windows
 from bayessim_mjx.diagnosis.residual import motion_inputs
 from bayessim_mjx.diagnosis.residual.disturbance import Disturbance, estimate
-from bayessim_mjx.diagnosis.residual.fingerprints import Number, regress
 from bayessim_mjx.diagnosis.residual.motion_inputs import Inputs
 from bayessim_mjx.diagnosis.residual.regions import discoveries
+from bayessim_mjx.diagnosis.residual.where import Number, regress
 
 Array = NDArray[np.float64]
 

@@ -1,4 +1,4 @@
-"""Effects' parameters that end at a bound: ranges grow as long as the logs ask for it, and what stays there is told."""
+"""Effects' parameters that end at a bound: their ranges grow as long as held-out evidence gains from it."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bayessim_mjx.diagnosis import phrases
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate, Coordinate, shrink
 from bayessim_mjx.diagnosis.fitting.quadratic import solve
-from bayessim_mjx.diagnosis.selection.budget import LEAVING_OUT
+from bayessim_mjx.diagnosis.selection.budget import LEAVING_OUT, Progress
+from bayessim_mjx.diagnosis.selection.fits import AFRESH
 from bayessim_mjx.diagnosis.selection.models import Model, nats, scored
-from bayessim_mjx.diagnosis.selection.pool import AFRESH, Pool, Progress, fresh
+from bayessim_mjx.diagnosis.selection.search_state import SearchState
 from bayessim_mjx.physics import Physics
 
 
@@ -32,6 +32,7 @@ class Widening:
 
 
 WIDENING = Widening()
+Change = Callable[[Physics, Coordinate, float], Coordinate]  # (physics, its range, its value) -> its new range
 
 
 @dataclass(frozen=True)
@@ -41,14 +42,15 @@ class Bound:
     Attributes:
         kind: "at least", "at most" (nothing larger or smaller was tried), "end" (physics ends there, or a wider range
             explains no more), "off" (it has no part in the effect).
-        why: a clause for people, after the parameter's name.
+        at: the bound, in the parameter's unit; physical: physics ends there.
     """
 
     kind: str
-    why: str
+    at: float
+    physical: bool = False
 
 
-def widened(pool: Pool, model: Model, say: Progress) -> Model:
+def widened(state: SearchState, model: Model, say: Progress) -> Model:
     """The model with ranges as wide as it takes for its effects' parameters to lie within, refitted.
 
     A range doubles as long as a still wider one promises held-out evidence, up to `farthest` times what it was; what
@@ -56,29 +58,29 @@ def widened(pool: Pool, model: Model, say: Progress) -> Model:
     an effect's memory.
     """
     last = model
-    while not pool.settings.budget.over(LEAVING_OUT) and _held(pool, last) and _promised(pool, last):
+    while not state.settings.budget.over(LEAVING_OUT) and _held(state, last) and _promised(state, last):
         say("wider ranges", 0, 1)
-        last = _refitted(pool, last, _moved(pool, last, _grown))
+        last = _refitted(state, last, _moved(state, last, _grown))
         if nats(model, last) >= WIDENING.nats:
-            _adopt(pool, last)
+            _adopt(state, last)
             model = last
     return model
 
 
-def _promised(pool: Pool, model: Model) -> bool:
+def _promised(state: SearchState, model: Model) -> bool:
     """Whether the held-out evidence that ranges as wide as they may get promise is worth a refit."""
-    left = max(model.total - promise(pool, model), 1e-9)
+    left = max(model.total - promise(state, model), 1e-9)
     return 0.5 * model.samples * math.log(model.total / left) > WIDENING.nats
 
 
-def promise(pool: Pool, model: Model) -> float:
+def promise(state: SearchState, model: Model) -> float:
     """By how much the cost would fall in ranges as wide as they may get, if the model were linear."""
     fit = model.fit
-    q, _ = fit.quadratic(pool.fitter.spread)
+    q, _ = fit.quadratic(state.fitter.spread)
     g, S = q.weighted(fit.weight)
     precision, pull, low, high = fit.prior()
     S, g = S + np.diag(precision), g + pull
-    far = {c.name: c for e in _moved(pool, model, _freed) for c in e.coordinates}
+    far = {c.name: c for e in _moved(state, model, _freed) for c in e.coordinates}
     wide = [far.get(c.name, c) for c in fit.coordinates]
     ends = [np.array([getattr(c, end) for c in wide]) - fit.values for end in ("low", "high")]
     near, free = solve(S, g, low, high), solve(S, g, *ends)
@@ -93,15 +95,13 @@ def of(physics: Physics, coordinate: Coordinate, value: float) -> Bound | None:
     quantity = physics.quantity(coordinate.index[0])
     at = getattr(coordinate, end)
     if at == quantity.neutral and not quantity.shape:
-        return Bound("off", phrases.off(at))
+        return Bound("off", at)
     least, most = quantity.ends()
-    unit = f" {coordinate.unit}" if coordinate.unit else ""
     if at == (most if end == "high" else least):
-        return Bound("end", phrases.physical_end(at, unit))
+        return Bound("end", at, physical=True)
     if at == _farthest(physics, coordinate, end):
-        kind = "at least" if end == "high" else "at most"
-        return Bound(kind, phrases.farthest_tried(at, unit, kind))
-    return Bound("end", phrases.bound(at, unit))
+        return Bound("at least" if end == "high" else "at most", at)
+    return Bound("end", at)
 
 
 def _end(c: Coordinate, value: float) -> str:
@@ -124,9 +124,9 @@ def _farthest(physics: Physics, coordinate: Coordinate, end: str) -> float:
     return low / WIDENING.farthest if low > 0 else coordinate.neutral + WIDENING.farthest * (low - coordinate.neutral)
 
 
-def _moved(pool: Pool, model: Model, change: Callable[[Physics, Coordinate, float], Coordinate]) -> list[Candidate]:
+def _moved(state: SearchState, model: Model, change: Change) -> list[Candidate]:
     """The model's effects with their ranges changed; the same objects where nothing is."""
-    physics, out = pool.fitter.simulator.physics, []
+    physics, out = state.fitter.simulator.physics, []
     for effect in model.effects:
         pairs = zip(effect.coordinates, model.values_of(effect), strict=True)
         new = tuple(change(physics, c, float(v)) for c, v in pairs)
@@ -134,9 +134,9 @@ def _moved(pool: Pool, model: Model, change: Callable[[Physics, Coordinate, floa
     return out
 
 
-def _held(pool: Pool, model: Model) -> bool:
+def _held(state: SearchState, model: Model) -> bool:
     """Whether a parameter ends at a bound that may move."""
-    return any(new is not old for new, old in zip(_moved(pool, model, _grown), model.effects, strict=True))
+    return any(new is not old for new, old in zip(_moved(state, model, _grown), model.effects, strict=True))
 
 
 def _freed(physics: Physics, c: Coordinate, value: float) -> Coordinate:
@@ -162,21 +162,21 @@ def _grown(physics: Physics, c: Coordinate, value: float) -> Coordinate:
     return wider if c.stated else replace(wider, precision=shrink(wider))
 
 
-def _refitted(pool: Pool, model: Model, effects: Sequence[Candidate]) -> Model:
-    fitter, base = pool.fitter, len(pool.fitter.base)
+def _refitted(state: SearchState, model: Model, effects: Sequence[Candidate]) -> Model:
+    fitter, base = state.fitter, len(state.fitter.base)
     own = {c.name: c for e in effects for c in e.coordinates}
     coordinates = tuple(c if i < base else own[c.name] for i, c in enumerate(model.fit.coordinates))
     start = fitter.refresh(replace(model.fit, coordinates=coordinates, **AFRESH))
-    (fit,) = fitter.iterate([start], WIDENING.steps, lambda f: fresh(pool, f))
+    (fit,) = fitter.iterate([start], WIDENING.steps, state.fresh)
     return scored(fitter, fitter.refresh(fit), tuple(effects))
 
 
-def _adopt(pool: Pool, new: Model) -> None:
-    """The pool with a model's effects in their new ranges; what was fitted with the old ones stays as it is."""
+def _adopt(state: SearchState, new: Model) -> None:
+    """The state with a model's effects in their new ranges; what was fitted with the old ones stays as it is."""
     own = {e.label: e for e in new.effects}
-    pool.models[frozenset(own)] = new
-    pool.candidates = [own.get(c.label, c) for c in pool.candidates]
-    pool.screened = [replace(s, candidate=own.get(s.candidate.label, s.candidate)) for s in pool.screened]
+    state.models[frozenset(own)] = new
+    state.candidates = [own.get(c.label, c) for c in state.candidates]
+    state.screened = [replace(s, candidate=own.get(s.candidate.label, s.candidate)) for s in state.screened]
 
 
 def spread_out(covariance: np.ndarray, values: np.ndarray, neutral: np.ndarray, at: Sequence[int]) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Time that a search may take, and what of it each part may have: the later ones are cut down before the first."""
+"""Time that a search may take: each part has its share, and later parts are cut before earlier ones."""
 
 from __future__ import annotations
 
@@ -6,22 +6,24 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-# Share of the time at which a part ends, so that those after it have theirs; what follows the search has the rest.
-# Of the time that is there once the simulator is compiled: nothing cuts what comes before.
-# A choice: what a search that was cut misses was not counted.
-KNOWN = "known parameters"  # their fit ends there, wherever it came to: on a stiff arm it alone took longer than all
+Progress = Callable[[str, int, int], None]  # (what is being done, done, total)
+
+# Shares of the time at which a part of the search ends; the stages after the search have the rest. They are shares of
+# the time that is left once the simulator is compiled: nothing before that is cut. A choice: the effects that a search
+# misses when it is cut were not counted.
+KNOWN = "known parameters"  # on a stiff arm this fit alone took longer than the whole limit
 SCREENING, SINGLES, TOGETHER = "screening", "single effects", "effects together"
-LEAVING_OUT = "leaving out"  # the last part: what is named with each effect left out, simulated held out
+LEAVING_OUT = "leaving out"  # the last part: the answer with each of its effects left out
 ENDS = {
     KNOWN: 0.1, SCREENING: 0.18, SINGLES: 0.3, TOGETHER: 0.45, LEAVING_OUT: 0.68,
 }  # fmt: skip
 
-ROOM = 0.8  # of the time, after which nothing is begun that can be left out: whole logs of a stiff arm took a fifth
+ROOM = 0.8  # share of the time after which no optional stage begins: whole logs of a stiff arm took a fifth
 
 
 @dataclass(frozen=True)
 class Budget:
-    """Until when the search may go on.
+    """The time that a search may take.
 
     Attributes:
         seconds: for the whole diagnosis; infinite: as long as it takes.
@@ -45,11 +47,11 @@ class Budget:
 
     @property
     def late(self) -> bool:
-        """Whether nothing should begin that a verdict can do without: it compiles programs of its own."""
+        """Whether it is too late to begin a stage that the verdict does not need: it compiles its own programs."""
         return self.spent > ROOM * self.seconds
 
     def searching(self) -> Budget:
-        """The same for a search that begins now."""
+        """The budget of a search that begins now."""
         return replace(self, fixed=min(self.spent, self.seconds)) if self.limited else self
 
     def left(self, part: str) -> float:
@@ -59,7 +61,7 @@ class Budget:
         return self.fixed + (self.seconds - self.fixed) * ENDS[part] - self.spent
 
     def over(self, part: str) -> bool:
-        """Whether a part has had its time."""
+        """Whether the time of a part is over."""
         return self.left(part) <= 0.0
 
 

@@ -14,7 +14,9 @@ from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
-from bayessim_mjx.diagnosis.selection.projection import Projection
+from bayessim_mjx.diagnosis.selection.budget import Progress
+from bayessim_mjx.diagnosis.selection.window_subset import looked_at, part
+from bayessim_mjx.diagnosis.statistics import times
 
 Array = NDArray[np.float64]
 
@@ -53,6 +55,53 @@ class Screened:
     whole: float = 0.0
 
 
+class Projection:
+    """The fit's own parameters and start states, projected out of columns and residuals."""
+
+    def __init__(self, fitter: Fitter, fit: Fit) -> None:
+        precision, pull, low, high = fit.prior()
+        q, starts = fit.quadratic(fitter.spread)
+        g, S = q.weighted(fit.weight)
+        slope = g + pull
+        pinned = ((low >= -1e-12) & (slope < 0)) | ((high <= 1e-12) & (slope > 0))
+        self.free = np.flatnonzero(~pinned)
+        self.fit, self.starts, self.root = fit, starts, np.sqrt(fit.weight)[:, None]
+        H = (S + np.diag(precision))[np.ix_(self.free, self.free)]
+        self.inverse = np.linalg.pinv(H) if len(self.free) else H
+        self.slope = slope[self.free]
+        self.A = fit.A[:, :, self.free]
+        self.Bt, self.BA = starts.B.mT, starts.B.mT @ self.A
+        # columns by the parameters as one matrix, weighted, and less what the start states take
+        rows = self.A.shape[0] * self.A.shape[1]  # there may be no parameter that is free
+        self.away = (self.A - starts.B @ (starts.M @ self.BA)).reshape(rows, len(self.free))
+        self.weighted = np.repeat(fit.weight, self.A.shape[1])[:, None] * self.away
+
+    def moments(self, a: Array) -> tuple[float, float, float, Array]:
+        """(s, g, full norm, projected column) of a column `[W, n]`."""
+        w, starts = self.fit.weight, self.starts
+        Ba = times(self.Bt, a)
+        MBa = times(starts.M, Ba)
+        s_aa = float(w @ (np.sum(a * a, 1) - np.sum(Ba * MBa, 1)))
+        g_a = float(w @ (np.sum(a * self.fit.r, 1) - np.sum(MBa * starts.b, 1)))
+        s_ab = self.weighted.T @ a.ravel()
+        along = self.inverse @ s_ab
+        projected = a - times(starts.B, MBa) - (self.away @ along).reshape(a.shape)
+        return s_aa - float(s_ab @ along), g_a - float(s_ab @ (self.inverse @ self.slope)), s_aa, projected * self.root
+
+    def taken(self, a: Array, share: float) -> Array | None:
+        """Steps `[k]` of the fit's numbers that do the work of a column `[W, n]`; None where they do less of it."""
+        w = self.fit.weight
+        MBa = times(self.starts.M, times(self.Bt, a))
+        s_ab = self.weighted.T @ a.ravel()
+        along = self.inverse @ s_ab
+        s_aa = float(w @ (np.sum(a * a, 1) - np.sum(times(self.Bt, a) * MBa, 1)))
+        if s_aa <= 0 or float(s_ab @ along) <= share * s_aa:
+            return None
+        steps = np.zeros(self.fit.A.shape[2])
+        steps[self.free] = along
+        return steps
+
+
 def room(candidate: Candidate, way: Array) -> tuple[float, float]:
     neutral = np.array([c.neutral for c in candidate.coordinates])
     low, high = (np.array([getattr(c, e) for c in candidate.coordinates]) for e in ("low", "high"))
@@ -62,7 +111,6 @@ def room(candidate: Candidate, way: Array) -> tuple[float, float]:
     return -float(np.min(behind)), float(np.min(ahead))
 
 
-Progress = Callable[[str, int, int], None]
 Plan = tuple[int, Array]  # candidate, starting point
 
 
@@ -189,17 +237,6 @@ def judged(
     return each
 
 
-def looked_at(fit: Fit, limit: int) -> NDArray[np.int64]:
-    """At most `limit` windows: half of them where most is left to explain (a limit acts in few), the rest spread."""
-    count = len(fit.r)
-    if count <= limit:
-        return np.arange(count)
-    worst = np.argsort(-np.sum(fit.r**2, 1), kind="stable")[: limit // 2]
-    others = np.setdiff1d(np.arange(count), worst)
-    spread = others[np.linspace(0, len(others) - 1, limit - len(worst)).round().astype(int)]
-    return np.sort(np.concatenate([worst, spread]))
-
-
 def _ordered(each: dict[int, list[tuple[Screened, Array]]]) -> list[Screened]:
     return sorted((_with_others(found) for found in each.values()), key=lambda s: -s.gain)
 
@@ -223,11 +260,6 @@ def _with_others(found: list[tuple[Screened, Array]]) -> Screened:
     least, seen = max(found, key=lambda f: f[0].whole)
     whole = [seen] if least.whole > 0 and not any(np.array_equal(seen, p) for p in (point, *levels)) else []
     return replace(first, others=(point, *others, *levels, *whole))
-
-
-def part(fit: Fit, own: NDArray[np.int64]) -> Fit:
-    """The fit on some of its windows."""
-    return replace(fit, offsets=fit.offsets[own], r=fit.r[own], A=fit.A[own], B=fit.B[own], weight=fit.weight[own])
 
 
 def _one(project: Projection, candidate: Candidate, point: Array, column: Array) -> Screened:

@@ -8,22 +8,21 @@ from typing import Any
 import numpy as np
 
 from bayessim_mjx import versions
-from bayessim_mjx.diagnosis import data_sheet, phrases, statistics
+from bayessim_mjx.diagnosis import phrases, statistics
 from bayessim_mjx.diagnosis.experiment.propose import Experiment
 from bayessim_mjx.diagnosis.findings import Findings, Where
-from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
 from bayessim_mjx.diagnosis.residual.black_boxes import BlackBoxes
-from bayessim_mjx.diagnosis.result import Diagnosis, Gap, Place
-from bayessim_mjx.diagnosis.selection import bounds, conditions, left_out, uncertainty
-from bayessim_mjx.diagnosis.selection.accuracy import Posterior
-from bayessim_mjx.diagnosis.selection.models import Model
-from bayessim_mjx.diagnosis.selection.selected import Selection
-from bayessim_mjx.diagnosis.selection.tried import Tried, ranked
-from bayessim_mjx.diagnosis.summary import effects_found, how_far
-from bayessim_mjx.diagnosis.summary.details import details
+from bayessim_mjx.diagnosis.result import Diagnosis, FoundEffect, Gap, Place
+from bayessim_mjx.diagnosis.selection import bounds
+from bayessim_mjx.diagnosis.selection.budget import SINGLES
+from bayessim_mjx.diagnosis.selection.models import systematic
+from bayessim_mjx.diagnosis.selection.search_state import SearchState, ranked
+from bayessim_mjx.diagnosis.summary import effects_found, first_look, how_far, known_parameters
 from bayessim_mjx.diagnosis.summary.finer_steps import AtFinerSteps
 from bayessim_mjx.diagnosis.summary.left_in_words import (
     black_boxes_in_words,
+    flexible_in_words,
+    formula_in_words,
     located_in_words,
     not_on_offer,
     places_of,
@@ -32,11 +31,11 @@ from bayessim_mjx.diagnosis.summary.left_in_words import (
 from bayessim_mjx.diagnosis.summary.sentences import horizon_warning, sentences
 from bayessim_mjx.diagnosis.summary.verdict import verdict_of
 from bayessim_mjx.diagnosis.summary.whole_logs import Whole
+from bayessim_mjx.diagnosis.tolerance import length_unit
+from bayessim_mjx.effects import spec_of
 from bayessim_mjx.logs.log import Channels
 
-# standard deviations from what a data sheet states, from where on that is told: by chance of one normal value in 22.
-# How often it is told wrongly of fitted values was not counted.
-FAR = 2.0
+TOLD = 0.25  # of the time, from which on it is told that this was gone before the search
 PACKAGES = ("bayessim-mjx", "mujoco", "mujoco-mjx", "jax", "numpy")  # what the result depends on
 
 
@@ -49,7 +48,7 @@ def diagnosis_of(found: Findings, about: Mapping[str, Any] | None = None, file: 
     setup, selection, model = found.setup, found.selection, found.model
     timestep = float(setup.robot.mj_model.opt.timestep) * (setup.discretisation.factor if setup.discretisation else 1)
     own = selection.estimated
-    together = own.covariance + np.diag(uncertainty.systematic(model, timestep, selection.gap(model).left) ** 2)
+    together = own.covariance + np.diag(systematic(model, timestep, selection.state.gap(model).left) ** 2)
     finer = found.part(AtFinerSteps)
     steps = finer.notes(found, together) if finer else []
     base = len(setup.fitter.base)
@@ -60,7 +59,7 @@ def diagnosis_of(found: Findings, about: Mapping[str, Any] | None = None, file: 
     far = how_far.measured(found, {k: v for k, v in closed.items() if k != "each"})
     verdict = verdict_of(found, far)
     known = own.mean[:base] + (finer.shift[:base] if finer else 0.0)
-    parameters = _parameters(selection, model, sd, known)
+    parameters = known_parameters.parameters(selection, model, sd, known)
     over, where, proposal = found.part(Whole), found.part(Where), found.part(Experiment)
     far = how_far.with_whole(far, over, setup.tolerance) if over else far
     told = sentences(verdict, effects, parameters, found, far)
@@ -71,21 +70,21 @@ def diagnosis_of(found: Findings, about: Mapping[str, Any] | None = None, file: 
     rivals = black_boxes_in_words(found.part(BlackBoxes), setup.fitter.simulator.windows.blocks)
     return Diagnosis(
         verdict=verdict.name,
-        sentences=[*filter(None, [*told, left_out.not_tried(selection)]), *rivals, *lies],
+        sentences=[*filter(None, [*told, not_tried(selection.state)]), *rivals, *lies],
         effects=effects,
         where=places_of(where.found) if where and where.found.spots else _where(found),
         gap=far,
         parameters=parameters,
-        candidates=ranking(selection),
-        warnings=[*notes, *_less_accurate(model, own.sheet), *found.warnings],
+        candidates=ranking(selection.state),
+        warnings=[*notes, *known_parameters.less_accurate(model, own.sheet), *found.warnings],
         next_experiment=proposal.to_dict(file) if proposal else {},
         versions=versions.of(PACKAGES),
         details=details(found, effects, closed) | more | ({"experiments": proposal.details()} if proposal else {}),
         covariance={"names": list(model.fit.names), "matrix": together},
-        not_fitted=left_out.not_fitted(selection),
+        not_fitted=not_fitted(selection.state),
         about={**about, "conditions": setup.fitter.simulator.windows.conditions} if about else {},
         hidden=list(selection.hidden),
-        accuracy=_accuracy(model, own.sheet),
+        accuracy=known_parameters.accuracy(model, own.sheet),
         evidence=selection.weighed.told(),
     )
 
@@ -102,66 +101,22 @@ def _told(found: Findings, covariance: np.ndarray) -> np.ndarray:
     return bounds.spread_out(covariance, model.fit.values, neutral, at)
 
 
-def _parameters(selection: Selection, model: Model, sd: np.ndarray, mean: np.ndarray) -> dict[str, dict[str, Any]]:
-    """Of the robot (their mean), and as they are simulated at the time step of the fit."""
-    remarks = conditions.structural(selection, model)
-    base, values = selection.fitter.base, model.fit.values
-    real = [float(np.clip(v, c.low, c.high)) for c, v in zip(base, mean, strict=True)]
-    return {
-        c.name: {
-            **_against_data_sheet(c, real[i], float(model.fit.belief()[i])),
-            "mean": real[i], "simulated": float(values[i]), "sd": float(sd[i]), "nominal": c.neutral,
-            "low": c.low, "high": c.high, "unit": c.unit, "structural": remarks.get(c.name, ""),
-            "same_as": list(selection.stand_ins.get(c.name, ())),
-        }
-        for i, c in enumerate(base)
-    }  # fmt: skip
-
-
-def _against_data_sheet(c: Coordinate, value: float, precision: float) -> dict[str, Any]:
-    """How far a known parameter is from what was stated of it, where that is far: in words, and in sd."""
-    away = abs(value - c.neutral) * precision**0.5
-    if not (c.stated and away > FAR):
-        return {"data_sheet": ""}
-    return {"data_sheet": phrases.far_from_data_sheet(value, away), "away": away}
-
-
-def _accuracy(model: Model, sheet: Posterior) -> dict[str, dict[str, float]]:
-    """Of each kind of parameter whose accuracy nobody stated."""
-    every = [c.kind for c in model.fit.coordinates]
-    ends = {kind: sheet.accuracy(kind) for kind in sheet.kinds}
-    return {
-        kind: {"median": middle, "low": low, "high": high, "parameters": every.count(kind)}
-        for kind, (low, middle, high) in ends.items()
-    }
-
-
-def _less_accurate(model: Model, sheet: Posterior) -> list[str]:
-    """Kinds of parameters that lie farther from their data sheet than half of all do, 9 to 1 or surer."""
-    found = {kind: own for kind, own in _accuracy(model, sheet).items() if own["low"] > data_sheet.ACCURACY}
-    return (
-        [phrases.less_accurate({kind: (own["median"], own["low"], own["high"]) for kind, own in found.items()})]
-        if found
-        else []
-    )
-
-
-def ranking(tried: Tried) -> list[dict[str, Any]]:
+def ranking(state: SearchState) -> list[dict[str, Any]]:
     """Models tried, best first: held-out score, nats over the known parameters alone, and its standard error."""
-    rows = statistics.leave_one_out(tried.fitter.simulator.windows.condition)
-    absorbed = {s.candidate.label: s.absorbed for s in tried.screened}
+    rows = statistics.leave_one_out(state.fitter.simulator.windows.condition)
+    absorbed = {s.candidate.label: s.absorbed for s in state.screened}
     out: list[dict[str, Any]] = []
-    rows_of = ranked(tried)[:60]
+    rows_of = ranked(state)[:60]
     samples = rows_of[0].samples  # one for all, so that scores are in the order of the errors
     for model in rows_of:
-        ratio = np.log((rows @ tried.base.cost) / (rows @ model.cost))
+        ratio = np.log((rows @ state.base.cost) / (rows @ model.cost))
         error = float(0.5 * samples * statistics.error(ratio)) if len(rows) else float("nan")
         out.append({
             "effects": [e.label for e in model.effects],
             "label": model.label,
-            "score": 0.5 * samples * float(np.log(tried.base.total / model.total)),
+            "score": 0.5 * samples * float(np.log(state.base.total / model.total)),
             "se": error,
-            "gap_closed": tried.gap(model).closed,
+            "gap_closed": state.gap(model).closed,
             "rms": float(np.sqrt(model.total / model.fit.r.size)),
             "parameters": dict(zip(model.fit.names, map(float, model.fit.values), strict=True)),
             "absorbed": absorbed.get(model.effects[0].label) if len(model.effects) == 1 else None,
@@ -204,3 +159,163 @@ def insufficient(reason: str, notes: Sequence[str], about: Mapping[str, Any] | N
         versions.of(PACKAGES),
         about=dict(about or {}),
     )
+
+
+def not_fitted(state: SearchState) -> dict[str, list[str]]:
+    """{reason: labels of candidates that are in no model}, of reasons that there are."""
+    fitted = frozenset().union(*state.models)
+    gains = {s.candidate.label: s.gain for s in state.screened}
+    out: dict[str, list[str]] = {}
+    for label in (c.label for c in state.candidates if c.label not in fitted):
+        out.setdefault(_reason(state, label, gains), []).append(label)
+    return out
+
+
+def not_tried(state: SearchState) -> str:
+    """What the time was too short for, in words; "" where nothing was left out."""
+    parts = [f"{count} models ({part})" for part, count in state.skipped.items() if part != SINGLES]
+    if state.cut_short:
+        parts.insert(0, f"{len(state.cut_short)} single effects")
+    if not parts:
+        return ""
+    budget = state.settings.budget
+    text = f"In {budget.seconds / 60:.3g} minutes not everything was tried: no time was left for {' and '.join(parts)}."
+    first = f" Before the search, looking at the logs and compiling took {budget.fixed / 60:.2g} of them."
+    return text + first * (budget.fixed > TOLD * budget.seconds)
+
+
+def _reason(state: SearchState, label: str, gains: dict[str, float]) -> str:
+    if label in state.cut_short:
+        return phrases.NO_TIME_LEFT
+    if label not in gains:
+        return phrases.NOT_SCREENED
+    if gains[label] <= 0.0:
+        return phrases.NO_GAIN
+    return phrases.LESS_PROMISING if state.above_noise(state.base) else phrases.NOTHING_LEFT
+
+
+MANY = 24  # candidates in the isolability matrix, overlays in the report
+
+
+def details(found: Findings, effects: list[FoundEffect], closed: dict[str, Any]) -> dict[str, Any]:
+    model, cut = found.model, found.setup.fitter.simulator.windows
+    each, deviation = known_parameters.per_condition(found.setup.fitter, model)
+    names = model.fit.names
+    return {
+        "effect_specs": {e.name: spec_of(e) for e in found.setup.physics.effects if e.quantities},
+        "overlays": _overlays(found),
+        "isolability": _isolability(found.selection.state),
+        "episodes": _episodes(found),
+        "closure": _closure(effects, closed),
+        "shapley": [{"effect": f"{e.name}@{e.where}", "share": e.share} for e in effects if e.share == e.share],
+        "flexible": _flexible(found),
+        "black_boxes": _black_boxes(found.part(BlackBoxes)),
+        "groups": {
+            "names": list(cut.groups),
+            "parameters": {n: {"mean": each[:, i], "sd": deviation[:, i]} for i, n in enumerate(names)},
+        },
+        "links": [
+            {
+                "name": f"{k.name} ({k.where})", "slope": k.slope, "correlation": k.correlation, "lag": k.lag,
+                "verdict": k.text,
+            }
+            for k in found.links
+        ],
+        "before_simulation": {"lines": first_look.lines(found.setup.look)} | found.setup.look.to_dict(),
+        "noise": [
+            {"channel": n, "sigma": float(s)}
+            for n, s in zip(Channels.of(found.setup.physics.mj_model).qvel, cut.sigma_q, strict=True)
+        ],
+    }  # fmt: skip
+
+
+def _closure(effects: list[FoundEffect], closed: dict[str, Any]) -> list[dict[str, Any]]:
+    """Promised and realised, of each effect and of all together."""
+    labels = [f"{e.name}@{e.where}" for e in effects]
+    rows: list[dict[str, Any]] = [
+        {"effects": [n], "predicted": e.predicted_gap_closed, "realised": e.gap_closed, "ci": e.gap_closed_ci}
+        for n, e in zip(labels, effects, strict=True)
+    ]
+    both = {k: closed[k] for k in ("predicted", "realised", "ci")} if len(rows) > 1 else {}
+    return [*rows, {"effects": labels} | both] if both else rows
+
+
+def _flexible(found: Findings) -> dict[str, Any]:
+    """The flexible force on the recalibrated simulator and on top of the effects, in noise standard deviations."""
+    base = found.flexible_base
+    winner = found.flexible_winner if found.model.effects else None
+    shown = winner or base
+    if shown is None:
+        return {}
+    size = found.setup.fitter.size
+    levels = [np.nan if f is None else float(np.sqrt(f.condition.cost.mean() / size)) for f in (base, winner)]
+    seeds = np.sqrt(np.maximum(shown.condition.totals.min(1), 0.0) / shown.force.shape[0])
+    return {
+        "depends_on": [{"input": d["input"], "importance": d["importance"]} for d in shown.depends_on],
+        "where": flexible_in_words(shown, found.setup.fitter.simulator.windows.blocks),
+        "seeds": [s / np.sqrt(size) for s in seeds.tolist()],
+        "rms_on_base": levels[0],
+        "rms_on_winner": levels[1],
+    }
+
+
+def _black_boxes(found: BlackBoxes | None) -> dict[str, Any]:
+    """Shares of the squared gap above the noise that are closed on conditions held out, and the formula."""
+    if found is None:
+        return {}
+    terms = [{"joint": t.joint, "term": t.what, "force": t.force} for t in found.terms]
+    shares = {"network": found.network, "formula": found.formula, "named_effects": found.named}
+    return shares | {"terms": terms, "formula_in_words": formula_in_words(found), "folds": found.folds}
+
+
+def _overlays(found: Findings) -> list[dict[str, Any]]:
+    setup = found.setup
+    cut, model = setup.fitter.simulator.windows, setup.physics.mj_model
+    out: list[dict[str, Any]] = []
+    for r, log in enumerate(cut.logs):
+        own = np.flatnonzero(cut.log == r)
+        for joint in range(model.njnt):
+            q, v = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
+            if int(model.jnt_type[joint]) not in (2, 3) or len(out) >= MANY or not len(own) or not log.seen_dofs[v]:
+                continue
+            rows = np.concatenate([np.arange(cut.start[w] + 1, cut.start[w] + 1 + cut.steps) for w in own])
+            entry: dict[str, Any] = {
+                "log": log.name, "joint": model.joint(joint).name or f"joint{joint}", "unit": length_unit(model, v),
+                "time": log.time[rows] - log.time[0], "measured": log.qpos[rows, q],
+                "starts": log.time[cut.start[own]] - log.time[0],
+            }  # fmt: skip
+            told = {k: p for k, p in found.predictions.items() if k != "with_effects" or found.model.effects}
+            for stage, prediction in told.items():
+                error = setup.tolerance.by_dof(prediction.error[own])[..., v]
+                entry[stage] = log.qpos[rows, q] - (error * cut.sigma_q[v]).reshape(-1)
+            out.append(entry)
+    return out
+
+
+def _isolability(of: SearchState) -> dict[str, Any]:
+    """|cos| between what the candidates change in the residual, known parameters and starts projected out."""
+    some = [s for s in of.screened if s.absorbed < 0.999][:MANY]
+    if len(some) < 2:
+        return {}
+    columns = np.stack([s.column.reshape(-1) for s in some])
+    columns = columns / np.maximum(np.linalg.norm(columns, axis=1, keepdims=True), 1e-300)
+    return {
+        "labels": [s.candidate.label for s in some],
+        "cosine": np.abs(columns @ columns.T),
+        "absorbed": [s.absorbed for s in some],
+    }
+
+
+def _episodes(found: Findings) -> list[dict[str, Any]]:
+    cut = found.setup.fitter.simulator.windows
+    out: list[dict[str, Any]] = []
+    for r, log in enumerate(cut.logs):
+        own = cut.log == r
+        if own.any():
+            row: dict[str, Any] = {
+                "log": log.name,
+                "condition": log.name if cut.blocks else cut.groups[int(cut.group[own][0])],
+            }
+            row |= {k: float(np.sqrt(p.cost(cut.steps)[own].mean())) for k, p in found.predictions.items()}
+            out.append(row)
+    return out

@@ -7,13 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from bayessim_mjx.diagnosis import statistics
+from bayessim_mjx.diagnosis import phrases, statistics
+from bayessim_mjx.diagnosis.evidence.selecting import Rival
+from bayessim_mjx.diagnosis.evidence.weighing import Size, size_of
 from bayessim_mjx.diagnosis.findings import Findings
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.result import Estimate, FoundEffect
-from bayessim_mjx.diagnosis.selection import bounds, heldout, predicted_gain
+from bayessim_mjx.diagnosis.selection import bounds, heldout
 from bayessim_mjx.diagnosis.selection.models import Model
-from bayessim_mjx.diagnosis.selection.selected import Rival, Size, size_of
 from bayessim_mjx.diagnosis.setup import Setup
 
 # operating conditions, from which on closure is quoted of conditions that the choice was made without: without one of
@@ -42,14 +43,12 @@ class _Part:
 
 def _parts(found: Findings, closed: dict[str, Any]) -> dict[str, _Part]:
     """{label: part}; the shares are of the linear promise where too many effects are named to fit all subsets."""
-    base, fitted = found.selection.base, found.selection.subsets
+    base, fitted = found.selection.state.base, found.selection.subsets
     labels = [e.label for e in found.model.effects]
     if not labels:
         return {}
     if fitted:
-        each = predicted_gain.shapley(
-            len(labels), lambda some: base.cost - fitted[frozenset(labels[i] for i in some)].cost
-        )
+        each = statistics.shapley(len(labels), lambda some: base.cost - fitted[frozenset(labels[i] for i in some)].cost)
     else:
         each = np.array([[closed["each"][n] if len(labels) > 1 else 1.0] for n in labels])
         each = each if each.sum() else np.ones_like(each)
@@ -81,7 +80,7 @@ def _closed(found: Findings) -> heldout.Closed:
     answer = frozenset(e.label for e in found.model.effects)
     for condition, chosen in selection.chosen.items() if nested(found) else ():
         if chosen != answer:
-            own, models = cut.group == condition, selection.models
+            own, models = cut.group == condition, selection.state.models
             after[own] = before[own] * models[chosen].cost[own] / models[frozenset()].cost[own]
     floor = heldout.noise_floor(found.setup.fitter, found.model.fit, selection.estimated.noise)
     return heldout.Closed(before, after, cut.condition, floor)
@@ -108,7 +107,7 @@ def _effect(found: Findings, effect: Candidate, sd: np.ndarray, part: _Part) -> 
         bound = bounds.of(setup.physics, c, value)
         deviation = float(sd[i]) if bound is None or bound.kind == "off" else float("nan")
         numbers[word] = Estimate(value, deviation, _unit(setup, effect, c.unit), bound.kind if bound else "")
-        clause = bound.why if bound else UNTOLD if deviation > UNKNOWN * (c.high - c.low) else ""
+        clause = _bound(bound, c.unit) if bound else UNTOLD if deviation > UNKNOWN * (c.high - c.low) else ""
         ends += [f"{word.replace('_', ' ')} {clause}"] if clause else []
     shared = _shared(effect, size_of(effect, model.fit.values[own], sd[own]), weighed, weights)
     return FoundEffect(
@@ -124,6 +123,10 @@ def _effect(found: Findings, effect: Candidate, sd: np.ndarray, part: _Part) -> 
         share=part.share if len(model.effects) > 1 else float("nan"),
         shared=shared | ({"unit": _unit(setup, effect, shared["unit"])} if shared else {}),
     )
+
+
+def _bound(bound: bounds.Bound, unit: str) -> str:
+    return phrases.at_bound(bound.kind, bound.at, unit, bound.physical)
 
 
 def _shared(effect: Candidate, own: Size, rivals: list[Rival], weights: list[float]) -> dict[str, Any]:

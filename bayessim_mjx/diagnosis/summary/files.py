@@ -1,65 +1,90 @@
-"""The folder of a diagnosis: what is known so far, the verdict as soon as it stands, and everything at the end."""
+"""The folder of a diagnosis: results so far, the verdict as soon as it stands, at the end the result and its files."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import json
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from bayessim_mjx import atomic
 from bayessim_mjx.diagnosis import correction
-from bayessim_mjx.diagnosis.experiment import command_file
 from bayessim_mjx.diagnosis.experiment.propose import Experiment
-from bayessim_mjx.diagnosis.findings import Findings
+from bayessim_mjx.diagnosis.findings import Findings, Observer
 from bayessim_mjx.diagnosis.fitting import journal
 from bayessim_mjx.diagnosis.fitting.robot import Robot
-from bayessim_mjx.diagnosis.result import Diagnosis, load
-from bayessim_mjx.diagnosis.selection.tried import Tried
+from bayessim_mjx.diagnosis.gap import of_one
+from bayessim_mjx.diagnosis.result import Diagnosis, load, plain
+from bayessim_mjx.diagnosis.selection.budget import Progress
+from bayessim_mjx.diagnosis.selection.search_state import SearchState
 from bayessim_mjx.diagnosis.setup import Setup
-from bayessim_mjx.diagnosis.summary import assemble, preliminary
+from bayessim_mjx.diagnosis.summary import assemble, first_look
+from bayessim_mjx.errors import UserError
 
-PRELIMINARY = "preliminary.json"  # what is known while the search goes on
-SEARCH = "search_so_far"  # folder of what was fitted
+PRELIMINARY = "preliminary.json"  # results while the search goes on
+BEST = 20  # models listed there
+SEARCH = "search_so_far"  # folder of the fits
 COMMAND = "next_experiment.csv"
 
 
-class Files:
-    """Writes into a folder, or nowhere where there is none.
+class Files(Observer):
+    """Writes results into a folder, and passes progress on to the caller.
 
     Args:
-        folder: made when there is something to write; about: what is diagnosed.
+        folder: it is made at the first file; None: nothing is written. about: entries of the report's header.
+        progress, early: called as the methods of `Observer`; None: not called.
     """
 
-    def __init__(self, folder: Path | None, about: Mapping[str, Any]) -> None:
+    def __init__(
+        self,
+        folder: Path | None,
+        about: Mapping[str, Any],
+        progress: Progress | None = None,
+        early: Callable[[Sequence[str]], None] | None = None,
+    ) -> None:
         self.folder, self.about = folder, about
+        self._progress, self._early = progress, early
+
+    def progress(self, text: str, done: int, total: int) -> None:
+        if self._progress is not None:
+            self._progress(text, done, total)
+
+    def early(self, lines: Sequence[str]) -> None:
+        if self._early is not None:
+            self._early(lines)
 
     @property
     def search(self) -> Path | None:
-        """Folder for what is fitted, from which a killed search goes on."""
+        """Folder for the fits, from which an interrupted search continues."""
         return None if self.folder is None else self.folder / SEARCH
 
-    def so_far(self, setup: Setup, tried: Tried | None) -> None:
-        """What is known before there is a verdict: killed there, this stays."""
+    def known(self, setup: Setup, state: SearchState | None) -> None:
+        """Write the results so far; they stay if the diagnosis is killed before its verdict."""
         if self.folder is not None:
-            preliminary.write(self.folder / PRELIMINARY, self.about, setup, tried)
+            write_preliminary(self.folder / PRELIMINARY, self.about, setup, state)
 
     def verdict(self, found: Findings) -> None:
-        """The verdict on its own: maps and the next experiment take time; killed there, it stays."""
+        """Write the verdict; it stays if the diagnosis is killed during maps and the next experiment."""
         if self.folder is not None:
             assemble.diagnosis_of(found, self.about).save(self.folder)
             (self.folder / PRELIMINARY).unlink(missing_ok=True)
             journal.remove(self.folder / SEARCH)
 
     def result(self, found: Findings) -> Diagnosis:
-        """What was found as a Diagnosis, its proposal as a file that can be played."""
+        """The findings as a Diagnosis; writes the proposed experiment as a file that can be played."""
         proposal, name = found.part(Experiment), ""
         if self.folder is not None and proposal is not None and proposal.chosen is not None:
             source = str(self.folder / "diagnosis.json")
-            name = command_file.write_command(self.folder / COMMAND, proposal, source).name
+            name = write_command(self.folder / COMMAND, proposal, source).name
         return assemble.diagnosis_of(found, self.about, name)
 
     def whole(self, result: Diagnosis, robot: Robot) -> Diagnosis:
-        """Write everything but the report; returns what can be loaded again."""
+        """Write everything but the report; returns the result as it is loaded again."""
         if self.folder is None:
             return result
         result.save(self.folder)  # before anything that could fail: nothing computed is lost
@@ -69,3 +94,115 @@ class Files:
             result = replace(result, warnings=[*result.warnings, *left_out])
             result.save(self.folder)
         return result
+
+
+def write_preliminary(path: Path, about: Mapping[str, Any], setup: Setup, state: SearchState | None) -> None:
+    """Write the results so far, whole or not at all; there is no verdict among them.
+
+    Args:
+        about: entries of the report's header; state: None before the first fit.
+    """
+    found = {"verdict": None, "about": dict(about), "before_simulation": first_look.lines(setup.look)}
+    found |= {"warnings": list(setup.warnings)} | ({} if state is None else _so_far(state))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    every = plain(found | {"windows": len(setup.fitter.simulator.windows)})
+    atomic.write_text(path, json.dumps(every, indent=1, allow_nan=False) + "\n")
+
+
+def _so_far(state: SearchState) -> dict[str, Any]:
+    """Gaps in noise standard deviations, recalibrated parameters and the best models."""
+    fit, calibrated = state.base.fit, state.gap(state.base)
+    nominal, _ = state.nominal.quadratic(state.fitter.spread)
+    best = [
+        {k: row[k] for k in ("label", "score", "se", "gap_closed", "parameters")}
+        for row in assemble.ranking(state)[:BEST]
+    ]
+    return {
+        "gap": {"nominal": of_one(float(nominal.c.sum()), calibrated.noise).rms, "calibrated": calibrated.rms},
+        "parameters": dict(zip(fit.names, map(float, fit.values), strict=True)),
+        "candidates": best,
+    }
+
+
+Array = NDArray[np.float64]
+
+
+def write_command(path: str | Path, experiment: Experiment, source: str = "") -> Path:
+    """Write `time, ctrl:<actuator>..., ref:<joint>...` (and `enabled:<actuator>`) and `<stem>.yaml` beside it.
+
+    Args:
+        source: the file or folder that the proposal came from.
+
+    Raises:
+        UserError: the proposal has nothing to play, or the file's ending is not .csv.
+    """
+    path = Path(path)
+    if experiment.chosen is None:
+        raise UserError(f"{path}: there is nothing to play: {experiment.why}")
+    if path.suffix != ".csv":
+        raise UserError(f"{path}: a command file ends in .csv")
+    log = experiment.chosen.played.log
+    table = {"time": log.time} | {f"ctrl:{n}": c for n, c in zip(log.actuators, log.ctrl.T, strict=True)}
+    table |= {f"ref:{n}": c for n, c in zip(log.channels.qpos, log.qpos.T, strict=True)}
+    table |= {k: s for k, s in log.streams.items() if k.startswith("enabled:")}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    formats = ["%.12g"] + ["%.9g"] * (len(table) - 1)
+    np.savetxt(path, np.stack(list(table.values()), 1), formats, ",", header=",".join(table), comments="")
+    notes = yaml.safe_dump(_notes(path, experiment, source), sort_keys=False, width=110, allow_unicode=True)
+    path.with_suffix(".yaml").write_text(notes)
+    return path
+
+
+def _notes(path: Path, e: Experiment, source: str) -> dict[str, Any]:
+    assert e.chosen is not None
+    log, d = e.chosen.played.log, e.drives
+    torque = [i for i, kind in enumerate(d.kind) if kind == "torque"]
+    notes: dict[str, Any] = {
+        "experiment": e.name,
+        "why": e.why,
+        "expected_evidence_nats": round(e.evidence, 2),
+        "needs": e.needs or "nobody: it runs by itself from the start position",
+        "file": path.name,
+        "source": source,
+        "control_period": round(log.period, 9),
+        "start": {n: round(float(x), 6) for n, x in zip(log.channels.qpos, log.qpos[0], strict=True)},
+        "kind": dict(zip(log.actuators, d.kind, strict=True)),
+        "how_to_play": "Bring the robot to rest at `start`. Send row k of ctrl at time[k] and hold it until time[k+1].",
+        "limits": _limits(e),
+        "how_to_log": {
+            "columns": ["time", *(f"ctrl:{n}" for n in log.actuators), *(f"qpos:{n}" for n in log.channels.qpos)],
+            "advice": "Log the command that was really sent, at every control period; add the log to the others.",
+            "side_yaml": {"condition": "next experiment", **_controller(log)},
+            "also": e.witnesses,
+        },
+    }
+    if torque:
+        notes["closed_loop"] = {
+            "law": "u = ctrl + kp (ref - q) + kd (d ref/dt - dq/dt), clipped to the command limits; recommended",
+            "kp": {log.actuators[i]: float(f"{d.kp[i]:.4g}") for i in torque},
+            "kd": {log.actuators[i]: float(f"{d.kd[i]:.4g}") for i in torque},
+            "note": "Log u as ctrl, with controller law torque: the diagnosis wants what was sent.",
+        }
+    return notes
+
+
+def _controller(log: Any) -> dict[str, Any]:
+    return {"controller": log.metadata["controller"]} if "controller" in log.metadata else {}
+
+
+def _limits(e: Experiment) -> dict[str, Any]:
+    assert e.chosen is not None
+    limits, log = e.limits, e.chosen.played.log
+    joints = {}
+    for name in log.joints:
+        v = log.channels.qvel.index(name) if name in log.channels.qvel else -1
+        if v >= 0 and np.isfinite(limits.high[v]):
+            joints[name] = {"range": _short(limits.low[v], limits.high[v]), "speed": _short(limits.speed[v])[0]}
+    rows = zip(log.actuators, limits.command_low, limits.command_high, limits.effort, strict=True)
+    actuators = {n: {"command": _short(low, high), "effort": _short(effort)[0]} for n, low, high, effort in rows}
+    used = round(e.chosen.played.worst, 3)
+    return {"joints": joints, "actuators": actuators, "largest_share_used": used, "from": limits.source}
+
+
+def _short(*values: float) -> list[float]:
+    return [float(f"{v:.6g}") for v in values]

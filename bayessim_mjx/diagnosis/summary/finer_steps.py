@@ -11,10 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayessim_mjx.diagnosis.findings import Findings, Progress
+from bayessim_mjx.diagnosis.findings import Findings
 from bayessim_mjx.diagnosis.fitting import windows
 from bayessim_mjx.diagnosis.fitting.discretisation import contacts, refined
 from bayessim_mjx.diagnosis.fitting.simulator import FAR, Simulator, physics_of
+from bayessim_mjx.diagnosis.selection.budget import Progress
 from bayessim_mjx.diagnosis.summary.whole_logs import theta_of
 from bayessim_mjx.physics import staggered
 

@@ -10,16 +10,13 @@ import numpy as np
 from bayessim_mjx import effects as library
 from bayessim_mjx.diagnosis import phrases
 from bayessim_mjx.diagnosis.gap import Gap, of_one
-from bayessim_mjx.diagnosis.residual import fingerprints
 from bayessim_mjx.diagnosis.residual.black_boxes import BlackBoxes
-from bayessim_mjx.diagnosis.residual.fingerprints import Fingerprint
 from bayessim_mjx.diagnosis.residual.flexible import Flexible
 from bayessim_mjx.diagnosis.residual.frequency import Heard
-from bayessim_mjx.diagnosis.residual.where import Located
+from bayessim_mjx.diagnosis.residual.where import LIMITS, Fingerprint, Located
 from bayessim_mjx.diagnosis.result import Place
-from bayessim_mjx.diagnosis.vocabulary import listed
 from bayessim_mjx.effects.support.words import words
-from bayessim_mjx.quantities import percent
+from bayessim_mjx.quantities import listed, percent
 
 
 @dataclass(frozen=True)
@@ -122,7 +119,7 @@ def _signature(found: Fingerprint) -> str:
         for key, words in own.terms.items()
         if (n := numbers.get(key)) is not None
     ]
-    return f"{found.joint}: {own.head.format(recent=fingerprints.LIMITS.recent)} {', '.join(told)}" if told else ""
+    return f"{found.joint}: {own.head.format(recent=LIMITS.recent)} {', '.join(told)}" if told else ""
 
 
 def spectra_in_words(found: Sequence[Heard]) -> list[str]:

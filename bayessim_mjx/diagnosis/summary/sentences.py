@@ -1,4 +1,4 @@
-"""The verdict in words."""
+"""The verdict in words: the texts of its sentences, and the numbers that fill them in."""
 
 from __future__ import annotations
 
@@ -8,42 +8,99 @@ from dataclasses import dataclass
 from typing import Any
 
 from bayessim_mjx.diagnosis import phrases, tolerance
+from bayessim_mjx.diagnosis.evidence.selecting import Rival
+from bayessim_mjx.diagnosis.evidence.sets import Weighed
 from bayessim_mjx.diagnosis.findings import Findings
 from bayessim_mjx.diagnosis.gap import of_one, of_rms
 from bayessim_mjx.diagnosis.result import FoundEffect, Gap
-from bayessim_mjx.diagnosis.selection.selected import Rival
-from bayessim_mjx.diagnosis.selection.sets import BASE, Weighed
+from bayessim_mjx.diagnosis.selection.models import BASE
 from bayessim_mjx.diagnosis.summary import first_look
 from bayessim_mjx.diagnosis.summary.left_in_words import flexible_in_words
-from bayessim_mjx.diagnosis.summary.texts import (
-    ABOVE,
-    BEATEN,
-    BENT,
-    BUILDS_UP,
-    CHANCE,
-    COASTS,
-    COASTS_CLOSED,
-    ELSEWHERE,
-    FALLS,
-    FAR,
-    HEADS,
-    HIDDEN,
-    IMPERFECT,
-    IN_SAMPLE,
-    NEAREST,
-    NESTED,
-    OF_SENSORS,
-    ON_TOP,
-    PARTLY,
-    PROBABLE,
-    REST,
-    STANDS_FOR,
-    STUCK,
-    WITHIN,
-)
 from bayessim_mjx.diagnosis.summary.verdict import Verdict
-from bayessim_mjx.diagnosis.vocabulary import by_law, listed, missing
-from bayessim_mjx.quantities import extent, percent
+from bayessim_mjx.quantities import extent, listed, percent
+
+HEADS = {
+    "no_gap": "No gap above the noise: the logs differ from the simulator by {nominal}.",
+    "parameters": "Only parameters are off, as far as these logs tell: recalibrated, the gap falls from {nominal} to "
+    "{calibrated}.",
+    "noise": "The noise is larger than estimated: what the recalibrated simulator leaves, {calibrated}, nothing "
+    "predicts, and no force leaves such a trace.",
+    "effects": "The simulator lacks {named}.",
+    "ambiguous": "The simulator lacks something like {named}, but these logs fit other explanations as well.",
+    "unexplained": "Something is missing that no effect of the library explains.",
+}
+ABOVE = {  # where the residual is above the noise
+    "no_gap": "The logs differ from the simulator by {nominal}. That is more than the noise, but too little for these "
+    "logs to tell what is missing.",
+    "parameters": "The parameters are off: recalibrated, the gap falls from {nominal} to {calibrated}. That is more "
+    "than the noise, but too little for these logs to tell what is missing.",
+}
+PARTLY = (
+    "Partly explained: {named} {close} {realised} of the squared gap above the noise, but more than the tolerance "
+    "remains at {beyond}."
+)
+REST = {
+    "effects": "The simulator lacks {named}, and more than the tolerance remains at {beyond}.",
+    "ambiguous": "The simulator lacks something like {named}, but these logs fit other explanations as well, and more "
+    "than the tolerance remains at {beyond}.",
+}
+IMPERFECT = (
+    "No candidate closes what remains, {remains_of} of the squared gap: the law is not quite that of the real system."
+)
+NEAREST = "Of the library, {named} {come} nearest"
+BEATEN = "; a flexible force alone predicts held-out {held} far better"
+ON_TOP = "; a flexible force on top of {them} still closes {remains} of the gap"
+FALLS = (
+    "With {them} the recalibrated simulator's gap falls from {calibrated} to {with_effects} on held-out {held}. "
+    "Before {they} fitted, {predicted} of the squared gap above the noise was predicted to close; {realised} did."
+)
+ELSEWHERE = (
+    "Where the effects are chosen anew without each operating condition in turn, they close {elsewhere} of the gap of "
+    "the condition that was left out."
+)
+NESTED = (
+    "For each operating condition the effects were chosen and fitted without it; the costs behind the choice were not, "
+    "so these shares may be a little too high."
+)
+IN_SAMPLE = (
+    "These numbers are in sample: one log is one operating condition, parts of it were held out, and nothing tells how "
+    "they hold in another condition."
+)
+WITHIN = "What remains is within the tolerance at every joint: {within}."
+PROBABLE = (
+    "Probability of this explanation among all that were fitted: {share}; of the others that stand beside it: "
+    "{others}; of the known parameters alone: {nothing}."
+)
+HIDDEN = (
+    "Beside {them} these logs would not show {hidden}: parameters of what is named do the same, and stand for both "
+    "where both are there."
+)
+STANDS_FOR = (
+    "The data sheet may be wrong at {parameters}, or the simulator lacks {effects}: both move the robot alike. "
+    "--accuracy weighs the two."
+)
+BUILDS_UP = (
+    "Over whole logs the error grows to {times} times what noise, start and parameters make likely, though within "
+    "{window} it hardly shows: the law, or the simulator's time step, is not quite right."
+)
+BENT = (
+    "This needs {far} of {known} known parameters far from the data sheet, by chance less often than in 1 of 10 000 "
+    "robots even if it is half as inaccurate again as stated: something else may be missing in their place, or the "
+    "data sheet is not this robot's (--accuracy, --parameters)."
+)
+OF_SENSORS = "What remains has the covariance of noise of the sensors, {colour}."
+CHANCE = (
+    "What remains, {calibrated}, no candidate and no flexible force predicts on held-out {held}: process noise, an "
+    "input that was not logged, or noise larger than estimated."
+)
+
+COASTS = (
+    "Joints that just keep their speed in a window, without any simulator, are {coasting} noise sd off, less than the "
+    "recalibrated simulator's {calibrated}{more}: its forces are far off, or hardly show in windows as short as these."
+)
+COASTS_CLOSED = "; of that squared gap the effects close {closed}"
+STUCK = "At a bound, where they stand in for something else or their range is too narrow: {named}."
+FAR = "Far from the data sheet: {named}."
 
 
 @dataclass(frozen=True)
@@ -65,7 +122,7 @@ def sentences(
     far: Gap,
 ) -> list[str]:
     """The verdict, most important first."""
-    name, cut = verdict.name, found.selection.fitter.simulator.windows
+    name, cut = verdict.name, found.selection.state.fitter.simulator.windows
     told = verdict_in_words(name, effects, far, verdict.remains, verdict.beaten)
     far_off, known = verdict.bent
     told += [BENT.format(far=far_off, known=known)] if known else []
@@ -77,12 +134,12 @@ def sentences(
     told += [_hidden(found.selection.hidden, len(effects))]
     if verdict.noise is not None and (name == "noise" or far.beyond):
         told.append(_of_sensors(verdict.noise.memory * cut.steps * cut.dt))
-    elif not effects and verdict.remains == 0.0 and found.selection.above_noise(found.selection.base):
+    elif not effects and verdict.remains == 0.0 and found.selection.state.above_noise(found.selection.state.base):
         told.append(CHANCE.format(calibrated=stage_in_words(far, "calibrated"), held=_held(far)))
     if name == "unexplained" and found.flexible_winner is not None:
         told += [f"{text[:1].upper()}{text[1:]}." for text in flexible_in_words(found.flexible_winner, cut.blocks)]
     told += [first_look.apart(found.setup.look)]
-    told += [f"At its bound: {missing(e.name, e.where)}. {e.sentence}" for e in effects if _at_bound(e)]
+    told += [f"At its bound: {phrases.missing(e.name, e.where)}. {e.sentence}" for e in effects if _at_bound(e)]
     told += _remarks(parameters)
     return [text for text in told if text]
 
@@ -114,7 +171,7 @@ def _hidden(labels: Sequence[str], effects: int) -> str:
 
 def _any_of(labels: Sequence[str]) -> str:
     """Effects in words, not too many."""
-    every = by_law([label.split("@", 1) for label in labels])
+    every = phrases.by_law([label.split("@", 1) for label in labels])
     parts = every[: LIMITS.told]
     parts += [f"{len(every) - len(parts)} more"] if len(every) > len(parts) else []
     return listed(parts, "or")
@@ -155,7 +212,7 @@ def verdict_in_words(
     promised, went = (far.closed.get(k, math.nan) for k in ("predicted", "realised"))
     one = len(effects) == 1
     fill = {s: stage_in_words(far, s) for s in ("nominal", "calibrated", "with_effects")} | {
-        "named": listed(by_law([(e.name, e.where) for e in effects])),
+        "named": listed(phrases.by_law([(e.name, e.where) for e in effects])),
         "them": "it" if one else "them",
         "they": "it was" if one else "they were",
         "come": "comes" if one else "come",
@@ -257,10 +314,10 @@ def number(value: float) -> str:
 
 def _instead(effect: FoundEffect, rivals: Sequence[Rival]) -> str:
     """What else it could be, and how large it is whichever it is."""
-    others = [listed(by_law([(c.effect, c.where) for c in r.effects])) for r in rivals if not r.contains][:4]
+    others = [listed(phrases.by_law([(c.effect, c.where) for c in r.effects])) for r in rivals if not r.contains][:4]
     if not others:
         return ""
-    text = f"Instead of {missing(effect.name, effect.where)} it could be {listed(others, 'or')}."
+    text = f"Instead of {phrases.missing(effect.name, effect.where)} it could be {listed(others, 'or')}."
     shared = effect.shared
     if not shared:
         return text

@@ -14,7 +14,7 @@ from bayessim_mjx.diagnosis.gap import of_one, of_rms
 from bayessim_mjx.diagnosis.residual.origin import Origin, origin
 from bayessim_mjx.diagnosis.result import Gap
 from bayessim_mjx.diagnosis.selection.models import Model
-from bayessim_mjx.diagnosis.selection.tried import FLOOR
+from bayessim_mjx.diagnosis.selection.search_state import FLOOR
 from bayessim_mjx.diagnosis.summary.whole_logs import Whole
 
 
@@ -110,21 +110,21 @@ def builds_up(found: Findings, far: Gap) -> float:
 
 
 def _name(found: Findings, far: Gap, remaining: float, alone: bool, noise: Origin | None) -> str:
-    tried, model = found.selection, found.model
+    state, model = found.selection.state, found.model
     if model.effects:
         matters = far.with_effects > LIMITS.shows or bool(far.beyond)
         little = of_rms(far.calibrated, far.with_effects).left <= LIMITS.share or noise is not None
         little = little and not standstill(far)
-        structured = tried.above_noise(model) and not remaining <= LIMITS.share  # NaN: all is on top
+        structured = state.above_noise(model) and not remaining <= LIMITS.share  # NaN: all is on top
         if (matters and not little) or structured or (found.flexible_winner is not None and alone):
             return "unexplained"
-        return "ambiguous" if tried.ambiguous else "effects"
-    calibrated = tried.gap(tried.base)
+        return "ambiguous" if found.selection.ambiguous else "effects"
+    calibrated = state.gap(state.base)
     if calibrated.rms > LIMITS.matters:
         return "unexplained" if noise is None or remaining > LIMITS.share else "noise"
-    if tried.above_noise(tried.base) and remaining > LIMITS.share:
+    if state.above_noise(state.base) and remaining > LIMITS.share:
         return "unexplained"
-    q, _ = tried.nominal.quadratic(tried.fitter.spread)
+    q, _ = state.nominal.quadratic(state.fitter.spread)
     nominal = of_one(float(q.c.sum()), calibrated.noise)
     return "parameters" if nominal.rms > FLOOR and nominal.after > 1.1 * calibrated.after else "no_gap"
 
@@ -142,12 +142,12 @@ def standstill(far: Gap) -> bool:
 
 def remains(found: Findings) -> float:
     """Share of the calibrated gap that a flexible force still closes on top of the winner; 0 where not significant."""
-    flex, base, model = found.flexible_winner, found.selection.base, found.model
+    flex, base, model = found.flexible_winner, found.selection.state.base, found.model
     if flex is None or not flex.condition.significant:
         return 0.0
     cost = float(model.plain.sum())  # as the force's is: of predictions, with nothing open
     top = cost - min(float(flex.condition.cost.sum()), cost)
-    return of_one(float(base.plain.sum()), found.selection.noise * len(base.cost)).share(top)
+    return of_one(float(base.plain.sum()), found.selection.state.noise * len(base.cost)).share(top)
 
 
 def beaten(found: Findings) -> bool:
@@ -155,12 +155,12 @@ def beaten(found: Findings) -> bool:
 
     By a relevant share of the gap too: of effects that close 99.9 % something is left that a force can learn.
     """
-    tried, base, model = found.selection, found.flexible_base, found.model
+    state, base, model = found.selection.state, found.flexible_base, found.model
     if base is None or not base.condition.significant:
         return False
     cost = float(model.plain.sum())
     better = cost - float(base.condition.cost.sum())
-    share = of_one(float(tried.base.plain.sum()), tried.noise * len(tried.base.cost)).share(better)
+    share = of_one(float(state.base.plain.sum()), state.noise * len(state.base.cost)).share(better)
     return better > LIMITS.beaten * cost and share > LIMITS.relevant
 
 
@@ -174,7 +174,7 @@ def sensors_noise(found: Findings) -> Origin | None:
     if flex is None or missing is None or flex.condition.significant or flex.interpolation.significant:
         return None
     fit = found.model.fit
-    fitter = found.selection.fitter
+    fitter = found.selection.state.fitter
     channels = int(fitter.used.sum())
     where = origin(fit.r, fit.B, missing.linear.D, missing.amplitude, channels, fit.weight, fitter.rate())
     return where if where.of_sensors else None

@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 
 from bayessim_mjx.device import cores
 from bayessim_mjx.diagnosis import statistics
-from bayessim_mjx.diagnosis.findings import Findings, Progress
+from bayessim_mjx.diagnosis.findings import Findings
 from bayessim_mjx.diagnosis.fitting import windows
 from bayessim_mjx.diagnosis.fitting.simulator import Simulator, physics_of
-from bayessim_mjx.diagnosis.selection import uncertainty
+from bayessim_mjx.diagnosis.selection.budget import Progress
 from bayessim_mjx.diagnosis.selection.heldout import Prediction
-from bayessim_mjx.diagnosis.selection.models import Model
+from bayessim_mjx.diagnosis.selection.models import KNOWN, Model, of_noise, systematic
 from bayessim_mjx.diagnosis.setup import Setup
 from bayessim_mjx.quantities import percent
 
@@ -94,8 +94,8 @@ def simulate(found: Findings) -> Whole:
     """Every stage on at most LOGS logs; parameters are those found without the log's condition, where it has one."""
     setup, cut = found.setup, found.setup.fitter.simulator.windows
     stages = {
-        "nominal": _Stage(found.selection.base, found.predictions["nominal"], True),
-        "calibrated": _Stage(found.selection.base, found.predictions["calibrated"], False),
+        "nominal": _Stage(found.selection.state.base, found.predictions["nominal"], True),
+        "calibrated": _Stage(found.selection.state.base, found.predictions["calibrated"], False),
     }
     if found.model.effects:
         stages["with_effects"] = _Stage(found.model, found.predictions["with_effects"], False)
@@ -173,9 +173,9 @@ def _drawn(
 
 def _root(found: Findings, model: Model) -> Array:
     """Square root `[k, k]` of the covariance of parameters whose law is right: noise, and what simulators differ by."""
-    setup, known = found.setup, uncertainty.KNOWN
-    own = uncertainty.systematic(model, float(setup.physics.mj_model.opt.timestep), known=known)
-    return statistics.root(uncertainty.of_noise(setup.fitter, model) + np.diag(own**2))
+    setup, known = found.setup, KNOWN
+    own = systematic(model, float(setup.physics.mj_model.opt.timestep), known=known)
+    return statistics.root(of_noise(setup.fitter, model) + np.diag(own**2))
 
 
 def _values(found: Findings, stage: _Stage, w: int) -> Array:

@@ -13,8 +13,9 @@ from bayessim_mjx.diagnosis.evidence.weighing import Weighing
 from bayessim_mjx.diagnosis.fitting import robot
 from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
 from bayessim_mjx.diagnosis.fitting.fit import Fit
-from bayessim_mjx.diagnosis.selection.begin import begin
-from bayessim_mjx.diagnosis.selection.sets import BASE
+from bayessim_mjx.diagnosis.request import Request
+from bayessim_mjx.diagnosis.selection.fits import begin
+from bayessim_mjx.diagnosis.selection.models import BASE
 from bayessim_mjx.parameters.parameter import Parameter
 from tests.diagnosis import pendulums
 
@@ -92,7 +93,7 @@ def test_a_lag_of_velocities_is_found_and_moves_no_parameter(tmp_path):
     logs = pendulums.recorded(scale=scale, count=6, late_velocity=late)
     path, numbers = tmp_path / "pendulum.xml", (pendulums.DAMPING, pendulums.ARMATURE, 0.0, pendulums.MASS)
     path.write_text(pendulums.MODEL % (pendulums.STEP, "RK4", *numbers))  # without an error of its own step
-    setup = preparing.prepare(robot.of_file(path), logs, ["viscous_friction"])
+    setup = preparing.prepare(robot.of_file(path), logs, Request(["viscous_friction"]))
     pool = begin(setup.fitter, setup.candidates, setup.settings)
     scored = Weighing(pool).scored[BASE]
     step = scored.learnt.step[len(pool.base.fit.values) :]

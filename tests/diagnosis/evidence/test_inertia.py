@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from bayessim_mjx.diagnosis.evidence.inertia import alike
+from bayessim_mjx.diagnosis.evidence.laws import with_same_inertia
 from bayessim_mjx.diagnosis.fitting import robot
 from bayessim_mjx.diagnosis.fitting.candidates import base_coordinates, enumerate_candidates
 from bayessim_mjx.diagnosis.fitting.fitter import Fitter
@@ -49,12 +49,14 @@ def test_a_payload_and_what_it_does_to_its_body():
     laws = {c.effect: c for c in enumerate_candidates(at.simulator.physics)}
     load, body = laws["payload"], laws["inertial_parameters"]
     names = [c.name for c in at.base]
-    found = alike(at, model_of(at, load, {"lower_mass_mult": 1.1}, [LOAD, *ARM]), load, body)
+    found = with_same_inertia(at, model_of(at, load, {"lower_mass_mult": 1.1}, [LOAD, *ARM]), load, body)
     assert found.known[names.index("lower_mass_mult")] == pytest.approx(1.1 + LOAD, rel=0.02)
     assert found.known[names.index("upper_mass_mult")] == 1.0
     assert found.own[:3] == pytest.approx(LOAD / (1.1 + LOAD) * ARM, abs=0.002)
 
-    back = alike(at, model_of(at, body, {"lower_mass_mult": 1.1 + LOAD}, [*(LOAD / 1.2 * ARM), 1.0]), body, load)
+    back = with_same_inertia(
+        at, model_of(at, body, {"lower_mass_mult": 1.1 + LOAD}, [*(LOAD / 1.2 * ARM), 1.0]), body, load
+    )
     mass = back.known[names.index("lower_mass_mult")]
     assert mass + back.own[0] == pytest.approx(1.2, rel=0.02)
     assert back.own[0] * back.own[1:] == pytest.approx(LOAD * ARM, abs=0.002)

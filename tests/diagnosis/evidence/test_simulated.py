@@ -9,8 +9,9 @@ from bayessim_mjx.diagnosis import setup as preparing
 from bayessim_mjx.diagnosis.evidence.gaussian import marginal, windows_of
 from bayessim_mjx.diagnosis.evidence.parameters import _truncated
 from bayessim_mjx.diagnosis.evidence.search import Search
-from bayessim_mjx.diagnosis.selection.begin import begin
-from bayessim_mjx.diagnosis.selection.sets import BASE
+from bayessim_mjx.diagnosis.request import Request
+from bayessim_mjx.diagnosis.selection.fits import begin
+from bayessim_mjx.diagnosis.selection.models import BASE
 from tests.diagnosis import pendulums
 
 pytestmark = [pytest.mark.slow, pytest.mark.ci]  # whole searches
@@ -23,7 +24,7 @@ def found(tmp_path_factory):
     """(search, posterior) of logs with dry friction, other masses and noise."""
     robot = pendulums.nominal(tmp_path_factory.mktemp("model")).stated(["5%"], [])
     logs = pendulums.recorded(friction=FRICTION, scale=(1.05, 0.97, 1.03), count=6)
-    setup = preparing.prepare(robot, logs, ["coulomb_friction", "viscous_friction"])
+    setup = preparing.prepare(robot, logs, Request(["coulomb_friction", "viscous_friction"]))
     pool = begin(setup.fitter, setup.candidates, setup.settings)
     search = Search(pool, lambda *_: None)
     return search, search.run()
@@ -33,7 +34,7 @@ def test_what_is_missing_is_named_and_what_is_not_is_not(found):
     search, weighed = found
     assert weighed.answer == DRY
     assert weighed.weight[DRY] > 0.99
-    model = search.pool.models[DRY]
+    model = search.state.models[DRY]
     assert model.fit.values[-1] == pytest.approx(FRICTION, rel=0.05)
 
 
@@ -48,7 +49,7 @@ def _sampled(found, key):
     """Evidence less an unbiased estimate of it: draws around the fit, each simulated; all else is integrated out."""
     search, _ = found
     weighing, scored = search.weighing, search.weighing.scored[key]
-    fit, learnt, fitter = scored.fit, scored.learnt, search.pool.fitter
+    fit, learnt, fitter = scored.fit, scored.learnt, search.state.fitter
     fixed = scored.model.fit
     precision = fit.belief()
     neutral = np.array([c.neutral for c in fit.coordinates]) - fit.values

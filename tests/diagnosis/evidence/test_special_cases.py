@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from bayessim_mjx.diagnosis.evidence.search import _as_large
+from bayessim_mjx.diagnosis.evidence.laws import related, special_case
+from bayessim_mjx.diagnosis.evidence.search import as_large
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate, Coordinate
-from bayessim_mjx.diagnosis.selection.laws import related, special_case
 
 
 def candidate(effect, *numbers, where="place", kind="joint"):
@@ -22,7 +22,7 @@ STRIBECK = candidate("stribeck_friction", ("level", 2.0, "N m"), ("excess", 2.0,
 @pytest.mark.parametrize(("high", "start"), [(2.0, 0.7), (0.5, 0.5)])
 def test_by_units_in_their_order_and_within_the_range(high, start):
     coulomb = candidate("coulomb_friction", ("level", high, "N m"))
-    (found,) = _as_large(coulomb, STRIBECK, np.array([0.7, 0.2, 0.1]))
+    (found,) = as_large(coulomb, STRIBECK, np.array([0.7, 0.2, 0.1]))
     assert found == pytest.approx([start])
 
 
@@ -30,11 +30,11 @@ def test_a_law_that_contains_another_begins_as_that_one():
     """Friction by direction begins with the level of Coulomb's in both; what has no partner is neutral."""
     coulomb = candidate("coulomb_friction", ("level", 2.0, "N m"))
     numbers = [("forward", 2.0, "N m"), ("backward", 2.0, "N m"), ("viscous", 1.0, "N m s/rad")]
-    (found,) = _as_large(candidate("asymmetric_friction", *numbers), coulomb, np.array([0.7]))
+    (found,) = as_large(candidate("asymmetric_friction", *numbers), coulomb, np.array([0.7]))
     assert found == pytest.approx([0.7, 0.7, 0.0])
-    (found,) = _as_large(candidate("asymmetric_friction", *numbers), STRIBECK, np.array([0.7, 0.2, 0.1]))
+    (found,) = as_large(candidate("asymmetric_friction", *numbers), STRIBECK, np.array([0.7, 0.2, 0.1]))
     assert found == pytest.approx([0.7, 0.2, 0.0])
-    assert _as_large(candidate("quadratic_drag", ("coefficient", 1.0, "N m s^2/rad^2")), STRIBECK, np.zeros(3)) == ()
+    assert as_large(candidate("quadratic_drag", ("coefficient", 1.0, "N m s^2/rad^2")), STRIBECK, np.zeros(3)) == ()
 
 
 def test_a_tied_law_has_each_place_as_a_special_case():

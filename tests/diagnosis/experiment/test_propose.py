@@ -8,16 +8,17 @@ import numpy as np
 import pytest
 import yaml
 
-from bayessim_mjx.diagnosis.experiment.command_file import write_command
-from bayessim_mjx.diagnosis.experiment.limits import limits_of
+from bayessim_mjx.diagnosis.evidence.selecting import Selection
+from bayessim_mjx.diagnosis.evidence.sets import Weighed
+from bayessim_mjx.diagnosis.experiment.excitation import limits_of
 from bayessim_mjx.diagnosis.experiment.propose import propose
 from bayessim_mjx.diagnosis.findings import Findings
 from bayessim_mjx.diagnosis.fitting.robot import Robot, default_space
+from bayessim_mjx.diagnosis.request import Request
 from bayessim_mjx.diagnosis.selection.models import nats, scored
-from bayessim_mjx.diagnosis.selection.selected import selection_of
-from bayessim_mjx.diagnosis.selection.sets import Weighed
-from bayessim_mjx.diagnosis.selection.tried import ranked
+from bayessim_mjx.diagnosis.selection.search_state import ranked
 from bayessim_mjx.diagnosis.setup import prepare
+from bayessim_mjx.diagnosis.summary.files import write_command
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Channels, Log
 from bayessim_mjx.logs.signals import estimate_velocity
@@ -74,7 +75,7 @@ def slow_logs():
 
 
 def diagnosed(logs):
-    setup = prepare(robot(), logs, ["viscous_friction", "quadratic_drag"])
+    setup = prepare(robot(), logs, Request(["viscous_friction", "quadratic_drag"]))
     return setup, singles.fitted(setup)
 
 
@@ -92,7 +93,7 @@ def concluded(pool, answer):
     weighed = Weighed(even, dict.fromkeys(pool.models, 0.0), {}, even)
     shares = {"subsets": {}, "promised": (0.0, {}), "chosen": {}, "elsewhere": float("nan")}
     nothing = {"hidden": (), "stand_ins": {}, "rivals": {}, "estimated": None}
-    return selection_of(pool, answer, weighed=weighed, **shares, **nothing)
+    return Selection(pool, answer, weighed=weighed, **shares, **nothing)
 
 
 @functools.cache
@@ -140,7 +141,7 @@ def read(path):
 
 
 def test_the_promised_evidence_comes_true(tmp_path):
-    before = contest()[0].selection
+    before = contest()[0].selection.state
     found = proposal()
     command, notes = read(write_command(tmp_path / "next.csv", found))
     kp, kd = (notes["closed_loop"][k]["motor"] for k in ("kp", "kd"))
@@ -187,7 +188,8 @@ def test_identical_rivals_are_said_to_be_inseparable():
 
 def test_a_single_survivor_is_sharpened():
     contested, _ = contest()
-    lonely = replace(contested, selection=replace(contested.selection, models={}))
+    selection = contested.selection
+    lonely = replace(contested, selection=replace(selection, state=replace(selection.state, models={})))
     found = propose(lonely, [], LIMITS)
     assert "sharpens hinge.quadratic_drag.coefficient" in found.why
     assert found.evidence > 0.3 and found.pairs == []

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from bayessim_mjx.diagnosis.fitting.fitter import weights
-from bayessim_mjx.diagnosis.selection.models import scored
-from bayessim_mjx.diagnosis.selection.uncertainty import of_noise
+from bayessim_mjx.diagnosis.request import Request
+from bayessim_mjx.diagnosis.selection.models import of_noise, scored
 from bayessim_mjx.diagnosis.setup import prepare
 from tests.diagnosis.pendulums import NAMES, fitted, nominal, recorded
 
@@ -18,12 +18,12 @@ FRICTION = 0.04
 @pytest.fixture(scope="module")
 def clean(tmp_path_factory):
     logs = recorded(scale=SCALE, sigma=1e-4)
-    return fitted(prepare(nominal(tmp_path_factory.mktemp("clean")), logs, ["actuator_delay"]))
+    return fitted(prepare(nominal(tmp_path_factory.mktemp("clean")), logs, Request(["actuator_delay"])))
 
 
 @pytest.fixture(scope="module")
 def rubbing(tmp_path_factory):
-    setup = prepare(nominal(tmp_path_factory.mktemp("dry")), recorded(friction=FRICTION), ["coulomb_friction"])
+    setup = prepare(nominal(tmp_path_factory.mktemp("dry")), recorded(friction=FRICTION), Request(["coulomb_friction"]))
     fitter, fit = fitted(setup)
     (candidate,) = setup.candidates
     new = fitter.derive(fit, candidate.coordinates, np.array([0.01]))
@@ -107,7 +107,7 @@ def test_columns_of_steps_that_are_refused_are_not_simulated_on_a_cpu(rubbing, m
 def test_numbers_that_do_the_same_have_the_same_column(tmp_path):
     """A joint's damping and viscous friction, near friction that sticks: steps of one change tell nothing apart."""
     effects = ["coulomb_friction", "viscous_friction"]
-    setup = prepare(nominal(tmp_path), recorded(friction=FRICTION, count=4), effects)
+    setup = prepare(nominal(tmp_path), recorded(friction=FRICTION, count=4), Request(effects))
     fitter, fit = fitted(setup)
     for candidate, value in zip(setup.candidates, (FRICTION, 0.01), strict=True):
         fit = fitter.derive(fit, candidate.coordinates, np.full(len(candidate.coordinates), value))

@@ -10,6 +10,7 @@ import pytest
 
 from bayessim_mjx.diagnosis.fitting import pruned_model
 from bayessim_mjx.diagnosis.fitting.robot import robot_of
+from bayessim_mjx.diagnosis.request import Request
 from bayessim_mjx.diagnosis.setup import prepare
 from bayessim_mjx.logs import Channels, Log
 from bayessim_mjx.physics import control_step
@@ -56,7 +57,7 @@ def test_they_are_left_out_of_the_simulation_alone(tmp_path):
     joint.limited, joint.range = mujoco.mjtLimited.mjLIMITED_TRUE, [-900, 900]
     robot = robot_of(spec)
     assert robot.mj_model.jnt_limited[0]
-    setup = prepare(robot, recorded(count=4, seconds=2.0), ("coulomb_friction",))
+    setup = prepare(robot, recorded(count=4, seconds=2.0), Request(("coulomb_friction",)))
     assert setup.robot.mj_model.jnt_limited[0] and not setup.physics.mj_model.jnt_limited[0]
     assert setup.physics.template._impl.efc_J.shape[0] == 0
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from bayessim_mjx.diagnosis.fitting.simulator import Simulator
+from bayessim_mjx.diagnosis.request import Request
 from bayessim_mjx.diagnosis.setup import prepare
 from bayessim_mjx.physics import tangent
 from tests.diagnosis.pendulums import nominal, recorded
@@ -20,7 +21,7 @@ FLOATING = """<mujoco><worldbody><body><freejoint/><geom size=".1"/>
 @pytest.fixture(scope="module")
 def setup(tmp_path_factory):
     logs = recorded(count=3, seconds=2.0, sigma=0.0)
-    return prepare(nominal(tmp_path_factory.mktemp("model")), logs, ["coulomb_friction", "actuator_delay"])
+    return prepare(nominal(tmp_path_factory.mktemp("model")), logs, Request(["coulomb_friction", "actuator_delay"]))
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +67,7 @@ def test_rows_that_late_sensors_show_of_the_start_move_with_it(tmp_path):
     Where what sensors remember stays as recorded, the row keeps .4 of the recorded start's noise, and moves by .6.
     """
     logs = recorded(count=2, seconds=2.0, sigma=0.0)
-    physics = prepare(nominal(tmp_path), logs, ["sensor_delay"])
+    physics = prepare(nominal(tmp_path), logs, Request(["sensor_delay"]))
     own = physics.fitter.simulator
     theta = own.physics.space.nominal.copy()
     theta[[i for i, p in enumerate(own.physics.space.parameters) if "sensor_delay" in p.name]] = 0.4 * own.physics.dt
@@ -92,7 +93,7 @@ def test_a_right_simulator_follows_mujoco_at_a_tenth_of_the_step(setup):
 def test_what_a_late_sensor_repeats_of_the_recording_is_no_prediction(tmp_path):
     """Of 2.5 control steps the first two are older than the start: they came from the log and agreed with it."""
     logs = recorded(count=2, seconds=2.0, sigma=5e-3)
-    ready = prepare(nominal(tmp_path), logs, ["sensor_delay"])
+    ready = prepare(nominal(tmp_path), logs, Request(["sensor_delay"]))
     simulator = ready.fitter.simulator
     names = list(simulator.physics.space.names)
     (late,) = [i for i, name in enumerate(names) if name.endswith("sensor_delay.delay")]

@@ -7,7 +7,8 @@ import pytest
 from bayessim_mjx import effects
 from bayessim_mjx.diagnosis.fitting import robot, scales
 from bayessim_mjx.diagnosis.logcheck import loads
-from bayessim_mjx.diagnosis.selection.tried import ranked
+from bayessim_mjx.diagnosis.request import Request
+from bayessim_mjx.diagnosis.selection.search_state import ranked
 from bayessim_mjx.diagnosis.setup import prepare
 from bayessim_mjx.logs import Channels, Log, estimate_velocity
 from tests.diagnosis import singles
@@ -88,7 +89,7 @@ def test_a_load_fifteen_times_its_flange_is_found_again(tmp_path):
     truth = compiled(load=LOAD, step=0.0005, integrator="RK4")
     path = tmp_path / "arm.xml"
     path.write_text(ARM % (0.002, "Euler", *LIMITS, ""))
-    setup = prepare(robot.of_file(path), [follow(truth, i, 2.0) for i in range(3)], ("payload",))
+    setup = prepare(robot.of_file(path), [follow(truth, i, 2.0) for i in range(3)], Request(("payload",)))
     candidates = [c for c in setup.candidates if c.where == "flange"]  # the same rigid body as the lower arm
     found = ranked(singles.fitted(setup, candidates))[0]
     assert [c.label for c in found.effects] == ["payload@flange"]

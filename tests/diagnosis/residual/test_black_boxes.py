@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bayessim_mjx.diagnosis.residual import black_boxes, formula, network
+from bayessim_mjx.diagnosis.residual import black_boxes
 from bayessim_mjx.diagnosis.residual.disturbance import estimate
 from bayessim_mjx.diagnosis.residual.motion_inputs import measured
 from bayessim_mjx.diagnosis.residual.regression import Regression
@@ -44,7 +44,7 @@ def test_nothing_is_explained_where_nothing_is_missing():
     problem = Regression(fitter, fit, missing, measured(fitter.simulator.windows, fitter.simulator.physics.mj_model))
     fold = fitter.simulator.windows.group
     noise = fit.r.size
-    for cost in (network.held_out(problem, fold), formula.held_out(problem, fold)[0]):
+    for cost in (black_boxes.network_costs(problem, fold), black_boxes.formula_costs(problem, fold)[0]):
         assert 0.8 * noise < cost.sum() < 1.3 * noise
 
 
@@ -62,7 +62,7 @@ def test_the_networks_gradient_is_that_of_its_cost(rubbed, monkeypatch):
         seen.append(((sides[1] - sides[0]) / 2e-5, cost(x)[1] @ along))
         return type("Found", (), {"x": x})
 
-    monkeypatch.setattr(network, "minimize", look)
-    network.held_out(problem, fitter.simulator.windows.group % 2)
+    monkeypatch.setattr(black_boxes, "minimize", look)
+    black_boxes.network_costs(problem, fitter.simulator.windows.group % 2)
     for differences, gradient in seen:
         assert gradient == pytest.approx(differences, rel=1e-4)

@@ -5,7 +5,7 @@ import pytest
 
 from bayessim_mjx.diagnosis import statistics
 from bayessim_mjx.diagnosis.residual import disturbance, motion_inputs, regions, where
-from bayessim_mjx.diagnosis.residual.fingerprints import fingerprints
+from bayessim_mjx.diagnosis.residual.where import fingerprints
 from bayessim_mjx.diagnosis.summary.left_in_words import located_in_words, places_of
 from tests.diagnosis.missing_forces import fitted, record
 

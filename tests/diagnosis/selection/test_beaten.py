@@ -16,13 +16,15 @@ def found(base: float, named: float, flexible: float, significant: bool = True):
     def total(level):
         return level * NOISE * WINDOWS
 
-    selection = SimpleNamespace(
+    state = SimpleNamespace(
         base=SimpleNamespace(plain=np.full(WINDOWS, total(base) / WINDOWS), cost=np.zeros(WINDOWS)),
         noise=NOISE,
     )
     condition = SimpleNamespace(significant=significant, cost=np.full(WINDOWS, total(flexible) / WINDOWS))
     model = SimpleNamespace(plain=np.full(WINDOWS, total(named) / WINDOWS))
-    return SimpleNamespace(selection=selection, model=model, flexible_base=SimpleNamespace(condition=condition))
+    return SimpleNamespace(
+        selection=SimpleNamespace(state=state), model=model, flexible_base=SimpleNamespace(condition=condition)
+    )
 
 
 @pytest.mark.parametrize(

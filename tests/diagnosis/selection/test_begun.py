@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from bayessim_mjx.diagnosis.fitting.fit import Fit
-from bayessim_mjx.diagnosis.selection import pool
-from bayessim_mjx.diagnosis.selection.pool import Pool
+from bayessim_mjx.diagnosis.selection import search_state
+from bayessim_mjx.diagnosis.selection.search_state import SearchState
 
 SPREAD = np.array([0.01, 0.1])
 
@@ -31,9 +31,9 @@ def fit(values, offsets):
 
 
 def begun(monkeypatch, offsets, contacts):
-    monkeypatch.setattr(pool, "contacts", lambda physics: contacts)
+    monkeypatch.setattr(search_state, "contacts", lambda physics: contacts)
     fitter, given = Begun(), fit([1.0], offsets)
-    own = Pool(fitter, (), None, None, None, None)
+    own = SearchState(fitter, (), None, None, None, None)
     return own.begun(given), own.begun(given), given, fitter
 
 

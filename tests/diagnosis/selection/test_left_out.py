@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from bayessim_mjx.diagnosis import phrases
-from bayessim_mjx.diagnosis.selection import begin as beginning
+from bayessim_mjx.diagnosis.selection import fits
 from bayessim_mjx.diagnosis.selection.budget import ENDS, Budget, begun
-from bayessim_mjx.diagnosis.selection.left_out import not_fitted, not_tried
-from bayessim_mjx.diagnosis.selection.tried import Settings
+from bayessim_mjx.diagnosis.selection.search_state import Settings
+from bayessim_mjx.diagnosis.summary.assemble import not_fitted, not_tried
 
 
 def tried(gains, fitted, cut_short=(), skipped=None, above=True, **settings):
@@ -113,10 +113,10 @@ def test_the_fit_of_the_known_parameters_ends_with_its_share_of_the_time(monkeyp
         seen.update(steps=fit.steps, screened=screened)
         return []
 
-    monkeypatch.setattr(beginning, "scored", lambda fitter, fit, effects: SimpleNamespace(fit=fit))
-    monkeypatch.setattr(beginning, "screen", screen)
-    monkeypatch.setattr(beginning.Pool, "rough", False)
-    monkeypatch.setattr(beginning.Pool, "begun", lambda pool, fit: fit)
-    beginning.begin(fitter, candidates, settings)
+    monkeypatch.setattr(fits, "scored", lambda fitter, fit, effects: SimpleNamespace(fit=fit))
+    monkeypatch.setattr(fits, "screen", screen)
+    monkeypatch.setattr(fits.SearchState, "rough", False)
+    monkeypatch.setattr(fits.SearchState, "begun", lambda pool, fit: fit)
+    fits.begin(fitter, candidates, settings)
     assert (seen["steps"], fitter.refreshed) == (steps, refreshed)
     assert seen["screened"] == windows  # 48 s for 80 points at .1 s a window are 6, but never fewer than 8

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bayessim_mjx.diagnosis.fitting.fitter import Fit
-from bayessim_mjx.diagnosis.selection.projection import Projection
+from bayessim_mjx.diagnosis.selection.screen import Projection
 
 
 def test_where_no_known_parameter_is_free_only_start_states_are_projected_out():

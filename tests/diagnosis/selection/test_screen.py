@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from bayessim_mjx.diagnosis.fitting.candidates import Coordinate, _probes
+from bayessim_mjx.diagnosis.request import Request
 from bayessim_mjx.diagnosis.selection.screen import screen
 from bayessim_mjx.diagnosis.setup import prepare
 from bayessim_mjx.effects.speed_torque_limit import SpeedTorqueLimit
@@ -21,7 +22,7 @@ TRUTHS: dict[str, dict[str, Any]] = {"coulomb_friction": {"friction": 0.03}, "ac
 
 @pytest.fixture(scope="module")
 def setup(tmp_path_factory):
-    return prepare(nominal(tmp_path_factory.mktemp("screen")), recorded(scale=SCALE), FEW)
+    return prepare(nominal(tmp_path_factory.mktemp("screen")), recorded(scale=SCALE), Request(FEW))
 
 
 @pytest.fixture(scope="module", params=TRUTHS)

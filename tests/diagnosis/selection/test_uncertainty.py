@@ -9,7 +9,7 @@ from scipy import stats
 from bayessim_mjx.diagnosis import statistics
 from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
 from bayessim_mjx.diagnosis.fitting.fitter import Fit
-from bayessim_mjx.diagnosis.selection import heldout, uncertainty
+from bayessim_mjx.diagnosis.selection import heldout, models
 
 
 def test_simulators_differ_by_a_part_of_a_step_and_a_percent():
@@ -19,9 +19,9 @@ def test_simulators_differ_by_a_part_of_a_step_and_a_percent():
     gain = Coordinate("motor.actuator_gain.gain", (2,), 1.0, 0.2, 2.0)
     fit = SimpleNamespace(coordinates=(known, delay, gain), values=np.array([1.1, 0.02, 0.7]))
     model = SimpleNamespace(effects=(SimpleNamespace(coordinates=(delay, gain)),), fit=fit)
-    np.testing.assert_allclose(uncertainty.systematic(model, 0.01), [0.0, 0.07 * 0.01, 0.01 * 0.3])
+    np.testing.assert_allclose(models.systematic(model, 0.01), [0.0, 0.07 * 0.01, 0.01 * 0.3])
     np.testing.assert_allclose(
-        uncertainty.systematic(model, 0.01, 0.04, known=0.005), [0.005 * 1.1, 0.07 * 0.01, (0.01 + 0.15 * 0.2) * 0.3]
+        models.systematic(model, 0.01, 0.04, known=0.005), [0.005 * 1.1, 0.07 * 0.01, (0.01 + 0.15 * 0.2) * 0.3]
     )
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from bayessim_mjx.diagnosis.selection.selected import Size
+from bayessim_mjx.diagnosis.evidence.weighing import Size
 from bayessim_mjx.diagnosis.summary import effects_found
 
 
@@ -21,9 +21,7 @@ def test_a_share_that_reaches_no_joint_is_said_to_be_told_by_nothing(monkeypatch
     effect = SimpleNamespace(effect="effort_coupling", where="waist", coordinates=coordinates, label="x", shapes=shapes)
     fit = SimpleNamespace(names=list(names), values=np.array([-0.027, 0.0]))
     model = SimpleNamespace(fit=fit, effects=(effect,))
-    found = SimpleNamespace(
-        setup=SimpleNamespace(physics=None), model=model, selection=SimpleNamespace(rivals={}, noise=1.0)
-    )
+    found = SimpleNamespace(setup=SimpleNamespace(physics=None), model=model, selection=SimpleNamespace(rivals={}))
     monkeypatch.setattr(effects_found.bounds, "of", lambda physics, coordinate, value: None)
     monkeypatch.setattr(effects_found, "_unit", lambda setup, effect, unit: unit)
     part = effects_found._Part(1.0, 1.0, (0.9, 1.0), 1.0)

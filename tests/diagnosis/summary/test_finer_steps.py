@@ -9,6 +9,7 @@ import pytest
 
 from bayessim_mjx.diagnosis.fitting import discretisation, robot
 from bayessim_mjx.diagnosis.fitting.quadratic import solve
+from bayessim_mjx.diagnosis.request import Request
 from bayessim_mjx.diagnosis.setup import prepare
 from bayessim_mjx.diagnosis.summary import finer_steps
 from bayessim_mjx.diagnosis.summary.finer_steps import AtFinerSteps
@@ -29,7 +30,7 @@ def test_where_parameters_would_go_at_finer_steps_is_where_the_truth_is(tmp_path
     monkeypatch.setattr(discretisation, "RULES", dataclasses.replace(discretisation.RULES, nats=np.inf))
     path = tmp_path / "pendulum.xml"
     path.write_text(MODEL % (COARSE, "Euler", DAMPING, ARMATURE, 0.0, MASS))
-    setup = prepare(robot.of_file(path), recorded(scale=SCALE, sigma=1e-3), FEW)
+    setup = prepare(robot.of_file(path), recorded(scale=SCALE, sigma=1e-3), Request(FEW))
     fitter, fit = fitted(setup)
     selection = SimpleNamespace(
         estimated=SimpleNamespace(step=lambda r: likeliest(dataclasses.replace(fit, r=r), fitter))

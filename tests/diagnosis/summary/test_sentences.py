@@ -4,9 +4,9 @@ import dataclasses
 
 import pytest
 
+from bayessim_mjx.diagnosis.phrases import missing
 from bayessim_mjx.diagnosis.result import VERDICTS, FoundEffect, Gap
 from bayessim_mjx.diagnosis.summary import sentences
-from bayessim_mjx.diagnosis.vocabulary import missing
 
 ROW = {"nominal": 0.02144, "calibrated": 0.0027, "with_effects": 0.000866, "unit": "rad", "tolerance": 0.02}
 SHARES = {"nominal": 0.02144, "calibrated": 0.0027, "with_effects": 0.000866}

@@ -11,7 +11,7 @@ def named(left: float, calibrated: float, noise: object = None) -> str:
     """The verdict on effects that leave so many noises (rms) of so many that recalibration leaves."""
     found = SimpleNamespace(
         model=SimpleNamespace(effects=("x",)),
-        selection=SimpleNamespace(above_noise=lambda model: False, ambiguous=False),
+        selection=SimpleNamespace(state=SimpleNamespace(above_noise=lambda model: False), ambiguous=False),
         flexible_winner=None,
     )
     far = SimpleNamespace(beyond=(), coasting=None, calibrated=calibrated, with_effects=left)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from bayessim_mjx.diagnosis import run
+from bayessim_mjx.diagnosis.request import Request
 from bayessim_mjx.diagnosis.summary import assemble, whole_logs
 from tests.diagnosis import pendulums
 from tests.diagnosis.pendulums import PERIOD, nominal, recorded
@@ -17,14 +18,14 @@ EFFECTS = ("coulomb_friction", "viscous_friction")
 def rubbing(tmp_path_factory):
     logs = recorded(friction=0.04, scale=(0.9, 1.1, 0.95), count=4, seconds=2.4)
     needed = [s for s in run.STAGES if not s.optional]
-    return run.investigate(nominal(tmp_path_factory.mktemp("rubbing")), logs, EFFECTS, stages=needed)
+    return run.investigate(nominal(tmp_path_factory.mktemp("rubbing")), logs, Request(EFFECTS), stages=needed)
 
 
 @pytest.mark.ci
 def test_a_log_begins_as_its_first_window(rubbing):
     cut = rubbing.setup.fitter.simulator.windows
     stages = {
-        "nominal": whole_logs._Stage(rubbing.selection.base, rubbing.predictions["nominal"], True),
+        "nominal": whole_logs._Stage(rubbing.selection.state.base, rubbing.predictions["nominal"], True),
         "with_effects": whole_logs._Stage(rubbing.model, rubbing.predictions["with_effects"], False),
     }
     first = int(np.flatnonzero(cut.log == 2)[0])
@@ -79,7 +80,7 @@ def test_what_is_likely_is_noise_and_what_draws_leave_of_the_mean():
 def test_an_unstable_motion_counts_as_long_as_it_can_be_predicted(tmp_path, monkeypatch):
     upside_down = pendulums.MODEL.replace("<option ", '<option gravity="0 0 9.81" ')
     monkeypatch.setattr(pendulums, "MODEL", upside_down)  # held upright by its controller; open loop it falls
-    found = run.investigate(nominal(tmp_path), recorded(friction=0.04, count=4, seconds=3.0), EFFECTS[:1])
+    found = run.investigate(nominal(tmp_path), recorded(friction=0.04, count=4, seconds=3.0), Request(EFFECTS[:1]))
     over = whole_logs.simulate(found)
     assert "unstable or chaotic motion: in 4 of 4 logs" in over.notes[0]
     assert over.seconds < 2.5 and (over.name.startswith("up to") or not len(over.group))

@@ -1,0 +1,163 @@
+"""Masked effects: the parameters of named effects, or known parameters, can reproduce them in these logs.
+
+A bias beside a spring moves the spring's angle of rest; viscous friction beside friction by direction is part of it.
+Such logs do not tell whether both are there: the named law stands for both (`by_effects`).
+
+A joint's viscous friction is its damping, rotor inertia beside a slide is its mass, a drive's gain is all of the
+robot's inertia, damping and friction together. The prior decides whether the data sheet is wrong or an effect is
+missing (`by_parameters`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayessim_mjx.diagnosis.data_sheet import SURE
+from bayessim_mjx.diagnosis.evidence.laws import compatible
+from bayessim_mjx.diagnosis.evidence.sets import ODDS
+from bayessim_mjx.diagnosis.fitting.candidates import Candidate, Coordinate
+from bayessim_mjx.diagnosis.fitting.fit import Fit
+from bayessim_mjx.diagnosis.selection.budget import Progress
+from bayessim_mjx.diagnosis.selection.models import Model
+from bayessim_mjx.diagnosis.selection.screen import Projection, judged, projected, room, simulated
+from bayessim_mjx.diagnosis.selection.search_state import SearchState
+from bayessim_mjx.diagnosis.selection.window_subset import looked_at, part
+
+Array = NDArray[np.float64]
+AMOUNTS = np.linspace(0.0, 1.0, 101)[1:]  # of an effect, shares of the largest in its range
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Shares of what an effect does, squared and in noises, that refitting other parameters hides.
+
+    Rules of thumb: how often a hidden effect is told has not been counted.
+
+    Attributes:
+        hidden: at every starting point beside the answer, or more.
+        shown: at one starting point beside the known parameters alone, or less.
+        perhaps: by what was simulated on the known parameters: from here on it is simulated on the answer.
+        most: candidates that are simulated; points: starting points of each, those that show most.
+    """
+
+    hidden: float = 0.98
+    shown: float = 0.9
+    perhaps: float = 0.8
+    most: int = 16
+    points: int = 4
+
+
+LIMITS = Limits()
+
+
+def by_effects(state: SearchState, answer: Model, say: Progress = lambda text, done, total: None) -> tuple[str, ...]:
+    """Labels of candidates that the answer's effects hide, and that show without these effects."""
+    if not answer.effects or not state.secants.columns:
+        return ()
+    others = [c for c in state.candidates if c.label in state.secants.columns]
+    others = [c for c in others if all(compatible(c, e) for e in answer.effects)]
+    alone, likely = _shown(state, state.base, others), _shown(state, answer, others)
+    some = [c for c in others if alone[c.label][0][0] < LIMITS.shown and likely[c.label][0][0] > LIMITS.perhaps]
+    some = sorted(some, key=lambda c: -likely[c.label][0][0])[: LIMITS.most]
+    plans = [(i, point) for i, c in enumerate(some) for _, point in likely[c.label][: LIMITS.points]]
+    own = looked_at(answer.fit, state.settings.screened)
+    columns = simulated(state.fitter, answer.fit, some, plans, own, lambda _, done, all_: say("hidden", done, all_))
+    found = judged(state.fitter, answer.fit, some, columns, own)
+    return tuple(some[i].label for i, each in found.items() if min(s.absorbed for s, _ in each) > LIMITS.hidden)
+
+
+def _shown(state: SearchState, model: Model, candidates: Sequence[Candidate]) -> dict[str, list[tuple[float, Array]]]:
+    """{label: (share that is hidden, starting point)}, what shows most first, without a simulation."""
+    found = projected(state.fitter, model.fit, candidates, state.secants)
+    each = {candidates[i].label: [(s.absorbed, point) for s, point in several] for i, several in found.items()}
+    return {label: sorted(several, key=lambda pair: pair[0]) for label, several in each.items()}
+
+
+def by_parameters(state: SearchState, answer: Model) -> dict[str, tuple[str, ...]]:
+    """{known parameter: labels of the effects that it may stand for}, without a simulation.
+
+    An effect stands beside a parameter's deviation where known parameters do all its work (`LIMITS.hidden`), and
+    where the data sheet speaks for it: without the effect's part the parameters are so much likelier that the odds
+    against the effect, one of all candidates and in its best size, are below `ODDS.strong`, and by `ODDS.mention` at
+    least. Beside the best one stand those that the data sheet does not speak strongly against; then what it leaves is
+    looked at in the same way.
+    """
+    fit = part(answer.fit, state.secants.own) if state.secants.columns else answer.fit
+    every = _works(state, answer, fit)
+    least = max(-state.log_prior(frozenset("x")) - np.log(ODDS.strong), np.log(ODDS.mention))
+    away = fit.values - np.array([c.neutral for c in fit.coordinates])
+    out: dict[str, list[str]] = {}
+    while every:
+        gains = {label: max(_gain(fit, away, own) for own in works) for label, works in every.items()}
+        best = max(gains.values())
+        if best.nats <= least:
+            break
+        for label, gain in gains.items():
+            if gain.nats > max(least, best.nats - np.log(ODDS.strong)):
+                out.setdefault(fit.names[gain.parameter], []).append(label)
+                del every[label]
+        away = away - best.steps
+    return {name: tuple(labels) for name, labels in out.items()}
+
+
+@dataclass(frozen=True, eq=False)
+class _Work:
+    """Of an effect at one point: the steps `[k]` of the fit's numbers that do it, and what its range allows of it."""
+
+    steps: Array
+    room: tuple[float, float]
+
+
+@dataclass(frozen=True, order=True)
+class _Gain:
+    """Nats by which the data sheet is likelier, the parameter that gains most, and the steps taken back `[k]`."""
+
+    nats: float
+    parameter: int
+    steps: Array = field(compare=False)
+
+
+def _works(state: SearchState, answer: Model, fit: Fit) -> dict[str, list[_Work]]:
+    """Of each effect whose work the fit's numbers can do."""
+    known = state.secants.columns
+    out: dict[str, list[_Work]] = {}
+    others = [c for c in state.candidates if known.get(c.label) and all(compatible(c, e) for e in answer.effects)]
+    project = Projection(state.fitter, fit) if others else None
+    for c in others:
+        neutral, found = np.array([x.neutral for x in c.coordinates]), []
+        for point, column in known[c.label]:
+            way = np.where(c.shapes, 0.0, point - neutral)
+            steps = project.taken(column, LIMITS.hidden) if project and way.any() else None
+            found += [] if steps is None else [_Work(steps, room(c, way))]
+        out |= {c.label: found} if found else {}
+    return out
+
+
+def _gain(fit: Fit, away: Array, of: _Work) -> _Gain:
+    """In its best amount, of parameters so far from the data sheet `[k]`."""
+    before = _far(fit.coordinates, away)
+    amounts = [float(end * share) for end in of.room if np.isfinite(end) and end for share in AMOUNTS]
+    gains = [before - _far(fit.coordinates, away - t * of.steps) for t in amounts]
+    if not gains or max(gains) <= 0:
+        return _Gain(0.0, -1, np.zeros_like(away))
+    steps = amounts[int(np.argmax(gains))] * of.steps
+    precision = np.array([c.precision if c.stated or c.kind else 0.0 for c in fit.coordinates])
+    return _Gain(max(gains), int(np.argmax(precision * (away**2 - (away - steps) ** 2))), steps)
+
+
+def _far(coordinates: Sequence[Coordinate], away: Array) -> float:
+    """Minus the log prior density of known parameters so far from the data sheet, up to a constant.
+
+    Of a kind whose accuracy nobody stated a multivariate Student t (`accuracy`), of stated ones a Gaussian.
+    """
+    squares = np.array([c.precision for c in coordinates]) * away**2
+    kinds = np.array([c.kind for c in coordinates])
+    total = 0.5 * float(squares[[c.stated and not c.kind for c in coordinates]].sum())
+    for kind in {k for k in kinds if k}:
+        own = squares[kinds == kind]
+        total += 0.5 * (SURE + len(own)) * float(np.log1p(own.sum() / SURE))
+    return total

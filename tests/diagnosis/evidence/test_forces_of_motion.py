@@ -1,0 +1,40 @@
+"""Forces that a motion takes, by hand, and what a common error of them does to a number that takes it."""
+
+from types import SimpleNamespace
+
+import mujoco
+import numpy as np
+import pytest
+
+from bayessim_mjx.diagnosis.evidence import doubts
+
+SERVO = """<mujoco><worldbody><body><joint name="hinge" axis="0 1 0" damping=".3" stiffness="2" armature=".05"/>
+  <geom type="capsule" size=".02" fromto="0 0 0 0 0 -.5" mass="1.5"/></body></worldbody>
+  <actuator><position joint="hinge" kp="40" kv="4" gear="2"/></actuator></mujoco>"""
+
+
+def test_terms_of_a_driven_pendulum_by_hand():
+    """Inertia times acceleration; damping and the servo's, through its gear squared; gravity and spring."""
+    model = mujoco.MjModel.from_xml_string(SERVO)
+    data, q, v, a = mujoco.MjData(model), 0.4, -1.3, 7.0
+    inertial, by_speed, by_position = doubts._at(model, data, np.array([q]), np.array([v]), np.array([a]))[:, 0]
+    about_joint = model.body_inertia[1][1] + 1.5 * 0.25**2 + 0.05
+    assert inertial == pytest.approx(about_joint * a)
+    assert by_speed == pytest.approx((0.3 + 4 * 2**2) * v)
+    assert by_position == pytest.approx(1.5 * 9.81 * 0.25 * np.sin(q) + 2 * q)
+
+
+def test_a_number_that_takes_a_common_force_is_as_uncertain_as_that_force(monkeypatch):
+    """A mass whose column is the inertial force: of 2 N m rms and a missing force of .01 N m it is known to .5 %."""
+    rng = np.random.default_rng(0)
+    forces, D = np.zeros((5, 3, 1, 4)), rng.normal(size=(5, 30, 4))
+    forces[:, 0, 0] = rng.normal(size=(5, 4))
+    forces *= 2.0 / np.sqrt(np.mean(forces[:, 0] ** 2))
+    monkeypatch.setattr(doubts, "of_motion", lambda fitter, nodes: forces)
+    column = (D @ forces[:, 0, 0, :, None])[..., 0]
+
+    def step(r):
+        return np.array([np.sum(column * r) / np.sum(column**2)])
+
+    found = doubts.covariance(SimpleNamespace(), D, np.array([0.01]), step, rng.normal(size=column.shape))
+    assert np.sqrt(found) == pytest.approx(0.005)

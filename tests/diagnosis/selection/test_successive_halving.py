@@ -1,0 +1,37 @@
+"""Which of many fits in lockstep go on, also in a search that goes on from what is on disk."""
+
+from types import SimpleNamespace
+
+import pytest
+
+from bayessim_mjx.diagnosis.selection.successive_halving import SuccessiveHalving
+
+
+def fit(*history):
+    return SimpleNamespace(cost=history[-1], history=history, promise=0.0)
+
+
+def test_starts_behind_their_own_best_stop_and_candidates_far_behind_the_best():
+    halving = SuccessiveHalving(lambda: False)
+    fits = [fit(90, 10), fit(95, 39), fit(99, 41), fit(200, 170)]  # three starts of one candidate, one of another
+    going = halving.among([3, 1])
+    assert going(1, fits, range(4)) == [0, 1, 2, 3]  # all still fall fast, but for the last, which is alone
+    slow = [fit(10, 10), fit(41, 39), fit(42, 41), fit(171, 170)]
+    assert going(1, slow, range(4)) == [0, 1, 3]
+    assert going(2, slow, range(4)) == [0]  # another candidate, 17 times behind
+    assert SuccessiveHalving(lambda: True).among([1])(1, [fit(1, 1)], [0]) == []
+
+
+def test_fits_from_the_disk_set_the_same_pace_as_those_that_were_made():
+    rows = [(90, 40, 30, 22, 21, 20), (95, 50), (80, 60, 25, 24)]
+    made = SuccessiveHalving(lambda: False)
+    for step in range(6):
+        now = [fit(*row[: step + 1]) for row in rows]  # settled ones stay as they are
+        made.among([1, 1, 1])(step, now, range(3))
+    read = SuccessiveHalving(lambda: False)
+    read.learn([fit(*row) for row in rows])
+    assert {at: read.pace[at] for at in SuccessiveHalving.CANDIDATES} == {
+        at: made.pace[at] for at in SuccessiveHalving.CANDIDATES
+    }
+    made.learn([fit(*row) for row in rows])
+    assert {at: made.pace[at] for at in SuccessiveHalving.CANDIDATES} == pytest.approx(read.pace)
