@@ -105,7 +105,7 @@ def show(console: Any, found: Any) -> None:
 
 
 def set_rows(sets: Any) -> list[list[str]]:
-    """The table of inference.sets.Sets: each number of trajectories, and the share of truths in its regions."""
+    """Rows of the table of `product_calibration.Sets`: numbers of trajectories and shares of truths in the regions."""
     rows = []
     for near, c in [(False, c) for c in sets.counts] + [(True, c) for c in sets.near]:
         shares = [percent_estimate(c.coverage(a), (a * (1 - a) / len(c.levels)) ** 0.5) for a in LEVELS]

@@ -12,6 +12,8 @@ import jax.numpy as jnp
 from jax import Array
 
 UNROLLED = 8  # rows
+REGRESSED = 1024  # features up to which normal equations save more time than they cost; rule of thumb, not counted
+RIDGE = 1e-3  # of the features' variance; rule of thumb, not counted
 
 
 def product(a: Array, b: Array) -> Array:
@@ -98,3 +100,12 @@ def lower_factor(rows: Array) -> Array:
 
     start = jnp.zeros_like(rows), jnp.zeros((*rows.shape[:-1], d), rows.dtype)
     return jax.lax.fori_loop(0, d, row, start)[1]
+
+
+def ridge(design: Array, y: Array, weights: Array) -> tuple[Array, Array]:
+    """Ridge regression of y [n, d] on design [n, H] with weights [n] of 0 or 1 -> mean [d], slope [H, d]."""
+    n = jnp.maximum(jnp.sum(weights), 1.0)
+    mean = weights @ y / n
+    weighted = (design * weights[:, None]).T
+    gram = product(weighted, design) / n + RIDGE * jnp.eye(design.shape[1])
+    return mean, jnp.linalg.solve(gram, product(weighted, y - mean[None, :]) / n)

@@ -20,11 +20,10 @@ from scipy.special import ndtr
 from bayessim_mjx.distributions import Distribution, box
 from bayessim_mjx.distributions.evaluate import candidates
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.inference.temperature import TEMPERATURES, temperature, widened
+from bayessim_mjx.inference.temperature import LEVELS, TEMPERATURES, temperature, widened
 from bayessim_mjx.keys import branch
 from bayessim_mjx.quantities import percent, percent_estimate
 
-LEVELS = (0.5, 0.8, 0.95)
 DRAWS = 256  # proposals per pair; those outside the box are left out
 FEWEST = 15  # pairs that say anything
 ALPHA = 0.01  # chance that a calibrated posterior is called anything else

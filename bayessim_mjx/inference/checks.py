@@ -17,8 +17,8 @@ from bayessim_mjx.inference.calibration import Report
 from bayessim_mjx.inference.fit import condition
 from bayessim_mjx.inference.identify import flat_sentences, restore_prior
 from bayessim_mjx.inference.misspecification import Misfit
+from bayessim_mjx.inference.product_calibration import Sets
 from bayessim_mjx.inference.range_ends import Pile, piles
-from bayessim_mjx.inference.sets import Sets
 from bayessim_mjx.inference.temperature import widened
 from bayessim_mjx.quantities import percent, percent_estimate
 

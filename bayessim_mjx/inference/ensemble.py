@@ -12,10 +12,9 @@ import numpy as np
 from jax import Array
 
 from bayessim_mjx.distributions import Distribution, charts, evaluate
-from bayessim_mjx.inference import coverage_factor, identify, mdn, uncut
-from bayessim_mjx.inference.data import Data
+from bayessim_mjx.inference import identify, mdn, temperature, truncation_moments
 from bayessim_mjx.inference.settings import InferenceSettings
-from bayessim_mjx.inference.state import FitState
+from bayessim_mjx.inference.state import Data, FitState
 from bayessim_mjx.inference.train import objective_of
 
 SCORED = 256  # validation rows for which the truncated density is reported
@@ -43,7 +42,7 @@ def mixtures(state: FitState, z: Array) -> mdn.Heads:
     d, settings = len(state.space), state.settings
     each = jax.vmap(lambda params: mdn.mixture(params, z, d, settings))(parts(state.params))
     found = joined(each, state.params["share"])
-    return uncut.weighed(*found)[:3] if settings.coordinates == "matched" else found
+    return truncation_moments.weighed(*found)[:3] if settings.coordinates == "matched" else found
 
 
 def parts(params: Any) -> Any:
@@ -130,13 +129,13 @@ def as_deep(state: FitState, data: Data, members: mdn.Heads) -> FitState:
     together: a network that is too wide for what it tells may be just right for the others, of which it makes flat
     Gaussians. So it is judged as it is used, with the prior where state.identified has nothing.
     """
-    most, settings, share, keep = coverage_factor.MOST, state.settings, state.params["share"], state.identified
+    most, settings, share, keep = temperature.MOST, state.settings, state.params["share"], state.identified
     centre, sd = (np.float32(v) for v in charts.SCORE[settings.chart])
     own = parts_of(jax.tree.map(lambda leaf: leaf[:, :most], members), state.params)
     logits, means, scales = joined(mdn.converted(own, settings), share)
     inside, learnt = None, (means, scales)
     if settings.coordinates == "matched":  # masses are long to compute: those of other factors are taken to be the same
-        logits, _, _, inside = uncut.weighed(logits, means, scales)
+        logits, _, _, inside = truncation_moments.weighed(logits, means, scales)
     means, scales = identify.beside_prior(means, scales, keep, settings.chart)
 
     def at(factor: Array) -> mdn.Heads:
@@ -144,13 +143,13 @@ def as_deep(state: FitState, data: Data, members: mdn.Heads) -> FitState:
             weights, centres, widths = joined(mdn.converted(mdn.sharper(own, factor), settings), share)
             return weights, *identify.beside_prior(centres, widths, keep, settings.chart)
         if inside is not None:
-            before_cut = uncut.shapes(learnt[0], learnt[1] / factor)
+            before_cut = truncation_moments.shapes(learnt[0], learnt[1] / factor)
             return logits, *identify.beside_prior(*before_cut, keep, settings.chart)
         return logits, means, scales / jnp.where(keep, factor, 1.0)[None, None, :, None]
 
     mask, truth = data.mask[:most], data.y[data.held[:most]] * sd + centre
     # the same draws in every fit: weights that are kept keep their factor
-    factor = coverage_factor.factor(jax.random.PRNGKey(0), at, truth, mask, keep, settings.chart, inside)
+    factor = temperature.coverage_factor(jax.random.PRNGKey(0), at, truth, mask, keep, settings.chart, inside)
     return replace(state, params={**state.params, "sharpness": state.params["sharpness"] * factor})
 
 

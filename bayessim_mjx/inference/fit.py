@@ -5,6 +5,7 @@ Arrays are padded to a capacity and the number of rows is traced: a growing data
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
 from typing import Any
@@ -17,9 +18,8 @@ from jax import Array
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.inference import ensemble, identify, mdn, whitening
-from bayessim_mjx.inference.data import Again, Data, prepare
 from bayessim_mjx.inference.settings import InferenceSettings
-from bayessim_mjx.inference.state import FitInfo, FitState, rotated
+from bayessim_mjx.inference.state import Again, Data, FitInfo, FitState, prepare, rotated
 from bayessim_mjx.inference.train import MEMBERS, train
 
 LADDER = 1  # power of the members' places that their dropout rises with
@@ -211,3 +211,25 @@ def _bases(state: FitState, data: Data) -> Array:
     if tried > 2 and state.settings.restandardise:
         kept = jnp.where(whitening.is_padded(kept), found[-1], kept)
     return jnp.where(state.fits == 0, found, kept[None])
+
+
+def combine(posteriors: Distribution | Sequence[Distribution], components: int | None = None) -> Distribution:
+    """Posterior given all trajectories: p(theta)^(1-n) prod_i q(theta | x_i), with K = `components` Gaussians.
+
+    `posteriors` is a list, or a batched Distribution as `condition` returns it. The trajectories are taken to be
+    independent given theta.
+    """
+    items = posteriors.split() if isinstance(posteriors, Distribution) else list(posteriors)
+    if not items:
+        raise ValueError("combine: no posterior given; at least one trajectory is needed")
+    if len(items) == 1 and components in (None, items[0].components):
+        return items[0]
+    return items[0].product(*items[1:], components=components)
+
+
+def infer(state: FitState, x: Array, components: int | None = None) -> Distribution:
+    """One posterior from the summaries x [n, D] of n real trajectories; ValueError on values that are not finite."""
+    bad = np.flatnonzero(~np.all(np.isfinite(np.asarray(x)), axis=-1))
+    if bad.size:
+        raise UserError(f"the summary of real trajectory {bad[0]} holds values that are not finite")
+    return combine(condition(state, jnp.asarray(x)), components)

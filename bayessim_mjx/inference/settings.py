@@ -60,7 +60,7 @@ class InferenceSettings(Section):
     dropout: float = setting(0.1, "of the last member, below 1", low=0)
     fourierFeatures: int = setting(256, "frequencies of MDRFF: twice as many features", low=1)
     embedding: Any = setting(
-        None, "trained with the network, which then takes in rows of summary_learned (embedding.py)"
+        None, "trained with the network, which then takes in rows of summary_learned (summaries/learned.py)"
     )
 
     def __post_init__(self) -> None:

@@ -15,15 +15,17 @@ from jax import Array
 from jax.flatten_util import ravel_pytree
 
 from bayessim_mjx.inference import densities, mdn
-from bayessim_mjx.inference.data import Data
-from bayessim_mjx.inference.linear_start import linear_start
+from bayessim_mjx.inference.densities import Params, density_of
 from bayessim_mjx.inference.settings import InferenceSettings
+from bayessim_mjx.inference.state import Data
+from bayessim_mjx.linalg import REGRESSED, inverse_lower, product, ridge
 
 APART = np.uint32(2654435769)  # between the keys of points of the curve: the steps of each have the next ones
 CURVE = 40  # points of the loss curves, at least
 PACE = 0.5  # of steps in the trials of bases: at the full rate one was once judged by how it shook (damped pendulum)
 TRIED = 150  # gradient steps at least (and a fortieth) that bases are tried for, and before a training may end early
 MEMBERS = "members"  # axis of the ensemble
+WEAK = 0.05  # smallest precision beyond the prior's that is given to a component of the probit chart
 
 
 def schedule_length(settings: InferenceSettings, capacity: int) -> tuple[int, int]:
@@ -190,3 +192,54 @@ def _start(params: Any, data: Data, settings: InferenceSettings, fresh: Array) -
         new = prepare(new, x, data.y, data.train, held, settings)
     new = linear_start(new, x, data.y, data.train.astype(jnp.float32), settings)
     return jax.tree.map(lambda a, b: jnp.where(fresh, a, b), new, params)
+
+
+def linear_start(params: Params, x: Array, y: Array, weights: Array, settings: InferenceSettings) -> Params:
+    """Set the linear path to the ridge regression of y [n, d] on x [n, D] and every component to its residuals.
+
+    Training then starts at the best linear-Gaussian posterior instead of the prior; components keep their spread, in
+    units of the residual sd. Features that do not change in training are regressed on too. No change beyond REGRESSED
+    features, where the normal equations would cost more than they save.
+
+    Args:
+        params: of one member.
+        x: [n, D] as the network takes them in.
+        y: [n, d] in the network's coordinates.
+        weights: [n] 1 for rows to use and 0 for the rest.
+        settings: of the network.
+    """
+    (dim_x, d), k = (x.shape[1], y.shape[1]), settings.components
+    regressed = density_of(settings).regressed
+    design = jnp.concatenate([mdn.hidden(params, x, settings), x], axis=1) if regressed else x
+    if design.shape[1] > REGRESSED or d == 0:
+        return params
+    mean, slope = ridge(design, y, weights)
+    residual = (y - mean[None, :] - product(design, slope)) * weights[:, None]
+    cov = product(residual.T, residual) / jnp.maximum(jnp.sum(weights), 1.0) + 1e-4 * jnp.eye(d)
+    sd = jnp.sqrt(jnp.diagonal(cov))
+    if mdn.bounded(settings):
+        mean, slope, cov = _beyond_prior(mean, slope, cov)
+    factor = inverse_lower(jnp.linalg.cholesky(cov))  # A^T A = cov^-1
+    if not settings.fullCovariance:
+        factor = jnp.diag(1.0 / jnp.sqrt(jnp.diagonal(cov)))
+    last = params["layers"][-1]
+    spread = last["b"][k : k + k * d].reshape(k, d)
+    log_diagonal = 8 * jnp.arctanh(jnp.clip(jnp.log(jnp.diagonal(factor)) / 8, -0.99, 0.99))
+    parts = [jnp.zeros(k), (mean[None, :] + spread * sd[None, :]).reshape(-1), jnp.tile(log_diagonal, k)]
+    if settings.fullCovariance:
+        parts.append(jnp.tile(factor[np.tril_indices(d, -1)], k))
+    columns = jnp.tile(slope, (1, k))
+    weight = last["w"]
+    if regressed:
+        weight = weight.at[:, k : k + k * d].add(columns[:-dim_x])
+    skip = params["skip"].at[:, k : k + k * d].set(columns[-dim_x:])
+    layers = [*params["layers"][:-1], {"w": weight, "b": jnp.concatenate(parts)}]
+    return {**params, "layers": layers, "skip": skip}
+
+
+def _beyond_prior(mean: Array, slope: Array, cov: Array) -> tuple[Array, Array, Array]:
+    """Centre mu, its slope and (A^T A)^-1 of the component of precision I + A^T A with that posterior mean and cov."""
+    values, vectors = jnp.linalg.eigh(cov)
+    extra = jnp.maximum(1 / values - 1, WEAK)  # eigenvalues of A^T A
+    stretch = product(vectors * ((1 + extra) / extra)[None, :], vectors.T)  # m = (I + A^T A)^-1 A^T A mu
+    return stretch @ mean, product(slope, stretch), product(vectors / extra[None, :], vectors.T)

@@ -7,10 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from bayessim_mjx.inference import ridge
 from bayessim_mjx.inference.densities import density_of
 from bayessim_mjx.inference.settings import InferenceSettings
-from bayessim_mjx.linalg import product
+from bayessim_mjx.linalg import product, ridge
 
 LIMIT = 512  # features up to which their eigenvectors are worth the cost; of more of them few tell something each
 MANY = 128  # features from which on a regression on the parameters is tried too
@@ -85,7 +84,7 @@ def regressed(x: Array, y: Array, train: Array) -> Array:
     weights = train.astype(jnp.float32)
     n = jnp.maximum(jnp.sum(weights), 1.0)
     centred = y - (weights @ y / n)[None, :]
-    _, slope = ridge.ridge(x, jnp.concatenate([centred, centred**2], axis=1)[:, : x.shape[1]], weights)
+    _, slope = ridge(x, jnp.concatenate([centred, centred**2], axis=1)[:, : x.shape[1]], weights)
     shown = product(x, slope)
     variance = weights @ (shown - (weights @ shown / n)[None, :]) ** 2 / n
     return slope * jax.lax.rsqrt(variance + EPS)[None, :]

@@ -11,7 +11,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from bayessim_mjx.inference import feature_names, summaries
+from bayessim_mjx.inference import summaries
+from bayessim_mjx.inference.summarizers import feature_names
 from bayessim_mjx.rl import Policy
 from bayessim_mjx.rollout import Trajectory
 
@@ -75,10 +76,10 @@ class Seen:
 
     def features(self, summary: str) -> tuple[str, ...]:
         """A name for every feature."""
-        return (*feature_names.names(summary, self.steps, self.states, self.actions), *self.context)
+        return (*feature_names(summary, self.steps, self.states, self.actions), *self.context)
 
     def embedding(self, summary: str) -> Any:
-        """The network that learns features from the summary's (inference/embedding.py); None: they are features."""
+        """The network that learns features from the summary (summaries/learned.py); None: the summary has them."""
         learn = summaries.entry(summary)[0].embedding
         return None if learn is None else learn(self.steps, len(self.states), len(self.actions))
 

@@ -15,8 +15,8 @@ import numpy as np
 from jax import Array
 
 from bayessim_mjx.distributions import Distribution
-from bayessim_mjx.inference import checks, near, rounds, sets
-from bayessim_mjx.inference.sets import Sets
+from bayessim_mjx.inference import checks, local_recalibration, product_calibration, rounds
+from bayessim_mjx.inference.product_calibration import Sets
 from bayessim_mjx.keys import branch
 from bayessim_mjx.loop import ranges
 from bayessim_mjx.loop.factors import conditioned, kept, multiplied
@@ -41,7 +41,7 @@ def judge(loop: Loop, state: LoopState, policy: Policy, known: int) -> Sets | No
         return None
     key = branch(loop.key(int(state.round), "fit"), 4)
     found = _simulated(loop, state, policy, known, key)
-    return None if found is None else replace(sets.judge(*found, loop.settings.components), known=known)
+    return None if found is None else replace(product_calibration.judge(*found, loop.settings.components), known=known)
 
 
 def widen(round_: Round, answer: Answer) -> tuple[Answer, Evidence]:
@@ -68,7 +68,7 @@ def settled(
     def drawn(posterior: Distribution, turn: int) -> tuple[list[list[Distribution]], np.ndarray] | None:
         return _simulated(loop, state, policy, known, branch(key, turn), posterior)
 
-    return near.settled(found, product, drawn, loop.settings.components)
+    return local_recalibration.settled(found, product, drawn, loop.settings.components)
 
 
 def rejudge(loop: Loop, state: LoopState, policy: Policy, known: int, key: Array, more: int = 1) -> Sets | None:
@@ -87,10 +87,10 @@ def rejudge(loop: Loop, state: LoopState, policy: Policy, known: int, key: Array
 
     if (found := again(0, None)) is None:
         return None
-    judged = sets.judge(*found, k, widened_by=(lambda n: 1.0) if used is None else used.widening)
+    judged = product_calibration.judge(*found, k, widened_by=(lambda n: 1.0) if used is None else used.widening)
     if used is None or not used.near or (found := again(more, used.used(product, known))) is None:
         return judged
-    row = near.count(*found, k, used.move, used.widening(used.counts[-1].trajectories))
+    row = local_recalibration.count(*found, k, used.move, used.widening(used.counts[-1].trajectories))
     return replace(judged, near=(row,), move=used.move)
 
 
@@ -125,9 +125,9 @@ def _simulated(
 def scores(found: Sets, known: int) -> dict[str, float]:
     """Numbers for curves, of the posterior of `known` trajectories."""
     one = found.at(known)
-    told = {"widening": found.widening(known), "gain": one.gain, "carried": float(found.carried)}
+    told = {"widening": found.widening(known), "gain": one.gain, "carried": float(found.saturates_at)}
     told |= {"moved": float(found.move is not None)}
-    told |= {f"coverage_{100 * level:.0f}": one.coverage(level) for level in sets.LEVELS}
+    told |= {f"coverage_{100 * level:.0f}": one.coverage(level) for level in product_calibration.LEVELS}
     return {f"sets/{name}": float(value) for name, value in told.items()}
 
 

@@ -15,8 +15,8 @@ import numpy as np
 
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.inference import importance, temperature
+from bayessim_mjx.inference.final_importance_sampling import UNRELIABLE
 from bayessim_mjx.inference.importance import Refined
-from bayessim_mjx.inference.pareto import UNRELIABLE
 from bayessim_mjx.loop.likelihood import Likelihood
 from bayessim_mjx.loop.noise import Noise
 

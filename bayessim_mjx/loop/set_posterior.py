@@ -20,9 +20,9 @@ from jax import Array
 from bayessim_mjx import inference
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.inference import restore_prior, set_network, sets
+from bayessim_mjx.inference import product_calibration, restore_prior, set_network
+from bayessim_mjx.inference.product_calibration import Count
 from bayessim_mjx.inference.rounds import REGION
-from bayessim_mjx.inference.sets import Count
 from bayessim_mjx.inference.temperature import tempered
 from bayessim_mjx.keys import branch
 from bayessim_mjx.loop.factors import conditioned, kept
@@ -40,7 +40,7 @@ class SetPosterior:
     """How the network of sets did on sets that it was not fitted on, and the product on the same.
 
     Attributes:
-        network: of sets, so widened; see `sets.Count`.
+        network: of sets, so widened; see `product_calibration.Count`.
         product: of single posteriors, as it would be used.
         used: whether the posterior is that of the network.
     """
@@ -64,7 +64,9 @@ class SetPosterior:
         """Numbers for curves."""
         told = {"used": float(self.used), "gain": self.network.gain, "product": self.product.gain}
         told |= {"widening": self.network.widening}
-        return told | {f"coverage_{100 * level:.0f}": self.network.coverage(level) for level in sets.LEVELS}
+        return told | {
+            f"coverage_{100 * level:.0f}": self.network.coverage(level) for level in product_calibration.LEVELS
+        }
 
 
 def use_set_network(round_: Round, answer: Answer) -> tuple[Answer, Evidence]:
@@ -113,8 +115,10 @@ def _learnt(loop: Loop, state: LoopState, policy: Policy, answer: Answer) -> tup
     if len(rows) < JUDGED // 2 or not own.sound:
         raise UserError("too many simulated trajectories are not finite")
     at, wholes, products = zip(*rows, strict=True)
-    ours = sets.judge([[q] for q in wholes], np.stack(at), b.components).counts[0]
-    theirs = sets.judge([[q] for q in products], np.stack(at), b.components, widened_by=lambda n: 1.0).counts[0]
+    ours = product_calibration.judge([[q] for q in wholes], np.stack(at), b.components).counts[0]
+    theirs = product_calibration.judge(
+        [[q] for q in products], np.stack(at), b.components, widened_by=lambda n: 1.0
+    ).counts[0]
     posterior = tempered(inference.combine([own], b.components), ours.widening)
     return SetPosterior(ours, theirs, b.sets == "embedding" or ours.gain > theirs.gain), posterior
 

@@ -14,7 +14,7 @@ from jax import Array
 
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.inference.calibration import Report
-from bayessim_mjx.inference.sets import Sets
+from bayessim_mjx.inference.product_calibration import Sets
 from bayessim_mjx.loop.state import Answer, Evidence, LoopState, Round
 from bayessim_mjx.quantities import fixed
 

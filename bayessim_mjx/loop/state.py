@@ -17,8 +17,8 @@ from bayessim_mjx.env import Env
 from bayessim_mjx.inference import InferenceSettings, checks, rounds
 from bayessim_mjx.inference.calibration import Report
 from bayessim_mjx.inference.misspecification import Misfit
+from bayessim_mjx.inference.product_calibration import Sets
 from bayessim_mjx.inference.range_ends import Pile
-from bayessim_mjx.inference.sets import Sets
 from bayessim_mjx.keys import branch
 from bayessim_mjx.loop.sources import Source
 from bayessim_mjx.parameters import ParameterSpace
@@ -81,7 +81,7 @@ class RoundInfo:
     seconds: dict[str, float]
     warnings: list[str]
     checks: checks.Checks | None = None  # calibration, misfit, ends of ranges; None: none asked for
-    sets: Any = None  # how products of several posteriors did on simulated sets, see inference/sets.py
+    sets: Any = None  # how products of several posteriors did on simulated sets, see inference/product_calibration.py
     refinement: Any = None  # what bayessim.refine made of the posterior, see loop/refinement.py
     set_posterior: Any = None  # how a network of sets did beside the product, see loop/set_posterior.py
     moves: tuple[Pile, ...] = ()  # ends of ranges at which the posterior piles up, and where they are in the next round

@@ -19,7 +19,7 @@ def calibration(report: Any, *, round: int | None = None, sets: Any = None) -> A
     Args:
         report: inference.calibration.Report.
         round: for the heading.
-        sets: inference.sets.Sets, in a third picture: posteriors of several trajectories as they are used.
+        sets: inference.product_calibration.Sets, for a third picture: products as they are used.
     """
     figure = new_figure(11.0 if sets is None else 16.0, 5.2, layout="constrained")
     axes = figure.subplots(1, 2 if sets is None else 3)

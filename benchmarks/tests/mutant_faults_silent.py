@@ -101,11 +101,12 @@ SILENT: tuple[tuple[str, str, str, str, tuple[str, ...]], ...] = (
         "return q.means, q.scales * factor", "return q.means, q.scales * factor**2", BY_HAND,
     ),
     (
-        "a widening is judged on the sets that chose it", f"{INFERENCE}/sets.py", "_best(gains[:, part != p])",
+        "a widening is judged on the sets that chose it", f"{INFERENCE}/product_calibration.py",
+        "_best(gains[:, part != p])",
         "_best(gains[:, part == p])", BY_HAND,
     ),
     (
-        "the shape of a Pareto tail without its prior", f"{INFERENCE}/pareto.py",
+        "the shape of a Pareto tail without its prior", f"{INFERENCE}/final_importance_sampling.py",
         "return (n * shape + 10 * 0.5) / (n + 10), scale", "return shape, scale", BY_HAND,
     ),
     (
@@ -118,11 +119,12 @@ SILENT: tuple[tuple[str, str, str, str, tuple[str, ...]], ...] = (
         _tests("inference/test_misspecification", k="combination"),
     ),
     (
-        "a product is moved by what chance adds too", f"{INFERENCE}/near.py", "return mean * (1 - chance / told), cov",
+        "a product is moved by what chance adds too", f"{INFERENCE}/local_recalibration.py",
+        "return mean * (1 - chance / told), cov",
         "return mean, cov", BY_HAND,
     ),
     (
-        "truncated draws are the posterior's, not the prior's", f"{INFERENCE}/proposal.py",
+        "truncated draws are the posterior's, not the prior's", f"{INFERENCE}/rounds.py",
         "jnp.exp(-wide.log_gain(theta)), 0.0", "1.0, 0.0", _tests("inference/test_proposal", k="truncated"),
     ),
     (

@@ -8,7 +8,7 @@ import pytest
 
 from bayessim_mjx import config
 from bayessim_mjx.distributions import Distribution
-from bayessim_mjx.inference.sets import stacked
+from bayessim_mjx.inference.product_calibration import stacked
 from bayessim_mjx.loop import outer_loop, round_inference
 from bayessim_mjx.loop.likelihood import Likelihood
 from bayessim_mjx.loop.refinement import _spread

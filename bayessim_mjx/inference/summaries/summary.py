@@ -40,7 +40,7 @@ class Summary:
         ending: the option of `function` that a whole number at the end of the name sets; None: it takes none.
         names: (T, names of the states, names of the actions, its option) -> a name for each feature; None: numbers.
         stream: (T, S, A, its option) -> Stream; None: it needs the whole trajectory.
-        embedding: (T, S, A) -> a network that learns features from these (embedding.py); None: they are features.
+        embedding: (T, S, A) -> a network that learns features from these (learned.py); None: they are features.
     """
 
     name: str

@@ -16,13 +16,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from bayessim_mjx.distributions import Distribution
-from bayessim_mjx.inference.posterior import combine
-from bayessim_mjx.inference.temperature import gain_at, tempered
+from bayessim_mjx.inference.fit import combine
+from bayessim_mjx.inference.temperature import LEVELS, gain_at, tempered
 
 FACTORS = np.geomspace(1.0, 12.0, 31)  # on standard deviations
 DOUBT = 0.3  # standard deviation of the factor's log before anything is seen: a few sets are off by chance
 BEYOND = -30.0  # log mass in the box that no move may take: what is left is rounding
-LEVELS = (0.5, 0.8, 0.95)  # regions that are told
 SURE = 2.58  # standard errors that chance exceeds once in a hundred times
 HALVES = 2  # the factor is fitted on one part of the sets and judged on the other, in turn
 
@@ -57,7 +56,8 @@ class Sets:
 
     Attributes:
         counts: on sets at draws of the prior, or of what the round was simulated from.
-        near: on sets of the last of these numbers at draws of the posterior itself, one row a turn of `near.settled`.
+        near: on sets of the last of these numbers at draws of the posterior itself, one row a turn of
+            `local_recalibration.settled`.
         move: [d] by which products there are moved, in the coordinates of their chart; None: not at all.
         known: real trajectories that are multiplied, where they are more than those of a set.
         settled: whether the last sets at the posterior's draws asked for no more.
@@ -70,7 +70,7 @@ class Sets:
     settled: bool = True
 
     @property
-    def carried(self) -> int:
+    def saturates_at(self) -> int:
         """After how many trajectories another one does not raise the gain any more."""
         best = self.counts[0]
         for one in self.counts[1:]:
@@ -117,7 +117,7 @@ class Sets:
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers, for JSON."""
         rows = [_plain(c) for c in self.counts]
-        told = {"carried": self.carried, "sets": len(self.counts[-1].levels), "counts": rows}
+        told = {"carried": self.saturates_at, "sets": len(self.counts[-1].levels), "counts": rows}
         told |= {"near": [_plain(c) for c in self.near]}
         told |= {"known": self.multiplied, "widening": self.widening(self.multiplied), "settled": self.settled}
         return {**told, "move": None if self.move is None else [float(x) for x in self.move]}
@@ -131,9 +131,9 @@ class Sets:
     def told(self) -> str:
         """How many trajectories the network can carry, in words."""
         last = self.counts[-1].trajectories
-        if self.carried == last:
+        if self.saturates_at == last:
             return f"the network carries all {last} trajectories: each more sharpened the posterior"
-        return f"the network carries {self.carried} of {last} trajectories: more do not sharpen the posterior"
+        return f"the network carries {self.saturates_at} of {last} trajectories: more do not sharpen the posterior"
 
     def sentence(self) -> str:
         """One line for a person."""
@@ -151,8 +151,8 @@ class Sets:
             told += "; where the posterior lies the network leans to one side, by which it is moved back"
         if not self.settled:
             told += "; the last sets still asked for more: take it for too narrow"
-        if self.carried < last.trajectories:
-            told += f"; the network carries {self.carried}, more do not sharpen the posterior"
+        if self.saturates_at < last.trajectories:
+            told += f"; the network carries {self.saturates_at}, more do not sharpen the posterior"
         return told
 
 
@@ -253,4 +253,4 @@ def counted(n: int, products: Distribution, thetas: np.ndarray, given: float | N
     return Count(n, float(FACTORS[best]), float(own.mean()), error, float(gains[0].mean()), levels)
 
 
-__all__ = ["Count", "Sets", "counted", "counts_to", "judge", "moved", "multiplied", "stacked"]
+__all__ = ["LEVELS", "Count", "Sets", "counted", "counts_to", "judge", "moved", "multiplied", "stacked"]

@@ -13,13 +13,14 @@ import numpy as np
 from scipy.special import logsumexp
 from scipy.stats import multivariate_t
 
-from bayessim_mjx.inference.pareto import effective, smoothed
-from bayessim_mjx.inference.weighted import Mixture
+from bayessim_mjx.inference.mixture_fit import Mixture
+from bayessim_mjx.inference.smc import ess_of, normalised
 
 DRAWS = 4096
 FREEDOM = 5.0  # degrees of freedom of what is drawn from: its tails are heavier than a posterior's
 WIDER = 1.2  # standard deviations, times
 TRIED = 64  # draws for each that is asked for, at most: the others lie beyond the unit cube
+UNRELIABLE = 0.7  # k from which on smoothed weights may be far off (Vehtari et al. 2024, section 3.2.4)
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +30,7 @@ class Weighted:
     Attributes:
         u: `[N, d]` in the unit cube.
         weights: `[N]`, their sum is 1.
-        shape: k of the Pareto tail of the weights, before they were smoothed; see `pareto.UNRELIABLE`.
+        shape: k of the Pareto tail of the weights, before they were smoothed; see UNRELIABLE.
     """
 
     u: np.ndarray
@@ -37,12 +38,12 @@ class Weighted:
     shape: float
 
     @property
-    def worth(self) -> float:
+    def ess(self) -> float:
         """How many draws of the posterior itself they are worth."""
-        return effective(self.weights)
+        return ess_of(self.weights)
 
 
-def independent(
+def final_importance_sampling(
     rng: np.random.Generator, q: Mixture, log_posterior: Callable[[np.ndarray], np.ndarray], each: int
 ) -> Weighted | None:
     """Weighted draws of the posterior; None where the unit cube holds too little of the Gaussians.
@@ -75,4 +76,43 @@ def independent(
     return Weighted(u, *smoothed(logs)) if np.isfinite(logs).any() else None
 
 
-__all__ = ["Weighted", "independent"]
+def smoothed(log_weights: np.ndarray) -> tuple[np.ndarray, float]:
+    """Weights [N] that sum to 1, their largest ones replaced by quantiles of the fitted Pareto tail; and its shape k.
+
+    Vehtari, Simpson, Gelman, Yao, Gabry (2024): Pareto smoothed importance sampling. k is inf where the tail is too
+    short to be fitted.
+    """
+    weights = normalised(log_weights)
+    count = int(min(0.2 * len(weights), 3 * np.sqrt(len(weights))))
+    order = np.argsort(weights)
+    if count < 5 or weights[order[-count - 1]] <= 0:
+        return weights, np.inf
+    cut, tail = weights[order[-count - 1]], weights[order[-count:]]
+    shape, scale = generalised_pareto(tail - cut)
+    if not np.isfinite(shape):
+        return weights, np.inf
+    p = (np.arange(count) + 0.5) / count
+    quantiles = -scale * np.log1p(-p) if abs(shape) < 1e-9 else scale / shape * np.expm1(-shape * np.log1p(-p))
+    out = weights.copy()
+    out[order[-count:]] = np.minimum(cut + quantiles, weights.max())
+    return out / out.sum(), float(shape)
+
+
+def generalised_pareto(x: np.ndarray) -> tuple[float, float]:
+    """(shape k, scale) of exceedances x [n] > 0, ascending: Zhang and Stephens (2009), with PSIS's prior on k."""
+    n = len(x)
+    grid = 30 + int(np.sqrt(n))
+    quartile = x[int(n / 4 + 0.5) - 1]
+    if not quartile > 0:
+        return np.nan, np.nan
+    theta = 1 / x[-1] + (1 - np.sqrt(grid / (np.arange(1, grid + 1) - 0.5))) / (3 * quartile)
+    shapes = np.array([np.log1p(-t * x).mean() for t in theta])
+    profile = n * (np.log(-theta / shapes) - shapes - 1)
+    weight = np.exp(profile - logsumexp(profile))
+    best = float(np.sum(theta * weight))
+    shape = float(np.log1p(-best * x).mean())
+    scale = -shape / best
+    return (n * shape + 10 * 0.5) / (n + 10), scale
+
+
+__all__ = ["UNRELIABLE", "Weighted", "final_importance_sampling", "generalised_pareto", "smoothed"]

@@ -19,11 +19,11 @@ from scipy.stats import f
 
 from bayessim_mjx.distributions import Distribution, box
 from bayessim_mjx.distributions.charts import EDGE, to_chart
-from bayessim_mjx.inference.sets import Count, Sets, counted, moved, multiplied, stacked
+from bayessim_mjx.inference.product_calibration import Count, Sets, counted, moved, multiplied, stacked
 from bayessim_mjx.inference.temperature import FEW
 
 TURNS = 6  # times that sets are drawn from the posterior, at most
-SAME = 1.05  # factor between widenings that is no difference: half of one between neighbours of sets.FACTORS
+SAME = 1.05  # factor between widenings that is no difference: half a step of FACTORS
 STILL = 0.25  # squared change of a move, in standard deviations of the errors, that is none, beyond what chance makes
 CHANCE = 0.01  # of a move where products are off by chance alone
 FOLDS = 8  # of the sets: each is judged with the move that the others ask for
@@ -40,9 +40,10 @@ def settled(found: Sets, product: Distribution, drawn: Drawn, components: int) -
     of it, until they ask for no more.
 
     Args:
-        found: by `sets.judge`.
+        found: by `product_calibration.judge`.
         product: of the found.multiplied real trajectories, neither moved nor widened.
-        drawn: (posterior, turn) -> factors and thetas of sets at its draws, as `sets.judge` takes them; None: none.
+        drawn: (posterior, turn) -> factors and thetas of sets at its draws, as `product_calibration.judge` takes
+            them; None: none.
         components: of the products.
     """
     n, product = found.multiplied, replace(product, prior_weight=jnp.zeros_like(product.prior_weight))

@@ -10,7 +10,7 @@ from scipy.linalg import eigh
 from scipy.special import logsumexp
 
 from bayessim_mjx.distributions import box
-from bayessim_mjx.inference.pareto import effective
+from bayessim_mjx.inference.smc import ess_of
 
 DRAWS = 4096  # at most, that are fitted to
 FLAT = 1.5  # sd, in the width of the cube: over it the density falls by 5 %, which is as good as flat
@@ -76,7 +76,7 @@ def supported(rng: np.random.Generator, z: np.ndarray, weights: np.ndarray, k: i
     """
     q = em(rng, z, weights, k)
     share = q.shares(z) * weights[:, None]
-    fewest = min(effective(own / own.sum()) if own.sum() > 0 else 0.0 for own in share.T)
+    fewest = min(ess_of(own / own.sum()) if own.sum() > 0 else 0.0 for own in share.T)
     return q if k == 1 or fewest >= FEWEST * z.shape[1] else supported(rng, z, weights, k // 2)
 
 
@@ -87,7 +87,7 @@ def _count(rng: np.random.Generator, halves: list[tuple[np.ndarray, np.ndarray]]
         held = 0.0
         for (z, weights), (others, theirs) in (halves, halves[::-1]):
             own = weights / weights.sum()
-            if effective(own) < FEWEST * z.shape[1] * k:
+            if ess_of(own) < FEWEST * z.shape[1] * k:
                 held = -np.inf
                 break
             held += float(theirs @ em(rng, z, own, k).log_density(others))
@@ -99,19 +99,19 @@ def _count(rng: np.random.Generator, halves: list[tuple[np.ndarray, np.ndarray]]
 def in_cube(
     fit: Callable[[np.ndarray], Mixture], draws: np.ndarray, worth: float, weights: np.ndarray | None = None
 ) -> Mixture:
-    """`uncut` Gaussians for draws in the unit cube, in the coordinates that are told; the others are flat.
+    """Gaussians for draws in the unit cube, matched in coordinates that are not uniform; the others are flat.
 
-    In those alone draws are enough for more Gaussians, and a curved valley needs them.
+    In those coordinates alone draws are enough for more Gaussians, and a curved valley needs them.
 
     Args:
         fit: Gaussians for the coordinates (`[d]`, bool) that are asked for.
-        draws, worth, weights: as for `uncut`.
+        draws, worth, weights: as for `match_truncated_moments`.
     """
     weights, d = _equal(draws) if weights is None else weights, draws.shape[1]
     flat = _flat(*_moments(draws, weights), worth)
     own = np.flatnonzero(~flat)
     nothing = Mixture(np.ones(1), np.zeros((1, 0)), np.ones((1, 0, 0)))
-    q = uncut(fit(~flat), draws[:, own], worth, weights) if len(own) else nothing
+    q = match_truncated_moments(fit(~flat), draws[:, own], worth, weights) if len(own) else nothing
     means, covariances = np.full((len(q.weights), d), 0.5), np.tile(FLAT**2 * np.eye(d), (len(q.weights), 1, 1))
     means[:, own], covariances[:, own[:, None], own] = q.means, q.covariances
     return Mixture(q.weights, means, covariances)
@@ -127,7 +127,9 @@ def _moments(draws: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.nda
     return mean, (draws - mean).T @ ((draws - mean) * weights[:, None])
 
 
-def uncut(q: Mixture, draws: np.ndarray, worth: float, weights: np.ndarray | None = None, steps: int = 20) -> Mixture:
+def match_truncated_moments(
+    q: Mixture, draws: np.ndarray, worth: float, weights: np.ndarray | None = None, steps: int = 20
+) -> Mixture:
     """Gaussians that have the draws' moments once they are cut off at the unit cube (Lee and Scott 2012).
 
     Of a parameter of which nothing is known, draws fill the range and so must the Gaussian: one whose draws cannot be
