@@ -81,7 +81,7 @@ def _calibrate(argv: Sequence[str] | None) -> int:
         console.say(f"{config.task}, round {done}, {args.pairs} fresh pairs of parameters and trajectories, {run.path}")
         found = loop.reexamine(parts, tree["state"], tree["policy"], args.pairs, args.seed)
         show(console, found)
-        if text := loop.standing.told(tree["state"]):
+        if text := loop.reused_posterior(tree["state"]):
             console.warning(text)
         folder = write(run.path / FOLDER, found, done)
         console.say(f"report and picture: {folder}, and in TensorBoard under {FOLDER}")

@@ -66,7 +66,7 @@ def summarise(summarizer: Callable, trajectory: Trajectory) -> Array:
 
 
 @dataclasses.dataclass(frozen=True)
-class Seen:
+class SummaryInputs:
     """Named inputs of a summarizer."""
 
     steps: int

@@ -6,15 +6,16 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 from scipy.special import gammainc, gammaln
 
 from bayessim_mjx.distributions.charts import from_chart, to_chart
 from bayessim_mjx.kalman import Gains
-from bayessim_mjx.loop.noise import FINEST, Linear, Noise, NoiseModel
-from bayessim_mjx.loop.starts import Starts
-from bayessim_mjx.loop.travel import repeated, silent, travel
+from bayessim_mjx.logs.signals import LEVELS, values_shown
+from bayessim_mjx.loop.noise import FINEST, Linear, Noise, NoiseModel, Starts
 from bayessim_mjx.physics import Physics
+from bayessim_mjx.physics.tangent import addresses, difference
 from bayessim_mjx.tracking import Record, close, errors, transitions
 
 SETTLED = 0.1  # relative change of the log likelihood's unit at which noise and posterior agree
@@ -23,6 +24,11 @@ TURNS = 6  # of noise and linear dynamics, at most, before anything is replayed
 NEAR = 0.3  # standard deviations of the posterior: a shorter step to its mean ends these turns
 SLOPE = 0.01  # step of central differences in z
 LEAP = 1.0  # longest step in z that linear dynamics are believed
+STILL = 1e-6  # rad, m, rad/s, m/s: what float32 and a simulator's rounding make of a joint that does not move
+# Rows of one value that tell as much as if their errors were independent: with it root mean squares of z are .92 to .99
+# where encoders show 2 to 52 rows a count, up to 3.5 without (benchmarks/inference/counts.py).
+ROWS = 4
+SAME = 0.1  # standard deviations of the sensor: what resampling between two equal rows makes of them is less
 
 
 class Likelihood:
@@ -203,4 +209,42 @@ def _rows(tree: Any, rows: slice) -> Any:
     return jax.tree.map(lambda x: x[rows], tree)
 
 
-__all__ = ["Likelihood"]
+def travel(record: Record, model: mujoco.MjModel) -> np.ndarray:
+    """Range of motion [2 nv] of positions (angles at most pi) and velocities; of what rests, a share of the largest."""
+    qpos, qvel = (np.asarray(x, float).reshape(-1, x.shape[-1]) for x in (record.qpos, record.qvel))
+    places = addresses(model)
+    moved = np.array([min(np.ptp(qpos[:, q]), np.pi) if q is not None else 1.0 for q in places])
+    return np.concatenate([np.maximum(x, max(FINEST * x.max(), STILL)) for x in (moved, np.ptp(qvel, axis=0))])
+
+
+def silent(record: Record, model: mujoco.MjModel, sensor: np.ndarray) -> np.ndarray:
+    """[2 nv]: measured channels whose noise was not told (0) and cannot be seen, as they show fewer than LEVELS values.
+
+    A held joint has no residual, hence no estimate of its noise. Whatever was assumed would be the simulator's own
+    rounding, and each of its residuals millions of standard deviations.
+    """
+    shown = [values_shown(column) for column in _channels(record, model).reshape(-1, 2 * model.nv).T]
+    return np.isfinite(sensor) & ~(np.asarray(sensor) > 0) & (np.array(shown) < LEVELS)
+
+
+def repeated(record: Record, model: mujoco.MjModel, sensor: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """[2 nv] factors on the sensors' standard deviations: of rows that repeat a value, ROWS tell and others do not.
+
+    An encoder's error stays while its count does. Taken for white noise, a hundred rows of one count would be averaged
+    to a tenth of it, and a posterior would be surer the more often a slow motion is sampled.
+    """
+    steps = np.abs(np.diff(_channels(record, model), axis=1))
+    same = steps <= SAME * np.where(np.isfinite(sensor), sensor, 0.0)
+    last = same.shape[1] - ROWS + 1
+    if last < 1:
+        return np.ones(len(sensor))
+    more = np.all([same[:, k : k + last] for k in range(ROWS)], axis=0) & (valid[:, ROWS - 1 :, None] > 0)
+    rows = len(valid) + float(np.sum(valid))
+    return np.sqrt(rows / (rows - more.sum((0, 1))))
+
+
+def _channels(record: Record, model: mujoco.MjModel) -> np.ndarray:
+    """Position tangents from the first position, and velocities [N, T + 1, 2 nv]."""
+    first = record.qpos[0, 0]
+    away = jax.vmap(jax.vmap(lambda q: difference(model, q, first)))(record.qpos)
+    return np.concatenate([np.asarray(away, float), np.asarray(record.qvel, float)], axis=2)

@@ -9,10 +9,13 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
+import jax.numpy as jnp
+import mujoco
 import numpy as np
 
 from bayessim_mjx.kalman import Force, Gains, innovations, measured_noise, riccati
-from bayessim_mjx.loop.starts import Starts
+from bayessim_mjx.physics.tangent import difference, integrate
+from bayessim_mjx.tracking import Record
 
 FINEST = 1e-3  # of a channel's range of motion: no sensor is believed to be better
 PROCESS = (1e-3, 1e-2, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0)  # of unmodelled forces, in the velocity's sensor noise
@@ -20,6 +23,8 @@ FINER = (3.0**0.5, 3.0**0.25)  # what the most likely of them is multiplied and 
 LASTING = (0.7, 0.9, 0.97)  # their correlations from step to step
 RATIOS = (0.1, 0.3)  # velocity's sensor noise against position's, times what was given: less of it than was given
 TURNS, ALIKE = 6, 0.05  # steps of EM for the noise of single channels; relative change of a variance that is none
+# degrees of freedom, no choice: 1 / chi^2 of the N - 1 that an estimated mean leaves has the mean 1 / (N - 3) (Stein)
+LOST = 3
 
 
 @dataclass(frozen=True)
@@ -197,4 +202,38 @@ class NoiseModel:
         return value, float(np.sqrt(factor))
 
 
-__all__ = ["FINEST", "Linear", "Noise", "NoiseModel"]
+class Starts:
+    """Measured starts of records, each channel by itself.
+
+    Attributes:
+        count: N.
+        away: `[N, 2 nv]` position tangents and velocities, from their means.
+    """
+
+    def __init__(self, record: Record, model: mujoco.MjModel) -> None:
+        self.record, self.model = record, model
+        qpos, qvel = record.qpos[:, 0], record.qvel[:, 0]
+        away = jax.vmap(lambda q: difference(model, q, qpos[0]))(qpos)
+        channels = np.concatenate([np.asarray(away, float), np.asarray(qvel, float)], axis=1)
+        self.count, self.away = len(channels), channels - channels.mean(0)
+
+    def share(self, sensor: np.ndarray) -> np.ndarray:
+        """[2 nv] of the measured spread that is noise of these standard deviations; 0 where nothing is measured."""
+        seen, freedom = np.isfinite(sensor), self.count - LOST
+        noise = freedom * np.where(seen, sensor, 0.0) ** 2
+        if freedom <= 0:
+            return np.zeros(len(sensor))
+        return np.minimum(noise / np.maximum((self.away**2).sum(0), 1e-300), 1.0)
+
+    def sd(self, sensor: np.ndarray) -> np.ndarray:
+        """[2 nv] standard deviations of what is left unknown of a start, over all of them."""
+        return sensor * np.sqrt(1 - self.share(sensor) * (1 - LOST / self.count) if self.count > LOST else 1.0)
+
+    def begun(self, sensor: np.ndarray) -> Record:
+        """The records, from their most likely starts under that noise of the sensors [2 nv]."""
+        nv, r = self.model.nv, self.record
+        step = jnp.asarray(-self.share(sensor) * self.away, jnp.float32)
+        qpos = jax.vmap(lambda q, by: integrate(self.model, q, by))(r.qpos[:, 0], step[:, :nv])
+        return r.replace(
+            qpos=jnp.asarray(r.qpos).at[:, 0].set(qpos), qvel=jnp.asarray(r.qvel).at[:, 0].add(step[:, nv:])
+        )

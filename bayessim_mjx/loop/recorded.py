@@ -17,7 +17,7 @@ from bayessim_mjx.inference.summaries import Summarizer
 from bayessim_mjx.keys import branch
 from bayessim_mjx.logs import Channels, Log, noise, read_logs, segments
 from bayessim_mjx.logs.velocities import trusted
-from bayessim_mjx.loop.collection import Seen, tiled
+from bayessim_mjx.loop.collection import SummaryInputs, tiled
 from bayessim_mjx.parameters import ParameterSpace
 from bayessim_mjx.physics import controllers
 from bayessim_mjx.physics.controllers import Law
@@ -57,14 +57,14 @@ class Recorded:
         return len(self.order)
 
     @property
-    def channels(self) -> Seen:
+    def channels(self) -> SummaryInputs:
         """What the summarizer sees: deviations from the nominal replay, and commands; then come the first states."""
         named = Channels.of(self.env.mj_model)
         speeds = [f"{name} speed" for name in named.qvel]
         shown = [name for name, there in zip(speeds, self.fast, strict=True) if there]
         states = [f"deviation of {name}" for name in (*named.qpos, *shown)]
         first = tuple(f"first {name}" for name in (*named.qpos, *speeds))
-        return Seen(self.data["command"].shape[1], tuple(states), named.actuators, first)
+        return SummaryInputs(self.data["command"].shape[1], tuple(states), named.actuators, first)
 
     def features(self, index: Array | np.ndarray, qpos: Array, qvel: Array) -> Array:
         """[N, D] of measured motion qpos [N, T+1, nq], qvel [N, T+1, nv] under the commands of the segments index [N].

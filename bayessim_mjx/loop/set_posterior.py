@@ -25,9 +25,9 @@ from bayessim_mjx.inference.product_calibration import Count
 from bayessim_mjx.inference.rounds import REGION
 from bayessim_mjx.inference.temperature import tempered
 from bayessim_mjx.keys import branch
-from bayessim_mjx.loop.factors import conditioned, kept
-from bayessim_mjx.loop.simulations import features
+from bayessim_mjx.loop.posterior import conditioned, kept
 from bayessim_mjx.loop.state import Answer, Evidence, Loop, LoopState, Round
+from bayessim_mjx.loop.trajectories import features
 from bayessim_mjx.quantities import fixed
 from bayessim_mjx.rl import Policy
 

@@ -58,7 +58,7 @@ class LoopState:
     temperature: Array  # [] factor on standard deviations that the last round's posterior was given
     motion: dict[str, Array] | None = None  # measured motion of the real trajectories, where bayessim.refine needs it
     moving: Moving | None = None  # None: all rounds have the ranges of the task
-    standing: Distribution | None = None  # the product used last, and what it gained on simulated sets (standing.py)
+    standing: Distribution | None = None  # the product used last, and what it gained on simulated sets (examination.py)
     standing_gain: Array | None = None  # [] nats
     standing_round: Array | None = None  # [] int32, the round that it comes from, from 1 on; 0: none was judged
 
@@ -82,7 +82,7 @@ class RoundInfo:
     warnings: list[str]
     checks: checks.Checks | None = None  # calibration, misfit, ends of ranges; None: none asked for
     sets: Any = None  # how products of several posteriors did on simulated sets, see inference/product_calibration.py
-    refinement: Any = None  # what bayessim.refine made of the posterior, see loop/refinement.py
+    refinement: Any = None  # what bayessim.refine made of the posterior, see likelihood_refinement.py
     set_posterior: Any = None  # how a network of sets did beside the product, see loop/set_posterior.py
     moves: tuple[Pile, ...] = ()  # ends of ranges at which the posterior piles up, and where they are in the next round
 

@@ -24,8 +24,8 @@ from noise_draws import scored
 from bayessim_mjx import cli, config, loop
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.inference import InferenceSettings, fit, init, product_calibration
-from bayessim_mjx.loop.factors import conditioned, kept
-from bayessim_mjx.loop.simulations import features, simulated
+from bayessim_mjx.loop.posterior import conditioned, kept
+from bayessim_mjx.loop.trajectories import features, simulated
 from bayessim_mjx.registry import make
 
 FRESH = 500  # pairs that score a network

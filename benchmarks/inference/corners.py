@@ -29,7 +29,7 @@ from bayessim_mjx import config, loop
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.inference import InferenceSettings, combine, fit, init, local_recalibration, product_calibration
 from bayessim_mjx.inference.temperature import tempered
-from bayessim_mjx.loop.simulations import features
+from bayessim_mjx.loop.trajectories import features
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 from bayessim_mjx.registry import make
 

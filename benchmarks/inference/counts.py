@@ -15,7 +15,7 @@ import argparse
 import numpy as np
 from scipy.linalg import expm
 
-from bayessim_mjx.loop.travel import ROWS
+from bayessim_mjx.loop.likelihood import ROWS
 
 MASS, DAMPING, STIFFNESS, GAINS = 2.0, 1.0, 4.0, (10.0, 5.0)
 SECONDS, HELD, TRAJECTORIES = 2.4, 0.2, 4

@@ -60,12 +60,12 @@ SILENT: tuple[tuple[str, str, str, str, tuple[str, ...]], ...] = (
     ),
     # loop
     (
-        "the first of a round's real trajectories keeps the last round's posterior", f"{LOOP}/round_inference.py",
+        "the first of a round's real trajectories keeps the last round's posterior", f"{LOOP}/posterior.py",
         "jnp.arange(factors.logits.shape[0]) >= seen", "jnp.arange(factors.logits.shape[0]) > seen",
         SCORES,
     ),
     (
-        "standard deviations of the surrogate's parameters are squared", f"{LOOP}/surrogate.py",
+        "standard deviations of the surrogate's parameters are squared", f"{LOOP}/sources.py",
         "jnp.asarray(self.sds)[component] * noise_", "jnp.asarray(self.sds)[component] ** 2 * noise_",
         _tests("loop/test_sources", k="standard_deviations"),
     ),
@@ -79,7 +79,7 @@ SILENT: tuple[tuple[str, str, str, str, tuple[str, ...]], ...] = (
         "clock = round_ * ppo.max_iterations * ppo.num_steps", "clock = 0 * round_ * ppo.num_steps", SCORES,
     ),
     (
-        "starts are drawn to their mean by N, not by N - 3", f"{LOOP}/starts.py",
+        "starts are drawn to their mean by N, not by N - 3", f"{LOOP}/noise.py",
         "freedom = np.isfinite(sensor), self.count - LOST", "freedom = np.isfinite(sensor), self.count",
         _tests("loop/test_starts", k="by_hand"),
     ),
@@ -88,11 +88,11 @@ SILENT: tuple[tuple[str, str, str, str, tuple[str, ...]], ...] = (
         "shape = 0.5 * (self.count + 1)", "shape = self.count + 1", SCORES,
     ),
     (
-        "what a posterior gains is judged without the widening it has", f"{LOOP}/standing.py",
-        "else found.at(known).gain if", "else found.at(known).plain if", _tests("loop/test_standing"),
+        "what a posterior gains is judged without the widening it has", f"{LOOP}/examination.py",
+        "else found.at(known).gain if", "else found.at(known).plain if", _tests("loop/test_keep_or_replace"),
     ),
     (
-        "scores of neighbouring stretches count half", f"{LOOP}/refinement.py",
+        "scores of neighbouring stretches count half", f"{LOOP}/likelihood_refinement.py",
         "(1 - lag / (lags + 1)) * (both + both.T)", "(1 - lag / (lags + 1)) * both", SCORES,
     ),
     # inference

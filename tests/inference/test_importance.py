@@ -17,7 +17,7 @@ from bayessim_mjx.inference.final_importance_sampling import (
 from bayessim_mjx.inference.importance import Refined, refine, sharpened
 from bayessim_mjx.inference.mixture_fit import Mixture
 from bayessim_mjx.inference.smc import ess_of
-from bayessim_mjx.loop.refinement import Refinement
+from bayessim_mjx.loop.likelihood_refinement import Refinement
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 
 SPACE = ParameterSpace([Parameter(name, 0.0, -1.0, 1.0) for name in "abc"])

@@ -14,7 +14,7 @@ from bayessim_mjx.config.names import DENSITIES, SUMMARIES
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.inference import InferenceSettings, densities, fit, infer, init, mdn, summaries
 from bayessim_mjx.inference.summarizers import feature_names, get, size, stream
-from bayessim_mjx.loop.collection import Seen
+from bayessim_mjx.loop.collection import SummaryInputs
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 
 PAGE = Path(__file__).parents[2] / "docs" / "own_summary.md"
@@ -57,7 +57,7 @@ def test_the_summary_of_the_how_to(page):
     ended = get("energy_2")(STATES, ACTIONS, jnp.asarray([1.0, 0.0, 0.0]))  # it stands still from the second state on
     np.testing.assert_allclose(ended, [0.5, 1.0, 1.0, 1.0])
     assert size(get("energy_3"), 20, 4, 2) == 12
-    seen = Seen(3, ("angle", "speed"), ("torque",))
+    seen = SummaryInputs(3, ("angle", "speed"), ("torque",))
     assert seen.features("energy") == ("mean square of angle, part 1", "mean square of speed, part 1")
     assert seen.embedding("energy") is None
     with pytest.raises(UserError, match="summary_energy has no streaming form; corr, corrdiff"):

@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 
 from bayessim_mjx.kalman import innovations, measured_noise, riccati
-from bayessim_mjx.loop import refining
-from bayessim_mjx.loop.likelihood import Likelihood
+from bayessim_mjx.loop import trajectories
+from bayessim_mjx.loop.likelihood import Likelihood, repeated, silent
 from bayessim_mjx.loop.state import LoopState
-from bayessim_mjx.loop.travel import repeated, silent
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 from bayessim_mjx.physics import Physics
 from bayessim_mjx.physics.tangent import difference, noisy
@@ -144,7 +143,7 @@ def test_a_surrogates_orientations_are_as_noisy_as_is_said_and_of_norm_one():
         jnp.float32,
     )
     state = types.SimpleNamespace
-    blank = refining.no_motion(
+    blank = trajectories.no_motion(
         loop := state(
             source=state(noise=sd), settings=state(trainTrajLen=rows - 1, realTrajs=1),
             env=state(physics=state(mj_model=FREE)), key=lambda *_: jax.random.key(3),
@@ -154,7 +153,7 @@ def test_a_surrogates_orientations_are_as_noisy_as_is_said_and_of_norm_one():
         qpos=qpos, qvel=jnp.zeros((1, rows, 6)), command=jnp.zeros((1, rows - 1, 0)), valid=jnp.ones((1, rows - 1))
     )
     empty = dict.fromkeys(f.name for f in dataclasses.fields(LoopState))
-    kept = refining.stored(loop, LoopState(**empty | {"round": 0, "motion": blank}), real).motion
+    kept = trajectories.stored(loop, LoopState(**empty | {"round": 0, "motion": blank}), real).motion
     np.testing.assert_allclose(np.linalg.norm(kept["qpos"][0, :, 3:], axis=-1), 1.0, atol=1e-5)
     away = np.asarray(jax.vmap(lambda a, b: difference(FREE, a, b))(kept["qpos"][0], qpos[0]))
     np.testing.assert_allclose(away.std(0), sd, rtol=0.12)  # sd of an sd of 400: 3.5 %

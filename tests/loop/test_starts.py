@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bayessim_mjx.loop.likelihood import Likelihood
-from bayessim_mjx.loop.starts import Starts
+from bayessim_mjx.loop.noise import Starts
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 from bayessim_mjx.physics import Physics
 from bayessim_mjx.rollout import replay
