@@ -25,8 +25,8 @@ from bayessim_mjx.keys import branch
 from bayessim_mjx.quantities import percent, percent_estimate
 
 DRAWS = 256  # proposals per pair; those outside the box are left out
-FEWEST = 15  # pairs that say anything
-ALPHA = 0.01  # chance that a calibrated posterior is called anything else
+FEWEST = 15  # pairs, at least, that a verdict needs; source: rule of thumb, not counted
+ALPHA = 0.01  # chance of another verdict on a calibrated posterior; source: a chosen level of the tests
 CALIBRATED, OVER, UNDER, BIASED, ODD = "calibrated", "over-confident", "under-confident", "biased", "miscalibrated"
 
 

@@ -22,7 +22,7 @@ from bayessim_mjx.inference.range_ends import Pile, piles
 from bayessim_mjx.inference.temperature import widened
 from bayessim_mjx.quantities import percent, percent_estimate
 
-CANDIDATES = 16  # draws of q for each one of q tilt / prior
+CANDIDATES = 16  # draws of q for each one of q tilt / prior; source: cost alone
 
 
 @dataclass(frozen=True)

@@ -16,11 +16,12 @@ from scipy.stats import multivariate_t
 from bayessim_mjx.inference.mixture_fit import Mixture
 from bayessim_mjx.inference.smc import ess_of, normalised
 
-DRAWS = 4096
-FREEDOM = 5.0  # degrees of freedom of what is drawn from: its tails are heavier than a posterior's
-WIDER = 1.2  # standard deviations, times
-TRIED = 64  # draws for each that is asked for, at most: the others lie beyond the unit cube
-UNRELIABLE = 0.7  # k from which on smoothed weights may be far off (Vehtari et al. 2024, section 3.2.4)
+DRAWS = 4096  # independent draws; source: benchmarks/results.md, refined posteriors: the fit limits, not their number
+# degrees of freedom of Student's t that draws are proposed from: heavier tails; source: rule of thumb, not counted
+FREEDOM = 5.0
+WIDER = 1.2  # factor on the standard deviations of a fitted proposal; source: rule of thumb, not counted
+TRIED = 64  # draws for each that is needed, at most: the others lie beyond the unit cube; source: cost alone
+UNRELIABLE = 0.7  # k above which smoothed weights may be far off; source: Vehtari et al. 2024, section 3.2.4
 
 
 @dataclass(frozen=True, eq=False)

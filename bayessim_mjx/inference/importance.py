@@ -22,15 +22,14 @@ from scipy.stats import multivariate_t
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.distributions.charts import EDGE, to_chart
 from bayessim_mjx.inference import smc
-from bayessim_mjx.inference.final_importance_sampling import final_importance_sampling
+from bayessim_mjx.inference.final_importance_sampling import FREEDOM, WIDER, final_importance_sampling
 from bayessim_mjx.inference.mixture_fit import Mixture, fitted, fitted_to_islands, in_cube
 from bayessim_mjx.inference.smc import KEPT, ParticleState, normalised, powered, tempering
 
 LogLikelihood = Callable[[np.ndarray], np.ndarray]  # theta [N, d] -> [N]; not finite: impossible
 
-DEFENSIVE = 0.1  # share of the draws that come from the prior, whatever was learnt (Hesterberg 1995)
-FREEDOM = 5.0  # degrees of freedom of the proposals: their tails are heavier than a posterior's
-WIDER = 1.2  # standard deviations of a fitted proposal, times
+DEFENSIVE = 0.1  # share of draws from the prior, whatever was learnt; source: Hesterberg 1995
+ENOUGH = 150.0  # independent draws that a posterior needs, of the worst parameter; source: rule of thumb, not counted
 
 
 @dataclass(frozen=True)
@@ -91,7 +90,7 @@ def refine(
     rounds: int = 4,
     moves: int = 96,
     components: int = 8,
-    enough: float = 150.0,
+    enough: float = ENOUGH,
     also: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> Refined:
     """The posterior prior x likelihood, found from `proposal`.
@@ -123,7 +122,7 @@ def refine(
 
 def tempered(
     found: Refined, proposal: Distribution, log_likelihood: LogLikelihood, power: float,
-    *, moves: int = 48, components: int = 8, enough: float = 150.0, seed: int = 0,
+    *, moves: int = 48, components: int = 8, enough: float = ENOUGH, seed: int = 0,
 ) -> Refined:  # fmt: skip
     """The same with the likelihood to a power, a generalised posterior (Bissiri et al. 2016)."""
     assert found.population is not None

@@ -22,12 +22,18 @@ from bayessim_mjx.distributions.charts import EDGE, to_chart
 from bayessim_mjx.inference.product_calibration import Count, Sets, counted, moved, multiplied, stacked
 from bayessim_mjx.inference.temperature import FEW
 
-TURNS = 6  # times that sets are drawn from the posterior, at most
-SAME = 1.05  # factor between widenings that is no difference: half a step of FACTORS
-STILL = 0.25  # squared change of a move, in standard deviations of the errors, that is none, beyond what chance makes
-CHANCE = 0.01  # of a move where products are off by chance alone
-FOLDS = 8  # of the sets: each is judged with the move that the others ask for
-FAR = {"plain": 1.0, "probit": 4.0}  # by which one product may count as off: a wild one decides nothing
+# times that sets are drawn from the posterior, at most; 1.9 to 3.9 are used. source: benchmarks/results.md, several
+# trajectories, the truth in a corner
+TURNS = 6
+SAME = 1.05  # factor between widenings that counts as none; source: half a step of product_calibration.FACTORS
+# squared change of a move that counts as none, in standard deviations of the errors, beyond the part of chance: half a
+# standard deviation. source: benchmarks/results.md, several trajectories, the truth in a corner
+STILL = 0.25
+CHANCE = 0.01  # of a move where products are off by chance alone; source: a chosen level of Hotelling's test
+LEAST = 1.5, 8  # sets that Hotelling's test needs: 1.5 a parameter and 8; source: rule of thumb, not counted
+FOLDS = 8  # of the sets: each is judged with the move of the other seven eighths; source: rule of thumb, not counted
+# error that a product counts as off by, at most, in its chart; source: rule of thumb, not counted
+FAR = {"plain": 1.0, "probit": 4.0}
 
 Factors = Sequence[Sequence[Distribution]]
 Drawn = Callable[[Distribution, int], tuple[Factors, np.ndarray] | None]
@@ -104,7 +110,7 @@ def mean_error(off: np.ndarray) -> tuple[np.ndarray | None, np.ndarray]:
     m, d = off.shape
     mean = off.mean(0)
     cov = np.atleast_2d(np.cov(off.T)) + 1e-12 * np.eye(d)
-    if m < 1.5 * d + 8:  # too few to tell
+    if m < LEAST[0] * d + LEAST[1]:
         return None, cov
     told = m * float(mean @ np.linalg.solve(cov, mean))
     chance = d * (m - 1) / (m - d)

@@ -24,10 +24,11 @@ from bayessim_mjx.linalg import inverse_lower, lower_factor, product
 
 Heads = tuple[Array, Array, Array]  # log weights [n, K], centres [n, K, d], factors A [n, K, d, d]
 
-UNUSED = -60.0  # log weight of components that a member does not use
-CUT_POINTS = 16  # quasi-Monte-Carlo points of a component's mass inside the box, in training
+UNUSED = -60.0  # log weight of components that a member does not use; source: below float32's resolution
+CUT_POINTS = 16  # quasi-Monte-Carlo points of a component's mass inside the box, in training; source: cost alone
 AT_ONCE = 1024  # trajectories embedded at once
-LEAST_INSIDE = float(np.log(0.1))  # log mass inside the box that training reckons with at least
+# log mass inside the box that training uses at least; source: rule of thumb, not counted
+LEAST_INSIDE = float(np.log(0.1))
 # of the parameters, those that are not trained by gradients; the last three belong to the parts of the mixture
 FIXED = ("used", "sharpness", "share", "member")
 LOG_2PI = float(np.log(2 * np.pi))

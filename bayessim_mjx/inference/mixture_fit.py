@@ -13,14 +13,14 @@ from bayessim_mjx.distributions import box
 from bayessim_mjx.inference.smc import ess_of
 
 DRAWS = 4096  # at most, that are fitted to
-FLAT = 1.5  # sd, in the width of the cube: over it the density falls by 5 %, which is as good as flat
-# standard errors, beyond which draws are not uniform by chance: .98 of uniform directions pass, and what is not uniform
-# and passes loses less than its moments' chance would (benchmarks/results.md, refined posteriors)
+FLAT = 1.5  # sd, in widths of the cube: the density falls by 5 % over the cube; source: exp(-0.5^2 / (2 FLAT^2))
+# standard errors beyond which draws are not uniform by chance: .98 of uniform directions pass, and a direction that
+# passes wrongly loses less than its moments' chance would. source: benchmarks/results.md, refined posteriors
 SURE = 3.0
 # draws in each direction, behind every Gaussian: fewer than one span a plane and have no Gaussian; where that does not
-# happen 0 to 6 make no difference (benchmarks/inference/few_draws.py)
+# happen 0 to 6 make no difference. source: benchmarks/inference/few_draws.py
 FEWEST = 3
-STRIDE = 1.5  # power of a ratio of variances: what is cut off changes by less than its Gaussian
+STRIDE = 1.5  # power of a ratio of variances: the cut part changes by less than its Gaussian; source: speed alone
 
 
 @dataclass(frozen=True)

@@ -18,10 +18,11 @@ from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.parameters.ranged import Ranged
 from bayessim_mjx.quantities import percent
 
-OUTER = 0.05  # of the range, in unit coordinates: mass of the prior that lies there
-PILED = 0.25  # mass of the posterior that does not get there by chance
-STEEPEST = 0.1  # of a limit above 0: nearer to 0 it does not move at once, and so never reaches it
-LEAST = 0.05  # of a range's width: a smaller move is none
+OUTER = 0.05  # of the range, in unit coordinates: mass of the prior that lies there; source: rule of thumb, not counted
+PILED = 0.25  # mass of the posterior there, five times that of the prior; source: rule of thumb, not counted
+# of a limit above 0: it comes ten times nearer to 0 in a round at most; source: rule of thumb, not counted
+STEEPEST = 0.1
+LEAST = 0.05  # of a range's width: a smaller move counts as none; source: rule of thumb, not counted
 
 
 @dataclass(frozen=True)

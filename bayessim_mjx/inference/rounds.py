@@ -24,9 +24,11 @@ from bayessim_mjx.inference.fit import FitInfo, FitState, fit, infer, init
 from bayessim_mjx.inference.settings import InferenceSettings
 
 METHODS = ("apt", "truncated", "division")
-GAUSSIANS = 8  # of a proposal of apt
-SHARE = 0.05  # of the prior in a proposal of apt: bounds what a wrong first round can hide
-MASS = 1e-3  # of the posterior that `truncated` leaves outside its region
+GAUSSIANS = 8  # of a proposal of apt; source: rule of thumb, not counted
+# of the prior in a proposal of apt: a wrong first round hides nothing for ever; source: rule of thumb, not counted
+SHARE = 0.05
+# of the posterior that `truncated` leaves outside; source: rule of thumb, method of Deistler et al. 2022
+MASS = 1e-3
 POOL = 4096  # draws tried at once by `truncated`
 
 

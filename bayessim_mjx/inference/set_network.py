@@ -28,15 +28,16 @@ from bayessim_mjx.inference.fit import FitInfo, FitState, condition, fit, init
 from bayessim_mjx.linalg import inverse_lower, lower_factor, product
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 
-LONGEST = 512  # features of a summary up to which they are pooled too: a choice, others were not measured
+LONGEST = 512  # features of a summary up to which they are pooled too; source: a choice, others were not measured
 AT_ONCE = 1024  # trajectories embedded at once, for the memory
 
 Simulate = Callable[[Array, Array], Array]  # key, theta [m, d] -> summaries [m, D]
-# choices; other values were not measured
-MASS = 1e-3  # of a Gaussian that an ellipsoid leaves outside, before it is made wider
-WIDER = 2.0  # standard deviations, times: with the posterior itself as region, its ends would look like knowledge
+MASS = 1e-3  # of a Gaussian that an ellipsoid leaves outside before it is widened; source: as `rounds.MASS`
+# standard deviations, times: with the posterior itself as region, its ends would look like knowledge.
+# source: a choice, others were not measured
+WIDER = 2.0
 POOL = 4096  # draws behind its mean and covariance
-STEPS = 32  # of a walk, times the number of parameters
+STEPS = 32  # of a walk, times the number of parameters; source: a choice, others were not measured
 
 
 @dataclass(frozen=True)

@@ -41,6 +41,8 @@ class InferenceSettings(Section):
     fullCovariance: bool = _of_run("fullCovariance")
     hiddenLayers: tuple[int, ...] = _of_run("hiddenLayers")
     lr: float = _of_run("lr")
+    # Sources: batch and dropout, benchmarks/history.md (posteriors); defensive, below; the other numbers are rules of
+    # thumb, not counted.
     weight_decay: float = setting(1e-4, "of AdamW", low=0)
     # a quarter of the rows in four times the steps: more per second, measured on noise-free data
     batch: int = setting(64, "rows of a gradient step", low=1)

@@ -18,15 +18,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import logsumexp
 
-ISLANDS = 8
-SWEEPS = 3  # of moves at a power below the last
-SPREAD = 2.38  # of Gaussians, the best step is this / sqrt(2 d) differences (Roberts and Rosenthal 2001)
-JUMPS = 0.1  # share of steps that are a whole difference, from mode to mode
-WIDER = 1.1  # standard deviations of the others, when a part is drawn anew
-PARTS = (0.25, 0.5, 1.0)  # share of the parameters that one step changes
-FORGOTTEN = 0.3  # correlation with where draws began: so much of their errors there may be left
-STILL = 5.0  # t of a likelihood that rises no more: .2 % of those are beyond it
-KEPT = 0.5  # share of the draws that should count at the next power
+ISLANDS = 8  # populations that never exchange draws; source: rule of thumb, not counted
+SWEEPS = 3  # of moves at a power below the last; source: rule of thumb, not counted
+SPREAD = 2.38  # the best step for Gaussians is this / sqrt(2 d) differences; source: Roberts and Rosenthal 2001
+JUMPS = 0.1  # share of steps that are a whole difference, from mode to mode; source: ter Braak 2006, every tenth step
+# factor on the standard deviations of the others when a part is drawn anew; source: rule of thumb, not counted
+WIDER = 1.1
+# share of the parameters that one step changes; source: rule of thumb, method of Laloy and Vrugt 2012
+PARTS = (0.25, 0.5, 1.0)
+FORGOTTEN = 0.3  # correlation with the start draws that may remain; source: rule of thumb, not counted
+STILL = 5.0  # t over 8 islands of the rise of the log likelihood: .2 % of still ones exceed it; source: Student's t
+# effective share of the draws at the next power; source: rule of thumb, method of Beskos et al. 2016
+KEPT = 0.5
 
 LogLikelihood = Callable[[np.ndarray], np.ndarray]  # u [N, d] -> [N]; not finite: impossible
 

@@ -16,10 +16,10 @@ from bayessim_mjx.distributions.storage import coordinates
 from bayessim_mjx.inference import mdn
 from bayessim_mjx.inference.settings import InferenceSettings
 from bayessim_mjx.inference.temperature import TOGETHER
-from bayessim_mjx.linalg import product
+from bayessim_mjx.keys import GOLDEN
+from bayessim_mjx.linalg import inverse_spread, product
 
-MOST = 4096  # held-out rows
-GOLDEN = np.uint32(2654435769)  # 2^32 / golden ratio: spreads the validation rows evenly over any number of rows
+MOST = 4096  # held-out rows; source: memory alone
 
 
 @struct.dataclass
@@ -116,7 +116,7 @@ def prepare(
     z, clipped = standardise(x, mean, rate, state.settings.clip)
 
     share = np.uint32(round(state.settings.validation * 2**32))
-    held = valid & (rows.astype(jnp.uint32) * GOLDEN < share)
+    held = valid & (rows.astype(jnp.uint32) * GOLDEN < share)  # spread evenly over any number of rows
     held = jnp.where(jnp.any(held), held, valid)  # a handful of rows: better to validate on them than not at all
     # a multiple of what is looked at together: a remainder would be another program of the same
     room = min(x.shape[0], -(-(int(state.settings.validation * x.shape[0]) + 8) // TOGETHER) * TOGETHER, MOST)
@@ -142,5 +142,4 @@ def column_scales(x: Array, valid: Array) -> tuple[Array, Array]:
     mean = jnp.sum(x, axis=0) / n
     deviation = jnp.where(valid[:, None], x - mean[None, :], 0.0)
     sd = jnp.sqrt(jnp.sum(deviation**2, axis=0) / n)
-    varies = sd > 1e-5 * jnp.abs(mean) + 1e-12
-    return mean, jnp.where(varies, 1.0 / jnp.where(varies, sd, 1.0), 0.0)
+    return mean, inverse_spread(mean, sd)

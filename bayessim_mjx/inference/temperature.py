@@ -19,17 +19,18 @@ from jax.typing import ArrayLike
 from bayessim_mjx.distributions import Distribution, box, charts
 from bayessim_mjx.linalg import inverse_lower, lower_factor, product
 
-TEMPERATURES = np.geomspace(1.0, 4.0, 15).astype(np.float32)
-FEW = 64  # points behind the mass of a Gaussian in the box; Distribution.from_unit takes 512
+TEMPERATURES = np.geomspace(1.0, 4.0, 15).astype(np.float32)  # factors tried; source: rule of thumb, not counted
+FEW = 64  # points behind the mass of a Gaussian in the box, 512 in Distribution.from_unit; source: cost alone
 Mixtures = tuple[Array, Array, Array]  # log weights [n, K], means [n, K, d], Cholesky factors of covariances
 
 DRAWS = 64  # of each posterior
-MOST = 512  # rows looked at
+MOST = 512  # rows in which levels are counted; source: cost alone
 TOGETHER = 64  # of them at once
+# factors on sharpness, tried; 1.1 to 1.2 were found to be enough on BayesSimIG's data. source: docs/inference.md
 FACTORS = np.geomspace(0.75, 1 / 0.75, 15).astype(np.float32)
 LEVELS = (0.5, 0.8, 0.95)  # mass of the regions of highest density in which truths are counted
 REGIONS = np.asarray(LEVELS, np.float32)
-DOUBT = 0.15  # standard deviation of the factor's log before anything is seen: a few rows are off by chance
+DOUBT = 0.15  # sd of the factor's log beforehand: a few rows are off by chance; source: rule of thumb, not counted
 
 
 def tempered(posterior: Distribution, factor: float | Array) -> Distribution:

@@ -18,14 +18,20 @@ from bayessim_mjx.inference import densities, mdn
 from bayessim_mjx.inference.densities import Params, density_of
 from bayessim_mjx.inference.settings import InferenceSettings
 from bayessim_mjx.inference.state import Data
+from bayessim_mjx.keys import GOLDEN
 from bayessim_mjx.linalg import REGRESSED, inverse_lower, product, ridge
 
-APART = np.uint32(2654435769)  # between the keys of points of the curve: the steps of each have the next ones
 CURVE = 40  # points of the loss curves, at least
-PACE = 0.5  # of steps in the trials of bases: at the full rate one was once judged by how it shook (damped pendulum)
-TRIED = 150  # gradient steps at least (and a fortieth) that bases are tried for, and before a training may end early
+# factor on steps in the trials of bases: at the full rate whitening was once chosen on the damped pendulum, 6.2 nats
+# for 7.3; at half none of six seeds did. source: benchmarks/history.md, posteriors
+PACE = 0.5
+# gradient steps at least (and a fortieth) that bases are tried for, and before a training may end early; source: rule
+# of thumb, not counted
+TRIED = 150
 MEMBERS = "members"  # axis of the ensemble
-WEAK = 0.05  # smallest precision beyond the prior's that is given to a component of the probit chart
+# smallest precision beyond the prior's that a component of the probit chart starts with; source: rule of thumb, not
+# counted
+WEAK = 0.05
 
 
 def schedule_length(settings: InferenceSettings, capacity: int) -> tuple[int, int]:
@@ -107,7 +113,7 @@ class _Member:
         count = jnp.maximum(jnp.sum(train.astype(jnp.int32)), 1)
         place = jnp.arange(chunk * batch, dtype=jnp.int32).reshape(chunk, batch)
         rows = order[place % count]
-        # the next keys: those of other points of the curve are APART, and what drops units hashes its key
+        # the next keys: those of other points of the curve are GOLDEN apart, and what drops units hashes its key
         keys = key[None, :] + jnp.arange(1, chunk + 1, dtype=key.dtype)[:, None]
         return rows, self.seen(rows, key[0] + (place // count).astype(key.dtype)), keys
 
@@ -155,7 +161,7 @@ def train(
         basis = jnp.where(i == 0, jnp.argmin(jax.lax.all_gather(best[0], MEMBERS)[:tried]), basis)
         inner, best = jax.tree.map(lambda a, b: jnp.where(i == 0, a, b), begin(basis), (inner, best))
         step = partial(member.step, basis, jnp.where(i < 0, PACE, 1.0))
-        inner, losses = jax.lax.scan(step, inner, member.batches(key + (i + trial).astype(key.dtype) * APART, chunk))
+        inner, losses = jax.lax.scan(step, inner, member.batches(key + (i + trial).astype(key.dtype) * GOLDEN, chunk))
         value = member.held_out(inner[0], basis)
         better = value < best[0]
         best = jax.tree.map(lambda a, b: jnp.where(better, a, b), (value, inner[0], i), best)

@@ -11,11 +11,12 @@ from bayessim_mjx.inference.densities import density_of
 from bayessim_mjx.inference.settings import InferenceSettings
 from bayessim_mjx.linalg import product, ridge
 
-LIMIT = 512  # features up to which their eigenvectors are worth the cost; of more of them few tell something each
-MANY = 128  # features from which on a regression on the parameters is tried too
-MOST = 4096  # features up to which a regression on them is worth its cost
-FLOOR = 1e-3  # added to the noise's variances: rounding is not to be blown up
-EPS = 1e-6  # of a direction that neither parameters nor noise move
+LIMIT = 512  # features up to which they are whitened; source: benchmarks/results.md, Ant's 600 features (3262ad5)
+# features from which on a regression on the parameters is tried too; source: benchmarks/results.md, 129 to 512 features
+MANY = 128
+MOST = 4096  # features up to which a regression on them is made; source: cost alone
+FLOOR = 1e-3  # added to the noise's variances: rounding is not to be blown up; source: rule of thumb, not counted
+EPS = 1e-6  # of a direction that neither parameters nor noise move; source: float32
 
 
 def width(settings: InferenceSettings, dim_x: int, d: int) -> int:

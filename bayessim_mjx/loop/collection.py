@@ -16,7 +16,7 @@ from bayessim_mjx.inference.summarizers import feature_names
 from bayessim_mjx.rl import Policy
 from bayessim_mjx.rollout import Trajectory
 
-RANDOM_SHARE = 0.1  # policy_rl_randomized: share of the steps with a uniformly random action (BayesSimIG)
+RANDOM_SHARE = 0.1  # policy_rl_randomized: share of the steps with a uniformly random action; source: BayesSimIG
 POLICY_DEPENDENT = ("policy_rl", "policy_rl_randomized")
 
 

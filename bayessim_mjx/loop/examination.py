@@ -30,11 +30,14 @@ from bayessim_mjx.loop.trajectories import at, features, proposal_of, simulated
 from bayessim_mjx.quantities import fixed
 from bayessim_mjx.rl import Policy
 
-SETS = 64  # thetas at which sets are simulated
-# trajectories in one, at most: beyond that the error that all of them share is taken to stay (`Sets.widening`)
+# simulated sets of trajectories that judge a posterior; 64 are too few for a widening of less than one step of
+# product_calibration.FACTORS. source: docs/inference.md, several trajectories; the number itself is a rule of thumb
+SETS = 64
+# trajectories in one set, at most: beyond that the error that all of them share is taken to stay (`Sets.widening`).
+# source: rule of thumb, not counted
 MOST = 32
-PAIRS, LOTS = 500, 4  # `reexamine` judges sets in as many lots as there are such parts of the pairs, up to this
-REFERENCE = 10000  # simulations that `reexamine` compares real trajectories with, at most
+PAIRS, LOTS = 500, 4  # `reexamine` judges one lot of sets for each 500 pairs, at most 4 lots; source: cost alone
+REFERENCE = 10000  # simulations that `reexamine` compares real trajectories with, at most; source: cost alone
 
 
 def calibrate_product(round_: Round, answer: Answer) -> tuple[Answer, Evidence]:

@@ -18,17 +18,27 @@ from bayessim_mjx.physics import Physics
 from bayessim_mjx.physics.tangent import addresses, difference
 from bayessim_mjx.tracking import Record, close, errors, transitions
 
-SETTLED = 0.1  # relative change of the log likelihood's unit at which noise and posterior agree
-LOOKED = 16  # trajectories at which noise is estimated
-TURNS = 6  # of noise and linear dynamics, at most, before anything is replayed
-NEAR = 0.3  # standard deviations of the posterior: a shorter step to its mean ends these turns
-SLOPE = 0.01  # step of central differences in z
-LEAP = 1.0  # longest step in z that linear dynamics are believed
-STILL = 1e-6  # rad, m, rad/s, m/s: what float32 and a simulator's rounding make of a joint that does not move
+# relative change of the log likelihood's unit at which noise and posterior agree; source: rule of thumb, not counted
+SETTLED = 0.1
+# trajectories that the noise is estimated from: 4 were too few (4454ff8). source: rule of thumb, not counted
+LOOKED = 16
+TURNS = 6  # of noise and linear dynamics, at most, before anything is replayed; source: rule of thumb, not counted
+# standard deviations of the posterior: a shorter step to its mean ends these turns; source: rule of thumb, not counted
+NEAR = 0.3
+# step of central differences in z, prior standard deviations: damping was off by 1.1 of its standard deviations with
+# .05, by .02 with .01. source: benchmarks/results.md, refined posteriors
+SLOPE = 0.01
+# longest step in z in which linear dynamics are used, prior standard deviations; source: rule of thumb, not counted
+LEAP = 1.0
+# rad, m, rad/s, m/s: motion of a resting joint by rounding in float32 and in the simulator; source: rule of thumb, not
+# counted
+STILL = 1e-6
 # Rows of one value that tell as much as if their errors were independent: with it root mean squares of z are .92 to .99
-# where encoders show 2 to 52 rows a count, up to 3.5 without (benchmarks/inference/counts.py).
+# where encoders show 2 to 52 rows a count, up to 3.5 without. source: benchmarks/inference/counts.py
 ROWS = 4
-SAME = 0.1  # standard deviations of the sensor: what resampling between two equal rows makes of them is less
+# standard deviations of the sensor: resampling changes a value between two equal rows by less; source: rule of thumb,
+# not counted
+SAME = 0.1
 
 
 class Likelihood:

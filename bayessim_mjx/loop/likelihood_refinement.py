@@ -32,10 +32,15 @@ from bayessim_mjx.physics.tangent import in_tangent
 from bayessim_mjx.tracking import Record
 
 DRAWS = 1024  # thetas of one call
-SHARE = 1e-4  # of the prior, at most: no training ends where the domain would have no mass at all
-PASSES = 5  # at most, of noise and posterior in turn
-WIDER = 1.1  # variance of the scores, in what the likelihood promises, from which on a posterior is widened
-SHARED = 3.0  # times what chance makes of it, groups that share nothing are moved in .01 to .07 of the cases
+# of the prior, at most: the domain of the next training has mass everywhere; source: rule of thumb, not counted
+SHARE = 1e-4
+PASSES = 5  # at most, of noise and posterior in turn; source: rule of thumb, not counted
+# variance of the scores over the variance that the likelihood promises: from here on a posterior is widened, by 5 % of
+# its standard deviations or more. source: rule of thumb, not counted
+WIDER = 1.1
+# times the squared distance that chance makes: groups that share nothing are moved in .01 to .07 of the cases.
+# source: tests/loop/test_widening.py
+SHARED = 3.0
 
 
 def refine_by_replays(round_: Round, answer: Answer) -> tuple[Answer, Evidence]:

@@ -24,7 +24,7 @@ from bayessim_mjx.quantities import percent
 from bayessim_mjx.rollout import select
 from bayessim_mjx.runs import checkpoints
 
-LOST = 0.05  # weight of a posterior that cannot be divided by the proposal worth a warning
+LOST = 0.05  # mean weight that cannot be divided by the proposal: more is a warning; source: rule of thumb, not counted
 
 
 def condition(loop: Loop, state: LoopState) -> tuple[LoopState, Answer, Evidence]:

@@ -26,7 +26,8 @@ from bayessim_mjx.rl import Policy
 from bayessim_mjx.rollout import Trajectory, recording, remembered, replay
 from bayessim_mjx.tracking import Record
 
-ESTIMATED_SPEED = 3.0  # error of a velocity estimated from positions, in its noise part: it lags at transients
+# error of a velocity estimated from positions, in its noise: it lags at transients; source: rule of thumb, not counted
+ESTIMATED_SPEED = 3.0
 REPLAYED = 512  # segments replayed at once at nominal parameters
 
 

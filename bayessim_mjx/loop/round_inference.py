@@ -35,11 +35,12 @@ from bayessim_mjx.rl import Policy
 __all__ = ["CORRECTIONS", "PREDICTIVE_DRAWS", "infer", "new_network", "score"]
 
 
-# of fresh simulations, on which the posterior has to be a density. Ant's networks that went on from an older policy's
-# trajectories had .99 of them and more in second rounds (5 runs), .66 to .91 in third ones, whose posteriors were lost
+# share of fresh simulations on which a network's posterior has to be a density. Ant's networks that went on from an
+# older policy's trajectories had .99 of them and more in second rounds (5 runs), .66 to .91 in third ones, whose
+# posteriors were lost. source: benchmarks/results.md, the loop sharpens the posterior
 SOUND = 0.95
-PREDICTIVE_DRAWS = 64
-CLIPPED = 0.01  # share of clipped summary entries worth a warning
+PREDICTIVE_DRAWS = 64  # thetas of the posterior predictive motion; source: cost alone
+CLIPPED = 0.01  # share of clipped summary entries: more is a warning; source: rule of thumb, not counted
 
 # of the product of the posteriors, in this order: later ones begin with the answer of those before
 CORRECTIONS: tuple[Callable[[Round, Answer], tuple[Answer, Evidence]], ...] = (

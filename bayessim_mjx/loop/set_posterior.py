@@ -25,14 +25,14 @@ from bayessim_mjx.inference.product_calibration import Count
 from bayessim_mjx.inference.rounds import REGION
 from bayessim_mjx.inference.temperature import tempered
 from bayessim_mjx.keys import branch
+from bayessim_mjx.loop.examination import SETS
 from bayessim_mjx.loop.posterior import conditioned, kept
 from bayessim_mjx.loop.state import Answer, Evidence, Loop, LoopState, Round
 from bayessim_mjx.loop.trajectories import features
 from bayessim_mjx.quantities import fixed
 from bayessim_mjx.rl import Policy
 
-FITTED = 2000  # sets that the network is fitted on; other numbers were not measured
-JUDGED = 64  # sets that it and the product are judged on, as many as `sets` judges products on
+FITTED = 2000  # sets that the network is fitted on; source: rule of thumb, other numbers were not measured
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ def _learnt(loop: Loop, state: LoopState, policy: Policy, answer: Answer) -> tup
         share = jnp.full_like(found.prior_weight, b.priorShare)
         return jax.tree.map(np.asarray, dataclasses.replace(found, prior_weight=share)).split()
 
-    thetas = dataclasses.replace(product, prior_weight=jnp.float32(0)).sample(k_theta, JUDGED)
+    thetas = dataclasses.replace(product, prior_weight=jnp.float32(0)).sample(k_theta, SETS)
     columns = [simulate(k, thetas) for k in keys]
 
     def used(q: Distribution) -> Distribution:
@@ -112,7 +112,7 @@ def _learnt(loop: Loop, state: LoopState, policy: Policy, answer: Answer) -> tup
     each = zip(np.asarray(thetas), posteriors(columns), _products(loop, state, columns, used), strict=True)
     rows = [(at, whole, other) for at, whole, other in each if other is not None and whole.sound]
     (own,) = posteriors([x[None] for x in real])
-    if len(rows) < JUDGED // 2 or not own.sound:
+    if len(rows) < SETS // 2 or not own.sound:
         raise UserError("too many simulated trajectories are not finite")
     at, wholes, products = zip(*rows, strict=True)
     ours = product_calibration.judge([[q] for q in wholes], np.stack(at), b.components).counts[0]

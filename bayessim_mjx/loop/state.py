@@ -27,7 +27,8 @@ from bayessim_mjx.physics.contact import collides
 from bayessim_mjx.rl import Policy, TrainState
 from bayessim_mjx.rollout import Trajectory
 
-KEPT_ROUNDS = 4  # rounds of simulated trajectories kept for the fit where the collection policy does not change
+# rounds of simulations kept for the fit where the collection policy does not change; source: memory alone
+KEPT_ROUNDS = 4
 
 
 @flax.struct.dataclass

@@ -20,8 +20,9 @@ from bayessim_mjx.inference.settings import InferenceSettings
 from bayessim_mjx.linalg import REGRESSED, product, ridge
 
 NU = {"RBF": np.inf, "Laplace": 0.5, "Matern12": 0.5, "Matern32": 1.5, "Matern52": 2.5}
-PAIRED = 512  # rows behind the median heuristic
-MULTIPLES = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0)  # of the median distance: bandwidths tried by validation
+PAIRED = 512  # rows behind the median heuristic; source: cost alone
+# bandwidths tried by validation, in median distances; source: rule of thumb, not counted
+MULTIPLES = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0)
 
 
 def frequencies(kernel: str, dim: int, count: int, seed: int = 0, sequence: str = "sobol") -> np.ndarray:

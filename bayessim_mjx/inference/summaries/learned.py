@@ -25,6 +25,7 @@ from jax import Array
 
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.inference.summaries.summary import Summary, affordable, at_steps, held, register
+from bayessim_mjx.linalg import inverse_spread
 
 
 class _Network(nn.Module):
@@ -150,8 +151,7 @@ def _moments(x: Array, weights: Array) -> tuple[Array, Array]:
     total, weights = jnp.maximum(jnp.sum(weights), 1.0), weights[..., None]
     mean = jnp.sum(weights * x, axis=(0, 1)) / total
     sd = jnp.sqrt(jnp.sum(weights * (x - mean[None, None]) ** 2, axis=(0, 1)) / total)
-    varies = sd > 1e-5 * jnp.abs(mean) + 1e-12
-    return mean, jnp.where(varies, 1.0 / jnp.where(varies, sd, 1.0), 0.0)
+    return mean, inverse_spread(mean, sd)
 
 
 def summary_learned(states: Array, actions: Array, valid: Array | None = None) -> Array:

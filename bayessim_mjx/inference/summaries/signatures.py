@@ -19,8 +19,8 @@ from jax import Array
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.inference.summaries.summary import MAX_FEATURES, Stream, Summary, affordable, held, register
 
-MOST_BY_DEFAULT = 12100  # BayesSimIG's limit n^depth <= 110^2 of the depth that it takes
-DEPTH = 3
+MOST_BY_DEFAULT = 12100  # BayesSimIG's limit n^depth <= 110^2 of the depth that it takes; source: its code
+DEPTH = 3  # of a signature by default; source: BayesSimIG
 Levels = tuple[Array, ...]
 
 

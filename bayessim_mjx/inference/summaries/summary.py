@@ -18,7 +18,7 @@ from bayessim_mjx.config.names import SUMMARIES
 from bayessim_mjx.errors import UserError
 
 Summarizer = Callable[..., Array]  # (states [T+1, S], actions [T, A], valid [T] or nothing) -> [D]
-MAX_FEATURES = 16384  # 10 000 trajectories of as many features are 0.6 GiB, and a network sees each of them
+MAX_FEATURES = 16384  # 10 000 trajectories of as many features are 0.6 GiB; source: memory alone
 
 
 class Stream(NamedTuple):
