@@ -124,7 +124,7 @@ def verdict_lines(found: Any) -> list[str]:
     if report.predictive is not None:
         lines += [f"predictive  p = {report.predictive:.2g} that simulations at the posterior reproduce the summaries"]
     if found.sets is not None:
-        lines += [f"sets        {found.sets.told}"]
+        lines += [f"sets        {found.sets.saturation}"]
     each = "" if len(misfit.p) == 1 else f" (each: {' '.join(f'{value:.2g}' for value in misfit.p)})"
     reality = "unlike anything simulated" if misfit.flagged else "like simulated ones"
     return [*lines, f"reality     the real trajectories are {reality}, p = {misfit.joint:.2g}{each}"]

@@ -83,7 +83,7 @@ def _rank(key: Array, draws: Array, value: Array, kept: Array) -> Array:
 
 @dataclass(frozen=True)
 class Report:
-    """What the held-out pairs say of a posterior; arrays on the host."""
+    """Calibration of a posterior on held-out pairs; arrays on the host."""
 
     names: tuple[str, ...]
     verdict: str  # calibrated, over-confident, under-confident, biased, miscalibrated

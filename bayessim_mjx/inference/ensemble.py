@@ -56,7 +56,7 @@ def parts(params: Any) -> Any:
 
 
 def heads(params: Any, data: Data, settings: InferenceSettings) -> mdn.Heads:
-    """What each member makes of the held-out rows, as it is by itself: leaves [E, V, K, ...].
+    """Outputs of each member by itself on the held-out rows: leaves [E, V, K, ...].
 
     All that follows training is computed from it: each forward pass would be compiled once more.
     """

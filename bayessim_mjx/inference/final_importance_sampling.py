@@ -1,7 +1,7 @@
 """Independent draws of a posterior that moved draws have found: importance sampling from Gaussians fitted to these.
 
-Moved draws are worth few independent ones, and a mixture of Gaussians that is fitted to few follows their chance: its
-regions hold less of the posterior than they say. Where Gaussians fit, almost every draw from them counts.
+The effective sample size of moved draws is small. A mixture of Gaussians that is fitted to few draws follows their
+chance: its regions hold less of the posterior than they say. Where Gaussians fit, almost every draw from them counts.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Weighted:
 
     @property
     def ess(self) -> float:
-        """How many draws of the posterior itself they are worth."""
+        """Effective sample size."""
         return ess_of(self.weights)
 
 
@@ -84,6 +84,7 @@ def smoothed(log_weights: np.ndarray) -> tuple[np.ndarray, float]:
     short to be fitted.
     """
     weights = normalised(log_weights)
+    # draws of the tail and the fewest that are fitted: as in PSIS
     count = int(min(0.2 * len(weights), 3 * np.sqrt(len(weights))))
     order = np.argsort(weights)
     if count < 5 or weights[order[-count - 1]] <= 0:

@@ -169,14 +169,14 @@ def _fit(
         state = ensemble.as_deep(state, data, members)
         own = ensemble.parts_of(members, state.params)
         mixture = ensemble.joined(mdn.converted(own, settings), state.params["share"])
-    told = {"parameter_gain": parameter_gain, "clipped": clipped, "n_invalid": n_invalid}
-    told |= {"steps": steps[0], "best": jnp.max(best), "skipped": jnp.sum(skipped)}
-    told |= ensemble.truncated_scores(state, data, thetas, own, mixture)
+    scores = {"parameter_gain": parameter_gain, "clipped": clipped, "n_invalid": n_invalid}
+    scores |= {"steps": steps[0], "best": jnp.max(best), "skipped": jnp.sum(skipped)}
+    scores |= ensemble.truncated_scores(state, data, thetas, own, mixture)
     gain = ensemble.average(ensemble.held_out(own, state.params["share"], data, settings), data.mask)
-    return state, _info(state, data, gain, curves, told)
+    return state, _info(state, data, gain, curves, scores)
 
 
-def _info(state: FitState, data: Data, gain: Array, curves: Array, told: dict[str, Array]) -> FitInfo:
+def _info(state: FitState, data: Data, gain: Array, curves: Array, scores: dict[str, Array]) -> FitInfo:
     """The scores of a fit, from its curves [E, 2, P] and its mean log density of y."""
     # densities of y -> densities of u; the same for every weight
     volume = jnp.sum(jnp.where(data.train, data.slopes, 0.0)) / jnp.maximum(jnp.sum(data.train.astype(jnp.float32)), 1)
@@ -188,7 +188,7 @@ def _info(state: FitState, data: Data, gain: Array, curves: Array, told: dict[st
         identified=state.identified,
         n_train=jnp.sum(data.train.astype(jnp.int32)),
         n_val=jnp.sum(data.mask).astype(jnp.int32),
-        **told,
+        **scores,
     )
 
 

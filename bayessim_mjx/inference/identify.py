@@ -1,4 +1,4 @@
-"""Which parameters the trajectories say anything about; the others are given back their prior.
+"""Parameters that the trajectories identify; the others keep their prior.
 
 A network's posterior of a parameter that the data do not constrain is close to flat, but not flat: the product over
 many trajectories would turn this into a narrow, meaningless peak. So a parameter counts as identified only where its

@@ -28,19 +28,21 @@ from bayessim_mjx.inference.smc import KEPT, ParticleState, normalised, powered,
 
 LogLikelihood = Callable[[np.ndarray], np.ndarray]  # theta [N, d] -> [N]; not finite: impossible
 
-DEFENSIVE = 0.1  # share of draws from the prior, whatever was learnt; source: Hesterberg 1995
+# share of draws from the prior, whatever was learnt; source: rule of thumb, method of Hesterberg 1995
+DEFENSIVE = 0.1
+ROUNDS, MOVES = 4, 96  # of importance sampling and of moves after it, at most; source: cost alone
 ENOUGH = 150.0  # independent draws that a posterior needs, of the worst parameter; source: rule of thumb, not counted
 
 
 @dataclass(frozen=True)
 class Refined:
-    """What importance sampling and moves found.
+    """Result of importance sampling and moves.
 
     Attributes:
         posterior: `fitted`, or the proposal where `reason` is not None.
         fitted: a mixture of Gaussians fitted to draws of the posterior.
         population: these draws, in the unit cube; None where no simulation has a finite likelihood.
-        effective: how many independent draws they are worth.
+        effective: their effective sample size.
         simulations: how many thetas were simulated.
         theta: the most likely theta that was simulated [d].
         reason: why the proposal was kept, or None.
@@ -87,8 +89,8 @@ def refine(
     *,
     seed: int = 0,
     draws: int = 1024,
-    rounds: int = 4,
-    moves: int = 96,
+    rounds: int = ROUNDS,
+    moves: int = MOVES,
     components: int = 8,
     enough: float = ENOUGH,
     also: tuple[np.ndarray, np.ndarray] | None = None,
@@ -122,7 +124,7 @@ def refine(
 
 def tempered(
     found: Refined, proposal: Distribution, log_likelihood: LogLikelihood, power: float,
-    *, moves: int = 48, components: int = 8, enough: float = ENOUGH, seed: int = 0,
+    *, moves: int = MOVES // 2, components: int = 8, enough: float = ENOUGH, seed: int = 0,
 ) -> Refined:  # fmt: skip
     """The same with the likelihood to a power, a generalised posterior (Bissiri et al. 2016)."""
     assert found.population is not None
@@ -135,7 +137,7 @@ def sharpened(
     found: Refined, proposal: Distribution, log_likelihood: LogLikelihood,
     *, draws: int = 1024, components: int = 8, power: float = 1.0, seed: int = 0,
 ) -> Refined:  # fmt: skip
-    """`found` with Gaussians fitted to independent draws of the same posterior, where these are worth more.
+    """`found` with Gaussians fitted to independent draws, where the effective sample size of these is larger.
 
     Args:
         found: as `refine` (power 1) or `tempered` left it.
@@ -184,7 +186,7 @@ def _answer(
     rng: np.random.Generator, proposal: Distribution, at: ParticleState, components: int, enough: float, before: int,
     power: float = 1.0,
 ) -> Refined:  # fmt: skip
-    """What the population says, if its islands agree."""
+    """The result of the particles, if their islands agree."""
     chart = "plain" if proposal.chart == "plain" else "probit"
     draws = np.asarray(to_chart(jnp.asarray(at.islands), chart), np.float64)
     every, count = draws.reshape(-1, draws.shape[-1]), max(at.ess, 1.0)

@@ -39,7 +39,7 @@ Factors = Sequence[Sequence[Distribution]]
 Drawn = Callable[[Distribution, int], tuple[Factors, np.ndarray] | None]
 
 
-def settled(found: Sets, product: Distribution, drawn: Drawn, components: int) -> Sets:
+def recalibrated(found: Sets, product: Distribution, drawn: Drawn, components: int) -> Sets:
     """`found`, with what sets at draws of the posterior ask for.
 
     The posterior is moved and widened as the sets at its draws ask for, and the next sets are at the draws of what came
@@ -92,7 +92,7 @@ def judged(
 def count(
     factors: Factors, thetas: np.ndarray, components: int, move: np.ndarray | None, widening: float | None = None
 ) -> Count:
-    """How products of all factors of each set do with this move [d] and this widening (None: the best)."""
+    """Results of products of all factors of each set with this move [d] and this widening (None: the best)."""
     products = stacked(multiplied(factors, components, [len(factors[0])])[0])
     return counted(len(factors[0]), shifted(products, move), thetas, widening)
 
@@ -112,11 +112,11 @@ def mean_error(off: np.ndarray) -> tuple[np.ndarray | None, np.ndarray]:
     cov = np.atleast_2d(np.cov(off.T)) + 1e-12 * np.eye(d)
     if m < LEAST[0] * d + LEAST[1]:
         return None, cov
-    told = m * float(mean @ np.linalg.solve(cov, mean))
+    statistic = m * float(mean @ np.linalg.solve(cov, mean))
     chance = d * (m - 1) / (m - d)
-    if told < chance * f.ppf(1 - CHANCE, d, m - d):
+    if statistic < chance * f.ppf(1 - CHANCE, d, m - d):
         return None, cov
-    return mean * (1 - chance / told), cov
+    return mean * (1 - chance / statistic), cov
 
 
 @jax.jit
@@ -131,4 +131,4 @@ def _errors(products: Distribution, thetas: jax.Array) -> jax.Array:
     return jax.vmap(one)(products, thetas)
 
 
-__all__ = ["count", "judged", "mean_error", "settled", "shifted"]
+__all__ = ["count", "judged", "mean_error", "recalibrated", "shifted"]

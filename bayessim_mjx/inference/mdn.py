@@ -111,7 +111,7 @@ def embedded(params: Params, x: Array, settings: InferenceSettings) -> Array:
 
 
 def hidden(params: Params, x: Array, settings: InferenceSettings, drop: Drop | None = None) -> Array:
-    """What the last layer sees: the density's hidden units (some dropped in training) or features, [n, F] -> [n, H]."""
+    """Inputs of the last layer: the density's hidden units (some dropped in training) or features, [n, F] -> [n, H]."""
     return densities.density_of(settings).hidden(params, x, drop)
 
 

@@ -47,7 +47,7 @@ class Scores(NamedTuple):
 
 @dataclass(frozen=True)
 class Misfit:
-    """How far real summaries are from what simulation produces; arrays over n real trajectories, on the host."""
+    """Distance of real summaries from simulated ones; arrays over n real trajectories, on the host."""
 
     p: np.ndarray  # [n] of each trajectory: uniform where nothing is wrong
     parts: np.ndarray  # [n, 3] the p-value of each score by itself
@@ -67,12 +67,12 @@ class Misfit:
         return self.joint < FLAGGED
 
     def part(self, rows: slice) -> Misfit:
-        """Some of the trajectories."""
+        """The result of some of the trajectories."""
         found = {name: getattr(self, name)[rows] for name in ("p", "parts", "sides", "features", "residuals")}
         return replace(self, **found)
 
     def sentence(self) -> str:
-        """What a person should know; empty where nothing is wrong."""
+        """A sentence for a person; empty where nothing is wrong."""
         if not self.flagged:
             return ""
         worst = int(np.argmin(self.p))
@@ -143,7 +143,7 @@ def _joint(held: np.ndarray, row: np.ndarray) -> tuple[float, np.ndarray, np.nda
 
 
 def _count_below(pool: np.ndarray) -> np.ndarray:
-    """How many of each column are smaller, [n, k]."""
+    """Number of smaller values in each column, [n, k]."""
     return np.stack([np.searchsorted(np.sort(column), column, side="left") for column in pool.T], axis=1)
 
 
@@ -156,7 +156,7 @@ def _two_sided(held: np.ndarray, real: np.ndarray) -> np.ndarray:
 
 
 def latent(state: Any, x: Array) -> Array:
-    """What the network made of summaries x [n, D]: the last hidden layers of all members of the ensemble, [n, E H]."""
+    """The network's features of summaries x [n, D]: the last hidden layers of all members of the ensemble, [n, E H]."""
     z = state.inputs(x)
     layers = jax.vmap(lambda params: mdn.hidden(params, mdn.embedded(params, z, state.settings), state.settings))(
         state.params
@@ -210,7 +210,7 @@ def _signal(signal: Array, used: Array) -> tuple[Array, Array]:
 
 
 def _alone(z: Array, f: Array, used: Array, z_new: Array, f_new: Array) -> Array:
-    """How far each feature is from what all the others predict, in standard deviations -> [n, D].
+    """Distance of each feature from its prediction by all others, in standard deviations -> [n, D].
 
     One odd feature spoils theta-hat and with it the residuals of features that are as they should be; so those are
     taken only where there are too many features to invert their covariance. f [NEAR, F] are functions of theta-hat.

@@ -81,7 +81,7 @@ def supported(rng: np.random.Generator, z: np.ndarray, weights: np.ndarray, k: i
 
 
 def _count(rng: np.random.Generator, halves: list[tuple[np.ndarray, np.ndarray]], most: int) -> int:
-    """How many Gaussians, fitted to either half (draws [N, d], weights [N]), explain the other one best."""
+    """Number of Gaussians that, fitted to one half (draws [N, d], weights [N]), explain the other half best."""
     best, score = 1, -np.inf
     for k in (k for k in (1, 2, 4, 8, 16, 32) if k <= most):
         held = 0.0
@@ -91,13 +91,13 @@ def _count(rng: np.random.Generator, halves: list[tuple[np.ndarray, np.ndarray]]
                 held = -np.inf
                 break
             held += float(theirs @ em(rng, z, own, k).log_density(others))
-        if held > score + 1e-3:
+        if held > score + 1e-3:  # nats a draw, for twice the Gaussians; rule of thumb, not counted
             best, score = k, held
     return best
 
 
 def in_cube(
-    fit: Callable[[np.ndarray], Mixture], draws: np.ndarray, worth: float, weights: np.ndarray | None = None
+    fit: Callable[[np.ndarray], Mixture], draws: np.ndarray, ess: float, weights: np.ndarray | None = None
 ) -> Mixture:
     """Gaussians for draws in the unit cube, matched in coordinates that are not uniform; the others are flat.
 
@@ -105,13 +105,13 @@ def in_cube(
 
     Args:
         fit: Gaussians for the coordinates (`[d]`, bool) that are asked for.
-        draws, worth, weights: as for `match_truncated_moments`.
+        draws, ess, weights: as for `match_truncated_moments`.
     """
     weights, d = _equal(draws) if weights is None else weights, draws.shape[1]
-    flat = _flat(*_moments(draws, weights), worth)
+    flat = _flat(*_moments(draws, weights), ess)
     own = np.flatnonzero(~flat)
     nothing = Mixture(np.ones(1), np.zeros((1, 0)), np.ones((1, 0, 0)))
-    q = match_truncated_moments(fit(~flat), draws[:, own], worth, weights) if len(own) else nothing
+    q = match_truncated_moments(fit(~flat), draws[:, own], ess, weights) if len(own) else nothing
     means, covariances = np.full((len(q.weights), d), 0.5), np.tile(FLAT**2 * np.eye(d), (len(q.weights), 1, 1))
     means[:, own], covariances[:, own[:, None], own] = q.means, q.covariances
     return Mixture(q.weights, means, covariances)
@@ -128,7 +128,7 @@ def _moments(draws: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def match_truncated_moments(
-    q: Mixture, draws: np.ndarray, worth: float, weights: np.ndarray | None = None, steps: int = 20
+    q: Mixture, draws: np.ndarray, ess: float, weights: np.ndarray | None = None, steps: int = 20
 ) -> Mixture:
     """Gaussians that have the draws' moments once they are cut off at the unit cube (Lee and Scott 2012).
 
@@ -137,14 +137,14 @@ def match_truncated_moments(
     narrower, in every such direction.
 
     Args:
-        draws: `[N, d]`; worth: how many independent ones they are worth.
+        draws: `[N, d]`; ess: their effective sample size.
         weights: `[N]` that sum to 1; None: equal ones.
     """
     share = q.shares(draws) * (_equal(draws) if weights is None else weights)[:, None]
     means, covariances = q.means.copy(), q.covariances.copy()
     for k, part in enumerate(share.T):
         mean, wanted = _moments(draws, part / np.maximum(part.sum(), 1e-9))
-        flat = _flat(mean, wanted, worth * part.sum())
+        flat = _flat(mean, wanted, ess * part.sum())
         own = np.flatnonzero(~flat)
         means[k][flat], covariances[k] = 0.5, np.diag(np.where(flat, FLAT**2, 0.0))
         block = np.ix_(own, own)

@@ -31,7 +31,7 @@ HALVES = 2  # the factor is fitted on one part of the sets and judged on the oth
 
 @dataclass(frozen=True)
 class Count:
-    """How posteriors of `trajectories` trajectories each did on simulated sets.
+    """Results of posteriors of `trajectories` trajectories each on simulated sets.
 
     Attributes:
         widening: factor on standard deviations with the highest mean log density at the truths.
@@ -60,7 +60,7 @@ class Sets:
     Attributes:
         counts: on sets at draws of the prior, or of what the round was simulated from.
         near: on sets of the last of these numbers at draws of the posterior itself, one row a turn of
-            `local_recalibration.settled`.
+            `local_recalibration.recalibrated`.
         move: [d] by which products there are moved, in the coordinates of their chart; None: not at all.
         known: real trajectories that are multiplied, where they are more than those of a set.
         settled: whether the last sets at the posterior's draws asked for no more.
@@ -112,27 +112,27 @@ class Sets:
         """
         for one in (*self.near[-1:], self.counts[-1]):
             errors = [float(np.sqrt(level * (1 - level) / len(one.levels))) for level in LEVELS]
-            told = [(level, one.coverage(level), error) for level, error in zip(LEVELS, errors, strict=True)]
-            if found := [row for row in told if row[1] < row[0] - SURE * row[2]]:
+            held = [(level, one.coverage(level), error) for level, error in zip(LEVELS, errors, strict=True)]
+            if found := [row for row in held if row[1] < row[0] - SURE * row[2]]:
                 return found
         return []
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers, for JSON."""
         rows = [_plain(c) for c in self.counts]
-        told = {"carried": self.saturates_at, "sets": len(self.counts[-1].levels), "counts": rows}
-        told |= {"near": [_plain(c) for c in self.near]}
-        told |= {"known": self.multiplied, "widening": self.widening(self.multiplied), "settled": self.settled}
-        return {**told, "move": None if self.move is None else [float(x) for x in self.move]}
+        numbers = {"carried": self.saturates_at, "sets": len(self.counts[-1].levels), "counts": rows}
+        numbers |= {"near": [_plain(c) for c in self.near]}
+        numbers |= {"known": self.multiplied, "widening": self.widening(self.multiplied), "settled": self.settled}
+        return {**numbers, "move": None if self.move is None else [float(x) for x in self.move]}
 
     @property
     def multiplied(self) -> int:
-        """How many real trajectories' posteriors are multiplied."""
+        """Number of real trajectories whose posteriors are multiplied."""
         return max(self.known, self.counts[-1].trajectories)
 
     @property
-    def told(self) -> str:
-        """How many trajectories the network can carry, in words."""
+    def saturation(self) -> str:
+        """A sentence on the number of trajectories that sharpen the posterior."""
         last = self.counts[-1].trajectories
         if self.saturates_at == last:
             return f"the network carries all {last} trajectories: each more sharpened the posterior"
@@ -142,21 +142,21 @@ class Sets:
         """One line for a person."""
         last, many = self.counts[-1], self.multiplied
         widening = self.widening(many)
-        told = f"with {many} trajectories standard deviations are widened {widening:.2f} times"
+        text = f"with {many} trajectories standard deviations are widened {widening:.2f} times"
         if many > last.trajectories:
             judged = self.widening(last.trajectories)
-            told += (
+            text += (
                 f" (sets of {last.trajectories} were simulated, which ask for {judged:.2f}: an error that all share)"
             )
         elif widening > last.widening:
-            told += f" ({last.widening:.2f} on average over the prior, more where the posterior lies)"
+            text += f" ({last.widening:.2f} on average over the prior, more where the posterior lies)"
         if self.move is not None:
-            told += "; where the posterior lies the network leans to one side, by which it is moved back"
+            text += "; where the posterior lies the network leans to one side, by which it is moved back"
         if not self.settled:
-            told += "; the last sets still asked for more: take it for too narrow"
+            text += "; the last sets still asked for more: take it for too narrow"
         if self.saturates_at < last.trajectories:
-            told += f"; the network carries {self.saturates_at}, more do not sharpen the posterior"
-        return told
+            text += f"; the network carries {self.saturates_at}, more do not sharpen the posterior"
+        return text
 
 
 def _plain(c: Count) -> dict[str, Any]:
@@ -235,12 +235,12 @@ def _levels(q: Distribution, thetas: jax.Array, factors: jax.Array) -> jax.Array
 
 
 def _best(gains: np.ndarray) -> int:
-    """Which of FACTORS serves the sets best, by gains [factors, m] and what is believed beforehand."""
+    """Index of the best of FACTORS for the sets, by gains [factors, m] and the prior on the factor."""
     return int(np.argmax(gains.sum(1) - 0.5 * (np.log(FACTORS) / DOUBT) ** 2))
 
 
 def counted(n: int, products: Distribution, thetas: np.ndarray, given: float | None = None) -> Count:
-    """How batched products of n did at thetas [m, d], widened by `given` or else by what the other half asks for."""
+    """Results of batched products of n at thetas [m, d], widened by `given` or the best factor of the other half."""
     at = jnp.asarray(thetas, jnp.float32)
     gains = np.nan_to_num(np.asarray(_gains(products, at), float), nan=-100.0, neginf=-100.0)
     part = np.arange(len(thetas)) % HALVES

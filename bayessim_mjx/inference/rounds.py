@@ -48,7 +48,7 @@ def first(space: object, proposal: str, components: int, chart: str) -> Distribu
 
 
 def following(posterior: Distribution, proposal: str) -> Distribution:
-    """What the next round is simulated from, given the posterior of this one."""
+    """The proposal of the next round, given the posterior of this one."""
     if proposal == "truncated":
         # the share of the prior, mixed in against misjudgement, would make all of the box the region
         w = posterior.prior_weight
@@ -84,7 +84,7 @@ def repeated(proposal: Distribution, rows: int) -> Distribution:
 
 
 def proposal_of(posterior: Distribution, method: str) -> Distribution:
-    """What the next round is simulated from (for `truncated`: by draw_truncated)."""
+    """The proposal of the next round (for `truncated`: drawn by draw_truncated)."""
     if method not in METHODS:
         raise ValueError(f"method = {method!r}: there are {', '.join(METHODS)}")
     if method == "division":
@@ -133,7 +133,7 @@ def draw_truncated(key: Array, posterior: Distribution, n: int, mass: float = MA
 
 @dataclass
 class Rounds:
-    """Where sequential inference stands: simulations of all rounds, and the posterior after the last one."""
+    """State of sequential inference: simulations of all rounds, and the posterior after the last one."""
 
     state: FitState
     thetas: Array

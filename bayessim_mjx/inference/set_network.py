@@ -133,7 +133,7 @@ def _pool(network: FitState, x: Array) -> _Pool:
 
 
 def _embedded(network: FitState, x: Array) -> _Pool:
-    """Of one summary [D]: the Gaussian that has the moments of its posterior, in the chart of the network."""
+    """The Gaussian with the moments of the posterior of one summary [D], in the chart of the network."""
     z = network.inputs(x[None])
     logits, means, scales = (leaf[0] for leaf in ensemble.mixtures(network, z))
     root = jnp.sqrt(jax.nn.softmax(logits))
@@ -194,7 +194,7 @@ def _draw_region(key: Array, near: Distribution, radius: Array, count: int) -> t
 
 
 def _chord(y: Array, way: Array, mean: Array, scale: Array, chart: str) -> tuple[Array, Array]:
-    """How far one can go back and forth along `way` [n, d] from y [n, d] within the ball and, if plain, the cube."""
+    """Distances back and forth along `way` [n, d] from y [n, d] to the ends of the ball and, if plain, the cube."""
     along = jnp.sum(y * way, axis=1)
     half = jnp.sqrt(jnp.maximum(along**2 + 1 - jnp.sum(y**2, axis=1), 0.0))
     low, high = -along - half, -along + half

@@ -20,7 +20,7 @@ def _of_run(name: str) -> Any:
 
 @dataclass(frozen=True)
 class InferenceSettings(Section):
-    """Those that `bayessim:` has too (config/settings.py) have its defaults and limits.
+    """Settings of the network; those that `bayessim:` has too (config/settings.py) have its defaults and limits.
 
     modelClass is MDNN, or MDRFF[_<kernel>[_<bandwidth>]] with the kernels RBF, Matern12 (Laplace), Matern32, Matern52
     and as bandwidth a number (in standard deviations of the features), `median` (of the distances) or `validation`

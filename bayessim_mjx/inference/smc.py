@@ -6,8 +6,8 @@ flat, some of the parameters at a time (Laloy and Vrugt 2012). Steps are in turn
 stay. Valleys that are straight in the parameters' own units, as several parameters times one number make, are straight
 there too.
 
-Draws are resampled within islands that never exchange any. How far the islands' means differ tells how many independent
-draws all are worth, and shows a likelihood that is too rough to follow.
+Draws are resampled within islands that never exchange any. The variance between the islands' means gives the effective
+sample size, and shows a likelihood that is too rough to follow.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class ParticleState:
 
     @property
     def simulations(self) -> int:
-        """How many thetas the moves simulated."""
+        """Number of thetas that the moves simulated."""
         return self.calls * len(self.u)
 
     @property
@@ -65,7 +65,7 @@ class ParticleState:
 
     @property
     def ess(self) -> float:
-        """Independent draws that those kept are worth, by how islands' means differ; of the worst parameter."""
+        """Effective sample size of the kept draws, by the variance between islands; of the worst parameter."""
         apart = self.islands
         within = apart.var(axis=1, ddof=1).mean(axis=0)
         between = apart.mean(axis=1).var(axis=0, ddof=1)
@@ -89,7 +89,7 @@ class ParticleState:
         return float(rise.mean() / max(rise.std(ddof=1) / ISLANDS**0.5, 1e-30))
 
     def missing(self, enough: float, to: float = 1.0) -> str | None:
-        """What these draws lack of `enough` independent ones at the power `to`; None if nothing."""
+        """The reason why these draws do not count as `enough` independent ones at the power `to`; None: they do."""
         if self.power != to:
             return f"the likelihood can be followed to its power {self.power:.2g} only"
         if not self.ess >= enough:
@@ -124,7 +124,7 @@ def run(
     most: int,
     to: float = 1.0,
 ) -> ParticleState:
-    """The draws at the likelihood's power `to`, moved until they are worth `enough` or `most` calls are made."""
+    """Draws at the power `to`, moved until their effective sample size is `enough`, `most` times at most."""
     left = most
     while at.power != to and left > 0:
         at = _reweighted(rng, at, to)
@@ -185,6 +185,7 @@ def _stepped(
     """(u, its log bias) after a share of the difference of two others, in `part` of the parameters; without bias."""
     count, d = u.shape
     one, two = rng.integers(len(others), size=(2, count))
+    # a tenth of the best step to all of it, for valleys that bend; rule of thumb, not counted
     size = SPREAD / np.sqrt(2 * part.sum(1)) * 10 ** rng.uniform(-1, 0, count)
     size = np.where(rng.random(count) < JUMPS, 1.0, size)[:, None]
     step = (

@@ -24,7 +24,7 @@ MOST = 4096  # held-out rows; source: memory alone
 
 @struct.dataclass
 class FitState:
-    """What the next fit needs: weights and the standardisation of the inputs. Arrays only, but for the two settings."""
+    """State between fits: weights and the standardisation of the inputs. Arrays only, but for the two settings."""
 
     params: Any  # of all members of the ensemble: leaves [E, ...]
     x_mean: Array  # [D]
@@ -37,7 +37,7 @@ class FitState:
 
     @property
     def coordinates(self) -> dict[str, Any]:
-        """What the network's outputs mean, as of a `Distribution`."""
+        """Meaning of the network's outputs, as of a `Distribution`."""
         return coordinates(self.space, self.settings.chart)
 
     def inputs(self, x: Array) -> Array:
@@ -48,7 +48,7 @@ class FitState:
 
 @struct.dataclass
 class FitInfo:
-    """What a person wants to see. Scores are means over held-out rows, in nats."""
+    """Report of a fit. Scores are means over held-out rows, in nats."""
 
     train_loss: Array  # [E] negative log density relative to the prior
     val_loss: Array  # [E], both are means over the ensemble

@@ -1,4 +1,4 @@
-"""How wide posteriors have to be: one factor on their standard deviations, by held-out truths.
+"""The width of posteriors: one factor on their standard deviations, by held-out truths.
 
 The temperature has the highest mean log density at the truths. The coverage factor makes regions hold as many truths as
 they should.

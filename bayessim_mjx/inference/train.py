@@ -50,7 +50,7 @@ def objective(
     drop: densities.Drop | None = None,
     x: Array | None = None,
 ) -> Array:
-    """What training maximises, per row: log q(theta | x), less the log of what the proposal makes of it."""
+    """The objective of training, per row: log q(theta | x), less the log of its integral under the proposal."""
     x = data.x[rows] if x is None else x
     return objective_of(mdn.forward(params, x, data.y.shape[-1], settings, drop), rows, data, settings)
 
@@ -67,7 +67,7 @@ def objective_of(heads: mdn.Heads, rows: Array, data: Data, settings: InferenceS
 
 @dataclass(frozen=True)
 class _Member:
-    """What stays the same in all steps of a member's training.
+    """Constant parts of all steps of a member's training.
 
     Its weights are one vector [W]: a few kernels per step instead of some for every layer.
     """
@@ -82,7 +82,7 @@ class _Member:
     def objective(
         self, flat: Array, basis: Array, rows: Array, seen: Array, drop: densities.Drop | None = None
     ) -> Array:
-        """Of rows [B] by the summaries x that are `seen` of them [B]."""
+        """The objective of rows [B], by the summaries `seen` [B] of them."""
         params = {**self.unravel(flat), **self.fixed}
         return objective(params, rows, self.data, self.settings, drop, self.data.x[basis, seen])
 
@@ -118,7 +118,7 @@ class _Member:
         return rows, self.seen(rows, key[0] + (place // count).astype(key.dtype)), keys
 
     def seen(self, rows: Array, turn: Array) -> Array:
-        """Where summaries of `rows` stand in x: each turn another draw of their noise, where there are several."""
+        """Places of the summaries of `rows` in x: each turn another draw of their noise, where there are several."""
         if self.data.own is None:
             return rows
         own, n, more = self.data.own[rows], len(self.data.train), self.data.draws - 1
@@ -151,7 +151,7 @@ def train(
     values = jax.vmap(member.held_out)(starts, jnp.arange(tried, dtype=jnp.int32))
 
     def begin(basis: Array) -> tuple[tuple, tuple]:
-        """What is trained, and the best so far: held-out loss, weights, place on the curve."""
+        """Start of the training, and the best so far: held-out loss, weights, place on the curve."""
         flat, zero = starts[basis], jnp.asarray(0, jnp.int32)
         return (flat, member.optimiser.init(flat), zero), (values[basis], flat, zero - 1)
 

@@ -20,12 +20,12 @@ EPS = 1e-6  # of a direction that neither parameters nor noise move; source: flo
 
 
 def width(settings: InferenceSettings, dim_x: int, d: int) -> int:
-    """How many inputs a network of d parameters has: all D features, or two `regressed` ones for each parameter."""
+    """Number of inputs of a network of d parameters: all D features, or two `regressed` ones for each parameter."""
     return min(2 * d, dim_x) if LIMIT < dim_x <= MOST and _may_change(settings) and d else dim_x
 
 
 def count(settings: InferenceSettings, dim_x: int) -> int:
-    """How many bases are tried, each by another member of the ensemble (the last one is linear at first)."""
+    """Number of bases that are tried, each by another member of the ensemble (the last one is linear at first)."""
     if not _may_change(settings) or dim_x > LIMIT or settings.ensemble < 3:
         return 1
     return 2 + (dim_x > MANY)
@@ -70,13 +70,13 @@ def whitened(x: Array, train: Array, noise: Array | None = None) -> Array:
     unit = jax.lax.rsqrt(jnp.diagonal(noise) + FLOOR)  # features in units of their noise
     noise, cov = (unit[:, None] * c * unit[None, :] for c in (noise, product((x * weights[:, None]).T, x)))
     values, vectors = jnp.linalg.eigh(cov - noise)
-    told, chance = jnp.maximum(values, 0.0), jnp.sum(vectors * product(noise, vectors), axis=0)
-    share = (told + EPS) / (told + jnp.maximum(chance, 0.0) + EPS)
-    return unit[:, None] * vectors * (share * jax.lax.rsqrt(told + 1.0))[None, :]
+    signal, chance = jnp.maximum(values, 0.0), jnp.sum(vectors * product(noise, vectors), axis=0)
+    share = (signal + EPS) / (signal + jnp.maximum(chance, 0.0) + EPS)
+    return unit[:, None] * vectors * (share * jax.lax.rsqrt(signal + 1.0))[None, :]
 
 
 def regressed(x: Array, y: Array, train: Array) -> Array:
-    """What linear regression makes of each parameter and of its square [D, 2 d], with unit variance.
+    """Linear regressions of each parameter and of its square [D, 2 d], with unit variance.
 
     A network that sees hundreds of features, few of which tell something, learns by heart what the others do in the
     rows that it is trained on. The posterior's mean is a summary that loses little (Fearnhead and Prangle 2012,

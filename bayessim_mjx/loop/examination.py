@@ -45,7 +45,7 @@ def calibrate_product(round_: Round, answer: Answer) -> tuple[Answer, Evidence]:
     if round_.loop.settings.temperature:
         return answer, Evidence()
     clock, known, now = time.perf_counter(), round_.known, (round_.loop, round_.state, round_.policy)
-    found = settled(*now, known, answer.posterior, judge(*now, known))
+    found = recalibrated(*now, known, answer.posterior, judge(*now, known))
     if found is None:
         return answer, Evidence()
     seconds = {"check": time.perf_counter() - clock}
@@ -66,7 +66,7 @@ def judge(loop: Loop, state: LoopState, policy: Policy, known: int) -> Sets | No
     return None if found is None else replace(product_calibration.judge(*found, loop.settings.components), known=known)
 
 
-def settled(
+def recalibrated(
     loop: Loop, state: LoopState, policy: Policy, known: int, product: Distribution, found: Sets | None
 ) -> Sets | None:
     """`judge`'s answer, with what sets at draws of the posterior of the `known` real trajectories ask for."""
@@ -77,7 +77,7 @@ def settled(
     def drawn(posterior: Distribution, turn: int) -> tuple[list[list[Distribution]], np.ndarray] | None:
         return _simulated(loop, state, policy, known, branch(key, turn), posterior)
 
-    return local_recalibration.settled(found, product, drawn, loop.settings.components)
+    return local_recalibration.recalibrated(found, product, drawn, loop.settings.components)
 
 
 def _simulated(
@@ -111,10 +111,10 @@ def _simulated(
 def scores(found: Sets, known: int) -> dict[str, float]:
     """Numbers for curves, of the posterior of `known` trajectories."""
     one = found.at(known)
-    told = {"widening": found.widening(known), "gain": one.gain, "carried": float(found.saturates_at)}
-    told |= {"moved": float(found.move is not None)}
-    told |= {f"coverage_{100 * level:.0f}": one.coverage(level) for level in product_calibration.LEVELS}
-    return {f"sets/{name}": float(value) for name, value in told.items()}
+    numbers = {"widening": found.widening(known), "gain": one.gain, "carried": float(found.saturates_at)}
+    numbers |= {"moved": float(found.move is not None)}
+    numbers |= {f"coverage_{100 * level:.0f}": one.coverage(level) for level in product_calibration.LEVELS}
+    return {f"sets/{name}": float(value) for name, value in numbers.items()}
 
 
 def keep_or_replace(round_: Round, answer: Answer) -> tuple[Answer, Evidence]:
@@ -125,10 +125,10 @@ def keep_or_replace(round_: Round, answer: Answer) -> tuple[Answer, Evidence]:
     gain = expected(verdict[0], answer.sets, round_.known)
     last, before = state.standing, -np.inf if state.standing_gain is None else float(state.standing_gain)
     if last is not None and gain < before and not _moved(last, answer.posterior):
-        told = f"{fixed(gain, 1)} nats" if np.isfinite(gain) else "nothing"
+        gained = f"{fixed(gain, 1)} nats" if np.isfinite(gain) else "nothing"
         warning = (
-            f"this round's posterior gains {told} on simulated trajectories, that of the last round {fixed(before, 1)} "
-            "nats: the last one stands"
+            f"this round's posterior gains {gained} on simulated trajectories, that of the last round "
+            f"{fixed(before, 1)} nats: the last one stands"
         )
         stands = dataclasses.replace(answer, posterior=last, source="last round")
         return stands, Evidence(scores={"sets/stood": 1.0}, warnings=[warning])
@@ -197,7 +197,7 @@ def rejudge(loop: Loop, state: LoopState, policy: Policy, known: int, key: Array
     """
     product, used, k = multiplied(loop, state, known)[0], None, loop.settings.components
     if not loop.settings.temperature:
-        used = settled(loop, state, policy, known, product, judge(loop, state, policy, known))
+        used = recalibrated(loop, state, policy, known, product, judge(loop, state, policy, known))
 
     def again(first: int, around: Distribution | None) -> tuple[list[list[Distribution]], np.ndarray] | None:
         lots = [_simulated(loop, state, policy, known, branch(key, first + i), around) for i in range(more)]
@@ -215,5 +215,5 @@ def rejudge(loop: Loop, state: LoopState, policy: Policy, known: int, key: Array
 
 __all__ = [
     "calibrate_product", "expected", "judge", "keep_or_replace", "reexamine", "rejudge", "reused_posterior", "scores",
-    "settled",
+    "recalibrated",
 ]  # fmt: skip

@@ -68,13 +68,13 @@ class Likelihood:
         self.silent = silent(record, physics.mj_model, sensor)
         self.scale = size = travel(record, physics.mj_model)
         known = np.isfinite(sensor) & ~self.silent
-        told = np.where(known, sensor, 0.0)
-        self.told = np.where(known, np.maximum(told, FINEST * size), np.inf)  # of one row, as of a start
-        more = repeated(record, physics.mj_model, told, self.valid)
-        self.floor = np.where(known, np.maximum(told * more, FINEST * size), np.inf)
+        stated = np.where(known, sensor, 0.0)
+        self.stated = np.where(known, np.maximum(stated, FINEST * size), np.inf)  # of one row, as of a start
+        more = repeated(record, physics.mj_model, stated, self.valid)
+        self.floor = np.where(known, np.maximum(stated * more, FINEST * size), np.inf)
         self.seen = np.isfinite(self.floor)
         self.starts = Starts(record, physics.mj_model)
-        self.begun = record  # from the most likely starts
+        self.shrunk = record  # from the most likely starts
         self.model = NoiseModel(self.floor, size, physics.dt, self.starts)
         self.nv = nv
         self.noise = Noise(self.floor, np.zeros(nv))
@@ -139,7 +139,9 @@ class Likelihood:
         ways, gaps = self._dynamics(theta, path, self.parts)
         linear = self._linear(theta, path, ways, gaps)
         self.noise = self.model.likely(linear, self.noise)
-        self.begun = self.starts.begun(self.told)  # by the told noise: what else sensors show is no error of starts
+        self.shrunk = self.starts.shrunk(
+            self.stated
+        )  # by the stated noise: what else sensors show is no error of starts
         self.laplace = self._posterior(linear)
         gains = self.model.gains(ways, self.noise)
         mask = jnp.asarray(self.valid, jnp.float32)[:, :, None, None]
@@ -160,7 +162,7 @@ class Likelihood:
 
     def _dynamics(self, theta: np.ndarray, path: Gains, parts: list[slice]) -> tuple[np.ndarray, np.ndarray]:
         found = [
-            transitions(self.physics, theta, _rows(self.begun, part), _rows(path, part), self.scale) for part in parts
+            transitions(self.physics, theta, _rows(self.shrunk, part), _rows(path, part), self.scale) for part in parts
         ]
         return np.concatenate([ways for ways, _ in found]), np.concatenate([gaps for _, gaps in found])
 
@@ -179,7 +181,7 @@ class Likelihood:
     def squares(self, thetas: np.ndarray) -> np.ndarray:
         """Sums of squared whitened prediction errors [M, N, blocks] at thetas [M, d]."""
         assert self.gains is not None, "settle first"
-        each = [errors(self.physics, thetas, _rows(self.begun, part), _rows(self.gains, part)) for part in self.parts]
+        each = [errors(self.physics, thetas, _rows(self.shrunk, part), _rows(self.gains, part)) for part in self.parts]
         return np.concatenate([np.asarray(x, np.float64) for x in each], axis=1)
 
     @property
@@ -190,7 +192,7 @@ class Likelihood:
 
     @property
     def least(self) -> float:
-        """The least factor on the variance of the noise as it was estimated: no sensor is better than was told.
+        """The least factor on the variance of the noise as it was estimated: no sensor is better than its stated noise.
 
         Velocity's noise may be any ratio of position's (RATIOS), so positions tell, where they are measured.
         """
@@ -228,7 +230,7 @@ def travel(record: Record, model: mujoco.MjModel) -> np.ndarray:
 
 
 def silent(record: Record, model: mujoco.MjModel, sensor: np.ndarray) -> np.ndarray:
-    """[2 nv]: measured channels whose noise was not told (0) and cannot be seen, as they show fewer than LEVELS values.
+    """[2 nv]: measured channels without a stated noise (0) that show fewer than LEVELS values, too few to estimate it.
 
     A held joint has no residual, hence no estimate of its noise. Whatever was assumed would be the simulator's own
     rounding, and each of its residuals millions of standard deviations.

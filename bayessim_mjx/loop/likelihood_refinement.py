@@ -78,13 +78,13 @@ def _without_noise(silent: np.ndarray, model: mujoco.MjModel) -> str:
 
 def scores(found: Refinement) -> dict[str, float]:
     """Numbers for curves."""
-    told = {"effective": found.refined.effective, "widening": found.widening}
-    told |= {"simulations": float(found.refined.simulations), "used": float(found.used)}
-    return {f"refine/{name}": float(value) for name, value in told.items()}
+    numbers = {"effective": found.refined.effective, "widening": found.widening}
+    numbers |= {"simulations": float(found.refined.simulations), "used": float(found.used)}
+    return {f"refine/{name}": float(value) for name, value in numbers.items()}
 
 
 def _likelihood(loop: Loop, state: LoopState, known: int) -> Likelihood:
-    """Of the first `known` real trajectories; windows of one log are grouped."""
+    """The likelihood of the first `known` real trajectories; windows of one log are one group."""
     physics, source = loop.env.physics, loop.source  # type: ignore[attr-defined]
     model, each = physics.mj_model, loop.settings.realTrajs
     if isinstance(source, Recorded):
@@ -135,15 +135,15 @@ class Refinement:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers, for JSON."""
-        told = {"used": self.used, "sentence": self.sentence(), "simulations": self.refined.simulations}
-        return told | {
+        numbers = {"used": self.used, "sentence": self.sentence(), "simulations": self.refined.simulations}
+        return numbers | {
             "effective": self.refined.effective,
             "widening": self.widening,
             "pareto_k": _finite(self.refined.shape),
         }
 
     def warning(self) -> str | None:
-        """What to be wary of."""
+        """A warning of weights with a heavy tail; None: there is none."""
         k = self.refined.shape
         if not self.used or k is None or k <= UNRELIABLE:
             return None

@@ -1,4 +1,4 @@
-"""What the simulator does not explain of recorded motion: sensor noise, and forces that are not modelled.
+"""Noise of recorded motion: that of the sensors, and forces that are not modelled; starts under that noise.
 
 Estimated near a theta, by the linear dynamics there: what the simulator cannot follow counts as noise.
 """
@@ -37,7 +37,7 @@ LOST = 3
 
 @dataclass(frozen=True)
 class Noise:
-    """What the simulator does not explain.
+    """Noise that the simulator does not explain.
 
     Attributes:
         sensor: `[2 nv]` standard deviations, positions first; inf where nothing is measured.
@@ -51,7 +51,7 @@ class Noise:
 
     @property
     def numbers(self) -> float:
-        """How many it has beside those of the sensors."""
+        """Count of its numbers beside those of the sensors."""
         return float(self.process.any()) + float(self.lasting > 0)
 
 
@@ -119,7 +119,7 @@ class NoiseModel:
     def likely(self, linear: Linear, otherwise: Noise) -> Noise:
         """The most likely noise, each number that is not needed left out (BIC): first what acts, then the sensors.
 
-        Sensors have one factor in common, or one each where that pays: one joint with a noise that nobody told, or
+        Sensors have one factor in common, or one each where that pays: one joint with an unknown noise, or
         with a friction that the simulator lacks, is no reason to believe the others less.
 
         `otherwise` where the dynamics are finite under none.
@@ -176,7 +176,7 @@ class NoiseModel:
         return noise
 
     def gains(self, ways: np.ndarray, noise: Noise) -> Gains:
-        """Of the filter along linear dynamics `ways` [N, T, 2 nv, 2 nv] under that noise."""
+        """Gains of the filter along linear dynamics `ways` [N, T, 2 nv, 2 nv] under that noise."""
         nothing = np.zeros(2 * self.nv)
         if noise.lasting:
             force = Force(noise.process, noise.lasting, self.dt)
@@ -237,7 +237,7 @@ class Starts:
         """[2 nv] standard deviations of what is left unknown of a start, over all of them."""
         return sensor * np.sqrt(1 - self.share(sensor) * (1 - LOST / self.count) if self.count > LOST else 1.0)
 
-    def begun(self, sensor: np.ndarray) -> Record:
+    def shrunk(self, sensor: np.ndarray) -> Record:
         """The records, from their most likely starts under that noise of the sensors [2 nv]."""
         nv, r = self.model.nv, self.record
         step = jnp.asarray(-self.share(sensor) * self.away, jnp.float32)

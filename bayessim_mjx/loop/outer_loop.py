@@ -41,7 +41,7 @@ __all__ = [
 
 
 class Monitor(Protocol):
-    """What the loop tells while it runs; every method may do nothing."""
+    """Observer of the loop while it runs; every method may do nothing."""
 
     def training(self, round_: int, metrics: dict[str, float], state: LoopState) -> None: ...
     def round(self, info: RoundInfo, policy: Policy) -> None: ...
@@ -248,7 +248,7 @@ def run(
 
 
 def tree_of(loop: Loop, state: LoopState) -> dict[str, Any]:
-    """What a checkpoint holds; also the template to restore one."""
+    """Contents of a checkpoint; also the template to restore one."""
     return {"policy": rl.policy_of(state.train), "state": state}
 
 
@@ -260,5 +260,5 @@ def checkpoint_step(loop: Loop, round_: int, trained: TrainState) -> int:
 
 
 def meta_of(state: LoopState) -> dict[str, int]:
-    """What a checkpoint says of itself beside its arrays."""
+    """Numbers that a checkpoint keeps beside its arrays."""
     return {"round": int(state.round), "iteration": int(state.train.iteration)}

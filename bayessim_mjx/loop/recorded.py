@@ -59,7 +59,7 @@ class Recorded:
 
     @property
     def channels(self) -> SummaryInputs:
-        """What the summarizer sees: deviations from the nominal replay, and commands; then come the first states."""
+        """Inputs of the summarizer: deviations from the nominal replay, and commands; then come the first states."""
         named = Channels.of(self.env.mj_model)
         speeds = [f"{name} speed" for name in named.qvel]
         shown = [name for name, there in zip(speeds, self.fast, strict=True) if there]
@@ -204,7 +204,7 @@ def apart(run: np.ndarray, start: np.ndarray, length: int) -> np.ndarray:
 
 
 def _expected(source: Recorded) -> dict[str, np.ndarray]:
-    """What the logs would show at nominal parameters: expected_qpos [M, T+1, nq], expected_qvel [M, T+1, nv]."""
+    """Logs that are expected at nominal parameters: expected_qpos [M, T+1, nq], expected_qvel [M, T+1, nv]."""
     count = len(source.pool)
     size = min(count, REPLAYED)
     thetas, found = tiled(jnp.asarray(source.space.nominal, jnp.float32), size), []

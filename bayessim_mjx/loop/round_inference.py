@@ -109,8 +109,8 @@ def train(
     correction: dict[str, Any] = {"again": simulations.again}
     if b.proposal == "apt":
         correction |= {"proposals": state.proposals, "origin": np.arange(len(thetas), dtype=np.int32) // b.trainTrajs}
-    network, told = inference.fit(loop.key(round_, "fit"), network, thetas, x, jnp.int32(count), **correction)
-    fit = {name: np.asarray(value) for name, value in dataclasses.asdict(told).items()}
+    network, info = inference.fit(loop.key(round_, "fit"), network, thetas, x, jnp.int32(count), **correction)
+    fit = {name: np.asarray(value) for name, value in dataclasses.asdict(info).items()}
     evidence = Evidence({"fit": fit}, seconds={"fit": time.perf_counter() - clock})
     return dataclasses.replace(state, fit=network), fit, evidence
 

@@ -37,7 +37,7 @@ FITTED = 2000  # sets that the network is fitted on; source: rule of thumb, othe
 
 @dataclass(frozen=True)
 class SetPosterior:
-    """How the network of sets did on sets that it was not fitted on, and the product on the same.
+    """Results of the network of sets and of the product, on the same sets, which the network was not fitted on.
 
     Attributes:
         network: of sets, so widened; see `product_calibration.Count`.
@@ -62,9 +62,9 @@ class SetPosterior:
     @property
     def scores(self) -> dict[str, float]:
         """Numbers for curves."""
-        told = {"used": float(self.used), "gain": self.network.gain, "product": self.product.gain}
-        told |= {"widening": self.network.widening}
-        return told | {
+        numbers = {"used": float(self.used), "gain": self.network.gain, "product": self.product.gain}
+        numbers |= {"widening": self.network.widening}
+        return numbers | {
             f"coverage_{100 * level:.0f}": self.network.coverage(level) for level in product_calibration.LEVELS
         }
 
@@ -144,7 +144,7 @@ def _usable(loop: Loop, state: LoopState, product: Distribution) -> Array:
 def _products(
     loop: Loop, state: LoopState, columns: list[Array], used: Callable[[Distribution], Distribution]
 ) -> list[Distribution | None]:
-    """Of each set, given as columns of summaries [m, D], the product as it is used; None where it is no density."""
+    """Products of the sets, given as columns of summaries [m, D], as they are used; None where one is no density."""
     b, each = loop.settings, []
     for x in columns:
         factors = kept(conditioned(state.fit, x, state.temperature), state.fit.identified, b.priorShare)

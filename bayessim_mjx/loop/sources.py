@@ -1,4 +1,4 @@
-"""Where real trajectories come from: a surrogate (the simulator at hidden parameters), or recorded logs (recorded.py).
+"""Sources of real trajectories: a surrogate (the simulator at hidden parameters), or recorded logs (recorded.py).
 
 Both are turned into summaries by the same function as the simulated trajectories, so the features always mean the same.
 """
@@ -49,7 +49,7 @@ class Surrogate:
         return self.means[int(np.argmax(self.weights))]
 
     def truth_of(self, keys: list[Array], count: int) -> np.ndarray:
-        """What the trajectories `real(key, .., count, ..)` of these keys can tell [d]: the mean of their theta.
+        """Mean theta [d] of the trajectories `real(key, .., count, ..)` of these keys.
 
         Parameters vary from trajectory to trajectory (`env.realParams.stds`), by more than a posterior may be wide.
         Those of the heaviest component count; its mean where it made none.
@@ -63,7 +63,7 @@ class Surrogate:
 
     @property
     def supply(self) -> int | None:
-        """How many real trajectories there are; None: as many as asked for."""
+        """Number of real trajectories; None: there is no limit."""
         return None
 
     @property
@@ -78,7 +78,7 @@ class Surrogate:
 
     @property
     def channels(self) -> SummaryInputs:
-        """What the summarizer sees: observations and actions."""
+        """Inputs of the summarizer: observations and actions."""
         (size,) = self.env.observation_size["policy"]
         states = named(getattr(self.env, "observation_names", ()), size, "observation")
         model = getattr(self.env, "mj_model", None)

@@ -1,4 +1,4 @@
-"""What the outer loop is made of: its static parts, the state between rounds (the checkpoint), what a round tells."""
+"""Parts of the outer loop: static ones, the state between rounds (the checkpoint), the report of a round."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ KEPT_ROUNDS = 4
 
 @flax.struct.dataclass
 class Moving:
-    """Where ranges may move: those of the next round, and which simulations were drawn from them."""
+    """Ranges of the next round where they may move, and the simulations that were drawn from them."""
 
     space: Ranged
     covered: Ranged  # what the simulations kept are draws of the prior over
@@ -66,7 +66,7 @@ class LoopState:
 
 @dataclasses.dataclass
 class RoundInfo:
-    """What a person wants to see of a round; numbers on the host."""
+    """Report of a round; numbers on the host."""
 
     round: int
     rounds: int
@@ -167,7 +167,7 @@ class Loop:
 
     @property
     def space(self) -> ParameterSpace:
-        """That of the first round."""
+        """Parameters with the ranges of the first round."""
         return Ranged(self.env.space) if self.moves else self.env.space
 
     @property
@@ -239,7 +239,7 @@ def space_of(loop: Loop, state: LoopState) -> ParameterSpace:
 
 
 def slot_of(loop: Loop, state: LoopState, done: int) -> int:
-    """Where the last of `done` rounds stands among the proposals and the simulations kept."""
+    """Slot of the last of `done` rounds among the kept proposals and simulations."""
     return (
         (done - 1) % max(1, loop.capacity // loop.settings.trainTrajs)
         if state.moving is None

@@ -139,7 +139,7 @@ def _refuse_overflow(source: Source, x: Array, chunks: int) -> None:
 
 
 def noise_draws(loop: Loop) -> int:
-    """How often each simulated trajectory is measured: as often as asked for and as there is room for."""
+    """Number of noise draws of each simulated trajectory: `bayessim.noiseDraws`, or fewer that fit the memory."""
     b, source = loop.settings, loop.source
     if source is None or not source.noisy or loop.moves:  # simulations kept lose their order where ranges move
         return 1
@@ -161,7 +161,7 @@ def _features(source: Source, draws: int) -> Callable[[Array, Array, Policy], tu
 
 
 def proposal_of(loop: Loop, state: LoopState) -> Distribution:
-    """What this round is simulated from."""
+    """The distribution that this round is simulated from."""
     if state.proposal is not None:
         return state.proposal
     return Distribution.prior(space_of(loop, state), loop.settings.components)

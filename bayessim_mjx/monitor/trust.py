@@ -70,7 +70,7 @@ def _sets(axes: Any, sets: Any) -> None:
         ylim=(0, 1.1), xlabel="trajectories", ylabel="share of true parameters inside (bands: ± 2 standard errors)"
     )
     title = "as used, on simulated sets; above: gain in nats"
-    axes.set_title("\n".join([title, *textwrap.wrap(sets.told, 56)]), fontsize=9, loc="left")
+    axes.set_title("\n".join([title, *textwrap.wrap(sets.saturation, 56)]), fontsize=9, loc="left")
     axes.legend(loc="lower left", frameon=False, fontsize=8)
 
 

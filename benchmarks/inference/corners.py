@@ -129,7 +129,7 @@ def measured(one: Fitted, truths: jax.Array, n: int, key: jax.Array) -> dict[str
             own = jax.random.fold_in(jax.random.fold_in(key, i), 10 * n + turn)
             return one.drawn(own, posterior.sample(own, SETS), n)
 
-        settled.append(local_recalibration.settled(found, product, around, k))
+        settled.append(local_recalibration.recalibrated(found, product, around, k))
         clock += time.perf_counter() - began
         wide = tempered(product, found.widening(n))
         for kind, q in {"as it is": product, "prior": wide, "here": settled[-1].used(product, n)}.items():

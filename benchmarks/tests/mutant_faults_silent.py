@@ -120,7 +120,7 @@ SILENT: tuple[tuple[str, str, str, str, tuple[str, ...]], ...] = (
     ),
     (
         "a product is moved by what chance adds too", f"{INFERENCE}/local_recalibration.py",
-        "return mean * (1 - chance / told), cov",
+        "return mean * (1 - chance / statistic), cov",
         "return mean, cov", BY_HAND,
     ),
     (

@@ -39,7 +39,7 @@ def test_sets_at_draws_of_the_posterior_take_back_what_the_network_leans_by_ther
         thetas = np.asarray(posterior.sample(jax.random.PRNGKey(turn), MANY))
         return leaning(thetas, 2 + turn), thetas
 
-    here = local_recalibration.settled(found, product, drawn, components=1)
+    here = local_recalibration.recalibrated(found, product, drawn, components=1)
     used = here.used(product, COUNT)
     assert here.counts == found.counts and here.widening(COUNT) < 1.3
     before, after = (float(q.credible_level(at)) for q in (found.used(product, COUNT), used))
@@ -52,7 +52,7 @@ def test_sets_at_draws_of_the_posterior_take_back_what_the_network_leans_by_ther
             assert np.mean([a.coverage(level) for a in again]) == pytest.approx(level, abs=0.13)
     else:
         assert here.move is None and len(here.near) == 1 and after == pytest.approx(before, abs=0.2)
-    assert local_recalibration.settled(found, product, lambda posterior, turn: None, components=1) == found
+    assert local_recalibration.recalibrated(found, product, lambda posterior, turn: None, components=1) == found
     np.testing.assert_allclose(found.used(product, 4).means, product.means)  # of fewer it tells nothing
 
 
@@ -109,10 +109,12 @@ def test_turns_that_end_without_an_answer_say_so(monkeypatch):
     never = [replace(found.counts[0], widening=2.0 + k) for k in range(local_recalibration.TURNS)]
     turns = iter(never)
     monkeypatch.setattr(local_recalibration, "judged", lambda *a: (next(turns), None, 0.0))
-    here = local_recalibration.settled(found, product, lambda posterior, turn: ([], np.zeros((0, 2))), components=1)
+    here = local_recalibration.recalibrated(
+        found, product, lambda posterior, turn: ([], np.zeros((0, 2))), components=1
+    )
     assert not here.settled and "still asked for more" in here.sentence() and here.to_dict()["settled"] is False
     assert here.widening(2) == local_recalibration.TURNS + 1
     monkeypatch.setattr(local_recalibration, "judged", lambda *a: (found.counts[0], None, 0.0))
-    assert local_recalibration.settled(
+    assert local_recalibration.recalibrated(
         found, product, lambda posterior, turn: ([], np.zeros((0, 2))), components=1
     ).settled

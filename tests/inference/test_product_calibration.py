@@ -72,7 +72,7 @@ def test_products_as_they_are_used_are_judged_with_the_widening_that_they_have(e
     assert [level for level, *_ in as_they_are.off] == [0.5, 0.8, 0.95] and last.coverage(0.5) < 0.35
     wider = product_calibration.judge(*shared, components=1, widened_by=lambda n: np.sqrt(1 + n * 0.25))
     assert not wider.off and wider.at(8).gain > last.gain and wider.at(8).coverage(0.8) == pytest.approx(0.8, abs=0.2)
-    assert exact.told.startswith("the network carries all 8 trajectories")
+    assert exact.saturation.startswith("the network carries all 8 trajectories")
     told = as_they_are.to_dict()
     assert told["carried"] == as_they_are.saturates_at and told["counts"][-1]["coverage"]["0.5"] == last.coverage(0.5)
 

@@ -91,7 +91,7 @@ def test_one_channel_with_more_noise_than_was_told_leaves_the_others_theirs(phys
     assert not found.noise.process.any()
     assert found.least == 1.0  # none of the others may become better than was told
     np.testing.assert_array_equal(
-        found.begun.qpos, found.starts.begun(told).qpos
+        found.shrunk.qpos, found.starts.shrunk(told).qpos
     )  # the noise of starts is the told one
 
 
@@ -111,7 +111,7 @@ def test_a_joint_that_shows_one_value_has_no_say_unless_its_noise_is_told(physic
     assert found.silent.tolist() == [False, True, False, True] and found.seen.tolist() == [True, False, True, False]
     assert found.scale.min() > 1e-4  # states that are not seen are varied by numbers that float32 can tell apart
     known = Likelihood(physics, held, np.ones((COUNT, STEPS)), np.array([0.02, 0.001, 0.05, 0.01]))
-    assert known.seen.all() and known.told[1] == pytest.approx(0.001)
+    assert known.seen.all() and known.stated[1] == pytest.approx(0.001)
 
 
 def test_a_sensor_without_noise_that_moves_keeps_its_say(physics):

@@ -1,4 +1,4 @@
-"""What a summary is, and what all of them share.
+"""Summaries: their contract, and the functions that all of them share.
 
 Rows: states[t] is before and states[t + 1] after actions[t]. `valid` [T] is 1 while the episode ran: what comes after
 counts as standing still with the last action held, whatever the arrays hold there. The network standardises each
