@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bayessim_mjx.distributions import Distribution
-from bayessim_mjx.inference import near, sets
+from bayessim_mjx.inference import local_recalibration, product_calibration
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 
 SPACE = ParameterSpace([Parameter(name, 0.0, -1.0, 1.0) for name in "ab"])
@@ -30,7 +30,7 @@ def leaning(thetas, seed):
 def test_sets_at_draws_of_the_posterior_take_back_what_the_network_leans_by_there(truth):
     """In a corner that hardly any draw of the prior reaches, products are sqrt(8) LEANS = 4.2 of their SD too low."""
     everywhere = np.random.default_rng(0).uniform(-1, CORNER, (MANY, 2))
-    found = sets.judge(leaning(everywhere, 1), everywhere, components=1)
+    found = product_calibration.judge(leaning(everywhere, 1), everywhere, components=1)
     at, mean = jnp.asarray([truth, 0.0]), np.array([truth - LEANS * SD * (truth > CORNER), 0.0])
     scale = np.eye(2)[None] * SD / 2 / COUNT**0.5
     product = Distribution.from_unit(SPACE, np.zeros(1), (mean[None] + 1) / 2, scale)
@@ -39,7 +39,7 @@ def test_sets_at_draws_of_the_posterior_take_back_what_the_network_leans_by_ther
         thetas = np.asarray(posterior.sample(jax.random.PRNGKey(turn), MANY))
         return leaning(thetas, 2 + turn), thetas
 
-    here = near.settled(found, product, drawn, components=1)
+    here = local_recalibration.recalibrated(found, product, drawn, components=1)
     used = here.used(product, COUNT)
     assert here.counts == found.counts and here.widening(COUNT) < 1.3
     before, after = (float(q.credible_level(at)) for q in (found.used(product, COUNT), used))
@@ -47,30 +47,30 @@ def test_sets_at_draws_of_the_posterior_take_back_what_the_network_leans_by_ther
         # SD 0.1 and its eighth of a variance, in unit coordinates
         np.testing.assert_allclose(here.move, [LEANS * SD / 2, 0.0], atol=3 * SD / 2 / (COUNT * MANY) ** 0.5)
         assert before > 0.999 and after < 0.5 and "moved back" in here.sentence()
-        again = [near.count(*drawn(used, t), 1, here.move, here.widening(COUNT)) for t in (9, 10, 11)]
+        again = [local_recalibration.count(*drawn(used, t), 1, here.move, here.widening(COUNT)) for t in (9, 10, 11)]
         for level in (0.5, 0.8, 0.95):  # sets that did not choose it; standard errors up to .04
             assert np.mean([a.coverage(level) for a in again]) == pytest.approx(level, abs=0.13)
     else:
         assert here.move is None and len(here.near) == 1 and after == pytest.approx(before, abs=0.2)
-    assert near.settled(found, product, lambda posterior, turn: None, components=1) == found
+    assert local_recalibration.recalibrated(found, product, lambda posterior, turn: None, components=1) == found
     np.testing.assert_allclose(found.used(product, 4).means, product.means)  # of fewer it tells nothing
 
 
 def test_a_mean_error_is_what_is_beyond_chance_and_few_sets_tell_none():
     rng = np.random.default_rng(0)
     errors = rng.normal(size=(400, 64, 5))
-    told = np.mean([near.mean_error(each)[0] is not None for each in errors])
+    told = np.mean([local_recalibration.mean_error(each)[0] is not None for each in errors])
     assert told < 0.03  # one in a hundred
-    move, cov = near.mean_error(errors[0] + np.array([3.0, 0, 0, 0, 0]))
+    move, cov = local_recalibration.mean_error(errors[0] + np.array([3.0, 0, 0, 0, 0]))
     np.testing.assert_allclose(move, [3.0, 0, 0, 0, 0], atol=0.45)
     np.testing.assert_allclose(cov, np.eye(5), atol=0.6)
-    assert near.mean_error(errors[0, :8] + 3.0)[0] is None
+    assert local_recalibration.mean_error(errors[0, :8] + 3.0)[0] is None
 
 
 def test_nothing_is_moved_out_of_the_box():
     q = Distribution.from_unit(SPACE, np.zeros(1), np.full((1, 2), 0.5), np.eye(2)[None] * 0.05)
-    assert sets.moved(q, np.array([5.0, 0.0])) is q
-    np.testing.assert_allclose(sets.moved(q, np.array([0.2, 0.0])).means, [[0.7, 0.5]], rtol=1e-6)
+    assert product_calibration.moved(q, np.array([5.0, 0.0])) is q
+    np.testing.assert_allclose(product_calibration.moved(q, np.array([0.2, 0.0])).means, [[0.7, 0.5]], rtol=1e-6)
 
 
 def test_parameters_that_are_not_identified_keep_no_other_from_being_moved():
@@ -78,8 +78,10 @@ def test_parameters_that_are_not_identified_keep_no_other_from_being_moved():
     space = ParameterSpace([Parameter(f"t{i}", 0.0, -1.0, 1.0) for i in range(13)])
     scale = np.diag([0.05] + [20.0] * 12)[None]
     q = Distribution.from_unit(space, np.zeros(1), np.full((1, 13), 0.5), scale)
-    assert float(q.log_inside) < 1.3 * sets.BEYOND
-    np.testing.assert_allclose(sets.moved(q, np.array([0.2] + [0.0] * 12)).means[0, :2], [0.7, 0.5], rtol=1e-6)
+    assert float(q.log_inside) < 1.3 * product_calibration.BEYOND
+    np.testing.assert_allclose(
+        product_calibration.moved(q, np.array([0.2] + [0.0] * 12)).means[0, :2], [0.7, 0.5], rtol=1e-6
+    )
 
 
 def test_sets_are_judged_by_moves_that_they_had_no_part_in():
@@ -92,7 +94,7 @@ def test_sets_are_judged_by_moves_that_they_had_no_part_in():
         thetas = rng.uniform(-0.3, 0.3, (24, 8))
         means = 0.5 * (thetas + 1) + 5 * sd + sd * rng.normal(size=thetas.shape)
         rows = [[Distribution.from_unit(space, np.zeros(1), m[None], sd * np.eye(8)[None])] for m in means]
-        count, move, _ = near.judged(rows, thetas, 1, None)
+        count, move, _ = local_recalibration.judged(rows, thetas, 1, None)
         np.testing.assert_allclose(move, -5 * sd, atol=4 * sd / 24**0.5)
         plain.append(count.plain)
     at_the_truth = -8 * np.log(np.sqrt(2 * np.pi) * sd)
@@ -102,13 +104,17 @@ def test_sets_are_judged_by_moves_that_they_had_no_part_in():
 
 
 def test_turns_that_end_without_an_answer_say_so(monkeypatch):
-    found = sets.Sets((sets.Count(2, 1.0, 1.0, 0.1, 1.0, np.linspace(0, 1, 8)),))
+    found = product_calibration.Sets((product_calibration.Count(2, 1.0, 1.0, 0.1, 1.0, np.linspace(0, 1, 8)),))
     product = Distribution.from_unit(SPACE, np.zeros(1), np.full((1, 2), 0.5), 0.05 * np.eye(2)[None])
-    never = [replace(found.counts[0], widening=2.0 + k) for k in range(near.TURNS)]
+    never = [replace(found.counts[0], widening=2.0 + k) for k in range(local_recalibration.TURNS)]
     turns = iter(never)
-    monkeypatch.setattr(near, "judged", lambda *a: (next(turns), None, 0.0))
-    here = near.settled(found, product, lambda posterior, turn: ([], np.zeros((0, 2))), components=1)
+    monkeypatch.setattr(local_recalibration, "judged", lambda *a: (next(turns), None, 0.0))
+    here = local_recalibration.recalibrated(
+        found, product, lambda posterior, turn: ([], np.zeros((0, 2))), components=1
+    )
     assert not here.settled and "still asked for more" in here.sentence() and here.to_dict()["settled"] is False
-    assert here.widening(2) == near.TURNS + 1
-    monkeypatch.setattr(near, "judged", lambda *a: (found.counts[0], None, 0.0))
-    assert near.settled(found, product, lambda posterior, turn: ([], np.zeros((0, 2))), components=1).settled
+    assert here.widening(2) == local_recalibration.TURNS + 1
+    monkeypatch.setattr(local_recalibration, "judged", lambda *a: (found.counts[0], None, 0.0))
+    assert local_recalibration.recalibrated(
+        found, product, lambda posterior, turn: ([], np.zeros((0, 2))), components=1
+    ).settled

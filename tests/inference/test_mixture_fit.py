@@ -6,8 +6,8 @@ import numpy as np
 
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.distributions.box import within
-from bayessim_mjx.inference.weighted import em, in_cube, supported, uncut
-from bayessim_mjx.inference.weighted import fitted as gaussians
+from bayessim_mjx.inference.mixture_fit import em, in_cube, match_truncated_moments, supported
+from bayessim_mjx.inference.mixture_fit import fitted as gaussians
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 
 SPACE = ParameterSpace([Parameter(f"p{i}", 0.5, 0.0, 1.0) for i in range(10)])
@@ -23,7 +23,9 @@ def drawn(rng, count, tied=False):
 
 
 def fitted(draws, worth):
-    q = uncut(em(np.random.default_rng(0), draws, np.full(len(draws), 1 / len(draws)), 1), draws, worth)
+    q = match_truncated_moments(
+        em(np.random.default_rng(0), draws, np.full(len(draws), 1 / len(draws)), 1), draws, worth
+    )
     return Distribution.from_unit(SPACE, np.log(q.weights), q.means, np.linalg.cholesky(q.covariances))
 
 

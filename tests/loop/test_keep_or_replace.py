@@ -9,7 +9,7 @@ import pytest
 from stub_source import SPACE, infer, made
 
 from bayessim_mjx.distributions import Distribution
-from bayessim_mjx.loop import round_inference, standing
+from bayessim_mjx.loop import examination, round_inference
 from bayessim_mjx.loop.state import Answer, Evidence
 
 
@@ -27,7 +27,7 @@ def chosen(state: State, posterior: Distribution, gain: float) -> tuple[State, A
     parts = SimpleNamespace(settings=settings, sequential=False)
     learnt = SimpleNamespace(verdict=(SimpleNamespace(gain=gain), None))
     round_ = SimpleNamespace(loop=parts, state=state, learnt=learnt, known=1)
-    answer, found = standing.keep_last(round_, Answer(posterior))
+    answer, found = examination.keep_or_replace(round_, Answer(posterior))
     return dataclasses.replace(state, **found.kept), answer, found
 
 
@@ -50,11 +50,11 @@ def test_what_gains_more_on_simulated_sets_stands():
 def test_it_is_told_whose_posterior_stands():
     first = State(Distribution.prior(SPACE, 2), jnp.float32(-np.inf), standing_round=jnp.int32(0))
     state, *_ = chosen(first, first.standing, 5.0)
-    assert int(state.standing_round) == 1 and standing.told(dataclasses.replace(state, round=1)) == ""
+    assert int(state.standing_round) == 1 and examination.reused_posterior(dataclasses.replace(state, round=1)) == ""
     after, *_ = chosen(dataclasses.replace(state, round=1), first.standing, 4.0)
-    text = standing.told(dataclasses.replace(after, round=2))
+    text = examination.reused_posterior(dataclasses.replace(after, round=2))
     assert text == "the posterior in use is that of round 1: simulated trajectories promise less of round 2's"
-    assert standing.told(dataclasses.replace(first, round=1)) == ""  # nothing was judged
+    assert examination.reused_posterior(dataclasses.replace(first, round=1)) == ""  # nothing was judged
 
 
 def test_without_a_judged_gain_nothing_stands_for_the_next_round():
@@ -65,16 +65,16 @@ def test_without_a_judged_gain_nothing_stands_for_the_next_round():
 
 def test_what_is_expected():
     report, counts = SimpleNamespace(gain=3.0), SimpleNamespace(at=lambda n: SimpleNamespace(gain=10.0 * n))
-    assert standing.expected(report, None, 1) == 3.0 and standing.expected(report, counts, 4) == 40.0
-    assert standing.expected(report, None, 2) == -np.inf  # hardly any set was a density
-    assert standing.expected(SimpleNamespace(gain=np.nan), None, 1) == -np.inf
+    assert examination.expected(report, None, 1) == 3.0 and examination.expected(report, counts, 4) == 40.0
+    assert examination.expected(report, None, 2) == -np.inf  # hardly any set was a density
+    assert examination.expected(SimpleNamespace(gain=np.nan), None, 1) == -np.inf
 
 
 @pytest.mark.parametrize(("pairs", "lost"), [(100, False), (95, False), (94, True), (None, True)])
 def test_a_network_is_lost_where_its_posteriors_are_no_densities(pairs, lost):
     """Simulations that diverged are nobody's fault."""
     x = jnp.zeros((120, 3)).at[100:].set(jnp.nan)
-    assert standing.lost(None if pairs is None else SimpleNamespace(pairs=pairs), x) == lost
+    assert round_inference.lost(None if pairs is None else SimpleNamespace(pairs=pairs), x) == lost
 
 
 @pytest.mark.slow
@@ -91,7 +91,7 @@ def test_a_lost_network_is_fitted_anew(monkeypatch):
 
     monkeypatch.setattr(round_inference, "train", watched)
     infer(parts, state)
-    monkeypatch.setattr(standing, "lost", lambda report, x: len(calls) == 2)
+    monkeypatch.setattr(round_inference, "lost", lambda report, x: len(calls) == 2)
     after, info = infer(parts, state)
     assert calls == [False, False, True]
     assert any("fitted anew" in text for text in info.warnings)

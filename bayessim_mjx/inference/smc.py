@@ -6,8 +6,8 @@ flat, some of the parameters at a time (Laloy and Vrugt 2012). Steps are in turn
 stay. Valleys that are straight in the parameters' own units, as several parameters times one number make, are straight
 there too.
 
-Draws are resampled within islands that never exchange any. How far the islands' means differ tells how many independent
-draws all are worth, and shows a likelihood that is too rough to follow.
+Draws are resampled within islands that never exchange any. The variance between the islands' means gives the effective
+sample size, and shows a likelihood that is too rough to follow.
 """
 
 from __future__ import annotations
@@ -18,23 +18,24 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import logsumexp
 
-from bayessim_mjx.inference.pareto import effective, normalised
-
-ISLANDS = 8
-SWEEPS = 3  # of moves at a power below the last
-SPREAD = 2.38  # of Gaussians, the best step is this / sqrt(2 d) differences (Roberts and Rosenthal 2001)
-JUMPS = 0.1  # share of steps that are a whole difference, from mode to mode
-WIDER = 1.1  # standard deviations of the others, when a part is drawn anew
-PARTS = (0.25, 0.5, 1.0)  # share of the parameters that one step changes
-FORGOTTEN = 0.3  # correlation with where draws began: so much of their errors there may be left
-STILL = 5.0  # t of a likelihood that rises no more: .2 % of those are beyond it
-KEPT = 0.5  # share of the draws that should count at the next power
+ISLANDS = 8  # populations that never exchange draws; source: rule of thumb, not counted
+SWEEPS = 3  # of moves at a power below the last; source: rule of thumb, not counted
+SPREAD = 2.38  # the best step for Gaussians is this / sqrt(2 d) differences; source: Roberts and Rosenthal 2001
+JUMPS = 0.1  # share of steps that are a whole difference, from mode to mode; source: ter Braak 2006, every tenth step
+# factor on the standard deviations of the others when a part is drawn anew; source: rule of thumb, not counted
+WIDER = 1.1
+# share of the parameters that one step changes; source: rule of thumb, method of Laloy and Vrugt 2012
+PARTS = (0.25, 0.5, 1.0)
+FORGOTTEN = 0.3  # correlation with the start draws that may remain; source: rule of thumb, not counted
+STILL = 5.0  # t over 8 islands of the rise of the log likelihood: .2 % of still ones exceed it; source: Student's t
+# effective share of the draws at the next power; source: rule of thumb, method of Beskos et al. 2016
+KEPT = 0.5
 
 LogLikelihood = Callable[[np.ndarray], np.ndarray]  # u [N, d] -> [N]; not finite: impossible
 
 
 @dataclass(frozen=True)
-class Population:
+class ParticleState:
     """Draws u [N, d] of prior x likelihood^power, as many on each of ISLANDS, and their log likelihood [N].
 
     `kept` are the draws after the last moves at one power, [S, N, d], `likes` their log likelihoods [S, N]; `evidence`
@@ -53,7 +54,7 @@ class Population:
 
     @property
     def simulations(self) -> int:
-        """How many thetas the moves simulated."""
+        """Number of thetas that the moves simulated."""
         return self.calls * len(self.u)
 
     @property
@@ -63,8 +64,8 @@ class Population:
         return self.kept.reshape(moves, ISLANDS, count // ISLANDS, d).swapaxes(0, 1).reshape(ISLANDS, -1, d)
 
     @property
-    def worth(self) -> float:
-        """Independent draws that those kept are worth, by how islands' means differ; of the worst parameter."""
+    def ess(self) -> float:
+        """Effective sample size of the kept draws, by the variance between islands; of the worst parameter."""
         apart = self.islands
         within = apart.var(axis=1, ddof=1).mean(axis=0)
         between = apart.mean(axis=1).var(axis=0, ddof=1)
@@ -88,17 +89,17 @@ class Population:
         return float(rise.mean() / max(rise.std(ddof=1) / ISLANDS**0.5, 1e-30))
 
     def missing(self, enough: float, to: float = 1.0) -> str | None:
-        """What these draws lack of `enough` independent ones at the power `to`; None if nothing."""
+        """The reason why these draws do not count as `enough` independent ones at the power `to`; None: they do."""
         if self.power != to:
             return f"the likelihood can be followed to its power {self.power:.2g} only"
-        if not self.worth >= enough:
-            return f"the draws are worth {self.worth:.0f} independent ones, {enough:.0f} are needed"
+        if not self.ess >= enough:
+            return f"the draws are worth {self.ess:.0f} independent ones, {enough:.0f} are needed"
         if self.memory > FORGOTTEN:
             return f"draws still depend on where they began, correlation {self.memory:.2f}"
         return "the draws' likelihood still changes" if abs(self.trend) > STILL else None
 
 
-def begun(rng: np.random.Generator, u: np.ndarray, like: np.ndarray, base: np.ndarray, count: int) -> Population:
+def init(rng: np.random.Generator, u: np.ndarray, like: np.ndarray, base: np.ndarray, count: int) -> ParticleState:
     """`count` draws of the highest power, at most 1, at which half as many count, out of weighted draws u [M, d].
 
     Args:
@@ -112,20 +113,25 @@ def begun(rng: np.random.Generator, u: np.ndarray, like: np.ndarray, base: np.nd
     logs = powered(base, like, power)
     chosen = rng.permutation(_systematic(rng, normalised(logs), count))
     evidence = float(logsumexp(logs) - np.log(len(logs)))
-    return Population(u[chosen], like[chosen], power, evidence, u[chosen][None], like[chosen][None], u[chosen])
+    return ParticleState(u[chosen], like[chosen], power, evidence, u[chosen][None], like[chosen][None], u[chosen])
 
 
-def moved(
-    rng: np.random.Generator, log_likelihood: LogLikelihood, at: Population, enough: float, most: int, to: float = 1.0
-) -> Population:
-    """The draws at the likelihood's power `to`, moved until they are worth `enough` or `most` calls are made."""
+def run(
+    rng: np.random.Generator,
+    log_likelihood: LogLikelihood,
+    at: ParticleState,
+    enough: float,
+    most: int,
+    to: float = 1.0,
+) -> ParticleState:
+    """Draws at the power `to`, moved until their effective sample size is `enough`, `most` times at most."""
     left = most
     while at.power != to and left > 0:
         at = _reweighted(rng, at, to)
         if at.power != to:
             for _ in range(SWEEPS):
                 at, left = _swept(rng, log_likelihood, at, at.u), left - 1
-    passed: list[Population] = []
+    passed: list[ParticleState] = []
     others = at.u
     at = replace(at, origin=at.u)
     while left > 0:
@@ -140,7 +146,7 @@ def moved(
     return at
 
 
-def _reweighted(rng: np.random.Generator, at: Population, to: float) -> Population:
+def _reweighted(rng: np.random.Generator, at: ParticleState, to: float) -> ParticleState:
     """Resampled for the next power towards `to`, at which KEPT of the draws count."""
     count = len(at.u)
     step = tempering(np.zeros(count), np.sign(to - at.power) * at.like, KEPT * count, abs(to - at.power))
@@ -154,7 +160,9 @@ def _reweighted(rng: np.random.Generator, at: Population, to: float) -> Populati
     return replace(at, u=at.u[chosen], like=at.like[chosen], power=power, evidence=evidence)
 
 
-def _swept(rng: np.random.Generator, log_likelihood: LogLikelihood, at: Population, others: np.ndarray) -> Population:
+def _swept(
+    rng: np.random.Generator, log_likelihood: LogLikelihood, at: ParticleState, others: np.ndarray
+) -> ParticleState:
     """One Metropolis step of every draw; `others` [M, d], which do not change meanwhile, tell how far and where to."""
     count, d = at.u.shape
     part = rng.random((count, d)) < rng.choice(PARTS, count)[:, None]
@@ -177,6 +185,7 @@ def _stepped(
     """(u, its log bias) after a share of the difference of two others, in `part` of the parameters; without bias."""
     count, d = u.shape
     one, two = rng.integers(len(others), size=(2, count))
+    # a tenth of the best step to all of it, for valleys that bend; rule of thumb, not counted
     size = SPREAD / np.sqrt(2 * part.sum(1)) * 10 ** rng.uniform(-1, 0, count)
     size = np.where(rng.random(count) < JUMPS, 1.0, size)[:, None]
     step = (
@@ -228,12 +237,12 @@ def powered(base: np.ndarray, like: np.ndarray, power: float) -> np.ndarray:
 def tempering(base: np.ndarray, like: np.ndarray, wanted: float, most: float = 1.0) -> float:
     """The largest power of the likelihood, at most `most`, at which `wanted` draws count."""
     held = np.where(np.isfinite(like), like, -1e300)
-    if effective(normalised(base + most * held)) >= wanted:
+    if ess_of(normalised(base + most * held)) >= wanted:
         return most
     low, high = 0.0, most
     for _ in range(40):
         middle = 0.5 * (low + high)
-        low, high = (middle, high) if effective(normalised(base + middle * held)) >= wanted else (low, middle)
+        low, high = (middle, high) if ess_of(normalised(base + middle * held)) >= wanted else (low, middle)
     return low
 
 
@@ -242,4 +251,15 @@ def _systematic(rng: np.random.Generator, weights: np.ndarray, count: int) -> np
     return np.minimum(np.searchsorted(np.cumsum(weights), (rng.random() + np.arange(count)) / count), len(weights) - 1)
 
 
-__all__ = ["Population", "begun", "moved", "powered", "reflected", "tempering"]
+def normalised(log_weights: np.ndarray) -> np.ndarray:
+    """Weights [N] that sum to 1."""
+    weights = np.exp(log_weights - np.max(log_weights))
+    return weights / weights.sum()
+
+
+def ess_of(weights: np.ndarray) -> float:
+    """Effective sample size of weights [N] that sum to 1 (Kish 1965)."""
+    return float(1.0 / np.sum(weights**2)) if len(weights) else 0.0
+
+
+__all__ = ["ParticleState", "ess_of", "init", "normalised", "powered", "reflected", "run", "tempering"]

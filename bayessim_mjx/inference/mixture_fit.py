@@ -10,17 +10,17 @@ from scipy.linalg import eigh
 from scipy.special import logsumexp
 
 from bayessim_mjx.distributions import box
-from bayessim_mjx.inference.pareto import effective
+from bayessim_mjx.inference.smc import ess_of
 
 DRAWS = 4096  # at most, that are fitted to
-FLAT = 1.5  # sd, in the width of the cube: over it the density falls by 5 %, which is as good as flat
-# standard errors, beyond which draws are not uniform by chance: .98 of uniform directions pass, and what is not uniform
-# and passes loses less than its moments' chance would (benchmarks/records/flat_directions.json)
+FLAT = 1.5  # sd, in widths of the cube: the density falls by 5 % over the cube; source: exp(-0.5^2 / (2 FLAT^2))
+# standard errors beyond which draws are not uniform by chance: .98 of uniform directions pass, and a direction that
+# passes wrongly loses less than its moments' chance would. source: benchmarks/records/flat_directions.json
 SURE = 3.0
 # draws in each direction, behind every Gaussian: fewer than one span a plane and have no Gaussian; where that does not
-# happen 0 to 6 make no difference (benchmarks/inference/few_draws.py)
+# happen 0 to 6 make no difference. source: benchmarks/inference/few_draws.py
 FEWEST = 3
-STRIDE = 1.5  # power of a ratio of variances: what is cut off changes by less than its Gaussian
+STRIDE = 1.5  # power of a ratio of variances: the cut part changes by less than its Gaussian; source: speed alone
 
 
 @dataclass(frozen=True)
@@ -76,42 +76,42 @@ def supported(rng: np.random.Generator, z: np.ndarray, weights: np.ndarray, k: i
     """
     q = em(rng, z, weights, k)
     share = q.shares(z) * weights[:, None]
-    fewest = min(effective(own / own.sum()) if own.sum() > 0 else 0.0 for own in share.T)
+    fewest = min(ess_of(own / own.sum()) if own.sum() > 0 else 0.0 for own in share.T)
     return q if k == 1 or fewest >= FEWEST * z.shape[1] else supported(rng, z, weights, k // 2)
 
 
 def _count(rng: np.random.Generator, halves: list[tuple[np.ndarray, np.ndarray]], most: int) -> int:
-    """How many Gaussians, fitted to either half (draws [N, d], weights [N]), explain the other one best."""
+    """Number of Gaussians that, fitted to one half (draws [N, d], weights [N]), explain the other half best."""
     best, score = 1, -np.inf
     for k in (k for k in (1, 2, 4, 8, 16, 32) if k <= most):
         held = 0.0
         for (z, weights), (others, theirs) in (halves, halves[::-1]):
             own = weights / weights.sum()
-            if effective(own) < FEWEST * z.shape[1] * k:
+            if ess_of(own) < FEWEST * z.shape[1] * k:
                 held = -np.inf
                 break
             held += float(theirs @ em(rng, z, own, k).log_density(others))
-        if held > score + 1e-3:
+        if held > score + 1e-3:  # nats a draw, for twice the Gaussians; rule of thumb, not counted
             best, score = k, held
     return best
 
 
 def in_cube(
-    fit: Callable[[np.ndarray], Mixture], draws: np.ndarray, worth: float, weights: np.ndarray | None = None
+    fit: Callable[[np.ndarray], Mixture], draws: np.ndarray, ess: float, weights: np.ndarray | None = None
 ) -> Mixture:
-    """`uncut` Gaussians for draws in the unit cube, in the coordinates that are told; the others are flat.
+    """Gaussians for draws in the unit cube, matched in coordinates that are not uniform; the others are flat.
 
-    In those alone draws are enough for more Gaussians, and a curved valley needs them.
+    In those coordinates alone draws are enough for more Gaussians, and a curved valley needs them.
 
     Args:
         fit: Gaussians for the coordinates (`[d]`, bool) that are asked for.
-        draws, worth, weights: as for `uncut`.
+        draws, ess, weights: as for `match_truncated_moments`.
     """
     weights, d = _equal(draws) if weights is None else weights, draws.shape[1]
-    flat = _flat(*_moments(draws, weights), worth)
+    flat = _flat(*_moments(draws, weights), ess)
     own = np.flatnonzero(~flat)
     nothing = Mixture(np.ones(1), np.zeros((1, 0)), np.ones((1, 0, 0)))
-    q = uncut(fit(~flat), draws[:, own], worth, weights) if len(own) else nothing
+    q = match_truncated_moments(fit(~flat), draws[:, own], ess, weights) if len(own) else nothing
     means, covariances = np.full((len(q.weights), d), 0.5), np.tile(FLAT**2 * np.eye(d), (len(q.weights), 1, 1))
     means[:, own], covariances[:, own[:, None], own] = q.means, q.covariances
     return Mixture(q.weights, means, covariances)
@@ -127,7 +127,9 @@ def _moments(draws: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.nda
     return mean, (draws - mean).T @ ((draws - mean) * weights[:, None])
 
 
-def uncut(q: Mixture, draws: np.ndarray, worth: float, weights: np.ndarray | None = None, steps: int = 20) -> Mixture:
+def match_truncated_moments(
+    q: Mixture, draws: np.ndarray, ess: float, weights: np.ndarray | None = None, steps: int = 20
+) -> Mixture:
     """Gaussians that have the draws' moments once they are cut off at the unit cube (Lee and Scott 2012).
 
     Of a parameter of which nothing is known, draws fill the range and so must the Gaussian: one whose draws cannot be
@@ -135,14 +137,14 @@ def uncut(q: Mixture, draws: np.ndarray, worth: float, weights: np.ndarray | Non
     narrower, in every such direction.
 
     Args:
-        draws: `[N, d]`; worth: how many independent ones they are worth.
+        draws: `[N, d]`; ess: their effective sample size.
         weights: `[N]` that sum to 1; None: equal ones.
     """
     share = q.shares(draws) * (_equal(draws) if weights is None else weights)[:, None]
     means, covariances = q.means.copy(), q.covariances.copy()
     for k, part in enumerate(share.T):
         mean, wanted = _moments(draws, part / np.maximum(part.sum(), 1e-9))
-        flat = _flat(mean, wanted, worth * part.sum())
+        flat = _flat(mean, wanted, ess * part.sum())
         own = np.flatnonzero(~flat)
         means[k][flat], covariances[k] = 0.5, np.diag(np.where(flat, FLAT**2, 0.0))
         block = np.ix_(own, own)

@@ -19,30 +19,37 @@ from scipy.stats import f
 
 from bayessim_mjx.distributions import Distribution, box
 from bayessim_mjx.distributions.charts import EDGE, to_chart
-from bayessim_mjx.inference.sets import Count, Sets, counted, moved, multiplied, stacked
+from bayessim_mjx.inference.product_calibration import Count, Sets, counted, moved, multiplied, stacked
 from bayessim_mjx.inference.temperature import FEW
 
-TURNS = 6  # times that sets are drawn from the posterior, at most
-SAME = 1.05  # factor between widenings that is no difference: half of one between neighbours of sets.FACTORS
-STILL = 0.25  # squared change of a move, in standard deviations of the errors, that is none, beyond what chance makes
-CHANCE = 0.01  # of a move where products are off by chance alone
-FOLDS = 8  # of the sets: each is judged with the move that the others ask for
-FAR = {"plain": 1.0, "probit": 4.0}  # by which one product may count as off: a wild one decides nothing
+# times that sets are drawn from the posterior, at most; 1.9 to 3.9 are used. source:
+# benchmarks/records/posteriors_corners.json
+TURNS = 6
+SAME = 1.05  # factor between widenings that counts as none; source: half a step of product_calibration.FACTORS
+# squared change of a move that counts as none, in standard deviations of the errors, beyond the part of chance: half a
+# standard deviation. source: docs/decisions/local_recalibration.md
+STILL = 0.25
+CHANCE = 0.01  # of a move where products are off by chance alone; source: a chosen level of Hotelling's test
+LEAST = 1.5, 8  # sets that Hotelling's test needs: 1.5 a parameter and 8; source: rule of thumb, not counted
+FOLDS = 8  # of the sets: each is judged with the move of the other seven eighths; source: rule of thumb, not counted
+# error that a product counts as off by, at most, in its chart; source: rule of thumb, not counted
+FAR = {"plain": 1.0, "probit": 4.0}
 
 Factors = Sequence[Sequence[Distribution]]
 Drawn = Callable[[Distribution, int], tuple[Factors, np.ndarray] | None]
 
 
-def settled(found: Sets, product: Distribution, drawn: Drawn, components: int) -> Sets:
+def recalibrated(found: Sets, product: Distribution, drawn: Drawn, components: int) -> Sets:
     """`found`, with what sets at draws of the posterior ask for.
 
     The posterior is moved and widened as the sets at its draws ask for, and the next sets are at the draws of what came
     of it, until they ask for no more.
 
     Args:
-        found: by `sets.judge`.
+        found: by `product_calibration.judge`.
         product: of the found.multiplied real trajectories, neither moved nor widened.
-        drawn: (posterior, turn) -> factors and thetas of sets at its draws, as `sets.judge` takes them; None: none.
+        drawn: (posterior, turn) -> factors and thetas of sets at its draws, as `product_calibration.judge` takes
+            them; None: none.
         components: of the products.
     """
     n, product = found.multiplied, replace(product, prior_weight=jnp.zeros_like(product.prior_weight))
@@ -85,7 +92,7 @@ def judged(
 def count(
     factors: Factors, thetas: np.ndarray, components: int, move: np.ndarray | None, widening: float | None = None
 ) -> Count:
-    """How products of all factors of each set do with this move [d] and this widening (None: the best)."""
+    """Results of products of all factors of each set with this move [d] and this widening (None: the best)."""
     products = stacked(multiplied(factors, components, [len(factors[0])])[0])
     return counted(len(factors[0]), shifted(products, move), thetas, widening)
 
@@ -103,13 +110,13 @@ def mean_error(off: np.ndarray) -> tuple[np.ndarray | None, np.ndarray]:
     m, d = off.shape
     mean = off.mean(0)
     cov = np.atleast_2d(np.cov(off.T)) + 1e-12 * np.eye(d)
-    if m < 1.5 * d + 8:  # too few to tell
+    if m < LEAST[0] * d + LEAST[1]:
         return None, cov
-    told = m * float(mean @ np.linalg.solve(cov, mean))
+    statistic = m * float(mean @ np.linalg.solve(cov, mean))
     chance = d * (m - 1) / (m - d)
-    if told < chance * f.ppf(1 - CHANCE, d, m - d):
+    if statistic < chance * f.ppf(1 - CHANCE, d, m - d):
         return None, cov
-    return mean * (1 - chance / told), cov
+    return mean * (1 - chance / statistic), cov
 
 
 @jax.jit
@@ -124,4 +131,4 @@ def _errors(products: Distribution, thetas: jax.Array) -> jax.Array:
     return jax.vmap(one)(products, thetas)
 
 
-__all__ = ["count", "judged", "mean_error", "settled", "shifted"]
+__all__ = ["count", "judged", "mean_error", "recalibrated", "shifted"]

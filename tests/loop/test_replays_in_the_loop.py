@@ -11,7 +11,7 @@ from bayessim_mjx import config, loop
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.inference.importance import Refined
-from bayessim_mjx.loop import findings, refinement, round_inference
+from bayessim_mjx.loop import likelihood_refinement, outer_loop, round_inference
 from bayessim_mjx.loop.likelihood import Likelihood
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 from bayessim_mjx.registry import make
@@ -27,7 +27,7 @@ SMALL = [
 def begun(*more: str) -> tuple[loop.Loop, loop.LoopState]:
     settings = config.load("Pendulum", overrides=[*SMALL, *more])
     parts = loop.make(settings, make("Pendulum", config=settings))
-    return parts, loop.LoopState(round=jax.numpy.int32(0), train=None, **round_inference.blank(parts))
+    return parts, loop.LoopState(round=jax.numpy.int32(0), train=None, **outer_loop.blank(parts))
 
 
 def inferred(parts: loop.Loop, state: loop.LoopState) -> tuple[loop.LoopState, loop.RoundInfo]:
@@ -115,8 +115,8 @@ def test_what_replays_tell_is_not_said_to_be_the_prior():
     """A network that identifies nothing: its posterior is the prior, but not the one that replays refined."""
     fit = {"identified": np.array([False, True]), "clipped": 0.0, "n_invalid": 0, "skipped": 0}
     before = np.ones(2, bool)
-    (alone,) = findings.complaints(("mass", "length"), fit, before, by_replays=False, fresh=False)
-    (refined,) = findings.complaints(("mass", "length"), fit, before, by_replays=True, fresh=False)
+    (alone,) = round_inference.complaints(("mass", "length"), fit, before, by_replays=False, fresh=False)
+    (refined,) = round_inference.complaints(("mass", "length"), fit, before, by_replays=True, fresh=False)
     assert alone == "not identified by these trajectories, kept at the prior: mass"
     assert "prior" not in refined
     assert "mass" in refined and "length" not in refined
@@ -129,7 +129,7 @@ def test_a_first_training_that_gained_nothing_is_told():
     known = np.ones(1, bool)
 
     def told(best: int, fresh: bool) -> list[str]:
-        return findings.complaints(("mass",), fit | {"best": best}, known, by_replays=False, fresh=fresh)
+        return round_inference.complaints(("mass",), fit | {"best": best}, known, by_replays=False, fresh=fresh)
 
     (text,) = told(-1, True)
     assert "linear posterior" in text and "158 steps" in text and "4500 trajectories" in text
@@ -145,10 +145,10 @@ def test_moves_that_do_not_reach_the_wider_posterior_do_not_throw_the_refined_on
     draws = SimpleNamespace(u=np.zeros((8, 1)))
     found = Refined(two, two, draws, 400.0, 1000, np.ones(1), None)
     short = dataclasses.replace(found, reason="the draws are worth 90 independent ones", simulations=50_000)
-    monkeypatch.setattr(refinement.importance, "tempered", lambda *a, **k: short)
-    monkeypatch.setattr(refinement, "_spread", lambda *a: (np.array([[4.0]]), np.eye(1)))
+    monkeypatch.setattr(likelihood_refinement.importance, "tempered", lambda *a, **k: short)
+    monkeypatch.setattr(likelihood_refinement, "_spread", lambda *a: (np.array([[4.0]]), np.eye(1)))
     likelihood = SimpleNamespace(squares=lambda thetas: thetas)
-    wide, factor = refinement._adjusted(found, Distribution.prior(space), likelihood, lambda t: t, 8, 0)
+    wide, factor = likelihood_refinement._adjusted(found, Distribution.prior(space), likelihood, lambda t: t, 8, 0)
     assert factor == pytest.approx(2.0) and wide.reason is None and wide.simulations == 50_000
     assert np.asarray(wide.posterior.scales)[:, 0, 0] == pytest.approx(0.04)
     assert np.asarray(wide.posterior.means) == pytest.approx(np.asarray(two.means))

@@ -9,13 +9,13 @@ import pytest
 
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.loop.likelihood import Likelihood
-from bayessim_mjx.loop.refinement import _spread, refine
+from bayessim_mjx.loop.likelihood_refinement import _spread, refine
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 from bayessim_mjx.physics import Physics
 from bayessim_mjx.rollout import replay
 from bayessim_mjx.tracking import Record
 
-pytestmark = pytest.mark.slow  # CI runs two rounds of the loop with it, test_refining.py
+pytestmark = pytest.mark.slow  # CI runs two rounds of the loop with it, test_replays_in_the_loop.py
 
 SLIDER = """<mujoco><option timestep=".02" gravity="0 0 0"/><worldbody><body name="cart">
   <joint name="x" type="slide" axis="1 0 0" damping="1"/><geom size=".1" mass="2"/></body></worldbody>

@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import norm, truncnorm
 
 from bayessim_mjx.distributions import box
-from bayessim_mjx.inference import InferenceSettings, calibration, condition, fit, init, uncut
+from bayessim_mjx.inference import InferenceSettings, calibration, condition, fit, init, truncation_moments
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 
 
@@ -20,14 +20,14 @@ def cut_at_ends(mean, sd):
     ("mean", "sd"), [(0.5, 0.1), (0.5, 0.25), (0.1, 0.08), (0.02, 0.015), (0.9, 0.07), (0.7, 0.2), (0.3, 0.15)]
 )
 def test_the_part_inside_has_the_mean_and_sd_it_was_made_from(mean, sd):
-    wide = uncut.shapes(jnp.asarray([mean]), jnp.asarray([[sd]]))
+    wide = truncation_moments.shapes(jnp.asarray([mean]), jnp.asarray([[sd]]))
     part = cut_at_ends(float(wide[0][0]), float(wide[1][0, 0]))
     assert part.mean() == pytest.approx(mean, abs=0.03 * sd) and part.std() == pytest.approx(sd, rel=0.03)
 
 
 def test_what_is_flat_becomes_all_but_flat_and_what_lies_inside_stays():
     means, sds = jnp.asarray([0.5, 0.5]), jnp.diag(jnp.asarray([12**-0.5, 0.02]))
-    wide = uncut.shapes(means, sds)
+    wide = truncation_moments.shapes(means, sds)
     assert cut_at_ends(0.5, float(wide[1][0, 0])).std() == pytest.approx(12**-0.5, rel=0.03)
     np.testing.assert_allclose(wide[1][1], [0, 0.02], atol=1e-5)
     np.testing.assert_allclose(wide[0], [0.5, 0.5], atol=1e-5)
@@ -41,7 +41,7 @@ def test_two_parameters_that_go_together_keep_their_moments_roughly(correlation)
     draws = rng.multivariate_normal([0.05, 0.5], covariance, 1_000_000)
     inside = draws[np.all((draws > 0) & (draws < 1), axis=1)]
     lower = np.linalg.cholesky(np.cov(inside.T))
-    mean, scale = uncut.shapes(jnp.asarray(inside.mean(0), jnp.float32), jnp.asarray(lower, jnp.float32))
+    mean, scale = truncation_moments.shapes(jnp.asarray(inside.mean(0), jnp.float32), jnp.asarray(lower, jnp.float32))
     np.testing.assert_allclose(mean, [0.05, 0.5], atol=0.02)
     np.testing.assert_allclose(np.asarray(scale) @ np.asarray(scale).T, covariance, atol=0.25 * covariance.max())
 
@@ -50,17 +50,17 @@ def test_no_direction_becomes_wider_than_the_widest_and_all_stays_finite():
     rng = np.random.default_rng(1)
     lower = np.linalg.cholesky(np.full((6, 6), 0.95) + 0.05 * np.eye(6)) * rng.uniform(0.01, 0.4, (500, 6, 1))
     means = rng.uniform(-0.1, 1.1, (500, 6))
-    mean, scale = uncut.shapes(jnp.asarray(means, jnp.float32), jnp.asarray(lower, jnp.float32))
+    mean, scale = truncation_moments.shapes(jnp.asarray(means, jnp.float32), jnp.asarray(lower, jnp.float32))
     assert np.isfinite(mean).all() and np.isfinite(scale).all()
     ratio = np.linalg.svd(np.linalg.solve(lower, np.asarray(scale, float)), compute_uv=False)
-    assert ratio.max() < uncut.WIDEST * 1.01 and ratio.min() > 0.99
+    assert ratio.max() < truncation_moments.WIDEST * 1.01 and ratio.min() > 0.99
 
 
 def test_each_gaussian_keeps_its_share_of_what_is_inside():
     logits = jnp.log(jnp.asarray([[0.3, 0.5, 0.2]]))
     means = jnp.asarray([[[0.1, 0.5], [0.6, 0.6], [-3.0, 0.5]]])  # the last is all but outside, and stays as it is
     scales = jnp.tile(0.1 * jnp.eye(2), (1, 3, 1, 1))
-    found = uncut.weighed(logits, means, scales)
+    found = truncation_moments.weighed(logits, means, scales)
     before = jax.nn.log_softmax(logits)[0] + box.log_masses(means[0], scales[0])
     after = found[0][0] + box.log_masses(found[1][0], found[2][0])
     np.testing.assert_allclose(after, before, atol=0.02)
@@ -76,7 +76,9 @@ def test_a_product_of_many_at_an_end_is_the_exact_posterior():
         x = truth + sd * rng.normal(size=n)
         own = [cut_at_ends(value, sd) for value in x]
         moments = np.array([(q.mean(), q.std()) for q in own])
-        wide = uncut.shapes(jnp.asarray(moments[:, :1], jnp.float32), jnp.asarray(moments[:, 1:, None], jnp.float32))
+        wide = truncation_moments.shapes(
+            jnp.asarray(moments[:, :1], jnp.float32), jnp.asarray(moments[:, 1:, None], jnp.float32)
+        )
         before = np.stack([np.asarray(wide[0])[:, 0], np.asarray(wide[1])[:, 0, 0]], axis=1).astype(float)
         for name, (m, s) in {
             "before the cut": before.T,

@@ -16,20 +16,22 @@ import jax.numpy as jnp
 import numpy as np
 
 from bayessim_mjx.distributions import Distribution
-from bayessim_mjx.inference.posterior import combine
-from bayessim_mjx.inference.temperature import gain_at, tempered
+from bayessim_mjx.inference.fit import combine
+from bayessim_mjx.inference.temperature import LEVELS, gain_at, tempered
 
-FACTORS = np.geomspace(1.0, 12.0, 31)  # on standard deviations
-DOUBT = 0.3  # standard deviation of the factor's log before anything is seen: a few sets are off by chance
-BEYOND = -30.0  # log mass in the box that no move may take: what is left is rounding
-LEVELS = (0.5, 0.8, 0.95)  # regions that are told
-SURE = 2.58  # standard errors that chance exceeds once in a hundred times
-HALVES = 2  # the factor is fitted on one part of the sets and judged on the other, in turn
+# factors on standard deviations, tried: 64 sets do not show less than a step, 8.6 %. source: docs/inference.md, several
+# trajectories
+FACTORS = np.geomspace(1.0, 12.0, 31)
+# sd of the factor's log beforehand: a few sets are off by chance (9486466). source: rule of thumb, not counted
+DOUBT = 0.3
+BEYOND = -30.0  # change of log mass in the box that no move may reach: rounding alone remains; source: float32
+SURE = 2.58  # standard errors that chance exceeds once in a hundred times; source: normal distribution, two-sided
+HALVES = 2  # the factor is fitted on one part of the sets and judged on the other, in turn; source: the least
 
 
 @dataclass(frozen=True)
 class Count:
-    """How posteriors of `trajectories` trajectories each did on simulated sets.
+    """Results of posteriors of `trajectories` trajectories each on simulated sets.
 
     Attributes:
         widening: factor on standard deviations with the highest mean log density at the truths.
@@ -57,7 +59,8 @@ class Sets:
 
     Attributes:
         counts: on sets at draws of the prior, or of what the round was simulated from.
-        near: on sets of the last of these numbers at draws of the posterior itself, one row a turn of `near.settled`.
+        near: on sets of the last of these numbers at draws of the posterior itself, one row a turn of
+            `local_recalibration.recalibrated`.
         move: [d] by which products there are moved, in the coordinates of their chart; None: not at all.
         known: real trajectories that are multiplied, where they are more than those of a set.
         settled: whether the last sets at the posterior's draws asked for no more.
@@ -70,7 +73,7 @@ class Sets:
     settled: bool = True
 
     @property
-    def carried(self) -> int:
+    def saturates_at(self) -> int:
         """After how many trajectories another one does not raise the gain any more."""
         best = self.counts[0]
         for one in self.counts[1:]:
@@ -109,51 +112,51 @@ class Sets:
         """
         for one in (*self.near[-1:], self.counts[-1]):
             errors = [float(np.sqrt(level * (1 - level) / len(one.levels))) for level in LEVELS]
-            told = [(level, one.coverage(level), error) for level, error in zip(LEVELS, errors, strict=True)]
-            if found := [row for row in told if row[1] < row[0] - SURE * row[2]]:
+            held = [(level, one.coverage(level), error) for level, error in zip(LEVELS, errors, strict=True)]
+            if found := [row for row in held if row[1] < row[0] - SURE * row[2]]:
                 return found
         return []
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers, for JSON."""
         rows = [_plain(c) for c in self.counts]
-        told = {"carried": self.carried, "sets": len(self.counts[-1].levels), "counts": rows}
-        told |= {"near": [_plain(c) for c in self.near]}
-        told |= {"known": self.multiplied, "widening": self.widening(self.multiplied), "settled": self.settled}
-        return {**told, "move": None if self.move is None else [float(x) for x in self.move]}
+        numbers = {"carried": self.saturates_at, "sets": len(self.counts[-1].levels), "counts": rows}
+        numbers |= {"near": [_plain(c) for c in self.near]}
+        numbers |= {"known": self.multiplied, "widening": self.widening(self.multiplied), "settled": self.settled}
+        return {**numbers, "move": None if self.move is None else [float(x) for x in self.move]}
 
     @property
     def multiplied(self) -> int:
-        """How many real trajectories' posteriors are multiplied."""
+        """Number of real trajectories whose posteriors are multiplied."""
         return max(self.known, self.counts[-1].trajectories)
 
     @property
-    def told(self) -> str:
-        """How many trajectories the network can carry, in words."""
+    def saturation(self) -> str:
+        """A sentence on the number of trajectories that sharpen the posterior."""
         last = self.counts[-1].trajectories
-        if self.carried == last:
+        if self.saturates_at == last:
             return f"the network carries all {last} trajectories: each more sharpened the posterior"
-        return f"the network carries {self.carried} of {last} trajectories: more do not sharpen the posterior"
+        return f"the network carries {self.saturates_at} of {last} trajectories: more do not sharpen the posterior"
 
     def sentence(self) -> str:
         """One line for a person."""
         last, many = self.counts[-1], self.multiplied
         widening = self.widening(many)
-        told = f"with {many} trajectories standard deviations are widened {widening:.2f} times"
+        text = f"with {many} trajectories standard deviations are widened {widening:.2f} times"
         if many > last.trajectories:
             judged = self.widening(last.trajectories)
-            told += (
+            text += (
                 f" (sets of {last.trajectories} were simulated, which ask for {judged:.2f}: an error that all share)"
             )
         elif widening > last.widening:
-            told += f" ({last.widening:.2f} on average over the prior, more where the posterior lies)"
+            text += f" ({last.widening:.2f} on average over the prior, more where the posterior lies)"
         if self.move is not None:
-            told += "; where the posterior lies the network leans to one side, by which it is moved back"
+            text += "; where the posterior lies the network leans to one side, by which it is moved back"
         if not self.settled:
-            told += "; the last sets still asked for more: take it for too narrow"
-        if self.carried < last.trajectories:
-            told += f"; the network carries {self.carried}, more do not sharpen the posterior"
-        return told
+            text += "; the last sets still asked for more: take it for too narrow"
+        if self.saturates_at < last.trajectories:
+            text += f"; the network carries {self.saturates_at}, more do not sharpen the posterior"
+        return text
 
 
 def _plain(c: Count) -> dict[str, Any]:
@@ -232,12 +235,12 @@ def _levels(q: Distribution, thetas: jax.Array, factors: jax.Array) -> jax.Array
 
 
 def _best(gains: np.ndarray) -> int:
-    """Which of FACTORS serves the sets best, by gains [factors, m] and what is believed beforehand."""
+    """Index of the best of FACTORS for the sets, by gains [factors, m] and the prior on the factor."""
     return int(np.argmax(gains.sum(1) - 0.5 * (np.log(FACTORS) / DOUBT) ** 2))
 
 
 def counted(n: int, products: Distribution, thetas: np.ndarray, given: float | None = None) -> Count:
-    """How batched products of n did at thetas [m, d], widened by `given` or else by what the other half asks for."""
+    """Results of batched products of n at thetas [m, d], widened by `given` or the best factor of the other half."""
     at = jnp.asarray(thetas, jnp.float32)
     gains = np.nan_to_num(np.asarray(_gains(products, at), float), nan=-100.0, neginf=-100.0)
     part = np.arange(len(thetas)) % HALVES
@@ -253,4 +256,4 @@ def counted(n: int, products: Distribution, thetas: np.ndarray, given: float | N
     return Count(n, float(FACTORS[best]), float(own.mean()), error, float(gains[0].mean()), levels)
 
 
-__all__ = ["Count", "Sets", "counted", "counts_to", "judge", "moved", "multiplied", "stacked"]
+__all__ = ["LEVELS", "Count", "Sets", "counted", "counts_to", "judge", "moved", "multiplied", "stacked"]

@@ -1,4 +1,4 @@
-"""A posterior refined with the simulator's own likelihood of the real trajectories, replayed under their commands.
+"""`bayessim.refine`: a posterior refined by the simulator's own likelihood of the real trajectories, replayed.
 
 The product of a network's posteriors proposes, and so do the linear dynamics along the records. `inference.importance`
 weighs thetas by how well a filter predicts the recorded motion one step ahead (`tracking`, `likelihood`), with noise
@@ -8,21 +8,98 @@ the likelihood admits, the posterior is widened in those directions, so that mod
 
 from __future__ import annotations
 
+import dataclasses
+import time
 from dataclasses import dataclass, replace
 from typing import Any
 
+import jax
+import jax.numpy as jnp
+import mujoco
 import numpy as np
 
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.inference import importance, temperature
+from bayessim_mjx.inference.final_importance_sampling import UNRELIABLE
 from bayessim_mjx.inference.importance import Refined
-from bayessim_mjx.inference.pareto import UNRELIABLE
+from bayessim_mjx.keys import branch
+from bayessim_mjx.logs import Channels
 from bayessim_mjx.loop.likelihood import Likelihood
 from bayessim_mjx.loop.noise import Noise
+from bayessim_mjx.loop.recorded import Recorded
+from bayessim_mjx.loop.state import Answer, Evidence, Loop, LoopState, Round
+from bayessim_mjx.physics.tangent import in_tangent
+from bayessim_mjx.tracking import Record
 
-PASSES = 5  # at most, of noise and posterior in turn
-WIDER = 1.1  # variance of the scores, in what the likelihood promises, from which on a posterior is widened
-SHARED = 3.0  # times what chance makes of it, groups that share nothing are moved in .01 to .07 of the cases
+DRAWS = 1024  # thetas of one call
+# of the prior, at most: the domain of the next training has mass everywhere; source: rule of thumb, not counted
+SHARE = 1e-4
+PASSES = 5  # at most, of noise and posterior in turn; source: rule of thumb, not counted
+# variance of the scores over the variance that the likelihood promises: from here on a posterior is widened, by 5 % of
+# its standard deviations or more. source: rule of thumb, not counted
+WIDER = 1.1
+# times the squared distance that chance makes: groups that share nothing are moved in .01 to .07 of the cases.
+# source: tests/loop/test_widening.py
+SHARED = 3.0
+
+
+def refine_by_replays(round_: Round, answer: Answer) -> tuple[Answer, Evidence]:
+    """Refine the posterior by replays of all real trajectories so far, where `bayessim.refine` asks for it."""
+    if not round_.loop.refines:
+        return answer, Evidence()
+    clock, loop, b, warnings = time.perf_counter(), round_.loop, round_.loop.settings, []
+    likelihood = _likelihood(loop, round_.state, round_.known)
+    if likelihood.silent.any() and not round_.number:
+        warnings.append(f"bayessim.refine: {_without_noise(likelihood.silent, likelihood.physics.mj_model)}")
+    if not likelihood.seen.any():
+        return answer, Evidence(warnings=warnings)
+    seed = int(jax.random.randint(branch(loop.key(round_.number, "fit"), 3), (), 0, 2**31 - 1))
+    found = refine(answer.posterior, likelihood, seed=seed, draws=DRAWS, components=b.components)
+    seconds = {"refine": time.perf_counter() - clock}
+    warnings += [text for text in [found.warning()] if text]
+    if not found.used and b.refine == "likelihood":
+        warnings.append(f"bayessim.refine: {found.sentence()}")
+    evidence = Evidence({"refinement": found}, scores(found), warnings, seconds)
+    if not found.used:
+        return answer, evidence
+    posterior = found.posterior.reduce(b.components).rechart(loop.chart)
+    posterior = dataclasses.replace(posterior, prior_weight=jnp.float32(min(b.priorShare, SHARE)))
+    return dataclasses.replace(answer, posterior=posterior, source="replays"), evidence
+
+
+def _without_noise(silent: np.ndarray, model: mujoco.MjModel) -> str:
+    names = [f"{stream}:{name}" for stream in ("qpos", "qvel") for name in Channels.of(model).qvel]
+    left_out = ", ".join(name for name, there in zip(names, silent, strict=True) if there)
+    return (
+        f"{left_out}: too few different values to see how noisy they are, so they have no part in the likelihood; "
+        "a `sigma` beside the logs (real.noise of a surrogate) gives them one"
+    )
+
+
+def scores(found: Refinement) -> dict[str, float]:
+    """Numbers for curves."""
+    numbers = {"effective": found.refined.effective, "widening": found.widening}
+    numbers |= {"simulations": float(found.refined.simulations), "used": float(found.used)}
+    return {f"refine/{name}": float(value) for name, value in numbers.items()}
+
+
+def _likelihood(loop: Loop, state: LoopState, known: int) -> Likelihood:
+    """The likelihood of the first `known` real trajectories; windows of one log are one group."""
+    physics, source = loop.env.physics, loop.source  # type: ignore[attr-defined]
+    model, each = physics.mj_model, loop.settings.realTrajs
+    if isinstance(source, Recorded):
+        index = source.order[np.arange(known) % len(source.order)]
+        record = source.records(index)
+        speeds = np.where(source.fast, source.noise["qvel"], np.inf)
+        sensor = np.concatenate([in_tangent(model, np.asarray(source.noise["qpos"])), speeds])
+        valid = np.ones(record.command.shape[:2])
+        return Likelihood(physics, record, valid, sensor, each, groups=source.data["run"][index])
+    motion = state.motion
+    assert motion is not None
+    rows = {name: value[:known] for name, value in motion.items()}
+    record = Record(rows["qpos"], rows["qvel"], rows["command"])
+    sensor = np.full(2 * model.nv, source.noise, float)  # type: ignore[union-attr]
+    return Likelihood(physics, record, np.asarray(rows["valid"]), sensor, each)
 
 
 @dataclass(frozen=True)
@@ -58,15 +135,15 @@ class Refinement:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers, for JSON."""
-        told = {"used": self.used, "sentence": self.sentence(), "simulations": self.refined.simulations}
-        return told | {
+        numbers = {"used": self.used, "sentence": self.sentence(), "simulations": self.refined.simulations}
+        return numbers | {
             "effective": self.refined.effective,
             "widening": self.widening,
             "pareto_k": _finite(self.refined.shape),
         }
 
     def warning(self) -> str | None:
-        """What to be wary of."""
+        """A warning of weights with a heavy tail; None: there is none."""
         k = self.refined.shape
         if not self.used or k is None or k <= UNRELIABLE:
             return None
@@ -213,6 +290,3 @@ def _adjusted(
     covariance = by @ np.asarray(q.scales[0] @ q.scales[0].T, np.float64) @ by.T
     wide = Distribution.from_unit(q.space, q.logits, q.means, np.linalg.cholesky(covariance)[None], chart=q.chart)
     return replace(found, posterior=wide, fitted=wide), float(np.sqrt(values.max()))
-
-
-__all__ = ["Refinement", "refine"]
