@@ -108,7 +108,7 @@ def check_time(table: Table, time: Array, min_rows: int) -> None:
     if period > 1.0:
         text = f"{table.path}: column 'time': median step {period:.4g} s"
         names = {"ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
-        fits = [u for u in names if 1e-4 <= period * TIMES[u] <= 1.0] or ["ms"]
+        fits = [u for u in names if 1e-4 <= period * TIMES[u] <= 10.0] or ["ms"]
         mends = (f"{names[u]}: `time: {{column: time, unit: {u}}}`, the same as scale: {TIMES[u]:g}" for u in fits)
         mend = f"{' or '.join(mends)} in the map"
         raise UserError(f"{text}; allowed: seconds, up to 1 s per row ({mend})")

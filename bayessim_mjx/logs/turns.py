@@ -13,19 +13,20 @@ from bayessim_mjx.logs.log import Array, Channels
 from bayessim_mjx.logs.table import Table
 
 TURN = 2.0 * np.pi
+HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
 MOST = 0.95  # share of the rows that have to agree
 NEAR = 0.25 * TURN  # rad between a reading and its target, modulo a turn
 
 
 def servos(model: mujoco.MjModel, through: Array) -> Iterator[tuple[int, int]]:
     """(actuator, joint) of the hinges with a position servo whose logged command is the target, in rad."""
-    joint_types = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+    joint_types = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
     for i in range(model.nu):
         gain, bias = model.actuator_gainprm[i, 0], model.actuator_biasprm[i, 1]
-        on_joint = model.actuator_trntype[i] in joint_types and model.actuator_gear[i, 0] == 1.0
+        on_joint = int(model.actuator_trntype[i]) in joint_types and model.actuator_gear[i, 0] == 1.0
         if on_joint and through[i] and gain > 0 and np.isclose(bias, -gain):
             joint = int(model.actuator_trnid[i, 0])
-            if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE:
+            if int(model.jnt_type[joint]) == HINGE:
                 yield i, joint
 
 
@@ -58,7 +59,7 @@ def placed(
         if _to_target(table, columns, reading, target, on):
             followed.add(j)
     for j, joint in enumerate(channels.joints):
-        limited = model.jnt_limited[j] and model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE
+        limited = model.jnt_limited[j] and int(model.jnt_type[j]) == HINGE
         if limited and j not in followed and f"qpos:{joint}" not in absent:
             _into_range(table, columns, f"qpos:{joint}", *map(float, model.jnt_range[j]))
 
