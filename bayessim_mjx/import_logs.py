@@ -52,6 +52,8 @@ def _ros(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--commands", metavar="TOPIC[=A,B]", nargs="+", default=[], help=text)
     text = "what is commanded, where messages have several: position, velocity or effort"
     parser.add_argument("--field", choices=("position", "velocity", "effort"), help=text)
+    text = "which publisher of the joint states, from 1, where a refusal numbers several"
+    parser.add_argument("--publisher", metavar="N", type=int, help=text)
     text = "times of headers, or when messages were received (default: header)"
     parser.add_argument("--stamps", choices=("header", "received"), default="header", help=text)
 
@@ -80,15 +82,17 @@ def _pairs(given: Sequence[str]) -> dict[str, str]:
     return dict(text.split("=", 1) for text in given)
 
 
-def _choice(args: argparse.Namespace) -> "Choice":
+def _choice(args: argparse.Namespace, model: Any) -> "Choice":
     from bayessim_mjx.logs.importers.ros import Choice
 
     topics = (text.partition("=") for text in args.commands)
     commands = {topic: [n for n in names.split(",") if n] for topic, _, names in topics}
-    return Choice(args.states, commands or None, args.field, args.stamps)
+    # the bias of a position servo pulls its joint back by the gain
+    targets = model is not None and model.nu > 0 and bool((model.actuator_biasprm[:, 1] < 0).all())
+    return Choice(args.states, commands or None, args.field, args.stamps, args.publisher, targets)
 
 
-def _recordings(args: argparse.Namespace) -> Iterator["Recording"]:
+def _recordings(args: argparse.Namespace, model: Any) -> Iterator["Recording"]:
     for path in map(Path, args.paths):
         if not path.exists():
             raise UserError(f"{path}: no such file or folder")
@@ -104,7 +108,7 @@ def _recordings(args: argparse.Namespace) -> Iterator["Recording"]:
             from bayessim_mjx.logs.importers import ros, ros_files
 
             read = ros_files.of_mcap if args.format == "from-mcap" else ros_files.of_rosbag
-            yield ros.recording(path.stem, read(path), _choice(args))
+            yield ros.recording(path.stem, read(path), _choice(args, model))
 
 
 def _arrays(args: argparse.Namespace) -> Any:
@@ -124,8 +128,9 @@ def _logs(argv: Sequence[str] | None) -> int:
     scale, of_commands = _scales(args)
     from bayessim_mjx.logs.importers.folder import Target
 
-    target = Target(Path(args.out), _model(args.model), _pairs(args.rename), scale, of_commands)
-    written = target.write(_recordings(args))
+    model = _model(args.model)
+    target = Target(Path(args.out), model, _pairs(args.rename), scale, of_commands)
+    written = target.write(_recordings(args, model))
     for note in target.notes:
         print(note)
     print(f"{len(written)} log(s) and map.yaml in {target.folder}")
