@@ -1,6 +1,7 @@
-"""`bayessim-mjx logs from-mcap FILE --out DIR`: recordings of other tools as logs that the diagnosis reads."""
+"""`bayessim-mjx logs`: `check DIR` shows what is understood of logs; `from-mcap FILE --out DIR` and others convert."""
 
 import argparse
+import errno
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -22,9 +23,11 @@ FORMATS = {
 
 
 def _parser() -> cli.PlainParser:
-    text = "Convert recordings to a folder of CSV files and a map of their columns (docs/logs.md)."
+    text = "Check logs, or convert recordings to a folder of CSV files and a map of their columns (docs/logs.md)."
     prog = cli.prog_of("logs").replace("bayessim_mjx.logs", "bayessim_mjx.import_logs")
-    parser = cli.PlainParser(prog=prog, description=text, usage="%(prog)s FORMAT PATH [PATH ...] --out DIR")
+    parser = cli.PlainParser(
+        prog=prog, description=text, usage="%(prog)s check DIR, or %(prog)s FORMAT PATH [PATH ...] --out DIR"
+    )
     formats = parser.add_subparsers(dest="format", metavar="FORMAT", required=True, prog=prog)
     of = {name: formats.add_parser(name, help=what, description=f"Convert {what}.") for name, what in FORMATS.items()}
     for name, each in of.items():
@@ -37,6 +40,7 @@ def _parser() -> cli.PlainParser:
         )
     for name in ("from-mcap", "from-rosbag"):
         _ros(of[name])
+    _check(formats, prog)
     of["from-lerobot"].add_argument(
         "--episodes", metavar="N", type=int, nargs="+", help="numbers of the episodes (default: all)"
     )
@@ -44,6 +48,15 @@ def _parser() -> cli.PlainParser:
     for name in ("from-lerobot", "from-hdf5"):
         _units(of[name])
     return parser
+
+
+def _check(formats: Any, prog: str) -> None:
+    text = "what is understood of logs, and what is missing"
+    parser = formats.add_parser("check", help=text, description=f"Show {text}; write a map.yaml where there is none.")
+    parser.usage = f"{prog} check DIR [--model FILE] [--map FILE]"
+    parser.add_argument("path", metavar="DIR", help="folder of logs, or one file")
+    parser.add_argument("--model", metavar="FILE", help="MJCF model; it names joints and actuators")
+    parser.add_argument("--map", metavar="FILE", help="map of the columns (default: map.yaml in the folder)")
 
 
 def _ros(parser: argparse.ArgumentParser) -> None:
@@ -125,6 +138,8 @@ def _arrays(args: argparse.Namespace) -> Any:
 def _logs(argv: Sequence[str] | None) -> int:
     """Recordings of other tools as a folder of logs; exit code 0, or 2 (bad input)."""
     args = _parser().parse_args(argv)
+    if args.format == "check":
+        return _checked(args)
     scale, of_commands = _scales(args)
     from bayessim_mjx.logs.importers.folder import Target
 
@@ -137,6 +152,51 @@ def _logs(argv: Sequence[str] | None) -> int:
     model = args.model or "robot.xml"
     print(f"next: bayessim-mjx diagnose --model {model} --data {target.folder}")
     return 0
+
+
+def _checked(args: argparse.Namespace) -> int:
+    """Print what was understood; exit code 0, or 2 where something is missing."""
+    from bayessim_mjx.logs.overview import overview
+
+    path = Path(args.path)
+    found = overview(path, _model(args.model), args.map)
+    _table(("column", "channel", "unit", "values", "note"), found.columns)
+    _table(("file", "rows", "length", "rate", "jitter", "gaps"), found.files)
+    for note in found.notes:
+        print(f"note: {note}")
+    if found.map_text:
+        _write_map(path, found.map_text)
+    for what in found.missing:
+        print(f"missing: {what}")
+    if not found.missing:
+        print(f"nothing is missing; next: bayessim-mjx diagnose --model {args.model} --data {path}")
+    return 2 if found.missing else 0
+
+
+def _write_map(path: Path, text: str) -> None:
+    """Into the folder; of a single file, or where nothing may be written, onto the terminal."""
+    try:
+        if path.is_dir():
+            if not path.stat().st_mode & 0o222:  # also for an administrator, whom no mode would stop
+                raise PermissionError(errno.EACCES, "the folder is read-only")
+            with (path / "map.yaml").open("x", encoding="utf-8") as file:
+                file.write(text)
+            print(f"map: {path / 'map.yaml'} is written; edit it where it is wrong")
+            return
+        why = "a map for it, for --map"
+    except OSError as error:
+        why = f"{path / 'map.yaml'} cannot be written ({error.strerror}); a map for --map"
+    print(f"map: {why}:")
+    print("".join(f"  {line}\n" for line in text.splitlines()), end="")
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    if not rows:
+        return
+    widths = [max(len(row[i]) for row in (head, *rows)) for i in range(len(head))]
+    for row in (head, *rows):
+        print("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+    print()
 
 
 def _scales(args: argparse.Namespace) -> tuple[float, float]:

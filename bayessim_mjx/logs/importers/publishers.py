@@ -104,7 +104,7 @@ def _apart(ranked: Sequence[tuple[_Form, Sequence[Message]]]) -> str:
     """Publishers of other forms whose positions lie off those of the first, interleaved with it."""
     for i, (first, many) in enumerate(ranked):
         for second, few in ranked[i + 1 :]:
-            for joint in set(first.names) & set(second.names):
+            for joint in sorted(set(first.names) & set(second.names)):
                 found = _off(many, few, joint)
                 if found:
                     return found
