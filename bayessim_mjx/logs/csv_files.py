@@ -62,7 +62,7 @@ def read_csv(path: Path, form: Form | None = None) -> Table:
     if not body:
         raise UserError(f"{path}: no data rows; allowed: a header line and one row per sample")
     names = [f.strip().lstrip("#").strip() for f in lines[0]] if form.header else [str(i) for i in range(len(body[0]))]
-    _other_delimiter(path, names)
+    _other_delimiter(path, names, lines)
     if form.header:
         _no_header(path, lines[0], names)
     unnamed = [i for i, name in enumerate(names) if not name]
@@ -87,7 +87,13 @@ def read_csv(path: Path, form: Form | None = None) -> Table:
     return Table(path, columns, first, lenient=form.lenient, ragged=ragged, marks=marks)
 
 
-def _other_delimiter(path: Path, names: Sequence[str]) -> None:
+def _other_delimiter(path: Path, names: Sequence[str], lines: Sequence[Sequence[str]]) -> None:
+    table = next((i for i, fields in enumerate(lines) if len(fields) > 1), 0) if len(names) == 1 else 0
+    if table and sum(len(fields) > 1 for fields in lines) > 0.5 * len(lines):
+        raise UserError(
+            f"{path}: the first line ({names[0]!r}) is one field, and line {table + 1} has {len(lines[table])}; "
+            f"`skip_rows` in a map (here {table} more) passes over lines before the header"
+        )
     other = next((d for d in DELIMITERS if d in names[0]), None) if len(names) == 1 else None
     if other is not None:
         mend = f"`delimiter: {other!r}` in a map (docs/logs.md)"

@@ -22,6 +22,7 @@ _MONTH = r"(?P<a>\d{1,2})[- ](?P<name>[A-Za-z]{3})[a-z]*[- ](?P<year>\d{4})"
 _FORMS = {form: re.compile(rf"{form}[ T,]+{_CLOCK}") for form in (_DAY, _YEAR, _MONTH)}
 _OF_DAY = re.compile(_CLOCK)
 _MINUTES = re.compile(r"(?P<minute>\d{1,2}):(?P<second>\d{2})[.,](?P<part>\d+)")
+_COLON = re.compile(r"[\d./-]*[T ]*\d{1,2}:\d{2}")  # some form of a time, known or not
 _TWO = re.compile(r"\d{1,2}:\d{2}")
 _MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
 _ORDERS = {"day first": ("a", "b"), "month first": ("b", "a")}
@@ -34,10 +35,14 @@ Where = Callable[[int], str]
 
 
 def dated(fields: Iterable[str]) -> bool:
-    """Whether the first field that is not blank is a date with a time, or a time of day."""
+    """Whether the first field that is not blank is a date with a time, or a time of day, in a known form or another."""
     first = next((field.strip() for field in fields if field.strip()), "")
     whole = (*_FORMS.values(), _OF_DAY, _MINUTES)
-    return _DATE.match(first) is not None or any(form.fullmatch(first) for form in whole)
+    return (
+        _DATE.match(first) is not None
+        or _COLON.match(first) is not None
+        or any(form.fullmatch(first) for form in whole)
+    )
 
 
 def seconds(fields: Sequence[str], where: Where, lenient: bool = False, form: str | None = None) -> Array:

@@ -22,7 +22,7 @@ _WORDS = {  # of a column's name, besides that of the joint; the first kind that
 }
 KINDS = {kind: frozenset(words.split()) for kind, words in _WORDS.items()}
 _CLOCK = frozenset(
-    ["t", "time", "timestamp", "timestamps", "stamp", "stamps", "zeit", "clock", "sec", "secs", "seconds", "elapsed"]
+    ("t", "time", "timestamp", "timestamps", "stamp", "stamps", "zeit", "clock", "sec", "secs", "seconds")
 )
 _PART = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+")
 _UNIT = re.compile(r"\s*[\[(<{][^\])>}]*[\])>}]\s*$")

@@ -1,0 +1,66 @@
+"""Each planted fault of a dialect is read rightly, or refused with the key of the map that mends it; none silently."""
+
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+from dialects import SERVO, TRUTH, Case
+from dialects_of_texts import CASES as TEXTS
+from dialects_of_times import CASES as TIMES
+from dialects_of_units import CASES as UNITS
+from log_files import ARM
+
+from bayessim_mjx.errors import UserError
+from bayessim_mjx.logs import Log, read_logs
+
+CASES = {case.name: case for case in (*TEXTS, *TIMES, *UNITS)}
+MODELS = {"arm": mujoco.MjModel.from_xml_string(ARM), "servo": mujoco.MjModel.from_xml_string(SERVO)}
+
+
+def read(path: Path, case: Case, log_map: Mapping[str, Any] | None) -> tuple[Log, str]:
+    """The one log of a case, and all that was said."""
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        (log,) = read_logs(path, MODELS[case.model], log_map)
+    return log, "\n".join(str(w.message) for w in said)
+
+
+def true(log: Log, case: Case) -> None:
+    truth = TRUTH if case.truth is None else case.truth
+    nu = log.ctrl.shape[1]
+    np.testing.assert_allclose(log.time - log.time[0], truth[:, 0] - truth[0, 0], atol=max(case.within, 2e-6))
+    np.testing.assert_allclose(log.ctrl, truth[:, 1 : 1 + nu], atol=case.within)
+    np.testing.assert_allclose(log.qpos, truth[:, 1 + nu :], atol=case.within)
+
+
+def test_there_are_many_and_each_has_a_name_and_a_source() -> None:
+    every = (*TEXTS, *TIMES, *UNITS)
+    assert len(every) == len(CASES) >= 60
+    assert all(":" in case.complaint for case in every)
+    assert all(case.words for case in every if case.refused)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_dialect(name: str, tmp_path: Path) -> None:
+    case = CASES[name]
+    path = tmp_path / "run.csv"
+    path.write_bytes(case.content)
+    if not case.refused:
+        log, said = read(path, case, case.log_map)
+        true(log, case)
+        for word in case.words:
+            assert word in said, said
+        return
+    with pytest.raises(UserError) as error, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        read_logs(path, MODELS[case.model], case.log_map)
+    text = str(error.value)
+    for word in case.words:
+        assert word in text, text
+    if case.mend is not None:
+        log, _ = read(path, case, {**(case.log_map or {}), **case.mend})
+        true(log, case)
